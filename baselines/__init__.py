@@ -1,0 +1,1 @@
+"""Estimators to compare with: ordinary users of the contract in `sonar_graph.estimator`."""

@@ -1,0 +1,149 @@
+"""What is known about vehicle and sensors before a run: noise, mountings, gravity, the start.
+
+A `Calibration` travels inside the log (a metadata record) or comes from a TOML or JSON file; every field has a unit
+in its name or docstring. Every estimator gets the same one.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import gtsam
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from sonar_graph.errors import CalibrationError
+
+Vector = tuple[float, float, float]
+STANDARD_GRAVITY = 9.80665
+
+
+class Section(BaseModel):
+    """A frozen group of settings that refuses names it does not know."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class Mounting(Section):
+    """Where a sensor sits on the body: ``body_T_sensor``."""
+
+    translation_m: Vector = (0.0, 0.0, 0.0)
+    """Lever arm: the sensor's origin in the body frame."""
+    rpy_rad: Vector = (0.0, 0.0, 0.0)
+    """Roll, pitch, yaw: body_R_sensor = Rz(yaw) Ry(pitch) Rx(roll)."""
+
+    def pose(self) -> gtsam.Pose3:
+        """body_T_sensor."""
+        return gtsam.Pose3(gtsam.Rot3.RzRyRx(*self.rpy_rad), np.array(self.translation_m))
+
+
+class ImuCalibration(Section):
+    """Gyroscopes and accelerometers."""
+
+    gyro_noise_density: float = Field(1.2e-4, ge=0)
+    """White noise of angular rate, rad/s/√Hz."""
+    gyro_bias_sigma: float = Field(5e-5, ge=0)
+    """What remains of the bias when the run starts, rad/s; 0 means that there is none to estimate."""
+    gyro_bias_walk_density: float = Field(1e-6, ge=0)
+    """Random walk of the bias, rad/s²/√Hz."""
+    accel_noise_density: float = Field(1.2e-3, ge=0)
+    """White noise of specific force, m/s²/√Hz."""
+    accel_bias_sigma: float = Field(1e-2, ge=0)
+    """Bias of specific force, m/s²."""
+    mounting: Mounting = Mounting()
+
+
+class DvlCalibration(Section):
+    """Doppler velocity log."""
+
+    velocity_sigma_m_s: Vector = (0.01, 0.01, 0.01)
+    """White noise of one velocity sample along each of the DVL's axes, where the log does not say."""
+    mounting: Mounting = Mounting()
+
+
+class DepthCalibration(Section):
+    """Pressure sensor."""
+
+    sigma_m: float = Field(0.01, gt=0)
+    """White noise of one sample, where the log does not say."""
+    port_m: Vector = (0.0, 0.0, 0.0)
+    """The pressure port in the body frame."""
+
+
+class SonarCalibration(Section):
+    """Imaging sonar, or whatever else measures range and azimuth to landmarks."""
+
+    mounting: Mounting = Mounting()
+    range_sigma_m: float = Field(0.02, gt=0)
+    """White noise of range, where the log does not say."""
+    azimuth_sigma_rad: float = Field(0.009, gt=0)
+    """White noise of azimuth, where the log does not say."""
+    elevation_aperture_rad: float = Field(0.244, gt=0)
+    """Full vertical opening; a detected point's elevation lies within half of it either side of zero."""
+
+
+class FloorPrior(Section):
+    """Landmarks lie on a floor whose height is known: landmark z ~ N(z_m, sigma_m²)."""
+
+    z_m: float
+    sigma_m: float = Field(gt=0)
+
+
+class PlanarMotion(Section):
+    """The vehicle stays on a horizontal plane: z, roll and pitch are N(0, sigma²) at every keyframe or update."""
+
+    z_m: float = 0.0
+    z_sigma_m: float = Field(1e-3, gt=0)
+    tilt_sigma_rad: float = Field(1e-3, gt=0)
+
+
+class Start(Section):
+    """World pose of the body at the first instant with IMU and DVL, as a prior."""
+
+    position_m: Vector = (0.0, 0.0, 0.0)
+    rpy_rad: Vector = (0.0, 0.0, 0.0)
+    position_sigma_m: Vector = (1e-3, 1e-3, 1e-3)
+    """Along the world's axes."""
+    rpy_sigma_rad: Vector = (1e-3, 1e-3, 1e-3)
+    """Small rotations about the body's axes."""
+
+    def pose(self) -> gtsam.Pose3:
+        """world_T_body."""
+        return gtsam.Pose3(gtsam.Rot3.RzRyRx(*self.rpy_rad), np.array(self.position_m))
+
+
+class Calibration(Section):
+    """All that is known before a run. Every field has a default, so that a log without one still runs."""
+
+    imu: ImuCalibration = ImuCalibration()
+    dvl: DvlCalibration = DvlCalibration()
+    depth: DepthCalibration = DepthCalibration()
+    sonar: SonarCalibration = SonarCalibration()
+    start: Start = Start()
+    floor: FloorPrior | None = None
+    """None: landmark heights are known only through the sonar's vertical aperture."""
+    planar: PlanarMotion | None = None
+    """None: the vehicle moves in three dimensions."""
+    use_gravity: bool = True
+    """Take roll and pitch from the accelerometers, where they measure."""
+    odometry_interpolation: Literal["linear", "hold-past"] = "linear"
+    """What a velocity or rate sample stands for. ``linear``: the value at its stamp, linear in between (Doppler logs,
+    gyros); ``hold-past``: the mean over the interval that ends at its stamp (wheel odometry given as displacements)."""
+    gravity_m_s2: float = Field(STANDARD_GRAVITY, gt=0)
+    earth_rate_latitude_rad: float | None = None
+    """Latitude for removing the Earth's rotation from the gyros (world x east, y north); None: not removed."""
+
+    @classmethod
+    def parse(cls, values: object, source: str) -> Calibration:
+        """Validate plain values (from TOML or JSON); ``source`` names their origin in the error.
+
+        Raises
+        ------
+        CalibrationError
+            Naming the source, each wrong field, and what was expected.
+        """
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+            raise CalibrationError(f"{source}: {faults}") from error

@@ -1,0 +1,53 @@
+"""The errors that this package raises on purpose, under one root.
+
+::
+
+    SonarGraphError
+    ├── MeasurementError        a block of measurements breaks its own rules
+    ├── CalibrationError        a calibration is missing or impossible
+    ├── LogError                a file cannot be read as what it should be
+    │   ├── MissingTopicError   ... because a needed topic is not in it
+    │   └── DatasetError        ... because a data set's folder or file is not what a converter expects
+    ├── EstimatorError          an estimator cannot be set up or go on
+    │   └── UnknownEstimatorError
+    └── EvaluationError         a comparison or report cannot be made
+
+Each message says what was asked, what was found, and what to do. The command line prints it on one line and exits
+with 2; only an unforeseen error ends in a traceback.
+"""
+
+
+class SonarGraphError(Exception):
+    """Root of every error that this package raises on purpose."""
+
+
+class MeasurementError(SonarGraphError):
+    """A block of measurements breaks its own rules (shape, order, finiteness)."""
+
+
+class CalibrationError(SonarGraphError):
+    """A calibration is missing or impossible."""
+
+
+class LogError(SonarGraphError):
+    """A file cannot be read as what it should be."""
+
+
+class MissingTopicError(LogError):
+    """A needed topic is not in the log."""
+
+
+class DatasetError(LogError):
+    """A data set's folder or file is not what its converter expects."""
+
+
+class EstimatorError(SonarGraphError):
+    """An estimator cannot be set up or cannot go on."""
+
+
+class UnknownEstimatorError(EstimatorError):
+    """No installed estimator has the name that was asked for."""
+
+
+class EvaluationError(SonarGraphError):
+    """A comparison or report cannot be made."""

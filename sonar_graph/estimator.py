@@ -1,0 +1,105 @@
+"""The contract of an estimator, and how estimators are found.
+
+An estimator is any class with the methods of `Estimator`, announced by its package under the entry-point group
+``sonar_graph.estimators``::
+
+    [project.entry-points."sonar_graph.estimators"]
+    my-filter = "my_package.my_module:MyFilter"
+
+It then takes part in ``sonar-graph compare`` under that name. `sonar_graph.estimator_checks` tests the contract.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+from pydantic import ValidationError
+
+from sonar_graph.calibration import Calibration, Section
+from sonar_graph.errors import EstimatorError, UnknownEstimatorError
+from sonar_graph.measurements import Measurements
+from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
+
+ENTRY_POINT_GROUP = "sonar_graph.estimators"
+
+
+@runtime_checkable
+class Estimator(Protocol):
+    """Turns measurements into poses and landmarks.
+
+    The outcome must not depend on how the measurements are cut into calls, only on the instants ``end_ns`` at which
+    estimates are asked for being returned.
+    """
+
+    Params: ClassVar[type[Section]]
+    """Settings of this estimator; all have defaults."""
+
+    def __init__(self, calibration: Calibration, params: Any = None) -> None: ...
+
+    def process(self, measurements: Measurements) -> Estimate | None:
+        """Take in what was measured and return the causal estimate at ``measurements.end_ns``.
+
+        None before the first instant with IMU and DVL.
+        """
+        ...
+
+    def trajectory(self) -> Trajectory:
+        """The best that is known now about every instant at which `process` returned an estimate."""
+        ...
+
+    def landmarks(self) -> LandmarkMap:
+        """The best that is known now about every landmark."""
+        ...
+
+    def detections(self) -> DetectionLog:
+        """What became of each detection so far."""
+        ...
+
+
+def installed_estimators() -> dict[str, EntryPoint]:
+    """Entry points by name; nothing is imported. Of two with one name the first found wins."""
+    found: dict[str, EntryPoint] = {}
+    for point in entry_points(group=ENTRY_POINT_GROUP):
+        found.setdefault(point.name, point)
+    return dict(sorted(found.items()))
+
+
+def load_estimator(name: str) -> type[Estimator]:
+    """The class behind an estimator's name.
+
+    Raises
+    ------
+    UnknownEstimatorError
+        Listing the names that exist.
+    EstimatorError
+        When its package cannot be imported or does not keep the contract.
+    """
+    installed = installed_estimators()
+    if name not in installed:
+        known = ", ".join(installed) or "none; reinstall the package"
+        raise UnknownEstimatorError(f"no estimator is called {name!r}; installed: {known}")
+    try:
+        loaded: Any = installed[name].load()
+    except Exception as error:  # a third party's import may fail in any way
+        raise EstimatorError(f"{name} ({installed[name].value}) cannot be loaded: {error}") from error
+    missing = [m for m in ("Params", "process", "trajectory", "landmarks", "detections") if not hasattr(loaded, m)]
+    if missing:
+        raise EstimatorError(f"{name} ({installed[name].value}) lacks {', '.join(missing)} of the estimator contract")
+    return loaded  # type: ignore[no-any-return]  # checked above
+
+
+def make_params(estimator: type[Estimator], overrides: dict[str, Any], name: str) -> Section:
+    """An estimator's settings with some replaced.
+
+    Raises
+    ------
+    EstimatorError
+        Naming the setting that does not exist or does not fit, and those that exist.
+    """
+    try:
+        return estimator.Params.model_validate(overrides)
+    except ValidationError as error:
+        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        known = ", ".join(estimator.Params.model_fields)
+        raise EstimatorError(f"settings of {name}: {faults}; it has: {known}") from error

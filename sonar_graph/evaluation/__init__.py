@@ -1,0 +1,1 @@
+"""Running estimators, judging them, and reporting: knows them only through their contract."""

@@ -1,0 +1,1 @@
+"""Logs in and out: MCAP with ROS 2 messages, trajectory files, converters."""

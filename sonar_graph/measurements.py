@@ -1,0 +1,137 @@
+"""What the sensors said: columnar blocks of n >= 1 samples.
+
+A live caller passes blocks of one row, a replay passes all rows between two instants: the same code, without a
+Python call for every IMU sample. Rows are sorted by stamp. `Measurements` bundles the blocks that arrived since the
+last call; that is what an estimator processes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_graph.errors import MeasurementError
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Rows with a stamp each; the base of every measurement.
+
+    Every field is an array whose first axis runs over the rows. Constructing a block copies nothing that already has
+    the right type, and checks the rules below.
+
+    Raises
+    ------
+    MeasurementError
+        When there is no row, a column's length differs from the number of stamps, or stamps run backwards.
+    """
+
+    stamps_ns: Ints
+    """Time of validity, shape (n,), integer nanoseconds, not decreasing."""
+
+    def __post_init__(self) -> None:
+        name = type(self).__name__
+        object.__setattr__(self, "stamps_ns", np.asarray(self.stamps_ns, dtype=np.int64))
+        n = len(self.stamps_ns)
+        if n == 0:
+            raise MeasurementError(f"{name}: a block needs at least one row; leave the block out instead")
+        for field in fields(self)[1:]:
+            kind = np.int64 if str(field.type) == "Ints" else np.float64
+            column = np.asarray(getattr(self, field.name), dtype=kind)
+            if column.shape[:1] != (n,):
+                raise MeasurementError(
+                    f"{name}.{field.name}: shape {column.shape} has not one row for each of {n} stamps"
+                )
+            object.__setattr__(self, field.name, column)
+        backwards = np.flatnonzero(np.diff(self.stamps_ns) < 0)
+        if backwards.size:
+            raise MeasurementError(f"{name}: stamps run backwards after row {backwards[0]}; sort the rows by stamp")
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def rows(self, selection: slice | NDArray[np.bool_] | Ints) -> Self:
+        """The block with only the selected rows."""
+        return type(self)(*(getattr(self, field.name)[selection] for field in fields(self)))
+
+    def between(self, after_ns: int, until_ns: int) -> Self | None:
+        """The rows with ``after_ns < stamp <= until_ns``, or None where there is none."""
+        first, last = np.searchsorted(self.stamps_ns, [after_ns, until_ns], side="right")
+        return self.rows(slice(first, last)) if last > first else None
+
+    @classmethod
+    def concatenate(cls, blocks: Sequence[Self]) -> Self:
+        """One block from several, in the order given."""
+        return cls(*(np.concatenate([getattr(b, field.name) for b in blocks]) for field in fields(cls)))
+
+
+@dataclass(frozen=True, eq=False)
+class Imu(Block):
+    """Inertial measurements in the IMU's frame."""
+
+    angular_velocity: Floats
+    """Shape (n, 3), rad/s."""
+    specific_force: Floats
+    """What the accelerometers feel, acceleration minus gravity: +9.81 on z at rest; NaN: not measured.
+    Shape (n, 3), m/s²."""
+
+
+@dataclass(frozen=True, eq=False)
+class Dvl(Block):
+    """Doppler velocity over the bottom, in the DVL's frame. Rows without bottom lock are not in the block."""
+
+    velocity: Floats
+    """Shape (n, 3), m/s."""
+    velocity_cov: Floats
+    """Shape (n, 3, 3), m²/s²; NaN where the log does not say: the calibration's value then holds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Depth(Block):
+    """Height of the pressure sensor's port in the world, from pressure."""
+
+    z_m: Floats
+    """World z of the port (negative below the surface of a world with its origin there), shape (n,)."""
+    variance_m2: Floats
+    """Shape (n,); NaN where the log does not say: the calibration's value then holds."""
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkDetections(Block):
+    """Recognised landmarks in sonar frames; one row a detection, rows of one frame share a stamp."""
+
+    range_m: Floats
+    """Slant range, shape (n,)."""
+    azimuth_rad: Floats
+    """``atan2(q_y, q_x)`` in the sonar frame, positive to the left, shape (n,)."""
+    range_azimuth_cov: Floats
+    """Covariance of (range, azimuth), shape (n, 2, 2); NaN where the log does not say."""
+    candidate_ids: Ints
+    """Identities that the recogniser considers, shape (n, k); -1 fills unused places."""
+    id_probability: Floats
+    """Posterior of each candidate, shape (n, k). What is missing to 1 is "none of the known landmarks"."""
+
+    def most_probable(self) -> tuple[Ints, Floats]:
+        """Identity with the highest posterior and that posterior, shapes (n,) and (n,)."""
+        best = np.argmax(self.id_probability, axis=1)
+        row = np.arange(len(self))
+        return self.candidate_ids[row, best], self.id_probability[row, best]
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """All that was measured since the previous call, up to and including ``end_ns``."""
+
+    end_ns: int
+    """The instant up to which the blocks are complete, and for which an estimate is wanted."""
+    imu: Imu | None = None
+    dvl: Dvl | None = None
+    depth: Depth | None = None
+    detections: LandmarkDetections | None = None

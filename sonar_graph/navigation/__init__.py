@@ -1,0 +1,1 @@
+"""From inertial and Doppler samples to motion and its covariance; no landmarks here."""

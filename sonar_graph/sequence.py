@@ -1,0 +1,80 @@
+"""A recorded or simulated run: what logs and the simulator produce and estimators consume."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.errors import MeasurementError
+from sonar_graph.measurements import Depth, Dvl, Imu, Ints, LandmarkDetections, Measurements
+from sonar_graph.states import LandmarkMap, Trajectory
+
+NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """Calibration, time-ordered measurements, and truth where there is one."""
+
+    name: str
+    """Short, for tables and file names."""
+    calibration: Calibration
+    imu: Imu
+    dvl: Dvl
+    depth: Depth | None = None
+    detections: LandmarkDetections | None = None
+    truth: Trajectory | None = None
+    """Reference poses of the body; where they come from is in `notes`."""
+    true_landmarks: LandmarkMap | None = None
+    notes: dict[str, str] = field(default_factory=dict)
+    """Provenance, by subject: data set, licence, what was simulated, seed."""
+
+    @property
+    def start_ns(self) -> int:
+        """First instant with IMU and DVL: the start pose of the calibration holds here."""
+        return int(max(self.imu.stamps_ns[0], self.dvl.stamps_ns[0]))
+
+    @property
+    def end_ns(self) -> int:
+        """Last instant with IMU and DVL."""
+        return int(min(self.imu.stamps_ns[-1], self.dvl.stamps_ns[-1]))
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds between `start_ns` and `end_ns`."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    def instants(self, rate_hz: float) -> Ints:
+        """Equally spaced instants after the start until the end, shape (n,), nanoseconds.
+
+        Raises
+        ------
+        MeasurementError
+            When the sequence is shorter than one step.
+        """
+        step_ns = round(NS_PER_S / rate_hz)
+        instants = np.arange(self.start_ns + step_ns, self.end_ns + 1, step_ns, dtype=np.int64)
+        if not len(instants):
+            raise MeasurementError(
+                f"{self.name}: {self.duration_s:.3f} s with IMU and DVL are too short for {rate_hz} Hz"
+            )
+        return instants
+
+    def replay(self, instants_ns: Ints) -> Iterator[Measurements]:
+        """Measurements cut at the instants: each item holds what came after the previous instant, up to this one.
+
+        The first item holds everything up to the first instant. Every estimator sees the same items in the same order.
+        """
+        after_ns = np.iinfo(np.int64).min
+        for end_ns in instants_ns.tolist():
+            yield Measurements(
+                end_ns,
+                self.imu.between(after_ns, end_ns),
+                self.dvl.between(after_ns, end_ns),
+                self.depth.between(after_ns, end_ns) if self.depth else None,
+                self.detections.between(after_ns, end_ns) if self.detections else None,
+            )
+            after_ns = end_ns

@@ -1,0 +1,1 @@
+"""Truth and sensor readings; shares no code with the models that it judges."""

@@ -1,0 +1,1 @@
+"""Landmark SLAM by incremental smoothing: models, factors, the iSAM2 estimator."""

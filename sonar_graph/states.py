@@ -1,0 +1,135 @@
+"""What an estimator says: poses in time, landmarks, and what became of each detection."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import gtsam
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from sonar_graph.errors import MeasurementError
+from sonar_graph.measurements import Floats, Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A causal estimate: what could be known at ``stamp_ns`` from what was measured until then."""
+
+    stamp_ns: int
+    world_T_body: gtsam.Pose3
+    covariance: Floats
+    """Of the body-frame perturbation [rotation, translation], shape (6, 6)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses of the body in the world over time, with their covariances where known."""
+
+    stamps_ns: Ints
+    """Shape (n,), strictly increasing."""
+    positions: Floats
+    """Origin of the body in the world, shape (n, 3), metres."""
+    quaternions_xyzw: Floats
+    """world_R_body, shape (n, 4), unit length, scalar last."""
+    covariances: Floats
+    """Of the body-frame perturbation [rotation, translation], shape (n, 6, 6); NaN where unknown."""
+
+    def __post_init__(self) -> None:
+        if np.any(np.diff(self.stamps_ns) <= 0):
+            raise MeasurementError("Trajectory: stamps must increase strictly")
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @classmethod
+    def from_estimates(cls, estimates: list[Estimate]) -> Trajectory:
+        """The trajectory through a list of estimates in time order."""
+        n = len(estimates)
+        rotations = np.array([e.world_T_body.rotation().matrix() for e in estimates])
+        return cls(
+            stamps_ns=np.fromiter((e.stamp_ns for e in estimates), np.int64, n),
+            positions=np.array([e.world_T_body.translation() for e in estimates]).reshape(n, 3),
+            quaternions_xyzw=Rotation.from_matrix(rotations.reshape(n, 3, 3)).as_quat() if n else np.empty((0, 4)),
+            covariances=np.array([e.covariance for e in estimates]).reshape(n, 6, 6),
+        )
+
+    @classmethod
+    def without_covariances(cls, stamps_ns: Ints, positions: Floats, quaternions_xyzw: Floats) -> Trajectory:
+        """A trajectory whose uncertainty is unknown, such as a reference."""
+        return cls(stamps_ns, positions, quaternions_xyzw, np.full((len(stamps_ns), 6, 6), np.nan))
+
+    def rotations(self) -> Rotation:
+        """world_R_body of every row."""
+        return Rotation.from_quat(self.quaternions_xyzw)
+
+    def rows(self, selection: slice | Ints) -> Trajectory:
+        """The trajectory with only the selected rows."""
+        return Trajectory(
+            self.stamps_ns[selection],
+            self.positions[selection],
+            self.quaternions_xyzw[selection],
+            self.covariances[selection],
+        )
+
+    def at(self, stamps_ns: Ints) -> Trajectory:
+        """Poses at other instants: position linear, rotation along the shortest arc; without covariances.
+
+        Raises
+        ------
+        MeasurementError
+            When an instant lies outside the trajectory.
+        """
+        if len(stamps_ns) and (stamps_ns[0] < self.stamps_ns[0] or stamps_ns[-1] > self.stamps_ns[-1]):
+            raise MeasurementError("Trajectory.at: an instant lies outside it; select the common time span first")
+        origin_ns = self.stamps_ns[0]
+        seconds, own = (stamps_ns - origin_ns) * 1e-9, (self.stamps_ns - origin_ns) * 1e-9
+        positions = np.column_stack([np.interp(seconds, own, self.positions[:, axis]) for axis in range(3)])
+        quaternions = Slerp(own, self.rotations())(seconds).as_quat()
+        return Trajectory.without_covariances(stamps_ns, positions, quaternions)
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkMap:
+    """Landmarks by identity."""
+
+    ids: Ints
+    """Shape (m,), each once, ascending."""
+    positions: Floats
+    """In the world, shape (m, 3), metres."""
+    covariances: Floats
+    """Shape (m, 3, 3), m²; NaN where unknown."""
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+class Outcome(StrEnum):
+    """What an estimator did with a detection."""
+
+    USED = "used"
+    NEW = "new landmark"
+    GATED = "refused: innovation outside the gate"
+    NO_IDENTITY = "refused: no identity probable enough"
+    LATE = "refused: older than what was already processed"
+    UNLOCATED = "refused: no odometry covers its stamp"
+
+
+@dataclass(frozen=True, eq=False)
+class DetectionLog:
+    """What became of each detection, in the order processed: one row each, nothing left out."""
+
+    stamps_ns: Ints
+    """Shape (n,)."""
+    landmark_ids: Ints
+    """Most probable identity, shape (n,)."""
+    innovations: Floats
+    """Measured minus predicted (range m, azimuth rad), shape (n, 2); NaN where there was no prediction."""
+    innovation_covs: Floats
+    """Shape (n, 2, 2); NaN where there was no prediction."""
+    outcomes: list[Outcome]
+    """Length n."""
+
+    def __len__(self) -> int:
+        return len(self.outcomes)
