@@ -15,7 +15,7 @@ Names
     ``world_R_body``   its rotation.
     ``*_m``, ``*_rad``, ``*_ns``  units, wherever they could be mistaken.
     ``*_sigma``        a standard deviation; ``*_cov`` a covariance; never one in the name of the other.
-    ``*_density``      a root power spectral density of white noise: its integral over T has sigma ``density * sqrt(T)``.
+    ``*_density``      the root spectral density of white noise: sigma of its integral over T is ``density * sqrt(T)``.
 
 Units
     Metres, radians, seconds, m/s, rad/s, m/s². Time stamps are integer nanoseconds of the sensor's own clock;
