@@ -1,0 +1,225 @@
+"""Gyro and Doppler rows, merged into steps of constant rate and velocity.
+
+Every estimator moves on these steps, so that no comparison hinges on how two sensors were interpolated.
+
+Nodes. The stamps of the DVL rows are *nodes*: between two nodes the velocity is known on both sides and the motion is
+final. A node counts as reached at time t when its own row and an IMU row at or after it are stamped at or before t.
+Whatever happens between nodes (a detection, a depth sample, an estimate being asked for) is related to the newest
+reached node by a provisional motion that uses nothing stamped later. Results therefore depend on stamps alone, not on
+how a log is cut into blocks, and nothing peeks ahead.
+
+Interpolation. ``linear``: rate and velocity are piecewise linear through the samples; the mean over a step is the value
+at its middle. ``hold-past``: a sample is the mean over the interval that ends at its stamp.
+
+Noise. Doppler samples are white: each perturbs the displacement by its weight (half the two intervals that it ends and
+begins) times its error. The same total over any chain follows from a velocity noise that is white in time with
+spectral density ``velocity_cov * interval``; half of a sample's variance falls on either side of its node.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.navigation.kernels import compiled
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Motion of the body in n successive steps, as measured (no bias removed)."""
+
+    duration_s: Floats
+    """Shape (n,)."""
+    rate: Floats
+    """Mean angular rate in the body frame, shape (n, 3), rad/s."""
+    velocity: Floats
+    """Mean velocity of the DVL's origin, body axes, shape (n, 3), m/s."""
+    velocity_psd: Floats
+    """Spectral density of its noise, body axes, shape (n, 3, 3), m²/s."""
+    specific_force: Floats
+    """Mean specific force at the IMU, body axes, shape (n, 3), m/s²; NaN where not measured."""
+
+    def __len__(self) -> int:
+        return len(self.duration_s)
+
+
+class Odometry:
+    """Keeps the rows that are still needed and turns them into steps.
+
+    Parameters
+    ----------
+    calibration
+        Mountings, DVL noise where the log has none, and the meaning of a sample.
+    """
+
+    def __init__(self, calibration: Calibration) -> None:
+        self._body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
+        self._body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
+        self._default_cov = np.diag(np.square(calibration.dvl.velocity_sigma_m_s))
+        self._hold_past = calibration.odometry_interpolation == "hold-past"
+        self._imu_ns: Ints = np.empty(0, np.int64)
+        self._rate: Floats = np.empty((0, 3))
+        self._force: Floats = np.empty((0, 3))
+        self._dvl_ns: Ints = np.empty(0, np.int64)
+        self._velocity: Floats = np.empty((0, 3))
+        self._cov: Floats = np.empty((0, 3, 3))
+
+    def add(self, imu: Imu | None, dvl: Dvl | None) -> None:
+        """Take in rows; those not newer than what is already there are passed over."""
+        newer_imu = imu.between(_last(self._imu_ns), _LATEST) if imu else None
+        newer_dvl = dvl.between(_last(self._dvl_ns), _LATEST) if dvl else None
+        if newer_imu:
+            self._add_imu(newer_imu)
+        if newer_dvl:
+            self._add_dvl(newer_dvl)
+
+    def _add_imu(self, imu: Imu) -> None:
+        self._imu_ns = np.concatenate([self._imu_ns, imu.stamps_ns])
+        self._rate = np.concatenate([self._rate, imu.angular_velocity @ self._body_R_imu.T])
+        self._force = np.concatenate([self._force, imu.specific_force @ self._body_R_imu.T])
+
+    def _add_dvl(self, dvl: Dvl) -> None:
+        cov = np.where(np.isnan(dvl.velocity_cov), self._default_cov, dvl.velocity_cov)
+        self._dvl_ns = np.concatenate([self._dvl_ns, dvl.stamps_ns])
+        self._velocity = np.concatenate([self._velocity, dvl.velocity @ self._body_R_dvl.T])
+        self._cov = np.concatenate([self._cov, self._body_R_dvl @ cov @ self._body_R_dvl.T])
+
+    def start_ns(self) -> int | None:
+        """First node that IMU rows cover from both sides; None before there is one."""
+        if not len(self._imu_ns) or not len(self._dvl_ns):
+            return None
+        first = np.searchsorted(self._dvl_ns, self._imu_ns[0])
+        if first == len(self._dvl_ns) or self._dvl_ns[first] > self._imu_ns[-1]:
+            return None
+        return int(self._dvl_ns[first])
+
+    def nodes(self, after_ns: int, until_ns: int) -> Ints:
+        """Nodes after one instant that are reached at another, in order."""
+        seen = np.searchsorted(self._imu_ns, until_ns, side="right")
+        covered_ns = int(self._imu_ns[seen - 1]) if seen else _EARLIEST
+        first, last = np.searchsorted(self._dvl_ns, [after_ns, min(until_ns, covered_ns)], side="right")
+        return self._dvl_ns[first:last]
+
+    def steps_between_nodes(self, start_ns: int, end_ns: int) -> Steps:
+        """Final motion from one node to a later, reached one."""
+        imu_rows = int(np.searchsorted(self._imu_ns, end_ns)) + 1
+        dvl_rows = int(np.searchsorted(self._dvl_ns, end_ns, side="right"))
+        return self._steps(start_ns, end_ns, imu_rows, dvl_rows)
+
+    def steps_since_node(self, node_ns: int, until_ns: int) -> Steps:
+        """Provisional motion from a reached node to any later instant, from rows stamped no later than that."""
+        imu_rows = int(np.searchsorted(self._imu_ns, until_ns, side="right"))
+        dvl_rows = int(np.searchsorted(self._dvl_ns, until_ns, side="right"))
+        return self._steps(node_ns, until_ns, imu_rows, dvl_rows)
+
+    def _steps(self, start_ns: int, end_ns: int, imu_rows: int, dvl_rows: int) -> Steps:
+        return Steps(
+            *_merge(
+                start_ns,
+                end_ns,
+                self._imu_ns[:imu_rows],
+                self._rate,
+                self._force,
+                self._dvl_ns[:dvl_rows],
+                self._velocity,
+                self._cov,
+                self._hold_past,
+            )
+        )
+
+    def velocity_at_node(self, node_ns: int) -> tuple[Floats, Floats, Floats]:
+        """DVL velocity (body axes), its covariance, and the angular rate at a node; shapes (3,), (3, 3), (3,)."""
+        k = int(np.searchsorted(self._dvl_ns, node_ns))
+        i = int(np.searchsorted(self._imu_ns, node_ns))
+        if self._hold_past or i == 0:
+            return self._velocity[k], self._cov[k], self._rate[i]
+        return self._velocity[k], self._cov[k], _between(self._imu_ns, self._rate, i, node_ns, False)
+
+    def forget_before(self, node_ns: int) -> None:
+        """Drop rows that no motion from this node on can need."""
+        first_imu = max(int(np.searchsorted(self._imu_ns, node_ns)) - 1, 0)
+        first_dvl = max(int(np.searchsorted(self._dvl_ns, node_ns)) - 1, 0)
+        self._imu_ns, self._rate, self._force = (
+            self._imu_ns[first_imu:],
+            self._rate[first_imu:],
+            self._force[first_imu:],
+        )
+        self._dvl_ns, self._velocity, self._cov = (
+            self._dvl_ns[first_dvl:],
+            self._velocity[first_dvl:],
+            self._cov[first_dvl:],
+        )
+
+
+_EARLIEST, _LATEST = np.iinfo(np.int64).min, np.iinfo(np.int64).max
+
+
+def _last(stamps_ns: Ints) -> int:
+    return int(stamps_ns[-1]) if len(stamps_ns) else _EARLIEST
+
+
+@compiled
+def _between(stamps: Ints, values: Floats, i: int, t: int, hold_past: bool) -> Floats:
+    """Value at t, where ``stamps[i - 1] < t <= stamps[i]``; the nearest end's value outside the rows."""
+    n = len(stamps)
+    if i >= n:
+        return values[n - 1]
+    if hold_past or i == 0:
+        return values[i]
+    share = (t - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
+    return values[i - 1] + share * (values[i] - values[i - 1])
+
+
+@compiled
+def _velocity_psd(dvl_ns: Ints, cov: Floats, k: int, hold_past: bool) -> Floats:
+    """Spectral density of the velocity noise between rows k - 1 and k; past the last row, that of the last interval."""
+    n = len(dvl_ns)
+    last = min(k, n - 1)
+    if last == 0:
+        return cov[0] * 0.0
+    interval_s = (dvl_ns[last] - dvl_ns[last - 1]) * 1e-9
+    if hold_past or k >= n:
+        return cov[last] * interval_s
+    return 0.5 * (cov[last] + cov[last - 1]) * interval_s
+
+
+@compiled
+def _merge(
+    start_ns: int,
+    end_ns: int,
+    imu_ns: Ints,
+    rate: Floats,
+    force: Floats,
+    dvl_ns: Ints,
+    velocity: Floats,
+    cov: Floats,
+    hold_past: bool,
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Cut (start, end] at every stamp of either sensor and take each sensor's mean over each piece."""
+    i, k = np.searchsorted(imu_ns, start_ns, side="right"), np.searchsorted(dvl_ns, start_ns, side="right")
+    most = len(imu_ns) - i + len(dvl_ns) - k + 1
+    duration, rates, velocities = np.empty(most), np.empty((most, 3)), np.empty((most, 3))
+    psds, forces = np.empty((most, 3, 3)), np.empty((most, 3))
+    n, t = 0, start_ns
+    while t < end_ns:
+        until = end_ns
+        if i < len(imu_ns) and imu_ns[i] < until:
+            until = imu_ns[i]
+        if k < len(dvl_ns) and dvl_ns[k] < until:
+            until = dvl_ns[k]
+        middle = t + (until - t) // 2
+        duration[n] = (until - t) * 1e-9
+        rates[n] = _between(imu_ns, rate, i, middle, hold_past)
+        forces[n] = _between(imu_ns, force, i, middle, hold_past)
+        velocities[n] = _between(dvl_ns, velocity, k, middle, hold_past)
+        psds[n] = _velocity_psd(dvl_ns, cov, k, hold_past)
+        n += 1
+        t = until
+        if i < len(imu_ns) and imu_ns[i] <= t:
+            i += 1
+        if k < len(dvl_ns) and dvl_ns[k] <= t:
+            k += 1
+    return duration[:n], rates[:n], velocities[:n], psds[:n], forces[:n]
