@@ -13,9 +13,10 @@ error ``n``::
     theta <- Exp(-phi)  theta + J_r(phi) dt d
     eps   <- eps - dR [J_l u dt]x theta + dR (D dt + J_l [l]x) dt d + dR J_l dt n,     D = d(J_l u) / d phi
 
-White noise gives the covariance, a constant ``d = -db`` the bias Jacobian, both by the same recursion, so that rotation
-and displacement are correlated as they should be and no sample is counted twice. A gyro error also reaches the velocity
-through the lever arm. Following Forster et al., TRO 2017, section VI, with the accelerometer replaced by the DVL; compare
+White noise gives the covariance, a constant ``d = -db`` the bias Jacobian, both by the same recursion, so that
+rotation and displacement are correlated as they should be and no sample is counted twice. A gyro error also reaches
+the velocity through the lever arm. Following Forster et al., TRO 2017, section VI, with the DVL in place of the
+accelerometer; compare
 Thoms et al., IEEE JOE 2023.
 """
 

@@ -7,7 +7,7 @@ than the arithmetic. Equations: Forster et al., "On-Manifold Preintegration", IE
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numba
 import numpy as np
@@ -22,7 +22,7 @@ SMALL_ANGLE_RAD = 1e-4
 
 def compiled(function: Compiled) -> Compiled:
     """Compile to machine code at the first call; the code is cached beside the source."""
-    return numba.njit(cache=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+    return cast(Compiled, numba.njit(cache=True, error_model="numpy")(function))
 
 
 @compiled

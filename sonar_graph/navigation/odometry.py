@@ -199,7 +199,8 @@ def _merge(
     hold_past: bool,
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Cut (start, end] at every stamp of either sensor and take each sensor's mean over each piece."""
-    i, k = np.searchsorted(imu_ns, start_ns, side="right"), np.searchsorted(dvl_ns, start_ns, side="right")
+    i = int(np.searchsorted(imu_ns, start_ns, side="right"))
+    k = int(np.searchsorted(dvl_ns, start_ns, side="right"))
     most = len(imu_ns) - i + len(dvl_ns) - k + 1
     duration, rates, velocities = np.empty(most), np.empty((most, 3)), np.empty((most, 3))
     psds, forces = np.empty((most, 3, 3)), np.empty((most, 3))
