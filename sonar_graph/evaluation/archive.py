@@ -1,0 +1,126 @@
+"""The arrays behind a report, in npz files, so that it can be drawn again without running anything.
+
+Fields of one object share a prefix: ``causal.stamps_ns``, ``causal.positions``, ... An object that is absent has none.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.errors import EvaluationError
+from sonar_graph.evaluation.atomic import replacing
+from sonar_graph.evaluation.results import ErrorSeries, Kind, RunResult
+from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Trajectory
+
+Arrays = dict[str, np.ndarray]
+T = TypeVar("T")
+KINDS: tuple[Kind, Kind] = ("causal", "smoothed")
+
+
+def write_arrays(path: Path, arrays: Arrays) -> None:
+    """Write named arrays, compressed, whole or not at all."""
+    with replacing(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def read_arrays(path: Path) -> Arrays:
+    """The arrays of a file by name.
+
+    Raises
+    ------
+    EvaluationError
+        When the file is missing or damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise EvaluationError(f"{path}: cannot be read as arrays ({error}); write the comparison anew") from error
+
+
+def sequence_arrays(sequence: Sequence) -> Arrays:
+    """Truth, and of IMU and Doppler log the first and the last row: what they measured is in the log."""
+    ends = np.array([0, -1])
+    arrays = _pack("imu", sequence.imu.rows(ends)) | _pack("dvl", sequence.dvl.rows(ends))
+    arrays |= _pack("truth", sequence.truth) | _pack("true_landmarks", sequence.true_landmarks)
+    return arrays
+
+
+def restore_sequence(name: str, calibration: Calibration, notes: dict[str, str], arrays: Arrays) -> Sequence:
+    """A sequence with its start, end and truth, but without its measurements."""
+    imu, dvl = _unpack("imu", Imu, arrays), _unpack("dvl", Dvl, arrays)
+    if imu is None or dvl is None:
+        raise EvaluationError("sequence.npz: the first and last rows of imu and dvl are missing")
+    truth = _unpack("truth", Trajectory, arrays)
+    true_landmarks = _unpack("true_landmarks", LandmarkMap, arrays)
+    return Sequence(name, calibration, imu, dvl, truth=truth, true_landmarks=true_landmarks, notes=notes)
+
+
+def run_arrays(run: RunResult, errors: dict[Kind, ErrorSeries]) -> Arrays:
+    """All arrays of one run, and its errors."""
+    arrays = {"update_s": run.update_s}
+    for kind in KINDS:
+        arrays |= _pack(kind, getattr(run, kind)) | _pack(f"errors.{kind}", errors.get(kind))
+    return arrays | _pack("landmarks", run.landmarks) | _pack("detections", run.detections)
+
+
+def restore_run(run: RunResult, arrays: Arrays) -> RunResult:
+    """A run with its arrays put back."""
+    return RunResult(
+        run.estimator,
+        run.params,
+        run.status,
+        run.reason,
+        causal=_unpack("causal", Trajectory, arrays),
+        smoothed=_unpack("smoothed", Trajectory, arrays),
+        landmarks=_unpack("landmarks", LandmarkMap, arrays),
+        detections=_unpack("detections", DetectionLog, arrays),
+        update_s=arrays["update_s"],
+        finish_s=run.finish_s,
+        peak_memory_mb=run.peak_memory_mb,
+    )
+
+
+def restore_errors(arrays: Arrays) -> dict[Kind, ErrorSeries]:
+    """The errors of one run."""
+    found = {kind: _unpack(f"errors.{kind}", ErrorSeries, arrays) for kind in KINDS}
+    return {kind: series for kind, series in found.items() if series is not None}
+
+
+def _pack(prefix: str, record: Any) -> Arrays:
+    """The fields of a dataclass as arrays; nothing for None."""
+    if record is None:
+        return {}
+    return {f"{prefix}.{field.name}": np.asarray(getattr(record, field.name)) for field in fields(record)}
+
+
+def _unpack(prefix: str, kind: type[T], arrays: Arrays) -> T | None:
+    """The dataclass that `_pack` took apart; None where it was absent.
+
+    Raises
+    ------
+    EvaluationError
+        Naming the field that is missing.
+    """
+    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]  # every kind here is a dataclass
+    if not any(f"{prefix}.{name}" in arrays for name in names):
+        return None
+    missing = [name for name in names if f"{prefix}.{name}" not in arrays]
+    if missing:
+        raise EvaluationError(f"stored {prefix} lacks {', '.join(missing)}; write the comparison anew")
+    return kind(**{name: _plain(name, arrays[f"{prefix}.{name}"]) for name in names})
+
+
+def _plain(name: str, array: np.ndarray) -> Any:
+    """What a field held before it became an array."""
+    if name == "outcomes":
+        return [Outcome(text) for text in array.tolist()]
+    return array.item() if array.ndim == 0 else array

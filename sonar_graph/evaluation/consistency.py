@@ -1,0 +1,132 @@
+"""Does the reported covariance fit the errors? NEES, NIS, and the bounds between which they should lie.
+
+Equations: docs/theory/metrics.md. Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to
+Tracking and Navigation, Wiley 2001, section 5.4.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from sonar_graph.evaluation.metrics import yaw_errors_rad
+from sonar_graph.evaluation.results import ErrorSeries
+from sonar_graph.measurements import Floats
+from sonar_graph.states import DetectionLog, Outcome, Trajectory
+
+
+def error_series(estimate: Trajectory, truth: Trajectory, position_dof: int) -> ErrorSeries:
+    """Errors, their reported standard deviations and their NEES at instants common to both.
+
+    Parameters
+    ----------
+    estimate, truth
+        At the same instants.
+    position_dof
+        2: the NEES of position takes x and y (planar motion); 3: also z.
+    """
+    yaw_error = yaw_errors_rad(estimate, truth)
+    position_error = estimate.positions - truth.positions
+    position_cov, yaw_var = world_position_covs(estimate), yaw_variances(estimate)
+    axes = slice(0, position_dof)
+    return ErrorSeries(
+        stamps_ns=estimate.stamps_ns,
+        position_m=position_error,
+        position_sigma_m=_root(np.diagonal(position_cov, axis1=1, axis2=2)),
+        yaw_rad=yaw_error,
+        yaw_sigma_rad=_root(yaw_var),
+        nees_position=normalised_squares(position_error[:, axes], position_cov[:, axes, axes]),
+        nees_yaw=normalised_squares(yaw_error[:, None], yaw_var[:, None, None]),
+        position_dof=position_dof,
+    )
+
+
+def world_position_covs(trajectory: Trajectory) -> Floats:
+    """Covariance of the position in the world, shape (n, 3, 3), m².
+
+    To first order ``mean @ Exp([theta, rho])`` has its origin at ``t + R rho``, so the covariance is ``R P_rho R^T``.
+    """
+    R = trajectory.rotations().as_matrix()
+    return np.asarray(R @ trajectory.covariances[:, 3:, 3:] @ R.transpose(0, 2, 1))
+
+
+def yaw_variances(trajectory: Trajectory) -> Floats:
+    """Variance of the heading ``atan2(R10, R00)``, shape (n,), rad².
+
+    With ``R Exp(theta)`` its derivative is ``[0, R21, R22] / (R00² + R10²)``: a turn about the body's own z moves
+    the heading of a level vehicle by as much, of a tilted one by another amount. NaN at a vertical x axis.
+    """
+    R = trajectory.rotations().as_matrix()
+    jacobian = np.zeros((len(trajectory), 3))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        jacobian[:, 1:] = R[:, 2, 1:] / (R[:, 0, 0] ** 2 + R[:, 1, 0] ** 2)[:, None]
+        return np.asarray(np.einsum("ni,nij,nj->n", jacobian, trajectory.covariances[:, :3, :3], jacobian))
+
+
+def normalised_squares(errors: Floats, covs: Floats) -> Floats:
+    """``e^T P^-1 e`` of every row; NaN where the covariance is unknown or not positive definite.
+
+    Parameters
+    ----------
+    errors
+        Shape (n, d).
+    covs
+        Shape (n, d, d).
+    """
+    squares = np.full(len(errors), np.nan)
+    known = np.isfinite(covs).all(axis=(1, 2)) & np.isfinite(errors).all(axis=1)
+    variances, axes = np.linalg.eigh(covs[known])
+    along = np.einsum("nji,nj->ni", axes, errors[known])
+    definite = variances[:, 0] > 0 if len(variances) else np.zeros(0, dtype=bool)
+    squares[np.flatnonzero(known)[definite]] = (along[definite] ** 2 / variances[definite]).sum(axis=1)
+    return squares
+
+
+def nis(log: DetectionLog) -> Floats:
+    """Normalised innovation squared of each detection that was used, shape (k,); 2 degrees of freedom.
+
+    The first sight of a landmark has no prediction and does not appear; what the gate refused does not either.
+    """
+    used = np.array([outcome is Outcome.USED for outcome in log.outcomes], dtype=bool)
+    squares = normalised_squares(log.innovations[used], log.innovation_covs[used])
+    return squares[np.isfinite(squares)]
+
+
+def mean_normalised(squares: Floats, dof: int) -> float:
+    """Mean over what is known, divided by the degrees of freedom: 1 is consistent, above it over-confident.
+
+    NaN when nothing is known.
+    """
+    known = squares[np.isfinite(squares)]
+    return float(known.mean() / dof) if known.size else float("nan")
+
+
+def anees_over_runs(nees: Floats, dof: int) -> Floats:
+    """Average over independent runs at each instant, divided by the degrees of freedom.
+
+    Parameters
+    ----------
+    nees
+        Shape (runs, n).
+
+    Returns
+    -------
+    Shape (n,); with consistent estimators each value lies in `anees_interval` with the probability given there.
+    """
+    return np.asarray(nees.mean(axis=0) / dof)
+
+
+def anees_interval(runs: int, dof: int, probability: float = 0.95) -> tuple[float, float]:
+    """Two-sided bounds of the ANEES of a consistent estimator, per degree of freedom.
+
+    The sum of the NEES of ``runs`` independent runs is chi-square with ``runs * dof`` degrees of freedom. Instants of
+    one run are not independent: these bounds do not hold for an average over time.
+    """
+    total = runs * dof
+    tail = (1 - probability) / 2
+    return float(chi2.ppf(tail, total) / total), float(chi2.ppf(1 - tail, total) / total)
+
+
+def _root(variances: Floats) -> Floats:
+    """Standard deviations; rounding below zero counts as zero."""
+    return np.asarray(np.sqrt(np.maximum(variances, 0.0)))

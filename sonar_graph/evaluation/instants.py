@@ -1,0 +1,82 @@
+"""At which instants estimators are scored: the same for all, and nothing dropped without being counted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sonar_graph.evaluation.results import RunResult
+from sonar_graph.measurements import Ints
+from sonar_graph.states import Trajectory
+
+TRUTH_GAP_S = 0.5
+"""Between truth samples further apart than this the truth is not interpolated (an occluded tracking system)."""
+GAP_TO_SPACING = 1.5
+"""... unless the truth is that sparse throughout: a gap is also this many times its median spacing."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredInstants:
+    """The instants that count, and how many of those asked for do not."""
+
+    stamps_ns: Ints
+    """Shape (n,)."""
+    asked: int
+    outside_truth: int
+    """Before the truth's first or after its last sample."""
+    in_truth_gap: int
+    gap_s: float
+    """What counts as a gap, seconds."""
+    not_estimated: int
+    """Of the rest, those at which some run that did not fail returned no estimate."""
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def __str__(self) -> str:
+        """The clause that protocols quote."""
+        left_out = (
+            (self.outside_truth, "outside the truth's time span"),
+            (self.in_truth_gap, f"in gaps of the truth longer than {self.gap_s:.2g} s"),
+            (self.not_estimated, "without an estimate from every estimator"),
+        )
+        reasons = ", ".join(f"{count} {why}" for count, why in left_out if count)
+        return f"{len(self)} of {self.asked} instants" + (f" (left out: {reasons})" if reasons else "")
+
+
+def scored_instants(asked_ns: Ints, truth: Trajectory, runs: list[RunResult]) -> ScoredInstants:
+    """Of the instants asked for, those with truth nearby and an estimate from each run that did not fail."""
+    inside = (asked_ns >= truth.stamps_ns[0]) & (asked_ns <= truth.stamps_ns[-1])
+    gap_s = gap_limit_s(truth)
+    covered = inside & ~_in_gap(asked_ns, truth, gap_s)
+    estimated = np.ones(len(asked_ns), dtype=bool)
+    for run in runs:
+        if run.causal is not None:
+            estimated &= np.isin(asked_ns, run.causal.stamps_ns)
+    return ScoredInstants(
+        stamps_ns=asked_ns[covered & estimated],
+        asked=len(asked_ns),
+        outside_truth=int((~inside).sum()),
+        in_truth_gap=int((inside & ~covered).sum()),
+        gap_s=gap_s,
+        not_estimated=int((covered & ~estimated).sum()),
+    )
+
+
+def gap_limit_s(truth: Trajectory) -> float:
+    """The distance between truth samples beyond which nothing is interpolated, seconds."""
+    spacing_s = np.diff(truth.stamps_ns) * 1e-9
+    return max(TRUTH_GAP_S, GAP_TO_SPACING * float(np.median(spacing_s))) if spacing_s.size else TRUTH_GAP_S
+
+
+def rows_at(trajectory: Trajectory, stamps_ns: Ints) -> Trajectory:
+    """The rows of a trajectory that has all of these stamps."""
+    return trajectory.rows(np.searchsorted(trajectory.stamps_ns, stamps_ns))
+
+
+def _in_gap(stamps_ns: Ints, truth: Trajectory, gap_s: float) -> np.ndarray:
+    """Which stamps lie strictly between two truth samples that are more than the gap apart."""
+    after = np.clip(np.searchsorted(truth.stamps_ns, stamps_ns, side="left"), 0, len(truth) - 1)
+    before = np.clip(np.searchsorted(truth.stamps_ns, stamps_ns, side="right") - 1, 0, len(truth) - 1)
+    return np.asarray((truth.stamps_ns[after] - truth.stamps_ns[before]) * 1e-9 > gap_s)

@@ -1,0 +1,163 @@
+"""Errors of trajectories and maps against the truth. Equations: docs/theory/metrics.md.
+
+Every function of two trajectories takes them at the same instants; `Trajectory.at` brings a truth there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.errors import EvaluationError
+from sonar_graph.evaluation.alignment import align_se3, align_yaw
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.sequence import NS_PER_S
+from sonar_graph.states import LandmarkMap, Trajectory
+
+PAIRING_TOLERANCE = 0.01
+"""A pair for the relative error may be this fraction of the delta longer or shorter than it."""
+
+
+def rmse(errors: Floats) -> float:
+    """Root of the mean squared norm of the rows: errors of shape (n,) or (n, d)."""
+    return float(np.sqrt(np.mean(np.square(errors)) * errors[0].size))
+
+
+def wrapped(angles_rad: Floats) -> Floats:
+    """Angles brought into [-pi, pi)."""
+    return np.asarray((angles_rad + np.pi) % (2 * np.pi) - np.pi)
+
+
+def yaw_rad(rotations: Rotation) -> Floats:
+    """Heading of the body's x axis, ``atan2(R[1, 0], R[0, 0])``, shape (n,)."""
+    matrices = rotations.as_matrix()
+    return np.asarray(np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0]))
+
+
+def ate_raw_m(estimate: Trajectory, truth: Trajectory) -> float:
+    """Absolute trajectory error: position rmse in three dimensions, both in the world of the start pose."""
+    check_paired(estimate, truth)
+    return rmse(estimate.positions - truth.positions)
+
+
+def ate_yaw_m(estimate: Trajectory, truth: Trajectory) -> float:
+    """Position rmse in three dimensions after the best rotation about the vertical and translation."""
+    check_paired(estimate, truth)
+    return rmse(align_yaw(estimate.positions, truth.positions).apply(estimate.positions) - truth.positions)
+
+
+def ate_se2_m(estimate: Trajectory, truth: Trajectory) -> float:
+    """Horizontal position rmse after the best SE(2) alignment."""
+    check_paired(estimate, truth)
+    return horizontal_aligned_rmse(estimate.positions, truth.positions)
+
+
+def ate_se3_m(estimate: Trajectory, truth: Trajectory) -> float:
+    """Position rmse in three dimensions after the best SE(3) alignment, without scale."""
+    check_paired(estimate, truth)
+    return rmse(align_se3(estimate.positions, truth.positions).apply(estimate.positions) - truth.positions)
+
+
+def yaw_errors_rad(estimate: Trajectory, truth: Trajectory) -> Floats:
+    """Estimated minus true heading, wrapped, shape (n,)."""
+    check_paired(estimate, truth)
+    return wrapped(yaw_rad(estimate.rotations()) - yaw_rad(truth.rotations()))
+
+
+def return_error_m(estimate: Trajectory, truth: Trajectory) -> float:
+    """Error of the displacement between the first and the last instant, in the world frame."""
+    check_paired(estimate, truth)
+    offset = estimate.positions - truth.positions
+    return float(np.linalg.norm(offset[-1] - offset[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeErrors:
+    """Errors of the motion between instants a fixed time apart, one row a pair; pairs overlap."""
+
+    translation_m: Floats
+    """Norm of the translation of ``(true motion)⁻¹ (estimated motion)``, shape (k,)."""
+    yaw_rad: Floats
+    """Estimated minus true change of heading, wrapped, shape (k,)."""
+
+    def __len__(self) -> int:
+        return len(self.yaw_rad)
+
+
+def relative_errors(estimate: Trajectory, truth: Trajectory, delta_s: float) -> RelativeErrors:
+    """Errors of the motion over ``delta_s`` from every instant that has a partner that much later.
+
+    The motion's translation is the displacement seen from the body at the pair's first instant, so that an error of
+    heading which is already there does not count again.
+    """
+    check_paired(estimate, truth)
+    first, second = pairs_apart(estimate.stamps_ns, delta_s)
+    error_m = _body_displacement(estimate, first, second) - _body_displacement(truth, first, second)
+    yaw_error = yaw_errors_rad(estimate, truth)
+    return RelativeErrors(np.linalg.norm(error_m, axis=1), wrapped(yaw_error[second] - yaw_error[first]))
+
+
+def pairs_apart(stamps_ns: Ints, delta_s: float) -> tuple[Ints, Ints]:
+    """Rows i and j with ``stamp[j] - stamp[i]`` nearest to ``delta_s`` and within one per cent of it."""
+    delta_ns = round(delta_s * NS_PER_S)
+    first = np.arange(len(stamps_ns))
+    wanted = stamps_ns + delta_ns
+    right = np.minimum(np.searchsorted(stamps_ns, wanted), len(stamps_ns) - 1)
+    left = np.maximum(right - 1, 0)
+    second = np.where(wanted - stamps_ns[left] < stamps_ns[right] - wanted, left, right)
+    near = np.abs(stamps_ns[second] - wanted) <= PAIRING_TOLERANCE * delta_ns
+    return first[near], second[near]
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkErrors:
+    """A map against the true one: landmarks that are in both, by identity."""
+
+    ids: Ints
+    """Shape (k,)."""
+    horizontal_m: Floats
+    """Estimate minus truth in x and y, not aligned, shape (k, 2)."""
+    horizontal_covs: Floats
+    """Reported covariance of the same, shape (k, 2, 2), m²."""
+    aligned_rmse_m: float
+    """Horizontal rmse after the SE(2) alignment of the map itself; NaN with fewer than two landmarks."""
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+def landmark_errors(estimated: LandmarkMap, true: LandmarkMap) -> LandmarkErrors:
+    """Compare two maps; landmarks in only one of them are left out."""
+    ids, rows, true_rows = np.intersect1d(estimated.ids, true.ids, return_indices=True)
+    points, targets = estimated.positions[rows], true.positions[true_rows]
+    aligned = horizontal_aligned_rmse(points, targets) if len(ids) >= 2 else float("nan")
+    return LandmarkErrors(ids, (points - targets)[:, :2], estimated.covariances[rows][:, :2, :2], aligned)
+
+
+def horizontal_aligned_rmse(points: Floats, targets: Floats) -> float:
+    """Rmse in x and y after the best SE(2) alignment of points of shape (n, 3)."""
+    return rmse((align_yaw(points, targets).apply(points) - targets)[:, :2])
+
+
+def check_paired(estimate: Trajectory, truth: Trajectory) -> None:
+    """Refuse trajectories that are not at the same instants, or empty.
+
+    Raises
+    ------
+    EvaluationError
+        Saying which.
+    """
+    if not len(estimate) or not np.array_equal(estimate.stamps_ns, truth.stamps_ns):
+        raise EvaluationError(
+            f"an error needs estimate and truth at the same instants, at least one; got {len(estimate)} and "
+            f"{len(truth)} rows: bring the truth to the estimate's with Trajectory.at"
+        )
+
+
+def _body_displacement(trajectory: Trajectory, first: Ints, second: Ints) -> Floats:
+    """Position at ``second`` in the body frame at ``first``, shape (k, 3)."""
+    step = trajectory.positions[second] - trajectory.positions[first]
+    matrices = trajectory.rotations().as_matrix()[first]
+    return np.asarray(np.einsum("kji,kj->ki", matrices, step))

@@ -1,0 +1,134 @@
+"""One estimator over one sequence: replayed, timed, checked. Its failure is a result with a reason."""
+
+from __future__ import annotations
+
+import textwrap
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from sonar_graph.calibration import Section
+from sonar_graph.errors import EstimatorError, UnknownEstimatorError
+from sonar_graph.estimator import Estimator, load_estimator, make_params
+from sonar_graph.evaluation.memory import PeakMemory
+from sonar_graph.evaluation.outcome import check_estimate, check_outcome
+from sonar_graph.evaluation.results import RunResult
+from sonar_graph.measurements import Ints, Measurements
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import Estimate, Trajectory
+
+REASON_WIDTH = 400
+"""Characters of a reason at most: one line that a table can hold."""
+
+
+def run_estimator(
+    sequence: Sequence,
+    name: str,
+    overrides: dict[str, Any] | None = None,
+    *,
+    instants_ns: Ints | None = None,
+    rate_hz: float = 2.0,
+    progress: Callable[[int, int], None] | None = None,
+) -> RunResult:
+    """Replay a sequence into an estimator and keep what it said, with the duration of each call.
+
+    The log is cut into steps before the clock starts; only calls of the estimator are timed, with everything that
+    these cause (a compilation at the first call, garbage collection).
+
+    Parameters
+    ----------
+    name
+        Under which the estimator is installed.
+    overrides
+        Settings that differ from the estimator's defaults.
+    instants_ns
+        When estimates are asked for, increasing; None: ``sequence.instants(rate_hz)``.
+    progress
+        Called after each step with the number of steps done and their total.
+
+    Returns
+    -------
+    A run whose status is ``failed`` when the estimator cannot be loaded, raises anything, or hands back what cannot be
+    scored (see `check_outcome`).
+
+    Raises
+    ------
+    UnknownEstimatorError
+        When no estimator has that name.
+    EstimatorError
+        When a setting does not exist or does not fit.
+    """
+    instants = sequence.instants(rate_hz) if instants_ns is None else instants_ns
+    try:
+        kind = load_estimator(name)
+    except UnknownEstimatorError:
+        raise
+    except EstimatorError as error:
+        return RunResult(name, dict(overrides or {}), "failed", one_line(error))
+    params = make_params(kind, overrides or {}, name)
+    return _Replay(sequence, list(sequence.replay(instants)), name, params).run(kind, progress)
+
+
+class _Replay:
+    """A run in progress: what has been said and how long it took."""
+
+    def __init__(self, sequence: Sequence, steps: list[Measurements], name: str, params: Section) -> None:
+        self._sequence = sequence
+        self._steps = steps
+        self._name = name
+        self._params = params
+        self._estimates: list[Estimate] = []
+        self._update_s: list[float] = []
+        self._stage = "at the start"
+
+    def run(self, kind: type[Estimator], progress: Callable[[int, int], None] | None) -> RunResult:
+        """Everything from construction to the final map."""
+        memory = PeakMemory()
+        try:
+            estimator = kind(self._sequence.calibration, self._params)
+            self._process(estimator, progress)
+            return self._finish(estimator, memory)
+        except Exception as error:  # a third party's estimator may fail in any way, and the others still run
+            return self._result("failed", f"{self._stage}: {one_line(error)}", peak_memory_mb=memory.rise_mb())
+
+    def _process(self, estimator: Estimator, progress: Callable[[int, int], None] | None) -> None:
+        for done, step in enumerate(self._steps, start=1):
+            self._stage = f"{(step.end_ns - self._sequence.start_ns) * 1e-9:.3f} s after the start ({step.end_ns} ns)"
+            before = time.perf_counter()
+            estimate = estimator.process(step)
+            self._update_s.append(time.perf_counter() - before)
+            check_estimate(estimate, step.end_ns)
+            if estimate is not None:
+                self._estimates.append(estimate)
+            if progress:
+                progress(done, len(self._steps))
+
+    def _finish(self, estimator: Estimator, memory: PeakMemory) -> RunResult:
+        self._stage = "at the end, asked for trajectory and map"
+        before = time.perf_counter()
+        smoothed, landmarks = estimator.trajectory(), estimator.landmarks()
+        finish_s = time.perf_counter() - before
+        peak_memory_mb, detections = memory.rise_mb(), estimator.detections()
+        self._stage = "at the end, outcome checked"
+        causal = Trajectory.from_estimates(self._estimates)
+        check_outcome(causal, smoothed, landmarks)
+        return self._result(
+            "ok",
+            causal=causal,
+            smoothed=smoothed,
+            landmarks=landmarks,
+            detections=detections,
+            finish_s=finish_s,
+            peak_memory_mb=peak_memory_mb,
+        )
+
+    def _result(self, status: Any, reason: str = "", **outcome: Any) -> RunResult:
+        params = self._params.model_dump(mode="json")
+        return RunResult(self._name, params, status, reason, update_s=np.array(self._update_s), **outcome)
+
+
+def one_line(error: Exception) -> str:
+    """The exception's type and message without line breaks."""
+    return textwrap.shorten(f"{type(error).__name__}: {error}", REASON_WIDTH, placeholder=" ...")

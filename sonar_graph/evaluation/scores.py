@@ -1,0 +1,203 @@
+"""Scores of one run: each a value with its unit and the sentence that says how it was got."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sonar_graph.evaluation.consistency import anees_interval, mean_normalised, nis, normalised_squares
+from sonar_graph.evaluation.metrics import (
+    ate_raw_m,
+    ate_se2_m,
+    ate_se3_m,
+    ate_yaw_m,
+    landmark_errors,
+    relative_errors,
+    return_error_m,
+    rmse,
+    yaw_errors_rad,
+)
+from sonar_graph.evaluation.results import ErrorSeries, Kind, RunResult, Score
+from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Trajectory
+
+RELATIVE_DELTAS_S = (1, 10)
+"""Time differences of the relative error."""
+ESTIMATES: dict[str, str] = {
+    "causal": "Causal estimate (what could be known at each instant)",
+    "smoothed": "Smoothed estimate (what is known at the end about each instant)",
+}
+IN_TIME = "instants of one run are correlated, so no band is given for their average"
+
+
+def trajectory_scores(
+    kind: Kind, estimate: Trajectory, truth: Trajectory, errors: ErrorSeries, instants: str
+) -> dict[str, Score]:
+    """Accuracy and consistency of one trajectory, under keys that begin with its kind.
+
+    Parameters
+    ----------
+    estimate, truth
+        At the scored instants.
+    errors
+        Of the same two.
+    instants
+        Which instants these are, for the protocols.
+    """
+    over = f"over {instants}; truth interpolated linearly"
+    scores = _absolute(estimate, truth, ESTIMATES[kind], over)
+    scores |= _relative(estimate, truth, ESTIMATES[kind], over)
+    scores |= _consistency(errors, ESTIMATES[kind], over)
+    return {f"{kind}.{key}": score for key, score in scores.items()}
+
+
+def _absolute(estimate: Trajectory, truth: Trajectory, which: str, over: str) -> dict[str, Score]:
+    yaw_rmse = rmse(yaw_errors_rad(estimate, truth))
+    fitted = "without scale (Umeyama 1991), fitted to these instants"
+    return {
+        "ate_raw_m": Score(ate_raw_m(estimate, truth), "m", f"{which}, not aligned: rms of 3-D position error {over}."),
+        "ate_yaw_m": Score(
+            ate_yaw_m(estimate, truth),
+            "m",
+            f"{which}, aligned by yaw and translation {fitted}: rms of 3-D position error {over}.",
+        ),
+        "ate_se2_m": Score(
+            ate_se2_m(estimate, truth),
+            "m",
+            f"{which}, aligned by SE(2) {fitted}: rms of horizontal position error {over}.",
+        ),
+        "ate_se3_m": Score(
+            ate_se3_m(estimate, truth),
+            "m",
+            f"{which}, aligned by SE(3) {fitted}: rms of 3-D position error {over}.",
+        ),
+        "yaw_rmse_rad": Score(yaw_rmse, "rad", f"{which}, not aligned: rms of wrapped heading error {over}."),
+        "return_error_m": Score(
+            return_error_m(estimate, truth),
+            "m",
+            f"{which}, not aligned: norm of estimated minus true displacement from the first to the last of {over}.",
+        ),
+    }
+
+
+def _relative(estimate: Trajectory, truth: Trajectory, which: str, over: str) -> dict[str, Score]:
+    """Relative errors for each time difference at which there are pairs."""
+    scores: dict[str, Score] = {}
+    for delta_s in RELATIVE_DELTAS_S:
+        relative = relative_errors(estimate, truth, delta_s)
+        if not len(relative):
+            continue
+        pairs = f"over {len(relative)} overlapping pairs {delta_s} s apart, {over}"
+        scores[f"rpe_{delta_s}s_m"] = Score(
+            rmse(relative.translation_m), "m", f"{which}: rms of the error of body-frame displacement {pairs}."
+        )
+        scores[f"rpe_{delta_s}s_rad"] = Score(
+            rmse(relative.yaw_rad), "rad", f"{which}: rms of the error of heading change {pairs}."
+        )
+    return scores
+
+
+def _consistency(errors: ErrorSeries, which: str, over: str) -> dict[str, Score]:
+    """Average NEES per degree of freedom, where covariances were reported."""
+    axes = "x and y" if errors.position_dof == 2 else "x, y and z"
+    parts = (
+        ("nees_position", errors.nees_position, errors.position_dof, f"position ({axes})"),
+        ("nees_yaw", errors.nees_yaw, 1, "heading"),
+    )
+    scores = {}
+    for key, nees, dof, what in parts:
+        known = int(np.isfinite(nees).sum())
+        protocol = (
+            f"{which}, not aligned: mean over the {known} instants with a covariance of the normalised squared "
+            f"error of {what}, divided by {dof}; 1 is consistent, above is over-confident; {IN_TIME}; {over}."
+        )
+        scores[key] = Score(mean_normalised(nees, dof), "1", protocol, better="inside")
+    return _finite(scores)
+
+
+def landmark_scores(estimated: LandmarkMap, true: LandmarkMap | None) -> dict[str, Score]:
+    """The final map against the true one, where there is one."""
+    count = Score(float(len(estimated)), "1", "Landmarks in the map at the end.", better="none")
+    if true is None:
+        return {"landmarks.count": count}
+    errors = landmark_errors(estimated, true)
+    if not len(errors):
+        return {"landmarks.count": count}
+    which = (
+        f"Map at the end, {len(errors)} landmarks matched by identity ({len(true)} true, {len(estimated)} estimated)"
+    )
+    nees = normalised_squares(errors.horizontal_m, errors.horizontal_covs)
+    scores = {
+        "landmarks.raw_m": Score(rmse(errors.horizontal_m), "m", f"{which}, not aligned: rms of horizontal error."),
+        "landmarks.se2_m": Score(
+            errors.aligned_rmse_m,
+            "m",
+            f"{which}, aligned by SE(2) without scale fitted to the landmarks: rms of horizontal error.",
+        ),
+        "landmarks.count": count,
+        "landmarks.nees": Score(
+            mean_normalised(nees, 2),
+            "1",
+            f"{which}, not aligned: mean normalised squared horizontal error divided by 2; 1 is consistent; landmarks "
+            "of one map are correlated, so no band is given.",
+            better="inside",
+        ),
+    }
+    return _finite(scores)
+
+
+def detection_scores(log: DetectionLog) -> dict[str, Score]:
+    """What became of the detections, and whether innovations fit their covariances."""
+    new = sum(outcome is Outcome.NEW for outcome in log.outcomes)
+    used = sum(outcome is Outcome.USED for outcome in log.outcomes) + new
+    scores = {
+        "detections.used": Score(
+            float(used), "1", f"Detections used, of {len(log)}; {new} of these began a landmark.", better="none"
+        ),
+        "detections.refused": Score(
+            float(len(log) - used), "1", f"Detections refused for any reason, of {len(log)}.", better="none"
+        ),
+    }
+    squares = nis(log)
+    if squares.size:
+        scores["detections.nis"] = Score(
+            mean_normalised(squares, 2),
+            "1",
+            f"Mean normalised squared innovation of {squares.size} detections used, divided by 2; 1 is consistent; the "
+            "two-sided 95 % band takes innovations as independent; what a gate refused is not in it, which lowers it.",
+            anees_interval(squares.size, 2),
+            "inside",
+        )
+    return scores
+
+
+def resource_scores(run: RunResult, log_s: float) -> dict[str, Score]:
+    """Time and memory of one run over a log of this duration in seconds."""
+    calls = f"over {len(run.update_s)} calls of process, one per instant, each with all measurements since the last"
+    total_s = float(run.update_s.sum() + run.finish_s)
+    ms = run.update_s * 1e3
+    scores = {
+        "time.update_median_ms": Score(float(np.median(ms)), "ms", f"Median wall-clock time {calls}."),
+        "time.update_p99_ms": Score(float(np.quantile(ms, 0.99)), "ms", f"99th percentile of wall-clock time {calls}."),
+        "time.update_max_ms": Score(
+            float(ms.max()), "ms", f"Longest wall-clock time {calls}; the first may include compilation."
+        ),
+        "time.total_s": Score(
+            total_s, "s", "Wall-clock time of all calls of process and of asking for trajectory and map at the end."
+        ),
+        "time.real_time_factor": Score(
+            log_s / total_s, "1", f"Duration of the log ({log_s:.1f} s) divided by time.total_s.", better="higher"
+        ),
+        "memory.peak_mb": Score(
+            run.peak_memory_mb,
+            "MB",
+            "Highest resident memory of the process during the run above that at its start (Linux); memory freed by "
+            "earlier runs is reused without being counted.",
+        ),
+    }
+    return _finite(scores)
+
+
+def _finite(scores: dict[str, Score]) -> dict[str, Score]:
+    """Without those that could not be determined."""
+    return {key: score for key, score in scores.items() if math.isfinite(score.value)}
