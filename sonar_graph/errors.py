@@ -5,6 +5,7 @@
     SonarGraphError
     ├── MeasurementError        a block of measurements breaks its own rules
     ├── CalibrationError        a calibration is missing or impossible
+    ├── SimulationError         a simulated run is asked for that cannot be made
     ├── LogError                a file cannot be read as what it should be
     │   ├── MissingTopicError   ... because a needed topic is not in it
     │   └── DatasetError        ... because a data set's folder or file is not what a converter expects
@@ -27,6 +28,10 @@ class MeasurementError(SonarGraphError):
 
 class CalibrationError(SonarGraphError):
     """A calibration is missing or impossible."""
+
+
+class SimulationError(SonarGraphError):
+    """A simulated run is asked for that cannot be made."""
 
 
 class LogError(SonarGraphError):

@@ -1,0 +1,111 @@
+"""A long mission with wide sonar views of the same landmarks: work for estimators, rather than an experiment.
+
+The vehicle goes round a closed, three-lobed loop again and again at a constant speed, 2 m over a flat floor; its
+forward-looking sonar sees up to ten landmarks at a time.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from pydantic import Field
+
+from sonar_graph.calibration import Mounting
+from sonar_graph.measurements import Floats
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.detections import Fan
+from sonar_graph.simulation.options import SimulationOptions
+from sonar_graph.simulation.recording import Streams, Vehicle, record
+from sonar_graph.simulation.vehicle import VehiclePath, smooth_noise
+from sonar_graph.simulation.world import world_on_floor
+
+FLOOR_Z_M = -5.0
+BODY_Z_M = -3.0
+LOOP_RADIUS_M = 6.0
+LOBE_M = 1.2
+LOBES = 3
+FIELD_RADIUS_M = 11.0
+KNOT_S = 0.5
+GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
+
+NOTES = {"ours": "everything: a synthetic mission", "truth": "exact: a quintic spline"}
+
+
+class MissionOptions(SimulationOptions):
+    """What can be chosen about the mission."""
+
+    duration_s: float = Field(2040.0, gt=5)
+    """Of the whole run."""
+    speed_m_s: float = Field(0.5, gt=0, le=1.0)
+    """Along the loop of about 40 m."""
+    landmarks: int = Field(12, ge=1, le=500)
+    """How many lie on the floor, spread evenly over a disc of 22 m."""
+    frame_rate_hz: float = Field(2.0, gt=0, le=30)
+    """Sonar frames a second."""
+    azimuth_aperture_rad: float = Field(math.radians(130), gt=0, lt=math.pi)
+    """Full horizontal opening of the sonar."""
+    elevation_aperture_rad: float = Field(math.radians(20), gt=0, lt=math.pi)
+    """Full vertical opening."""
+    range_max_m: float = Field(15.0, gt=0.5)
+    """The farthest it sees; the nearest is 0.5 m."""
+
+
+def simulate_mission(options: MissionOptions | None = None) -> Sequence:
+    """The mission with exact truth.
+
+    Parameters
+    ----------
+    options
+        None: 34 minutes with 12 landmarks.
+    """
+    options = options or MissionOptions()
+    streams = Streams.of(options.seed)
+    world = world_on_floor(_landmarks_xy(options.landmarks), FLOOR_Z_M, options.floor_sigma_m, streams.world)
+    path = _path(options, streams.path)
+    return record("mission", options, _vehicle(options), path, world, streams, NOTES)
+
+
+def _vehicle(options: MissionOptions) -> Vehicle:
+    """A survey vehicle with a wide sonar tilted 10° down."""
+    return Vehicle(
+        sonar=Mounting(translation_m=(0.40, 0.0, -0.05), rpy_rad=(0.0, math.radians(10), 0.0)),
+        fan=Fan(0.5, options.range_max_m, options.azimuth_aperture_rad / 2, options.elevation_aperture_rad / 2),
+        dvl=Mounting(translation_m=(-0.20, 0.0, -0.15)),
+        depth_port_m=(0.10, 0.05, 0.10),
+    )
+
+
+def _landmarks_xy(count: int) -> Floats:
+    """Evenly over a disc, without rows: the sunflower's spiral, shape (count, 2)."""
+    index = np.arange(count)
+    radius = FIELD_RADIUS_M * np.sqrt((index + 0.5) / count)
+    angle = GOLDEN_ANGLE_RAD * index
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+
+
+def _path(options: MissionOptions, rng: np.random.Generator) -> VehiclePath:
+    """Round the loop, heading along it, with a little wobble."""
+    seconds = np.linspace(0, options.duration_s, math.ceil(options.duration_s / KNOT_S) + 1)
+    xy, heading = _loop(options.speed_m_s * seconds)
+    level = np.zeros_like(seconds)
+    intended = np.column_stack([xy, level + BODY_Z_M, level, level, heading])
+    position = smooth_noise(seconds, np.array([0.05, 0.05, 0.04]), 8.0, 3, rng)
+    attitude = smooth_noise(seconds, np.radians([1.8, 1.8, 2.0]), 4.0, 3, rng)
+    return VehiclePath.through(seconds, intended + np.column_stack([position, attitude]))
+
+
+def _loop(travelled_m: Floats) -> tuple[Floats, Floats]:
+    """Position (n, 2) and unwrapped heading (n,) after some distance on the loop r = 6 m + 1.2 m cos(3 angle)."""
+    fine = np.linspace(0, 2 * math.pi, 20_001)
+    along_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(_loop_xy(fine), axis=0).T))])
+    laps, rest_m = np.divmod(travelled_m, along_m[-1])
+    angle = np.interp(rest_m, along_m, fine) + 2 * math.pi * laps
+    ahead = _loop_xy(angle + 1e-4) - _loop_xy(angle - 1e-4)
+    return _loop_xy(angle), np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+
+
+def _loop_xy(angle: Floats) -> Floats:
+    """The loop by its polar angle, shape (n, 2)."""
+    radius = LOOP_RADIUS_M + LOBE_M * np.cos(LOBES * angle)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])

@@ -1,0 +1,178 @@
+"""Everything that sensors record along a true path, as a `Sequence`.
+
+Each sensor draws from a random stream of its own, so that changing one (the sonar's frame rate, say) leaves the noise
+of all others as it was.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sonar_graph import __version__
+from sonar_graph.calibration import (
+    Calibration,
+    DepthCalibration,
+    DvlCalibration,
+    FloorPrior,
+    ImuCalibration,
+    Mounting,
+    SonarCalibration,
+    Start,
+)
+from sonar_graph.measurements import Floats
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.detections import Fan, Recogniser, simulate_detections
+from sonar_graph.simulation.options import SimulationOptions
+from sonar_graph.simulation.presets import DEPTH_RATE_HZ, DVL_PRESETS, IMU_PRESETS, IMU_RATE_HZ
+from sonar_graph.simulation.sensors import (
+    DvlFaults,
+    regular_stamps,
+    seconds_since_start,
+    simulate_depth,
+    simulate_dvl,
+    simulate_imu,
+)
+from sonar_graph.simulation.vehicle import VehiclePath, rpy_from_rotation
+from sonar_graph.simulation.world import World
+from sonar_graph.states import Trajectory
+
+TRUTH_RATE_HZ = 50.0
+SONAR_OFFSET_S = 0.0371
+"""First sonar frame; not a multiple of any other sensor's period."""
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """Where the sensors sit, and what the sonar sees."""
+
+    sonar: Mounting
+    fan: Fan
+    dvl: Mounting
+    depth_port_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Streams:
+    """Independent random generators, one for each purpose, all from one seed."""
+
+    path: np.random.Generator
+    world: np.random.Generator
+    start: np.random.Generator
+    imu: np.random.Generator
+    dvl: np.random.Generator
+    depth: np.random.Generator
+    sonar: np.random.Generator
+
+    @classmethod
+    def of(cls, seed: int) -> Streams:
+        """The streams of a seed."""
+        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(7)))
+
+
+def record(
+    name: str,
+    options: SimulationOptions,
+    vehicle: Vehicle,
+    path: VehiclePath,
+    world: World,
+    streams: Streams,
+    notes: dict[str, str],
+) -> Sequence:
+    """All measurements along a path, with the truth and the calibration that describes them truly.
+
+    Parameters
+    ----------
+    name
+        Of the sequence.
+    options
+        Sensors and faults.
+    vehicle
+        Mountings and the sonar's fan.
+    path, world
+        The truth.
+    streams
+        Source of everything random.
+    notes
+        Provenance to add to generator and options.
+    """
+    calibration = _calibration(options, vehicle, path, world, streams.start)
+    rates_hz = IMU_RATE_HZ, DVL_PRESETS[options.dvl].rate_hz, DEPTH_RATE_HZ, TRUTH_RATE_HZ
+    imu_ns, dvl_ns, depth_ns, truth_ns = (regular_stamps(rate, path.duration_s) for rate in rates_hz)
+    frames_ns = regular_stamps(options.frame_rate_hz, path.duration_s, SONAR_OFFSET_S)
+    truth = path.at(seconds_since_start(truth_ns))
+    faults = DvlFaults(options.dvl_scale_error, options.dvl_dropouts_per_hour, options.dvl_dropout_s)
+    recogniser = Recogniser(
+        options.detection_probability,
+        options.wrong_id_rate,
+        options.false_detections_per_frame,
+        options.confident_false_fraction,
+    )
+    return Sequence(
+        name=name,
+        calibration=calibration,
+        imu=simulate_imu(path, imu_ns, calibration.imu, calibration.gravity_m_s2, streams.imu),
+        dvl=simulate_dvl(path, dvl_ns, calibration.dvl, faults, streams.dvl),
+        depth=simulate_depth(path, depth_ns, calibration.depth, streams.depth),
+        detections=simulate_detections(
+            path, frames_ns, calibration.sonar, vehicle.fan, recogniser, world, streams.sonar
+        ),
+        truth=Trajectory.without_covariances(truth_ns, truth.position, truth.world_R_body.as_quat()),
+        true_landmarks=world.landmark_map(),
+        notes={"generator": f"sonar_graph {__version__}, {name}", "options": options.model_dump_json(), **notes},
+    )
+
+
+def _calibration(
+    options: SimulationOptions, vehicle: Vehicle, path: VehiclePath, world: World, rng: np.random.Generator
+) -> Calibration:
+    """What estimators are told: the very noise that is simulated, and a start drawn about the true one."""
+    sigma_m_s = DVL_PRESETS[options.dvl].velocity_sigma_m_s
+    return Calibration(
+        imu=scaled_imu(options),
+        dvl=DvlCalibration(velocity_sigma_m_s=(sigma_m_s,) * 3, mounting=vehicle.dvl),
+        depth=DepthCalibration(sigma_m=0.01, port_m=vehicle.depth_port_m),
+        sonar=SonarCalibration(
+            mounting=vehicle.sonar,
+            range_sigma_m=options.range_sigma_m,
+            azimuth_sigma_rad=options.azimuth_sigma_rad,
+            elevation_aperture_rad=2 * vehicle.fan.elevation_half_rad,
+        ),
+        start=_drawn_start(path, options.start_position_sigma_m, options.start_rotation_sigma_rad, rng),
+        floor=FloorPrior(z_m=world.floor_z_m, sigma_m=options.floor_sigma_m),
+    )
+
+
+def scaled_imu(options: SimulationOptions) -> ImuCalibration:
+    """The IMU preset with its biases scaled."""
+    preset = IMU_PRESETS[options.imu]
+    return preset.model_copy(
+        update={
+            "gyro_bias_sigma": preset.gyro_bias_sigma * options.gyro_bias_scale,
+            "gyro_bias_walk_density": preset.gyro_bias_walk_density * options.gyro_bias_scale,
+            "accel_bias_sigma": preset.accel_bias_sigma * options.accel_bias_scale,
+        }
+    )
+
+
+def _drawn_start(
+    path: VehiclePath, position_sigma_m: float, rotation_sigma_rad: float, rng: np.random.Generator
+) -> Start:
+    """A prior whose mean is drawn about the truth: its error is as large as it says."""
+    true = path.at(np.zeros(1))
+    position = true.position[0] + position_sigma_m * rng.standard_normal(3)
+    rotation = true.world_R_body[0] * Rotation.from_rotvec(rotation_sigma_rad * rng.standard_normal(3))
+    return Start(
+        position_m=_vector(position),
+        rpy_rad=_vector(rpy_from_rotation(rotation)),
+        position_sigma_m=(position_sigma_m,) * 3,
+        rpy_sigma_rad=(rotation_sigma_rad,) * 3,
+    )
+
+
+def _vector(values: Floats) -> tuple[float, float, float]:
+    """Plain numbers for a calibration."""
+    x, y, z = values.tolist()
+    return x, y, z

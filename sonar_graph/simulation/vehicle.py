@@ -1,0 +1,132 @@
+"""True motion: one smooth curve through pose samples, with exact derivatives at any time.
+
+Position and attitude (x, y, z, roll, pitch, yaw) are a quintic spline of time. All that a sensor feels follows from
+its derivatives in closed form, so that the noise-free measurements of a run are exact, not integrated.
+With ``world_R_body = Rz(yaw) Ry(pitch) Rx(roll)`` the body's angular velocity is linear in the angle rates::
+
+    omega = ( roll' - yaw' sin(pitch),
+              pitch' cos(roll) + yaw' sin(roll) cos(pitch),
+             -pitch' sin(roll) + yaw' cos(roll) cos(pitch) )
+
+and its angular acceleration is the time derivative of that (Diebel, "Representing Attitude", 2006, section 5.6).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.measurements import Floats
+
+DEGREE = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Kinematics:
+    """The body's motion at n instants."""
+
+    position: Floats
+    """Origin of the body in the world, shape (n, 3), m."""
+    velocity: Floats
+    """Of that origin, in the world, shape (n, 3), m/s."""
+    acceleration: Floats
+    """Of that origin, in the world, shape (n, 3), m/s²."""
+    world_R_body: Rotation
+    """n rotations."""
+    angular_velocity: Floats
+    """Of the body against the world, in the body frame, shape (n, 3), rad/s."""
+    angular_acceleration: Floats
+    """Time derivative of `angular_velocity`, shape (n, 3), rad/s²."""
+
+
+@dataclass(frozen=True, eq=False)
+class VehiclePath:
+    """True pose over time."""
+
+    spline: BSpline
+    """(x, y, z, roll, pitch, yaw) over seconds since the start; metres and radians, yaw unwrapped."""
+    duration_s: float
+
+    @classmethod
+    def through(cls, seconds: Floats, poses: Floats) -> VehiclePath:
+        """The quintic spline through poses (x, y, z, roll, pitch, yaw), shape (n, 6), at increasing times."""
+        return cls(make_interp_spline(seconds, poses, k=DEGREE), float(seconds[-1]))
+
+    def at(self, seconds: Floats) -> Kinematics:
+        """Motion at any instants from 0 to ``duration_s``, shape (n,), seconds since the start."""
+        pose, rate, change = (self.spline(seconds, nu=order) for order in range(3))
+        angular_velocity, angular_acceleration = _angular_motion(pose[:, 3:], rate[:, 3:], change[:, 3:])
+        return Kinematics(
+            position=pose[:, :3],
+            velocity=rate[:, :3],
+            acceleration=change[:, :3],
+            world_R_body=rotation_from_rpy(pose[:, 3:]),
+            angular_velocity=angular_velocity,
+            angular_acceleration=angular_acceleration,
+        )
+
+
+def rotation_from_rpy(rpy_rad: Floats) -> Rotation:
+    """Rz(yaw) Ry(pitch) Rx(roll) of angles (roll, pitch, yaw) in the last axis."""
+    return Rotation.from_euler("ZYX", np.asarray(rpy_rad)[..., ::-1])
+
+
+def rpy_from_rotation(rotation: Rotation) -> Floats:
+    """The angles (roll, pitch, yaw) of `rotation_from_rpy`, in the last axis."""
+    return rotation.as_euler("ZYX")[..., ::-1]
+
+
+def smooth_noise(
+    seconds: Floats, sigma: float | Floats, interval_s: float, columns: int, rng: np.random.Generator
+) -> Floats:
+    """Random smooth wandering: quintic B-splines with independent normal coefficients every ``interval_s``.
+
+    Parameters
+    ----------
+    seconds
+        Instants from 0 on, shape (n,).
+    sigma
+        Standard deviation of the coefficients, for all columns or each; the curve's own is about 0.66 of it.
+    interval_s
+        Time between coefficients: the shorter, the livelier.
+    columns
+        Number of independent curves.
+    rng
+        Source of the coefficients.
+
+    Returns
+    -------
+    Floats
+        Shape (n, columns).
+    """
+    spans = int(np.ceil(seconds[-1] / interval_s)) + 1
+    knots = interval_s * np.arange(-DEGREE, spans + DEGREE + 1)
+    coefficients = sigma * rng.standard_normal((spans + DEGREE, columns))
+    wandering: Floats = BSpline(knots, coefficients, DEGREE)(seconds)
+    return wandering
+
+
+def _angular_motion(rpy: Floats, rate: Floats, change: Floats) -> tuple[Floats, Floats]:
+    """Angular velocity and acceleration in the body frame from angles and their two time derivatives."""
+    (sin_r, sin_p, _), (cos_r, cos_p, _) = np.sin(rpy).T, np.cos(rpy).T
+    (roll, pitch, yaw), (roll2, pitch2, yaw2) = rate.T, change.T
+    velocity = (
+        roll - yaw * sin_p,
+        pitch * cos_r + yaw * sin_r * cos_p,
+        -pitch * sin_r + yaw * cos_r * cos_p,
+    )
+    acceleration = (
+        roll2 - yaw2 * sin_p - yaw * pitch * cos_p,
+        pitch2 * cos_r
+        - pitch * roll * sin_r
+        + yaw2 * sin_r * cos_p
+        + yaw * (roll * cos_r * cos_p - pitch * sin_r * sin_p),
+        -pitch2 * sin_r
+        - pitch * roll * cos_r
+        + yaw2 * cos_r * cos_p
+        - yaw * (roll * sin_r * cos_p + pitch * cos_r * sin_p),
+    )
+    return np.column_stack(velocity), np.column_stack(acceleration)
