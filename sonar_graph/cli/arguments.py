@@ -1,0 +1,31 @@
+"""Arguments and options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+LogPath = Annotated[
+    Path, typer.Argument(metavar="LOG", exists=True, dir_okay=False, readable=True, help="MCAP log to read.")
+]
+OutputLog = Annotated[Path, typer.Option("--output", "-o", metavar="OUT.mcap", help="MCAP log to write.")]
+OutputFolder = Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write to.")]
+CalibrationPath = Annotated[
+    Path | None,
+    typer.Option(
+        "--calibration",
+        metavar="FILE",
+        exists=True,
+        dir_okay=False,
+        help="TOML or JSON file with the calibration; replaces the one in the log.",
+    ),
+]
+RateHz = Annotated[
+    float, typer.Option("--rate-hz", min=1e-3, help="How often every estimator is asked for its estimate.")
+]
+EstimatorSettings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME.SETTING=VALUE", help="Change a setting of an estimator; may be repeated."),
+]

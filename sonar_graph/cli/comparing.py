@@ -1,0 +1,174 @@
+"""``sonar-graph run``, ``compare``, ``report`` and ``demo``: from a log to a side-by-side report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from sonar_graph.cli.arguments import CalibrationPath, EstimatorSettings, LogPath, OutputFolder, RateHz
+from sonar_graph.cli.outputs import writable_folder
+from sonar_graph.cli.progress import progress_bars, working
+from sonar_graph.cli.settings import estimator_settings, read_calibration
+from sonar_graph.cli.texts import plural
+from sonar_graph.errors import EstimatorError, UnknownEstimatorError
+
+if TYPE_CHECKING:
+    from sonar_graph.evaluation.results import Comparison
+    from sonar_graph.sequence import Sequence
+
+DEFAULT_ESTIMATORS = "isam2,ekf-slam,dead-reckoning"
+DEFAULT_RATE_HZ = 2.0
+DEMO_DURATION_S = 300.0
+
+
+def run(
+    log: LogPath,
+    output: OutputFolder,
+    estimator: Annotated[str, typer.Option("--estimator", help="Name of an installed estimator.")] = "isam2",
+    rate_hz: RateHz = DEFAULT_RATE_HZ,
+    settings: EstimatorSettings = None,
+    calibration: CalibrationPath = None,
+) -> None:
+    """Run one estimator on a log; write its trajectories, landmarks and scores."""
+    comparison = _compare_log(log, output, [estimator], rate_hz, settings, calibration)
+    _print_summary(comparison)
+    typer.echo(f"Results: {output}")
+    _exit_by(comparison)
+
+
+def compare(
+    log: LogPath,
+    output: OutputFolder,
+    estimators: Annotated[str, typer.Option(help="Names of installed estimators, with commas.")] = DEFAULT_ESTIMATORS,
+    rate_hz: RateHz = DEFAULT_RATE_HZ,
+    settings: EstimatorSettings = None,
+    calibration: CalibrationPath = None,
+) -> None:
+    """Run several estimators on the same measurements and write a report on how they compare.
+
+    Writes report.html, comparison.json, result.mcap for a viewer, and runs/NAME/ with each estimator's trajectories.
+    """
+    comparison = _compare_log(log, output, _estimator_names(estimators), rate_hz, settings, calibration)
+    page = _write_report(comparison, output)
+    _print_summary(comparison)
+    typer.echo(f"Report: {page}")
+    _exit_by(comparison)
+
+
+def report(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that compare or run wrote.")
+    ],
+) -> None:
+    """Write report.html anew from what compare or run left in a folder."""
+    from sonar_graph.evaluation.storage import read_comparison
+
+    comparison = read_comparison(folder)
+    typer.echo(f"Report: {_write_report(comparison, writable_folder(folder))}")
+
+
+def demo(output: OutputFolder = Path("demo")) -> None:
+    """Simulate a few minutes in a basin, compare the three estimators that come along, and write the report."""
+    from sonar_graph.logs.writing import write_sequence
+    from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+
+    log = writable_folder(output) / "basin.mcap"
+    with working("simulating"):
+        write_sequence(log, simulate_basin(BasinOptions(duration_s=DEMO_DURATION_S, laps=1)))
+    compare(log, output)
+
+
+def _estimator_names(text: str) -> list[str]:
+    """Names from a list with commas, each once, in order.
+
+    Raises
+    ------
+    EstimatorError
+        When there is none.
+    """
+    names = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    if not names:
+        raise EstimatorError(f"--estimators {text!r}: expected names such as {DEFAULT_ESTIMATORS}")
+    return names
+
+
+def _compare_log(
+    log: Path,
+    output: Path,
+    names: list[str],
+    rate_hz: float,
+    settings: list[str] | None,
+    calibration_path: Path | None,
+) -> Comparison:
+    from sonar_graph.evaluation.comparison import compare as compare_runs
+    from sonar_graph.logs.reading import read_sequence
+
+    overrides = estimator_settings(settings or [], names)
+    _check_settings(names, overrides)
+    calibration = read_calibration(calibration_path)
+    writable_folder(output)
+    with working(f"reading {log.name}"):
+        sequence = read_sequence(log, calibration=calibration)
+    with progress_bars() as progress:
+        comparison = compare_runs(sequence, names, overrides, rate_hz=rate_hz, progress=progress)
+    _write_results(comparison, sequence, output)
+    return comparison
+
+
+def _check_settings(names: list[str], overrides: dict[str, dict[str, Any]]) -> None:
+    """Refuse unknown names and settings before the log is read.
+
+    An estimator that cannot be loaded is no mistake of the user's: its run fails, and the others go on.
+    """
+    from sonar_graph.estimator import load_estimator, make_params
+
+    for name in names:
+        try:
+            estimator = load_estimator(name)
+        except UnknownEstimatorError:
+            raise
+        except EstimatorError:
+            continue
+        make_params(estimator, overrides.get(name, {}), name)
+
+
+def _write_results(comparison: Comparison, sequence: Sequence, folder: Path) -> None:
+    from sonar_graph.evaluation.storage import write_comparison
+    from sonar_graph.logs.result_log import write_result
+
+    estimates = {
+        run.estimator: (run.causal, run.smoothed, run.landmarks)
+        for run in comparison.runs
+        if run.causal is not None and run.smoothed is not None and run.landmarks is not None
+    }
+    with working("writing results"):
+        write_comparison(comparison, folder)
+        write_result(folder / "result.mcap", sequence, estimates)
+
+
+def _write_report(comparison: Comparison, folder: Path) -> Path:
+    from sonar_graph.evaluation.report import write_report
+
+    page = folder / "report.html"
+    with working("drawing"):
+        write_report(comparison, page)
+    return page
+
+
+def _print_summary(comparison: Comparison) -> None:
+    from sonar_graph.evaluation.console import summary_table
+
+    Console().print(summary_table(comparison))
+
+
+def _exit_by(comparison: Comparison) -> None:
+    """Exit with 1 when a run failed, naming it; everything is written by then."""
+    failed = [run for run in comparison.runs if run.status == "failed"]
+    for run in failed:
+        typer.echo(f"{run.estimator} failed: {run.reason}", err=True)
+    if failed:
+        typer.echo(f"sonar-graph: {plural(len(failed), 'run')} failed of {len(comparison.runs)}", err=True)
+        raise typer.Exit(1)

@@ -1,0 +1,83 @@
+"""Settings given on the command line or in a file: ``--set name=value`` and ``--calibration FILE``."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sonar_graph.errors import CalibrationError, EstimatorError
+
+if TYPE_CHECKING:
+    from sonar_graph.calibration import Calibration
+
+
+def parse_setting(text: str) -> tuple[str, Any]:
+    """Name and value of ``name=value``; the value is read as TOML, and as plain text where it is none.
+
+    Raises
+    ------
+    EstimatorError
+        When there is no name or no ``=``.
+    """
+    name, equals, value = text.partition("=")
+    if not equals or not name.strip():
+        raise EstimatorError(f"--set {text}: expected name=value")
+    return name.strip(), _plain_value(value.strip())
+
+
+def _plain_value(text: str) -> Any:
+    if "\n" in text:
+        return text
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def estimator_settings(texts: list[str], names: list[str]) -> dict[str, dict[str, Any]]:
+    """Settings by estimator, from texts such as ``isam2.lag_s=20``; deeper dots go into nested settings.
+
+    Raises
+    ------
+    EstimatorError
+        When a text does not begin with one of the estimators that run.
+    """
+    settings: dict[str, dict[str, Any]] = {}
+    for text in texts:
+        path, value = parse_setting(text)
+        estimator, dot, setting = path.partition(".")
+        if not dot or estimator not in names:
+            raise EstimatorError(f"--set {text}: expected ESTIMATOR.setting=value with one of {', '.join(names)}")
+        _put(settings.setdefault(estimator, {}), setting.split("."), value)
+    return settings
+
+
+def _put(tree: dict[str, Any], path: list[str], value: Any) -> None:
+    for name in path[:-1]:
+        if not isinstance(tree.get(name), dict):
+            tree[name] = {}
+        tree = tree[name]
+    tree[path[-1]] = value
+
+
+def read_calibration(path: Path | None) -> Calibration | None:
+    """The calibration in a TOML or JSON file, which replaces the log's own; None where no file is given.
+
+    Raises
+    ------
+    CalibrationError
+        When the file is neither TOML nor JSON, or a field does not fit.
+    """
+    from sonar_graph.calibration import Calibration
+
+    if path is None:
+        return None
+    try:
+        text = path.read_text(encoding="utf-8")
+        values = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except (json.JSONDecodeError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        kind = "JSON" if path.suffix == ".json" else "TOML"
+        raise CalibrationError(f"{path}: not {kind}: {error}") from error
+    return Calibration.parse(values, str(path))

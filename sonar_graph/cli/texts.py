@@ -1,0 +1,13 @@
+"""What commands say in the same way everywhere."""
+
+from __future__ import annotations
+
+
+def examples(*commands: str) -> str:
+    """Commands to copy, for the end of a help page; an empty line keeps each on a line of its own."""
+    return "\n\n".join(["Examples:", *commands])
+
+
+def plural(count: int, noun: str) -> str:
+    """``1 row``, ``2 rows``."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -1,0 +1,93 @@
+"""What an estimator made of a sequence, and what is demanded of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.estimator import Estimator
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
+
+MakeEstimator = Callable[[Calibration], Estimator]
+ASK_HZ = 1.0
+SYMMETRY = 1e-9
+"""Largest asymmetry or negative eigenvalue of a covariance, relative to its largest entry."""
+
+
+class ContractError(AssertionError):
+    """An estimator does not keep the contract; the message says how."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """All that an estimator said about one sequence."""
+
+    estimates: list[Estimate]
+    trajectory: Trajectory
+    landmarks: LandmarkMap
+    detections: DetectionLog
+
+    def causal(self, stamps_ns: list[int]) -> Trajectory:
+        """The causal estimates at some of the instants."""
+        wanted = set(stamps_ns)
+        return Trajectory.from_estimates([e for e in self.estimates if e.stamp_ns in wanted])
+
+
+def run(
+    make: MakeEstimator, sequence: Sequence, instants_ns: Ints | None = None, *, ask_each_time: bool = False
+) -> Outcome:
+    """Feed a sequence to a fresh estimator, cut at the instants, and ask for everything at the end."""
+    estimator = make(sequence.calibration)
+    estimates = []
+    for step in sequence.replay(sequence.instants(ASK_HZ) if instants_ns is None else instants_ns):
+        estimates.append(estimator.process(step))
+        if ask_each_time:
+            estimator.trajectory(), estimator.landmarks(), estimator.detections()
+    return Outcome(
+        [estimate for estimate in estimates if estimate is not None],
+        estimator.trajectory(),
+        estimator.landmarks(),
+        estimator.detections(),
+    )
+
+
+def difference(one: Outcome, other: Outcome) -> float:
+    """Largest difference of causal estimates at the instants of ``one``, and of landmarks at the end.
+
+    Infinite where an instant or a landmark is missing from ``other``.
+    """
+    stamps_ns = [estimate.stamp_ns for estimate in one.estimates]
+    mine, theirs = one.causal(stamps_ns), other.causal(stamps_ns)
+    if not np.array_equal(mine.stamps_ns, theirs.stamps_ns) or not np.array_equal(
+        one.landmarks.ids, other.landmarks.ids
+    ):
+        return float("inf")
+    turned_rad = (mine.rotations().inv() * theirs.rotations()).magnitude() if len(mine) else np.empty(0)
+    pairs = (
+        (mine.positions, theirs.positions),
+        (mine.covariances, theirs.covariances),
+        (one.landmarks.positions, other.landmarks.positions),
+    )
+    return max([float(np.max(turned_rad, initial=0.0)), *(float(np.max(np.abs(a - b), initial=0.0)) for a, b in pairs)])
+
+
+def require(kept: bool, violation: str) -> None:
+    """Raise `ContractError` unless ``kept``."""
+    if not kept:
+        raise ContractError(violation)
+
+
+def require_covariance(matrix: Floats, size: int, name: str) -> None:
+    """Raise unless ``matrix`` is finite, symmetric and positive semi-definite, shape (size, size)."""
+    require(matrix.shape == (size, size), f"{name}: shape {matrix.shape}, not {(size, size)}")
+    require(bool(np.isfinite(matrix).all()), f"{name} is not finite")
+    scale = float(np.abs(matrix).max())
+    asymmetry = float(np.abs(matrix - matrix.T).max())
+    require(asymmetry <= SYMMETRY * scale, f"{name} is not symmetric: {asymmetry:.1e}")
+    least = float(np.linalg.eigvalsh(matrix).min())
+    require(least >= -SYMMETRY * scale, f"{name} has a negative eigenvalue: {least:.1e}")

@@ -1,0 +1,140 @@
+"""Two small worlds with known truth: a gentle left turn past three landmarks, and a vehicle at rest.
+
+Body velocity and angular rate are constant in the first, so that its truth is a circle in closed form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.calibration import Calibration, ImuCalibration, Start
+from sonar_graph.measurements import Block, Depth, Dvl, Floats, Imu, Ints, LandmarkDetections
+from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.states import LandmarkMap, Trajectory
+
+START_NS = 1_700_000_000 * NS_PER_S
+DURATION_S = 20
+STILL_S = 60
+SPEED_M_S = 0.3
+YAW_RATE_RAD_S = 0.05
+HEIGHT_M = -0.5
+LANDMARKS_M = {4: (7.0, 3.0), 9: (3.0, 7.0), 11: (5.5, 5.5)}
+STILL_START = Start(position_m=(1.0, -2.0, HEIGHT_M), rpy_rad=(0.1, -0.05, 0.7))
+IMU_HZ, DVL_HZ, DEPTH_HZ, FRAME_HZ = 50, 5, 5, 2
+SEED = 20
+
+
+def small_world(dvl_delay_s: float = 0.0) -> Sequence:
+    """The left turn, with little noise; the DVL may begin later than the IMU."""
+    noise = np.random.default_rng(SEED)
+    calibration = Calibration(start=_circle_start(dvl_delay_s), imu=ImuCalibration(gyro_bias_sigma=1e-5))
+    truth = _circle(_stamps(0, IMU_HZ, DURATION_S))
+    return Sequence(
+        name="left turn",
+        calibration=calibration,
+        imu=_turning_imu(calibration, noise),
+        dvl=_driving_dvl(calibration, dvl_delay_s, noise),
+        depth=_level_depth(calibration, noise),
+        detections=_detections(calibration, noise),
+        truth=truth,
+        true_landmarks=_true_landmarks(),
+    )
+
+
+def still_world() -> Sequence:
+    """A tilted vehicle at rest; every sensor is exact, the IMU feels gravity alone."""
+    calibration = Calibration(start=STILL_START)
+    imu_stamps, slow_stamps = _stamps(0, IMU_HZ, STILL_S), _stamps(0, DVL_HZ, STILL_S)
+    up_in_body = Rotation.from_euler("xyz", STILL_START.rpy_rad).inv().apply([0.0, 0.0, calibration.gravity_m_s2])
+    n = len(slow_stamps)
+    return Sequence(
+        name="at rest",
+        calibration=calibration,
+        imu=Imu(imu_stamps, np.zeros((len(imu_stamps), 3)), np.tile(up_in_body, (len(imu_stamps), 1))),
+        dvl=Dvl(slow_stamps, np.zeros((n, 3)), np.full((n, 3, 3), np.nan)),
+        depth=Depth(slow_stamps, np.full(n, HEIGHT_M), np.full(n, np.nan)),
+    )
+
+
+def every_stamp(sequence: Sequence) -> Ints:
+    """Each instant from the start to the end at which anything was measured, shape (n,)."""
+    stamps_ns = np.unique(np.concatenate([block.stamps_ns for block in blocks(sequence)]))
+    return stamps_ns[(stamps_ns > sequence.start_ns) & (stamps_ns <= sequence.end_ns)]
+
+
+def blocks(sequence: Sequence) -> Iterator[Block]:
+    """The blocks of a sequence that are there."""
+    for block in (sequence.imu, sequence.dvl, sequence.depth, sequence.detections):
+        if block is not None:
+            yield block
+
+
+def _stamps(first_s: float, rate_hz: int, until_s: int) -> Ints:
+    return START_NS + np.arange(round(first_s * rate_hz), until_s * rate_hz + 1, dtype=np.int64) * (NS_PER_S // rate_hz)
+
+
+def _circle(stamps_ns: Ints) -> Trajectory:
+    """Truth: x = (v/ω) sin ωt, y = (v/ω)(1 - cos ωt), yaw = ωt."""
+    yaw_rad = YAW_RATE_RAD_S * (stamps_ns - START_NS) * 1e-9
+    radius_m = SPEED_M_S / YAW_RATE_RAD_S
+    x, y = radius_m * np.sin(yaw_rad), radius_m * (1 - np.cos(yaw_rad))
+    positions = np.column_stack([x, y, np.full(len(x), HEIGHT_M)])
+    return Trajectory.without_covariances(stamps_ns, positions, Rotation.from_euler("z", yaw_rad[:, None]).as_quat())
+
+
+def _circle_start(after_s: float) -> Start:
+    pose = _circle(np.array([START_NS + round(after_s * NS_PER_S)], dtype=np.int64))
+    x, y, z = pose.positions[0].tolist()
+    return Start(position_m=(x, y, z), rpy_rad=(0.0, 0.0, YAW_RATE_RAD_S * after_s))
+
+
+def _turning_imu(calibration: Calibration, noise: np.random.Generator) -> Imu:
+    """Constant yaw rate; the specific force is centripetal acceleration v ω to the left, and gravity."""
+    stamps_ns = _stamps(0, IMU_HZ, DURATION_S)
+    shape, root_hz = (len(stamps_ns), 3), np.sqrt(IMU_HZ)
+    force = np.array([0.0, SPEED_M_S * YAW_RATE_RAD_S, calibration.gravity_m_s2])
+    rate_sigma = calibration.imu.gyro_noise_density * root_hz
+    force_sigma = calibration.imu.accel_noise_density * root_hz
+    rates = np.array([0.0, 0.0, YAW_RATE_RAD_S]) + rate_sigma * noise.standard_normal(shape)
+    return Imu(stamps_ns, rates, force + force_sigma * noise.standard_normal(shape))
+
+
+def _driving_dvl(calibration: Calibration, delay_s: float, noise: np.random.Generator) -> Dvl:
+    stamps_ns = _stamps(delay_s, DVL_HZ, DURATION_S)
+    n = len(stamps_ns)
+    scatter = np.array(calibration.dvl.velocity_sigma_m_s) * noise.standard_normal((n, 3))
+    return Dvl(stamps_ns, np.array([SPEED_M_S, 0.0, 0.0]) + scatter, np.full((n, 3, 3), np.nan))
+
+
+def _level_depth(calibration: Calibration, noise: np.random.Generator) -> Depth:
+    stamps_ns = _stamps(0, DEPTH_HZ, DURATION_S)
+    n = len(stamps_ns)
+    return Depth(stamps_ns, HEIGHT_M + calibration.depth.sigma_m * noise.standard_normal(n), np.full(n, np.nan))
+
+
+def _detections(calibration: Calibration, noise: np.random.Generator) -> LandmarkDetections:
+    """Every landmark in every frame that lies between two IMU samples; one in ten is not recognised."""
+    frames_ns = _stamps(0, FRAME_HZ, DURATION_S - 2)[3:] + NS_PER_S // 3
+    stamps_ns = np.repeat(frames_ns, len(LANDMARKS_M))
+    n = len(stamps_ns)
+    there = np.tile(_true_landmarks().positions, (len(frames_ns), 1))
+    body = _circle(frames_ns)
+    here, facing = np.repeat(body.positions, len(LANDMARKS_M), axis=0), np.repeat(body.quaternions_xyzw, 3, axis=0)
+    seen: Floats = Rotation.from_quat(facing).inv().apply(there - here)
+    ids = np.tile(np.array(list(LANDMARKS_M), dtype=np.int64), len(frames_ns))[:, None]
+    return LandmarkDetections(
+        stamps_ns,
+        np.linalg.norm(seen, axis=1) + calibration.sonar.range_sigma_m * noise.standard_normal(n),
+        np.arctan2(seen[:, 1], seen[:, 0]) + calibration.sonar.azimuth_sigma_rad * noise.standard_normal(n),
+        np.full((n, 2, 2), np.nan),
+        ids,
+        np.where(np.arange(n) % 10 == 9, 0.05, 0.99)[:, None],
+    )
+
+
+def _true_landmarks() -> LandmarkMap:
+    positions = np.array([(x, y, HEIGHT_M) for x, y in LANDMARKS_M.values()])
+    return LandmarkMap(np.array(list(LANDMARKS_M), dtype=np.int64), positions, np.full((len(positions), 3, 3), np.nan))
