@@ -1,0 +1,88 @@
+"""The direction of gravity from accelerometers, with the vehicle's own acceleration taken out by the Doppler log.
+
+Over an interval of duration T from node i to node j the specific force f, turned into frame i and averaged, is the
+change of velocity plus gravity's reaction. With the velocity v of the IMU's point in body axes at both ends and the
+rotation dR = i_R_j::
+
+    mean(i_R(t) f(t)) = (dR v_j - v_i) / T + g up_i
+
+    up_j    = dR^T up_i,    a measurement of body_R_world e_z at node j, which has roll and pitch but no yaw
+    sigma^2 = (accel_noise^2 / T + 2 sigma_v^2 / T^2 + accel_bias^2) / g^2
+
+Taking the change of velocity out is what lets a moving vehicle measure its tilt; the gyro's noise over a second is far
+below the accelerometer's bias and left out. The bias does not average out: successive directions share it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sonar_graph.calibration import ImuCalibration
+from sonar_graph.measurements import Floats
+from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
+from sonar_graph.navigation.kernels import compiled
+
+
+def velocity_at_imu(velocity: Floats, rate: Floats, body_p_dvl: Floats, body_p_imu: Floats) -> Floats:
+    """Velocity of the IMU's point from that of the DVL's: ``v + w x (p_imu - p_dvl)``, body axes, shape (3,), m/s."""
+    return np.asarray(velocity + np.cross(rate, body_p_imu - body_p_dvl))
+
+
+def gravity_direction(
+    motion: PreintegratedMotion,
+    velocity_i: Floats,
+    velocity_j: Floats,
+    velocity_sigma_m_s: float,
+    imu: ImuCalibration,
+    gravity_m_s2: float,
+) -> tuple[Floats, float] | None:
+    """The world's up in frame j.
+
+    Parameters
+    ----------
+    motion
+        From node i to node j, with the mean specific force.
+    velocity_i, velocity_j
+        Velocity of the IMU's point in body axes at the two nodes (see `velocity_at_imu`), shape (3,), m/s.
+    velocity_sigma_m_s
+        Standard deviation of one component of either velocity.
+
+    Returns
+    -------
+    The unit vector ``body_R_world e_z`` at node j, shape (3,), and the standard deviation of a small tilt of it, rad.
+    None where the specific force was not measured.
+    """
+    i_R_j = np.ascontiguousarray(motion.i_T_j.rotation().matrix())
+    up_j = up_direction(motion.mean_specific_force, i_R_j, velocity_i, velocity_j, motion.duration_s)
+    if not np.isfinite(up_j).all():
+        return None
+    return up_j, tilt_sigma(
+        motion.duration_s, velocity_sigma_m_s, imu.accel_noise_density, imu.accel_bias_sigma, gravity_m_s2
+    )
+
+
+@compiled
+def up_direction(
+    mean_force: Floats, i_R_j: Floats, velocity_i: Floats, velocity_j: Floats, duration_s: float
+) -> Floats:
+    """Unit vector of the module's equation, shape (3,); NaN where the force is."""
+    up_i = np.empty(3)
+    for r in range(3):
+        turned = i_R_j[r, 0] * velocity_j[0] + i_R_j[r, 1] * velocity_j[1] + i_R_j[r, 2] * velocity_j[2]
+        up_i[r] = mean_force[r] - (turned - velocity_i[r]) / duration_s
+    length = math.sqrt(up_i[0] ** 2 + up_i[1] ** 2 + up_i[2] ** 2)
+    up_j = np.empty(3)
+    for c in range(3):
+        up_j[c] = (i_R_j[0, c] * up_i[0] + i_R_j[1, c] * up_i[1] + i_R_j[2, c] * up_i[2]) / length
+    return up_j
+
+
+@compiled
+def tilt_sigma(
+    duration_s: float, velocity_sigma_m_s: float, accel_noise_density: float, accel_bias_sigma: float, gravity: float
+) -> float:
+    """Standard deviation of the direction's tilt, rad."""
+    noise = accel_noise_density**2 / duration_s + 2.0 * (velocity_sigma_m_s / duration_s) ** 2
+    return math.sqrt(noise + accel_bias_sigma**2) / gravity

@@ -1,0 +1,94 @@
+"""Which landmark a detection belongs to, whether it may be believed, and the record of what became of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from scipy.stats import chi2
+
+from sonar_graph.measurements import Floats, Ints, LandmarkDetections
+from sonar_graph.states import DetectionLog, Outcome
+
+
+@dataclass(frozen=True, eq=False)
+class Identities:
+    """The identity of each detection of a block, or the reason why it has none."""
+
+    ids: Ints
+    """Most probable identity, shape (n,)."""
+    refusals: list[Outcome | None]
+    """None where the identity is accepted, length n."""
+
+
+def identify(detections: LandmarkDetections, minimum_probability: float) -> Identities:
+    """Accept the most probable identity of each row where its posterior is high enough.
+
+    Parameters
+    ----------
+    minimum_probability
+        Rows whose highest posterior is below it, or is not a number, or belongs to no identity (-1), are refused.
+    """
+    ids, probability = detections.most_probable()
+    accepted = (probability >= minimum_probability) & (ids >= 0)
+    return Identities(ids, [None if good else Outcome.NO_IDENTITY for good in accepted.tolist()])
+
+
+@cache
+def gate_threshold(probability: float, dof: int) -> float:
+    """Squared Mahalanobis distance that a true innovation of ``dof`` components stays below with this probability."""
+    return float(chi2.ppf(probability, dof))
+
+
+class DetectionJournal:
+    """Rows about detections, in the order in which an estimator deals with them."""
+
+    def __init__(self) -> None:
+        self._stamps_ns: list[int] = []
+        self._ids: list[int] = []
+        self._outcomes: list[Outcome] = []
+        self._innovations: list[Floats] = []
+        self._innovation_covs: list[Floats] = []
+
+    def __len__(self) -> int:
+        return len(self._outcomes)
+
+    def record(
+        self,
+        stamp_ns: int,
+        landmark_id: int,
+        outcome: Outcome,
+        innovation: Floats | None = None,
+        innovation_cov: Floats | None = None,
+    ) -> None:
+        """Append a row.
+
+        Parameters
+        ----------
+        innovation
+            Measured minus predicted (range m, azimuth rad), shape (2,), kept without a copy; None: nothing was
+            predicted.
+        innovation_cov
+            Shape (2, 2), kept without a copy.
+        """
+        self._stamps_ns.append(stamp_ns)
+        self._ids.append(landmark_id)
+        self._outcomes.append(outcome)
+        self._innovations.append(_NO_INNOVATION if innovation is None else innovation)
+        self._innovation_covs.append(_NO_COV if innovation_cov is None else innovation_cov)
+
+    def log(self) -> DetectionLog:
+        """All rows so far."""
+        n = len(self)
+        return DetectionLog(
+            stamps_ns=np.array(self._stamps_ns, dtype=np.int64),
+            landmark_ids=np.array(self._ids, dtype=np.int64),
+            innovations=np.array(self._innovations, dtype=np.float64).reshape(n, 2),
+            innovation_covs=np.array(self._innovation_covs, dtype=np.float64).reshape(n, 2, 2),
+            outcomes=list(self._outcomes),
+        )
+
+
+_NO_INNOVATION = np.full(2, np.nan)
+_NO_COV = np.full((2, 2), np.nan)
