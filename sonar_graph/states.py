@@ -114,6 +114,7 @@ class Outcome(StrEnum):
     NO_IDENTITY = "refused: no identity probable enough"
     LATE = "refused: older than what was already processed"
     UNLOCATED = "refused: no odometry covers its stamp"
+    IGNORED = "ignored: this estimator uses no landmarks"
 
 
 @dataclass(frozen=True, eq=False)
