@@ -31,12 +31,7 @@ from sonar_graph.navigation.kernels import compiled, skew
 @compiled
 def wrap_angle(angle_rad: float) -> float:
     """The same direction in (-pi, pi]."""
-    wrapped = math.fmod(angle_rad, 2.0 * math.pi)
-    if wrapped > math.pi:
-        return wrapped - 2.0 * math.pi
-    if wrapped <= -math.pi:
-        return wrapped + 2.0 * math.pi
-    return wrapped
+    return angle_rad - 2.0 * math.pi * math.ceil((angle_rad - math.pi) / (2.0 * math.pi))
 
 
 @compiled
