@@ -1,0 +1,78 @@
+"""The comparison in the terminal: the few numbers that are read first."""
+
+from __future__ import annotations
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+from rich.text import Text
+
+from sonar_graph.evaluation.results import Comparison, RunResult
+from sonar_graph.evaluation.score_table import LABELS
+from sonar_graph.evaluation.wording import (
+    ABSENT,
+    consistency,
+    display_unit,
+    display_value,
+    failed_runs,
+    headline_metric,
+    score_of,
+)
+
+COLUMNS = {
+    "causal.yaw_rmse_rad": "yaw RMS",
+    "causal.nees_position": "NEES pos.",
+    "causal.nees_yaw": "NEES yaw",
+    "time.update_median_ms": "median",
+    "time.update_p99_ms": "p99",
+    "time.total_s": "total",
+}
+"""Columns after the two position errors; those that no run has are left out."""
+
+
+def summary_table(comparison: Comparison) -> Table:
+    """The runs in rows with position error (causal and smoothed), yaw error, NEES and time; below, why runs failed.
+
+    The same numbers as in the report. NEES is 1 for a consistent estimator.
+    """
+    columns = _columns(comparison)
+    title = Text(comparison.sequence.name, style="bold")
+    table = Table(title=title, caption=_caption(comparison), title_justify="left", caption_justify="left")
+    table.box, table.padding = SIMPLE_HEAD, (0, 1, 0, 0)
+    table.add_column("estimator", no_wrap=True)
+    for key, heading in columns.items():
+        table.add_column(Text(_heading(comparison, key, heading)), justify="right", no_wrap=True)
+    for run in comparison.runs:
+        table.add_row(Text(run.estimator), *(_cell(comparison, run, key) for key in columns))
+    return table
+
+
+def _columns(comparison: Comparison) -> dict[str, str]:
+    metric = headline_metric(comparison)
+    errors = {f"causal.{metric}": "causal", f"smoothed.{metric}": "smoothed"} if metric else {}
+    present = {key for scores in comparison.scores.values() for key in scores}
+    return {key: heading for key, heading in {**errors, **COLUMNS}.items() if key in present}
+
+
+def _heading(comparison: Comparison, key: str, heading: str) -> str:
+    units = {display_unit(scores[key]) for scores in comparison.scores.values() if key in scores}
+    unit = next(iter(units), "")
+    return f"{heading}\n({unit})" if unit else heading
+
+
+def _caption(comparison: Comparison) -> Text:
+    lines = [f"{run.estimator} failed: {run.reason}" for run in failed_runs(comparison)]
+    metric = headline_metric(comparison)
+    if metric is None:
+        lines.append("No position errors: the report says why.")
+    else:
+        lines.append(f"causal, smoothed: {LABELS[metric]}")
+        lines.append("NEES: 1 is consistent; ▲ over-confident, ▼ over-cautious")
+    return Text("\n".join(lines))
+
+
+def _cell(comparison: Comparison, run: RunResult, key: str) -> Text:
+    score = score_of(comparison, run.estimator, key)
+    if score is None:
+        return Text(ABSENT)
+    mark = {"over-confident": " ▲", "over-cautious": " ▼"}.get(consistency(score), "")
+    return Text(display_value(score) + mark)

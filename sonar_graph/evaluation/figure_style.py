@@ -1,0 +1,104 @@
+"""The looks that all figures share: colours, panels, and how long series are thinned."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from sonar_graph.evaluation.results import Comparison
+from sonar_graph.measurements import Floats, Ints
+
+INK = "#1c2024"
+MUTED = "#5d656d"
+RULE = "#d5d9dd"
+TRUTH = "#8b9198"
+ESTIMATOR_COLOURS = ("#0072b2", "#d55e00", "#00805e", "#a8508a", "#7a6a00", "#5b53b0")
+"""After Okabe and Ito, told apart with any colour vision; darkened where white paper asks for more contrast."""
+LINE_STYLES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (4, 1.4, 1, 1.4)), (0, (1.2, 1.2)))
+LABEL_SIZE, TICK_SIZE = 9.5, 9.0
+SERIES_POINTS = 700
+"""Points that a drawn series keeps: more cannot be seen at the width of a page."""
+
+
+def colour(index: int) -> str:
+    """Colour of the comparison's run with this index, the same in every figure."""
+    return ESTIMATOR_COLOURS[index % len(ESTIMATOR_COLOURS)]
+
+
+def line_style(index: int) -> Any:
+    """Line style of the comparison's run with this index, for figures in which runs share a panel."""
+    return LINE_STYLES[index % len(LINE_STYLES)]
+
+
+def blank_panels(rows: int, columns: int, size_in: tuple[float, float], **sharing: Any) -> tuple[Figure, NDArray[Any]]:
+    """A figure of styled, empty panels, shape (rows, columns), without any state of pyplot."""
+    figure = Figure(figsize=size_in, layout="constrained", facecolor="none")
+    axes = figure.subplots(rows, columns, squeeze=False, **sharing)
+    for panel in axes.flat:
+        _style(panel)
+    return figure, axes
+
+
+def _style(panel: Axes) -> None:
+    panel.set_facecolor("none")
+    panel.grid(True, color=RULE, linewidth=0.6)
+    panel.set_axisbelow(True)
+    panel.tick_params(which="both", color=RULE, labelcolor=MUTED, labelsize=TICK_SIZE)
+    for side, spine in panel.spines.items():
+        spine.set_visible(side in ("left", "bottom"))
+        spine.set_color(RULE)
+
+
+def name_axes(panel: Axes, x: str = "", y: str = "") -> None:
+    """Label the axes; an empty label is left out."""
+    panel.set_xlabel(x, color=INK, fontsize=LABEL_SIZE)
+    panel.set_ylabel(y, color=INK, fontsize=LABEL_SIZE)
+
+
+def head_panel(panel: Axes, title: str, own_colour: str = INK) -> None:
+    """Put a left-aligned heading over a panel."""
+    panel.set_title(title, loc="left", color=own_colour, fontsize=LABEL_SIZE, fontweight="bold")
+
+
+def legend_above(figure: Figure, panel: Axes, columns: int = 4) -> None:
+    """One legend for the figure, outside the data."""
+    handles, labels = panel.get_legend_handles_labels()
+    figure.legend(
+        handles,
+        labels,
+        loc="outside upper left",
+        ncols=columns,
+        frameon=False,
+        labelcolor=INK,
+        fontsize=TICK_SIZE,
+        handlelength=2.6,
+    )
+
+
+def seconds_since_start(comparison: Comparison, stamps_ns: Ints) -> Floats:
+    """Seconds since the sequence's first instant with IMU and DVL."""
+    return np.asarray((stamps_ns - comparison.sequence.start_ns) * 1e-9)
+
+
+def thinned(values: Floats, points: int = SERIES_POINTS) -> Ints:
+    """Rows that draw like the whole series: first, last, and the extremes of each of ``points / 2`` equal stretches.
+
+    Extremes stay, so that thinning never hides a jump; a stretch with a gap (NaN) keeps the gap.
+    """
+    n = len(values)
+    if n <= points:
+        return np.arange(n)
+    edges = np.linspace(0, n, points // 2 + 1).astype(np.int64)
+    stretches = list(zip(edges[:-1], edges[1:], strict=True))
+    lowest = [first + int(np.argmin(values[first:last])) for first, last in stretches]
+    highest = [first + int(np.argmax(values[first:last])) for first, last in stretches]
+    return np.unique(np.array([0, *lowest, *highest, n - 1], dtype=np.int64))
+
+
+def evenly(n: int, points: int = SERIES_POINTS) -> Ints:
+    """At most ``points`` rows out of n, equally spaced, first and last among them."""
+    return np.unique(np.linspace(0, n - 1, min(n, points)).round().astype(np.int64)) if n else np.empty(0, np.int64)

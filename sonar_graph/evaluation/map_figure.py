@@ -1,0 +1,175 @@
+"""The map: paths, landmarks and 95 % ellipses in the world of the start pose, seen from above."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from scipy.stats import chi2
+
+from sonar_graph.evaluation.figure_style import (
+    INK,
+    TICK_SIZE,
+    TRUTH,
+    blank_panels,
+    colour,
+    evenly,
+    legend_above,
+    line_style,
+    name_axes,
+)
+from sonar_graph.evaluation.results import Comparison, RunResult
+from sonar_graph.measurements import Floats
+from sonar_graph.states import LandmarkMap, Trajectory
+
+ELLIPSE_PROBABILITY = 0.95
+MARGIN = 0.3
+"""How far, in sizes of the truth, the map follows estimates that leave it."""
+WIDTH_IN = 7.4
+SAME_M = 1e-3
+"""A smoothed path nowhere farther than this from the causal one is not drawn a second time."""
+PATH_POINTS = 2500
+
+
+def map_figure(comparison: Comparison) -> Figure | None:
+    """Truth, causal and smoothed paths, landmarks with covariance ellipses; None where there is no path to draw.
+
+    Axes are world x and y in metres at one scale, nothing is aligned. The view holds the truth, true landmarks and as
+    much around them as `MARGIN` says; `paths_cut_off` names the runs that leave it.
+    """
+    view = _view(comparison)
+    if view is None:
+        return None
+    span = view[1] - view[0]
+    height = float(np.clip(WIDTH_IN * span[1] / span[0], 3.2, 8.0)) + 1.0
+    figure, axes = blank_panels(1, 1, (WIDTH_IN, height))
+    panel: Axes = axes[0, 0]
+    _draw_truth(panel, comparison)
+    for index, run in enumerate(comparison.runs):
+        _draw_paths(panel, run, index)
+        _draw_landmarks(panel, run, index)
+    _label_landmarks(panel, comparison, view)
+    panel.set(xlim=view[:, 0], ylim=view[:, 1])
+    panel.set_aspect("equal", adjustable="box")
+    name_axes(panel, "world x (m)", "world y (m)")
+    legend_above(figure, panel, columns=3)
+    return figure
+
+
+def paths_cut_off(comparison: Comparison) -> list[str]:
+    """Names of runs whose path leaves the map's view."""
+    view = _view(comparison)
+    if view is None:
+        return []
+    return [
+        run.estimator
+        for run in comparison.runs
+        if any(np.any((path < view[0]) | (path > view[1])) for path in _paths(run))
+    ]
+
+
+def smoothed_differs(run: RunResult) -> bool:
+    """Whether the smoothed path is another one than the causal one."""
+    if run.smoothed is None or not len(run.smoothed):
+        return False
+    if run.causal is None or len(run.causal) != len(run.smoothed):
+        return True
+    return bool(np.abs(run.smoothed.positions - run.causal.positions).max() > SAME_M)
+
+
+def _paths(run: RunResult) -> list[Floats]:
+    return [path.positions[:, :2] for path in (run.causal, run.smoothed) if path is not None and len(path)]
+
+
+def _view(comparison: Comparison) -> Floats | None:
+    """Lower left and upper right corner, shape (2, 2)."""
+    estimates = [path for run in comparison.runs for path in _paths(run)]
+    sequence = comparison.sequence
+    references = [sequence.truth.positions[:, :2]] if sequence.truth and len(sequence.truth) else []
+    if not references and not estimates:
+        return None
+    if sequence.true_landmarks and len(sequence.true_landmarks):
+        references.append(sequence.true_landmarks.positions[:, :2])
+    maps = [run.landmarks.positions[:, :2] for run in comparison.runs if run.landmarks and len(run.landmarks)]
+    anchor = _box(np.vstack(references or estimates))
+    largest = max(float(np.max(anchor[1] - anchor[0])), 1.0)
+    limits = anchor + np.array([[-1.0], [1.0]]) * MARGIN * largest
+    everything = np.vstack([anchor, *estimates, *maps])
+    box = _box(np.clip(everything[np.isfinite(everything).all(axis=1)], limits[0], limits[1]))
+    return box + np.array([[-1.0], [1.0]]) * 0.04 * largest
+
+
+def _box(points: Floats) -> Floats:
+    return np.array([np.nanmin(points, axis=0), np.nanmax(points, axis=0)])
+
+
+def _draw_truth(panel: Axes, comparison: Comparison) -> None:
+    truth, landmarks = comparison.sequence.truth, comparison.sequence.true_landmarks
+    if truth is not None and len(truth):
+        x, y = _xy(truth)
+        panel.plot(x, y, color=TRUTH, linewidth=3.2, alpha=0.6, label="truth", solid_capstyle="round", zorder=1)
+    if landmarks is not None and len(landmarks):
+        x, y = landmarks.positions[:, 0], landmarks.positions[:, 1]
+        panel.plot(x, y, "+", color=INK, markersize=9, markeredgewidth=1.4, label="true landmarks", zorder=5)
+
+
+def _draw_paths(panel: Axes, run: RunResult, index: int) -> None:
+    if run.causal is not None and len(run.causal):
+        x, y = _xy(run.causal)
+        label = f"{run.estimator}, causal"
+        panel.plot(x, y, color=colour(index), linestyle=line_style(index), linewidth=1.3, label=label, zorder=3)
+    if run.smoothed is not None and smoothed_differs(run):
+        x, y = _xy(run.smoothed)
+        label = f"{run.estimator}, smoothed"
+        panel.plot(x, y, color=colour(index), linestyle=(0, (1, 1)), linewidth=1.9, alpha=0.75, label=label, zorder=2)
+
+
+def _draw_landmarks(panel: Axes, run: RunResult, index: int) -> None:
+    if run.landmarks is None or not len(run.landmarks):
+        return
+    x, y = run.landmarks.positions[:, 0], run.landmarks.positions[:, 1]
+    label = f"{run.estimator}, landmarks"
+    marker = "os^Dv<"[index % 6]
+    panel.plot(x, y, marker, color=colour(index), markersize=3.5, markerfacecolor="none", label=label, zorder=4)
+    for ellipse in _ellipses(run.landmarks, colour(index)):
+        panel.add_patch(ellipse)
+
+
+def _ellipses(landmarks: LandmarkMap, edge: str) -> list[Ellipse]:
+    scale = 2 * np.sqrt(chi2.ppf(ELLIPSE_PROBABILITY, 2))
+    ellipses = []
+    for position, cov in zip(landmarks.positions, landmarks.covariances[:, :2, :2], strict=True):
+        if not np.isfinite(cov).all():
+            continue
+        variances, directions = np.linalg.eigh(cov)
+        width, height = scale * np.sqrt(np.maximum(variances[::-1], 0.0))
+        angle = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
+        ellipses.append(
+            Ellipse((position[0], position[1]), width, height, angle=angle, fill=False, edgecolor=edge, zorder=4)
+        )
+    return ellipses
+
+
+def _label_landmarks(panel: Axes, comparison: Comparison, view: Floats) -> None:
+    candidates = [comparison.sequence.true_landmarks, *(run.landmarks for run in comparison.runs)]
+    landmarks = next((known for known in candidates if known is not None and len(known)), None)
+    if landmarks is None:
+        return
+    size = TICK_SIZE if len(landmarks) <= 40 else 6.0
+    for identity, position in zip(landmarks.ids.tolist(), landmarks.positions[:, :2], strict=True):
+        if np.all((position >= view[0]) & (position <= view[1])):
+            panel.annotate(
+                str(identity),
+                (position[0], position[1]),
+                xytext=(5, 4),
+                textcoords="offset points",
+                color=INK,
+                fontsize=size,
+                zorder=6,
+            )
+
+
+def _xy(trajectory: Trajectory) -> tuple[Floats, Floats]:
+    rows = evenly(len(trajectory), PATH_POINTS)
+    return trajectory.positions[rows, 0], trajectory.positions[rows, 1]
