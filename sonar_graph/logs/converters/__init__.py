@@ -1,1 +1,1 @@
-"""Other people's data sets, one file each, to a `Sequence`."""
+"""Public data sets as sequences, one module a data set."""
