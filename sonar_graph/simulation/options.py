@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Self
-
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from sonar_graph.calibration import Section
-from sonar_graph.errors import SimulationError
 from sonar_graph.simulation.presets import DvlName, ImuName
 
 
@@ -50,18 +47,3 @@ class SimulationOptions(Section):
     """The same for its rotation, about each body axis."""
     floor_sigma_m: float = Field(0.01, gt=0)
     """Landmark heights are drawn about the floor with this sigma, and estimators are told so."""
-
-    @classmethod
-    def parse(cls, values: dict[str, Any]) -> Self:
-        """Options from plain values, such as those of a command line.
-
-        Raises
-        ------
-        SimulationError
-            Naming each wrong option, what was expected, and the options that exist.
-        """
-        try:
-            return cls.model_validate(values)
-        except ValidationError as error:
-            faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-            raise SimulationError(f"simulation: {faults}; options: {', '.join(cls.model_fields)}") from error

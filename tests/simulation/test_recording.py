@@ -1,0 +1,118 @@
+"""A recording tells estimators the truth about its own errors, and nothing else changes when one thing does."""
+
+import gtsam
+import numpy as np
+import pytest
+from scipy import stats
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.simulation.presets import DVL_PRESETS, IMU_PRESETS
+
+
+def short(**options: object) -> Sequence:
+    return simulate_basin(BasinOptions.model_validate({"duration_s": 130, "laps": 1, **options}))
+
+
+def columns(sequence: Sequence) -> list[np.ndarray]:
+    assert sequence.depth is not None
+    assert sequence.detections is not None
+    return [
+        sequence.imu.angular_velocity,
+        sequence.imu.specific_force,
+        sequence.dvl.velocity,
+        sequence.depth.z_m,
+        sequence.detections.range_m,
+        sequence.detections.id_probability,
+    ]
+
+
+def test_same_seed_gives_same_bits():
+    for first, second in zip(columns(short(seed=4)), columns(short(seed=4)), strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+def test_another_seed_gives_other_bits():
+    for first, second in zip(columns(short(seed=4)), columns(short(seed=5)), strict=True):
+        assert not np.array_equal(first, second)
+
+
+def test_changing_the_sonar_leaves_all_other_noise_alone():
+    slow, fast = short(frame_rate_hz=2), short(frame_rate_hz=10, false_detections_per_frame=0.3)
+    for first, second in zip(columns(slow)[:4], columns(fast)[:4], strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+def test_stamps_begin_together_and_truth_covers_the_run():
+    run = short()
+    assert run.truth is not None
+    assert run.imu.stamps_ns[0] == run.dvl.stamps_ns[0] == run.start_ns == run.truth.stamps_ns[0]
+    assert run.truth.stamps_ns[-1] >= run.end_ns
+    assert run.duration_s == pytest.approx(130, abs=0.2)
+    assert np.isnan(run.truth.covariances).all()
+
+
+def test_rows_of_a_frame_share_a_stamp_and_frames_fall_between_imu_samples():
+    found = short(false_detections_per_frame=2.0).detections
+    assert found is not None
+    frames = np.unique(found.stamps_ns)
+    assert len(frames) < len(found)
+    assert np.all(np.diff(frames) % 200_000_000 <= 1)
+    assert np.all((frames - frames[0]) % 10_000_000 <= 1)
+    assert (frames[0] - 1_400_000_000_000_000_000) % 10_000_000 == 7_100_000
+
+
+@pytest.mark.parametrize("imu", ["hg1700", "mti1"])
+@pytest.mark.parametrize("dvl", ["workhorse", "explorer"])
+def test_calibration_carries_the_presets(imu: str, dvl: str):
+    run = short(imu=imu, dvl=dvl)
+    told, preset = run.calibration.imu, IMU_PRESETS[imu]  # type: ignore[index]
+    assert told == preset
+    assert run.calibration.dvl.velocity_sigma_m_s[0] == DVL_PRESETS[dvl].velocity_sigma_m_s  # type: ignore[index]
+    assert 1e9 / np.median(np.diff(run.dvl.stamps_ns)) == pytest.approx(DVL_PRESETS[dvl].rate_hz)  # type: ignore[index]
+
+
+def test_presets_are_the_data_sheets_figures():
+    # Each once more by hand: 1 °/h is 360° in 15 days; 0.125 °/√h over one hour is 0.125°.
+    hg1700 = IMU_PRESETS["hg1700"]
+    assert hg1700.gyro_bias_sigma * 15 * 86400 == pytest.approx(2 * np.pi)
+    assert np.degrees(hg1700.gyro_noise_density * np.sqrt(3600)) == pytest.approx(0.125)
+    assert hg1700.accel_noise_density == pytest.approx(3.30e-4, rel=2e-3)
+    assert IMU_PRESETS["mti1"].gyro_noise_density == pytest.approx(1.2217e-4, rel=1e-4)
+
+
+def test_no_bias_is_neither_simulated_nor_told():
+    run = short(gyro_bias_scale=0, accel_bias_scale=0)
+    assert run.calibration.imu.gyro_bias_sigma == run.calibration.imu.gyro_bias_walk_density == 0
+    assert run.calibration.imu.accel_bias_sigma == 0
+    difference = short(gyro_bias_scale=1000).imu.angular_velocity - run.imu.angular_velocity
+    assert np.abs(difference.mean(axis=0)).max() > 1e-3
+    assert short(gyro_bias_scale=1000).calibration.imu.gyro_bias_sigma == pytest.approx(1000 * 4.848e-6, rel=1e-3)
+
+
+def test_start_is_drawn_about_the_truth_with_its_own_sigmas():
+    normalised = []
+    for seed in range(60):
+        run = short(seed=seed, frame_rate_hz=0.1)
+        assert run.truth is not None
+        true = gtsam.Pose3(gtsam.Rot3(run.truth.rotations()[0].as_matrix()), run.truth.positions[0])
+        told = run.calibration.start
+        turned = gtsam.Rot3.Logmap(true.rotation().between(told.pose().rotation())) / told.rpy_sigma_rad
+        moved = (told.pose().translation() - true.translation()) / told.position_sigma_m
+        normalised.append([turned, moved])
+    low, high = stats.chi2.interval(0.9999, 180)
+    for kind in np.moveaxis(np.array(normalised), 1, 0):
+        assert low < np.sum(kind**2) < high
+
+
+def test_calibration_survives_being_written_and_read():
+    told = short().calibration
+    assert Calibration.parse(told.model_dump(mode="json"), "log") == told
+
+
+def test_notes_say_what_was_simulated():
+    notes = short(seed=9).notes
+    assert "basin" in notes["generator"]
+    assert BasinOptions.model_validate_json(notes["options"]).seed == 9
+    assert {"from the paper", "ours"} <= set(notes)

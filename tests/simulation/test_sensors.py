@@ -1,0 +1,189 @@
+"""Sensors feel the true motion, plus exactly the errors that the calibration says."""
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from sonar_graph.calibration import DepthCalibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.simulation.sensors import (
+    EPOCH_NS,
+    DvlFaults,
+    dvl_readings,
+    imu_readings,
+    regular_stamps,
+    seconds_since_start,
+    simulate_depth,
+    simulate_dvl,
+    simulate_imu,
+)
+from sonar_graph.simulation.vehicle import VehiclePath, smooth_noise
+
+G = 9.80665
+SECONDS = np.linspace(0, 60, 121)
+EXACT_IMU = ImuCalibration(
+    gyro_noise_density=0, gyro_bias_sigma=0, gyro_bias_walk_density=0, accel_noise_density=0, accel_bias_sigma=0
+)
+SKEWED = Mounting(translation_m=(0.3, -0.2, 0.1), rpy_rad=(0.3, -0.4, 0.8))
+
+
+def moving(seed: int = 2) -> VehiclePath:
+    wander = smooth_noise(SECONDS, np.array([1.0, 1.0, 0.3, 0.3, 0.3, 1.0]), 4.0, 6, np.random.default_rng(seed))
+    return VehiclePath.through(SECONDS, wander)
+
+
+def still(rpy: tuple[float, float, float] = (0.0, 0.0, 0.0), duration_s: float = 60.0) -> VehiclePath:
+    seconds = np.linspace(0, duration_s, 121)
+    return VehiclePath.through(seconds, np.tile([1.0, 2.0, -1.0, *rpy], (121, 1)))
+
+
+def test_stamps_begin_at_the_epoch_and_stay_within_the_run():
+    stamps = regular_stamps(7.0, 10.0)
+    assert stamps[0] == EPOCH_NS
+    assert len(stamps) == 71
+    assert np.abs(np.diff(stamps) - 1e9 / 7).max() <= 1
+    assert regular_stamps(5.0, 10.0, offset_s=0.03)[-1] <= EPOCH_NS + 10_000_000_000
+
+
+def test_level_vehicle_at_rest_feels_gravity_upwards():
+    omega, force = imu_readings(still().at(SECONDS), Mounting(), G)
+    np.testing.assert_allclose(omega, 0, atol=1e-9)
+    np.testing.assert_allclose(force, np.tile([0, 0, G], (121, 1)), atol=1e-8)
+
+
+@given(st.tuples(st.floats(-3, 3), st.floats(-1.4, 1.4), st.floats(-3, 3)))
+@settings(max_examples=20)
+def test_tilted_vehicle_at_rest_feels_gravity_along_the_worlds_up(rpy: tuple[float, float, float]):
+    up_in_imu = (gtsam.Rot3.RzRyRx(*rpy) * gtsam.Rot3.RzRyRx(*SKEWED.rpy_rad)).unrotate(np.array([0, 0, 1.0]))
+    _, force = imu_readings(still(rpy).at(SECONDS[:1]), SKEWED, G)
+    np.testing.assert_allclose(force[0], G * up_in_imu, atol=1e-7)
+
+
+def test_gtsam_integrates_exact_imu_samples_back_to_the_truth():
+    path, step = moving(), 1e-3
+    begins = np.arange(0, 10 - step / 2, step)
+    # Its integrator holds rate and force over a step and turns the force by the attitude at the step's begin.
+    omegas, _ = imu_readings(path.at(begins + step / 2), Mounting(), G)
+    _, forces = imu_readings(path.at(begins), Mounting(), G)
+    integrated = gtsam.PreintegratedImuMeasurements(
+        gtsam.PreintegrationParams.MakeSharedU(G), gtsam.imuBias.ConstantBias()
+    )
+    for omega, force in zip(omegas, forces, strict=True):
+        integrated.integrateMeasurement(force, omega, step)
+    first, last = path.at(np.array([0.0])), path.at(np.array([10.0]))
+    begin = gtsam.NavState(
+        gtsam.Pose3(gtsam.Rot3(first.world_R_body.as_matrix()[0]), first.position[0]), first.velocity[0]
+    )
+    end = integrated.predict(begin, gtsam.imuBias.ConstantBias())
+    np.testing.assert_allclose(end.position(), last.position[0], atol=2e-3)
+    np.testing.assert_allclose(end.velocity(), last.velocity[0], atol=5e-4)
+    np.testing.assert_allclose(end.attitude().matrix(), last.world_R_body.as_matrix()[0], atol=1e-5)
+
+
+def points_of_mounting(path: VehiclePath, seconds: np.ndarray, lever: tuple[float, float, float]) -> np.ndarray:
+    motion = path.at(seconds)
+    return motion.position + motion.world_R_body.apply(lever)
+
+
+def test_accelerometers_on_a_lever_arm_feel_that_points_acceleration():
+    path, middle, h = moving(), np.linspace(5, 55, 31), 1e-3
+    before, at, after = (points_of_mounting(path, middle + d, SKEWED.translation_m) for d in (-h, 0, h))
+    acceleration = (after - 2 * at + before) / h**2
+    world_R_imu = path.at(middle).world_R_body.as_matrix() @ gtsam.Rot3.RzRyRx(*SKEWED.rpy_rad).matrix()
+    expected = np.einsum("nji,nj->ni", world_R_imu, acceleration + np.array([0, 0, G]))
+    _, force = imu_readings(path.at(middle), SKEWED, G)
+    np.testing.assert_allclose(force, expected, atol=1e-5)
+    _, without_lever = imu_readings(path.at(middle), Mounting(rpy_rad=SKEWED.rpy_rad), G)
+    assert np.abs(without_lever - expected).max() > 0.01
+
+
+def test_dvl_on_a_lever_arm_measures_that_points_velocity():
+    path, middle, h = moving(), np.linspace(5, 55, 31), 1e-4
+    before, after = (points_of_mounting(path, middle + d, SKEWED.translation_m) for d in (-h, h))
+    world_R_dvl = path.at(middle).world_R_body.as_matrix() @ gtsam.Rot3.RzRyRx(*SKEWED.rpy_rad).matrix()
+    expected = np.einsum("nji,nj->ni", world_R_dvl, (after - before) / (2 * h))
+    np.testing.assert_allclose(dvl_readings(path.at(middle), SKEWED), expected, atol=1e-7)
+    assert np.abs(dvl_readings(path.at(middle), Mounting(rpy_rad=SKEWED.rpy_rad)) - expected).max() > 0.01
+
+
+def assert_sigma(samples: np.ndarray, sigma: float, probability: float = 0.9999) -> None:
+    """Two-sided: neither too small nor too large, and white."""
+    n = samples.size
+    low, high = stats.chi2.interval(probability, n)
+    assert low < np.sum((samples / sigma) ** 2) < high
+    assert abs(samples.mean()) < 4 * sigma / np.sqrt(n)
+    assert abs(np.mean(samples[1:] * samples[:-1])) < 4 * sigma**2 / np.sqrt(n)
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 200.0])
+def test_imu_white_noise_has_the_stated_density_at_any_rate(rate_hz: float):
+    calibration = EXACT_IMU.model_copy(update={"gyro_noise_density": 2e-3, "accel_noise_density": 5e-3})
+    stamps = regular_stamps(rate_hz, 60.0)
+    imu = simulate_imu(still(), stamps, calibration, G, np.random.default_rng(5))
+    for axis in range(3):
+        assert_sigma(imu.angular_velocity[:, axis], 2e-3 * np.sqrt(rate_hz))
+        assert_sigma(imu.specific_force[:, axis] - [0, 0, G][axis], 5e-3 * np.sqrt(rate_hz))
+
+
+def test_biases_are_drawn_with_their_sigmas_and_stay_constant_without_walk():
+    calibration = EXACT_IMU.model_copy(update={"gyro_bias_sigma": 3e-3, "accel_bias_sigma": 0.02})
+    runs = [simulate_imu(still(), regular_stamps(10, 2), calibration, G, np.random.default_rng(s)) for s in range(200)]
+    gyro = np.array([r.angular_velocity for r in runs])
+    np.testing.assert_allclose(gyro, gyro[:, :1] + np.zeros_like(gyro), atol=1e-9)
+    assert_sigma(gyro[:, 0].ravel(), 3e-3)
+    assert_sigma(np.array([r.specific_force[0] - [0, 0, G] for r in runs]).ravel(), 0.02)
+
+
+def test_gyro_bias_walks_with_the_root_of_time():
+    calibration = EXACT_IMU.model_copy(update={"gyro_bias_walk_density": 1e-3})
+    runs = [simulate_imu(still(), regular_stamps(20, 50), calibration, G, np.random.default_rng(s)) for s in range(200)]
+    walk = np.array([r.angular_velocity for r in runs])
+    np.testing.assert_allclose(walk[:, 0], 0, atol=1e-9)
+    for second in (5, 20, 50):
+        assert_sigma(walk[:, 20 * second].ravel(), 1e-3 * np.sqrt(second))
+
+
+def test_dvl_noise_is_what_its_covariance_column_says():
+    calibration = DvlCalibration(velocity_sigma_m_s=(0.004, 0.008, 0.016), mounting=SKEWED)
+    path, stamps = moving(), regular_stamps(100, 60)
+    dvl = simulate_dvl(path, stamps, calibration, DvlFaults(), np.random.default_rng(6))
+    error = dvl.velocity - dvl_readings(path.at(seconds_since_start(stamps)), SKEWED)
+    for axis in range(3):
+        assert_sigma(error[:, axis], float(np.sqrt(dvl.velocity_cov[0, axis, axis])))
+    np.testing.assert_allclose(np.sqrt(np.diag(dvl.velocity_cov[-1])), calibration.velocity_sigma_m_s)
+
+
+def test_dvl_scale_error_stretches_velocity():
+    calibration = DvlCalibration(velocity_sigma_m_s=(0, 0, 0))
+    path, stamps = moving(), regular_stamps(7, 60)
+    stretched = simulate_dvl(path, stamps, calibration, DvlFaults(scale_error=0.05), np.random.default_rng(0))
+    exact = dvl_readings(path.at(seconds_since_start(stamps)), Mounting())
+    np.testing.assert_allclose(stretched.velocity, 1.05 * exact, atol=1e-12)
+
+
+def test_dvl_dropouts_leave_gaps_of_their_length_at_their_rate():
+    path, stamps = still(duration_s=3600.0), regular_stamps(7, 3600)
+    faults = DvlFaults(dropouts_per_hour=60, dropout_s=5.0)
+    dvl = simulate_dvl(path, stamps, DvlCalibration(), faults, np.random.default_rng(8))
+    gaps_s = np.diff(dvl.stamps_ns) * 1e-9
+    gaps_s = gaps_s[gaps_s > 0.2]
+    assert dvl.stamps_ns[0] == stamps[0]
+    assert dvl.stamps_ns[-1] == stamps[-1]
+    # A sample is lost when a Poisson event lies within the 5 s before it.
+    assert 1 - len(dvl) / len(stamps) == pytest.approx(1 - np.exp(-60 * 5 / 3600), abs=0.03)
+    assert gaps_s.min() > 4.9
+    without = simulate_dvl(path, stamps, DvlCalibration(), DvlFaults(), np.random.default_rng(8))
+    assert len(without) == len(stamps)
+
+
+def test_depth_is_the_height_of_the_port_with_the_stated_noise():
+    calibration = DepthCalibration(sigma_m=0.02, port_m=(0.5, -0.3, 0.4))
+    path, stamps = moving(), regular_stamps(50, 60)
+    depth = simulate_depth(path, stamps, calibration, np.random.default_rng(9))
+    seconds = seconds_since_start(stamps)
+    error = depth.z_m - points_of_mounting(path, seconds, calibration.port_m)[:, 2]
+    assert_sigma(error, 0.02)
+    np.testing.assert_allclose(depth.variance_m2, 0.0004)
+    assert np.std(depth.z_m - path.at(seconds).position[:, 2]) > 0.05
