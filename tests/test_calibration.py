@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.calibration import Calibration, Mounting, Start
+from sonar_graph.errors import CalibrationError
+
+angles = st.floats(-3, 3)
+lengths = st.floats(-5, 5)
+
+
+@given(st.tuples(lengths, lengths, lengths), st.tuples(angles, angles, angles))
+def test_mounting_turns_about_z_after_y_after_x(
+    translation_m: tuple[float, float, float], rpy_rad: tuple[float, float, float]
+) -> None:
+    body_T_sensor = Mounting(translation_m=translation_m, rpy_rad=rpy_rad).pose()
+    expected = Rotation.from_euler("xyz", rpy_rad).as_matrix()  # fixed axes x, y, z: Rz Ry Rx
+    np.testing.assert_allclose(body_T_sensor.rotation().matrix(), expected, atol=1e-12)
+    np.testing.assert_array_equal(body_T_sensor.translation(), translation_m)
+
+
+def test_start_heading_is_positive_to_the_left() -> None:
+    ahead_of_body = Start(position_m=(1.0, 2.0, 0.0), rpy_rad=(0.0, 0.0, np.pi / 2)).pose()
+    np.testing.assert_allclose(ahead_of_body.transformFrom(np.array([1.0, 0, 0])), [1, 3, 0], atol=1e-12)
+
+
+def test_sonar_pitched_down_looks_at_the_floor() -> None:
+    body_T_sonar = Mounting(rpy_rad=(0.0, np.radians(30), 0.0)).pose()
+    assert body_T_sonar.transformFrom(np.array([1.0, 0, 0]))[2] == pytest.approx(-0.5)
+
+
+def test_calibration_survives_json() -> None:
+    calibration = Calibration.parse({"imu": {"gyro_noise_density": 1 / 3}, "floor": {"z_m": -1.7, "sigma_m": 0.1}}, "x")
+    assert Calibration.model_validate_json(calibration.model_dump_json()) == calibration
+
+
+def test_empty_calibration_is_usable() -> None:
+    assert Calibration.parse({}, "x") == Calibration()
+
+
+@pytest.mark.parametrize(
+    ("values", "field"),
+    [
+        ({"imu": {"gyro_noise": 1}}, "imu.gyro_noise"),
+        ({"imu": {"gyro_noise_density": -1}}, "imu.gyro_noise_density"),
+        ({"dvl": {"velocity_sigma_m_s": [1, 2]}}, "dvl.velocity_sigma_m_s"),
+        ({"floor": {"z_m": -1.0}}, "floor.sigma_m"),
+        ({"odometry_interpolation": "cubic"}, "odometry_interpolation"),
+        ({"gravity_m_s2": 0}, "gravity_m_s2"),
+    ],
+)
+def test_wrong_field_is_refused_by_source_and_name(values: dict[str, object], field: str) -> None:
+    with pytest.raises(CalibrationError) as refusal:
+        Calibration.parse(values, "vehicle.toml")
+    message = str(refusal.value)
+    assert message.startswith("vehicle.toml: ")
+    assert field in message
+    assert "\n" not in message
+
+
+def test_every_wrong_field_is_named_at_once() -> None:
+    with pytest.raises(CalibrationError, match=r"gravity_m_s2.*nonsense"):
+        Calibration.parse({"gravity_m_s2": -1, "nonsense": 1}, "x")
+
+
+def test_calibration_cannot_be_changed() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        Calibration().gravity_m_s2 = 1.0  # type: ignore[misc]
+
+
+def test_every_field_says_what_it_means() -> None:
+    without = [name for name, field in Calibration().imu.__class__.model_fields.items() if not field.description]
+    assert without == ["mounting"]  # its type says it

@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from sonar_graph.errors import MeasurementError
+from sonar_graph.measurements import Depth, Imu, LandmarkDetections
+
+
+def depth(stamps_ns: list[int]) -> Depth:
+    """Rows whose height says which row they were."""
+    return Depth(np.array(stamps_ns), np.arange(len(stamps_ns), dtype=float), np.full(len(stamps_ns), np.nan))
+
+
+sorted_stamps = st.lists(st.integers(-(2**62), 2**62), min_size=1, max_size=20).map(sorted)
+
+
+@given(sorted_stamps, st.lists(st.integers(-(2**62), 2**62), max_size=5))
+def test_windows_between_consecutive_cuts_hold_every_row_once(stamps_ns: list[int], cuts_ns: list[int]) -> None:
+    block = depth(stamps_ns)
+    edges = [np.iinfo(np.int64).min, *sorted(cuts_ns), np.iinfo(np.int64).max]
+    windows = [block.between(after, until) for after, until in itertools.pairwise(edges)]
+    rows = np.concatenate([window.z_m for window in windows if window is not None])
+    np.testing.assert_array_equal(rows, block.z_m)
+
+
+def test_window_excludes_its_beginning_and_includes_its_end() -> None:
+    window = depth([10, 20, 30]).between(10, 20)
+    assert window is not None
+    assert window.stamps_ns.tolist() == [20]
+
+
+def test_window_without_rows_is_none() -> None:
+    assert depth([10, 20]).between(20, 100) is None
+
+
+@given(sorted_stamps, st.integers(0, 20))
+def test_concatenation_undoes_a_split(stamps_ns: list[int], at: int) -> None:
+    block = depth(stamps_ns)
+    parts = [part for part in (slice(None, at), slice(at, None)) if len(stamps_ns[part])]
+    joined = Depth.concatenate([block.rows(part) for part in parts])
+    np.testing.assert_array_equal(joined.stamps_ns, block.stamps_ns)
+    np.testing.assert_array_equal(joined.z_m, block.z_m)
+
+
+def test_stamps_keep_every_nanosecond_of_an_epoch() -> None:
+    stamp_ns = 1_700_000_000_123_456_789  # a float would round it to a multiple of 256
+    assert depth([stamp_ns]).stamps_ns[0] == stamp_ns
+
+
+def test_block_without_rows_is_refused() -> None:
+    with pytest.raises(MeasurementError, match="at least one row"):
+        depth([])
+
+
+def test_stamps_that_run_backwards_are_refused_with_their_row() -> None:
+    with pytest.raises(MeasurementError, match="after row 1"):
+        depth([1, 5, 4])
+
+
+def test_equal_stamps_are_allowed() -> None:
+    assert len(depth([5, 5, 5])) == 3
+
+
+@pytest.mark.parametrize("column", ["angular_velocity", "specific_force"])
+def test_column_of_another_length_is_refused_by_name(column: str) -> None:
+    columns = {"angular_velocity": np.zeros((3, 3)), "specific_force": np.zeros((3, 3))}
+    columns[column] = np.zeros((2, 3))
+    with pytest.raises(MeasurementError, match=rf"Imu\.{column}"):
+        Imu(np.arange(3), **columns)
+
+
+def test_whole_number_columns_become_floats_and_identities_stay_whole() -> None:
+    block = LandmarkDetections([0], [3], [1], [[[1, 0], [0, 1]]], [[7]], [[1]])  # type: ignore[arg-type]
+    assert block.range_m.dtype == np.float64
+    assert block.candidate_ids.dtype == np.int64
+
+
+@given(arrays.arrays(np.float64, (6, 4), elements=st.floats(0, 1)))
+def test_most_probable_identity_has_the_largest_posterior(posterior: np.ndarray) -> None:
+    ids = np.arange(24).reshape(6, 4)
+    block = LandmarkDetections(np.arange(6), np.ones(6), np.zeros(6), np.zeros((6, 2, 2)), ids, posterior)
+    best, probability = block.most_probable()
+    for row in range(6):
+        assert probability[row] == max(posterior[row])
+        assert posterior[row][ids[row].tolist().index(best[row])] == probability[row]
+
+
+def test_single_rows_and_the_whole_are_the_same_block() -> None:
+    block = depth([1, 2, 3])
+    one_by_one = Depth.concatenate([block.rows(slice(i, i + 1)) for i in range(3)])
+    np.testing.assert_array_equal(one_by_one.z_m, block.z_m)

@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.errors import MeasurementError
+from sonar_graph.measurements import Depth, Dvl, Imu
+from sonar_graph.sequence import NS_PER_S, Sequence
+
+
+def recording(imu_s: tuple[float, float] = (0.0, 10.0), dvl_s: tuple[float, float] = (0.0, 10.0)) -> Sequence:
+    """IMU at 50 Hz and DVL at 7 Hz between the given times, depth at 10 Hz from before to after."""
+    epoch_ns = 1_700_000_000 * NS_PER_S
+
+    def stamps(between_s: tuple[float, float], rate_hz: float) -> np.ndarray:
+        seconds = np.arange(between_s[0], between_s[1] + 1e-9, 1 / rate_hz)
+        return epoch_ns + np.round(seconds * NS_PER_S).astype(np.int64)
+
+    imu, dvl, depth = stamps(imu_s, 50), stamps(dvl_s, 7), stamps((-2.0, 12.0), 10)
+    return Sequence(
+        "test",
+        Calibration(),
+        Imu(imu, np.zeros((len(imu), 3)), np.zeros((len(imu), 3))),
+        Dvl(dvl, np.zeros((len(dvl), 3)), np.full((len(dvl), 3, 3), np.nan)),
+        Depth(depth, np.zeros(len(depth)), np.full(len(depth), np.nan)),
+    )
+
+
+def test_start_and_end_have_both_imu_and_dvl() -> None:
+    sequence = recording(imu_s=(0.5, 9.0), dvl_s=(1.0, 8.0))
+    assert sequence.start_ns == sequence.dvl.stamps_ns[0]
+    assert sequence.end_ns == sequence.dvl.stamps_ns[-1]
+    assert sequence.duration_s == pytest.approx(7.0)
+    assert recording(imu_s=(2.0, 9.0)).start_ns == recording(imu_s=(2.0, 9.0)).imu.stamps_ns[0]
+
+
+@given(st.floats(0.3, 40))
+def test_instants_are_equally_spaced_inside_the_sequence(rate_hz: float) -> None:
+    sequence = recording()
+    instants = sequence.instants(rate_hz)
+    step_ns = round(NS_PER_S / rate_hz)
+    assert instants[0] == sequence.start_ns + step_ns
+    assert sequence.end_ns - step_ns < instants[-1] <= sequence.end_ns
+    assert set(np.diff(instants).tolist()) <= {step_ns}
+
+
+def test_sequence_shorter_than_a_step_is_refused() -> None:
+    with pytest.raises(MeasurementError, match=r"too short for 0\.05 Hz"):
+        recording().instants(0.05)
+
+
+@given(st.floats(0.3, 40))
+def test_replay_hands_out_every_row_once_and_in_time(rate_hz: float) -> None:
+    sequence = recording()
+    steps = list(sequence.replay(sequence.instants(rate_hz)))
+    last_ns = steps[-1].end_ns
+    for name in ("imu", "dvl", "depth"):
+        handed = [getattr(step, name).stamps_ns for step in steps if getattr(step, name) is not None]
+        all_stamps = getattr(sequence, name).stamps_ns
+        np.testing.assert_array_equal(np.concatenate(handed), all_stamps[all_stamps <= last_ns])
+    for before, step in itertools.pairwise(steps):
+        if step.imu is not None:
+            assert before.end_ns < step.imu.stamps_ns[0]
+            assert step.imu.stamps_ns[-1] <= step.end_ns
+
+
+def test_first_step_of_a_replay_holds_what_came_before_the_start() -> None:
+    sequence = recording(imu_s=(1.0, 9.0))
+    first = next(sequence.replay(sequence.instants(2.0)))
+    assert first.depth is not None
+    assert first.depth.stamps_ns[0] < sequence.start_ns
+
+
+def test_sensor_that_is_missing_stays_missing() -> None:
+    step = next(recording().replay(recording().instants(1.0)))
+    assert step.detections is None

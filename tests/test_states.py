@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonar_graph.errors import MeasurementError
+from sonar_graph.states import Estimate, Trajectory
+
+angles = st.floats(-3.1, 3.1)
+
+
+def turning(n: int = 11, step_rad: float = 0.3) -> Trajectory:
+    """Constant speed along x and constant yaw rate, a second a row."""
+    yaw = step_rad * np.arange(n)
+    quaternions = np.column_stack([np.zeros(n), np.zeros(n), np.sin(yaw / 2), np.cos(yaw / 2)])
+    positions = np.column_stack([np.arange(n, dtype=float), np.zeros(n), np.full(n, -1.0)])
+    return Trajectory.without_covariances(np.arange(n, dtype=np.int64) * 10**9, positions, quaternions)
+
+
+@given(angles, st.floats(-1.5, 1.5), angles)
+def test_trajectory_through_estimates_keeps_their_poses(roll: float, pitch: float, yaw: float) -> None:
+    pose = gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array([1.0, -2.0, 3.0]))
+    covariance = np.diag(np.arange(1.0, 7.0))
+    path = Trajectory.from_estimates([Estimate(5, pose, covariance)])
+    np.testing.assert_allclose(path.rotations().as_matrix()[0], pose.rotation().matrix(), atol=1e-12)
+    np.testing.assert_array_equal(path.positions[0], pose.translation())
+    np.testing.assert_array_equal(path.covariances[0], covariance)
+
+
+def test_trajectory_through_no_estimate_is_empty() -> None:
+    path = Trajectory.from_estimates([])
+    assert len(path) == 0
+    assert path.covariances.shape == (0, 6, 6)
+
+
+def test_poses_at_the_own_instants_are_the_own_poses() -> None:
+    path = turning()
+    again = path.at(path.stamps_ns)
+    np.testing.assert_allclose(again.positions, path.positions, atol=1e-12)
+    np.testing.assert_allclose((again.rotations().inv() * path.rotations()).magnitude(), 0, atol=1e-12)
+
+
+@given(st.floats(0, 1), st.floats(-3, 3))
+def test_interpolation_of_a_steady_turn_is_exact(fraction: float, step_rad: float) -> None:
+    path = turning(3, step_rad)
+    stamp_ns = round((1 + fraction) * 1e9)
+    there = path.at(np.array([stamp_ns]))
+    seconds = stamp_ns * 1e-9
+    assert there.positions[0, 0] == pytest.approx(seconds, abs=1e-9)
+    half = step_rad * seconds / 2
+    dot = there.quaternions_xyzw[0] @ [0, 0, np.sin(half), np.cos(half)]
+    assert abs(dot) == pytest.approx(1, abs=1e-12)
+
+
+def test_interpolated_poses_claim_no_covariance() -> None:
+    assert np.isnan(turning().at(np.array([5 * 10**8])).covariances).all()
+
+
+def test_interpolation_keeps_nanoseconds_of_an_epoch() -> None:
+    path = turning(2)
+    epoch_ns = 1_700_000_000 * 10**9
+    late = Trajectory.without_covariances(path.stamps_ns + epoch_ns, path.positions, path.quaternions_xyzw)
+    moved_m = late.at(np.array([epoch_ns + 1])).positions[0, 0]
+    assert moved_m == pytest.approx(1e-9, rel=1e-6)
+
+
+@pytest.mark.parametrize("outside_ns", [-1, 10 * 10**9 + 1])
+def test_instants_outside_are_refused(outside_ns: int) -> None:
+    with pytest.raises(MeasurementError, match="outside"):
+        turning().at(np.array([outside_ns]))
+
+
+def test_stamps_must_increase_strictly() -> None:
+    with pytest.raises(MeasurementError, match="increase"):
+        Trajectory.without_covariances(np.array([1, 1]), np.zeros((2, 3)), np.tile([0.0, 0, 0, 1], (2, 1)))
+
+
+def test_rows_select_every_column_alike() -> None:
+    path = turning()
+    part = path.rows(np.array([2, 5]))
+    assert part.stamps_ns.tolist() == [2 * 10**9, 5 * 10**9]
+    np.testing.assert_array_equal(part.positions, path.positions[[2, 5]])
+    np.testing.assert_array_equal(part.quaternions_xyzw, path.quaternions_xyzw[[2, 5]])
+    assert part.covariances.shape == (2, 6, 6)
