@@ -103,25 +103,33 @@ def record(
     imu_ns, dvl_ns, depth_ns, truth_ns = (regular_stamps(rate, path.duration_s) for rate in rates_hz)
     frames_ns = regular_stamps(options.frame_rate_hz, path.duration_s, SONAR_OFFSET_S)
     truth = path.at(seconds_since_start(truth_ns))
-    faults = DvlFaults(options.dvl_scale_error, options.dvl_dropouts_per_hour, options.dvl_dropout_s)
-    recogniser = Recogniser(
-        options.detection_probability,
-        options.wrong_id_rate,
-        options.false_detections_per_frame,
-        options.confident_false_fraction,
-    )
     return Sequence(
         name=name,
         calibration=calibration,
         imu=simulate_imu(path, imu_ns, calibration.imu, calibration.gravity_m_s2, streams.imu),
-        dvl=simulate_dvl(path, dvl_ns, calibration.dvl, faults, streams.dvl),
+        dvl=simulate_dvl(path, dvl_ns, calibration.dvl, _dvl_faults(options), streams.dvl),
         depth=simulate_depth(path, depth_ns, calibration.depth, streams.depth),
         detections=simulate_detections(
-            path, frames_ns, calibration.sonar, vehicle.fan, recogniser, world, streams.sonar
+            path, frames_ns, calibration.sonar, vehicle.fan, _recogniser(options), world, streams.sonar
         ),
         truth=Trajectory.without_covariances(truth_ns, truth.position, truth.world_R_body.as_quat()),
         true_landmarks=world.landmark_map(),
         notes={"generator": f"sonar_graph {__version__}, {name}", "options": options.model_dump_json(), **notes},
+    )
+
+
+def _dvl_faults(options: SimulationOptions) -> DvlFaults:
+    """What goes wrong with the Doppler log."""
+    return DvlFaults(options.dvl_scale_error, options.dvl_dropouts_per_hour, options.dvl_dropout_s)
+
+
+def _recogniser(options: SimulationOptions) -> Recogniser:
+    """How often detections are right."""
+    return Recogniser(
+        detection_probability=options.detection_probability,
+        wrong_id_rate=options.wrong_id_rate,
+        false_detections_per_frame=options.false_detections_per_frame,
+        confident_false_fraction=options.confident_false_fraction,
     )
 
 
@@ -131,7 +139,7 @@ def _calibration(
     """What estimators are told: the very noise that is simulated, and a start drawn about the true one."""
     sigma_m_s = DVL_PRESETS[options.dvl].velocity_sigma_m_s
     return Calibration(
-        imu=scaled_imu(options),
+        imu=_scaled_imu(options),
         dvl=DvlCalibration(velocity_sigma_m_s=(sigma_m_s,) * 3, mounting=vehicle.dvl),
         depth=DepthCalibration(sigma_m=0.01, port_m=vehicle.depth_port_m),
         sonar=SonarCalibration(
@@ -145,7 +153,7 @@ def _calibration(
     )
 
 
-def scaled_imu(options: SimulationOptions) -> ImuCalibration:
+def _scaled_imu(options: SimulationOptions) -> ImuCalibration:
     """The IMU preset with its biases scaled."""
     preset = IMU_PRESETS[options.imu]
     return preset.model_copy(
