@@ -1,0 +1,139 @@
+"""Measurements and poses as messages: the reverse of decoding, and what viewers draw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+
+import numpy as np
+
+from sonar_graph.errors import LogError
+from sonar_graph.logs.cdr import Bytes, Value, encode
+from sonar_graph.logs.message_definitions import definition
+from sonar_graph.logs.pose_covariance import body_to_ros
+from sonar_graph.logs.recorder import Outgoing
+from sonar_graph.logs.roles import DETECTIONS, DVL, IMU, LANDMARK_MAP, ODOMETRY, POSE_WITH_COVARIANCE
+from sonar_graph.logs.schema import Struct, parse_definition
+from sonar_graph.logs.table import NS_PER_S
+from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints, LandmarkDetections
+from sonar_graph.states import LandmarkMap, Trajectory
+
+WORLD_FRAME = "map"
+BODY_FRAME = "base_link"
+_Z_VARIANCE = 14
+_SECONDS = np.iinfo(np.int32)
+
+
+@lru_cache
+def own_definition(type_name: str) -> Struct:
+    """The tree of one of the types that this package writes."""
+    return parse_definition(type_name, definition(type_name))
+
+
+def header(stamps_ns: Ints, frame_id: str, prefix: str = "header") -> dict[str, Value]:
+    """Columns of a header.
+
+    Raises
+    ------
+    LogError
+        When a stamp lies outside what ROS 2 can express (years 1901 to 2038).
+    """
+    seconds, nanoseconds = np.divmod(stamps_ns, NS_PER_S)
+    if len(seconds) and not (_SECONDS.min <= seconds.min() and seconds.max() <= _SECONDS.max):
+        raise LogError(f"stamp {stamps_ns.max()} ns: ROS 2 stamps have 32-bit seconds; give stamps of another epoch")
+    return {
+        f"{prefix}.stamp.sec": seconds,
+        f"{prefix}.stamp.nanosec": nanoseconds,
+        f"{prefix}.frame_id": frame_id,
+    }
+
+
+def fields(prefix: str, names: str, columns: Floats) -> dict[str, Value]:
+    """Columns side by side as fields: ``fields("velocity", "xyz", v)``."""
+    return {f"{prefix}.{name}": columns[..., i] for i, name in enumerate(names)}
+
+
+def outgoing(topic: str, type_name: str, stamps_ns: Ints, values: Mapping[str, Value]) -> Outgoing:
+    """Messages with one stamp each, recorded at that stamp."""
+    return Outgoing(topic, type_name, stamps_ns, encode(own_definition(type_name), len(stamps_ns), values))
+
+
+def imu_messages(topic: str, imu: Imu) -> Outgoing:
+    """``sensor_msgs/Imu`` without orientation."""
+    unmeasured = np.isnan(imu.specific_force).all(axis=1)
+    no_orientation = np.array([-1.0] + [0.0] * 8)
+    values = header(imu.stamps_ns, "imu")
+    values |= {"orientation.w": 1.0, "orientation_covariance": no_orientation[None, :]}
+    values |= fields("angular_velocity", "xyz", imu.angular_velocity)
+    values |= fields("linear_acceleration", "xyz", imu.specific_force)
+    values["linear_acceleration_covariance"] = np.outer(unmeasured, no_orientation)
+    return outgoing(topic, IMU, imu.stamps_ns, values)
+
+
+def dvl_messages(topic: str, dvl: Dvl) -> Outgoing:
+    """``marine_acoustic_msgs/Dvl`` over the bottom, without single beams."""
+    covariances = dvl.velocity_cov.reshape(-1, 9).copy()
+    covariances[np.isnan(covariances).any(axis=1)] = [-1.0] + [0.0] * 8
+    values = header(dvl.stamps_ns, "dvl") | fields("velocity", "xyz", dvl.velocity)
+    values |= {"velocity_mode": 1, "velocity_covar": covariances, "num_good_beams": 4}
+    return outgoing(topic, DVL, dvl.stamps_ns, values)
+
+
+def depth_messages(topic: str, depth: Depth) -> Outgoing:
+    """``PoseWithCovarianceStamped`` of which only z counts: it keeps the height to the bit, which pressure does not."""
+    covariances = np.zeros((len(depth), 36))
+    covariances[:, _Z_VARIANCE] = np.where(np.isnan(depth.variance_m2), 0.0, depth.variance_m2)
+    values = header(depth.stamps_ns, WORLD_FRAME)
+    values |= {"pose.pose.position.z": depth.z_m, "pose.pose.orientation.w": 1.0, "pose.covariance": covariances}
+    return outgoing(topic, POSE_WITH_COVARIANCE, depth.stamps_ns, values)
+
+
+def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgoing]:
+    """``sonar_graph_msgs/LandmarkDetections``, one a frame; frames with equally many detections share an entry."""
+    stamps_ns, first, counts = np.unique(detections.stamps_ns, return_index=True, return_counts=True)
+    entries = []
+    for count in np.unique(counts).tolist():
+        frames = counts == count
+        rows = first[frames][:, None] + np.arange(count)
+        values = header(stamps_ns[frames], "sonar") | {
+            name: column[rows].reshape(len(rows), -1)
+            for name, column in (
+                ("range_m", detections.range_m),
+                ("azimuth_rad", detections.azimuth_rad),
+                ("covariance", detections.range_azimuth_cov),
+                ("candidate_ids", detections.candidate_ids),
+                ("id_probability", detections.id_probability),
+            )
+        }
+        entries.append(outgoing(topic, DETECTIONS, stamps_ns[frames], values))
+    return entries
+
+
+def pose_columns(trajectory: Trajectory) -> dict[str, Value]:
+    """Columns of a ``PoseWithCovariance`` called ``pose``; a covariance of zeros: unknown."""
+    covariances = body_to_ros(trajectory.covariances, trajectory.rotations().as_matrix())
+    values = fields("pose.pose.position", "xyz", trajectory.positions)
+    values |= fields("pose.pose.orientation", "xyzw", trajectory.quaternions_xyzw)
+    return values | {"pose.covariance": covariances.reshape(-1, 36)}
+
+
+def odometry_messages(topic: str, trajectory: Trajectory) -> Outgoing:
+    """``nav_msgs/Odometry`` without a twist."""
+    values = header(trajectory.stamps_ns, WORLD_FRAME) | pose_columns(trajectory) | {"child_frame_id": BODY_FRAME}
+    return outgoing(topic, ODOMETRY, trajectory.stamps_ns, values)
+
+
+def landmark_map_message(topic: str, landmarks: LandmarkMap, stamp_ns: int) -> Outgoing:
+    """One ``sonar_graph_msgs/LandmarkMap``."""
+    stamps_ns = np.array([stamp_ns])
+    values = header(stamps_ns, WORLD_FRAME) | {
+        "ids": landmarks.ids[None, :],
+        "position": landmarks.positions.reshape(1, -1),
+        "covariance": landmarks.covariances.reshape(1, -1),
+    }
+    return outgoing(topic, LANDMARK_MAP, stamps_ns, values)
+
+
+def static_message(topic: str, type_name: str, stamp_ns: int, payload: Bytes) -> Outgoing:
+    """One message that was encoded already."""
+    return Outgoing(topic, type_name, np.array([stamp_ns]), payload)

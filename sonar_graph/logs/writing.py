@@ -1,0 +1,52 @@
+"""From a `Sequence` to an MCAP log."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from sonar_graph.logs import encoding
+from sonar_graph.logs.mountings import encode_mountings
+from sonar_graph.logs.reading import METADATA
+from sonar_graph.logs.recorder import Outgoing, write_recording
+from sonar_graph.logs.roles import TF
+from sonar_graph.sequence import Sequence
+
+
+def write_sequence(path: Path, sequence: Sequence) -> None:
+    """Write a log of ROS 2 messages from which `read_sequence` gives the same sequence.
+
+    Parameters
+    ----------
+    path
+        The MCAP file; one that exists is replaced.
+    sequence
+        Its calibration, name and notes go into the metadata record ``sonar_graph``; the mountings into ``/tf_static``.
+
+    Raises
+    ------
+    LogError
+        When the file cannot be written, or a stamp does not fit into a ROS 2 message.
+    """
+    record = {
+        "name": sequence.name,
+        "calibration": sequence.calibration.model_dump_json(),
+        "notes": json.dumps(sequence.notes),
+    }
+    write_recording(Path(path), _messages(sequence), {METADATA: record})
+
+
+def _messages(sequence: Sequence) -> list[Outgoing]:
+    first_ns = int(min(sequence.imu.stamps_ns[0], sequence.dvl.stamps_ns[0]))
+    messages = [encoding.static_message("/tf_static", TF, first_ns, encode_mountings(sequence.calibration))]
+    if sequence.true_landmarks is not None:
+        messages.append(encoding.landmark_map_message("/ground_truth/landmarks", sequence.true_landmarks, first_ns))
+    messages.append(encoding.imu_messages("/imu/data", sequence.imu))
+    messages.append(encoding.dvl_messages("/dvl/data", sequence.dvl))
+    if sequence.depth is not None:
+        messages.append(encoding.depth_messages("/depth/pose", sequence.depth))
+    if sequence.detections is not None:
+        messages += encoding.detection_messages("/sonar/landmarks", sequence.detections)
+    if sequence.truth is not None:
+        messages.append(encoding.odometry_messages("/ground_truth/odometry", sequence.truth))
+    return messages
