@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sonar_graph.evaluation.instants import gap_limit_s, rows_at, scored_instants
+from sonar_graph.evaluation.results import RunResult
+from sonar_graph.states import Trajectory
+
+
+def trajectory(seconds: list[float]) -> Trajectory:
+    stamps = np.round(np.array(seconds) * 1e9).astype(np.int64)
+    n = len(stamps)
+    positions = np.column_stack([stamps * 1e-9, np.zeros((n, 2))])
+    return Trajectory.without_covariances(stamps, positions, np.tile([0.0, 0, 0, 1], (n, 1)))
+
+
+def seconds(*values: float) -> np.ndarray:
+    return np.round(np.array(values) * 1e9).astype(np.int64)
+
+
+DENSE = np.arange(0, 3.01, 0.1).tolist()
+
+
+def test_instants_outside_the_truth_are_left_out_and_counted() -> None:
+    scored = scored_instants(seconds(-0.5, 0, 1, 3, 3.5), trajectory(DENSE), [])
+    np.testing.assert_array_equal(scored.stamps_ns, seconds(0, 1, 3))
+    assert (scored.asked, scored.outside_truth, scored.in_truth_gap) == (5, 2, 0)
+    assert str(scored) == "3 of 5 instants (left out: 2 outside the truth's time span)"
+
+
+def test_instants_in_a_gap_of_the_truth_are_left_out_but_not_its_edges() -> None:
+    occluded = [t for t in DENSE if not 1.0 < t < 1.95]
+    scored = scored_instants(seconds(0.5, 1.0, 1.5, 2.0), trajectory(occluded), [])
+    np.testing.assert_array_equal(scored.stamps_ns, seconds(0.5, 1.0, 2.0))
+    assert scored.in_truth_gap == 1
+    assert "1 in gaps of the truth longer than 0.5 s" in str(scored)
+
+
+def test_a_short_gap_is_interpolated() -> None:
+    occluded = [t for t in DENSE if not 1.05 < t < 1.45]
+    assert len(scored_instants(seconds(1.25), trajectory(occluded), [])) == 1
+
+
+def test_a_sparse_truth_is_no_gap_throughout() -> None:
+    reference = trajectory([0.0, 1.0, 2.0, 3.0, 6.0, 7.0])
+    assert gap_limit_s(reference) == pytest.approx(1.5)
+    scored = scored_instants(seconds(0.5, 1.5, 4.0, 6.5), reference, [])
+    np.testing.assert_array_equal(scored.stamps_ns, seconds(0.5, 1.5, 6.5))
+
+
+def test_an_instant_that_one_run_lacks_is_left_out_for_all() -> None:
+    runs = [
+        RunResult("a", {}, "ok", causal=trajectory([0.5, 1.0, 1.5])),
+        RunResult("b", {}, "ok", causal=trajectory([1.0, 1.5])),
+        RunResult("c", {}, "failed", "raised"),
+    ]
+    scored = scored_instants(seconds(0.5, 1.0, 1.5), trajectory(DENSE), runs)
+    np.testing.assert_array_equal(scored.stamps_ns, seconds(1.0, 1.5))
+    assert scored.not_estimated == 1
+
+
+def test_rows_are_found_by_stamp() -> None:
+    rows = rows_at(trajectory(DENSE), seconds(0.5, 2.0))
+    np.testing.assert_allclose(rows.positions[:, 0], [0.5, 2.0])

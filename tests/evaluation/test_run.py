@@ -1,0 +1,223 @@
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+import sonar_graph.evaluation.run as run_module
+from sonar_graph.errors import EstimatorError, UnknownEstimatorError
+from sonar_graph.evaluation.run import run_estimator
+from sonar_graph.measurements import Measurements
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import Estimate, LandmarkMap, Trajectory
+
+Make = Callable[..., Sequence]
+Install = Callable[..., None]
+
+
+def test_every_row_reaches_the_estimator_once_and_in_order(
+    install: Install, make_sequence: Make, offset_estimator: Any
+) -> None:
+    seen: list[Measurements] = []
+
+    class Recorder(offset_estimator):
+        def process(self, measurements: Measurements) -> Estimate | None:
+            seen.append(measurements)
+            return super().process(measurements)
+
+    install(recorder=Recorder)
+    sequence = make_sequence()
+    result = run_estimator(sequence, "recorder", rate_hz=2.0)
+    assert result.status == "ok"
+    stamps = np.concatenate([step.imu.stamps_ns for step in seen if step.imu])
+    np.testing.assert_array_equal(stamps, sequence.imu.stamps_ns)
+    np.testing.assert_array_equal([step.end_ns for step in seen], sequence.instants(2.0))
+
+
+def test_causal_and_smoothed_are_what_the_estimator_said(
+    install: Install, make_sequence: Make, offset_estimator: Any
+) -> None:
+    install(offset=offset_estimator)
+    result = run_estimator(make_sequence(), "offset", {"offset_m": 0.4})
+    assert result.causal is not None
+    assert result.smoothed is not None
+    np.testing.assert_allclose(result.causal.positions[:, 1], 0.4)
+    np.testing.assert_allclose(result.smoothed.positions[:, 1], 0.2)
+    assert result.params == {"offset_m": 0.4, "sigma_m": 0.3}
+    assert result.landmarks is not None
+    assert result.detections is not None
+
+
+def test_only_calls_of_the_estimator_are_timed(
+    install: Install, make_sequence: Make, offset_estimator: Any
+) -> None:
+    class Slow(offset_estimator):
+        def process(self, measurements: Measurements) -> Estimate | None:
+            time.sleep(0.01)
+            return super().process(measurements)
+
+        def trajectory(self) -> Trajectory:
+            time.sleep(0.03)
+            return super().trajectory()
+
+    install(slow=Slow)
+    before = time.perf_counter()
+    result = run_estimator(make_sequence(5.0), "slow", progress=lambda done, total: time.sleep(0.02))
+    whole_s = time.perf_counter() - before
+    assert len(result.update_s) == 10
+    assert np.all(result.update_s >= 0.01)
+    assert result.finish_s >= 0.03
+    assert result.update_s.sum() + result.finish_s < whole_s - 10 * 0.02
+
+
+def test_progress_counts_to_the_total(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
+    install(offset=offset_estimator)
+    calls: list[tuple[int, int]] = []
+    run_estimator(make_sequence(5.0), "offset", progress=lambda done, total: calls.append((done, total)))
+    assert calls == [(i, 10) for i in range(1, 11)]
+
+
+def test_an_exception_becomes_a_reason_of_one_line_with_type_and_time(
+    install: Install, make_sequence: Make, offset_estimator: Any
+) -> None:
+    class Singular(offset_estimator):
+        def process(self, measurements: Measurements) -> Estimate | None:
+            if len(self.estimates) == 6:
+                raise ZeroDivisionError("the matrix\n  is singular")
+            return super().process(measurements)
+
+    install(singular=Singular)
+    result = run_estimator(make_sequence(), "singular")
+    assert result.status == "failed"
+    assert result.reason == "3.500 s after the start (4500000000 ns): ZeroDivisionError: the matrix is singular"
+    assert result.causal is None
+    assert len(result.update_s) == 6
+
+
+def estimate_with(estimate: Estimate, **change: Any) -> Estimate:
+    return replace(estimate, **change)
+
+
+NAN_POSE = gtsam.Pose3(gtsam.Rot3(), np.array([np.nan, 0.0, 0.0]))
+NEGATIVE = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1e-3])
+ASYMMETRIC = np.eye(6) + 0.5 * np.eye(6, k=1)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"world_T_body": NAN_POSE}, "causal pose is not finite in 39 of 40 rows, first at ns 2000000000"),
+        ({"covariance": NEGATIVE}, "causal covariance is impossible in 39 of 40 rows"),
+        ({"covariance": ASYMMETRIC}, "causal covariance is impossible"),
+        ({"covariance": np.where(np.eye(6) > 0, np.nan, 0.0)}, "causal covariance is impossible"),
+        ({"stamp_ns": 17}, "returned an estimate for 17 ns when asked for 2000000000 ns"),
+    ],
+)
+def test_an_impossible_estimate_fails_the_run(
+    install: Install, make_sequence: Make, offset_estimator: Any, change: dict[str, Any], reason: str
+) -> None:
+    class Wrong(offset_estimator):
+        def process(self, measurements: Measurements) -> Estimate | None:
+            estimate = super().process(measurements)
+            return estimate if len(self.estimates) == 1 else estimate_with(estimate, **change)
+
+    install(wrong=Wrong)
+    result = run_estimator(make_sequence(), "wrong")
+    assert result.status == "failed"
+    assert reason in result.reason
+
+
+def test_unknown_covariances_are_allowed(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
+    class Modest(offset_estimator):
+        def beside(self, stamp_ns: int, offset_m: float) -> Estimate:
+            return estimate_with(super().beside(stamp_ns, offset_m), covariance=np.full((6, 6), np.nan))
+
+    install(modest=Modest)
+    assert run_estimator(make_sequence(), "modest").status == "ok"
+
+
+def test_rounding_below_zero_is_no_impossible_covariance(
+    install: Install, make_sequence: Make, offset_estimator: Any
+) -> None:
+    class Rounded(offset_estimator):
+        def beside(self, stamp_ns: int, offset_m: float) -> Estimate:
+            return estimate_with(super().beside(stamp_ns, offset_m), covariance=np.diag([1.0] * 5 + [-1e-12]))
+
+    install(rounded=Rounded)
+    assert run_estimator(make_sequence(), "rounded").status == "ok"
+
+
+def test_a_trajectory_at_other_instants_fails_the_run(
+    install: Install, make_sequence: Make, offset_estimator: Any
+) -> None:
+    class Short(offset_estimator):
+        def trajectory(self) -> Trajectory:
+            return super().trajectory().rows(slice(1, None))
+
+    install(short=Short)
+    result = run_estimator(make_sequence(), "short")
+    assert result.status == "failed"
+    assert "trajectory() has 39 instants, not the 40" in result.reason
+
+
+def test_a_map_that_is_not_finite_fails_the_run(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
+    class Lost(offset_estimator):
+        def landmarks(self) -> LandmarkMap:
+            return LandmarkMap(np.array([7]), np.array([[np.inf, 0.0, 0.0]]), np.full((1, 3, 3), np.nan))
+
+    install(lost=Lost)
+    result = run_estimator(make_sequence(), "lost")
+    assert "position is not finite in 1 of 1 rows, first at landmark 7" in result.reason
+
+
+def test_an_estimator_that_never_speaks_fails(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
+    class Mute(offset_estimator):
+        def process(self, measurements: Measurements) -> Estimate | None:
+            return None
+
+    install(mute=Mute)
+    assert "never returned an estimate" in run_estimator(make_sequence(), "mute").reason
+
+
+def test_an_empty_map_is_fine(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
+    class Blind(offset_estimator):
+        def landmarks(self) -> LandmarkMap:
+            return LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+
+    install(blind=Blind)
+    assert run_estimator(make_sequence(), "blind").status == "ok"
+
+
+def test_mistakes_of_the_user_are_raised(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
+    install(offset=offset_estimator)
+    with pytest.raises(UnknownEstimatorError):
+        run_estimator(make_sequence(), "ofset")
+    with pytest.raises(EstimatorError, match="offset_cm"):
+        run_estimator(make_sequence(), "offset", {"offset_cm": 3})
+
+
+def test_an_estimator_that_cannot_be_loaded_is_a_failed_run(
+    monkeypatch: pytest.MonkeyPatch, make_sequence: Make
+) -> None:
+    def load(name: str) -> Any:
+        raise EstimatorError(f"{name} cannot be loaded: No module named 'torch'")
+
+    monkeypatch.setattr(run_module, "load_estimator", load)
+    result = run_estimator(make_sequence(), "neural")
+    assert result.status == "failed"
+    assert "No module named 'torch'" in result.reason
+
+
+def test_interruption_is_not_swallowed(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
+    class Interrupted(offset_estimator):
+        def process(self, measurements: Measurements) -> Estimate | None:
+            raise KeyboardInterrupt
+
+    install(interrupted=Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_estimator(make_sequence(), "interrupted")
