@@ -117,7 +117,7 @@ class Odometry:
 
     def _steps(self, start_ns: int, end_ns: int, imu_rows: int, dvl_rows: int) -> Steps:
         return Steps(
-            *_merge(
+            *merge_rows(
                 start_ns,
                 end_ns,
                 self._imu_ns[:imu_rows],
@@ -136,7 +136,19 @@ class Odometry:
         i = int(np.searchsorted(self._imu_ns, node_ns))
         if self._hold_past or i == 0:
             return self._velocity[k], self._cov[k], self._rate[i]
-        return self._velocity[k], self._cov[k], _between(self._imu_ns, self._rate, i, node_ns, False)
+        return self._velocity[k], self._cov[k], value_at(self._imu_ns, self._rate, i, node_ns, False)
+
+    def columns(self) -> tuple[Ints, Floats, Floats, Ints, Floats, Floats, bool]:
+        """What `merge_rows` takes after the two instants, all rows, for compiled loops over many instants."""
+        return (
+            self._imu_ns,
+            self._rate,
+            self._force,
+            self._dvl_ns,
+            self._velocity,
+            self._cov,
+            self._hold_past,
+        )
 
     def forget_before(self, node_ns: int) -> None:
         """Drop rows that no motion from this node on can need."""
@@ -162,7 +174,7 @@ def _last(stamps_ns: Ints) -> int:
 
 
 @compiled
-def _between(stamps: Ints, values: Floats, i: int, t: int, hold_past: bool) -> Floats:
+def value_at(stamps: Ints, values: Floats, i: int, t: int, hold_past: bool) -> Floats:
     """Value at t, where ``stamps[i - 1] < t <= stamps[i]``; the nearest end's value outside the rows."""
     n = len(stamps)
     if i >= n:
@@ -187,7 +199,7 @@ def _velocity_psd(dvl_ns: Ints, cov: Floats, k: int, hold_past: bool) -> Floats:
 
 
 @compiled
-def _merge(
+def merge_rows(
     start_ns: int,
     end_ns: int,
     imu_ns: Ints,
@@ -213,9 +225,9 @@ def _merge(
             until = dvl_ns[k]
         middle = t + (until - t) // 2
         duration[n] = (until - t) * 1e-9
-        rates[n] = _between(imu_ns, rate, i, middle, hold_past)
-        forces[n] = _between(imu_ns, force, i, middle, hold_past)
-        velocities[n] = _between(dvl_ns, velocity, k, middle, hold_past)
+        rates[n] = value_at(imu_ns, rate, i, middle, hold_past)
+        forces[n] = value_at(imu_ns, force, i, middle, hold_past)
+        velocities[n] = value_at(dvl_ns, velocity, k, middle, hold_past)
         psds[n] = _velocity_psd(dvl_ns, cov, k, hold_past)
         n += 1
         t = until

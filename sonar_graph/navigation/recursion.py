@@ -1,0 +1,235 @@
+"""The recursion of preintegration as machine code: about 0.2 µs for a step, where matrix expressions take 5 µs.
+
+The equations are those of `sonar_graph.navigation.dvl_preintegration`. Arrays are made once before the loop, and
+products of 3 × 3 matrices are written into arrays that exist: in compiled code a small allocation costs as much as the
+arithmetic, and a call into BLAS several times that.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sonar_graph.measurements import Floats
+from sonar_graph.navigation.kernels import SMALL_ANGLE_RAD, compiled, skew
+
+
+@compiled
+def integrate_steps(
+    duration: Floats,
+    rate: Floats,
+    velocity: Floats,
+    velocity_psd: Floats,
+    force: Floats,
+    bias: Floats,
+    earth: Floats,
+    lever: Floats,
+    gyro_density: float,
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Motion over all steps, from frame i to frame j.
+
+    Parameters
+    ----------
+    duration, rate, velocity, velocity_psd, force
+        The columns of `sonar_graph.navigation.odometry.Steps`.
+    bias
+        Gyro bias to remove, body frame, shape (3,), rad/s.
+    earth
+        Earth's rotation in frame i, shape (3,), rad/s.
+    lever
+        The DVL in the body frame, shape (3,), m.
+    gyro_density
+        White noise of the gyros, rad/s/√Hz.
+
+    Returns
+    -------
+    dR (3, 3), dp (3,), covariance (6, 6) and bias Jacobian (6, 3) of the perturbation in frame j, and the integral of
+    the specific force in frame i (3,), m/s.
+    """
+    dR, dp, impulse = np.eye(3), np.zeros(3), np.zeros(3)
+    cov_tt, cov_rt, cov_rr = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    D_t, D_r = np.zeros((3, 3)), np.zeros((3, 3))
+    turn, chord, back, unchord = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    w, phi, u, step = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    turned, swing, G_r = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    work, other = np.empty((3, 3)), np.empty((3, 3))
+    lever_cross = skew(lever)
+    for k in range(len(duration)):
+        dt = duration[k]
+        for r in range(3):
+            w[r] = rate[k, r] - bias[r] - (dR[0, r] * earth[0] + dR[1, r] * earth[1] + dR[2, r] * earth[2])
+            phi[r] = w[r] * dt
+        for r in range(3):
+            a, b = (r + 1) % 3, (r + 2) % 3
+            u[r] = velocity[k, r] - (w[a] * lever[b] - w[b] * lever[a])
+        _rotations(phi, turn, chord, back, unchord)
+        for r in range(3):
+            step[r] = (chord[r, 0] * u[0] + chord[r, 1] * u[1] + chord[r, 2] * u[2]) * dt
+
+        _product(dR, chord, turned)
+        _swing(dR, step, swing)
+        _chord_derivative(phi, u, dt, work)
+        _product(dR, work, G_r)
+        _add_product(turned, lever_cross, G_r)
+        _transport(cov_tt, cov_rt, cov_rr, back, swing, work, other)
+        _add_gyro_noise(cov_tt, cov_rt, cov_rr, unchord, G_r, gyro_density * gyro_density * dt)
+        _add_turned(turned, velocity_psd[k], dt, cov_rr, work)
+        _transport_bias(D_t, D_r, back, swing, unchord, G_r, dt, work)
+
+        for r in range(3):
+            impulse[r] += (dR[r, 0] * force[k, 0] + dR[r, 1] * force[k, 1] + dR[r, 2] * force[k, 2]) * dt
+            dp[r] += dR[r, 0] * step[0] + dR[r, 1] * step[1] + dR[r, 2] * step[2]
+        _product(dR, turn, work)
+        dR[:] = work
+    cov, D = _in_last_frame(dR, cov_tt, cov_rt, cov_rr, D_t, D_r)
+    return dR, dp, cov, D, impulse
+
+
+@compiled
+def _rotations(phi: Floats, turn: Floats, chord: Floats, back: Floats, unchord: Floats) -> None:
+    """Exp(phi), J_l(phi), Exp(-phi) and J_l(-phi) at once: they share sine and cosine."""
+    angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    if angle2 < SMALL_ANGLE_RAD**2:
+        s1, s2, s3 = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0, 1.0 / 6.0 - angle2 / 120.0
+    else:
+        angle = np.sqrt(angle2)
+        s1, s2 = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
+        s3 = (1.0 - s1) / angle2
+    _fill(phi, angle2, s1, s2, turn)
+    _fill(phi, angle2, s2, s3, chord)
+    _fill(phi, angle2, -s1, s2, back)
+    _fill(phi, angle2, -s2, s3, unchord)
+
+
+@compiled
+def _fill(phi: Floats, angle2: float, a: float, b: float, out: Floats) -> None:
+    """``I + a [phi]x + b [phi]x^2``, with ``[phi]x^2 = phi phi^T - |phi|^2 I``."""
+    for r in range(3):
+        for c in range(3):
+            out[r, c] = b * phi[r] * phi[c]
+        out[r, r] += 1.0 - b * angle2
+    for r in range(3):
+        c, other = (r + 1) % 3, (r + 2) % 3
+        out[r, c] -= a * phi[other]
+        out[c, r] += a * phi[other]
+
+
+@compiled
+def _product(A: Floats, B: Floats, out: Floats) -> None:
+    """``out = A B``, 3 × 3."""
+    for r in range(3):
+        for c in range(3):
+            out[r, c] = A[r, 0] * B[0, c] + A[r, 1] * B[1, c] + A[r, 2] * B[2, c]
+
+
+@compiled
+def _add_product(A: Floats, B: Floats, out: Floats) -> None:
+    """``out += A B``, 3 × 3."""
+    for r in range(3):
+        for c in range(3):
+            out[r, c] += A[r, 0] * B[0, c] + A[r, 1] * B[1, c] + A[r, 2] * B[2, c]
+
+
+@compiled
+def _product_transposed(A: Floats, B: Floats, out: Floats) -> None:
+    """``out = A B^T``, 3 × 3."""
+    for r in range(3):
+        for c in range(3):
+            out[r, c] = A[r, 0] * B[c, 0] + A[r, 1] * B[c, 1] + A[r, 2] * B[c, 2]
+
+
+@compiled
+def _swing(dR: Floats, step: Floats, out: Floats) -> None:
+    """``-dR [step]x``: what a rotation error does to the step that follows."""
+    for r in range(3):
+        out[r, 0] = dR[r, 2] * step[1] - dR[r, 1] * step[2]
+        out[r, 1] = dR[r, 0] * step[2] - dR[r, 2] * step[0]
+        out[r, 2] = dR[r, 1] * step[0] - dR[r, 0] * step[1]
+
+
+@compiled
+def _chord_derivative(phi: Floats, u: Floats, scale: float, out: Floats) -> None:
+    """Derivative of ``J_l(phi) u`` by phi, times scale; to second order in phi (a step turns by far less than 1 rad).
+
+    ``-[u]x / 2 - ([phi]x [u]x + [phi x u]x) / 6``, with ``[phi]x [u]x = u phi^T - (phi . u) I``.
+    """
+    dot = phi[0] * u[0] + phi[1] * u[1] + phi[2] * u[2]
+    for r in range(3):
+        for c in range(3):
+            out[r, c] = -scale * u[r] * phi[c] / 6.0
+        out[r, r] += scale * dot / 6.0
+    for r in range(3):
+        c, other = (r + 1) % 3, (r + 2) % 3
+        turn = scale * (0.5 * u[other] + (phi[r] * u[c] - phi[c] * u[r]) / 6.0)
+        out[r, c] += turn
+        out[c, r] -= turn
+
+
+@compiled
+def _transport(
+    cov_tt: Floats, cov_rt: Floats, cov_rr: Floats, back: Floats, swing: Floats, moved: Floats, work: Floats
+) -> None:
+    """``P <- F P F^T`` with ``F = [[back, 0], [swing, I]]``; ``moved`` and ``work`` are scratch."""
+    moved[:] = cov_rt
+    _add_product(swing, cov_tt, moved)
+    _product_transposed(swing, cov_rt, work)
+    for r in range(3):
+        for c in range(3):
+            cov_rr[r, c] += (
+                work[r, c] + moved[r, 0] * swing[c, 0] + moved[r, 1] * swing[c, 1] + moved[r, 2] * swing[c, 2]
+            )
+    _product_transposed(moved, back, cov_rt)
+    _product(back, cov_tt, work)
+    _product_transposed(work, back, cov_tt)
+
+
+@compiled
+def _add_gyro_noise(cov_tt: Floats, cov_rt: Floats, cov_rr: Floats, G_t: Floats, G_r: Floats, variance: float) -> None:
+    """``P += G G^T variance``."""
+    for r in range(3):
+        for c in range(3):
+            cov_tt[r, c] += variance * (G_t[r, 0] * G_t[c, 0] + G_t[r, 1] * G_t[c, 1] + G_t[r, 2] * G_t[c, 2])
+            cov_rt[r, c] += variance * (G_r[r, 0] * G_t[c, 0] + G_r[r, 1] * G_t[c, 1] + G_r[r, 2] * G_t[c, 2])
+            cov_rr[r, c] += variance * (G_r[r, 0] * G_r[c, 0] + G_r[r, 1] * G_r[c, 1] + G_r[r, 2] * G_r[c, 2])
+
+
+@compiled
+def _add_turned(turned: Floats, psd: Floats, dt: float, cov_rr: Floats, work: Floats) -> None:
+    """``P_rr += turned psd turned^T dt``."""
+    _product(turned, psd, work)
+    for r in range(3):
+        for c in range(3):
+            cov_rr[r, c] += dt * (work[r, 0] * turned[c, 0] + work[r, 1] * turned[c, 1] + work[r, 2] * turned[c, 2])
+
+
+@compiled
+def _transport_bias(
+    D_t: Floats, D_r: Floats, back: Floats, swing: Floats, G_t: Floats, G_r: Floats, dt: float, work: Floats
+) -> None:
+    """``D <- F D - G dt``."""
+    _add_product(swing, D_t, D_r)
+    _product(back, D_t, work)
+    for r in range(3):
+        for c in range(3):
+            D_t[r, c] = work[r, c] - G_t[r, c] * dt
+            D_r[r, c] -= G_r[r, c] * dt
+
+
+@compiled
+def _in_last_frame(
+    dR: Floats, cov_tt: Floats, cov_rt: Floats, cov_rr: Floats, D_t: Floats, D_r: Floats
+) -> tuple[Floats, Floats]:
+    """Covariance and bias Jacobian with the translation turned from frame i into frame j."""
+    cov, D = np.empty((6, 6)), np.empty((6, 3))
+    R_T = np.ascontiguousarray(dR.T)
+    turned, rr, work = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    _product(R_T, cov_rt, turned)
+    _product(R_T, cov_rr, work)
+    _product_transposed(work, R_T, rr)
+    _product(R_T, D_r, work)
+    for r in range(3):
+        for c in range(3):
+            cov[r, c] = 0.5 * (cov_tt[r, c] + cov_tt[c, r])
+            cov[3 + r, c] = cov[c, 3 + r] = turned[r, c]
+            cov[3 + r, 3 + c] = 0.5 * (rr[r, c] + rr[c, r])
+            D[r, c], D[3 + r, c] = D_t[r, c], work[r, c]
+    return cov, D
