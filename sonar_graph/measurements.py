@@ -7,7 +7,7 @@ last call; that is what an estimator processes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Self
 
@@ -117,6 +117,12 @@ class LandmarkDetections(Block):
     """Identities that the recogniser considers, shape (n, k); -1 fills unused places."""
     id_probability: Floats
     """Posterior of each candidate, shape (n, k). What is missing to 1 is "none of the known landmarks"."""
+
+    def frames(self) -> Iterator[LandmarkDetections]:
+        """The rows of each sonar frame, that is of each stamp."""
+        ends = np.append(np.flatnonzero(np.diff(self.stamps_ns)) + 1, len(self)).tolist()
+        for first, last in zip([0, *ends[:-1]], ends, strict=True):
+            yield self.rows(slice(first, last))
 
     def most_probable(self) -> tuple[Ints, Floats]:
         """Identity with the highest posterior and that posterior, shapes (n,) and (n,)."""

@@ -31,6 +31,7 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.kernels import compiled, left_jacobian, rotation_exp, skew
 from sonar_graph.navigation.odometry import Steps
+from sonar_graph.navigation.recursion import integrate_steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +81,7 @@ class Preintegrator:
         earth_rate
             Earth's rotation in body frame i, shape (3,), rad/s; None: not removed.
         """
-        rotation, displacement, cov, D, force = _integrate(
+        rotation, displacement, cov, D, impulse = integrate_steps(
             steps.duration_s,
             steps.rate,
             steps.velocity,
@@ -92,59 +93,43 @@ class Preintegrator:
             self.gyro_noise_density,
         )
         i_T_j = gtsam.Pose3(gtsam.Rot3(rotation), displacement)
-        return PreintegratedMotion(i_T_j, cov, D, bias, float(steps.duration_s.sum()), force)
+        duration_s = float(steps.duration_s.sum())
+        mean_force = impulse / duration_s if duration_s > 0 else np.full(3, np.nan)
+        return PreintegratedMotion(i_T_j, cov, D, bias, duration_s, mean_force)
+
+    def path_of(self, point: Floats, steps: Steps, bias: Floats, offsets_s: Floats) -> Floats:
+        """Positions of a point of the body at times after the first instant, in the first body frame.
+
+        Parameters
+        ----------
+        point
+            In the body frame, shape (3,), m.
+        offsets_s
+            Times after the start of the steps, not decreasing, shape (n,).
+
+        Returns
+        -------
+        Floats
+            Shape (n, 3), m; linear within a step.
+        """
+        return _path(steps.duration_s, steps.rate, steps.velocity, bias, self.body_p_dvl, point, offsets_s)
 
 
 @compiled
-def _integrate(
-    duration: Floats,
-    rate: Floats,
-    velocity: Floats,
-    velocity_psd: Floats,
-    force: Floats,
-    bias: Floats,
-    earth: Floats,
-    lever: Floats,
-    gyro_density: float,
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """The recursion of the module's docstring; covariance and bias Jacobian leave it in frame j."""
+def _path(
+    duration: Floats, rate: Floats, velocity: Floats, bias: Floats, lever: Floats, point: Floats, offsets: Floats
+) -> Floats:
+    positions = np.empty((len(offsets), 3))
     dR, dp = np.eye(3), np.zeros(3)
-    P, D = np.zeros((6, 6)), np.zeros((6, 3))
-    F, G = np.eye(6), np.zeros((6, 3))
-    L = skew(lever)
-    mean_force = np.zeros(3)
+    before, elapsed, n = dR @ point, 0.0, 0
     for k in range(len(duration)):
-        dt = duration[k]
-        w = rate[k] - bias - dR.T @ earth
-        phi = w * dt
-        u = velocity[k] - L.T @ w
-        J = left_jacobian(phi)
-        step = J @ u * dt
-        turned = dR @ J
-        F[:3, :3] = rotation_exp(-phi)
-        F[3:, :3] = -dR @ skew(step)
-        G[:3] = left_jacobian(-phi) * dt
-        G[3:] = (dR @ _chord_derivative(phi, u) * dt + turned @ L) * dt
-        P = F @ P @ F.T + G @ G.T * (gyro_density**2 / dt)
-        P[3:, 3:] += turned @ velocity_psd[k] @ turned.T * dt
-        D = F @ D - G
-        mean_force += dR @ force[k] * dt
-        dp = dp + dR @ step
-        dR = dR @ rotation_exp(phi)
-    to_frame_j = np.eye(6)
-    to_frame_j[3:, 3:] = dR.T
-    total = np.sum(duration)
-    return (
-        dR,
-        dp,
-        to_frame_j @ P @ to_frame_j.T,
-        to_frame_j @ D,
-        mean_force / total if total > 0 else mean_force * np.nan,
-    )
-
-
-@compiled
-def _chord_derivative(phi: Floats, u: Floats) -> Floats:
-    """Derivative of ``J_l(phi) u`` by phi, to second order in phi (a step turns by far less than a radian)."""
-    K, U = skew(phi), skew(u)
-    return -0.5 * U - (K @ U + skew(K @ u)) / 6.0
+        w = rate[k] - bias
+        dp = dp + dR @ (left_jacobian(w * duration[k]) @ (velocity[k] - skew(w) @ lever)) * duration[k]
+        dR = dR @ rotation_exp(w * duration[k])
+        after = dp + dR @ point
+        while n < len(offsets) and offsets[n] <= elapsed + duration[k]:
+            positions[n] = before + (offsets[n] - elapsed) / duration[k] * (after - before)
+            n += 1
+        before, elapsed = after, elapsed + duration[k]
+    positions[n:] = before
+    return positions

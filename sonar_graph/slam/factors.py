@@ -1,0 +1,202 @@
+"""The factors of the graph, each from a measurement and its noise.
+
+::
+
+    start prior ── X0 ──odometry── X1 ──odometry── X2 ── ...        X  world_T_body at a keyframe
+                   │ ╲            ╱ │                                B  gyro bias, one a stretch of time
+                   │   B0 ──walk── B1                                L  landmark in the world
+                   └── range, azimuth ── L7 ── floor prior
+    depth, gravity direction and the planar constraint: one keyframe each
+
+All but the odometry factor with a gyro bias are GTSAM's own (compiled) factors; each is checked numerically in the tests
+against `sonar_graph.slam.models`. Range and azimuth are two factors, so that elevation stays unknown:
+
+* range: ``RangeFactorWithTransform3D``.
+* azimuth: a pinhole camera whose optical axis lies in the sonar's fan plane along the measured azimuth. Its horizontal
+  image coordinate of a point is ``tan(azimuth - measured)`` whatever the elevation, its vertical one
+  ``tan(elevation)`` for small azimuth errors, so a horizontal sigma and a vertical sigma say exactly what is known. The
+  tangent differs from its argument by less than 1e-4 relative within 1 degree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import gtsam
+import numpy as np
+
+from sonar_graph.calibration import Calibration, PlanarMotion
+from sonar_graph.measurements import Floats
+from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
+from sonar_graph.slam.models import range_azimuth_jacobians, wrap_angle
+
+UNINFORMATIVE_M = 1e5
+UNINFORMATIVE_TANGENT = 1e3
+"""Sigmas that leave a direction to the other factors, in metres and as the tangent of an angle."""
+CORRELATION_LIMIT = 1e-6
+"""Above it, range and azimuth noise are taken together."""
+PINHOLE = gtsam.Cal3_S2()
+
+Robust = Callable[[gtsam.noiseModel.Base], gtsam.noiseModel.Base]
+"""Wraps a noise model in a robust kernel, or returns it as it is."""
+
+
+def start_prior(pose_key: int, calibration: Calibration) -> gtsam.NonlinearFactor:
+    """Prior of the first keyframe; position sigmas are along the world's axes, rotation sigmas about the body's."""
+    start = calibration.start
+    body_R_world = start.pose().rotation().matrix().T
+    cov = np.zeros((6, 6))
+    cov[:3, :3] = np.diag(np.square(start.rpy_sigma_rad))
+    cov[3:, 3:] = body_R_world @ np.diag(np.square(start.position_sigma_m)) @ body_R_world.T
+    return gtsam.PriorFactorPose3(pose_key, start.pose(), gtsam.noiseModel.Gaussian.Covariance(cov))
+
+
+def bias_prior(bias_key: int, sigma: float) -> gtsam.NonlinearFactor:
+    """Gyro bias is N(0, sigma²) on each axis, rad/s."""
+    return gtsam.PriorFactorPoint3(bias_key, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, sigma))
+
+
+def bias_walk(key_i: int, key_j: int, sigma: float) -> gtsam.NonlinearFactor:
+    """Gyro bias of the next stretch is that of the last, give or take sigma on each axis, rad/s."""
+    return gtsam.BetweenFactorPoint3(key_i, key_j, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, sigma))
+
+
+def odometry(key_i: int, key_j: int, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
+    """Relative pose from preintegrated gyro and DVL where the gyro has no bias to estimate."""
+    noise = gtsam.noiseModel.Gaussian.Covariance(motion.covariance)
+    return gtsam.BetweenFactorPose3(key_i, key_j, motion.i_T_j, noise)
+
+
+def odometry_with_bias(key_i: int, key_j: int, bias_key: int, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
+    """Relative pose from preintegrated gyro and DVL, and its gyro bias.
+
+    Error ``Log(corrected(b)^-1 X_i^-1 X_j)``, shape (6,), with ``corrected(b) = i_T_j Exp(D_bias (b - bias))``.
+    """
+    keys = [key_i, key_j, bias_key]
+    inverse_mean = motion.i_T_j.inverse()
+
+    def error(
+        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None
+    ) -> Floats:
+        X_i, X_j = values.atPose3(key_i), values.atPose3(key_j)
+        return odometry_error(X_i, X_j, values.atPoint3(bias_key), motion, inverse_mean, jacobians)
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(motion.covariance), keys, error)
+
+
+def odometry_error(
+    X_i: gtsam.Pose3,
+    X_j: gtsam.Pose3,
+    bias: Floats,
+    motion: PreintegratedMotion,
+    inverse_mean: gtsam.Pose3,
+    jacobians: list[Floats] | None = None,
+) -> Floats:
+    """Error of `odometry_with_bias`, shape (6,); fills the derivatives by X_i (6, 6), X_j (6, 6), bias (6, 3)."""
+    correction = motion.D_bias @ (bias - motion.bias)
+    E = gtsam.Pose3.Expmap(-correction).compose(inverse_mean).compose(X_i.between(X_j))
+    error = gtsam.Pose3.Logmap(E)
+    if jacobians is not None:
+        D_log = gtsam.Pose3.LogmapDerivative(error)
+        E_inverse = E.inverse()
+        jacobians[0] = -D_log @ X_j.between(X_i).AdjointMap()
+        jacobians[1] = D_log
+        jacobians[2] = -D_log @ E_inverse.AdjointMap() @ gtsam.Pose3.ExpmapDerivative(correction) @ motion.D_bias
+    return error
+
+
+def landmark_sighting(
+    pose_key: int,
+    landmark_key: int,
+    body_T_sonar: gtsam.Pose3,
+    z: Floats,
+    cov: Floats,
+    robust: Robust,
+    elevation_sigma_rad: float | None = None,
+) -> list[gtsam.NonlinearFactor]:
+    """Range and azimuth of a landmark.
+
+    Parameters
+    ----------
+    body_T_sonar
+        Sonar in the keyframe's body frame when the frame was taken.
+    z, cov
+        Range (m) and azimuth (rad), shape (2,), and their covariance, shape (2, 2).
+    elevation_sigma_rad
+        Elevation is N(0, sigma²); None: not said here. Say it once a landmark: its elevation does not vary between
+        frames as noise would, so that repeating it would invent information.
+    """
+    correlation = cov[0, 1] / np.sqrt(cov[0, 0] * cov[1, 1])
+    factors = [_camera(pose_key, landmark_key, body_T_sonar, z[1], np.sqrt(cov[1, 1]), elevation_sigma_rad, robust)]
+    if abs(correlation) < CORRELATION_LIMIT:
+        noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, float(np.sqrt(cov[0, 0]))))
+        return [*factors, gtsam.RangeFactorWithTransform3D(pose_key, landmark_key, z[0], noise, body_T_sonar)]
+    elevation_only = (
+        [_camera(pose_key, landmark_key, body_T_sonar, z[1], UNINFORMATIVE_TANGENT, elevation_sigma_rad, robust)]
+        if elevation_sigma_rad
+        else []
+    )
+    return [*elevation_only, correlated_sighting(pose_key, landmark_key, body_T_sonar, z, cov, robust)]
+
+
+def _camera(
+    pose_key: int,
+    landmark_key: int,
+    body_T_sonar: gtsam.Pose3,
+    azimuth_rad: float,
+    azimuth_sigma_rad: float,
+    elevation_sigma_rad: float | None,
+    robust: Robust,
+) -> gtsam.NonlinearFactor:
+    c, s = np.cos(azimuth_rad), np.sin(azimuth_rad)
+    # Columns: image x to the left, image y up, optical axis along the measured azimuth.
+    sonar_R_camera = gtsam.Rot3(np.array([[-s, 0.0, c], [c, 0.0, s], [0.0, 1.0, 0.0]]))
+    body_T_camera = body_T_sonar.compose(gtsam.Pose3(sonar_R_camera, np.zeros(3)))
+    vertical = UNINFORMATIVE_TANGENT if elevation_sigma_rad is None else np.tan(elevation_sigma_rad)
+    noise = robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([azimuth_sigma_rad, vertical])))
+    return gtsam.GenericProjectionFactorCal3_S2(
+        np.zeros(2), noise, pose_key, landmark_key, PINHOLE, False, False, body_T_camera
+    )
+
+
+def correlated_sighting(
+    pose_key: int, landmark_key: int, body_T_sonar: gtsam.Pose3, z: Floats, cov: Floats, robust: Robust
+) -> gtsam.NonlinearFactor:
+    """Range and azimuth whose noises are correlated, as one factor: ``h(X, L) - z``, azimuth wrapped."""
+
+    def error(
+        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None
+    ) -> Floats:
+        X, p = values.atPose3(pose_key), values.atPoint3(landmark_key)
+        predicted, by_pose, by_landmark = range_azimuth_jacobians(X, body_T_sonar, p)
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = by_pose, by_landmark
+        return np.array([predicted[0] - z[0], wrap_angle(predicted[1] - z[1])])
+
+    return gtsam.CustomFactor(robust(gtsam.noiseModel.Gaussian.Covariance(cov)), [pose_key, landmark_key], error)
+
+
+def floor_prior(landmark_key: int, z_m: float, sigma_m: float) -> gtsam.NonlinearFactor:
+    """Landmark z is N(z_m, sigma_m²); x and y are left to the other factors."""
+    sigmas = np.array([UNINFORMATIVE_M, UNINFORMATIVE_M, sigma_m])
+    return gtsam.PriorFactorPoint3(landmark_key, np.array([0.0, 0.0, z_m]), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+
+
+def depth(pose_key: int, z_m: float, body_p_port: Floats, sigma_m: float) -> gtsam.NonlinearFactor:
+    """World z of a point of the body, shape (3,) in the body frame, is N(z_m, sigma_m²)."""
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([UNINFORMATIVE_M, UNINFORMATIVE_M, sigma_m]))
+    return gtsam.GPSFactorArm(pose_key, np.array([0.0, 0.0, z_m]), body_p_port, noise)
+
+
+def gravity_direction(pose_key: int, up_in_body: Floats, sigma_rad: float) -> gtsam.NonlinearFactor:
+    """World's up, seen in the body as ``up_in_body`` (any length), to sigma_rad about each horizontal axis."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma_rad)
+    return gtsam.AttitudeFactorPose3(pose_key, gtsam.Unit3(np.array([0.0, 0.0, 1.0])), noise, gtsam.Unit3(up_in_body))
+
+
+def planar(pose_key: int, motion: PlanarMotion) -> list[gtsam.NonlinearFactor]:
+    """The keyframe is level and at the plane's height."""
+    return [
+        gravity_direction(pose_key, np.array([0.0, 0.0, 1.0]), motion.tilt_sigma_rad),
+        depth(pose_key, motion.z_m, np.zeros(3), motion.z_sigma_m),
+    ]

@@ -1,0 +1,161 @@
+"""The smoothing estimator: keyframes, landmarks and gyro bias in one incrementally solved graph.
+
+Flow of one call of `Isam2.process`::
+
+    odometry  ── nodes due as keyframes ──► preintegrate ──► factors of that keyframe
+    frames of detections ──► newest keyframe, or a new one ──► identity ──► gate ──► sighting factors
+    one update of the smoother, if there is anything new
+    newest keyframe's estimate, carried on by odometry ──► Estimate at end_ns
+
+A frame is tied to its keyframe through the odometry between them: the sonar's pose in the keyframe's body frame at the
+time of the frame. Keyframes can then be sparser than frames at no loss but the (included) noise of that short motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L, X
+from pydantic import Field
+
+from sonar_graph.calibration import Calibration, Section
+from sonar_graph.measurements import Floats, Measurements
+from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
+from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
+from sonar_graph.slam.sightings import SightingPolicy, Sightings
+from sonar_graph.slam.smoother import Smoother
+from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
+
+
+class Isam2Params(Section):
+    """Settings of the smoothing estimator."""
+
+    lag_s: float = Field(30.0, gt=0)
+    """Poses older than this are marginalised out of the incremental solution; a large value keeps the whole history."""
+    min_keyframe_interval_s: float = Field(1.0, ge=0)
+    """While landmarks are seen, keyframes are at least this far apart."""
+    max_keyframe_interval_s: float = Field(5.0, gt=0)
+    """A keyframe is set at the latest after this time."""
+    bias_interval_s: float = Field(60.0, gt=0)
+    """The gyro bias is constant over stretches of this length."""
+    relinearize_threshold: float = Field(0.01, gt=0)
+    """A variable is relinearised when a component of its change exceeds this (rad or m)."""
+    kernel: Literal["none", "huber", "cauchy"] = "huber"
+    """Robust kernel on range and on azimuth."""
+    kernel_width: float = Field(2.0, gt=0)
+    """Width of the kernel, in standard deviations."""
+    identity_probability: float = Field(0.7, ge=0, le=1)
+    """A detection is used when its most probable identity has at least this posterior."""
+    gate_probability: float = Field(0.999, gt=0, le=1)
+    """A detection whose squared Mahalanobis innovation exceeds this chi-square quantile (2 dof) is refused; 1: none."""
+
+
+class Isam2:
+    """Landmark SLAM by incremental smoothing (Kaess et al., iSAM2, IJRR 31(2), 2012).
+
+    Parameters
+    ----------
+    calibration
+        What is known before the run.
+    params
+        Settings; None for the defaults.
+    """
+
+    Params: ClassVar[type[Section]] = Isam2Params
+
+    def __init__(self, calibration: Calibration, params: Any = None) -> None:
+        self._calibration = calibration
+        self._params: Isam2Params = params or Isam2Params()
+        p = self._params
+        self._smoother = Smoother(p.lag_s, p.relinearize_threshold)
+        policy = KeyframePolicy(p.min_keyframe_interval_s, p.max_keyframe_interval_s, p.bias_interval_s)
+        self._keyframes = Keyframes(calibration, policy, self._smoother)
+        sightings = SightingPolicy(p.identity_probability, p.gate_probability, p.kernel, p.kernel_width)
+        self._sightings = Sightings(calibration, sightings, self._smoother, self._keyframes)
+        self._asked: list[Anchored] = []
+
+    @property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """Every factor added so far."""
+        return self._smoother.graph
+
+    @property
+    def values(self) -> gtsam.Values:
+        """The newest estimate of every variable: ``X(i)`` keyframes, ``L(id)`` landmarks, ``B(i)`` gyro biases."""
+        return self._smoother.values
+
+    def process(self, measurements: Measurements) -> Estimate | None:
+        """Take in measurements; the causal estimate at their end, or None before IMU and DVL have begun."""
+        self._keyframes.add(measurements.imu, measurements.dvl, measurements.depth)
+        if measurements.detections is not None:
+            for frame in measurements.detections.frames():
+                self._keyframes.advance(int(frame.stamps_ns[0]))
+                self._sightings.add(frame)
+        self._keyframes.advance(measurements.end_ns)
+        if self._smoother.has_news:
+            self._smoother.update(self._keyframes.newest_s)
+        if self._keyframes.newest_ns is None:
+            return None
+        motion = self._keyframes.motion_since_newest(measurements.end_ns)
+        self._asked.append(Anchored(measurements.end_ns, len(self._keyframes.stamps_ns) - 1, motion))
+        return self._causal_estimate(self._asked[-1])
+
+    def _causal_estimate(self, asked: Anchored) -> Estimate:
+        X_key, B_key = X(asked.keyframe), self._keyframes.bias_key(asked.keyframe)
+        joint = self._smoother.joint_covariance([X_key] if B_key is None else [X_key, B_key])
+        return asked.carried_on(self._smoother.values, B_key, joint)
+
+    def trajectory(self) -> Trajectory:
+        """The smoothed pose at every instant at which `process` returned an estimate.
+
+        Solves the whole graph. Between keyframes the pose of the keyframe before is carried on by its own odometry.
+        """
+        values, marginals = self._smoother.solve_history()
+        estimates = []
+        for asked in self._asked:
+            X_key, B_key = X(asked.keyframe), self._keyframes.bias_key(asked.keyframe)
+            joint = marginals.jointMarginalCovariance([X_key] if B_key is None else [X_key, B_key])
+            estimates.append(asked.carried_on(values, B_key, joint))
+        return Trajectory.from_estimates(estimates)
+
+    def landmarks(self) -> LandmarkMap:
+        """Landmarks by identity after solving the whole graph, with marginal covariances."""
+        values, marginals = self._smoother.solve_history()
+        ids = sorted(self._sightings.ids)
+        return LandmarkMap(
+            np.array(ids, dtype=np.int64),
+            np.array([values.atPoint3(L(i)) for i in ids]).reshape(-1, 3),
+            np.array([marginals.marginalCovariance(L(i)) for i in ids]).reshape(-1, 3, 3),
+        )
+
+    def detections(self) -> DetectionLog:
+        """What became of each detection."""
+        return self._sightings.journal.log()
+
+
+@dataclass(frozen=True, eq=False)
+class Anchored:
+    """An instant, tied to the newest keyframe of its time by odometry."""
+
+    stamp_ns: int
+    keyframe: int
+    motion: PreintegratedMotion
+
+    def carried_on(self, values: gtsam.Values, bias_key: int | None, joint: gtsam.JointMarginal) -> Estimate:
+        """The pose at this instant from that of the keyframe (and the bias, whose error the motion inherits).
+
+        ``X Exp(e_X) M Exp(D e_b) = X M Exp(Ad(M^-1) e_X + D e_b)``, so the covariance is ``J P J^T`` with
+        ``J = [Ad(M^-1) D]`` and P that of keyframe and bias, plus that of the motion.
+        """
+        key = X(self.keyframe)
+        bias = self.motion.bias if bias_key is None else values.atPoint3(bias_key)
+        motion = self.motion.corrected(bias)
+        J_pose = motion.inverse().AdjointMap()
+        cov = J_pose @ joint.at(key, key) @ J_pose.T + self.motion.covariance
+        if bias_key is not None:
+            cross = J_pose @ joint.at(key, bias_key) @ self.motion.D_bias.T
+            cov += cross + cross.T + self.motion.D_bias @ joint.at(bias_key, bias_key) @ self.motion.D_bias.T
+        return Estimate(self.stamp_ns, values.atPose3(key).compose(motion), 0.5 * (cov + cov.T))

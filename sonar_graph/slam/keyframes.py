@@ -1,0 +1,183 @@
+"""Keyframes: where they are set, and the factors that odometry, depth and gravity give each of them.
+
+A keyframe sits at a node of the odometry (a DVL stamp). One is due ``max_interval_s`` after the last, or, when landmarks
+are seen, ``min_interval_s`` after it. The gyro bias is constant over stretches of ``bias_interval_s`` and walks between.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, X
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.measurements import Depth, Dvl, Floats, Imu
+from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
+from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
+from sonar_graph.navigation.earth import earth_rate_in_world
+from sonar_graph.navigation.odometry import Odometry, Steps
+from sonar_graph.slam import factors
+from sonar_graph.slam.smoother import Smoother
+
+S_PER_NS = 1e-9
+LATEST_NS = np.iinfo(np.int64).max
+
+
+@dataclass(frozen=True)
+class KeyframePolicy:
+    """When a keyframe is set; seconds."""
+
+    min_interval_s: float
+    max_interval_s: float
+    bias_interval_s: float
+
+
+@dataclass
+class Keyframes:
+    """Sets keyframes along the odometry and adds their factors to a smoother."""
+
+    calibration: Calibration
+    policy: KeyframePolicy
+    smoother: Smoother
+    stamps_ns: list[int] = field(default_factory=list)
+    """Of each keyframe; its key is ``X(index)``."""
+    bias_keys: list[int] = field(default_factory=list)
+    """Of each keyframe: the bias that holds from it on."""
+
+    def __post_init__(self) -> None:
+        self.odometry = Odometry(self.calibration)
+        self._preintegrator = Preintegrator.from_calibration(self.calibration)
+        self._estimates_bias = self.calibration.imu.gyro_bias_sigma > 0
+        self._bias_since_ns = 0
+        self._depths: list[Depth] = []
+        self._earth = earth_rate_in_world(self.calibration)
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest keyframe; None before the first."""
+        return self.stamps_ns[-1] if self.stamps_ns else None
+
+    @property
+    def newest_s(self) -> float:
+        """The same in seconds, as the smoother counts them."""
+        return self.stamps_ns[-1] * S_PER_NS
+
+    @property
+    def newest_key(self) -> int:
+        """Key of the newest keyframe."""
+        return X(len(self.stamps_ns) - 1)
+
+    def add(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None) -> None:
+        """Take in rows."""
+        self.odometry.add(imu, dvl)
+        if depth is not None:
+            self._depths.append(depth)
+
+    def advance(self, until_ns: int) -> None:
+        """Set the keyframes that are due from nodes reached at an instant; the first starts the graph."""
+        if not self.stamps_ns:
+            start_ns = self.odometry.start_ns()
+            if start_ns is None or start_ns > until_ns:
+                return
+            self._start(start_ns)
+        interval_ns = round(self.policy.max_interval_s / S_PER_NS)
+        for node_ns in self.odometry.nodes(self.stamps_ns[-1], until_ns).tolist():
+            if node_ns - self.stamps_ns[-1] >= interval_ns:
+                self._set(node_ns)
+
+    def set_for_frame(self, stamp_ns: int) -> None:
+        """Set a keyframe at the newest node reached at a frame's stamp, if the newest keyframe is old enough."""
+        nodes = self.odometry.nodes(self.stamps_ns[-1], stamp_ns)
+        if len(nodes) and nodes[-1] - self.stamps_ns[-1] >= self.policy.min_interval_s / S_PER_NS:
+            self._set(int(nodes[-1]))
+
+    def motion_since_newest(self, until_ns: int) -> PreintegratedMotion:
+        """Provisional motion from the newest keyframe to any later instant."""
+        steps = self.odometry.steps_since_node(self.stamps_ns[-1], until_ns)
+        return self._preintegrator.integrate(steps, self.bias(len(self.stamps_ns) - 1), self._earth_rate())
+
+    def bias(self, index: int) -> Floats:
+        """Newest estimate of the gyro bias that holds from a keyframe on, shape (3,), rad/s."""
+        return self.smoother.values.atPoint3(self.bias_keys[index]) if self._estimates_bias else np.zeros(3)
+
+    def bias_key(self, index: int) -> int | None:
+        """Key of the bias that holds from a keyframe on; None when there is none to estimate."""
+        return self.bias_keys[index] if self._estimates_bias else None
+
+    def _earth_rate(self) -> Floats | None:
+        if self._earth is None:
+            return None
+        return self.smoother.values.atPose3(self.newest_key).rotation().matrix().T @ self._earth
+
+    def _start(self, node_ns: int) -> None:
+        imu = self.calibration.imu
+        self.stamps_ns.append(node_ns)
+        self._bias_since_ns = node_ns
+        self.smoother.add_pose(X(0), self.calibration.start.pose(), node_ns * S_PER_NS)
+        self.smoother.add([factors.start_prior(X(0), self.calibration)])
+        self.bias_keys.append(B(0))
+        if self._estimates_bias:
+            self.smoother.add_lasting(B(0), np.zeros(3))
+            self.smoother.add([factors.bias_prior(B(0), imu.gyro_bias_sigma)])
+        self._constrain(0)
+
+    def _set(self, node_ns: int) -> None:
+        i, j = len(self.stamps_ns) - 1, len(self.stamps_ns)
+        steps = self.odometry.steps_between_nodes(self.stamps_ns[i], node_ns)
+        motion = self._preintegrator.integrate(steps, self.bias(i), self._earth_rate())
+        self.smoother.add_pose(X(j), self.smoother.values.atPose3(X(i)).compose(motion.i_T_j), node_ns * S_PER_NS)
+        self.smoother.add([self._odometry_factor(i, motion), *self._gravity(j, node_ns, motion)])
+        self.smoother.add(self._depth(j, node_ns, steps, motion))
+        self.bias_keys.append(self._next_bias_key(i, node_ns))
+        self.stamps_ns.append(node_ns)
+        self._constrain(j)
+        self.odometry.forget_before(node_ns)
+
+    def _odometry_factor(self, i: int, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
+        if self._estimates_bias:
+            return factors.odometry_with_bias(X(i), X(i + 1), self.bias_keys[i], motion)
+        return factors.odometry(X(i), X(i + 1), motion)
+
+    def _gravity(self, j: int, node_ns: int, motion: PreintegratedMotion) -> list[gtsam.NonlinearFactor]:
+        if not self.calibration.use_gravity:
+            return []
+        (v_i, cov_i, rate_i), (v_j, cov_j, rate_j) = map(self.odometry.velocity_at_node, (self.stamps_ns[-1], node_ns))
+        imu, dvl_m = self.calibration.imu, np.array(self.calibration.dvl.mounting.translation_m)
+        imu_m = np.array(imu.mounting.translation_m)
+        at_i, at_j = velocity_at_imu(v_i, rate_i, dvl_m, imu_m), velocity_at_imu(v_j, rate_j, dvl_m, imu_m)
+        sigma = float(np.sqrt((np.trace(cov_i) + np.trace(cov_j)) / 6))
+        up = gravity_direction(motion, at_i, at_j, sigma, imu, self.calibration.gravity_m_s2)
+        return [factors.gravity_direction(X(j), *up)] if up else []
+
+    def _depth(self, j: int, node_ns: int, steps: Steps, motion: PreintegratedMotion) -> list[gtsam.NonlinearFactor]:
+        """One factor for all samples since the last keyframe: their weighted mean, at the weighted mean of the ports."""
+        start_ns = self.stamps_ns[-1]
+        rows = [block for depth in self._depths if (block := depth.between(start_ns, node_ns))]
+        self._depths = [block for depth in self._depths if (block := depth.between(node_ns, LATEST_NS))]
+        if not rows:
+            return []
+        samples = Depth.concatenate(rows)
+        variance = np.where(np.isnan(samples.variance_m2), self.calibration.depth.sigma_m**2, samples.variance_m2)
+        weights = (1 / variance) / np.sum(1 / variance)
+        port = np.array(self.calibration.depth.port_m)
+        ports = self._preintegrator.path_of(port, steps, motion.bias, (samples.stamps_ns - start_ns) * S_PER_NS)
+        mean_port_in_j = motion.i_T_j.transformTo(weights @ ports)
+        return [factors.depth(X(j), float(weights @ samples.z_m), mean_port_in_j, float(np.sum(1 / variance) ** -0.5))]
+
+    def _constrain(self, j: int) -> None:
+        if self.calibration.planar:
+            self.smoother.add(factors.planar(X(j), self.calibration.planar))
+
+    def _next_bias_key(self, i: int, node_ns: int) -> int:
+        elapsed_s = (node_ns - self._bias_since_ns) * S_PER_NS
+        walk = self.calibration.imu.gyro_bias_walk_density
+        if not self._estimates_bias or walk == 0 or elapsed_s < self.policy.bias_interval_s:
+            return self.bias_keys[i]
+        old = self.bias_keys[i]
+        new = B(gtsam.Symbol(old).index() + 1)
+        self._bias_since_ns = node_ns
+        self.smoother.add_lasting(new, self.smoother.values.atPoint3(old))
+        self.smoother.add([factors.bias_walk(old, new, walk * np.sqrt(elapsed_s))])
+        return new
