@@ -40,7 +40,7 @@ def read_arrays(path: Path) -> Arrays:
         When the file is missing or damaged.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise EvaluationError(f"{path}: cannot be read as arrays ({error}); write the comparison anew") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 import numpy as np
 
@@ -148,14 +149,17 @@ def landmark_scores(estimated: LandmarkMap, true: LandmarkMap | None) -> dict[st
 
 def detection_scores(log: DetectionLog) -> dict[str, Score]:
     """What became of the detections, and whether innovations fit their covariances."""
-    new = sum(outcome is Outcome.NEW for outcome in log.outcomes)
-    used = sum(outcome is Outcome.USED for outcome in log.outcomes) + new
+    counts = Counter(log.outcomes)
+    new, ignored = counts[Outcome.NEW], counts[Outcome.IGNORED]
+    used = counts[Outcome.USED] + new
+    refused = len(log) - used - ignored
+    of_all = f"of {len(log)}" + (f", {ignored} of which this estimator has no use for" if ignored else "")
     scores = {
         "detections.used": Score(
-            float(used), "1", f"Detections used, of {len(log)}; {new} of these began a landmark.", better="none"
+            float(used), "1", f"Detections used, {of_all}; {new} of those used began a landmark.", better="none"
         ),
         "detections.refused": Score(
-            float(len(log) - used), "1", f"Detections refused for any reason, of {len(log)}.", better="none"
+            float(refused), "1", f"Detections refused for any reason, {of_all}.", better="none"
         ),
     }
     squares = nis(log)

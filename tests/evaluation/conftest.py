@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -56,7 +56,7 @@ class Offset:
         offset_m: float = 0.3
         sigma_m: float = 0.3
 
-    def __init__(self, calibration: Calibration, params: Any = None) -> None:
+    def __init__(self, _calibration: Calibration, params: Any = None) -> None:
         self.params = params or self.Params()
         self.estimates: list[Estimate] = []
 

@@ -53,9 +53,7 @@ def test_causal_and_smoothed_are_what_the_estimator_said(
     assert result.detections is not None
 
 
-def test_only_calls_of_the_estimator_are_timed(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
+def test_only_calls_of_the_estimator_are_timed(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
     class Slow(offset_estimator):
         def process(self, measurements: Measurements) -> Estimate | None:
             time.sleep(0.01)
@@ -67,7 +65,7 @@ def test_only_calls_of_the_estimator_are_timed(
 
     install(slow=Slow)
     before = time.perf_counter()
-    result = run_estimator(make_sequence(5.0), "slow", progress=lambda done, total: time.sleep(0.02))
+    result = run_estimator(make_sequence(5.0), "slow", progress=lambda *_: time.sleep(0.02))
     whole_s = time.perf_counter() - before
     assert len(result.update_s) == 10
     assert np.all(result.update_s >= 0.01)
@@ -177,7 +175,7 @@ def test_a_map_that_is_not_finite_fails_the_run(install: Install, make_sequence:
 
 def test_an_estimator_that_never_speaks_fails(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
     class Mute(offset_estimator):
-        def process(self, measurements: Measurements) -> Estimate | None:
+        def process(self, _measurements: Measurements) -> Estimate | None:
             return None
 
     install(mute=Mute)
@@ -215,7 +213,7 @@ def test_an_estimator_that_cannot_be_loaded_is_a_failed_run(
 
 def test_interruption_is_not_swallowed(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
     class Interrupted(offset_estimator):
-        def process(self, measurements: Measurements) -> Estimate | None:
+        def process(self, _measurements: Measurements) -> Estimate | None:
             raise KeyboardInterrupt
 
     install(interrupted=Interrupted)

@@ -1,0 +1,209 @@
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evo.tools import file_interface
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.errors import EvaluationError
+from sonar_graph.evaluation.comparison import compare
+from sonar_graph.evaluation.results import Comparison
+from sonar_graph.evaluation.storage import read_comparison, write_comparison
+from sonar_graph.measurements import Measurements
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import Estimate
+
+Make = Callable[..., Sequence]
+
+
+@pytest.fixture
+def comparison(install: Callable[..., None], make_sequence: Make, offset_estimator: Any) -> Comparison:
+    """One run that went well, one that failed."""
+
+    class Broken(offset_estimator):
+        def process(self, _measurements: Measurements) -> Estimate | None:
+            raise RuntimeError("diverged")
+
+    install(offset=offset_estimator, broken=Broken, other=offset_estimator)
+    return compare(make_sequence(), ["offset", "broken"], {"offset": {"offset_m": 0.4}})
+
+
+def assert_same(left: Any, right: Any, where: str = "") -> None:
+    """Equal all the way down; arrays exactly, NaN equal to NaN."""
+    if is_dataclass(left):
+        for field in fields(left):
+            assert_same(getattr(left, field.name), getattr(right, field.name), f"{where}.{field.name}")
+    elif isinstance(left, dict):
+        assert list(left) == list(right), where
+        for key in left:
+            assert_same(left[key], right[key], f"{where}[{key}]")
+    elif isinstance(left, list):
+        assert len(left) == len(right), where
+        for index, pair in enumerate(zip(left, right, strict=True)):
+            assert_same(*pair, f"{where}[{index}]")
+    elif isinstance(left, (np.ndarray, float)):
+        np.testing.assert_array_equal(left, right, err_msg=where)
+    else:
+        assert left == right, where
+
+
+def test_reading_returns_what_was_written(comparison: Comparison, tmp_path: Path) -> None:
+    write_comparison(comparison, tmp_path)
+    restored = read_comparison(tmp_path)
+    for name in ("runs", "scores", "errors", "environment", "instants_ns"):
+        assert_same(getattr(comparison, name), getattr(restored, name), name)
+    for name in ("name", "notes", "truth", "true_landmarks", "start_ns", "end_ns"):
+        assert_same(getattr(comparison.sequence, name), getattr(restored.sequence, name), name)
+    assert restored.sequence.calibration == comparison.sequence.calibration
+    assert isinstance(restored.sequence.calibration, Calibration)
+
+
+def test_a_comparison_without_truth_survives(
+    install: Callable[..., None], make_sequence: Make, offset_estimator: Any, tmp_path: Path
+) -> None:
+    install(offset=offset_estimator)
+    written = compare(make_sequence(truth=False), ["offset"])
+    write_comparison(written, tmp_path)
+    restored = read_comparison(tmp_path)
+    assert restored.sequence.truth is None
+    assert restored.errors == {}
+    assert_same(written.scores, restored.scores)
+
+
+def test_json_is_strict_and_tells_units_and_protocol(comparison: Comparison, tmp_path: Path) -> None:
+    write_comparison(comparison, tmp_path)
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    index = json.loads((tmp_path / "comparison.json").read_text("utf-8"), parse_constant=refuse)
+    score = index["runs"]["offset"]["scores"]["causal.ate_raw_m"]
+    assert score["value"] == pytest.approx(0.4)
+    assert score["unit"] == "m"
+    assert "not aligned" in score["protocol"]
+    assert index["runs"]["offset"]["params"]["offset_m"] == 0.4
+    assert index["runs"]["offset"]["errors"]["causal"]["rms_xyz_m"] == pytest.approx([0.0, 0.4, 0.0])
+    assert index["runs"]["broken"]["status"] == "failed"
+    assert "diverged" in index["runs"]["broken"]["reason"]
+
+
+def test_what_is_not_a_number_is_null(comparison: Comparison, tmp_path: Path) -> None:
+    object.__setattr__(comparison.runs[0], "peak_memory_mb", float("nan"))
+    write_comparison(comparison, tmp_path)
+    assert json.loads((tmp_path / "comparison.json").read_text("utf-8"))["runs"]["offset"]["peak_memory_mb"] is None
+    assert np.isnan(read_comparison(tmp_path).runs[0].peak_memory_mb)
+
+
+def test_folder_holds_what_other_tools_read(comparison: Comparison, tmp_path: Path) -> None:
+    write_comparison(comparison, tmp_path)
+    folder = tmp_path / "runs" / "offset"
+    assert sorted(path.name for path in folder.iterdir()) == [
+        *("causal.tum", "landmarks.csv", "result.json", "series.npz", "trajectory.tum")
+    ]
+    causal = file_interface.read_tum_trajectory_file(folder / "causal.tum")
+    smoothed = file_interface.read_tum_trajectory_file(folder / "trajectory.tum")
+    np.testing.assert_allclose(causal.positions_xyz[:, 1], 0.4)
+    np.testing.assert_allclose(smoothed.positions_xyz[:, 1], 0.2)
+    landmarks = (folder / "landmarks.csv").read_text("utf-8").splitlines()
+    assert [row.split(",")[0] for row in landmarks] == ["id", "7", "9", "20"]
+    result = json.loads((folder / "result.json").read_text("utf-8"))
+    assert result["params"]["offset_m"] == 0.4
+    assert result["environment"]["gtsam"]
+    assert result["timings"]["update_median_ms"] > 0
+
+
+def test_a_failed_run_leaves_only_its_reason(comparison: Comparison, tmp_path: Path) -> None:
+    write_comparison(comparison, tmp_path)
+    folder = tmp_path / "runs" / "broken"
+    assert sorted(path.name for path in folder.iterdir()) == ["result.json", "series.npz"]
+    assert "diverged" in json.loads((folder / "result.json").read_text("utf-8"))["reason"]
+
+
+def test_nothing_of_an_earlier_comparison_remains(comparison: Comparison, make_sequence: Make, tmp_path: Path) -> None:
+    write_comparison(compare(make_sequence(), ["other", "offset"]), tmp_path)
+    (tmp_path / "runs" / "other" / "my notes.txt").write_text("kept")
+    (tmp_path / "runs" / "broken").mkdir()
+    (tmp_path / "runs" / "broken" / "trajectory.tum").write_text("of a run that went well")
+    write_comparison(comparison, tmp_path)
+    assert [path.name for path in (tmp_path / "runs" / "other").iterdir()] == ["my notes.txt"]
+    assert not (tmp_path / "runs" / "broken" / "trajectory.tum").exists()
+    assert [run.estimator for run in read_comparison(tmp_path).runs] == ["offset", "broken"]
+
+
+def test_an_interrupted_writing_is_not_taken_for_a_comparison(
+    comparison: Comparison, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    write_comparison(comparison, tmp_path)
+
+    def fail(*_: Any) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr("sonar_graph.evaluation.storage.write_landmarks_csv", fail)
+    with pytest.raises(OSError, match="no space"):
+        write_comparison(comparison, tmp_path)
+    assert not list(tmp_path.rglob(".partial-*"))
+    with pytest.raises(EvaluationError, match=r"no comparison\.json"):
+        read_comparison(tmp_path)
+
+
+def test_a_name_that_leaves_the_folder_is_refused(comparison: Comparison, tmp_path: Path) -> None:
+    object.__setattr__(comparison.runs[0], "estimator", "../elsewhere")
+    with pytest.raises(EvaluationError, match="cannot name a folder"):
+        write_comparison(comparison, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def damage_index(folder: Path) -> None:
+    (folder / "comparison.json").write_text("{")
+
+
+def damage_format(folder: Path) -> None:
+    (folder / "comparison.json").write_text('{"format": "something else"}')
+
+
+def damage_arrays(folder: Path) -> None:
+    path = folder / "runs" / "offset" / "series.npz"
+    path.write_bytes(path.read_bytes()[:100])
+
+
+def remove_arrays(folder: Path) -> None:
+    (folder / "sequence.npz").unlink()
+
+
+def remove_column(folder: Path) -> None:
+    path = folder / "sequence.npz"
+    with np.load(path) as archive:
+        kept = {name: archive[name] for name in archive.files if name != "truth.positions"}
+    np.savez(path, **kept)
+
+
+@pytest.mark.parametrize(
+    ("damage", "named"),
+    [
+        (damage_index, r"comparison\.json"),
+        (damage_format, "something else"),
+        (damage_arrays, r"series\.npz"),
+        (remove_arrays, r"sequence\.npz"),
+        (remove_column, "truth lacks positions"),
+    ],
+)
+def test_damage_is_named(comparison: Comparison, tmp_path: Path, damage: Callable[[Path], None], named: str) -> None:
+    write_comparison(comparison, tmp_path)
+    damage(tmp_path)
+    with pytest.raises(EvaluationError, match=named):
+        read_comparison(tmp_path)
+
+
+def test_arrays_hold_no_code(comparison: Comparison, tmp_path: Path) -> None:
+    write_comparison(comparison, tmp_path)
+    for path in tmp_path.rglob("*.npz"):
+        with zipfile.ZipFile(path) as archive:
+            for name in archive.namelist():
+                assert b"'descr': '|O'" not in archive.read(name)[:200], name
