@@ -134,12 +134,11 @@ class Messages:
         if column is None:
             return np.empty((len(self), 0))
         size = column.dtype.itemsize
-        views = [self.payloads[:, at : at + count * size].view(column.dtype) for at, count in column.runs]
-        if not views:
-            return np.empty((len(self), 0), column.dtype)
-        if column.is_single:
-            return views[0][:, 0]
-        return views[0] if len(views) == 1 else np.concatenate(views, axis=1)
+        if len(column.runs) != 1:
+            return np.ascontiguousarray(self.payloads[:, _places(column)]).view(column.dtype)
+        at, count = column.runs[0]
+        values = self.payloads[:, at : at + count * size].view(column.dtype)
+        return values[:, 0] if column.is_single else values
 
     def strings(self, path: str) -> list[list[str]]:
         """Values of a string field, for each message one of each occurrence."""
@@ -227,8 +226,8 @@ def encode(definition: Struct, n: int, values: Mapping[str, Value], lengths: Map
         raise ValueError(f"{definition.name} has no field {', '.join(sorted(unknown))}")
     payloads = np.zeros((n, layout.size), np.uint8)
     payloads[:, :HEADER_BYTES] = np.frombuffer(_LITTLE_ENDIAN, np.uint8)
-    for offset, length in layout.length_words:
-        payloads[:, offset : offset + 4] = np.array([length], "<u4").view(np.uint8)
+    words = Column(np.dtype("<" + _LENGTH), is_single=False, runs=[(offset, 1) for offset, _ in layout.length_words])
+    _fill(payloads, words, np.array([[length for _, length in layout.length_words]]))
     for path, value in values.items():
         _fill(payloads, layout.columns[path], value)
     return payloads
@@ -250,15 +249,23 @@ def _given_lengths(values: Mapping[str, Value], lengths: Mapping[str, int]) -> L
 def _fill(payloads: Bytes, column: Column, value: Value) -> None:
     if isinstance(value, str | list):
         texts = [value] * len(column.runs) if isinstance(value, str) else value
-        for (at, count), text in zip(column.runs, texts, strict=True):
-            payloads[:, at : at + count - 1] = np.frombuffer(text.encode(), np.uint8)
+        characters = b"".join(str(text).encode() + b"\0" for text in texts)
+        payloads[:, _places(column)] = np.frombuffer(characters, np.uint8)
         return
-    total = sum(count for _, count in column.runs)
     columns = np.asarray(value, column.dtype)
     columns = columns.reshape(-1, 1) if columns.ndim == 1 and column.is_single else columns
-    columns = np.broadcast_to(columns, (len(payloads), total))
-    size, taken = column.dtype.itemsize, 0
-    for at, count in column.runs:
-        part = np.ascontiguousarray(columns[:, taken : taken + count])
-        payloads[:, at : at + count * size] = part.view(np.uint8)
-        taken += count
+    columns = np.broadcast_to(columns, (len(payloads), sum(count for _, count in column.runs)))
+    octets = np.ascontiguousarray(columns).view(np.uint8)
+    if len(column.runs) == 1:
+        at = column.runs[0][0]
+        payloads[:, at : at + octets.shape[1]] = octets
+    else:
+        payloads[:, _places(column)] = octets
+
+
+def _places(column: Column) -> Ints:
+    """Offsets of all bytes of a column, in order."""
+    runs = np.array(column.runs, np.int64).reshape(-1, 2)
+    sizes = runs[:, 1] * column.dtype.itemsize
+    within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return np.repeat(runs[:, 0], sizes) + within

@@ -53,9 +53,15 @@ def fields(prefix: str, names: str, columns: Floats) -> dict[str, Value]:
     return {f"{prefix}.{name}": columns[..., i] for i, name in enumerate(names)}
 
 
-def outgoing(topic: str, type_name: str, stamps_ns: Ints, values: Mapping[str, Value]) -> Outgoing:
-    """Messages with one stamp each, recorded at that stamp."""
-    return Outgoing(topic, type_name, stamps_ns, encode(own_definition(type_name), len(stamps_ns), values))
+def outgoing(
+    topic: str,
+    type_name: str,
+    stamps_ns: Ints,
+    values: Mapping[str, Value],
+    lengths: Mapping[str, int] | None = None,
+) -> Outgoing:
+    """Messages recorded at the stamps given; values and lengths as in `encode`."""
+    return Outgoing(topic, type_name, stamps_ns, encode(own_definition(type_name), len(stamps_ns), values, lengths))
 
 
 def imu_messages(topic: str, imu: Imu) -> Outgoing:

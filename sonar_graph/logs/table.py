@@ -16,7 +16,7 @@ from sonar_graph.measurements import Ints
 NS_PER_S = 1_000_000_000
 
 
-def header_stamps_ns(group: Messages, log_times_ns: Ints) -> Ints:
+def header_stamps_ns(group: Messages, log_times_ns: Ints, prefix: str = "header.stamp.") -> Ints:
     """Stamps of messages from their headers, shape (n,); the log's time where a header's stamp is zero.
 
     Parameters
@@ -25,8 +25,10 @@ def header_stamps_ns(group: Messages, log_times_ns: Ints) -> Ints:
         n messages.
     log_times_ns
         Of all messages of the topic.
+    prefix
+        Of the stamp's two fields.
     """
-    stamps_ns = group["header.stamp.sec"].astype(np.int64) * NS_PER_S + group["header.stamp.nanosec"]
+    stamps_ns = group[f"{prefix}sec"].astype(np.int64) * NS_PER_S + group[f"{prefix}nanosec"]
     return np.where(stamps_ns == 0, log_times_ns[group.rows], stamps_ns)
 
 

@@ -1,0 +1,155 @@
+"""What is in a log: topics, their times and gaps, which part each would play, and what is damaged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sonar_graph.errors import SonarGraphError
+from sonar_graph.logs.cdr import decode
+from sonar_graph.logs.container import STAMP_BYTES, Keep, Recording, Topic, scan
+from sonar_graph.logs.message_definitions import definition, short_name
+from sonar_graph.logs.mountings import static_frames
+from sonar_graph.logs.reading import METADATA, read_calibration, read_notes
+from sonar_graph.logs.roles import ROLES, TF, choose_topic
+from sonar_graph.logs.schema import Struct, parse_definition
+from sonar_graph.logs.table import header_stamps_ns
+from sonar_graph.measurements import Ints
+
+
+@dataclass(frozen=True)
+class TopicSummary:
+    """One topic with its times; of the sensors' headers where its messages have one, else of the recording."""
+
+    name: str
+    type_name: str
+    encoding: str
+    """Such as ``cdr`` or ``protobuf``."""
+    messages: int
+    first_stamp_ns: int
+    last_stamp_ns: int
+    rate_hz: float
+    """Messages per second between the first and the last; 0 where all have one stamp."""
+    largest_gap_s: float
+    """Longest time between successive stamps."""
+    stamps_from: str
+    """``header`` or ``log``."""
+
+
+@dataclass(frozen=True)
+class RoleSummary:
+    """Which topic plays a part."""
+
+    role: str
+    topic: str | None
+    """None: none does, or several could."""
+    reason: str
+
+
+@dataclass(frozen=True)
+class LogSummary:
+    """What a log holds."""
+
+    path: Path
+    name: str | None
+    """As the log calls itself."""
+    topics: tuple[TopicSummary, ...]
+    roles: tuple[RoleSummary, ...]
+    calibration: str
+    """Where a calibration would come from, or why the one in the log cannot be used."""
+    notes: dict[str, str]
+    damage: tuple[str, ...]
+    """What is lost or cannot be read; empty for a sound file."""
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds between the first and the last stamp of the topics that play a part."""
+        used = {role.topic for role in self.roles}
+        topics = [topic for topic in self.topics if topic.name in used] or list(self.topics)
+        if not topics:
+            return 0.0
+        return (max(t.last_stamp_ns for t in topics) - min(t.first_stamp_ns for t in topics)) * 1e-9
+
+
+def inspect_log(path: Path) -> LogSummary:
+    """Summarise an MCAP file; what is wrong in it becomes part of the summary.
+
+    Raises
+    ------
+    LogError
+        When there is no such file or it is not MCAP.
+    """
+    recording = scan(Path(path), lambda kind: Keep.ALL if short_name(kind) == short_name(TF) else Keep.STAMP)
+    damage = [*recording.corrupt, *([recording.ending] if recording.ending else [])]
+    choices = [choose_topic(role, recording) for role in ROLES.values()]
+    return LogSummary(
+        path=recording.path,
+        name=recording.metadata.get(METADATA, {}).get("name"),
+        topics=tuple(_summarise(topic) for topic in recording.topics.values()),
+        roles=tuple(RoleSummary(choice.role.name, choice.topic, choice.reason) for choice in choices),
+        calibration=_calibration(recording),
+        notes=_notes(recording, damage),
+        damage=tuple(damage),
+    )
+
+
+def _summarise(topic: Topic) -> TopicSummary:
+    stamps_ns = _stamps_from_headers(topic)
+    origin = "log" if stamps_ns is None else "header"
+    stamps_ns = np.sort(topic.log_times_ns if stamps_ns is None else stamps_ns)
+    span_s = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
+    return TopicSummary(
+        name=topic.name,
+        type_name=topic.type_name,
+        encoding=topic.encoding,
+        messages=len(topic),
+        first_stamp_ns=int(stamps_ns[0]),
+        last_stamp_ns=int(stamps_ns[-1]),
+        rate_hz=(len(topic) - 1) / span_s if span_s > 0 else 0.0,
+        largest_gap_s=float(np.diff(stamps_ns).max(initial=0)) * 1e-9,
+        stamps_from=origin,
+    )
+
+
+def _stamps_from_headers(topic: Topic) -> Ints | None:
+    """Stamps read from the beginning of each message, or None where not every message has one there."""
+    try:
+        first = topic.definition().fields[:1] if topic.is_ros2 else ()
+        if not first or not isinstance(first[0].kind, Struct) or first[0].is_array:
+            return None
+        if first[0].kind.name != "std_msgs/Header" or min(topic.stacks, default=0) < STAMP_BYTES:
+            return None
+        return _decode_stamps(topic)
+    except SonarGraphError:
+        return None
+
+
+def _decode_stamps(topic: Topic) -> Ints:
+    time = parse_definition("builtin_interfaces/msg/Time", definition("builtin_interfaces/msg/Time"))
+    stamps_ns = np.empty(len(topic), np.int64)
+    parts = [(rows, payloads[:, :STAMP_BYTES]) for stack in topic.stacks.values() for rows, payloads in stack]
+    for group in decode(time, parts):
+        stamps_ns[group.rows] = header_stamps_ns(group, topic.log_times_ns, prefix="")
+    return stamps_ns
+
+
+def _calibration(recording: Recording) -> str:
+    try:
+        if read_calibration(recording) is not None:
+            return "in the log"
+        frames = static_frames(recording)
+    except SonarGraphError as error:
+        return f"unusable: {error}"
+    if frames:
+        return f"none in the log; defaults with the mountings of /tf_static ({', '.join(frames)})"
+    return "none in the log and no /tf_static; defaults"
+
+
+def _notes(recording: Recording, damage: list[str]) -> dict[str, str]:
+    try:
+        return read_notes(recording)
+    except SonarGraphError as error:
+        damage.append(str(error))
+        return {}

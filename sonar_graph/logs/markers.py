@@ -1,0 +1,72 @@
+"""Landmarks as ``visualization_msgs/MarkerArray``: 95 % ellipsoids with their identities."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from sonar_graph.logs import encoding
+from sonar_graph.logs.recorder import Outgoing
+from sonar_graph.measurements import Floats
+from sonar_graph.states import LandmarkMap
+
+MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
+SPHERE, TEXT_VIEW_FACING = 2, 9
+UNKNOWN_DIAMETER_M = 0.2
+"""Drawn where a covariance is unknown."""
+_SMALLEST_DIAMETER_M = 1e-3
+_TEXT_HEIGHT_M = 0.3
+_SIGMAS = float(np.sqrt(chi2.ppf(0.95, df=3)))
+
+Colour = tuple[float, float, float, float]
+BLUE: Colour = (0.12, 0.47, 0.71, 0.8)
+ORANGE: Colour = (1.0, 0.5, 0.05, 0.8)
+PURPLE: Colour = (0.58, 0.4, 0.74, 0.8)
+GREEN: Colour = (0.17, 0.63, 0.17, 0.8)
+GREY: Colour = (0.5, 0.5, 0.5, 0.9)
+
+
+def ellipsoids(covariances: Floats) -> tuple[Floats, Floats]:
+    """The 95 % ellipsoids of Gaussian points in space, ``x' C^-1 x = chi2_3(0.95)``.
+
+    Parameters
+    ----------
+    covariances
+        Shape (m, 3, 3), m²; NaN where unknown: a small sphere then.
+
+    Returns
+    -------
+    diameters
+        Along the principal axes, shape (m, 3), metres.
+    quaternions_xyzw
+        From the principal axes to the world, shape (m, 4).
+    """
+    covariances = covariances.copy()
+    unknown = ~np.isfinite(covariances.reshape(-1, 9)).all(axis=1)
+    covariances[unknown] = np.eye(3) * (UNKNOWN_DIAMETER_M / (2 * _SIGMAS)) ** 2
+    variances, axes = np.linalg.eigh(covariances)
+    axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # right-handed
+    diameters = 2 * _SIGMAS * np.sqrt(np.maximum(variances, 0))
+    return np.maximum(diameters, _SMALLEST_DIAMETER_M), Rotation.from_matrix(axes).as_quat()
+
+
+def landmark_markers(topic: str, landmarks: LandmarkMap, stamp_ns: int, colour: Colour) -> Outgoing:
+    """One message: for each landmark an ellipsoid, and its identity as text above it."""
+    count = len(landmarks)
+    diameters, quaternions = ellipsoids(landmarks.covariances)
+    upright = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
+    above = landmarks.positions + np.array([0, 0, _TEXT_HEIGHT_M])
+    stamps_ns = np.full(2 * count, stamp_ns)
+    values = encoding.header(stamps_ns, encoding.WORLD_FRAME, "markers.header")
+    values |= encoding.fields("markers.pose.position", "xyz", np.vstack([landmarks.positions, above]))
+    values |= encoding.fields("markers.pose.orientation", "xyzw", np.vstack([quaternions, upright]))
+    values |= encoding.fields("markers.scale", "xyz", np.vstack([diameters, np.full((count, 3), _TEXT_HEIGHT_M)]))
+    values |= encoding.fields("markers.color", "rgba", np.tile(colour, (2 * count, 1)))
+    values |= {
+        "markers.ns": ["landmark"] * count + ["identity"] * count,
+        "markers.id": np.tile(np.arange(count), 2),
+        "markers.type": np.repeat([SPHERE, TEXT_VIEW_FACING], count),
+        "markers.text": [""] * count + [str(identity) for identity in landmarks.ids.tolist()],
+    }
+    return encoding.outgoing(topic, MARKER_ARRAY, np.array([stamp_ns]), values, {"markers": 2 * count})
