@@ -229,7 +229,7 @@ def test_calibration_file_replaces_that_of_the_log(basin: Path, tmp_path: Path) 
 def test_inspect_names_the_topics(basin: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("inspect", basin) == 0
     shown = capsys.readouterr().out
-    for name in ("sensor_msgs/msg/Imu", "marine_acoustic_msgs/msg/Dvl", "sonar_graph_msgs/msg/LandmarkDetections"):
+    for name in ("sensor_msgs/Imu", "marine_acoustic_msgs/Dvl", "sonar_graph_msgs/LandmarkDetections"):
         assert name in shown
 
 

@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
 from sonar_graph.cli.arguments import CalibrationPath, EstimatorSettings, LogPath, OutputFolder, RateHz
 from sonar_graph.cli.outputs import writable_folder
 from sonar_graph.cli.progress import progress_bars, working
 from sonar_graph.cli.settings import estimator_settings, read_calibration
-from sonar_graph.cli.texts import plural
+from sonar_graph.cli.texts import answers, plural
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 
 if TYPE_CHECKING:
@@ -161,7 +160,7 @@ def _write_report(comparison: Comparison, folder: Path) -> Path:
 def _print_summary(comparison: Comparison) -> None:
     from sonar_graph.evaluation.console import summary_table
 
-    Console().print(summary_table(comparison))
+    answers().print(summary_table(comparison))
 
 
 def _exit_by(comparison: Comparison) -> None:

@@ -4,20 +4,59 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 from sonar_graph.cli.arguments import LogPath
+from sonar_graph.cli.texts import answers
 
 if TYPE_CHECKING:
-    from sonar_graph.logs.inspection import LogSummary
+    from rich.console import Console
+
+    from sonar_graph.logs.inspection import LogSummary, TopicSummary
 
 
 def inspect(log: LogPath) -> None:
     """Say what is in a log: topics, rates, gaps, and which topic would be used for what and why."""
     from sonar_graph.logs.inspection import inspect_log
 
-    _print_summary(Console(), inspect_log(log))
+    _print_summary(answers(), inspect_log(log))
 
 
 def _print_summary(console: Console, summary: LogSummary) -> None:
-    console.print(summary)
+    console.print(f"[bold]{escape(summary.name or summary.path.name)}[/], {summary.duration_s:.1f} s\n", soft_wrap=True)
+    console.print(_topics_table(summary), "")
+    console.print(_roles_table(summary), "")
+    console.print(f"[bold]calibration[/] {escape(summary.calibration)}", soft_wrap=True)
+    for subject, note in summary.notes.items():
+        console.print(f"[bold]{escape(subject)}[/] {escape(note)}", soft_wrap=True)
+    for loss in summary.damage:
+        console.print(f"[bold red]damage[/] {escape(loss)}", soft_wrap=True)
+
+
+def _topics_table(summary: LogSummary) -> Table:
+    table = Table(box=None, pad_edge=False)
+    for heading in ("topic", "type"):
+        table.add_column(heading, overflow="fold")
+    for heading in ("messages", "rate (Hz)", "span (s)", "max gap (s)"):
+        table.add_column(heading, justify="right")
+    origin_ns = min((topic.first_stamp_ns for topic in summary.topics), default=0)
+    for topic in summary.topics:
+        table.add_row(*map(escape, _topic_cells(topic, origin_ns)))
+    return table
+
+
+def _topic_cells(topic: TopicSummary, origin_ns: int) -> list[str]:
+    kind = topic.type_name.replace("/msg/", "/")
+    if topic.encoding != "cdr":
+        kind += f" ({topic.encoding})"
+    first_s, last_s = ((stamp_ns - origin_ns) * 1e-9 for stamp_ns in (topic.first_stamp_ns, topic.last_stamp_ns))
+    span = f"{first_s:.1f} to {last_s:.1f}"
+    return [topic.name, kind, str(topic.messages), f"{topic.rate_hz:.2f}", span, f"{topic.largest_gap_s:.2f}"]
+
+
+def _roles_table(summary: LogSummary) -> Table:
+    table = Table("used for", "topic", "because", box=None, pad_edge=False)
+    for role in summary.roles:
+        table.add_row(escape(role.role.replace("_", " ")), escape(role.topic or "-"), escape(role.reason))
+    return table

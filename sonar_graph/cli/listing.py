@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+
+from sonar_graph.cli.texts import answers
 
 if TYPE_CHECKING:
     from sonar_graph.calibration import Section
@@ -18,7 +19,7 @@ def estimators() -> None:
     from sonar_graph.errors import EstimatorError
     from sonar_graph.estimator import installed_estimators, load_estimator
 
-    console = Console()
+    console = answers()
     failed = False
     for name, point in installed_estimators().items():
         try:

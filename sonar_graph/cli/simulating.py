@@ -13,6 +13,8 @@ from sonar_graph.cli.settings import parse_setting
 from sonar_graph.cli.texts import examples
 
 if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
     from sonar_graph.simulation.basin import BasinOptions
 
 worlds = typer.Typer(name="simulate", help="Simulate a run with known truth and write it as an MCAP log.")
@@ -61,5 +63,12 @@ def _basin_options(values: dict[str, Any]) -> BasinOptions:
     try:
         return BasinOptions.model_validate(values)
     except ValidationError as error:
-        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        faults = "; ".join(map(_fault, error.errors()))
         raise typer.BadParameter(f"{faults}. The basin has: {', '.join(BasinOptions.model_fields)}") from error
+
+
+def _fault(error: ErrorDetails) -> str:
+    name = ".".join(map(str, error["loc"]))
+    if error["type"] == "extra_forbidden":
+        return f"there is no option {name}"
+    return f"{name}: {error['msg']}, not {error['input']!r}"

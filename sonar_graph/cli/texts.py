@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from rich.console import Console
+
+WIDTH_OF_A_FILE = 200
+
 
 def examples(*commands: str) -> str:
     """Commands to copy, for the end of a help page; an empty line keeps each on a line of its own."""
@@ -11,3 +15,9 @@ def examples(*commands: str) -> str:
 def plural(count: int, noun: str) -> str:
     """``1 row``, ``2 rows``."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def answers() -> Console:
+    """Where results go: stdout, and where that is no terminal, wide enough for lines to stay whole."""
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=WIDTH_OF_A_FILE)
