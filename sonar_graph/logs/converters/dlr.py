@@ -17,14 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from sonar_graph.calibration import Calibration, DvlCalibration, FloorPrior, ImuCalibration, PlanarMotion
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.converters.planar import (
-    mean_gyro_noise_density,
-    mean_velocity_sigma_m_s,
     point_detections,
     step_stamps_ns,
+    stepped_calibration,
     stepped_odometry,
+    symmetric,
 )
 from sonar_graph.logs.converters.tables import numbers, read_lines
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections
@@ -32,10 +31,11 @@ from sonar_graph.sequence import Sequence
 
 FILE_NAME = "map.circles"
 STEP_S = 1
-FLOOR_SIGMA_M = 1e-3
 STEP_COLUMNS = ("dX", "dY", "dPhi", "cXX", "cXY", "cYY", "cXPhi", "cYPhi", "cPhiPhi")
 POINT_COLUMNS = ("pX", "pY", "quality", "cXX", "cXY", "cYY")
 EXPECTED = "lines 'STEP image dX dY dPhi + 6 covariances' and 'LANDMARK_C pX pY quality + 3 covariances + IDs'"
+STEP_COV_PLACES = [[0, 1, 3], [1, 2, 4], [3, 4, 5]]
+POINT_COV_PLACES = [[0, 1], [1, 2]]
 BODY_OF_FILE = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """(x, y, θ) of the body's axes from (x, y, φ) of the file's."""
 
@@ -61,22 +61,11 @@ def read_dlr(path: Path) -> Sequence:
     """
     lines = _read(path / FILE_NAME if path.is_dir() else path)
     steps = np.array(lines.steps)
-    covs = _symmetric(steps[:, 3:])
+    covs = symmetric(steps[:, 3:], STEP_COV_PLACES)
     imu, dvl = stepped_odometry(steps[:, :3] @ BODY_OF_FILE.T, BODY_OF_FILE @ covs @ BODY_OF_FILE.T, STEP_S)
     return Sequence(
         name="dlr_spatial_cognition",
-        calibration=Calibration(
-            imu=ImuCalibration(
-                gyro_noise_density=mean_gyro_noise_density(covs, STEP_S),
-                gyro_bias_sigma=0.0,
-                gyro_bias_walk_density=0.0,
-            ),
-            dvl=DvlCalibration(velocity_sigma_m_s=mean_velocity_sigma_m_s(dvl)),
-            floor=FloorPrior(z_m=0.0, sigma_m=FLOOR_SIGMA_M),
-            planar=PlanarMotion(),
-            use_gravity=False,
-            odometry_interpolation="hold-past",
-        ),
+        calibration=stepped_calibration(dvl, covs, STEP_S),
         imu=imu,
         dvl=dvl,
         detections=_detections(lines, step_stamps_ns(len(steps), STEP_S)) if lines.points else None,
@@ -134,7 +123,7 @@ def _detections(lines: _Lines, stamps_ns: Ints) -> LandmarkDetections:
     points = np.array(lines.points)
     candidate_ids, id_probability = _candidates(lines.ids)
     plane = BODY_OF_FILE[:2, :2]
-    covs = np.stack([points[:, [3, 4]], points[:, [4, 5]]], axis=1)
+    covs = symmetric(points[:, 3:], POINT_COV_PLACES)
     return point_detections(
         stamps_ns[lines.poses], points[:, :2] @ plane.T, plane @ covs @ plane.T, candidate_ids, id_probability
     )
@@ -148,8 +137,3 @@ def _candidates(ids: list[list[int]]) -> tuple[Ints, Floats]:
         candidate_ids[row, : len(known)] = known
     known_places = candidate_ids >= 0
     return candidate_ids, known_places / np.maximum(known_places.sum(axis=1, keepdims=True), 1)
-
-
-def _symmetric(covs: Floats) -> Floats:
-    """Matrices (n, 3, 3) from rows of c_xx, c_xy, c_yy, c_xφ, c_yφ, c_φφ."""
-    return covs[:, [[0, 1, 3], [1, 2, 4], [3, 4, 5]]]

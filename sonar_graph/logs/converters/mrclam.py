@@ -33,6 +33,7 @@ from sonar_graph.calibration import (
 )
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.converters.planar import (
+    FLOOR_SIGMA_M,
     VERTICAL_VELOCITY_SIGMA_M_S,
     planar_dvl,
     planar_imu,
@@ -57,7 +58,6 @@ RANGE_SIGMA_M = 0.18
 AZIMUTH_SIGMA_RAD = 0.0125
 TYPICAL_INTERVAL_S = 0.0145
 """Mean time between commands: the interval given to the first row, which has none, and to the calibration."""
-FLOOR_SIGMA_M = 1e-3
 
 FILES = "Barcodes.dat, Landmark_Groundtruth.dat, RobotN_Odometry.dat and RobotN_Measurement.dat"
 

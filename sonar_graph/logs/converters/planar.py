@@ -15,10 +15,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sonar_graph.calibration import Calibration, DvlCalibration, FloorPrior, ImuCalibration, PlanarMotion
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints, LandmarkDetections
 from sonar_graph.sequence import NS_PER_S
 from sonar_graph.states import Trajectory
 
+FLOOR_SIGMA_M = 1e-3
+"""Of a landmark's height over the plane in which it was measured."""
 SMALL_ANGLE_RAD = 1e-4
 """Below it the series for h is exact to 1e-18."""
 VERTICAL_VELOCITY_SIGMA_M_S = 1e-3
@@ -116,12 +119,28 @@ def point_detections(
     return LandmarkDetections(stamps_ns, ranges, azimuths, polar_covs, candidate_ids, id_probability)
 
 
-def mean_gyro_noise_density(covs: Floats, step_s: int) -> float:
-    """Density whose integral over a step has the mean variance of dθ: ``sqrt(mean(cov_θθ) / T)``, rad/s/√Hz."""
-    return float(np.sqrt(np.mean(covs[:, 2, 2]) / step_s))
+def stepped_calibration(dvl: Dvl, step_covs: Floats, step_s: int) -> Calibration:
+    """What a file of steps says about its vehicle: planar, known without bias, landmarks on its own plane.
+
+    The turn's noise is one density whose integral over a step has the mean variance of dθ,
+    ``sqrt(mean(c_θθ) / T)``; that of the velocity is in the rows, and here their root mean square.
+    """
+    x, y, z = np.sqrt(np.mean(np.diagonal(dvl.velocity_cov, axis1=1, axis2=2), axis=0)).tolist()
+    return Calibration(
+        imu=ImuCalibration(
+            gyro_noise_density=float(np.sqrt(np.mean(step_covs[:, 2, 2]) / step_s)),
+            gyro_bias_sigma=0.0,
+            gyro_bias_walk_density=0.0,
+        ),
+        dvl=DvlCalibration(velocity_sigma_m_s=(x, y, z)),
+        floor=FloorPrior(z_m=0.0, sigma_m=FLOOR_SIGMA_M),
+        planar=PlanarMotion(),
+        use_gravity=False,
+        odometry_interpolation="hold-past",
+    )
 
 
-def mean_velocity_sigma_m_s(dvl: Dvl) -> tuple[float, float, float]:
-    """Root mean square of the rows' own sigmas along each axis: what a calibration can say in one number each."""
-    x, y, z = np.sqrt(np.mean(np.diagonal(dvl.velocity_cov, axis1=1, axis2=2), axis=0))
-    return float(x), float(y), float(z)
+def symmetric(entries: Floats, places: list[list[int]]) -> Floats:
+    """Matrices (n, size, size) whose element (i, j) is the column ``places[i][j]`` of ``entries``."""
+    matrices: Floats = entries[:, places]
+    return matrices

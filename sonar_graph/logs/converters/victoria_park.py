@@ -18,23 +18,22 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from sonar_graph.calibration import Calibration, DvlCalibration, FloorPrior, ImuCalibration, PlanarMotion
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.converters.planar import (
-    mean_gyro_noise_density,
-    mean_velocity_sigma_m_s,
     point_detections,
     step_stamps_ns,
+    stepped_calibration,
     stepped_odometry,
+    symmetric,
 )
 from sonar_graph.logs.converters.tables import numbers, read_lines
-from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
 
 STEP_S = 1
-FLOOR_SIGMA_M = 1e-3
 ODOMETRY_COLUMNS = ("i", "j", "dx", "dy", "dtheta", "c_xx", "c_xy", "c_xt", "c_yy", "c_yt", "c_tt")
 LANDMARK_COLUMNS = ("i", "landmark", "x", "y", "c_xx", "c_xy", "c_yy")
+STEP_COV_PLACES = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
+POINT_COV_PLACES = [[0, 1], [1, 2]]
 EXPECTED = "lines 'ODOMETRY i j dx dy dtheta + 6 covariances' and 'LANDMARK i landmark x y + 3 covariances'"
 
 
@@ -56,8 +55,8 @@ def read_victoria_park(path: Path | None = None) -> Sequence:
     DatasetError
         When the file is missing or malformed, or its odometry is no single chain.
     """
-    edges = _read(path or Path(gtsam.findExampleDataFile("victoria_park.txt")))
-    steps, covs = np.array(edges.steps), _symmetric(np.array(edges.step_covs), 3)
+    edges = _read(path or Path(gtsam.findExampleDataFile("victoria_park.txt")))  # type: ignore[no-untyped-call]
+    steps, covs = np.array(edges.steps), symmetric(np.array(edges.step_covs), STEP_COV_PLACES)
     imu, dvl = stepped_odometry(steps, covs, STEP_S)
     stamps_ns = step_stamps_ns(len(steps), STEP_S)
     detections = None
@@ -66,30 +65,19 @@ def read_victoria_park(path: Path | None = None) -> Sequence:
         detections = point_detections(
             stamps_ns[edges.poses],
             np.array(edges.points),
-            _symmetric(np.array(edges.point_covs), 2),
+            symmetric(np.array(edges.point_covs), POINT_COV_PLACES),
             ids,
             np.ones(ids.shape),
         )
     return Sequence(
         name="victoria_park",
-        calibration=Calibration(
-            imu=ImuCalibration(
-                gyro_noise_density=mean_gyro_noise_density(covs, STEP_S),
-                gyro_bias_sigma=0.0,
-                gyro_bias_walk_density=0.0,
-            ),
-            dvl=DvlCalibration(velocity_sigma_m_s=mean_velocity_sigma_m_s(dvl)),
-            floor=FloorPrior(z_m=0.0, sigma_m=FLOOR_SIGMA_M),
-            planar=PlanarMotion(),
-            use_gravity=False,
-            odometry_interpolation="hold-past",
-        ),
+        calibration=stepped_calibration(dvl, covs, STEP_S),
         imu=imu,
         dvl=dvl,
         detections=detections,
         notes={
             "data set": "Victoria Park; Guivant, Nebot, IEEE T-RA 17(3), 2001; edge list of GTSAM's examples",
-            "time": "the file has none: the pose after n odometry edges is at n seconds, so rates and speeds are per step",
+            "time": "the file has none: the pose after n edges is at n seconds, so rates and speeds are per step",
             "truth": "none",
             "odometry": "each edge as the constant twist that makes it in one second",
             "noise": "the file's covariances",
@@ -137,12 +125,3 @@ def _read(path: Path) -> _Edges:
     if not edges.steps:
         raise DatasetError(f"{path}: holds no ODOMETRY line; expected {EXPECTED}")
     return edges
-
-
-def _symmetric(upper: Floats, size: int) -> Floats:
-    """Matrices (n, size, size) from the rows of their upper triangles."""
-    matrices = np.empty((len(upper), size, size))
-    rows, columns = np.triu_indices(size)
-    matrices[:, rows, columns] = upper
-    matrices[:, columns, rows] = upper
-    return matrices
