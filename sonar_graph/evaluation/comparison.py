@@ -10,7 +10,7 @@ from sonar_graph.evaluation.consistency import error_series
 from sonar_graph.evaluation.environment import describe_environment
 from sonar_graph.evaluation.instants import ScoredInstants, rows_at, scored_instants
 from sonar_graph.evaluation.results import Comparison, ErrorSeries, Kind, RunResult, Score
-from sonar_graph.evaluation.run import run_estimator
+from sonar_graph.evaluation.run import check_request, run_estimator
 from sonar_graph.evaluation.scores import detection_scores, landmark_scores, resource_scores, trajectory_scores
 from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence
@@ -46,10 +46,12 @@ def compare(
     EvaluationError
         When no estimator is named, one is named twice, or settings are for one that is not named.
     UnknownEstimatorError, EstimatorError
-        As in `run_estimator`: mistakes in names and settings. A run that fails is a result instead.
+        As in `run_estimator`, before anything runs: mistakes in names and settings. A failed run is a result instead.
     """
     settings = overrides or {}
     _check_names(names, settings)
+    for name in names:
+        check_request(name, settings.get(name))
     instants_ns = sequence.instants(rate_hz)
     runs = [
         run_estimator(sequence, name, settings.get(name), instants_ns=instants_ns, progress=_named(progress, name))

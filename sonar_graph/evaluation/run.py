@@ -71,6 +71,17 @@ def run_estimator(
     return _Replay(sequence, list(sequence.replay(instants)), name, params).run(kind, progress)
 
 
+def check_request(name: str, overrides: dict[str, Any] | None = None) -> None:
+    """Raise for a name or setting that does not exist, as `run_estimator` would, without running anything."""
+    try:
+        kind = load_estimator(name)
+    except UnknownEstimatorError:
+        raise
+    except EstimatorError:
+        return
+    make_params(kind, overrides or {}, name)
+
+
 class _Replay:
     """A run in progress: what has been said and how long it took."""
 

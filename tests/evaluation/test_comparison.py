@@ -171,6 +171,16 @@ def test_mistakes_of_the_user_are_raised(install: Install, make_sequence: Make, 
         compare(sequence, ["offset"], {"offset": {"colour": 1}})
 
 
+def test_a_wrong_name_is_found_before_anything_runs(
+    install: Install, make_sequence: Make, offset_estimator: Any
+) -> None:
+    install(offset=offset_estimator)
+    calls: list[Any] = []
+    with pytest.raises(UnknownEstimatorError):
+        compare(make_sequence(), ["offset", "nobody"], progress=lambda *call: calls.append(call))
+    assert calls == []
+
+
 def test_progress_names_the_estimator(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
     install(one=offset_estimator, two=offset_estimator)
     calls: list[tuple[str, int, int]] = []
