@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import sonar_graph
 from sonar_graph.calibration import Calibration
 from sonar_graph.cli import app, main
-from sonar_graph.cli.settings import estimator_settings, parse_setting, read_calibration
+from sonar_graph.cli.settings import estimator_settings, parse_setting, read_calibration, topic_choices
 from sonar_graph.errors import CalibrationError, EstimatorError
 
 
@@ -114,6 +114,9 @@ MISTAKES = {
     "setting without value": (["run", "LOG", "-o", "OUT", "--set", "isam2.lag_s"], "expected name=value"),
     "setting of another": (["run", "LOG", "-o", "OUT", "--set", "ekf-slam.x=1"], "expected ESTIMATOR.setting=value"),
     "unknown setting": (["run", "LOG", "-o", "OUT", "--set", "isam2.nonsense=1"], "nonsense"),
+    "topic without role": (["run", "LOG", "-o", "OUT", "--topic", "/imu/data"], "expected ROLE=TOPIC"),
+    "topic of no such role": (["run", "LOG", "-o", "OUT", "--topic", "smell=/imu/data"], "smell"),
+    "topic that is not there": (["run", "LOG", "-o", "OUT", "--topic", "imu=/imu/raw"], "/imu/raw"),
     "broken calibration": (["run", "LOG", "-o", "OUT", "--calibration", "TEXT"], "not TOML"),
     "unknown simulation option": (["simulate", "basin", "-o", "new.mcap", "--set", "wind=3"], "wind"),
     "unknown preset": (["simulate", "basin", "-o", "new.mcap", "--imu", "sundial"], "sundial"),
@@ -301,6 +304,10 @@ def test_settings_go_to_their_estimator_at_any_depth() -> None:
 def test_setting_of_an_estimator_that_does_not_run_is_refused() -> None:
     with pytest.raises(EstimatorError, match="one of isam2, mine"):
         estimator_settings(["other.gain=1"], ["isam2", "mine"])
+
+
+def test_topics_go_to_their_roles() -> None:
+    assert topic_choices(["imu=/imu/data", "dvl=/a=b"]) == {"imu": "/imu/data", "dvl": "/a=b"}
 
 
 @pytest.mark.parametrize(

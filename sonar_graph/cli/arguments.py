@@ -29,3 +29,11 @@ EstimatorSettings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME.SETTING=VALUE", help="Change a setting of an estimator; may be repeated."),
 ]
+TopicChoices = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--topic",
+        metavar="ROLE=TOPIC",
+        help="Topic for a role, where inspect says that several fit or none; may be repeated.",
+    ),
+]

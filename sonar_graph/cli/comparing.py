@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sonar_graph.cli.arguments import CalibrationPath, EstimatorSettings, LogPath, OutputFolder, RateHz
+from sonar_graph.cli.arguments import CalibrationPath, EstimatorSettings, LogPath, OutputFolder, RateHz, TopicChoices
 from sonar_graph.cli.outputs import writable_folder
 from sonar_graph.cli.progress import progress_bars, working
-from sonar_graph.cli.settings import estimator_settings, read_calibration
-from sonar_graph.cli.texts import answers, plural
+from sonar_graph.cli.settings import estimator_settings, read_calibration, topic_choices
+from sonar_graph.cli.texts import answers
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 
 if TYPE_CHECKING:
@@ -23,6 +24,22 @@ DEFAULT_RATE_HZ = 2.0
 DEMO_DURATION_S = 300.0
 
 
+@dataclass(frozen=True)
+class LogSource:
+    """A log, and what the user said about reading it."""
+
+    path: Path
+    calibration: Path | None = None
+    topics: list[str] | None = None
+
+    def read(self) -> Sequence:
+        """The log as a sequence; the errors are those of reading a log, a calibration, or choices of topics."""
+        from sonar_graph.logs.reading import read_sequence
+
+        topics = topic_choices(self.topics or [])
+        return read_sequence(self.path, calibration=read_calibration(self.calibration), topics=topics)
+
+
 def run(
     log: LogPath,
     output: OutputFolder,
@@ -30,9 +47,10 @@ def run(
     rate_hz: RateHz = DEFAULT_RATE_HZ,
     settings: EstimatorSettings = None,
     calibration: CalibrationPath = None,
+    topics: TopicChoices = None,
 ) -> None:
     """Run one estimator on a log; write its trajectories, landmarks and scores."""
-    comparison = _compare_log(log, output, [estimator], rate_hz, settings, calibration)
+    comparison = _compare_log(LogSource(log, calibration, topics), output, [estimator], rate_hz, settings)
     _print_summary(comparison)
     typer.echo(f"Results: {output}")
     _exit_by(comparison)
@@ -45,12 +63,15 @@ def compare(
     rate_hz: RateHz = DEFAULT_RATE_HZ,
     settings: EstimatorSettings = None,
     calibration: CalibrationPath = None,
+    topics: TopicChoices = None,
 ) -> None:
     """Run several estimators on the same measurements and write a report on how they compare.
 
     Writes report.html, comparison.json, result.mcap for a viewer, and runs/NAME/ with each estimator's trajectories.
     """
-    comparison = _compare_log(log, output, _estimator_names(estimators), rate_hz, settings, calibration)
+    comparison = _compare_log(
+        LogSource(log, calibration, topics), output, _estimator_names(estimators), rate_hz, settings
+    )
     page = _write_report(comparison, output)
     _print_summary(comparison)
     typer.echo(f"Report: {page}")
@@ -95,22 +116,15 @@ def _estimator_names(text: str) -> list[str]:
 
 
 def _compare_log(
-    log: Path,
-    output: Path,
-    names: list[str],
-    rate_hz: float,
-    settings: list[str] | None,
-    calibration_path: Path | None,
+    source: LogSource, output: Path, names: list[str], rate_hz: float, settings: list[str] | None
 ) -> Comparison:
     from sonar_graph.evaluation.comparison import compare as compare_runs
-    from sonar_graph.logs.reading import read_sequence
 
     overrides = estimator_settings(settings or [], names)
     _check_settings(names, overrides)
-    calibration = read_calibration(calibration_path)
     writable_folder(output)
-    with working(f"reading {log.name}"):
-        sequence = read_sequence(log, calibration=calibration)
+    with working(f"reading {source.path.name}"):
+        sequence = source.read()
     with progress_bars() as progress:
         comparison = compare_runs(sequence, names, overrides, rate_hz=rate_hz, progress=progress)
     _write_results(comparison, sequence, output)
@@ -164,10 +178,9 @@ def _print_summary(comparison: Comparison) -> None:
 
 
 def _exit_by(comparison: Comparison) -> None:
-    """Exit with 1 when a run failed, naming it; everything is written by then."""
+    """Exit with 1 when a run failed, saying why; everything is written by then."""
     failed = [run for run in comparison.runs if run.status == "failed"]
     for run in failed:
-        typer.echo(f"{run.estimator} failed: {run.reason}", err=True)
+        typer.echo(f"sonar-graph: {run.estimator} failed: {run.reason}", err=True)
     if failed:
-        typer.echo(f"sonar-graph: {plural(len(failed), 'run')} failed of {len(comparison.runs)}", err=True)
         raise typer.Exit(1)

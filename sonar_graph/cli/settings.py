@@ -1,4 +1,4 @@
-"""Settings given on the command line or in a file: ``--set name=value`` and ``--calibration FILE``."""
+"""Settings given on the command line or in a file: ``--set``, ``--topic`` and ``--calibration``."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sonar_graph.errors import CalibrationError, EstimatorError
+from sonar_graph.errors import CalibrationError, EstimatorError, LogError
 
 if TYPE_CHECKING:
     from sonar_graph.calibration import Calibration
@@ -60,6 +60,23 @@ def _put(tree: dict[str, Any], path: list[str], value: Any) -> None:
             tree[name] = {}
         tree = tree[name]
     tree[path[-1]] = value
+
+
+def topic_choices(texts: list[str]) -> dict[str, str]:
+    """Topics by role, from texts such as ``imu=/imu/data``.
+
+    Raises
+    ------
+    LogError
+        When there is no role, no ``=`` or no topic.
+    """
+    choices = {}
+    for text in texts:
+        role, _, topic = text.partition("=")
+        if not role or not topic:
+            raise LogError(f"--topic {text}: expected ROLE=TOPIC such as imu=/imu/data")
+        choices[role] = topic
+    return choices
 
 
 def read_calibration(path: Path | None) -> Calibration | None:

@@ -12,11 +12,6 @@ def examples(*commands: str) -> str:
     return "\n\n".join(["Examples:", *commands])
 
 
-def plural(count: int, noun: str) -> str:
-    """``1 row``, ``2 rows``."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
-
-
 def answers() -> Console:
     """Where results go: stdout, and where that is no terminal, wide enough for lines to stay whole."""
     console = Console(highlight=False)
