@@ -1,0 +1,73 @@
+"""What the README and the pages of docs promise is there."""
+
+from __future__ import annotations
+
+import ast
+import re
+import tomllib
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from sonar_graph.calibration import Calibration
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_between_pages_lead_somewhere(page: Path) -> None:
+    text = re.sub(r"```.*?```|`[^`]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    targets = re.findall(r"(?<!!)\[[^\]]*\]\(([^)#\s]+)", text)
+    missing = [target for target in targets if "://" not in target and not (page.parent / target).exists()]
+    assert not missing
+
+
+def test_example_calibration_is_one() -> None:
+    example = next(block for block in blocks("toml") if "[imu]" in block)
+    parsed = Calibration.parse(tomllib.loads(example), "README.md")
+    assert parsed.dvl.mounting.translation_m == (0.30, 0.0, -0.15)
+
+
+def test_example_entry_point_joins_the_group() -> None:
+    from sonar_graph.estimator import ENTRY_POINT_GROUP
+
+    example = next(block for block in blocks("toml") if "entry-points" in block)
+    assert ENTRY_POINT_GROUP in tomllib.loads(example)["project"]["entry-points"]
+
+
+def test_names_imported_in_examples_exist() -> None:
+    imports = [
+        node for block in blocks("python") for node in ast.walk(ast.parse(block)) if isinstance(node, ast.ImportFrom)
+    ]
+    assert imports
+    for node in imports:
+        for name in node.names:
+            assert hasattr(import_module(str(node.module)), name.name)
+
+
+def test_commands_are_understood(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import typer.main
+
+    from sonar_graph.cli import app
+
+    monkeypatch.chdir(tmp_path)
+    for name in ("dive.mcap", "vehicle.toml"):
+        Path(name).touch()
+    group = typer.main.get_command(app)
+    lines = re.findall(r"^    sonar-graph (.+)$|`sonar-graph ([a-z]+ [^`]*\.mcap[^`]*)`", README, flags=re.MULTILINE)
+    assert len(lines) >= 4
+    for words in ((indented or inline).split() for indented, inline in lines):
+        group.commands[words[0]].make_context(words[0], words[1:])  # type: ignore[attr-defined]
+
+
+def test_citation_names_the_version_of_the_package() -> None:
+    from sonar_graph import __version__
+
+    assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
