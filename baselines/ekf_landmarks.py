@@ -1,0 +1,249 @@
+"""Landmarks in EKF-SLAM: the paper's observation (6) and innovation (7), and augmentation at first sight.
+
+All happens at the instant of a frame, which lies a provisional motion (dR, dp, cov) after the state. With
+``R_t = R dR``, ``p_t = X + R dp`` the body then, T from `perturbation_jacobian` and a landmark at
+``p_b = R_t^T (p - p_t)`` in the body frame::
+
+    z     = h(x_v, p)                                     (6)  range and azimuth, `sonar_graph.slam.models.project`
+    e     = z_measured - z, azimuth wrapped               (7)
+    H_b   = D_q sonar_R_body [ [p_b]x | -I ]              by the body's perturbation then
+    H_v   = H_b T,   H_p = D_q sonar_R_body R_t^T         by the state
+    S     = H P H^T + R + H_b cov H_b^T
+
+A new landmark at ``p = g(x_v, z, elevation) = p_t + R_t p_b`` with ``G_b = R_t [ -[p_b]x | I ]``::
+
+    P_pv = G_b T P_v.,   P_pp = (G_b T) P_vv (G_b T)^T + G_b cov G_b^T + G_z diag(R, elevation_sigma^2) G_z^T
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from baselines.ekf_state import LANDMARK, POSE, correct, correct_pair, cross, perturbation_jacobian, product
+from baselines.euler import rotation_from_euler
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.navigation.kernels import compiled, skew
+from sonar_graph.slam.models import floor_elevation, project, sonar_point, sonar_point_jacobian, wrap_angle
+
+USED, NEW, GATED = 0, 1, 2
+"""What became of a detection, in compiled code."""
+
+
+class SonarModel(NamedTuple):
+    """What is known of sonar and floor."""
+
+    body_R_sonar: Floats
+    body_p_sonar: Floats
+    gate: float
+    """Squared Mahalanobis distance beyond which an innovation is refused."""
+    aperture_rad: float
+    has_floor: bool
+    floor_z_m: float
+    floor_variance_m2: float
+
+
+class Moment(NamedTuple):
+    """The body at the instant of a frame."""
+
+    world_R_body: Floats
+    position: Floats
+    T: Floats
+    """Derivative of the perturbation [theta, rho] by the pose state, shape (6, 6)."""
+    cov: Floats
+    """Of the provisional motion, shape (6, 6)."""
+
+
+@compiled
+def moment_after(x: Floats, dR: Floats, dp: Floats, cov: Floats) -> Moment:
+    """The body a motion after the state."""
+    R = rotation_from_euler(x[3:POSE])
+    position = np.empty(3)
+    for r in range(3):
+        position[r] = x[r] + R[r, 0] * dp[0] + R[r, 1] * dp[1] + R[r, 2] * dp[2]
+    return Moment(product(R, dR), position, perturbation_jacobian(x[3:POSE], dR, dp), cov)
+
+
+@compiled
+def pose_after(x: Floats, P: Floats, dR: Floats, dp: Floats, cov: Floats) -> tuple[Floats, Floats, Floats]:
+    """world_R_body, position, and the covariance of [theta, rho] a motion after the state: ``T P_vv T^T + cov``."""
+    moment = moment_after(x, dR, dp, cov)
+    own = product(product(moment.T, P[:POSE, :POSE]), moment.T.T) + cov
+    return moment.world_R_body, moment.position, 0.5 * (own + own.T)
+
+
+@compiled
+def observe_frame(
+    x: Floats,
+    P: Floats,
+    n: int,
+    dR: Floats,
+    dp: Floats,
+    cov: Floats,
+    sonar: SonarModel,
+    slots: Ints,
+    z: Floats,
+    R: Floats,
+) -> tuple[int, Ints, Floats, Floats]:
+    """Take in the detections of one frame, row by row.
+
+    Parameters
+    ----------
+    slots
+        Place of each row's landmark in the state; the first unused place is a new landmark, shape (m,).
+    z
+        Range and azimuth, shape (m, 2).
+    R
+        Their covariance, shape (m, 2, 2).
+
+    Returns
+    -------
+    Length of the state; USED, NEW or GATED for each row (m,); innovations (m, 2) and their covariances (m, 2, 2), NaN
+    for new landmarks.
+    """
+    m = len(slots)
+    outcomes, innovations, covs = np.empty(m, np.int64), np.full((m, 2), np.nan), np.full((m, 2, 2), np.nan)
+    for row in range(m):
+        at = POSE + LANDMARK * slots[row]
+        moment = moment_after(x, dR, dp, cov)
+        if at >= n:
+            _augment(x, P, n, moment, sonar, z[row], R[row])
+            n += LANDMARK
+            outcomes[row] = NEW
+        else:
+            outcomes[row] = _observe(x, P, n, at, moment, sonar, z[row], R[row], innovations[row], covs[row])
+    return n, outcomes, innovations, covs
+
+
+@compiled
+def observation(moment: Moment, p: Floats, body_R_sonar: Floats, body_p_sonar: Floats) -> tuple[Floats, Floats, Floats]:
+    """(6): predicted range and azimuth (2,), H_b (2, 6) and H_p (2, 3)."""
+    R_t = moment.world_R_body
+    p_b, q = np.zeros(3), np.zeros(3)
+    for r in range(3):
+        for k in range(3):
+            p_b[r] += R_t[k, r] * (p[k] - moment.position[k])
+    for r in range(3):
+        for k in range(3):
+            q[r] += body_R_sonar[k, r] * (p_b[k] - body_p_sonar[k])
+    z, D_q = project(q)
+    by_p_b = product(D_q, body_R_sonar.T)
+    H_b = np.empty((2, POSE))
+    H_b[:, :3] = product(by_p_b, skew(p_b))
+    H_b[:, 3:] = -by_p_b
+    return z, H_b, product(by_p_b, R_t.T)
+
+
+@compiled
+def _observe(
+    x: Floats,
+    P: Floats,
+    n: int,
+    at: int,
+    moment: Moment,
+    sonar: SonarModel,
+    z: Floats,
+    R: Floats,
+    innovation: Floats,
+    S: Floats,
+) -> int:
+    """Correct by a landmark that is in the state, where its innovation is inside the gate."""
+    predicted, H_b, H_p = observation(moment, x[at : at + LANDMARK], sonar.body_R_sonar, sonar.body_p_sonar)
+    innovation[0], innovation[1] = z[0] - predicted[0], wrap_angle(z[1] - predicted[1])  # (7)
+    H_v = product(H_b, moment.T)
+    U = _cross_covariance(P, n, at, H_v, H_p)
+    motion_noise = product(product(H_b, moment.cov), H_b.T)
+    for r in range(2):
+        for c in range(2):
+            S[r, c] = R[r, c] + motion_noise[r, c]
+            for k in range(POSE):
+                S[r, c] += U[r, k] * H_v[c, k]
+            for k in range(LANDMARK):
+                S[r, c] += U[r, at + k] * H_p[c, k]
+    S[0, 1] = S[1, 0] = 0.5 * (S[0, 1] + S[1, 0])
+    if not squared_distance(innovation, S) <= sonar.gate:
+        return GATED
+    correct_pair(x, P, n, U, S, innovation)
+    return USED
+
+
+@compiled
+def _cross_covariance(P: Floats, n: int, at: int, H_v: Floats, H_p: Floats) -> Floats:
+    """``H P``, shape (2, n): only the columns of pose and landmark in H are not zero."""
+    U = np.zeros((2, n))
+    for r in range(2):
+        for k in range(POSE):
+            for c in range(n):
+                U[r, c] += H_v[r, k] * P[k, c]
+        for k in range(LANDMARK):
+            for c in range(n):
+                U[r, c] += H_p[r, k] * P[at + k, c]
+    return U
+
+
+@compiled
+def squared_distance(e: Floats, S: Floats) -> float:
+    """``e^T S^-1 e`` for two numbers."""
+    determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
+    return (S[1, 1] * e[0] * e[0] - (S[0, 1] + S[1, 0]) * e[0] * e[1] + S[0, 0] * e[1] * e[1]) / determinant
+
+
+@compiled
+def _augment(x: Floats, P: Floats, n: int, moment: Moment, sonar: SonarModel, z: Floats, R: Floats) -> None:
+    """Append a landmark where it was seen; its elevation from the floor where there is one, else zero."""
+    elevation = _elevation(moment, sonar, z)
+    point, G_b, G_z = location(moment, sonar.body_R_sonar, sonar.body_p_sonar, z, elevation)
+    x[n : n + LANDMARK] = point
+    noise = np.zeros((3, 3))
+    noise[:2, :2] = R
+    noise[2, 2] = sonar.aperture_rad**2 / 12.0
+    G_v = product(G_b, moment.T)
+    rows = product(G_v, P[:POSE, :n])
+    own = (
+        product(rows[:, :POSE], G_v.T) + product(product(G_b, moment.cov), G_b.T) + product(product(G_z, noise), G_z.T)
+    )
+    for r in range(LANDMARK):
+        for c in range(n):
+            P[n + r, c] = P[c, n + r] = rows[r, c]
+        for c in range(LANDMARK):
+            P[n + r, n + c] = 0.5 * (own[r, c] + own[c, r])
+    if sonar.has_floor:
+        after = n + LANDMARK
+        S = P[after - 1, after - 1] + sonar.floor_variance_m2
+        correct(x, P, after, P[after - 1, :after].copy(), S, sonar.floor_z_m - x[after - 1])
+
+
+@compiled
+def _elevation(moment: Moment, sonar: SonarModel, z: Floats) -> float:
+    """Elevation on the floor; 0 without one, or where it is outside the aperture."""
+    if not sonar.has_floor:
+        return 0.0
+    R_sonar = product(moment.world_R_body, sonar.body_R_sonar)
+    sonar_z = moment.position[2]
+    for k in range(3):
+        sonar_z += moment.world_R_body[2, k] * sonar.body_p_sonar[k]
+    elevation = floor_elevation(R_sonar[2], sonar.floor_z_m - sonar_z, z[0], z[1], sonar.aperture_rad)
+    return 0.0 if math.isnan(elevation) else elevation
+
+
+@compiled
+def location(
+    moment: Moment, body_R_sonar: Floats, body_p_sonar: Floats, z: Floats, elevation_rad: float
+) -> tuple[Floats, Floats, Floats]:
+    """The point g (3,) that a detection shows, G_b (3, 6), and G_z by (range, azimuth, elevation) (3, 3)."""
+    q = sonar_point(z[0], z[1], elevation_rad)
+    R_t = moment.world_R_body
+    p_b, point = body_p_sonar.copy(), moment.position.copy()
+    for r in range(3):
+        for k in range(3):
+            p_b[r] += body_R_sonar[r, k] * q[k]
+    for r in range(3):
+        for k in range(3):
+            point[r] += R_t[r, k] * p_b[k]
+    G_b = np.empty((3, POSE))
+    G_b[:, :3] = product(R_t, cross(-p_b, np.eye(3)))
+    G_b[:, 3:] = R_t
+    G_z = product(product(R_t, body_R_sonar), sonar_point_jacobian(z[0], z[1], elevation_rad))
+    return point, G_b, G_z

@@ -1,0 +1,276 @@
+"""EKF-SLAM between sonar frames: prediction from node to node, with depth, gravity and the planar constraint.
+
+One compiled call takes all that was measured between two frames. Events happen in the order of their stamps: all nodes
+that are reached by then (see `sonar_graph.navigation.odometry`), then the depth sample, at a provisional motion from
+the newest of them.
+
+Gravity. From the specific force over about a second follows the direction of the world's up in the body
+(`sonar_graph.navigation.alignment`), of which roll and pitch are ``atan2(up_y, up_z)`` and
+``atan2(-up_x, hypot(up_y, up_z))``: corrections of one state each, with the variance of the tilt (for roll over
+``cos(theta)^2``).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from baselines.ekf_landmarks import moment_after
+from baselines.ekf_state import POSE, correct, predict
+from baselines.euler import rotation_from_euler
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.navigation.alignment import tilt_sigma, up_direction
+from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.odometry import merge_rows, value_at
+from sonar_graph.navigation.recursion import integrate_steps
+from sonar_graph.slam.models import wrap_angle
+
+Columns = tuple[Ints, Floats, Floats, Ints, Floats, Floats, bool]
+Motion = tuple[Floats, Floats, Floats]
+"""dR (3, 3), dp (3,), covariance [rotation, translation] (6, 6)."""
+
+NODE, OPENED = 0, 1
+"""Places in `Clock`: stamp of the state, stamp at which the running gravity interval began."""
+
+
+class VehicleModel(NamedTuple):
+    """What is known of the sensors that move the state."""
+
+    gyro_noise_density: float
+    body_p_dvl: Floats
+    dvl_p_imu: Floats
+    """Lever arm from DVL to IMU, body axes."""
+    earth_rate: Floats
+    """In the world, rad/s; zero where it is not removed."""
+    body_p_port: Floats
+    gravity_interval_ns: int
+    """0: gravity is not used."""
+    accel_noise_density: float
+    accel_bias_sigma: float
+    gravity_m_s2: float
+    is_planar: bool
+    plane_z_m: float
+    plane_z_variance: float
+    plane_tilt_variance: float
+
+
+class GravityInterval(NamedTuple):
+    """What has run up since the last use of gravity."""
+
+    i_R_node: Floats
+    """Rotation since the interval began, shape (3, 3)."""
+    impulse: Floats
+    """Integral of the specific force in the interval's first frame, shape (3,), m/s."""
+    velocity: Floats
+    """Of the IMU's point when it began, shape (3,), and the variance of one component: shape (4,)."""
+
+
+@compiled
+def advance(
+    columns: Columns,
+    model: VehicleModel,
+    x: Floats,
+    P: Floats,
+    n: int,
+    clock: Ints,
+    interval: GravityInterval,
+    depth_ns: Ints,
+    depth_m: Floats,
+    depth_variance: Floats,
+    until_ns: int,
+) -> Motion:
+    """Bring the state to the newest node reached at an instant, with the depth samples on the way.
+
+    Parameters
+    ----------
+    columns
+        Rows of `Odometry.columns`.
+    x, P, n, clock, interval
+        Filter state; changed.
+    depth_ns, depth_m, depth_variance
+        Samples between the state and ``until_ns``, in order.
+
+    Returns
+    -------
+    The provisional motion from the state to ``until_ns``.
+    """
+    for k in range(len(depth_ns)):
+        _commit_nodes(columns, model, x, P, n, clock, interval, depth_ns[k])
+        motion = _provisional_motion(columns, model, x, clock[NODE], depth_ns[k])
+        _correct_depth(x, P, n, motion, model.body_p_port, depth_m[k], depth_variance[k])
+    _commit_nodes(columns, model, x, P, n, clock, interval, until_ns)
+    return _provisional_motion(columns, model, x, clock[NODE], until_ns)
+
+
+@compiled
+def open_interval(columns: Columns, dvl_p_imu: Floats, interval: GravityInterval, clock: Ints) -> None:
+    """Begin a gravity interval at the node."""
+    interval.i_R_node[:] = np.eye(3)
+    interval.impulse[:] = 0.0
+    interval.velocity[:] = _velocity_at_node(columns, clock[NODE], dvl_p_imu)
+    clock[OPENED] = clock[NODE]
+
+
+@compiled
+def _velocity_at_node(columns: Columns, node_ns: int, dvl_p_imu: Floats) -> Floats:
+    """Velocity of the IMU's point in body axes, m/s, and the variance of one component, shape (4,)."""
+    imu_ns, rate, _, dvl_ns, velocity, cov, hold_past = columns
+    k = np.searchsorted(dvl_ns, node_ns)
+    w = value_at(imu_ns, rate, np.searchsorted(imu_ns, node_ns), node_ns, hold_past)
+    at_imu = np.empty(4)
+    for r in range(3):
+        a, b = (r + 1) % 3, (r + 2) % 3
+        at_imu[r] = velocity[k, r] + w[a] * dvl_p_imu[b] - w[b] * dvl_p_imu[a]
+    at_imu[3] = (cov[k, 0, 0] + cov[k, 1, 1] + cov[k, 2, 2]) / 3.0
+    return at_imu
+
+
+@compiled
+def _commit_nodes(
+    columns: Columns,
+    model: VehicleModel,
+    x: Floats,
+    P: Floats,
+    n: int,
+    clock: Ints,
+    interval: GravityInterval,
+    until_ns: int,
+) -> None:
+    """Predict over all nodes that are reached at an instant."""
+    imu_ns, dvl_ns = columns[0], columns[3]
+    seen = np.searchsorted(imu_ns, until_ns, side="right")
+    if seen == 0:
+        return
+    covered_ns = min(until_ns, imu_ns[seen - 1])
+    for k in range(np.searchsorted(dvl_ns, clock[NODE], side="right"), len(dvl_ns)):
+        if dvl_ns[k] > covered_ns:
+            return
+        if dvl_ns[k] > clock[NODE]:
+            _to_node(columns, model, x, P, n, clock, interval, dvl_ns[k])
+
+
+@compiled
+def _to_node(
+    columns: Columns,
+    model: VehicleModel,
+    x: Floats,
+    P: Floats,
+    n: int,
+    clock: Ints,
+    interval: GravityInterval,
+    node_ns: int,
+) -> None:
+    """Predict to a node and apply what holds there."""
+    imu_rows = np.searchsorted(columns[0], node_ns) + 1
+    dvl_rows = np.searchsorted(columns[3], node_ns, side="right")
+    dR, dp, cov, impulse = _motion(columns, model, x, clock[NODE], node_ns, imu_rows, dvl_rows)
+    predict(x, P, n, dR, dp, cov)
+    clock[NODE] = node_ns
+    if model.gravity_interval_ns > 0:
+        _extend(interval, dR, impulse)
+        if node_ns - clock[OPENED] >= model.gravity_interval_ns:
+            _correct_gravity(columns, model, x, P, n, clock, interval)
+            open_interval(columns, model.dvl_p_imu, interval, clock)
+    if model.is_planar:
+        _correct_state(x, P, n, 2, model.plane_z_m, model.plane_z_variance)
+        _correct_state(x, P, n, 3, 0.0, model.plane_tilt_variance)
+        _correct_state(x, P, n, 4, 0.0, model.plane_tilt_variance)
+
+
+@compiled
+def _provisional_motion(columns: Columns, model: VehicleModel, x: Floats, node_ns: int, until_ns: int) -> Motion:
+    """From the newest node to an instant, from rows stamped no later."""
+    imu_rows = np.searchsorted(columns[0], until_ns, side="right")
+    dvl_rows = np.searchsorted(columns[3], until_ns, side="right")
+    dR, dp, cov, _ = _motion(columns, model, x, node_ns, until_ns, imu_rows, dvl_rows)
+    return dR, dp, cov
+
+
+@compiled
+def _motion(
+    columns: Columns, model: VehicleModel, x: Floats, start_ns: int, end_ns: int, imu_rows: int, dvl_rows: int
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Motion between two instants from the first rows of each sensor, and the integral of the specific force."""
+    imu_ns, rate, force, dvl_ns, velocity, cov, hold_past = columns
+    duration, w, v, psd, f = merge_rows(
+        start_ns, end_ns, imu_ns[:imu_rows], rate, force, dvl_ns[:dvl_rows], velocity, cov, hold_past
+    )
+    earth = np.zeros(3)
+    if model.earth_rate.any():
+        R = rotation_from_euler(x[3:POSE])
+        for r in range(3):
+            for k in range(3):
+                earth[r] += R[k, r] * model.earth_rate[k]
+    no_bias = np.zeros(3)
+    dR, dp, motion_cov, _, impulse = integrate_steps(
+        duration, w, v, psd, f, no_bias, earth, model.body_p_dvl, model.gyro_noise_density
+    )
+    return dR, dp, motion_cov, impulse
+
+
+@compiled
+def _extend(interval: GravityInterval, dR: Floats, impulse: Floats) -> None:
+    """Let the running interval reach one node further."""
+    R = interval.i_R_node
+    turned = np.zeros((3, 3))
+    for r in range(3):
+        for k in range(3):
+            interval.impulse[r] += R[r, k] * impulse[k]
+            for c in range(3):
+                turned[r, c] += R[r, k] * dR[k, c]
+    R[:] = turned
+
+
+@compiled
+def _correct_gravity(
+    columns: Columns, model: VehicleModel, x: Floats, P: Floats, n: int, clock: Ints, interval: GravityInterval
+) -> None:
+    """Correct roll and pitch, where the specific force was measured."""
+    duration_s = (clock[NODE] - clock[OPENED]) * 1e-9
+    velocity = _velocity_at_node(columns, clock[NODE], model.dvl_p_imu)
+    mean_force = interval.impulse / duration_s
+    up = up_direction(mean_force, interval.i_R_node, interval.velocity[:3], velocity[:3], duration_s)
+    if not np.isfinite(up).all():
+        return
+    velocity_sigma = math.sqrt(0.5 * (velocity[3] + interval.velocity[3]))
+    sigma = tilt_sigma(
+        duration_s, velocity_sigma, model.accel_noise_density, model.accel_bias_sigma, model.gravity_m_s2
+    )
+    level = math.hypot(up[1], up[2])
+    _correct_state(x, P, n, 3, math.atan2(up[1], up[2]), (sigma / level) ** 2)
+    _correct_state(x, P, n, 4, math.atan2(-up[0], level), sigma**2)
+
+
+@compiled
+def _correct_state(x: Floats, P: Floats, n: int, at: int, value: float, variance: float) -> None:
+    """Correct by a direct measurement of Z or of an angle."""
+    innovation = value - x[at] if at < 3 else wrap_angle(value - x[at])
+    correct(x, P, n, P[at, :n].copy(), P[at, at] + variance, innovation)
+
+
+@compiled
+def _correct_depth(x: Floats, P: Floats, n: int, motion: Motion, port: Floats, z_m: float, variance_m2: float) -> None:
+    """Correct by the height of the pressure port: ``z = p_t,z + (R_t port)_z``."""
+    moment = moment_after(x, motion[0], motion[1], motion[2])
+    down = moment.world_R_body[2]
+    h_b, h = np.empty(POSE), np.zeros(POSE)
+    predicted = moment.position[2]
+    for r in range(3):
+        a, b = (r + 1) % 3, (r + 2) % 3
+        h_b[r] = port[a] * down[b] - port[b] * down[a]
+        h_b[3 + r] = down[r]
+        predicted += down[r] * port[r]
+    S = variance_m2
+    for r in range(POSE):
+        for k in range(POSE):
+            h[r] += h_b[k] * moment.T[k, r]
+            S += h_b[r] * moment.cov[r, k] * h_b[k]
+    U = np.zeros(n)
+    for k in range(POSE):
+        for c in range(n):
+            U[c] += h[k] * P[k, c]
+    for k in range(POSE):
+        S += U[k] * h[k]
+    correct(x, P, n, U, S, z_m - predicted)

@@ -1,0 +1,315 @@
+"""EKF-SLAM as published, in its textbook form: the baseline that a smoother has to beat."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import ClassVar
+
+import gtsam
+import numpy as np
+from pydantic import Field
+
+from baselines.ekf_landmarks import GATED, NEW, USED, SonarModel, observe_frame, pose_after
+from baselines.ekf_prediction import NODE, GravityInterval, Motion, VehicleModel, advance, open_interval
+from baselines.ekf_state import LANDMARK, POSE
+from baselines.euler import euler_from_rates, euler_from_rotation
+from sonar_graph.calibration import Calibration, Section, Start
+from sonar_graph.errors import EstimatorError, MeasurementError
+from sonar_graph.measurements import Depth, Floats, Ints, LandmarkDetections, Measurements
+from sonar_graph.navigation.earth import earth_rate_in_world
+from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.slam.association import DetectionJournal, gate_threshold, identify
+from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
+
+ROOM = 8
+"""Landmarks that the first arrays have room for; doubled when needed."""
+SINGULAR_COSINE = 1e-3
+"""Below this cosine of the pitch the Euler angles are useless."""
+OUTCOMES = {USED: Outcome.USED, NEW: Outcome.NEW, GATED: Outcome.GATED}
+
+
+class EkfSlamParams(Section):
+    """Settings of EKF-SLAM; the paper gives none of them."""
+
+    gate_probability: float = Field(0.999, gt=0, le=1)
+    """Share of true innovations that the gate lets pass; 1: no gate."""
+    minimum_id_probability: float = Field(0.5, ge=0, le=1)
+    """Posterior below which an identity is not believed."""
+    gravity_interval_s: float = Field(1.0, gt=0)
+    """Over which the specific force is averaged for one correction of roll and pitch."""
+
+
+class EkfSlam:
+    """Extended Kalman filter over pose and landmarks.
+
+    State (4) and covariance (5), prediction by gyros and Doppler log, observation (6) and innovation (7) of range and
+    azimuth, augmentation at first sight; the numbers are those of "Experimental Results of Real-time Sonar-based
+    Underwater Localization Using Landmarks". Equations: `baselines.ekf_state`, `baselines.ekf_landmarks`,
+    `baselines.ekf_prediction`. Derivation: docs/theory/ekf_slam.md.
+
+    What the paper leaves open, and how it is settled here:
+
+    - Prediction runs from one DVL stamp to the next, over the same steps as every other estimator's
+      (`sonar_graph.navigation.odometry`); attitude is integrated exactly for a constant rate, Q is the covariance of
+      the integrated gyro and Doppler noise, lever arms included.
+    - There is no gyro bias in the state (4). Its drift is not in the covariance either: with a biased gyro this filter
+      trusts its heading too much, and gates true detections sooner or later.
+    - A new landmark's elevation comes from the floor where its height is known, else it is 0; its sigma is the
+      aperture over sqrt(12). A known floor enters once for each landmark, as a measurement of its height.
+    - Identities need a posterior, innovations a gate (`EkfSlamParams`). A refused detection changes nothing.
+    - Depth, the direction of gravity and planar motion, where the calibration has them, are further corrections;
+      none is gated. Successive gravity directions are taken as independent, although they share the accelerometer's
+      bias.
+    - Several detections of one frame are taken one after the other, in the order of their rows.
+    - Corrections are ``P - K S K^T`` in a form that stays symmetric, the Jacobians are taken once (no iteration).
+
+    Parameters
+    ----------
+    calibration
+        Noise, mountings, start, floor.
+    params
+        None: the defaults.
+    """
+
+    Params: ClassVar[type[Section]] = EkfSlamParams
+
+    def __init__(self, calibration: Calibration, params: EkfSlamParams | None = None) -> None:
+        self._calibration = calibration
+        self._params = params or EkfSlamParams()
+        self._vehicle = _vehicle_model(calibration, self._params)
+        self._sonar = _sonar_model(calibration, self._params)
+        self._odometry = Odometry(calibration)
+        self._journal = DetectionJournal()
+        self._estimates: list[Estimate] = []
+        self._slots: dict[int, int] = {}
+        self._x, self._P = _start_state(calibration.start)
+        self._n = POSE
+        self._clock: Ints = np.zeros(2, np.int64)
+        self._interval = GravityInterval(np.eye(3), np.zeros(3), np.zeros(4))
+        self._started = False
+        self._done_ns = np.iinfo(np.int64).min
+
+    def process(self, measurements: Measurements) -> Estimate | None:
+        """Take in what was measured and return the causal estimate at ``measurements.end_ns``.
+
+        None before the first DVL stamp that IMU rows cover from both sides.
+
+        Raises
+        ------
+        EstimatorError
+            When the pitch comes so near 90 degrees that the Euler angles are singular.
+        MeasurementError
+            When a range or azimuth is not finite.
+        """
+        self._odometry.add(measurements.imu, measurements.dvl)
+        depth = self._depth_columns(measurements.depth)
+        for frame in _frames(measurements.detections):
+            depth = self._process_frame(frame, depth)
+        self._done_ns = max(self._done_ns, measurements.end_ns)
+        if not self._has_started(measurements.end_ns):
+            return None
+        motion, _ = self._advance(depth, measurements.end_ns)
+        self._odometry.forget_before(int(self._clock[NODE]))
+        estimate = self._estimate(measurements.end_ns, motion)
+        self._estimates.append(estimate)
+        return estimate
+
+    def trajectory(self) -> Trajectory:
+        """The causal estimates: a filter does not look back."""
+        return Trajectory.from_estimates(self._estimates)
+
+    def landmarks(self) -> LandmarkMap:
+        """Landmarks in the state, with their blocks of (5)."""
+        ids = sorted(self._slots)
+        places = [POSE + LANDMARK * self._slots[i] for i in ids]
+        return LandmarkMap(
+            ids=np.array(ids, dtype=np.int64),
+            positions=np.array([self._x[k : k + 3] for k in places]).reshape(-1, 3),
+            covariances=np.array([self._P[k : k + 3, k : k + 3] for k in places]).reshape(-1, 3, 3),
+        )
+
+    def detections(self) -> DetectionLog:
+        """What became of each detection so far."""
+        return self._journal.log()
+
+    def state(self) -> tuple[int, Floats, Floats]:
+        """Stamp (ns), x of equation (4) and P of (5) at the newest node; copies."""
+        n = self._n
+        return int(self._clock[NODE]), self._x[:n].copy(), self._P[:n, :n].copy()
+
+    def _has_started(self, instant_ns: int) -> bool:
+        """Whether the start was reached by then; sets the clock when it is."""
+        if self._started:
+            return instant_ns >= self._clock[NODE]
+        start_ns = self._odometry.start_ns()
+        if start_ns is None or not len(self._odometry.nodes(start_ns - 1, instant_ns)):
+            return False
+        self._started = True
+        self._clock[NODE] = start_ns
+        open_interval(self._odometry.columns(), self._vehicle.dvl_p_imu, self._interval, self._clock)
+        return True
+
+    def _depth_columns(self, depth: Depth | None) -> tuple[Ints, Floats, Floats]:
+        """Stamps, heights and variances of the samples that are not late."""
+        if depth is None:
+            return _NO_DEPTH
+        first = int(np.searchsorted(depth.stamps_ns, self._done_ns))
+        default = self._calibration.depth.sigma_m**2
+        variance = np.where(np.isnan(depth.variance_m2), default, depth.variance_m2)
+        return depth.stamps_ns[first:], depth.z_m[first:], variance[first:]
+
+    def _advance(self, depth: tuple[Ints, Floats, Floats], until_ns: int) -> tuple[Motion, tuple[Ints, Floats, Floats]]:
+        """Predict up to an instant; returns the provisional motion to it and the depth samples after it."""
+        stamps_ns, z_m, variance = depth
+        first, last = np.searchsorted(stamps_ns, [self._clock[NODE], until_ns + 1])
+        motion = advance(
+            self._odometry.columns(),
+            self._vehicle,
+            self._x,
+            self._P,
+            self._n,
+            self._clock,
+            self._interval,
+            stamps_ns[first:last],
+            z_m[first:last],
+            variance[first:last],
+            until_ns,
+        )
+        if math.cos(self._x[4]) < SINGULAR_COSINE:
+            raise EstimatorError(
+                f"ekf-slam: pitch is {math.degrees(self._x[4]):.2f} deg at {int(self._clock[NODE])} ns, where the Euler"
+                " angles of its state are singular; use isam2 for this log"
+            )
+        return motion, (stamps_ns[last:], z_m[last:], variance[last:])
+
+    def _process_frame(
+        self, frame: LandmarkDetections, depth: tuple[Ints, Floats, Floats]
+    ) -> tuple[Ints, Floats, Floats]:
+        """Take in the detections of one frame; returns the depth samples after it."""
+        stamp_ns = int(frame.stamps_ns[0])
+        identities = identify(frame, self._params.minimum_id_probability)
+        refusal = self._refusal(stamp_ns)
+        refusals = [refusal or reason for reason in identities.refusals]
+        rows = [row for row, reason in enumerate(refusals) if reason is None]
+        found: dict[int, tuple[Outcome, Floats, Floats]] = {}
+        if rows:
+            motion, depth = self._advance(depth, stamp_ns)
+            found = dict(zip(rows, self._observe(frame, rows, identities.ids, motion), strict=True))
+        for row, reason in enumerate(refusals):
+            landmark_id = int(identities.ids[row])
+            if reason is None:
+                self._journal.record(stamp_ns, landmark_id, *found[row])
+            else:
+                self._journal.record(stamp_ns, landmark_id, reason)
+        return depth
+
+    def _refusal(self, stamp_ns: int) -> Outcome | None:
+        """Why nothing stamped then can be used."""
+        if self._started and stamp_ns < self._done_ns:
+            return Outcome.LATE
+        return None if self._has_started(stamp_ns) else Outcome.UNLOCATED
+
+    def _observe(
+        self, frame: LandmarkDetections, rows: list[int], ids: Ints, motion: Motion
+    ) -> list[tuple[Outcome, Floats, Floats]]:
+        """Correct by the accepted rows of a frame."""
+        slots = np.array([self._slots.setdefault(int(ids[row]), len(self._slots)) for row in rows])
+        self._make_room()
+        self._n, outcomes, innovations, covs = observe_frame(
+            self._x,
+            self._P,
+            self._n,
+            *motion,
+            self._sonar,
+            slots,
+            np.column_stack([frame.range_m[rows], frame.azimuth_rad[rows]]),
+            self._noise(frame.range_azimuth_cov[rows]),
+        )
+        return [(OUTCOMES[outcome], innovations[k], covs[k]) for k, outcome in enumerate(outcomes.tolist())]
+
+    def _noise(self, cov: Floats) -> Floats:
+        """Covariance of range and azimuth, the calibration's where the log does not say."""
+        sonar = self._calibration.sonar
+        return np.where(np.isnan(cov), np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2]), cov)
+
+    def _make_room(self) -> None:
+        needed, room = POSE + LANDMARK * len(self._slots), len(self._x)
+        if needed <= room:
+            return
+        grown = max(2 * room, needed)
+        x, P = np.zeros(grown), np.zeros((grown, grown))
+        x[:room], P[:room, :room] = self._x, self._P
+        self._x, self._P = x, P
+
+    def _estimate(self, stamp_ns: int, motion: Motion) -> Estimate:
+        world_R_body, position, cov = pose_after(self._x, self._P, *motion)
+        return Estimate(stamp_ns, gtsam.Pose3(gtsam.Rot3(world_R_body), position), cov)
+
+
+_NO_DEPTH = (np.empty(0, np.int64), np.empty(0), np.empty(0))
+
+
+def _frames(detections: LandmarkDetections | None) -> list[LandmarkDetections]:
+    """Detections by stamp: one block for each sonar frame."""
+    if detections is None:
+        return []
+    for name in ("range_m", "azimuth_rad"):
+        faulty = np.flatnonzero(~np.isfinite(getattr(detections, name)))
+        if faulty.size:
+            raise MeasurementError(
+                f"LandmarkDetections.{name}: row {faulty[0]} is not finite; leave such rows out of the log"
+            )
+    cuts = np.flatnonzero(np.diff(detections.stamps_ns)) + 1
+    if not cuts.size:
+        return [detections]
+    edges = [0, *cuts.tolist(), len(detections)]
+    return [detections.rows(slice(first, last)) for first, last in pairwise(edges)]
+
+
+def _start_state(start: Start) -> tuple[Floats, Floats]:
+    """State and covariance of the start pose: world axes for position, small body rotations for attitude."""
+    room = POSE + LANDMARK * ROOM
+    x, P = np.zeros(room), np.zeros((room, room))
+    x[:3] = start.position_m
+    x[3:POSE] = euler_from_rotation(start.pose().rotation().matrix())
+    E = euler_from_rates(x[3:POSE])
+    P[:3, :3] = np.diag(np.square(start.position_sigma_m))
+    P[3:POSE, 3:POSE] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
+    return x, P
+
+
+def _vehicle_model(calibration: Calibration, params: EkfSlamParams) -> VehicleModel:
+    imu, dvl = calibration.imu, calibration.dvl
+    body_p_dvl = np.array(dvl.mounting.translation_m)
+    plane = calibration.planar
+    earth_rate = earth_rate_in_world(calibration)
+    return VehicleModel(
+        gyro_noise_density=imu.gyro_noise_density,
+        body_p_dvl=body_p_dvl,
+        dvl_p_imu=np.array(imu.mounting.translation_m) - body_p_dvl,
+        earth_rate=np.zeros(3) if earth_rate is None else earth_rate,
+        body_p_port=np.array(calibration.depth.port_m),
+        gravity_interval_ns=round(params.gravity_interval_s * 1e9) if calibration.use_gravity else 0,
+        accel_noise_density=imu.accel_noise_density,
+        accel_bias_sigma=imu.accel_bias_sigma,
+        gravity_m_s2=calibration.gravity_m_s2,
+        is_planar=plane is not None,
+        plane_z_m=plane.z_m if plane else 0.0,
+        plane_z_variance=plane.z_sigma_m**2 if plane else 1.0,
+        plane_tilt_variance=plane.tilt_sigma_rad**2 if plane else 1.0,
+    )
+
+
+def _sonar_model(calibration: Calibration, params: EkfSlamParams) -> SonarModel:
+    body_T_sonar = calibration.sonar.mounting.pose()
+    floor = calibration.floor
+    return SonarModel(
+        body_R_sonar=np.ascontiguousarray(body_T_sonar.rotation().matrix()),
+        body_p_sonar=np.array(calibration.sonar.mounting.translation_m),
+        gate=gate_threshold(params.gate_probability, 2),
+        aperture_rad=calibration.sonar.elevation_aperture_rad,
+        has_floor=floor is not None,
+        floor_z_m=floor.z_m if floor else 0.0,
+        floor_variance_m2=floor.sigma_m**2 if floor else 1.0,
+    )
