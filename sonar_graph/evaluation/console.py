@@ -19,12 +19,11 @@ from sonar_graph.evaluation.wording import (
 )
 
 COLUMNS = {
-    "causal.yaw_rmse_rad": "yaw RMS",
-    "causal.nees_position": "NEES pos.",
-    "causal.nees_yaw": "NEES yaw",
+    "causal.yaw_rmse_rad": "yaw",
+    "causal.nees_position": "NEES\npos.",
+    "causal.nees_yaw": "NEES\nyaw",
     "time.update_median_ms": "median",
     "time.update_p99_ms": "p99",
-    "time.total_s": "total",
 }
 """Columns after the two position errors; those that no run has are left out."""
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from itertools import pairwise
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import NDArray
 
 from sonar_graph.evaluation.results import Comparison
@@ -64,6 +66,14 @@ def head_panel(panel: Axes, title: str, own_colour: str = INK) -> None:
     panel.set_title(title, loc="left", color=own_colour, fontsize=LABEL_SIZE, fontweight="bold")
 
 
+def logarithmic(panel: Axes, direction: Literal["x", "y"]) -> None:
+    """Put an axis on a logarithmic scale with plain numbers at the powers of ten."""
+    axis = panel.xaxis if direction == "x" else panel.yaxis
+    panel.set(**{f"{direction}scale": "log"})
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
 def legend_above(figure: Figure, panel: Axes, columns: int = 4) -> None:
     """One legend for the figure, outside the data."""
     handles, labels = panel.get_legend_handles_labels()
@@ -93,7 +103,7 @@ def thinned(values: Floats, points: int = SERIES_POINTS) -> Ints:
     if n <= points:
         return np.arange(n)
     edges = np.linspace(0, n, points // 2 + 1).astype(np.int64)
-    stretches = list(zip(edges[:-1], edges[1:], strict=True))
+    stretches = list(pairwise(edges.tolist()))
     lowest = [first + int(np.argmin(values[first:last])) for first, last in stretches]
     highest = [first + int(np.argmax(values[first:last])) for first, last in stretches]
     return np.unique(np.array([0, *lowest, *highest, n - 1], dtype=np.int64))

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sonar_graph.errors import EvaluationError
@@ -28,6 +29,7 @@ from sonar_graph.evaluation.figure_style import (
     head_panel,
     legend_above,
     line_style,
+    logarithmic,
     name_axes,
     seconds_since_start,
     thinned,
@@ -41,6 +43,10 @@ from sonar_graph.states import DetectionLog, Outcome, Trajectory
 TIME_LABEL = "time since start (s)"
 BAND_PROBABILITY = 0.95
 NIS_DOF = 2
+NEES_FLOOR = 1e-3
+"""Smaller values are drawn at the edge: below the band it does not matter how far."""
+NEES_MEANS = 40
+"""Stretches of the run over which NEES is averaged for the line among the dots."""
 COLUMN_IN = 3.1
 """Width of a panel where runs stand side by side."""
 
@@ -94,11 +100,12 @@ def nees_figure(comparison: Comparison) -> Figure | None:
     for column, (index, run) in enumerate(runs):
         errors = comparison.errors[run.estimator]["causal"]
         head_panel(axes[0, column], run.estimator, colour(index))
+        seconds = seconds_since_start(comparison, errors.stamps_ns)
         blocks = (("position", errors.nees_position, errors.position_dof), ("yaw", errors.nees_yaw, 1))
         for row, (label, nees, dof) in enumerate(blocks):
-            seconds = seconds_since_start(comparison, errors.stamps_ns)
+            logarithmic(axes[row, column], "y")
             _draw_nees(axes[row, column], seconds, nees, dof, colour(index))
-            name_axes(axes[row, column], TIME_LABEL if row else "", "" if column else f"{label} NEES / dof (–)")
+            name_axes(axes[row, column], TIME_LABEL if row else "", "" if column else f"{label} NEES / dof")
     return figure
 
 
@@ -126,13 +133,13 @@ def nis_figure(comparison: Comparison) -> Figure | None:
         return None
     figure, axes = blank_panels(1, 1, (7.4, 3.1))
     panel: Axes = axes[0, 0]
-    grid = np.geomspace(1e-3, max(30.0, *(float(values.max()) for _, _, values in runs)), 200)
+    grid = np.geomspace(1e-2, max(30.0, *(float(values.max()) for _, _, values in runs)), 200)
     panel.plot(grid, 100 * chi2.cdf(grid, NIS_DOF), color=TRUTH, linewidth=3.2, alpha=0.6, label="χ², 2 dof: expected")
     for index, run, values in runs:
         _draw_distribution(panel, values, index, run.estimator)
-    panel.set_xscale("log")
+    logarithmic(panel, "x")
     panel.set_xlim(grid[0], grid[-1])
-    name_axes(panel, "NIS (–)", "detections below (%)")
+    name_axes(panel, "NIS", "detections below (%)")
     legend_above(figure, panel)
     return figure
 
@@ -148,7 +155,7 @@ def timing_figure(comparison: Comparison) -> Figure | None:
         update_ms = 1e3 * run.update_s
         _draw_distribution(panel, update_ms, index, run.estimator)
         panel.plot(np.percentile(update_ms, [50, 99]), [50, 99], "o", color=colour(index), markersize=5)
-    panel.set_xscale("log")
+    logarithmic(panel, "x")
     name_axes(panel, "duration of an update (ms)", "updates at most as long (%)")
     legend_above(figure, panel)
     return figure
@@ -222,21 +229,31 @@ def _has_nees(comparison: Comparison, run: RunResult) -> bool:
 
 
 def _draw_nees(panel: Axes, seconds: Floats, nees: Floats, dof: int, own_colour: str) -> None:
-    low, high = chi2.ppf([(1 - BAND_PROBABILITY) / 2, (1 + BAND_PROBABILITY) / 2], dof) / dof
+    low, high = (float(chi2.ppf((1 + side * BAND_PROBABILITY) / 2, dof)) / dof for side in (-1, 1))
     per_dof = nees / dof
     known = per_dof[np.isfinite(per_dof)]
-    panel.set_yscale("log")
-    panel.set_ylim(1e-3, 10 ** np.ceil(np.log10(max(10.0, float(known.max(initial=0.0))))))
+    top = max(panel.get_ylim()[1], 10.0, 2 * float(known.max(initial=0.0)))
+    panel.set_ylim(NEES_FLOOR, top)
     panel.axhspan(low, high, color=TRUTH, alpha=0.25, linewidth=0)
-    rows = thinned(per_dof, SERIES_POINTS)
-    panel.plot(seconds[rows], np.maximum(per_dof[rows], 1e-6), color=own_colour, linewidth=0.8)
+    panel.axhline(1.0, color=MUTED, linewidth=0.7)
+    rows = evenly(len(per_dof), SERIES_POINTS // 2)
+    panel.plot(seconds[rows], np.maximum(per_dof[rows], NEES_FLOOR), ".", color=own_colour, markersize=2, alpha=0.5)
+    mean_seconds, means = _means(seconds, per_dof)
+    panel.plot(mean_seconds, means, color=own_colour, linewidth=1.6)
     if known.size:
         inside = 100 * float(np.mean((known >= low) & (known <= high)))
         panel.text(0.02, 0.04, f"{inside:.0f} % in the band", transform=panel.transAxes, color=INK, fontsize=TICK_SIZE)
 
 
-def _predicted(log: DetectionLog) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    return np.isfinite(log.innovations).all(axis=1)
+def _means(seconds: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Mean time and mean value of each of `NEES_MEANS` stretches of the run in which a value is known."""
+    known = np.isfinite(values)
+    stretches = [rows for rows in np.array_split(np.flatnonzero(known), NEES_MEANS) if rows.size]
+    return np.array([seconds[rows].mean() for rows in stretches]), np.array([values[rows].mean() for rows in stretches])
+
+
+def _predicted(log: DetectionLog) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(log.innovations).all(axis=1), dtype=np.bool_)
 
 
 def _draw_innovations(
@@ -250,9 +267,9 @@ def _draw_innovations(
         (predicted & gated, "x", INK, "refused by the gate"),
     ):
         values = factor * log.innovations[chosen, component]
-        rows = thinned(values, SERIES_POINTS // 2)
-        drawn = {"markersize": 3.5, "linestyle": "none", "label": label}
-        panel.plot(seconds[chosen][rows], values[rows], marker, color=shade, **drawn)
+        rows = np.union1d(evenly(len(values), SERIES_POINTS // 2), thinned(values, SERIES_POINTS // 20))
+        x, y = seconds[chosen][rows], values[rows]
+        panel.plot(x, y, marker, color=shade, markersize=3.5, linestyle="none", label=label)
     panel.axhline(0.0, color=MUTED, linewidth=0.7)
 
 

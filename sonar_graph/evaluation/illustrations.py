@@ -47,8 +47,8 @@ def illustrations(comparison: Comparison) -> dict[str, Illustration]:
             "errors",
             "Error over time",
             error_figure,
-            "Estimate minus truth of the causal estimates, not aligned. The shaded band is the reported ±3σ: a "
-            "consistent estimator leaves it almost never. Each panel has its own scale.",
+            "Estimate minus truth of the causal estimates, not aligned. The shaded band is three reported standard "
+            "deviations either side: a consistent estimator leaves it almost never. Each panel has its own scale.",
             no_errors,
         ),
         _draw(
@@ -65,8 +65,9 @@ def illustrations(comparison: Comparison) -> dict[str, Illustration]:
             "Consistency over time",
             nees_figure,
             "Normalised estimation error squared (NEES) of the causal estimates, divided by its degrees of freedom. "
-            "The band holds 95 % of a consistent estimator's values. Instants of one run depend on each other, so a "
-            "share near 95 % is a hint and not a test.",
+            "Dots are instants, the line is the mean over a fortieth of the run; 1 is consistent. The band holds 95 % "
+            "of a consistent estimator's values. Instants of one run depend on each other, so a share near 95 % is a "
+            "hint and not a test.",
             f"{no_errors} NEES needs them.",
         ),
         _draw(
@@ -74,7 +75,8 @@ def illustrations(comparison: Comparison) -> dict[str, Illustration]:
             "innovations",
             "Innovations over time",
             innovation_figure,
-            "Measured minus predicted range and azimuth of each detection that had a prediction.",
+            "Measured minus predicted range and azimuth of detections that had a prediction; in long runs an even "
+            "choice of them, with the extremes.",
             "No run reports innovations.",
         ),
         _draw(

@@ -27,6 +27,7 @@ ELLIPSE_PROBABILITY = 0.95
 MARGIN = 0.3
 """How far, in sizes of the truth, the map follows estimates that leave it."""
 WIDTH_IN = 7.4
+LEGEND_COLUMNS = 3
 SAME_M = 1e-3
 """A smoothed path nowhere farther than this from the causal one is not drawn a second time."""
 PATH_POINTS = 2500
@@ -41,9 +42,7 @@ def map_figure(comparison: Comparison) -> Figure | None:
     view = _view(comparison)
     if view is None:
         return None
-    span = view[1] - view[0]
-    height = float(np.clip(WIDTH_IN * span[1] / span[0], 3.2, 8.0)) + 1.0
-    figure, axes = blank_panels(1, 1, (WIDTH_IN, height))
+    figure, axes = blank_panels(1, 1, (WIDTH_IN, WIDTH_IN))
     panel: Axes = axes[0, 0]
     _draw_truth(panel, comparison)
     for index, run in enumerate(comparison.runs):
@@ -53,8 +52,17 @@ def map_figure(comparison: Comparison) -> Figure | None:
     panel.set(xlim=view[:, 0], ylim=view[:, 1])
     panel.set_aspect("equal", adjustable="box")
     name_axes(panel, "world x (m)", "world y (m)")
-    legend_above(figure, panel, columns=3)
+    legend_above(figure, panel, columns=LEGEND_COLUMNS)
+    figure.set_size_inches(WIDTH_IN, _height_in(panel, view))
     return figure
+
+
+def _height_in(panel: Axes, view: Floats) -> float:
+    """Height at which axes of the view's shape fill the figure's width, with room for legend and labels."""
+    span = view[1] - view[0]
+    legend_rows = -(-len(panel.get_legend_handles_labels()[1]) // LEGEND_COLUMNS)
+    drawing = np.clip((WIDTH_IN - 0.8) * span[1] / span[0], 2.5, 8.0)
+    return float(drawing) + 0.75 + 0.17 * legend_rows
 
 
 def paths_cut_off(comparison: Comparison) -> list[str]:
@@ -162,10 +170,11 @@ def _label_landmarks(panel: Axes, comparison: Comparison, view: Floats) -> None:
             panel.annotate(
                 str(identity),
                 (position[0], position[1]),
-                xytext=(5, 4),
+                xytext=(7, 6),
                 textcoords="offset points",
                 color=INK,
                 fontsize=size,
+                fontweight="bold",
                 zorder=6,
             )
 

@@ -15,7 +15,7 @@ from sonar_graph.evaluation.figure_style import ESTIMATOR_COLOURS
 from sonar_graph.evaluation.illustrations import illustrations
 from sonar_graph.evaluation.results import Comparison, RunResult
 from sonar_graph.evaluation.score_table import score_blocks
-from sonar_graph.evaluation.wording import failed_runs, finding, format_value
+from sonar_graph.evaluation.wording import ABSENT, failed_runs, finding, format_value
 from sonar_graph.states import Outcome
 
 TEMPLATE = "report.html"
@@ -69,8 +69,9 @@ def _summary(comparison: Comparison) -> str:
     planar = "planar" if sequence.calibration.planar else "three-dimensional"
     truth = "with ground truth" if sequence.truth is not None else "without ground truth"
     return (
-        f"{format_value(round(sequence.duration_s, 1))} s of {planar} motion {truth}, {detections} landmark detections, "
-        f"{len(comparison.instants_ns)} scored instants, {_counted(len(comparison.runs), 'estimator')}."
+        f"{format_value(round(sequence.duration_s, 1))} s of {planar} motion {truth}, "
+        f"{_counted(detections, 'landmark detection')}, {len(comparison.instants_ns)} instants, "
+        f"{_counted(len(comparison.runs), 'estimator')}."
     )
 
 
@@ -87,15 +88,15 @@ def _outcomes(comparison: Comparison) -> dict[str, list[str]]:
         if any(count and count[outcome] for count in counts)
     }
     if rows:
-        rows["All detections"] = ["–" if count is None else str(count.total()) for count in counts]
+        rows["All detections"] = [ABSENT if count is None else str(count.total()) for count in counts]
     return rows
 
 
 def _share(count: Counter[Outcome] | None, outcome: Outcome) -> str:
     if count is None:
-        return "–"
+        return ABSENT
     percent = 100 * count[outcome] / max(count.total(), 1)
-    return f"{count[outcome]} ({format_value(round(percent, 1))} %)"
+    return f"{count[outcome]} ({percent:.1f} %)"
 
 
 def _files(run: RunResult) -> dict[str, str]:

@@ -15,7 +15,6 @@ PAGE_COLOURS = {INK: "--ink", MUTED: "--muted", RULE: "--rule", TRUTH: "--truth"
     own: f"--run-{index}" for index, own in enumerate(ESTIMATOR_COLOURS)
 }
 """Custom property of the page that takes the place of each colour, so that figures follow dark and light."""
-SETTINGS = {"svg.fonttype": "none", "path.simplify_threshold": 0.25}
 POINTS_PER_INCH = 72
 
 
@@ -33,7 +32,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
         What the figure shows, for those who cannot see it.
     """
     buffer = io.StringIO()
-    with mpl.rc_context({**SETTINGS, "svg.hashsalt": name}):
+    with mpl.rc_context({"svg.fonttype": "none", "path.simplify_threshold": 0.25, "svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", metadata={"Date": None})
     drawing = _without_wrapping(buffer.getvalue())
     drawing = _with_own_identifiers(drawing, name)

@@ -6,7 +6,7 @@ import math
 
 from sonar_graph.evaluation.results import Comparison, RunResult, Score
 
-ABSENT = "–"
+ABSENT = "\N{EN DASH}"
 TOO_CLOSE = 0.05
 """Relative difference below which one run says nothing about which of two errors is the smaller one."""
 CONSISTENCY_KEY = "causal.nees_position"
@@ -25,15 +25,16 @@ def format_value(value: float) -> str:
     if math.isnan(value):
         return ABSENT
     if math.isinf(value):
-        return "∞" if value > 0 else "−∞"
+        return "∞" if value > 0 else "\N{MINUS SIGN}∞"
     if float(value).is_integer() or abs(value) >= 1000:
         text = f"{value:.0f}"
     elif abs(value) < 1e-3:
         mantissa, exponent = f"{value:.2e}".split("e")
         text = f"{mantissa}e{int(exponent)}"
     else:
-        text = f"{value:.{max(0, 2 - math.floor(math.log10(abs(value))))}f}"
-    return text.replace("-", "−")
+        rounded = float(f"{value:.3g}")
+        text = f"{rounded:.{max(0, 2 - math.floor(math.log10(abs(rounded))))}f}"
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
 def display_unit(score: Score) -> str:
@@ -114,14 +115,19 @@ def _causal_sentence(comparison: Comparison, metric: str) -> str:
     if len(scored) == 1:
         return opening + "."
     (first, least), *others = scored
-    return f"{opening}; " + ", ".join(_difference(first, least, name, score) for name, score in others) + "."
+    close = [name for name, score in others if _reduction(least, score) < TOO_CLOSE]
+    far = [f"{100 * _reduction(least, score):.0f} % below {name}" for name, score in others if name not in close]
+    said = [f"{first} is {' and '.join(far)}"] if far else []
+    if close:
+        said.append(
+            f"{first} and {' and '.join(close)} differ by less than 5 %, too little for one run to tell them apart"
+        )
+    return f"{opening}; {'; '.join(said)}."
 
 
-def _difference(first: str, least: Score, name: str, score: Score) -> str:
-    relative = 1 - least.value / score.value if score.value > 0 else 0.0
-    if relative < TOO_CLOSE:
-        return f"{first} and {name} differ by {100 * relative:.1f} %, too little for one run to tell them apart"
-    return f"{first} is {100 * relative:.0f} % below {name}"
+def _reduction(least: Score, score: Score) -> float:
+    """How much smaller the least error is, relative to another."""
+    return 1 - least.value / score.value if score.value > 0 else 0.0
 
 
 def _smoothed_sentence(comparison: Comparison, metric: str) -> list[str]:

@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+import io
+from typing import Any
+
+from rich.console import Console
+
+from sonar_graph.evaluation.console import summary_table
+from sonar_graph.evaluation.results import Comparison, Score
+from sonar_graph.evaluation.wording import display_value
+
+from .synthetic import basin_comparison, with_failure, with_score
+
+
+def printed(comparison: Comparison, width: int = 80) -> str:
+    options: dict[str, Any] = {"file": io.StringIO(), "width": width, "color_system": None}
+    console = Console(**options)
+    console.print(summary_table(comparison))
+    return console.file.getvalue()
+
+
+def test_the_terminal_shows_the_numbers_of_the_report_in_80_columns():
+    comparison = basin_comparison(60)
+    text = printed(comparison)
+    keys = ("causal.ate_se2_m", "smoothed.ate_se2_m", "causal.yaw_rmse_rad", "causal.nees_yaw", "time.update_p99_ms")
+    for name, scores in comparison.scores.items():
+        row = next(line for line in text.splitlines() if name in line)
+        assert all(display_value(scores[key]) in row for key in keys)
+    assert "…" not in text
+
+
+def test_a_failure_is_told_with_its_reason_as_it_is():
+    text = printed(with_failure(basin_comparison(60), "ekf-slam", "no [bold] odometry"))
+    assert "ekf-slam failed: no [bold] odometry" in text
+
+
+def test_without_truth_columns_of_errors_are_left_out():
+    text = printed(basin_comparison(60, truth=False))
+    assert "causal" not in text
+    assert "median" in text
+
+
+def test_a_nees_outside_its_interval_is_marked():
+    comparison = basin_comparison(60)
+    score = Score(3.0, "1", "By hand.", (0.9, 1.1), "inside")
+    assert "3 ▲" not in printed(comparison)
+    assert "3 ▲" in printed(with_score(comparison, "isam2", "causal.nees_position", score))

@@ -1,0 +1,226 @@
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+from sonar_graph.errors import EvaluationError
+from sonar_graph.evaluation.figure_style import colour, evenly, thinned
+from sonar_graph.evaluation.figures import (
+    error_figure,
+    innovation_figure,
+    nees_figure,
+    nis_figure,
+    timing_figure,
+    write_map_png,
+    yaw_figure,
+)
+from sonar_graph.evaluation.map_figure import map_figure, paths_cut_off
+from sonar_graph.evaluation.results import Comparison, RunResult
+from sonar_graph.evaluation.svg import inline_svg
+from sonar_graph.states import Trajectory
+
+from .synthetic import basin_comparison, only, with_failure, with_run
+
+FIGURES = [map_figure, error_figure, yaw_figure, nees_figure, innovation_figure, nis_figure, timing_figure]
+
+
+@pytest.fixture(scope="module")
+def comparison() -> Comparison:
+    return basin_comparison()
+
+
+def drawn(figure: Figure | None) -> Figure:
+    assert figure is not None
+    return figure
+
+
+def labels(figure: Figure) -> list[tuple[str, str]]:
+    return [(panel.get_xlabel(), panel.get_ylabel()) for panel in figure.axes]
+
+
+def run_of(comparison: Comparison, name: str) -> RunResult:
+    return next(run for run in comparison.runs if run.estimator == name)
+
+
+def moved(path: Trajectory, offset: list[float]) -> Trajectory:
+    return replace(path, positions=path.positions + np.array(offset))
+
+
+@pytest.mark.parametrize(
+    ("draw", "x", "y"),
+    [
+        (map_figure, "world x (m)", {"world y (m)"}),
+        (error_figure, "time since start (s)", {"error in x (m)", "error in y (m)", "yaw error (°)"}),
+        (yaw_figure, "time since start (s)", {"yaw (°)"}),
+        (nees_figure, "time since start (s)", {"position NEES / dof", "yaw NEES / dof"}),
+        (innovation_figure, "time since start (s)", {"range (m)", "azimuth (°)"}),
+        (nis_figure, "NIS", {"detections below (%)"}),
+        (timing_figure, "duration of an update (ms)", {"updates at most as long (%)"}),
+    ],
+)
+def test_axes_say_quantity_and_unit(comparison, draw, x, y):
+    named = labels(drawn(draw(comparison)))
+    assert {label for label, _ in named} - {""} == {x}
+    assert {label for _, label in named} - {""} == y
+
+
+def test_three_dimensional_run_shows_the_error_in_height():
+    figure = drawn(error_figure(basin_comparison(60, planar=False)))
+    assert "error in z (m)" in {label for _, label in labels(figure)}
+
+
+def test_errors_and_their_band_are_drawn_in_their_units(comparison):
+    name = "ekf-slam"
+    figure = drawn(error_figure(only(comparison, name)))
+    errors = comparison.errors[name]["causal"]
+    x_line, yaw_line = figure.axes[0].lines[-1], figure.axes[2].lines[-1]
+    np.testing.assert_allclose(x_line.get_ydata(), errors.position_m[:, 0])
+    np.testing.assert_allclose(yaw_line.get_ydata(), np.degrees(errors.yaw_rad))
+    seconds = (errors.stamps_ns - errors.stamps_ns[0]) * 1e-9 + 0.5
+    np.testing.assert_allclose(x_line.get_xdata(), seconds)
+    corners = figure.axes[0].collections[0].get_datalim(figure.axes[0].transData)
+    assert corners.y1 == pytest.approx(3 * errors.position_sigma_m[:, 0].max())
+
+
+def test_no_band_is_drawn_where_no_covariance_was_reported(comparison):
+    errors = comparison.errors["isam2"]["causal"]
+    unknown = replace(
+        errors,
+        position_sigma_m=np.full_like(errors.position_sigma_m, np.nan),
+        yaw_sigma_rad=np.full_like(errors.yaw_sigma_rad, np.nan),
+    )
+    silent = replace(only(comparison, "isam2"), errors={"isam2": {"causal": unknown}})
+    assert not any(panel.collections for panel in drawn(error_figure(silent)).axes)
+    assert any(panel.collections for panel in drawn(error_figure(comparison)).axes)
+
+
+def test_yaw_is_never_joined_across_the_wrap(comparison):
+    for line in drawn(yaw_figure(comparison)).axes[0].lines:
+        steps = np.abs(np.diff(np.asarray(line.get_ydata(), dtype=float)))
+        assert np.nanmax(steps) <= 180
+        assert np.isnan(steps).any(), "three laps pass ±180° and must leave gaps"
+
+
+def test_landmark_ellipses_hold_95_percent_of_draws(comparison):
+    run = run_of(comparison, "isam2")
+    assert run.landmarks is not None
+    panel = drawn(map_figure(only(comparison, "isam2"))).axes[0]
+    ellipses = [patch for patch in panel.patches if isinstance(patch, Ellipse)]
+    assert len(ellipses) == len(run.landmarks)
+    rng = np.random.default_rng(3)
+    for ellipse, mean, cov in zip(ellipses, run.landmarks.positions, run.landmarks.covariances, strict=True):
+        draws = rng.multivariate_normal(mean[:2], cov[:2, :2], 20_000)
+        turn = np.radians(ellipse.angle)
+        along = (draws - ellipse.center) @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        inside = np.sum((2 * along / [ellipse.width, ellipse.height]) ** 2, axis=1) <= 1
+        assert inside.mean() == pytest.approx(0.95, abs=0.01)
+
+
+def test_map_has_one_scale_and_landmark_ids(comparison):
+    panel = drawn(map_figure(comparison)).axes[0]
+    assert panel.get_aspect() == 1
+    assert {text.get_text() for text in panel.texts} == {"1", "2", "3", "4"}
+
+
+def test_a_run_that_flies_off_does_not_shrink_the_map(comparison):
+    run = run_of(comparison, "dead-reckoning")
+    assert run.causal is not None
+    gone = with_run(comparison, replace(run, causal=moved(run.causal, [500.0, 0, 0]), smoothed=None))
+    assert np.ptp(drawn(map_figure(gone)).axes[0].get_xlim()) < 20
+    assert paths_cut_off(gone) == ["dead-reckoning"]
+    assert paths_cut_off(only(comparison, "isam2")) == []
+
+
+def test_the_smoothed_path_is_drawn_only_where_it_differs(comparison):
+    shown = drawn(map_figure(comparison)).axes[0].get_legend_handles_labels()[1]
+    assert "isam2, smoothed" in shown
+    assert "ekf-slam, smoothed" not in shown
+
+
+@pytest.mark.parametrize("draw", [map_figure, yaw_figure, timing_figure])
+def test_estimators_keep_their_colour_when_another_one_fails(comparison, draw):
+    failed = with_failure(comparison, "isam2", "lost")
+    used = {to_hex(line.get_color()) for panel in drawn(draw(failed)).axes for line in panel.lines}
+    assert colour(0) not in used
+    assert {colour(1), colour(2)} <= used
+
+
+def test_every_nees_stays_in_view(comparison):
+    figure = drawn(nees_figure(comparison))
+    for panel, run in zip(figure.axes, comparison.runs, strict=False):
+        errors = comparison.errors[run.estimator]["causal"]
+        assert panel.get_ylim()[1] > np.nanmax(errors.nees_position) / errors.position_dof
+
+
+def test_without_truth_only_the_figures_of_errors_are_missing():
+    comparison = basin_comparison(60, truth=False)
+    missing = {draw.__name__ for draw in FIGURES if draw(comparison) is None}
+    assert missing == {"error_figure", "nees_figure"}
+
+
+@pytest.mark.parametrize("draw", FIGURES)
+def test_nothing_to_draw_is_no_figure(comparison, draw):
+    empty = replace(only(comparison), sequence=replace(comparison.sequence, truth=None, true_landmarks=None))
+    assert draw(empty) is None
+
+
+def test_the_map_is_written_as_a_picture(comparison, tmp_path: Path):
+    write_map_png(comparison, tmp_path / "map.png", dpi=40)
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_map_of_nothing_is_refused_by_name(comparison, tmp_path: Path):
+    empty = replace(only(comparison), sequence=replace(comparison.sequence, truth=None))
+    with pytest.raises(EvaluationError, match=r"map\.png: basin-three-laps has neither"):
+        write_map_png(empty, tmp_path / "map.png")
+
+
+@pytest.mark.parametrize("draw", FIGURES)
+def test_inline_svg_is_well_formed_and_takes_the_colours_of_the_page(comparison, draw):
+    svg = inline_svg(drawn(draw(comparison)), "figure", 'says "<x>" & more')
+    root = ElementTree.fromstring(svg)
+    assert root.attrib["aria-label"] == 'says "<x>" & more'
+    assert "var(--ink)" in svg
+    assert re.findall(r"#[0-9a-f]{6}\b", svg) == [], "a fixed colour would not follow dark and light"
+    assert "http" not in svg
+
+
+def test_two_inline_svgs_share_no_identifier(comparison):
+    figures = [drawn(yaw_figure(comparison)), drawn(timing_figure(comparison))]
+    first, second = (inline_svg(figure, name, "") for figure, name in zip(figures, ("a", "b"), strict=True))
+    own = [set(re.findall(r'\sid="([^"]+)"', svg)) for svg in (first, second)]
+    assert own[0]
+    assert not own[0] & own[1]
+    assert set(re.findall(r"url\(#([^)]+)\)", first)) <= own[0]
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=400), st.integers(4, 60))
+@settings(deadline=None)
+def test_thinning_keeps_ends_and_extremes(values, points):
+    series = np.array(values)
+    rows = thinned(series, points)
+    assert len(rows) <= points + 2
+    assert rows[0] == 0
+    assert rows[-1] == len(series) - 1
+    assert np.all(np.diff(rows) > 0)
+    assert series[rows].max() == series.max()
+    assert series[rows].min() == series.min()
+
+
+@given(st.integers(0, 5000), st.integers(2, 900))
+def test_even_choice_keeps_the_ends(n, points):
+    rows = evenly(n, points)
+    assert len(rows) == min(n, points)
+    if n:
+        assert rows[0] == 0
+        assert rows[-1] == n - 1
