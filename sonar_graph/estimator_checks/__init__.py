@@ -10,20 +10,21 @@ Each check takes something that makes an estimator from a calibration, such as i
     def test_my_filter_keeps_the_contract(check):
         check(MyFilter)
 
-and without: ``check_estimator(MyFilter)``. The checks bring their own small world, a vehicle that turns gently to the
+and without: ``check_estimator(MyFilter)``. A filter, or whatever else never iterates, should pass `FILTER_CHECKS` as
+well. The checks bring their own small world, a vehicle that turns gently to the
 left past three landmarks at its own depth, so that they need no data and no simulator.
 """
 
 from __future__ import annotations
 
-from sonar_graph.estimator_checks.laws import CHECKS, Check
+from sonar_graph.estimator_checks.laws import CHECKS, FILTER_CHECKS, Check
 from sonar_graph.estimator_checks.outcome import ContractError, MakeEstimator
 
-__all__ = ["CHECKS", "Check", "ContractError", "MakeEstimator", "check_estimator"]
+__all__ = ["CHECKS", "FILTER_CHECKS", "Check", "ContractError", "MakeEstimator", "check_estimator"]
 
 
 def check_estimator(make: MakeEstimator) -> None:
-    """Run every check.
+    """Run every check of `CHECKS`.
 
     Raises
     ------

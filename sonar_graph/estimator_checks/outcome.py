@@ -61,19 +61,44 @@ def difference(one: Outcome, other: Outcome) -> float:
 
     Infinite where an instant or a landmark is missing from ``other``.
     """
-    stamps_ns = [estimate.stamp_ns for estimate in one.estimates]
-    mine, theirs = one.causal(stamps_ns), other.causal(stamps_ns)
-    if not np.array_equal(mine.stamps_ns, theirs.stamps_ns) or not np.array_equal(
-        one.landmarks.ids, other.landmarks.ids
-    ):
+    mine, theirs = _at_same_instants(one, other)
+    if len(mine) != len(theirs) or not np.array_equal(one.landmarks.ids, other.landmarks.ids):
         return float("inf")
-    turned_rad = (mine.rotations().inv() * theirs.rotations()).magnitude() if len(mine) else np.empty(0)
     pairs = (
-        (mine.positions, theirs.positions),
+        (_perturbation(mine, theirs), 0.0),
         (mine.covariances, theirs.covariances),
         (one.landmarks.positions, other.landmarks.positions),
     )
-    return max([float(np.max(turned_rad, initial=0.0)), *(float(np.max(np.abs(a - b), initial=0.0)) for a, b in pairs)])
+    return max(float(np.max(np.abs(a - b), initial=0.0)) for a, b in pairs)
+
+
+def deviation(one: Outcome, other: Outcome) -> tuple[float, float]:
+    """Largest deviation of causal poses, and of their covariances, relative to the standard deviations of ``one``.
+
+    Infinite where an instant is missing from ``other``.
+    """
+    mine, theirs = _at_same_instants(one, other)
+    if len(mine) != len(theirs):
+        return float("inf"), float("inf")
+    sigmas = np.sqrt(np.einsum("nii->ni", mine.covariances))
+    products = np.einsum("ni,nj->nij", sigmas, sigmas)
+    return (
+        float(np.max(np.abs(_perturbation(mine, theirs)) / sigmas, initial=0.0)),
+        float(np.max(np.abs(mine.covariances - theirs.covariances) / products, initial=0.0)),
+    )
+
+
+def _at_same_instants(one: Outcome, other: Outcome) -> tuple[Trajectory, Trajectory]:
+    stamps_ns = [estimate.stamp_ns for estimate in one.estimates]
+    return one.causal(stamps_ns), other.causal(stamps_ns)
+
+
+def _perturbation(mine: Trajectory, theirs: Trajectory) -> Floats:
+    """[rotation, translation] from one trajectory to another in the body frame of the first, shape (n, 6)."""
+    if not len(mine):
+        return np.empty((0, 6))
+    into_body = mine.rotations().inv()
+    return np.hstack([(into_body * theirs.rotations()).as_rotvec(), into_body.apply(theirs.positions - mine.positions)])
 
 
 def require(kept: bool, violation: str) -> None:
