@@ -245,18 +245,29 @@ class _Scan:
         """Take in what lies outside chunks."""
         data = bytes(self._loose)
         self._loose.clear()
-        self._gather(data, self._messages_in(data))
+        self._take("a stretch without chunks", lambda: data)
 
     def _take_chunk(self, body: bytes) -> None:
         self._chunks += 1
-        try:
+
+        def unpack() -> bytes:
             chunk = Chunk.read(ReadDataStream(BytesIO(body)))
             data: bytes = get_chunk_data_stream(chunk, validate_crc=True)[0].read(chunk.uncompressed_size)
+            return data
+
+        self._take(f"chunk {self._chunks}", unpack)
+
+    def _take(self, part: str, unpack: Callable[[], bytes]) -> None:
+        try:
+            data = unpack()
             found = self._messages_in(data)
         except Exception as error:  # the decompressors and the record reader each have errors of their own
-            self._recording.corrupt.append(f"chunk {self._chunks} is lost ({error})")
-        else:
-            self._gather(data, found)
+            self._recording.corrupt.append(f"{part} is lost ({error})")
+            return
+        for channel in found.keys() - self._topics.keys():
+            count = len(found.pop(channel))
+            self._recording.corrupt.append(f"{part} has {count} messages of channel {channel}, which is not described")
+        self._gather(data, found)
 
     def _messages_in(self, data: bytes) -> dict[int, list[tuple[int, int, int]]]:
         """Offset, size and log time of each message, by channel."""

@@ -43,18 +43,23 @@ def write_recording(path: Path, messages: list[Outgoing], metadata: Mapping[str,
     partial = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as stream:
-            writer = Writer(stream, chunk_size=_CHUNK_BYTES)
-            writer.start(profile="ros2", library="sonar-graph")
-            for name, record in metadata.items():
-                writer.add_metadata(name, dict(record))
-            _add_messages(writer, messages)
-            writer.finish()  # type: ignore[no-untyped-call]  # of the mcap package
-        partial.replace(path)
+        try:
+            _write(partial, messages, metadata)
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
     except OSError as error:
         raise LogError(f"{path} cannot be written: {error.strerror}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+
+
+def _write(path: Path, messages: list[Outgoing], metadata: Mapping[str, Mapping[str, str]]) -> None:
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=_CHUNK_BYTES)
+        writer.start(profile="ros2", library="sonar-graph")
+        for name, record in metadata.items():
+            writer.add_metadata(name, dict(record))
+        _add_messages(writer, messages)
+        writer.finish()  # type: ignore[no-untyped-call]  # of the mcap package
 
 
 def _add_messages(writer: Writer, messages: list[Outgoing]) -> None:

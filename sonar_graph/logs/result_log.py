@@ -5,7 +5,7 @@ For each estimator ``NAME`` (with ``_`` for what ROS does not allow in a topic),
 ==========================  ===============================================================================
 ``/NAME/odometry``          ``nav_msgs/Odometry``: the causal estimate with its covariance
 ``/NAME/pose``              ``geometry_msgs/PoseWithCovarianceStamped``: the same, for viewers without Odometry
-``/NAME/path``              ``nav_msgs/Path``: the causal estimate so far, every 30 s; at the end the smoothed one
+``/NAME/path``              ``nav_msgs/Path``: the causal estimate so far, now and then; at the end the smoothed one
 ``/NAME/landmarks``         ``visualization_msgs/MarkerArray`` at the end: 95 % ellipsoids and identities
 ``/tf``                     ``map`` to ``base_link`` of the first estimator
 ``/ground_truth/...``       ``odometry``, ``path``, ``landmarks``, where known
@@ -31,7 +31,9 @@ from sonar_graph.states import LandmarkMap, Trajectory
 
 PATH = "nav_msgs/msg/Path"
 _PATH_PERIOD_NS = 30 * 10**9
+_MOST_CAUSAL_PATHS = 20
 _CAUSAL_PATH_STEP_NS = 10**9
+_MOST_CAUSAL_POSES = 1000
 _TRUE_PATH_STEP_NS = 10**8
 _COLOURS: tuple[Colour, ...] = (BLUE, ORANGE, PURPLE, GREEN)
 
@@ -100,9 +102,11 @@ def _poses(topic: str, trajectory: Trajectory) -> Outgoing:
 
 
 def _causal_paths(topic: str, causal: Trajectory) -> list[Outgoing]:
-    """The path so far, every 30 s, thinned: all of them together grow with the square of time."""
-    thinned = _thinned(causal, _CAUSAL_PATH_STEP_NS)
-    ends_ns = np.arange(causal.stamps_ns[0] + _PATH_PERIOD_NS, causal.stamps_ns[-1], _PATH_PERIOD_NS)
+    """The path so far, now and then, thinned: all of them together would grow with the square of time."""
+    first_ns, last_ns = int(causal.stamps_ns[0]), int(causal.stamps_ns[-1])
+    period_ns = max(_PATH_PERIOD_NS, (last_ns - first_ns) // _MOST_CAUSAL_PATHS)
+    thinned = _thinned(causal, max(_CAUSAL_PATH_STEP_NS, (last_ns - first_ns) // _MOST_CAUSAL_POSES))
+    ends_ns = np.arange(first_ns + period_ns, last_ns, period_ns)
     counts = np.searchsorted(thinned.stamps_ns, ends_ns, side="right")
     pairs = zip(counts.tolist(), ends_ns.tolist(), strict=True)
     return [_path(topic, thinned.rows(slice(count)), end_ns) for count, end_ns in pairs]

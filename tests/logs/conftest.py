@@ -1,0 +1,155 @@
+"""Logs written by another library than ours, and a small sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from mcap_ros2.writer import Writer
+
+from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
+from sonar_graph.logs.message_definitions import definition
+from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import LandmarkMap, Trajectory
+
+T0_NS = 1_700_000_000_123_456_789
+TYPES = {
+    "imu": "sensor_msgs/msg/Imu",
+    "dvl": "marine_acoustic_msgs/msg/Dvl",
+    "pressure": "sensor_msgs/msg/FluidPressure",
+    "depth": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "odometry": "nav_msgs/msg/Odometry",
+    "detections": "sonar_graph_msgs/msg/LandmarkDetections",
+    "map": "sonar_graph_msgs/msg/LandmarkMap",
+    "tf": "tf2_msgs/msg/TFMessage",
+}
+Entry = tuple[str, str, list[dict[str, Any]]]
+
+
+def stamp(ns: int) -> dict[str, int]:
+    return {"sec": ns // 10**9, "nanosec": ns % 10**9}
+
+
+def header(ns: int, frame_id: str = "sensor") -> dict[str, Any]:
+    return {"stamp": stamp(ns), "frame_id": frame_id}
+
+
+def vector(x: float, y: float, z: float) -> dict[str, float]:
+    return {"x": x, "y": y, "z": z}
+
+
+class Bench:
+    """Builds logs message by message with mcap-ros2-support."""
+
+    t0_ns = T0_NS
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def imu(self, ns: int, rate: tuple[float, ...] = (0, 0, 0.1), **other: Any) -> dict[str, Any]:
+        message = {"header": header(ns, "imu_link"), "angular_velocity": vector(*rate)}
+        message["linear_acceleration"] = vector(0.1, 0.2, 9.8)
+        return message | other
+
+    def dvl(self, ns: int, velocity: tuple[float, ...] = (0.5, 0, 0), **other: Any) -> dict[str, Any]:
+        message = {"header": header(ns, "dvl_link"), "velocity": vector(*velocity), "velocity_mode": 1}
+        return message | {"num_good_beams": 4} | other
+
+    def pressure(self, ns: int, pascals: float, variance: float = 0.0) -> dict[str, Any]:
+        return {"header": header(ns, "pressure_link"), "fluid_pressure": pascals, "variance": variance}
+
+    def odometry(self, ns: int, x: float, **other: Any) -> dict[str, Any]:
+        pose = {"position": vector(x, 0, 0), "orientation": {**vector(0, 0, 0), "w": 1.0}}
+        return {"header": header(ns, "map"), "pose": {"pose": pose}} | other
+
+    def detections(self, ns: int, ranges: list[float], ids: list[int]) -> dict[str, Any]:
+        count = len(ranges)
+        message = {"header": header(ns, "sonar_link"), "range_m": ranges, "azimuth_rad": [0.1] * count}
+        message |= {"covariance": [0.01, 0, 0, 0.02] * count, "candidate_ids": ids}
+        return message | {"id_probability": [0.5] * len(ids)}
+
+    def transform(self, parent: str, child: str, xyz: tuple[float, ...], yaw_rad: float = 0.0) -> dict[str, Any]:
+        rotation = {**vector(0, 0, np.sin(yaw_rad / 2)), "w": np.cos(yaw_rad / 2)}
+        moved = {"translation": vector(*xyz), "rotation": rotation}
+        return {"header": header(0, parent), "child_frame_id": child, "transform": moved}
+
+    def basics(self, samples: int = 5) -> list[Entry]:
+        """The topics that every log needs."""
+        stamps = [T0_NS + i * 10**8 for i in range(samples)]
+        return [("/imu", "imu", [self.imu(s) for s in stamps]), ("/dvl", "dvl", [self.dvl(s) for s in stamps])]
+
+    def write(self, *entries: Entry, name: str = "log.mcap", **settings: Any) -> Path:
+        path = self._folder / name
+        with path.open("wb") as stream:
+            writer = Writer(stream, **settings)
+            for topic, kind, messages in entries:
+                schema = writer.register_msgdef(TYPES[kind], definition(TYPES[kind]))
+                for i, message in enumerate(messages):
+                    time_ns = T0_NS + i * 10**8
+                    writer.write_message(topic, schema, message, log_time=time_ns, publish_time=time_ns)
+            writer.finish()
+        return path
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Bench:
+    return Bench(tmp_path)
+
+
+@pytest.fixture
+def decoded() -> Callable[[Path], dict[str, list[Any]]]:
+    """Reads the messages of a log by topic with mcap-ros2-support."""
+
+    def decode(path: Path) -> dict[str, list[Any]]:
+        found: dict[str, list[Any]] = {}
+        with path.open("rb") as stream:
+            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+            for _, channel, _, message in reader.iter_decoded_messages():
+                found.setdefault(channel.topic, []).append(message)
+        return found
+
+    return decode
+
+
+@pytest.fixture(scope="session")
+def make_sequence() -> Callable[..., Sequence]:
+    return sequence_with
+
+
+def sequence_with(seed: int = 0, samples: int = 20, candidates: int = 2) -> Sequence:
+    """Every field filled with different numbers; some covariances known, some not."""
+    rng = np.random.default_rng(seed)
+    stamps = T0_NS + np.sort(rng.choice(10**10, samples, replace=False))
+    covs = rng.normal(size=(samples, 3, 3))
+    covs = covs @ covs.transpose(0, 2, 1)
+    covs[::3] = np.nan
+    force = rng.normal(size=(samples, 3))
+    force[::4] = np.nan
+    frames = np.sort(rng.choice(stamps, samples))
+    quaternions = rng.normal(size=(samples, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    calibration = Calibration(imu=ImuCalibration(mounting=Mounting(translation_m=(0.1, 0.2, 0.3), rpy_rad=(0.1, 0, 1))))
+    return Sequence(
+        name="a name with spaces and ψ",
+        calibration=calibration,
+        imu=Imu(stamps, rng.normal(size=(samples, 3)), force),
+        dvl=Dvl(stamps, rng.normal(size=(samples, 3)), covs),
+        depth=Depth(stamps, rng.normal(size=samples), np.where(np.arange(samples) % 2, np.nan, 0.01)),
+        detections=LandmarkDetections(
+            frames,
+            rng.uniform(1, 5, samples),
+            rng.normal(size=samples),
+            rng.normal(size=(samples, 2, 2)),
+            rng.integers(-1, 9, (samples, candidates)),
+            rng.uniform(0, 1, (samples, candidates)),
+        ),
+        truth=Trajectory.without_covariances(stamps, rng.normal(size=(samples, 3)), quaternions),
+        true_landmarks=LandmarkMap(np.array([3, 7]), rng.normal(size=(2, 3)), np.full((2, 3, 3), np.nan)),
+        notes={"source": "made up", "seed": str(seed)},
+    )

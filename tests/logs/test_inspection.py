@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from sonar_graph.logs.inspection import LogSummary, inspect_log
+from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.writing import write_sequence
+
+
+def role(summary: LogSummary, name: str) -> tuple[str | None, str]:
+    return next((r.topic, r.reason) for r in summary.roles if r.role == name)
+
+
+def test_rates_and_gaps_come_from_the_headers(bench: Any) -> None:
+    _, dvl = bench.basics()
+    seconds = [0, 1, 2, 5]
+    imu = ("/imu", "imu", [bench.imu(bench.t0_ns + s * 10**9) for s in seconds])
+    summary = inspect_log(bench.write(imu, dvl))
+    topic = next(t for t in summary.topics if t.name == "/imu")
+    assert (topic.type_name, topic.encoding, topic.messages) == ("sensor_msgs/msg/Imu", "cdr", 4)
+    assert (topic.first_stamp_ns, topic.last_stamp_ns) == (bench.t0_ns, bench.t0_ns + 5 * 10**9)
+    assert topic.rate_hz == pytest.approx(3 / 5)
+    assert topic.largest_gap_s == pytest.approx(3)
+    assert topic.stamps_from == "header"
+    assert summary.duration_s == pytest.approx(5)
+
+
+def test_roles_are_explained_whether_filled_or_not(bench: Any) -> None:
+    imu, dvl = bench.basics()
+    poses = [bench.odometry(bench.t0_ns, 0.0)]
+    summary = inspect_log(bench.write(imu, dvl, ("/second", "imu", imu[2]), ("/odom", "odometry", poses)))
+    assert role(summary, "imu") == (None, "2 topics fit: /imu, /second")
+    assert role(summary, "dvl") == ("/dvl", "the only marine_acoustic_msgs/msg/Dvl that fits")
+    assert role(summary, "truth")[0] is None
+    assert "/odom not used because of its name" in role(summary, "truth")[1]
+    assert summary.calibration.startswith("none in the log and no /tf_static")
+
+
+def test_the_roles_are_those_that_reading_uses(make_sequence: Any, tmp_path: Path) -> None:
+    sequence = make_sequence()
+    write_sequence(tmp_path / "a.mcap", sequence)
+    summary = inspect_log(tmp_path / "a.mcap")
+    used = read_sequence(tmp_path / "a.mcap").notes["log.topics"]
+    assert used == "; ".join(f"{r.role}: {r.topic}" for r in summary.roles)
+    assert summary.calibration == "in the log"
+    assert summary.name == sequence.name
+    assert summary.notes == sequence.notes
+    assert summary.damage == ()
+
+
+def test_mountings_in_the_log_are_mentioned(bench: Any) -> None:
+    tree = ("/tf_static", "tf", [{"transforms": [bench.transform("base_link", "imu_link", (1, 0, 0))]}])
+    summary = inspect_log(bench.write(*bench.basics(), tree))
+    assert "mountings of /tf_static (imu_link)" in summary.calibration
+    assert next(t for t in summary.topics if t.name == "/tf_static").stamps_from == "log"
+
+
+def test_damage_is_reported_instead_of_raised(make_sequence: Any, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write_sequence(path, make_sequence(samples=20_000))
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    (ending,) = inspect_log(path).damage
+    assert "cut off" in ending
+    flipped = np.frombuffer(content, np.uint8).copy()
+    chunk = make_reader(io.BytesIO(content)).get_summary().chunk_indexes[0]  # type: ignore[union-attr]
+    flipped[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
+    path.write_bytes(flipped.tobytes())
+    assert "chunk" in inspect_log(path).damage[0]
+
+
+@pytest.mark.recording
+def test_a_third_party_log_is_described(recordings: Path) -> None:
+    summary = inspect_log(recordings / "bags" / "nav2_turtlebot.mcap")
+    counts = {t.name: t.messages for t in summary.topics}
+    assert counts == {"/amcl_pose": 135, "/odom": 2639, "/tf": 5422, "/tf_static": 1}
+    assert all(r.topic is None for r in summary.roles)
+    assert summary.damage == ()

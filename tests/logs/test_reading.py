@@ -1,0 +1,224 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.errors import CalibrationError, LogError, MissingTopicError
+from sonar_graph.logs.encoding import dvl_messages, imu_messages
+from sonar_graph.logs.message_definitions import definition
+from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.recorder import write_recording
+from sonar_graph.logs.writing import write_sequence
+
+STEP_NS = 10**8
+
+
+def test_a_log_without_imu_or_dvl_names_what_is_there(bench: Any) -> None:
+    imu, dvl = bench.basics()
+    with pytest.raises(
+        MissingTopicError, match=r"nothing for dvl: no marine_acoustic_msgs/msg/Dvl.*/imu \(sensor_msgs"
+    ):
+        read_sequence(bench.write(imu))
+    with pytest.raises(MissingTopicError, match=r"nothing for imu.*/dvl \(marine"):
+        read_sequence(bench.write(dvl))
+
+
+def test_two_topics_for_one_role_must_be_chosen_from(bench: Any) -> None:
+    imu, dvl = bench.basics()
+    fast = [bench.imu(bench.t0_ns + i * STEP_NS, (0, 0, 7.0)) for i in range(5)]
+    path = bench.write(imu, dvl, ("/other", "imu", fast))
+    with pytest.raises(LogError, match=r"2 topics fit: /imu, /other; choose one: topics=\{'imu': '/imu'\}"):
+        read_sequence(path)
+    assert read_sequence(path, topics={"imu": "/imu"}).imu.angular_velocity[0, 2] == 0.1
+    chosen = read_sequence(path, topics={"imu": "/other"})
+    assert chosen.imu.angular_velocity[0, 2] == 7.0
+    assert "imu: /other" in chosen.notes["log.topics"]
+
+
+def test_choices_that_cannot_be_are_refused(bench: Any) -> None:
+    path = bench.write(*bench.basics())
+    with pytest.raises(MissingTopicError, match=r"/nowhere was chosen but is not in the log.*/imu"):
+        read_sequence(path, topics={"imu": "/nowhere"})
+    with pytest.raises(MissingTopicError, match="/dvl was chosen but is a marine_acoustic_msgs/msg/Dvl"):
+        read_sequence(path, topics={"depth": "/dvl"})
+    with pytest.raises(LogError, match="no role gyro; topics are chosen for imu, dvl"):
+        read_sequence(path, topics={"gyro": "/imu"})
+
+
+def test_stamps_are_the_headers_sorted_and_once(bench: Any) -> None:
+    imu, dvl = bench.basics()
+    stamps = [bench.t0_ns + i * STEP_NS for i in (0, 2, 1, 2, 3)]
+    rates = [(float(i), 0, 0) for i in range(5)]
+    imu = ("/imu", "imu", [bench.imu(s, r) for s, r in zip(stamps, rates, strict=True)])
+    sequence = read_sequence(bench.write(imu, dvl))
+    assert sequence.imu.stamps_ns.tolist() == [bench.t0_ns + i * STEP_NS for i in range(4)]
+    assert sequence.imu.angular_velocity[:, 0].tolist() == [0, 2, 1, 4]
+    assert sequence.notes["log.dropped"] == "imu: 1 with the stamp of another"
+
+
+def test_log_time_stands_in_for_a_stamp_of_zero(bench: Any) -> None:
+    _, dvl = bench.basics()
+    imu = ("/imu", "imu", [bench.imu(0) for _ in range(3)])
+    sequence = read_sequence(bench.write(imu, dvl))
+    assert sequence.imu.stamps_ns.tolist() == [bench.t0_ns + i * STEP_NS for i in range(3)]
+
+
+def test_unusable_rows_are_left_out_and_counted(bench: Any) -> None:
+    t0 = bench.t0_ns
+    nothing = [-1.0] + [0.0] * 8
+    imu = [bench.imu(t0), bench.imu(t0 + 1, (np.nan, 0, 0)), bench.imu(t0 + 2, angular_velocity_covariance=nothing)]
+    imu += [bench.imu(t0 + 3, linear_acceleration_covariance=nothing)]
+    dvl = [bench.dvl(t0), bench.dvl(t0 + 1, (np.inf, 0, 0)), bench.dvl(t0 + 2, velocity_mode=2)]
+    dvl += [bench.dvl(t0 + 3, num_good_beams=0), bench.dvl(t0 + 4)]
+    sequence = read_sequence(bench.write(("/imu", "imu", imu), ("/dvl", "dvl", dvl)))
+    assert (sequence.imu.stamps_ns - t0).tolist() == [0, 3]
+    assert (sequence.dvl.stamps_ns - t0).tolist() == [0, 4]
+    np.testing.assert_array_equal(sequence.imu.specific_force, [[0.1, 0.2, 9.8], [np.nan] * 3])
+    assert sequence.notes["log.dropped"] == (
+        "imu: 1 without angular rate, 1 with values that are not finite; "
+        "dvl: 1 not over the bottom, 1 without a good beam, 1 with values that are not finite"
+    )
+
+
+def test_a_role_of_which_nothing_is_left_is_an_error(bench: Any) -> None:
+    imu, _ = bench.basics()
+    water = ("/dvl", "dvl", [bench.dvl(bench.t0_ns + i, velocity_mode=2) for i in range(3)])
+    with pytest.raises(LogError, match=r"/dvl: none of its 3 messages can be used: 3 not over the bottom"):
+        read_sequence(bench.write(imu, water))
+
+
+def test_a_driver_that_never_counts_beams_is_believed(bench: Any) -> None:
+    imu, _ = bench.basics()
+    dvl = ("/dvl", "dvl", [bench.dvl(bench.t0_ns + i, num_good_beams=0) for i in range(3)])
+    assert len(read_sequence(bench.write(imu, dvl)).dvl) == 3
+
+
+def test_unknown_velocity_covariances_are_nan_and_known_ones_are_kept(bench: Any) -> None:
+    imu, _ = bench.basics()
+    known = [0.1, 0, 0, 0, 0.2, 0, 0, 0, 0.3]
+    covariances = [[-1.0] + [0.0] * 8, [0.0] * 9, known]
+    dvl = ("/dvl", "dvl", [bench.dvl(bench.t0_ns + i, velocity_covar=c) for i, c in enumerate(covariances)])
+    found = read_sequence(bench.write(imu, dvl)).dvl.velocity_cov
+    assert np.isnan(found[:2]).all()
+    np.testing.assert_array_equal(found[2], np.diag([0.1, 0.2, 0.3]))
+
+
+def test_pressure_becomes_height_by_hydrostatics(bench: Any) -> None:
+    # ten metres of fresh water at standard gravity weigh 98066.5 Pa
+    messages = [bench.pressure(bench.t0_ns, 101_325.0), bench.pressure(bench.t0_ns + 1, 101_325 + 98_066.5, 98.0665**2)]
+    sequence = read_sequence(bench.write(*bench.basics(), ("/bar30", "pressure", messages)))
+    assert sequence.depth is not None
+    np.testing.assert_allclose(sequence.depth.z_m, [0, -10], atol=1e-12)
+    np.testing.assert_allclose(sequence.depth.variance_m2, [np.nan, 1e-4])
+    assert "1000 kg/m3" in sequence.notes["log.depth"]
+
+
+def test_truth_needs_a_name_that_says_so(bench: Any) -> None:
+    poses = [bench.odometry(bench.t0_ns + i, float(i)) for i in range(3)]
+    guess = read_sequence(bench.write(*bench.basics(), ("/odom", "odometry", poses)))
+    assert guess.truth is None
+    assert "/odom not used" in guess.notes["log.truth"]
+    path = bench.write(*bench.basics(), ("/odom", "odometry", poses), ("/rov/ground_truth", "odometry", poses))
+    for sequence in (read_sequence(path), read_sequence(path, topics={"truth": "/odom"})):
+        assert sequence.truth is not None
+        assert sequence.truth.positions[:, 0].tolist() == [0, 1, 2]
+        assert np.isnan(sequence.truth.covariances).all()
+
+
+def test_detections_are_padded_to_the_most_candidates(bench: Any) -> None:
+    t0 = bench.t0_ns
+    frames = [bench.detections(t0, [1.0, 2.0], [5, 6]), bench.detections(t0 + 1, [], [])]
+    frames += [bench.detections(t0 + 2, [3.0], [7, 8, 9]), bench.detections(t0 + 3, [np.nan, 4.0], [1, 2])]
+    sequence = read_sequence(bench.write(*bench.basics(), ("/landmarks", "detections", frames)))
+    assert sequence.detections is not None
+    assert (sequence.detections.stamps_ns - t0).tolist() == [0, 0, 2, 3]
+    assert sequence.detections.range_m.tolist() == [1, 2, 3, 4]
+    assert sequence.detections.candidate_ids.tolist() == [[5, -1, -1], [6, -1, -1], [7, 8, 9], [2, -1, -1]]
+    assert sequence.detections.id_probability[0].tolist() == [0.5, 0, 0]
+    np.testing.assert_array_equal(sequence.detections.range_azimuth_cov[0], [[0.01, 0], [0, 0.02]])
+
+
+def test_detections_whose_lists_disagree_are_named(bench: Any) -> None:
+    frames = [bench.detections(bench.t0_ns, [1.0], [5]), bench.detections(bench.t0_ns, [1.0, 2.0], [5, 6, 7])]
+    with pytest.raises(LogError, match=r"/landmarks: message 1 has 2 ranges.* 3 identities"):
+        read_sequence(bench.write(*bench.basics(), ("/landmarks", "detections", frames)))
+
+
+def test_mountings_come_from_tf_static_through_frames_in_between(bench: Any) -> None:
+    first = bench.transform("base_link", "frame", (1, 0, 0), np.pi / 2)
+    second = bench.transform("frame", "imu_link", (0.5, 0, 0), np.pi / 2)
+    tree = ("/tf_static", "tf", [{"transforms": [second]}, {"transforms": [first]}])
+    sequence = read_sequence(bench.write(*bench.basics(), tree))
+    # half a metre along the frame's x, which points along the body's y
+    np.testing.assert_allclose(sequence.calibration.imu.mounting.translation_m, [1, 0.5, 0], atol=1e-12)
+    np.testing.assert_allclose(np.abs(sequence.calibration.imu.mounting.rpy_rad), [0, 0, np.pi], atol=1e-12)
+    assert sequence.calibration.dvl == Calibration().dvl
+    assert "mountings from /tf_static: imu; not in the tree" in sequence.notes["log.calibration"]
+
+
+def test_a_given_calibration_goes_before_the_one_in_the_log(make_sequence: Any, tmp_path: Path) -> None:
+    sequence = make_sequence()
+    write_sequence(tmp_path / "a.mcap", sequence)
+    assert read_sequence(tmp_path / "a.mcap").calibration == sequence.calibration
+    given = read_sequence(tmp_path / "a.mcap", calibration=Calibration(), name="mine")
+    assert given.calibration == Calibration()
+    assert given.name == "mine"
+    assert given.notes["log.calibration"] == "given by the caller"
+
+
+@pytest.mark.parametrize(
+    ("record", "error", "message"),
+    [
+        ({"calibration": "{"}, LogError, "calibration is not JSON"),
+        ({"calibration": '{"imu": {"nonsense": 1}}'}, CalibrationError, "imu.nonsense"),
+        ({"notes": "[]"}, LogError, "notes must be a JSON object"),
+    ],
+)
+def test_a_broken_metadata_record_is_named(
+    make_sequence: Any, tmp_path: Path, record: dict[str, str], error: type[Exception], message: str
+) -> None:
+    sequence = make_sequence()
+    messages = [imu_messages("/imu", sequence.imu), dvl_messages("/dvl", sequence.dvl)]
+    write_recording(tmp_path / "a.mcap", messages, {"sonar_graph": record})
+    with pytest.raises(error, match=message):
+        read_sequence(tmp_path / "a.mcap")
+
+
+def test_a_definition_without_a_needed_field_is_named(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    lacking = definition("sensor_msgs/msg/Imu").replace("geometry_msgs/Vector3 angular_velocity\n", "")
+    imu, dvl = bench.basics()
+    for message in imu[2]:
+        message.pop("angular_velocity")
+    monkeypatch.setitem(
+        bench.write.__globals__, "definition", lambda n: lacking if n.endswith("Imu") else definition(n)
+    )
+    with pytest.raises(LogError, match=r"/imu: its sensor_msgs/msg/Imu has no field angular_velocity\.x"):
+        read_sequence(bench.write(imu, dvl))
+
+
+def test_a_file_cut_at_its_end_is_read_with_a_note(make_sequence: Any, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    sequence = make_sequence(samples=20_000)
+    write_sequence(path, sequence)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    found = read_sequence(path)
+    assert 0 < len(found.imu) < len(sequence.imu)
+    assert "cut off" in found.notes["log.ending"]
+
+
+@pytest.mark.recording
+def test_a_third_party_log_without_the_sensors_lists_its_topics(recordings: Path) -> None:
+    with pytest.raises(
+        MissingTopicError, match=r"nothing for imu.*/amcl_pose \(.*/odom \(nav_msgs.*/tf \(.*/tf_static"
+    ):
+        read_sequence(recordings / "bags" / "nav2_turtlebot.mcap")
+
+
+@pytest.mark.recording
+def test_a_ros_1_bag_is_sent_to_rosbags_convert(recordings: Path) -> None:
+    with pytest.raises(LogError, match=r"a ROS 1 bag.*rosbags-convert"):
+        read_sequence(recordings / "bags" / "husky.bag")

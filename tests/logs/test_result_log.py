@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evo.tools import file_interface
+from rosbags.highlevel import AnyReader
+
+from sonar_graph.logs.result_log import write_result
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import LandmarkMap, Trajectory
+
+T0_NS = 1_700_000_000_000_000_000
+EMPTY = Trajectory.without_covariances(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 4)))
+NO_LANDMARKS = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+
+
+def straight(offset_m: float, n: int = 100) -> Trajectory:
+    """A pose a second along x, heading to +y, with a covariance that tells its axes apart."""
+    positions = np.column_stack([np.arange(n) + offset_m, np.zeros(n), np.zeros(n)])
+    quaternions = np.tile([0, 0, np.sqrt(0.5), np.sqrt(0.5)], (n, 1))
+    covariances = np.tile(np.diag([1.0, 2, 3, 4, 5, 6]), (n, 1, 1))
+    return Trajectory(T0_NS + np.arange(n) * 10**9, positions, quaternions, covariances)
+
+
+@pytest.fixture
+def result(make_sequence: Any, tmp_path: Path) -> Path:
+    landmarks = LandmarkMap(
+        np.array([6, 20]), np.array([[1.0, 2, 0], [3, 4, 0]]), np.tile(np.diag([1, 4, 9.0]), (2, 1, 1))
+    )
+    estimates = {
+        "ekf-slam": (straight(0), straight(0), landmarks),
+        "isam2": (straight(10), straight(20), landmarks),
+        "failed": (EMPTY, EMPTY, NO_LANDMARKS),
+    }
+    write_result(tmp_path / "result.mcap", make_sequence(), estimates)
+    return tmp_path / "result.mcap"
+
+
+@pytest.fixture
+def messages(result: Path, decoded: Any) -> dict[str, list[Any]]:
+    return decoded(result)
+
+
+def test_every_estimator_and_the_truth_are_there(messages: dict[str, list[Any]]) -> None:
+    each = ("odometry", "pose", "path", "landmarks")
+    expected = {f"/{name}/{kind}" for name in ("ekf_slam", "isam2") for kind in each}
+    expected |= {"/ground_truth/odometry", "/ground_truth/path", "/ground_truth/landmarks", "/tf", "/tf_static"}
+    assert set(messages) == expected
+
+
+def test_odometry_is_causal_and_the_last_path_smoothed(messages: dict[str, list[Any]]) -> None:
+    assert [m.pose.pose.position.x for m in messages["/isam2/odometry"]] == list(np.arange(100) + 10.0)
+    *so_far, last = messages["/isam2/path"]
+    assert [len(path.poses) for path in so_far] == [31, 61, 91]
+    assert [p.poses[0].pose.position.x for p in so_far] == [10, 10, 10]
+    assert [p.pose.position.x for p in last.poses] == list(np.arange(100) + 20.0)
+    assert [p.header.stamp.sec for p in last.poses] == list(range(1_700_000_000, 1_700_000_100))
+
+
+def test_covariances_are_in_the_order_and_axes_of_ros(messages: dict[str, list[Any]]) -> None:
+    pose = messages["/isam2/pose"][0]
+    # body axes turned by 90 degrees: what lies along the body's x lies along the world's y
+    assert np.diag(np.reshape(pose.pose.covariance, (6, 6))) == pytest.approx([5, 4, 6, 2, 1, 3])
+    assert (pose.header.frame_id, messages["/isam2/odometry"][0].child_frame_id) == ("map", "base_link")
+
+
+def test_landmarks_are_ellipsoids_with_their_identities(messages: dict[str, list[Any]]) -> None:
+    (array,) = messages["/isam2/landmarks"]
+    spheres = [m for m in array.markers if m.type == 2]
+    texts = [m for m in array.markers if m.type == 9]
+    assert [m.text for m in texts] == ["6", "20"]
+    assert [(m.pose.position.x, m.pose.position.y) for m in spheres] == [(1, 2), (3, 4)]
+    scale = spheres[0].scale
+    assert sorted([scale.x, scale.y, scale.z]) == pytest.approx(2 * 2.7954834829151074 * np.array([1, 2, 3]))
+    assert len({(m.ns, m.id) for m in array.markers}) == 4
+
+
+def test_tf_carries_the_first_estimator(messages: dict[str, list[Any]]) -> None:
+    transforms = [m.transforms for m in messages["/tf"]]
+    assert [t[0].transform.translation.x for t in transforms] == list(np.arange(100.0))
+    assert {(t[0].header.frame_id, t[0].child_frame_id) for t in transforms} == {("map", "base_link")}
+
+
+def test_rosbags_re_encodes_all_that_is_written_to_the_same_bytes(result: Path) -> None:
+    with AnyReader([result]) as reader:
+        for connection, _, raw in reader.messages():
+            message = reader.typestore.deserialize_cdr(raw, connection.msgtype)
+            assert bytes(reader.typestore.serialize_cdr(message, connection.msgtype)) == raw
+
+
+def test_evo_reads_a_trajectory_from_it(result: Path) -> None:
+    with file_interface.Rosbag2Reader(result) as reader:
+        trajectory = file_interface.read_bag_trajectory(reader, "/isam2/odometry")
+    np.testing.assert_array_equal(trajectory.positions_xyz, straight(10).positions)
+
+
+def test_paths_stay_small_on_long_runs(make_sequence: Any, tmp_path: Path, decoded: Any) -> None:
+    sequence: Sequence = make_sequence()
+    long = straight(0, 20_000)
+    write_result(tmp_path / "r.mcap", sequence, {"isam2": (long, long.rows(slice(0, 1)), NO_LANDMARKS)})
+    assert sum(len(m.poses) for m in decoded(tmp_path / "r.mcap")["/isam2/path"]) < 12_000

@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evo.tools import file_interface
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonar_graph.errors import LogError
+from sonar_graph.logs.tum import read_landmarks_csv, read_tum, write_landmarks_csv, write_tum
+from sonar_graph.states import LandmarkMap, Trajectory
+
+STAMPS = st.lists(st.integers(-(2**62), 2**62), min_size=1, max_size=20, unique=True).map(sorted)
+
+
+@given(STAMPS, st.integers(0, 99))
+def test_not_a_nanosecond_nor_a_bit_is_lost(tmp_path_factory: Any, stamps: list[int], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = len(stamps)
+    written = Trajectory.without_covariances(np.array(stamps), rng.normal(size=(n, 3)), rng.normal(size=(n, 4)))
+    path = tmp_path_factory.mktemp("tum") / "t.tum"
+    write_tum(path, written)
+    found = read_tum(path)
+    assert found.stamps_ns.tolist() == stamps
+    np.testing.assert_array_equal(found.positions, written.positions)
+    np.testing.assert_array_equal(found.quaternions_xyzw, written.quaternions_xyzw)
+
+
+def test_the_line_is_the_one_that_tum_describes(tmp_path: Path) -> None:
+    pose = Trajectory.without_covariances(np.array([1_700_000_000_000_000_001]), np.array([[1, 2, 3.5]]), np.eye(4)[3:])
+    write_tum(tmp_path / "t.tum", pose)
+    assert (tmp_path / "t.tum").read_text() == "1700000000.000000001 1.0 2.0 3.5 0.0 0.0 0.0 1.0\n"
+
+
+def test_evo_reads_the_same_poses(make_sequence: Any, tmp_path: Path) -> None:
+    truth = make_sequence().truth
+    write_tum(tmp_path / "t.tum", truth)
+    theirs = file_interface.read_tum_trajectory_file(tmp_path / "t.tum")
+    np.testing.assert_array_equal(theirs.positions_xyz, truth.positions)
+    np.testing.assert_array_equal(theirs.orientations_quat_wxyz, truth.quaternions_xyzw[:, [3, 0, 1, 2]])
+
+
+def test_comments_blank_lines_and_exponents_are_read(tmp_path: Path) -> None:
+    (tmp_path / "t.tum").write_text("# t x y z\n\n1.5e0 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
+    assert read_tum(tmp_path / "t.tum").stamps_ns.tolist() == [1_500_000_000, 2_000_000_000]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1 0 0 0 0 0 0\n", "line 1: 7 values"),
+        ("1 0 0 0 0 0 0 1\n2 0 0 x 0 0 0 1\n", "line 2: .* no number"),
+        ("t 0 0 0 0 0 0 1\n", "line 1: .* no number"),
+        ("nan 0 0 0 0 0 0 1\n", "line 1: .* no number"),
+        ("2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "pose 2 is not later"),
+    ],
+)
+def test_a_line_that_is_no_pose_is_named(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "t.tum").write_text(text)
+    with pytest.raises(LogError, match=message):
+        read_tum(tmp_path / "t.tum")
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"none\.tum cannot be read"):
+        read_tum(tmp_path / "none.tum")
+
+
+def test_landmarks_come_back_from_their_table(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(3, 3, 3))
+    covariances = root + root.transpose(0, 2, 1)
+    covariances[1] = np.nan
+    landmarks = LandmarkMap(np.array([1, 6, 2**40]), rng.normal(size=(3, 3)), covariances)
+    write_landmarks_csv(tmp_path / "l.csv", landmarks)
+    lines = (tmp_path / "l.csv").read_text().splitlines()
+    assert lines[0] == "id,x_m,y_m,z_m,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz"
+    assert float(lines[1].split(",")[8]) == covariances[0, 1, 2]
+    found = read_landmarks_csv(tmp_path / "l.csv")
+    assert found.ids.tolist() == [1, 6, 2**40]
+    np.testing.assert_array_equal(found.positions, landmarks.positions)
+    np.testing.assert_array_equal(found.covariances, landmarks.covariances)
+
+
+def test_an_empty_map_is_a_header(tmp_path: Path) -> None:
+    write_landmarks_csv(tmp_path / "l.csv", LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3))))
+    assert len((tmp_path / "l.csv").read_text().splitlines()) == 1
+    assert len(read_landmarks_csv(tmp_path / "l.csv")) == 0
+
+
+def test_a_table_without_its_columns_is_named(tmp_path: Path) -> None:
+    (tmp_path / "l.csv").write_text("id,x\n1,2\n")
+    with pytest.raises(LogError, match=r"l\.csv is not a landmark table"):
+        read_landmarks_csv(tmp_path / "l.csv")

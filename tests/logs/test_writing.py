@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from rosbags.highlevel import AnyReader
+
+from sonar_graph.errors import LogError
+from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.writing import write_sequence
+from sonar_graph.measurements import Imu
+
+BLOCKS = ("imu", "dvl", "depth", "detections", "truth", "true_landmarks")
+
+
+@settings(max_examples=25)
+@given(
+    seed=st.integers(0, 2**31),
+    samples=st.integers(1, 40),
+    candidates=st.integers(1, 4),
+    left_out=st.sets(st.sampled_from(BLOCKS[2:])),
+)
+def test_reading_what_was_written_is_the_identity(
+    make_sequence: Any, tmp_path_factory: Any, seed: int, samples: int, candidates: int, left_out: set[str]
+) -> None:
+    sequence = replace(make_sequence(seed, samples, candidates), **dict.fromkeys(left_out))
+    path = tmp_path_factory.mktemp("log") / "log.mcap"
+    write_sequence(path, sequence)
+    found = read_sequence(path)
+    for name in BLOCKS:
+        expected, actual = getattr(sequence, name), getattr(found, name)
+        assert (expected is None) == (actual is None), name
+        for field in fields(expected) if expected is not None else ():
+            np.testing.assert_array_equal(
+                getattr(actual, field.name), getattr(expected, field.name), f"{name}.{field.name}"
+            )
+    assert (found.name, found.calibration) == (sequence.name, sequence.calibration)
+    assert found.notes.items() >= sequence.notes.items()
+
+
+def test_known_covariances_of_the_truth_survive(make_sequence: Any, tmp_path: Path) -> None:
+    sequence = make_sequence()
+    root = np.random.default_rng(0).normal(size=(len(sequence.truth), 6, 6))
+    truth = replace(sequence.truth, covariances=root @ root.transpose(0, 2, 1))
+    write_sequence(tmp_path / "a.mcap", replace(sequence, truth=truth))
+    found = read_sequence(tmp_path / "a.mcap").truth
+    assert found is not None
+    np.testing.assert_allclose(found.covariances, truth.covariances, atol=1e-12)
+
+
+def test_mcap_ros2_support_decodes_what_is_written(make_sequence: Any, tmp_path: Path, decoded: Any) -> None:
+    sequence = make_sequence()
+    write_sequence(tmp_path / "a.mcap", sequence)
+    messages = decoded(tmp_path / "a.mcap")
+    assert set(messages) == {"/imu/data", "/dvl/data", "/depth/pose", "/sonar/landmarks", "/tf_static",
+                             "/ground_truth/odometry", "/ground_truth/landmarks"}  # fmt: skip
+    imu = messages["/imu/data"]
+    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in imu]
+    assert stamps == sequence.imu.stamps_ns.tolist()
+    rates = [[m.angular_velocity.x, m.angular_velocity.y, m.angular_velocity.z] for m in imu]
+    assert rates == sequence.imu.angular_velocity.tolist()
+    assert [m.linear_acceleration_covariance[0] for m in imu] == [-1.0 if i % 4 == 0 else 0.0 for i in range(20)]
+    assert [m.velocity_mode for m in messages["/dvl/data"]] == [1] * 20
+    assert [m.pose.pose.position.z for m in messages["/depth/pose"]] == sequence.depth.z_m.tolist()
+    ranges = [r for m in messages["/sonar/landmarks"] for r in m.range_m]
+    assert ranges == sequence.detections.range_m.tolist()
+    assert list(messages["/ground_truth/landmarks"][0].ids) == [3, 7]
+    (tree,) = messages["/tf_static"]
+    assert [t.child_frame_id for t in tree.transforms] == ["imu", "dvl", "depth", "sonar"]
+    assert tree.transforms[0].transform.translation.y == 0.2
+
+
+def test_rosbags_re_encodes_all_that_is_written_to_the_same_bytes(make_sequence: Any, tmp_path: Path) -> None:
+    write_sequence(tmp_path / "a.mcap", make_sequence())
+    count = 0
+    with AnyReader([tmp_path / "a.mcap"]) as reader:
+        for connection, _, raw in reader.messages():
+            message = reader.typestore.deserialize_cdr(raw, connection.msgtype)
+            assert bytes(reader.typestore.serialize_cdr(message, connection.msgtype)) == raw
+            count += 1
+    assert count > 80
+
+
+def test_messages_lie_in_the_order_of_their_times(make_sequence: Any, tmp_path: Path) -> None:
+    write_sequence(tmp_path / "a.mcap", make_sequence())
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        times = [r.log_time for r in StreamReader(stream).records if isinstance(r, Message)]
+    assert len(times) > 80
+    assert times == sorted(times)
+
+
+@pytest.mark.parametrize("stamp_ns", [2**31 * 10**9, -(2**31) * 10**9 - 1])
+def test_stamps_that_ros_cannot_express_are_refused(make_sequence: Any, tmp_path: Path, stamp_ns: int) -> None:
+    sequence = replace(make_sequence(), imu=Imu(np.array([stamp_ns]), np.zeros((1, 3)), np.zeros((1, 3))))
+    with pytest.raises(LogError, match="32-bit seconds"):
+        write_sequence(tmp_path / "a.mcap", sequence)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_cannot_be_written_is_named(make_sequence: Any, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(LogError, match=r"file/a\.mcap cannot be written"):
+        write_sequence(tmp_path / "file" / "a.mcap", make_sequence())
