@@ -43,6 +43,8 @@ class Isam2Params(Section):
     """The gyro bias is constant over stretches of this length."""
     relinearize_threshold: float = Field(0.01, gt=0)
     """A variable is relinearised when a component of its change exceeds this (rad or m)."""
+    stale_shift_m: float = Field(0.1, gt=0)
+    """The window is linearised anew, from a solution of the whole graph, when a landmark has moved by more than this."""
     kernel: Literal["none", "huber", "cauchy"] = "huber"
     """Robust kernel on range and on azimuth."""
     kernel_width: float = Field(2.0, gt=0)
@@ -70,7 +72,7 @@ class Isam2:
         self._calibration = calibration
         self._params: Isam2Params = params or Isam2Params()
         p = self._params
-        self._smoother = Smoother(p.lag_s, p.relinearize_threshold)
+        self._smoother = Smoother(p.lag_s, p.relinearize_threshold, p.stale_shift_m)
         policy = KeyframePolicy(p.min_keyframe_interval_s, p.max_keyframe_interval_s, p.bias_interval_s)
         self._keyframes = Keyframes(calibration, policy, self._smoother)
         sightings = SightingPolicy(p.identity_probability, p.gate_probability, p.kernel, p.kernel_width)

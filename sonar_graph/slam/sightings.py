@@ -181,5 +181,5 @@ class View:
         )
         world_T_body = self.world_T_keyframe.compose(self.motion.i_T_j)
         _, by_motion, _ = range_azimuth_jacobians(world_T_body, body_T_sonar, point)
-        R = cov + by_motion @ self.motion.covariance @ by_motion.T
+        R = cov + np.diag(np.diag(by_motion @ self.motion.covariance @ by_motion.T))
         return predicted, np.hstack([by_keyframe, by_point]), R

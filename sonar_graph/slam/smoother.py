@@ -1,19 +1,20 @@
 """Incremental smoothing whose cost per update stays bounded, and the whole graph's solution when it is asked for.
 
-Two solvers share the same factors:
+Two solutions share the same factors:
 
-* *window*: GTSAM's iSAM2 over the poses of the last ``lag_s`` seconds and all landmarks and biases. Older poses are
+* the *window*: GTSAM's iSAM2 over the poses of the last ``lag_s`` seconds, all landmarks and all biases. Older poses are
   marginalised, so that an update does not walk over all sightings that a landmark ever had.
-* *history*: every factor ever added. Solving it (Levenberg–Marquardt) relinearises everything.
+* the *history*: every factor ever added, solved by Levenberg-Marquardt when the smoothed result is asked for.
 
-Marginalising freezes the linearisation of the landmarks it touches. When an estimate has moved away from where it was
-frozen, the history is solved again and the window restarts from that solution with fresh linearisation; the number of
-factors at least `RESTART_GROWTH` times that of the last time keeps the total cost proportional to the history.
+Marginalising freezes the linearisation of the landmarks that it touches. When one has since moved by more than
+``stale_shift_m`` (a loop was closed after much drift), the history is solved at once and the window starts again from
+that solution with fresh linearisations. The graph must have grown by `RESTART_GROWTH` since the last time, which keeps
+the total cost of restarts proportional to that of the last one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 
 import gtsam
 import numpy as np
@@ -21,7 +22,10 @@ import numpy as np
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.batch import solve
 
-RESTART_GROWTH = 1.5
+RESTART_GROWTH = 1.25
+"""Number of factors, relative to that at the last restart, before the next one."""
+FIRST_RESTART = 100
+"""Number of factors before the first restart."""
 
 
 class Smoother:
@@ -33,10 +37,14 @@ class Smoother:
         Poses older than this leave the window; infinite: plain iSAM2 over the whole history.
     relinearize_threshold
         A variable is relinearised when any component of its change exceeds this (rad or m).
+    stale_shift_m
+        The window restarts when a landmark has moved by more than this from where it was linearised.
     """
 
-    def __init__(self, lag_s: float, relinearize_threshold: float) -> None:
+    def __init__(self, lag_s: float, relinearize_threshold: float, stale_shift_m: float) -> None:
         self._lag_s = lag_s
+        self._stale_shift_m = stale_shift_m
+        self._restart_size = FIRST_RESTART
         self._threshold = relinearize_threshold
         self.graph = gtsam.NonlinearFactorGraph()
         """Every factor ever added."""
@@ -45,6 +53,7 @@ class Smoother:
         self._pending = gtsam.NonlinearFactorGraph()
         self._pending_values = gtsam.Values()
         self._pending_times: dict[int, float] = {}
+        self._pose_times: dict[int, float] = {}
         self._lasting: list[int] = []
         self._window = self._new_window()
         self._solved: tuple[gtsam.Values, gtsam.Marginals] | None = None
@@ -62,6 +71,7 @@ class Smoother:
         self._pending_values.insert(key, pose)
         self.values.insert(key, pose)
         self._pending_times[key] = time_s
+        self._pose_times[key] = time_s
 
     def add_lasting(self, key: int, point: Floats) -> None:
         """A new landmark or bias, which never leaves the window."""
@@ -88,6 +98,28 @@ class Smoother:
         self._pending_values = gtsam.Values()
         self._pending_times = {}
         self.values.update(self._window.calculateEstimate())
+        if self.graph.size() >= self._restart_size and self._is_stale():
+            self._restart(time_s)
+
+    def _is_stale(self) -> bool:
+        delta = self._window.getDelta()
+        return any(np.abs(delta.at(key)).max() > self._stale_shift_m for key in self._lasting)
+
+    def _restart(self, time_s: float) -> None:
+        """Solve the history; start a window whose prior is the marginal of all that lies before it."""
+        self._restart_size = int(RESTART_GROWTH * self.graph.size())
+        self.values = solve(self.graph, self.values)
+        times = {key: t for key, t in self._pose_times.items() if t >= time_s - self._lag_s}
+        times |= dict.fromkeys(self._lasting, time_s)
+        inside, outside = _split(self.graph, times)
+        values = gtsam.Values()
+        for key in times:
+            _copy(self.values, key, values)
+        for factor in _marginal(outside, self.values, times):
+            inside.push_back(factor)
+        self._window = self._new_window()
+        self._window.update(inside, values, times)
+        self.values.update(self._window.calculateEstimate())
 
     def covariance(self, key: int) -> Floats:
         """Marginal covariance of a variable in the window."""
@@ -104,3 +136,33 @@ class Smoother:
             self._solved = values, gtsam.Marginals(self.graph.linearize(values), values)
             self._solved_size = self.graph.size()
         return self._solved
+
+
+def _split(
+    graph: gtsam.NonlinearFactorGraph, kept: Container[int]
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.NonlinearFactorGraph]:
+    """Factors on kept variables only, and those that touch any other."""
+    inside, outside = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+    for i in range(graph.size()):
+        factor = graph.at(i)
+        (inside if all(key in kept for key in factor.keys()) else outside).push_back(factor)
+    return inside, outside
+
+
+def _marginal(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kept: Container[int]
+) -> list[gtsam.NonlinearFactor]:
+    """What a graph says about the kept variables alone, linearised at the values."""
+    if graph.size() == 0:
+        return []
+    linear = graph.linearize(values)
+    separator = [key for key in linear.keyVector() if key in kept]
+    marginal = linear.marginal(separator)
+    return [gtsam.LinearContainerFactor(marginal.at(i), values) for i in range(marginal.size())]
+
+
+def _copy(source: gtsam.Values, key: int, target: gtsam.Values) -> None:
+    if gtsam.Symbol(key).chr() == ord("x"):
+        target.insert(key, source.atPose3(key))
+    else:
+        target.insert(key, source.atPoint3(key))
