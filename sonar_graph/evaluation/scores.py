@@ -45,7 +45,7 @@ def trajectory_scores(
     instants
         Which instants these are, for the protocols.
     """
-    over = f"over {instants}; truth interpolated linearly"
+    over = f"over {instants}, to which the truth is interpolated"
     scores = _absolute(estimate, truth, ESTIMATES[kind], over)
     scores |= _relative(estimate, truth, ESTIMATES[kind], over)
     scores |= _consistency(errors, ESTIMATES[kind], over)
@@ -76,7 +76,7 @@ def _absolute(estimate: Trajectory, truth: Trajectory, which: str, over: str) ->
         "return_error_m": Score(
             return_error_m(estimate, truth),
             "m",
-            f"{which}, not aligned: norm of estimated minus true displacement from the first to the last of {over}.",
+            f"{which}, not aligned: norm of estimated minus true displacement from the first to the last, {over}.",
         ),
     }
 
@@ -109,8 +109,8 @@ def _consistency(errors: ErrorSeries, which: str, over: str) -> dict[str, Score]
     for key, nees, dof, what in parts:
         known = int(np.isfinite(nees).sum())
         protocol = (
-            f"{which}, not aligned: mean over the {known} instants with a covariance of the normalised squared "
-            f"error of {what}, divided by {dof}; 1 is consistent, above is over-confident; {IN_TIME}; {over}."
+            f"{which}, not aligned: mean normalised squared error of {what} divided by {dof}, {over}, {known} of which "
+            f"have a covariance; 1 is consistent, above is over-confident; {IN_TIME}."
         )
         scores[key] = Score(mean_normalised(nees, dof), "1", protocol, better="inside")
     return _finite(scores)
