@@ -1,0 +1,167 @@
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
+
+from sonar_graph.logs.converters.akit import enu_R_flu, read_akit
+
+IMU_HEADER = "Time [s],ACC X [m/s^2],ACC Y [m/s^2],ACC Z [m/s^2],GYRO X [rad/s],GYRO Y [rad/s],GYRO Z [rad/s]"
+DVL_HEADER = "Time [s],DVL X [m/s],DVL Y [m/s],DVL Z [m/s]"
+GT_HEADER = (
+    "Time [s],Longitude [rad],Latitude [rad],Altitude [m],V North [m/s],V East [m/s],V Down [m/s],"
+    "Roll [rad],Pitch [rad],Yaw [rad]"
+)
+LATITUDE = 0.5733
+EARTH_RATE_RAD_S = 7.292115e-5
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Three seconds north-east of a vehicle that floats level and heads east."""
+    run = tmp_path / "Trajectory2"
+    run.mkdir()
+
+    def write(kind, header, rows):
+        text = "\n".join([header, *(",".join(map(repr, map(float, row))) for row in rows)])
+        (run / f"{kind}_trajectory2.csv").write_text(text + "\n")
+
+    write("IMU", IMU_HEADER, [(k * 0.01000025, 0.1, 0.2, -9.8, 0.01, 0.02, 0.03) for k in range(300)])
+    write("DVL", DVL_HEADER, [(k * 1.0025, 1.0, 0.5, 0.25) for k in range(3)])
+    step = 1e-6
+    write(
+        "GT",
+        GT_HEADER,
+        [(k, 0.61 + k * step, LATITUDE + k * step, -10 - k, 0, 0, 0, 0, 0, np.pi / 2) for k in range(3)],
+    )
+    return tmp_path
+
+
+def test_axes_turn_to_forward_left_up(folder):
+    """The DVL is forward, right, down; the IMU the same but for its y axis, which is to the left already."""
+    sequence = read_akit(folder, 2)
+    assert np.allclose(sequence.dvl.velocity[0], [1.0, -0.5, -0.25])
+    assert np.allclose(sequence.imu.angular_velocity[0], [0.01, 0.02, -0.03])
+    assert np.allclose(sequence.imu.specific_force[0], [0.1, 0.2, 9.8])
+
+
+def test_rows_are_timed_by_their_number(folder):
+    sequence = read_akit(folder, 2)
+    assert np.unique(np.diff(sequence.imu.stamps_ns)).tolist() == [10_000_000]
+    assert sequence.dvl.stamps_ns.tolist() == [10**9, 2 * 10**9, 3 * 10**9]
+    assert sequence.truth.stamps_ns.tolist() == [0, 10**9, 2 * 10**9]
+    assert sequence.start_ns == 10**9
+
+
+def test_reference_is_metres_east_north_up(folder):
+    """Radii of curvature by hand at that latitude: 6 354 km along the meridian, 5 366 km along the parallel."""
+    sequence = read_akit(folder, 2)
+    steps = np.diff(sequence.truth.positions, axis=0)
+    assert np.allclose(steps, [[5.366, 6.354, -1.0]] * 2, rtol=0, atol=5e-3)
+    assert np.allclose(sequence.truth.positions[0], [0, 0, -10], atol=1e-6)
+
+
+def test_heading_east_is_along_x(folder):
+    sequence = read_akit(folder, 2)
+    assert np.allclose(sequence.truth.rotations()[0].as_matrix(), np.eye(3), atol=1e-12)
+    assert np.allclose(sequence.calibration.start.rpy_rad, 0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("roll", "pitch", "yaw", "body", "world"),
+    [
+        (0, 0, 0, [1, 0, 0], [0, 1, 0]),  # north
+        (0, 0, np.pi / 2, [0, 1, 0], [0, 1, 0]),  # heading east, left is north
+        (0, np.pi / 2, 0, [1, 0, 0], [0, 0, 1]),  # nose up
+        (np.pi / 2, 0, 0, [0, 1, 0], [0, 0, 1]),  # right side down, heading north: left is up
+    ],
+)
+def test_attitude_by_hand(roll, pitch, yaw, body, world):
+    turned = enu_R_flu(*np.array([[roll], [pitch], [yaw]])).apply(body)
+    assert np.allclose(turned, world, atol=1e-12)
+
+
+def test_start_is_the_reference_when_the_dvl_begins(folder):
+    sequence = read_akit(folder, 2)
+    assert np.allclose(sequence.calibration.start.position_m, sequence.truth.positions[1])
+
+
+def test_trajectories_that_exist_are_named(folder, tmp_path, refusal):
+    refusal(lambda: read_akit(folder, 5), "no trajectory 5", "it has 2")
+    refusal(lambda: read_akit(folder / "Trajectory2", 2), "no folder TrajectoryN")
+    refusal(lambda: read_akit(tmp_path / "absent", 1), "not a folder")
+
+
+def test_a_malformed_line_is_named(folder, refusal):
+    path = folder / "Trajectory2" / "DVL_trajectory2.csv"
+    path.write_text(f"{DVL_HEADER}\n0,1,2,3\n1,2,3\n")
+    refusal(lambda: read_akit(folder, 2), path, "line 3", "DVL Z")
+
+
+def test_a_missing_file_is_named(folder, refusal):
+    (folder / "Trajectory2" / "GT_trajectory2.csv").unlink()
+    refusal(lambda: read_akit(folder, 2), "GT_trajectory2.csv", "Longitude")
+
+
+@pytest.mark.recording
+class TestRecording:
+    """Against the reference, which lags the IMU by a time that differs between trajectories."""
+
+    @pytest.fixture(params=[1, 3, 7])
+    def sequence(self, request, unpacked):
+        return read_akit(next(unpacked("akit_1-7.tar.xz").rglob("Trajectory1")).parent, request.param)
+
+    def test_gyros_follow_the_reference_once_the_earths_rotation_is_removed(self, sequence):
+        latitude = sequence.calibration.earth_rate_latitude_rad
+        removed = best_drift(sequence, EARTH_RATE_RAD_S * np.array([0, np.cos(latitude), np.sin(latitude)]))
+        kept = best_drift(sequence, np.zeros(3))
+        assert np.linalg.norm(removed) < 3e-6
+        assert np.linalg.norm(kept) > 6e-5
+
+    def test_dvl_measures_the_references_velocity_behind_its_origin(self, sequence):
+        lever = np.array(sequence.calibration.dvl.mounting.translation_m)
+        right = sideways_error(sequence, lever)
+        assert right < 0.06
+        assert right < 0.6 * sideways_error(sequence, np.zeros(3))
+        assert right < 0.6 * sideways_error(sequence, lever, dvl_delay_s=-1.0)
+
+
+def sideways_error(sequence, lever, dvl_delay_s=0.0):
+    """Standard deviation of the DVL's leftward velocity error, with the reference's delay taken out."""
+    knots = sequence.truth.stamps_ns * 1e-9
+    position, attitude = CubicSpline(knots, sequence.truth.positions), Slerp(knots, sequence.truth.rotations())
+    rows = np.arange(5, 395)
+    seconds = sequence.dvl.stamps_ns[rows] * 1e-9 + dvl_delay_s
+    centre = np.round(seconds * 100).astype(int)
+    rate = np.mean([sequence.imu.angular_velocity[centre + k] for k in range(-10, 11)], axis=0)
+    delay = reference_delay(sequence)
+    body_R_world = attitude(seconds + delay).inv()
+    expected = body_R_world.apply(position(seconds + delay, 1)) + np.cross(rate, lever)
+    return np.std(sequence.dvl.velocity[rows, 1] - expected[:, 1])
+
+
+def reference_delay(sequence):
+    """Seconds by which the reference's heading rate comes after the gyro's."""
+    knots = sequence.truth.stamps_ns * 1e-9
+    heading = CubicSpline(knots, np.unwrap(sequence.truth.rotations().as_euler("ZYX")[:, 0]))
+    smooth = np.convolve(sequence.imu.angular_velocity[:, 2], np.ones(100) / 100, "same")
+    seconds = np.arange(5, 390)
+    errors = [(np.std(heading(seconds + d, 1) - smooth[seconds * 100]), d) for d in np.arange(-0.7, 0.71, 0.02)]
+    return min(errors)[1]
+
+
+def best_drift(sequence, earth_rate):
+    """Slope of the reference's attitude over the integrated gyro, rad/s, east north up, at the delay that fits."""
+    rates, truth = sequence.imu.angular_velocity, sequence.truth.rotations()
+    attitude = truth[0]
+    integrated = [attitude]
+    for rate in 0.5 * (rates[1:] + rates[:-1]).reshape(-1, 3):
+        attitude = attitude * Rotation.from_rotvec((rate - attitude.inv().apply(earth_rate)) * 0.01)
+        integrated.append(attitude)
+    integrated = Rotation.concatenate(integrated)
+    seconds, best = np.arange(1, 399), (np.inf, None)
+    for delay in range(-60, 61, 4):
+        error = (truth[seconds] * integrated[seconds * 100 + delay].inv()).as_rotvec()
+        slope, offset = np.polyfit(seconds, error, 1)
+        residual = np.std(error[:, 2] - offset[2] - slope[2] * seconds)
+        best = min(best, (residual, slope), key=lambda found: found[0])
+    return best[1]
