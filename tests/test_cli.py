@@ -324,3 +324,10 @@ def test_calibration_with_an_unknown_field_names_file_and_field(tmp_path: Path) 
     path.write_text("[imu]\ngyro_sigma = 1\n")
     with pytest.raises(CalibrationError, match=r"vehicle\.toml: imu\.gyro_sigma"):
         read_calibration(path)
+
+
+@pytest.mark.slow
+def test_demo_leaves_a_log_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("demo", "-o", tmp_path) == 0
+    assert f"Report: {tmp_path / 'report.html'}" in capsys.readouterr().out
+    assert (tmp_path / "basin.mcap").stat().st_size > 100_000

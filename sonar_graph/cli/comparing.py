@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 DEFAULT_ESTIMATORS = "isam2,ekf-slam,dead-reckoning"
 DEFAULT_RATE_HZ = 2.0
-DEMO_DURATION_S = 300.0
+DEMO = {"duration_s": 600.0, "laps": 2, "imu": "mti1", "dvl": "explorer"}
+"""Two laps, so that landmarks are seen again; cheap sensors, so that dead reckoning drifts within minutes."""
 
 
 @dataclass(frozen=True)
@@ -91,13 +92,13 @@ def report(
 
 
 def demo(output: OutputFolder = Path("demo")) -> None:
-    """Simulate a few minutes in a basin, compare the three estimators that come along, and write the report."""
+    """Simulate ten minutes in a basin, compare the three estimators that come along, and write the report."""
     from sonar_graph.logs.writing import write_sequence
     from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
     log = writable_folder(output) / "basin.mcap"
     with working("simulating"):
-        write_sequence(log, simulate_basin(BasinOptions(duration_s=DEMO_DURATION_S, laps=1)))
+        write_sequence(log, simulate_basin(BasinOptions.model_validate(DEMO)))
     compare(log, output)
 
 
