@@ -18,6 +18,8 @@ from sonar_graph.logs.schema import Struct, parse_definition
 from sonar_graph.logs.table import header_stamps_ns
 from sonar_graph.measurements import Ints
 
+_FRAMES_NAMED = 6
+
 
 @dataclass(frozen=True)
 class TopicSummary:
@@ -65,9 +67,10 @@ class LogSummary:
 
     @property
     def duration_s(self) -> float:
-        """Seconds between the first and the last stamp of the topics that play a part."""
+        """Seconds between the first and the last stamp of the topics that play a part, or of all where none does."""
         used = {role.topic for role in self.roles}
-        topics = [topic for topic in self.topics if topic.name in used] or list(self.topics)
+        by_header = [topic for topic in self.topics if topic.stamps_from == "header"]  # not the recorder's clock
+        topics = [topic for topic in self.topics if topic.name in used] or by_header or self.topics
         if not topics:
             return 0.0
         return (max(t.last_stamp_ns for t in topics) - min(t.first_stamp_ns for t in topics)) * 1e-9
@@ -143,7 +146,8 @@ def _calibration(recording: Recording) -> str:
     except SonarGraphError as error:
         return f"unusable: {error}"
     if frames:
-        return f"none in the log; defaults with the mountings of /tf_static ({', '.join(frames)})"
+        names = ", ".join(list(frames)[:_FRAMES_NAMED]) + (", ..." if len(frames) > _FRAMES_NAMED else "")
+        return f"none in the log; defaults with the mountings of /tf_static ({names})"
     return "none in the log and no /tf_static; defaults"
 
 

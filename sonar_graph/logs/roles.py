@@ -40,8 +40,12 @@ class Role:
 
     def describe(self) -> str:
         """What is looked for."""
+        by_words: dict[tuple[str, ...], list[str]] = {}
+        for type_name, words in self.types.items():
+            by_words.setdefault(words, []).append(type_name)
         return " or ".join(
-            name + (f" on a topic with {words[0]!r} in its name" if words else "") for name, words in self.types.items()
+            " or ".join(names) + (f" on a topic with {words[0]!r} in its name" if words else "")
+            for words, names in by_words.items()
         )
 
 

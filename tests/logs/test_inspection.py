@@ -81,4 +81,5 @@ def test_a_third_party_log_is_described(recordings: Path) -> None:
     counts = {t.name: t.messages for t in summary.topics}
     assert counts == {"/amcl_pose": 135, "/odom": 2639, "/tf": 5422, "/tf_static": 1}
     assert all(r.topic is None for r in summary.roles)
+    assert summary.duration_s == pytest.approx(101.394)  # by the robot's clock, not the recorder's
     assert summary.damage == ()
