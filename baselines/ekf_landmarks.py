@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.ekf_state import LANDMARK, POSE, correct, correct_pair, cross, perturbation_jacobian, product
+from baselines.ekf_state import LANDMARK, POSE, correct, correct_pair, perturbation_jacobian, place, product
 from baselines.euler import rotation_from_euler
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.kernels import compiled, skew
@@ -131,8 +131,8 @@ def observation(moment: Moment, p: Floats, body_R_sonar: Floats, body_p_sonar: F
     z, D_q = project(q)
     by_p_b = product(D_q, body_R_sonar.T)
     H_b = np.empty((2, POSE))
-    H_b[:, :3] = product(by_p_b, skew(p_b))
-    H_b[:, 3:] = -by_p_b
+    place(product(by_p_b, skew(p_b)), H_b, 0, 0)
+    place(-by_p_b, H_b, 0, 3)
     return z, H_b, product(by_p_b, R_t.T)
 
 
@@ -195,9 +195,8 @@ def _augment(x: Floats, P: Floats, n: int, moment: Moment, sonar: SonarModel, z:
     """Append a landmark where it was seen; its elevation from the floor where there is one, else zero."""
     elevation = _elevation(moment, sonar, z)
     point, G_b, G_z = location(moment, sonar.body_R_sonar, sonar.body_p_sonar, z, elevation)
-    x[n : n + LANDMARK] = point
     noise = np.zeros((3, 3))
-    noise[:2, :2] = R
+    place(R, noise, 0, 0)
     noise[2, 2] = sonar.aperture_rad**2 / 12.0
     G_v = product(G_b, moment.T)
     rows = product(G_v, P[:POSE, :n])
@@ -205,6 +204,7 @@ def _augment(x: Floats, P: Floats, n: int, moment: Moment, sonar: SonarModel, z:
         product(rows[:, :POSE], G_v.T) + product(product(G_b, moment.cov), G_b.T) + product(product(G_z, noise), G_z.T)
     )
     for r in range(LANDMARK):
+        x[n + r] = point[r]
         for c in range(n):
             P[n + r, c] = P[c, n + r] = rows[r, c]
         for c in range(LANDMARK):
@@ -243,7 +243,7 @@ def location(
         for k in range(3):
             point[r] += R_t[r, k] * p_b[k]
     G_b = np.empty((3, POSE))
-    G_b[:, :3] = product(R_t, cross(-p_b, np.eye(3)))
-    G_b[:, 3:] = R_t
+    place(product(R_t, skew(-p_b)), G_b, 0, 0)
+    place(R_t, G_b, 0, 3)
     G_z = product(product(R_t, body_R_sonar), sonar_point_jacobian(z[0], z[1], elevation_rad))
     return point, G_b, G_z

@@ -18,12 +18,12 @@ from typing import NamedTuple
 import numpy as np
 
 from baselines.ekf_landmarks import moment_after
-from baselines.ekf_state import POSE, correct, predict
+from baselines.ekf_state import POSE, correct, place, predict
 from baselines.euler import rotation_from_euler
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.alignment import tilt_sigma, up_direction
 from sonar_graph.navigation.kernels import compiled
-from sonar_graph.navigation.odometry import merge_rows, value_at
+from sonar_graph.navigation.odometry import merge_rows, rows_until, value_at
 from sonar_graph.navigation.recursion import integrate_steps
 from sonar_graph.slam.models import wrap_angle
 
@@ -96,20 +96,32 @@ def advance(
     -------
     The provisional motion from the state to ``until_ns``.
     """
-    for k in range(len(depth_ns)):
-        _commit_nodes(columns, model, x, P, n, clock, interval, depth_ns[k])
-        motion = _provisional_motion(columns, model, x, clock[NODE], depth_ns[k])
-        _correct_depth(x, P, n, motion, model.body_p_port, depth_m[k], depth_variance[k])
-    _commit_nodes(columns, model, x, P, n, clock, interval, until_ns)
-    return _provisional_motion(columns, model, x, clock[NODE], until_ns)
+    samples, events = 0, len(depth_ns)
+    while True:
+        event_ns = depth_ns[samples] if samples < events else until_ns
+        node_ns = _next_node(columns, clock[NODE], event_ns)
+        target_ns = event_ns if node_ns < 0 else node_ns
+        dR, dp, cov, impulse = _motion(columns, model, x, clock[NODE], target_ns, node_ns >= 0)
+        if node_ns >= 0:
+            predict(x, P, n, dR, dp, cov)
+            clock[NODE] = node_ns
+            _correct_at_node(columns, model, x, P, n, clock, interval, dR, impulse)
+        elif samples < events:
+            _correct_depth(x, P, n, (dR, dp, cov), model.body_p_port, depth_m[samples], depth_variance[samples])
+            samples += 1
+        else:
+            return dR, dp, cov
 
 
 @compiled
 def open_interval(columns: Columns, dvl_p_imu: Floats, interval: GravityInterval, clock: Ints) -> None:
     """Begin a gravity interval at the node."""
-    interval.i_R_node[:] = np.eye(3)
-    interval.impulse[:] = 0.0
-    interval.velocity[:] = _velocity_at_node(columns, clock[NODE], dvl_p_imu)
+    velocity = _velocity_at_node(columns, clock[NODE], dvl_p_imu)
+    place(np.eye(3), interval.i_R_node, 0, 0)
+    for r in range(3):
+        interval.impulse[r] = 0.0
+    for r in range(4):
+        interval.velocity[r] = velocity[r]
     clock[OPENED] = clock[NODE]
 
 
@@ -117,8 +129,8 @@ def open_interval(columns: Columns, dvl_p_imu: Floats, interval: GravityInterval
 def _velocity_at_node(columns: Columns, node_ns: int, dvl_p_imu: Floats) -> Floats:
     """Velocity of the IMU's point in body axes, m/s, and the variance of one component, shape (4,)."""
     imu_ns, rate, _, dvl_ns, velocity, cov, hold_past = columns
-    k = np.searchsorted(dvl_ns, node_ns)
-    w = value_at(imu_ns, rate, np.searchsorted(imu_ns, node_ns), node_ns, hold_past)
+    k = rows_until(dvl_ns, node_ns - 1)
+    w = value_at(imu_ns, rate, rows_until(imu_ns, node_ns - 1), node_ns, hold_past)
     at_imu = np.empty(4)
     for r in range(3):
         a, b = (r + 1) % 3, (r + 2) % 3
@@ -128,31 +140,17 @@ def _velocity_at_node(columns: Columns, node_ns: int, dvl_p_imu: Floats) -> Floa
 
 
 @compiled
-def _commit_nodes(
-    columns: Columns,
-    model: VehicleModel,
-    x: Floats,
-    P: Floats,
-    n: int,
-    clock: Ints,
-    interval: GravityInterval,
-    until_ns: int,
-) -> None:
-    """Predict over all nodes that are reached at an instant."""
+def _next_node(columns: Columns, node_ns: int, until_ns: int) -> int:
+    """The first node after one instant, when it is reached at another; else -1."""
     imu_ns, dvl_ns = columns[0], columns[3]
-    seen = np.searchsorted(imu_ns, until_ns, side="right")
-    if seen == 0:
-        return
-    covered_ns = min(until_ns, imu_ns[seen - 1])
-    for k in range(np.searchsorted(dvl_ns, clock[NODE], side="right"), len(dvl_ns)):
-        if dvl_ns[k] > covered_ns:
-            return
-        if dvl_ns[k] > clock[NODE]:
-            _to_node(columns, model, x, P, n, clock, interval, dvl_ns[k])
+    k, seen = rows_until(dvl_ns, node_ns), rows_until(imu_ns, until_ns)
+    if k == len(dvl_ns) or seen == 0 or dvl_ns[k] > min(until_ns, imu_ns[seen - 1]):
+        return -1
+    return int(dvl_ns[k])
 
 
 @compiled
-def _to_node(
+def _correct_at_node(
     columns: Columns,
     model: VehicleModel,
     x: Floats,
@@ -160,50 +158,48 @@ def _to_node(
     n: int,
     clock: Ints,
     interval: GravityInterval,
-    node_ns: int,
+    dR: Floats,
+    impulse: Floats,
 ) -> None:
-    """Predict to a node and apply what holds there."""
-    imu_rows = np.searchsorted(columns[0], node_ns) + 1
-    dvl_rows = np.searchsorted(columns[3], node_ns, side="right")
-    dR, dp, cov, impulse = _motion(columns, model, x, clock[NODE], node_ns, imu_rows, dvl_rows)
-    predict(x, P, n, dR, dp, cov)
-    clock[NODE] = node_ns
+    """Apply what holds at a node that was reached by a rotation, with an integral of the specific force."""
     if model.gravity_interval_ns > 0:
         _extend(interval, dR, impulse)
-        if node_ns - clock[OPENED] >= model.gravity_interval_ns:
+        if clock[NODE] - clock[OPENED] >= model.gravity_interval_ns:
             _correct_gravity(columns, model, x, P, n, clock, interval)
             open_interval(columns, model.dvl_p_imu, interval, clock)
     if model.is_planar:
-        _correct_state(x, P, n, 2, model.plane_z_m, model.plane_z_variance)
-        _correct_state(x, P, n, 3, 0.0, model.plane_tilt_variance)
-        _correct_state(x, P, n, 4, 0.0, model.plane_tilt_variance)
-
-
-@compiled
-def _provisional_motion(columns: Columns, model: VehicleModel, x: Floats, node_ns: int, until_ns: int) -> Motion:
-    """From the newest node to an instant, from rows stamped no later."""
-    imu_rows = np.searchsorted(columns[0], until_ns, side="right")
-    dvl_rows = np.searchsorted(columns[3], until_ns, side="right")
-    dR, dp, cov, _ = _motion(columns, model, x, node_ns, until_ns, imu_rows, dvl_rows)
-    return dR, dp, cov
+        values = (model.plane_z_m, 0.0, 0.0)
+        variances = (model.plane_z_variance, model.plane_tilt_variance, model.plane_tilt_variance)
+        for k in range(3):
+            _correct_state(x, P, n, 2 + k, values[k], variances[k])
 
 
 @compiled
 def _motion(
-    columns: Columns, model: VehicleModel, x: Floats, start_ns: int, end_ns: int, imu_rows: int, dvl_rows: int
+    columns: Columns, model: VehicleModel, x: Floats, start_ns: int, end_ns: int, to_node: bool
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Motion between two instants from the first rows of each sensor, and the integral of the specific force."""
+    """Motion between two instants, and the integral of the specific force.
+
+    To a node: final, with the first IMU row at or after it; to any other instant: from rows stamped no later.
+    """
     imu_ns, rate, force, dvl_ns, velocity, cov, hold_past = columns
+    imu_rows = rows_until(imu_ns, end_ns - 1) + 1 if to_node else rows_until(imu_ns, end_ns)
     duration, w, v, psd, f = merge_rows(
-        start_ns, end_ns, imu_ns[:imu_rows], rate, force, dvl_ns[:dvl_rows], velocity, cov, hold_past
+        start_ns,
+        end_ns,
+        imu_ns[:imu_rows],
+        rate,
+        force,
+        dvl_ns[: rows_until(dvl_ns, end_ns)],
+        velocity,
+        cov,
+        hold_past,
     )
-    earth = np.zeros(3)
-    if model.earth_rate.any():
-        R = rotation_from_euler(x[3:POSE])
-        for r in range(3):
-            for k in range(3):
-                earth[r] += R[k, r] * model.earth_rate[k]
-    no_bias = np.zeros(3)
+    no_bias, earth = np.zeros(3), np.zeros(3)
+    R = rotation_from_euler(x[3:POSE])
+    for r in range(3):
+        for k in range(3):
+            earth[r] += R[k, r] * model.earth_rate[k]
     dR, dp, motion_cov, _, impulse = integrate_steps(
         duration, w, v, psd, f, no_bias, earth, model.body_p_dvl, model.gyro_noise_density
     )
@@ -220,7 +216,7 @@ def _extend(interval: GravityInterval, dR: Floats, impulse: Floats) -> None:
             interval.impulse[r] += R[r, k] * impulse[k]
             for c in range(3):
                 turned[r, c] += R[r, k] * dR[k, c]
-    R[:] = turned
+    place(turned, R, 0, 0)
 
 
 @compiled

@@ -49,6 +49,14 @@ def product(A: Floats, B: Floats) -> Floats:
 
 
 @compiled
+def place(A: Floats, out: Floats, row: int, column: int) -> None:
+    """Write a small matrix into a larger one; an assignment of arrays would take seconds to compile."""
+    for r in range(A.shape[0]):
+        for c in range(A.shape[1]):
+            out[row + r, column + c] = A[r, c]
+
+
+@compiled
 def cross(v: Floats, B: Floats) -> Floats:
     """``[v]x B`` for a 3 × 3 matrix."""
     C = np.empty((3, 3))
@@ -86,9 +94,10 @@ def predict(x: Floats, P: Floats, n: int, dR: Floats, dp: Floats, cov: Floats) -
     """
     R = rotation_from_euler(x[3:POSE])
     R_after, position_D_angles, angles_D_angles, E_after = transition(x[3:POSE], dR, dp)
+    angles = euler_from_rotation(R_after)
     for r in range(3):
         x[r] += R[r, 0] * dp[0] + R[r, 1] * dp[1] + R[r, 2] * dp[2]
-    x[3:POSE] = euler_from_rotation(R_after)
+        x[3 + r] = angles[r]
     _transport_rows(P, n, position_D_angles, angles_D_angles)
     _transport_pose_columns(P, position_D_angles, angles_D_angles)
     _add_motion_noise(P, R_after, E_after, cov)
@@ -121,8 +130,8 @@ def _transport_pose_columns(P: Floats, A: Floats, B: Floats) -> None:
 def _add_motion_noise(P: Floats, R_after: Floats, E_after: Floats, cov: Floats) -> None:
     """``P_vv += G cov G^T``, then equal to its transpose to the last bit."""
     G = np.zeros((POSE, POSE))
-    G[:3, 3:] = R_after
-    G[3:, :3] = E_after
+    place(R_after, G, 0, 3)
+    place(E_after, G, 3, 0)
     Q = product(product(G, cov), G.T)
     for r in range(POSE):
         for c in range(r + 1):
@@ -138,9 +147,9 @@ def perturbation_jacobian(angles: Floats, dR: Floats, dp: Floats) -> Floats:
     """
     R, W = rotation_from_euler(angles), rates_from_euler(angles)
     T = np.zeros((POSE, POSE))
-    T[:3, 3:] = product(dR.T, W)
-    T[3:, :3] = product(R, dR).T
-    T[3:, 3:] = product(dR.T, cross(-dp, W))
+    place(product(dR.T, W), T, 0, 3)
+    place(product(R, dR).T, T, 3, 0)
+    place(product(dR.T, cross(-dp, W)), T, 3, 3)
     return T
 
 

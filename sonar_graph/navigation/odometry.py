@@ -174,6 +174,19 @@ def _last(stamps_ns: Ints) -> int:
 
 
 @compiled
+def rows_until(stamps: Ints, instant_ns: int) -> int:
+    """Number of rows stamped at or before an instant; numpy's search takes its side as text, slow to compile."""
+    low, high = 0, len(stamps)
+    while low < high:
+        middle = (low + high) // 2
+        if stamps[middle] <= instant_ns:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@compiled
 def value_at(stamps: Ints, values: Floats, i: int, t: int, hold_past: bool) -> Floats:
     """Value at t, where ``stamps[i - 1] < t <= stamps[i]``; the nearest end's value outside the rows."""
     n = len(stamps)
@@ -211,8 +224,7 @@ def merge_rows(
     hold_past: bool,
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Cut (start, end] at every stamp of either sensor and take each sensor's mean over each piece."""
-    i = int(np.searchsorted(imu_ns, start_ns, side="right"))
-    k = int(np.searchsorted(dvl_ns, start_ns, side="right"))
+    i, k = rows_until(imu_ns, start_ns), rows_until(dvl_ns, start_ns)
     most = len(imu_ns) - i + len(dvl_ns) - k + 1
     duration, rates, velocities = np.empty(most), np.empty((most, 3)), np.empty((most, 3))
     psds, forces = np.empty((most, 3, 3)), np.empty((most, 3))
@@ -225,10 +237,13 @@ def merge_rows(
             until = dvl_ns[k]
         middle = t + (until - t) // 2
         duration[n] = (until - t) * 1e-9
-        rates[n] = value_at(imu_ns, rate, i, middle, hold_past)
-        forces[n] = value_at(imu_ns, force, i, middle, hold_past)
-        velocities[n] = value_at(dvl_ns, velocity, k, middle, hold_past)
-        psds[n] = _velocity_psd(dvl_ns, cov, k, hold_past)
+        psd = _velocity_psd(dvl_ns, cov, k, hold_past)
+        w, f = value_at(imu_ns, rate, i, middle, hold_past), value_at(imu_ns, force, i, middle, hold_past)
+        v = value_at(dvl_ns, velocity, k, middle, hold_past)
+        for row in range(3):
+            rates[n, row], forces[n, row], velocities[n, row] = w[row], f[row], v[row]
+            for column in range(3):
+                psds[n, row, column] = psd[row, column]
         n += 1
         t = until
         if i < len(imu_ns) and imu_ns[i] <= t:

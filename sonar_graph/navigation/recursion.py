@@ -79,7 +79,7 @@ def integrate_steps(
             impulse[r] += (dR[r, 0] * force[k, 0] + dR[r, 1] * force[k, 1] + dR[r, 2] * force[k, 2]) * dt
             dp[r] += dR[r, 0] * step[0] + dR[r, 1] * step[1] + dR[r, 2] * step[2]
         _product(dR, turn, work)
-        dR[:] = work
+        _copy(work, dR)
     cov, D = _in_last_frame(dR, cov_tt, cov_rt, cov_rr, D_t, D_r)
     return dR, dp, cov, D, impulse
 
@@ -111,6 +111,14 @@ def _fill(phi: Floats, angle2: float, a: float, b: float, out: Floats) -> None:
         c, other = (r + 1) % 3, (r + 2) % 3
         out[r, c] -= a * phi[other]
         out[c, r] += a * phi[other]
+
+
+@compiled
+def _copy(A: Floats, out: Floats) -> None:
+    """``out = A``, 3 × 3; an assignment of arrays takes seconds to compile."""
+    for r in range(3):
+        for c in range(3):
+            out[r, c] = A[r, c]
 
 
 @compiled
@@ -169,7 +177,7 @@ def _transport(
     cov_tt: Floats, cov_rt: Floats, cov_rr: Floats, back: Floats, swing: Floats, moved: Floats, work: Floats
 ) -> None:
     """``P <- F P F^T`` with ``F = [[back, 0], [swing, I]]``; ``moved`` and ``work`` are scratch."""
-    moved[:] = cov_rt
+    _copy(cov_rt, moved)
     _add_product(swing, cov_tt, moved)
     _product_transposed(swing, cov_rt, work)
     for r in range(3):
