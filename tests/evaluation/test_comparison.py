@@ -10,7 +10,8 @@ from scipy.stats import chi2
 
 from sonar_graph.errors import EstimatorError, EvaluationError, UnknownEstimatorError
 from sonar_graph.evaluation.comparison import compare
-from sonar_graph.evaluation.scores import detection_scores
+from sonar_graph.evaluation.results import RunResult
+from sonar_graph.evaluation.scores import detection_scores, resource_scores
 from sonar_graph.measurements import Measurements
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, Estimate, Outcome
@@ -179,6 +180,17 @@ def test_a_wrong_name_is_found_before_anything_runs(
     with pytest.raises(UnknownEstimatorError):
         compare(make_sequence(), ["offset", "nobody"], progress=lambda *call: calls.append(call))
     assert calls == []
+
+
+def test_times_by_hand() -> None:
+    run = RunResult("by hand", {}, "ok", update_s=np.array([0.001, 0.002, 0.003, 0.010]), finish_s=0.984)
+    value = {key: score.value for key, score in resource_scores(run, log_s=50.0).items()}
+    assert value["time.update_median_ms"] == pytest.approx(2.5)
+    assert value["time.update_p99_ms"] == pytest.approx(3.0 + 0.97 * 7.0)
+    assert value["time.update_max_ms"] == pytest.approx(10.0)
+    assert value["time.total_s"] == pytest.approx(1.0)
+    assert value["time.real_time_factor"] == pytest.approx(50.0)
+    assert "memory.peak_mb" not in value
 
 
 def test_progress_names_the_estimator(install: Install, make_sequence: Make, offset_estimator: Any) -> None:

@@ -142,7 +142,8 @@ def test_an_interrupted_writing_is_not_taken_for_a_comparison(
 ) -> None:
     write_comparison(comparison, tmp_path)
 
-    def fail(*_: Any) -> None:
+    def fail(path: Path, _: Any) -> None:
+        path.write_text("half a line")
         raise OSError("no space left on device")
 
     monkeypatch.setattr("sonar_graph.evaluation.storage.write_landmarks_csv", fail)
