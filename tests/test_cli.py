@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +64,12 @@ def test_no_argument_shows_the_commands(capsys: pytest.CaptureFixture[str]) -> N
     shown = capsys.readouterr().out
     for path in commands():
         assert path[0] in shown
+
+
+def test_help_does_not_wait_for_heavy_imports() -> None:
+    heavy = "{'gtsam', 'matplotlib', 'numba', 'numpy', 'scipy'}"
+    code = f"import sys, sonar_graph.cli; print(sorted({heavy} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
 def test_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
