@@ -187,28 +187,39 @@ def rows_until(stamps: Ints, instant_ns: int) -> int:
 
 
 @compiled
-def value_at(stamps: Ints, values: Floats, i: int, t: int, hold_past: bool) -> Floats:
-    """Value at t, where ``stamps[i - 1] < t <= stamps[i]``; the nearest end's value outside the rows."""
+def _bracket(stamps: Ints, i: int, t: int, hold_past: bool) -> tuple[int, int, float]:
+    """Rows before and after t and the share of the later, where ``stamps[i - 1] < t <= stamps[i]``.
+
+    Outside the rows the nearest end's value holds.
+    """
     n = len(stamps)
     if i >= n:
-        return values[n - 1]
+        return n - 1, n - 1, 0.0
     if hold_past or i == 0:
-        return values[i]
-    share = (t - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
-    return values[i - 1] + share * (values[i] - values[i - 1])
+        return i, i, 0.0
+    return i - 1, i, (t - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
 
 
 @compiled
-def _velocity_psd(dvl_ns: Ints, cov: Floats, k: int, hold_past: bool) -> Floats:
+def value_at(stamps: Ints, values: Floats, i: int, t: int, hold_past: bool) -> Floats:
+    """Value at t, where ``stamps[i - 1] < t <= stamps[i]``; the nearest end's value outside the rows."""
+    before, after, share = _bracket(stamps, i, t, hold_past)
+    value = np.empty(3)
+    for row in range(3):
+        value[row] = values[before, row] + share * (values[after, row] - values[before, row])
+    return value
+
+
+@compiled
+def _velocity_psd(dvl_ns: Ints, cov: Floats, k: int, hold_past: bool, out: Floats) -> None:
     """Spectral density of the velocity noise between rows k - 1 and k; past the last row, that of the last interval."""
     n = len(dvl_ns)
     last = min(k, n - 1)
-    if last == 0:
-        return cov[0] * 0.0
-    interval_s = (dvl_ns[last] - dvl_ns[last - 1]) * 1e-9
-    if hold_past or k >= n:
-        return cov[last] * interval_s
-    return 0.5 * (cov[last] + cov[last - 1]) * interval_s
+    interval_s = (dvl_ns[last] - dvl_ns[last - 1]) * 1e-9 if last > 0 else 0.0
+    other = last if hold_past or k >= n or last == 0 else last - 1
+    for row in range(3):
+        for column in range(3):
+            out[row, column] = 0.5 * (cov[last, row, column] + cov[other, row, column]) * interval_s
 
 
 @compiled
@@ -237,13 +248,14 @@ def merge_rows(
             until = dvl_ns[k]
         middle = t + (until - t) // 2
         duration[n] = (until - t) * 1e-9
-        psd = _velocity_psd(dvl_ns, cov, k, hold_past)
-        w, f = value_at(imu_ns, rate, i, middle, hold_past), value_at(imu_ns, force, i, middle, hold_past)
-        v = value_at(dvl_ns, velocity, k, middle, hold_past)
+        before, after, share = _bracket(imu_ns, i, middle, hold_past)
         for row in range(3):
-            rates[n, row], forces[n, row], velocities[n, row] = w[row], f[row], v[row]
-            for column in range(3):
-                psds[n, row, column] = psd[row, column]
+            rates[n, row] = rate[before, row] + share * (rate[after, row] - rate[before, row])
+            forces[n, row] = force[before, row] + share * (force[after, row] - force[before, row])
+        before, after, share = _bracket(dvl_ns, k, middle, hold_past)
+        for row in range(3):
+            velocities[n, row] = velocity[before, row] + share * (velocity[after, row] - velocity[before, row])
+        _velocity_psd(dvl_ns, cov, k, hold_past, psds[n])
         n += 1
         t = until
         if i < len(imu_ns) and imu_ns[i] <= t:
