@@ -71,3 +71,8 @@ def test_citation_names_the_version_of_the_package() -> None:
     from sonar_graph import __version__
 
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+
+
+def test_every_page_on_design_is_in_the_index() -> None:
+    index = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+    assert [page.name for page in (ROOT / "docs" / "design").glob("*.md") if f"design/{page.name}" not in index] == []
