@@ -255,14 +255,14 @@ def _frames(detections: LandmarkDetections | None) -> list[LandmarkDetections]:
     if detections is None:
         return []
     for name in ("range_m", "azimuth_rad"):
-        faulty = np.flatnonzero(~np.isfinite(getattr(detections, name)))
-        if faulty.size:
+        finite = np.isfinite(getattr(detections, name))
+        if not finite.all():
             raise MeasurementError(
-                f"LandmarkDetections.{name}: row {faulty[0]} is not finite; leave such rows out of the log"
+                f"LandmarkDetections.{name}: row {finite.argmin()} is not finite; leave such rows out of the log"
             )
-    cuts = np.flatnonzero(np.diff(detections.stamps_ns)) + 1
-    if not cuts.size:
+    if detections.stamps_ns[0] == detections.stamps_ns[-1]:
         return [detections]
+    cuts = np.flatnonzero(np.diff(detections.stamps_ns)) + 1
     edges = [0, *cuts.tolist(), len(detections)]
     return [detections.rows(slice(first, last)) for first, last in pairwise(edges)]
 

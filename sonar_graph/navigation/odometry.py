@@ -19,6 +19,7 @@ spectral density ``velocity_cov * interval``; half of a sample's variance falls 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -69,8 +70,8 @@ class Odometry:
 
     def add(self, imu: Imu | None, dvl: Dvl | None) -> None:
         """Take in rows; those not newer than what is already there are passed over."""
-        newer_imu = imu.between(_last(self._imu_ns), _LATEST) if imu else None
-        newer_dvl = dvl.between(_last(self._dvl_ns), _LATEST) if dvl else None
+        newer_imu = _newer(imu, self._imu_ns) if imu else None
+        newer_dvl = _newer(dvl, self._dvl_ns) if dvl else None
         if newer_imu:
             self._add_imu(newer_imu)
         if newer_dvl:
@@ -169,8 +170,14 @@ class Odometry:
 _EARLIEST, _LATEST = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 
-def _last(stamps_ns: Ints) -> int:
-    return int(stamps_ns[-1]) if len(stamps_ns) else _EARLIEST
+_Rows = TypeVar("_Rows", Imu, Dvl)
+
+
+def _newer(block: _Rows, stamps_ns: Ints) -> _Rows | None:
+    """Rows of the block after those that are there already."""
+    if not len(stamps_ns) or block.stamps_ns[0] > stamps_ns[-1]:
+        return block
+    return block.between(int(stamps_ns[-1]), _LATEST)
 
 
 @compiled
