@@ -1,0 +1,93 @@
+"""Rows of sensors along made-up motions, and derivatives by differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.navigation.odometry import Steps
+
+NS = 1_000_000_000
+T0_NS = 1_700_000_000 * NS
+
+
+def stamps(rate_hz: float, seconds: float, offset_s: float = 0.0) -> Ints:
+    n = round(seconds * rate_hz) + 1
+    return T0_NS + np.round((np.arange(n) / rate_hz + offset_s) * NS).astype(np.int64)
+
+
+def imu(stamps_ns: Ints, rate: ArrayLike, force: ArrayLike = (0.0, 0.0, 9.80665)) -> Imu:
+    shape = (len(stamps_ns), 3)
+    return Imu(stamps_ns, np.broadcast_to(rate, shape), np.broadcast_to(force, shape))
+
+
+def dvl(stamps_ns: Ints, velocity: ArrayLike, cov: ArrayLike = np.nan) -> Dvl:
+    n = len(stamps_ns)
+    return Dvl(stamps_ns, np.broadcast_to(velocity, (n, 3)), np.broadcast_to(cov, (n, 3, 3)))
+
+
+def waves(stamps_ns: Ints, seed: int, amplitude: float) -> Floats:
+    """Three smooth components, periods of 1 s to 5 s, shape (n, 3)."""
+    rng = np.random.default_rng(seed)
+    t = (stamps_ns - T0_NS)[:, None] * 1e-9
+    phase, period = rng.uniform(0, 2 * np.pi, (2, 3)), rng.uniform(1, 5, (2, 3))
+    return amplitude * np.sin(2 * np.pi * t / period[0] + phase[0]) * np.cos(2 * np.pi * t / period[1] + phase[1])
+
+
+def random_steps(seed: int, n: int = 60, rate_rad_s: float = 0.8) -> Steps:
+    """Brisk motion with a different full covariance at every step."""
+    rng = np.random.default_rng(seed)
+    root = 0.01 * rng.standard_normal((n, 3, 3))
+    return Steps(
+        duration_s=rng.uniform(0.004, 0.012, n),
+        rate=rate_rad_s * rng.standard_normal((n, 3)),
+        velocity=np.array([0.5, 0.0, 0.0]) + 0.3 * rng.standard_normal((n, 3)),
+        velocity_psd=root @ np.swapaxes(root, 1, 2),
+        specific_force=np.array([0.0, 0.0, 9.8]) + rng.standard_normal((n, 3)),
+    )
+
+
+def part(steps: Steps, first: int, last: int) -> Steps:
+    columns = (steps.duration_s, steps.rate, steps.velocity, steps.velocity_psd, steps.specific_force)
+    return Steps(*(column[first:last] for column in columns))
+
+
+def dead_reckoned(steps: Steps, bias: Floats, lever: Floats) -> list[gtsam.Pose3]:
+    """Poses after every step: a constant twist for each, by GTSAM's exponential."""
+    poses = [gtsam.Pose3()]
+    for dt, w, v in zip(steps.duration_s, steps.rate - bias, steps.velocity, strict=True):
+        poses.append(poses[-1].compose(gtsam.Pose3.Expmap(dt * np.concatenate([w, v - np.cross(w, lever)]))))
+    return poses
+
+
+def derivative(function: Callable[[Floats], ArrayLike], size: int, step: float = 1e-6) -> Floats:
+    """Central differences of a function at zero, one column an argument."""
+    columns = [
+        (np.asarray(function(step * axis)) - np.asarray(function(-step * axis))) / (2 * step) for axis in np.eye(size)
+    ]
+    return np.column_stack(columns)
+
+
+def dense_covariance(steps: Steps, bias: Floats, lever: Floats, gyro_density: float) -> tuple[Floats, Floats]:
+    """Covariance (6, 6) and bias derivative (6, 3) at the end, step by step with differentiated exponentials."""
+    P, D = np.zeros((6, 6)), np.zeros((6, 3))
+    poses = dead_reckoned(steps, bias, lever)
+    for k, (before, after) in enumerate(pairwise(poses)):
+        dt, w, v, motion = steps.duration_s[k], steps.rate[k] - bias, steps.velocity[k], before.between(after)
+
+        def off(error: Floats, dt=dt, w=w, v=v, motion=motion) -> Floats:
+            wrong = w + error[:3]
+            twist = np.concatenate([wrong, v + error[3:] - np.cross(wrong, lever)])
+            return gtsam.Pose3.Logmap(motion.inverse().compose(gtsam.Pose3.Expmap(dt * twist)))
+
+        G = derivative(off, 6)
+        Q = np.zeros((6, 6))
+        Q[:3, :3], Q[3:, 3:] = np.eye(3) * gyro_density**2 / dt, steps.velocity_psd[k] / dt
+        F = motion.inverse().AdjointMap()
+        P, D = F @ P @ F.T + G @ Q @ G.T, F @ D - G[:, :3]
+    return P, D

@@ -1,0 +1,105 @@
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from sonar_graph.calibration import ImuCalibration
+from sonar_graph.measurements import Floats
+from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
+from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
+from sonar_graph.navigation.odometry import Steps
+
+G = 9.81
+GRAVITY = np.array([0.0, 0.0, G])
+IMU = ImuCalibration(accel_noise_density=2e-3, accel_bias_sigma=5e-3)
+T, N = 1.0, 2000
+TILT = Rotation.from_euler("xyz", [0.2, -0.3, 1.1])
+BODY_RATE = np.array([0.15, -0.1, 0.3])
+
+
+def world_velocity(t: float) -> Floats:
+    return np.array([0.4 * np.sin(2 * t), 0.3 * t**2, 0.1 * np.cos(3 * t)])
+
+
+def world_acceleration(t: float) -> Floats:
+    return np.array([0.8 * np.cos(2 * t), 0.6 * t, -0.3 * np.sin(3 * t)])
+
+
+def attitude(t: float) -> Rotation:
+    return TILT * Rotation.from_rotvec(BODY_RATE * t)
+
+
+def accelerated() -> tuple[PreintegratedMotion, Floats, Floats]:
+    """A turning, swaying vehicle's motion over T, with its velocities in the body at both ends."""
+    middles = (np.arange(N) + 0.5) * T / N
+    force = [attitude(t).inv().apply(world_acceleration(t) + GRAVITY) for t in middles]
+    velocity = [attitude(t).inv().apply(world_velocity(t)) for t in middles]
+    steps = Steps(
+        np.full(N, T / N), np.tile(BODY_RATE, (N, 1)), np.array(velocity), np.zeros((N, 3, 3)), np.array(force)
+    )
+    motion = Preintegrator(0.0, np.zeros(3)).integrate(steps, np.zeros(3))
+    return motion, attitude(0).inv().apply(world_velocity(0)), attitude(T).inv().apply(world_velocity(T))
+
+
+def test_up_is_found_in_a_moving_vehicle():
+    """And would be off by degrees, were the vehicle's own acceleration left in."""
+    motion, v_i, v_j = accelerated()
+    truth = attitude(T).inv().apply([0, 0, 1.0])
+    up, _ = gravity_direction(motion, v_i, v_j, 0.01, IMU, G)
+    assert np.linalg.norm(up) == pytest.approx(1)
+    assert np.arccos(up @ truth) < 1e-4
+    naive, _ = gravity_direction(motion, np.zeros(3), np.zeros(3), 0.01, IMU, G)
+    assert np.arccos(naive @ truth) > np.radians(1)
+
+
+def test_stated_sigma_is_that_of_many_noisy_intervals():
+    """Two-sided, about both horizontal axes, with noise in force, bias and both velocities."""
+    motion, v_i, v_j = accelerated()
+    truth, runs, rng, velocity_sigma = attitude(T).inv(), 1500, np.random.default_rng(1), 0.004
+    level = truth.apply(np.eye(3)[:2])
+    squares = []
+    for _ in range(runs):
+        force = motion.mean_specific_force + IMU.accel_noise_density / np.sqrt(T) * rng.standard_normal(3)
+        noisy = PreintegratedMotion(
+            motion.i_T_j, motion.covariance, motion.D_bias, motion.bias, T,
+            force + IMU.accel_bias_sigma * rng.standard_normal(3),
+        )  # fmt: skip
+        scatter = velocity_sigma * rng.standard_normal((2, 3))
+        up, sigma = gravity_direction(noisy, v_i + scatter[0], v_j + scatter[1], velocity_sigma, IMU, G)
+        squares.append(np.sum((level @ up / sigma) ** 2))
+    low, high = chi2.ppf([0.0005, 0.9995], 2 * runs) / runs
+    assert low < np.mean(squares) < high
+
+
+@given(st.floats(0.2, 5.0), st.floats(0.0, 0.05))
+@settings(max_examples=30)
+def test_each_source_of_tilt_noise_falls_with_time_as_it_should(duration_s, velocity_sigma):
+    """White force as 1 / sqrt(T), velocities as 1 / T, the bias not at all."""
+    motion = PreintegratedMotion(
+        gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), duration_s, np.array([0, 0, G])
+    )
+    _, sigma = gravity_direction(motion, np.zeros(3), np.zeros(3), velocity_sigma, IMU, G)
+    parts = [2e-3 / np.sqrt(duration_s), np.sqrt(2) * velocity_sigma / duration_s, 5e-3]
+    assert sigma == pytest.approx(np.linalg.norm(parts) / G)
+
+
+def test_without_forces_there_is_no_direction():
+    motion = PreintegratedMotion(gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), 1.0, np.full(3, np.nan))
+    assert gravity_direction(motion, np.zeros(3), np.zeros(3), 0.01, IMU, G) is None
+
+
+def test_velocity_at_the_imu_is_that_of_a_point_of_a_rigid_body():
+    """Differences of the two points' positions on a turning body."""
+    body_p_dvl, body_p_imu, v_dvl, w = (
+        np.array([-0.2, 0.1, -0.1]),
+        np.array([0.3, 0.0, 0.2]),
+        np.array([0.5, 0.1, 0]),
+        BODY_RATE,
+    )
+    twist_at_dvl = np.concatenate([w, v_dvl])
+    moved = gtsam.Pose3.Expmap(1e-6 * twist_at_dvl).transformFrom(body_p_imu - body_p_dvl)
+    expected = (moved - (body_p_imu - body_p_dvl)) / 1e-6
+    assert velocity_at_imu(v_dvl, w, body_p_dvl, body_p_imu) == pytest.approx(expected, abs=1e-5)
