@@ -51,7 +51,7 @@ FORWARD_NOISE_M_SQRT_S = 0.02
 """Wheel slip along the heading: sigma of the distance over T is this times sqrt(T)."""
 SIDEWAYS_NOISE_M_SQRT_S = 0.005
 """The same across the heading."""
-GYRO_NOISE_DENSITY = 0.05
+GYRO_NOISE_DENSITY = 0.04
 GYRO_BIAS_SIGMA_RAD_S = 0.003
 GYRO_BIAS_WALK_DENSITY = 1e-5
 RANGE_SIGMA_M = 0.18
