@@ -69,7 +69,7 @@ class Odometry:
         self._cov: Floats = np.empty((0, 3, 3))
 
     def add(self, imu: Imu | None, dvl: Dvl | None) -> None:
-        """Take in rows; those not newer than what is already there are passed over."""
+        """Take in rows; those not newer than what is already there, or stamped as the row before, are passed over."""
         newer_imu = _newer(imu, self._imu_ns) if imu else None
         newer_dvl = _newer(dvl, self._dvl_ns) if dvl else None
         if newer_imu:
@@ -174,10 +174,22 @@ _Rows = TypeVar("_Rows", Imu, Dvl)
 
 
 def _newer(block: _Rows, stamps_ns: Ints) -> _Rows | None:
-    """Rows of the block after those that are there already."""
-    if not len(stamps_ns) or block.stamps_ns[0] > stamps_ns[-1]:
-        return block
-    return block.between(int(stamps_ns[-1]), _LATEST)
+    """Rows of the block after those that are there already; of equal stamps the first."""
+    after_ns = _last(stamps_ns)
+    newer = block if block.stamps_ns[0] > after_ns else block.between(after_ns, _LATEST)
+    if newer is None or not _has_repeats(newer.stamps_ns):
+        return newer
+    return newer.rows(np.unique(newer.stamps_ns, return_index=True)[1])
+
+
+def _last(stamps_ns: Ints) -> int:
+    return int(stamps_ns[-1]) if len(stamps_ns) else _EARLIEST
+
+
+@compiled
+def _has_repeats(stamps: Ints) -> bool:
+    """Whether two rows share a stamp: nothing can be interpolated between them."""
+    return bool(np.any(stamps[1:] == stamps[:-1]))
 
 
 @compiled

@@ -246,3 +246,19 @@ def test_velocity_noise_does_not_depend_on_where_the_imu_cuts():
     at, cov = stamps(5, 2.0), 1e-4 * np.eye(3)
     coarse, fine = (odometry_of(imu(t, 0.0), dvl(at, 0.0, cov)) for t in (at, stamps(97, 3.0, -0.01)))
     assert displacement_variance(fine, at.tolist()) == pytest.approx(displacement_variance(coarse, at.tolist()))
+
+
+@pytest.mark.parametrize("sensor", ["imu", "dvl"])
+def test_a_repeated_stamp_counts_once(sensor):
+    """Drivers do repeat rows; the first of equal stamps holds."""
+    imu_rows, dvl_rows = recorded()
+    rows = {"imu": imu_rows, "dvl": dvl_rows}
+    rows[sensor] = rows[sensor].rows(
+        np.repeat(np.arange(len(rows[sensor])), np.where(np.arange(len(rows[sensor])) == 8, 2, 1))
+    )
+    repeated = odometry_of(rows["imu"], rows["dvl"])
+    plain = odometry_of(imu_rows, dvl_rows)
+    nodes = plain.nodes(0, T0_NS + 10 * NS)
+    assert np.array_equal(repeated.nodes(0, T0_NS + 10 * NS), nodes)
+    first, last = int(nodes[0]), int(nodes[-1])
+    assert same_steps(repeated.steps_between_nodes(first, last), plain.steps_between_nodes(first, last))
