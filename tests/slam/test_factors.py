@@ -1,0 +1,324 @@
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import B, L, X
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.calibration import Calibration, PlanarMotion, Start
+from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
+from sonar_graph.slam import factors
+from sonar_graph.slam.models import range_azimuth
+
+from .graphs import assert_jacobians, graph_of, information
+
+BODY_T_SONAR = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.5, -0.2), np.array([0.4, 0.05, -0.1]))
+BODY_POSES = {
+    "random": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.4, -0.6, 2.2), np.array([3.0, -2.0, 1.0])),
+    "near identity": gtsam.Pose3(gtsam.Rot3.RzRyRx(1e-9, -1e-9, 1e-9), np.array([1e-9, 0.0, 0.0])),
+    "yaw near pi": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.05, 0.02, np.pi - 1e-8), np.array([-1.0, 5.0, 0.3])),
+    "yaw beyond -pi": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.0, -np.pi + 1e-8), np.array([-1.0, 5.0, 0.3])),
+}
+poses = pytest.mark.parametrize("pose", BODY_POSES.values(), ids=BODY_POSES)
+
+
+def plain(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
+    return noise
+
+
+def values_of(**named) -> gtsam.Values:
+    """Values by name: X0, L3, B1."""
+    symbols = {"X": X, "L": L, "B": B}
+    values = gtsam.Values()
+    for name, value in named.items():
+        values.insert(symbols[name[0]](int(name[1:])), value)
+    return values
+
+
+def full_covariance(n: int, sigma: float, seed: int = 0) -> np.ndarray:
+    root = np.random.default_rng(seed).standard_normal((n, n))
+    return sigma**2 * (root @ root.T + np.eye(n))
+
+
+def some_motion(seed: int = 0, turn_rad: float = 0.3) -> PreintegratedMotion:
+    rng = np.random.default_rng(seed)
+    i_T_j = gtsam.Pose3.Expmap(np.concatenate([turn_rad * rng.standard_normal(3), rng.standard_normal(3)]))
+    D_bias = rng.standard_normal((6, 3))
+    return PreintegratedMotion(
+        i_T_j, full_covariance(6, 0.05, seed), D_bias, 0.01 * rng.standard_normal(3), 1.0, np.zeros(3)
+    )
+
+
+def small_pose(rng: np.random.Generator, sigma: float) -> gtsam.Pose3:
+    return gtsam.Pose3.Expmap(sigma * rng.standard_normal(6))
+
+
+# Odometry ---------------------------------------------------------------------------------------------------------
+
+
+@poses
+@pytest.mark.parametrize("off", [0.0, 1e-7, 0.4], ids=["at the mean", "next to it", "far from it"])
+def test_derivatives_of_odometry_with_bias_are_those_of_differences(pose, off):
+    rng = np.random.default_rng(4)
+    motion = some_motion(1)
+    bias = motion.bias + off * rng.standard_normal(3)
+    X_j = pose.compose(motion.corrected(bias)).compose(small_pose(rng, off))
+    factor = factors.odometry_with_bias(X(0), X(1), B(0), motion)
+    assert_jacobians(factor, values_of(X0=pose, X1=X_j, B0=bias))
+
+
+def test_derivatives_of_odometry_hold_where_a_turn_goes_through_pi():
+    motion = PreintegratedMotion(
+        gtsam.Pose3(gtsam.Rot3.Rz(np.pi - 1e-7), np.array([1.0, 0, 0])), full_covariance(6, 0.05),
+        some_motion().D_bias, np.zeros(3), 1.0, np.zeros(3),
+    )  # fmt: skip
+    X_j = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.01, 0.02, -np.pi + 0.05), np.array([1.1, 0, 0]))
+    factor = factors.odometry_with_bias(X(0), X(1), B(0), motion)
+    values = values_of(X0=gtsam.Pose3(), X1=X_j, B0=np.array([0.01, 0.0, -0.01]))
+    assert np.abs(factor.unwhitenedError(values)).max() < 0.2
+    assert_jacobians(factor, values)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0, 1.0))
+@settings(max_examples=25)
+def test_derivatives_of_odometry_hold_everywhere(seed, spread):
+    rng = np.random.default_rng(seed)
+    motion, pose = some_motion(seed), small_pose(rng, 2.0)
+    bias = spread * 0.1 * rng.standard_normal(3)
+    X_j = pose.compose(motion.corrected(bias)).compose(small_pose(rng, 0.3 * spread))
+    assert_jacobians(factors.odometry_with_bias(X(0), X(1), B(0), motion), values_of(X0=pose, X1=X_j, B0=bias))
+
+
+def test_odometry_error_is_what_the_pose_is_off_the_corrected_motion():
+    """Zero where the second pose is the first moved by the corrected motion; else the perturbation from there."""
+    motion, pose, bias = some_motion(2), BODY_POSES["random"], np.array([0.02, 0.0, -0.03])
+    perturbation = np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.3])
+    X_j = pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(motion.D_bias @ (bias - motion.bias)))
+    factor = factors.odometry_with_bias(X(0), X(1), B(0), motion)
+    assert np.allclose(factor.unwhitenedError(values_of(X0=pose, X1=X_j, B0=bias)), 0, atol=1e-12)
+    off = X_j.compose(gtsam.Pose3.Expmap(perturbation))
+    assert np.allclose(factor.unwhitenedError(values_of(X0=pose, X1=off, B0=bias)), perturbation)
+    assert not np.allclose(factor.unwhitenedError(values_of(X0=pose, X1=X_j, B0=motion.bias)), 0, atol=1e-3)
+
+
+def test_odometry_with_the_bias_it_was_integrated_with_is_gtsams_between_factor():
+    motion, pose = some_motion(3), BODY_POSES["random"]
+    X_j = pose.compose(motion.i_T_j).compose(small_pose(np.random.default_rng(0), 0.1))
+    with_bias = factors.odometry_with_bias(X(0), X(1), B(0), motion)
+    without = factors.odometry(X(0), X(1), motion)
+    values = values_of(X0=pose, X1=X_j, B0=motion.bias)
+    assert np.allclose(with_bias.unwhitenedError(values), without.unwhitenedError(values))
+    assert with_bias.error(values) == pytest.approx(without.error(values))
+    error = without.unwhitenedError(values)
+    assert without.error(values) == pytest.approx(0.5 * error @ np.linalg.solve(motion.covariance, error))
+
+
+def test_bias_prior_and_walk_weigh_by_their_sigmas():
+    values = values_of(B0=np.array([1e-3, 0, 0]), B1=np.array([1e-3, 3e-3, 0]))
+    assert factors.bias_prior(B(0), 5e-4).error(values) == pytest.approx(0.5 * 2**2)
+    assert factors.bias_walk(B(0), B(1), 1e-3).error(values) == pytest.approx(0.5 * 3**2)
+
+
+# Sightings --------------------------------------------------------------------------------------------------------
+
+
+def seen_from(pose: gtsam.Pose3, azimuth_rad: float, elevation_rad: float, range_m: float) -> np.ndarray:
+    """The point at these spherical coordinates of the mounted sonar, by scipy."""
+    beam = Rotation.from_euler("ZY", [azimuth_rad, -elevation_rad]).apply([range_m, 0, 0])
+    return pose.transformFrom(BODY_T_SONAR.transformFrom(beam))
+
+
+@poses
+@given(azimuth=st.floats(-1.13, 1.13), elevation=st.floats(-0.12, 0.12), range_m=st.floats(0.5, 15))
+@settings(max_examples=15)
+def test_a_sighting_is_range_and_azimuth_whatever_the_elevation(pose, azimuth, elevation, range_m):
+    """Errors in sigmas are (predicted - measured) / sigma; azimuth's as a tangent, off by 1e-4 within a degree."""
+    sigma, off = np.array([0.02, 0.009]), np.array([0.03, np.radians(1.0)])
+    z = np.array([range_m, azimuth]) - off
+    values = values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, range_m))
+    camera, distance = factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, np.diag(sigma**2), plain)
+    across, up = camera.whitenedError(values)
+    assert across == pytest.approx(off[1] / sigma[1], rel=1.1e-4)
+    assert distance.whitenedError(values) == pytest.approx(off[:1] / sigma[0], rel=1e-6)
+    assert abs(up) < 1e-3
+    predicted = range_azimuth(pose.compose(BODY_T_SONAR), values.atPoint3(L(0)))
+    assert predicted == pytest.approx([range_m, azimuth], abs=1e-6)
+
+
+@poses
+@given(azimuth=st.floats(-1.13, 1.13), elevation=st.floats(-0.12, 0.12))
+@settings(max_examples=10)
+def test_derivatives_of_sightings_are_those_of_differences(pose, azimuth, elevation):
+    z, cov = np.array([2.0, azimuth + 0.02]), np.array([[4e-4, 0], [0, 8e-5]])
+    values = values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, 2.1))
+    for factor in factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain, 0.07):
+        assert_jacobians(factor, values)
+    cov[0, 1] = cov[1, 0] = 1e-4
+    for factor in factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain, 0.07):
+        assert_jacobians(factor, values)
+
+
+@given(azimuth=st.floats(-1.13, 1.13), elevation=st.floats(-0.12, 0.12))
+@settings(max_examples=20)
+def test_elevation_is_the_vertical_image_coordinate(azimuth, elevation):
+    pose, sigma = BODY_POSES["random"], 0.07
+    values = values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, 2.0))
+    camera = factors.landmark_sighting(
+        X(0), L(0), BODY_T_SONAR, np.array([2.0, azimuth]), np.diag([4e-4, 8e-5]), plain, sigma
+    )[0]
+    assert camera.whitenedError(values)[1] == pytest.approx(np.tan(elevation) / np.tan(sigma), abs=1e-9)
+
+
+@given(st.floats(-1.13, 1.13), st.floats(-0.12, 0.12), st.floats(-0.9, 0.9))
+@settings(max_examples=20)
+def test_a_correlated_sighting_is_the_model_weighed_by_its_covariance(azimuth, elevation, correlation):
+    pose, sigma, off = BODY_POSES["random"], np.array([0.02, 0.009]), np.array([0.03, -0.01])
+    cov = np.outer(sigma, sigma) * [[1, correlation], [correlation, 1]]
+    z = np.array([2.0, azimuth]) - off
+    values = values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, 2.0))
+    sighting = factors.correlated_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain)
+    assert np.allclose(sighting.unwhitenedError(values), off, atol=1e-9)
+    assert sighting.error(values) == pytest.approx(0.5 * off @ np.linalg.solve(cov, off), rel=1e-6)
+
+
+def test_a_correlated_sighting_wraps_its_azimuth():
+    """A sonar that looks back sees the landmark on either side of pi."""
+    values = values_of(X0=gtsam.Pose3(), L0=np.array([-2.0, -0.01, 0.0]))
+    sighting = factors.correlated_sighting(X(0), L(0), gtsam.Pose3(), np.array([2.0, np.pi - 0.01]), np.eye(2), plain)
+    assert sighting.unwhitenedError(values)[1] == pytest.approx(0.015, abs=1e-6)
+
+
+@pytest.mark.parametrize("elevation_sigma_rad", [None, 0.07])
+def test_correlation_changes_how_it_is_said_but_not_what(elevation_sigma_rad):
+    """With a correlation next to nothing both forms carry the same information."""
+    pose, sigma = BODY_POSES["random"], np.array([0.02, 0.009])
+    values = values_of(X0=pose, L0=seen_from(pose, 0.2, 0.05, 2.0))
+    said = []
+    for correlation in (0.0, 2e-6):
+        cov = np.outer(sigma, sigma) * [[1, correlation], [correlation, 1]]
+        sighting = factors.landmark_sighting(
+            X(0), L(0), BODY_T_SONAR, np.array([2.0, 0.2]), cov, plain, elevation_sigma_rad
+        )
+        said.append(information(sighting, values, [X(0), L(0)]))
+    assert np.allclose(said[0], said[1], rtol=1e-4, atol=1e-4 * np.abs(said[0]).max())
+
+
+def test_without_an_elevation_a_sighting_says_next_to_nothing_about_it():
+    """Information along the unmeasured direction is under a millionth of that across it; with a sigma, it is said."""
+    pose = BODY_POSES["random"]
+    point = seen_from(pose, 0.2, 0.05, 2.0)
+    upwards = seen_from(pose, 0.2, 0.05 + 1e-6, 2.0) - point
+    upwards /= np.linalg.norm(upwards)
+    values, z, cov = values_of(X0=pose, L0=point), np.array([2.0, 0.2]), np.diag([0.02**2, 0.009**2])
+    silent, told = (
+        information(factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain, s), values, [L(0), X(0)])[:3, :3]
+        for s in (None, 0.07)
+    )
+    assert upwards @ silent @ upwards < 1e-6
+    assert upwards @ told @ upwards == pytest.approx(1 / (2.0 * 0.07) ** 2, rel=0.02)
+    assert np.sort(np.linalg.eigvalsh(silent))[1:] == pytest.approx([1 / 0.02**2, 1 / (0.009 * 2) ** 2], rel=0.02)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.5])
+def test_the_robust_kernel_weighs_every_part_of_a_sighting(correlation):
+    def huber(noise):
+        return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(2.0), noise)
+
+    sigma = np.array([0.02, 0.009])
+    cov = np.outer(sigma, sigma) * [[1, correlation], [correlation, 1]]
+    values = values_of(X0=gtsam.Pose3(), L0=np.array([3.0, 0.3, 0.0]))
+    z = np.array([2.0, 0.0])
+    robust, quadratic = (
+        graph_of(factors.landmark_sighting(X(0), L(0), gtsam.Pose3(), z, cov, kernel)).error(values)
+        for kernel in (huber, plain)
+    )
+    assert robust < 0.2 * quadratic
+
+
+# Depth, gravity, floor, plane, start ------------------------------------------------------------------------------
+
+
+@poses
+def test_depth_is_the_height_of_the_port_and_nothing_else(pose):
+    port, sigma = np.array([0.3, -0.2, 0.1]), 0.02
+    height = float(Rotation.from_matrix(pose.rotation().matrix()).apply(port)[2] + pose.translation()[2])
+    factor = factors.depth(X(0), height - 0.05, port, sigma)
+    values = values_of(X0=pose)
+    assert factor.whitenedError(values)[2] == pytest.approx(0.05 / sigma)
+    assert np.abs(factor.whitenedError(values)[:2]).max() < 1e-3
+    assert_jacobians(factor, values)
+    eigenvalues = np.linalg.eigvalsh(information([factor], values, [X(0)]))
+    assert eigenvalues[-1] > 1 / sigma**2 > 1e9 * eigenvalues[-2]
+
+
+def test_depth_sees_the_tilt_through_the_lever_arm():
+    """Nose down by 0.1 rad: a port 0.5 m ahead sinks by 5 cm."""
+    nose_down = values_of(X0=gtsam.Pose3(gtsam.Rot3.Pitch(0.1), np.zeros(3)))
+    factor = factors.depth(X(0), 0.0, np.array([0.5, 0, 0]), 0.01)
+    assert factor.unwhitenedError(nose_down)[2] == pytest.approx(-0.5 * np.sin(0.1))
+
+
+@poses
+@given(roll=st.floats(-0.3, 0.3), pitch=st.floats(-0.3, 0.3))
+@settings(max_examples=10)
+def test_gravity_direction_weighs_the_tilt_and_leaves_the_yaw(pose, roll, pitch):
+    sigma = 0.01
+    up_in_body = pose.rotation().matrix().T @ [0, 0, 1.0]
+    truth = factors.gravity_direction(X(0), 9.8 * up_in_body, sigma)
+    assert np.allclose(truth.unwhitenedError(values_of(X0=pose)), 0, atol=1e-12)
+    yawed = gtsam.Pose3(gtsam.Rot3.Rz(1.3).compose(pose.rotation()), pose.translation())
+    assert np.allclose(truth.unwhitenedError(values_of(X0=yawed)), 0, atol=1e-12)
+    tilted = values_of(X0=pose.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, 0), np.zeros(3))))
+    angle = np.arccos(np.clip(tilted.atPose3(X(0)).rotation().matrix().T[:, 2] @ up_in_body, -1, 1))
+    assert np.linalg.norm(truth.whitenedError(tilted)) == pytest.approx(np.sin(angle) / sigma, abs=1e-5)
+    assert_jacobians(truth, tilted)
+
+
+def test_gravity_direction_says_sigma_about_each_horizontal_axis():
+    values, sigma = values_of(X0=BODY_POSES["random"]), 0.01
+    up = BODY_POSES["random"].rotation().matrix().T @ [0, 0, 1.0]
+    said = information([factors.gravity_direction(X(0), up, sigma)], values, [X(0)])
+    assert np.linalg.eigvalsh(said)[-2:] == pytest.approx([1e4, 1e4])
+    assert np.abs(said @ np.concatenate([up, np.zeros(3)])).max() < 1e-6
+
+
+def test_the_plane_holds_height_roll_and_pitch_and_leaves_the_rest():
+    plane = PlanarMotion(z_m=0.4, z_sigma_m=0.01, tilt_sigma_rad=0.02)
+    pose = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([5.0, -3.0, 0.4]))
+    said = information(factors.planar(X(0), plane), values_of(X0=pose), [X(0)])
+    assert np.diag(said) == pytest.approx([2500, 2500, 0, 0, 0, 1e4], abs=1e-6)
+    graph = graph_of(factors.planar(X(0), plane))
+    assert graph.error(values_of(X0=pose)) < 1e-6
+    off = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([5.0, -3.0, 0.43]))
+    assert graph.error(values_of(X0=off)) == pytest.approx(4.5, rel=1e-6)
+    for factor in factors.planar(X(0), plane):
+        assert_jacobians(factor, values_of(X0=BODY_POSES["random"]))
+
+
+def test_the_floor_holds_the_height_of_a_landmark_alone():
+    factor = factors.floor_prior(L(0), -1.7, 0.01)
+    values = values_of(L0=np.array([40.0, -30.0, -1.68]))
+    assert factor.error(values) == pytest.approx(0.5 * 2**2, rel=1e-5)
+    assert np.diag(information([factor], values, [L(0)])) == pytest.approx([0, 0, 1e4], abs=1e-8)
+
+
+def test_start_sigmas_of_position_are_along_the_worlds_axes():
+    """Many starts, drawn with the position in the world and the rotation about the body's axes."""
+    sigmas, turns = np.array([0.5, 0.02, 0.1]), np.array([0.01, 0.02, 0.03])
+    start = Start(
+        position_m=(1, 2, 3), rpy_rad=(0.3, -0.2, 1.2), position_sigma_m=tuple(sigmas), rpy_sigma_rad=tuple(turns)
+    )
+    factor, pose = factors.start_prior(X(0), Calibration(start=start)), start.pose()
+    rng, n = np.random.default_rng(0), 2000
+    squares = []
+    for position, rotation in zip(
+        sigmas * rng.standard_normal((n, 3)), turns * rng.standard_normal((n, 3)), strict=True
+    ):
+        drawn = gtsam.Pose3(pose.rotation().compose(gtsam.Rot3.Expmap(rotation)), pose.translation() + position)
+        squares.append(2 * factor.error(values_of(X0=drawn)))
+    assert 5.7 < np.mean(squares) < 6.3
+    assert (
+        np.linalg.norm(np.diag(np.linalg.inv(information([factor], values_of(X0=pose), [X(0)]))[:3, :3]) - turns**2)
+        < 1e-9
+    )
