@@ -1,0 +1,163 @@
+"""Are EKF-SLAM and iSAM2 as sure as they are right? NEES over independent runs of the nominal basin without bias.
+
+Each seed is a basin of its own: route, sensor noise, start, landmark heights. The normalised squared error (NEES) of
+position (3 numbers) and heading is averaged over the seeds at each instant (ANEES, per degree of freedom: 1 is
+consistent). Instants of one run are correlated, seeds are not, so three things are said:
+
+* the ANEES at the last instant, with its two-sided 95 % band for this many runs;
+* the ANEES over all instants, with a 95 % interval from the spread of the runs' own averages, which should hold 1;
+* the share of instants whose ANEES is inside the band; 95 % on average, with much scatter as instants are correlated.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from common import in_parallel, make_parser, print_figures, print_table, refuse
+
+from sonar_graph.evaluation.comparison import compare
+from sonar_graph.evaluation.consistency import anees_interval, anees_over_runs
+from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+
+ESTIMATORS = {"ekf": "ekf-slam", "isam2": "isam2"}
+QUANTITIES = {"position": 3, "yaw": 1}
+RATE_HZ = 1.0
+SETTLING_S = 10.0
+"""Before it errors are the start's, known to be drawn from the prior."""
+Nees = dict[tuple[str, str], np.ndarray]
+"""By estimator and quantity, over the instants."""
+
+
+@dataclass(frozen=True)
+class Basin:
+    """What is varied from the nominal run."""
+
+    duration_s: float
+    laps: int
+
+
+def run_seed(basin: Basin, seed: int) -> tuple[np.ndarray, Nees]:
+    """Seconds since the start (n,), and NEES (n,) by estimator and quantity."""
+    options = BasinOptions(
+        seed=seed, gyro_bias_scale=0, accel_bias_scale=0, duration_s=basin.duration_s, laps=basin.laps
+    )
+    sequence = simulate_basin(options)
+    comparison = compare(sequence, list(ESTIMATORS.values()), rate_hz=RATE_HZ)
+    for run in comparison.runs:
+        if run.status == "failed":
+            raise RuntimeError(f"seed {seed}: {run.estimator}: {run.reason}")
+    errors = {short: comparison.errors[name]["causal"] for short, name in ESTIMATORS.items()}
+    nees = {}
+    for short, series in errors.items():
+        nees[short, "position"], nees[short, "yaw"] = series.nees_position, series.nees_yaw
+    return (errors["ekf"].stamps_ns - sequence.start_ns) * 1e-9, nees
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is said about one quantity of one estimator."""
+
+    final: float
+    band: tuple[float, float]
+    average: float
+    average_interval: tuple[float, float]
+    share_inside: float
+
+    @property
+    def final_inside(self) -> bool:
+        return self.band[0] <= self.final <= self.band[1]
+
+    @property
+    def average_fits(self) -> bool:
+        return self.average_interval[0] <= 1 <= self.average_interval[1]
+
+
+def judge(nees: np.ndarray, dof: int) -> Verdict:
+    """From the NEES of all runs, shape (runs, n)."""
+    runs = len(nees)
+    band = anees_interval(runs, dof)
+    anees = anees_over_runs(nees, dof)
+    own = nees.mean(axis=1) / dof
+    half = 1.96 * float(own.std(ddof=1)) / np.sqrt(runs)
+    mean = float(own.mean())
+    inside = float(np.mean((anees >= band[0]) & (anees <= band[1])))
+    return Verdict(float(anees[-1]), band, mean, (mean - half, mean + half), inside)
+
+
+def draw(seconds: np.ndarray, nees: Nees, path: Path) -> None:
+    """ANEES over time with the band, one panel a quantity."""
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    for axes, (quantity, dof) in zip(figure.subplots(2, sharex=True), QUANTITIES.items(), strict=True):
+        runs = len(nees["ekf", quantity])
+        axes.axhspan(*anees_interval(runs, dof), color="0.9", label="95 % band")
+        for short, name in ESTIMATORS.items():
+            axes.plot(seconds, anees_over_runs(nees[short, quantity], dof), lw=1, label=name)
+        axes.set_ylabel(f"ANEES of {quantity} / {dof}")
+        axes.legend(loc="upper left", ncols=3)
+    axes.set_xlabel("time (s)")
+    figure.suptitle(f"{runs} runs of the basin without bias")
+    figure.savefig(path, dpi=120)
+
+
+def report(verdicts: dict[tuple[str, str], Verdict]) -> dict[str, Any]:
+    """Print the table; the figures by name."""
+    rows = []
+    figures: dict[str, Any] = {}
+    for (short, quantity), verdict in verdicts.items():
+        low, high = verdict.band
+        a, b = verdict.average_interval
+        rows.append(
+            (
+                f"{ESTIMATORS[short]} {quantity}",
+                verdict.final,
+                f"{low:.3f}..{high:.3f}",
+                "inside" if verdict.final_inside else "OUTSIDE",
+                verdict.average,
+                f"{a:.3f}..{b:.3f}",
+                "holds 1" if verdict.average_fits else "DOES NOT",
+                f"{verdict.share_inside:.0%}",
+            )
+        )
+        figures[f"{short}_{quantity}_anees"] = verdict.final
+        figures[f"{short}_{quantity}_anees_over_time"] = verdict.average
+        figures[f"{short}_{quantity}_anees_over_time_interval"] = verdict.average_interval
+        figures[f"share_inside_{short}_{quantity}"] = verdict.share_inside
+        figures[f"band_{quantity}"] = verdict.band
+    headers = ("ANEES / dof", "last instant", "band", "", "over time", "95 % interval", "", "instants in band")
+    print_table(headers, rows)
+    figures["passed"] = all(v.final_inside and v.average_fits for v in verdicts.values())
+    return figures
+
+
+def main() -> None:
+    parser = make_parser(__doc__, workers=True)
+    parser.add_argument("--seeds", type=int, help="number of runs (default: 50; with --quick 4)")
+    parser.add_argument("--first-seed", type=int, default=0, help="runs use this seed and those after it")
+    parser.add_argument("--out", type=Path, help="write a figure (PNG) here")
+    arguments = parser.parse_args()
+    basin = Basin(240.0, 1) if arguments.quick else Basin(2039.0, 3)
+    count = arguments.seeds or (4 if arguments.quick else 50)
+    if count < 2:
+        refuse("--seeds: a spread needs at least 2 runs")
+    seeds = range(arguments.first_seed, arguments.first_seed + count)
+    runs = in_parallel(partial(run_seed, basin), seeds, arguments.workers, "seed")
+    seconds = runs[0][0]
+    kept = seconds > SETTLING_S
+    nees = {key: np.array([run[1][key][kept] for run in runs]) for key in runs[0][1]}
+    verdicts = {key: judge(values, QUANTITIES[key[1]]) for key, values in nees.items()}
+    figures = report(verdicts)
+    if arguments.out:
+        draw(seconds[kept], nees, arguments.out)
+    print_figures({"runs": count, "duration_s": basin.duration_s, **figures})
+
+
+if __name__ == "__main__":
+    main()
