@@ -1,0 +1,184 @@
+import math
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from baselines.ekf_landmarks import GATED, NEW, USED, SonarModel, location, moment_after, observation, observe_frame
+from sonar_graph.slam.association import gate_threshold
+from sonar_graph.slam.models import locate, range_azimuth
+
+STEP = 1e-6
+MOUNTING = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.5, -0.2), np.array([0.4, 0.1, -0.2]))
+NOISE = np.diag([0.02**2, 0.01**2])
+MOTION_SIGMA = 1e-3
+attitudes = st.builds(
+    lambda *angles: np.array(angles), st.floats(-3.1, 3.1), st.floats(-1.3, 1.3), st.floats(-3.1, 3.1)
+)
+views = st.tuples(st.floats(1.0, 10.0), st.floats(-math.pi, math.pi), st.floats(-0.8, 0.8))
+
+
+def sonar(**changes):
+    model = SonarModel(
+        body_R_sonar=MOUNTING.rotation().matrix().copy(order="C"),
+        body_p_sonar=MOUNTING.translation(),
+        gate=gate_threshold(0.999, 2),
+        aperture_rad=0.244,
+        has_floor=False,
+        floor_z_m=0.0,
+        floor_variance_m2=1e-4,
+    )
+    return model._replace(**changes)
+
+
+def motion():
+    dR = gtsam.Rot3.Expmap(np.array([0.02, -0.01, 0.05])).matrix().copy(order="C")
+    return dR, np.array([0.1, 0.02, -0.01]), MOTION_SIGMA**2 * np.eye(6)
+
+
+def body(x):
+    """The body at the instant of the frame, by gtsam."""
+    dR, dp, _ = motion()
+    return gtsam.Pose3(gtsam.Rot3.RzRyRx(x[3:6]), x[:3]).compose(gtsam.Pose3(gtsam.Rot3(dR), dp))
+
+
+def state(angles, *landmarks, room=3):
+    n = 6 + 3 * len(landmarks)
+    x, P = np.zeros(n + 3 * room), np.zeros((n + 3 * room, n + 3 * room))
+    x[:3], x[3:6] = (1.0, -2.0, 3.0), angles
+    if landmarks:
+        x[6:n] = np.concatenate(landmarks)
+    A = 0.02 * np.random.default_rng(3).normal(size=(n, n))
+    P[:n, :n] = A @ A.T
+    return x, P, n
+
+
+def frame(x, P, n, slots, z, model=None, R=NOISE):
+    return observe_frame(x, P, n, *motion(), model or sonar(), np.array(slots), np.array(z), np.array([R] * len(slots)))
+
+
+def difference(ahead, behind):
+    change = (ahead - behind) / (2 * STEP)
+    if len(change) == 2:
+        change[1] = math.remainder(ahead[1] - behind[1], 2 * math.pi) / (2 * STEP)
+    return change
+
+
+@given(attitudes, views)
+def test_jacobians_of_the_observation_are_the_numerical_ones(angles, view):
+    x, _, _ = state(angles)
+    p = locate(body(x).compose(MOUNTING), *view)
+    moment = moment_after(x, *motion())
+    z, H_b, H_p = observation(moment, p, sonar().body_R_sonar, sonar().body_p_sonar)
+
+    def seen(pose_state, point):
+        return range_azimuth(body(pose_state).compose(MOUNTING), point)
+
+    assert_allclose(difference(z, seen(x, p)), 0.0, atol=1e-3)  # over 2e-6: 1e-9
+    by_pose = [difference(seen(x[:6] + STEP * u, p), seen(x[:6] - STEP * u, p)) for u in np.eye(6)]
+    by_point = [difference(seen(x, p + STEP * u), seen(x, p - STEP * u)) for u in np.eye(3)]
+    assert_allclose(H_b @ moment.T, np.array(by_pose).T, atol=1e-5, rtol=1e-5)
+    assert_allclose(H_p, np.array(by_point).T, atol=1e-5, rtol=1e-5)
+
+
+@given(attitudes, views)
+def test_jacobians_of_the_augmentation_are_the_numerical_ones(angles, view):
+    x, _, _ = state(angles)
+    moment = moment_after(x, *motion())
+    point, G_b, G_z = location(moment, sonar().body_R_sonar, sonar().body_p_sonar, np.array(view[:2]), view[2])
+
+    def located(pose_state, values):
+        return locate(body(pose_state).compose(MOUNTING), *values)
+
+    values = np.array(view)
+    assert_allclose(point, located(x, values), atol=1e-12)
+    by_pose = [difference(located(x[:6] + STEP * u, values), located(x[:6] - STEP * u, values)) for u in np.eye(6)]
+    by_view = [difference(located(x, values + STEP * u), located(x, values - STEP * u)) for u in np.eye(3)]
+    assert_allclose(G_b @ moment.T, np.array(by_pose).T, atol=1e-5, rtol=1e-5)
+    assert_allclose(G_z, np.array(by_view).T, atol=1e-5, rtol=1e-5)
+
+
+def test_a_new_landmark_has_the_covariance_of_many_draws():
+    rng = np.random.default_rng(5)
+    x, P, n = state(np.array([0.1, 0.2, 0.3]))
+    P *= 0.01
+    before, root = x[:6].copy(), np.linalg.cholesky(P[:6, :6])
+    aperture = 0.05
+    n_after, outcomes, _, _ = frame(x, P, n, [0], [[2.0, 0.3]], sonar(aperture_rad=aperture))
+    assert (n_after, outcomes.tolist()) == (9, [NEW])
+    draws = np.empty((20_000, 9))
+    for row in draws:
+        row[:6] = before + root @ rng.normal(size=6)
+        theta, rho = MOTION_SIGMA * rng.normal(size=(2, 3))
+        pose = body(row[:6]).compose(gtsam.Pose3(gtsam.Rot3.Expmap(theta), rho)).compose(MOUNTING)
+        z = rng.multivariate_normal([2.0, 0.3], NOISE)
+        row[6:] = locate(pose, *z, rng.uniform(-0.5, 0.5) * aperture)
+    spread, sigma = np.cov(draws.T), np.std(draws, axis=0)
+    assert_allclose(x[6:9], draws[:, 6:].mean(axis=0), atol=2e-3)
+    assert_allclose(P[:9, :9] / np.outer(sigma, sigma), spread / np.outer(sigma, sigma), atol=0.05)
+
+
+def test_a_known_floor_fixes_the_height_of_a_new_landmark():
+    angles = np.zeros(3)
+    x, P, n = state(angles)
+    true = locate(body(x).compose(MOUNTING), 2.0, 0.3, 0.05)
+    frame(x, P, n, [0], [[2.0, 0.3]], sonar(has_floor=True, floor_z_m=true[2], floor_variance_m2=1e-6))
+    assert_allclose(x[6:9], true, atol=1e-3)
+    assert P[8, 8] == pytest.approx(1e-6, rel=0.01)
+
+
+def test_without_a_floor_a_new_landmark_is_in_the_middle_of_the_aperture():
+    x, P, n = state(np.zeros(3))
+    middle = locate(body(x).compose(MOUNTING), 2.0, 0.3, 0.0)
+    frame(x, P, n, [0], [[2.0, 0.3]])
+    assert_allclose(x[6:9], middle, atol=1e-12)
+
+
+def test_a_gated_detection_leaves_the_state_untouched():
+    x, P, n = state(np.zeros(3))
+    p = locate(body(x).compose(MOUNTING), 2.0, 0.3, 0.05)
+    x, P, n = state(np.zeros(3), p)
+    before = x.copy(), P.copy()
+    n_after, outcomes, innovations, covs = frame(x, P, n, [0], [[3.0, 0.3]])
+    assert (n_after, outcomes.tolist()) == (n, [GATED])
+    assert innovations[0, 0] == pytest.approx(1.0)
+    assert np.linalg.eigvalsh(covs[0]).min() > 0
+    assert_array_equal(x, before[0])
+    assert_array_equal(P, before[1])
+
+
+def test_the_innovation_of_azimuth_wraps_around():
+    x, P, n = state(np.zeros(3))
+    behind = locate(body(x).compose(MOUNTING), 2.0, math.pi - 0.004, 0.0)
+    x, P, n = state(np.zeros(3), behind)
+    _, outcomes, innovations, _ = frame(x, P, n, [0], [[2.0, -math.pi + 0.004]])
+    assert outcomes.tolist() == [USED]
+    assert innovations[0, 1] == pytest.approx(0.008)
+
+
+def test_a_correction_is_the_textbook_s():
+    x, P, n = state(np.array([0.1, -0.2, 0.5]))
+    p = locate(body(x).compose(MOUNTING), 2.0, 0.3, 0.05)
+    x, P, n = state(np.array([0.1, -0.2, 0.5]), p)
+    moment = moment_after(x, *motion())
+    z, H_b, H_p = observation(moment, p, sonar().body_R_sonar, sonar().body_p_sonar)
+    H = np.hstack([H_b @ moment.T, H_p])
+    S = H @ P[:n, :n] @ H.T + NOISE + H_b @ moment.cov @ H_b.T
+    K = P[:n, :n] @ H.T @ np.linalg.inv(S)
+    e = np.array([0.01, -0.005])
+    expected = x[:n] + K @ e, (np.eye(n) - K @ H) @ P[:n, :n]
+    _, _, innovations, covs = frame(x, P, n, [0], [z + e])
+    assert_allclose(innovations[0], e, atol=1e-12)
+    assert_allclose(covs[0], S, rtol=1e-9)
+    assert_allclose(x[:n], expected[0], atol=1e-12)
+    assert_allclose(P[:n, :n], expected[1], atol=1e-12)
+
+
+def test_the_rows_of_a_frame_are_taken_in_their_order():
+    x, P, n = state(np.zeros(3))
+    n, outcomes, _, _ = frame(x, P, n, [0, 0, 1], [[2.0, 0.3], [2.001, 0.301], [2.5, -0.3]])
+    assert n == 12
+    assert outcomes.tolist() == [NEW, USED, NEW]

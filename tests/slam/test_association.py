@@ -1,0 +1,54 @@
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+from scipy.stats import chi2
+
+from sonar_graph.measurements import LandmarkDetections
+from sonar_graph.slam.association import DetectionJournal, gate_threshold, identify
+from sonar_graph.states import Outcome
+
+
+def detections(ids, probabilities):
+    n = len(ids)
+    return LandmarkDetections(
+        np.arange(n), np.ones(n), np.zeros(n), np.full((n, 2, 2), np.nan), np.array(ids), np.array(probabilities)
+    )
+
+
+def test_the_most_probable_identity_is_accepted_from_the_threshold_on():
+    found = identify(detections([[3, 7], [3, 7], [3, 7]], [[0.2, 0.8], [0.5, 0.1], [0.49, 0.48]]), 0.5)
+    assert_array_equal(found.ids, [7, 3, 3])
+    assert found.refusals == [None, None, Outcome.NO_IDENTITY]
+
+
+def test_no_identity_and_no_number_are_refused_however_low_the_threshold():
+    found = identify(detections([[-1, 2], [4, -1]], [[0.9, 0.1], [np.nan, 0.0]]), 0.0)
+    assert found.refusals == [Outcome.NO_IDENTITY, Outcome.NO_IDENTITY]
+
+
+@pytest.mark.parametrize("dof", [1, 2, 3])
+def test_a_gate_lets_its_share_pass(dof):
+    assert chi2.cdf(gate_threshold(0.95, dof), dof) == pytest.approx(0.95)
+    assert gate_threshold(1.0, dof) == np.inf
+
+
+def test_a_journal_keeps_every_row_in_order():
+    journal = DetectionJournal()
+    assert len(journal.log()) == 0
+    assert journal.log().innovation_covs.shape == (0, 2, 2)
+    journal.record(5, 2, Outcome.NEW)
+    journal.record(9, 3, Outcome.USED, np.array([0.1, 0.2]), np.eye(2))
+    log = journal.log()
+    assert_array_equal(log.stamps_ns, [5, 9])
+    assert_array_equal(log.landmark_ids, [2, 3])
+    assert log.outcomes == [Outcome.NEW, Outcome.USED]
+    assert_array_equal(log.innovations, [[np.nan, np.nan], [0.1, 0.2]])
+    assert_array_equal(log.innovation_covs[1], np.eye(2))
+
+
+def test_a_log_is_a_copy():
+    journal = DetectionJournal()
+    journal.record(5, 2, Outcome.NEW)
+    before = journal.log()
+    journal.record(6, 2, Outcome.USED, np.zeros(2), np.eye(2))
+    assert len(before) == 1
