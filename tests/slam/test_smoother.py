@@ -1,0 +1,244 @@
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import B, L, X
+
+import sonar_graph.slam.smoother as smoother_module
+from sonar_graph.measurements import Floats
+from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
+from sonar_graph.slam import factors
+from sonar_graph.slam.batch import solve
+from sonar_graph.slam.smoother import FIRST_RESTART, Smoother
+
+from .graphs import graph_of, information
+from .rail import RANGE_SIGMA_M, STEP_S, VELOCITY_SIGMA_M_S, calibration, rail
+
+FOREVER_S = 1e9
+NEVER_M = 1e9
+SONAR = gtsam.Pose3(gtsam.Rot3.Ry(0.4), np.array([0.3, 0.0, -0.1]))
+
+
+def plain(noise):
+    return noise
+
+
+class Fed:
+    """A smoother, and on the side every factor that it was given."""
+
+    def __init__(self, lag_s: float, stale_shift_m: float = NEVER_M) -> None:
+        self.smoother = Smoother(lag_s, 1e-6, stale_shift_m)
+        self.given: list[gtsam.NonlinearFactor] = []
+
+    def add(self, new: list[gtsam.NonlinearFactor]) -> None:
+        self.given += new
+        self.smoother.add(new)
+
+
+def on_the_rail(nodes: int, lag_s: float, stale_shift_m: float = NEVER_M) -> Fed:
+    _, numbers = rail(nodes)
+    fed, seen = Fed(lag_s, stale_shift_m), set()
+    fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
+    fed.add([factors.start_prior(X(0), calibration())])
+    cov = np.diag([1e-12] * 3 + [(VELOCITY_SIGMA_M_S * STEP_S) ** 2] * 3)
+    for k in range(1, nodes):
+        moved = gtsam.Pose3(gtsam.Rot3(), np.array([numbers.displacements_m[k - 1], 0, 0]))
+        pose = fed.smoother.values.atPose3(X(k - 1)).compose(moved)
+        fed.smoother.add_pose(X(k), pose, k * STEP_S)
+        motion = PreintegratedMotion(moved, cov, np.zeros((6, 3)), np.zeros(3), STEP_S, np.zeros(3))
+        fed.add([factors.odometry(X(k - 1), X(k), motion)])
+        for _, i, distance in (r for r in numbers.ranges if r[0] == k):
+            if i not in seen:
+                fed.smoother.add_lasting(L(i), pose.translation() + distance * np.eye(3)[0])
+            z, R = np.array([distance, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e6])
+            fed.add(factors.landmark_sighting(X(k), L(i), gtsam.Pose3(), z, R, plain, None if i in seen else 3e-4))
+            seen.add(i)
+        fed.smoother.update(k * STEP_S)
+    return fed
+
+
+def in_the_basin(steps: int, lag_s: float, stale_shift_m: float = NEVER_M, seed: int = 0) -> Fed:
+    """Circles past three landmarks with a gyro bias; nothing about it is linear."""
+    rng = np.random.default_rng(seed)
+    turn = gtsam.Pose3(gtsam.Rot3.Rz(0.25), np.array([0.5, 0.0, 0.0]))
+    landmarks = {3: np.array([3.0, 1.0, -1.0]), 5: np.array([2.0, 4.0, -0.8]), 8: np.array([-1.0, 2.5, -1.2])}
+    cov = np.diag([1e-4] * 3 + [4e-4] * 3)
+    fed, truth, seen = Fed(lag_s, stale_shift_m), gtsam.Pose3(), set()
+    fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
+    fed.smoother.add_lasting(B(0), np.zeros(3))
+    prior = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01] * 3 + [0.02] * 3))
+    fed.add([gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), prior), factors.bias_prior(B(0), 0.01)])
+    for k in range(1, steps):
+        truth = truth.compose(turn)
+        moved = turn.compose(gtsam.Pose3.Expmap(np.sqrt(np.diag(cov)) * rng.standard_normal(6)))
+        D_bias = np.vstack([-np.eye(3), np.zeros((3, 3))])
+        motion = PreintegratedMotion(moved, cov, D_bias, np.zeros(3), 1.0, np.zeros(3))
+        fed.smoother.add_pose(X(k), fed.smoother.values.atPose3(X(k - 1)).compose(moved), float(k))
+        fed.add([factors.odometry_with_bias(X(k - 1), X(k), B(0), motion)])
+        for i, p in landmarks.items():
+            q = truth.compose(SONAR).transformTo(p)
+            z = np.array([np.linalg.norm(q), np.arctan2(q[1], q[0])]) + [0.02, 0.009] * rng.standard_normal(2)
+            if i not in seen:
+                fed.smoother.add_lasting(L(i), p + 0.3 * rng.standard_normal(3))
+            new = factors.landmark_sighting(
+                X(k), L(i), SONAR, z, np.diag([4e-4, 8e-5]), plain, None if i in seen else 0.3
+            )
+            fed.add(new)
+            seen.add(i)
+        fed.smoother.update(float(k))
+    return fed
+
+
+def dense_covariance(fed: Fed, values: gtsam.Values, keys: list[int]) -> Floats:
+    """Block of the inverse of the information of all factors that were given, by numpy."""
+    every = sorted({key for factor in fed.given for key in list(factor.keys())})
+    sizes = [len(values.zeroVectors().at(key)) for key in every]
+    ends = dict(zip(every, np.cumsum(sizes).tolist(), strict=True))
+    wanted = np.concatenate([np.arange(ends[k] - sizes[every.index(k)], ends[k]) for k in keys])
+    return np.linalg.inv(information(fed.given, values, every))[np.ix_(wanted, wanted)]
+
+
+def settled(fed: Fed, time_s: float) -> Fed:
+    """Updated until nothing is relinearised any more."""
+    for _ in range(8):
+        fed.smoother.update(time_s)
+    return fed
+
+
+def joint(fed: Fed, keys: list[int]) -> Floats:
+    found = fed.smoother.joint_covariance(keys)
+    return np.block([[found.at(a, b) for b in keys] for a in keys])
+
+
+@pytest.mark.parametrize("lag_s", [FOREVER_S, 2.6, 0.6], ids=["all", "five poses", "one pose"])
+def test_on_the_rail_the_window_is_least_squares(lag_s):
+    """Marginalising is exact where nothing is linearised: mean and covariance of pose and landmarks to 1e-8."""
+    nodes = 21
+    fed, (_, numbers) = on_the_rail(nodes, lag_s), rail(nodes)
+    mean, variance = numbers.solution(nodes)
+    newest = fed.smoother.values.atPose3(X(nodes - 1)).translation()[0]
+    assert newest == pytest.approx(mean[f"x{nodes - 1}"], abs=1e-8)
+    assert joint(fed, [X(nodes - 1)])[3, 3] == pytest.approx(variance[f"x{nodes - 1}"], abs=1e-8)
+    for i in (4, 7):
+        assert fed.smoother.values.atPoint3(L(i))[0] == pytest.approx(mean[f"l{i}"], abs=1e-8)
+        assert fed.smoother.covariance(L(i))[0, 0] == pytest.approx(variance[f"l{i}"], abs=1e-8)
+
+
+def test_on_the_rail_the_history_is_least_squares_for_every_pose():
+    nodes = 21
+    fed, (_, numbers) = on_the_rail(nodes, 2.6), rail(nodes)
+    mean, variance = numbers.solution(nodes)
+    values, marginals = fed.smoother.solve_history()
+    for k in range(nodes):
+        assert values.atPose3(X(k)).translation()[0] == pytest.approx(mean[f"x{k}"], abs=1e-8)
+        assert marginals.marginalCovariance(X(k))[3, 3] == pytest.approx(variance[f"x{k}"], abs=1e-8)
+
+
+def test_every_factor_is_counted_once_in_the_window():
+    """With nothing marginalised the window's covariance is the inverse of the sum of all information given."""
+    fed = settled(in_the_basin(15, FOREVER_S), 14.0)
+    keys = [X(14), L(3), L(8), B(0)]
+    assert fed.smoother.graph.size() == len(fed.given)
+    expected = dense_covariance(fed, fed.smoother.values, keys)
+    assert np.allclose(joint(fed, keys), expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max())
+
+
+def test_every_factor_is_counted_once_in_the_history():
+    fed = in_the_basin(15, 4.0)
+    values, marginals = fed.smoother.solve_history()
+    for key in (X(2), X(14), L(5), B(0)):
+        expected = dense_covariance(fed, values, [key])
+        assert np.allclose(marginals.marginalCovariance(key), expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+    assert fed.smoother.graph.error(values) == pytest.approx(graph_of(fed.given).error(values))
+
+
+def test_the_history_is_solved_anew_when_it_has_grown():
+    fed = in_the_basin(8, FOREVER_S)
+    before, _ = fed.smoother.solve_history()
+    fed.add([gtsam.PriorFactorPoint3(L(3), np.array([3.5, 1.0, -1.0]), gtsam.noiseModel.Isotropic.Sigma(3, 1e-3))])
+    fed.smoother.update(7.0)
+    after, _ = fed.smoother.solve_history()
+    assert after.atPoint3(L(3)) == pytest.approx([3.5, 1.0, -1.0], abs=0.02)
+    assert not np.allclose(before.atPoint3(L(3)), after.atPoint3(L(3)), atol=0.1)
+
+
+def test_the_window_stays_near_the_batch_solution_when_poses_leave_it():
+    """A fraction of a standard deviation, over eighty poses of which ten are kept."""
+    fed = in_the_basin(80, 10.0)
+    batch = solve(graph_of(fed.given), fed.smoother.values)
+    cov = dense_covariance(fed, batch, [X(79)])
+    off = gtsam.Pose3.Logmap(batch.atPose3(X(79)).between(fed.smoother.values.atPose3(X(79))))
+    assert off @ np.linalg.solve(cov, off) < 0.3
+    assert np.allclose(np.diag(joint(fed, [X(79)])), np.diag(cov), rtol=0.1)
+
+
+def counted_solves(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Sizes of the graphs that the smoother solves from now on."""
+    sizes: list[int] = []
+
+    def counting(graph, values):
+        sizes.append(graph.size())
+        return solve(graph, values)
+
+    monkeypatch.setattr(smoother_module, "solve", counting)
+    return sizes
+
+
+@pytest.mark.parametrize("lag_s", [FOREVER_S, 6.0])
+def test_a_restart_leaves_what_the_batch_gives(monkeypatch, lag_s):
+    """Just after a restart newest pose, landmarks and bias, and their joint covariance, are those of all factors."""
+    sizes = counted_solves(monkeypatch)
+    size = next(n for n in range(5, 40) if len(in_the_basin(n, lag_s).given) >= FIRST_RESTART)
+    assert not sizes
+    fed = in_the_basin(size, lag_s, stale_shift_m=1e-9)
+    assert sizes == [len(fed.given)]
+    keys = [X(size - 1), L(3), L(5), L(8), B(0)]
+    batch = solve(graph_of(fed.given), fed.smoother.values)
+    for key in keys[1:]:
+        assert np.allclose(fed.smoother.values.atPoint3(key), batch.atPoint3(key), atol=1e-4)
+    assert fed.smoother.values.atPose3(keys[0]).equals(batch.atPose3(keys[0]), 1e-4)
+    expected = dense_covariance(fed, batch, keys)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.abs((joint(fed, keys) - expected) / scale).max() < 1e-3
+
+
+def test_on_the_rail_restarts_change_nothing(monkeypatch):
+    nodes = 61
+    sizes = counted_solves(monkeypatch)
+    fed, (_, numbers) = on_the_rail(nodes, 3.1, stale_shift_m=1e-9), rail(nodes)
+    assert len(sizes) >= 3
+    mean, variance = numbers.solution(nodes)
+    assert fed.smoother.values.atPose3(X(nodes - 1)).translation()[0] == pytest.approx(mean[f"x{nodes - 1}"], abs=1e-7)
+    assert joint(fed, [X(nodes - 1)])[3, 3] == pytest.approx(variance[f"x{nodes - 1}"], rel=1e-6)
+    assert fed.smoother.covariance(L(7))[0, 0] == pytest.approx(variance["l7"], rel=1e-6)
+
+
+def test_restarts_grow_apart_with_the_graph(monkeypatch):
+    sizes = counted_solves(monkeypatch)
+    in_the_basin(60, 6.0, stale_shift_m=1e-9)
+    assert len(sizes) > 2
+    assert all(later >= 1.2 * earlier for earlier, later in pairwise(sizes))
+
+
+def test_an_update_without_news_changes_nothing():
+    fed = settled(in_the_basin(20, 6.0), 19.0)
+    keys = [X(19), L(3), B(0)]
+    before, cov = gtsam.Values(fed.smoother.values), joint(fed, keys)
+    assert not fed.smoother.has_news
+    fed.smoother.update(19.0)
+    fed.smoother.update(19.0)
+    assert fed.smoother.values.equals(before, 1e-6)
+    assert np.allclose(joint(fed, keys), cov, rtol=1e-4)
+
+
+def test_news_are_waited_for():
+    fed = in_the_basin(5, 6.0)
+    pull = gtsam.PriorFactorPoint3(L(3), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.01))
+    before = fed.smoother.values.atPoint3(L(3))
+    fed.add([pull])
+    assert fed.smoother.has_news
+    assert np.array_equal(fed.smoother.values.atPoint3(L(3)), before)
+    fed.smoother.update(4.0)
+    assert not fed.smoother.has_news
+    assert np.linalg.norm(fed.smoother.values.atPoint3(L(3)) - before) > 0.5
