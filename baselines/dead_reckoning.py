@@ -7,6 +7,7 @@ from typing import ClassVar
 import gtsam
 import numpy as np
 
+from baselines.causal import CausalEstimates
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.measurements import Floats, LandmarkDetections, Measurements
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
@@ -54,7 +55,7 @@ class DeadReckoning:
         self._pose = calibration.start.pose()
         self._P = _start_covariance(calibration)
         self._node_ns: int | None = None
-        self._estimates: list[Estimate] = []
+        self._estimates = CausalEstimates()
         self._journal = DetectionJournal()
 
     def process(self, measurements: Measurements) -> Estimate | None:
@@ -69,12 +70,12 @@ class DeadReckoning:
             return None
         node_ns = self._advance(node_ns, measurements.end_ns)
         estimate = self._estimate(node_ns, measurements.end_ns)
-        self._estimates.append(estimate)
+        self._estimates.keep(estimate)
         return estimate
 
     def trajectory(self) -> Trajectory:
         """The causal estimates: dead reckoning does not look back."""
-        return Trajectory.from_estimates(self._estimates)
+        return self._estimates.trajectory()
 
     def landmarks(self) -> LandmarkMap:
         """None."""

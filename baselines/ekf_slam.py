@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 from pydantic import Field
 
+from baselines.causal import CausalEstimates
 from baselines.ekf_landmarks import GATED, NEW, USED, SonarModel, observe_frame, pose_after
 from baselines.ekf_prediction import NODE, GravityInterval, Motion, VehicleModel, advance, open_interval
 from baselines.ekf_state import LANDMARK, POSE
@@ -81,7 +82,7 @@ class EkfSlam:
         self._sonar = _sonar_model(calibration, self._params)
         self._odometry = Odometry(calibration)
         self._journal = DetectionJournal()
-        self._estimates: list[Estimate] = []
+        self._estimates = CausalEstimates()
         self._slots: dict[int, int] = {}
         self._x, self._P = _start_state(calibration.start)
         self._n = POSE
@@ -112,12 +113,12 @@ class EkfSlam:
         motion, _ = self._advance(depth, measurements.end_ns)
         self._odometry.forget_before(int(self._clock[NODE]))
         estimate = self._estimate(measurements.end_ns, motion)
-        self._estimates.append(estimate)
+        self._estimates.keep(estimate)
         return estimate
 
     def trajectory(self) -> Trajectory:
         """The causal estimates: a filter does not look back."""
-        return Trajectory.from_estimates(self._estimates)
+        return self._estimates.trajectory()
 
     def landmarks(self) -> LandmarkMap:
         """Landmarks in the state, with their blocks of (5)."""
