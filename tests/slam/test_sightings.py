@@ -1,0 +1,276 @@
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import L, X
+from scipy.stats import chi2
+
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    FloorPrior,
+    ImuCalibration,
+    Mounting,
+    SonarCalibration,
+    Start,
+)
+from sonar_graph.measurements import Dvl, Floats, Imu, LandmarkDetections
+from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
+from sonar_graph.slam.sightings import SightingPolicy, Sightings
+from sonar_graph.slam.smoother import Smoother
+from sonar_graph.states import Outcome
+
+NS = 1_000_000_000
+T0_NS = 1_500_000_000 * NS
+TRUSTING = SightingPolicy(identity_probability=0.7, gate_probability=0.99, kernel="none", kernel_width=2.0)
+SONAR = SonarCalibration(
+    mounting=Mounting(translation_m=(0.3, 0.1, -0.1), rpy_rad=(0.0, 0.4, 0.2)),
+    range_sigma_m=0.02,
+    azimuth_sigma_rad=0.01,
+)
+FLOOR = FloorPrior(z_m=-1.0, sigma_m=0.01)
+CALIBRATION = Calibration(
+    imu=ImuCalibration(gyro_bias_sigma=0.0),
+    sonar=SONAR,
+    start=Start(position_sigma_m=(0.05, 0.02, 0.01), rpy_sigma_rad=(0.01, 0.01, 0.03)),
+    use_gravity=False,
+)
+
+
+class Dive:
+    """Everything up to the sightings, driving straight on at 0.5 m/s for 10 s."""
+
+    def __init__(self, calibration: Calibration = CALIBRATION, policy: SightingPolicy = TRUSTING) -> None:
+        self.smoother = Smoother(1e9, 1e-6, 1e9)
+        self.keyframes = Keyframes(calibration, KeyframePolicy(1.0, 5.0, 60.0), self.smoother)
+        self.sightings = Sightings(calibration, policy, self.smoother, self.keyframes)
+        stamps = T0_NS + np.arange(0, 101) * NS // 10
+        n = len(stamps)
+        velocity = np.tile([0.5, 0.0, 0.0], (n, 1))
+        self.keyframes.add(
+            Imu(stamps, np.zeros((n, 3)), np.full((n, 3), np.nan)),
+            Dvl(stamps, velocity, np.full((n, 3, 3), np.nan)),
+            None,
+        )
+
+    def see(
+        self, after_s: float, *rows: tuple[int, float, float], probability: float = 0.9, cov: Floats | None = None
+    ) -> None:
+        stamp = T0_NS + round(after_s * NS)
+        self.keyframes.advance(stamp)
+        self.sightings.add(frame(stamp, rows, probability, cov))
+
+    @property
+    def outcomes(self) -> list[Outcome]:
+        return self.sightings.journal.log().outcomes
+
+
+def frame(stamp: int, rows, probability: float = 0.9, cov: Floats | None = None) -> LandmarkDetections:
+    n = len(rows)
+    ids, ranges, azimuths = zip(*rows, strict=True)
+    return LandmarkDetections(
+        np.full(n, stamp),
+        np.array(ranges),
+        np.array(azimuths),
+        np.tile(np.full((2, 2), np.nan) if cov is None else cov, (n, 1, 1)),
+        np.array(ids)[:, None],
+        np.full((n, 1), probability),
+    )
+
+
+def spherical(x: float, p: Floats) -> tuple[float, float]:
+    """Range and azimuth of a point from the mounted sonar of a level vehicle at (x, 0, 0), by scipy-free algebra."""
+    (roll, pitch, yaw), t = SONAR.mounting.rpy_rad, np.array(SONAR.mounting.translation_m)
+    assert roll == 0
+    Ry = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
+    Rz = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    q = (Rz @ Ry).T @ (p - [x, 0, 0] - t)
+    return float(np.linalg.norm(q)), float(np.arctan2(q[1], q[0]))
+
+
+def test_a_first_sighting_places_a_landmark_on_the_centre_beam():
+    """Range 3 m straight ahead of a sonar that looks 0.4 rad down and 0.2 rad to the left."""
+    dive = Dive()
+    dive.see(0.0, (5, 3.0, 0.0))
+    beam = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
+    assert dive.outcomes == [Outcome.NEW]
+    assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(np.array([0.3, 0.1, -0.1]) + 3.0 * beam)
+
+
+def test_a_known_floor_gives_the_elevation():
+    dive = Dive(CALIBRATION.model_copy(update={"floor": FLOOR}))
+    truth = np.array([2.6, 0.9, FLOOR.z_m])
+    dive.see(0.0, (5, *spherical(0.0, truth)))
+    assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(truth, abs=1e-9)
+    assert dive.smoother.graph.size() == 1 + 3
+    dive.smoother.update(dive.keyframes.newest_s)
+    assert np.sqrt(dive.smoother.covariance(L(5))[2, 2]) == pytest.approx(FLOOR.sigma_m, rel=1e-3)
+
+
+def test_where_the_floor_is_out_of_the_aperture_the_centre_beam_is_taken():
+    dive = Dive(CALIBRATION.model_copy(update={"floor": FloorPrior(z_m=-9.0, sigma_m=0.01)}))
+    dive.see(0.0, (5, 3.0, 0.0))
+    assert dive.smoother.values.atPoint3(L(5))[2] == pytest.approx(-0.1 - 3.0 * np.sin(0.4))
+
+
+def test_a_frame_between_keyframes_is_seen_from_where_the_vehicle_was():
+    """0.35 s after the keyframe the vehicle is 0.175 m further on."""
+    dive = Dive()
+    dive.see(0.35, (5, 3.0, 0.0))
+    beam = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
+    assert dive.keyframes.stamps_ns == [T0_NS]
+    assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(np.array([0.475, 0.1, -0.1]) + 3.0 * beam)
+
+
+def test_elevation_is_said_once_for_a_landmark():
+    """It does not vary as noise would: many sightings from one place leave its height as unknown as the first."""
+    dive = Dive(
+        CALIBRATION.model_copy(update={"start": Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)})
+    )
+    for k in range(9):
+        dive.see(0.01 * k, (5, 3.0, 0.0))
+    dive.smoother.update(dive.keyframes.newest_s)
+    up = np.array([np.cos(0.2) * np.sin(0.4), np.sin(0.2) * np.sin(0.4), np.cos(0.4)])
+    cov = dive.smoother.covariance(L(5))
+    elevation_sigma = SONAR.elevation_aperture_rad / np.sqrt(12)
+    assert np.sqrt(up @ cov @ up) == pytest.approx(3.0 * np.tan(elevation_sigma), rel=0.01)
+    assert dive.outcomes == [Outcome.NEW] + [Outcome.USED] * 8
+
+
+def test_innovation_and_its_covariance_are_those_of_the_joint_prediction():
+    """S = H P H^T + R by numpy, with H by differences and P the window's joint covariance."""
+    dive = Dive()
+    truth = np.array([3.0, 0.8, -1.4])
+    dive.see(0.0, (5, *spherical(0.0, truth)))
+    dive.smoother.update(dive.keyframes.newest_s)
+    landmark = dive.smoother.values.atPoint3(L(5))
+    joint = dive.smoother.joint_covariance([X(0), L(5)])
+    P = np.block([[joint.at(a, b) for b in (X(0), L(5))] for a in (X(0), L(5))])
+    world_T_body = dive.smoother.values.atPose3(X(0))
+
+    def expected(change: Floats) -> Floats:
+        pose = world_T_body.compose(gtsam.Pose3.Expmap(change[:6])).compose(SONAR.mounting.pose())
+        q = pose.transformTo(landmark + change[6:])
+        return np.array([np.linalg.norm(q), np.arctan2(q[1], q[0])])
+
+    H = np.column_stack([(expected(1e-6 * a) - expected(-1e-6 * a)) / 2e-6 for a in np.eye(9)])
+    z = expected(np.zeros(9)) + np.array([0.03, -0.02])
+    dive.see(0.0, (5, *z))
+    log = dive.sightings.journal.log()
+    assert log.outcomes[-1] is Outcome.USED
+    assert log.innovations[-1] == pytest.approx([0.03, -0.02], abs=1e-9)
+    assert np.allclose(log.innovation_covs[-1], H @ P @ H.T + np.diag([0.02**2, 0.01**2]), rtol=1e-5, atol=1e-10)
+
+
+def test_noise_of_the_motion_since_the_keyframe_is_added():
+    """Dead ahead, 2 s after the keyframe, with a log of 0.2 m/s at 10 Hz: range has 0.2^2 x 0.1 s x 2 s more of it."""
+    ahead = CALIBRATION.model_copy(
+        update={
+            "dvl": DvlCalibration(velocity_sigma_m_s=(0.2, 1e-6, 1e-6)),
+            "sonar": SonarCalibration(range_sigma_m=0.02, azimuth_sigma_rad=0.01),
+        }
+    )
+    dive = Dive(ahead)
+    dive.keyframes.policy = KeyframePolicy(100.0, 100.0, 60.0)
+    dive.see(0.0, (5, 4.0, 0.0))
+    dive.see(0.0, (5, 4.0, 0.0))
+    dive.see(2.0, (5, 3.0, 0.0))
+    _, before, later = dive.sightings.journal.log().innovation_covs
+    motion_variance = 0.2**2 * 0.1 * 2.0
+    assert before[0, 0] == pytest.approx(2 * 0.02**2, rel=1e-3)
+    assert later[0, 0] == pytest.approx(1.5 * 0.02**2 + motion_variance, rel=1e-3)
+
+
+@pytest.mark.parametrize("beyond", [False, True])
+def test_the_gate_is_the_chi_square_quantile(beyond):
+    """An innovation just inside it is used; just outside it is refused and leaves the graph as it was."""
+    dive = Dive()
+    dive.see(0.0, (5, 3.0, 0.0))
+    dive.see(0.0, (5, 9.0, 0.0))
+    assert dive.outcomes == [Outcome.NEW, Outcome.GATED]
+    before = dive.smoother.graph.size()
+    information = np.linalg.inv(dive.sightings.journal.log().innovation_covs[-1])
+    edge_m = np.sqrt(chi2.ppf(0.99, 2) / information[0, 0])
+    dive.see(0.0, (5, 3.0 + edge_m * (1.001 if beyond else 0.999), 0.0))
+    assert dive.outcomes[-1] is (Outcome.GATED if beyond else Outcome.USED)
+    assert dive.smoother.graph.size() == before + (0 if beyond else 2)
+    assert dive.sightings.journal.log().innovations[1] == pytest.approx([6.0, 0.0], abs=1e-6)
+
+
+def test_without_a_gate_nothing_is_refused():
+    dive = Dive(policy=SightingPolicy(0.7, 1.0, "none", 2.0))
+    dive.see(0.0, (5, 3.0, 0.0))
+    dive.see(0.0, (5, 30.0, 1.0))
+    assert dive.outcomes == [Outcome.NEW, Outcome.USED]
+
+
+@pytest.mark.parametrize("rows", [((5, 3.0, 0.0),), ((-1, 3.0, 0.0), (4, 2.0, 0.1))])
+def test_a_doubtful_identity_changes_nothing(rows):
+    """Neither keyframe nor landmark nor factor."""
+    dive = Dive()
+    dive.see(1.5, *rows, probability=0.69)
+    assert dive.outcomes == [Outcome.NO_IDENTITY] * len(rows)
+    assert dive.smoother.graph.size() == 1
+    assert dive.sightings.ids == set()
+    assert len(dive.keyframes.stamps_ns) == 1
+
+
+def test_a_frame_before_the_start_is_unlocated():
+    dive = Dive()
+    dive.sightings.add(frame(T0_NS - 1, [(5, 3.0, 0.0), (6, 2.0, 0.0)]))
+    assert dive.outcomes == [Outcome.UNLOCATED] * 2
+    assert dive.smoother.graph.size() == 0
+
+
+def test_a_frame_before_the_newest_keyframe_is_late():
+    dive = Dive()
+    dive.see(3.0, (5, 3.0, 0.0))
+    before = dive.smoother.graph.size()
+    dive.sightings.add(frame(T0_NS + 2 * NS, [(5, 3.0, 0.0)]))
+    assert dive.outcomes == [Outcome.NEW, Outcome.LATE]
+    assert dive.smoother.graph.size() == before
+
+
+def test_one_identity_twice_in_a_frame_is_new_and_then_seen_again():
+    dive = Dive()
+    dive.see(0.0, (5, 3.0, 0.0), (5, 3.01, 0.0), (6, 2.0, 0.1))
+    log = dive.sightings.journal.log()
+    assert log.outcomes == [Outcome.NEW, Outcome.USED, Outcome.NEW]
+    assert log.landmark_ids.tolist() == [5, 5, 6]
+    assert log.innovations[1] == pytest.approx([0.01, 0.0], abs=1e-6)
+    assert dive.sightings.ids == {5, 6}
+
+
+@pytest.mark.parametrize("told", [None, np.diag([0.1**2, 0.05**2])])
+def test_a_covariance_in_the_log_goes_before_that_of_the_calibration(told):
+    tight = CALIBRATION.model_copy(update={"start": Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)})
+    dive = Dive(tight)
+    dive.see(0.0, (5, 3.0, 0.0), cov=told)
+    dive.see(0.0, (5, 3.0, 0.0), cov=told)
+    sigma = [0.02, 0.01] if told is None else [0.1, 0.05]
+    S = dive.sightings.journal.log().innovation_covs[-1]
+    assert np.sqrt(np.diag(S)) == pytest.approx(np.sqrt(2) * np.array(sigma), rel=0.01)
+
+
+@pytest.mark.parametrize("kernel", ["huber", "cauchy"])
+def test_a_kernel_keeps_an_outlier_from_pulling(kernel):
+    pulls = []
+    for name in ("none", kernel):
+        dive = Dive(policy=SightingPolicy(0.7, 1.0, name, 2.0))
+        for _ in range(5):
+            dive.see(0.0, (5, 3.0, 0.0))
+        before = dive.smoother.values.atPoint3(L(5))
+        dive.see(0.0, (5, 4.0, 0.0))
+        for _ in range(5):
+            dive.smoother.update(dive.keyframes.newest_s)
+        pulls.append(np.linalg.norm(dive.smoother.values.atPoint3(L(5)) - before))
+    assert pulls[1] < 0.2 * pulls[0]
+
+
+def test_azimuths_either_side_of_pi_are_near_each_other():
+    backwards = SonarCalibration(mounting=Mounting(), range_sigma_m=0.02, azimuth_sigma_rad=0.01)
+    dive = Dive(CALIBRATION.model_copy(update={"sonar": backwards}))
+    dive.see(0.0, (5, 3.0, np.pi - 0.005))
+    dive.see(0.0, (5, 3.0, -np.pi + 0.005))
+    log = dive.sightings.journal.log()
+    assert log.outcomes[-1] is Outcome.USED
+    assert log.innovations[-1] == pytest.approx([0.0, 0.01], abs=1e-6)
