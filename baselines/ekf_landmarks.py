@@ -28,8 +28,10 @@ from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.kernels import compiled, skew
 from sonar_graph.slam.models import floor_elevation, project, sonar_point, sonar_point_jacobian, wrap_angle
 
-USED, NEW, GATED = 0, 1, 2
+USED, NEW, GATED, PASSED_OVER = 0, 1, 2, 3
 """What became of a detection, in compiled code."""
+NO_SLOT = -1
+"""The place of a detection that is not to be used."""
 
 
 class SonarModel(NamedTuple):
@@ -40,9 +42,16 @@ class SonarModel(NamedTuple):
     gate: float
     """Squared Mahalanobis distance beyond which an innovation is refused."""
     aperture_rad: float
+    range_variance_m2: float
+    """Where the log does not say."""
+    azimuth_variance: float
+    """Where the log does not say, rad²."""
     has_floor: bool
     floor_z_m: float
     floor_variance_m2: float
+
+
+SonarValues = tuple[Floats, Floats, float, float, float, float, bool, float, float]
 
 
 class Moment(NamedTuple):
@@ -82,39 +91,55 @@ def observe_frame(
     dR: Floats,
     dp: Floats,
     cov: Floats,
-    sonar: SonarModel,
+    sonar_values: SonarValues,
     slots: Ints,
-    z: Floats,
-    R: Floats,
+    range_m: Floats,
+    azimuth_rad: Floats,
+    noise: Floats,
 ) -> tuple[int, Ints, Floats, Floats]:
     """Take in the detections of one frame, row by row.
 
     Parameters
     ----------
+    sonar_values
+        The fields of a `SonarModel`; as a plain tuple they enter compiled code faster.
     slots
-        Place of each row's landmark in the state; the first unused place is a new landmark, shape (m,).
-    z
-        Range and azimuth, shape (m, 2).
-    R
-        Their covariance, shape (m, 2, 2).
+        Place of each row's landmark in the state, the first unused one for a new landmark, or NO_SLOT; shape (m,).
+    range_m, azimuth_rad
+        Shape (m,).
+    noise
+        Covariance of range and azimuth, shape (m, 2, 2); NaN where the log does not say.
 
     Returns
     -------
-    Length of the state; USED, NEW or GATED for each row (m,); innovations (m, 2) and their covariances (m, 2, 2), NaN
-    for new landmarks.
+    Length of the state; USED, NEW, GATED or PASSED_OVER for each row (m,); innovations (m, 2) and their covariances
+    (m, 2, 2), NaN where nothing was predicted.
     """
+    sonar = SonarModel(*sonar_values)
     m = len(slots)
     outcomes, innovations, covs = np.empty(m, np.int64), np.full((m, 2), np.nan), np.full((m, 2, 2), np.nan)
     for row in range(m):
+        if slots[row] == NO_SLOT:
+            outcomes[row] = PASSED_OVER
+            continue
         at = POSE + LANDMARK * slots[row]
+        z, R = np.array([range_m[row], azimuth_rad[row]]), _noise(noise[row], sonar)
         moment = moment_after(x, dR, dp, cov)
         if at >= n:
-            _augment(x, P, n, moment, sonar, z[row], R[row])
+            _augment(x, P, n, moment, sonar, z, R)
             n += LANDMARK
             outcomes[row] = NEW
         else:
-            outcomes[row] = _observe(x, P, n, at, moment, sonar, z[row], R[row], innovations[row], covs[row])
+            outcomes[row] = _observe(x, P, n, at, moment, sonar, z, R, innovations[row], covs[row])
     return n, outcomes, innovations, covs
+
+
+@compiled
+def _noise(logged: Floats, sonar: SonarModel) -> Floats:
+    """Covariance of range and azimuth: as logged, or the calibration's."""
+    if not math.isnan(logged[0, 0] + logged[0, 1] + logged[1, 0] + logged[1, 1]):
+        return logged
+    return np.array([[sonar.range_variance_m2, 0.0], [0.0, sonar.azimuth_variance]])
 
 
 @compiled

@@ -67,15 +67,19 @@ class GravityInterval(NamedTuple):
     """Of the IMU's point when it began, shape (3,), and the variance of one component: shape (4,)."""
 
 
+VehicleValues = tuple[float, Floats, Floats, Floats, Floats, int, float, float, float, bool, float, float, float]
+GravityValues = tuple[Floats, Floats, Floats]
+
+
 @compiled
 def advance(
     columns: Columns,
-    model: VehicleModel,
+    model_values: VehicleValues,
     x: Floats,
     P: Floats,
     n: int,
     clock: Ints,
-    interval: GravityInterval,
+    interval_values: GravityValues,
     depth_ns: Ints,
     depth_m: Floats,
     depth_variance: Floats,
@@ -87,8 +91,10 @@ def advance(
     ----------
     columns
         Rows of `Odometry.columns`.
-    x, P, n, clock, interval
-        Filter state; changed.
+    model_values, interval_values
+        The fields of a `VehicleModel` and a `GravityInterval`; as plain tuples they enter compiled code faster.
+    x, P, n, clock
+        Filter state; changed, as is the gravity interval.
     depth_ns, depth_m, depth_variance
         Samples between the state and ``until_ns``, in order.
 
@@ -96,6 +102,7 @@ def advance(
     -------
     The provisional motion from the state to ``until_ns``.
     """
+    model, interval = VehicleModel(*model_values), GravityInterval(*interval_values)
     samples, events = 0, len(depth_ns)
     while True:
         event_ns = depth_ns[samples] if samples < events else until_ns

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from baselines.causal import CausalEstimates
-from baselines.ekf_landmarks import GATED, NEW, USED, SonarModel, observe_frame, pose_after
+from baselines.ekf_landmarks import GATED, NEW, NO_SLOT, USED, SonarModel, observe_frame, pose_after
 from baselines.ekf_prediction import NODE, GravityInterval, Motion, VehicleModel, advance, open_interval
 from baselines.ekf_state import LANDMARK, POSE
 from baselines.euler import euler_from_rates, euler_from_rotation
@@ -88,6 +88,8 @@ class EkfSlam:
         self._n = POSE
         self._clock: Ints = np.zeros(2, np.int64)
         self._interval = GravityInterval(np.eye(3), np.zeros(3), np.zeros(4))
+        self._vehicle_values, self._sonar_values = (*self._vehicle,), (*self._sonar,)
+        self._interval_values = (*self._interval,)
         self._started = False
         self._done_ns = np.iinfo(np.int64).min
 
@@ -166,12 +168,12 @@ class EkfSlam:
         first, last = np.searchsorted(stamps_ns, [self._clock[NODE], until_ns + 1])
         motion = advance(
             self._odometry.columns(),
-            self._vehicle,
+            self._vehicle_values,
             self._x,
             self._P,
             self._n,
             self._clock,
-            self._interval,
+            self._interval_values,
             stamps_ns[first:last],
             z_m[first:last],
             variance[first:last],
@@ -190,19 +192,17 @@ class EkfSlam:
         """Take in the detections of one frame; returns the depth samples after it."""
         stamp_ns = int(frame.stamps_ns[0])
         identities = identify(frame, self._params.minimum_id_probability)
+        ids = identities.ids.tolist()
         refusal = self._refusal(stamp_ns)
         refusals = [refusal or reason for reason in identities.refusals]
-        rows = [row for row, reason in enumerate(refusals) if reason is None]
-        found: dict[int, tuple[Outcome, Floats, Floats]] = {}
-        if rows:
-            motion, depth = self._advance(depth, stamp_ns)
-            found = dict(zip(rows, self._observe(frame, rows, identities.ids, motion), strict=True))
-        for row, reason in enumerate(refusals):
-            landmark_id = int(identities.ids[row])
-            if reason is None:
-                self._journal.record(stamp_ns, landmark_id, *found[row])
-            else:
-                self._journal.record(stamp_ns, landmark_id, reason)
+        if all(refusals):
+            for landmark_id, reason in zip(ids, refusals, strict=True):
+                self._journal.record(stamp_ns, landmark_id, reason or Outcome.NO_IDENTITY)
+            return depth
+        motion, depth = self._advance(depth, stamp_ns)
+        rows = self._observe(frame, ids, refusals, motion)
+        for landmark_id, reason, (outcome, innovation, cov) in zip(ids, refusals, rows, strict=True):
+            self._journal.record(stamp_ns, landmark_id, reason or OUTCOMES[outcome], innovation, cov)
         return depth
 
     def _refusal(self, stamp_ns: int) -> Outcome | None:
@@ -212,27 +212,26 @@ class EkfSlam:
         return None if self._has_started(stamp_ns) else Outcome.UNLOCATED
 
     def _observe(
-        self, frame: LandmarkDetections, rows: list[int], ids: Ints, motion: Motion
-    ) -> list[tuple[Outcome, Floats, Floats]]:
-        """Correct by the accepted rows of a frame."""
-        slots = np.array([self._slots.setdefault(int(ids[row]), len(self._slots)) for row in rows])
+        self, frame: LandmarkDetections, ids: list[int], refusals: list[Outcome | None], motion: Motion
+    ) -> list[tuple[int, Floats, Floats]]:
+        """Correct by the rows of a frame that are not refused."""
+        slots = [
+            NO_SLOT if reason else self._slots.setdefault(landmark_id, len(self._slots))
+            for landmark_id, reason in zip(ids, refusals, strict=True)
+        ]
         self._make_room()
         self._n, outcomes, innovations, covs = observe_frame(
             self._x,
             self._P,
             self._n,
             *motion,
-            self._sonar,
-            slots,
-            np.column_stack([frame.range_m[rows], frame.azimuth_rad[rows]]),
-            self._noise(frame.range_azimuth_cov[rows]),
+            self._sonar_values,
+            np.array(slots),
+            frame.range_m,
+            frame.azimuth_rad,
+            frame.range_azimuth_cov,
         )
-        return [(OUTCOMES[outcome], innovations[k], covs[k]) for k, outcome in enumerate(outcomes.tolist())]
-
-    def _noise(self, cov: Floats) -> Floats:
-        """Covariance of range and azimuth, the calibration's where the log does not say."""
-        sonar = self._calibration.sonar
-        return np.where(np.isnan(cov), np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2]), cov)
+        return list(zip(outcomes.tolist(), innovations, covs, strict=True))
 
     def _make_room(self) -> None:
         needed, room = POSE + LANDMARK * len(self._slots), len(self._x)
@@ -310,6 +309,8 @@ def _sonar_model(calibration: Calibration, params: EkfSlamParams) -> SonarModel:
         body_p_sonar=np.array(calibration.sonar.mounting.translation_m),
         gate=gate_threshold(params.gate_probability, 2),
         aperture_rad=calibration.sonar.elevation_aperture_rad,
+        range_variance_m2=calibration.sonar.range_sigma_m**2,
+        azimuth_variance=calibration.sonar.azimuth_sigma_rad**2,
         has_floor=floor is not None,
         floor_z_m=floor.z_m if floor else 0.0,
         floor_variance_m2=floor.sigma_m**2 if floor else 1.0,

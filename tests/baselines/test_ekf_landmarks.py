@@ -7,7 +7,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from baselines.ekf_landmarks import GATED, NEW, USED, SonarModel, location, moment_after, observation, observe_frame
+from baselines.ekf_landmarks import (
+    GATED,
+    NEW,
+    NO_SLOT,
+    PASSED_OVER,
+    USED,
+    SonarModel,
+    location,
+    moment_after,
+    observation,
+    observe_frame,
+)
 from sonar_graph.slam.association import gate_threshold
 from sonar_graph.slam.models import locate, range_azimuth
 
@@ -27,6 +38,8 @@ def sonar(**changes):
         body_p_sonar=MOUNTING.translation(),
         gate=gate_threshold(0.999, 2),
         aperture_rad=0.244,
+        range_variance_m2=NOISE[0, 0],
+        azimuth_variance=NOISE[1, 1],
         has_floor=False,
         floor_z_m=0.0,
         floor_variance_m2=1e-4,
@@ -57,7 +70,9 @@ def state(angles, *landmarks, room=3):
 
 
 def frame(x, P, n, slots, z, model=None, R=NOISE):
-    return observe_frame(x, P, n, *motion(), model or sonar(), np.array(slots), np.array(z), np.array([R] * len(slots)))
+    range_m, azimuth = np.array(z).T.copy()
+    noise = np.array([R] * len(slots))
+    return observe_frame(x, P, n, *motion(), (*(model or sonar()),), np.array(slots), range_m, azimuth, noise)
 
 
 def difference(ahead, behind):
@@ -182,3 +197,21 @@ def test_the_rows_of_a_frame_are_taken_in_their_order():
     n, outcomes, _, _ = frame(x, P, n, [0, 0, 1], [[2.0, 0.3], [2.001, 0.301], [2.5, -0.3]])
     assert n == 12
     assert outcomes.tolist() == [NEW, USED, NEW]
+
+
+@pytest.mark.parametrize("hole", [(0, 0), (1, 1), (0, 1)])
+def test_noise_that_the_log_does_not_give_is_the_calibration_s(hole):
+    logged = NOISE.copy()
+    logged[hole] = math.nan
+    given, missing = state(np.zeros(3)), state(np.zeros(3))
+    frame(*given, [0], [[2.0, 0.3]])
+    frame(*missing, [0], [[2.0, 0.3]], R=logged)
+    assert_array_equal(given[1], missing[1])
+
+
+def test_a_row_without_a_place_is_passed_over():
+    x, P, n = state(np.zeros(3))
+    n_after, outcomes, innovations, _ = frame(x, P, n, [NO_SLOT, 0], [[2.0, 0.3], [2.0, 0.3]])
+    assert n_after == n + 3
+    assert outcomes.tolist() == [PASSED_OVER, NEW]
+    assert np.isnan(innovations).all()
