@@ -86,7 +86,7 @@ def load_estimator(name: str) -> type[Estimator]:
     missing = [m for m in ("Params", "process", "trajectory", "landmarks", "detections") if not hasattr(loaded, m)]
     if missing:
         raise EstimatorError(f"{name} ({installed[name].value}) lacks {', '.join(missing)} of the estimator contract")
-    return loaded  # type: ignore[no-any-return]  # checked above
+    return loaded
 
 
 def make_params(estimator: type[Estimator], overrides: dict[str, Any], name: str) -> Section:

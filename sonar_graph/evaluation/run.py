@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import textwrap
 import time
 from collections.abc import Callable
@@ -21,6 +22,9 @@ from sonar_graph.states import Estimate, Trajectory
 
 REASON_WIDTH = 400
 """Characters of a reason at most: one line that a table can hold."""
+WARM_UP_STEPS = 20
+MAX_WARM_UP_STEPS = 200
+"""Steps given to the instance that warms up: without and with detections to wait for."""
 
 
 def run_estimator(
@@ -34,8 +38,9 @@ def run_estimator(
 ) -> RunResult:
     """Replay a sequence into an estimator and keep what it said, with the duration of each call.
 
-    The log is cut into steps before the clock starts; only calls of the estimator are timed, with everything that
-    these cause (a compilation at the first call, garbage collection).
+    The log is cut into steps before the clock starts, and a second instance of the estimator takes the first of them,
+    so that compiling at a first call is not counted. Only calls of the estimator are timed, with everything that these
+    cause.
 
     Parameters
     ----------
@@ -96,6 +101,7 @@ class _Replay:
 
     def run(self, kind: type[Estimator], progress: Callable[[int, int], None] | None) -> RunResult:
         """Everything from construction to the final map."""
+        self._warm_up(kind)
         memory = PeakMemory()
         try:
             estimator = kind(self._sequence.calibration, self._params)
@@ -103,6 +109,15 @@ class _Replay:
             return self._finish(estimator, memory)
         except Exception as error:  # a third party's estimator may fail in any way, and the others still run
             return self._result("failed", f"{self._stage}: {one_line(error)}", peak_memory_mb=memory.rise_mb())
+
+    def _warm_up(self, kind: type[Estimator]) -> None:
+        """Let an estimator that is thrown away compile what it needs, up to the second frame with detections."""
+        with_detections = [i for i, step in enumerate(self._steps) if step.detections is not None]
+        last = with_detections[1] if len(with_detections) > 1 else WARM_UP_STEPS
+        with contextlib.suppress(Exception):  # what fails here fails again below, where it is reported
+            estimator = kind(self._sequence.calibration, self._params)
+            for step in self._steps[: min(last, MAX_WARM_UP_STEPS) + 1]:
+                estimator.process(step)
 
     def _process(self, estimator: Estimator, progress: Callable[[int, int], None] | None) -> None:
         for done, step in enumerate(self._steps, start=1):

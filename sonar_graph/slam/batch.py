@@ -1,7 +1,7 @@
 """Solving a whole graph at once, when some of its factors are Python functions.
 
-GTSAM's optimisers hand each Python factor a copy of all values, which makes their cost quadratic in the length of a run.
-Linearising from Python does not; so the loop is here, and the linear algebra is GTSAM's.
+GTSAM's optimisers hand each Python factor a copy of all values, which makes their cost quadratic in the length of a
+run. Linearising from Python does not; so the loop is here, and the linear algebra is GTSAM's.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def _damped(linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: fl
         return linear
     damped = linear.clone()
     zero = values.zeroVectors()
-    for key in values.keys():
+    for key in linear.keyVector():
         n = len(zero.at(key))
         damped.push_back(
             gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n))

@@ -8,8 +8,8 @@
                    └── range, azimuth ── L7 ── floor prior
     depth, gravity direction and the planar constraint: one keyframe each
 
-All but the odometry factor with a gyro bias are GTSAM's own (compiled) factors; each is checked numerically in the tests
-against `sonar_graph.slam.models`. Range and azimuth are two factors, so that elevation stays unknown:
+All but the odometry factor with a gyro bias are GTSAM's own (compiled) factors; each is checked numerically in the
+tests against `sonar_graph.slam.models`. Range and azimuth are two factors, so that elevation stays unknown:
 
 * range: ``RangeFactorWithTransform3D``.
 * azimuth: a pinhole camera whose optical axis lies in the sonar's fan plane along the measured azimuth. Its horizontal
@@ -75,9 +75,7 @@ def odometry_with_bias(key_i: int, key_j: int, bias_key: int, motion: Preintegra
     keys = [key_i, key_j, bias_key]
     inverse_mean = motion.i_T_j.inverse()
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None
-    ) -> Floats:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
         X_i, X_j = values.atPose3(key_i), values.atPose3(key_j)
         return odometry_error(X_i, X_j, values.atPoint3(bias_key), motion, inverse_mean, jacobians)
 
@@ -164,9 +162,7 @@ def correlated_sighting(
 ) -> gtsam.NonlinearFactor:
     """Range and azimuth whose noises are correlated, as one factor: ``h(X, L) - z``, azimuth wrapped."""
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None
-    ) -> Floats:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
         X, p = values.atPose3(pose_key), values.atPoint3(landmark_key)
         predicted, by_pose, by_landmark = range_azimuth_jacobians(X, body_T_sonar, p)
         if jacobians is not None:

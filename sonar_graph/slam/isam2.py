@@ -22,7 +22,7 @@ from gtsam.symbol_shorthand import L, X
 from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Section
-from sonar_graph.measurements import Floats, Measurements
+from sonar_graph.measurements import Measurements
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
 from sonar_graph.slam.sightings import SightingPolicy, Sightings
@@ -36,15 +36,18 @@ class Isam2Params(Section):
     lag_s: float = Field(30.0, gt=0)
     """Poses older than this are marginalised out of the incremental solution; a large value keeps the whole history."""
     min_keyframe_interval_s: float = Field(1.0, ge=0)
-    """While landmarks are seen, keyframes are at least this far apart."""
+    """While landmarks are seen, keyframes are this far apart."""
     max_keyframe_interval_s: float = Field(5.0, gt=0)
     """A keyframe is set at the latest after this time."""
+    motion_noise_share: float = Field(0.1, gt=0)
+    """While landmarks are seen, a keyframe is set sooner once the variance of the motion since the last one exceeds
+    this share of the sonar's variance."""
     bias_interval_s: float = Field(60.0, gt=0)
     """The gyro bias is constant over stretches of this length."""
     relinearize_threshold: float = Field(0.01, gt=0)
     """A variable is relinearised when a component of its change exceeds this (rad or m)."""
     stale_shift_m: float = Field(0.1, gt=0)
-    """The window is linearised anew, from a solution of the whole graph, when a landmark has moved by more than this."""
+    """The window is linearised anew, from a solution of the whole graph, when a landmark has moved farther."""
     kernel: Literal["none", "huber", "cauchy"] = "huber"
     """Robust kernel on range and on azimuth."""
     kernel_width: float = Field(2.0, gt=0)
@@ -73,7 +76,9 @@ class Isam2:
         self._params: Isam2Params = params or Isam2Params()
         p = self._params
         self._smoother = Smoother(p.lag_s, p.relinearize_threshold, p.stale_shift_m)
-        policy = KeyframePolicy(p.min_keyframe_interval_s, p.max_keyframe_interval_s, p.bias_interval_s)
+        policy = KeyframePolicy(
+            p.min_keyframe_interval_s, p.max_keyframe_interval_s, p.motion_noise_share, p.bias_interval_s
+        )
         self._keyframes = Keyframes(calibration, policy, self._smoother)
         sightings = SightingPolicy(p.identity_probability, p.gate_probability, p.kernel, p.kernel_width)
         self._sightings = Sightings(calibration, sightings, self._smoother, self._keyframes)

@@ -1,7 +1,8 @@
 """Keyframes: where they are set, and the factors that odometry, depth and gravity give each of them.
 
-A keyframe sits at a node of the odometry (a DVL stamp). One is due ``max_interval_s`` after the last, or, when landmarks
-are seen, ``min_interval_s`` after it. The gyro bias is constant over stretches of ``bias_interval_s`` and walks between.
+A keyframe sits at a node of the odometry (a DVL stamp). One is due ``max_interval_s`` after the last, or, when
+landmarks are seen, ``min_interval_s`` after it or as soon as the motion since has blurred what the sonar sees.
+The gyro bias is constant over stretches of ``bias_interval_s`` and walks between them.
 """
 
 from __future__ import annotations
@@ -27,10 +28,12 @@ LATEST_NS = np.iinfo(np.int64).max
 
 @dataclass(frozen=True)
 class KeyframePolicy:
-    """When a keyframe is set; seconds."""
+    """When a keyframe is set."""
 
     min_interval_s: float
     max_interval_s: float
+    motion_noise_share: float
+    """Variance of the motion since the last keyframe over the sonar's, above which ``min_interval_s`` is not kept."""
     bias_interval_s: float
 
 
@@ -87,11 +90,23 @@ class Keyframes:
             if node_ns - self.stamps_ns[-1] >= interval_ns:
                 self._set(node_ns)
 
-    def set_for_frame(self, stamp_ns: int) -> None:
-        """Set a keyframe at the newest node reached at a frame's stamp, if the newest keyframe is old enough."""
+    def motion_to_frame(self, stamp_ns: int) -> PreintegratedMotion:
+        """Motion from the newest keyframe to a frame, after setting a keyframe if the frame deserves a newer one."""
+        motion = self.motion_since_newest(stamp_ns)
         nodes = self.odometry.nodes(self.stamps_ns[-1], stamp_ns)
-        if len(nodes) and nodes[-1] - self.stamps_ns[-1] >= self.policy.min_interval_s / S_PER_NS:
-            self._set(int(nodes[-1]))
+        if not len(nodes):
+            return motion
+        aged = nodes[-1] - self.stamps_ns[-1] >= self.policy.min_interval_s / S_PER_NS
+        if not aged and not self._is_noisy(motion):
+            return motion
+        self._set(int(nodes[-1]))
+        return self.motion_since_newest(stamp_ns)
+
+    def _is_noisy(self, motion: PreintegratedMotion) -> bool:
+        """Whether the motion's noise would blur what the sonar saw."""
+        sonar, variance = self.calibration.sonar, np.diag(motion.covariance)
+        share = max(variance[:3].max() / sonar.azimuth_sigma_rad**2, variance[3:].max() / sonar.range_sigma_m**2)
+        return bool(share > self.policy.motion_noise_share)
 
     def motion_since_newest(self, until_ns: int) -> PreintegratedMotion:
         """Provisional motion from the newest keyframe to any later instant."""
@@ -152,7 +167,7 @@ class Keyframes:
         return [factors.gravity_direction(X(j), *up)] if up else []
 
     def _depth(self, j: int, node_ns: int, steps: Steps, motion: PreintegratedMotion) -> list[gtsam.NonlinearFactor]:
-        """One factor for all samples since the last keyframe: their weighted mean, at the weighted mean of the ports."""
+        """One factor for all samples since the last keyframe: their weighted mean at the mean of the ports."""
         start_ns = self.stamps_ns[-1]
         rows = [block for depth in self._depths if (block := depth.between(start_ns, node_ns))]
         self._depths = [block for depth in self._depths if (block := depth.between(node_ns, LATEST_NS))]
@@ -160,9 +175,10 @@ class Keyframes:
             return []
         samples = Depth.concatenate(rows)
         variance = np.where(np.isnan(samples.variance_m2), self.calibration.depth.sigma_m**2, samples.variance_m2)
-        weights = (1 / variance) / np.sum(1 / variance)
+        weights = np.asarray((1 / variance) / np.sum(1 / variance), dtype=np.float64)
         port = np.array(self.calibration.depth.port_m)
-        ports = self._preintegrator.path_of(port, steps, motion.bias, (samples.stamps_ns - start_ns) * S_PER_NS)
+        offsets_s = np.asarray((samples.stamps_ns - start_ns) * S_PER_NS, dtype=np.float64)
+        ports = self._preintegrator.path_of(port, steps, motion.bias, offsets_s)
         mean_port_in_j = motion.i_T_j.transformTo(weights @ ports)
         return [factors.depth(X(j), float(weights @ samples.z_m), mean_port_in_j, float(np.sum(1 / variance) ** -0.5))]
 

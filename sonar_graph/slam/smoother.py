@@ -2,8 +2,8 @@
 
 Two solutions share the same factors:
 
-* the *window*: GTSAM's iSAM2 over the poses of the last ``lag_s`` seconds, all landmarks and all biases. Older poses are
-  marginalised, so that an update does not walk over all sightings that a landmark ever had.
+* the *window*: GTSAM's iSAM2 over the poses of the last ``lag_s`` seconds, all landmarks and all biases. Older poses
+  are marginalised, so that an update does not walk over all sightings that a landmark ever had.
 * the *history*: every factor ever added, solved by Levenberg-Marquardt when the smoothed result is asked for.
 
 Marginalising freezes the linearisation of the landmarks that it touches. When one has since moved by more than
@@ -15,6 +15,7 @@ the total cost of restarts proportional to that of the last one.
 from __future__ import annotations
 
 from collections.abc import Container, Iterable
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -92,7 +93,7 @@ class Smoother:
 
     def update(self, time_s: float) -> None:
         """Bring the window's estimate up to date with what was added."""
-        times = self._pending_times | dict.fromkeys(self._lasting, time_s)
+        times: dict[Any, float] = self._pending_times | dict.fromkeys(self._lasting, time_s)
         self._window.update(self._pending, self._pending_values, times)
         self._pending = gtsam.NonlinearFactorGraph()
         self._pending_values = gtsam.Values()
@@ -109,9 +110,9 @@ class Smoother:
         """Solve the history; start a window whose prior is the marginal of all that lies before it."""
         self._restart_size = int(RESTART_GROWTH * self.graph.size())
         self.values = solve(self.graph, self.values)
-        times = {key: t for key, t in self._pose_times.items() if t >= time_s - self._lag_s}
+        times: dict[Any, float] = {key: t for key, t in self._pose_times.items() if t >= time_s - self._lag_s}
         times |= dict.fromkeys(self._lasting, time_s)
-        inside, outside = _split(self.graph, times)
+        inside, outside = _split(self.graph, set(times))
         values = gtsam.Values()
         for key in times:
             _copy(self.values, key, values)
@@ -139,13 +140,13 @@ class Smoother:
 
 
 def _split(
-    graph: gtsam.NonlinearFactorGraph, kept: Container[int]
+    graph: gtsam.NonlinearFactorGraph, kept: set[int]
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.NonlinearFactorGraph]:
     """Factors on kept variables only, and those that touch any other."""
     inside, outside = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
     for i in range(graph.size()):
         factor = graph.at(i)
-        (inside if all(key in kept for key in factor.keys()) else outside).push_back(factor)
+        (inside if kept.issuperset(factor.keys()) else outside).push_back(factor)
     return inside, outside
 
 
