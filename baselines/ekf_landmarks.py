@@ -51,6 +51,11 @@ class SonarModel(NamedTuple):
     floor_variance_m2: float
 
 
+Motion = tuple[Floats, Floats, Floats]
+"""Rotation (3, 3), displacement (3,), covariance of [rotation, translation] at the end (6, 6)."""
+DetectionColumns = tuple[Ints, Floats, Floats, Floats]
+"""Place of each row's landmark in the state, the first unused one for a new landmark, or NO_SLOT (m,); range in m and
+azimuth in rad (m,); their covariance (m, 2, 2), NaN where the log does not say."""
 SonarValues = tuple[Floats, Floats, float, float, float, float, bool, float, float]
 
 
@@ -66,8 +71,9 @@ class Moment(NamedTuple):
 
 
 @compiled
-def moment_after(x: Floats, dR: Floats, dp: Floats, cov: Floats) -> Moment:
+def moment_after(x: Floats, motion: Motion) -> Moment:
     """The body a motion after the state."""
+    dR, dp, cov = motion
     R = rotation_from_euler(x[3:POSE])
     position = np.empty(3)
     for r in range(3):
@@ -76,62 +82,61 @@ def moment_after(x: Floats, dR: Floats, dp: Floats, cov: Floats) -> Moment:
 
 
 @compiled
-def pose_after(x: Floats, P: Floats, dR: Floats, dp: Floats, cov: Floats) -> tuple[Floats, Floats, Floats]:
+def pose_after(x: Floats, P: Floats, motion: Motion) -> tuple[Floats, Floats, Floats]:
     """world_R_body, position, and the covariance of [theta, rho] a motion after the state: ``T P_vv T^T + cov``."""
-    moment = moment_after(x, dR, dp, cov)
-    own = product(product(moment.T, P[:POSE, :POSE]), moment.T.T) + cov
-    return moment.world_R_body, moment.position, 0.5 * (own + own.T)
+    moment = moment_after(x, motion)
+    own = product(product(moment.T, P[:POSE, :POSE]), moment.T.T)
+    for r in range(POSE):
+        for c in range(r + 1):
+            own[r, c] = own[c, r] = 0.5 * (own[r, c] + own[c, r] + moment.cov[r, c] + moment.cov[c, r])
+    return moment.world_R_body, moment.position, own
 
 
 @compiled
-def observe_frame(
+def observe_rows(
     x: Floats,
     P: Floats,
     n: int,
-    dR: Floats,
-    dp: Floats,
-    cov: Floats,
-    sonar_values: SonarValues,
-    slots: Ints,
-    range_m: Floats,
-    azimuth_rad: Floats,
-    noise: Floats,
-) -> tuple[int, Ints, Floats, Floats]:
-    """Take in the detections of one frame, row by row.
+    motion: Motion,
+    sonar: SonarModel,
+    detections: DetectionColumns,
+    first: int,
+    last: int,
+    outcomes: Ints,
+    innovations: Floats,
+    covs: Floats,
+) -> int:
+    """Take in some rows, all of one instant, one after the other.
 
     Parameters
     ----------
-    sonar_values
-        The fields of a `SonarModel`; as a plain tuple they enter compiled code faster.
-    slots
-        Place of each row's landmark in the state, the first unused one for a new landmark, or NO_SLOT; shape (m,).
-    range_m, azimuth_rad
-        Shape (m,).
-    noise
-        Covariance of range and azimuth, shape (m, 2, 2); NaN where the log does not say.
+    motion
+        From the state to that instant.
+    first, last
+        Rows from the first up to, without, the last.
+    outcomes, innovations, covs
+        Written: USED, NEW, GATED or PASSED_OVER, shape (m,); innovations (m, 2) and their covariances (m, 2, 2), which
+        stay as they are where nothing is predicted.
 
     Returns
     -------
-    Length of the state; USED, NEW, GATED or PASSED_OVER for each row (m,); innovations (m, 2) and their covariances
-    (m, 2, 2), NaN where nothing was predicted.
+    Length of the state.
     """
-    sonar = SonarModel(*sonar_values)
-    m = len(slots)
-    outcomes, innovations, covs = np.empty(m, np.int64), np.full((m, 2), np.nan), np.full((m, 2, 2), np.nan)
-    for row in range(m):
+    slots, range_m, azimuth_rad, noise = detections
+    for row in range(first, last):
         if slots[row] == NO_SLOT:
             outcomes[row] = PASSED_OVER
             continue
         at = POSE + LANDMARK * slots[row]
         z, R = np.array([range_m[row], azimuth_rad[row]]), _noise(noise[row], sonar)
-        moment = moment_after(x, dR, dp, cov)
+        moment = moment_after(x, motion)
         if at >= n:
             _augment(x, P, n, moment, sonar, z, R)
             n += LANDMARK
             outcomes[row] = NEW
         else:
             outcomes[row] = _observe(x, P, n, at, moment, sonar, z, R, innovations[row], covs[row])
-    return n, outcomes, innovations, covs
+    return n
 
 
 @compiled

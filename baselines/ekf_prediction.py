@@ -1,8 +1,7 @@
-"""EKF-SLAM between sonar frames: prediction from node to node, with depth, gravity and the planar constraint.
+"""EKF-SLAM without landmarks: prediction from node to node, depth, gravity and the planar constraint.
 
-One compiled call takes all that was measured between two frames. Events happen in the order of their stamps: all nodes
-that are reached by then (see `sonar_graph.navigation.odometry`), then the depth sample, at a provisional motion from
-the newest of them.
+Nodes are the stamps of the Doppler log (`sonar_graph.navigation.odometry`); a depth sample between two of them is
+related to the earlier by a provisional motion.
 
 Gravity. From the specific force over about a second follows the direction of the world's up in the body
 (`sonar_graph.navigation.alignment`), of which roll and pitch are ``atan2(up_y, up_z)`` and
@@ -17,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.ekf_landmarks import moment_after
+from baselines.ekf_landmarks import Motion, moment_after
 from baselines.ekf_state import POSE, correct, place, predict
 from baselines.euler import rotation_from_euler
 from sonar_graph.measurements import Floats, Ints
@@ -28,8 +27,6 @@ from sonar_graph.navigation.recursion import integrate_steps
 from sonar_graph.slam.models import wrap_angle
 
 Columns = tuple[Ints, Floats, Floats, Ints, Floats, Floats, bool]
-Motion = tuple[Floats, Floats, Floats]
-"""dR (3, 3), dp (3,), covariance [rotation, translation] (6, 6)."""
 
 NODE, OPENED = 0, 1
 """Places in `Clock`: stamp of the state, stamp at which the running gravity interval began."""
@@ -72,55 +69,6 @@ GravityValues = tuple[Floats, Floats, Floats]
 
 
 @compiled
-def advance(
-    columns: Columns,
-    model_values: VehicleValues,
-    x: Floats,
-    P: Floats,
-    n: int,
-    clock: Ints,
-    interval_values: GravityValues,
-    depth_ns: Ints,
-    depth_m: Floats,
-    depth_variance: Floats,
-    until_ns: int,
-) -> Motion:
-    """Bring the state to the newest node reached at an instant, with the depth samples on the way.
-
-    Parameters
-    ----------
-    columns
-        Rows of `Odometry.columns`.
-    model_values, interval_values
-        The fields of a `VehicleModel` and a `GravityInterval`; as plain tuples they enter compiled code faster.
-    x, P, n, clock
-        Filter state; changed, as is the gravity interval.
-    depth_ns, depth_m, depth_variance
-        Samples between the state and ``until_ns``, in order.
-
-    Returns
-    -------
-    The provisional motion from the state to ``until_ns``.
-    """
-    model, interval = VehicleModel(*model_values), GravityInterval(*interval_values)
-    samples, events = 0, len(depth_ns)
-    while True:
-        event_ns = depth_ns[samples] if samples < events else until_ns
-        node_ns = _next_node(columns, clock[NODE], event_ns)
-        target_ns = event_ns if node_ns < 0 else node_ns
-        dR, dp, cov, impulse = _motion(columns, model, x, clock[NODE], target_ns, node_ns >= 0)
-        if node_ns >= 0:
-            predict(x, P, n, dR, dp, cov)
-            clock[NODE] = node_ns
-            _correct_at_node(columns, model, x, P, n, clock, interval, dR, impulse)
-        elif samples < events:
-            _correct_depth(x, P, n, (dR, dp, cov), model.body_p_port, depth_m[samples], depth_variance[samples])
-            samples += 1
-        else:
-            return dR, dp, cov
-
-
-@compiled
 def open_interval(columns: Columns, dvl_p_imu: Floats, interval: GravityInterval, clock: Ints) -> None:
     """Begin a gravity interval at the node."""
     velocity = _velocity_at_node(columns, clock[NODE], dvl_p_imu)
@@ -147,7 +95,7 @@ def _velocity_at_node(columns: Columns, node_ns: int, dvl_p_imu: Floats) -> Floa
 
 
 @compiled
-def _next_node(columns: Columns, node_ns: int, until_ns: int) -> int:
+def next_node(columns: Columns, node_ns: int, until_ns: int) -> int:
     """The first node after one instant, when it is reached at another; else -1."""
     imu_ns, dvl_ns = columns[0], columns[3]
     k, seen = rows_until(dvl_ns, node_ns), rows_until(imu_ns, until_ns)
@@ -157,32 +105,7 @@ def _next_node(columns: Columns, node_ns: int, until_ns: int) -> int:
 
 
 @compiled
-def _correct_at_node(
-    columns: Columns,
-    model: VehicleModel,
-    x: Floats,
-    P: Floats,
-    n: int,
-    clock: Ints,
-    interval: GravityInterval,
-    dR: Floats,
-    impulse: Floats,
-) -> None:
-    """Apply what holds at a node that was reached by a rotation, with an integral of the specific force."""
-    if model.gravity_interval_ns > 0:
-        _extend(interval, dR, impulse)
-        if clock[NODE] - clock[OPENED] >= model.gravity_interval_ns:
-            _correct_gravity(columns, model, x, P, n, clock, interval)
-            open_interval(columns, model.dvl_p_imu, interval, clock)
-    if model.is_planar:
-        values = (model.plane_z_m, 0.0, 0.0)
-        variances = (model.plane_z_variance, model.plane_tilt_variance, model.plane_tilt_variance)
-        for k in range(3):
-            _correct_state(x, P, n, 2 + k, values[k], variances[k])
-
-
-@compiled
-def _motion(
+def motion_between(
     columns: Columns, model: VehicleModel, x: Floats, start_ns: int, end_ns: int, to_node: bool
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Motion between two instants, and the integral of the specific force.
@@ -211,6 +134,42 @@ def _motion(
         duration, w, v, psd, f, no_bias, earth, model.body_p_dvl, model.gyro_noise_density
     )
     return dR, dp, motion_cov, impulse
+
+
+@compiled
+def advance_to_node(
+    columns: Columns,
+    model: VehicleModel,
+    x: Floats,
+    P: Floats,
+    n: int,
+    clock: Ints,
+    interval: GravityInterval,
+    node_ns: int,
+    motion: Motion,
+    impulse: Floats,
+) -> None:
+    """Predict over a motion to a node and apply what holds there.
+
+    Parameters
+    ----------
+    x, P, n, clock, interval
+        Filter state; changed.
+    impulse
+        Integral of the specific force over the motion, in its first frame, shape (3,), m/s.
+    """
+    predict(x, P, n, motion[0], motion[1], motion[2])
+    clock[NODE] = node_ns
+    if model.gravity_interval_ns > 0:
+        _extend(interval, motion[0], impulse)
+        if clock[NODE] - clock[OPENED] >= model.gravity_interval_ns:
+            _correct_gravity(columns, model, x, P, n, clock, interval)
+            open_interval(columns, model.dvl_p_imu, interval, clock)
+    if model.is_planar:
+        values = (model.plane_z_m, 0.0, 0.0)
+        variances = (model.plane_z_variance, model.plane_tilt_variance, model.plane_tilt_variance)
+        for k in range(3):
+            _correct_state(x, P, n, 2 + k, values[k], variances[k])
 
 
 @compiled
@@ -254,9 +213,9 @@ def _correct_state(x: Floats, P: Floats, n: int, at: int, value: float, variance
 
 
 @compiled
-def _correct_depth(x: Floats, P: Floats, n: int, motion: Motion, port: Floats, z_m: float, variance_m2: float) -> None:
+def correct_depth(x: Floats, P: Floats, n: int, motion: Motion, port: Floats, z_m: float, variance_m2: float) -> None:
     """Correct by the height of the pressure port: ``z = p_t,z + (R_t port)_z``."""
-    moment = moment_after(x, motion[0], motion[1], motion[2])
+    moment = moment_after(x, motion)
     down = moment.world_R_body[2]
     h_b, h = np.empty(POSE), np.zeros(POSE)
     predicted = moment.position[2]

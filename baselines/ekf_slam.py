@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import ClassVar
 
 import gtsam
@@ -11,9 +10,10 @@ import numpy as np
 from pydantic import Field
 
 from baselines.causal import CausalEstimates
-from baselines.ekf_landmarks import GATED, NEW, NO_SLOT, USED, SonarModel, observe_frame, pose_after
-from baselines.ekf_prediction import NODE, GravityInterval, Motion, VehicleModel, advance, open_interval
+from baselines.ekf_landmarks import GATED, NEW, NO_SLOT, USED, DetectionColumns, SonarModel
+from baselines.ekf_prediction import NODE, GravityInterval, VehicleModel, open_interval
 from baselines.ekf_state import LANDMARK, POSE
+from baselines.ekf_window import DepthColumns, DetectionOutcomes, PoseArrays, process_window
 from baselines.euler import euler_from_rates, euler_from_rotation
 from sonar_graph.calibration import Calibration, Section, Start
 from sonar_graph.errors import EstimatorError, MeasurementError
@@ -90,8 +90,9 @@ class EkfSlam:
         self._interval = GravityInterval(np.eye(3), np.zeros(3), np.zeros(4))
         self._vehicle_values, self._sonar_values = (*self._vehicle,), (*self._sonar,)
         self._interval_values = (*self._interval,)
-        self._started = False
-        self._done_ns = np.iinfo(np.int64).min
+        self._depth_variance = calibration.depth.sigma_m**2
+        self._reached_ns = _NEVER
+        self._done_ns = int(np.iinfo(np.int64).min)
 
     def process(self, measurements: Measurements) -> Estimate | None:
         """Take in what was measured and return the causal estimate at ``measurements.end_ns``.
@@ -103,18 +104,24 @@ class EkfSlam:
         EstimatorError
             When the pitch comes so near 90 degrees that the Euler angles are singular.
         MeasurementError
-            When a range or azimuth is not finite.
+            When a range or azimuth is not finite, or a row is stamped after ``end_ns``.
         """
         self._odometry.add(measurements.imu, measurements.dvl)
-        depth = self._depth_columns(measurements.depth)
-        for frame in _frames(measurements.detections):
-            depth = self._process_frame(frame, depth)
+        self._start()
+        detections, depth = measurements.detections, measurements.depth
+        _check(detections, depth, measurements.end_ns)
+        ids, refusals = self._identify(detections)
+        since_ns = max(self._done_ns, self._reached_ns)
         self._done_ns = max(self._done_ns, measurements.end_ns)
-        if not self._has_started(measurements.end_ns):
+        if measurements.end_ns < max(self._reached_ns, int(self._clock[NODE])):
+            self._record(detections, ids, refusals, _NO_OUTCOMES)
             return None
-        motion, _ = self._advance(depth, measurements.end_ns)
+        columns = self._detection_columns(detections, ids, refusals)
+        frame_ns = np.maximum(detections.stamps_ns, since_ns) if detections else _NO_STAMPS
+        outcomes, pose = self._run(_since(depth, since_ns), frame_ns, columns, measurements.end_ns)
+        self._record(detections, ids, refusals, outcomes)
         self._odometry.forget_before(int(self._clock[NODE]))
-        estimate = self._estimate(measurements.end_ns, motion)
+        estimate = Estimate(measurements.end_ns, gtsam.Pose3(gtsam.Rot3(pose[0]), pose[1]), pose[2])
         self._estimates.keep(estimate)
         return estimate
 
@@ -141,42 +148,66 @@ class EkfSlam:
         n = self._n
         return int(self._clock[NODE]), self._x[:n].copy(), self._P[:n, :n].copy()
 
-    def _has_started(self, instant_ns: int) -> bool:
-        """Whether the start was reached by then; sets the clock when it is."""
-        if self._started:
-            return instant_ns >= self._clock[NODE]
+    def _start(self) -> None:
+        """Set the clock once the first node is covered by IMU rows from both sides."""
+        if self._reached_ns < _NEVER:
+            return
         start_ns = self._odometry.start_ns()
-        if start_ns is None or not len(self._odometry.nodes(start_ns - 1, instant_ns)):
-            return False
-        self._started = True
+        if start_ns is None:
+            return
+        columns = self._odometry.columns()
+        imu_ns = columns[0]
+        self._reached_ns = int(imu_ns[np.searchsorted(imu_ns, start_ns)])
         self._clock[NODE] = start_ns
-        open_interval(self._odometry.columns(), self._vehicle.dvl_p_imu, self._interval, self._clock)
-        return True
+        open_interval(columns, self._vehicle.dvl_p_imu, self._interval, self._clock)
 
-    def _depth_columns(self, depth: Depth | None) -> tuple[Ints, Floats, Floats]:
-        """Stamps, heights and variances of the samples that are not late."""
-        if depth is None:
-            return _NO_DEPTH
-        first = int(np.searchsorted(depth.stamps_ns, self._done_ns))
-        default = self._calibration.depth.sigma_m**2
-        variance = np.where(np.isnan(depth.variance_m2), default, depth.variance_m2)
-        return depth.stamps_ns[first:], depth.z_m[first:], variance[first:]
+    def _identify(self, detections: LandmarkDetections | None) -> tuple[list[int], list[Outcome | None]]:
+        """The most probable identity of each row, and why it is not used, if so."""
+        if detections is None:
+            return [], []
+        identities = identify(detections, self._params.minimum_id_probability)
+        refusals = [
+            self._refusal(stamp_ns) or reason
+            for stamp_ns, reason in zip(detections.stamps_ns.tolist(), identities.refusals, strict=True)
+        ]
+        return identities.ids.tolist(), refusals
 
-    def _advance(self, depth: tuple[Ints, Floats, Floats], until_ns: int) -> tuple[Motion, tuple[Ints, Floats, Floats]]:
-        """Predict up to an instant; returns the provisional motion to it and the depth samples after it."""
-        stamps_ns, z_m, variance = depth
-        first, last = np.searchsorted(stamps_ns, [self._clock[NODE], until_ns + 1])
-        motion = advance(
+    def _refusal(self, stamp_ns: int) -> Outcome | None:
+        """Why nothing stamped then can be used."""
+        if stamp_ns < self._reached_ns:
+            return Outcome.UNLOCATED
+        return Outcome.LATE if stamp_ns < self._done_ns else None
+
+    def _detection_columns(
+        self, detections: LandmarkDetections | None, ids: list[int], refusals: list[Outcome | None]
+    ) -> DetectionColumns:
+        """What compiled code needs of the detections; makes room for those of new landmarks."""
+        if detections is None:
+            return _NO_DETECTIONS
+        slots = [
+            NO_SLOT if reason else self._slots.setdefault(landmark_id, len(self._slots))
+            for landmark_id, reason in zip(ids, refusals, strict=True)
+        ]
+        self._make_room()
+        return np.array(slots), detections.range_m, detections.azimuth_rad, detections.range_azimuth_cov
+
+    def _run(
+        self, depth: DepthColumns, frame_ns: Ints, detections: DetectionColumns, until_ns: int
+    ) -> tuple[DetectionOutcomes, PoseArrays]:
+        """Take the filter to an instant."""
+        self._n, outcomes, pose = process_window(
             self._odometry.columns(),
             self._vehicle_values,
+            self._sonar_values,
             self._x,
             self._P,
             self._n,
             self._clock,
             self._interval_values,
-            stamps_ns[first:last],
-            z_m[first:last],
-            variance[first:last],
+            depth,
+            self._depth_variance,
+            frame_ns,
+            detections,
             until_ns,
         )
         if math.cos(self._x[4]) < SINGULAR_COSINE:
@@ -184,54 +215,24 @@ class EkfSlam:
                 f"ekf-slam: pitch is {math.degrees(self._x[4]):.2f} deg at {int(self._clock[NODE])} ns, where the Euler"
                 " angles of its state are singular; use isam2 for this log"
             )
-        return motion, (stamps_ns[last:], z_m[last:], variance[last:])
+        return outcomes, pose
 
-    def _process_frame(
-        self, frame: LandmarkDetections, depth: tuple[Ints, Floats, Floats]
-    ) -> tuple[Ints, Floats, Floats]:
-        """Take in the detections of one frame; returns the depth samples after it."""
-        stamp_ns = int(frame.stamps_ns[0])
-        identities = identify(frame, self._params.minimum_id_probability)
-        ids = identities.ids.tolist()
-        refusal = self._refusal(stamp_ns)
-        refusals = [refusal or reason for reason in identities.refusals]
-        if all(refusals):
-            for landmark_id, reason in zip(ids, refusals, strict=True):
-                self._journal.record(stamp_ns, landmark_id, reason or Outcome.NO_IDENTITY)
-            return depth
-        motion, depth = self._advance(depth, stamp_ns)
-        rows = self._observe(frame, ids, refusals, motion)
-        for landmark_id, reason, (outcome, innovation, cov) in zip(ids, refusals, rows, strict=True):
-            self._journal.record(stamp_ns, landmark_id, reason or OUTCOMES[outcome], innovation, cov)
-        return depth
-
-    def _refusal(self, stamp_ns: int) -> Outcome | None:
-        """Why nothing stamped then can be used."""
-        if self._started and stamp_ns < self._done_ns:
-            return Outcome.LATE
-        return None if self._has_started(stamp_ns) else Outcome.UNLOCATED
-
-    def _observe(
-        self, frame: LandmarkDetections, ids: list[int], refusals: list[Outcome | None], motion: Motion
-    ) -> list[tuple[int, Floats, Floats]]:
-        """Correct by the rows of a frame that are not refused."""
-        slots = [
-            NO_SLOT if reason else self._slots.setdefault(landmark_id, len(self._slots))
-            for landmark_id, reason in zip(ids, refusals, strict=True)
-        ]
-        self._make_room()
-        self._n, outcomes, innovations, covs = observe_frame(
-            self._x,
-            self._P,
-            self._n,
-            *motion,
-            self._sonar_values,
-            np.array(slots),
-            frame.range_m,
-            frame.azimuth_rad,
-            frame.range_azimuth_cov,
-        )
-        return list(zip(outcomes.tolist(), innovations, covs, strict=True))
+    def _record(
+        self,
+        detections: LandmarkDetections | None,
+        ids: list[int],
+        refusals: list[Outcome | None],
+        outcomes: DetectionOutcomes,
+    ) -> None:
+        if detections is None:
+            return
+        kinds, innovations, covs = outcomes
+        for row, (landmark_id, reason) in enumerate(zip(ids, refusals, strict=True)):
+            stamp_ns = int(detections.stamps_ns[row])
+            if reason:
+                self._journal.record(stamp_ns, landmark_id, reason)
+            else:
+                self._journal.record(stamp_ns, landmark_id, OUTCOMES[int(kinds[row])], innovations[row], covs[row])
 
     def _make_room(self) -> None:
         needed, room = POSE + LANDMARK * len(self._slots), len(self._x)
@@ -242,29 +243,38 @@ class EkfSlam:
         x[:room], P[:room, :room] = self._x, self._P
         self._x, self._P = x, P
 
-    def _estimate(self, stamp_ns: int, motion: Motion) -> Estimate:
-        world_R_body, position, cov = pose_after(self._x, self._P, *motion)
-        return Estimate(stamp_ns, gtsam.Pose3(gtsam.Rot3(world_R_body), position), cov)
+
+_NEVER = int(np.iinfo(np.int64).max)
+_NO_STAMPS = np.empty(0, np.int64)
+_NO_DEPTH = (_NO_STAMPS, np.empty(0), np.empty(0))
+_NO_DETECTIONS = (_NO_STAMPS, np.empty(0), np.empty(0), np.empty((0, 2, 2)))
+_NO_OUTCOMES = (_NO_STAMPS, np.empty((0, 2)), np.empty((0, 2, 2)))
 
 
-_NO_DEPTH = (np.empty(0, np.int64), np.empty(0), np.empty(0))
-
-
-def _frames(detections: LandmarkDetections | None) -> list[LandmarkDetections]:
-    """Detections by stamp: one block for each sonar frame."""
-    if detections is None:
-        return []
-    for name in ("range_m", "azimuth_rad"):
+def _check(detections: LandmarkDetections | None, depth: Depth | None, end_ns: int) -> None:
+    """Refuse what can only be a mistake of the caller."""
+    for block in (detections, depth):
+        if block is not None and block.stamps_ns[-1] > end_ns:
+            raise MeasurementError(
+                f"Measurements: {type(block).__name__} has a row at {block.stamps_ns[-1]} ns, after end_ns = {end_ns};"
+                " hand it in with the call that reaches it"
+            )
+    for name in ("range_m", "azimuth_rad") if detections is not None else ():
         finite = np.isfinite(getattr(detections, name))
         if not finite.all():
             raise MeasurementError(
                 f"LandmarkDetections.{name}: row {finite.argmin()} is not finite; leave such rows out of the log"
             )
-    if detections.stamps_ns[0] == detections.stamps_ns[-1]:
-        return [detections]
-    cuts = np.flatnonzero(np.diff(detections.stamps_ns)) + 1
-    edges = [0, *cuts.tolist(), len(detections)]
-    return [detections.rows(slice(first, last)) for first, last in pairwise(edges)]
+
+
+def _since(depth: Depth | None, since_ns: int) -> DepthColumns:
+    """Depth samples that are not older than an instant."""
+    if depth is None:
+        return _NO_DEPTH
+    if depth.stamps_ns[0] >= since_ns:
+        return depth.stamps_ns, depth.z_m, depth.variance_m2
+    first = int(np.searchsorted(depth.stamps_ns, since_ns))
+    return depth.stamps_ns[first:], depth.z_m[first:], depth.variance_m2[first:]
 
 
 def _start_state(start: Start) -> tuple[Floats, Floats]:

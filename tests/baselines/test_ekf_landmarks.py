@@ -17,7 +17,7 @@ from baselines.ekf_landmarks import (
     location,
     moment_after,
     observation,
-    observe_frame,
+    observe_rows,
 )
 from sonar_graph.slam.association import gate_threshold
 from sonar_graph.slam.models import locate, range_azimuth
@@ -70,9 +70,11 @@ def state(angles, *landmarks, room=3):
 
 
 def frame(x, P, n, slots, z, model=None, R=NOISE):
-    range_m, azimuth = np.array(z).T.copy()
-    noise = np.array([R] * len(slots))
-    return observe_frame(x, P, n, *motion(), (*(model or sonar()),), np.array(slots), range_m, azimuth, noise)
+    m, (range_m, azimuth) = len(slots), np.array(z).T.copy()
+    columns = np.array(slots), range_m, azimuth, np.array([R] * m)
+    outcomes, innovations, covs = np.empty(m, np.int64), np.full((m, 2), np.nan), np.full((m, 2, 2), np.nan)
+    n = observe_rows(x, P, n, motion(), model or sonar(), columns, 0, m, outcomes, innovations, covs)
+    return n, outcomes, innovations, covs
 
 
 def difference(ahead, behind):
@@ -86,7 +88,7 @@ def difference(ahead, behind):
 def test_jacobians_of_the_observation_are_the_numerical_ones(angles, view):
     x, _, _ = state(angles)
     p = locate(body(x).compose(MOUNTING), *view)
-    moment = moment_after(x, *motion())
+    moment = moment_after(x, motion())
     z, H_b, H_p = observation(moment, p, sonar().body_R_sonar, sonar().body_p_sonar)
 
     def seen(pose_state, point):
@@ -102,7 +104,7 @@ def test_jacobians_of_the_observation_are_the_numerical_ones(angles, view):
 @given(attitudes, views)
 def test_jacobians_of_the_augmentation_are_the_numerical_ones(angles, view):
     x, _, _ = state(angles)
-    moment = moment_after(x, *motion())
+    moment = moment_after(x, motion())
     point, G_b, G_z = location(moment, sonar().body_R_sonar, sonar().body_p_sonar, np.array(view[:2]), view[2])
 
     def located(pose_state, values):
@@ -178,7 +180,7 @@ def test_a_correction_is_the_textbook_s():
     x, P, n = state(np.array([0.1, -0.2, 0.5]))
     p = locate(body(x).compose(MOUNTING), 2.0, 0.3, 0.05)
     x, P, n = state(np.array([0.1, -0.2, 0.5]), p)
-    moment = moment_after(x, *motion())
+    moment = moment_after(x, motion())
     z, H_b, H_p = observation(moment, p, sonar().body_R_sonar, sonar().body_p_sonar)
     H = np.hstack([H_b @ moment.T, H_p])
     S = H @ P[:n, :n] @ H.T + NOISE + H_b @ moment.cov @ H_b.T
