@@ -16,7 +16,10 @@ from __future__ import annotations
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.kernels import SMALL_ANGLE_RAD, compiled
+from sonar_graph.navigation.kernels import compiled
+
+SERIES_ANGLE2 = 2.5e-3
+"""Squared angle (rad²) below which four terms of each series are exact to 1e-16."""
 
 
 @compiled
@@ -89,10 +92,12 @@ def integrate_steps(
 
 @compiled
 def _rotations(phi: Floats, turn: Floats, chord: Floats) -> None:
-    """Exp(phi) and J_l(phi) at once: they share sine and cosine."""
+    """Exp(phi) and J_l(phi) at once: they share sine and cosine, and a sample's turn needs neither."""
     angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
-    if angle2 < SMALL_ANGLE_RAD**2:
-        s1, s2, s3 = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0, 1.0 / 6.0 - angle2 / 120.0
+    if angle2 < SERIES_ANGLE2:
+        s1 = 1.0 - angle2 * (1.0 / 6.0 - angle2 * (1.0 / 120.0 - angle2 / 5040.0))
+        s2 = 0.5 - angle2 * (1.0 / 24.0 - angle2 * (1.0 / 720.0 - angle2 / 40320.0))
+        s3 = 1.0 / 6.0 - angle2 * (1.0 / 120.0 - angle2 * (1.0 / 5040.0 - angle2 / 362880.0))
     else:
         angle = np.sqrt(angle2)
         s1, s2 = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
