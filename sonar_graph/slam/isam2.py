@@ -102,8 +102,7 @@ class Isam2:
                 self._keyframes.advance(int(frame.stamps_ns[0]))
                 self._sightings.add(frame)
         self._keyframes.advance(measurements.end_ns)
-        if self._smoother.has_news:
-            self._smoother.update(self._keyframes.newest_s)
+        self._keyframes.update_if_new()
         if self._keyframes.newest_ns is None:
             return None
         motion = self._keyframes.motion_since_newest(measurements.end_ns)

@@ -16,6 +16,7 @@ from gtsam.symbol_shorthand import B, X
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu
 from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
+from sonar_graph.navigation.depth_mean import weights_at_end
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
 from sonar_graph.navigation.earth import earth_rate_in_world
 from sonar_graph.navigation.odometry import Odometry, Steps
@@ -90,9 +91,19 @@ class Keyframes:
             if node_ns - self.stamps_ns[-1] >= interval_ns:
                 self._set(node_ns)
 
-    def motion_to_frame(self, stamp_ns: int) -> PreintegratedMotion:
-        """Motion from the newest keyframe to a frame, after setting a keyframe if the frame deserves a newer one."""
-        motion = self.motion_since_newest(stamp_ns)
+    def set_for_frame(self, stamp_ns: int, motion: PreintegratedMotion) -> PreintegratedMotion:
+        """Set a keyframe if a frame deserves a newer one than the newest.
+
+        Parameters
+        ----------
+        motion
+            From the newest keyframe to the frame.
+
+        Returns
+        -------
+        PreintegratedMotion
+            From what is then the newest keyframe to the frame.
+        """
         nodes = self.odometry.nodes(self.stamps_ns[-1], stamp_ns)
         if not len(nodes):
             return motion
@@ -112,6 +123,11 @@ class Keyframes:
         """Provisional motion from the newest keyframe to any later instant."""
         steps = self.odometry.steps_since_node(self.stamps_ns[-1], until_ns)
         return self._preintegrator.integrate(steps, self.bias(len(self.stamps_ns) - 1), self._earth_rate())
+
+    def update_if_new(self) -> None:
+        """Bring the smoother up to date when keyframes or landmarks were added since it last was."""
+        if self.smoother.has_new_variables:
+            self.smoother.update(self.newest_s)
 
     def bias(self, index: int) -> Floats:
         """Newest estimate of the gyro bias that holds from a keyframe on, shape (3,), rad/s."""
@@ -167,7 +183,7 @@ class Keyframes:
         return [factors.gravity_direction(X(j), *up)] if up else []
 
     def _depth(self, j: int, node_ns: int, steps: Steps, motion: PreintegratedMotion) -> list[gtsam.NonlinearFactor]:
-        """One factor for all samples since the last keyframe: their weighted mean at the mean of the ports."""
+        """One factor for all samples since the last keyframe, carried to this one and averaged there."""
         start_ns = self.stamps_ns[-1]
         rows = [block for depth in self._depths if (block := depth.between(start_ns, node_ns))]
         self._depths = [block for depth in self._depths if (block := depth.between(node_ns, LATEST_NS))]
@@ -175,12 +191,19 @@ class Keyframes:
             return []
         samples = Depth.concatenate(rows)
         variance = np.where(np.isnan(samples.variance_m2), self.calibration.depth.sigma_m**2, samples.variance_m2)
-        weights = np.asarray((1 / variance) / np.sum(1 / variance), dtype=np.float64)
-        port = np.array(self.calibration.depth.port_m)
         offsets_s = np.asarray((samples.stamps_ns - start_ns) * S_PER_NS, dtype=np.float64)
-        ports = self._preintegrator.path_of(port, steps, motion.bias, offsets_s)
-        mean_port_in_j = motion.i_T_j.transformTo(weights @ ports)
-        return [factors.depth(X(j), float(weights @ samples.z_m), mean_port_in_j, float(np.sum(1 / variance) ** -0.5))]
+        weights, mean_variance = weights_at_end(variance, motion.duration_s - offsets_s, self._wander_m2_s(steps))
+        port = np.array(self.calibration.depth.port_m)
+        mean_port = weights @ self._preintegrator.path_of(port, steps, motion.bias, offsets_s)
+        return [
+            factors.depth(X(j), float(weights @ samples.z_m), motion.i_T_j.transformTo(mean_port), mean_variance**0.5)
+        ]
+
+    def _wander_m2_s(self, steps: Steps) -> float:
+        """Spectral density of the vertical velocity noise over the steps, for the attitude of the newest keyframe."""
+        up = self.smoother.values.atPose3(self.newest_key).rotation().matrix()[2]
+        mean_psd = np.average(steps.velocity_psd, axis=0, weights=steps.duration_s)
+        return float(up @ mean_psd @ up)
 
     def _constrain(self, j: int) -> None:
         if self.calibration.planar:

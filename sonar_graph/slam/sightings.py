@@ -12,6 +12,7 @@ from gtsam.symbol_shorthand import L
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.slam import factors
 from sonar_graph.slam.association import DetectionJournal, gate_threshold, identify
 from sonar_graph.slam.keyframes import Keyframes
@@ -69,72 +70,107 @@ class Sightings:
                 self.journal.record(stamp_ns, landmark_id, late)
             return
         identities = identify(frame, self.policy.identity_probability)
-        accepted = {i for i, r in zip(identities.ids.tolist(), identities.refusals, strict=True) if r is None}
-        view = self._view(stamp_ns, accepted & self.ids) if accepted else None
-        for row, (landmark_id, refusal) in enumerate(zip(identities.ids.tolist(), identities.refusals, strict=True)):
-            if refusal is not None or view is None:
-                self.journal.record(stamp_ns, landmark_id, refusal or Outcome.NO_IDENTITY)
-                continue
-            if landmark_id in self.ids and landmark_id not in view.landmarks:
-                view = self._view(stamp_ns, accepted & self.ids)  # the frame shows a new landmark twice
-            z = np.array([frame.range_m[row], frame.azimuth_rad[row]])
-            cov = frame.range_azimuth_cov[row]
-            sight = self._sight_again if landmark_id in self.ids else self._sight_first
-            sight(view, landmark_id, z, self._default_cov if np.isnan(cov).any() else cov)
+        rows = zip(range(len(frame)), identities.ids.tolist(), identities.refusals, strict=True)
+        accepted = [(row, landmark_id) for row, landmark_id, refusal in rows if refusal is None]
+        for landmark_id, refusal in zip(identities.ids.tolist(), identities.refusals, strict=True):
+            if refusal is not None:
+                self.journal.record(stamp_ns, landmark_id, refusal)
+        if accepted:
+            self._sight(frame, stamp_ns, accepted)
 
-    def _view(self, stamp_ns: int, landmark_ids: set[int]) -> View:
-        """What the graph expects at a frame; sets a keyframe if one is due and brings the smoother up to date."""
-        motion = self.keyframes.motion_to_frame(stamp_ns)
-        if self.smoother.has_news:
-            self.smoother.update(self.keyframes.newest_s)
-        ids = sorted(landmark_ids)
-        pose_key = self.keyframes.newest_key
+    def _sight(self, frame: LandmarkDetections, stamp_ns: int, accepted: list[tuple[int, int]]) -> None:
+        self.keyframes.update_if_new()
+        seen = self.keyframes.motion_since_newest(stamp_ns)
+        view = self._view(seen, {landmark_id for _, landmark_id in accepted} & self.ids)
+        tie = Tie.between(self.keyframes.set_for_frame(stamp_ns, seen), self.keyframes.newest_key, self._body_T_sonar)
+        for row, landmark_id in accepted:
+            cov = frame.range_azimuth_cov[row]
+            sighting = Sighting(
+                stamp_ns,
+                landmark_id,
+                np.array([frame.range_m[row], frame.azimuth_rad[row]]),
+                self._default_cov if np.isnan(cov).any() else cov,
+            )
+            if landmark_id in view.landmarks:
+                self._sight_again(view, tie, sighting)
+            elif landmark_id not in self.ids:
+                self._sight_first(view, tie, sighting)
+            else:
+                self.journal.record(stamp_ns, landmark_id, Outcome.REPEATED)
+        self.keyframes.update_if_new()
+
+    def _view(self, motion: PreintegratedMotion, landmark_ids: set[int]) -> View:
+        key = self.keyframes.newest_key
         return View(
-            stamp_ns=stamp_ns,
-            pose_key=pose_key,
-            world_T_keyframe=self.smoother.values.atPose3(pose_key),
+            pose_key=key,
+            world_T_keyframe=self.smoother.values.atPose3(key),
             motion=motion,
             body_T_sonar=self._body_T_sonar,
-            landmarks={i: self.smoother.values.atPoint3(L(i)) for i in ids},
-            covariance=self.smoother.joint_covariance([pose_key, *map(L, ids)]),
+            landmarks={i: self.smoother.values.atPoint3(L(i)) for i in landmark_ids},
+            covariance=self.smoother.joint_covariance([key, *map(L, sorted(landmark_ids))]),
         )
 
-    def _sight_again(self, view: View, landmark_id: int, z: Floats, cov: Floats) -> None:
-        predicted, S, R = view.expect(landmark_id, cov)
-        innovation = np.array([z[0] - predicted[0], wrap_angle(z[1] - predicted[1])])
+    def _sight_again(self, view: View, tie: Tie, sighting: Sighting) -> None:
+        predicted, prior_cov = view.expect(sighting.landmark_id)
+        innovation = np.array([sighting.z[0] - predicted[0], wrap_angle(sighting.z[1] - predicted[1])])
+        S = prior_cov + sighting.cov
         distance = innovation @ np.linalg.solve(S, innovation)
         inside = self.policy.gate_probability == 1 or distance <= gate_threshold(self.policy.gate_probability, 2)
         outcome = Outcome.USED if inside else Outcome.GATED
-        self.journal.record(view.stamp_ns, landmark_id, outcome, innovation, S)
+        self.journal.record(sighting.stamp_ns, sighting.landmark_id, outcome, innovation, S)
         if inside:
-            self.smoother.add(
-                factors.landmark_sighting(
-                    view.pose_key, L(landmark_id), view.keyframe_T_sonar, z, R, self.policy.robust
-                )
-            )
+            self._add_factors(view, tie, sighting, view.landmarks[sighting.landmark_id], None)
 
-    def _sight_first(self, view: View, landmark_id: int, z: Floats, cov: Floats) -> None:
-        floor, sonar = self.calibration.floor, self.calibration.sonar
-        elevation = (
-            elevation_on_floor(view.world_T_sonar, z[0], z[1], floor.z_m, sonar.elevation_aperture_rad)
-            if floor
-            else None
-        )
-        point = locate(view.world_T_sonar, z[0], z[1], elevation or 0.0)
-        _, _, R = view.expect_at(point, cov)
-        self.ids.add(landmark_id)
-        self.journal.record(view.stamp_ns, landmark_id, Outcome.NEW)
-        self.smoother.add_lasting(L(landmark_id), point)
+    def _sight_first(self, view: View, tie: Tie, sighting: Sighting) -> None:
+        floor, sonar, (range_m, azimuth_rad) = self.calibration.floor, self.calibration.sonar, sighting.z
+        elevation = None
+        if floor:
+            elevation = elevation_on_floor(
+                view.world_T_sonar, range_m, azimuth_rad, floor.z_m, sonar.elevation_aperture_rad
+            )
+        point = locate(view.world_T_sonar, range_m, azimuth_rad, elevation or 0.0)
+        self.ids.add(sighting.landmark_id)
+        self.journal.record(sighting.stamp_ns, sighting.landmark_id, Outcome.NEW)
+        self.smoother.add_lasting(L(sighting.landmark_id), point)
+        self._add_factors(view, tie, sighting, point, None if floor else self._elevation_sigma_rad)
+        if floor:
+            self.smoother.add([factors.floor_prior(L(sighting.landmark_id), floor.z_m, floor.sigma_m)])
+
+    def _add_factors(
+        self, view: View, tie: Tie, sighting: Sighting, point: Floats, elevation_sigma_rad: float | None
+    ) -> None:
+        R = sighting.cov + np.diag(view.noise_of(tie.motion, point))
+        key, robust = L(sighting.landmark_id), self.policy.robust
         self.smoother.add(
             factors.landmark_sighting(
-                view.pose_key,
-                L(landmark_id),
-                view.keyframe_T_sonar,
-                z,
-                R,
-                self.policy.robust,
-                None if floor else self._elevation_sigma_rad,
+                tie.pose_key, key, tie.keyframe_T_sonar, sighting.z, R, robust, elevation_sigma_rad
             )
         )
-        if floor:
-            self.smoother.add([factors.floor_prior(L(landmark_id), floor.z_m, floor.sigma_m)])
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """A detection with an identity."""
+
+    stamp_ns: int
+    landmark_id: int
+    z: Floats
+    """Range (m) and azimuth (rad), shape (2,)."""
+    cov: Floats
+    """Their noise, shape (2, 2)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tie:
+    """How a frame hangs on the keyframe that gets its factors."""
+
+    pose_key: int
+    motion: PreintegratedMotion
+    """From that keyframe to the frame; its noise blurs the sightings."""
+    keyframe_T_sonar: gtsam.Pose3
+    """The sonar at the frame, in the keyframe's body frame."""
+
+    @classmethod
+    def between(cls, motion: PreintegratedMotion, pose_key: int, body_T_sonar: gtsam.Pose3) -> Tie:
+        """Tie by a motion and the sonar's mounting."""
+        return cls(pose_key, motion, motion.i_T_j.compose(body_T_sonar))

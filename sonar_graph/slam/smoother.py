@@ -57,6 +57,8 @@ class Smoother:
         self._pose_times: dict[int, float] = {}
         self._lasting: list[int] = []
         self._window = self._new_window()
+        self._joint: gtsam.JointMarginal | None = None
+        self._joint_keys: set[int] = set()
         self._solved: tuple[gtsam.Values, gtsam.Marginals] | None = None
         self._solved_size = 0
 
@@ -87,9 +89,9 @@ class Smoother:
             self.graph.push_back(factor)
 
     @property
-    def has_news(self) -> bool:
-        """Whether factors wait for an update."""
-        return self._pending.size() > 0
+    def has_new_variables(self) -> bool:
+        """Whether variables wait for an update. Factors alone can wait for the next keyframe."""
+        return self._pending_values.size() > 0
 
     def update(self, time_s: float) -> None:
         """Bring the window's estimate up to date with what was added."""
@@ -98,6 +100,7 @@ class Smoother:
         self._pending = gtsam.NonlinearFactorGraph()
         self._pending_values = gtsam.Values()
         self._pending_times = {}
+        self._joint = None
         self.values.update(self._window.calculateEstimate())
         if self.graph.size() >= self._restart_size and self._is_stale():
             self._restart(time_s)
@@ -127,8 +130,15 @@ class Smoother:
         return self._window.marginalCovariance(key)
 
     def joint_covariance(self, keys: list[int]) -> gtsam.JointMarginal:
-        """Joint marginal covariance of variables in the window."""
-        return self._window.getISAM2().jointMarginalCovariance(keys)
+        """Joint marginal covariance of variables in the window, and possibly of more of them.
+
+        One computation serves until the next update: it also covers the landmarks and biases that were asked for
+        before, since successive frames show mostly the same.
+        """
+        if self._joint is None or not self._joint_keys.issuperset(keys):
+            self._joint_keys = set(keys) | self._joint_keys.intersection(self._lasting)
+            self._joint = self._window.getISAM2().jointMarginalCovariance(list(self._joint_keys))
+        return self._joint
 
     def solve_history(self) -> tuple[gtsam.Values, gtsam.Marginals]:
         """Solve the whole graph from the present values; the solution and its marginal covariances."""
