@@ -29,9 +29,8 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.kernels import compiled, left_jacobian, rotation_exp, skew
 from sonar_graph.navigation.odometry import Steps
-from sonar_graph.navigation.recursion import integrate_steps
+from sonar_graph.navigation.recursion import integrate_steps, trace_point
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,24 +111,4 @@ class Preintegrator:
         Floats
             Shape (n, 3), m; linear within a step.
         """
-        return _path(steps.duration_s, steps.rate, steps.velocity, bias, self.body_p_dvl, point, offsets_s)
-
-
-@compiled
-def _path(
-    duration: Floats, rate: Floats, velocity: Floats, bias: Floats, lever: Floats, point: Floats, offsets: Floats
-) -> Floats:
-    positions = np.empty((len(offsets), 3))
-    dR, dp = np.eye(3), np.zeros(3)
-    before, elapsed, n = dR @ point, 0.0, 0
-    for k in range(len(duration)):
-        w = rate[k] - bias
-        dp = dp + dR @ (left_jacobian(w * duration[k]) @ (velocity[k] - skew(w) @ lever)) * duration[k]
-        dR = dR @ rotation_exp(w * duration[k])
-        after = dp + dR @ point
-        while n < len(offsets) and offsets[n] <= elapsed + duration[k]:
-            positions[n] = before + (offsets[n] - elapsed) / duration[k] * (after - before)
-            n += 1
-        before, elapsed = after, elapsed + duration[k]
-    positions[n:] = before
-    return positions
+        return trace_point(steps.duration_s, steps.rate, steps.velocity, bias, self.body_p_dvl, point, offsets_s)

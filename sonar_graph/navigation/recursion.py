@@ -91,6 +91,54 @@ def integrate_steps(
 
 
 @compiled
+def trace_point(
+    duration: Floats, rate: Floats, velocity: Floats, bias: Floats, lever: Floats, point: Floats, offsets: Floats
+) -> Floats:
+    """Where a point of the body is at times after the first instant, in frame i, shape (n, 3); the mean motion only.
+
+    Parameters
+    ----------
+    point
+        In the body frame, shape (3,), m.
+    offsets
+        Seconds after the start of the steps, not decreasing, shape (n,). Motion within a step is taken as straight.
+    """
+    positions = np.empty((len(offsets), 3))
+    dR, dp = np.eye(3), np.zeros(3)
+    turn, chord, work = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    w, phi, u, step, before, after = np.empty(3), np.empty(3), np.empty(3), np.empty(3), point.copy(), point.copy()
+    elapsed, n = 0.0, 0
+    for k in range(len(duration)):
+        dt = duration[k]
+        for r in range(3):
+            w[r] = rate[k, r] - bias[r]
+            phi[r] = w[r] * dt
+        for r in range(3):
+            a, b = (r + 1) % 3, (r + 2) % 3
+            u[r] = velocity[k, r] - (w[a] * lever[b] - w[b] * lever[a])
+        _rotations(phi, turn, chord)
+        for r in range(3):
+            step[r] = (chord[r, 0] * u[0] + chord[r, 1] * u[1] + chord[r, 2] * u[2]) * dt
+        for r in range(3):
+            dp[r] += dR[r, 0] * step[0] + dR[r, 1] * step[1] + dR[r, 2] * step[2]
+        _product(dR, turn, work)
+        _copy(work, dR)
+        for r in range(3):
+            after[r] = dp[r] + dR[r, 0] * point[0] + dR[r, 1] * point[1] + dR[r, 2] * point[2]
+        while n < len(offsets) and offsets[n] <= elapsed + dt:
+            for r in range(3):
+                positions[n, r] = before[r] + (offsets[n] - elapsed) / dt * (after[r] - before[r])
+            n += 1
+        for r in range(3):
+            before[r] = after[r]
+        elapsed += dt
+    for m in range(n, len(offsets)):
+        for r in range(3):
+            positions[m, r] = before[r]
+    return positions
+
+
+@compiled
 def _rotations(phi: Floats, turn: Floats, chord: Floats) -> None:
     """Exp(phi) and J_l(phi) at once: they share sine and cosine, and a sample's turn needs neither."""
     angle2 = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]

@@ -31,8 +31,11 @@ def identify(detections: LandmarkDetections, minimum_probability: float) -> Iden
         Rows whose highest posterior is below it, or is not a number, or belongs to no identity (-1), are refused.
     """
     ids, probability = detections.most_probable()
-    accepted = (probability >= minimum_probability) & (ids >= 0)
-    return Identities(ids, [None if good else Outcome.NO_IDENTITY for good in accepted.tolist()])
+    refusals = [
+        None if p >= minimum_probability and landmark_id >= 0 else Outcome.NO_IDENTITY
+        for p, landmark_id in zip(probability.tolist(), ids.tolist(), strict=True)
+    ]
+    return Identities(ids, refusals)
 
 
 @cache

@@ -35,13 +35,14 @@ class Isam2Params(Section):
 
     lag_s: float = Field(30.0, gt=0)
     """Poses older than this are marginalised out of the incremental solution; a large value keeps the whole history."""
-    min_keyframe_interval_s: float = Field(1.0, ge=0)
-    """While landmarks are seen, keyframes are this far apart."""
     max_keyframe_interval_s: float = Field(5.0, gt=0)
     """A keyframe is set at the latest after this time."""
-    motion_noise_share: float = Field(0.1, gt=0)
-    """While landmarks are seen, a keyframe is set sooner once the variance of the motion since the last one exceeds
-    this share of the sonar's variance."""
+    motion_noise_share: float = Field(0.1, ge=0)
+    """While landmarks are seen, a keyframe is set sooner: once the variance of the motion since the last one exceeds
+    this share of the sonar's variance. 0: every frame with a landmark."""
+    waiting_gain: float = Field(0.5, ge=0)
+    """Sightings wait for the next keyframe until what they would add, the sum of expected over measured variance,
+    exceeds this. 0: none waits."""
     bias_interval_s: float = Field(60.0, gt=0)
     """The gyro bias is constant over stretches of this length."""
     relinearize_threshold: float = Field(0.01, gt=0)
@@ -75,10 +76,8 @@ class Isam2:
         self._calibration = calibration
         self._params: Isam2Params = params or Isam2Params()
         p = self._params
-        self._smoother = Smoother(p.lag_s, p.relinearize_threshold, p.stale_shift_m)
-        policy = KeyframePolicy(
-            p.min_keyframe_interval_s, p.max_keyframe_interval_s, p.motion_noise_share, p.bias_interval_s
-        )
+        self._smoother = Smoother(p.lag_s, p.relinearize_threshold, p.stale_shift_m, p.waiting_gain)
+        policy = KeyframePolicy(p.max_keyframe_interval_s, p.motion_noise_share, p.bias_interval_s)
         self._keyframes = Keyframes(calibration, policy, self._smoother)
         sightings = SightingPolicy(p.identity_probability, p.gate_probability, p.kernel, p.kernel_width)
         self._sightings = Sightings(calibration, sightings, self._smoother, self._keyframes)
@@ -102,7 +101,7 @@ class Isam2:
                 self._keyframes.advance(int(frame.stamps_ns[0]))
                 self._sightings.add(frame)
         self._keyframes.advance(measurements.end_ns)
-        self._keyframes.update_if_new()
+        self._keyframes.update_if_due()
         if self._keyframes.newest_ns is None:
             return None
         motion = self._keyframes.motion_since_newest(measurements.end_ns)

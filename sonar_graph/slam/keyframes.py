@@ -1,7 +1,7 @@
 """Keyframes: where they are set, and the factors that odometry, depth and gravity give each of them.
 
-A keyframe sits at a node of the odometry (a DVL stamp). One is due ``max_interval_s`` after the last, or, when
-landmarks are seen, ``min_interval_s`` after it or as soon as the motion since has blurred what the sonar sees.
+A keyframe sits at a node of the odometry (a DVL stamp). One is due ``max_interval_s`` after the last, and sooner when
+landmarks are seen and the motion since has blurred what the sonar sees: then sightings would lose by hanging on it.
 The gyro bias is constant over stretches of ``bias_interval_s`` and walks between them.
 """
 
@@ -31,10 +31,9 @@ LATEST_NS = np.iinfo(np.int64).max
 class KeyframePolicy:
     """When a keyframe is set."""
 
-    min_interval_s: float
     max_interval_s: float
     motion_noise_share: float
-    """Variance of the motion since the last keyframe over the sonar's, above which ``min_interval_s`` is not kept."""
+    """Variance of the motion since the last keyframe over the sonar's, above which a frame gets a keyframe."""
     bias_interval_s: float
 
 
@@ -105,17 +104,15 @@ class Keyframes:
             From what is then the newest keyframe to the frame.
         """
         nodes = self.odometry.nodes(self.stamps_ns[-1], stamp_ns)
-        if not len(nodes):
-            return motion
-        aged = nodes[-1] - self.stamps_ns[-1] >= self.policy.min_interval_s / S_PER_NS
-        if not aged and not self._is_noisy(motion):
+        if not len(nodes) or not self._is_noisy(motion):
             return motion
         self._set(int(nodes[-1]))
         return self.motion_since_newest(stamp_ns)
 
     def _is_noisy(self, motion: PreintegratedMotion) -> bool:
-        """Whether the motion's noise would blur what the sonar saw."""
-        sonar, variance = self.calibration.sonar, np.diag(motion.covariance)
+        """Whether the motion's noise, and what the gyro bias may add to it, would blur what the sonar saw."""
+        sonar, bias_sigma = self.calibration.sonar, self.calibration.imu.gyro_bias_sigma
+        variance = np.diag(motion.covariance) + np.sum(np.square(motion.D_bias * bias_sigma), axis=1)
         share = max(variance[:3].max() / sonar.azimuth_sigma_rad**2, variance[3:].max() / sonar.range_sigma_m**2)
         return bool(share > self.policy.motion_noise_share)
 
@@ -124,9 +121,9 @@ class Keyframes:
         steps = self.odometry.steps_since_node(self.stamps_ns[-1], until_ns)
         return self._preintegrator.integrate(steps, self.bias(len(self.stamps_ns) - 1), self._earth_rate())
 
-    def update_if_new(self) -> None:
-        """Bring the smoother up to date when keyframes or landmarks were added since it last was."""
-        if self.smoother.has_new_variables:
+    def update_if_due(self) -> None:
+        """Bring the smoother up to date when what was added since it last was matters."""
+        if self.smoother.is_due:
             self.smoother.update(self.newest_s)
 
     def bias(self, index: int) -> Floats:
@@ -150,7 +147,7 @@ class Keyframes:
         self.smoother.add([factors.start_prior(X(0), self.calibration)])
         self.bias_keys.append(B(0))
         if self._estimates_bias:
-            self.smoother.add_lasting(B(0), np.zeros(3))
+            self.smoother.add_bias(B(0), np.zeros(3))
             self.smoother.add([factors.bias_prior(B(0), imu.gyro_bias_sigma)])
         self._constrain(0)
 
@@ -217,6 +214,6 @@ class Keyframes:
         old = self.bias_keys[i]
         new = B(gtsam.Symbol(old).index() + 1)
         self._bias_since_ns = node_ns
-        self.smoother.add_lasting(new, self.smoother.values.atPoint3(old))
+        self.smoother.add_bias(new, self.smoother.values.atPoint3(old))
         self.smoother.add([factors.bias_walk(old, new, walk * np.sqrt(elapsed_s))])
         return new

@@ -79,7 +79,7 @@ class Sightings:
             self._sight(frame, stamp_ns, accepted)
 
     def _sight(self, frame: LandmarkDetections, stamp_ns: int, accepted: list[tuple[int, int]]) -> None:
-        self.keyframes.update_if_new()
+        self.keyframes.update_if_due()
         seen = self.keyframes.motion_since_newest(stamp_ns)
         view = self._view(seen, {landmark_id for _, landmark_id in accepted} & self.ids)
         tie = Tie.between(self.keyframes.set_for_frame(stamp_ns, seen), self.keyframes.newest_key, self._body_T_sonar)
@@ -97,7 +97,7 @@ class Sightings:
                 self._sight_first(view, tie, sighting)
             else:
                 self.journal.record(stamp_ns, landmark_id, Outcome.REPEATED)
-        self.keyframes.update_if_new()
+        self.keyframes.update_if_due()
 
     def _view(self, motion: PreintegratedMotion, landmark_ids: set[int]) -> View:
         key = self.keyframes.newest_key
@@ -119,6 +119,7 @@ class Sightings:
         outcome = Outcome.USED if inside else Outcome.GATED
         self.journal.record(sighting.stamp_ns, sighting.landmark_id, outcome, innovation, S)
         if inside:
+            self.smoother.waiting_gain += float(np.max(np.diag(prior_cov) / np.diag(sighting.cov)))
             self._add_factors(view, tie, sighting, view.landmarks[sighting.landmark_id], None)
 
     def _sight_first(self, view: View, tie: Tie, sighting: Sighting) -> None:
@@ -131,7 +132,7 @@ class Sightings:
         point = locate(view.world_T_sonar, range_m, azimuth_rad, elevation or 0.0)
         self.ids.add(sighting.landmark_id)
         self.journal.record(sighting.stamp_ns, sighting.landmark_id, Outcome.NEW)
-        self.smoother.add_lasting(L(sighting.landmark_id), point)
+        self.smoother.add_landmark(L(sighting.landmark_id), point)
         self._add_factors(view, tie, sighting, point, None if floor else self._elevation_sigma_rad)
         if floor:
             self.smoother.add([factors.floor_prior(L(sighting.landmark_id), floor.z_m, floor.sigma_m)])

@@ -40,22 +40,30 @@ class Smoother:
         A variable is relinearised when any component of its change exceeds this (rad or m).
     stale_shift_m
         The window restarts when a landmark has moved by more than this from where it was linearised.
+    greatest_waiting_gain
+        An update is due when `waiting_gain` exceeds this.
     """
 
-    def __init__(self, lag_s: float, relinearize_threshold: float, stale_shift_m: float) -> None:
+    def __init__(
+        self, lag_s: float, relinearize_threshold: float, stale_shift_m: float, greatest_waiting_gain: float
+    ) -> None:
         self._lag_s = lag_s
         self._stale_shift_m = stale_shift_m
+        self._greatest_waiting_gain = greatest_waiting_gain
         self._restart_size = FIRST_RESTART
         self._threshold = relinearize_threshold
         self.graph = gtsam.NonlinearFactorGraph()
         """Every factor ever added."""
         self.values = gtsam.Values()
         """The newest estimate of every variable; of those that left the window, the last one there."""
+        self.waiting_gain = 0.0
+        """What the factors added since the last update would add: a sum of expected over measured variances."""
         self._pending = gtsam.NonlinearFactorGraph()
         self._pending_values = gtsam.Values()
         self._pending_times: dict[int, float] = {}
         self._pose_times: dict[int, float] = {}
-        self._lasting: list[int] = []
+        self._landmarks: list[int] = []
+        self._bias: list[int] = []
         self._window = self._new_window()
         self._joint: gtsam.JointMarginal | None = None
         self._joint_keys: set[int] = set()
@@ -76,11 +84,17 @@ class Smoother:
         self._pending_times[key] = time_s
         self._pose_times[key] = time_s
 
-    def add_lasting(self, key: int, point: Floats) -> None:
-        """A new landmark or bias, which never leaves the window."""
+    def add_landmark(self, key: int, point: Floats) -> None:
+        """A new landmark, which never leaves the window, with its first estimate."""
         self._pending_values.insert(key, point)
         self.values.insert(key, point)
-        self._lasting.append(key)
+        self._landmarks.append(key)
+
+    def add_bias(self, key: int, bias: Floats) -> None:
+        """A new gyro bias, with its first estimate. It stays in the window until the lag after the next one."""
+        self._pending_values.insert(key, bias)
+        self.values.insert(key, bias)
+        self._bias = [key]
 
     def add(self, factors: Iterable[gtsam.NonlinearFactor]) -> None:
         """New factors, used at the next update."""
@@ -89,17 +103,18 @@ class Smoother:
             self.graph.push_back(factor)
 
     @property
-    def has_new_variables(self) -> bool:
-        """Whether variables wait for an update. Factors alone can wait for the next keyframe."""
-        return self._pending_values.size() > 0
+    def is_due(self) -> bool:
+        """Whether an update is: variables wait for it, or factors that would change the estimate."""
+        return self._pending_values.size() > 0 or self.waiting_gain > self._greatest_waiting_gain
 
     def update(self, time_s: float) -> None:
         """Bring the window's estimate up to date with what was added."""
-        times: dict[Any, float] = self._pending_times | dict.fromkeys(self._lasting, time_s)
+        times: dict[Any, float] = self._pending_times | dict.fromkeys(self._landmarks + self._bias, time_s)
         self._window.update(self._pending, self._pending_values, times)
         self._pending = gtsam.NonlinearFactorGraph()
         self._pending_values = gtsam.Values()
         self._pending_times = {}
+        self.waiting_gain = 0.0
         self._joint = None
         self.values.update(self._window.calculateEstimate())
         if self.graph.size() >= self._restart_size and self._is_stale():
@@ -107,14 +122,14 @@ class Smoother:
 
     def _is_stale(self) -> bool:
         delta = self._window.getDelta()
-        return any(np.abs(delta.at(key)).max() > self._stale_shift_m for key in self._lasting)
+        return any(np.abs(delta.at(key)).max() > self._stale_shift_m for key in self._landmarks)
 
     def _restart(self, time_s: float) -> None:
         """Solve the history; start a window whose prior is the marginal of all that lies before it."""
         self._restart_size = int(RESTART_GROWTH * self.graph.size())
         self.values = solve(self.graph, self.values)
         times: dict[Any, float] = {key: t for key, t in self._pose_times.items() if t >= time_s - self._lag_s}
-        times |= dict.fromkeys(self._lasting, time_s)
+        times |= dict.fromkeys(self._landmarks + self._bias, time_s)
         inside, outside = _split(self.graph, set(times))
         values = gtsam.Values()
         for key in times:
@@ -132,11 +147,11 @@ class Smoother:
     def joint_covariance(self, keys: list[int]) -> gtsam.JointMarginal:
         """Joint marginal covariance of variables in the window, and possibly of more of them.
 
-        One computation serves until the next update: it also covers the landmarks and biases that were asked for
-        before, since successive frames show mostly the same.
+        One computation serves until the next update: it also covers the landmarks that were asked for before,
+        since successive frames show mostly the same.
         """
         if self._joint is None or not self._joint_keys.issuperset(keys):
-            self._joint_keys = set(keys) | self._joint_keys.intersection(self._lasting)
+            self._joint_keys = set(keys) | self._joint_keys.intersection(self._landmarks)
             self._joint = self._window.getISAM2().jointMarginalCovariance(list(self._joint_keys))
         return self._joint
 
