@@ -1,0 +1,129 @@
+"""Real data with independent truth: UTIAS MRCLAM data set 6, robots 1 to 5, identities known, start pose given.
+
+Every robot is run with the same noise parameters. Trajectory errors are horizontal rms after the best SE(2) alignment, of
+the causal estimate and of the smoothed one; landmark errors the same after aligning the map itself.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from common import in_parallel, make_parser, print_figures, print_table, recording
+
+from sonar_graph.evaluation.comparison import compare
+from sonar_graph.logs.converters.mrclam import read_mrclam
+
+ROBOTS = (1, 2, 3, 4, 5)
+ESTIMATORS = ("isam2", "ekf-slam", "dead-reckoning")
+RATE_HZ = 2.0
+Scores = dict[str, dict[str, float]]
+"""By estimator and score."""
+
+
+def run_robot(folder: Path, robot: int) -> Scores:
+    """All scores of all estimators on one robot's run."""
+    comparison = compare(read_mrclam(folder, robot), list(ESTIMATORS), rate_hz=RATE_HZ)
+    for run in comparison.runs:
+        if run.status == "failed":
+            raise RuntimeError(f"robot {robot}: {run.estimator}: {run.reason}")
+    return {name: {key: score.value for key, score in scores.items()} for name, scores in comparison.scores.items()}
+
+
+@dataclass(frozen=True)
+class Target:
+    """A figure and the most that it may be."""
+
+    what: str
+    measured: float
+    limit: float
+
+    @property
+    def met(self) -> bool:
+        return self.measured <= self.limit
+
+
+def collect(runs: list[Scores]) -> dict[str, Any]:
+    """The figures by name."""
+    figures: dict[str, Any] = {}
+    for short, name in {"isam2": "isam2", "ekf": "ekf-slam", "dead_reckoning": "dead-reckoning"}.items():
+        for kind in ("smoothed", "causal") if short == "isam2" else ("causal",):
+            errors = [run[name][f"{kind}.ate_se2_m"] for run in runs]
+            figures[f"{short}_{kind}_ate_m"] = errors
+            figures[f"{short}_{kind}_ate_mean_m"] = float(np.mean(errors))
+    figures["landmark_error_m"] = [run["isam2"]["landmarks.se2_m"] for run in runs]
+    figures["ekf_landmark_error_m"] = [run["ekf-slam"]["landmarks.se2_m"] for run in runs]
+    return figures
+
+
+def targets(figures: dict[str, Any]) -> list[Target]:
+    """What must be true."""
+    return [
+        Target("iSAM2 smoothed ATE, worst robot", max(figures["isam2_smoothed_ate_m"]), 0.17),
+        Target("iSAM2 smoothed ATE, mean", figures["isam2_smoothed_ate_mean_m"], 0.125),
+        Target("EKF-SLAM causal ATE, worst robot", max(figures["ekf_causal_ate_m"]), 0.50),
+        Target("iSAM2 causal ATE, mean", figures["isam2_causal_ate_mean_m"], 0.23),
+        Target(
+            "iSAM2 causal ATE, mean, against EKF-SLAM's",
+            figures["isam2_causal_ate_mean_m"],
+            figures["ekf_causal_ate_mean_m"],
+        ),
+        Target("iSAM2 landmark error, worst robot", max(figures["landmark_error_m"]), 0.15),
+    ]
+
+
+def print_robots(robots: tuple[int, ...], runs: list[Scores]) -> None:
+    """A row for each robot and estimator."""
+    keys = (
+        "causal.ate_se2_m",
+        "smoothed.ate_se2_m",
+        "landmarks.se2_m",
+        "causal.nees_position",
+        "causal.nees_yaw",
+        "smoothed.nees_position",
+        "detections.refused",
+        "time.total_s",
+    )
+    rows = [
+        (f"robot {robot} {name}", *(scores.get(key, "-") for key in keys))
+        for robot, run in zip(robots, runs, strict=True)
+        for name, scores in run.items()
+    ]
+    headers = (
+        "",
+        "causal ATE m",
+        "smoothed ATE m",
+        "landmarks m",
+        "NEES pos",
+        "NEES yaw",
+        "smoothed NEES pos",
+        "refused",
+        "s",
+    )
+    print_table(headers, rows)
+
+
+def main() -> None:
+    parser = make_parser(__doc__, data=True, workers=True)
+    arguments = parser.parse_args()
+    robots = ROBOTS[:1] if arguments.quick else ROBOTS
+    with recording(arguments.data, "mrclam_ds6.tar.xz", "MRCLAM_Dataset6") as folder:
+        runs = in_parallel(partial(run_robot, folder), robots, arguments.workers, "robot")
+    print_robots(robots, runs)
+    figures = collect(runs)
+    checks = targets(figures)
+    print_table(
+        ("target", "measured m", "at most m", ""),
+        [(t.what, t.measured, t.limit, "met" if t.met else "NOT MET") for t in checks],
+    )
+    print_figures({"robots": robots, **figures, "passed": all(t.met for t in checks)})
+
+
+if __name__ == "__main__":
+    main()
