@@ -25,6 +25,8 @@ from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Tra
 
 ROOM = 8
 """Landmarks that the first arrays have room for; doubled when needed."""
+SPARE_ROWS = 256
+"""IMU rows that may be kept longer than needed."""
 SINGULAR_COSINE = 1e-3
 """Below this cosine of the pitch the Euler angles are useless."""
 OUTCOMES = {USED: Outcome.USED, NEW: Outcome.NEW, GATED: Outcome.GATED}
@@ -120,7 +122,7 @@ class EkfSlam:
         frame_ns = np.maximum(detections.stamps_ns, since_ns) if detections else _NO_STAMPS
         outcomes, pose = self._run(_since(depth, since_ns), frame_ns, columns, measurements.end_ns)
         self._record(detections, ids, refusals, outcomes)
-        self._odometry.forget_before(int(self._clock[NODE]))
+        self._forget()
         estimate = Estimate(measurements.end_ns, gtsam.Pose3(gtsam.Rot3(pose[0]), pose[1]), pose[2])
         self._estimates.keep(estimate)
         return estimate
@@ -217,6 +219,11 @@ class EkfSlam:
             )
         return outcomes, pose
 
+    def _forget(self) -> None:
+        """Drop used rows now and then: that costs as much as keeping a few."""
+        if len(self._odometry.columns()[0]) > SPARE_ROWS:
+            self._odometry.forget_before(int(self._clock[NODE]))
+
     def _record(
         self,
         detections: LandmarkDetections | None,
@@ -259,7 +266,9 @@ def _check(detections: LandmarkDetections | None, depth: Depth | None, end_ns: i
                 f"Measurements: {type(block).__name__} has a row at {block.stamps_ns[-1]} ns, after end_ns = {end_ns};"
                 " hand it in with the call that reaches it"
             )
-    for name in ("range_m", "azimuth_rad") if detections is not None else ():
+    if detections is None or math.isfinite(detections.range_m @ detections.azimuth_rad):
+        return
+    for name in ("range_m", "azimuth_rad"):
         finite = np.isfinite(getattr(detections, name))
         if not finite.all():
             raise MeasurementError(

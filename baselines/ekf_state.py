@@ -129,13 +129,18 @@ def _transport_pose_columns(P: Floats, A: Floats, B: Floats) -> None:
 @compiled
 def _add_motion_noise(P: Floats, R_after: Floats, E_after: Floats, cov: Floats) -> None:
     """``P_vv += G cov G^T``, then equal to its transpose to the last bit."""
-    G = np.zeros((POSE, POSE))
-    place(R_after, G, 0, 3)
-    place(E_after, G, 3, 0)
-    Q = product(product(G, cov), G.T)
+    Q_XX = product(product(R_after, cov[3:, 3:]), R_after.T)
+    Q_EX = product(product(E_after, cov[:3, 3:]), R_after.T)
+    Q_EE = product(product(E_after, cov[:3, :3]), E_after.T)
+    for r in range(3):
+        for c in range(3):
+            P[r, c] += Q_XX[r, c]
+            P[3 + r, c] += Q_EX[r, c]
+            P[c, 3 + r] += Q_EX[r, c]
+            P[3 + r, 3 + c] += Q_EE[r, c]
     for r in range(POSE):
-        for c in range(r + 1):
-            P[r, c] = P[c, r] = 0.5 * (P[r, c] + P[c, r] + Q[r, c] + Q[c, r])
+        for c in range(r):
+            P[r, c] = P[c, r] = 0.5 * (P[r, c] + P[c, r])
 
 
 @compiled

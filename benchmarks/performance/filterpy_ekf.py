@@ -1,8 +1,8 @@
 """The same EKF-SLAM as `baselines.ekf_slam`, written the way filterpy is used: dense matrices, one prediction a sample.
 
 State, motion model, noise, rules and order of events are the same, the code is not: F, Q and H are full matrices, every
-IMU or Doppler sample is a prediction, corrections are filterpy's (Joseph's form). Motions of single steps come from
-`sonar_graph.navigation` and are not part of the time that is measured.
+IMU or Doppler sample is a prediction, corrections are filterpy's (Joseph's form). The motion of a sample comes from
+`sonar_graph.navigation`.
 """
 
 from __future__ import annotations
@@ -64,14 +64,17 @@ class FilterpySlam:
         self.ekf.P[3:, 3:] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
 
     def pose(self) -> gtsam.Pose3:
+        """The body in the world."""
         return gtsam.Pose3(gtsam.Rot3.RzRyRx(*self.ekf.x[3:6]), self.ekf.x[:3])
 
     def timed(self, work: Callable[[], None]) -> None:
+        """Do work that counts."""
         before = time.perf_counter()
         work()
         self.seconds += time.perf_counter() - before
 
     def predict(self, motion: PreintegratedMotion) -> None:
+        """Carry mean and covariance over a motion."""
         n = len(self.ekf.x)
         before, W = self.pose(), body_rates(self.ekf.x)
         after = before.compose(motion.i_T_j)
@@ -83,10 +86,12 @@ class FilterpySlam:
         self.ekf.F[3:6, 3:6] = E_after @ motion.i_T_j.rotation().matrix().T @ W
         G[:3, 3:], G[3:6, :3] = R_after, E_after
         self.ekf.Q = G @ motion.covariance @ G.T
-        self.ekf.predict_x = lambda u=0: None  # the mean has moved already
+        self.ekf.predict_x = lambda _: None  # the mean has moved already
         self.ekf.predict()
 
     def update(self, z: Floats, predicted: Floats, H: Floats, R: Floats, *, wrapped: tuple[int, ...] = ()) -> None:
+        """Correct as filterpy does, with some innovations wrapped."""
+
         def residual(measured: Floats, expected: Floats) -> Floats:
             e = measured - expected
             for k in wrapped:
@@ -98,6 +103,7 @@ class FilterpySlam:
             self.ekf.x[k] = math.remainder(self.ekf.x[k], 2 * math.pi)
 
     def update_state(self, at: int, value: float, variance: float) -> None:
+        """Correct by a direct measurement of one number of the state."""
         H = np.zeros((1, len(self.ekf.x)))
         H[0, at] = 1.0
         angle = (0,) if 3 <= at < 6 else ()
@@ -111,6 +117,7 @@ class FilterpySlam:
         return pose.compose(motion.i_T_j), motion.i_T_j.inverse().AdjointMap() @ to_perturbation
 
     def update_depth(self, motion: PreintegratedMotion, z_m: float, variance: float) -> None:
+        """Correct by the height of the pressure port a motion after the state."""
         pose, T = self.carried(motion)
         port, down = np.array(self.calibration.depth.port_m), pose.rotation().matrix()[2]
         by_body = np.concatenate([-down @ gtsam.Rot3.Hat(port), down])[None]
@@ -120,6 +127,7 @@ class FilterpySlam:
         self.update(np.array([z_m]), np.array([pose.translation()[2] + down @ port]), H, R)
 
     def detect(self, motion: PreintegratedMotion, landmark: int, z: Floats, R: Floats) -> None:
+        """Correct by range and azimuth a motion after the state, or augment."""
         if landmark not in self.slots:
             self.augment(motion, landmark, z, R)
             return
@@ -137,6 +145,7 @@ class FilterpySlam:
             self.update(z, predicted, H, R, wrapped=(1,))
 
     def augment(self, motion: PreintegratedMotion, landmark: int, z: Floats, R: Floats) -> None:
+        """Append a landmark."""
         pose, T = self.carried(motion)
         sonar, floor, n = self.calibration.sonar, self.calibration.floor, len(self.ekf.x)
         body_T_sonar = sonar.mounting.pose()

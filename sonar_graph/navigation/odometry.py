@@ -23,7 +23,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.kernels import compiled
 
@@ -57,8 +57,8 @@ class Odometry:
     """
 
     def __init__(self, calibration: Calibration) -> None:
-        self._body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
-        self._body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
+        self._body_R_imu = _rotation(calibration.imu.mounting)
+        self._body_R_dvl = _rotation(calibration.dvl.mounting)
         self._default_cov = np.diag(np.square(calibration.dvl.velocity_sigma_m_s))
         self._hold_past = calibration.odometry_interpolation == "hold-past"
         self._imu_ns: Ints = np.empty(0, np.int64)
@@ -79,14 +79,20 @@ class Odometry:
 
     def _add_imu(self, imu: Imu) -> None:
         self._imu_ns = np.concatenate([self._imu_ns, imu.stamps_ns])
-        self._rate = np.concatenate([self._rate, imu.angular_velocity @ self._body_R_imu.T])
-        self._force = np.concatenate([self._force, imu.specific_force @ self._body_R_imu.T])
+        rate, force = imu.angular_velocity, imu.specific_force
+        if self._body_R_imu is not None:
+            rate, force = rate @ self._body_R_imu.T, force @ self._body_R_imu.T
+        self._rate = np.concatenate([self._rate, rate])
+        self._force = np.concatenate([self._force, force])
 
     def _add_dvl(self, dvl: Dvl) -> None:
         cov = np.where(np.isnan(dvl.velocity_cov), self._default_cov, dvl.velocity_cov)
         self._dvl_ns = np.concatenate([self._dvl_ns, dvl.stamps_ns])
-        self._velocity = np.concatenate([self._velocity, dvl.velocity @ self._body_R_dvl.T])
-        self._cov = np.concatenate([self._cov, self._body_R_dvl @ cov @ self._body_R_dvl.T])
+        velocity = dvl.velocity
+        if self._body_R_dvl is not None:
+            velocity, cov = velocity @ self._body_R_dvl.T, self._body_R_dvl @ cov @ self._body_R_dvl.T
+        self._velocity = np.concatenate([self._velocity, velocity])
+        self._cov = np.concatenate([self._cov, cov])
 
     def start_ns(self) -> int | None:
         """First node that IMU rows cover from both sides; None before there is one."""
@@ -168,6 +174,11 @@ class Odometry:
 
 
 _EARLIEST, _LATEST = np.iinfo(np.int64).min, np.iinfo(np.int64).max
+
+
+def _rotation(mounting: Mounting) -> Floats | None:
+    """body_R_sensor, None for a sensor whose axes are the body's."""
+    return mounting.pose().rotation().matrix() if any(mounting.rpy_rad) else None
 
 
 _Rows = TypeVar("_Rows", Imu, Dvl)
