@@ -14,6 +14,7 @@ time of the frame. Keyframes can then be sparser than frames at no loss but the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, ClassVar, Literal
 
 import gtsam
@@ -40,7 +41,7 @@ class Isam2Params(Section):
     motion_noise_share: float = Field(0.1, ge=0)
     """While landmarks are seen, a keyframe is set sooner: once the variance of the motion since the last one exceeds
     this share of the sonar's variance. 0: every frame with a landmark."""
-    waiting_gain: float = Field(0.5, ge=0)
+    waiting_gain: float = Field(2.0, ge=0)
     """Sightings wait for the next keyframe until what they would add, the sum of expected over measured variance,
     exceeds this. 0: none waits."""
     bias_interval_s: float = Field(60.0, gt=0)
@@ -120,10 +121,10 @@ class Isam2:
         """
         values, marginals = self._smoother.solve_history()
         estimates = []
-        for asked in self._asked:
-            X_key, B_key = X(asked.keyframe), self._keyframes.bias_key(asked.keyframe)
-            joint = marginals.jointMarginalCovariance([X_key] if B_key is None else [X_key, B_key])
-            estimates.append(asked.carried_on(values, B_key, joint))
+        for keyframe, asked in groupby(self._asked, key=lambda instant: instant.keyframe):
+            bias_key = self._keyframes.bias_key(keyframe)
+            joint = marginals.jointMarginalCovariance([k for k in (X(keyframe), bias_key) if k is not None])
+            estimates += [instant.carried_on(values, bias_key, joint) for instant in asked]
         return Trajectory.from_estimates(estimates)
 
     def landmarks(self) -> LandmarkMap:

@@ -134,6 +134,11 @@ class Keyframes:
         """Key of the bias that holds from a keyframe on; None when there is none to estimate."""
         return self.bias_keys[index] if self._estimates_bias else None
 
+    @property
+    def newest_bias_key(self) -> int | None:
+        """Key of the bias that holds since the newest keyframe; None when there is none to estimate."""
+        return self.bias_key(len(self.stamps_ns) - 1)
+
     def _earth_rate(self) -> Floats | None:
         if self._earth is None:
             return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -16,9 +15,9 @@ from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.slam import factors
 from sonar_graph.slam.association import DetectionJournal, gate_threshold, identify
 from sonar_graph.slam.keyframes import Keyframes
-from sonar_graph.slam.models import elevation_on_floor, locate, wrap_angle
+from sonar_graph.slam.models import elevation_on_floor, locate
 from sonar_graph.slam.smoother import Smoother
-from sonar_graph.slam.view import View
+from sonar_graph.slam.view import View, weigh
 from sonar_graph.states import Outcome
 
 
@@ -31,15 +30,13 @@ class SightingPolicy:
     kernel: Literal["none", "huber", "cauchy"]
     kernel_width: float
 
-    def robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
-        """The noise model inside the chosen robust kernel."""
-        if self.kernel == "none":
-            return noise
-        kernels: dict[str, Callable[[float], gtsam.noiseModel.mEstimator.Base]] = {
-            "huber": gtsam.noiseModel.mEstimator.Huber.Create,
-            "cauchy": gtsam.noiseModel.mEstimator.Cauchy.Create,
-        }
-        return gtsam.noiseModel.Robust.Create(kernels[self.kernel](self.kernel_width), noise)
+    def estimator(self) -> gtsam.noiseModel.mEstimator.Base | None:
+        """The robust kernel; None for none."""
+        if self.kernel == "huber":
+            return gtsam.noiseModel.mEstimator.Huber.Create(self.kernel_width)
+        if self.kernel == "cauchy":
+            return gtsam.noiseModel.mEstimator.Cauchy.Create(self.kernel_width)
+        return None
 
 
 @dataclass
@@ -58,6 +55,9 @@ class Sightings:
         sonar = self.calibration.sonar
         self._body_T_sonar = sonar.mounting.pose()
         self._default_cov = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
+        self._kernel = self.policy.estimator()
+        probability = self.policy.gate_probability
+        self._gate = gate_threshold(probability, 2) if probability < 1 else np.inf
         self._elevation_sigma_rad = sonar.elevation_aperture_rad / np.sqrt(12.0)
 
     def add(self, frame: LandmarkDetections) -> None:
@@ -100,26 +100,25 @@ class Sightings:
         self.keyframes.update_if_due()
 
     def _view(self, motion: PreintegratedMotion, landmark_ids: set[int]) -> View:
-        key = self.keyframes.newest_key
+        key, bias_key = self.keyframes.newest_key, self.keyframes.newest_bias_key
+        keys = [key, *map(L, sorted(landmark_ids))]
         return View(
             pose_key=key,
+            bias_key=bias_key,
             world_T_keyframe=self.smoother.values.atPose3(key),
             motion=motion,
             body_T_sonar=self._body_T_sonar,
             landmarks={i: self.smoother.values.atPoint3(L(i)) for i in landmark_ids},
-            covariance=self.smoother.joint_covariance([key, *map(L, sorted(landmark_ids))]),
+            covariance=self.smoother.joint_covariance(keys if bias_key is None else [*keys, bias_key]),
         )
 
     def _sight_again(self, view: View, tie: Tie, sighting: Sighting) -> None:
-        predicted, prior_cov = view.expect(sighting.landmark_id)
-        innovation = np.array([sighting.z[0] - predicted[0], wrap_angle(sighting.z[1] - predicted[1])])
-        S = prior_cov + sighting.cov
-        distance = innovation @ np.linalg.solve(S, innovation)
-        inside = self.policy.gate_probability == 1 or distance <= gate_threshold(self.policy.gate_probability, 2)
+        innovation, S, distance, gain = weigh(sighting.z, *view.expect(sighting.landmark_id), sighting.cov)
+        inside = distance <= self._gate
         outcome = Outcome.USED if inside else Outcome.GATED
         self.journal.record(sighting.stamp_ns, sighting.landmark_id, outcome, innovation, S)
         if inside:
-            self.smoother.waiting_gain += float(np.max(np.diag(prior_cov) / np.diag(sighting.cov)))
+            self.smoother.waiting_gain += gain
             self._add_factors(view, tie, sighting, view.landmarks[sighting.landmark_id], None)
 
     def _sight_first(self, view: View, tie: Tie, sighting: Sighting) -> None:
@@ -140,13 +139,17 @@ class Sightings:
     def _add_factors(
         self, view: View, tie: Tie, sighting: Sighting, point: Floats, elevation_sigma_rad: float | None
     ) -> None:
-        R = sighting.cov + np.diag(view.noise_of(tie.motion, point))
-        key, robust = L(sighting.landmark_id), self.policy.robust
+        R, key = sighting.cov.copy(), L(sighting.landmark_id)
+        R[[0, 1], [0, 1]] += view.noise_of(tie.motion, point)
         self.smoother.add(
             factors.landmark_sighting(
-                tie.pose_key, key, tie.keyframe_T_sonar, sighting.z, R, robust, elevation_sigma_rad
+                tie.pose_key, key, tie.keyframe_T_sonar, sighting.z, R, self._robust, elevation_sigma_rad
             )
         )
+
+    def _robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
+        """The noise model inside the chosen robust kernel."""
+        return gtsam.noiseModel.Robust.Create(self._kernel, noise) if self._kernel else noise
 
 
 @dataclass(frozen=True, eq=False)
