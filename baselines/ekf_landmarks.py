@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.ekf_state import LANDMARK, POSE, correct, correct_pair, perturbation_jacobian, place, product
+from baselines.ekf_state import LANDMARK, POSE, correct, correct_pair, perturbation_jacobian, place, product, product_3
 from baselines.euler import rotation_from_euler
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.kernels import compiled, skew
@@ -78,7 +78,7 @@ def moment_after(x: Floats, motion: Motion) -> Moment:
     position = np.empty(3)
     for r in range(3):
         position[r] = x[r] + R[r, 0] * dp[0] + R[r, 1] * dp[1] + R[r, 2] * dp[2]
-    return Moment(product(R, dR), position, perturbation_jacobian(x[3:POSE], dR, dp), cov)
+    return Moment(product_3(R, dR), position, perturbation_jacobian(x[3:POSE], dR, dp), cov)
 
 
 @compiled
@@ -231,7 +231,9 @@ def _augment(x: Floats, P: Floats, n: int, moment: Moment, sonar: SonarModel, z:
     G_v = product(G_b, moment.T)
     rows = product(G_v, P[:POSE, :n])
     own = (
-        product(rows[:, :POSE], G_v.T) + product(product(G_b, moment.cov), G_b.T) + product(product(G_z, noise), G_z.T)
+        product(rows[:, :POSE], G_v.T)
+        + product(product(G_b, moment.cov), G_b.T)
+        + product_3(product_3(G_z, noise), G_z.T)
     )
     for r in range(LANDMARK):
         x[n + r] = point[r]
@@ -250,7 +252,7 @@ def _elevation(moment: Moment, sonar: SonarModel, z: Floats) -> float:
     """Elevation on the floor; 0 without one, or where it is outside the aperture."""
     if not sonar.has_floor:
         return 0.0
-    R_sonar = product(moment.world_R_body, sonar.body_R_sonar)
+    R_sonar = product_3(moment.world_R_body, sonar.body_R_sonar)
     sonar_z = moment.position[2]
     for k in range(3):
         sonar_z += moment.world_R_body[2, k] * sonar.body_p_sonar[k]
@@ -273,7 +275,7 @@ def location(
         for k in range(3):
             point[r] += R_t[r, k] * p_b[k]
     G_b = np.empty((3, POSE))
-    place(product(R_t, skew(-p_b)), G_b, 0, 0)
+    place(product_3(R_t, skew(-p_b)), G_b, 0, 0)
     place(R_t, G_b, 0, 3)
-    G_z = product(product(R_t, body_R_sonar), sonar_point_jacobian(z[0], z[1], elevation_rad))
+    G_z = product_3(product_3(R_t, body_R_sonar), sonar_point_jacobian(z[0], z[1], elevation_rad))
     return point, G_b, G_z

@@ -198,7 +198,12 @@ def _correct_gravity(
         return
     velocity_sigma = math.sqrt(0.5 * (velocity[3] + interval.velocity[3]))
     sigma = tilt_sigma(
-        duration_s, velocity_sigma, model.accel_noise_density, model.accel_bias_sigma, model.gravity_m_s2
+        duration_s,
+        velocity_sigma,
+        model.accel_noise_density,
+        model.accel_bias_sigma,
+        model.gyro_noise_density,
+        model.gravity_m_s2,
     )
     level = math.hypot(up[1], up[2])
     _correct_state(x, P, n, 3, math.atan2(up[1], up[2]), (sigma / level) ** 2)

@@ -49,6 +49,16 @@ def product(A: Floats, B: Floats) -> Floats:
 
 
 @compiled
+def product_3(A: Floats, B: Floats) -> Floats:
+    """``A B`` of 3 × 3 matrices."""
+    C = np.empty((3, 3))
+    for r in range(3):
+        for c in range(3):
+            C[r, c] = A[r, 0] * B[0, c] + A[r, 1] * B[1, c] + A[r, 2] * B[2, c]
+    return C
+
+
+@compiled
 def place(A: Floats, out: Floats, row: int, column: int) -> None:
     """Write a small matrix into a larger one; an assignment of arrays would take seconds to compile."""
     for r in range(A.shape[0]):
@@ -76,10 +86,10 @@ def transition(angles: Floats, dR: Floats, dp: Floats) -> tuple[Floats, Floats, 
     R' (3, 3), ``dX'/d(phi, theta, psi)`` (3, 3), ``d(phi, theta, psi)'/d(phi, theta, psi)`` (3, 3), and E' (3, 3).
     """
     R, W = rotation_from_euler(angles), rates_from_euler(angles)
-    R_after = product(R, dR)
+    R_after = product_3(R, dR)
     E_after = euler_from_rates(euler_from_rotation(R_after))
-    position_D_angles = product(R, cross(-dp, W))
-    angles_D_angles = product(E_after, product(dR.T, W))
+    position_D_angles = product_3(R, cross(-dp, W))
+    angles_D_angles = product_3(E_after, product_3(dR.T, W))
     return R_after, position_D_angles, angles_D_angles, E_after
 
 
@@ -129,9 +139,9 @@ def _transport_pose_columns(P: Floats, A: Floats, B: Floats) -> None:
 @compiled
 def _add_motion_noise(P: Floats, R_after: Floats, E_after: Floats, cov: Floats) -> None:
     """``P_vv += G cov G^T``, then equal to its transpose to the last bit."""
-    Q_XX = product(product(R_after, cov[3:, 3:]), R_after.T)
-    Q_EX = product(product(E_after, cov[:3, 3:]), R_after.T)
-    Q_EE = product(product(E_after, cov[:3, :3]), E_after.T)
+    Q_XX = product_3(product_3(R_after, cov[3:, 3:]), R_after.T)
+    Q_EX = product_3(product_3(E_after, cov[:3, 3:]), R_after.T)
+    Q_EE = product_3(product_3(E_after, cov[:3, :3]), E_after.T)
     for r in range(3):
         for c in range(3):
             P[r, c] += Q_XX[r, c]
@@ -152,9 +162,9 @@ def perturbation_jacobian(angles: Floats, dR: Floats, dp: Floats) -> Floats:
     """
     R, W = rotation_from_euler(angles), rates_from_euler(angles)
     T = np.zeros((POSE, POSE))
-    place(product(dR.T, W), T, 0, 3)
-    place(product(R, dR).T, T, 3, 0)
-    place(product(dR.T, cross(-dp, W)), T, 3, 3)
+    place(product_3(dR.T, W), T, 0, 3)
+    place(product_3(R, dR).T, T, 3, 0)
+    place(product_3(dR.T, cross(-dp, W)), T, 3, 3)
     return T
 
 

@@ -184,11 +184,11 @@ def _product(A: Floats, B: Floats, out: Floats) -> None:
 
 
 @compiled
-def _product_transposed(A: Floats, B: Floats, out: Floats) -> None:
-    """``out = A B^T``, 3 × 3."""
+def _transposed_product(A: Floats, B: Floats, out: Floats) -> None:
+    """``out = A^T B``, 3 × 3."""
     for r in range(3):
         for c in range(3):
-            out[r, c] = A[r, 0] * B[c, 0] + A[r, 1] * B[c, 1] + A[r, 2] * B[c, 2]
+            out[r, c] = A[0, r] * B[0, c] + A[1, r] * B[1, c] + A[2, r] * B[2, c]
 
 
 @compiled
@@ -229,32 +229,35 @@ def _chord_derivative(phi: Floats, u: Floats, scale: float, out: Floats) -> None
 
 @compiled
 def _transport(cov_tt: Floats, cov_rt: Floats, cov_rr: Floats, step: Floats, before: Floats) -> None:
-    """``P <- F P F^T`` with ``F = [[I, 0], [-[step]x, I]]``; ``before`` is scratch."""
+    """``P <- F P F^T`` with ``F = [[I, 0], [-[step]x, I]]``; ``before`` is scratch; upper half of P_rr only."""
     _copy(cov_rt, before)
     _subtract_cross(step, cov_tt, cov_rt)
     for r in range(3):
         a, b = (r + 1) % 3, (r + 2) % 3
-        for c in range(3):
+        for c in range(r, 3):
+            d, e = (c + 1) % 3, (c + 2) % 3
             cov_rr[r, c] -= step[a] * before[c, b] - step[b] * before[c, a]
-            cov_rr[c, r] -= step[a] * cov_rt[c, b] - step[b] * cov_rt[c, a]
+            cov_rr[r, c] -= step[d] * cov_rt[r, e] - step[e] * cov_rt[r, d]
 
 
 @compiled
 def _add_gyro_noise(cov_tt: Floats, cov_rt: Floats, cov_rr: Floats, G_t: Floats, G_r: Floats, variance: float) -> None:
-    """``P += G G^T variance``."""
+    """``P += G G^T variance``; upper half of P_rr only."""
     for r in range(3):
-        for c in range(3):
+        for c in range(r, 3):
             cov_tt[r, c] += variance * (G_t[r, 0] * G_t[c, 0] + G_t[r, 1] * G_t[c, 1] + G_t[r, 2] * G_t[c, 2])
-            cov_rt[r, c] += variance * (G_r[r, 0] * G_t[c, 0] + G_r[r, 1] * G_t[c, 1] + G_r[r, 2] * G_t[c, 2])
+            cov_tt[c, r] = cov_tt[r, c]
             cov_rr[r, c] += variance * (G_r[r, 0] * G_r[c, 0] + G_r[r, 1] * G_r[c, 1] + G_r[r, 2] * G_r[c, 2])
+        for c in range(3):
+            cov_rt[r, c] += variance * (G_r[r, 0] * G_t[c, 0] + G_r[r, 1] * G_t[c, 1] + G_r[r, 2] * G_t[c, 2])
 
 
 @compiled
 def _add_doppler_noise(cov_rr: Floats, turned: Floats, psd: Floats, dt: float, work: Floats) -> None:
-    """``P_rr += turned psd turned^T dt``."""
+    """``P_rr += turned psd turned^T dt``; upper half only."""
     _product(turned, psd, work)
     for r in range(3):
-        for c in range(3):
+        for c in range(r, 3):
             cov_rr[r, c] += dt * (work[r, 0] * turned[c, 0] + work[r, 1] * turned[c, 1] + work[r, 2] * turned[c, 2])
 
 
@@ -274,14 +277,16 @@ def _in_last_frame(
 ) -> tuple[Floats, Floats]:
     """Covariance and bias Jacobian turned from frame i into frame j."""
     cov, D = np.empty((6, 6)), np.empty((6, 3))
-    R_T = np.ascontiguousarray(dR.T)
-    tt, rt, rr = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    D_t_j, D_r_j, work = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for block, out in ((cov_tt, tt), (cov_rt, rt), (cov_rr, rr)):
-        _product(R_T, block, work)
-        _product_transposed(work, R_T, out)
-    _product(R_T, D_t, D_t_j)
-    _product(R_T, D_r, D_r_j)
+    tt, rt, rr, work = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    D_t_j, D_r_j = np.empty((3, 3)), np.empty((3, 3))
+    for r in range(3):
+        for c in range(r):
+            cov_rr[r, c] = cov_rr[c, r]
+    _turn_back(dR, cov_tt, tt, work)
+    _turn_back(dR, cov_rt, rt, work)
+    _turn_back(dR, cov_rr, rr, work)
+    _transposed_product(dR, D_t, D_t_j)
+    _transposed_product(dR, D_r, D_r_j)
     for r in range(3):
         for c in range(3):
             cov[r, c] = 0.5 * (tt[r, c] + tt[c, r])
@@ -289,3 +294,10 @@ def _in_last_frame(
             cov[3 + r, 3 + c] = 0.5 * (rr[r, c] + rr[c, r])
             D[r, c], D[3 + r, c] = D_t_j[r, c], D_r_j[r, c]
     return cov, D
+
+
+@compiled
+def _turn_back(dR: Floats, A: Floats, out: Floats, work: Floats) -> None:
+    """``out = dR^T A dR``."""
+    _transposed_product(dR, A, work)
+    _product(work, dR, out)
