@@ -7,10 +7,16 @@ rotation dR = i_R_j::
     mean(i_R(t) f(t)) = (dR v_j - v_i) / T + g up_i
 
     up_j    = dR^T up_i,    a measurement of body_R_world e_z at node j, which has roll and pitch but no yaw
-    sigma^2 = (accel_noise^2 / T + 2 sigma_v^2 / T^2 + accel_bias^2) / g^2
+    sigma^2 = (accel_noise^2 / T + 2 sigma_v^2 / T^2) / g^2 + beta^2 max(1, tau / T)
 
 Taking the change of velocity out is what lets a moving vehicle measure its tilt; the gyro's noise over a second is far
-below the accelerometer's bias and left out. The bias does not average out: successive directions share it.
+below the accelerometer's bias and left out.
+
+The bias does not average out: successive directions share its tilt ``beta = accel_bias / g``. Taken as fresh noise each
+time it would let the estimate believe itself better than the bias allows. A tilt that walks with the gyro noise density
+N and is measured every T with sigma s settles at the variance ``N s sqrt(T)`` (the scalar Riccati equation for
+s^2 >> N^2 T). With ``s = beta sqrt(tau / T)`` and ``tau = (beta / N)^2``, the time in which the gyro drifts as far as
+the bias misleads, that is ``beta^2``: the bias's own.
 """
 
 from __future__ import annotations
@@ -23,6 +29,9 @@ from sonar_graph.calibration import ImuCalibration
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.navigation.kernels import compiled
+
+LEAST_GYRO_NOISE_DENSITY = 1e-7
+"""rad/s/√Hz, ten times below the best fibre gyros: keeps the time above finite for a gyro without noise."""
 
 
 def velocity_at_imu(velocity: Floats, rate: Floats, body_p_dvl: Floats, body_p_imu: Floats) -> Floats:
@@ -59,7 +68,12 @@ def gravity_direction(
     if not np.isfinite(up_j).all():
         return None
     return up_j, tilt_sigma(
-        motion.duration_s, velocity_sigma_m_s, imu.accel_noise_density, imu.accel_bias_sigma, gravity_m_s2
+        motion.duration_s,
+        velocity_sigma_m_s,
+        imu.accel_noise_density,
+        imu.accel_bias_sigma,
+        imu.gyro_noise_density,
+        gravity_m_s2,
     )
 
 
@@ -81,8 +95,15 @@ def up_direction(
 
 @compiled
 def tilt_sigma(
-    duration_s: float, velocity_sigma_m_s: float, accel_noise_density: float, accel_bias_sigma: float, gravity: float
+    duration_s: float,
+    velocity_sigma_m_s: float,
+    accel_noise_density: float,
+    accel_bias_sigma: float,
+    gyro_noise_density: float,
+    gravity: float,
 ) -> float:
     """Standard deviation of the direction's tilt, rad."""
-    noise = accel_noise_density**2 / duration_s + 2.0 * (velocity_sigma_m_s / duration_s) ** 2
-    return math.sqrt(noise + accel_bias_sigma**2) / gravity
+    noise = (accel_noise_density**2 / duration_s + 2.0 * (velocity_sigma_m_s / duration_s) ** 2) / gravity**2
+    beta = accel_bias_sigma / gravity
+    tau_s = (beta / max(gyro_noise_density, LEAST_GYRO_NOISE_DENSITY)) ** 2
+    return math.sqrt(noise + beta**2 * max(1.0, tau_s / duration_s))

@@ -14,7 +14,8 @@ from sonar_graph.navigation.odometry import Steps
 
 G = 9.81
 GRAVITY = np.array([0.0, 0.0, G])
-IMU = ImuCalibration(accel_noise_density=2e-3, accel_bias_sigma=5e-3)
+IMU = ImuCalibration(accel_noise_density=2e-3, accel_bias_sigma=5e-3, gyro_noise_density=1e-2)
+"""A gyro that drifts so fast that directions a second apart share next to nothing."""
 T, N = 1.0, 2000
 TILT = Rotation.from_euler("xyz", [0.2, -0.3, 1.1])
 BODY_RATE = np.array([0.15, -0.1, 0.3])
@@ -84,6 +85,28 @@ def test_each_source_of_tilt_noise_falls_with_time_as_it_should(duration_s, velo
     _, sigma = gravity_direction(motion, np.zeros(3), np.zeros(3), velocity_sigma, IMU, G)
     parts = [2e-3 / np.sqrt(duration_s), np.sqrt(2) * velocity_sigma / duration_s, 5e-3]
     assert sigma == pytest.approx(np.linalg.norm(parts) / G)
+
+
+@pytest.mark.parametrize("duration_s", [1.0, 5.0])
+@pytest.mark.parametrize("gyro_density", [3.6e-5, 1.2e-4])
+def test_tilt_settles_at_what_the_accelerometer_bias_allows(duration_s, gyro_density):
+    """A scalar Kalman filter fed with many directions; taking the bias as fresh noise would claim several times less."""
+    imu = ImuCalibration(accel_noise_density=1e-5, accel_bias_sigma=1e-2, gyro_noise_density=gyro_density)
+    motion = PreintegratedMotion(
+        gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), duration_s, np.array([0, 0, G])
+    )
+    _, sigma = gravity_direction(motion, np.zeros(3), np.zeros(3), 1e-6, imu, G)
+    settled, naive = (settled_tilt_sigma(s, gyro_density, duration_s) for s in (sigma, 1e-2 / G))
+    assert settled == pytest.approx(1e-2 / G, rel=0.03)
+    assert naive < 0.6 * settled
+
+
+def settled_tilt_sigma(sigma, gyro_density, duration_s):
+    variance = 1.0
+    for _ in range(20_000):
+        predicted = variance + gyro_density**2 * duration_s
+        variance = predicted * sigma**2 / (predicted + sigma**2)
+    return np.sqrt(variance)
 
 
 def test_without_forces_there_is_no_direction():
