@@ -29,6 +29,7 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats
+from sonar_graph.navigation.kernels import compiled
 from sonar_graph.navigation.odometry import Steps
 from sonar_graph.navigation.recursion import integrate_steps, trace_point
 
@@ -48,6 +49,25 @@ class PreintegratedMotion:
     duration_s: float
     mean_specific_force: Floats
     """Mean over time of the specific force, turned into frame i, shape (3,), m/s²; NaN where not measured."""
+
+    def then(self, next_motion: PreintegratedMotion) -> PreintegratedMotion:
+        """Followed by the next motion, from the last instant on, for the same gyro bias.
+
+        ``i_T_k = i_T_j j_T_k``; a perturbation of the first reaches frame k through ``Ad(j_T_k^-1)``.
+        """
+        i_R_j = self.i_T_j.rotation().matrix()
+        cov, D, force = _chained(
+            next_motion.i_T_j.inverse().AdjointMap(),
+            self.covariance,
+            self.D_bias,
+            next_motion.covariance,
+            next_motion.D_bias,
+            self.mean_specific_force * self.duration_s,
+            i_R_j @ next_motion.mean_specific_force * next_motion.duration_s,
+        )
+        duration_s = self.duration_s + next_motion.duration_s
+        i_T_k = self.i_T_j.compose(next_motion.i_T_j)
+        return PreintegratedMotion(i_T_k, cov, D, self.bias, duration_s, force / duration_s)
 
     def corrected(self, bias: Floats) -> gtsam.Pose3:
         """i_T_j for another gyro bias, to first order: ``i_T_j Exp(D_bias (bias - self.bias))``."""
@@ -112,3 +132,10 @@ class Preintegrator:
             Shape (n, 3), m; linear within a step.
         """
         return trace_point(steps.duration_s, steps.rate, steps.velocity, bias, self.body_p_dvl, point, offsets_s)
+
+
+@compiled
+def _chained(
+    A: Floats, cov: Floats, D: Floats, next_cov: Floats, next_D: Floats, impulse: Floats, next_impulse: Floats
+) -> tuple[Floats, Floats, Floats]:
+    return A @ cov @ A.T + next_cov, A @ D + next_D, impulse + next_impulse

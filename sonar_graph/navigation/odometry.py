@@ -105,10 +105,13 @@ class Odometry:
 
     def nodes(self, after_ns: int, until_ns: int) -> Ints:
         """Nodes after one instant that are reached at another, in order."""
-        seen = np.searchsorted(self._imu_ns, until_ns, side="right")
-        covered_ns = int(self._imu_ns[seen - 1]) if seen else _EARLIEST
-        first, last = np.searchsorted(self._dvl_ns, [after_ns, min(until_ns, covered_ns)], side="right")
+        first, last = node_range(self._imu_ns, self._dvl_ns, after_ns, until_ns)
         return self._dvl_ns[first:last]
+
+    def newest_node(self, after_ns: int, until_ns: int) -> int | None:
+        """Last of `nodes`; None where there is none."""
+        first, last = node_range(self._imu_ns, self._dvl_ns, after_ns, until_ns)
+        return int(self._dvl_ns[last - 1]) if last > first else None
 
     def steps_between_nodes(self, start_ns: int, end_ns: int) -> Steps:
         """Final motion from one node to a later, reached one."""
@@ -228,6 +231,17 @@ def _bracket(stamps: Ints, i: int, t: int, hold_past: bool) -> tuple[int, int, f
     if hold_past or i == 0:
         return i, i, 0.0
     return i - 1, i, (t - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
+
+
+@compiled
+def node_range(imu_ns: Ints, dvl_ns: Ints, after_ns: int, until_ns: int) -> tuple[int, int]:
+    """Rows of the DVL that are nodes after one instant and reached at another: first, and one past the last."""
+    seen = np.searchsorted(imu_ns, until_ns, side="right")
+    if seen == 0:
+        return 0, 0
+    covered_ns = min(until_ns, imu_ns[seen - 1])
+    first = np.searchsorted(dvl_ns, after_ns, side="right")
+    return int(first), max(int(first), int(np.searchsorted(dvl_ns, covered_ns, side="right")))
 
 
 @compiled

@@ -19,7 +19,9 @@ from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
 from sonar_graph.navigation.depth_mean import weights_at_end
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
 from sonar_graph.navigation.earth import earth_rate_in_world
+from sonar_graph.navigation.kernels import compiled
 from sonar_graph.navigation.odometry import Odometry, Steps
+from sonar_graph.navigation.running_motion import RunningMotion
 from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import Smoother
 
@@ -54,6 +56,7 @@ class Keyframes:
         self._preintegrator = Preintegrator.from_calibration(self.calibration)
         self._estimates_bias = self.calibration.imu.gyro_bias_sigma > 0
         self._bias_since_ns = 0
+        self._running: RunningMotion | None = None
         self._depths: list[Depth] = []
         self._earth = earth_rate_in_world(self.calibration)
 
@@ -103,23 +106,30 @@ class Keyframes:
         PreintegratedMotion
             From what is then the newest keyframe to the frame.
         """
-        nodes = self.odometry.nodes(self.stamps_ns[-1], stamp_ns)
-        if not len(nodes) or not self._is_noisy(motion):
+        node_ns = self.odometry.newest_node(self.stamps_ns[-1], stamp_ns)
+        if node_ns is None or not self._is_noisy(motion):
             return motion
-        self._set(int(nodes[-1]))
+        self._set(node_ns)
         return self.motion_since_newest(stamp_ns)
 
     def _is_noisy(self, motion: PreintegratedMotion) -> bool:
         """Whether the motion's noise, and what the gyro bias may add to it, would blur what the sonar saw."""
         sonar, bias_sigma = self.calibration.sonar, self.calibration.imu.gyro_bias_sigma
-        variance = np.diag(motion.covariance) + np.sum(np.square(motion.D_bias * bias_sigma), axis=1)
-        share = max(variance[:3].max() / sonar.azimuth_sigma_rad**2, variance[3:].max() / sonar.range_sigma_m**2)
-        return bool(share > self.policy.motion_noise_share)
+        turn, shift = largest_variances(motion.covariance, motion.D_bias, bias_sigma)
+        share = max(turn / sonar.azimuth_sigma_rad**2, shift / sonar.range_sigma_m**2)
+        return share > self.policy.motion_noise_share
 
     def motion_since_newest(self, until_ns: int) -> PreintegratedMotion:
-        """Provisional motion from the newest keyframe to any later instant."""
-        steps = self.odometry.steps_since_node(self.stamps_ns[-1], until_ns)
-        return self._preintegrator.integrate(steps, self.bias(len(self.stamps_ns) - 1), self._earth_rate())
+        """Provisional motion from the newest keyframe to an instant not before that of any earlier call."""
+        if self._running is None:
+            self._running = RunningMotion(
+                self.odometry,
+                self._preintegrator,
+                self.stamps_ns[-1],
+                self.bias(len(self.stamps_ns) - 1),
+                self._earth_rate(),
+            )
+        return self._running.until(until_ns)
 
     def update_if_due(self) -> None:
         """Bring the smoother up to date when what was added since it last was matters."""
@@ -165,6 +175,7 @@ class Keyframes:
         self.smoother.add(self._depth(j, node_ns, steps, motion))
         self.bias_keys.append(self._next_bias_key(i, node_ns))
         self.stamps_ns.append(node_ns)
+        self._running = None
         self._constrain(j)
         self.odometry.forget_before(node_ns)
 
@@ -222,3 +233,13 @@ class Keyframes:
         self.smoother.add_bias(new, self.smoother.values.atPoint3(old))
         self.smoother.add([factors.bias_walk(old, new, walk * np.sqrt(elapsed_s))])
         return new
+
+
+@compiled
+def largest_variances(cov: Floats, D_bias: Floats, bias_sigma: float) -> tuple[float, float]:
+    """Largest variance of rotation (rad²) and of translation (m²) by noise and an unknown gyro bias."""
+    largest = np.zeros(2)
+    for r in range(6):
+        by_bias = D_bias[r, 0] ** 2 + D_bias[r, 1] ** 2 + D_bias[r, 2] ** 2
+        largest[r // 3] = max(largest[r // 3], cov[r, r] + by_bias * bias_sigma**2)
+    return largest[0], largest[1]

@@ -45,7 +45,7 @@ class Smoother:
     """
 
     def __init__(
-        self, lag_s: float, relinearize_threshold: float, stale_shift_m: float, greatest_waiting_gain: float
+        self, lag_s: float, relinearize_threshold: float, stale_shift_m: float, greatest_waiting_gain: float = 0.0
     ) -> None:
         self._lag_s = lag_s
         self._stale_shift_m = stale_shift_m
