@@ -62,8 +62,7 @@ class EkfSlam:
       aperture over sqrt(12). A known floor enters once for each landmark, as a measurement of its height.
     - Identities need a posterior, innovations a gate (`EkfSlamParams`). A refused detection changes nothing.
     - Depth, the direction of gravity and planar motion, where the calibration has them, are further corrections;
-      none is gated. Successive gravity directions are taken as independent, although they share the accelerometer's
-      bias.
+      none is gated. Gravity's sigma is widened for the bias that successive directions share.
     - Several detections of one frame are taken one after the other, in the order of their rows.
     - Corrections are ``P - K S K^T`` in a form that stays symmetric, the Jacobians are taken once (no iteration).
 
