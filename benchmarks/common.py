@@ -78,9 +78,11 @@ def recording(data: Path | str | None, archive: str, folder: str) -> Iterator[Pa
 
 
 def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], workers: int, what: str) -> list[Result]:
-    """``function`` of every item, in the order of the items, by processes of one thread each."""
+    """``function`` of every item, in the order of the items, by one-thread processes; one worker: in this one."""
     for variable in THREAD_VARIABLES:
         os.environ[variable] = "1"
+    if workers <= 1:
+        return [function(item) for item in items]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(workers, len(items)), mp_context=context) as pool:
         jobs = {pool.submit(function, item): place for place, item in enumerate(items)}

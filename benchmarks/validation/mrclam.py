@@ -1,7 +1,7 @@
 """Real data with independent truth: UTIAS MRCLAM data set 6, robots 1 to 5, identities known, start pose given.
 
-Every robot is run with the same noise parameters. Trajectory errors are horizontal rms after the best SE(2) alignment, of
-the causal estimate and of the smoothed one; landmark errors the same after aligning the map itself.
+Every robot is run with the same noise parameters. Trajectory errors are horizontal rms after the best SE(2) alignment,
+of the causal estimate and of the smoothed one; landmark errors the same after aligning the map itself.
 """
 
 from __future__ import annotations

@@ -61,15 +61,15 @@ for index, (before_ns, after_ns) in enumerate([(int(nodes[0]), start_ns), (start
     graph.push_back(factors.odometry(X(index), X(index + 1), step))
     values.insert(X(index + 1), pose)
 
-body_T_sonar = calibration.sonar.mounting.pose()
+sonar_mounting = calibration.sonar.mounting.pose()
 noise = np.diag([calibration.sonar.range_sigma_m**2, calibration.sonar.azimuth_sigma_rad**2])
 landmark = pose.transformFrom(np.array([2.0, 0.3, -1.0]))
 values.insert(L(1), landmark)
 graph.push_back(factors.floor_prior(L(1), landmark[2], sigma_m=0.01))
 for index in (1, 2):
-    q = values.atPose3(X(index)).compose(body_T_sonar).transformTo(landmark)
+    q = values.atPose3(X(index)).compose(sonar_mounting).transformTo(landmark)
     z = np.array([np.linalg.norm(q), np.arctan2(q[1], q[0])])
-    for factor in factors.landmark_sighting(X(index), L(1), body_T_sonar, z, noise, robust=lambda model: model):
+    for factor in factors.landmark_sighting(X(index), L(1), sonar_mounting, z, noise, robust=lambda model: model):
         graph.push_back(factor)
 
 solution = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()

@@ -1,0 +1,89 @@
+"""Every benchmark script runs in its short version and ends in one line of figures."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+
+
+def run(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {key: value for key, value in os.environ.items() if key != "SONAR_GRAPH_DATA"}
+    command = [sys.executable, str(BENCHMARKS / script), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=600, env=environment)
+
+
+def figures(script: str, *arguments: str) -> dict[str, Any]:
+    done = run(script, "--quick", *arguments)
+    assert done.returncode == 0, done.stderr
+    last: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return last
+
+
+def test_missing_recordings_are_one_line_and_exit_code_2(tmp_path: Path) -> None:
+    for arguments in ((), ("--data", str(tmp_path))):
+        done = run("validation/mrclam.py", *arguments)
+        assert done.returncode == 2
+        assert len(done.stderr.splitlines()) == 1
+        assert "--data" in done.stderr
+        assert done.stdout == ""
+
+
+def test_isam2_mission_names_its_figures() -> None:
+    found = figures("performance/isam2_mission.py")
+    assert {"plain_ratio", "p99_ms", "decile_ratio", "ours_s", "plain_s", "passed"} <= set(found)
+    assert found["plain_ratio"] == pytest.approx(found["ours_s"] / found["plain_s"])
+    # Both follow the truth, else their times would compare nothing.
+    assert found["ours_error_m"] < 0.3
+    assert found["plain_error_m"] < 0.3
+
+
+@pytest.mark.slow
+def test_ekf_step_names_its_figures() -> None:
+    assert {"log_s", "filterpy_ratio"} <= set(figures("performance/ekf_step.py"))
+
+
+@pytest.mark.slow
+def test_consistency_names_its_figures_and_draws(tmp_path: Path) -> None:
+    picture = tmp_path / "anees.png"
+    found = figures("validation/consistency.py", "--workers", "2", "--out", str(picture))
+    for quantity in ("position", "yaw"):
+        low, high = found[f"band_{quantity}"]
+        assert low < 1 < high
+        for estimator in ("ekf", "isam2"):
+            assert found[f"{estimator}_{quantity}_anees"] > 0
+            assert 0 <= found[f"share_inside_{estimator}_{quantity}"] <= 1
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_victoria_park_agrees_with_the_batch_solution() -> None:
+    found = figures("validation/victoria_park.py", "--workers", "2")
+    assert found["cost_ratio"] == pytest.approx(1, abs=5e-3)
+    assert found["landmark_rms_difference_m"] < 0.05
+    # The other reading of the file's odometry noise is another problem: the comparison can tell two problems apart.
+    assert found["file_noise_cost_ratio"] > found["cost_ratio"] + 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.recording
+def test_mrclam_names_its_figures(recordings: Path) -> None:
+    found = figures("validation/mrclam.py", "--data", str(recordings), "--workers", "1")
+    assert found["robots"] == [1]
+    assert found["isam2_smoothed_ate_m"][0] < found["dead_reckoning_causal_ate_m"][0]
+    assert {"ekf_causal_ate_m", "landmark_error_m", "passed"} <= set(found)
+
+
+def test_every_script_is_listed() -> None:
+    listed = (BENCHMARKS / "README.md").read_text(encoding="utf-8")
+    for folder in ("performance", "validation"):
+        for script in (BENCHMARKS / folder).glob("*.py"):
+            if "__main__" in script.read_text(encoding="utf-8"):
+                assert f"{folder}/{script.name}" in listed
