@@ -34,7 +34,7 @@ from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
 class Isam2Params(Section):
     """Settings of the smoothing estimator."""
 
-    lag_s: float = Field(30.0, gt=0)
+    lag_s: float = Field(15.0, gt=0)
     """Poses older than this are marginalised out of the incremental solution; a large value keeps the whole history."""
     max_keyframe_interval_s: float = Field(5.0, gt=0)
     """A keyframe is set at the latest after this time."""

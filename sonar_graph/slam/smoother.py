@@ -67,6 +67,8 @@ class Smoother:
         self._window = self._new_window()
         self._joint: gtsam.JointMarginal | None = None
         self._joint_keys: set[int] = set()
+        self._asked: set[int] = set()
+        self._asked_before: set[int] = set()
         self._solved: tuple[gtsam.Values, gtsam.Marginals] | None = None
         self._solved_size = 0
 
@@ -115,7 +117,7 @@ class Smoother:
         self._pending_values = gtsam.Values()
         self._pending_times = {}
         self.waiting_gain = 0.0
-        self._joint = None
+        self._joint, self._asked, self._asked_before = None, set(), self._asked.intersection(self._landmarks)
         self.values.update(self._window.calculateEstimate())
         if self.graph.size() >= self._restart_size and self._is_stale():
             self._restart(time_s)
@@ -147,11 +149,12 @@ class Smoother:
     def joint_covariance(self, keys: list[int]) -> gtsam.JointMarginal:
         """Joint marginal covariance of variables in the window, and possibly of more of them.
 
-        One computation serves until the next update: it also covers the landmarks that were asked for before,
-        since successive frames show mostly the same.
+        One computation serves until the next update: it also covers the landmarks that were asked for before the last
+        one, since successive frames show mostly the same.
         """
+        self._asked.update(keys)
         if self._joint is None or not self._joint_keys.issuperset(keys):
-            self._joint_keys = set(keys) | self._joint_keys.intersection(self._landmarks)
+            self._joint_keys = self._asked | self._asked_before
             self._joint = self._window.getISAM2().jointMarginalCovariance(list(self._joint_keys))
         return self._joint
 
