@@ -20,6 +20,7 @@ tests against `sonar_graph.slam.models`. Range and azimuth are two factors, so t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import gtsam
@@ -36,6 +37,9 @@ UNINFORMATIVE_TANGENT = 1e3
 CORRELATION_LIMIT = 1e-6
 """Above it, range and azimuth noise are taken together."""
 PINHOLE = gtsam.Cal3_S2()
+BEAM_R_CAMERA = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
+"""Columns: image x to the left, image y up, optical axis along the beam."""
+ORIGIN = np.zeros(3)
 
 Robust = Callable[[gtsam.noiseModel.Base], gtsam.noiseModel.Base]
 """Wraps a noise model in a robust kernel, or returns it as it is."""
@@ -124,13 +128,15 @@ def landmark_sighting(
         Elevation is N(0, sigma²); None: not said here. Say it once a landmark: its elevation does not vary between
         frames as noise would, so that repeating it would invent information.
     """
-    correlation = cov[0, 1] / np.sqrt(cov[0, 0] * cov[1, 1])
-    factors = [_camera(pose_key, landmark_key, body_T_sonar, z[1], np.sqrt(cov[1, 1]), elevation_sigma_rad, robust)]
-    if abs(correlation) < CORRELATION_LIMIT:
-        noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, float(np.sqrt(cov[0, 0]))))
-        return [*factors, gtsam.RangeFactorWithTransform3D(pose_key, landmark_key, z[0], noise, body_T_sonar)]
+    range_var, azimuth_var, covariance = float(cov[0, 0]), float(cov[1, 1]), float(cov[0, 1])
+    factors = [
+        _camera(pose_key, landmark_key, body_T_sonar, float(z[1]), math.sqrt(azimuth_var), elevation_sigma_rad, robust)
+    ]
+    if abs(covariance) < CORRELATION_LIMIT * math.sqrt(range_var * azimuth_var):
+        noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, math.sqrt(range_var)))
+        return [*factors, gtsam.RangeFactorWithTransform3D(pose_key, landmark_key, float(z[0]), noise, body_T_sonar)]
     elevation_only = (
-        [_camera(pose_key, landmark_key, body_T_sonar, z[1], UNINFORMATIVE_TANGENT, elevation_sigma_rad, robust)]
+        [_camera(pose_key, landmark_key, body_T_sonar, float(z[1]), UNINFORMATIVE_TANGENT, elevation_sigma_rad, robust)]
         if elevation_sigma_rad
         else []
     )
@@ -146,11 +152,9 @@ def _camera(
     elevation_sigma_rad: float | None,
     robust: Robust,
 ) -> gtsam.NonlinearFactor:
-    c, s = np.cos(azimuth_rad), np.sin(azimuth_rad)
-    # Columns: image x to the left, image y up, optical axis along the measured azimuth.
-    sonar_R_camera = gtsam.Rot3(np.array([[-s, 0.0, c], [c, 0.0, s], [0.0, 1.0, 0.0]]))
-    body_T_camera = body_T_sonar.compose(gtsam.Pose3(sonar_R_camera, np.zeros(3)))
-    vertical = UNINFORMATIVE_TANGENT if elevation_sigma_rad is None else np.tan(elevation_sigma_rad)
+    sonar_T_beam = gtsam.Pose3(gtsam.Rot3.Rz(azimuth_rad).compose(BEAM_R_CAMERA), ORIGIN)
+    body_T_camera = body_T_sonar.compose(sonar_T_beam)
+    vertical = UNINFORMATIVE_TANGENT if elevation_sigma_rad is None else math.tan(elevation_sigma_rad)
     noise = robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([azimuth_sigma_rad, vertical])))
     return gtsam.GenericProjectionFactorCal3_S2(
         np.zeros(2), noise, pose_key, landmark_key, PINHOLE, False, False, body_T_camera

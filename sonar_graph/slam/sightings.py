@@ -139,8 +139,7 @@ class Sightings:
     def _add_factors(
         self, view: View, tie: Tie, sighting: Sighting, point: Floats, elevation_sigma_rad: float | None
     ) -> None:
-        R, key = sighting.cov.copy(), L(sighting.landmark_id)
-        R[[0, 1], [0, 1]] += view.noise_of(tie.motion, point)
+        R, key = view.blurred(sighting.cov, tie.motion, point), L(sighting.landmark_id)
         self.smoother.add(
             factors.landmark_sighting(
                 tie.pose_key, key, tie.keyframe_T_sonar, sighting.z, R, self._robust, elevation_sigma_rad

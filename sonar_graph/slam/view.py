@@ -83,9 +83,12 @@ class View:
             self._motion.covariance,
         )
 
-    def noise_of(self, motion: PreintegratedMotion, point: Floats) -> Floats:
-        """Variance of range and azimuth of a point of the world by the noise of a motion that ends here, shape (2,)."""
-        return _motion_noise(point, self._world_R_sonar, self._world_p_sonar, self._to_body, motion.covariance)
+    def blurred(self, cov: Floats, motion: PreintegratedMotion, point: Floats) -> Floats:
+        """Noise of range and azimuth of a point of the world, (2, 2), with that of a motion that ends at the frame.
+
+        The motion's part is added to each variance; that it correlates range and azimuth a little is left out.
+        """
+        return _blurred(cov, point, self._world_R_sonar, self._world_p_sonar, self._to_body, motion.covariance)
 
 
 @compiled
@@ -139,11 +142,14 @@ def _expect(
 
 
 @compiled
-def _motion_noise(
-    point: Floats, world_R_sonar: Floats, world_p_sonar: Floats, to_body: Floats, motion_cov: Floats
+def _blurred(
+    cov: Floats, point: Floats, world_R_sonar: Floats, world_p_sonar: Floats, to_body: Floats, motion_cov: Floats
 ) -> Floats:
     q = np.ascontiguousarray(world_R_sonar.T) @ (point - world_p_sonar)
     _, D_q = project(q)
     by_body = _by_sonar_pose(q, D_q) @ to_body
     noise = by_body @ motion_cov @ by_body.T
-    return np.array([noise[0, 0], noise[1, 1]])
+    blurred = cov.copy()
+    for k in range(2):
+        blurred[k, k] += noise[k, k]
+    return blurred
