@@ -41,7 +41,7 @@ class Isam2Params(Section):
     motion_noise_share: float = Field(0.1, ge=0)
     """While landmarks are seen, a keyframe is set sooner: once the variance of the motion since the last one exceeds
     this share of the sonar's variance. 0: every frame with a landmark."""
-    waiting_gain: float = Field(2.0, ge=0)
+    waiting_gain: float = Field(5.0, ge=0)
     """Sightings wait for the next keyframe until what they would add, the sum of expected over measured variance,
     exceeds this. 0: none waits."""
     bias_interval_s: float = Field(60.0, gt=0)
