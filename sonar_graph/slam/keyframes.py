@@ -50,6 +50,8 @@ class Keyframes:
     """Of each keyframe; its key is ``X(index)``."""
     bias_keys: list[int] = field(default_factory=list)
     """Of each keyframe: the bias that holds from it on."""
+    advanced_ns: int = np.iinfo(np.int64).min
+    """Latest instant that was advanced to."""
 
     def __post_init__(self) -> None:
         self.odometry = Odometry(self.calibration)
@@ -83,6 +85,7 @@ class Keyframes:
 
     def advance(self, until_ns: int) -> None:
         """Set the keyframes that are due from nodes reached at an instant; the first starts the graph."""
+        self.advanced_ns = max(self.advanced_ns, until_ns)
         if not self.stamps_ns:
             start_ns = self.odometry.start_ns()
             if start_ns is None or start_ns > until_ns:

@@ -63,9 +63,9 @@ class Sightings:
     def add(self, frame: LandmarkDetections) -> None:
         """Take in the detections of one frame."""
         stamp_ns = int(frame.stamps_ns[0])
-        newest_ns = self.keyframes.newest_ns
-        if newest_ns is None or stamp_ns < newest_ns:
-            late = Outcome.UNLOCATED if newest_ns is None else Outcome.LATE
+        unlocated = self.keyframes.newest_ns is None
+        if unlocated or stamp_ns < self.keyframes.advanced_ns:
+            late = Outcome.UNLOCATED if unlocated else Outcome.LATE
             for landmark_id in frame.most_probable()[0].tolist():
                 self.journal.record(stamp_ns, landmark_id, late)
             return

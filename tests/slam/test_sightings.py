@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from sonar_graph.states import Outcome
 
 NS = 1_000_000_000
 T0_NS = 1_500_000_000 * NS
+POLICY = KeyframePolicy(max_interval_s=5.0, motion_noise_share=1e9, bias_interval_s=60.0)
 TRUSTING = SightingPolicy(identity_probability=0.7, gate_probability=0.99, kernel="none", kernel_width=2.0)
 SONAR = SonarCalibration(
     mounting=Mounting(translation_m=(0.3, 0.1, -0.1), rpy_rad=(0.0, 0.4, 0.2)),
@@ -41,7 +44,7 @@ class Dive:
 
     def __init__(self, calibration: Calibration = CALIBRATION, policy: SightingPolicy = TRUSTING) -> None:
         self.smoother = Smoother(1e9, 1e-6, 1e9)
-        self.keyframes = Keyframes(calibration, KeyframePolicy(1.0, 5.0, 60.0), self.smoother)
+        self.keyframes = Keyframes(calibration, POLICY, self.smoother)
         self.sightings = Sightings(calibration, policy, self.smoother, self.keyframes)
         stamps = T0_NS + np.arange(0, 101) * NS // 10
         n = len(stamps)
@@ -106,10 +109,15 @@ def test_a_known_floor_gives_the_elevation():
     assert np.sqrt(dive.smoother.covariance(L(5))[2, 2]) == pytest.approx(FLOOR.sigma_m, rel=1e-3)
 
 
-def test_where_the_floor_is_out_of_the_aperture_the_centre_beam_is_taken():
-    dive = Dive(CALIBRATION.model_copy(update={"floor": FloorPrior(z_m=-9.0, sigma_m=0.01)}))
+def test_a_floor_out_of_the_aperture_is_believed_all_the_same():
+    """0.2 rad below the centre beam, where half the aperture is 0.12 rad: first put on the beam, then on the floor."""
+    dive = Dive(CALIBRATION.model_copy(update={"floor": FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.6), sigma_m=0.01)}))
     dive.see(0.0, (5, 3.0, 0.0))
-    assert dive.smoother.values.atPoint3(L(5))[2] == pytest.approx(-0.1 - 3.0 * np.sin(0.4))
+    for _ in range(5):
+        dive.smoother.update(dive.keyframes.newest_s)
+    assert dive.outcomes == [Outcome.NEW]
+    assert dive.smoother.values.atPoint3(L(5))[2] == pytest.approx(-0.1 - 3.0 * np.sin(0.6), abs=1e-3)
+    assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-3)
 
 
 def test_a_frame_between_keyframes_is_seen_from_where_the_vehicle_was():
@@ -170,7 +178,7 @@ def test_noise_of_the_motion_since_the_keyframe_is_added():
         }
     )
     dive = Dive(ahead)
-    dive.keyframes.policy = KeyframePolicy(100.0, 100.0, 60.0)
+    dive.keyframes.policy = KeyframePolicy(100.0, 1e9, 60.0)
     dive.see(0.0, (5, 4.0, 0.0))
     dive.see(0.0, (5, 4.0, 0.0))
     dive.see(2.0, (5, 3.0, 0.0))
@@ -221,23 +229,31 @@ def test_a_frame_before_the_start_is_unlocated():
     assert dive.smoother.graph.size() == 0
 
 
-def test_a_frame_before_the_newest_keyframe_is_late():
+@pytest.mark.parametrize("share", [0.0, 1e9], ids=["keyframe in between", "no keyframe in between"])
+def test_a_frame_older_than_what_was_processed_is_late(share):
+    """Whether a keyframe was set since then or not: motion to it is no longer kept."""
     dive = Dive()
+    dive.keyframes.policy = replace(POLICY, motion_noise_share=share)
     dive.see(3.0, (5, 3.0, 0.0))
     before = dive.smoother.graph.size()
-    dive.sightings.add(frame(T0_NS + 2 * NS, [(5, 3.0, 0.0)]))
-    assert dive.outcomes == [Outcome.NEW, Outcome.LATE]
+    dive.see(2.99, (5, 3.0, 0.0), (6, 2.0, 0.0))
+    assert dive.outcomes == [Outcome.NEW, Outcome.LATE, Outcome.LATE]
     assert dive.smoother.graph.size() == before
+    assert len(dive.keyframes.stamps_ns) == (2 if share == 0 else 1)
 
 
-def test_one_identity_twice_in_a_frame_is_new_and_then_seen_again():
+def test_one_identity_twice_in_a_frame_is_new_and_then_repeated():
+    """A frame is expected before any of it is used, so that the second has nothing to be compared with."""
     dive = Dive()
     dive.see(0.0, (5, 3.0, 0.0), (5, 3.01, 0.0), (6, 2.0, 0.1))
     log = dive.sightings.journal.log()
-    assert log.outcomes == [Outcome.NEW, Outcome.USED, Outcome.NEW]
+    assert log.outcomes == [Outcome.NEW, Outcome.REPEATED, Outcome.NEW]
     assert log.landmark_ids.tolist() == [5, 5, 6]
-    assert log.innovations[1] == pytest.approx([0.01, 0.0], abs=1e-6)
+    assert np.isnan(log.innovations).all()
     assert dive.sightings.ids == {5, 6}
+    assert dive.smoother.graph.size() == 1 + 2 * 2
+    dive.see(0.0, (5, 3.0, 0.0), (5, 3.01, 0.0))
+    assert dive.outcomes[3:] == [Outcome.USED] * 2
 
 
 @pytest.mark.parametrize("told", [None, np.diag([0.1**2, 0.05**2])])
