@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -11,18 +13,22 @@ from sonar_graph.calibration import (
     ImuCalibration,
     Mounting,
     PlanarMotion,
+    SonarCalibration,
     Start,
 )
 from sonar_graph.measurements import Depth, Dvl, Imu
+from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.navigation.earth import earth_rate_in_world
-from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
+from sonar_graph.slam import factors
+from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes, largest_variances
 from sonar_graph.slam.smoother import Smoother
 
 NS = 1_000_000_000
 T0_NS = 1_500_000_000 * NS
 G = 9.80665
 NO_BIAS = ImuCalibration(gyro_bias_sigma=0.0)
-POLICY = KeyframePolicy(min_interval_s=0.5, max_interval_s=2.0, bias_interval_s=10.0)
+EXACT_DVL = DvlCalibration(velocity_sigma_m_s=(1e-7, 1e-7, 1e-7))
+POLICY = KeyframePolicy(max_interval_s=2.0, motion_noise_share=1e9, bias_interval_s=10.0)
 
 
 def seconds(keyframes: Keyframes) -> list[float]:
@@ -72,7 +78,7 @@ def test_one_is_set_at_the_first_node_after_the_longest_interval():
 
 
 def test_nodes_off_the_interval_are_waited_for():
-    keyframes = keyframes_of(Calibration(imu=NO_BIAS), KeyframePolicy(0.5, 1.9, 10.0))
+    keyframes = keyframes_of(Calibration(imu=NO_BIAS), replace(POLICY, max_interval_s=1.9))
     keyframes.add(level_imu(4.5), steady_dvl(4.5, hz=3), None)
     keyframes.advance(int(at(4.5)[0]))
     assert seconds(keyframes) == pytest.approx([0.0, 2.0, 4.0], abs=1e-8)
@@ -92,14 +98,89 @@ def test_there_is_none_before_imu_covers_a_doppler_stamp():
     assert seconds(keyframes) == pytest.approx([1.02])
 
 
-def test_frames_bring_one_at_the_newest_reached_node_when_the_last_is_old_enough():
-    keyframes = driven(Calibration(imu=NO_BIAS), 1.0)
-    keyframes.set_for_frame(int(at(0.45)[0]))
-    assert seconds(keyframes) == [0.0]
-    keyframes.set_for_frame(int(at(0.79)[0]))
-    assert seconds(keyframes) == [0.0, 0.6]
-    keyframes.set_for_frame(int(at(1.0)[0]))
-    assert seconds(keyframes) == [0.0, 0.6]
+def see(keyframes: Keyframes, after_s: float) -> PreintegratedMotion:
+    """A frame comes: the motion to it from what is then the newest keyframe."""
+    stamp = int(at(after_s)[0])
+    keyframes.advance(stamp)
+    return keyframes.set_for_frame(stamp, keyframes.motion_since_newest(stamp))
+
+
+def noisy_keyframes(share: float, **calibration) -> Keyframes:
+    """0.3 m/s at 5 Hz: the displacement's variance grows by 0.018 m^2 a second."""
+    dvl = DvlCalibration(velocity_sigma_m_s=(0.3, 0.3, 0.3))
+    exact_gyro = ImuCalibration(gyro_noise_density=0.0, gyro_bias_sigma=0.0)
+    keyframes = keyframes_of(
+        Calibration(**({"imu": exact_gyro, "dvl": dvl} | calibration)), replace(POLICY, motion_noise_share=share)
+    )
+    keyframes.add(level_imu(1.99), steady_dvl(1.99), None)
+    return keyframes
+
+
+@pytest.mark.parametrize(("blurred_s", "expected"), [(0.55, [0.0]), (0.57, [0.0, 0.4])])
+def test_a_frame_brings_one_once_the_motion_blurs_it_by_the_share(blurred_s, expected):
+    """A tenth of (0.3178 m)^2 is 0.0101 m^2, reached after 0.561 s; it sits at the newest reached node."""
+    sonar = SonarCalibration(range_sigma_m=np.sqrt(0.018 * 0.561 / 0.1), azimuth_sigma_rad=1e3)
+    keyframes = noisy_keyframes(0.1, sonar=sonar)
+    motion = see(keyframes, blurred_s)
+    assert seconds(keyframes) == pytest.approx(expected)
+    assert motion.i_T_j.translation() == pytest.approx([0.5 * (blurred_s - expected[-1]), 0, 0])
+    assert motion.covariance[3, 3] == pytest.approx(0.018 * (blurred_s - expected[-1]))
+
+
+def test_the_turn_is_compared_with_azimuth():
+    """Gyro noise of 0.1 rad/s/sqrt(Hz): 0.0045 rad^2 after 0.45 s, a tenth of (0.21 rad)^2."""
+    for azimuth_sigma_rad, expected in ((0.20, [0.0, 0.4]), (0.22, [0.0])):
+        keyframes = noisy_keyframes(
+            0.1,
+            imu=ImuCalibration(gyro_noise_density=0.1, gyro_bias_sigma=0.0),
+            dvl=EXACT_DVL,
+            sonar=SonarCalibration(range_sigma_m=1e3, azimuth_sigma_rad=azimuth_sigma_rad),
+        )
+        see(keyframes, 0.45)
+        assert seconds(keyframes) == pytest.approx(expected)
+
+
+def test_an_unknown_bias_blurs_too():
+    """0.1 rad/s unknown: (0.045 rad)^2 after 0.45 s, and none where the bias is known to be zero."""
+    for bias_sigma, expected in ((0.1, [0.0, 0.4]), (0.0, [0.0])):
+        keyframes = noisy_keyframes(
+            0.1,
+            imu=ImuCalibration(gyro_noise_density=0.0, gyro_bias_sigma=bias_sigma),
+            dvl=EXACT_DVL,
+            sonar=SonarCalibration(range_sigma_m=1e3, azimuth_sigma_rad=0.1),
+        )
+        see(keyframes, 0.45)
+        assert seconds(keyframes) == pytest.approx(expected)
+
+
+def test_with_no_share_every_frame_brings_one_if_a_node_was_reached_since():
+    keyframes = noisy_keyframes(0.0)
+    for after_s in (0.1, 0.3, 0.35, 0.41, 1.0):
+        see(keyframes, after_s)
+    assert seconds(keyframes) == pytest.approx([0.0, 0.2, 0.4, 1.0])
+
+
+def test_largest_variances_are_those_of_noise_and_bias_together():
+    rng = np.random.default_rng(0)
+    root, D_bias, sigma = rng.standard_normal((6, 6)), rng.standard_normal((6, 3)), 0.7
+    total = np.diag(root @ root.T + sigma**2 * D_bias @ D_bias.T)
+    assert largest_variances(root @ root.T, D_bias, sigma) == pytest.approx((total[:3].max(), total[3:].max()))
+
+
+def test_the_smoother_waits_with_sightings_and_not_with_keyframes():
+    keyframes = keyframes_of(Calibration(imu=NO_BIAS))
+    keyframes.smoother = Smoother(1e9, 0.01, 1e9, 1.0)
+    keyframes.add(level_imu(4.0), steady_dvl(4.0), None)
+    keyframes.advance(int(at(1.0)[0]))
+    keyframes.update_if_due()
+    before = keyframes.smoother.covariance(X(0))
+    keyframes.smoother.add([factors.depth(X(0), 0.0, np.zeros(3), 1e-5)])
+    keyframes.smoother.waiting_gain = 0.9
+    keyframes.update_if_due()
+    assert np.array_equal(keyframes.smoother.covariance(X(0)), before)
+    keyframes.advance(int(at(2.0)[0]))
+    keyframes.update_if_due()
+    assert keyframes.smoother.covariance(X(0))[5, 5] < 0.1 * before[5, 5]
 
 
 def test_first_estimates_follow_the_odometry():
@@ -159,9 +240,9 @@ def test_velocity_is_taken_to_the_imu_before_gravity_is():
 
 
 def test_depths_since_the_last_keyframe_become_one_factor_at_their_weighted_mean():
-    """The vehicle sinks at 0.1 m/s; samples on the way are carried to the keyframe by its own motion."""
+    """The vehicle sinks at 0.1 m/s; samples on the way are carried to the keyframe by its own (exact) motion."""
     port, variance = (0.3, 0.0, 0.2), np.array([1e-4, 4e-4, np.nan])
-    calibration = Calibration(imu=NO_BIAS, depth=DepthCalibration(sigma_m=0.03, port_m=port))
+    calibration = Calibration(imu=NO_BIAS, dvl=EXACT_DVL, depth=DepthCalibration(sigma_m=0.03, port_m=port))
     when = np.array([0.5, 1.1, 1.9])
     depth = Depth(at(*when), -0.1 * when + port[2] + 0.01, variance)
     keyframes = driven(calibration, 2.0, depth, velocity=(0.0, 0.0, -0.1))
@@ -174,14 +255,24 @@ def test_depths_since_the_last_keyframe_become_one_factor_at_their_weighted_mean
 
 def test_depths_are_weighed_by_their_variances():
     depth = Depth(at(0.5, 1.5), np.array([1.0, 2.0]), np.array([1.0, 3.0]))
-    keyframes = driven(Calibration(imu=NO_BIAS), 2.0, depth)
+    keyframes = driven(Calibration(imu=NO_BIAS, dvl=EXACT_DVL), 2.0, depth)
     (factor,) = factors_on(keyframes, gtsam.GPSFactorArm, X(1))
     assert factor.unwhitenedError(keyframes.smoother.values)[2] == pytest.approx(-1.25)
 
 
+def test_a_depth_carried_far_by_a_noisy_log_is_worth_less():
+    """Vertical noise of 0.2 m/s at 5 Hz on a vehicle that points straight up: its x axis; for 1.5 s."""
+    dvl = DvlCalibration(velocity_sigma_m_s=(0.2, 1e-7, 1e-7))
+    for pitch, carried in ((0.0, 0.0), (-np.pi / 2, 0.2**2 * 0.2 * 1.5)):
+        calibration = Calibration(imu=NO_BIAS, dvl=dvl, start=Start(rpy_rad=(0, pitch, 0)), use_gravity=False)
+        keyframes = driven(calibration, 2.0, Depth(at(0.5), np.zeros(1), np.full(1, 1e-4)))
+        (factor,) = factors_on(keyframes, gtsam.GPSFactorArm, X(1))
+        assert factor.noiseModel().sigmas()[2] ** 2 == pytest.approx(1e-4 + carried, rel=1e-3)
+
+
 def test_each_depth_is_used_once_at_the_next_keyframe():
     when = np.arange(1, 60) / 10
-    keyframes = driven(Calibration(imu=NO_BIAS), 6.0, Depth(at(*when), np.zeros(59), np.full(59, 1e-4)))
+    keyframes = driven(Calibration(imu=NO_BIAS, dvl=EXACT_DVL), 6.0, Depth(at(*when), np.zeros(59), np.full(59, 1e-4)))
     sigmas = [factors_on(keyframes, gtsam.GPSFactorArm, X(k))[0].noiseModel().sigmas()[2] for k in (1, 2, 3)]
     assert [1e-4 / sigma**2 for sigma in sigmas] == pytest.approx([20, 20, 19])
 

@@ -50,7 +50,7 @@ def on_the_rail(nodes: int, lag_s: float, stale_shift_m: float = NEVER_M) -> Fed
         fed.add([factors.odometry(X(k - 1), X(k), motion)])
         for _, i, distance in (r for r in numbers.ranges if r[0] == k):
             if i not in seen:
-                fed.smoother.add_lasting(L(i), pose.translation() + distance * np.eye(3)[0])
+                fed.smoother.add_landmark(L(i), pose.translation() + distance * np.eye(3)[0])
             z, R = np.array([distance, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e6])
             fed.add(factors.landmark_sighting(X(k), L(i), gtsam.Pose3(), z, R, plain, None if i in seen else 3e-4))
             seen.add(i)
@@ -66,7 +66,7 @@ def in_the_basin(steps: int, lag_s: float, stale_shift_m: float = NEVER_M, seed:
     cov = np.diag([1e-4] * 3 + [4e-4] * 3)
     fed, truth, seen = Fed(lag_s, stale_shift_m), gtsam.Pose3(), set()
     fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
-    fed.smoother.add_lasting(B(0), np.zeros(3))
+    fed.smoother.add_bias(B(0), np.zeros(3))
     prior = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01] * 3 + [0.02] * 3))
     fed.add([gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), prior), factors.bias_prior(B(0), 0.01)])
     for k in range(1, steps):
@@ -80,7 +80,7 @@ def in_the_basin(steps: int, lag_s: float, stale_shift_m: float = NEVER_M, seed:
             q = truth.compose(SONAR).transformTo(p)
             z = np.array([np.linalg.norm(q), np.arctan2(q[1], q[0])]) + [0.02, 0.009] * rng.standard_normal(2)
             if i not in seen:
-                fed.smoother.add_lasting(L(i), p + 0.3 * rng.standard_normal(3))
+                fed.smoother.add_landmark(L(i), p + 0.3 * rng.standard_normal(3))
             new = factors.landmark_sighting(
                 X(k), L(i), SONAR, z, np.diag([4e-4, 8e-5]), plain, None if i in seen else 0.3
             )
@@ -225,20 +225,66 @@ def test_an_update_without_news_changes_nothing():
     fed = settled(in_the_basin(20, 6.0), 19.0)
     keys = [X(19), L(3), B(0)]
     before, cov = gtsam.Values(fed.smoother.values), joint(fed, keys)
-    assert not fed.smoother.has_news
+    assert not fed.smoother.is_due
     fed.smoother.update(19.0)
     fed.smoother.update(19.0)
     assert fed.smoother.values.equals(before, 1e-6)
     assert np.allclose(joint(fed, keys), cov, rtol=1e-4)
 
 
-def test_news_are_waited_for():
+def test_factors_wait_until_they_are_worth_an_update():
     fed = in_the_basin(5, 6.0)
-    pull = gtsam.PriorFactorPoint3(L(3), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.01))
     before = fed.smoother.values.atPoint3(L(3))
-    fed.add([pull])
-    assert fed.smoother.has_news
+    fed.add([gtsam.PriorFactorPoint3(L(3), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.01))])
+    assert not fed.smoother.is_due
+    fed.smoother.waiting_gain += 0.1
+    assert fed.smoother.is_due
     assert np.array_equal(fed.smoother.values.atPoint3(L(3)), before)
     fed.smoother.update(4.0)
-    assert not fed.smoother.has_news
+    assert not fed.smoother.is_due
     assert np.linalg.norm(fed.smoother.values.atPoint3(L(3)) - before) > 0.5
+
+
+def test_a_new_variable_does_not_wait():
+    smoother = Smoother(6.0, 1e-6, NEVER_M, greatest_waiting_gain=1e9)
+    smoother.waiting_gain = 1e8
+    assert not smoother.is_due
+    smoother.add_landmark(L(1), np.zeros(3))
+    assert smoother.is_due
+
+
+def test_one_computation_of_covariances_serves_until_the_next_update():
+    """Asked for more than before, it is made for all; what it says does not depend on who asked first."""
+    fed = in_the_basin(12, FOREVER_S)
+    alone = fed.smoother.joint_covariance([X(11), L(3)])
+    pose = alone.at(X(11), X(11)).copy()
+    both = fed.smoother.joint_covariance([X(11), L(3), L(5)])
+    assert np.allclose(both.at(X(11), X(11)), pose, rtol=1e-9)
+    assert np.allclose(both.at(L(5), L(5)), fed.smoother.covariance(L(5)), rtol=1e-6)
+    assert fed.smoother.joint_covariance([L(5)]) is both
+    fed.add([gtsam.PriorFactorPoint3(L(5), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 1e-3))])
+    fed.smoother.update(11.0)
+    assert fed.smoother.joint_covariance([L(5)]).at(L(5), L(5))[0, 0] < 1e-5
+
+
+@pytest.mark.parametrize("lag_s", [FOREVER_S, 3.0])
+def test_biases_in_a_row_are_least_squares(lag_s):
+    """Old ones leave the window; the newest is that of all: scalars by hand, prior, walk, and a reading of each."""
+    smoother, sigma, walk, reading = Smoother(lag_s, 1e-6, NEVER_M), 1.0, 0.5, 0.3
+    A, b = [np.eye(8)[0] / sigma], [0.0]
+    for k in range(8):
+        smoother.add_pose(X(k), gtsam.Pose3(), float(k))
+        smoother.add([gtsam.PriorFactorPose3(X(k), gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6))])
+        smoother.add_bias(B(k), np.zeros(3))
+        smoother.add([factors.bias_walk(B(k - 1), B(k), walk) if k else factors.bias_prior(B(0), sigma)])
+        noise = gtsam.noiseModel.Isotropic.Sigma(3, reading)
+        smoother.add([gtsam.PriorFactorPoint3(B(k), np.full(3, np.sin(k)), noise)])
+        smoother.update(float(k))
+        if k:
+            A.append((np.eye(8)[k] - np.eye(8)[k - 1]) / walk)
+            b.append(0.0)
+        A.append(np.eye(8)[k] / reading)
+        b.append(np.sin(k) / reading)
+    cov = np.linalg.inv(np.transpose(A) @ A)
+    assert smoother.values.atPoint3(B(7)) == pytest.approx([(cov @ np.transpose(A) @ b)[7]] * 3, abs=1e-9)
+    assert np.diag(smoother.covariance(B(7))) == pytest.approx([cov[7, 7]] * 3, abs=1e-9)

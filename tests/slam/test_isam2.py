@@ -1,0 +1,385 @@
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import L
+from scipy.stats import chi2
+
+from sonar_graph.calibration import Calibration, ImuCalibration, PlanarMotion, Start
+from sonar_graph.estimator_checks.world import small_world, still_world
+from sonar_graph.evaluation.consistency import normalised_squares
+from sonar_graph.logs.converters.mrclam import read_mrclam
+from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections, Measurements
+from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.states import Estimate, Outcome
+
+BASIN_S = 130.0
+
+
+@pytest.fixture(scope="module")
+def basin() -> Sequence:
+    return simulate_basin(BasinOptions(duration_s=BASIN_S, laps=1, seed=3))
+
+
+def run(estimator: Isam2, sequence: Sequence, rate_hz: float = 2.0) -> list[Estimate]:
+    answers = [estimator.process(step) for step in sequence.replay(sequence.instants(rate_hz))]
+    return [answer for answer in answers if answer is not None]
+
+
+def same(one: Estimate, other: Estimate) -> bool:
+    return (
+        one.stamp_ns == other.stamp_ns
+        and np.array_equal(one.world_T_body.matrix(), other.world_T_body.matrix())
+        and np.array_equal(one.covariance, other.covariance)
+    )
+
+
+def until(sequence: Sequence, end_ns: int) -> Sequence:
+    """The log, had it been cut off there."""
+    return replace(
+        sequence,
+        imu=sequence.imu.between(0, end_ns),
+        dvl=sequence.dvl.between(0, end_ns),
+        depth=sequence.depth.between(0, end_ns) if sequence.depth else None,
+        detections=sequence.detections.between(0, end_ns) if sequence.detections else None,
+    )
+
+
+def with_calibration(sequence: Sequence, **changes) -> Sequence:
+    return replace(sequence, calibration=sequence.calibration.model_copy(update=changes))
+
+
+# At rest ------------------------------------------------------------------------------------------------------------
+
+
+def noisy(sequence: Sequence, seed: int) -> Sequence:
+    """The same with the noise that its calibration states."""
+    rng, c = np.random.default_rng(seed), sequence.calibration
+    imu_hz = NS_PER_S / np.diff(sequence.imu.stamps_ns)[0]
+
+    def scatter(values: Floats, sigma) -> Floats:
+        return values + sigma * rng.standard_normal(values.shape)
+
+    rate = scatter(sequence.imu.angular_velocity, c.imu.gyro_noise_density * np.sqrt(imu_hz))
+    force = scatter(sequence.imu.specific_force, c.imu.accel_noise_density * np.sqrt(imu_hz))
+    velocity = scatter(sequence.dvl.velocity, np.array(c.dvl.velocity_sigma_m_s))
+    return replace(
+        sequence,
+        imu=Imu(sequence.imu.stamps_ns, rate, force),
+        dvl=Dvl(sequence.dvl.stamps_ns, velocity, sequence.dvl.velocity_cov),
+        depth=Depth(sequence.depth.stamps_ns, scatter(sequence.depth.z_m, c.depth.sigma_m), sequence.depth.variance_m2),
+    )
+
+
+def test_a_still_vehicle_stays_still():
+    """60 s of gravity alone on a tilted vehicle."""
+    sequence = still_world()
+    start = sequence.calibration.start.pose()
+    for estimate in run(Isam2(sequence.calibration), sequence):
+        assert np.abs(gtsam.Pose3.Logmap(start.between(estimate.world_T_body))).max() < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_still_vehicle_with_noise_stays_within_its_doubt(seed):
+    """A velocity of 1 cm/s at 5 Hz wanders by 1 cm/s x sqrt(0.2 s x 60 s) on each axis, and the filter knows it."""
+    sequence = noisy(still_world(), seed)
+    start = sequence.calibration.start.pose()
+    estimates = run(Isam2(sequence.calibration), sequence)
+    for estimate in estimates:
+        off = gtsam.Pose3.Logmap(start.between(estimate.world_T_body))
+        assert np.linalg.norm(off[:3]) < 0.01
+        assert off @ np.linalg.solve(estimate.covariance, off) < chi2.ppf(0.9999, 6)
+    R = estimates[-1].world_T_body.rotation().matrix()
+    sigmas = np.sqrt(np.diag(R @ estimates[-1].covariance[3:, 3:] @ R.T))
+    assert sigmas[:2] == pytest.approx([0.01 * np.sqrt(0.2 * 60)] * 2, rel=0.03)
+    assert sigmas[2] < 0.01
+
+
+# Against batch ------------------------------------------------------------------------------------------------------
+
+
+def batch_solution(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values) -> gtsam.Values:
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-9)
+    return gtsam.LevenbergMarquardtOptimizer(graph, initial, params).optimize()
+
+
+def assert_is_batch(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+    """Cost within 1 % and poses within 1 cm of Levenberg-Marquardt on the identical factors."""
+    batch = batch_solution(graph, values)
+    assert graph.error(batch) <= graph.error(values) * (1 + 1e-9)
+    assert graph.error(values) == pytest.approx(graph.error(batch), rel=0.01)
+    for key in poses_in(values):
+        assert np.linalg.norm(values.atPose3(key).translation() - batch.atPose3(key).translation()) < 0.01
+
+
+def poses_in(values: gtsam.Values) -> list[int]:
+    return [key for key in list(values.keys()) if gtsam.Symbol(key).chr() == ord("x")]
+
+
+@pytest.mark.parametrize("kernel", ["none", "huber", "cauchy"])
+@pytest.mark.parametrize("bias", [0.0, 1.0])
+def test_incremental_equals_batch_in_the_basin(kernel, bias):
+    """iSAM2's own estimate, when it keeps all poses and relinearises what moved by a tenth of a milliradian."""
+    sequence = simulate_basin(BasinOptions(duration_s=BASIN_S, laps=1, seed=3, gyro_bias_scale=bias))
+    settings = Isam2Params(lag_s=1e6, kernel=kernel, relinearize_threshold=1e-4, waiting_gain=0.0)
+    estimator = Isam2(sequence.calibration, settings)
+    run(estimator, sequence)
+    assert len(poses_in(estimator.values)) > 20
+    assert_is_batch(estimator.graph, estimator.values)
+
+
+def test_the_default_window_ends_next_to_the_batch(basin):
+    """Newest pose and landmarks, which a lag and coarse relinearisation cost under a fifth of a standard deviation."""
+    estimator = Isam2(basin.calibration)
+    last = run(estimator, basin)[-1]
+    values = estimator.values
+    batch = batch_solution(estimator.graph, values)
+    newest = poses_in(values)[-1]
+    off = gtsam.Pose3.Logmap(batch.atPose3(newest).between(values.atPose3(newest)))
+    assert np.all(np.abs(off) < 0.2 * np.sqrt(np.diag(last.covariance)))
+    for landmark_id in (1, 2, 3, 4):
+        assert values.atPoint3(L(landmark_id)) == pytest.approx(batch.atPoint3(L(landmark_id)), abs=0.01)
+
+
+@pytest.mark.recording
+def test_incremental_equals_batch_on_mrclam(unpacked):
+    folder = next(unpacked("mrclam_ds6.tar.xz").rglob("Barcodes.dat")).parent
+    whole = read_mrclam(folder, 1)
+    sequence = until(whole, whole.start_ns + 300 * NS_PER_S)
+    estimator = Isam2(sequence.calibration, Isam2Params(lag_s=1e6, relinearize_threshold=1e-3, waiting_gain=0.0))
+    run(estimator, sequence)
+    assert len(poses_in(estimator.values)) > 100
+    assert_is_batch(estimator.graph, estimator.values)
+
+
+def test_the_final_answer_is_the_batch_solution(basin):
+    """Trajectory and landmarks with the default settings; the instants asked for are the keyframes' and others."""
+    estimator = Isam2(basin.calibration)
+    run(estimator, basin, 7.0)
+    before = gtsam.Values(estimator.values)
+    batch = batch_solution(estimator.graph, before)
+    found, smoothed = estimator.landmarks(), estimator.trajectory()
+    for landmark_id, position in zip(found.ids.tolist(), found.positions, strict=True):
+        assert position == pytest.approx(batch.atPoint3(L(landmark_id)), abs=1e-3)
+    batch_positions = np.array([batch.atPose3(key).translation() for key in poses_in(batch)[1:]])
+    nearest = np.min(np.linalg.norm(smoothed.positions[None] - batch_positions[:, None], axis=2), axis=1)
+    assert np.median(nearest) < 1e-3
+    assert estimator.values.equals(before, 0.0)
+
+
+# Causality and bookkeeping ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cut_s", [17.3, 64.0])
+def test_nothing_peeks_ahead(basin, cut_s):
+    """Estimates until t are the same, to the bit, from a log that ends at t."""
+    end_ns = basin.start_ns + round(cut_s * NS_PER_S)
+    whole, cut = (run(Isam2(basin.calibration), s) for s in (basin, until(basin, end_ns)))
+    assert len(cut) > 25
+    assert all(same(a, b) for a, b in zip(whole, cut[:-1], strict=False))
+
+
+def test_motion_and_depth_that_arrive_early_are_not_used_early():
+    """All rows but the detections at once: the estimates are those of rows that come in time."""
+    sequence = small_world()
+    in_time, early = Isam2(sequence.calibration), Isam2(sequence.calibration)
+    expected = run(in_time, sequence)
+    actual, first = [], True
+    for step in sequence.replay(sequence.instants(2.0)):
+        blocks = (sequence.imu, sequence.dvl, sequence.depth) if first else (None, None, None)
+        actual.append(early.process(Measurements(step.end_ns, *blocks, step.detections)))
+        first = False
+    assert all(same(a, b) for a, b in zip(expected, actual, strict=True))
+
+
+def test_every_detection_has_one_row_in_the_order_of_frames(basin):
+    estimator = Isam2(basin.calibration)
+    run(estimator, basin)
+    log = estimator.detections()
+    seen = basin.detections.between(0, int(log.stamps_ns[-1]))
+    assert np.array_equal(log.stamps_ns, seen.stamps_ns)
+    rows = list(zip(log.stamps_ns.tolist(), log.landmark_ids.tolist(), strict=True))
+    assert sorted(rows) == sorted(zip(seen.stamps_ns.tolist(), seen.most_probable()[0].tolist(), strict=True))
+    counts = {outcome: log.outcomes.count(outcome) for outcome in set(log.outcomes)}
+    assert counts[Outcome.NEW] == 4
+    assert counts[Outcome.USED] > 0.8 * len(log)
+    assert counts.get(Outcome.NO_IDENTITY, 0) == int(np.sum(seen.most_probable()[1] < 0.7))
+
+
+def test_used_detections_are_two_factors_each_and_refused_none():
+    """Against the same log without detections, keyframes at the same stamps."""
+    sequence = with_calibration(small_world(), imu=ImuCalibration(gyro_bias_sigma=0.0))
+    params = Isam2Params(motion_noise_share=1e9, max_keyframe_interval_s=1.0)
+    sighted, blind = (Isam2(s.calibration, params) for s in (sequence, sequence))
+    run(sighted, sequence)
+    run(blind, replace(sequence, detections=None))
+    outcomes = sighted.detections().outcomes
+    told = sum(outcome in (Outcome.USED, Outcome.NEW) for outcome in outcomes)
+    assert 0 < outcomes.count(Outcome.NO_IDENTITY) < len(outcomes)
+    assert sighted.graph.size() == blind.graph.size() + 2 * told
+
+
+def test_refused_detections_leave_everything_as_it_is():
+    sequence = small_world()
+    rows = sequence.detections
+    doubtful = LandmarkDetections(
+        rows.stamps_ns,
+        rows.range_m,
+        rows.azimuth_rad,
+        rows.range_azimuth_cov,
+        rows.candidate_ids,
+        0.1 * rows.id_probability,
+    )
+    refusing, blind = Isam2(sequence.calibration), Isam2(sequence.calibration)
+    refused = run(refusing, replace(sequence, detections=doubtful))
+    plain = run(blind, replace(sequence, detections=None))
+    assert refusing.detections().outcomes == [Outcome.NO_IDENTITY] * len(rows)
+    assert refusing.graph.size() == blind.graph.size()
+    assert all(same(a, b) for a, b in zip(refused, plain, strict=True))
+
+
+def test_a_detection_far_off_is_gated_and_changes_nothing():
+    sequence = small_world()
+    last = sequence.detections.rows(slice(len(sequence.detections) - 1, None))
+    ghost = replace(
+        last,
+        stamps_ns=last.stamps_ns + NS_PER_S // 10,
+        range_m=last.range_m + 2.0,
+        id_probability=last.id_probability * 0 + 1,
+    )
+    gated = Isam2Params(gate_probability=0.999)
+    haunted, plain = Isam2(sequence.calibration, gated), Isam2(sequence.calibration, gated)
+    ends = run(haunted, replace(sequence, detections=LandmarkDetections.concatenate([sequence.detections, ghost])))
+    expected = run(plain, sequence)
+    assert haunted.detections().outcomes[-1] is Outcome.GATED
+    assert np.abs(gtsam.Pose3.Logmap(ends[-1].world_T_body.between(expected[-1].world_T_body))).max() < 1e-3
+    assert len(haunted.detections()) == len(plain.detections()) + 1
+
+
+def test_detections_before_the_start_are_unlocated():
+    sequence = small_world(dvl_delay_s=5.0)
+    estimator = Isam2(sequence.calibration)
+    for step in sequence.replay(sequence.start_ns + np.arange(-8, 20) * NS_PER_S // 2):
+        estimator.process(step)
+    log = estimator.detections()
+    early = log.stamps_ns < sequence.start_ns
+    assert early.any()
+    assert [o is Outcome.UNLOCATED for o in log.outcomes] == early.tolist()
+
+
+# Kinds of vehicles --------------------------------------------------------------------------------------------------
+
+
+def planar_world() -> Sequence:
+    """Wheels on a plane: nothing measured vertically, a sonar on the axis."""
+    sequence = small_world()
+    calibration = sequence.calibration
+    start = calibration.start.model_copy(update={"position_m": (0.0, 0.0, -0.5)})
+    return with_calibration(
+        replace(sequence, depth=None, imu=replace(sequence.imu, specific_force=sequence.imu.specific_force * np.nan)),
+        planar=PlanarMotion(z_m=-0.5),
+        start=start,
+    )
+
+
+def test_planar_motion_stays_in_the_plane():
+    sequence = planar_world()
+    estimator = Isam2(sequence.calibration)
+    estimates = run(estimator, sequence)
+    for estimate in estimates:
+        assert abs(estimate.world_T_body.translation()[2] + 0.5) < 0.015
+        assert np.abs(estimate.world_T_body.rotation().xyz()[:2]).max() < 5e-3
+    off = estimator.trajectory().positions - sequence.truth.at(estimator.trajectory().stamps_ns).positions
+    assert np.linalg.norm(off, axis=1).max() < 0.1
+
+
+@pytest.mark.parametrize("bias_sigma", [0.0, 1e-4])
+@pytest.mark.parametrize("depth", [True, False])
+def test_bias_and_depth_may_be_absent(bias_sigma, depth):
+    sequence = with_calibration(small_world(), imu=ImuCalibration(gyro_bias_sigma=bias_sigma))
+    sequence = sequence if depth else replace(sequence, depth=None)
+    estimator = Isam2(sequence.calibration)
+    estimates = run(estimator, sequence)
+    truth = sequence.truth.at(np.array([e.stamp_ns for e in estimates]))
+    off = np.array([e.world_T_body.translation() for e in estimates]) - truth.positions
+    assert np.abs(off).max() < 0.15
+    kinds = {chr(gtsam.Symbol(key).chr()) for key in list(estimator.values.keys())}
+    assert kinds == ({"x", "l", "b"} if bias_sigma else {"x", "l"})
+
+
+def test_a_landmarks_height_is_wide_until_it_is_seen_from_several_heights():
+    """No floor: from one height the aperture is all that is known; a dive of 2 m tells it by the ranges."""
+    spread = {}
+    for dive_m in (0.0, 2.0):
+        sequence = dipping(dive_m)
+        estimator = Isam2(sequence.calibration)
+        run(estimator, sequence)
+        found = estimator.landmarks()
+        spread[dive_m] = np.sqrt(found.covariances[0, 2, 2])
+        assert abs(found.positions[0, 2] - DIP_LANDMARK[2]) < 3 * spread[dive_m]
+    aperture_m = 3.0 * Calibration().sonar.elevation_aperture_rad / np.sqrt(12)
+    assert spread[0.0] == pytest.approx(aperture_m, rel=0.1)
+    assert spread[2.0] < 0.2 * spread[0.0]
+
+
+DIP_LANDMARK = np.array([3.0, 0.0, 0.1])
+
+
+def dipping(dive_m: float) -> Sequence:
+    """20 s on the spot, or down and up again, watching one landmark; measurements are exact."""
+    hz, seconds = 10, 20
+    stamps = 10**18 + np.arange(seconds * hz + 1) * NS_PER_S // hz
+    t = (stamps - stamps[0]) * 1e-9
+    z = -dive_m / 2 * (1 - np.cos(2 * np.pi * t / seconds))
+    sink = -dive_m / 2 * 2 * np.pi / seconds * np.sin(2 * np.pi * t / seconds)
+    n, seen = len(stamps), slice(1, None, 5)
+    points = DIP_LANDMARK - np.column_stack([0 * z, 0 * z, z])
+    return Sequence(
+        "dip",
+        Calibration(imu=ImuCalibration(gyro_bias_sigma=0.0), start=Start(rpy_sigma_rad=(1e-4,) * 3)),
+        Imu(stamps, np.zeros((n, 3)), np.full((n, 3), np.nan)),
+        Dvl(stamps, np.outer(sink, [0, 0, 1.0]), np.full((n, 3, 3), np.nan)),
+        Depth(stamps, z, np.full(n, 1e-6)),
+        LandmarkDetections(
+            stamps[seen],
+            np.linalg.norm(points, axis=1)[seen],
+            np.zeros(n)[seen],
+            np.full((n, 2, 2), np.nan)[seen],
+            np.full((n, 1), 2)[seen],
+            np.ones((n, 1))[seen],
+        ),
+    )
+
+
+# Consistency --------------------------------------------------------------------------------------------------------
+
+
+def position_nees(sequence: Sequence, estimates: list[Estimate]) -> Floats:
+    truth = sequence.truth.at(np.array([e.stamp_ns for e in estimates]))
+    off = np.array([e.world_T_body.translation() for e in estimates]) - truth.positions
+    covs = []
+    for e in estimates:
+        R = e.world_T_body.rotation().matrix()
+        covs.append(R @ e.covariance[3:, 3:] @ R.T)
+    return normalised_squares(off, np.array(covs))
+
+
+def test_errors_in_the_basin_are_neither_far_above_nor_far_below_their_doubt(basin):
+    """One run, its instants correlated: mean of the position's NEES between a tenth and four times its three."""
+    nees = position_nees(basin, run(Isam2(basin.calibration), basin))
+    assert 0.3 < nees.mean() < 12.0
+
+
+@pytest.mark.slow
+def test_twenty_basins_are_consistent():
+    """Two-sided 99.9 % band of the mean over independent runs at the end of each, three degrees of freedom."""
+    last = []
+    for seed in range(20):
+        sequence = simulate_basin(BasinOptions(duration_s=300.0, laps=1, seed=seed, gyro_bias_scale=0.0))
+        last.append(position_nees(sequence, run(Isam2(sequence.calibration), sequence, 1.0))[-1])
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * len(last)) / len(last)
+    assert low < np.mean(last) < high

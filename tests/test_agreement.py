@@ -1,0 +1,159 @@
+"""EKF-SLAM, the smoother and dead reckoning where they must say the same."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from baselines.dead_reckoning import DeadReckoning
+from baselines.ekf_slam import EkfSlam, EkfSlamParams
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
+from sonar_graph.estimator import Estimator
+from sonar_graph.measurements import Dvl, Floats, Imu
+from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.states import Estimate
+
+from .slam.rail import STEP_S, T0_NS, rail
+
+NODES = 21
+EVERY_NODE = {"max_keyframe_interval_s": 0.1, "waiting_gain": 0.0}
+SMOOTHERS = {
+    "everything kept": Isam2Params(
+        kernel="none", gate_probability=1, lag_s=1e6, relinearize_threshold=1e-6, **EVERY_NODE
+    ),
+    "three seconds kept": Isam2Params(
+        kernel="none", gate_probability=1, lag_s=3.1, relinearize_threshold=1e-6, **EVERY_NODE
+    ),
+}
+smoothers = pytest.mark.parametrize("params", SMOOTHERS.values(), ids=SMOOTHERS)
+
+
+def run(estimator: Estimator, sequence: Sequence, rate_hz: float = 1 / STEP_S) -> list[Estimate]:
+    answers = [estimator.process(step) for step in sequence.replay(sequence.instants(rate_hz))]
+    return [answer for answer in answers if answer is not None]
+
+
+def difference(one: list[Estimate], other: list[Estimate], axes: slice = slice(0, 6)) -> tuple[float, float]:
+    """Largest difference of pose (m, rad) and of the covariance of some axes, relative to the sigmas."""
+    assert [e.stamp_ns for e in one] == [e.stamp_ns for e in other]
+    poses = [
+        np.abs(a.world_T_body.inverse().compose(b.world_T_body).matrix() - np.eye(4)).max()
+        for a, b in _pairs(one, other)
+    ]
+    covs = []
+    for a, b in _pairs(one, other):
+        sigma = np.sqrt(np.diag(b.covariance)[axes])
+        covs.append(np.abs((a.covariance - b.covariance)[axes, axes] / np.outer(sigma, sigma)).max())
+    return max(poses), max(covs)
+
+
+def _pairs(one: list[Estimate], other: list[Estimate]) -> list[tuple[Estimate, Estimate]]:
+    return list(zip(one, other, strict=True))
+
+
+def ekf(calibration: Calibration) -> EkfSlam:
+    return EkfSlam(calibration, EkfSlamParams(gate_probability=1))
+
+
+@smoothers
+def test_filter_and_smoother_are_least_squares_where_all_is_linear(params):
+    """At every node, with what was measured until then, along x: mean and variance to 1e-6."""
+    sequence, numbers = rail(NODES)
+    for estimator in (ekf(sequence.calibration), Isam2(sequence.calibration, params)):
+        for k, estimate in enumerate(run(estimator, sequence), 1):
+            mean, variance = numbers.solution(k + 1)
+            assert estimate.world_T_body.translation()[0] == pytest.approx(mean[f"x{k}"], abs=1e-6)
+            assert estimate.covariance[3, 3] == pytest.approx(variance[f"x{k}"], abs=1e-6 * variance[f"x{k}"] ** 0.5)
+
+
+@smoothers
+def test_filter_and_smoother_agree_where_all_is_linear(params):
+    """Between nodes too, and in all that is known of the pose."""
+    sequence, _ = rail(NODES)
+    filtered, smoothed = (
+        run(e, sequence, 10) for e in (ekf(sequence.calibration), Isam2(sequence.calibration, params))
+    )
+    poses, covariances = difference(filtered, smoothed, slice(3, 6))
+    assert poses < 1e-6
+    assert covariances < 1e-6
+
+
+@smoothers
+def test_maps_are_least_squares_where_all_is_linear(params):
+    sequence, numbers = rail(NODES)
+    mean, variance = numbers.solution(NODES)
+    for estimator in (ekf(sequence.calibration), Isam2(sequence.calibration, params)):
+        run(estimator, sequence)
+        found = estimator.landmarks()
+        assert found.ids.tolist() == [4, 7]
+        assert found.positions[:, 0] == pytest.approx([mean["l4"], mean["l7"]], abs=1e-6)
+        assert found.covariances[:, 0, 0] == pytest.approx([variance["l4"], variance["l7"]], abs=1e-6)
+
+
+@smoothers
+def test_the_smoothed_trajectory_is_least_squares_with_all_measurements(params):
+    """And better than the causal one, but for the last pose."""
+    sequence, numbers = rail(NODES)
+    mean, variance = numbers.solution(NODES)
+    estimator = Isam2(sequence.calibration, params)
+    causal = run(estimator, sequence)
+    smoothed = estimator.trajectory()
+    for k in range(1, NODES):
+        assert smoothed.positions[k - 1, 0] == pytest.approx(mean[f"x{k}"], abs=1e-6)
+        assert smoothed.covariances[k - 1, 3, 3] == pytest.approx(variance[f"x{k}"], abs=1e-6)
+    assert smoothed.covariances[9, 3, 3] < causal[9].covariance[3, 3] - 1e-6
+    assert smoothed.positions[-1, 0] == pytest.approx(causal[-1].world_T_body.translation()[0], abs=1e-6)
+
+
+def winding(gyro_bias_sigma: float = 0.0) -> Sequence:
+    """A minute of driving, turning and leaning, with lever arms, and nothing that could correct it."""
+    calibration = Calibration(
+        imu=ImuCalibration(gyro_noise_density=1e-3, gyro_bias_sigma=gyro_bias_sigma, gyro_bias_walk_density=0.0),
+        dvl=DvlCalibration(
+            velocity_sigma_m_s=(0.01, 0.02, 0.03),
+            mounting=Mounting(translation_m=(-0.4, 0.1, -0.2), rpy_rad=(0, 0, 0.8)),
+        ),
+        start=Start(
+            position_m=(1, 2, -3),
+            rpy_rad=(0.1, -0.2, 2.5),
+            position_sigma_m=(0.1, 0.02, 0.3),
+            rpy_sigma_rad=(0.01, 0.02, 0.03),
+        ),
+        use_gravity=False,
+    )
+    imu_ns, dvl_ns = (T0_NS + np.arange(60 * hz + 1) * NS_PER_S // hz for hz in (50, 6))
+    rates, velocities = (_waves((ns - T0_NS) * 1e-9) for ns in (imu_ns, dvl_ns))
+    into_dvl = Rotation.from_euler("z", 0.8).inv()
+    return Sequence(
+        "winding",
+        calibration,
+        Imu(imu_ns, 0.15 * rates, np.full((len(imu_ns), 3), np.nan)),
+        Dvl(dvl_ns, into_dvl.apply([0.5, 0, 0] + 0.1 * velocities), np.full((len(dvl_ns), 3, 3), np.nan)),
+    )
+
+
+def _waves(t: Floats) -> Floats:
+    return np.column_stack([np.sin(1.1 * t), np.cos(0.7 * t), 0.5 + np.sin(0.3 * t)])
+
+
+def test_without_sightings_all_are_dead_reckoning():
+    """Poses and whole covariances, at nodes and between them."""
+    sequence = winding()
+    reckoned = run(DeadReckoning(sequence.calibration), sequence, 3.7)
+    for estimator in (EkfSlam(sequence.calibration), Isam2(sequence.calibration)):
+        poses, covariances = difference(run(estimator, sequence, 3.7), reckoned)
+        assert poses < 1e-6
+        assert covariances < 1e-6
+
+
+def test_without_sightings_the_smoother_carries_the_bias_as_dead_reckoning_does():
+    """A constant bias of which nothing is learnt: unknown, and the same at all times."""
+    sequence = winding(gyro_bias_sigma=2e-3)
+    reckoned = run(DeadReckoning(sequence.calibration), sequence, 3.7)
+    poses, covariances = difference(run(Isam2(sequence.calibration), sequence, 3.7), reckoned)
+    assert poses < 1e-6
+    assert covariances < 1e-3
+    unaware = run(DeadReckoning(winding().calibration), sequence, 3.7)
+    assert difference(unaware, reckoned)[1] > 0.1
