@@ -90,7 +90,7 @@ def test_each_source_of_tilt_noise_falls_with_time_as_it_should(duration_s, velo
 @pytest.mark.parametrize("duration_s", [1.0, 5.0])
 @pytest.mark.parametrize("gyro_density", [3.6e-5, 1.2e-4])
 def test_tilt_settles_at_what_the_accelerometer_bias_allows(duration_s, gyro_density):
-    """A scalar Kalman filter fed with many directions; taking the bias as fresh noise would claim several times less."""
+    """A scalar Kalman filter fed with many directions; as fresh noise the bias would be claimed several times less."""
     imu = ImuCalibration(accel_noise_density=1e-5, accel_bias_sigma=1e-2, gyro_noise_density=gyro_density)
     motion = PreintegratedMotion(
         gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), duration_s, np.array([0, 0, G])

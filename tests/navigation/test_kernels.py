@@ -1,3 +1,8 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import gtsam
 import numpy as np
 import pytest
@@ -5,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
+import sonar_graph
 from sonar_graph.navigation.kernels import SMALL_ANGLE_RAD, left_jacobian, rotation_exp, skew
 
 ANGLES_RAD = [0.0, 1e-9, 0.99 * SMALL_ANGLE_RAD, 1.01 * SMALL_ANGLE_RAD, 0.01, 1.0, np.pi - 1e-6, np.pi, 5.0]
@@ -37,3 +43,58 @@ def test_constant_twist_moves_as_the_exponential_of_se3(phi, rho):
     motion = gtsam.Pose3.Expmap(np.array(phi + rho))
     assert np.allclose(rotation_exp(np.array(phi)), motion.rotation().matrix(), atol=1e-9)
     assert np.allclose(left_jacobian(np.array(phi)) @ np.array(rho), motion.translation(), atol=1e-9)
+
+
+CALLEE = """
+from sonar_graph.navigation.kernels import compiled
+
+
+@compiled
+def inner(x):
+    return x + 1.0
+"""
+CALLER = """
+from callee import inner
+
+from sonar_graph.navigation.kernels import compiled
+
+
+@compiled
+def outer(x):
+    return 10.0 * inner(x)
+"""
+
+
+def answer(folder: Path) -> float:
+    """What the caller says in a fresh interpreter."""
+    command = [sys.executable, "-c", "import caller; print(caller.outer(1.0))"]
+    python_path = os.pathsep.join([str(folder), str(Path(sonar_graph.__file__).parents[1])])
+    environment = os.environ | {"PYTHONPATH": python_path}
+    return float(subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout)
+
+
+@pytest.mark.parametrize("changed", [True, False])
+def test_cached_code_does_not_outlive_a_callee_in_another_file(tmp_path, changed):
+    """Nor is it dropped when nothing changed: then the index keeps its time."""
+    (tmp_path / "callee.py").write_text(CALLEE)
+    (tmp_path / "caller.py").write_text(CALLER)
+    assert answer(tmp_path) == 20.0
+    (index,) = (tmp_path / "__pycache__").glob("caller.outer-*.nbi")
+    made_ns = index.stat().st_mtime_ns
+    if changed:
+        (tmp_path / "callee.py").write_text(CALLEE.replace("1.0", "2.5"))
+        os.utime(tmp_path / "callee.py", ns=(made_ns + 1, made_ns + 1))
+    assert answer(tmp_path) == (35.0 if changed else 20.0)
+    assert (index.stat().st_mtime_ns != made_ns) is changed
+
+
+def test_numba_alone_would_keep_it(tmp_path):
+    """Negative control: without the check for a newer callee the old answer comes from the cache."""
+    plain = CALLER.replace("from sonar_graph.navigation.kernels import compiled", "from numba import njit").replace(
+        "@compiled", "@njit(cache=True, error_model='numpy')"
+    )
+    (tmp_path / "callee.py").write_text(CALLEE)
+    (tmp_path / "caller.py").write_text(plain)
+    assert answer(tmp_path) == 20.0
+    (tmp_path / "callee.py").write_text(CALLEE.replace("1.0", "2.5"))
+    assert answer(tmp_path) == 20.0

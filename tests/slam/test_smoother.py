@@ -288,3 +288,59 @@ def test_biases_in_a_row_are_least_squares(lag_s):
     cov = np.linalg.inv(np.transpose(A) @ A)
     assert smoother.values.atPoint3(B(7)) == pytest.approx([(cov @ np.transpose(A) @ b)[7]] * 3, abs=1e-9)
     assert np.diag(smoother.covariance(B(7))) == pytest.approx([cov[7, 7]] * 3, abs=1e-9)
+
+
+def test_an_older_bias_leaves_the_window_once_the_lag_is_over():
+    """The next one takes its place; the old stays in what the history gives."""
+    fed = in_the_basin(5, 3.0)
+    fed.smoother.add_bias(B(1), np.zeros(3))
+    fed.add([factors.bias_walk(B(0), B(1), 1e-3)])
+    D_bias = np.vstack([-np.eye(3), np.zeros((3, 3))])
+    motion = PreintegratedMotion(gtsam.Pose3(), 1e-4 * np.eye(6), D_bias, np.zeros(3), 1.0, np.zeros(3))
+    for k in range(5, 12):
+        fed.smoother.add_pose(X(k), fed.smoother.values.atPose3(X(k - 1)), float(k))
+        fed.add([factors.odometry_with_bias(X(k - 1), X(k), B(1), motion)])
+        fed.smoother.update(float(k))
+    assert fed.smoother.covariance(B(1)).shape == (3, 3)
+    with pytest.raises(IndexError, match="not in the BayesTree"):
+        fed.smoother.covariance(B(0))
+    values, marginals = fed.smoother.solve_history()
+    assert np.allclose(marginals.marginalCovariance(B(0)), dense_covariance(fed, values, [B(0)]), rtol=1e-6)
+
+
+def counted_marginals(monkeypatch: pytest.MonkeyPatch) -> list[set[int]]:
+    """Keys of each joint covariance that is computed from now on."""
+    asked: list[set[int]] = []
+    compute = gtsam.ISAM2.jointMarginalCovariance
+
+    def counting(isam, keys):
+        asked.append(set(keys))
+        return compute(isam, keys)
+
+    monkeypatch.setattr(gtsam.ISAM2, "jointMarginalCovariance", counting)
+    return asked
+
+
+def test_landmarks_asked_for_before_an_update_come_with_the_first_question_after_it(monkeypatch):
+    """Successive frames show mostly the same: one computation an update, and it is that of all factors."""
+    fed, asked = settled(in_the_basin(6, FOREVER_S), 5.0), counted_marginals(monkeypatch)
+    joint(fed, [X(5), L(3)])
+    joint(fed, [X(5), L(5)])
+    fed.smoother.update(5.0)
+    joint(fed, [X(5)])
+    joint(fed, [L(5), X(5)])
+    assert asked == [{X(5), L(3)}, {X(5), L(3), L(5)}, {X(5), L(3), L(5)}]
+    keys = [X(5), L(5)]
+    expected = dense_covariance(fed, fed.smoother.values, keys)
+    assert np.allclose(joint(fed, keys), expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max())
+
+
+def test_landmarks_that_are_no_longer_asked_for_are_let_go(monkeypatch):
+    """Remembered over one update, not for ever; poses not at all, since they may have left the window."""
+    fed, asked = in_the_basin(6, FOREVER_S), counted_marginals(monkeypatch)
+    joint(fed, [X(4), L(3), L(5)])
+    fed.smoother.update(5.0)
+    joint(fed, [X(5), L(5)])
+    fed.smoother.update(5.0)
+    joint(fed, [X(5)])
+    assert asked == [{X(4), L(3), L(5)}, {X(5), L(3), L(5)}, {X(5), L(5)}]
