@@ -1,6 +1,6 @@
-import os
-import subprocess
+import importlib
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import gtsam
@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-import sonar_graph
+from sonar_graph.navigation import kernels
 from sonar_graph.navigation.kernels import SMALL_ANGLE_RAD, left_jacobian, rotation_exp, skew
 
 ANGLES_RAD = [0.0, 1e-9, 0.99 * SMALL_ANGLE_RAD, 1.01 * SMALL_ANGLE_RAD, 0.01, 1.0, np.pi - 1e-6, np.pi, 5.0]
@@ -46,55 +46,78 @@ def test_constant_twist_moves_as_the_exponential_of_se3(phi, rho):
 
 
 CALLEE = """
-from sonar_graph.navigation.kernels import compiled
+{imported}
 
 
-@compiled
+@{decorator}
 def inner(x):
-    return x + 1.0
+    return x + {offset}
 """
 CALLER = """
 from callee import inner
 
-from sonar_graph.navigation.kernels import compiled
+{imported}
 
 
-@compiled
+@{decorator}
 def outer(x):
     return 10.0 * inner(x)
 """
+CHECKED = {"imported": "from sonar_graph.navigation.kernels import compiled", "decorator": "compiled"}
+UNCHECKED = {"imported": "import numba", "decorator": "numba.njit(cache=True, error_model='numpy')"}
 
 
-def answer(folder: Path) -> float:
-    """What the caller says in a fresh interpreter."""
-    command = [sys.executable, "-c", "import caller; print(caller.outer(1.0))"]
-    python_path = os.pathsep.join([str(folder), str(Path(sonar_graph.__file__).parents[1])])
-    environment = os.environ | {"PYTHONPATH": python_path}
-    return float(subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout)
+@dataclass
+class Pair:
+    """A compiled function that calls another in another file, imported afresh as a new interpreter would."""
+
+    folder: Path
+    monkeypatch: pytest.MonkeyPatch
+
+    def write(self, how: dict[str, str], offset: float) -> None:
+        (self.folder / "callee.py").write_text(CALLEE.format(**how, offset=offset))
+        caller = self.folder / "caller.py"
+        if not caller.exists():
+            caller.write_text(CALLER.format(**how))
+
+    def answer(self) -> float:
+        self.monkeypatch.setattr(kernels, "_sources", set())
+        for name in ("callee", "caller"):
+            self.monkeypatch.delitem(sys.modules, name, raising=False)
+        importlib.invalidate_caches()
+        return importlib.import_module("caller").outer(1.0)
+
+    @property
+    def index(self) -> Path:
+        (found,) = (self.folder / "__pycache__").glob("caller.outer-*.nbi")
+        return found
 
 
-@pytest.mark.parametrize("changed", [True, False])
-def test_cached_code_does_not_outlive_a_callee_in_another_file(tmp_path, changed):
-    """Nor is it dropped when nothing changed: then the index keeps its time."""
-    (tmp_path / "callee.py").write_text(CALLEE)
-    (tmp_path / "caller.py").write_text(CALLER)
-    assert answer(tmp_path) == 20.0
-    (index,) = (tmp_path / "__pycache__").glob("caller.outer-*.nbi")
-    made_ns = index.stat().st_mtime_ns
-    if changed:
-        (tmp_path / "callee.py").write_text(CALLEE.replace("1.0", "2.5"))
-        os.utime(tmp_path / "callee.py", ns=(made_ns + 1, made_ns + 1))
-    assert answer(tmp_path) == (35.0 if changed else 20.0)
-    assert (index.stat().st_mtime_ns != made_ns) is changed
+@pytest.fixture
+def pair(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    made = Pair(tmp_path, monkeypatch)
+    yield made
+    for name in ("callee", "caller"):
+        sys.modules.pop(name, None)
 
 
-def test_numba_alone_would_keep_it(tmp_path):
-    """Negative control: without the check for a newer callee the old answer comes from the cache."""
-    plain = CALLER.replace("from sonar_graph.navigation.kernels import compiled", "from numba import njit").replace(
-        "@compiled", "@njit(cache=True, error_model='numpy')"
-    )
-    (tmp_path / "callee.py").write_text(CALLEE)
-    (tmp_path / "caller.py").write_text(plain)
-    assert answer(tmp_path) == 20.0
-    (tmp_path / "callee.py").write_text(CALLEE.replace("1.0", "2.5"))
-    assert answer(tmp_path) == 20.0
+def test_cached_code_does_not_outlive_a_callee_in_another_file(pair):
+    """Nor is it dropped while nothing changes: the index then keeps its time."""
+    pair.write(CHECKED, 1.0)
+    assert pair.answer() == 20.0
+    made_ns = pair.index.stat().st_mtime_ns
+    assert pair.answer() == 20.0
+    assert pair.index.stat().st_mtime_ns == made_ns
+    pair.write(CHECKED, 2.5)
+    assert pair.answer() == 35.0
+    assert pair.index.stat().st_mtime_ns > made_ns
+
+
+def test_without_the_check_the_old_answer_comes_from_the_cache(pair):
+    """Negative control."""
+    pair.write(UNCHECKED, 1.0)
+    assert pair.answer() == 20.0
+    pair.write(UNCHECKED, 2.5)
+    assert pair.answer() == 20.0
