@@ -61,7 +61,7 @@ class Smoother:
         self._pending = gtsam.NonlinearFactorGraph()
         self._pending_values = gtsam.Values()
         self._pending_times: dict[int, float] = {}
-        self._pose_times: dict[int, float] = {}
+        self._expiring: dict[int, float] = {}
         self._landmarks: list[int] = []
         self._bias: list[int] = []
         self._window = self._new_window()
@@ -84,7 +84,7 @@ class Smoother:
         self._pending_values.insert(key, pose)
         self.values.insert(key, pose)
         self._pending_times[key] = time_s
-        self._pose_times[key] = time_s
+        self._expiring[key] = time_s
 
     def add_landmark(self, key: int, point: Floats) -> None:
         """A new landmark, which never leaves the window, with its first estimate."""
@@ -112,6 +112,7 @@ class Smoother:
     def update(self, time_s: float) -> None:
         """Bring the window's estimate up to date with what was added."""
         times: dict[Any, float] = self._pending_times | dict.fromkeys(self._landmarks + self._bias, time_s)
+        self._expiring |= dict.fromkeys(self._bias, time_s)
         self._window.update(self._pending, self._pending_values, times)
         self._pending = gtsam.NonlinearFactorGraph()
         self._pending_values = gtsam.Values()
@@ -130,8 +131,8 @@ class Smoother:
         """Solve the history; start a window whose prior is the marginal of all that lies before it."""
         self._restart_size = int(RESTART_GROWTH * self.graph.size())
         self.values = solve(self.graph, self.values)
-        times: dict[Any, float] = {key: t for key, t in self._pose_times.items() if t >= time_s - self._lag_s}
-        times |= dict.fromkeys(self._landmarks + self._bias, time_s)
+        times: dict[Any, float] = {key: t for key, t in self._expiring.items() if t >= time_s - self._lag_s}
+        times |= dict.fromkeys(self._landmarks, time_s)
         inside, outside = _split(self.graph, set(times))
         values = gtsam.Values()
         for key in times:

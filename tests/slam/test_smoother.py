@@ -58,8 +58,10 @@ def on_the_rail(nodes: int, lag_s: float, stale_shift_m: float = NEVER_M) -> Fed
     return fed
 
 
-def in_the_basin(steps: int, lag_s: float, stale_shift_m: float = NEVER_M, seed: int = 0) -> Fed:
-    """Circles past three landmarks with a gyro bias; nothing about it is linear."""
+def in_the_basin(
+    steps: int, lag_s: float, stale_shift_m: float = NEVER_M, seed: int = 0, bias_steps: int = 1000
+) -> Fed:
+    """Circles past three landmarks with a gyro bias that walks between stretches; nothing about it is linear."""
     rng = np.random.default_rng(seed)
     turn = gtsam.Pose3(gtsam.Rot3.Rz(0.25), np.array([0.5, 0.0, 0.0]))
     landmarks = {3: np.array([3.0, 1.0, -1.0]), 5: np.array([2.0, 4.0, -0.8]), 8: np.array([-1.0, 2.5, -1.2])}
@@ -75,7 +77,11 @@ def in_the_basin(steps: int, lag_s: float, stale_shift_m: float = NEVER_M, seed:
         D_bias = np.vstack([-np.eye(3), np.zeros((3, 3))])
         motion = PreintegratedMotion(moved, cov, D_bias, np.zeros(3), 1.0, np.zeros(3))
         fed.smoother.add_pose(X(k), fed.smoother.values.atPose3(X(k - 1)).compose(moved), float(k))
-        fed.add([factors.odometry_with_bias(X(k - 1), X(k), B(0), motion)])
+        fed.add([factors.odometry_with_bias(X(k - 1), X(k), B((k - 1) // bias_steps), motion)])
+        if k % bias_steps == 0:
+            new = k // bias_steps
+            fed.smoother.add_bias(B(new), fed.smoother.values.atPoint3(B(new - 1)))
+            fed.add([factors.bias_walk(B(new - 1), B(new), 0.003)])
         for i, p in landmarks.items():
             q = truth.compose(SONAR).transformTo(p)
             z = np.array([np.linalg.norm(q), np.arctan2(q[1], q[0])]) + [0.02, 0.009] * rng.standard_normal(2)
@@ -201,6 +207,18 @@ def test_a_restart_leaves_what_the_batch_gives(monkeypatch, lag_s):
     expected = dense_covariance(fed, batch, keys)
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     assert np.abs((joint(fed, keys) - expected) / scale).max() < 1e-3
+
+
+def test_a_restart_freezes_nothing_that_is_within_the_lag(monkeypatch):
+    """Of a window that keeps all, with biases come and gone, no linear factor is left and it settles on the batch."""
+    sizes = counted_solves(monkeypatch)
+    fed = settled(in_the_basin(40, FOREVER_S, stale_shift_m=1e-9, bias_steps=7), 39.0)
+    assert len(sizes) >= 2
+    batch = solve(graph_of(fed.given), fed.smoother.values)
+    graph = graph_of(fed.given)
+    assert graph.error(fed.smoother.values) == pytest.approx(graph.error(batch), rel=1e-4)
+    expected = dense_covariance(fed, batch, [X(39), L(3), B(5)])
+    assert np.allclose(np.diag(joint(fed, [X(39), L(3), B(5)])), np.diag(expected), rtol=1e-3)
 
 
 def test_on_the_rail_restarts_change_nothing(monkeypatch):
