@@ -108,7 +108,7 @@ def see(keyframes: Keyframes, after_s: float) -> PreintegratedMotion:
 def noisy_keyframes(share: float, **calibration) -> Keyframes:
     """0.3 m/s at 5 Hz: the displacement's variance grows by 0.018 m^2 a second."""
     dvl = DvlCalibration(velocity_sigma_m_s=(0.3, 0.3, 0.3))
-    exact_gyro = ImuCalibration(gyro_noise_density=0.0, gyro_bias_sigma=0.0)
+    exact_gyro = ImuCalibration(gyro_noise_density=1e-12, gyro_bias_sigma=0.0)
     keyframes = keyframes_of(
         Calibration(**({"imu": exact_gyro, "dvl": dvl} | calibration)), replace(POLICY, motion_noise_share=share)
     )
@@ -145,7 +145,7 @@ def test_an_unknown_bias_blurs_too():
     for bias_sigma, expected in ((0.1, [0.0, 0.4]), (0.0, [0.0])):
         keyframes = noisy_keyframes(
             0.1,
-            imu=ImuCalibration(gyro_noise_density=0.0, gyro_bias_sigma=bias_sigma),
+            imu=ImuCalibration(gyro_noise_density=1e-12, gyro_bias_sigma=bias_sigma),
             dvl=EXACT_DVL,
             sonar=SonarCalibration(range_sigma_m=1e3, azimuth_sigma_rad=0.1),
         )
