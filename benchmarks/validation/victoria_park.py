@@ -11,7 +11,7 @@ is solved under both readings: under the sensors' it is the problem that our smo
 equal; how far the file's is from that is what the conversion to a log costs.
 
 Our smoother gets the log that the converter made. Like for like: a keyframe at every pose, no robust kernel, no
-gate. As users run it: the defaults, whose kernel and gate make another problem of it.
+gate. As users run it: the defaults, whose robust kernel makes another problem of it.
 """
 
 from __future__ import annotations
