@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
-from typing import Self
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +30,14 @@ class Block:
     Raises
     ------
     MeasurementError
-        When there is no row, a column's length differs from the number of stamps, or stamps run backwards.
+        When there is no row, a column's length differs from the number of stamps, a number that must be finite is
+        not, or stamps run backwards.
     """
 
     stamps_ns: Ints
     """Time of validity, shape (n,), integer nanoseconds, not decreasing."""
+    finite_columns: ClassVar[tuple[str, ...]] = ()
+    """Columns that have no meaning for "not measured"."""
 
     def __post_init__(self) -> None:
         name = type(self).__name__
@@ -50,6 +53,11 @@ class Block:
                     f"{name}.{field.name}: shape {column.shape} has not one row for each of {n} stamps"
                 )
             object.__setattr__(self, field.name, column)
+        for finite in self.finite_columns:
+            whole = np.isfinite(getattr(self, finite).reshape(n, -1)).all(axis=1)
+            if not whole.all():
+                row = int(np.argmin(whole))
+                raise MeasurementError(f"{name}.{finite}: row {row} is not finite; leave such rows out of the block")
         backwards = np.flatnonzero(np.diff(self.stamps_ns) < 0)
         if backwards.size:
             raise MeasurementError(f"{name}: stamps run backwards after row {backwards[0]}; sort the rows by stamp")
@@ -87,6 +95,7 @@ class Imu(Block):
 
     angular_velocity: Floats
     """Shape (n, 3), rad/s."""
+    finite_columns = ("angular_velocity",)
     specific_force: Floats
     """What the accelerometers feel, acceleration minus gravity: +9.81 on z at rest; NaN: not measured.
     Shape (n, 3), m/s²."""
@@ -98,6 +107,7 @@ class Dvl(Block):
 
     velocity: Floats
     """Shape (n, 3), m/s."""
+    finite_columns = ("velocity",)
     velocity_cov: Floats
     """Shape (n, 3, 3), m²/s²; NaN where the log does not say: the calibration's value then holds."""
 
@@ -108,6 +118,7 @@ class Depth(Block):
 
     z_m: Floats
     """World z of the port (negative below the surface of a world with its origin there), shape (n,)."""
+    finite_columns = ("z_m",)
     variance_m2: Floats
     """Shape (n,); NaN where the log does not say: the calibration's value then holds."""
 
@@ -120,6 +131,7 @@ class LandmarkDetections(Block):
     """Slant range, shape (n,)."""
     azimuth_rad: Floats
     """``atan2(q_y, q_x)`` in the sonar frame, positive to the left, shape (n,)."""
+    finite_columns = ("range_m", "azimuth_rad")
     range_azimuth_cov: Floats
     """Covariance of (range, azimuth), shape (n, 2, 2); NaN where the log does not say."""
     candidate_ids: Ints

@@ -112,7 +112,7 @@ class Outcome(StrEnum):
     NEW = "new landmark"
     GATED = "refused: innovation outside the gate"
     NO_IDENTITY = "refused: no identity probable enough"
-    REPEATED = "refused: the frame shows this new landmark twice"
+    REPEATED = "refused: the frame shows this landmark elsewhere, more probably"
     LATE = "refused: older than what was already processed"
     UNLOCATED = "refused: no odometry covers its stamp"
     IGNORED = "ignored: this estimator uses no landmarks"

@@ -95,3 +95,13 @@ def test_single_rows_and_the_whole_are_the_same_block() -> None:
     block = depth([1, 2, 3])
     one_by_one = Depth.concatenate([block.rows(slice(i, i + 1)) for i in range(3)])
     np.testing.assert_array_equal(one_by_one.z_m, block.z_m)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_numbers_without_a_meaning_for_not_measured_must_be_finite(bad):
+    """Named with their row; a specific force may be missing."""
+    rate = np.zeros((3, 3))
+    rate[1, 2] = bad
+    with pytest.raises(MeasurementError, match=r"Imu.angular_velocity: row 1 is not finite"):
+        Imu(np.arange(3), rate, np.zeros((3, 3)))
+    Imu(np.arange(3), np.zeros((3, 3)), np.full((3, 3), np.nan))

@@ -42,4 +42,4 @@ def weights_at_end(variance_m2: Floats, before_end_s: Floats, wander_m2_s: float
         weights *= 1.0 - gain
         weights[k] = gain
         P *= 1.0 - gain
-    return weights, P + wander_m2_s * before_end_s[-1]
+    return weights, P + wander_m2_s * max(before_end_s[-1], 0.0)

@@ -82,7 +82,7 @@ def integrate_steps(
         _transport_bias(D_t, D_r, step, turned, G_r, dt)
 
         for r in range(3):
-            impulse[r] += (dR[r, 0] * force[k, 0] + dR[r, 1] * force[k, 1] + dR[r, 2] * force[k, 2]) * dt
+            impulse[r] += (turned[r, 0] * force[k, 0] + turned[r, 1] * force[k, 1] + turned[r, 2] * force[k, 2]) * dt
             dp[r] += step[r]
         _product(dR, turn, work)
         _copy(work, dR)

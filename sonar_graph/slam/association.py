@@ -25,6 +25,9 @@ class Identities:
 def identify(detections: LandmarkDetections, minimum_probability: float) -> Identities:
     """Accept the most probable identity of each row where its posterior is high enough.
 
+    A landmark is in one place: of several rows of one frame with one identity the most probable is accepted, the first
+    of equals.
+
     Parameters
     ----------
     minimum_probability
@@ -35,7 +38,20 @@ def identify(detections: LandmarkDetections, minimum_probability: float) -> Iden
         None if p >= minimum_probability and landmark_id >= 0 else Outcome.NO_IDENTITY
         for p, landmark_id in zip(probability.tolist(), ids.tolist(), strict=True)
     ]
-    return Identities(ids, refusals)
+    return Identities(ids, _once_a_frame(detections.stamps_ns.tolist(), ids.tolist(), probability.tolist(), refusals))
+
+
+def _once_a_frame(
+    stamps_ns: list[int], ids: list[int], probability: list[float], refusals: list[Outcome | None]
+) -> list[Outcome | None]:
+    best: dict[tuple[int, int], int] = {}
+    for row, place in enumerate(zip(stamps_ns, ids, strict=True)):
+        if refusals[row] is None and (place not in best or probability[row] > probability[best[place]]):
+            best[place] = row
+    return [
+        refusal if refusal or best[stamp_ns, landmark_id] == row else Outcome.REPEATED
+        for row, (stamp_ns, landmark_id, refusal) in enumerate(zip(stamps_ns, ids, refusals, strict=True))
+    ]
 
 
 @cache

@@ -70,34 +70,33 @@ class Sightings:
                 self.journal.record(stamp_ns, landmark_id, late)
             return
         identities = identify(frame, self.policy.identity_probability)
-        rows = zip(range(len(frame)), identities.ids.tolist(), identities.refusals, strict=True)
-        accepted = [(row, landmark_id) for row, landmark_id, refusal in rows if refusal is None]
-        for landmark_id, refusal in zip(identities.ids.tolist(), identities.refusals, strict=True):
-            if refusal is not None:
-                self.journal.record(stamp_ns, landmark_id, refusal)
-        if accepted:
-            self._sight(frame, stamp_ns, accepted)
-
-    def _sight(self, frame: LandmarkDetections, stamp_ns: int, accepted: list[tuple[int, int]]) -> None:
+        rows = list(zip(range(len(frame)), identities.ids.tolist(), identities.refusals, strict=True))
+        if all(refusal for _, _, refusal in rows):
+            for _, landmark_id, refusal in rows:
+                if refusal:
+                    self.journal.record(stamp_ns, landmark_id, refusal)
+            return
         self.keyframes.update_if_due()
         seen = self.keyframes.motion_since_newest(stamp_ns)
-        view = self._view(seen, {landmark_id for _, landmark_id in accepted} & self.ids)
+        view = self._view(seen, {landmark_id for _, landmark_id, refusal in rows if not refusal} & self.ids)
         tie = Tie.between(self.keyframes.set_for_frame(stamp_ns, seen), self.keyframes.newest_key, self._body_T_sonar)
-        for row, landmark_id in accepted:
-            cov = frame.range_azimuth_cov[row]
-            sighting = Sighting(
-                stamp_ns,
-                landmark_id,
-                np.array([frame.range_m[row], frame.azimuth_rad[row]]),
-                self._default_cov if np.isnan(cov).any() else cov,
-            )
-            if landmark_id in view.landmarks:
-                self._sight_again(view, tie, sighting)
-            elif landmark_id not in self.ids:
-                self._sight_first(view, tie, sighting)
+        for row, landmark_id, refusal in rows:
+            if refusal:
+                self.journal.record(stamp_ns, landmark_id, refusal)
             else:
-                self.journal.record(stamp_ns, landmark_id, Outcome.REPEATED)
+                self._sight(view, tie, self._sighting(frame, stamp_ns, row, landmark_id))
         self.keyframes.update_if_due()
+
+    def _sighting(self, frame: LandmarkDetections, stamp_ns: int, row: int, landmark_id: int) -> Sighting:
+        cov = frame.range_azimuth_cov[row]
+        z = np.array([frame.range_m[row], frame.azimuth_rad[row]])
+        return Sighting(stamp_ns, landmark_id, z, self._default_cov if np.isnan(cov).any() else cov)
+
+    def _sight(self, view: View, tie: Tie, sighting: Sighting) -> None:
+        if sighting.landmark_id in view.landmarks:
+            self._sight_again(view, tie, sighting)
+        else:
+            self._sight_first(view, tie, sighting)
 
     def _view(self, motion: PreintegratedMotion, landmark_ids: set[int]) -> View:
         key, bias_key = self.keyframes.newest_key, self.keyframes.newest_bias_key

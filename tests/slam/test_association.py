@@ -52,3 +52,10 @@ def test_a_log_is_a_copy():
     before = journal.log()
     journal.record(6, 2, Outcome.USED, np.zeros(2), np.eye(2))
     assert len(before) == 1
+
+
+def test_of_one_identity_in_one_frame_the_most_probable_row_is_taken():
+    """Of equals the first; the same identity in another frame is another matter."""
+    rows = detections([[7], [7], [7], [7]], [[0.8], [0.9], [0.9], [0.8]])
+    rows = LandmarkDetections(np.array([0, 0, 0, 1]), *list(vars(rows).values())[1:])
+    assert identify(rows, 0.5).refusals == [Outcome.REPEATED, None, Outcome.REPEATED, None]

@@ -7,6 +7,7 @@ from gtsam.symbol_shorthand import L
 from scipy.stats import chi2
 
 from sonar_graph.calibration import Calibration, ImuCalibration, PlanarMotion, Start
+from sonar_graph.errors import CalibrationError
 from sonar_graph.estimator_checks.world import small_world, still_world
 from sonar_graph.evaluation.consistency import normalised_squares
 from sonar_graph.logs.converters.mrclam import read_mrclam
@@ -383,3 +384,23 @@ def test_twenty_basins_are_consistent():
         last.append(position_nees(sequence, run(Isam2(sequence.calibration), sequence, 1.0))[-1])
     low, high = chi2.ppf([0.0005, 0.9995], 3 * len(last)) / len(last)
     assert low < np.mean(last) < high
+
+
+def test_time_does_not_go_back(basin):
+    """The same instant again is the same estimate and one row of the trajectory; an earlier one gets none."""
+    estimator = Isam2(basin.calibration)
+    instants = basin.instants(1.0)[:20]
+    first = [estimator.process(m) for m in basin.replay(instants)][-1]
+    again = estimator.process(Measurements(int(instants[-1])))
+    assert again.world_T_body.equals(first.world_T_body, 1e-12)
+    assert estimator.process(Measurements(int(instants[5]))) is None
+    assert estimator.trajectory().stamps_ns.tolist() == instants.tolist()
+
+
+@pytest.mark.parametrize(("section", "name"), [("imu", "gyro_noise_density"), ("start", "position_sigma_m")])
+def test_noise_of_zero_is_refused_by_name(basin, section, name):
+    part = getattr(basin.calibration, section)
+    zero = 0.0 if section == "imu" else (0.0, 0.0, 0.0)
+    calibration = basin.calibration.model_copy(update={section: part.model_copy(update={name: zero})})
+    with pytest.raises(CalibrationError, match=f"{section}.{name}"):
+        Isam2(calibration)

@@ -362,3 +362,29 @@ def test_landmarks_that_are_no_longer_asked_for_are_let_go(monkeypatch):
     fed.smoother.update(5.0)
     joint(fed, [X(5)])
     assert asked == [{X(4), L(3), L(5)}, {X(5), L(3), L(5)}, {X(5), L(5)}]
+
+
+def test_drift_beyond_what_cholesky_takes_is_survived():
+    """A pose uncertain by 20 m with millimetre steps: the plain solver gives up, the smoother says what algebra does."""
+    plain = gtsam.ISAM2()
+    sigmas = np.array([20.0, 0.002])
+    smoother = Smoother(FOREVER_S, 1e-3, NEVER_M)
+    wide, narrow = (gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-3] * 3 + [s] * 3)) for s in sigmas)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for k in range(3):
+        factor = (
+            gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), narrow)
+            if k
+            else gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), wide)
+        )
+        graph.push_back(factor)
+        values.insert(X(k), gtsam.Pose3())
+        smoother.add_pose(X(k), gtsam.Pose3(), float(k))
+        smoother.add([factor])
+        smoother.update(float(k))
+    with pytest.raises(RuntimeError, match="Indeterminate"):
+        plain.update(graph, values)
+    variance = sigmas[0] ** 2 + 2 * sigmas[1] ** 2
+    assert smoother.covariance(X(2))[5, 5] == pytest.approx(variance, rel=1e-6)
+    _, marginals = smoother.solve_history()
+    assert marginals.marginalCovariance(X(2))[5, 5] == pytest.approx(variance, rel=1e-6)
