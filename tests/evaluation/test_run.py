@@ -23,20 +23,59 @@ Install = Callable[..., None]
 def test_every_row_reaches_the_estimator_once_and_in_order(
     install: Install, make_sequence: Make, offset_estimator: Any
 ) -> None:
-    seen: list[Measurements] = []
+    instances: list[list[Measurements]] = []
 
     class Recorder(offset_estimator):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            self.seen: list[Measurements] = []
+            instances.append(self.seen)
+
         def process(self, measurements: Measurements) -> Estimate | None:
-            seen.append(measurements)
+            self.seen.append(measurements)
             return super().process(measurements)
 
     install(recorder=Recorder)
     sequence = make_sequence()
     result = run_estimator(sequence, "recorder", rate_hz=2.0)
     assert result.status == "ok"
+    seen = instances[-1]
     stamps = np.concatenate([step.imu.stamps_ns for step in seen if step.imu])
     np.testing.assert_array_equal(stamps, sequence.imu.stamps_ns)
     np.testing.assert_array_equal([step.end_ns for step in seen], sequence.instants(2.0))
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_nothing_of_the_instance_that_warms_up_reaches_the_result(
+    install: Install, make_sequence: Make, offset_estimator: Any, fails: bool
+) -> None:
+    instances: list[Any] = []
+    calls: list[tuple[int, int]] = []
+
+    class FirstIsOther(offset_estimator):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            instances.append(self)
+
+        def process(self, measurements: Measurements) -> Estimate | None:
+            if self is not instances[0]:
+                return super().process(measurements)
+            if fails:
+                raise ZeroDivisionError
+            time.sleep(0.05)
+            return self.beside(measurements.end_ns, 99.0)
+
+    install(first=FirstIsOther, offset=offset_estimator)
+    result = run_estimator(make_sequence(5.0), "first", progress=lambda *call: calls.append(call))
+    plain = run_estimator(make_sequence(5.0), "offset")
+    assert len(instances) == 2
+    assert (result.status, result.reason) == ("ok", "")
+    assert result.causal is not None
+    assert plain.causal is not None
+    np.testing.assert_array_equal(result.causal.positions, plain.causal.positions)
+    assert len(result.update_s) == 10
+    assert result.update_s.min() < 0.05
+    assert calls == [(i, 10) for i in range(1, 11)]
 
 
 def test_causal_and_smoothed_are_what_the_estimator_said(
