@@ -16,7 +16,7 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.atomic import replacing
 from sonar_graph.evaluation.results import ErrorSeries, Kind, RunResult
-from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Trajectory
 
@@ -47,21 +47,24 @@ def read_arrays(path: Path) -> Arrays:
 
 
 def sequence_arrays(sequence: Sequence) -> Arrays:
-    """Truth, and of IMU and Doppler log the first and the last row: what they measured is in the log."""
+    """Truth and detections, and of IMU and Doppler log the first and last row: what they measured is in the log."""
     ends = np.array([0, -1])
     arrays = _pack("imu", sequence.imu.rows(ends)) | _pack("dvl", sequence.dvl.rows(ends))
     arrays |= _pack("truth", sequence.truth) | _pack("true_landmarks", sequence.true_landmarks)
-    return arrays
+    return arrays | _pack("detections", sequence.detections)
 
 
 def restore_sequence(name: str, calibration: Calibration, notes: dict[str, str], arrays: Arrays) -> Sequence:
-    """A sequence with its start, end and truth, but without its measurements."""
+    """A sequence with its start, end, detections and truth, but without its motion's measurements."""
     imu, dvl = _unpack("imu", Imu, arrays), _unpack("dvl", Dvl, arrays)
     if imu is None or dvl is None:
         raise EvaluationError("sequence.npz: the first and last rows of imu and dvl are missing")
     truth = _unpack("truth", Trajectory, arrays)
     true_landmarks = _unpack("true_landmarks", LandmarkMap, arrays)
-    return Sequence(name, calibration, imu, dvl, truth=truth, true_landmarks=true_landmarks, notes=notes)
+    detections = _unpack("detections", LandmarkDetections, arrays)
+    return Sequence(
+        name, calibration, imu, dvl, detections=detections, truth=truth, true_landmarks=true_landmarks, notes=notes
+    )
 
 
 def run_arrays(run: RunResult, errors: dict[Kind, ErrorSeries]) -> Arrays:

@@ -10,10 +10,13 @@ from sonar_graph.evaluation.results import Comparison, RunResult
 from sonar_graph.evaluation.score_table import LABELS
 from sonar_graph.evaluation.wording import (
     ABSENT,
+    NO_DETECTIONS,
+    TOLERATED_FACTOR,
     consistency,
     display_unit,
     display_value,
     failed_runs,
+    has_detections,
     headline_metric,
     score_of,
 )
@@ -26,12 +29,15 @@ COLUMNS = {
     "time.update_p99_ms": "p99",
 }
 """Columns after the two position errors; those that no run has are left out."""
+NEES_LEGEND = (
+    f"NEES: 1 fits; ▲ above {TOLERATED_FACTOR:g} over-confident, ▼ below {1 / TOLERATED_FACTOR:g} over-cautious"
+)
 
 
 def summary_table(comparison: Comparison) -> Table:
     """The runs in rows with position error (causal and smoothed), yaw error, NEES and time; below, why runs failed.
 
-    The same numbers as in the report. NEES is 1 for a consistent estimator.
+    The same numbers as in the report. NEES is 1 for a consistent estimator, and marked where `consistency` says more.
     """
     columns = _columns(comparison)
     title = Text(comparison.sequence.name, style="bold")
@@ -60,12 +66,16 @@ def _heading(comparison: Comparison, key: str, heading: str) -> str:
 
 def _caption(comparison: Comparison) -> Text:
     lines = [f"{run.estimator} failed: {run.reason}" for run in failed_runs(comparison)]
+    if ending := comparison.sequence.notes.get("log.ending"):
+        lines.append(f"Log: {ending}")
+    if not has_detections(comparison):
+        lines.append(NO_DETECTIONS)
     metric = headline_metric(comparison)
     if metric is None:
         lines.append("No position errors: the report says why.")
     else:
         lines.append(f"causal, smoothed: {LABELS[metric]}")
-        lines.append("NEES: 1 is consistent; ▲ over-confident, ▼ over-cautious")
+        lines.append(NEES_LEGEND)
     return Text("\n".join(lines))
 
 

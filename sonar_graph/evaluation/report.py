@@ -15,7 +15,7 @@ from sonar_graph.evaluation.figure_style import ESTIMATOR_COLOURS
 from sonar_graph.evaluation.illustrations import illustrations
 from sonar_graph.evaluation.results import Comparison, RunResult
 from sonar_graph.evaluation.score_table import score_blocks
-from sonar_graph.evaluation.wording import ABSENT, failed_runs, finding, format_value
+from sonar_graph.evaluation.wording import ABSENT, TOLERATED_FACTOR, failed_runs, finding, format_value
 from sonar_graph.states import Outcome
 
 TEMPLATE = "report.html"
@@ -53,6 +53,7 @@ def _content(comparison: Comparison) -> dict[str, Any]:
         "runs": comparison.runs,
         "colours": len(ESTIMATOR_COLOURS),
         "blocks": score_blocks(comparison),
+        "nees_limits": [f"{1 / TOLERATED_FACTOR:g}", f"{TOLERATED_FACTOR:g}"],
         "figures": illustrations(comparison),
         "outcomes": _outcomes(comparison),
         "files": {run.estimator: _files(run) for run in comparison.runs},

@@ -3,7 +3,7 @@
 ::
 
     DIR/comparison.json         scores with units and protocol, states of the runs, settings, environment
-    DIR/sequence.npz            truth and true landmarks
+    DIR/sequence.npz            truth, true landmarks, detections and instants
     DIR/runs/NAME/trajectory.tum, causal.tum, landmarks.csv
                                 what the estimator said, for other tools; absent when the run failed
     DIR/runs/NAME/result.json   settings, versions, timings, status and reason

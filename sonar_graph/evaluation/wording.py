@@ -9,7 +9,10 @@ from sonar_graph.evaluation.results import Comparison, RunResult, Score
 ABSENT = "\N{EN DASH}"
 TOO_CLOSE = 0.05
 """Relative difference below which one run says nothing about which of two errors is the smaller one."""
-CONSISTENCY_KEY = "causal.nees_position"
+CONSISTENCY_KEYS = {"position": "causal.nees_position", "yaw": "causal.nees_yaw"}
+TOLERATED_FACTOR = 2.0
+"""How far from 1 a normalised squared error may lie where no interval is known, before it is called inconsistent."""
+NO_DETECTIONS = "The log has no landmark detections; without them every estimator is dead reckoning."
 
 HEADLINES = {
     "ate_se2_m": "RMS after SE(2) alignment",
@@ -55,13 +58,25 @@ def with_unit(score: Score) -> str:
 
 
 def consistency(score: Score) -> str:
-    """What a normalised squared error says of the reported covariances; empty where no interval was computed."""
-    if score.interval is None or math.isnan(score.value):
+    """What a normalised squared error says of the reported covariances.
+
+    Outside the score's interval, or where it has none outside `TOLERATED_FACTOR` about 1, it is over-confident or
+    over-cautious. Inside the interval it is consistent; inside the factor nothing is said, as one run proves little.
+    Empty for scores of other kinds.
+    """
+    if score.better != "inside" or math.isnan(score.value):
         return ""
-    lowest, highest = score.interval
+    lowest, highest = score.interval or (1 / TOLERATED_FACTOR, TOLERATED_FACTOR)
     if score.value > highest:
         return "over-confident"
-    return "over-cautious" if score.value < lowest else "consistent"
+    if score.value < lowest:
+        return "over-cautious"
+    return "consistent" if score.interval else ""
+
+
+def has_detections(comparison: Comparison) -> bool:
+    """Whether the log holds any landmark detection."""
+    return bool(comparison.sequence.detections)
 
 
 def failed_runs(comparison: Comparison) -> list[RunResult]:
@@ -86,8 +101,13 @@ def headline_metric(comparison: Comparison) -> str | None:
 
 
 def finding(comparison: Comparison) -> list[str]:
-    """What the comparison found, a sentence each: failures first, then errors, then whether covariances hold."""
+    """What the comparison found, a sentence each: failures first, then errors, then whether covariances hold.
+
+    A log without detections is mentioned after the failures.
+    """
     sentences = [f"{run.estimator} failed: {run.reason.rstrip('.')}." for run in failed_runs(comparison)]
+    if not has_detections(comparison):
+        sentences.append(NO_DETECTIONS)
     metric = headline_metric(comparison)
     if metric is None:
         return [*sentences, _why_no_error(comparison)]
@@ -141,12 +161,19 @@ def _smoothed_sentence(comparison: Comparison, metric: str) -> list[str]:
 
 
 def _consistency_sentence(comparison: Comparison) -> list[str]:
-    judged = []
-    for run in comparison.runs:
-        score = score_of(comparison, run.estimator, CONSISTENCY_KEY)
-        if score is not None:
-            verdict = consistency(score)
-            judged.append(f"{run.estimator} {display_value(score)}" + (f" ({verdict})" if verdict else ""))
-    if not judged:
+    judged = [_worst_nees(comparison, run.estimator) for run in comparison.runs]
+    if not any(judged):
         return []
-    return [f"Position NEES, 1 where the reported uncertainty fits, above it over-confident: {', '.join(judged)}."]
+    listed = ", ".join(filter(None, judged))
+    return [f"NEES, of position or yaw whichever is further from the 1 of a fitting uncertainty: {listed}."]
+
+
+def _worst_nees(comparison: Comparison, name: str) -> str:
+    """A run's NEES that is furthest from 1 by ratio, with what it is of and what it says; empty where it has none."""
+    scores = {what: score_of(comparison, name, key) for what, key in CONSISTENCY_KEYS.items()}
+    known = {what: score for what, score in scores.items() if score is not None}
+    if not known:
+        return ""
+    what, score = max(known.items(), key=lambda item: abs(math.log(max(item[1].value, math.ulp(0.0)))))
+    said = ", ".join(filter(None, [what, consistency(score)]))
+    return f"{name} {display_value(score)} ({said})"

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import io
+import re
+from dataclasses import replace
 from typing import Any
 
 from rich.console import Console
@@ -38,6 +40,34 @@ def test_without_truth_columns_of_errors_are_left_out():
     text = printed(basin_comparison(60, truth=False))
     assert "causal" not in text
     assert "median" in text
+
+
+def test_a_nees_is_marked_by_the_rule_of_the_legend():
+    comparison = basin_comparison(60)
+    for value, shown in ((2.1, "2.10 ▲"), (1.9, "1.90"), (0.6, "0.600"), (0.4, "0.400 ▼")):
+        score = Score(value, "1", "By hand.", better="inside")
+        row = next(
+            line
+            for line in printed(with_score(comparison, "isam2", "causal.nees_yaw", score)).splitlines()
+            if "isam2" in line
+        )
+        assert shown in row
+        assert any(mark in shown for mark in "▲▼") or not re.search(f"{shown} [▲▼]", row)
+    assert "▲ above 2 over-confident, ▼ below 0.5 over-cautious" in printed(comparison)
+
+
+def test_a_log_without_detections_is_told():
+    comparison = basin_comparison(60)
+    assert "dead reckoning." not in printed(comparison)
+    blind = replace(comparison, sequence=replace(comparison.sequence, detections=None))
+    assert "without them every estimator is dead reckoning." in " ".join(printed(blind, 120).split())
+
+
+def test_a_log_that_is_cut_off_is_told():
+    comparison = basin_comparison(60)
+    notes = {"log.ending": "the file is cut off at byte 7"}
+    cut = replace(comparison, sequence=replace(comparison.sequence, notes=notes))
+    assert "Log: the file is cut off at byte 7" in printed(cut)
 
 
 def test_a_nees_outside_its_interval_is_marked():

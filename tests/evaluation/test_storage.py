@@ -59,7 +59,7 @@ def test_reading_returns_what_was_written(comparison: Comparison, tmp_path: Path
     restored = read_comparison(tmp_path)
     for name in ("runs", "scores", "errors", "environment", "instants_ns"):
         assert_same(getattr(comparison, name), getattr(restored, name), name)
-    for name in ("name", "notes", "truth", "true_landmarks", "start_ns", "end_ns"):
+    for name in ("name", "notes", "truth", "true_landmarks", "detections", "start_ns", "end_ns"):
         assert_same(getattr(comparison.sequence, name), getattr(restored.sequence, name), name)
     assert restored.sequence.calibration == comparison.sequence.calibration
     assert isinstance(restored.sequence.calibration, Calibration)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.evaluation.results import Score
-from sonar_graph.evaluation.wording import display_value, finding, format_value, with_unit
+from sonar_graph.evaluation.wording import NO_DETECTIONS, consistency, display_value, finding, format_value, with_unit
 
 from .synthetic import basin_comparison, only, with_failure, with_score
 
@@ -95,3 +95,40 @@ def test_finding_says_why_there_is_none():
     assert "nothing to compare" in finding(everything_failed)[-1]
     unscored = replace(scored(), scores={})
     assert finding(unscored) == ["No position error could be computed against the log's ground truth."]
+
+
+def test_consistency_follows_the_interval_and_without_one_a_factor_of_two():
+    assert [consistency(Score(v, "1", "", better="inside")) for v in (0.49, 0.51, 1.99, 2.01)] == [
+        "over-cautious",
+        "",
+        "",
+        "over-confident",
+    ]
+    bounds = (0.9, 1.1)
+    assert [consistency(Score(v, "1", "", bounds, "inside")) for v in (0.8, 1.0, 1.2)] == [
+        "over-cautious",
+        "consistent",
+        "over-confident",
+    ]
+    assert consistency(Score(40.0, "m", "")) == ""
+
+
+def test_finding_tells_the_nees_furthest_from_one():
+    comparison = only(basin_comparison(60), "isam2")
+    for position, yaw, told in (
+        (1.5, 6.0, "isam2 6 (yaw, over-confident)"),
+        (0.1, 6.0, "isam2 0.100 (position, over-cautious)"),
+        (1.5, 1.2, "isam2 1.50 (position)"),
+        (0.0, 6.0, "isam2 0 (position, over-cautious)"),
+    ):
+        judged = with_score(comparison, "isam2", "causal.nees_position", Score(position, "1", "", better="inside"))
+        judged = with_score(judged, "isam2", "causal.nees_yaw", Score(yaw, "1", "", better="inside"))
+        assert finding(judged)[-1].endswith(f": {told}.")
+
+
+@pytest.mark.parametrize("truth", [True, False])
+def test_finding_says_that_there_were_no_detections(truth):
+    comparison = basin_comparison(60, truth=truth)
+    assert NO_DETECTIONS not in finding(comparison)
+    none = replace(comparison.sequence, detections=None)
+    assert finding(replace(comparison, sequence=none))[0] == NO_DETECTIONS
