@@ -51,9 +51,9 @@ TURN_S = 8.0
 FASTEST_M_S = 0.45
 KNOT_S = 0.5
 
+PAPER_DURATION_S, PAPER_LAPS, PAPER_SPEED_M_S = 2039.0, 3, 0.15
+
 NOTES = {
-    "from the paper": "basin, landmark positions, tilt, window, total time, three laps, speed while driving",
-    "ours": "route, hovering, sensor models and mountings, rates, noise, wobble, error rates of the recogniser",
     "truth": "exact: a quintic spline",
     "earth rotation": "neither simulated nor to be removed",
 }
@@ -62,11 +62,11 @@ NOTES = {
 class BasinOptions(SimulationOptions):
     """What can be chosen about the basin experiment."""
 
-    duration_s: float = Field(2039.0, gt=0)
+    duration_s: float = Field(PAPER_DURATION_S, gt=0)
     """Of the whole run. What driving and turning leave is spent watching landmarks."""
-    laps: int = Field(3, ge=1)
+    laps: int = Field(PAPER_LAPS, ge=1)
     """Rounds of the square."""
-    speed_m_s: float = Field(0.15, gt=0, le=FASTEST_M_S)
+    speed_m_s: float = Field(PAPER_SPEED_M_S, gt=0, le=FASTEST_M_S)
     """While driving straight; raised, up to 0.45 m/s, as far as the duration needs it."""
 
 
@@ -87,9 +87,26 @@ def simulate_basin(options: BasinOptions | None = None) -> Sequence:
     streams = Streams.of(options.seed)
     world = world_on_floor(LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, streams.world)
     path = _path(options, streams.path)
-    return record(
-        "basin", options, YSHARK, path, world, streams, {**NOTES, "speed_m_s": f"{cruise_speed(options):.3f}"}
-    )
+    return record("basin", options, YSHARK, path, world, streams, _notes(options))
+
+
+def _notes(options: BasinOptions) -> dict[str, str]:
+    """Provenance: what is the paper's, which of duration, laps and speed only where they are as published."""
+    speed_m_s = cruise_speed(options)
+    chosen = {
+        f"{options.duration_s:g} s in all": options.duration_s == PAPER_DURATION_S,
+        f"laps: {options.laps}": options.laps == PAPER_LAPS,
+        f"{speed_m_s:.3f} m/s while driving": speed_m_s == PAPER_SPEED_M_S,
+    }
+    published = ["basin", "landmark positions", "tilt", "window", *(text for text, same in chosen.items() if same)]
+    ours = ["route", "hovering", "sensor models and mountings", "rates", "noise", "wobble"]
+    ours += ["error rates of the recogniser", *(text for text, same in chosen.items() if not same)]
+    return {
+        "from the paper": ", ".join(published),
+        "ours": ", ".join(ours),
+        **NOTES,
+        "speed_m_s": f"{speed_m_s:.3f}",
+    }
 
 
 def cruise_speed(options: BasinOptions) -> float:

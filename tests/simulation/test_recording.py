@@ -115,4 +115,12 @@ def test_notes_say_what_was_simulated():
     notes = short(seed=9).notes
     assert "basin" in notes["generator"]
     assert BasinOptions.model_validate_json(notes["options"]).seed == 9
-    assert {"from the paper", "ours"} <= set(notes)
+    assert "laps: 1" in notes["ours"]
+    assert "130 s in all" in notes["ours"]
+    assert "laps" not in notes["from the paper"]
+
+
+def test_notes_of_the_published_run_credit_the_paper():
+    notes = simulate_basin().notes
+    assert notes["from the paper"].endswith("window, 2039 s in all, laps: 3, 0.150 m/s while driving")
+    assert "laps" not in notes["ours"]
