@@ -102,6 +102,28 @@ def test_examples_in_help_are_understood(
         command.make_context(path[-1], words[1 + len(path) :])
 
 
+@pytest.mark.parametrize("group", ["simulate", "convert"])
+def test_help_of_a_group_ends_in_examples(group: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(group, "--help") == 0
+    assert f"sonar-graph {group} " in capsys.readouterr().out.partition("Examples:")[2]
+
+
+def test_help_names_defaults_presets_and_roles_as_they_are() -> None:
+    from sonar_graph.logs.roles import ROLES
+    from sonar_graph.simulation.basin import BasinOptions
+    from sonar_graph.simulation.presets import DVL_PRESETS, IMU_PRESETS
+
+    options = BasinOptions()
+    helps = {option.name: option.help for option in commands()["simulate", "basin"].params}
+    for name in ("seed", "duration_s", "laps"):
+        assert helps[name].endswith(f" Default: {getattr(options, name):g}.")
+    for name, presets in (("imu", IMU_PRESETS), ("dvl", DVL_PRESETS)):
+        assert f"{getattr(options, name)} (default)" in helps[name]
+        assert all(preset in helps[name] for preset in presets)
+    topic = next(option.help for option in commands()["compare",].params if option.name == "topics")
+    assert topic.endswith(f" Roles: {', '.join(ROLES)}.")
+
+
 # --- the user's mistakes ------------------------------------------------------------------------------------------
 
 MISTAKES = {
@@ -121,11 +143,13 @@ MISTAKES = {
     "rate too low": (["run", "LOG", "-o", "OUT", "--estimator", "dead-reckoning", "--rate-hz", "0.001"], "too short"),
     "setting without value": (["run", "LOG", "-o", "OUT", "--set", "isam2.lag_s"], "expected name=value"),
     "setting of another": (["run", "LOG", "-o", "OUT", "--set", "ekf-slam.x=1"], "expected ESTIMATOR.setting=value"),
+    "setting without name": (["run", "LOG", "-o", "OUT", "--set", "isam2.=1"], "expected ESTIMATOR.setting=value"),
     "unknown setting": (["run", "LOG", "-o", "OUT", "--set", "isam2.nonsense=1"], "nonsense"),
     "topic without role": (["run", "LOG", "-o", "OUT", "--topic", "/imu/data"], "expected ROLE=TOPIC"),
     "topic of no such role": (["run", "LOG", "-o", "OUT", "--topic", "smell=/imu/data"], "smell"),
     "topic that is not there": (["run", "LOG", "-o", "OUT", "--topic", "imu=/imu/raw"], "/imu/raw"),
     "broken calibration": (["run", "LOG", "-o", "OUT", "--calibration", "TEXT"], "not TOML"),
+    "list as calibration": (["run", "LOG", "-o", "OUT", "--calibration", "LIST"], "expected an object with sections"),
     "unknown simulation option": (["simulate", "basin", "-o", "new.mcap", "--set", "wind=3"], "wind"),
     "unknown preset": (["simulate", "basin", "-o", "new.mcap", "--imu", "sundial"], "sundial"),
     "too short for the laps": (["simulate", "basin", "-o", "new.mcap", "--duration-s", "1"], "laps"),
@@ -147,7 +171,8 @@ def test_mistake_is_told_in_one_line(
     monkeypatch.chdir(tmp_path)
     Path("FOLDER").mkdir()
     Path("notes.txt").write_text("these are = = words")
-    places = {"LOG": str(basin), "TEXT": "notes.txt", "TEXT/deeper": "notes.txt/deeper"}
+    Path("list.json").write_text("[1]")
+    places = {"LOG": str(basin), "LIST": "list.json", "TEXT": "notes.txt", "TEXT/deeper": "notes.txt/deeper"}
     assert run(*(places.get(word, word) for word in arguments)) == 2
     told = capsys.readouterr().err
     assert re.fullmatch(r"sonar-graph: .+\n", told)
@@ -242,6 +267,19 @@ def test_inspect_names_the_topics(basin: Path, capsys: pytest.CaptureFixture[str
     shown = capsys.readouterr().out
     for name in ("sensor_msgs/Imu", "marine_acoustic_msgs/Dvl", "sonar_graph_msgs/LandmarkDetections"):
         assert name in shown
+
+
+def test_inspect_ends_in_what_compare_would_lack(
+    basin: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from sonar_graph.logs.inspection import LogSummary
+
+    assert run("inspect", basin) == 0
+    assert "not usable" not in capsys.readouterr().out
+    monkeypatch.setattr(LogSummary, "obstacles", ("no IMU (a/msg/B)", "no DVL (c/msg/D)"))
+    assert run("inspect", basin) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == "not usable for compare: no IMU (a/msg/B), no DVL (c/msg/D)"
 
 
 def test_estimators_lists_every_setting(capsys: pytest.CaptureFixture[str]) -> None:

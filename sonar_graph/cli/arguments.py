@@ -34,6 +34,7 @@ TopicChoices = Annotated[
     typer.Option(
         "--topic",
         metavar="ROLE=TOPIC",
-        help="Topic for a role, where inspect says that several fit or none; may be repeated.",
+        help="Topic for a role, where inspect says that several fit or none; may be repeated. "
+        "Roles: imu, dvl, depth, detections, truth, true_landmarks.",
     ),
 ]

@@ -17,7 +17,14 @@ if TYPE_CHECKING:
 
     from sonar_graph.sequence import Sequence
 
-datasets = typer.Typer(name="convert", help="Convert a public data set to an MCAP log.")
+datasets = typer.Typer(
+    name="convert",
+    help="Convert a public data set to an MCAP log.",
+    epilog=examples(
+        "sonar-graph convert victoria-park -o victoria_park.mcap",
+        "sonar-graph convert mrclam MRCLAM_Dataset6 --robot 3 -o mrclam_6_3.mcap",
+    ),
+)
 
 DatasetFolder = Annotated[
     Path, typer.Argument(metavar="DATASET_DIR", exists=True, file_okay=False, help="Folder of the data set.")

@@ -32,6 +32,8 @@ def _print_summary(console: Console, summary: LogSummary) -> None:
         console.print(f"[bold]{escape(subject)}[/] {escape(note)}", soft_wrap=True)
     for loss in summary.damage:
         console.print(f"[bold red]damage[/] {escape(loss)}", soft_wrap=True)
+    if summary.obstacles:
+        console.print(f"[bold red]not usable for compare[/]: {escape(', '.join(summary.obstacles))}", soft_wrap=True)
 
 
 def _topics_table(summary: LogSummary) -> Table:

@@ -48,7 +48,7 @@ def estimator_settings(texts: list[str], names: list[str]) -> dict[str, dict[str
     for text in texts:
         path, value = parse_setting(text)
         estimator, dot, setting = path.partition(".")
-        if not dot or estimator not in names:
+        if not dot or estimator not in names or not all(setting.split(".")):
             raise EstimatorError(f"--set {text}: expected ESTIMATOR.setting=value with one of {', '.join(names)}")
         _put(settings.setdefault(estimator, {}), setting.split("."), value)
     return settings
@@ -97,4 +97,6 @@ def read_calibration(path: Path | None) -> Calibration | None:
     except (json.JSONDecodeError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         kind = "JSON" if path.suffix == ".json" else "TOML"
         raise CalibrationError(f"{path}: not {kind}: {error}") from error
+    if not isinstance(values, dict):
+        raise CalibrationError(f"{path}: expected an object with sections such as imu, not {json.dumps(values):.40}")
     return Calibration.parse(values, str(path))

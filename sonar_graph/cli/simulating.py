@@ -17,7 +17,14 @@ if TYPE_CHECKING:
 
     from sonar_graph.simulation.basin import BasinOptions
 
-worlds = typer.Typer(name="simulate", help="Simulate a run with known truth and write it as an MCAP log.")
+worlds = typer.Typer(
+    name="simulate",
+    help="Simulate a run with known truth and write it as an MCAP log.",
+    epilog=examples(
+        "sonar-graph simulate basin -o basin.mcap",
+        "sonar-graph simulate basin -o short.mcap --duration-s 300 --laps 1",
+    ),
+)
 
 
 @worlds.command(
@@ -29,11 +36,11 @@ worlds = typer.Typer(name="simulate", help="Simulate a run with known truth and 
 )
 def basin(
     output: OutputLog,
-    seed: Annotated[int | None, typer.Option(min=0, help="Same seed, same log.")] = None,
-    duration_s: Annotated[float | None, typer.Option(help="Length of the run in seconds.")] = None,
-    laps: Annotated[int | None, typer.Option(min=1, help="Times round the landmarks.")] = None,
-    imu: Annotated[str | None, typer.Option(help="Preset of the inertial sensor.")] = None,
-    dvl: Annotated[str | None, typer.Option(help="Preset of the Doppler log.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Same seed, same log. Default: 0.")] = None,
+    duration_s: Annotated[float | None, typer.Option(help="Length of the run in seconds. Default: 2039.")] = None,
+    laps: Annotated[int | None, typer.Option(min=1, help="Times round the landmarks. Default: 3.")] = None,
+    imu: Annotated[str | None, typer.Option(help="Preset of the inertial sensor: hg1700 (default) or mti1.")] = None,
+    dvl: Annotated[str | None, typer.Option(help="Preset of the Doppler log: workhorse (default) or explorer.")] = None,
     no_bias: Annotated[bool, typer.Option("--no-bias", help="Gyros without bias.")] = False,
     settings: Annotated[
         list[str] | None,

@@ -48,6 +48,8 @@ class RoleSummary:
     topic: str | None
     """None: none does, or several could."""
     reason: str
+    candidates: tuple[str, ...] = ()
+    """The topics that fit, where they are several."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,20 @@ class LogSummary:
     notes: dict[str, str]
     damage: tuple[str, ...]
     """What is lost or cannot be read; empty for a sound file."""
+
+    @property
+    def obstacles(self) -> tuple[str, ...]:
+        """What keeps estimators from running on the log as it is: needed parts that no topic plays, or several could.
+
+        Such as ``no IMU (sensor_msgs/msg/Imu)``.
+        """
+        needed = [role for role in self.roles if ROLES[role.role].is_required and role.topic is None]
+        return tuple(
+            f"{len(role.candidates)} topics for {role.role} (choose: --topic {role.role}={role.candidates[0]})"
+            if role.candidates
+            else f"no {role.role.upper()} ({ROLES[role.role].describe()})"
+            for role in needed
+        )
 
     @property
     def duration_s(self) -> float:
@@ -91,7 +107,9 @@ def inspect_log(path: Path) -> LogSummary:
         path=recording.path,
         name=recording.metadata.get(METADATA, {}).get("name"),
         topics=tuple(_summarise(topic) for topic in recording.topics.values()),
-        roles=tuple(RoleSummary(choice.role.name, choice.topic, choice.reason) for choice in choices),
+        roles=tuple(
+            RoleSummary(choice.role.name, choice.topic, choice.reason, choice.candidates) for choice in choices
+        ),
         calibration=_calibration(recording),
         notes=_notes(recording, damage),
         damage=tuple(damage),

@@ -52,6 +52,15 @@ def test_the_roles_are_those_that_reading_uses(make_sequence: Any, tmp_path: Pat
     assert summary.name == sequence.name
     assert summary.notes == sequence.notes
     assert summary.damage == ()
+    assert summary.obstacles == ()
+
+
+def test_what_keeps_a_log_from_being_used_is_named(bench: Any) -> None:
+    imu, dvl = bench.basics()
+    missing = inspect_log(bench.write(("/odom", "odometry", [bench.odometry(bench.t0_ns, 0.0)])))
+    assert missing.obstacles == ("no IMU (sensor_msgs/msg/Imu)", "no DVL (marine_acoustic_msgs/msg/Dvl)")
+    twice = inspect_log(bench.write(imu, dvl, ("/second", "imu", imu[2])))
+    assert twice.obstacles == ("2 topics for imu (choose: --topic imu=/imu)",)
 
 
 def test_mountings_in_the_log_are_mentioned(bench: Any) -> None:
