@@ -52,7 +52,7 @@ def _lower(
 ) -> tuple[gtsam.Values | None, float, float]:
     while damping <= MAX_DAMPING:
         try:
-            candidate = values.retract(_damped(linear, values, damping).optimize())
+            candidate = _step(linear, values, damping)
             candidate_error = graph.error(candidate)
         except RuntimeError:  # GTSAM: indeterminate for this damping
             candidate_error = np.inf
@@ -60,6 +60,29 @@ def _lower(
             return candidate, candidate_error, max(damping / DAMPING_FACTOR, FIRST_DAMPING)
         damping *= DAMPING_FACTOR
     return None, error, damping
+
+
+def _step(linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float) -> gtsam.Values:
+    damped = _damped(linear, values, damping)
+    try:
+        return values.retract(damped.optimize())
+    except RuntimeError:  # Cholesky refuses what is determined, but weakly
+        return qr_tree(damped, values).calculateEstimate()
+
+
+def qr_tree(linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> gtsam.ISAM2:
+    """A linear graph, eliminated by QR: for its solution and marginals where Cholesky refuses it.
+
+    GTSAM's Python interface offers QR only inside ISAM2; the factors are held there at the values they came from.
+    """
+    params = gtsam.ISAM2Params()
+    params.setFactorization("QR")
+    tree = gtsam.ISAM2(params)
+    held = gtsam.NonlinearFactorGraph()
+    for i in range(linear.size()):
+        held.push_back(gtsam.LinearContainerFactor(linear.at(i), values))
+    tree.update(held, values)
+    return tree
 
 
 def _damped(linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float) -> gtsam.GaussianFactorGraph:

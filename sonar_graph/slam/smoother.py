@@ -25,7 +25,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.batch import solve
+from sonar_graph.slam.batch import qr_tree, solve
 
 RESTART_GROWTH = 1.25
 """Number of factors, relative to that at the last restart, before the next one."""
@@ -189,14 +189,7 @@ def _marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam
     try:
         return gtsam.Marginals(linear, values)
     except RuntimeError:
-        params = gtsam.ISAM2Params()
-        params.setFactorization("QR")
-        tree = gtsam.ISAM2(params)
-        held = gtsam.NonlinearFactorGraph()
-        for i in range(linear.size()):
-            held.push_back(gtsam.LinearContainerFactor(linear.at(i), values))
-        tree.update(held, values)
-        return tree
+        return qr_tree(linear, values)
 
 
 def _split(
