@@ -365,7 +365,7 @@ def test_landmarks_that_are_no_longer_asked_for_are_let_go(monkeypatch):
 
 
 def test_drift_beyond_what_cholesky_takes_is_survived():
-    """A pose uncertain by 20 m with millimetre steps: the plain solver gives up, the smoother says what algebra does."""
+    """A pose uncertain by 20 m with millimetre steps: the plain solver gives up, the smoother agrees with algebra."""
     plain = gtsam.ISAM2()
     sigmas = np.array([20.0, 0.002])
     smoother = Smoother(FOREVER_S, 1e-3, NEVER_M)
