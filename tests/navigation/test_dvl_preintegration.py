@@ -243,3 +243,13 @@ def test_linear_interpolation_is_of_second_order_and_a_hold_of_first():
     assert all(3.3 < coarse / fine < 5.0 for coarse, fine in pairwise(linear))
     assert all(1.5 < coarse / fine < 2.6 for coarse, fine in pairwise(held))
     assert linear[0] < 0.2 * held[0]
+
+
+def test_mean_force_is_turned_by_the_attitude_in_the_middle_of_a_step():
+    """Gravity in a vehicle that pitches at 0.1 rad/s, in steps of 0.1 s; their first attitudes err by 5 mrad."""
+    n, dt, rate = 20, 0.1, np.array([0.0, 0.1, 0.0])
+    middles = (np.arange(n) + 0.5) * dt
+    force = np.array([gtsam.Rot3.Expmap(rate * t).unrotate(np.array([0.0, 0.0, 9.81])) for t in middles])
+    steps = Steps(np.full(n, dt), np.tile(rate, (n, 1)), np.zeros((n, 3)), np.zeros((n, 3, 3)), force)
+    motion = Preintegrator(1e-4, np.zeros(3)).integrate(steps, np.zeros(3))
+    assert motion.mean_specific_force == pytest.approx([0.0, 0.0, 9.81], abs=1e-3)

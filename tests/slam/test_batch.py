@@ -163,3 +163,17 @@ def test_where_nothing_lowers_the_error_the_initial_values_are_returned():
     graph.push_back(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3), [L(0)], unwise))
     initial.insert(L(0), np.ones(3))
     assert solve(graph, initial).equals(initial, 0.0)
+
+
+def test_what_cholesky_refuses_is_solved_in_one_step(monkeypatch):
+    """A pose known to 20 m with steps of 2 mm is linear enough for one undamped step."""
+    monkeypatch.setattr("sonar_graph.slam.batch.MAX_ITERATIONS", 1)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    wide, narrow = (gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-3] * 3 + [s] * 3)) for s in (20.0, 0.002))
+    graph.push_back(gtsam.PriorFactorPose3(0, gtsam.Pose3(gtsam.Rot3(), np.array([9.0, 0.0, 0.0])), wide))
+    graph.push_back(gtsam.BetweenFactorPose3(0, 1, gtsam.Pose3(), narrow))
+    for key in (0, 1):
+        values.insert(key, gtsam.Pose3())
+    with pytest.raises(RuntimeError, match="Indeterminate"):
+        graph.linearize(values).optimize()
+    assert solve(graph, values).atPose3(1).translation() == pytest.approx([9.0, 0.0, 0.0], abs=1e-6)
