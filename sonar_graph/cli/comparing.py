@@ -151,16 +151,11 @@ def _check_settings(names: list[str], overrides: dict[str, dict[str, Any]]) -> N
 
 def _write_results(comparison: Comparison, sequence: Sequence, folder: Path) -> None:
     from sonar_graph.evaluation.storage import write_comparison
-    from sonar_graph.logs.result_log import write_result
+    from sonar_graph.evaluation.viewer_files import write_viewer_files
 
-    estimates = {
-        run.estimator: (run.causal, run.smoothed, run.landmarks)
-        for run in comparison.runs
-        if run.causal is not None and run.smoothed is not None and run.landmarks is not None
-    }
     with working("writing results"):
         write_comparison(comparison, folder)
-        write_result(folder / "result.mcap", sequence, estimates)
+        write_viewer_files(comparison, sequence, folder)
 
 
 def _write_report(comparison: Comparison, folder: Path) -> Path:

@@ -59,9 +59,12 @@ def outgoing(
     stamps_ns: Ints,
     values: Mapping[str, Value],
     lengths: Mapping[str, int] | None = None,
+    *,
+    is_latched: bool = False,
 ) -> Outgoing:
     """Messages recorded at the stamps given; values and lengths as in `encode`."""
-    return Outgoing(topic, type_name, stamps_ns, encode(own_definition(type_name), len(stamps_ns), values, lengths))
+    payloads = encode(own_definition(type_name), len(stamps_ns), values, lengths)
+    return Outgoing(topic, type_name, stamps_ns, payloads, is_latched)
 
 
 def imu_messages(topic: str, imu: Imu) -> Outgoing:
@@ -123,10 +126,16 @@ def pose_columns(trajectory: Trajectory) -> dict[str, Value]:
     return values | {"pose.covariance": covariances.reshape(-1, 36)}
 
 
-def odometry_messages(topic: str, trajectory: Trajectory) -> Outgoing:
+def odometry_messages(topic: str, trajectory: Trajectory, body_frame: str = BODY_FRAME) -> Outgoing:
     """``nav_msgs/Odometry`` without a twist."""
-    values = header(trajectory.stamps_ns, WORLD_FRAME) | pose_columns(trajectory) | {"child_frame_id": BODY_FRAME}
+    values = header(trajectory.stamps_ns, WORLD_FRAME) | pose_columns(trajectory) | {"child_frame_id": body_frame}
     return outgoing(topic, ODOMETRY, trajectory.stamps_ns, values)
+
+
+def pose_messages(topic: str, trajectory: Trajectory) -> Outgoing:
+    """``geometry_msgs/PoseWithCovarianceStamped``."""
+    values = header(trajectory.stamps_ns, WORLD_FRAME) | pose_columns(trajectory)
+    return outgoing(topic, POSE_WITH_COVARIANCE, trajectory.stamps_ns, values)
 
 
 def landmark_map_message(topic: str, landmarks: LandmarkMap, stamp_ns: int) -> Outgoing:
@@ -141,5 +150,5 @@ def landmark_map_message(topic: str, landmarks: LandmarkMap, stamp_ns: int) -> O
 
 
 def static_message(topic: str, type_name: str, stamp_ns: int, payload: Bytes) -> Outgoing:
-    """One message that was encoded already."""
-    return Outgoing(topic, type_name, np.array([stamp_ns]), payload)
+    """One message that was encoded already and holds from then on."""
+    return Outgoing(topic, type_name, np.array([stamp_ns]), payload, is_latched=True)

@@ -1,8 +1,13 @@
-"""Landmarks as ``visualization_msgs/MarkerArray``: 95 % ellipsoids with their identities."""
+"""Landmarks as ``visualization_msgs/MarkerArray``: 95 % ellipsoids with their identities.
+
+A marker's namespace says what it is: ``ellipsoid_95_percent``, ``covariance_unknown`` (a sphere whose size means
+nothing), ``identity``. A viewer switches each on and off.
+"""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -16,7 +21,7 @@ SPHERE, TEXT_VIEW_FACING = 2, 9
 UNKNOWN_DIAMETER_M = 0.2
 """Drawn where a covariance is unknown."""
 _SMALLEST_DIAMETER_M = 1e-3
-_TEXT_HEIGHT_M = 0.3
+ELLIPSOID, UNKNOWN, IDENTITY = "ellipsoid_95_percent", "covariance_unknown", "identity"
 _SIGMAS = float(np.sqrt(chi2.ppf(0.95, df=3)))
 
 Colour = tuple[float, float, float, float]
@@ -43,30 +48,36 @@ def ellipsoids(covariances: Floats) -> tuple[Floats, Floats]:
         From the principal axes to the world, shape (m, 4).
     """
     covariances = covariances.copy()
-    unknown = ~np.isfinite(covariances.reshape(-1, 9)).all(axis=1)
-    covariances[unknown] = np.eye(3) * (UNKNOWN_DIAMETER_M / (2 * _SIGMAS)) ** 2
+    covariances[_unknown(covariances)] = np.eye(3) * (UNKNOWN_DIAMETER_M / (2 * _SIGMAS)) ** 2
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # right-handed
     diameters = 2 * _SIGMAS * np.sqrt(np.maximum(variances, 0))
     return np.maximum(diameters, _SMALLEST_DIAMETER_M), Rotation.from_matrix(axes).as_quat()
 
 
-def landmark_markers(topic: str, landmarks: LandmarkMap, stamp_ns: int, colour: Colour) -> Outgoing:
+def _unknown(covariances: Floats) -> NDArray[np.bool_]:
+    return np.asarray(~np.isfinite(covariances.reshape(-1, 9)).all(axis=1))
+
+
+def landmark_markers(
+    topic: str, landmarks: LandmarkMap, stamp_ns: int, colour: Colour, text_height_m: float
+) -> Outgoing:
     """One message: for each landmark an ellipsoid, and its identity as text above it."""
     count = len(landmarks)
     diameters, quaternions = ellipsoids(landmarks.covariances)
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
-    above = landmarks.positions + np.array([0, 0, _TEXT_HEIGHT_M])
+    above = landmarks.positions + np.array([0, 0, text_height_m])
     stamps_ns = np.full(2 * count, stamp_ns)
     values = encoding.header(stamps_ns, encoding.WORLD_FRAME, "markers.header")
     values |= encoding.fields("markers.pose.position", "xyz", np.vstack([landmarks.positions, above]))
     values |= encoding.fields("markers.pose.orientation", "xyzw", np.vstack([quaternions, upright]))
-    values |= encoding.fields("markers.scale", "xyz", np.vstack([diameters, np.full((count, 3), _TEXT_HEIGHT_M)]))
+    values |= encoding.fields("markers.scale", "xyz", np.vstack([diameters, np.full((count, 3), text_height_m)]))
     values |= encoding.fields("markers.color", "rgba", np.tile(colour, (2 * count, 1)))
     values |= {
-        "markers.ns": ["landmark"] * count + ["identity"] * count,
+        "markers.ns": [UNKNOWN if unknown else ELLIPSOID for unknown in _unknown(landmarks.covariances)]
+        + [IDENTITY] * count,
         "markers.id": np.tile(np.arange(count), 2),
         "markers.type": np.repeat([SPHERE, TEXT_VIEW_FACING], count),
         "markers.text": [""] * count + [str(identity) for identity in landmarks.ids.tolist()],
     }
-    return encoding.outgoing(topic, MARKER_ARRAY, np.array([stamp_ns]), values, {"markers": 2 * count})
+    return encoding.outgoing(topic, MARKER_ARRAY, np.array([stamp_ns]), values, {"markers": 2 * count}, is_latched=True)

@@ -1,8 +1,13 @@
-"""Writing MCAP: columns of payloads from several topics, merged by time."""
+"""Writing MCAP: columns of payloads from several topics, merged by time.
+
+A file has profile ``ros2``, chunks with CRCs, and all indexes. Topics that a viewer must also get when it joins late
+carry the quality of service "transient local" in the form of rosbag2, so that ``ros2 bag play`` offers it: without it
+RViz would never receive ``/tf_static``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +20,14 @@ from sonar_graph.logs.message_definitions import definition
 from sonar_graph.measurements import Ints
 
 _CHUNK_BYTES = 1 << 20
+_FOREVER = "{sec: 9223372036, nsec: 854775807}"
+_TRANSIENT_LOCAL = (
+    f"- {{history: 1, depth: 10, reliability: 1, durability: 1, deadline: {_FOREVER}, lifespan: {_FOREVER}, "
+    f"liveliness: 1, liveliness_lease_duration: {_FOREVER}, avoid_ros_namespace_conventions: false}}"
+)
+"""Keep last, reliable, transient local: the numbers of rmw's enumerations, as rosbag2 has them up to version 8."""
+_ROSBAG2 = {"serialized_metadata": ""}
+"""Makes newer versions of rosbag2, which write words, read numbers in what a channel offers."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +41,26 @@ class Outgoing:
     """When each message counts as recorded, shape (n,)."""
     payloads: Bytes
     """Shape (n, size)."""
+    is_latched: bool = False
+    """Viewers that join late get it too; the first entry of a topic decides."""
 
 
-def write_recording(path: Path, messages: list[Outgoing], metadata: Mapping[str, Mapping[str, str]]) -> None:
+@dataclass(frozen=True)
+class Attachment:
+    """A file within the recording."""
+
+    name: str
+    media_type: str
+    """Such as ``application/json``."""
+    content: bytes
+
+
+def write_recording(
+    path: Path,
+    messages: list[Outgoing],
+    metadata: Mapping[str, Mapping[str, str]],
+    attachments: Sequence[Attachment] = (),
+) -> None:
     """Write an MCAP file of profile ``ros2``; an existing file is replaced only when the new one is complete.
 
     Messages appear in the order of their log times; those at one instant in the order of the list.
@@ -44,7 +74,7 @@ def write_recording(path: Path, messages: list[Outgoing], metadata: Mapping[str,
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            _write(partial, messages, metadata)
+            _write(partial, messages, metadata, attachments)
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
@@ -52,12 +82,22 @@ def write_recording(path: Path, messages: list[Outgoing], metadata: Mapping[str,
         raise LogError(f"{path} cannot be written: {error.strerror}") from error
 
 
-def _write(path: Path, messages: list[Outgoing], metadata: Mapping[str, Mapping[str, str]]) -> None:
+def _write(
+    path: Path,
+    messages: list[Outgoing],
+    metadata: Mapping[str, Mapping[str, str]],
+    attachments: Sequence[Attachment],
+) -> None:
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=_CHUNK_BYTES)
         writer.start(profile="ros2", library="sonar-graph")
         for name, record in metadata.items():
             writer.add_metadata(name, dict(record))
+        if any(entry.is_latched for entry in messages):
+            writer.add_metadata("rosbag2", _ROSBAG2)
+        end_ns = max((int(m.log_times_ns.max()) for m in messages if len(m.log_times_ns)), default=0)
+        for file in attachments:
+            writer.add_attachment(0, max(end_ns, 0), file.name, file.media_type, file.content)
         _add_messages(writer, messages)
         writer.finish()  # type: ignore[no-untyped-call]  # of the mcap package
 
@@ -81,5 +121,6 @@ def _register(writer: Writer, messages: list[Outgoing]) -> list[int]:
             text = definition(entry.type_name).encode()
             schemas[entry.type_name] = writer.register_schema(entry.type_name, "ros2msg", text)
         if entry.topic not in channels:
-            channels[entry.topic] = writer.register_channel(entry.topic, "cdr", schemas[entry.type_name])
+            offers = {"offered_qos_profiles": _TRANSIENT_LOCAL} if entry.is_latched else {}
+            channels[entry.topic] = writer.register_channel(entry.topic, "cdr", schemas[entry.type_name], offers)
     return [channels[entry.topic] for entry in messages]

@@ -1,47 +1,63 @@
-"""The outcome of several estimators as one MCAP file for a viewer (RViz, Foxglove, Lichtblick, evo).
+"""The outcome of several estimators as one MCAP file for viewers (Foxglove, Lichtblick, RViz 2) and evo.
 
-For each estimator ``NAME`` (with ``_`` for what ROS does not allow in a topic), in the frame ``map``:
+For each estimator ``NAME`` (as `source_names` spells it), in the frame ``map``:
 
-==========================  ===============================================================================
-``/NAME/odometry``          ``nav_msgs/Odometry``: the causal estimate with its covariance
-``/NAME/pose``              ``geometry_msgs/PoseWithCovarianceStamped``: the same, for viewers without Odometry
-``/NAME/path``              ``nav_msgs/Path``: the causal estimate so far, now and then; at the end the smoothed one
-``/NAME/landmarks``         ``visualization_msgs/MarkerArray`` at the end: 95 % ellipsoids and identities
-``/tf``                     ``map`` to ``base_link`` of the first estimator
-``/ground_truth/...``       ``odometry``, ``path``, ``landmarks``, where known
-==========================  ===============================================================================
+=========================  ==============================================================================
+``/NAME/odometry``         ``nav_msgs/Odometry``: the causal estimate with its covariance
+``/NAME/pose``             ``geometry_msgs/PoseWithCovarianceStamped``: the same, for viewers without Odometry
+``/NAME/smoothed``         the same type: what is known at the end about each instant; equal to it for a filter
+``/NAME/path``             ``nav_msgs/Path``: the causal estimate so far, now and then; at the end the smoothed
+``/NAME/landmarks``        ``visualization_msgs/MarkerArray`` at the end: 95 % ellipsoids and identities
+``/NAME/landmark_cloud``   ``sensor_msgs/PointCloud2`` at the end: position, identity, covariance
+``/tf``                    ``map`` to ``NAME/base_link``, and to ``base_link``, which follows the first estimator
+``/tf_static``             ``base_link`` to the sensors
+``/ground_truth/...``      ``odometry``, ``path``, ``landmarks``, ``landmark_cloud`` from the start, and its
+                           frame in ``/tf``, where known
+=========================  ==============================================================================
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from collections.abc import Sequence as List
 from pathlib import Path
 
 import numpy as np
 
 from sonar_graph.logs import encoding
-from sonar_graph.logs.cdr import Value
+from sonar_graph.logs.body_frames import body_transforms
+from sonar_graph.logs.landmark_cloud import landmark_cloud
 from sonar_graph.logs.markers import BLUE, GREEN, GREY, ORANGE, PURPLE, Colour, landmark_markers
 from sonar_graph.logs.mountings import encode_mountings
-from sonar_graph.logs.recorder import Outgoing, write_recording
-from sonar_graph.logs.roles import POSE_WITH_COVARIANCE, TF
+from sonar_graph.logs.recorder import Attachment, Outgoing, write_recording
+from sonar_graph.logs.roles import TF
+from sonar_graph.logs.viewer_layouts import PATH, Layer, Scene, write_layouts
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import LandmarkMap, Trajectory
 
-PATH = "nav_msgs/msg/Path"
+RESULT_RECORD = "sonar_graph_result"
+TRUTH = "ground_truth"
 _PATH_PERIOD_NS = 30 * 10**9
 _MOST_CAUSAL_PATHS = 20
 _CAUSAL_PATH_STEP_NS = 10**9
 _MOST_CAUSAL_POSES = 1000
-_TRUE_PATH_STEP_NS = 10**8
+_PATH_STEP_NS = 10**8
+_MOST_POSES = 5000
 _COLOURS: tuple[Colour, ...] = (BLUE, ORANGE, PURPLE, GREEN)
+
+Estimates = tuple[Trajectory, Trajectory, LandmarkMap]
+"""Causal trajectory, smoothed trajectory, landmarks; any of them may be empty."""
 
 
 def write_result(
-    path: Path, sequence: Sequence, estimates: Mapping[str, tuple[Trajectory, Trajectory, LandmarkMap]]
+    path: Path,
+    sequence: Sequence,
+    estimates: Mapping[str, Estimates],
+    about: Mapping[str, str] | None = None,
+    attachments: List[Attachment] = (),
 ) -> None:
-    """Write what the estimators said, and the truth where there is one.
+    """Write what the estimators said, and the truth where there is one; beside it the layouts of `write_layouts`.
 
     Parameters
     ----------
@@ -50,55 +66,111 @@ def write_result(
     sequence
         What the estimators were given.
     estimates
-        By the estimator's name: causal trajectory, smoothed trajectory, landmarks. Any of them may be empty.
+        By the estimator's name.
+    about
+        Settings and versions, for the metadata record ``sonar_graph_result``.
+    attachments
+        Files to go into it.
 
     Raises
     ------
     LogError
-        When the file cannot be written, or a stamp does not fit into a ROS 2 message.
+        When a file cannot be written, or a stamp does not fit into a ROS 2 message.
     """
+    sources = dict(zip(source_names(estimates), estimates.values(), strict=True))
+    scene = Scene.around([*_positions(sequence, estimates.values())])
+    colours = {name: _COLOURS[i % len(_COLOURS)] for i, name in enumerate(sources)} | {TRUTH: GREY}
     messages = [encoding.static_message("/tf_static", TF, sequence.start_ns, encode_mountings(sequence.calibration))]
-    messages += _truth(sequence)
-    for i, (name, (causal, smoothed, landmarks)) in enumerate(estimates.items()):
-        messages += _estimator(name, causal, smoothed, landmarks, _COLOURS[i % len(_COLOURS)])
-    if estimates:
-        first, _, _ = next(iter(estimates.values()))
-        messages += [_transforms(first)] if len(first) else []
-    record = {"sequence": sequence.name, "estimators": ",".join(estimates)}
-    write_recording(Path(path), messages, {"sonar_graph_result": record})
+    messages += _truth(sequence, scene)
+    for name, estimate in sources.items():
+        messages += _estimator(name, estimate, colours[name], scene)
+    messages += body_transforms("/tf", _bodies(sequence, sources))
+    record = {"sequence": sequence.name, "estimators": ",".join(estimates), "topics of them": ",".join(sources)}
+    write_recording(Path(path), messages, {RESULT_RECORD: record | dict(about or {})}, attachments)
+    write_layouts(Path(path), _layers(messages, colours), scene)
 
 
-def _truth(sequence: Sequence) -> list[Outgoing]:
+def source_names(estimators: Iterable[str]) -> list[str]:
+    """How estimators are called in topics and frames.
+
+    ROS allows letters, digits and single underscores, and no digit first. Names that would be alike get a number.
+    """
+    taken = {TRUTH, "tf", "tf_static"}
+    names = []
+    for estimator in estimators:
+        plain = re.sub(r"[^0-9A-Za-z]+", "_", estimator).strip("_")
+        plain = plain if plain[:1].isalpha() else f"estimator_{plain}".rstrip("_")
+        candidates = (plain if i == 1 else f"{plain}_{i}" for i in range(1, len(taken) + 2))
+        names.append(next(name for name in candidates if name not in taken))
+        taken.add(names[-1])
+    return names
+
+
+def _positions(sequence: Sequence, estimates: Iterable[Estimates]) -> Iterable[np.ndarray]:
+    """Everything that is somewhere."""
+    for causal, smoothed, landmarks in estimates:
+        yield from (causal.positions, smoothed.positions, landmarks.positions)
+    if sequence.truth is not None:
+        yield sequence.truth.positions
+    if sequence.true_landmarks is not None:
+        yield sequence.true_landmarks.positions
+
+
+def _truth(sequence: Sequence, scene: Scene) -> list[Outgoing]:
     """The truth, of which path and landmarks are there from the start."""
     messages = []
     if sequence.truth is not None and len(sequence.truth):
-        messages.append(encoding.odometry_messages("/ground_truth/odometry", sequence.truth))
-        messages.append(_path("/ground_truth/path", _thinned(sequence.truth, _TRUE_PATH_STEP_NS), sequence.start_ns))
-    if sequence.true_landmarks is not None and len(sequence.true_landmarks):
-        messages.append(landmark_markers("/ground_truth/landmarks", sequence.true_landmarks, sequence.start_ns, GREY))
+        messages.append(encoding.odometry_messages(f"/{TRUTH}/odometry", sequence.truth, f"{TRUTH}/base_link"))
+        messages.append(_path(f"/{TRUTH}/path", _drawable(sequence.truth), sequence.start_ns))
+    if sequence.true_landmarks is not None:
+        messages += _landmarks(TRUTH, sequence.true_landmarks, sequence.start_ns, GREY, scene)
     return messages
 
 
-def _estimator(
-    name: str, causal: Trajectory, smoothed: Trajectory, landmarks: LandmarkMap, colour: Colour
-) -> list[Outgoing]:
-    name = re.sub(r"\W", "_", name)
+def _estimator(name: str, estimate: Estimates, colour: Colour, scene: Scene) -> list[Outgoing]:
+    causal, smoothed, landmarks = estimate
     messages = []
     if len(causal):
-        messages.append(encoding.odometry_messages(f"/{name}/odometry", causal))
-        messages.append(_poses(f"/{name}/pose", causal))
+        messages.append(encoding.odometry_messages(f"/{name}/odometry", causal, _frame(name)))
+        messages.append(encoding.pose_messages(f"/{name}/pose", causal))
         messages += _causal_paths(f"/{name}/path", causal)
     ends = [int(t.stamps_ns[-1]) for t in (causal, smoothed) if len(t)]
     if len(smoothed):
-        messages.append(_path(f"/{name}/path", smoothed, max(ends)))
-    if len(landmarks) and ends:
-        messages.append(landmark_markers(f"/{name}/landmarks", landmarks, max(ends), colour))
-    return messages
+        messages.append(encoding.pose_messages(f"/{name}/smoothed", smoothed))
+        messages.append(_path(f"/{name}/path", _drawable(smoothed), max(ends)))
+    return messages + (_landmarks(name, landmarks, max(ends), colour, scene) if ends else [])
 
 
-def _poses(topic: str, trajectory: Trajectory) -> Outgoing:
-    values = encoding.header(trajectory.stamps_ns, encoding.WORLD_FRAME) | encoding.pose_columns(trajectory)
-    return encoding.outgoing(topic, POSE_WITH_COVARIANCE, trajectory.stamps_ns, values)
+def _landmarks(name: str, landmarks: LandmarkMap, stamp_ns: int, colour: Colour, scene: Scene) -> list[Outgoing]:
+    if not len(landmarks):
+        return []
+    markers = landmark_markers(f"/{name}/landmarks", landmarks, stamp_ns, colour, scene.text_height_m)
+    return [markers, landmark_cloud(f"/{name}/landmark_cloud", landmarks, stamp_ns)]
+
+
+def _frame(name: str) -> str:
+    return f"{name}/{encoding.BODY_FRAME}"
+
+
+def _bodies(sequence: Sequence, sources: Mapping[str, Estimates]) -> dict[str, Trajectory]:
+    """Body frames: one of each causal estimate, that of the sensors, and the truth at the instants of the estimates."""
+    bodies = {_frame(name): causal for name, (causal, _, _) in sources.items() if len(causal)}
+    owner = next(iter(bodies.values()), sequence.truth)
+    truth = sequence.truth
+    if truth is not None and len(truth):
+        instants_ns = np.unique(np.concatenate([b.stamps_ns for b in bodies.values()] or [_drawable(truth).stamps_ns]))
+        within = (instants_ns >= truth.stamps_ns[0]) & (instants_ns <= truth.stamps_ns[-1])
+        bodies[_frame(TRUTH)] = truth.at(instants_ns[within]) if len(truth) > 1 else truth
+    return {encoding.BODY_FRAME: owner, **bodies} if owner is not None and len(owner) else bodies
+
+
+def _layers(messages: Iterable[Outgoing], colours: Mapping[str, Colour]) -> list[Layer]:
+    """What a viewer may draw: every topic once."""
+    topics = {entry.topic: entry for entry in messages}
+    return [
+        Layer(topic, entry.type_name, colours.get(topic.split("/")[1], GREY), is_latched=entry.is_latched)
+        for topic, entry in topics.items()
+    ]
 
 
 def _causal_paths(topic: str, causal: Trajectory) -> list[Outgoing]:
@@ -110,6 +182,12 @@ def _causal_paths(topic: str, causal: Trajectory) -> list[Outgoing]:
     counts = np.searchsorted(thinned.stamps_ns, ends_ns, side="right")
     pairs = zip(counts.tolist(), ends_ns.tolist(), strict=True)
     return [_path(topic, thinned.rows(slice(count)), end_ns) for count, end_ns in pairs]
+
+
+def _drawable(trajectory: Trajectory) -> Trajectory:
+    """As many poses as a line needs."""
+    duration_ns = int(trajectory.stamps_ns[-1] - trajectory.stamps_ns[0])
+    return _thinned(trajectory, max(_PATH_STEP_NS, duration_ns // _MOST_POSES))
 
 
 def _thinned(trajectory: Trajectory, step_ns: int) -> Trajectory:
@@ -125,16 +203,4 @@ def _path(topic: str, trajectory: Trajectory, stamp_ns: int) -> Outgoing:
     poses |= encoding.fields("poses.pose.position", "xyz", trajectory.positions)
     poses |= encoding.fields("poses.pose.orientation", "xyzw", trajectory.quaternions_xyzw)
     values = encoding.header(at_ns, encoding.WORLD_FRAME) | poses
-    return encoding.outgoing(topic, PATH, at_ns, values, {"poses": len(trajectory)})
-
-
-def _transforms(trajectory: Trajectory) -> Outgoing:
-    """``map`` to ``base_link``, one ``tf2_msgs/TFMessage`` a pose."""
-    columns = encoding.header(trajectory.stamps_ns, encoding.WORLD_FRAME, "transforms.header")
-    columns |= encoding.fields("transforms.transform.translation", "xyz", trajectory.positions)
-    columns |= encoding.fields("transforms.transform.rotation", "xyzw", trajectory.quaternions_xyzw)
-    one_each: dict[str, Value] = {
-        path: value[:, None] if isinstance(value, np.ndarray) else value for path, value in columns.items()
-    }
-    one_each["transforms.child_frame_id"] = encoding.BODY_FRAME
-    return encoding.outgoing("/tf", TF, trajectory.stamps_ns, one_each, {"transforms": 1})
+    return encoding.outgoing(topic, PATH, at_ns, values, {"poses": len(trajectory)}, is_latched=True)

@@ -45,10 +45,10 @@ def messages(result: Path, decoded: Any) -> dict[str, list[Any]]:
 
 
 def test_every_estimator_and_the_truth_are_there(messages: dict[str, list[Any]]) -> None:
-    each = ("odometry", "pose", "path", "landmarks")
+    each = ("odometry", "pose", "smoothed", "path", "landmarks", "landmark_cloud")
     expected = {f"/{name}/{kind}" for name in ("ekf_slam", "isam2") for kind in each}
-    expected |= {"/ground_truth/odometry", "/ground_truth/path", "/ground_truth/landmarks", "/tf", "/tf_static"}
-    assert set(messages) == expected
+    expected |= {f"/ground_truth/{kind}" for kind in ("odometry", "path", "landmarks", "landmark_cloud")}
+    assert set(messages) == expected | {"/tf", "/tf_static"}
 
 
 def test_odometry_is_causal_and_the_last_path_smoothed(messages: dict[str, list[Any]]) -> None:
@@ -64,7 +64,10 @@ def test_covariances_are_in_the_order_and_axes_of_ros(messages: dict[str, list[A
     pose = messages["/isam2/pose"][0]
     # body axes turned by 90 degrees: what lies along the body's x lies along the world's y
     assert np.diag(np.reshape(pose.pose.covariance, (6, 6))) == pytest.approx([5, 4, 6, 2, 1, 3])
-    assert (pose.header.frame_id, messages["/isam2/odometry"][0].child_frame_id) == ("map", "base_link")
+    assert (pose.header.frame_id, messages["/isam2/odometry"][0].child_frame_id) == (
+        "map",
+        "isam2/base_link",
+    )
 
 
 def test_landmarks_are_ellipsoids_with_their_identities(messages: dict[str, list[Any]]) -> None:
@@ -78,10 +81,27 @@ def test_landmarks_are_ellipsoids_with_their_identities(messages: dict[str, list
     assert len({(m.ns, m.id) for m in array.markers}) == 4
 
 
-def test_tf_carries_the_first_estimator(messages: dict[str, list[Any]]) -> None:
-    transforms = [m.transforms for m in messages["/tf"]]
-    assert [t[0].transform.translation.x for t in transforms] == list(np.arange(100.0))
-    assert {(t[0].header.frame_id, t[0].child_frame_id) for t in transforms} == {("map", "base_link")}
+def test_tf_is_a_tree_below_the_map_in_which_the_sensors_follow_the_first_estimator(
+    messages: dict[str, list[Any]],
+) -> None:
+    parents: dict[str, set[str]] = {}
+    for transform in [t for m in messages["/tf"] + messages["/tf_static"] for t in m.transforms]:
+        parents.setdefault(transform.child_frame_id, set()).add(transform.header.frame_id)
+    sensors = {sensor: {"base_link"} for sensor in ("imu", "dvl", "depth", "sonar")}
+    bodies = ("base_link", "ekf_slam/base_link", "isam2/base_link", "ground_truth/base_link")
+    assert parents == sensors | {body: {"map"} for body in bodies}
+    assert {m.child_frame_id for m in messages["/isam2/odometry"]} <= parents.keys()
+
+
+def test_transforms_of_one_instant_share_a_message(messages: dict[str, list[Any]]) -> None:
+    instants = [{(t.header.stamp.sec, t.header.stamp.nanosec) for t in m.transforms} for m in messages["/tf"]]
+    assert {len(stamps) for stamps in instants} == {1}
+    assert len(set.union(*instants)) == len(instants)
+    xs = {name: [] for name in ("base_link", "ekf_slam/base_link", "isam2/base_link")}
+    for transform in [t for m in messages["/tf"] for t in m.transforms if t.child_frame_id in xs]:
+        xs[transform.child_frame_id].append(transform.transform.translation.x)
+    assert xs["base_link"] == xs["ekf_slam/base_link"] == list(np.arange(100.0))
+    assert xs["isam2/base_link"] == list(np.arange(100.0) + 10)
 
 
 def test_rosbags_re_encodes_all_that_is_written_to_the_same_bytes(result: Path) -> None:
