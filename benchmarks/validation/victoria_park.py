@@ -11,7 +11,10 @@ is solved under both readings: under the sensors' it is the problem that our smo
 equal; how far the file's is from that is what the conversion to a log costs.
 
 Our smoother gets the log that the converter made. Like for like: a keyframe at every pose, no robust kernel, no
-gate. As users run it: the defaults, whose robust kernel makes another problem of it.
+gate. As users run it: the defaults, with fewer keyframes and a robust kernel, against a batch solution with that
+kernel. Such a cost has many minima that hardly differ, so the batch solver starts both from the solution without kernel
+and from ours, and the lower result counts; both costs are printed. The costs of poses between keyframes are not
+compared, since those are not solved for but carried on.
 """
 
 from __future__ import annotations
@@ -45,19 +48,22 @@ LIKE_FOR_LIKE = {
     "max_keyframe_interval_s": 0.5,
     "waiting_gain": 0.0,
 }
+KERNEL_WIDTH = 1.5
+"""Of the default kernel (Cauchy), in standard deviations."""
 SETTINGS: dict[str, dict[str, Any]] = {"like for like": LIKE_FOR_LIKE, "defaults": {}}
 QUICK_LINES = 1500
 PRIOR_SIGMA = 1e-3
 COST_AGREEMENT = 5e-3
 """Solutions whose costs differ by less than this share are at the same minimum."""
 RMS_AGREEMENT_M = 0.05
-SIGMAS_AGREEMENT = 0.5
-"""Rms over all landmarks, and any single one in its own standard deviations, for maps to agree: a mistaken sighting in
-the file moves its landmark by some, as our azimuth factor weighs ``tan(e)`` where GTSAM's weighs ``e``."""
+SIGMAS_AGREEMENT = 0.1
+"""Rms over all landmarks, and any single one in its own standard deviations, for maps to agree."""
 SLICES = 20
 """Of an edge, for adding up noise along it."""
 Reading = Callable[[gtsam.Pose2, np.ndarray], np.ndarray]
 """Covariance of an edge (3, 3) from its motion and what the file says."""
+Sighter = Callable[[int, int, np.ndarray, np.ndarray], list[gtsam.NonlinearFactor]]
+"""Factors of a sighting from keys of pose and landmark, the point in the body frame and its covariance."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +75,7 @@ class Step:
     points: list[tuple[int, np.ndarray, np.ndarray]]
     """Landmark, point in the body frame (2,), covariance (2, 2)."""
 
-    def factors(self, index: int, reading: Reading) -> gtsam.NonlinearFactorGraph:
+    def factors(self, index: int, reading: Reading, sighter: Sighter) -> gtsam.NonlinearFactorGraph:
         """Of this pose, the ``index``-th."""
         graph = gtsam.NonlinearFactorGraph()
         if self.edge is None:
@@ -81,7 +87,8 @@ class Step:
             noise = gtsam.noiseModel.Gaussian.Covariance(reading(step, cov))
             graph.push_back(gtsam.BetweenFactorPose2(X(index - 1), X(index), step, noise))
         for landmark, point, cov in self.points:
-            graph.push_back(sighting(X(index), L(landmark), point, cov))
+            for factor in sighter(X(index), L(landmark), point, cov):
+                graph.push_back(factor)
         return graph
 
     def first_values(self, index: int, before: gtsam.Pose2, known: set[int]) -> tuple[gtsam.Pose2, gtsam.Values]:
@@ -136,13 +143,31 @@ def upper_to_full(entries: list[float], size: int) -> np.ndarray:
     return full + np.triu(full, 1).T
 
 
-def sighting(pose: int, landmark: int, point: np.ndarray, cov: np.ndarray) -> gtsam.NonlinearFactor:
-    """A point in the body frame as bearing and range, with the covariance that follows to first order."""
+def plain_sighting(pose: int, landmark: int, point: np.ndarray, cov: np.ndarray) -> list[gtsam.NonlinearFactor]:
+    """Bearing and range, with the covariance that follows from the point's to first order."""
+    bearing, distance, noise = bearing_and_range(point, cov)
+    return [gtsam.BearingRangeFactor2D(pose, landmark, bearing, distance, gtsam.noiseModel.Gaussian.Covariance(noise))]
+
+
+def robust_sighting(pose: int, landmark: int, point: np.ndarray, cov: np.ndarray) -> list[gtsam.NonlinearFactor]:
+    """The same with a kernel on each of the two, which the file's covariances leave uncorrelated."""
+    bearing, distance, noise = bearing_and_range(point, cov)
+    kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(KERNEL_WIDTH)
+    across, along = (
+        gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Isotropic.Variance(1, variance))
+        for variance in np.diag(noise).tolist()
+    )
+    return [
+        gtsam.BearingFactor2D(pose, landmark, bearing, across),
+        gtsam.RangeFactor2D(pose, landmark, distance, along),
+    ]
+
+
+def bearing_and_range(point: np.ndarray, cov: np.ndarray) -> tuple[gtsam.Rot2, float, np.ndarray]:
+    """Bearing and range of a point in the body frame, and their covariance (2, 2)."""
     distance = float(np.hypot(*point))
     J = np.array([[-point[1] / distance**2, point[0] / distance**2], [point[0] / distance, point[1] / distance]])
-    noise = gtsam.noiseModel.Gaussian.Covariance(J @ cov @ J.T)
-    bearing = gtsam.Rot2.fromAngle(float(np.arctan2(point[1], point[0])))
-    return gtsam.BearingRangeFactor2D(pose, landmark, bearing, distance, noise)
+    return gtsam.Rot2.fromAngle(float(np.arctan2(point[1], point[0]))), distance, J @ cov @ J.T
 
 
 def solve(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
@@ -170,18 +195,18 @@ def incremental(steps: list[Step]) -> gtsam.Values:
     isam, pose, known = gtsam.ISAM2(params), gtsam.Pose2(), set()
     for index, step in enumerate(steps):
         _, new = step.first_values(index, pose, known)
-        isam.update(step.factors(index, at_its_end), new)
+        isam.update(step.factors(index, at_its_end, plain_sighting), new)
         pose = isam.calculateEstimatePose2(X(index))
         if index % 2000 == 0:
             note(f"GTSAM's iSAM2: {index} of {len(steps)} poses")
     return isam.calculateBestEstimate()
 
 
-def joined(steps: list[Step], reading: Reading) -> gtsam.NonlinearFactorGraph:
+def joined(steps: list[Step], reading: Reading, sighter: Sighter = plain_sighting) -> gtsam.NonlinearFactorGraph:
     """All factors."""
     graph = gtsam.NonlinearFactorGraph()
     for index, step in enumerate(steps):
-        graph.push_back(step.factors(index, reading))
+        graph.push_back(step.factors(index, reading, sighter))
     return graph
 
 
@@ -224,6 +249,11 @@ class Batch:
     graph: gtsam.NonlinearFactorGraph
     solution: gtsam.Values
 
+    @classmethod
+    def solved(cls, graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> Batch:
+        """By Levenberg-Marquardt from a start."""
+        return cls(graph, solve(graph, start))
+
     @property
     def cost(self) -> float:
         return float(self.graph.error(self.solution))
@@ -261,38 +291,55 @@ def main() -> None:
             zip(SETTINGS, in_parallel(partial(run_ours, path), list(SETTINGS), arguments.workers, "isam2"), strict=True)
         )
     steps = read_steps(lines)
-    start, graphs = (
-        incremental(steps),
-        {"sensor noise": joined(steps, all_along), "file noise": joined(steps, at_its_end)},
+    start = incremental(steps)
+    plain = {
+        "sensor noise": Batch.solved(joined(steps, all_along), start),
+        "file noise": Batch.solved(joined(steps, at_its_end), start),
+    }
+    lost = solve(plain["file noise"].graph, dead_reckoning(steps))
+    lost_cost = plain["file noise"].graph.error(lost)
+    print(
+        f"{len(steps)} poses; cost of the batch solution {plain['file noise'].cost:.3f}; "
+        f"from dead reckoning {lost_cost:.3f}"
     )
-    batches = {name: Batch(graph, solve(graph, start)) for name, graph in graphs.items()}
-    lost = solve(graphs["file noise"], dead_reckoning(steps))
-    cost, lost_cost = batches["file noise"].cost, graphs["file noise"].error(lost)
-    print(f"{len(steps)} poses; cost of the batch solution {cost:.3f}; from dead reckoning {lost_cost:.3f}\n")
+    robust = joined(steps, all_along, robust_sighting)
+    starts = [plain["sensor noise"].solution, *([in_the_plane(runs["defaults"])] if runs["defaults"].landmarks else [])]
+    solutions = [Batch.solved(robust, values) for values in starts]
+    print(
+        "with a kernel, from the solution without and from ours: "
+        + ", ".join(f"{s.cost:.3f}" for s in solutions)
+        + "\n"
+    )
+    batches = {
+        "like for like": plain,
+        "defaults": {"sensor noise and kernel": min(solutions, key=lambda solution: solution.cost)},
+    }
     print_figures(report(runs, batches))
 
 
-def report(runs: dict[str, RunResult], batches: dict[str, Batch]) -> dict[str, Any]:
+def report(runs: dict[str, RunResult], batches: dict[str, dict[str, Batch]]) -> dict[str, Any]:
     """Print the table; the figures by name."""
     rows, found = [], {}
     for name, run in runs.items():
         if run.status == "failed":
             print(f"isam2, {name}: failed {run.reason}\n")
             continue
-        for noise, batch in batches.items():
+        for noise, batch in batches[name].items():
             found[name, noise] = batch.against(run)
             rows.append((f"isam2 {name}, batch with {noise}", *found[name, noise].values()))
     print_table(("", "cost ratio", "restarted", "rms m", "max m", "aligned rms m", "aligned max m", "max sigmas"), rows)
-    same, file = found.get(("like for like", "sensor noise")), found.get(("like for like", "file noise"))
-    figures: dict[str, Any] = {
-        f"landmark_{key}" if "difference" in key else key: value for key, value in (same or {}).items()
-    }
-    figures |= {f"file_noise_{key}": value for key, value in (file or {}).items()}
-    figures |= {f"defaults_{key}": value for key, value in found.get(("defaults", "sensor noise"), {}).items()}
+    same, defaults = found.get(("like for like", "sensor noise")), found.get(("defaults", "sensor noise and kernel"))
+    figures = _named("", same) | _named("file_noise_", found.get(("like for like", "file noise")))
+    figures |= {key: value for key, value in _named("defaults_", defaults).items() if "cost" not in key}
     figures["gated"] = {name: refused(run) for name, run in runs.items() if run.status == "ok"}
     figures["failed"] = {name: run.reason for name, run in runs.items() if run.status == "failed"}
-    figures["passed"] = bool(same) and passed(same)
+    figures["passed"] = bool(same and defaults) and passed(same) and maps_agree(defaults)
     return figures
+
+
+def _named(prefix: str, figures: dict[str, float] | None) -> dict[str, Any]:
+    landmark = "" if prefix else "landmark_"
+    return {prefix + (landmark if "difference" in key else "") + key: value for key, value in (figures or {}).items()}
 
 
 def refused(run: RunResult) -> int:
@@ -301,12 +348,18 @@ def refused(run: RunResult) -> int:
 
 
 def passed(same: dict[str, float]) -> bool:
-    """Whether maps are equal and nothing started from ours goes elsewhere."""
+    """Whether maps are equal, and nothing started from ours goes elsewhere."""
     return (
-        same["rms_difference_m"] <= RMS_AGREEMENT_M
-        and same["max_difference_sigmas"] <= SIGMAS_AGREEMENT
+        maps_agree(same)
         and abs(same["cost_ratio"] - 1) <= COST_AGREEMENT
         and abs(same["restarted_cost_ratio"] - 1) <= COST_AGREEMENT
+    )
+
+
+def maps_agree(differences: dict[str, float]) -> bool:
+    """Whether landmarks are where the batch solution has them."""
+    return (
+        differences["rms_difference_m"] <= RMS_AGREEMENT_M and differences["max_difference_sigmas"] <= SIGMAS_AGREEMENT
     )
 
 

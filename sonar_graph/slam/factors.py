@@ -12,10 +12,13 @@ All but the odometry factor with a gyro bias are GTSAM's own (compiled) factors;
 tests against `sonar_graph.slam.models`. Range and azimuth are two factors, so that elevation stays unknown:
 
 * range: ``RangeFactorWithTransform3D``.
-* azimuth: a pinhole camera whose optical axis lies in the sonar's fan plane along the measured azimuth. Its horizontal
-  image coordinate of a point is ``tan(azimuth - measured)`` whatever the elevation, its vertical one
-  ``tan(elevation)`` for small azimuth errors, so a horizontal sigma and a vertical sigma say exactly what is known. The
-  tangent differs from its argument by less than 1e-4 relative within 1 degree.
+* azimuth: a camera whose optical axis lies in the sonar's fan plane along the measured azimuth, with the equidistant
+  projection (Kannala and Brandt, IEEE PAMI 28(8), 2006, equation 6 without distortion): a direction at angle ``t`` from
+  the axis has an image point at distance ``t`` from its centre. The horizontal coordinate of a point at elevation 0 is
+  ``azimuth - measured``; at a small elevation ``e`` it is that times ``e / tan(e)`` (0.995 at 7 degrees), zero where
+  the azimuth is as measured, whatever ``e``. The vertical coordinate is ``e``. A horizontal and a vertical sigma thus
+  say what is known. A pinhole, with tangents for angles, lets an azimuth that is wrong by tens of degrees pull much
+  harder.
 """
 
 from __future__ import annotations
@@ -32,11 +35,12 @@ from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.slam.models import range_azimuth_jacobians, wrap_angle
 
 UNINFORMATIVE_M = 1e5
-UNINFORMATIVE_TANGENT = 1e3
-"""Sigmas that leave a direction to the other factors, in metres and as the tangent of an angle."""
+UNINFORMATIVE_RAD = 1e3
+"""Sigmas that leave a direction to the other factors."""
 CORRELATION_LIMIT = 1e-6
 """Above it, range and azimuth noise are taken together."""
-PINHOLE = gtsam.Cal3_S2()
+EQUIDISTANT = gtsam.Cal3Fisheye(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""Unit focal lengths; no skew, offset or distortion."""
 BEAM_R_CAMERA = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
 """Columns: image x to the left, image y up, optical axis along the beam."""
 ORIGIN = np.zeros(3)
@@ -136,7 +140,7 @@ def landmark_sighting(
         noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, math.sqrt(range_var)))
         return [*factors, gtsam.RangeFactorWithTransform3D(pose_key, landmark_key, float(z[0]), noise, body_T_sonar)]
     elevation_only = (
-        [_camera(pose_key, landmark_key, body_T_sonar, float(z[1]), UNINFORMATIVE_TANGENT, elevation_sigma_rad, robust)]
+        [_camera(pose_key, landmark_key, body_T_sonar, float(z[1]), UNINFORMATIVE_RAD, elevation_sigma_rad, robust)]
         if elevation_sigma_rad
         else []
     )
@@ -154,10 +158,10 @@ def _camera(
 ) -> gtsam.NonlinearFactor:
     sonar_T_beam = gtsam.Pose3(gtsam.Rot3.Rz(azimuth_rad).compose(BEAM_R_CAMERA), ORIGIN)
     body_T_camera = body_T_sonar.compose(sonar_T_beam)
-    vertical = UNINFORMATIVE_TANGENT if elevation_sigma_rad is None else math.tan(elevation_sigma_rad)
+    vertical = UNINFORMATIVE_RAD if elevation_sigma_rad is None else elevation_sigma_rad
     noise = robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([azimuth_sigma_rad, vertical])))
-    return gtsam.GenericProjectionFactorCal3_S2(
-        np.zeros(2), noise, pose_key, landmark_key, PINHOLE, False, False, body_T_camera
+    return gtsam.GenericProjectionFactorCal3Fisheye(
+        np.zeros(2), noise, pose_key, landmark_key, EQUIDISTANT, False, False, body_T_camera
     )
 
 

@@ -139,6 +139,7 @@ class Sightings:
         self, view: View, tie: Tie, sighting: Sighting, point: Floats, elevation_sigma_rad: float | None
     ) -> None:
         R, key = view.blurred(sighting.cov, tie.motion, point), L(sighting.landmark_id)
+        self.smoother.sightlines.add(key, tie.pose_key, tie.keyframe_T_sonar, sighting.z)
         self.smoother.add(
             factors.landmark_sighting(
                 tie.pose_key, key, tie.keyframe_T_sonar, sighting.z, R, self._robust, elevation_sigma_rad

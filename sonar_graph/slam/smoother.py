@@ -26,11 +26,14 @@ import numpy as np
 
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.batch import qr_tree, solve
+from sonar_graph.slam.sightlines import Sightlines
 
 RESTART_GROWTH = 1.25
 """Number of factors, relative to that at the last restart, before the next one."""
 FIRST_RESTART = 100
 """Number of factors before the first restart."""
+MAX_PLACEMENTS = 3
+"""Times that stuck landmarks are placed anew in one solution."""
 
 
 class Smoother:
@@ -60,6 +63,8 @@ class Smoother:
         """Every factor ever added."""
         self.values = gtsam.Values()
         """The newest estimate of every variable; of those that left the window, the last one there."""
+        self.sightlines = Sightlines()
+        """Where each landmark was seen from."""
         self.waiting_gain = 0.0
         """What the factors added since the last update would add: a sum of expected over measured variances."""
         self._pending = gtsam.NonlinearFactorGraph()
@@ -143,7 +148,7 @@ class Smoother:
     def _restart(self, time_s: float, factorization: str = "CHOLESKY") -> None:
         """Solve the history; start a window whose prior is the marginal of all that lies before it."""
         self._restart_size = int(RESTART_GROWTH * self.graph.size())
-        self.values = solve(self.graph, self.values)
+        self.values = self._solve()
         times: dict[Any, float] = {key: t for key, t in self._expiring.items() if t >= time_s - self._lag_s}
         times |= dict.fromkeys(self._landmarks, time_s)
         inside, outside = _split(self.graph, set(times))
@@ -155,6 +160,19 @@ class Smoother:
         self._window = self._new_window(factorization)
         self._window.update(inside, values, times)
         self.values.update(self._window.calculateEstimate())
+
+    def _solve(self) -> gtsam.Values:
+        """Solve the history; again while landmarks are stuck behind the sonar and a new start of theirs lowers the error."""
+        values = solve(self.graph, self.values)
+        for _ in range(MAX_PLACEMENTS):
+            stuck = self.sightlines.turned_away(values)
+            if not stuck:
+                break
+            retried = solve(self.graph, self.sightlines.placed_anew(values, stuck))
+            if self.graph.error(retried) >= self.graph.error(values):
+                break
+            values = retried
+        return values
 
     def covariance(self, key: int) -> Floats:
         """Marginal covariance of a variable in the window."""
@@ -178,7 +196,7 @@ class Smoother:
         Ask that for ``marginalCovariance(key)`` or ``jointMarginalCovariance(keys)``.
         """
         if self._solved is None or self._solved_size != self.graph.size():
-            values = solve(self.graph, self.values)
+            values = self._solve()
             self._solved = values, _marginals(self.graph, values)
             self._solved_size = self.graph.size()
         return self._solved
