@@ -1,11 +1,17 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.logs.markers import UNKNOWN_DIAMETER_M, ellipsoids
+from sonar_graph.logs.markers import GREY, UNKNOWN_DIAMETER_M, ellipsoids, landmark_markers
+from sonar_graph.logs.recorder import write_recording
+from sonar_graph.states import LandmarkMap
 
 
 @given(st.integers(0, 10_000))
@@ -37,3 +43,38 @@ def test_unknown_covariances_are_small_spheres_and_known_ones_beside_them_stay()
 
 def test_a_landmark_known_exactly_can_still_be_seen() -> None:
     assert (ellipsoids(np.zeros((1, 3, 3)))[0] > 0).all()
+
+
+def test_namespaces_tell_ellipsoids_that_mean_something_from_those_that_do_not(
+    tmp_path: Path, decoded: Callable[[Path], dict[str, list[Any]]]
+) -> None:
+    covariances = np.array([np.diag([0.01, 0.04, 0.09]), np.full((3, 3), np.nan)])
+    landmarks = LandmarkMap(np.array([7, 2**40]), np.array([[1.0, 2, 3], [4, 5, 6]]), covariances)
+    write_recording(tmp_path / "a.mcap", [landmark_markers("/landmarks", landmarks, 1, GREY, 0.5)], {})
+    ((array,),) = decoded(tmp_path / "a.mcap").values()
+    assert [(m.ns, m.text) for m in array.markers] == [
+        ("ellipsoid_95_percent", ""),
+        ("covariance_unknown", ""),
+        ("identity", "7"),
+        ("identity", "1099511627776"),
+    ]
+    assert [(m.pose.position.z, m.scale.z) for m in array.markers[2:]] == [(3.5, 0.5), (6.5, 0.5)]
+    assert {(m.header.frame_id, m.action, m.lifetime.sec) for m in array.markers} == {("map", 0, 0)}
+
+
+def test_a_drawn_ellipsoid_lies_as_its_covariance_does(
+    tmp_path: Path, decoded: Callable[[Path], dict[str, list[Any]]]
+) -> None:
+    """A stick of 1 m standard deviation along (1, 1, 0), thin across; by hand, its longest axis lies there."""
+    along, across = np.array([1.0, 1, 0]) / np.sqrt(2), np.array([1.0, -1, 0]) / np.sqrt(2)
+    covariance = np.outer(along, along) + 0.04 * np.outer(across, across) + 0.01 * np.diag([0, 0, 1.0])
+    landmarks = LandmarkMap(np.array([1]), np.zeros((1, 3)), covariance[None])
+    write_recording(tmp_path / "a.mcap", [landmark_markers("/landmarks", landmarks, 1, GREY, 0.5)], {})
+    ((array,),) = decoded(tmp_path / "a.mcap").values()
+    marker = array.markers[0]
+    diameters = np.array([marker.scale.x, marker.scale.y, marker.scale.z])
+    q = marker.pose.orientation
+    axes = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+    longest = axes[:, np.argmax(diameters)]
+    np.testing.assert_allclose(np.abs(longest @ along), 1)
+    np.testing.assert_allclose(np.sort(diameters), 2 * 2.7954834829151074 * np.array([0.1, 0.2, 1.0]))

@@ -1,14 +1,21 @@
 from __future__ import annotations
 
+import os
+import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from evo.tools import file_interface
+from hypothesis import given
+from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
+from scipy.spatial.transform import Rotation
 
-from sonar_graph.logs.result_log import write_result
+from sonar_graph.logs.result_log import source_names, write_result
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import LandmarkMap, Trajectory
 
@@ -122,3 +129,101 @@ def test_paths_stay_small_on_long_runs(make_sequence: Any, tmp_path: Path, decod
     long = straight(0, 20_000)
     write_result(tmp_path / "r.mcap", sequence, {"isam2": (long, long.rows(slice(0, 1)), NO_LANDMARKS)})
     assert sum(len(m.poses) for m in decoded(tmp_path / "r.mcap")["/isam2/path"]) < 12_000
+
+
+# --- to the bit, by mcap-ros2-support -------------------------------------------------------------------------------
+
+
+def turning(seed: int, n: int = 60, *, upright: bool = False) -> Trajectory:
+    """Poses with every number different, at odd instants; upright: the body's axes are the world's."""
+    rng = np.random.default_rng(seed)
+    stamps_ns = T0_NS + np.cumsum(rng.integers(1, 10**9, n))
+    root = rng.normal(size=(n, 6, 6))
+    quaternions = np.tile([0, 0, 0, 1.0], (n, 1)) if upright else Rotation.random(n, rng).as_quat()
+    return Trajectory(stamps_ns, rng.normal(size=(n, 3)), quaternions, root @ root.transpose(0, 2, 1))
+
+
+def numbers(messages: list[Any]) -> dict[str, np.ndarray]:
+    poses = [m.pose.pose for m in messages]
+    return {
+        "stamps_ns": np.array([m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in messages]),
+        "positions": np.array([(p.position.x, p.position.y, p.position.z) for p in poses]),
+        "quaternions_xyzw": np.array([(q.x, q.y, q.z, q.w) for q in (p.orientation for p in poses)]),
+        "covariances": np.array([m.pose.covariance for m in messages]).reshape(-1, 6, 6),
+    }
+
+
+def written(folder: Path, sequence: Sequence, decoded: Any, **estimates: Any) -> dict[str, list[Any]]:
+    write_result(folder / "r.mcap", sequence, estimates)
+    return decoded(folder / "r.mcap")
+
+
+def test_poses_survive_to_the_bit(make_sequence: Any, tmp_path: Path, decoded: Any) -> None:
+    sequence, causal, smoothed = make_sequence(), turning(1), turning(2)
+    messages = written(tmp_path, sequence, decoded, a=(causal, smoothed, NO_LANDMARKS))
+    topics = {"/a/odometry": causal, "/a/pose": causal, "/a/smoothed": smoothed}
+    for topic, expected in (topics | {"/ground_truth/odometry": sequence.truth}).items():
+        found = numbers(messages[topic])
+        for name in ("stamps_ns", "positions", "quaternions_xyzw"):
+            np.testing.assert_array_equal(found[name], getattr(expected, name), err_msg=f"{topic} {name}")
+
+
+def test_covariances_of_an_upright_body_are_reordered_to_the_bit(
+    make_sequence: Any, tmp_path: Path, decoded: Any
+) -> None:
+    causal, smoothed = turning(1, upright=True), turning(2, upright=True)
+    messages = written(tmp_path, make_sequence(), decoded, a=(causal, smoothed, NO_LANDMARKS))
+    order = [3, 4, 5, 0, 1, 2]  # ours has rotation first, ROS translation
+    for topic, expected in {"/a/odometry": causal, "/a/pose": causal, "/a/smoothed": smoothed}.items():
+        np.testing.assert_array_equal(
+            numbers(messages[topic])["covariances"], expected.covariances[:, order][:, :, order]
+        )
+
+
+def test_a_covariance_is_that_of_sampled_poses_about_the_axes_of_the_map(
+    make_sequence: Any, tmp_path: Path, decoded: Any
+) -> None:
+    causal = turning(3, n=2)
+    messages = written(tmp_path, make_sequence(), decoded, a=(causal, EMPTY, NO_LANDMARKS))
+    world_R_body = causal.rotations()[0]
+    samples = np.random.default_rng(4).multivariate_normal(np.zeros(6), causal.covariances[0] * 1e-8, 40_000)
+    moved = samples[:, 3:] @ world_R_body.as_matrix().T
+    turned = (world_R_body * Rotation.from_rotvec(samples[:, :3]) * world_R_body.inv()).as_rotvec()
+    sampled = np.cov(np.hstack([moved, turned]).T) * 1e8
+    found = numbers(messages["/a/pose"])["covariances"][0]
+    np.testing.assert_allclose(found, sampled, atol=0.04 * np.abs(sampled).max())
+
+
+# --- names ----------------------------------------------------------------------------------------------------------
+
+
+@given(st.lists(st.text(max_size=6), max_size=6))
+def test_source_names_are_ros_names_and_each_its_own(estimators: list[str]) -> None:
+    names = source_names(estimators)
+    assert len(names) == len(set(names)) == len(estimators)
+    assert not {"ground_truth", "tf", "tf_static"} & set(names)
+    assert all(re.fullmatch(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*", name) for name in names)
+
+
+def test_source_names_stay_close_to_the_estimators() -> None:
+    assert source_names(["ekf-slam", "ekf_slam", "isam2", "2d", "ground-truth"]) == [
+        "ekf_slam",
+        "ekf_slam_2",
+        "isam2",
+        "estimator_2d",
+        "ground_truth_2",
+    ]
+
+
+# --- other programs -------------------------------------------------------------------------------------------------
+
+
+def test_the_command_of_evo_reads_every_trajectory(result: Path, tmp_path: Path) -> None:
+    kinds = ("odometry", "pose", "smoothed")
+    topics = [f"/{name}/{kind}" for name in ("ekf_slam", "isam2") for kind in kinds]
+    command = [Path(sys.executable).with_name("evo_traj"), "mcap", result.name, *topics]
+    home = {**os.environ, "HOME": str(tmp_path)}
+    done = subprocess.run(command, cwd=result.parent, capture_output=True, text=True, env=home, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert re.findall(r"name:\s+(\S+)", done.stdout) == topics
+    assert re.findall(r"infos:\s+(\d+) poses, ([\d.]+)m", done.stdout) == [("100", "99.000")] * len(topics)

@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+
+from sonar_graph.evaluation.comparison import compare
+from sonar_graph.evaluation.storage import write_comparison
+from sonar_graph.evaluation.viewer_files import write_viewer_files
+from sonar_graph.measurements import Measurements
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import Estimate
+
+
+@pytest.fixture
+def folder(
+    install: Callable[..., None], make_sequence: Callable[..., Sequence], offset_estimator: Any, tmp_path: Path
+) -> Path:
+    class Broken(offset_estimator):
+        def process(self, _measurements: Measurements) -> Estimate | None:
+            raise RuntimeError("diverged")
+
+    install(offset=offset_estimator, broken=Broken)
+    sequence = make_sequence()
+    comparison = compare(sequence, ["offset", "broken"], {"offset": {"offset_m": 0.4}})
+    write_comparison(comparison, tmp_path)
+    write_viewer_files(comparison, sequence, tmp_path)
+    return tmp_path
+
+
+def test_the_result_carries_the_json_files_beside_it(folder: Path) -> None:
+    with (folder / "result.mcap").open("rb") as stream:
+        attached = {a.name: a.data for a in make_reader(stream, validate_crcs=True).iter_attachments()}
+    assert set(attached) == {"comparison.json", "runs/offset/result.json", "runs/broken/result.json"}
+    for name, content in attached.items():
+        assert content == (folder / name).read_bytes()
+
+
+def test_the_record_says_settings_versions_and_what_the_topics_are_of(folder: Path) -> None:
+    with (folder / "result.mcap").open("rb") as stream:
+        record = {m.name: m.metadata for m in make_reader(stream).iter_metadata()}["sonar_graph_result"]
+    environment = json.loads((folder / "comparison.json").read_text("utf-8"))["environment"]
+    assert environment.items() <= record.items()
+    assert {"gtsam", "numpy", "sonar_graph", "date", "command"} <= record.keys()
+    assert json.loads(record["settings of offset"])["offset_m"] == 0.4
+    assert record["estimators"] == "offset"
+
+
+def test_layouts_name_what_ran_and_not_what_failed(folder: Path) -> None:
+    layout = json.loads((folder / "result.foxglove.json").read_text("utf-8"))
+    names = {topic.split("/")[1] for topic in layout["configById"]["3D!result"]["topics"]}
+    assert names == {"offset", "ground_truth"}
+    assert "/offset/path" in (folder / "result.rviz").read_text("utf-8")
