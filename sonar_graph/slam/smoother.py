@@ -162,7 +162,7 @@ class Smoother:
         self.values.update(self._window.calculateEstimate())
 
     def _solve(self) -> gtsam.Values:
-        """Solve the history; again while landmarks are stuck behind the sonar and a new start of theirs lowers the error."""
+        """Solve the history; again while a landmark is stuck behind the sonar and its new start lowers the error."""
         values = solve(self.graph, self.values)
         for _ in range(MAX_PLACEMENTS):
             stuck = self.sightlines.turned_away(values)
