@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,6 +150,38 @@ class LandmarkDetections(Block):
         best = np.argmax(self.id_probability, axis=1)
         row = np.arange(len(self))
         return self.candidate_ids[row, best], self.id_probability[row, best]
+
+
+@dataclass(frozen=True, eq=False)
+class SonarFrames:
+    """Polar images of an imaging sonar, as recorded; frames of one block share their beams and range bins.
+
+    Raises
+    ------
+    MeasurementError
+        When there is no frame, or the shapes do not belong together.
+    """
+
+    stamps_ns: Ints
+    """When each ping was sent, shape (n,), not decreasing."""
+    intensity: NDArray[Any]
+    """Shape (n, beams, bins), in the sonar's own type and scale."""
+    ranges_m: Floats
+    """Middle of each range bin, shape (bins,)."""
+    azimuths_rad: Floats
+    """Of each beam, positive to the left, in the order of the image, shape (beams,)."""
+
+    def __post_init__(self) -> None:
+        expected = (len(self.stamps_ns), len(self.azimuths_rad), len(self.ranges_m))
+        if self.intensity.shape != expected or 0 in expected:
+            raise MeasurementError(
+                f"SonarFrames.intensity: shape {self.intensity.shape}; stamps, beams and bins are {expected}"
+            )
+        if np.any(np.diff(self.stamps_ns) < 0):
+            raise MeasurementError("SonarFrames: stamps run backwards; sort the frames by stamp")
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
 
 
 @dataclass(frozen=True)

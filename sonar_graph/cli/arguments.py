@@ -35,6 +35,6 @@ TopicChoices = Annotated[
         "--topic",
         metavar="ROLE=TOPIC",
         help="Topic for a role, where inspect says that several fit or none; may be repeated. "
-        "Roles: imu, dvl, depth, detections, truth, true_landmarks.",
+        "Roles: imu, dvl, depth, detections, truth, true_landmarks, sonar.",
     ),
 ]

@@ -13,7 +13,7 @@ from sonar_graph.logs.container import STAMP_BYTES, Keep, Recording, Topic, scan
 from sonar_graph.logs.message_definitions import definition, short_name
 from sonar_graph.logs.mountings import static_frames
 from sonar_graph.logs.reading import METADATA, read_calibration, read_notes
-from sonar_graph.logs.roles import ROLES, TF, choose_topic
+from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, TF, choose_topic
 from sonar_graph.logs.schema import Struct, parse_definition
 from sonar_graph.logs.table import header_stamps_ns
 from sonar_graph.measurements import Ints
@@ -71,13 +71,13 @@ class LogSummary:
     def obstacles(self) -> tuple[str, ...]:
         """What keeps estimators from running on the log as it is: needed parts that no topic plays, or several could.
 
-        Such as ``no IMU (sensor_msgs/msg/Imu)``.
+        Such as ``no IMU``.
         """
         needed = [role for role in self.roles if ROLES[role.role].is_required and role.topic is None]
         return tuple(
             f"{len(role.candidates)} topics for {role.role} (choose: --topic {role.role}={role.candidates[0]})"
             if role.candidates
-            else f"no {role.role.upper()} ({ROLES[role.role].describe()})"
+            else f"no {role.role.upper()}"
             for role in needed
         )
 
@@ -102,7 +102,7 @@ def inspect_log(path: Path) -> LogSummary:
     """
     recording = scan(Path(path), lambda kind: Keep.ALL if short_name(kind) == short_name(TF) else Keep.STAMP)
     damage = [*recording.corrupt, *([recording.ending] if recording.ending else [])]
-    choices = [choose_topic(role, recording) for role in ROLES.values()]
+    choices = [choose_topic(ROLES[name], recording) for name in SEQUENCE_ROLES]
     return LogSummary(
         path=recording.path,
         name=recording.metadata.get(METADATA, {}).get("name"),

@@ -9,28 +9,30 @@ from typing import TypeVar
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
+from sonar_graph.logs.adapters.adapter import Adapter
+from sonar_graph.logs.adapters.config import LogConfig
+from sonar_graph.logs.adapters.detection_array import DetectionArrayAdapter
+from sonar_graph.logs.adapters.doppler import DvlAdapter
+from sonar_graph.logs.adapters.inertial import ImuAdapter
+from sonar_graph.logs.adapters.reference import TruthAdapter
+from sonar_graph.logs.adapters.vertical import DepthAdapter
 from sonar_graph.logs.container import Keep, Recording, scan
-from sonar_graph.logs.decoding import (
-    WATER_DENSITY_KG_M3,
-    Dropped,
-    read_depth,
-    read_detections,
-    read_dvl,
-    read_imu,
-    read_landmark_map,
-    read_truth,
-)
+from sonar_graph.logs.decoding import read_detections, read_landmark_map
 from sonar_graph.logs.message_definitions import short_name
 from sonar_graph.logs.mountings import mounting_of, static_frames, with_mountings
-from sonar_graph.logs.roles import PRESSURE, READ_TYPES, Choice, choose_topics
-from sonar_graph.logs.table import Table
-from sonar_graph.measurements import Depth
+from sonar_graph.logs.roles import Choice, choose_topics, wanted_types
+from sonar_graph.logs.table import Dropped
+from sonar_graph.measurements import Depth, LandmarkDetections
 from sonar_graph.sequence import Sequence
 
 METADATA = "sonar_graph"
 """The metadata record that carries name, calibration and notes."""
 
+TABLES = frozenset({"imu", "dvl", "depth", "truth"})
+"""Roles whose messages are read as one table."""
+
 T = TypeVar("T")
+A = TypeVar("A", bound=Adapter)
 
 
 def read_sequence(
@@ -39,6 +41,7 @@ def read_sequence(
     calibration: Calibration | None = None,
     name: str | None = None,
     topics: Mapping[str, str] | None = None,
+    config: LogConfig | None = None,
 ) -> Sequence:
     """Read a log of ROS 2 messages.
 
@@ -55,7 +58,9 @@ def read_sequence(
         Instead of the one in the file; without either, the file's name.
     topics
         Topics by role (``imu``, ``dvl``, ``depth``, ``detections``, ``truth``, ``true_landmarks``), where several
-        fit or none is found by type and name.
+        fit or none is found by type and name; before those of `config`.
+    config
+        What the topics of a foreign log are; `read_log_config` reads one from a TOML file.
 
     Raises
     ------
@@ -67,9 +72,11 @@ def read_sequence(
         When the calibration in the file is not one.
     """
     path = Path(path)
-    recording = scan(path, lambda kind: Keep.ALL if short_name(kind) in READ_TYPES else Keep.STAMP)
+    config = config or LogConfig()
+    types = wanted_types(config)
+    recording = scan(path, lambda kind: Keep.ALL if short_name(kind) in types else Keep.STAMP)
     recording.require_sound()
-    return _Reader(recording, choose_topics(recording, topics or {})).sequence(calibration, name)
+    return _Reader(recording, choose_topics(recording, topics or {}, config)).sequence(calibration, name)
 
 
 class _Reader:
@@ -79,8 +86,9 @@ class _Reader:
         self._recording = recording
         self._record = recording.metadata.get(METADATA, {})
         self._topics = {role: recording.topics[c.topic] for role, c in choices.items() if c.topic is not None}
+        self._adapters = {role: c.adapter for role, c in choices.items() if c.adapter is not None}
         self._tables = {
-            role: Table(self._topics[role]) for role in ("imu", "dvl", "depth", "truth") if role in self._topics
+            role: self._adapters[role].table(topic) for role, topic in self._topics.items() if role in TABLES
         }
         self._dropped: dict[str, Dropped] = {}
         self._notes = read_notes(recording)
@@ -91,18 +99,17 @@ class _Reader:
             self._notes["log.ending"] = recording.ending
 
     def sequence(self, calibration: Calibration | None, name: str | None) -> Sequence:
-        tables = self._tables
         calibration = self._calibration(calibration)
         sequence = Sequence(
             name=name or self._record.get("name") or self._recording.path.stem,
             calibration=calibration,
-            imu=self._needed("imu", self._kept("imu", read_imu(tables["imu"]))),
-            dvl=self._needed("dvl", self._kept("dvl", read_dvl(tables["dvl"]))),
+            imu=self._needed("imu", self._kept("imu", self._adapter("imu", ImuAdapter).read(self._tables["imu"]))),
+            dvl=self._needed("dvl", self._kept("dvl", self._adapter("dvl", DvlAdapter).read(self._tables["dvl"]))),
             depth=self._depth(calibration),
-            detections=self._kept("detections", read_detections(self._topics["detections"]))
-            if "detections" in self._topics
+            detections=self._detections(),
+            truth=self._kept("truth", self._adapter("truth", TruthAdapter).read(self._tables["truth"]))
+            if "truth" in self._tables
             else None,
-            truth=self._kept("truth", read_truth(tables["truth"])) if "truth" in tables else None,
             true_landmarks=read_landmark_map(self._topics["true_landmarks"])
             if "true_landmarks" in self._topics
             else None,
@@ -110,7 +117,17 @@ class _Reader:
         )
         if self._dropped:
             self._notes["log.dropped"] = "; ".join(f"{role}: {_list(d)}" for role, d in self._dropped.items())
+        warnings = [
+            f"{role}: {text}" for role, table in self._tables.items() for text in self._adapters[role].warnings(table)
+        ]
+        if warnings:
+            self._notes["log.warnings"] = "; ".join(warnings)
         return sequence
+
+    def _adapter(self, role: str, kind: type[A]) -> A:
+        adapter = self._adapters[role]
+        assert isinstance(adapter, kind)  # each role has adapters of one kind
+        return adapter
 
     def _kept(self, role: str, outcome: tuple[T, Dropped]) -> T:
         if outcome[1]:
@@ -124,15 +141,21 @@ class _Reader:
             raise LogError(f"{topic.file}: topic {topic.name}: none of its {len(topic)} messages can be used: {faults}")
         return block
 
+    def _detections(self) -> LandmarkDetections | None:
+        if "detections" not in self._topics:
+            return None
+        adapter, topic = self._adapters["detections"], self._topics["detections"]
+        outcome = adapter.read(topic) if isinstance(adapter, DetectionArrayAdapter) else read_detections(topic)
+        return self._kept("detections", outcome)
+
     def _depth(self, calibration: Calibration) -> Depth | None:
         if "depth" not in self._tables:
             return None
-        if short_name(self._topics["depth"].type_name) == short_name(PRESSURE):
-            g = calibration.gravity_m_s2
-            self._notes["log.depth"] = (
-                f"z = -(p - 101325 Pa) / ({WATER_DENSITY_KG_M3:g} kg/m3 x {g:g} m/s2), fresh water assumed"
-            )
-        return self._kept("depth", read_depth(self._tables["depth"], calibration))
+        adapter = self._adapter("depth", DepthAdapter)
+        assumption = adapter.assumption(calibration.gravity_m_s2)
+        if assumption:
+            self._notes["log.depth"] = assumption
+        return self._kept("depth", adapter.read(self._tables["depth"], calibration.gravity_m_s2))
 
     def _calibration(self, given: Calibration | None) -> Calibration:
         recorded = read_calibration(self._recording)
@@ -146,11 +169,13 @@ class _Reader:
 
     def _default_calibration(self) -> Calibration:
         frames = static_frames(self._recording)
-        sensors = {role: self._tables[role].frame_id() for role in ("imu", "dvl")}
-        if "depth" in self._topics and short_name(self._topics["depth"].type_name) == short_name(PRESSURE):
-            sensors["depth"] = self._tables["depth"].frame_id()
+        sensors: dict[str, str] = {}
+        for role in ("imu", "dvl"):
+            sensors[role] = self._adapters[role].frame_in(self._tables[role].groups)
+        if "depth" in self._tables and (frame := self._adapters["depth"].frame_in(self._tables["depth"].groups)):
+            sensors["depth"] = frame
         if "detections" in self._topics:
-            sensors["sonar"] = self._topics["detections"].messages()[0].first_string("header.frame_id")
+            sensors["sonar"] = self._adapters["detections"].frame_in(self._topics["detections"].messages())
         found = {name: mounting_of(frame, frames) for name, frame in sensors.items()}
         known = {name: mounting for name, mounting in found.items() if mounting is not None}
         missing = [f"{name} ({sensors[name]!r})" for name in sensors if name not in known]

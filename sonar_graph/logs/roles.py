@@ -1,25 +1,27 @@
-"""Which topic of a log plays which part: found by type, and by name where a type alone says too little."""
+"""Which topic of a log plays which part: as the user said, or found by type, and by name where that says too little."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from sonar_graph.errors import LogError, MissingTopicError
+from sonar_graph.logs.adapters.adapter import Adapter
+from sonar_graph.logs.adapters.config import LogConfig
+from sonar_graph.logs.adapters.shipped import SHIPPED, Shipped
 from sonar_graph.logs.container import Recording, Topic
 from sonar_graph.logs.message_definitions import short_name
 
 IMU = "sensor_msgs/msg/Imu"
 DVL = "marine_acoustic_msgs/msg/Dvl"
-PRESSURE = "sensor_msgs/msg/FluidPressure"
-POSE = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
 DETECTIONS = "sonar_graph_msgs/msg/LandmarkDetections"
 LANDMARK_MAP = "sonar_graph_msgs/msg/LandmarkMap"
 TF = "tf2_msgs/msg/TFMessage"
 
-_TRUTH_WORDS = ("ground_truth", "groundtruth", "truth")
+_IMAGES = "sonar"
+_DEFAULTS = LogConfig()
 
 
 @dataclass(frozen=True)
@@ -27,41 +29,26 @@ class Role:
     """A part that a topic can play."""
 
     name: str
-    types: Mapping[str, tuple[str, ...]]
-    """Message types that fit, each with the words of which a topic's name must hold one; none: any name fits."""
+    shipped: tuple[Shipped, ...]
+    """The adapters that come along for it."""
     is_required: bool = False
-
-    def fits(self, topic: Topic, *, by_name: bool = True) -> bool:
-        """Whether a topic can play this part."""
-        for type_name, words in self.types.items():
-            if short_name(type_name) == short_name(topic.type_name) and topic.is_ros2:
-                return not by_name or not words or any(word in topic.name.lower() for word in words)
-        return False
 
     def describe(self) -> str:
         """What is looked for."""
         by_words: dict[tuple[str, ...], list[str]] = {}
-        for type_name, words in self.types.items():
-            by_words.setdefault(words, []).append(type_name)
-        return " or ".join(
-            " or ".join(names) + (f" on a topic with {words[0]!r} in its name" if words else "")
+        for offer in self.shipped:
+            names = by_words.setdefault(offer.words, [])
+            if short_name(offer.adapter.type) not in names:
+                names.append(short_name(offer.adapter.type))
+        return ", or ".join(
+            ", ".join(names) + (f" on a topic with {words[0]!r} in its name" if words else "")
             for words, names in by_words.items()
         )
 
 
-ROLES = {
-    role.name: role
-    for role in (
-        Role("imu", {IMU: ()}, is_required=True),
-        Role("dvl", {DVL: ()}, is_required=True),
-        Role("depth", {PRESSURE: (), POSE_WITH_COVARIANCE: ("depth",), POSE: ("depth",)}),
-        Role("detections", {DETECTIONS: ()}),
-        Role("truth", {ODOMETRY: _TRUTH_WORDS}),
-        Role("true_landmarks", {LANDMARK_MAP: _TRUTH_WORDS}),
-    )
-}
-READ_TYPES = frozenset(short_name(name) for role in ROLES.values() for name in role.types) | {short_name(TF)}
-"""Types whose messages are needed, without the ``msg``."""
+ROLES = {name: Role(name, shipped, is_required=name in ("imu", "dvl")) for name, shipped in SHIPPED.items()}
+SEQUENCE_ROLES = tuple(name for name in ROLES if name != _IMAGES)
+"""Those that make a `Sequence`; sonar images are read by themselves."""
 
 
 @dataclass(frozen=True)
@@ -71,37 +58,111 @@ class Choice:
     role: Role
     topic: str | None
     reason: str
+    adapter: Adapter | None = None
+    """How its messages are read."""
     candidates: tuple[str, ...] = field(default=())
     """The topics that fit, where they are several."""
 
 
-def choose_topic(role: Role, recording: Recording, wanted: str | None = None) -> Choice:
-    """The topic for a part; a reason instead of an error where there is none.
+def wanted_types(config: LogConfig = _DEFAULTS, roles: Iterable[str] = SEQUENCE_ROLES) -> frozenset[str]:
+    """Types whose messages may be needed, without the ``msg``."""
+    shipped = {short_name(offer.adapter.type) for name in roles for offer in ROLES[name].shipped}
+    return config.types() | shipped | {short_name(TF)}
+
+
+def choose_topic(role: Role, recording: Recording, config: LogConfig = _DEFAULTS, wanted: str | None = None) -> Choice:
+    """The topic for a part, and how to read it; a reason instead of an error where there is none.
 
     Parameters
     ----------
     role, recording
         The part and the log.
+    config
+        What the user said about topics; its topic goes before a search by type.
     wanted
-        The topic that the user chose, which then only needs the right type.
+        The topic that the user chose, before that of the configuration.
     """
-    topics = recording.topics
-    if wanted is not None:
-        if wanted in topics and role.fits(topics[wanted], by_name=False):
-            return Choice(role, wanted, "chosen by name")
-        found = f"is a {topics[wanted].type_name}" if wanted in topics else "is not in the log"
-        return Choice(role, None, f"{wanted} was chosen but {found}")
-    fitting = tuple(name for name, topic in topics.items() if role.fits(topic))
-    if len(fitting) == 1:
-        return Choice(role, fitting[0], f"the only {topics[fitting[0]].type_name} that fits")
-    if fitting:
-        return Choice(role, None, f"{len(fitting)} topics fit: {', '.join(fitting)}", fitting)
-    others = [name for name, topic in topics.items() if role.fits(topic, by_name=False)]
-    passed_over = f"; {', '.join(others)} not used because of its name" if others else ""
+    table = config.table(role.name)
+    if table.get("use") is False and wanted is None:
+        return Choice(role, None, f"switched off in {config.source}")
+    named = wanted or table.get("topic") or None
+    if named is not None:
+        return _named(role, recording, config, named, "by name" if wanted else f"in {config.source}")
+    if "type" in table:
+        fitting = [t for t in recording.topics.values() if short_name(t.type_name) == short_name(table["type"])]
+        return _only(role, recording, config, fitting) or Choice(
+            role, None, f"no {table['type']}, which {config.source} asks for"
+        )
+    return _by_type(role, recording, config)
+
+
+def _named(role: Role, recording: Recording, config: LogConfig, name: str, how: str) -> Choice:
+    topic = recording.topics.get(name)
+    if topic is None:
+        return Choice(role, None, f"{name} was chosen but is not in the log")
+    adapter = adapter_for(role, topic, config)
+    if isinstance(adapter, str):
+        return Choice(role, None, f"{name} was chosen but {adapter}")
+    return Choice(role, name, f"chosen {how}", adapter)
+
+
+def _by_type(role: Role, recording: Recording, config: LogConfig) -> Choice:
+    for general in (False, True):
+        fitting = [t for t in recording.topics.values() if _fits(role, t, general=general)]
+        if (choice := _only(role, recording, config, fitting)) is not None:
+            return choice
+    others = [t.name for t in recording.topics.values() if not isinstance(adapter_for(role, t, config), str)]
+    passed_over = f"; {', '.join(others)} only if chosen: --topic {role.name}={others[0]}" if others else ""
     return Choice(role, None, f"no {role.describe()}{passed_over}")
 
 
-def choose_topics(recording: Recording, wanted: Mapping[str, str]) -> dict[str, Choice]:
+def _fits(role: Role, topic: Topic, *, general: bool) -> bool:
+    return topic.is_ros2 and any(
+        short_name(offer.adapter.type) == short_name(topic.type_name)
+        and (not offer.words or any(word in topic.name.lower() for word in offer.words))
+        for offer in role.shipped
+        if offer.is_general == general
+    )
+
+
+def _only(role: Role, recording: Recording, config: LogConfig, fitting: list[Topic]) -> Choice | None:
+    """The only one of the topics that fit; None where none does."""
+    adapters = {topic.name: adapter_for(role, topic, config) for topic in fitting}
+    usable = {name: adapter for name, adapter in adapters.items() if not isinstance(adapter, str)}
+    if len(usable) > 1:
+        return Choice(role, None, f"{len(usable)} topics fit: {', '.join(usable)}", candidates=tuple(usable))
+    for name, adapter in usable.items():
+        return Choice(role, name, f"the only {recording.topics[name].type_name} that fits", adapter)
+    reasons = [f"{name} {reason}" for name, reason in adapters.items()]
+    return Choice(role, None, "; ".join(reasons)) if reasons else None
+
+
+def adapter_for(role: Role, topic: Topic, config: LogConfig) -> Adapter | str:
+    """How a topic would be read in a part, or why it cannot be."""
+    if not topic.is_ros2:
+        return f"is {topic.encoding or 'of no encoding'} with a {topic.schema_encoding or 'missing'} definition"
+    table = config.table(role.name)
+    if "type" in table and short_name(table["type"]) != short_name(topic.type_name):
+        return f"is a {topic.type_name}, and {config.source} asks for a {table['type']}"
+    adapters = config.adapters(role.name, topic.type_name)
+    if not adapters:
+        return f"is a {topic.type_name}, for which no adapter comes along: name type and fields in --log-config"
+    try:
+        missing = [adapter.missing_in(topic.definition()) for adapter in adapters]
+    except LogError as error:
+        return f"has a definition that cannot be read: {error}"
+    for adapter, paths in zip(adapters, missing, strict=True):
+        if not paths:
+            return adapter
+    return f"has no field {', '.join(missing[-1])}"
+
+
+def choose_topics(
+    recording: Recording,
+    wanted: Mapping[str, str],
+    config: LogConfig = _DEFAULTS,
+    roles: Iterable[str] = SEQUENCE_ROLES,
+) -> dict[str, Choice]:
     """The choice for each part.
 
     Raises
@@ -114,18 +175,25 @@ def choose_topics(recording: Recording, wanted: Mapping[str, str]) -> dict[str, 
     unknown = wanted.keys() - ROLES.keys()
     if unknown:
         raise LogError(f"there is no role {', '.join(sorted(unknown))}; topics are chosen for {', '.join(ROLES)}")
-    choices = {name: choose_topic(role, recording, wanted.get(name)) for name, role in ROLES.items()}
+    choices = {name: choose_topic(ROLES[name], recording, config, wanted.get(name)) for name in roles}
     for choice in choices.values():
-        _require(choice, recording, wanted)
+        _require(choice, recording, wanted, config)
     return choices
 
 
-def _require(choice: Choice, recording: Recording, wanted: Mapping[str, str]) -> None:
+def advice(choice: Choice) -> str:
+    """How to choose one of several topics, in the words of the command line, of Python, and of a configuration."""
+    role, topic = choice.role.name, choice.candidates[0]
+    return f"--topic {role}={topic} (topics={{{role!r}: {topic!r}}} in Python, [{role}] topic in a log configuration)"
+
+
+def _require(choice: Choice, recording: Recording, wanted: Mapping[str, str], config: LogConfig) -> None:
     role, path = choice.role, recording.path
     if choice.candidates:
-        example = f"topics={{{role.name!r}: {choice.candidates[0]!r}}}"
-        raise LogError(f"{path}: for {role.name}, {choice.reason}; choose one: {example}")
-    if choice.topic is None and (role.is_required or role.name in wanted):
+        raise LogError(f"{path}: for {role.name}, {choice.reason}; choose one: {advice(choice)}")
+    is_asked_for = role.name in wanted or {"topic", "type"} & config.table(role.name).keys()
+    is_off = config.table(role.name).get("use") is False and role.name not in wanted
+    if choice.topic is None and (role.is_required or (is_asked_for and not is_off)):
         raise MissingTopicError(
             f"{path}: nothing for {role.name}: {choice.reason}; the log has {topic_list(recording)}"
         )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,11 @@ from sonar_graph.logs.container import Topic
 from sonar_graph.measurements import Ints
 
 NS_PER_S = 1_000_000_000
+Dropped = dict[str, int]
+"""How many rows were left out, by reason."""
+NOT_FINITE = "with values that are not finite"
+LOG_TIME = "log"
+"""In the place of a stamp's field: the time of recording."""
 
 
 def header_stamps_ns(group: Messages, log_times_ns: Ints, prefix: str = "header.stamp.") -> Ints:
@@ -35,45 +40,104 @@ def header_stamps_ns(group: Messages, log_times_ns: Ints, prefix: str = "header.
 class Table:
     """All messages of a topic whose fields of interest have the same size in each.
 
+    Parameters
+    ----------
+    topic
+        With its payloads.
+    stamp
+        The field with the time of validity: a Time, or a number; ``log`` takes the time of recording.
+    stamp_unit_s
+        Of the stamp, where it is a number.
+
     Raises
     ------
     LogError
         Naming file, topic and field where the messages are not what their definition says.
     """
 
-    def __init__(self, topic: Topic) -> None:
+    def __init__(self, topic: Topic, stamp: str = "header.stamp", stamp_unit_s: float = 1.0) -> None:
         self.topic = topic
         self.groups = topic.messages()
-        self.stamps_ns = np.empty(len(topic), np.int64)
-        self._require("header.stamp.sec")
         log_times_ns = topic.log_times_ns
-        for group in self.groups:
-            self.stamps_ns[group.rows] = header_stamps_ns(group, log_times_ns)
+        if stamp == LOG_TIME:
+            self.stamps_ns = log_times_ns
+        elif self.has(stamp):
+            self.stamps_ns = _nanoseconds(self.column(stamp), stamp_unit_s)
+        else:
+            self._require(f"{stamp}.sec")
+            self.stamps_ns = np.empty(len(topic), np.int64)
+            for group in self.groups:
+                self.stamps_ns[group.rows] = header_stamps_ns(group, log_times_ns, f"{stamp}.")
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    def has(self, path: str) -> bool:
+        """Whether every message has a field with values."""
+        return all(field_of(path)[0] in group.layout.columns for group in self.groups)
+
     def column(self, path: str) -> NDArray[Any]:
-        """A field over all rows, shape (n,) or (n, m)."""
+        """A field over all rows, shape (n,) or (n, m); ``a.b[2]`` is one element of an array, shape (n,)."""
         self._require(path)
-        parts = [group[path] for group in self.groups]
-        values = np.empty((len(self), *parts[0].shape[1:]), parts[0].dtype.newbyteorder("="))
+        name, index = field_of(path)
+        parts = [group[name] for group in self.groups]
+        if len({part.shape[1:] for part in parts}) > 1:
+            self.refuse(name, "has more elements in some messages than in others")
+        values = np.empty((len(self.topic), *parts[0].shape[1:]), parts[0].dtype.newbyteorder("="))
         for group, part in zip(self.groups, parts, strict=True):
             values[group.rows] = part
-        return values
+        if index is None:
+            return values
+        if values.ndim == 1 or index >= values.shape[1]:
+            self.refuse(path, f"has {values.shape[1] if values.ndim > 1 else 'no'} elements")
+        return values[:, index]
 
     def columns(self, prefix: str, names: str) -> NDArray[Any]:
         """Fields side by side, shape (n, m): ``columns("velocity", "xyz")``."""
-        return np.column_stack([self.column(f"{prefix}.{name}") for name in names])
+        return self.beside([f"{prefix}.{name}" for name in names])
 
-    def frame_id(self) -> str:
-        """The frame of the first message."""
-        return self.groups[0].first_string("header.frame_id")
+    def beside(self, paths: Sequence[str]) -> NDArray[Any]:
+        """Fields of one number a message side by side, shape (n, m)."""
+        found = [self.column(path) for path in paths]
+        for path, column in zip(paths, found, strict=True):
+            if column.ndim > 1:
+                self.refuse(path, f"is an array of {column.shape[1]}; name one element, such as {path}[0]")
+        return np.column_stack(found)
+
+    def first_string(self, path: str) -> str:
+        """A string field of the first message; empty where there is no such field."""
+        return self.groups[0].first_string(path)
+
+    def refuse(self, path: str, fault: str) -> NoReturn:
+        """Raise a `LogError` about a field."""
+        topic = self.topic
+        raise LogError(f"{topic.file}: topic {topic.name}: field {path} of {topic.type_name} {fault}")
 
     def _require(self, path: str) -> None:
-        if any(path not in group.layout.columns for group in self.groups):
+        if not self.has(path):
             topic = self.topic
             raise LogError(f"{topic.file}: topic {topic.name}: its {topic.type_name} has no field {path}")
+
+
+def field_of(path: str) -> tuple[str, int | None]:
+    """Field and index of a path: ``("a.b", 2)`` for ``a.b[2]``."""
+    name, bracket, rest = path.partition("[")
+    return name, int(rest.rstrip("]")) if bracket else None
+
+
+def _nanoseconds(values: NDArray[Any], unit_s: float) -> Ints:
+    """Exact where the unit is a whole number of nanoseconds; what is not finite counts as 0."""
+    unit_ns = unit_s * NS_PER_S
+    finite = np.where(np.isfinite(values), values, 0)
+    if unit_ns < 1 or abs(unit_ns - round(unit_ns)) > 1e-9 * unit_ns:
+        return np.rint(finite * unit_ns).astype(np.int64)
+    whole = np.floor(finite)
+    return whole.astype(np.int64) * round(unit_ns) + np.rint((finite - whole) * unit_ns).astype(np.int64)
+
+
+def not_finite(*columns: NDArray[Any]) -> NDArray[np.bool_]:
+    """Rows in which some column has a value that is not finite, shape (n,)."""
+    return ~np.all([np.isfinite(c).reshape(len(c), -1).all(axis=1) for c in columns], axis=0)
 
 
 def fit_rows(stamps_ns: Ints, faults: Mapping[str, NDArray[np.bool_]], *, unique: bool) -> tuple[Ints, dict[str, int]]:
