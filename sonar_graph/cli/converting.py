@@ -1,4 +1,4 @@
-"""``sonar-graph convert``: public data sets as MCAP logs."""
+"""``sonar-graph convert``: public data sets and ROS bags as MCAP logs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 
 from sonar_graph.cli.arguments import OutputLog
 from sonar_graph.cli.outputs import writable_log
-from sonar_graph.cli.progress import working
+from sonar_graph.cli.progress import progress_bars, working
 from sonar_graph.cli.texts import examples
 
 if TYPE_CHECKING:
@@ -19,10 +19,11 @@ if TYPE_CHECKING:
 
 datasets = typer.Typer(
     name="convert",
-    help="Convert a public data set to an MCAP log.",
+    help="Convert a public data set or a ROS bag to an MCAP log.",
     epilog=examples(
         "sonar-graph convert victoria-park -o victoria_park.mcap",
         "sonar-graph convert mrclam MRCLAM_Dataset6 --robot 3 -o mrclam_6_3.mcap",
+        "sonar-graph convert rosbag dive.bag -o dive.mcap",
     ),
 )
 
@@ -80,6 +81,27 @@ def akit(
     from sonar_graph.logs.converters.akit import read_akit
 
     _convert(lambda: read_akit(dataset, trajectory), output)
+
+
+@datasets.command(
+    epilog=examples(
+        "sonar-graph convert rosbag dive.bag -o dive.mcap", "sonar-graph convert rosbag ros2_bag_folder -o dive.mcap"
+    )
+)
+def rosbag(
+    bag: Annotated[Path, typer.Argument(metavar="BAG", exists=True, help="ROS 1 .bag, or folder of a ROS 2 bag.")],
+    output: OutputLog,
+) -> None:
+    """Any ROS 1 bag, or ROS 2 bag of the sqlite3 kind, with all its topics."""
+    from sonar_graph.logs.converters.rosbag import convert_rosbag
+
+    path = writable_log(output)
+    with progress_bars() as progress:
+        done = convert_rosbag(bag, path, lambda number, total: progress(f"converting {bag.name}", number, total))
+    typer.echo(f"{bag.name}: {done.duration_s:.1f} s, {done.messages} messages on {done.topics} topics")
+    for topic, reason in done.left_out.items():
+        typer.echo(f"left out: {topic}: {reason}")
+    typer.echo(f"Log: {path}\nWhat is in it: sonar-graph inspect {path}")
 
 
 def _convert(read: Callable[[], Sequence], output: Path) -> None:

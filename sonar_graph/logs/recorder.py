@@ -21,12 +21,12 @@ from sonar_graph.measurements import Ints
 
 _CHUNK_BYTES = 1 << 20
 _FOREVER = "{sec: 9223372036, nsec: 854775807}"
-_TRANSIENT_LOCAL = (
+TRANSIENT_LOCAL = (
     f"- {{history: 1, depth: 10, reliability: 1, durability: 1, deadline: {_FOREVER}, lifespan: {_FOREVER}, "
     f"liveliness: 1, liveliness_lease_duration: {_FOREVER}, avoid_ros_namespace_conventions: false}}"
 )
 """Keep last, reliable, transient local: the numbers of rmw's enumerations, as rosbag2 has them up to version 8."""
-_ROSBAG2 = {"serialized_metadata": ""}
+ROSBAG2_METADATA = {"serialized_metadata": ""}
 """Makes newer versions of rosbag2, which write words, read numbers in what a channel offers."""
 
 
@@ -94,7 +94,7 @@ def _write(
         for name, record in metadata.items():
             writer.add_metadata(name, dict(record))
         if any(entry.is_latched for entry in messages):
-            writer.add_metadata("rosbag2", _ROSBAG2)
+            writer.add_metadata("rosbag2", ROSBAG2_METADATA)
         end_ns = max((int(m.log_times_ns.max()) for m in messages if len(m.log_times_ns)), default=0)
         for file in attachments:
             writer.add_attachment(0, max(end_ns, 0), file.name, file.media_type, file.content)
@@ -121,6 +121,6 @@ def _register(writer: Writer, messages: list[Outgoing]) -> list[int]:
             text = definition(entry.type_name).encode()
             schemas[entry.type_name] = writer.register_schema(entry.type_name, "ros2msg", text)
         if entry.topic not in channels:
-            offers = {"offered_qos_profiles": _TRANSIENT_LOCAL} if entry.is_latched else {}
+            offers = {"offered_qos_profiles": TRANSIENT_LOCAL} if entry.is_latched else {}
             channels[entry.topic] = writer.register_channel(entry.topic, "cdr", schemas[entry.type_name], offers)
     return [channels[entry.topic] for entry in messages]
