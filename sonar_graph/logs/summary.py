@@ -1,0 +1,107 @@
+"""The summary at a file's end: what the file says about itself, believed only where its CRC fits."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from io import BytesIO
+from typing import Any, TypeVar
+
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Channel, ChunkIndex, Schema, Statistics
+
+from sonar_graph.errors import LogError
+from sonar_graph.logs.records import HEAD, MAGIC, LogFile
+
+_FOOTER = struct.Struct("<BQQQI")
+_DATA_END = struct.Struct("<BQI")
+
+T = TypeVar("T", bound=Any)
+
+
+@dataclass
+class Summary:
+    """What stands after the data section."""
+
+    data_end_at: int
+    """Where the data section ends, before its own end record."""
+    data_crc: int
+    """Of the data section; 0: none."""
+    has_crc: bool
+    """Whether a CRC covers what follows."""
+    schemas: list[Schema] = field(default_factory=list)
+    channels: list[Channel] = field(default_factory=list)
+    chunks: dict[int, ChunkIndex] = field(default_factory=dict)
+    """By offset of the chunk."""
+    statistics: Statistics | None = None
+
+
+def parse(kind: Callable[[ReadDataStream], T], content: bytes) -> T:
+    """A record read by the mcap package.
+
+    Raises
+    ------
+    LogError
+        When the content is not exactly one such record.
+    """
+    try:
+        record = kind(ReadDataStream(BytesIO(content)))
+        builder = RecordBuilder()
+        record.write(builder)
+        again = builder.end()[HEAD.size :]  # type: ignore[no-untyped-call]  # of the mcap package
+    except Exception as error:  # the package's reader raises whatever its parts raise
+        raise LogError(f"it cannot be read ({error or type(error).__name__})") from error
+    if again != content:  # the package's reader takes what is too short or too long without a word
+        raise LogError(f"its {len(content)} bytes do not make sense")
+    return record
+
+
+def read_summary(file: LogFile) -> tuple[Summary | None, str | None]:
+    """The summary if it can be believed, and what is wrong with the end of the file."""
+    tail = file.read(max(file.size - _FOOTER.size - len(MAGIC), 0), _FOOTER.size + len(MAGIC))
+    if len(tail) < _FOOTER.size + len(MAGIC) or not tail.endswith(MAGIC):
+        return None, "it does not end as an MCAP file does"
+    opcode, length, start, _, crc = _FOOTER.unpack_from(tail)
+    footer_at = file.size - len(tail)
+    end = start or footer_at
+    least = len(MAGIC) + _DATA_END.size
+    if opcode != Opcode.FOOTER or length != _FOOTER.size - HEAD.size or not least <= end <= footer_at:
+        return None, "its footer is damaged"
+    content = file.read(end, footer_at - end)
+    if crc and zlib.crc32(tail[: _FOOTER.size - 4], zlib.crc32(content)) != crc:
+        return None, "its summary is damaged: the CRC does not fit"
+    return _read(file, content, end - _DATA_END.size, has_crc=crc != 0)
+
+
+def _read(file: LogFile, content: bytes, data_end_at: int, *, has_crc: bool) -> tuple[Summary | None, str | None]:
+    opcode, length, data_crc = _DATA_END.unpack(file.read(data_end_at, _DATA_END.size))
+    is_sound = (opcode, length) == (Opcode.DATA_END, 4)
+    summary = Summary(data_end_at, data_crc if is_sound else 0, has_crc)
+    try:
+        _fill(summary, content)
+    except LogError as error:
+        return None, f"its summary is damaged: {error}"
+    return summary, None if is_sound else "the record that ends its data is damaged"
+
+
+def _fill(summary: Summary, content: bytes) -> None:
+    at = 0
+    while at + HEAD.size <= len(content):
+        opcode, length = HEAD.unpack_from(content, at)
+        at += HEAD.size
+        if length > len(content) - at:
+            raise LogError("a record in it is longer than the summary")
+        record = content[at : at + length]
+        if opcode == Opcode.SCHEMA:
+            summary.schemas.append(parse(Schema.read, record))
+        elif opcode == Opcode.CHANNEL:
+            summary.channels.append(parse(Channel.read, record))
+        elif opcode == Opcode.CHUNK_INDEX:
+            index = parse(ChunkIndex.read, record)
+            summary.chunks[index.chunk_start_offset] = index
+        elif opcode == Opcode.STATISTICS:
+            summary.statistics = parse(Statistics.read, record)
+        at += length
