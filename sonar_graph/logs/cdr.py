@@ -1,118 +1,34 @@
 """ROS 2 messages as columns: CDR payloads read and written many at a time.
 
-Where a field lies in a payload depends on the type's definition and on the lengths of the strings and sequences
-before it, on nothing else. So the `Layout` is worked out once, by walking the definition; all payloads whose length
-words are the same share it, and a field of all of them is one strided view of their bytes. The same walk, given the
-lengths instead of reading them, tells where to put each column when writing.
-
-Encoding is plain CDR (XCDR1, OMG DDS-XTypes 1.3, 7.4.1): a four-byte encapsulation header, then primitives aligned to
-their own size counted from after that header; a string is its length with the closing NUL as uint32 and its bytes.
+The `Layout` of a payload is worked out once, by walking the type's `Plan`; all payloads whose length words are the same
+share it, and a field of all of them is one strided view of their bytes. The same walk, given the lengths instead of
+reading them, tells where to put each column when writing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from sonar_graph.errors import LogError
-from sonar_graph.logs.schema import PRIMITIVES, STRING, Struct
+from sonar_graph.logs.layout import ENCAPSULATIONS, Bytes, Column, Layout
+from sonar_graph.logs.plan import LENGTH_BYTES, Step, Text, plan_of
+from sonar_graph.logs.schema import Struct
+from sonar_graph.logs.soundness import UnsoundMessageError, layout_of, unsound_contents
 from sonar_graph.measurements import Ints
 
-HEADER_BYTES = 4
-_LITTLE_ENDIAN = bytes([0, 1, 0, 0])
-_BYTE_ORDERS = {(0, 0): ">", (0, 1): "<"}
-_LENGTH = "u4"
-
-Bytes = NDArray[np.uint8]
 Value = NDArray[Any] | float | str | Sequence[str]
+Lengths = Mapping[str, int | Sequence[int]]
 
-
-@dataclass(frozen=True)
-class Column:
-    """Where the values of one field lie."""
-
-    dtype: np.dtype[Any]
-    """Of one value; for a string, one byte."""
-    is_single: bool
-    """No array or sequence on the path: one value a message."""
-    runs: list[tuple[int, int]] = field(default_factory=list)
-    """Byte offset and number of values of each stretch."""
-
-
-@dataclass
-class Layout:
-    """Where everything lies in payloads of one type whose strings and sequences have the same lengths."""
-
-    byte_order: str
-    columns: dict[str, Column] = field(default_factory=dict)
-    """By path, such as ``header.stamp.sec``; what lies in a sequence of structs has one path for all elements."""
-    length_words: list[tuple[int, int]] = field(default_factory=list)
-    """Byte offset and value of each length word."""
-    size: int = HEADER_BYTES
-
-    def same(self, payloads: Bytes) -> NDArray[np.bool_]:
-        """Which payloads, shape (n, size), have this layout."""
-        places = [1, *(offset + i for offset, _ in self.length_words for i in range(4))]
-        words = np.array([value for _, value in self.length_words], dtype=self.byte_order + _LENGTH)
-        expected = np.concatenate([[self.byte_order == "<"], words.view(np.uint8)])
-        return np.asarray((payloads[:, places] == expected).all(axis=1))
-
-
-class LengthWord(NamedTuple):
-    """A length word whose value is wanted."""
-
-    path: str
-    offset: int
-    is_string: bool
-    """Of a string, with its closing NUL; otherwise of a sequence."""
-
-
-LengthOf = Callable[[LengthWord], int]
-
-
-class _Walk:
-    """Works out a layout by going through a definition field by field."""
-
-    def __init__(self, byte_order: str, length_of: LengthOf) -> None:
-        self.layout = Layout(byte_order)
-        self._length_of = length_of
-
-    def struct(self, definition: Struct, prefix: str = "", *, is_single: bool = True) -> Layout:
-        for entry in definition.fields:
-            path, single = prefix + entry.name, is_single and not entry.is_array
-            count = self._length_word(path, is_string=False) if entry.length is None else entry.length
-            if isinstance(entry.kind, Struct):
-                for _ in range(count):
-                    self.struct(entry.kind, path + ".", is_single=single)
-            elif entry.kind == STRING:
-                for _ in range(count):
-                    self._values(path, "u1", self._length_word(path, is_string=True), single)
-            else:
-                self._values(path, PRIMITIVES[entry.kind], count, single)
-        return self.layout
-
-    def _length_word(self, path: str, *, is_string: bool) -> int:
-        self._align(4)
-        offset = self.layout.size
-        length = self._length_of(LengthWord(path, offset, is_string))
-        self.layout.length_words.append((offset, length))
-        self.layout.size += 4
-        return length
-
-    def _values(self, path: str, kind: str, count: int, is_single: bool) -> None:
-        dtype = np.dtype(self.layout.byte_order + kind)
-        column = self.layout.columns.setdefault(path, Column(dtype, is_single))
-        if count:
-            self._align(dtype.itemsize)
-        column.runs.append((self.layout.size, count))
-        self.layout.size += count * dtype.itemsize
-
-    def _align(self, size: int) -> None:
-        self.layout.size += -(self.layout.size - HEADER_BYTES) % size
+_ROWS_COMPARED_PER_WALK = 32
+"""Comparing a payload with a layout costs about this much less than walking it."""
+_LAYOUTS_REMEMBERED = 8
+"""Of each payload length, from one part of a topic to the next."""
 
 
 @dataclass(frozen=True)
@@ -129,33 +45,50 @@ class Messages:
         return len(self.rows)
 
     def __getitem__(self, path: str) -> NDArray[Any]:
-        """Values of a numeric field: shape (n,) for a single one, (n, m) within arrays; empty where m is 0."""
-        column = self.layout.columns.get(path)
-        if column is None:
-            return np.empty((len(self), 0))
-        size = column.dtype.itemsize
-        if len(column.runs) != 1:
-            return np.ascontiguousarray(self.payloads[:, _places(column)]).view(column.dtype)
-        at, count = column.runs[0]
-        values = self.payloads[:, at : at + count * size].view(column.dtype)
+        """Values of a numeric field: shape (n,) for a single one, (n, m) within arrays.
+
+        Raises
+        ------
+        KeyError
+            When the type has no such field, or it holds no values itself.
+        """
+        column = self.layout.column(path)
+        values = _view(self.payloads, column)
+        if values is None:
+            values = self.payloads[:, _places(column)].view(column.dtype)
         return values[:, 0] if column.is_single else values
+
+    def lengths(self, path: str) -> list[int]:
+        """Numbers of elements of an array or sequence: one each time it occurs in a message, the same in all."""
+        return self.layout.lengths(path)
 
     def strings(self, path: str) -> list[list[str]]:
         """Values of a string field, for each message one of each occurrence."""
-        runs = self.layout.columns[path].runs if path in self.layout.columns else []
-        return [[_text(row[at : at + count]) for at, count in runs] for row in self.payloads]
+        column = self.layout.column(path)
+        runs = [(start, start + count - 1) for start, count in zip(column.starts, column.counts, strict=True)]
+        contents = (payload.tobytes() for payload in self.payloads)
+        return [
+            [str(content[start:end], "utf-8") if end > start else "" for start, end in runs] for content in contents
+        ]
 
     def first_string(self, path: str) -> str:
-        """A string field's value in the first message."""
+        """A string field's value in the first message; empty where there is none."""
+        if path not in self.layout.columns:
+            return ""
         return next(iter(Messages(self.rows[:1], self.payloads[:1], self.layout).strings(path)[0]), "")
 
 
-def _text(characters: Bytes) -> str:
-    return characters.tobytes().rstrip(b"\0").decode("utf-8", "replace")
+class Decoded(NamedTuple):
+    """What became of payloads."""
+
+    groups: list[Messages]
+    """Sound messages by layout."""
+    unsound: dict[str, Ints]
+    """Rows of the others by what is wrong with them, which completes "3 messages ..."."""
 
 
-def decode(definition: Struct, payloads: Iterable[tuple[Ints, Bytes]]) -> list[Messages]:
-    """Messages grouped by layout.
+def decode(definition: Struct, payloads: Iterable[tuple[Ints, Bytes]]) -> Decoded:
+    """Messages grouped by layout; those that are not what their definition says are named and left out.
 
     Parameters
     ----------
@@ -163,44 +96,82 @@ def decode(definition: Struct, payloads: Iterable[tuple[Ints, Bytes]]) -> list[M
         Of the messages' type.
     payloads
         For each length that occurs: which messages have it, shape (n,), and their bytes, shape (n, length).
-
-    Raises
-    ------
-    LogError
-        For a payload that is shorter than its definition, or not plain CDR.
     """
-    groups = []
-    for rows, stack in payloads:
-        left = np.arange(len(rows))
+    return Decoder(definition).decode(payloads)
+
+
+class Decoder:
+    """Decodes messages of one type part by part; layouts met before are tried first."""
+
+    def __init__(self, definition: Struct) -> None:
+        self._plan = plan_of(definition)
+        self._known: dict[int, list[Layout]] = defaultdict(list)
+        self._unsound: dict[str, list[Ints]] = defaultdict(list)
+
+    def decode(self, payloads: Iterable[tuple[Ints, Bytes]]) -> Decoded:
+        """As the function `decode`."""
+        self._unsound.clear()
+        groups = [group for rows, stack in payloads for group in self._groups(rows, stack)]
+        return Decoded(groups, {fault: np.concatenate(parts) for fault, parts in self._unsound.items()})
+
+    def _groups(self, rows: Ints, stack: Bytes) -> Iterator[Messages]:
+        for layout, members in self._by_layout(rows, stack):
+            payloads = _members(stack, members)
+            is_sound = np.ones(len(members), bool)
+            for fault, has_it in unsound_contents(layout, payloads):
+                self._unsound[fault].append(rows[members[has_it & is_sound]])
+                is_sound &= ~has_it
+            if is_sound.all():
+                yield Messages(rows[members], payloads, layout)
+            elif is_sound.any():
+                yield Messages(rows[members[is_sound]], payloads[is_sound], layout)
+
+    def _by_layout(self, rows: Ints, stack: Bytes) -> Iterator[tuple[Layout, Ints]]:
+        known = self._known[stack.shape[1]]
+        left = np.arange(len(stack))
+        for layout in known:
+            same = layout.same(stack, left)
+            if same.any():
+                yield layout, left[same]
+                left = left[~same]
         while left.size:
-            part = stack if left.size == len(rows) else stack[left]
-            layout = _layout_of(definition, part[0])
-            same = layout.same(part)
-            groups.append(Messages(rows[left[same]], part if same.all() else part[same], layout))
+            found = self._layout(rows[left[0]], stack[left[0]])
+            if found is None:
+                left = left[1:]
+                continue
+            same = found.same(stack, left) if left.size > 1 else np.ones(1, bool)
+            yield found, left[same]
+            if np.count_nonzero(same) * _ROWS_COMPARED_PER_WALK < left.size:
+                yield from self._one_by_one(rows, stack, left[~same])
+                return
             left = left[~same]
-    return groups
+            known[_LAYOUTS_REMEMBERED - 1 :] = [found]
+
+    def _one_by_one(self, rows: Ints, stack: Bytes, left: Ints) -> Iterator[tuple[Layout, Ints]]:
+        """Walk every payload, where hardly two have the same layout."""
+        found: dict[tuple[object, ...], tuple[Layout, list[int]]] = {}
+        for member in left.tolist():
+            layout = self._layout(rows[member], stack[member])
+            if layout is not None:
+                found.setdefault((layout.byte_order, *layout.words), (layout, []))[1].append(member)
+        for layout, members in found.values():
+            yield layout, np.array(members)
+
+    def _layout(self, row: int, payload: Bytes) -> Layout | None:
+        try:
+            return layout_of(self._plan, payload.data)
+        except UnsoundMessageError as fault:
+            self._unsound[str(fault)].append(np.array([row]))
+            return None
 
 
-def _layout_of(definition: Struct, payload: Bytes) -> Layout:
-    order = _BYTE_ORDERS.get((int(payload[0]), int(payload[1]))) if len(payload) >= HEADER_BYTES else None
-    if order is None:
-        start = payload[:HEADER_BYTES].tobytes().hex()
-        raise LogError(f"a message of {definition.name} is not plain CDR (it begins with {start})")
-
-    def read_length(word: LengthWord) -> int:
-        value = payload[word.offset : word.offset + 4]
-        length = int(value.view(order + _LENGTH)[0]) if len(value) == 4 else len(payload)
-        if length > len(payload) - word.offset:
-            raise LogError(f"a message of {definition.name} is shorter than its definition says, at {word.path}")
-        return length
-
-    layout = _Walk(order, read_length).struct(definition)
-    if layout.size > len(payload):
-        raise LogError(f"a message of {definition.name} has {len(payload)} bytes; its definition needs {layout.size}")
-    return layout
+def _members(stack: Bytes, members: Ints) -> Bytes:
+    """Some payloads, as a view where they lie side by side."""
+    first, last = int(members[0]), int(members[-1])
+    return stack[first : last + 1] if last - first + 1 == len(members) else stack[members]
 
 
-def encode(definition: Struct, n: int, values: Mapping[str, Value], lengths: Mapping[str, int] | None = None) -> Bytes:
+def encode(definition: Struct, n: int, values: Mapping[str, Value], lengths: Lengths | None = None) -> Bytes:
     """Payloads of n messages that share a layout; what is not given is zero or empty.
 
     Parameters
@@ -213,59 +184,87 @@ def encode(definition: Struct, n: int, values: Mapping[str, Value], lengths: Map
         By path. Numbers: anything that broadcasts to shape (n,), or (n, m) within arrays, where m also is the length
         of a sequence of numbers. Strings: one for all, or a list with one for each occurrence in a message.
     lengths
-        Number of elements of sequences of structs, by path.
+        Number of elements of sequences by path, for all occurrences in a message or for each; needed for sequences of
+        structs, and of numbers within those.
 
     Returns
     -------
     NDArray[uint8]
         Shape (n, size).
+
+    Raises
+    ------
+    ValueError
+        For a field that the type does not have, and a number that does not fit into its field.
     """
-    layout = _Walk("<", _given_lengths(values, lengths or {})).struct(definition)
-    unknown = values.keys() - layout.columns.keys()
+    plan = plan_of(definition)
+    unknown = values.keys() - plan.leaves.keys()
     if unknown:
         raise ValueError(f"{definition.name} has no field {', '.join(sorted(unknown))}")
+    layout = Layout(plan, "<", plan.walk(_given_lengths(values, lengths or {})))
     payloads = np.zeros((n, layout.size), np.uint8)
-    payloads[:, :HEADER_BYTES] = np.frombuffer(_LITTLE_ENDIAN, np.uint8)
-    words = Column(np.dtype("<" + _LENGTH), is_single=False, runs=[(offset, 1) for offset, _ in layout.length_words])
-    _fill(payloads, words, np.array([[length for _, length in layout.length_words]]))
+    payloads[:, : len(ENCAPSULATIONS["<"])] = np.frombuffer(ENCAPSULATIONS["<"], np.uint8)
+    for at, length in layout.words:
+        payloads[:, at : at + LENGTH_BYTES] = np.frombuffer(length.to_bytes(LENGTH_BYTES, "little"), np.uint8)
     for path, value in values.items():
-        _fill(payloads, layout.columns[path], value)
+        _fill(payloads, path, layout.column(path), value)
     return payloads
 
 
-def _given_lengths(values: Mapping[str, Value], lengths: Mapping[str, int]) -> LengthOf:
-    occurrences = {path: iter(value) for path, value in values.items() if isinstance(value, list)}
+def _given_lengths(values: Mapping[str, Value], lengths: Lengths) -> Callable[[Step, int], int]:
+    texts = {path: iter(value) for path, value in values.items() if isinstance(value, list)}
+    each = {path: iter(length) for path, length in lengths.items() if not isinstance(length, int)}
 
-    def length_of(word: LengthWord) -> int:
-        value = values.get(word.path)
-        if word.is_string:
-            text = next(occurrences[word.path]) if word.path in occurrences else value or ""
+    def length_of(step: Step, _: int) -> int:
+        value = values.get(step.path)
+        if isinstance(step, Text):
+            text = next(texts[step.path]) if step.path in texts else value or ""
             return len(str(text).encode()) + 1
-        return int(value.shape[1]) if isinstance(value, np.ndarray) else lengths.get(word.path, 0)
+        if step.path in each:
+            return next(each[step.path])
+        given = lengths.get(step.path)
+        if isinstance(given, int):
+            return given
+        return value.shape[1] if isinstance(value, np.ndarray) else len(value) if isinstance(value, list) else 0
 
     return length_of
 
 
-def _fill(payloads: Bytes, column: Column, value: Value) -> None:
+def _fill(payloads: Bytes, path: str, column: Column, value: Value) -> None:
     if isinstance(value, str | list):
-        texts = [value] * len(column.runs) if isinstance(value, str) else value
+        texts = [value] * len(column.starts) if isinstance(value, str) else value
         characters = b"".join(str(text).encode() + b"\0" for text in texts)
         payloads[:, _places(column)] = np.frombuffer(characters, np.uint8)
         return
-    columns = np.asarray(value, column.dtype)
-    columns = columns.reshape(-1, 1) if columns.ndim == 1 and column.is_single else columns
-    columns = np.broadcast_to(columns, (len(payloads), sum(count for _, count in column.runs)))
-    octets = np.ascontiguousarray(columns).view(np.uint8)
-    if len(column.runs) == 1:
-        at = column.runs[0][0]
-        payloads[:, at : at + octets.shape[1]] = octets
+    given = np.asarray(value)
+    numbers = given.astype(column.dtype)
+    if column.dtype.kind in "iu" and not np.array_equal(numbers, given):
+        raise ValueError(f"{path}: a number does not fit into {column.dtype}")
+    numbers = numbers.reshape(-1, 1) if numbers.ndim == 1 and column.is_single else numbers
+    numbers = np.broadcast_to(numbers, (len(payloads), sum(column.counts)))
+    view = _view(payloads, column)
+    if view is None:
+        payloads[:, _places(column)] = np.ascontiguousarray(numbers).view(np.uint8)
     else:
-        payloads[:, _places(column)] = octets
+        view[...] = numbers
+
+
+def _view(payloads: Bytes, column: Column) -> NDArray[Any] | None:
+    """A column without copying, shape (n, m); None where its stretches are not evenly spaced single values."""
+    starts, size = column.starts, column.dtype.itemsize
+    if not starts:
+        return np.empty((len(payloads), 0), column.dtype)
+    values = payloads[:, starts[0] : starts[0] + column.counts[0] * size].view(column.dtype)
+    if len(starts) == 1:
+        return values
+    spacing = starts[1] - starts[0]
+    if any(count != 1 for count in column.counts) or starts != list(range(starts[0], starts[-1] + 1, spacing)):
+        return None
+    return as_strided(values, (len(payloads), len(starts)), (values.strides[0], spacing))
 
 
 def _places(column: Column) -> Ints:
     """Offsets of all bytes of a column, in order."""
-    runs = np.array(column.runs, np.int64).reshape(-1, 2)
-    sizes = runs[:, 1] * column.dtype.itemsize
+    sizes = np.array(column.counts, np.int64) * column.dtype.itemsize
     within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return np.repeat(runs[:, 0], sizes) + within
+    return np.repeat(np.array(column.starts, np.int64), sizes) + within

@@ -8,7 +8,8 @@ from functools import lru_cache
 import numpy as np
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.cdr import Bytes, Value, encode
+from sonar_graph.logs.cdr import Value, encode
+from sonar_graph.logs.layout import Bytes
 from sonar_graph.logs.message_definitions import definition
 from sonar_graph.logs.pose_covariance import body_to_ros
 from sonar_graph.logs.recorder import Outgoing

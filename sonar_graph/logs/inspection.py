@@ -147,11 +147,14 @@ def _stamps_from_headers(topic: Topic) -> Ints | None:
         return None
 
 
-def _decode_stamps(topic: Topic) -> Ints:
+def _decode_stamps(topic: Topic) -> Ints | None:
     time = parse_definition("builtin_interfaces/msg/Time", definition("builtin_interfaces/msg/Time"))
     stamps_ns = np.empty(len(topic), np.int64)
     parts = [(rows, payloads[:, :STAMP_BYTES]) for stack in topic.stacks.values() for rows, payloads in stack]
-    for group in decode(time, parts):
+    decoded = decode(time, parts)
+    if decoded.unsound:
+        return None
+    for group in decoded.groups:
         stamps_ns[group.rows] = header_stamps_ns(group, topic.log_times_ns, prefix="")
     return stamps_ns
 

@@ -7,8 +7,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, Mounting
-from sonar_graph.logs.cdr import Bytes, Value, encode
+from sonar_graph.logs.cdr import Value, encode
 from sonar_graph.logs.container import Recording
+from sonar_graph.logs.layout import Bytes
 from sonar_graph.logs.message_definitions import definition, short_name
 from sonar_graph.logs.roles import TF
 from sonar_graph.logs.schema import parse_definition

@@ -15,7 +15,7 @@ import numpy as np
 from mcap.writer import Writer
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.cdr import Bytes
+from sonar_graph.logs.layout import Bytes
 from sonar_graph.logs.message_definitions import definition
 from sonar_graph.measurements import Ints
 

@@ -14,7 +14,7 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs.message_definitions import DEFINITIONS, short_name
 
 PRIMITIVES = {
-    "bool": "u1",
+    "bool": "?",
     "byte": "u1",
     "char": "u1",
     "uint8": "u1",
@@ -37,7 +37,7 @@ _FIELD = re.compile(
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Struct:
     """A message type: its fields in order."""
 

@@ -74,7 +74,7 @@ class DetectionArrayAdapter(Adapter):
 
     def _rows(self, topic: Topic, group: Messages) -> _Rows | None:
         """The detections of messages that share a layout, message by message."""
-        counts = results_of_each(group)
+        counts = np.array(group.lengths("detections.results"), np.int64)
         if not len(counts):
             return None
         n, k = len(group), max(1, int(counts.max(initial=0)))
@@ -136,19 +136,6 @@ class _Rows(NamedTuple):
     def widened(self, candidates: int) -> _Rows:
         more = ((0, 0), (0, candidates - self.ids.shape[1]))
         return self._replace(ids=np.pad(self.ids, more, constant_values=-1), scores=np.pad(self.scores, more))
-
-
-def results_of_each(group: Messages) -> Ints:
-    """Number of results of each detection in messages of one layout, shape (detections,).
-
-    A detection's results lie between the end of the previous detection and its own box.
-    """
-    columns = group.layout.columns
-    if _DETECTION not in columns:
-        return np.empty(0, np.int64)
-    boxes = np.array([at for at, _ in columns[_DETECTION].runs])
-    scores = np.array([at for at, _ in columns[_SCORE].runs] if _SCORE in columns else [], dtype=np.int64)
-    return np.diff(np.searchsorted(scores, boxes), prepend=0).astype(np.int64)
 
 
 def range_and_azimuth(positions: Floats, covariances: Floats) -> tuple[Floats, Floats, Floats]:
