@@ -29,6 +29,16 @@ EstimatorSettings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME.SETTING=VALUE", help="Change a setting of an estimator; may be repeated."),
 ]
+LogConfigPath = Annotated[
+    Path | None,
+    typer.Option(
+        "--log-config",
+        metavar="FILE.toml",
+        exists=True,
+        dir_okay=False,
+        help="What the topics of a foreign log are: types, fields, units, axes. `inspect LOG --toml` prints one.",
+    ),
+]
 TopicChoices = Annotated[
     list[str] | None,
     typer.Option(

@@ -8,10 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sonar_graph.cli.arguments import CalibrationPath, EstimatorSettings, LogPath, OutputFolder, RateHz, TopicChoices
+from sonar_graph.cli.arguments import (
+    CalibrationPath,
+    EstimatorSettings,
+    LogConfigPath,
+    LogPath,
+    OutputFolder,
+    RateHz,
+    TopicChoices,
+)
 from sonar_graph.cli.outputs import writable_folder
 from sonar_graph.cli.progress import progress_bars, working
-from sonar_graph.cli.settings import estimator_settings, read_calibration, topic_choices
+from sonar_graph.cli.settings import estimator_settings, read_calibration, read_config, topic_choices
 from sonar_graph.cli.texts import answers
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 
@@ -32,13 +40,14 @@ class LogSource:
     path: Path
     calibration: Path | None = None
     topics: list[str] | None = None
+    config: Path | None = None
 
     def read(self) -> Sequence:
         """The log as a sequence; the errors are those of reading a log, a calibration, or choices of topics."""
         from sonar_graph.logs.reading import read_sequence
 
-        topics = topic_choices(self.topics or [])
-        return read_sequence(self.path, calibration=read_calibration(self.calibration), topics=topics)
+        topics, config = topic_choices(self.topics or []), read_config(self.config)
+        return read_sequence(self.path, calibration=read_calibration(self.calibration), topics=topics, config=config)
 
 
 def run(
@@ -49,9 +58,10 @@ def run(
     settings: EstimatorSettings = None,
     calibration: CalibrationPath = None,
     topics: TopicChoices = None,
+    log_config: LogConfigPath = None,
 ) -> None:
     """Run one estimator on a log; write its trajectories, landmarks and scores."""
-    comparison = _compare_log(LogSource(log, calibration, topics), output, [estimator], rate_hz, settings)
+    comparison = _compare_log(LogSource(log, calibration, topics, log_config), output, [estimator], rate_hz, settings)
     _print_summary(comparison)
     typer.echo(f"Results: {output}")
     _exit_by(comparison)
@@ -65,13 +75,14 @@ def compare(
     settings: EstimatorSettings = None,
     calibration: CalibrationPath = None,
     topics: TopicChoices = None,
+    log_config: LogConfigPath = None,
 ) -> None:
     """Run several estimators on the same measurements and write a report on how they compare.
 
     Writes report.html, comparison.json, result.mcap for a viewer, and runs/NAME/ with each estimator's trajectories.
     """
     comparison = _compare_log(
-        LogSource(log, calibration, topics), output, _estimator_names(estimators), rate_hz, settings
+        LogSource(log, calibration, topics, log_config), output, _estimator_names(estimators), rate_hz, settings
     )
     page = _write_report(comparison, output)
     _print_summary(comparison)

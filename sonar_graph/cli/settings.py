@@ -1,4 +1,4 @@
-"""Settings given on the command line or in a file: ``--set``, ``--topic`` and ``--calibration``."""
+"""Settings given on the command line or in a file: ``--set``, ``--topic``, ``--log-config``, ``--calibration``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from sonar_graph.errors import CalibrationError, EstimatorError, LogError
 
 if TYPE_CHECKING:
     from sonar_graph.calibration import Calibration
+    from sonar_graph.logs.adapters.config import LogConfig
 
 
 def parse_setting(text: str) -> tuple[str, Any]:
@@ -77,6 +78,19 @@ def topic_choices(texts: list[str]) -> dict[str, str]:
             raise LogError(f"--topic {text}: expected ROLE=TOPIC such as imu=/imu/data")
         choices[role] = topic
     return choices
+
+
+def read_config(path: Path | None) -> LogConfig | None:
+    """What a TOML file says about a log's topics; None where no file is given.
+
+    Raises
+    ------
+    LogError
+        When the file is not TOML, or says something that cannot be.
+    """
+    from sonar_graph.logs.adapters.config import read_log_config
+
+    return None if path is None else read_log_config(path)
 
 
 def read_calibration(path: Path | None) -> Calibration | None:

@@ -48,6 +48,8 @@ class Table:
         The field with the time of validity: a Time, or a number; ``log`` takes the time of recording.
     stamp_unit_s
         Of the stamp, where it is a number.
+    stamp_offset_s
+        Added to every stamp.
 
     Raises
     ------
@@ -55,7 +57,9 @@ class Table:
         Naming file, topic and field where the messages are not what their definition says.
     """
 
-    def __init__(self, topic: Topic, stamp: str = "header.stamp", stamp_unit_s: float = 1.0) -> None:
+    def __init__(
+        self, topic: Topic, stamp: str = "header.stamp", stamp_unit_s: float = 1.0, stamp_offset_s: float = 0.0
+    ) -> None:
         self.topic = topic
         self.groups = topic.messages()
         log_times_ns = topic.log_times_ns
@@ -68,6 +72,8 @@ class Table:
             self.stamps_ns = np.empty(len(topic), np.int64)
             for group in self.groups:
                 self.stamps_ns[group.rows] = header_stamps_ns(group, log_times_ns, f"{stamp}.")
+        if stamp_offset_s:
+            self.stamps_ns = self.stamps_ns + round(stamp_offset_s * NS_PER_S)
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

@@ -27,6 +27,8 @@ class Adapter(Section):
     """Field with the time of validity (a Time or a number), or "log": when the message was recorded."""
     stamp_unit_s: float = Field(1.0, gt=0)
     """What one unit of the stamp is, where it is a number; 1e-6 for microseconds."""
+    stamp_offset_s: float = 0.0
+    """Added to every stamp: minus the delay of a driver that stamps when a message arrives."""
     frame_id_field: str | None = "header.frame_id"
     """Field with the name of the sensor's frame in /tf_static."""
     frame_id: str | None = None
@@ -45,7 +47,7 @@ class Adapter(Section):
 
     def table(self, topic: Topic) -> Table:
         """The messages of a topic, with their stamps."""
-        return Table(topic, self.stamp, self.stamp_unit_s)
+        return Table(topic, self.stamp, self.stamp_unit_s, self.stamp_offset_s)
 
     def frame_in(self, messages: Sequence[Messages]) -> str:
         """The sensor's frame; empty where the messages do not name one."""

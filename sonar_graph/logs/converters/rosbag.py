@@ -127,9 +127,11 @@ class _Copy:
         conversion = Conversion(len({c.topic for c in connections}), duration_s=bag.duration * 1e-9, left_out=missing)
         broken: dict[str, int] = {}
         total = sum(c.msgcount for c in connections)
-        for number, (connection, time_ns, raw) in enumerate(bag.messages(connections=connections) if connections else ()):
+        for number, (connection, time_ns, raw) in enumerate(
+            bag.messages(connections=connections) if connections else ()
+        ):
             try:
-                payload = self._recoders[connection.msgtype](raw)
+                payload = bytes(self._recoders[connection.msgtype](raw))
             except SerdeError:
                 broken[connection.topic] = broken.get(connection.topic, 0) + 1
                 continue
@@ -173,6 +175,8 @@ class _Copy:
 
 def _is_latched(connection: Connection) -> bool:
     """Whether those that join late get the last message: ``latching`` in ROS 1, "transient local" in ROS 2."""
-    if hasattr(connection.ext, "latching"):
-        return bool(connection.ext.latching)
-    return any(profile.durability.value == 1 for profile in connection.ext.offered_qos_profiles)
+    from rosbags.interfaces import ConnectionExtRosbag2
+
+    if isinstance(connection.ext, ConnectionExtRosbag2):
+        return any(profile.durability.value == 1 for profile in connection.ext.offered_qos_profiles)
+    return bool(connection.ext.latching)
