@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.cdr import Messages, decode
-from sonar_graph.logs.layout import Bytes, Layout
+from sonar_graph.logs.cdr import Decoded, Decoder, Messages
+from sonar_graph.logs.layout import Bytes
 from sonar_graph.logs.schema import Struct, parse_definition
 from sonar_graph.measurements import Ints
 
