@@ -1,4 +1,7 @@
-"""Landmarks as ``visualization_msgs/MarkerArray``: 95 % ellipsoids with their identities.
+"""Landmarks and positions as ``visualization_msgs/MarkerArray``: 95 % ellipsoids, and landmarks' identities.
+
+Viewers differ in how large they draw the covariance of a pose (RViz: one sigma; Lichtblick: half a sigma, without
+correlations); an ellipsoid marker looks the same in all of them.
 
 A marker's namespace says what it is: ``ellipsoid_95_percent``, ``covariance_unknown`` (a sphere whose size means
 nothing), ``identity``. A viewer switches each on and off.
@@ -12,9 +15,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from sonar_graph.logs import encoding
+from sonar_graph.logs.cdr import Value
+from sonar_graph.logs.pose_covariance import body_to_ros
 from sonar_graph.logs.recorder import Outgoing
 from sonar_graph.measurements import Floats
-from sonar_graph.states import LandmarkMap
+from sonar_graph.states import LandmarkMap, Trajectory
 
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
 SPHERE, TEXT_VIEW_FACING = 2, 9
@@ -22,6 +27,7 @@ UNKNOWN_DIAMETER_M = 0.2
 """Drawn where a covariance is unknown."""
 _SMALLEST_DIAMETER_M = 1e-3
 ELLIPSOID, UNKNOWN, IDENTITY = "ellipsoid_95_percent", "covariance_unknown", "identity"
+_FAINT = 0.35
 _SIGMAS = float(np.sqrt(chi2.ppf(0.95, df=3)))
 
 Colour = tuple[float, float, float, float]
@@ -81,3 +87,20 @@ def landmark_markers(
         "markers.text": [""] * count + [str(identity) for identity in landmarks.ids.tolist()],
     }
     return encoding.outgoing(topic, MARKER_ARRAY, np.array([stamp_ns]), values, {"markers": 2 * count}, is_latched=True)
+
+
+def position_ellipsoids(topic: str, trajectory: Trajectory, colour: Colour) -> Outgoing:
+    """For each pose whose covariance is known one message: where the position is, as an ellipsoid."""
+    known = trajectory.rows(np.flatnonzero(~_unknown(trajectory.covariances[:, 3:, 3:])))
+    world_axes = body_to_ros(known.covariances, known.rotations().as_matrix()) if len(known) else known.covariances
+    diameters, quaternions = ellipsoids(world_axes[:, :3, :3])
+    columns = encoding.header(known.stamps_ns, encoding.WORLD_FRAME, "markers.header")
+    columns |= encoding.fields("markers.pose.position", "xyz", known.positions)
+    columns |= encoding.fields("markers.pose.orientation", "xyzw", quaternions)
+    columns |= encoding.fields("markers.scale", "xyz", diameters)
+    columns |= encoding.fields("markers.color", "rgba", np.tile((*colour[:3], _FAINT), (len(known), 1)))
+    values: dict[str, Value] = {
+        path: value[:, None] if isinstance(value, np.ndarray) else value for path, value in columns.items()
+    }
+    values |= {"markers.ns": ELLIPSOID, "markers.type": SPHERE}
+    return encoding.outgoing(topic, MARKER_ARRAY, known.stamps_ns, values, {"markers": 1})

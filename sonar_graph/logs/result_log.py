@@ -5,6 +5,7 @@ For each estimator ``NAME`` (as `source_names` spells it), in the frame ``map``:
 =========================  ==============================================================================
 ``/NAME/odometry``         ``nav_msgs/Odometry``: the causal estimate with its covariance
 ``/NAME/pose``             ``geometry_msgs/PoseWithCovarianceStamped``: the same, for viewers without Odometry
+``/NAME/pose_ellipsoid``   ``visualization_msgs/MarkerArray``: its 95 % ellipsoid of position
 ``/NAME/smoothed``         the same type: what is known at the end about each instant; equal to it for a filter
 ``/NAME/path``             ``nav_msgs/Path``: the causal estimate so far, now and then; at the end the smoothed
 ``/NAME/landmarks``        ``visualization_msgs/MarkerArray`` at the end: 95 % ellipsoids and identities
@@ -28,7 +29,7 @@ import numpy as np
 from sonar_graph.logs import encoding
 from sonar_graph.logs.body_frames import body_transforms
 from sonar_graph.logs.landmark_cloud import landmark_cloud
-from sonar_graph.logs.markers import BLUE, GREEN, GREY, ORANGE, PURPLE, Colour, landmark_markers
+from sonar_graph.logs.markers import BLUE, GREEN, GREY, ORANGE, PURPLE, Colour, landmark_markers, position_ellipsoids
 from sonar_graph.logs.mountings import encode_mountings
 from sonar_graph.logs.recorder import Attachment, Outgoing, write_recording
 from sonar_graph.logs.roles import TF
@@ -133,6 +134,7 @@ def _estimator(name: str, estimate: Estimates, colour: Colour, scene: Scene) -> 
     if len(causal):
         messages.append(encoding.odometry_messages(f"/{name}/odometry", causal, _frame(name)))
         messages.append(encoding.pose_messages(f"/{name}/pose", causal))
+        messages.append(position_ellipsoids(f"/{name}/pose_ellipsoid", causal, colour))
         messages += _causal_paths(f"/{name}/path", causal)
     ends = [int(t.stamps_ns[-1]) for t in (causal, smoothed) if len(t)]
     if len(smoothed):
@@ -166,7 +168,7 @@ def _bodies(sequence: Sequence, sources: Mapping[str, Estimates]) -> dict[str, T
 
 def _layers(messages: Iterable[Outgoing], colours: Mapping[str, Colour]) -> list[Layer]:
     """What a viewer may draw: every topic once."""
-    topics = {entry.topic: entry for entry in messages}
+    topics = {entry.topic: entry for entry in messages if len(entry.log_times_ns)}
     return [
         Layer(topic, entry.type_name, colours.get(topic.split("/")[1], GREY), is_latched=entry.is_latched)
         for topic, entry in topics.items()

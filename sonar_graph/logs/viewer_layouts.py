@@ -151,12 +151,7 @@ def _drawing_settings(scene: Scene) -> dict[str, Callable[[Layer], dict[str, Any
     return {
         PATH: lambda layer: {"type": "line", "lineWidth": scene.line_m, "gradient": [layer.css(1), layer.css(1)]},
         MARKER_ARRAY: lambda _: {},
-        POSE_WITH_COVARIANCE: lambda layer: {
-            "type": "axis",
-            "axisScale": scene.axis_m,
-            "showCovariance": True,
-            "covarianceColor": layer.css(0.4),
-        },
+        POSE_WITH_COVARIANCE: lambda _: {"type": "axis", "axisScale": scene.axis_m, "showCovariance": False},
         POINT_CLOUD: lambda layer: {"pointSize": 6, "colorMode": "flat", "flatColor": layer.css(1)},
     }
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,7 @@ def test_the_cloud_keeps_the_rules_of_its_type(cloud: Any) -> None:
     assert (cloud.height, cloud.width, cloud.is_bigendian) == (1, 2, False)
     assert cloud.row_step == cloud.width * cloud.point_step == len(cloud.data)
     places = [(f.offset, f.offset + struct.calcsize(FORMATS[f.datatype])) for f in cloud.fields]
-    assert all(end <= start for (_, end), (start, _) in zip(places, places[1:], strict=False))
+    assert all(end <= start for (_, end), (start, _) in pairwise(places))
     assert places[-1][1] <= cloud.point_step
     assert {f.count for f in cloud.fields} == {1}
 

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.logs.markers import GREY, UNKNOWN_DIAMETER_M, ellipsoids, landmark_markers
+from sonar_graph.logs.markers import GREY, UNKNOWN_DIAMETER_M, ellipsoids, landmark_markers, position_ellipsoids
 from sonar_graph.logs.recorder import write_recording
-from sonar_graph.states import LandmarkMap
+from sonar_graph.states import LandmarkMap, Trajectory
 
 
 @given(st.integers(0, 10_000))
@@ -78,3 +78,27 @@ def test_a_drawn_ellipsoid_lies_as_its_covariance_does(
     longest = axes[:, np.argmax(diameters)]
     np.testing.assert_allclose(np.abs(longest @ along), 1)
     np.testing.assert_allclose(np.sort(diameters), 2 * 2.7954834829151074 * np.array([0.1, 0.2, 1.0]))
+
+
+def test_the_ellipsoid_of_a_pose_holds_95_percent_of_sampled_positions(
+    tmp_path: Path, decoded: Callable[[Path], dict[str, list[Any]]]
+) -> None:
+    """Its covariance is in the body's axes, the ellipsoid is drawn in those of the map."""
+    rng = np.random.default_rng(5)
+    root = rng.normal(size=(3, 6, 6))
+    covariances = root @ root.transpose(0, 2, 1)
+    covariances[1] = np.nan
+    rotations = Rotation.random(3, rng)
+    positions = rng.normal(size=(3, 3))
+    trajectory = Trajectory(np.array([10, 20, 30]), positions, rotations.as_quat(), covariances)
+    write_recording(tmp_path / "a.mcap", [position_ellipsoids("/pose", trajectory, GREY)], {})
+    (arrays,) = decoded(tmp_path / "a.mcap").values()
+    assert [array.markers[0].header.stamp.nanosec for array in arrays] == [10, 30]
+    for array, row in zip(arrays, (0, 2), strict=True):
+        marker, q = array.markers[0], array.markers[0].pose.orientation
+        samples = rng.multivariate_normal(np.zeros(6), covariances[row], 50_000)[:, 3:]
+        sampled = rotations[row].apply(samples) + positions[row]
+        centre = np.array([marker.pose.position.x, marker.pose.position.y, marker.pose.position.z])
+        radii = np.array([marker.scale.x, marker.scale.y, marker.scale.z]) / 2
+        within = Rotation.from_quat([q.x, q.y, q.z, q.w]).inv().apply(sampled - centre) / radii
+        assert abs(np.mean(np.sum(within**2, axis=1) < 1) - 0.95) < 0.005

@@ -52,7 +52,7 @@ def messages(result: Path, decoded: Any) -> dict[str, list[Any]]:
 
 
 def test_every_estimator_and_the_truth_are_there(messages: dict[str, list[Any]]) -> None:
-    each = ("odometry", "pose", "smoothed", "path", "landmarks", "landmark_cloud")
+    each = ("odometry", "pose", "pose_ellipsoid", "smoothed", "path", "landmarks", "landmark_cloud")
     expected = {f"/{name}/{kind}" for name in ("ekf_slam", "isam2") for kind in each}
     expected |= {f"/ground_truth/{kind}" for kind in ("odometry", "path", "landmarks", "landmark_cloud")}
     assert set(messages) == expected | {"/tf", "/tf_static"}

@@ -183,6 +183,13 @@ def test_the_scene_holds_everything_and_the_camera_sees_it(layout: dict[str, Any
     assert view["Distance"] == camera["distance"]
 
 
+def test_identities_can_be_read_from_the_camera(messages: dict[str, list[Any]], layout: dict[str, Any]) -> None:
+    distance_m = layout["configById"]["3D!result"]["cameraState"]["distance"]
+    heights = {m.scale.z for m in messages["/isam2/landmarks"][0].markers if m.text}
+    assert heights
+    assert all(0.01 < height_m / distance_m < 0.05 for height_m in heights)
+
+
 def test_a_grid_has_few_cells_and_reaches_over_the_scene() -> None:
     for size_m in (1.0, 9.9, 10.0, 320.0, 4000.0):
         scene = Scene((0, 0, 0), size_m)
