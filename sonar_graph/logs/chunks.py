@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import lz4.frame
 import numpy as np
@@ -34,32 +34,49 @@ class ChunkError(LogError):
     """A chunk is not whole."""
 
 
-@dataclass
-class Content:
-    """The records in a stretch of uncompressed bytes, in their order."""
+class Found(NamedTuple):
+    """Messages of one channel in a stretch of bytes, in their order."""
 
-    data: bytes | memoryview
-    channels: Ints
-    """Of each message, shape (n,)."""
     offsets: Ints
-    """Of the payloads in the data."""
+    """Of the payloads, shape (n,)."""
     sizes: Ints
     """Of the payloads."""
     log_times_ns: Ints
-    described: list[tuple[int, bytes]] = field(default_factory=list)
-    """Opcode and content of the schemas and channels among them."""
-    end: int = 0
+
+    def of(self, rows: slice | Ints | NDArray[np.bool_]) -> Found:
+        """Some of them."""
+        return Found(self.offsets[rows], self.sizes[rows], self.log_times_ns[rows])
+
+
+@dataclass
+class Content:
+    """The records in a stretch of uncompressed bytes."""
+
+    data: bytes | memoryview
+    channels: dict[int, Found]
+    """Its messages."""
+    described: list[tuple[int, bytes]]
+    """Opcode and content of its schemas and channels, in their order."""
+    end: int
     """Where the last whole record ends."""
+
+    def __len__(self) -> int:
+        return sum(len(found.sizes) for found in self.channels.values())
+
+    def times_ns(self) -> tuple[int, int]:
+        """The earliest and the latest log time; there must be a message."""
+        times_ns = [found.log_times_ns for found in self.channels.values()]
+        return min(int(t.min()) for t in times_ns), max(int(t.max()) for t in times_ns)
 
     def trusted(self) -> Content:
         """Without the last message, where what follows it is no record: it may reach into what is damaged."""
-        rest = self.data[self.end :]
-        if not len(rest) or rest[0] in LOOSE or not len(self.channels):
+        rest = self.data[self.end : self.end + 1]
+        if not len(rest) or rest[0] in LOOSE or not self.channels:
             return self
-        channels, offsets, sizes, times_ns = (
-            column[:-1] for column in (self.channels, self.offsets, self.sizes, self.log_times_ns)
-        )
-        return Content(self.data, channels, offsets, sizes, times_ns, self.described, self.end)
+        last = max(self.channels, key=lambda channel: int(self.channels[channel].offsets[-1]))
+        rest_of_last = self.channels[last].of(slice(0, -1))
+        channels = {**self.channels, last: rest_of_last}
+        return Content(self.data, {c: f for c, f in channels.items() if len(f.sizes)}, self.described, self.end)
 
 
 def unpack(chunk: ChunkRecord, packed: bytes) -> bytes:
@@ -124,38 +141,54 @@ def find_by_index(data: bytes | memoryview, index: Index) -> Content | None:
     Every record that the index names must be a message of that channel and time, and between them may lie only
     schemas and channels: an index that leaves out a message, or points into one, is found out.
     """
-    channels = np.repeat(np.array(list(index), np.int64), [len(rows) for rows in index.values()])
+    counts = [len(rows) for rows in index.values()]
     rows = np.concatenate([*index.values(), np.empty((0, 2), np.uint64)])
-    order = np.argsort(rows[:, 1], kind="stable")
-    starts, times_ns, channels = rows[order, 1].astype(np.int64), rows[order, 0], channels[order]
-    if len(starts) and (starts[0] < 0 or starts[-1] > len(data) - _MESSAGE.itemsize):
+    starts, times_ns = rows[:, 1].astype(np.int64), rows[:, 0]
+    if len(starts) and (starts.min() < 0 or starts.max() > len(data) - _MESSAGE.itemsize):
         return None
-    heads = np.ndarray((max(len(data) - _MESSAGE.itemsize + 1, 0),), _MESSAGE, data, strides=(1,))[starts]
+    heads = _heads(data)[starts]
     lengths = heads["length"].astype(np.int64)
+    channels = np.repeat(np.array(list(index), np.uint16), counts)
     agree = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == channels) & (heads["log"] == times_ns)
     if not (agree & (lengths >= _MESSAGE_FIELDS) & (lengths <= len(data))).all():
         return None
-    ends = starts + HEAD.size + lengths
-    described = _between(data, np.concatenate([[0], ends]), np.concatenate([starts, [len(data)]]))
+    described = _between(data, starts, starts + HEAD.size + lengths)
     if described is None:
         return None
-    payloads = starts + _MESSAGE.itemsize
-    return Content(data, channels, payloads, lengths - _MESSAGE_FIELDS, times_ns.astype(np.int64), described, len(data))
+    every = Found(starts + _MESSAGE.itemsize, lengths - _MESSAGE_FIELDS, times_ns.astype(np.int64))
+    ends = np.cumsum(counts).tolist()
+    found = {
+        channel: every.of(slice(end - count, end)) for channel, count, end in zip(index, counts, ends, strict=True)
+    }
+    return Content(data, {channel: _in_order(part) for channel, part in found.items()}, described, len(data))
 
 
-def _between(data: bytes | memoryview, ends: Ints, starts: Ints) -> list[tuple[int, bytes]] | None:
-    """The schemas and channels between messages; None where there is anything else."""
-    if (starts < ends).any():
+def _heads(data: bytes | memoryview) -> NDArray[Any]:
+    """What a message's head would be at each offset."""
+    return np.ndarray((max(len(data) - _MESSAGE.itemsize + 1, 0),), _MESSAGE, data, strides=(1,))
+
+
+def _in_order(found: Found) -> Found:
+    is_sorted = (found.offsets[1:] > found.offsets[:-1]).all()
+    return found if is_sorted else found.of(np.argsort(found.offsets))
+
+
+def _between(data: bytes | memoryview, starts: Ints, ends: Ints) -> list[tuple[int, bytes]] | None:
+    """The schemas and channels between messages; None where there is anything else, or messages overlap."""
+    order = np.argsort(starts, kind="stable")
+    before = np.concatenate([[0], ends[order]])
+    after = np.concatenate([starts[order], [len(data)]])
+    if (after < before).any():
         return None
     described = []
-    for gap in np.flatnonzero(starts > ends).tolist():
-        at = int(ends[gap])
-        for opcode, start, stop in _records(data[at : int(starts[gap])]):
+    for gap in np.flatnonzero(after > before).tolist():
+        at = last = int(before[gap])
+        for opcode, start, stop in _records(data[at : int(after[gap])]):
             if opcode == Opcode.MESSAGE:
                 return None
             described.append((opcode, bytes(data[at + start : at + stop])))
             last = at + stop
-        if not described or last != starts[gap]:
+        if last != after[gap]:
             return None
     return described
 
@@ -172,10 +205,11 @@ def find_by_walk(data: bytes | memoryview) -> Content:
             described.append((opcode, bytes(data[start:stop])))
         end = stop
     starts = np.array(messages, np.int64)
-    heads = np.ndarray((max(len(data) - _MESSAGE.itemsize + 1, 0),), _MESSAGE, data, strides=(1,))[starts]
-    sizes = heads["length"].astype(np.int64) - _MESSAGE_FIELDS
-    channels, times_ns = heads["channel"].astype(np.int64), heads["log"].astype(np.int64)
-    return Content(data, channels, starts + _MESSAGE.itemsize, sizes, times_ns, described, end)
+    heads = _heads(data)[starts]
+    sizes, times_ns = heads["length"].astype(np.int64) - _MESSAGE_FIELDS, heads["log"].astype(np.int64)
+    every = Found(starts + _MESSAGE.itemsize, sizes, times_ns)
+    found = {channel: every.of(heads["channel"] == channel) for channel in np.unique(heads["channel"]).tolist()}
+    return Content(data, found, described, end)
 
 
 def _records(data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:

@@ -21,6 +21,8 @@ from sonar_graph.logs.window import Window, first_time_ns
 
 __all__ = ["STAMP_BYTES", "Keep", "Progress", "Recording", "Topic", "scan", "stream"]
 
+_PIECE_BYTES = 1 << 20
+
 
 @dataclass
 class Recording:
@@ -107,7 +109,9 @@ def stream(
     window: Window | None = None,
     progress: Progress | None = None,
 ) -> Iterator[Topic]:
-    """Messages chunk by chunk: each item holds those of one topic in one chunk, and nothing else stays in memory.
+    """Messages piece by piece: each item holds some of one topic, in the order of the file.
+
+    A piece is given as soon as it has 1 MiB, so that what is in memory at a time does not grow with the file.
 
     Parameters
     ----------
@@ -122,16 +126,19 @@ def stream(
     with LogFile(path) as file:
         limits_ns = window.resolve(first_time_ns(file)) if window else None
         passage = Passage(file, keep, limits_ns, progress=progress)
+        held: dict[str, Topic] = {}
         for piece in passage:
-            topic = piece.topic.empty()
-            topic.gather(piece.data, piece.offsets, piece.sizes, piece.log_times_ns)
-            yield topic
+            topic = held.get(piece.topic.name) or held.setdefault(piece.topic.name, piece.topic.empty())
+            topic.gather(piece.data, *piece.found)
+            if topic.held_bytes >= _PIECE_BYTES:
+                yield held.pop(topic.name)
+        yield from (topic for topic in held.values() if len(topic))
     Recording(path, damage=passage.damage).require_sound()
 
 
 def _gather(passage: Passage) -> None:
     for piece in passage:
-        piece.topic.gather(piece.data, piece.offsets, piece.sizes, piece.log_times_ns)
+        piece.topic.gather(piece.data, *piece.found)
 
 
 def _recording(path: Path, passage: Passage) -> Recording:

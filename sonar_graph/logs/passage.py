@@ -11,14 +11,22 @@ from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Metadata
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.chunks import ChunkError, Content, Index, find_by_index, find_by_walk, unpack, unpack_beginning
+from sonar_graph.logs.chunks import (
+    ChunkError,
+    Content,
+    Found,
+    Index,
+    find_by_index,
+    find_by_walk,
+    unpack,
+    unpack_beginning,
+)
 from sonar_graph.logs.damage import Damage, Loss
 from sonar_graph.logs.descriptions import Descriptions
 from sonar_graph.logs.metadata import open_seal
 from sonar_graph.logs.records import PRIVATE, ChunkRecord, Hole, LogFile, Record, Stretch, Walk
 from sonar_graph.logs.summary import parse, read_summary
 from sonar_graph.logs.topic import Keep, Topic
-from sonar_graph.measurements import Ints
 
 _BLOCK = 1 << 22
 Progress = Callable[[int, int], None]
@@ -34,10 +42,7 @@ class Piece(NamedTuple):
 
     topic: Topic
     data: bytes | memoryview
-    offsets: Ints
-    """Of the payloads in the data, shape (n,)."""
-    sizes: Ints
-    log_times_ns: Ints
+    found: Found
 
 
 class Passage:
@@ -191,12 +196,11 @@ class Passage:
 
     def _check_against_summary(self, chunk: ChunkRecord, content: Content) -> None:
         index = self._indexed(chunk)
-        if index is None or not len(content.channels):
+        if index is None or not content.channels:
             return
-        channels = set(np.unique(content.channels).tolist())
-        times_ns = content.log_times_ns
-        is_inside = chunk.start_ns <= times_ns.min() and times_ns.max() <= chunk.end_ns
-        if channels <= index.message_index_offsets.keys() and is_inside:
+        first_ns, last_ns = content.times_ns()
+        is_inside = chunk.start_ns <= first_ns and last_ns <= chunk.end_ns
+        if content.channels.keys() <= index.message_index_offsets.keys() and is_inside:
             return
         self._remark(f"the summary's index does not fit chunk {self.chunks} (byte {chunk.at}); read without")
         if self._may_skip:
@@ -221,7 +225,7 @@ class Passage:
             return
         self.chunks += 1
         content = find_by_walk(unpack_beginning(chunk, self._file.read(chunk.data_at, chunk.data_size))).trusted()
-        reason += f"; {len(content.channels)} messages are from the beginning of a chunk, which no CRC covers"
+        reason += f"; {len(content)} messages are from the beginning of a chunk, which no CRC covers"
         self.damage.ending = Loss(hole.at, hole.end, reason, self._last_ns)
         yield from self._take_content(content, hole.at, hole.end, is_covered=False)
 
@@ -247,22 +251,21 @@ class Passage:
                 self._described.add(opcode, described, is_covered=is_covered)
             except LogError as error:
                 self._lose(at, end, f"the description of a channel is lost: {error}", messages={})
-        if len(content.log_times_ns):
-            self._close_losses(int(content.log_times_ns.min()))
-            self._last_ns = max(self._last_ns or 0, int(content.log_times_ns.max()))
-        for channel in np.unique(content.channels).tolist():
-            rows = content.channels == channel
+        if content.channels:
+            first_ns, last_ns = content.times_ns()
+            self._close_losses(first_ns)
+            self._last_ns = max(self._last_ns or 0, last_ns)
+        for channel, found in content.channels.items():
             topic = self._described.by_channel.get(channel)
             if topic is None:
-                count = int(np.count_nonzero(rows))
                 reason = f"messages of channel {channel}, whose description is lost"
-                self._lose(at, end, reason, messages={f"channel {channel}": count})
+                self._lose(at, end, reason, messages={f"channel {channel}": len(found.sizes)})
                 continue
             if self._limits_ns and not topic.is_latched:
                 first_ns, after_ns = self._limits_ns
-                rows &= (content.log_times_ns >= first_ns) & (content.log_times_ns < after_ns)
-            if rows.any():
-                yield Piece(topic, content.data, content.offsets[rows], content.sizes[rows], content.log_times_ns[rows])
+                found = found.of((found.log_times_ns >= first_ns) & (found.log_times_ns < after_ns))
+            if len(found.sizes):
+                yield Piece(topic, content.data, found)
 
     def _lose(
         self,

@@ -53,6 +53,8 @@ class Topic:
     """Row numbers and payload bytes by number of bytes."""
     unsound: dict[str, int] = field(default_factory=dict)
     """Number of messages that are not what their definition says, by fault; known once they were decoded."""
+    held_bytes: int = 0
+    """Memory that the payloads take."""
     _count: int = 0
     _decoders: list[Decoder] = field(default_factory=list, repr=False)
     """At most one, made when it is needed, and shared by all pieces of a topic: it remembers layouts."""
@@ -125,9 +127,11 @@ class Topic:
         self._count += len(sizes)
         if self.keep is Keep.NONE:
             return
-        self.times.append(log_times_ns)
         kept = sizes if self.keep is Keep.ALL else np.minimum(sizes, self.keep.value)
-        for size in np.unique(kept).tolist():
+        self.times.append(log_times_ns)
+        self.held_bytes += int(kept.sum())
+        smallest, largest = int(kept.min(initial=1 << 62)), int(kept.max(initial=0))
+        for size in [largest] if smallest == largest else np.unique(kept).tolist():
             rows = np.flatnonzero(kept == size)
             if not size:
                 self.stacks[size].append((first + rows, np.empty((len(rows), 0), np.uint8)))
@@ -137,4 +141,4 @@ class Topic:
 
     def empty(self) -> Topic:
         """The same topic without messages."""
-        return replace(self, times=[], stacks=defaultdict(list), unsound={}, _count=0)
+        return replace(self, times=[], stacks=defaultdict(list), unsound={}, held_bytes=0, _count=0)

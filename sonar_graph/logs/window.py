@@ -87,5 +87,6 @@ def first_time_ns(file: LogFile) -> int:
         if isinstance(item, ChunkRecord) and 0 < item.start_ns <= item.end_ns:
             times_ns.append(item.start_ns)
         elif isinstance(item, Stretch):
-            times_ns += find_by_walk(file.read(item.at, item.end - item.at)).log_times_ns[:1].tolist()
+            content = find_by_walk(file.read(item.at, item.end - item.at))
+            times_ns += [content.times_ns()[0]] if content.channels else []
     return min(times_ns, default=0)
