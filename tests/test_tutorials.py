@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -51,9 +52,33 @@ def test_library_page_prints_what_it_says(tmp_path: Path) -> None:
     assert 0 < abs(correlation) < 1
 
 
+def test_page_on_viewers_has_commands_and_a_program_that_work(tmp_path: Path) -> None:
+    page = (TUTORIALS / "03_viewers.md").read_text(encoding="utf-8")
+    here = Path(sys.executable).parent
+    environment = {**os.environ, "HOME": str(tmp_path), "MPLBACKEND": "Agg"}
+    short = ["basin", "-o", "basin.mcap", "--duration-s", "120", "--laps", "1"]
+    compared = ["basin.mcap", "-o", "comparison", "--estimators", "isam2"]
+    for command in (["simulate", *short], ["compare", *compared]):
+        subprocess.run([here / "sonar-graph", *command], cwd=tmp_path, check=True, capture_output=True)
+    lines = re.findall(r"^    (evo_\w+ .*)$|`(evo_\w+ [^`]*)`", page, re.MULTILINE)
+    assert len(lines) == 4
+    for name, *words in ((indented or inline).split() for indented, inline in lines):
+        command = [here / name, *words]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment, timeout=120)
+        assert done.returncode == 0, f"{name} {words}\n{done.stdout}{done.stderr}"
+        assert "rmse" in done.stdout or "poses" in done.stdout
+    (program,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    seen = re.findall(r"landmark (\d) at (-?[\d.]+), (-?[\d.]+)", done.stdout)
+    assert seen
+    for landmark, x_m, y_m in seen:
+        assert (float(x_m), float(y_m)) == pytest.approx(TRUE_LANDMARKS[int(landmark)], abs=0.3)
+
+
 def test_every_tutorial_is_listed_and_run() -> None:
     listed = (TUTORIALS / "README.md").read_text(encoding="utf-8")
     run_here = Path(__file__).read_text(encoding="utf-8")
-    for script in TUTORIALS.glob("*.py"):
+    for script in TUTORIALS.glob("0*"):
         assert script.name in listed
         assert script.name in run_here
