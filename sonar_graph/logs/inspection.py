@@ -10,9 +10,9 @@ import numpy as np
 from sonar_graph.errors import SonarGraphError
 from sonar_graph.logs.cdr import decode
 from sonar_graph.logs.container import STAMP_BYTES, Keep, Recording, Topic, scan
+from sonar_graph.logs.log_record import METADATA, read_calibration, read_notes
 from sonar_graph.logs.message_definitions import definition, short_name
 from sonar_graph.logs.mountings import static_frames
-from sonar_graph.logs.reading import METADATA, read_calibration, read_notes
 from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, TF, choose_topic
 from sonar_graph.logs.schema import Struct, parse_definition
 from sonar_graph.logs.table import header_stamps_ns

@@ -62,6 +62,8 @@ class Table:
     ) -> None:
         self.topic = topic
         self.groups = topic.messages()
+        if not self.groups:
+            raise LogError(f"{topic.file}: topic {topic.name}: none of its messages is what its definition says")
         log_times_ns = topic.log_times_ns
         if stamp == LOG_TIME:
             self.stamps_ns = log_times_ns

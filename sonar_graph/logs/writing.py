@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 
 from sonar_graph.logs import encoding
+from sonar_graph.logs.log_record import METADATA
 from sonar_graph.logs.mountings import encode_mountings
-from sonar_graph.logs.reading import METADATA
 from sonar_graph.logs.recorder import Outgoing, write_recording
 from sonar_graph.logs.roles import TF
 from sonar_graph.sequence import Sequence

@@ -25,6 +25,9 @@ _UUV_DVL_TYPES = (
     "smarc_msgs/msg/DVL",
 )
 
+Z_DOWN_TYPES = frozenset({"marine_acoustic_msgs/msg/Dvl"})
+"""Types whose definition says that z points downwards, which not all drivers follow."""
+
 
 @dataclass(frozen=True)
 class Shipped:

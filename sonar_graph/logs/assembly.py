@@ -1,0 +1,201 @@
+"""Chosen topics put together into a sequence, with an account of what was assumed, left out, and looks wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TypeVar
+
+from sonar_graph.calibration import Calibration, Mounting
+from sonar_graph.errors import LogError
+from sonar_graph.logs.adapters.adapter import Adapter
+from sonar_graph.logs.adapters.detection_array import DetectionArrayAdapter
+from sonar_graph.logs.adapters.doppler import DvlAdapter
+from sonar_graph.logs.adapters.inertial import ImuAdapter
+from sonar_graph.logs.adapters.reference import TruthAdapter
+from sonar_graph.logs.adapters.vertical import DepthAdapter
+from sonar_graph.logs.container import Recording
+from sonar_graph.logs.decoding import read_detections, read_landmark_map
+from sonar_graph.logs.log_record import read_calibration, read_notes, recorded_name
+from sonar_graph.logs.mountings import mounting_of, static_frames, with_mountings
+from sonar_graph.logs.roles import Choice
+from sonar_graph.logs.sanity import axes_warning, gravity_warning
+from sonar_graph.logs.table import Dropped
+from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import Trajectory
+
+_TABLES = frozenset({"imu", "dvl", "depth", "truth"})
+"""Roles whose messages are read as one table."""
+
+T = TypeVar("T")
+A = TypeVar("A", bound=Adapter)
+
+
+class Assembly:
+    """Reads the topics that were chosen.
+
+    Parameters
+    ----------
+    recording
+        The log.
+    choices
+        By role.
+    calibration
+        Instead of the one in the log.
+
+    Raises
+    ------
+    LogError
+        When messages of a chosen topic are not what they should be.
+    CalibrationError
+        When the calibration in the log is not one.
+    """
+
+    def __init__(
+        self, recording: Recording, choices: Mapping[str, Choice], calibration: Calibration | None = None
+    ) -> None:
+        self._recording = recording
+        self._topics = {role: recording.topics[c.topic] for role, c in choices.items() if c.topic is not None}
+        self._adapters = {role: c.adapter for role, c in choices.items() if c.adapter is not None}
+        self._tables = {
+            role: self._adapters[role].table(topic) for role, topic in self._topics.items() if role in _TABLES
+        }
+        self._dropped: dict[str, Dropped] = {}
+        self._is_mounting_known = True
+        self._notes = read_notes(recording)
+        self._notes["log.topics"] = "; ".join(f"{role}: {topic.name}" for role, topic in self._topics.items())
+        if "truth" in choices and choices["truth"].topic is None:
+            self._notes["log.truth"] = choices["truth"].reason
+        if recording.ending:
+            self._notes["log.ending"] = recording.ending
+        self.calibration = self._calibration(calibration)
+
+    def sequence(self, name: str | None = None) -> Sequence:
+        """All that was chosen as one sequence, called ``name``, or as the log calls itself, or like the file.
+
+        Raises
+        ------
+        LogError
+            When no row of IMU or DVL is fit for use, or a message breaks its own rules.
+        """
+        imu, dvl = self._needed("imu", self.imu()), self._needed("dvl", self.dvl())
+        sequence = Sequence(
+            name=name or recorded_name(self._recording) or self._recording.path.stem,
+            calibration=self.calibration,
+            imu=imu,
+            dvl=dvl,
+            depth=self.depth(),
+            detections=self.detections(),
+            truth=self.truth(),
+            true_landmarks=read_landmark_map(self._topics["true_landmarks"])
+            if "true_landmarks" in self._topics
+            else None,
+            notes=self._notes,
+        )
+        if self._dropped:
+            self._notes["log.dropped"] = "; ".join(self.left_out())
+        warnings = list(self.warnings())
+        if warnings:
+            self._notes["log.warnings"] = "; ".join(warnings)
+        return sequence
+
+    def imu(self) -> Imu | None:
+        """The inertial measurements; None where no topic or no row is fit."""
+        return self._kept("imu", self._adapter("imu", ImuAdapter).read(self._tables["imu"]))
+
+    def dvl(self) -> Dvl | None:
+        """The Doppler velocities; None where no topic or no row is fit."""
+        return self._kept("dvl", self._adapter("dvl", DvlAdapter).read(self._tables["dvl"]))
+
+    def depth(self) -> Depth | None:
+        """The heights; None where no topic or no row is fit."""
+        if "depth" not in self._tables:
+            return None
+        adapter = self._adapter("depth", DepthAdapter)
+        assumption = adapter.assumption(self.calibration.gravity_m_s2)
+        if assumption:
+            self._notes["log.depth"] = assumption
+        return self._kept("depth", adapter.read(self._tables["depth"], self.calibration.gravity_m_s2))
+
+    def detections(self) -> LandmarkDetections | None:
+        """The landmark detections; None where no topic or no row is fit."""
+        if "detections" not in self._topics:
+            return None
+        adapter, topic = self._adapters["detections"], self._topics["detections"]
+        outcome = adapter.read(topic) if isinstance(adapter, DetectionArrayAdapter) else read_detections(topic)
+        return self._kept("detections", outcome)
+
+    def truth(self) -> Trajectory | None:
+        """The reference poses; None where no topic or no row is fit."""
+        if "truth" not in self._tables:
+            return None
+        return self._kept("truth", self._adapter("truth", TruthAdapter).read(self._tables["truth"]))
+
+    def left_out(self) -> list[str]:
+        """Rows that were left out of what was read so far, by role and reason."""
+        return [f"{role}: {_list(dropped)}" for role, dropped in self._dropped.items()]
+
+    def warnings(self) -> Iterator[str]:
+        """What can be read but looks wrong."""
+        for role, table in self._tables.items():
+            yield from (f"{role}: {text}" for text in self._adapters[role].warnings(table))
+        if "imu" in self._tables and (imu := self.imu()) is not None:
+            text = gravity_warning(imu.specific_force, self.calibration.imu.mounting, self.calibration.gravity_m_s2)
+            yield from [f"imu: {text}"] if text else []
+        if "dvl" in self._tables and not self._is_mounting_known:
+            text = axes_warning(self._adapters["dvl"])
+            yield from [f"dvl: {text}"] if text else []
+
+    def _adapter(self, role: str, kind: type[A]) -> A:
+        adapter = self._adapters[role]
+        assert isinstance(adapter, kind)  # each role has adapters of one kind
+        return adapter
+
+    def _kept(self, role: str, outcome: tuple[T, Dropped]) -> T:
+        if outcome[1]:
+            self._dropped[role] = outcome[1]
+        return outcome[0]
+
+    def _needed(self, role: str, block: T | None) -> T:
+        if block is None:
+            topic = self._topics[role]
+            faults = _list(self._dropped.get(role, {}))
+            raise LogError(f"{topic.file}: topic {topic.name}: none of its {len(topic)} messages can be used: {faults}")
+        return block
+
+    def _calibration(self, given: Calibration | None) -> Calibration:
+        recorded = read_calibration(self._recording)
+        if given is not None:
+            self._notes["log.calibration"] = "given by the caller"
+            return given
+        if recorded is not None:
+            self._notes["log.calibration"] = "from the log"
+            return recorded
+        sensors = self._frames()
+        known = self._mountings(sensors)
+        missing = [f"{name} ({frame!r})" for name, frame in sensors.items() if name not in known]
+        self._is_mounting_known = "dvl" in known
+        self._notes["log.calibration"] = f"defaults; mountings from /tf_static: {', '.join(known) or 'none'}" + (
+            f"; not in the tree, taken as base_link: {', '.join(missing)}" if missing else ""
+        )
+        return with_mountings(Calibration(), known)
+
+    def _frames(self) -> dict[str, str]:
+        """The frame of each sensor, by the calibration's name for it."""
+        frames = {
+            role: self._adapters[role].frame_in(table.groups) for role, table in self._tables.items() if role != "truth"
+        }
+        if not frames.get("depth", "depth"):
+            del frames["depth"]  # a pose in the world: there is no port to mount
+        if "detections" in self._topics:
+            frames["sonar"] = self._adapters["detections"].frame_in(self._topics["detections"].messages())
+        return frames
+
+    def _mountings(self, sensors: Mapping[str, str]) -> dict[str, Mounting]:
+        tree = static_frames(self._recording)
+        found = {name: mounting_of(frame, tree) for name, frame in sensors.items()}
+        return {name: mounting for name, mounting in found.items() if mounting is not None}
+
+
+def _list(dropped: Dropped) -> str:
+    return ", ".join(f"{count} {fault}" for fault, count in dropped.items())
