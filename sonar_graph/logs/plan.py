@@ -19,14 +19,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sonar_graph.errors import LogError
 from sonar_graph.logs.schema import PRIMITIVES, STRING, Field, Struct
 
 HEADER_BYTES = 4
 LENGTH_BYTES = 4
 BYTE_ORDERS = "<>"
 _PHASES = 8
-_MOST_PARTS = 10_000
 
 
 def padding(at: int, size: int) -> int:
@@ -164,13 +162,7 @@ def _dtypes(kind: str) -> Mapping[str, np.dtype[Any]]:
 
 
 class Plan:
-    """A message type as steps.
-
-    Raises
-    ------
-    LogError
-        When it has more parts than any real type.
-    """
+    """A message type as steps."""
 
     def __init__(self, definition: Struct) -> None:
         self.name = definition.name
@@ -247,8 +239,6 @@ class Plan:
 
     def _next(self) -> int:
         self._parts += 1
-        if self._parts > _MOST_PARTS:
-            raise LogError(f"the definition of {self.name} has more than {_MOST_PARTS} parts; no real message has")
         return self._parts - 1
 
 

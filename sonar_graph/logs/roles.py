@@ -11,6 +11,7 @@ from sonar_graph.logs.adapters.config import LogConfig
 from sonar_graph.logs.adapters.shipped import SHIPPED, Shipped
 from sonar_graph.logs.container import Recording, Topic
 from sonar_graph.logs.message_definitions import short_name
+from sonar_graph.logs.refusal import refusal
 
 IMU = "sensor_msgs/msg/Imu"
 DVL = "marine_acoustic_msgs/msg/Dvl"
@@ -117,7 +118,7 @@ def _by_type(role: Role, recording: Recording, config: LogConfig) -> Choice:
 
 
 def _fits(role: Role, topic: Topic, *, general: bool) -> bool:
-    return topic.is_ros2 and any(
+    return any(
         short_name(offer.adapter.type) == short_name(topic.type_name)
         and (not offer.words or any(word in topic.name.lower() for word in offer.words))
         for offer in role.shipped
@@ -139,18 +140,15 @@ def _only(role: Role, recording: Recording, config: LogConfig, fitting: list[Top
 
 def adapter_for(role: Role, topic: Topic, config: LogConfig) -> Adapter | str:
     """How a topic would be read in a part, or why it cannot be."""
-    if not topic.is_ros2:
-        return f"is {topic.encoding or 'of no encoding'} with a {topic.schema_encoding or 'missing'} definition"
+    if (reason := refusal(topic)) is not None:
+        return reason
     table = config.table(role.name)
     if "type" in table and short_name(table["type"]) != short_name(topic.type_name):
         return f"is a {topic.type_name}, and {config.source} asks for a {table['type']}"
     adapters = config.adapters(role.name, topic.type_name)
     if not adapters:
         return f"is a {topic.type_name}, for which no adapter comes along: name type and fields in --log-config"
-    try:
-        missing = [adapter.missing_in(topic.definition()) for adapter in adapters]
-    except LogError as error:
-        return f"has a definition that cannot be read: {error}"
+    missing = [adapter.missing_in(topic.definition()) for adapter in adapters]
     for adapter, paths in zip(adapters, missing, strict=True):
         if not paths:
             return adapter
@@ -202,7 +200,7 @@ def _require(choice: Choice, recording: Recording, wanted: Mapping[str, str], co
 def topic_list(recording: Recording) -> str:
     """The topics of a log with their types, for a message."""
     entries = [
-        f"{t.name} ({t.type_name or 'no type'}{'' if t.is_ros2 else ', not ROS 2 CDR'})"
+        f"{t.name} ({t.type_name or 'no type'}{'' if (reason := refusal(t)) is None else f', {reason}'})"
         for t in recording.topics.values()
     ]
     return ", ".join(entries) or "no messages at all"

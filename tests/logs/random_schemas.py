@@ -1,0 +1,234 @@
+"""Random message types and values, and the comparison of this package's CDR with two other libraries.
+
+Each case is encoded by rosbags, decoded by mcap-ros2-support and by us, compared leaf for leaf, and encoded again by us
+byte for byte. As a command: ``python tests/logs/random_schemas.py [schemas] [messages] [seed]``.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from mcap_ros2._dynamic import generate_dynamic
+from rosbags.interfaces import Typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from sonar_graph.logs.cdr import Messages, decode, encode
+from sonar_graph.logs.schema import PRIMITIVES, STRING, Struct, parse_definition
+
+ROOT = "fuzz_msgs/msg/Root"
+TEXTS = ["", "a", "base_link", "ψ → 深い", "with \0 inside", "\U0001f420", "x" * 40]
+CONSTANTS = ["uint8 A=1", "float64 B = -1.5", 'string C="a # b"', "  # a comment: float64 no", "", "bool D=true"]
+DEFAULTS = {"bool": "true", "string": '"a b"', "float32": "-1.5", "float64": "1e-3"}
+BUILTIN = {"builtin_interfaces/Time": "int32 sec\nuint32 nanosec", "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec"}
+
+
+class RandomTypes:
+    """Draws message types, some of them nested in others."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self.texts: dict[str, str] = {}
+
+    def draw(self, name: str = "fuzz_msgs/Root", depth: int = 3) -> str:
+        """Adds a type with all that it uses."""
+        lines = []
+        for i in range(self._rng.integers(0 if depth < 3 else 1, 7)):
+            lines += [CONSTANTS[i]] if self._rng.random() < 0.2 else []
+            lines.append(self._field(f"f{i}", depth))
+        self.texts[name] = "\n".join(lines)
+        return name
+
+    def _field(self, name: str, depth: int) -> str:
+        kind = self._kind(depth)
+        array = str(self._rng.choice(["", "", "[]", "[3]", "[<=4]", "[1]"]))
+        if kind == STRING and self._rng.random() < 0.2:
+            kind = "string<=64"
+        default = ""
+        if not array and kind in {*PRIMITIVES, STRING} and self._rng.random() < 0.2:
+            default = " " + DEFAULTS.get(kind, "7")
+        comment = "  # [m] float64 x" if self._rng.random() < 0.2 and kind != STRING else ""
+        return f"{kind}{array} {name}{default}{comment}"
+
+    def _kind(self, depth: int) -> str:
+        draw = self._rng.random()
+        if draw < 0.3 and depth:
+            return self.draw(f"fuzz_msgs/T{len(self.texts)}x{depth}", depth - 1)
+        if draw < 0.4:
+            kind = str(self._rng.choice(list(BUILTIN)))
+            self.texts[kind] = BUILTIN[kind]
+            return kind
+        return str(self._rng.choice([*PRIMITIVES, STRING, STRING]))
+
+    def schema(self) -> str:
+        """The text of the root with all others."""
+        others = [f"{'=' * 80}\nMSG: {name}\n{text}\n" for name, text in self.texts.items() if name != "fuzz_msgs/Root"]
+        return self.texts["fuzz_msgs/Root"] + "\n" + "".join(others)
+
+
+def typestore(texts: dict[str, str]) -> Typestore:
+    """The types as rosbags knows them."""
+    store = get_typestore(Stores.EMPTY)
+    types: dict[str, Any] = {}
+    for name, text in texts.items():
+        types |= get_types_from_msg(text, name.replace("/", "/msg/"))
+    store.register(types)
+    return store
+
+
+def random_message(definition: Struct, store: Typestore, rng: np.random.Generator) -> Any:
+    """A message as rosbags has it; floats are random bits, with NaN and infinities among them."""
+    values = []
+    for entry in definition.fields:
+        count = entry.length if entry.length is not None else int(rng.choice([0, 1, 2, 4]))
+        if isinstance(entry.kind, Struct):
+            value: Any = [random_message(entry.kind, store, rng) for _ in range(count)]
+        elif entry.kind == STRING:
+            value = [str(rng.choice(TEXTS)) for _ in range(count)]
+        else:
+            value = random_numbers(PRIMITIVES[entry.kind], count, rng)
+            if entry.kind == "byte" and not entry.is_array:
+                value &= 0x7F  # rosbags packs a single byte as signed, unlike a list of them
+        values.append(value if entry.is_array else value[0])
+    if not definition.fields:
+        values = [0]
+    return store.types[definition.name.replace("/", "/msg/")](*values)
+
+
+def random_numbers(kind: str, count: int, rng: np.random.Generator) -> np.ndarray:
+    if kind == "?":
+        return rng.integers(0, 2, count).astype(bool)
+    numbers = np.frombuffer(rng.bytes(count * np.dtype(kind).itemsize), kind).copy()
+    if numbers.dtype.kind == "f":
+        special = np.array([np.nan, np.inf, -np.inf, -0.0, 1.5], kind)
+        numbers = np.where(rng.random(count) < 0.3, rng.choice(special, count), numbers)
+    return numbers
+
+
+def leaves_of(message: Any, definition: Struct, prefix: str, found: dict[str, list[Any]]) -> dict[str, list[Any]]:
+    """All values by path, in order, of a message as mcap-ros2-support decodes it; of arrays their lengths too."""
+    for entry in definition.fields:
+        path, value = prefix + entry.name, getattr(message, entry.name)
+        elements = list(value) if entry.is_array else [value]
+        if entry.is_array:
+            found.setdefault(f"len {path}", []).append(len(elements))
+        if isinstance(entry.kind, Struct):
+            for element in elements:
+                leaves_of(element, entry.kind, path + ".", found)
+        else:
+            found.setdefault(path, []).extend(x % 256 if entry.kind == "char" else x for x in elements)
+    return found
+
+
+def paths_of(definition: Struct, prefix: str = "") -> list[tuple[str, bool]]:
+    """Fields that hold values, and whether those are strings."""
+    found = []
+    for entry in definition.fields:
+        if isinstance(entry.kind, Struct):
+            found += paths_of(entry.kind, f"{prefix}{entry.name}.")
+        else:
+            found.append((prefix + entry.name, entry.kind == STRING))
+    return found
+
+
+def arrays_of(definition: Struct, prefix: str = "") -> list[str]:
+    """Paths of arrays and sequences."""
+    found = []
+    for entry in definition.fields:
+        found += [prefix + entry.name] if entry.is_array else []
+        found += arrays_of(entry.kind, f"{prefix}{entry.name}.") if isinstance(entry.kind, Struct) else []
+    return found
+
+
+def same_leaf(ours: Any, theirs: Any) -> bool:
+    return bool(ours == theirs or (ours != ours and theirs != theirs))
+
+
+def differences(group: Messages, at: int, definition: Struct, expected: dict[str, list[Any]]) -> list[str]:
+    """Paths at which a message of ours differs from the one that mcap-ros2-support decoded."""
+    found = []
+    for path, is_text in paths_of(definition):
+        ours = group.strings(path)[at] if is_text else np.atleast_1d(group[path][at]).tolist()
+        theirs = expected.get(path, [])
+        if len(ours) != len(theirs) or not all(map(same_leaf, ours, theirs)):
+            found.append(path)
+    return found + [p for p in arrays_of(definition) if group.lengths(p) != expected.get(f"len {p}", [])]
+
+
+def encoded_again(group: Messages, at: int, definition: Struct) -> bytes:
+    """A decoded message written from its columns and lengths."""
+    values: dict[str, Any] = {
+        path: group.strings(path)[at] if is_text else group[path][at : at + 1] for path, is_text in paths_of(definition)
+    }
+    lengths = {path: group.lengths(path) for path in arrays_of(definition)}
+    return encode(definition, 1, values, lengths)[0].tobytes()
+
+
+@dataclass
+class Tally:
+    """How many agreed, and what did not."""
+
+    schemas: int = 0
+    messages: int = 0
+    decoded_differently: int = 0
+    encoded_differently: int = 0
+    unsound: int = 0
+    examples: tuple[str, ...] = ()
+
+    @property
+    def is_clean(self) -> bool:
+        """Whether everything agreed."""
+        return not (self.decoded_differently or self.encoded_differently or self.unsound)
+
+
+def stacked(payloads: list[bytes]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """What the container hands over: payloads stacked by length."""
+    sizes = np.array([len(p) for p in payloads])
+    return [
+        (np.flatnonzero(sizes == size), np.array([np.frombuffer(p, np.uint8) for p in payloads if len(p) == size]))
+        for size in np.unique(sizes)
+    ]
+
+
+def check_schema(seed: int, messages: int, tally: Tally) -> None:
+    """Compare one random type with random values, in both byte orders."""
+    rng = np.random.default_rng(seed)
+    types = RandomTypes(rng)
+    types.draw()
+    schema = types.schema()
+    definition, store = parse_definition(ROOT, schema), typestore(types.texts)
+    oracle = generate_dynamic(ROOT, schema)[ROOT]
+    drawn = [random_message(definition, store, rng) for _ in range(messages)]
+    little = [bytes(store.serialize_cdr(message, ROOT)) for message in drawn]
+    big = [bytes(store.serialize_cdr(message, ROOT, little_endian=False)) for message in drawn]
+    padded = [payload + bytes(-len(payload) % 4) for payload in little + big]
+    tally.schemas += 1
+    decoded = decode(definition, stacked(padded))
+    tally.unsound += sum(map(len, decoded.unsound.values()))
+    for group in decoded.groups:
+        for at, row in enumerate(group.rows.tolist()):
+            expected = leaves_of(oracle(padded[row]), definition, "", {})
+            wrong = differences(group, at, definition, expected)
+            tally.messages += 1
+            tally.decoded_differently += bool(wrong)
+            again = encoded_again(group, at, definition)
+            tally.encoded_differently += again != little[row % messages]
+            if wrong or again != little[row % messages]:
+                tally.examples = (*tally.examples, f"seed {seed}, message {row}: {wrong}\n{schema}")[:3]
+
+
+def check(schemas: int, messages: int, seed: int = 0) -> Tally:
+    """Compare many random types."""
+    tally = Tally()
+    for i in range(schemas):
+        check_schema(seed + i, messages, tally)
+    return tally
+
+
+if __name__ == "__main__":
+    result = check(*map(int, sys.argv[1:] or (300, 10)))
+    print(*result.examples, sep="\n\n")
+    print(json.dumps({name: count for name, count in vars(result).items() if name != "examples"}))
