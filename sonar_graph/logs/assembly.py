@@ -13,13 +13,13 @@ from sonar_graph.logs.adapters.doppler import DvlAdapter
 from sonar_graph.logs.adapters.inertial import ImuAdapter
 from sonar_graph.logs.adapters.reference import TruthAdapter
 from sonar_graph.logs.adapters.vertical import DepthAdapter
-from sonar_graph.logs.container import Recording
+from sonar_graph.logs.container import Recording, Topic
 from sonar_graph.logs.decoding import read_detections, read_landmark_map
 from sonar_graph.logs.log_record import read_calibration, read_notes, recorded_name
 from sonar_graph.logs.mountings import mounting_of, static_frames, with_mountings
-from sonar_graph.logs.roles import Choice
+from sonar_graph.logs.roles import ROLES, Choice
 from sonar_graph.logs.sanity import axes_warning, gravity_warning
-from sonar_graph.logs.table import Dropped
+from sonar_graph.logs.table import Dropped, Table
 from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
@@ -57,10 +57,9 @@ class Assembly:
         self._recording = recording
         self._topics = {role: recording.topics[c.topic] for role, c in choices.items() if c.topic is not None}
         self._adapters = {role: c.adapter for role, c in choices.items() if c.adapter is not None}
-        self._tables = {
-            role: self._adapters[role].table(topic) for role, topic in self._topics.items() if role in _TABLES
-        }
         self._dropped: dict[str, Dropped] = {}
+        tables = {role: self._table(role, topic) for role, topic in self._topics.items() if role in _TABLES}
+        self._tables = {role: table for role, table in tables.items() if table is not None}
         self._is_mounting_known = True
         self._notes = read_notes(recording)
         self._notes["log.topics"] = "; ".join(f"{role}: {topic.name}" for role, topic in self._topics.items())
@@ -87,7 +86,7 @@ class Assembly:
             depth=self.depth(),
             detections=self.detections(),
             truth=self.truth(),
-            true_landmarks=read_landmark_map(self._topics["true_landmarks"])
+            true_landmarks=self._kept("true_landmarks", (read_landmark_map(self._topics["true_landmarks"]), {}))
             if "true_landmarks" in self._topics
             else None,
             notes=self._notes,
@@ -146,14 +145,34 @@ class Assembly:
             text = axes_warning(self._adapters["dvl"])
             yield from [f"dvl: {text}"] if text else []
 
+    def survey(self) -> tuple[list[str], list[str]]:
+        """What is left out and what looks wrong in all that was chosen, also where that is too little for a sequence."""
+        if "imu" in self._tables:
+            self.imu()
+        if "dvl" in self._tables:
+            self.dvl()
+        self.depth(), self.detections(), self.truth()
+        return self.left_out(), list(self.warnings())
+
     def _adapter(self, role: str, kind: type[A]) -> A:
         adapter = self._adapters[role]
         assert isinstance(adapter, kind)  # each role has adapters of one kind
         return adapter
 
+    def _table(self, role: str, topic: Topic) -> Table | None:
+        """None for a role that is not needed, where no message of its topic is sound."""
+        try:
+            return self._adapters[role].table(topic)
+        except LogError:
+            if len(topic) or ROLES[role].is_required:
+                raise
+            self._dropped[role] = topic.unsound
+            return None
+
     def _kept(self, role: str, outcome: tuple[T, Dropped]) -> T:
-        if outcome[1]:
-            self._dropped[role] = outcome[1]
+        dropped = self._topics[role].unsound | outcome[1]
+        if dropped:
+            self._dropped[role] = dropped
         return outcome[0]
 
     def _needed(self, role: str, block: T | None) -> T:
@@ -187,8 +206,8 @@ class Assembly:
         }
         if not frames.get("depth", "depth"):
             del frames["depth"]  # a pose in the world: there is no port to mount
-        if "detections" in self._topics:
-            frames["sonar"] = self._adapters["detections"].frame_in(self._topics["detections"].messages())
+        if "detections" in self._topics and (messages := self._topics["detections"].messages()):
+            frames["sonar"] = self._adapters["detections"].frame_in(messages)
         return frames
 
     def _mountings(self, sensors: Mapping[str, str]) -> dict[str, Mounting]:

@@ -20,8 +20,8 @@ def read_detections(topic: Topic) -> tuple[LandmarkDetections | None, Dropped]:
     LogError
         When the lists of a message do not belong together.
     """
-    log_times_ns = topic.log_times_ns
     groups = [group for group in topic.messages() if group["range_m"].shape[1]]
+    log_times_ns = topic.log_times_ns  # of sound messages, now that they are known
     if not groups:
         return None, {}
     parts = [_detection_columns(topic, group, log_times_ns) for group in groups]
@@ -63,15 +63,18 @@ def _widen(columns: np.ndarray, places: int, filling: int) -> np.ndarray:
     return np.pad(columns, ((0, 0), (0, places - columns.shape[1])), constant_values=filling)
 
 
-def read_landmark_map(topic: Topic) -> LandmarkMap:
-    """The last ``sonar_graph_msgs/LandmarkMap`` of a topic.
+def read_landmark_map(topic: Topic) -> LandmarkMap | None:
+    """The last sound ``sonar_graph_msgs/LandmarkMap`` of a topic; None where none is.
 
     Raises
     ------
     LogError
         When its lists do not belong together or an identity comes twice.
     """
-    last = next(group for group in topic.messages() if group.rows[-1] == len(topic) - 1)
+    groups = topic.messages()
+    if not groups:
+        return None
+    last = max(groups, key=lambda group: int(group.rows[-1]))
     ids, position, covariance = (last[name][-1] for name in ("ids", "position", "covariance"))
     count = len(ids)
     sizes = (len(np.unique(ids)), len(position), len(covariance))

@@ -63,7 +63,8 @@ class Table:
         self.topic = topic
         self.groups = topic.messages()
         if not self.groups:
-            raise LogError(f"{topic.file}: topic {topic.name}: none of its messages is what its definition says")
+            faults = ", ".join(f"{count} {fault}" for fault, count in topic.unsound.items())
+            raise LogError(f"{topic.file}: topic {topic.name}: no message is what its definition says: {faults}")
         log_times_ns = topic.log_times_ns
         if stamp == LOG_TIME:
             self.stamps_ns = log_times_ns

@@ -73,6 +73,8 @@ class SonarAdapter(Adapter):
         LogError
             When an image is not as long as beams and bins say.
         """
+        if not topic.messages():
+            return  # nothing sound in this piece of the log
         table = self.table(topic)
         for group in table.groups:
             yield from self._blocks(table, group)
