@@ -90,9 +90,9 @@ def test_examples_in_help_are_understood(
     path: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for name in ("dive.mcap", "vehicle.toml"):
+    for name in ("dive.mcap", "vehicle.toml", "dive.toml", "dive.bag"):
         Path(name).touch()
-    for name in ("comparison", "MRCLAM_Dataset6", "DLR", "A-KIT"):
+    for name in ("comparison", "MRCLAM_Dataset6", "DLR", "A-KIT", "ros2_bag_folder"):
         Path(name).mkdir()
     command = commands()[path]
     examples = examples_of(command)
@@ -206,7 +206,7 @@ def test_unforeseen_error_is_not_hidden(basin: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_compare_writes_report_numbers_results_and_runs(compared: Path) -> None:
-    for name in ("report.html", "comparison.json", "result.mcap"):
+    for name in ("report.html", "comparison.json", "result.mcap", "result.foxglove.json", "result.rviz"):
         assert (compared / name).stat().st_size > 1000
     for estimator in ("isam2", "ekf-slam", "dead-reckoning"):
         there = {path.name for path in (compared / "runs" / estimator).iterdir()}

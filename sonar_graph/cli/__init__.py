@@ -37,7 +37,9 @@ app = typer.Typer(
 )
 app.add_typer(worlds)
 app.add_typer(datasets)
-app.command(epilog=examples("sonar-graph inspect dive.mcap"))(inspect)
+app.command(epilog=examples("sonar-graph inspect dive.mcap", "sonar-graph inspect dive.mcap --toml > dive.toml"))(
+    inspect
+)
 app.command(
     epilog=examples(
         "sonar-graph run dive.mcap --estimator isam2 -o out",
@@ -48,6 +50,7 @@ app.command(
     epilog=examples(
         "sonar-graph compare dive.mcap -o comparison",
         "sonar-graph compare dive.mcap --estimators isam2,dead-reckoning --rate-hz 5 -o comparison",
+        "sonar-graph compare dive.mcap --log-config dive.toml -o comparison",
     )
 )(compare)
 app.command(epilog=examples("sonar-graph report comparison"))(report)

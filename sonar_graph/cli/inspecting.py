@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
+import typer
 from rich.markup import escape
 from rich.table import Table
 
-from sonar_graph.cli.arguments import LogPath
+from sonar_graph.cli.arguments import LogConfigPath, LogPath, TopicChoices
+from sonar_graph.cli.settings import read_config, topic_choices
 from sonar_graph.cli.texts import answers
 
 if TYPE_CHECKING:
@@ -16,11 +18,22 @@ if TYPE_CHECKING:
     from sonar_graph.logs.inspection import LogSummary, TopicSummary
 
 
-def inspect(log: LogPath) -> None:
+def inspect(
+    log: LogPath,
+    topics: TopicChoices = None,
+    log_config: LogConfigPath = None,
+    toml: Annotated[
+        bool, typer.Option("--toml", help="Print only the log configuration to start from, for --log-config.")
+    ] = False,
+) -> None:
     """Say what is in a log: topics, rates, gaps, and which topic would be used for what and why."""
     from sonar_graph.logs.inspection import inspect_log
 
-    _print_summary(answers(), inspect_log(log))
+    summary = inspect_log(log, read_config(log_config), topic_choices(topics or []))
+    if toml:
+        typer.echo(summary.toml, nl=False)
+    else:
+        _print_summary(answers(), summary)
 
 
 def _print_summary(console: Console, summary: LogSummary) -> None:
@@ -30,10 +43,23 @@ def _print_summary(console: Console, summary: LogSummary) -> None:
     console.print(f"[bold]calibration[/] {escape(summary.calibration)}", soft_wrap=True)
     for subject, note in summary.notes.items():
         console.print(f"[bold]{escape(subject)}[/] {escape(note)}", soft_wrap=True)
+    if summary.sonar:
+        console.print(f"[bold]sonar images[/] {escape(summary.sonar)}", soft_wrap=True)
+    for rows in summary.left_out:
+        console.print(f"[bold]left out[/] {escape(rows)}", soft_wrap=True)
+    for topic in summary.topics:
+        for fault in topic.stamp_faults:
+            console.print(f"[bold yellow]stamps[/] {escape(topic.name)}: {escape(fault)}", soft_wrap=True)
+    for warning in summary.warnings:
+        console.print(f"[bold yellow]warning[/] {escape(warning)}", soft_wrap=True)
     for loss in summary.damage:
         console.print(f"[bold red]damage[/] {escape(loss)}", soft_wrap=True)
     if summary.obstacles:
         console.print(f"[bold red]not usable for compare[/]: {escape(', '.join(summary.obstacles))}", soft_wrap=True)
+        hint = f"sonar-graph inspect {summary.path} --toml > log.toml"
+        console.print(
+            f"Say what its topics are: {escape(hint)}, edit it, and give --log-config log.toml", soft_wrap=True
+        )
 
 
 def _topics_table(summary: LogSummary) -> Table:

@@ -146,7 +146,7 @@ class Assembly:
             yield from [f"dvl: {text}"] if text else []
 
     def survey(self) -> tuple[list[str], list[str]]:
-        """What is left out and what looks wrong in all that was chosen, also where that is too little for a sequence."""
+        """What is left out and what looks wrong in all that was chosen, be it enough for a sequence or not."""
         if "imu" in self._tables:
             self.imu()
         if "dvl" in self._tables:

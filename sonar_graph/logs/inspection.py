@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from sonar_graph.errors import SonarGraphError
+from sonar_graph.errors import CalibrationError, SonarGraphError
+from sonar_graph.logs.adapters.config import LogConfig
+from sonar_graph.logs.assembly import Assembly
 from sonar_graph.logs.cdr import decode
 from sonar_graph.logs.container import STAMP_BYTES, Keep, Recording, Topic, scan
-from sonar_graph.logs.log_record import METADATA, read_calibration, read_notes
+from sonar_graph.logs.log_record import read_calibration, read_notes, recorded_name
 from sonar_graph.logs.message_definitions import definition, short_name
 from sonar_graph.logs.mountings import static_frames
-from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, TF, choose_topic
+from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, Choice, choose_topic, wanted_types
 from sonar_graph.logs.schema import Struct, parse_definition
-from sonar_graph.logs.table import header_stamps_ns
+from sonar_graph.logs.sonar_reading import describe_frames, read_sonar_frames
+from sonar_graph.logs.stamp_check import stamp_faults
+from sonar_graph.logs.starting_config import starting_config
+from sonar_graph.logs.table import NS_PER_S
 from sonar_graph.measurements import Ints
 
 _FRAMES_NAMED = 6
@@ -38,6 +44,8 @@ class TopicSummary:
     """Longest time between successive stamps."""
     stamps_from: str
     """``header`` or ``log``."""
+    stamp_faults: tuple[str, ...] = ()
+    """What is wrong with the stamps."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +74,14 @@ class LogSummary:
     notes: dict[str, str]
     damage: tuple[str, ...]
     """What is lost or cannot be read; empty for a sound file."""
+    left_out: tuple[str, ...] = ()
+    """Rows that are not fit for use, by role and reason."""
+    warnings: tuple[str, ...] = ()
+    """What can be read but looks wrong."""
+    sonar: str | None = None
+    """Size, sector and range of the sonar's first frames."""
+    toml: str = ""
+    """The log configuration to start from; read back unchanged it makes the same choices."""
 
     @property
     def obstacles(self) -> tuple[str, ...]:
@@ -92,34 +108,70 @@ class LogSummary:
         return (max(t.last_stamp_ns for t in topics) - min(t.first_stamp_ns for t in topics)) * 1e-9
 
 
-def inspect_log(path: Path) -> LogSummary:
+def inspect_log(path: Path, config: LogConfig | None = None, topics: Mapping[str, str] | None = None) -> LogSummary:
     """Summarise an MCAP file; what is wrong in it becomes part of the summary.
+
+    Parameters
+    ----------
+    path
+        The log.
+    config, topics
+        What the user says about topics, as of `read_sequence`.
 
     Raises
     ------
     LogError
         When there is no such file or it is not MCAP.
     """
-    recording = scan(Path(path), lambda kind: Keep.ALL if short_name(kind) == short_name(TF) else Keep.STAMP)
+    config = config or LogConfig()
+    types = wanted_types(config)
+    recording = scan(Path(path), lambda kind: Keep.ALL if short_name(kind) in types else Keep.STAMP)
     damage = [*recording.corrupt, *([recording.ending] if recording.ending else [])]
-    choices = [choose_topic(ROLES[name], recording) for name in SEQUENCE_ROLES]
+    choices = {name: choose_topic(role, recording, config, (topics or {}).get(name)) for name, role in ROLES.items()}
+    calibration, notes = _calibration(recording), _notes(recording, damage)
+    summaries = tuple(_summarise(topic) for topic in recording.topics.values())
+    left_out, warnings = _trial(recording, {name: choices[name] for name in SEQUENCE_ROLES}, damage)
     return LogSummary(
         path=recording.path,
-        name=recording.metadata.get(METADATA, {}).get("name"),
-        topics=tuple(_summarise(topic) for topic in recording.topics.values()),
-        roles=tuple(
-            RoleSummary(choice.role.name, choice.topic, choice.reason, choice.candidates) for choice in choices
-        ),
-        calibration=_calibration(recording),
-        notes=_notes(recording, damage),
+        name=recorded_name(recording),
+        topics=summaries,
+        roles=tuple(RoleSummary(c.role.name, c.topic, c.reason, c.candidates) for c in choices.values()),
+        calibration=calibration,
+        notes=notes,
         damage=tuple(damage),
+        left_out=tuple(left_out),
+        warnings=tuple(warnings),
+        sonar=_sonar(recording.path, choices[SONAR], config),
+        toml=starting_config(recording, list(choices.values())),
     )
 
 
+def _trial(recording: Recording, choices: Mapping[str, Choice], damage: list[str]) -> tuple[list[str], list[str]]:
+    """Read what was chosen, as a run would, for what is left out and what looks wrong."""
+    try:
+        return Assembly(recording, choices).survey()
+    except CalibrationError:
+        return [], []  # told where the calibration comes from
+    except SonarGraphError as error:
+        damage.append(str(error))
+        return [], []
+
+
+def _sonar(path: Path, choice: Choice, config: LogConfig) -> str | None:
+    """What the first frames of the sonar are like."""
+    if choice.topic is None:
+        return None
+    try:
+        frames = next(read_sonar_frames(path, choice.topic, config), None)
+    except SonarGraphError as error:
+        return f"cannot be read: {error}"
+    return describe_frames(frames) if frames else None
+
+
 def _summarise(topic: Topic) -> TopicSummary:
-    stamps_ns = _stamps_from_headers(topic)
-    origin = "log" if stamps_ns is None else "header"
-    stamps_ns = np.sort(topic.log_times_ns if stamps_ns is None else stamps_ns)
+    recorded = _stamps_from_headers(topic)
+    log_times_ns = topic.log_times_ns
+    stamps_ns = np.sort(log_times_ns if recorded is None else np.where(recorded == 0, log_times_ns, recorded))
     span_s = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
     return TopicSummary(
         name=topic.name,
@@ -130,12 +182,13 @@ def _summarise(topic: Topic) -> TopicSummary:
         last_stamp_ns=int(stamps_ns[-1]),
         rate_hz=(len(topic) - 1) / span_s if span_s > 0 else 0.0,
         largest_gap_s=float(np.diff(stamps_ns).max(initial=0)) * 1e-9,
-        stamps_from=origin,
+        stamps_from="log" if recorded is None else "header",
+        stamp_faults=() if recorded is None else tuple(stamp_faults(recorded, log_times_ns)),
     )
 
 
 def _stamps_from_headers(topic: Topic) -> Ints | None:
-    """Stamps read from the beginning of each message, or None where not every message has one there."""
+    """Stamps as they stand at the beginning of each message, or None where not every message has one there."""
     try:
         first = topic.definition().fields[:1] if topic.is_ros2 else ()
         if not first or not isinstance(first[0].kind, Struct) or first[0].is_array:
@@ -155,7 +208,7 @@ def _decode_stamps(topic: Topic) -> Ints | None:
     if decoded.unsound:
         return None
     for group in decoded.groups:
-        stamps_ns[group.rows] = header_stamps_ns(group, topic.log_times_ns, prefix="")
+        stamps_ns[group.rows] = group["sec"].astype(np.int64) * NS_PER_S + group["nanosec"]
     return stamps_ns
 
 

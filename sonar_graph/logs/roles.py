@@ -21,7 +21,8 @@ DETECTIONS = "sonar_graph_msgs/msg/LandmarkDetections"
 LANDMARK_MAP = "sonar_graph_msgs/msg/LandmarkMap"
 TF = "tf2_msgs/msg/TFMessage"
 
-_IMAGES = "sonar"
+SONAR = "sonar"
+"""The role of sonar images."""
 _DEFAULTS = LogConfig()
 
 
@@ -48,7 +49,7 @@ class Role:
 
 
 ROLES = {name: Role(name, shipped, is_required=name in ("imu", "dvl")) for name, shipped in SHIPPED.items()}
-SEQUENCE_ROLES = tuple(name for name in ROLES if name != _IMAGES)
+SEQUENCE_ROLES = tuple(name for name in ROLES if name != SONAR)
 """Those that make a `Sequence`; sonar images are read by themselves."""
 
 
@@ -63,6 +64,10 @@ class Choice:
     """How its messages are read."""
     candidates: tuple[str, ...] = field(default=())
     """The topics that fit, where they are several."""
+    could_be: tuple[str, ...] = field(default=())
+    """Topics that could be read for it, but whose names do not say that they play it."""
+    is_off: bool = False
+    """The user wants nothing to play it."""
 
 
 def wanted_types(config: LogConfig = _DEFAULTS, roles: Iterable[str] = SEQUENCE_ROLES) -> frozenset[str]:
@@ -85,7 +90,7 @@ def choose_topic(role: Role, recording: Recording, config: LogConfig = _DEFAULTS
     """
     table = config.table(role.name)
     if table.get("use") is False and wanted is None:
-        return Choice(role, None, f"switched off in {config.source}")
+        return Choice(role, None, f"switched off in {config.source}", is_off=True)
     named = wanted or table.get("topic") or None
     if named is not None:
         return _named(role, recording, config, named, "by name" if wanted else f"in {config.source}")
@@ -112,9 +117,9 @@ def _by_type(role: Role, recording: Recording, config: LogConfig) -> Choice:
         fitting = [t for t in recording.topics.values() if _fits(role, t, general=general)]
         if (choice := _only(role, recording, config, fitting)) is not None:
             return choice
-    others = [t.name for t in recording.topics.values() if not isinstance(adapter_for(role, t, config), str)]
+    others = tuple(t.name for t in recording.topics.values() if not isinstance(adapter_for(role, t, config), str))
     passed_over = f"; {', '.join(others)} only if chosen: --topic {role.name}={others[0]}" if others else ""
-    return Choice(role, None, f"no {role.describe()}{passed_over}")
+    return Choice(role, None, f"no {role.describe()}{passed_over}", could_be=others)
 
 
 def _fits(role: Role, topic: Topic, *, general: bool) -> bool:
@@ -190,8 +195,7 @@ def _require(choice: Choice, recording: Recording, wanted: Mapping[str, str], co
     if choice.candidates:
         raise LogError(f"{path}: for {role.name}, {choice.reason}; choose one: {advice(choice)}")
     is_asked_for = role.name in wanted or {"topic", "type"} & config.table(role.name).keys()
-    is_off = config.table(role.name).get("use") is False and role.name not in wanted
-    if choice.topic is None and (role.is_required or (is_asked_for and not is_off)):
+    if choice.topic is None and (role.is_required or (is_asked_for and not choice.is_off)):
         raise MissingTopicError(
             f"{path}: nothing for {role.name}: {choice.reason}; the log has {topic_list(recording)}"
         )

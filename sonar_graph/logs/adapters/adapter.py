@@ -42,7 +42,7 @@ class Adapter(Section):
 
     def missing_in(self, definition: Struct) -> list[str]:
         """Which of `fields` a message type does not have."""
-        known = set(leaf_paths(definition))
+        known = dict(leaf_fields(definition))
         return [path for path in self.fields() if field_of(path)[0] not in known]
 
     def table(self, topic: Topic) -> Table:
@@ -60,10 +60,11 @@ class Adapter(Section):
         yield from ()
 
 
-def leaf_paths(definition: Struct, prefix: str = "") -> Iterator[str]:
-    """Paths of all fields that hold values, through arrays and nested messages."""
+def leaf_fields(definition: Struct, prefix: str = "", size: str = "") -> Iterator[tuple[str, str]]:
+    """Paths of all fields that hold values, through nested messages, each with ``[n]`` or ``[]`` for its arrays."""
     for entry in definition.fields:
+        own = size + (f"[{entry.length or ''}]" if entry.is_array else "")
         if isinstance(entry.kind, Struct):
-            yield from leaf_paths(entry.kind, f"{prefix}{entry.name}.")
+            yield from leaf_fields(entry.kind, f"{prefix}{entry.name}.", own)
         else:
-            yield prefix + entry.name
+            yield prefix + entry.name, own

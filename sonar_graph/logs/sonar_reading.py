@@ -1,0 +1,55 @@
+"""Sonar images from a log, a chunk of the file at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from sonar_graph.errors import LogError
+from sonar_graph.logs.adapters.config import LogConfig
+from sonar_graph.logs.adapters.sonar_images import SonarAdapter
+from sonar_graph.logs.container import Keep, Recording, Topic, stream
+from sonar_graph.logs.message_definitions import short_name
+from sonar_graph.logs.roles import ROLES, SONAR, advice, choose_topic, wanted_types
+from sonar_graph.measurements import SonarFrames
+
+
+def read_sonar_frames(path: Path, topic: str | None = None, config: LogConfig | None = None) -> Iterator[SonarFrames]:
+    """Frames of one sonar, in blocks that share beams and bins; only one chunk of the file is held at a time.
+
+    Parameters
+    ----------
+    path
+        An MCAP file.
+    topic
+        Where several fit.
+    config
+        What the topics of a foreign log are; its table is ``[sonar]``.
+
+    Raises
+    ------
+    LogError
+        When several topics fit, or an image is not what its message says; a log without sonar images gives no block.
+    """
+    config = config or LogConfig()
+    types = wanted_types(config, roles=(SONAR,))
+    seen: dict[str, Topic] = {}
+    for piece in stream(Path(path), lambda kind: Keep.ALL if short_name(kind) in types else Keep.NONE):
+        seen.setdefault(piece.name, piece)
+        choice = choose_topic(ROLES[SONAR], Recording(Path(path), seen), config, topic)
+        if choice.candidates:
+            raise LogError(f"{path}: for {SONAR}, {choice.reason}; choose one: {advice(choice)}")
+        if choice.topic == piece.name and isinstance(choice.adapter, SonarAdapter):
+            yield from choice.adapter.read(piece)
+
+
+def describe_frames(frames: SonarFrames) -> str:
+    """Size, sector and range of a block, in words."""
+    _, beams, bins = frames.intensity.shape
+    left, right = np.degrees([frames.azimuths_rad.max(), frames.azimuths_rad.min()])
+    return (
+        f"{beams} beams x {bins} bins of {frames.intensity.dtype}, azimuth {right:.1f}° to {left:.1f}°, "
+        f"{frames.ranges_m.min():.2f} m to {frames.ranges_m.max():.2f} m"
+    )
