@@ -86,7 +86,8 @@ def write_result(
     for name, estimate in sources.items():
         messages += _estimator(name, estimate, colours[name], scene)
     messages += body_transforms("/tf", _bodies(sequence, sources))
-    record = {"sequence": sequence.name, "estimators": ",".join(estimates), "topics of them": ",".join(sources)}
+    messages = [entry for entry in messages if len(entry.log_times_ns)]
+    record = {"sequence": sequence.name, "estimators": ",".join(estimates), "topics": ",".join(sources)}
     write_recording(Path(path), messages, {RESULT_RECORD: record | dict(about or {})}, attachments)
     write_layouts(Path(path), _layers(messages, colours), scene)
 
@@ -168,7 +169,7 @@ def _bodies(sequence: Sequence, sources: Mapping[str, Estimates]) -> dict[str, T
 
 def _layers(messages: Iterable[Outgoing], colours: Mapping[str, Colour]) -> list[Layer]:
     """What a viewer may draw: every topic once."""
-    topics = {entry.topic: entry for entry in messages if len(entry.log_times_ns)}
+    topics = {entry.topic: entry for entry in messages}
     return [
         Layer(topic, entry.type_name, colours.get(topic.split("/")[1], GREY), is_latched=entry.is_latched)
         for topic, entry in topics.items()

@@ -47,7 +47,7 @@ def test_the_record_says_settings_versions_and_what_the_topics_are_of(folder: Pa
     assert environment.items() <= record.items()
     assert {"gtsam", "numpy", "sonar_graph", "date", "command"} <= record.keys()
     assert json.loads(record["settings of offset"])["offset_m"] == 0.4
-    assert record["estimators"] == "offset"
+    assert (record["estimators"], record["topics"]) == ("offset", "offset")
 
 
 def test_layouts_name_what_ran_and_not_what_failed(folder: Path) -> None:

@@ -166,6 +166,8 @@ def test_poses_survive_to_the_bit(make_sequence: Any, tmp_path: Path, decoded: A
         found = numbers(messages[topic])
         for name in ("stamps_ns", "positions", "quaternions_xyzw"):
             np.testing.assert_array_equal(found[name], getattr(expected, name), err_msg=f"{topic} {name}")
+    centres = [array.markers[0].pose.position for array in messages["/a/pose_ellipsoid"]]
+    np.testing.assert_array_equal([(c.x, c.y, c.z) for c in centres], causal.positions)
 
 
 def test_covariances_of_an_upright_body_are_reordered_to_the_bit(
@@ -192,6 +194,16 @@ def test_a_covariance_is_that_of_sampled_poses_about_the_axes_of_the_map(
     sampled = np.cov(np.hstack([moved, turned]).T) * 1e8
     found = numbers(messages["/a/pose"])["covariances"][0]
     np.testing.assert_allclose(found, sampled, atol=0.04 * np.abs(sampled).max())
+
+
+def test_an_estimator_without_covariances_has_no_ellipsoids(make_sequence: Any, tmp_path: Path, decoded: Any) -> None:
+    path = straight(0)
+    unsure = Trajectory.without_covariances(path.stamps_ns, path.positions, path.quaternions_xyzw)
+    messages = written(tmp_path, make_sequence(), decoded, a=(unsure, unsure, NO_LANDMARKS))
+    assert not numbers(messages["/a/pose"])["covariances"].any()
+    assert "/a/pose_ellipsoid" not in messages
+    for layout in ("r.foxglove.json", "r.rviz"):
+        assert "pose_ellipsoid" not in (tmp_path / layout).read_text("utf-8")
 
 
 # --- names ----------------------------------------------------------------------------------------------------------
