@@ -55,7 +55,7 @@ class Messages:
         column = self.layout.column(path)
         values = _view(self.payloads, column)
         if values is None:
-            values = self.payloads[:, _places(column)].view(column.dtype)
+            values = np.ascontiguousarray(self.payloads[:, _places(column)]).view(column.dtype)
         return values[:, 0] if column.is_single else values
 
     def lengths(self, path: str) -> list[int]:
@@ -237,7 +237,8 @@ def _fill(payloads: Bytes, path: str, column: Column, value: Value) -> None:
         payloads[:, _places(column)] = np.frombuffer(characters, np.uint8)
         return
     given = np.asarray(value)
-    numbers = given.astype(column.dtype)
+    with np.errstate(invalid="ignore"):  # the next line finds it
+        numbers = given.astype(column.dtype)
     if column.dtype.kind in "iu" and not np.array_equal(numbers, given):
         raise ValueError(f"{path}: a number does not fit into {column.dtype}")
     numbers = numbers.reshape(-1, 1) if numbers.ndim == 1 and column.is_single else numbers

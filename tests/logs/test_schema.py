@@ -69,8 +69,31 @@ def test_types_of_the_own_package_need_no_prefix_and_time_needs_no_definition() 
         ("wstring text\n", "wstring"),
         ("float64\n", "no ros2msg field"),
         (f"Part p\n{RULE}\nMSG: some_msgs/Part\nPart[] p\n", "within itself"),
+        ("Thing[] things\n", "within itself"),
+        ("float64 x\nint8 x\n", "two fields called x"),
+        ("float64[0] x\n", "no ros2msg field"),
+        ("{}", "no ros2msg field"),
     ],
 )
 def test_what_cannot_be_understood_is_named(text: str, message: str) -> None:
     with pytest.raises(LogError, match=message):
         parse_definition(NAME, text)
+
+
+def doubling(levels: int) -> str:
+    """Types of which each has two of the next: a few lines with as many fields as 2 to the power of their number."""
+    names = [f"some_msgs/T{i}" for i in range(levels)] + ["float64"]
+    parts = [f"MSG: {name}\n{names[i + 1]} a\n{names[i + 1]} b\n" for i, name in enumerate(names[:-1])]
+    return f"T0 root\n{RULE}\n" + f"{RULE}\n".join(parts)
+
+
+def test_a_definition_that_grows_without_bounds_is_refused_at_once() -> None:
+    assert len(parse_definition(NAME, doubling(8)).fields) == 1
+    with pytest.raises(LogError, match="more than 10000 fields"):
+        parse_definition(NAME, doubling(45))
+
+
+def test_a_definition_nested_without_bounds_is_refused() -> None:
+    chain = "".join(f"{RULE}\nMSG: some_msgs/T{i}\nT{i + 1} next\n" for i in range(3000))
+    with pytest.raises(LogError, match="more than 50 deep"):
+        parse_definition(NAME, "T0 first\n" + chain)
