@@ -1,0 +1,257 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.errors import LogError, MissingTopicError
+
+VELOCITY = (1.0, 2.0, 3.0)
+KNOWN = [0.1, 0.01, 0, 0.01, 0.2, 0, 0, 0, 0.3]
+
+
+def beam(number: int) -> dict[str, Any]:
+    return {"id": number, "velocity": 0.1 * number, "distance": 2.0, "rssi": 0.0, "nsd": 0.0, "valid": True}
+
+
+def water_linked(foreign: Any, rows: list[dict[str, Any]], **other: Any) -> list[dict[str, Any]]:
+    return [
+        {"header": foreign.header(i), "velocity": foreign.vector(*VELOCITY), "fom": 0.02, "velocity_valid": True}
+        | {"beams": [], "form": "json_v3", **other, **row}
+        for i, row in enumerate(rows)
+    ]
+
+
+def test_water_linked_has_a_standard_deviation_and_any_number_of_beams(foreign: Any, read: Any) -> None:
+    rows = [{"beams": [beam(i) for i in range(n)]} for n in (4, 3, 0, 4)] + [{"velocity_valid": False}]
+    sequence = read(foreign.imu(), ("/dvl/data", "dvl_msgs/msg/DVL", water_linked(foreign, rows)))
+    assert ((sequence.dvl.stamps_ns - foreign.t0_ns) // foreign.step_ns).tolist() == [0, 1, 2, 3]
+    np.testing.assert_array_equal(sequence.dvl.velocity, [VELOCITY] * 4)
+    np.testing.assert_allclose(sequence.dvl.velocity_cov, [np.eye(3) * 0.02**2] * 4)
+    assert sequence.notes["log.dropped"] == "dvl: 1 with velocity_valid not true"
+
+
+def test_forks_of_water_linked_bring_the_whole_covariance(foreign: Any, read: Any) -> None:
+    as_rows = {"cov": [foreign.vector(*row) for row in np.reshape(KNOWN, (3, 3)).tolist()]}
+    none = {"cov": []}
+    forks = [("geometry_msgs/Vector3[] cov", [as_rows] * 2), ("float64[9] covariance", [{"covariance": KNOWN}] * 2)]
+    for text, rows in forks:
+        entry = ("/dvl", "dvl_msgs/msg/DVL", water_linked(foreign, rows), foreign.water_linked(text))
+        np.testing.assert_array_equal(read(foreign.imu(), entry).dvl.velocity_cov, [np.reshape(KNOWN, (3, 3))] * 2)
+    entry = ("/dvl", "dvl_msgs/msg/DVL", water_linked(foreign, [none] * 2), foreign.water_linked(forks[0][0]))
+    assert np.isnan(read(foreign.imu(), entry).dvl.velocity_cov).all()
+
+
+def test_simulators_say_invalid_by_minus_one_and_unknown_by_zeros(foreign: Any, read: Any) -> None:
+    covariances = [KNOWN, [0.0] * 9, [-1.0] + [0.0] * 8]
+    messages = [
+        {"header": foreign.header(i), "velocity": foreign.vector(*VELOCITY), "velocity_covariance": c, "beams": []}
+        for i, c in enumerate(covariances)
+    ]
+    sequence = read(foreign.imu(), ("/rov/dvl", "stonefish_ros2/msg/DVL", messages))
+    assert len(sequence.dvl) == 2
+    np.testing.assert_array_equal(sequence.dvl.velocity_cov[0], np.reshape(KNOWN, (3, 3)))
+    assert np.isnan(sequence.dvl.velocity_cov[1]).all()
+    assert sequence.notes["log.dropped"] == "dvl: 1 with a covariance that says invalid"
+
+
+def twists(foreign: Any, covariance: list[float] | None = None) -> list[dict[str, Any]]:
+    twist = {"linear": foreign.vector(*VELOCITY), "angular": foreign.vector(7, 8, 9)}
+    inner = {"twist": twist, "covariance": covariance or np.diag([1.0, 2, 3, 4, 5, 6]).ravel().tolist()}
+    return [{"header": foreign.header(i, "dvl_link"), "twist": inner} for i in range(3)]
+
+
+TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+def test_a_twist_is_a_doppler_log_where_its_name_says_so_or_it_is_chosen(foreign: Any, read: Any) -> None:
+    sequence = read(foreign.imu(), ("/dvl/twist", TWIST, twists(foreign)))
+    np.testing.assert_array_equal(sequence.dvl.velocity, [VELOCITY] * 3)
+    np.testing.assert_array_equal(sequence.dvl.velocity_cov, [np.diag([1.0, 2, 3])] * 3)
+    with pytest.raises(MissingTopicError, match="/wheels only if chosen: --topic dvl=/wheels"):
+        read(foreign.imu(), ("/wheels", TWIST, twists(foreign)))
+    assert len(read(foreign.imu(), ("/wheels", TWIST, twists(foreign)), topics={"dvl": "/wheels"}).dvl) == 3
+
+
+def test_a_real_doppler_log_goes_before_a_twist(foreign: Any, read: Any) -> None:
+    sequence = read(foreign.imu(), foreign.dvl(rows=4), ("/dvl/twist", TWIST, twists(foreign)))
+    assert len(sequence.dvl) == 4
+
+
+def test_the_twist_of_odometry_is_in_the_frame_of_its_child(foreign: Any, read: Any) -> None:
+    odometry = [
+        {"header": message["header"] | {"frame_id": "odom"}, "child_frame_id": "dvl_link", "twist": message["twist"]}
+        for message in twists(foreign)
+    ]
+    rotation = {"x": 0.0, "y": 0.0, "z": 1.0, "w": 0.0}
+    link = {"header": foreign.header(0, "base_link"), "child_frame_id": "dvl_link"}
+    link["transform"] = {"translation": foreign.vector(0.5, 0, 0), "rotation": rotation}
+    tree = ("/tf_static", "tf2_msgs/msg/TFMessage", [{"transforms": [link]}])
+    sequence = read(foreign.imu(), ("/odom", ODOMETRY, odometry), tree, topics={"dvl": "/odom"})
+    np.testing.assert_array_equal(sequence.dvl.velocity, [VELOCITY] * 3)
+    assert sequence.calibration.dvl.mounting.translation_m == (0.5, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("rotation", "expected"),
+    [('"flu"', (1, 2, 3)), ('"frd"', (1, -2, -3)), ("[180, 0, 0]", (1, -2, -3)), ("[0, 0, 90]", (-2, 1, 3))],
+)
+def test_the_axes_of_a_driver_are_turned_into_ours(
+    foreign: Any, read: Any, rotation: str, expected: tuple[float, ...]
+) -> None:
+    toml = f"[dvl]\nrotation = {rotation}"
+    sequence = read(foreign.imu(), foreign.dvl(velocity_covar=KNOWN), toml=toml)
+    np.testing.assert_allclose(sequence.dvl.velocity, [expected] * 5, atol=1e-15)
+    # a covariance is turned as the velocity is: by the matrix that did it
+    columns = [
+        read(foreign.imu(), foreign.dvl(velocity=foreign.vector(*unit)), toml=toml).dvl.velocity[0]
+        for unit in np.eye(3).tolist()
+    ]
+    R = np.column_stack(columns)
+    np.testing.assert_allclose(sequence.dvl.velocity_cov[0], R @ np.reshape(KNOWN, (3, 3)) @ R.T, atol=1e-15)
+
+
+def test_scale_turns_units_and_covariances_with_them(foreign: Any, read: Any) -> None:
+    entry = foreign.dvl(velocity=foreign.vector(1000, 2000, 3000), velocity_covar=(np.array(KNOWN) * 1e6).tolist())
+    sequence = read(foreign.imu(), entry, toml="[dvl]\nscale = 0.001")
+    np.testing.assert_allclose(sequence.dvl.velocity, [VELOCITY] * 5)
+    np.testing.assert_allclose(sequence.dvl.velocity_cov, [np.reshape(KNOWN, (3, 3))] * 5)
+
+
+def test_a_standard_deviation_given_as_a_variance_is_squared(foreign: Any, read: Any) -> None:
+    deviations = np.diag([0.1, 0.2, 0.3]).ravel().tolist()
+    entry = foreign.dvl(velocity_covar=deviations)
+    assert read(foreign.imu(), entry).dvl.velocity_cov[0, 1, 1] == 0.2
+    toml = '[dvl]\ncovariance = {meaning = "standard deviation"}'
+    np.testing.assert_allclose(
+        read(foreign.imu(), entry, toml=toml).dvl.velocity_cov, [np.diag([0.01, 0.04, 0.09])] * 5
+    )
+
+
+@pytest.mark.parametrize(
+    ("toml", "rows", "unknown"),
+    [
+        ("", 3, [False, True, True]),
+        ('covariance = {negative = "invalid"}', 2, [False, True]),
+        ('covariance = {zero = "invalid"}', 2, [False, True]),
+        ("covariance = false", 3, [True, True, True]),
+    ],
+)
+def test_the_meaning_of_zeros_and_of_minus_one_can_be_said(
+    foreign: Any, read: Any, toml: str, rows: int, unknown: list[bool]
+) -> None:
+    topic, kind, messages = foreign.dvl(rows=3)
+    for message, covariance in zip(messages, [KNOWN, [0.0] * 9, [-1.0] + [0.0] * 8], strict=True):
+        message["velocity_covar"] = covariance
+    found = read(foreign.imu(), (topic, kind, messages), toml=f"[dvl]\n{toml}").dvl.velocity_cov
+    assert np.isnan(found).all(axis=(1, 2)).tolist() == unknown
+    assert len(found) == rows
+
+
+def packets(velocities: list[list[float]]) -> tuple[str, str, list[dict[str, Any]]]:
+    rows = [{"timestamp": 1.4e15 + 1e5 * i, "range": [1.0] * 4, "velocity": v} for i, v in enumerate(velocities)]
+    return "/pd0", "provider_dvl/msg/PD0Packet", rows
+
+
+TABLE = '[dvl]\ntopic = "/pd0"\ntype = "provider_dvl/msg/PD0Packet"\n'
+OF_ARRAY = TABLE + 'velocity = ["velocity[0]", "velocity[1]", "velocity[2]"]\n'
+
+
+def test_a_type_of_which_nothing_is_known_needs_only_its_fields(foreign: Any, read: Any) -> None:
+    entry = packets([[1.0, 2.0, 3.0, 0.01]] * 5)
+    sequence = read(foreign.imu(), entry, toml=OF_ARRAY + 'stamp = "log"')
+    np.testing.assert_array_equal(sequence.dvl.velocity, [VELOCITY] * 5)
+    assert np.isnan(sequence.dvl.velocity_cov).all()
+    assert sequence.dvl.stamps_ns.tolist() == sequence.imu.stamps_ns.tolist()
+
+
+def test_a_stamp_can_be_a_number_of_any_unit_and_be_shifted(foreign: Any, read: Any) -> None:
+    toml = OF_ARRAY + 'stamp = "timestamp"\nstamp_unit_s = 1e-6\nstamp_offset_s = 3e8'
+    stamps_ns = read(foreign.imu(), packets([[1.0, 2.0, 3.0, 0.0]] * 3), toml=toml).dvl.stamps_ns
+    assert (stamps_ns - foreign.t0_ns).tolist() == [0, 10**8, 2 * 10**8]
+
+
+@pytest.mark.parametrize(
+    ("toml", "message"),
+    [
+        (OF_ARRAY.replace("[2]", "[4]") + 'stamp = "log"', r"/pd0: field velocity\[4\] .* has 4 elements"),
+        (OF_ARRAY.replace("velocity[2]", "velocity") + 'stamp = "log"', r"velocity .* is an array of 4; name one"),
+        (OF_ARRAY, r"/pd0: its provider_dvl/msg/PD0Packet has no field header\.stamp\.sec"),
+        (OF_ARRAY.replace("velocity[2]", "speed"), r"nothing for dvl: /pd0 was chosen but has no field speed"),
+    ],
+)
+def test_a_field_that_is_not_there_is_named(foreign: Any, read: Any, toml: str, message: str) -> None:
+    with pytest.raises(LogError, match=message):
+        read(foreign.imu(), packets([[1.0, 2.0, 3.0, 0.0]] * 3), toml=toml)
+
+
+def janus(tilt_deg: float, azimuth_deg: list[float]) -> np.ndarray:
+    """Beam directions by turning the vertical: first outwards, then about itself."""
+    return np.array(
+        [Rotation.from_euler("yz", [tilt_deg, azimuth], degrees=True).apply([0, 0, 1]) for azimuth in azimuth_deg]
+    )
+
+
+@pytest.mark.parametrize("lost", [None, 2])
+def test_a_velocity_is_solved_from_its_beams(foreign: Any, read: Any, lost: int | None) -> None:
+    along = (janus(30, [45, -45, -135, 135]) @ VELOCITY).tolist()
+    if lost is not None:
+        along[lost] = float("nan")
+    geometry = 'beams = {velocity = "velocity", tilt_deg = 30, azimuth_deg = [45, -45, -135, 135]}\nstamp = "log"'
+    found = read(foreign.imu(), packets([along] * 3), toml=TABLE + geometry).dvl.velocity
+    np.testing.assert_allclose(found, [VELOCITY] * 3, atol=1e-12)
+
+
+def test_two_beams_are_no_velocity(foreign: Any, read: Any) -> None:
+    rows = [[1.0, 1.0, float("nan"), float("nan")], [1.0, 1.0, 1.0, 1.0]]
+    geometry = 'beams = {velocity = "velocity", tilt_deg = 30, azimuth_deg = [45, -45, -135, 135]}\nstamp = "log"'
+    assert len(read(foreign.imu(), packets(rows), toml=TABLE + geometry).dvl) == 1
+
+
+SINE, COSINE = float(np.sin(np.radians(22.5))), float(np.cos(np.radians(22.5)))
+
+
+def unit_vectors(foreign: Any, across: float, down: float) -> dict[str, Any]:
+    return {"beam_unit_vec": [foreign.vector(x, y, down) for x in (-across, across) for y in (-across, across)]}
+
+
+@pytest.mark.parametrize(
+    ("across", "down", "tilt", "warned"),
+    [
+        (0.6533, SINE, None, "tilted by 67.5°, which no Doppler log is: the driver seems to publish the sine of 22.5°"),
+        (SINE / 2**0.5, COSINE, None, None),
+        (SINE / 2**0.5, COSINE, 30, "tilted by 22.5°, the configured beams by 30°"),
+        (SINE / 2**0.5, COSINE, 22.5, None),
+        (0.6533, 0.8, None, "no unit vectors"),
+    ],
+)
+def test_beam_directions_are_doubted_and_never_used(
+    foreign: Any, read: Any, across: float, down: float, tilt: float | None, warned: str | None
+) -> None:
+    geometry = f"beams = {{tilt_deg = {tilt}, azimuth_deg = [45, -45, 135, -135]}}" if tilt else ""
+    entry = foreign.dvl(sound_speed=1480.0, **unit_vectors(foreign, across, down))
+    sequence = read(foreign.imu(), entry, toml=f'[dvl]\nrotation = "frd"\n{geometry}')
+    assert (warned is None) == ("log.warnings" not in sequence.notes)
+    assert warned is None or warned in sequence.notes["log.warnings"]
+    np.testing.assert_array_equal(np.abs(sequence.dvl.velocity), [VELOCITY] * 5)
+
+
+def test_fields_that_a_driver_leaves_alone_are_mentioned(foreign: Any, read: Any) -> None:
+    lying = foreign.dvl(beam_ranges_valid=True, range=[2.0, 0.0, 2.0, 2.0], sound_speed=0.0)
+    warnings = read(foreign.imu(), lying).notes["log.warnings"]
+    assert "beam_ranges_valid is true in 5 messages that have a range of 0 or less" in warnings
+    assert "sound_speed is 0 in every message" in warnings
+    honest = foreign.dvl(beam_ranges_valid=True, range=[2.0] * 4, sound_speed=1480.0)
+    assert "log.warnings" not in read(foreign.imu(), honest, toml='[dvl]\nrotation = "frd"').notes
+
+
+def test_z_down_by_definition_is_mentioned_where_nothing_says_how_the_instrument_sits(foreign: Any, read: Any) -> None:
+    entry = foreign.dvl(sound_speed=1480.0)
+    assert "marine_acoustic_msgs/msg/Dvl has z downwards" in read(foreign.imu(), entry).notes["log.warnings"]
+    link = {"header": foreign.header(0, "base_link"), "child_frame_id": "sensor"}
+    link["transform"] = {"translation": foreign.vector(0, 0, 0), "rotation": {"x": 1.0, "y": 0.0, "z": 0.0, "w": 0.0}}
+    tree = ("/tf_static", "tf2_msgs/msg/TFMessage", [{"transforms": [link]}])
+    assert "log.warnings" not in read(foreign.imu(), entry, tree).notes
