@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from heapq import merge
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 
 from sonar_graph.logs.cdr import Bytes, encode
 from sonar_graph.logs.message_definitions import definition
@@ -73,7 +74,15 @@ def definition_of(topic: str) -> str:
     return SONAR_DEFINITION if topic == SONAR else definition(TYPES[topic])
 
 
-def write_mission(path: Path, duration_s: float, frames: int, *, frame_repeats: int = 1) -> int:
+def write_mission(
+    path: Path,
+    duration_s: float,
+    frames: int,
+    *,
+    frame_repeats: int = 1,
+    chunk_bytes: int = CHUNK_BYTES,
+    **settings: Any,
+) -> int:
     """Write the log; its payload in bytes.
 
     Parameters
@@ -86,6 +95,8 @@ def write_mission(path: Path, duration_s: float, frames: int, *, frame_repeats: 
         Sonar images, equally spaced.
     frame_repeats
         How many times each image is stored, a nanosecond apart: a quick way to a large file.
+    chunk_bytes, settings
+        Of mcap's writer.
     """
     rng = np.random.default_rng(0)
     sensors = {topic: _sensor(topic, duration_s, rng) for topic in RATES_HZ}
@@ -93,8 +104,9 @@ def write_mission(path: Path, duration_s: float, frames: int, *, frame_repeats: 
     streams.append(_sonar(duration_s, frames, frame_repeats, rng))
     size = 0
     with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        writer = Writer(stream, chunk_size=chunk_bytes, **settings)
         writer.start("ros2", "benchmark")
+        writer.add_metadata("mission", {"site": "basin", "depth_m": "12.5"})
         channels = {}
         for topic, kind in TYPES.items():
             schema = writer.register_schema(kind, "ros2msg", definition_of(topic).encode())

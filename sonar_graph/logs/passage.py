@@ -235,7 +235,8 @@ class Passage:
                 found = parse(Metadata.read, self._file.content(record))
                 content, is_sealed = open_seal(found.metadata)
             except LogError as error:
-                self._lose(record.at, record.end, f"a metadata record is lost: {error}", messages={})
+                end = self._walk.search(record.at).end  # its length may be what is wrong
+                self._lose(record.at, end, f"a metadata record is lost: {error}", messages={})
                 return
             self.metadata[found.name] = content
             if not is_sealed:

@@ -10,7 +10,7 @@ Format: https://mcap.dev/spec
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -129,8 +129,10 @@ class LogFile:
 
     def read(self, at: int, count: int) -> bytes:
         """Bytes from an offset on; fewer than asked for at the end of the file."""
+        if at >= self.size:  # a damaged length may point anywhere
+            return b""
         self._stream.seek(at)
-        return self._stream.read(count)
+        return self._stream.read(min(count, self.size - at))
 
     def content(self, record: Record) -> bytes:
         """What a record holds."""
@@ -251,8 +253,18 @@ class Walk:
         return at + (place if at + place == self._stop_at else last)
 
     def _next_record(self, start: int) -> int | None:
-        """Where the next trustworthy record begins: a chunk or metadata; in a file without chunks three in a row."""
-        kinds = [Opcode.CHUNK, Opcode.METADATA, *(LOOSE if self._is_loose and not self._has_chunks else ())]
+        """Where the next trustworthy record begins: a chunk or metadata; in a file without chunks three in a row.
+
+        What looks like a message is not taken for one in a file with chunks: it may lie within a damaged chunk.
+        """
+        found = None
+        if not self._is_loose or self._has_chunks:
+            found = self._next_of(start, (Opcode.CHUNK, Opcode.METADATA))
+        if found is None and not self._has_chunks:
+            found = self._next_of(start, (Opcode.METADATA, *LOOSE))
+        return found
+
+    def _next_of(self, start: int, kinds: Sequence[Opcode]) -> int | None:
         for block_at in range(start, self._stop_at, _BLOCK):
             block = self._file.read(block_at, _BLOCK + HEAD.size)
             for offset in _places_of(block, kinds, self._stop_at):
@@ -273,7 +285,7 @@ class Walk:
         return True
 
 
-def _places_of(block: bytes, kinds: list[Opcode], limit: int) -> list[int]:
+def _places_of(block: bytes, kinds: Sequence[Opcode], limit: int) -> list[int]:
     """Offsets at which a byte is one of the kinds and the eight after it are a length below the limit."""
     octets = np.frombuffer(block, np.uint8)
     if len(octets) < HEAD.size:

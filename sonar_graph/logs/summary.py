@@ -18,6 +18,8 @@ from sonar_graph.logs.records import HEAD, MAGIC, LogFile
 
 _FOOTER = struct.Struct("<BQQQI")
 _DATA_END = struct.Struct("<BQI")
+_DATA_END_HEAD = HEAD.pack(Opcode.DATA_END, 4)
+_LARGEST_MOVED = 1 << 26
 
 T = TypeVar("T", bound=Any)
 
@@ -70,18 +72,40 @@ def read_summary(file: LogFile) -> tuple[Summary | None, str | None]:
     least = len(MAGIC) + _DATA_END.size
     if opcode != Opcode.FOOTER or length != _FOOTER.size - HEAD.size or not least <= end <= footer_at:
         return None, "its footer is damaged"
-    content = file.read(end, footer_at - end)
-    if crc and zlib.crc32(tail[: _FOOTER.size - 4], zlib.crc32(content)) != crc:
-        return None, "its summary is damaged: the CRC does not fit"
-    return _read(file, content, end - _DATA_END.size, has_crc=crc != 0)
+    if crc and _crc(file, end, footer_at) != crc:
+        moved = _moved_start(file, footer_at, crc)
+        if moved is None:
+            return None, "its summary is damaged: the CRC does not fit"
+        summary, _ = _read(file, moved, footer_at, has_crc=True)
+        if summary:
+            summary.chunks.clear()
+        return summary, "bytes are missing or doubled in it, so that its index does not fit"
+    return _read(file, end, footer_at, has_crc=crc != 0)
 
 
-def _read(file: LogFile, content: bytes, data_end_at: int, *, has_crc: bool) -> tuple[Summary | None, str | None]:
+def _crc(file: LogFile, start: int, footer_at: int) -> int:
+    return zlib.crc32(file.read(start, footer_at + _FOOTER.size - 4 - start))
+
+
+def _moved_start(file: LogFile, footer_at: int, crc: int) -> int | None:
+    """Where the summary begins, if not where the footer says."""
+    first = max(footer_at - _LARGEST_MOVED, 0)
+    content = file.read(first, footer_at - first)
+    at = content.rfind(_DATA_END_HEAD)
+    while at >= 0:
+        if _crc(file, first + at + _DATA_END.size, footer_at) == crc:
+            return first + at + _DATA_END.size
+        at = content.rfind(_DATA_END_HEAD, 0, at)
+    return None
+
+
+def _read(file: LogFile, start: int, footer_at: int, *, has_crc: bool) -> tuple[Summary | None, str | None]:
+    data_end_at = start - _DATA_END.size
     opcode, length, data_crc = _DATA_END.unpack(file.read(data_end_at, _DATA_END.size))
     is_sound = (opcode, length) == (Opcode.DATA_END, 4)
     summary = Summary(data_end_at, data_crc if is_sound else 0, has_crc)
     try:
-        _fill(summary, content)
+        _fill(summary, file.read(start, footer_at - start))
     except LogError as error:
         return None, f"its summary is damaged: {error}"
     return summary, None if is_sound else "the record that ends its data is damaged"
