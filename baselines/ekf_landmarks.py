@@ -1,18 +1,21 @@
 """Landmarks in EKF-SLAM: the paper's observation (6) and innovation (7), and augmentation at first sight.
 
-All happens at the instant of a frame, which lies a provisional motion (dR, dp, cov) after the state. With
-``R_t = R dR``, ``p_t = X + R dp`` the body then, T from `perturbation_jacobian` and a landmark at
-``p_b = R_t^T (p - p_t)`` in the body frame::
+All happens at the instant of a frame, which lies a provisional motion (dR, dp, cov) after the state. What a sensor sees
+from there depends on state and motion through how far a point s fixed in the body (in the axes of the state's body)
+moves along a direction n (in the same axes)::
+
+    row(n, s) = [ (R n)^T   (s x n)^T W | ((s - dp) x n)^T   n^T ]     by X, (phi, theta, psi) | theta_i, eps
+
+Observation and innovation, for a landmark at ``p_b = dR^T (p_n - dp)``, ``p_n = R^T (p - X)`` in the body frame then::
 
     z     = h(x_v, p)                                     (6)  range and azimuth, `sonar_graph.slam.models.project`
     e     = z_measured - z, azimuth wrapped               (7)
-    H_b   = D_q sonar_R_body [ [p_b]x | -I ]              by the body's perturbation then
-    H_v   = H_b T,   H_p = D_q sonar_R_body R_t^T         by the state
-    S     = H P H^T + R + H_b cov H_b^T
+    H_v | H_m = row(-n, p_n),   H_p = (R n)^T             for n = dR body_R_sonar D_q^T of range and azimuth each
+    S     = H P H^T + R_z + H_m cov H_m^T
 
-A new landmark at ``p = g(x_v, z, elevation) = p_t + R_t p_b`` with ``G_b = R_t [ -[p_b]x | I ]``::
+A new landmark at ``p = g(x_v, z, elevation) = X + R s``, with ``G_v | G_m = row(n, s)`` for the world's three axes n::
 
-    P_pv = G_b T P_v.,   P_pp = (G_b T) P_vv (G_b T)^T + G_b cov G_b^T + G_z diag(R, elevation_sigma^2) G_z^T
+    P_pv = G_v P_v.,   P_pp = G_v P_vv G_v^T + G_m cov G_m^T + G_z diag(R_z, elevation_sigma^2) G_z^T
 """
 
 from __future__ import annotations
@@ -22,10 +25,29 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.ekf_state import LANDMARK, POSE, correct, correct_pair, perturbation_jacobian, place, product, product_3
-from baselines.euler import rotation_from_euler
+from baselines.ekf_state import LANDMARK, POSE, correct, correct_pair
+from baselines.euler import rates_from_euler, rotation_from_euler
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.navigation.kernels import compiled, skew
+from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.recursion import Integral
+from sonar_graph.navigation.triples import (
+    Matrix,
+    Vector,
+    cross,
+    dot,
+    matrix,
+    minus,
+    place,
+    plus,
+    product,
+    sandwich,
+    scaled,
+    symmetric,
+    times,
+    transformed,
+    transposed,
+    vector,
+)
 from sonar_graph.slam.models import floor_elevation, project, sonar_point, sonar_point_jacobian, wrap_angle
 
 USED, NEW, GATED, PASSED_OVER = 0, 1, 2, 3
@@ -37,8 +59,8 @@ NO_SLOT = -1
 class SonarModel(NamedTuple):
     """What is known of sonar and floor."""
 
-    body_R_sonar: Floats
-    body_p_sonar: Floats
+    body_R_sonar: Matrix
+    body_p_sonar: Vector
     gate: float
     """Squared Mahalanobis distance beyond which an innovation is refused."""
     aperture_rad: float
@@ -51,45 +73,59 @@ class SonarModel(NamedTuple):
     floor_variance_m2: float
 
 
-Motion = tuple[Floats, Floats, Floats]
-"""Rotation (3, 3), displacement (3,), covariance of [rotation, translation] at the end (6, 6)."""
 DetectionColumns = tuple[Ints, Floats, Floats, Floats]
 """Place of each row's landmark in the state, the first unused one for a new landmark, or NO_SLOT (m,); range in m and
 azimuth in rad (m,); their covariance (m, 2, 2), NaN where the log does not say."""
-SonarValues = tuple[Floats, Floats, float, float, float, float, bool, float, float]
+SonarValues = tuple[Matrix, Vector, float, float, float, float, bool, float, float]
 
 
 class Moment(NamedTuple):
-    """The body at the instant of a frame."""
+    """The state, and what lies between it and the instant of a frame."""
 
-    world_R_body: Floats
-    position: Floats
-    T: Floats
-    """Derivative of the perturbation [theta, rho] by the pose state, shape (6, 6)."""
-    cov: Floats
-    """Of the provisional motion, shape (6, 6)."""
+    X: Vector
+    R: Matrix
+    W: Matrix
+    motion: Integral
 
 
-@compiled
-def moment_after(x: Floats, motion: Motion) -> Moment:
-    """The body a motion after the state."""
-    dR, dp, cov = motion
-    R = rotation_from_euler(x[3:POSE])
-    position = np.empty(3)
-    for r in range(3):
-        position[r] = x[r] + R[r, 0] * dp[0] + R[r, 1] * dp[1] + R[r, 2] * dp[2]
-    return Moment(product_3(R, dR), position, perturbation_jacobian(x[3:POSE], dR, dp), cov)
+class Row(NamedTuple):
+    """Derivative of one number by the pose state and by the motion since."""
+
+    by_X: Vector
+    by_angles: Vector
+    by_theta: Vector
+    by_eps: Vector
 
 
 @compiled
-def pose_after(x: Floats, P: Floats, motion: Motion) -> tuple[Floats, Floats, Floats]:
-    """world_R_body, position, and the covariance of [theta, rho] a motion after the state: ``T P_vv T^T + cov``."""
-    moment = moment_after(x, motion)
-    own = product(product(moment.T, P[:POSE, :POSE]), moment.T.T)
-    for r in range(POSE):
-        for c in range(r + 1):
-            own[r, c] = own[c, r] = 0.5 * (own[r, c] + own[c, r] + moment.cov[r, c] + moment.cov[c, r])
-    return moment.world_R_body, moment.position, own
+def moment_after(x: Floats, motion: Integral) -> Moment:
+    """The state and a motion after it."""
+    angles = vector(x[3:])
+    return Moment(vector(x), rotation_from_euler(angles), rates_from_euler(angles), motion)
+
+
+@compiled
+def row_along(moment: Moment, n: Vector, s: Vector) -> Row:
+    """``row(n, s)`` of the module's docstring."""
+    by_angles = times(transposed(moment.W), cross(s, n))
+    return Row(times(moment.R, n), by_angles, cross(minus(s, moment.motion.dp), n), n)
+
+
+@compiled
+def motion_covariance(motion: Integral, one: Row, other: Row) -> float:
+    """``H_m cov H_m^T`` of two numbers."""
+    theta = plus(times(motion.cov_tt, other.by_theta), times(transposed(motion.cov_rt), other.by_eps))
+    eps = plus(times(motion.cov_rt, other.by_theta), times(motion.cov_rr, other.by_eps))
+    return dot(one.by_theta, theta) + dot(one.by_eps, eps)
+
+
+@compiled
+def add_covariances(P: Floats, n: int, at: int, factors: Vector, out: Floats) -> None:
+    """``out += factors^T P[at : at + 3]``, shape (n,)."""
+    for k in range(3):
+        factor = factors[k]
+        for c in range(n):
+            out[c] += factor * P[at + k, c]
 
 
 @compiled
@@ -97,7 +133,7 @@ def observe_rows(
     x: Floats,
     P: Floats,
     n: int,
-    motion: Motion,
+    motion: Integral,
     sonar: SonarModel,
     detections: DetectionColumns,
     first: int,
@@ -128,42 +164,40 @@ def observe_rows(
             outcomes[row] = PASSED_OVER
             continue
         at = POSE + LANDMARK * slots[row]
-        z, R = np.array([range_m[row], azimuth_rad[row]]), _noise(noise[row], sonar)
+        z, R_z = (range_m[row], azimuth_rad[row]), _noise(noise[row], sonar)
         moment = moment_after(x, motion)
         if at >= n:
-            _augment(x, P, n, moment, sonar, z, R)
+            _augment(x, P, n, moment, sonar, z, R_z)
             n += LANDMARK
             outcomes[row] = NEW
         else:
-            outcomes[row] = _observe(x, P, n, at, moment, sonar, z, R, innovations[row], covs[row])
+            outcomes[row] = _observe(x, P, n, at, moment, sonar, z, R_z, innovations[row], covs[row])
     return n
 
 
-@compiled
-def _noise(logged: Floats, sonar: SonarModel) -> Floats:
-    """Covariance of range and azimuth: as logged, or the calibration's."""
-    if not math.isnan(logged[0, 0] + logged[0, 1] + logged[1, 0] + logged[1, 1]):
-        return logged
-    return np.array([[sonar.range_variance_m2, 0.0], [0.0, sonar.azimuth_variance]])
+Noise = tuple[float, float, float]
+"""Variance of the range, covariance, variance of the azimuth."""
 
 
 @compiled
-def observation(moment: Moment, p: Floats, body_R_sonar: Floats, body_p_sonar: Floats) -> tuple[Floats, Floats, Floats]:
-    """(6): predicted range and azimuth (2,), H_b (2, 6) and H_p (2, 3)."""
-    R_t = moment.world_R_body
-    p_b, q = np.zeros(3), np.zeros(3)
-    for r in range(3):
-        for k in range(3):
-            p_b[r] += R_t[k, r] * (p[k] - moment.position[k])
-    for r in range(3):
-        for k in range(3):
-            q[r] += body_R_sonar[k, r] * (p_b[k] - body_p_sonar[k])
-    z, D_q = project(q)
-    by_p_b = product(D_q, body_R_sonar.T)
-    H_b = np.empty((2, POSE))
-    place(product(by_p_b, skew(p_b)), H_b, 0, 0)
-    place(-by_p_b, H_b, 0, 3)
-    return z, H_b, product(by_p_b, R_t.T)
+def _noise(logged: Floats, sonar: SonarModel) -> Noise:
+    """Of range and azimuth: as logged, or the calibration's."""
+    if math.isnan(logged[0, 0] + logged[0, 1] + logged[1, 0] + logged[1, 1]):
+        return sonar.range_variance_m2, 0.0, sonar.azimuth_variance
+    return logged[0, 0], 0.5 * (logged[0, 1] + logged[1, 0]), logged[1, 1]
+
+
+@compiled
+def observation(moment: Moment, p: Vector, sonar: SonarModel) -> tuple[Floats, Row, Row]:
+    """(6): predicted range and azimuth (2,), and ``H_v | H_m`` of each; ``H_p`` is the opposite of its ``by_X``."""
+    motion = moment.motion
+    p_n = times(transposed(moment.R), minus(p, moment.X))
+    p_b = times(transposed(motion.dR), minus(p_n, motion.dp))
+    q = times(transposed(sonar.body_R_sonar), minus(p_b, sonar.body_p_sonar))
+    z, D_q = project(np.array(q))
+    node_R_sonar = product(motion.dR, sonar.body_R_sonar)
+    by_range, by_azimuth = times(node_R_sonar, vector(D_q[0])), times(node_R_sonar, vector(D_q[1]))
+    return z, row_along(moment, scaled(-1.0, by_range), p_n), row_along(moment, scaled(-1.0, by_azimuth), p_n)
 
 
 @compiled
@@ -174,25 +208,22 @@ def _observe(
     at: int,
     moment: Moment,
     sonar: SonarModel,
-    z: Floats,
-    R: Floats,
+    z: tuple[float, float],
+    R_z: Noise,
     innovation: Floats,
     S: Floats,
 ) -> int:
     """Correct by a landmark that is in the state, where its innovation is inside the gate."""
-    predicted, H_b, H_p = observation(moment, x[at : at + LANDMARK], sonar.body_R_sonar, sonar.body_p_sonar)
+    predicted, by_range, by_azimuth = observation(moment, vector(x[at:]), sonar)
     innovation[0], innovation[1] = z[0] - predicted[0], wrap_angle(z[1] - predicted[1])  # (7)
-    H_v = product(H_b, moment.T)
-    U = _cross_covariance(P, n, at, H_v, H_p)
-    motion_noise = product(product(H_b, moment.cov), H_b.T)
-    for r in range(2):
-        for c in range(2):
-            S[r, c] = R[r, c] + motion_noise[r, c]
-            for k in range(POSE):
-                S[r, c] += U[r, k] * H_v[c, k]
-            for k in range(LANDMARK):
-                S[r, c] += U[r, at + k] * H_p[c, k]
-    S[0, 1] = S[1, 0] = 0.5 * (S[0, 1] + S[1, 0])
+    U = np.zeros((2, n))
+    _add_row_covariances(P, n, at, by_range, U[0])
+    _add_row_covariances(P, n, at, by_azimuth, U[1])
+    motion = moment.motion
+    S[0, 0] = _variance_share(U[0], at, by_range) + R_z[0] + motion_covariance(motion, by_range, by_range)
+    S[0, 1] = _variance_share(U[0], at, by_azimuth) + R_z[1] + motion_covariance(motion, by_range, by_azimuth)
+    S[1, 1] = _variance_share(U[1], at, by_azimuth) + R_z[2] + motion_covariance(motion, by_azimuth, by_azimuth)
+    S[1, 0] = S[0, 1]
     if not squared_distance(innovation, S) <= sonar.gate:
         return GATED
     correct_pair(x, P, n, U, S, innovation)
@@ -200,17 +231,17 @@ def _observe(
 
 
 @compiled
-def _cross_covariance(P: Floats, n: int, at: int, H_v: Floats, H_p: Floats) -> Floats:
-    """``H P``, shape (2, n): only the columns of pose and landmark in H are not zero."""
-    U = np.zeros((2, n))
-    for r in range(2):
-        for k in range(POSE):
-            for c in range(n):
-                U[r, c] += H_v[r, k] * P[k, c]
-        for k in range(LANDMARK):
-            for c in range(n):
-                U[r, c] += H_p[r, k] * P[at + k, c]
-    return U
+def _add_row_covariances(P: Floats, n: int, at: int, row: Row, out: Floats) -> None:
+    """``out += H P`` for a row of H with a landmark, shape (n,): only columns of pose and landmark are not zero."""
+    add_covariances(P, n, 0, row.by_X, out)
+    add_covariances(P, n, 3, row.by_angles, out)
+    add_covariances(P, n, at, scaled(-1.0, row.by_X), out)
+
+
+@compiled
+def _variance_share(U: Floats, at: int, row: Row) -> float:
+    """``U H^T`` for a row of H with a landmark."""
+    return dot(row.by_X, minus(vector(U), vector(U[at:]))) + dot(row.by_angles, vector(U[3:]))
 
 
 @compiled
@@ -221,26 +252,26 @@ def squared_distance(e: Floats, S: Floats) -> float:
 
 
 @compiled
-def _augment(x: Floats, P: Floats, n: int, moment: Moment, sonar: SonarModel, z: Floats, R: Floats) -> None:
+def _augment(
+    x: Floats, P: Floats, n: int, moment: Moment, sonar: SonarModel, z: tuple[float, float], R_z: Noise
+) -> None:
     """Append a landmark where it was seen; its elevation from the floor where there is one, else zero."""
-    elevation = _elevation(moment, sonar, z)
-    point, G_b, G_z = location(moment, sonar.body_R_sonar, sonar.body_p_sonar, z, elevation)
-    noise = np.zeros((3, 3))
-    place(R, noise, 0, 0)
-    noise[2, 2] = sonar.aperture_rad**2 / 12.0
-    G_v = product(G_b, moment.T)
-    rows = product(G_v, P[:POSE, :n])
-    own = (
-        product(rows[:, :POSE], G_v.T)
-        + product(product(G_b, moment.cov), G_b.T)
-        + product_3(product_3(G_z, noise), G_z.T)
-    )
+    point, G, G_z = location(moment, sonar, z, _elevation(moment, sonar, z))
+    noise = ((R_z[0], R_z[1], 0.0), (R_z[1], R_z[2], 0.0), (0.0, 0.0, sonar.aperture_rad**2 / 12.0))
+    own = np.empty((LANDMARK, LANDMARK))
+    place(symmetric(sandwich(G_z, noise, G_z)), own, 0, 0)
     for r in range(LANDMARK):
         x[n + r] = point[r]
+        P[n + r, :n] = 0.0
+        add_covariances(P, n, 0, G[r].by_X, P[n + r])
+        add_covariances(P, n, 3, G[r].by_angles, P[n + r])
         for c in range(n):
-            P[n + r, c] = P[c, n + r] = rows[r, c]
-        for c in range(LANDMARK):
-            P[n + r, n + c] = 0.5 * (own[r, c] + own[c, r])
+            P[c, n + r] = P[n + r, c]
+    for r in range(LANDMARK):
+        for c in range(r + 1):
+            own[r, c] += motion_covariance(moment.motion, G[r], G[c])
+            own[r, c] += dot(G[c].by_X, vector(P[n + r])) + dot(G[c].by_angles, vector(P[n + r, 3:]))
+            P[n + r, n + c] = P[n + c, n + r] = own[r, c]
     if sonar.has_floor:
         after = n + LANDMARK
         S = P[after - 1, after - 1] + sonar.floor_variance_m2
@@ -248,34 +279,27 @@ def _augment(x: Floats, P: Floats, n: int, moment: Moment, sonar: SonarModel, z:
 
 
 @compiled
-def _elevation(moment: Moment, sonar: SonarModel, z: Floats) -> float:
+def _elevation(moment: Moment, sonar: SonarModel, z: tuple[float, float]) -> float:
     """Elevation on the floor; 0 without one, or where it is outside the aperture."""
     if not sonar.has_floor:
         return 0.0
-    R_sonar = product_3(moment.world_R_body, sonar.body_R_sonar)
-    sonar_z = moment.position[2]
-    for k in range(3):
-        sonar_z += moment.world_R_body[2, k] * sonar.body_p_sonar[k]
-    elevation = floor_elevation(R_sonar[2], sonar.floor_z_m - sonar_z, z[0], z[1], sonar.aperture_rad)
+    motion = moment.motion
+    place_n = transformed(motion.dp, motion.dR, sonar.body_p_sonar)
+    world_R_sonar = product(product(moment.R, motion.dR), sonar.body_R_sonar)
+    height_m = sonar.floor_z_m - transformed(moment.X, moment.R, place_n)[2]
+    elevation = floor_elevation(np.array(world_R_sonar[2]), height_m, z[0], z[1], sonar.aperture_rad)
     return 0.0 if math.isnan(elevation) else elevation
 
 
 @compiled
 def location(
-    moment: Moment, body_R_sonar: Floats, body_p_sonar: Floats, z: Floats, elevation_rad: float
-) -> tuple[Floats, Floats, Floats]:
-    """The point g (3,) that a detection shows, G_b (3, 6), and G_z by (range, azimuth, elevation) (3, 3)."""
-    q = sonar_point(z[0], z[1], elevation_rad)
-    R_t = moment.world_R_body
-    p_b, point = body_p_sonar.copy(), moment.position.copy()
-    for r in range(3):
-        for k in range(3):
-            p_b[r] += body_R_sonar[r, k] * q[k]
-    for r in range(3):
-        for k in range(3):
-            point[r] += R_t[r, k] * p_b[k]
-    G_b = np.empty((3, POSE))
-    place(product_3(R_t, skew(-p_b)), G_b, 0, 0)
-    place(R_t, G_b, 0, 3)
-    G_z = product_3(product_3(R_t, body_R_sonar), sonar_point_jacobian(z[0], z[1], elevation_rad))
-    return point, G_b, G_z
+    moment: Moment, sonar: SonarModel, z: tuple[float, float], elevation_rad: float
+) -> tuple[Vector, tuple[Row, Row, Row], Matrix]:
+    """The point g that a detection shows, ``G_v | G_m`` of its coordinates, G_z by (range, azimuth, elevation)."""
+    motion = moment.motion
+    p_b = transformed(sonar.body_p_sonar, sonar.body_R_sonar, vector(sonar_point(z[0], z[1], elevation_rad)))
+    s = transformed(motion.dp, motion.dR, p_b)
+    G = (row_along(moment, moment.R[0], s), row_along(moment, moment.R[1], s), row_along(moment, moment.R[2], s))
+    world_R_sonar = product(product(moment.R, motion.dR), sonar.body_R_sonar)
+    G_z = product(world_R_sonar, matrix(sonar_point_jacobian(z[0], z[1], elevation_rad)))
+    return transformed(moment.X, moment.R, s), G, G_z

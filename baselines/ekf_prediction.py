@@ -16,17 +16,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.ekf_landmarks import Motion, moment_after
-from baselines.ekf_state import POSE, correct, place, predict
-from baselines.euler import rotation_from_euler
+from baselines.ekf_landmarks import add_covariances, moment_after, motion_covariance, row_along
+from baselines.ekf_state import correct, predict
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.alignment import tilt_sigma, up_direction
 from sonar_graph.navigation.kernels import compiled
-from sonar_graph.navigation.odometry import merge_rows, rows_until, value_at
-from sonar_graph.navigation.recursion import integrate_steps
+from sonar_graph.navigation.odometry import Columns, rows_until, value_at
+from sonar_graph.navigation.recursion import Integral
+from sonar_graph.navigation.triples import (
+    IDENTITY,
+    Vector,
+    cross,
+    dot,
+    matrix,
+    place,
+    plus,
+    product,
+    transformed,
+    vector,
+)
 from sonar_graph.slam.models import wrap_angle
-
-Columns = tuple[Ints, Floats, Floats, Ints, Floats, Floats, bool]
 
 NODE, OPENED = 0, 1
 """Places in `Clock`: stamp of the state, stamp at which the running gravity interval began."""
@@ -36,12 +45,12 @@ class VehicleModel(NamedTuple):
     """What is known of the sensors that move the state."""
 
     gyro_noise_density: float
-    body_p_dvl: Floats
-    dvl_p_imu: Floats
+    body_p_dvl: Vector
+    dvl_p_imu: Vector
     """Lever arm from DVL to IMU, body axes."""
-    earth_rate: Floats
+    earth_rate: Vector
     """In the world, rad/s; zero where it is not removed."""
-    body_p_port: Floats
+    body_p_port: Vector
     gravity_interval_ns: int
     """0: gravity is not used."""
     accel_noise_density: float
@@ -64,15 +73,15 @@ class GravityInterval(NamedTuple):
     """Of the IMU's point when it began, shape (3,), and the variance of one component: shape (4,)."""
 
 
-VehicleValues = tuple[float, Floats, Floats, Floats, Floats, int, float, float, float, bool, float, float, float]
+VehicleValues = tuple[float, Vector, Vector, Vector, Vector, int, float, float, float, bool, float, float, float]
 GravityValues = tuple[Floats, Floats, Floats]
 
 
 @compiled
-def open_interval(columns: Columns, dvl_p_imu: Floats, interval: GravityInterval, clock: Ints) -> None:
+def open_interval(columns: Columns, dvl_p_imu: Vector, interval: GravityInterval, clock: Ints) -> None:
     """Begin a gravity interval at the node."""
     velocity = _velocity_at_node(columns, clock[NODE], dvl_p_imu)
-    place(np.eye(3), interval.i_R_node, 0, 0)
+    place(IDENTITY, interval.i_R_node, 0, 0)
     for r in range(3):
         interval.impulse[r] = 0.0
     for r in range(4):
@@ -81,15 +90,13 @@ def open_interval(columns: Columns, dvl_p_imu: Floats, interval: GravityInterval
 
 
 @compiled
-def _velocity_at_node(columns: Columns, node_ns: int, dvl_p_imu: Floats) -> Floats:
+def _velocity_at_node(columns: Columns, node_ns: int, dvl_p_imu: Vector) -> Floats:
     """Velocity of the IMU's point in body axes, m/s, and the variance of one component, shape (4,)."""
     imu_ns, rate, _, dvl_ns, velocity, cov, hold_past = columns
     k = rows_until(dvl_ns, node_ns - 1)
     w = value_at(imu_ns, rate, rows_until(imu_ns, node_ns - 1), node_ns, hold_past)
     at_imu = np.empty(4)
-    for r in range(3):
-        a, b = (r + 1) % 3, (r + 2) % 3
-        at_imu[r] = velocity[k, r] + w[a] * dvl_p_imu[b] - w[b] * dvl_p_imu[a]
+    at_imu[0], at_imu[1], at_imu[2] = plus(vector(velocity[k]), cross(w, dvl_p_imu))
     at_imu[3] = (cov[k, 0, 0] + cov[k, 1, 1] + cov[k, 2, 2]) / 3.0
     return at_imu
 
@@ -105,38 +112,6 @@ def next_node(columns: Columns, node_ns: int, until_ns: int) -> int:
 
 
 @compiled
-def motion_between(
-    columns: Columns, model: VehicleModel, x: Floats, start_ns: int, end_ns: int, to_node: bool
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Motion between two instants, and the integral of the specific force.
-
-    To a node: final, with the first IMU row at or after it; to any other instant: from rows stamped no later.
-    """
-    imu_ns, rate, force, dvl_ns, velocity, cov, hold_past = columns
-    imu_rows = rows_until(imu_ns, end_ns - 1) + 1 if to_node else rows_until(imu_ns, end_ns)
-    duration, w, v, psd, f = merge_rows(
-        start_ns,
-        end_ns,
-        imu_ns[:imu_rows],
-        rate,
-        force,
-        dvl_ns[: rows_until(dvl_ns, end_ns)],
-        velocity,
-        cov,
-        hold_past,
-    )
-    no_bias, earth = np.zeros(3), np.zeros(3)
-    R = rotation_from_euler(x[3:POSE])
-    for r in range(3):
-        for k in range(3):
-            earth[r] += R[k, r] * model.earth_rate[k]
-    dR, dp, motion_cov, _, impulse = integrate_steps(
-        duration, w, v, psd, f, no_bias, earth, model.body_p_dvl, model.gyro_noise_density
-    )
-    return dR, dp, motion_cov, impulse
-
-
-@compiled
 def advance_to_node(
     columns: Columns,
     model: VehicleModel,
@@ -146,8 +121,7 @@ def advance_to_node(
     clock: Ints,
     interval: GravityInterval,
     node_ns: int,
-    motion: Motion,
-    impulse: Floats,
+    motion: Integral,
 ) -> None:
     """Predict over a motion to a node and apply what holds there.
 
@@ -155,13 +129,11 @@ def advance_to_node(
     ----------
     x, P, n, clock, interval
         Filter state; changed.
-    impulse
-        Integral of the specific force over the motion, in its first frame, shape (3,), m/s.
     """
-    predict(x, P, n, motion[0], motion[1], motion[2])
+    predict(x, P, n, motion)
     clock[NODE] = node_ns
     if model.gravity_interval_ns > 0:
-        _extend(interval, motion[0], impulse)
+        _extend(interval, motion)
         if clock[NODE] - clock[OPENED] >= model.gravity_interval_ns:
             _correct_gravity(columns, model, x, P, n, clock, interval)
             open_interval(columns, model.dvl_p_imu, interval, clock)
@@ -173,16 +145,11 @@ def advance_to_node(
 
 
 @compiled
-def _extend(interval: GravityInterval, dR: Floats, impulse: Floats) -> None:
+def _extend(interval: GravityInterval, motion: Integral) -> None:
     """Let the running interval reach one node further."""
-    R = interval.i_R_node
-    turned = np.zeros((3, 3))
-    for r in range(3):
-        for k in range(3):
-            interval.impulse[r] += R[r, k] * impulse[k]
-            for c in range(3):
-                turned[r, c] += R[r, k] * dR[k, c]
-    place(turned, R, 0, 0)
+    i_R_node, impulse = matrix(interval.i_R_node), interval.impulse
+    impulse[0], impulse[1], impulse[2] = transformed(vector(impulse), i_R_node, motion.impulse)
+    place(product(i_R_node, motion.dR), interval.i_R_node, 0, 0)
 
 
 @compiled
@@ -218,26 +185,13 @@ def _correct_state(x: Floats, P: Floats, n: int, at: int, value: float, variance
 
 
 @compiled
-def correct_depth(x: Floats, P: Floats, n: int, motion: Motion, port: Floats, z_m: float, variance_m2: float) -> None:
-    """Correct by the height of the pressure port: ``z = p_t,z + (R_t port)_z``."""
+def correct_depth(x: Floats, P: Floats, n: int, motion: Integral, port: Vector, z_m: float, variance_m2: float) -> None:
+    """Correct by the height of the pressure port, ``(X + R s)_z`` with ``s = dp + dR port``: row(n, s) along up."""
     moment = moment_after(x, motion)
-    down = moment.world_R_body[2]
-    h_b, h = np.empty(POSE), np.zeros(POSE)
-    predicted = moment.position[2]
-    for r in range(3):
-        a, b = (r + 1) % 3, (r + 2) % 3
-        h_b[r] = port[a] * down[b] - port[b] * down[a]
-        h_b[3 + r] = down[r]
-        predicted += down[r] * port[r]
-    S = variance_m2
-    for r in range(POSE):
-        for k in range(POSE):
-            h[r] += h_b[k] * moment.T[k, r]
-            S += h_b[r] * moment.cov[r, k] * h_b[k]
+    s = transformed(motion.dp, motion.dR, port)
+    row = row_along(moment, moment.R[2], s)
     U = np.zeros(n)
-    for k in range(POSE):
-        for c in range(n):
-            U[c] += h[k] * P[k, c]
-    for k in range(POSE):
-        S += U[k] * h[k]
-    correct(x, P, n, U, S, z_m - predicted)
+    add_covariances(P, n, 0, row.by_X, U)
+    add_covariances(P, n, 3, row.by_angles, U)
+    S = dot(row.by_X, vector(U)) + dot(row.by_angles, vector(U[3:])) + motion_covariance(motion, row, row) + variance_m2
+    correct(x, P, n, U, S, z_m - x[2] - dot(moment.R[2], s))

@@ -20,6 +20,7 @@ from sonar_graph.errors import EstimatorError, MeasurementError
 from sonar_graph.measurements import Depth, Floats, Ints, LandmarkDetections, Measurements
 from sonar_graph.navigation.earth import earth_rate_in_world
 from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation.triples import ZERO, matrix, minus, vector
 from sonar_graph.slam.association import DetectionJournal, gate_threshold, identify
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
 
@@ -290,8 +291,8 @@ def _start_state(start: Start) -> tuple[Floats, Floats]:
     room = POSE + LANDMARK * ROOM
     x, P = np.zeros(room), np.zeros((room, room))
     x[:3] = start.position_m
-    x[3:POSE] = euler_from_rotation(start.pose().rotation().matrix())
-    E = euler_from_rates(x[3:POSE])
+    x[3:POSE] = euler_from_rotation(matrix(start.pose().rotation().matrix()))
+    E = np.array(euler_from_rates(vector(x[3:])))
     P[:3, :3] = np.diag(np.square(start.position_sigma_m))
     P[3:POSE, 3:POSE] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
     return x, P
@@ -299,15 +300,15 @@ def _start_state(start: Start) -> tuple[Floats, Floats]:
 
 def _vehicle_model(calibration: Calibration, params: EkfSlamParams) -> VehicleModel:
     imu, dvl = calibration.imu, calibration.dvl
-    body_p_dvl = np.array(dvl.mounting.translation_m)
+    body_p_dvl = dvl.mounting.translation_m
     plane = calibration.planar
     earth_rate = earth_rate_in_world(calibration)
     return VehicleModel(
         gyro_noise_density=imu.gyro_noise_density,
         body_p_dvl=body_p_dvl,
-        dvl_p_imu=np.array(imu.mounting.translation_m) - body_p_dvl,
-        earth_rate=np.zeros(3) if earth_rate is None else earth_rate,
-        body_p_port=np.array(calibration.depth.port_m),
+        dvl_p_imu=minus(imu.mounting.translation_m, body_p_dvl),
+        earth_rate=ZERO if earth_rate is None else vector(earth_rate),
+        body_p_port=calibration.depth.port_m,
         gravity_interval_ns=round(params.gravity_interval_s * 1e9) if calibration.use_gravity else 0,
         accel_noise_density=imu.accel_noise_density,
         accel_bias_sigma=imu.accel_bias_sigma,
@@ -323,8 +324,8 @@ def _sonar_model(calibration: Calibration, params: EkfSlamParams) -> SonarModel:
     body_T_sonar = calibration.sonar.mounting.pose()
     floor = calibration.floor
     return SonarModel(
-        body_R_sonar=np.ascontiguousarray(body_T_sonar.rotation().matrix()),
-        body_p_sonar=np.array(calibration.sonar.mounting.translation_m),
+        body_R_sonar=matrix(body_T_sonar.rotation().matrix()),
+        body_p_sonar=calibration.sonar.mounting.translation_m,
         gate=gate_threshold(params.gate_probability, 2),
         aperture_rad=calibration.sonar.elevation_aperture_rad,
         range_variance_m2=calibration.sonar.range_sigma_m**2,

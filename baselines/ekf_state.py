@@ -13,9 +13,10 @@ Prediction from one DVL stamp to the next, with the motion (dR, dp) that gyros a
     R'    = R dR                        the exact integral of the Euler kinematics for a constant rate
     P_vv' = F P_vv F^T + Q,  P_vm' = F P_vm
 
-    F = [ I  -R [dp]x W  ]      Q = G cov G^T,  G = [ 0   R' ]      W, E: see `baselines.euler`; cov: of the motion's
-        [ 0   E' dR^T W  ]                          [ E'  0  ]      perturbation [rotation, translation] at its end
+    F = [ I  -R [dp]x W  ]      Q = G cov G^T,  G = [ 0         R ]
+        [ 0   E' dR^T W  ]                          [ E' dR^T   0 ]
 
+W, E: see `baselines.euler`; cov: of the motion's perturbation [theta_i, eps], see `baselines.ekf_motion`.
 Arrays have room for more landmarks than there are; ``n`` is the length of the state. Everything happens in place.
 """
 
@@ -28,6 +29,24 @@ import numpy as np
 from baselines.euler import euler_from_rates, euler_from_rotation, rates_from_euler, rotation_from_euler
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.recursion import Integral
+from sonar_graph.navigation.triples import (
+    Matrix,
+    Vector,
+    matrix,
+    place,
+    plus,
+    product,
+    sandwich,
+    scaled,
+    skew_times,
+    sum_of,
+    symmetric,
+    times,
+    transformed,
+    transposed,
+    vector,
+)
 from sonar_graph.slam.models import wrap_angle
 
 POSE = 6
@@ -37,135 +56,83 @@ LANDMARK = 3
 
 
 @compiled
-def product(A: Floats, B: Floats) -> Floats:
-    """``A B`` of small matrices; calling BLAS would cost more than the arithmetic."""
-    rows, inner, columns = A.shape[0], A.shape[1], B.shape[1]
-    C = np.zeros((rows, columns))
-    for r in range(rows):
-        for k in range(inner):
-            for c in range(columns):
-                C[r, c] += A[r, k] * B[k, c]
-    return C
+def predict(x: Floats, P: Floats, n: int, motion: Integral) -> None:
+    """Carry state and covariance over a motion."""
+    angles = vector(x[3:])
+    R, W = rotation_from_euler(angles), rates_from_euler(angles)
+    angles_after = euler_from_rotation(product(R, motion.dR))
+    E_dR = product(euler_from_rates(angles_after), transposed(motion.dR))
+    X_by_angles, angles_by_angles = product(R, skew_times(scaled(-1.0, motion.dp), W)), product(E_dR, W)
+    _set_triple(x, 0, transformed(vector(x), R, motion.dp))
+    _set_triple(x, 3, angles_after)
+    _predict_pose(P, X_by_angles, angles_by_angles, motion, R, E_dR)
+    _predict_landmarks(P, n, X_by_angles, angles_by_angles)
 
 
 @compiled
-def product_3(A: Floats, B: Floats) -> Floats:
-    """``A B`` of 3 × 3 matrices."""
-    C = np.empty((3, 3))
-    for r in range(3):
-        for c in range(3):
-            C[r, c] = A[r, 0] * B[0, c] + A[r, 1] * B[1, c] + A[r, 2] * B[2, c]
-    return C
+def _predict_pose(P: Floats, A: Matrix, B: Matrix, motion: Integral, R: Matrix, E_dR: Matrix) -> None:
+    """``P_vv <- F P_vv F^T + Q`` with ``F = [[I, A], [0, B]]``."""
+    XX, XE, EE = matrix(P[:, :3]), matrix(P[:, 3:]), matrix(P[3:, 3:])
+    XE_carried = sum_of(XE, product(A, EE))
+    XX = sum_of(sum_of(XX, product(XE_carried, transposed(A))), product(A, transposed(XE)))
+    XX = sum_of(XX, sandwich(R, motion.cov_rr, R))
+    XE = sum_of(product(XE_carried, transposed(B)), sandwich(R, motion.cov_rt, E_dR))
+    EE = sum_of(sandwich(B, EE, B), sandwich(E_dR, motion.cov_tt, E_dR))
+    place_symmetric(symmetric(XX), transposed(XE), symmetric(EE), P)
 
 
 @compiled
-def place(A: Floats, out: Floats, row: int, column: int) -> None:
-    """Write a small matrix into a larger one; an assignment of arrays would take seconds to compile."""
-    for r in range(A.shape[0]):
-        for c in range(A.shape[1]):
-            out[row + r, column + c] = A[r, c]
+def _predict_landmarks(P: Floats, n: int, A: Matrix, B: Matrix) -> None:
+    """``P_vm <- F P_vm``, and its transpose."""
+    for c in range(POSE, n):
+        angles = (P[3, c], P[4, c], P[5, c])
+        column = plus((P[0, c], P[1, c], P[2, c]), times(A, angles)) + times(B, angles)
+        for r in range(POSE):
+            P[r, c] = P[c, r] = column[r]
 
 
 @compiled
-def cross(v: Floats, B: Floats) -> Floats:
-    """``[v]x B`` for a 3 × 3 matrix."""
-    C = np.empty((3, 3))
-    for c in range(3):
-        C[0, c] = v[1] * B[2, c] - v[2] * B[1, c]
-        C[1, c] = v[2] * B[0, c] - v[0] * B[2, c]
-        C[2, c] = v[0] * B[1, c] - v[1] * B[0, c]
-    return C
+def place_symmetric(first: Matrix, mixed: Matrix, second: Matrix, out: Floats) -> None:
+    """Write ``[[first, mixed^T], [mixed, second]]``."""
+    place(first, out, 0, 0)
+    place(transposed(mixed), out, 0, 3)
+    place(mixed, out, 3, 0)
+    place(second, out, 3, 3)
 
 
 @compiled
-def transition(angles: Floats, dR: Floats, dp: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Attitude after a motion, and the blocks of F and G that are neither zero nor identity.
+def pose_after(x: Floats, P: Floats, motion: Integral) -> tuple[Floats, Floats, Floats]:
+    """The body a motion after the state, and the covariance of its perturbation [theta, rho].
+
+    ``theta = dR^T (W d(angles) + theta_i)`` and ``rho = dR^T (R^T dX - [dp]x W d(angles) + eps)``.
 
     Returns
     -------
-    R' (3, 3), ``dX'/d(phi, theta, psi)`` (3, 3), ``d(phi, theta, psi)'/d(phi, theta, psi)`` (3, 3), and E' (3, 3).
+    world_R_body (3, 3), position (3,), covariance (6, 6).
     """
+    angles = vector(x[3:])
     R, W = rotation_from_euler(angles), rates_from_euler(angles)
-    R_after = product_3(R, dR)
-    E_after = euler_from_rates(euler_from_rotation(R_after))
-    position_D_angles = product_3(R, cross(-dp, W))
-    angles_D_angles = product_3(E_after, product_3(dR.T, W))
-    return R_after, position_D_angles, angles_D_angles, E_after
+    V, node_R_world, j_R_i = skew_times(scaled(-1.0, motion.dp), W), transposed(R), transposed(motion.dR)
+    XX, XE, EE = matrix(P[:, :3]), product(node_R_world, matrix(P[:, 3:])), matrix(P[3:, 3:])
+    XE_carried = sum_of(XE, product(V, EE))
+    tt = sum_of(sandwich(W, EE, W), motion.cov_tt)
+    rt = sum_of(product(XE_carried, transposed(W)), motion.cov_rt)
+    rr = sum_of(sandwich(node_R_world, XX, node_R_world), motion.cov_rr)
+    rr = sum_of(rr, sum_of(product(XE_carried, transposed(V)), product(V, transposed(XE))))
+    own = np.empty((POSE, POSE))
+    place_symmetric(
+        symmetric(sandwich(j_R_i, tt, j_R_i)),
+        sandwich(j_R_i, rt, j_R_i),
+        symmetric(sandwich(j_R_i, rr, j_R_i)),
+        own,
+    )
+    return np.array(product(R, motion.dR)), np.array(transformed(vector(x), R, motion.dp)), own
 
 
 @compiled
-def predict(x: Floats, P: Floats, n: int, dR: Floats, dp: Floats, cov: Floats) -> None:
-    """Carry state and covariance over a motion.
-
-    Parameters
-    ----------
-    dR, dp, cov
-        Rotation, displacement and covariance [rotation, translation] from body frame to body frame.
-    """
-    R = rotation_from_euler(x[3:POSE])
-    R_after, position_D_angles, angles_D_angles, E_after = transition(x[3:POSE], dR, dp)
-    angles = euler_from_rotation(R_after)
-    for r in range(3):
-        x[r] += R[r, 0] * dp[0] + R[r, 1] * dp[1] + R[r, 2] * dp[2]
-        x[3 + r] = angles[r]
-    _transport_rows(P, n, position_D_angles, angles_D_angles)
-    _transport_pose_columns(P, position_D_angles, angles_D_angles)
-    _add_motion_noise(P, R_after, E_after, cov)
-    for r in range(POSE):
-        for c in range(POSE, n):
-            P[c, r] = P[r, c]
-
-
-@compiled
-def _transport_rows(P: Floats, n: int, A: Floats, B: Floats) -> None:
-    """``P[:6] <- F P[:6]``."""
-    for c in range(n):
-        phi, theta, psi = P[3, c], P[4, c], P[5, c]
-        for r in range(3):
-            P[r, c] += A[r, 0] * phi + A[r, 1] * theta + A[r, 2] * psi
-            P[3 + r, c] = B[r, 0] * phi + B[r, 1] * theta + B[r, 2] * psi
-
-
-@compiled
-def _transport_pose_columns(P: Floats, A: Floats, B: Floats) -> None:
-    """``P_vv <- P_vv F^T``."""
-    for r in range(POSE):
-        phi, theta, psi = P[r, 3], P[r, 4], P[r, 5]
-        for c in range(3):
-            P[r, c] += A[c, 0] * phi + A[c, 1] * theta + A[c, 2] * psi
-            P[r, 3 + c] = B[c, 0] * phi + B[c, 1] * theta + B[c, 2] * psi
-
-
-@compiled
-def _add_motion_noise(P: Floats, R_after: Floats, E_after: Floats, cov: Floats) -> None:
-    """``P_vv += G cov G^T``, then equal to its transpose to the last bit."""
-    Q_XX = product_3(product_3(R_after, cov[3:, 3:]), R_after.T)
-    Q_EX = product_3(product_3(E_after, cov[:3, 3:]), R_after.T)
-    Q_EE = product_3(product_3(E_after, cov[:3, :3]), E_after.T)
-    for r in range(3):
-        for c in range(3):
-            P[r, c] += Q_XX[r, c]
-            P[3 + r, c] += Q_EX[r, c]
-            P[c, 3 + r] += Q_EX[r, c]
-            P[3 + r, 3 + c] += Q_EE[r, c]
-    for r in range(POSE):
-        for c in range(r):
-            P[r, c] = P[c, r] = 0.5 * (P[r, c] + P[c, r])
-
-
-@compiled
-def perturbation_jacobian(angles: Floats, dR: Floats, dp: Floats) -> Floats:
-    """Derivative of the body's perturbation [theta, rho] after a motion by the pose state before it, shape (6, 6).
-
-    ``theta = dR^T W d(angles)`` and ``rho = dR^T (R^T dX - [dp]x W d(angles))``. With no motion it turns P_vv into the
-    covariance of [theta, rho].
-    """
-    R, W = rotation_from_euler(angles), rates_from_euler(angles)
-    T = np.zeros((POSE, POSE))
-    place(product_3(dR.T, W), T, 0, 3)
-    place(product_3(R, dR).T, T, 3, 0)
-    place(product_3(dR.T, cross(-dp, W)), T, 3, 3)
-    return T
+def _set_triple(x: Floats, at: int, value: Vector) -> None:
+    """Three numbers of the state."""
+    x[at], x[at + 1], x[at + 2] = value
 
 
 @compiled

@@ -8,21 +8,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from baselines.ekf_landmarks import DetectionColumns, SonarModel, SonarValues, observe_rows, pose_after
+from baselines.ekf_landmarks import DetectionColumns, SonarModel, SonarValues, observe_rows
+from baselines.ekf_motion import motion_since_node, motion_to_node, nothing_running
 from baselines.ekf_prediction import (
     NODE,
-    Columns,
     GravityInterval,
     GravityValues,
     VehicleModel,
     VehicleValues,
     advance_to_node,
     correct_depth,
-    motion_between,
     next_node,
 )
+from baselines.ekf_state import pose_after
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.odometry import Columns
 
 DepthColumns = tuple[Ints, Floats, Floats]
 """Stamps in ns, heights of the port in m, variances in m² (NaN where the log does not say), each (m,)."""
@@ -73,16 +74,16 @@ def process_window(
     interval = GravityInterval(*interval_values)
     rows = len(frame_ns)
     outcomes, innovations, covs = np.empty(rows, np.int64), np.full((rows, 2), np.nan), np.full((rows, 2, 2), np.nan)
-    sample = row = 0
+    sample, row, running = 0, 0, nothing_running()
     while True:
         kind, event_ns = _next_event(depth[0], sample, frame_ns, row, until_ns)
         node_ns = next_node(columns, clock[NODE], event_ns)
-        target_ns = event_ns if node_ns < 0 else node_ns
-        dR, dp, cov, impulse = motion_between(columns, vehicle, x, clock[NODE], target_ns, node_ns >= 0)
-        motion = (dR, dp, cov)
         if node_ns >= 0:
-            advance_to_node(columns, vehicle, x, P, n, clock, interval, node_ns, motion, impulse)
-        elif kind == DEPTH:
+            motion = motion_to_node(columns, vehicle, x, clock[NODE], node_ns)
+            advance_to_node(columns, vehicle, x, P, n, clock, interval, node_ns, motion)
+            continue
+        running, motion = motion_since_node(columns, vehicle, x, running, clock[NODE], event_ns)
+        if kind == DEPTH:
             variance = depth_variance if np.isnan(depth[2][sample]) else depth[2][sample]
             correct_depth(x, P, n, motion, vehicle.body_p_port, depth[1][sample], variance)
             sample += 1

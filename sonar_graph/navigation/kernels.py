@@ -28,6 +28,9 @@ def compiled(function: Compiled) -> Compiled:
     numba drops cached code when the function's own file changes, but not when a function that it calls in another file
     does. Callees are decorated before their callers (their modules are imported first), so code older than the newest
     file seen so far is removed here.
+
+    Callees become part of their callers: a call that hands over arrays or tuples costs as much as the arithmetic of a
+    step, and tuples stay in registers only within one function.
     """
     assert isinstance(function, FunctionType)
     source = Path(function.__code__.co_filename)
@@ -36,7 +39,7 @@ def compiled(function: Compiled) -> Compiled:
     for index in (source.parent / "__pycache__").glob(f"{source.stem}.{function.__qualname__}-*.nbi"):
         if index.stat().st_mtime_ns < newest_ns:
             index.unlink(missing_ok=True)
-    return cast(Compiled, numba.njit(cache=True, error_model="numpy")(function))
+    return cast(Compiled, numba.njit(cache=True, error_model="numpy", forceinline=True)(function))
 
 
 @compiled

@@ -19,13 +19,39 @@ spectral density ``velocity_cov * interval``; half of a sample's variance falls 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.recursion import Step
+from sonar_graph.navigation.triples import (
+    Matrix,
+    Vector,
+    matrix,
+    minus,
+    multiple_of,
+    place,
+    plus,
+    scaled,
+    sum_of,
+    vector,
+)
+
+Columns = tuple[Ints, Floats, Floats, Ints, Floats, Floats, bool]
+"""IMU: stamps, rate, specific force. DVL: stamps, velocity, covariance. Whether a sample holds for what lies before."""
+
+
+class Cursor(NamedTuple):
+    """An instant among the rows."""
+
+    stamp_ns: int
+    imu_row: int
+    """First row after it."""
+    dvl_row: int
+    """First row after it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,19 +152,7 @@ class Odometry:
         return self._steps(node_ns, until_ns, imu_rows, dvl_rows)
 
     def _steps(self, start_ns: int, end_ns: int, imu_rows: int, dvl_rows: int) -> Steps:
-        return Steps(
-            *merge_rows(
-                start_ns,
-                end_ns,
-                self._imu_ns[:imu_rows],
-                self._rate,
-                self._force,
-                self._dvl_ns[:dvl_rows],
-                self._velocity,
-                self._cov,
-                self._hold_past,
-            )
-        )
+        return Steps(*merge_rows(self.columns(), imu_rows, dvl_rows, start_ns, end_ns))
 
     def velocity_at_node(self, node_ns: int) -> tuple[Floats, Floats, Floats]:
         """DVL velocity (body axes), its covariance, and the angular rate at a node; shapes (3,), (3, 3), (3,)."""
@@ -146,10 +160,10 @@ class Odometry:
         i = int(np.searchsorted(self._imu_ns, node_ns))
         if self._hold_past or i == 0:
             return self._velocity[k], self._cov[k], self._rate[i]
-        return self._velocity[k], self._cov[k], value_at(self._imu_ns, self._rate, i, node_ns, False)
+        return self._velocity[k], self._cov[k], np.array(value_at(self._imu_ns, self._rate, i, node_ns, False))
 
-    def columns(self) -> tuple[Ints, Floats, Floats, Ints, Floats, Floats, bool]:
-        """What `merge_rows` takes after the two instants, all rows, for compiled loops over many instants."""
+    def columns(self) -> Columns:
+        """All rows, for compiled loops over many instants."""
         return (
             self._imu_ns,
             self._rate,
@@ -220,12 +234,11 @@ def rows_until(stamps: Ints, instant_ns: int) -> int:
 
 
 @compiled
-def _bracket(stamps: Ints, i: int, t: int, hold_past: bool) -> tuple[int, int, float]:
+def _bracket(stamps: Ints, n: int, i: int, t: int, hold_past: bool) -> tuple[int, int, float]:
     """Rows before and after t and the share of the later, where ``stamps[i - 1] < t <= stamps[i]``.
 
-    Outside the rows the nearest end's value holds.
+    Outside the first n rows the nearest end's value holds.
     """
-    n = len(stamps)
     if i >= n:
         return n - 1, n - 1, 0.0
     if hold_past or i == 0:
@@ -245,65 +258,79 @@ def node_range(imu_ns: Ints, dvl_ns: Ints, after_ns: int, until_ns: int) -> tupl
 
 
 @compiled
-def value_at(stamps: Ints, values: Floats, i: int, t: int, hold_past: bool) -> Floats:
+def value_at(stamps: Ints, values: Floats, i: int, t: int, hold_past: bool) -> Vector:
     """Value at t, where ``stamps[i - 1] < t <= stamps[i]``; the nearest end's value outside the rows."""
-    before, after, share = _bracket(stamps, i, t, hold_past)
-    value = np.empty(3)
-    for row in range(3):
-        value[row] = values[before, row] + share * (values[after, row] - values[before, row])
-    return value
+    return _between(values, *_bracket(stamps, len(stamps), i, t, hold_past))
 
 
 @compiled
-def _velocity_psd(dvl_ns: Ints, cov: Floats, k: int, hold_past: bool, out: Floats) -> None:
-    """Spectral density of the velocity noise between rows k - 1 and k; past the last row, that of the last interval."""
-    n = len(dvl_ns)
+def _between(values: Floats, before: int, after: int, share: float) -> Vector:
+    """Between two rows."""
+    a, b = vector(values[before]), vector(values[after])
+    return plus(a, scaled(share, minus(b, a)))
+
+
+@compiled
+def _velocity_psd(dvl_ns: Ints, cov: Floats, n: int, k: int, hold_past: bool) -> Matrix:
+    """Spectral density of the velocity noise between rows k - 1 and k; past row n - 1, that of the last interval."""
     last = min(k, n - 1)
     interval_s = (dvl_ns[last] - dvl_ns[last - 1]) * 1e-9 if last > 0 else 0.0
     other = last if hold_past or k >= n or last == 0 else last - 1
-    for row in range(3):
-        for column in range(3):
-            out[row, column] = 0.5 * (cov[last, row, column] + cov[other, row, column]) * interval_s
+    return multiple_of(interval_s, multiple_of(0.5, sum_of(matrix(cov[last]), matrix(cov[other]))))
+
+
+@compiled
+def cursor_at(columns: Columns, instant_ns: int) -> Cursor:
+    """The cursor with which motion from an instant begins."""
+    return Cursor(instant_ns, rows_until(columns[0], instant_ns), rows_until(columns[3], instant_ns))
+
+
+@compiled
+def next_step(columns: Columns, imu_rows: int, dvl_rows: int, cursor: Cursor, end_ns: int) -> tuple[Cursor, Step]:
+    """The step from a cursor to the next stamp of either sensor, or to the end: each sensor's mean over it.
+
+    Parameters
+    ----------
+    columns
+        Of `Odometry.columns`, of which only the first ``imu_rows`` and ``dvl_rows`` rows are used.
+    """
+    imu_ns, rate, force, dvl_ns, velocity, cov, hold_past = columns
+    t, i, k = cursor
+    until = end_ns
+    if i < imu_rows:
+        until = min(until, imu_ns[i])
+    if k < dvl_rows:
+        until = min(until, dvl_ns[k])
+    middle = t + (until - t) // 2
+    before, after, share = _bracket(imu_ns, imu_rows, i, middle, hold_past)
+    step = Step(
+        (until - t) * 1e-9,
+        _between(rate, before, after, share),
+        _between(velocity, *_bracket(dvl_ns, dvl_rows, k, middle, hold_past)),
+        _velocity_psd(dvl_ns, cov, dvl_rows, k, hold_past),
+        _between(force, before, after, share),
+    )
+    past_imu = i < imu_rows and imu_ns[i] <= until
+    past_dvl = k < dvl_rows and dvl_ns[k] <= until
+    return Cursor(until, i + int(past_imu), k + int(past_dvl)), step
 
 
 @compiled
 def merge_rows(
-    start_ns: int,
-    end_ns: int,
-    imu_ns: Ints,
-    rate: Floats,
-    force: Floats,
-    dvl_ns: Ints,
-    velocity: Floats,
-    cov: Floats,
-    hold_past: bool,
+    columns: Columns, imu_rows: int, dvl_rows: int, start_ns: int, end_ns: int
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Cut (start, end] at every stamp of either sensor and take each sensor's mean over each piece."""
-    i, k = rows_until(imu_ns, start_ns), rows_until(dvl_ns, start_ns)
-    most = len(imu_ns) - i + len(dvl_ns) - k + 1
+    cursor = cursor_at(columns, start_ns)
+    most = max(imu_rows - cursor.imu_row, 0) + max(dvl_rows - cursor.dvl_row, 0) + 1
     duration, rates, velocities = np.empty(most), np.empty((most, 3)), np.empty((most, 3))
     psds, forces = np.empty((most, 3, 3)), np.empty((most, 3))
-    n, t = 0, start_ns
-    while t < end_ns:
-        until = end_ns
-        if i < len(imu_ns) and imu_ns[i] < until:
-            until = imu_ns[i]
-        if k < len(dvl_ns) and dvl_ns[k] < until:
-            until = dvl_ns[k]
-        middle = t + (until - t) // 2
-        duration[n] = (until - t) * 1e-9
-        before, after, share = _bracket(imu_ns, i, middle, hold_past)
-        for row in range(3):
-            rates[n, row] = rate[before, row] + share * (rate[after, row] - rate[before, row])
-            forces[n, row] = force[before, row] + share * (force[after, row] - force[before, row])
-        before, after, share = _bracket(dvl_ns, k, middle, hold_past)
-        for row in range(3):
-            velocities[n, row] = velocity[before, row] + share * (velocity[after, row] - velocity[before, row])
-        _velocity_psd(dvl_ns, cov, k, hold_past, psds[n])
+    n = 0
+    while cursor.stamp_ns < end_ns:
+        cursor, step = next_step(columns, imu_rows, dvl_rows, cursor, end_ns)
+        duration[n] = step.duration_s
+        rates[n, 0], rates[n, 1], rates[n, 2] = step.rate
+        velocities[n, 0], velocities[n, 1], velocities[n, 2] = step.velocity
+        forces[n, 0], forces[n, 1], forces[n, 2] = step.specific_force
+        place(step.velocity_psd, psds[n], 0, 0)
         n += 1
-        t = until
-        if i < len(imu_ns) and imu_ns[i] <= t:
-            i += 1
-        if k < len(dvl_ns) and dvl_ns[k] <= t:
-            k += 1
     return duration[:n], rates[:n], velocities[:n], psds[:n], forces[:n]

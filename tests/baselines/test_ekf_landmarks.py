@@ -16,11 +16,15 @@ from baselines.ekf_landmarks import (
     SonarModel,
     location,
     moment_after,
+    motion_covariance,
     observation,
     observe_rows,
 )
+from sonar_graph.navigation.triples import matrix, vector
 from sonar_graph.slam.association import gate_threshold
 from sonar_graph.slam.models import locate, range_azimuth
+
+from .motions import motion_of
 
 STEP = 1e-6
 MOUNTING = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.5, -0.2), np.array([0.4, 0.1, -0.2]))
@@ -34,8 +38,8 @@ views = st.tuples(st.floats(1.0, 10.0), st.floats(-math.pi, math.pi), st.floats(
 
 def sonar(**changes):
     model = SonarModel(
-        body_R_sonar=MOUNTING.rotation().matrix().copy(order="C"),
-        body_p_sonar=MOUNTING.translation(),
+        body_R_sonar=matrix(MOUNTING.rotation().matrix()),
+        body_p_sonar=vector(MOUNTING.translation()),
         gate=gate_threshold(0.999, 2),
         aperture_rad=0.244,
         range_variance_m2=NOISE[0, 0],
@@ -47,15 +51,26 @@ def sonar(**changes):
     return model._replace(**changes)
 
 
+TWIST = np.array([0.02, -0.01, 0.05, 0.1, 0.02, -0.01])
+
+
 def motion():
-    dR = gtsam.Rot3.Expmap(np.array([0.02, -0.01, 0.05])).matrix().copy(order="C")
-    return dR, np.array([0.1, 0.02, -0.01]), MOTION_SIGMA**2 * np.eye(6)
+    return motion_of(TWIST, MOTION_SIGMA**2 * np.eye(6))
 
 
-def body(x):
-    """The body at the instant of the frame, by gtsam."""
-    dR, dp, _ = motion()
-    return gtsam.Pose3(gtsam.Rot3.RzRyRx(x[3:6]), x[:3]).compose(gtsam.Pose3(gtsam.Rot3(dR), dp))
+def body(x, xi=None):
+    """The body at the instant of the frame, by gtsam; the motion perturbed on the left of its rotation, in place."""
+    dR, dp, xi = gtsam.Rot3.Expmap(TWIST[:3]), TWIST[3:], np.zeros(6) if xi is None else xi
+    motion = gtsam.Pose3(gtsam.Rot3.Expmap(xi[:3]).compose(dR), dp + xi[3:])
+    return gtsam.Pose3(gtsam.Rot3.RzRyRx(x[3:6]), x[:3]).compose(motion)
+
+
+def numbers(rows):
+    """Derivatives by the pose state (m, 6) and by the motion (m, 6)."""
+    return (
+        np.array([row.by_X + row.by_angles for row in rows]),
+        np.array([row.by_theta + row.by_eps for row in rows]),
+    )
 
 
 def state(angles, *landmarks, room=3):
@@ -88,34 +103,48 @@ def difference(ahead, behind):
 def test_jacobians_of_the_observation_are_the_numerical_ones(angles, view):
     x, _, _ = state(angles)
     p = locate(body(x).compose(MOUNTING), *view)
-    moment = moment_after(x, motion())
-    z, H_b, H_p = observation(moment, p, sonar().body_R_sonar, sonar().body_p_sonar)
+    z, *rows = observation(moment_after(x, motion()), vector(p), sonar())
+    H_v, H_m = numbers(rows)
 
-    def seen(pose_state, point):
-        return range_azimuth(body(pose_state).compose(MOUNTING), point)
+    def seen(pose_state, point, xi=None):
+        return range_azimuth(body(pose_state, xi).compose(MOUNTING), point)
 
     assert_allclose(difference(z, seen(x, p)), 0.0, atol=1e-3)  # over 2e-6: 1e-9
     by_pose = [difference(seen(x[:6] + STEP * u, p), seen(x[:6] - STEP * u, p)) for u in np.eye(6)]
+    by_motion = [difference(seen(x, p, STEP * u), seen(x, p, -STEP * u)) for u in np.eye(6)]
     by_point = [difference(seen(x, p + STEP * u), seen(x, p - STEP * u)) for u in np.eye(3)]
-    assert_allclose(H_b @ moment.T, np.array(by_pose).T, atol=1e-5, rtol=1e-5)
-    assert_allclose(H_p, np.array(by_point).T, atol=1e-5, rtol=1e-5)
+    assert_allclose(H_v, np.array(by_pose).T, atol=1e-5, rtol=1e-5)
+    assert_allclose(H_m, np.array(by_motion).T, atol=1e-5, rtol=1e-5)
+    assert_allclose(-H_v[:, :3], np.array(by_point).T, atol=1e-5, rtol=1e-5)
 
 
 @given(attitudes, views)
 def test_jacobians_of_the_augmentation_are_the_numerical_ones(angles, view):
     x, _, _ = state(angles)
-    moment = moment_after(x, motion())
-    point, G_b, G_z = location(moment, sonar().body_R_sonar, sonar().body_p_sonar, np.array(view[:2]), view[2])
+    point, rows, G_z = location(moment_after(x, motion()), sonar(), view[:2], view[2])
+    G_v, G_m = numbers(rows)
 
-    def located(pose_state, values):
-        return locate(body(pose_state).compose(MOUNTING), *values)
+    def located(pose_state, values, xi=None):
+        return locate(body(pose_state, xi).compose(MOUNTING), *values)
 
     values = np.array(view)
     assert_allclose(point, located(x, values), atol=1e-12)
     by_pose = [difference(located(x[:6] + STEP * u, values), located(x[:6] - STEP * u, values)) for u in np.eye(6)]
+    by_motion = [difference(located(x, values, STEP * u), located(x, values, -STEP * u)) for u in np.eye(6)]
     by_view = [difference(located(x, values + STEP * u), located(x, values - STEP * u)) for u in np.eye(3)]
-    assert_allclose(G_b @ moment.T, np.array(by_pose).T, atol=1e-5, rtol=1e-5)
+    assert_allclose(G_v, np.array(by_pose).T, atol=1e-5, rtol=1e-5)
+    assert_allclose(G_m, np.array(by_motion).T, atol=1e-5, rtol=1e-5)
     assert_allclose(G_z, np.array(by_view).T, atol=1e-5, rtol=1e-5)
+
+
+def test_the_covariance_of_a_motion_is_that_of_its_six_numbers():
+    A = 0.01 * np.random.default_rng(7).normal(size=(6, 6))
+    cov, turn = A @ A.T, np.kron(np.eye(2), gtsam.Rot3.Expmap(TWIST[:3]).matrix())
+    moved = motion_of(TWIST, cov)
+    _, *rows = observation(moment_after(state(np.array([0.1, 0.2, 0.3]))[0], moved), (2.0, 1.0, 0.5), sonar())
+    _, H_m = numbers(rows)
+    actual = [[motion_covariance(moved, one, other) for other in rows] for one in rows]
+    assert_allclose(actual, H_m @ turn @ cov @ turn.T @ H_m.T, rtol=1e-12)
 
 
 def test_a_new_landmark_has_the_covariance_of_many_draws():
@@ -181,9 +210,10 @@ def test_a_correction_is_the_textbook_s():
     p = locate(body(x).compose(MOUNTING), 2.0, 0.3, 0.05)
     x, P, n = state(np.array([0.1, -0.2, 0.5]), p)
     moment = moment_after(x, motion())
-    z, H_b, H_p = observation(moment, p, sonar().body_R_sonar, sonar().body_p_sonar)
-    H = np.hstack([H_b @ moment.T, H_p])
-    S = H @ P[:n, :n] @ H.T + NOISE + H_b @ moment.cov @ H_b.T
+    z, *rows = observation(moment, vector(p), sonar())
+    H_v, H_m = numbers(rows)
+    H = np.hstack([H_v, -H_v[:, :3]])
+    S = H @ P[:n, :n] @ H.T + NOISE + MOTION_SIGMA**2 * H_m @ H_m.T
     K = P[:n, :n] @ H.T @ np.linalg.inv(S)
     e = np.array([0.01, -0.005])
     expected = x[:n] + K @ e, (np.eye(n) - K @ H) @ P[:n, :n]

@@ -5,8 +5,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from baselines.ekf_state import correct, correct_pair, perturbation_jacobian, predict
+from baselines.ekf_state import correct, correct_pair, pose_after, predict
 from baselines.euler import euler_from_rates, euler_from_rotation, rotation_from_euler
+from sonar_graph.navigation.triples import matrix, vector
+
+from .motions import motion_of
 
 N = 12
 STEP = 1e-6
@@ -38,7 +41,7 @@ def moved(x, motion, xi=None):
     after = world_T_i.compose(i_T_j)
     if xi is not None:
         after = after.compose(gtsam.Pose3(gtsam.Rot3.Expmap(xi[:3]), xi[3:]))
-    return np.concatenate([after.translation(), euler_from_rotation(after.rotation().matrix()), x[6:]])
+    return np.concatenate([after.translation(), euler_from_rotation(matrix(after.rotation().matrix())), x[6:]])
 
 
 def unwrapped(difference):
@@ -54,13 +57,13 @@ def numerical(function, size):
 
 def predicted(x, P, motion, cov, n=N):
     x, P = x.copy(), P.copy()
-    predict(x, P, n, gtsam.Rot3.Expmap(motion[:3]).matrix().copy(order="C"), motion[3:].copy(), cov)
+    predict(x, P, n, motion_of(motion, cov))
     return x, P
 
 
 def far_from_singular(angles, motion):
-    after = rotation_from_euler(angles) @ gtsam.Rot3.Expmap(motion[:3]).matrix()
-    return abs(euler_from_rotation(after)[1]) < 1.4
+    after = np.array(rotation_from_euler(vector(angles))) @ gtsam.Rot3.Expmap(motion[:3]).matrix()
+    return abs(euler_from_rotation(matrix(after))[1]) < 1.4
 
 
 @given(attitudes, motions)
@@ -95,19 +98,25 @@ def test_prediction_touches_nothing_beyond_the_state():
 
 
 @given(attitudes, motions)
-def test_the_perturbation_after_a_motion_has_the_numerical_jacobian(angles, motion):
-    x = state(angles, 6)[:6]
-    T = perturbation_jacobian(angles, gtsam.Rot3.Expmap(motion[:3]).matrix().copy(order="C"), motion[3:].copy())
+def test_the_pose_after_a_motion_has_the_numerical_covariance(angles, motion):
+    """That of the state by numerical derivatives, and that of the motion, which is given at its end."""
+    x, P, own = state(angles, 6)[:6], random_covariance(6)[:6, :6], random_covariance(6, seed=1, scale=0.01)[:6, :6]
 
     def pose(values):
         i_T_j = gtsam.Pose3(gtsam.Rot3.Expmap(motion[:3]), motion[3:])
         return gtsam.Pose3(gtsam.Rot3.RzRyRx(values[3:6]), values[:3]).compose(i_T_j)
 
-    columns = [
-        (pose(x).localCoordinates(pose(x + STEP * u)) - pose(x).localCoordinates(pose(x - STEP * u))) / (2 * STEP)
-        for u in np.eye(6)
-    ]
-    assert_allclose(T, np.array(columns).T, atol=1e-6, rtol=1e-6)
+    T = np.array(
+        [
+            (pose(x).localCoordinates(pose(x + STEP * u)) - pose(x).localCoordinates(pose(x - STEP * u))) / (2 * STEP)
+            for u in np.eye(6)
+        ]
+    ).T
+    world_R_body, position, cov = pose_after(x, P, motion_of(motion, own))
+    assert_allclose(world_R_body, pose(x).rotation().matrix(), atol=1e-12)
+    assert_allclose(position, pose(x).translation(), atol=1e-12)
+    assert_allclose(cov, T @ P @ T.T + own, atol=1e-7, rtol=1e-6)
+    assert_array_equal(cov, cov.T)
 
 
 def joseph(x, P, H, R, innovation):
@@ -144,7 +153,9 @@ def test_a_correction_keeps_roll_and_yaw_within_half_a_turn():
     assert x[5] == pytest.approx(-3.2 + 2 * np.pi)
 
 
-def test_start_covariance_and_perturbation_jacobian_are_inverse_transforms():
-    angles = np.array([0.3, -0.4, 1.0])
-    T = perturbation_jacobian(angles, np.eye(3), np.zeros(3))
-    assert_allclose(T[:3, 3:] @ euler_from_rates(angles), np.eye(3), atol=1e-12)
+def test_start_covariance_and_pose_covariance_are_inverse_transforms():
+    angles, sigma = (0.3, -0.4, 1.0), np.array([0.1, 0.2, 0.3])
+    E, P = np.array(euler_from_rates(angles)), np.zeros((6, 6))
+    P[3:, 3:] = E @ np.diag(sigma**2) @ E.T
+    _, _, cov = pose_after(state(angles, 6), P, motion_of(np.zeros(6), np.zeros((6, 6))))
+    assert_allclose(cov[:3, :3], np.diag(sigma**2), atol=1e-12)
