@@ -93,9 +93,9 @@ class LogConfig:
         bases = shipped_for(role, type_name)
         if not bases and "type" not in self.table(role):
             return []
-        return [self._build(role, type(base), {**_plain(base), **_changes(base, table)}) for base in bases] or [
-            self._build(role, ADAPTERS[role], table)
-        ]
+        if not bases:
+            return [self._build(role, ADAPTERS[role], _changes(ADAPTERS[role].model_construct(), table))]
+        return [self._build(role, type(base), {**_plain(base), **_changes(base, table)}) for base in bases]
 
     def _check(self, role: str, table: Table) -> None:
         """Find mistakes before any log is read; where the type is not known yet, one that comes along must fit."""
