@@ -48,3 +48,20 @@ TopicChoices = Annotated[
         "Roles: imu, dvl, depth, detections, truth, true_landmarks, sonar.",
     ),
 ]
+StartTime = Annotated[
+    str | None,
+    typer.Option(
+        "--start",
+        metavar="TIME",
+        help="Leave out what was recorded before: seconds from the log's beginning (90.5), or a date and time, "
+        "in UTC unless it says else (2026-05-01T12:30:00Z).",
+    ),
+]
+EndTime = Annotated[
+    str | None,
+    typer.Option("--end", metavar="TIME", help="Leave out what was recorded then and later; written like --start."),
+]
+Salvage = Annotated[
+    bool,
+    typer.Option("--salvage", help="Read what is whole of a damaged log; the notes say what is lost."),
+]

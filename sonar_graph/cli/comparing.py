@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,16 +11,19 @@ import typer
 
 from sonar_graph.cli.arguments import (
     CalibrationPath,
+    EndTime,
     EstimatorSettings,
     LogConfigPath,
     LogPath,
     OutputFolder,
     RateHz,
+    Salvage,
+    StartTime,
     TopicChoices,
 )
 from sonar_graph.cli.outputs import writable_folder
-from sonar_graph.cli.progress import progress_bars, working
-from sonar_graph.cli.settings import estimator_settings, read_calibration, read_config, topic_choices
+from sonar_graph.cli.progress import Report, progress_bars, working
+from sonar_graph.cli.settings import estimator_settings, read_calibration, read_config, topic_choices, window_of
 from sonar_graph.cli.texts import answers
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 
@@ -41,13 +45,24 @@ class LogSource:
     calibration: Path | None = None
     topics: list[str] | None = None
     config: Path | None = None
+    start: str | None = None
+    end: str | None = None
+    salvage: bool = False
 
-    def read(self) -> Sequence:
+    def read(self, progress: Report) -> Sequence:
         """The log as a sequence; the errors are those of reading a log, a calibration, or choices of topics."""
         from sonar_graph.logs.reading import read_sequence
 
         topics, config = topic_choices(self.topics or []), read_config(self.config)
-        return read_sequence(self.path, calibration=read_calibration(self.calibration), topics=topics, config=config)
+        return read_sequence(
+            self.path,
+            calibration=read_calibration(self.calibration),
+            topics=topics,
+            config=config,
+            window=window_of(self.start, self.end),
+            salvage=self.salvage,
+            progress=partial(progress, f"reading {self.path.name}"),
+        )
 
 
 def run(
@@ -59,9 +74,13 @@ def run(
     calibration: CalibrationPath = None,
     topics: TopicChoices = None,
     log_config: LogConfigPath = None,
+    start: StartTime = None,
+    end: EndTime = None,
+    salvage: Salvage = False,
 ) -> None:
     """Run one estimator on a log; write its trajectories, landmarks and scores."""
-    comparison = _compare_log(LogSource(log, calibration, topics, log_config), output, [estimator], rate_hz, settings)
+    source = LogSource(log, calibration, topics, log_config, start, end, salvage)
+    comparison = _compare_log(source, output, [estimator], rate_hz, settings)
     _print_summary(comparison)
     typer.echo(f"Results: {output}")
     _exit_by(comparison)
@@ -76,14 +95,16 @@ def compare(
     calibration: CalibrationPath = None,
     topics: TopicChoices = None,
     log_config: LogConfigPath = None,
+    start: StartTime = None,
+    end: EndTime = None,
+    salvage: Salvage = False,
 ) -> None:
     """Run several estimators on the same measurements and write a report on how they compare.
 
     Writes report.html, comparison.json, result.mcap for a viewer, and runs/NAME/ with each estimator's trajectories.
     """
-    comparison = _compare_log(
-        LogSource(log, calibration, topics, log_config), output, _estimator_names(estimators), rate_hz, settings
-    )
+    source = LogSource(log, calibration, topics, log_config, start, end, salvage)
+    comparison = _compare_log(source, output, _estimator_names(estimators), rate_hz, settings)
     page = _write_report(comparison, output)
     _print_summary(comparison)
     typer.echo(f"Report: {page}")
@@ -135,8 +156,8 @@ def _compare_log(
     overrides = estimator_settings(settings or [], names)
     _check_settings(names, overrides)
     writable_folder(output)
-    with working(f"reading {source.path.name}"):
-        sequence = source.read()
+    with progress_bars() as progress:
+        sequence = source.read(progress)
     with progress_bars() as progress:
         comparison = compare_runs(sequence, names, overrides, rate_hz=rate_hz, progress=progress)
     _write_results(comparison, sequence, output)

@@ -8,8 +8,8 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from sonar_graph.cli.arguments import LogConfigPath, LogPath, TopicChoices
-from sonar_graph.cli.settings import read_config, topic_choices
+from sonar_graph.cli.arguments import EndTime, LogConfigPath, LogPath, StartTime, TopicChoices
+from sonar_graph.cli.settings import read_config, topic_choices, window_of
 from sonar_graph.cli.texts import answers
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ def inspect(
     log: LogPath,
     topics: TopicChoices = None,
     log_config: LogConfigPath = None,
+    start: StartTime = None,
+    end: EndTime = None,
     toml: Annotated[
         bool, typer.Option("--toml", help="Print only the log configuration to start from, for --log-config.")
     ] = False,
@@ -29,7 +31,7 @@ def inspect(
     """Say what is in a log: topics, rates, gaps, and which topic would be used for what and why."""
     from sonar_graph.logs.inspection import inspect_log
 
-    summary = inspect_log(log, read_config(log_config), topic_choices(topics or []))
+    summary = inspect_log(log, read_config(log_config), topic_choices(topics or []), window_of(start, end))
     if toml:
         typer.echo(summary.toml, nl=False)
     else:

@@ -1,4 +1,4 @@
-"""Settings given on the command line or in a file: ``--set``, ``--topic``, ``--log-config``, ``--calibration``."""
+"""Settings given on the command line or in a file: ``--set``, ``--topic``, ``--log-config``, ``--start``."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from sonar_graph.errors import CalibrationError, EstimatorError, LogError
 if TYPE_CHECKING:
     from sonar_graph.calibration import Calibration
     from sonar_graph.logs.adapters.config import LogConfig
+    from sonar_graph.logs.window import Window
 
 
 def parse_setting(text: str) -> tuple[str, Any]:
@@ -114,3 +115,16 @@ def read_calibration(path: Path | None) -> Calibration | None:
     if not isinstance(values, dict):
         raise CalibrationError(f"{path}: expected an object with sections such as imu, not {json.dumps(values):.40}")
     return Calibration.parse(values, str(path))
+
+
+def window_of(start: str | None, end: str | None) -> Window:
+    """The part of a log that ``--start`` and ``--end`` name.
+
+    Raises
+    ------
+    LogError
+        When one is no time.
+    """
+    from sonar_graph.logs.window import Instant, Window
+
+    return Window(Instant.parse(start) if start else None, Instant.parse(end) if end else None)

@@ -65,8 +65,7 @@ class Assembly:
         self._notes["log.topics"] = "; ".join(f"{role}: {topic.name}" for role, topic in self._topics.items())
         if "truth" in choices and choices["truth"].topic is None:
             self._notes["log.truth"] = choices["truth"].reason
-        if recording.ending:
-            self._notes["log.ending"] = recording.ending
+        self._notes |= recording.notes()
         self.calibration = self._calibration(calibration)
 
     def sequence(self, name: str | None = None) -> Sequence:

@@ -41,6 +41,8 @@ class Recording:
     """In the file."""
     skipped_chunks: int = 0
     """Passed over, because they hold nothing that was asked for; their CRCs are not checked."""
+    part: str | None = None
+    """Which part of the time was asked for, if not all."""
 
     @property
     def ending(self) -> str | None:
@@ -51,6 +53,21 @@ class Recording:
     def corrupt(self) -> list[str]:
         """What is lost, where, of which topics, and why."""
         return [loss.describe(self.beginning_ns) for loss in self.damage.losses]
+
+    def notes(self) -> dict[str, str]:
+        """What a reader of results must know about how the file was read, by subject."""
+        skipped = (
+            f"{self.skipped_chunks} of {self.chunks} chunks hold nothing that was asked for; not read, not checked"
+        )
+        texts = {
+            "log.ending": self.damage.ending.describe(self.beginning_ns) if self.damage.ending else "",
+            "log.damage": "; ".join(self.corrupt),
+            "log.remarks": "; ".join(self.damage.remarks),
+            "log.unprotected": ", ".join(self.damage.unprotected),
+            "log.part": self.part or "",
+            "log.skipped": skipped if self.skipped_chunks else "",
+        }
+        return {subject: text for subject, text in texts.items() if text}
 
     def require_sound(self) -> None:
         """Refuse a file that has holes.
@@ -87,8 +104,10 @@ def scan(
     LogError
         When there is no such file, it is not MCAP, or nothing in it was recorded in the window.
     """
+    window = window or Window()
     with LogFile(path) as file:
-        limits_ns = window.resolve(first_time_ns(file)) if window else None
+        beginning_ns = 0 if window.is_all else first_time_ns(file)
+        limits_ns = None if window.is_all else window.resolve(beginning_ns)
         passage = Passage(file, keep, limits_ns, progress=progress)
         try:
             _gather(passage)
@@ -98,8 +117,11 @@ def scan(
             _gather(passage)
             passage.damage.remarks[:0] = remarks
         recording = _recording(path, passage)
-    if window and not any(not topic.is_latched for topic in recording.topics.values()):
-        raise LogError(f"{path}: nothing was recorded between --start and --end")
+    if limits_ns is None:
+        return recording
+    recording.part = window.describe(beginning_ns)
+    if not any(len(topic) and not topic.is_latched for topic in recording.topics.values()):
+        raise LogError(f"{path}: nothing was recorded from {recording.part}")
     return recording
 
 
@@ -124,7 +146,7 @@ def stream(
         As `scan`, and at the end when the file has holes: what was given until then is whole.
     """
     with LogFile(path) as file:
-        limits_ns = window.resolve(first_time_ns(file)) if window else None
+        limits_ns = None if window is None or window.is_all else window.resolve(first_time_ns(file))
         passage = Passage(file, keep, limits_ns, progress=progress)
         held: dict[str, Topic] = {}
         for piece in passage:
@@ -142,7 +164,12 @@ def _gather(passage: Passage) -> None:
 
 
 def _recording(path: Path, passage: Passage) -> Recording:
-    topics = {name: topic for name, topic in sorted(passage.topics.items()) if len(topic)}
+    counts = passage.counts or {}
+    topics = {
+        name: topic
+        for name, topic in sorted(passage.topics.items())
+        if len(topic) or (topic.keep is Keep.NONE and counts.get(name))  # those of chunks passed over
+    }
     whole = passage.counts if passage.is_complete else None
     settle(passage.damage, topics, whole)
     first_ns = [int(topic.log_times_ns.min()) for topic in topics.values() if topic.times]

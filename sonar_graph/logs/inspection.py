@@ -22,6 +22,7 @@ from sonar_graph.logs.sonar_reading import describe_frames, read_sonar_frames
 from sonar_graph.logs.stamp_check import stamp_faults
 from sonar_graph.logs.starting_config import starting_config
 from sonar_graph.logs.table import NS_PER_S
+from sonar_graph.logs.window import Window
 from sonar_graph.measurements import Ints
 
 _FRAMES_NAMED = 6
@@ -108,7 +109,12 @@ class LogSummary:
         return (max(t.last_stamp_ns for t in topics) - min(t.first_stamp_ns for t in topics)) * 1e-9
 
 
-def inspect_log(path: Path, config: LogConfig | None = None, topics: Mapping[str, str] | None = None) -> LogSummary:
+def inspect_log(
+    path: Path,
+    config: LogConfig | None = None,
+    topics: Mapping[str, str] | None = None,
+    window: Window | None = None,
+) -> LogSummary:
     """Summarise an MCAP file; what is wrong in it becomes part of the summary.
 
     Parameters
@@ -117,6 +123,8 @@ def inspect_log(path: Path, config: LogConfig | None = None, topics: Mapping[str
         The log.
     config, topics
         What the user says about topics, as of `read_sequence`.
+    window
+        Only what was recorded then.
 
     Raises
     ------
@@ -125,8 +133,8 @@ def inspect_log(path: Path, config: LogConfig | None = None, topics: Mapping[str
     """
     config = config or LogConfig()
     types = wanted_types(config)
-    recording = scan(Path(path), lambda kind: Keep.ALL if short_name(kind) in types else Keep.STAMP)
-    damage = [*recording.corrupt, *([recording.ending] if recording.ending else [])]
+    recording = scan(Path(path), lambda kind: Keep.ALL if short_name(kind) in types else Keep.STAMP, window)
+    damage = [*recording.corrupt, *([recording.ending] if recording.ending else []), *recording.damage.remarks]
     choices = {name: choose_topic(role, recording, config, (topics or {}).get(name)) for name, role in ROLES.items()}
     calibration, notes = _calibration(recording), _notes(recording, damage)
     summaries = tuple(_summarise(topic) for topic in recording.topics.values())

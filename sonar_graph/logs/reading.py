@@ -8,9 +8,10 @@ from pathlib import Path
 from sonar_graph.calibration import Calibration
 from sonar_graph.logs.adapters.config import LogConfig
 from sonar_graph.logs.assembly import Assembly
-from sonar_graph.logs.container import Keep, scan
+from sonar_graph.logs.container import Keep, Progress, scan
 from sonar_graph.logs.message_definitions import short_name
 from sonar_graph.logs.roles import choose_topics, wanted_types
+from sonar_graph.logs.window import Window
 from sonar_graph.sequence import Sequence
 
 
@@ -21,6 +22,9 @@ def read_sequence(
     name: str | None = None,
     topics: Mapping[str, str] | None = None,
     config: LogConfig | None = None,
+    window: Window | None = None,
+    salvage: bool = False,
+    progress: Progress | None = None,
 ) -> Sequence:
     """Read a log of ROS 2 messages.
 
@@ -40,19 +44,27 @@ def read_sequence(
         fit or none is found by type and name; before those of `config`.
     config
         What the topics of a foreign log are; `read_log_config` reads one from a TOML file.
+    window
+        Only what was recorded then, with ``/tf_static`` and other latched topics whenever recorded.
+    salvage
+        Read what is whole of a file that is damaged in its middle; what is lost is in the notes, under ``log.damage``.
+    progress
+        Called with the bytes done and the bytes in all.
 
     Raises
     ------
     MissingTopicError
         When the log has no IMU or no DVL; listing the topics that it has.
     LogError
-        When the file is not MCAP, is damaged in its middle, or a message breaks its own rules.
+        When the file is not MCAP, is damaged in its middle without `salvage`, has nothing in the window, or a message
+        breaks its own rules.
     CalibrationError
         When the calibration in the file is not one.
     """
     path = Path(path)
     config = config or LogConfig()
     types = wanted_types(config)
-    recording = scan(path, lambda kind: Keep.ALL if short_name(kind) in types else Keep.STAMP)
-    recording.require_sound()
+    recording = scan(path, lambda kind: Keep.ALL if short_name(kind) in types else Keep.NONE, window, progress)
+    if not salvage:
+        recording.require_sound()
     return Assembly(recording, choose_topics(recording, topics or {}, config), calibration).sequence(name)

@@ -1,8 +1,11 @@
 """Writing MCAP: columns of payloads from several topics, merged by time.
 
-A file has profile ``ros2``, chunks with CRCs, and all indexes. Topics that a viewer must also get when it joins late
-carry the quality of service "transient local" in the form of rosbag2, so that ``ros2 bag play`` offers it: without it
-RViz would never receive ``/tf_static``.
+A file has profile ``ros2``, chunks with CRCs, and all indexes. What lies outside chunks is covered too: by a CRC over
+all data, and metadata by a checksum of their own, which also holds in a file that was cut off. Each chunk is on its way
+to the disk as soon as it is full, so that a writer that is killed loses only the one that it was filling.
+
+Topics that a viewer must also get when it joins late carry the quality of service "transient local" in the form of
+rosbag2, so that ``ros2 bag play`` offers it: without it RViz would never receive ``/tf_static``.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from mcap.writer import Writer
@@ -17,6 +21,7 @@ from mcap.writer import Writer
 from sonar_graph.errors import LogError
 from sonar_graph.logs.layout import Bytes
 from sonar_graph.logs.message_definitions import definition
+from sonar_graph.logs.metadata import seal
 from sonar_graph.measurements import Ints
 
 _CHUNK_BYTES = 1 << 20
@@ -89,27 +94,31 @@ def _write(
     attachments: Sequence[Attachment],
 ) -> None:
     with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=_CHUNK_BYTES)
+        writer = Writer(stream, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
         writer.start(profile="ros2", library="sonar-graph")
         for name, record in metadata.items():
-            writer.add_metadata(name, dict(record))
+            writer.add_metadata(name, seal(record))
         if any(entry.is_latched for entry in messages):
             writer.add_metadata("rosbag2", ROSBAG2_METADATA)
         end_ns = max((int(m.log_times_ns.max()) for m in messages if len(m.log_times_ns)), default=0)
         for file in attachments:
             writer.add_attachment(0, max(end_ns, 0), file.name, file.media_type, file.content)
-        _add_messages(writer, messages)
+        _add_messages(writer, messages, stream)
         writer.finish()  # type: ignore[no-untyped-call]  # of the mcap package
 
 
-def _add_messages(writer: Writer, messages: list[Outgoing]) -> None:
+def _add_messages(writer: Writer, messages: list[Outgoing], stream: BinaryIO) -> None:
     channels = _register(writer, messages)
     times_ns = np.concatenate([np.maximum(m.log_times_ns, 0) for m in messages] or [np.empty(0, np.int64)])
     source = np.repeat(np.arange(len(messages)), [len(m.log_times_ns) for m in messages])
     row = np.concatenate([np.arange(len(m.log_times_ns)) for m in messages] or [np.empty(0, np.int64)])
     order = np.argsort(times_ns, kind="stable")
+    written = stream.tell()
     for time_ns, of, at in zip(times_ns[order].tolist(), source[order].tolist(), row[order].tolist(), strict=True):
         writer.add_message(channels[of], time_ns, messages[of].payloads[at].tobytes(), time_ns)
+        if stream.tell() != written:  # a chunk was full
+            stream.flush()
+            written = stream.tell()
 
 
 def _register(writer: Writer, messages: list[Outgoing]) -> list[int]:

@@ -68,6 +68,18 @@ class Window:
     start: Instant | None = None
     end: Instant | None = None
 
+    @property
+    def is_all(self) -> bool:
+        """Whether it has no limits."""
+        return self.start is None and self.end is None
+
+    def describe(self, beginning_ns: int) -> str:
+        """In seconds after the log's beginning."""
+        start_ns, end_ns = self.resolve(beginning_ns)
+        start = "the beginning" if self.start is None else f"{(start_ns - beginning_ns) / _NS_PER_S:.3f} s"
+        end = "the end" if self.end is None else f"{(end_ns - beginning_ns) / _NS_PER_S:.3f} s"
+        return f"{start} to {end} of the recording"
+
     def resolve(self, beginning_ns: int) -> tuple[int, int]:
         """First instant within, and first instant after, in nanoseconds since 1970."""
         start_ns = self.start.resolve(beginning_ns) if self.start else _FIRST_NS

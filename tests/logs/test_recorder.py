@@ -9,6 +9,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from sonar_graph.logs.encoding import pose_messages, static_message
+from sonar_graph.logs.metadata import open_seal
 from sonar_graph.logs.recorder import Attachment, Outgoing, write_recording
 from sonar_graph.states import Trajectory
 
@@ -58,7 +59,8 @@ def test_a_flipped_bit_in_a_chunk_does_not_pass_its_crc(recording: Path, tmp_pat
 def test_metadata_and_attachments_are_found_by_name(recording: Path) -> None:
     with recording.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
-        assert {m.name: m.metadata for m in reader.iter_metadata()}["about"] == {"key": "value ψ"}
+        about = {m.name: m.metadata for m in reader.iter_metadata()}["about"]
+        assert open_seal(about) == ({"key": "value ψ"}, True)
         (file,) = reader.iter_attachments()
     assert (file.name, file.media_type, file.data) == ("notes/a.json", "application/json", b'{"a": 1}')
 
