@@ -150,7 +150,7 @@ def inspect_log(
         left_out=tuple(left_out),
         warnings=tuple(warnings),
         sonar=_sonar(recording.path, choices[SONAR], config),
-        toml=starting_config(recording, list(choices.values())),
+        toml=starting_config(recording, list(choices.values()), config),
     )
 
 

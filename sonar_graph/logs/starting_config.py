@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters.adapter import Adapter, leaf_fields
-from sonar_graph.logs.adapters.config import shipped_for
-from sonar_graph.logs.adapters.toml_text import comment, table_text
+from sonar_graph.logs.adapters.config import LogConfig, shipped_for
+from sonar_graph.logs.adapters.toml_text import comment, plain_lines, table_text
 from sonar_graph.logs.container import Recording, Topic
 from sonar_graph.logs.message_definitions import short_name
 from sonar_graph.logs.roles import TF, Choice
@@ -20,23 +21,23 @@ _EXAMPLES = {
 }
 
 
-def starting_config(recording: Recording, choices: Sequence[Choice]) -> str:
+def starting_config(recording: Recording, choices: Sequence[Choice], config: LogConfig) -> str:
     """TOML that, read back unchanged, makes the same choices; comments say what else might be chosen."""
     used = {choice.topic for choice in choices}
     unknown = [topic for topic in recording.topics.values() if topic.name not in used and _is_unknown(topic)]
     parts = [f"# What the topics of {recording.path.name} are. Every key of a table that comes along may be left out."]
-    parts += [_table(recording, choice) for choice in choices]
+    parts += [_table(recording, choice, config.table(choice.role.name)) for choice in choices]
     if any(choice.topic is None and choice.role.is_required for choice in choices):
         parts += [comment(_described(topic)) for topic in unknown]
     return "\n\n".join(parts) + "\n"
 
 
-def _table(recording: Recording, choice: Choice) -> str:
+def _table(recording: Recording, choice: Choice, said: Mapping[str, Any]) -> str:
     role = choice.role.name
     if choice.topic is not None and choice.adapter is not None:
         return table_text(role, choice.topic, choice.adapter, _base(choice, recording.topics[choice.topic]))
-    if choice.is_off:
-        return f"[{role}]\nuse = false"
+    if said:  # it stays as it is, also where nothing in this log answers to it
+        return "\n".join([comment(choice.reason), f"[{role}]", *plain_lines(said)])
     named = choice.candidates or choice.could_be
     if named:
         return comment("\n".join([f"[{role}]  # one of", *(f'topic = "{name}"' for name in named)]))

@@ -94,7 +94,7 @@ class LogConfig:
         if not bases and "type" not in self.table(role):
             return []
         if not bases:
-            return [self._build(role, ADAPTERS[role], _changes(ADAPTERS[role].model_construct(), table))]
+            return [self._build(role, ADAPTERS[role], _changes(ADAPTERS[role].model_construct(type=type_name), table))]
         return [self._build(role, type(base), {**_plain(base), **_changes(base, table)}) for base in bases]
 
     def _check(self, role: str, table: Table) -> None:

@@ -36,6 +36,11 @@ def table_text(role: str, topic: str, adapter: Adapter, shipped: Adapter | None)
     return "\n".join(lines)
 
 
+def plain_lines(table: Mapping[str, Any]) -> list[str]:
+    """The keys of a table, one a line."""
+    return [f"{_key(name)} = {toml_value(value)}" for name, value in table.items()]
+
+
 def comment(text: str) -> str:
     """Text as comment lines."""
     return "\n".join(f"# {line}".rstrip() for line in text.splitlines())

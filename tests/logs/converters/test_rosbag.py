@@ -1,0 +1,216 @@
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from sonar_graph.errors import LogError
+from sonar_graph.logs.adapters.config import LogConfig
+from sonar_graph.logs.converters.rosbag import convert_rosbag
+from sonar_graph.logs.reading import read_sequence
+
+T0_NS = 1_447_550_804_242_631_687
+STEP_NS = 20_000_001
+Decode = Callable[[Path], dict[str, list[Any]]]
+
+
+def messages(store: Any, *, ros1: bool) -> list[tuple[str, str, Any]]:
+    """Topic, type and message: IMU, a camera whose fields have other names in ROS 2, and a latched transform."""
+    types = store.types
+    vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+    time, header = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
+
+    def head(row: int) -> Any:
+        stamp = time(*divmod(T0_NS + row * STEP_NS, 10**9))
+        return header(seq=row, stamp=stamp, frame_id="imu") if ros1 else header(stamp=stamp, frame_id="imu")
+
+    nine = np.arange(9.0)
+    found: list[tuple[str, str, Any]] = []
+    for row in range(5):
+        imu = types["sensor_msgs/msg/Imu"](
+            head(row), quaternion(0, 0, 0, 1), nine, vector(row, 2, 3), nine, vector(0, 0, 9.8), nine
+        )
+        found.append(("/imu", "sensor_msgs/msg/Imu", imu))
+    move = types["geometry_msgs/msg/Transform"](vector(1, 2, 3), quaternion(0, 0, 0, 1))
+    link = types["geometry_msgs/msg/TransformStamped"](head(0), "imu", move)
+    found.append(("/tf_static", "tf2_msgs/msg/TFMessage", types["tf2_msgs/msg/TFMessage"]([link])))
+    return found
+
+
+def ros1_store() -> Any:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage"))
+    return store
+
+
+@pytest.fixture
+def ros1_bag(tmp_path: Path) -> Path:
+    store = ros1_store()
+    path = tmp_path / "old.bag"
+    with Ros1Writer(path) as writer:
+        connections: dict[str, Any] = {}
+        for row, (topic, kind, message) in enumerate(messages(store, ros1=True)):
+            if topic not in connections:
+                latching = 1 if topic == "/tf_static" else None
+                connections[topic] = writer.add_connection(topic, kind, typestore=store, latching=latching)
+            writer.write(connections[topic], T0_NS + row * STEP_NS, store.serialize_ros1(message, kind))
+        info = store.types["sensor_msgs/msg/CameraInfo"]
+        names = {"D": np.array([0.5]), "K": np.arange(9.0), "R": np.arange(9.0), "P": np.arange(12.0)}
+        roi = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+        head = messages(store, ros1=True)[0][2].header
+        camera = info(head, 480, 640, "plumb_bob", *names.values(), 1, 1, roi)
+        kind = "sensor_msgs/msg/CameraInfo"
+        connection = writer.add_connection("/camera", kind, typestore=store)
+        writer.write(connection, T0_NS, store.serialize_ros1(camera, kind))
+    return path
+
+
+def test_stamps_values_and_times_are_those_of_the_bag(ros1_bag: Path, tmp_path: Path, decoded: Decode) -> None:
+    done = convert_rosbag(ros1_bag, tmp_path / "new.mcap")
+    assert (done.topics, done.messages, done.left_out) == (3, 7, {})
+    found = decoded(tmp_path / "new.mcap")
+    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in found["/imu"]]
+    assert stamps == [T0_NS + row * STEP_NS for row in range(5)]
+    assert [m.angular_velocity.x for m in found["/imu"]] == [0, 1, 2, 3, 4]
+    with (tmp_path / "new.mcap").open("rb") as stream:
+        times = [message.log_time for _, _, message in make_reader(stream).iter_messages(topics=["/imu"])]
+    assert times == stamps
+
+
+def test_definitions_are_those_of_ros_2(ros1_bag: Path, tmp_path: Path, decoded: Decode) -> None:
+    convert_rosbag(ros1_bag, tmp_path / "new.mcap")
+    with (tmp_path / "new.mcap").open("rb") as stream:
+        reader = make_reader(stream)
+        summary = reader.get_summary()
+        assert summary
+        texts = {schema.name: schema.data.decode() for schema in summary.schemas.values()}
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+        offers = {channel.topic: channel.metadata for channel in summary.channels.values()}
+    assert "seq" not in texts["sensor_msgs/msg/Imu"]
+    assert "float64[] d\n" in texts["sensor_msgs/msg/CameraInfo"]
+    assert decoded(tmp_path / "new.mcap")["/camera"][0].k == list(range(9))
+    assert metadata["rosbag"]["/imu"] == "sensor_msgs/Imu 6a62c6daae103f4ff57a132d6f95cec2"  # as rosmsg md5 prints it
+    assert "durability: 1" in offers["/tf_static"]["offered_qos_profiles"]
+    assert offers["/imu"] == {}
+
+
+def test_sqlite3_bags_keep_their_payloads(tmp_path: Path, decoded: Decode) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    folder = tmp_path / "ros2"
+    with Ros2Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connections: dict[str, Any] = {}
+        for row, (topic, kind, message) in enumerate(messages(store, ros1=False)):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(connections[topic], T0_NS + row * STEP_NS, store.serialize_cdr(message, kind))
+    (database,) = folder.glob("*.db3")
+    for source in (folder, database):
+        done = convert_rosbag(source, tmp_path / "new.mcap")
+        assert (done.topics, done.messages, done.left_out) == (2, 6, {})
+        found = decoded(tmp_path / "new.mcap")
+        assert [m.angular_velocity.x for m in found["/imu"]] == [0, 1, 2, 3, 4]
+        assert found["/tf_static"][0].transforms[0].transform.translation.y == 2
+
+
+def test_a_type_of_the_users_own_keeps_its_definition(tmp_path: Path, decoded: Decode) -> None:
+    store = ros1_store()
+    store.register(get_types_from_msg("Header header\nfloat64[4] velocity\n", "provider_dvl/msg/Packet"))
+    with Ros1Writer(tmp_path / "own.bag") as writer:
+        kind = "provider_dvl/msg/Packet"
+        connection = writer.add_connection("/dvl", kind, typestore=store)
+        head = messages(store, ros1=True)[3][2].header
+        message = store.types[kind](head, np.arange(4.0))
+        writer.write(connection, T0_NS, store.serialize_ros1(message, kind))
+    convert_rosbag(tmp_path / "own.bag", tmp_path / "own.mcap")
+    (found,) = decoded(tmp_path / "own.mcap")["/dvl"]
+    assert found.velocity == [0, 1, 2, 3]
+    assert found.header.stamp.nanosec == (T0_NS + 3 * STEP_NS) % 10**9
+
+
+def test_progress_counts_messages(ros1_bag: Path, tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+    convert_rosbag(ros1_bag, tmp_path / "new.mcap", lambda done, total: told.append((done, total)))
+    assert told
+    assert all(total == 7 and done <= total for done, total in told)
+
+
+def test_without_the_library_the_command_that_installs_it_is_named(
+    ros1_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(LogError, match=r"not installed: pip install 'sonar-graph\[rosbag\]'"):
+        convert_rosbag(ros1_bag, tmp_path / "new.mcap")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("broken.bag", b"#ROSBAG V2.0\nnonsense", r"broken\.bag cannot be read as a bag.*rosbag reindex"),
+        ("alone.db3", b"SQLite format 3\0", r"alone\.db3 cannot be read as a bag.*give the folder"),
+        ("text.txt", b"hello", r"text\.txt cannot be read as a bag"),
+    ],
+)
+def test_what_is_no_bag_is_refused_and_leaves_nothing(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(LogError, match=message):
+        convert_rosbag(tmp_path / name, tmp_path / "new.mcap")
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.recording
+@pytest.mark.parametrize("name", ["sonia_imu_dvl", "husky"])
+def test_real_bags_decode_to_what_the_library_reads(
+    recordings: Path, tmp_path: Path, decoded: Decode, name: str
+) -> None:
+    source = recordings / "bags" / f"{name}.bag"
+    convert_rosbag(source, tmp_path / "new.mcap")
+    found = decoded(tmp_path / "new.mcap")
+    with AnyReader([source]) as bag:
+        expected: dict[str, list[Any]] = {}
+        for connection, _, raw in bag.messages():
+            expected.setdefault(connection.topic, []).append(bag.deserialize(raw, connection.msgtype))
+    assert {topic: len(rows) for topic, rows in found.items()} == {t: len(rows) for t, rows in expected.items()}
+    for ours, theirs in zip(found["/imu/data"], expected["/imu/data"], strict=True):
+        assert (ours.header.stamp.sec, ours.header.stamp.nanosec) == (
+            theirs.header.stamp.sec,
+            theirs.header.stamp.nanosec,
+        )
+        assert ours.linear_acceleration.y == theirs.linear_acceleration.y
+        assert ours.orientation_covariance == theirs.orientation_covariance.tolist()
+
+
+@pytest.mark.recording
+def test_the_pool_run_of_sonia_is_a_sequence_with_a_few_lines_of_configuration(
+    recordings: Path, tmp_path: Path
+) -> None:
+    convert_rosbag(recordings / "bags" / "sonia_imu_dvl.bag", tmp_path / "new.mcap")
+    table = {"topic": "/provider_dvl_PD0Packet", "type": "provider_dvl/msg/PD0Packet", "stamp": "log"}
+    table["velocity"] = [f"velocity[{i}]" for i in range(3)]  # type: ignore[assignment]
+    sequence = read_sequence(tmp_path / "new.mcap", config=LogConfig.parse({"dvl": table}, "x"))
+    assert len(sequence.imu) == 9377
+    assert len(sequence.dvl) == 643
+    assert sequence.notes["log.dropped"] == "dvl: 1 with values that are not finite"
+    assert "log.warnings" not in sequence.notes
+    assert np.linalg.norm(sequence.dvl.velocity, axis=1).max() < 1.5
+
+
+@pytest.mark.recording
+def test_gravity_of_husky_is_on_the_side_and_a_rotation_puts_it_up(recordings: Path, tmp_path: Path) -> None:
+    convert_rosbag(recordings / "bags" / "husky.bag", tmp_path / "new.mcap")
+    topics = {"dvl": "/husky_velocity_controller/odom"}
+    plain = read_sequence(tmp_path / "new.mcap", topics=topics)
+    assert "gravity is felt along +y" in plain.notes["log.warnings"]
+    turned = LogConfig.parse({"imu": {"rotation": [90, 0, 0]}}, "x")
+    sequence = read_sequence(tmp_path / "new.mcap", topics=topics, config=turned)
+    assert "log.warnings" not in sequence.notes
+    assert np.median(sequence.imu.specific_force[:, 2]) == pytest.approx(9.8, abs=0.1)

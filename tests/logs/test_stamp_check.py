@@ -1,0 +1,28 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sonar_graph.logs.stamp_check import stamp_faults
+
+SECOND = 10**9
+EVEN = np.arange(100) * SECOND // 10 + 10**18
+
+
+def test_even_stamps_have_no_faults() -> None:
+    assert list(stamp_faults(EVEN, EVEN + SECOND // 20)) == []
+
+
+@pytest.mark.parametrize(
+    ("stamps_ns", "log_times_ns", "expected"),
+    [
+        (np.where(np.arange(100) < 3, 0, EVEN), EVEN, "3 messages without a stamp"),
+        (EVEN[np.r_[:50, 52, 50:52, 53:100]], EVEN, "once backwards, by 0.2 s at most"),
+        (np.where(np.arange(100) == 7, EVEN[6], EVEN), EVEN, "1 messages with the stamp of another"),
+        (EVEN - 5 * SECOND, EVEN, "stamped 5 s before recording"),
+        (EVEN + 5 * SECOND, EVEN, "stamped 5 s after recording"),
+        (EVEN - np.where(np.arange(100) < 60, 0, SECOND * 9 // 10), EVEN, "drift apart by 0.9 s"),
+    ],
+)
+def test_each_fault_is_told(stamps_ns: np.ndarray, log_times_ns: np.ndarray, expected: str) -> None:
+    assert any(expected in fault for fault in stamp_faults(stamps_ns, log_times_ns))
