@@ -20,6 +20,7 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from sonar_graph.errors import LogError
+from sonar_graph.logs.other_files import START_BYTES, kind_and_advice
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")
@@ -42,7 +43,6 @@ PRIVATE = 0x80
 _BLOCK = 1 << 22
 _STRETCH = 1 << 20
 _CHAIN = 3
-_OTHER_FORMATS = {b"#ROSBAG": "a ROS 1 bag", b"SQLite format 3": "a ROS 2 bag of the sqlite3 kind"}
 
 
 @dataclass(frozen=True)
@@ -114,12 +114,10 @@ class LogFile:
             raise LogError(f"{path} cannot be read: {error.strerror}") from error
         self.path = path
         self.size = self._stream.seek(0, 2)
-        start = self.read(0, 16)
+        start = self.read(0, START_BYTES)
         if not start.startswith(MAGIC):
             self._stream.close()
-            kind = next((name for magic, name in _OTHER_FORMATS.items() if start.startswith(magic)), "something else")
-            advice = "of a ROS bag `rosbags-convert --src BAG --dst FOLDER --dst-storage mcap` makes one"
-            raise LogError(f"{path} is not an MCAP file but {kind}; {advice}")
+            raise LogError(f"{path} is not an MCAP file but {kind_and_advice(path, start)}")
 
     def __enter__(self) -> Self:
         return self

@@ -219,6 +219,6 @@ def test_a_third_party_log_without_the_sensors_lists_its_topics(recordings: Path
 
 
 @pytest.mark.recording
-def test_a_ros_1_bag_is_sent_to_rosbags_convert(recordings: Path) -> None:
-    with pytest.raises(LogError, match=r"a ROS 1 bag.*rosbags-convert"):
+def test_a_ros_1_bag_is_sent_to_convert(recordings: Path) -> None:
+    with pytest.raises(LogError, match=r"a ROS 1 bag; `sonar-graph convert rosbag"):
         read_sequence(recordings / "bags" / "husky.bag")

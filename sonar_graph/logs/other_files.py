@@ -1,0 +1,42 @@
+"""Files that are given as a log and are none: what they seem to be, and what to do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+START_BYTES = 64
+"""How much of a file's beginning tells."""
+
+
+def kind_and_advice(path: Path, start: bytes) -> str:
+    """What completes "is not an MCAP file but ...".
+
+    Parameters
+    ----------
+    path
+        Of the file.
+    start
+        Its first bytes; fewer than `START_BYTES` only where the file ends.
+    """
+    if not start:
+        return "empty: copy it again, or see whether the recorder wrote anything"
+    convert = f"`sonar-graph convert rosbag {path} -o {path.with_suffix('.mcap').name}` makes one"
+    if start.startswith(b"#ROSBAG"):
+        return f"a ROS 1 bag; {convert}"
+    if start.startswith(b"SQLite format 3"):
+        return f"a ROS 2 bag of the sqlite3 kind; {convert}"
+    if not start.strip(b"\0"):
+        return "zeros: copy it again, or see whether the recorder wrote anything"
+    if _is_text(start):
+        first_line = start.decode("utf-8", "replace").strip().partition("\n")[0]
+        return f"a text that begins with {first_line[:40]!r}; {_LOGS}"
+    return f"something else; {_LOGS}"
+
+
+_LOGS = "logs are .mcap files, and ROS bags become one by `sonar-graph convert rosbag`"
+
+
+def _is_text(start: bytes) -> bool:
+    """Whether these are printable characters, the last of which may be cut."""
+    text = start.decode("utf-8", "replace").rstrip("\ufffd")
+    return bool(text) and all(character.isprintable() or character.isspace() for character in text)
