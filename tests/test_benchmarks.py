@@ -45,6 +45,13 @@ def test_isam2_mission_names_its_figures() -> None:
     assert found["plain_error_m"] < 0.3
 
 
+def test_nested_messages_are_the_same_in_both_libraries() -> None:
+    found = figures("performance/nested_messages.py")
+    assert found["same"]
+    kinds = ("detections", "diagnostics", "scans")
+    assert {f"{kind}_{share}" for kind in kinds for share in ("ratio", "shared_ratio")} <= set(found)
+
+
 @pytest.mark.slow
 def test_ekf_step_names_its_figures() -> None:
     assert {"log_s", "filterpy_ratio"} <= set(figures("performance/ekf_step.py"))

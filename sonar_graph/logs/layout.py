@@ -68,20 +68,13 @@ class Layout:
         sequence = self._plan.sequences.get(path)
         return self.column(path).counts if sequence is None else self._found[sequence.index][1::2]
 
-    def texts(self) -> Iterator[tuple[str, int, int]]:
-        """Path, start and end of every string, with its closing NUL."""
-        for path in self._plan.texts:
-            yield from self._stretches(path)
+    def texts(self) -> Iterator[tuple[str, Column]]:
+        """Every string field with its path; the closing NUL counts as one of its bytes."""
+        return ((path, self.column(path)) for path in self._plan.texts)
 
-    def booleans(self) -> Iterator[tuple[str, int, int]]:
-        """Path, start and end of every stretch of booleans."""
-        for path in self._plan.booleans:
-            yield from self._stretches(path)
-
-    def _stretches(self, path: str) -> Iterator[tuple[str, int, int]]:
-        column = self.column(path)
-        for start, count in zip(column.starts, column.counts, strict=True):
-            yield path, start, start + count
+    def booleans(self) -> Iterator[tuple[str, Column]]:
+        """Every field of booleans with its path."""
+        return ((path, self.column(path)) for path in self._plan.booleans)
 
     def same(self, payloads: Bytes, rows: Ints) -> NDArray[np.bool_]:
         """Which rows of payloads, shape (n, size), have this layout."""

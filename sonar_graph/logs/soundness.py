@@ -65,18 +65,20 @@ def _byte_order(payload: memoryview) -> str:
 
 def unsound_contents(layout: Layout, payloads: Bytes) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """What is wrong with booleans and strings of payloads that share a layout, and which have it, shape (n,)."""
-    for path, start, end in layout.booleans():
-        has_it = np.asarray((payloads[:, start:end] > 1).any(axis=1))
-        if has_it.any():
-            yield f"with a boolean {path} that is neither 0 nor 1", has_it
-    many, first = len(payloads) > 1, payloads[0].data
-    for path, start, end in layout.texts():
-        characters = payloads[:, start:end].tobytes() if many else bytes(first[start:end])
-        length = end - start
-        if length and not (characters.isascii() and characters[length - 1 :: length].count(0) == len(payloads)):
-            has_it = np.array([not _is_text(characters[i : i + length]) for i in range(0, len(characters), length)])
+    for path, column in layout.booleans():
+        for start, count in zip(column.starts, column.counts, strict=True):
+            has_it = np.asarray((payloads[:, start : start + count] > 1).any(axis=1))
             if has_it.any():
-                yield f"with a string {path} that is not UTF-8 closed by a NUL", has_it
+                yield f"with a boolean {path} that is neither 0 nor 1", has_it
+    many, first = len(payloads) > 1, payloads[0].data
+    for path, column in layout.texts():
+        for start, length in zip(column.starts, column.counts, strict=True):
+            end = start + length
+            characters = payloads[:, start:end].tobytes() if many else bytes(first[start:end])
+            if length and (any(characters[length - 1 :: length]) or not characters.isascii()):
+                has_it = np.array([not _is_text(characters[i : i + length]) for i in range(0, len(characters), length)])
+                if has_it.any():
+                    yield f"with a string {path} that is not UTF-8 closed by a NUL", has_it
 
 
 def _is_text(characters: bytes) -> bool:

@@ -53,6 +53,11 @@ def test_constants_comments_defaults_and_bounds_are_understood() -> None:
     }
 
 
+def test_types_may_be_named_with_msg_as_rosbag2_does() -> None:
+    text = f"some_msgs/Part part\n{RULE}\nMSG: some_msgs/msg/Part\nfloat64 x\n"
+    assert [field.name for field in parse_definition(NAME, text).fields] == ["part"]
+
+
 def test_types_of_the_own_package_need_no_prefix_and_time_needs_no_definition() -> None:
     text = f"Part part\nbuiltin_interfaces/Time stamp\n{RULE}\nMSG: some_msgs/Part\nfloat64 x\n"
     part, stamp = parse_definition(NAME, text).fields
