@@ -106,7 +106,7 @@ class EkfSlam:
         EstimatorError
             When the pitch comes so near 90 degrees that the Euler angles are singular.
         MeasurementError
-            When a range or azimuth is not finite, or a row is stamped after ``end_ns``.
+            When a row is stamped after ``end_ns``.
         """
         self._odometry.add(measurements.imu, measurements.dvl)
         self._start()
@@ -119,7 +119,7 @@ class EkfSlam:
             self._record(detections, ids, refusals, _NO_OUTCOMES)
             return None
         columns = self._detection_columns(detections, ids, refusals)
-        frame_ns = np.maximum(detections.stamps_ns, since_ns) if detections else _NO_STAMPS
+        frame_ns = _NO_STAMPS if detections is None else np.maximum(detections.stamps_ns, since_ns)
         outcomes, pose = self._run(_since(depth, since_ns), frame_ns, columns, measurements.end_ns)
         self._record(detections, ids, refusals, outcomes)
         self._forget()
@@ -233,13 +233,13 @@ class EkfSlam:
     ) -> None:
         if detections is None:
             return
-        kinds, innovations, covs = outcomes
-        for row, (landmark_id, reason) in enumerate(zip(ids, refusals, strict=True)):
-            stamp_ns = int(detections.stamps_ns[row])
+        kinds, innovations, covs = outcomes[0].tolist(), outcomes[1], outcomes[2]
+        rows = zip(detections.stamps_ns.tolist(), ids, refusals, strict=True)
+        for row, (stamp_ns, landmark_id, reason) in enumerate(rows):
             if reason:
                 self._journal.record(stamp_ns, landmark_id, reason)
             else:
-                self._journal.record(stamp_ns, landmark_id, OUTCOMES[int(kinds[row])], innovations[row], covs[row])
+                self._journal.record(stamp_ns, landmark_id, OUTCOMES[kinds[row]], innovations[row], covs[row])
 
     def _make_room(self) -> None:
         needed, room = POSE + LANDMARK * len(self._slots), len(self._x)
@@ -265,14 +265,6 @@ def _check(detections: LandmarkDetections | None, depth: Depth | None, end_ns: i
             raise MeasurementError(
                 f"Measurements: {type(block).__name__} has a row at {block.stamps_ns[-1]} ns, after end_ns = {end_ns};"
                 " hand it in with the call that reaches it"
-            )
-    if detections is None or math.isfinite(detections.range_m @ detections.azimuth_rad):
-        return
-    for name in ("range_m", "azimuth_rad"):
-        finite = np.isfinite(getattr(detections, name))
-        if not finite.all():
-            raise MeasurementError(
-                f"LandmarkDetections.{name}: row {finite.argmin()} is not finite; leave such rows out of the log"
             )
 
 

@@ -96,11 +96,11 @@ class Odometry:
 
     def add(self, imu: Imu | None, dvl: Dvl | None) -> None:
         """Take in rows; those not newer than what is already there, or stamped as the row before, are passed over."""
-        newer_imu = _newer(imu, self._imu_ns) if imu else None
-        newer_dvl = _newer(dvl, self._dvl_ns) if dvl else None
-        if newer_imu:
+        newer_imu = None if imu is None else _newer(imu, self._imu_ns)
+        newer_dvl = None if dvl is None else _newer(dvl, self._dvl_ns)
+        if newer_imu is not None:
             self._add_imu(newer_imu)
-        if newer_dvl:
+        if newer_dvl is not None:
             self._add_dvl(newer_dvl)
 
     def _add_imu(self, imu: Imu) -> None:

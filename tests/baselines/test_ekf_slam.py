@@ -195,10 +195,10 @@ def test_a_detection_far_off_is_gated_and_changes_nothing():
     assert_array_equal(slam.state()[2], before[2])
 
 
-def test_a_range_that_is_no_number_is_an_error_that_names_it():
+def test_a_row_after_the_instant_is_an_error_that_names_it():
     slam = EkfSlam(Calibration())
-    with pytest.raises(MeasurementError, match="range_m: row 0"):
-        slam.process(Measurements(T0_NS + 1, None, None, None, detection(T0_NS, range_m=math.nan)))
+    with pytest.raises(MeasurementError, match=f"LandmarkDetections has a row at {T0_NS + 1} ns"):
+        slam.process(Measurements(T0_NS, None, None, None, detection(T0_NS + 1)))
 
 
 def tilted(roll, pitch, force_scale=1.0):
