@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 TUTORIALS = Path(__file__).parents[1] / "docs" / "tutorials"
@@ -74,6 +75,60 @@ def test_page_on_viewers_has_commands_and_a_program_that_work(tmp_path: Path) ->
     assert seen
     for landmark, x_m, y_m in seen:
         assert (float(x_m), float(y_m)) == pytest.approx(TRUE_LANDMARKS[int(landmark)], abs=0.3)
+
+
+def test_page_on_own_logs_has_programs_a_configuration_and_commands_that_work(tmp_path: Path) -> None:
+    page = (TUTORIALS / "04_your_own_log.md").read_text(encoding="utf-8")
+    making, *others = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (configuration,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    write_ros1_bag(tmp_path / "old.bag")
+    subprocess.run([sys.executable, "-W", "error", "-c", making], cwd=tmp_path, check=True)
+    printed = {}
+    for line in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE):
+        words, _, target = line.partition(" > ")
+        command = [Path(sys.executable).parent / "sonar-graph", *words.split()]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr
+        printed[words] = done.stdout
+        if target:  # what is printed is a starting point; the page's own text is where the reader ends
+            assert '# topic = "/nav/dvl"\n# type = "my_msgs/msg/Speed"' in done.stdout
+            (tmp_path / target).write_text(configuration, encoding="utf-8")
+    first, second = printed["inspect dive.mcap"], printed["inspect dive.mcap --log-config dive.toml"]
+    assert "not usable for compare: no DVL" in first
+    assert "gravity is felt along -z" in first
+    assert "less than the atmosphere's" in first
+    assert not {"warning", "not usable", "left out"} & set(re.findall("warning|not usable|left out", second))
+    for program in others:
+        subprocess.run([sys.executable, "-W", "error", "-c", program], cwd=tmp_path, check=True)
+    assert_is_simulated(tmp_path)
+
+
+def write_ros1_bag(path: Path) -> None:
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Writer(path) as writer:
+        text = store.types["std_msgs/msg/String"]("hello")
+        connection = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=store)
+        writer.write(connection, 1, store.serialize_ros1(text, "std_msgs/msg/String"))
+
+
+def assert_is_simulated(folder: Path) -> None:
+    """What is read from the log that the page makes is what was simulated, whatever the axes and units between."""
+    from sonar_graph.logs.adapters.config import read_log_config
+    from sonar_graph.logs.reading import read_sequence
+    from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+
+    truth = simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1))
+    found = read_sequence(folder / "dive.mcap", config=read_log_config(folder / "dive.toml"))
+    assert truth.depth
+    assert found.depth
+    np.testing.assert_allclose(found.imu.angular_velocity, truth.imu.angular_velocity, atol=1e-12)
+    np.testing.assert_allclose(found.imu.specific_force, truth.imu.specific_force, atol=1e-12)
+    np.testing.assert_allclose(found.dvl.velocity, truth.dvl.velocity, atol=1e-12)
+    scale = truth.calibration.gravity_m_s2 / 9.80665  # the calibration does not travel in a foreign log
+    np.testing.assert_allclose(found.depth.z_m, truth.depth.z_m * scale, atol=1e-9)
 
 
 def test_every_tutorial_is_listed_and_run() -> None:
