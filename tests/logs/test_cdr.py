@@ -158,6 +158,20 @@ def test_messages_with_a_layout_each_are_read_like_those_that_share_one() -> Non
     assert seen == {row: (names, float(row)) for row, names in enumerate(lists)}
 
 
+def test_byte_orders_are_told_apart_where_every_message_has_its_own_layout() -> None:
+    definition = parse_definition(NAME, "uint8[] a\nuint8[] b\nint32 c\n")
+    sizes = [(4 * i, 160 - 4 * i) for i in range(41) for _ in "<>"]
+    payloads = [
+        bytes([0, order == "<", 0, 0]) + struct.pack(f"{order}I{a}sI{b}si", a, b"a" * a, b, b"b" * b, row)
+        for row, ((a, b), order) in enumerate(zip(sizes, "<>" * 41, strict=True))
+    ]
+    groups = decode(definition, stacked(payloads)).groups
+    found = {
+        row: value for group in groups for row, value in zip(group.rows.tolist(), group["c"].tolist(), strict=True)
+    }
+    assert found == {row: row for row in range(82)}
+
+
 def test_layouts_met_in_an_earlier_part_give_the_same_columns() -> None:
     definition = parse_definition(NAME, "string s\nfloat64[] v\n")
     payloads = encode(definition, 6, {"s": "abc", "v": np.arange(12.0).reshape(6, 2)})

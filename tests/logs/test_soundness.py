@@ -3,6 +3,7 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Callable
+from itertools import combinations, islice, pairwise
 from typing import Any
 
 import numpy as np
@@ -117,6 +118,19 @@ def test_21_000_messages_that_are_broken_or_hardly_share_a_layout_take_no_longer
     start = time.perf_counter()
     decode(DEFINITION, stacks)
     assert time.perf_counter() - start < 3.0
+
+
+def test_12_000_messages_of_one_length_with_a_layout_each_take_no_longer_than_seconds() -> None:
+    ends = [(0, *cuts, 64) for cuts in islice(combinations(range(1, 64), 3), 12_000)]
+    texts = [[4 * (b - a) for a, b in pairwise(cuts)] for cuts in ends]  # four strings of together 256 bytes
+    payloads = [START + b"".join(struct.pack(f"<I{n}s", n, b"x" * (n - 1)) for n in lengths) for lengths in texts]
+    stacks = stacked(payloads)
+    assert len(stacks) == 1
+    definition = parse_definition(NAME, "string[4] names\n")
+    start = time.perf_counter()
+    decoded = decode(definition, stacks)
+    assert time.perf_counter() - start < 3.0
+    assert len(decoded.groups) == 12_000
 
 
 def test_a_fixed_array_without_end_is_found_out_before_it_is_walked() -> None:
