@@ -19,6 +19,7 @@ from sonar_graph.logs.log_record import read_calibration, read_notes, recorded_n
 from sonar_graph.logs.mountings import mounting_of, static_frames, with_mountings
 from sonar_graph.logs.roles import ROLES, Choice
 from sonar_graph.logs.sanity import axes_warning, gravity_warning
+from sonar_graph.logs.stamp_check import stamp_faults
 from sonar_graph.logs.table import Dropped, Table
 from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
@@ -92,6 +93,9 @@ class Assembly:
         )
         if self._dropped:
             self._notes["log.dropped"] = "; ".join(self.left_out())
+        stamps = list(self._stamp_faults())
+        if stamps:
+            self._notes["log.stamps"] = "; ".join(stamps)
         warnings = list(self.warnings())
         if warnings:
             self._notes["log.warnings"] = "; ".join(warnings)
@@ -143,6 +147,10 @@ class Assembly:
         if "dvl" in self._tables and not self._is_mounting_known:
             text = axes_warning(self._adapters["dvl"])
             yield from [f"dvl: {text}"] if text else []
+
+    def _stamp_faults(self) -> Iterator[str]:
+        for role, table in self._tables.items():
+            yield from (f"{role}: {text}" for text in stamp_faults(table.stamps_ns, table.topic.log_times_ns))
 
     def survey(self) -> tuple[list[str], list[str]]:
         """What is left out and what looks wrong in all that was chosen, be it enough for a sequence or not."""

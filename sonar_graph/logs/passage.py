@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -121,12 +121,11 @@ class Passage:
             if chunk is not None and isinstance(item, Record) and item.opcode == Opcode.MESSAGE_INDEX:
                 index.update(self._read_index(item))
                 continue
-            if chunk is not None:
-                yield from self._take_chunk(chunk, index, item)
+            is_told = chunk is not None and (yield from self._take_chunk(chunk, index, item))
             chunk, index = (item if isinstance(item, ChunkRecord) else None), {}
             if isinstance(item, Stretch):
                 yield from self._take_loose(item)
-            elif isinstance(item, Hole):
+            elif isinstance(item, Hole) and not is_told:
                 yield from self._take_hole(item)
             elif isinstance(item, Record) and chunk is None:
                 self._take_other(item)
@@ -141,19 +140,18 @@ class Passage:
         rows = np.frombuffer(content, "<u8", offset=6, count=(len(content) - 6) // 16 * 2).reshape(-1, 2)
         return {int.from_bytes(content[:2], "little"): rows}
 
-    def _take_chunk(self, chunk: ChunkRecord, index: Index, following: object) -> Iterator[Piece]:
+    def _take_chunk(self, chunk: ChunkRecord, index: Index, following: object) -> Generator[Piece, None, bool]:
+        """Whether a hole that follows is told already, as a part of a chunk that is not whole."""
         self._report(chunk.end)
         self.chunks += 1
         if not self._is_wanted(chunk):
             self.skipped += 1
-            return
+            return False
         try:
             data = unpack(chunk, self._file.read(chunk.data_at, chunk.data_size))
         except ChunkError as error:
-            is_followed = not isinstance(following, Hole)
-            end = chunk.end if is_followed else self._walk.search(chunk.at).end
-            self._lose(chunk.at, end, f"chunk {self.chunks} is lost: {error}", chunk, self._counted(index))
-            return
+            self._lose_chunk(chunk, index, isinstance(following, Hole), f"chunk {self.chunks} is lost: {error}")
+            return True
         content = find_by_index(data, index) if index else None
         if content is None:
             content = find_by_walk(data)
@@ -164,6 +162,15 @@ class Passage:
         self._check_against_summary(chunk, content)
         self._without_crc += not chunk.crc
         yield from self._take_content(content, chunk.at, chunk.end, is_covered=chunk.crc != 0)
+        return False
+
+    def _lose_chunk(self, chunk: ChunkRecord, index: Index, before_hole: bool, reason: str) -> None:
+        """A chunk with a hole after it may have the wrong length: what follows is searched from its beginning."""
+        end = self._walk.search(chunk.at).end if before_hole else chunk.end
+        if end == self._file.size and not self._walk.reached_end:
+            self.damage.ending = Loss(chunk.at, end, f"the file is cut off, or overwritten from there: {reason}")
+        else:
+            self._lose(chunk.at, end, reason, chunk, self._counted(index))
 
     def _counted(self, index: Index) -> dict[str, int] | None:
         """How many messages of each topic a chunk's index counts."""

@@ -1,45 +1,17 @@
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, IndexType
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.container import Keep, scan
+from sonar_graph.logs.container import Keep, scan, stream
+from sonar_graph.logs.window import Instant, Window
 
-TEXT = b"uint8[] data\n"
-
-
-def write(path: Path, count: int = 400, **settings: object) -> list[tuple[int, bytes]]:
-    """A log of messages of three lengths on one topic, between others in JSON; returns times and payloads."""
-    rng = np.random.default_rng(0)
-    written = []
-    with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=4096, **settings)  # type: ignore[arg-type]
-        writer.start("ros2", "test")
-        schema = writer.register_schema("test_msgs/msg/Bytes", "ros2msg", TEXT)
-        other = writer.register_schema("Some", "jsonschema", b"{}")
-        channel = writer.register_channel("/bytes", "cdr", schema)
-        silent = writer.register_channel("/json", "json", other)
-        writer.register_channel("/never", "cdr", schema)
-        writer.add_metadata("sonar_graph", {"name": "x"})
-        for i in range(count):
-            payload = rng.bytes([20, 50, 80][i % 3])
-            written.append((1000 + i, payload))
-            writer.add_message(channel, 1000 + i, payload, 1000 + i)
-            writer.add_message(silent, 1000 + i, b'{"a": 1}', 1000 + i)
-        writer.finish()
-    return written
-
-
-def read(path: Path) -> list[tuple[int, bytes]]:
-    topic = scan(path, lambda _: Keep.ALL).topics["/bytes"]
-    stacks = [part for stack in topic.stacks.values() for part in stack]
-    payloads = {row: p.tobytes() for rows, ps in stacks for row, p in zip(rows, ps, strict=True)}
-    return [(int(time), payloads[row]) for row, time in enumerate(topic.log_times_ns)]
+from .containers import chunk_indexes, entries, flip, read, scan_all, write, write_apart
 
 
 @pytest.mark.parametrize(
@@ -63,6 +35,7 @@ def test_every_message_is_found_whatever_the_container(tmp_path: Path, settings:
     assert recording.metadata == {"sonar_graph": {"name": "x"}}
     assert recording.ending is None
     assert recording.corrupt == []
+    assert recording.damage.remarks == []
 
 
 def test_only_the_beginning_is_kept_where_only_the_stamp_is_wanted(tmp_path: Path) -> None:
@@ -89,10 +62,7 @@ def test_a_file_cut_off_gives_what_is_whole_and_says_so(tmp_path: Path, kept: fl
 def test_a_writer_killed_between_records_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     write(path)
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    last = summary.chunk_indexes[-1]
+    last = chunk_indexes(path)[-1]
     path.write_bytes(path.read_bytes()[: last.chunk_start_offset + last.chunk_length])
     assert scan(path, lambda _: Keep.ALL).ending is not None
 
@@ -101,33 +71,34 @@ def test_a_writer_killed_between_records_is_noticed(tmp_path: Path) -> None:
 def test_a_flipped_bit_loses_its_chunk_and_is_never_read_as_data(tmp_path: Path, compression: CompressionType) -> None:
     path = tmp_path / "log.mcap"
     written = write(path, compression=compression)
-    content = bytearray(path.read_bytes())
-    with path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    chunk = summary.chunk_indexes[1]
-    content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 4
-    path.write_bytes(content)
+    chunk = chunk_indexes(path)[1]
+    flip(path, chunk.chunk_start_offset + chunk.chunk_length // 2)
     found = read(path)
     assert set(found) < set(written)
     recording = scan(path, lambda _: Keep.ALL)
-    with pytest.raises(LogError, match=r"damaged: bytes \d+ to \d+: chunk 2 is lost.*lost: 35 of /bytes, 35 of /json.*--salvage"):
+    with pytest.raises(
+        LogError, match=r"damaged: bytes \d+ to \d+: chunk 2 is lost.*lost: 35 of /bytes, 35 of /json.*--salvage"
+    ):
         recording.require_sound()
 
 
 @pytest.mark.parametrize(
     ("content", "kind"),
     [
-        (b"#ROSBAG V2.0\n", "a ROS 1 bag"),
-        (b"SQLite format 3\0", "sqlite3"),
-        (b"", "something else"),
-        (b"{}", "something else"),
+        (b"#ROSBAG V2.0\n", r"a ROS 1 bag; `sonar-graph convert rosbag .*log\.bag -o log\.mcap`"),
+        (b"SQLite format 3\0", "a ROS 2 bag of the sqlite3 kind; `sonar-graph convert rosbag"),
+        (b"", "empty: copy it again"),
+        (bytes(1000), "zeros: copy it again"),
+        (b'{"a": 1}\nb', r"""a text that begins with '\{"a": 1\}'"""),
+        ("Überschrift\n".encode() * 9, "a text that begins with 'Überschrift'"),
+        (b" \n ", "a text that begins with ''"),
+        (b"\x7fELF\x02\x01\x01", "something else"),
     ],
 )
 def test_other_files_are_named_for_what_they_are(tmp_path: Path, content: bytes, kind: str) -> None:
     path = tmp_path / "log.bag"
     path.write_bytes(content)
-    with pytest.raises(LogError, match=rf"not an MCAP file but .*{kind}.*rosbags-convert"):
+    with pytest.raises(LogError, match=rf"not an MCAP file but {kind}"):
         scan(path, lambda _: Keep.ALL)
 
 
@@ -136,3 +107,136 @@ def test_folders_and_missing_files_are_named(tmp_path: Path) -> None:
         scan(tmp_path, lambda _: Keep.ALL)
     with pytest.raises(LogError, match="No such file"):
         scan(tmp_path / "none.mcap", lambda _: Keep.ALL)
+
+
+def test_pieces_are_what_a_scan_finds_in_the_same_order(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    write(path)
+    pieces: dict[str, list[tuple[int, bytes]]] = {}
+    for piece in stream(path, lambda _: Keep.ALL):
+        pieces.setdefault(piece.name, []).extend(entries(piece))
+    assert pieces == {name: entries(topic) for name, topic in scan_all(path).topics.items()}
+
+
+def test_pieces_of_a_damaged_file_end_in_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    written = write(path)
+    flip(path, chunk_indexes(path)[1].chunk_start_offset + 100)
+    found = []
+    with pytest.raises(LogError, match="damaged: bytes"):
+        found += [
+            entry for piece in stream(path, lambda _: Keep.ALL) if piece.name == "/bytes" for entry in entries(piece)
+        ]
+    assert set(found) <= set(written)
+
+
+def test_chunks_without_a_wanted_topic_are_not_even_read(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    write_apart(path)
+    for index in chunk_indexes(path)[1::2]:  # those of /b: damage there goes unnoticed, and the recording says so
+        flip(path, index.chunk_start_offset + index.chunk_length - 1)
+    whole = scan_all(path)
+    assert len(whole.corrupt) == 50
+    recording = scan(path, lambda kind: Keep.NONE if kind.endswith("/B") else Keep.ALL)
+    assert len(recording.topics["/a"]) == 50
+    assert recording.corrupt == []
+    assert (recording.chunks, recording.skipped_chunks) == (100, 50)
+    assert recording.notes()["log.skipped"].startswith("50 of 100 chunks")
+
+
+def test_a_window_holds_what_was_recorded_in_it_and_latched_topics(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    write_apart(path)
+    recording = scan(path, lambda _: Keep.ALL, Window(Instant.parse("10"), Instant.parse("20")))
+    times_s = sorted(t for name in ("/a", "/b") for t in (recording.topics[name].log_times_ns // 10**9).tolist())
+    assert times_s == list(range(11, 21))
+    assert entries(recording.topics["/tf_static"]) == [(10**9, b"static")]
+    assert recording.skipped_chunks == 89
+    assert recording.notes()["log.part"] == "10.000 s to 20.000 s of the recording"
+    absolute = Window(Instant.parse("1970-01-01T00:01:31Z"))
+    assert sum(len(t) for t in scan(path, lambda _: Keep.ALL, absolute).topics.values()) == 11
+
+
+@pytest.mark.parametrize("summary", [True, False])
+def test_a_window_is_the_same_without_summary(tmp_path: Path, summary: bool) -> None:
+    path = tmp_path / "log.mcap"
+    written = write(path)
+    if not summary:
+        path.write_bytes(path.read_bytes()[: chunk_indexes(path)[-1].chunk_start_offset])
+        written = read(path)
+    window = Window(Instant.parse("100e-9"), Instant.parse("150e-9"))
+    recording = scan(path, lambda _: Keep.ALL, window)
+    assert entries(recording.topics["/bytes"]) == [entry for entry in written if 1100 <= entry[0] < 1150]
+    assert (recording.skipped_chunks > 0) == summary
+
+
+def test_an_empty_window_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    write_apart(path)
+    with pytest.raises(LogError, match=r"nothing was recorded from 1000\.000 s to the end"):
+        scan(path, lambda _: Keep.ALL, Window(Instant.parse("1000")))
+
+
+@pytest.mark.parametrize("part", ["time", "offset", "channel", "missing"])
+def test_an_index_that_does_not_fit_its_chunk_is_not_believed(tmp_path: Path, part: str) -> None:
+    path = tmp_path / "log.mcap"
+    written = write(path, compression=CompressionType.NONE)
+    chunk = chunk_indexes(path)[2]
+    index_at = min(chunk.message_index_offsets.values())
+    if part == "missing":  # an index with one entry fewer, its lengths in order
+        content = bytearray(path.read_bytes())
+        (length,) = struct.unpack_from("<Q", content, index_at + 1)
+        private = struct.pack("<BQ", 0x80, 16 - 9) + bytes(16 - 9)
+        content[index_at + 1 : index_at + 9] = struct.pack("<Q", length - 16)
+        content[index_at + 11 : index_at + 15] = struct.pack("<I", length - 16 - 6)
+        content[index_at + 9 + length - 16 : index_at + 9 + length] = private
+        path.write_bytes(content)
+    else:
+        flip(path, index_at + {"channel": 9, "time": 15, "offset": 23}[part], 1)
+    recording = scan_all(path)
+    assert entries(recording.topics["/bytes"]) == written
+    assert recording.corrupt == []
+    assert any("message index of chunk 3" in remark for remark in recording.damage.remarks)
+
+
+def test_a_summary_that_lies_about_chunks_is_not_used_to_skip(tmp_path: Path) -> None:
+    """The index of a chunk with /a says that it holds /b only, in a summary without CRC."""
+    path = tmp_path / "log.mcap"
+    write_apart(path)
+    content = bytearray(path.read_bytes())
+    footer_at = len(content) - 8 - 29
+    content[footer_at + 25 : footer_at + 29] = bytes(4)
+    index = chunk_indexes(path)[4]
+    entry = struct.pack("<IHQ", 10, 1, index.message_index_offsets[1])
+    assert content.count(entry) == 1
+    at = content.index(entry)
+    content[at : at + len(entry)] = struct.pack("<IHQ", 10, 2, index.message_index_offsets[1])
+    path.write_bytes(content)
+    recording = scan(path, lambda _: Keep.ALL, Window(Instant.parse("3"), Instant.parse("7")))
+    assert (recording.topics["/a"].log_times_ns // 10**9).tolist() == [5, 7]
+    assert any("the summary's index does not fit chunk 5" in remark for remark in recording.damage.remarks)
+    assert recording.skipped_chunks == 0
+
+
+def test_progress_ends_at_the_whole(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    write(path)
+    calls: list[tuple[int, int]] = []
+    scan(path, lambda _: Keep.ALL, progress=lambda done, total: calls.append((done, total)))
+    done = [d for d, _ in calls]
+    assert done == sorted(done)
+    assert {total for _, total in calls} == {path.stat().st_size}
+    assert len(calls) == len(chunk_indexes(path))
+
+
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE])
+def test_half_a_chunk_gives_its_whole_messages(tmp_path: Path, compression: CompressionType) -> None:
+    path = tmp_path / "log.mcap"
+    written = write(path, 60_000, chunk_size=1 << 20, compression=compression)
+    second = chunk_indexes(path)[1]
+    before = int(np.searchsorted([time for time, _ in written], second.message_start_time))
+    path.write_bytes(path.read_bytes()[: second.chunk_start_offset + second.chunk_length // 2])
+    found = read(path)
+    assert found == written[: len(found)]
+    assert len(found) > before + 0.2 * before
+    assert "which no CRC covers" in (scan_all(path).ending or "")

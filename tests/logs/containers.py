@@ -1,0 +1,83 @@
+"""Small MCAP files to be read and damaged, written by mcap's own writer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap.records import ChunkIndex
+from mcap.writer import Writer
+
+from sonar_graph.logs.container import Keep, Recording, Topic, scan
+
+TEXT = b"uint8[] data\n"
+Entry = tuple[int, bytes]
+
+
+def write(path: Path, count: int = 400, *, chunk_size: int = 4096, **settings: Any) -> list[Entry]:
+    """Messages of three lengths on /bytes, 1 ns apart, between others in JSON; what was written on /bytes."""
+    rng = np.random.default_rng(0)
+    written = []
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=chunk_size, **settings)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("test_msgs/msg/Bytes", "ros2msg", TEXT)
+        other = writer.register_schema("Some", "jsonschema", b"{}")
+        channel = writer.register_channel("/bytes", "cdr", schema)
+        silent = writer.register_channel("/json", "json", other)
+        writer.register_channel("/never", "cdr", schema)
+        writer.add_metadata("sonar_graph", {"name": "x"})
+        for i in range(count):
+            payload = rng.bytes([20, 50, 80][i % 3])
+            written.append((1000 + i, payload))
+            writer.add_message(channel, 1000 + i, payload, 1000 + i)
+            writer.add_message(silent, 1000 + i, b'{"a": 1}', 1000 + i)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return written
+
+
+def write_apart(path: Path, count: int = 100) -> None:
+    """/a and /b in chunks of their own, by turns, a second apart from second 1 on; /tf_static is in the first chunk."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2", "test")
+        channels = []
+        for name, kind in (("/a", "A"), ("/b", "B"), ("/tf_static", "Static")):
+            schema = writer.register_schema(f"test_msgs/msg/{kind}", "ros2msg", TEXT)
+            channels.append(writer.register_channel(name, "cdr", schema))
+        writer.add_message(channels[2], 10**9, b"static", 10**9)
+        for i in range(count):
+            writer.add_message(channels[i % 2], (1 + i) * 10**9, bytes([i]), 10**9)
+            writer.flush()  # type: ignore[no-untyped-call]
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def entries(topic: Topic) -> list[Entry]:
+    """Log times and payloads, in order."""
+    stacks = [part for stack in topic.stacks.values() for part in stack]
+    payloads = {row: p.tobytes() for rows, ps in stacks for row, p in zip(rows, ps, strict=True)}
+    return [(int(time), payloads[row]) for row, time in enumerate(topic.log_times_ns)]
+
+
+def scan_all(path: Path) -> Recording:
+    return scan(path, lambda _: Keep.ALL)
+
+
+def read(path: Path) -> list[Entry]:
+    """What /bytes holds."""
+    return entries(scan_all(path).topics["/bytes"])
+
+
+def chunk_indexes(path: Path) -> list[ChunkIndex]:
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    return summary.chunk_indexes
+
+
+def flip(path: Path, at: int, bit: int = 4) -> None:
+    content = bytearray(path.read_bytes())
+    content[at] ^= bit
+    path.write_bytes(content)
