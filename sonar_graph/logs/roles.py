@@ -138,7 +138,8 @@ def _only(role: Role, recording: Recording, config: LogConfig, fitting: list[Top
     if len(usable) > 1:
         return Choice(role, None, f"{len(usable)} topics fit: {', '.join(usable)}", candidates=tuple(usable))
     for name, adapter in usable.items():
-        return Choice(role, name, f"the only {recording.topics[name].type_name} that fits", adapter)
+        as_said = f", read as {config.source} says" if config.table(role.name) else ""
+        return Choice(role, name, f"the only {recording.topics[name].type_name} that fits{as_said}", adapter)
     reasons = [f"{name} {reason}" for name, reason in adapters.items()]
     return Choice(role, None, "; ".join(reasons)) if reasons else None
 
