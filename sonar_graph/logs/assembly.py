@@ -8,10 +8,12 @@ from typing import TypeVar
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters.adapter import Adapter
+from sonar_graph.logs.adapters.config import shipped_like
 from sonar_graph.logs.adapters.detection_array import DetectionArrayAdapter
 from sonar_graph.logs.adapters.doppler import DvlAdapter
 from sonar_graph.logs.adapters.inertial import ImuAdapter
 from sonar_graph.logs.adapters.reference import TruthAdapter
+from sonar_graph.logs.adapters.toml_text import changes_text
 from sonar_graph.logs.adapters.vertical import DepthAdapter
 from sonar_graph.logs.container import Recording, Topic
 from sonar_graph.logs.decoding import read_detections, read_landmark_map
@@ -64,6 +66,9 @@ class Assembly:
         self._is_mounting_known = True
         self._notes = read_notes(recording)
         self._notes["log.topics"] = "; ".join(f"{role}: {topic.name}" for role, topic in self._topics.items())
+        changes = list(self._changes())
+        if changes:
+            self._notes["log.adapters"] = "; ".join(changes)
         if "truth" in choices and choices["truth"].topic is None:
             self._notes["log.truth"] = choices["truth"].reason
         self._notes |= recording.notes()
@@ -160,6 +165,13 @@ class Assembly:
             self.dvl()
         self.depth(), self.detections(), self.truth()
         return self.left_out(), list(self.warnings())
+
+    def _changes(self) -> Iterator[str]:
+        """What was said about topics beyond the adapters that come along."""
+        for role, adapter in self._adapters.items():
+            topic = self._topics[role]
+            text = changes_text(adapter, shipped_like(role, topic.type_name, topic.definition()))
+            yield from [f"{role}: {text}"] if text else []
 
     def _adapter(self, role: str, kind: type[A]) -> A:
         adapter = self._adapters[role]

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.adapters.adapter import Adapter, leaf_fields
-from sonar_graph.logs.adapters.config import LogConfig, shipped_for
+from sonar_graph.logs.adapters.adapter import leaf_fields
+from sonar_graph.logs.adapters.config import LogConfig, shipped_like
 from sonar_graph.logs.adapters.toml_text import comment, plain_lines, table_text
 from sonar_graph.logs.container import Recording, Topic
 from sonar_graph.logs.message_definitions import short_name
@@ -35,7 +35,9 @@ def starting_config(recording: Recording, choices: Sequence[Choice], config: Log
 def _table(recording: Recording, choice: Choice, said: Mapping[str, Any]) -> str:
     role = choice.role.name
     if choice.topic is not None and choice.adapter is not None:
-        return table_text(role, choice.topic, choice.adapter, _base(choice, recording.topics[choice.topic]))
+        topic = recording.topics[choice.topic]
+        base = shipped_like(role, topic.type_name, topic.definition())
+        return table_text(role, choice.topic, choice.adapter, base)
     if said:  # it stays as it is, also where nothing in this log answers to it
         return "\n".join([comment(choice.reason), f"[{role}]", *plain_lines(said)])
     named = choice.candidates or choice.could_be
@@ -54,11 +56,6 @@ def _template(recording: Recording, role: str) -> list[str]:
     if likely and "header.stamp.sec" not in _leaves(likely[0]):
         lines.append('stamp = "log"  # messages without a header: when they were recorded')
     return [*lines, _EXAMPLES[role]]
-
-
-def _base(choice: Choice, topic: Topic) -> Adapter | None:
-    bases = shipped_for(choice.role.name, topic.type_name)
-    return next((base for base in bases if not base.missing_in(topic.definition())), None)
 
 
 def _is_unknown(topic: Topic) -> bool:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from sonar_graph.logs.adapters.config import LogConfig
 from sonar_graph.logs.inspection import LogSummary, inspect_log
 from sonar_graph.logs.reading import read_sequence
 from sonar_graph.logs.writing import write_sequence
@@ -47,7 +48,7 @@ def test_the_roles_are_those_that_reading_uses(make_sequence: Any, tmp_path: Pat
     write_sequence(tmp_path / "a.mcap", sequence)
     summary = inspect_log(tmp_path / "a.mcap")
     used = read_sequence(tmp_path / "a.mcap").notes["log.topics"]
-    assert used == "; ".join(f"{r.role}: {r.topic}" for r in summary.roles)
+    assert used == "; ".join(f"{r.role}: {r.topic}" for r in summary.roles if r.topic)
     assert summary.calibration == "in the log"
     assert summary.name == sequence.name
     assert summary.notes == sequence.notes
@@ -92,3 +93,35 @@ def test_a_third_party_log_is_described(recordings: Path) -> None:
     assert all(r.topic is None for r in summary.roles)
     assert summary.duration_s == pytest.approx(101.394)  # by the robot's clock, not the recorder's
     assert summary.damage == ()
+
+
+def test_what_a_run_would_leave_out_and_doubt_is_told_before(bench: Any) -> None:
+    imu, _ = bench.basics()
+    sideways = [message | {"linear_acceleration": {"x": 0.0, "y": 9.8, "z": 0.0}} for message in imu[2]]
+    dvl = ("/dvl", "dvl", [bench.dvl(bench.t0_ns + i * 10**8, velocity_mode=1 + (i == 2)) for i in range(5)])
+    path = bench.write(("/imu", "imu", sideways), dvl)
+    summary = inspect_log(path)
+    notes = read_sequence(path).notes
+    assert summary.left_out == ("dvl: 1 with velocity_mode not 1",)
+    assert "; ".join(summary.left_out) == notes["log.dropped"]
+    assert "; ".join(summary.warnings) == notes["log.warnings"]
+    assert any("gravity is felt along +y" in warning for warning in summary.warnings)
+
+
+def test_stamps_are_doubted(bench: Any) -> None:
+    imu, dvl = bench.basics()
+    unset = ("/imu", "imu", [bench.imu(0), *imu[2][1:]])
+    summary = inspect_log(bench.write(unset, dvl))
+    faults = {topic.name: topic.stamp_faults for topic in summary.topics}
+    assert faults["/dvl"] == ()
+    assert "1 messages without a stamp: the time of recording is used" in faults["/imu"]
+
+
+def test_what_the_user_says_is_what_is_inspected(bench: Any) -> None:
+    imu, dvl = bench.basics()
+    path = bench.write(imu, dvl, ("/second", "imu", imu[2]))
+    assert role(inspect_log(path, topics={"imu": "/second"}), "imu") == ("/second", "chosen by name")
+    config = LogConfig.parse({"imu": {"topic": "/imu"}, "dvl": {"use": False}}, "my.toml")
+    summary = inspect_log(path, config)
+    assert role(summary, "imu") == ("/imu", "chosen in my.toml")
+    assert role(summary, "dvl") == (None, "switched off in my.toml")

@@ -31,6 +31,7 @@ from sonar_graph.logs.adapters.shipped import SHIPPED
 from sonar_graph.logs.adapters.sonar_images import SonarAdapter
 from sonar_graph.logs.adapters.vertical import DepthAdapter
 from sonar_graph.logs.message_definitions import short_name
+from sonar_graph.logs.schema import Struct
 
 ADAPTERS: dict[str, type[Adapter]] = {
     "imu": ImuAdapter,
@@ -125,6 +126,11 @@ def shipped_for(role: str, type_name: str) -> list[Adapter]:
     """The adapters for a type that come along."""
     wanted = short_name(type_name)
     return [s.adapter for s in SHIPPED[role] if short_name(s.adapter.type) == wanted]
+
+
+def shipped_like(role: str, type_name: str, definition: Struct) -> Adapter | None:
+    """The adapter that comes along for a type and has all its fields in the definition; None where there is none."""
+    return next((base for base in shipped_for(role, type_name) if not base.missing_in(definition)), None)
 
 
 def read_log_config(path: Path) -> LogConfig:

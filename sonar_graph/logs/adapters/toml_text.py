@@ -36,6 +36,16 @@ def table_text(role: str, topic: str, adapter: Adapter, shipped: Adapter | None)
     return "\n".join(lines)
 
 
+def changes_text(adapter: Adapter, shipped: Adapter | None) -> str:
+    """What differs from the adapter that comes along, or all that is said where none does; empty: nothing."""
+    base = shipped or type(adapter).model_construct(type="")
+    said = {name: getattr(adapter, name) for name in type(adapter).model_fields if name not in ("topic", "use")}
+    changed = {name: value for name, value in said.items() if value != getattr(base, name, None)}
+    return ", ".join(
+        f"{name} = {_TURNED_OFF if value is None else toml_value(value)}" for name, value in changed.items()
+    )
+
+
 def plain_lines(table: Mapping[str, Any]) -> list[str]:
     """The keys of a table, one a line."""
     return [f"{_key(name)} = {toml_value(value)}" for name, value in table.items()]

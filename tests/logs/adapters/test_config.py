@@ -61,6 +61,13 @@ def test_a_table_changes_only_what_it_names() -> None:
     assert adapter.covariance.fields == ("velocity_covar",)  # type: ignore[attr-defined]
 
 
+def test_the_notes_tell_what_was_said(foreign: Any, read: Any) -> None:
+    toml = '[dvl]\nrotation = "frd"\ngood_beams = false\n[imu]\ntopic = "/imu"'
+    notes = read(foreign.imu(), foreign.dvl(), toml=toml).notes
+    assert notes["log.adapters"] == 'dvl: rotation = "frd", good_beams = false'
+    assert "log.adapters" not in read(foreign.imu(), foreign.dvl()).notes
+
+
 def test_a_role_can_be_switched_off(foreign: Any, read: Any) -> None:
     pressure = ("/bar30", "sensor_msgs/msg/FluidPressure", [{"header": foreign.header(0), "fluid_pressure": 2e5}])
     assert read(foreign.imu(), foreign.dvl(), pressure).depth is not None
