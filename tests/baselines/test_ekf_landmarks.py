@@ -212,12 +212,13 @@ def test_a_correction_is_the_textbook_s():
     moment = moment_after(x, motion())
     z, *rows = observation(moment, vector(p), sonar())
     H_v, H_m = numbers(rows)
+    R = np.array([[4e-4, 1e-4], [1e-4, 1e-4]])
     H = np.hstack([H_v, -H_v[:, :3]])
-    S = H @ P[:n, :n] @ H.T + NOISE + MOTION_SIGMA**2 * H_m @ H_m.T
+    S = H @ P[:n, :n] @ H.T + R + MOTION_SIGMA**2 * H_m @ H_m.T
     K = P[:n, :n] @ H.T @ np.linalg.inv(S)
     e = np.array([0.01, -0.005])
     expected = x[:n] + K @ e, (np.eye(n) - K @ H) @ P[:n, :n]
-    _, _, innovations, covs = frame(x, P, n, [0], [z + e])
+    _, _, innovations, covs = frame(x, P, n, [0], [z + e], R=R)
     assert_allclose(innovations[0], e, atol=1e-12)
     assert_allclose(covs[0], S, rtol=1e-9)
     assert_allclose(x[:n], expected[0], atol=1e-12)
