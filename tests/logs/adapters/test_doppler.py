@@ -97,7 +97,13 @@ def test_the_twist_of_odometry_is_in_the_frame_of_its_child(foreign: Any, read: 
 
 @pytest.mark.parametrize(
     ("rotation", "expected"),
-    [('"flu"', (1, 2, 3)), ('"frd"', (1, -2, -3)), ("[180, 0, 0]", (1, -2, -3)), ("[0, 0, 90]", (-2, 1, 3))],
+    [
+        ('"flu"', (1, 2, 3)),
+        ('"frd"', (1, -2, -3)),
+        ("[180, 0, 0]", (1, -2, -3)),
+        ("[0, 0, 90]", (-2, 1, 3)),
+        ("[30, 0, 0]", (1, 3**0.5 - 1.5, 1 + 1.5 * 3**0.5)),
+    ],
 )
 def test_the_axes_of_a_driver_are_turned_into_ours(
     foreign: Any, read: Any, rotation: str, expected: tuple[float, ...]
