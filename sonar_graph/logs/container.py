@@ -17,7 +17,7 @@ from sonar_graph.logs.damage import Damage, settle
 from sonar_graph.logs.passage import IndexLiesError, Passage, Progress
 from sonar_graph.logs.records import LogFile
 from sonar_graph.logs.topic import STAMP_BYTES, Keep, Topic
-from sonar_graph.logs.window import Window, first_time_ns
+from sonar_graph.logs.window import Window
 
 __all__ = ["STAMP_BYTES", "Keep", "Progress", "Recording", "Topic", "scan", "stream"]
 
@@ -104,23 +104,17 @@ def scan(
     LogError
         When there is no such file, it is not MCAP, or nothing in it was recorded in the window.
     """
-    window = window or Window()
     with LogFile(path) as file:
-        beginning_ns = 0 if window.is_all else first_time_ns(file)
-        limits_ns = None if window.is_all else window.resolve(beginning_ns)
-        passage = Passage(file, keep, limits_ns, progress=progress)
+        passage = Passage(file, keep, window, progress=progress)
         try:
             _gather(passage)
         except IndexLiesError:
             remarks = passage.damage.remarks
-            passage = Passage(file, keep, limits_ns, may_skip=False, progress=progress)
+            passage = Passage(file, keep, window, may_skip=False, progress=progress)
             _gather(passage)
             passage.damage.remarks[:0] = remarks
         recording = _recording(path, passage)
-    if limits_ns is None:
-        return recording
-    recording.part = window.describe(beginning_ns)
-    if not any(len(topic) and not topic.is_latched for topic in recording.topics.values()):
+    if recording.part and not any(len(topic) and not topic.is_latched for topic in recording.topics.values()):
         raise LogError(f"{path}: nothing was recorded from {recording.part}")
     return recording
 
@@ -146,15 +140,14 @@ def stream(
         As `scan`, and at the end when the file has holes: what was given until then is whole.
     """
     with LogFile(path) as file:
-        limits_ns = None if window is None or window.is_all else window.resolve(first_time_ns(file))
-        passage = Passage(file, keep, limits_ns, progress=progress)
+        passage = Passage(file, keep, window, progress=progress)
         held: dict[str, Topic] = {}
         for piece in passage:
             topic = held.get(piece.topic.name) or held.setdefault(piece.topic.name, piece.topic.empty())
             topic.gather(piece.data, *piece.found)
             if topic.held_bytes >= _PIECE_BYTES:
                 yield held.pop(topic.name)
-        yield from (topic for topic in held.values() if len(topic))
+        yield from (topic for topic in held.values() if topic.keep is not Keep.NONE)
     Recording(path, damage=passage.damage).require_sound()
 
 
@@ -181,4 +174,5 @@ def _recording(path: Path, passage: Passage) -> Recording:
         min(first_ns, default=None),
         passage.chunks,
         passage.skipped,
+        passage.part,
     )

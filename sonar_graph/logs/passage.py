@@ -27,6 +27,7 @@ from sonar_graph.logs.metadata import open_seal
 from sonar_graph.logs.records import PRIVATE, ChunkRecord, Hole, LogFile, Record, Stretch, Walk
 from sonar_graph.logs.summary import parse, read_summary
 from sonar_graph.logs.topic import Keep, Topic
+from sonar_graph.logs.window import Window, first_time_ns
 
 _BLOCK = 1 << 22
 Progress = Callable[[int, int], None]
@@ -54,8 +55,8 @@ class Passage:
         The log.
     keep
         From a type's name, how much of such messages is wanted.
-    limits_ns
-        Messages recorded from the first up to but not including the second are wanted; latched topics always.
+    window
+        What was recorded then is wanted; of latched topics all.
     may_skip
         Whether chunks may be passed over for what the summary says about them.
     progress
@@ -66,7 +67,7 @@ class Passage:
         self,
         file: LogFile,
         keep: Callable[[str], Keep],
-        limits_ns: tuple[int, int] | None = None,
+        window: Window | None = None,
         *,
         may_skip: bool = True,
         progress: Progress | None = None,
@@ -77,10 +78,15 @@ class Passage:
         """Chunks passed over."""
         self.chunks = 0
         self._file = file
-        self._limits_ns = limits_ns
         self._may_skip = may_skip
         self._progress = progress
         self._summary, self._ending_fault = read_summary(file)
+        self.part: str | None = None
+        """Which part of the time is wanted, if not all."""
+        self._limits_ns: tuple[int, int] | None = None
+        if window is not None and not window.is_all:
+            beginning_ns = first_time_ns(file, self._summary)
+            self._limits_ns, self.part = window.resolve(beginning_ns), window.describe(beginning_ns)
         self._described = Descriptions(file.path, keep)
         self._walk = Walk(file, self._summary.data_end_at if self._summary else None)
         self._last_ns: int | None = None
@@ -122,12 +128,14 @@ class Passage:
                 index.update(self._read_index(item))
                 continue
             is_told = chunk is not None and (yield from self._take_chunk(chunk, index, item))
-            chunk, index = (item if isinstance(item, ChunkRecord) else None), {}
-            if isinstance(item, Stretch):
+            chunk, index = None, {}
+            if isinstance(item, ChunkRecord):
+                chunk = item if self._is_due(item) else None
+            elif isinstance(item, Stretch):
                 yield from self._take_loose(item)
             elif isinstance(item, Hole) and not is_told:
                 yield from self._take_hole(item)
-            elif isinstance(item, Record) and chunk is None:
+            elif isinstance(item, Record):
                 self._take_other(item)
         if chunk is not None:
             yield from self._take_chunk(chunk, index, None)
@@ -140,13 +148,19 @@ class Passage:
         rows = np.frombuffer(content, "<u8", offset=6, count=(len(content) - 6) // 16 * 2).reshape(-1, 2)
         return {int.from_bytes(content[:2], "little"): rows}
 
-    def _take_chunk(self, chunk: ChunkRecord, index: Index, following: object) -> Generator[Piece, None, bool]:
-        """Whether a hole that follows is told already, as a part of a chunk that is not whole."""
+    def _is_due(self, chunk: ChunkRecord) -> bool:
+        """Whether a chunk must be unpacked; else the walk goes on after it and its message indexes."""
         self._report(chunk.end)
         self.chunks += 1
-        if not self._is_wanted(chunk):
-            self.skipped += 1
-            return False
+        index = self._indexed(chunk) if self._may_skip else None
+        if index is None or self._is_wanted(chunk, index):
+            return True
+        self.skipped += 1
+        self._walk.jump(chunk.end + index.message_index_length)
+        return False
+
+    def _take_chunk(self, chunk: ChunkRecord, index: Index, following: object) -> Generator[Piece, None, bool]:
+        """Whether a hole that follows is told already, as a part of a chunk that is not whole."""
         try:
             data = unpack(chunk, self._file.read(chunk.data_at, chunk.data_size))
         except ChunkError as error:
@@ -190,10 +204,7 @@ class Passage:
         said = (index.message_start_time, index.message_end_time, index.compressed_size, index.uncompressed_size)
         return index if said == (chunk.start_ns, chunk.end_ns, chunk.data_size, chunk.uncompressed_size) else None
 
-    def _is_wanted(self, chunk: ChunkRecord) -> bool:
-        index = self._indexed(chunk) if self._may_skip else None
-        if index is None:
-            return True
+    def _is_wanted(self, chunk: ChunkRecord, index: ChunkIndex) -> bool:
         topics = [self._described.by_channel.get(channel) for channel in index.message_index_offsets]
         first_ns, after_ns = self._limits_ns or (chunk.start_ns, chunk.end_ns + 1)
         is_inside = chunk.start_ns < after_ns and chunk.end_ns >= first_ns

@@ -216,6 +216,10 @@ class Walk:
         self._at = self._stop_at if found is None else found
         return Hole(at, self._at)
 
+    def jump(self, at: int) -> None:
+        """Go on at an offset, where something trustworthy says that a record begins."""
+        self._at = at
+
     def _is_data_end(self, record: Record) -> bool:
         known = self._data_end_at is not None
         return record.opcode == Opcode.DATA_END and record.size == 4 and not known

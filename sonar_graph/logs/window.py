@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from sonar_graph.errors import LogError
 from sonar_graph.logs.chunks import find_by_walk
 from sonar_graph.logs.records import ChunkRecord, LogFile, Stretch, Walk
-from sonar_graph.logs.summary import read_summary
+from sonar_graph.logs.summary import Summary
 
 _NS_PER_S = 1_000_000_000
 _FIRST_NS, _LAST_NS = -(1 << 63), (1 << 63) - 1
@@ -89,9 +89,8 @@ class Window:
         return start_ns, end_ns
 
 
-def first_time_ns(file: LogFile) -> int:
+def first_time_ns(file: LogFile, summary: Summary | None) -> int:
     """The earliest log time: by the statistics, or else the heads of the chunks, or else the messages themselves."""
-    summary, _ = read_summary(file)
     if summary and summary.statistics and summary.statistics.message_count:
         return int(summary.statistics.message_start_time)
     times_ns = []
