@@ -52,6 +52,22 @@ def test_nested_messages_are_the_same_in_both_libraries() -> None:
     assert {f"{kind}_{share}" for kind in kinds for share in ("ratio", "shared_ratio")} <= set(found)
 
 
+def test_log_reading_names_its_figures_and_agrees_with_rosbags() -> None:
+    found = figures("performance/log_reading.py")
+    assert found["agrees"]
+    assert found["limit_ratio"] == pytest.approx(found["ours_s"] / found["limit_s"], rel=1e-3)
+    assert found["rosbags_ratio"] == pytest.approx(found["rosbags_s"] / found["ours_s"], rel=1e-3)
+    assert found["mcap_ros2_ratio"] == pytest.approx(found["mcap_ros2_s"] / found["ours_s"], rel=1e-3)
+    assert 10 < found["peak_rss_mb"] < 150
+
+
+def test_damaged_logs_names_its_figures() -> None:
+    found = figures("validation/damaged_logs.py", "--workers", "2")
+    assert found["files"] == 60
+    assert (found["crashes"], found["hangs"], found["silent_errors"]) == (0, 0, 0)
+    assert found["recovered_share"] == 1
+
+
 @pytest.mark.slow
 def test_ekf_step_names_its_figures() -> None:
     assert {"log_s", "filterpy_ratio"} <= set(figures("performance/ekf_step.py"))

@@ -16,7 +16,7 @@ rosbags, mcap-ros2-support
     Decode the messages of the same four topics one by one, and do nothing with them.
 
 ``limit_ratio`` is our time over the limit's, ``rosbags_ratio`` and ``mcap_ros2_ratio`` theirs over ours.
-``sequence_ratio`` is the time of `read_sequence`, which besides sorts, checks and rotates covariances, over the limit's.
+``sequence_ratio`` is the time of `read_sequence` over the limit's; it sorts, checks and rotates covariances besides.
 ``peak_rss_mb`` is the largest resident memory of a process that does nothing but load the same columns and add them up
 chunk by chunk; ``arrays_rss_mb`` of one that keeps them; ``sequence_rss_mb`` of one that runs `read_sequence`. The
 arrays themselves take ``arrays_mb``.

@@ -12,7 +12,10 @@ from sonar_graph.logs.encoding import dvl_messages, imu_messages
 from sonar_graph.logs.message_definitions import definition
 from sonar_graph.logs.reading import read_sequence
 from sonar_graph.logs.recorder import write_recording
+from sonar_graph.logs.window import Instant, Window
 from sonar_graph.logs.writing import write_sequence
+
+from .containers import chunk_indexes, flip
 
 STEP_NS = 10**8
 
@@ -208,6 +211,60 @@ def test_a_file_cut_at_its_end_is_read_with_a_note(make_sequence: Any, tmp_path:
     found = read_sequence(path)
     assert 0 < len(found.imu) < len(sequence.imu)
     assert "cut off" in found.notes["log.ending"]
+
+
+def damaged(path: Path, sequence: Any) -> None:
+    """A log with a bit of its second chunk flipped."""
+    write_sequence(path, sequence)
+    chunk = chunk_indexes(path)[1]
+    flip(path, chunk.chunk_start_offset + chunk.chunk_length // 2)
+
+
+def test_a_hole_is_refused_unless_salvage_is_asked_for(make_sequence: Any, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    sequence = make_sequence(samples=20_000)
+    damaged(path, sequence)
+    with pytest.raises(
+        LogError, match=r"is damaged: bytes \d+ to \d+: chunk 2 is lost.*lost: .* of /imu/data.*--salvage"
+    ):
+        read_sequence(path)
+    found = read_sequence(path, salvage=True)
+    is_there = np.isin(sequence.imu.stamps_ns, found.imu.stamps_ns)
+    assert 0 < np.count_nonzero(~is_there) < len(sequence.imu)
+    np.testing.assert_array_equal(found.imu.angular_velocity, sequence.imu.angular_velocity[is_there])
+    assert f"{np.count_nonzero(~is_there)} of /imu/data" in found.notes["log.damage"]
+
+
+def test_a_window_is_the_same_part_of_every_block(make_sequence: Any, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    sequence = make_sequence(samples=20_000)
+    write_sequence(path, sequence)
+    first_ns = int(min(sequence.imu.stamps_ns[0], sequence.dvl.stamps_ns[0]))
+    start_ns, end_ns = first_ns + 2 * 10**9, first_ns + 4 * 10**9
+    found = read_sequence(path, window=Window(Instant.parse("2"), Instant.parse("4")))
+    for name in ("imu", "dvl", "depth", "truth"):
+        whole, part = getattr(sequence, name), getattr(found, name)
+        is_inside = (whole.stamps_ns >= start_ns) & (whole.stamps_ns < end_ns)
+        np.testing.assert_array_equal(part.stamps_ns, whole.stamps_ns[is_inside])
+    assert found.calibration == sequence.calibration
+    assert found.notes["log.part"] == "2.000 s to 4.000 s of the recording"
+
+
+def test_stamps_that_run_backwards_or_beside_the_log_are_in_the_notes(bench: Any) -> None:
+    _, dvl = bench.basics()
+    late = [bench.t0_ns + i * STEP_NS - 60 * 10**9 for i in (0, 2, 1, 3)]
+    sequence = read_sequence(bench.write(("/imu", "imu", [bench.imu(s) for s in late]), dvl))
+    assert "imu: once backwards, by 0.1 s" in sequence.notes["log.stamps"]
+    assert "imu: stamped 60 s before recording" in sequence.notes["log.stamps"]
+    assert "dvl" not in sequence.notes["log.stamps"]
+
+
+def test_a_flipped_bit_in_the_calibration_is_never_read_as_a_number(make_sequence: Any, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write_sequence(path, make_sequence())
+    flip(path, path.read_bytes().index(b"gravity_m_s2") + len("gravity_m_s2") + 2, 1)
+    with pytest.raises(LogError, match="a metadata record is lost: its CRC does not fit"):
+        read_sequence(path)
 
 
 @pytest.mark.recording
