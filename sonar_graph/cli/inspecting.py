@@ -50,6 +50,8 @@ def _print_summary(console: Console, summary: LogSummary) -> None:
     for rows in summary.left_out:
         console.print(f"[bold]left out[/] {escape(rows)}", soft_wrap=True)
     for topic in summary.topics:
+        if topic.refusal:
+            console.print(f"[bold yellow]not read[/] {escape(topic.name)} {escape(topic.refusal)}", soft_wrap=True)
         for fault in topic.stamp_faults:
             console.print(f"[bold yellow]stamps[/] {escape(topic.name)}: {escape(fault)}", soft_wrap=True)
     for warning in summary.warnings:

@@ -16,6 +16,7 @@ from sonar_graph.logs.container import STAMP_BYTES, Keep, Recording, Topic, scan
 from sonar_graph.logs.log_record import read_calibration, read_notes, recorded_name
 from sonar_graph.logs.message_definitions import definition, short_name
 from sonar_graph.logs.mountings import static_frames
+from sonar_graph.logs.refusal import refusal
 from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, Choice, choose_topic, wanted_types
 from sonar_graph.logs.schema import Struct, parse_definition
 from sonar_graph.logs.sonar_reading import describe_frames, read_sonar_frames
@@ -47,6 +48,8 @@ class TopicSummary:
     """``header`` or ``log``."""
     stamp_faults: tuple[str, ...] = ()
     """What is wrong with the stamps."""
+    refusal: str | None = None
+    """Why its messages cannot be decoded, which completes "/imu ..."; None: they can."""
 
 
 @dataclass(frozen=True)
@@ -192,6 +195,7 @@ def _summarise(topic: Topic) -> TopicSummary:
         largest_gap_s=float(np.diff(stamps_ns).max(initial=0)) * 1e-9,
         stamps_from="log" if recorded is None else "header",
         stamp_faults=() if recorded is None else tuple(stamp_faults(recorded, log_times_ns)),
+        refusal=refusal(topic),
     )
 
 

@@ -9,6 +9,7 @@ from mcap.writer import Writer
 
 from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.container import Keep, scan
+from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.reading import read_sequence
 from sonar_graph.logs.refusal import refusal
 
@@ -63,6 +64,12 @@ def test_a_topic_that_cannot_be_decoded_is_refused_by_name_and_counted(mixed: Pa
     assert len(topics[topic]) == 2
     assert FOREIGN[topic][-1] in (refusal(topics[topic]) or "")
     assert refusal(topics["/imu"]) is None
+
+
+def test_inspection_lists_what_is_not_read_with_number_and_reason(mixed: Path) -> None:
+    topics = {topic.name: topic for topic in inspect_log(mixed).topics}
+    assert {name for name, topic in topics.items() if topic.refusal} == set(FOREIGN)
+    assert all(topics[name].messages == 2 and FOREIGN[name][-1] in str(topics[name].refusal) for name in FOREIGN)
 
 
 def test_topics_of_other_kinds_do_not_touch_ours(mixed: Path, bench: Bench) -> None:
