@@ -43,7 +43,7 @@ EQUIDISTANT = gtsam.Cal3Fisheye(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Unit focal lengths; no skew, offset or distortion."""
 BEAM_R_CAMERA = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
 """Columns: image x to the left, image y up, optical axis along the beam."""
-ORIGIN = np.zeros(3)
+ORIGIN, IMAGE_CENTRE = np.zeros(3), np.zeros(2)
 
 Robust = Callable[[gtsam.noiseModel.Base], gtsam.noiseModel.Base]
 """Wraps a noise model in a robust kernel, or returns it as it is."""
@@ -156,12 +156,12 @@ def _camera(
     elevation_sigma_rad: float | None,
     robust: Robust,
 ) -> gtsam.NonlinearFactor:
-    sonar_T_beam = gtsam.Pose3(gtsam.Rot3.Rz(azimuth_rad).compose(BEAM_R_CAMERA), ORIGIN)
-    body_T_camera = body_T_sonar.compose(sonar_T_beam)
+    sonar_R_camera = gtsam.Rot3.Rz(azimuth_rad).compose(BEAM_R_CAMERA)
+    body_T_camera = body_T_sonar.compose(gtsam.Pose3(sonar_R_camera, ORIGIN))
     vertical = UNINFORMATIVE_RAD if elevation_sigma_rad is None else elevation_sigma_rad
     noise = robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([azimuth_sigma_rad, vertical])))
     return gtsam.GenericProjectionFactorCal3Fisheye(
-        np.zeros(2), noise, pose_key, landmark_key, EQUIDISTANT, False, False, body_T_camera
+        IMAGE_CENTRE, noise, pose_key, landmark_key, EQUIDISTANT, False, False, body_T_camera
     )
 
 

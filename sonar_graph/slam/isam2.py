@@ -24,12 +24,16 @@ from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import CalibrationError
-from sonar_graph.measurements import Measurements
+from sonar_graph.measurements import Floats, Measurements
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
+from sonar_graph.navigation.kernels import compiled
+from sonar_graph.slam.joint_covariance import JointCovariance
 from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
 from sonar_graph.slam.sightings import SightingPolicy, Sightings
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
+
+NO_DERIVATIVE = np.zeros((6, 3))
 
 
 class Isam2Params(Section):
@@ -145,7 +149,7 @@ class Isam2:
         estimates = []
         for keyframe, asked in groupby(self._asked, key=lambda instant: instant.keyframe):
             bias_key = self._keyframes.bias_key(keyframe)
-            joint = marginals.jointMarginalCovariance([k for k in (X(keyframe), bias_key) if k is not None])
+            joint = JointCovariance.of(marginals, [k for k in (X(keyframe), bias_key) if k is not None])
             estimates += [instant.carried_on(values, bias_key, joint) for instant in asked]
         return Trajectory.from_estimates(estimates)
 
@@ -191,18 +195,28 @@ class Anchored:
     keyframe: int
     motion: PreintegratedMotion
 
-    def carried_on(self, values: gtsam.Values, bias_key: int | None, joint: gtsam.JointMarginal) -> Estimate:
+    def carried_on(self, values: gtsam.Values, bias_key: int | None, joint: JointCovariance) -> Estimate:
         """The pose at this instant from that of the keyframe (and the bias, whose error the motion inherits).
 
         ``X Exp(e_X) M Exp(D e_b) = X M Exp(Ad(M^-1) e_X + D e_b)``, so the covariance is ``J P J^T`` with
         ``J = [Ad(M^-1) D]`` and P that of keyframe and bias, plus that of the motion.
         """
-        key = X(self.keyframe)
-        bias = self.motion.bias if bias_key is None else values.atPoint3(bias_key)
-        motion = self.motion.corrected(bias)
-        J_pose = motion.inverse().AdjointMap()
-        cov = J_pose @ joint.at(key, key) @ J_pose.T + self.motion.covariance
+        key, motion, D_bias = X(self.keyframe), self.motion.i_T_j, NO_DERIVATIVE
+        bias_row = 0
         if bias_key is not None:
-            cross = J_pose @ joint.at(key, bias_key) @ self.motion.D_bias.T
-            cov += cross + cross.T + self.motion.D_bias @ joint.at(bias_key, bias_key) @ self.motion.D_bias.T
-        return Estimate(self.stamp_ns, values.atPose3(key).compose(motion), 0.5 * (cov + cov.T))
+            motion, D_bias = self.motion.corrected(values.atPoint3(bias_key)), self.motion.D_bias
+            bias_row = joint.rows[bias_key]
+        J_pose = motion.inverse().AdjointMap()
+        cov = _carried_on(joint.matrix, joint.rows[key], bias_row, J_pose, D_bias, self.motion.covariance)
+        return Estimate(self.stamp_ns, values.atPose3(key).compose(motion), cov)
+
+
+@compiled
+def _carried_on(
+    joint: Floats, pose_row: int, bias_row: int, J_pose: Floats, D_bias: Floats, motion_cov: Floats
+) -> Floats:
+    pose, bias = slice(pose_row, pose_row + 6), slice(bias_row, bias_row + 3)
+    P_pose, P_cross, P_bias = joint[pose, pose].copy(), joint[pose, bias].copy(), joint[bias, bias].copy()
+    cross = J_pose @ P_cross @ D_bias.T
+    cov = J_pose @ P_pose @ J_pose.T + cross + cross.T + D_bias @ P_bias @ D_bias.T + motion_cov
+    return 0.5 * (cov + cov.T)

@@ -59,6 +59,7 @@ class Keyframes:
         self._estimates_bias = self.calibration.imu.gyro_bias_sigma > 0
         self._bias_since_ns = 0
         self._running: RunningMotion | None = None
+        self._latest: tuple[int, PreintegratedMotion] | None = None
         self._depths: list[Depth] = []
         self._earth = earth_rate_in_world(self.calibration)
 
@@ -80,6 +81,7 @@ class Keyframes:
     def add(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None) -> None:
         """Take in rows."""
         self.odometry.add(imu, dvl)
+        self._latest = None
         if depth is not None:
             self._depths.append(depth)
 
@@ -132,7 +134,9 @@ class Keyframes:
                 self.bias(len(self.stamps_ns) - 1),
                 self._earth_rate(),
             )
-        return self._running.until(until_ns)
+        if self._latest is None or self._latest[0] != until_ns:
+            self._latest = until_ns, self._running.until(until_ns)
+        return self._latest[1]
 
     def update_if_due(self) -> None:
         """Bring the smoother up to date when what was added since it last was matters."""
@@ -178,7 +182,7 @@ class Keyframes:
         self.smoother.add(self._depth(j, node_ns, steps, motion))
         self.bias_keys.append(self._next_bias_key(i, node_ns))
         self.stamps_ns.append(node_ns)
-        self._running = None
+        self._running = self._latest = None
         self._constrain(j)
         self.odometry.forget_before(node_ns)
 

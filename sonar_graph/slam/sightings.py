@@ -13,12 +13,16 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.slam import factors
-from sonar_graph.slam.association import DetectionJournal, gate_threshold, identify
+from sonar_graph.slam.association import DetectionJournal, Identities, gate_threshold, identify
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.models import elevation_on_floor, locate
+from sonar_graph.slam.sightlines import Sightline
 from sonar_graph.slam.smoother import Smoother
-from sonar_graph.slam.view import View, weigh
+from sonar_graph.slam.view import View
 from sonar_graph.states import Outcome
+
+Verdict = tuple[Outcome, Floats | None, Floats | None]
+"""What became of a detection, its innovation (2,) and that one's covariance (2, 2); None: nothing was expected."""
 
 
 @dataclass(frozen=True)
@@ -70,81 +74,83 @@ class Sightings:
                 self.journal.record(stamp_ns, landmark_id, late)
             return
         identities = identify(frame, self.policy.identity_probability)
-        rows = list(zip(range(len(frame)), identities.ids.tolist(), identities.refusals, strict=True))
-        if all(refusal for _, _, refusal in rows):
-            for _, landmark_id, refusal in rows:
-                if refusal:
-                    self.journal.record(stamp_ns, landmark_id, refusal)
-            return
+        verdicts: dict[int, Verdict] = {row: (why, None, None) for row, why in enumerate(identities.refusals) if why}
+        if len(verdicts) < len(frame):
+            verdicts |= self._use(stamp_ns, self._with_identity(frame, identities))
+        for row, landmark_id in enumerate(identities.ids.tolist()):
+            self.journal.record(stamp_ns, landmark_id, *verdicts[row])
+
+    def _with_identity(self, frame: LandmarkDetections, identities: Identities) -> Seen:
+        rows = [row for row, refusal in enumerate(identities.refusals) if not refusal]
+        cov = frame.range_azimuth_cov[rows]
+        cov[np.isnan(cov).any(axis=(1, 2))] = self._default_cov
+        z = np.column_stack((frame.range_m[rows], frame.azimuth_rad[rows]))
+        ids: list[int] = identities.ids[rows].tolist()
+        return Seen(rows, ids, [L(i) for i in ids], z, cov)
+
+    def _use(self, stamp_ns: int, seen: Seen) -> dict[int, Verdict]:
+        """Add the factors of a frame's landmarks; what became of each, by row."""
         self.keyframes.update_if_due()
-        seen = self.keyframes.motion_since_newest(stamp_ns)
-        view = self._view(seen, {landmark_id for _, landmark_id, refusal in rows if not refusal} & self.ids)
-        tie = Tie.between(self.keyframes.set_for_frame(stamp_ns, seen), self.keyframes.newest_key, self._body_T_sonar)
-        for row, landmark_id, refusal in rows:
-            if refusal:
-                self.journal.record(stamp_ns, landmark_id, refusal)
-            else:
-                self._sight(view, tie, self._sighting(frame, stamp_ns, row, landmark_id))
+        motion = self.keyframes.motion_since_newest(stamp_ns)
+        is_known = [i in self.ids for i in seen.ids]
+        known, new = seen.where(is_known), seen.where([not known for known in is_known])
+        view = self._view(motion, known.keys)
+        motion = self.keyframes.set_for_frame(stamp_ns, motion)
+        tie = Tie.between(motion, self.keyframes.newest_key, self._body_T_sonar)
+        verdicts = self._sight_again(view, tie, known) | self._sight_first(view, tie, new)
         self.keyframes.update_if_due()
+        return verdicts
 
-    def _sighting(self, frame: LandmarkDetections, stamp_ns: int, row: int, landmark_id: int) -> Sighting:
-        cov = frame.range_azimuth_cov[row]
-        z = np.array([frame.range_m[row], frame.azimuth_rad[row]])
-        return Sighting(stamp_ns, landmark_id, z, self._default_cov if np.isnan(cov).any() else cov)
-
-    def _sight(self, view: View, tie: Tie, sighting: Sighting) -> None:
-        if sighting.landmark_id in view.landmarks:
-            self._sight_again(view, tie, sighting)
-        else:
-            self._sight_first(view, tie, sighting)
-
-    def _view(self, motion: PreintegratedMotion, landmark_ids: set[int]) -> View:
+    def _view(self, motion: PreintegratedMotion, landmark_keys: list[int]) -> View:
         key, bias_key = self.keyframes.newest_key, self.keyframes.newest_bias_key
-        keys = [key, *map(L, sorted(landmark_ids))]
+        keys = [key, *landmark_keys] if bias_key is None else [key, bias_key, *landmark_keys]
         return View(
             pose_key=key,
             bias_key=bias_key,
             world_T_keyframe=self.smoother.values.atPose3(key),
             motion=motion,
             body_T_sonar=self._body_T_sonar,
-            landmarks={i: self.smoother.values.atPoint3(L(i)) for i in landmark_ids},
-            covariance=self.smoother.joint_covariance(keys if bias_key is None else [*keys, bias_key]),
+            covariance=self.smoother.joint_covariance(keys),
         )
 
-    def _sight_again(self, view: View, tie: Tie, sighting: Sighting) -> None:
-        innovation, S, distance, gain = weigh(sighting.z, *view.expect(sighting.landmark_id), sighting.cov)
-        inside = distance <= self._gate
-        outcome = Outcome.USED if inside else Outcome.GATED
-        self.journal.record(sighting.stamp_ns, sighting.landmark_id, outcome, innovation, S)
-        if inside:
-            self.smoother.waiting_gain += gain
-            self._add_factors(view, tie, sighting, view.landmarks[sighting.landmark_id], None)
+    def _sight_again(self, view: View, tie: Tie, seen: Seen) -> dict[int, Verdict]:
+        """Compare landmarks of the graph with what is expected of them; add what is inside the gate."""
+        if not seen.ids:
+            return {}
+        points = np.array([self.smoother.values.atPoint3(key) for key in seen.keys])
+        found = view.compare(seen.keys, points, seen.z, seen.cov)
+        inside: list[bool] = (found.distance <= self._gate).tolist()
+        self.smoother.waiting_gain += float(found.gain[inside].sum())
+        self._add_factors(view, tie, seen.where(inside), points[inside], None)
+        outcomes = [Outcome.USED if is_inside else Outcome.GATED for is_inside in inside]
+        return dict(zip(seen.rows, zip(outcomes, found.innovation, found.S, strict=True), strict=True))
 
-    def _sight_first(self, view: View, tie: Tie, sighting: Sighting) -> None:
-        floor, sonar, (range_m, azimuth_rad) = self.calibration.floor, self.calibration.sonar, sighting.z
-        elevation = None
-        if floor:
-            elevation = elevation_on_floor(
-                view.world_T_sonar, range_m, azimuth_rad, floor.z_m, sonar.elevation_aperture_rad
-            )
-        point = locate(view.world_T_sonar, range_m, azimuth_rad, elevation or 0.0)
-        self.ids.add(sighting.landmark_id)
-        self.journal.record(sighting.stamp_ns, sighting.landmark_id, Outcome.NEW)
-        self.smoother.add_landmark(L(sighting.landmark_id), point)
-        self._add_factors(view, tie, sighting, point, None if floor else self._elevation_sigma_rad)
-        if floor:
-            self.smoother.add([factors.floor_prior(L(sighting.landmark_id), floor.z_m, floor.sigma_m)])
+    def _sight_first(self, view: View, tie: Tie, seen: Seen) -> dict[int, Verdict]:
+        """Add landmarks to the graph."""
+        floor = self.calibration.floor
+        points = np.array([self._located(view, *z) for z in seen.z.tolist()]).reshape(-1, 3)
+        for key, landmark_id, point in zip(seen.keys, seen.ids, points, strict=True):
+            self.ids.add(landmark_id)
+            self.smoother.add_landmark(key, point)
+            if floor:
+                self.smoother.add([factors.floor_prior(key, floor.z_m, floor.sigma_m)])
+        self._add_factors(view, tie, seen, points, None if floor else self._elevation_sigma_rad)
+        return dict.fromkeys(seen.rows, (Outcome.NEW, None, None))
 
-    def _add_factors(
-        self, view: View, tie: Tie, sighting: Sighting, point: Floats, elevation_sigma_rad: float | None
-    ) -> None:
-        R, key = view.blurred(sighting.cov, tie.motion, point), L(sighting.landmark_id)
-        self.smoother.sightlines.add(key, tie.pose_key, tie.keyframe_T_sonar, sighting.z)
-        self.smoother.add(
-            factors.landmark_sighting(
-                tie.pose_key, key, tie.keyframe_T_sonar, sighting.z, R, self._robust, elevation_sigma_rad
+    def _located(self, view: View, range_m: float, azimuth_rad: float) -> Floats:
+        floor, aperture = self.calibration.floor, self.calibration.sonar.elevation_aperture_rad
+        elevation = elevation_on_floor(view.world_T_sonar, range_m, azimuth_rad, floor.z_m, aperture) if floor else None
+        return locate(view.world_T_sonar, range_m, azimuth_rad, elevation or 0.0)
+
+    def _add_factors(self, view: View, tie: Tie, seen: Seen, points: Floats, elevation_sigma_rad: float | None) -> None:
+        added: list[gtsam.NonlinearFactor] = []
+        noise = view.blurred(seen.cov, tie.motion, points)
+        for key, z, R in zip(seen.keys, seen.z, noise, strict=True):
+            self.smoother.sightlines.add(key, Sightline(tie.pose_key, tie.keyframe_T_sonar, z))
+            added += factors.landmark_sighting(
+                tie.pose_key, key, tie.keyframe_T_sonar, z, R, self._robust, elevation_sigma_rad
             )
-        )
+        self.smoother.add(added)
 
     def _robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
         """The noise model inside the chosen robust kernel."""
@@ -152,15 +158,26 @@ class Sightings:
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
-    """A detection with an identity."""
+class Seen:
+    """Detections of one frame that have an identity, each its own."""
 
-    stamp_ns: int
-    landmark_id: int
+    rows: list[int]
+    """In the frame, length m."""
+    ids: list[int]
+    keys: list[int]
+    """Of the landmarks in the graph."""
     z: Floats
-    """Range (m) and azimuth (rad), shape (2,)."""
+    """Range (m) and azimuth (rad), shape (m, 2)."""
     cov: Floats
-    """Their noise, shape (2, 2)."""
+    """Their noise, shape (m, 2, 2)."""
+
+    def where(self, chosen: list[bool]) -> Seen:
+        """Those that are chosen."""
+        if all(chosen):
+            return self
+        at = [k for k, is_chosen in enumerate(chosen) if is_chosen]
+        rows, ids, keys = ([column[k] for k in at] for column in (self.rows, self.ids, self.keys))
+        return Seen(rows, ids, keys, self.z[at], self.cov[at])
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,18 +19,26 @@ from sonar_graph.measurements import Floats
 
 @dataclass(frozen=True, eq=False)
 class Sightline:
-    """One sighting of a landmark, in the body frame of its keyframe."""
+    """One sighting of a landmark."""
 
     pose_key: int
-    origin: Floats
-    """The sonar, shape (3,), m."""
-    point: Floats
-    """The landmark where it was measured, at elevation 0, shape (3,), m."""
+    body_T_sonar: gtsam.Pose3
+    """The sonar in the body frame of that keyframe."""
+    z: Floats
+    """Range (m) and azimuth (rad), shape (2,)."""
+
+    def point(self, values: gtsam.Values) -> Floats:
+        """Where in the world the landmark was measured, at elevation 0, shape (3,), m."""
+        on_beam = self.z[0] * np.array([np.cos(self.z[1]), np.sin(self.z[1]), 0.0])
+        return self._world_T_sonar(values).transformFrom(on_beam)
 
     def is_behind(self, values: gtsam.Values, landmark: Floats) -> bool:
         """Whether a point of the world is more than a right angle off the measured azimuth."""
-        seen = values.atPose3(self.pose_key).transformTo(landmark) - self.origin
-        return bool(seen @ (self.point - self.origin) <= 0)
+        x, y, _ = self._world_T_sonar(values).transformTo(landmark)
+        return bool(x * np.cos(self.z[1]) + y * np.sin(self.z[1]) <= 0)
+
+    def _world_T_sonar(self, values: gtsam.Values) -> gtsam.Pose3:
+        return values.atPose3(self.pose_key).compose(self.body_T_sonar)
 
 
 class Sightlines:
@@ -39,11 +47,9 @@ class Sightlines:
     def __init__(self) -> None:
         self._lines: dict[int, list[Sightline]] = defaultdict(list)
 
-    def add(self, landmark_key: int, pose_key: int, body_T_sonar: gtsam.Pose3, z: Floats) -> None:
-        """A sighting: the sonar in the keyframe's body frame, range (m) and azimuth (rad)."""
-        on_beam = z[0] * np.array([np.cos(z[1]), np.sin(z[1]), 0.0])
-        line = Sightline(pose_key, body_T_sonar.translation(), body_T_sonar.transformFrom(on_beam))
-        self._lines[landmark_key].append(line)
+    def add(self, landmark_key: int, sightline: Sightline) -> None:
+        """A sighting of a landmark."""
+        self._lines[landmark_key].append(sightline)
 
     def turned_away(self, values: gtsam.Values) -> list[int]:
         """Landmarks that lie behind the sonar in at least half of their sightings."""
@@ -53,8 +59,7 @@ class Sightlines:
         """The values, with each of the landmarks at the median of where its sightings, from these poses, say it is."""
         placed = gtsam.Values(values)
         for key in landmark_keys:
-            points = [values.atPose3(line.pose_key).transformFrom(line.point) for line in self._lines[key]]
-            placed.update(key, np.median(points, axis=0))
+            placed.update(key, np.median([line.point(values) for line in self._lines[key]], axis=0))
         return placed
 
 

@@ -26,6 +26,7 @@ import numpy as np
 
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.batch import qr_tree, solve
+from sonar_graph.slam.joint_covariance import JointCovariance
 from sonar_graph.slam.sightlines import Sightlines
 
 RESTART_GROWTH = 1.25
@@ -74,8 +75,7 @@ class Smoother:
         self._landmarks: list[int] = []
         self._bias: list[int] = []
         self._window = self._new_window()
-        self._joint: gtsam.JointMarginal | None = None
-        self._joint_keys: set[int] = set()
+        self._joint: JointCovariance | None = None
         self._asked: set[int] = set()
         self._asked_before: set[int] = set()
         self._solved: tuple[gtsam.Values, gtsam.Marginals | gtsam.ISAM2] | None = None
@@ -111,8 +111,8 @@ class Smoother:
     def add(self, factors: Iterable[gtsam.NonlinearFactor]) -> None:
         """New factors, used at the next update."""
         for factor in factors:
-            self._pending.push_back(factor)
-            self.graph.push_back(factor)
+            self._pending.add(factor)
+            self.graph.add(factor)
 
     @property
     def is_due(self) -> bool:
@@ -178,16 +178,15 @@ class Smoother:
         """Marginal covariance of a variable in the window."""
         return self._window.marginalCovariance(key)
 
-    def joint_covariance(self, keys: list[int]) -> gtsam.JointMarginal:
+    def joint_covariance(self, keys: list[int]) -> JointCovariance:
         """Joint marginal covariance of variables in the window, and possibly of more of them.
 
         One computation serves until the next update: it also covers the landmarks that were asked for before the last
         one, since successive frames show mostly the same.
         """
         self._asked.update(keys)
-        if self._joint is None or not self._joint_keys.issuperset(keys):
-            self._joint_keys = self._asked | self._asked_before
-            self._joint = self._window.getISAM2().jointMarginalCovariance(list(self._joint_keys))
+        if self._joint is None or not self._joint.rows.keys() >= self._asked:
+            self._joint = JointCovariance.of(self._window.getISAM2(), sorted(self._asked | self._asked_before))
         return self._joint
 
     def solve_history(self) -> tuple[gtsam.Values, gtsam.Marginals | gtsam.ISAM2]:

@@ -2,14 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import L
 
-from sonar_graph.measurements import Floats
+from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.navigation.kernels import compiled, skew
+from sonar_graph.slam.joint_covariance import JointCovariance
 from sonar_graph.slam.models import project, wrap_angle
+
+ABSENT = -1
+"""Row of a variable that is not estimated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Detections of a frame beside what was expected of them."""
+
+    innovation: Floats
+    """Measured minus expected range (m) and azimuth (rad, wrapped), shape (m, 2)."""
+    S: Floats
+    """Covariance of the innovation, shape (m, 2, 2)."""
+    distance: Floats
+    """Squared Mahalanobis distance of the innovation, shape (m,)."""
+    gain: Floats
+    """The larger of the expected variances relative to the noise, shape (m,): how much a detection has to tell."""
 
 
 class View:
@@ -30,10 +49,8 @@ class View:
         From the keyframe to the frame.
     body_T_sonar
         The sonar's mounting.
-    landmarks
-        Estimates of the landmarks that may be seen, shape (3,), by identity.
     covariance
-        Of the keyframe, the bias and those landmarks together.
+        Of the keyframe, the bias and the landmarks that are compared, together.
     """
 
     def __init__(
@@ -43,70 +60,64 @@ class View:
         world_T_keyframe: gtsam.Pose3,
         motion: PreintegratedMotion,
         body_T_sonar: gtsam.Pose3,
-        landmarks: dict[int, Floats],
-        covariance: gtsam.JointMarginal,
+        covariance: JointCovariance,
     ) -> None:
         keyframe_T_sonar = motion.i_T_j.compose(body_T_sonar)
         self.world_T_sonar = world_T_keyframe.compose(keyframe_T_sonar)
         """The sonar at the frame."""
-        self.landmarks = landmarks
-        self._pose_key, self._bias_key = pose_key, bias_key
         self._covariance = covariance
-        self._world_R_sonar = np.ascontiguousarray(self.world_T_sonar.rotation().matrix())
-        self._world_p_sonar = np.asarray(self.world_T_sonar.translation(), dtype=np.float64)
-        self._to_keyframe = np.ascontiguousarray(keyframe_T_sonar.inverse().AdjointMap())
-        self._to_body = np.ascontiguousarray(body_T_sonar.inverse().AdjointMap())
+        self._pose_row = covariance.rows[pose_key]
+        self._bias_row = ABSENT if bias_key is None else covariance.rows[bias_key]
+        self._world_T_sonar = self.world_T_sonar.matrix()
+        self._to_keyframe = keyframe_T_sonar.inverse().AdjointMap()
+        self._to_body = body_T_sonar.inverse().AdjointMap()
         self._motion = motion
-        self._P = np.zeros((12, 12))
-        self._P[:6, :6] = covariance.at(pose_key, pose_key)
-        if bias_key is not None:
-            self._P[6:9, 6:9] = covariance.at(bias_key, bias_key)
-            self._P[:6, 6:9] = covariance.at(pose_key, bias_key)
-            self._P[6:9, :6] = self._P[:6, 6:9].T
 
-    def expect(self, landmark_id: int) -> tuple[Floats, Floats]:
-        """Expected range and azimuth of a landmark, shape (2,), and their covariance, shape (2, 2)."""
-        p = L(landmark_id)
-        self._P[9:, 9:] = self._covariance.at(p, p)
-        self._P[:6, 9:] = self._covariance.at(self._pose_key, p)
-        if self._bias_key is not None:
-            self._P[6:9, 9:] = self._covariance.at(self._bias_key, p)
-        self._P[9:, :9] = self._P[:9, 9:].T
+    def expect(self, keys: list[int], points: Floats) -> tuple[Floats, Floats]:
+        """What landmarks at points of the world, shape (m, 3), are expected to show.
+
+        Returns
+        -------
+        Range (m) and azimuth (rad), shape (m, 2), and their covariances, shape (m, 2, 2).
+        """
+        rows = np.array([self._covariance.rows[key] for key in keys], dtype=np.int64)
         return _expect(
-            self.landmarks[landmark_id],
-            self._world_R_sonar,
-            self._world_p_sonar,
+            points,
+            rows,
+            self._pose_row,
+            self._bias_row,
+            self._covariance.matrix,
+            self._world_T_sonar,
             self._to_keyframe,
             self._to_body,
-            self._P,
             self._motion.D_bias,
             self._motion.covariance,
         )
 
-    def blurred(self, cov: Floats, motion: PreintegratedMotion, point: Floats) -> Floats:
-        """Noise of range and azimuth of a point of the world, (2, 2), with that of a motion that ends at the frame.
+    def compare(self, keys: list[int], points: Floats, z: Floats, cov: Floats) -> Comparison:
+        """Detections z, shape (m, 2), with noise (m, 2, 2), of landmarks at points of the world, shape (m, 3)."""
+        return Comparison(*weigh(z, *self.expect(keys, points), cov))
+
+    def blurred(self, cov: Floats, motion: PreintegratedMotion, points: Floats) -> Floats:
+        """Noise of range and azimuth of points of the world, (m, 2, 2), with that of a motion that ends at the frame.
 
         The motion's part is added to each variance; that it correlates range and azimuth a little is left out.
         """
-        return _blurred(cov, point, self._world_R_sonar, self._world_p_sonar, self._to_body, motion.covariance)
+        return _blurred(cov, points, self._world_T_sonar, self._to_body, motion.covariance)
 
 
 @compiled
-def weigh(z: Floats, predicted: Floats, prior_cov: Floats, cov: Floats) -> tuple[Floats, Floats, float, float]:
-    """Compare a detection with what was expected.
-
-    Returns
-    -------
-    Innovation (2,), azimuth wrapped; its covariance S (2, 2); its squared Mahalanobis distance; and the larger of the
-    expected variances relative to the noise, which says how much the detection has to tell.
-    """
-    innovation = np.array([z[0] - predicted[0], wrap_angle(z[1] - predicted[1])])
+def weigh(z: Floats, predicted: Floats, prior_cov: Floats, cov: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Compare m detections with what was expected: the fields of `Comparison`."""
     S = prior_cov + cov
-    a, b, c = S[0, 0], 0.5 * (S[0, 1] + S[1, 0]), S[1, 1]
-    distance = (c * innovation[0] ** 2 - 2.0 * b * innovation[0] * innovation[1] + a * innovation[1] ** 2) / (
-        a * c - b * b
-    )
-    return innovation, S, distance, max(prior_cov[0, 0] / cov[0, 0], prior_cov[1, 1] / cov[1, 1])
+    innovation, distance, gain = np.empty(z.shape), np.empty(len(z)), np.empty(len(z))
+    for k in range(len(z)):
+        r, alpha = z[k, 0] - predicted[k, 0], wrap_angle(z[k, 1] - predicted[k, 1])
+        innovation[k, 0], innovation[k, 1] = r, alpha
+        a, b, c = S[k, 0, 0], 0.5 * (S[k, 0, 1] + S[k, 1, 0]), S[k, 1, 1]
+        distance[k] = (c * r**2 - 2.0 * b * r * alpha + a * alpha**2) / (a * c - b * b)
+        gain[k] = max(prior_cov[k, 0, 0] / cov[k, 0, 0], prior_cov[k, 1, 1] / cov[k, 1, 1])
+    return innovation, S, distance, gain
 
 
 @compiled
@@ -120,36 +131,49 @@ def _by_sonar_pose(q: Floats, D_q: Floats) -> Floats:
 
 @compiled
 def _expect(
-    point: Floats,
-    world_R_sonar: Floats,
-    world_p_sonar: Floats,
+    points: Floats,
+    rows: Ints,
+    pose_row: int,
+    bias_row: int,
+    joint: Floats,
+    world_T_sonar: Floats,
     to_keyframe: Floats,
     to_body: Floats,
-    P: Floats,
     D_bias: Floats,
     motion_cov: Floats,
 ) -> tuple[Floats, Floats]:
-    sonar_R_world = np.ascontiguousarray(world_R_sonar.T)
-    q = sonar_R_world @ (point - world_p_sonar)
-    predicted, D_q = project(q)
-    by_sonar = _by_sonar_pose(q, D_q)
-    by_body = by_sonar @ to_body
-    H = np.empty((2, 12))
-    H[:, :6] = by_sonar @ to_keyframe
-    H[:, 6:9] = by_body @ D_bias
-    H[:, 9:] = D_q @ sonar_R_world
-    return predicted, H @ P @ H.T + by_body @ motion_cov @ by_body.T
+    sonar_R_world = np.ascontiguousarray(world_T_sonar[:3, :3].T)
+    predicted, covs = np.empty((len(points), 2)), np.empty((len(points), 2, 2))
+    place = np.full(12, ABSENT)
+    H, P = np.zeros((2, 12)), np.zeros((12, 12))
+    for k in range(len(points)):
+        q = sonar_R_world @ (points[k] - world_T_sonar[:3, 3])
+        predicted[k], D_q = project(q)
+        by_sonar = _by_sonar_pose(q, D_q)
+        by_body = by_sonar @ to_body
+        H[:, :6] = by_sonar @ to_keyframe
+        H[:, 6:9] = by_body @ D_bias
+        H[:, 9:] = D_q @ sonar_R_world
+        for r in range(12):
+            place[r] = pose_row + r if r < 6 else rows[k] + r - 9
+            if 6 <= r < 9:
+                place[r] = ABSENT if bias_row == ABSENT else bias_row + r - 6
+        for r in range(12):
+            for c in range(12):
+                P[r, c] = 0.0 if place[r] == ABSENT or place[c] == ABSENT else joint[place[r], place[c]]
+        covs[k] = H @ P @ H.T + by_body @ motion_cov @ by_body.T
+    return predicted, covs
 
 
 @compiled
-def _blurred(
-    cov: Floats, point: Floats, world_R_sonar: Floats, world_p_sonar: Floats, to_body: Floats, motion_cov: Floats
-) -> Floats:
-    q = np.ascontiguousarray(world_R_sonar.T) @ (point - world_p_sonar)
-    _, D_q = project(q)
-    by_body = _by_sonar_pose(q, D_q) @ to_body
-    noise = by_body @ motion_cov @ by_body.T
+def _blurred(cov: Floats, points: Floats, world_T_sonar: Floats, to_body: Floats, motion_cov: Floats) -> Floats:
+    sonar_R_world = np.ascontiguousarray(world_T_sonar[:3, :3].T)
     blurred = cov.copy()
-    for k in range(2):
-        blurred[k, k] += noise[k, k]
+    for k in range(len(points)):
+        q = sonar_R_world @ (points[k] - world_T_sonar[:3, 3])
+        _, D_q = project(q)
+        by_body = _by_sonar_pose(q, D_q) @ to_body
+        noise = by_body @ motion_cov @ by_body.T
+        for r in range(2):
+            blurred[k, r, r] += noise[r, r]
     return blurred

@@ -7,7 +7,7 @@ from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.slam import factors
 from sonar_graph.slam.batch import solve
-from sonar_graph.slam.sightlines import Sightlines
+from sonar_graph.slam.sightlines import Sightline, Sightlines
 from sonar_graph.slam.smoother import Smoother
 
 BODY_T_SONAR = gtsam.Pose3(gtsam.Rot3.Ypr(0.3, 0.4, 0.0), np.array([0.8, 0.1, -0.2]))
@@ -31,7 +31,7 @@ def one_pose(landmark: np.ndarray) -> gtsam.Values:
 def seen(*sightings: np.ndarray) -> Sightlines:
     lines = Sightlines()
     for z in sightings:
-        lines.add(L(1), X(0), BODY_T_SONAR, z)
+        lines.add(L(1), Sightline(X(0), BODY_T_SONAR, z))
     return lines
 
 
@@ -74,7 +74,7 @@ def test_a_landmark_stuck_behind_comes_round_in_the_solution_of_the_history():
     smoother.add(factors.landmark_sighting(X(0), L(1), BODY_T_SONAR, Z, cov, lambda noise: noise, 0.07))
     stuck = solve(smoother.graph, smoother.values)
     assert np.linalg.norm(stuck.atPoint3(L(1)) - world_point(*Z)) > 3.0
-    smoother.sightlines.add(L(1), X(0), BODY_T_SONAR, Z)
+    smoother.sightlines.add(L(1), Sightline(X(0), BODY_T_SONAR, Z))
     values, _ = smoother.solve_history()
     assert values.atPoint3(L(1)) == pytest.approx(world_point(*Z), abs=1e-6)
     assert smoother.graph.error(values) == pytest.approx(0.0, abs=1e-9)
