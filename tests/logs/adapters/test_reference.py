@@ -54,3 +54,12 @@ def test_covariances_follow_the_axes_and_what_they_mean(foreign: Any, read: Any,
     truth = read(foreign.imu(), foreign.dvl(), entry, toml=toml).truth
     # body x is north, y (left) west, z up: [rotation, translation] in the body, signs drop out of a diagonal
     np.testing.assert_allclose(truth.covariances, [np.diag(deviations[[3, 4, 5, 0, 1, 2]] ** 2)] * 3, atol=1e-15)
+
+
+def test_a_body_that_the_driver_turns_is_turned_back(foreign: Any, read: Any) -> None:
+    # the driver's x is our y: with it pointing along the world's x, our x points along the world's -y
+    messages = poses(foreign, POSE, Rotation.identity())
+    toml = "[truth]\nrotation = [0, 0, 90]"
+    truth = read(foreign.imu(), foreign.dvl(), ("/ground_truth/pose", POSE, messages), toml=toml).truth
+    np.testing.assert_allclose(truth.rotations().apply([1, 0, 0]), [[0, -1, 0]] * 3, atol=1e-12)
+    np.testing.assert_array_equal(truth.positions, [[1, 2, 3]] * 3)

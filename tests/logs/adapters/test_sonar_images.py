@@ -8,6 +8,7 @@ import pytest
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters.config import read_log_config
+from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.sonar_reading import describe_frames, read_sonar_frames
 from sonar_graph.measurements import SonarFrames
 
@@ -123,3 +124,37 @@ def test_a_log_without_sonar_has_no_frames(foreign: Any) -> None:
 def test_frames_are_described_by_size_and_sector(foreign: Any) -> None:
     (frames,) = frames_in(foreign.write(("/oculus", PING, [ping(foreign, 0, gains=None)])))
     assert describe_frames(frames) == "3 beams x 4 bins of uint8, azimuth -30.0° to 30.0°, 0.25 m to 1.75 m"
+
+
+def test_inspect_describes_the_sonar_and_says_what_is_wrong_with_it(foreign: Any) -> None:
+    sound = foreign.write(("/oculus", PING, [ping(foreign, 0, gains=None)]))
+    assert inspect_log(sound).sonar == "3 beams x 4 bins of uint8, azimuth -30.0° to 30.0°, 0.25 m to 1.75 m"
+    broken = foreign.write(("/oculus", PING, [ping(foreign, 0, gains=None) | {"ping_data": b"\0" * 5}]))
+    assert "cannot be read: " in str(inspect_log(broken).sonar)
+    assert inspect_log(foreign.write(foreign.imu())).sonar is None
+
+
+@pytest.mark.recording
+def test_a_real_oculus_ping_comes_out_as_its_own_header_says(foreign: Any, recordings: Path) -> None:
+    raw = (recordings / "sonar" / "one_ping_8bit.raw").read_bytes()
+    bearings = np.round(np.linspace(-3000, 3000, 256)).astype(int).tolist()
+    pixels = np.frombuffer(raw[2048 : 2048 + 256 * 703], np.uint8).reshape(703, 256)
+    message = ping(foreign, 0, gains=None) | {
+        "range_resolution": 2.0 / 703,
+        "n_ranges": 703,
+        "n_beams": 256,
+        "step": 256,
+        "bearings": bearings,
+        "ping_data": pixels.tobytes(),
+    }
+    (frames,) = frames_in(foreign.write(("/oculus", PING, [message])))
+    assert frames.intensity.shape == (1, 256, 703)
+    # neighbours along a beam and across beams look alike in the right order, and do not when it is transposed
+    right = frames.intensity[0].astype(float)
+    config = foreign.config('[sonar]\nimage_order = "beam-major"\nrow_bytes = false')
+    (wrong,) = frames_in(foreign.write(("/oculus", PING, [message])), config)
+    assert _roughness(right) < 0.8 * _roughness(wrong.intensity[0].astype(float))
+
+
+def _roughness(image: np.ndarray) -> float:
+    return float(np.abs(np.diff(image, axis=0)).mean() + np.abs(np.diff(image, axis=1)).mean())

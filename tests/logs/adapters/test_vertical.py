@@ -34,6 +34,14 @@ def test_pressure_becomes_height_in_any_water_and_unit(
     assert "fresh" not in sequence.notes["log.depth"]
 
 
+def test_a_variance_is_scaled_with_its_pressure(foreign: Any, read: Any) -> None:
+    deviation_m = 0.05
+    deviation_mbar = deviation_m * 1000 * 9.80665 / 100
+    entry = pressures(foreign, [1500.0], variance=deviation_mbar**2)
+    sequence = read(foreign.imu(), foreign.dvl(), entry, toml="[depth]\nscale = 100")
+    np.testing.assert_allclose(sequence.depth.variance_m2, [deviation_m**2])
+
+
 def test_a_pressure_that_is_no_absolute_one_in_pascals_is_mentioned(foreign: Any, read: Any) -> None:
     sequence = read(foreign.imu(), foreign.dvl(), pressures(foreign, [1013.25, 1500.0]))
     assert "less than the atmosphere's: give scale (100 for hPa or mbar)" in sequence.notes["log.warnings"]
