@@ -66,8 +66,8 @@ def _heading(comparison: Comparison, key: str, heading: str) -> str:
 
 def _caption(comparison: Comparison) -> Text:
     lines = [f"{run.estimator} failed: {run.reason}" for run in failed_runs(comparison)]
-    if ending := comparison.sequence.notes.get("log.ending"):
-        lines.append(f"Log: {ending}")
+    notes = comparison.sequence.notes
+    lines += [f"Log: {notes[subject]}" for subject in ("log.ending", "log.damage") if subject in notes]
     if not has_detections(comparison):
         lines.append(NO_DETECTIONS)
     metric = headline_metric(comparison)

@@ -63,11 +63,12 @@ def test_a_log_without_detections_is_told():
     assert "without them every estimator is dead reckoning." in " ".join(printed(blind, 120).split())
 
 
-def test_a_log_that_is_cut_off_is_told():
+def test_a_log_that_is_cut_off_or_has_holes_is_told():
     comparison = basin_comparison(60)
-    notes = {"log.ending": "the file is cut off at byte 7"}
+    notes = {"log.ending": "the file is cut off at byte 7", "log.damage": "bytes 3 to 5: chunk 2 is lost"}
     cut = replace(comparison, sequence=replace(comparison.sequence, notes=notes))
     assert "Log: the file is cut off at byte 7" in printed(cut)
+    assert "Log: bytes 3 to 5: chunk 2 is lost" in printed(cut)
 
 
 def test_a_nees_outside_its_interval_is_marked():
