@@ -308,8 +308,9 @@ def test_inspect_ends_in_what_compare_would_lack(
     assert "not usable" not in capsys.readouterr().out
     monkeypatch.setattr(LogSummary, "obstacles", ("no IMU (a/msg/B)", "no DVL (c/msg/D)"))
     assert run("inspect", basin) == 0
-    last = capsys.readouterr().out.splitlines()[-1]
-    assert last == "not usable for compare: no IMU (a/msg/B), no DVL (c/msg/D)"
+    *_, lack, advice = capsys.readouterr().out.splitlines()
+    assert lack == "not usable for compare: no IMU (a/msg/B), no DVL (c/msg/D)"
+    assert "--toml > log.toml" in advice
 
 
 def test_estimators_lists_every_setting(capsys: pytest.CaptureFixture[str]) -> None:

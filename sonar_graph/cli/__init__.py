@@ -37,9 +37,7 @@ app = typer.Typer(
 )
 app.add_typer(worlds)
 app.add_typer(datasets)
-app.command(epilog=examples("sonar-graph inspect dive.mcap", "sonar-graph inspect dive.mcap --toml > dive.toml"))(
-    inspect
-)
+app.command(epilog=examples("sonar-graph inspect dive.mcap", "sonar-graph inspect dive.mcap --toml"))(inspect)
 app.command(
     epilog=examples(
         "sonar-graph run dive.mcap --estimator isam2 -o out",

@@ -180,6 +180,13 @@ def test_a_stamp_can_be_a_number_of_any_unit_and_be_shifted(foreign: Any, read: 
     assert (stamps_ns - foreign.t0_ns).tolist() == [0, 10**8, 2 * 10**8]
 
 
+def test_a_stamp_in_seconds_keeps_its_fraction(foreign: Any, read: Any) -> None:
+    topic, kind, rows = packets([[1.0, 2.0, 3.0, 0.0]] * 3)
+    rows = [row | {"timestamp": foreign.t0_ns / 1e9 + 0.25 * i} for i, row in enumerate(rows)]
+    stamps_ns = read(foreign.imu(), (topic, kind, rows), toml=OF_ARRAY + 'stamp = "timestamp"').dvl.stamps_ns
+    assert (stamps_ns - foreign.t0_ns).tolist() == [0, 250_000_000, 500_000_000]
+
+
 @pytest.mark.parametrize(
     ("toml", "message"),
     [

@@ -103,6 +103,12 @@ def test_oculus_rows_begin_with_a_gain_that_is_taken_out(foreign: Any, size: int
     np.testing.assert_allclose(plain.ranges_m, [0.25, 0.75, 1.25, 1.75])
 
 
+def test_the_size_of_a_row_follows_from_beams_samples_and_gain(foreign: Any) -> None:
+    path = foreign.write(("/oculus", PING, [ping(foreign, 0, gains=[1, 4, 9, 16], size=2)]))
+    (frames,) = frames_in(path, foreign.config("[sonar]\nrow_bytes = false"))
+    np.testing.assert_allclose(frames.intensity[0], POLAR / [1, 2, 3, 4])
+
+
 def test_the_side_of_positive_bearings_can_be_said(foreign: Any) -> None:
     path = foreign.write(("/oculus", PING, [ping(foreign, 0, gains=None)]))
     (frames,) = frames_in(path, foreign.config('[sonar]\nbearing_positive = "left"'))

@@ -61,6 +61,7 @@ def test_poses_are_depths_with_a_variance_or_what_stands_for_it(
     toml = f'[depth]\ntopic = "{entry[0]}"\nvariance = {{meaning = "{meaning}"}}'
     sequence = read(foreign.imu(), foreign.dvl(), entry, toml=toml)
     assert sequence.depth.z_m.tolist() == [-3] * 3
+    assert "depth" not in sequence.notes["log.calibration"]  # a pose in the world has no port to mount
     np.testing.assert_allclose(sequence.depth.variance_m2, expected)
 
 
