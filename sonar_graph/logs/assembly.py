@@ -211,7 +211,7 @@ class Assembly:
             return recorded
         sensors = self._frames()
         known = self._mountings(sensors)
-        missing = [f"{name} ({frame!r})" for name, frame in sensors.items() if name not in known]
+        missing = [f"{name} ({frame or 'unnamed'})" for name, frame in sensors.items() if name not in known]
         self._is_mounting_known = "dvl" in known
         self._notes["log.calibration"] = f"defaults; mountings from /tf_static: {', '.join(known) or 'none'}" + (
             f"; not in the tree, taken as base_link: {', '.join(missing)}" if missing else ""

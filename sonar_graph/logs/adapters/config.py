@@ -96,7 +96,7 @@ class LogConfig:
             return []
         if not bases:
             return [self._build(role, ADAPTERS[role], _changes(ADAPTERS[role].model_construct(type=type_name), table))]
-        return [self._build(role, type(base), {**_plain(base), **_changes(base, table)}) for base in bases]
+        return [self._build(role, type(base), {**base.model_dump(), **_changes(base, table)}) for base in bases]
 
     def _check(self, role: str, table: Table) -> None:
         """Find mistakes before any log is read; where the type is not known yet, one that comes along must fit."""
@@ -150,10 +150,6 @@ def read_log_config(path: Path) -> LogConfig:
     return LogConfig.parse(values, str(path))
 
 
-def _plain(model: BaseModel) -> dict[str, Any]:
-    return model.model_dump()
-
-
 def _changes(base: BaseModel, table: Table) -> dict[str, Any]:
     """A table over an adapter: sections are merged, ``false`` takes away what can be absent."""
     changes: dict[str, Any] = {}
@@ -162,7 +158,7 @@ def _changes(base: BaseModel, table: Table) -> dict[str, Any]:
         if value is False and not isinstance(old, bool):
             changes[key] = None
         elif isinstance(old, BaseModel) and isinstance(value, Mapping):
-            changes[key] = {**_plain(old), **value}
+            changes[key] = {**old.model_dump(), **value}
         else:
             changes[key] = value
     return changes

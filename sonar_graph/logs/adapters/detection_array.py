@@ -119,7 +119,7 @@ class DetectionArrayAdapter(Adapter):
         except ValueError:
             raise LogError(
                 f"{topic.file}: topic {topic.name}: class {name!r} is no integer identity; say in a log "
-                f'configuration which it is: [detections] ids = {{"{name}" = 1}}'
+                f'configuration which it is: [detections] ids = {{"{name}" = 1}}, or do not use them: use = false'
             ) from None
 
 

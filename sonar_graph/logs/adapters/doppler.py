@@ -62,7 +62,9 @@ class DvlAdapter(Adapter):
         """The rows with a valid velocity; a covariance that is not known is NaN."""
         velocity = self._velocities(table)
         covariance, invalid = self._covariances(table)
-        faults = {f"with {path} not {_toml(value)}": table.column(path) != value for path, value in self._conditions()}
+        faults = {
+            f"with {path} not {_toml(value)}": table.column(path) != value for path, value in self.valid_where.items()
+        }
         if self.good_beams is not None:
             beams = table.column(self.good_beams)
             faults["without a good beam"] = (beams == 0) & beams.any()
@@ -87,9 +89,6 @@ class DvlAdapter(Adapter):
             wrong = said & ~(np.isfinite(ranges) & (ranges > 0)).all(axis=1)
             if wrong.any():
                 yield f"{self.beam_ranges_valid} is true in {wrong.sum()} messages that have a range of 0 or less"
-
-    def _conditions(self) -> Iterator[tuple[str, Number]]:
-        yield from self.valid_where.items()
 
     def _velocities(self, table: Table) -> Floats:
         if self.velocity is not None:
