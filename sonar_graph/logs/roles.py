@@ -198,8 +198,8 @@ def _require(choice: Choice, recording: Recording, wanted: Mapping[str, str], co
     is_asked_for = role.name in wanted or {"topic", "type"} & config.table(role.name).keys()
     if choice.topic is None and (role.is_required or (is_asked_for and not choice.is_off)):
         raise MissingTopicError(
-            f"{path}: nothing for {role.name}: {choice.reason}; the log has {topic_list(recording)}; what other types are "
-            f"is said in a log configuration, which `sonar-graph inspect {path} --toml` begins"
+            f"{path}: nothing for {role.name}: {choice.reason}; the log has {topic_list(recording)}; "
+            f"what other types are is said in a log configuration, which `sonar-graph inspect {path} --toml` begins"
         )
 
 
