@@ -141,6 +141,9 @@ class LandmarkDetections(Block):
 
     def frames(self) -> Iterator[LandmarkDetections]:
         """The rows of each sonar frame, that is of each stamp."""
+        if self.stamps_ns[0] == self.stamps_ns[-1]:
+            yield self
+            return
         ends = np.append(np.flatnonzero(np.diff(self.stamps_ns)) + 1, len(self)).tolist()
         for first, last in zip([0, *ends[:-1]], ends, strict=True):
             yield self.rows(slice(first, last))

@@ -26,7 +26,7 @@ from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import Smoother
 
 S_PER_NS = 1e-9
-LATEST_NS = np.iinfo(np.int64).max
+EARLIEST_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Keyframes:
     """Of each keyframe; its key is ``X(index)``."""
     bias_keys: list[int] = field(default_factory=list)
     """Of each keyframe: the bias that holds from it on."""
-    advanced_ns: int = np.iinfo(np.int64).min
+    advanced_ns: int = EARLIEST_NS
     """Latest instant that was advanced to."""
 
     def __post_init__(self) -> None:
@@ -79,11 +79,12 @@ class Keyframes:
         return X(len(self.stamps_ns) - 1)
 
     def add(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None) -> None:
-        """Take in rows."""
+        """Take in rows; depths not newer than those that wait are passed over."""
         self.odometry.add(imu, dvl)
         self._latest = None
-        if depth is not None:
-            self._depths.append(depth)
+        newest_ns = self._depths[-1].stamps_ns[-1] if self._depths else EARLIEST_NS
+        if depth is not None and (in_order := depth.between(newest_ns, LATEST_NS)):
+            self._depths.append(in_order)
 
     def advance(self, until_ns: int) -> None:
         """Set the keyframes that are due from nodes reached at an instant; the first starts the graph."""
@@ -205,11 +206,9 @@ class Keyframes:
     def _depth(self, j: int, node_ns: int, steps: Steps, motion: PreintegratedMotion) -> list[gtsam.NonlinearFactor]:
         """One factor for all samples since the last keyframe, carried to this one and averaged there."""
         start_ns = self.stamps_ns[-1]
-        rows = [block for depth in self._depths if (block := depth.between(start_ns, node_ns))]
-        self._depths = [block for depth in self._depths if (block := depth.between(node_ns, LATEST_NS))]
-        if not rows:
+        samples = self._depths_until(node_ns)
+        if samples is None:
             return []
-        samples = Depth.concatenate(rows)
         variance = np.where(np.isnan(samples.variance_m2), self.calibration.depth.sigma_m**2, samples.variance_m2)
         offsets_s = np.asarray((samples.stamps_ns - start_ns) * S_PER_NS, dtype=np.float64)
         weights, mean_variance = weights_at_end(variance, motion.duration_s - offsets_s, self._wander_m2_s(steps))
@@ -218,6 +217,15 @@ class Keyframes:
         return [
             factors.depth(X(j), float(weights @ samples.z_m), motion.i_T_j.transformTo(mean_port), mean_variance**0.5)
         ]
+
+    def _depths_until(self, node_ns: int) -> Depth | None:
+        """The samples since the last keyframe, which are then done with."""
+        if not self._depths:
+            return None
+        waiting = Depth.concatenate(self._depths)
+        later = waiting.between(node_ns, LATEST_NS)
+        self._depths = [later] if later else []
+        return waiting.between(self.stamps_ns[-1], node_ns)
 
     def _wander_m2_s(self, steps: Steps) -> float:
         """Spectral density of the vertical velocity noise over the steps, for the attitude of the newest keyframe."""

@@ -82,9 +82,11 @@ class Sightings:
 
     def _with_identity(self, frame: LandmarkDetections, identities: Identities) -> Seen:
         rows = [row for row, refusal in enumerate(identities.refusals) if not refusal]
-        cov = frame.range_azimuth_cov[rows]
-        cov[np.isnan(cov).any(axis=(1, 2))] = self._default_cov
         z = np.column_stack((frame.range_m[rows], frame.azimuth_rad[rows]))
+        cov = frame.range_azimuth_cov[rows]
+        is_unknown = np.isnan(cov).any(axis=(1, 2))
+        if is_unknown.any():
+            cov[is_unknown] = self._default_cov
         ids: list[int] = identities.ids[rows].tolist()
         return Seen(rows, ids, [L(i) for i in ids], z, cov)
 

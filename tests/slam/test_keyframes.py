@@ -337,3 +337,21 @@ def test_a_lever_arm_is_known_to_the_keyframes():
     keyframes = driven(Calibration(imu=NO_BIAS, dvl=dvl), 4.0, rate=(0, 0, 0.3), velocity=(0, 0, 0))
     expected = [1 - np.cos(1.2), -np.sin(1.2), 0.0]
     assert keyframes.smoother.values.atPose3(X(2)).translation() == pytest.approx(expected, abs=1e-9)
+
+
+def test_depths_that_come_late_are_passed_over():
+    """A live feed may deliver a sample twice, or an old one after a newer: neither counts."""
+
+    def depth_factor(*when: float) -> gtsam.NonlinearFactor:
+        keyframes = keyframes_of(Calibration(imu=NO_BIAS, dvl=EXACT_DVL))
+        keyframes.add(level_imu(2.0), steady_dvl(2.0), None)
+        keyframes.advance(int(at(0.0)[0]))
+        for t in when:
+            keyframes.add(None, None, Depth(at(t), np.full(1, -t), np.full(1, 1e-4)))
+        keyframes.advance(int(at(2.0)[0]))
+        (factor,) = factors_on(keyframes, gtsam.GPSFactorArm, X(1))
+        return factor
+
+    in_order, again, more = depth_factor(0.3, 0.9), depth_factor(0.3, 0.9, 0.9, 0.6), depth_factor(0.3, 0.6, 0.9)
+    assert in_order.equals(again, 1e-12)
+    assert not in_order.equals(more, 1e-3)
