@@ -69,8 +69,9 @@ def test_after_missing_bytes_reading_goes_on_with_the_next_chunk(path: Path, com
     first = chunk_indexes(path)[1]
     lost, others = chunk_of(path, 1), chunk_of(path, 1, channel=2)
     at = first.chunk_start_offset + 200
+    assert first.message_index_length < 1500 < first.chunk_length - 200
     content = path.read_bytes()
-    path.write_bytes(content[:at] + content[at + 50 :])
+    path.write_bytes(content[:at] + content[at + 1500 :])  # more than its index takes
     assert read(path) == [entry for entry in written if entry not in lost]
     (loss,) = scan_all(path).damage.losses
     assert loss.at == first.chunk_start_offset
@@ -131,6 +132,38 @@ def test_descriptions_lost_with_the_first_chunk_come_from_the_summary(path: Path
     assert read(path) == written[len(lost) :]
 
 
+def test_descriptions_come_from_a_summary_that_has_moved(path: Path) -> None:
+    written = write(path)
+    lost = chunk_of(path, 0)
+    at = chunk_indexes(path)[0].chunk_start_offset + 200
+    content = path.read_bytes()
+    path.write_bytes(content[:at] + content[at + 10 :])
+    assert read(path) == written[len(lost) :]
+
+
+def test_a_channel_outside_chunks_that_differs_from_the_summary_is_not_believed(path: Path) -> None:
+    written = write(path, use_chunking=False)
+    flip(path, path.read_bytes().index(b"/bytes"), 1)
+    recording = scan_all(path)
+    assert entries(recording.topics["/bytes"]) == written
+    assert any("channel 1 (/bytes) is described in two ways" in remark for remark in recording.damage.remarks)
+
+
+def test_a_description_with_a_wrong_length_within_is_lost_not_shortened(path: Path) -> None:
+    write(path, use_chunking=False, use_statistics=False, repeat_channels=False, repeat_schemas=False)
+    content = path.read_bytes()
+    flip(path, content.index(b"uint8[] data") - 4, 16)  # of 13 bytes it now claims 29, of which 13 are there
+    recording = scan_all(path)
+    assert any("the description of a channel is lost" in loss for loss in recording.corrupt)
+
+
+def test_a_wrong_length_of_metadata_costs_no_message(path: Path) -> None:
+    written = write(path)
+    flip(path, path.read_bytes().index(b"sonar_graph") - 4 - 8, 64)
+    assert read(path) == written
+    assert "a metadata record is lost" in scan_all(path).corrupt[0]
+
+
 def test_without_any_description_messages_are_counted_as_lost(path: Path) -> None:
     written = write(path)
     first, second = chunk_indexes(path)[:2]
@@ -158,7 +191,7 @@ def test_zeros_after_a_cut_are_not_taken_for_a_message(path: Path) -> None:
     written = write(path, 2000, chunk_size=1 << 20, compression=CompressionType.NONE)
     content = path.read_bytes()
     for kept in range(20_000, 20_080):
-        path.write_bytes(content[:kept] + bytes(len(content) // 3))
+        path.write_bytes(content[:kept] + bytes(300))
         found = read(path)
         assert found == written[: len(found)]
         assert len(found) > 100
@@ -228,7 +261,7 @@ class Telling(Writer):
         os.write(1, b"%d\\n" % time_ns)
 
 recorder.Writer, recorder._CHUNK_BYTES = Telling, 65536
-payloads = np.random.default_rng(0).integers(0, 256, (50_000, 1000), np.uint8)
+payloads = np.zeros((50_000, 1000), np.uint8)  # small when compressed: a chunk fits into a buffer
 write_recording(Path(path), [Outgoing("/n", "std_msgs/msg/Header", np.arange(50_000), payloads)], {})
 """,
 }

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ from rosbags.highlevel import AnyReader
 from sonar_graph.logs.encoding import pose_messages, static_message
 from sonar_graph.logs.metadata import open_seal
 from sonar_graph.logs.recorder import Attachment, Outgoing, write_recording
+from sonar_graph.logs.records import LogFile
+from sonar_graph.logs.summary import read_summary
 from sonar_graph.states import Trajectory
 
 T0_NS = 1_700_000_000_000_000_000
@@ -63,6 +66,13 @@ def test_metadata_and_attachments_are_found_by_name(recording: Path) -> None:
         assert open_seal(about) == ({"key": "value ψ"}, True)
         (file,) = reader.iter_attachments()
     assert (file.name, file.media_type, file.data) == ("notes/a.json", "application/json", b'{"a": 1}')
+
+
+def test_a_crc_covers_all_data(recording: Path) -> None:
+    with LogFile(recording) as file:
+        summary, fault = read_summary(file)
+        assert (summary is not None, fault) == (True, None)
+        assert summary.data_crc == zlib.crc32(file.read(0, summary.data_end_at)) != 0
 
 
 def test_latched_topics_offer_transient_local_in_numbers_that_all_rosbag2_read(recording: Path) -> None:
