@@ -147,6 +147,12 @@ class LogFile:
             return chunk
         return Record(opcode, at, size)
 
+    def is_like_chunk(self, at: int) -> bool:
+        """Whether a chunk begins at an offset, be its lengths as they may."""
+        start = self.read(at, _CHUNK_HEAD)
+        chunk = _chunk(start, at)
+        return chunk is not None and start[0] == Opcode.CHUNK and chunk.compression in ("", "lz4", "zstd")
+
     def _begins(self, at: int) -> bool:
         """Whether something that begins like a record, or nothing, is at an offset."""
         head = self.read(at, HEAD.size)
@@ -212,6 +218,7 @@ class Walk:
 
     def search(self, at: int) -> Hole:
         """Give up what begins at an offset and go on with the next trustworthy record after it."""
+        self._has_chunks |= self._file.is_like_chunk(at)
         found = self._next_record(at + 1)
         self._at = self._stop_at if found is None else found
         return Hole(at, self._at)
