@@ -36,6 +36,13 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "unchunked, data CRC": {"use_chunking": False, "enable_data_crcs": True},
     "data CRC": {"enable_data_crcs": True},
 }
+WRITING = f"""
+import sys
+from pathlib import Path
+sys.path.insert(0, {str(Path(__file__).parents[1] / "performance")!r})
+from mission_log import write_mission
+write_mission(Path(sys.argv[1]), {DURATION_S}, {FRAMES}, chunk_bytes={CHUNK_BYTES})
+"""
 
 
 def source_logs(folder: Path) -> list[Path]:
@@ -56,7 +63,7 @@ def killed_logs(folder: Path, count: int) -> list[tuple[Path, Truth]]:
     found = []
     for number in itertools.count():
         path = folder / f"killed{number}.mcap"
-        writer = subprocess.Popen([sys.executable, __file__, str(path)])
+        writer = subprocess.Popen([sys.executable, "-c", WRITING, str(path)])
         size = whole.stat().st_size * (number + 1) // (count + 1)
         while writer.poll() is None and (not path.exists() or path.stat().st_size < size):
             time.sleep(1e-4)
@@ -66,7 +73,3 @@ def killed_logs(folder: Path, count: int) -> list[tuple[Path, Truth]]:
         if len(found) == count:
             return found
     raise AssertionError
-
-
-if __name__ == "__main__":
-    write_mission(Path(sys.argv[1]), DURATION_S, FRAMES, chunk_bytes=CHUNK_BYTES)

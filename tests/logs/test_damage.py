@@ -88,6 +88,15 @@ def test_what_looks_like_messages_within_a_damaged_chunk_is_not_read(path: Path)
     assert read(path) == [entry for entry in written if entry not in lost]
 
 
+def test_also_the_first_chunk_is_not_read_as_messages_without_chunk(path: Path) -> None:
+    write(path, chunk_size=1 << 20, compression=CompressionType.NONE)
+    (chunk,) = chunk_indexes(path)
+    path.write_bytes(path.read_bytes()[: chunk.chunk_start_offset + chunk.chunk_length])
+    flip(path, chunk.chunk_start_offset + 1)
+    flip(path, chunk.chunk_start_offset + 9 + 32, 1)
+    assert scan_all(path).topics == {}
+
+
 def test_a_length_that_lies_outside_chunks_costs_one_message(path: Path) -> None:
     written = write(path, use_chunking=False)
     content = path.read_bytes()
