@@ -79,6 +79,32 @@ float32[4] range_covar
 float32[4] beam_quality
 float32[4] beam_velocity
 float32[4] beam_velocity_covar""",
+    "marine_acoustic_msgs/PingInfo": """\
+float32 frequency
+float32 sound_speed
+float32[] tx_beamwidths
+float32[] rx_beamwidths""",
+    "marine_acoustic_msgs/SonarImageData": """\
+uint8 DTYPE_UINT8=0
+uint8 DTYPE_INT8=1
+uint8 DTYPE_UINT16=2
+uint8 DTYPE_INT16=3
+uint8 DTYPE_UINT32=4
+uint8 DTYPE_INT32=5
+uint8 DTYPE_UINT64=6
+uint8 DTYPE_INT64=7
+uint8 DTYPE_FLOAT32=8
+uint8 DTYPE_FLOAT64=9
+bool is_bigendian
+uint32 dtype
+uint32 beam_count
+uint8[] data""",
+    "marine_acoustic_msgs/ProjectedSonarImage": """\
+std_msgs/Header header
+marine_acoustic_msgs/PingInfo ping_info
+geometry_msgs/Vector3[] beam_directions
+float32[] ranges
+marine_acoustic_msgs/SonarImageData image""",
     "visualization_msgs/UVCoordinate": "float32 u\nfloat32 v",
     "visualization_msgs/MeshFile": "string filename\nuint8[] data",
     "visualization_msgs/Marker": """\

@@ -10,7 +10,8 @@ rosbag2, so that ``ros2 bag play`` offers it: without it RViz would never receiv
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -75,11 +76,43 @@ def write_recording(
     LogError
         When the file cannot be written.
     """
+    with recording(path, metadata) as out:
+        if any(entry.is_latched for entry in messages):
+            out.offer_latched()
+        end_ns = max((int(m.log_times_ns.max()) for m in messages if len(m.log_times_ns)), default=0)
+        for file in attachments:
+            out.attach(file, max(end_ns, 0))
+        out.write(messages)
+
+
+@contextmanager
+def recording(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> Iterator[RecordingWriter]:
+    """A recording that is written piece by piece, for what does not fit into memory.
+
+    An existing file is replaced when the context ends without an error; until then, pieces go to a file beside it.
+
+    Parameters
+    ----------
+    path
+        The MCAP file.
+    metadata
+        Records by name, written first.
+
+    Raises
+    ------
+    LogError
+        When the file cannot be written.
+    """
     partial = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            _write(partial, messages, metadata, attachments)
+            with partial.open("wb") as stream:
+                out = RecordingWriter(stream)
+                for name, record in metadata.items():
+                    out.add_metadata(name, record)
+                yield out
+                out.finish()
             partial.replace(path)
         finally:
             partial.unlink(missing_ok=True)
@@ -87,49 +120,57 @@ def write_recording(
         raise LogError(f"{path} cannot be written: {error.strerror}") from error
 
 
-def _write(
-    path: Path,
-    messages: list[Outgoing],
-    metadata: Mapping[str, Mapping[str, str]],
-    attachments: Sequence[Attachment],
-) -> None:
-    with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
-        writer.start(profile="ros2", library="sonar-graph")
-        for name, record in metadata.items():
-            writer.add_metadata(name, seal(record))
-        if any(entry.is_latched for entry in messages):
-            writer.add_metadata("rosbag2", ROSBAG2_METADATA)
-        end_ns = max((int(m.log_times_ns.max()) for m in messages if len(m.log_times_ns)), default=0)
-        for file in attachments:
-            writer.add_attachment(0, max(end_ns, 0), file.name, file.media_type, file.content)
-        _add_messages(writer, messages, stream)
-        writer.finish()  # type: ignore[no-untyped-call]  # of the mcap package
+class RecordingWriter:
+    """Writes to an open file; memory holds one chunk and what the index needs."""
 
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
+        self._writer.start(profile="ros2", library="sonar-graph")
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._offers_latched = False
 
-def _add_messages(writer: Writer, messages: list[Outgoing], stream: BinaryIO) -> None:
-    channels = _register(writer, messages)
-    times_ns = np.concatenate([np.maximum(m.log_times_ns, 0) for m in messages] or [np.empty(0, np.int64)])
-    source = np.repeat(np.arange(len(messages)), [len(m.log_times_ns) for m in messages])
-    row = np.concatenate([np.arange(len(m.log_times_ns)) for m in messages] or [np.empty(0, np.int64)])
-    order = np.argsort(times_ns, kind="stable")
-    written = stream.tell()
-    for time_ns, of, at in zip(times_ns[order].tolist(), source[order].tolist(), row[order].tolist(), strict=True):
-        writer.add_message(channels[of], time_ns, messages[of].payloads[at].tobytes(), time_ns)
-        if stream.tell() != written:  # a chunk was full
-            stream.flush()
-            written = stream.tell()
+    def add_metadata(self, name: str, record: Mapping[str, str]) -> None:
+        """A metadata record with its checksum."""
+        self._writer.add_metadata(name, seal(record))
 
+    def attach(self, file: Attachment, time_ns: int) -> None:
+        """A file within the recording."""
+        self._writer.add_attachment(0, time_ns, file.name, file.media_type, file.content)
 
-def _register(writer: Writer, messages: list[Outgoing]) -> list[int]:
-    """The channel of each entry; entries of one topic share it."""
-    schemas: dict[str, int] = {}
-    channels: dict[str, int] = {}
-    for entry in messages:
-        if entry.type_name not in schemas:
+    def offer_latched(self) -> None:
+        """Say in the form of rosbag2 that there are latched topics; once is enough."""
+        if not self._offers_latched:
+            self._writer.add_metadata("rosbag2", ROSBAG2_METADATA)
+            self._offers_latched = True
+
+    def write(self, messages: Sequence[Outgoing]) -> None:
+        """Messages in the order of their log times; those at one instant in the order of the list."""
+        channels = [self._channel(entry) for entry in messages]
+        times_ns = np.concatenate([np.maximum(m.log_times_ns, 0) for m in messages] or [np.empty(0, np.int64)])
+        source = np.repeat(np.arange(len(messages)), [len(m.log_times_ns) for m in messages])
+        row = np.concatenate([np.arange(len(m.log_times_ns)) for m in messages] or [np.empty(0, np.int64)])
+        order = np.argsort(times_ns, kind="stable")
+        written = self._stream.tell()
+        for time_ns, of, at in zip(times_ns[order].tolist(), source[order].tolist(), row[order].tolist(), strict=True):
+            self._writer.add_message(channels[of], time_ns, messages[of].payloads[at].tobytes(), time_ns)
+            if self._stream.tell() != written:  # a chunk was full
+                self._stream.flush()
+                written = self._stream.tell()
+
+    def finish(self) -> None:
+        """Write the summary."""
+        self._writer.finish()  # type: ignore[no-untyped-call]  # of the mcap package
+
+    def _channel(self, entry: Outgoing) -> int:
+        if entry.type_name not in self._schemas:
             text = definition(entry.type_name).encode()
-            schemas[entry.type_name] = writer.register_schema(entry.type_name, "ros2msg", text)
-        if entry.topic not in channels:
+            self._schemas[entry.type_name] = self._writer.register_schema(entry.type_name, "ros2msg", text)
+        if entry.topic not in self._channels:
+            if entry.is_latched:
+                self.offer_latched()
             offers = {"offered_qos_profiles": TRANSIENT_LOCAL} if entry.is_latched else {}
-            channels[entry.topic] = writer.register_channel(entry.topic, "cdr", schemas[entry.type_name], offers)
-    return [channels[entry.topic] for entry in messages]
+            schema = self._schemas[entry.type_name]
+            self._channels[entry.topic] = self._writer.register_channel(entry.topic, "cdr", schema, offers)
+        return self._channels[entry.topic]

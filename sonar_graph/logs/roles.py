@@ -19,6 +19,7 @@ POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
 DETECTIONS = "sonar_graph_msgs/msg/LandmarkDetections"
 LANDMARK_MAP = "sonar_graph_msgs/msg/LandmarkMap"
+SONAR_IMAGE = "marine_acoustic_msgs/msg/ProjectedSonarImage"
 TF = "tf2_msgs/msg/TFMessage"
 
 SONAR = "sonar"

@@ -15,7 +15,7 @@ from sonar_graph.logs.container import Topic
 from sonar_graph.logs.table import Table
 from sonar_graph.measurements import Floats, SonarFrames
 
-_SAMPLE_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
+SAMPLE_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 """numpy's type for each number in marine_acoustic_msgs/SonarImageData."""
 _GAIN_BYTES = 4
 
@@ -142,9 +142,9 @@ class SonarAdapter(Adapter):
     def _dtype(self, table: Table, kind: NDArray[np.int64]) -> np.dtype[np.generic]:
         order = ">" if kind[2] > 0 else "<"
         if self.sample_type is not None:
-            if not 0 <= kind[0] < len(_SAMPLE_TYPES):
-                table.refuse(self.sample_type, f"is {kind[0]}; kinds of samples are 0 to {len(_SAMPLE_TYPES) - 1}")
-            return np.dtype(order + _SAMPLE_TYPES[kind[0]])
+            if not 0 <= kind[0] < len(SAMPLE_TYPES):
+                table.refuse(self.sample_type, f"is {kind[0]}; kinds of samples are 0 to {len(SAMPLE_TYPES) - 1}")
+            return np.dtype(order + SAMPLE_TYPES[kind[0]])
         size = int(kind[1]) if self.sample_bytes is not None else 1
         if size not in (1, 2, 4):
             table.refuse(str(self.sample_bytes), f"is {size}; samples have 1, 2 or 4 bytes")
