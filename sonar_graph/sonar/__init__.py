@@ -1,0 +1,1 @@
+"""From polar sonar images to recognised landmarks with identity probabilities."""
