@@ -1,0 +1,32 @@
+"""Machine code for loops over samples and pixels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import FunctionType
+from typing import TypeVar, cast
+
+import numba
+
+Compiled = TypeVar("Compiled")
+_sources: set[Path] = set()
+
+
+def compiled(function: Compiled) -> Compiled:
+    """Compile to machine code at the first call; the code is cached beside the source.
+
+    numba drops cached code when the function's own file changes, but not when a function that it calls in another file
+    does. Callees are decorated before their callers (their modules are imported first), so code older than the newest
+    file seen so far is removed here.
+
+    Callees become part of their callers: a call that hands over arrays or tuples costs as much as the arithmetic of a
+    step, and tuples stay in registers only within one function.
+    """
+    assert isinstance(function, FunctionType)
+    source = Path(function.__code__.co_filename)
+    _sources.add(source)
+    newest_ns = max(path.stat().st_mtime_ns for path in _sources)
+    for index in (source.parent / "__pycache__").glob(f"{source.stem}.{function.__qualname__}-*.nbi"):
+        if index.stat().st_mtime_ns < newest_ns:
+            index.unlink(missing_ok=True)
+    return cast(Compiled, numba.njit(cache=True, error_model="numpy", forceinline=True)(function))
