@@ -1,0 +1,101 @@
+"""Designs are what their file draws, wherever one looks."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sonar_graph.errors import CalibrationError
+from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign, load_designs
+
+HALF = """
+[[landmark]]
+id = 7
+name = "half"
+size_m = 0.4
+height_m = 0.02
+shapes = [{ level_db = 5.0, polygon_m = [[0.0, 0.0], [0.2, 0.0], [0.2, 0.2], [0.0, 0.2]] }]
+"""
+
+
+def written(folder: Path, text: str, name: str = "landmarks.toml") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_four_distinct_designs_ship():
+    assert [design.id for design in DEFAULT_DESIGNS] == [1, 2, 3, 4]
+    assert [design.name for design in DEFAULT_DESIGNS] == ["disc", "square", "triangle", "cross"]
+    foam = [design.mask > 0 for design in DEFAULT_DESIGNS]
+    for i, one in enumerate(foam):
+        for other in foam[:i]:
+            turned = max((np.rot90(one, k) & other).sum() / (np.rot90(one, k) | other).sum() for k in range(4))
+            assert turned < 0.9
+
+
+def test_areas_of_the_default_figures_are_those_of_geometry():
+    areas_m2 = [np.sum(design.mask > 0) * 0.002**2 for design in DEFAULT_DESIGNS]
+    side_m = 2 * 0.1602
+    expected = [np.pi * 0.14**2, 0.26**2, side_m**2 * np.sqrt(3) / 4, 2 * 0.34 * 0.09 - 0.09**2]
+    np.testing.assert_allclose(areas_m2, expected, rtol=0.01)
+
+
+def test_level_is_that_of_the_shape_at_a_point_and_nan_elsewhere(tmp_path: Path):
+    (half,) = load_designs(written(tmp_path, HALF))
+    x_m = np.array([0.1, -0.1, 0.1, 0.1, 0.21])
+    y_m = np.array([0.1, 0.1, -0.1, 0.19, 0.1])
+    np.testing.assert_array_equal(half.level_db(x_m, y_m), [5, np.nan, np.nan, 5, np.nan])
+    assert half.height_m == 0.02
+
+
+def test_picture_means_what_its_greys_say(tmp_path: Path):
+    picture = np.zeros((2, 2, 4), np.uint8)
+    picture[0, 0], picture[0, 1], picture[1, 1] = [255, 255, 255, 255], [0, 0, 0, 255], [51, 51, 51, 255]
+    cv2.imwrite(str(tmp_path / "ring.png"), picture)
+    text = '[[landmark]]\nid = 9\nname = "ring"\nsize_m = 0.4\npicture = "ring.png"\nblack_db = -10\nwhite_db = 15\n'
+    (ring,) = load_designs(written(tmp_path, text))
+    np.testing.assert_allclose(ring.mask, [[15, -10], [np.nan, -5]], atol=1e-12)
+    assert ring.level_db(np.array(-0.1), np.array(0.1)) == 15  # the first row is at +y, the first column at -x
+
+
+def test_folder_gives_the_designs_of_all_its_files(tmp_path: Path):
+    written(tmp_path, HALF.replace("7", "8"), "b.toml")
+    written(tmp_path, HALF, "a.toml")
+    assert [design.id for design in load_designs(tmp_path)] == [7, 8]
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("", "no landmark designs"),
+        ("[[landmark]\n", "is not TOML"),
+        (HALF + HALF, "half and half both have the id 7"),
+        (HALF.replace("size_m = 0.4", "size_m = -1"), "landmark.0.size_m: Input should be greater than 0"),
+        (HALF.replace("polygon_m", "plygon_m"), "plygon_m"),
+        (HALF.replace("shapes", "#"), "give either shapes or picture"),
+        (HALF + "[[landmarks]]\n", "landmarks"),
+        ('[[landmark]]\nid = 1\nname = "a"\nsize_m = 1\npicture = "none.png"\n', "none.png is not a picture"),
+    ],
+)
+def test_impossible_files_are_refused_with_the_reason(tmp_path: Path, text: str, complaint: str):
+    with pytest.raises(CalibrationError, match=complaint):
+        load_designs(written(tmp_path, text))
+
+
+def test_missing_file_is_named(tmp_path: Path):
+    with pytest.raises(CalibrationError, match=r"nowhere\.toml cannot be read"):
+        load_designs(tmp_path / "nowhere.toml")
+
+
+def test_oblong_picture_is_refused(tmp_path: Path):
+    cv2.imwrite(str(tmp_path / "flat.png"), np.zeros((2, 3), np.uint8))
+    text = '[[landmark]]\nid = 1\nname = "flat"\nsize_m = 1\npicture = "flat.png"\n'
+    with pytest.raises(CalibrationError, match="3 x 2, not square"):
+        load_designs(written(tmp_path, text))
+
+
+def test_design_can_be_made_without_a_file():
+    design = LandmarkDesign(5, "plain", 0.2, np.full((1, 1), 3.0))
+    assert design.level_db(np.array(0.0), np.array(0.0)) == 3
