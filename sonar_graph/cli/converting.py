@@ -1,4 +1,4 @@
-"""``sonar-graph convert``: public data sets and ROS bags as MCAP logs."""
+"""``sonar-graph convert``: public data sets, ROS bags and recordings of sonars as MCAP logs."""
 
 from __future__ import annotations
 
@@ -15,17 +15,20 @@ from sonar_graph.cli.texts import examples
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from sonar_graph.logs.converters.sonar_conversion import Progress, SonarConversion
     from sonar_graph.sequence import Sequence
 
 datasets = typer.Typer(
     name="convert",
-    help="Convert a public data set or a ROS bag to an MCAP log.",
+    help="Convert a public data set, a ROS bag or a sonar's recording to an MCAP log.",
     epilog=examples(
         "sonar-graph convert victoria-park -o victoria_park.mcap",
         "sonar-graph convert mrclam MRCLAM_Dataset6 --robot 3 -o mrclam_6_3.mcap",
         "sonar-graph convert rosbag dive.bag -o dive.mcap",
+        "sonar-graph convert aris dive.aris -o dive_sonar.mcap",
     ),
 )
+_MOST_LOSSES_SHOWN = 10
 
 DatasetFolder = Annotated[
     Path, typer.Argument(metavar="DATASET_DIR", exists=True, file_okay=False, help="Folder of the data set.")
@@ -101,6 +104,60 @@ def rosbag(
     typer.echo(f"{bag.name}: {done.duration_s:.1f} s, {done.messages} messages on {done.topics} topics")
     for topic, reason in done.left_out.items():
         typer.echo(f"left out: {topic}: {reason}")
+    typer.echo(f"Log: {path}\nWhat is in it: sonar-graph inspect {path}")
+
+
+SonarRecording = Annotated[
+    Path,
+    typer.Argument(metavar="FILE", exists=True, dir_okay=False, help="Recording as the sonar's software wrote it."),
+]
+
+
+@datasets.command(
+    epilog=examples(
+        "sonar-graph convert didson dive.ddf -o dive_sonar.mcap",
+        "sonar-graph convert didson dive.ddf --sound-speed 1482 -o dive_sonar.mcap",
+    )
+)
+def didson(
+    recording: SonarRecording,
+    output: OutputLog,
+    sound_speed: Annotated[
+        float | None,
+        typer.Option(min=1350, max=1650, help="Of the water, m/s; default: ranges as the sonar names them (1465 m/s)."),
+    ] = None,
+) -> None:
+    """Images of a DIDSON (.ddf, versions 3 and 4)."""
+    from sonar_graph.logs.converters.didson import convert_didson
+
+    _convert_sonar(
+        lambda log, progress: convert_didson(recording, log, progress, sound_speed_m_s=sound_speed), recording, output
+    )
+
+
+@datasets.command(epilog=examples("sonar-graph convert aris dive.aris -o dive_sonar.mcap"))
+def aris(recording: SonarRecording, output: OutputLog) -> None:
+    """Images of an ARIS (.aris)."""
+    from sonar_graph.logs.converters.aris import convert_aris
+
+    _convert_sonar(lambda log, progress: convert_aris(recording, log, progress), recording, output)
+
+
+@datasets.command(epilog=examples("sonar-graph convert oculus pings.raw -o dive_sonar.mcap"))
+def oculus(recording: SonarRecording, output: OutputLog) -> None:
+    """Images of an Oculus: its network messages, one after another in a file."""
+    from sonar_graph.logs.converters.oculus import convert_oculus
+
+    _convert_sonar(lambda log, progress: convert_oculus(recording, log, progress), recording, output)
+
+
+def _convert_sonar(convert: Callable[[Path, Progress], SonarConversion], recording: Path, output: Path) -> None:
+    path = writable_log(output)
+    with progress_bars() as progress:
+        done = convert(path, lambda at, size: progress(f"converting {recording.name}", at, size))
+    typer.echo(f"{recording.name}: {done.frames} frames, {done.duration_s:.1f} s")
+    for line in done.shortcomings(_MOST_LOSSES_SHOWN):
+        typer.echo(line)
     typer.echo(f"Log: {path}\nWhat is in it: sonar-graph inspect {path}")
 
 
