@@ -1,0 +1,158 @@
+"""Recordings of sonars, byte for byte from the documented layouts; nothing of the readers is used."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+START = datetime(2014, 5, 6, 7, 8, 9, 250_000, tzinfo=UTC)
+STEP = timedelta(milliseconds=120)
+START_NS = 1_399_360_089_250_000_000
+STEP_NS = 120_000_000
+
+
+def images(count: int, beams: int, samples: int, seed: int = 0) -> NDArray[np.uint8]:
+    """Frames (count, beams, samples) of which no two samples in a row are told apart by chance."""
+    return np.random.default_rng(seed).integers(0, 256, (count, beams, samples), dtype=np.uint8)
+
+
+def put(header: bytearray, at: int, layout: str, *values: Any) -> None:
+    struct.pack_into("<" + layout, header, at, *values)
+
+
+@dataclass
+class Ddf:
+    """A DIDSON recording; the offsets are those of the DDF_03 and DDF_04 descriptions."""
+
+    frames: NDArray[np.uint8]
+    version: int = 3
+    high: int = 1
+    reverse: int = 0
+    serial: int = 42
+    start_code: int = 3
+    length_code: int = 0
+    flags: int = 0
+    promised: int | None = None
+    frame_version: bytes | None = None
+    readings: dict[int, float] = field(default_factory=dict)
+
+    def file_header(self) -> bytes:
+        count, beams, samples = self.frames.shape
+        header = bytearray(512 if self.version == 3 else 1024)
+        put(header, 0, "3sB", b"DDF", self.version)
+        put(header, 4, "4i", count if self.promised is None else self.promised, 8, self.high, beams)
+        put(header, 20, "fi", 400_000.0, samples)
+        put(header, 28, "5i", 20, self.start_code, self.length_code, self.reverse, self.serial)
+        put(header, 48, "32s", b"2014-05-06")
+        return bytes(header)
+
+    def frame(self, i: int) -> bytes:
+        header = bytearray(256 if self.version == 3 else 1024)
+        moment = START + i * STEP
+        put(header, 0, "i", i)
+        put(header, 4, "2i", int(moment.timestamp()) + 7, 0)  # the computer's clock is 7 s ahead
+        put(header, 12, "4s", self.frame_version or b"DDF" + bytes([self.version]))
+        put(header, 20, "3i", moment.year, moment.month, moment.day)
+        put(header, 32, "4i", moment.hour, moment.minute, moment.second, moment.microsecond // 10_000)
+        put(header, 48, "3i", 3, self.start_code, self.length_code)
+        for at, value in self.readings.items():
+            put(header, at, "f", value + i)
+        put(header, 192, "i", self.flags)
+        return bytes(header) + self.frames[i].T.tobytes()  # beams fastest
+
+    def pieces(self) -> list[bytes]:
+        return [self.file_header(), *(self.frame(i) for i in range(len(self.frames)))]
+
+    def content(self) -> bytes:
+        return b"".join(self.pieces())
+
+
+@dataclass
+class Aris:
+    """An ARIS recording; the offsets are those of aris-file-sdk's ArisFrameHeader."""
+
+    frames: NDArray[np.uint8]
+    mode: int = 9
+    telephoto: int = 0
+    system: int = 1
+    high: int = 1
+    sound_speed: float = 1482.5
+    period_us: int = 5
+    delay_us: int = 1700
+    in_order: int = 1
+    sound_speeds: Sequence[float] = ()
+
+    def frame(self, i: int) -> bytes:
+        header = bytearray(1024)
+        clock_us = (START_NS + i * STEP_NS) // 1000
+        put(header, 0, "IQ4sIQ", i, clock_us + 7_000_000, b"DDF\x05", 0, clock_us)
+        put(header, 128, "f", 1.5 + i)
+        put(header, 160, "f", 90.0 - i)
+        put(header, 436, "6I", self.mode, self.high, 12, 30_000, self.period_us, 1)
+        speed = self.sound_speeds[i] if self.sound_speeds else self.sound_speed
+        put(header, 460, "2fI", 8.3, speed, self.frames.shape[2])
+        put(header, 476, "3I", self.delay_us, self.telephoto, self.system)
+        put(header, 516, "I", self.in_order)
+        return bytes(header) + self.frames[i].T.tobytes()
+
+    def pieces(self) -> list[bytes]:
+        header = bytearray(1024)
+        put(header, 0, "4sI", b"DDF\x05", len(self.frames))
+        return [bytes(header), *(self.frame(i) for i in range(len(self.frames)))]
+
+    def content(self) -> bytes:
+        return b"".join(self.pieces())
+
+
+@dataclass
+class Oculus:
+    """Oculus pings of either version, with samples of 8, 16 or 32 bits and with or without gains."""
+
+    frames: NDArray[Any]
+    version: int = 0
+    gains: NDArray[np.uint32] | None = None
+    first_clock: int = 2**32 - 100_000_000
+    bin_m: float = 0.003
+    first_number: int = 500
+
+    def frame(self, i: int) -> bytes:
+        image = np.ascontiguousarray(self.frames[i].T)
+        ranges, beams = image.shape
+        rows = [row.astype(f"<u{image.itemsize}").tobytes() for row in image]
+        if self.gains is not None:
+            rows = [struct.pack("<I", gain) + row for gain, row in zip(self.gains.tolist(), rows, strict=True)]
+        pixels = b"".join(rows)
+        bearings = struct.pack(f"<{beams}h", *np.linspace(-6500, 6000, beams).astype(int).tolist())
+        extra = struct.pack("<9I", *range(9)) if self.version == 2 else b""
+        flags = 0b11001 | (0b100 if self.gains is not None else 0)
+        fire = struct.pack("<5B4d", 2, 0, 255, 127, flags, 2.0, 50.0, 0.0, 0.0) + extra
+        clock_ns = self.first_clock + i * STEP_NS
+        number = self.first_number + i
+        if self.version == 2:
+            result = struct.pack("<2I8d", number, 0, 2.1e6, 12.5, 1.9, 45.0 + i, 3.0, -2.0, 1481.0, clock_ns * 1e-9)
+        else:
+            result = struct.pack("<2I4dI", number, 0, 2.1e6, 12.5, 1.9, 1481.0, clock_ns % 2**32)
+        result += struct.pack("<BdHH", image.itemsize - 1, self.bin_m, ranges, beams)
+        result += struct.pack("<4I", 0, 0, 0, 0) if self.version == 2 else b""
+        offset = 2048
+        total = offset + len(pixels)
+        result += struct.pack("<3I", offset, len(pixels), total)
+        header = struct.pack("<HHHHHIH", 0x4F53, 1, 2, 0x23, self.version, total - 16, 0)
+        return (header + fire + result + bearings).ljust(offset, b"\0") + pixels
+
+    def pieces(self) -> list[bytes]:
+        return [b"", *(self.frame(i) for i in range(len(self.frames)))]
+
+    def content(self) -> bytes:
+        return b"".join(self.pieces())
+
+
+def oculus_note(payload: bytes = b"\0" * 12) -> bytes:
+    """A message without an image: the user's configuration."""
+    return struct.pack("<HHHHHIH", 0x4F53, 1, 2, 0x55, 0, len(payload), 0) + payload
