@@ -1,0 +1,144 @@
+"""How often a landmark looks like which: the measured model that turns what a frame looks like into evidence.
+
+Classes are the designs in their order and last "none of them"; features the same. ``matrix[k, j] = p(z = j | x = k)``
+is the mean soft score of feature j over the labelled frames of class k: rows sum to 1. With it go the two numbers that
+make scores of correlations, and the accuracy of range and azimuth, all measured on the same frames. The file says
+where those came from. `DEFAULT_CONFUSION` was measured on simulated basins with the designs that ship.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field, ValidationError, model_validator
+from scipy.optimize import minimize
+
+from sonar_graph.calibration import Section
+from sonar_graph.errors import CalibrationError
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.sonar.scores import soft_scores
+
+LEAST_ENTRY = 1e-3
+"""Smallest entry of the matrix: a class that never looked like a feature in some hundred frames still may."""
+LEAST_FRAMES = 20
+"""Of every class, for a measured row."""
+
+
+class Confusion(Section):
+    """The measured model of a recogniser."""
+
+    ids: tuple[int, ...] = Field(min_length=1)
+    """Identities of the designs, in the order of rows and columns."""
+    matrix: tuple[tuple[float, ...], ...]
+    """p(z = j | x = k), shape (ids + 1, ids + 1); the last row and column are "none of them"."""
+    sharpness: float = Field(gt=0)
+    """Exponent of the scores; half the number of independent samples in a patch, as it were."""
+    threshold: float = Field(gt=0, lt=1)
+    """Correlation at which "none of them" is as probable as a design."""
+    range_sigma_m: float = Field(gt=0)
+    """Of a landmark's range, a frame."""
+    azimuth_sigma_rad: float = Field(gt=0)
+    """Of its azimuth."""
+    provenance: Mapping[str, str] = Field(default_factory=dict)
+    """Where the frames came from, how many there were of each class, what was assumed."""
+
+    @model_validator(mode="after")
+    def _is_stochastic(self) -> Confusion:
+        matrix = np.array(self.matrix, float, ndmin=2) if len({len(r) for r in self.matrix}) == 1 else np.empty((0, 0))
+        classes = len(self.ids) + 1
+        if matrix.shape != (classes, classes):
+            raise ValueError(f"matrix: expected {classes} rows of {classes} for {len(self.ids)} ids and none of them")
+        if (matrix < 0).any() or not np.allclose(matrix.sum(axis=1), 1, atol=1e-6):
+            raise ValueError("matrix: each row must be probabilities that sum to 1 (rows are the true classes)")
+        return self
+
+    def array(self) -> Floats:
+        """The matrix, no entry below 0.001, rows with sum 1."""
+        matrix = np.maximum(np.array(self.matrix), LEAST_ENTRY)
+        return np.asarray(matrix / matrix.sum(axis=1, keepdims=True))
+
+    def base(self) -> Floats:
+        """Share of each feature when all classes are equally frequent, shape (ids + 1,)."""
+        return np.asarray(self.array().mean(axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledFits:
+    """What was seen of objects whose class is known."""
+
+    correlation: Floats
+    """Of each design with the patch, shape (n, ids)."""
+    visible: Floats
+    """Share of the template in view, shape (n,)."""
+    label: Ints
+    """Index of the true class; the number of ids for "none of them", shape (n,)."""
+    range_azimuth_error: Floats
+    """Measured minus true (m, rad), shape (n, 2); NaN where there is no landmark."""
+
+
+def estimate_confusion(fits: LabelledFits, ids: tuple[int, ...], provenance: dict[str, str]) -> Confusion:
+    """The model that makes the labelled frames most likely, all classes counting the same.
+
+    Raises
+    ------
+    CalibrationError
+        When a class has too few frames, naming it.
+    """
+    counts = np.bincount(fits.label, minlength=len(ids) + 1)
+    names = [*(f"landmark {i}" for i in ids), "no landmark"]
+    poor = [f"{name}: {count}" for name, count in zip(names, counts.tolist(), strict=True) if count < LEAST_FRAMES]
+    if poor:
+        raise CalibrationError(
+            f"too few labelled frames ({'; '.join(poor)}; needed {LEAST_FRAMES} of each): give longer or more logs"
+        )
+    weights = 1.0 / (counts[fits.label] * len(counts))
+    sharpness, threshold = _fit_scores(fits, weights)
+    scores = soft_scores(fits.correlation, fits.visible, sharpness, threshold)
+    matrix = np.array([scores[fits.label == k].mean(axis=0) for k in range(len(counts))])
+    matrix = np.maximum(matrix, LEAST_ENTRY)
+    sigmas = np.sqrt(np.nanmean(fits.range_azimuth_error**2, axis=0))
+    return Confusion(
+        ids=ids,
+        matrix=tuple(map(tuple, (matrix / matrix.sum(axis=1, keepdims=True)).tolist())),
+        sharpness=sharpness,
+        threshold=threshold,
+        range_sigma_m=float(sigmas[0]),
+        azimuth_sigma_rad=float(sigmas[1]),
+        provenance=provenance | {f"frames of {n}": str(c) for n, c in zip(names, counts.tolist(), strict=True)},
+    )
+
+
+def _fit_scores(fits: LabelledFits, weights: Floats) -> tuple[float, float]:
+    """Sharpness and threshold of the highest weighted likelihood of the labels."""
+    rows = np.arange(len(fits.label))
+
+    def loss(unbounded: Floats) -> float:
+        sharpness, threshold = float(np.exp(unbounded[0])), float(1 / (1 + np.exp(-unbounded[1])))
+        scores = soft_scores(fits.correlation, fits.visible, sharpness, threshold)
+        return float(-weights @ np.log(np.maximum(scores[rows, fits.label], 1e-12)))
+
+    found = minimize(loss, np.array([np.log(10.0), 1.0]), method="Nelder-Mead")
+    return float(np.exp(found.x[0])), float(1 / (1 + np.exp(-found.x[1])))
+
+
+def read_confusion(path: Path) -> Confusion:
+    """A model that `sonar-graph calibrate` wrote.
+
+    Raises
+    ------
+    CalibrationError
+        When the file is not JSON or not such a model, naming the field.
+    """
+    try:
+        return Confusion.model_validate(json.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise CalibrationError(f"{path} cannot be read: {error.strerror}") from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"{path} is not JSON: {error}") from error
+    except ValidationError as error:
+        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        raise CalibrationError(f"{path}: {faults}; write one with sonar-graph calibrate") from error

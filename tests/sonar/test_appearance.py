@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.sonar.appearance import Appearance, Fit
+from sonar_graph.sonar.floor_patch import PolarGrid, View
+
+from .polar_images import AZIMUTHS_RAD, HEIGHT_M, RANGES_M, image_db, level_R_sonar
+
+GRID = PolarGrid(RANGES_M, AZIMUTHS_RAD)
+
+
+@pytest.fixture(scope="module")
+def appearance() -> Appearance:
+    return Appearance(DEFAULT_DESIGNS)
+
+
+def _fit(appearance: Appearance, image: np.ndarray, rotation: np.ndarray, near_m: tuple[float, float]) -> Fit:
+    view = View(rotation, HEIGHT_M)
+    patch = GRID.patch(image, view, np.array(near_m), appearance.patch_side, appearance.params.cell_m)
+    return appearance.fit(patch)
+
+
+@pytest.mark.parametrize("index", range(len(DEFAULT_DESIGNS)))
+@pytest.mark.parametrize("heading_rad", [0.3, 2.0, -2.6])
+def test_every_design_is_known_at_every_heading_in_speckle(appearance, index, heading_rad):
+    rng = np.random.default_rng(index)
+    rotation = level_R_sonar(np.radians(31), np.radians(-2))
+    image = image_db(DEFAULT_DESIGNS[index], (1.7, 0.05), heading_rad, rotation, rng)
+    fit = _fit(appearance, image, rotation, (1.72, 0.03))
+    assert fit.best == index
+    assert fit.correlation[index] > 0.75
+    assert fit.correlation[index] - np.delete(fit.correlation, index).max() > 0.02
+    np.testing.assert_allclose(fit.centre_m, [1.7, 0.05], atol=0.008)
+
+
+def test_heading_of_a_triangle_is_found_up_to_its_symmetry(appearance):
+    rotation = level_R_sonar()
+    fit = _fit(appearance, image_db(DEFAULT_DESIGNS[2], (1.7, 0.0), 0.4, rotation, None), rotation, (1.7, 0.0))
+    off = (fit.heading_rad - 0.4) % (2 * np.pi / 3)
+    assert min(off, 2 * np.pi / 3 - off) < np.radians(5)
+
+
+def test_neither_gain_nor_floor_level_matter(appearance):
+    rotation = level_R_sonar()
+    image = image_db(DEFAULT_DESIGNS[3], (1.7, 0.0), 1.0, rotation, np.random.default_rng(0))
+    plain = _fit(appearance, image, rotation, (1.7, 0.0))
+    other = _fit(appearance, 0.5 * image + 20, rotation, (1.7, 0.0))
+    np.testing.assert_allclose(other.correlation, plain.correlation, atol=1e-3)
+
+
+def test_bare_floor_and_a_bar_fit_no_design_well(appearance):
+    rotation, rng = level_R_sonar(), np.random.default_rng(3)
+    bar = np.full((60, 60), np.nan)
+    bar[24:36] = 12.0
+    for design in (None, LandmarkDesign(9, "bar", 0.42, bar)):
+        fit = _fit(appearance, image_db(design, (1.7, 0.0), 0.2, rotation, rng), rotation, (1.7, 0.0))
+        assert fit.correlation.max() < 0.7
+
+
+def test_a_wrong_height_costs_correlation(appearance):
+    rotation = level_R_sonar()
+    image = image_db(DEFAULT_DESIGNS[1], (1.7, 0.0), 0.4, rotation, None)
+    right = _fit(appearance, image, rotation, (1.7, 0.0))
+    patch = GRID.patch(image, View(rotation, 0.5), np.array([1.9, 0.0]), appearance.patch_side, 0.015)
+    assert appearance.fit(patch).correlation[1] < right.correlation[1] - 0.05
+
+
+def test_a_landmark_at_the_edge_counts_by_what_is_in_view(appearance):
+    rotation = level_R_sonar()
+    image = image_db(DEFAULT_DESIGNS[0], (1.7, 0.40), 0.0, rotation, None)
+    partly = _fit(appearance, image, rotation, (1.7, 0.40))
+    assert partly.best == 0
+    assert appearance.params.least_visible <= partly.visible < 0.95
+    gone = _fit(appearance, image, rotation, (1.7, 0.75))
+    assert (gone.correlation == -1).all()
+
+
+def test_a_disc_needs_one_template_and_a_square_a_quarter_of_the_headings(appearance):
+    counts = np.bincount(appearance.templates.design)
+    assert counts[0] == 1
+    assert counts[1] == 12
