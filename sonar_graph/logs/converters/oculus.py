@@ -30,6 +30,7 @@ OTHERS = {0x15, 0x55, 0xFF}
 """Kinds of messages without an image: fire, user configuration, dummy."""
 MOST_OTHER_BYTES = 1 << 16
 MOST_BEAMS = 1024
+MOST_BEARING = 9000
 CLOCK_PERIOD_NS = 1 << 32
 """The older pings' clock is a 32-bit number. Its unit is not documented: as nanoseconds, the sample has 16 pings a
 second; microseconds would make it one a minute."""
@@ -152,4 +153,4 @@ def _ping(content: bytes, at: int, version: int, total: int) -> FrameHead:
 
 def _increase(bearings: bytes) -> bool:
     hundredths = np.frombuffer(bearings, "<i2").astype(np.int64)
-    return bool(np.all(np.diff(hundredths) > 0) and np.abs(hundredths[[0, -1]]).max() <= 9000)
+    return bool(np.all(np.diff(hundredths) > 0) and np.abs(hundredths).max(initial=0) <= MOST_BEARING)
