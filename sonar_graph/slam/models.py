@@ -27,6 +27,11 @@ import numpy as np
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.kernels import compiled, skew
 
+FLOOR_GATE = 10.83
+"""0.999 of the chi-square distribution with one degree of freedom. A landmark whose height on the centre of the
+aperture is farther from the floor than this, squared and in variances of elevation, pose and floor, does not stand on
+it."""
+
 
 @compiled
 def wrap_angle(angle_rad: float) -> float:
