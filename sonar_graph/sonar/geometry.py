@@ -1,0 +1,167 @@
+"""Ranges and azimuths as points, on a floor or with an unknown elevation.
+
+A point q of the sonar frame (x along the centre beam, y left, z up) has
+
+    range r = |q|,    azimuth a = atan2(q_y, q_x),    elevation e = asin(q_z / r),
+    q = r (cos e cos a, cos e sin a, sin e).
+
+The image gives r and a; e is only known to lie in the aperture. On a level floor, height h below the sonar, it follows:
+with (u1, u2, u3) the upward direction in the sonar frame, u . q = -h, that is
+
+    (u1 cos a + u2 sin a) cos e + u3 sin e = -h / r,
+
+of whose two solutions the one nearer to the centre beam counts. A beam is a plane of constant azimuth here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from sonar_graph.errors import CalibrationError
+from sonar_graph.kernels import compiled
+from sonar_graph.measurements import Floats
+
+
+@dataclass(frozen=True, eq=False)
+class FloorView:
+    """A sonar over a level floor.
+
+    Level axes have their origin at the sonar, z up and x horizontal, along the centre beam; the floor is the plane
+    ``z = -height_m``.
+
+    Raises
+    ------
+    CalibrationError
+        When the sonar is not above the floor, or the centre beam is vertical.
+    """
+
+    level_R_sonar: Floats
+    """From sonar axes to level ones, shape (3, 3)."""
+    height_m: float
+    """Of the sonar over the floor."""
+    height_sigma_m: float = 0.02
+    """Standard deviation of the height."""
+    tilt_sigma_rad: float = 0.01
+    """Standard deviation of roll and of pitch."""
+
+    def __post_init__(self) -> None:
+        if not self.height_m > 0:
+            raise CalibrationError(f"FloorView.height_m: {self.height_m} m; the sonar must be above the floor")
+        if not np.hypot(*self.level_R_sonar[:2, 0]) > 1e-6:
+            raise CalibrationError("FloorView: the centre beam is vertical, so that level axes have no direction")
+
+    @classmethod
+    def from_angles(cls, height_m: float, roll_rad: float, pitch_rad: float) -> FloorView:
+        """From the sonar's own roll and pitch; a positive pitch turns the centre beam down."""
+        return cls(gtsam.Rot3.RzRyRx(roll_rad, pitch_rad, 0.0).matrix(), height_m)
+
+    @classmethod
+    def from_pose(cls, world_T_sonar: gtsam.Pose3, floor_z_m: float) -> FloorView:
+        """From the sonar's pose in a world with z up; the heading drops out."""
+        rotation = world_T_sonar.rotation()
+        forward = rotation.matrix()[:, 0]
+        heading = gtsam.Rot3.Rz(math.atan2(forward[1], forward[0]))
+        return cls((heading.inverse() * rotation).matrix(), float(world_T_sonar.translation()[2]) - floor_z_m)
+
+    def floor_points(self, ranges_m: Floats, azimuths_rad: Floats) -> Floats:
+        """Sonar-frame points where rays meet the floor, shape (n, 3); NaN where they do not."""
+        elevations = floor_elevations(ranges_m, azimuths_rad, self.level_R_sonar[2], self.height_m)
+        return points(ranges_m, azimuths_rad, elevations)
+
+    def floor_point(self, range_m: float, azimuth_rad: float) -> Floats | None:
+        """Level (x, y) of what is seen there, shape (2,); None where the ray does not reach the floor."""
+        q = self.floor_points(np.array([range_m]), np.array([azimuth_rad]))[0]
+        return None if np.isnan(q[0]) else np.asarray(self.level_R_sonar @ q)[:2]
+
+    def range_azimuth(self, xy_m: Floats) -> tuple[float, float]:
+        """Where a floor point, level (x, y) of shape (2,), is seen."""
+        q = self.level_R_sonar.T @ np.array([xy_m[0], xy_m[1], -self.height_m])
+        return float(np.linalg.norm(q)), math.atan2(q[1], q[0])
+
+    def elevation_sigmas(self, points_m: Floats) -> Floats:
+        """Standard deviation of the elevation of floor points, shape (n,), given in the sonar frame, shape (n, 3).
+
+        From ``u . q = -h``: ``de (u . dq/de) = -dh - du . q``, where a tilt about the two level axes moves u . q by
+        the horizontal distance.
+        """
+        up = self.level_R_sonar[2]
+        along = points_m @ up
+        horizontal2 = np.maximum(np.sum(points_m**2, axis=1) - along**2, 0.0)
+        slope = np.abs(_elevation_derivatives(points_m) @ up)
+        return np.asarray(
+            np.sqrt(self.height_sigma_m**2 + horizontal2 * self.tilt_sigma_rad**2) / np.maximum(slope, 1e-9)
+        )
+
+
+def points(ranges_m: Floats, azimuths_rad: Floats, elevations_rad: Floats | float = 0.0) -> Floats:
+    """Points in the sonar frame, shape (n, 3)."""
+    level = ranges_m * np.cos(elevations_rad)
+    z = ranges_m * np.sin(elevations_rad)
+    return np.stack([level * np.cos(azimuths_rad), level * np.sin(azimuths_rad), z + 0.0 * level], axis=-1)
+
+
+def ranges_azimuths_elevations(points_m: Floats) -> tuple[Floats, Floats, Floats]:
+    """Of points in the sonar frame, shape (n, 3); each of shape (n,)."""
+    x, y, z = np.moveaxis(np.asarray(points_m, dtype=np.float64), -1, 0)
+    level = np.hypot(x, y)
+    return np.hypot(level, z), np.arctan2(y, x), np.arctan2(z, level)
+
+
+def elevation_sigma(aperture_rad: float) -> float:
+    """Standard deviation of an elevation of which only the aperture is known: uniform, ``aperture / sqrt(12)``."""
+    return aperture_rad / math.sqrt(12.0)
+
+
+def point_covariances(points_m: Floats, range_azimuth_cov: Floats, elevation_sigmas_rad: Floats) -> Floats:
+    """Covariance of points in the sonar frame, first order, shape (n, 3, 3).
+
+    ``J blockdiag(R, sigma_e^2) J^T`` with J the derivative of q by (r, a, e).
+
+    Parameters
+    ----------
+    points_m
+        Shape (n, 3).
+    range_azimuth_cov
+        R, shape (n, 2, 2) or (2, 2).
+    elevation_sigmas_rad
+        Shape (n,): `elevation_sigma` of the aperture, or `FloorView.elevation_sigmas`.
+    """
+    r, _, _ = ranges_azimuths_elevations(points_m)
+    by_azimuth = np.stack([-points_m[:, 1], points_m[:, 0], np.zeros(len(r))], axis=1)
+    jacobian = np.stack([points_m / r[:, None], by_azimuth, _elevation_derivatives(points_m)], axis=2)
+    spherical = np.zeros((len(r), 3, 3))
+    spherical[:, :2, :2] = range_azimuth_cov
+    spherical[:, 2, 2] = elevation_sigmas_rad**2
+    return np.asarray(jacobian @ spherical @ jacobian.transpose(0, 2, 1))
+
+
+def _elevation_derivatives(points_m: Floats) -> Floats:
+    """dq/de, shape (n, 3): ``r (-sin e cos a, -sin e sin a, cos e)``."""
+    level = np.maximum(np.hypot(points_m[:, 0], points_m[:, 1]), 1e-12)
+    lift = points_m[:, 2] / level
+    return np.stack([-lift * points_m[:, 0], -lift * points_m[:, 1], level], axis=1)
+
+
+@compiled
+def floor_elevation(range_m: float, azimuth_rad: float, up: Floats, height_m: float) -> float:
+    """Elevation at which a ray of this range meets the floor; NaN where it does not."""
+    across = up[0] * math.cos(azimuth_rad) + up[1] * math.sin(azimuth_rad)
+    reach = -height_m / (math.hypot(across, up[2]) * range_m)
+    if not abs(reach) <= 1.0:
+        return math.nan
+    middle, spread = math.atan2(up[2], across), math.acos(reach)
+    one, other = math.remainder(middle - spread, 2 * math.pi), math.remainder(middle + spread, 2 * math.pi)
+    return one if abs(one) <= abs(other) else other
+
+
+@compiled
+def floor_elevations(ranges_m: Floats, azimuths_rad: Floats, up: Floats, height_m: float) -> Floats:
+    """`floor_elevation` of each of n rays, shape (n,)."""
+    found = np.empty(len(ranges_m))
+    for i in range(len(found)):
+        found[i] = floor_elevation(ranges_m[i], azimuths_rad[i], up, height_m)
+    return found
