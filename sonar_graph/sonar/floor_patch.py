@@ -1,12 +1,7 @@
 """The image around a point of the floor, on a square metric grid.
 
-Level axes have their origin at the sonar, z up and x horizontally along the centre beam; the floor is the plane
-``z = -height``. A floor point p is the sonar point ``q = level_R_sonar^T p``, seen at range |q| and azimuth
-atan2(q_y, q_x). The other way round, a range and azimuth meet the floor at the elevation e that solves
-
-    (r1 cos a + r2 sin a) cos e + r3 sin e = -height / range        (r1, r2, r3) the last row of level_R_sonar
-
-of whose two solutions the one nearer to the centre beam counts (docs/theory/models.md, "Elevation on a floor").
+Level axes are those of `sonar_graph.sonar.geometry.FloorView`. A floor point p is the sonar point
+``q = level_R_sonar^T p``, seen at range |q| and azimuth atan2(q_y, q_x): each point of the grid is looked up there.
 """
 
 from __future__ import annotations
@@ -19,36 +14,10 @@ from numpy.typing import NDArray
 
 from sonar_graph.kernels import compiled
 from sonar_graph.measurements import Floats
+from sonar_graph.sonar.geometry import FloorView
 
 Floats32 = NDArray[np.float32]
 _STEPS_A_BEAM = 4
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """Where the sonar is over the floor."""
-
-    level_R_sonar: Floats
-    """From sonar axes to level ones, shape (3, 3)."""
-    height_m: float
-    """Of the sonar over the floor."""
-
-    def range_azimuth(self, xy_m: Floats) -> tuple[float, float]:
-        """Where a floor point, shape (2,), is seen."""
-        q = self.level_R_sonar.T @ np.array([xy_m[0], xy_m[1], -self.height_m])
-        return float(np.linalg.norm(q)), math.atan2(q[1], q[0])
-
-    def floor_point(self, range_m: float, azimuth_rad: float) -> Floats | None:
-        """Level (x, y) of what is seen there, shape (2,); None where the ray does not reach the floor."""
-        r1, r2, r3 = self.level_R_sonar[2]
-        across = r1 * math.cos(azimuth_rad) + r2 * math.sin(azimuth_rad)
-        reach = -self.height_m / (math.hypot(across, r3) * range_m)
-        if abs(reach) > 1:
-            return None
-        middle, spread = math.atan2(r3, across), math.acos(reach)
-        e = min((math.remainder(middle + side * spread, 2 * math.pi) for side in (-1, 1)), key=abs)
-        q = (math.cos(e) * math.cos(azimuth_rad), math.cos(e) * math.sin(azimuth_rad), math.sin(e))
-        return np.asarray(range_m * (self.level_R_sonar @ q))[:2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +52,7 @@ class PolarGrid:
         self.first_azimuth_rad, self.azimuth_step_rad = float(places[0]), float(places[1] - places[0])
         self.beam_of_azimuth = np.interp(places, azimuths_rad[order], order.astype(float))
 
-    def patch(self, image_db: Floats32, view: View, centre_m: Floats, side: int, cell_m: float) -> Patch:
+    def patch(self, image_db: Floats32, view: FloorView, centre_m: Floats, side: int, cell_m: float) -> Patch:
         """The image on a grid of ``side`` by ``side`` floor points around a centre."""
         level, seen = sample_floor(
             image_db,

@@ -5,7 +5,8 @@ import pytest
 
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.sonar.appearance import Appearance, Fit
-from sonar_graph.sonar.floor_patch import PolarGrid, View
+from sonar_graph.sonar.floor_patch import PolarGrid
+from sonar_graph.sonar.geometry import FloorView
 
 from .polar_images import AZIMUTHS_RAD, HEIGHT_M, RANGES_M, image_db, level_R_sonar
 
@@ -18,7 +19,7 @@ def appearance() -> Appearance:
 
 
 def _fit(appearance: Appearance, image: np.ndarray, rotation: np.ndarray, near_m: tuple[float, float]) -> Fit:
-    view = View(rotation, HEIGHT_M)
+    view = FloorView(rotation, HEIGHT_M)
     patch = GRID.patch(image, view, np.array(near_m), appearance.patch_side, appearance.params.cell_m)
     return appearance.fit(patch)
 
@@ -64,7 +65,7 @@ def test_a_wrong_height_costs_correlation(appearance):
     rotation = level_R_sonar()
     image = image_db(DEFAULT_DESIGNS[1], (1.7, 0.0), 0.4, rotation, None)
     right = _fit(appearance, image, rotation, (1.7, 0.0))
-    patch = GRID.patch(image, View(rotation, 0.5), np.array([1.9, 0.0]), appearance.patch_side, 0.015)
+    patch = GRID.patch(image, FloorView(rotation, 0.5), np.array([1.9, 0.0]), appearance.patch_side, 0.015)
     assert appearance.fit(patch).correlation[1] < right.correlation[1] - 0.05
 
 

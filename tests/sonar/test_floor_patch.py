@@ -1,31 +1,17 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given
-from hypothesis import strategies as st
 
-from sonar_graph.sonar.floor_patch import PolarGrid, View
+from sonar_graph.sonar.floor_patch import PolarGrid
+from sonar_graph.sonar.geometry import FloorView
 
 from .polar_images import AZIMUTHS_RAD, HEIGHT_M, RANGES_M, floor_points, level_R_sonar
-
-angles = st.floats(np.radians(-5), np.radians(5))
-
-
-@given(st.floats(1.5, 2.1), st.floats(-0.4, 0.4), angles, angles)
-def test_floor_to_image_and_back_is_the_identity(x, y, pitch_off, roll):
-    view = View(level_R_sonar(np.radians(30) + pitch_off, roll), HEIGHT_M)
-    range_m, azimuth_rad = view.range_azimuth(np.array([x, y]))
-    np.testing.assert_allclose(view.floor_point(range_m, azimuth_rad), [x, y], atol=1e-9)
-
-
-def test_a_ray_shorter_than_the_height_meets_no_floor():
-    assert View(level_R_sonar(), 0.95).floor_point(0.9, 0.0) is None
 
 
 def test_patch_shows_what_a_search_along_rays_finds():
     rotation = level_R_sonar(np.radians(29), np.radians(3))
     xy, lit = floor_points(rotation)
-    grid, view = PolarGrid(RANGES_M, AZIMUTHS_RAD), View(rotation, HEIGHT_M)
+    grid, view = PolarGrid(RANGES_M, AZIMUTHS_RAD), FloorView(rotation, HEIGHT_M)
     for axis in range(2):
         image = np.where(lit, 100 * xy[..., axis], 0).astype(np.float32)
         patch = grid.patch(image, view, np.array([1.75, 0.02]), 21, 0.015)
@@ -40,7 +26,7 @@ def test_patch_shows_what_a_search_along_rays_finds():
 def test_order_of_beams_does_not_matter():
     rotation, rng = level_R_sonar(), np.random.default_rng(0)
     image = rng.normal(size=(96, 512)).astype(np.float32)
-    view, centre = View(rotation, HEIGHT_M), np.array([1.7, 0.0])
+    view, centre = FloorView(rotation, HEIGHT_M), np.array([1.7, 0.0])
     left = PolarGrid(RANGES_M, AZIMUTHS_RAD).patch(image, view, centre, 21, 0.015)
     right = PolarGrid(RANGES_M, AZIMUTHS_RAD[::-1]).patch(image[::-1].copy(), view, centre, 21, 0.015)
     np.testing.assert_allclose(left.level_db, right.level_db, atol=1e-4)
@@ -48,7 +34,7 @@ def test_order_of_beams_does_not_matter():
 
 def test_what_lies_outside_the_image_is_not_seen():
     patch = PolarGrid(RANGES_M, AZIMUTHS_RAD).patch(
-        np.ones((96, 512), np.float32), View(level_R_sonar(), HEIGHT_M), np.array([1.7, 0.45]), 21, 0.015
+        np.ones((96, 512), np.float32), FloorView(level_R_sonar(), HEIGHT_M), np.array([1.7, 0.45]), 21, 0.015
     )
     assert 0 < patch.seen.mean() < 1
     assert (patch.level_db[patch.seen == 0] == 0).all()
