@@ -1,4 +1,4 @@
-"""The basin experiment of the seed paper, at measurement level.
+"""The basin experiment of the seed paper, with landmark detections or with sonar images.
 
 Four landmarks lie on the floor of a basin of 20 m × 14 m × 1.7 m, at (5, 0), (7, -5), (2, -7) and (0, -2). A vehicle
 with an imaging sonar tilted 30° down is driven around them three times in 2039 s at about 0.15 m/s.
@@ -15,20 +15,27 @@ Source: "Experimental Results of Real-time Sonar-based Underwater Localization U
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from pydantic import Field
 
 from sonar_graph.calibration import Mounting
 from sonar_graph.errors import SimulationError
+from sonar_graph.landmark_designs import DEFAULT_DESIGNS
 from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.detections import Fan
+from sonar_graph.simulation.image_options import ImageOptions
+from sonar_graph.simulation.imaging import ImagedFrames, image_along
 from sonar_graph.simulation.options import SimulationOptions
-from sonar_graph.simulation.recording import Streams, Vehicle, record
+from sonar_graph.simulation.recording import Streams, Vehicle, frame_stamps, record
 from sonar_graph.simulation.route import Piece, PlanarPose, drive, follow, hover, turn
+from sonar_graph.simulation.seabed import SeabedObject, place_landmark, scattered_objects
+from sonar_graph.simulation.sonar_image import FrameSimulator
 from sonar_graph.simulation.vehicle import VehiclePath, smooth_noise
-from sonar_graph.simulation.world import world_on_floor
+from sonar_graph.simulation.world import World, world_on_floor
 
 LANDMARKS_XY_M = np.array([[5.0, 0.0], [7.0, -5.0], [2.0, -7.0], [0.0, -2.0]])
 FLOOR_Z_M = -1.7
@@ -45,6 +52,10 @@ YSHARK = Vehicle(
 )
 WATCHING_M = 1.8
 """Horizontal distance from sonar to landmark while hovering: a slant range of 2.04 m."""
+
+OBJECTS_ALONG_SIDE_M = (2.2, 3.5, 6.5)
+OBJECTS_ASIDE_M = 0.3
+"""Stones and patches that are no landmarks lie about there along each side, up to so far to either side of it."""
 
 RAMP_S = 3.0
 TURN_S = 8.0
@@ -68,6 +79,8 @@ class BasinOptions(SimulationOptions):
     """Rounds of the square."""
     speed_m_s: float = Field(PAPER_SPEED_M_S, gt=0, le=FASTEST_M_S)
     """While driving straight; raised, up to 0.45 m/s, as far as the duration needs it."""
+    image: ImageOptions | None = None
+    """None: landmark detections; otherwise the sonar records images, in which landmarks are still to be recognised."""
 
 
 def simulate_basin(options: BasinOptions | None = None) -> Sequence:
@@ -76,7 +89,8 @@ def simulate_basin(options: BasinOptions | None = None) -> Sequence:
     Parameters
     ----------
     options
-        None: the published run with the better sensors.
+        None: the published run with the better sensors. With ``image`` there are no detections: the frames come from
+        `simulate_basin_frames`.
 
     Raises
     ------
@@ -87,7 +101,55 @@ def simulate_basin(options: BasinOptions | None = None) -> Sequence:
     streams = Streams.of(options.seed)
     world = world_on_floor(LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, streams.world)
     path = _path(options, streams.path)
-    return record("basin", options, YSHARK, path, world, streams, _notes(options))
+    sequence = record("basin", options, YSHARK, path, world, streams, _notes(options))
+    return sequence if options.image is None else replace(sequence, detections=None)
+
+
+def simulate_basin_frames(options: BasinOptions, frames_per_block: int = 32) -> Iterator[ImagedFrames]:
+    """The images of the very run that `simulate_basin` gives for the same options, a block at a time.
+
+    Parameters
+    ----------
+    options
+        Without ``image`` its defaults hold.
+    frames_per_block
+        How many frames are held at once.
+
+    Raises
+    ------
+    SimulationError
+        When the duration is too short for the laps.
+    """
+    streams = Streams.of(options.seed)
+    world = world_on_floor(LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, streams.world)
+    path = _path(options, streams.path)
+    image = options.image or ImageOptions()
+    simulator = FrameSimulator(image, _seabed(world, image, streams.seabed), FLOOR_Z_M, options.seed)
+    stamps_ns = frame_stamps(options.frame_rate_hz, path.duration_s)
+    yield from image_along(path, YSHARK.sonar, stamps_ns, simulator, frames_per_block)
+
+
+def _seabed(world: World, image: ImageOptions, rng: np.random.Generator) -> list[SeabedObject]:
+    """Landmarks of the default designs, turned at random, and what is no landmark."""
+    yaw_rad = rng.uniform(-np.pi, np.pi, len(world.landmark_ids))
+    designs = {design.id: design for design in DEFAULT_DESIGNS}
+    placed = zip(world.landmark_ids.tolist(), world.landmark_positions, yaw_rad.tolist(), strict=True)
+    landmarks = [place_landmark(designs[id_], position, yaw, FLOOR_Z_M) for id_, position, yaw in placed]
+    spots = rng.permutation(_spots(rng))[: image.stones + image.decoys]
+    return landmarks + scattered_objects(spots, image.stones, rng)
+
+
+def _spots(rng: np.random.Generator) -> Floats:
+    """Places on the route where something may lie that is no landmark, shape (12, 3)."""
+    spots, corner = [], np.zeros(2)
+    for heading_rad in -math.pi / 2 * np.arange(SIDES):
+        ahead = np.array([math.cos(heading_rad), math.sin(heading_rad)])
+        left = np.array([-ahead[1], ahead[0]])
+        for along_m in OBJECTS_ALONG_SIDE_M:
+            aside_m = rng.uniform(-OBJECTS_ASIDE_M, OBJECTS_ASIDE_M)
+            spots.append([*(corner + (along_m + rng.uniform(-0.2, 0.2)) * ahead + aside_m * left), FLOOR_Z_M])
+        corner = corner + SIDE_M * ahead
+    return np.array(spots)
 
 
 def _notes(options: BasinOptions) -> dict[str, str]:
@@ -100,7 +162,8 @@ def _notes(options: BasinOptions) -> dict[str, str]:
     }
     published = ["basin", "landmark positions", "tilt", "window", *(text for text, same in chosen.items() if same)]
     ours = ["route", "hovering", "sensor models and mountings", "rates", "noise", "wobble"]
-    ours += ["error rates of the recogniser", *(text for text, same in chosen.items() if not same)]
+    ours += ["error rates of the recogniser"] if options.image is None else ["landmark designs", "image model"]
+    ours += [*(text for text, same in chosen.items() if not same)]
     return {
         "from the paper": ", ".join(published),
         "ours": ", ".join(ours),

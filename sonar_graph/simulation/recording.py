@@ -22,7 +22,7 @@ from sonar_graph.calibration import (
     SonarCalibration,
     Start,
 )
-from sonar_graph.measurements import Floats
+from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.detections import Fan, Recogniser, simulate_detections
 from sonar_graph.simulation.options import SimulationOptions
@@ -65,11 +65,12 @@ class Streams:
     dvl: np.random.Generator
     depth: np.random.Generator
     sonar: np.random.Generator
+    seabed: np.random.Generator
 
     @classmethod
     def of(cls, seed: int) -> Streams:
         """The streams of a seed."""
-        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(7)))
+        return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(8)))
 
 
 def record(
@@ -101,7 +102,7 @@ def record(
     calibration = _calibration(options, vehicle, path, world, streams.start)
     rates_hz = IMU_RATE_HZ, DVL_PRESETS[options.dvl].rate_hz, DEPTH_RATE_HZ, TRUTH_RATE_HZ
     imu_ns, dvl_ns, depth_ns, truth_ns = (regular_stamps(rate, path.duration_s) for rate in rates_hz)
-    frames_ns = regular_stamps(options.frame_rate_hz, path.duration_s, SONAR_OFFSET_S)
+    frames_ns = frame_stamps(options.frame_rate_hz, path.duration_s)
     truth = path.at(seconds_since_start(truth_ns))
     return Sequence(
         name=name,
@@ -116,6 +117,11 @@ def record(
         true_landmarks=world.landmark_map(),
         notes={"generator": f"sonar_graph {__version__}, {name}", "options": options.model_dump_json(), **notes},
     )
+
+
+def frame_stamps(rate_hz: float, duration_s: float) -> Ints:
+    """When the sonar sends its pings."""
+    return regular_stamps(rate_hz, duration_s, SONAR_OFFSET_S)
 
 
 def _dvl_faults(options: SimulationOptions) -> DvlFaults:
