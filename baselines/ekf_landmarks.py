@@ -16,6 +16,11 @@ Observation and innovation, for a landmark at ``p_b = dR^T (p_n - dp)``, ``p_n =
 A new landmark at ``p = g(x_v, z, elevation) = X + R s``, with ``G_v | G_m = row(n, s)`` for the world's three axes n::
 
     P_pv = G_v P_v.,   P_pp = G_v P_vv G_v^T + G_m cov G_m^T + G_z diag(R_z, elevation_sigma^2) G_z^T
+
+On a floor of known height, the height p_z is measured once, then and there: innovation ``floor - p_z``, variance
+``P_pp[z, z] + floor_sigma^2``. A point whose range and azimuth show no floor within the aperture has elevation 0, and
+an innovation that the gate of the floor refuses unless the floor is near the aperture's edge: it is something in the
+water, or a false detection, and must not move the vehicle.
 """
 
 from __future__ import annotations
@@ -48,7 +53,14 @@ from sonar_graph.navigation.triples import (
     transposed,
     vector,
 )
-from sonar_graph.slam.models import floor_elevation, project, sonar_point, sonar_point_jacobian, wrap_angle
+from sonar_graph.slam.models import (
+    FLOOR_GATE,
+    floor_elevation,
+    project,
+    sonar_point,
+    sonar_point_jacobian,
+    wrap_angle,
+)
 
 USED, NEW, GATED, PASSED_OVER = 0, 1, 2, 3
 """What became of a detection, in compiled code."""
@@ -273,9 +285,15 @@ def _augment(
             own[r, c] += dot(G[c].by_X, vector(P[n + r])) + dot(G[c].by_angles, vector(P[n + r, 3:]))
             P[n + r, n + c] = P[n + c, n + r] = own[r, c]
     if sonar.has_floor:
-        after = n + LANDMARK
-        S = P[after - 1, after - 1] + sonar.floor_variance_m2
-        correct(x, P, after, P[after - 1, :after].copy(), S, sonar.floor_z_m - x[after - 1])
+        _stand_on_floor(x, P, n + LANDMARK, sonar)
+
+
+@compiled
+def _stand_on_floor(x: Floats, P: Floats, n: int, sonar: SonarModel) -> None:
+    """Correct the height of the landmark at the end by the floor's, where it can stand there."""
+    innovation, S = sonar.floor_z_m - x[n - 1], P[n - 1, n - 1] + sonar.floor_variance_m2
+    if innovation * innovation <= FLOOR_GATE * S:
+        correct(x, P, n, P[n - 1, :n].copy(), S, innovation)
 
 
 @compiled

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import subprocess
@@ -70,7 +71,33 @@ def test_damaged_logs_names_its_figures() -> None:
 
 @pytest.mark.slow
 def test_ekf_step_names_its_figures() -> None:
-    assert {"log_s", "filterpy_ratio"} <= set(figures("performance/ekf_step.py"))
+    found = figures("performance/ekf_step.py")
+    assert {"log_s", "filterpy_ratio", "passed"} <= set(found)
+    # A prediction a node is less work than one a sample, and ends in the same state.
+    assert 1 < found["filterpy_node_ratio"] < found["filterpy_ratio"]
+    assert found["difference"] < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("changes", "of_full_run", "of_quick_run"),
+    [
+        ({}, 0, 0),
+        ({"log_s": 0.501}, 1, 0),
+        ({"filterpy_ratio": 49.9}, 1, 0),
+        ({"filterpy_node_ratio": 5.0}, 0, 0),
+        ({"difference": 1e-5}, 1, 1),
+        ({"difference": float("inf")}, 1, 1),
+    ],
+)
+def test_ekf_step_fails_when_a_full_run_misses_a_target(
+    changes: dict[str, float], of_full_run: int, of_quick_run: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS / "performance"))
+    ekf_step = importlib.import_module("ekf_step")
+    met = {"log_s": 0.5, "filterpy_ratio": 50.0, "filterpy_node_ratio": 20.0, "difference": 1e-12} | changes
+    assert ekf_step.meets_targets(met) == (of_full_run == 0)
+    assert ekf_step.exit_code(met, quick=False) == of_full_run
+    assert ekf_step.exit_code(met, quick=True) == of_quick_run
 
 
 @pytest.mark.slow

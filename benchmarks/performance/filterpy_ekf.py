@@ -2,7 +2,8 @@
 
 State, motion model, noise, rules and order of events are the same, the code is not: F, Q and H are full matrices, every
 IMU or Doppler sample is a prediction, corrections are filterpy's (Joseph's form). The motion of a sample comes from
-`sonar_graph.navigation`.
+`sonar_graph.navigation`. On request there is one prediction a DVL node instead, over the motion preintegrated since the
+node before, as `baselines.ekf_slam` has it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Prein
 from sonar_graph.navigation.odometry import Odometry, Steps
 from sonar_graph.sequence import NS_PER_S, Sequence
 from sonar_graph.slam.association import gate_threshold, identify
-from sonar_graph.slam.models import elevation_on_floor, locate_jacobians, range_azimuth_jacobians
+from sonar_graph.slam.models import FLOOR_GATE, elevation_on_floor, locate_jacobians, range_azimuth_jacobians
 
 GATE_PROBABILITY = 0.999
 MINIMUM_ID_PROBABILITY = 0.5
@@ -162,7 +163,7 @@ class FilterpySlam:
         self.ekf.x, self.ekf.P = np.concatenate([self.ekf.x, point]), P
         self.ekf.dim_x, self.ekf._I = n + 3, np.eye(n + 3)
         self.slots[landmark] = len(self.slots)
-        if floor:
+        if floor and (floor.z_m - point[2]) ** 2 <= FLOOR_GATE * (P[n + 2, n + 2] + floor.sigma_m**2):
             self.update_state(n + 2, floor.z_m, floor.sigma_m**2)
 
 
@@ -176,12 +177,14 @@ class _Feed:
     preintegrator: Preintegrator
     node_ns: int
     opened_ns: int
+    predicts_by_node: bool
     nodes: int = 0
 
     def advance(self, until_ns: int) -> None:
         for node_ns in self.odometry.nodes(self.node_ns, until_ns).tolist():
             steps = self.odometry.steps_between_nodes(self.node_ns, node_ns)
-            motions = [self.preintegrator.integrate(_row(steps, k), NO_BIAS) for k in range(len(steps))]
+            pieces = [steps] if self.predicts_by_node else [_row(steps, k) for k in range(len(steps))]
+            motions = [self.preintegrator.integrate(piece, NO_BIAS) for piece in pieces]
             self.slam.timed(lambda motions=motions: [self.slam.predict(motion) for motion in motions])  # type: ignore[misc]
             self.node_ns, self.nodes = node_ns, self.nodes + 1
             if self.slam.calibration.use_gravity and node_ns - self.opened_ns >= GRAVITY_INTERVAL_NS:
@@ -235,14 +238,21 @@ class _Feed:
         self.slam.timed(lambda: self.slam.detect(motion, int(identity.ids[0]), z, R))
 
 
-def run(sequence: Sequence, until_ns: int) -> FilterpyRun:
-    """Feed a sequence up to an instant; without the Earth's rotation and the planar constraint."""
+def run(sequence: Sequence, until_ns: int, *, predicts_by_node: bool = False) -> FilterpyRun:
+    """Feed a sequence up to an instant; without the Earth's rotation and the planar constraint.
+
+    Parameters
+    ----------
+    predicts_by_node
+        Predict once a DVL node, over the motion preintegrated since the node before, and not once a sample.
+    """
     odometry = Odometry(sequence.calibration)
     odometry.add(sequence.imu, sequence.dvl)
     start_ns = odometry.start_ns()
     assert start_ns is not None
     slam = FilterpySlam(sequence.calibration)
-    feed = _Feed(sequence, slam, odometry, Preintegrator.from_calibration(sequence.calibration), start_ns, start_ns)
+    preintegrator = Preintegrator.from_calibration(sequence.calibration)
+    feed = _Feed(sequence, slam, odometry, preintegrator, start_ns, start_ns, predicts_by_node)
     events = []
     if sequence.depth is not None:
         events += [(int(t), 0, row) for row, t in enumerate(sequence.depth.stamps_ns)]

@@ -22,7 +22,7 @@ from baselines.ekf_landmarks import (
 )
 from sonar_graph.navigation.triples import matrix, vector
 from sonar_graph.slam.association import gate_threshold
-from sonar_graph.slam.models import locate, range_azimuth
+from sonar_graph.slam.models import FLOOR_GATE, elevation_on_floor, locate, range_azimuth
 
 from .motions import motion_of
 
@@ -174,6 +174,70 @@ def test_a_known_floor_fixes_the_height_of_a_new_landmark():
     frame(x, P, n, [0], [[2.0, 0.3]], sonar(has_floor=True, floor_z_m=true[2], floor_variance_m2=1e-6))
     assert_allclose(x[6:9], true, atol=1e-3)
     assert P[8, 8] == pytest.approx(1e-6, rel=0.01)
+
+
+def seen_above_a_floor(height_m, range_m=3.0):
+    """First sight of a landmark by a body that is sure of all but its height, sigma 0.2 m; x, P, and x before."""
+    x, P, n = state(np.zeros(3))
+    P[:] = 0.0
+    P[:6, :6] = np.diag([1e-3, 1e-3, 0.2, 1e-3, 1e-3, 1e-3]) ** 2
+    before = x.copy()
+    model = sonar(has_floor=True, floor_z_m=x[2] - height_m)
+    n, outcomes, _, _ = frame(x, P, n, [0], [[range_m, 0.3]], model)
+    assert (n, outcomes.tolist()) == (9, [NEW])
+    return x, P, before
+
+
+def test_a_false_detection_far_above_the_floor_does_not_move_the_vehicle():
+    x, P, before = seen_above_a_floor(5.0)
+    middle = locate(body(before).compose(MOUNTING), 3.0, 0.3, 0.0)
+    assert_array_equal(x[:6], before[:6])
+    assert P[2, 2] == pytest.approx(0.04)
+    assert_allclose(x[6:9], middle, atol=1e-12)
+
+
+def test_a_detection_on_the_floor_tells_the_vehicle_its_height():
+    x, P, _ = seen_above_a_floor(1.6)
+    assert x[8] == pytest.approx(3.0 - 1.6, abs=0.01)
+    assert P[2, 2] < 0.9 * 0.04
+
+
+FLOOR_SIGMA_M = 0.01
+
+
+def on_floor_beside_the_aperture(variances):
+    """First sight with the floor this many (signed root) variances off the aperture's centre: x, P, height there, S."""
+    bare, bare_P, n = state(np.array([0.1, 0.2, 0.3]))
+    frame(bare, bare_P, n, [0], [[2.0, 0.3]])
+    S = bare_P[8, 8] + FLOOR_SIGMA_M**2
+    floor_z_m = bare[8] + math.copysign(math.sqrt(abs(variances) * S), variances)
+    x, P, n = state(np.array([0.1, 0.2, 0.3]))
+    world_T_sonar = body(x).compose(MOUNTING)
+    model = sonar(has_floor=True, floor_z_m=floor_z_m, floor_variance_m2=FLOOR_SIGMA_M**2)
+    assert elevation_on_floor(world_T_sonar, 2.0, 0.3, floor_z_m, model.aperture_rad) is None
+    frame(x, P, n, [0], [[2.0, 0.3]], model)
+    return x, P, bare, bare_P, floor_z_m
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_floor_just_outside_the_aperture_still_fixes_the_height(side):
+    """Up to the gate; the innovation's variance has the aperture's share, the pose's and the floor's."""
+    for variances in (0.5 * FLOOR_GATE, 0.999 * FLOOR_GATE):
+        x, P, bare, bare_P, floor_z_m = on_floor_beside_the_aperture(side * variances)
+        share = bare_P[:9, 8] / (bare_P[8, 8] + FLOOR_SIGMA_M**2)
+        assert_allclose(x[:9], bare[:9] + share * (floor_z_m - bare[8]), atol=1e-12)
+        assert P[8, 8] == pytest.approx(share[8] * FLOOR_SIGMA_M**2)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_floor_beyond_its_gate_changes_nothing(side):
+    x, P, bare, bare_P, _ = on_floor_beside_the_aperture(side * 1.001 * FLOOR_GATE)
+    assert_array_equal(x, bare)
+    assert_array_equal(P, bare_P)
+
+
+def test_the_floor_s_gate_is_passed_by_999_of_1000_that_stand_on_it():
+    assert pytest.approx(gate_threshold(0.999, 1), abs=5e-3) == FLOOR_GATE
 
 
 def test_without_a_floor_a_new_landmark_is_in_the_middle_of_the_aperture():

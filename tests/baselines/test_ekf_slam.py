@@ -67,7 +67,8 @@ def test_the_contract_is_kept(check):
     check(EkfSlam)
 
 
-def test_the_same_filter_on_filterpy_ends_in_the_same_state(mission, monkeypatch):
+@pytest.mark.parametrize("predicts_by_node", [False, True])
+def test_the_same_filter_on_filterpy_ends_in_the_same_state(mission, monkeypatch, predicts_by_node):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     spec = importlib.util.spec_from_file_location("filterpy_ekf", BENCHMARKS / "filterpy_ekf.py")
     filterpy_ekf = importlib.util.module_from_spec(spec)
@@ -77,7 +78,7 @@ def test_the_same_filter_on_filterpy_ends_in_the_same_state(mission, monkeypatch
     slam = EkfSlam(mission.calibration)
     for window in mission.replay(mission.instants(2.0)):
         slam.process(window)
-    theirs = filterpy_ekf.run(mission, int(mission.instants(2.0)[-1]))
+    theirs = filterpy_ekf.run(mission, int(mission.instants(2.0)[-1]), predicts_by_node=predicts_by_node)
     node_ns, x, P = slam.state()
     assert node_ns == theirs.node_ns
     assert len(x) > 6 + 3 * 5
