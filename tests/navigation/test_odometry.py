@@ -137,6 +137,7 @@ def test_there_is_no_start_before_imu_rows_cover_a_node():
     assert odometry_of(imu(stamps(10, 1), 0.0), dvl(stamps(10, 1, 1.05), 0.0)).start_ns() is None
     assert odometry_of(imu(stamps(10, 1, 5.0), 0.0), dvl(stamps(10, 1), 0.0)).start_ns() is None
     assert odometry_of(imu(stamps(10, 1), 0.0), dvl(stamps(10, 1, -0.33), 0.0)).start_ns() == T0_NS + 70_000_000
+    assert odometry_of(imu(stamps(10, 1), 0.0), dvl(stamps(10, 1, 1.0), 0.0)).start_ns() == T0_NS + NS
 
 
 def test_late_rows_are_passed_over():
