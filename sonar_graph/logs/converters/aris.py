@@ -18,7 +18,14 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.converters.sonar_beams import aris_azimuths, even_azimuths
 from sonar_graph.logs.converters.sonar_conversion import Progress, SonarConversion, convert_sonar_file
-from sonar_graph.logs.converters.sonar_file import ByteSource, DamagedFrameError, FrameGeometry, FrameHead, Settings
+from sonar_graph.logs.converters.sonar_file import (
+    ByteSource,
+    DamagedFrameError,
+    FrameGeometry,
+    FrameHead,
+    Settings,
+    may_be_numbered_header,
+)
 
 SIGNATURE = b"DDF\x05"
 HEADER_BYTES = 1024
@@ -95,6 +102,10 @@ class ArisFormat:
             raise DamagedFrameError(f"frame {number} with a time of {clock_us} us")
         readings = {name: float(struct.unpack_from("<f", content, where)[0]) for name, where in _READINGS.items()}
         return FrameHead(at, HEADER_BYTES + beams * samples, number, clock_us * 1000, settings, readings)
+
+    def may_follow(self, content: bytes, earlier: FrameHead) -> bool:
+        """Whether some bytes can begin the frame after."""
+        return may_be_numbered_header(content, self.signature, self.signature_at, earlier.number + 1)
 
     def geometry(self, settings: Settings) -> FrameGeometry:
         """Bins begin ``delay c / 2`` away and are ``period c / 2`` long."""

@@ -23,7 +23,14 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.converters.sonar_beams import didson_azimuths
 from sonar_graph.logs.converters.sonar_conversion import Progress, SonarConversion, convert_sonar_file
-from sonar_graph.logs.converters.sonar_file import ByteSource, DamagedFrameError, FrameGeometry, FrameHead, Settings
+from sonar_graph.logs.converters.sonar_file import (
+    ByteSource,
+    DamagedFrameError,
+    FrameGeometry,
+    FrameHead,
+    Settings,
+    may_be_numbered_header,
+)
 
 MAGIC = b"DDF"
 HEADER_BYTES = {3: (512, 256), 4: (1024, 1024)}
@@ -121,7 +128,7 @@ class DidsonFormat:
             raise DamagedFrameError(f"a frame cut off, {len(content)} bytes of its header are there")
         if content[self.signature_at : self.signature_at + 4] != self.signature:
             raise DamagedFrameError("no frame begins here")
-        (number,) = struct.unpack_from("<i", content, 0)
+        (number,) = struct.unpack_from("<I", content, 0)
         start, length = struct.unpack_from("<2i", content, _WINDOW_AT)
         flags = self._flags(struct.unpack_from("<I", content, _FLAGS_AT)[0])
         shift = 0 if self._is_high else LOW_FREQUENCY_SHIFT
@@ -131,6 +138,10 @@ class DidsonFormat:
         size = self.head_bytes + self._beams * self._samples
         settings = start, length, flags, self._beams, self._samples
         return FrameHead(at, size, number, _clock_ns(content, number), settings, readings)
+
+    def may_follow(self, content: bytes, earlier: FrameHead) -> bool:
+        """Whether some bytes can begin the frame after."""
+        return may_be_numbered_header(content, self.signature, self.signature_at, earlier.number + 1)
 
     def geometry(self, settings: Settings) -> FrameGeometry:
         """Bins divide the window evenly."""
@@ -157,10 +168,9 @@ class DidsonFormat:
 
     def _signature(self, source: ByteSource) -> bytes:
         """What stands where a frame's header has its version: usually that of the file, in any case always the same."""
-        size = self.head_bytes + self._beams * self._samples
-        seen = [source.read(self.first_at + i * size + self.signature_at, 4) for i in (0, 1)]
         usual = MAGIC + bytes([self._version])
-        return usual if usual in seen else seen[0]
+        first_frames = source.read(len(usual), self.first_at + 2 * (self.head_bytes + self._beams * self._samples))
+        return usual if usual in first_frames else source.read(self.first_at + self.signature_at, len(usual))
 
 
 def _version(source: ByteSource) -> int:

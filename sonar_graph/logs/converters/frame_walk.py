@@ -1,17 +1,21 @@
 """From frame to frame through a sonar's file, believing none that its neighbours contradict.
 
 The formats have no checksums. What can be checked is checked: a frame is whole when its header makes sense and another
-sensible header, or the end of the file, follows where it should; and a frame whose settings or time differ from those
-of both neighbours, which agree, has a damaged header. Samples that were overwritten in place cannot be told.
+sensible header, or the end of the file, follows where it should; a frame has a damaged header whose settings are those
+of none of its neighbours (some sonars alternate between two), or whose time is not between theirs. What cannot be told:
+samples that were overwritten in place, and bytes that are missing or too many by exactly the length of frames.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator, Sequence
+from itertools import combinations
 
 from sonar_graph.logs.converters.sonar_file import ByteSource, DamagedFrameError, FrameHead, Lost, SonarFormat
 
+_NEIGHBOURS = 4
+"""On either side, with which a frame's settings are compared."""
 _DRIFT = 1e-3
 """Relative change of a setting given as a float (speed of sound) between neighbours that is none."""
 _ODD_GAP = 10
@@ -23,14 +27,14 @@ _ODD_GAP_NS = 1_000_000_000
 
 def frames_and_losses(source: ByteSource, kind: SonarFormat) -> Iterator[FrameHead | Lost]:
     """Headers of all frames that can be believed, in the order of the file, and what is lost between."""
-    accepted: deque[FrameHead] = deque(maxlen=2)
+    accepted: deque[FrameHead] = deque(maxlen=_NEIGHBOURS)
     waiting: deque[FrameHead] = deque()
     for found in _whole(source, kind):
         if isinstance(found, Lost):
             yield found
             continue
         waiting.append(found)
-        while len(waiting) > (1 if accepted else 2):
+        if len(waiting) > _NEIGHBOURS:
             yield _judged(accepted, waiting, kind.clock_period_ns)
     while waiting:
         yield _judged(accepted, waiting, kind.clock_period_ns)
@@ -56,19 +60,18 @@ def first_sound(source: ByteSource, kind: SonarFormat) -> FrameHead | None:
 
 def _whole(source: ByteSource, kind: SonarFormat) -> Iterator[FrameHead | Lost]:
     """Frames after which the file goes on as it should, with their neighbours not yet compared."""
-    at, pending, proven_size = kind.first_at, None, 0
+    at, pending = kind.first_at, None
     while at < source.size:
         try:
             head = _head(source, kind, at)
         except DamagedFrameError as error:
-            found = _next_sound(source, kind, (pending.at if pending else at) + 1)
-            is_shifted = pending is not None and _is_shifted(source, kind, pending, found, proven_size)
+            found = _next_sound(source, kind, _search_start(kind, pending, at), but_not=at)
+            is_shifted = pending is not None and _is_shifted(source, kind, pending, found)
             yield from _around_damage(pending, at, found.at if found else source.size, str(error), is_shifted)
             pending, at = None, found.at if found else source.size
             continue
         if pending and pending.has_image:
             yield pending
-        proven_size = pending.size if pending else proven_size
         pending, at = head, head.end
     if pending and pending.end > source.size:
         have = source.size - pending.at
@@ -79,6 +82,13 @@ def _whole(source: ByteSource, kind: SonarFormat) -> Iterator[FrameHead | Lost]:
         yield pending
 
 
+def _search_start(kind: SonarFormat, pending: FrameHead | None, at: int) -> int:
+    """Within the frame before, from which bytes may be missing, or within the file's header, from which too."""
+    if pending:
+        return pending.at + 1
+    return 0 if at == kind.first_at else at + 1
+
+
 def _head(source: ByteSource, kind: SonarFormat, at: int) -> FrameHead:
     head = kind.head(source.read(at, kind.head_bytes), at)
     if head.end > source.size and _next_sound(source, kind, at + 1):
@@ -86,14 +96,14 @@ def _head(source: ByteSource, kind: SonarFormat, at: int) -> FrameHead:
     return head
 
 
-def _is_shifted(
-    source: ByteSource, kind: SonarFormat, pending: FrameHead, found: FrameHead | None, proven_size: int
-) -> bool:
+def _is_shifted(source: ByteSource, kind: SonarFormat, pending: FrameHead, found: FrameHead | None) -> bool:
     """Whether bytes may be missing from the frame before a bad header, or too many be in it."""
     if found is not None:
         return (found.at - pending.end) % pending.size != 0
     rest = source.size - pending.end
-    return rest >= kind.head_bytes and rest % pending.size != 0 and pending.size != proven_size
+    if rest < kind.head_bytes and kind.may_follow(source.read(pending.end, rest), pending):
+        return False
+    return rest % pending.size != 0
 
 
 def _around_damage(
@@ -105,17 +115,20 @@ def _around_damage(
         return
     if pending and pending.has_image:
         yield pending
-    yield Lost(at, end, reason)
+    yield Lost(at, end, reason) if end > at else Lost(0, end, f"the file's header is {at - end} bytes too short")
 
 
-def _next_sound(source: ByteSource, kind: SonarFormat, start: int) -> FrameHead | None:
+def _next_sound(source: ByteSource, kind: SonarFormat, start: int, but_not: int = -1) -> FrameHead | None:
+    """The first header from ``start`` on that makes sense, one place left out."""
     at = source.find(kind.signature, start + kind.signature_at)
     while at is not None:
         begin = at - kind.signature_at
         try:
-            return kind.head(source.read(begin, kind.head_bytes), begin)
+            if begin != but_not:
+                return kind.head(source.read(begin, kind.head_bytes), begin)
         except DamagedFrameError:
-            at = source.find(kind.signature, at + 1)
+            pass  # the signature's bytes by chance
+        at = source.find(kind.signature, at + 1)
     return None
 
 
@@ -125,35 +138,29 @@ def _fault(
     """Why a frame's header is not believed; None: it is."""
     if accepted and (accepted[-1].number, accepted[-1].clock_ns) == (judged.number, judged.clock_ns):
         return f"a repetition of the frame at byte {accepted[-1].at}"
+    if _is_odd(judged, [*accepted, *waiting]):
+        return "its settings are those of no frame beside it"
     if accepted and waiting:
-        return _fault_between(accepted[-1], judged, waiting[0], period_ns)
-    if len(waiting) > 1:
-        gaps_ns = _elapsed(judged, waiting[0], period_ns), _elapsed(waiting[0], waiting[1], period_ns)
-        return _fault_at_edge(judged, waiting[0], waiting[1], *gaps_ns)
-    if len(accepted) > 1:
-        gaps_ns = _elapsed(accepted[-1], judged, period_ns), _elapsed(accepted[-2], accepted[-1], period_ns)
-        return _fault_at_edge(judged, accepted[-1], accepted[-2], *gaps_ns)
-    return None
+        is_right = _is_between(accepted[-1], judged, waiting[0], period_ns)
+    elif len(waiting) > 1:
+        is_right = _is_near(_elapsed(judged, waiting[0], period_ns), _elapsed(waiting[0], waiting[1], period_ns))
+    elif len(accepted) > 1:
+        is_right = _is_near(_elapsed(accepted[-1], judged, period_ns), _elapsed(accepted[-2], accepted[-1], period_ns))
+    else:
+        return None
+    return None if is_right else "its time does not fit those of the frames beside it"
 
 
-def _fault_between(earlier: FrameHead, judged: FrameHead, later: FrameHead, period_ns: int | None) -> str | None:
-    if _is_odd(judged, earlier, later):
-        return "its settings are those of neither neighbour, which agree"
-    if not _is_between(earlier, judged, later, period_ns):
-        return "its time is not between those of its neighbours"
-    return None
+def _is_odd(judged: FrameHead, others: list[FrameHead]) -> bool:
+    """Whether no other has its settings although some agree among themselves."""
+    if any(_agree(judged, other) for other in others):
+        return False
+    return any(_agree(one, other) for one, other in combinations(others, 2))
 
 
-def _fault_at_edge(judged: FrameHead, near: FrameHead, far: FrameHead, gap_ns: int, usual_ns: int) -> str | None:
-    if _is_odd(judged, near, far):
-        return "its settings are not those of the two beside it, which agree"
-    if usual_ns >= 0 and not 0 <= gap_ns <= _ODD_GAP * usual_ns + _ODD_GAP_NS:
-        return "its time does not fit the two beside it"
-    return None
-
-
-def _is_odd(judged: FrameHead, one: FrameHead, other: FrameHead) -> bool:
-    return _agree(one, other) and not _agree(judged, one)
+def _is_near(gap_ns: int, usual_ns: int) -> bool:
+    """Whether the first or last interval can be one, given the one beside it; where that runs back, nobody knows."""
+    return usual_ns < 0 or 0 <= gap_ns <= _ODD_GAP * usual_ns + _ODD_GAP_NS
 
 
 def _agree(one: FrameHead, other: FrameHead) -> bool:

@@ -93,6 +93,10 @@ class OculusFormat:
             raise DamagedFrameError(f"a message of kind {kind:#x}, version {version}")
         return _ping(content, at, version, HEADER.size + payload)
 
+    def may_follow(self, content: bytes, earlier: FrameHead) -> bool:  # noqa: ARG002
+        """Whether some bytes can begin the message after."""
+        return SIGNATURE.startswith(content[: len(SIGNATURE)])
+
     def geometry(self, settings: Settings) -> FrameGeometry:
         """Bins begin at the sonar; bearings are positive to the right."""
         *_, ranges, _, bin_m, sound_speed, frequency_hz, bearings = settings

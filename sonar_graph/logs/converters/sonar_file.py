@@ -127,6 +127,10 @@ class SonarFormat(Protocol):
         """
         ...
 
+    def may_follow(self, content: bytes, earlier: FrameHead) -> bool:
+        """Whether bytes at the end of the file, fewer than a header, can be the beginning of the next frame."""
+        ...
+
     def geometry(self, settings: Settings) -> FrameGeometry:
         """Ranges and azimuths of frames with these settings."""
         ...
@@ -134,6 +138,12 @@ class SonarFormat(Protocol):
     def samples(self, frame: bytes, settings: Settings) -> NDArray[np.generic]:
         """The image in a frame's bytes, shape (beams, bins)."""
         ...
+
+
+def may_be_numbered_header(content: bytes, signature: bytes, signature_at: int, number: int) -> bool:
+    """Whether bytes begin like a header with a number in its first four bytes and a signature later on."""
+    signed = content[signature_at:]
+    return number.to_bytes(4, "little").startswith(content[:4]) and signature.startswith(signed[: len(signature)])
 
 
 class ByteSource:

@@ -175,7 +175,27 @@ def test_a_first_or_last_time_that_is_far_from_the_others_is_damage(tmp_path: Pa
     frames[which_one] = patched(frames[which_one], 24, bytes([frames[which_one][24] ^ 1]))
     numbers, said = read(tmp_path, [head, *frames], "aris")
     assert numbers == [n for n in range(COUNT) if n != which_one]
-    assert "its time does not fit the two beside it" in said
+    assert "its time does not fit" in said
+
+
+@each_kind
+def test_two_settings_that_alternate_are_believed(tmp_path: Path, ending: str) -> None:
+    """Some sonars switch between two frequencies or windows with every frame."""
+    head, *frames = PIECES[ending]
+    at = SETTING_AT[ending] + 6 * (ending == "raw")
+    pieces = [patched(frame, at, bytes([frame[at] ^ 4])) if i % 2 else frame for i, frame in enumerate(frames)]
+    assert read(tmp_path, [head, *pieces], ending) == (list(range(COUNT)), "")
+
+
+@each_kind
+def test_two_damaged_headers_side_by_side_are_both_told(tmp_path: Path, ending: str) -> None:
+    head, *frames = PIECES[ending]
+    at = SETTING_AT[ending] + 6 * (ending == "raw")
+    for i, bit in ((0, 1), (1, 2), (4, 4), (5, 8)):
+        frames[i] = patched(frames[i], at, bytes([frames[i][at] ^ bit]))
+    numbers, said = read(tmp_path, [head, *frames], ending)
+    assert numbers == [2, 3, 6]
+    assert said.count("settings") == 4
 
 
 def test_a_clock_that_is_set_back_loses_nothing(tmp_path: Path) -> None:
@@ -188,15 +208,25 @@ def test_a_clock_that_is_set_back_loses_nothing(tmp_path: Path) -> None:
     assert sorted(which(result, "aris")) == list(range(COUNT))
 
 
-def test_a_length_beyond_the_file_does_not_swallow_what_follows(tmp_path: Path) -> None:
+@pytest.mark.parametrize("which_one", [0, 2])
+def test_a_length_beyond_the_file_does_not_swallow_what_follows(tmp_path: Path, which_one: int) -> None:
     """65,000 samples a beam are possible, but then other frames would lie within this one."""
     head, *frames = PIECES["aris"]
-    frame = bytearray(frames[2])
+    frame = bytearray(frames[which_one])
     put(frame, 468, "I", 65_000)
-    frames[2] = bytes(frame)
+    frames[which_one] = bytes(frame)
     numbers, said = read(tmp_path, [head, *frames], "aris")
-    assert numbers == [0, 1, 3, 4, 5, 6]
+    assert numbers == [n for n in range(COUNT) if n != which_one]
     assert "longer than the file" in said
+
+
+@pytest.mark.parametrize("ending", ["ddf", "aris"])
+def test_a_file_header_that_lost_bytes_costs_no_frame(tmp_path: Path, ending: str) -> None:
+    head, *frames = PIECES[ending]
+    result = converted(tmp_path, b"".join([head[:300], *frames]), ending)
+    assert which(result, ending) == list(range(COUNT))
+    assert [loss.end for loss in result.done.lost] == [300]
+    assert f"{len(head) - 300} bytes too short" in result.done.shortcomings()[0]
 
 
 @each_kind
