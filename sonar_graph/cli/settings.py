@@ -29,6 +29,21 @@ def parse_setting(text: str) -> tuple[str, Any]:
     return name.strip(), _plain_value(value.strip())
 
 
+def nested_settings(texts: list[str]) -> dict[str, Any]:
+    """Settings by name, from texts such as ``laps=2``; dots go into nested settings: ``image.noise_db=20``.
+
+    Raises
+    ------
+    EstimatorError
+        When there is no name or no ``=``.
+    """
+    settings: dict[str, Any] = {}
+    for text in texts:
+        path, value = parse_setting(text)
+        _put(settings, path.split("."), value)
+    return settings
+
+
 def _plain_value(text: str) -> Any:
     if "\n" in text:
         return text

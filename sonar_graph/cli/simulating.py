@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sonar_graph.cli.arguments import OutputLog
+from sonar_graph.cli.arguments import OutputLog, Overwrite
 from sonar_graph.cli.outputs import writable_log
-from sonar_graph.cli.progress import working
-from sonar_graph.cli.settings import parse_setting
+from sonar_graph.cli.progress import Report, progress_bars, working
+from sonar_graph.cli.settings import nested_settings
 from sonar_graph.cli.texts import examples
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
+    from sonar_graph.logs.recorder import Outgoing
     from sonar_graph.simulation.basin import BasinOptions
 
 worlds = typer.Typer(
@@ -22,7 +25,7 @@ worlds = typer.Typer(
     help="Simulate a run with known truth and write it as an MCAP log.",
     epilog=examples(
         "sonar-graph simulate basin -o basin.mcap",
-        "sonar-graph simulate basin -o short.mcap --duration-s 300 --laps 1",
+        "sonar-graph simulate basin -o images.mcap --images",
     ),
 )
 
@@ -32,6 +35,8 @@ worlds = typer.Typer(
         "sonar-graph simulate basin -o basin.mcap",
         "sonar-graph simulate basin -o short.mcap --duration-s 300 --laps 1 --seed 7",
         "sonar-graph simulate basin -o hard.mcap --imu mti1 --dvl explorer --set wrong_id_rate=0.05",
+        "sonar-graph simulate basin -o images.mcap --images --duration-s 130 --laps 1",
+        "sonar-graph simulate basin -o bare.mcap --images --set image.multipath=false --set image.stones=0",
     )
 )
 def basin(
@@ -42,36 +47,71 @@ def basin(
     imu: Annotated[str | None, typer.Option(help="Preset of the inertial sensor: hg1700 (default) or mti1.")] = None,
     dvl: Annotated[str | None, typer.Option(help="Preset of the Doppler log: workhorse (default) or explorer.")] = None,
     no_bias: Annotated[bool, typer.Option("--no-bias", help="Gyros without bias.")] = False,
+    images: Annotated[
+        bool,
+        typer.Option("--images", help="Record sonar images, in which landmarks are still to be found, not detections."),
+    ] = False,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Any other option of the basin; may be repeated."),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
-    """A vehicle drives round four landmarks in a basin, with IMU, DVL, depth and landmark detections."""
+    """A vehicle drives round four landmarks in a basin, with IMU, DVL, depth and landmark detections or images."""
+    flags = {"seed": seed, "duration_s": duration_s, "laps": laps, "imu": imu, "dvl": dvl}
+    values: dict[str, Any] = {name: value for name, value in flags.items() if value is not None}
+    if no_bias:
+        values["gyro_bias_scale"] = 0.0
+    if images:
+        values["image"] = {}
+    options = _basin_options(values | nested_settings(settings or []))
+    path = writable_log(output, overwrite=overwrite)
+    write_basin(path, options)
+    typer.echo(f"Log: {path}")
+
+
+def write_basin(path: Path, options: BasinOptions) -> None:
+    """Write the log of a simulated basin, with images where its options ask for them."""
     from sonar_graph.logs.writing import write_sequence
     from sonar_graph.simulation.basin import simulate_basin
 
-    flags = {"seed": seed, "duration_s": duration_s, "laps": laps, "imu": imu, "dvl": dvl}
-    values = {name: value for name, value in flags.items() if value is not None}
-    if no_bias:
-        values["gyro_bias_scale"] = 0.0
-    options = _basin_options(values | dict(map(parse_setting, settings or [])))
-    path = writable_log(output)
-    with working("simulating"):
-        write_sequence(path, simulate_basin(options))
-    typer.echo(f"Log: {path}")
+    if options.image is None:
+        with working("simulating"):
+            write_sequence(path, simulate_basin(options))
+        return
+    with progress_bars() as report:
+        write_sequence(path, simulate_basin(options), _image_messages(options, report))
+
+
+def _image_messages(options: BasinOptions, report: Report) -> Iterator[Outgoing]:
+    """Images of the basin, a block at a time."""
+    from sonar_graph.logs.sonar_encoding import sonar_image_messages
+    from sonar_graph.simulation.basin import simulate_basin_frames
+    from sonar_graph.simulation.imaging_sonar import SOUND_SPEED_M_S
+    from sonar_graph.simulation.sonar_image import SONARS
+
+    assert options.image is not None
+    frequency_hz = SONARS[options.image.sonar].frequency_hz
+    told_m_s = SOUND_SPEED_M_S * (1 + options.image.sound_speed_error)
+    total, done = round(options.duration_s * options.frame_rate_hz), 0
+    for block in simulate_basin_frames(options):
+        yield sonar_image_messages("/sonar/image", block.frames, frequency_hz=frequency_hz, sound_speed_m_s=told_m_s)
+        done += len(block.frames)
+        report("simulating images", done, total)
 
 
 def _basin_options(values: dict[str, Any]) -> BasinOptions:
     from pydantic import ValidationError
 
     from sonar_graph.simulation.basin import BasinOptions
+    from sonar_graph.simulation.image_options import ImageOptions
 
     try:
         return BasinOptions.model_validate(values)
     except ValidationError as error:
         faults = "; ".join(map(_fault, error.errors()))
-        raise typer.BadParameter(f"{faults}. The basin has: {', '.join(BasinOptions.model_fields)}") from error
+        names = [*BasinOptions.model_fields, *(f"image.{name}" for name in ImageOptions.model_fields)]
+        raise typer.BadParameter(f"{faults}. The basin has: {', '.join(names)}") from error
 
 
 def _fault(error: ErrorDetails) -> str:
