@@ -69,6 +69,14 @@ def test_damaged_logs_names_its_figures() -> None:
     assert found["recovered_share"] == 1
 
 
+def test_damaged_sonar_files_names_its_figures() -> None:
+    found = figures("validation/damaged_sonar_files.py")
+    assert found["files"] == 60
+    assert (found["crashes"], found["hangs"], found["silent_errors"]) == (0, 0, 0)
+    assert found["recovered_share"] == 1
+    assert found["unseen_samples"] > 0  # flipped samples are among the damages
+
+
 @pytest.mark.slow
 def test_ekf_step_names_its_figures() -> None:
     found = figures("performance/ekf_step.py")
