@@ -9,13 +9,13 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import Calibration, FloorPrior
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.slam import factors
 from sonar_graph.slam.association import DetectionJournal, Identities, gate_threshold, identify
 from sonar_graph.slam.keyframes import Keyframes
-from sonar_graph.slam.models import elevation_on_floor, locate
+from sonar_graph.slam.models import FLOOR_GATE, elevation_on_floor, locate
 from sonar_graph.slam.sightlines import Sightline
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.slam.view import View
@@ -129,20 +129,37 @@ class Sightings:
 
     def _sight_first(self, view: View, tie: Tie, seen: Seen) -> dict[int, Verdict]:
         """Add landmarks to the graph."""
-        floor = self.calibration.floor
-        points = np.array([self._located(view, *z) for z in seen.z.tolist()]).reshape(-1, 3)
-        for key, landmark_id, point in zip(seen.keys, seen.ids, points, strict=True):
+        for k, (key, landmark_id) in enumerate(zip(seen.keys, seen.ids, strict=True)):
             self.ids.add(landmark_id)
-            self.smoother.add_landmark(key, point)
-            if floor:
-                self.smoother.add([factors.floor_prior(key, floor.z_m, floor.sigma_m)])
-        self._add_factors(view, tie, seen, points, None if floor else self._elevation_sigma_rad)
+            self._place(view, tie, seen.where([row == k for row in range(len(seen.ids))]), key)
         return dict.fromkeys(seen.rows, (Outcome.NEW, None, None))
 
-    def _located(self, view: View, range_m: float, azimuth_rad: float) -> Floats:
-        floor, aperture = self.calibration.floor, self.calibration.sonar.elevation_aperture_rad
-        elevation = elevation_on_floor(view.world_T_sonar, range_m, azimuth_rad, floor.z_m, aperture) if floor else None
-        return locate(view.world_T_sonar, range_m, azimuth_rad, elevation or 0.0)
+    def _place(self, view: View, tie: Tie, seen: Seen, key: int) -> None:
+        """Add one landmark where it was seen: on the floor, where it can stand there, else on the centre beam."""
+        range_m, azimuth_rad = seen.z[0].tolist()
+        floor = self._floor_under(view, range_m, azimuth_rad)
+        elevation = self._elevation_on(floor, view, range_m, azimuth_rad)
+        point = locate(view.world_T_sonar, range_m, azimuth_rad, elevation)
+        self.smoother.add_landmark(key, point)
+        self._add_factors(view, tie, seen, point[None], None if floor else self._elevation_sigma_rad)
+        if floor:
+            self.smoother.add([factors.floor_prior(key, floor.z_m, floor.sigma_m)])
+
+    def _floor_under(self, view: View, range_m: float, azimuth_rad: float) -> FloorPrior | None:
+        """The known floor, unless it is implausibly far from the point on the centre beam (`FLOOR_GATE`)."""
+        floor = self.calibration.floor
+        if floor is None:
+            return None
+        point = locate(view.world_T_sonar, range_m, azimuth_rad, 0.0)
+        by_elevation = range_m * view.world_T_sonar.rotation().matrix()[2, 2] * self._elevation_sigma_rad
+        variance = by_elevation**2 + view.height_variance(point) + floor.sigma_m**2
+        return floor if (point[2] - floor.z_m) ** 2 <= FLOOR_GATE * variance else None
+
+    def _elevation_on(self, floor: FloorPrior | None, view: View, range_m: float, azimuth_rad: float) -> float:
+        if floor is None:
+            return 0.0
+        aperture = self.calibration.sonar.elevation_aperture_rad
+        return elevation_on_floor(view.world_T_sonar, range_m, azimuth_rad, floor.z_m, aperture) or 0.0
 
     def _add_factors(self, view: View, tie: Tie, seen: Seen, points: Floats, elevation_sigma_rad: float | None) -> None:
         added: list[gtsam.NonlinearFactor] = []

@@ -12,8 +12,8 @@ that solution with fresh linearisations. The graph must have grown by `RESTART_G
 the total cost of restarts proportional to that of the last one.
 
 GTSAM's Cholesky elimination gives up ("indeterminate") when a variable's absolute sigma is more than 4096 times its
-sigma given its neighbours, which millimetre odometry reaches after some metres of drift. QR does not, at about 1.3
-times the cost; the window and the marginals of the history turn to it when Cholesky has given up.
+sigma given its neighbours, which millimetre odometry reaches after some metres of drift. QR does not, at a higher cost;
+once Cholesky has given up the window stays with QR, and so do the marginals of the history.
 """
 
 from __future__ import annotations
@@ -60,6 +60,7 @@ class Smoother:
         self._greatest_waiting_gain = greatest_waiting_gain
         self._restart_size = FIRST_RESTART
         self._threshold = relinearize_threshold
+        self._factorization = "CHOLESKY"
         self.graph = gtsam.NonlinearFactorGraph()
         """Every factor ever added."""
         self.values = gtsam.Values()
@@ -81,9 +82,9 @@ class Smoother:
         self._solved: tuple[gtsam.Values, gtsam.Marginals | gtsam.ISAM2] | None = None
         self._solved_size = 0
 
-    def _new_window(self, factorization: str = "CHOLESKY") -> gtsam.IncrementalFixedLagSmoother:
+    def _new_window(self) -> gtsam.IncrementalFixedLagSmoother:
         params = gtsam.ISAM2Params()
-        params.setFactorization(factorization)
+        params.setFactorization(self._factorization)
         params.relinearizeSkip = 1
         params.setRelinearizeThreshold(self._threshold)
         params.findUnusedFactorSlots = True
@@ -126,8 +127,9 @@ class Smoother:
         try:
             self._window.update(self._pending, self._pending_values, times)
         except RuntimeError:  # Cholesky met a pose 4096 times less certain than its step: QR has no such limit
+            self._factorization = "QR"
             self._clear_pending()
-            self._restart(time_s, "QR")
+            self._restart(time_s)
             return
         self._clear_pending()
         self.values.update(self._window.calculateEstimate())
@@ -145,9 +147,9 @@ class Smoother:
         delta = self._window.getDelta()
         return any(np.abs(delta.at(key)).max() > self._stale_shift_m for key in self._landmarks)
 
-    def _restart(self, time_s: float, factorization: str = "CHOLESKY") -> None:
+    def _restart(self, time_s: float) -> None:
         """Solve the history; start a window whose prior is the marginal of all that lies before it."""
-        self._restart_size = int(RESTART_GROWTH * self.graph.size())
+        self._restart_size = max(FIRST_RESTART, int(RESTART_GROWTH * self.graph.size()))
         self.values = self._solve()
         times: dict[Any, float] = {key: t for key, t in self._expiring.items() if t >= time_s - self._lag_s}
         times |= dict.fromkeys(self._landmarks, time_s)
@@ -157,7 +159,7 @@ class Smoother:
             _copy(self.values, key, values)
         for factor in _marginal(outside, self.values, times):
             inside.push_back(factor)
-        self._window = self._new_window(factorization)
+        self._window = self._new_window()
         self._window.update(inside, values, times)
         self.values.update(self._window.calculateEstimate())
 

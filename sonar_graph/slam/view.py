@@ -65,6 +65,7 @@ class View:
         keyframe_T_sonar = motion.i_T_j.compose(body_T_sonar)
         self.world_T_sonar = world_T_keyframe.compose(keyframe_T_sonar)
         """The sonar at the frame."""
+        self._world_T_keyframe = world_T_keyframe
         self._covariance = covariance
         self._pose_row = covariance.rows[pose_key]
         self._bias_row = ABSENT if bias_key is None else covariance.rows[bias_key]
@@ -72,6 +73,17 @@ class View:
         self._to_keyframe = keyframe_T_sonar.inverse().AdjointMap()
         self._to_body = body_T_sonar.inverse().AdjointMap()
         self._motion = motion
+
+    def height_variance(self, point: Floats) -> float:
+        """Variance of the world z of a point fixed to the body at the frame, shape (3,) in the world, m².
+
+        Of keyframe and motion; that of the gyro bias, which turns about the vertical most of all, is left out.
+        """
+        by_keyframe = _height_derivative(self._world_T_keyframe, point)
+        by_body = _height_derivative(self._world_T_keyframe.compose(self._motion.i_T_j), point)
+        r = self._pose_row
+        P = self._covariance.matrix[r : r + 6, r : r + 6]
+        return float(by_keyframe @ P @ by_keyframe + by_body @ self._motion.covariance @ by_body)
 
     def expect(self, keys: list[int], points: Floats) -> tuple[Floats, Floats]:
         """What landmarks at points of the world, shape (m, 3), are expected to show.
@@ -104,6 +116,12 @@ class View:
         The motion's part is added to each variance; that it correlates range and azimuth a little is left out.
         """
         return _blurred(cov, points, self._world_T_sonar, self._to_body, motion.covariance)
+
+
+def _height_derivative(world_T_body: gtsam.Pose3, point: Floats) -> Floats:
+    """Derivative of the world z of a point of the body by the right perturbation of its pose, shape (6,)."""
+    up = world_T_body.rotation().matrix()[2]
+    return np.concatenate([np.cross(world_T_body.transformTo(point), up), up])
 
 
 @compiled

@@ -355,3 +355,34 @@ def test_depths_that_come_late_are_passed_over():
     in_order, again, more = depth_factor(0.3, 0.9), depth_factor(0.3, 0.9, 0.9, 0.6), depth_factor(0.3, 0.6, 0.9)
     assert in_order.equals(again, 1e-12)
     assert not in_order.equals(more, 1e-3)
+
+
+def test_rows_that_come_between_two_questions_about_one_instant_count():
+    """A live feed delivers a Doppler row late, after the motion to that instant was already asked for."""
+    until, calibration = int(at(1.0)[0]), Calibration(imu=NO_BIAS, dvl=EXACT_DVL)
+    late = Dvl(at(1.0), np.array([[0.9, 0.0, 0.0]]), np.full((1, 3, 3), np.nan))
+    asked_twice, at_once = keyframes_of(calibration), keyframes_of(calibration)
+    for keyframes in (asked_twice, at_once):
+        keyframes.add(level_imu(2.0), steady_dvl(0.8), None)
+        keyframes.advance(int(at(0.0)[0]))
+    before = asked_twice.motion_since_newest(until)
+    for keyframes in (asked_twice, at_once):
+        keyframes.add(None, late, None)
+    after, expected = asked_twice.motion_since_newest(until), at_once.motion_since_newest(until)
+    assert after.i_T_j.equals(expected.i_T_j, 1e-12)
+    assert not after.i_T_j.equals(before.i_T_j, 1e-3)
+
+
+def test_what_carrying_a_depth_adds_is_the_vertical_noise_of_the_tilted_doppler_log():
+    """World z of the noise of a vehicle that is rolled, pitched and turned, by scipy."""
+    sigmas, rpy = np.array([0.1, 0.02, 0.05]), (0.3, -0.5, 1.1)
+    calibration = Calibration(
+        imu=NO_BIAS, dvl=DvlCalibration(velocity_sigma_m_s=tuple(sigmas)), start=Start(rpy_rad=rpy)
+    )
+    keyframes = driven(calibration, 1.0)
+    steps = keyframes.odometry.steps_between_nodes(keyframes.stamps_ns[0], int(at(0.8)[0]))
+    world_R_body = Rotation.from_euler("xyz", rpy).as_matrix()
+    up, wrong = world_R_body[2], world_R_body[:, 2]
+    mean_psd = np.average(steps.velocity_psd, axis=0, weights=steps.duration_s)
+    assert keyframes._wander_m2_s(steps) == pytest.approx(up @ mean_psd @ up)
+    assert up @ mean_psd @ up != pytest.approx(wrong @ mean_psd @ wrong, rel=0.1)

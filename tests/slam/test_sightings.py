@@ -120,6 +120,27 @@ def test_a_floor_out_of_the_aperture_is_believed_all_the_same():
     assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-3)
 
 
+def test_a_landmark_that_cannot_stand_on_the_floor_does_not_drag_the_vehicle_there():
+    """0.5 rad below the centre beam is seven sigmas of the aperture: no floor is said, but the aperture is."""
+    floor = FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.9), sigma_m=0.01)
+    dive, without = Dive(CALIBRATION.model_copy(update={"floor": floor})), Dive()
+    for each in (dive, without):
+        each.see(0.0, (5, 3.0, 0.0))
+        each.smoother.update(each.keyframes.newest_s)
+    assert dive.smoother.graph.equals(without.smoother.graph, 1e-12)
+    assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-9)
+
+
+def test_a_doubtful_height_of_the_vehicle_lets_the_floor_be_farther():
+    floor = FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.9), sigma_m=0.01)
+    start = Start(position_sigma_m=(0.05, 0.02, 2.0), rpy_sigma_rad=(0.01, 0.01, 0.03))
+    dive = Dive(CALIBRATION.model_copy(update={"floor": floor, "start": start}))
+    dive.see(0.0, (5, 3.0, 0.0))
+    for _ in range(5):
+        dive.smoother.update(dive.keyframes.newest_s)
+    assert dive.smoother.values.atPoint3(L(5))[2] == pytest.approx(floor.z_m, abs=1e-2)
+
+
 def test_a_frame_between_keyframes_is_seen_from_where_the_vehicle_was():
     """0.35 s after the keyframe the vehicle is 0.175 m further on."""
     dive = Dive()
@@ -355,3 +376,45 @@ def test_a_frame_that_brings_a_keyframe_hangs_on_it():
     beam = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
     seen = np.array([0.3 + 0.5 * 1.05, 0.1, -0.1]) + 3.0 * beam
     assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(seen, abs=1e-6)
+
+
+def factor_of(dive: Dive, kind: type) -> gtsam.NonlinearFactor:
+    graph = dive.smoother.graph
+    (factor,) = [graph.at(k) for k in range(graph.size()) if isinstance(graph.at(k), kind)]
+    return factor
+
+
+def test_factors_of_a_frame_off_its_keyframe_carry_the_noise_of_the_motion():
+    """0.35 s of a Doppler log of 0.2 m/s: the range factor is as doubtful as what `View.blurred` says."""
+    noisy = CALIBRATION.model_copy(update={"dvl": DvlCalibration(velocity_sigma_m_s=(0.2, 0.2, 0.2))})
+    at_the_keyframe, off_it = Dive(noisy), Dive(noisy)
+    at_the_keyframe.see(0.0, (5, 3.0, 0.0))
+    off_it.see(0.35, (5, 3.0, 0.0))
+    sigmas = [
+        factor_of(dive, gtsam.RangeFactorWithTransform3D).noiseModel().sigma() for dive in (at_the_keyframe, off_it)
+    ]
+    motion = off_it.keyframes.motion_since_newest(T0_NS + round(0.35 * NS))
+    assert sigmas[0] == pytest.approx(SONAR.range_sigma_m)
+    assert sigmas[1] == pytest.approx(np.sqrt(SONAR.range_sigma_m**2 + motion.covariance[3, 3]), rel=1e-2)
+    assert sigmas[1] > 1.5 * sigmas[0]
+
+
+def test_a_sightline_begins_where_the_sonar_was_at_the_frame():
+    dive = Dive()
+    dive.see(0.35, (5, 3.0, 0.0))
+    placed = dive.smoother.sightlines.placed_anew(dive.smoother.values, [L(5)])
+    assert placed.atPoint3(L(5)) == pytest.approx(dive.smoother.values.atPoint3(L(5)))
+
+
+def test_rows_of_one_frame_keep_their_own_covariance():
+    """The calibration's noise is only for the row whose log does not say."""
+    told = np.diag([0.05**2, 0.03**2])
+    both = frame(T0_NS, ((5, 3.0, 0.0), (6, 2.5, 0.1)))
+    both = replace(both, range_azimuth_cov=np.array([told, np.full((2, 2), np.nan)]))
+    dive = Dive()
+    dive.keyframes.advance(T0_NS)
+    dive.sightings.add(both)
+    graph = dive.smoother.graph
+    ranges = [graph.at(k) for k in range(graph.size()) if isinstance(graph.at(k), gtsam.RangeFactorWithTransform3D)]
+    sigmas = {list(factor.keys())[1]: factor.noiseModel().sigma() for factor in ranges}
+    assert sigmas == {L(5): pytest.approx(0.05), L(6): pytest.approx(SONAR.range_sigma_m)}

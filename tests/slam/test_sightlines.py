@@ -78,3 +78,21 @@ def test_a_landmark_stuck_behind_comes_round_in_the_solution_of_the_history():
     values, _ = smoother.solve_history()
     assert values.atPoint3(L(1)) == pytest.approx(world_point(*Z), abs=1e-6)
     assert smoother.graph.error(values) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_new_start_that_ends_higher_is_not_taken():
+    """One sharp sighting ahead against two dull ones behind: most lie behind, yet the landmark is where it is best."""
+    smoother = Smoother(lag_s=10.0, relinearize_threshold=1e-3, stale_shift_m=0.1)
+    smoother.add_pose(X(0), POSE, 0.0)
+    smoother.add([gtsam.PriorFactorPose3(X(0), POSE, gtsam.noiseModel.Isotropic.Sigma(6, 1e-3))])
+    smoother.add_landmark(L(1), world_point(*Z))
+    opposite = np.array([2.0, Z[1] + 0.95 * np.pi])
+    for z, sigma in ((Z, 1e-3), (opposite, 0.3), (opposite, 0.3)):
+        smoother.add(factors.landmark_sighting(X(0), L(1), BODY_T_SONAR, z, np.eye(2) * sigma**2, lambda n: n, 0.07))
+        smoother.sightlines.add(L(1), Sightline(X(0), BODY_T_SONAR, z))
+    assert smoother.sightlines.turned_away(smoother.values) == [L(1)]
+    elsewhere = solve(smoother.graph, smoother.sightlines.placed_anew(smoother.values, [L(1)]))
+    values, _ = smoother.solve_history()
+    assert np.linalg.norm(elsewhere.atPoint3(L(1)) - world_point(*Z)) > 1.0
+    assert np.linalg.norm(values.atPoint3(L(1)) - world_point(*Z)) < 0.01
+    assert smoother.graph.error(values) < smoother.graph.error(elsewhere)

@@ -6,6 +6,7 @@ import pytest
 from gtsam.symbol_shorthand import B, L, X
 
 import sonar_graph.slam.smoother as smoother_module
+from sonar_graph.calibration import Calibration, Start
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.slam import factors
@@ -388,3 +389,40 @@ def test_drift_beyond_what_cholesky_takes_is_survived():
     assert smoother.covariance(X(2))[5, 5] == pytest.approx(variance, rel=1e-6)
     _, marginals = smoother.solve_history()
     assert marginals.marginalCovariance(X(2))[5, 5] == pytest.approx(variance, rel=1e-6)
+
+
+@pytest.mark.parametrize(("shift_m", "is_due"), [(0.09, False), (0.11, True)])
+def test_the_window_restarts_once_a_landmark_has_moved_by_the_stale_shift(monkeypatch, shift_m, is_due):
+    sizes = counted_solves(monkeypatch)
+    smoother = Smoother(1e9, 1.0, 0.1)
+    tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
+    smoother.add([gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), tight)] * FIRST_RESTART)
+    smoother.add_landmark(L(1), np.zeros(3))
+    there = np.array([shift_m, 0.0, 0.0])
+    smoother.add([gtsam.PriorFactorPoint3(L(1), there, gtsam.noiseModel.Isotropic.Sigma(3, 0.01))])
+    smoother.update(0.0)
+    assert bool(sizes) == is_due
+
+
+def test_a_start_that_is_hardly_known_is_smoothed_to_the_end(monkeypatch):
+    """100 m of doubt and millimetre odometry: Cholesky gives up, and the window stays with QR through its restarts."""
+    sizes = counted_solves(monkeypatch)
+    calibration_ = Calibration(start=Start(position_sigma_m=(100.0,) * 3))
+    fed = Fed(30.0, stale_shift_m=1e-9)
+    fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
+    fed.add([factors.start_prior(X(0), calibration_)])
+    cov, step = np.diag([1e-10] * 3 + [1e-6] * 3), gtsam.Pose3(gtsam.Rot3.Rz(0.02), np.array([0.1, 0.0, 0.0]))
+    motion = PreintegratedMotion(step, cov, np.zeros((6, 3)), np.zeros(3), 1.0, np.zeros(3))
+    truth, landmark = gtsam.Pose3(), np.array([3.0, 1.0, -1.0])
+    fed.smoother.add_landmark(L(1), landmark + np.array([0.3, -0.2, 0.1]))
+    for k in range(1, 100):
+        truth = truth.compose(step)
+        fed.smoother.add_pose(X(k), fed.smoother.values.atPose3(X(k - 1)).compose(step), float(k))
+        q = truth.compose(SONAR).transformTo(landmark)
+        z = np.array([np.linalg.norm(q), np.arctan2(q[1], q[0])])
+        fed.add([factors.odometry(X(k - 1), X(k), motion)])
+        fed.add(factors.landmark_sighting(X(k), L(1), SONAR, z, np.diag([4e-4, 8e-5]), plain, 0.3 if k == 1 else None))
+        fed.smoother.update(float(k))
+    assert len(sizes) > 2
+    assert np.linalg.norm(fed.smoother.values.atPose3(X(99)).translation() - truth.translation()) < 0.05

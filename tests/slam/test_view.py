@@ -144,6 +144,21 @@ def test_the_expected_covariance_is_that_of_many_draws():
 
 
 @keyframes
+def test_the_variance_of_a_height_is_that_of_keyframe_and_motion(keyframe):
+    """By differences of the world z of a point that moves with the body."""
+    view, motion, _, joint = some_view(keyframe, True)
+    body = keyframe.compose(motion.i_T_j)
+    q = np.array([1.5, -0.4, -0.8])
+
+    def z(change: Floats) -> float:
+        return moved(keyframe, motion, change[:6], np.zeros(3), change[6:]).transformFrom(q)[2]
+
+    J = np.array([(z(1e-6 * axis) - z(-1e-6 * axis)) / 2e-6 for axis in np.eye(12)])
+    expected = J[:6] @ joint.at(X(2), X(2)) @ J[:6] + J[6:] @ motion.covariance @ J[6:]
+    assert view.height_variance(body.transformFrom(q)) == pytest.approx(expected, rel=1e-6)
+
+
+@keyframes
 def test_blurred_noise_is_the_noise_and_the_variances_of_the_motion(keyframe):
     view, motion, landmarks, _ = some_view(keyframe, True)
     R = np.array([[4e-4, 3e-5], [3e-5, 8e-5]])
