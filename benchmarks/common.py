@@ -109,3 +109,10 @@ def _cell(value: object) -> str:
 def print_figures(figures: dict[str, Any]) -> None:
     """The last line: one JSON object."""
     print(json.dumps(figures, allow_nan=False))
+
+
+def conclude(figures: dict[str, Any], *, is_quick: bool) -> None:
+    """The last line; a full run that misses a target ends with exit code 1."""
+    print_figures(figures)
+    if not is_quick and not figures["passed"]:
+        raise SystemExit(1)

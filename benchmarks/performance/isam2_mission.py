@@ -26,7 +26,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, L, X
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
-from common import make_parser, note, print_figures, print_table
+from common import conclude, make_parser, note, print_table
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import LandmarkDetections, Measurements
@@ -269,7 +269,7 @@ def main() -> None:
     figures = report(race(simulate_mission(options)))
     for name, limit in TARGETS.items():
         print(f"{name}: {figures[name]:.3f}, target at most {limit:g}")
-    print_figures({"duration_s": duration_s, "landmarks": arguments.landmarks, **figures})
+    conclude({"duration_s": duration_s, "landmarks": arguments.landmarks, **figures}, is_quick=arguments.quick)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
-from common import in_parallel, make_parser, print_figures, print_table, refuse
+from common import conclude, in_parallel, make_parser, print_table, refuse
 
 from sonar_graph.evaluation.comparison import compare
 from sonar_graph.evaluation.consistency import anees_interval, anees_over_runs
@@ -156,7 +156,7 @@ def main() -> None:
     figures = report(verdicts)
     if arguments.out:
         draw(seconds[kept], nees, arguments.out)
-    print_figures({"runs": count, "duration_s": basin.duration_s, **figures})
+    conclude({"runs": count, "duration_s": basin.duration_s, **figures}, is_quick=arguments.quick)
 
 
 if __name__ == "__main__":

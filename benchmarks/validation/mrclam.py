@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
-from common import in_parallel, make_parser, print_figures, print_table, recording
+from common import conclude, in_parallel, make_parser, print_table, recording
 
 from sonar_graph.evaluation.comparison import judge
 from sonar_graph.evaluation.run import run_estimator
@@ -153,7 +153,7 @@ def main() -> None:
         ("target", "measured m", "at most m", ""),
         [(t.what, t.measured, t.limit, "met" if t.met else "NOT MET") for t in checks],
     )
-    print_figures({"robots": robots, **figures, "passed": all(t.met for t in checks)})
+    conclude({"robots": robots, **figures, "passed": all(t.met for t in checks)}, is_quick=arguments.quick)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
-from common import in_parallel, make_parser, note, print_figures, print_table
+from common import conclude, in_parallel, make_parser, note, print_table
 
 from sonar_graph.evaluation.alignment import align_yaw
 from sonar_graph.evaluation.results import RunResult
@@ -314,7 +314,7 @@ def main() -> None:
         "like for like": plain,
         "defaults": {"sensor noise and kernel": min(solutions, key=lambda solution: solution.cost)},
     }
-    print_figures(report(runs, batches))
+    conclude(report(runs, batches), is_quick=arguments.quick)
 
 
 def report(runs: dict[str, RunResult], batches: dict[str, dict[str, Batch]]) -> dict[str, Any]:

@@ -16,9 +16,9 @@ tests against `sonar_graph.slam.models`. Range and azimuth are two factors, so t
   projection (Kannala and Brandt, IEEE PAMI 28(8), 2006, equation 6 without distortion): a direction at angle ``t`` from
   the axis has an image point at distance ``t`` from its centre. The horizontal coordinate of a point at elevation 0 is
   ``azimuth - measured``; at a small elevation ``e`` it is that times ``e / tan(e)`` (0.995 at 7 degrees), zero where
-  the azimuth is as measured, whatever ``e``. The vertical coordinate is ``e`` near the axis. A horizontal and a vertical sigma thus
-  say what is known. A pinhole, with tangents for angles, lets an azimuth that is wrong by tens of degrees pull much
-  harder.
+  the azimuth is as measured, whatever ``e``. The vertical coordinate is ``e`` near the axis. A horizontal and a
+  vertical sigma thus say what is known. A pinhole, with tangents for angles, lets an azimuth that is wrong by tens of
+  degrees pull much harder.
 """
 
 from __future__ import annotations
