@@ -11,6 +11,7 @@ LogPath = Annotated[
     Path, typer.Argument(metavar="LOG", exists=True, dir_okay=False, readable=True, help="MCAP log to read.")
 ]
 OutputLog = Annotated[Path, typer.Option("--output", "-o", metavar="OUT.mcap", help="MCAP log to write.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a file even where sonar-graph did not write it.")]
 OutputFolder = Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write to.")]
 CalibrationPath = Annotated[
     Path | None,

@@ -21,7 +21,7 @@ from sonar_graph.cli.arguments import (
     StartTime,
     TopicChoices,
 )
-from sonar_graph.cli.outputs import writable_folder
+from sonar_graph.cli.outputs import writable_folder, writable_log
 from sonar_graph.cli.progress import Report, progress_bars, working
 from sonar_graph.cli.settings import estimator_settings, read_calibration, read_config, topic_choices, window_of
 from sonar_graph.cli.texts import answers
@@ -48,6 +48,11 @@ class LogSource:
     start: str | None = None
     end: str | None = None
     salvage: bool = False
+
+    @property
+    def files(self) -> tuple[Path | None, ...]:
+        """What is read, and must not be overwritten."""
+        return self.path, self.calibration, self.config
 
     def read(self, progress: Report) -> Sequence:
         """The log as a sequence; the errors are those of reading a log, a calibration, or choices of topics."""
@@ -128,7 +133,7 @@ def demo(output: OutputFolder = Path("demo")) -> None:
     from sonar_graph.logs.writing import write_sequence
     from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
-    log = writable_folder(output) / "basin.mcap"
+    log = writable_log(writable_folder(output) / "basin.mcap")
     with working("simulating"):
         write_sequence(log, simulate_basin(BasinOptions.model_validate(DEMO)))
     compare(log, output)
@@ -155,7 +160,7 @@ def _compare_log(
 
     overrides = estimator_settings(settings or [], names)
     _check_settings(names, overrides)
-    writable_folder(output)
+    writable_folder(output, source.files)
     with progress_bars() as progress:
         sequence = source.read(progress)
     with progress_bars() as progress:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sonar_graph.cli.arguments import OutputLog
+from sonar_graph.cli.arguments import OutputLog, Overwrite
 from sonar_graph.cli.outputs import writable_log
 from sonar_graph.cli.progress import progress_bars, working
 from sonar_graph.cli.texts import examples
@@ -40,11 +40,12 @@ def mrclam(
     dataset: DatasetFolder,
     output: OutputLog,
     robot: Annotated[int, typer.Option(help="Robot, 1 to 5.")],
+    overwrite: Overwrite = False,
 ) -> None:
     """UTIAS multi-robot data set: odometry, ranges and bearings to landmarks, motion-capture truth."""
     from sonar_graph.logs.converters.mrclam import read_mrclam
 
-    _convert(lambda: read_mrclam(dataset, robot), output)
+    _convert(lambda: read_mrclam(dataset, robot), dataset, output, overwrite)
 
 
 @datasets.command("victoria-park", epilog=examples("sonar-graph convert victoria-park -o victoria_park.mcap"))
@@ -54,11 +55,12 @@ def victoria_park(
         Path | None,
         typer.Option("--file", exists=True, dir_okay=False, help="Default: the one which the gtsam package brings."),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Victoria Park: a truck among trees, odometry and landmarks, no truth."""
     from sonar_graph.logs.converters.victoria_park import read_victoria_park
 
-    _convert(lambda: read_victoria_park(source), output)
+    _convert(lambda: read_victoria_park(source), source, output, overwrite)
 
 
 @datasets.command(epilog=examples("sonar-graph convert dlr DLR -o dlr.mcap"))
@@ -67,11 +69,12 @@ def dlr(
         Path, typer.Argument(metavar="PATH", exists=True, help="Folder of the data set, or its map.circles file.")
     ],
     output: OutputLog,
+    overwrite: Overwrite = False,
 ) -> None:
     """DLR Spatial Cognition: a robot in an office building, artificial landmarks with IDs, no truth."""
     from sonar_graph.logs.converters.dlr import read_dlr
 
-    _convert(lambda: read_dlr(dataset), output)
+    _convert(lambda: read_dlr(dataset), dataset, output, overwrite)
 
 
 @datasets.command(epilog=examples("sonar-graph convert akit A-KIT --trajectory 1 -o akit_1.mcap"))
@@ -79,11 +82,12 @@ def akit(
     dataset: DatasetFolder,
     output: OutputLog,
     trajectory: Annotated[int, typer.Option(help="Trajectory, counted from 1.")],
+    overwrite: Overwrite = False,
 ) -> None:
     """A-KIT: an autonomous underwater vehicle at sea, fibre-optic IMU and DVL, navigation-system reference."""
     from sonar_graph.logs.converters.akit import read_akit
 
-    _convert(lambda: read_akit(dataset, trajectory), output)
+    _convert(lambda: read_akit(dataset, trajectory), dataset, output, overwrite)
 
 
 @datasets.command(
@@ -94,11 +98,12 @@ def akit(
 def rosbag(
     bag: Annotated[Path, typer.Argument(metavar="BAG", exists=True, help="ROS 1 .bag, or folder of a ROS 2 bag.")],
     output: OutputLog,
+    overwrite: Overwrite = False,
 ) -> None:
     """Any ROS 1 bag, or ROS 2 bag of the sqlite3 kind, with all its topics."""
     from sonar_graph.logs.converters.rosbag import convert_rosbag
 
-    path = writable_log(output)
+    path = writable_log(output, bag, overwrite=overwrite)
     with progress_bars() as progress:
         done = convert_rosbag(bag, path, lambda number, total: progress(f"converting {bag.name}", number, total))
     typer.echo(f"{bag.name}: {done.duration_s:.1f} s, {done.messages} messages on {done.topics} topics")
@@ -126,33 +131,37 @@ def didson(
         float | None,
         typer.Option(min=1350, max=1650, help="Of the water, m/s; default: ranges as the sonar names them (1465 m/s)."),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Images of a DIDSON (.ddf, versions 3 and 4)."""
     from sonar_graph.logs.converters.didson import convert_didson
 
-    _convert_sonar(
-        lambda log, progress: convert_didson(recording, log, progress, sound_speed_m_s=sound_speed), recording, output
-    )
+    def convert(log: Path, progress: Progress) -> SonarConversion:
+        return convert_didson(recording, log, progress, sound_speed_m_s=sound_speed)
+
+    _convert_sonar(convert, recording, output, overwrite)
 
 
 @datasets.command(epilog=examples("sonar-graph convert aris dive.aris -o dive_sonar.mcap"))
-def aris(recording: SonarRecording, output: OutputLog) -> None:
+def aris(recording: SonarRecording, output: OutputLog, overwrite: Overwrite = False) -> None:
     """Images of an ARIS (.aris)."""
     from sonar_graph.logs.converters.aris import convert_aris
 
-    _convert_sonar(lambda log, progress: convert_aris(recording, log, progress), recording, output)
+    _convert_sonar(lambda log, progress: convert_aris(recording, log, progress), recording, output, overwrite)
 
 
 @datasets.command(epilog=examples("sonar-graph convert oculus pings.raw -o dive_sonar.mcap"))
-def oculus(recording: SonarRecording, output: OutputLog) -> None:
+def oculus(recording: SonarRecording, output: OutputLog, overwrite: Overwrite = False) -> None:
     """Images of an Oculus: its network messages, one after another in a file."""
     from sonar_graph.logs.converters.oculus import convert_oculus
 
-    _convert_sonar(lambda log, progress: convert_oculus(recording, log, progress), recording, output)
+    _convert_sonar(lambda log, progress: convert_oculus(recording, log, progress), recording, output, overwrite)
 
 
-def _convert_sonar(convert: Callable[[Path, Progress], SonarConversion], recording: Path, output: Path) -> None:
-    path = writable_log(output)
+def _convert_sonar(
+    convert: Callable[[Path, Progress], SonarConversion], recording: Path, output: Path, overwrite: bool
+) -> None:
+    path = writable_log(output, recording, overwrite=overwrite)
     with progress_bars() as progress:
         done = convert(path, lambda at, size: progress(f"converting {recording.name}", at, size))
     typer.echo(f"{recording.name}: {done.frames} frames, {done.duration_s:.1f} s")
@@ -161,10 +170,10 @@ def _convert_sonar(convert: Callable[[Path, Progress], SonarConversion], recordi
     typer.echo(f"Log: {path}\nWhat is in it: sonar-graph inspect {path}")
 
 
-def _convert(read: Callable[[], Sequence], output: Path) -> None:
+def _convert(read: Callable[[], Sequence], source: Path | None, output: Path, overwrite: bool) -> None:
     from sonar_graph.logs.writing import write_sequence
 
-    path = writable_log(output)
+    path = writable_log(output, source, overwrite=overwrite)
     with working("converting"):
         sequence = read()
         write_sequence(path, sequence)

@@ -1,25 +1,43 @@
-"""Places to write to, tried before any long work begins."""
+"""Places to write to, tried before any long work begins; nothing that the user wrote is overwritten."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from tempfile import TemporaryFile
 
 from sonar_graph.errors import EvaluationError, LogError
 
+_WRITTEN = ("report.html", "comparison.json", "sequence.npz", "result.mcap", "result.foxglove.json", "result.rviz")
+_WRITTEN_FOR_A_RUN = ("trajectory.tum", "causal.tum", "landmarks.csv", "result.json", "series.npz")
 
-def writable_log(path: Path) -> Path:
+
+def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = False) -> Path:
     """``path``, with its folder made, once it is known that a log can be written there.
+
+    Parameters
+    ----------
+    path
+        Of the log.
+    source
+        File or folder that it is made from; never overwritten.
+    overwrite
+        Replace a file that this package did not write.
 
     Raises
     ------
     LogError
-        When it is a folder, is not called ``*.mcap``, or its folder cannot be written to.
+        When it is a folder, is not called ``*.mcap``, is the source or a part of it, is a file that this package did
+        not write, or its folder cannot be written to.
     """
     if path.is_dir():
         raise LogError(f"{path}: is a folder; give the name of a file such as {path / 'log.mcap'}")
     if path.suffix != ".mcap":
         raise LogError(f"{path}: logs are MCAP files; give a name that ends in .mcap")
+    if source is not None and _is_part_of(path, source):
+        raise LogError(f"{path}: is what is read, and would be overwritten; choose another name with -o")
+    if not (overwrite or _is_replaceable(path)):
+        raise LogError(f"{path}: exists, and sonar-graph did not write it; choose another name, or give --overwrite")
     try:
         _try_writing_in(path.parent)
     except OSError as error:
@@ -27,21 +45,57 @@ def writable_log(path: Path) -> Path:
     return path
 
 
-def writable_folder(path: Path) -> Path:
-    """``path``, made where it did not exist, once it is known that files can be written there.
+def writable_folder(path: Path, sources: Iterable[Path | None] = ()) -> Path:
+    """``path``, made where it did not exist, once it is known that a comparison can be written there.
+
+    Parameters
+    ----------
+    path
+        Of the folder.
+    sources
+        Files that are read; never overwritten.
 
     Raises
     ------
     EvaluationError
-        When it is a file or cannot be written to.
+        When it is a file, cannot be written to, or holds a source under a name that is written, or a
+        ``result.mcap`` that this package did not write.
     """
     if path.exists() and not path.is_dir():
         raise EvaluationError(f"{path}: is a file; give a folder with -o")
+    for written in _written_in(path):
+        if any(source is not None and written.samefile(source) for source in sources):
+            raise EvaluationError(
+                f"{written}: is what is read, and would be overwritten; choose another folder with -o"
+            )
+        if written.suffix == ".mcap" and not _is_replaceable(written):
+            raise EvaluationError(f"{written}: exists, and sonar-graph did not write it; choose another folder with -o")
     try:
         _try_writing_in(path)
     except OSError as error:
         raise EvaluationError(f"{path}: cannot be written: {error.strerror}; choose another place with -o") from error
     return path
+
+
+def _written_in(folder: Path) -> Iterator[Path]:
+    """What is there under the names of a comparison's files."""
+    names = [folder / name for name in _WRITTEN]
+    names += [run / name for run in folder.glob("runs/*") for name in _WRITTEN_FOR_A_RUN]
+    yield from (path for path in names if path.exists())
+
+
+def _is_part_of(path: Path, source: Path) -> bool:
+    """Whether a file is the source, be it through links, or lies in the folder that is the source."""
+    if not path.exists():
+        return False
+    return path.samefile(source) or (source.is_dir() and path.resolve().is_relative_to(source.resolve()))
+
+
+def _is_replaceable(path: Path) -> bool:
+    """Whether a file holds nothing, or what this package can make again."""
+    from sonar_graph.logs.recorder import is_own_log
+
+    return not path.exists() or path.stat().st_size == 0 or is_own_log(path)
 
 
 def _try_writing_in(folder: Path) -> None:

@@ -10,6 +10,7 @@ rosbag2, so that ``ros2 bag play`` offers it: without it RViz would never receiv
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from mcap.writer import Writer
+from mcap.writer import MCAP0_MAGIC, Writer
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.layout import Bytes
@@ -32,6 +33,10 @@ TRANSIENT_LOCAL = (
     f"liveliness: 1, liveliness_lease_duration: {_FOREVER}, avoid_ros_namespace_conventions: false}}"
 )
 """Keep last, reliable, transient local: the numbers of rmw's enumerations, as rosbag2 has them up to version 8."""
+LIBRARY = "sonar-graph"
+"""What the head of a log says that this package wrote."""
+_OWN_HEAD = struct.pack(f"<I4sI{len(LIBRARY)}s", 4, b"ros2", len(LIBRARY), LIBRARY.encode())
+_HEAD_AT = 17  # after the magic bytes, an opcode and a length
 ROSBAG2_METADATA = {"serialized_metadata": ""}
 """Makes newer versions of rosbag2, which write words, read numbers in what a channel offers."""
 
@@ -120,13 +125,20 @@ def recording(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> Iterator
         raise LogError(f"{path} cannot be written: {error.strerror}") from error
 
 
+def is_own_log(path: Path) -> bool:
+    """Whether the head of a file says that it is a log which this package wrote."""
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD_AT + len(_OWN_HEAD))
+    return head.startswith(MCAP0_MAGIC) and head[_HEAD_AT:] == _OWN_HEAD
+
+
 class RecordingWriter:
     """Writes to an open file; memory holds one chunk and what the index needs."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
         self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
-        self._writer.start(profile="ros2", library="sonar-graph")
+        self._writer.start(profile="ros2", library=LIBRARY)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._offers_latched = False

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from mcap.writer import Writer
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.recorder import ROSBAG2_METADATA, TRANSIENT_LOCAL
+from sonar_graph.logs.recorder import LIBRARY, ROSBAG2_METADATA, TRANSIENT_LOCAL
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -119,7 +119,7 @@ class _Copy:
         from rosbags.serde import SerdeError
 
         bag, writer = self._bag, self._writer
-        writer.start(profile="ros2", library="sonar-graph")
+        writer.start(profile="ros2", library=LIBRARY)
         self._add_source()
         connections = [c for c in bag.connections if c.msgtype in bag.typestore.fielddefs]
         missing = {c.topic: f"{c.msgtype} is not defined in the bag" for c in bag.connections if c not in connections}

@@ -1,0 +1,39 @@
+"""Commands as a user gives them, and a short log to give them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from sonar_graph.cli import main
+from sonar_graph.logs.writing import write_sequence
+from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+
+
+def run_command(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main([str(argument) for argument in arguments])
+    return int(stop.value.code or 0)
+
+
+@pytest.fixture(scope="session")
+def run() -> Callable[..., int]:
+    """Gives the exit code of ``sonar-graph`` with these arguments."""
+    return run_command
+
+
+@pytest.fixture(scope="session")
+def basin_content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    log = tmp_path_factory.mktemp("log") / "basin.mcap"
+    write_sequence(log, simulate_basin(BasinOptions(seed=3, duration_s=120.0, laps=1)))
+    return log.read_bytes()
+
+
+@pytest.fixture
+def basin(basin_content: bytes, tmp_path: Path) -> Path:
+    """A log of a short run in the basin."""
+    log = tmp_path / "basin.mcap"
+    log.write_bytes(basin_content)
+    return log
