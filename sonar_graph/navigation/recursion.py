@@ -100,7 +100,7 @@ def increment(dR: Matrix, duration_s: float, rate: Vector, velocity: Vector, lev
         The DVL in the body frame, m.
     """
     phi, u = scaled(duration_s, rate), minus(velocity, cross(rate, lever))
-    turn, chord = _rotations(phi)
+    turn, chord = exp_and_chord(phi)
     turned = product(dR, chord)
     by_rate = sum_of(product(dR, _chord_derivative(phi, u, duration_s)), times_skew(turned, lever))
     return Increment(turn, scaled(duration_s, times(turned, u)), turned, by_rate)
@@ -202,7 +202,7 @@ def trace_point(
     before, elapsed, n = p, 0.0, 0
     for k in range(len(duration)):
         dt, w = duration[k], minus(vector(rate[k]), body_bias)
-        turn, chord = _rotations(scaled(dt, w))
+        turn, chord = exp_and_chord(scaled(dt, w))
         step = scaled(dt, times(chord, minus(vector(velocity[k]), cross(w, arm))))
         dp, dR = plus(dp, times(dR, step)), product(dR, turn)
         after = transformed(dp, dR, p)
@@ -218,9 +218,16 @@ def trace_point(
 
 
 @compiled
-def _rotations(phi: Vector) -> tuple[Matrix, Matrix]:
+def exp_and_chord(phi: Vector) -> tuple[Matrix, Matrix]:
     """Exp(phi) and J_l(phi) at once: they share sine and cosine, and a sample's turn needs neither."""
     angle2 = dot(phi, phi)
+    s1, s2, s3 = sine_series(angle2)
+    return rotation_series(phi, angle2, s1, s2), rotation_series(phi, angle2, s2, s3)
+
+
+@compiled
+def sine_series(angle2: float) -> Vector:
+    """``sum_n (-x)^n / (2n + k)!`` for k = 1, 2, 3: sin(t)/t, (1 - cos(t))/t^2, (t - sin(t))/t^3 with ``x = t^2``."""
     if angle2 < SERIES_ANGLE2:
         s1 = 1.0 - angle2 * (1.0 / 6.0 - angle2 * (1.0 / 120.0 - angle2 / 5040.0))
         s2 = 0.5 - angle2 * (1.0 / 24.0 - angle2 * (1.0 / 720.0 - angle2 / 40320.0))
@@ -229,11 +236,11 @@ def _rotations(phi: Vector) -> tuple[Matrix, Matrix]:
         angle = np.sqrt(angle2)
         s1, s2 = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
         s3 = (1.0 - s1) / angle2
-    return _rotation_series(phi, angle2, s1, s2), _rotation_series(phi, angle2, s2, s3)
+    return s1, s2, s3
 
 
 @compiled
-def _rotation_series(phi: Vector, angle2: float, a: float, b: float) -> Matrix:
+def rotation_series(phi: Vector, angle2: float, a: float, b: float) -> Matrix:
     """``I + a [phi]x + b [phi]x^2``, with ``[phi]x^2 = phi phi^T - |phi|^2 I``."""
     x, y, z = phi
     d = 1.0 - b * angle2

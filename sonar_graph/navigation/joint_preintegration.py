@@ -1,0 +1,231 @@
+"""Joint preintegration of gyro, accelerometer and Doppler log between two keyframes.
+
+From body frame i to body frame j, t seconds later, with world gravity g and every point of the body known by its place
+in it (a: the IMU, d: the Doppler log)::
+
+    R = i_R_j                              rotation
+    v = i_R_world (v_a,j - v_a,i - g t)           velocity that the accelerometer gained
+    p = i_R_world (a_j - a_i - v_a,i t - g t^2 / 2)     position that it gained
+    s = i_R_world (d_j - d_i)                     displacement by the Doppler log
+
+with one covariance of all twelve errors, since the gyros turn all of them and, with the rule "inertial", the
+accelerometer draws s between the Doppler samples. Each measurement enters once. Lever arms need no rates: v and p are
+those of the IMU's point, s that of the Doppler log's.
+Derivation: docs/theory/preintegration.md. After Forster et al., TRO 2017, section VI.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import gtsam
+import numpy as np
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.errors import MeasurementError
+from sonar_graph.measurements import Dvl, Floats, Imu
+from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
+from sonar_graph.navigation.joint_recursion import Inertial, preintegrate
+from sonar_graph.navigation.joint_rules import RULES, DopplerRule
+
+ROTATION, VELOCITY, POSITION, DISPLACEMENT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+"""Rows of a covariance and of derivatives."""
+GYRO, ACCEL, SCALE, MOUNTING = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 10)
+"""Columns of derivatives."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointMotion:
+    """Motion from body frame i to body frame j, a Doppler sample at either end.
+
+    Errors are ``[theta, dv, dp, ds]``: theta in frame j (``R Exp(theta)``), the others added in frame i. Where the
+    specific force was not measured, velocity and position and all that belongs to them are NaN.
+    """
+
+    i_R_j: gtsam.Rot3
+    velocity: Floats
+    """v, shape (3,), m/s."""
+    position: Floats
+    """p, shape (3,), m."""
+    displacement: Floats
+    """s, shape (3,), m."""
+    inner_covariance: Floats
+    """Shape (12, 12), without the noise of the two Doppler samples at the ends."""
+    D_parameters: Floats
+    """Derivatives of the errors by gyro bias, accelerometer bias, scale and mounting, shape (12, 10)."""
+    end_weights: tuple[Floats, Floats]
+    """Derivative of s by the velocity (body axes) of the first and of the last Doppler sample, shape (3, 3), s."""
+    end_covariances: tuple[Floats, Floats]
+    """Of these two samples, shape (3, 3), m²/s²."""
+    shared_covariance: Floats
+    """What sharing the first sample with the motion before adds to s, shape (3, 3), m²; zero before `after`."""
+    bias: Floats
+    """Gyro and accelerometer bias that were removed, body axes, shape (6,), rad/s and m/s²."""
+    duration_s: float
+    body_p_imu: Floats
+    """Shape (3,), m."""
+    body_p_dvl: Floats
+    """Shape (3,), m."""
+
+    @property
+    def covariance(self) -> Floats:
+        """Of the errors, shape (12, 12)."""
+        P = self.inner_covariance.copy()
+        for W, Q in zip(self.end_weights, self.end_covariances, strict=True):
+            P[DISPLACEMENT, DISPLACEMENT] += W @ Q @ W.T
+        P[DISPLACEMENT, DISPLACEMENT] += self.shared_covariance
+        return P
+
+    def after(self, before: JointMotion) -> JointMotion:
+        """The same motion in a chain, next to the one before.
+
+        The Doppler sample between them moves both, so that their errors are correlated. Charging all of it to the later
+        one, ``C + C^T`` with ``C = R^T W_last Q W_first^T``, lets a graph take them as independent: the covariance of
+        the chain's displacement is then that of the samples with their weights, however it is cut.
+        """
+        C = before.i_R_j.matrix().T @ before.end_weights[1] @ self.end_covariances[0] @ self.end_weights[0].T
+        return replace(self, shared_covariance=C + C.T)
+
+    def corrected(self, change: Floats) -> JointMotion:
+        """For other parameters, to first order.
+
+        Parameters
+        ----------
+        change
+            Of gyro bias, accelerometer bias, scale and mounting, shape (10,).
+        """
+        error = self.D_parameters @ change
+        return replace(
+            self,
+            i_R_j=self.i_R_j.compose(gtsam.Rot3.Expmap(error[ROTATION])),
+            velocity=self.velocity + error[VELOCITY],
+            position=self.position + error[POSITION],
+            displacement=self.displacement + error[DISPLACEMENT],
+            bias=self.bias + change[:6],
+        )
+
+    def relative_pose(self) -> PreintegratedMotion:
+        """Rotation and Doppler displacement alone, as the body's relative pose.
+
+        The body's origin moves by ``s - (R - I) d``.
+        """
+        R, arm = self.i_R_j.matrix(), self.body_p_dvl
+        translation = self.displacement - R @ arm + arm
+        J = np.zeros((6, 12))
+        J[:3, ROTATION], J[3:, ROTATION] = np.eye(3), gtsam.SO3.Hat(arm)
+        J[3:, DISPLACEMENT] = R.T
+        used = np.r_[ROTATION, DISPLACEMENT]
+        cov = J[:, used] @ self.covariance[np.ix_(used, used)] @ J[:, used].T
+        D = J[:, used] @ self.D_parameters[used, GYRO]
+        pose = gtsam.Pose3(self.i_R_j, translation)
+        return PreintegratedMotion(pose, cov, D, self.bias[:3], self.duration_s, self.velocity / self.duration_s)
+
+
+@dataclass(frozen=True, eq=False)
+class JointPreintegrator:
+    """What joint preintegration needs to know of the sensors."""
+
+    gyro_noise_density: float
+    """rad/s/√Hz."""
+    accel_noise_density: float
+    """m/s²/√Hz."""
+    velocity_sigma_m_s: tuple[float, float, float] = (0.01, 0.01, 0.01)
+    """Of a Doppler sample along the log's axes, where its covariance is NaN."""
+    body_T_imu: gtsam.Pose3 = field(default_factory=gtsam.Pose3)
+    body_T_dvl: gtsam.Pose3 = field(default_factory=gtsam.Pose3)
+    rule: DopplerRule = "inertial"
+    """How a velocity is had between samples: `sonar_graph.navigation.joint_rules`."""
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration, rule: DopplerRule = "inertial") -> JointPreintegrator:
+        """Pick the numbers from a calibration."""
+        imu, dvl = calibration.imu, calibration.dvl
+        return cls(
+            imu.gyro_noise_density,
+            imu.accel_noise_density,
+            dvl.velocity_sigma_m_s,
+            imu.mounting.pose(),
+            dvl.mounting.pose(),
+            rule,
+        )
+
+    def integrate(
+        self,
+        imu: Imu,
+        dvl: Dvl,
+        start_ns: int,
+        end_ns: int,
+        bias: Floats | None = None,
+        earth_rate: Floats | None = None,
+    ) -> JointMotion:
+        """Motion between the stamps of two Doppler samples.
+
+        Parameters
+        ----------
+        imu, dvl
+            Rows that hold the interval; longer blocks cost nothing.
+        start_ns, end_ns
+            Stamps of rows of ``dvl``.
+        bias
+            Gyro and accelerometer bias in body axes to remove, shape (6,), rad/s and m/s²; None: zero.
+        earth_rate
+            Earth's rotation in body frame i, shape (3,), rad/s; None: not removed.
+
+        Raises
+        ------
+        MeasurementError
+            When an end is no Doppler stamp, the inertial rows do not reach both ends, or the rule needs a specific
+            force that was not measured.
+        """
+        doppler, inertial = self._doppler_rows(dvl, start_ns, end_ns), _inertial_rows(imu, start_ns, end_ns)
+        bias = np.zeros(6) if bias is None else np.asarray(bias, np.float64)
+        body_R_imu = self.body_T_imu.rotation().matrix()
+        force = inertial.specific_force @ body_R_imu.T
+        if self.rule == "inertial" and np.isnan(force).any():
+            raise MeasurementError('Imu.specific_force: not measured in every row; use the rule "linear"')
+        rows = Inertial(
+            inertial.stamps_ns,
+            inertial.angular_velocity @ body_R_imu.T,
+            force,
+            _vector(bias[:3]),
+            _vector(bias[3:]),
+            _vector(np.zeros(3) if earth_rate is None else earth_rate),
+            self.gyro_noise_density**2,
+            self.accel_noise_density**2,
+        )
+        R, (v, p, s), P, D, first, last = preintegrate(
+            rows, doppler.stamps_ns, doppler.velocity, doppler.velocity_cov, RULES[self.rule]
+        )
+        ends = doppler.velocity_cov[0], doppler.velocity_cov[-1]
+        duration_s = (end_ns - start_ns) * 1e-9
+        arms = self.body_T_imu.translation(), self.body_T_dvl.translation()
+        return JointMotion(gtsam.Rot3(R), v, p, s, P, D, (first, last), ends, np.zeros((3, 3)), bias, duration_s, *arms)
+
+    def _doppler_rows(self, dvl: Dvl, start_ns: int, end_ns: int) -> Dvl:
+        """Rows from one end to the other, in body axes, each with a covariance."""
+        first = int(np.searchsorted(dvl.stamps_ns, start_ns))
+        last = int(np.searchsorted(dvl.stamps_ns, end_ns))
+        if end_ns <= start_ns or last == len(dvl) or (dvl.stamps_ns[first], dvl.stamps_ns[last]) != (start_ns, end_ns):
+            raise MeasurementError(
+                f"Dvl.stamps_ns: no motion from {start_ns} to {end_ns} ns; take two of its stamps, the earlier first"
+            )
+        rows, body_R_dvl = dvl.rows(slice(first, last + 1)), self.body_T_dvl.rotation().matrix()
+        default = np.diag(np.square(self.velocity_sigma_m_s))
+        cov = np.where(np.isnan(rows.velocity_cov), default, rows.velocity_cov)
+        return Dvl(rows.stamps_ns, rows.velocity @ body_R_dvl.T, body_R_dvl @ cov @ body_R_dvl.T)
+
+
+def _inertial_rows(imu: Imu, start_ns: int, end_ns: int) -> Imu:
+    """Rows from the last at or before the start to the first at or after the end."""
+    first = int(np.searchsorted(imu.stamps_ns, start_ns, side="right")) - 1
+    last = int(np.searchsorted(imu.stamps_ns, end_ns))
+    if first < 0 or last == len(imu):
+        raise MeasurementError(
+            f"Imu.stamps_ns: rows from {imu.stamps_ns[0]} to {imu.stamps_ns[-1]} ns do not reach from {start_ns} to"
+            f" {end_ns} ns; begin and end at Doppler samples within them"
+        )
+    return imu.rows(slice(first, last + 1))
+
+
+def _vector(a: Floats) -> tuple[float, float, float]:
+    return float(a[0]), float(a[1]), float(a[2])

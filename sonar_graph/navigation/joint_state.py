@@ -1,0 +1,196 @@
+"""One inertial step: rotation, velocity, position and Doppler displacement, their covariance and derivatives.
+
+All errors are in frame i: ``R_true = Exp(theta) R``, ``v + dv``, ``p + dp``, ``s + ds``. Over a step of duration dt
+with constant rate and specific force f, and with ``G`` the integral and ``H`` the double integral of the rotation::
+
+    a = G f,  b = H f,  c = G u         u velocity of the DVL in body axes
+    v <- v + a,    p <- p + v dt + b,    s <- s + c
+    dv <- dv - [a]x theta,    dp <- dp + dv dt - [b]x theta,    ds <- ds - [c]x theta
+
+Isotropic gyro noise stays isotropic however the body turns: ``cov(theta) = n_g^2 t I``. A covariance with theta is then
+a vector m, ``cov(dx, theta) = -[m]x``, and one of two integrals x and y with increments a_x, a_y changes by::
+
+    cov(dx, dy) <- cov(dx, dy) - (h_y a_x^T + a_y h_x^T) + (a_x . h_y + a_y . h_x) I,     h = m + q a / 2
+
+where q is the variance of theta in the middle of the step. That is why a step costs little more than its mean.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.recursion import SERIES_ANGLE2, rotation_series, sine_series
+from sonar_graph.navigation.triples import (
+    IDENTITY,
+    ZERO,
+    ZEROS,
+    Matrix,
+    Vector,
+    dot,
+    multiple_of,
+    plus,
+    product,
+    scaled,
+    skew_times,
+    sum_of,
+    times,
+    transposed,
+)
+
+
+class Path(NamedTuple):
+    """The mean, in frame i."""
+
+    elapsed_s: float
+    R: Matrix
+    v: Vector
+    p: Vector
+    s: Vector
+
+
+class Spread(NamedTuple):
+    """Covariances; rows belong to the first letter, columns to the second."""
+
+    mv: Vector
+    mp: Vector
+    ms: Vector
+    vv: Matrix
+    vp: Matrix
+    pp: Matrix
+    sv: Matrix
+    sp: Matrix
+    ss: Matrix
+
+
+class Slopes(NamedTuple):
+    """Derivatives by the biases of gyros (g) and accelerometers (a), the Doppler scale and the mounting."""
+
+    M: Matrix
+    """Integral of R: minus the derivative of theta by g and of v by a."""
+    N: Matrix
+    """Double integral of R: minus the derivative of p by a."""
+    v_g: Matrix
+    p_g: Matrix
+    s_g: Matrix
+    s_a: Matrix
+    s_scale: Vector
+    s_mounting: Matrix
+
+
+class Push(NamedTuple):
+    """What a step adds, in frame i."""
+
+    dt: float
+    turn: Matrix
+    G: Matrix
+    H: Matrix
+    a: Vector
+    b: Vector
+    c: Vector
+
+
+AT_REST = Path(0.0, IDENTITY, ZERO, ZERO, ZERO)
+NO_SPREAD = Spread(ZERO, ZERO, ZERO, ZEROS, ZEROS, ZEROS, ZEROS, ZEROS, ZEROS)
+NO_SLOPES = Slopes(ZEROS, ZEROS, ZEROS, ZEROS, ZEROS, ZEROS, ZERO, ZEROS)
+
+
+@compiled
+def push(R: Matrix, dt: float, rate: Vector, force: Vector) -> Push:
+    """A step of constant rate and specific force; without a displacement."""
+    phi = scaled(dt, rate)
+    angle2 = dot(phi, phi)
+    s1, s2, s3 = sine_series(angle2)
+    s4 = (0.5 - s2) / angle2 if angle2 > SERIES_ANGLE2 else 1 / 24 - angle2 * (1 / 720 - angle2 / 40320)
+    G = multiple_of(dt, product(R, rotation_series(phi, angle2, s2, s3)))
+    H = multiple_of(0.5 * dt * dt, product(R, rotation_series(phi, angle2, 2.0 * s3, 2.0 * s4)))
+    return Push(dt, rotation_series(phi, angle2, s1, s2), G, H, times(G, force), times(H, force), ZERO)
+
+
+@compiled
+def pushed_path(path: Path, by: Push) -> Path:
+    """The mean after a step."""
+    return Path(
+        path.elapsed_s + by.dt,
+        product(path.R, by.turn),
+        plus(path.v, by.a),
+        plus(plus(path.p, scaled(by.dt, path.v)), by.b),
+        plus(path.s, by.c),
+    )
+
+
+@compiled
+def pushed_spread(spread: Spread, by: Push, theta_variance: float, accel_psd: float) -> Spread:
+    """The covariance after a step.
+
+    Parameters
+    ----------
+    theta_variance
+        In the middle of the step, rad².
+    accel_psd
+        Spectral density of the accelerometers' noise, (m/s²)²/Hz.
+    """
+    dt, half = by.dt, 0.5 * theta_variance
+    mp = plus(spread.mp, scaled(dt, spread.mv))
+    pp = sum_of(spread.pp, multiple_of(dt, sum_of(spread.vp, transposed(spread.vp))))
+    pp = sum_of(pp, multiple_of(dt * dt, spread.vv))
+    vp = sum_of(spread.vp, multiple_of(dt, spread.vv))
+    sp = sum_of(spread.sp, multiple_of(dt, spread.sv))
+    hv, hp, hs = (
+        plus(spread.mv, scaled(half, by.a)),
+        plus(mp, scaled(half, by.b)),
+        plus(spread.ms, scaled(half, by.c)),
+    )
+    noise = accel_psd * dt
+    return Spread(
+        plus(spread.mv, scaled(theta_variance, by.a)),
+        plus(mp, scaled(theta_variance, by.b)),
+        plus(spread.ms, scaled(theta_variance, by.c)),
+        _coupled(spread.vv, by.a, hv, by.a, hv, noise),
+        _coupled(vp, by.a, hv, by.b, hp, noise * dt / 2.0),
+        _coupled(pp, by.b, hp, by.b, hp, noise * dt * dt / 3.0),
+        _coupled(spread.sv, by.c, hs, by.a, hv, 0.0),
+        _coupled(sp, by.c, hs, by.b, hp, 0.0),
+        _coupled(spread.ss, by.c, hs, by.c, hs, 0.0),
+    )
+
+
+@compiled
+def _coupled(P: Matrix, ax: Vector, hx: Vector, ay: Vector, hy: Vector, noise: float) -> Matrix:
+    d = dot(ax, hy) + dot(ay, hx) + noise
+    x, y, z = P
+    return (
+        (
+            x[0] + d - hy[0] * ax[0] - ay[0] * hx[0],
+            x[1] - hy[0] * ax[1] - ay[0] * hx[1],
+            x[2] - hy[0] * ax[2] - ay[0] * hx[2],
+        ),
+        (
+            y[0] - hy[1] * ax[0] - ay[1] * hx[0],
+            y[1] + d - hy[1] * ax[1] - ay[1] * hx[1],
+            y[2] - hy[1] * ax[2] - ay[1] * hx[2],
+        ),
+        (
+            z[0] - hy[2] * ax[0] - ay[2] * hx[0],
+            z[1] - hy[2] * ax[1] - ay[2] * hx[1],
+            z[2] + d - hy[2] * ax[2] - ay[2] * hx[2],
+        ),
+    )
+
+
+@compiled
+def pushed_slopes(slopes: Slopes, by: Push) -> Slopes:
+    """The derivatives after a step; the rotation's own change within it counts by its mean."""
+    half = sum_of(slopes.M, multiple_of(0.5, by.G))
+    third = sum_of(slopes.M, multiple_of(1.0 / 3.0, by.G))
+    p_g = sum_of(slopes.p_g, multiple_of(by.dt, slopes.v_g))
+    return Slopes(
+        sum_of(slopes.M, by.G),
+        sum_of(sum_of(slopes.N, multiple_of(by.dt, slopes.M)), by.H),
+        sum_of(slopes.v_g, skew_times(by.a, half)),
+        sum_of(p_g, skew_times(by.b, third)),
+        sum_of(slopes.s_g, skew_times(by.c, half)),
+        slopes.s_a,
+        slopes.s_scale,
+        slopes.s_mounting,
+    )

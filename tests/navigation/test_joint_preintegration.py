@@ -1,0 +1,203 @@
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.errors import MeasurementError
+from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.navigation.dvl_preintegration import Preintegrator
+from sonar_graph.navigation.joint_preintegration import DISPLACEMENT, JointMotion, JointPreintegrator
+from sonar_graph.navigation.joint_rules import RULES
+from sonar_graph.navigation.odometry import Odometry
+
+from .joint_rows import ACCEL, GYRO, random_rows, step_by_step
+from .rows import NS, T0_NS, derivative, dvl, imu, stamps, waves
+
+BIAS = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.05])
+ARM = np.array([0.3, -0.1, 0.2])
+seeds = st.integers(0, 2**32 - 9)
+ours = pytest.mark.parametrize("rule", ["inertial", "linear"])
+every_rule = pytest.mark.parametrize("rule", sorted(RULES))
+
+
+def made(rows: tuple[Imu, Dvl], rule: str, bias=BIAS, **options) -> JointMotion:
+    samples = rows[1].stamps_ns
+    preintegrator = JointPreintegrator(GYRO, ACCEL, rule=rule, **options)
+    return preintegrator.integrate(*rows, int(samples[0]), int(samples[-1]), bias)
+
+
+def difference(of: JointMotion, to: JointMotion) -> np.ndarray:
+    """[theta (frame j), v, p, s]."""
+    theta = gtsam.Rot3.Logmap(of.i_R_j.between(to.i_R_j))
+    return np.r_[theta, to.velocity - of.velocity, to.position - of.position, to.displacement - of.displacement]
+
+
+def relative(actual: np.ndarray, expected: np.ndarray) -> float:
+    sigmas = np.sqrt(np.diag(expected))
+    return float(np.abs((actual - expected) / np.outer(sigmas, sigmas)).max())
+
+
+@ours
+@given(seeds)
+@settings(max_examples=10, deadline=None)
+def test_preintegration_equals_dead_reckoning(rule, seed):
+    rows = random_rows(seed)
+    motion, truth = made(rows, rule), step_by_step(*rows, rule == "inertial", BIAS)
+    assert np.allclose(motion.i_R_j.matrix(), truth.R, atol=1e-12)
+    assert np.allclose(motion.velocity, truth.v, atol=1e-11)
+    assert np.allclose(motion.position, truth.p, atol=1e-11)
+    assert np.allclose(motion.displacement, truth.s, atol=1e-11)
+    assert relative(motion.covariance, truth.covariance()) < 1e-9
+
+
+@every_rule
+@given(seeds)
+@settings(max_examples=5, deadline=None)
+def test_derivatives_equal_differences(rule, seed):
+    """By both biases, scale and mounting; of every rule."""
+    rows = random_rows(seed)
+    motion = made(rows, rule)
+
+    def moved(change):
+        z = (1 + change[6]) * rows[1].velocity @ gtsam.SO3.Expmap(change[7:]).matrix().T
+        other = Dvl(rows[1].stamps_ns, z, rows[1].velocity_cov)
+        return difference(motion, made((rows[0], other), rule, BIAS + change[:6]))
+
+    numerical = derivative(moved, 10, 1e-5)
+    for column in range(10):
+        scale = max(np.abs(numerical[:, column]).max(), 0.1)
+        assert np.abs(motion.D_parameters[:, column] - numerical[:, column]).max() < 5e-4 * scale
+
+
+@ours
+def test_corrected_equals_integrating_again(rule):
+    """To first order; uncorrected, or with the opposite sign, it is far off."""
+    rows, change = random_rows(4), np.r_[2e-3, -1e-3, 3e-3, 0.02, -0.01, 0.03]
+    motion, again = made(rows, rule), made(rows, rule, BIAS + change)
+    corrected = motion.corrected(np.r_[change, np.zeros(4)])
+    wrong = [
+        np.abs(difference(m, again)).max() for m in (corrected, motion, motion.corrected(np.r_[-change, np.zeros(4)]))
+    ]
+    assert wrong[0] < 0.01 * wrong[1] < 0.01 * wrong[2]
+    assert np.array_equal(corrected.bias, again.bias)
+
+
+@every_rule
+@given(seeds, st.integers(1, 7))
+@settings(max_examples=5, deadline=None)
+def test_a_chain_has_the_displacement_of_the_whole(rule, seed, cut):
+    """Mean and covariance: whatever is cut, the shared sample counts as it acts. Taken as independent, less."""
+    rows = random_rows(seed)
+    at = rows[1].stamps_ns
+    preintegrator = JointPreintegrator(0.0, 0.0, rule=rule)
+    whole, first, second = (
+        preintegrator.integrate(*rows, int(a), int(b), BIAS)
+        for a, b in ((at[0], at[-1]), (at[0], at[cut]), (at[cut], at[-1]))
+    )
+    R = first.i_R_j.matrix()
+    assert whole.i_R_j.equals(first.i_R_j.compose(second.i_R_j), 1e-12)
+    assert np.allclose(first.displacement + R @ second.displacement, whole.displacement, atol=1e-10)
+    expected = whole.covariance[DISPLACEMENT, DISPLACEMENT]
+    block = [m.covariance[DISPLACEMENT, DISPLACEMENT] for m in (first, second, second.after(first))]
+    assert np.allclose(block[0] + R @ block[2] @ R.T, expected, rtol=1e-9, atol=1e-15)
+    independent = np.trace(block[0]) + np.trace(block[1])
+    shares = rule not in ("hold-previous", "zoh-previous", "zoh-current")
+    assert (independent < (1 - 1e-6) * np.trace(expected)) == shares
+
+
+def test_linear_rule_is_the_motion_of_the_gyro_and_doppler_preintegrator():
+    """Mean and bias derivative, lever arm and mountings included; its covariance spreads a sample over time instead."""
+    rows = random_rows(8)
+    calibration = Calibration(
+        dvl=DvlCalibration(mounting=Mounting(translation_m=tuple(ARM), rpy_rad=(3.1, 0.1, 0.8))),
+        imu=ImuCalibration(mounting=Mounting(rpy_rad=(0.2, -0.1, 2.0))),
+    )
+    odometry, samples = Odometry(calibration), rows[1].stamps_ns
+    odometry.add(*rows)
+    steps = odometry.steps_between_nodes(int(samples[0]), int(samples[-1]))
+    expected = Preintegrator.from_calibration(calibration).integrate(steps, BIAS[:3])
+    joint = JointPreintegrator.from_calibration(calibration, "linear")
+    actual = joint.integrate(*rows, int(samples[0]), int(samples[-1]), np.r_[BIAS[:3], 0, 0, 0]).relative_pose()
+    assert actual.i_T_j.equals(expected.i_T_j, 1e-10)
+    assert np.allclose(actual.D_bias, expected.D_bias, atol=1e-4)
+    assert np.allclose(actual.mean_specific_force, expected.mean_specific_force, atol=1e-9)
+    assert np.allclose(actual.covariance, expected.covariance, rtol=0.3, atol=2e-5)
+
+
+def test_inertial_part_is_that_of_gtsam():
+    """Its tangent preintegration turns a step by the attitude at its start: first order in small steps."""
+    quick = stamps(1000, 2.0)
+    rows = imu(quick, waves(quick, 1, 0.5), np.array([0.3, -0.2, 9.8]) + waves(quick, 2, 1.0)), dvl(quick[::200], 0.1)
+    params = gtsam.PreintegrationParams.MakeSharedU(9.81)
+    params.setGyroscopeCovariance(GYRO**2 * np.eye(3))
+    params.setAccelerometerCovariance(ACCEL**2 * np.eye(3))
+    params.setIntegrationCovariance(np.zeros((3, 3)))
+    theirs = gtsam.PreintegratedImuMeasurements(params, gtsam.imuBias.ConstantBias(BIAS[3:], BIAS[:3]))
+    for k in range(len(quick) - 1):
+        mean = [(column[k] + column[k + 1]) / 2 for column in (rows[0].specific_force, rows[0].angular_velocity)]
+        theirs.integrateMeasurement(*mean, 1e-3)
+    motion = made(rows, "inertial")
+    assert motion.i_R_j.equals(theirs.deltaRij(), 2e-5)
+    assert np.allclose(motion.velocity, theirs.deltaVij(), atol=3e-3)
+    assert np.allclose(motion.position, theirs.deltaPij(), atol=3e-3)
+    order = np.r_[0:3, 6:9, 3:6]
+    sigmas = np.sqrt(np.diag(motion.covariance)[order])
+    assert np.sqrt(np.diag(theirs.preintMeasCov())) == pytest.approx(sigmas, rel=0.01)
+
+
+def test_a_vehicle_at_rest_stays_there():
+    """Whatever its tilt: the Doppler samples level the accelerometer."""
+    at, slow = stamps(100, 60.0), stamps(5, 60.0)
+    up = gtsam.Rot3.RzRyRx(0.4, -0.3, 1.0).unrotate(np.array([0, 0, 9.81]))
+    motion = made((imu(at, np.zeros(3), up), dvl(slow, np.zeros(3))), "inertial", np.zeros(6))
+    assert np.abs(motion.displacement).max() < 1e-9
+    assert motion.velocity == pytest.approx(60 * up)
+
+
+def test_the_accelerometer_draws_what_lies_between_two_samples():
+    """One swing of 0.5 m/s amplitude, unseen by samples that meet it at its zeros: also over a gap of two seconds."""
+    at, slow = stamps(500, 4.0), stamps(0.5, 4.0)
+    t = (at - T0_NS) * 1e-9
+    surge = 0.25 * np.sin(np.pi * t / 2) ** 2
+    force = np.column_stack([np.gradient(surge, t, edge_order=2), 0 * t, 9.81 + 0 * t])
+    rows = imu(at, np.zeros(3), force), dvl(slow, np.zeros(3))
+    truth = np.trapezoid(surge, t)
+    assert made(rows, "inertial", np.zeros(6)).displacement[0] == pytest.approx(truth, abs=1e-4)
+    assert made(rows, "linear", np.zeros(6)).displacement[0] == pytest.approx(0.0, abs=1e-12)
+    assert truth > 0.4
+
+
+def test_without_an_accelerometer_the_displacement_is_the_same():
+    rows = random_rows(5)
+    unfelt = Imu(rows[0].stamps_ns, rows[0].angular_velocity, np.full((len(rows[0]), 3), np.nan))
+    with_it, without = made(rows, "linear").relative_pose(), made((unfelt, rows[1]), "linear").relative_pose()
+    assert with_it.i_T_j.equals(without.i_T_j, 1e-15)
+    assert np.array_equal(with_it.covariance, without.covariance)
+    assert np.isnan(without.mean_specific_force).all()
+    with pytest.raises(MeasurementError, match='rule "linear"'):
+        made((unfelt, rows[1]), "inertial")
+
+
+def test_ends_that_are_not_covered_are_refused():
+    rows = random_rows(6)
+    at = rows[1].stamps_ns
+    preintegrator = JointPreintegrator(GYRO, ACCEL)
+    for ends in ((at[0] + 1, at[-1]), (at[0], at[-1] + 1), (at[3], at[3]), (at[4], at[2])):
+        with pytest.raises(MeasurementError, match="take two of its stamps"):
+            preintegrator.integrate(*rows, int(ends[0]), int(ends[1]))
+    late, early = rows[0].between(int(at[0]) + 1, int(at[-1]) + NS), rows[0].between(0, int(at[-1]) - 1)
+    for part in (late, early):
+        with pytest.raises(MeasurementError, match="do not reach"):
+            preintegrator.integrate(part, rows[1], int(at[0]), int(at[-1]))
+
+
+def test_longer_blocks_change_nothing():
+    rows = random_rows(7)
+    at = rows[1].stamps_ns
+    preintegrator = JointPreintegrator(GYRO, ACCEL)
+    part = rows[0].between(int(at[2]) - NS // 20, int(at[5]) + NS // 20), rows[1].rows(slice(2, 6))
+    a, b = (preintegrator.integrate(*r, int(at[2]), int(at[5]), BIAS) for r in (rows, part))
+    assert np.array_equal(a.displacement, b.displacement)
+    assert np.array_equal(a.covariance, b.covariance)
