@@ -6,10 +6,11 @@ in its name or docstring. Every estimator gets the same one.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sonar_graph.errors import CalibrationError
@@ -70,10 +71,33 @@ class DepthCalibration(Section):
     """The pressure port in the body frame."""
 
 
+class SonarImage(Section):
+    """What the samples of sonar images mean."""
+
+    scale: Literal["decibel", "linear"] = "decibel"
+    """``decibel``: samples grow with the logarithm of the echo (DIDSON, ARIS); ``linear``: with its amplitude."""
+    decibel_span: float = Field(80.0, gt=0)
+    """What the full scale of a sample spans, dB, where samples are logarithmic."""
+    full_scale: float = Field(255.0, gt=0)
+    """The largest sample."""
+
+    def decibels(self, samples: NDArray[Any]) -> NDArray[np.float32]:
+        """Levels of samples, in dB over the smallest one; only their differences mean something.
+
+        ``samples * decibel_span / full_scale``, or ``20 log10(samples)`` of linear ones; linear samples of 0
+        count as one count, real ones below 1/100000 of the full scale as that.
+        """
+        if self.scale == "decibel":
+            return np.multiply(samples, np.float32(self.decibel_span / self.full_scale), dtype=np.float32)
+        least = 1.0 if np.issubdtype(samples.dtype, np.integer) else 1e-5 * self.full_scale
+        return np.float32(20.0) * np.log10(np.maximum(samples, np.float32(least)) / np.float32(least), dtype=np.float32)
+
+
 class SonarCalibration(Section):
     """Imaging sonar, or whatever else measures range and azimuth to landmarks."""
 
     mounting: Mounting = Mounting()
+    image: SonarImage = SonarImage()
     range_sigma_m: float = Field(0.02, gt=0)
     """White noise of range, where the log does not say."""
     azimuth_sigma_rad: float = Field(0.009, gt=0)

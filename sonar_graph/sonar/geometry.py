@@ -147,6 +147,12 @@ def _elevation_derivatives(points_m: Floats) -> Floats:
 
 
 @compiled
+def _wrapped(angle_rad: float) -> float:
+    """The same angle between -pi and pi."""
+    return angle_rad - 2.0 * math.pi * round(angle_rad / (2.0 * math.pi))
+
+
+@compiled
 def floor_elevation(range_m: float, azimuth_rad: float, up: Floats, height_m: float) -> float:
     """Elevation at which a ray of this range meets the floor; NaN where it does not."""
     across = up[0] * math.cos(azimuth_rad) + up[1] * math.sin(azimuth_rad)
@@ -154,7 +160,7 @@ def floor_elevation(range_m: float, azimuth_rad: float, up: Floats, height_m: fl
     if not abs(reach) <= 1.0:
         return math.nan
     middle, spread = math.atan2(up[2], across), math.acos(reach)
-    one, other = math.remainder(middle - spread, 2 * math.pi), math.remainder(middle + spread, 2 * math.pi)
+    one, other = _wrapped(middle - spread), _wrapped(middle + spread)
     return one if abs(one) <= abs(other) else other
 
 

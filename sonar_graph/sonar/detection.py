@@ -1,0 +1,206 @@
+"""Candidate selection: what stands out of one polar frame, at a constant false-alarm rate in decibels.
+
+1. Mean level over a patch of `DetectionParams.smoothing_m`, in decibels.
+2. Local background B and spread sigma of these means (`sonar_graph.sonar.background`).
+3. A pixel stands out when it exceeds ``B + offset(sigma)``. The offset is that of speckle with as many looks L as sigma
+   says, ``sigma^2 = (10 / ln 10)^2 psi'(L)`` with psi the digamma function (`false_alarm_offset_db`).
+4. Pixels that stand out, closed over gaps, form regions; areas and extents in metres decide which are candidates.
+
+Because sigma is measured where the pixel is, texture raises the threshold by itself.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.special import digamma, gammainccinv, polygamma
+
+from sonar_graph.calibration import Section
+from sonar_graph.errors import MeasurementError
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.sonar.background import Floats32, background_and_spread
+from sonar_graph.sonar.candidates import Candidates, Verdict
+from sonar_graph.sonar.geometry import FloorView, elevation_sigma
+from sonar_graph.sonar.regions import measure_regions
+
+DB_PER_NEPER = 10.0 / np.log(10.0)
+
+
+class DetectionParams(Section):
+    """Settings of the candidate selection. Lengths are on the ground for landmarks of about 0.3 m."""
+
+    false_alarm: float = Field(1e-3, gt=0, lt=0.5)
+    """Probability that a pixel of mere background stands out."""
+    smoothing_m: float = Field(0.03, gt=0)
+    """Side of the patch over which levels are averaged."""
+    background_m: float = Field(0.9, gt=0)
+    """Side of the neighbourhood that gives the background; well over twice the landmarks' size."""
+    closing_m: float = Field(0.03, ge=0)
+    """Gaps up to this width are bridged."""
+    min_area_m2: float = Field(0.008, ge=0)
+    """Smaller regions are rejected."""
+    max_area_m2: float = Field(0.2, gt=0)
+    """Larger regions are rejected."""
+    max_extent_m: float = Field(0.7, gt=0)
+    """Longer regions are rejected."""
+    keep_at_edge: bool = False
+    """Accept regions that touch the edge of the image; their centroids are then not the objects'."""
+    max_candidates: int = Field(16, gt=0)
+    """Of those left, this many with the highest level times area are accepted."""
+    elevation_aperture_rad: float = Field(0.244, gt=0)
+    """Full vertical opening of the sonar: what is known of the elevation without a floor."""
+
+
+def select_candidates(
+    image_db: Floats32,
+    ranges_m: Floats,
+    azimuths_rad: Floats,
+    view: FloorView | None = None,
+    params: DetectionParams | None = None,
+) -> Candidates:
+    """The regions of one polar frame that stand out, rejected ones included.
+
+    Parameters
+    ----------
+    image_db
+        Levels in dB, shape (beams, bins), finite.
+    ranges_m, azimuths_rad
+        Middle of each bin, shape (bins,), and of each beam, shape (beams,).
+    view
+        The floor; None: not known, areas are in the slant plane.
+    params
+        Settings; None for the defaults.
+
+    Raises
+    ------
+    MeasurementError
+        When the shapes do not belong together, or a level is not finite.
+    """
+    params = params or DetectionParams()
+    if image_db.shape != (len(azimuths_rad), len(ranges_m)) or min(image_db.shape) < 2:
+        raise MeasurementError(
+            f"sonar frame: shape {image_db.shape}; beams and bins are {(len(azimuths_rad), len(ranges_m))}, 2 or more"
+        )
+    if not np.isfinite(cv2.sumElems(image_db)[0]):
+        raise MeasurementError("sonar frame: levels that are not finite; leave the frame out")
+    cell_m = _cell_m(ranges_m, azimuths_rad)
+    smooth, background, spread = background_and_spread(
+        image_db, _odd(params.smoothing_m, cell_m), _odd(params.background_m, cell_m)
+    )
+    contrast = smooth - background
+    mask = (contrast > false_alarm_offsets_db(spread, params.false_alarm)).view(np.uint8)
+    closing = cv2.getStructuringElement(cv2.MORPH_RECT, _odd(params.closing_m, cell_m)[::-1])
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        cv2.morphologyEx(mask, cv2.MORPH_CLOSE, closing), connectivity=8, ltype=cv2.CV_32S
+    )
+    return _judged(
+        contrast,
+        np.asarray(labels, dtype=np.int32),
+        stats[1:count].astype(np.int64),
+        ranges_m,
+        azimuths_rad,
+        view,
+        params,
+    )
+
+
+def false_alarm_offset_db(spread_db: float, false_alarm: float) -> float:
+    """How far over its mean a level must be, in dB, for mere speckle to get there with this probability.
+
+    The intensity is Gamma with L looks, so that its level in dB has the mean ``c psi(L) + const`` and the variance
+    ``c^2 psi'(L)``, with ``c = 10 / ln 10``. One look: 5.57 dB, and 9.14 dB for 1 %.
+    """
+    looks = _looks(spread_db)
+    return float(DB_PER_NEPER * (np.log(gammainccinv(looks, false_alarm)) - digamma(looks)))
+
+
+def false_alarm_offsets_db(spreads_db: Floats32, false_alarm: float) -> Floats32:
+    """`false_alarm_offset_db` of each, by interpolation to 0.01 dB."""
+    spreads, offsets = _offset_table(false_alarm)
+    return np.interp(spreads_db, spreads, offsets).astype(np.float32)
+
+
+@lru_cache(maxsize=16)
+def _offset_table(false_alarm: float) -> tuple[Floats, Floats]:
+    spreads = np.linspace(0.05, 12.0, 240)
+    return spreads, np.array([false_alarm_offset_db(spread, false_alarm) for spread in spreads])
+
+
+def _looks(spread_db: float) -> float:
+    """L with ``psi'(L) = (spread / c)^2``, by Newton's method on its logarithm."""
+    wanted = (spread_db / DB_PER_NEPER) ** 2
+    log_looks = -np.log(wanted) if wanted < 1 else -0.5 * np.log(wanted)
+    for _ in range(30):
+        looks = np.exp(log_looks)
+        value = float(polygamma(1, looks))
+        log_looks += (np.log(wanted) - np.log(value)) * value / (looks * float(polygamma(2, looks)))
+    return float(np.exp(log_looks))
+
+
+def _cell_m(ranges_m: Floats, azimuths_rad: Floats) -> tuple[float, float]:
+    """Width of a beam at mid-range and length of a bin."""
+    across = abs(float(azimuths_rad[-1] - azimuths_rad[0])) / (len(azimuths_rad) - 1)
+    along = abs(float(ranges_m[-1] - ranges_m[0])) / (len(ranges_m) - 1)
+    return across * float(ranges_m[0] + ranges_m[-1]) / 2, along
+
+
+def _odd(length_m: float, cell_m: tuple[float, float]) -> tuple[int, int]:
+    """Beams and bins of a square with this side, odd numbers."""
+    beams, bins = (2 * round((length_m / cell - 1) / 2) + 1 for cell in cell_m)
+    return max(1, beams), max(1, bins)
+
+
+def _judged(
+    contrast: Floats32,
+    labels: NDArray[np.int32],
+    stats: Ints,
+    ranges_m: Floats,
+    azimuths_rad: Floats,
+    view: FloorView | None,
+    params: DetectionParams,
+) -> Candidates:
+    """Positions, sizes and verdicts of labelled regions."""
+    regions = measure_regions(contrast, labels, len(stats), ranges_m, azimuths_rad, view)
+    boxes = stats[:, [1, 0, 3, 2]]
+    if view is None:
+        sigma = np.full(len(stats), elevation_sigma(params.elevation_aperture_rad))
+    else:
+        sigma = view.elevation_sigmas(regions.points_m)
+    return Candidates(
+        verdicts=_verdicts(regions.area_m2, regions.extent_m, regions.level_db, boxes, labels.shape, params),
+        range_m=regions.range_m,
+        azimuth_rad=regions.azimuth_rad,
+        elevation_rad=regions.elevation_rad,
+        elevation_sigma_rad=sigma,
+        area_m2=regions.area_m2,
+        extent_m=regions.extent_m,
+        level_db=regions.level_db,
+        boxes=boxes,
+        labels=labels,
+    )
+
+
+def _verdicts(
+    area_m2: Floats, extent_m: Floats, level_db: Floats, boxes: Ints, shape: tuple[int, ...], params: DetectionParams
+) -> Ints:
+    """`Verdict` of each region."""
+    at_edge = (boxes[:, :2] == 0).any(axis=1) | (boxes[:, :2] + boxes[:, 2:] == shape).any(axis=1)
+    verdicts = np.select(
+        [
+            ~(area_m2 > 0),
+            at_edge & (not params.keep_at_edge),
+            area_m2 < params.min_area_m2,
+            area_m2 > params.max_area_m2,
+            extent_m > params.max_extent_m,
+        ],
+        [Verdict.OFF_FLOOR, Verdict.AT_EDGE, Verdict.TOO_SMALL, Verdict.TOO_LARGE, Verdict.TOO_LONG],
+        Verdict.ACCEPTED,
+    ).astype(np.int64)
+    accepted = np.flatnonzero(verdicts == Verdict.ACCEPTED)
+    strongest_first = accepted[np.argsort(-(level_db * area_m2)[accepted], kind="stable")]
+    verdicts[strongest_first[params.max_candidates :]] = Verdict.BEYOND_LIMIT
+    return verdicts
