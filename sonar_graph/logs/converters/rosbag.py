@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from mcap.writer import Writer
 
 from sonar_graph.errors import LogError
+from sonar_graph.logs.other_files import START_BYTES, why_no_bag
 from sonar_graph.logs.recorder import LIBRARY, ROSBAG2_METADATA, TRANSIENT_LOCAL
 
 if TYPE_CHECKING:
@@ -84,6 +85,7 @@ def _bag(source: Path) -> Iterator[AnyReader]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise LogError(f"{source}: bags are read by the rosbags library, which is not installed: {_INSTALL}") from error
+    _refuse_other_files(source)
     is_file_in_bag = source.suffix == ".db3" and (source.parent / "metadata.yaml").exists()
     path = source.parent if is_file_in_bag else source
     try:
@@ -91,6 +93,15 @@ def _bag(source: Path) -> Iterator[AnyReader]:
             yield bag
     except (AnyReaderError, FileNotFoundError) as error:
         raise LogError(f"{source} cannot be read as a bag: {error}{_advice(source)}") from error
+
+
+def _refuse_other_files(source: Path) -> None:
+    if not source.is_file():
+        return
+    with source.open("rb") as stream:
+        fault = why_no_bag(source, stream.read(START_BYTES))
+    if fault is not None:
+        raise LogError(f"{source} is {fault}")
 
 
 def _advice(source: Path) -> str:

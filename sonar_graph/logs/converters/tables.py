@@ -85,7 +85,9 @@ def read_lines(
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{path}: cannot be read as text ({error}); expected {expected}") from error
+        raise DatasetError(
+            f"{path}: cannot be read as text ({getattr(error, 'strerror', None) or error}); expected {expected}"
+        ) from error
     empty = True
     for number, line in enumerate(lines[header_lines:], start=header_lines + 1):
         if line.strip() and not line.lstrip().startswith("#"):

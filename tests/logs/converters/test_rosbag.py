@@ -157,7 +157,15 @@ def test_without_the_library_the_command_that_installs_it_is_named(
     [
         ("broken.bag", b"#ROSBAG V2.0\nnonsense", r"broken\.bag cannot be read as a bag.*rosbag reindex"),
         ("alone.db3", b"SQLite format 3\0", r"alone\.db3 cannot be read as a bag.*give the folder"),
-        ("text.txt", b"hello", r"text\.txt cannot be read as a bag"),
+        ("text.txt", b"hello", r"text\.txt is no bag but a text that begins with 'hello'; give a ROS 1 \.bag"),
+        ("empty.bag", b"", r"empty\.bag is no bag but empty: copy it again.*wrote anything$"),
+        ("zeros.bag", bytes(99), r"zeros\.bag is no bag but zeros: copy it again.*wrote anything$"),
+        (
+            "a.mcap",
+            b"\x89MCAP0\r\n",
+            r"a\.mcap is already an MCAP file: read it directly, `sonar-graph inspect .*a\.mcap`",
+        ),
+        ("a.bag", b"\x89MCAP0\r\n", r"a\.bag is already an MCAP file: read it directly"),
     ],
 )
 def test_what_is_no_bag_is_refused_and_leaves_nothing(tmp_path: Path, name: str, content: bytes, message: str) -> None:
