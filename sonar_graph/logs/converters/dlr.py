@@ -60,7 +60,7 @@ def read_dlr(path: Path) -> Sequence:
         When the file is missing or malformed, or a landmark comes before the first step.
     """
     if path.is_dir() and not (path / FILE_NAME).exists():
-        raise DatasetError(f"{path}: holds no {FILE_NAME}; give the folder that does, or the file itself")
+        raise DatasetError(f"{path}: holds no {FILE_NAME} ({EXPECTED}); give the folder that does, or the file itself")
     lines = _read(path / FILE_NAME if path.is_dir() else path)
     steps = np.array(lines.steps)
     covs = symmetric(steps[:, 3:], STEP_COV_PLACES)
