@@ -85,13 +85,9 @@ def step(state: StepByStep, imu: Imu, dvl: Dvl, t: int, until: int, inertial: bo
     rate = np.array([np.interp(middle, seconds, column) for column in imu.angular_velocity.T]) - bias[:3]
     force = np.array([np.interp(middle, seconds, column) for column in imu.specific_force.T]) - bias[3:]
     A = np.zeros((8, 8))
-    A[:3, :3], A[:3, 3] = hat(rate), force
-    A[3, 4] = 1.0
+    A[:3, :3], A[:3, 3], A[3, 4], A[:3, 5:] = hat(rate), force, 1.0, np.eye(3)
     E = expm(A * dt)
-    A[:3, 3] = 0
-    A[:3, 5:8] = np.eye(3)
-    G = state.R @ expm(A * dt)[:3, 5:8]
-    a, b = state.R @ E[:3, 3], state.R @ E[:3, 4]
+    a, b, G = state.R @ E[:3, 3], state.R @ E[:3, 4], state.R @ E[:3, 5:]
     F = np.eye(len(state.P))
     F[3:6, :3], F[6:9, :3], F[6:9, 3:6] = -hat(a), -hat(b), dt * np.eye(3)
     c = np.zeros(3)
