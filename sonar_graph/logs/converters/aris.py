@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.converters.sonar_beams import aris_azimuths, even_azimuths
 from sonar_graph.logs.converters.sonar_conversion import Progress, SonarConversion, convert_sonar_file
@@ -36,6 +36,7 @@ FREQUENCIES_HZ = {0: (1.1e6, 1.8e6), 1: (1.8e6, 3.0e6), 2: (0.7e6, 1.2e6)}
 """Low and high, by system type: ARIS 1800, 3000, 1200."""
 SOUND_SPEEDS_M_S = (1350.0, 1650.0)
 """Outside, a header is damaged."""
+DECIBEL_SPAN = 80.0
 _US = 1e-6
 LAST_US = 2**31 * 10**6 - 1
 """Stamps of ROS 2 have 31 bits for seconds since 1970."""
@@ -80,12 +81,13 @@ class ArisFormat:
         if start != SIGNATURE and source.find(SIGNATURE, HEADER_BYTES) != HEADER_BYTES + self.signature_at:
             raise DatasetError(f"{source.path}: begins with {start!r}; an ARIS recording begins with {SIGNATURE!r}")
         (self.frames_promised,) = struct.unpack("<I", source.read(4, 4).ljust(4, b"\0"))
-        self.calibration = Calibration()
+        image = SonarImage(scale="decibel", decibel_span=DECIBEL_SPAN)
+        self.calibration = Calibration(sonar=SonarCalibration(image=image))
         self.notes = {
             "source": f"ARIS recording {source.path.name}",
             "sonar.time": "the sonar's own clock, microseconds since 1970",
             "sonar.beams": "the manufacturer's table for lens and number of beams, evenly spaced where there is none",
-            "sonar.scale": "counts 0 to 255 are 0 to 80 dB",
+            "sonar.scale": f"counts 0 to 255 are 0 to {DECIBEL_SPAN:g} dB",
         }
 
     def head(self, content: bytes, at: int) -> FrameHead:

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.converters.sonar_beams import didson_azimuths
 from sonar_graph.logs.converters.sonar_conversion import Progress, SonarConversion, convert_sonar_file
@@ -37,6 +37,8 @@ HEADER_BYTES = {3: (512, 256), 4: (1024, 1024)}
 """Of the file and of a frame, by version."""
 BEAMS = (48, 96)
 MOST_SAMPLES = 4096
+DECIBEL_SPAN = 90.0
+"""Echoview's description of the format; 80 for ARIS."""
 LAST_YEAR = 2037
 """Stamps of ROS 2 end early in 2038."""
 NOMINAL_SOUND_SPEED_M_S = 1465.0
@@ -113,13 +115,14 @@ class DidsonFormat:
         self._is_high = resolution == 1
         self._sound_speed_m_s = sound_speed_m_s or NOMINAL_SOUND_SPEED_M_S
         self.signature = self._signature(source)
-        self.calibration = Calibration()
+        image = SonarImage(scale="decibel", decibel_span=DECIBEL_SPAN)
+        self.calibration = Calibration(sonar=SonarCalibration(image=image))
         self.notes = {
             "source": f"DIDSON recording {source.path.name}, DDF version {self._version}",
             "sonar.time": "the sonar's own calendar time, to hundredths of a second, taken as UTC",
             "sonar.beams": "the manufacturer's polynomial for the lens",
             "sonar.ranges": f"from window codes, for a sound speed of {self._sound_speed_m_s:g} m/s",
-            "sonar.scale": "counts 0 to 255 are 0 to 90 dB (Echoview's description of the format)",
+            "sonar.scale": f"counts 0 to 255 are 0 to {DECIBEL_SPAN:g} dB (Echoview's description of the format)",
         }
 
     def head(self, content: bytes, at: int) -> FrameHead:

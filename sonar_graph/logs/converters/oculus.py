@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.converters.frame_walk import first_sound
 from sonar_graph.logs.converters.sonar_conversion import Progress, SonarConversion, convert_sonar_file
@@ -71,7 +71,9 @@ class OculusFormat:
             raise DatasetError(f"{source.path}: holds no Oculus ping; give the sonar's network messages as recorded")
         wraps = first.settings[0] != 2
         self.clock_period_ns = CLOCK_PERIOD_NS if wraps else None
-        self.calibration = Calibration()
+        sample_bytes = int(first.settings[4])
+        image = SonarImage(scale="linear", full_scale=2 ** (8 * sample_bytes) - 1)
+        self.calibration = Calibration(sonar=SonarCalibration(image=image))
         clock = ", a 32-bit number taken as nanoseconds and continued where it wraps around" if wraps else ""
         self.notes = {
             "source": f"Oculus recording {source.path.name}",

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from sonar_graph.logs.converters.aris import convert_aris
 from sonar_graph.logs.sonar_reading import read_sonar_frames
@@ -58,6 +60,21 @@ def test_what_other_sensors_said_is_in_the_notes(tmp_path: Path) -> None:
     notes = converted(tmp_path, Aris(images(3, 48, 64), mode=1).content(), "aris").notes
     assert (notes["sonar.depth"], notes["sonar.compass heading"]) == ("1.5 to 3.5", "88 to 90")
     assert "since 1970" in notes["sonar.time"]
+
+
+def test_the_log_says_that_counts_are_decibels(tmp_path: Path) -> None:
+    image = converted(tmp_path, Aris(images(1, 128, 64)).content(), "aris").calibration.sonar.image
+    np.testing.assert_allclose(image.decibels(np.array([0, 51, 255], np.uint8)), [0, 16, 80], rtol=1e-6)
+
+
+@pytest.mark.parametrize("system", [(1, 1, 3.0e6), (1, 0, 1.8e6), (0, 1, 1.8e6), (2, 0, 0.7e6)])
+def test_frequency_and_speed_of_sound_are_in_the_messages(tmp_path: Path, system: tuple[int, int, float]) -> None:
+    kind, high, frequency_hz = system
+    converted(tmp_path, Aris(images(1, 128, 64), system=kind, high=high).content(), "aris")
+    with (tmp_path / "dive.mcap").open("rb") as stream:
+        ((*_, message),) = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+    assert message.ping_info.frequency == pytest.approx(frequency_hz)
+    assert message.ping_info.sound_speed == pytest.approx(1482.5)
 
 
 @pytest.mark.parametrize(

@@ -77,6 +77,11 @@ def test_what_other_sensors_said_is_in_the_notes(tmp_path: Path) -> None:
     assert "UTC" in notes["sonar.time"]
 
 
+def test_the_log_says_that_counts_are_decibels(tmp_path: Path) -> None:
+    image = converted(tmp_path, Ddf(images(1, 96, 64)).content(), "ddf").calibration.sonar.image
+    np.testing.assert_allclose(image.decibels(np.array([0, 51, 255], np.uint8)), [0, 18, 90], rtol=1e-6)
+
+
 def test_frames_that_bear_another_version_are_read(tmp_path: Path) -> None:
     pictures = images(3, 48, 64)
     content = Ddf(pictures, high=0, frame_version=b"5.26").content()

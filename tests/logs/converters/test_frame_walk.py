@@ -91,6 +91,17 @@ def test_a_cut_frame_is_named_with_its_bytes(tmp_path: Path, ending: str) -> Non
 
 
 @each_kind
+@pytest.mark.parametrize("count", [1, 5, 40])
+def test_a_last_frame_with_foreign_bytes_is_not_believed(tmp_path: Path, ending: str, count: int) -> None:
+    """The same number of bytes remains as of a cut header, but they are not how a header begins."""
+    head, *frames = PIECES[ending]
+    frames[-1] = frames[-1][:-30] + b"\x5a" * count + frames[-1][-30:]
+    numbers, said = read(tmp_path, [head, *frames], ending)
+    assert numbers == list(range(COUNT - 1))
+    assert "bytes are missing or too many" in said
+
+
+@each_kind
 @in_one_folder
 @given(part=st.floats(0, 1, exclude_max=True), count=st.integers(1, 3000))
 def test_missing_bytes_cost_the_frames_that_they_touch(tmp_path: Path, ending: str, part: float, count: int) -> None:

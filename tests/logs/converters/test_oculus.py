@@ -69,6 +69,12 @@ def test_attitude_is_in_the_notes_of_the_newer_pings(tmp_path: Path) -> None:
     assert "switched on" in notes["sonar.time"]
 
 
+@pytest.mark.parametrize(("kind", "full_scale"), [("u1", 255), ("u2", 65_535)])
+def test_the_log_says_that_counts_are_linear(tmp_path: Path, kind: str, full_scale: float) -> None:
+    image = converted(tmp_path, Oculus(images(1, 16, 8).astype(kind)).content(), "raw").calibration.sonar.image
+    assert (image.scale, image.full_scale) == ("linear", full_scale)
+
+
 def test_another_file_is_named(tmp_path: Path, refusal: Any) -> None:
     path = tmp_path / "dive.raw"
     path.write_bytes(b"DDF\x05" + bytes(4000))
