@@ -3,13 +3,14 @@
 Classes are the designs in their order and last "none of them"; features the same. ``matrix[k, j] = p(z = j | x = k)``
 is the mean soft score of feature j over the labelled frames of class k: rows sum to 1. With it go the two numbers that
 make scores of correlations, and the accuracy of range and azimuth, all measured on the same frames. The file says
-where those came from. `DEFAULT_CONFUSION` was measured on simulated basins with the designs that ship.
+where those came from. The one that ships, ``default_confusion.json``, was measured on simulated basins with the designs
+that ship.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,11 +20,14 @@ from scipy.optimize import minimize
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import CalibrationError
+from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sonar.scores import soft_scores
 
 LEAST_ENTRY = 1e-3
 """Smallest entry of the matrix: a class that never looked like a feature in some hundred frames still may."""
+ASSUMED_RIGHT = 0.9
+"""Share of frames in which a landmark that nobody measured looks like itself."""
 LEAST_FRAMES = 20
 """Of every class, for a measured row."""
 
@@ -142,3 +146,21 @@ def read_confusion(path: Path) -> Confusion:
     except ValidationError as error:
         faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
         raise CalibrationError(f"{path}: {faults}; write one with sonar-graph calibrate") from error
+
+
+def confusion_for(designs: Sequence[LandmarkDesign]) -> Confusion:
+    """The model that ships, for the designs that ship; for others an assumed one, which says so."""
+    ids = tuple(design.id for design in designs)
+    shipped = read_confusion(Path(__file__).with_name("default_confusion.json"))
+    if tuple(designs) == DEFAULT_DESIGNS:
+        return shipped
+    classes = len(ids) + 1
+    matrix = np.full((classes, classes), (1 - ASSUMED_RIGHT) / (classes - 1))
+    np.fill_diagonal(matrix, ASSUMED_RIGHT)
+    return shipped.model_copy(
+        update={
+            "ids": ids,
+            "matrix": tuple(map(tuple, matrix.tolist())),
+            "provenance": {"origin": f"assumed: {ASSUMED_RIGHT:.0%} right; measure it with sonar-graph calibrate"},
+        }
+    )

@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sonar_graph.sonar.association import Association
+from sonar_graph.sonar.beliefs import Beliefs, IdentityParams
+from sonar_graph.sonar.confusion import Confusion
+
+CONFUSION = Confusion(
+    ids=(1, 2),
+    matrix=((0.9, 0.05, 0.05), (0.05, 0.9, 0.05), (0.05, 0.05, 0.9)),
+    sharpness=20.0,
+    threshold=0.8,
+    range_sigma_m=0.01,
+    azimuth_sigma_rad=0.003,
+)
+LOOKS_LIKE_1 = np.array([[0.9, 0.05, 0.05]])
+SIDEWAYS = np.array([[0.0, 1.0, 0.0]])
+
+
+def _association(before: list[int], after: list[int]) -> Association:
+    matrix = np.array([[float(track == old) for old in before] + [float(track not in before)] for track in after])
+    n = len(after)
+    return Association(
+        0, np.array(before, int), np.array(after), matrix.reshape(n, len(before) + 1), np.zeros(n, int), np.ones(n),
+        np.tile([2.0, 0, 0], (n, 1)), np.zeros((n, 3, 3)), np.full(n, 5), np.array([], int), (),
+    )  # fmt: skip
+
+
+def _after(rule: str, places: list[tuple[float, float, float] | None]) -> list[float]:
+    """Belief in landmark 1 after each frame of one track."""
+    beliefs, before, found = Beliefs(CONFUSION, IdentityParams.model_validate({"rule": rule})), [], []
+    for place in places:
+        looked = None if place is None else np.array(place)
+        found.append(float(beliefs.step(_association(before, [7]), LOOKS_LIKE_1, [looked], SIDEWAYS)[0, 0]))
+        before = [7]
+    return found
+
+
+def test_a_resting_sonar_learns_nothing_from_more_frames():
+    first, *rest = _after("virtual-evidence", [(0, 0, 0)] * 20)
+    assert first > 0.3
+    assert max(rest) <= first
+
+
+def test_looks_from_new_places_add_up():
+    found = _after("virtual-evidence", [(0, 0.07 * k, 0) for k in range(6)])
+    assert (np.diff(found) > 0).all()
+    assert found[-1] > 0.98
+
+
+def test_coming_back_to_an_old_place_is_no_news():
+    away_and_back = _after("virtual-evidence", [(0, 0, 0), (0, 0.1, 0), (0, 0, 0), (0, 0.1, 0)])
+    assert away_and_back[1] > away_and_back[0]
+    assert away_and_back[3] <= away_and_back[1]
+
+
+def test_motion_ahead_counts_less_than_motion_to_the_side():
+    ahead = _after("virtual-evidence", [(0, 0, 0), (0.1, 0, 0)])
+    aside = _after("virtual-evidence", [(0, 0, 0), (0, 0.1, 0)])
+    assert ahead[1] <= ahead[0] < aside[1]
+
+
+def test_a_frame_without_a_look_changes_hardly_anything():
+    found = _after("virtual-evidence", [(0, 0, 0), None])
+    assert found[1] == pytest.approx(found[0], abs=1e-3)
+
+
+def test_the_papers_rule_counts_every_frame_and_saturates():
+    found = _after("jeffrey", [(0, 0, 0)] * 200)
+    assert found[1] > found[0]
+    assert found[-1] == pytest.approx(1.0, abs=0.01)  # C' b = s is solved by b = (1, 0, 0) here
+
+
+def test_beliefs_follow_their_tracks_when_rows_change_places():
+    beliefs = Beliefs(CONFUSION)
+    scores = np.array([[0.9, 0.05, 0.05], [0.05, 0.9, 0.05]])
+    place, sideways = np.zeros(3), np.tile(SIDEWAYS, (2, 1))
+    first = beliefs.step(_association([], [3, 4]), scores, [place, place], sideways)
+    after = beliefs.step(_association([3, 4], [4, 3]), 0 * scores, [None, None], sideways)
+    np.testing.assert_allclose(after, first[::-1], atol=1e-3)

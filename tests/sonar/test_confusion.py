@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from sonar_graph.errors import CalibrationError
+from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.sonar.confusion import LabelledFits, confusion_for, estimate_confusion, read_confusion
+from sonar_graph.sonar.scores import soft_scores
+
+
+def _fits(per_class: int, noise: float, seed: int = 0) -> LabelledFits:
+    """Correlations of 0.9 with the true design and 0.7 with others; of 0.6 with all where there is none."""
+    rng = np.random.default_rng(seed)
+    label = np.repeat(np.arange(3), per_class)
+    means = np.array([[0.9, 0.7], [0.7, 0.9], [0.6, 0.6]])[label]
+    error = np.where((label < 2)[:, None], rng.normal(0, [0.01, 0.002], (len(label), 2)), np.nan)
+    return LabelledFits(means + rng.normal(0, noise, means.shape), np.ones(len(label)), label, error)
+
+
+def test_scores_are_probabilities_and_rise_with_correlation():
+    scores = soft_scores(np.array([[0.9, 0.5], [0.3, 0.2]]), np.ones(2), 20.0, 0.8)
+    np.testing.assert_allclose(scores.sum(axis=1), 1)
+    assert scores[0, 0] > 0.9
+    assert scores[1, 2] > 0.9
+    certain = soft_scores(np.array([[1.0, 1.0]]), np.ones(1), 500.0, 0.8)
+    assert np.isfinite(certain).all()
+
+
+def test_scores_of_what_is_hardly_in_view_are_flatter():
+    whole, half = (soft_scores(np.array([[0.9, 0.8]]), np.array([v]), 10.0, 0.7)[0] for v in (1.0, 0.5))
+    assert half.max() < whole.max()
+
+
+def test_scores_that_are_fitted_are_calibrated():
+    fitted, unseen = estimate_confusion(_fits(400, 0.08), (1, 2), {}), _fits(400, 0.08, seed=1)
+    scores = soft_scores(unseen.correlation, unseen.visible, fitted.sharpness, fitted.threshold)
+    confidence, right = scores.max(axis=1), scores.argmax(axis=1) == unseen.label
+    assert abs(confidence.mean() - right.mean()) < 0.04
+    assert 0.6 < fitted.threshold < 0.9
+
+
+def test_matrix_is_the_mean_score_of_each_class():
+    fits = _fits(100, 0.1)
+    model = estimate_confusion(fits, (1, 2), {"origin": "made up"})
+    scores = soft_scores(fits.correlation, fits.visible, model.sharpness, model.threshold)
+    for k in range(3):
+        np.testing.assert_allclose(np.array(model.matrix)[k], scores[fits.label == k].mean(axis=0), atol=5e-3)
+    assert model.provenance["origin"] == "made up"
+    assert model.provenance["frames of landmark 1"] == "100"
+    assert model.range_sigma_m == pytest.approx(0.01, rel=0.2)
+
+
+def test_a_class_with_too_few_frames_is_named():
+    fits = _fits(100, 0.1)
+    few = LabelledFits(*(getattr(fits, n)[:210] for n in ("correlation", "visible", "label", "range_azimuth_error")))
+    with pytest.raises(CalibrationError, match="no landmark: 10"):
+        estimate_confusion(few, (1, 2), {})
+
+
+def test_files_come_back_and_wrong_ones_are_named(tmp_path):
+    model = estimate_confusion(_fits(50, 0.1), (1, 2), {})
+    path = tmp_path / "model.json"
+    path.write_text(model.model_dump_json())
+    assert read_confusion(path) == model
+    values = json.loads(model.model_dump_json())
+    values["matrix"][0][0] += 0.5
+    path.write_text(json.dumps(values))
+    with pytest.raises(CalibrationError, match="each row must be probabilities"):
+        read_confusion(path)
+    path.write_text("{")
+    with pytest.raises(CalibrationError, match="not JSON"):
+        read_confusion(path)
+
+
+def test_designs_that_ship_have_a_measured_model_and_others_an_assumed_one():
+    assert confusion_for(DEFAULT_DESIGNS).ids == (1, 2, 3, 4)
+    other = confusion_for([LandmarkDesign(9, "ring", 0.3, np.zeros((4, 4)))])
+    assert other.ids == (9,)
+    assert "assumed" in other.provenance["origin"]
+    np.testing.assert_allclose(other.array().sum(axis=1), 1)
