@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sonar_graph.errors import CalibrationError
+from sonar_graph.validation import faults_in
 
 Vector = tuple[float, float, float]
 STANDARD_GRAVITY = 9.80665
@@ -164,10 +165,9 @@ class Calibration(Section):
         Raises
         ------
         CalibrationError
-            Naming the source, each wrong field, and what was expected.
+            Naming the source, each wrong field, what was expected, and the fields that exist.
         """
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-            raise CalibrationError(f"{source}: {faults}") from error
+            raise CalibrationError(f"{source}: {faults_in(error, cls)}") from error

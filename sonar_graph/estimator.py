@@ -20,6 +20,7 @@ from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 from sonar_graph.measurements import Measurements
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
+from sonar_graph.validation import faults_in
 
 ENTRY_POINT_GROUP = "sonar_graph.estimators"
 
@@ -100,6 +101,4 @@ def make_params(estimator: type[Estimator], overrides: dict[str, Any], name: str
     try:
         return estimator.Params.model_validate(overrides)
     except ValidationError as error:
-        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        known = ", ".join(estimator.Params.model_fields)
-        raise EstimatorError(f"settings of {name}: {faults}; it has: {known}") from error
+        raise EstimatorError(f"settings of {name}: {faults_in(error, estimator.Params)}") from error

@@ -79,11 +79,11 @@ def test_settings_replace_defaults_one_by_one() -> None:
     assert settings == Nothing.Params(gain=2.0)
 
 
-@pytest.mark.parametrize("wrong", [{"gian": 1}, {"gain": "high"}])
-def test_wrong_setting_is_refused_with_those_that_exist(wrong: dict[str, object]) -> None:
-    with pytest.raises(EstimatorError, match=r"settings of nothing: .*it has: gain, name") as refusal:
-        make_params(Nothing, wrong, "nothing")  # type: ignore[arg-type]
-    assert next(iter(wrong)) in str(refusal.value)
+def test_wrong_setting_is_refused_with_those_that_exist() -> None:
+    with pytest.raises(EstimatorError, match=r"settings of nothing: gian: .* did you mean gain\? it has: gain, name"):
+        make_params(Nothing, {"gian": 1}, "nothing")  # type: ignore[arg-type]
+    with pytest.raises(EstimatorError, match=r"settings of nothing: gain: .* number, .* not 'high'"):
+        make_params(Nothing, {"gain": "high"}, "nothing")  # type: ignore[arg-type]
 
 
 def test_protocol_is_told_apart_by_its_methods() -> None:

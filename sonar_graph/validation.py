@@ -1,0 +1,102 @@
+"""What is wrong with settings that a user gave, in words that name each field and those that exist."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from difflib import SequenceMatcher
+from functools import partial
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+Place = tuple[int | str, ...]
+_SHOWN_CHARACTERS = 60
+_LEAST_SIMILARITY = 0.7
+
+
+def faults_in(error: ValidationError, model: type[BaseModel]) -> str:
+    """Every wrong field with what was expected, in one line.
+
+    Parameters
+    ----------
+    error
+        Of validating plain values.
+    model
+        What they were validated against.
+    """
+    errors = error.errors()
+    short = dict.fromkeys(_list_of(e) for e in errors if _is_short_list(e))
+    texts = [_describe(e, model) for e in errors if not _is_short_list(e)]
+    return "; ".join([*texts, *(_wrong_length(place, errors) for place in short)])
+
+
+def _describe(error: ErrorDetails, model: type[BaseModel]) -> str:
+    place = error["loc"]
+    if error["type"] == "extra_forbidden":
+        return unknown_field(place, model)
+    if error["type"] == "missing":
+        return f"{_path(place)}: is missing"
+    if error["type"] == "too_long" and not isinstance(error["input"], str):
+        return f"{_path(place)}: expected {error['ctx']['max_length']} values, not {_shown(error['input'])}"
+    message = error["msg"].removeprefix("Value error, ")
+    return f"{_path(place)}: {message}, not {_shown(error['input'])}" if place else message
+
+
+def unknown_field(place: Place, model: type[BaseModel]) -> str:
+    """That a field does not exist, which one may be meant, and which its section has."""
+    section = section_at(model, place[:-1])
+    names = list(section.model_fields) if section else []
+    similar = max(names, key=partial(_similarity, str(place[-1])), default="")
+    is_meant = _similarity(str(place[-1]), similar) >= _LEAST_SIMILARITY
+    suggestion = f"; did you mean {similar}?" if is_meant else ";"
+    return f"{_path(place)}: there is no such field{suggestion} {_path(place[:-1]) or 'it'} has: {', '.join(names)}"
+
+
+def _similarity(name: str, known: str) -> float:
+    """1 for what is meant beyond doubt; a beginning of the name counts, since units at its end are forgotten."""
+    return max(SequenceMatcher(None, name, text).ratio() for text in (known, known[: len(name)]))
+
+
+def _is_short_list(error: ErrorDetails) -> bool:
+    return error["type"] == "missing" and bool(error["loc"]) and isinstance(error["loc"][-1], int)
+
+
+def _list_of(error: ErrorDetails) -> Place:
+    return error["loc"][:-1]
+
+
+def _wrong_length(place: Place, errors: list[ErrorDetails]) -> str:
+    lacking = [e for e in errors if _is_short_list(e) and _list_of(e) == place]
+    expected = max(int(e["loc"][-1]) for e in lacking) + 1
+    return f"{_path(place)}: expected {expected} values, not {_shown(lacking[0]['input'])}"
+
+
+def _shown(value: Any) -> str:
+    text = repr(list(value) if isinstance(value, tuple) else value)
+    return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}..."
+
+
+def _path(place: Place) -> str:
+    """Names with dots; what pydantic adds for the branch of a union is left out."""
+    return ".".join(str(part) for part in place if isinstance(part, int) or part.isidentifier())
+
+
+def section_at(model: type[BaseModel], place: Place) -> type[BaseModel] | None:
+    """The section at a place within a model; None where there is none."""
+    section: type[BaseModel] | None = model
+    for name in place:
+        if section is None:
+            return None
+        if isinstance(name, str) and name in section.model_fields:
+            section = next(_sections(section.model_fields[name].annotation), None)
+    return section
+
+
+def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
+    if get_origin(annotation) in (Union, UnionType):
+        for option in get_args(annotation):
+            yield from _sections(option)
+    elif isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
