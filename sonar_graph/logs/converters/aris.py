@@ -78,7 +78,8 @@ class ArisFormat:
 
     def __init__(self, source: ByteSource) -> None:
         start = source.read(0, len(SIGNATURE))
-        if start != SIGNATURE and source.find(SIGNATURE, HEADER_BYTES) != HEADER_BYTES + self.signature_at:
+        in_first_frame = source.read(HEADER_BYTES + self.signature_at, len(SIGNATURE))
+        if SIGNATURE not in (start, in_first_frame):
             raise DatasetError(f"{source.path}: begins with {start!r}; an ARIS recording begins with {SIGNATURE!r}")
         (self.frames_promised,) = struct.unpack("<I", source.read(4, 4).ljust(4, b"\0"))
         image = SonarImage(scale="decibel", decibel_span=DECIBEL_SPAN)

@@ -120,15 +120,13 @@ def _around_damage(
 
 def _next_sound(source: ByteSource, kind: SonarFormat, start: int, but_not: int = -1) -> FrameHead | None:
     """The first header from ``start`` on that makes sense, one place left out."""
-    at = source.find(kind.signature, start + kind.signature_at)
-    while at is not None:
+    for at in source.places(kind.signature, start + kind.signature_at):
         begin = at - kind.signature_at
         try:
             if begin != but_not:
                 return kind.head(source.read(begin, kind.head_bytes), begin)
         except DamagedFrameError:
-            pass  # the signature's bytes by chance
-        at = source.find(kind.signature, at + 1)
+            continue  # the signature's bytes by chance
     return None
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -171,12 +171,11 @@ class ByteSource:
         except OSError as error:
             raise DatasetError(f"{self.path}: cannot be read at byte {at}: {error.strerror}") from error
 
-    def find(self, pattern: bytes, start: int) -> int | None:
-        """Where a pattern begins for the first time from ``start`` on."""
-        at = start
-        while at < self.size:
-            found = self.read(at, _BLOCK_BYTES + len(pattern) - 1).find(pattern)
-            if found >= 0:
-                return at + found
-            at += _BLOCK_BYTES
-        return None
+    def places(self, pattern: bytes, start: int) -> Iterator[int]:
+        """Where a pattern begins, from ``start`` on."""
+        for at in range(start, self.size, _BLOCK_BYTES):
+            block = self.read(at, _BLOCK_BYTES + len(pattern) - 1)
+            found = block.find(pattern)
+            while found >= 0:
+                yield at + found
+                found = block.find(pattern, found + 1)

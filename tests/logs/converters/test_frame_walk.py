@@ -29,7 +29,7 @@ CLOCK_AT = {"ddf": 40, "aris": 24, "raw": 53 + 40 + 3}
 """A byte of a frame's time, worth seconds for a DIDSON, hours for an ARIS, and tenths of one for an Oculus."""
 ENDINGS = list(PIECES)
 each_kind = pytest.mark.parametrize("ending", ENDINGS)
-in_one_folder = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+in_one_folder = settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def which(result: Converted, ending: str) -> list[int]:
