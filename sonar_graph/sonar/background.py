@@ -10,6 +10,8 @@ grid of about one independent level a node. The factor makes sigma the standard 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -21,33 +23,38 @@ LEAST_SPREAD_DB = 0.2
 STEPS_PER_DB = 4.0
 DEVIATION_STEPS_PER_DB = 20.0
 LARGEST_WINDOW = 127
+TREND_NODES = 5
+"""The median along the beams is itself averaged over so many nodes in range."""
 
 
-def background_and_spread(
-    image_db: Floats32, smoothing: tuple[int, int], neighbourhood: tuple[int, int]
-) -> tuple[Floats32, Floats32, Floats32]:
-    """Smoothed levels, their background and their spread, all in dB and of shape (beams, bins).
+@dataclass(frozen=True, eq=False)
+class Background:
+    """On a grid of nodes over the image, about one independent level each, shape (nodes, nodes)."""
+
+    level_db: Floats32
+    """B."""
+    spread_db: Floats32
+    """sigma."""
+
+
+def background_of(smooth_db: Floats32, smoothing: tuple[int, int], neighbourhood: tuple[int, int]) -> Background:
+    """Background and spread of smoothed levels.
 
     Parameters
     ----------
-    image_db
+    smooth_db
         Shape (beams, bins).
     smoothing, neighbourhood
-        Beams and bins, odd numbers.
+        Beams and bins over which levels were averaged, and over which medians are taken; odd numbers.
     """
-    smooth = cv2.blur(image_db, smoothing[::-1], borderType=cv2.BORDER_REFLECT_101)
-    steps = tuple(max(1, size // 2) for size in smoothing)
-    nodes = np.ascontiguousarray(smooth[steps[0] // 2 :: steps[0], steps[1] // 2 :: steps[1]])
-    trend = np.median(nodes, axis=0, keepdims=True).astype(np.float32)
-    window = (
-        min(round(np.mean([n / s for n, s in zip(neighbourhood, steps, strict=True)])), LARGEST_WINDOW) // 2 * 2 + 1
-    )
+    beams, bins = smoothing
+    nodes = np.ascontiguousarray(smooth_db[beams // 2 :: beams, bins // 2 :: bins])
+    trend = cv2.blur(np.median(nodes, axis=0, keepdims=True), (TREND_NODES, 1))
+    window = min(round((neighbourhood[0] / beams + neighbourhood[1] / bins) / 2), LARGEST_WINDOW) // 2 * 2 + 1
     residual = nodes - trend
     local = _median(residual, window, STEPS_PER_DB, 128.0)
     spread = MEDIAN_TO_SIGMA * _median(np.abs(residual - local), window, DEVIATION_STEPS_PER_DB, 0.0)
-    size = image_db.shape[::-1]
-    background = cv2.resize(local + trend, size, interpolation=cv2.INTER_LINEAR)
-    return smooth, background, cv2.resize(np.maximum(spread, np.float32(LEAST_SPREAD_DB)), size)  # type: ignore[return-value]
+    return Background(local + trend, np.maximum(spread, np.float32(LEAST_SPREAD_DB)))
 
 
 def _median(values: Floats32, window: int, steps_per_db: float, zero: float) -> Floats32:

@@ -54,6 +54,8 @@ class Candidates:
     """Mean level over the local background, shape (n,)."""
     boxes: Ints
     """First beam, first bin, number of beams, number of bins, shape (n, 4)."""
+    window: Floats
+    """What the image covers: smallest and largest range (m), smallest and largest azimuth (rad), shape (2, 2)."""
     labels: NDArray[np.int32]
     """Shape (beams, bins): i + 1 in the pixels of candidate i, 0 elsewhere."""
 

@@ -22,7 +22,7 @@ from scipy.special import digamma, gammainccinv, polygamma
 from sonar_graph.calibration import Section
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.sonar.background import Floats32, background_and_spread
+from sonar_graph.sonar.background import Floats32, background_of
 from sonar_graph.sonar.candidates import Candidates, Verdict
 from sonar_graph.sonar.geometry import FloorView, elevation_sigma
 from sonar_graph.sonar.regions import measure_regions
@@ -88,11 +88,12 @@ def select_candidates(
     if not np.isfinite(cv2.sumElems(image_db)[0]):
         raise MeasurementError("sonar frame: levels that are not finite; leave the frame out")
     cell_m = _cell_m(ranges_m, azimuths_rad)
-    smooth, background, spread = background_and_spread(
-        image_db, _odd(params.smoothing_m, cell_m), _odd(params.background_m, cell_m)
-    )
-    contrast = smooth - background
-    mask = (contrast > false_alarm_offsets_db(spread, params.false_alarm)).view(np.uint8)
+    smoothing = _odd(params.smoothing_m, cell_m)
+    smooth = np.asarray(cv2.blur(image_db, smoothing[::-1], borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
+    background = background_of(smooth, smoothing, _odd(params.background_m, cell_m))
+    contrast = smooth - _spread_out(background.level_db, smooth.shape)
+    offsets = false_alarm_offsets_db(background.spread_db, params.false_alarm)
+    mask = cv2.compare(contrast, _spread_out(offsets, smooth.shape), cv2.CMP_GT)
     closing = cv2.getStructuringElement(cv2.MORPH_RECT, _odd(params.closing_m, cell_m)[::-1])
     count, labels, stats, _ = cv2.connectedComponentsWithStats(
         cv2.morphologyEx(mask, cv2.MORPH_CLOSE, closing), connectivity=8, ltype=cv2.CV_32S
@@ -154,6 +155,11 @@ def _odd(length_m: float, cell_m: tuple[float, float]) -> tuple[int, int]:
     return max(1, beams), max(1, bins)
 
 
+def _spread_out(nodes: Floats32, shape: tuple[int, ...]) -> Floats32:
+    """Nodes of the background interpolated to every pixel."""
+    return np.asarray(cv2.resize(nodes, shape[::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+
+
 def _judged(
     contrast: Floats32,
     labels: NDArray[np.int32],
@@ -180,6 +186,7 @@ def _judged(
         extent_m=regions.extent_m,
         level_db=regions.level_db,
         boxes=boxes,
+        window=np.array([[ranges_m.min(), ranges_m.max()], [azimuths_rad.min(), azimuths_rad.max()]]),
         labels=labels,
     )
 

@@ -147,27 +147,26 @@ def _elevation_derivatives(points_m: Floats) -> Floats:
 
 
 @compiled
-def _wrapped(angle_rad: float) -> float:
-    """The same angle between -pi and pi."""
-    return angle_rad - 2.0 * math.pi * round(angle_rad / (2.0 * math.pi))
+def floor_lift(range_m: float, cos_a: float, sin_a: float, up: Floats, height_m: float) -> tuple[float, float]:
+    """Cosine and sine of the elevation at which a ray of this range meets the floor; NaN where it does not.
 
-
-@compiled
-def floor_elevation(range_m: float, azimuth_rad: float, up: Floats, height_m: float) -> float:
-    """Elevation at which a ray of this range meets the floor; NaN where it does not."""
-    across = up[0] * math.cos(azimuth_rad) + up[1] * math.sin(azimuth_rad)
-    reach = -height_m / (math.hypot(across, up[2]) * range_m)
-    if not abs(reach) <= 1.0:
-        return math.nan
-    middle, spread = math.atan2(up[2], across), math.acos(reach)
-    one, other = _wrapped(middle - spread), _wrapped(middle + spread)
-    return one if abs(one) <= abs(other) else other
+    With ``A = u1 cos a + u2 sin a``, ``B = u3``, ``k = -h / r``, ``w = sqrt(A^2 + B^2 - k^2)``, the solutions are
+    ``cos e = (A k +- B w) / (A^2 + B^2)``, ``sin e = (B k -+ A w) / (A^2 + B^2)``; the larger cosine is nearer to the
+    centre beam.
+    """
+    across, lift, k = up[0] * cos_a + up[1] * sin_a, up[2], -height_m / range_m
+    norm2 = across * across + lift * lift
+    if not k * k <= norm2:
+        return math.nan, math.nan
+    w = math.copysign(math.sqrt(norm2 - k * k), lift)
+    return (across * k + lift * w) / norm2, (lift * k - across * w) / norm2
 
 
 @compiled
 def floor_elevations(ranges_m: Floats, azimuths_rad: Floats, up: Floats, height_m: float) -> Floats:
-    """`floor_elevation` of each of n rays, shape (n,)."""
+    """Elevation at which each of n rays meets the floor, shape (n,); NaN where it does not."""
     found = np.empty(len(ranges_m))
     for i in range(len(found)):
-        found[i] = floor_elevation(ranges_m[i], azimuths_rad[i], up, height_m)
+        cos_e, sin_e = floor_lift(ranges_m[i], math.cos(azimuths_rad[i]), math.sin(azimuths_rad[i]), up, height_m)
+        found[i] = math.atan2(sin_e, cos_e)
     return found

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sonar_graph.kernels import compiled
 from sonar_graph.measurements import Floats
 from sonar_graph.sonar.background import Floats32
-from sonar_graph.sonar.geometry import FloorView, floor_elevation, ranges_azimuths_elevations
+from sonar_graph.sonar.geometry import FloorView, floor_lift, ranges_azimuths_elevations
 
 AREA, LEVEL, X, Y, XX, XY, YY, PIXELS = range(8)
 
@@ -83,7 +83,7 @@ def _sums(
                 continue
             r = ranges_m[bin_]
             if height_m > 0:
-                x, y, area = _floor_cell(r, azimuths_rad[beam], level_R_sonar, height_m)
+                x, y, area = _floor_cell(r, cos_a, sin_a, level_R_sonar, height_m)
                 area *= dr * da
             else:
                 x, y, area = r * cos_a, r * sin_a, r * dr * da
@@ -100,14 +100,15 @@ def _sums(
 
 
 @compiled
-def _floor_cell(r: float, a: float, level_R_sonar: Floats, height_m: float) -> tuple[float, float, float]:
+def _floor_cell(
+    r: float, cos_a: float, sin_a: float, level_R_sonar: Floats, height_m: float
+) -> tuple[float, float, float]:
     """Level x and y of a floor point, and area there per unit of range and azimuth; area 0 off the floor."""
     up = level_R_sonar[2]
-    e = floor_elevation(r, a, up, height_m)
+    cos_e, sin_e = floor_lift(r, cos_a, sin_a, up, height_m)
     g2 = r * r - height_m * height_m
-    if not math.isfinite(e) or g2 <= 0:
+    if not g2 > 0 or not math.isfinite(cos_e):
         return 0.0, 0.0, 0.0
-    cos_a, sin_a, cos_e, sin_e = math.cos(a), math.sin(a), math.cos(e), math.sin(e)
     qx, qy, qz = r * cos_e * cos_a, r * cos_e * sin_a, r * sin_e
     by_e = (-r * sin_e * cos_a, -r * sin_e * sin_a, r * cos_e)
     ratio = -(up[1] * qx - up[0] * qy) / (up[0] * by_e[0] + up[1] * by_e[1] + up[2] * by_e[2])
