@@ -276,3 +276,16 @@ def test_what_is_no_covariance_is_refused(spoil: Callable[[np.ndarray], np.ndarr
     require_covariance(np.zeros((6, 6)), 6, "P")
     with pytest.raises(ContractError, match=complaint):
         require_covariance(spoil(np.eye(6)), 6, "P")
+
+
+class Careless(PlainDeadReckoning):
+    """Takes every block for present."""
+
+    def process(self, measurements: Measurements) -> Estimate | None:
+        len(measurements.dvl)  # type: ignore[arg-type]
+        return super().process(measurements)
+
+
+def test_an_estimator_that_raises_is_named_with_the_check():
+    with pytest.raises(ContractError, match=r"\w+: the estimator raised TypeError: .*may be None"):
+        check_estimator(Careless)

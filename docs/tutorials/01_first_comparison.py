@@ -1,6 +1,6 @@
 """From a log to a report: three estimators on the same measurements.
 
-Run it in any folder: ``python 01_first_comparison.py``. It takes about half a minute and writes ``basin.mcap`` and
+Run it in any folder: ``python 01_first_comparison.py``. It takes some seconds and writes ``basin.mcap`` and
 ``comparison/``. The same by commands::
 
     sonar-graph simulate basin --help
@@ -12,8 +12,8 @@ from pathlib import Path
 from sonar_graph.evaluation.comparison import compare
 from sonar_graph.evaluation.report import write_report
 from sonar_graph.evaluation.storage import write_comparison
+from sonar_graph.evaluation.viewer_files import write_viewer_files
 from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.result_log import write_result
 from sonar_graph.logs.writing import write_sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
@@ -32,7 +32,8 @@ comparison = compare(sequence, ["isam2", "ekf-slam", "dead-reckoning"])
 
 # Causal: what was known at each instant; a robot steers by it. Smoothed: what is known at the end about each instant; a
 # map is drawn from it. A filter does not look back, so that its two columns are equal. Only causal errors compare a
-# smoother with a filter fairly.
+# smoother with a filter fairly. In one short lap with few landmarks the errors may lie within a few millimetres of each
+# other, in either order: one run does not rank estimators.
 print("\n                  causal ATE   smoothed ATE     NEES   time")
 for name, scores in comparison.scores.items():
     causal, smoothed = scores["causal.ate_raw_m"], scores["smoothed.ate_raw_m"]
@@ -59,8 +60,7 @@ for landmark, position, covariance in zip(landmarks.ids, landmarks.positions, la
 folder = Path("comparison")
 folder.mkdir(exist_ok=True)
 write_comparison(comparison, folder)
-estimates = {run.estimator: (run.causal, run.smoothed, run.landmarks) for run in comparison.runs}
-write_result(folder / "result.mcap", sequence, estimates)
+write_viewer_files(comparison, sequence, folder)
 write_report(comparison, folder / "report.html")
 print(f"\nreport: {folder / 'report.html'}")
 

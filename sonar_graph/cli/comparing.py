@@ -205,9 +205,9 @@ def _write_report(comparison: Comparison, folder: Path) -> Path:
 
 
 def _print_summary(comparison: Comparison) -> None:
-    from sonar_graph.evaluation.console import summary_table
+    from sonar_graph.evaluation.console import summary
 
-    answers().print(summary_table(comparison))
+    answers().print(summary(comparison))
 
 
 def _exit_by(comparison: Comparison) -> None:

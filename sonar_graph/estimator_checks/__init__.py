@@ -29,10 +29,15 @@ def check_estimator(make: MakeEstimator) -> None:
     Raises
     ------
     ContractError
-        At the first check that fails, with its name.
+        At the first check that fails, with its name; also where the estimator itself raises.
     """
     for check in CHECKS:
         try:
             check(make)
         except ContractError as violation:
             raise ContractError(f"{check.__name__}: {violation}") from violation
+        except Exception as error:
+            said = f"{type(error).__name__}: {error}"
+            raise ContractError(
+                f"{check.__name__}: the estimator raised {said}; any block of Measurements may be None"
+            ) from error

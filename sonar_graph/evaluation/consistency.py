@@ -14,6 +14,10 @@ from sonar_graph.evaluation.results import ErrorSeries
 from sonar_graph.measurements import Floats
 from sonar_graph.states import DetectionLog, Outcome, Trajectory
 
+GATED_SHARE = 0.2
+"""Above this share of detections outside its gate an estimator has lost its way, or its noise is far too small; the
+innovations that the gate let through then say nothing of its covariances."""
+
 
 def error_series(estimate: Trajectory, truth: Trajectory, position_dof: int) -> ErrorSeries:
     """Errors, their reported standard deviations and their NEES at instants common to both.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rich.box import SIMPLE_HEAD
+from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
@@ -18,6 +19,7 @@ from sonar_graph.evaluation.wording import (
     failed_runs,
     has_detections,
     headline_metric,
+    lost_runs,
     score_of,
 )
 
@@ -26,7 +28,7 @@ COLUMNS = {
     "causal.nees_position": "NEES\npos.",
     "causal.nees_yaw": "NEES\nyaw",
     "time.update_median_ms": "median",
-    "time.update_p99_ms": "p99",
+    "time.update_max_ms": "longest",
 }
 """Columns after the two position errors; those that no run has are left out."""
 NEES_LEGEND = (
@@ -34,21 +36,22 @@ NEES_LEGEND = (
 )
 
 
-def summary_table(comparison: Comparison) -> Table:
+def summary(comparison: Comparison) -> Group:
     """The runs in rows with position error (causal and smoothed), yaw error, NEES and time; below, why runs failed.
 
-    The same numbers as in the report. NEES is 1 for a consistent estimator, and marked where `consistency` says more.
+    What is below may be as wide as the terminal. The same numbers as in the report. NEES is 1 for a consistent
+    estimator, and marked where `consistency` says more.
     """
     columns = _columns(comparison)
     title = Text(comparison.sequence.name, style="bold")
-    table = Table(title=title, caption=_caption(comparison), title_justify="left", caption_justify="left")
+    table = Table(title=title, title_justify="left")
     table.box, table.padding = SIMPLE_HEAD, (0, 1, 0, 0)
     table.add_column("estimator", no_wrap=True)
     for key, heading in columns.items():
         table.add_column(Text(_heading(comparison, key, heading)), justify="right", no_wrap=True)
     for run in comparison.runs:
         table.add_row(Text(run.estimator), *(_cell(comparison, run, key) for key in columns))
-    return table
+    return Group(table, _notes(comparison))
 
 
 def _columns(comparison: Comparison) -> dict[str, str]:
@@ -64,8 +67,9 @@ def _heading(comparison: Comparison, key: str, heading: str) -> str:
     return f"{heading}\n({unit})" if unit else heading
 
 
-def _caption(comparison: Comparison) -> Text:
+def _notes(comparison: Comparison) -> Text:
     lines = [f"{run.estimator} failed: {run.reason}" for run in failed_runs(comparison)]
+    lines += lost_runs(comparison)
     notes = comparison.sequence.notes
     lines += [f"Log: {notes[subject]}" for subject in ("log.ending", "log.damage") if subject in notes]
     if not has_detections(comparison):

@@ -7,7 +7,7 @@ from collections import Counter
 
 import numpy as np
 
-from sonar_graph.evaluation.consistency import anees_interval, mean_normalised, nis, normalised_squares
+from sonar_graph.evaluation.consistency import GATED_SHARE, anees_interval, mean_normalised, nis, normalised_squares
 from sonar_graph.evaluation.metrics import (
     ate_raw_m,
     ate_se2_m,
@@ -163,6 +163,7 @@ def detection_scores(log: DetectionLog) -> dict[str, Score]:
         ),
     }
     squares = nis(log)
+    is_gated_much = counts[Outcome.GATED] > GATED_SHARE * len(log)
     if squares.size:
         scores["detections.nis"] = Score(
             mean_normalised(squares, 2),
@@ -170,7 +171,7 @@ def detection_scores(log: DetectionLog) -> dict[str, Score]:
             f"Mean normalised squared innovation of {squares.size} detections used, divided by 2; 1 is consistent; the "
             "two-sided 95 % band takes innovations as independent; what a gate refused is not in it, which lowers it.",
             anees_interval(squares.size, 2),
-            "inside",
+            "none" if is_gated_much else "inside",
         )
     return scores
 

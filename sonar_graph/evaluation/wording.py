@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 
+from sonar_graph.evaluation.consistency import GATED_SHARE
 from sonar_graph.evaluation.results import Comparison, RunResult, Score
+from sonar_graph.states import Outcome
 
 ABSENT = "\N{EN DASH}"
 TOO_CLOSE = 0.05
@@ -84,6 +86,20 @@ def failed_runs(comparison: Comparison) -> list[RunResult]:
     return [run for run in comparison.runs if run.status == "failed"]
 
 
+def lost_runs(comparison: Comparison) -> list[str]:
+    """A sentence on each run whose gate refused more than `GATED_SHARE` of the detections."""
+    said = []
+    for run in comparison.runs:
+        outcomes = run.detections.outcomes if run.detections else []
+        gated = outcomes.count(Outcome.GATED)
+        if gated > GATED_SHARE * max(len(outcomes), 1):
+            said.append(
+                f"{run.estimator} refused {gated} of {len(outcomes)} detections as outside its gate: it has lost its "
+                "way, or noise is set far too small; its NIS only tells of what the gate let through."
+            )
+    return said
+
+
 def score_of(comparison: Comparison, name: str, key: str) -> Score | None:
     """A run's score, or None where it is missing or not a number."""
     score = comparison.scores.get(name, {}).get(key)
@@ -103,14 +119,15 @@ def headline_metric(comparison: Comparison) -> str | None:
 def finding(comparison: Comparison) -> list[str]:
     """What the comparison found, a sentence each: failures first, then errors, then whether covariances hold.
 
-    A log without detections is mentioned after the failures.
+    A log without detections, and runs that lost their way, are mentioned after the failures.
     """
     sentences = [f"{run.estimator} failed: {run.reason.rstrip('.')}." for run in failed_runs(comparison)]
     if not has_detections(comparison):
         sentences.append(NO_DETECTIONS)
+    sentences += lost_runs(comparison)
     metric = headline_metric(comparison)
     if metric is None:
-        return [*sentences, _why_no_error(comparison)]
+        return [*sentences, _why_no_error(comparison), *_nis_sentence(comparison)]
     sentences.append(_causal_sentence(comparison, metric))
     return [*sentences, *_smoothed_sentence(comparison, metric), *_consistency_sentence(comparison)]
 
@@ -166,6 +183,16 @@ def _consistency_sentence(comparison: Comparison) -> list[str]:
         return []
     listed = ", ".join(filter(None, judged))
     return [f"NEES, of position or yaw whichever is further from the 1 of a fitting uncertainty: {listed}."]
+
+
+def _nis_sentence(comparison: Comparison) -> list[str]:
+    """Without truth innovations alone tell whether covariances hold."""
+    judged = [
+        f"{run.estimator} {display_value(score)} ({consistency(score)})"
+        for run in comparison.runs
+        if (score := score_of(comparison, run.estimator, "detections.nis")) is not None and consistency(score)
+    ]
+    return [f"NIS, 1 where innovations fit their covariances: {', '.join(judged)}."] if judged else []
 
 
 def _worst_nees(comparison: Comparison, name: str) -> str:

@@ -3,12 +3,15 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.evaluation.results import Score
+from sonar_graph.evaluation.scores import detection_scores
 from sonar_graph.evaluation.wording import NO_DETECTIONS, consistency, display_value, finding, format_value, with_unit
+from sonar_graph.states import DetectionLog, Outcome
 
 from .synthetic import basin_comparison, only, with_failure, with_score
 
@@ -90,7 +93,7 @@ def test_failures_come_first():
 
 
 def test_finding_says_why_there_is_none():
-    assert "no ground truth" in finding(basin_comparison(60, truth=False))[-1]
+    assert "no ground truth" in " ".join(finding(basin_comparison(60, truth=False)))
     everything_failed = with_failure(only(scored(), "isam2"), "isam2", "no odometry")
     assert "nothing to compare" in finding(everything_failed)[-1]
     unscored = replace(scored(), scores={})
@@ -132,3 +135,24 @@ def test_finding_says_that_there_were_no_detections(truth):
     assert NO_DETECTIONS not in finding(comparison)
     none = replace(comparison.sequence, detections=None)
     assert finding(replace(comparison, sequence=none))[0] == NO_DETECTIONS
+
+
+@pytest.mark.parametrize(("gated", "is_told"), [(19, False), (21, True)])
+def test_an_estimator_that_refuses_a_fifth_of_the_detections_is_called_lost(gated, is_told):
+    outcomes = [Outcome.GATED] * gated + [Outcome.USED] * (100 - gated)
+    log = DetectionLog(
+        np.arange(100), np.ones(100, np.int64), np.full((100, 2), 0.1), np.tile(np.eye(2), (100, 1, 1)), outcomes
+    )
+    comparison = basin_comparison(60)
+    runs = [replace(run, detections=log) if run.estimator == "ekf-slam" else run for run in comparison.runs]
+    sentences = finding(replace(comparison, runs=runs))
+    told = [sentence for sentence in sentences if sentence.startswith(f"ekf-slam refused {gated} of 100")]
+    assert bool(told) == is_told
+    assert consistency(detection_scores(log)["detections.nis"]) == ("" if is_told else "over-cautious")
+
+
+def test_without_truth_innovations_tell_whether_covariances_hold():
+    comparison = with_score(
+        basin_comparison(60, truth=False), "isam2", "detections.nis", Score(6.9, "1", "By hand.", (0.9, 1.1), "inside")
+    )
+    assert "isam2 6.90 (over-confident)" in finding(comparison)[-1]
