@@ -56,6 +56,16 @@ def test_messages_without_images_are_passed_over(tmp_path: Path) -> None:
     assert result.done.shortcomings() == []
 
 
+def test_damage_after_a_message_without_image_costs_only_itself(tmp_path: Path) -> None:
+    pictures = images(4, 16, 8)
+    _, *pings = Oculus(pictures).pieces()
+    note = oculus_note()
+    result = converted(tmp_path, b"".join([pings[0], note, bytes(len(note)), *pings[1:]]), "raw")
+    np.testing.assert_array_equal(result.frames.intensity, pictures)
+    begin = len(pings[0]) + len(note)
+    assert [(loss.at, loss.end) for loss in result.done.lost] == [(begin, begin + len(note))]
+
+
 def test_pings_that_were_not_recorded_are_counted(tmp_path: Path) -> None:
     _, *pings = Oculus(images(6, 16, 8)).pieces()
     done = converted(tmp_path, b"".join(pings[:2] + pings[4:]), "raw").done
