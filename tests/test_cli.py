@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import sonar_graph
-from sonar_graph.calibration import Calibration
 from sonar_graph.cli import app, main
 from sonar_graph.cli.settings import estimator_settings, parse_setting, read_calibration, topic_choices
 from sonar_graph.errors import CalibrationError, EstimatorError
+from sonar_graph.logs.calibration_sources import PartialCalibration
 
 
 def run(*arguments: object) -> int:
@@ -283,13 +283,21 @@ def test_run_writes_one_estimator(basin: Path, tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["dead-reckoning"]
 
 
-def test_calibration_file_replaces_that_of_the_log(basin: Path, tmp_path: Path) -> None:
+def test_calibration_file_goes_before_that_of_the_log_field_by_field(basin: Path, tmp_path: Path) -> None:
     moved = tmp_path / "moved.toml"
     moved.write_text("[start]\nposition_m = [100.0, 0.0, -1.0]\n")
-    arguments = ("run", basin, "--estimator", "dead-reckoning", "-o", tmp_path / "out", "--calibration", moved)
-    assert run(*arguments) == 0
+    arguments = ("run", basin, "--estimator", "dead-reckoning", "-o", tmp_path / "out")
+    calibrations = []
+    for more in ((), ("--calibration", moved)):
+        assert run(*arguments, *more) == 0
+        said = json.loads((tmp_path / "out" / "comparison.json").read_text())["sequence"]
+        calibrations.append(said["calibration"])
     first = (tmp_path / "out" / "runs" / "dead-reckoning" / "causal.tum").read_text().splitlines()[1].split()
     assert float(first[1]) == pytest.approx(100, abs=3)
+    of_log, changed = calibrations
+    assert changed["start"].pop("position_m") != of_log["start"].pop("position_m")
+    assert changed == of_log
+    assert said["notes"]["log.calibration"] == f"from {moved}: start.position_m; else from the log"
 
 
 def test_inspect_names_the_topics(basin: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -393,7 +401,7 @@ def test_topics_go_to_their_roles() -> None:
 def test_calibration_is_read_from_toml_and_json(name: str, text: str, tmp_path: Path) -> None:
     path = tmp_path / name
     path.write_text(text)
-    assert read_calibration(path) == Calibration.parse({"imu": {"gyro_bias_sigma": 0.5}}, "")
+    assert read_calibration(path) == PartialCalibration({"imu": {"gyro_bias_sigma": 0.5}}, str(path))
 
 
 def test_calibration_with_an_unknown_field_names_file_and_field(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ CalibrationPath = Annotated[
         metavar="FILE",
         exists=True,
         dir_okay=False,
-        help="TOML or JSON file with the calibration; replaces the one in the log.",
+        help="TOML or JSON file whose fields go before those of the log's own calibration and mountings.",
     ),
 ]
 RateHz = Annotated[

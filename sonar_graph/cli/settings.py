@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from sonar_graph.errors import CalibrationError, EstimatorError, LogError
 
 if TYPE_CHECKING:
-    from sonar_graph.calibration import Calibration
     from sonar_graph.logs.adapters.config import LogConfig
+    from sonar_graph.logs.calibration_sources import PartialCalibration
     from sonar_graph.logs.window import Window
 
 
@@ -109,15 +109,15 @@ def read_config(path: Path | None) -> LogConfig | None:
     return None if path is None else read_log_config(path)
 
 
-def read_calibration(path: Path | None) -> Calibration | None:
-    """The calibration in a TOML or JSON file, which replaces the log's own; None where no file is given.
+def read_calibration(path: Path | None) -> PartialCalibration | None:
+    """What a TOML or JSON file says of the calibration, before the log's own; None where no file is given.
 
     Raises
     ------
     CalibrationError
         When the file is neither TOML nor JSON, or a field does not fit.
     """
-    from sonar_graph.calibration import Calibration
+    from sonar_graph.logs.calibration_sources import PartialCalibration
 
     if path is None:
         return None
@@ -129,7 +129,7 @@ def read_calibration(path: Path | None) -> Calibration | None:
         raise CalibrationError(f"{path}: not {kind}: {error}") from error
     if not isinstance(values, dict):
         raise CalibrationError(f"{path}: expected an object with sections such as imu, not {json.dumps(values):.40}")
-    return Calibration.parse(values, str(path))
+    return PartialCalibration.parse(values, str(path))
 
 
 def window_of(start: str | None, end: str | None) -> Window:

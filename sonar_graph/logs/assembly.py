@@ -15,10 +15,11 @@ from sonar_graph.logs.adapters.inertial import ImuAdapter
 from sonar_graph.logs.adapters.reference import TruthAdapter
 from sonar_graph.logs.adapters.toml_text import changes_text
 from sonar_graph.logs.adapters.vertical import DepthAdapter
+from sonar_graph.logs.calibration_sources import PartialCalibration, gathered, mounted_by
 from sonar_graph.logs.container import Recording, Topic
 from sonar_graph.logs.decoding import read_detections, read_landmark_map
 from sonar_graph.logs.log_record import read_calibration, read_notes, recorded_name
-from sonar_graph.logs.mountings import mounting_of, static_frames, with_mountings
+from sonar_graph.logs.mountings import mounting_of, static_frames
 from sonar_graph.logs.roles import ROLES, Choice
 from sonar_graph.logs.sanity import axes_warning, gravity_warning
 from sonar_graph.logs.stamp_check import stamp_faults
@@ -44,18 +45,21 @@ class Assembly:
     choices
         By role.
     calibration
-        Instead of the one in the log.
+        Instead of the one in the log; or what goes before that, field by field.
 
     Raises
     ------
     LogError
         When messages of a chosen topic are not what they should be.
     CalibrationError
-        When the calibration in the log is not one.
+        When the calibration in the log, or what it becomes by the user's changes, is not one.
     """
 
     def __init__(
-        self, recording: Recording, choices: Mapping[str, Choice], calibration: Calibration | None = None
+        self,
+        recording: Recording,
+        choices: Mapping[str, Choice],
+        calibration: Calibration | PartialCalibration | None = None,
     ) -> None:
         self._recording = recording
         self._topics = {role: recording.topics[c.topic] for role, c in choices.items() if c.topic is not None}
@@ -201,22 +205,22 @@ class Assembly:
             raise LogError(f"{topic.file}: topic {topic.name}: none of its {len(topic)} messages can be used: {faults}")
         return block
 
-    def _calibration(self, given: Calibration | None) -> Calibration:
-        recorded = read_calibration(self._recording)
-        if given is not None:
+    def _calibration(self, given: Calibration | PartialCalibration | None) -> Calibration:
+        if isinstance(given, Calibration):
             self._notes["log.calibration"] = "given by the caller"
             return given
-        if recorded is not None:
-            self._notes["log.calibration"] = "from the log"
-            return recorded
+        recorded = read_calibration(self._recording)
+        said = mounted_by(given.values if given else {}) | mounted_by(
+            recorded.model_dump(exclude_unset=True) if recorded else {}
+        )
         sensors = self._frames()
         known = self._mountings(sensors)
-        missing = [f"{name} ({frame or 'unnamed'})" for name, frame in sensors.items() if name not in known]
-        self._is_mounting_known = "dvl" in known
-        self._notes["log.calibration"] = f"defaults; mountings from /tf_static: {', '.join(known) or 'none'}" + (
-            f"; not in the tree, taken as base_link: {', '.join(missing)}" if missing else ""
+        self._is_mounting_known = "dvl" in known.keys() | said
+        of_log = "from the log" if recorded else _source_of_mountings(sensors, known, said)
+        self._notes["log.calibration"] = (
+            f"from {given.source}: {', '.join(given.fields()) or 'nothing'}; else {of_log}" if given else of_log
         )
-        return with_mountings(Calibration(), known)
+        return gathered(given, recorded, known)
 
     def _frames(self) -> dict[str, str]:
         """The frame of each sensor, by the calibration's name for it."""
@@ -233,6 +237,14 @@ class Assembly:
         tree = static_frames(self._recording)
         found = {name: mounting_of(frame, tree) for name, frame in sensors.items()}
         return {name: mounting for name, mounting in found.items() if mounting is not None}
+
+
+def _source_of_mountings(sensors: Mapping[str, str], known: Mapping[str, Mounting], said: set[str]) -> str:
+    """Where the places of sensors come from in a log without a calibration, in words."""
+    missing = [f"{name} ({frame or 'unnamed'})" for name, frame in sensors.items() if name not in known.keys() | said]
+    return f"defaults; mountings from /tf_static: {', '.join(known) or 'none'}" + (
+        f"; not in the tree, taken as base_link: {', '.join(missing)}" if missing else ""
+    )
 
 
 def _list(dropped: Dropped) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 from sonar_graph.calibration import Calibration
 from sonar_graph.logs.adapters.config import LogConfig
 from sonar_graph.logs.assembly import Assembly
+from sonar_graph.logs.calibration_sources import PartialCalibration
 from sonar_graph.logs.container import Keep, Progress, scan
 from sonar_graph.logs.message_definitions import short_name
 from sonar_graph.logs.roles import choose_topics, wanted_types
@@ -18,7 +19,7 @@ from sonar_graph.sequence import Sequence
 def read_sequence(
     path: Path,
     *,
-    calibration: Calibration | None = None,
+    calibration: Calibration | PartialCalibration | None = None,
     name: str | None = None,
     topics: Mapping[str, str] | None = None,
     config: LogConfig | None = None,
@@ -36,7 +37,8 @@ def read_sequence(
     path
         An MCAP file.
     calibration
-        Instead of the one in the file; without either, defaults with the mountings of ``/tf_static``.
+        A `Calibration` replaces all that the file says. A `PartialCalibration` goes before it, field by field.
+        Without either: the file's record; where it has none, defaults with the mountings of ``/tf_static``.
     name
         Instead of the one in the file; without either, the file's name.
     topics
@@ -59,7 +61,7 @@ def read_sequence(
         When the file is not MCAP, is damaged in its middle without `salvage`, has nothing in the window, or a message
         breaks its own rules.
     CalibrationError
-        When the calibration in the file is not one.
+        When the calibration in the file, or what `calibration` makes of it, is not one.
     """
     path = Path(path)
     config = config or LogConfig()
