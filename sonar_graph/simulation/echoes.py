@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sonar_graph.kernels import compiled
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.simulation.scatterers import CELL_M, CELLS, Floats32
+from sonar_graph.simulation.scatterers import Floats32
 
 TAPS = 6
 """Bins that one echo reaches."""
@@ -32,6 +32,8 @@ STEEP = 0.25
 class Tables(NamedTuple):
     """What does not change from frame to frame."""
 
+    cell_m: float
+    """Of the scatterers' grid."""
     column_rad: float
     """Width of a column of azimuth."""
     columns: int
@@ -88,16 +90,16 @@ class Horizon(NamedTuple):
 
 
 @compiled
-def block_rays(view: View, surface: Surface, horizon: Horizon, raised_m: float) -> None:
+def block_rays(view: View, surface: Surface, horizon: Horizon, raised_m: float, cell_m: float) -> None:
     """Fill the horizon: what lies behind something raised is blocked below the ray over its top."""
     bearings, distances = horizon.tangent.shape
     for row in range(surface.relief_m.shape[0]):
-        y = (view.first_row + row + 0.5) * CELL_M - view.position_m[1]
+        y = (view.first_row + row + 0.5) * cell_m - view.position_m[1]
         for column in range(surface.relief_m.shape[1]):
             relief = surface.relief_m[row, column]
             if relief < raised_m:
                 continue
-            x = (surface.first_column + column + 0.5) * CELL_M - view.position_m[0]
+            x = (surface.first_column + column + 0.5) * cell_m - view.position_m[0]
             ahead = view.heading[0] * x + view.heading[1] * y
             aside = view.heading[0] * y - view.heading[1] * x
             run = np.sqrt(x * x + y * y)
@@ -159,20 +161,21 @@ def sum_echoes(
 ) -> None:
     """Add every echo in view to ``echoes``, shape (columns, TAPS + bins + TAPS, 2), real and imaginary part."""
     R = view.sonar_R_world
+    cell_m, cells = tables.cell_m, points.shape[0]
     has_objects = surface.amplitude.shape[0] > 0
     has_shadows = horizon.tangent.shape[0] > 0
     least_range_m = tables.range_start_m - TAPS * tables.bin_m
     most_range_m = tables.range_start_m + (tables.bins + TAPS) * tables.bin_m
     height_m = view.position_m[2] - view.floor_z_m
     for row in range(view.spans.shape[0]):
-        i = (view.first_row + row) % CELLS
-        point_row = (i + view.shift[0]) % CELLS
-        y_row = (view.first_row + row) * CELL_M - view.position_m[1]
+        i = (view.first_row + row) % cells
+        point_row = (i + view.shift[0]) % cells
+        y_row = (view.first_row + row) * cell_m - view.position_m[1]
         for column in range(view.spans[row, 0], view.spans[row, 1]):
-            j = column % CELLS
-            point = points[point_row, (j + view.shift[1]) % CELLS]
-            x = column * CELL_M - view.position_m[0] + CELL_M * point[2]
-            y = y_row + CELL_M * point[3]
+            j = column % cells
+            point = points[point_row, (j + view.shift[1]) % cells]
+            x = column * cell_m - view.position_m[0] + cell_m * point[2]
+            y = y_row + cell_m * point[3]
             z, gain, facing, area, relief = -height_m, texture[i, j], 0.0, 1.0, 0.0
             slope_x, slope_y = 0.0, 0.0
             if has_objects:
@@ -182,8 +185,8 @@ def sum_echoes(
                 if not np.isnan(surface.amplitude[row, at]):
                     gain = surface.amplitude[row, at]
                 if 0 < row < surface.relief_m.shape[0] - 1 and 0 < at < surface.relief_m.shape[1] - 1:
-                    slope_x = (surface.relief_m[row, at + 1] - surface.relief_m[row, at - 1]) / (2 * CELL_M)
-                    slope_y = (surface.relief_m[row + 1, at] - surface.relief_m[row - 1, at]) / (2 * CELL_M)
+                    slope_x = (surface.relief_m[row, at + 1] - surface.relief_m[row, at - 1]) / (2 * cell_m)
+                    slope_y = (surface.relief_m[row + 1, at] - surface.relief_m[row - 1, at]) / (2 * cell_m)
                     area = np.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
             range_m = np.sqrt(x * x + y * y + z * z)
             if range_m < least_range_m or range_m > most_range_m:

@@ -89,7 +89,7 @@ DIDSON = ImagingSonar(
     firing_groups=8,
     lens_cubic=(1.012 * 0.0030, 1.012 * -0.0055, 1.012 * 2.6829, 1.012 * 48.04 + 1),
 )
-"""High frequency, shortest extended window. The lens is the measured one: beams 0.37° apart at the centre, 0.23° at the
+"""High frequency, shortest extended window. The lens is the measured one: beams 0.37° apart at the centre, 0.21° at the
 edge. Length of the pulse: ours."""
 ARIS_3000 = ImagingSonar(
     frequency_hz=3.0e6,

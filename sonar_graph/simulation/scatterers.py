@@ -18,8 +18,8 @@ from scipy import stats
 
 Floats32 = NDArray[np.float32]
 
-CELL_M = 0.004
-CELLS = 1000
+CELL_M = 0.0032
+CELLS = 1250
 TEXTURE_M = 0.03
 """Correlation length of the floor's strength."""
 JOINT_SPACING_M, JOINT_WIDTH_M, JOINT_DB = 0.5, 0.008, 6.0
@@ -27,12 +27,12 @@ JOINT_SPACING_M, JOINT_WIDTH_M, JOINT_DB = 0.5, 0.008, 6.0
 
 @dataclass(frozen=True, eq=False)
 class Scatterers:
-    """One period of the floor: cell (row i, column j) covers y from 4 mm · i and x from 4 mm · j on."""
+    """One period of the floor: cell (row i, column j) covers y from 3.2 mm · i and x from 3.2 mm · j on."""
 
     points: Floats32
-    """Real and imaginary part of the amplitude, then x and y within the cell as shares of it; (1000, 1000, 4)."""
+    """Real and imaginary part of the amplitude, then x and y within the cell as shares of it; (1250, 1250, 4)."""
     texture: Floats32
-    """Amplitude of the bare floor, mean square 1 but for joints, shape (1000, 1000)."""
+    """Amplitude of the bare floor, mean square 1 but for joints, shape (1250, 1250)."""
 
 
 def scatterers(texture_shape: float | None, joints: bool, rng: np.random.Generator) -> Scatterers:

@@ -74,9 +74,8 @@ class FrameSimulator:
         self.objects = list(objects)
         self._floor_z_m = floor_z_m
         self._seed = seed
-        floor_rng, gain_rng = (np.random.default_rng([seed, stream]) for stream in (0, 1))
+        floor_rng = np.random.default_rng([seed, 0])
         self._floor = scatterers(options.texture_shape, options.joints, floor_rng)
-        self._gain_error_db = self._drawn_gain_error_db(gain_rng)
 
     def azimuths_rad(self) -> Floats:
         """What a log says about the beams: where they point, or equally spaced."""
@@ -166,7 +165,7 @@ class FrameSimulator:
         steps = int(np.ceil(farthest_m * 1.1 / DISTANCE_STEP_M)) + 1
         blocked = np.full((BEARINGS, steps), -np.inf, np.float32)
         horizon = Horizon(blocked, float(np.tan(half_bearing_rad + 0.02)), DISTANCE_STEP_M)
-        echoes.block_rays(view, surface, horizon, RAISED_M)
+        echoes.block_rays(view, surface, horizon, RAISED_M, CELL_M)
         return surface, horizon
 
     def _through_beams(self, total: Floats32) -> Floats32:
@@ -193,18 +192,14 @@ class FrameSimulator:
         result[:, arrives, 1] += real * sin + imaginary * cos
         return result
 
-    def _drawn_gain_error_db(self, rng: np.random.Generator) -> Floats:
-        """A tilt over the window and a slow wave of a third of it, shape (bins,)."""
-        along = np.linspace(-0.5, 0.5, self.sonar.bins)
-        tilt, wave, phase = rng.standard_normal(), rng.standard_normal(), rng.uniform(0, 2 * np.pi)
-        return self.options.tvg_error_db * (tilt * along + wave / 3 * np.sin(3 * np.pi * along + phase))
-
     @cached_property
     def _gain_db(self) -> Floats32:
         ranges_m = self.sonar.ranges_m()
         exact = GAIN_SLOPE_DB * np.log10(ranges_m / REFERENCE_M)
         absorbed = 2 * self.options.absorption_db_m * (ranges_m - REFERENCE_M)
-        return (exact + absorbed + self._gain_error_db).astype(np.float32)
+        return (exact + absorbed + drawn_gain_error_db(self.options.tvg_error_db, len(ranges_m), self._seed)).astype(
+            np.float32
+        )
 
     @cached_property
     def _spreading(self) -> Floats32:
@@ -233,6 +228,7 @@ class FrameSimulator:
         column_rad = sonar.beam_width_rad / COLUMNS_PER_BEAM
         lift = (np.arange(ELEVATION_STEPS) + 0.5) / ELEVATION_STEPS - 0.5
         return Tables(
+            cell_m=CELL_M,
             column_rad=column_rad,
             columns=4 * int(np.ceil(half_rad / column_rad / 2)),
             range_start_m=sonar.range_start_m,
@@ -262,6 +258,14 @@ class FrameSimulator:
         if self.options.cross_talk_db is not None and self.sonar.firing_groups > 1:
             leak = 10 ** (self.options.cross_talk_db / 20) / np.sqrt(others)
         return np.where(together, leak, 0.0) + (1 - leak) * np.eye(self.sonar.beams)
+
+
+def drawn_gain_error_db(sigma_db: float, bins: int, seed: int) -> Floats:
+    """What time-varied gain leaves: a tilt over the window and a slow wave of a third of it, shape (bins,)."""
+    rng = np.random.default_rng([seed, 1])
+    along = np.linspace(-0.5, 0.5, bins)
+    tilt, wave, phase = rng.standard_normal(), rng.standard_normal(), rng.uniform(0, 2 * np.pi)
+    return sigma_db * (tilt * along + wave / 3 * np.sin(3 * np.pi * along + phase))
 
 
 def _laid_out(objects: Sequence[SeabedObject], cells: Cells) -> Surface:

@@ -1,0 +1,199 @@
+"""Landmarks along a recorded run, and what a sonar on that vehicle would have reported of them.
+
+The vehicle, its IMU and its Doppler log are real; landmarks and detections are drawn. The log's reference trajectory is
+taken for the truth, through which a quintic spline is laid, so that detections between its poses have a place. What is
+wrong in the reference (its time, its noise) is therefore in the geometry of the detections too.
+
+Landmarks lie on either side of the track, at distances and heights drawn anew for each; the same stretch driven twice
+sees the same ones.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from pydantic import Field
+
+from sonar_graph.calibration import Mounting, Section, SonarCalibration
+from sonar_graph.errors import SimulationError
+from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.simulation.detections import Fan, Recogniser, simulate_detections
+from sonar_graph.simulation.sensors import EPOCH_NS, regular_stamps
+from sonar_graph.simulation.vehicle import VehiclePath, rpy_from_rotation
+from sonar_graph.simulation.world import World
+from sonar_graph.states import Trajectory
+
+LEAST_POSES = 6
+"""A quintic spline needs as many."""
+KNOT_S = 0.5
+
+
+class LandmarkOptions(Section):
+    """What can be chosen about landmarks and sonar."""
+
+    seed: int = Field(0, ge=0)
+    """Of everything random; equal options give equal bits."""
+    spacing_m: float = Field(25.0, gt=0)
+    """Along the track, between one landmark and the next."""
+    side_min_m: float = Field(4.0, gt=0)
+    """Horizontal distance of a landmark from the track, at least."""
+    side_max_m: float = Field(15.0, gt=0)
+    """At most."""
+    height_sigma_m: float = Field(1.0, ge=0)
+    """Of a landmark's height about that of the vehicle when it passes."""
+    frame_rate_hz: float = Field(2.0, gt=0, le=30)
+    """Sonar frames a second."""
+    range_min_m: float = Field(1.0, gt=0)
+    """The nearest that the sonar sees."""
+    range_max_m: float = Field(40.0, gt=0)
+    """The farthest."""
+    azimuth_aperture_rad: float = Field(math.radians(130), gt=0, lt=math.pi)
+    """Full horizontal opening of the sonar, which looks ahead."""
+    elevation_aperture_rad: float = Field(math.radians(20), gt=0, lt=math.pi)
+    """Full vertical opening."""
+    range_sigma_m: float = Field(0.05, gt=0)
+    """White noise of a detection's range."""
+    azimuth_sigma_rad: float = Field(0.009, gt=0)
+    """White noise of a detection's azimuth (half a degree)."""
+    detection_probability: float = Field(0.8, ge=0, le=1)
+    """Of a landmark inside the fan, in each frame."""
+    wrong_id_rate: float = Field(0.01, ge=0, le=1)
+    """Share of the detected landmarks taken confidently for another one."""
+    false_detections_per_frame: float = Field(0.05, ge=0)
+    """Mean number of detections of nothing."""
+    confident_false_fraction: float = Field(0.0, ge=0, le=1)
+    """Share of the false detections taken confidently for a landmark."""
+
+
+def add_landmarks(recorded: Sequence, options: LandmarkOptions | None = None) -> Sequence:
+    """The run with landmarks, detections and the sonar's calibration; all else as recorded.
+
+    Parameters
+    ----------
+    recorded
+        With a reference trajectory; detections and landmarks that it has are replaced.
+    options
+        None: a landmark every 25 m, seen from up to 40 m.
+
+    Raises
+    ------
+    SimulationError
+        When the log has no reference trajectory, too short a one, or ranges are the wrong way round.
+    """
+    options = options or LandmarkOptions()
+    _check(options)
+    first_ns, path = _path(recorded)
+    world_rng, sonar_rng = (np.random.default_rng(child) for child in np.random.SeedSequence(options.seed).spawn(2))
+    world = _world(path, options, world_rng)
+    calibration = recorded.calibration.model_copy(update={"sonar": _sonar(options), "floor": None})
+    detections = simulate_detections(
+        path,
+        regular_stamps(options.frame_rate_hz, path.duration_s),
+        calibration.sonar,
+        _fan(options),
+        _recogniser(options),
+        world,
+        sonar_rng,
+    )
+    if detections is None:
+        raise SimulationError(
+            f"{recorded.name}: not one landmark is seen; lower spacing_m = {options.spacing_m:g} or raise range_max_m"
+        )
+    return replace(
+        recorded,
+        calibration=calibration,
+        detections=_restamped(detections, first_ns),
+        true_landmarks=world.landmark_map(),
+        notes=recorded.notes
+        | {
+            "simulated": "landmarks and detections, on the recorded reference trajectory; all else is recorded",
+            "landmark options": options.model_dump_json(),
+        },
+    )
+
+
+def _check(options: LandmarkOptions) -> None:
+    for low, high in (("range_min_m", "range_max_m"), ("side_min_m", "side_max_m")):
+        least, most = getattr(options, low), getattr(options, high)
+        if least >= most:
+            raise SimulationError(f"simulate landmarks: {low} = {least:g} must be less than {high} = {most:g}")
+
+
+def _path(recorded: Sequence) -> tuple[int, VehiclePath]:
+    """The stamp at which the path begins, and the spline through the reference while IMU and DVL run."""
+    if recorded.truth is None or not len(recorded.truth):
+        raise SimulationError(
+            f"{recorded.name}: no reference trajectory, along which landmarks could lie; "
+            "name its topic with --topic truth=TOPIC"
+        )
+    stamps_ns = recorded.truth.stamps_ns
+    inside = np.flatnonzero((stamps_ns >= recorded.start_ns) & (stamps_ns <= recorded.end_ns))
+    if len(inside) < LEAST_POSES:
+        raise SimulationError(
+            f"{recorded.name}: {len(inside)} poses of the reference lie within the time of IMU and DVL; "
+            f"expected {LEAST_POSES} or more"
+        )
+    stamps_ns = stamps_ns[inside]
+    seconds = _knots((stamps_ns - stamps_ns[0]) * 1e-9)
+    poses = recorded.truth.at(stamps_ns[0] + np.rint(seconds * NS_PER_S).astype(np.int64))
+    angles = np.unwrap(rpy_from_rotation(poses.rotations()), axis=0)
+    return int(stamps_ns[0]), VehiclePath.through(seconds, np.column_stack([poses.positions, angles]))
+
+
+def _knots(seconds: Floats) -> Floats:
+    """Times of the reference's poses, thinned where it is quick: its noise is no motion."""
+    knots = [0.0]
+    for instant in seconds[1:].tolist():
+        if instant - knots[-1] >= KNOT_S - 1e-6:
+            knots.append(instant)
+    return np.array(knots) if len(knots) >= LEAST_POSES else seconds
+
+
+def _world(path: VehiclePath, options: LandmarkOptions, rng: np.random.Generator) -> World:
+    """Landmarks beside the track."""
+    seconds = np.arange(0.0, path.duration_s, 0.1)
+    motion = path.at(seconds)
+    along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(motion.position[:, :2], axis=0), axis=1))])
+    places_m = np.arange(0.5 * options.spacing_m, max(along_m[-1], options.spacing_m), options.spacing_m)
+    row = np.minimum(np.searchsorted(along_m, places_m), len(seconds) - 1)
+    course = np.arctan2(motion.velocity[row, 1], motion.velocity[row, 0])
+    side_m = rng.choice([-1.0, 1.0], len(row)) * rng.uniform(options.side_min_m, options.side_max_m, len(row))
+    offset = np.column_stack([-np.sin(course) * side_m, np.cos(course) * side_m])
+    height = motion.position[row, 2] + options.height_sigma_m * rng.standard_normal(len(row))
+    positions = np.column_stack([motion.position[row, :2] + offset, height])
+    return World(np.arange(1, len(row) + 1), positions, float(height.min()))
+
+
+def _sonar(options: LandmarkOptions) -> SonarCalibration:
+    return SonarCalibration(
+        mounting=Mounting(),
+        range_sigma_m=options.range_sigma_m,
+        azimuth_sigma_rad=options.azimuth_sigma_rad,
+        elevation_aperture_rad=options.elevation_aperture_rad,
+    )
+
+
+def _fan(options: LandmarkOptions) -> Fan:
+    return Fan(
+        options.range_min_m,
+        options.range_max_m,
+        options.azimuth_aperture_rad / 2,
+        options.elevation_aperture_rad / 2,
+    )
+
+
+def _recogniser(options: LandmarkOptions) -> Recogniser:
+    return Recogniser(
+        detection_probability=options.detection_probability,
+        wrong_id_rate=options.wrong_id_rate,
+        false_detections_per_frame=options.false_detections_per_frame,
+        confident_false_fraction=options.confident_false_fraction,
+    )
+
+
+def _restamped(detections: LandmarkDetections, first_ns: int) -> LandmarkDetections:
+    """On the log's clock instead of the simulator's."""
+    return replace(detections, stamps_ns=detections.stamps_ns - EPOCH_NS + first_ns)

@@ -1,0 +1,142 @@
+"""Images belong to the run whose other sensors `simulate_basin` gives, and their truth says what is in them."""
+
+from collections.abc import Iterator
+from itertools import islice
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.basin import BasinOptions, simulate_basin, simulate_basin_frames
+from sonar_graph.simulation.image_options import ImageOptions
+from sonar_graph.simulation.imaging import ImagedFrames, frame_truth
+from sonar_graph.simulation.seabed import block, place
+from sonar_graph.simulation.sonar_image import FrameSimulator
+
+SLOW = {"duration_s": 130, "laps": 1, "frame_rate_hz": 1.0}
+
+
+def options(**image: object) -> BasinOptions:
+    return BasinOptions.model_validate(SLOW | {"image": image})
+
+
+def blocks(**image: object) -> Iterator[ImagedFrames]:
+    return simulate_basin_frames(options(**image), frames_per_block=16)
+
+
+@pytest.fixture(scope="module")
+def run() -> tuple[Sequence, list[ImagedFrames]]:
+    return simulate_basin(options()), list(blocks())
+
+
+def test_landmarks_must_be_recognised_where_there_are_images(run):
+    sequence, _ = run
+    assert sequence.detections is None
+    assert simulate_basin(BasinOptions.model_validate(SLOW)).detections is not None
+    assert "image model" in sequence.notes["ours"]
+
+
+def test_asking_for_images_leaves_all_other_sensors_alone(run):
+    sequence, _ = run
+    plain = simulate_basin(BasinOptions.model_validate(SLOW))
+    np.testing.assert_array_equal(sequence.imu.angular_velocity, plain.imu.angular_velocity)
+    np.testing.assert_array_equal(sequence.dvl.velocity, plain.dvl.velocity)
+    np.testing.assert_array_equal(sequence.true_landmarks.positions, plain.true_landmarks.positions)
+
+
+def test_truth_of_frames_is_that_of_the_run(run):
+    sequence, made = run
+    body_T_sonar = sequence.calibration.sonar.mounting.pose()
+    for imaged in made[::3]:
+        stamp_ns = imaged.frames.stamps_ns[0]
+        nearest = np.argmin(np.abs(sequence.truth.stamps_ns - stamp_ns))
+        world_R_body = sequence.truth.rotations()[nearest]
+        position = sequence.truth.positions[nearest] + world_R_body.apply(np.array(body_T_sonar.translation()))
+        np.testing.assert_allclose(imaged.truth.positions[0], position, atol=0.01)
+        world_R_sonar = world_R_body * Rotation.from_matrix(np.array(body_T_sonar.rotation().matrix()))
+        error = (world_R_sonar.inv() * Rotation.from_quat(imaged.truth.quaternions_xyzw[0])).magnitude()
+        assert error < 0.02
+
+
+def test_every_landmark_is_seen_whole_and_brightest_where_truth_says(run):
+    _, made = run
+    seen = dict.fromkeys([1, 2, 3, 4], 0)
+    for imaged in made:
+        truth, frames = imaged.truth, imaged.frames
+        assert truth.ids[:4].tolist() == [1, 2, 3, 4]
+        for frame, target in np.argwhere(truth.share_in_view[:, :4] == 1):
+            beam = np.abs(frames.azimuths_rad - truth.azimuth_rad()[frame, target]).argmin()
+            bin_ = np.abs(frames.ranges_m - truth.range_m()[frame, target]).argmin()
+            image = frames.intensity[frame].astype(float)
+            on_landmark = image[beam - 3 : beam + 4, bin_ - 10 : bin_ + 11].mean()
+            assert on_landmark > np.median(image) + 20
+            seen[int(truth.ids[target])] += 1
+    assert min(seen.values()) >= 2
+
+
+def test_objects_that_are_no_landmarks_come_into_view(run):
+    _, made = run
+    others = np.concatenate([imaged.truth.share_in_view[:, 4:] for imaged in made])
+    assert (made[0].truth.ids[4:] < 0).all()
+    assert (others.max(axis=0) > 0.5).sum() >= 6
+    assert next(blocks(stones=0, decoys=0)).truth.ids.tolist() == [1, 2, 3, 4]
+
+
+def test_frames_stream_and_do_not_depend_on_the_size_of_blocks(run):
+    _, made = run
+    smaller = simulate_basin_frames(options(), frames_per_block=5)
+    first = np.concatenate([b.frames.intensity for b in islice(smaller, 3)])
+    np.testing.assert_array_equal(first, made[0].frames.intensity[:15])
+    assert max(len(b.frames) for b in made) <= 16
+
+
+def test_dropped_frames_are_missing_and_change_no_other():
+    whole = [b.frames for b in blocks(drop_probability=0.0)]
+    some = [b.frames for b in blocks(drop_probability=0.3)]
+    stamps_ns = np.concatenate([f.stamps_ns for f in whole])
+    kept_ns = np.concatenate([f.stamps_ns for f in some])
+    assert len(stamps_ns) == 130
+    assert 0.55 < len(kept_ns) / len(stamps_ns) < 0.85
+    at = np.searchsorted(stamps_ns, some[0].stamps_ns[5])
+    np.testing.assert_array_equal(some[0].intensity[5], whole[at // 16].intensity[at % 16])
+
+
+def test_time_offset_makes_stamps_late_and_nothing_else(run):
+    _, made = run
+    late = next(blocks(time_offset_s=0.05))
+    np.testing.assert_array_equal(late.frames.stamps_ns - made[0].frames.stamps_ns, 50_000_000)
+    np.testing.assert_array_equal(late.frames.intensity, made[0].frames.intensity)
+
+
+def test_wrong_sound_speed_scales_ranges_and_nothing_else(run):
+    _, made = run
+    wrong = next(blocks(sound_speed_error=0.01))
+    np.testing.assert_allclose(wrong.frames.ranges_m / made[0].frames.ranges_m, 1.01)
+    np.testing.assert_array_equal(wrong.frames.intensity, made[0].frames.intensity)
+
+
+def test_share_in_view_falls_from_one_to_zero_across_the_edge_of_the_fan():
+    disc = place(-1, "disc", block(0.2, 0.2, 0.0, 6.0), 0.1, np.array([1.7, 0.0, 0.0]), 0.0)
+    simulator = FrameSimulator(ImageOptions(texture_shape=None), [disc], 0.0)
+    tilt = Rotation.from_euler("ZYX", [0, 30, 0], degrees=True)
+    edge_m = 1.7 * np.tan(np.radians(14.25)) / np.cos(np.radians(30)) * 0.95  # roughly, for a tilted fan
+    positions = np.array([[0.0, y, 0.95] for y in (0.0, edge_m, 1.0)])
+    truth = frame_truth(positions, Rotation.concatenate([tilt] * 3), simulator)
+    assert truth.share_in_view[0, 0] == 1
+    assert 0.2 < truth.share_in_view[1, 0] < 0.9
+    assert truth.share_in_view[2, 0] == 0
+    np.testing.assert_allclose(truth.range_m()[:, 0], np.linalg.norm(positions - [1.7, 0, 0], axis=1))
+    assert truth.azimuth_rad()[2, 0] < 0  # the sonar is to the left of the disc
+
+
+def test_other_objects_in_other_places_for_another_seed():
+    first, second = (next(simulate_basin_frames(options().model_copy(update={"seed": s}), 1)) for s in (0, 1))
+    assert not np.array_equal(first.frames.intensity, second.frames.intensity)
+    assert not np.allclose(first.truth.points_m[0, 4:], second.truth.points_m[0, 4:], atol=0.05)
+
+
+def test_oculus_frames_have_its_size():
+    imaged = next(simulate_basin_frames(BasinOptions.model_validate(SLOW | {"image": {"sonar": "oculus1200"}}), 1))
+    assert imaged.frames.intensity.shape == (1, 512, 512)
+    assert imaged.frames.azimuths_rad[0] < -0.5

@@ -1,0 +1,355 @@
+"""Simulated images obey the laws that real ones obey, each with its switch."""
+
+from copy import copy
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.simulation.image_options import ImageOptions
+from sonar_graph.simulation.imaging_sonar import ImagingSonar
+from sonar_graph.simulation.seabed import SeabedObject, block, place, place_landmark
+from sonar_graph.simulation.sonar_image import SONARS, FrameSimulator, drawn_gain_error_db
+
+HEIGHT_M = 0.95
+TILT = Rotation.from_euler("ZYX", [0, 30, 0], degrees=True)
+PLAIN = ImageOptions(
+    cross_talk_db=None,
+    tvg_error_db=0.0,
+    texture_shape=None,
+    joints=False,
+    multipath=False,
+    noise_db=None,
+    drop_probability=0.0,
+)
+EVEN = SONARS["didson"].model_copy(update={"lens_cubic": None})
+"""The same sonar with equally spaced beams."""
+
+
+@cache
+def floor_of(changes: tuple[tuple[str, object], ...], seed: int, sonar: ImagingSonar | None) -> FrameSimulator:
+    options = ImageOptions.model_validate(PLAIN.model_dump() | dict(changes))
+    return FrameSimulator(options, (), 0.0, seed, sonar)
+
+
+def simulator(
+    objects: list[SeabedObject] | None = None, seed: int = 0, sonar: ImagingSonar | None = None, **changes: object
+) -> FrameSimulator:
+    """One floor for each set of options, with other objects on it at each call."""
+    made = copy(floor_of(tuple(sorted(changes.items())), seed, sonar))
+    made.objects = objects or []
+    return made
+
+
+def level_db(made: FrameSimulator, x_m: float = 0.0, y_m: float = 0.0, number: int = 0) -> np.ndarray:
+    return made.level_db(np.array([x_m, y_m, HEIGHT_M]), TILT, number)
+
+
+def intensity(made: FrameSimulator, x_m: float = 0.0, y_m: float = 0.0, number: int = 0) -> np.ndarray:
+    return 10 ** (level_db(made, x_m, y_m, number).astype(float) / 10)
+
+
+def looks(count: int, **changes: object) -> np.ndarray:
+    """Intensities from places so far apart that their speckle is independent, shape (count, beams, bins)."""
+    made = simulator(**changes)
+    return np.array([intensity(made, 0.31 * (k % 12), 0.33 * (k // 12), k) for k in range(count)])
+
+
+def bins_at(made: FrameSimulator, *ranges_m: float) -> np.ndarray:
+    return np.searchsorted(made.ranges_m(), ranges_m)
+
+
+def test_speckle_of_one_look_has_a_spread_of_5_57_decibels():
+    first, last = bins_at(simulator(), 1.7, 2.3)
+    level = 10 * np.log10(looks(24)[:, 30:66, first:last])
+    level -= level.mean(axis=(0, 1))
+    assert level.std() == pytest.approx(5.57, rel=0.015)  # 1 % more: a cell holds a finite number of scatterers
+
+
+def test_speckle_is_exponential_in_intensity():
+    first, last = bins_at(simulator(), 1.9, 2.1)
+    values = looks(24)[:, 30:66:4, first:last:8]
+    relative = (values / values.mean(axis=(0, 1))).reshape(-1)
+    assert stats.kstest(relative, "expon").pvalue > 1e-3
+    assert stats.kstest(np.sqrt(relative), "expon").pvalue < 1e-6
+
+
+@pytest.mark.parametrize("shape", [1.0, 2.0])
+def test_texture_makes_the_floor_k_distributed(shape: float):
+    first, last = bins_at(simulator(), 1.9, 2.1)
+    rough, even = (looks(30, texture_shape=s)[:, 20:76, first:last] for s in (shape, None))
+    moments = [np.mean((x / x.mean(axis=(0, 1))) ** 2) for x in (rough, even)]
+    assert moments[0] == pytest.approx(2 * (1 + 1 / shape), rel=0.12)
+    assert moments[1] == pytest.approx(2, rel=0.03)
+
+
+def speckle_correlation(moved_m: float, **changes: object) -> float:
+    """Correlation of intensities of the same floor, seen from a sonar that moved across and turned back to it."""
+    sonar = EVEN.model_copy(update={"beams": 9, "azimuth_span_rad": np.radians(0.3 * 9)})  # one looks straight ahead
+    made = simulator(sonar=sonar, **changes)
+    across_m = np.sqrt(2.0**2 - HEIGHT_M**2)
+    turned = Rotation.from_euler("Z", -np.arctan2(moved_m, across_m))
+    shift_m = (np.hypot(across_m, moved_m) - across_m) * across_m / 2.0
+    ranges_m = made.ranges_m()
+    near = (ranges_m > 1.96) & (ranges_m < 2.04)
+    pairs = []
+    for k in range(100):
+        x_m, y_m = 0.31 * (k % 12), 0.33 * (k // 12)
+        here = intensity(made, x_m, y_m, 2 * k)[4]
+        there = made.level_db(np.array([x_m, y_m + moved_m, HEIGHT_M]), turned * TILT, 2 * k + 1)[4]
+        pairs.append((here[near], np.interp(ranges_m[near] + shift_m, ranges_m, 10 ** (there.astype(float) / 10))))
+    here, there = np.array(pairs).transpose(1, 0, 2).reshape(2, -1)
+    return float(np.corrcoef(here, there)[0, 1])
+
+
+def spline_correlation(moved_m: float) -> float:
+    """Square of the autocorrelation of a two-way aperture (a triangle): the cubic B-spline."""
+    u = 2 * moved_m / (0.886 * 1480 / 1.8e6 / np.radians(0.3))
+    return max(1 - 1.5 * u**2 + 0.75 * u**3 if u < 1 else (2 - u) ** 3 / 4, 0) ** 2
+
+
+@pytest.mark.parametrize("moved_m", [0.0, 0.018, 0.036, 0.07])
+def test_speckle_decorrelates_with_motion_across_as_the_aperture_says(moved_m: float):
+    assert speckle_correlation(moved_m) == pytest.approx(spline_correlation(moved_m), abs=0.07)
+
+
+def test_half_of_the_correlation_is_left_after_3_6_centimetres():
+    assert spline_correlation(0.036) == pytest.approx(0.5, abs=0.02)
+
+
+def test_speckle_drawn_for_each_frame_forgets_without_motion():
+    assert abs(speckle_correlation(0.0, speckle="frame")) < 0.1
+
+
+def test_level_over_range_is_that_of_spreading_absorption_and_gain():
+    made = simulator(absorption_db_m=0.8)
+    at = bins_at(made, 1.65, 1.8, 2.0, 2.2, 2.35)
+    mean = looks(60)[:, 20:76].mean(axis=(0, 1))
+    smooth = np.array([mean[k - 12 : k + 12].mean() for k in at])
+    r = made.ranges_m()[at]
+    sine = HEIGHT_M / r
+    lift = np.arcsin(sine) - np.radians(30)
+    pattern = np.sinc(0.886 * np.sin(lift) / np.sin(np.radians(14))) ** 4
+    cell = r / np.sqrt(1 - sine**2)  # metres of floor in a beam, times those in a bin
+    echo = sine**2 * pattern * cell / r**4 * r**3  # Lambert, spreading, and gain of 30 log r
+    np.testing.assert_allclose(10 * np.log10(smooth / smooth[2]), 10 * np.log10(echo / echo[2]), atol=0.35)
+    assert 10 * np.log10(smooth[2]) == pytest.approx(40 + 10 * np.log10(pattern[2]), abs=0.3)
+
+
+def test_absorption_is_what_gain_gives_back_and_noise_shows():
+    quiet, far = (simulator(noise_db=15.0, absorption_db_m=a, floor_db=-60.0) for a in (0.0, 0.8))
+    difference = level_db(far).mean(axis=0) - level_db(quiet).mean(axis=0)
+    np.testing.assert_allclose(difference, 2 * 0.8 * (far.ranges_m() - 2.0), atol=1e-3)
+    at_2_m = bins_at(far, 2.0)[0]
+    noise = np.mean([intensity(far, number=n)[:, at_2_m - 20 : at_2_m + 20] for n in range(10)])
+    assert 10 * np.log10(noise) == pytest.approx(15, abs=0.15)
+
+
+@pytest.mark.parametrize("height_m", [0.03, 0.06])
+def test_shadow_is_as_long_as_height_and_grazing_angle_make_it(height_m: float):
+    near_x_m = 1.45
+    box = place(-1, "box", block(0.1, 0.3, height_m, 0.0), 0.2, np.array([near_x_m + 0.05, 0.0, 0.0]), 0.0)
+    end_m = (near_x_m + 0.1) * HEIGHT_M / (HEIGHT_M - height_m)  # horizontal: over the far upper edge
+    end_range_m = np.hypot(end_m, HEIGHT_M)
+    top_range_m = np.hypot(near_x_m + 0.1, HEIGHT_M - height_m)
+    made, open_ = simulator([box]), simulator([box], shadows=False)
+    profile = level_db(made)[40:56].mean(axis=0)
+    ranges_m = made.ranges_m()
+    dark = np.flatnonzero((profile < 0) & (ranges_m > 1.6))
+    assert ranges_m[dark[0]] == pytest.approx(top_range_m, abs=0.012)
+    assert ranges_m[dark[-1]] == pytest.approx(end_range_m, abs=0.012)
+    floor_behind = (ranges_m > np.hypot(near_x_m + 0.11, HEIGHT_M)) & (ranges_m < end_range_m)
+    assert level_db(open_)[40:56].mean(axis=0)[floor_behind].min() > 20
+
+
+def polar_picture(design: LandmarkDesign, position: np.ndarray, yaw_rad: float, made: FrameSimulator) -> np.ndarray:
+    """Beams and bins on which a point of a landmark's figure falls, by geometry alone."""
+    u = np.linspace(-design.size_m / 2, design.size_m / 2, 600)
+    x, y = np.meshgrid(u, u)
+    foam = design.level_db(x, y) > 0
+    plane = Rotation.from_euler("Z", yaw_rad).apply(np.column_stack([x[foam], y[foam], 0 * x[foam]]))
+    q = TILT.inv().apply(position + plane - [0, 0, HEIGHT_M])
+    azimuths, ranges_m = made.sonar.azimuths_rad(), made.ranges_m()
+    beam = np.abs(np.arctan2(q[:, 1], q[:, 0])[:, None] - azimuths).argmin(axis=1)
+    picture = np.zeros((len(azimuths), len(ranges_m)), bool)
+    picture[beam, np.searchsorted(ranges_m + (ranges_m[1] - ranges_m[0]) / 2, np.linalg.norm(q, axis=1))] = True
+    return picture
+
+
+@pytest.mark.parametrize("design", DEFAULT_DESIGNS, ids=lambda d: d.name)
+@pytest.mark.parametrize("azimuth_deg", [-9.0, 4.0])
+def test_landmark_lies_where_geometry_says(design: LandmarkDesign, azimuth_deg: float):
+    bearing, yaw_rad = np.radians(azimuth_deg), 0.7
+    position = np.array([1.7 * np.cos(bearing), 1.7 * np.sin(bearing), 0.02])
+    flush = replace(design, height_m=0.0)  # the edge that faces the sonar would glint
+    made = simulator([place_landmark(flush, position, yaw_rad, 0.0)], speckle="frame")
+    mean_db = 10 * np.log10(np.mean([intensity(made, number=n) for n in range(24)], axis=0))
+    seen, expected = mean_db > 45, polar_picture(design, position, yaw_rad, made)
+    assert np.sum(seen & expected) / np.sum(seen | expected) > 0.85
+    centres = [
+        (made.sonar.azimuths_rad()[b].mean(), made.ranges_m()[r].mean()) for b, r in map(np.nonzero, (seen, expected))
+    ]
+    np.testing.assert_allclose(np.degrees(centres[0][0]), np.degrees(centres[1][0]), atol=0.1)
+    np.testing.assert_allclose(centres[0][1], centres[1][1], atol=0.003)
+    assert polar_picture(design, position, yaw_rad + 0.6, made)[seen].mean() < 0.97 or design.name == "disc"
+
+
+def test_left_is_positive():
+    left = simulator([place(-1, "box", block(0.1, 0.1, 0.0, 20.0), 0.1, np.array([1.7, 0.3, 0.0]), 0.0)])
+    beam = np.argmax(intensity(left).mean(axis=1))
+    assert left.azimuths_rad()[beam] > np.radians(5)
+
+
+def test_landmark_is_as_much_brighter_than_the_floor_as_its_mask_says():
+    plate = place(-1, "plate", block(0.3, 0.3, 0.0, 12.0), 0.25, np.array([1.7, 0.0, 0.0]), 0.0)
+    first, last = bins_at(simulator(), 1.9, 2.0)
+    pairs = [
+        (intensity(simulator([plate], speckle="frame"), number=n), intensity(simulator(speckle="frame"), number=n))
+        for n in range(8)
+    ]
+    on, off = np.mean(pairs, axis=0)[:, 42:54, first:last].mean(axis=(1, 2))
+    assert 10 * np.log10(on / off) == pytest.approx(12, abs=0.2)
+
+
+def point_response(**changes: object) -> np.ndarray:
+    """Level of every beam around a small strong object straight ahead, in dB below its own."""
+    dot = place(-1, "dot", block(0.005, 0.005, 0.0, 140.0), 0.02, np.array([1.75, 0.002, 0.0]), 0.0)
+    image = level_db(simulator([dot], **changes))
+    column = int(np.argmax(image.max(axis=0)))
+    return image[:, column] - image[:, column].max()
+
+
+def test_first_side_lobe_lies_26_decibels_down_and_can_be_switched_off():
+    width_rad = 0.886 / 0.8859 * np.radians(0.3)
+    first_lobe = 1.43 * width_rad / 0.886
+    fine = EVEN.model_copy(update={"beams": 960})
+    offset = np.linspace(0.8, 2.0, 2000) * width_rad / 0.886
+    pattern_db = 20 * np.log10(fine.two_way_pattern(offset, True))
+    outside = offset > 1.0 * width_rad / 0.886
+    assert pattern_db[outside].max() == pytest.approx(-26.5, abs=0.2)
+    assert offset[outside][np.argmax(pattern_db[outside])] == pytest.approx(first_lobe, rel=0.01)
+    with_lobes, without = np.sort(point_response())[::-1], np.sort(point_response(side_lobes=False))[::-1]
+    assert with_lobes[20] > without[20] + 20
+
+
+def test_one_way_beam_is_down_by_half_power_at_half_its_width():
+    half = np.array([EVEN.beam_width_rad / 2])
+    for side_lobes in (True, False):
+        assert 20 * np.log10(EVEN.two_way_pattern(half, side_lobes)) == pytest.approx(-6.02, abs=0.05)
+    assert 20 * np.log10(EVEN.elevation_pattern(np.radians([7.0]))) == pytest.approx(-6.02, abs=0.2)
+
+
+def test_cross_talk_shows_every_eighth_beam_at_its_level():
+    quiet, loud = point_response(side_lobes=False), point_response(side_lobes=False, cross_talk_db=-25.0)
+    strongest = int(np.argmax(loud))
+    away = np.arange(96)
+    away = away[np.abs(away - strongest) > 6]
+    raised = away[loud[away] > quiet[away] + 10]
+    ghosts = {int(b) for b in away if (b - strongest) % 8 == 0}
+    assert ghosts <= set(raised.tolist())
+    assert 10 * np.log10(np.sum(10 ** (loud[list(ghosts)] / 10))) == pytest.approx(-25, abs=1.5)
+
+
+def test_echo_by_way_of_the_surface_arrives_where_the_mirror_puts_it():
+    depth_m, ahead_m = 0.75, 1.35
+    dot = place(-1, "dot", block(0.02, 0.02, 0.0, 60.0), 0.05, np.array([ahead_m, 0.0, 0.0]), 0.0)
+    position = np.array([0.0, 0.0, HEIGHT_M])
+    direct_m = np.hypot(ahead_m, HEIGHT_M)
+    ghost_m = 0.5 * (direct_m + np.hypot(ahead_m, HEIGHT_M + 2 * depth_m))
+    with_, without = (
+        simulator([dot], multipath=m).level_db(position, TILT, 0, HEIGHT_M + depth_m) for m in (True, False)
+    )
+    rise = (with_ - without)[46:50].mean(axis=0)
+    ranges_m = simulator().ranges_m()
+    assert ranges_m[np.argmax(rise)] == pytest.approx(ghost_m, abs=0.02)
+    assert rise[ranges_m < direct_m + 0.05].max() < 3
+
+
+def test_steep_faces_echo_again_by_way_of_the_floor():
+    box = place(-1, "box", block(0.1, 0.3, 0.08, 0.0), 0.2, np.array([1.6, 0.0, 0.0]), 0.0)
+    with_, without = (intensity(simulator([box], multipath=m))[42:54].mean(axis=0) for m in (True, False))
+    front_m = np.hypot(1.55, HEIGHT_M)
+    ghost_m = 0.5 * (np.hypot(1.55, HEIGHT_M - 0.08) + np.hypot(1.55, HEIGHT_M + 0.08))
+    ranges_m = simulator().ranges_m()
+    grown = 10 * np.log10(with_ / without)
+    assert ranges_m[np.argmax(grown)] == pytest.approx(ghost_m, abs=0.01)
+    assert abs(grown[ranges_m < front_m - 0.08]).max() < 0.5
+
+
+def test_lens_is_the_measured_one_and_the_log_may_say_otherwise():
+    told, linear = simulator(), simulator(measured_lens=False)
+    spacing_deg = np.degrees(np.diff(told.azimuths_rad()))
+    assert spacing_deg[47] == pytest.approx(0.368, abs=0.002)
+    assert spacing_deg[0] == pytest.approx(0.21, abs=0.01)
+    # The published cubic, read the other way round.
+    deg = np.degrees(told.azimuths_rad())
+    beam = 1.012 * (0.0030 * deg**3 - 0.0055 * deg**2 + 2.6829 * deg + 48.04) + 1
+    np.testing.assert_allclose(beam, np.arange(1, 97), atol=1e-3)
+    np.testing.assert_allclose(np.degrees(np.diff(linear.azimuths_rad())), 0.3)
+    assert np.abs(np.degrees(linear.azimuths_rad()) - deg).max() > 0.8
+    np.testing.assert_array_equal(level_db(told), level_db(linear))
+
+
+def test_gain_is_wrong_by_the_tilt_asked_for():
+    tilts = []
+    for seed in range(200):
+        error = drawn_gain_error_db(1.5, 512, seed)
+        tilts.append(np.polyfit(np.linspace(-0.5, 0.5, 512), error, 1)[0])
+    assert np.std(tilts) == pytest.approx(1.5, rel=0.35)
+    difference = level_db(simulator(tvg_error_db=1.5)) - level_db(simulator())
+    np.testing.assert_allclose(difference, np.tile(drawn_gain_error_db(1.5, 512, 0), (96, 1)), atol=1e-3)
+
+
+def test_stamps_of_dropped_frames_are_drawn_at_their_rate():
+    made = simulator(drop_probability=0.1)
+    assert np.mean([made.is_dropped(n) for n in range(3000)]) == pytest.approx(0.1, abs=0.02)
+    assert not any(simulator().is_dropped(n) for n in range(300))
+
+
+def test_same_seed_gives_same_bytes_and_another_seed_others():
+    position = np.array([0.1, 0.2, HEIGHT_M])
+    full = {"texture_shape": 5.0, "noise_db": 15.0, "cross_talk_db": -25.0, "multipath": True, "joints": True}
+    one, again, other = (simulator(seed=s, **full).frame(position, TILT, 5, 1.7) for s in (4, 4, 5))
+    np.testing.assert_array_equal(one, again)
+    assert np.mean(one != other) > 0.9
+    assert one.dtype == np.uint8
+    assert one.shape == (96, 512)
+
+
+def test_noise_differs_between_frames_and_speckle_does_not():
+    position = np.array([0.0, 0.0, HEIGHT_M])
+    noisy = simulator(noise_db=15.0)
+    first, second = (noisy.level_db(position, TILT, n) for n in (0, 1))
+    assert not np.array_equal(first, second)
+    still = simulator()
+    np.testing.assert_array_equal(still.level_db(position, TILT, 0), still.level_db(position, TILT, 1))
+
+
+def test_counts_are_decibels_over_the_span():
+    made = simulator()
+    counts = made.frame(np.array([0, 0, HEIGHT_M]), TILT, 0).astype(float)
+    inside = (counts > 0) & (counts < 255)
+    np.testing.assert_allclose(counts[inside] * 80 / 255, level_db(made)[inside], atol=0.5 * 80 / 255 + 1e-4)
+
+
+def test_sonar_that_looks_up_or_lies_on_the_floor_sees_only_noise():
+    made = simulator(noise_db=15.0)
+    for position, rotation in (
+        (np.array([0, 0, HEIGHT_M]), Rotation.from_euler("ZYX", [0, -40, 0], degrees=True)),
+        (np.array([0, 0, 0.0]), TILT),
+    ):
+        at_2_m = made.level_db(position, rotation, 0)[:, bins_at(made, 2.0)[0]]
+        assert 10 * np.log10(np.mean(10 ** (at_2_m / 10))) == pytest.approx(15, abs=1.5)
+
+
+@pytest.mark.parametrize("name", sorted(SONARS))
+def test_every_sonar_makes_images_of_its_own_size(name):
+    made = simulator(sonar=SONARS[name], noise_db=15.0)
+    image = made.frame(np.array([0, 0, HEIGHT_M]), TILT, 0)
+    assert image.shape == (SONARS[name].beams, SONARS[name].bins)
+    middle = image[SONARS[name].beams // 2 - 5 : SONARS[name].beams // 2 + 5, 250:350]
+    assert np.mean(middle) * 80 / 255 == pytest.approx(40 - 2.5, abs=1.5)  # the mean of decibels: 2.5 below
