@@ -12,7 +12,7 @@ from sonar_graph.logs.converters.aris import convert_aris
 from sonar_graph.logs.sonar_reading import read_sonar_frames
 
 from .sonar_logs import converted, degrees
-from .sonar_recordings import START_NS, STEP_NS, Aris, images
+from .sonar_recordings import START_NS, STEP_NS, Aris, images, put
 
 BEAMS = {1: 48, 2: 48, 3: 96, 5: 96, 6: 64, 8: 64, 9: 128, 12: 128}
 
@@ -65,6 +65,20 @@ def test_what_other_sensors_said_is_in_the_notes(tmp_path: Path) -> None:
 def test_the_log_says_that_counts_are_decibels(tmp_path: Path) -> None:
     image = converted(tmp_path, Aris(images(1, 128, 64)).content(), "aris").calibration.sonar.image
     np.testing.assert_allclose(image.decibels(np.array([0, 51, 255], np.uint8)), [0, 16, 80], rtol=1e-6)
+
+
+def test_readings_that_are_no_numbers_are_left_out(tmp_path: Path) -> None:
+    content = bytearray(Aris(images(3, 48, 64), mode=1).content())
+    put(content, 1024 + 128, "f", float("nan"))
+    assert converted(tmp_path, bytes(content), "aris").notes["sonar.depth"] == "2.5 to 3.5"
+
+
+def test_a_time_beyond_what_a_log_can_hold_loses_the_frame(tmp_path: Path, refusal: Any) -> None:
+    content = bytearray(Aris(images(1, 48, 64), mode=1).content())
+    put(content, 1024 + 20, "Q", 2**31 * 10**6)
+    path = tmp_path / "dive.aris"
+    path.write_bytes(content)
+    refusal(lambda: convert_aris(path, tmp_path / "dive.mcap"), path, "frame 0 with a time of 2147483648000000 us")
 
 
 @pytest.mark.parametrize("system", [(1, 1, 3.0e6), (1, 0, 1.8e6), (0, 1, 1.8e6), (2, 0, 0.7e6)])

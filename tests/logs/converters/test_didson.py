@@ -11,7 +11,7 @@ import pytest
 from sonar_graph.logs.converters.didson import convert_didson
 
 from .sonar_logs import converted, degrees
-from .sonar_recordings import START_NS, STEP_NS, Ddf, images
+from .sonar_recordings import START_NS, STEP_NS, Ddf, images, put
 
 
 @pytest.mark.parametrize("version", [3, 4])
@@ -129,3 +129,25 @@ def test_files_without_a_whole_header_are_refused(tmp_path: Path, refusal: Any, 
     path = tmp_path / "dive.ddf"
     path.write_bytes(Ddf(images(1, 96, 64)).content()[:length])
     refusal(lambda: convert_didson(path, tmp_path / "dive.mcap"), path)
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "words"),
+    [
+        (52, 32, "window codes 32 and 0"),
+        (52, -1, "window codes -1 and 0"),
+        (56, 4, "window codes 3 and 4"),  # at low frequency there are four lengths
+        (20, 1970, "year 1970"),
+        (20, 2038, "year 2038"),
+        (24, 13, "a time that does not exist"),
+        (44, 100, "100 hundredths"),
+    ],
+)
+def test_a_frame_whose_header_makes_no_sense_is_lost(
+    tmp_path: Path, refusal: Any, at: int, value: int, words: str
+) -> None:
+    content = bytearray(Ddf(images(1, 48, 64), high=0).content())
+    put(content, 512 + at, "i", value)
+    path = tmp_path / "dive.ddf"
+    path.write_bytes(content)
+    refusal(lambda: convert_didson(path, tmp_path / "dive.mcap"), path, "no whole frame: bytes 512 to", words)

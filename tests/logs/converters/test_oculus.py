@@ -10,7 +10,7 @@ from sonar_graph.logs.converters.oculus import convert_oculus
 from sonar_graph.logs.sonar_reading import read_sonar_frames
 
 from .sonar_logs import converted, degrees
-from .sonar_recordings import STEP_NS, Oculus, images, oculus_note
+from .sonar_recordings import STEP_NS, Oculus, images, oculus_note, put
 
 
 @pytest.mark.parametrize("version", [0, 2])
@@ -83,6 +83,63 @@ def test_attitude_is_in_the_notes_of_the_newer_pings(tmp_path: Path) -> None:
 def test_the_log_says_that_counts_are_linear(tmp_path: Path, kind: str, full_scale: float) -> None:
     image = converted(tmp_path, Oculus(images(1, 16, 8).astype(kind)).content(), "raw").calibration.sonar.image
     assert (image.scale, image.full_scale) == ("linear", full_scale)
+
+
+def test_the_newer_clock_does_not_wrap_around(tmp_path: Path) -> None:
+    _, first, *_ = Oculus(images(1, 16, 8), version=2, first_clock=10**12).pieces()
+    _, second, *_ = Oculus(images(1, 16, 8, seed=1), version=2, first_clock=10**12 + 10**10, first_number=501).pieces()
+    stamps_ns = converted(tmp_path, first + second, "raw").frames.stamps_ns
+    assert stamps_ns.tolist() == [10**12, 10**12 + 10**10]
+
+
+def test_numbers_that_begin_anew_are_not_missing(tmp_path: Path) -> None:
+    pieces = Oculus(images(3, 16, 8)).pieces() + Oculus(images(3, 16, 8, seed=1), first_number=7).pieces()
+    assert converted(tmp_path, b"".join(pieces), "raw").done.missing == 0
+
+
+def test_a_huge_message_without_image_is_damage(tmp_path: Path) -> None:
+    _, *pings = Oculus(images(3, 16, 8)).pieces()
+    note = bytearray(oculus_note())
+    put(note, 10, "I", 1 << 20)
+    result = converted(tmp_path, b"".join([bytes(note), *pings]), "raw")
+    assert result.done.shortcomings() == [f"lost: bytes 0 to {len(note) - 1}: a message of kind 0x55, version 0"]
+    assert result.done.frames == 3
+
+
+@pytest.mark.parametrize(
+    ("at", "layout", "value", "words"),
+    [
+        (122 - 8, "I", 100, "an image of 100 bytes"),
+        (122 - 4, "I", 2177, "a message of 2177 bytes"),
+        (122 - 12, "I", 150, "an image from byte 150"),
+        (122 - 12, "I", 2049, "a message of"),
+        (122 + 4, "h", -8000, "bearings that do not increase"),
+        (122, "h", -9100, "bearings that do not increase"),
+        (97, "B", 2, "3 bytes a sample"),
+        (98, "d", 5.0, "bins of 5 m"),
+        (98, "d", float("nan"), "bins of nan m"),
+        (106, "H", 0, "0 ranges"),
+        (108, "H", 2000, "2000 beams"),
+        (85, "d", 15.0, "sound speed of 15"),
+    ],
+)
+def test_a_ping_whose_header_makes_no_sense_is_lost(
+    tmp_path: Path, at: int, layout: str, value: Any, words: str
+) -> None:
+    _, *pings = Oculus(images(4, 16, 8)).pieces()
+    broken = bytearray(pings[1])
+    put(broken, at, layout, value)
+    done = converted(tmp_path, b"".join([pings[0], bytes(broken), *pings[2:]]), "raw").done
+    assert done.frames == 3
+    assert words in str(done.lost[0])
+
+
+@pytest.mark.parametrize("length", [3, 16, 60, 130, 150])
+def test_a_ping_cut_within_its_header_is_named(tmp_path: Path, length: int) -> None:
+    _, *pings = Oculus(images(3, 16, 8)).pieces()
+    done = converted(tmp_path, b"".join([*pings[:2], pings[2][:length]]), "raw").done
+    assert done.frames == 2
+    assert "cut off" in str(done.lost[0])
 
 
 def test_another_file_is_named(tmp_path: Path, refusal: Any) -> None:
