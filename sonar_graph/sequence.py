@@ -53,8 +53,12 @@ class Sequence:
         Raises
         ------
         MeasurementError
-            When the sequence is shorter than one step.
+            When the rate is none, or the sequence is shorter than one step.
         """
+        if not 0 < rate_hz <= NS_PER_S:
+            raise MeasurementError(
+                f"{rate_hz} Hz is no rate; expected more than 0, and at most one instant a nanosecond"
+            )
         step_ns = round(NS_PER_S / rate_hz)
         instants = np.arange(self.start_ns + step_ns, self.end_ns + 1, step_ns, dtype=np.int64)
         if not len(instants):

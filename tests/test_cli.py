@@ -170,6 +170,13 @@ MISTAKES = {
     "unknown estimator": (["compare", "LOG", "-o", "OUT", "--estimators", "isam3"], "no estimator is called 'isam3'"),
     "no estimator": (["compare", "LOG", "-o", "OUT", "--estimators", ","], "expected names such as"),
     "rate of zero": (["compare", "LOG", "-o", "OUT", "--rate-hz", "0"], "--rate-hz"),
+    "rate without end": (["compare", "LOG", "-o", "OUT", "--rate-hz", "inf"], "--rate-hz"),
+    "rate of no number": (["compare", "LOG", "-o", "OUT", "--rate-hz", "nan"], "--rate-hz"),
+    "rate too high": (["compare", "LOG", "-o", "OUT", "--rate-hz", "2000"], "--rate-hz"),
+    "rate above the IMU's": (
+        ["compare", "LOG", "-o", "OUT", "--rate-hz", "200"],
+        "measures 100 times a second; give at most 100",
+    ),
     "rate too low": (["run", "LOG", "-o", "OUT", "--estimator", "dead-reckoning", "--rate-hz", "0.001"], "too short"),
     "setting without value": (["run", "LOG", "-o", "OUT", "--set", "isam2.lag_s"], "expected name=value"),
     "setting of another": (["run", "LOG", "-o", "OUT", "--set", "ekf-slam.x=1"], "expected ESTIMATOR.setting=value"),

@@ -79,3 +79,9 @@ def test_first_step_of_a_replay_holds_what_came_before_the_start() -> None:
 def test_sensor_that_is_missing_stays_missing() -> None:
     step = next(recording().replay(recording().instants(1.0)))
     assert step.detections is None
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("inf"), float("nan"), 3e9])
+def test_a_rate_that_is_none_is_refused(rate_hz: float) -> None:
+    with pytest.raises(MeasurementError, match="Hz is no rate"):
+        recording().instants(rate_hz)

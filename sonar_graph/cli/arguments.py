@@ -24,7 +24,13 @@ CalibrationPath = Annotated[
     ),
 ]
 RateHz = Annotated[
-    float, typer.Option("--rate-hz", min=1e-3, help="How often every estimator is asked for its estimate.")
+    float,
+    typer.Option(
+        "--rate-hz",
+        min=1e-3,
+        max=1e3,
+        help="How often every estimator is asked for its estimate; at most as often as the IMU measures.",
+    ),
 ]
 EstimatorSettings = Annotated[
     list[str] | None,

@@ -23,7 +23,14 @@ from sonar_graph.cli.arguments import (
 )
 from sonar_graph.cli.outputs import writable_folder, writable_log
 from sonar_graph.cli.progress import Report, progress_bars, working
-from sonar_graph.cli.settings import estimator_settings, read_calibration, read_config, topic_choices, window_of
+from sonar_graph.cli.settings import (
+    check_rate,
+    estimator_settings,
+    read_calibration,
+    read_config,
+    topic_choices,
+    window_of,
+)
 from sonar_graph.cli.texts import answers
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 
@@ -163,6 +170,7 @@ def _compare_log(
     writable_folder(output, source.files)
     with progress_bars() as progress:
         sequence = source.read(progress)
+    check_rate(rate_hz, sequence, DEFAULT_RATE_HZ)
     with progress_bars() as progress:
         comparison = compare_runs(sequence, names, overrides, rate_hz=rate_hz, progress=progress)
     _write_results(comparison, sequence, output)

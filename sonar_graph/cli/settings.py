@@ -7,12 +7,16 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sonar_graph.errors import CalibrationError, EstimatorError, LogError
+from sonar_graph.errors import CalibrationError, EstimatorError, EvaluationError, LogError
 
 if TYPE_CHECKING:
     from sonar_graph.logs.adapters.config import LogConfig
     from sonar_graph.logs.calibration_sources import PartialCalibration
     from sonar_graph.logs.window import Window
+    from sonar_graph.sequence import Sequence
+
+_SLACK = 1.01
+"""For a rate that is counted, not stated."""
 
 
 def parse_setting(text: str) -> tuple[str, Any]:
@@ -94,6 +98,24 @@ def topic_choices(texts: list[str]) -> dict[str, str]:
             raise LogError(f"--topic {text}: expected ROLE=TOPIC such as imu=/imu/data")
         choices[role] = topic
     return choices
+
+
+def check_rate(rate_hz: float, sequence: Sequence, default_hz: float) -> None:
+    """Refuse to ask for estimates more often than the IMU measures; the default rate holds for any log.
+
+    Raises
+    ------
+    EvaluationError
+        Naming the highest rate.
+    """
+    stamps_ns = sequence.imu.stamps_ns
+    imu_hz = len(stamps_ns) / max(float(stamps_ns[-1] - stamps_ns[0]) * 1e-9, 1.0)
+    highest_hz = max(default_hz, imu_hz)
+    if rate_hz > highest_hz * _SLACK:
+        raise EvaluationError(
+            f"--rate-hz {rate_hz:g}: the IMU of {sequence.name} measures {imu_hz:.4g} times a second; "
+            f"give at most {highest_hz:.4g}"
+        )
 
 
 def read_config(path: Path | None) -> LogConfig | None:
