@@ -88,7 +88,34 @@ def choose_topic(role: Role, recording: Recording, config: LogConfig = _DEFAULTS
         What the user said about topics; its topic goes before a search by type.
     wanted
         The topic that the user chose, before that of the configuration.
+
+    Raises
+    ------
+    LogError
+        When the configuration names fields that the messages which it is about do not have.
     """
+    choice = _choose(role, recording, config, wanted)
+    for topic in _topics_meant(choice, recording, config, wanted):
+        config.require_fields(role.name, topic.type_name, topic.definition())
+    return choice
+
+
+def _topics_meant(choice: Choice, recording: Recording, config: LogConfig, wanted: str | None) -> list[Topic]:
+    """The topics that a table of the configuration is about; none where there is no table."""
+    table, topics = config.table(choice.role.name), recording.topics
+    if not table or choice.is_off or choice.candidates:
+        return []
+    named = choice.topic or wanted or table.get("topic")
+    if named:
+        meant = [topics[named]] if named in topics else []
+    elif "type" in table:
+        meant = [t for t in topics.values() if short_name(t.type_name) == short_name(table["type"])]
+    else:
+        meant = [t for t in topics.values() if any(_fits(choice.role, t, general=general) for general in (False, True))]
+    return [t for t in meant if refusal(t) is None]
+
+
+def _choose(role: Role, recording: Recording, config: LogConfig, wanted: str | None) -> Choice:
     table = config.table(role.name)
     if table.get("use") is False and wanted is None:
         return Choice(role, None, f"switched off in {config.source}", is_off=True)

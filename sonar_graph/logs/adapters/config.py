@@ -22,6 +22,7 @@ from pydantic import BaseModel, ValidationError
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters.adapter import Adapter
+from sonar_graph.logs.adapters.config_faults import absent_fields
 from sonar_graph.logs.adapters.detection_array import DetectionArrayAdapter
 from sonar_graph.logs.adapters.doppler import DvlAdapter
 from sonar_graph.logs.adapters.inertial import ImuAdapter
@@ -32,6 +33,7 @@ from sonar_graph.logs.adapters.sonar_images import SonarAdapter
 from sonar_graph.logs.adapters.vertical import DepthAdapter
 from sonar_graph.logs.message_definitions import short_name
 from sonar_graph.logs.schema import Struct
+from sonar_graph.validation import faults_in
 
 ADAPTERS: dict[str, type[Adapter]] = {
     "imu": ImuAdapter,
@@ -98,6 +100,21 @@ class LogConfig:
             return [self._build(role, ADAPTERS[role], _changes(ADAPTERS[role].model_construct(type=type_name), table))]
         return [self._build(role, type(base), {**base.model_dump(), **_changes(base, table)}) for base in bases]
 
+    def require_fields(self, role: str, type_name: str, definition: Struct) -> None:
+        """Refuse a table that names fields which messages do not have.
+
+        Raises
+        ------
+        LogError
+            Naming source, table, key and field, and the fields that there are.
+        """
+        lacking = [
+            absent_fields(self.table(role), adapter.missing_in(definition), definition)
+            for adapter in self.adapters(role, type_name)
+        ]
+        if lacking and all(lacking):
+            raise LogError(f"{self.source}: [{role}] {'; '.join(lacking[-1])}")
+
     def _check(self, role: str, table: Table) -> None:
         """Find mistakes before any log is read; where the type is not known yet, one that comes along must fit."""
         if "type" in table and not isinstance(table["type"], str):
@@ -119,7 +136,9 @@ class LogConfig:
         try:
             return kind.model_validate(values)
         except ValidationError as error:
-            raise LogError(f"{self.source}: [{role}] {'; '.join(map(_fault, error.errors()))}") from error
+            is_incomplete = any(fault["type"] == "missing" for fault in error.errors())
+            why = f"; no adapter comes along for {values['type']}, so its fields are named" if is_incomplete else ""
+            raise LogError(f"{self.source}: [{role}] {faults_in(error, kind)}{why}") from error
 
 
 def shipped_for(role: str, type_name: str) -> list[Adapter]:
@@ -162,12 +181,3 @@ def _changes(base: BaseModel, table: Table) -> dict[str, Any]:
         else:
             changes[key] = value
     return changes
-
-
-def _fault(error: Any) -> str:
-    key = ".".join(str(part) for part in error["loc"] if part not in ("tuple[float, float, float]",))
-    if error["type"] == "extra_forbidden":
-        return f"{key}: there is no such key"
-    if error["type"] == "missing":
-        return f"{key}: is missing, and the type has no adapter that comes along"
-    return f"{key or 'table'}: {error['msg']}, not {error['input']!r:.80}" if key else error["msg"]

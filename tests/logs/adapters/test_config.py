@@ -12,12 +12,23 @@ from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.adapters.config import LogConfig, read_log_config
 from sonar_graph.logs.adapters.shipped import SHIPPED
 from sonar_graph.logs.adapters.toml_text import table_text, toml_value
+from sonar_graph.logs.inspection import inspect_log
 
 MISTAKES = {
     "a role that there is not": ("[sonra]\n", r"there is no role \[sonra\]; tables are for imu, dvl, depth"),
     "no table": ('imu = "/imu"', r"imu: expected a table, \[imu\]"),
-    "an unknown key": ('[dvl]\ntopc = "/dvl"', r"\[dvl\] topc: there is no such key"),
-    "a key in an inner table": ("[dvl]\ncovariance = {kind = 1}", r"\[dvl\] covariance\.kind: there is no such key"),
+    "an unknown key": (
+        '[dvl]\ntopc = "/dvl"',
+        r"\[dvl\] topc: there is no such field; did you mean topic\? it has: type, topic, .*velocity",
+    ),
+    "a type of which too little is said": (
+        '[imu]\ntype = "my_msgs/msg/Gyro"',
+        r"\[imu\] angular_velocity: is missing; .*no adapter comes along for my_msgs/msg/Gyro",
+    ),
+    "a key in an inner table": (
+        "[dvl]\ncovariance = {kind = 1}",
+        r"\[dvl\] covariance\.kind: there is no such field; covariance has: fields, meaning",
+    ),
     "axes that are none": ('[imu]\nrotation = "ned"', r"\[imu\] rotation.*'flu' or 'frd'.*not 'ned'"),
     "two angles": ("[imu]\nrotation = [1, 2]", r"\[imu\] rotation"),
     "a type that comes along with a wrong meaning": (
@@ -115,3 +126,42 @@ LEAVES = st.booleans() | st.integers(-(2**60), 2**60) | st.floats(allow_nan=Fals
 @given(st.dictionaries(st.text(min_size=1), LEAVES | st.lists(LEAVES, max_size=3), max_size=4))
 def test_values_are_toml(values: dict[str, Any]) -> None:
     assert tomllib.loads(f"x = {toml_value(values)}")["x"] == values
+
+
+@pytest.mark.parametrize(
+    ("toml", "message"),
+    [
+        (
+            '[imu]\nangular_velocity = ["angular_velocity.x", "angular_velocity.y", "angular_velocity.w"]',
+            r"\[imu\] angular_velocity: sensor_msgs/Imu has no field angular_velocity\.w; did you mean "
+            r"angular_velocity\.[xyz]\? it has: .*angular_velocity_covariance\[9\]",
+        ),
+        ('[imu]\nstamp = "header.time"', r"\[imu\] stamp: .* has no field header\.time; .*header\.stamp\.sec"),
+        ('[imu]\nframe_id_field = "frame"', r"\[imu\] frame_id_field: .* has no field frame; .*header\.frame_id"),
+        ('[dvl]\ntopic = "/dvl"\ngood_beams = "beams"', r"\[dvl\] good_beams: .* has no field beams; .*num_good_beams"),
+        ("[dvl]\nvalid_where = {lock = true}", r"\[dvl\] valid_where: .* has no field lock; .*velocity_mode"),
+        (
+            '[dvl]\ncovariance = {fields = ["velocity_cov"]}',
+            r"\[dvl\] covariance\.fields: .* has no field velocity_cov; did you mean velocity_covar\?",
+        ),
+        (
+            '[dvl]\ntype = "marine_acoustic_msgs/msg/Dvl"\nsound_speed = "speed"',
+            r"\[dvl\] sound_speed: .* has no field speed; ",
+        ),
+    ],
+)
+def test_a_field_that_messages_do_not_have_is_named_with_file_table_and_key(
+    foreign: Any, read: Any, tmp_path: Path, toml: str, message: str
+) -> None:
+    with pytest.raises(LogError, match=rf"log\.toml: {message}") as told:
+        read(foreign.imu(), foreign.dvl(), toml=toml)
+    path = next(tmp_path.rglob("*.mcap"))
+    with pytest.raises(LogError) as inspected:
+        inspect_log(path, read_log_config(next(tmp_path.rglob("*.toml"))))
+    assert str(inspected.value) == str(told.value)
+
+
+def test_fields_of_a_topic_that_is_not_meant_do_not_matter(foreign: Any, read: Any) -> None:
+    toml = '[dvl]\ntopic = "/dvl"\ngood_beams = "num_good_beams"\nstamp = "log"\nframe_id_field = false'
+    twist = ("/dvl/twist", "geometry_msgs/msg/TwistWithCovarianceStamped", [{"header": foreign.header(0)}] * 2)
+    assert len(read(foreign.imu(), foreign.dvl(), twist, toml=toml).dvl) == 5

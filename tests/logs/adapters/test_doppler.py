@@ -193,7 +193,7 @@ def test_a_stamp_in_seconds_keeps_its_fraction(foreign: Any, read: Any) -> None:
         (OF_ARRAY.replace("[2]", "[4]") + 'stamp = "log"', r"/pd0: field velocity\[4\] .* has 4 elements"),
         (OF_ARRAY.replace("velocity[2]", "velocity") + 'stamp = "log"', r"velocity .* is an array of 4; name one"),
         (OF_ARRAY, r"/pd0: its provider_dvl/msg/PD0Packet has no field header\.stamp\.sec"),
-        (OF_ARRAY.replace("velocity[2]", "speed"), r"nothing for dvl: /pd0 was chosen but has no field speed"),
+        (OF_ARRAY.replace("velocity[2]", "speed"), r"\[dvl\] velocity: .*PD0Packet has no field speed; it has: "),
     ],
 )
 def test_a_field_that_is_not_there_is_named(foreign: Any, read: Any, toml: str, message: str) -> None:
