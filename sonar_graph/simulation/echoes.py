@@ -23,8 +23,8 @@ from sonar_graph.simulation.scatterers import Floats32
 TAPS = 6
 """Bins that one echo reaches."""
 PULSE_STEPS = 32
-PHASE_STEPS = 4096
-ELEVATION_STEPS = 1024
+PHASE_STEPS = 1024
+ELEVATION_STEPS = 512
 STEEP = 0.25
 """Facets with ``1 - 1/|N|`` above it see the floor in front of them."""
 
@@ -34,13 +34,14 @@ class Tables(NamedTuple):
 
     cell_m: float
     """Of the scatterers' grid."""
-    column_rad: float
-    """Width of a column of azimuth."""
+    columns_per_rad: float
+    """Columns of azimuth; see `columns`."""
     columns: int
     """Centred on azimuth 0."""
     range_start_m: float
     """Edge of the first bin."""
     bin_m: float
+    bins_per_m: float
     bins: int
     waves_per_m: float
     """Of the way there and back: 2 / wavelength."""
@@ -123,7 +124,7 @@ def add_echo(
     step = int((waves - np.floor(waves)) * PHASE_STEPS)
     cos, sin = tables.phasor[step, 0] * amplitude, tables.phasor[step, 1] * amplitude
     real, imaginary = re * cos - im * sin, re * sin + im * cos
-    place = (range_m - tables.range_start_m) / tables.bin_m - 0.5 * TAPS + 0.5
+    place = (range_m - tables.range_start_m) * tables.bins_per_m - 0.5 * TAPS + 0.5
     first = int(np.floor(place))
     within = int((place - first) * PULSE_STEPS)
     if first < -TAPS or first >= tables.bins:
@@ -145,7 +146,36 @@ def is_blocked(view: View, horizon: Horizon, x: float, y: float, z: float) -> bo
     distance = int(run / horizon.distance_m) - 1
     if not 0 <= bearing < bearings or distance < 0:
         return False
-    return z / run < horizon.tangent[bearing, min(distance, distances - 1)]
+    return z < run * horizon.tangent[bearing, min(distance, distances - 1)]
+
+
+@compiled
+def slopes(relief_m: Floats32, row: int, column: int, cell_m: float) -> tuple[float, float]:
+    """Rise per metre along x and y; 0 at the border of what is in view."""
+    rows, columns = relief_m.shape
+    if not (0 < row < rows - 1 and 0 < column < columns - 1):
+        return 0.0, 0.0
+    along_x = relief_m[row, column + 1] - relief_m[row, column - 1]
+    along_y = relief_m[row + 1, column] - relief_m[row - 1, column]
+    return along_x / (2 * cell_m), along_y / (2 * cell_m)
+
+
+@compiled
+def table_places(R: Floats, x: float, y: float, z: float, per_range: float, tables: Tables) -> tuple[int, int]:
+    """Column of azimuth and step of elevation of a point at distance 1 / per_range, (-1, -1) outside of the tables."""
+    forward = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
+    left = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
+    up = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
+    if forward <= 0:
+        return -1, -1
+    t = left / forward
+    t2 = t * t
+    azimuth = t * (1 - t2 * (1 / 3 - t2 * (1 / 5 - t2 * (1 / 7 - t2 / 9)))) if t2 < 0.1 else np.arctan(t)
+    column = int(np.floor(azimuth * tables.columns_per_rad + 0.5 * tables.columns))
+    lift = int((up * per_range + 0.5) * ELEVATION_STEPS)
+    if not 0 <= column < tables.columns or not 0 <= lift < ELEVATION_STEPS:
+        return -1, -1
+    return column, lift
 
 
 @compiled
@@ -160,75 +190,62 @@ def sum_echoes(
     echoes: Floats32,
 ) -> None:
     """Add every echo in view to ``echoes``, shape (columns, TAPS + bins + TAPS, 2), real and imaginary part."""
-    R = view.sonar_R_world
     cell_m, cells = tables.cell_m, points.shape[0]
     has_objects = surface.amplitude.shape[0] > 0
     has_shadows = horizon.tangent.shape[0] > 0
-    least_range_m = tables.range_start_m - TAPS * tables.bin_m
-    most_range_m = tables.range_start_m + (tables.bins + TAPS) * tables.bin_m
+    least_m2 = (tables.range_start_m - TAPS * tables.bin_m) ** 2
+    most_m2 = (tables.range_start_m + (tables.bins + TAPS) * tables.bin_m) ** 2
     height_m = view.position_m[2] - view.floor_z_m
     for row in range(view.spans.shape[0]):
         i = (view.first_row + row) % cells
         point_row = (i + view.shift[0]) % cells
         y_row = (view.first_row + row) * cell_m - view.position_m[1]
+        j = (view.spans[row, 0] - 1) % cells
+        point_column = (j + view.shift[1]) % cells
         for column in range(view.spans[row, 0], view.spans[row, 1]):
-            j = column % cells
-            point = points[point_row, (j + view.shift[1]) % cells]
+            j = j + 1 if j + 1 < cells else 0  # a remainder costs as much as all else here
+            point_column = point_column + 1 if point_column + 1 < cells else 0
+            point = points[point_row, point_column]
             x = column * cell_m - view.position_m[0] + cell_m * point[2]
             y = y_row + cell_m * point[3]
-            z, gain, facing, area, relief = -height_m, texture[i, j], 0.0, 1.0, 0.0
-            slope_x, slope_y = 0.0, 0.0
+            gain, relief, slope_x, slope_y, area = texture[i, j], 0.0, 0.0, 0.0, 1.0
             if has_objects:
                 at = column - surface.first_column
                 relief = surface.relief_m[row, at]
-                z += relief
+                slope_x, slope_y = slopes(surface.relief_m, row, at, cell_m)
                 if not np.isnan(surface.amplitude[row, at]):
                     gain = surface.amplitude[row, at]
-                if 0 < row < surface.relief_m.shape[0] - 1 and 0 < at < surface.relief_m.shape[1] - 1:
-                    slope_x = (surface.relief_m[row, at + 1] - surface.relief_m[row, at - 1]) / (2 * cell_m)
-                    slope_y = (surface.relief_m[row + 1, at] - surface.relief_m[row - 1, at]) / (2 * cell_m)
-                    area = np.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
-            range_m = np.sqrt(x * x + y * y + z * z)
-            if range_m < least_range_m or range_m > most_range_m:
-                continue
-            facing = (x * slope_x + y * slope_y - z) / range_m
-            if facing <= 0:
+                area = np.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
+            z = relief - height_m
+            range_m2, toward = x * x + y * y + z * z, x * slope_x + y * slope_y - z
+            if range_m2 < least_m2 or range_m2 > most_m2 or toward <= 0:
                 continue
             if has_shadows and is_blocked(view, horizon, x, y, z):
                 continue
-            forward = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
-            left = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
-            up = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
-            tangent = left / forward
-            t2 = tangent * tangent
-            azimuth = tangent * (1 - t2 * (1 / 3 - t2 * (1 / 5 - t2 * (1 / 7 - t2 / 9))))
-            if t2 > 0.1:
-                azimuth = np.arctan(tangent)
-            beam_column = int(np.floor(azimuth / tables.column_rad + 0.5 * tables.columns))
-            lift = int((up / range_m + 0.5) * ELEVATION_STEPS)
-            if forward <= 0 or not 0 <= beam_column < tables.columns or not 0 <= lift < ELEVATION_STEPS:
+            range_m = np.sqrt(range_m2)
+            beam_column, lift = table_places(view.sonar_R_world, x, y, z, 1 / range_m, tables)
+            if beam_column < 0:
                 continue
-            amplitude = gain * facing / np.sqrt(area) * tables.elevation[lift]
+            amplitude = gain * toward / (range_m * np.sqrt(area)) * tables.elevation[lift]
             add_echo(tables, echoes, beam_column, range_m, amplitude, point[0], point[1])
             steepness = 1 - 1 / area
-            if floor_reflection > 0 and steepness > STEEP and relief > 0:
-                below = height_m + relief
-                image_m = np.sqrt(x * x + y * y + below * below)
+            if steepness > STEEP and relief > 0 and floor_reflection > 0:
+                image_m = np.sqrt(x * x + y * y + (height_m + relief) ** 2)
                 ghost = 2 * floor_reflection * steepness * amplitude
                 add_echo(tables, echoes, beam_column, 0.5 * (range_m + image_m), ghost, point[0], point[1])
 
 
 @compiled
-def through_beams(beam_matrix: Floats32, echoes: Floats32, seen: Floats32) -> None:
+def through_beams(beam_matrix: Floats32, bands: Ints, echoes: Floats32, seen: Floats32) -> None:
     """Matrix product ``seen += beam_matrix @ echoes``, on one core and always in the same order.
 
-    Shapes (beams, columns), (columns, samples), (beams, samples). A BLAS would use all cores for a product this small,
-    and its bytes would depend on their number.
+    Shapes (beams, columns), (columns, samples), (beams, samples). Of each beam only the columns of its band count, from
+    the first to the last (not included), whose number is divisible by 4. A BLAS would use all cores for a product this
+    small, and its bytes would depend on their number.
     """
-    beams, columns = beam_matrix.shape
     samples = echoes.shape[1]
-    for beam in range(beams):
-        for column in range(0, columns - 3, 4):
+    for beam in range(beam_matrix.shape[0]):
+        for column in range(bands[beam, 0], bands[beam, 1], 4):
             a, b = beam_matrix[beam, column], beam_matrix[beam, column + 1]
             c, d = beam_matrix[beam, column + 2], beam_matrix[beam, column + 3]
             for k in range(samples):

@@ -24,7 +24,6 @@ from sonar_graph.simulation.detections import Fan, Recogniser, simulate_detectio
 from sonar_graph.simulation.sensors import EPOCH_NS, regular_stamps
 from sonar_graph.simulation.vehicle import VehiclePath, rpy_from_rotation
 from sonar_graph.simulation.world import World
-from sonar_graph.states import Trajectory
 
 LEAST_POSES = 6
 """A quintic spline needs as many."""

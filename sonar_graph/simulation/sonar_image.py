@@ -39,6 +39,8 @@ GAIN_SLOPE_DB = 30.0
 COLUMNS_PER_BEAM = 5
 HALF_LIFT_RAD = np.radians(15)
 """Elevations beyond are left out: two-way, they are 50 dB down."""
+LEAST_AMPLITUDE = 3e-4
+"""Where a beam's pattern stays below, 70 dB down, it is taken for zero."""
 RAISED_M = 0.003
 """What stands higher casts a shadow."""
 BEARINGS, DISTANCE_STEP_M = 256, 0.006
@@ -128,7 +130,7 @@ class FrameSimulator:
         total = np.zeros((tables.columns, tables.bins + 2 * TAPS, 2), np.float32)
         height_m = position_m[2] - self._floor_z_m
         window = self.sonar.range_start_m, self.sonar.range_start_m + self.sonar.range_length_m
-        half_azimuth_rad = 0.5 * tables.columns * tables.column_rad
+        half_azimuth_rad = 0.5 * tables.columns * self._column_rad
         sector = lit_sector(world_R_sonar, height_m, window, half_azimuth_rad, HALF_LIFT_RAD)
         if sector is not None:
             cells = cells_of(sector, position_m)
@@ -160,6 +162,8 @@ class FrameSimulator:
         if not near:
             return echoes.no_surface(), echoes.no_horizon()
         surface = _laid_out(near, cells)
+        if not surface.relief_m.any() and np.isnan(surface.amplitude).all():
+            return echoes.no_surface(), echoes.no_horizon()
         if not self.options.shadows:
             return surface, echoes.no_horizon()
         steps = int(np.ceil(farthest_m * 1.1 / DISTANCE_STEP_M)) + 1
@@ -172,8 +176,20 @@ class FrameSimulator:
         """Beams' patterns and what depends on range alone, shape (beams, bins, 2)."""
         columns, bins, _ = total.shape
         seen = np.zeros((self.sonar.beams, bins * 2), np.float32)
-        echoes.through_beams(self._beam_matrix, np.ascontiguousarray(total).reshape(columns, -1), seen)
-        return seen.reshape(-1, bins, 2) * self._spreading[:, None]
+        matrix, bands = self._beam_matrix
+        echoes.through_beams(matrix, bands, np.ascontiguousarray(total).reshape(columns, -1), seen)
+        return self._with_cross_talk(seen).reshape(-1, bins, 2) * self._spreading[:, None]
+
+    def _with_cross_talk(self, seen: Floats32) -> Floats32:
+        """Adds to each beam a share of all others that are fired together with it."""
+        groups = self.sonar.firing_groups
+        others = self.sonar.beams // groups - 1
+        if self.options.cross_talk_db is None or groups == 1 or others < 1:
+            return seen
+        leak = float(10 ** (self.options.cross_talk_db / 20) / np.sqrt(others))
+        number = np.arange(self.sonar.beams) % groups
+        together = np.stack([seen[number == group].sum(axis=0) for group in range(groups)])
+        return (1 - leak) * seen + leak * together[number]
 
     def _with_surface_path(self, signal: Floats32, height_m: float, depth_m: float) -> Floats32:
         """Adds what went one way by the surface: echoes of the floor that arrive later than their own."""
@@ -220,19 +236,24 @@ class FrameSimulator:
         """Of the Gaussian amplitude whose square has the resolution as its width at half."""
         return self.sonar.range_resolution_m / (2 * np.sqrt(np.log(2)))
 
+    @property
+    def _column_rad(self) -> float:
+        return self.sonar.beam_width_rad / COLUMNS_PER_BEAM
+
     @cached_property
     def _tables(self) -> Tables:
         sonar = self.sonar
         bin_m = sonar.range_length_m / sonar.bins
         half_rad = np.abs(sonar.azimuths_rad()).max() + 4 * sonar.beam_width_rad
-        column_rad = sonar.beam_width_rad / COLUMNS_PER_BEAM
+        column_rad = self._column_rad
         lift = (np.arange(ELEVATION_STEPS) + 0.5) / ELEVATION_STEPS - 0.5
         return Tables(
             cell_m=CELL_M,
-            column_rad=column_rad,
+            columns_per_rad=1 / column_rad,
             columns=4 * int(np.ceil(half_rad / column_rad / 2)),
             range_start_m=sonar.range_start_m,
             bin_m=bin_m,
+            bins_per_m=1 / bin_m,
             bins=sonar.bins,
             waves_per_m=2 / sonar.wavelength_m,
             phasor=echoes.phasors(),
@@ -241,23 +262,16 @@ class FrameSimulator:
         )
 
     @cached_property
-    def _beam_matrix(self) -> Floats32:
-        """Amplitude of each column in each beam, cross-talk included, shape (beams, columns)."""
-        tables, sonar = self._tables, self.sonar
-        middles = (np.arange(tables.columns) + 0.5 - 0.5 * tables.columns) * tables.column_rad
-        offset = middles[None, :] - sonar.azimuths_rad()[:, None]
-        pattern = sonar.two_way_pattern(offset, self.options.side_lobes)
-        return (self._mixing() @ pattern).astype(np.float32)
-
-    def _mixing(self) -> Floats:
-        """Own signal and what leaks over from beams that are fired together, shape (beams, beams)."""
-        number = np.arange(self.sonar.beams)
-        together = (number[:, None] - number) % self.sonar.firing_groups == 0
-        others = max(int(together[0].sum()) - 1, 1)
-        leak = 0.0
-        if self.options.cross_talk_db is not None and self.sonar.firing_groups > 1:
-            leak = 10 ** (self.options.cross_talk_db / 20) / np.sqrt(others)
-        return np.where(together, leak, 0.0) + (1 - leak) * np.eye(self.sonar.beams)
+    def _beam_matrix(self) -> tuple[Floats32, NDArray[np.int64]]:
+        """Amplitude of each column in each beam, shape (beams, columns), and the columns that matter to it."""
+        columns = self._tables.columns
+        middles = (np.arange(columns) + 0.5 - 0.5 * columns) * self._column_rad
+        offset = middles[None, :] - self.sonar.azimuths_rad()[:, None]
+        pattern = self.sonar.two_way_pattern(offset, self.options.side_lobes)
+        matters = pattern > LEAST_AMPLITUDE
+        first, last = matters.argmax(axis=1), columns - matters[:, ::-1].argmax(axis=1)
+        bands = np.column_stack([first // 4 * 4, -(-last // 4) * 4])
+        return pattern.astype(np.float32), bands
 
 
 def drawn_gain_error_db(sigma_db: float, bins: int, seed: int) -> Floats:

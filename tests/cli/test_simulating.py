@@ -10,11 +10,11 @@ from sonar_graph.logs.reading import read_sequence
 from sonar_graph.logs.sonar_reading import read_sonar_frames
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin, simulate_basin_frames
 
-SHORT = {"duration_s": 114, "laps": 1, "frame_rate_hz": 0.5, "image": {"multipath": False}}
+SHORT = {"duration_s": 120, "laps": 1, "frame_rate_hz": 0.5, "image": {"multipath": False}}
 
 
 def simulate(path: Path, *more: str) -> None:
-    words = ["simulate", "basin", "-o", str(path), "--images", "--duration-s", "114", "--laps", "1"]
+    words = ["simulate", "basin", "-o", str(path), "--images", "--duration-s", "120", "--laps", "1"]
     result = CliRunner().invoke(app, [*words, "--set", "frame_rate_hz=0.5", "--set", "image.multipath=false", *more])
     assert result.exit_code == 0, result.output
 
