@@ -189,7 +189,7 @@ class FrameSimulator:
         leak = float(10 ** (self.options.cross_talk_db / 20) / np.sqrt(others))
         number = np.arange(self.sonar.beams) % groups
         together = np.stack([seen[number == group].sum(axis=0) for group in range(groups)])
-        return (1 - leak) * seen + leak * together[number]
+        return ((1 - leak) * seen + leak * together[number]).astype(np.float32, copy=False)
 
     def _with_surface_path(self, signal: Floats32, height_m: float, depth_m: float) -> Floats32:
         """Adds what went one way by the surface: echoes of the floor that arrive later than their own."""

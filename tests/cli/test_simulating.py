@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import numpy as np
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
 from typer.testing import CliRunner
 
 from sonar_graph.cli import app
@@ -46,3 +48,11 @@ def test_unknown_image_option_is_answered_with_those_there_are():
     assert result.exit_code == 2
     assert "there is no option image.nois" in " ".join(result.output.split())
     assert "image.noise_db" in result.output
+
+
+def test_images_lie_among_the_other_messages_in_the_order_of_time(tmp_path: Path):
+    simulate(tmp_path / "a.mcap")
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        times_ns = [record.log_time for record in StreamReader(stream).records if isinstance(record, Message)]
+    assert len(times_ns) > 60
+    assert times_ns == sorted(times_ns)
