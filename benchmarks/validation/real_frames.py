@@ -5,6 +5,7 @@ frames are Cartesian fans without ranges; apex and edges of the fan are fitted i
 same polar image (128 beams, one bin a pixel). Lengths are in pixels, counted as centimetres.
 
 * ``ours``: `sonar_graph.sonar.detection.select_candidates`; the probability of a false alarm is swept.
+* ``ours-strongest``: the same at its own false alarm probability; how many of the strongest are kept is swept.
 * ``soca``: smallest-of cell averaging along range (40 training, 10 guard cells, Pfa 0.1, gate 65 of 255: the values
   that bruce_slam publishes) on the samples as they are; Pfa and, along with it, the gate are swept.
 * ``soca-power``: the same on the echo's power, ``10^(dB / 10)``, without a gate; Pfa is swept.
@@ -12,8 +13,8 @@ same polar image (128 beams, one bin a pixel). Lengths are in pixels, counted as
   neighbourhood (radius 8) minus an offset of 1; the offset is swept.
 
 What a detector marks becomes regions in the same way for all: gaps closed, connected, gated by area. A box is found
-when a region has its centroid in it and a bounding box that overlaps it (intersection over union) by at least 0.2. "Wall"
-boxes are counted apart: a wall is no landmark, and gates on area are there to reject it.
+when a region has its centroid in it and a bounding box that overlaps it (intersection over union) by at least 0.2.
+"Wall" boxes are counted apart: a wall is no landmark, and gates on area are there to reject it.
 """
 
 from __future__ import annotations
@@ -129,9 +130,9 @@ Detector = Callable[[Frame, DetectionParams], tuple[Labels, NDArray[Any]]]
 """Label image and the labels of the accepted regions."""
 
 
-def ours(false_alarm: float, frame: Frame, settings: DetectionParams) -> tuple[Labels, NDArray[Any]]:
+def ours(change: dict[str, float], frame: Frame, settings: DetectionParams) -> tuple[Labels, NDArray[Any]]:
     level = SonarImage().decibels(frame.polar)
-    params = settings.model_copy(update={"false_alarm": false_alarm})
+    params = settings.model_copy(update=change)
     candidates = select_candidates(level, frame.ranges_m, frame.azimuths_rad, None, params)
     return candidates.labels, candidates.accepted + 1
 
@@ -223,6 +224,7 @@ def is_hit(centroid: tuple[float, float], region: Box, box: Box) -> bool:
 
 
 OURS = (0.2, 0.05, 0.02, 0.01, 3e-3, 1e-3, 1e-4, 1e-6, 1e-9, 1e-13, 1e-20, 1e-30, 1e-45, 1e-60, 1e-90)
+STRONGEST = (1, 2, 3, 4, 5, 6, 8, 12, 16)
 SOCA = tuple((pfa, gate) for gate in (0, 65, 100) for pfa in (0.3, 0.25, 0.2, 0.17, 0.14, 0.12, 0.1, 0.01))
 PFAS = (0.1, 0.03, 0.01, 3e-3, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-10, 1e-12, 1e-15, 1e-20)
 OFFSETS = (1.0, 0.0, -2.0, -4.0, -6.0, -8.0, -11.0, -15.0, -20.0, -25.0, -30.0, -40.0)
@@ -231,14 +233,15 @@ OFFSETS = (1.0, 0.0, -2.0, -4.0, -6.0, -8.0, -11.0, -15.0, -20.0, -25.0, -30.0, 
 def detectors() -> dict[str, list[tuple[object, Detector]]]:
     """All detectors by name, each with its settings."""
     return {
-        "ours": [(p, partial(ours, p)) for p in OURS],
+        "ours": [(p, partial(ours, {"false_alarm": p})) for p in OURS],
+        "ours-strongest": [(k, partial(ours, {"max_candidates": k})) for k in STRONGEST],
         "soca": [(s, partial(soca, s, False)) for s in SOCA],
         "soca-power": [(p, partial(soca, (p, -1.0), True)) for p in PFAS],
         "actag": [(o, partial(actag, o)) for o in OFFSETS],
     }
 
 
-PUBLISHED = {"ours": 1e-3, "soca": (0.1, 65), "soca-power": 0.1, "actag": 1.0}
+PUBLISHED = {"ours": 1e-3, "ours-strongest": 16, "soca": (0.1, 65), "soca-power": 0.1, "actag": 1.0}
 """The setting each comes with."""
 
 
@@ -297,7 +300,7 @@ def draw(points: Sequence[Point], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
-    for name, mark in zip(detectors(), "os^D", strict=True):
+    for name, mark in zip(detectors(), "oPs^D", strict=True):
         own = sorted((p for p in points if p.detector == name), key=lambda p: p.candidates)
         axes.plot([p.candidates for p in own], [p.hit_rate for p in own], mark, label=name, ms=4, alpha=0.5)
         budgets = np.geomspace(0.3, 60, 200)
@@ -327,7 +330,10 @@ def main() -> None:
     print_table(("objects found with at most", *(f"{b:g}" for b in BUDGETS)), [(n, *row) for n, row in best.items()])
     if arguments.figure:
         draw(points, arguments.figure)
-    ahead = [all(best["ours"][i] >= row[i] for row in best.values()) for i in range(len(BUDGETS))]
+    others = [row for name, row in best.items() if not name.startswith("ours")]
+    ahead = [
+        all(max(best["ours"][i], best["ours-strongest"][i]) > row[i] for row in others) for i in range(len(BUDGETS))
+    ]
     figures: dict[str, Any] = {"frames": len(paths), "candidates_a_frame": list(BUDGETS), "passed": all(ahead)}
     figures |= {name.replace("-", "_"): [round(rate, 4) for rate in row] for name, row in best.items()}
     print_figures(figures | {"ahead": ahead})

@@ -57,7 +57,7 @@ class TrackingParams(Section):
     """What is added to each coordinate's deviation a frame, for what motion and a point at rest do not explain."""
     gate_probability: float = Field(0.999, gt=0, lt=1)
     """A candidate outside this quantile of a track's innovation (2 dof) cannot belong to it."""
-    least_existence: float = Field(0.02, ge=0, lt=1)
+    least_existence: float = Field(0.01, ge=0, lt=1)
     """A track is given up below it."""
     leaving_sigmas: float = Field(3.0, gt=0)
     """A track is given up when it is so many deviations outside the image."""

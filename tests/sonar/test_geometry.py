@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonar_graph.errors import CalibrationError
+from sonar_graph.sonar.geometry import (
+    FloorView,
+    elevation_sigma,
+    point_covariances,
+    points,
+    ranges_azimuths_elevations,
+)
+
+angles = st.floats(-0.3, 0.3)
+
+
+def view_of(height: float, roll: float, pitch: float) -> FloorView:
+    return FloorView.from_angles(height, roll, pitch)
+
+
+@given(st.floats(0.1, 50), st.floats(-3.1, 3.1), st.floats(-1.5, 1.5))
+def test_range_azimuth_and_elevation_are_undone_by_their_point(r, a, e):
+    found = ranges_azimuths_elevations(points(np.array([r]), np.array([a]), np.array([e])))
+    assert np.allclose(np.ravel(found), [r, a, e], atol=1e-9 * max(r, 1))
+
+
+def test_left_is_positive_and_so_is_up():
+    q = points(np.array([2.0]), np.array([0.1]), np.array([0.2]))[0]
+    assert q[1] > 0
+    assert q[2] > 0
+
+
+@given(st.floats(0.5, 1.2), angles, st.floats(0.2, 0.9), st.floats(1.3, 2.5), angles)
+def test_floor_points_lie_on_the_floor_at_their_range_and_azimuth(height, roll, pitch, r, a):
+    view = view_of(height, roll, pitch)
+    q = view.floor_points(np.array([r]), np.array([a]))
+    world = gtsam.Rot3.RzRyRx(roll, pitch, 0.0).matrix() @ q[0]
+    assert world[2] == pytest.approx(-height, abs=1e-9)
+    found_r, found_a, _ = ranges_azimuths_elevations(q)
+    assert (found_r[0], found_a[0]) == pytest.approx((r, a), abs=1e-9)
+    xy = view.floor_point(r, a)
+    assert xy is not None
+    assert view.range_azimuth(xy) == pytest.approx((r, a), abs=1e-9)
+
+
+def test_a_centre_beam_tilted_down_meets_the_floor_where_the_triangle_says():
+    """Tilt 30 degrees, height 1 m: the centre beam is 2 m long and 1.732 m out; 1.5 m is seen below it."""
+    view = view_of(1.0, 0.0, np.radians(30))
+    assert view.floor_points(np.array([2.0]), np.array([0.0]))[0] == pytest.approx([2.0, 0.0, 0.0], abs=1e-12)
+    assert view.floor_point(2.0, 0.0) == pytest.approx([np.sqrt(3), 0.0])
+    q = view.floor_points(np.array([1.5]), np.array([0.0]))
+    _, _, e = ranges_azimuths_elevations(q)
+    assert e[0] == pytest.approx(np.radians(30) - np.arcsin(1 / 1.5))
+
+
+def test_what_is_nearer_than_the_floor_has_no_floor_point():
+    assert view_of(1.0, 0.0, 0.5).floor_point(0.9, 0.0) is None
+    assert np.isnan(view_of(1.0, 0.0, 0.5).floor_points(np.array([0.9]), np.array([0.1]))).all()
+
+
+@given(st.floats(-3, 3), angles, st.floats(0.2, 0.9))
+def test_heading_drops_out_of_a_view_from_a_pose(yaw, roll, pitch):
+    pose = gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array([3.0, -2.0, -0.7]))
+    view, expected = FloorView.from_pose(pose, -1.7), view_of(1.0, roll, pitch)
+    assert view.height_m == pytest.approx(1.0)
+    assert np.allclose(view.level_R_sonar, expected.level_R_sonar, atol=1e-9)
+
+
+@pytest.mark.parametrize("height", [0.0, -1.0, np.nan])
+def test_a_sonar_must_be_above_the_floor(height):
+    with pytest.raises(CalibrationError, match="height_m"):
+        view_of(height, 0.0, 0.5)
+
+
+def test_a_vertical_centre_beam_is_refused():
+    with pytest.raises(CalibrationError, match="vertical"):
+        view_of(1.0, 0.0, np.pi / 2)
+
+
+def test_covariance_of_a_point_is_that_of_many_samples():
+    rng = np.random.default_rng(1)
+    R = np.array([[4e-4, 2e-5], [2e-5, 1e-4]])
+    ra = rng.multivariate_normal([2.0, 0.2], R, 200_000)
+    e = rng.uniform(-0.06, 0.06, 200_000)
+    sampled = np.cov(points(ra[:, 0], ra[:, 1], e).T)
+    centre = points(np.array([2.0]), np.array([0.2]))
+    found = point_covariances(centre, R, np.array([elevation_sigma(0.12)]))[0]
+    assert np.allclose(found, sampled, atol=0.02 * np.abs(sampled).max())
+
+
+def test_elevation_spread_on_a_floor_is_that_of_many_samples():
+    """Height and tilt drawn; the elevation of the floor at one pixel, from ``tilt - asin(h / r)``."""
+    rng = np.random.default_rng(2)
+    height, tilt = rng.normal(0.95, 0.02, 200_000), rng.normal(np.radians(30), 0.01, 200_000)
+    sampled = np.std(tilt - np.arcsin(height / 2.0))
+    view = view_of(0.95, 0.0, np.radians(30))
+    found = view.elevation_sigmas(view.floor_points(np.array([2.0]), np.array([0.0])))
+    assert found[0] == pytest.approx(sampled, rel=0.02)

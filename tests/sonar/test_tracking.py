@@ -1,0 +1,210 @@
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonar_graph.errors import MeasurementError
+from sonar_graph.sonar.tracking import SonarStep, Tracker, TrackingParams
+from sonar_graph.sonar.tracks import Expected, Tracks, corrected
+
+from .candidate_rows import WINDOW, candidates_at
+
+FRAME_NS = 100_000_000
+STILL = SonarStep.none()
+AREA = float(np.prod(WINDOW[:, 1] - WINDOW[:, 0]))
+ahead = st.lists(st.tuples(st.floats(1.3, 2.5), st.floats(-0.24, 0.24)), max_size=6)
+
+
+def moved_by(x=0.0, y=0.0, yaw=0.0):
+    pose = gtsam.Pose3(gtsam.Rot3.Rz(yaw), np.array([x, y, 0.0]))
+    return SonarStep(pose, np.diag([1e-8] * 3 + [1e-6] * 3))
+
+
+def run(tracker, frames, step=STILL):
+    """Associations of frames, each a list of (range, azimuth)."""
+    return [
+        tracker.step(candidates_at([r for r, _ in seen], [a for _, a in seen]), step, (k + 1) * FRAME_NS)
+        for k, seen in enumerate(frames)
+    ]
+
+
+@given(st.lists(ahead, min_size=1, max_size=5))
+def test_rows_of_the_association_are_probabilities(frames):
+    for found in run(Tracker(), frames):
+        assert found.matrix.shape == (len(found.track_ids), len(found.previous_ids) + 1)
+        assert (found.matrix >= 0).all()
+        assert np.allclose(found.matrix.sum(axis=1), 1.0)
+        assert ((found.existence >= 0) & (found.existence <= 1)).all()
+
+
+@given(st.lists(ahead, min_size=1, max_size=4), st.randoms(use_true_random=False))
+def test_the_order_of_candidates_does_not_matter(frames, random):
+    orders = [random.sample(range(len(seen)), len(seen)) for seen in frames]
+    shuffled = [[seen[i] for i in order] for seen, order in zip(frames, orders, strict=True)]
+    one, other = run(Tracker(), frames)[-1], run(Tracker(), shuffled)[-1]
+
+    def by_position(found):
+        order = np.lexsort(found.position_m.T)
+        return found.position_m[order], found.existence[order], found.matrix[order, -1]
+
+    for left, right in zip(by_position(one), by_position(other), strict=True):
+        assert np.allclose(left, right)
+
+
+def test_association_is_the_ratio_of_densities_by_hand():
+    """One track, one candidate 2 cm behind it."""
+    params = TrackingParams(drift_m=0.0, lifetime_s=1e12)
+    tracker = Tracker(params)
+    run(tracker, [[(2.0, 0.0)]])
+    found = tracker.step(candidates_at([2.02], [0.0]), STILL, 2 * FRAME_NS)
+    # The track starts with the noise of one candidate, and the next one adds its own: twice the variance.
+    var_r, var_a = 2 * params.range_sigma_m**2, 2 * params.azimuth_sigma_rad**2
+    density = np.exp(-0.5 * 0.02**2 / var_r) / (2 * np.pi * np.sqrt(var_r * var_a))
+    birth = 0.1 / 0.6
+    from_track, from_none = birth * 0.9 * density, 0.6 / AREA
+    assert found.matrix == pytest.approx(np.array([[from_track, from_none]]) / (from_track + from_none), rel=1e-6)
+    likelihood = 0.1 + 0.9 * density * AREA / 0.5
+    assert found.existence[0] == pytest.approx(birth * likelihood / (1 - birth + birth * likelihood), rel=1e-6)
+    # Halfway between two equally certain places.
+    assert found.position_m[0] == pytest.approx([2.01, 0.0, 0.0], abs=1e-9)
+
+
+def test_a_missed_track_loses_existence_as_bayes_says():
+    tracker = Tracker(TrackingParams(lifetime_s=1e12))
+    before = run(tracker, [[(1.9, 0.0)]])[-1].existence[0]
+    found = tracker.step(candidates_at([], []), STILL, 2 * FRAME_NS)
+    assert found.existence[0] == pytest.approx(before * 0.1 / (1 - before + before * 0.1), rel=1e-6)
+    assert found.matrix.tolist() == [[1.0, 0.0]]
+    assert found.candidate.tolist() == [-1]
+
+
+def test_what_persists_becomes_certain_and_what_flickers_ends_with_its_reason():
+    rng = np.random.default_rng(7)
+    frames = [[(2.0, 0.1), (rng.uniform(1.3, 2.5), rng.uniform(-0.24, 0.0))] for _ in range(20)]
+    found = run(Tracker(), frames)
+    last = found[-1]
+    persistent = int(np.flatnonzero(last.track_ids == found[0].track_ids[0])[0])
+    assert last.existence[persistent] > 0.999
+    assert last.frames_seen[persistent] == 20
+    assert (np.delete(last.existence, persistent) < 0.9).all()
+    ended = [reason for step in found for reason in step.ended_reasons]
+    assert len(ended) > 5
+    assert set(ended) == {"exists with less than 0.01"}
+
+
+@pytest.mark.parametrize("is_compensated", [True, False])
+def test_motion_is_what_makes_a_track_persist(is_compensated):
+    """The sonar turns and moves 5 cm a frame; without the motion handed in (negative control) nothing persists."""
+    step, point = moved_by(0.05, 0.03, 0.05), np.array([2.3, 0.5, 0.0])
+    tracker, ids = Tracker(), []
+    for k in range(6):
+        candidates = candidates_at([float(np.linalg.norm(point))], [float(np.arctan2(point[1], point[0]))])
+        found = tracker.step(candidates, step if is_compensated else STILL, (k + 1) * FRAME_NS)
+        ids.append(int(found.track_ids[found.candidate >= 0][0]))
+        point = step.previous_T_sonar.transformTo(point)
+    assert (len(set(ids)) == 1) is is_compensated
+    if is_compensated:
+        assert found.position_m[0] == pytest.approx(step.previous_T_sonar.transformFrom(point), abs=1e-3)
+
+
+def test_a_skipped_frame_moves_the_tracks_too():
+    step, point = moved_by(0.1, 0.0, 0.04), np.array([2.2, 0.1, 0.0])
+    tracker = Tracker()
+    run(tracker, [[(float(np.linalg.norm(point)), float(np.arctan2(point[1], point[0])))]])
+    tracker.skip(step)
+    twice = step.previous_T_sonar.transformTo(step.previous_T_sonar.transformTo(point))
+    candidates = candidates_at([float(np.linalg.norm(twice))], [float(np.arctan2(twice[1], twice[0]))])
+    found = tracker.step(candidates, step, 3 * FRAME_NS)
+    assert found.track_ids.tolist() == [0]
+    assert found.position_m[0] == pytest.approx(twice, abs=1e-6)
+
+
+def test_steps_join_as_samples_of_them_do():
+    rng = np.random.default_rng(8)
+    one, two = moved_by(0.3, 0.1, 0.4), moved_by(-0.1, 0.2, -0.9)
+    one, two = (SonarStep(step.previous_T_sonar, np.diag([1e-4, 2e-4, 3e-4, 1e-3, 2e-3, 5e-4])) for step in (one, two))
+    joined = one.then(two)
+    noise = rng.multivariate_normal(np.zeros(12), np.kron(np.eye(2), one.covariance), 8_000)
+    tangents = [
+        joined.previous_T_sonar.localCoordinates(
+            one.previous_T_sonar.retract(n[:6]).compose(two.previous_T_sonar.retract(n[6:]))
+        )
+        for n in noise
+    ]
+    assert np.allclose(np.cov(np.array(tangents).T), joined.covariance, atol=0.05 * joined.covariance.max())
+
+
+def test_covariance_of_a_moved_track_is_that_of_samples():
+    rng = np.random.default_rng(9)
+    step = SonarStep(moved_by(0.3, 0.1, 0.4).previous_T_sonar, np.diag([1e-4, 2e-4, 3e-4, 1e-3, 2e-3, 5e-4]))
+    q, P = np.array([2.0, 0.3, -0.2]), np.diag([1e-3, 2e-3, 4e-3])
+    tracks = Tracks(np.array([0]), q[None], P[None], np.array([0.5]), np.array([1]))
+    found = tracks.moved(step, 0.0)
+    points = rng.multivariate_normal(q, P, 8_000)
+    noise = rng.multivariate_normal(np.zeros(6), step.covariance, 8_000)
+    pairs = zip(noise, points, strict=True)
+    sampled = [step.previous_T_sonar.retract(n).transformTo(p) for n, p in pairs]
+    assert np.allclose(found.position_m[0], np.mean(sampled, axis=0), atol=2e-3)
+    assert np.allclose(found.position_cov[0], np.cov(np.array(sampled).T), atol=0.06 * found.position_cov.max())
+
+
+def test_a_correction_is_that_of_the_information_form():
+    """P^-1 grows by H^T R^-1 H; H by differences of range and azimuth."""
+    q, P, R = np.array([1.9, 0.2, -0.3]), np.diag([1e-2, 3e-2, 2e-2]), np.diag([9e-4, 2e-4])
+    tracks = Tracks(np.array([0]), q[None], P[None], np.array([0.5]), np.array([1]))
+    expected = Expected.of(tracks, R)
+
+    def seen(point):
+        return np.array([np.linalg.norm(point), np.arctan2(point[1], point[0])])
+
+    H = np.column_stack([(seen(q + d) - seen(q - d)) / 2e-6 for d in 1e-6 * np.eye(3)])
+    z = seen(q) + np.array([0.02, -0.01])
+    after = corrected(tracks, expected, z[None], np.array([0]), R)
+    information = np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H
+    assert np.allclose(after.position_cov[0], np.linalg.inv(information), rtol=1e-5)
+    gain = np.linalg.solve(information, H.T @ np.linalg.inv(R))
+    assert after.position_m[0] == pytest.approx(q + gain @ [0.02, -0.01], abs=1e-7)
+
+
+def test_innovations_wrap_behind_the_sonar():
+    tracks = Tracks(np.array([0]), np.array([[-2.0, 1e-3, 0.0]]), np.eye(3)[None], np.array([0.5]), np.array([1]))
+    innovation = Expected.of(tracks, np.eye(2)).innovations(np.array([[2.0, -np.pi + 5e-4]]))
+    assert innovation[0, 0] == pytest.approx([0.0, 1e-3], abs=1e-6)
+
+
+def test_what_leaves_the_image_ends_and_is_not_held_against_it():
+    tracker = Tracker(TrackingParams(lifetime_s=1e12))
+    before = run(tracker, [[(1.4, 0.0)]] * 10)[-1]
+    tracker.skip(moved_by(0.2))
+    out = tracker.step(candidates_at([], []), moved_by(0.0), 20 * FRAME_NS)
+    assert out.ended_ids.tolist() == before.track_ids.tolist() or out.existence[0] > 0.99
+    gone = tracker.step(candidates_at([], []), moved_by(0.3), 21 * FRAME_NS)
+    assert "left the image" in out.ended_reasons + gone.ended_reasons
+
+
+def test_rejected_candidates_start_no_track_and_rows_point_into_all_of_them():
+    found = Tracker().step(candidates_at([2.0, 1.5, 1.7], [0.0, 0.1, 0.2], rejected=(0,)), None, FRAME_NS)
+    assert found.candidate.tolist() == [1, 2]
+    assert found.position_m[0] == pytest.approx(1.5 * np.array([np.cos(0.1), np.sin(0.1), 0.0]))
+
+
+def test_one_candidate_serves_one_track_and_numbers_are_not_used_twice():
+    tracker = Tracker()
+    frames = [[(2.0, 0.0), (2.05, 0.0)], [(2.02, 0.0)], [(2.0, 0.0), (2.05, 0.0)], [(1.4, 0.2)]]
+    numbers = []
+    for found in run(tracker, frames):
+        taken = found.candidate[found.candidate >= 0]
+        assert len(set(taken.tolist())) == len(taken)
+        numbers += [number for number in found.track_ids.tolist() if number not in found.previous_ids]
+    assert len(set(numbers)) == len(numbers)
+
+
+@pytest.mark.parametrize("later_ns", [0, -1])
+def test_frames_that_are_not_later_are_refused(later_ns):
+    tracker = Tracker()
+    tracker.step(candidates_at([2.0], [0.0]), None, FRAME_NS)
+    with pytest.raises(MeasurementError, match="not later"):
+        tracker.step(candidates_at([2.0], [0.0]), STILL, FRAME_NS + later_ns)
