@@ -70,5 +70,9 @@ EndTime = Annotated[
 ]
 Salvage = Annotated[
     bool,
-    typer.Option("--salvage", help="Read what is whole of a damaged log; the notes say what is lost."),
+    typer.Option(
+        "--salvage",
+        help="Read what is whole of a log that is damaged in its middle, "
+        "and say what is lost. One that is cut off is always read as far as it goes.",
+    ),
 ]

@@ -21,6 +21,7 @@ from sonar_graph.logs.window import Window
 
 __all__ = ["STAMP_BYTES", "Keep", "Progress", "Recording", "Topic", "scan", "stream"]
 
+_NS_PER_S = 1_000_000_000
 _PIECE_BYTES = 1 << 20
 
 
@@ -46,8 +47,13 @@ class Recording:
 
     @property
     def ending(self) -> str | None:
-        """What is wrong with the end of a file that was cut off; everything before is whole."""
-        return self.damage.ending.reason if self.damage.ending else None
+        """What is wrong with the end of a file that was cut off, and how much is there; everything before is whole."""
+        ending = self.damage.ending
+        if ending is None:
+            return None
+        if ending.start_ns is None or self.beginning_ns is None:
+            return f"{ending.reason}; no message is there"
+        return f"{ending.reason}; what is there spans {(ending.start_ns - self.beginning_ns) / _NS_PER_S:.3f} s"
 
     @property
     def corrupt(self) -> list[str]:
@@ -60,7 +66,7 @@ class Recording:
             f"{self.skipped_chunks} of {self.chunks} chunks hold nothing that was asked for; not read, not checked"
         )
         texts = {
-            "log.ending": self.damage.ending.describe(self.beginning_ns) if self.damage.ending else "",
+            "log.ending": self.ending or "",
             "log.damage": "; ".join(self.corrupt),
             "log.remarks": "; ".join(self.damage.remarks),
             "log.unprotected": ", ".join(self.damage.unprotected),

@@ -243,7 +243,8 @@ class Passage:
             return
         self.chunks += 1
         content = find_by_walk(unpack_beginning(chunk, self._file.read(chunk.data_at, chunk.data_size))).trusted()
-        reason += f"; {len(content)} messages are from the beginning of a chunk, which no CRC covers"
+        if len(content):
+            reason += f"; of the messages, {len(content)} are from the beginning of a chunk, which no CRC covers"
         self.damage.ending = Loss(hole.at, hole.end, reason, self._last_ns)
         yield from self._take_content(content, hole.at, hole.end, is_covered=False)
 
@@ -321,10 +322,14 @@ class Passage:
         damage.remarks += self._described.remarks
         if self._ending_fault and damage.ending is None:
             if self._summary is None and not self._walk.reached_end:
-                reason = f"the file is cut off: its last whole record ends at byte {self._file.size} of itself"
+                reason = (
+                    f"the file is cut off: it ends after a whole record, at byte {self._file.size}, without a summary"
+                )
                 damage.ending = Loss(self._file.size, self._file.size, reason, self._last_ns)
             else:
                 damage.remarks.append(f"{self._ending_fault}; the data before its end is whole")
+        if damage.ending is not None:
+            damage.ending.start_ns = self._last_ns
         unprotected = [f"{self._without_crc} chunks carry no CRC"] if self._without_crc else []
         unprotected += ["messages lie outside chunks"] if self._is_loose else []
         unprotected += [f"metadata record {name!r}" for name in self._unsealed]

@@ -224,6 +224,8 @@ def _require(choice: Choice, recording: Recording, wanted: Mapping[str, str], co
     if choice.candidates:
         raise LogError(f"{path}: for {role.name}, {choice.reason}; choose one: {advice(choice)}")
     is_asked_for = role.name in wanted or {"topic", "type"} & config.table(role.name).keys()
+    if role.is_required and not recording.topics:
+        raise MissingTopicError(f"{path}: has no messages: {recording.ending or 'see whether the recorder wrote any'}")
     if choice.topic is None and (role.is_required or (is_asked_for and not choice.is_off)):
         raise MissingTopicError(
             f"{path}: nothing for {role.name}: {choice.reason}; the log has {topic_list(recording)}; "

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType
 
-from sonar_graph.errors import LogError
+from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.container import Keep, scan, stream
+from sonar_graph.logs.reading import read_sequence
 from sonar_graph.logs.window import Instant, Window
 
 from .containers import chunk_indexes, entries, flip, read, scan_all, write, write_apart
@@ -55,8 +56,24 @@ def test_a_file_cut_off_gives_what_is_whole_and_says_so(tmp_path: Path, kept: fl
     assert found == written[: len(found)]
     recording = scan(path, lambda _: Keep.ALL)
     assert recording.ending is not None
-    assert "cut off" in recording.ending
+    times_ns = [time_ns for topic in recording.topics.values() for time_ns, _ in entries(topic)]
+    span_s = (max(times_ns) - min(times_ns)) / 1e9
+    assert recording.ending.startswith("the file is cut off: ")
+    assert recording.ending.endswith(f"; what is there spans {span_s:.3f} s")
+    assert " 0 " not in recording.ending
     recording.require_sound()
+
+
+def test_a_file_cut_off_before_its_first_message_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    write(path)
+    path.write_bytes(path.read_bytes()[: chunk_indexes(path)[0].chunk_start_offset + 3])
+    ending = scan(path, lambda _: Keep.ALL).ending
+    assert ending is not None
+    assert ending.startswith("the file is cut off: ")
+    assert ending.endswith("; no message is there")
+    with pytest.raises(MissingTopicError, match=r"log\.mcap: has no messages: the file is cut off: "):
+        read_sequence(path)
 
 
 def test_a_writer_killed_between_records_is_noticed(tmp_path: Path) -> None:
