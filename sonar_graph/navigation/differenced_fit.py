@@ -1,0 +1,177 @@
+"""Least squares on differences of successive samples, whose noises are unknown and told from the residuals.
+
+A stretch is a run of m differences ``y_k = x_{k+1} - x_k`` over durations T_k, three axes each, with the model::
+
+    y = A p + B n + e,    cov(e) = sigma^2 K
+    K = tridiag(-1, 2, -1) + r_1 diag(T) + r_2 T_j T_k min(t_j, t_k)
+
+p is common to all stretches, n is a stretch's own and of no interest. Each sample's white noise enters two successive
+differences with opposite signs (the tridiagonal part); white noise of a rate, such as an accelerometer's, enters each
+difference with a variance that grows with its duration; a rate that walks from the stretch's beginning, as gravity seen
+with a gyro's noise does, correlates all later ones (t is the time of a difference's middle). Taking the differences for
+independent would make the parameters look more or less certain than they are.
+
+The ratios r maximise the restricted likelihood, in which what fitting p and n costs is counted (Harville, JASA 72,
+1977)::
+
+    -2 log L = (N - rank) log RSS + sum 3 log|K| + log|B' K^-1 B| + log|A' P A|,    P = K^-1 projected off B
+
+and sigma^2 is ``RSS / (N - rank)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.optimize import minimize
+
+from sonar_graph.measurements import Floats
+
+LOG_RATIO_LIMIT = 12.0
+"""Of both ratios, made free of units by the mean duration."""
+RANK_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Successive differences without a gap."""
+
+    y: Floats
+    """Shape (m, 3)."""
+    A: Floats
+    """Derivative by the common parameters, shape (m, 3, p)."""
+    B: Floats
+    """Derivative by the stretch's own, shape (m, 3, q)."""
+    duration_s: Floats
+    """Shape (m,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Common parameters and how sure they are."""
+
+    parameters: Floats
+    """Shape (p,)."""
+    covariance: Floats
+    """Shape (p, p)."""
+    rss: float
+    """Whitened sum of squares, of the prior too, in units of the samples' variance."""
+    variance: float
+    """sigma², the variance of a sample's noise."""
+    ratios: Floats
+    """(r_1 in 1/s, r_2 in 1/s³)."""
+
+
+def fit(stretches: Sequence[Stretch], prior_sigmas: Floats, ratios: Floats | None = None) -> Fit:
+    """The common parameters.
+
+    Parameters
+    ----------
+    stretches
+        At least one, with more differences in all than parameters.
+    prior_sigmas
+        Of the common parameters about zero, shape (p,): so wide that they matter only where the data say nothing. A
+        parameter whose covariance is the prior's was not seen.
+    ratios
+        Of the noises; None: told from the data.
+    """
+    if ratios is None:
+        ratios = _likeliest_ratios(stretches, prior_sigmas)
+    return _Reduced.of(stretches, ratios).fit(prior_sigmas, ratios)
+
+
+def _likeliest_ratios(stretches: Sequence[Stretch], prior_sigmas: Floats) -> Floats:
+    rate = 1.0 / float(np.concatenate([s.duration_s for s in stretches]).mean())
+    units = np.array([rate, rate**3])
+
+    def criterion(logs: Floats) -> float:
+        bounded = np.clip(logs, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
+        return _Reduced.of(stretches, units * np.exp(bounded)).criterion(prior_sigmas)
+
+    start = np.array([[-2.0, -6.0], [1.0, -6.0], [-2.0, -2.0]])
+    best = minimize(
+        criterion, start[0], method="Nelder-Mead", options={"initial_simplex": start, "xatol": 0.1, "fatol": 0.02}
+    )
+    return np.asarray(units * np.exp(np.clip(best.x, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Reduced:
+    """Whitened data of all stretches with their own parameters projected out."""
+
+    AtA: Floats
+    Aty: Floats
+    yty: float
+    freedom: int
+    """Rows less the stretches' own parameters."""
+    log_determinants: float
+    """``sum 3 log|K| + log|B' K^-1 B|``."""
+
+    @classmethod
+    def of(cls, stretches: Sequence[Stretch], ratios: Floats) -> _Reduced:
+        parts = [_reduce(stretch, ratios) for stretch in stretches]
+        return cls(
+            sum((p.AtA for p in parts[1:]), parts[0].AtA),
+            sum((p.Aty for p in parts[1:]), parts[0].Aty),
+            sum(p.yty for p in parts),
+            sum(p.freedom for p in parts),
+            sum(p.log_determinants for p in parts),
+        )
+
+    def solve(self, prior_sigmas: Floats) -> tuple[Floats, Floats, float, float]:
+        """Parameters, information, sum of squares and sample variance; the prior's weight takes two rounds."""
+        count = len(prior_sigmas)
+        variance = self.yty / self.freedom
+        for _ in range(3):
+            information = self.AtA + np.diag(variance / np.square(prior_sigmas))
+            parameters = np.asarray(np.linalg.solve(information, self.Aty), dtype=np.float64)
+            rss = max(self.yty - float(parameters @ self.Aty), 1e-12 * self.yty + 1e-300)
+            variance = rss / max(self.freedom - count, 1)
+        return parameters, information, rss, variance
+
+    def criterion(self, prior_sigmas: Floats) -> float:
+        _, information, rss, _ = self.solve(prior_sigmas)
+        freedom = max(self.freedom - len(prior_sigmas), 1)
+        return float(freedom * np.log(rss) + self.log_determinants + np.linalg.slogdet(information)[1])
+
+    def fit(self, prior_sigmas: Floats, ratios: Floats) -> Fit:
+        parameters, information, rss, variance = self.solve(prior_sigmas)
+        covariance = np.asarray(variance * np.linalg.inv(information), dtype=np.float64)
+        return Fit(parameters, covariance, rss, variance, ratios)
+
+
+def _reduce(stretch: Stretch, ratios: Floats) -> _Reduced:
+    m, _, p = stretch.A.shape
+    lower = np.linalg.cholesky(_correlation(stretch.duration_s, ratios))
+    columns = np.concatenate([stretch.y[:, :, None], stretch.A, stretch.B], axis=2)
+    white = solve_triangular(lower, columns.reshape(m, -1), lower=True, check_finite=False).reshape(3 * m, -1)
+    own, size = _orthonormal(white[:, 1 + p :])
+    kept = white[:, : 1 + p] - own @ (own.T @ white[:, : 1 + p])
+    squares = kept.T @ kept
+    return _Reduced(
+        squares[1:, 1:],
+        squares[1:, 0],
+        float(squares[0, 0]),
+        3 * m - own.shape[1],
+        6.0 * float(np.log(np.diag(lower)).sum()) + size,
+    )
+
+
+def _correlation(duration_s: Floats, ratios: Floats) -> Floats:
+    """K, shape (m, m)."""
+    m = len(duration_s)
+    middle = np.cumsum(duration_s) - 0.5 * duration_s
+    walk = np.outer(duration_s, duration_s) * np.minimum.outer(middle, middle)
+    return np.asarray(np.diag(2.0 + ratios[0] * duration_s) - np.eye(m, k=1) - np.eye(m, k=-1) + ratios[1] * walk)
+
+
+def _orthonormal(B: Floats) -> tuple[Floats, float]:
+    """A basis of the columns' span, and ``log|B'B|`` over it."""
+    if not B.shape[1]:
+        return B, 0.0
+    U, s, _ = np.linalg.svd(B, full_matrices=False)
+    kept = s > RANK_TOLERANCE * max(float(s[0]), 1e-300)
+    return U[:, kept], 2.0 * float(np.log(s[kept]).sum())

@@ -1,0 +1,183 @@
+"""Time offset, mounting and scale of a Doppler log, from the accelerations that it shares with the IMU.
+
+Between two Doppler samples the change of velocity is also what the accelerometers felt, less gravity. In the frame g of
+`sonar_graph.navigation.inertial_path`, with the samples k at their stamps plus the offset tau::
+
+    x_k     = C_k (R v_k - w_k x l) - F_k
+    x_{k+1} - x_k = -d(C R v) (s - 1) + d(C [R v]x) psi + d(C [w]x) dl - d(S) b + gamma T + gamma' T t
+
+s is the factor on the log's velocities, psi a small turn of its mounting (``Exp(psi) R``), dl a correction to the
+lever arm l from the IMU to the log, b the accelerometers' bias. Gravity and its slow turning, which stands for tilt,
+gyro bias and the Earth's rotation, are fitted anew every half minute. The offset acts through the change of the
+velocity as the body sees it: ``d/dtau x = -C dv/dt`` and a constant. Straight and steady driving says nothing of it.
+
+The velocities that multiply s and psi are those that the accelerometers carry on from a fit over the stretch. The log's
+own would bring their noise into the regression twice, which shrinks s towards nothing (errors in variables).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.measurements import Dvl, Floats, Imu
+from sonar_graph.navigation.differenced_fit import Stretch
+from sonar_graph.navigation.inertial_path import InertialPath
+from sonar_graph.navigation.offset_search import RANGE_S, Estimate1D, search_offset
+
+STRETCH_S = 30.0
+"""Gravity and its turning are fitted anew after so long."""
+MEAN_OVER_S = 1.0
+"""Samples are averaged over so long: in shorter differences noise is larger than what the motion changes."""
+LEAST_ROWS = 12
+LARGEST_INTERVAL = 3.0
+"""Times the usual one: a longer time between two samples ends a stretch."""
+LEAST_STRETCHES = 2
+
+PRIOR_SIGMAS = np.array([1.0, 0.05, 0.05, 1.0, *[1.0] * 3, *[0.5] * 3])
+"""Scale; turn, rad, about x and y near what the calibration says; lever arm, m; accelerometer bias, m/s²."""
+SCALE, YAW = 1, 4
+"""Places among the parameters, after the offset."""
+LARGEST_STEP_LEFT = 0.01
+"""Of turn (rad) and scale together, after which linearising again changes nothing that matters."""
+ROUNDS = 5
+
+OFFSET_LIMIT_S, YAW_LIMIT_RAD, SCALE_LIMIT = 0.1, np.radians(2.0), 0.02
+"""What is less certain than this is said not to be told."""
+NO_MANOEUVRES = "too little acceleration"
+
+
+@dataclass(frozen=True)
+class DvlMatch:
+    """What a Doppler log's readings say about its stamps, its mounting and its scale."""
+
+    offset: Estimate1D
+    """To be added to its stamps, s."""
+    yaw: Estimate1D
+    """To be added to the mounting's yaw, about the body's z axis, rad."""
+    scale: Estimate1D
+    """Factor by which its velocities must be multiplied."""
+
+
+def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
+    """Compare velocities with accelerations.
+
+    Parameters
+    ----------
+    imu, dvl
+        Of one run; the IMU with specific forces, else nothing can be told.
+    calibration
+        Mountings as far as they are known; the yaw found is on top of them.
+    """
+    if not np.isfinite(imu.specific_force).all():
+        return _unknown("no accelerometers")
+    path = InertialPath.of(_in_body_axes(imu, calibration))
+    seconds = path.since_origin(dvl.stamps_ns)
+    inside = path.covers(seconds - RANGE_S) & path.covers(seconds + RANGE_S)
+    body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
+    seconds, velocity = seconds[inside], dvl.velocity[inside] @ body_R_dvl.T
+    runs = list(stretches_of(seconds))
+    if len(runs) < LEAST_STRETCHES:
+        return _unknown(f"less than {LEAST_STRETCHES * STRETCH_S:g} s with both")
+    lever = np.subtract(calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m)
+    return _matched(path, seconds, velocity, runs, lever)
+
+
+def _matched(path: InertialPath, seconds: Floats, velocity: Floats, runs: list[slice], lever: Floats) -> DvlMatch:
+    yaw, scale = 0.0, 1.0
+    for _ in range(ROUNDS):
+        turned = scale * Rotation.from_rotvec([0.0, 0.0, yaw]).apply(velocity)
+        found = search_offset(partial(_line_up, path, seconds, turned, runs, lever), PRIOR_SIGMAS)
+        more, turn = found.fit.parameters[[SCALE, YAW]].tolist()
+        yaw, scale = yaw + turn, scale * (1.0 + more)
+        if np.hypot(turn, more) < LARGEST_STEP_LEFT:
+            break
+    else:
+        return _unknown(NO_MANOEUVRES)
+    sigma = np.sqrt(np.diag(found.fit.covariance))
+    return DvlMatch(
+        found.offset().limited(OFFSET_LIMIT_S, NO_MANOEUVRES),
+        Estimate1D(yaw, float(sigma[YAW])).limited(YAW_LIMIT_RAD, NO_MANOEUVRES),
+        Estimate1D(scale, float(sigma[SCALE])).limited(SCALE_LIMIT, NO_MANOEUVRES),
+    )
+
+
+def _unknown(reason: str) -> DvlMatch:
+    nothing = Estimate1D(np.nan, np.inf, reason)
+    return DvlMatch(nothing, nothing, nothing)
+
+
+def _in_body_axes(imu: Imu, calibration: Calibration) -> Imu:
+    body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
+    return Imu(imu.stamps_ns, imu.angular_velocity @ body_R_imu.T, imu.specific_force @ body_R_imu.T)
+
+
+def stretches_of(seconds: Floats) -> Iterator[slice]:
+    """Runs of samples without a gap, about half a minute each; shorter ones with too few samples are left out."""
+    intervals = np.diff(seconds)
+    if not len(intervals):
+        return
+    usual = float(np.median(intervals))
+    ends = np.flatnonzero(intervals > LARGEST_INTERVAL * usual) + 1
+    rows = max(LEAST_ROWS, round(STRETCH_S / max(usual, 1e-9)))
+    for first, last in zip([0, *ends], [*ends, len(seconds)], strict=True):
+        count = max(1, round((last - first - 1) / rows))
+        edges = np.linspace(first, last - 1, count + 1).astype(int).tolist()
+        for begin, end in pairwise(edges):
+            if end - begin >= LEAST_ROWS:
+                yield slice(begin, end + 1)
+
+
+def _line_up(
+    path: InertialPath, stamped_s: Floats, velocity: Floats, runs: list[slice], lever: Floats, offset_s: float
+) -> list[Stretch]:
+    seconds = stamped_s + offset_s
+    C, impulse = path.rotations_at(seconds), path.impulse_at(seconds)
+    turning = C @ cross_matrices(path.rate_at(seconds))
+    x = np.einsum("nij,nj->ni", C, velocity) - turning @ lever - impulse
+    S = path.turned_time_at(seconds)
+    return [_stretch(seconds[r], x[r], impulse[r], C[r], turning[r], S[r], lever) for r in runs]
+
+
+def _stretch(
+    seconds: Floats, x: Floats, impulse: Floats, C: Floats, turning: Floats, S: Floats, lever: Floats
+) -> Stretch:
+    """Differences of x; their derivatives are taken at the velocity that the IMU carries on, which is free of noise."""
+    since = seconds - seconds.mean()
+    slow = np.vander(since, 3)
+    carried = impulse + slow @ np.linalg.lstsq(slow, x, rcond=None)[0] + turning @ lever
+    in_body = np.einsum("nji,nj->ni", C, carried)
+    A = np.concatenate([-carried[:, :, None], C @ cross_matrices(in_body), turning, -S], axis=2)
+    together = max(1, round(MEAN_OVER_S / float(np.median(np.diff(since)))))
+    return _difference(*(mean_of_successive(values, together) for values in (since, x, A)))
+
+
+def _difference(seconds: Floats, x: Floats, A: Floats) -> Stretch:
+    duration = np.diff(seconds)
+    middle = seconds[:-1] + 0.5 * duration
+    gravity = duration[:, None, None] * np.eye(3)
+    return Stretch(
+        np.diff(x, axis=0),
+        np.diff(A, axis=0),
+        np.concatenate([gravity, middle[:, None, None] * gravity], axis=2),
+        duration,
+    )
+
+
+def mean_of_successive(values: Floats, count: int) -> Floats:
+    """Means of so many rows at a time; what is left over at the end is left out."""
+    whole = len(values) // count
+    return np.asarray(values[: whole * count].reshape(whole, count, *values.shape[1:]).mean(axis=1))
+
+
+def cross_matrices(vectors: Floats) -> Floats:
+    """[v]x with ``[v]x w = v x w`` of each row, shape (n, 3, 3)."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

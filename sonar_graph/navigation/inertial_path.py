@@ -1,0 +1,94 @@
+"""Attitude and velocity change by gyros and accelerometers alone, from the first sample on, at any instant.
+
+The frame g is the IMU's own at its first sample. With C = g_R_imu, piecewise linear rates and the trapezoid rule::
+
+    C <- C Exp((w_i + w_{i+1}) / 2 dt),    F(t) = int C f dt,    S(t) = int C dt
+
+F is the change of velocity plus gravity's reaction, S what a constant accelerometer bias adds to it. Nothing here knows
+the world: which way is up is left to whoever fits it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.measurements import Floats, Imu, Ints
+from sonar_graph.navigation.kernels import compiled, rotation_exp
+
+
+@dataclass(frozen=True, eq=False)
+class InertialPath:
+    """Integrals of one IMU's samples."""
+
+    seconds: Floats
+    """Of the samples since ``origin_ns``, shape (n,)."""
+    origin_ns: int
+    rotations: Floats
+    """C, shape (n, 3, 3)."""
+    impulse: Floats
+    """F, shape (n, 3), m/s; NaN from the first sample on whose force was not measured."""
+    turned_time: Floats
+    """S, shape (n, 3, 3), s."""
+    rate: Floats
+    """Angular rate as measured, shape (n, 3), rad/s."""
+
+    @classmethod
+    def of(cls, imu: Imu) -> InertialPath:
+        """Integrate; of samples with one stamp the first counts."""
+        stamps, first = np.unique(imu.stamps_ns, return_index=True)
+        seconds = (stamps - stamps[0]) * 1e-9
+        rate = imu.angular_velocity[first]
+        rotations, impulse, turned = _integrate(seconds, rate, imu.specific_force[first])
+        return cls(seconds, int(stamps[0]), rotations, impulse, turned, rate)
+
+    def since_origin(self, stamps_ns: Ints) -> Floats:
+        """Seconds of other stamps on this path's axis, shape (k,)."""
+        return np.asarray((stamps_ns - self.origin_ns) * 1e-9)
+
+    def covers(self, seconds: Floats) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """Which instants lie within the samples."""
+        return np.asarray((seconds >= 0) & (seconds <= self.seconds[-1]))
+
+    def rotations_at(self, seconds: Floats) -> Floats:
+        """C at instants within the samples, along the shortest arc between two, shape (k, 3, 3)."""
+        after = np.clip(np.searchsorted(self.seconds, seconds), 1, len(self.seconds) - 1)
+        share = (seconds - self.seconds[after - 1]) / (self.seconds[after] - self.seconds[after - 1])
+        before = Rotation.from_matrix(self.rotations[after - 1])
+        step = (before.inv() * Rotation.from_matrix(self.rotations[after])).as_rotvec()
+        return np.asarray((before * Rotation.from_rotvec(share[:, None] * step)).as_matrix())
+
+    def impulse_at(self, seconds: Floats) -> Floats:
+        """F, shape (k, 3)."""
+        return interpolated(seconds, self.seconds, self.impulse)
+
+    def turned_time_at(self, seconds: Floats) -> Floats:
+        """S, shape (k, 3, 3)."""
+        return interpolated(seconds, self.seconds, self.turned_time)
+
+    def rate_at(self, seconds: Floats) -> Floats:
+        """Angular rate, shape (k, 3)."""
+        return interpolated(seconds, self.seconds, self.rate)
+
+
+def interpolated(seconds: Floats, own_seconds: Floats, values: Floats) -> Floats:
+    """Columns of shape (n, ...) linear between their instants, at other instants."""
+    columns = values.reshape(len(values), -1)
+    found = np.column_stack([np.interp(seconds, own_seconds, column) for column in columns.T])
+    return found.reshape(len(seconds), *values.shape[1:])
+
+
+@compiled
+def _integrate(seconds: Floats, rate: Floats, force: Floats) -> tuple[Floats, Floats, Floats]:
+    n = len(seconds)
+    rotations, impulse, turned = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3, 3))
+    rotations[0] = np.eye(3)
+    for i in range(1, n):
+        dt = seconds[i] - seconds[i - 1]
+        rotations[i] = rotations[i - 1] @ rotation_exp(0.5 * dt * (rate[i - 1] + rate[i]))
+        before, after = rotations[i - 1] @ force[i - 1], rotations[i] @ force[i]
+        impulse[i] = impulse[i - 1] + 0.5 * dt * (before + after)
+        turned[i] = turned[i - 1] + 0.5 * dt * (rotations[i - 1] + rotations[i])
+    return rotations, impulse, turned

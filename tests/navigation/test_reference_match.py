@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.measurements import Imu
+from sonar_graph.navigation.reference_match import match_reference_to_imu
+from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.states import Trajectory
+
+RUN = simulate_mission(MissionOptions(seed=3, duration_s=200, landmarks=1))
+
+
+@pytest.fixture(params=[-0.43, 0.25])
+def offset_s(request):
+    return request.param
+
+
+def early(offset_s: float, seed: int = 0, wrong_rad: float = 0.0) -> Trajectory:
+    truth = RUN.truth
+    stamps = truth.stamps_ns[::50]
+    noise = Rotation.from_rotvec(1e-3 * np.random.default_rng(seed).standard_normal((len(stamps), 3)))
+    seconds = (stamps - stamps[0]) * 1e-9
+    turned = Rotation.from_euler("z", np.where(seconds < 11, wrong_rad, 0.0)[:, None])
+    rotations = turned * Rotation.from_quat(truth.quaternions_xyzw[::50]) * noise
+    return Trajectory.without_covariances(stamps - round(offset_s * 1e9), truth.positions[::50], rotations.as_quat())
+
+
+def test_offset_is_found(offset_s):
+    found = match_reference_to_imu(RUN.imu, early(offset_s), RUN.calibration).offset
+    assert abs(found.value - offset_s) < 4 * found.sigma < 0.1
+
+
+def test_interval_holds_the_offset_at_its_stated_rate():
+    found = [match_reference_to_imu(RUN.imu, early(0.2, seed), RUN.calibration).offset for seed in range(40)]
+    held = [abs(f.value - 0.2) < 1.96 * f.sigma for f in found]
+    assert np.mean(held) >= 0.8
+    assert np.std([f.value for f in found]) > 0.3 * np.mean([f.sigma for f in found])
+
+
+def test_a_wrong_start_heading_is_named():
+    found = match_reference_to_imu(RUN.imu, early(0.1, wrong_rad=0.07), RUN.calibration).start_heading
+    assert found.value == pytest.approx(0.07, abs=4 * found.sigma)
+    right = match_reference_to_imu(RUN.imu, early(0.1), RUN.calibration).start_heading
+    assert abs(right.value) < 0.005
+
+
+def test_without_turning_the_offset_cannot_be_told():
+    still = Imu(RUN.imu.stamps_ns, 1e-4 * np.ones((len(RUN.imu), 3)), RUN.imu.specific_force)
+    level = replace(early(0.1), quaternions_xyzw=np.tile([0.0, 0, 0, 1], (len(early(0.1)), 1)))
+    assert not match_reference_to_imu(still, level, RUN.calibration).offset.is_known
