@@ -10,6 +10,7 @@ import typer
 
 from sonar_graph.cli.arguments import OutputLog, Overwrite
 from sonar_graph.cli.outputs import writable_log
+from sonar_graph.cli.placing_landmarks import landmarks
 from sonar_graph.cli.progress import Report, progress_bars, working
 from sonar_graph.cli.settings import nested_settings
 from sonar_graph.cli.texts import examples
@@ -26,8 +27,15 @@ worlds = typer.Typer(
     epilog=examples(
         "sonar-graph simulate basin -o basin.mcap",
         "sonar-graph simulate basin -o images.mcap --images",
+        "sonar-graph simulate landmarks --on dive.mcap -o with_landmarks.mcap",
     ),
 )
+worlds.command(
+    epilog=examples(
+        "sonar-graph simulate landmarks --on dive.mcap -o with_landmarks.mcap",
+        "sonar-graph simulate landmarks --on dive.mcap -o hard.mcap --seed 7 --set wrong_id_rate=0.05",
+    )
+)(landmarks)
 
 
 @worlds.command(

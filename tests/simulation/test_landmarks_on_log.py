@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sonar_graph.errors import SimulationError
+from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks
+from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+
+RECORDED = replace(simulate_mission(MissionOptions(seed=5, duration_s=120)), detections=None, true_landmarks=None)
+CLEAN = LandmarkOptions(
+    spacing_m=5.0, detection_probability=1.0, wrong_id_rate=0.0, false_detections_per_frame=0.0, height_sigma_m=0.2
+)
+
+
+def residuals(run):
+    """Of right identities: (range, azimuth) errors over their sigmas, by the recorded reference alone."""
+    found = run.detections
+    ids, _ = found.most_probable()
+    frames, frame = np.unique(found.stamps_ns, return_inverse=True)
+    pose = run.truth.at(frames)
+    place = run.true_landmarks.positions[np.searchsorted(run.true_landmarks.ids, ids)]
+    seen = pose.rotations()[frame].inv().apply(place - pose.positions[frame])
+    errors = np.column_stack(
+        [found.range_m - np.linalg.norm(seen, axis=1), found.azimuth_rad - np.arctan2(seen[:, 1], seen[:, 0])]
+    )
+    return errors / [run.calibration.sonar.range_sigma_m, run.calibration.sonar.azimuth_sigma_rad]
+
+
+def test_detections_fit_the_reference_to_their_noise():
+    scaled = residuals(add_landmarks(RECORDED, CLEAN))
+    assert len(scaled) > 100
+    assert scaled.std(axis=0) == pytest.approx(1.0, abs=0.15)
+
+
+def test_wrong_identities_and_false_detections_come_at_their_rates():
+    wrong = residuals(add_landmarks(RECORDED, CLEAN.model_copy(update={"wrong_id_rate": 0.2})))
+    assert 0.1 < np.mean(np.abs(wrong).max(axis=1) > 6) < 0.3
+    fewer = add_landmarks(RECORDED, CLEAN.model_copy(update={"detection_probability": 0.5}))
+    assert 0.4 < len(fewer.detections) / len(add_landmarks(RECORDED, CLEAN).detections) < 0.6
+
+
+def test_what_was_recorded_stays():
+    run = add_landmarks(RECORDED)
+    assert run.imu is RECORDED.imu
+    assert run.dvl is RECORDED.dvl
+    assert run.truth is RECORDED.truth
+    assert run.calibration.imu == RECORDED.calibration.imu
+    assert "simulated" in run.notes
+
+
+def test_the_seed_decides():
+    first, again, other = (add_landmarks(RECORDED, LandmarkOptions(seed=s, spacing_m=5.0)) for s in (1, 1, 2))
+    assert np.array_equal(first.detections.range_m, again.detections.range_m)
+    assert not np.array_equal(first.true_landmarks.positions, other.true_landmarks.positions)
+
+
+def test_what_cannot_be_done_is_said():
+    with pytest.raises(SimulationError, match="no reference trajectory"):
+        add_landmarks(replace(RECORDED, truth=None))
+    with pytest.raises(SimulationError, match="range_min_m = 50"):
+        add_landmarks(RECORDED, LandmarkOptions(range_min_m=50.0))
