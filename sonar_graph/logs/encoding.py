@@ -86,6 +86,7 @@ def dvl_messages(topic: str, dvl: Dvl) -> Outgoing:
     covariances[np.isnan(covariances).any(axis=1)] = [-1.0] + [0.0] * 8
     values = header(dvl.stamps_ns, "dvl") | fields("velocity", "xyz", dvl.velocity)
     values |= {"velocity_mode": 1, "velocity_covar": covariances, "num_good_beams": 4}
+    values |= {"sound_speed": np.nan}  # not known; 0 is what drivers leave that do not fill it
     return outgoing(topic, DVL, dvl.stamps_ns, values)
 
 

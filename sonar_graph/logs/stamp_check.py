@@ -23,9 +23,9 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
     log_times_ns
         When each message was recorded, shape (n,).
     """
-    unset = stamps_ns == 0
+    unset = (stamps_ns == 0) & (log_times_ns != 0)  # recorded at 0, 0 is the time: data sets begin there
     if unset.any():
-        yield f"{_messages(unset)} without a stamp: the time of recording is used"
+        yield f"{_messages(int(unset.sum()))} without a stamp: the time of recording is used"
     stamps_ns, log_times_ns = stamps_ns[~unset], log_times_ns[~unset]
     if len(stamps_ns) < 2:
         return
@@ -34,7 +34,7 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
         yield f"{_times(steps_ns < 0)} backwards, by {-steps_ns.min() / _NS_PER_S:.3g} s at most: rows are sorted"
     again = len(stamps_ns) - len(np.unique(stamps_ns))
     if again:
-        yield f"{again} messages with the stamp of another"
+        yield f"{_messages(again)} with the stamp of another"
     yield from _lag(log_times_ns - stamps_ns)
 
 
@@ -49,8 +49,8 @@ def _lag(lag_ns: Ints) -> Iterator[str]:
         yield f"stamps and recording drift apart by {abs(last_s - first_s):.3g} s: a clock jumped or runs wrong"
 
 
-def _messages(which: np.ndarray) -> str:
-    return f"{np.count_nonzero(which)} messages"
+def _messages(count: int) -> str:
+    return "1 message" if count == 1 else f"{count} messages"
 
 
 def _times(which: np.ndarray) -> str:

@@ -9,9 +9,11 @@ import pytest
 from mcap.reader import make_reader
 
 from sonar_graph.logs.adapters.config import LogConfig
+from sonar_graph.logs.converters.victoria_park import read_victoria_park
 from sonar_graph.logs.inspection import LogSummary, inspect_log
 from sonar_graph.logs.reading import read_sequence
 from sonar_graph.logs.writing import write_sequence
+from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
 
 def role(summary: LogSummary, name: str) -> tuple[str | None, str]:
@@ -114,7 +116,7 @@ def test_stamps_are_doubted(bench: Any) -> None:
     summary = inspect_log(bench.write(unset, dvl))
     faults = {topic.name: topic.stamp_faults for topic in summary.topics}
     assert faults["/dvl"] == ()
-    assert "1 messages without a stamp: the time of recording is used" in faults["/imu"]
+    assert "1 message without a stamp: the time of recording is used" in faults["/imu"]
 
 
 def test_what_the_user_says_is_what_is_inspected(bench: Any) -> None:
@@ -125,3 +127,14 @@ def test_what_the_user_says_is_what_is_inspected(bench: Any) -> None:
     summary = inspect_log(path, config)
     assert role(summary, "imu") == ("/imu", "chosen in my.toml")
     assert role(summary, "dvl") == (None, "switched off in my.toml")
+
+
+def test_what_this_package_wrote_gives_no_warning(tmp_path: Path) -> None:
+    write_sequence(tmp_path / "a.mcap", read_victoria_park())
+    write_sequence(tmp_path / "b.mcap", simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1)))
+    for name in ("a.mcap", "b.mcap"):
+        summary = inspect_log(tmp_path / name)
+        assert summary.warnings == ()
+        assert [topic.stamp_faults for topic in summary.topics if topic.stamp_faults] == []
+        assert summary.damage == ()
+        assert not {"log.stamps", "log.warnings"} & read_sequence(tmp_path / name).notes.keys()
