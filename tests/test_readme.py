@@ -35,6 +35,23 @@ def test_example_calibration_is_one() -> None:
     assert parsed.dvl.mounting.translation_m == (0.30, 0.0, -0.15)
 
 
+def test_table_of_topics_has_every_type_and_word_that_is_found_without_being_asked_for() -> None:
+    from sonar_graph.logs.adapters.shipped import SHIPPED
+    from sonar_graph.logs.roles import ROLES
+
+    names = {"imu": "IMU", "dvl": "Doppler log", "detections": "landmarks", "sonar": "sonar images"}
+    rows = {row.split(" | ")[0].removeprefix("| "): row for row in README.splitlines() if row.startswith("| ")}
+    for role, offers in SHIPPED.items():
+        row = rows[names.get(role, role.replace("_", " "))]
+        for offer in offers:
+            package, _, name = offer.adapter.type.split("/")
+            assert f"{package}`" in row or f"{package}/msg/{name}`" in row or f"`{name}`" in row, offer.adapter.type
+            assert name in row
+            for word in offer.words:
+                assert f"`{word}`" in row
+                assert f"'{word}'" in ROLES[role].describe(), "inspect says the same words"
+
+
 def test_example_entry_point_joins_the_group() -> None:
     from sonar_graph.estimator import ENTRY_POINT_GROUP
 

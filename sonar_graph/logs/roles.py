@@ -44,7 +44,7 @@ class Role:
             if short_name(offer.adapter.type) not in names:
                 names.append(short_name(offer.adapter.type))
         return ", or ".join(
-            ", ".join(names) + (f" on a topic with {words[0]!r} in its name" if words else "")
+            ", ".join(names) + (f" on a topic with {' or '.join(map(repr, words))} in its name" if words else "")
             for words, names in by_words.items()
         )
 

@@ -14,7 +14,7 @@ from sonar_graph.logs.adapters.reference import TruthAdapter
 from sonar_graph.logs.adapters.sonar_images import SonarAdapter
 from sonar_graph.logs.adapters.vertical import DepthAdapter
 
-TRUTH_WORDS = ("ground_truth", "groundtruth", "truth")
+TRUTH_WORDS = ("truth",)
 _DVL_WORDS = ("dvl", "doppler")
 _DEPTH_WORDS = ("depth",)
 _LANDMARK_WORDS = ("landmark", "sonar")
