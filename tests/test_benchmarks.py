@@ -46,6 +46,22 @@ def test_isam2_mission_names_its_figures() -> None:
     assert found["plain_error_m"] < 0.3
 
 
+def test_preintegration_names_its_figures() -> None:
+    found = figures("performance/preintegration.py")
+    assert found["gtsam_cpp_ratio"] == pytest.approx(found["ours_ns"] / found["gtsam_cpp_ns"], rel=1e-3)
+    assert found["gtsam_python_ratio"] > 1
+    assert len(found["factor_us"]) == 4
+
+
+def test_preintegration_consistency_tells_rules_apart() -> None:
+    found = figures("validation/preintegration_consistency.py", "--workers", "2")
+    low, high = found["keyframe_joint_anees"]
+    assert 0.8 < low < high < 1.2
+    assert found["keyframe_coug_fgo_anees"][1] > 5
+    assert found["keyframe_TURTLMap_anees"][1] > 5
+    assert {"chain_joint_anees", "brisk_linear_anees", "passed"} <= set(found)
+
+
 def test_nested_messages_are_the_same_in_both_libraries() -> None:
     found = figures("performance/nested_messages.py")
     assert found["same"]

@@ -53,6 +53,15 @@ def test_library_page_prints_what_it_says(tmp_path: Path) -> None:
     assert 0 < abs(correlation) < 1
 
 
+def test_preintegration_page_finds_the_bias_and_the_way(tmp_path: Path) -> None:
+    printed = run("05_preintegration.py", tmp_path)
+    bias, sigma = number_after(printed, "about z:"), number_after(printed, "±")
+    assert abs(bias - 0.01) < 3.5 * sigma < 1e-3
+    assert number_after(printed, "after 20 s:") < 0.05
+    assert 10 < number_after(printed, "held velocity:") < 40
+    assert "6 rows instead of 12" in printed
+
+
 def test_page_on_viewers_has_commands_and_a_program_that_work(tmp_path: Path) -> None:
     page = (TUTORIALS / "03_viewers.md").read_text(encoding="utf-8")
     here = Path(sys.executable).parent

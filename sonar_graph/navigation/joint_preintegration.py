@@ -177,7 +177,8 @@ class JointPreintegrator:
             When an end is no Doppler stamp, the inertial rows do not reach both ends, or the rule needs a specific
             force that was not measured.
         """
-        doppler, inertial = self._doppler_rows(dvl, start_ns, end_ns), _inertial_rows(imu, start_ns, end_ns)
+        samples, inertial = _doppler_rows(dvl, start_ns, end_ns), _inertial_rows(imu, start_ns, end_ns)
+        velocity, cov = self._in_body(samples)
         bias = np.zeros(6) if bias is None else np.asarray(bias, np.float64)
         body_R_imu = self.body_T_imu.rotation().matrix()
         force = inertial.specific_force @ body_R_imu.T
@@ -193,26 +194,30 @@ class JointPreintegrator:
             self.gyro_noise_density**2,
             self.accel_noise_density**2,
         )
-        R, (v, p, s), P, D, first, last = preintegrate(
-            rows, doppler.stamps_ns, doppler.velocity, doppler.velocity_cov, RULES[self.rule]
-        )
-        ends = doppler.velocity_cov[0], doppler.velocity_cov[-1]
+        columns = samples.stamps_ns, velocity, cov
+        R, (v, p, s), P, D, first, last = preintegrate(rows, *columns, RULES[self.rule])
         duration_s = (end_ns - start_ns) * 1e-9
         arms = self.body_T_imu.translation(), self.body_T_dvl.translation()
-        return JointMotion(gtsam.Rot3(R), v, p, s, P, D, (first, last), ends, np.zeros((3, 3)), bias, duration_s, *arms)
+        ends, unshared = (cov[0], cov[-1]), np.zeros((3, 3))
+        return JointMotion(gtsam.Rot3(R), v, p, s, P, D, (first, last), ends, unshared, bias, duration_s, *arms)
 
-    def _doppler_rows(self, dvl: Dvl, start_ns: int, end_ns: int) -> Dvl:
-        """Rows from one end to the other, in body axes, each with a covariance."""
-        first = int(np.searchsorted(dvl.stamps_ns, start_ns))
-        last = int(np.searchsorted(dvl.stamps_ns, end_ns))
-        if end_ns <= start_ns or last == len(dvl) or (dvl.stamps_ns[first], dvl.stamps_ns[last]) != (start_ns, end_ns):
-            raise MeasurementError(
-                f"Dvl.stamps_ns: no motion from {start_ns} to {end_ns} ns; take two of its stamps, the earlier first"
-            )
-        rows, body_R_dvl = dvl.rows(slice(first, last + 1)), self.body_T_dvl.rotation().matrix()
-        default = np.diag(np.square(self.velocity_sigma_m_s))
-        cov = np.where(np.isnan(rows.velocity_cov), default, rows.velocity_cov)
-        return Dvl(rows.stamps_ns, rows.velocity @ body_R_dvl.T, body_R_dvl @ cov @ body_R_dvl.T)
+    def _in_body(self, samples: Dvl) -> tuple[Floats, Floats]:
+        """Velocities in body axes and a covariance for each."""
+        body_R_dvl, cov = self.body_T_dvl.rotation().matrix(), samples.velocity_cov
+        unsaid = np.isnan(cov)
+        if unsaid.any():
+            cov = np.where(unsaid, np.diag(np.square(self.velocity_sigma_m_s)), cov)
+        return samples.velocity @ body_R_dvl.T, body_R_dvl @ cov @ body_R_dvl.T
+
+
+def _doppler_rows(dvl: Dvl, start_ns: int, end_ns: int) -> Dvl:
+    """Rows from one end to the other."""
+    first, last = (int(row) for row in np.searchsorted(dvl.stamps_ns, [start_ns, end_ns]))
+    if end_ns <= start_ns or last == len(dvl) or (dvl.stamps_ns[first], dvl.stamps_ns[last]) != (start_ns, end_ns):
+        raise MeasurementError(
+            f"Dvl.stamps_ns: no motion from {start_ns} to {end_ns} ns; take two of its stamps, the earlier first"
+        )
+    return dvl.rows(slice(first, last + 1))
 
 
 def _inertial_rows(imu: Imu, start_ns: int, end_ns: int) -> Imu:
