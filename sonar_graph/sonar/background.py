@@ -20,8 +20,8 @@ Floats32 = NDArray[np.float32]
 MEDIAN_TO_SIGMA = 1.4826
 LEAST_SPREAD_DB = 0.2
 """Below it a level is not told from its quantisation."""
-STEPS_PER_DB = 4.0
-DEVIATION_STEPS_PER_DB = 20.0
+STEPS_PER_DB = 8.0
+DEVIATION_STEPS_PER_DB = 40.0
 LARGEST_WINDOW = 127
 TREND_NODES = 5
 """The median along the beams is itself averaged over so many nodes in range."""
@@ -58,6 +58,14 @@ def background_of(smooth_db: Floats32, smoothing: tuple[int, int], neighbourhood
 
 
 def _median(values: Floats32, window: int, steps_per_db: float, zero: float) -> Floats32:
-    """Median over a square window, to half a step; opencv's median over large windows takes bytes."""
+    """Median over a square window, to half a step.
+
+    Mirrored at the edges: opencv would repeat the edge, whose few nodes then had most of the votes. In bytes, because
+    its median over large windows takes nothing else.
+    """
+    half = window // 2
     counts = cv2.convertScaleAbs(np.clip(values * np.float32(steps_per_db) + np.float32(zero), 0, 255))
-    return (cv2.medianBlur(counts, window).astype(np.float32) - np.float32(zero)) / np.float32(steps_per_db)
+    mirrored = cv2.copyMakeBorder(counts, half, half, half, half, cv2.BORDER_REFLECT_101)
+    middle = np.s_[half : half + values.shape[0], half : half + values.shape[1]]
+    medians = np.asarray(cv2.medianBlur(mirrored, window), dtype=np.float32)[middle]
+    return (medians - np.float32(zero)) / np.float32(steps_per_db)

@@ -13,6 +13,7 @@ from sonar_graph.sonar.detection import (
     select_candidates,
 )
 from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar.regions import measure_regions
 
 from .candidate_rows import AZIMUTHS_RAD, RANGES_M, speckle_db
 
@@ -62,10 +63,13 @@ def test_interpolated_offsets_are_the_offsets():
     assert false_alarm_offsets_db(spreads, 1e-3) == pytest.approx(exact, abs=0.02)
 
 
-@pytest.mark.parametrize("level", [20.0, 50.0, 30.0 - 12.0 * (RANGES_M - 1.26) / 1.25])
+ACROSS = np.linspace(-1.0, 1.0, 96)[:, None]
+
+
+@pytest.mark.parametrize("level", [20.0, 50.0, 30.0 - 12.0 * (RANGES_M - 1.26) / 1.25, 30.0 + 3.0 * ACROSS])
 def test_false_alarms_keep_their_rate_whatever_the_level(level):
     shares = [share_that_stands_out(speckle_db(seed, level).astype(np.float32), 1e-2) for seed in range(12)]
-    assert 0.5e-2 < np.mean(shares) < 2e-2
+    assert 0.7e-2 < np.mean(shares) < 1.7e-2
 
 
 def test_texture_raises_the_threshold_by_itself():
@@ -113,8 +117,6 @@ def test_areas_on_the_floor_are_larger_than_in_the_slant_plane():
 
 def test_the_area_of_all_of_the_image_is_that_of_a_sector():
     """Every pixel labelled: on the floor, angle times (g1^2 - g0^2) / 2 for an untilted sonar's sector of rings."""
-    from sonar_graph.sonar.regions import measure_regions
-
     labels = np.ones((96, 512), dtype=np.int32)
     contrast = np.zeros((96, 512), dtype=np.float32)
     angle = (AZIMUTHS_RAD[0] - AZIMUTHS_RAD[-1]) * 96 / 95
@@ -122,12 +124,18 @@ def test_the_area_of_all_of_the_image_is_that_of_a_sector():
     found = measure_regions(contrast, labels, 1, RANGES_M, AZIMUTHS_RAD, level)
     edges2 = np.array([1.26, 2.51]) ** 2 - 0.95**2
     assert found.area_m2[0] == pytest.approx(angle * np.diff(edges2)[0] / 2, rel=1e-3)
-    tilted = measure_regions(contrast, labels, 1, RANGES_M, AZIMUTHS_RAD, VIEW).area_m2[0]
-    xy = floor_xy()
-    outline = np.concatenate([xy[:, 0], xy[:, :, -1], xy[:, -1, ::-1], xy[:, ::-1, 0]], axis=1)
-    x, y = outline
+
+
+def test_the_area_of_all_of_a_tilted_and_rolled_image_is_that_of_its_outline():
+    """The outline on the floor, by the shoelace formula."""
+    view, azimuths = FloorView.from_angles(0.95, 0.3, 0.5), np.linspace(0.9, -0.9, 192)
+    labels, contrast = np.ones((192, 512), dtype=np.int32), np.zeros((192, 512), dtype=np.float32)
+    area = measure_regions(contrast, labels, 1, RANGES_M, azimuths, view).area_m2[0]
+    q = view.floor_points(np.tile(RANGES_M, 192), np.repeat(azimuths, 512)) @ view.level_R_sonar.T
+    xy = q.T[:2].reshape(2, 192, 512)
+    x, y = np.concatenate([xy[:, 0], xy[:, :, -1], xy[:, -1, ::-1], xy[:, ::-1, 0]], axis=1)
     shoelace = abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
-    assert tilted == pytest.approx(shoelace * 96 / 95 * 512 / 511, rel=2e-3)
+    assert area == pytest.approx(shoelace * 192 / 191 * 512 / 511, rel=2e-3)
 
 
 @pytest.mark.parametrize(

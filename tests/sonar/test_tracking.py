@@ -15,6 +15,9 @@ from .candidate_rows import WINDOW, candidates_at
 FRAME_NS = 100_000_000
 STILL = SonarStep.none()
 AREA = float(np.prod(WINDOW[:, 1] - WINDOW[:, 0]))
+_mixing = np.random.default_rng(11).normal(size=(6, 6)) * 0.02
+CORRELATED = _mixing @ _mixing.T
+"""Covariance of a step whose rotation and translation are wrong together."""
 ahead = st.lists(st.tuples(st.floats(1.3, 2.5), st.floats(-0.24, 0.24)), max_size=6)
 
 
@@ -125,7 +128,7 @@ def test_a_skipped_frame_moves_the_tracks_too():
 def test_steps_join_as_samples_of_them_do():
     rng = np.random.default_rng(8)
     one, two = moved_by(0.3, 0.1, 0.4), moved_by(-0.1, 0.2, -0.9)
-    one, two = (SonarStep(step.previous_T_sonar, np.diag([1e-4, 2e-4, 3e-4, 1e-3, 2e-3, 5e-4])) for step in (one, two))
+    one, two = (SonarStep(step.previous_T_sonar, CORRELATED) for step in (one, two))
     joined = one.then(two)
     noise = rng.multivariate_normal(np.zeros(12), np.kron(np.eye(2), one.covariance), 8_000)
     tangents = [
@@ -139,7 +142,7 @@ def test_steps_join_as_samples_of_them_do():
 
 def test_covariance_of_a_moved_track_is_that_of_samples():
     rng = np.random.default_rng(9)
-    step = SonarStep(moved_by(0.3, 0.1, 0.4).previous_T_sonar, np.diag([1e-4, 2e-4, 3e-4, 1e-3, 2e-3, 5e-4]))
+    step = SonarStep(moved_by(0.3, 0.1, 0.4).previous_T_sonar, CORRELATED)
     q, P = np.array([2.0, 0.3, -0.2]), np.diag([1e-3, 2e-3, 4e-3])
     tracks = Tracks(np.array([0]), q[None], P[None], np.array([0.5]), np.array([1]))
     found = tracks.moved(step, 0.0)
@@ -147,7 +150,7 @@ def test_covariance_of_a_moved_track_is_that_of_samples():
     noise = rng.multivariate_normal(np.zeros(6), step.covariance, 8_000)
     pairs = zip(noise, points, strict=True)
     sampled = [step.previous_T_sonar.retract(n).transformTo(p) for n, p in pairs]
-    assert np.allclose(found.position_m[0], np.mean(sampled, axis=0), atol=2e-3)
+    assert np.allclose(found.position_m[0], np.mean(sampled, axis=0), atol=1e-2)
     assert np.allclose(found.position_cov[0], np.cov(np.array(sampled).T), atol=0.06 * found.position_cov.max())
 
 
