@@ -17,6 +17,7 @@ from sonar_graph.cli.comparing import compare, demo, report, run
 from sonar_graph.cli.converting import datasets
 from sonar_graph.cli.inspecting import inspect
 from sonar_graph.cli.listing import estimators
+from sonar_graph.cli.recognising import calibrate, recognise
 from sonar_graph.cli.simulating import worlds
 from sonar_graph.cli.texts import examples
 from sonar_graph.errors import SonarGraphError
@@ -51,6 +52,13 @@ app.command(
         "sonar-graph compare dive.mcap --log-config dive.toml -o comparison",
     )
 )(compare)
+app.command(
+    epilog=examples(
+        "sonar-graph recognise dive.mcap -o recognised.mcap",
+        "sonar-graph recognise dive.mcap -o recognised.mcap --rule jeffrey",
+    )
+)(recognise)
+app.command(epilog=examples("sonar-graph calibrate dive.mcap -o model.json"))(calibrate)
 app.command(epilog=examples("sonar-graph report comparison"))(report)
 app.command(epilog=examples("sonar-graph estimators"))(estimators)
 app.command(epilog=examples("sonar-graph demo -o demo"))(demo)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -35,6 +35,7 @@ from sonar_graph.cli.texts import answers
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 
 if TYPE_CHECKING:
+    from sonar_graph.evaluation.recognition import Recognition
     from sonar_graph.evaluation.results import Comparison
     from sonar_graph.sequence import Sequence
 
@@ -147,16 +148,21 @@ def demo(output: OutputFolder = Path("demo")) -> None:
 
 
 def _estimator_names(text: str) -> list[str]:
-    """Names from a list with commas, each once, in order.
+    """Names from a list with commas, in order.
 
     Raises
     ------
     EstimatorError
-        When there is none.
+        When there is none, one is empty, or one comes again.
     """
-    names = list(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
-    if not names:
+    names = [name.strip() for name in text.split(",")]
+    if not any(names):
         raise EstimatorError(f"--estimators {text!r}: expected names such as {DEFAULT_ESTIMATORS}")
+    again = next((name for name in names if names.count(name) > 1), None)
+    if not all(names):
+        raise EstimatorError(f"--estimators {text!r}: a name is empty; expected names such as {DEFAULT_ESTIMATORS}")
+    if again is not None:
+        raise EstimatorError(f"--estimators {text!r}: {again} is named twice; each runs once")
     return names
 
 
@@ -171,10 +177,30 @@ def _compare_log(
     with progress_bars() as progress:
         sequence = source.read(progress)
     check_rate(rate_hz, sequence, DEFAULT_RATE_HZ)
+    sequence, recognition = _with_recognised(source, sequence)
     with progress_bars() as progress:
         comparison = compare_runs(sequence, names, overrides, rate_hz=rate_hz, progress=progress)
+    comparison = replace(comparison, recognition=recognition)
     _write_results(comparison, sequence, output)
     return comparison
+
+
+def _with_recognised(source: LogSource, sequence: Sequence) -> tuple[Sequence, Recognition | None]:
+    """The sequence with landmarks recognised in the log's sonar images, where it has images and no detections."""
+    from sonar_graph.evaluation.recognising import recognise, with_detections
+
+    if sequence.detections is not None:
+        return sequence, None
+    topic = topic_choices(source.topics or []).get("sonar")
+    with progress_bars() as progress:
+        found = recognise(
+            source.path,
+            sequence,
+            topic=topic,
+            config=read_config(source.config),
+            progress=lambda done: progress("recognising landmarks (frames)", done, 0),
+        )
+    return (sequence, None) if found is None else (with_detections(sequence, found), found)
 
 
 def _check_settings(names: list[str], overrides: dict[str, dict[str, Any]]) -> None:

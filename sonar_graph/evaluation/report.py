@@ -13,6 +13,7 @@ from markupsafe import Markup
 
 from sonar_graph.evaluation.figure_style import ESTIMATOR_COLOURS
 from sonar_graph.evaluation.illustrations import illustrations
+from sonar_graph.evaluation.recognition_section import recognition_content
 from sonar_graph.evaluation.results import Comparison, RunResult
 from sonar_graph.evaluation.score_table import score_blocks
 from sonar_graph.evaluation.wording import ABSENT, TOLERATED_FACTOR, failed_runs, finding, format_value
@@ -56,6 +57,7 @@ def _content(comparison: Comparison) -> dict[str, Any]:
         "nees_limits": [f"{1 / TOLERATED_FACTOR:g}", f"{TOLERATED_FACTOR:g}"],
         "figures": illustrations(comparison),
         "outcomes": _outcomes(comparison),
+        "recognition": recognition_content(comparison),
         "files": {run.estimator: _files(run) for run in comparison.runs},
         "settings": {run.estimator: _as_json(run.params) for run in comparison.runs},
         "calibration": _as_json(comparison.sequence.calibration.model_dump(mode="json")),

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from sonar_graph.evaluation.recognition import Recognition
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, LandmarkMap, Trajectory
@@ -86,3 +87,5 @@ class Comparison:
     """By run name; empty where there is no truth."""
     environment: dict[str, str]
     """Versions, machine, date, and the command that made it."""
+    recognition: Recognition | None = None
+    """How the detections came from sonar images; None where the log had detections or no images."""

@@ -4,6 +4,8 @@
 
     DIR/comparison.json         scores with units and protocol, states of the runs, settings, environment
     DIR/sequence.npz            truth, true landmarks, detections and instants
+    DIR/recognition.json, recognised/STAMP.jpg
+                                how detections came from sonar images, and the pictures that the report shows
     DIR/runs/NAME/trajectory.tum, causal.tum, landmarks.csv
                                 what the estimator said, for other tools; absent when the run failed
     DIR/runs/NAME/result.json   settings, versions, timings, status and reason
@@ -33,6 +35,7 @@ from sonar_graph.evaluation.archive import (
 )
 from sonar_graph.evaluation.atomic import replacing
 from sonar_graph.evaluation.metrics import rmse
+from sonar_graph.evaluation.recognition import read_recognition, write_recognition
 from sonar_graph.evaluation.results import Comparison, ErrorSeries, Kind, RunResult, Score
 from sonar_graph.evaluation.strict_json import read_json, write_json
 from sonar_graph.logs.tum import write_landmarks_csv, write_tum
@@ -63,6 +66,7 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
     write_arrays(folder / SEQUENCE, sequence_arrays(comparison.sequence) | {"instants_ns": comparison.instants_ns})
     for run in comparison.runs:
         _write_run(run, comparison, folder / RUNS / run.estimator)
+    write_recognition(comparison.recognition, folder)
     write_json(folder / INDEX, _index(comparison))
 
 
@@ -97,6 +101,7 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
         scores={name: _restore_scores(entry["scores"]) for name, entry in index["runs"].items()},
         errors=errors,
         environment=index["environment"],
+        recognition=read_recognition(folder),
     )
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from sonar_graph.evaluation.results import Comparison
 from sonar_graph.evaluation.storage import INDEX, RESULT, RUNS
+from sonar_graph.logs.pictures import Picture
 from sonar_graph.logs.recorder import Attachment
 from sonar_graph.logs.result_log import write_result
 from sonar_graph.sequence import Sequence
@@ -37,4 +38,7 @@ def write_viewer_files(comparison: Comparison, sequence: Sequence, folder: Path)
     }
     names = [INDEX, *(f"{RUNS}/{run.estimator}/{RESULT}" for run in comparison.runs)]
     attachments = [Attachment(name, "application/json", (folder / name).read_bytes()) for name in names]
-    write_result(folder / RESULT_LOG, sequence, estimates, comparison.environment | settings, attachments)
+    drawn = comparison.recognition.pictures if comparison.recognition else []
+    pictures = [Picture(picture.stamp_ns, picture.jpeg) for picture in drawn]
+    about = comparison.environment | settings
+    write_result(folder / RESULT_LOG, sequence, estimates, about, attachments, pictures)

@@ -14,6 +14,7 @@ For each estimator ``NAME`` (as `source_names` spells it), in the frame ``map``:
 ``/tf_static``             ``base_link`` to the sensors
 ``/ground_truth/...``      ``odometry``, ``path``, ``landmarks``, ``landmark_cloud`` from the start, and its
                            frame in ``/tf``, where known
+``/sonar/recognised``      ``sensor_msgs/CompressedImage``: sonar images with the recognised identities drawn in
 =========================  ==============================================================================
 """
 
@@ -31,6 +32,7 @@ from sonar_graph.logs.body_frames import body_transforms
 from sonar_graph.logs.landmark_cloud import landmark_cloud
 from sonar_graph.logs.markers import BLUE, GREEN, GREY, ORANGE, PURPLE, Colour, landmark_markers, position_ellipsoids
 from sonar_graph.logs.mountings import encode_mountings
+from sonar_graph.logs.pictures import PICTURES, Picture, picture_messages
 from sonar_graph.logs.recorder import Attachment, Outgoing, write_recording
 from sonar_graph.logs.roles import TF
 from sonar_graph.logs.viewer_layouts import PATH, Layer, Scene, write_layouts
@@ -57,6 +59,7 @@ def write_result(
     estimates: Mapping[str, Estimates],
     about: Mapping[str, str] | None = None,
     attachments: List[Attachment] = (),
+    pictures: List[Picture] = (),
 ) -> None:
     """Write what the estimators said, and the truth where there is one; beside it the layouts of `write_layouts`.
 
@@ -72,6 +75,8 @@ def write_result(
         Settings and versions, for the metadata record ``sonar_graph_result``.
     attachments
         Files to go into it.
+    pictures
+        Sonar images with what was recognised in them.
 
     Raises
     ------
@@ -85,6 +90,7 @@ def write_result(
     messages += _truth(sequence, scene)
     for name, estimate in sources.items():
         messages += _estimator(name, estimate, colours[name], scene)
+    messages += picture_messages(PICTURES, pictures)
     messages += body_transforms("/tf", _bodies(sequence, sources))
     messages = [entry for entry in messages if len(entry.log_times_ns)]
     record = {"sequence": sequence.name, "estimators": ",".join(estimates), "topics": ",".join(sources)}

@@ -20,6 +20,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from sonar_graph.errors import LogError
 from sonar_graph.logs.landmark_cloud import POINT_CLOUD
 from sonar_graph.logs.markers import MARKER_ARRAY, Colour
+from sonar_graph.logs.pictures import COMPRESSED_IMAGE
 from sonar_graph.logs.roles import ODOMETRY, POSE_WITH_COVARIANCE
 from sonar_graph.measurements import Floats
 
@@ -143,7 +144,19 @@ def foxglove_layout(layers: Sequence[Layer], scene: Scene) -> dict[str, Any]:
     view["layers"]["grid"] |= grid
     for panel, (field, endings) in _PLOTS.items():
         panels[panel]["paths"] = [_plotted(layer, field) for layer in layers if layer.topic.endswith(endings)]
+    _show_pictures(layout, [layer.topic for layer in layers if layer.type_name == COMPRESSED_IMAGE])
     return layout
+
+
+def _show_pictures(layout: dict[str, Any], topics: list[str]) -> None:
+    """A panel for the first topic with pictures, over the plots; nothing where there is none."""
+    if not topics:
+        return
+    panel = "Image!pictures"
+    layout["configById"][panel] = {"imageMode": {"imageTopic": topics[0]}}
+    beside = layout["layout"]
+    plots = beside["second"]
+    beside["second"] = {"direction": "column", "splitPercentage": 40, "first": panel, "second": plots}
 
 
 def _drawing_settings(scene: Scene) -> dict[str, Callable[[Layer], dict[str, Any]]]:
@@ -184,5 +197,6 @@ def rviz_config(layers: Sequence[Layer], scene: Scene) -> str:
         "POSE_WITH_COVARIANCE": POSE_WITH_COVARIANCE,
         "ODOMETRY": ODOMETRY,
         "POINT_CLOUD": POINT_CLOUD,
+        "COMPRESSED_IMAGE": COMPRESSED_IMAGE,
     }
     return environment.get_template("rviz.jinja").render(layers=layers, scene=scene, **types)

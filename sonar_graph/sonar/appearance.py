@@ -21,6 +21,9 @@ from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sonar.floor_patch import Patch
 from sonar_graph.sonar.templates import Floats32, Templates
 
+MOST_MULTIPLICATIONS = 250_000
+"""OpenBLAS uses several cores from 262,144 on."""
+
 
 class AppearanceParams(Section):
     """How candidates are compared with designs."""
@@ -33,7 +36,7 @@ class AppearanceParams(Section):
     """Standard deviation of the sonar's resolution on the floor."""
     search_m: float = Field(0.045, ge=0)
     """How far a landmark's centre is sought from the candidate's, along each axis."""
-    least_visible: float = Field(0.6, gt=0, le=1)
+    least_visible: float = Field(0.8, gt=0, le=1)
     """Share of the cells that must lie in the image."""
 
 
@@ -72,8 +75,7 @@ class Appearance:
         self.patch_side = self.templates.side + 2 * self._steps
         self._rows, self._shifts = self._shifted_cells()
         pictures = self.templates.pictures
-        self._sums = np.ascontiguousarray(np.concatenate([pictures, pictures**2]).T)
-        self._pictures = np.ascontiguousarray(pictures.T)
+        self._pictures, self._squares = np.ascontiguousarray(pictures.T), np.ascontiguousarray(pictures.T**2)
 
     def _shifted_cells(self) -> tuple[Ints, Ints]:
         """Places of the templates' cells in a patch at every shift, shape (shifts, cells), and the shifts, (n, 2)."""
@@ -105,12 +107,11 @@ class Appearance:
         count = seen.sum(axis=1)
         mean = (level * seen).sum(axis=1) / np.maximum(count, 1)
         level = (level - mean[:, None]) * seen
-        sums = seen @ self._sums
-        template_sum, template_square = np.split(sums, 2, axis=1)
+        template_sum, template_square = _product(seen, self._pictures), _product(seen, self._squares)
         n = np.maximum(count, 1)[:, None]
         template_variance = template_square - template_sum**2 / n
         level_variance = np.einsum("sc,sc->s", level, level)[:, None]
-        product = level @ self._pictures
+        product = _product(level, self._pictures)
         visible = count / level.shape[1]
         known = (visible[:, None] >= self.params.least_visible) & (template_variance > 0) & (level_variance > 0)
         scale = np.sqrt(np.where(known, template_variance * level_variance, 1.0))
@@ -122,6 +123,12 @@ class Appearance:
         surface = correlation.reshape(side, side)
         x, y = divmod(best, side)
         return np.array([_top(surface[:, y], x), _top(surface[x, :], y)])
+
+
+def _product(rows: Floats32, columns: Floats32) -> Floats32:
+    """The matrix product, in pieces that BLAS takes on one core: for so little, threads that wait cost far more."""
+    step = max(1, MOST_MULTIPLICATIONS // columns.size)
+    return np.concatenate([rows[first : first + step] @ columns for first in range(0, len(rows), step)])
 
 
 def _top(values: Floats32, at: int) -> float:

@@ -29,8 +29,8 @@ class IdentityParams(Section):
     """Belief in "none of them" about a new track."""
     forgetting: float = Field(1e-4, ge=0, lt=1)
     """Share of a belief that returns to that of a new track, a frame."""
-    temper: float = Field(0.5, gt=0, le=1)
-    """Weight of a frame that is all news: what makes a landmark look like another outlasts the speckle."""
+    temper: float = Field(1.0, gt=0, le=1)
+    """Weight of a frame that is all news; below 1 where a landmark's looks are less certain than was measured."""
     least_news: float = Field(0.3, ge=0, lt=1)
     """Frames that are less of a news are left out; what they have adds up until the next counts."""
     aperture_m: float = Field(0.14, gt=0)

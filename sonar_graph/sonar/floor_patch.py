@@ -41,9 +41,12 @@ class PolarGrid:
         Middle of each bin, equally spaced, shape (bins,).
     azimuths_rad
         Of each beam, increasing or decreasing, shape (beams,).
+    elevation_aperture_rad
+        Full vertical opening: what lies outside of it is not in the image, whatever the range.
     """
 
-    def __init__(self, ranges_m: Floats, azimuths_rad: Floats) -> None:
+    def __init__(self, ranges_m: Floats, azimuths_rad: Floats, elevation_aperture_rad: float = math.pi) -> None:
+        self.highest_sine = math.sin(min(elevation_aperture_rad, math.pi) / 2)
         self.first_range_m = float(ranges_m[0])
         self.bin_m = float(ranges_m[-1] - ranges_m[0]) / (len(ranges_m) - 1)
         order = np.argsort(azimuths_rad)
@@ -63,6 +66,7 @@ class PolarGrid:
             self.azimuth_step_rad,
             view.level_R_sonar,
             view.height_m,
+            self.highest_sine,
             centre_m,
             side,
             cell_m,
@@ -80,6 +84,7 @@ def sample_floor(
     azimuth_step_rad: float,
     level_R_sonar: Floats,
     height_m: float,
+    highest_sine: float,
     centre: Floats,
     side: int,
     cell_m: float,
@@ -98,7 +103,10 @@ def sample_floor(
             x, y, z = centre[0] + cell_m * (i - half), centre[1] + cell_m * (j - half), -height_m
             qx = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
             qy = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
+            qz = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
             distance = math.sqrt(x * x + y * y + z * z)
+            if abs(qz) > highest_sine * distance:
+                continue
             place = (math.atan2(qy, qx) - first_azimuth_rad) / azimuth_step_rad
             if not 0 <= place < len(beam_of_azimuth) - 1:
                 continue

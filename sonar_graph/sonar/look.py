@@ -31,6 +31,8 @@ class Sighting:
     azimuth_rad: float
     covariance: Floats
     """Of both, shape (2, 2)."""
+    is_fitted: bool = False
+    """Whether range and azimuth are those of a design's centre, not of the candidate's centroid."""
 
 
 class Look:
@@ -42,10 +44,13 @@ class Look:
         The designs.
     confusion
         The measured model.
+    elevation_aperture_rad
+        Full vertical opening of the sonar.
     """
 
-    def __init__(self, appearance: Appearance, confusion: Confusion) -> None:
+    def __init__(self, appearance: Appearance, confusion: Confusion, elevation_aperture_rad: float) -> None:
         self._appearance, self._confusion = appearance, confusion
+        self._aperture_rad = elevation_aperture_rad
         self._grid: PolarGrid | None = None
         self._shape: tuple[Floats, Floats] | None = None
 
@@ -75,7 +80,7 @@ class Look:
         """The lookup of the frame's beams and bins, made once for all frames that share them."""
         shape = (frame.ranges_m, frame.azimuths_rad)
         if self._grid is None or self._shape is None or not all(map(_is_same, self._shape, shape)):
-            self._grid, self._shape = PolarGrid(*shape), shape
+            self._grid, self._shape = PolarGrid(*shape, self._aperture_rad), shape
         return self._grid
 
     def _one(self, image_db: Floats32, grid: PolarGrid, view: FloorView, candidates: Candidates, row: int) -> Sighting:
@@ -93,7 +98,7 @@ class Look:
             return Sighting(fit, range_m, azimuth_rad, unfitted.covariance)
         model = self._confusion
         sigmas = np.array([model.range_sigma_m, model.azimuth_sigma_rad]) / fit.visible
-        return Sighting(fit, *view.range_azimuth(fit.centre_m), np.diag(sigmas**2))
+        return Sighting(fit, *view.range_azimuth(fit.centre_m), np.diag(sigmas**2), is_fitted=True)
 
 
 def _is_same(one: Floats, other: Floats) -> bool:

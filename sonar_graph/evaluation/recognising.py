@@ -1,0 +1,177 @@
+"""From a log's sonar images to landmark detections.
+
+Images are streamed and never held together; motion, tilt and height come from the sequence's other sensors
+(`sonar_graph.evaluation.sonar_motion`). Detections are computed once for a log and are the same for all estimators.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from sonar_graph.evaluation.fan_picture import Fan, as_jpeg, draw_fan
+from sonar_graph.evaluation.recognition import DrawnFrame, Recognition
+from sonar_graph.evaluation.sonar_motion import SonarMotion, SonarMotions
+from sonar_graph.landmark_designs import LandmarkDesign
+from sonar_graph.logs.adapters.config import LogConfig
+from sonar_graph.logs.sonar_reading import read_sonar_frames
+from sonar_graph.measurements import LandmarkDetections, SonarFrames
+from sonar_graph.sequence import NS_PER_S
+from sonar_graph.sequence import Sequence as Run
+from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar.recogniser import Recogniser, RecogniserParams
+from sonar_graph.sonar.tracking import SonarStep
+
+MOST_PICTURES = 400
+MOST_WARNINGS = 200
+PICTURE_PERIOD_NS = NS_PER_S
+NO_ODOMETRY = "no IMU and Doppler log at its stamp, or out of order"
+
+
+def recognise(
+    log: Path,
+    sequence: Run,
+    *,
+    topic: str | None = None,
+    config: LogConfig | None = None,
+    designs: Sequence[LandmarkDesign] | None = None,
+    params: RecogniserParams | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Recognition | None:
+    """Recognise landmarks in the sonar images of a log.
+
+    Parameters
+    ----------
+    log
+        An MCAP file with sonar images.
+    sequence
+        The rest of the log.
+    topic, config
+        As of `read_sonar_frames`.
+    designs, params
+        As of `Recogniser`.
+    progress
+        Called with the number of frames done.
+
+    Returns
+    -------
+    Recognition | None
+        None where the log has no images.
+
+    Raises
+    ------
+    LogError
+        As `read_sonar_frames`.
+    CalibrationError
+        When designs and measured model do not belong together.
+    """
+    frames = (frame for block in read_sonar_frames(log, topic, config) for frame in one_by_one(block))
+    session = RecognitionSession(sequence, designs, params)
+    for frame in frames:
+        session.take(frame)
+        if progress is not None:
+            progress(session.result.frames)
+    return session.finish() if session.result.frames else None
+
+
+def with_detections(sequence: Run, recognition: Recognition) -> Run:
+    """The sequence with what was recognised; its notes say how."""
+    return replace(sequence, detections=recognition.detections, notes=sequence.notes | recognition.notes)
+
+
+def one_by_one(block: SonarFrames) -> Iterator[SonarFrames]:
+    """Blocks of one frame each."""
+    for row in range(len(block)):
+        yield SonarFrames(
+            block.stamps_ns[row : row + 1], block.intensity[row : row + 1], block.ranges_m, block.azimuths_rad
+        )
+
+
+class RecognitionSession:
+    """Recognises frame by frame and gathers what came of it; what is kept does not grow with the images."""
+
+    def __init__(
+        self,
+        sequence: Run,
+        designs: Sequence[LandmarkDesign] | None = None,
+        params: RecogniserParams | None = None,
+        *,
+        pictures: bool = True,
+    ) -> None:
+        self._draws = pictures
+        self.result = Recognition()
+        self.recogniser = Recogniser(sequence.calibration, designs, params)
+        self.motion: SonarMotion | None = None
+        self._image_scale = sequence.calibration.sonar.image
+        self._motions = SonarMotions(sequence)
+        self._blocks: list[LandmarkDetections] = []
+        self._fan: Fan | None = None
+        self._fan_of: tuple[object, object] = (None, None)
+        self._picture_period_ns = PICTURE_PERIOD_NS
+
+    def take(self, frame: SonarFrames) -> LandmarkDetections | None:
+        """One frame, a block of one."""
+        self.result.frames += 1
+        stamp_ns = int(frame.stamps_ns[0])
+        if not self._motions.covers(stamp_ns):
+            self._warn(stamp_ns, f"frame not used: {NO_ODOMETRY}")
+            return None
+        self.motion = motion = self._motions.at(stamp_ns)
+        found = self.recogniser.process(frame, step_of(motion), view_of(motion))
+        for fate in self.recogniser.fates:
+            if np.isnan(fate.range_m) and fate.track < 0:
+                self._warn(stamp_ns, fate.outcome)
+            else:
+                self.result.outcomes[fate.outcome] += 1
+        if found is not None:
+            self._blocks.append(found)
+        if self._draws:
+            self._draw(frame, found)
+        return found
+
+    def finish(self) -> Recognition:
+        """All that was gathered."""
+        result, model = self.result, self.recogniser.confusion
+        result.detections = LandmarkDetections.concatenate(self._blocks) if self._blocks else None
+        result.notes = {
+            "detections": f"recognised in {result.frames} sonar images",
+            "detections.rule": self.recogniser.params.identity.rule,
+            "detections.designs": ", ".join(f"{d.id}: {d.name}" for d in self.recogniser.designs),
+            "detections.model": "; ".join(f"{k}: {v}" for k, v in model.provenance.items()) or "not said",
+        }
+        return result
+
+    def _warn(self, stamp_ns: int, reason: str) -> None:
+        self.result.outcomes[reason] += 1
+        if len(self.result.warnings) < MOST_WARNINGS:
+            self.result.warnings.append((stamp_ns, reason))
+
+    def _draw(self, frame: SonarFrames, found: LandmarkDetections | None) -> None:
+        """A picture now and then; of too many every second one is given up."""
+        pictures, stamp_ns = self.result.pictures, int(frame.stamps_ns[0])
+        if pictures and stamp_ns - pictures[-1].stamp_ns < self._picture_period_ns:
+            return
+        if self._fan is None or self._fan_of != (id(frame.ranges_m), id(frame.azimuths_rad)):
+            self._fan = Fan.of(frame.ranges_m, frame.azimuths_rad)
+            self._fan_of = (id(frame.ranges_m), id(frame.azimuths_rad))
+        ids, probabilities = found.most_probable() if found is not None else (np.empty(0, int), np.empty(0))
+        picture = draw_fan(self._image_scale.decibels(frame.intensity[0]), self._fan, found)
+        pictures.append(DrawnFrame(stamp_ns, as_jpeg(picture), tuple(ids.tolist()), tuple(probabilities.tolist())))
+        if len(pictures) > MOST_PICTURES:
+            del pictures[1::2]
+            self._picture_period_ns *= 2
+
+
+def step_of(motion: SonarMotion) -> SonarStep | None:
+    """The motion since the frame before, as the tracker wants it."""
+    return None if motion.previous_T_sonar is None else SonarStep(motion.previous_T_sonar, motion.covariance)
+
+
+def view_of(motion: SonarMotion) -> FloorView | None:
+    """The floor, where the height over it is known."""
+    if motion.height_m is None or motion.height_m <= 0:
+        return None
+    return FloorView(motion.level_R_sonar, motion.height_m, motion.height_sigma_m, motion.tilt_sigma_rad)
