@@ -141,6 +141,7 @@ def test_help_of_a_group_ends_in_examples(group: str, capsys: pytest.CaptureFixt
 def test_help_names_defaults_presets_and_roles_as_they_are() -> None:
     from sonar_graph.logs.roles import ROLES
     from sonar_graph.simulation.basin import BasinOptions
+    from sonar_graph.simulation.image_options import ImageOptions
     from sonar_graph.simulation.presets import DVL_PRESETS, IMU_PRESETS
 
     options = BasinOptions()
@@ -150,6 +151,9 @@ def test_help_names_defaults_presets_and_roles_as_they_are() -> None:
     for name, presets in (("imu", IMU_PRESETS), ("dvl", DVL_PRESETS)):
         assert f"{getattr(options, name)} (default)" in helps[name]
         assert all(preset in helps[name] for preset in presets)
+    said = set(re.findall(r"[a-z_]+", helps["settings"].partition("repeated: ")[2]))
+    others = BasinOptions.model_fields.keys() - {"seed", "imu", "dvl", "duration_s", "laps", "image"}
+    assert said - {"and", "with", "images", "image"} == others | ImageOptions.model_fields.keys()
     topic = next(option.help for option in commands()["compare",].params if option.name == "topics")
     assert topic.endswith(f" Roles: {', '.join(ROLES)}.")
 
@@ -169,6 +173,8 @@ MISTAKES = {
     "output log with another ending": (["simulate", "basin", "-o", "basin.bag"], "ends in .mcap"),
     "unknown estimator": (["compare", "LOG", "-o", "OUT", "--estimators", "isam3"], "no estimator is called 'isam3'"),
     "no estimator": (["compare", "LOG", "-o", "OUT", "--estimators", ","], "expected names such as"),
+    "estimator without name": (["compare", "LOG", "-o", "OUT", "--estimators", "isam2,,mine"], "a name is empty"),
+    "estimator twice": (["compare", "LOG", "-o", "OUT", "--estimators", "isam2,isam2"], "isam2 is named twice"),
     "rate of zero": (["compare", "LOG", "-o", "OUT", "--rate-hz", "0"], "--rate-hz"),
     "rate without end": (["compare", "LOG", "-o", "OUT", "--rate-hz", "inf"], "--rate-hz"),
     "rate of no number": (["compare", "LOG", "-o", "OUT", "--rate-hz", "nan"], "--rate-hz"),
@@ -179,7 +185,10 @@ MISTAKES = {
     ),
     "rate too low": (["run", "LOG", "-o", "OUT", "--estimator", "dead-reckoning", "--rate-hz", "0.001"], "too short"),
     "setting without value": (["run", "LOG", "-o", "OUT", "--set", "isam2.lag_s"], "expected name=value"),
-    "setting of another": (["run", "LOG", "-o", "OUT", "--set", "ekf-slam.x=1"], "expected ESTIMATOR.setting=value"),
+    "setting of another": (
+        ["run", "LOG", "-o", "OUT", "--set", "ekf-slam.x=1"],
+        "ekf-slam is not among the estimators",
+    ),
     "setting without name": (["run", "LOG", "-o", "OUT", "--set", "isam2.=1"], "expected ESTIMATOR.setting=value"),
     "unknown setting": (["run", "LOG", "-o", "OUT", "--set", "isam2.nonsense=1"], "nonsense"),
     "topic without role": (["run", "LOG", "-o", "OUT", "--topic", "/imu/data"], "expected ROLE=TOPIC"),
@@ -394,7 +403,7 @@ def test_settings_go_to_their_estimator_at_any_depth() -> None:
 
 
 def test_setting_of_an_estimator_that_does_not_run_is_refused() -> None:
-    with pytest.raises(EstimatorError, match="one of isam2, mine"):
+    with pytest.raises(EstimatorError, match="other is not among the estimators that run: isam2, mine"):
         estimator_settings(["other.gain=1"], ["isam2", "mine"])
 
 

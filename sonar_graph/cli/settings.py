@@ -69,7 +69,9 @@ def estimator_settings(texts: list[str], names: list[str]) -> dict[str, dict[str
     for text in texts:
         path, value = parse_setting(text)
         estimator, dot, setting = path.partition(".")
-        if not dot or estimator not in names or not all(setting.split(".")):
+        if dot and estimator not in names:
+            raise EstimatorError(f"--set {text}: {estimator} is not among the estimators that run: {', '.join(names)}")
+        if not dot or not all(setting.split(".")):
             raise EstimatorError(f"--set {text}: expected ESTIMATOR.setting=value with one of {', '.join(names)}")
         _put(settings.setdefault(estimator, {}), setting.split("."), value)
     return settings

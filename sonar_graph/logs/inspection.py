@@ -234,7 +234,10 @@ def _calibration(recording: Recording) -> str:
     if frames:
         names = ", ".join(list(frames)[:_FRAMES_NAMED]) + (", ..." if len(frames) > _FRAMES_NAMED else "")
         return f"none in the log; defaults with the mountings of /tf_static ({names})"
-    return "none in the log and no /tf_static; defaults"
+    return (
+        "none in the log and no /tf_static; defaults, with every sensor at base_link: sonar_graph/calibration.py lists "
+        "them with units, comparison.json with the results, and --calibration FILE gives others"
+    )
 
 
 def _notes(recording: Recording, damage: list[str]) -> dict[str, str]:

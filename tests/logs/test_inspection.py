@@ -43,6 +43,7 @@ def test_roles_are_explained_whether_filled_or_not(bench: Any) -> None:
     assert role(summary, "truth")[0] is None
     assert "/odom only if chosen: --topic truth=/odom" in role(summary, "truth")[1]
     assert summary.calibration.startswith("none in the log and no /tf_static")
+    assert "sonar_graph/calibration.py lists them" in summary.calibration
 
 
 def test_the_roles_are_those_that_reading_uses(make_sequence: Any, tmp_path: Path) -> None:
