@@ -155,6 +155,17 @@ def test_mrclam_names_its_figures(recordings: Path) -> None:
     assert {"ekf_causal_ate_m", "landmark_error_m", "passed"} <= set(found)
 
 
+@pytest.mark.recording
+def test_real_frames_names_its_figures(recordings: Path, tmp_path: Path) -> None:
+    figure = tmp_path / "curve.png"
+    arguments = ("--data", str(recordings), "--workers", "1", "--figure", str(figure))
+    found = figures("validation/real_frames.py", *arguments)
+    assert found["frames"] == 15
+    assert {"ours", "soca", "soca_power", "actag", "ahead", "passed"} <= set(found)
+    assert max(found["ours"]) > 0.8
+    assert figure.stat().st_size > 10_000
+
+
 def test_every_script_is_listed() -> None:
     listed = (BENCHMARKS / "README.md").read_text(encoding="utf-8")
     for folder in ("performance", "validation"):

@@ -11,8 +11,8 @@ same polar image (128 beams, one bin a pixel). Lengths are in pixels, counted as
 * ``actag``: AcTag's median filter (radius 4) and threshold at the middle between the smallest and largest of a
   neighbourhood (radius 8) minus an offset of 1; the offset is swept.
 
-``...-strongest`` keeps a detector's threshold (ours as it comes, the others' best) and sweeps how many regions are kept,
-those with the largest product of level and area first.
+``...-strongest`` keeps a detector's threshold (ours as it comes, the others' best) and sweeps how many regions are
+kept, those with the largest product of level and area first.
 
 What a detector marks becomes regions in the same way for all: gaps closed, connected, gated by area. A box is found
 when a region has its centroid in it and a bounding box that overlaps it (intersection over union) by at least 0.2.

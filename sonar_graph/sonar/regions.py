@@ -2,7 +2,8 @@
 
 A pixel of ``dr`` by ``da`` covers, in the slant plane, ``r dr da``. On the floor its points are at the horizontal
 distance ``g = sqrt(r^2 - h^2)``, so that ``dg = (r / g) dr``, and a step da moves them along a circle by
-``|dq/da + dq/de de/da| da`` with ``de/da = -(u . dq/da) / (u . dq/de)``, u the upward direction in the sonar frame.
+``|dq/da + dq/de de/da| da`` with ``de/da = -(u . dq/da) / (u . dq/de)``, u the upward direction in the sonar frame. The
+two derivatives are perpendicular, of lengths ``r cos e`` and r.
 Centroids and second moments are taken over these areas.
 """
 
@@ -110,9 +111,9 @@ def _floor_cell(
     if not g2 > 0 or not math.isfinite(cos_e):
         return 0.0, 0.0, 0.0
     qx, qy, qz = r * cos_e * cos_a, r * cos_e * sin_a, r * sin_e
-    by_e = (-r * sin_e * cos_a, -r * sin_e * sin_a, r * cos_e)
-    ratio = -(up[1] * qx - up[0] * qy) / (up[0] * by_e[0] + up[1] * by_e[1] + up[2] * by_e[2])
-    step = math.sqrt((-qy + ratio * by_e[0]) ** 2 + (qx + ratio * by_e[1]) ** 2 + (ratio * by_e[2]) ** 2)
+    by_elevation = r * (up[2] * cos_e - sin_e * (up[0] * cos_a + up[1] * sin_a))
+    ratio = (up[1] * qx - up[0] * qy) / by_elevation
+    step = r * math.sqrt(cos_e * cos_e + ratio * ratio)
     x = level_R_sonar[0, 0] * qx + level_R_sonar[0, 1] * qy + level_R_sonar[0, 2] * qz
     y = level_R_sonar[1, 0] * qx + level_R_sonar[1, 1] * qy + level_R_sonar[1, 2] * qz
     return x, y, step * r / math.sqrt(g2)

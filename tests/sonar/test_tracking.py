@@ -123,6 +123,9 @@ def test_a_skipped_frame_moves_the_tracks_too():
     found = tracker.step(candidates, step, 3 * FRAME_NS)
     assert found.track_ids.tolist() == [0]
     assert found.position_m[0] == pytest.approx(twice, abs=1e-6)
+    # The skipped motion counts once.
+    later = tracker.step(candidates, STILL, 4 * FRAME_NS)
+    assert later.position_m[0] == pytest.approx(twice, abs=1e-6)
 
 
 def test_steps_join_as_samples_of_them_do():
@@ -176,6 +179,13 @@ def test_innovations_wrap_behind_the_sonar():
     tracks = Tracks(np.array([0]), np.array([[-2.0, 1e-3, 0.0]]), np.eye(3)[None], np.array([0.5]), np.array([1]))
     innovation = Expected.of(tracks, np.eye(2)).innovations(np.array([[2.0, -np.pi + 5e-4]]))
     assert innovation[0, 0] == pytest.approx([0.0, 1e-3], abs=1e-6)
+
+
+def test_a_track_on_the_edge_is_missed_with_half_the_probability():
+    tracker = Tracker(TrackingParams(lifetime_s=1e12))
+    before = run(tracker, [[(1.26, 0.0)]] * 3)[-1].existence[0]
+    found = tracker.step(candidates_at([], []), STILL, 4 * FRAME_NS)
+    assert found.existence[0] == pytest.approx(before * 0.55 / (1 - before + before * 0.55), rel=1e-4)
 
 
 def test_what_leaves_the_image_ends_and_is_not_held_against_it():
