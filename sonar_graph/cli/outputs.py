@@ -45,6 +45,32 @@ def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = Fa
     return path
 
 
+def writable_json(path: Path, sources: Iterable[Path]) -> Path:
+    """``path``, with its folder made, once it is known that a JSON file can be written there.
+
+    Parameters
+    ----------
+    path
+        Of the file.
+    sources
+        Files that it is made from; never overwritten.
+
+    Raises
+    ------
+    EvaluationError
+        When it is a folder, is not called ``*.json``, is a source, or its folder cannot be written to.
+    """
+    if path.is_dir() or path.suffix != ".json":
+        raise EvaluationError(f"{path}: expected the name of a file that ends in .json")
+    if any(_is_part_of(path, source) for source in sources):
+        raise EvaluationError(f"{path}: is what is read, and would be overwritten; choose another name with -o")
+    try:
+        _try_writing_in(path.parent)
+    except OSError as error:
+        raise EvaluationError(f"{path}: cannot be written: {error.strerror}; choose another place with -o") from error
+    return path
+
+
 def writable_folder(path: Path, sources: Iterable[Path | None] = ()) -> Path:
     """``path``, made where it did not exist, once it is known that a comparison can be written there.
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sonar_graph.cli.arguments import CalibrationPath, LogConfigPath, LogPath, OutputLog, TopicChoices
-from sonar_graph.cli.outputs import writable_log
+from sonar_graph.cli.arguments import CalibrationPath, LogConfigPath, LogPath, OutputLog, Overwrite, TopicChoices
+from sonar_graph.cli.outputs import writable_json, writable_log
 from sonar_graph.cli.progress import progress_bars, working
 from sonar_graph.cli.settings import read_calibration, read_config, topic_choices
 from sonar_graph.cli.texts import answers
@@ -56,12 +56,13 @@ def recognise(
     calibration: CalibrationPath = None,
     topics: TopicChoices = None,
     log_config: LogConfigPath = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Recognise landmarks in a log's sonar images; write the log anew with the detections in it."""
     from sonar_graph.logs.amending import write_amended
     from sonar_graph.logs.encoding import detection_messages
 
-    path = writable_log(output)
+    path = writable_log(output, log, overwrite=overwrite)
     choices, config = topic_choices(topics or []), read_config(log_config)
     sequence = _read(log, calibration, {r: t for r, t in choices.items() if r != "sonar"}, log_config)
     from sonar_graph.evaluation.recognising import recognise as recognise_log
@@ -96,13 +97,14 @@ def calibrate(
     """Measure how often landmarks look like which, on logs with sonar images whose truth is known."""
     from sonar_graph.evaluation.calibrating import calibrate as measure
 
+    path = writable_json(output, logs)
     choices = topic_choices(topics or [])
     others = {role: topic for role, topic in choices.items() if role != "sonar"}
     with working("calibrating"):
         runs = [(log, _read(log, None, others, log_config)) for log in logs]
         measured = measure(runs, topic=choices.get("sonar"), config=read_config(log_config), designs=_designs(designs))
-    output.write_text(measured.model_dump_json(indent=2) + "\n", encoding="utf-8")
-    typer.echo(f"Model: {output}")
+    path.write_text(measured.model_dump_json(indent=2) + "\n", encoding="utf-8")
+    typer.echo(f"Model: {path}")
 
 
 def recogniser_params(model: Path | None, rule: str) -> RecogniserParams:

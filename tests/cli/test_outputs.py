@@ -1,8 +1,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.writer import Writer
@@ -139,3 +140,53 @@ def test_a_link_to_nowhere_is_no_obstacle(run: Run, tmp_path: Path) -> None:
     (tmp_path / "log.mcap").symlink_to(tmp_path / "missing.mcap")
     assert run("convert", "victoria-park", "-o", tmp_path / "log.mcap") == 0
     assert (tmp_path / "log.mcap").stat().st_size > 0
+
+
+@pytest.mark.parametrize("command", [("recognise",), ("simulate", "landmarks", "--on")], ids=" ".join)
+def test_a_log_made_from_a_log_never_replaces_it(
+    command: tuple[str, ...], basin: Path, run: Run, tmp_path: Path
+) -> None:
+    before = basin.read_bytes()
+    for output in (basin, *links(basin, tmp_path)):
+        assert run(*command, basin, "-o", output, "--overwrite") == 2
+        assert basin.read_bytes() == before
+
+
+def test_a_model_never_replaces_a_log(
+    basin: Path, run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = basin.read_bytes()
+    assert run("calibrate", basin, "-o", basin) == 2
+    assert "ends in .json" in capsys.readouterr().err
+    link = tmp_path / "log.json"
+    link.hardlink_to(basin)
+    assert run("calibrate", basin, "-o", link) == 2
+    assert "is what is read" in capsys.readouterr().err
+    assert basin.read_bytes() == before
+
+
+def test_every_command_that_writes_a_log_from_a_file_is_tried_here() -> None:
+    """A command that joins later must not be forgotten."""
+    import typer.main
+
+    from sonar_graph.cli import app
+
+    def commands(group: Any) -> Iterator[Any]:
+        for command in group.commands.values():
+            yield from commands(command) if hasattr(command, "commands") else [command]
+
+    writing = {c.name for c in commands(typer.main.get_command(app)) if any(p.name == "output" for p in c.params)}
+    of_folders, of_nothing = {"mrclam", "dlr", "akit"}, {"basin", "demo"}
+    tried = {
+        "rosbag",
+        "didson",
+        "aris",
+        "oculus",
+        "victoria-park",
+        "compare",
+        "run",
+        "recognise",
+        "landmarks",
+        "calibrate",
+    }
+    assert writing == tried | of_folders | of_nothing
