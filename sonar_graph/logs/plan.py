@@ -12,6 +12,7 @@ type without fields is one byte.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -52,16 +53,16 @@ class Walk:
         return at + LENGTH_BYTES, count
 
 
-class Step:
+class Step(ABC):
     """A part of a message type."""
 
     def __init__(self, index: int, path: str) -> None:
         self.index = index
         self.path = path
 
+    @abstractmethod
     def take(self, at: int, walk: Walk) -> int:
         """Note where the part after byte ``at`` lies; the byte after it."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
