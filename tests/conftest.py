@@ -6,9 +6,15 @@ import os
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+if TYPE_CHECKING:
+    from sonar_graph.evaluation.recognition import Recognition
+
+    from .imaged_lane import Lane
 
 os.environ["MPLBACKEND"] = "Agg"
 
@@ -43,3 +49,28 @@ def unpacked(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Call
         return folders[name]
 
     return unpack
+
+
+@pytest.fixture(scope="session")
+def lane() -> Lane:
+    """A short run along all four landmarks, a stone and a rough patch, with images; simulated once a session."""
+    from .imaged_lane import lane_run
+
+    return lane_run(1)
+
+
+@pytest.fixture(scope="session")
+def lane_log(lane: Lane, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same as a log; not to be written to."""
+    return lane.write(tmp_path_factory.mktemp("lane") / "lane.mcap")
+
+
+@pytest.fixture(scope="session")
+def lane_recognition(lane: Lane) -> Recognition:
+    """What is recognised in its images."""
+    from sonar_graph.evaluation.recognising import RecognitionSession, one_by_one
+
+    session = RecognitionSession(lane.sequence)
+    for frame in one_by_one(lane.frames):
+        session.take(frame)
+    return session.finish()

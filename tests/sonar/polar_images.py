@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from sonar_graph.landmark_designs import LandmarkDesign
@@ -20,6 +22,12 @@ def level_R_sonar(pitch_rad: float = np.radians(30), roll_rad: float = 0.0) -> n
 
 def floor_points(rotation: np.ndarray, height_m: float = HEIGHT_M) -> tuple[np.ndarray, np.ndarray]:
     """Level floor point (beams, bins, 2) of every pixel, by a search over elevation, and where there is one."""
+    return _searched(tuple(rotation.ravel().tolist()), height_m)
+
+
+@cache
+def _searched(numbers: tuple[float, ...], height_m: float) -> tuple[np.ndarray, np.ndarray]:
+    rotation = np.reshape(numbers, (3, 3))
     elevation = np.radians(np.linspace(-9, 9, 721))
     xy = np.full((96, 512, 2), np.nan)
     for beam, azimuth in enumerate(AZIMUTHS_RAD):

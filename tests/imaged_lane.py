@@ -1,0 +1,92 @@
+"""A lane with all four landmarks, a stone and a rough patch, driven along once with an imaging sonar.
+
+It holds in half a minute what a lap of the basin holds in two: for tests that need images.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from sonar_graph.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.logs.sonar_encoding import sonar_image_messages
+from sonar_graph.logs.writing import write_sequence
+from sonar_graph.measurements import SonarFrames
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.basin import BODY_Z_M, FLOOR_Z_M, YSHARK
+from sonar_graph.simulation.image_options import ImageOptions
+from sonar_graph.simulation.imaging import FrameTruth, image_along
+from sonar_graph.simulation.options import SimulationOptions
+from sonar_graph.simulation.recording import Streams, frame_stamps, record
+from sonar_graph.simulation.route import drive, follow
+from sonar_graph.simulation.seabed import place_landmark, scattered_objects
+from sonar_graph.simulation.sonar_image import FrameSimulator
+from sonar_graph.simulation.vehicle import VehiclePath, smooth_noise
+from sonar_graph.simulation.world import World, world_on_floor
+
+LANDMARKS_XY_M = np.array([[2.4, 0.05], [4.0, -0.12], [5.6, 0.1], [6.4, -0.08]])
+OTHERS_M = np.array([[3.2, 0.1, FLOOR_Z_M], [4.8, -0.1, FLOOR_Z_M]])
+"""A stone and a rough patch as large and as bright as a landmark."""
+LENGTH_M, SPEED_M_S, RAMP_S = 5.2, 0.2, 2.0
+TOPIC = "/sonar/image"
+
+
+@dataclass(frozen=True, eq=False)
+class Lane:
+    """The sensors of the run, its images, and what is in them."""
+
+    sequence: Sequence
+    """Without detections."""
+    frames: SonarFrames
+    truth: list[FrameTruth]
+    """One a frame."""
+    path: VehiclePath
+
+    def write(self, log: Path, *more: SonarFrames) -> Path:
+        """As a log, with further images after those of the run."""
+        blocks = (self.frames, *more)
+        messages = (sonar_image_messages(TOPIC, b, frequency_hz=1.8e6, sound_speed_m_s=1480) for b in blocks)
+        write_sequence(log, self.sequence, messages)
+        return log
+
+    def one(self, row: int) -> SonarFrames:
+        """A block of one frame."""
+        frames = self.frames
+        return SonarFrames(
+            frames.stamps_ns[row : row + 1], frames.intensity[row : row + 1], frames.ranges_m, frames.azimuths_rad
+        )
+
+
+def lane_path(rng: np.random.Generator) -> VehiclePath:
+    """Straight ahead, swaying by centimetres and degrees."""
+    piece = drive((0.0, 0.0, 0.0), LENGTH_M, SPEED_M_S, RAMP_S)
+    seconds = np.linspace(0, piece.duration_s, round(2 * piece.duration_s) + 1)
+    x, y, yaw = follow((0.0, 0.0, 0.0), [piece], seconds).T
+    level = np.zeros_like(seconds)
+    sway = smooth_noise(seconds, np.array([0.03, 0.06, 0.02, *np.radians([2.0, 2.0, 3.0])]), 4.0, 6, rng)
+    return VehiclePath.through(seconds, np.column_stack([x, y, level + BODY_Z_M, level, level, yaw]) + sway)
+
+
+def lane_run(seed: int, image: ImageOptions | None = None, rate_hz: float = 5.0) -> Lane:
+    """The run of a seed."""
+    options, image = SimulationOptions(seed=seed, frame_rate_hz=rate_hz), image or ImageOptions()
+    streams = Streams.of(seed)
+    world = world_on_floor(LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, streams.world)
+    path = lane_path(streams.path)
+    sequence = replace(record("lane", options, YSHARK, path, world, streams, {"ours": "a lane"}), detections=None)
+    simulator = FrameSimulator(image, _objects(world, streams.seabed), FLOOR_Z_M, seed)
+    blocks = list(image_along(path, YSHARK.sonar, frame_stamps(rate_hz, path.duration_s), simulator, 1))
+    return Lane(sequence, _joined([block.frames for block in blocks]), [block.truth for block in blocks], path)
+
+
+def _objects(world: World, rng: np.random.Generator) -> list:
+    yaw_rad = rng.uniform(-np.pi, np.pi, len(DEFAULT_DESIGNS))
+    placed = zip(DEFAULT_DESIGNS, world.landmark_positions, yaw_rad, strict=True)
+    return [place_landmark(*each, FLOOR_Z_M) for each in placed] + scattered_objects(OTHERS_M, 1, rng)
+
+
+def _joined(blocks: list[SonarFrames]) -> SonarFrames:
+    columns = (np.concatenate([getattr(b, name) for b in blocks]) for name in ("stamps_ns", "intensity"))
+    return SonarFrames(*columns, blocks[0].ranges_m, blocks[0].azimuths_rad)

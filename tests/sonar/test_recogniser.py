@@ -1,0 +1,264 @@
+from __future__ import annotations
+
+from collections import Counter
+from functools import cache
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
+from sonar_graph.errors import CalibrationError
+from sonar_graph.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.measurements import SonarFrames
+from sonar_graph.sonar.beliefs import IdentityParams
+from sonar_graph.sonar.confusion import confusion_for
+from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar.recogniser import REPORTED, Recogniser, RecogniserParams, each_once
+from sonar_graph.sonar.tracks import SonarStep
+
+from .polar_images import AZIMUTHS_RAD, HEIGHT_M, RANGES_M, image_db, level_R_sonar
+
+DECIBELS = Calibration(sonar=SonarCalibration(image=SonarImage(decibel_span=80.0, full_scale=80.0)))
+ROTATION = level_R_sonar()
+VIEW = FloorView(ROTATION, HEIGHT_M)
+FRAME_NS = 200_000_000
+DISC, SQUARE, TRIANGLE, CROSS = range(4)
+COVARIANCE = np.diag([1e-8] * 3 + [1e-8] * 3)
+
+
+@cache
+def picture(design: int | None, x_m: float, y_m: float, heading_rad: float, seed: int) -> np.ndarray:
+    known = None if design is None else DEFAULT_DESIGNS[design]
+    return image_db(known, (x_m, y_m), heading_rad, ROTATION, np.random.default_rng(seed))
+
+
+def frame(number: int, image: np.ndarray) -> SonarFrames:
+    return SonarFrames(np.array([number * FRAME_NS]), image[None], RANGES_M, AZIMUTHS_RAD)
+
+
+def aside(metres: float) -> SonarStep:
+    """To the left, level: in the axes of a sonar that is tilted about its y axis, along y."""
+    return SonarStep(gtsam.Pose3(gtsam.Rot3(), np.array([0.0, metres, 0.0])), COVARIANCE)
+
+
+def pass_by(recogniser: Recogniser, design: int | None, frames: int = 9, step_m: float = 0.05) -> list:
+    """Detections of frames in which the sonar moves to the left past something straight ahead."""
+    found = []
+    for k in range(frames):
+        y_m = round((frames // 2 - k) * step_m, 6)
+        motion = None if k == 0 else aside(step_m)
+        found.append(recogniser.process(frame(k, picture(design, 1.7, y_m, 0.4, k)), motion, VIEW))
+    return found
+
+
+@pytest.mark.parametrize("design", [DISC, SQUARE, TRIANGLE, CROSS])
+def test_a_landmark_passed_by_is_named_and_lies_where_geometry_says(design: int):
+    last = pass_by(Recogniser(DECIBELS), design)[-1]
+    assert last.candidate_ids.tolist() == [[1, 2, 3, 4]]
+    ids, probability = last.most_probable()
+    assert ids.tolist() == [design + 1]
+    assert probability[0] > 0.9
+    assert last.id_probability.sum() <= 1 + 1e-12
+    r, a = VIEW.range_azimuth(np.array([1.7, -0.2]))
+    errors = np.array([last.range_m[0] - r, last.azimuth_rad[0] - a])
+    assert errors @ np.linalg.solve(last.range_azimuth_cov[0], errors) < 13.8  # 0.999 of chi2 with two degrees
+    assert np.abs(errors) == pytest.approx([0, 0], abs=0.015)
+    assert last.stamps_ns.tolist() == [8 * FRAME_NS]
+
+
+def test_bare_floor_is_no_landmark():
+    assert pass_by(Recogniser(DECIBELS), None) == [None] * 9
+
+
+def test_nothing_is_reported_before_enough_frames_and_the_reason_is_said():
+    recogniser = Recogniser(DECIBELS, params=RecogniserParams(least_frames=4))
+    outcomes = []
+    for k in range(5):
+        found = recogniser.process(frame(k, picture(SQUARE, 1.7, 0.0, 0.4, k)), None if k == 0 else aside(0.0), VIEW)
+        outcomes.append([fate.outcome for fate in recogniser.fates if fate.track >= 0])
+        assert (found is None) is (k < 3)
+    assert outcomes == [["not reported: seen in fewer than 4 frames"]] * 3 + [[REPORTED]] * 2
+
+
+def test_a_track_that_hardly_exists_is_not_reported():
+    recogniser = Recogniser(DECIBELS, params=RecogniserParams(least_frames=1, least_existence=0.5))
+    assert recogniser.process(frame(0, picture(SQUARE, 1.7, 0.0, 0.4, 0)), None, VIEW) is None
+    assert [f.outcome for f in recogniser.fates if f.track >= 0] == ["not reported: exists with less than 0.5"]
+    assert recogniser.process(frame(1, picture(SQUARE, 1.7, 0.0, 0.4, 1)), aside(0.0), VIEW) is not None
+
+
+def test_nothing_that_stands_out_disappears_without_a_row(monkeypatch: pytest.MonkeyPatch):
+    import sonar_graph.sonar.recogniser as module
+
+    seen = []
+    select = module.select_candidates
+    monkeypatch.setattr(module, "select_candidates", lambda *a, **k: seen.append(select(*a, **k)) or seen[-1])
+    recogniser = Recogniser(DECIBELS)
+    for k in range(4):
+        recogniser.process(frame(k, picture(CROSS, 1.7, 0.0, 0.4, k)), None if k == 0 else aside(0.0), VIEW)
+        fates = [f for f in recogniser.fates if np.isfinite(f.range_m)]
+        assert len(fates) == len(seen[-1]) > 1
+        assert sum(f.track >= 0 for f in fates) == len(seen[-1].accepted)
+        assert {f.stamp_ns for f in recogniser.fates} == {k * FRAME_NS}
+        words = Counter(f.outcome for f in fates if f.track < 0)
+        assert words["candidate rejected: too small"] == np.sum(seen[-1].verdicts == 3)
+
+
+def test_the_end_of_a_track_has_a_row():
+    recogniser = Recogniser(DECIBELS)
+    pass_by(recogniser, DISC, 4, 0.0)
+    ended = []
+    for k in range(4, 20):
+        recogniser.process(frame(k, picture(None, 1.7, 0.0, 0.4, k)), aside(0.0), VIEW)
+        ended += [f for f in recogniser.fates if f.outcome.startswith("track ended")]
+    assert next((f.track, f.outcome) for f in ended) == (0, "track ended: exists with less than 0.01")
+
+
+BAD = {
+    "not finite": np.full((96, 512), np.nan, np.float32),
+    "zero": np.zeros((96, 512), np.float32),
+    "saturated": np.full((96, 512), 80.0, np.float32),
+}
+
+
+@pytest.mark.parametrize("reason", [*BAD, "wrong size", "duplicated", "out of order"])
+def test_a_bad_frame_is_named_and_the_others_are_as_without_it(reason: str):
+    """The motion over it is handed in all the same, and counts once."""
+    good, bad = Recogniser(DECIBELS), Recogniser(DECIBELS)
+    for k in range(5):
+        good.process(frame(k, picture(SQUARE, 1.7, 0.2 - 0.05 * k, 0.4, k)), None if k == 0 else aside(0.05), VIEW)
+        bad.process(frame(k, picture(SQUARE, 1.7, 0.2 - 0.05 * k, 0.4, k)), None if k == 0 else aside(0.05), VIEW)
+    image = BAD.get(reason, picture(CROSS, 1.6, 0.1, 0.4, 77))
+    stamp_ns = {"duplicated": 4 * FRAME_NS, "out of order": 3 * FRAME_NS}.get(reason, 5 * FRAME_NS)
+    ranges_m = RANGES_M
+    if reason == "wrong size":
+        image, ranges_m = image[:, :500], RANGES_M[:500]
+    faulty = SonarFrames(np.array([stamp_ns]), image[None], ranges_m, AZIMUTHS_RAD)
+    assert bad.process(faulty, aside(0.02), VIEW) is None
+    (fate,) = bad.fates
+    assert fate.outcome.startswith("frame not used: ")
+    assert reason in fate.outcome
+    assert (fate.stamp_ns, fate.track) == (stamp_ns, -1)
+    assert np.isnan([fate.range_m, fate.azimuth_rad]).all()
+    assert bad.sightings == []
+    last = frame(6, picture(SQUARE, 1.7, -0.05, 0.4, 6))
+    expected, found = good.process(last, aside(0.05), VIEW), bad.process(last, aside(0.03), VIEW)
+    np.testing.assert_allclose(found.range_m, expected.range_m)
+    np.testing.assert_allclose(found.id_probability, expected.id_probability, atol=1e-6)
+    assert [f.track for f in bad.fates if f.track >= 0] == [f.track for f in good.fates if f.track >= 0]
+
+
+def test_more_frames_from_one_place_make_no_landmark_surer_and_the_papers_rule_counts_them():
+    ours, papers = (
+        [float(found.id_probability[0, SQUARE]) for found in _resting(rule) if found is not None]
+        for rule in ("virtual-evidence", "jeffrey")
+    )
+    assert (np.diff(ours) <= 0).all()
+    assert (np.diff(papers) > 0).all()
+    assert papers[-1] > ours[-1] + 0.05
+
+
+def _resting(rule: str) -> list:
+    params = RecogniserParams(identity=IdentityParams.model_validate({"rule": rule}))
+    return pass_by(Recogniser(DECIBELS, params=params), SQUARE, 8, 0.0)
+
+
+def _belief_after(steps: list[SonarStep], xy_m: list[tuple[float, float]]) -> float:
+    """Belief in the square after frames along these steps."""
+    recogniser = Recogniser(DECIBELS, params=RecogniserParams(least_frames=1, least_existence=0.0))
+    found = None
+    for k, (step, xy) in enumerate(zip([None, *steps], xy_m, strict=True)):
+        found = recogniser.process(frame(k, picture(SQUARE, *xy, 0.4, 5)), step, VIEW)
+    return float(found.id_probability[0, SQUARE])
+
+
+def test_turning_on_the_spot_is_no_news_and_moving_across_is():
+    """The same pictures every time, so that only the motion differs; the vertical is tilted in the sonar's axes."""
+    up = ROTATION.T @ [0.0, 0.0, 1.0]
+    turned = SonarStep(gtsam.Pose3(gtsam.Rot3.AxisAngle(up, 0.03), np.zeros(3)), COVARIANCE)
+    spots = [(1.7 * np.cos(0.03 * k), round(-1.7 * np.sin(0.03 * k), 6)) for k in range(4)]
+    turning = _belief_after([turned] * 3, spots)
+    once = _belief_after([], spots[:1])
+    across = _belief_after([aside(0.05)] * 3, [(1.7, round(-0.05 * k, 6)) for k in range(4)])
+    assert once - 0.1 < turning <= once < across - 0.05
+
+
+def test_what_is_across_turns_with_the_sonar():
+    """After a quarter turn, motion along the old centre beam is motion to the side."""
+    recogniser = Recogniser(DECIBELS)
+    quarter = SonarStep(gtsam.Pose3(gtsam.Rot3.Rz(np.pi / 2), np.zeros(3)), COVARIANCE)
+    recogniser.process(frame(0, picture(SQUARE, 1.7, 0.0, 0.4, 0)), None, VIEW)
+    recogniser.process(frame(1, picture(SQUARE, 1.7, 0.0, 0.4, 1)), quarter, VIEW)
+
+    class OneTrack:
+        position_m = np.array([[2.0, 0.0, 0.0]])
+
+    np.testing.assert_allclose(recogniser._sideways(OneTrack()), [[-1.0, 0.0, 0.0]], atol=1e-12)
+
+
+def test_linear_samples_give_what_decibels_give():
+    linear = Calibration(sonar=SonarCalibration(image=SonarImage(scale="linear", full_scale=1e8)))
+    one, other = Recogniser(DECIBELS), Recogniser(linear)
+    for k in range(4):
+        image = np.maximum(picture(TRIANGLE, 1.7, 0.0, 0.4, k), 0.0)
+        amplitude = (1e3 * 10 ** (image / 20)).astype(np.float32)
+        motion = None if k == 0 else aside(0.0)
+        a, b = one.process(frame(k, image), motion, VIEW), other.process(frame(k, amplitude), motion, VIEW)
+    np.testing.assert_allclose(a.range_m, b.range_m, atol=1e-4)
+    np.testing.assert_allclose(a.id_probability, b.id_probability, atol=0.01)
+
+
+def test_without_a_floor_patches_are_compared_in_the_plane_of_the_image():
+    recogniser = Recogniser(DECIBELS)
+    for k in range(4):
+        found = recogniser.process(frame(k, picture(DISC, 1.7, 0.0, 0.4, k)), None if k == 0 else aside(0.0), None)
+    r, a = VIEW.range_azimuth(np.array([1.7, 0.0]))
+    assert (found.range_m[0], found.azimuth_rad[0]) == pytest.approx((r, a), abs=0.04)
+
+
+def test_a_model_of_other_landmarks_is_refused():
+    model = confusion_for(DEFAULT_DESIGNS[:2])
+    with pytest.raises(CalibrationError, match=r"\(1, 2\), the designs are \(1, 2, 3, 4\).*calibrate"):
+        Recogniser(DECIBELS, params=RecogniserParams(confusion=model))
+    assert Recogniser(DECIBELS, DEFAULT_DESIGNS[:2], RecogniserParams(confusion=model)).ids.tolist() == [1, 2]
+
+
+def test_the_surer_of_two_tracks_keeps_the_landmark_and_the_other_is_none():
+    beliefs = np.array([[0.7, 0.1, 0.2], [0.9, 0.05, 0.05]])
+    found = each_once(beliefs)
+    np.testing.assert_allclose(found, [[0.0, 0.1, 0.9], [0.9, 0.05, 0.05]])
+    np.testing.assert_allclose(each_once(beliefs[::-1]), found[::-1])
+
+
+def test_two_discs_at_once_are_not_both_the_disc():
+    """Two discs in one image: one is the landmark, the other is believed to be none."""
+    recogniser = Recogniser(DECIBELS)
+    for k in range(9):
+        y_m = round(0.2 - 0.05 * k, 6)
+        left, right = picture(DISC, 1.7, y_m + 0.2, 0.4, k), picture(DISC, 1.75, y_m - 0.2, 0.4, k)
+        found = recogniser.process(frame(k, np.maximum(left, right)), None if k == 0 else aside(0.05), VIEW)
+        if found is not None and len(found) == 2:
+            assert sorted(found.id_probability.argmax(axis=1)[found.id_probability.max(axis=1) > 0.5].tolist()) in (
+                [],
+                [DISC],
+            )
+            pair = found
+    assert np.sort(pair.id_probability[:, DISC])[0] == 0
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(1, 4))
+def test_no_landmark_is_the_most_probable_identity_of_two_tracks(seed: int, tracks: int, known: int):
+    rng = np.random.default_rng(seed)
+    beliefs = rng.dirichlet(np.full(known + 1, 0.4), tracks)
+    found = each_once(beliefs)
+    np.testing.assert_allclose(found.sum(axis=1), 1)
+    best = found.argmax(axis=1)
+    named = best[best < known]
+    assert len(set(named.tolist())) == len(named)
+    before = beliefs.argmax(axis=1)
+    free = before[before < known]
+    if len(set(free.tolist())) == len(free):
+        np.testing.assert_array_equal(found, beliefs)
