@@ -28,7 +28,8 @@ from sonar_graph.sonar.tracking import SonarStep
 MOST_PICTURES = 400
 MOST_WARNINGS = 200
 PICTURE_PERIOD_NS = NS_PER_S
-NO_ODOMETRY = "no IMU and Doppler log at its stamp, or out of order"
+OUT_OF_ORDER = "out of order"
+NO_ODOMETRY = "no IMU and Doppler log at its stamp"
 
 
 def recognise(
@@ -117,7 +118,8 @@ class RecognitionSession:
         self.result.frames += 1
         stamp_ns = int(frame.stamps_ns[0])
         if not self._motions.covers(stamp_ns):
-            self._warn(stamp_ns, f"frame not used: {NO_ODOMETRY}")
+            reason = OUT_OF_ORDER if self._motions.passed(stamp_ns) else NO_ODOMETRY
+            self._warn(stamp_ns, f"frame not used: {reason}")
             return None
         self.motion = motion = self._motions.at(stamp_ns)
         found = self.recogniser.process(frame, step_of(motion), view_of(motion))

@@ -139,7 +139,11 @@ class SonarMotions:
 
     def covers(self, stamp_ns: int) -> bool:
         """Whether IMU and Doppler log are there at an instant, and it is not before the last one asked for."""
-        return self._start_ns <= stamp_ns <= self._end_ns and stamp_ns >= self._stamp_ns
+        return self._start_ns <= stamp_ns <= self._end_ns and not self.passed(stamp_ns)
+
+    def passed(self, stamp_ns: int) -> bool:
+        """Whether an instant is before the last one asked for."""
+        return not self._is_first and stamp_ns < self._stamp_ns
 
     def at(self, stamp_ns: int) -> SonarMotion:
         """At a frame, not before that of the call before."""

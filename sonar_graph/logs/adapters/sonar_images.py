@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Literal
+from collections.abc import Callable, Iterator, Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +13,28 @@ from sonar_graph.logs.adapters.adapter import Adapter
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.container import Topic
 from sonar_graph.logs.table import Table
-from sonar_graph.measurements import Floats, SonarFrames
+from sonar_graph.measurements import Floats, Ints, SonarFrames
 
 SAMPLE_TYPES = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 """numpy's type for each number in marine_acoustic_msgs/SonarImageData."""
 _GAIN_BYTES = 4
+Refused = Callable[[int, str], None]
+"""Called with a message's stamp and why it is no image."""
+
+
+class _NoImageError(Exception):
+    """A message is no image: the field, and what is wrong with it."""
+
+
+class _Images(NamedTuple):
+    """Images of one size and kind, in no particular order."""
+
+    rows: Ints
+    """Which messages of the topic."""
+    samples: NDArray[np.generic]
+    """Shape (n, beams, bins)."""
+    ranges_m: Floats
+    azimuths_rad: Floats
 
 
 class SonarAdapter(Adapter):
@@ -65,21 +82,35 @@ class SonarAdapter(Adapter):
         yield from filter(None, (*single, self.big_endian, self.row_gains, self.row_bytes))
         yield from self.directions or ()
 
-    def read(self, topic: Topic) -> Iterator[SonarFrames]:
-        """Blocks of frames that share beams, bins and kind of sample, in no particular order of time.
+    def read(self, topic: Topic, refused: Refused | None = None) -> Iterator[SonarFrames]:
+        """Blocks of frames that share beams, bins and kind of sample, in the order of the log.
+
+        A block ends where the next frame differs in these, or has an earlier stamp.
+
+        Parameters
+        ----------
+        topic
+            With its payloads.
+        refused
+            Called with stamp and reason of each message that is no image; None: the first is an error.
 
         Raises
         ------
         LogError
-            When an image is not as long as beams and bins say.
+            When an image is not as long as beams and bins say, without ``refused``.
         """
-        if not topic.messages():
-            return  # nothing sound in this piece of the log
+        recorded_ns = topic.log_times_ns
+        is_any_sound = bool(topic.messages())
+        if refused is not None:
+            for stamp_ns in _missing(recorded_ns, topic.log_times_ns):
+                refused(stamp_ns, f"message {' or '.join(topic.unsound)}")
+        if not is_any_sound:
+            return
         table = self.table(topic)
-        for group in table.groups:
-            yield from self._blocks(table, group)
+        blocks = [block for group in table.groups for block in self._blocks(table, group, refused)]
+        yield from _in_order(blocks, table.stamps_ns)
 
-    def _blocks(self, table: Table, group: Messages) -> Iterator[SonarFrames]:
+    def _blocks(self, table: Table, group: Messages, refused: Refused | None) -> Iterator[_Images]:
         """Splits messages of one layout where beams, bins or samples change."""
         beams, bins = self._azimuths(group), self._bins(group)
         kind = np.column_stack([self._flag(group, path) for path in self._kinds()])
@@ -88,14 +119,24 @@ class SonarAdapter(Adapter):
         )
         for number, at in enumerate(first.tolist()):
             rows = np.flatnonzero(block.reshape(-1) == number)
-            samples = self._samples(table, group, rows, beams.shape[1], kind[at])
-            count = samples.shape[2]
-            ranges_m = bins[at] if self.ranges is not None else (np.arange(count) + 0.5) * bins[at, 0]
-            if len(ranges_m) != count:
-                table.refuse(self.data, f"has {count} bins a beam; {self.ranges} has {len(ranges_m)}")
-            stamps_ns = table.stamps_ns[group.rows[rows]]
-            order = np.argsort(stamps_ns, kind="stable")
-            yield SonarFrames(stamps_ns[order], samples[order], ranges_m, beams[at])
+            try:
+                samples = self._samples(group, rows, beams.shape[1], kind[at])
+                ranges_m = self._ranges(bins[at], samples.shape[2])
+            except _NoImageError as fault:
+                if refused is None:
+                    table.refuse(*fault.args)
+                for stamp_ns in table.stamps_ns[group.rows[rows]].tolist():
+                    refused(stamp_ns, " ".join(fault.args))
+                continue
+            yield _Images(group.rows[rows], samples, ranges_m, beams[at])
+
+    def _ranges(self, bins_m: Floats, count: int) -> Floats:
+        """Middles of bins of an image that has so many."""
+        if self.ranges is None:
+            return (np.arange(count) + 0.5) * bins_m[0]
+        if len(bins_m) != count:
+            raise _NoImageError(self.data, f"has {count} bins a beam; {self.ranges} has {len(bins_m)}")
+        return bins_m
 
     def _kinds(self) -> tuple[str | None, ...]:
         return self.sample_type, self.sample_bytes, self.big_endian, self.row_gains, self.row_bytes
@@ -116,10 +157,10 @@ class SonarAdapter(Adapter):
         return sign * np.radians(group[str(self.bearings)].astype(float) * self.bearing_unit_deg)
 
     def _samples(
-        self, table: Table, group: Messages, rows: NDArray[np.int64], beams: int, kind: NDArray[np.int64]
+        self, group: Messages, rows: NDArray[np.int64], beams: int, kind: NDArray[np.int64]
     ) -> NDArray[np.generic]:
         """Intensities, shape (n, beams, bins)."""
-        dtype = self._dtype(table, kind)
+        dtype = self._dtype(kind)
         has_gains, row_bytes = kind[3] > 0, int(kind[4])
         data = np.ascontiguousarray(group[self.data][rows]).view(np.uint8)
         head = _GAIN_BYTES if has_gains else 0
@@ -131,7 +172,7 @@ class SonarAdapter(Adapter):
             row_count, row_bytes = beams, row_bytes if row_bytes > 0 else size // max(beams, 1)
             used = row_bytes
         if beams == 0 or row_count == 0 or row_count * row_bytes != size or used > row_bytes:
-            table.refuse(self.data, f"has {size} bytes; that is no image of {beams} beams of {dtype} samples")
+            raise _NoImageError(self.data, f"has {size} bytes; that is no image of {beams} beams of {dtype} samples")
         image = data.reshape(len(rows), row_count, row_bytes)
         values = np.ascontiguousarray(image[:, :, head:used]).view(dtype)
         if has_gains:
@@ -139,13 +180,49 @@ class SonarAdapter(Adapter):
             values = (values / np.sqrt(np.maximum(gains, 1))).astype(np.float32)
         return values.transpose(0, 2, 1) if self.image_order == "range-major" else values
 
-    def _dtype(self, table: Table, kind: NDArray[np.int64]) -> np.dtype[np.generic]:
+    def _dtype(self, kind: NDArray[np.int64]) -> np.dtype[np.generic]:
         order = ">" if kind[2] > 0 else "<"
         if self.sample_type is not None:
             if not 0 <= kind[0] < len(SAMPLE_TYPES):
-                table.refuse(self.sample_type, f"is {kind[0]}; kinds of samples are 0 to {len(SAMPLE_TYPES) - 1}")
+                raise _NoImageError(self.sample_type, f"is {kind[0]}; kinds of samples are 0 to {len(SAMPLE_TYPES) - 1}")
             return np.dtype(order + SAMPLE_TYPES[kind[0]])
         size = int(kind[1]) if self.sample_bytes is not None else 1
         if size not in (1, 2, 4):
-            table.refuse(str(self.sample_bytes), f"is {size}; samples have 1, 2 or 4 bytes")
+            raise _NoImageError(str(self.sample_bytes), f"is {size}; samples have 1, 2 or 4 bytes")
         return np.dtype(f"{order}u{size}")
+
+
+def _in_order_of_time(blocks: list[SonarFrames]) -> Iterator[SonarFrames]:
+    """The blocks, cut where frames of another one come in between."""
+    if len(blocks) == 1:
+        yield blocks[0]
+        return
+    of = np.repeat(np.arange(len(blocks)), [len(block) for block in blocks])
+    row = np.concatenate([np.arange(len(block)) for block in blocks])
+    order = np.argsort(np.concatenate([block.stamps_ns for block in blocks]), kind="stable")
+    for run in np.split(order, np.flatnonzero(np.diff(of[order])) + 1):
+        block, rows = blocks[of[run[0]]], row[run]
+        yield SonarFrames(block.stamps_ns[rows], block.intensity[rows], block.ranges_m, block.azimuths_rad)
+
+
+def _in_order(blocks: Sequence[_Images], stamps_ns: Ints) -> Iterator[SonarFrames]:
+    """Runs of frames that follow each other in the log, share a block, and whose stamps do not run backwards."""
+    rows = np.concatenate([images.rows for images in blocks] or [np.empty(0, np.int64)])
+    block = np.repeat(np.arange(len(blocks)), [len(images.rows) for images in blocks])
+    within = np.concatenate([np.arange(len(images.rows)) for images in blocks] or [np.empty(0, np.int64)])
+    order = np.argsort(rows)
+    rows, block, within = rows[order], block[order], within[order]
+    begins = np.flatnonzero((np.diff(block) != 0) | (np.diff(stamps_ns[rows]) < 0)) + 1
+    for run in np.split(np.arange(len(rows)), begins):
+        if len(run):
+            images = blocks[block[run[0]]]
+            is_whole = len(run) == len(images.rows)
+            samples = images.samples if is_whole else images.samples[within[run]]
+            yield SonarFrames(stamps_ns[rows[run]], samples, images.ranges_m, images.azimuths_rad)
+
+
+def _missing(before_ns: Ints, after_ns: Ints) -> list[int]:
+    """Log times of messages that are no longer there, those at one instant taken together."""
+    instants, counts = np.unique(before_ns, return_counts=True)
+    there = np.searchsorted(np.sort(after_ns), instants, "right") - np.searchsorted(np.sort(after_ns), instants)
+    return np.repeat(instants, counts - there).tolist()

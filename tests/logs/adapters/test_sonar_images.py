@@ -60,7 +60,8 @@ def test_blocks_are_split_where_the_range_changes(foreign: Any) -> None:
     data = POLAR.T.astype("u1").tobytes()
     messages = [image(foreign, i, data) | {"ranges": [r * (2 if i == 1 else 1) for r in RANGES]} for i in range(3)]
     blocks = frames_in(foreign.write(("/sonar", IMAGE, messages)))
-    assert sorted((len(block), float(block.ranges_m[-1])) for block in blocks) == [(1, 5.0), (2, 2.5)]
+    assert [(len(block), float(block.ranges_m[-1])) for block in blocks] == [(1, 2.5), (1, 5.0), (1, 2.5)]
+    assert [(block.stamps_ns[0] - foreign.t0_ns) // foreign.step_ns for block in blocks] == [0, 1, 2]
 
 
 @pytest.mark.parametrize(("data", "dtype", "words"), [(b"\0" * 11, 0, "11 bytes"), (b"\0" * 12, 17, "dtype .* is 17")])
