@@ -192,19 +192,6 @@ class SonarAdapter(Adapter):
         return np.dtype(f"{order}u{size}")
 
 
-def _in_order_of_time(blocks: list[SonarFrames]) -> Iterator[SonarFrames]:
-    """The blocks, cut where frames of another one come in between."""
-    if len(blocks) == 1:
-        yield blocks[0]
-        return
-    of = np.repeat(np.arange(len(blocks)), [len(block) for block in blocks])
-    row = np.concatenate([np.arange(len(block)) for block in blocks])
-    order = np.argsort(np.concatenate([block.stamps_ns for block in blocks]), kind="stable")
-    for run in np.split(order, np.flatnonzero(np.diff(of[order])) + 1):
-        block, rows = blocks[of[run[0]]], row[run]
-        yield SonarFrames(block.stamps_ns[rows], block.intensity[rows], block.ranges_m, block.azimuths_rad)
-
-
 def _in_order(blocks: Sequence[_Images], stamps_ns: Ints) -> Iterator[SonarFrames]:
     """Runs of frames that follow each other in the log, share a block, and whose stamps do not run backwards."""
     rows = np.concatenate([images.rows for images in blocks] or [np.empty(0, np.int64)])
