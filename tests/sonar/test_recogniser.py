@@ -120,7 +120,7 @@ def test_the_end_of_a_track_has_a_row():
 BAD = {
     "not finite": np.full((96, 512), np.nan, np.float32),
     "zero": np.zeros((96, 512), np.float32),
-    "saturated": np.full((96, 512), 80.0, np.float32),
+    "saturated": np.where(np.arange(512) < 300, 80.0, 40.0).astype(np.float32) * np.ones((96, 1), np.float32),
 }
 
 
