@@ -130,6 +130,8 @@ def stream(
     keep: Callable[[str], Keep],
     window: Window | None = None,
     progress: Progress | None = None,
+    *,
+    salvage: bool = False,
 ) -> Iterator[Topic]:
     """Messages piece by piece: each item holds some of one topic, in the order of the file.
 
@@ -139,11 +141,13 @@ def stream(
     ----------
     path, keep, window, progress
         As of `scan`.
+    salvage
+        Holes are no error.
 
     Raises
     ------
     LogError
-        As `scan`, and at the end when the file has holes: what was given until then is whole.
+        As `scan`, and without ``salvage`` at the end when the file has holes: what was given until then is whole.
     """
     with LogFile(path) as file:
         passage = Passage(file, keep, window, progress=progress)
@@ -154,7 +158,8 @@ def stream(
             if topic.held_bytes >= _PIECE_BYTES:
                 yield held.pop(topic.name)
         yield from (topic for topic in held.values() if topic.keep is not Keep.NONE)
-    Recording(path, damage=passage.damage).require_sound()
+    if not salvage:
+        Recording(path, damage=passage.damage).require_sound()
 
 
 def _gather(passage: Passage) -> None:

@@ -1,28 +1,82 @@
-"""Frames that must not be used: found before anything is made of them, each with its reason."""
+"""Frames that must not be used: found before anything is made of them, each with its reason.
+
+A sonar's window (number of beams and bins, where they lie) may change while it works: an operator turns a knob, or a
+sonar alternates between two modes. A damaged header looks the same, once. So the first frame of a window that was never
+there before is not used, and every later one is.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
 
-from sonar_graph.measurements import SonarFrames
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_graph.calibration import SonarImage
+from sonar_graph.measurements import Floats, SonarFrames
 
 SATURATED_SHARE = 0.5
-"""Of the samples at the top of their type's scale, from which on a frame shows nothing."""
+"""Of the samples that are the largest in a frame, from which on it shows nothing."""
+SAME_PLACE = 0.5
+"""Windows are one when no bin and no beam lies farther off than this share of the distance between two."""
+LEAST_BEAMS, LEAST_BINS = 8, 32
+"""Smaller images show no landmark."""
+MOST_WINDOWS = 64
+"""So many are remembered."""
+
+
+class Window(NamedTuple):
+    """Where the samples of a frame lie."""
+
+    ranges_m: Floats
+    azimuths_rad: Floats
+
+    def is_like(self, other: Window) -> bool:
+        """Whether bins and beams are the same, but for what a driver computes anew for every ping."""
+        return all(
+            len(own) == len(others) and bool(np.abs(own - others).max() <= SAME_PLACE * _step(own))
+            for own, others in zip(self, other, strict=True)
+        )
+
+    def __str__(self) -> str:
+        size = f"{len(self.azimuths_rad)} x {len(self.ranges_m)}"
+        left, right = np.degrees([self.azimuths_rad.max(), self.azimuths_rad.min()])
+        return f"{size}, {self.ranges_m[0]:.2f} m to {self.ranges_m[-1]:.2f} m, {right:.1f}° to {left:.1f}°"
 
 
 class FrameCheck:
-    """Compares each frame with the newest one before it."""
+    """Compares each frame with the good one before it.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    image
+        What samples mean; those that it does not allow are faults. None: decibels in bytes.
+    """
+
+    def __init__(self, image: SonarImage | None = None) -> None:
+        self._scale = image or SonarImage()
         self._stamp_ns: int | None = None
-        self._shape: tuple[int, ...] | None = None
+        self._image: NDArray[np.generic] | None = None
+        self._window: Window | None = None
+        self._seen: list[Window] = []
+        self.change: str | None = None
+        """How the window of the frame last found good differs from that of the one before."""
 
     def fault(self, frame: SonarFrames) -> str | None:
         """Why a frame (a block of one) must not be used; None for a good one, with which later ones are compared."""
         stamp_ns, image = int(frame.stamps_ns[0]), frame.intensity[0]
-        reason = self._fault_of_stamp(stamp_ns) or self._fault_of_size(image.shape) or _fault_of_samples(image)
+        window = Window(frame.ranges_m, frame.azimuths_rad)
+        reason = (
+            self._fault_of_stamp(stamp_ns)
+            or _fault_of_places(window)
+            or self._fault_of_samples(image)
+            or self._fault_of_window(window)
+        )
+        self.change = None
         if reason is None:
-            self._stamp_ns, self._shape = stamp_ns, image.shape
+            if self._window is not None and not window.is_like(self._window):
+                self.change = f"window changed: {window}; tracks that lie in it go on"
+            self._stamp_ns, self._image, self._window = stamp_ns, image, window
         return reason
 
     def _fault_of_stamp(self, stamp_ns: int) -> str | None:
@@ -30,17 +84,47 @@ class FrameCheck:
             return None
         return "duplicated: same stamp as the frame before" if stamp_ns == self._stamp_ns else "out of order"
 
-    def _fault_of_size(self, shape: tuple[int, ...]) -> str | None:
-        if self._shape is None or shape == self._shape:
+    def _fault_of_window(self, window: Window) -> str | None:
+        """A window counts from its second frame on; the first of all is taken as it is."""
+        if self._window is not None and window.is_like(self._window):
             return None
-        return f"wrong size: {shape[0]} x {shape[1]}, frames before had {self._shape[0]} x {self._shape[1]}"
+        if any(window.is_like(seen) for seen in self._seen):
+            return None
+        self._seen = [*self._seen[-MOST_WINDOWS + 1 :], window]
+        return None if len(self._seen) == 1 else f"wrong size or window: {window}; used if it comes again"
+
+    def _fault_of_samples(self, image: NDArray[np.generic]) -> str | None:
+        low, high = image.min(), image.max()
+        if np.issubdtype(image.dtype, np.floating) and not max(abs(low), abs(high)) < np.finfo(np.float32).max:
+            return "samples that are not finite"
+        if low == high < self._scale.full_scale:
+            return "all samples are zero" if high == 0 else "all samples are the same"
+        if self._scale.scale == "decibel" and high > self._scale.full_scale:
+            return (
+                f"samples over {self._scale.full_scale:g}, the full scale that the calibration states; "
+                "correct sonar.image.full_scale or sonar.image.scale with --calibration"
+            )
+        if np.count_nonzero(image == high) > SATURATED_SHARE * image.size:
+            return "saturated"
+        if self._image is not None and np.array_equal(image, self._image):
+            return "duplicated: same samples as the frame before"
+        return None
 
 
-def _fault_of_samples(image: np.ndarray) -> str | None:
-    is_real = np.issubdtype(image.dtype, np.floating)
-    if is_real and not np.isfinite(image).all():
-        return "samples that are not finite"
-    if not image.any():
-        return "all samples are zero"
-    top = image.max() if is_real else np.iinfo(image.dtype).max
-    return "saturated" if np.count_nonzero(image == top) > SATURATED_SHARE * image.size else None
+def _fault_of_places(window: Window) -> str | None:
+    """What is wrong with ranges and azimuths themselves."""
+    ranges_m, azimuths_rad = window
+    if len(azimuths_rad) < LEAST_BEAMS or len(ranges_m) < LEAST_BINS:
+        size = f"{len(azimuths_rad)} x {len(ranges_m)}"
+        return f"wrong size: {size}, expected at least {LEAST_BEAMS} beams and {LEAST_BINS} bins"
+    if not (np.isfinite(ranges_m).all() and np.isfinite(azimuths_rad).all()):
+        return "ranges or azimuths that are not finite"
+    steps_m, steps_rad = np.diff(ranges_m), np.diff(azimuths_rad)
+    is_even = np.abs(steps_m - steps_m.mean()).max() <= SAME_PLACE * abs(steps_m.mean())
+    if ranges_m[0] < 0 or not steps_m.mean() > 0 or not is_even:
+        return "ranges that do not increase evenly from the sonar on"
+    return None if (steps_rad > 0).all() or (steps_rad < 0).all() else "azimuths that do not go one way"
+
+
+def _step(places: Floats) -> float:
+    return abs(float(places[-1] - places[0])) / (len(places) - 1)

@@ -105,7 +105,7 @@ class Recogniser:
         )
         self._tracker = Tracker(self.params.tracking)
         self._beliefs = Beliefs(self.confusion, self.params.identity)
-        self._check = FrameCheck()
+        self._check = FrameCheck(calibration.sonar.image)
         self._start_T_sonar = gtsam.Pose3()
         self.fates: list[Fate] = []
         """What became of everything in the frame last processed."""
@@ -146,7 +146,10 @@ class Recogniser:
         self.sightings = self._look.at(image_db, frame, view, candidates, association.candidate)
         scores = self._look.scores(self.sightings)
         beliefs = self._beliefs.step(association, scores, self._places(), self._sideways(association))
-        return self._report(stamp_ns, candidates, association, beliefs)
+        found = self._report(stamp_ns, candidates, association, beliefs)
+        if self._check.change is not None:
+            self.fates.append(Fate(stamp_ns, -1, np.nan, np.nan, self._check.change))
+        return found
 
     def _places(self) -> list[Floats | None]:
         """Where the sonar is, for each track that could be compared with the designs."""

@@ -184,7 +184,8 @@ class SonarAdapter(Adapter):
         order = ">" if kind[2] > 0 else "<"
         if self.sample_type is not None:
             if not 0 <= kind[0] < len(SAMPLE_TYPES):
-                raise _NoImageError(self.sample_type, f"is {kind[0]}; kinds of samples are 0 to {len(SAMPLE_TYPES) - 1}")
+                last = len(SAMPLE_TYPES) - 1
+                raise _NoImageError(self.sample_type, f"is {kind[0]}; kinds of samples are 0 to {last}")
             return np.dtype(order + SAMPLE_TYPES[kind[0]])
         size = int(kind[1]) if self.sample_bytes is not None else 1
         if size not in (1, 2, 4):
