@@ -1,0 +1,319 @@
+"""From a log with images to detections that are right: the whole chain, on a lane whose truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sonar_graph.evaluation.comparison import compare
+from sonar_graph.evaluation.recognising import RecognitionSession, one_by_one, recognise, with_detections
+from sonar_graph.evaluation.recognition import Recognition
+from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.sonar_encoding import sonar_image_messages
+from sonar_graph.logs.writing import write_sequence
+from sonar_graph.measurements import Floats, Ints, LandmarkDetections, SonarFrames
+from sonar_graph.sonar.beliefs import IdentityParams
+from sonar_graph.sonar.confusion import confusion_for
+from sonar_graph.sonar.recogniser import REPORTED, RecogniserParams
+
+from ..imaged_lane import TOPIC, Lane
+
+SURE = 0.9
+
+
+def truth_of(lane: Lane, found: LandmarkDetections) -> tuple[Ints, Floats, Floats]:
+    """Identity (negative: no landmark) and true range and azimuth of the object nearest to each detection."""
+    row = np.searchsorted(lane.frames.stamps_ns, found.stamps_ns)
+    ids, errors = [], []
+    for frame, r, a in zip(row.tolist(), found.range_m, found.azimuth_rad, strict=True):
+        truth = lane.truth[frame]
+        q = truth.points_m[0]
+        at = int(np.argmin(np.hypot(np.linalg.norm(q, axis=1) - r, r * (np.arctan2(q[:, 1], q[:, 0]) - a))))
+        ids.append(int(truth.ids[at]))
+        errors.append((r - np.linalg.norm(q[at]), a - np.arctan2(q[at, 1], q[at, 0])))
+    return np.array(ids), *np.array(errors).T
+
+
+def accepted(found: LandmarkDetections, ids: Ints) -> set[tuple[int, int]]:
+    """Pairs of true identity and the one that was named with certainty."""
+    named, probability = found.most_probable()
+    return set(zip(ids[probability > SURE].tolist(), named[probability > SURE].tolist(), strict=True))
+
+
+def recognised(lane: Lane, frames: Iterable[SonarFrames] | None = None, **settings: object) -> Recognition:
+    session = RecognitionSession(lane.sequence, pictures=False, **settings)
+    for frame in one_by_one(lane.frames) if frames is None else frames:
+        session.take(frame)
+    return session.finish()
+
+
+def test_every_landmark_is_recognised_by_its_name_and_nothing_else_is(lane, lane_recognition):
+    found = lane_recognition.detections
+    ids, _, _ = truth_of(lane, found)
+    assert accepted(found, ids) == {(1, 1), (2, 2), (3, 3), (4, 4)}
+    assert {-1, -2} <= set(ids.tolist())  # stone and patch were tracked, and are named by nothing
+    named, probability = found.most_probable()
+    none = 1 - found.id_probability.sum(axis=1)
+    assert (none[ids < 0] > 0.5).all()
+    assert np.mean((named == ids)[ids > 0] & (probability > 0.5)[ids > 0]) > 0.8
+
+
+def test_range_and_azimuth_are_as_accurate_as_their_covariance_says(lane, lane_recognition):
+    found = lane_recognition.detections
+    ids, range_error_m, azimuth_error_rad = truth_of(lane, found)
+    errors = np.column_stack([range_error_m, azimuth_error_rad])
+    sure = (ids > 0) & (found.most_probable()[1] > SURE)
+    fitted = sure & (found.range_azimuth_cov[:, 0, 0] < 0.03**2)  # the others are about to leave the beam
+    assert fitted.sum() > 40
+    assert np.sqrt(np.mean(range_error_m[fitted] ** 2)) < 0.010
+    assert np.sqrt(np.mean(range_error_m[sure] ** 2)) < 0.025
+    assert np.degrees(np.sqrt(np.mean(azimuth_error_rad[sure] ** 2))) < 0.5
+    nis = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(found.range_azimuth_cov), errors)[sure]
+    assert 0.5 < nis.mean() / 2 < 2.2
+    assert np.mean(nis < 9.21) > 0.93
+
+
+def test_designs_under_other_names_give_other_names(lane):
+    """Negative control: names come from the designs and from nothing else."""
+    turned = tuple(replace(d, id=d.id % 4 + 1) for d in DEFAULT_DESIGNS)
+    turned = tuple(sorted(turned, key=lambda d: d.id))
+    model = confusion_for(DEFAULT_DESIGNS)
+    found = recognised(lane, designs=turned, params=RecogniserParams(confusion=model)).detections
+    pairs = accepted(found, truth_of(lane, found)[0])
+    assert len(pairs) >= 3
+    assert all(named == true % 4 + 1 for true, named in pairs)
+
+
+def test_landmarks_of_other_designs_are_not_accepted(lane):
+    """Negative control: a bar and a small ring are not in the lane."""
+    bar, ring = np.full((60, 60), np.nan), np.full((60, 60), np.nan)
+    bar[26:34] = 12.0
+    x, y = np.meshgrid(*2 * [np.arange(60) - 29.5])
+    ring[(np.hypot(x, y) < 29) & (np.hypot(x, y) > 20)] = 12.0
+    designs = [LandmarkDesign(7, "bar", 0.5, bar), LandmarkDesign(8, "ring", 0.5, ring)]
+    found = recognised(lane, designs=designs).detections
+    named, probability = found.most_probable()
+    assert set(np.unique(found.candidate_ids).tolist()) == {7, 8}
+    assert np.mean(probability > SURE) < 0.05
+
+
+def test_a_lane_without_landmarks_yields_none(lane):
+    """Negative control: the same frames with the order of their beams shuffled hold nothing that persists."""
+    order = np.random.default_rng(0).permutation(len(lane.frames.azimuths_rad))
+    shuffled = replace(lane.frames, intensity=np.ascontiguousarray(lane.frames.intensity[:, order]))
+    found = recognised(lane, one_by_one(shuffled)).detections
+    assert found is None or not accepted(found, truth_of(lane, found)[0])
+
+
+def test_both_rules_name_landmarks_and_the_notes_say_which_was_used(lane):
+    params = RecogniserParams(identity=IdentityParams(rule="jeffrey"))
+    result = recognised(lane, params=params)
+    pairs = accepted(result.detections, truth_of(lane, result.detections)[0])
+    assert {(k, k) for k in (1, 2, 3, 4)} <= pairs
+    assert result.notes["detections.rule"] == "jeffrey"
+
+
+def test_a_log_gives_what_its_images_give(lane, lane_log, lane_recognition):
+    counts: list[int] = []
+    sequence = read_sequence(lane_log)
+    assert sequence.detections is None
+    result = recognise(lane_log, sequence, progress=counts.append)
+    assert counts == list(range(1, len(lane.frames) + 1))
+    assert result.frames == len(lane.frames)
+    assert result.outcomes == lane_recognition.outcomes
+    for name in ("stamps_ns", "range_m", "azimuth_rad", "range_azimuth_cov", "candidate_ids", "id_probability"):
+        expected = getattr(lane_recognition.detections, name)
+        np.testing.assert_allclose(getattr(result.detections, name), expected, atol=1e-4, err_msg=name)
+
+
+def test_rows_account_for_every_frame_and_detection(lane, lane_recognition):
+    result = lane_recognition
+    assert result.frames == len(lane.frames)
+    assert result.outcomes[REPORTED] == len(result.detections)
+    assert result.warnings == []
+    assert (np.diff(result.detections.stamps_ns) >= 0).all()
+    assert set(result.detections.stamps_ns.tolist()) <= set(lane.frames.stamps_ns.tolist())
+    assert result.notes["detections"] == f"recognised in {len(lane.frames)} sonar images"
+    assert result.notes["detections.designs"] == "1: disc, 2: square, 3: triangle, 4: cross"
+    assert "virtual-evidence" in result.notes["detections.rule"]
+    assert result.notes["detections.model"] != "not said"
+
+
+def test_a_log_without_images_gives_nothing(lane, tmp_path):
+    write_sequence(tmp_path / "bare.mcap", lane.sequence)
+    assert recognise(tmp_path / "bare.mcap", lane.sequence) is None
+
+
+def test_both_estimators_are_given_the_same_detections(lane, lane_recognition, monkeypatch):
+    """The very same block, which adds to the notes and leaves the rest of the sequence alone."""
+    import sonar_graph.evaluation.run as module
+
+    sequence = with_detections(lane.sequence, lane_recognition)
+    assert sequence.detections is lane_recognition.detections
+    assert sequence.imu is lane.sequence.imu
+    assert sequence.notes == lane.sequence.notes | lane_recognition.notes
+    given: dict[str, list[Floats]] = {}
+    load = module.load_estimator
+
+    def spying(name: str) -> type:
+        class Spy(load(name)):
+            def process(self, measurements):
+                if measurements.detections is not None:
+                    block = measurements.detections
+                    given.setdefault(name, []).append(np.column_stack([block.range_m, block.id_probability]))
+                return super().process(measurements)
+
+        return Spy
+
+    monkeypatch.setattr(module, "load_estimator", spying)
+    result = compare(sequence, ["isam2", "ekf-slam"], {}, rate_hz=2.0)
+    assert [run.status for run in result.runs] == ["ok", "ok"]
+    one, other = (np.concatenate(given[name]) for name in ("isam2", "ekf-slam"))
+    np.testing.assert_array_equal(one, other)
+    assert len(one) > 0.9 * len(sequence.detections)
+
+
+def test_pictures_come_once_a_second_and_show_what_was_recognised(lane, lane_recognition):
+    pictures = lane_recognition.pictures
+    stamps_ns = np.array([picture.stamp_ns for picture in pictures])
+    assert len(pictures) > 20
+    assert np.diff(stamps_ns).min() >= 10**9
+    assert all(picture.jpeg[:2] == b"\xff\xd8" for picture in pictures)
+    shown = [picture for picture in pictures if picture.landmark_ids]
+    detections = lane_recognition.detections
+    for picture in shown:
+        ids, probability = detections.rows(detections.stamps_ns == picture.stamp_ns).most_probable()
+        assert picture.landmark_ids == tuple(ids.tolist())
+        assert picture.probabilities == tuple(probability.tolist())
+    assert len(shown) > 10
+
+
+def test_of_many_pictures_every_second_one_is_given_up(lane, monkeypatch):
+    import sonar_graph.evaluation.recognising as module
+
+    monkeypatch.setattr(module, "MOST_PICTURES", 6)
+    session = RecognitionSession(lane.sequence)
+    for frame in one_by_one(lane.frames):
+        session.take(frame)
+        assert len(session.result.pictures) <= 6
+    stamps_ns = np.array([picture.stamp_ns for picture in session.result.pictures])
+    assert 3 <= len(stamps_ns)
+    assert np.ptp(np.diff(stamps_ns)) <= 10**9
+    assert np.diff(stamps_ns).min() >= 4 * 10**9
+
+
+def changed(frame: SonarFrames, **columns: object) -> SonarFrames:
+    return replace(frame, **columns)
+
+
+def bad_frames(lane: Lane, at: int) -> dict[str, SonarFrames]:
+    """Frames that must not be used, each to come instead of or before frame ``at``; by words of the reason."""
+    frame, image = lane.one(at), lane.one(at).intensity
+    earlier = lane.one(at - 10)
+    bright = np.where(np.arange(image.shape[2]) < 300, 255, image).astype(np.uint8)
+    return {
+        "wrong size": changed(frame, intensity=image[:, :, :500], ranges_m=frame.ranges_m[:500]),
+        "zero": changed(frame, intensity=np.zeros_like(image)),
+        "saturated": changed(frame, intensity=bright),
+        "out of order": earlier,
+        "duplicated": lane.one(at - 1),
+    }
+
+
+BAD = ["wrong size", "zero", "saturated", "out of order", "duplicated"]
+AT = 60
+
+
+@pytest.fixture(scope="module")
+def without(lane) -> Recognition:
+    """What is recognised when frame `AT` is not there at all."""
+    return recognised(lane, [lane.one(k) for k in range(len(lane.frames)) if k != AT])
+
+
+def assert_same_detections(found: LandmarkDetections, expected: LandmarkDetections) -> None:
+    np.testing.assert_array_equal(found.stamps_ns, expected.stamps_ns)
+    np.testing.assert_allclose(found.range_m, expected.range_m, atol=1e-4)
+    np.testing.assert_allclose(found.id_probability, expected.id_probability, atol=1e-2)
+
+
+@pytest.mark.parametrize("reason", BAD)
+def test_a_bad_frame_is_named_in_a_warning_and_not_used(lane, without, reason):
+    bad = bad_frames(lane, AT)[reason]
+    frames = [lane.one(k) for k in range(len(lane.frames))]
+    frames[AT] = bad
+    result = recognised(lane, frames)
+    (warning,) = result.warnings
+    assert warning[0] == bad.stamps_ns[0]
+    assert warning[1].startswith("frame not used: ")
+    assert reason in warning[1]
+    assert result.outcomes[warning[1]] == 1
+    assert_same_detections(result.detections, without.detections)
+
+
+def test_a_frame_that_is_not_finite_is_named_in_a_warning_and_not_used(lane, without):
+    frames = [changed(lane.one(k), intensity=lane.one(k).intensity.astype(np.float32)) for k in range(len(lane.frames))]
+    frames[AT].intensity[0, 3, 4] = np.nan
+    result = recognised(lane, frames)
+    assert [reason for _, reason in result.warnings] == ["frame not used: samples that are not finite"]
+    assert_same_detections(result.detections, without.detections)
+
+
+@pytest.mark.parametrize("reason", BAD)
+def test_a_bad_frame_in_a_log_is_named_in_a_warning_and_not_used(lane, without, reason, tmp_path):
+    result = recognised_in_log(lane, tmp_path, [*range(AT)], bad_frames(lane, AT)[reason], [*range(AT + 1, 138)])
+    assert [reason in text for _, text in result.warnings] == [True]
+    assert_same_detections(result.detections, without.detections)
+
+
+def recognised_in_log(lane: Lane, folder: Path, before: list[int], bad: SonarFrames, after: list[int]) -> Recognition:
+    """Of a log in which a bad frame lies between good ones, whatever its stamp says."""
+    frames = [*(lane.one(k) for k in before), bad, *(lane.one(k) for k in after if k < len(lane.frames))]
+    messages, time_ns = [], 0
+    for frame in frames:
+        entry = sonar_image_messages(TOPIC, frame)
+        time_ns = max(time_ns + 1, int(frame.stamps_ns[0]))
+        messages.append(replace(entry, log_times_ns=np.array([time_ns])))
+    log = folder / "bad.mcap"
+    write_sequence(log, lane.sequence, messages)
+    return recognise(log, read_sequence(log))
+
+
+def test_a_bad_first_frame_costs_hardly_more_than_itself(lane, tmp_path):
+    """The first frame must not become the measure of all others."""
+    bad = bad_frames(lane, 5)["wrong size"]
+    result = recognised_in_log(lane, tmp_path, [], bad, [*range(6, 138)])
+    assert 1 <= len(result.warnings) <= 3
+    assert all("window" in reason for _, reason in result.warnings)
+    assert accepted(result.detections, truth_of(lane, result.detections)[0]) == {(k, k) for k in (1, 2, 3, 4)}
+
+
+def test_frames_without_odometry_are_named_and_the_others_are_used(lane):
+    sequence = lane.sequence
+    late_ns, early_ns = sequence.end_ns + 1, sequence.start_ns - 1
+    frames = [
+        changed(lane.one(0), stamps_ns=np.array([early_ns])),
+        *(lane.one(k) for k in range(20)),
+        changed(lane.one(20), stamps_ns=np.array([late_ns])),
+        *(lane.one(k) for k in range(20, 40)),
+    ]
+    result = recognised(lane, frames)
+    assert result.warnings == [
+        (stamp_ns, "frame not used: no IMU and Doppler log at its stamp") for stamp_ns in (early_ns, late_ns)
+    ]
+    assert_same_detections(result.detections, recognised(lane, [lane.one(k) for k in range(40)]).detections)
+
+
+def test_warnings_are_counted_although_not_all_are_kept(lane, monkeypatch):
+    import sonar_graph.evaluation.recognising as module
+
+    monkeypatch.setattr(module, "MOST_WARNINGS", 3)
+    zero = np.zeros_like(lane.one(0).intensity)
+    result = recognised(lane, [changed(lane.one(k), intensity=zero) for k in range(10)])
+    assert len(result.warnings) == 3
+    assert result.outcomes == {"frame not used: all samples are zero": 10}
+    assert result.detections is None
