@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import json
 import os
 import subprocess
@@ -76,6 +77,17 @@ def test_log_reading_names_its_figures_and_agrees_with_rosbags() -> None:
     assert found["rosbags_ratio"] == pytest.approx(found["rosbags_s"] / found["ours_s"], rel=1e-3)
     assert found["mcap_ros2_ratio"] == pytest.approx(found["mcap_ros2_s"] / found["ours_s"], rel=1e-3)
     assert 10 < found["peak_rss_mb"] < 150
+
+
+def test_recognition_names_its_figures() -> None:
+    found = figures("performance/recognition.py")
+    parts = sum(found[f"{part}_ms"] for part in ("selection", "tracking", "look", "beliefs"))
+    assert 0.5 * found["frame_ms"] < parts < found["frame_ms"]
+    assert found["detections"] > 0  # landmarks were looked at, else the comparison with designs would cost nothing
+    assert found["median_ms"] < found["p99_ms"]
+    assert found["rss_growth_mb"] < found["peak_rss_mb"]
+    is_compared = importlib.util.find_spec("actag") is not None
+    assert (found["actag_ratio"] is not None) == is_compared
 
 
 def test_damaged_logs_names_its_figures() -> None:
