@@ -5,12 +5,14 @@ It holds in half a minute what a lap of the basin holds in two: for tests that n
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.logs.recorder import Outgoing
 from sonar_graph.logs.sonar_encoding import sonar_image_messages
 from sonar_graph.logs.writing import write_sequence
 from sonar_graph.measurements import SonarFrames
@@ -44,11 +46,10 @@ class Lane:
     """One a frame."""
     path: VehiclePath
 
-    def write(self, log: Path, *more: SonarFrames) -> Path:
-        """As a log, with further images after those of the run."""
-        blocks = (self.frames, *more)
-        messages = (sonar_image_messages(TOPIC, b, frequency_hz=1.8e6, sound_speed_m_s=1480) for b in blocks)
-        write_sequence(log, self.sequence, messages)
+    def write(self, log: Path, frames: Iterable[SonarFrames] | None = None) -> Path:
+        """As a log, with images in the order given, whatever their stamps say."""
+        blocks = [self.one(row) for row in range(len(self.frames))] if frames is None else frames
+        write_sequence(log, self.sequence, _in_this_order(blocks))
         return log
 
     def one(self, row: int) -> SonarFrames:
@@ -57,6 +58,15 @@ class Lane:
         return SonarFrames(
             frames.stamps_ns[row : row + 1], frames.intensity[row : row + 1], frames.ranges_m, frames.azimuths_rad
         )
+
+
+def _in_this_order(blocks: Iterable[SonarFrames]) -> Iterator[Outgoing]:
+    """Each block of one frame is recorded after the one before."""
+    time_ns = 0
+    for block in blocks:
+        time_ns = max(time_ns + 1, int(block.stamps_ns[0]))
+        message = sonar_image_messages(TOPIC, block, frequency_hz=1.8e6, sound_speed_m_s=1480)
+        yield replace(message, log_times_ns=np.array([time_ns]))
 
 
 def lane_path(rng: np.random.Generator) -> VehiclePath:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -14,14 +15,14 @@ from sonar_graph.evaluation.recognising import RecognitionSession, one_by_one, r
 from sonar_graph.evaluation.recognition import Recognition
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.sonar_encoding import sonar_image_messages
 from sonar_graph.logs.writing import write_sequence
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, SonarFrames
 from sonar_graph.sonar.beliefs import IdentityParams
 from sonar_graph.sonar.confusion import confusion_for
 from sonar_graph.sonar.recogniser import REPORTED, RecogniserParams
 
-from ..imaged_lane import TOPIC, Lane
+if TYPE_CHECKING:
+    from tests.imaged_lane import Lane
 
 SURE = 0.9
 
@@ -97,7 +98,7 @@ def test_landmarks_of_other_designs_are_not_accepted(lane):
     ring[(np.hypot(x, y) < 29) & (np.hypot(x, y) > 20)] = 12.0
     designs = [LandmarkDesign(7, "bar", 0.5, bar), LandmarkDesign(8, "ring", 0.5, ring)]
     found = recognised(lane, designs=designs).detections
-    named, probability = found.most_probable()
+    _, probability = found.most_probable()
     assert set(np.unique(found.candidate_ids).tolist()) == {7, 8}
     assert np.mean(probability > SURE) < 0.05
 
@@ -202,7 +203,7 @@ def test_of_many_pictures_every_second_one_is_given_up(lane, monkeypatch):
         session.take(frame)
         assert len(session.result.pictures) <= 6
     stamps_ns = np.array([picture.stamp_ns for picture in session.result.pictures])
-    assert 3 <= len(stamps_ns)
+    assert len(stamps_ns) >= 3
     assert np.ptp(np.diff(stamps_ns)) <= 10**9
     assert np.diff(stamps_ns).min() >= 4 * 10**9
 
@@ -226,13 +227,20 @@ def bad_frames(lane: Lane, at: int) -> dict[str, SonarFrames]:
 
 
 BAD = ["wrong size", "zero", "saturated", "out of order", "duplicated"]
-AT = 60
+AT, FRAMES = 30, 50
+
+
+def with_one_replaced(lane: Lane, frame: SonarFrames | None) -> list[SonarFrames]:
+    """The first frames, with another one or (None) a gap instead of frame `AT`."""
+    frames = [lane.one(k) for k in range(FRAMES)]
+    frames[AT : AT + 1] = [] if frame is None else [frame]
+    return frames
 
 
 @pytest.fixture(scope="module")
-def without(lane) -> Recognition:
+def without(lane) -> LandmarkDetections:
     """What is recognised when frame `AT` is not there at all."""
-    return recognised(lane, [lane.one(k) for k in range(len(lane.frames)) if k != AT])
+    return recognised(lane, with_one_replaced(lane, None)).detections
 
 
 def assert_same_detections(found: LandmarkDetections, expected: LandmarkDetections) -> None:
@@ -241,55 +249,44 @@ def assert_same_detections(found: LandmarkDetections, expected: LandmarkDetectio
     np.testing.assert_allclose(found.id_probability, expected.id_probability, atol=1e-2)
 
 
+@pytest.mark.parametrize("is_from_log", [False, True], ids=["given", "in a log"])
 @pytest.mark.parametrize("reason", BAD)
-def test_a_bad_frame_is_named_in_a_warning_and_not_used(lane, without, reason):
+def test_a_bad_frame_is_named_in_a_warning_and_not_used(lane, without, reason, is_from_log, tmp_path):
     bad = bad_frames(lane, AT)[reason]
-    frames = [lane.one(k) for k in range(len(lane.frames))]
-    frames[AT] = bad
-    result = recognised(lane, frames)
+    frames = with_one_replaced(lane, bad)
+    result = recognised_in_log(lane, tmp_path, frames) if is_from_log else recognised(lane, frames)
     (warning,) = result.warnings
     assert warning[0] == bad.stamps_ns[0]
     assert warning[1].startswith("frame not used: ")
     assert reason in warning[1]
     assert result.outcomes[warning[1]] == 1
-    assert_same_detections(result.detections, without.detections)
+    assert result.frames == FRAMES
+    assert_same_detections(result.detections, without)
 
 
-def test_a_frame_that_is_not_finite_is_named_in_a_warning_and_not_used(lane, without):
-    frames = [changed(lane.one(k), intensity=lane.one(k).intensity.astype(np.float32)) for k in range(len(lane.frames))]
+@pytest.mark.parametrize("is_from_log", [False, True], ids=["given", "in a log"])
+def test_a_frame_that_is_not_finite_is_named_in_a_warning_and_not_used(lane, without, is_from_log, tmp_path):
+    frames = [
+        changed(frame, intensity=frame.intensity.astype(np.float32)) for frame in with_one_replaced(lane, lane.one(AT))
+    ]
     frames[AT].intensity[0, 3, 4] = np.nan
-    result = recognised(lane, frames)
-    assert [reason for _, reason in result.warnings] == ["frame not used: samples that are not finite"]
-    assert_same_detections(result.detections, without.detections)
+    result = recognised_in_log(lane, tmp_path, frames) if is_from_log else recognised(lane, frames)
+    assert result.warnings == [(frames[AT].stamps_ns[0], "frame not used: samples that are not finite")]
+    assert_same_detections(result.detections, without)
 
 
-@pytest.mark.parametrize("reason", BAD)
-def test_a_bad_frame_in_a_log_is_named_in_a_warning_and_not_used(lane, without, reason, tmp_path):
-    result = recognised_in_log(lane, tmp_path, [*range(AT)], bad_frames(lane, AT)[reason], [*range(AT + 1, 138)])
-    assert [reason in text for _, text in result.warnings] == [True]
-    assert_same_detections(result.detections, without.detections)
-
-
-def recognised_in_log(lane: Lane, folder: Path, before: list[int], bad: SonarFrames, after: list[int]) -> Recognition:
-    """Of a log in which a bad frame lies between good ones, whatever its stamp says."""
-    frames = [*(lane.one(k) for k in before), bad, *(lane.one(k) for k in after if k < len(lane.frames))]
-    messages, time_ns = [], 0
-    for frame in frames:
-        entry = sonar_image_messages(TOPIC, frame)
-        time_ns = max(time_ns + 1, int(frame.stamps_ns[0]))
-        messages.append(replace(entry, log_times_ns=np.array([time_ns])))
-    log = folder / "bad.mcap"
-    write_sequence(log, lane.sequence, messages)
+def recognised_in_log(lane: Lane, folder: Path, frames: list[SonarFrames]) -> Recognition:
+    log = lane.write(folder / "bad.mcap", frames)
     return recognise(log, read_sequence(log))
 
 
-def test_a_bad_first_frame_costs_hardly_more_than_itself(lane, tmp_path):
+def test_a_bad_first_frame_costs_hardly_more_than_itself(lane):
     """The first frame must not become the measure of all others."""
-    bad = bad_frames(lane, 5)["wrong size"]
-    result = recognised_in_log(lane, tmp_path, [], bad, [*range(6, 138)])
+    frames = [bad_frames(lane, 11)["wrong size"], *(lane.one(k) for k in range(12, FRAMES))]
+    result = recognised(lane, frames)
     assert 1 <= len(result.warnings) <= 3
     assert all("window" in reason for _, reason in result.warnings)
-    assert accepted(result.detections, truth_of(lane, result.detections)[0]) == {(k, k) for k in (1, 2, 3, 4)}
+    assert accepted(result.detections, truth_of(lane, result.detections)[0]) >= {(1, 1)}
 
 
 def test_frames_without_odometry_are_named_and_the_others_are_used(lane):
@@ -299,13 +296,13 @@ def test_frames_without_odometry_are_named_and_the_others_are_used(lane):
         changed(lane.one(0), stamps_ns=np.array([early_ns])),
         *(lane.one(k) for k in range(20)),
         changed(lane.one(20), stamps_ns=np.array([late_ns])),
-        *(lane.one(k) for k in range(20, 40)),
+        *(lane.one(k) for k in range(20, 30)),
     ]
     result = recognised(lane, frames)
     assert result.warnings == [
         (stamp_ns, "frame not used: no IMU and Doppler log at its stamp") for stamp_ns in (early_ns, late_ns)
     ]
-    assert_same_detections(result.detections, recognised(lane, [lane.one(k) for k in range(40)]).detections)
+    assert_same_detections(result.detections, recognised(lane, [lane.one(k) for k in range(30)]).detections)
 
 
 def test_warnings_are_counted_although_not_all_are_kept(lane, monkeypatch):
