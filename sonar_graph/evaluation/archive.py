@@ -15,7 +15,7 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.atomic import replacing
-from sonar_graph.evaluation.results import ErrorSeries, Kind, RunResult
+from sonar_graph.evaluation.results import ErrorSeries, Kind, MapSoFar, RunResult
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Trajectory
@@ -72,6 +72,8 @@ def run_arrays(run: RunResult, errors: dict[Kind, ErrorSeries]) -> Arrays:
     arrays = {"update_s": run.update_s}
     for kind in KINDS:
         arrays |= _pack(kind, getattr(run, kind)) | _pack(f"errors.{kind}", errors.get(kind))
+    for number, known in enumerate(run.maps):
+        arrays |= {f"maps.{number}.stamp_ns": np.asarray(known.stamp_ns)} | _pack(f"maps.{number}", known.landmarks)
     return arrays | _pack("landmarks", run.landmarks) | _pack("detections", run.detections)
 
 
@@ -86,10 +88,19 @@ def restore_run(run: RunResult, arrays: Arrays) -> RunResult:
         smoothed=_unpack("smoothed", Trajectory, arrays),
         landmarks=_unpack("landmarks", LandmarkMap, arrays),
         detections=_unpack("detections", DetectionLog, arrays),
+        maps=_restore_maps(arrays),
         update_s=arrays["update_s"],
         finish_s=run.finish_s,
         peak_memory_mb=run.peak_memory_mb,
     )
+
+
+def _restore_maps(arrays: Arrays) -> list[MapSoFar]:
+    """The maps of a run in order."""
+    maps: list[MapSoFar] = []
+    while (landmarks := _unpack(f"maps.{len(maps)}", LandmarkMap, arrays)) is not None:
+        maps.append(MapSoFar(int(arrays[f"maps.{len(maps)}.stamp_ns"]), landmarks))
+    return maps
 
 
 def restore_errors(arrays: Arrays) -> dict[Kind, ErrorSeries]:

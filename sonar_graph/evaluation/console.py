@@ -1,4 +1,4 @@
-"""The comparison in the terminal: the few numbers that are read first."""
+"""The comparison in the terminal: the few numbers that are read first, and the counterpart of a published table."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from sonar_graph.evaluation.landmark_table import PAPER, LandmarkTable, landmark_table
+from sonar_graph.evaluation.published_experiment import repeats_published
 from sonar_graph.evaluation.results import Comparison, RunResult
 from sonar_graph.evaluation.score_table import LABELS
 from sonar_graph.evaluation.wording import (
@@ -34,6 +36,10 @@ COLUMNS = {
 NEES_LEGEND = (
     f"NEES: 1 fits; ▲ above {TOLERATED_FACTOR:g} over-confident, ▼ below {1 / TOLERATED_FACTOR:g} over-cautious"
 )
+PUBLISHED_LEGEND = (
+    f"{PAPER}: landmarks and their errors from its Table I, last less first position from its section III; it measured "
+    "a vehicle in a real basin, whose true path it did not know.\nAll else: this run."
+)
 
 
 def summary(comparison: Comparison) -> Group:
@@ -52,6 +58,49 @@ def summary(comparison: Comparison) -> Group:
     for run in comparison.runs:
         table.add_row(Text(run.estimator), *(_cell(comparison, run, key) for key in columns))
     return Group(table, _notes(comparison))
+
+
+def published_counterpart(comparison: Comparison) -> Group | None:
+    """Table I of the 2014 paper and its counterpart; None where the run does not repeat that experiment.
+
+    The same numbers as in the report.
+    """
+    found = landmark_table(comparison) if repeats_published(comparison.sequence) else None
+    if found is None:
+        return None
+    return Group(_positions(found), _totals(found), Text(PUBLISHED_LEGEND))
+
+
+def _positions(found: LandmarkTable) -> Table:
+    """As in the paper: landmarks across; x and y of the truth and of each column down."""
+    table = _plain_table(
+        "Landmarks: position in metres (estimate minus truth)",
+        ["", *(row.label.removesuffix(", x") for row in found.positions[::2])],
+    )
+    for axis in (0, 1):
+        table.add_row(f"true {'xy'[axis]}", *(row.true for row in found.positions[axis::2]))
+    for column, name in enumerate(found.columns):
+        if found.has_map(column):
+            for axis in (0, 1):
+                table.add_row(f"{name} {'xy'[axis]}", *(row.cells[column] for row in found.positions[axis::2]))
+    return table
+
+
+def _totals(found: LandmarkTable) -> Table:
+    """What they come to: a column a quantity."""
+    table = _plain_table("", ["", "RMS", "RMS after\nSE(2)", "last less\nfirst x", "last less\nfirst y"])
+    table.add_row("true", *(row.true for row in found.totals))
+    for column, name in enumerate(found.columns):
+        table.add_row(name, *(row.cells[column] for row in found.totals))
+    return table
+
+
+def _plain_table(title: str, headings: list[str]) -> Table:
+    table = Table(title=Text(title, style="bold") if title else None, title_justify="left")
+    table.box, table.padding = SIMPLE_HEAD, (0, 1, 0, 0)
+    for number, heading in enumerate(headings):
+        table.add_column(heading, no_wrap=True, justify="right" if number else "left")
+    return table
 
 
 def _columns(comparison: Comparison) -> dict[str, str]:

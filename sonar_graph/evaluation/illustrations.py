@@ -15,7 +15,9 @@ from sonar_graph.evaluation.figures import (
     timing_figure,
     yaw_figure,
 )
+from sonar_graph.evaluation.growth_figure import enlargement, growth_figure
 from sonar_graph.evaluation.map_figure import map_figure, paths_cut_off
+from sonar_graph.evaluation.published_experiment import DURATION_S, MAP_TIMES_S, repeats_published
 from sonar_graph.evaluation.results import Comparison
 from sonar_graph.evaluation.svg import inline_svg
 from sonar_graph.evaluation.wording import finding, score_of, with_unit
@@ -44,6 +46,14 @@ def illustrations(comparison: Comparison) -> dict[str, Illustration]:
         _draw(comparison, "map", "Map", map_figure, _map_caption(comparison), "No run has a path to draw."),
         _draw(
             comparison,
+            "growth",
+            "Map as it grew",
+            growth_figure,
+            _growth_caption(comparison),
+            "No run kept its map on the way.",
+        ),
+        _draw(
+            comparison,
             "errors",
             "Error over time",
             error_figure,
@@ -56,7 +66,7 @@ def illustrations(comparison: Comparison) -> dict[str, Illustration]:
             "yaw",
             "Yaw over time",
             yaw_figure,
-            "Heading of the body's x axis, wrapped to ±180°, causal.",
+            "Heading of the body's x axis, wrapped to ±180°, causal." + _counterpart(comparison, "Fig. 5"),
             "No run has a path to draw.",
         ),
         _draw(
@@ -121,6 +131,26 @@ def _map_caption(comparison: Comparison) -> str:
     )
     gone = paths_cut_off(comparison)
     return f"{caption} Leaves the picture: {', '.join(gone)}." if gone else caption
+
+
+def _growth_caption(comparison: Comparison) -> str:
+    factor = enlargement(comparison)
+    drawn = "" if factor == 1 else f", drawn {factor} times as large"
+    caption = (
+        "Causal paths until the time T since start, and the landmarks as each estimator knew them then, not aligned. "
+        f"Ellipses hold 95 %{drawn}."
+    )
+    if not repeats_published(comparison.sequence):
+        return caption
+    caption += _counterpart(comparison, "Fig. 4")
+    if abs(comparison.sequence.duration_s - DURATION_S) < 1:
+        return caption
+    times = ", ".join(f"{time_s:g}" for time_s in MAP_TIMES_S)
+    return f"{caption} This run is shorter or longer: T are the fractions of it that {times} s are of {DURATION_S:g} s."
+
+
+def _counterpart(comparison: Comparison, figure: str) -> str:
+    return f" The counterpart of {figure} of the 2014 paper." if repeats_published(comparison.sequence) else ""
 
 
 def _in_numbers(comparison: Comparison, name: str) -> str:

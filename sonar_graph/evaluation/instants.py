@@ -1,4 +1,7 @@
-"""At which instants estimators are scored: the same for all, and nothing dropped without being counted."""
+"""At which instants estimators are scored: the same for all, and nothing dropped without being counted.
+
+And at which their maps are kept: those of the 2014 paper's Fig. 4, or the same fractions of another run.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sonar_graph.evaluation.published_experiment import DURATION_S, MAP_TIMES_S
 from sonar_graph.evaluation.results import RunResult
 from sonar_graph.measurements import Ints
 from sonar_graph.states import Trajectory
@@ -62,6 +66,14 @@ def scored_instants(asked_ns: Ints, truth: Trajectory, runs: list[RunResult]) ->
         gap_s=gap_s,
         not_estimated=int((covered & ~estimated).sum()),
     )
+
+
+def map_instants(asked_ns: Ints, start_ns: int) -> Ints:
+    """Of the instants asked for, those nearest to the published times scaled to the run's length; the last included."""
+    if not len(asked_ns):
+        return asked_ns
+    wanted_ns = start_ns + (asked_ns[-1] - start_ns) * np.array(MAP_TIMES_S) / DURATION_S
+    return np.unique(asked_ns[np.abs(asked_ns[None, :] - wanted_ns[:, None]).argmin(axis=1)])
 
 
 def gap_limit_s(truth: Trajectory) -> float:

@@ -39,7 +39,7 @@ def map_figure(comparison: Comparison) -> Figure | None:
     Axes are world x and y in metres at one scale, nothing is aligned. The view holds the truth, true landmarks and as
     much around them as `MARGIN` says; `paths_cut_off` names the runs that leave it.
     """
-    view = _view(comparison)
+    view = seen_from_above(comparison)
     if view is None:
         return None
     figure, axes = blank_panels(1, 1, (WIDTH_IN, WIDTH_IN))
@@ -48,7 +48,7 @@ def map_figure(comparison: Comparison) -> Figure | None:
     for index, run in enumerate(comparison.runs):
         _draw_paths(panel, run, index)
         _draw_landmarks(panel, run, index)
-    _label_landmarks(panel, comparison, view)
+    label_landmarks(panel, comparison, view)
     panel.set(xlim=view[:, 0], ylim=view[:, 1])
     panel.set_aspect("equal", adjustable="box")
     name_axes(panel, "world x (m)", "world y (m)")
@@ -67,7 +67,7 @@ def _height_in(panel: Axes, view: Floats) -> float:
 
 def paths_cut_off(comparison: Comparison) -> list[str]:
     """Names of runs whose path leaves the map's view."""
-    view = _view(comparison)
+    view = seen_from_above(comparison)
     if view is None:
         return []
     return [
@@ -90,8 +90,8 @@ def _paths(run: RunResult) -> list[Floats]:
     return [path.positions[:, :2] for path in (run.causal, run.smoothed) if path is not None and len(path)]
 
 
-def _view(comparison: Comparison) -> Floats | None:
-    """Lower left and upper right corner, shape (2, 2)."""
+def seen_from_above(comparison: Comparison) -> Floats | None:
+    """What a map shows, lower left and upper right corner, shape (2, 2); None where there is no path."""
     estimates = [path for run in comparison.runs for path in _paths(run)]
     sequence = comparison.sequence
     references = [sequence.truth.positions[:, :2]] if sequence.truth and len(sequence.truth) else []
@@ -115,7 +115,7 @@ def _box(points: Floats) -> Floats:
 def _draw_truth(panel: Axes, comparison: Comparison) -> None:
     truth, landmarks = comparison.sequence.truth, comparison.sequence.true_landmarks
     if truth is not None and len(truth):
-        x, y = _xy(truth)
+        x, y = horizontal(truth)
         panel.plot(x, y, color=TRUTH, linewidth=3.2, alpha=0.6, label="truth", solid_capstyle="round", zorder=1)
     if landmarks is not None and len(landmarks):
         x, y = landmarks.positions[:, 0], landmarks.positions[:, 1]
@@ -124,11 +124,11 @@ def _draw_truth(panel: Axes, comparison: Comparison) -> None:
 
 def _draw_paths(panel: Axes, run: RunResult, index: int) -> None:
     if run.causal is not None and len(run.causal):
-        x, y = _xy(run.causal)
+        x, y = horizontal(run.causal)
         label = f"{run.estimator}, causal"
         panel.plot(x, y, color=colour(index), linestyle=line_style(index), linewidth=1.3, label=label, zorder=3)
     if run.smoothed is not None and smoothed_differs(run):
-        x, y = _xy(run.smoothed)
+        x, y = horizontal(run.smoothed)
         label = f"{run.estimator}, smoothed"
         panel.plot(x, y, color=colour(index), linestyle=(0, (1, 1)), linewidth=1.9, alpha=0.75, label=label, zorder=2)
 
@@ -140,12 +140,13 @@ def _draw_landmarks(panel: Axes, run: RunResult, index: int) -> None:
     label = f"{run.estimator}, landmarks"
     marker = "os^Dv<"[index % 6]
     panel.plot(x, y, marker, color=colour(index), markersize=3.5, markerfacecolor="none", label=label, zorder=4)
-    for ellipse in _ellipses(run.landmarks, colour(index)):
+    for ellipse in ellipses(run.landmarks, colour(index)):
         panel.add_patch(ellipse)
 
 
-def _ellipses(landmarks: LandmarkMap, edge: str) -> list[Ellipse]:
-    scale = 2 * np.sqrt(chi2.ppf(ELLIPSE_PROBABILITY, 2))
+def ellipses(landmarks: LandmarkMap, edge: str, enlarged: float = 1.0) -> list[Ellipse]:
+    """What holds each landmark with `ELLIPSE_PROBABILITY`, horizontally; none where the covariance is unknown."""
+    scale = enlarged * 2 * np.sqrt(chi2.ppf(ELLIPSE_PROBABILITY, 2))
     ellipses = []
     for position, cov in zip(landmarks.positions, landmarks.covariances[:, :2, :2], strict=True):
         if not np.isfinite(cov).all():
@@ -159,7 +160,8 @@ def _ellipses(landmarks: LandmarkMap, edge: str) -> list[Ellipse]:
     return ellipses
 
 
-def _label_landmarks(panel: Axes, comparison: Comparison, view: Floats) -> None:
+def label_landmarks(panel: Axes, comparison: Comparison, view: Floats) -> None:
+    """Write identities beside landmarks that are in view: the true ones, or those of the first run that has any."""
     candidates = [comparison.sequence.true_landmarks, *(run.landmarks for run in comparison.runs)]
     landmarks = next((known for known in candidates if known is not None and len(known)), None)
     if landmarks is None:
@@ -179,6 +181,7 @@ def _label_landmarks(panel: Axes, comparison: Comparison, view: Floats) -> None:
             )
 
 
-def _xy(trajectory: Trajectory) -> tuple[Floats, Floats]:
+def horizontal(trajectory: Trajectory) -> tuple[Floats, Floats]:
+    """World x and y of as many poses as can be told apart."""
     rows = evenly(len(trajectory), PATH_POINTS)
     return trajectory.positions[rows, 0], trajectory.positions[rows, 1]

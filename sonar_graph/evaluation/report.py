@@ -13,6 +13,8 @@ from markupsafe import Markup
 
 from sonar_graph.evaluation.figure_style import ESTIMATOR_COLOURS
 from sonar_graph.evaluation.illustrations import illustrations
+from sonar_graph.evaluation.landmark_table import PAPER, landmark_table
+from sonar_graph.evaluation.published_experiment import repeats_published
 from sonar_graph.evaluation.recognition_section import recognition_content
 from sonar_graph.evaluation.results import Comparison, RunResult
 from sonar_graph.evaluation.score_table import score_blocks
@@ -56,6 +58,8 @@ def _content(comparison: Comparison) -> dict[str, Any]:
         "blocks": score_blocks(comparison),
         "nees_limits": [f"{1 / TOLERATED_FACTOR:g}", f"{TOLERATED_FACTOR:g}"],
         "figures": illustrations(comparison),
+        "landmarks": landmark_table(comparison),
+        "paper": PAPER if repeats_published(comparison.sequence) else "",
         "outcomes": _outcomes(comparison),
         "recognition": recognition_content(comparison),
         "files": {run.estimator: _files(run) for run in comparison.runs},

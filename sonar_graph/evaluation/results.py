@@ -16,6 +16,14 @@ Kind = Literal["causal", "smoothed"]
 
 
 @dataclass(frozen=True, eq=False)
+class MapSoFar:
+    """The map as an estimator knew it at an instant of its run."""
+
+    stamp_ns: int
+    landmarks: LandmarkMap
+
+
+@dataclass(frozen=True, eq=False)
 class RunResult:
     """One estimator's run over one sequence. A failed run is a result too, with its reason."""
 
@@ -31,6 +39,8 @@ class RunResult:
     """What `trajectory` returned at the end: the same instants. A filter's is its causal one."""
     landmarks: LandmarkMap | None = None
     detections: DetectionLog | None = None
+    maps: list[MapSoFar] = field(default_factory=list)
+    """The map at `map_instants`, in order; the last one is `landmarks`."""
     update_s: Floats = field(default_factory=lambda: np.empty(0))
     """Duration of each call of `process`, shape (n,)."""
     finish_s: float = 0.0

@@ -13,9 +13,10 @@ import numpy as np
 from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 from sonar_graph.estimator import Estimator, load_estimator, make_params
+from sonar_graph.evaluation.instants import map_instants
 from sonar_graph.evaluation.memory import PeakMemory
 from sonar_graph.evaluation.outcome import check_estimate, check_outcome
-from sonar_graph.evaluation.results import RunResult
+from sonar_graph.evaluation.results import MapSoFar, RunResult
 from sonar_graph.measurements import Ints, Measurements
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Estimate, Trajectory
@@ -40,7 +41,8 @@ def run_estimator(
 
     The log is cut into steps before the clock starts, and a second instance of the estimator takes the first of them,
     so that compiling at a first call is not counted. Only calls of the estimator are timed, with everything that these
-    cause.
+    cause. The map is kept at `map_instants`; asking for it before the end is not timed, and changes nothing in an
+    estimator that keeps its contract.
 
     Parameters
     ----------
@@ -97,6 +99,9 @@ class _Replay:
         self._params = params
         self._estimates: list[Estimate] = []
         self._update_s: list[float] = []
+        ends_ns = np.array([step.end_ns for step in steps], dtype=np.int64)
+        self._map_at_ns = set(map_instants(ends_ns, sequence.start_ns).tolist()[:-1])
+        self._maps: list[MapSoFar] = []
         self._stage = "at the start"
 
     def run(self, kind: type[Estimator], progress: Callable[[int, int], None] | None) -> RunResult:
@@ -128,6 +133,8 @@ class _Replay:
             check_estimate(estimate, step.end_ns)
             if estimate is not None:
                 self._estimates.append(estimate)
+                if step.end_ns in self._map_at_ns:
+                    self._maps.append(MapSoFar(step.end_ns, estimator.landmarks()))
             if progress:
                 progress(done, len(self._steps))
 
@@ -140,12 +147,14 @@ class _Replay:
         self._stage = "at the end, outcome checked"
         causal = Trajectory.from_estimates(self._estimates)
         check_outcome(causal, smoothed, landmarks)
+        self._maps.append(MapSoFar(int(causal.stamps_ns[-1]), landmarks))
         return self._result(
             "ok",
             causal=causal,
             smoothed=smoothed,
             landmarks=landmarks,
             detections=detections,
+            maps=self._maps,
             finish_s=finish_s,
             peak_memory_mb=peak_memory_mb,
         )
