@@ -1,0 +1,199 @@
+"""AcTag fiducials in sonar images, decoded by AcTag's own detector (the extra ``actag``).
+
+AcTag wants rows and columns that are equally spaced in range and azimuth, the farthest range and the leftmost azimuth
+first, and its filters have a size in pixels. Frames are therefore sampled anew: by the log's own table of beams, and
+with as many pixels a bit of the tag as `AcTagSettings.pixels_per_bit` says. Each frame stands for itself: AcTag has
+neither tracks nor probabilities.
+
+Source: K. Norman, D. Butterfield, J. Mangelson, "AcTag: Opti-Acoustic Fiducial Markers for Underwater Localization and
+Mapping", IROS 2023; PyPI ``actag`` (BSD-2-Clause).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from sonar_graph.calibration import Calibration, Section
+from sonar_graph.errors import CalibrationError
+from sonar_graph.measurements import Floats, LandmarkDetections, SonarFrames
+from sonar_graph.sonar.frame_check import FrameCheck
+from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar.recogniser import REPORTED, Fate
+from sonar_graph.sonar.tracks import SonarStep
+
+INSTALL = "pip install 'sonar-graph[actag]'"
+BITS_OF_INNER_SQUARE = 3
+"""Of a tag with 24 bits, which is 7 bits wide."""
+COUNTS_A_DECIBEL = 255 / 80
+"""AcTag's threshold has an offset of one count; so fine is a DIDSON's or ARIS' scale."""
+SEED = 1
+"""AcTag fits quadrilaterals to random points; the same frame gives the same tags."""
+
+
+class AcTagSettings(Section):
+    """Which tags there are, and how AcTag is used."""
+
+    family: str = "AcTag24h10"
+    """AcTag24h4, 24h6, 24h8 or 24h10: bits, and the least number of bits in which two tags differ."""
+    tag_size_m: float = Field(0.1306, gt=0)
+    """Side of the inner square; the whole tag is 7/3 of it."""
+    bit_corrections: int = Field(4, ge=0)
+    """Wrong bits that are put right: fewer than half of those in which two tags differ."""
+    pixels_per_bit: float = Field(8.0, ge=4)
+    """Size of a bit in the image that AcTag gets."""
+    probability: float = Field(0.99, gt=0, lt=1)
+    """Posterior of a decoded identity."""
+    range_sigma_m: float = Field(0.01, gt=0)
+    """Of a tag's centre."""
+    azimuth_sigma_rad: float = Field(0.005, gt=0)
+    """The same in azimuth."""
+
+
+class Tag(NamedTuple):
+    """A decoded tag, and where its centre is."""
+
+    id: int
+    range_m: float
+    azimuth_rad: float
+
+
+class AcTagRecogniser:
+    """Recognises AcTags, one frame after another, as `sonar_graph.sonar.recogniser.Recogniser` does its landmarks.
+
+    Parameters
+    ----------
+    calibration
+        Of the sonar: the scale of its samples.
+    settings
+        None: the defaults.
+
+    Raises
+    ------
+    CalibrationError
+        When AcTag is not installed, or refuses the settings.
+    """
+
+    def __init__(self, calibration: Calibration, settings: AcTagSettings | None = None) -> None:
+        self.settings = settings or AcTagSettings()
+        self._image = calibration.sonar.image
+        self._check = FrameCheck(calibration.sonar.image)
+        self._make = _actag()
+        try:
+            self._detector(np.array([1.0, 2.0]), np.array([-0.25, 0.25]))
+        except (ValueError, FileNotFoundError) as error:
+            raise CalibrationError(f"AcTag: family {self.settings.family}: {error}") from error
+        self.fates: list[Fate] = []
+        """What became of everything in the frame last processed."""
+
+    def process(
+        self, frame: SonarFrames, motion: SonarStep | None = None, view: FloorView | None = None
+    ) -> LandmarkDetections | None:
+        """The tags in a block of one frame; AcTag has no use for motion and floor."""
+        del motion, view
+        stamp_ns = int(frame.stamps_ns[0])
+        if (fault := self._check.fault(frame)) is not None:
+            self.fates = [Fate(stamp_ns, -1, np.nan, np.nan, f"frame not used: {fault}")]
+            return None
+        first: dict[int, Tag] = {}
+        self.fates = []
+        for tag in self._decoded(frame):
+            outcome = "not reported: decoded already in this frame" if tag.id in first else REPORTED
+            self.fates.append(Fate(stamp_ns, -1, tag.range_m, tag.azimuth_rad, outcome))
+            first.setdefault(tag.id, tag)
+        if self._check.change is not None:
+            self.fates.append(Fate(stamp_ns, -1, np.nan, np.nan, self._check.change))
+        return self._detections(stamp_ns, list(first.values())) if first else None
+
+    def notes(self) -> dict[str, str]:
+        """How detections come about, for a log's notes."""
+        return {
+            "detections.rule": "AcTag, each frame for itself",
+            "detections.designs": f"{self.settings.family}, inner square {self.settings.tag_size_m:g} m",
+        }
+
+    def _decoded(self, frame: SonarFrames) -> list[Tag]:
+        bit_m = self.settings.tag_size_m / BITS_OF_INNER_SQUARE
+        image_db = self._image.decibels(frame.intensity[0])
+        picture_db, rows_m, columns_rad = evenly_sampled(
+            image_db, frame.ranges_m, frame.azimuths_rad, bit_m / self.settings.pixels_per_bit
+        )
+        counts = np.clip(np.rint(picture_db * COUNTS_A_DECIBEL), 0, 255).astype(np.int64)
+        found = self._detector(rows_m, columns_rad).run_detection(counts)
+        return [Tag(int(id_), *np.mean(range_azimuth, axis=0).tolist()) for id_, _, range_azimuth in found]
+
+    def _detector(self, rows_m: Floats, columns_rad: Floats) -> Any:
+        return self._make(
+            min_range=float(rows_m.min()),
+            max_range=float(rows_m.max()),
+            horizontal_aperture=float(np.ptp(columns_rad)),
+            tag_family=self.settings.family,
+            tag_size=self.settings.tag_size_m,
+            decoding_num_bit_corrections=self.settings.bit_corrections,
+            quads_random_seed=SEED,
+        )
+
+    def _detections(self, stamp_ns: int, tags: list[Tag]) -> LandmarkDetections:
+        settings, n = self.settings, len(tags)
+        covariance = np.diag([settings.range_sigma_m**2, settings.azimuth_sigma_rad**2])
+        return LandmarkDetections(
+            stamps_ns=np.full(n, stamp_ns),
+            range_m=np.array([tag.range_m for tag in tags]),
+            azimuth_rad=np.array([tag.azimuth_rad for tag in tags]),
+            range_azimuth_cov=np.tile(covariance, (n, 1, 1)),
+            candidate_ids=np.array([[tag.id] for tag in tags]),
+            id_probability=np.full((n, 1), settings.probability),
+        )
+
+
+def evenly_sampled(
+    image_db: NDArray[np.float32], ranges_m: Floats, azimuths_rad: Floats, pixel_m: float
+) -> tuple[NDArray[np.float32], Floats, Floats]:
+    """A polar image on equally spaced ranges and azimuths, as long and (in the middle of the window) as wide.
+
+    Levels are averaged over as many bins as a pixel covers, and interpolated between beams.
+
+    Parameters
+    ----------
+    image_db
+        Shape (beams, bins).
+    ranges_m, azimuths_rad
+        Of bins (equally spaced) and beams (in any order, however spaced).
+    pixel_m
+        Side of a pixel.
+
+    Returns
+    -------
+    picture_db
+        Shape (rows, columns).
+    rows_m
+        Range of each row, farthest first.
+    columns_rad
+        Azimuth of each column, leftmost first, positive to the left and 0 in the middle as AcTag has it.
+    """
+    first_m, last_m = float(ranges_m[0]), float(ranges_m[-1])
+    widest_rad = float(np.abs(azimuths_rad).max())
+    rows_m = np.linspace(last_m, first_m, max(2, round((last_m - first_m) / pixel_m)))
+    columns = max(2, round(2 * widest_rad * 0.5 * (first_m + last_m) / pixel_m))
+    columns_rad = np.linspace(widest_rad, -widest_rad, columns)
+    order = np.argsort(azimuths_rad)
+    bin_m = (last_m - first_m) / (len(ranges_m) - 1)
+    smooth_db = cv2.blur(image_db, (max(1, round(pixel_m / bin_m)), 1))
+    bins = np.repeat(((rows_m - first_m) / bin_m)[:, None], columns, axis=1).astype(np.float32)
+    beams = np.repeat(np.interp(columns_rad, azimuths_rad[order], order)[None], len(rows_m), axis=0).astype(np.float32)
+    picture = cv2.remap(smooth_db, bins, beams, cv2.INTER_LINEAR)
+    return np.asarray(picture, np.float32), rows_m, columns_rad
+
+
+def _actag() -> Callable[..., Any]:
+    """AcTag's class."""
+    try:
+        return import_module("actag").AcTag
+    except ImportError as error:
+        raise CalibrationError(f"recognising AcTags needs the package actag: {INSTALL} ({error})") from error

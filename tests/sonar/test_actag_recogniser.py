@@ -1,0 +1,169 @@
+from __future__ import annotations
+
+import sys
+from types import ModuleType, SimpleNamespace
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.errors import CalibrationError
+from sonar_graph.measurements import SonarFrames
+from sonar_graph.simulation.image_options import ImageOptions
+from sonar_graph.simulation.imaging_sonar import DIDSON
+from sonar_graph.simulation.seabed import place_landmark
+from sonar_graph.simulation.sonar_image import FrameSimulator
+from sonar_graph.sonar.actag_recogniser import AcTagRecogniser, AcTagSettings, evenly_sampled
+from sonar_graph.sonar.recogniser import REPORTED
+
+from .actag_pictures import FAMILY, tag_design
+
+RANGES_M, AZIMUTHS_RAD = DIDSON.ranges_m(), DIDSON.azimuths_rad()
+
+
+class Decoder:
+    """In place of AcTag: gives what it is told, and remembers what it was given."""
+
+    found: ClassVar[list[list[Any]]] = []
+    settings: ClassVar[dict[str, Any]] = {}
+    image: ClassVar[np.ndarray | None] = None
+
+    def __init__(self, **settings: Any) -> None:
+        if settings["tag_family"] != FAMILY:
+            raise FileNotFoundError(f"no {settings['tag_family']}")
+        Decoder.settings = settings
+
+    def run_detection(self, image: np.ndarray) -> list[list[Any]]:
+        Decoder.image = image
+        return Decoder.found
+
+
+@pytest.fixture
+def decoder(monkeypatch: pytest.MonkeyPatch) -> type[Decoder]:
+    module = ModuleType("actag")
+    module.AcTag = Decoder  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "actag", module)
+    Decoder.found, Decoder.image = [], None
+    return Decoder
+
+
+def frame_of(image: np.ndarray, stamp_ns: int = 5) -> SonarFrames:
+    return SonarFrames(np.array([stamp_ns]), image[None], RANGES_M, AZIMUTHS_RAD)
+
+
+def noise(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 200, (96, 512)).astype(np.uint8)
+
+
+def test_a_bright_spot_stays_where_it_is_though_beams_are_not_equally_spaced():
+    spot_m, spot_rad = 1.9, np.radians(7.0)
+    beams, bins = np.meshgrid(AZIMUTHS_RAD, RANGES_M, indexing="ij")
+    image = np.exp(-(((beams - spot_rad) / 0.01) ** 2) - ((bins - spot_m) / 0.02) ** 2).astype(np.float32)
+    picture, rows_m, columns_rad = evenly_sampled(image, RANGES_M, AZIMUTHS_RAD, 0.005)
+    row, column = np.unravel_index(np.argmax(picture), picture.shape)
+    assert rows_m[row] == pytest.approx(spot_m, abs=0.004)
+    assert columns_rad[column] == pytest.approx(spot_rad, abs=0.002)
+    as_if_even = np.linspace(AZIMUTHS_RAD[0], AZIMUTHS_RAD[-1], 96)[np.argmax(image.max(axis=1))]
+    assert abs(as_if_even - spot_rad) > np.radians(0.8)
+
+
+def test_the_farthest_range_and_the_leftmost_beam_come_first_and_pixels_are_square():
+    _, rows_m, columns_rad = evenly_sampled(noise().astype(np.float32), RANGES_M, AZIMUTHS_RAD, 0.005)
+    assert rows_m[0] == RANGES_M[-1]
+    assert rows_m[-1] == RANGES_M[0]
+    assert columns_rad[0] == pytest.approx(-columns_rad[-1])
+    assert columns_rad[0] == AZIMUTHS_RAD.max()
+    assert -np.diff(rows_m)[0] == pytest.approx(0.005, rel=0.02)
+    assert -np.diff(columns_rad)[0] * RANGES_M.mean() == pytest.approx(0.005, rel=0.02)
+
+
+def test_beams_in_reverse_order_give_the_same_picture():
+    image = noise().astype(np.float32)
+    forth, *_ = evenly_sampled(image, RANGES_M, AZIMUTHS_RAD, 0.005)
+    back, *_ = evenly_sampled(image[::-1].copy(), RANGES_M, AZIMUTHS_RAD[::-1], 0.005)
+    np.testing.assert_allclose(forth, back, atol=1e-3)
+
+
+def test_a_decoded_tag_becomes_a_detection_of_its_centre(decoder):
+    corners = np.array([[1.9, 0.10], [2.0, 0.11], [2.02, 0.02], [1.92, 0.01]])
+    decoder.found = [[3, corners * 0, corners]]
+    recogniser = AcTagRecogniser(Calibration(), AcTagSettings(probability=0.97, range_sigma_m=0.02))
+    found = recogniser.process(frame_of(noise()))
+    assert found is not None
+    assert found.range_m == pytest.approx([1.96])
+    assert found.azimuth_rad == pytest.approx([0.06])
+    assert found.candidate_ids.tolist() == [[3]]
+    assert found.id_probability.tolist() == [[0.97]]
+    assert found.range_azimuth_cov[0] == pytest.approx(np.diag([0.02**2, 0.005**2]))
+    assert found.stamps_ns.tolist() == [5]
+    assert [fate.outcome for fate in recogniser.fates] == [REPORTED]
+    assert decoder.settings["min_range"] == pytest.approx(RANGES_M[0])
+    assert decoder.settings["max_range"] == pytest.approx(RANGES_M[-1])
+    assert decoder.settings["horizontal_aperture"] == pytest.approx(2 * AZIMUTHS_RAD.max())
+    assert decoder.image.shape == pytest.approx([1.25 / 0.00544, 0.497 * 1.885 / 0.00544], rel=0.01)
+
+
+def test_a_tag_is_reported_once_a_frame(decoder):
+    corners = np.full((4, 2), [2.0, 0.0])
+    decoder.found = [[3, corners, corners], [3, corners, corners + 0.1], [4, corners, corners]]
+    recogniser = AcTagRecogniser(Calibration())
+    found = recogniser.process(frame_of(noise()))
+    assert found is not None
+    assert found.candidate_ids.ravel().tolist() == [3, 4]
+    assert [fate.outcome for fate in recogniser.fates].count(REPORTED) == 2
+    assert any("already" in fate.outcome for fate in recogniser.fates)
+
+
+def test_a_frame_without_tags_gives_nothing(decoder):
+    assert AcTagRecogniser(Calibration()).process(frame_of(noise())) is None
+
+
+def test_a_frame_that_must_not_be_used_is_not_shown_to_actag(decoder):
+    recogniser = AcTagRecogniser(Calibration())
+    assert recogniser.process(frame_of(np.zeros((96, 512), np.uint8))) is None
+    assert decoder.image is None
+    assert "zero" in recogniser.fates[0].outcome
+
+
+def test_an_unknown_family_is_refused_by_name(decoder):
+    with pytest.raises(CalibrationError, match="AcTag99h1"):
+        AcTagRecogniser(Calibration(), AcTagSettings(family="AcTag99h1"))
+
+
+def test_without_the_package_the_error_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "actag", None)
+    with pytest.raises(CalibrationError, match=r"sonar-graph\[actag\]"):
+        AcTagRecogniser(Calibration())
+
+
+@pytest.mark.parametrize("tag", range(7))
+def test_actag_itself_reads_tags_in_simulated_frames(tag):
+    pytest.importorskip("actag", reason="AcTag has wheels for Linux with Python 3.10 and 3.11 only: extra actag")
+    seen = [simulated(tag, number) for number in range(3)]
+    right = [(frame, truth) for frame, truth in seen if decoded_ids(frame) == [tag]]
+    assert len(right) >= 2
+    for frame, truth in right:
+        found = AcTagRecogniser(Calibration()).process(frame)
+        assert found is not None
+        assert found.range_m[0] == pytest.approx(truth.range_m, abs=0.015)
+        assert found.azimuth_rad[0] == pytest.approx(truth.azimuth_rad, abs=0.004)
+
+
+def decoded_ids(frame: SonarFrames) -> list[int]:
+    found = AcTagRecogniser(Calibration()).process(frame)
+    return [] if found is None else found.candidate_ids.ravel().tolist()
+
+
+def simulated(tag: int, number: int) -> tuple[SonarFrames, SimpleNamespace]:
+    """A tag on the floor of a basin, seen from a height of 0.95 m, and where it is."""
+    rng = np.random.default_rng([tag, number])
+    floor_m, centre_m = -1.7, np.array([11.7, 7.0 + rng.uniform(-0.1, 0.1), -1.687])
+    design = place_landmark(tag_design(tag, 0.1306), centre_m, rng.uniform(-np.pi, np.pi), floor_m)
+    simulator = FrameSimulator(ImageOptions(), [design], floor_m, seed=tag)
+    sonar_m = np.array([10.0 + 0.1 * (number - 1), 7.0, floor_m + 0.95])
+    world_R_sonar = Rotation.from_euler("ZYX", [0, np.radians(30), 0])
+    image = simulator.frame(sonar_m, world_R_sonar, number, 0.0)
+    q = world_R_sonar.inv().apply(centre_m - sonar_m)
+    return frame_of(image), SimpleNamespace(range_m=np.linalg.norm(q), azimuth_rad=np.arctan2(q[1], q[0]))
