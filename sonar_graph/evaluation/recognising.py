@@ -18,6 +18,7 @@ from sonar_graph.evaluation.sonar_motion import SonarMotion, SonarMotions
 from sonar_graph.landmark_designs import LandmarkDesign
 from sonar_graph.logs.adapters.config import LogConfig
 from sonar_graph.logs.sonar_reading import read_sonar_frames
+from sonar_graph.logs.window import Window
 from sonar_graph.measurements import LandmarkDetections, SonarFrames
 from sonar_graph.sequence import NS_PER_S
 from sonar_graph.sequence import Sequence as Run
@@ -40,6 +41,8 @@ def recognise(
     config: LogConfig | None = None,
     designs: Sequence[LandmarkDesign] | None = None,
     params: RecogniserParams | None = None,
+    window: Window | None = None,
+    salvage: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> Recognition | None:
     """Recognise landmarks in the sonar images of a log.
@@ -54,6 +57,8 @@ def recognise(
         As of `read_sonar_frames`.
     designs, params
         As of `Recogniser`.
+    window, salvage
+        As of `read_sequence`, and as the sequence was read.
     progress
         Called with the number of frames done.
 
@@ -69,9 +74,9 @@ def recognise(
     CalibrationError
         When designs and measured model do not belong together.
     """
-    frames = (frame for block in read_sonar_frames(log, topic, config) for frame in one_by_one(block))
     session = RecognitionSession(sequence, designs, params)
-    for frame in frames:
+    blocks = read_sonar_frames(log, topic, config, window=window, salvage=salvage, refused=session.refuse)
+    for frame in (frame for block in blocks for frame in one_by_one(block)):
         session.take(frame)
         if progress is not None:
             progress(session.result.frames)
@@ -133,6 +138,11 @@ class RecognitionSession:
         if self._draws:
             self._draw(frame, found)
         return found
+
+    def refuse(self, stamp_ns: int, reason: str) -> None:
+        """Count a message that is no frame."""
+        self.result.frames += 1
+        self._warn(stamp_ns, f"frame not used: {reason}")
 
     def finish(self) -> Recognition:
         """All that was gathered."""
