@@ -239,9 +239,13 @@ def _write_report(comparison: Comparison, folder: Path) -> Path:
 
 
 def _print_summary(comparison: Comparison) -> None:
-    from sonar_graph.evaluation.console import summary
+    from sonar_graph.evaluation.console import published_counterpart, summary
 
-    answers().print(summary(comparison))
+    out = answers()
+    out.print(summary(comparison))
+    counterpart = published_counterpart(comparison)
+    if counterpart is not None:
+        out.print(counterpart)
 
 
 def _exit_by(comparison: Comparison) -> None:
