@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sonar_graph.cli.arguments import CalibrationPath, LogConfigPath, LogPath, OutputLog, Overwrite, TopicChoices
+from sonar_graph.cli.arguments import (
+    CalibrationPath,
+    LogConfigPath,
+    LogPath,
+    OutputLog,
+    Overwrite,
+    Salvage,
+    TopicChoices,
+)
 from sonar_graph.cli.outputs import writable_json, writable_log
 from sonar_graph.cli.progress import progress_bars, working
 from sonar_graph.cli.settings import read_calibration, read_config, topic_choices
@@ -17,10 +26,14 @@ from sonar_graph.errors import LogError
 if TYPE_CHECKING:
     from sonar_graph.evaluation.recognition import Recognition
     from sonar_graph.landmark_designs import LandmarkDesign
+    from sonar_graph.logs.amending import Amended
     from sonar_graph.sequence import Sequence
     from sonar_graph.sonar.recogniser import RecogniserParams
 
 TOPIC = "/sonar/landmarks"
+RECORD = "sonar_graph_recognition"
+"""The metadata record with what became of every frame."""
+MOST_WARNINGS_SHOWN = 10
 
 DesignsPath = Annotated[
     Path | None,
@@ -56,15 +69,17 @@ def recognise(
     calibration: CalibrationPath = None,
     topics: TopicChoices = None,
     log_config: LogConfigPath = None,
+    salvage: Salvage = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Recognise landmarks in a log's sonar images; write the log anew with the detections in it."""
-    from sonar_graph.logs.amending import write_amended
-    from sonar_graph.logs.encoding import detection_messages
+    """Recognise landmarks in a log's sonar images; write the log anew with the detections in it.
 
+    Detections that an earlier recognise put into the log are replaced.
+    """
     path = writable_log(output, log, overwrite=overwrite)
     choices, config = topic_choices(topics or []), read_config(log_config)
-    sequence = _read(log, calibration, {r: t for r, t in choices.items() if r != "sonar"}, log_config)
+    others = {role: topic for role, topic in choices.items() if role != "sonar"}
+    sequence = _read(log, calibration, others, log_config, salvage=salvage)
     from sonar_graph.evaluation.recognising import recognise as recognise_log
 
     with progress_bars() as progress:
@@ -75,13 +90,18 @@ def recognise(
             config=config,
             designs=_designs(designs),
             params=recogniser_params(model, rule),
+            salvage=salvage,
             progress=lambda done: progress("recognising", done, 0),
         )
     if found is None:
         raise LogError(f"{log}: has no sonar images; `sonar-graph inspect {log}` lists what it has")
     with working("writing"):
-        write_amended(log, path, detection_messages(TOPIC, found.detections) if found.detections else [])
-    print_outcomes(found)
+        amended = _write(log, path, found, salvage=salvage)
+    print_outcomes(found, sequence.start_ns)
+    for topic, count in amended.replaced.items():
+        typer.echo(f"Replaced: {count} messages that the log had on {topic}")
+    for note in amended.notes.values():
+        typer.echo(f"Not copied: {note}")
     typer.echo(f"Log: {path}")
 
 
@@ -128,12 +148,33 @@ def recogniser_params(model: Path | None, rule: str) -> RecogniserParams:
     return RecogniserParams(identity=identity, confusion=None if model is None else read_confusion(model))
 
 
-def print_outcomes(found: Recognition) -> None:
-    """What became of everything, on stdout."""
+def print_outcomes(found: Recognition, start_ns: int) -> None:
+    """What became of everything, on stdout; warnings with seconds after the start."""
     out = answers()
     out.print(f"{found.frames} frames, {0 if found.detections is None else len(found.detections)} detections")
     for outcome, count in found.outcomes.most_common():
         out.print(f"  {count:6d}  {outcome}")
+    for stamp_ns, reason in found.warnings[:MOST_WARNINGS_SHOWN]:
+        out.print(f"Warning: {(stamp_ns - start_ns) * 1e-9:.3f} s: {reason}")
+    if (more := sum(found.warned().values()) - MOST_WARNINGS_SHOWN) > 0:
+        out.print(f"Warning: {more} more such rows; with their stamps in the log's metadata record {RECORD}")
+
+
+def _write(log: Path, path: Path, found: Recognition, *, salvage: bool) -> Amended:
+    """The log with the detections, and with how they came about in its notes."""
+    from sonar_graph.logs.amending import write_amended
+    from sonar_graph.logs.encoding import detection_messages
+    from sonar_graph.logs.log_record import METADATA, with_notes
+    from sonar_graph.logs.roles import DETECTIONS
+
+    return write_amended(
+        log,
+        path,
+        detection_messages(TOPIC, found.detections) if found.detections else [],
+        anew={TOPIC: DETECTIONS},
+        metadata={METADATA: with_notes(log, found.notes), RECORD: {"recognition": json.dumps(found.entry())}},
+        salvage=salvage,
+    )
 
 
 def _designs(path: Path | None) -> tuple[LandmarkDesign, ...] | None:
@@ -142,8 +183,10 @@ def _designs(path: Path | None) -> tuple[LandmarkDesign, ...] | None:
     return None if path is None else load_designs(path)
 
 
-def _read(log: Path, calibration: Path | None, topics: dict[str, str], log_config: Path | None) -> Sequence:
+def _read(
+    log: Path, calibration: Path | None, topics: dict[str, str], log_config: Path | None, *, salvage: bool = False
+) -> Sequence:
     from sonar_graph.logs.reading import read_sequence
 
-    config = read_config(log_config)
-    return read_sequence(log, calibration=read_calibration(calibration), topics=topics, config=config)
+    given, config = read_calibration(calibration), read_config(log_config)
+    return read_sequence(log, calibration=given, topics=topics, config=config, salvage=salvage)

@@ -35,11 +35,22 @@ class Recognition:
     outcomes: Counter[str] = field(default_factory=Counter)
     """How often each thing became of a candidate, track or frame."""
     warnings: list[tuple[int, str]] = field(default_factory=list)
-    """Stamp and reason of the first frames that were not used."""
+    """Stamp and reason: frames that were not used, and changes of the sonar's window; the first of each reason, and of
+    all others the earliest."""
     pictures: list[DrawnFrame] = field(default_factory=list)
     """Evenly over the run."""
     notes: dict[str, str] = field(default_factory=dict)
     """Which model and settings."""
+
+    def warned(self) -> dict[str, int]:
+        """How often frames were warned about, by reason; most frequent first."""
+        reasons = {reason for _, reason in self.warnings}
+        return {outcome: count for outcome, count in self.outcomes.most_common() if outcome in reasons}
+
+    def entry(self) -> dict[str, Any]:
+        """All but detections and pictures, as it stands in JSON."""
+        outcomes = dict(self.outcomes.most_common())
+        return {"frames": self.frames, "outcomes": outcomes, "warnings": self.warnings, "notes": self.notes}
 
     def shown(self) -> list[DrawnFrame]:
         """The surest picture of each landmark, at most six, in order of identity."""
@@ -62,14 +73,8 @@ def write_recognition(recognition: Recognition | None, folder: Path) -> None:
     shown = recognition.shown()
     for picture in shown:
         (folder / PICTURES / f"{picture.stamp_ns}.jpg").write_bytes(picture.jpeg)
-    entry = {
-        "frames": recognition.frames,
-        "outcomes": dict(recognition.outcomes.most_common()),
-        "warnings": recognition.warnings,
-        "notes": recognition.notes,
-        "pictures": [[p.stamp_ns, p.landmark_ids, p.probabilities] for p in shown],
-    }
-    write_json(folder / RECOGNITION, entry)
+    pictures = [[p.stamp_ns, p.landmark_ids, p.probabilities] for p in shown]
+    write_json(folder / RECOGNITION, recognition.entry() | {"pictures": pictures})
 
 
 def read_recognition(folder: Path) -> Recognition | None:

@@ -30,6 +30,8 @@ class Descriptions:
         self._channels: dict[int, tuple[Channel, bool]] = {}
         self.by_channel: dict[int, Topic] = {}
         self.by_name: dict[str, Topic] = {}
+        self.as_written: dict[str, tuple[Channel, Schema]] = {}
+        """Each topic's channel and schema, byte by byte."""
         self.remarks: list[str] = []
 
     def add_summary(self, summary: Summary) -> None:
@@ -86,4 +88,5 @@ class Descriptions:
             keep=self._keep(schema.name),
             is_latched=channel.topic.endswith("_static") or bool(_TRANSIENT_LOCAL.search(offered)),
         )
+        self.as_written.setdefault(channel.topic, (channel, schema))
         return self.by_name.setdefault(channel.topic, topic)

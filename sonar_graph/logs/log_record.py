@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from pathlib import Path
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
-from sonar_graph.logs.container import Recording
+from sonar_graph.logs.container import Keep, Recording, scan
 
 METADATA = "sonar_graph"
 """The metadata record that carries name, calibration and notes."""
@@ -43,6 +45,25 @@ def read_notes(recording: Recording) -> dict[str, str]:
     if not isinstance(notes, dict):
         raise LogError(f"{recording.path}: metadata record {METADATA!r}: notes must be a JSON object")
     return {str(subject): str(note) for subject, note in notes.items()}
+
+
+def with_notes(path: Path, notes: Mapping[str, str]) -> dict[str, str]:
+    """A log's record as it is, with further notes.
+
+    Parameters
+    ----------
+    path
+        The log; one without a record is given one that holds only notes.
+    notes
+        By subject; they go before those of the log.
+
+    Raises
+    ------
+    LogError
+        When the log cannot be read, or its notes are no JSON object.
+    """
+    recording = scan(path, lambda _: Keep.NONE)
+    return recording.metadata.get(METADATA, {}) | {"notes": json.dumps(read_notes(recording) | dict(notes))}
 
 
 def _json(recording: Recording, key: str, text: str) -> object:

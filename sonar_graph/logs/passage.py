@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, Metadata
+from mcap.records import Channel, ChunkIndex, Metadata, Schema
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.chunks import (
@@ -74,6 +74,8 @@ class Passage:
     ) -> None:
         self.damage = Damage()
         self.metadata: dict[str, dict[str, str]] = {}
+        self.others: list[Record] = []
+        """Metadata that are whole, and attachments."""
         self.skipped = 0
         """Chunks passed over."""
         self.chunks = 0
@@ -101,6 +103,10 @@ class Passage:
     def topics(self) -> dict[str, Topic]:
         """All that are described, by name."""
         return self._described.by_name
+
+    def as_written(self, topic: str) -> tuple[Channel, Schema]:
+        """A topic's channel and schema."""
+        return self._described.as_written[topic]
 
     @property
     def counts(self) -> dict[str, int] | None:
@@ -258,8 +264,11 @@ class Passage:
                 self._lose(record.at, end, f"a metadata record is lost: {error}", messages={})
                 return
             self.metadata[found.name] = content
+            self.others.append(record)
             if not is_sealed:
                 self._unsealed.append(found.name)
+        elif record.opcode == Opcode.ATTACHMENT:
+            self.others.append(record)
         elif record.opcode >= PRIVATE:
             self._remark(f"bytes {record.at} to {record.end}: a record of private kind {record.opcode:#x}, not read")
 

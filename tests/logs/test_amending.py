@@ -1,0 +1,150 @@
+"""A log written anew: everything that was in it, and what was added; also where it is not whole."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from sonar_graph.errors import LogError
+from sonar_graph.logs.amending import write_amended
+from sonar_graph.logs.container import Keep, scan
+from sonar_graph.logs.encoding import landmark_map_message
+from sonar_graph.logs.recorder import Outgoing
+from sonar_graph.states import LandmarkMap
+
+MAP = "sonar_graph_msgs/msg/LandmarkMap"
+IMU_TEXT = b"float64 x"
+BINARY_SCHEMA = bytes(range(256))
+
+
+def foreign_log(path: Path, count: int = 400) -> Path:
+    """A log of another program: two encodings, publish times that differ, metadata and an attachment."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=2000, enable_data_crcs=True)
+        writer.start(profile="ros2", library="another")
+        text = writer.register_schema("a/msg/B", "ros2msg", IMU_TEXT)
+        binary = writer.register_schema("c.D", "protobuf", BINARY_SCHEMA)
+        one = writer.register_channel("/one", "cdr", text, {"offered_qos_profiles": "- {durability: 1}"})
+        other = writer.register_channel("/other", "protobuf", binary)
+        bare = writer.register_channel("/bare", "json", 0)
+        writer.add_metadata("about", {"ship": "Vessel"})
+        writer.add_attachment(1, 2, "notes.txt", "text/plain", b"of the dive")
+        for k in range(count):
+            writer.add_message(one, 10 * k, struct.pack("<Id", 256, k), 10 * k - (3 if k else 0), k)
+            writer.add_message((other, bare)[k % 2], 10 * k + 1, bytes([k % 256]) * (k % 50), 10 * k + 1, 7)
+        writer.finish()
+    return path
+
+
+def content(path: Path) -> dict[str, list]:
+    """All that a reader by another hand finds."""
+    found: dict[str, list] = {}
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        for schema, channel, message in reader.iter_messages():
+            described = (schema.name, schema.encoding, schema.data) if schema else None
+            entry = (message.log_time, message.publish_time, message.sequence, message.data)
+            found.setdefault(channel.topic, [(described, channel.message_encoding, channel.metadata)]).append(entry)
+        found["metadata"] = [(record.name, record.metadata) for record in reader.iter_metadata()]
+        found["attachments"] = [(a.name, a.media_type, a.log_time, a.data) for a in reader.iter_attachments()]
+    return found
+
+
+def landmarks(time_ns: int, topic: str = "/map") -> Outgoing:
+    known = LandmarkMap(np.array([3]), np.array([[1.0, 2.0, 3.0]]), np.eye(3)[None])
+    return landmark_map_message(topic, known, time_ns)
+
+
+def test_everything_is_there_byte_by_byte_and_what_was_added(tmp_path: Path) -> None:
+    source = foreign_log(tmp_path / "a.mcap")
+    amended = write_amended(source, tmp_path / "b.mcap", [landmarks(2005)], metadata={"more": {"key": "value"}})
+    before, after = content(source), content(tmp_path / "b.mcap")
+    assert after.pop("/map")[1][:2] == (2005, 2005)
+    (name, record) = after["metadata"].pop()
+    assert (name, record["key"]) == ("more", "value")
+    assert after == before
+    assert (amended.replaced, amended.notes) == ({}, {})
+
+
+def test_messages_lie_in_the_order_of_their_times(tmp_path: Path) -> None:
+    write_amended(foreign_log(tmp_path / "a.mcap"), tmp_path / "b.mcap", [landmarks(2005)])
+    with (tmp_path / "b.mcap").open("rb") as stream:
+        times_ns = [m.log_time for _, _, m in make_reader(stream).iter_messages(log_time_order=False)]
+    assert times_ns == sorted(times_ns)
+    assert 2005 in times_ns
+
+
+@pytest.mark.parametrize("share", [0.3, 0.77])
+def test_of_a_log_that_is_cut_off_what_is_whole_is_copied_and_the_end_is_named(tmp_path: Path, share: float) -> None:
+    whole = foreign_log(tmp_path / "a.mcap").read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole[: int(share * len(whole))])
+    amended = write_amended(cut, tmp_path / "b.mcap", [landmarks(15)])
+    assert "cut off" in amended.notes["log.ending"]
+    before, after = content(tmp_path / "a.mcap"), content(tmp_path / "b.mcap")
+    assert len(after["/map"]) == 2
+    for topic in ("/one", "/other", "/bare"):
+        assert after[topic] == before[topic][: len(after[topic])]
+        assert len(after[topic]) == 1 + len(scan(cut, lambda _: Keep.NONE).topics[topic])
+    assert 0.5 * share < (len(after["/one"]) - 1) / 400 < 1.5 * share
+    assert after["metadata"] == before["metadata"]
+    assert after["attachments"] == before["attachments"]
+    assert scan(tmp_path / "b.mcap", lambda _: Keep.NONE).ending is None
+
+
+def test_a_hole_is_refused_and_with_salvage_what_is_whole_is_copied(tmp_path: Path) -> None:
+    source = foreign_log(tmp_path / "a.mcap")
+    data = bytearray(source.read_bytes())
+    data[len(data) // 4] ^= 0xFF  # within a chunk
+    (tmp_path / "hole.mcap").write_bytes(data)
+    with pytest.raises(LogError, match=r"hole.mcap is damaged.*--salvage"):
+        write_amended(tmp_path / "hole.mcap", tmp_path / "b.mcap", [])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "hole.mcap"]
+    amended = write_amended(tmp_path / "hole.mcap", tmp_path / "b.mcap", [], salvage=True)
+    assert "lost" in amended.notes["log.damage"]
+    before, after = content(source), content(tmp_path / "b.mcap")
+    assert 300 < len(after["/one"]) < len(before["/one"])
+    assert all(message in before["/one"] for message in after["/one"])
+
+
+def test_a_topic_that_is_there_already_is_refused_unless_it_is_written_anew(tmp_path: Path) -> None:
+    source = foreign_log(tmp_path / "a.mcap")
+    once, twice = tmp_path / "once.mcap", tmp_path / "twice.mcap"
+    write_amended(source, once, [landmarks(5)])
+    with pytest.raises(LogError, match=r"/map .* is in the log already"):
+        write_amended(once, twice, [landmarks(6)])
+    amended = write_amended(once, twice, [landmarks(6)], anew={"/map": MAP})
+    assert amended.replaced == {"/map": 1}
+    assert [message[0] for message in content(twice)["/map"][1:]] == [6]
+
+
+def test_what_is_written_anew_is_gone_even_where_nothing_comes_in_its_place(tmp_path: Path) -> None:
+    write_amended(foreign_log(tmp_path / "a.mcap"), tmp_path / "once.mcap", [landmarks(5)])
+    write_amended(tmp_path / "once.mcap", tmp_path / "b.mcap", [], anew={"/map": MAP})
+    assert content(tmp_path / "b.mcap") == content(tmp_path / "a.mcap")
+
+
+def test_a_topic_of_another_type_is_never_replaced(tmp_path: Path) -> None:
+    source = foreign_log(tmp_path / "a.mcap")
+    with pytest.raises(LogError, match=r"/one \(a/msg/B\) is in the log already"):
+        write_amended(source, tmp_path / "b.mcap", [replace(landmarks(5), topic="/one")], anew={"/one": MAP})
+
+
+def test_a_log_is_never_written_over_itself(tmp_path: Path) -> None:
+    source = foreign_log(tmp_path / "a.mcap")
+    with pytest.raises(LogError, match="is the log itself"):
+        write_amended(source, source, [])
+
+
+def test_a_damaged_attachment_is_left_out_and_named(tmp_path: Path) -> None:
+    source = foreign_log(tmp_path / "a.mcap")
+    (tmp_path / "bad.mcap").write_bytes(source.read_bytes().replace(b"of the dive", b"of the dove"))
+    amended = write_amended(tmp_path / "bad.mcap", tmp_path / "b.mcap", [], salvage=True)
+    assert "damaged and left out" in amended.notes["log.attachments"]
+    assert content(tmp_path / "b.mcap")["attachments"] == []
