@@ -6,59 +6,22 @@ display only: nothing is measured in such a picture.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.measurements import LandmarkDetections
+from sonar_graph.sonar.geometry import Fan
 
 Picture = NDArray[np.uint8]
-PIXELS_HIGH = 420
 MARGIN = 6
 SURE = 0.9
 """Posterior from which on an identity is drawn as recognised."""
 RECOGNISED, DOUBTFUL = (60, 220, 255), (190, 190, 190)
 """Blue, green, red."""
 JPEG_QUALITY = 85
-
-
-@dataclass(frozen=True, eq=False)
-class Fan:
-    """Where each pixel of a picture lies in a polar image: range up, azimuth positive to the left."""
-
-    beam: NDArray[np.int32]
-    """Shape (height, width); -1 outside of the fan."""
-    bin: NDArray[np.int32]
-    """Shape (height, width)."""
-    pixels_per_m: float
-    lowest_m: float
-    """Distance ahead of the sonar at the lower edge."""
-    half_width_m: float
-
-    @classmethod
-    def of(cls, ranges_m: Floats, azimuths_rad: Floats) -> Fan:
-        """The fan of a sonar's beams and bins."""
-        r0, r1 = float(ranges_m.min()), float(ranges_m.max())
-        widest = float(np.abs(azimuths_rad).max())
-        lowest, half_width = r0 * np.cos(widest), r1 * np.sin(min(widest, np.pi / 2))
-        scale = PIXELS_HIGH / (r1 - lowest)
-        ahead = lowest + (np.arange(PIXELS_HIGH)[::-1, None] + 0.5) / scale
-        across = half_width - (np.arange(int(2 * half_width * scale))[None] + 0.5) / scale
-        distance, azimuth = np.hypot(ahead, across), np.arctan2(across, ahead)
-        order = np.argsort(azimuths_rad)
-        place = np.interp(azimuth, azimuths_rad[order], np.arange(len(order)), -1, -1)
-        inside = (place >= 0) & (distance >= r0) & (distance <= r1)
-        beam = np.where(inside, order[np.rint(np.maximum(place, 0)).astype(int)], -1)
-        at = np.rint(np.interp(distance, np.sort(ranges_m), np.argsort(ranges_m)))
-        return cls(beam.astype(np.int32), at.astype(np.int32), scale, float(lowest), float(half_width))
-
-    def pixel(self, range_m: float, azimuth_rad: float) -> tuple[int, int]:
-        """Column and row of a point."""
-        ahead, across = range_m * np.cos(azimuth_rad), range_m * np.sin(azimuth_rad)
-        column = (self.half_width_m - across) * self.pixels_per_m
-        return round(column), round(PIXELS_HIGH - (ahead - self.lowest_m) * self.pixels_per_m)
+TEXT_SIZE = 0.85
+"""Of letters that can still be read where a page shows four pictures in a row."""
 
 
 def draw_fan(image_db: NDArray[np.floating], fan: Fan, detections: LandmarkDetections | None) -> Picture:
@@ -81,11 +44,11 @@ def _draw_detection(picture: Picture, place: tuple[int, int], landmark: int, pro
     text = f"ID {landmark}" if is_sure else f"ID {landmark}?  {probability:.2f}"
     cv2.circle(picture, place, radius, colour, 2 if is_sure else 1, cv2.LINE_AA)
     cv2.drawMarker(picture, place, colour, cv2.MARKER_CROSS, 9, 1)
-    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.6, 2)
+    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, 2)
     left = int(np.clip(place[0] - width // 2, MARGIN, picture.shape[1] - width - MARGIN))
-    corner = (left, max(place[1] - radius - MARGIN, 18))
-    cv2.putText(picture, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 4, cv2.LINE_AA)
-    cv2.putText(picture, text, corner, cv2.FONT_HERSHEY_SIMPLEX, 0.6, colour, 2, cv2.LINE_AA)
+    corner = (left, max(place[1] - radius - MARGIN, 28))
+    cv2.putText(picture, text, corner, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, (0, 0, 0), 7, cv2.LINE_AA)
+    cv2.putText(picture, text, corner, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, colour, 2, cv2.LINE_AA)
 
 
 def as_jpeg(picture: Picture) -> bytes:
