@@ -31,7 +31,7 @@ from sonar_graph.simulation.world import World, world_on_floor
 LANDMARKS_XY_M = np.array([[2.4, 0.05], [4.0, -0.12], [5.6, 0.1], [6.4, -0.08]])
 OTHERS_M = np.array([[3.2, 0.1, FLOOR_Z_M], [4.8, -0.1, FLOOR_Z_M]])
 """A stone and a rough patch as large and as bright as a landmark."""
-LENGTH_M, SPEED_M_S, RAMP_S = 5.2, 0.2, 2.0
+LENGTH_M, SPEED_M_S, RAMP_S = 5.2, 0.17, 2.0
 TOPIC = "/sonar/image"
 
 
