@@ -99,6 +99,8 @@ class SonarCalibration(Section):
 
     mounting: Mounting = Mounting()
     image: SonarImage = SonarImage()
+    lens: Literal["as-logged", "didson", "aris", "aris-telephoto"] = "as-logged"
+    """Where the beams of images point: as the log says; or, if a driver spaced them equally, by the maker's table."""
     range_sigma_m: float = Field(0.02, gt=0)
     """White noise of range, where the log does not say."""
     azimuth_sigma_rad: float = Field(0.009, gt=0)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sonar_graph.evaluation.fan_picture import Fan, as_jpeg, draw_fan
+from sonar_graph.evaluation.fan_picture import as_jpeg, draw_fan
 from sonar_graph.evaluation.recognition import DrawnFrame, Recognition
 from sonar_graph.evaluation.sonar_motion import SonarMotion, SonarMotions
 from sonar_graph.landmark_designs import LandmarkDesign
@@ -22,7 +22,7 @@ from sonar_graph.logs.window import Window
 from sonar_graph.measurements import LandmarkDetections, SonarFrames
 from sonar_graph.sequence import NS_PER_S
 from sonar_graph.sequence import Sequence as Run
-from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar.geometry import Fan, FloorView, with_lens
 from sonar_graph.sonar.recogniser import Recogniser, RecogniserParams
 from sonar_graph.sonar.tracking import SonarStep
 
@@ -112,6 +112,7 @@ class RecognitionSession:
         self.recogniser = Recogniser(sequence.calibration, designs, params)
         self.motion: SonarMotion | None = None
         self._image_scale = sequence.calibration.sonar.image
+        self._lens = sequence.calibration.sonar.lens
         self._motions = SonarMotions(sequence)
         self._blocks: list[LandmarkDetections] = []
         self._fan: Fan | None = None
@@ -127,6 +128,7 @@ class RecognitionSession:
             self._warn(stamp_ns, f"frame not used: {reason}")
             return None
         self.motion = motion = self._motions.at(stamp_ns)
+        frame = with_lens(frame, self._lens)
         found = self.recogniser.process(frame, step_of(motion), view_of(motion))
         for fate in self.recogniser.fates:
             if np.isnan(fate.range_m) and fate.track < 0:
@@ -154,12 +156,14 @@ class RecognitionSession:
             "detections.designs": ", ".join(f"{d.id}: {d.name}" for d in self.recogniser.designs),
             "detections.model": "; ".join(f"{k}: {v}" for k, v in model.provenance.items()) or "not said",
         }
+        if result.warnings:
+            result.notes["detections.warnings"] = "; ".join(f"{n} x {reason}" for reason, n in result.warned().items())
         return result
 
     def _warn(self, stamp_ns: int, reason: str) -> None:
-        self.result.outcomes[reason] += 1
-        if len(self.result.warnings) < MOST_WARNINGS:
+        if len(self.result.warnings) < MOST_WARNINGS or reason not in self.result.outcomes:
             self.result.warnings.append((stamp_ns, reason))
+        self.result.outcomes[reason] += 1
 
     def _draw(self, frame: SonarFrames, found: LandmarkDetections | None) -> None:
         """A picture now and then; of too many every second one is given up."""

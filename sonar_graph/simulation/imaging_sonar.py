@@ -36,7 +36,8 @@ class ImagingSonar(Section):
     firing_groups: int = Field(1, ge=1)
     """Beams whose numbers are equal modulo this are fired together."""
     lens_cubic: tuple[float, float, float, float] | None = None
-    """Beam number (from 1) as a cubic of azimuth in degrees, lowest order last; None: beams are equally spaced."""
+    """Beam number, from 1 at the left, as a cubic of degrees to the right, lowest order last; None: beams are equally
+    spaced."""
     decibel_span: float = Field(80.0, gt=0)
     """Decibels over the 255 counts of a sample."""
 
@@ -63,7 +64,7 @@ class ImagingSonar(Section):
         if self.lens_cubic is None:
             return self.linear_azimuths_rad()
         numbers = np.polyval(self.lens_cubic, _FINE_DEG)
-        return np.radians(np.interp(np.arange(1, self.beams + 1), numbers, _FINE_DEG))
+        return np.radians(-np.interp(np.arange(1, self.beams + 1), numbers, _FINE_DEG)[::-1])
 
     def two_way_pattern(self, offset_rad: Floats, side_lobes: bool) -> Floats:
         """Amplitude over the angle from a beam's centre, 1 there; without side lobes a Gaussian of equal width."""

@@ -16,14 +16,17 @@ of whose two solutions the one nearer to the centre beam counts. A beam is a pla
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
+from sonar_graph.beam_tables import DIDSON_BEAMS, aris_azimuths, didson_azimuths
 from sonar_graph.errors import CalibrationError
 from sonar_graph.kernels import compiled
-from sonar_graph.measurements import Floats
+from sonar_graph.measurements import Floats, SonarFrames
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +98,80 @@ class FloorView:
         return np.asarray(
             np.sqrt(self.height_sigma_m**2 + horizontal2 * self.tilt_sigma_rad**2) / np.maximum(slope, 1e-9)
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Fan:
+    """Where each pixel of a picture lies in a polar image: range up, azimuth positive to the left.
+
+    For display only: nearest beam and bin, nothing is measured in such a picture.
+    """
+
+    beam: NDArray[np.int32]
+    """Shape (height, width); -1 outside of the fan."""
+    bin: NDArray[np.int32]
+    """Shape (height, width)."""
+    pixels_per_m: float
+    lowest_m: float
+    """Distance ahead of the sonar at the lower edge."""
+    half_width_m: float
+
+    @classmethod
+    def of(cls, ranges_m: Floats, azimuths_rad: Floats, pixels_high: int = 420) -> Fan:
+        """The fan of a sonar's beams and bins."""
+        r0, r1 = float(ranges_m.min()), float(ranges_m.max())
+        widest = float(np.abs(azimuths_rad).max())
+        lowest, half_width = r0 * np.cos(widest), r1 * np.sin(min(widest, np.pi / 2))
+        scale = pixels_high / (r1 - lowest)
+        ahead = lowest + (np.arange(pixels_high)[::-1, None] + 0.5) / scale
+        across = half_width - (np.arange(int(2 * half_width * scale))[None] + 0.5) / scale
+        distance, azimuth = np.hypot(ahead, across), np.arctan2(across, ahead)
+        order = np.argsort(azimuths_rad)
+        place = np.interp(azimuth, azimuths_rad[order], np.arange(len(order)), -1, -1)
+        inside = (place >= 0) & (distance >= r0) & (distance <= r1)
+        beam = np.where(inside, order[np.rint(np.maximum(place, 0)).astype(int)], -1)
+        at = np.rint(np.interp(distance, np.sort(ranges_m), np.argsort(ranges_m)))
+        return cls(beam.astype(np.int32), at.astype(np.int32), scale, float(lowest), float(half_width))
+
+    def pixel(self, range_m: float, azimuth_rad: float) -> tuple[int, int]:
+        """Column and row of a point."""
+        ahead, across = range_m * np.cos(azimuth_rad), range_m * np.sin(azimuth_rad)
+        column = (self.half_width_m - across) * self.pixels_per_m
+        return round(column), round(len(self.beam) - (ahead - self.lowest_m) * self.pixels_per_m)
+
+
+def with_lens(frames: SonarFrames, lens: str) -> SonarFrames:
+    """The frames with beams that point where the lens of that name makes them point, as-logged: as they are.
+
+    Raises
+    ------
+    CalibrationError
+        When no table is known for so many beams.
+    """
+    if lens == "as-logged":
+        return frames
+    logged_rad = frames.azimuths_rad
+    return replace(frames, azimuths_rad=lens_azimuths(lens, len(logged_rad), bool(logged_rad[0] < logged_rad[-1])))
+
+
+@lru_cache(maxsize=8)
+def lens_azimuths(lens: str, beams: int, is_rightmost_first: bool = True) -> Floats:
+    """Azimuths of a lens' beams, positive to the left, shape (beams,).
+
+    Raises
+    ------
+    CalibrationError
+        When no table is known for so many beams.
+    """
+    if lens == "didson":
+        table = didson_azimuths(beams) if beams in DIDSON_BEAMS else None
+    else:
+        table = aris_azimuths(beams, telephoto=lens == "aris-telephoto")
+    if table is None:
+        raise CalibrationError(f"calibration.sonar.lens: no table of {lens} has {beams} beams; set it to as-logged")
+    table = table if is_rightmost_first else table[::-1].copy()
+    table.flags.writeable = False
+    return table
 
 
 def points(ranges_m: Floats, azimuths_rad: Floats, elevations_rad: Floats | float = 0.0) -> Floats:

@@ -284,11 +284,11 @@ def test_lens_is_the_measured_one_and_the_log_may_say_otherwise():
     told, linear = simulator(), simulator(measured_lens=False)
     spacing_deg = np.degrees(np.diff(told.azimuths_rad()))
     assert spacing_deg[47] == pytest.approx(0.368, abs=0.002)
-    assert spacing_deg[0] == pytest.approx(0.21, abs=0.01)
-    # The published cubic, read the other way round.
+    assert spacing_deg[-1] == pytest.approx(0.21, abs=0.01)
+    # The published cubic, read the other way round: it counts from the left, with angles to the right.
     deg = np.degrees(told.azimuths_rad())
-    beam = 1.012 * (0.0030 * deg**3 - 0.0055 * deg**2 + 2.6829 * deg + 48.04) + 1
-    np.testing.assert_allclose(beam, np.arange(1, 97), atol=1e-3)
+    beam = 1.012 * (-0.0030 * deg**3 - 0.0055 * deg**2 - 2.6829 * deg + 48.04) + 1
+    np.testing.assert_allclose(beam, np.arange(96, 0, -1), atol=1e-3)
     np.testing.assert_allclose(np.degrees(np.diff(linear.azimuths_rad())), 0.3)
     assert np.abs(np.degrees(linear.azimuths_rad()) - deg).max() > 0.8
     np.testing.assert_array_equal(level_db(told), level_db(linear))

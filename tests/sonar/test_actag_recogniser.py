@@ -74,7 +74,7 @@ def test_the_farthest_range_and_the_leftmost_beam_come_first_and_pixels_are_squa
     assert rows_m[0] == RANGES_M[-1]
     assert rows_m[-1] == RANGES_M[0]
     assert columns_rad[0] == pytest.approx(-columns_rad[-1])
-    assert columns_rad[0] == AZIMUTHS_RAD.max()
+    assert columns_rad[0] == np.abs(AZIMUTHS_RAD).max()
     assert -np.diff(rows_m)[0] == pytest.approx(0.005, rel=0.02)
     assert -np.diff(columns_rad)[0] * RANGES_M.mean() == pytest.approx(0.005, rel=0.02)
 
@@ -101,7 +101,7 @@ def test_a_decoded_tag_becomes_a_detection_of_its_centre(decoder):
     assert [fate.outcome for fate in recogniser.fates] == [REPORTED]
     assert decoder.settings["min_range"] == pytest.approx(RANGES_M[0])
     assert decoder.settings["max_range"] == pytest.approx(RANGES_M[-1])
-    assert decoder.settings["horizontal_aperture"] == pytest.approx(2 * AZIMUTHS_RAD.max())
+    assert decoder.settings["horizontal_aperture"] == pytest.approx(2 * np.abs(AZIMUTHS_RAD).max())
     assert decoder.image.shape == pytest.approx([1.25 / 0.00544, 0.497 * 1.885 / 0.00544], rel=0.01)
 
 

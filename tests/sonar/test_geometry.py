@@ -7,12 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.errors import CalibrationError
+from sonar_graph.measurements import SonarFrames
+from sonar_graph.simulation.imaging_sonar import DIDSON
 from sonar_graph.sonar.geometry import (
+    Fan,
     FloorView,
     elevation_sigma,
     point_covariances,
     points,
     ranges_azimuths_elevations,
+    with_lens,
 )
 
 angles = st.floats(-0.3, 0.3)
@@ -100,3 +104,63 @@ def test_elevation_spread_on_a_floor_is_that_of_many_samples():
     view = view_of(0.95, 0.0, np.radians(30))
     found = view.elevation_sigmas(view.floor_points(np.array([2.0]), np.array([0.0])))
     assert found[0] == pytest.approx(sampled, rel=0.02)
+
+
+def frames_of(azimuths_rad: np.ndarray, bins: int = 8) -> SonarFrames:
+    image = np.arange(len(azimuths_rad))[:, None] * np.ones(bins)
+    return SonarFrames(np.array([0]), image[None], np.linspace(1.0, 2.0, bins), azimuths_rad)
+
+
+def test_a_log_with_equally_spaced_beams_is_put_right_by_the_lens():
+    """The simulator holds the published cubic on its own; equal spacing errs by 1.25 degrees, 4 cm at 2 m."""
+    told = frames_of(DIDSON.linear_azimuths_rad())
+    assert np.degrees(np.abs(told.azimuths_rad - DIDSON.azimuths_rad()).max()) > 1.2
+    found = with_lens(told, "didson")
+    assert np.allclose(found.azimuths_rad, DIDSON.azimuths_rad(), atol=1e-5)
+    assert found.intensity is told.intensity
+
+
+def test_a_lens_keeps_the_order_of_the_beams():
+    leftmost_first = with_lens(frames_of(DIDSON.linear_azimuths_rad()[::-1]), "didson")
+    assert np.allclose(leftmost_first.azimuths_rad, DIDSON.azimuths_rad()[::-1], atol=1e-5)
+    aris = with_lens(frames_of(np.linspace(-0.25, 0.25, 128)), "aris").azimuths_rad
+    assert (np.diff(aris) > 0).all()
+    assert np.degrees(aris[-1]) == pytest.approx(14.7, abs=0.1)
+
+
+def test_without_a_lens_frames_are_as_logged():
+    told = frames_of(DIDSON.linear_azimuths_rad())
+    assert with_lens(told, "as-logged") is told
+
+
+@pytest.mark.parametrize("lens", ["didson", "aris"])
+def test_a_number_of_beams_that_no_table_has_is_refused(lens):
+    with pytest.raises(CalibrationError, match=f"no table of {lens} has 50 beams"):
+        with_lens(frames_of(np.linspace(-0.2, 0.2, 50)), lens)
+
+
+@pytest.mark.parametrize("turned", [1, -1])
+def test_each_pixel_of_a_fan_shows_the_sample_at_its_place(turned):
+    """Cartesian pixels are converted back by hand; no sample is farther off than half a step."""
+    ranges, azimuths = DIDSON.ranges_m(), DIDSON.azimuths_rad()[::turned]
+    fan = Fan.of(ranges, azimuths, 200)
+    inside = np.argwhere(fan.beam >= 0)
+    ahead = fan.lowest_m + (200 - inside[:, 0] - 0.5) / fan.pixels_per_m
+    left = fan.half_width_m - (inside[:, 1] + 0.5) / fan.pixels_per_m
+    off_m = np.hypot(ahead, left) - ranges[fan.bin[tuple(inside.T)]]
+    off_rad = np.arctan2(left, ahead) - azimuths[fan.beam[tuple(inside.T)]]
+    assert np.abs(off_m).max() <= 0.51 * np.diff(ranges)[0]
+    assert np.abs(off_rad).max() <= 0.51 * np.abs(np.diff(azimuths)).max()
+    sector_m2 = 0.5 * np.ptp(azimuths) * (ranges[-1] ** 2 - ranges[0] ** 2)
+    assert len(inside) / fan.pixels_per_m**2 == pytest.approx(sector_m2, rel=0.01)
+
+
+@given(st.floats(1.3, 2.5), st.floats(-0.24, 0.24))
+def test_a_point_is_drawn_on_the_pixel_that_shows_it(range_m, azimuth_rad):
+    ranges, azimuths = DIDSON.ranges_m(), DIDSON.azimuths_rad()
+    fan = Fan.of(ranges, azimuths)
+    column, row = fan.pixel(range_m, azimuth_rad)
+    row, column = min(row, len(fan.beam) - 1), min(column, fan.beam.shape[1] - 1)
+    assert fan.beam[row, column] >= 0
+    assert ranges[fan.bin[row, column]] == pytest.approx(range_m, abs=1.5 / fan.pixels_per_m)
+    assert azimuths[fan.beam[row, column]] == pytest.approx(azimuth_rad, abs=2 / fan.pixels_per_m / range_m + 0.004)

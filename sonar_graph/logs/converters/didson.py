@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sonar_graph.beam_tables import didson_azimuths
 from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
 from sonar_graph.errors import DatasetError
-from sonar_graph.logs.converters.sonar_beams import didson_azimuths
 from sonar_graph.logs.converters.sonar_conversion import Progress, SonarConversion, convert_sonar_file
 from sonar_graph.logs.converters.sonar_file import (
     ByteSource,

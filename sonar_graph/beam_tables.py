@@ -17,6 +17,9 @@ _DIDSON_POLYNOMIALS = {
 }
 """Beam number from 1 minus 1, as a polynomial of the angle to the right in degrees, constant first."""
 
+DIDSON_BEAMS = tuple(_DIDSON_POLYNOMIALS)
+"""Numbers of beams that a DIDSON has."""
+
 _Table = tuple[int, tuple[tuple[int, float], ...]]
 _ARIS_TABLES: dict[tuple[int, bool], _Table] = {
     (48, False): (
