@@ -13,8 +13,9 @@ from typing import Annotated, Any
 import typer
 
 from sonar_graph import __version__
-from sonar_graph.cli.comparing import compare, demo, report, run
+from sonar_graph.cli.comparing import compare, report, run
 from sonar_graph.cli.converting import datasets
+from sonar_graph.cli.demonstrating import demo
 from sonar_graph.cli.inspecting import inspect
 from sonar_graph.cli.listing import estimators
 from sonar_graph.cli.recognising import calibrate, recognise

@@ -1,4 +1,4 @@
-"""``sonar-graph run``, ``compare``, ``report`` and ``demo``: from a log to a side-by-side report."""
+"""``sonar-graph run``, ``compare`` and ``report``: from a log to a side-by-side report."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sonar_graph.cli.arguments import (
     StartTime,
     TopicChoices,
 )
-from sonar_graph.cli.outputs import writable_folder, writable_log
+from sonar_graph.cli.outputs import writable_folder
 from sonar_graph.cli.progress import Report, progress_bars, working
 from sonar_graph.cli.settings import (
     check_rate,
@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 
 DEFAULT_ESTIMATORS = "isam2,ekf-slam,dead-reckoning"
 DEFAULT_RATE_HZ = 2.0
-DEMO = {"duration_s": 600.0, "laps": 2, "imu": "mti1", "dvl": "explorer"}
-"""Two laps, so that landmarks are seen again; cheap sensors, so that dead reckoning drifts within minutes."""
 
 
 @dataclass(frozen=True)
@@ -134,17 +132,6 @@ def report(
 
     comparison = read_comparison(folder)
     typer.echo(f"Report: {_write_report(comparison, writable_folder(folder))}")
-
-
-def demo(output: OutputFolder = Path("demo")) -> None:
-    """Simulate ten minutes in a basin, compare the three estimators that come along, and write the report."""
-    from sonar_graph.logs.writing import write_sequence
-    from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-
-    log = writable_log(writable_folder(output) / "basin.mcap")
-    with working("simulating"):
-        write_sequence(log, simulate_basin(BasinOptions.model_validate(DEMO)))
-    compare(log, output)
 
 
 def _estimator_names(text: str) -> list[str]:
