@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from sonar_graph.evaluation.recognition import DrawnFrame, Recognition, read_recognition, write_recognition
+
+JPEG = b"\xff\xd8 a picture \xff\xd9"
+
+
+def drawn(stamp_ns: int, **probability_of: float) -> DrawnFrame:
+    """A frame with detections such as ``id3=0.9``."""
+    ids = tuple(int(name.removeprefix("id")) for name in probability_of)
+    return DrawnFrame(stamp_ns, JPEG + bytes([stamp_ns]), ids, tuple(probability_of.values()))
+
+
+@pytest.fixture
+def recognition() -> Recognition:
+    return Recognition(
+        frames=7,
+        outcomes=Counter({"not reported: rare": 1, "reported": 4}),
+        warnings=[(12, "frame not used: saturated"), (15, 'frame not used: "ä" & <b>')],
+        pictures=[drawn(1, id2=0.6), drawn(2, id2=0.9, id4=0.7), drawn(3, id1=0.4), drawn(4, id2=0.8)],
+        notes={"detections.rule": "jeffrey"},
+    )
+
+
+def test_the_surest_picture_of_each_landmark_is_shown_in_order(recognition: Recognition) -> None:
+    assert [picture.stamp_ns for picture in recognition.shown()] == [2, 2]  # of landmark 2, and of landmark 4
+    recognition.pictures.append(drawn(5, id4=0.95, id1=0.51))
+    assert [picture.stamp_ns for picture in recognition.shown()] == [5, 2, 5]
+    recognition.pictures += [drawn(10 + k, **{f"id{10 + k}": 0.9}) for k in range(8)]
+    assert len(recognition.shown()) == 6
+
+
+def test_what_was_written_is_read_again(recognition: Recognition, tmp_path: Path) -> None:
+    write_recognition(recognition, tmp_path)
+    read = read_recognition(tmp_path)
+    assert read is not None
+    assert (read.frames, read.outcomes, read.notes) == (7, recognition.outcomes, recognition.notes)
+    assert read.warnings == recognition.warnings
+    assert [p.__dict__ for p in read.pictures] == [p.__dict__ for p in recognition.shown()]
+    assert read.detections is None
+
+
+def test_the_commonest_outcome_comes_first(recognition: Recognition, tmp_path: Path) -> None:
+    write_recognition(recognition, tmp_path)
+    read = read_recognition(tmp_path)
+    assert read is not None
+    assert list(read.outcomes) == ["reported", "not reported: rare"]
+
+
+def test_nothing_of_an_earlier_recognition_is_left(recognition: Recognition, tmp_path: Path) -> None:
+    write_recognition(recognition, tmp_path)
+    before = {path.name for path in (tmp_path / "recognised").iterdir()}
+    assert before == {"2.jpg"}
+    recognition.pictures = [drawn(9, id1=0.8)]
+    write_recognition(recognition, tmp_path)
+    assert {path.name for path in (tmp_path / "recognised").iterdir()} == {"9.jpg"}
+    write_recognition(None, tmp_path)
+    assert read_recognition(tmp_path) is None
+    assert list((tmp_path / "recognised").iterdir()) == []
