@@ -44,11 +44,13 @@ def _draw_detection(picture: Picture, place: tuple[int, int], landmark: int, pro
     text = f"ID {landmark}" if is_sure else f"ID {landmark}?  {probability:.2f}"
     cv2.circle(picture, place, radius, colour, 2 if is_sure else 1, cv2.LINE_AA)
     cv2.drawMarker(picture, place, colour, cv2.MARKER_CROSS, 9, 1)
-    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, 2)
+    (width, height), descent = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, 2)
     left = int(np.clip(place[0] - width // 2, MARGIN, picture.shape[1] - width - MARGIN))
-    corner = (left, max(place[1] - radius - MARGIN, 28))
-    cv2.putText(picture, text, corner, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, (0, 0, 0), 7, cv2.LINE_AA)
-    cv2.putText(picture, text, corner, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, colour, 2, cv2.LINE_AA)
+    foot = max(place[1] - radius - 2 * MARGIN, height + MARGIN)
+    cv2.rectangle(
+        picture, (left - MARGIN, foot - height - MARGIN), (left + width + MARGIN, foot + descent), (0, 0, 0), -1
+    )
+    cv2.putText(picture, text, (left, foot), cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, colour, 2, cv2.LINE_AA)
 
 
 def as_jpeg(picture: Picture) -> bytes:

@@ -46,6 +46,7 @@ def growth_figure(comparison: Comparison) -> Figure | None:
     view, runs = seen_from_above(comparison), _runs_with_maps(comparison)
     if view is None or not runs:
         return None
+    view = view + np.array([[-1.0], [1.0]]) * LARGEST_ELLIPSE * float((view[1] - view[0]).max())
     stamps_ns = growth_instants(comparison)
     enlarged = enlargement(comparison)
     span = view[1] - view[0]

@@ -143,10 +143,12 @@ def _growth_caption(comparison: Comparison) -> str:
     if not repeats_published(comparison.sequence):
         return caption
     caption += _counterpart(comparison, "Fig. 4")
+    *others, last = (f"{time_s:.1f}" for time_s in MAP_TIMES_S)
     if abs(comparison.sequence.duration_s - DURATION_S) < 1:
-        return caption
-    times = ", ".join(f"{time_s:g}" for time_s in MAP_TIMES_S)
-    return f"{caption} This run is shorter or longer: T are the fractions of it that {times} s are of {DURATION_S:g} s."
+        return f"{caption} T are the instants nearest to its {', '.join(others)} and {last} s."
+    return (
+        f"{caption} T are the same fractions of this run as its {', '.join(others)} and {last} s of {DURATION_S:.1f} s."
+    )
 
 
 def _counterpart(comparison: Comparison, figure: str) -> str:
