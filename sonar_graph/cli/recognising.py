@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
@@ -19,17 +20,20 @@ from sonar_graph.cli.arguments import (
 )
 from sonar_graph.cli.outputs import writable_json, writable_log
 from sonar_graph.cli.progress import progress_bars, working
-from sonar_graph.cli.settings import read_calibration, read_config, topic_choices
+from sonar_graph.cli.settings import nested_settings, read_calibration, read_config, topic_choices
 from sonar_graph.cli.texts import answers
 from sonar_graph.errors import LogError
 
 if TYPE_CHECKING:
+    from sonar_graph.calibration import Calibration, Section
+    from sonar_graph.evaluation.recognising import LandmarkRecogniser
     from sonar_graph.evaluation.recognition import Recognition
     from sonar_graph.landmark_designs import LandmarkDesign
     from sonar_graph.logs.amending import Amended
     from sonar_graph.sequence import Sequence
     from sonar_graph.sonar.recogniser import RecogniserParams
 
+_Kind = TypeVar("_Kind", bound="Section")
 TOPIC = "/sonar/landmarks"
 RECORD = "sonar_graph_recognition"
 """The metadata record with what became of every frame."""
@@ -58,6 +62,21 @@ RuleName = Annotated[
     str,
     typer.Option(help="How beliefs are updated: virtual-evidence (ours) or jeffrey (the 2014 paper's equations)."),
 ]
+RecogniserName = Annotated[
+    Literal["designs", "actag"],
+    typer.Option(
+        "--recogniser", help="designs: ours; actag: AcTag's own detector, which sees AcTags only (extra actag)."
+    ),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="A setting of the recogniser, such as identity.temper=0.5, or of actag: family, tag_size_m (side of the "
+        "inner square), bit_corrections, pixels_per_bit; may be repeated.",
+    ),
+]
 
 
 def recognise(
@@ -66,6 +85,8 @@ def recognise(
     designs: DesignsPath = None,
     model: ModelPath = None,
     rule: RuleName = "virtual-evidence",
+    recogniser: RecogniserName = "designs",
+    settings: Settings = None,
     calibration: CalibrationPath = None,
     topics: TopicChoices = None,
     log_config: LogConfigPath = None,
@@ -88,8 +109,7 @@ def recognise(
             sequence,
             topic=choices.get("sonar"),
             config=config,
-            designs=_designs(designs),
-            params=recogniser_params(model, rule),
+            recogniser=_recogniser(recogniser, sequence.calibration, designs, model, rule, settings or []),
             salvage=salvage,
             progress=lambda done: progress("recognising", done, 0),
         )
@@ -127,25 +147,53 @@ def calibrate(
     typer.echo(f"Model: {path}")
 
 
-def recogniser_params(model: Path | None, rule: str) -> RecogniserParams:
-    """Settings of the recogniser.
+def _recogniser(
+    name: str, calibration: Calibration, designs: Path | None, model: Path | None, rule: str, settings: list[str]
+) -> LandmarkRecogniser:
+    """The recogniser of that name.
+
+    Raises
+    ------
+    CalibrationError
+        When a file is not what it should be, or AcTag is asked for and not installed.
+    """
+    from sonar_graph.sonar.recogniser import Recogniser
+
+    if name != "actag":
+        return Recogniser(calibration, _designs(designs), recogniser_params(model, rule, settings))
+    if designs is not None or model is not None or rule != "virtual-evidence":
+        raise typer.BadParameter("--designs, --model and --rule are not for actag, which knows its own tags: use --set")
+    from sonar_graph.sonar.actag_recogniser import AcTagRecogniser, AcTagSettings
+
+    return AcTagRecogniser(calibration, _with_settings(AcTagSettings, nested_settings(settings)))
+
+
+def recogniser_params(model: Path | None, rule: str, settings: Iterable[str] = ()) -> RecogniserParams:
+    """Settings of our recogniser.
 
     Raises
     ------
     CalibrationError
         When the model's file is not one.
     """
-    from pydantic import ValidationError
-
-    from sonar_graph.sonar.beliefs import IdentityParams
     from sonar_graph.sonar.confusion import read_confusion
     from sonar_graph.sonar.recogniser import RecogniserParams
 
+    values = nested_settings([f"identity.rule={rule}", *settings])
+    if model is not None:
+        values["confusion"] = read_confusion(model)
+    return _with_settings(RecogniserParams, values)
+
+
+def _with_settings(kind: type[_Kind], values: dict[str, Any]) -> _Kind:
+    from pydantic import ValidationError
+
+    from sonar_graph.validation import faults_in
+
     try:
-        identity = IdentityParams.model_validate({"rule": rule})
+        return kind.model_validate(values)
     except ValidationError as error:
-        raise typer.BadParameter(f"--rule {rule}: expected virtual-evidence or jeffrey") from error
-    return RecogniserParams(identity=identity, confusion=None if model is None else read_confusion(model))
+        raise typer.BadParameter(f"{kind.__name__}: {faults_in(error, kind)}") from error
 
 
 def print_outcomes(found: Recognition, start_ns: int) -> None:

@@ -21,6 +21,7 @@ from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence as Run
 from sonar_graph.sonar.confusion import Confusion, LabelledFits, estimate_confusion
 from sonar_graph.sonar.look import Sighting
+from sonar_graph.sonar.recogniser import Recogniser
 
 SAME_M, APART_M = 0.08, 0.40
 NO_LABEL = -2
@@ -115,21 +116,22 @@ def calibrate(
     for path, run in logs:
         if run.truth is None or run.true_landmarks is None:
             raise CalibrationError(f"{path}: without true trajectory and true landmarks nothing in it can be labelled")
-        session = RecognitionSession(run, designs, pictures=False)
+        recogniser = Recogniser(run.calibration, designs)
+        session = RecognitionSession(run, recogniser=recogniser, pictures=False)
         for block in read_sonar_frames(path, topic, config):
             for frame in one_by_one(block):
                 session.take(frame)
-                _gather(gathered, session, run, int(frame.stamps_ns[0]))
+                _gather(gathered, recogniser, run, int(frame.stamps_ns[0]))
     names = ", ".join(path.name for path, _ in logs)
     kinds = "; ".join(dict.fromkeys(run.notes.get("ours", "recorded") for _, run in logs))
     return estimate_confusion(gathered.fits(), gathered.ids, {"logs": names, "what they are": kinds})
 
 
-def _gather(gathered: LabelledSightings, session: RecognitionSession, run: Run, stamp_ns: int) -> None:
+def _gather(gathered: LabelledSightings, recogniser: Recogniser, run: Run, stamp_ns: int) -> None:
     truth, landmarks = run.truth, run.true_landmarks
     if truth is None or landmarks is None or not truth.stamps_ns[0] <= stamp_ns <= truth.stamps_ns[-1]:
         return
     range_m, azimuth_rad = true_ranges_azimuths(run, stamp_ns)
-    for sighting in session.recogniser.sightings:
+    for sighting in recogniser.sightings:
         if sighting is not None:
             gathered.add(sighting, landmarks.ids, range_m, azimuth_rad)

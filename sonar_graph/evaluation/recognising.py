@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from sonar_graph.measurements import LandmarkDetections, SonarFrames
 from sonar_graph.sequence import NS_PER_S
 from sonar_graph.sequence import Sequence as Run
 from sonar_graph.sonar.geometry import Fan, FloorView, with_lens
-from sonar_graph.sonar.recogniser import Recogniser, RecogniserParams
+from sonar_graph.sonar.recogniser import Fate, Recogniser, RecogniserParams
 from sonar_graph.sonar.tracking import SonarStep
 
 MOST_PICTURES = 400
@@ -31,6 +32,23 @@ MOST_WARNINGS = 200
 PICTURE_PERIOD_NS = NS_PER_S
 OUT_OF_ORDER = "out of order"
 NO_ODOMETRY = "no IMU and Doppler log at its stamp"
+
+
+class LandmarkRecogniser(Protocol):
+    """What makes detections of frames: `Recogniser`, or another one in its place."""
+
+    fates: list[Fate]
+    """What became of everything in the frame last processed."""
+
+    def process(
+        self, frame: SonarFrames, motion: SonarStep | None = None, view: FloorView | None = None
+    ) -> LandmarkDetections | None:
+        """Take in one frame; what is recognised in it."""
+        ...
+
+    def notes(self) -> dict[str, str]:
+        """How detections come about, for a log's notes."""
+        ...
 
 
 def recognise(
@@ -41,6 +59,7 @@ def recognise(
     config: LogConfig | None = None,
     designs: Sequence[LandmarkDesign] | None = None,
     params: RecogniserParams | None = None,
+    recogniser: LandmarkRecogniser | None = None,
     window: Window | None = None,
     salvage: bool = False,
     progress: Callable[[int], None] | None = None,
@@ -57,6 +76,8 @@ def recognise(
         As of `read_sonar_frames`.
     designs, params
         As of `Recogniser`.
+    recogniser
+        In place of a `Recogniser` with those designs and params.
     window, salvage
         As of `read_sequence`, and as the sequence was read.
     progress
@@ -74,7 +95,7 @@ def recognise(
     CalibrationError
         When designs and measured model do not belong together.
     """
-    session = RecognitionSession(sequence, designs, params)
+    session = RecognitionSession(sequence, designs, params, recogniser=recogniser)
     blocks = read_sonar_frames(log, topic, config, window=window, salvage=salvage, refused=session.refuse)
     for frame in (frame for block in blocks for frame in one_by_one(block)):
         session.take(frame)
@@ -105,11 +126,12 @@ class RecognitionSession:
         designs: Sequence[LandmarkDesign] | None = None,
         params: RecogniserParams | None = None,
         *,
+        recogniser: LandmarkRecogniser | None = None,
         pictures: bool = True,
     ) -> None:
         self._draws = pictures
         self.result = Recognition()
-        self.recogniser = Recogniser(sequence.calibration, designs, params)
+        self.recogniser = recogniser or Recogniser(sequence.calibration, designs, params)
         self.motion: SonarMotion | None = None
         self._image_scale = sequence.calibration.sonar.image
         self._lens = sequence.calibration.sonar.lens
@@ -148,14 +170,9 @@ class RecognitionSession:
 
     def finish(self) -> Recognition:
         """All that was gathered."""
-        result, model = self.result, self.recogniser.confusion
+        result = self.result
         result.detections = LandmarkDetections.concatenate(self._blocks) if self._blocks else None
-        result.notes = {
-            "detections": f"recognised in {result.frames} sonar images",
-            "detections.rule": self.recogniser.params.identity.rule,
-            "detections.designs": ", ".join(f"{d.id}: {d.name}" for d in self.recogniser.designs),
-            "detections.model": "; ".join(f"{k}: {v}" for k, v in model.provenance.items()) or "not said",
-        }
+        result.notes = {"detections": f"recognised in {result.frames} sonar images"} | self.recogniser.notes()
         if result.warnings:
             result.notes["detections.warnings"] = "; ".join(f"{n} x {reason}" for reason, n in result.warned().items())
         return result

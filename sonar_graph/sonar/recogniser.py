@@ -151,6 +151,14 @@ class Recogniser:
             self.fates.append(Fate(stamp_ns, -1, np.nan, np.nan, self._check.change))
         return found
 
+    def notes(self) -> dict[str, str]:
+        """How detections come about, for a log's notes."""
+        return {
+            "detections.rule": self.params.identity.rule,
+            "detections.designs": ", ".join(f"{design.id}: {design.name}" for design in self.designs),
+            "detections.model": "; ".join(f"{k}: {v}" for k, v in self.confusion.provenance.items()) or "not said",
+        }
+
     def _places(self) -> list[Floats | None]:
         """Where the sonar is, for each track that could be compared with the designs."""
         place = self._start_T_sonar.translation()
