@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sonar_graph.errors import LogError
+from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.adapters.config import LogConfig
 from sonar_graph.logs.adapters.sonar_images import Refused, SonarAdapter
 from sonar_graph.logs.container import Keep, Recording, Topic, stream
@@ -45,6 +45,8 @@ def read_sonar_frames(
 
     Raises
     ------
+    MissingTopicError
+        When ``topic`` has no image.
     LogError
         When several topics fit, the file is damaged in its middle (without ``salvage``, after the last frame), or an
         image is not what its message says (without ``refused``). A log without sonar images gives no block.
@@ -63,6 +65,8 @@ def read_sonar_frames(
             raise LogError(f"{path}: for {SONAR}, {choice.reason}; choose one: {advice(choice)}")
         if choice.topic == piece.name and isinstance(choice.adapter, SonarAdapter):
             yield from choice.adapter.read(piece, refused)
+    if topic is not None and topic not in seen:
+        raise MissingTopicError(f"{path}: no image on {topic}; sonar images are on {', '.join(seen) or 'no topic'}")
 
 
 def describe_frames(frames: SonarFrames) -> str:

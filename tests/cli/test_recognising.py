@@ -1,0 +1,166 @@
+"""``recognise``, ``calibrate`` and ``compare`` on a log with images, and what they say to a user's mistakes."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.writing import write_sequence
+from sonar_graph.sonar.confusion import read_confusion
+
+if TYPE_CHECKING:
+    from tests.imaged_lane import Lane
+
+Run = Callable[..., int]
+QUICK = ("--estimators", "dead-reckoning")
+DESIGNS = """
+[[landmark]]
+id = 4
+name = "plate"
+size_m = 0.3
+shapes = [{ level_db = 12.0, circle_m = [0.0, 0.0, 0.15] }]
+"""
+
+
+@pytest.fixture(scope="module")
+def recognised(lane_log: Path, run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log with what was recognised in it."""
+    out = tmp_path_factory.mktemp("recognised") / "out.mcap"
+    assert run("recognise", lane_log, "-o", out) == 0
+    return out
+
+
+def contents(path: Path) -> Counter[tuple[str, int, bytes]]:
+    with path.open("rb") as stream:
+        return Counter((channel.topic, m.log_time, m.data) for _, channel, m in make_reader(stream).iter_messages())
+
+
+def test_recognise_adds_detections_and_leaves_the_rest_as_it_was(lane_log, recognised, lane_recognition):
+    before, after = contents(lane_log), contents(recognised)
+    assert before - after == Counter()
+    added = after - before
+    assert {topic for topic, _, _ in added} == {"/sonar/landmarks"}
+    found, expected = read_sequence(recognised).detections, lane_recognition.detections
+    assert found is not None
+    np.testing.assert_array_equal(found.stamps_ns, expected.stamps_ns)
+    np.testing.assert_allclose(found.range_m, expected.range_m, atol=1e-4)
+    np.testing.assert_allclose(found.range_azimuth_cov, expected.range_azimuth_cov, rtol=1e-3, atol=1e-9)
+    np.testing.assert_array_equal(found.most_probable()[0], expected.most_probable()[0])
+    np.testing.assert_allclose(found.id_probability.sum(axis=1), expected.id_probability.sum(axis=1), atol=1e-3)
+
+
+def test_recognise_says_what_became_of_everything(lane, lane_log, lane_recognition, run, tmp_path, capsys):
+    assert run("recognise", lane_log, "-o", tmp_path / "out.mcap") == 0
+    said = capsys.readouterr().out
+    assert f"{len(lane.frames)} frames, {len(lane_recognition.detections)} detections" in said
+    for outcome, count in lane_recognition.outcomes.items():
+        assert re.search(rf"^ +{count}  {re.escape(outcome)}$", said, re.MULTILINE), outcome
+    assert said.rstrip().endswith("out.mcap")
+
+
+def test_recognising_again_replaces_what_was_there(recognised, run, tmp_path, capsys):
+    assert run("recognise", recognised, "-o", tmp_path / "again.mcap", "--rule", "jeffrey") == 0
+    assert "Replaced: " in capsys.readouterr().out
+    one, other = read_sequence(recognised).detections, read_sequence(tmp_path / "again.mcap").detections
+    assert one is not None
+    assert other is not None
+    assert len(one) == len(other)
+    assert not np.allclose(one.id_probability, other.id_probability)
+
+
+def test_compare_recognises_by_itself_and_gives_what_recognise_gives(lane_log, recognised, run, tmp_path):
+    assert run("compare", lane_log, "-o", tmp_path / "images", *QUICK) == 0
+    assert run("compare", recognised, "-o", tmp_path / "detections", *QUICK) == 0
+    pages = [(tmp_path / name / "report.html").read_text() for name in ("images", "detections")]
+    assert 'id="recognition"' in pages[0]
+    assert 'id="recognition"' not in pages[1]
+    assert json.loads((tmp_path / "images" / "recognition.json").read_text())["frames"] > 100
+    topics = {topic for topic, _, _ in contents(tmp_path / "images" / "result.mcap")}
+    assert "/sonar/recognised" in topics
+
+
+def test_a_model_that_calibrate_wrote_is_used(lane_log, run, tmp_path):
+    assert run("calibrate", lane_log, "-o", tmp_path / "model.json") == 0
+    model = read_confusion(tmp_path / "model.json")
+    assert model.provenance["logs"] == "lane.mcap"
+    assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--model", tmp_path / "model.json") == 0
+    found = read_sequence(tmp_path / "out.mcap").detections
+    assert found is not None
+    assert np.median(found.range_azimuth_cov[:, 0, 0]) < 0.05**2
+
+
+def test_designs_of_ones_own_need_no_code(lane_log, run, tmp_path):
+    (tmp_path / "mine.toml").write_text(DESIGNS)
+    assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--designs", tmp_path / "mine.toml") == 0
+    found = read_sequence(tmp_path / "out.mcap").detections
+    assert found is not None
+    assert np.unique(found.candidate_ids).tolist() == [4]
+
+
+@pytest.fixture
+def files(lane: Lane, lane_log: Path, tmp_path: Path) -> dict[str, object]:
+    """What a user may give by mistake."""
+    bare, blind = tmp_path / "bare.mcap", tmp_path / "blind.mcap"
+    write_sequence(bare, lane.sequence)
+    short = replace(lane, sequence=replace(lane.sequence, truth=None))
+    short.write(blind, [lane.one(k) for k in range(3)])
+    (tmp_path / "words.json").write_text("{ no")
+    (tmp_path / "list.json").write_text("[]")
+    (tmp_path / "designs.toml").write_text(DESIGNS)
+    (tmp_path / "broken.toml").write_text('[[landmark]]\nid = 1\nname = "x"\nsize_m = -1\n')
+    (tmp_path / "empty").mkdir()
+    names = ("words.json", "list.json", "designs.toml", "broken.toml", "empty")
+    return {
+        "lane": lane_log,
+        "bare": bare,
+        "blind": blind,
+        "new": tmp_path / "new.mcap",
+        "model": tmp_path / "m.json",
+    } | {name: tmp_path / name for name in names}
+
+
+MISTAKES = {
+    "recognise bare -o new": r"bare\.mcap: has no sonar images; `sonar-graph inspect .*` lists what it has",
+    "recognise lane -o new --rule bayes": r"rule.*virtual-evidence.*jeffrey",
+    "recognise lane -o new --model words.json": r"words\.json is not JSON",
+    "recognise lane -o new --model list.json": r"list\.json: .*calibrate",
+    "recognise lane -o new --designs broken.toml": r"broken\.toml.*size_m",
+    "recognise lane -o new --designs empty": r"empty: no landmark designs",
+    "recognise lane -o lane --overwrite": r"is what is read",
+    "recognise lane -o new --topic sonar=/none": r"no image on /none; sonar images are on /sonar/image",
+    "compare lane -o new --topic sonar=/none": r"no image on /none",
+    "recognise words.json -o new": r"words\.json",
+    "recognise missing.mcap -o new": r"missing\.mcap",
+    "calibrate bare -o new": r"ends in \.json",
+    "calibrate blind -o model": r"blind\.mcap: without true trajectory and true landmarks",
+    "calibrate bare -o model": r"bare\.mcap|too few labelled frames",
+    "calibrate lane -o model --designs broken.toml": r"broken\.toml.*size_m",
+    "compare words.json -o new": r"words\.json",
+}
+
+
+@pytest.mark.parametrize("command", MISTAKES)
+def test_a_mistake_is_answered_in_a_line(command: str, files, run, capsys):
+    arguments = [files.get(word, word) for word in command.split()]
+    before = {path: path.read_bytes() for path in files.values() if path.is_file()}
+    assert run(*arguments) == 2
+    said = capsys.readouterr().err
+    assert "Traceback" not in said
+    assert re.search(MISTAKES[command], " ".join(re.sub(r"[│╭╮╰╯─]", " ", said).split())), said
+    if said.startswith("sonar-graph: "):
+        assert said.count("\n") == 1
+    else:
+        assert said.startswith("Usage: ")
+    assert {path: path.read_bytes() for path in before} == before
+    assert not files["new"].is_file()
+    assert not files["model"].exists()
