@@ -33,7 +33,7 @@ import numpy as np
 from baselines.ekf_state import LANDMARK, POSE, correct, correct_pair
 from baselines.euler import rates_from_euler, rotation_from_euler
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.kernels import compiled, inlined
 from sonar_graph.navigation.recursion import Integral
 from sonar_graph.navigation.triples import (
     Matrix,
@@ -116,7 +116,7 @@ def moment_after(x: Floats, motion: Integral) -> Moment:
     return Moment(vector(x), rotation_from_euler(angles), rates_from_euler(angles), motion)
 
 
-@compiled
+@inlined
 def row_along(moment: Moment, n: Vector, s: Vector) -> Row:
     """``row(n, s)`` of the module's docstring."""
     by_angles = times(transposed(moment.W), cross(s, n))
@@ -131,7 +131,7 @@ def motion_covariance(motion: Integral, one: Row, other: Row) -> float:
     return dot(one.by_theta, theta) + dot(one.by_eps, eps)
 
 
-@compiled
+@inlined
 def add_covariances(P: Floats, n: int, at: int, factors: Vector, out: Floats) -> None:
     """``out += factors^T P[at : at + 3]``, shape (n,)."""
     for k in range(3):
@@ -191,7 +191,7 @@ Noise = tuple[float, float, float]
 """Variance of the range, covariance, variance of the azimuth."""
 
 
-@compiled
+@inlined
 def _noise(logged: Floats, sonar: SonarModel) -> Noise:
     """Of range and azimuth: as logged, or the calibration's."""
     if math.isnan(logged[0, 0] + logged[0, 1] + logged[1, 0] + logged[1, 1]):
@@ -212,7 +212,7 @@ def observation(moment: Moment, p: Vector, sonar: SonarModel) -> tuple[Floats, R
     return z, row_along(moment, scaled(-1.0, by_range), p_n), row_along(moment, scaled(-1.0, by_azimuth), p_n)
 
 
-@compiled
+@inlined
 def _observe(
     x: Floats,
     P: Floats,
@@ -242,7 +242,7 @@ def _observe(
     return USED
 
 
-@compiled
+@inlined
 def _add_row_covariances(P: Floats, n: int, at: int, row: Row, out: Floats) -> None:
     """``out += H P`` for a row of H with a landmark, shape (n,): only columns of pose and landmark are not zero."""
     add_covariances(P, n, 0, row.by_X, out)
@@ -250,20 +250,20 @@ def _add_row_covariances(P: Floats, n: int, at: int, row: Row, out: Floats) -> N
     add_covariances(P, n, at, scaled(-1.0, row.by_X), out)
 
 
-@compiled
+@inlined
 def _variance_share(U: Floats, at: int, row: Row) -> float:
     """``U H^T`` for a row of H with a landmark."""
     return dot(row.by_X, minus(vector(U), vector(U[at:]))) + dot(row.by_angles, vector(U[3:]))
 
 
-@compiled
+@inlined
 def squared_distance(e: Floats, S: Floats) -> float:
     """``e^T S^-1 e`` for two numbers."""
     determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
     return (S[1, 1] * e[0] * e[0] - (S[0, 1] + S[1, 0]) * e[0] * e[1] + S[0, 0] * e[1] * e[1]) / determinant
 
 
-@compiled
+@inlined
 def _augment(
     x: Floats, P: Floats, n: int, moment: Moment, sonar: SonarModel, z: tuple[float, float], R_z: Noise
 ) -> None:
@@ -288,7 +288,7 @@ def _augment(
         _stand_on_floor(x, P, n + LANDMARK, sonar)
 
 
-@compiled
+@inlined
 def _stand_on_floor(x: Floats, P: Floats, n: int, sonar: SonarModel) -> None:
     """Correct the height of the landmark at the end by the floor's, where it can stand there."""
     innovation, S = sonar.floor_z_m - x[n - 1], P[n - 1, n - 1] + sonar.floor_variance_m2
@@ -296,7 +296,7 @@ def _stand_on_floor(x: Floats, P: Floats, n: int, sonar: SonarModel) -> None:
         correct(x, P, n, P[n - 1, :n].copy(), S, innovation)
 
 
-@compiled
+@inlined
 def _elevation(moment: Moment, sonar: SonarModel, z: tuple[float, float]) -> float:
     """Elevation on the floor; 0 without one, or where it is outside the aperture."""
     if not sonar.has_floor:

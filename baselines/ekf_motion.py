@@ -14,7 +14,7 @@ from typing import NamedTuple
 from baselines.ekf_prediction import VehicleModel
 from baselines.euler import rotation_from_euler
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.kernels import compiled, inlined
 from sonar_graph.navigation.odometry import Columns, Cursor, cursor_at, next_step, rows_until
 from sonar_graph.navigation.recursion import NO_MOTION, Integral, extended, increment, mirrored, rate_of_turn
 from sonar_graph.navigation.triples import ZERO, Vector, times, transposed, vector
@@ -71,13 +71,13 @@ def nothing_running() -> RunningMotion:
     return RunningMotion(-1, -1, ZERO, Cursor(-1, 0, 0), NO_MOTION)
 
 
-@compiled
+@inlined
 def earth_in_body(vehicle: VehicleModel, x: Floats) -> Vector:
     """Earth's rotation in the body frame of the state, rad/s."""
     return times(transposed(rotation_from_euler(vector(x[3:]))), vehicle.earth_rate)
 
 
-@compiled
+@inlined
 def _integrate(
     columns: Columns,
     vehicle: VehicleModel,
@@ -97,7 +97,7 @@ def _integrate(
     return cursor, motion
 
 
-@compiled
+@inlined
 def _finished(motion: Integral) -> Integral:
     """With all blocks of the covariance whole."""
     return Integral(motion.dR, motion.dp, motion.impulse, motion.cov_tt, motion.cov_rt, mirrored(motion.cov_rr))

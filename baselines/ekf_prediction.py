@@ -20,7 +20,7 @@ from baselines.ekf_landmarks import add_covariances, moment_after, motion_covari
 from baselines.ekf_state import correct, predict
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.alignment import tilt_sigma, up_direction
-from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.kernels import compiled, inlined
 from sonar_graph.navigation.odometry import Columns, rows_until, value_at
 from sonar_graph.navigation.recursion import Integral
 from sonar_graph.navigation.triples import (
@@ -89,7 +89,7 @@ def open_interval(columns: Columns, dvl_p_imu: Vector, interval: GravityInterval
     clock[OPENED] = clock[NODE]
 
 
-@compiled
+@inlined
 def _velocity_at_node(columns: Columns, node_ns: int, dvl_p_imu: Vector) -> Floats:
     """Velocity of the IMU's point in body axes, m/s, and the variance of one component, shape (4,)."""
     imu_ns, rate, _, dvl_ns, velocity, cov, hold_past = columns
@@ -101,7 +101,7 @@ def _velocity_at_node(columns: Columns, node_ns: int, dvl_p_imu: Vector) -> Floa
     return at_imu
 
 
-@compiled
+@inlined
 def next_node(columns: Columns, node_ns: int, until_ns: int) -> int:
     """The first node after one instant, when it is reached at another; else -1."""
     imu_ns, dvl_ns = columns[0], columns[3]
@@ -144,7 +144,7 @@ def advance_to_node(
             _correct_state(x, P, n, 2 + k, values[k], variances[k])
 
 
-@compiled
+@inlined
 def _extend(interval: GravityInterval, motion: Integral) -> None:
     """Let the running interval reach one node further."""
     i_R_node, impulse = matrix(interval.i_R_node), interval.impulse
@@ -152,7 +152,7 @@ def _extend(interval: GravityInterval, motion: Integral) -> None:
     place(product(i_R_node, motion.dR), interval.i_R_node, 0, 0)
 
 
-@compiled
+@inlined
 def _correct_gravity(
     columns: Columns, model: VehicleModel, x: Floats, P: Floats, n: int, clock: Ints, interval: GravityInterval
 ) -> None:
@@ -177,14 +177,14 @@ def _correct_gravity(
     _correct_state(x, P, n, 4, math.atan2(-up[0], level), sigma**2)
 
 
-@compiled
+@inlined
 def _correct_state(x: Floats, P: Floats, n: int, at: int, value: float, variance: float) -> None:
     """Correct by a direct measurement of Z or of an angle."""
     innovation = value - x[at] if at < 3 else wrap_angle(value - x[at])
     correct(x, P, n, P[at, :n].copy(), P[at, at] + variance, innovation)
 
 
-@compiled
+@inlined
 def correct_depth(x: Floats, P: Floats, n: int, motion: Integral, port: Vector, z_m: float, variance_m2: float) -> None:
     """Correct by the height of the pressure port, ``(X + R s)_z`` with ``s = dp + dR port``: row(n, s) along up."""
     moment = moment_after(x, motion)

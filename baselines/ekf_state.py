@@ -28,7 +28,7 @@ import numpy as np
 
 from baselines.euler import euler_from_rates, euler_from_rotation, rates_from_euler, rotation_from_euler
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.kernels import inlined
 from sonar_graph.navigation.recursion import Integral
 from sonar_graph.navigation.triples import (
     Matrix,
@@ -55,7 +55,7 @@ LANDMARK = 3
 """Numbers of p_i."""
 
 
-@compiled
+@inlined
 def predict(x: Floats, P: Floats, n: int, motion: Integral) -> None:
     """Carry state and covariance over a motion."""
     angles = vector(x[3:])
@@ -69,7 +69,7 @@ def predict(x: Floats, P: Floats, n: int, motion: Integral) -> None:
     _predict_landmarks(P, n, X_by_angles, angles_by_angles)
 
 
-@compiled
+@inlined
 def _predict_pose(P: Floats, A: Matrix, B: Matrix, motion: Integral, R: Matrix, E_dR: Matrix) -> None:
     """``P_vv <- F P_vv F^T + Q`` with ``F = [[I, A], [0, B]]``."""
     XX, XE, EE = matrix(P[:, :3]), matrix(P[:, 3:]), matrix(P[3:, 3:])
@@ -81,7 +81,7 @@ def _predict_pose(P: Floats, A: Matrix, B: Matrix, motion: Integral, R: Matrix, 
     place_symmetric(symmetric(XX), transposed(XE), symmetric(EE), P)
 
 
-@compiled
+@inlined
 def _predict_landmarks(P: Floats, n: int, A: Matrix, B: Matrix) -> None:
     """``P_vm <- F P_vm``, and its transpose."""
     for c in range(POSE, n):
@@ -91,7 +91,7 @@ def _predict_landmarks(P: Floats, n: int, A: Matrix, B: Matrix) -> None:
             P[r, c] = P[c, r] = column[r]
 
 
-@compiled
+@inlined
 def place_symmetric(first: Matrix, mixed: Matrix, second: Matrix, out: Floats) -> None:
     """Write ``[[first, mixed^T], [mixed, second]]``."""
     place(first, out, 0, 0)
@@ -100,7 +100,7 @@ def place_symmetric(first: Matrix, mixed: Matrix, second: Matrix, out: Floats) -
     place(second, out, 3, 3)
 
 
-@compiled
+@inlined
 def pose_after(x: Floats, P: Floats, motion: Integral) -> tuple[Floats, Floats, Floats]:
     """The body a motion after the state, and the covariance of its perturbation [theta, rho].
 
@@ -129,13 +129,13 @@ def pose_after(x: Floats, P: Floats, motion: Integral) -> tuple[Floats, Floats, 
     return np.array(product(R, motion.dR)), np.array(transformed(vector(x), R, motion.dp)), own
 
 
-@compiled
+@inlined
 def _set_triple(x: Floats, at: int, value: Vector) -> None:
     """Three numbers of the state."""
     x[at], x[at + 1], x[at + 2] = value
 
 
-@compiled
+@inlined
 def correct(x: Floats, P: Floats, n: int, cross_cov: Floats, S: float, innovation: float) -> None:
     """Correction by one number.
 
@@ -161,7 +161,7 @@ def correct(x: Floats, P: Floats, n: int, cross_cov: Floats, S: float, innovatio
     _wrap(x)
 
 
-@compiled
+@inlined
 def correct_pair(x: Floats, P: Floats, n: int, cross_cov: Floats, S: Floats, innovation: Floats) -> None:
     """Correction by two numbers at once: as `correct`, with the Cholesky factor of S in place of the root.
 
@@ -190,7 +190,7 @@ def correct_pair(x: Floats, P: Floats, n: int, cross_cov: Floats, S: Floats, inn
     _wrap(x)
 
 
-@compiled
+@inlined
 def _wrap(x: Floats) -> None:
     """Keep roll and yaw in (-pi, pi]."""
     x[3], x[5] = wrap_angle(x[3]), wrap_angle(x[5])

@@ -22,7 +22,7 @@ from baselines.ekf_prediction import (
 )
 from baselines.ekf_state import pose_after
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.kernels import compiled, inlined
 from sonar_graph.navigation.odometry import Columns
 
 DepthColumns = tuple[Ints, Floats, Floats]
@@ -96,7 +96,7 @@ def process_window(
             return n, (outcomes, innovations, covs), pose_after(x, P, motion)
 
 
-@compiled
+@inlined
 def _next_event(depth_ns: Ints, sample: int, frame_ns: Ints, row: int, until_ns: int) -> tuple[int, int]:
     """Kind and stamp of the event that comes next."""
     kind, event_ns = END, until_ns

@@ -15,11 +15,11 @@ from __future__ import annotations
 
 import math
 
-from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.kernels import inlined
 from sonar_graph.navigation.triples import Matrix, Vector
 
 
-@compiled
+@inlined
 def rotation_from_euler(angles: Vector) -> Matrix:
     """world_R_body from (phi, theta, psi), rad."""
     c_r, s_r = math.cos(angles[0]), math.sin(angles[0])
@@ -32,7 +32,7 @@ def rotation_from_euler(angles: Vector) -> Matrix:
     )
 
 
-@compiled
+@inlined
 def euler_from_rotation(R: Matrix) -> Vector:
     """(phi, theta, psi), rad; phi and psi in (-pi, pi], theta in [-pi/2, pi/2]."""
     return (
@@ -42,7 +42,7 @@ def euler_from_rotation(R: Matrix) -> Vector:
     )
 
 
-@compiled
+@inlined
 def rates_from_euler(angles: Vector) -> Matrix:
     """W of the module's docstring."""
     c_r, s_r = math.cos(angles[0]), math.sin(angles[0])
@@ -50,7 +50,7 @@ def rates_from_euler(angles: Vector) -> Matrix:
     return (1.0, 0.0, -s_p), (0.0, c_r, s_r * c_p), (0.0, -s_r, c_r * c_p)
 
 
-@compiled
+@inlined
 def euler_from_rates(angles: Vector) -> Matrix:
     """E of the module's docstring."""
     c_r, s_r = math.cos(angles[0]), math.sin(angles[0])

@@ -18,10 +18,21 @@ def compiled(function: Compiled) -> Compiled:
     numba drops cached code when the function's own file changes, but not when a function that it calls in another file
     does. Callees are decorated before their callers (their modules are imported first), so code older than the newest
     file seen so far is removed here.
-
-    Callees become part of their callers: a call that hands over arrays or tuples costs as much as the arithmetic of a
-    step, and tuples stay in registers only within one function.
     """
+    return _compiled(function, forceinline=False)
+
+
+def inlined(function: Compiled) -> Compiled:
+    """As `compiled`, and always a part of its callers: for the steps of a loop over samples.
+
+    There a call that hands over tuples costs as much as the arithmetic of a step, and tuples stay in registers only
+    within one function. Elsewhere it gains nothing and costs compile time: the code of the callee is compiled in every
+    caller, and that of a function which Python calls twice, once for the call from Python.
+    """
+    return _compiled(function, forceinline=True)
+
+
+def _compiled(function: Compiled, *, forceinline: bool) -> Compiled:
     assert isinstance(function, FunctionType)
     source = Path(function.__code__.co_filename)
     _sources.add(source)
@@ -29,4 +40,4 @@ def compiled(function: Compiled) -> Compiled:
     for index in (source.parent / "__pycache__").glob(f"{source.stem}.{function.__qualname__}-*.nbi"):
         if index.stat().st_mtime_ns < newest_ns:
             index.unlink(missing_ok=True)
-    return cast(Compiled, numba.njit(cache=True, error_model="numpy", forceinline=True)(function))
+    return cast(Compiled, numba.njit(cache=True, error_model="numpy", forceinline=forceinline)(function))

@@ -17,7 +17,7 @@ are kept apart: the neighbouring motion has the same sample.
 from __future__ import annotations
 
 from sonar_graph.navigation.joint_state import Path, Slopes, Spread
-from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.kernels import inlined
 from sonar_graph.navigation.triples import (
     Matrix,
     Vector,
@@ -34,7 +34,7 @@ from sonar_graph.navigation.triples import (
 )
 
 
-@compiled
+@inlined
 def with_sample(
     path: Path, spread: Spread, slopes: Slopes, z: Vector, weight_s: float, gyro_psd: float
 ) -> tuple[Path, Spread, Slopes]:
@@ -80,7 +80,7 @@ def with_sample(
     )
 
 
-@compiled
+@inlined
 def _skew_product(a: Vector, b: Vector) -> Matrix:
     """``[a]x [b]x = b a^T - (a . b) I``."""
     d = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -91,7 +91,7 @@ def _skew_product(a: Vector, b: Vector) -> Matrix:
     )
 
 
-@compiled
+@inlined
 def with_inertial_position(path: Path, spread: Spread, slopes: Slopes) -> tuple[Path, Spread, Slopes]:
     """At the end, ``s <- p + s``."""
     sp = sum_of(spread.pp, spread.sp)

@@ -25,7 +25,7 @@ from sonar_graph.navigation.joint_state import (
     pushed_slopes,
     pushed_spread,
 )
-from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.kernels import compiled, inlined
 from sonar_graph.navigation.odometry import rows_until, value_at
 from sonar_graph.navigation.triples import (
     IDENTITY,
@@ -143,13 +143,13 @@ def preintegrate(
     return _arrays(motion, first, last, imu.gyro_psd)
 
 
-@compiled
+@inlined
 def _at_sample(motion: Motion, z: Vector, weight_s: float, gyro_psd: float) -> Motion:
     path, spread, slopes = with_sample(motion.path, motion.spread, motion.slopes, z, weight_s, gyro_psd)
     return Motion(path, spread, slopes, motion.weights, motion.row)
 
 
-@compiled
+@inlined
 def _over(motion: Motion, imu: Inertial, interval: Interval, rule: Rule) -> Motion:
     """All inertial steps between two Doppler samples; a fixed rotation acts at its own instant."""
     motion = Motion(motion.path, motion.spread, motion.slopes, NO_WEIGHTS, motion.row)
@@ -168,7 +168,7 @@ def _over(motion: Motion, imu: Inertial, interval: Interval, rule: Rule) -> Moti
     return Motion(motion.path, motion.spread, slopes, motion.weights, motion.row)
 
 
-@compiled
+@inlined
 def _stepped(motion: Motion, imu: Inertial, interval: Interval, t: int, end_ns: int, rule: Rule) -> Motion:
     """Inertial steps, cut at every row; with the Doppler displacement where it turns with every row."""
     path, spread, slopes, (A, B), row = motion
@@ -190,7 +190,7 @@ def _stepped(motion: Motion, imu: Inertial, interval: Interval, t: int, end_ns: 
     return Motion(path, spread, slopes, Weights(A, B), row)
 
 
-@compiled
+@inlined
 def _push_at(R: Matrix, imu: Inertial, row: int, t: int, until: int) -> Push:
     """The step between two instants of which no row lies in between."""
     middle = t + (until - t) // 2
@@ -199,7 +199,7 @@ def _push_at(R: Matrix, imu: Inertial, row: int, t: int, until: int) -> Push:
     return push(R, (until - t) * 1e-9, minus(rate, times(transposed(R), imu.earth)), force)
 
 
-@compiled
+@inlined
 def _displaced(motion: Motion, turned: Matrix, interval: Interval, later: float, gyro_psd: float) -> Motion:
     """A whole interval's displacement at once, by a rotation times the interval's length."""
     by = Push(0.0, IDENTITY, ZEROS, ZEROS, ZERO, ZERO, times(turned, _mixed(interval, later)))
@@ -212,13 +212,13 @@ def _displaced(motion: Motion, turned: Matrix, interval: Interval, later: float,
     )
 
 
-@compiled
+@inlined
 def _mixed(interval: Interval, later: float) -> Vector:
     """Between the two samples, by the later one's share."""
     return plus(interval.z, scaled(later, minus(interval.z_next, interval.z)))
 
 
-@compiled
+@inlined
 def _with_calibration(slopes: Slopes, weights: Weights, z: Vector, z_next: Vector) -> Slopes:
     """``s_scale`` and ``s_mounting`` after an interval."""
     scale = plus(slopes.s_scale, plus(times(weights.before, z), times(weights.after, z_next)))
@@ -228,7 +228,7 @@ def _with_calibration(slopes: Slopes, weights: Weights, z: Vector, z_next: Vecto
     return Slopes(M, N, v_g, p_g, s_g, s_a, scale, mounting)
 
 
-@compiled
+@inlined
 def _with_noise(motion: Motion, noise: Matrix) -> Motion:
     """The motion with a Doppler sample's part of the covariance of s."""
     mv, mp, ms, vv, vp, pp, sv, sp, ss = motion.spread
@@ -236,7 +236,7 @@ def _with_noise(motion: Motion, noise: Matrix) -> Motion:
     return Motion(motion.path, spread, motion.slopes, motion.weights, motion.row)
 
 
-@compiled
+@inlined
 def _arrays(
     motion: Motion, first: Matrix, last: Matrix, gyro_psd: float
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
@@ -271,7 +271,7 @@ def _arrays(
     return R, vectors, P, D, weights[0], weights[1]
 
 
-@compiled
+@inlined
 def _place_pair(A: Matrix, out: Floats, row: int, column: int) -> None:
     place(A, out, row, column)
     place(transposed(A), out, column, row)

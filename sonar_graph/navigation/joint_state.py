@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.kernels import inlined
 from sonar_graph.navigation.recursion import SERIES_ANGLE2, rotation_series, sine_series
 from sonar_graph.navigation.triples import (
     IDENTITY,
@@ -95,7 +95,7 @@ NO_SPREAD = Spread(ZERO, ZERO, ZERO, ZEROS, ZEROS, ZEROS, ZEROS, ZEROS, ZEROS)
 NO_SLOPES = Slopes(ZEROS, ZEROS, ZEROS, ZEROS, ZEROS, ZEROS, ZERO, ZEROS)
 
 
-@compiled
+@inlined
 def push(R: Matrix, dt: float, rate: Vector, force: Vector) -> Push:
     """A step of constant rate and specific force; without a displacement."""
     phi = scaled(dt, rate)
@@ -107,7 +107,7 @@ def push(R: Matrix, dt: float, rate: Vector, force: Vector) -> Push:
     return Push(dt, rotation_series(phi, angle2, s1, s2), G, H, times(G, force), times(H, force), ZERO)
 
 
-@compiled
+@inlined
 def pushed_path(path: Path, by: Push) -> Path:
     """The mean after a step."""
     return Path(
@@ -119,7 +119,7 @@ def pushed_path(path: Path, by: Push) -> Path:
     )
 
 
-@compiled
+@inlined
 def pushed_spread(spread: Spread, by: Push, theta_variance: float, accel_psd: float) -> Spread:
     """The covariance after a step.
 
@@ -155,7 +155,7 @@ def pushed_spread(spread: Spread, by: Push, theta_variance: float, accel_psd: fl
     )
 
 
-@compiled
+@inlined
 def _coupled(P: Matrix, ax: Vector, hx: Vector, ay: Vector, hy: Vector, noise: float) -> Matrix:
     d = dot(ax, hy) + dot(ay, hx) + noise
     x, y, z = P
@@ -178,7 +178,7 @@ def _coupled(P: Matrix, ax: Vector, hx: Vector, ay: Vector, hy: Vector, noise: f
     )
 
 
-@compiled
+@inlined
 def pushed_slopes(slopes: Slopes, by: Push) -> Slopes:
     """The derivatives after a step; the rotation's own change within it counts by its mean."""
     half = sum_of(slopes.M, multiple_of(0.5, by.G))

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sonar_graph.kernels import compiled as compiled  # the estimators' loops take it from here
+from sonar_graph.kernels import compiled as compiled  # the estimators' loops take both from here
+from sonar_graph.kernels import inlined as inlined
 from sonar_graph.measurements import Floats
 
 SMALL_ANGLE_RAD = 1e-4

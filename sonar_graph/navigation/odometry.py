@@ -25,7 +25,7 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
-from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.kernels import compiled, inlined
 from sonar_graph.navigation.recursion import Step
 from sonar_graph.navigation.triples import (
     Matrix,
@@ -220,7 +220,7 @@ def _has_repeats(stamps: Ints) -> bool:
     return bool(np.any(stamps[1:] == stamps[:-1]))
 
 
-@compiled
+@inlined
 def rows_until(stamps: Ints, instant_ns: int) -> int:
     """Number of rows stamped at or before an instant; numpy's search takes its side as text, slow to compile."""
     low, high = 0, len(stamps)
@@ -233,7 +233,7 @@ def rows_until(stamps: Ints, instant_ns: int) -> int:
     return low
 
 
-@compiled
+@inlined
 def _bracket(stamps: Ints, n: int, i: int, t: int, hold_past: bool) -> tuple[int, int, float]:
     """Rows before and after t and the share of the later, where ``stamps[i - 1] < t <= stamps[i]``.
 
@@ -257,20 +257,20 @@ def node_range(imu_ns: Ints, dvl_ns: Ints, after_ns: int, until_ns: int) -> tupl
     return int(first), max(int(first), int(np.searchsorted(dvl_ns, covered_ns, side="right")))
 
 
-@compiled
+@inlined
 def value_at(stamps: Ints, values: Floats, i: int, t: int, hold_past: bool) -> Vector:
     """Value at t, where ``stamps[i - 1] < t <= stamps[i]``; the nearest end's value outside the rows."""
     return _between(values, *_bracket(stamps, len(stamps), i, t, hold_past))
 
 
-@compiled
+@inlined
 def _between(values: Floats, before: int, after: int, share: float) -> Vector:
     """Between two rows."""
     a, b = vector(values[before]), vector(values[after])
     return plus(a, scaled(share, minus(b, a)))
 
 
-@compiled
+@inlined
 def _velocity_psd(dvl_ns: Ints, cov: Floats, n: int, k: int, hold_past: bool) -> Matrix:
     """Spectral density of the velocity noise between rows k - 1 and k; past row n - 1, that of the last interval."""
     last = min(k, n - 1)
@@ -279,13 +279,13 @@ def _velocity_psd(dvl_ns: Ints, cov: Floats, n: int, k: int, hold_past: bool) ->
     return multiple_of(interval_s, multiple_of(0.5, sum_of(matrix(cov[last]), matrix(cov[other]))))
 
 
-@compiled
+@inlined
 def cursor_at(columns: Columns, instant_ns: int) -> Cursor:
     """The cursor with which motion from an instant begins."""
     return Cursor(instant_ns, rows_until(columns[0], instant_ns), rows_until(columns[3], instant_ns))
 
 
-@compiled
+@inlined
 def next_step(columns: Columns, imu_rows: int, dvl_rows: int, cursor: Cursor, end_ns: int) -> tuple[Cursor, Step]:
     """The step from a cursor to the next stamp of either sensor, or to the end: each sensor's mean over it.
 

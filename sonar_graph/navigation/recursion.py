@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.kernels import compiled, inlined
 from sonar_graph.navigation.triples import (
     IDENTITY,
     ZERO,
@@ -88,7 +88,7 @@ class Increment(NamedTuple):
 NO_MOTION = Integral(IDENTITY, ZERO, ZERO, ZEROS, ZEROS, ZEROS)
 
 
-@compiled
+@inlined
 def increment(dR: Matrix, duration_s: float, rate: Vector, velocity: Vector, lever: Vector) -> Increment:
     """What a step adds after a rotation.
 
@@ -106,13 +106,13 @@ def increment(dR: Matrix, duration_s: float, rate: Vector, velocity: Vector, lev
     return Increment(turn, scaled(duration_s, times(turned, u)), turned, by_rate)
 
 
-@compiled
+@inlined
 def rate_of_turn(step: Step, dR: Matrix, bias: Vector, earth: Vector) -> Vector:
     """Angular rate without gyro bias and Earth rate (in frame i), body axes."""
     return minus(minus(step.rate, bias), times(transposed(dR), earth))
 
 
-@compiled
+@inlined
 def extended(motion: Integral, step: Step, added: Increment, gyro_density: float) -> Integral:
     """The integral one step further."""
     G_t, G_r, s, dt = added.theta_by_rate, added.eps_by_rate, added.displacement, step.duration_s
@@ -131,7 +131,7 @@ def extended(motion: Integral, step: Step, added: Increment, gyro_density: float
     )
 
 
-@compiled
+@inlined
 def mirrored(A: Matrix) -> Matrix:
     """The upper half in both places."""
     return A[0], (A[0][1], A[1][1], A[1][2]), (A[0][2], A[1][2], A[2][2])
@@ -217,7 +217,7 @@ def trace_point(
     return positions
 
 
-@compiled
+@inlined
 def exp_and_chord(phi: Vector) -> tuple[Matrix, Matrix]:
     """Exp(phi) and J_l(phi) at once: they share sine and cosine, and a sample's turn needs neither."""
     angle2 = dot(phi, phi)
@@ -225,7 +225,7 @@ def exp_and_chord(phi: Vector) -> tuple[Matrix, Matrix]:
     return rotation_series(phi, angle2, s1, s2), rotation_series(phi, angle2, s2, s3)
 
 
-@compiled
+@inlined
 def sine_series(angle2: float) -> Vector:
     """``sum_n (-x)^n / (2n + k)!`` for k = 1, 2, 3: sin(t)/t, (1 - cos(t))/t^2, (t - sin(t))/t^3 with ``x = t^2``."""
     if angle2 < SERIES_ANGLE2:
@@ -239,7 +239,7 @@ def sine_series(angle2: float) -> Vector:
     return s1, s2, s3
 
 
-@compiled
+@inlined
 def rotation_series(phi: Vector, angle2: float, a: float, b: float) -> Matrix:
     """``I + a [phi]x + b [phi]x^2``, with ``[phi]x^2 = phi phi^T - |phi|^2 I``."""
     x, y, z = phi
@@ -251,7 +251,7 @@ def rotation_series(phi: Vector, angle2: float, a: float, b: float) -> Matrix:
     )
 
 
-@compiled
+@inlined
 def _chord_derivative(phi: Vector, u: Vector, scale: float) -> Matrix:
     """Derivative of ``J_l(phi) u`` by phi, times scale; to second order in phi (a step turns by far less than 1 rad).
 
@@ -271,7 +271,7 @@ def _chord_derivative(phi: Vector, u: Vector, scale: float) -> Matrix:
     )
 
 
-@compiled
+@inlined
 def _in_last_frame(motion: Integral, D_t: Matrix, D_r: Matrix) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Arrays of `integrate_steps`: covariance and bias Jacobian turned from frame i into frame j."""
     j_R_i = transposed(motion.dR)
