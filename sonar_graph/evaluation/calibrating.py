@@ -37,16 +37,20 @@ class LabelledSightings:
     _correlation: list[Floats] = field(default_factory=list)
     _visible: list[float] = field(default_factory=list)
     _label: list[int] = field(default_factory=list)
+    _track: list[tuple[int, int]] = field(default_factory=list)
     _error: list[tuple[float, float]] = field(default_factory=list)
 
-    def add(self, sighting: Sighting, ids: Ints, range_m: Floats, azimuth_rad: Floats) -> None:
-        """One sighting, and where every landmark truly is, shapes (m,)."""
+    def add(
+        self, sighting: Sighting, track: tuple[int, int], ids: Ints, range_m: Floats, azimuth_rad: Floats
+    ) -> None:
+        """One sighting, the log and the track that it is of, and where every landmark truly is, shapes (m,)."""
         if sighting.fit is None:
             return
         label, at = label_of(sighting, ids, range_m, azimuth_rad)
         if label == NO_LABEL or (label != NONE and label not in self.ids):
             return
         known = label != NONE
+        self._track.append(track)
         self._correlation.append(sighting.fit.correlation)
         self._visible.append(sighting.fit.visible)
         self._label.append(self.ids.index(label) if known else len(self.ids))
@@ -60,6 +64,7 @@ class LabelledSightings:
             np.array(self._correlation, float).reshape(-1, len(self.ids)),
             np.array(self._visible, float),
             np.array(self._label, np.int64),
+            np.unique(np.reshape(self._track, (-1, 2)), axis=0, return_inverse=True)[1].ravel(),
             np.array(self._error, float).reshape(-1, 2),
         )
 
@@ -113,7 +118,7 @@ def calibrate(
     """
     designs = tuple(designs or DEFAULT_DESIGNS)
     gathered = LabelledSightings(tuple(design.id for design in designs))
-    for path, run in logs:
+    for log, (path, run) in enumerate(logs):
         if run.truth is None or run.true_landmarks is None:
             raise CalibrationError(f"{path}: without true trajectory and true landmarks nothing in it can be labelled")
         recogniser = Recogniser(run.calibration, designs)
@@ -121,17 +126,17 @@ def calibrate(
         for block in read_sonar_frames(path, topic, config):
             for frame in one_by_one(block):
                 session.take(frame)
-                _gather(gathered, recogniser, run, int(frame.stamps_ns[0]))
+                _gather(gathered, log, recogniser, run, int(frame.stamps_ns[0]))
     names = ", ".join(path.name for path, _ in logs)
     kinds = "; ".join(dict.fromkeys(run.notes.get("ours", "recorded") for _, run in logs))
     return estimate_confusion(gathered.fits(), gathered.ids, {"logs": names, "what they are": kinds})
 
 
-def _gather(gathered: LabelledSightings, recogniser: Recogniser, run: Run, stamp_ns: int) -> None:
+def _gather(gathered: LabelledSightings, log: int, recogniser: Recogniser, run: Run, stamp_ns: int) -> None:
     truth, landmarks = run.truth, run.true_landmarks
     if truth is None or landmarks is None or not truth.stamps_ns[0] <= stamp_ns <= truth.stamps_ns[-1]:
         return
     range_m, azimuth_rad = true_ranges_azimuths(run, stamp_ns)
-    for sighting in recogniser.sightings:
+    for track, sighting in zip(recogniser.track_ids.tolist(), recogniser.sightings, strict=True):
         if sighting is not None:
-            gathered.add(sighting, landmarks.ids, range_m, azimuth_rad)
+            gathered.add(sighting, (log, track), landmarks.ids, range_m, azimuth_rad)

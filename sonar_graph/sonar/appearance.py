@@ -37,7 +37,9 @@ class AppearanceParams(Section):
     search_m: float = Field(0.045, ge=0)
     """How far a landmark's centre is sought from the candidate's, along each axis."""
     least_visible: float = Field(0.8, gt=0, le=1)
-    """Share of the cells that must lie in the image."""
+    """Share of the cells that must lie in the image where the best of all fits."""
+    least_searched: float = Field(0.5, gt=0, le=1)
+    """The same while the best is sought: less, or the rim of the image would push the best fit aside."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +96,10 @@ class Appearance:
         best_shift, best_template = np.unravel_index(np.argmax(at), at.shape)
         by_design = np.array([at[:, self.templates.design == d].max() for d in range(self.designs)])
         offset = self._between_points(at[:, best_template], int(best_shift))
+        share = float(visible[best_shift])
         return Fit(
-            by_design,
-            float(visible[best_shift]),
+            by_design if share >= self.params.least_visible else np.full_like(by_design, -1.0),
+            share,
             int(self.templates.design[best_template]),
             float(self.templates.heading_rad[best_template]),
             patch.centre_m + self.params.cell_m * (self._shifts[best_shift] + offset),
@@ -113,7 +116,7 @@ class Appearance:
         level_variance = np.einsum("sc,sc->s", level, level)[:, None]
         product = _product(level, self._pictures)
         visible = count / level.shape[1]
-        known = (visible[:, None] >= self.params.least_visible) & (template_variance > 0) & (level_variance > 0)
+        known = (visible[:, None] >= self.params.least_searched) & (template_variance > 0) & (level_variance > 0)
         scale = np.sqrt(np.where(known, template_variance * level_variance, 1.0))
         return np.where(known, product / scale, -1.0), visible
 

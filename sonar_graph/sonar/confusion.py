@@ -80,6 +80,8 @@ class LabelledFits:
     """Share of the template in view, shape (n,)."""
     label: Ints
     """Index of the true class; the number of ids for "none of them", shape (n,)."""
+    track: Ints
+    """Number of the track that it is of; frames of one track are not independent. Shape (n,)."""
     range_azimuth_error: Floats
     """Measured minus true (m, rad), shape (n, 2); NaN where there is no landmark."""
 
@@ -99,8 +101,8 @@ def estimate_confusion(fits: LabelledFits, ids: tuple[int, ...], provenance: dic
         raise CalibrationError(
             f"too few labelled frames ({'; '.join(poor)}; needed {LEAST_FRAMES} of each): give longer or more logs"
         )
-    weights = 1.0 / (counts[fits.label] * len(counts))
-    sharpness, threshold = _fit_scores(fits, weights)
+    tracks = np.array([len(np.unique(fits.track[fits.label == k])) for k in range(len(counts))])
+    sharpness, threshold = _fit_scores(fits, _targets(tracks)[fits.label] / (counts[fits.label] * len(counts))[:, None])
     scores = soft_scores(fits.correlation, fits.visible, sharpness, threshold)
     matrix = np.array([scores[fits.label == k].mean(axis=0) for k in range(len(counts))])
     matrix = np.maximum(matrix, LEAST_ENTRY)
@@ -112,18 +114,31 @@ def estimate_confusion(fits: LabelledFits, ids: tuple[int, ...], provenance: dic
         threshold=threshold,
         range_sigma_m=float(sigmas[0]),
         azimuth_sigma_rad=float(sigmas[1]),
-        provenance=provenance | {f"frames of {n}": str(c) for n, c in zip(names, counts.tolist(), strict=True)},
+        provenance=provenance
+        | {f"frames of {n}": str(c) for n, c in zip(names, counts.tolist(), strict=True)}
+        | {f"tracks of {n}": str(c) for n, c in zip(names, tracks.tolist(), strict=True)},
     )
 
 
-def _fit_scores(fits: LabelledFits, weights: Floats) -> tuple[float, float]:
-    """Sharpness and threshold of the highest weighted likelihood of the labels."""
-    rows = np.arange(len(fits.label))
+def _targets(tracks: Ints) -> Floats:
+    """Probabilities that a class can be taken for certain with after n tracks, shape (classes, classes).
+
+    ``(n + 1) / (n + 2)`` for itself: with classes that never were confused the most likely scores would be certain,
+    which n tracks do not show (Platt, "Probabilistic outputs for support vector machines", 1999, section 2.2).
+    """
+    others = 1.0 / ((tracks + 2.0) * (len(tracks) - 1))
+    targets = np.tile(others[:, None], (1, len(tracks)))
+    np.fill_diagonal(targets, (tracks + 1.0) / (tracks + 2.0))
+    return targets
+
+
+def _fit_scores(fits: LabelledFits, targets: Floats) -> tuple[float, float]:
+    """Sharpness and threshold of the scores that come nearest to weighted targets, shape (n, classes)."""
 
     def loss(unbounded: Floats) -> float:
         sharpness, threshold = float(np.exp(unbounded[0])), float(1 / (1 + np.exp(-unbounded[1])))
         scores = soft_scores(fits.correlation, fits.visible, sharpness, threshold)
-        return float(-weights @ np.log(np.maximum(scores[rows, fits.label], 1e-12)))
+        return float(-np.sum(targets * np.log(np.maximum(scores, 1e-12))))
 
     found = minimize(loss, np.array([np.log(10.0), 1.0]), method="Nelder-Mead")
     return float(np.exp(found.x[0])), float(1 / (1 + np.exp(-found.x[1])))

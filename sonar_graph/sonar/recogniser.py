@@ -20,7 +20,7 @@ from scipy.optimize import linear_sum_assignment
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import CalibrationError
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
-from sonar_graph.measurements import Floats, LandmarkDetections, SonarFrames
+from sonar_graph.measurements import Floats, Ints, LandmarkDetections, SonarFrames
 from sonar_graph.sonar.appearance import Appearance, AppearanceParams
 from sonar_graph.sonar.association import Association
 from sonar_graph.sonar.beliefs import Beliefs, IdentityParams
@@ -111,6 +111,8 @@ class Recogniser:
         """What became of everything in the frame last processed."""
         self.sightings: list[Sighting | None] = []
         """How the designs fitted each track of that frame; None where it had no candidate."""
+        self.track_ids: Ints = np.empty(0, dtype=np.int64)
+        """Numbers of those tracks."""
 
     def process(
         self, frame: SonarFrames, motion: SonarStep | None = None, view: FloorView | None = None
@@ -133,7 +135,7 @@ class Recogniser:
             none, and for a frame that must not be used; `fates` says why.
         """
         stamp_ns = int(frame.stamps_ns[0])
-        self.sightings = []
+        self.sightings, self.track_ids = [], np.empty(0, dtype=np.int64)
         if motion is not None:
             self._start_T_sonar = self._start_T_sonar.compose(motion.previous_T_sonar)
         if (fault := self._check.fault(frame)) is not None:
@@ -143,6 +145,7 @@ class Recogniser:
         image_db = self._calibration.sonar.image.decibels(frame.intensity[0])
         candidates = select_candidates(image_db, frame.ranges_m, frame.azimuths_rad, view, self.params.detection)
         association = self._tracker.step(candidates, motion, stamp_ns)
+        self.track_ids = association.track_ids
         self.sightings = self._look.at(image_db, frame, view, candidates, association.candidate)
         scores = self._look.scores(self.sightings)
         beliefs = self._beliefs.step(association, scores, self._places(), self._sideways(association))
@@ -177,8 +180,8 @@ class Recogniser:
         self.fates = _fates_of_candidates(stamp_ns, candidates)
         reported = []
         for row, sighting in enumerate(self.sightings):
-            outcome = self._outcome(association, row)
             if sighting is not None:
+                outcome = self._outcome(association, row, sighting)
                 track = int(association.track_ids[row])
                 self.fates.append(Fate(stamp_ns, track, sighting.range_m, sighting.azimuth_rad, outcome))
                 if outcome == REPORTED:
@@ -199,7 +202,9 @@ class Recogniser:
             id_probability=each_once(beliefs[rows])[:, :-1],
         )
 
-    def _outcome(self, association: Association, row: int) -> str:
+    def _outcome(self, association: Association, row: int, sighting: Sighting) -> str:
+        if sighting.fit is None:
+            return "not reported: too little of it is in view"
         if association.frames_seen[row] < self.params.least_frames:
             return f"not reported: seen in fewer than {self.params.least_frames} frames"
         if association.existence[row] < self.params.least_existence:

@@ -64,7 +64,7 @@ def test_sightings_become_columns_with_their_errors():
         sighting(2.2, 0.1),
         sighting(2.0, 0.1, is_compared=False),
     ):
-        gathered.add(seen, IDS, RANGE_M, AZIMUTH_RAD)
+        gathered.add(seen, (0, 7), IDS, RANGE_M, AZIMUTH_RAD)
     fits = gathered.fits()
     assert fits.label.tolist() == [1, 0, 2]  # in the order of the designs; what is unclear or not compared is left out
     np.testing.assert_allclose(fits.correlation, np.tile([0.9, 0.3], (3, 1)))
@@ -75,7 +75,7 @@ def test_sightings_become_columns_with_their_errors():
 
 def test_landmarks_that_no_design_is_of_are_left_out():
     gathered = LabelledSightings((3, 9))
-    gathered.add(sighting(2.0, 0.1), IDS, RANGE_M, AZIMUTH_RAD)
+    gathered.add(sighting(2.0, 0.1), (0, 1), IDS, RANGE_M, AZIMUTH_RAD)
     assert len(gathered.fits().label) == 0
     assert gathered.fits().correlation.shape == (0, 2)
 

@@ -71,12 +71,22 @@ def test_a_wrong_height_costs_correlation(appearance):
 
 def test_a_landmark_at_the_edge_counts_by_what_is_in_view(appearance):
     rotation = level_R_sonar()
-    image = image_db(DEFAULT_DESIGNS[0], (1.7, 0.40), 0.0, rotation, None)
-    partly = _fit(appearance, image, rotation, (1.7, 0.40))
+    image = image_db(DEFAULT_DESIGNS[0], (1.7, 0.37), 0.0, rotation, None)
+    partly = _fit(appearance, image, rotation, (1.7, 0.37))
     assert partly.best == 0
     assert appearance.params.least_visible <= partly.visible < 0.95
     gone = _fit(appearance, image, rotation, (1.7, 0.75))
     assert (gone.correlation == -1).all()
+
+
+@pytest.mark.parametrize("design", DEFAULT_DESIGNS, ids=lambda design: design.name)
+@pytest.mark.parametrize("y_m", np.linspace(0.34, 0.46, 7))
+def test_the_rim_of_the_image_does_not_push_a_landmark_aside(appearance, design, y_m: float):
+    rotation = level_R_sonar()
+    image = image_db(design, (1.7, y_m), 0.6, rotation, None)
+    fit = _fit(appearance, image, rotation, (1.7, y_m - 0.02))
+    if fit.correlation.max() > 0:
+        np.testing.assert_allclose(fit.centre_m, (1.7, y_m), atol=0.003)
 
 
 def test_a_disc_needs_one_template_and_a_square_a_quarter_of_the_headings(appearance):

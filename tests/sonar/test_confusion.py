@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ def _fits(per_class: int, noise: float, seed: int = 0) -> LabelledFits:
     label = np.repeat(np.arange(3), per_class)
     means = np.array([[0.9, 0.7], [0.7, 0.9], [0.6, 0.6]])[label]
     error = np.where((label < 2)[:, None], rng.normal(0, [0.01, 0.002], (len(label), 2)), np.nan)
-    return LabelledFits(means + rng.normal(0, noise, means.shape), np.ones(len(label)), label, error)
+    return LabelledFits(means + rng.normal(0, noise, means.shape), np.ones(len(label)), label, np.arange(len(label)), error)
 
 
 def test_scores_are_probabilities_and_rise_with_correlation():
@@ -53,9 +54,21 @@ def test_matrix_is_the_mean_score_of_each_class():
     assert model.range_sigma_m == pytest.approx(0.01, rel=0.2)
 
 
+def test_classes_that_never_were_confused_are_as_certain_as_their_tracks_allow():
+    fits = _fits(200, 0.01)
+    few, many = (
+        estimate_confusion(replace(fits, track=np.arange(600) % tracks + 1000 * fits.label), (1, 2), {})
+        for tracks in (5, 100)
+    )
+    for model, tracks in ((few, 5), (many, 100)):
+        scores = soft_scores(fits.correlation, fits.visible, model.sharpness, model.threshold)
+        assert scores.max(axis=1).mean() == pytest.approx((tracks + 1) / (tracks + 2), abs=0.03)
+        assert model.provenance["tracks of landmark 2"] == str(tracks)
+
+
 def test_a_class_with_too_few_frames_is_named():
     fits = _fits(100, 0.1)
-    few = LabelledFits(*(getattr(fits, n)[:210] for n in ("correlation", "visible", "label", "range_azimuth_error")))
+    few = LabelledFits(*(getattr(fits, n)[:210] for n in ("correlation", "visible", "label", "track", "range_azimuth_error")))
     with pytest.raises(CalibrationError, match="no landmark: 10"):
         estimate_confusion(few, (1, 2), {})
 
