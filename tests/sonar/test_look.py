@@ -90,13 +90,13 @@ def test_what_no_ray_finds_on_the_floor_is_compared_with_nothing(appearance, tri
 def test_a_track_that_was_not_seen_has_no_sighting_and_rows_say_which_candidate(appearance, triangle):
     r, a = VIEW.range_azimuth(np.array([1.7, 0.05]))
     look = Look(appearance, MODEL, APERTURE_RAD)
-    candidates = candidates_at([2.2, r], [-0.2, a])
+    candidates = candidates_at([2.05, r], [-0.1, a])
     found = look.at(triangle, frame(triangle), VIEW, candidates, np.array([-1, 1, 0]))
     assert found[0] is None
     assert found[1] is not None
     assert found[1].is_fitted
     assert found[2] is not None
-    assert found[2].azimuth_rad == pytest.approx(-0.2, abs=0.05)
+    assert found[2].azimuth_rad == pytest.approx(-0.1, abs=0.05)
     scores = look.scores(found)
     assert scores.shape == (3, 5)
     assert (scores[0] == 0).all()
