@@ -97,7 +97,7 @@ def _totals(found: LandmarkTable) -> Table:
 
 def _plain_table(title: str, headings: list[str]) -> Table:
     table = Table(title=Text(title, style="bold") if title else None, title_justify="left")
-    table.box, table.padding = SIMPLE_HEAD, (0, 1, 0, 0)
+    table.box, table.padding = SIMPLE_HEAD, 0
     for number, heading in enumerate(headings):
         table.add_column(heading, no_wrap=True, justify="right" if number else "left")
     return table
@@ -121,6 +121,8 @@ def _notes(comparison: Comparison) -> Text:
     lines += lost_runs(comparison)
     notes = comparison.sequence.notes
     lines += [f"Log: {notes[subject]}" for subject in ("log.ending", "log.damage") if subject in notes]
+    if comparison.recognition is not None:
+        lines += [f"Sonar images: {n} x {reason}" for reason, n in comparison.recognition.warned().items()]
     if not has_detections(comparison):
         lines.append(NO_DETECTIONS)
     metric = headline_metric(comparison)

@@ -7,17 +7,19 @@ from typing import Any
 
 from rich.console import Console
 
-from sonar_graph.evaluation.console import summary
+from sonar_graph.evaluation.console import published_counterpart, summary
+from sonar_graph.evaluation.landmark_table import landmark_table
+from sonar_graph.evaluation.published_experiment import published_maps
 from sonar_graph.evaluation.results import Comparison, Score
 from sonar_graph.evaluation.wording import display_value
 
 from .synthetic import basin_comparison, with_failure, with_score
 
 
-def printed(comparison: Comparison, width: int = 80) -> str:
+def printed(comparison: Comparison, width: int = 80, shown: Any = None) -> str:
     options: dict[str, Any] = {"file": io.StringIO(), "width": width, "color_system": None}
     console = Console(**options)
-    console.print(summary(comparison))
+    console.print(summary(comparison) if shown is None else shown)
     return console.file.getvalue()
 
 
@@ -82,3 +84,15 @@ def test_what_stands_below_the_table_may_be_as_wide_as_the_terminal():
     reason = "no odometry covers the stamps of any of the sonar frames that the log holds"
     text = printed(with_failure(basin_comparison(60, truth=False), "isam2", reason), width=100)
     assert f"isam2 failed: {reason}" in text
+
+
+def test_the_published_table_has_a_counterpart_in_80_columns_with_the_numbers_of_the_report():
+    comparison = basin_comparison(60)
+    assert published_counterpart(comparison) is None
+    same = replace(comparison, sequence=replace(comparison.sequence, true_landmarks=published_maps()[1]))
+    text, table = printed(same, 80, published_counterpart(same)), landmark_table(same)
+    assert "…" not in text
+    assert table is not None
+    for row in (*table.positions, *table.totals):
+        assert all(cell in text for cell in row.cells)
+    assert "dead-reckoning x" not in text

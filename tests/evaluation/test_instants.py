@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation.instants import gap_limit_s, rows_at, scored_instants
+from sonar_graph.evaluation.instants import gap_limit_s, map_instants, rows_at, scored_instants
 from sonar_graph.evaluation.results import RunResult
 from sonar_graph.states import Trajectory
 
@@ -63,3 +63,20 @@ def test_an_instant_that_one_run_lacks_is_left_out_for_all() -> None:
 def test_rows_are_found_by_stamp() -> None:
     rows = rows_at(trajectory(DENSE), seconds(0.5, 2.0))
     np.testing.assert_allclose(rows.positions[:, 0], [0.5, 2.0])
+
+
+@pytest.mark.parametrize("duration_s", [2039.0, 203.9])
+def test_maps_are_kept_at_the_published_times_or_the_same_fractions(duration_s: float) -> None:
+    scale = duration_s / 2039.0
+    asked = seconds(*(7.0 + np.linspace(0, duration_s, 4079)[1:]))
+    kept = map_instants(asked, int(seconds(7.0)[0]))
+    assert set(kept.tolist()) <= set(asked.tolist())
+    np.testing.assert_allclose(
+        (kept - seconds(7.0)) * 1e-9, np.array([833.1, 1369.4, 2039.0]) * scale, atol=0.26 * scale
+    )
+    assert kept[-1] == asked[-1]
+
+
+def test_few_instants_are_each_kept_once() -> None:
+    np.testing.assert_array_equal(map_instants(seconds(1.0), 0), seconds(1.0))
+    assert len(map_instants(seconds(), 0)) == 0

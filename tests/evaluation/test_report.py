@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sonar_graph.evaluation.published_experiment import published_maps
 from sonar_graph.evaluation.report import render_report, write_report
 from sonar_graph.evaluation.results import Comparison, Score
 from sonar_graph.evaluation.score_table import score_blocks
@@ -229,3 +230,12 @@ def test_text_and_lines_stand_out_from_the_paper(html, scheme):
 def test_a_long_mission_still_makes_a_small_page(tmp_path: Path):
     write_report(basin_comparison(4078), tmp_path / "report.html")
     assert (tmp_path / "report.html").stat().st_size < 3_000_000
+
+
+def test_only_the_repeated_experiment_stands_beside_the_paper(comparison: Comparison) -> None:
+    same = replace(comparison, sequence=replace(comparison.sequence, true_landmarks=published_maps()[1]))
+    for shown, is_repeated in ((comparison, False), (same, True)):
+        text = Page(render_report(shown)).text
+        assert ("2014 paper" in text) == is_repeated
+        assert ("4.81 (\N{MINUS SIGN}0.19)" in text) == is_repeated
+        assert "Positions in the map at the end, metres; in brackets estimate minus truth" in text

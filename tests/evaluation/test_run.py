@@ -11,6 +11,7 @@ import pytest
 
 import sonar_graph.evaluation.run as run_module
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
+from sonar_graph.evaluation.instants import map_instants
 from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.measurements import Measurements
 from sonar_graph.sequence import Sequence
@@ -258,3 +259,61 @@ def test_interruption_is_not_swallowed(install: Install, make_sequence: Make, of
     install(interrupted=Interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_estimator(make_sequence(), "interrupted")
+
+
+def test_the_map_is_kept_on_the_way_as_it_was_known_then(
+    install: Install, make_sequence: Make, offset_estimator: Any
+) -> None:
+    class Counting(offset_estimator):
+        """Has as many landmarks as it took steps."""
+
+        def landmarks(self) -> LandmarkMap:
+            n = len(self.estimates)
+            return LandmarkMap(np.arange(n), np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
+
+    install(counting=Counting)
+    sequence = make_sequence()
+    result = run_estimator(sequence, "counting", rate_hz=2.0)
+    instants = sequence.instants(2.0)
+    expected = map_instants(instants, sequence.start_ns)
+    assert [known.stamp_ns for known in result.maps] == expected.tolist()
+    assert [len(known.landmarks) for known in result.maps] == (np.searchsorted(instants, expected) + 1).tolist()
+    assert result.landmarks is result.maps[-1].landmarks
+
+
+def test_asking_for_the_map_on_the_way_is_not_timed(
+    install: Install, make_sequence: Make, offset_estimator: Any
+) -> None:
+    class SlowToTell(offset_estimator):
+        def landmarks(self) -> LandmarkMap:
+            time.sleep(0.2)
+            return super().landmarks()
+
+    install(slow=SlowToTell)
+    result = run_estimator(make_sequence(), "slow", rate_hz=2.0)
+    assert len(result.maps) == 3
+    assert result.update_s.max() < 0.15
+
+
+def test_no_map_is_asked_for_before_the_first_estimate(
+    install: Install, make_sequence: Make, offset_estimator: Any
+) -> None:
+    class Late(offset_estimator):
+        def process(self, measurements: Measurements) -> Estimate | None:
+            estimate = super().process(measurements)
+            if len(self.estimates) < 30:
+                return None
+            return estimate
+
+        def trajectory(self) -> Trajectory:
+            return Trajectory.from_estimates(self.estimates[29:])
+
+        def landmarks(self) -> LandmarkMap:
+            if len(self.estimates) < 30:
+                raise RuntimeError("nothing is known yet")
+            return super().landmarks()
+
+    install(late=Late)
+    result = run_estimator(make_sequence(), "late", rate_hz=2.0)
+    assert (result.status, result.reason) == ("ok", "")
+    assert len(result.maps) == 1
