@@ -1,0 +1,24 @@
+"""What pages of theory quote is what their scripts print."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+
+THEORY = Path(__file__).parents[1] / "docs" / "theory"
+
+
+def test_recognition_quotes_what_its_script_prints_and_draws(tmp_path: Path) -> None:
+    picture = tmp_path / "recognition.png"
+    command = [sys.executable, "-W", "error", THEORY / "recognition.py", picture]
+    done = subprocess.run(command, capture_output=True, text=True, encoding="utf-8", timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.splitlines()) == 13
+    page = (THEORY / "recognition.md").read_text(encoding="utf-8")
+    assert f"```\n{done.stdout}```\n" in page
+    drawn, shown = (cv2.imread(os.fspath(path)) for path in (picture, THEORY.parent / "images" / "recognition.png"))
+    assert drawn.shape == shown.shape
