@@ -16,6 +16,7 @@ from mcap.reader import make_reader
 
 from sonar_graph.logs.reading import read_sequence
 from sonar_graph.logs.writing import write_sequence
+from sonar_graph.sonar import confusion
 from sonar_graph.sonar.confusion import read_confusion
 
 if TYPE_CHECKING:
@@ -89,7 +90,10 @@ def test_compare_recognises_by_itself_and_gives_what_recognise_gives(lane_log, r
     assert "/sonar/recognised" in topics
 
 
-def test_a_model_that_calibrate_wrote_is_used(lane_log, run, tmp_path):
+def test_a_model_that_calibrate_wrote_is_used(lane_log, run, tmp_path, monkeypatch, capsys):
+    assert run("calibrate", lane_log, "-o", tmp_path / "model.json") == 2
+    assert re.fullmatch(r"sonar-graph: too few labelled frames .*give longer or more logs\n", capsys.readouterr().err)
+    monkeypatch.setattr(confusion, "LEAST_FRAMES", 8)
     assert run("calibrate", lane_log, "-o", tmp_path / "model.json") == 0
     model = read_confusion(tmp_path / "model.json")
     assert model.provenance["logs"] == "lane.mcap"

@@ -19,6 +19,7 @@ from sonar_graph.evaluation.calibrating import (
 )
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS
 from sonar_graph.logs.reading import read_sequence
+from sonar_graph.sonar import confusion
 from sonar_graph.sonar.appearance import Fit
 from sonar_graph.sonar.confusion import Confusion
 from sonar_graph.sonar.look import Sighting
@@ -94,6 +95,14 @@ def test_true_ranges_and_azimuths_are_those_of_the_simulator(lane, second: int):
         assert azimuth_rad[row] == pytest.approx(np.arctan2(q[1], q[0]), abs=1e-6)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_frames_are_enough():
+    """A lane is shorter than what one would calibrate on."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(confusion, "LEAST_FRAMES", 8)
+        yield
+
+
 @pytest.fixture(scope="module")
 def measured(lane_log) -> Confusion:
     return calibrate([(lane_log, read_sequence(lane_log))])
@@ -103,12 +112,12 @@ def test_a_model_measured_on_a_log_is_of_its_landmarks_and_says_where_it_comes_f
     assert measured.ids == (1, 2, 3, 4)
     matrix = np.array(measured.matrix)
     assert (matrix.argmax(axis=1) == np.arange(5)).all()
-    assert np.diag(matrix).mean() > 0.6
+    assert np.diag(matrix).mean() > 0.4
     said = measured.provenance
     assert said["logs"] == "lane.mcap"
     assert said["what they are"] == lane.sequence.notes["ours"] == "a lane"
-    assert all(int(said[f"frames of landmark {k}"]) >= 20 for k in (1, 2, 3, 4))
-    assert int(said["frames of no landmark"]) >= 20
+    assert all(int(said[f"frames of landmark {k}"]) >= 8 for k in (1, 2, 3, 4))
+    assert int(said["frames of no landmark"]) >= 8
     assert measured.range_sigma_m < 0.02
     assert np.degrees(measured.azimuth_sigma_rad) < 0.5
 
@@ -124,9 +133,13 @@ def test_logs_count_together(lane_log, measured):
     twice = calibrate([(lane_log, run), (lane_log, replace(run, notes={}))])
     assert twice.provenance["logs"] == "lane.mcap, lane.mcap"
     assert twice.provenance["what they are"] == "a lane; recorded"
-    counts = [int(m.provenance["frames of landmark 1"]) for m in (measured, twice)]
-    assert counts[1] == 2 * counts[0]
-    np.testing.assert_allclose(twice.matrix, measured.matrix, atol=1e-3)
+
+    def said(model: Confusion, what: str) -> int:
+        return int(model.provenance[f"{what} of landmark 1"])
+
+    assert said(twice, "frames") == 2 * said(measured, "frames")
+    assert said(twice, "tracks") == 2 * said(measured, "tracks")
+    assert (np.diag(twice.matrix) > np.diag(measured.matrix)).all()  # more tracks allow more certainty
 
 
 @pytest.mark.parametrize("missing", ["truth", "true_landmarks"])
