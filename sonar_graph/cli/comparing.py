@@ -185,6 +185,8 @@ def _with_recognised(source: LogSource, sequence: Sequence) -> tuple[Sequence, R
             sequence,
             topic=topic,
             config=read_config(source.config),
+            window=window_of(source.start, source.end),
+            salvage=source.salvage,
             progress=lambda done: progress("recognising landmarks (frames)", done, 0),
         )
     return (sequence, None) if found is None else (with_detections(sequence, found), found)

@@ -117,7 +117,7 @@ class Passage:
         found: dict[str, int] = {}
         for channel, count in statistics.channel_message_counts.items():
             topic = self._described.by_channel.get(channel)
-            name = topic.name if topic else f"channel {channel}"
+            name = f"channel {channel}" if topic is None else topic.name
             found[name] = found.get(name, 0) + count
         return found
 
@@ -200,7 +200,7 @@ class Passage:
 
     def _name(self, channel: int) -> str:
         topic = self._described.by_channel.get(channel)
-        return topic.name if topic else f"channel {channel}"
+        return f"channel {channel}" if topic is None else topic.name
 
     def _indexed(self, chunk: ChunkRecord) -> ChunkIndex | None:
         """What the summary says of a chunk, where it agrees with the chunk's own head."""

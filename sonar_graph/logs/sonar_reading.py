@@ -7,12 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.adapters.config import LogConfig
 from sonar_graph.logs.adapters.sonar_images import Refused, SonarAdapter
-from sonar_graph.logs.container import Keep, Recording, Topic, stream
-from sonar_graph.logs.message_definitions import short_name
-from sonar_graph.logs.roles import ROLES, SONAR, advice, choose_topic, wanted_types
+from sonar_graph.logs.container import Keep, scan, stream
+from sonar_graph.logs.roles import SONAR, choose_topics
 from sonar_graph.logs.window import Window
 from sonar_graph.measurements import SonarFrames
 
@@ -46,27 +44,20 @@ def read_sonar_frames(
     Raises
     ------
     MissingTopicError
-        When ``topic`` has no image.
+        When the topic that was asked for is not there, or is none that can be read.
     LogError
         When several topics fit, the file is damaged in its middle (without ``salvage``, after the last frame), or an
         image is not what its message says (without ``refused``). A log without sonar images gives no block.
     """
-    config = config or LogConfig()
-    types = wanted_types(config, roles=(SONAR,))
-    seen: dict[str, Topic] = {}
-
-    def keep(kind: str) -> Keep:
-        return Keep.ALL if short_name(kind) in types else Keep.NONE
-
-    for piece in stream(Path(path), keep, window, salvage=salvage):
-        seen.setdefault(piece.name, piece)
-        choice = choose_topic(ROLES[SONAR], Recording(Path(path), seen), config, topic)
-        if choice.candidates:
-            raise LogError(f"{path}: for {SONAR}, {choice.reason}; choose one: {advice(choice)}")
-        if choice.topic == piece.name and isinstance(choice.adapter, SonarAdapter):
+    config, path = config or LogConfig(), Path(path)
+    recording = scan(path, lambda _: Keep.NONE)
+    choice = choose_topics(recording, {SONAR: topic} if topic else {}, config, (SONAR,))[SONAR]
+    if choice.topic is None or not isinstance(choice.adapter, SonarAdapter):
+        return
+    kind = recording.topics[choice.topic].type_name
+    for piece in stream(path, lambda name: Keep.ALL if name == kind else Keep.NONE, window, salvage=salvage):
+        if piece.name == choice.topic:
             yield from choice.adapter.read(piece, refused)
-    if topic is not None and topic not in seen:
-        raise MissingTopicError(f"{path}: no image on {topic}; sonar images are on {', '.join(seen) or 'no topic'}")
 
 
 def describe_frames(frames: SonarFrames) -> str:
