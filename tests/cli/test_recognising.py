@@ -141,7 +141,7 @@ MISTAKES = {
     "recognise lane -o new --designs broken.toml": r"broken\.toml.*size_m",
     "recognise lane -o new --designs empty": r"empty: no landmark designs",
     "recognise lane -o lane --overwrite": r"is what is read",
-    "recognise lane -o new --topic sonar=/none": r"/none was chosen but is not in the log; sonar images are on /sonar/image",
+    "recognise lane -o new --topic sonar=/none": r"/none was chosen but is not in the log",
     "compare lane -o new --topic sonar=/none": r"/none was chosen but is not in the log",
     "recognise words.json -o new": r"words\.json",
     "recognise missing.mcap -o new": r"missing\.mcap",
