@@ -14,9 +14,13 @@ from hypothesis import strategies as st
 
 import sonar_graph
 from sonar_graph.cli import app, main
+from sonar_graph.cli.demonstrating import DEMO
 from sonar_graph.cli.settings import estimator_settings, parse_setting, read_calibration, topic_choices
 from sonar_graph.errors import CalibrationError, EstimatorError
+from sonar_graph.evaluation.storage import read_comparison
 from sonar_graph.logs.calibration_sources import PartialCalibration
+from sonar_graph.logs.reading import read_sequence
+from sonar_graph.simulation.basin import FASTEST_M_S, PAPER_LAPS, BasinOptions, cruise_speed
 
 
 def run(*arguments: object) -> int:
@@ -428,7 +432,27 @@ def test_calibration_with_an_unknown_field_names_file_and_field(tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_demo_leaves_a_log_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_demo_goes_from_images_to_the_papers_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sonar_graph.cli.demonstrating.DEMO", DEMO | {"duration_s": 130.0, "laps": 1})
     assert run("demo", "-o", tmp_path) == 0
-    assert f"Report: {tmp_path / 'report.html'}" in capsys.readouterr().out
-    assert (tmp_path / "basin.mcap").stat().st_size > 100_000
+    told = capsys.readouterr().out
+    assert f"Report: {tmp_path / 'report.html'}" in told
+    assert "2014 paper x" in told
+    sequence = read_sequence(tmp_path / "basin.mcap")
+    assert sequence.detections is None, "the log holds images, not what is in them"
+    comparison = read_comparison(tmp_path)
+    assert comparison.recognition is not None
+    assert comparison.recognition.frames > 600
+    assert {run.estimator for run in comparison.runs if run.landmarks is not None and len(run.landmarks) == 4} == {
+        "isam2",
+        "ekf-slam",
+    }
+
+
+def test_demo_drives_the_three_laps_of_the_paper_with_images() -> None:
+    options = BasinOptions.model_validate(DEMO)
+    assert options.laps == PAPER_LAPS
+    assert options.image is not None
+    assert cruise_speed(options) < FASTEST_M_S
