@@ -16,6 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from sonar_graph.calibration import Section
+from sonar_graph.kernels import compiled
 from sonar_graph.landmark_designs import LandmarkDesign
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sonar.floor_patch import Patch
@@ -75,50 +76,49 @@ class Appearance:
         self.designs = len(designs)
         self._steps = math.ceil(self.params.search_m / self.params.cell_m)
         self.patch_side = self.templates.side + 2 * self._steps
-        self._rows, self._shifts = self._shifted_cells()
-        pictures = self.templates.pictures
-        self._pictures, self._squares = np.ascontiguousarray(pictures.T), np.ascontiguousarray(pictures.T**2)
-
-    def _shifted_cells(self) -> tuple[Ints, Ints]:
-        """Places of the templates' cells in a patch at every shift, shape (shifts, cells), and the shifts, (n, 2)."""
         x, y = np.divmod(self.templates.cells, self.templates.side)
         steps = np.arange(2 * self._steps + 1)
-        shifts = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
-        rows = (x + shifts[:, :1]) * self.patch_side + y + shifts[:, 1:]
-        return rows, shifts - self._steps
+        self._shifts = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+        self._cells, self._offsets = x * self.patch_side + y, self._shifts @ np.array([self.patch_side, 1])
+        pictures = self.templates.pictures
+        self._pictures, self._squares = np.ascontiguousarray(pictures.T), np.ascontiguousarray(pictures.T**2)
+        self._sums = self._pictures.sum(axis=0), self._squares.sum(axis=0)
+        self._first_of_design = np.searchsorted(self.templates.design, np.arange(self.designs))
 
     def fit(self, patch: Patch) -> Fit:
         """The designs at their best headings and shifts."""
-        seen = patch.seen.ravel()[self._rows]
-        level = patch.level_db.ravel()[self._rows]
-        correlation, visible = self._correlations(level, seen)
-        at = correlation.reshape(len(self._shifts), -1)
-        best_shift, best_template = np.unravel_index(np.argmax(at), at.shape)
-        by_design = np.array([at[:, self.templates.design == d].max() for d in range(self.designs)])
-        offset = self._between_points(at[:, best_template], int(best_shift))
+        visible = _visible(patch.seen.ravel(), self._cells, self._offsets)
+        at = self._correlations(patch, visible)
+        best_shift, best_template = divmod(int(np.argmax(at)), at.shape[1])
+        offset = self._between_points(at[:, best_template], best_shift)
+        by_design = np.maximum.reduceat(at.max(axis=0), self._first_of_design)
         share = float(visible[best_shift])
         return Fit(
             by_design if share >= self.params.least_visible else np.full_like(by_design, -1.0),
             share,
             int(self.templates.design[best_template]),
             float(self.templates.heading_rad[best_template]),
-            patch.centre_m + self.params.cell_m * (self._shifts[best_shift] + offset),
+            patch.centre_m + self.params.cell_m * (self._shifts[best_shift] - self._steps + offset),
         )
 
-    def _correlations(self, level: Floats32, seen: Floats32) -> tuple[Floats32, Floats32]:
-        """Correlation of each shift with each template, shape (shifts, templates), and the visible share (shifts,)."""
-        count = seen.sum(axis=1)
-        mean = (level * seen).sum(axis=1) / np.maximum(count, 1)
-        level = (level - mean[:, None]) * seen
-        template_sum, template_square = _product(seen, self._pictures), _product(seen, self._squares)
-        n = np.maximum(count, 1)[:, None]
-        template_variance = template_square - template_sum**2 / n
-        level_variance = np.einsum("sc,sc->s", level, level)[:, None]
-        product = _product(level, self._pictures)
-        visible = count / level.shape[1]
-        known = (visible[:, None] >= self.params.least_searched) & (template_variance > 0) & (level_variance > 0)
-        scale = np.sqrt(np.where(known, template_variance * level_variance, 1.0))
-        return np.where(known, product / scale, -1.0), visible
+    def _correlations(self, patch: Patch, visible: Floats32) -> Floats32:
+        """Correlation of each shift with each template, shape (shifts, templates); -1 where too little is visible."""
+        correlation = np.full((len(visible), self._pictures.shape[1]), -1.0, np.float32)
+        shifts = np.flatnonzero(visible >= self.params.least_searched)
+        if not len(shifts):
+            return correlation
+        level, seen, square = _windows(patch.level_db.ravel(), patch.seen.ravel(), self._cells, self._offsets[shifts])
+        scale = np.sqrt(np.maximum(self._variances(seen, visible[shifts]), 0.0) * square[:, None])
+        known = scale > 0
+        correlation[shifts] = np.where(known, _product(level, self._pictures) / np.where(known, scale, 1.0), -1.0)
+        return correlation
+
+    def _variances(self, seen: Floats32, visible: Floats32) -> Floats32:
+        """Of the templates over the cells that are seen, times their number, shape (shifts, templates)."""
+        total, square = (np.tile(whole, (len(seen), 1)) for whole in self._sums)
+        cut = np.flatnonzero(visible < 1)
+        total[cut], square[cut] = _product(seen[cut], self._pictures), _product(seen[cut], self._squares)
+        return square - total**2 / (visible * seen.shape[1])[:, None]
 
     def _between_points(self, correlation: Floats32, best: int) -> Floats:
         """Where a parabola through the neighbours of the best shift has its top, in points, shape (2,)."""
@@ -128,10 +128,45 @@ class Appearance:
         return np.array([_top(surface[:, y], x), _top(surface[x, :], y)])
 
 
+@compiled
+def _visible(seen: Floats32, cells: Ints, offsets: Ints) -> Floats32:
+    """Share of the cells that a patch holds at each offset, shape (offsets,)."""
+    share = np.empty(len(offsets), np.float32)
+    for n in range(len(offsets)):
+        total = 0.0
+        for c in range(len(cells)):
+            total += seen[cells[c] + offsets[n]]
+        share[n] = total / len(cells)
+    return share
+
+
+@compiled
+def _windows(level_db: Floats32, seen: Floats32, cells: Ints, offsets: Ints) -> tuple[Floats32, Floats32, Floats32]:
+    """Levels over their mean and what is seen at each offset, shape (offsets, cells), and the sum of squares."""
+    shape = len(offsets), len(cells)
+    level, is_seen, square = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape[0], np.float32)
+    for n in range(len(offsets)):
+        count = total = squares = 0.0
+        for c in range(len(cells)):
+            at = cells[c] + offsets[n]
+            level[n, c], is_seen[n, c] = level_db[at], seen[at]
+            count += seen[at]
+            total += level_db[at]
+        mean = total / max(count, 1.0)
+        for c in range(len(cells)):
+            level[n, c] = (level[n, c] - mean) * is_seen[n, c]
+            squares += level[n, c] ** 2
+        square[n] = squares
+    return level, is_seen, square
+
+
 def _product(rows: Floats32, columns: Floats32) -> Floats32:
     """The matrix product, in pieces that BLAS takes on one core: for so little, threads that wait cost far more."""
     step = max(1, MOST_MULTIPLICATIONS // columns.size)
-    return np.concatenate([rows[first : first + step] @ columns for first in range(0, len(rows), step)])
+    product = np.empty((len(rows), columns.shape[1]), np.float32)
+    for first in range(0, len(rows), step):
+        np.matmul(rows[first : first + step], columns, out=product[first : first + step])
+    return product
 
 
 def _top(values: Floats32, at: int) -> float:

@@ -49,7 +49,9 @@ def background_of(smooth_db: Floats32, smoothing: tuple[int, int], neighbourhood
     """
     beams, bins = smoothing
     nodes = np.ascontiguousarray(smooth_db[beams // 2 :: beams, bins // 2 :: bins])
-    trend = cv2.blur(np.median(nodes, axis=0, keepdims=True), (TREND_NODES, 1))
+    ordered, count = np.sort(nodes, axis=0), len(nodes)
+    medians = (ordered[[(count - 1) // 2]] + ordered[[count // 2]]) / 2  # numpy's own takes eight times as long
+    trend = cv2.blur(medians, (TREND_NODES, 1))
     window = min(round((neighbourhood[0] / beams + neighbourhood[1] / bins) / 2), LARGEST_WINDOW) // 2 * 2 + 1
     residual = nodes - trend
     local = _median(residual, window, STEPS_PER_DB, 128.0)
@@ -64,7 +66,7 @@ def _median(values: Floats32, window: int, steps_per_db: float, zero: float) -> 
     its median over large windows takes nothing else.
     """
     half = window // 2
-    counts = cv2.convertScaleAbs(np.clip(values * np.float32(steps_per_db) + np.float32(zero), 0, 255))
+    counts = cv2.convertScaleAbs(np.maximum(values, -zero / steps_per_db), alpha=steps_per_db, beta=zero)
     mirrored = cv2.copyMakeBorder(counts, half, half, half, half, cv2.BORDER_REFLECT_101)
     middle = np.s_[half : half + values.shape[0], half : half + values.shape[1]]
     medians = np.asarray(cv2.medianBlur(mirrored, window), dtype=np.float32)[middle]

@@ -95,8 +95,9 @@ def select_candidates(
     offsets = false_alarm_offsets_db(background.spread_db, params.false_alarm)
     mask = cv2.compare(contrast, _spread_out(offsets, smooth.shape), cv2.CMP_GT)
     closing = cv2.getStructuringElement(cv2.MORPH_RECT, _odd(params.closing_m, cell_m)[::-1])
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(
-        cv2.morphologyEx(mask, cv2.MORPH_CLOSE, closing), connectivity=8, ltype=cv2.CV_32S
+    # opencv's own choice takes three times as long for the same labels
+    count, labels, stats, _ = cv2.connectedComponentsWithStatsWithAlgorithm(
+        cv2.morphologyEx(mask, cv2.MORPH_CLOSE, closing), 8, cv2.CV_32S, cv2.CCL_GRANA
     )
     return _judged(
         contrast,
@@ -194,19 +195,14 @@ def _judged(
 def _verdicts(
     area_m2: Floats, extent_m: Floats, level_db: Floats, boxes: Ints, shape: tuple[int, ...], params: DetectionParams
 ) -> Ints:
-    """`Verdict` of each region."""
+    """`Verdict` of each region; each overrides those before it."""
     at_edge = (boxes[:, :2] == 0).any(axis=1) | (boxes[:, :2] + boxes[:, 2:] == shape).any(axis=1)
-    verdicts = np.select(
-        [
-            ~(area_m2 > 0),
-            at_edge & (not params.keep_at_edge),
-            area_m2 < params.min_area_m2,
-            area_m2 > params.max_area_m2,
-            extent_m > params.max_extent_m,
-        ],
-        [Verdict.OFF_FLOOR, Verdict.AT_EDGE, Verdict.TOO_SMALL, Verdict.TOO_LARGE, Verdict.TOO_LONG],
-        Verdict.ACCEPTED,
-    ).astype(np.int64)
+    verdicts = np.full(len(boxes), int(Verdict.ACCEPTED))
+    verdicts[extent_m > params.max_extent_m] = Verdict.TOO_LONG
+    verdicts[area_m2 > params.max_area_m2] = Verdict.TOO_LARGE
+    verdicts[area_m2 < params.min_area_m2] = Verdict.TOO_SMALL
+    verdicts[at_edge & (not params.keep_at_edge)] = Verdict.AT_EDGE
+    verdicts[~(area_m2 > 0)] = Verdict.OFF_FLOOR
     accepted = np.flatnonzero(verdicts == Verdict.ACCEPTED)
     strongest_first = accepted[np.argsort(-(level_db * area_m2)[accepted], kind="stable")]
     verdicts[strongest_first[params.max_candidates :]] = Verdict.BEYOND_LIMIT

@@ -62,6 +62,7 @@ class Fate(NamedTuple):
 
 
 REPORTED = "reported"
+REJECTED = {int(v): f"candidate rejected: {v.name.lower().replace('_', ' ')}" for v in Verdict}
 
 
 class Recogniser:
@@ -142,7 +143,7 @@ class Recogniser:
             self._tracker.skip(motion or SonarStep.none())
             self.fates = [Fate(stamp_ns, -1, np.nan, np.nan, f"frame not used: {fault}")]
             return None
-        image_db = self._calibration.sonar.image.decibels(frame.intensity[0])
+        image_db = self._calibration.sonar.image.decibels(np.ascontiguousarray(frame.intensity[0]))
         candidates = select_candidates(image_db, frame.ranges_m, frame.azimuths_rad, view, self.params.detection)
         association = self._tracker.step(candidates, motion, stamp_ns)
         self.track_ids = association.track_ids
@@ -235,14 +236,9 @@ def each_once(beliefs: Floats) -> Floats:
 
 def _fates_of_candidates(stamp_ns: int, candidates: Candidates) -> list[Fate]:
     """Those that were rejected before they came to a track."""
-    rejected = np.flatnonzero(candidates.verdicts != Verdict.ACCEPTED)
+    columns = candidates.verdicts.tolist(), candidates.range_m.tolist(), candidates.azimuth_rad.tolist()
     return [
-        Fate(
-            stamp_ns,
-            -1,
-            float(candidates.range_m[row]),
-            float(candidates.azimuth_rad[row]),
-            f"candidate rejected: {Verdict(candidates.verdicts[row]).name.lower().replace('_', ' ')}",
-        )
-        for row in rejected.tolist()
+        Fate(stamp_ns, -1, range_m, azimuth_rad, REJECTED[verdict])
+        for verdict, range_m, azimuth_rad in zip(*columns, strict=True)
+        if verdict != Verdict.ACCEPTED
     ]

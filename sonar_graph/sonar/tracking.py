@@ -77,13 +77,16 @@ class Tracker:
         self._noise = np.diag([self.params.range_sigma_m**2, self.params.azimuth_sigma_rad**2])
         self._gate = float(chi2.ppf(self.params.gate_probability, 2))
         self._tracks = Tracks.none()
-        self._skipped = SonarStep.none()
+        self._skipped: SonarStep | None = None
         self._stamp_ns: int | None = None
         self._next_id = 0
 
     def skip(self, motion: SonarStep) -> None:
         """Let the sonar move without a frame, because there was none that could be used."""
-        self._skipped = self._skipped.then(motion)
+        self._skipped = self._since_last_frame(motion)
+
+    def _since_last_frame(self, motion: SonarStep) -> SonarStep:
+        return motion if self._skipped is None else self._skipped.then(motion)
 
     def step(self, candidates: Candidates, motion: SonarStep | None, stamp_ns: int) -> Association:
         """Take in the accepted candidates of one frame.
@@ -121,7 +124,7 @@ class Tracker:
         reasons = [
             self._reason_to_end(*row) for row in zip(after.existence, inside.min(axis=(1, 2), initial=0.0), strict=True)
         ]
-        new = np.setdiff1d(np.arange(len(rows)), took)
+        new = np.array([row for row in range(len(rows)) if row not in took], dtype=np.int64)
         return self._association_of(stamp_ns, candidates, before.ids, after, matrix, took, new, reasons)
 
     def _before(self, motion: SonarStep, stamp_ns: int) -> Tracks:
@@ -131,8 +134,8 @@ class Tracker:
                 f"sonar frame at {stamp_ns} ns is not later than the one before, {self._stamp_ns} ns; leave it out"
             )
         elapsed_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
-        moved = self._tracks.moved(self._skipped.then(motion), self.params.drift_m)
-        self._stamp_ns, self._skipped = stamp_ns, SonarStep.none()
+        moved = self._tracks.moved(self._since_last_frame(motion), self.params.drift_m)
+        self._stamp_ns, self._skipped = stamp_ns, None
         return replace(moved, existence=moved.existence * np.exp(-elapsed_s / self.params.lifetime_s))
 
     def _association(self, weights: Floats, area: float) -> Floats:
@@ -182,7 +185,10 @@ class Tracker:
         itself = np.eye(len(previous_ids), len(previous_ids) + 1)[stay]
         own = np.vstack([itself, np.zeros((len(new), len(previous_ids) + 1))])
         own[rows >= 0] = matrix[rows[rows >= 0]]
-        self._tracks = tracks = after.rows(stay).and_(self._born(candidates, candidates.accepted[new]))
+        tracks = after.rows(stay)
+        if len(new):
+            tracks = tracks.and_(self._born(candidates, candidates.accepted[new]))
+        self._tracks = tracks
         return Association(
             stamp_ns=stamp_ns,
             previous_ids=previous_ids,
@@ -201,6 +207,8 @@ class Tracker:
 def _assigned(matrix: Floats) -> Ints:
     """The candidate of each track in the most probable assignment, -1: none, shape (M',)."""
     candidates, tracks = matrix.shape[0], matrix.shape[1] - 1
+    if not candidates or not tracks:
+        return np.full(tracks, -1)
     cost = np.full((candidates, tracks + candidates), NEVER)
     np.log(matrix[:, :tracks], out=cost[:, :tracks], where=matrix[:, :tracks] > 0)
     cost[:, :tracks] = np.where(matrix[:, :tracks] > 0, -cost[:, :tracks], NEVER)

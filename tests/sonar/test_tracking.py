@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import multivariate_normal
 
 from sonar_graph.errors import MeasurementError
 from sonar_graph.sonar.tracking import SonarStep, Tracker, TrackingParams
@@ -178,9 +179,17 @@ def test_a_correction_is_that_of_the_information_form():
 
 
 def test_innovations_wrap_behind_the_sonar():
-    tracks = Tracks(np.array([0]), np.array([[-2.0, 1e-3, 0.0]]), np.eye(3)[None], np.array([0.5]), np.array([1]))
-    innovation = Expected.of(tracks, np.eye(2)).innovations(np.array([[2.0, -np.pi + 5e-4]]))
-    assert innovation[0, 0] == pytest.approx([0.0, 1e-3], abs=1e-6)
+    R = np.diag([1e-4, 1e-6])
+    tracks = Tracks(
+        np.array([0]), np.array([[-2.0, 1e-3, 0.0]]), 1e-4 * np.eye(3)[None], np.array([0.5]), np.array([1])
+    )
+    expected = Expected.of(tracks, R)
+    turned, plain = np.array([[2.0, -np.pi + 5e-4]]), np.array([[2.0, np.pi + 5e-4]])
+    density = expected.densities(turned, 9.0)[0, 0]
+    assert density == pytest.approx(multivariate_normal(expected.z[0], expected.S[0]).pdf(plain[0]), rel=1e-9)
+    moved = [corrected(tracks, expected, z, np.array([0]), R).position_m for z in (turned, plain)]
+    assert moved[0] == pytest.approx(moved[1], abs=1e-12)
+    assert moved[0][0, 1] < 0  # on the other side of the axis
 
 
 def test_a_track_on_the_edge_is_missed_with_half_the_probability():
