@@ -5,7 +5,7 @@ import pytest
 
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.sonar.appearance import Appearance, Fit
-from sonar_graph.sonar.floor_patch import PolarGrid
+from sonar_graph.sonar.floor_patch import Patch, PolarGrid
 from sonar_graph.sonar.geometry import FloorView
 
 from .polar_images import AZIMUTHS_RAD, HEIGHT_M, RANGES_M, image_db, level_R_sonar
@@ -50,6 +50,30 @@ def test_neither_gain_nor_floor_level_matter(appearance):
     plain = _fit(appearance, image, rotation, (1.7, 0.0))
     other = _fit(appearance, 0.5 * image + 20, rotation, (1.7, 0.0))
     np.testing.assert_allclose(other.correlation, plain.correlation, atol=1e-3)
+
+
+@pytest.mark.parametrize("rim", [39, 36, 27, 22])
+def test_the_best_fit_is_that_of_numpy_over_the_cells_in_view(appearance, rim: int):
+    """All shifts and headings by `np.corrcoef`, on noise of which the image holds the first columns."""
+    templates, side = appearance.templates, appearance.patch_side
+    seen = np.broadcast_to(np.arange(side) < rim, (side, side)).astype(np.float32)
+    level = np.random.default_rng(rim).normal(40, 5, (side, side)).astype(np.float32) * seen
+    x, y = np.divmod(templates.cells, templates.side)
+    steps = range(side - templates.side + 1)
+    best: dict[int, tuple[float, float, int]] = {}
+    for i, j in ((i, j) for i in steps for j in steps):
+        held = seen[x + i, y + j] > 0
+        if held.mean() >= appearance.params.least_searched:
+            window = level[x + i, y + j][held]
+            for picture, design in zip(templates.pictures, templates.design.tolist(), strict=True):
+                found = float(np.corrcoef(window, picture[held])[0, 1]), float(held.mean()), design
+                best[design] = max(best.get(design, found), found)
+    highest = max(best.values())
+    fit = appearance.fit(Patch(level, seen, np.zeros(2)))
+    assert fit.best == highest[2]
+    assert fit.visible == pytest.approx(highest[1], abs=1e-6)
+    wanted = [best[design][0] for design in range(appearance.designs)] if highest[1] >= 0.8 else [-1.0] * 4
+    assert fit.correlation == pytest.approx(wanted, abs=1e-5)
 
 
 def test_bare_floor_and_a_bar_fit_no_design_well(appearance):
