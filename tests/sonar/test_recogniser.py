@@ -197,6 +197,10 @@ def test_what_is_across_turns_with_the_sonar():
         position_m = np.array([[2.0, 0.0, 0.0]])
 
     np.testing.assert_allclose(recogniser._sideways(OneTrack()), [[-1.0, 0.0, 0.0]], atol=1e-12)
+    ahead = SonarStep(gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 0.0])), COVARIANCE)
+    recogniser.process(frame(2, picture(SQUARE, 1.7, 0.0, 0.4, 2)), ahead, VIEW)
+    (place,) = [place for place in recogniser._places() if place is not None]
+    np.testing.assert_allclose(place, [0.0, 0.1, 0.0], atol=1e-12)  # in the axes of the first frame
 
 
 def test_linear_samples_give_what_decibels_give():
