@@ -17,13 +17,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from pydantic import Field
 
 from sonar_graph.calibration import Mounting
 from sonar_graph.errors import SimulationError
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign, load_designs
 from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.detections import Fan
@@ -99,7 +100,7 @@ def simulate_basin(options: BasinOptions | None = None) -> Sequence:
     """
     options = options or BasinOptions()
     streams = Streams.of(options.seed)
-    world = world_on_floor(LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, streams.world)
+    world = _world(options, streams.world)
     path = _path(options, streams.path)
     sequence = record("basin", options, YSHARK, path, world, streams, _notes(options))
     return sequence if options.image is None else replace(sequence, detections=None)
@@ -121,7 +122,7 @@ def simulate_basin_frames(options: BasinOptions, frames_per_block: int = 32) -> 
         When the duration is too short for the laps.
     """
     streams = Streams.of(options.seed)
-    world = world_on_floor(LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, streams.world)
+    world = _world(options, streams.world)
     path = _path(options, streams.path)
     image = options.image or ImageOptions()
     simulator = FrameSimulator(image, _seabed(world, image, streams.seabed), FLOOR_Z_M, options.seed)
@@ -129,12 +130,32 @@ def simulate_basin_frames(options: BasinOptions, frames_per_block: int = 32) -> 
     yield from image_along(path, YSHARK.sonar, stamps_ns, simulator, frames_per_block)
 
 
+def _world(options: BasinOptions, rng: np.random.Generator) -> World:
+    """The landmarks on the floor, with the identities of their designs."""
+    world = world_on_floor(LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, rng)
+    return replace(world, landmark_ids=np.array([design.id for design in _designs(options.image)]))
+
+
+def _designs(image: ImageOptions | None) -> list[LandmarkDesign]:
+    """One for each landmark, by identity.
+
+    Raises
+    ------
+    SimulationError
+        When there are fewer.
+    """
+    named = None if image is None else image.designs
+    designs = DEFAULT_DESIGNS if named is None else load_designs(Path(named))
+    if len(designs) < len(LANDMARKS_XY_M):
+        raise SimulationError(f"{named}: {len(designs)} landmark designs; the basin needs {len(LANDMARKS_XY_M)}")
+    return sorted(designs, key=lambda design: design.id)[: len(LANDMARKS_XY_M)]
+
+
 def _seabed(world: World, image: ImageOptions, rng: np.random.Generator) -> list[SeabedObject]:
-    """Landmarks of the default designs, turned at random, and what is no landmark."""
+    """Landmarks, turned at random, and what is no landmark."""
     yaw_rad = rng.uniform(-np.pi, np.pi, len(world.landmark_ids))
-    designs = {design.id: design for design in DEFAULT_DESIGNS}
-    placed = zip(world.landmark_ids.tolist(), world.landmark_positions, yaw_rad.tolist(), strict=True)
-    landmarks = [place_landmark(designs[id_], position, yaw, FLOOR_Z_M) for id_, position, yaw in placed]
+    placed = zip(_designs(image), world.landmark_positions, yaw_rad.tolist(), strict=True)
+    landmarks = [place_landmark(design, position, yaw, FLOOR_Z_M) for design, position, yaw in placed]
     spots = rng.permutation(_spots(rng))[: image.stones + image.decoys]
     return landmarks + scattered_objects(spots, image.stones, rng)
 

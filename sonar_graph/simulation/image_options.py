@@ -20,6 +20,9 @@ class ImageOptions(Section):
 
     sonar: SonarName = "didson"
     """Which sonar; the window is the same for all."""
+    designs: str | None = None
+    """TOML file, or folder of such files, with the landmarks that lie in the basin: the four lowest identities; None:
+    those that ship."""
     speckle: Literal["world", "frame"] = "world"
     """world: scatterers stay where they are, so that speckle changes only as the vehicle moves; frame: drawn anew for
     each frame, as many simulators do."""

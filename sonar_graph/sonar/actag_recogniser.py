@@ -44,15 +44,15 @@ class AcTagSettings(Section):
     """AcTag24h4, 24h6, 24h8 or 24h10: bits, and the least number of bits in which two tags differ."""
     tag_size_m: float = Field(0.1306, gt=0)
     """Side of the inner square; the whole tag is 7/3 of it."""
-    bit_corrections: int = Field(4, ge=0)
+    bit_corrections: int = Field(3, ge=0)
     """Wrong bits that are put right: fewer than half of those in which two tags differ."""
     pixels_per_bit: float = Field(8.0, ge=4)
     """Size of a bit in the image that AcTag gets."""
     probability: float = Field(0.99, gt=0, lt=1)
     """Posterior of a decoded identity."""
-    range_sigma_m: float = Field(0.01, gt=0)
+    range_sigma_m: float = Field(0.003, gt=0)
     """Of a tag's centre."""
-    azimuth_sigma_rad: float = Field(0.005, gt=0)
+    azimuth_sigma_rad: float = Field(0.001, gt=0)
     """The same in azimuth."""
 
 

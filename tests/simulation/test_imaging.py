@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sonar_graph.errors import CalibrationError, SimulationError
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin, simulate_basin_frames
 from sonar_graph.simulation.image_options import ImageOptions
@@ -140,3 +142,36 @@ def test_oculus_frames_have_its_size():
     imaged = next(simulate_basin_frames(BasinOptions.model_validate(SLOW | {"image": {"sonar": "oculus1200"}}), 1))
     assert imaged.frames.intensity.shape == (1, 512, 512)
     assert imaged.frames.azimuths_rad[0] < -0.5
+
+
+def squares(path: Path, ids: list[int]) -> Path:
+    """Bright squares with these identities."""
+    corners = "[[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]"
+    shape = f'name = "square"\nsize_m = 0.3\nshapes = [{{ level_db = 25.0, polygon_m = {corners} }}]\n'
+    path.write_text("".join(f"[[landmark]]\nid = {id_}\n{shape}" for id_ in ids), encoding="utf-8")
+    return path
+
+
+def test_own_landmarks_lie_in_the_basin_under_their_own_identities(run, tmp_path):
+    file = squares(tmp_path / "own.toml", [40, 10, 30, 20, 50])
+    sequence = simulate_basin(options(designs=str(file)))
+    usual, made = run
+    assert sequence.true_landmarks.ids.tolist() == [10, 20, 30, 40]
+    np.testing.assert_array_equal(sequence.true_landmarks.positions, usual.true_landmarks.positions)
+    number = next(i for i, imaged in enumerate(made) if (imaged.truth.share_in_view[:, :4] == 1).any())
+    own, other = next(islice(blocks(designs=str(file)), number, None)), made[number]
+    assert own.truth.ids[:4].tolist() == [10, 20, 30, 40]
+    assert (own.truth.ids[4:] < 0).all()
+    row, landmark = np.argwhere(other.truth.share_in_view[:, :4] == 1)[0]
+    beam = np.argmin(np.abs(own.frames.azimuths_rad - own.truth.azimuth_rad()[row, landmark]))
+    first = np.argmin(np.abs(own.frames.ranges_m - own.truth.range_m()[row, landmark]))
+    around = np.s_[row, beam - 2 : beam + 3, first - 10 : first + 11]
+    brighter = own.frames.intensity[around].mean() - other.frames.intensity[around].mean()
+    assert brighter * 80 / 255 == pytest.approx(25 - 12, abs=4)
+
+
+def test_too_few_landmarks_for_the_basin_are_refused(tmp_path):
+    with pytest.raises(SimulationError, match="3 landmark designs; the basin needs 4"):
+        simulate_basin(options(designs=str(squares(tmp_path / "own.toml", [1, 2, 3]))))
+    with pytest.raises(CalibrationError, match=r"none\.toml"):
+        next(blocks(designs=str(tmp_path / "none.toml")))
