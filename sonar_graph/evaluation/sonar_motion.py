@@ -187,8 +187,9 @@ class SonarMotions:
 
 def level_from_up(up: Floats) -> Floats:
     """Rotation to level axes from the direction of up, shape (3, 3); x lies in the vertical plane of the first axis."""
-    x = _unit(np.array([1.0, 0.0, 0.0]) - up[0] * up)
-    return np.array([x, np.cross(up, x), up])
+    x = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    y = np.array([0.0, up[2], -up[1]])
+    return np.array([_unit(x), _unit(y), up])
 
 
 def _unit(v: Floats) -> Floats:
