@@ -94,3 +94,15 @@ def test_detections_are_counted_by_what_they_truly_are(comparison, lane_recognit
     assert (counts[:4, 1] == 0).all()
     assert counts[4].tolist()[:2] == [0, 0]
     assert counts[4, 2] > 20
+
+
+def test_a_landmark_that_is_named_as_another_is_named_wrongly(comparison) -> None:
+    detections = comparison.sequence.detections
+    swapped = replace(detections, candidate_ids=detections.candidate_ids % 4 + 1)
+    before = recognition_content(comparison)
+    after = recognition_content(replace(comparison, sequence=replace(comparison.sequence, detections=swapped)))
+    assert before is not None
+    assert after is not None
+    for what in (f"landmark {k}" for k in (1, 2, 3, 4)):
+        right, wrong, none = before["named"][what]
+        assert after["named"][what] == [wrong, right, none]
