@@ -6,7 +6,7 @@ Images are streamed and never held together; motion, tilt and height come from t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
@@ -30,7 +30,9 @@ from sonar_graph.sonar.tracking import SonarStep
 MOST_PICTURES = 400
 MOST_WARNINGS = 200
 PICTURE_PERIOD_NS = NS_PER_S
+NOT_USED = "frame not used"
 OUT_OF_ORDER = "out of order"
+LEAPT = "out of order: its stamp is ahead of the frame after it"
 NO_ODOMETRY = "no IMU and Doppler log at its stamp"
 
 
@@ -97,7 +99,8 @@ def recognise(
     """
     session = RecognitionSession(sequence, designs, params, recogniser=recogniser)
     blocks = read_sonar_frames(log, topic, config, window=window, salvage=salvage, refused=session.refuse)
-    for frame in (frame for block in blocks for frame in one_by_one(block)):
+    frames = (frame for block in blocks for frame in one_by_one(block))
+    for frame in without_leaps(frames, session.refuse):
         session.take(frame)
         if progress is not None:
             progress(session.result.frames)
@@ -115,6 +118,26 @@ def one_by_one(block: SonarFrames) -> Iterator[SonarFrames]:
         yield SonarFrames(
             block.stamps_ns[row : row + 1], block.intensity[row : row + 1], block.ranges_m, block.azimuths_rad
         )
+
+
+def without_leaps(frames: Iterable[SonarFrames], refuse: Callable[[int, str], None]) -> Iterator[SonarFrames]:
+    """Frames, blocks of one, without those whose stamp is wrong by so much that the frames after would be late.
+
+    A frame that is ahead of the next one, while that one is ahead of all before, is refused: of the two stamps one is
+    wrong, and this way only one frame is lost.
+    """
+    latest_ns, held = -1, None
+    for frame in frames:
+        if held is not None:
+            stamp_ns, next_ns = int(held.stamps_ns[0]), int(frame.stamps_ns[0])
+            if stamp_ns > next_ns > latest_ns:
+                refuse(stamp_ns, LEAPT)
+            else:
+                latest_ns = max(latest_ns, stamp_ns)
+                yield held
+        held = frame
+    if held is not None:
+        yield held
 
 
 class RecognitionSession:
@@ -147,32 +170,35 @@ class RecognitionSession:
         stamp_ns = int(frame.stamps_ns[0])
         if not self._motions.covers(stamp_ns):
             reason = OUT_OF_ORDER if self._motions.passed(stamp_ns) else NO_ODOMETRY
-            self._warn(stamp_ns, f"frame not used: {reason}")
+            self._warn(stamp_ns, f"{NOT_USED}: {reason}")
             return None
         self.motion = motion = self._motions.at(stamp_ns)
         frame = with_lens(frame, self._lens)
         found = self.recogniser.process(frame, step_of(motion), view_of(motion))
+        is_used = True
         for fate in self.recogniser.fates:
             if np.isnan(fate.range_m) and fate.track < 0:
                 self._warn(stamp_ns, fate.outcome)
+                is_used &= not fate.outcome.startswith(NOT_USED)
             else:
                 self.result.outcomes[fate.outcome] += 1
         if found is not None:
             self._blocks.append(found)
-        if self._draws:
+        if self._draws and is_used:
             self._draw(frame, found)
         return found
 
     def refuse(self, stamp_ns: int, reason: str) -> None:
         """Count a message that is no frame."""
         self.result.frames += 1
-        self._warn(stamp_ns, f"frame not used: {reason}")
+        self._warn(stamp_ns, f"{NOT_USED}: {reason}")
 
     def finish(self) -> Recognition:
         """All that was gathered."""
         result = self.result
         result.detections = LandmarkDetections.concatenate(self._blocks) if self._blocks else None
         result.notes = {"detections": f"recognised in {result.frames} sonar images"} | self.recogniser.notes()
+        result.warnings.sort(key=lambda row: row[0])
         if result.warnings:
             result.notes["detections.warnings"] = "; ".join(f"{n} x {reason}" for reason, n in result.warned().items())
         return result

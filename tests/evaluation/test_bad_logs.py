@@ -1,0 +1,155 @@
+"""Logs with images as they come from real dives: damaged, cut off, with a window that changes, with two sonars."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from sonar_graph.errors import LogError, MissingTopicError
+from sonar_graph.evaluation.recognising import LEAPT, recognise
+from sonar_graph.evaluation.recognition import Recognition
+from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.recorder import Outgoing
+from sonar_graph.logs.sonar_encoding import sonar_image_messages
+from sonar_graph.logs.window import Instant, Window
+from sonar_graph.logs.writing import write_sequence
+from sonar_graph.measurements import SonarFrames
+
+if TYPE_CHECKING:
+    from tests.imaged_lane import Lane
+
+
+TOPIC = "/sonar/image"
+COUNT = 70
+SECONDS = 10**9
+
+
+def message(frame: SonarFrames, topic: str = TOPIC, recorded_ns: int | None = None) -> Outgoing:
+    entry = sonar_image_messages(topic, frame)
+    return entry if recorded_ns is None else replace(entry, log_times_ns=np.array([recorded_ns]))
+
+
+def frames_of(lane: Lane) -> list[SonarFrames]:
+    return [lane.one(k) for k in range(COUNT)]
+
+
+def recognised(lane: Lane, log: Path, messages: list[Outgoing], **settings: object) -> Recognition:
+    write_sequence(log, lane.sequence, messages)
+    salvage = {"salvage": settings["salvage"]} if "salvage" in settings else {}
+    found = recognise(log, read_sequence(log, **salvage), **settings)
+    assert found is not None
+    return found
+
+
+def cropped(frame: SonarFrames, bins: int) -> SonarFrames:
+    return SonarFrames(frame.stamps_ns, frame.intensity[:, :, :bins], frame.ranges_m[:bins], frame.azimuths_rad)
+
+
+def sure(found: Recognition) -> set[int]:
+    ids, probability = found.detections.most_probable()
+    return set(ids[probability > 0.9].tolist())
+
+
+@pytest.fixture(scope="module")
+def plain(lane, tmp_path_factory) -> Recognition:
+    return recognised(lane, tmp_path_factory.mktemp("plain") / "log.mcap", [message(f) for f in frames_of(lane)])
+
+
+def test_a_window_that_changes_costs_one_frame_and_tracks_go_on(lane, tmp_path, plain):
+    frames = [cropped(f, 450) if 20 <= k < 45 else f for k, f in enumerate(frames_of(lane))]
+    found = recognised(lane, tmp_path / "log.mcap", [message(f) for f in frames])
+    stamps = [int(frames[k].stamps_ns[0]) for k in (20, 21, 45)]
+    assert [stamp for stamp, _ in found.warnings] == stamps
+    words = ["used if it comes again", "window changed: 96 x 450", "window changed: 96 x 512"]
+    assert all(word in reason for word, (_, reason) in zip(words, found.warnings, strict=True))
+    assert sure(found) == sure(plain)
+    reported = Counter(found.detections.stamps_ns.tolist())
+    for stamp in stamps[1:]:  # a track that began anew would not be reported in its first frames
+        assert reported[stamp] == Counter(plain.detections.stamps_ns.tolist())[stamp]
+
+
+def test_two_windows_in_turn_are_both_used(lane, tmp_path, plain):
+    frames = [cropped(f, 450) if k % 2 else f for k, f in enumerate(frames_of(lane))]
+    found = recognised(lane, tmp_path / "log.mcap", [message(f) for f in frames])
+    assert sum("not used" in reason for _, reason in found.warnings) == 1
+    assert len(found.detections) > 0.8 * len(plain.detections)
+
+
+def test_a_leap_of_the_clock_costs_one_frame(lane, tmp_path, plain):
+    frames = frames_of(lane)
+    wrong = replace(frames[30], stamps_ns=frames[30].stamps_ns + 10 * SECONDS)
+    messages = [message(f) for f in frames]
+    messages[30] = message(wrong, recorded_ns=int(frames[30].stamps_ns[0]))
+    found = recognised(lane, tmp_path / "log.mcap", messages)
+    assert found.warnings == [(int(wrong.stamps_ns[0]), f"frame not used: {LEAPT}")]
+    assert len(found.detections) >= len(plain.detections) - 3
+
+
+def test_a_message_that_is_no_image_is_named_and_the_others_are_used(lane, tmp_path, plain):
+    messages = [message(f) for f in frames_of(lane)]
+    whole = messages[30].payloads
+    messages[30] = replace(messages[30], payloads=np.ascontiguousarray(whole[:, :-1000]))
+    found = recognised(lane, tmp_path / "log.mcap", messages)
+    ((stamp, reason),) = found.warnings
+    assert stamp == lane.frames.stamps_ns[30]
+    assert "image.data" in reason
+    assert found.frames == COUNT
+    assert len(found.detections) >= len(plain.detections) - 3
+
+
+def test_bad_frames_are_never_drawn(lane, tmp_path):
+    frames = [replace(f, intensity=np.full(f.intensity.shape, np.nan, np.float32)) for f in frames_of(lane)[:12]]
+    found = recognised(lane, tmp_path / "log.mcap", [message(f) for f in frames])
+    assert found.pictures == []
+    assert found.outcomes == {"frame not used: samples that are not finite": 12}
+
+
+def test_of_two_sonars_one_must_be_chosen_before_any_image_is_read(lane, tmp_path, plain):
+    log = tmp_path / "log.mcap"
+    messages = [message(f, topic) for f in frames_of(lane) for topic in (TOPIC, "/other/image")]
+    write_sequence(log, lane.sequence, messages)
+    sequence, done = read_sequence(log), []
+    with pytest.raises(LogError, match=r"2 topics fit: /other/image, /sonar/image; choose one: --topic sonar="):
+        recognise(log, sequence, progress=done.append)
+    assert done == []
+    assert recognise(log, sequence, topic=TOPIC).frames == COUNT
+    with pytest.raises(MissingTopicError, match="/none was chosen but is not in the log"):
+        recognise(log, sequence, topic="/none")
+
+
+def test_only_the_part_that_was_read_is_recognised(lane, tmp_path):
+    log = tmp_path / "log.mcap"
+    write_sequence(log, lane.sequence, [message(f) for f in frames_of(lane)])
+    window = Window(Instant.parse("2"), Instant.parse("8"))
+    found = recognise(log, read_sequence(log, window=window), window=window)
+    assert 28 <= found.frames <= 31
+    assert not [reason for _, reason in found.warnings if "out of order" in reason]
+
+
+def test_a_hole_is_refused_and_with_salvage_named_and_the_rest_is_used(lane, tmp_path):
+    log = tmp_path / "log.mcap"
+    write_sequence(log, lane.sequence, [message(f) for f in frames_of(lane)])
+    data = bytearray(log.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    log.write_bytes(data)
+    with pytest.raises(LogError, match="--salvage"):
+        read_sequence(log)
+    sequence = read_sequence(log, salvage=True)
+    assert "lost" in sequence.notes["log.damage"]
+    found = recognise(log, sequence, salvage=True)
+    assert COUNT / 2 < found.frames < COUNT
+
+
+def test_a_log_without_depth_and_floor_is_recognised_in_the_image_plane(lane, tmp_path):
+    log = tmp_path / "log.mcap"
+    bare = replace(lane.sequence, depth=None, calibration=lane.sequence.calibration.model_copy(update={"floor": None}))
+    write_sequence(log, bare, [message(f) for f in frames_of(lane)])
+    found = recognise(log, read_sequence(log))
+    assert found.frames == COUNT
+    assert found.warnings == []
+    assert found.detections is not None
