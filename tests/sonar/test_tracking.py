@@ -160,6 +160,25 @@ def test_covariance_of_a_moved_track_is_that_of_samples():
     assert np.allclose(found.position_cov[0], np.cov(np.array(sampled).T), atol=0.06 * found.position_cov.max())
 
 
+def test_a_track_at_rest_grows_less_certain_by_its_drift():
+    P = np.diag([1e-2, 3e-2, 2e-2])
+    tracks = Tracks(np.array([0]), np.array([[1.9, 0.2, -0.3]]), P[None], np.array([0.5]), np.array([1]))
+    after = tracks.moved(STILL, 0.02)
+    assert after.position_m == pytest.approx(tracks.position_m)
+    assert after.position_cov[0] == pytest.approx(P + 4e-4 * np.eye(3))
+
+
+def test_a_density_ends_at_the_gate():
+    """Inside it is the normal density, just outside 0."""
+    tracks = Tracks(np.array([0]), np.array([[1.9, 0.2, -0.3]]), CORRELATED[:3, :3][None], np.ones(1), np.ones(1, int))
+    expected = Expected.of(tracks, np.diag([9e-4, 2e-4]))
+    along = np.linalg.cholesky(expected.S[0])[:, 0]
+    z = expected.z + np.array([2.99, 3.01])[:, None] * along
+    inside, outside = expected.densities(z, 9.0)[:, 0]
+    assert inside == pytest.approx(multivariate_normal(expected.z[0], expected.S[0]).pdf(z[0]), rel=1e-9)
+    assert outside == 0
+
+
 def test_a_correction_is_that_of_the_information_form():
     """P^-1 grows by H^T R^-1 H; H by differences of range and azimuth."""
     q, P, R = np.array([1.9, 0.2, -0.3]), np.diag([1e-2, 3e-2, 2e-2]), np.diag([9e-4, 2e-4])
