@@ -170,7 +170,8 @@ def test_a_track_at_rest_grows_less_certain_by_its_drift():
 
 def test_a_density_ends_at_the_gate():
     """Inside it is the normal density, just outside 0."""
-    tracks = Tracks(np.array([0]), np.array([[1.9, 0.2, -0.3]]), CORRELATED[:3, :3][None], np.ones(1), np.ones(1, int))
+    P = np.ascontiguousarray(CORRELATED[:3, :3])[None]
+    tracks = Tracks(np.array([0]), np.array([[1.9, 0.2, -0.3]]), P, np.ones(1), np.ones(1, int))
     expected = Expected.of(tracks, np.diag([9e-4, 2e-4]))
     along = np.linalg.cholesky(expected.S[0])[:, 0]
     z = expected.z + np.array([2.99, 3.01])[:, None] * along
