@@ -1,4 +1,7 @@
-"""What all tests share: the recordings, a plotting backend without a screen, hypothesis without deadlines."""
+"""What all tests share: the recordings, a plotting backend without a screen, hypothesis without deadlines.
+
+Linear algebra runs in one thread: matrices here are small, and the threads of several workers wait for each other.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,8 @@ if TYPE_CHECKING:
     from .imaged_lane import Lane
 
 os.environ["MPLBACKEND"] = "Agg"
+for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):  # before numpy is loaded, here and in the workers
+    os.environ.setdefault(name, "1")
 
 settings.register_profile("sonar_graph", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("sonar_graph")
