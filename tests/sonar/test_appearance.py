@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
-from sonar_graph.sonar.appearance import Appearance, Fit
+from sonar_graph.sonar.appearance import Appearance, AppearanceParams, Fit
 from sonar_graph.sonar.floor_patch import Patch, PolarGrid
 from sonar_graph.sonar.geometry import FloorView
 
@@ -117,3 +117,22 @@ def test_a_disc_needs_one_template_and_a_square_a_quarter_of_the_headings(appear
     counts = np.bincount(appearance.templates.design)
     assert counts[0] == 1
     assert counts[1] == 12
+
+
+def test_correlation_is_that_of_the_cells_in_view_at_the_best_shift_and_heading():
+    """By brute force with another library's correlation, on a patch of noise with holes."""
+    params = AppearanceParams(cell_m=0.03, search_m=0.03)
+    appearance = Appearance(DEFAULT_DESIGNS, params)
+    rng, side, templates = np.random.default_rng(5), appearance.patch_side, appearance.templates
+    level = rng.normal(30, 5, (side, side)).astype(np.float32)
+    seen = (rng.random((side, side)) < 0.97).astype(np.float32)
+    fit = appearance.fit(Patch(level * seen, seen, np.zeros(2)))
+    x, y = np.divmod(templates.cells, templates.side)
+    best = np.full(len(DEFAULT_DESIGNS), -1.0)
+    for shift_x, shift_y in np.ndindex(3, 3):
+        cells = (x + shift_x, y + shift_y)
+        there = seen[cells] > 0
+        for picture, design in zip(templates.pictures, templates.design, strict=True):
+            found = np.corrcoef(level[cells][there], picture[there])[0, 1]
+            best[design] = max(best[design], found)
+    np.testing.assert_allclose(fit.correlation, best, atol=1e-4)

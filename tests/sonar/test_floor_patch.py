@@ -38,3 +38,21 @@ def test_what_lies_outside_the_image_is_not_seen():
     )
     assert 0 < patch.seen.mean() < 1
     assert (patch.level_db[patch.seen == 0] == 0).all()
+
+
+def test_a_point_is_seen_when_all_bins_of_its_cell_are_in_the_image():
+    """A fine grid over the far end, and one over the near end."""
+    view, cell_m = FloorView(level_R_sonar(), HEIGHT_M), 0.004
+    bin_m = RANGES_M[1] - RANGES_M[0]
+    grid, image = PolarGrid(RANGES_M, AZIMUTHS_RAD), np.ones((96, 512), np.float32)
+    for end_m in (RANGES_M[0], RANGES_M[-1]):
+        centre = np.array([np.sqrt(end_m**2 - HEIGHT_M**2), 0.0])
+        patch = grid.patch(image, view, centre, 41, cell_m)
+        x = centre[0] + cell_m * (np.arange(41) - 20)
+        y = cell_m * (np.arange(41) - 20)
+        r = np.sqrt(x[:, None] ** 2 + y**2 + HEIGHT_M**2)
+        bins = RANGES_M[0] + bin_m * np.arange(-60, 572)
+        covered = np.abs(bins - r[..., None]) < cell_m / 2
+        outside = covered[..., [*range(60), *range(572, 632)]].any(axis=2)
+        np.testing.assert_array_equal(patch.seen, ~outside)
+        np.testing.assert_allclose(patch.level_db, patch.seen, atol=1e-6)

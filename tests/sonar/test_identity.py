@@ -154,6 +154,12 @@ def test_a_new_track_has_the_belief_of_birth() -> None:
     np.testing.assert_allclose(predicted, [birth])
 
 
+def test_a_share_of_a_belief_returns_to_that_of_a_new_track() -> None:
+    birth = np.array([0.1, 0.2, 0.7])
+    predicted = predict(np.eye(3)[:1], np.array([[1.0, 0.0]]), birth, forgetting=0.1)
+    np.testing.assert_allclose(predicted, [0.9 * np.eye(3)[0] + 0.1 * birth])
+
+
 def test_merging_tracks_of_different_identity_is_ambiguous() -> None:
     predicted = predict(np.eye(3)[:2], np.array([[0.5, 0.5, 0.0]]), np.full(3, 1 / 3), forgetting=0.0)
     np.testing.assert_allclose(predicted, [[0.5, 0.5, 0.0]])

@@ -61,6 +61,15 @@ def test_range_and_azimuth_are_those_of_the_designs_centre_and_not_of_the_candid
     np.testing.assert_allclose(found.covariance, np.diag([0.01**2, 0.004**2]) / found.fit.visible**2)
 
 
+def test_what_is_partly_in_view_is_less_certain(appearance):
+    image = image_db(DEFAULT_DESIGNS[0], (1.7, 0.34), 0.0, ROTATION, None)
+    found = look_at(appearance, image, (1.7, 0.33))
+    assert found.is_fitted
+    assert found.fit is not None
+    assert 0.8 <= found.fit.visible < 0.97
+    np.testing.assert_allclose(found.covariance, np.diag([0.01**2, 0.004**2]) / found.fit.visible**2)
+
+
 def test_what_no_design_fits_stays_where_its_centroid_is(appearance, triangle):
     strict = MODEL.model_copy(update={"threshold": 0.999})
     found = look_at(appearance, triangle, (1.725, 0.03), strict)

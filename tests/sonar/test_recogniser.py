@@ -15,6 +15,7 @@ from sonar_graph.landmark_designs import DEFAULT_DESIGNS
 from sonar_graph.measurements import SonarFrames
 from sonar_graph.sonar.beliefs import IdentityParams
 from sonar_graph.sonar.confusion import confusion_for
+from sonar_graph.sonar.detection import DetectionParams
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.recogniser import REPORTED, Recogniser, RecogniserParams, each_once
 from sonar_graph.sonar.tracks import SonarStep
@@ -88,6 +89,13 @@ def test_a_track_that_hardly_exists_is_not_reported():
     assert recogniser.process(frame(0, picture(SQUARE, 1.7, 0.0, 0.4, 0)), None, VIEW) is None
     assert [f.outcome for f in recogniser.fates if f.track >= 0] == ["not reported: exists with less than 0.5"]
     assert recogniser.process(frame(1, picture(SQUARE, 1.7, 0.0, 0.4, 1)), aside(0.0), VIEW) is not None
+
+
+def test_what_is_hardly_in_view_is_not_reported_and_the_reason_is_said():
+    params = RecogniserParams(detection=DetectionParams(keep_at_edge=True), least_frames=1, least_existence=0.0)
+    recogniser = Recogniser(DECIBELS, params=params)
+    assert recogniser.process(frame(0, picture(SQUARE, 1.7, 0.45, 0.0, 0)), None, VIEW) is None
+    assert {f.outcome for f in recogniser.fates if f.track >= 0} == {"not reported: too little of it is in view"}
 
 
 def test_nothing_that_stands_out_disappears_without_a_row(monkeypatch: pytest.MonkeyPatch):

@@ -87,6 +87,41 @@ def test_a_missed_track_loses_existence_as_bayes_says():
     assert found.candidate.tolist() == [-1]
 
 
+def test_existence_fades_with_time_and_frames_are_counted_where_it_was_seen():
+    """After a lifetime of 10 s a third is left, before the frame is looked at."""
+    tracker = Tracker(TrackingParams(lifetime_s=10.0, least_existence=0.0))
+    before = run(tracker, [[(1.9, 0.0)]])[-1].existence[0]
+    found = tracker.step(candidates_at([], []), STILL, FRAME_NS + 10 * 10**9)
+    faded = before * np.exp(-1)
+    assert found.existence[0] == pytest.approx(faded * 0.1 / (1 - faded + faded * 0.1), rel=1e-6)
+    assert found.frames_seen.tolist() == [1]
+
+
+def test_a_candidate_beyond_the_gate_is_of_no_track():
+    """18 cm are 4.2 deviations of the innovation; 14 cm are 3.3."""
+    for off_m, is_inside in ((0.18, False), (0.14, True)):
+        tracker = Tracker()
+        run(tracker, [[(2.0, 0.0)]])
+        found = tracker.step(candidates_at([2.0 + off_m], [0.0]), STILL, 2 * FRAME_NS)
+        row = int(np.flatnonzero(found.candidate == 0)[0])
+        assert (found.matrix[row, 0] > 0) is is_inside
+        assert (found.matrix[row, 0] == 0) is not is_inside
+
+
+def test_a_new_track_is_as_uncertain_as_its_candidate_and_its_elevation():
+    found = Tracker().step(candidates_at([2.0], [0.0]), None, FRAME_NS)
+    assert np.allclose(found.position_cov[0], np.diag([0.03**2, (2 * 0.015) ** 2, (2 * 0.07) ** 2]))
+
+
+def test_a_covariance_turns_with_the_sonar_and_drift_adds_to_it():
+    P = np.diag([1e-3, 2e-3, 4e-3])
+    tracks = Tracks(np.array([0]), np.array([[2.0, 0.0, 0.0]]), P[None], np.array([0.5]), np.array([1]))
+    quarter = SonarStep(gtsam.Pose3(gtsam.Rot3.Rz(np.pi / 2), np.zeros(3)), np.zeros((6, 6)))
+    found = tracks.moved(quarter, 0.1)
+    assert np.allclose(found.position_cov[0], np.diag([2e-3, 1e-3, 4e-3]) + 0.01 * np.eye(3))
+    assert np.allclose(found.position_m[0], [0.0, -2.0, 0.0])
+
+
 def test_what_persists_becomes_certain_and_what_flickers_ends_with_its_reason():
     rng = np.random.default_rng(7)
     frames = [[(2.0, 0.1), (rng.uniform(1.3, 2.5), rng.uniform(-0.24, 0.0))] for _ in range(20)]
