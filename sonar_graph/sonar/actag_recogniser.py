@@ -2,8 +2,8 @@
 
 AcTag wants rows and columns that are equally spaced in range and azimuth, the farthest range and the leftmost azimuth
 first, and its filters have a size in pixels. Frames are therefore sampled anew: by the log's own table of beams, and
-with as many pixels a bit of the tag as `AcTagSettings.pixels_per_bit` says. Each frame stands for itself: AcTag has
-neither tracks nor probabilities.
+with as many pixels a bit of the tag as `AcTagSettings.pixels_per_bit` says. AcTag looks at each frame for itself and
+decodes clutter now and then; a tag is reported from the second frame on that has it in the same place.
 
 Source: K. Norman, D. Butterfield, J. Mangelson, "AcTag: Opti-Acoustic Fiducial Markers for Underwater Localization and
 Mapping", IROS 2023; PyPI ``actag`` (BSD-2-Clause).
@@ -16,6 +16,7 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 import cv2
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -24,7 +25,7 @@ from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import CalibrationError
 from sonar_graph.measurements import Floats, LandmarkDetections, SonarFrames
 from sonar_graph.sonar.frame_check import FrameCheck
-from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar.geometry import FloorView, points
 from sonar_graph.sonar.recogniser import REPORTED, Fate
 from sonar_graph.sonar.tracks import SonarStep
 
@@ -48,6 +49,10 @@ class AcTagSettings(Section):
     """Wrong bits that are put right: fewer than half of those in which two tags differ."""
     pixels_per_bit: float = Field(8.0, ge=4)
     """Size of a bit in the image that AcTag gets."""
+    least_frames: int = Field(2, ge=1)
+    """Frames in which a tag must have been decoded in one place before it is reported."""
+    same_place_m: float = Field(0.5, gt=0)
+    """How far apart one place may seem: the elevation of a tag is not known."""
     probability: float = Field(0.99, gt=0, lt=1)
     """Posterior of a decoded identity."""
     range_sigma_m: float = Field(0.003, gt=0)
@@ -89,32 +94,50 @@ class AcTagRecogniser:
             self._detector(np.array([1.0, 2.0]), np.array([-0.25, 0.25]))
         except (ValueError, FileNotFoundError) as error:
             raise CalibrationError(f"AcTag: family {self.settings.family}: {error}") from error
+        self._start_T_sonar = gtsam.Pose3()
+        self._seen: dict[int, tuple[Floats, int]] = {}
         self.fates: list[Fate] = []
         """What became of everything in the frame last processed."""
 
     def process(
         self, frame: SonarFrames, motion: SonarStep | None = None, view: FloorView | None = None
     ) -> LandmarkDetections | None:
-        """The tags in a block of one frame; AcTag has no use for motion and floor."""
-        del motion, view
+        """The tags in a block of one frame; motion as for `Recogniser`, the floor is of no use to AcTag."""
+        del view
         stamp_ns = int(frame.stamps_ns[0])
+        if motion is not None:
+            self._start_T_sonar = self._start_T_sonar.compose(motion.previous_T_sonar)
         if (fault := self._check.fault(frame)) is not None:
             self.fates = [Fate(stamp_ns, -1, np.nan, np.nan, f"frame not used: {fault}")]
             return None
-        first: dict[int, Tag] = {}
-        self.fates = []
-        for tag in self._decoded(frame):
-            outcome = "not reported: decoded already in this frame" if tag.id in first else REPORTED
-            self.fates.append(Fate(stamp_ns, -1, tag.range_m, tag.azimuth_rad, outcome))
-            first.setdefault(tag.id, tag)
+        tags = self._decoded(frame)
+        outcomes = [self._outcome(tag, [other.id for other in tags[:n]]) for n, tag in enumerate(tags)]
+        self.fates = [
+            Fate(stamp_ns, -1, tag.range_m, tag.azimuth_rad, outcome)
+            for tag, outcome in zip(tags, outcomes, strict=True)
+        ]
         if self._check.change is not None:
             self.fates.append(Fate(stamp_ns, -1, np.nan, np.nan, self._check.change))
-        return self._detections(stamp_ns, list(first.values())) if first else None
+        reported = [tag for tag, outcome in zip(tags, outcomes, strict=True) if outcome == REPORTED]
+        return self._detections(stamp_ns, reported) if reported else None
+
+    def _outcome(self, tag: Tag, earlier_ids: list[int]) -> str:
+        """What becomes of a tag; remembers where it was decoded."""
+        if tag.id in earlier_ids:
+            return "not reported: decoded already in this frame"
+        q = points(np.array([tag.range_m]), np.array([tag.azimuth_rad]))[0]
+        place = np.asarray(self._start_T_sonar.transformFrom(q))
+        before, frames = self._seen.get(tag.id, (place, 0))
+        frames = frames + 1 if np.linalg.norm(place - before) <= self.settings.same_place_m else 1
+        self._seen[tag.id] = place, frames
+        if frames < self.settings.least_frames:
+            return f"not reported: decoded in fewer than {self.settings.least_frames} frames in one place"
+        return REPORTED
 
     def notes(self) -> dict[str, str]:
         """How detections come about, for a log's notes."""
         return {
-            "detections.rule": "AcTag, each frame for itself",
+            "detections.rule": f"AcTag, decoded in {self.settings.least_frames} frames in one place",
             "detections.designs": f"{self.settings.family}, inner square {self.settings.tag_size_m:g} m",
         }
 

@@ -4,6 +4,7 @@ import sys
 from types import ModuleType, SimpleNamespace
 from typing import Any, ClassVar
 
+import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -17,6 +18,7 @@ from sonar_graph.simulation.seabed import place_landmark
 from sonar_graph.simulation.sonar_image import FrameSimulator
 from sonar_graph.sonar.actag_recogniser import AcTagRecogniser, AcTagSettings, evenly_sampled
 from sonar_graph.sonar.recogniser import REPORTED
+from sonar_graph.sonar.tracks import SonarStep
 
 from .actag_pictures import FAMILY, tag_design
 
@@ -89,7 +91,7 @@ def test_beams_in_reverse_order_give_the_same_picture():
 def test_a_decoded_tag_becomes_a_detection_of_its_centre(decoder):
     corners = np.array([[1.9, 0.10], [2.0, 0.11], [2.02, 0.02], [1.92, 0.01]])
     decoder.found = [[3, corners * 0, corners]]
-    recogniser = AcTagRecogniser(Calibration(), AcTagSettings(probability=0.97, range_sigma_m=0.02))
+    recogniser = AcTagRecogniser(Calibration(), AcTagSettings(probability=0.97, range_sigma_m=0.02, least_frames=1))
     found = recogniser.process(frame_of(noise()))
     assert found is not None
     assert found.range_m == pytest.approx([1.96])
@@ -108,12 +110,31 @@ def test_a_decoded_tag_becomes_a_detection_of_its_centre(decoder):
 def test_a_tag_is_reported_once_a_frame(decoder):
     corners = np.full((4, 2), [2.0, 0.0])
     decoder.found = [[3, corners, corners], [3, corners, corners + 0.1], [4, corners, corners]]
-    recogniser = AcTagRecogniser(Calibration())
+    recogniser = AcTagRecogniser(Calibration(), AcTagSettings(least_frames=1))
     found = recogniser.process(frame_of(noise()))
     assert found is not None
     assert found.candidate_ids.ravel().tolist() == [3, 4]
     assert [fate.outcome for fate in recogniser.fates].count(REPORTED) == 2
     assert any("already" in fate.outcome for fate in recogniser.fates)
+
+
+def reported(decoder: type[Decoder], ranges_m: list[float], ahead_m: list[float]) -> list[bool]:
+    """Whether tag 3 is reported in each frame, decoded at these ranges after these motions ahead."""
+    recogniser, found = AcTagRecogniser(Calibration()), []
+    for n, (range_m, moved_m) in enumerate(zip(ranges_m, ahead_m, strict=True)):
+        decoder.found = [[3, np.zeros((4, 2)), np.tile([range_m, 0.0], (4, 1))]]
+        step = SonarStep(gtsam.Pose3(gtsam.Rot3(), np.array([moved_m, 0.0, 0.0])), np.zeros((6, 6)))
+        found.append(recogniser.process(frame_of(noise(n), n), step) is not None)
+    return found
+
+
+def test_a_tag_is_reported_when_it_was_decoded_twice_in_one_place(decoder):
+    assert reported(decoder, [2.3, 1.5, 2.3], [0.0, 0.8, -0.8]) == [False, True, True]
+
+
+def test_a_tag_that_does_not_stay_where_it_was_is_not_reported(decoder):
+    assert reported(decoder, [2.3, 1.5, 1.5], [0.0, 0.0, 0.0]) == [False, False, True]
+    assert reported(decoder, [2.0, 2.0, 2.0], [0.0, 1.0, 1.0]) == [False, False, False]
 
 
 def test_a_frame_without_tags_gives_nothing(decoder):
@@ -143,7 +164,7 @@ def test_actag_itself_reads_tags_in_simulated_frames(tag):
     pytest.importorskip("actag", reason="AcTag has wheels for Linux with Python 3.10 and 3.11 only: extra actag")
     right = 0
     for frame, truth in (simulated(tag, number) for number in range(3)):
-        found = AcTagRecogniser(Calibration()).process(frame)
+        found = AcTagRecogniser(Calibration(), AcTagSettings(least_frames=1)).process(frame)
         if found is not None:
             assert found.candidate_ids.ravel().tolist() == [tag]
             assert found.range_m[0] == pytest.approx(truth.range_m, abs=0.015)
