@@ -28,9 +28,10 @@ def _association(before: list[int], after: list[int]) -> Association:
     )  # fmt: skip
 
 
-def _after(rule: str, places: list[tuple[float, float, float] | None]) -> list[float]:
+def _after(rule: str, places: list[tuple[float, float, float] | None], **settings: float) -> list[float]:
     """Belief in landmark 1 after each frame of one track."""
-    beliefs, before, found = Beliefs(CONFUSION, IdentityParams.model_validate({"rule": rule})), [], []
+    params = IdentityParams.model_validate({"rule": rule} | settings)
+    beliefs, before, found = Beliefs(CONFUSION, params), [], []
     for place in places:
         looked = None if place is None else np.array(place)
         found.append(float(beliefs.step(_association(before, [7]), LOOKS_LIKE_1, [looked], SIDEWAYS)[0, 0]))
@@ -80,3 +81,59 @@ def test_beliefs_follow_their_tracks_when_rows_change_places():
     first = beliefs.step(_association([], [3, 4]), scores, [place, place], sideways)
     after = beliefs.step(_association([3, 4], [4, 3]), 0 * scores, [None, None], sideways)
     np.testing.assert_allclose(after, first[::-1], atol=1e-3)
+
+
+def test_beliefs_follow_their_numbers_when_the_tracks_before_come_in_another_order():
+    beliefs = Beliefs(CONFUSION)
+    scores = np.array([[0.9, 0.05, 0.05], [0.05, 0.9, 0.05]])
+    place, sideways = np.zeros(3), np.tile(SIDEWAYS, (2, 1))
+    first = beliefs.step(_association([], [3, 4]), scores, [place, place], sideways)
+    after = beliefs.step(_association([4, 3], [3, 4]), 0 * scores, [None, None], sideways)
+    np.testing.assert_allclose(after, first, atol=1e-3)
+
+
+def test_a_new_track_that_is_not_looked_at_has_the_prior():
+    found = Beliefs(CONFUSION, IdentityParams(unknown_prior=0.6)).step(
+        _association([], [7]), np.zeros((1, 3)), [None], SIDEWAYS
+    )
+    np.testing.assert_allclose(found, [[0.2, 0.2, 0.6]])
+
+
+def test_temper_is_a_share_of_the_log_odds():
+    whole, half = (_after("virtual-evidence", [(0, 0, 0)], temper=temper)[0] for temper in (1.0, 0.5))
+    prior = np.log(0.25 / 0.75)
+    # Against the two others together, whose own odds stay as the base and the matrix are symmetric.
+    assert prior < np.log(half / (1 - half)) < np.log(whole / (1 - whole))
+
+
+def test_hardly_any_motion_waits_until_it_adds_up():
+    """4 mm each: a hundredth of a frame; after 16 mm a seventh."""
+    found = _after("virtual-evidence", [(0, 0.004 * k, 0) for k in range(6)])
+    assert found[1] <= found[0]
+    assert found[2] <= found[1]
+    assert max(found[3:]) > found[0]
+
+
+def test_places_beyond_the_limit_are_forgotten():
+    back = [(0, 0, 0), (0, 0.14, 0), (0, 0, 0)]
+    assert (np.diff(_after("virtual-evidence", back, most_looks=1)) > 0).all()
+    remembered = _after("virtual-evidence", back)
+    assert remembered[2] <= remembered[1]
+
+
+def test_a_belief_fades_by_the_share_that_is_set():
+    found = _after("virtual-evidence", [(0, 0, 0), None], forgetting=0.5)
+    assert found[1] == pytest.approx(0.5 * found[0] + 0.5 * 0.25)
+
+
+@pytest.mark.parametrize("rule", ["virtual-evidence", "jeffrey"])
+def test_scores_without_a_look_do_not_count(rule: str):
+    found = _after(rule, [(0, 0, 0), None, None, None], forgetting=0.0)
+    assert found[1:] == pytest.approx([found[0]] * 3)
+
+
+def test_what_is_kept_of_a_track_ends_with_it():
+    beliefs = Beliefs(CONFUSION)
+    beliefs.step(_association([], [7]), LOOKS_LIKE_1, [np.zeros(3)], SIDEWAYS)
+    beliefs.step(_association([7], [8]), LOOKS_LIKE_1, [np.zeros(3)], SIDEWAYS)
+    assert list(beliefs._looks) == [8]

@@ -8,7 +8,7 @@ import pytest
 
 from sonar_graph.errors import CalibrationError
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
-from sonar_graph.sonar.confusion import LabelledFits, confusion_for, estimate_confusion, read_confusion
+from sonar_graph.sonar.confusion import Confusion, LabelledFits, confusion_for, estimate_confusion, read_confusion
 from sonar_graph.sonar.scores import soft_scores
 
 
@@ -18,7 +18,9 @@ def _fits(per_class: int, noise: float, seed: int = 0) -> LabelledFits:
     label = np.repeat(np.arange(3), per_class)
     means = np.array([[0.9, 0.7], [0.7, 0.9], [0.6, 0.6]])[label]
     error = np.where((label < 2)[:, None], rng.normal(0, [0.01, 0.002], (len(label), 2)), np.nan)
-    return LabelledFits(means + rng.normal(0, noise, means.shape), np.ones(len(label)), label, np.arange(len(label)), error)
+    return LabelledFits(
+        means + rng.normal(0, noise, means.shape), np.ones(len(label)), label, np.arange(len(label)), error
+    )
 
 
 def test_scores_are_probabilities_and_rise_with_correlation():
@@ -28,6 +30,12 @@ def test_scores_are_probabilities_and_rise_with_correlation():
     assert scores[1, 2] > 0.9
     certain = soft_scores(np.array([[1.0, 1.0]]), np.ones(1), 500.0, 0.8)
     assert np.isfinite(certain).all()
+
+
+def test_odds_of_scores_are_those_of_the_equation():
+    scores = soft_scores(np.array([[0.9, 0.6, -0.4]]), np.array([0.5]), 10.0, 0.7)[0]
+    weight = (1 - np.array([0.9, 0.6, 0.0, 0.7]) ** 2) ** (-10.0 * 0.5)
+    np.testing.assert_allclose(scores, weight / weight.sum())
 
 
 def test_scores_of_what_is_hardly_in_view_are_flatter():
@@ -62,13 +70,16 @@ def test_classes_that_never_were_confused_are_as_certain_as_their_tracks_allow()
     )
     for model, tracks in ((few, 5), (many, 100)):
         scores = soft_scores(fits.correlation, fits.visible, model.sharpness, model.threshold)
-        assert scores.max(axis=1).mean() == pytest.approx((tracks + 1) / (tracks + 2), abs=0.03)
+        known = scores[fits.label < 2].max(axis=1).mean()
+        assert known == pytest.approx((2 * tracks + 1) / (2 * tracks + 2), abs=0.03)
         assert model.provenance["tracks of landmark 2"] == str(tracks)
 
 
 def test_a_class_with_too_few_frames_is_named():
     fits = _fits(100, 0.1)
-    few = LabelledFits(*(getattr(fits, n)[:210] for n in ("correlation", "visible", "label", "track", "range_azimuth_error")))
+    few = LabelledFits(
+        *(getattr(fits, n)[:210] for n in ("correlation", "visible", "label", "track", "range_azimuth_error"))
+    )
     with pytest.raises(CalibrationError, match="no landmark: 10"):
         estimate_confusion(few, (1, 2), {})
 
@@ -94,3 +105,45 @@ def test_designs_that_ship_have_a_measured_model_and_others_an_assumed_one():
     assert other.ids == (9,)
     assert "assumed" in other.provenance["origin"]
     np.testing.assert_allclose(other.array().sum(axis=1), 1)
+
+
+def _model(*rows: tuple[float, ...]) -> Confusion:
+    return Confusion(
+        ids=tuple(range(1, len(rows))), matrix=rows, sharpness=9.0, threshold=0.8, range_sigma_m=0.01,
+        azimuth_sigma_rad=0.002,
+    )  # fmt: skip
+
+
+def test_what_was_never_seen_is_not_impossible():
+    model = _model((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.2, 0.3, 0.5))
+    np.testing.assert_allclose(model.array()[0], np.array([1.0, 0.001, 0.001]) / 1.002)
+    np.testing.assert_allclose(model.array()[2], [0.2, 0.3, 0.5])
+
+
+def test_the_base_is_what_is_seen_of_all_classes_together():
+    model = _model((0.8, 0.1, 0.1), (0.2, 0.7, 0.1), (0.5, 0.1, 0.4))
+    np.testing.assert_allclose(model.base(), [0.5, 0.3, 0.2])
+
+
+def test_negative_probabilities_are_refused():
+    with pytest.raises(ValueError, match="each row must be probabilities"):
+        _model((1.5, -0.5, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def test_accuracy_is_that_of_range_and_of_azimuth():
+    model = estimate_confusion(_fits(300, 0.1), (1, 2), {})
+    assert model.range_sigma_m == pytest.approx(0.01, rel=0.15)
+    assert model.azimuth_sigma_rad == pytest.approx(0.002, rel=0.15)
+
+
+def test_a_class_that_was_seen_more_often_counts_no_more():
+    """Every frame of the first class five times over, on the same tracks."""
+    fits = _fits(60, 0.1)
+    rows = np.concatenate([np.repeat(np.arange(60), 5), np.arange(60, 180)])
+    more = LabelledFits(*(column[rows] for column in vars(fits).values()))
+    one, other = (estimate_confusion(f, (1, 2), {}) for f in (fits, more))
+    assert (other.sharpness, other.threshold) == (
+        pytest.approx(one.sharpness, rel=0.01),
+        pytest.approx(one.threshold, abs=0.002),
+    )
+    np.testing.assert_allclose(other.matrix, one.matrix, atol=2e-3)

@@ -169,3 +169,26 @@ def test_half_of_a_frame_is_news_after_the_motion_that_decorrelates_speckle() ->
     news = news_of_motion(np.array([0.0, 0.0357, 0.07, 0.14, 1.0]), 0.14)
     np.testing.assert_allclose(news, [0, 0.5, 1 - 0.25**2, 1, 1], atol=0.01)
     assert (np.diff(news_of_motion(np.linspace(0, 0.2, 50), 0.14)) >= 0).all()
+
+
+def test_virtual_evidence_is_its_equation_as_printed() -> None:
+    rng = np.random.default_rng(4)
+    start, scores, confusion, base = _rows(rng, 2, 3), _rows(rng, 2, 4), _rows(rng, 3, 4), _rows(rng, 4)
+    weights = np.array([1.0, 0.3])
+    expected = np.zeros((2, 3))
+    for m, k in np.ndindex(2, 3):
+        likelihood = sum(confusion[k, j] * scores[m, j] / base[j] for j in range(4))
+        expected[m, k] = start[m, k] * likelihood ** weights[m]
+    expected /= expected.sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(virtual_evidence(start, scores, confusion, base, weights), expected)
+
+
+def test_news_follow_from_the_autocorrelation_of_a_triangle() -> None:
+    """By numerical convolution: a lens that sends and receives weighs its aperture by a triangle."""
+    places = np.linspace(-0.5, 0.5, 2001)
+    triangle = np.maximum(0.07 - np.abs(places) / 1.0, 0.0)
+    autocorrelation = np.convolve(triangle, triangle, mode="same")
+    rho = autocorrelation / autocorrelation.max()
+    moved = np.array([0.0, 0.01, 0.03, 0.05, 0.07, 0.09, 0.12, 0.14])
+    expected = 1 - np.interp(moved, places, rho) ** 2
+    np.testing.assert_allclose(news_of_motion(moved, 0.14), expected, atol=1e-3)
