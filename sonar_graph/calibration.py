@@ -81,17 +81,20 @@ class SonarImage(Section):
     """What the full scale of a sample spans, dB, where samples are logarithmic."""
     full_scale: float = Field(255.0, gt=0)
     """The largest sample."""
+    gamma: float = Field(1.0, gt=0)
+    """Power to which the echo's amplitude was raised, where samples are linear (Oculus)."""
 
     def decibels(self, samples: NDArray[Any]) -> NDArray[np.float32]:
         """Levels of samples, in dB over the smallest one; only their differences mean something.
 
-        ``samples * decibel_span / full_scale``, or ``20 log10(samples)`` of linear ones; linear samples of 0
+        ``samples * decibel_span / full_scale``, or ``20 / gamma log10(samples)`` of linear ones; linear samples of 0
         count as one count, real ones below 1/100000 of the full scale as that.
         """
         if self.scale == "decibel":
             return np.multiply(samples, np.float32(self.decibel_span / self.full_scale), dtype=np.float32)
         least = 1.0 if np.issubdtype(samples.dtype, np.integer) else 1e-5 * self.full_scale
-        return np.float32(20.0) * np.log10(np.maximum(samples, np.float32(least)) / np.float32(least), dtype=np.float32)
+        ratio = np.maximum(samples, np.float32(least)) / np.float32(least)
+        return np.float32(20.0 / self.gamma) * np.log10(ratio, dtype=np.float32)
 
 
 class SonarCalibration(Section):

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, Mounting, Start
+from sonar_graph.calibration import Calibration, Mounting, SonarImage, Start
 from sonar_graph.errors import CalibrationError
 
 angles = st.floats(-3, 3)
@@ -76,3 +76,19 @@ def test_calibration_cannot_be_changed() -> None:
 def test_every_field_says_what_it_means() -> None:
     without = [name for name, field in Calibration().imu.__class__.model_fields.items() if not field.description]
     assert without == ["mounting"]  # its type says it
+
+
+@given(st.floats(20.0, 120.0))
+def test_logarithmic_counts_are_decibels_by_their_span(span: float) -> None:
+    level_db = np.linspace(0, span, 50)
+    counts = np.rint(level_db * 255 / span).astype(np.uint8)
+    found = SonarImage(decibel_span=span).decibels(counts)
+    np.testing.assert_allclose(found, level_db, atol=0.51 * span / 255)
+
+
+@given(st.floats(0.2, 1.0))
+def test_linear_counts_are_decibels_of_the_amplitude_whatever_the_gamma(gamma: float) -> None:
+    level_db = np.linspace(0, 40, 50)
+    counts = (10 ** (level_db / 20)) ** gamma
+    found = SonarImage(scale="linear", gamma=gamma, full_scale=1e4).decibels(counts)
+    np.testing.assert_allclose(np.diff(found), np.diff(level_db), atol=1e-3)

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from sonar_graph.calibration import Mounting
+from sonar_graph.calibration import Calibration, Mounting, SonarImage
 from sonar_graph.errors import SimulationError
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign, load_designs
 from sonar_graph.measurements import Floats
@@ -34,7 +34,7 @@ from sonar_graph.simulation.options import SimulationOptions
 from sonar_graph.simulation.recording import Streams, Vehicle, frame_stamps, record
 from sonar_graph.simulation.route import Piece, PlanarPose, drive, follow, hover, turn
 from sonar_graph.simulation.seabed import SeabedObject, place_landmark, scattered_objects
-from sonar_graph.simulation.sonar_image import FrameSimulator
+from sonar_graph.simulation.sonar_image import SONARS, FrameSimulator
 from sonar_graph.simulation.vehicle import VehiclePath, smooth_noise
 from sonar_graph.simulation.world import World, world_on_floor
 
@@ -103,7 +103,15 @@ def simulate_basin(options: BasinOptions | None = None) -> Sequence:
     world = _world(options, streams.world)
     path = _path(options, streams.path)
     sequence = record("basin", options, YSHARK, path, world, streams, _notes(options))
-    return sequence if options.image is None else replace(sequence, detections=None)
+    if options.image is None:
+        return sequence
+    return replace(sequence, detections=None, calibration=_imaging(sequence.calibration, options.image))
+
+
+def _imaging(calibration: Calibration, image: ImageOptions) -> Calibration:
+    """The calibration with what the counts of the images mean."""
+    scale = SonarImage(scale="decibel", decibel_span=SONARS[image.sonar].decibel_span, full_scale=255)
+    return calibration.model_copy(update={"sonar": calibration.sonar.model_copy(update={"image": scale})})
 
 
 def simulate_basin_frames(options: BasinOptions, frames_per_block: int = 32) -> Iterator[ImagedFrames]:

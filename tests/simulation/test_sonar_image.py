@@ -9,7 +9,9 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from sonar_graph.calibration import SonarImage
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.simulation.image_options import ImageOptions
 from sonar_graph.simulation.imaging_sonar import ImagingSonar
 from sonar_graph.simulation.seabed import SeabedObject, block, place, place_landmark
@@ -353,3 +355,24 @@ def test_every_sonar_makes_images_of_its_own_size(name):
     assert image.shape == (SONARS[name].beams, SONARS[name].bins)
     middle = image[SONARS[name].beams // 2 - 5 : SONARS[name].beams // 2 + 5, 250:350]
     assert np.mean(middle) * 80 / 255 == pytest.approx(40 - 2.5, abs=1.5)  # the mean of decibels: 2.5 below
+
+
+@pytest.mark.parametrize("name", sorted(SONARS))
+def test_the_log_of_each_sonar_says_what_its_counts_span(name, monkeypatch):
+    image = ImageOptions(sonar=name)
+    for span in (SONARS[name].decibel_span, 64.0):
+        monkeypatch.setitem(SONARS, name, SONARS[name].model_copy(update={"decibel_span": span}))
+        said = simulate_basin(BasinOptions(duration_s=120.0, laps=1, image=image)).calibration.sonar.image
+        assert (said.scale, said.decibel_span, said.full_scale) == ("decibel", span, 255)
+
+
+def test_levels_do_not_depend_on_the_span_that_counts_have():
+    at = np.array([0.0, 0.0, HEIGHT_M])
+    levels = []
+    for span in (80.0, 100.0):
+        sonar = SONARS["didson"].model_copy(update={"decibel_span": span})
+        counts = FrameSimulator(PLAIN, (), 0.0, 3, sonar).frame(at, TILT, 0)
+        levels.append(SonarImage(decibel_span=span).decibels(counts))
+    inside = (levels[0] > 1) & (levels[0] < 79)
+    assert inside.mean() > 0.9
+    assert np.abs(levels[0] - levels[1])[inside].max() < 0.5 * (80 + 100) / 255 + 1e-3

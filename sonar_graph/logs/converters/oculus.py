@@ -40,6 +40,8 @@ RESULTS = {0: struct.Struct("<2I4dIBd2H3I"), 1: struct.Struct("<2I4dIBd2H3I"), 2
 RESULT_AT = {0: 53, 1: 53, 2: 89}
 """What was measured, by version: where, and number, status, frequency, temperature, pressure, (heading, pitch, roll),
 speed of sound, time, bytes a sample - 1, bin, ranges, beams, (spare), where the image is, its size, that of all."""
+NO_GAMMA = (0, 255)
+"""Codes for none; others are 255ths."""
 HAS_GAINS = 0b100
 GAIN_BYTES = 4
 
@@ -72,14 +74,16 @@ class OculusFormat:
         wraps = first.settings[0] != 2
         self.clock_period_ns = CLOCK_PERIOD_NS if wraps else None
         sample_bytes = int(first.settings[4])
-        image = SonarImage(scale="linear", full_scale=2 ** (8 * sample_bytes) - 1)
+        code = int(first.settings[2])
+        gamma = 1.0 if code in NO_GAMMA else code / 255
+        image = SonarImage(scale="linear", full_scale=2 ** (8 * sample_bytes) - 1, gamma=gamma)
         self.calibration = Calibration(sonar=SonarCalibration(image=image))
         clock = ", a 32-bit number taken as nanoseconds and continued where it wraps around" if wraps else ""
         self.notes = {
             "source": f"Oculus recording {source.path.name}",
             "sonar.time": f"since the sonar was switched on, not since 1970{clock}",
             "sonar.beams": "bearings of the pings",
-            "sonar.scale": "counts are linear to the power of the gamma that was set",
+            "sonar.scale": f"counts are the amplitude to the power of {gamma:.3g}, the gamma of the first ping",
         }
 
     def head(self, content: bytes, at: int) -> FrameHead:

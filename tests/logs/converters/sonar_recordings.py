@@ -120,6 +120,7 @@ class Oculus:
     first_clock: int = 2**32 - 100_000_000
     bin_m: float = 0.003
     first_number: int = 500
+    gamma_code: int = 127
 
     def frame(self, i: int) -> bytes:
         image = np.ascontiguousarray(self.frames[i].T)
@@ -131,7 +132,7 @@ class Oculus:
         bearings = struct.pack(f"<{beams}h", *np.linspace(-6500, 6000, beams).astype(int).tolist())
         extra = struct.pack("<9I", *range(9)) if self.version == 2 else b""
         flags = 0b11001 | (0b100 if self.gains is not None else 0)
-        fire = struct.pack("<5B4d", 2, 0, 255, 127, flags, 2.0, 50.0, 0.0, 0.0) + extra
+        fire = struct.pack("<5B4d", 2, 0, 255, self.gamma_code, flags, 2.0, 50.0, 0.0, 0.0) + extra
         clock_ns = self.first_clock + i * STEP_NS
         number = self.first_number + i
         if self.version == 2:

@@ -85,6 +85,13 @@ def test_the_log_says_that_counts_are_linear(tmp_path: Path, kind: str, full_sca
     assert (image.scale, image.full_scale) == ("linear", full_scale)
 
 
+@pytest.mark.parametrize(("code", "gamma"), [(0, 1.0), (255, 1.0), (127, 0.498), (51, 0.2)])
+def test_the_log_says_the_gamma_that_was_set(tmp_path: Path, code: int, gamma: float) -> None:
+    result = converted(tmp_path, Oculus(images(1, 16, 8), gamma_code=code).content(), "raw")
+    assert result.calibration.sonar.image.gamma == pytest.approx(gamma, abs=1e-3)
+    assert f"{gamma:g}" in result.notes["sonar.scale"]
+
+
 def test_the_newer_clock_does_not_wrap_around(tmp_path: Path) -> None:
     _, first, *_ = Oculus(images(1, 16, 8), version=2, first_clock=10**12).pieces()
     _, second, *_ = Oculus(images(1, 16, 8, seed=1), version=2, first_clock=10**12 + 10**10, first_number=501).pieces()
