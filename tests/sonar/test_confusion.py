@@ -147,3 +147,15 @@ def test_a_class_that_was_seen_more_often_counts_no_more():
         pytest.approx(one.threshold, abs=0.002),
     )
     np.testing.assert_allclose(other.matrix, one.matrix, atol=2e-3)
+
+
+def test_certainty_is_what_so_many_tracks_allow():
+    """Nothing is confused here, so that the scores become as certain as their targets, (n + 1) / (n + 2)."""
+    certain = {}
+    for tracks in (4, 100):
+        fits = _fits(100, 0.0)
+        fits = replace(fits, track=fits.label * tracks + np.arange(len(fits.label)) % tracks)
+        model = estimate_confusion(fits, (1, 2), {})
+        certain[tracks] = np.diag(model.matrix).mean()
+    assert certain[4] == pytest.approx(5 / 6, abs=0.04)
+    assert certain[100] == pytest.approx(101 / 102, abs=0.02)
