@@ -126,3 +126,10 @@ def test_full_scale_is_that_of_the_calibration():
     image = _noise(1) * np.uint16(100)
     assert FrameCheck(SonarImage(full_scale=65535)).fault(_frame(1, image)) is None
     assert "sonar.image.full_scale" in (FrameCheck(SonarImage(full_scale=4095)).fault(_frame(1, image)) or "")
+
+
+def test_windows_that_are_remembered_do_not_grow_without_limit():
+    check = FrameCheck()
+    for k in range(200):
+        check.fault(_frame(k + 1, end_m=2.0 + 0.5 * k))
+    assert len(check._seen) <= 64
