@@ -16,12 +16,12 @@ from sonar_graph.simulation.image_options import ImageOptions
 from sonar_graph.simulation.imaging_sonar import DIDSON
 from sonar_graph.simulation.seabed import place_landmark
 from sonar_graph.simulation.sonar_image import FrameSimulator
+from sonar_graph.sonar.actag_designs import tag_design
 from sonar_graph.sonar.actag_recogniser import AcTagRecogniser, AcTagSettings, evenly_sampled
 from sonar_graph.sonar.recogniser import REPORTED
 from sonar_graph.sonar.tracks import SonarStep
 
-from .actag_pictures import FAMILY, tag_design
-
+FAMILY = "AcTag24h10"
 RANGES_M, AZIMUTHS_RAD = DIDSON.ranges_m(), DIDSON.azimuths_rad()
 
 
@@ -177,7 +177,7 @@ def simulated(tag: int, number: int) -> tuple[SonarFrames, SimpleNamespace]:
     """A tag on the floor of a basin, seen from a height of 0.95 m, and where it is."""
     rng = np.random.default_rng([tag, number])
     floor_m, centre_m = -1.7, np.array([11.7, 7.0 + rng.uniform(-0.1, 0.1), -1.687])
-    design = place_landmark(tag_design(tag, 0.1306), centre_m, rng.uniform(-np.pi, np.pi), floor_m)
+    design = place_landmark(tag_design(FAMILY, tag, 0.1306), centre_m, rng.uniform(-np.pi, np.pi), floor_m)
     simulator = FrameSimulator(ImageOptions(), [design], floor_m, seed=tag)
     sonar_m = np.array([10.0 + 0.1 * (number - 1), 7.0, floor_m + 0.95])
     world_R_sonar = Rotation.from_euler("ZYX", [0, np.radians(30), 0])
