@@ -92,11 +92,11 @@ def test_recognition_names_its_figures() -> None:
 
 def test_actag_names_its_figures_or_the_extra() -> None:
     if importlib.util.find_spec("actag") is None:
-        done = run("validation/actag.py", "--quick")
+        done = run("validation/actag_reading.py", "--quick")
         assert (done.returncode, done.stderr.count("\n")) == (2, 1)
         assert "sonar-graph[actag]" in done.stderr
         return
-    found = figures("validation/actag.py")
+    found = figures("validation/actag_reading.py")
     assert found["tags_in_view"] > 10
     assert found["decoded_share"] > 0.4
     assert found["range_rms_m"] < 0.01

@@ -88,6 +88,12 @@ def test_beams_in_reverse_order_give_the_same_picture():
     np.testing.assert_allclose(forth, back, atol=1e-3)
 
 
+def test_bins_are_averaged_over_a_pixel():
+    speckle = np.random.default_rng(0).normal(0, 5.6, (96, 512)).astype(np.float32)
+    fine, coarse = (evenly_sampled(speckle, RANGES_M, AZIMUTHS_RAD, pixel_m)[0].std() for pixel_m in (0.0024, 0.0098))
+    assert coarse < 0.6 * fine
+
+
 def test_a_decoded_tag_becomes_a_detection_of_its_centre(decoder):
     corners = np.array([[1.9, 0.10], [2.0, 0.11], [2.02, 0.02], [1.92, 0.01]])
     decoder.found = [[3, corners * 0, corners]]

@@ -123,6 +123,7 @@ def test_a_log_with_equally_spaced_beams_is_put_right_by_the_lens():
 def test_a_lens_keeps_the_order_of_the_beams():
     leftmost_first = with_lens(frames_of(DIDSON.linear_azimuths_rad()[::-1]), "didson")
     assert np.allclose(leftmost_first.azimuths_rad, DIDSON.azimuths_rad()[::-1], atol=1e-5)
+    assert len(with_lens(frames_of(np.linspace(-0.25, 0.25, 48)), "didson").azimuths_rad) == 48
     aris = with_lens(frames_of(np.linspace(-0.25, 0.25, 128)), "aris").azimuths_rad
     assert (np.diff(aris) > 0).all()
     assert np.degrees(aris[-1]) == pytest.approx(14.7, abs=0.1)
