@@ -107,18 +107,24 @@ class Appearance:
         shifts = np.flatnonzero(visible >= self.params.least_searched)
         if not len(shifts):
             return correlation
-        level, seen, square = _windows(patch.level_db.ravel(), patch.seen.ravel(), self._cells, self._offsets[shifts])
-        scale = np.sqrt(np.maximum(self._variances(seen, visible[shifts]), 0.0) * square[:, None])
-        known = scale > 0
-        correlation[shifts] = np.where(known, _product(level, self._pictures) / np.where(known, scale, 1.0), -1.0)
+        n = (visible[shifts] * len(self._cells))[:, None]
+        level = _windows(_centred(patch).ravel(), self._cells, self._offsets[shifts])
+        total, square = self._template_sums(patch, visible, shifts)
+        level_sum, level_square = level.sum(axis=1)[:, None], np.einsum("sc,sc->s", level, level)[:, None]
+        covariance = _product(level, self._pictures) - level_sum * total / n
+        scale2 = np.maximum(square - total**2 / n, 0.0) * np.maximum(level_square - level_sum**2 / n, 0.0)
+        known = scale2 > 0
+        correlation[shifts] = np.where(known, covariance / np.sqrt(np.where(known, scale2, 1.0)), -1.0)
         return correlation
 
-    def _variances(self, seen: Floats32, visible: Floats32) -> Floats32:
-        """Of the templates over the cells that are seen, times their number, shape (shifts, templates)."""
-        total, square = (np.tile(whole, (len(seen), 1)) for whole in self._sums)
-        cut = np.flatnonzero(visible < 1)
-        total[cut], square[cut] = _product(seen[cut], self._pictures), _product(seen[cut], self._squares)
-        return square - total**2 / (visible * seen.shape[1])[:, None]
+    def _template_sums(self, patch: Patch, visible: Floats32, shifts: Ints) -> tuple[Floats32, Floats32]:
+        """Of the templates and of their squares over the cells that are seen, shape (shifts, templates)."""
+        total, square = (np.tile(whole, (len(shifts), 1)) for whole in self._sums)
+        cut = np.flatnonzero(visible[shifts] < 1)
+        if len(cut):
+            seen = _windows(patch.seen.ravel(), self._cells, self._offsets[shifts[cut]])
+            total[cut], square[cut] = _product(seen, self._pictures), _product(seen, self._squares)
+        return total, square
 
     def _between_points(self, correlation: Floats32, best: int) -> Floats:
         """Where a parabola through the neighbours of the best shift has its top, in points, shape (2,)."""
@@ -128,36 +134,31 @@ class Appearance:
         return np.array([_top(surface[:, y], x), _top(surface[x, :], y)])
 
 
+def _centred(patch: Patch) -> Floats32:
+    """Levels over their mean, 0 where nothing is seen: sums of small numbers are exact enough."""
+    return (patch.level_db - patch.level_db.sum() / max(patch.seen.sum(), 1.0)) * patch.seen
+
+
 @compiled
 def _visible(seen: Floats32, cells: Ints, offsets: Ints) -> Floats32:
     """Share of the cells that a patch holds at each offset, shape (offsets,)."""
     share = np.empty(len(offsets), np.float32)
     for n in range(len(offsets)):
-        total = 0.0
+        count = 0
         for c in range(len(cells)):
-            total += seen[cells[c] + offsets[n]]
-        share[n] = total / len(cells)
+            count += int(seen[cells[c] + offsets[n]])
+        share[n] = count / len(cells)
     return share
 
 
 @compiled
-def _windows(level_db: Floats32, seen: Floats32, cells: Ints, offsets: Ints) -> tuple[Floats32, Floats32, Floats32]:
-    """Levels over their mean and what is seen at each offset, shape (offsets, cells), and the sum of squares."""
-    shape = len(offsets), len(cells)
-    level, is_seen, square = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape[0], np.float32)
+def _windows(values: Floats32, cells: Ints, offsets: Ints) -> Floats32:
+    """Values of a patch in the cells at each offset, shape (offsets, cells)."""
+    windows = np.empty((len(offsets), len(cells)), np.float32)
     for n in range(len(offsets)):
-        count = total = squares = 0.0
         for c in range(len(cells)):
-            at = cells[c] + offsets[n]
-            level[n, c], is_seen[n, c] = level_db[at], seen[at]
-            count += seen[at]
-            total += level_db[at]
-        mean = total / max(count, 1.0)
-        for c in range(len(cells)):
-            level[n, c] = (level[n, c] - mean) * is_seen[n, c]
-            squares += level[n, c] ** 2
-        square[n] = squares
-    return level, is_seen, square
+            windows[n, c] = values[cells[c] + offsets[n]]
+    return windows
 
 
 def _product(rows: Floats32, columns: Floats32) -> Floats32:
