@@ -91,6 +91,7 @@ def test_compare_recognises_by_itself_and_gives_what_recognise_gives(lane_log, r
 
 
 def test_a_model_that_calibrate_wrote_is_used(lane_log, run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(confusion, "LEAST_FRAMES", 10**6)
     assert run("calibrate", lane_log, "-o", tmp_path / "model.json") == 2
     assert re.fullmatch(r"sonar-graph: too few labelled frames .*give longer or more logs\n", capsys.readouterr().err)
     monkeypatch.setattr(confusion, "LEAST_FRAMES", 8)
