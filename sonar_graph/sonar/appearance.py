@@ -37,7 +37,7 @@ class AppearanceParams(Section):
     """Standard deviation of the sonar's resolution on the floor."""
     search_m: float = Field(0.045, ge=0)
     """How far a landmark's centre is sought from the candidate's, along each axis."""
-    least_visible: float = Field(0.8, gt=0, le=1)
+    least_visible: float = Field(0.65, gt=0, le=1)
     """Share of the cells that must lie in the image where the best of all fits."""
     least_searched: float = Field(0.5, gt=0, le=1)
     """The same while the best is sought: less, or the rim of the image would push the best fit aside."""

@@ -121,14 +121,15 @@ def estimate_confusion(fits: LabelledFits, ids: tuple[int, ...], provenance: dic
 
 
 def _targets(tracks: Ints) -> Floats:
-    """Probabilities that a class can be taken for certain with after n tracks, shape (classes, classes).
+    """How certain the scores of each class may be after so many tracks of each, shape (classes, classes).
 
-    ``(n + 1) / (n + 2)`` for itself: with classes that never were confused the most likely scores would be certain,
-    which n tracks do not show (Platt, "Probabilistic outputs for support vector machines", 1999, section 2.2).
+    ``(n + 1) / (n + 2)`` for itself, the rest for the others: for classes that were never confused the most likely
+    scores would be certain, which n tracks do not show (Platt, "Probabilistic outputs for support vector machines",
+    1999, section 2.2). All landmarks share the numbers that are fitted, so that n counts the tracks of all of them.
     """
-    others = 1.0 / ((tracks + 2.0) * (len(tracks) - 1))
-    targets = np.tile(others[:, None], (1, len(tracks)))
-    np.fill_diagonal(targets, (tracks + 1.0) / (tracks + 2.0))
+    n = np.append(np.full(len(tracks) - 1, tracks[:-1].sum()), tracks[-1])
+    targets = np.tile(1.0 / ((n + 2.0) * (len(n) - 1))[:, None], (1, len(n)))
+    np.fill_diagonal(targets, (n + 1.0) / (n + 2.0))
     return targets
 
 
