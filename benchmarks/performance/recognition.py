@@ -11,8 +11,9 @@ and ``median_ms`` are of the whole. Motion, tilt and height (``motion_ms``) come
 part of it. ``simulate_frame_ms`` is the mean for making a frame.
 
 ``actag_ratio`` is AcTag's time for a frame over ours, in the mean over the same frames, every few of the log. AcTag
-1.0.1 as it comes (compiled path, its default settings), for tags as large as our landmarks. Our figure has tracking
-and beliefs in it, AcTag has none; it finds nothing here, since these are not its tags.
+1.0.1 as it comes (compiled path, its default settings), for tags as large as our landmarks; where it is not installed
+(``pip install 'sonar-graph[actag]'``) the figure is null and its target not met. Our time has tracking and beliefs in
+it, AcTag's has none; AcTag finds nothing here, since these are not its tags.
 
 Everything runs on one core; of each side all CPU time of the process counts, which no other process adds to. ``wall``
 figures are by the clock. The sides take turns of one chunk of the log.
@@ -147,7 +148,7 @@ def make_actag(frames: SonarFrames) -> Any:
     try:
         from actag import AcTag
     except ImportError:
-        note("AcTag is not installed, so that nothing is compared with it: pip install actag")
+        note("AcTag is not installed, so that nothing is compared with it: pip install 'sonar-graph[actag]'")
         return None
     opening_rad = float(np.ptp(frames.azimuths_rad))
     return AcTag(float(frames.ranges_m[0]), float(frames.ranges_m[-1]), opening_rad, TAG_FAMILY, TAG_SIZE_M)

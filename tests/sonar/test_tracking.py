@@ -150,19 +150,22 @@ def test_motion_is_what_makes_a_track_persist(is_compensated):
         assert found.position_m[0] == pytest.approx(step.previous_T_sonar.transformFrom(point), abs=1e-3)
 
 
-def test_a_skipped_frame_moves_the_tracks_too():
+@pytest.mark.parametrize("skipped", [1, 3])
+def test_skipped_frames_move_the_tracks_too(skipped: int):
     step, point = moved_by(0.1, 0.0, 0.04), np.array([2.2, 0.1, 0.0])
     tracker = Tracker()
     run(tracker, [[(float(np.linalg.norm(point)), float(np.arctan2(point[1], point[0])))]])
-    tracker.skip(step)
-    twice = step.previous_T_sonar.transformTo(step.previous_T_sonar.transformTo(point))
-    candidates = candidates_at([float(np.linalg.norm(twice))], [float(np.arctan2(twice[1], twice[0]))])
+    moved = step.previous_T_sonar.transformTo(point)
+    for _ in range(skipped):
+        tracker.skip(step)
+        moved = step.previous_T_sonar.transformTo(moved)
+    candidates = candidates_at([float(np.linalg.norm(moved))], [float(np.arctan2(moved[1], moved[0]))])
     found = tracker.step(candidates, step, 3 * FRAME_NS)
     assert found.track_ids.tolist() == [0]
-    assert found.position_m[0] == pytest.approx(twice, abs=1e-6)
+    assert found.position_m[0] == pytest.approx(moved, abs=1e-6)
     # The skipped motion counts once.
     later = tracker.step(candidates, STILL, 4 * FRAME_NS)
-    assert later.position_m[0] == pytest.approx(twice, abs=1e-6)
+    assert later.position_m[0] == pytest.approx(moved, abs=1e-6)
 
 
 def test_steps_join_as_samples_of_them_do():
