@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -116,7 +116,7 @@ def recognise(
     if found is None:
         raise LogError(f"{log}: has no sonar images; `sonar-graph inspect {log}` lists what it has")
     with working("writing"):
-        amended = _write(log, path, found, salvage=salvage)
+        amended = _write(log, path, found, sequence.notes, salvage=salvage)
     print_outcomes(found, sequence.start_ns)
     for topic, count in amended.replaced.items():
         typer.echo(f"Replaced: {count} messages that the log had on {topic}")
@@ -208,19 +208,21 @@ def print_outcomes(found: Recognition, start_ns: int) -> None:
         out.print(f"Warning: {more} more such rows; with their stamps in the log's metadata record {RECORD}")
 
 
-def _write(log: Path, path: Path, found: Recognition, *, salvage: bool) -> Amended:
-    """The log with the detections, and with how they came about in its notes."""
+def _write(log: Path, path: Path, found: Recognition, notes: Mapping[str, str], *, salvage: bool) -> Amended:
+    """The log with the detections, and with how they came about, and what it is not a copy of, in its notes."""
     from sonar_graph.logs.amending import write_amended
     from sonar_graph.logs.encoding import detection_messages
     from sonar_graph.logs.log_record import METADATA, with_notes
     from sonar_graph.logs.roles import DETECTIONS
 
+    losses = {f"copied.{name}": f"{log.name}: {notes[name]}" for name in ("log.ending", "log.damage") if name in notes}
+    record = with_notes(log, found.notes | losses)
     return write_amended(
         log,
         path,
         detection_messages(TOPIC, found.detections) if found.detections else [],
         anew={TOPIC: DETECTIONS},
-        metadata={METADATA: with_notes(log, found.notes), RECORD: {"recognition": json.dumps(found.entry())}},
+        metadata={METADATA: record, RECORD: {"recognition": json.dumps(found.entry())}},
         salvage=salvage,
     )
 

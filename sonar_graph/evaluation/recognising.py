@@ -33,6 +33,7 @@ PICTURE_PERIOD_NS = NS_PER_S
 NOT_USED = "frame not used"
 OUT_OF_ORDER = "out of order"
 LEAPT = "out of order: its stamp is ahead of the frame after it"
+NO_FLOOR = "frame without a known floor: compared with the designs in the plane of the image"
 NO_ODOMETRY = "no IMU and Doppler log at its stamp"
 
 
@@ -174,7 +175,9 @@ class RecognitionSession:
             return None
         self.motion = motion = self._motions.at(stamp_ns)
         frame = with_lens(frame, self._lens)
-        found = self.recogniser.process(frame, step_of(motion), view_of(motion))
+        view = view_of(motion)
+        self.result.outcomes[NO_FLOOR] += view is None
+        found = self.recogniser.process(frame, step_of(motion), view)
         is_used = True
         for fate in self.recogniser.fates:
             if np.isnan(fate.range_m) and fate.track < 0:
@@ -198,6 +201,7 @@ class RecognitionSession:
         result = self.result
         result.detections = LandmarkDetections.concatenate(self._blocks) if self._blocks else None
         result.notes = {"detections": f"recognised in {result.frames} sonar images"} | self.recogniser.notes()
+        result.outcomes = +result.outcomes  # without what never happened
         result.warnings.sort(key=lambda row: row[0])
         if result.warnings:
             result.notes["detections.warnings"] = "; ".join(f"{n} x {reason}" for reason, n in result.warned().items())

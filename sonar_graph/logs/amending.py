@@ -104,6 +104,7 @@ class _Copy:
         self._schemas: dict[_Described, int] = {("", "", b""): 0}
         self._channels: dict[str, int] = {}
         self._amended = Amended()
+        self._beginning_ns: int | None = None
 
     def run(self, added: Sequence[Outgoing], metadata: Mapping[str, Mapping[str, str]], salvage: bool) -> Amended:
         writer, passage = self._writer, self._passage
@@ -111,7 +112,7 @@ class _Copy:
         both = heapq.merge(self._of_log(), self._of_entries(added), key=lambda message: message[0])
         for log_time, publish_time, topic, payload, number in both:
             writer.add_message(self._channels[topic], log_time, payload, publish_time, number)
-        recording = Recording(self._log.path, damage=passage.damage, chunks=passage.chunks)
+        recording = Recording(self._log.path, damage=passage.damage, beginning_ns=self._beginning_ns)
         if not salvage:
             recording.require_sound()
         self._copy_others()
@@ -127,7 +128,12 @@ class _Copy:
         for _, pieces in groupby(self._passage, key=lambda piece: id(piece.data)):
             yield from _sorted([piece for piece in pieces if self._is_copied(piece)])
 
+    def _note_time(self, piece: Piece) -> None:
+        first_ns = int(piece.found.log_times_ns.min())
+        self._beginning_ns = first_ns if self._beginning_ns is None else min(first_ns, self._beginning_ns)
+
     def _is_copied(self, piece: Piece) -> bool:
+        self._note_time(piece)
         topic = piece.topic
         wanted = self._anew.get(topic.name)
         if topic.name in self._taken or (wanted is not None and short_name(topic.type_name) != short_name(wanted)):

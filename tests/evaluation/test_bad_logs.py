@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.evaluation.recognising import LEAPT, recognise
+from sonar_graph.evaluation.recognising import LEAPT, NO_FLOOR, recognise
 from sonar_graph.evaluation.recognition import Recognition
 from sonar_graph.logs.reading import read_sequence
 from sonar_graph.logs.recorder import Outgoing
@@ -152,4 +152,5 @@ def test_a_log_without_depth_and_floor_is_recognised_in_the_image_plane(lane, tm
     found = recognise(log, read_sequence(log))
     assert found.frames == COUNT
     assert found.warnings == []
+    assert found.outcomes[NO_FLOOR] == COUNT
     assert found.detections is not None
