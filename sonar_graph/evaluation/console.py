@@ -37,8 +37,8 @@ NEES_LEGEND = (
     f"NEES: 1 fits; ▲ above {TOLERATED_FACTOR:g} over-confident, ▼ below {1 / TOLERATED_FACTOR:g} over-cautious"
 )
 PUBLISHED_LEGEND = (
-    f"{PAPER}: landmarks and their errors from its Table I, last less first position from its section III; it measured "
-    "a vehicle in a real basin, whose true path it did not know.\nAll else: this run."
+    f"{PAPER}: landmarks from its Table I, of which the errors are, and last minus first position from its section III. "
+    "It measured in a real basin and did not know the true path.\nAll else: this run."
 )
 
 
@@ -88,7 +88,7 @@ def _positions(found: LandmarkTable) -> Table:
 
 def _totals(found: LandmarkTable) -> Table:
     """What they come to: a column a quantity."""
-    table = _plain_table("", ["", "RMS", "RMS after\nSE(2)", "last less\nfirst x", "last less\nfirst y"])
+    table = _plain_table("", ["", "RMS", "RMS after\nSE(2)", "last minus\nfirst x", "last minus\nfirst y"])
     table.add_row("true", *(row.true for row in found.totals))
     for column, name in enumerate(found.columns):
         table.add_row(name, *(row.cells[column] for row in found.totals))
