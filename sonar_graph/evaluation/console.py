@@ -37,7 +37,7 @@ NEES_LEGEND = (
     f"NEES: 1 fits; ▲ above {TOLERATED_FACTOR:g} over-confident, ▼ below {1 / TOLERATED_FACTOR:g} over-cautious"
 )
 PUBLISHED_LEGEND = (
-    f"{PAPER}: landmarks from its Table I, of which the errors are, and last minus first position from its section III. "
+    f"{PAPER}: landmarks from its Table I, of which the errors are, and last minus first position from section III. "
     "It measured in a real basin and did not know the true path.\nAll else: this run."
 )
 
