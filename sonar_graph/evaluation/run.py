@@ -17,7 +17,7 @@ from sonar_graph.evaluation.instants import map_instants
 from sonar_graph.evaluation.memory import PeakMemory
 from sonar_graph.evaluation.outcome import check_estimate, check_outcome
 from sonar_graph.evaluation.results import MapSoFar, RunResult
-from sonar_graph.measurements import Ints, Measurements
+from sonar_graph.measurements import Ints, LandmarkDetections, Measurements
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Estimate, Trajectory
 
@@ -26,6 +26,8 @@ REASON_WIDTH = 400
 WARM_UP_STEPS = 20
 MAX_WARM_UP_STEPS = 200
 """Steps given to the instance that warms up: without and with detections to wait for."""
+WARM_UP_FRAMES = 4
+"""Steps with a landmark that can be named: it is begun, waited for, and seen again."""
 
 
 def run_estimator(
@@ -116,9 +118,9 @@ class _Replay:
             return self._result("failed", f"{self._stage}: {one_line(error)}", peak_memory_mb=memory.rise_mb())
 
     def _warm_up(self, kind: type[Estimator]) -> None:
-        """Let an estimator that is thrown away compile what it needs, up to the second frame with detections."""
-        with_detections = [i for i, step in enumerate(self._steps) if step.detections is not None]
-        last = with_detections[1] if len(with_detections) > 1 else WARM_UP_STEPS
+        """Let an estimator that is thrown away compile what it needs, until landmarks were seen again."""
+        named = [i for i, step in enumerate(self._steps) if step.detections is not None and _names(step.detections)]
+        last = named[min(len(named), WARM_UP_FRAMES) - 1] if named else WARM_UP_STEPS
         with contextlib.suppress(Exception):  # what fails here fails again below, where it is reported
             estimator = kind(self._sequence.calibration, self._params)
             for step in self._steps[: min(last, MAX_WARM_UP_STEPS) + 1]:
@@ -162,6 +164,11 @@ class _Replay:
     def _result(self, status: Any, reason: str = "", **outcome: Any) -> RunResult:
         params = self._params.model_dump(mode="json")
         return RunResult(self._name, params, status, reason, update_s=np.array(self._update_s), **outcome)
+
+
+def _names(detections: LandmarkDetections) -> bool:
+    """Whether any identity is more probable than all else: others are refused, and nothing is compiled for them."""
+    return bool(len(detections) and detections.most_probable()[1].max() > 0.5)
 
 
 def one_line(error: Exception) -> str:

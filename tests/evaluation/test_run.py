@@ -13,7 +13,7 @@ import sonar_graph.evaluation.run as run_module
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 from sonar_graph.evaluation.instants import map_instants
 from sonar_graph.evaluation.run import run_estimator
-from sonar_graph.measurements import Measurements
+from sonar_graph.measurements import LandmarkDetections, Measurements
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Estimate, LandmarkMap, Trajectory
 
@@ -317,3 +317,33 @@ def test_no_map_is_asked_for_before_the_first_estimate(
     result = run_estimator(make_sequence(), "late", rate_hz=2.0)
     assert (result.status, result.reason) == ("ok", "")
     assert len(result.maps) == 1
+
+
+def test_the_instance_that_warms_up_waits_for_landmarks_that_can_be_named(
+    install: Install, make_sequence: Make, offset_estimator: Any
+) -> None:
+    """Ten frames name nothing, then five name a landmark: it is still warming up when that is seen again."""
+    instances: list[list[int]] = []
+
+    class Recorder(offset_estimator):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            self.ends_ns: list[int] = []
+            instances.append(self.ends_ns)
+
+        def process(self, measurements: Measurements) -> Estimate | None:
+            self.ends_ns.append(measurements.end_ns)
+            return super().process(measurements)
+
+    install(recorder=Recorder)
+    sequence = make_sequence()
+    stamps_ns = sequence.imu.stamps_ns[5:155:10]
+    n = len(stamps_ns)
+    probable = np.where(np.arange(n) < 10, 0.2, 0.9)[:, None]
+    unsure = LandmarkDetections(
+        stamps_ns, np.ones(n), np.zeros(n), np.full((n, 2, 2), np.nan), np.full((n, 1), 7), probable
+    )
+    assert run_estimator(replace(sequence, detections=unsure), "recorder", rate_hz=2.0).status == "ok"
+    warmed_up, judged = instances
+    assert warmed_up[-1] >= stamps_ns[11]
+    assert len(warmed_up) < len(judged)
