@@ -40,9 +40,7 @@ class LabelledSightings:
     _track: list[tuple[int, int]] = field(default_factory=list)
     _error: list[tuple[float, float]] = field(default_factory=list)
 
-    def add(
-        self, sighting: Sighting, track: tuple[int, int], ids: Ints, range_m: Floats, azimuth_rad: Floats
-    ) -> None:
+    def add(self, sighting: Sighting, track: tuple[int, int], ids: Ints, range_m: Floats, azimuth_rad: Floats) -> None:
         """One sighting, the log and the track that it is of, and where every landmark truly is, shapes (m,)."""
         if sighting.fit is None:
             return

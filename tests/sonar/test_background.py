@@ -20,7 +20,7 @@ def medians(values: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("nodes", [20, 21])
 @pytest.mark.parametrize("shaded", [0.0, 0.4])
 def test_the_background_is_a_median_and_the_spread_the_median_of_what_is_left(nodes: int, shaded: float):
-    """A shadow 40 dB deep over less than half of the beams is farther down than bytes reach, -16 dB: it counts as below."""
+    """A shadow 40 dB deep over less than half of the beams is below what bytes reach, -16 dB."""
     rng = np.random.default_rng(nodes)
     level = rng.normal(40, 2, (nodes, 30)) + 0.3 * np.arange(30)
     level[: int(shaded * nodes)] -= 40

@@ -41,12 +41,14 @@ def test_a_heading_turns_from_x_to_y():
 
 
 @pytest.mark.parametrize("margin_m", [0.0, 0.05])
-def test_cells_are_those_of_a_disc_with_a_margin_around_the_largest_design(margin_m: float):
+def test_cells_are_those_of_a_disc_with_a_margin_around_the_largest_design_but_for_its_shadow(margin_m: float):
     templates = Templates.of(DEFAULT_DESIGNS, 0.01, margin_m, 0.01)
-    radius_m = max(map(material_radius_m, DEFAULT_DESIGNS)) + margin_m
+    material_m = max(map(material_radius_m, DEFAULT_DESIGNS))
+    radius_m = material_m + margin_m
     away_m = np.hypot(*places_m(templates).T)
     assert radius_m - 0.01 < away_m.max() <= radius_m
-    assert len(away_m) == pytest.approx(np.pi * radius_m**2 / 0.01**2, rel=0.03)
+    area_m2 = np.pi * (material_m**2 + 2 / 3 * (radius_m**2 - material_m**2))  # a third of the ring is behind
+    assert len(away_m) == pytest.approx(area_m2 / 0.01**2, rel=0.03)
 
 
 def test_material_ends_where_the_mask_ends():
@@ -59,3 +61,12 @@ def test_designs_that_look_alike_have_templates_each():
     disc = DEFAULT_DESIGNS[0]
     twin = LandmarkDesign(9, "twin", disc.size_m, disc.mask)
     assert np.bincount(Templates.of([disc, twin], 0.02, 0.0, 0.01).design).tolist() == [1, 1]
+
+
+def test_floor_behind_a_landmark_is_not_compared():
+    templates = Templates.of(DEFAULT_DESIGNS, 0.01, 0.05, 0.01)
+    x, y = places_m(templates).T
+    away_m = np.hypot(x, y)
+    material_m = max(map(material_radius_m, DEFAULT_DESIGNS))
+    assert away_m[x > 0.51 * away_m].max() <= material_m
+    assert away_m[x < 0.49 * away_m].max() > material_m + 0.03
