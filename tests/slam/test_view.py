@@ -183,7 +183,7 @@ def test_weighing_is_mahalanobis_of_the_wrapped_innovation(measured, expected, r
         np.array([[3.0 + range_off, measured]]), np.array([[3.0, expected]]), prior[None], noise[None]
     )
     assert innovation[0] == pytest.approx(range_off)
-    assert abs(innovation[1]) <= np.pi
+    assert abs(innovation[1]) <= np.pi + 1e-12
     assert np.exp(1j * (innovation[1] - (measured - expected))) == pytest.approx(1.0)
     assert np.array_equal(S, prior + noise)
     assert distance == pytest.approx(innovation @ np.linalg.solve(S, innovation), rel=1e-9, abs=1e-12)
