@@ -22,6 +22,7 @@ from sonar_graph.calibration import Section
 from sonar_graph.errors import CalibrationError
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.measurements import Floats, Ints
+from sonar_graph.sonar.identity import virtual_evidence
 from sonar_graph.sonar.scores import soft_scores
 
 LEAST_ENTRY = 1e-3
@@ -87,7 +88,7 @@ class LabelledFits:
 
 
 def estimate_confusion(fits: LabelledFits, ids: tuple[int, ...], provenance: dict[str, str]) -> Confusion:
-    """The model that makes the labelled frames most likely, all classes counting the same.
+    """The model with which one frame says as much as the labelled ones bear out, all classes counting the same.
 
     Raises
     ------
@@ -103,13 +104,11 @@ def estimate_confusion(fits: LabelledFits, ids: tuple[int, ...], provenance: dic
         )
     tracks = np.array([len(np.unique(fits.track[fits.label == k])) for k in range(len(counts))])
     sharpness, threshold = _fit_scores(fits, _targets(tracks)[fits.label] / (counts[fits.label] * len(counts))[:, None])
-    scores = soft_scores(fits.correlation, fits.visible, sharpness, threshold)
-    matrix = np.array([scores[fits.label == k].mean(axis=0) for k in range(len(counts))])
-    matrix = np.maximum(matrix, LEAST_ENTRY)
+    matrix = _mean_scores(soft_scores(fits.correlation, fits.visible, sharpness, threshold), fits.label)
     sigmas = np.sqrt(np.nanmean(fits.range_azimuth_error**2, axis=0))
     return Confusion(
         ids=ids,
-        matrix=tuple(map(tuple, (matrix / matrix.sum(axis=1, keepdims=True)).tolist())),
+        matrix=tuple(map(tuple, matrix.tolist())),
         sharpness=sharpness,
         threshold=threshold,
         range_sigma_m=float(sigmas[0]),
@@ -121,11 +120,11 @@ def estimate_confusion(fits: LabelledFits, ids: tuple[int, ...], provenance: dic
 
 
 def _targets(tracks: Ints) -> Floats:
-    """How certain the scores of each class may be after so many tracks of each, shape (classes, classes).
+    """How certain a frame of each class may be after so many tracks of each, shape (classes, classes).
 
     ``(n + 1) / (n + 2)`` for itself, the rest for the others: for classes that were never confused the most likely
-    scores would be certain, which n tracks do not show (Platt, "Probabilistic outputs for support vector machines",
-    1999, section 2.2). All landmarks share the numbers that are fitted, so that n counts the tracks of all of them.
+    numbers would make it certain, which n tracks do not show (Platt, "Probabilistic outputs for support vector
+    machines", 1999, section 2.2). All landmarks share what is fitted, so that n counts the tracks of all of them.
     """
     n = np.append(np.full(len(tracks) - 1, tracks[:-1].sum()), tracks[-1])
     targets = np.tile(1.0 / ((n + 2.0) * (len(n) - 1))[:, None], (1, len(n)))
@@ -133,13 +132,28 @@ def _targets(tracks: Ints) -> Floats:
     return targets
 
 
+def _mean_scores(scores: Floats, label: Ints) -> Floats:
+    """The confusion matrix, no entry below the least, rows with sum 1."""
+    matrix = np.array([scores[label == k].mean(axis=0) for k in range(scores.shape[1])])
+    matrix = np.maximum(matrix, LEAST_ENTRY)
+    return np.asarray(matrix / matrix.sum(axis=1, keepdims=True))
+
+
 def _fit_scores(fits: LabelledFits, targets: Floats) -> tuple[float, float]:
-    """Sharpness and threshold of the scores that come nearest to weighted targets, shape (n, classes)."""
+    """Sharpness and threshold with which one frame's posterior comes nearest to weighted targets, shape (n, classes).
+
+    It is the posterior that counts, after the confusion matrix and from equal priors: doubt that were in the scores
+    already would count twice.
+    """
+    classes = targets.shape[1]
+    equal, news = np.full((len(targets), classes), 1.0 / classes), np.ones(len(targets))
 
     def loss(unbounded: Floats) -> float:
         sharpness, threshold = float(np.exp(unbounded[0])), float(1 / (1 + np.exp(-unbounded[1])))
         scores = soft_scores(fits.correlation, fits.visible, sharpness, threshold)
-        return float(-np.sum(targets * np.log(np.maximum(scores, 1e-12))))
+        matrix = _mean_scores(scores, fits.label)
+        posterior = virtual_evidence(equal, scores, matrix, matrix.mean(axis=0), news)
+        return float(-np.sum(targets * np.log(np.maximum(posterior, 1e-12))))
 
     found = minimize(loss, np.array([np.log(10.0), 1.0]), method="Nelder-Mead")
     return float(np.exp(found.x[0])), float(1 / (1 + np.exp(-found.x[1])))

@@ -9,6 +9,7 @@ import pytest
 from sonar_graph.errors import CalibrationError
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.sonar.confusion import Confusion, LabelledFits, confusion_for, estimate_confusion, read_confusion
+from sonar_graph.sonar.identity import virtual_evidence
 from sonar_graph.sonar.scores import soft_scores
 
 
@@ -62,17 +63,16 @@ def test_matrix_is_the_mean_score_of_each_class():
     assert model.range_sigma_m == pytest.approx(0.01, rel=0.2)
 
 
-def test_classes_that_never_were_confused_are_as_certain_as_their_tracks_allow():
+@pytest.mark.parametrize("tracks", [5, 100])
+def test_a_frame_of_classes_that_never_were_confused_is_as_certain_as_their_tracks_allow(tracks: int):
     fits = _fits(200, 0.01)
-    few, many = (
-        estimate_confusion(replace(fits, track=np.arange(600) % tracks + 1000 * fits.label), (1, 2), {})
-        for tracks in (5, 100)
-    )
-    for model, tracks in ((few, 5), (many, 100)):
-        scores = soft_scores(fits.correlation, fits.visible, model.sharpness, model.threshold)
-        known = scores[fits.label < 2].max(axis=1).mean()
-        assert known == pytest.approx((2 * tracks + 1) / (2 * tracks + 2), abs=0.03)
-        assert model.provenance["tracks of landmark 2"] == str(tracks)
+    model = estimate_confusion(replace(fits, track=np.arange(600) % tracks + 1000 * fits.label), (1, 2), {})
+    scores = soft_scores(fits.correlation, fits.visible, model.sharpness, model.threshold)
+    posterior = virtual_evidence(np.full((600, 3), 1 / 3), scores, model.array(), model.base(), np.ones(600))
+    right = posterior[np.arange(600), fits.label]
+    assert right[fits.label < 2].mean() == pytest.approx((2 * tracks + 1) / (2 * tracks + 2), abs=0.02)
+    assert right[fits.label == 2].mean() == pytest.approx((tracks + 1) / (tracks + 2), abs=0.02)
+    assert model.provenance["tracks of landmark 2"] == str(tracks)
 
 
 def test_a_class_with_too_few_frames_is_named():
@@ -147,15 +147,3 @@ def test_a_class_that_was_seen_more_often_counts_no_more():
         pytest.approx(one.threshold, abs=0.002),
     )
     np.testing.assert_allclose(other.matrix, one.matrix, atol=2e-3)
-
-
-def test_certainty_is_what_so_many_tracks_allow():
-    """Nothing is confused here, so that the scores become as certain as their targets, (n + 1) / (n + 2)."""
-    certain = {}
-    for tracks in (4, 100):
-        fits = _fits(100, 0.0)
-        fits = replace(fits, track=fits.label * tracks + np.arange(len(fits.label)) % tracks)
-        model = estimate_confusion(fits, (1, 2), {})
-        certain[tracks] = np.diag(model.matrix).mean()
-    assert certain[4] == pytest.approx(5 / 6, abs=0.04)
-    assert certain[100] == pytest.approx(101 / 102, abs=0.02)
