@@ -96,9 +96,8 @@ class Look:
             return unfitted
         if fit.correlation.max() < self._confusion.threshold:
             return Sighting(fit, range_m, azimuth_rad, unfitted.covariance)
-        model = self._confusion
-        sigmas = np.array([model.range_sigma_m, model.azimuth_sigma_rad]) / fit.visible
-        return Sighting(fit, *view.range_azimuth(fit.centre_m), np.diag(sigmas**2), is_fitted=True)
+        covariance = self._confusion.range_azimuth_cov(fit.visible)
+        return Sighting(fit, *view.range_azimuth(fit.centre_m), covariance, is_fitted=True)
 
 
 def _is_same(one: Floats, other: Floats) -> bool:

@@ -136,6 +136,16 @@ def test_accuracy_is_that_of_range_and_of_azimuth():
     assert model.azimuth_sigma_rad == pytest.approx(0.002, rel=0.15)
 
 
+def test_sigmas_are_those_of_a_landmark_that_is_wholly_in_view():
+    fits = _fits(300, 0.1)
+    cut = replace(fits, visible=np.full(900, 0.7), range_azimuth_error=fits.range_azimuth_error / 0.7**2)
+    model = estimate_confusion(cut, (1, 2), {})
+    assert model.range_sigma_m == pytest.approx(0.01, rel=0.15)
+    np.testing.assert_allclose(
+        np.diag(model.range_azimuth_cov(0.7)), np.nanmean(cut.range_azimuth_error**2, axis=0), rtol=1e-9
+    )
+
+
 def test_a_class_that_was_seen_more_often_counts_no_more():
     """Every frame of the first class five times over, on the same tracks."""
     fits = _fits(60, 0.1)

@@ -58,7 +58,7 @@ def test_range_and_azimuth_are_those_of_the_designs_centre_and_not_of_the_candid
     assert found.fit.best == TRIANGLE
     r, a = VIEW.range_azimuth(np.array([1.7, 0.05]))
     assert (found.range_m, found.azimuth_rad) == (pytest.approx(r, abs=0.006), pytest.approx(a, abs=0.004))
-    np.testing.assert_allclose(found.covariance, np.diag([0.01**2, 0.004**2]) / found.fit.visible**2)
+    np.testing.assert_allclose(found.covariance, np.diag([0.01**2, 0.004**2]) / found.fit.visible**4)
 
 
 def test_what_is_partly_in_view_is_less_certain(appearance):
@@ -67,7 +67,7 @@ def test_what_is_partly_in_view_is_less_certain(appearance):
     assert found.is_fitted
     assert found.fit is not None
     assert 0.8 <= found.fit.visible < 0.97
-    np.testing.assert_allclose(found.covariance, np.diag([0.01**2, 0.004**2]) / found.fit.visible**2)
+    np.testing.assert_allclose(found.covariance, np.diag([0.01**2, 0.004**2]) / found.fit.visible**4)
 
 
 def test_what_no_design_fits_stays_where_its_centroid_is(appearance, triangle):
