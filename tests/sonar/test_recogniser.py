@@ -191,7 +191,8 @@ def test_turning_on_the_spot_is_no_news_and_moving_across_is():
     turning = _belief_after([turned] * 3, spots)
     once = _belief_after([], spots[:1])
     across = _belief_after([aside(0.05)] * 3, [(1.7, round(-0.05 * k, 6)) for k in range(4)])
-    assert once - 0.1 < turning <= once < across - 0.05
+    assert once - 0.1 < turning <= once
+    assert 1 - across < 0.1 * (1 - once)
 
 
 def test_what_is_across_turns_with_the_sonar():
