@@ -180,6 +180,23 @@ def correlated_sighting(
     return gtsam.CustomFactor(robust(gtsam.noiseModel.Gaussian.Covariance(cov)), [pose_key, landmark_key], error)
 
 
+def first_direction(pose_key: int, landmark_key: int, body_p_landmark: Floats) -> gtsam.NonlinearFactor:
+    """A landmark is somewhere about where it was first seen: direction to a radian, range to its whole length.
+
+    Beside a sonar's noise that says nothing. But the azimuth factor is blind to what lies behind it, and where a wrong
+    identity contradicts a right one a solution may lie behind both: without this factor nothing but two ranges would
+    then hold the landmark, and the system would have no solution.
+
+    Parameters
+    ----------
+    body_p_landmark
+        In the keyframe's body frame, shape (3,), m.
+    """
+    range_m = float(np.linalg.norm(body_p_landmark))
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([1.0, 1.0, range_m]))
+    return gtsam.BearingRangeFactor3D(pose_key, landmark_key, gtsam.Unit3(body_p_landmark), range_m, noise)
+
+
 def floor_prior(landmark_key: int, z_m: float, sigma_m: float) -> gtsam.NonlinearFactor:
     """Landmark z is N(z_m, sigma_m²); x and y are left to the other factors."""
     sigmas = np.array([UNINFORMATIVE_M, UNINFORMATIVE_M, sigma_m])

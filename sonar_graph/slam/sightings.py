@@ -142,6 +142,8 @@ class Sightings:
         point = locate(view.world_T_sonar, range_m, azimuth_rad, elevation)
         self.smoother.add_landmark(key, point)
         self._add_factors(view, tie, seen, point[None], None if floor else self._elevation_sigma_rad)
+        on_beam = locate(tie.keyframe_T_sonar, range_m, azimuth_rad, elevation)
+        self.smoother.add([factors.first_direction(tie.pose_key, key, on_beam)])
         if floor:
             self.smoother.add([factors.floor_prior(key, floor.z_m, floor.sigma_m)])
 

@@ -310,6 +310,35 @@ def test_the_plane_holds_height_roll_and_pitch_and_leaves_the_rest():
         assert_jacobians(factor, values_of(X0=BODY_POSES["random"]))
 
 
+BLIND_POSES = (gtsam.Pose3(), gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 20.0, 0.0])))
+"""Two sonars that look along x; the azimuth factors of neither have a slope at a landmark behind them."""
+
+
+@pytest.mark.parametrize("is_held", [False, True])
+def test_only_its_first_direction_holds_a_landmark_behind_every_sonar_that_saw_it(is_held):
+    values = values_of(X0=BLIND_POSES[0], X1=BLIND_POSES[1], L0=np.array([-10.0, 9.0, 0.5]))
+    graph: list[gtsam.NonlinearFactor] = []
+    for k, pose in enumerate(BLIND_POSES):
+        z = np.array([np.linalg.norm(pose.transformTo(values.atPoint3(L(0)))), 0.1])
+        graph += factors.landmark_sighting(X(k), L(0), gtsam.Pose3(), z, np.diag([4e-4, 8e-5]), plain, 0.07)
+    if is_held:
+        graph.append(factors.first_direction(X(0), L(0), np.array([12.0, 1.0, 0.0])))
+    held = np.linalg.eigvalsh(information(graph, values, [X(0), X(1), L(0)])[12:, 12:])
+    assert (held[0] > 1e-3) == is_held
+
+
+def test_the_first_direction_says_next_to_nothing_beside_a_sighting():
+    pose, z = BODY_POSES["random"], np.array([3.0, 0.2])
+    point = seen_from(pose, 0.2, 0.0, 3.0)
+    values = values_of(X0=pose, L0=point)
+    sighting = factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, np.diag([4e-4, 8e-5]), plain, 0.07)
+    first = factors.first_direction(X(0), L(0), pose.transformTo(point))
+    assert first.error(values) == pytest.approx(0.0, abs=1e-12)
+    assert_jacobians(first, values)
+    without, including = (information([*sighting, *more], values, [X(0), L(0)])[6:, 6:] for more in ([], [first]))
+    assert np.linalg.eigvalsh(np.linalg.solve(without, including)).max() < 1.01
+
+
 def test_the_floor_holds_the_height_of_a_landmark_alone():
     factor = factors.floor_prior(L(0), -1.7, 0.01)
     values = values_of(L0=np.array([40.0, -30.0, -1.68]))
