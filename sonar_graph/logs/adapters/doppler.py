@@ -16,13 +16,14 @@ from sonar_graph.logs.table import NOT_FINITE, Dropped, Table, fit_rows, not_fin
 from sonar_graph.measurements import Dvl, Floats
 
 Number = bool | int | float
+SAID_INVALID = "with a covariance that says invalid"
 
 
 class DvlAdapter(Adapter):
     """Velocity over the bottom in the instrument's frame."""
 
     velocity: tuple[str, str, str] | None = None
-    """Fields of the velocity along x, y, z; none where it is computed from `beams`."""
+    """Fields of the velocity along x, y, z; not used where `beams` have a velocity."""
     scale: float = 1.0
     """Turns it into m/s; 0.001 from mm/s, -1 where the driver gives the bottom's velocity."""
     covariance: CovarianceFields | None = None
@@ -34,7 +35,8 @@ class DvlAdapter(Adapter):
     beams: BeamGeometry | None = None
     """Where the beams point."""
     beam_unit_vectors: tuple[str, str, str] | None = None
-    """Array fields with x, y, z of each beam's direction: only checked, because drivers get them wrong."""
+    """Array fields with x, y, z of each beam's direction: only checked, because drivers get them wrong. Velocities come
+    from the directions of `beams`."""
     beam_ranges: str | None = None
     """Array field with a range for each beam: only checked."""
     beam_ranges_valid: str | None = None
@@ -59,16 +61,15 @@ class DvlAdapter(Adapter):
             yield from filter(None, (self.beams.velocity, self.beams.valid))
 
     def read(self, table: Table) -> tuple[Dvl | None, Dropped]:
-        """The rows with a valid velocity; a covariance that is not known is NaN."""
-        velocity = self._velocities(table)
-        covariance, invalid = self._covariances(table)
-        faults = {
+        """The rows with a valid velocity, or with part of one from beams; a covariance that is not known is NaN."""
+        velocity, covariance, faults = self._by_beams(table) if self._is_by_beams else self._by_velocity(table)
+        faults |= {
             f"with {path} not {_toml(value)}": table.column(path) != value for path, value in self.valid_where.items()
         }
         if self.good_beams is not None:
             beams = table.column(self.good_beams)
             faults["without a good beam"] = (beams == 0) & beams.any()
-        faults |= {"with a covariance that says invalid": invalid, NOT_FINITE: not_finite(velocity)}
+        faults[NOT_FINITE] = not_finite(velocity)
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
         velocity, covariance = (
             turn(self.rotation, velocity[rows]),
@@ -80,8 +81,9 @@ class DvlAdapter(Adapter):
         """What in the messages contradicts itself, although it can be read."""
         if self.beam_unit_vectors is not None:
             vectors = np.stack([table.column(path)[0] for path in self.beam_unit_vectors], axis=-1)
-            fault = unit_vector_warning(vectors, self.beams.tilt_deg if self.beams else None)
-            yield from [fault] if fault else []
+            fault = unit_vector_warning(vectors, self.beams)
+            if fault:
+                yield f"topic {table.topic.name}: {self.beam_unit_vectors[0].rpartition('.')[0]}: {fault}"
         if self.sound_speed is not None and not table.column(self.sound_speed).any():
             yield f"{self.sound_speed} is 0 in every message: the driver does not fill it"
         if self.beam_ranges is not None and self.beam_ranges_valid is not None:
@@ -90,13 +92,26 @@ class DvlAdapter(Adapter):
             if wrong.any():
                 yield f"{self.beam_ranges_valid} is true in {wrong.sum()} messages that have a range of 0 or less"
 
-    def _velocities(self, table: Table) -> Floats:
-        if self.velocity is not None:
-            velocity = table.beside(self.velocity)
-        else:
-            assert self.beams is not None  # by the validator
-            velocity = self.beams.velocities(table)
-        return velocity if self.scale == 1 else velocity * self.scale
+    @property
+    def _is_by_beams(self) -> bool:
+        return self.beams is not None and self.beams.velocity is not None
+
+    def _by_velocity(self, table: Table) -> tuple[Floats, Floats, dict[str, NDArray[np.bool_]]]:
+        """The driver's own velocity and covariance, and rows with a fault."""
+        assert self.velocity is not None  # by the validator
+        velocity = table.beside(self.velocity)
+        covariance, invalid = self._covariances(table)
+        return velocity if self.scale == 1 else velocity * self.scale, covariance, {SAID_INVALID: invalid}
+
+    def _by_beams(self, table: Table) -> tuple[Floats, Floats, dict[str, NDArray[np.bool_]]]:
+        """The same from single beams; what a driver says of their sum holds where nothing is said of them."""
+        assert self.beams is not None
+        velocity, covariance, count = self.beams.velocities(table, self.scale)
+        fewest = self.beams.fewest
+        faults = {"without a valid beam" if fewest == 1 else f"with fewer than {fewest} valid beams": count < fewest}
+        if self.beams.sigma_m_s is None:
+            covariance, faults[SAID_INVALID] = self._covariances(table)
+        return velocity, covariance, faults
 
     def _covariances(self, table: Table) -> tuple[Floats, NDArray[np.bool_]]:
         if self.covariance is None:

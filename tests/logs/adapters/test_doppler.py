@@ -224,6 +224,40 @@ def test_two_beams_are_no_velocity(foreign: Any, read: Any) -> None:
     assert len(read(foreign.imu(), packets(rows), toml=TABLE + geometry).dvl) == 1
 
 
+GEOMETRY = "tilt_deg = 30, azimuth_deg = [45, -45, -135, 135]"
+
+
+def test_beams_of_known_noise_count_even_alone(foreign: Any, read: Any) -> None:
+    """What one or two beams measured is measured, and nothing else is claimed."""
+    directions = janus(30, [45, -45, -135, 135])
+    rows = np.tile(directions @ VELOCITY, (5, 1))
+    kept = [[0, 1, 2, 3], [0, 1, 3], [1, 2], [3], []]
+    for row, beams in zip(rows, kept, strict=True):
+        row[np.setdiff1d(range(4), beams)] = np.nan
+    toml = TABLE + f'beams = {{velocity = "velocity", sigma_m_s = 0.02, {GEOMETRY}}}\nscale = 0.5\nstamp = "log"'
+    sequence = read(foreign.imu(), packets((2 * rows).tolist()), toml=toml)
+    assert sequence.notes["log.dropped"] == "dvl: 1 without a valid beam"
+    np.testing.assert_allclose(sequence.dvl.velocity[:2], [VELOCITY] * 2, atol=1e-12)
+    for beams, velocity, cov in zip(kept[:4], sequence.dvl.velocity, sequence.dvl.velocity_cov, strict=True):
+        along = directions[beams]
+        np.testing.assert_allclose(along @ velocity, along @ VELOCITY, atol=1e-12)
+        information = along.T @ along / 0.02**2
+        np.testing.assert_allclose(np.linalg.inv(cov), information, atol=2e-4, rtol=1e-5)
+
+
+def test_beams_go_before_the_velocity_that_a_driver_makes_of_them(foreign: Any, read: Any) -> None:
+    rows = [{"velocity": foreign.vector(9, 9, 9), "beams": [beam(i) for i in range(4)]} for _ in range(3)]
+    expected = np.linalg.pinv(janus(22.5, [45, -45, -135, 135])) @ [0.0, 0.1, 0.2, 0.3]
+    said = '[dvl.beams]\nvelocity = "beams.velocity"\nvalid = "beams.valid"\nsigma_m_s = 0.01\n'
+    toml = said + "tilt_deg = 22.5\nazimuth_deg = [45, -45, -135, 135]"
+    entry = ("/dvl/data", "dvl_msgs/msg/DVL", water_linked(foreign, rows))
+    np.testing.assert_allclose(read(foreign.imu(), entry, toml=toml).dvl.velocity, [expected] * 3, atol=1e-9)
+    rows[1]["beams"][2]["valid"] = rows[1]["beams"][3]["valid"] = False
+    entry = ("/dvl/data", "dvl_msgs/msg/DVL", water_linked(foreign, rows))
+    variances = np.trace(read(foreign.imu(), entry, toml=toml).dvl.velocity_cov, axis1=1, axis2=2)
+    assert (variances > 1).tolist() == [False, True, False]
+
+
 SINE, COSINE = float(np.sin(np.radians(22.5))), float(np.cos(np.radians(22.5)))
 
 
@@ -239,6 +273,7 @@ def unit_vectors(foreign: Any, across: float, down: float) -> dict[str, Any]:
         (SINE / 2**0.5, COSINE, 30, "tilted by 22.5°, the configured beams by 30°"),
         (SINE / 2**0.5, COSINE, 22.5, None),
         (0.6533, 0.8, None, "no unit vectors"),
+        (SINE / 2**0.5, SINE, None, "z = 0.383, the sine of the tilt of 22.5°, where its cosine 0.924 should be"),
     ],
 )
 def test_beam_directions_are_doubted_and_never_used(
@@ -250,6 +285,22 @@ def test_beam_directions_are_doubted_and_never_used(
     assert (warned is None) == ("log.warnings" not in sequence.notes)
     assert warned is None or warned in sequence.notes["log.warnings"]
     np.testing.assert_array_equal(np.abs(sequence.dvl.velocity), [VELOCITY] * 5)
+
+
+@pytest.mark.parametrize(("azimuth_deg", "warned"), [("[45, -45, 135, -135]", True), ("[-135, 135, -45, 45]", False)])
+def test_published_directions_that_are_not_the_configured_ones_are_named_with_topic_and_field(
+    foreign: Any, read: Any, azimuth_deg: str, warned: bool
+) -> None:
+    toml = f"""[dvl]
+rotation = "frd"
+beams = {{velocity = "beam_velocity", tilt_deg = 22.5, azimuth_deg = {azimuth_deg}, sigma_m_s = 0.01}}"""
+    along = (janus(22.5, [-135, 135, -45, 45]) @ VELOCITY).tolist()
+    entry = foreign.dvl(sound_speed=1480.0, beam_velocity=along, **unit_vectors(foreign, SINE / 2**0.5, COSINE))
+    sequence = read(foreign.imu(), entry, toml=toml)
+    said = sequence.notes.get("log.warnings", "")
+    assert ("beam_unit_vec: beam directions and the configured ones differ by up to" in said) == warned
+    assert (f"topic {entry[0]}: " in said) == warned
+    assert np.allclose(sequence.dvl.velocity, np.array(VELOCITY) * [1, -1, -1], atol=1e-6) != warned
 
 
 def test_fields_that_a_driver_leaves_alone_are_mentioned(foreign: Any, read: Any) -> None:
