@@ -18,8 +18,10 @@ from sonar_graph.sonar.recogniser import RecogniserParams
 
 WHOLE = 0.9
 """Share of an object that must be in view for it to be in view."""
-GAP_S = 2.0
-"""An object that is out of view for less is still being passed."""
+GAP_S = 15.0
+"""An object that is out of view for less is still being passed: a vehicle that hovers sways."""
+MARGIN_S = 1.0
+"""Before and after it is wholly in view, detections count too."""
 LEAST_FRAMES = 5
 """In view, for a pass to count: one second."""
 SAME_M, APART_M = 0.15, 0.40
@@ -58,8 +60,8 @@ class Passes:
     frames: np.ndarray
 
     def during(self, row: int, stamp_s: np.ndarray) -> np.ndarray:
-        """Which instants are of a pass; up to half the gap before and after it counts too."""
-        return (stamp_s >= self.begin_s[row] - GAP_S / 2) & (stamp_s <= self.end_s[row] + GAP_S / 2)
+        """Which instants are of a pass."""
+        return (stamp_s >= self.begin_s[row] - MARGIN_S) & (stamp_s <= self.end_s[row] + MARGIN_S)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from sonar_graph.errors import CalibrationError
-from sonar_graph.evaluation.recognising import RecognitionSession, one_by_one
+from sonar_graph.evaluation.recognising import RecognitionSession, one_by_one, without_leaps
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.logs.adapters.config import LogConfig
 from sonar_graph.logs.sonar_reading import read_sonar_frames
@@ -121,10 +121,12 @@ def calibrate(
             raise CalibrationError(f"{path}: without true trajectory and true landmarks nothing in it can be labelled")
         recogniser = Recogniser(run.calibration, designs)
         session = RecognitionSession(run, recogniser=recogniser, pictures=False)
-        for block in read_sonar_frames(path, topic, config):
-            for frame in one_by_one(block):
-                session.take(frame)
-                _gather(gathered, log, recogniser, run, int(frame.stamps_ns[0]))
+        frames = (frame for block in read_sonar_frames(path, topic, config) for frame in one_by_one(block))
+        for frame in without_leaps(frames, session.refuse):
+            stamp_ns = int(frame.stamps_ns[0])
+            session.take(frame)
+            if recogniser.stamp_ns == stamp_ns:
+                _gather(gathered, log, recogniser, run, stamp_ns)
     names = ", ".join(path.name for path, _ in logs)
     kinds = "; ".join(dict.fromkeys(run.notes.get("ours", "recorded") for _, run in logs))
     return estimate_confusion(gathered.fits(), gathered.ids, {"logs": names, "what they are": kinds})

@@ -19,7 +19,7 @@ class Association:
     """Track numbers after the frame, shape (M,). Numbers are never used twice."""
     matrix: Floats
     """Probability that track m now was track j before, shape (M, M' + 1); the last column is "new track". Rows sum
-    to 1. A track without a candidate in this frame is itself, with certainty."""
+    to 1. A track without a candidate in this frame is itself, with certainty; only a track that starts can be new."""
     candidate: Ints
     """Row in `Candidates` that each track took, shape (M,); -1: it was not seen in this frame."""
     existence: Floats

@@ -28,7 +28,7 @@ class IdentityParams(Section):
     unknown_prior: float = Field(0.5, gt=0, lt=1)
     """Belief in "none of them" about a new track."""
     forgetting: float = Field(1e-4, ge=0, lt=1)
-    """Share of a belief that returns to that of a new track, a frame."""
+    """Share of a belief that returns to that of a new track, a frame that is all news."""
     temper: float = Field(1.0, gt=0, le=1)
     """Weight of a frame that is all news; below 1 where a landmark's looks are less certain than was measured."""
     least_news: float = Field(0.1, ge=0, lt=1)
@@ -83,13 +83,14 @@ class Beliefs:
             Beliefs after the frame, shape (M, classes).
         """
         rows = [self._order.index(track) for track in association.previous_ids.tolist()]
-        predicted = predict(self._beliefs[rows], association.matrix, self._birth, self.params.forgetting)
         weights = np.array(
             [
                 self._weight(track, place, direction)
                 for track, place, direction in zip(association.track_ids.tolist(), places, sideways, strict=True)
             ]
         )
+        forgetting = self.params.forgetting * weights[:, None]
+        predicted = predict(self._beliefs[rows], association.matrix, self._birth, forgetting)
         scores = np.where(weights[:, None] > 0, scores, 0.0)
         self._beliefs = update(self.params.rule, predicted, scores, self._matrix, self._base, weights)
         self._order = association.track_ids.tolist()

@@ -36,7 +36,7 @@ LEAST_PROBABILITY = 1e-12
 """Beliefs never reach 0, from which no evidence leads back."""
 
 
-def predict(beliefs: Floats, association: Floats, birth: Floats, forgetting: float = 1e-3) -> Floats:
+def predict(beliefs: Floats, association: Floats, birth: Floats, forgetting: Floats | float = 1e-3) -> Floats:
     """Equation (1): beliefs of the tracks now, before the frame is looked at.
 
     Parameters
@@ -49,7 +49,7 @@ def predict(beliefs: Floats, association: Floats, birth: Floats, forgetting: flo
     birth
         Belief about a new track, shape (K,).
     forgetting
-        ``e``: identities do not change, but a belief must be able to.
+        ``e``: identities do not change, but a belief must be able to. One number, or one a track, shape (M, 1).
 
     Returns
     -------

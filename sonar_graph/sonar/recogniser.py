@@ -110,6 +110,8 @@ class Recogniser:
         self._start_T_sonar = gtsam.Pose3()
         self.fates: list[Fate] = []
         """What became of everything in the frame last processed."""
+        self.stamp_ns: int | None = None
+        """Of the frame last processed."""
         self.sightings: list[Sighting | None] = []
         """How the designs fitted each track of that frame; None where it had no candidate."""
         self.track_ids: Ints = np.empty(0, dtype=np.int64)
@@ -135,7 +137,7 @@ class Recogniser:
             One row a track that is seen now and trusted, with the posterior over all landmarks. None where there is
             none, and for a frame that must not be used; `fates` says why.
         """
-        stamp_ns = int(frame.stamps_ns[0])
+        self.stamp_ns = stamp_ns = int(frame.stamps_ns[0])
         self.sightings, self.track_ids = [], np.empty(0, dtype=np.int64)
         if motion is not None:
             self._start_T_sonar = self._start_T_sonar.compose(motion.previous_T_sonar)

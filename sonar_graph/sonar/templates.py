@@ -55,7 +55,8 @@ class Templates:
         material_m = max(map(material_radius_m, designs))
         half = math.ceil((material_m + margin_m) / cell_m)
         places_m = cell_m * np.arange(-half, half + 1)
-        cells = np.flatnonzero(_compared(*np.meshgrid(places_m, places_m, indexing="ij"), material_m, margin_m))
+        x_m, y_m = np.meshgrid(places_m, places_m, indexing="ij")
+        cells = np.flatnonzero(_compared(x_m, y_m, material_m, margin_m))
         pictures: list[Floats32] = []
         of: list[int] = []
         headings: list[float] = []

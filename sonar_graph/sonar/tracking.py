@@ -185,6 +185,9 @@ class Tracker:
         itself = np.eye(len(previous_ids), len(previous_ids) + 1)[stay]
         own = np.vstack([itself, np.zeros((len(new), len(previous_ids) + 1))])
         own[rows >= 0] = matrix[rows[rows >= 0]]
+        old = np.arange(len(stay))
+        own[old, stay] += own[old, -1]  # where its candidate is of something new, a track was not seen and is itself
+        own[old, -1] = 0.0
         tracks = after.rows(stay)
         if len(new):
             tracks = tracks.and_(self._born(candidates, candidates.accepted[new]))

@@ -121,9 +121,11 @@ def test_places_beyond_the_limit_are_forgotten():
     assert remembered[2] <= remembered[1]
 
 
-def test_a_belief_fades_by_the_share_that_is_set():
-    found = _after("virtual-evidence", [(0, 0, 0), None], forgetting=0.5)
-    assert found[1] == pytest.approx(0.5 * found[0] + 0.5 * 0.25)
+def test_a_belief_fades_by_the_share_that_is_set_and_only_when_looked_at():
+    kept, faded = (_after("virtual-evidence", [(0, 0, 0), None, (0, 1, 0)], forgetting=e) for e in (0.0, 1 - 1e-12))
+    assert kept[1] == faded[1] == pytest.approx(kept[0])
+    assert kept[2] > kept[0]
+    assert faded[2] == pytest.approx(kept[0])  # as if it were the first look
 
 
 @pytest.mark.parametrize("rule", ["virtual-evidence", "jeffrey"])

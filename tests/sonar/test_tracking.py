@@ -61,6 +61,19 @@ def test_the_order_of_candidates_does_not_matter(counts, seed):
 
 
 def test_association_is_the_ratio_of_densities_by_hand():
+    """Two tracks side by side, each seen again where it was; what may be of something new leaves a track itself."""
+    params = TrackingParams(drift_m=0.0, lifetime_s=1e12)
+    tracker = Tracker(params)
+    run(tracker, [[(2.0, 0.0), (2.0, 0.03)]])
+    found = tracker.step(candidates_at([2.0, 2.0], [0.0, 0.03]), STILL, 2 * FRAME_NS)
+    var_r, var_a = 2 * params.range_sigma_m**2, 2 * params.azimuth_sigma_rad**2
+    own = 0.1 / 0.6 * 0.9 / (2 * np.pi * np.sqrt(var_r * var_a))
+    other, none = own * np.exp(-0.5 * 0.03**2 / var_a), 0.6 / AREA
+    expected = np.array([[own + none, other, 0.0], [other, own + none, 0.0]]) / (own + other + none)
+    assert found.matrix == pytest.approx(expected, rel=1e-6)
+
+
+def test_existence_is_the_ratio_of_densities_by_hand():
     """One track, one candidate 2 cm behind it."""
     params = TrackingParams(drift_m=0.0, lifetime_s=1e12)
     tracker = Tracker(params)
@@ -70,8 +83,6 @@ def test_association_is_the_ratio_of_densities_by_hand():
     var_r, var_a = 2 * params.range_sigma_m**2, 2 * params.azimuth_sigma_rad**2
     density = np.exp(-0.5 * 0.02**2 / var_r) / (2 * np.pi * np.sqrt(var_r * var_a))
     birth = 0.1 / 0.6
-    from_track, from_none = birth * 0.9 * density, 0.6 / AREA
-    assert found.matrix == pytest.approx(np.array([[from_track, from_none]]) / (from_track + from_none), rel=1e-6)
     likelihood = 0.1 + 0.9 * density * AREA / 0.5
     assert found.existence[0] == pytest.approx(birth * likelihood / (1 - birth + birth * likelihood), rel=1e-6)
     # Halfway between two equally certain places.
