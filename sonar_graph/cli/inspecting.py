@@ -8,14 +8,21 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from sonar_graph.cli.arguments import EndTime, LogConfigPath, LogPath, StartTime, TopicChoices
-from sonar_graph.cli.settings import read_config, topic_choices, window_of
+from sonar_graph.cli.arguments import CalibrationPath, EndTime, LogConfigPath, LogPath, StartTime, TopicChoices
+from sonar_graph.cli.progress import working
+from sonar_graph.cli.settings import read_calibration, read_config, topic_choices, window_of
 from sonar_graph.cli.texts import answers
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rich.console import Console
 
+    from sonar_graph.evaluation.sensor_check import Finding
+    from sonar_graph.logs.adapters.config import LogConfig
+    from sonar_graph.logs.calibration_sources import PartialCalibration
     from sonar_graph.logs.inspection import LogSummary, TopicSummary
+    from sonar_graph.logs.window import Window
 
 
 def inspect(
@@ -24,21 +31,71 @@ def inspect(
     log_config: LogConfigPath = None,
     start: StartTime = None,
     end: EndTime = None,
+    calibration: CalibrationPath = None,
     toml: Annotated[
         bool, typer.Option("--toml", help="Print only the log configuration to start from, for --log-config.")
     ] = False,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick", help="Do not compare sensors with each other (time offsets, DVL yaw and scale, noise): seconds."
+        ),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print everything as one JSON object.")] = False,
 ) -> None:
-    """Say what is in a log: topics, rates, gaps, and which topic would be used for what and why."""
+    """Say what is in a log: topics, rates, gaps, which topic would be used for what and why, what sensors disagree."""
     from sonar_graph.logs.inspection import inspect_log
 
-    summary = inspect_log(log, read_config(log_config), topic_choices(topics or []), window_of(start, end))
+    config, chosen, window = read_config(log_config), topic_choices(topics or []), window_of(start, end)
+    given = read_calibration(calibration)
+    summary = inspect_log(log, config, chosen, window)
     if toml:
         typer.echo(summary.toml, nl=False)
+        return
+    findings: list[Finding] = []
+    skipped = "not compared: --quick"
+    if not quick:
+        findings, skipped = _compare_sensors(summary, log, config, chosen, window, given)
+    if as_json:
+        typer.echo(_as_json(summary, findings, skipped))
     else:
-        _print_summary(answers(), summary)
+        _print_summary(answers(), summary, findings, skipped)
 
 
-def _print_summary(console: Console, summary: LogSummary) -> None:
+def _compare_sensors(
+    summary: LogSummary,
+    log: Path,
+    config: LogConfig | None,
+    topics: dict[str, str],
+    window: Window,
+    calibration: PartialCalibration | None,
+) -> tuple[list[Finding], str]:
+    """What sensors say about each other, or why they were not asked."""
+    from sonar_graph.errors import SonarGraphError
+    from sonar_graph.evaluation.sensor_check import check_sensors
+    from sonar_graph.logs.reading import read_sequence
+
+    if summary.obstacles:
+        return [], f"not compared: {', '.join(summary.obstacles)}"
+    try:
+        with working("comparing sensors"):
+            sequence = read_sequence(log, calibration=calibration, config=config, topics=topics, window=window)
+            return check_sensors(sequence, config), ""
+    except SonarGraphError as error:
+        return [], f"not compared: {error}"
+
+
+def _as_json(summary: LogSummary, findings: list[Finding], skipped: str) -> str:
+    from dataclasses import asdict
+
+    from sonar_graph.evaluation.strict_json import strict_json
+
+    content = asdict(summary) | {"path": str(summary.path), "duration_s": summary.duration_s}
+    found = {"sensors": [finding.plain() for finding in findings], "sensors_skipped": skipped}
+    return strict_json(content | {"obstacles": summary.obstacles} | found)
+
+
+def _print_summary(console: Console, summary: LogSummary, findings: list[Finding], skipped: str) -> None:
     console.print(f"[bold]{escape(summary.name or summary.path.name)}[/], {summary.duration_s:.1f} s\n", soft_wrap=True)
     console.print(_topics_table(summary), "")
     console.print(_roles_table(summary), "")
@@ -47,6 +104,7 @@ def _print_summary(console: Console, summary: LogSummary) -> None:
         console.print(f"[bold]{escape(subject)}[/] {escape(note)}", soft_wrap=True)
     if summary.sonar:
         console.print(f"[bold]sonar images[/] {escape(summary.sonar)}", soft_wrap=True)
+    _print_findings(console, findings, skipped)
     for rows in summary.left_out:
         console.print(f"[bold]left out[/] {escape(rows)}", soft_wrap=True)
     for topic in summary.topics:
@@ -66,11 +124,22 @@ def _print_summary(console: Console, summary: LogSummary) -> None:
         )
 
 
+def _print_findings(console: Console, findings: list[Finding], skipped: str) -> None:
+    if skipped:
+        console.print(f"[bold]sensors[/] {escape(skipped)}", soft_wrap=True)
+        return
+    console.print("\n[bold]sensors against each other[/] (± 95 %)")
+    for finding in findings:
+        style = "bold yellow" if finding.acts else "bold"
+        console.print(f"[{style}]{escape(finding.quantity)}[/] {escape(finding.text())}", soft_wrap=True)
+    console.print()
+
+
 def _topics_table(summary: LogSummary) -> Table:
     table = Table(box=None, pad_edge=False)
     for heading in ("topic", "type"):
         table.add_column(heading, overflow="fold")
-    for heading in ("messages", "rate (Hz)", "span (s)", "max gap (s)"):
+    for heading in ("messages", "rate (Hz)", "span (s)", "max gap (s)", "jitter (ms)", "recorded after (s)"):
         table.add_column(heading, justify="right")
     origin_ns = min((topic.first_stamp_ns for topic in summary.topics), default=0)
     for topic in summary.topics:
@@ -84,7 +153,9 @@ def _topic_cells(topic: TopicSummary, origin_ns: int) -> list[str]:
         kind += f" ({topic.encoding})"
     first_s, last_s = ((stamp_ns - origin_ns) * 1e-9 for stamp_ns in (topic.first_stamp_ns, topic.last_stamp_ns))
     span = f"{first_s:.1f} to {last_s:.1f}"
-    return [topic.name, kind, str(topic.messages), f"{topic.rate_hz:.2f}", span, f"{topic.largest_gap_s:.2f}"]
+    lag = "-" if topic.lag_s is None else f"{topic.lag_s:.3f}"
+    times = [f"{topic.rate_hz:.2f}", span, f"{topic.largest_gap_s:.2f}", f"{1e3 * topic.jitter_s:.2g}", lag]
+    return [topic.name, kind, str(topic.messages), *times]
 
 
 def _roles_table(summary: LogSummary) -> Table:

@@ -14,7 +14,12 @@ from sonar_graph.evaluation.atomic import replacing
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write whole or not at all; what is not a finite number becomes null."""
     with replacing(path) as partial:
-        partial.write_text(json.dumps(_strict(content), indent=2, allow_nan=False, ensure_ascii=False) + "\n", "utf-8")
+        partial.write_text(strict_json(content) + "\n", "utf-8")
+
+
+def strict_json(content: dict[str, Any]) -> str:
+    """The text; what is not a finite number becomes null."""
+    return json.dumps(_strict(content), indent=2, allow_nan=False, ensure_ascii=False)
 
 
 def read_json(path: Path) -> dict[str, Any]:

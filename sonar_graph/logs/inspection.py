@@ -46,6 +46,10 @@ class TopicSummary:
     """Longest time between successive stamps."""
     stamps_from: str
     """``header`` or ``log``."""
+    jitter_s: float = 0.0
+    """Scatter of the times between successive stamps: half of the central 68 %."""
+    lag_s: float | None = None
+    """Median time of recording less stamp; None where messages have no stamps."""
     stamp_faults: tuple[str, ...] = ()
     """What is wrong with the stamps."""
     refusal: str | None = None
@@ -184,6 +188,8 @@ def _summarise(topic: Topic) -> TopicSummary:
     log_times_ns = topic.log_times_ns
     stamps_ns = np.sort(log_times_ns if recorded is None else np.where(recorded == 0, log_times_ns, recorded))
     span_s = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
+    steps_s = np.diff(stamps_ns) * 1e-9
+    low, high = np.quantile(steps_s, [0.16, 0.84]) if len(steps_s) else (0.0, 0.0)
     return TopicSummary(
         name=topic.name,
         type_name=topic.type_name,
@@ -192,11 +198,19 @@ def _summarise(topic: Topic) -> TopicSummary:
         first_stamp_ns=int(stamps_ns[0]),
         last_stamp_ns=int(stamps_ns[-1]),
         rate_hz=(len(topic) - 1) / span_s if span_s > 0 else 0.0,
-        largest_gap_s=float(np.diff(stamps_ns).max(initial=0)) * 1e-9,
+        largest_gap_s=float(steps_s.max(initial=0)),
         stamps_from="log" if recorded is None else "header",
+        jitter_s=float(high - low) / 2,
+        lag_s=None if recorded is None else _lag_s(recorded, log_times_ns),
         stamp_faults=() if recorded is None else tuple(stamp_faults(recorded, log_times_ns)),
         refusal=refusal(topic),
     )
+
+
+def _lag_s(stamps_ns: Ints, log_times_ns: Ints) -> float | None:
+    """Of messages with a stamp."""
+    stamped = (stamps_ns != 0) | (log_times_ns == 0)
+    return float(np.median((log_times_ns - stamps_ns)[stamped])) * 1e-9 if stamped.any() else None
 
 
 def _stamps_from_headers(topic: Topic) -> Ints | None:

@@ -11,6 +11,10 @@ difference with a variance that grows with its duration; a rate that walks from 
 with a gyro's noise does, correlates all later ones (t is the time of a difference's middle). Taking the differences for
 independent would make the parameters look more or less certain than they are.
 
+Not every axis need walk: a tilt turns gravity's two horizontal components and leaves the vertical one as it is. Axes
+that do not walk have r_2 = 0 (`Stretch.walks`). Sharing one r_2 among all three would spread the walk of two axes over
+three, and slow motion would claim 1.2 times too small a sigma.
+
 The ratios r maximise the restricted likelihood, in which what fitting p and n costs is counted (Harville, JASA 72,
 1977)::
 
@@ -47,6 +51,8 @@ class Stretch:
     """Derivative by the stretch's own, shape (m, 3, q)."""
     duration_s: Floats
     """Shape (m,)."""
+    walks: tuple[bool, bool, bool] = (True, True, True)
+    """Which axes of y walk."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,9 +151,15 @@ class _Reduced:
 
 def _reduce(stretch: Stretch, ratios: Floats) -> _Reduced:
     m, _, p = stretch.A.shape
-    lower = np.linalg.cholesky(_correlation(stretch.duration_s, ratios))
     columns = np.concatenate([stretch.y[:, :, None], stretch.A, stretch.B], axis=2)
-    white = solve_triangular(lower, columns.reshape(m, -1), lower=True, check_finite=False).reshape(3 * m, -1)
+    factors = {
+        walks: np.linalg.cholesky(_correlation(stretch.duration_s, ratios, walks)) for walks in set(stretch.walks)
+    }
+    axes = [
+        solve_triangular(factors[walks], columns[:, axis], lower=True, check_finite=False)
+        for axis, walks in enumerate(stretch.walks)
+    ]
+    white = np.concatenate(axes)
     own, size = _orthonormal(white[:, 1 + p :])
     kept = white[:, : 1 + p] - own @ (own.T @ white[:, : 1 + p])
     squares = kept.T @ kept
@@ -156,16 +168,18 @@ def _reduce(stretch: Stretch, ratios: Floats) -> _Reduced:
         squares[1:, 0],
         float(squares[0, 0]),
         3 * m - own.shape[1],
-        6.0 * float(np.log(np.diag(lower)).sum()) + size,
+        2.0 * sum(float(np.log(np.diag(factors[walks])).sum()) for walks in stretch.walks) + size,
     )
 
 
-def _correlation(duration_s: Floats, ratios: Floats) -> Floats:
+def _correlation(duration_s: Floats, ratios: Floats, walks: bool) -> Floats:
     """K, shape (m, m)."""
     m = len(duration_s)
     middle = np.cumsum(duration_s) - 0.5 * duration_s
     walk = np.outer(duration_s, duration_s) * np.minimum.outer(middle, middle)
-    return np.asarray(np.diag(2.0 + ratios[0] * duration_s) - np.eye(m, k=1) - np.eye(m, k=-1) + ratios[1] * walk)
+    return np.asarray(
+        np.diag(2.0 + ratios[0] * duration_s) - np.eye(m, k=1) - np.eye(m, k=-1) + walks * ratios[1] * walk
+    )
 
 
 def _orthonormal(B: Floats) -> tuple[Floats, float]:

@@ -155,19 +155,26 @@ def _stretch(
     in_body = np.einsum("nji,nj->ni", C, carried)
     A = np.concatenate([-carried[:, :, None], C @ cross_matrices(in_body), turning, -S], axis=2)
     together = max(1, round(MEAN_OVER_S / float(np.median(np.diff(since)))))
-    return _difference(*(mean_of_successive(values, together) for values in (since, x, A)))
+    return _difference(_levelling(impulse), *(mean_of_successive(values, together) for values in (since, x, A)))
 
 
-def _difference(seconds: Floats, x: Floats, A: Floats) -> Stretch:
+def _difference(level_R_g: Floats, seconds: Floats, x: Floats, A: Floats) -> Stretch:
     duration = np.diff(seconds)
     middle = seconds[:-1] + 0.5 * duration
     gravity = duration[:, None, None] * np.eye(3)
     return Stretch(
-        np.diff(x, axis=0),
-        np.diff(A, axis=0),
+        np.diff(x, axis=0) @ level_R_g.T,
+        level_R_g @ np.diff(A, axis=0),
         np.concatenate([gravity, middle[:, None, None] * gravity], axis=2),
         duration,
+        walks=(True, True, False),
     )
+
+
+def _levelling(impulse: Floats) -> Floats:
+    """Rotation from g to axes whose third is what the accelerometers felt over a stretch: the vertical, nearly."""
+    vertical = impulse[-1] - impulse[0]
+    return np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], vertical[None])[0].as_matrix())
 
 
 def mean_of_successive(values: Floats, count: int) -> Floats:

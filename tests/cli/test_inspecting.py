@@ -1,0 +1,60 @@
+"""``inspect`` compares sensors, skips that with a reason, and what it advises can be given to it again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from sonar_graph.cli import app
+from sonar_graph.logs.writing import write_sequence
+from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("inspect") / "mission.mcap"
+    write_sequence(path, simulate_mission(MissionOptions(seed=6, duration_s=150, landmarks=2)))
+    return path
+
+
+def answer(*words: str | Path) -> dict:
+    result = CliRunner().invoke(app, ["inspect", *map(str, words), "--json"])
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def sensor(said: dict, quantity: str) -> dict:
+    return next(entry for entry in said["sensors"] if entry["quantity"] == quantity)
+
+
+def test_a_stamp_offset_in_the_configuration_moves_the_offset_found(log: Path, tmp_path: Path):
+    (tmp_path / "late.toml").write_text("[dvl]\nstamp_offset_s = 0.5\n")
+    here = sensor(answer(log), "DVL against IMU: time offset")
+    there = sensor(answer(log, "--log-config", tmp_path / "late.toml"), "DVL against IMU: time offset")
+    assert there["value"] - here["value"] == pytest.approx(-0.5, abs=0.03)
+    assert there["act"]
+
+
+def test_a_mounting_in_the_calibration_moves_the_yaw_found(log: Path, tmp_path: Path):
+    (tmp_path / "turned.toml").write_text("[dvl]\nmounting.rpy_rad = [0, 0, 0.1]\n")
+    yaw = sensor(answer(log, "--calibration", tmp_path / "turned.toml"), "DVL mounting yaw")
+    assert yaw["value"] == pytest.approx(-5.73, abs=1.0)
+    assert "dvl.mounting.rpy_rad" in yaw["advice"]
+
+
+def test_quick_says_that_nothing_was_compared(log: Path):
+    said = answer(log, "--quick")
+    assert said["sensors"] == []
+    assert "--quick" in said["sensors_skipped"]
+    assert {topic["name"] for topic in said["topics"]} >= {"/imu/data"}
+
+
+def test_sentences_say_whether_to_act(log: Path):
+    result = CliRunner().invoke(app, ["inspect", str(log)])
+    assert result.exit_code == 0, result.output
+    assert "sensors against each other (± 95 %)" in result.stdout
+    assert "no need to act" in result.stdout
+    assert "cannot be told: never still for 30 s" in result.stdout

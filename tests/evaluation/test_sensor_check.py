@@ -1,0 +1,90 @@
+"""Truth from the simulator: known faults are named with the line that puts them right, and that line does."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.evaluation.sensor_check import Finding, check_sensors, with_interval
+from sonar_graph.logs.adapters.config import LogConfig
+from sonar_graph.measurements import Dvl
+from sonar_graph.navigation.offset_search import Estimate1D
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+
+RIGHT = simulate_mission(MissionOptions(seed=4, duration_s=240, landmarks=1))
+OFFSET_S, YAW_RAD, SCALE = 0.4, np.radians(5), 1.04
+
+
+def by_name(findings: list[Finding]) -> dict[str, Finding]:
+    return {finding.quantity: finding for finding in findings}
+
+
+def spoilt() -> Sequence:
+    """Early stamps, turned and short velocities."""
+    velocity = Rotation.from_euler("z", -YAW_RAD).apply(RIGHT.dvl.velocity) / SCALE
+    early = RIGHT.dvl.stamps_ns - round(OFFSET_S * 1e9)
+    return replace(RIGHT, dvl=Dvl(early, velocity, RIGHT.dvl.velocity_cov))
+
+
+def corrected(run: Sequence, found: dict[str, Finding]) -> Sequence:
+    """The Doppler log as the advice's own lines make it."""
+    lines = {name: tomllib.loads(finding.advice.split("`")[1]) for name, finding in found.items() if finding.acts}
+    shift_s, scale = lines["DVL against IMU: time offset"]["stamp_offset_s"], lines["DVL scale"]["scale"]
+    rpy = tuple(lines["DVL mounting yaw"]["dvl"]["mounting"]["rpy_rad"])
+    dvl, calibration = run.dvl, run.calibration
+    mounting = calibration.dvl.mounting.model_copy(update={"rpy_rad": rpy})
+    section = calibration.dvl.model_copy(update={"mounting": mounting})
+    moved = Dvl(dvl.stamps_ns + round(shift_s * 1e9), dvl.velocity * scale, dvl.velocity_cov)
+    return replace(run, dvl=moved, calibration=calibration.model_copy(update={"dvl": section}))
+
+
+def test_the_advised_lines_put_the_log_right():
+    found = by_name(check_sensors(spoilt()))
+    again = by_name(check_sensors(corrected(spoilt(), found)))
+    for name in ("DVL against IMU: time offset", "DVL mounting yaw", "DVL scale"):
+        assert found[name].acts, name
+        assert not again[name].acts, again[name].text()
+        assert again[name].advice == "no need to act"
+
+
+def test_corrections_are_added_to_what_the_configuration_says():
+    config = LogConfig.parse({"dvl": {"stamp_offset_s": -0.1, "scale": 2.0}}, "x")
+    found = by_name(check_sensors(spoilt(), config))
+    offset, scale = (
+        tomllib.loads(found[name].advice.split("`")[1]) for name in ("DVL against IMU: time offset", "DVL scale")
+    )
+    assert offset["stamp_offset_s"] == pytest.approx(OFFSET_S - 0.1, abs=0.15)
+    assert scale["scale"] == pytest.approx(2 * SCALE, abs=0.05)
+
+
+def test_a_start_taken_from_a_late_reference_is_named_with_the_right_one():
+    """The vehicle turns at the start: half a second late is some degrees off."""
+    assert RIGHT.truth is not None
+    late = replace(RIGHT.truth, stamps_ns=RIGHT.truth.stamps_ns + 500_000_000)
+    turning = replace(RIGHT, truth=late)
+    first_ns = turning.start_ns + 20_000_000_000
+    turning = replace(turning, imu=RIGHT.imu.rows(RIGHT.imu.stamps_ns >= first_ns))
+    for reference, acts in ((late, True), (RIGHT.truth, False)):
+        yaw, pitch, roll = reference.at(np.array([turning.start_ns])).rotations().as_euler("ZYX")[0].tolist()
+        start = turning.calibration.start.model_copy(update={"rpy_rad": (roll, pitch, yaw)})
+        run = replace(turning, calibration=turning.calibration.model_copy(update={"start": start}))
+        finding = by_name(check_sensors(run))["start heading of the calibration"]
+        assert finding.acts == acts, finding.text()
+
+
+def test_a_number_that_cannot_be_told_asks_for_nothing():
+    short = replace(RIGHT, imu=RIGHT.imu.rows(slice(0, 1000)), dvl=RIGHT.dvl.rows(slice(0, 60)), truth=None)
+    for finding in check_sensors(short):
+        assert not finding.acts
+        assert finding.text().startswith("cannot be told: ")
+        assert finding.plain()["value"] is None
+
+
+def test_digits_are_those_that_the_interval_supports():
+    assert with_interval(Estimate1D(1.0312345, 0.0102), "s") == "+1.031 ± 0.020 s"
+    assert with_interval(Estimate1D(1.00213, 0.0011), "") == "1.0021 ± 0.0022"
