@@ -1,32 +1,41 @@
-"""Velocities from one or two Doppler beams, completed by the velocity just before.
+"""Velocities from one or two Doppler beams, completed by what precedes and follows them.
 
-A row that leaves a direction unmeasured (`sonar_graph.doppler_beams`) is joined with what the row before lets expect.
-The velocity in the body's axes is taken for a random walk of spectral density q, ``velocity_walk_density``²::
+A row that leaves a direction unmeasured (`sonar_graph.doppler_beams`) waits for the next whole one. Then all rows k
+from the whole row 0 to the whole row m are solved together. With R the rotation by the gyros and F the velocity that
+the accelerometers gain from rest, both in frame 0, the velocity of the IMU's point less F is a straight line whose
+slope is gravity (`sonar_graph.navigation.inertial_carry`), give or take a random walk::
 
-    P- = P_k + q T I,    P = (P-^-1 + R^-1)^-1,    A = P P-^-1,    v = A v_k + P R^-1 z               (1)
+    y_k = R_k z_k - F_k,    y_k+1 = y_k + g T_k + N(0, q T_k I),    z_k ~ N(measured, cov_k)              (1)
 
-z, R the row. Where the beams measure this is the row itself, elsewhere it is the velocity before, the less certain the
-longer ago.
+Gravity g is unknown and constant. Where a specific force was not measured R = I, F = 0, g = 0, and q is that of
+``velocity_walk_density``. Least squares gives y and its joint covariance P; completed rows are ``R_k^T (y_k + F_k)``.
+Rows 0 and m stay as they are to the bit.
 
-Errors of successive completed rows are no longer independent, ``e_k+1 = A e_k + ...``, whereas odometry takes each
-row's noise as white. A displacement sums them with weights w (half the intervals either side), so that each completed
-row is given, beside its own covariance, what it shares with all before it::
+Errors of completed rows are not independent, whereas odometry takes each row's noise as white. A displacement sums them
+with weights w (half the intervals either side), so that each completed row is given what it shares with the others::
 
-    X_k+1 = A (X_k + w_k P_k),    cov_k+1 = P + (X_k+1 + X_k+1^T) / w_k+1                            (2)
+    cov_k = sum_j w_j / w_k (P_kj + P_jk) / 2,    counted twice for j = 0 and m, which keep their own      (2)
 
-Then ``sum w² cov`` is the variance of the summed displacement, at every row and without looking ahead. X is 0 at a row
-with three beams or more, which stays as it is to the bit.
+With it ``sum w^2 cov`` is the variance of the summed displacement.
 
-A partial row that comes longer after the last one than velocities are linear over, before the first whole one, or late,
-is passed over: there the IMU knows more.
+A partial row before the first whole one, late, or in a stretch longer than `LONGEST_STRETCH_NS` is passed over.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
+from sonar_graph.calibration import Calibration
 from sonar_graph.doppler_beams import is_partial
 from sonar_graph.measurements import Floats, Ints
+from sonar_graph.navigation.inertial_carry import Carry, InertialRows, carry
+
+LONGEST_STRETCH_NS = 60_000_000_000
+"""What is solved at once stays small, and no accelerometer carries a velocity longer."""
+Rows = tuple[Ints, Floats, Floats]
+"""Stamps, shape (n,), velocities (n, 3) and covariances (n, 3, 3), body axes."""
 
 
 class PartialVelocities:
@@ -34,77 +43,119 @@ class PartialVelocities:
 
     Parameters
     ----------
-    walk_density
-        Of the vehicle's velocity, m/s/√s.
-    longest_ns
-        Longest time since the row before.
+    calibration
+        Noise of the IMU, lever arms, and the walk of the vehicle's velocity.
     """
 
-    def __init__(self, walk_density: float, longest_ns: int) -> None:
-        self._q = walk_density**2
-        self._longest_ns = longest_ns
-        self._stamp_ns: int | None = None
-        self._before_s = 0.0
-        self._velocity: Floats = np.zeros(3)
-        self._P: Floats = np.zeros((3, 3))
-        self._shared: Floats = np.zeros((3, 3))
+    def __init__(self, calibration: Calibration) -> None:
+        self._calibration = calibration
+        self._whole: _Row | None = None
+        self._waiting: list[_Row] = []
 
-    def completed(self, stamps_ns: Ints, velocity: Floats, covs: Floats) -> tuple[Ints, Floats, Floats]:
-        """The rows that can be used, all with a whole velocity.
+    def completed(self, stamps_ns: Ints, velocity: Floats, covs: Floats, imu: InertialRows) -> Rows:
+        """The rows that can be used now, all with a whole velocity; they may be older than those given.
 
         Parameters
         ----------
         stamps_ns, velocity, covs
-            Shapes (n,), (n, 3), (n, 3, 3), m/s; no NaN.
+            In order; no NaN.
+        imu
+            All rows known; of those after a stamp nothing is used for it.
         """
         partial = is_partial(covs)
-        if not partial.any():
-            self._remember_last(stamps_ns, velocity, covs)
+        if not partial.any() and not self._waiting:
+            self._remember(_Row(int(stamps_ns[-1]), velocity[-1], covs[-1]))
             return stamps_ns, velocity, covs
-        velocity, covs = velocity.copy(), covs.copy()
-        used = np.ones(len(stamps_ns), dtype=bool)
-        for k, stamp_ns in enumerate(stamps_ns.tolist()):
-            if partial[k]:
-                used[k] = self._stamp_ns is not None and 0 < stamp_ns - self._stamp_ns <= self._longest_ns
-                if used[k]:
-                    velocity[k], covs[k] = self._complete(stamp_ns, velocity[k], covs[k])
+        usable: list[_Row] = []
+        for stamp_ns, v, cov, is_part in zip(stamps_ns.tolist(), velocity, covs, partial.tolist(), strict=True):
+            row = _Row(stamp_ns, v, cov)
+            if is_part:
+                self._wait(row)
             else:
-                self._remember(stamp_ns, velocity[k], covs[k])
-        return stamps_ns[used], velocity[used], covs[used]
+                usable += [*self._closed_by(row, imu), row]
+        return (
+            np.array([row.stamp_ns for row in usable], dtype=np.int64),
+            np.array([row.velocity for row in usable]).reshape(-1, 3),
+            np.array([row.cov for row in usable]).reshape(-1, 3, 3),
+        )
 
-    def _remember_last(self, stamps_ns: Ints, velocity: Floats, covs: Floats) -> None:
-        for k in range(max(len(stamps_ns) - 2, 0), len(stamps_ns)):
-            self._remember(int(stamps_ns[k]), velocity[k], covs[k])
+    def _wait(self, row: _Row) -> None:
+        newest_ns = self._waiting[-1].stamp_ns if self._waiting else self._whole.stamp_ns if self._whole else None
+        if newest_ns is not None and row.stamp_ns > newest_ns:
+            self._waiting.append(row)
 
-    def _remember(self, stamp_ns: int, velocity: Floats, P: Floats) -> None:
-        """A whole row shares nothing with those before; one that comes late is not the newest."""
-        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
-            return
-        self._advance(stamp_ns)
-        self._velocity, self._P, self._shared = velocity, P, np.zeros((3, 3))
+    def _remember(self, row: _Row) -> None:
+        if self._whole is None or row.stamp_ns > self._whole.stamp_ns:
+            self._whole = row
 
-    def _advance(self, stamp_ns: int) -> float:
-        """The time since the row before."""
-        interval_ns = 0 if self._stamp_ns is None else min(stamp_ns - self._stamp_ns, self._longest_ns)
-        self._stamp_ns, self._before_s = stamp_ns, interval_ns * 1e-9
-        return self._before_s
+    def _closed_by(self, row: _Row, imu: InertialRows) -> list[_Row]:
+        """The rows that waited for this one."""
+        within = [waiting for waiting in self._waiting if waiting.stamp_ns < row.stamp_ns]
+        self._waiting = [waiting for waiting in self._waiting if waiting.stamp_ns > row.stamp_ns]
+        whole = self._whole
+        self._remember(row)
+        if not within or whole is None or row.stamp_ns - whole.stamp_ns > LONGEST_STRETCH_NS:
+            return []
+        return _solved([whole, *within, row], imu, self._calibration)
 
-    def _complete(self, stamp_ns: int, z: Floats, R: Floats) -> tuple[Floats, Floats]:
-        """Equations (1) and (2)."""
-        half_before_s = 0.5 * self._before_s
-        interval_s = self._advance(stamp_ns)
-        weight_s = half_before_s + 0.5 * interval_s
-        expected = np.linalg.inv(self._P + self._q * interval_s * np.eye(3))
-        measured = np.linalg.inv(R)
-        P = np.linalg.inv(expected + measured)
-        A = P @ expected
-        self._shared = A @ (self._shared + weight_s * self._P)
-        self._velocity = A @ self._velocity + P @ measured @ z
-        self._P = 0.5 * (P + P.T)
-        return self._velocity, _positive(self._P + (self._shared + self._shared.T) / interval_s)
+
+class _Row(NamedTuple):
+    stamp_ns: int
+    velocity: Floats
+    cov: Floats
+
+
+def _solved(rows: list[_Row], imu: InertialRows, calibration: Calibration) -> list[_Row]:
+    """All rows but the first and the last, completed."""
+    stamps_ns = np.array([row.stamp_ns for row in rows], dtype=np.int64)
+    by = carry(imu, stamps_ns, calibration)
+    y, P = _least_squares(rows, by, np.diff(stamps_ns) * 1e-9)
+    weights_s = _weights(stamps_ns)
+    completed = []
+    for k in range(1, len(rows) - 1):
+        R = by.rotation[k]
+        shared = _shared(P, weights_s, k)
+        velocity = R.T @ (y[k] + by.velocity[k]) - by.from_lever[k]
+        completed.append(_Row(rows[k].stamp_ns, velocity, _positive(R.T @ shared @ R)))
+    return completed
+
+
+def _least_squares(rows: list[_Row], by: Carry, intervals_s: Floats) -> tuple[Floats, Floats]:
+    """Equation (1): y, shape (n, 3), and its joint covariance, shape (3n, 3n)."""
+    n = len(rows)
+    size = 3 * n + (3 if by.is_inertial else 0)
+    information, vector = np.zeros((size, size)), np.zeros(size)
+    for k, row in enumerate(rows):
+        R, at = by.rotation[k], slice(3 * k, 3 * k + 3)
+        measured = np.linalg.inv(R @ row.cov @ R.T)
+        information[at, at] += measured
+        vector[at] += measured @ (R @ (row.velocity + by.from_lever[k]) - by.velocity[k])
+    for k, interval_s in enumerate(intervals_s.tolist()):
+        step = np.zeros((3, size))
+        step[:, 3 * k : 3 * k + 3], step[:, 3 * k + 3 : 3 * k + 6] = -np.eye(3), np.eye(3)
+        if by.is_inertial:
+            step[:, 3 * n :] = -interval_s * np.eye(3)
+        information += step.T @ step / (by.walk_density**2 * interval_s)
+    P = np.linalg.inv(information)
+    y: Floats = (P @ vector)[: 3 * n].reshape(n, 3)
+    return y, np.asarray(P[: 3 * n, : 3 * n])
+
+
+def _weights(stamps_ns: Ints) -> Floats:
+    """Half the intervals either side, seconds; the ends are taken to go on as they are."""
+    intervals_s = np.diff(stamps_ns) * 1e-9
+    return 0.5 * (np.concatenate([intervals_s[:1], intervals_s]) + np.concatenate([intervals_s, intervals_s[-1:]]))
+
+
+def _shared(P: Floats, weights_s: Floats, k: int) -> Floats:
+    """Equation (2), axes of frame 0."""
+    relative = weights_s / weights_s[k]
+    relative[[0, -1]] *= 2.0
+    total = np.einsum("jab,j->ab", P[3 * k : 3 * k + 3].reshape(3, -1, 3).transpose(1, 0, 2), relative)
+    return np.asarray(0.5 * (total + total.T))
 
 
 def _positive(cov: Floats) -> Floats:
-    """The nearest covariance: turned noise may leave a direction below zero, and none is better than its smallest."""
+    """The nearest covariance: what rows share may leave a direction of one of them below zero."""
     variances, axes = np.linalg.eigh(cov)
     return np.asarray((axes * np.maximum(variances, 1e-12)) @ axes.T)

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from sonar_graph.calibration import Calibration, DvlCalibration
 from sonar_graph.doppler_beams import velocity_of_beams
-from sonar_graph.navigation.partial_velocity import PartialVelocities
+from sonar_graph.navigation.inertial_carry import InertialRows
+from sonar_graph.navigation.partial_velocity import LONGEST_STRETCH_NS, PartialVelocities
 
 STEP_NS = 200_000_000
 STEP_S = 0.2
@@ -17,11 +19,15 @@ JANUS = np.array(
         for azimuth in np.radians([45.0, -45.0, -135.0, 135.0])
     ]
 )
-LONGEST_NS = 1_500_000_000
 
 
-def completion():
-    return PartialVelocities(WALK, LONGEST_NS)
+CALIBRATION = Calibration(dvl=DvlCalibration(velocity_walk_density=WALK))
+NO_FORCE = InertialRows(np.array([0, 10**12]), np.zeros((2, 3)), np.full((2, 3), np.nan))
+
+
+def completed(stamps_ns, velocity, cov, imu=NO_FORCE, calibration=CALIBRATION):
+    """All rows in one block."""
+    return PartialVelocities(calibration).completed(stamps_ns, velocity, cov, imu)
 
 
 def pings(valid, rng, velocities):
@@ -47,9 +53,10 @@ def stamps(n):
 def test_rows_with_three_beams_or_more_stay_as_they_are_to_the_bit():
     rng = np.random.default_rng(0)
     velocity, cov = pings(valid_beams(4, 3, 2, 4, 1, 3), rng, walk(6, rng))
-    _, completed, covs = completion().completed(stamps(6), velocity, cov)
+    kept, velocities, covs = completed(stamps(6), velocity, cov)
     whole = [0, 1, 3, 5]
-    np.testing.assert_array_equal(completed[whole], velocity[whole])
+    np.testing.assert_array_equal(kept, stamps(6))
+    np.testing.assert_array_equal(velocities[whole], velocity[whole])
     np.testing.assert_array_equal(covs[whole], cov[whole])
     assert np.trace(covs, axis1=1, axis2=2).max() < 1.0
 
@@ -57,59 +64,58 @@ def test_rows_with_three_beams_or_more_stay_as_they_are_to_the_bit():
 def test_results_do_not_depend_on_how_rows_are_cut_into_blocks():
     rng = np.random.default_rng(1)
     velocity, cov = pings(valid_beams(4, 4, 2, 1, 1, 4, 4, 2, 2, 3), rng, walk(10, rng))
-    _, *whole = completion().completed(stamps(10), velocity, cov)
+    whole = completed(stamps(10), velocity, cov)
     for cut in range(1, 9):
-        piecewise = completion()
+        piecewise = PartialVelocities(CALIBRATION)
         blocks = [
-            piecewise.completed(stamps(10)[rows], velocity[rows], cov[rows])
+            piecewise.completed(stamps(10)[rows], velocity[rows], cov[rows], NO_FORCE)
             for rows in (slice(0, cut), slice(cut, cut + 1), slice(cut + 1, 10))
         ]
-        np.testing.assert_allclose(np.concatenate([b[1] for b in blocks]), whole[0], rtol=0, atol=1e-15)
-        np.testing.assert_allclose(np.concatenate([b[2] for b in blocks]), whole[1], rtol=0, atol=1e-15)
+        for together, column in zip(whole, zip(*blocks, strict=True), strict=True):
+            np.testing.assert_array_equal(np.concatenate(column), together)
 
 
-def test_what_no_beam_measured_is_the_velocity_before_and_its_walk_since():
-    """A vertical beam alone: x keeps its value; var s^2 + q T, and twice s^2 shared with the row before it."""
-    velocity = np.array([[0.7, 0.1, 0.0], [0.0, 0.0, 0.2]])
-    cov = np.array([SIGMA**2 * np.eye(3), np.diag([1e4, 1e4, SIGMA**2])])
-    _, completed, covs = completion().completed(stamps(2), velocity, cov)
-    assert completed[1, :2] == pytest.approx([0.7, 0.1], abs=1e-6)
-    assert completed[1, 2] == pytest.approx(0.2 * (SIGMA**2 + WALK**2 * STEP_S) / (2 * SIGMA**2 + WALK**2 * STEP_S))
-    # the first row's weight is half an interval, the second's a whole one
-    assert covs[1, 0, 0] == pytest.approx(SIGMA**2 + WALK**2 * STEP_S + 2 * 0.5 * SIGMA**2, rel=1e-4)
+def test_what_no_beam_measured_is_half_way_between_the_whole_rows_and_shares_their_errors():
+    """A vertical beam alone, x by hand: (z_0 + z_2) / 2, (s^2 + q T) / 2, and s^2 / 2 shared with either end."""
+    velocity = np.array([[0.7, 0.1, 0.0], [0.0, 0.0, 0.2], [0.9, 0.1, 0.0]])
+    cov = np.array([SIGMA**2 * np.eye(3), np.diag([1e4, 1e4, SIGMA**2]), SIGMA**2 * np.eye(3)])
+    _, velocities, covs = completed(stamps(3), velocity, cov)
+    bridge = 0.5 * (SIGMA**2 + WALK**2 * STEP_S)
+    assert velocities[1, :2] == pytest.approx([0.8, 0.1], abs=1e-6)
+    assert velocities[1, 2] == pytest.approx(0.2 * bridge / (bridge + SIGMA**2))
+    assert covs[1, 0, 0] == pytest.approx(bridge + 2 * SIGMA**2, rel=1e-4)
 
 
 @pytest.mark.parametrize("counts", [[2] * 12, [1] * 12, [2, 2, 1, 1, 2, 0, 1, 1, 2, 2, 1, 2]])
 def test_the_variance_of_a_displacement_is_what_the_rows_say_together(counts):
     """Monte Carlo over 600 runs, two-sided."""
-    counts = np.array([4, 4, *counts])
+    counts = np.array([4, 4, *counts, 4])
     runs, n = 600, len(counts)
     rng = np.random.default_rng(2)
     truth = walk(n, rng, runs)
-    weights = STEP_S * np.ones(n)
     errors, variance = [], np.zeros((3, 3))
     for k in range(runs):
         velocity, cov = pings(valid_beams(*counts), rng, truth[k])
-        _, completed, covs = completion().completed(stamps(n), velocity, cov)
-        errors.append(weights @ (completed - truth[k]))
-        variance = np.einsum("k,kij->ij", weights**2, covs)
+        _, velocities, covs = completed(stamps(n), velocity, cov)
+        errors.append(STEP_S * (velocities - truth[k]).sum(axis=0))
+        variance = STEP_S**2 * covs.sum(axis=0)
     anees = np.mean(np.einsum("ki,ij,kj->k", errors, np.linalg.inv(variance), errors)) / 3
     assert 0.9 < anees < 1.1
 
 
-def test_a_row_before_the_first_whole_one_or_long_after_the_last_is_passed_over():
+def test_a_row_before_the_first_whole_one_after_the_last_or_in_an_endless_stretch_is_passed_over():
     rng = np.random.default_rng(3)
-    velocity, cov = pings(valid_beams(2, 4, 2, 2), rng, walk(4, rng))
-    late = np.array([0, STEP_NS, 2 * STEP_NS, 2 * STEP_NS + LONGEST_NS + 1])
-    kept, *_ = completion().completed(late, velocity, cov)
-    assert kept.tolist() == [STEP_NS, 2 * STEP_NS]
+    velocity, cov = pings(valid_beams(2, 4, 2, 4, 2, 4, 2), rng, walk(7, rng))
+    late = np.array([0, 1, 2, 3, 4, 4 + LONGEST_STRETCH_NS, 5 + LONGEST_STRETCH_NS])
+    kept, *_ = completed(late, velocity, cov)
+    assert kept.tolist() == [1, 2, 3, 4 + LONGEST_STRETCH_NS]
 
 
 def test_more_beams_are_never_less_certain():
     rng = np.random.default_rng(4)
-    truth = walk(6, rng)
+    truth = walk(7, rng)
     traces = []
-    for count in range(1, 5):
-        velocity, cov = pings(valid_beams(4, *[count] * 5), rng, truth)
-        traces.append(np.trace(completion().completed(stamps(6), velocity, cov)[2][-1]))
-    assert traces[0] > 1.9 * traces[1] > 19 * traces[2] > 19 * traces[3]
+    for count in range(5):
+        velocity, cov = pings(valid_beams(4, *[count] * 5, 4), rng, truth)
+        traces.append(np.trace(completed(stamps(7), velocity, cov)[2].sum(axis=0)))
+    assert np.all(np.diff(traces) < 0)
