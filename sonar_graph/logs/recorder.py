@@ -10,6 +10,7 @@ rosbag2, so that ``ros2 bag play`` offers it: without it RViz would never receiv
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -35,8 +36,8 @@ TRANSIENT_LOCAL = (
 """Keep last, reliable, transient local: the numbers of rmw's enumerations, as rosbag2 has them up to version 8."""
 LIBRARY = "sonar-graph"
 """What the head of a log says that this package wrote."""
-_OWN_HEAD = struct.pack(f"<I4sI{len(LIBRARY)}s", 4, b"ros2", len(LIBRARY), LIBRARY.encode())
 _HEAD_AT = 17  # after the magic bytes, an opcode and a length
+_LONGEST_PROFILE = 64
 ROSBAG2_METADATA = {"serialized_metadata": ""}
 """Makes newer versions of rosbag2, which write words, read numbers in what a channel offers."""
 
@@ -126,10 +127,17 @@ def recording(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> Iterator
 
 
 def is_own_log(path: Path) -> bool:
-    """Whether the head of a file says that it is a log which this package wrote."""
+    """Whether the head of a file says that it is a log which this package wrote, of whatever profile."""
     with path.open("rb") as stream:
-        head = stream.read(_HEAD_AT + len(_OWN_HEAD))
-    return head.startswith(MCAP0_MAGIC) and head[_HEAD_AT:] == _OWN_HEAD
+        if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+            return False
+        stream.seek(_HEAD_AT)
+        profile_size = int.from_bytes(stream.read(4), "little")
+        if profile_size > _LONGEST_PROFILE:
+            return False
+        stream.seek(profile_size, os.SEEK_CUR)
+        own = struct.pack(f"<I{len(LIBRARY)}s", len(LIBRARY), LIBRARY.encode())
+        return stream.read(len(own)) == own
 
 
 class RecordingWriter:

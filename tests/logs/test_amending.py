@@ -16,7 +16,7 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs.amending import write_amended
 from sonar_graph.logs.container import Keep, scan
 from sonar_graph.logs.encoding import landmark_map_message
-from sonar_graph.logs.recorder import Outgoing
+from sonar_graph.logs.recorder import Outgoing, is_own_log
 from sonar_graph.states import LandmarkMap
 
 MAP = "sonar_graph_msgs/msg/LandmarkMap"
@@ -24,11 +24,11 @@ IMU_TEXT = b"float64 x"
 BINARY_SCHEMA = bytes(range(256))
 
 
-def foreign_log(path: Path, count: int = 400) -> Path:
+def foreign_log(path: Path, count: int = 400, profile: str = "ros2") -> Path:
     """A log of another program: two encodings, publish times that differ, metadata and an attachment."""
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=2000, enable_data_crcs=True)
-        writer.start(profile="ros2", library="another")
+        writer.start(profile=profile, library="another")
         text = writer.register_schema("a/msg/B", "ros2msg", IMU_TEXT)
         binary = writer.register_schema("c.D", "protobuf", BINARY_SCHEMA)
         one = writer.register_channel("/one", "cdr", text, {"offered_qos_profiles": "- {durability: 1}"})
@@ -71,6 +71,16 @@ def test_everything_is_there_byte_by_byte_and_what_was_added(tmp_path: Path) -> 
     assert (name, record["key"]) == ("more", "value")
     assert after == before
     assert (amended.replaced, amended.notes) == ({}, {})
+
+
+@pytest.mark.parametrize("profile", ["ros2", "", "x" * 40])
+def test_what_was_written_is_known_as_ours_whatever_the_profile_of_the_log(tmp_path: Path, profile: str) -> None:
+    source = foreign_log(tmp_path / "a.mcap", 3, profile)
+    write_amended(source, tmp_path / "b.mcap", [landmarks(2005)])
+    with (tmp_path / "b.mcap").open("rb") as stream:
+        assert make_reader(stream).get_header().profile == profile
+    assert is_own_log(tmp_path / "b.mcap")
+    assert not is_own_log(source)
 
 
 def test_messages_lie_in_the_order_of_their_times(tmp_path: Path) -> None:
