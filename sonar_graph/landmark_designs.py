@@ -13,27 +13,50 @@ floor around it; NaN where it has no material and the floor shows. One's own des
     black_db = -8.0               # what 0 means ...
     white_db = 12.0               # ... and what 255 means; transparent pixels are floor
 
+What can be recognised: one figure that is brighter than the floor, in one piece, about the middle of the square. Each
+connected bright part of an image is a candidate of its own, and only those are compared with designs that have an area
+between ``detection.min_area_m2`` and ``detection.max_area_m2`` and are no longer than ``detection.max_extent_m``
+(0.008 m², 0.2 m² and 0.7 m unless set otherwise). Dark parts may lie apart. What no setting makes visible is refused
+here; what the settings of a recogniser leave out is refused when it is made
+(`sonar_graph.sonar.bright_figure`). What reaches over the square is cut off at its edges.
+
 The landmarks of the 2014 experiment were never published. All designs here, sizes and levels included, are ours.
 """
 
 from __future__ import annotations
 
+import hashlib
+import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import CalibrationError
 from sonar_graph.measurements import Floats
+from sonar_graph.validation import faults_in
 
 PIXEL_M = 0.002
 """Size of the pixels into which drawn shapes are turned."""
+LEAST_SIZE_M, MOST_SIZE_M = 0.02, 2.0
+MOST_PIXELS = 2000
+"""Along the side of a picture."""
+MOST_ID = 2**31 - 1
+LEAST_BRIGHT_DB = 3.0
+"""What nowhere scatters as much more than the floor does not stand out of its speckle."""
+OWN_DESIGNS = "landmark designs"
+"""The note of a log that says which landmarks lie there, where they are not those that ship."""
+
+_Level = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
+_Length = Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +83,25 @@ class LandmarkDesign:
         last = pixels - 1
         return np.where(inside, self.mask[np.clip(row, 0, last), np.clip(column, 0, last)], np.nan)
 
+    def digest(self) -> str:
+        """16 hexadecimal digits that change with name, size, height or mask (from 0.01 dB on)."""
+        counts = np.where(np.isnan(self.mask), -(2**31), np.round(100 * np.nan_to_num(self.mask)))
+        text = f"{self.name}\n{self.size_m:.6f}\n{self.height_m:.6f}\n{self.mask.shape}\n"
+        return hashlib.sha256(text.encode() + counts.astype("<i4").tobytes()).hexdigest()[:16]
+
+    def looks_like(self, other: LandmarkDesign) -> bool:
+        """Whether the other one has the same picture and size, turned by quarters or not."""
+        return self.size_m == other.size_m and any(
+            np.array_equal(np.rot90(self.mask, quarters), other.mask, equal_nan=True) for quarters in range(4)
+        )
+
 
 class _Shape(Section):
     """A filled circle or polygon of one level."""
 
-    level_db: float
-    circle_m: tuple[float, float, float] | None = None
-    polygon_m: list[tuple[float, float]] | None = Field(None, min_length=3)
+    level_db: _Level
+    circle_m: tuple[_Length, _Length, _Length] | None = None
+    polygon_m: list[tuple[_Length, _Length]] | None = Field(None, min_length=3)
 
     @model_validator(mode="after")
     def _is_one_shape(self) -> _Shape:
@@ -85,14 +120,14 @@ class _Shape(Section):
 class _Entry(Section):
     """A ``[[landmark]]`` of a TOML file."""
 
-    id: int = Field(ge=0)
-    name: str
-    size_m: float = Field(gt=0)
-    height_m: float = Field(0.013, ge=0)
+    id: int = Field(ge=0, le=MOST_ID)
+    name: str = Field(min_length=1)
+    size_m: float = Field(ge=LEAST_SIZE_M, le=MOST_SIZE_M, allow_inf_nan=False)
+    height_m: float = Field(0.013, ge=0, le=1, allow_inf_nan=False)
     shapes: tuple[_Shape, ...] = ()
     picture: str | None = None
-    black_db: float = -8.0
-    white_db: float = 12.0
+    black_db: _Level = -8.0
+    white_db: _Level = 12.0
 
     @model_validator(mode="after")
     def _has_one_source(self) -> _Entry:
@@ -101,8 +136,15 @@ class _Entry(Section):
         return self
 
     def design(self, folder: Path) -> LandmarkDesign:
-        """Drawn, or with its picture from the folder."""
-        mask = self._drawn() if self.picture is None else self._pictured(folder / self.picture)
+        """Drawn, or with its picture from the folder.
+
+        Raises
+        ------
+        ValueError
+            When the picture is none, or the landmark could not be told from the floor.
+        """
+        mask = self._drawn() if self.picture is None else _pictured(folder / self.picture, self.black_db, self.white_db)
+        _check_stands_out(mask)
         return LandmarkDesign(self.id, self.name, self.size_m, mask, self.height_m)
 
     def _drawn(self) -> Floats:
@@ -110,22 +152,59 @@ class _Entry(Section):
         middles_m = ((np.arange(pixels) + 0.5) / pixels - 0.5) * self.size_m
         x_m, y_m = np.meshgrid(middles_m, -middles_m)
         mask = np.full((pixels, pixels), np.nan)
-        for shape in self.shapes:
-            mask[shape.covers(x_m, y_m)] = shape.level_db
+        for number, shape in enumerate(self.shapes, 1):
+            covered = shape.covers(x_m, y_m)
+            if not covered.any():
+                half_m = self.size_m / 2
+                raise ValueError(
+                    f"shape {number} covers nothing of the square, which reaches from {-half_m:g} to {half_m:g} m in x "
+                    "and y; move it, or leave it out"
+                )
+            mask[covered] = shape.level_db
         return mask
 
-    def _pictured(self, path: Path) -> Floats:
+
+def _pictured(path: Path, black_db: float, white_db: float) -> Floats:
+    """The mask that a picture shows.
+
+    Raises
+    ------
+    ValueError
+        When there is none that can be one.
+    """
+    try:
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
-        if picture is None:
-            raise CalibrationError(f"landmark {self.name}: {path} is not a picture; give a PNG file beside the TOML")
-        if picture.shape[0] != picture.shape[1]:
-            raise CalibrationError(
-                f"landmark {self.name}: {path} is {picture.shape[1]} x {picture.shape[0]}, not square"
-            )
-        transparent = picture[..., 3] < 128 if picture.ndim == 3 and picture.shape[2] == 4 else False
-        grey = picture if picture.ndim == 2 else cv2.cvtColor(picture[..., :3], cv2.COLOR_BGR2GRAY)
-        share = grey / (65535.0 if grey.dtype == np.uint16 else 255.0)
-        return np.where(transparent, np.nan, self.black_db + share * (self.white_db - self.black_db))
+    except cv2.error:
+        picture = None
+    if picture is None or picture.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"{path} is not a picture; give a PNG file of 8 or 16 bits beside the TOML")
+    height, width = picture.shape[:2]
+    if height != width:
+        raise ValueError(f"{path} is {width} x {height}, not square")
+    if width > MOST_PIXELS:
+        raise ValueError(f"{path} is {width} x {height}; make it {MOST_PIXELS} x {MOST_PIXELS} or smaller")
+    full = 255.0 if picture.dtype == np.uint8 else 65535.0
+    transparent = picture[..., 3] < full / 2 if picture.ndim == 3 and picture.shape[2] == 4 else False
+    grey = picture if picture.ndim == 2 else cv2.cvtColor(picture[..., :3], cv2.COLOR_BGR2GRAY)
+    return np.where(transparent, np.nan, black_db + grey / full * (white_db - black_db))
+
+
+def _check_stands_out(mask: Floats) -> None:
+    """Refuse what is never a candidate.
+
+    Raises
+    ------
+    ValueError
+        When it has no material, or no bright part.
+    """
+    if np.isnan(mask).all():
+        raise ValueError("its picture is wholly transparent; give it material, pixels that are opaque")
+    brightest_db = float(np.nanmax(mask))
+    if brightest_db < LEAST_BRIGHT_DB:
+        raise ValueError(
+            f"nowhere more than {brightest_db:g} dB over the floor, it would never stand out of it; "
+            f"give a part of it at least {LEAST_BRIGHT_DB:g} dB"
+        )
 
 
 def load_designs(path: Path) -> tuple[LandmarkDesign, ...]:
@@ -153,25 +232,47 @@ def load_designs(path: Path) -> tuple[LandmarkDesign, ...]:
 def _read(file: Path) -> list[LandmarkDesign]:
     try:
         values = tomllib.loads(file.read_text(encoding="utf-8"))
-        entries = TypeAdapter(dict[str, list[_Entry]]).validate_python(values)
     except OSError as error:
         raise CalibrationError(f"{file} cannot be read: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise CalibrationError(f"{file} is not TOML: {error}") from error
+    return [_design(file, number, table) for number, table in enumerate(_tables(file, values), 1)]
+
+
+def _tables(file: Path, values: Mapping[str, Any]) -> list[dict[str, Any]]:
+    if unknown := sorted(values.keys() - {"landmark"}):
+        meant = "; did you mean [[landmark]]?" if unknown[0].lower().startswith("landmark") else ";"
+        raise CalibrationError(f"{file}: {unknown[0]}: unknown{meant} a designs file has [[landmark]] tables only")
+    tables = values.get("landmark", [])
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        raise CalibrationError(f"{file}: landmark: write [[landmark]] with two brackets above each landmark")
+    return tables
+
+
+def _design(file: Path, number: int, table: Mapping[str, Any]) -> LandmarkDesign:
+    name = table.get("name")
+    place = f"{file}: landmark {name!r}" if name and isinstance(name, str) else f"{file}: [[landmark]] number {number}"
+    try:
+        return _Entry.model_validate(table).design(file.parent)
     except ValidationError as error:
-        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise CalibrationError(f"{file}: {faults}") from error
-    if unknown := set(entries) - {"landmark"}:
-        raise CalibrationError(f"{file}: unknown table {', '.join(sorted(unknown))}; landmarks are [[landmark]] tables")
-    return [entry.design(file.parent) for entry in entries.get("landmark", [])]
+        raise CalibrationError(f"{place}: {_counted_from_one(faults_in(error, _Entry))}") from error
+    except ValueError as error:
+        raise CalibrationError(f"{place}: {error}") from error
+
+
+def _counted_from_one(faults: str) -> str:
+    return re.sub(r"\bshapes\.(\d+)", lambda row: f"shape {int(row[1]) + 1}", faults)
 
 
 def _check_distinct(path: Path, designs: Sequence[LandmarkDesign]) -> None:
-    first: dict[int, str] = {}
-    for design in designs:
-        if design.id in first:
-            raise CalibrationError(f"{path}: {first[design.id]} and {design.name} both have the id {design.id}")
-        first[design.id] = design.name
+    for one, other in combinations(designs, 2):
+        if one.id == other.id:
+            raise CalibrationError(f"{path}: {one.name} and {other.name} both have the id {one.id}; change one")
+        if one.looks_like(other):
+            raise CalibrationError(
+                f"{path}: {one.name} (id {one.id}) and {other.name} (id {other.id}) look the same, so that nothing "
+                "tells them apart; change or leave out one"
+            )
 
 
 def _in_polygon(vertices: Floats, x: Floats, y: Floats) -> NDArray[np.bool_]:

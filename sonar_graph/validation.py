@@ -95,7 +95,7 @@ def section_at(model: type[BaseModel], place: Place) -> type[BaseModel] | None:
 
 
 def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
-    if get_origin(annotation) in (Union, UnionType):
+    if get_origin(annotation) in (Union, UnionType, tuple, list):
         for option in get_args(annotation):
             yield from _sections(option)
     elif isinstance(annotation, type) and issubclass(annotation, BaseModel):

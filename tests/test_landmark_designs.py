@@ -1,5 +1,6 @@
 """Designs are what their file draws, wherever one looks."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -61,7 +62,7 @@ def test_picture_means_what_its_greys_say(tmp_path: Path):
 
 
 def test_folder_gives_the_designs_of_all_its_files(tmp_path: Path):
-    written(tmp_path, HALF.replace("7", "8"), "b.toml")
+    written(tmp_path, HALF.replace("7", "8").replace("5.0", "6.0"), "b.toml")
     written(tmp_path, HALF, "a.toml")
     assert [design.id for design in load_designs(tmp_path)] == [7, 8]
 
@@ -72,16 +73,86 @@ def test_folder_gives_the_designs_of_all_its_files(tmp_path: Path):
         ("", "no landmark designs"),
         ("[[landmark]\n", "is not TOML"),
         (HALF + HALF, "half and half both have the id 7"),
-        (HALF.replace("size_m = 0.4", "size_m = -1"), "landmark.0.size_m: Input should be greater than 0"),
-        (HALF.replace("polygon_m", "plygon_m"), "plygon_m"),
+        (HALF.replace("size_m = 0.4", "size_m = -1"), "landmark 'half': size_m: Input should be greater than or"),
+        (HALF.replace("polygon_m", "plygon_m"), "'half': shape 1.plygon_m: there is no .*did you mean polygon_m"),
+        (HALF.replace("size_m", "sizes_m"), "sizes_m: there is no such field; did you mean size_m"),
+        (HALF.replace('name = "half"', ""), r"\[\[landmark\]\] number 1: name: is missing"),
+        (HALF.replace("= 0.4", "= inf"), "'half': size_m: .*not inf"),
+        (HALF.replace("= 0.4", "= 0.0005"), "'half': size_m: .*not 0.0005"),
+        (HALF.replace("= 0.4", "= 42.0"), "'half': size_m: .*less than or equal to 2, not 42"),
+        (HALF.replace("= 0.02", "= nan"), "'half': height_m: .*not nan"),
+        (HALF.replace("id = 7", "id = 100000000000000000000"), "'half': id: .*less than or equal to 2147483647"),
+        (HALF.replace("= 5.0", "= nan"), "'half': shape 1.level_db: .*not nan"),
+        (HALF.replace("= 5.0", "= inf"), "'half': shape 1.level_db: .*not inf"),
+        (HALF.replace("[0.0, 0.2]]", "[0.0, inf]]"), "'half': shape 1.polygon_m.3.1: .*not inf"),
+        (HALF.replace("= 5.0", "= 2.0"), "'half': nowhere more than 2 dB over the floor"),
+        (HALF.replace("= 5.0", "= -5.0"), "'half': nowhere more than -5 dB over the floor"),
+        (HALF.replace("0.2", "0.0"), "'half': shape 1 covers nothing of the square"),
+        (HALF.replace("0.0,", "0.3,"), "shape 1 covers nothing of the square, which reaches from -0.2 to 0.2 m"),
+        (HALF + HALF.replace("7", "8").replace("half", "twin"), r"half \(id 7\) and twin \(id 8\) look the same"),
+        (HALF.replace("[[landmark]]", "[landmark]"), r"landmark: write \[\[landmark\]\] with two brackets"),
+        ("landmark = [3]", r"landmark: write \[\[landmark\]\] with two brackets"),
+        ("[imu]\n", r"imu: unknown; a designs file has \[\[landmark\]\] tables only"),
         (HALF.replace("shapes", "#"), "give either shapes or picture"),
-        (HALF + "[[landmarks]]\n", "landmarks"),
+        (HALF + "[[landmarks]]\n", r"landmarks: unknown; did you mean \[\[landmark\]\]"),
         ('[[landmark]]\nid = 1\nname = "a"\nsize_m = 1\npicture = "none.png"\n', "none.png is not a picture"),
     ],
 )
 def test_impossible_files_are_refused_with_the_reason(tmp_path: Path, text: str, complaint: str):
-    with pytest.raises(CalibrationError, match=complaint):
+    with pytest.raises(CalibrationError, match=complaint) as refusal:
         load_designs(written(tmp_path, text))
+    assert "\n" not in str(refusal.value)
+    assert "landmarks.toml" in str(refusal.value)
+
+
+def pictured(folder: Path, picture: np.ndarray, id_: int = 9, name: str = "ring") -> str:
+    cv2.imwrite(str(folder / f"{name}.png"), picture)
+    return f'[[landmark]]\nid = {id_}\nname = "{name}"\nsize_m = 0.4\npicture = "{name}.png"\n'
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_wholly_transparent_picture_is_refused(tmp_path: Path, kind: type[np.unsignedinteger]):
+    """Of 16 bits the limit lies in their middle, not at 128."""
+    picture = np.full((4, 4, 4), np.iinfo(kind).max, kind)
+    picture[..., 3] = np.iinfo(kind).max // 2 - 1
+    with pytest.raises(CalibrationError, match="landmark 'ring': its picture is wholly transparent"):
+        load_designs(written(tmp_path, pictured(tmp_path, picture)))
+
+
+def test_even_picture_at_the_level_of_the_floor_is_refused(tmp_path: Path):
+    text = pictured(tmp_path, np.full((4, 4), 102, np.uint8))
+    with pytest.raises(CalibrationError, match="landmark 'ring': nowhere more than 0 dB over the floor"):
+        load_designs(written(tmp_path, text))
+
+
+def test_picture_that_memory_may_not_hold_is_refused(tmp_path: Path):
+    text = pictured(tmp_path, np.full((2001, 2001), 255, np.uint8))
+    with pytest.raises(CalibrationError, match="2001 x 2001; make it 2000 x 2000 or smaller"):
+        load_designs(written(tmp_path, text))
+
+
+def test_pictures_that_are_each_other_turned_are_refused_and_mirrored_ones_are_not(tmp_path: Path):
+    picture = np.zeros((4, 4), np.uint8)
+    picture[0, :3] = picture[1, 0] = 255
+    one = pictured(tmp_path, picture)
+    with pytest.raises(CalibrationError, match=r"ring \(id 9\) and turned \(id 10\) look the same"):
+        load_designs(written(tmp_path, one + pictured(tmp_path, np.rot90(picture), 10, "turned")))
+    assert len(load_designs(written(tmp_path, one + pictured(tmp_path, picture.T, 10, "mirrored")))) == 2
+
+
+def test_digest_is_that_of_all_that_a_landmark_looks_like():
+    disc = DEFAULT_DESIGNS[0]
+    changed = disc.mask.copy()
+    changed[100, 100] = np.nan
+    others = [
+        replace(disc, name="disk"),
+        replace(disc, size_m=0.41),
+        replace(disc, height_m=0.02),
+        replace(disc, mask=changed),
+        replace(disc, mask=disc.mask + 0.5),
+    ]
+    assert len({disc.digest(), *(other.digest() for other in others)}) == 6
+    assert disc.digest() == replace(disc, mask=disc.mask.copy(), id=8).digest()
 
 
 def test_missing_file_is_named(tmp_path: Path):
