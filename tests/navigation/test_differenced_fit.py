@@ -1,0 +1,56 @@
+"""The fit against textbook generalised least squares with the dense covariance, written down anew."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+from sonar_graph.navigation.differenced_fit import Stretch, fit
+
+RATIOS = np.array([0.3, 0.02])
+WIDE = np.array([1e4, 1e4])
+
+
+def stretch_of(seed: int, walks: tuple[bool, bool, bool]) -> Stretch:
+    rng = np.random.default_rng(seed)
+    m = 20
+    return Stretch(
+        rng.standard_normal((m, 3)), rng.standard_normal((m, 3, 2)), np.tile(np.eye(3), (m, 1, 1)), np.ones(m), walks
+    )
+
+
+def dense_covariance(m: int, walks: bool) -> np.ndarray:
+    """Of differences of white samples, plus a rate's white noise, plus the walk of a rate from the beginning."""
+    difference = np.diff(np.eye(m + 1), axis=0)
+    walk = np.minimum.outer(np.arange(m) + 0.5, np.arange(m) + 0.5)
+    return difference @ difference.T + RATIOS[0] * np.eye(m) + RATIOS[1] * walk * walks
+
+
+def textbook(stretches: list[Stretch]) -> tuple[np.ndarray, np.ndarray]:
+    """Common parameters and covariance, each stretch's own as columns of one large problem; rows axis by axis."""
+    m = len(stretches[0].y)
+    A = np.concatenate([s.A.transpose(1, 0, 2).reshape(3 * m, -1) for s in stretches])
+    B = block_diag(*[s.B.transpose(1, 0, 2).reshape(3 * m, -1) for s in stretches])
+    y = np.concatenate([s.y.T.ravel() for s in stretches])
+    weight = np.linalg.inv(block_diag(*[dense_covariance(m, walks) for s in stretches for walks in s.walks]))
+    columns = np.hstack([A, B])
+    information = columns.T @ weight @ columns
+    found = np.linalg.solve(information, columns.T @ weight @ y)
+    left = y - columns @ found
+    variance = left @ weight @ left / (len(y) - columns.shape[1])
+    return found[:2], variance * np.linalg.inv(information)[:2, :2]
+
+
+@pytest.mark.parametrize("walks", [(True, True, True), (True, True, False), (False, False, False)])
+def test_fit_is_generalised_least_squares_with_a_walk_on_the_axes_that_walk(walks):
+    stretches = [stretch_of(seed, walks) for seed in range(4)]
+    parameters, covariance = textbook(stretches)
+    found = fit(stretches, WIDE, RATIOS)
+    assert found.parameters == pytest.approx(parameters, rel=1e-6)
+    assert found.covariance == pytest.approx(covariance, rel=1e-6)
+
+
+def test_which_axes_walk_matters():
+    both = [fit([stretch_of(0, walks)], WIDE, RATIOS).parameters for walks in ((True,) * 3, (True, True, False))]
+    assert np.abs(both[0] - both[1]).max() > 1e-3
