@@ -12,7 +12,8 @@ from sonar_graph.calibration import Calibration, Section
 from sonar_graph.measurements import Floats, LandmarkDetections, Measurements
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
 from sonar_graph.navigation.earth import earth_rate_in_world
-from sonar_graph.navigation.odometry import Odometry, Steps
+from sonar_graph.navigation.node_motion import motion_between_nodes, motion_since_node
+from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.slam.association import DetectionJournal
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
 
@@ -102,7 +103,7 @@ class DeadReckoning:
     def _advance(self, node_ns: int, instant_ns: int) -> int:
         """Commit all nodes reached by then; returns the newest."""
         for reached_ns in self._odometry.nodes(node_ns, instant_ns).tolist():
-            motion = self._integrate(self._odometry.steps_between_nodes(node_ns, reached_ns))
+            motion = motion_between_nodes(*self._from_node(node_ns, reached_ns))
             self._P = self._carried(motion)
             self._pose = self._pose.compose(motion.i_T_j)
             node_ns = reached_ns
@@ -110,9 +111,12 @@ class DeadReckoning:
         self._node_ns = node_ns
         return node_ns
 
-    def _integrate(self, steps: Steps) -> PreintegratedMotion:
+    def _from_node(
+        self, node_ns: int, until_ns: int
+    ) -> tuple[Odometry, Preintegrator, int, int, Floats, Floats | None]:
+        """What a motion from the newest node committed needs."""
         earth_rate = None if self._earth_rate is None else self._pose.rotation().matrix().T @ self._earth_rate
-        return self._preintegrator.integrate(steps, _ZERO_BIAS, earth_rate)
+        return self._odometry, self._preintegrator, node_ns, until_ns, _ZERO_BIAS, earth_rate
 
     def _carried(self, motion: PreintegratedMotion) -> Floats:
         """Covariance of [theta, rho, bias] after a motion, shape (9, 9)."""
@@ -125,7 +129,7 @@ class DeadReckoning:
         return np.asarray(0.5 * (P + P.T))
 
     def _estimate(self, node_ns: int, instant_ns: int) -> Estimate:
-        motion = self._integrate(self._odometry.steps_since_node(node_ns, instant_ns))
+        motion = motion_since_node(*self._from_node(node_ns, instant_ns))
         return Estimate(instant_ns, self._pose.compose(motion.i_T_j), self._carried(motion)[:6, :6].copy())
 
 

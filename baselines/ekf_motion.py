@@ -14,10 +14,11 @@ from typing import NamedTuple
 from baselines.ekf_prediction import VehicleModel
 from baselines.euler import rotation_from_euler
 from sonar_graph.measurements import Floats
+from sonar_graph.navigation.gap_motion import bridge
 from sonar_graph.navigation.kernels import compiled, inlined
 from sonar_graph.navigation.odometry import Columns, Cursor, cursor_at, next_step, rows_until
 from sonar_graph.navigation.recursion import NO_MOTION, Integral, extended, increment, mirrored, rate_of_turn
-from sonar_graph.navigation.triples import ZERO, Vector, times, transposed, vector
+from sonar_graph.navigation.triples import ZERO, Vector, gram, multiple_of, sum_of, times, transposed, vector
 
 
 class RunningMotion(NamedTuple):
@@ -35,6 +36,8 @@ class RunningMotion(NamedTuple):
 @compiled
 def motion_to_node(columns: Columns, vehicle: VehicleModel, x: Floats, start_ns: int, node_ns: int) -> Integral:
     """Final motion to the next node, with the first IMU row at or after it."""
+    if node_ns - start_ns > vehicle.gap[0]:
+        return _bridged(columns, vehicle, x, start_ns, node_ns, True)
     imu_ns, dvl_ns = columns[0], columns[3]
     imu_rows, dvl_rows = rows_until(imu_ns, node_ns - 1) + 1, rows_until(dvl_ns, node_ns)
     start, earth = cursor_at(columns, start_ns), earth_in_body(vehicle, x)
@@ -53,6 +56,8 @@ def motion_since_node(
     running
         As returned for an earlier instant, or by `nothing_running`.
     """
+    if until_ns - node_ns > vehicle.gap[0]:
+        return running, _bridged(columns, vehicle, x, node_ns, until_ns, False)
     imu_ns, dvl_ns = columns[0], columns[3]
     imu_rows, dvl_rows = rows_until(imu_ns, until_ns), rows_until(dvl_ns, until_ns)
     earth = earth_in_body(vehicle, x)
@@ -63,6 +68,36 @@ def motion_since_node(
     cursor, motion = _integrate(columns, vehicle, imu_rows, dvl_rows, earth, cursor, motion, newest_ns)
     _, until = _integrate(columns, vehicle, imu_rows, dvl_rows, earth, cursor, motion, until_ns)
     return RunningMotion(node_ns, dvl_rows, earth, cursor, motion), _finished(until)
+
+
+@compiled
+def _bridged(
+    columns: Columns, vehicle: VehicleModel, x: Floats, start_ns: int, end_ns: int, is_closed: bool
+) -> Integral:
+    """Motion over a gap of the Doppler log, with what an unknown gyro bias adds to the displacement.
+
+    The state has no bias. Elsewhere its drift is left out, as published; in a gap it tilts gravity, and the
+    displacement would be wrong by many times its sigma.
+    """
+    motion, _, D = bridge(columns, vehicle.gap, start_ns, end_ns, is_closed, ZERO, earth_in_body(vehicle, x))
+    cov_rr = sum_of(motion.cov_rr, multiple_of(vehicle.gyro_bias_sigma**2, gram(D)))
+    return Integral(motion.dR, motion.dp, motion.impulse, motion.cov_tt, motion.cov_rt, cov_rr)
+
+
+@compiled
+def told_again(motion: Integral, times_told: int) -> Integral:
+    """The motion to the k-th measurement that is related to the state over the same gap.
+
+    All share its error. Taken as independent, many of them would tell more than one exact one can: with k (k + 1) times
+    the covariance the information of all together stays below that, since ``sum 1 / (k (k + 1)) = 1``.
+    """
+    share = float(times_told * (times_told + 1))
+    tt, rt, rr = (
+        multiple_of(share, motion.cov_tt),
+        multiple_of(share, motion.cov_rt),
+        multiple_of(share, motion.cov_rr),
+    )
+    return Integral(motion.dR, motion.dp, motion.impulse, tt, rt, rr)
 
 
 @compiled

@@ -20,6 +20,7 @@ from baselines.ekf_landmarks import add_covariances, moment_after, motion_covari
 from baselines.ekf_state import correct, predict
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.alignment import tilt_sigma, up_direction
+from sonar_graph.navigation.gap_motion import NO_GAPS, GapValues
 from sonar_graph.navigation.kernels import compiled, inlined
 from sonar_graph.navigation.odometry import Columns, rows_until, value_at
 from sonar_graph.navigation.recursion import Integral
@@ -37,8 +38,9 @@ from sonar_graph.navigation.triples import (
 )
 from sonar_graph.slam.models import wrap_angle
 
-NODE, OPENED = 0, 1
-"""Places in `Clock`: stamp of the state, stamp at which the running gravity interval began."""
+NODE, OPENED, DEPTHS, SIGHTINGS = 0, 1, 2, 3
+"""Places in the clock: stamp of the state, stamp at which the running gravity interval began, and how many depth
+samples and detections were used since the Doppler log lost the bottom."""
 
 
 class VehicleModel(NamedTuple):
@@ -60,6 +62,9 @@ class VehicleModel(NamedTuple):
     plane_z_m: float
     plane_z_variance: float
     plane_tilt_variance: float
+    gap: GapValues = NO_GAPS
+    gyro_bias_sigma: float = 0.0
+    """Of gaps only, rad/s."""
 
 
 class GravityInterval(NamedTuple):
@@ -73,7 +78,9 @@ class GravityInterval(NamedTuple):
     """Of the IMU's point when it began, shape (3,), and the variance of one component: shape (4,)."""
 
 
-VehicleValues = tuple[float, Vector, Vector, Vector, Vector, int, float, float, float, bool, float, float, float]
+VehicleValues = tuple[
+    float, Vector, Vector, Vector, Vector, int, float, float, float, bool, float, float, float, GapValues, float
+]
 GravityValues = tuple[Floats, Floats, Floats]
 
 
@@ -132,6 +139,7 @@ def advance_to_node(
     """
     predict(x, P, n, motion)
     clock[NODE] = node_ns
+    clock[DEPTHS:] = 0
     if model.gravity_interval_ns > 0:
         _extend(interval, motion)
         if clock[NODE] - clock[OPENED] >= model.gravity_interval_ns:

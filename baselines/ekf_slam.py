@@ -19,6 +19,7 @@ from sonar_graph.calibration import Calibration, Section, Start
 from sonar_graph.errors import EstimatorError, MeasurementError
 from sonar_graph.measurements import Depth, Floats, Ints, LandmarkDetections, Measurements
 from sonar_graph.navigation.earth import earth_rate_in_world
+from sonar_graph.navigation.gap_motion import gap_values
 from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.navigation.triples import ZERO, matrix, minus, vector
 from sonar_graph.slam.association import DetectionJournal, gate_threshold, identify
@@ -59,6 +60,9 @@ class EkfSlam:
       the integrated gyro and Doppler noise, lever arms included.
     - There is no gyro bias in the state (4). Its drift is not in the covariance either: with a biased gyro this filter
       trusts its heading too much, and gates true detections sooner or later.
+    - While the Doppler log has no bottom lock the prediction is that of `sonar_graph.navigation.gap_motion`, common to
+      all estimators; only there Q holds the gyro bias, which tilts gravity. The state does not grow: what is measured
+      in a gap is related to the state before it, ever more weakly (`baselines.ekf_motion.told_again`).
     - A new landmark's elevation comes from the floor where its height is known, else it is 0; its sigma is the
       aperture over sqrt(12). A known floor enters once for each landmark, as a measurement of its height.
     - Identities need a posterior, innovations a gate (`EkfSlamParams`). A refused detection changes nothing.
@@ -86,9 +90,10 @@ class EkfSlam:
         self._journal = DetectionJournal()
         self._estimates = CausalEstimates()
         self._slots: dict[int, int] = {}
+        self._most_rows = SPARE_ROWS
         self._x, self._P = _start_state(calibration.start)
         self._n = POSE
-        self._clock: Ints = np.zeros(2, np.int64)
+        self._clock: Ints = np.zeros(4, np.int64)
         self._interval = GravityInterval(np.eye(3), np.zeros(3), np.zeros(4))
         self._vehicle_values, self._sonar_values = (*self._vehicle,), (*self._sonar,)
         self._interval_values = (*self._interval,)
@@ -221,8 +226,10 @@ class EkfSlam:
 
     def _forget(self) -> None:
         """Drop used rows now and then: that costs as much as keeping a few."""
-        if len(self._odometry.columns()[0]) > SPARE_ROWS:
+        self._odometry.settle(int(self._clock[NODE]))
+        if len(self._odometry.columns()[0]) > self._most_rows:
             self._odometry.forget_before(int(self._clock[NODE]))
+            self._most_rows = len(self._odometry.columns()[0]) + SPARE_ROWS
 
     def _record(
         self,
@@ -309,6 +316,8 @@ def _vehicle_model(calibration: Calibration, params: EkfSlamParams) -> VehicleMo
         plane_z_m=plane.z_m if plane else 0.0,
         plane_z_variance=plane.z_sigma_m**2 if plane else 1.0,
         plane_tilt_variance=plane.tilt_sigma_rad**2 if plane else 1.0,
+        gap=gap_values(calibration),
+        gyro_bias_sigma=imu.gyro_bias_sigma,
     )
 
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from baselines.ekf_landmarks import DetectionColumns, SonarModel, SonarValues, observe_rows
-from baselines.ekf_motion import motion_since_node, motion_to_node, nothing_running
+from baselines.ekf_motion import motion_since_node, motion_to_node, nothing_running, told_again
 from baselines.ekf_prediction import (
+    DEPTHS,
     NODE,
+    SIGHTINGS,
     GravityInterval,
     GravityValues,
     VehicleModel,
@@ -83,7 +85,11 @@ def process_window(
             advance_to_node(columns, vehicle, x, P, n, clock, interval, node_ns, motion)
             continue
         running, motion = motion_since_node(columns, vehicle, x, running, clock[NODE], event_ns)
+        is_gap = event_ns - clock[NODE] > vehicle.gap[0]
         if kind == DEPTH:
+            if is_gap:
+                clock[DEPTHS] += 1
+                motion = told_again(motion, clock[DEPTHS])
             variance = depth_variance if np.isnan(depth[2][sample]) else depth[2][sample]
             correct_depth(x, P, n, motion, vehicle.body_p_port, depth[1][sample], variance)
             sample += 1
@@ -91,6 +97,9 @@ def process_window(
             first = row
             while row < rows and frame_ns[row] == event_ns:
                 row += 1
+            if is_gap:
+                clock[SIGHTINGS] += row - first
+                motion = told_again(motion, clock[SIGHTINGS])
             n = observe_rows(x, P, n, motion, sonar, detections, first, row, outcomes, innovations, covs)
         else:
             return n, (outcomes, innovations, covs), pose_after(x, P, motion)

@@ -61,6 +61,8 @@ class DvlCalibration(Section):
     velocity_sigma_m_s: Vector = (0.01, 0.01, 0.01)
     """White noise of one velocity sample along each of the DVL's axes, where the log does not say."""
     mounting: Mounting = Mounting()
+    gap_s: float = Field(1.5, gt=0)
+    """Time without a sample above which the velocity is no longer taken as linear: accelerometers carry it then."""
     velocity_walk_density: float = Field(0.1, gt=0)
     """How the vehicle's velocity may change, as a random walk, m/s/√s: where it bridges gaps that no accelerometer
     measured, and in the gate of outlying velocities."""

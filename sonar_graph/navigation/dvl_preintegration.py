@@ -29,9 +29,10 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats
+from sonar_graph.navigation.gap_motion import GapValues, bridge, gap_values
 from sonar_graph.navigation.kernels import compiled
-from sonar_graph.navigation.odometry import Steps
-from sonar_graph.navigation.recursion import integrate_steps, trace_point
+from sonar_graph.navigation.odometry import Columns, Steps
+from sonar_graph.navigation.recursion import in_last_frame, integrate_steps, trace_point
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +83,14 @@ class Preintegrator:
     """rad/s/√Hz."""
     body_p_dvl: Floats
     """Lever arm of the DVL, shape (3,), m."""
+    gap: GapValues | None = None
+    """Of `sonar_graph.navigation.gap_motion`; None: the velocity is linear or held however long a gap lasts."""
 
     @classmethod
     def from_calibration(cls, calibration: Calibration) -> Preintegrator:
-        """Pick the two numbers from a calibration."""
-        return cls(calibration.imu.gyro_noise_density, np.array(calibration.dvl.mounting.translation_m))
+        """Pick the numbers from a calibration."""
+        body_p_dvl = np.array(calibration.dvl.mounting.translation_m)
+        return cls(calibration.imu.gyro_noise_density, body_p_dvl, gap_values(calibration))
 
     def integrate(self, steps: Steps, bias: Floats, earth_rate: Floats | None = None) -> PreintegratedMotion:
         """Integrate steps.
@@ -116,6 +120,34 @@ class Preintegrator:
         mean_force = impulse / duration_s if duration_s > 0 else np.full(3, np.nan)
         return PreintegratedMotion(i_T_j, cov, D, bias, duration_s, mean_force)
 
+    def bridge(
+        self,
+        columns: Columns,
+        start_ns: int,
+        end_ns: int,
+        is_closed: bool,
+        bias: Floats,
+        earth_rate: Floats | None = None,
+    ) -> PreintegratedMotion:
+        """Motion over a gap of the Doppler log (`sonar_graph.navigation.gap_motion`).
+
+        Parameters
+        ----------
+        columns
+            Of `sonar_graph.navigation.odometry.Odometry`.
+        start_ns, end_ns
+            From a node to the next, or (not closed) to an instant before it.
+        bias, earth_rate
+            As those of `integrate`.
+        """
+        assert self.gap is not None, "made without a calibration"
+        earth = (0.0, 0.0, 0.0) if earth_rate is None else _vector(earth_rate)
+        motion = bridge(columns, self.gap, start_ns, end_ns, is_closed, _vector(bias), earth)
+        rotation, displacement, cov, D, impulse = in_last_frame(*motion)
+        duration_s = (end_ns - start_ns) * 1e-9
+        pose = gtsam.Pose3(gtsam.Rot3(rotation), displacement)
+        return PreintegratedMotion(pose, cov, D, bias, duration_s, impulse / duration_s)
+
     def path_of(self, point: Floats, steps: Steps, bias: Floats, offsets_s: Floats) -> Floats:
         """Positions of a point of the body at times after the first instant, in the first body frame.
 
@@ -139,3 +171,7 @@ def _chained(
     A: Floats, cov: Floats, D: Floats, next_cov: Floats, next_D: Floats, impulse: Floats, next_impulse: Floats
 ) -> tuple[Floats, Floats, Floats]:
     return A @ cov @ A.T + next_cov, A @ D + next_D, impulse + next_impulse
+
+
+def _vector(a: Floats) -> tuple[float, float, float]:
+    return float(a[0]), float(a[1]), float(a[2])

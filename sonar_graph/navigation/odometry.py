@@ -25,7 +25,9 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.navigation.inertial_carry import InertialRows
 from sonar_graph.navigation.kernels import compiled, inlined
+from sonar_graph.navigation.partial_velocity import PartialVelocities
 from sonar_graph.navigation.recursion import Step
 from sonar_graph.navigation.triples import (
     Matrix,
@@ -39,6 +41,7 @@ from sonar_graph.navigation.triples import (
     sum_of,
     vector,
 )
+from sonar_graph.navigation.velocity_gate import GATE, Refusal, RefusedRow, distances
 
 Columns = tuple[Ints, Floats, Floats, Ints, Floats, Floats, bool]
 """IMU: stamps, rate, specific force. DVL: stamps, velocity, covariance. Whether a sample holds for what lies before."""
@@ -73,6 +76,9 @@ class Steps:
         return len(self.duration_s)
 
 
+_Rows = TypeVar("_Rows", Imu, Dvl)
+
+
 class Odometry:
     """Keeps the rows that are still needed and turns them into steps.
 
@@ -87,6 +93,13 @@ class Odometry:
         self._body_R_dvl = _rotation(calibration.dvl.mounting)
         self._default_cov = np.diag(np.square(calibration.dvl.velocity_sigma_m_s))
         self._hold_past = calibration.odometry_interpolation == "hold-past"
+        self._longest_ns = longest_interval_ns(calibration)
+        self._partial = PartialVelocities(calibration)
+        self._walk = calibration.dvl.velocity_walk_density
+        self.settled_ns: int = _EARLIEST
+        """Up to when motion is used and stays as it is."""
+        self.refused: list[RefusedRow] = []
+        """Rows that are not used, and why."""
         self._imu_ns: Ints = np.empty(0, np.int64)
         self._rate: Floats = np.empty((0, 3))
         self._force: Floats = np.empty((0, 3))
@@ -94,31 +107,94 @@ class Odometry:
         self._velocity: Floats = np.empty((0, 3))
         self._cov: Floats = np.empty((0, 3, 3))
 
-    def add(self, imu: Imu | None, dvl: Dvl | None) -> None:
-        """Take in rows; those not newer than what is already there, or stamped as the row before, are passed over."""
-        newer_imu = None if imu is None else _newer(imu, self._imu_ns)
-        newer_dvl = None if dvl is None else _newer(dvl, self._dvl_ns)
-        if newer_imu is not None:
-            self._add_imu(newer_imu)
-        if newer_dvl is not None:
-            self._add_dvl(newer_dvl)
+    def add(self, imu: Imu | None, dvl: Dvl | None) -> bool:
+        """Take in rows and place them by their stamps.
 
-    def _add_imu(self, imu: Imu) -> None:
-        self._imu_ns = np.concatenate([self._imu_ns, imu.stamps_ns])
+        Of rows with equal stamps the first counts. A row stamped at or before `settled_ns` is late, and a velocity may
+        be an outlier (`sonar_graph.navigation.velocity_gate`): these become rows of `refused`.
+
+        Returns
+        -------
+        Whether rows were placed before others that are there already: provisional motion has to be had anew.
+        """
+        placed_imu = imu is not None and self._add_imu(imu)
+        placed_dvl = dvl is not None and self._add_dvl(dvl)
+        return placed_imu or placed_dvl
+
+    def _add_imu(self, rows: Imu) -> bool:
+        imu = self._in_time(rows, self._imu_ns, "imu")
+        if imu is None:
+            return False
         rate, force = imu.angular_velocity, imu.specific_force
         if self._body_R_imu is not None:
             rate, force = rate @ self._body_R_imu.T, force @ self._body_R_imu.T
+        comes_after = not len(self._imu_ns) or bool(imu.stamps_ns[0] > self._imu_ns[-1])
+        self._imu_ns = np.concatenate([self._imu_ns, imu.stamps_ns])
         self._rate = np.concatenate([self._rate, rate])
         self._force = np.concatenate([self._force, force])
+        if not comes_after:
+            order = np.unique(self._imu_ns, return_index=True)[1]
+            self._imu_ns, self._rate, self._force = self._imu_ns[order], self._rate[order], self._force[order]
+        return not comes_after
 
-    def _add_dvl(self, dvl: Dvl) -> None:
-        cov = np.where(np.isnan(dvl.velocity_cov), self._default_cov, dvl.velocity_cov)
-        self._dvl_ns = np.concatenate([self._dvl_ns, dvl.stamps_ns])
-        velocity = dvl.velocity
-        if self._body_R_dvl is not None:
-            velocity, cov = velocity @ self._body_R_dvl.T, self._body_R_dvl @ cov @ self._body_R_dvl.T
+    def _add_dvl(self, rows: Dvl) -> bool:
+        dvl = self._in_time(rows, self._dvl_ns, "dvl")
+        if dvl is None:
+            return False
+        velocity, cov = self._in_body(dvl)
+        stamps_ns, velocity, cov = self._believed(dvl.stamps_ns, velocity, cov)
+        if not len(stamps_ns):
+            return False
+        stamps_ns, velocity, cov = self._partial.completed(stamps_ns, velocity, cov, InertialRows(*self.columns()[:3]))
+        if not len(stamps_ns):
+            return False
+        comes_after = not len(self._dvl_ns) or bool(stamps_ns[0] > self._dvl_ns[-1])
+        self._dvl_ns = np.concatenate([self._dvl_ns, stamps_ns])
         self._velocity = np.concatenate([self._velocity, velocity])
         self._cov = np.concatenate([self._cov, cov])
+        if not comes_after:
+            order = np.unique(self._dvl_ns, return_index=True)[1]
+            self._dvl_ns, self._velocity, self._cov = self._dvl_ns[order], self._velocity[order], self._cov[order]
+        return not comes_after
+
+    def _in_body(self, dvl: Dvl) -> tuple[Floats, Floats]:
+        """Velocity and its covariance in body axes."""
+        cov = np.where(np.isnan(dvl.velocity_cov), self._default_cov, dvl.velocity_cov)
+        if self._body_R_dvl is None:
+            return dvl.velocity, cov
+        return dvl.velocity @ self._body_R_dvl.T, self._body_R_dvl @ cov @ self._body_R_dvl.T
+
+    def _believed(self, stamps_ns: Ints, velocity: Floats, cov: Floats) -> tuple[Ints, Floats, Floats]:
+        """Rows that are no outliers, each beside the one before it; held velocities may jump and are all believed."""
+        if self._hold_past:
+            return stamps_ns, velocity, cov
+        k = int(np.searchsorted(self._dvl_ns, stamps_ns[0])) - 1
+        before = (int(self._dvl_ns[k]), self._velocity[k], self._cov[k]) if k >= 0 else (_LATEST, velocity[0], cov[0])
+        found = distances(stamps_ns, velocity, cov, *before, self._walk)
+        is_outlier = found > GATE
+        if not is_outlier.any():
+            return stamps_ns, velocity, cov
+        for stamp_ns, distance in zip(stamps_ns[is_outlier].tolist(), found[is_outlier].tolist(), strict=True):
+            self.refused.append(RefusedRow("dvl", stamp_ns, Refusal.OUTLIER, distance))
+        return stamps_ns[~is_outlier], velocity[~is_outlier], cov[~is_outlier]
+
+    def _in_time(self, rows: _Rows, known_ns: Ints, sensor: str) -> _Rows | None:
+        """Rows that can still be used, each stamp once."""
+        if rows.stamps_ns[0] <= self.settled_ns:
+            late = rows.between(_EARLIEST, self.settled_ns)
+            new = [] if late is None else np.setdiff1d(late.stamps_ns, known_ns).tolist()
+            self.refused += [RefusedRow(sensor, stamp_ns, Refusal.LATE, np.nan) for stamp_ns in new]
+            later = rows.between(self.settled_ns, _LATEST)
+            if later is None:
+                return None
+            rows = later
+        if _has_repeats(rows.stamps_ns):
+            rows = rows.rows(np.unique(rows.stamps_ns, return_index=True)[1])
+        return rows
+
+    def settle(self, node_ns: int) -> None:
+        """Motion up to a node is used and stays as it is: rows up to there come too late from now on."""
+        self.settled_ns = max(self.settled_ns, node_ns)
 
     def start_ns(self) -> int | None:
         """First node that IMU rows cover from both sides; None before there is one."""
@@ -151,6 +227,17 @@ class Odometry:
         dvl_rows = int(np.searchsorted(self._dvl_ns, until_ns, side="right"))
         return self._steps(node_ns, until_ns, imu_rows, dvl_rows)
 
+    def is_gap(self, start_ns: int, end_ns: int) -> bool:
+        """Whether the velocity is not taken as linear, or held, over a time without samples."""
+        return end_ns - start_ns > self._longest_ns
+
+    def gaps(self, start_ns: int, end_ns: int) -> list[tuple[int, int]]:
+        """Stamps of successive nodes with a gap in between, from one node to another."""
+        first, last = np.searchsorted(self._dvl_ns, [start_ns, end_ns])
+        within = self._dvl_ns[first : last + 1]
+        before = np.flatnonzero(np.diff(within) > self._longest_ns)
+        return list(zip(within[before].tolist(), within[before + 1].tolist(), strict=True)) if len(before) else []
+
     def _steps(self, start_ns: int, end_ns: int, imu_rows: int, dvl_rows: int) -> Steps:
         return Steps(*merge_rows(self.columns(), imu_rows, dvl_rows, start_ns, end_ns))
 
@@ -175,9 +262,11 @@ class Odometry:
         )
 
     def forget_before(self, node_ns: int) -> None:
-        """Drop rows that no motion from this node on can need."""
-        first_imu = max(int(np.searchsorted(self._imu_ns, node_ns)) - 1, 0)
-        first_dvl = max(int(np.searchsorted(self._dvl_ns, node_ns)) - 1, 0)
+        """Drop rows that no motion from this node on can need, gaps after it included."""
+        self.settle(node_ns)
+        needed_ns = node_ns if self._hold_past else node_ns - WINDOW_NS
+        first_imu = max(int(np.searchsorted(self._imu_ns, needed_ns)) - 1, 0)
+        first_dvl = max(int(np.searchsorted(self._dvl_ns, needed_ns)) - 1, 0)
         self._imu_ns, self._rate, self._force = (
             self._imu_ns[first_imu:],
             self._rate[first_imu:],
@@ -191,27 +280,19 @@ class Odometry:
 
 
 _EARLIEST, _LATEST = np.iinfo(np.int64).min, np.iinfo(np.int64).max
+WINDOW_NS = 5_000_000_000
+"""Rows kept before a node, where gravity is found should bottom lock be lost there: enough for 1 mm/s² with samples of
+5 mm/s at 7 Hz, short enough for an accelerometer's bias not to have turned."""
+
+
+def longest_interval_ns(calibration: Calibration) -> int:
+    """Between velocity samples that is no gap; held samples leave none."""
+    return _LATEST if calibration.odometry_interpolation == "hold-past" else round(calibration.dvl.gap_s * 1e9)
 
 
 def _rotation(mounting: Mounting) -> Floats | None:
     """body_R_sensor, None for a sensor whose axes are the body's."""
     return mounting.pose().rotation().matrix() if any(mounting.rpy_rad) else None
-
-
-_Rows = TypeVar("_Rows", Imu, Dvl)
-
-
-def _newer(block: _Rows, stamps_ns: Ints) -> _Rows | None:
-    """Rows of the block after those that are there already; of equal stamps the first."""
-    after_ns = _last(stamps_ns)
-    newer = block if block.stamps_ns[0] > after_ns else block.between(after_ns, _LATEST)
-    if newer is None or not _has_repeats(newer.stamps_ns):
-        return newer
-    return newer.rows(np.unique(newer.stamps_ns, return_index=True)[1])
-
-
-def _last(stamps_ns: Ints) -> int:
-    return int(stamps_ns[-1]) if len(stamps_ns) else _EARLIEST
 
 
 @compiled
@@ -260,7 +341,13 @@ def node_range(imu_ns: Ints, dvl_ns: Ints, after_ns: int, until_ns: int) -> tupl
 @inlined
 def value_at(stamps: Ints, values: Floats, i: int, t: int, hold_past: bool) -> Vector:
     """Value at t, where ``stamps[i - 1] < t <= stamps[i]``; the nearest end's value outside the rows."""
-    return _between(values, *_bracket(stamps, len(stamps), i, t, hold_past))
+    return value_among(stamps, values, len(stamps), i, t, hold_past)
+
+
+@inlined
+def value_among(stamps: Ints, values: Floats, rows: int, i: int, t: int, hold_past: bool) -> Vector:
+    """The same, of the first rows only."""
+    return _between(values, *_bracket(stamps, rows, i, t, hold_past))
 
 
 @inlined

@@ -180,7 +180,7 @@ def integrate_steps(
         D_t = difference_of(D_t, multiple_of(step.duration_s, added.theta_by_rate))
         D_r = difference_of(D_r, multiple_of(step.duration_s, added.eps_by_rate))
         motion = extended(motion, step, added, gyro_density)
-    return _in_last_frame(motion, D_t, D_r)
+    return in_last_frame(motion, D_t, D_r)
 
 
 @compiled
@@ -271,8 +271,8 @@ def _chord_derivative(phi: Vector, u: Vector, scale: float) -> Matrix:
     )
 
 
-@inlined
-def _in_last_frame(motion: Integral, D_t: Matrix, D_r: Matrix) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+@compiled
+def in_last_frame(motion: Integral, D_t: Matrix, D_r: Matrix) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Arrays of `integrate_steps`: covariance and bias Jacobian turned from frame i into frame j."""
     j_R_i = transposed(motion.dR)
     rt = sandwich(j_R_i, motion.cov_rt, j_R_i)

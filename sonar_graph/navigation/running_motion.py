@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
-from sonar_graph.navigation.odometry import Odometry, Steps
+from sonar_graph.navigation.node_motion import motion_between_nodes, motion_since_node
+from sonar_graph.navigation.odometry import Odometry
 
 
 class RunningMotion:
@@ -41,14 +42,17 @@ class RunningMotion:
         """Provisional motion to an instant not before that of any earlier call."""
         newest_ns = self._odometry.newest_node(self._reached_ns, instant_ns)
         if newest_ns is not None:
-            self._reached = self._after(self._odometry.steps_between_nodes(self._reached_ns, newest_ns))
+            motion = motion_between_nodes(*self._from_reached(newest_ns))
+            self._reached = motion if self._reached is None else self._reached.then(motion)
             self._reached_ns = newest_ns
         if instant_ns == self._reached_ns and self._reached is not None:
             return self._reached
-        return self._after(self._odometry.steps_since_node(self._reached_ns, instant_ns))
+        motion = motion_since_node(*self._from_reached(instant_ns))
+        return motion if self._reached is None else self._reached.then(motion)
 
-    def _after(self, steps: Steps) -> PreintegratedMotion:
-        if self._reached is None:
-            return self._preintegrator.integrate(steps, self._bias, self._earth_rate)
-        earth_rate = None if self._earth_rate is None else self._reached.i_T_j.rotation().unrotate(self._earth_rate)
-        return self._reached.then(self._preintegrator.integrate(steps, self._bias, earth_rate))
+    def _from_reached(self, until_ns: int) -> tuple[Odometry, Preintegrator, int, int, Floats, Floats | None]:
+        """What a motion from the newest node reached needs."""
+        earth_rate = self._earth_rate
+        if earth_rate is not None and self._reached is not None:
+            earth_rate = self._reached.i_T_j.rotation().unrotate(earth_rate)
+        return self._odometry, self._preintegrator, self._reached_ns, until_ns, self._bias, earth_rate

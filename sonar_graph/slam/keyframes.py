@@ -7,7 +7,8 @@ The gyro bias is constant over stretches of ``bias_interval_s`` and walks betwee
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -20,12 +21,15 @@ from sonar_graph.navigation.depth_mean import weights_at_end
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
 from sonar_graph.navigation.earth import earth_rate_in_world
 from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.node_motion import motion_between_nodes
 from sonar_graph.navigation.odometry import Odometry, Steps
 from sonar_graph.navigation.running_motion import RunningMotion
 from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import Smoother
 
 S_PER_NS = 1e-9
+CARRIED_IN_GAP_NS = 300_000_000
+"""Over the end of a gap, straight on, a depth sample is carried no longer than this."""
 EARLIEST_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 
@@ -37,6 +41,14 @@ class KeyframePolicy:
     motion_noise_share: float
     """Variance of the motion since the last keyframe over the sonar's, above which a frame gets a keyframe."""
     bias_interval_s: float
+
+
+class Carried(NamedTuple):
+    """The way on which depth samples reach a keyframe."""
+
+    start_ns: int
+    steps: Steps
+    motion: PreintegratedMotion
 
 
 @dataclass
@@ -61,6 +73,7 @@ class Keyframes:
         self._running: RunningMotion | None = None
         self._latest: tuple[int, PreintegratedMotion] | None = None
         self._depths: list[Depth] = []
+        self._told = 0
         self._earth = earth_rate_in_world(self.calibration)
 
     @property
@@ -80,7 +93,8 @@ class Keyframes:
 
     def add(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None) -> None:
         """Take in rows; depths not newer than those that wait are passed over."""
-        self.odometry.add(imu, dvl)
+        if self.odometry.add(imu, dvl):
+            self._running = None
         self._latest = None
         newest_ns = self._depths[-1].stamps_ns[-1] if self._depths else EARLIEST_NS
         if depth is not None and (in_order := depth.between(newest_ns, LATEST_NS)):
@@ -113,10 +127,22 @@ class Keyframes:
             From what is then the newest keyframe to the frame.
         """
         node_ns = self.odometry.newest_node(self.stamps_ns[-1], stamp_ns)
-        if node_ns is None or not self._is_noisy(motion):
+        if node_ns is not None and self._is_noisy(motion):
+            self._set(node_ns)
+            motion = self.motion_since_newest(stamp_ns)
+        return self._told_again(motion, node_ns or self.stamps_ns[-1], stamp_ns)
+
+    def _told_again(self, motion: PreintegratedMotion, node_ns: int, stamp_ns: int) -> PreintegratedMotion:
+        """The motion to the k-th frame that is tied to a keyframe over the same gap of the Doppler log.
+
+        All share its error. Taken as independent, many of them would tell more than one exact one can: with k (k + 1)
+        times the covariance the information of all together stays below that, since ``sum 1 / (k (k + 1)) = 1``.
+        """
+        if not self.odometry.is_gap(node_ns, stamp_ns):
+            self._told = 0
             return motion
-        self._set(node_ns)
-        return self.motion_since_newest(stamp_ns)
+        self._told += 1
+        return replace(motion, covariance=motion.covariance * (self._told * (self._told + 1)))
 
     def _is_noisy(self, motion: PreintegratedMotion) -> bool:
         """Whether the motion's noise, and what the gyro bias may add to it, would blur what the sonar saw."""
@@ -176,16 +202,27 @@ class Keyframes:
 
     def _set(self, node_ns: int) -> None:
         i, j = len(self.stamps_ns) - 1, len(self.stamps_ns)
-        steps = self.odometry.steps_between_nodes(self.stamps_ns[i], node_ns)
-        motion = self._preintegrator.integrate(steps, self.bias(i), self._earth_rate())
+        motion, carried = self._motion_to(node_ns)
         self.smoother.add_pose(X(j), self.smoother.values.atPose3(X(i)).compose(motion.i_T_j), node_ns * S_PER_NS)
         self.smoother.add([self._odometry_factor(i, motion), *self._gravity(j, node_ns, motion)])
-        self.smoother.add(self._depth(j, node_ns, steps, motion))
+        self.smoother.add(self._depth(j, node_ns, carried))
         self.bias_keys.append(self._next_bias_key(i, node_ns))
         self.stamps_ns.append(node_ns)
         self._running = self._latest = None
         self._constrain(j)
         self.odometry.forget_before(node_ns)
+
+    def _motion_to(self, node_ns: int) -> tuple[PreintegratedMotion, Carried]:
+        """From the newest keyframe to a node, and how depth samples reach it: not over a gap of the Doppler log."""
+        start_ns, bias, earth_rate = self.stamps_ns[-1], self.bias(len(self.stamps_ns) - 1), self._earth_rate()
+        gaps = self.odometry.gaps(start_ns, node_ns)
+        since_ns = gaps[-1][1] - CARRIED_IN_GAP_NS if gaps else start_ns
+        steps = self.odometry.steps_between_nodes(since_ns, node_ns)
+        motion = self._preintegrator.integrate(steps, bias, earth_rate)
+        carried = Carried(since_ns, steps, motion)
+        if gaps:
+            motion = motion_between_nodes(self.odometry, self._preintegrator, start_ns, node_ns, bias, earth_rate)
+        return motion, carried
 
     def _odometry_factor(self, i: int, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
         if self._estimates_bias:
@@ -203,10 +240,10 @@ class Keyframes:
         up = gravity_direction(motion, at_i, at_j, sigma, imu, self.calibration.gravity_m_s2)
         return [factors.gravity_direction(X(j), *up)] if up else []
 
-    def _depth(self, j: int, node_ns: int, steps: Steps, motion: PreintegratedMotion) -> list[gtsam.NonlinearFactor]:
-        """One factor for all samples since the last keyframe, carried to this one and averaged there."""
-        start_ns = self.stamps_ns[-1]
-        samples = self._depths_until(node_ns)
+    def _depth(self, j: int, node_ns: int, carried: Carried) -> list[gtsam.NonlinearFactor]:
+        """One factor for the samples since the last keyframe, carried to this one and averaged there."""
+        start_ns, steps, motion = carried
+        samples = self._depths_until(start_ns, node_ns)
         if samples is None:
             return []
         variance = np.where(np.isnan(samples.variance_m2), self.calibration.depth.sigma_m**2, samples.variance_m2)
@@ -218,14 +255,14 @@ class Keyframes:
             factors.depth(X(j), float(weights @ samples.z_m), motion.i_T_j.transformTo(mean_port), mean_variance**0.5)
         ]
 
-    def _depths_until(self, node_ns: int) -> Depth | None:
-        """The samples since the last keyframe, which are then done with."""
+    def _depths_until(self, start_ns: int, node_ns: int) -> Depth | None:
+        """The samples after an instant, all of which are then done with."""
         if not self._depths:
             return None
         waiting = Depth.concatenate(self._depths)
         later = waiting.between(node_ns, LATEST_NS)
         self._depths = [later] if later else []
-        return waiting.between(self.stamps_ns[-1], node_ns)
+        return waiting.between(start_ns, node_ns)
 
     def _wander_m2_s(self, steps: Steps) -> float:
         """Spectral density of the vertical velocity noise over the steps, for the attitude of the newest keyframe."""

@@ -31,7 +31,11 @@ def odometry(request):
     rows = Odometry(
         Calibration(
             imu=ImuCalibration(gyro_noise_density=GYRO_DENSITY),
-            dvl=DvlCalibration(mounting=Mounting(translation_m=LEVER), velocity_sigma_m_s=(0.01, 0.02, 0.03)),
+            dvl=DvlCalibration(
+                mounting=Mounting(translation_m=LEVER),
+                velocity_sigma_m_s=(0.01, 0.02, 0.03),
+                velocity_walk_density=5.0,
+            ),
             odometry_interpolation=request.param,
         )
     )

@@ -54,7 +54,7 @@ def an_interval():
 def test_an_interval_begins_with_the_velocity_of_the_imu_s_point(dvl_ns, hold_past, expected_rate):
     """``v + w x l``; a held rate belongs to what lies before its stamp, on which the node may be."""
     imu_ns, dvl_ns = T0_NS + np.array([0, 100, 200, 300]), T0_NS + np.array([dvl_ns, 290])
-    interval, clock = an_interval(), np.array([dvl_ns[0], 0])
+    interval, clock = an_interval(), np.array([dvl_ns[0], 0, 0, 0])
     open_interval(columns_of(imu_ns, dvl_ns, hold_past=hold_past), LEVER, interval, clock)
     assert_allclose(interval.velocity[:3], VELOCITIES[0] + np.cross(expected_rate, LEVER), atol=1e-12)
     assert clock[1] == dvl_ns[0]
@@ -75,7 +75,7 @@ def test_gravity_corrects_with_the_velocity_noise_of_both_ends():
     dvl_ns = T0_NS + np.array([0, round(duration_s * NS_PER_S)])
     columns = columns_of(imu_ns, dvl_ns, rates=np.zeros((4, 3)), velocities=np.zeros((2, 3)))
     model = VEHICLE._replace(gravity_interval_ns=NS_PER_S)
-    x, P, clock, interval = np.zeros(6), prior * np.eye(6), np.array([T0_NS, 0]), an_interval()
+    x, P, clock, interval = np.zeros(6), prior * np.eye(6), np.array([T0_NS, 0, 7, 7]), an_interval()
     open_interval(columns, LEVER, interval, clock)
     motion = NO_MOTION._replace(impulse=(0.0, 0.0, GRAVITY * duration_s))
     advance_to_node(columns, model, x, P, 6, clock, interval, int(dvl_ns[1]), motion)
@@ -84,7 +84,7 @@ def test_gravity_corrects_with_the_velocity_noise_of_both_ends():
     expected = 1 / (1 / prior + 1 / tilt)
     assert_allclose(np.diag(P), [prior, prior, prior, expected, expected, prior], rtol=1e-9)
     assert_allclose(x, 0.0, atol=1e-12)
-    assert clock.tolist() == [dvl_ns[1], dvl_ns[1]]
+    assert clock.tolist() == [dvl_ns[1], dvl_ns[1], 0, 0]
     assert interval.velocity[3] == pytest.approx(VARIANCES[1].mean())
 
 
@@ -94,7 +94,7 @@ def test_a_plane_is_measured_in_height_roll_and_pitch_each_with_its_own_noise():
     before, prior = np.array([1.0, 2.0, 0.7, 0.05, -0.08, 0.3]), np.array([1e-2, 2e-2, 3e-2, 1e-3, 2e-3, 3e-3])
     x, P = before.copy(), np.diag(prior)
     columns = columns_of(T0_NS + np.arange(4), T0_NS + np.array([0, 2]))
-    advance_to_node(columns, model, x, P, 6, np.array([T0_NS, 0]), an_interval(), T0_NS + 2, NO_MOTION)
+    advance_to_node(columns, model, x, P, 6, np.array([T0_NS, 0, 7, 7]), an_interval(), T0_NS + 2, NO_MOTION)
     noise, plane = np.array([4e-2, 9e-4, 9e-4]), np.array([0.5, 0.0, 0.0])
     gain = prior[2:5] / (prior[2:5] + noise)
     assert_allclose(x[2:5], before[2:5] + gain * (plane - before[2:5]), atol=1e-12)

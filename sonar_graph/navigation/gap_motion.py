@@ -1,0 +1,285 @@
+"""Motion while the Doppler log has no bottom lock, carried by the accelerometers.
+
+From node i on, with everything in frame i: R the rotation by the gyros, F and P the velocity and position that the
+accelerometers gain from rest (`sonar_graph.navigation.joint_state`), g gravity. The velocity of the IMU's point less F
+is then a straight line whose slope is gravity, and a Doppler sample z at time t measures a point of it::
+
+    y(t) = R z - F = v + g t
+
+Closed: the sample j that ends the gap is there. The line joins both ends, ``displacement = P + T (y_i + y_j)/2``.
+Tilt, initial velocity and a constant accelerometer bias cancel; what is left is how the gyros' noise and bias tilt the
+frame, how a bias turns with the vehicle, and white noise.
+
+Open: nothing stamped later is there. The line is fitted to the samples of the last `WINDOW_NS` before the node, and
+extrapolated. Its slope is gravity with the accelerometers' bias as it was then, so that neither attitude nor bias need
+be known. Errors grow with the time since then squared.
+
+Where a specific force was not measured, or nothing precedes the node to fit a line to, the velocity is a random walk of
+spectral density q between its ends, whose displacement has the variance ``q T^3 / 12`` beside the samples' (closed),
+or from its last value on, ``q T^3 / 3`` (open).
+
+The covariance holds, beside the noise of the samples: gyro and accelerometer noise, and the bias of the accelerometers,
+constant over the gap. That of the gyros is the derivative's affair. Derivation: docs/theory/gaps.md.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.navigation.joint_nodes import with_inertial_position, with_sample
+from sonar_graph.navigation.joint_state import (
+    AT_REST,
+    NO_SLOPES,
+    NO_SPREAD,
+    Path,
+    Slopes,
+    Spread,
+    push,
+    pushed_path,
+    pushed_slopes,
+    pushed_spread,
+)
+from sonar_graph.navigation.kernels import compiled
+from sonar_graph.navigation.line_before import integral, line_before
+from sonar_graph.navigation.odometry import (
+    Columns,
+    cursor_at,
+    longest_interval_ns,
+    next_step,
+    rows_until,
+    value_among,
+)
+from sonar_graph.navigation.recursion import NO_MOTION, Integral, Step, extended, increment, mirrored, rate_of_turn
+from sonar_graph.navigation.triples import (
+    IDENTITY,
+    ZERO,
+    ZEROS,
+    Matrix,
+    Vector,
+    cross,
+    difference_of,
+    gram,
+    matrix,
+    minus,
+    multiple_of,
+    plus,
+    sandwich,
+    skew_times,
+    sum_of,
+    times,
+    times_skew,
+    transposed,
+    vector,
+)
+
+
+class GapModel(NamedTuple):
+    """What is known of sensors and vehicle."""
+
+    longest_ns: int
+    """Between samples, for the velocity to be linear."""
+    gyro_noise_density: float
+    accel_noise_density: float
+    accel_bias_sigma: float
+    velocity_walk_density: float
+    body_p_imu: Vector
+    body_p_dvl: Vector
+
+
+GapValues = tuple[int, float, float, float, float, Vector, Vector]
+
+
+def gap_values(calibration: Calibration) -> GapValues:
+    """Fields of the model that a calibration describes; plain tuples enter compiled code faster."""
+    imu, dvl = calibration.imu, calibration.dvl
+    return (
+        longest_interval_ns(calibration),
+        imu.gyro_noise_density,
+        imu.accel_noise_density,
+        imu.accel_bias_sigma,
+        dvl.velocity_walk_density,
+        imu.mounting.translation_m,
+        dvl.mounting.translation_m,
+    )
+
+
+NO_GAPS: GapValues = (int(np.iinfo(np.int64).max), 0.0, 0.0, 0.0, 0.0, ZERO, ZERO)
+"""However long it lasts, the velocity is linear or held."""
+
+
+class GapMotion(NamedTuple):
+    """Motion of the body from frame i, and its derivatives by the gyro bias, of [theta_i, eps]."""
+
+    integral: Integral
+    D_t: Matrix
+    D_r: Matrix
+
+
+@compiled
+def bridge(
+    columns: Columns,
+    values: GapValues,
+    start_ns: int,
+    end_ns: int,
+    is_closed: bool,
+    bias: Vector,
+    earth: Vector,
+) -> GapMotion:
+    """Motion over a gap.
+
+    Parameters
+    ----------
+    columns
+        Of `sonar_graph.navigation.odometry.Odometry`.
+    values
+        Fields of a `GapModel`.
+    start_ns, end_ns
+        From a node to the next (closed), or to an instant before it, from rows stamped no later (open).
+    bias
+        Gyro bias to remove, body axes, rad/s.
+    earth
+        Earth's rotation in frame i, rad/s.
+    """
+    model = GapModel(*values)
+    motion, is_known = _by_accelerometers(columns, model, start_ns, end_ns, is_closed, bias, earth)
+    if is_known:
+        return motion
+    return _by_walk(columns, model, start_ns, end_ns, is_closed, bias, earth)
+
+
+@compiled
+def _by_accelerometers(
+    columns: Columns, model: GapModel, start_ns: int, end_ns: int, is_closed: bool, bias: Vector, earth: Vector
+) -> tuple[GapMotion, bool]:
+    """The motion, and whether there is what it takes."""
+    dvl_ns = columns[3]
+    elapsed_s = (end_ns - start_ns) * 1e-9
+    k, gyro_psd = rows_until(dvl_ns, start_ns) - 1, model.gyro_noise_density**2
+    path, spread, slopes = AT_REST, NO_SPREAD, NO_SLOPES
+    is_known, doppler = True, ZEROS
+    if is_closed:
+        path, spread, slopes = with_sample(
+            path, spread, slopes, _velocity_at_imu(columns, model, k, bias), elapsed_s / 2, gyro_psd
+        )
+    else:
+        line = line_before(columns, model.body_p_imu, model.body_p_dvl, k, bias, earth)
+        is_known = line.is_known
+        s, s_g, s_a, doppler = integral(line, elapsed_s, model.gyro_noise_density, model.accel_noise_density)
+        path = Path(0.0, IDENTITY, path.v, path.p, s)
+        slopes = Slopes(slopes.M, slopes.N, slopes.v_g, slopes.p_g, s_g, s_a, slopes.s_scale, slopes.s_mounting)
+    path, spread, slopes = _carried(columns, model, path, spread, slopes, (start_ns, end_ns), is_closed, bias, earth)
+    if is_closed:
+        doppler = _at_both_ends(columns, k, elapsed_s, path.R)
+        z = _velocity_at_imu(columns, model, k + 1, bias)
+        path, spread, slopes = with_sample(path, spread, slopes, z, elapsed_s / 2, gyro_psd)
+    path, spread, slopes = with_inertial_position(path, spread, slopes)
+    by_bias = multiple_of(model.accel_bias_sigma**2, gram(slopes.s_a))
+    ss = sum_of(spread.ss, sum_of(doppler, by_bias))
+    s_g = slopes.s_g
+    if is_closed:
+        both = sum_of(IDENTITY, path.R)
+        s_g = sum_of(s_g, multiple_of(elapsed_s / 2, times_skew(both, minus(model.body_p_imu, model.body_p_dvl))))
+    motion = _of_body(path, spread.ms, slopes.M, s_g, ss, gyro_psd, model.body_p_imu)
+    return motion, is_known and np.isfinite(path.s[0] + path.s[1] + path.s[2])
+
+
+@compiled
+def _carried(
+    columns: Columns,
+    model: GapModel,
+    path: Path,
+    spread: Spread,
+    slopes: Slopes,
+    span_ns: tuple[int, int],
+    is_closed: bool,
+    bias: Vector,
+    earth: Vector,
+) -> tuple[Path, Spread, Slopes]:
+    """Over all inertial rows of a gap."""
+    imu_ns, rate, force, hold_past = columns[0], columns[1], columns[2], columns[6]
+    t, end_ns = span_ns
+    rows = rows_until(imu_ns, end_ns - 1) + 1 if is_closed else rows_until(imu_ns, end_ns)
+    rows, row = min(rows, len(imu_ns)), rows_until(imu_ns, t)
+    gyro_psd, accel_psd = model.gyro_noise_density**2, model.accel_noise_density**2
+    while t < end_ns:
+        until = min(end_ns, imu_ns[row]) if row < rows else end_ns
+        middle = t + (until - t) // 2
+        w = minus(value_among(imu_ns, rate, rows, row, middle, hold_past), bias)
+        f = value_among(imu_ns, force, rows, row, middle, hold_past)
+        by = push(path.R, (until - t) * 1e-9, minus(w, times(transposed(path.R), earth)), f)
+        spread = pushed_spread(spread, by, gyro_psd * (path.elapsed_s + 0.5 * by.dt), accel_psd)
+        slopes = pushed_slopes(slopes, by)
+        path = pushed_path(path, by)
+        row += int(row < rows and imu_ns[row] <= until)
+        t = until
+    return path, spread, slopes
+
+
+@compiled
+def _velocity_at_imu(columns: Columns, model: GapModel, k: int, bias: Vector) -> Vector:
+    """Of the IMU's point at a Doppler row, body axes."""
+    imu_ns, rate, t = columns[0], columns[1], columns[3][k]
+    w = minus(value_among(imu_ns, rate, len(imu_ns), rows_until(imu_ns, t - 1), t, columns[6]), bias)
+    return plus(vector(columns[4][k]), cross(w, minus(model.body_p_imu, model.body_p_dvl)))
+
+
+@compiled
+def _at_both_ends(columns: Columns, k: int, elapsed_s: float, R: Matrix) -> Matrix:
+    """Displacement covariance by the samples k and k + 1, half the gap's length each.
+
+    Each also ends or begins a neighbouring interval, of length d, and errors add up:
+    ``((T + d) / 2)^2 = (T / 2)^2 (1 + 2 d / T) + (d / 2)^2``, of which the last is the neighbour's own.
+    """
+    dvl_ns, cov = columns[3], columns[5]
+    neighbour_s = min((dvl_ns[k] - dvl_ns[k - 1]) * 1e-9, elapsed_s) if k > 0 else 0.0
+    both = sum_of(matrix(cov[k]), sandwich(R, matrix(cov[k + 1]), R))
+    return multiple_of(elapsed_s * (elapsed_s + 2.0 * neighbour_s) / 4.0, both)
+
+
+@compiled
+def _of_body(path: Path, ms: Vector, M: Matrix, s_g: Matrix, ss: Matrix, gyro_psd: float, lever: Vector) -> GapMotion:
+    """From the IMU's point to the body's origin: ``dp = s - (R - I) l``, ``eps = ds + [R l]x theta``.
+
+    ``cov(ds, theta) = -[ms]x``, M the integral of R, s_g the derivative of s by the gyro bias, ss its covariance.
+    """
+    turned = times(path.R, lever)
+    tt = multiple_of(gyro_psd * path.elapsed_s, IDENTITY)
+    st = times_skew(multiple_of(-1.0, IDENTITY), ms)
+    rt = sum_of(st, skew_times(turned, tt))
+    rr = sum_of(difference_of(ss, times_skew(st, turned)), skew_times(turned, transposed(rt)))
+    D_t = multiple_of(-1.0, M)
+    dp = minus(path.s, minus(turned, lever))
+    whole = Integral(path.R, dp, path.v, tt, rt, mirrored(rr))
+    return GapMotion(whole, D_t, sum_of(s_g, skew_times(turned, D_t)))
+
+
+@compiled
+def _by_walk(
+    columns: Columns, model: GapModel, start_ns: int, end_ns: int, is_closed: bool, bias: Vector, earth: Vector
+) -> GapMotion:
+    """Velocity linear between the ends or held since the first, and a random walk about that."""
+    imu_ns, dvl_ns, cov = columns[0], columns[3], columns[5]
+    elapsed_s, k = (end_ns - start_ns) * 1e-9, rows_until(dvl_ns, start_ns) - 1
+    walk = (model.velocity_walk_density * elapsed_s) ** 2
+    psd = sum_of(multiple_of(elapsed_s, matrix(cov[k])), multiple_of(walk / 3.0, IDENTITY))
+    imu_rows, dvl_rows = rows_until(imu_ns, end_ns), k + 1
+    if is_closed:
+        imu_rows, dvl_rows = min(rows_until(imu_ns, end_ns - 1) + 1, len(imu_ns)), k + 2
+        neighbour_s = min((dvl_ns[k] - dvl_ns[k - 1]) * 1e-9, elapsed_s) if k > 0 else 0.0
+        both = sum_of(matrix(cov[k]), matrix(cov[k + 1]))
+        psd = sum_of(multiple_of((elapsed_s + 2.0 * neighbour_s) / 4.0, both), multiple_of(walk / 12.0, IDENTITY))
+    motion, D_t, D_r, cursor = NO_MOTION, ZEROS, ZEROS, cursor_at(columns, start_ns)
+    while cursor.stamp_ns < end_ns:
+        cursor, own = next_step(columns, imu_rows, dvl_rows, cursor, end_ns)
+        step = Step(own.duration_s, own.rate, own.velocity, psd, own.specific_force)
+        turn = rate_of_turn(step, motion.dR, bias, earth)
+        added = increment(motion.dR, step.duration_s, turn, step.velocity, model.body_p_dvl)
+        D_r = difference_of(D_r, skew_times(added.displacement, D_t))
+        D_t = difference_of(D_t, multiple_of(step.duration_s, added.theta_by_rate))
+        D_r = difference_of(D_r, multiple_of(step.duration_s, added.eps_by_rate))
+        motion = extended(motion, step, added, model.gyro_noise_density)
+    whole = Integral(motion.dR, motion.dp, motion.impulse, motion.cov_tt, motion.cov_rt, mirrored(motion.cov_rr))
+    return GapMotion(whole, D_t, D_r)
