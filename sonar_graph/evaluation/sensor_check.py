@@ -24,7 +24,7 @@ from sonar_graph.sequence import NS_PER_S, Sequence
 from sonar_graph.states import Trajectory
 
 LONGEST_S = 600.0
-"""IMU and Doppler log are compared over at most so long, in the middle of the log, which bounds the time: 240 s take about 1 s."""
+"""Compared over at most so long, in the middle of the log, which bounds the time: 240 s take about 1 s."""
 INTERVAL_SIGMAS = 1.96
 """Intervals are printed as plus or minus 95 %."""
 LEAST_OFFSET_S = 0.01
