@@ -60,6 +60,16 @@ def test_an_instant_that_one_run_lacks_is_left_out_for_all() -> None:
     assert scored.not_estimated == 1
 
 
+def test_every_instant_asked_for_is_scored_or_left_out_for_one_reason() -> None:
+    """The run lacks an instant before the truth, one in its gap and one that it covers: only the last is its fault."""
+    occluded = [t for t in DENSE if not 1.0 < t < 1.95]
+    runs = [RunResult("a", {}, "ok", causal=trajectory([2.5, 3.0, 3.5]))]
+    scored = scored_instants(seconds(-0.5, 0.5, 1.5, 2.5, 3.0, 3.5), trajectory(occluded), runs)
+    np.testing.assert_array_equal(scored.stamps_ns, seconds(2.5, 3.0))
+    assert (scored.outside_truth, scored.in_truth_gap, scored.not_estimated) == (2, 1, 1)
+    assert len(scored) + scored.outside_truth + scored.in_truth_gap + scored.not_estimated == scored.asked
+
+
 def test_rows_are_found_by_stamp() -> None:
     rows = rows_at(trajectory(DENSE), seconds(0.5, 2.0))
     np.testing.assert_allclose(rows.positions[:, 0], [0.5, 2.0])

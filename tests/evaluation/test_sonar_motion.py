@@ -232,6 +232,20 @@ def test_height_follows_the_doppler_log_between_depth_samples(path, every: int):
     assert (np.diff([m.height_sigma_m for m in found[2:]]) > 0).all()
 
 
+def test_height_grows_uncertain_by_the_doppler_log_and_not_by_the_gyros():
+    """At rest, by hand: 20 samples a second of 1 mm/s, over a second; the gyros' own variance is 300 times that."""
+    density, sigma_v = 0.004, 1e-3
+    imu = MOUNTED.imu.model_copy(update={"gyro_noise_density": density, "gyro_bias_sigma": 0.0})
+    dvl = MOUNTED.dvl.model_copy(update={"mounting": Mounting()})
+    run = at_rest((0.0, 0.0, 0.0), imu=imu, dvl=dvl)
+    run = replace(run, depth=run.depth.rows(slice(0, 2)))
+    first_ns = run.start_ns + 10**9
+    first, second = along(run, [first_ns, first_ns + 10**9])
+    grown = second.height_sigma_m**2 - first.height_sigma_m**2
+    assert grown == pytest.approx(sigma_v**2 / 20, rel=0.1)
+    assert density**2 > 300 * sigma_v**2 / 20
+
+
 def test_covariance_of_a_step_is_that_of_gyros_and_doppler_log_seen_from_the_sonar():
     """At rest, by hand: the lever arm from body to sonar turns with the gyros' error."""
     density, sigma_v = 0.004, 1e-3

@@ -24,7 +24,7 @@ IMU_TEXT = b"float64 x"
 BINARY_SCHEMA = bytes(range(256))
 
 
-def foreign_log(path: Path, count: int = 400, profile: str = "ros2") -> Path:
+def foreign_log(path: Path, count: int = 400, profile: str = "ros2", tick_ns: int = 10) -> Path:
     """A log of another program: two encodings, publish times that differ, metadata and an attachment."""
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=2000, enable_data_crcs=True)
@@ -37,8 +37,9 @@ def foreign_log(path: Path, count: int = 400, profile: str = "ros2") -> Path:
         writer.add_metadata("about", {"ship": "Vessel"})
         writer.add_attachment(1, 2, "notes.txt", "text/plain", b"of the dive")
         for k in range(count):
-            writer.add_message(one, 10 * k, struct.pack("<Id", 256, k), 10 * k - (3 if k else 0), k)
-            writer.add_message((other, bare)[k % 2], 10 * k + 1, bytes([k % 256]) * (k % 50), 10 * k + 1, 7)
+            at_ns = tick_ns * k
+            writer.add_message(one, at_ns, struct.pack("<Id", 256, k), at_ns - (3 if k else 0), k)
+            writer.add_message((other, bare)[k % 2], at_ns + 1, bytes([k % 256]) * (k % 50), at_ns + 1, 7)
         writer.finish()
     return path
 
@@ -89,6 +90,34 @@ def test_messages_lie_in_the_order_of_their_times(tmp_path: Path) -> None:
         times_ns = [m.log_time for _, _, m in make_reader(stream).iter_messages(log_time_order=False)]
     assert times_ns == sorted(times_ns)
     assert 2005 in times_ns
+
+
+def test_messages_of_one_chunk_come_in_the_order_of_their_times_and_equal_ones_as_they_were(tmp_path: Path) -> None:
+    """Two topics in one chunk, whose times go to and fro."""
+    times_ns = [70, 10, 40, 40, 90, 10, 40]
+    with (tmp_path / "a.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channels = [writer.register_channel(topic, "json", 0) for topic in ("/one", "/other")]
+        for number, time_ns in enumerate(times_ns):
+            writer.add_message(channels[number % 2], time_ns, b"{}", time_ns, number)
+        writer.finish()
+    write_amended(tmp_path / "a.mcap", tmp_path / "b.mcap", [landmarks(50)])
+    with (tmp_path / "b.mcap").open("rb") as stream:
+        messages = [(m.log_time, m.sequence) for _, _, m in make_reader(stream).iter_messages(log_time_order=False)]
+    assert messages == [(10, 1), (10, 5), (40, 2), (40, 3), (40, 6), (50, 0), (70, 0), (90, 4)]
+
+
+def test_what_is_there_of_a_log_that_is_cut_off_is_counted_from_its_first_message(tmp_path: Path) -> None:
+    whole = foreign_log(tmp_path / "a.mcap", tick_ns=100_000_000).read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(whole[: int(0.7 * len(whole))])
+    amended = write_amended(tmp_path / "cut.mcap", tmp_path / "b.mcap", [])
+    copied = content(tmp_path / "b.mcap")
+    last_ns = max(message[0] for topic in ("/one", "/other", "/bare") for message in copied[topic][1:])
+    spans = re.search(r"what is there spans ([0-9.]+) s", amended.notes["log.ending"])
+    assert spans is not None
+    assert float(spans[1]) == pytest.approx(last_ns * 1e-9, abs=1e-3)
+    assert last_ns > 20e9
 
 
 @pytest.mark.parametrize("share", [0.3, 0.77])

@@ -271,6 +271,21 @@ def test_echo_by_way_of_the_surface_arrives_where_the_mirror_puts_it():
     assert rise[ranges_m < direct_m + 0.05].max() < 3
 
 
+def test_echo_by_way_of_the_surface_is_as_strong_as_its_longer_way_leaves_it():
+    """The samples of a bright plate come again at the later bin: spreading (r / late)^4, gain (late / r)^3."""
+    depth_m, surface_path_db = 0.75, -9.0
+    plate = place(-1, "plate", block(0.3, 0.4, 0.0, 60.0), 0.25, np.array([1.35, 0.0, 0.0]), 0.0)
+    made = simulator([plate], multipath=True, surface_path_db=surface_path_db, absorption_db_m=0.0)
+    image = made.level_db(np.array([0.0, 0.0, HEIGHT_M]), TILT, 0, HEIGHT_M + depth_m)[42:54].astype(float)
+    r = made.ranges_m()
+    late_m = 0.5 * (r + np.sqrt(np.maximum(r**2 - HEIGHT_M**2, 0) + (HEIGHT_M + 2 * depth_m) ** 2))
+    on = (r > np.hypot(1.25, HEIGHT_M)) & (r < np.hypot(1.45, HEIGHT_M))
+    echo = image[:, np.abs(r - late_m[on, None]).argmin(axis=1)]
+    expected = surface_path_db - 10 * np.log10(late_m[on] / r[on])
+    assert np.mean(echo - image[:, on] - expected) == pytest.approx(0, abs=0.3)
+    assert np.mean(20 * np.log10(late_m[on] / r[on])) > 2  # by which it would be off without one of the spreadings
+
+
 def test_steep_faces_echo_again_by_way_of_the_floor():
     box = place(-1, "box", block(0.1, 0.3, 0.08, 0.0), 0.2, np.array([1.6, 0.0, 0.0]), 0.0)
     with_, without = (intensity(simulator([box], multipath=m))[42:54].mean(axis=0) for m in (True, False))
@@ -304,6 +319,17 @@ def test_gain_is_wrong_by_the_tilt_asked_for():
     assert np.std(tilts) == pytest.approx(1.5, rel=0.35)
     difference = level_db(simulator(tvg_error_db=1.5)) - level_db(simulator())
     np.testing.assert_allclose(difference, np.tile(drawn_gain_error_db(1.5, 512, 0), (96, 1)), atol=1e-3)
+
+
+def test_gain_is_also_wrong_by_a_slow_wave_of_a_third_of_the_tilt():
+    along = np.linspace(-0.5, 0.5, 512)
+    basis = np.column_stack([along, np.sin(3 * np.pi * along), np.cos(3 * np.pi * along)])
+    errors = np.array([drawn_gain_error_db(1.5, 512, seed) for seed in range(400)])
+    fitted = np.linalg.lstsq(basis, errors.T, rcond=None)[0]
+    np.testing.assert_allclose(basis @ fitted, errors.T, atol=1e-9)
+    tilt, wave = np.sqrt(np.mean(fitted[0] ** 2)), np.sqrt(np.mean(fitted[1] ** 2 + fitted[2] ** 2))
+    assert tilt == pytest.approx(1.5, rel=0.15)
+    assert wave == pytest.approx(0.5, rel=0.15)
 
 
 def test_stamps_of_dropped_frames_are_drawn_at_their_rate():

@@ -61,6 +61,14 @@ def test_a_centre_beam_tilted_down_meets_the_floor_where_the_triangle_says():
     assert e[0] == pytest.approx(np.radians(30) - np.arcsin(1 / 1.5))
 
 
+@given(st.floats(0.5, 1.2), angles, st.floats(0.2, 0.9), st.floats(1.3, 2.5), angles)
+def test_a_sonar_hung_upside_down_sees_the_same_floor_mirrored(height, roll, pitch, r, a):
+    """Half a turn about the centre beam swaps left and right, up and down; the point on the floor stays."""
+    upright, inverted = view_of(height, roll, pitch), view_of(height, roll + np.pi, pitch)
+    q = upright.floor_points(np.array([r]), np.array([a]))[0]
+    np.testing.assert_allclose(inverted.floor_points(np.array([r]), np.array([-a]))[0], q * [1, -1, -1], atol=1e-9)
+
+
 def test_what_is_nearer_than_the_floor_has_no_floor_point():
     assert view_of(1.0, 0.0, 0.5).floor_point(0.9, 0.0) is None
     assert np.isnan(view_of(1.0, 0.0, 0.5).floor_points(np.array([0.9]), np.array([0.1]))).all()

@@ -44,6 +44,17 @@ def test_rows_of_the_association_are_probabilities(frames):
         assert ((found.existence >= 0) & (found.existence <= 1)).all()
 
 
+@given(st.lists(st.integers(0, 6), min_size=2, max_size=5), st.integers(0, 2**32 - 1))
+def test_only_a_track_that_starts_can_be_new(counts, seed):
+    """Candidates crowd in a few decimetres, so that they may be of several tracks."""
+    rng = np.random.default_rng(seed)
+    frames = [list(zip(rng.uniform(1.8, 2.0, n), rng.uniform(-0.06, 0.06, n), strict=True)) for n in counts]
+    for found in run(Tracker(), frames):
+        goes_on = np.isin(found.track_ids, found.previous_ids)
+        assert (found.matrix[goes_on, -1] == 0).all()
+        assert (found.matrix[~goes_on, -1] > 0).all()
+
+
 @given(st.lists(st.integers(0, 6), min_size=1, max_size=4), st.integers(0, 2**32 - 1))
 def test_the_order_of_candidates_does_not_matter(counts, seed):
     """Places are drawn and not chosen: between two candidates equally far from a track there is no better one."""
