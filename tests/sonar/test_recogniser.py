@@ -173,6 +173,17 @@ def _resting(rule: str) -> list:
     return pass_by(Recogniser(DECIBELS, params=params), SQUARE, 8, 0.0)
 
 
+def test_a_sonar_that_comes_to_rest_believes_for_500_frames_what_it_believed():
+    """The same picture from the same place, an unseen bit brighter every other time: no copy of the frame before."""
+    recogniser = Recogniser(DECIBELS)
+    before = pass_by(recogniser, SQUARE)[-1]
+    image = picture(SQUARE, 1.7, -0.2, 0.4, 8)
+    for k in range(500):
+        found = recogniser.process(frame(9 + k, image + np.float32(1e-3 * (k % 2))), aside(0.0), VIEW)
+    assert before.id_probability[0, SQUARE] > 0.9
+    np.testing.assert_allclose(found.id_probability, before.id_probability, rtol=1e-9)
+
+
 def _belief_after(steps: list[SonarStep], xy_m: list[tuple[float, float]]) -> float:
     """Belief in the square after frames along these steps."""
     recogniser = Recogniser(DECIBELS, params=RecogniserParams(least_frames=1, least_existence=0.0))
