@@ -136,6 +136,15 @@ def test_accuracy_is_that_of_range_and_of_azimuth():
     assert model.azimuth_sigma_rad == pytest.approx(0.002, rel=0.15)
 
 
+def test_errors_that_are_always_the_same_count_as_errors():
+    """A landmark that is always seen 3 cm too far: root mean square, not the spread about the mean."""
+    fits = _fits(300, 0.1)
+    off = replace(fits, range_azimuth_error=fits.range_azimuth_error + np.array([0.03, -0.005]))
+    model = estimate_confusion(off, (1, 2), {})
+    assert model.range_sigma_m == pytest.approx(np.hypot(0.03, 0.01), rel=0.05)
+    assert model.azimuth_sigma_rad == pytest.approx(np.hypot(0.005, 0.002), rel=0.05)
+
+
 def test_sigmas_are_those_of_a_landmark_that_is_wholly_in_view():
     fits = _fits(300, 0.1)
     cut = replace(fits, visible=np.full(900, 0.7), range_azimuth_error=fits.range_azimuth_error / 0.7**2)
@@ -157,12 +166,3 @@ def test_a_class_that_was_seen_more_often_counts_no_more():
         pytest.approx(one.threshold, abs=0.002),
     )
     np.testing.assert_allclose(other.matrix, one.matrix, atol=2e-3)
-def test_errors_that_are_always_the_same_count_as_errors():
-    """A landmark that is always seen 3 cm too far: root mean square, not the spread about the mean."""
-    fits = _fits(300, 0.1)
-    off = replace(fits, range_azimuth_error=fits.range_azimuth_error + np.array([0.03, -0.005]))
-    model = estimate_confusion(off, (1, 2), {})
-    assert model.range_sigma_m == pytest.approx(np.hypot(0.03, 0.01), rel=0.05)
-    assert model.azimuth_sigma_rad == pytest.approx(np.hypot(0.005, 0.002), rel=0.05)
-
-
