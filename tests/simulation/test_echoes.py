@@ -54,7 +54,7 @@ def by_hand(rise: float, *, is_ghost: bool = False) -> float:
     return float(np.mean(cos**2 * area * pattern / r))
 
 
-@pytest.mark.parametrize("rise", [0.5, 1.0, 1.5])
+@pytest.mark.parametrize("rise", [1.0, 1.5])
 def test_a_sloping_face_echoes_by_lamberts_rule_times_its_area(rise: float):
     ratio_db = 10 * np.log10(energy(rise) / energy(0.0))
     assert ratio_db == pytest.approx(10 * np.log10(by_hand(rise) / by_hand(0.0)), abs=0.4)
