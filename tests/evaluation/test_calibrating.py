@@ -149,6 +149,25 @@ def test_a_log_without_truth_is_refused_by_name(lane_log, missing):
         calibrate([(lane_log, run)])
 
 
+def test_frames_that_come_too_late_count_nothing_again(lane, measured, tmp_path):
+    """Every fifth frame is followed by an older one, which is refused while the sightings before it are still known."""
+    rows = [row for k in range(len(lane.frames)) for row in ([k, k - 3] if k % 5 == 4 else [k])]
+    late = lane.write(tmp_path / "lane.mcap", [lane.one(row) for row in rows])
+    assert len(rows) > len(lane.frames) + 20
+    assert calibrate([(late, read_sequence(late))]) == measured
+
+
+def test_frames_without_odometry_count_nothing(lane, lane_log, tmp_path):
+    """The Doppler log ends before the truth does: as if the frames after its end were not there."""
+    run = read_sequence(lane_log)
+    end_ns = int(run.dvl.stamps_ns[-1]) - 3 * 10**9
+    run = replace(run, dvl=run.dvl.rows(run.dvl.stamps_ns <= end_ns))
+    kept = np.flatnonzero(lane.frames.stamps_ns <= run.end_ns)
+    assert len(kept) < len(lane.frames) - 10
+    short = lane.write(tmp_path / "lane.mcap", [lane.one(row) for row in kept])
+    assert calibrate([(lane_log, run)]) == calibrate([(short, run)])
+
+
 def test_landmarks_that_are_not_in_the_log_are_named(lane_log):
     """The designs of two landmarks under other identities."""
     strangers = tuple(replace(d, id=d.id + 6) for d in DEFAULT_DESIGNS[:2])
