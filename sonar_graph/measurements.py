@@ -159,6 +159,11 @@ class LandmarkDetections(Block):
 class SonarFrames:
     """Polar images of an imaging sonar, as recorded; frames of one block share their beams and range bins.
 
+    ``intensity`` has shape (n, beams, bins), any integer or real type; row b holds the samples of the beam at
+    ``azimuths_rad[b]``, its column r those at ``ranges_m[r]``. Azimuths are ``atan2(y, x)`` in the sonar's frame
+    (x along its axis, y to its left): positive to the left, in radians. What samples mean (decibels or amplitudes, and
+    their full scale) says ``calibration.sonar.image``. A frame alone is a block with n = 1: ``image[None]``.
+
     Raises
     ------
     MeasurementError

@@ -62,6 +62,17 @@ def test_preintegration_page_finds_the_bias_and_the_way(tmp_path: Path) -> None:
     assert "6 rows instead of 12" in printed
 
 
+def test_recogniser_page_finds_the_landmark_where_it_is(tmp_path: Path) -> None:
+    printed = run("06_recogniser.py", tmp_path)
+    last = printed[printed.index("frame 29:") :]
+    identity, certainty, range_m = re.search(r"landmark (\d) \(([\d.]+)\) at ([\d.]+)", last).groups()
+    assert identity == "3"
+    assert float(certainty) > 0.9
+    assert float(range_m) == pytest.approx(number_after(last, "true: landmark 3 at"), abs=0.01)
+    azimuth_deg = number_after(last, "mm,")
+    assert azimuth_deg == pytest.approx(number_after(last, r"true: landmark 3 at [\d.]+ m,"), abs=0.3)
+
+
 def test_page_on_viewers_has_commands_and_a_program_that_work(tmp_path: Path) -> None:
     page = (TUTORIALS / "03_viewers.md").read_text(encoding="utf-8")
     here = Path(sys.executable).parent

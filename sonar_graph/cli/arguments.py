@@ -76,3 +76,29 @@ Salvage = Annotated[
         "and say what is lost. One that is cut off is always read as far as it goes.",
     ),
 ]
+DesignsPath = Annotated[
+    Path | None,
+    typer.Option(
+        "--designs",
+        metavar="PATH",
+        exists=True,
+        help="Landmark designs: a TOML file, or a folder of such files. Default: those that ship.",
+    ),
+]
+ModelPath = Annotated[
+    Path | None,
+    typer.Option(
+        "--model",
+        metavar="MODEL.json",
+        exists=True,
+        dir_okay=False,
+        help="How often landmarks look like which, as calibrate measured it.",
+    ),
+]
+RuleName = Annotated[
+    str | None,
+    typer.Option(
+        "--rule",
+        help="How beliefs are updated: virtual-evidence (ours, the default) or jeffrey (the 2014 paper's equations).",
+    ),
+]

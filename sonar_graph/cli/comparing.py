@@ -11,18 +11,22 @@ import typer
 
 from sonar_graph.cli.arguments import (
     CalibrationPath,
+    DesignsPath,
     EndTime,
     EstimatorSettings,
     LogConfigPath,
     LogPath,
+    ModelPath,
     OutputFolder,
     RateHz,
+    RuleName,
     Salvage,
     StartTime,
     TopicChoices,
 )
 from sonar_graph.cli.outputs import writable_folder
 from sonar_graph.cli.progress import Report, progress_bars, working
+from sonar_graph.cli.recognising import no_images, our_recogniser, warn_of_other_designs
 from sonar_graph.cli.settings import (
     check_rate,
     estimator_settings,
@@ -32,7 +36,7 @@ from sonar_graph.cli.settings import (
     window_of,
 )
 from sonar_graph.cli.texts import answers
-from sonar_graph.errors import EstimatorError, UnknownEstimatorError
+from sonar_graph.errors import EstimatorError, LogError, UnknownEstimatorError
 
 if TYPE_CHECKING:
     from sonar_graph.evaluation.recognition import Recognition
@@ -54,11 +58,19 @@ class LogSource:
     start: str | None = None
     end: str | None = None
     salvage: bool = False
+    designs: Path | None = None
+    model: Path | None = None
+    rule: str | None = None
 
     @property
     def files(self) -> tuple[Path | None, ...]:
         """What is read, and must not be overwritten."""
-        return self.path, self.calibration, self.config
+        return self.path, self.calibration, self.config, self.designs, self.model
+
+    @property
+    def is_recognised_anew(self) -> bool:
+        """Whether images are looked at even where the log has detections."""
+        return not (self.designs is None and self.model is None and self.rule is None)
 
     def read(self, progress: Report) -> Sequence:
         """The log as a sequence; the errors are those of reading a log, a calibration, or choices of topics."""
@@ -103,6 +115,9 @@ def compare(
     estimators: Annotated[str, typer.Option(help="Names of installed estimators, with commas.")] = DEFAULT_ESTIMATORS,
     rate_hz: RateHz = DEFAULT_RATE_HZ,
     settings: EstimatorSettings = None,
+    designs: DesignsPath = None,
+    model: ModelPath = None,
+    rule: RuleName = None,
     calibration: CalibrationPath = None,
     topics: TopicChoices = None,
     log_config: LogConfigPath = None,
@@ -112,9 +127,12 @@ def compare(
 ) -> None:
     """Run several estimators on the same measurements and write a report on how they compare.
 
+    Landmarks are recognised in sonar images where the log has no detections; with --designs, --model or --rule also
+    where it has, in their place.
+
     Writes report.html, comparison.json, result.mcap for a viewer, and runs/NAME/ with each estimator's trajectories.
     """
-    source = LogSource(log, calibration, topics, log_config, start, end, salvage)
+    source = LogSource(log, calibration, topics, log_config, start, end, salvage, designs, model, rule)
     comparison = _compare_log(source, output, _estimator_names(estimators), rate_hz, settings)
     page = _write_report(comparison, output)
     _print_summary(comparison)
@@ -173,10 +191,16 @@ def _compare_log(
 
 
 def _with_recognised(source: LogSource, sequence: Sequence) -> tuple[Sequence, Recognition | None]:
-    """The sequence with landmarks recognised in the log's sonar images, where it has images and no detections."""
+    """The sequence with landmarks recognised in the log's sonar images, where that is asked for or it has none yet.
+
+    Raises
+    ------
+    LogError
+        When it is asked for and there are no images.
+    """
     from sonar_graph.evaluation.recognising import recognise, with_detections
 
-    if sequence.detections is not None:
+    if sequence.detections is not None and not source.is_recognised_anew:
         return sequence, None
     topic = topic_choices(source.topics or []).get("sonar")
     with progress_bars() as progress:
@@ -185,11 +209,18 @@ def _with_recognised(source: LogSource, sequence: Sequence) -> tuple[Sequence, R
             sequence,
             topic=topic,
             config=read_config(source.config),
+            recogniser=our_recogniser(sequence.calibration, source.designs, source.model, source.rule),
             window=window_of(source.start, source.end),
             salvage=source.salvage,
             progress=lambda done: progress("recognising landmarks (frames)", done, 0),
         )
-    return (sequence, None) if found is None else (with_detections(sequence, found), found)
+    if found is None:
+        if source.is_recognised_anew:
+            raise LogError(f"{no_images(source.path)}; --designs, --model and --rule are for images")
+        return sequence, None
+    if source.designs is None:
+        warn_of_other_designs(sequence)
+    return with_detections(sequence, found), found
 
 
 def _check_settings(names: list[str], overrides: dict[str, dict[str, Any]]) -> None:

@@ -6,13 +6,13 @@ has none within 40 cm is of none; what lies between, such as a piece of a landma
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from sonar_graph.errors import CalibrationError
+from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.evaluation.recognising import RecognitionSession, one_by_one, without_leaps
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.logs.adapters.config import LogConfig
@@ -21,7 +21,7 @@ from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence as Run
 from sonar_graph.sonar.confusion import Confusion, LabelledFits, estimate_confusion
 from sonar_graph.sonar.look import Sighting
-from sonar_graph.sonar.recogniser import Recogniser
+from sonar_graph.sonar.recogniser import Recogniser, RecogniserParams
 
 SAME_M, APART_M = 0.08, 0.40
 NO_LABEL = -2
@@ -95,6 +95,8 @@ def calibrate(
     topic: str | None = None,
     config: LogConfig | None = None,
     designs: Sequence[LandmarkDesign] | None = None,
+    params: RecogniserParams | None = None,
+    salvage: bool = False,
 ) -> Confusion:
     """Measure the model on logs with images, true trajectory and true landmarks.
 
@@ -106,30 +108,50 @@ def calibrate(
         As of `read_sonar_frames`.
     designs
         The landmarks; None: those that ship.
+    params
+        Of the recogniser that will use the model; None: the defaults.
+    salvage
+        As of `read_sequence`, and as the sequences were read.
 
     Raises
     ------
     CalibrationError
-        When a log has no truth, or a landmark was seen too rarely.
+        When a log has no truth, has none of the landmarks, or a landmark was seen too rarely.
     LogError
-        When images cannot be read.
+        When a log has no images, or they cannot be read.
     """
     designs = tuple(designs or DEFAULT_DESIGNS)
     gathered = LabelledSightings(tuple(design.id for design in designs))
     for log, (path, run) in enumerate(logs):
         if run.truth is None or run.true_landmarks is None:
             raise CalibrationError(f"{path}: without true trajectory and true landmarks nothing in it can be labelled")
-        recogniser = Recogniser(run.calibration, designs)
+        _require_common(path, run.true_landmarks.ids, gathered.ids)
+        recogniser = Recogniser(run.calibration, designs, params)
         session = RecognitionSession(run, recogniser=recogniser, pictures=False)
-        frames = (frame for block in read_sonar_frames(path, topic, config) for frame in one_by_one(block))
+        blocks = read_sonar_frames(path, topic, config, salvage=salvage)
+        frames = (frame for block in blocks for frame in one_by_one(block))
         for frame in without_leaps(frames, session.refuse):
             stamp_ns = int(frame.stamps_ns[0])
             session.take(frame)
             if recogniser.stamp_ns == stamp_ns:
                 _gather(gathered, log, recogniser, run, stamp_ns)
+        if not session.result.frames:
+            raise LogError(f"{path}: has no sonar images; `sonar-graph inspect {path}` lists what it has")
     names = ", ".join(path.name for path, _ in logs)
     kinds = "; ".join(dict.fromkeys(run.notes.get("ours", "recorded") for _, run in logs))
     return estimate_confusion(gathered.fits(), gathered.ids, {"logs": names, "what they are": kinds})
+
+
+def _require_common(path: Path, in_log: Ints, known: tuple[int, ...]) -> None:
+    if not set(known) & set(in_log.tolist()):
+        raise CalibrationError(
+            f"{path}: its true landmarks are {_listed(in_log.tolist())}, the designs are {_listed(known)}: none can "
+            "be measured; give the designs of the log's landmarks with --designs (designs in Python)"
+        )
+
+
+def _listed(ids: Iterable[int]) -> str:
+    return ", ".join(map(str, sorted(ids)))
 
 
 def _gather(gathered: LabelledSightings, log: int, recogniser: Recogniser, run: Run, stamp_ns: int) -> None:

@@ -36,6 +36,12 @@ COLUMNS = {
 NEES_LEGEND = (
     f"NEES: 1 fits; ▲ above {TOLERATED_FACTOR:g} over-confident, ▼ below {1 / TOLERATED_FACTOR:g} over-cautious"
 )
+SAID_NOTES = ("log.ending", "log.damage", "log.start")
+"""Notes on the log that are said here; the report has all."""
+RECOGNISED_BEFORE = (
+    "Sonar images: the detections are those that recognise put into the log; for pictures and outcomes in the report "
+    "let compare recognise anew: --rule virtual-evidence"
+)
 PUBLISHED_LEGEND = (
     f"{PAPER}: landmarks from its Table I, of which the errors are, and last minus first position from section III. "
     "It measured in a real basin and did not know the true path.\nAll else: this run."
@@ -120,9 +126,8 @@ def _notes(comparison: Comparison) -> Text:
     lines = [f"{run.estimator} failed: {run.reason}" for run in failed_runs(comparison)]
     lines += lost_runs(comparison)
     notes = comparison.sequence.notes
-    lines += [f"Log: {notes[subject]}" for subject in ("log.ending", "log.damage") if subject in notes]
-    if comparison.recognition is not None:
-        lines += [f"Sonar images: {n} x {reason}" for reason, n in comparison.recognition.warned().items()]
+    lines += [f"Log: {notes[subject]}" for subject in SAID_NOTES if subject in notes]
+    lines += _recognition(comparison)
     if not has_detections(comparison):
         lines.append(NO_DETECTIONS)
     metric = headline_metric(comparison)
@@ -132,6 +137,15 @@ def _notes(comparison: Comparison) -> Text:
         lines.append(f"causal, smoothed: {LABELS[metric]}")
         lines.append(NEES_LEGEND)
     return Text("\n".join(lines))
+
+
+def _recognition(comparison: Comparison) -> list[str]:
+    """What was recognised in the log's images, or how to see it where that was done before."""
+    found = comparison.recognition
+    if found is None:
+        return [RECOGNISED_BEFORE] if "detections.model" in comparison.sequence.notes else []
+    warned = [f"{n} x {reason}" for reason, n in found.warned().items()]
+    return [f"Sonar images: {line}" for line in [*found.naming(comparison.sequence.true_landmarks), *warned]]
 
 
 def _cell(comparison: Comparison, run: RunResult, key: str) -> Text:

@@ -7,11 +7,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sonar_graph.evaluation.strict_json import read_json, write_json
 from sonar_graph.measurements import LandmarkDetections
+from sonar_graph.states import LandmarkMap
 
 RECOGNITION, PICTURES = "recognition.json", "recognised"
 MOST_SHOWN = 6
+NONE = -1
+LEAST_NAMED = 0.5
+"""Posterior above which a detection names a landmark."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +52,31 @@ class Recognition:
         """How often frames were warned about, by reason; most frequent first."""
         reasons = {reason for _, reason in self.warnings}
         return {outcome: count for outcome, count in self.outcomes.most_common() if outcome in reasons}
+
+    def naming(self, true_landmarks: LandmarkMap | None = None) -> list[str]:
+        """Lines on how often each landmark was the most probable class, and a warning where none ever was.
+
+        Parameters
+        ----------
+        true_landmarks
+            Those that the log says to be there, if it does.
+        """
+        named: Counter[int] = Counter()
+        if self.detections is not None:
+            ids, probability = self.detections.most_probable()
+            named.update(np.where(probability > LEAST_NAMED, ids, NONE).tolist())
+        counts = [f"landmark {i}: {n}" for i, n in sorted(named.items()) if i != NONE]
+        lines = [f"Most probable: {', '.join([*counts, f'none of them: {named[NONE]}'])}"] if named else []
+        if not counts:
+            designs = self.notes.get("detections.designs", "those given")
+            lines.append(f"Warning: no landmark was recognised; looked for {designs}; --designs gives others")
+        looked_for = set() if self.detections is None else set(np.unique(self.detections.candidate_ids).tolist())
+        if true_landmarks is not None and looked_for:
+            unknown = sorted(set(true_landmarks.ids.tolist()) - looked_for)
+            if unknown:
+                listed = ", ".join(map(str, unknown))
+                lines.append(f"Warning: the log has landmarks {listed}, of which there is no design; give --designs")
+        return lines
 
     def entry(self) -> dict[str, Any]:
         """All but detections and pictures, as it stands in JSON."""

@@ -34,6 +34,7 @@ LABELS = {
     "nees": "Landmark NEES per degree of freedom",
     "used": "Detections used",
     "refused": "Detections refused",
+    "unnamed": "Detections of no landmark that is probable enough",
     "nis": "NIS per degree of freedom",
     "update_median_ms": "Per update, median",
     "update_p99_ms": "Per update, 99th percentile",

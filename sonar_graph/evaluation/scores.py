@@ -152,14 +152,25 @@ def detection_scores(log: DetectionLog) -> dict[str, Score]:
     counts = Counter(log.outcomes)
     new, ignored = counts[Outcome.NEW], counts[Outcome.IGNORED]
     used = counts[Outcome.USED] + new
-    refused = len(log) - used - ignored
+    unnamed = counts[Outcome.NO_IDENTITY]
+    refused = len(log) - used - ignored - unnamed
     of_all = f"of {len(log)}" + (f", {ignored} of which this estimator has no use for" if ignored else "")
     scores = {
         "detections.used": Score(
             float(used), "1", f"Detections used, {of_all}; {new} of those used began a landmark.", better="none"
         ),
         "detections.refused": Score(
-            float(refused), "1", f"Detections refused for any reason, {of_all}.", better="none"
+            float(refused),
+            "1",
+            f"Detections of a landmark refused, {of_all}: outside the gate, repeated, too late or without odometry.",
+            better="none",
+        ),
+        "detections.unnamed": Score(
+            float(unnamed),
+            "1",
+            f"Detections in which no landmark is probable enough for this estimator, {of_all}; the recogniser mostly "
+            "took these for no landmark.",
+            better="none",
         ),
     }
     squares = nis(log)

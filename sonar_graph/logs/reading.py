@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.logs.adapters.config import LogConfig
 from sonar_graph.logs.assembly import Assembly
 from sonar_graph.logs.calibration_sources import PartialCalibration
-from sonar_graph.logs.container import Keep, Progress, scan
+from sonar_graph.logs.container import Keep, Progress, Recording, scan
+from sonar_graph.logs.log_record import read_calibration
 from sonar_graph.logs.message_definitions import short_name
 from sonar_graph.logs.roles import choose_topics, wanted_types
 from sonar_graph.logs.window import Window
@@ -69,4 +71,23 @@ def read_sequence(
     recording = scan(path, lambda kind: Keep.ALL if short_name(kind) in types else Keep.NONE, window, progress)
     if not salvage:
         recording.require_sound()
-    return Assembly(recording, choose_topics(recording, topics or {}, config), calibration).sequence(name)
+    sequence = Assembly(recording, choose_topics(recording, topics or {}, config), calibration).sequence(name)
+    said = _start_elsewhere(recording, calibration, window)
+    return replace(sequence, notes=sequence.notes | {"log.start": said}) if said else sequence
+
+
+def _start_elsewhere(
+    recording: Recording, given: Calibration | PartialCalibration | None, window: Window | None
+) -> str | None:
+    """That the start pose in the log is of another instant than the first one read; None where that is not so."""
+    if window is None or window.start is None or recording.beginning_ns is None or isinstance(given, Calibration):
+        return None
+    recorded = read_calibration(recording)
+    is_given = given is not None and "start" in given.values
+    late_ns = window.start.resolve(recording.beginning_ns) - recording.beginning_ns
+    if is_given or late_ns <= 0 or recorded is None or "start" not in recorded.model_fields_set:
+        return None
+    return (
+        f"the start pose that it states is of its beginning, {late_ns * 1e-9:.3f} s before the part that was read; "
+        "give the pose there as [start] position_m and rpy_rad in a file for --calibration"
+    )

@@ -227,9 +227,11 @@ def _require(choice: Choice, recording: Recording, wanted: Mapping[str, str], co
     if role.is_required and not recording.topics:
         raise MissingTopicError(f"{path}: has no messages: {recording.ending or 'see whether the recorder wrote any'}")
     if choice.topic is None and (role.is_required or (is_asked_for and not choice.is_off)):
+        needed = " (IMU and Doppler log must both be in the log, for recognising in sonar images too)"
         raise MissingTopicError(
-            f"{path}: nothing for {role.name}: {choice.reason}; the log has {topic_list(recording)}; "
-            f"what other types are is said in a log configuration, which `sonar-graph inspect {path} --toml` begins"
+            f"{path}: nothing for {role.name}: {choice.reason}{needed if role.is_required else ''}; the log has "
+            f"{topic_list(recording)}; what other types are is said in a log configuration, which "
+            f"`sonar-graph inspect {path} --toml` begins"
         )
 
 

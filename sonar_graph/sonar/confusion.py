@@ -24,6 +24,7 @@ from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sonar.identity import virtual_evidence
 from sonar_graph.sonar.scores import soft_scores
+from sonar_graph.validation import faults_in
 
 LEAST_ENTRY = 1e-3
 """Smallest entry of the matrix: a class that never looked like a feature in some hundred frames still may."""
@@ -182,8 +183,9 @@ def read_confusion(path: Path) -> Confusion:
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise CalibrationError(f"{path} is not JSON: {error}") from error
     except ValidationError as error:
-        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise CalibrationError(f"{path}: {faults}; write one with sonar-graph calibrate") from error
+        raise CalibrationError(
+            f"{path}: {faults_in(error, Confusion)}; write one with sonar-graph calibrate"
+        ) from error
 
 
 def confusion_for(designs: Sequence[LandmarkDesign]) -> Confusion:

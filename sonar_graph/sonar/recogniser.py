@@ -18,7 +18,7 @@ from pydantic import Field
 from scipy.optimize import linear_sum_assignment
 
 from sonar_graph.calibration import Calibration, Section
-from sonar_graph.errors import CalibrationError
+from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, SonarFrames
 from sonar_graph.sonar.appearance import Appearance, AppearanceParams
@@ -136,7 +136,14 @@ class Recogniser:
         LandmarkDetections | None
             One row a track that is seen now and trusted, with the posterior over all landmarks. None where there is
             none, and for a frame that must not be used; `fates` says why.
+
+        Raises
+        ------
+        MeasurementError
+            When the block holds more than one frame.
         """
+        if len(frame) != 1:
+            raise MeasurementError(f"Recogniser.process: a block of {len(frame)} frames; give blocks of one, in order")
         self.stamp_ns = stamp_ns = int(frame.stamps_ns[0])
         self.sightings, self.track_ids = [], np.empty(0, dtype=np.int64)
         if motion is not None:

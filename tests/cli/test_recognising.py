@@ -15,6 +15,8 @@ import pytest
 from mcap.reader import make_reader
 
 from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.recorder import write_recording
+from sonar_graph.logs.sonar_encoding import sonar_image_messages
 from sonar_graph.logs.writing import write_sequence
 from sonar_graph.sonar import confusion
 from sonar_graph.sonar.confusion import read_confusion
@@ -39,6 +41,14 @@ def recognised(lane_log: Path, run: Run, tmp_path_factory: pytest.TempPathFactor
     out = tmp_path_factory.mktemp("recognised") / "out.mcap"
     assert run("recognise", lane_log, "-o", out) == 0
     return out
+
+
+@pytest.fixture(scope="module")
+def strange_designs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of a landmark that is not in the log."""
+    path = tmp_path_factory.mktemp("strange") / "mine.toml"
+    path.write_text(DESIGNS.replace("0.3", "2.0").replace("0.15]", "1.0]").replace("id = 4", "id = 9"))
+    return path
 
 
 def contents(path: Path) -> Counter[tuple[str, int, bytes]]:
@@ -67,6 +77,31 @@ def test_recognise_says_what_became_of_everything(lane, lane_log, lane_recogniti
     for outcome, count in lane_recognition.outcomes.items():
         assert re.search(rf"^ +{count}  {re.escape(outcome)}$", said, re.MULTILINE), outcome
     assert said.rstrip().endswith("out.mcap")
+    ids, probability = lane_recognition.detections.most_probable()
+    counts = [f"landmark {k}: {np.count_nonzero((ids == k) & (probability > 0.5))}" for k in (1, 2, 3, 4)]
+    rest = np.count_nonzero(probability <= 0.5)
+    assert f"Most probable: {', '.join(counts)}, none of them: {rest}\n" in said
+    assert "Warning" not in said
+
+
+def test_where_nothing_is_recognised_one_line_says_so_and_what_was_looked_for(
+    lane_log, strange_designs, run, tmp_path, capsys
+):
+    for command, out in (("recognise", "out.mcap"), ("compare", "out")):
+        more = QUICK if command == "compare" else ()
+        assert run(command, lane_log, "-o", tmp_path / out, "--designs", strange_designs, *more) == 0
+        said = capsys.readouterr().out
+        assert "Warning: no landmark was recognised; looked for 9: plate; --designs gives others" in said
+
+
+def test_a_log_made_with_other_designs_says_so(lane, run, tmp_path, capsys):
+    log = tmp_path / "mine.mcap"
+    options = {"options": '{"image":{"designs":"mine.toml"}}'}
+    made = replace(lane, sequence=replace(lane.sequence, notes=options))
+    made.write(log, [lane.one(k) for k in range(3)])
+    assert run("recognise", log, "-o", tmp_path / "out.mcap") == 0
+    said = capsys.readouterr().out
+    assert "Warning: the log was made with the designs of mine.toml; give them with --designs" in said
 
 
 def test_recognising_again_replaces_what_was_there(recognised, run, tmp_path, capsys):
@@ -79,12 +114,18 @@ def test_recognising_again_replaces_what_was_there(recognised, run, tmp_path, ca
     assert not np.allclose(one.id_probability, other.id_probability)
 
 
-def test_compare_recognises_by_itself_and_gives_what_recognise_gives(lane_log, recognised, run, tmp_path):
+def test_compare_recognises_by_itself_and_gives_what_recognise_gives(lane_log, recognised, run, tmp_path, capsys):
     assert run("compare", lane_log, "-o", tmp_path / "images", *QUICK) == 0
     assert run("compare", recognised, "-o", tmp_path / "detections", *QUICK) == 0
     pages = [(tmp_path / name / "report.html").read_text() for name in ("images", "detections")]
     assert 'id="recognition"' in pages[0]
     assert 'id="recognition"' not in pages[1]
+    said = [" ".join(text.split()) for text in capsys.readouterr().out.split("Report: ")]
+    assert "Most probable: landmark 1: " in said[0]
+    assert "those that recognise put into the log" in said[1]
+    assert "--rule virtual-evidence" in said[1]
+    assert run("compare", recognised, "-o", tmp_path / "anew", *QUICK, "--rule", "virtual-evidence") == 0
+    assert 'id="recognition"' in (tmp_path / "anew" / "report.html").read_text()
     assert json.loads((tmp_path / "images" / "recognition.json").read_text())["frames"] > 100
     topics = {topic for topic, _, _ in contents(tmp_path / "images" / "result.mcap")}
     assert "/sonar/recognised" in topics
@@ -96,6 +137,9 @@ def test_a_model_that_calibrate_wrote_is_used(lane_log, run, tmp_path, monkeypat
     assert re.fullmatch(r"sonar-graph: too few labelled frames .*give longer or more logs\n", capsys.readouterr().err)
     monkeypatch.setattr(confusion, "LEAST_FRAMES", 8)
     assert run("calibrate", lane_log, "-o", tmp_path / "model.json") == 0
+    said = capsys.readouterr().out
+    assert re.search(r"^  landmark 1: \d+ frames, 1 tracks?$", said, re.MULTILINE)
+    assert re.search(r"^Caution: fewer than 10 tracks of landmark 1, .*more logs", said, re.MULTILINE)
     model = read_confusion(tmp_path / "model.json")
     assert model.provenance["logs"] == "lane.mcap"
     assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--model", tmp_path / "model.json") == 0
@@ -104,16 +148,23 @@ def test_a_model_that_calibrate_wrote_is_used(lane_log, run, tmp_path, monkeypat
     assert np.median(found.range_azimuth_cov[:, 0, 0]) < 0.05**2
 
 
-def test_designs_of_ones_own_need_no_code(lane_log, run, tmp_path):
+def test_designs_of_ones_own_need_no_code(lane_log, run, tmp_path, capsys):
     (tmp_path / "mine.toml").write_text(DESIGNS)
     assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--designs", tmp_path / "mine.toml") == 0
+    assert "Warning: the log has landmarks 1, 2, 3, of which there is no design" in capsys.readouterr().out
     found = read_sequence(tmp_path / "out.mcap").detections
     assert found is not None
     assert np.unique(found.candidate_ids).tolist() == [4]
 
 
+def images_alone(lane: Lane, path: Path) -> Path:
+    """A log as one of a sonar's own file is."""
+    write_recording(path, [sonar_image_messages("/sonar", lane.one(0), frequency_hz=1.8e6, sound_speed_m_s=1480)], {})
+    return path
+
+
 @pytest.fixture
-def files(lane: Lane, lane_log: Path, tmp_path: Path) -> dict[str, object]:
+def files(lane: Lane, lane_log: Path, strange_designs: Path, tmp_path: Path) -> dict[str, object]:
     """What a user may give by mistake."""
     bare, blind = tmp_path / "bare.mcap", tmp_path / "blind.mcap"
     write_sequence(bare, lane.sequence)
@@ -129,6 +180,8 @@ def files(lane: Lane, lane_log: Path, tmp_path: Path) -> dict[str, object]:
         "lane": lane_log,
         "bare": bare,
         "blind": blind,
+        "images": images_alone(lane, tmp_path / "images.mcap"),
+        "strange": strange_designs,
         "new": tmp_path / "new.mcap",
         "model": tmp_path / "m.json",
     } | {name: tmp_path / name for name in names}
@@ -148,7 +201,17 @@ MISTAKES = {
     "recognise missing.mcap -o new": r"missing\.mcap",
     "calibrate bare -o new": r"ends in \.json",
     "calibrate blind -o model": r"blind\.mcap: without true trajectory and true landmarks",
-    "calibrate bare -o model": r"bare\.mcap|too few labelled frames",
+    "calibrate bare -o model": r"bare\.mcap: has no sonar images",
+    "calibrate lane lane -o model": r"lane\.mcap: is named twice.*name each log once",
+    "calibrate lane -o model --designs strange": r"true landmarks are 1, 2, 3, 4, the designs are 9: .*--designs",
+    "calibrate lane -o model --set identity.tempre=1": r"settings of the recogniser: identity\.tempre: .*temper",
+    "calibrate lane -o model --calibration words.json": r"words\.json: not JSON",
+    "compare bare -o new --rule jeffrey": r"bare\.mcap: has no sonar images.*--rule",
+    "compare lane -o new --rule bayes": r"settings of the recogniser: identity\.rule: .*virtual-evidence.*jeffrey",
+    "compare lane -o new --model list.json": r"list\.json: .*calibrate",
+    "compare lane -o new --designs broken.toml": r"broken\.toml.*size_m",
+    "recognise lane -o new --rule jeffrey --set identity.rule=jeffrey": r"--rule jeffrey and --set .*give one of them",
+    "recognise images -o new": r"images\.mcap: nothing for imu.*IMU and Doppler log must both be in the log",
     "calibrate lane -o model --designs broken.toml": r"broken\.toml.*size_m",
     "compare words.json -o new": r"words\.json",
 }

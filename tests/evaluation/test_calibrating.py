@@ -170,9 +170,14 @@ def test_frames_without_odometry_count_nothing(lane, lane_log, tmp_path):
 
 def test_landmarks_that_are_not_in_the_log_are_named(lane_log):
     """The designs of two landmarks under other identities."""
+    run = read_sequence(lane_log)
     strangers = tuple(replace(d, id=d.id + 6) for d in DEFAULT_DESIGNS[:2])
-    with pytest.raises(CalibrationError, match=r"landmark 7: 0.*landmark 8: 0"):
-        calibrate([(lane_log, read_sequence(lane_log))], designs=strangers)
+    with pytest.raises(
+        CalibrationError, match=r"lane\.mcap: its true landmarks are 1, 2, 3, 4, the designs are 7, 8: "
+    ):
+        calibrate([(lane_log, run)], designs=strangers)
+    with pytest.raises(CalibrationError, match=r"landmark 8: 0"):
+        calibrate([(lane_log, run)], designs=(DEFAULT_DESIGNS[0], strangers[1]))
 
 
 def test_frames_outside_the_truth_are_not_labelled(lane_log, measured):

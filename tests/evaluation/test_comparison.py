@@ -24,7 +24,7 @@ TRAJECTORY_KEYS = {
 }
 OTHER_KEYS = {
     *("landmarks.raw_m", "landmarks.se2_m", "landmarks.count", "landmarks.nees"),
-    *("detections.used", "detections.refused", "detections.nis"),
+    *("detections.used", "detections.refused", "detections.unnamed", "detections.nis"),
     *("time.update_median_ms", "time.update_p99_ms", "time.update_max_ms", "time.total_s", "time.real_time_factor"),
 }
 
@@ -70,7 +70,8 @@ def test_ignored_detections_are_neither_used_nor_refused() -> None:
     unpredicted = (np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan))
     log = DetectionLog(np.arange(n), np.ones(n, int), *unpredicted, [Outcome.IGNORED] * 2 + [Outcome.NO_IDENTITY])
     scores = detection_scores(log)
-    assert (scores["detections.used"].value, scores["detections.refused"].value) == (0, 1)
+    kinds = ("used", "refused", "unnamed")
+    assert [scores[f"detections.{kind}"].value for kind in kinds] == [0, 0, 1]
     assert "of 3, 2 of which" in scores["detections.refused"].protocol
     assert "detections.nis" not in scores
 

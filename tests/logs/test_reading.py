@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError, LogError, MissingTopicError
+from sonar_graph.logs.calibration_sources import PartialCalibration
 from sonar_graph.logs.encoding import dvl_messages, imu_messages
 from sonar_graph.logs.message_definitions import definition
 from sonar_graph.logs.reading import read_sequence
@@ -26,7 +28,9 @@ def test_a_log_without_imu_or_dvl_names_what_is_there(bench: Any) -> None:
         MissingTopicError, match=r"nothing for dvl: no marine_acoustic_msgs/Dvl, dvl_msgs/DVL.*/imu \(sensor_msgs"
     ):
         read_sequence(bench.write(imu))
-    with pytest.raises(MissingTopicError, match=r"nothing for imu.*/dvl \(marine"):
+    with pytest.raises(
+        MissingTopicError, match=r"nothing for imu.*IMU and Doppler log must both be in the log.*/dvl \(marine"
+    ):
         read_sequence(bench.write(dvl))
 
 
@@ -248,6 +252,27 @@ def test_a_window_is_the_same_part_of_every_block(make_sequence: Any, tmp_path: 
         np.testing.assert_array_equal(part.stamps_ns, whole.stamps_ns[is_inside])
     assert found.calibration == sequence.calibration
     assert found.notes["log.part"] == "2.000 s to 4.000 s of the recording"
+
+
+def test_a_start_pose_of_the_logs_beginning_is_said_to_be_of_another_instant(
+    make_sequence: Any, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.mcap"
+    write_sequence(path, make_sequence(samples=20_000))
+    later = Window(Instant.parse("2"))
+    said = read_sequence(path, window=later).notes["log.start"]
+    assert re.search(r"of its beginning, 2\.000 s before .*\[start\] position_m and rpy_rad .*--calibration", said)
+    given = PartialCalibration.parse({"start": {"position_m": [1.0, 0.0, 0.0]}}, "x.toml")
+    other = PartialCalibration.parse({"gravity_m_s2": 9.8}, "x.toml")
+    assert "log.start" in read_sequence(path, window=later, calibration=other).notes
+    for harmless in (
+        {"window": later, "calibration": given},
+        {"window": later, "calibration": Calibration()},
+        {"window": Window(end=Instant.parse("2"))},
+        {"window": Window(Instant.parse("0"))},
+        {},
+    ):
+        assert "log.start" not in read_sequence(path, **harmless).notes
 
 
 def test_stamps_that_run_backwards_or_beside_the_log_are_in_the_notes(bench: Any) -> None:

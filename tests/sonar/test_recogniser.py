@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
-from sonar_graph.errors import CalibrationError
+from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS
 from sonar_graph.measurements import SonarFrames
 from sonar_graph.sonar.beliefs import IdentityParams
@@ -285,3 +285,12 @@ def test_no_landmark_is_the_most_probable_identity_of_two_tracks(seed: int, trac
     free = before[before < known]
     if len(set(free.tolist())) == len(free):
         np.testing.assert_array_equal(found, beliefs)
+
+
+def test_a_block_of_two_frames_is_refused_and_changes_nothing():
+    recogniser = Recogniser(DECIBELS)
+    both = np.stack([picture(DISC, 1.7, 0.0, 0.0, 1), picture(DISC, 1.7, 0.0, 0.0, 2)])
+    block = SonarFrames(np.array([0, FRAME_NS]), both, RANGES_M, AZIMUTHS_RAD)
+    with pytest.raises(MeasurementError, match=r"a block of 2 frames; give blocks of one"):
+        recogniser.process(block, None, VIEW)
+    assert recogniser.stamp_ns is None
