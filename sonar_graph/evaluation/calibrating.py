@@ -139,7 +139,7 @@ def calibrate(
             raise LogError(f"{path}: has no sonar images; `sonar-graph inspect {path}` lists what it has")
     names = ", ".join(path.name for path, _ in logs)
     kinds = "; ".join(dict.fromkeys(run.notes.get("ours", "recorded") for _, run in logs))
-    return estimate_confusion(gathered.fits(), gathered.ids, {"logs": names, "what they are": kinds})
+    return estimate_confusion(gathered.fits(), gathered.ids, {"logs": names, "what they are": kinds}, designs)
 
 
 def _require_common(path: Path, in_log: Ints, known: tuple[int, ...]) -> None:

@@ -3,8 +3,8 @@
 Classes are the designs in their order and last "none of them"; features the same. ``matrix[k, j] = p(z = j | x = k)``
 is the mean soft score of feature j over the labelled frames of class k: rows sum to 1. With it go the two numbers that
 make scores of correlations, and the accuracy of range and azimuth, all measured on the same frames. The file says
-where those came from. The one that ships, ``default_confusion.json``, was measured on simulated basins with the designs
-that ship.
+where those came from, and what the landmarks look like for which it was measured. The one that ships,
+``default_confusion.json``, was measured on simulated basins with the designs that ship.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy.optimize import minimize
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import CalibrationError
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.landmark_designs import LandmarkDesign
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sonar.identity import virtual_evidence
 from sonar_graph.sonar.scores import soft_scores
@@ -34,11 +34,21 @@ LEAST_FRAMES = 20
 """Of every class, for a measured row."""
 
 
+class DesignMark(Section):
+    """By what a design is known again."""
+
+    name: str
+    digest: str
+    """As `LandmarkDesign.digest` gives it."""
+
+
 class Confusion(Section):
     """The measured model of a recogniser."""
 
     ids: tuple[int, ...] = Field(min_length=1)
     """Identities of the designs, in the order of rows and columns."""
+    designs: tuple[DesignMark, ...] = ()
+    """Of each identity, what it looked like when it was measured; without them no recogniser takes the model."""
     matrix: tuple[tuple[float, ...], ...]
     """p(z = j | x = k), shape (ids + 1, ids + 1); the last row and column are "none of them"."""
     sharpness: float = Field(gt=0)
@@ -56,11 +66,33 @@ class Confusion(Section):
     def _is_stochastic(self) -> Confusion:
         matrix = np.array(self.matrix, float, ndmin=2) if len({len(r) for r in self.matrix}) == 1 else np.empty((0, 0))
         classes = len(self.ids) + 1
+        if self.designs and len(self.designs) != len(self.ids):
+            raise ValueError(f"designs: expected one for each of {len(self.ids)} ids, not {len(self.designs)}")
         if matrix.shape != (classes, classes):
             raise ValueError(f"matrix: expected {classes} rows of {classes} for {len(self.ids)} ids and none of them")
         if (matrix < 0).any() or not np.allclose(matrix.sum(axis=1), 1, atol=1e-6):
             raise ValueError("matrix: each row must be probabilities that sum to 1 (rows are the true classes)")
         return self
+
+    def check_designs(self, designs: Sequence[LandmarkDesign], source: str = "confusion") -> None:
+        """Refuse designs other than those that it was measured for.
+
+        Raises
+        ------
+        CalibrationError
+            Naming the source, and the first design that is another.
+        """
+        ids, remedy = tuple(design.id for design in designs), "measure a model for these with sonar-graph calibrate"
+        if self.ids != ids:
+            raise CalibrationError(f"{source}: measured for landmarks {self.ids}, the designs are {ids}; {remedy}")
+        if not self.designs:
+            raise CalibrationError(f"{source}: designs: is missing, so that it may be of other landmarks; {remedy}")
+        for mark, design in zip(self.designs, designs, strict=True):
+            if mark != mark_of(design):
+                raise CalibrationError(
+                    f"{source}: measured for another landmark {design.id} ({mark.name}) than the design given "
+                    f"({design.name}): name, size, height or picture differ; {remedy}"
+                )
 
     def array(self) -> Floats:
         """The matrix, no entry below 0.001, rows with sum 1."""
@@ -80,6 +112,11 @@ class Confusion(Section):
         return np.asarray(self.array().mean(axis=0))
 
 
+def mark_of(design: LandmarkDesign) -> DesignMark:
+    """Its name and digest."""
+    return DesignMark(name=design.name, digest=design.digest())
+
+
 @dataclass(frozen=True, eq=False)
 class LabelledFits:
     """What was seen of objects whose class is known."""
@@ -96,8 +133,21 @@ class LabelledFits:
     """Measured minus true (m, rad), shape (n, 2); NaN where there is no landmark."""
 
 
-def estimate_confusion(fits: LabelledFits, ids: tuple[int, ...], provenance: dict[str, str]) -> Confusion:
+def estimate_confusion(
+    fits: LabelledFits, ids: tuple[int, ...], provenance: dict[str, str], designs: Sequence[LandmarkDesign] = ()
+) -> Confusion:
     """The model with which one frame says as much as the labelled ones bear out, all classes counting the same.
+
+    Parameters
+    ----------
+    fits
+        What was seen.
+    ids
+        Of the designs, in their order.
+    provenance
+        Where it comes from.
+    designs
+        What the identities look like; left out, no recogniser takes the model.
 
     Raises
     ------
@@ -117,6 +167,7 @@ def estimate_confusion(fits: LabelledFits, ids: tuple[int, ...], provenance: dic
     sigmas = np.sqrt(np.nanmean((fits.range_azimuth_error * fits.visible[:, None] ** 2) ** 2, axis=0))
     return Confusion(
         ids=ids,
+        designs=tuple(map(mark_of, designs)),
         matrix=tuple(map(tuple, matrix.tolist())),
         sharpness=sharpness,
         threshold=threshold,
@@ -192,7 +243,8 @@ def confusion_for(designs: Sequence[LandmarkDesign]) -> Confusion:
     """The model that ships, for the designs that ship; for others an assumed one, which says so."""
     ids = tuple(design.id for design in designs)
     shipped = read_confusion(Path(__file__).with_name("default_confusion.json"))
-    if tuple(designs) == DEFAULT_DESIGNS:
+    marks = tuple(map(mark_of, designs))
+    if (ids, marks) == (shipped.ids, shipped.designs):
         return shipped
     classes = len(ids) + 1
     matrix = np.full((classes, classes), (1 - ASSUMED_RIGHT) / (classes - 1))
@@ -200,6 +252,7 @@ def confusion_for(designs: Sequence[LandmarkDesign]) -> Confusion:
     return shipped.model_copy(
         update={
             "ids": ids,
+            "designs": marks,
             "matrix": tuple(map(tuple, matrix.tolist())),
             "provenance": {"origin": f"assumed: {ASSUMED_RIGHT:.0%} right; measure it with sonar-graph calibrate"},
         }

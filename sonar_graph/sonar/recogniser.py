@@ -18,7 +18,7 @@ from pydantic import Field
 from scipy.optimize import linear_sum_assignment
 
 from sonar_graph.calibration import Calibration, Section
-from sonar_graph.errors import CalibrationError, MeasurementError
+from sonar_graph.errors import MeasurementError
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, SonarFrames
 from sonar_graph.sonar.appearance import Appearance, AppearanceParams
@@ -93,11 +93,7 @@ class Recogniser:
         self.designs = tuple(designs or DEFAULT_DESIGNS)
         self.confusion = self.params.confusion or confusion_for(self.designs)
         self.ids = np.array([design.id for design in self.designs])
-        if self.confusion.ids != tuple(self.ids.tolist()):
-            raise CalibrationError(
-                f"confusion: measured for landmarks {self.confusion.ids}, the designs are {tuple(self.ids.tolist())}; "
-                "measure it with sonar-graph calibrate"
-            )
+        self.confusion.check_designs(self.designs)
         self._calibration = calibration
         self._look = Look(
             Appearance(self.designs, self.params.appearance),

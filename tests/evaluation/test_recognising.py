@@ -83,7 +83,7 @@ def test_designs_under_other_names_give_other_names(lane):
     """Negative control: names come from the designs and from nothing else."""
     turned = tuple(replace(d, id=d.id % 4 + 1) for d in DEFAULT_DESIGNS)
     turned = tuple(sorted(turned, key=lambda d: d.id))
-    model = confusion_for(DEFAULT_DESIGNS)
+    model = confusion_for(DEFAULT_DESIGNS).model_copy(update={"designs": confusion_for(turned).designs})
     found = recognised(lane, designs=turned, params=RecogniserParams(confusion=model)).detections
     pairs = accepted(found, truth_of(lane, found)[0])
     assert len(pairs) >= 3

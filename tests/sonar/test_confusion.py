@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sonar_graph import landmark_designs
 from sonar_graph.errors import CalibrationError
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign, load_designs
 from sonar_graph.sonar.confusion import Confusion, LabelledFits, confusion_for, estimate_confusion, read_confusion
 from sonar_graph.sonar.identity import virtual_evidence
 from sonar_graph.sonar.scores import soft_scores
@@ -100,11 +102,40 @@ def test_files_come_back_and_wrong_ones_are_named(tmp_path):
 
 
 def test_designs_that_ship_have_a_measured_model_and_others_an_assumed_one():
-    assert confusion_for(DEFAULT_DESIGNS).ids == (1, 2, 3, 4)
+    for shipped in (DEFAULT_DESIGNS, load_designs(Path(landmark_designs.__file__).with_name("default_landmarks.toml"))):
+        assert "simulated basins" in confusion_for(shipped).provenance["origin"]
     other = confusion_for([LandmarkDesign(9, "ring", 0.3, np.zeros((4, 4)))])
     assert other.ids == (9,)
     assert "assumed" in other.provenance["origin"]
     np.testing.assert_allclose(other.array().sum(axis=1), 1)
+    other.check_designs([RING])
+
+
+RING = LandmarkDesign(9, "ring", 0.3, np.zeros((4, 4)))
+
+
+@pytest.mark.parametrize("change", [{"name": "plate"}, {"size_m": 0.31}, {"height_m": 0.02}, {"mask": np.eye(4)}])
+def test_designs_that_only_have_the_same_numbers_are_refused(tmp_path, change):
+    """For a model that came from a file as for any other."""
+    path = tmp_path / "model.json"
+    path.write_text(estimate_confusion(_fits(50, 0.1), (9, 10), {}, [RING, replace(RING, id=10)]).model_dump_json())
+    model = read_confusion(path)
+    model.check_designs([RING, replace(RING, id=10)])
+    with pytest.raises(CalibrationError, match=r"mine: measured for another landmark 9 \(ring\) than .*calibrate"):
+        model.check_designs([replace(RING, **change), replace(RING, id=10)], "mine")
+    with pytest.raises(CalibrationError, match=r"measured for landmarks \(9, 10\), the designs are \(10, 9\)"):
+        model.check_designs([replace(RING, id=10), RING])
+
+
+def test_a_model_that_does_not_say_what_it_was_measured_for_is_refused():
+    model = estimate_confusion(_fits(50, 0.1), (9, 10), {})
+    with pytest.raises(CalibrationError, match="designs: is missing"):
+        model.check_designs([RING, replace(RING, id=10)])
+
+
+def test_marks_that_are_not_one_for_each_identity_are_refused():
+    with pytest.raises(ValueError, match="expected one for each of 2 ids, not 1"):
+        estimate_confusion(_fits(50, 0.1), (9, 10), {}, [RING])
 
 
 def _model(*rows: tuple[float, ...]) -> Confusion:
