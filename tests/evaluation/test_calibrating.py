@@ -157,17 +157,6 @@ def test_frames_that_come_too_late_count_nothing_again(lane, measured, tmp_path)
     assert calibrate([(late, read_sequence(late))]) == measured
 
 
-def test_frames_without_odometry_count_nothing(lane, lane_log, tmp_path):
-    """The Doppler log ends before the truth does: as if the frames after its end were not there."""
-    run = read_sequence(lane_log)
-    end_ns = int(run.dvl.stamps_ns[-1]) - 3 * 10**9
-    run = replace(run, dvl=run.dvl.rows(run.dvl.stamps_ns <= end_ns))
-    kept = np.flatnonzero(lane.frames.stamps_ns <= run.end_ns)
-    assert len(kept) < len(lane.frames) - 10
-    short = lane.write(tmp_path / "lane.mcap", [lane.one(row) for row in kept])
-    assert calibrate([(lane_log, run)]) == calibrate([(short, run)])
-
-
 def test_landmarks_that_are_not_in_the_log_are_named(lane_log):
     """The designs of two landmarks under other identities."""
     run = read_sequence(lane_log)
