@@ -27,7 +27,8 @@ _OTHERS = (
     "confident_false_fraction, start_position_sigma_m, start_rotation_sigma_rad, floor_sigma_m, speed_m_s; and with "
     "--images image.NAME: sonar, designs, speckle, side_lobes, cross_talk_db, measured_lens, floor_db, "
     "absorption_db_m, tvg_error_db, texture_shape, joints, shadows, multipath, surface_path_db, floor_reflection, "
-    "noise_db, drop_probability, time_offset_s, sound_speed_error, stones, decoys"
+    "noise_db, drop_probability, time_offset_s, sound_speed_error, stones, decoys. image.designs is a TOML file of at "
+    "least four landmarks; the four lowest ids are laid, in their order"
 )
 """Written out, because help must not wait for the simulator to be imported."""
 worlds = typer.Typer(
@@ -79,12 +80,25 @@ def basin(
     values: dict[str, Any] = {name: value for name, value in flags.items() if value is not None}
     if no_bias:
         values["gyro_bias_scale"] = 0.0
+    given = nested_settings(settings or [])
+    if "image" in given and not images:
+        raise typer.BadParameter("--set image.NAME=VALUE is for sonar images: give --images too, or leave it out")
     if images:
         values["image"] = {}
-    options = _basin_options(values | nested_settings(settings or []))
+    options = _basin_options(values | given)
     path = writable_log(output, overwrite=overwrite)
     write_basin(path, options)
+    if options.image is not None:
+        typer.echo(f"Landmarks: {_laid(options)}")
     typer.echo(f"Log: {path}")
+
+
+def _laid(options: BasinOptions) -> str:
+    """Which landmarks lie where."""
+    from sonar_graph.simulation.basin import LANDMARKS_XY_M, designs_laid
+
+    placed = zip(designs_laid(options.image), LANDMARKS_XY_M.tolist(), strict=True)
+    return ", ".join(f"{design.id} {design.name} at ({x:g}, {y:g})" for design, (x, y) in placed)
 
 
 def write_basin(path: Path, options: BasinOptions) -> None:

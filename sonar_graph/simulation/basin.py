@@ -24,7 +24,7 @@ from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Mounting, SonarImage
 from sonar_graph.errors import SimulationError
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign, load_designs
+from sonar_graph.landmark_designs import DEFAULT_DESIGNS, OWN_DESIGNS, LandmarkDesign, load_designs
 from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.detections import Fan
@@ -141,28 +141,33 @@ def simulate_basin_frames(options: BasinOptions, frames_per_block: int = 32) -> 
 def _world(options: BasinOptions, rng: np.random.Generator) -> World:
     """The landmarks on the floor, with the identities of their designs."""
     world = world_on_floor(LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, rng)
-    return replace(world, landmark_ids=np.array([design.id for design in _designs(options.image)]))
+    return replace(world, landmark_ids=np.array([design.id for design in designs_laid(options.image)]))
 
 
-def _designs(image: ImageOptions | None) -> list[LandmarkDesign]:
-    """One for each landmark, by identity.
+def designs_laid(image: ImageOptions | None) -> list[LandmarkDesign]:
+    """The four that lie at `LANDMARKS_XY_M`, in this order: those of the lowest identities, by identity.
 
     Raises
     ------
+    CalibrationError
+        When the file of one's own designs is none.
     SimulationError
-        When there are fewer.
+        When there are fewer than four.
     """
     named = None if image is None else image.designs
     designs = DEFAULT_DESIGNS if named is None else load_designs(Path(named))
-    if len(designs) < len(LANDMARKS_XY_M):
-        raise SimulationError(f"{named}: {len(designs)} landmark designs; the basin needs {len(LANDMARKS_XY_M)}")
+    if (missing := len(LANDMARKS_XY_M) - len(designs)) > 0:
+        raise SimulationError(
+            f"image.designs: {named} has {len(designs)} landmark designs, the basin needs {len(LANDMARKS_XY_M)}; "
+            f"add {missing}"
+        )
     return sorted(designs, key=lambda design: design.id)[: len(LANDMARKS_XY_M)]
 
 
 def _seabed(world: World, image: ImageOptions, rng: np.random.Generator) -> list[SeabedObject]:
     """Landmarks, turned at random, and what is no landmark."""
     yaw_rad = rng.uniform(-np.pi, np.pi, len(world.landmark_ids))
-    placed = zip(_designs(image), world.landmark_positions, yaw_rad.tolist(), strict=True)
+    placed = zip(designs_laid(image), world.landmark_positions, yaw_rad.tolist(), strict=True)
     landmarks = [place_landmark(design, position, yaw, FLOOR_Z_M) for design, position, yaw in placed]
     spots = rng.permutation(_spots(rng))[: image.stones + image.decoys]
     return landmarks + scattered_objects(spots, image.stones, rng)
@@ -197,8 +202,16 @@ def _notes(options: BasinOptions) -> dict[str, str]:
         "from the paper": ", ".join(published),
         "ours": ", ".join(ours),
         **NOTES,
+        **_own_designs(options.image),
         "speed_m_s": f"{speed_m_s:.3f}",
     }
+
+
+def _own_designs(image: ImageOptions | None) -> dict[str, str]:
+    if image is None or image.designs is None:
+        return {}
+    laid = ", ".join(f"{design.id}: {design.name}" for design in designs_laid(image))
+    return {OWN_DESIGNS: f"{laid}, of {Path(image.designs).name}"}
 
 
 def cruise_speed(options: BasinOptions) -> float:

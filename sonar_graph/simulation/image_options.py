@@ -21,8 +21,9 @@ class ImageOptions(Section):
     sonar: SonarName = "didson"
     """Which sonar; the window is the same for all."""
     designs: str | None = None
-    """TOML file, or folder of such files, with the landmarks that lie in the basin: the four lowest identities; None:
-    those that ship."""
+    """TOML file, or folder of such files, with the landmarks that lie in the basin. It needs four; of more, those with
+    the four lowest identities lie there, in the order of their identities at (5, 0), (7, -5), (2, -7) and (0, -2).
+    None: those that ship."""
     speckle: Literal["world", "frame"] = "world"
     """world: scatterers stay where they are, so that speckle changes only as the vehicle moves; frame: drawn anew for
     each frame, as many simulators do."""

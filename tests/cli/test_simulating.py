@@ -15,14 +15,17 @@ from sonar_graph.simulation.basin import BasinOptions, simulate_basin, simulate_
 SHORT = {"duration_s": 120, "laps": 1, "frame_rate_hz": 0.5, "image": {"multipath": False}}
 
 
-def simulate(path: Path, *more: str) -> None:
+def simulate(path: Path, *more: str, said: str = "Log: ") -> None:
     words = ["simulate", "basin", "-o", str(path), "--images", "--duration-s", "120", "--laps", "1"]
     result = CliRunner().invoke(app, [*words, "--set", "frame_rate_hz=0.5", "--set", "image.multipath=false", *more])
     assert result.exit_code == 0, result.output
+    assert said in result.output
 
 
 def test_images_and_other_sensors_are_those_of_the_library(tmp_path: Path):
-    simulate(tmp_path / "a.mcap")
+    simulate(
+        tmp_path / "a.mcap", said="Landmarks: 1 disc at (5, 0), 2 square at (7, -5), 3 triangle at (2, -7), 4 cross"
+    )
     options = BasinOptions.model_validate(SHORT)
     read, made = list(read_sonar_frames(tmp_path / "a.mcap")), list(simulate_basin_frames(options))
     order = np.argsort([block.stamps_ns[0] for block in read])
@@ -41,6 +44,12 @@ def test_same_seed_gives_the_same_bytes(tmp_path: Path):
     contents = [(tmp_path / f"{name}.mcap").read_bytes() for name in "abc"]
     assert contents[0] == contents[1]
     assert contents[0] != contents[2]
+
+
+def test_image_options_without_images_are_refused():
+    result = CliRunner().invoke(app, ["simulate", "basin", "-o", "a.mcap", "--set", "image.designs=mine.toml"])
+    assert result.exit_code == 2
+    assert "give --images too" in " ".join(result.output.split())
 
 
 def test_unknown_image_option_is_answered_with_those_there_are():

@@ -16,6 +16,7 @@ from sonar_graph.evaluation.published_experiment import (
     published_maps,
     repeats_published,
 )
+from sonar_graph.landmark_designs import OWN_DESIGNS
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import LANDMARKS_XY_M, BasinOptions, simulate_basin
 from sonar_graph.states import LandmarkMap
@@ -71,6 +72,11 @@ def test_another_arrangement_does_not_repeat_it(change: str):
         "unknown": None,
     }[change]
     assert not repeats_published(sequence(changed))
+
+
+def test_landmarks_of_ones_own_design_do_not_repeat_it():
+    own = replace(sequence(published_maps()[1]), notes={OWN_DESIGNS: "1: ring, of mine.toml"})
+    assert not repeats_published(own)
 
 
 def test_height_does_not_matter():

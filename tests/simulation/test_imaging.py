@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import CalibrationError, SimulationError
+from sonar_graph.landmark_designs import OWN_DESIGNS
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin, simulate_basin_frames
 from sonar_graph.simulation.image_options import ImageOptions
@@ -145,10 +146,12 @@ def test_oculus_frames_have_its_size():
 
 
 def squares(path: Path, ids: list[int]) -> Path:
-    """Bright squares with these identities."""
+    """Bright squares with these identities, on plates of unequal sizes."""
     corners = "[[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]"
-    shape = f'name = "square"\nsize_m = 0.3\nshapes = [{{ level_db = 25.0, polygon_m = {corners} }}]\n'
-    path.write_text("".join(f"[[landmark]]\nid = {id_}\n{shape}" for id_ in ids), encoding="utf-8")
+    shape = f'name = "square"\nshapes = [{{ level_db = 25.0, polygon_m = {corners} }}]\n'
+    path.write_text(
+        "".join(f"[[landmark]]\nid = {id_}\nsize_m = {0.3 + id_ / 500}\n{shape}" for id_ in ids), encoding="utf-8"
+    )
     return path
 
 
@@ -156,6 +159,8 @@ def test_own_landmarks_lie_in_the_basin_under_their_own_identities(run, tmp_path
     file = squares(tmp_path / "own.toml", [40, 10, 30, 20, 50])
     sequence = simulate_basin(options(designs=str(file)))
     usual, made = run
+    assert sequence.notes[OWN_DESIGNS] == "10: square, 20: square, 30: square, 40: square, of own.toml"
+    assert OWN_DESIGNS not in usual.notes
     assert sequence.true_landmarks.ids.tolist() == [10, 20, 30, 40]
     np.testing.assert_array_equal(sequence.true_landmarks.positions, usual.true_landmarks.positions)
     number = next(i for i, imaged in enumerate(made) if (imaged.truth.share_in_view[:, :4] == 1).any())
@@ -171,7 +176,9 @@ def test_own_landmarks_lie_in_the_basin_under_their_own_identities(run, tmp_path
 
 
 def test_too_few_landmarks_for_the_basin_are_refused(tmp_path):
-    with pytest.raises(SimulationError, match="3 landmark designs; the basin needs 4"):
+    with pytest.raises(
+        SimulationError, match=r"image.designs: .*own.toml has 3 landmark designs, the basin needs 4; add 1"
+    ):
         simulate_basin(options(designs=str(squares(tmp_path / "own.toml", [1, 2, 3]))))
     with pytest.raises(CalibrationError, match=r"none\.toml"):
         next(blocks(designs=str(tmp_path / "none.toml")))
