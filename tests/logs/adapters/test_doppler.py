@@ -248,7 +248,9 @@ def test_beams_of_known_noise_count_even_alone(foreign: Any, read: Any) -> None:
 def test_beams_go_before_the_velocity_that_a_driver_makes_of_them(foreign: Any, read: Any) -> None:
     rows = [{"velocity": foreign.vector(9, 9, 9), "beams": [beam(i) for i in range(4)]} for _ in range(3)]
     expected = np.linalg.pinv(janus(22.5, [45, -45, -135, 135])) @ [0.0, 0.1, 0.2, 0.3]
-    said = '[dvl]\nvalid_where = {}\n[dvl.beams]\nvelocity = "beams.velocity"\nvalid = "beams.valid"\nsigma_m_s = 0.01\n'
+    said = (
+        '[dvl]\nvalid_where = {}\n[dvl.beams]\nvelocity = "beams.velocity"\nvalid = "beams.valid"\nsigma_m_s = 0.01\n'
+    )
     toml = said + "tilt_deg = 22.5\nazimuth_deg = [45, -45, -135, 135]"
     entry = ("/dvl/data", "dvl_msgs/msg/DVL", water_linked(foreign, rows))
     np.testing.assert_allclose(read(foreign.imu(), entry, toml=toml).dvl.velocity, [expected] * 3, atol=1e-9)
