@@ -155,7 +155,7 @@ def test_help_names_defaults_presets_and_roles_as_they_are() -> None:
     for name, presets in (("imu", IMU_PRESETS), ("dvl", DVL_PRESETS)):
         assert f"{getattr(options, name)} (default)" in helps[name]
         assert all(preset in helps[name] for preset in presets)
-    said = set(re.findall(r"[a-z_]+", helps["settings"].partition("repeated: ")[2]))
+    said = set(re.findall(r"[a-z_]+", helps["settings"].partition("repeated: ")[2].partition(". ")[0]))
     others = BasinOptions.model_fields.keys() - {"seed", "imu", "dvl", "duration_s", "laps", "image"}
     assert said - {"and", "with", "images", "image"} == others | ImageOptions.model_fields.keys()
     topic = next(option.help for option in commands()["compare",].params if option.name == "topics")
