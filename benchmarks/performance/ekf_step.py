@@ -73,7 +73,7 @@ def is_same(figures: dict[str, float]) -> bool:
 def meets_targets(figures: dict[str, float]) -> bool:
     """Whether the comparison is valid and both targets are met."""
     fast = figures["log_s"] <= MOST_LOG_S and figures["filterpy_ratio"] >= LEAST_FILTERPY_RATIO
-    return fast and is_same(figures)
+    return bool(fast and is_same(figures))
 
 
 def exit_code(figures: dict[str, float], *, quick: bool) -> int:
