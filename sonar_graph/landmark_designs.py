@@ -17,8 +17,8 @@ What can be recognised: one figure that is brighter than the floor, in one piece
 connected bright part of an image is a candidate of its own, and only those are compared with designs that have an area
 between ``detection.min_area_m2`` and ``detection.max_area_m2`` and are no longer than ``detection.max_extent_m``
 (0.008 m², 0.2 m² and 0.7 m unless set otherwise). Dark parts may lie apart. What no setting makes visible is refused
-here; bright parts that lie apart, are too small or too large are not. What reaches over the square is cut off at its
-edges.
+here; bright parts that lie apart, are too small or too large are refused by the recogniser, on whose settings that
+depends (`sonar_graph.sonar.candidate_design`). What reaches over the square is cut off at its edges.
 
 The landmarks of the 2014 experiment were never published. All designs here, sizes and levels included, are ours.
 """

@@ -24,7 +24,7 @@ from pydantic import Field
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import CalibrationError
 from sonar_graph.measurements import Floats, LandmarkDetections, SonarFrames
-from sonar_graph.sonar.frame_check import FrameCheck
+from sonar_graph.sonar.frame_check import FrameCheck, check_block
 from sonar_graph.sonar.geometry import FloorView, points
 from sonar_graph.sonar.recogniser import REPORTED, Fate
 from sonar_graph.sonar.tracks import SonarStep
@@ -102,8 +102,15 @@ class AcTagRecogniser:
     def process(
         self, frame: SonarFrames, motion: SonarStep | None = None, view: FloorView | None = None
     ) -> LandmarkDetections | None:
-        """The tags in a block of one frame; motion as for `Recogniser`, the floor is of no use to AcTag."""
+        """The tags in a block of one frame; motion as for `Recogniser`, the floor is of no use to AcTag.
+
+        Raises
+        ------
+        MeasurementError
+            When the block is not one frame.
+        """
         del view
+        check_block(frame)
         stamp_ns = int(frame.stamps_ns[0])
         if motion is not None:
             self._start_T_sonar = self._start_T_sonar.compose(motion.previous_T_sonar)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.calibration import SonarImage
+from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats, SonarFrames
 
 SATURATED_SHARE = 0.5
@@ -46,6 +47,18 @@ class Window(NamedTuple):
         size = f"{len(self.azimuths_rad)} x {len(self.ranges_m)}"
         left, right = np.degrees([self.azimuths_rad.max(), self.azimuths_rad.min()])
         return f"{size}, {self.ranges_m[0]:.2f} m to {self.ranges_m[-1]:.2f} m, {right:.1f}° to {left:.1f}°"
+
+
+def check_block(frame: SonarFrames) -> None:
+    """Refuse a block that is not one frame.
+
+    Raises
+    ------
+    MeasurementError
+        When it has more frames, or none.
+    """
+    if len(frame) != 1:
+        raise MeasurementError(f"a recogniser was given a block of {len(frame)} frames; give blocks of one, in order")
 
 
 class FrameCheck:

@@ -18,16 +18,16 @@ from pydantic import Field
 from scipy.optimize import linear_sum_assignment
 
 from sonar_graph.calibration import Calibration, Section
-from sonar_graph.errors import MeasurementError
 from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, SonarFrames
 from sonar_graph.sonar.appearance import Appearance, AppearanceParams
 from sonar_graph.sonar.association import Association
 from sonar_graph.sonar.beliefs import Beliefs, IdentityParams
+from sonar_graph.sonar.candidate_design import check_candidates
 from sonar_graph.sonar.candidates import Candidates, Verdict
 from sonar_graph.sonar.confusion import Confusion, confusion_for
 from sonar_graph.sonar.detection import DetectionParams, select_candidates
-from sonar_graph.sonar.frame_check import FrameCheck
+from sonar_graph.sonar.frame_check import FrameCheck, check_block
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.look import Look, Sighting
 from sonar_graph.sonar.tracking import SonarStep, Tracker, TrackingParams
@@ -80,7 +80,7 @@ class Recogniser:
     Raises
     ------
     CalibrationError
-        When the measured model is of other landmarks.
+        When the measured model is of other landmarks, or a design can never be found.
     """
 
     def __init__(
@@ -94,6 +94,7 @@ class Recogniser:
         self.confusion = self.params.confusion or confusion_for(self.designs)
         self.ids = np.array([design.id for design in self.designs])
         self.confusion.check_designs(self.designs)
+        check_candidates(self.designs, self.params.detection, self.params.appearance.search_m)
         self._calibration = calibration
         self._look = Look(
             Appearance(self.designs, self.params.appearance),
@@ -136,10 +137,9 @@ class Recogniser:
         Raises
         ------
         MeasurementError
-            When the block holds more than one frame.
+            When the block is not one frame.
         """
-        if len(frame) != 1:
-            raise MeasurementError(f"Recogniser.process: a block of {len(frame)} frames; give blocks of one, in order")
+        check_block(frame)
         self.stamp_ns = stamp_ns = int(frame.stamps_ns[0])
         self.sightings, self.track_ids = [], np.empty(0, dtype=np.int64)
         if motion is not None:

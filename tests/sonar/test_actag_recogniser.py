@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.errors import CalibrationError
+from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import SonarFrames
 from sonar_graph.simulation.image_options import ImageOptions
 from sonar_graph.simulation.imaging_sonar import DIDSON
@@ -152,6 +152,13 @@ def test_a_frame_that_must_not_be_used_is_not_shown_to_actag(decoder):
     assert recogniser.process(frame_of(np.zeros((96, 512), np.uint8))) is None
     assert decoder.image is None
     assert "zero" in recogniser.fates[0].outcome
+
+
+def test_a_block_of_two_frames_is_refused_and_not_shown_to_actag(decoder):
+    block = SonarFrames(np.array([5, 6]), np.stack([noise(1), noise(2)]), RANGES_M, AZIMUTHS_RAD)
+    with pytest.raises(MeasurementError, match=r"a block of 2 frames; give blocks of one"):
+        AcTagRecogniser(Calibration()).process(block)
+    assert decoder.image is None
 
 
 def test_an_unknown_family_is_refused_by_name(decoder):
