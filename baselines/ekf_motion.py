@@ -15,9 +15,10 @@ from baselines.ekf_prediction import VehicleModel
 from baselines.euler import rotation_from_euler
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.gap_motion import bridge
+from sonar_graph.navigation.interpolation import rows_until
 from sonar_graph.navigation.kernels import compiled, inlined
-from sonar_graph.navigation.odometry import Columns, Cursor, cursor_at, next_step, rows_until
 from sonar_graph.navigation.recursion import NO_MOTION, Integral, extended, increment, mirrored, rate_of_turn
+from sonar_graph.navigation.steps import Columns, Cursor, cursor_at, next_step
 from sonar_graph.navigation.triples import ZERO, Vector, gram, multiple_of, sum_of, times, transposed, vector
 
 

@@ -21,9 +21,10 @@ from baselines.ekf_state import correct, predict
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.alignment import tilt_sigma, up_direction
 from sonar_graph.navigation.gap_motion import NO_GAPS, GapValues
+from sonar_graph.navigation.interpolation import rows_until, value_at
 from sonar_graph.navigation.kernels import compiled, inlined
-from sonar_graph.navigation.odometry import Columns, rows_until, value_at
 from sonar_graph.navigation.recursion import Integral
+from sonar_graph.navigation.steps import Columns
 from sonar_graph.navigation.triples import (
     IDENTITY,
     Vector,

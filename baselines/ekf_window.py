@@ -25,7 +25,7 @@ from baselines.ekf_prediction import (
 from baselines.ekf_state import pose_after
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.kernels import compiled, inlined
-from sonar_graph.navigation.odometry import Columns
+from sonar_graph.navigation.steps import Columns
 
 DepthColumns = tuple[Ints, Floats, Floats]
 """Stamps in ns, heights of the port in m, variances in m² (NaN where the log does not say), each (m,)."""

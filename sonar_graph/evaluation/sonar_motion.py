@@ -14,7 +14,9 @@ import numpy as np
 from sonar_graph.measurements import Depth, Floats
 from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
-from sonar_graph.navigation.odometry import Odometry, Steps, merge_rows, rows_until
+from sonar_graph.navigation.interpolation import rows_until
+from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation.steps import Steps, merge_rows
 from sonar_graph.sequence import NS_PER_S, Sequence
 
 GRAVITY_INTERVAL_NS = NS_PER_S

@@ -31,8 +31,8 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.gap_motion import GapValues, bridge, gap_values
 from sonar_graph.navigation.kernels import compiled
-from sonar_graph.navigation.odometry import Columns, Steps
 from sonar_graph.navigation.recursion import in_last_frame, integrate_steps, trace_point
+from sonar_graph.navigation.steps import Columns, Steps
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.navigation.interpolation import rows_until, value_among
 from sonar_graph.navigation.joint_nodes import with_inertial_position, with_sample
 from sonar_graph.navigation.joint_state import (
     AT_REST,
@@ -44,15 +45,9 @@ from sonar_graph.navigation.joint_state import (
 )
 from sonar_graph.navigation.kernels import compiled
 from sonar_graph.navigation.line_before import integral, line_before
-from sonar_graph.navigation.odometry import (
-    Columns,
-    cursor_at,
-    longest_interval_ns,
-    next_step,
-    rows_until,
-    value_among,
-)
+from sonar_graph.navigation.odometry import longest_interval_ns
 from sonar_graph.navigation.recursion import NO_MOTION, Integral, Step, extended, increment, mirrored, rate_of_turn
+from sonar_graph.navigation.steps import Columns, cursor_at, next_step
 from sonar_graph.navigation.triples import (
     IDENTITY,
     ZERO,

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
+from sonar_graph.navigation.interpolation import rows_until, value_at
 from sonar_graph.navigation.joint_nodes import with_inertial_position, with_sample
 from sonar_graph.navigation.joint_rules import Rule
 from sonar_graph.navigation.joint_state import (
@@ -26,7 +27,6 @@ from sonar_graph.navigation.joint_state import (
     pushed_spread,
 )
 from sonar_graph.navigation.kernels import compiled, inlined
-from sonar_graph.navigation.odometry import rows_until, value_at
 from sonar_graph.navigation.triples import (
     IDENTITY,
     ZERO,

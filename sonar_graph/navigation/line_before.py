@@ -20,9 +20,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sonar_graph.navigation.interpolation import rows_until, value_among
 from sonar_graph.navigation.joint_state import AT_REST, NO_SLOPES, push, pushed_path, pushed_slopes
 from sonar_graph.navigation.kernels import compiled, inlined
-from sonar_graph.navigation.odometry import WINDOW_NS, Columns, rows_until, value_among
+from sonar_graph.navigation.stamped_rows import WINDOW_NS
+from sonar_graph.navigation.steps import Columns
 from sonar_graph.navigation.triples import (
     IDENTITY,
     ZERO,

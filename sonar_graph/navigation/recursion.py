@@ -48,7 +48,7 @@ SERIES_ANGLE2 = 2.5e-3
 
 
 class Step(NamedTuple):
-    """One row of `sonar_graph.navigation.odometry.Steps`."""
+    """One row of `sonar_graph.navigation.steps.Steps`."""
 
     duration_s: float
     rate: Vector
@@ -154,7 +154,7 @@ def integrate_steps(
     Parameters
     ----------
     duration, rate, velocity, velocity_psd, force
-        The columns of `sonar_graph.navigation.odometry.Steps`.
+        The columns of `sonar_graph.navigation.steps.Steps`.
     bias
         Gyro bias to remove, body frame, shape (3,), rad/s.
     earth

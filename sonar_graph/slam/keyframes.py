@@ -22,8 +22,9 @@ from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Prein
 from sonar_graph.navigation.earth import earth_rate_in_world
 from sonar_graph.navigation.kernels import compiled
 from sonar_graph.navigation.node_motion import motion_between_nodes
-from sonar_graph.navigation.odometry import Odometry, Steps
+from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.navigation.running_motion import RunningMotion
+from sonar_graph.navigation.steps import Steps
 from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import Smoother
 

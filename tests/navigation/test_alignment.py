@@ -10,7 +10,7 @@ from sonar_graph.calibration import ImuCalibration
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
-from sonar_graph.navigation.odometry import Steps
+from sonar_graph.navigation.steps import Steps
 
 G = 9.81
 GRAVITY = np.array([0.0, 0.0, G])

@@ -9,7 +9,8 @@ from scipy.stats import chi2
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.navigation.dvl_preintegration import Preintegrator
-from sonar_graph.navigation.odometry import Odometry, Steps
+from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation.steps import Steps
 
 from .rows import (
     NS,
