@@ -7,7 +7,7 @@ from enum import StrEnum
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats, Ints
@@ -83,10 +83,14 @@ class Trajectory:
         """
         if len(stamps_ns) and (stamps_ns[0] < self.stamps_ns[0] or stamps_ns[-1] > self.stamps_ns[-1]):
             raise MeasurementError("Trajectory.at: an instant lies outside it; select the common time span first")
-        origin_ns = self.stamps_ns[0]
-        seconds, own = (stamps_ns - origin_ns) * 1e-9, (self.stamps_ns - origin_ns) * 1e-9
-        positions = np.column_stack([np.interp(seconds, own, self.positions[:, axis]) for axis in range(3)])
-        quaternions = Slerp(own, self.rotations())(seconds).as_quat()
+        after = np.clip(np.searchsorted(self.stamps_ns, stamps_ns, side="right"), 1, len(self) - 1)
+        before = after - 1
+        elapsed_ns = stamps_ns - self.stamps_ns[before]
+        interval_ns = np.maximum(self.stamps_ns[after] - self.stamps_ns[before], 1)
+        share = (elapsed_ns / interval_ns)[:, None]
+        start, end = Rotation.from_quat(self.quaternions_xyzw[before]), Rotation.from_quat(self.quaternions_xyzw[after])
+        quaternions = (start * Rotation.from_rotvec(share * (start.inv() * end).as_rotvec())).as_quat()
+        positions = self.positions[before] + share * (self.positions[after] - self.positions[before])
         return Trajectory.without_covariances(stamps_ns, positions, quaternions)
 
 

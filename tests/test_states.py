@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation, Slerp
 
 from sonar_graph.errors import MeasurementError
 from sonar_graph.states import Estimate, Trajectory
@@ -53,6 +55,25 @@ def test_interpolation_of_a_steady_turn_is_exact(fraction: float, step_rad: floa
     half = step_rad * seconds / 2
     dot = there.quaternions_xyzw[0] @ [0, 0, np.sin(half), np.cos(half)]
     assert abs(dot) == pytest.approx(1, abs=1e-12)
+
+
+def test_interpolation_is_that_of_scipy() -> None:
+    rng, n = np.random.default_rng(3), 50
+    stamps_ns = np.cumsum(rng.integers(1, 10**9, n))
+    positions, rotations = rng.normal(size=(n, 3)), Rotation.random(n, rng=rng)
+    path = Trajectory.without_covariances(stamps_ns, positions, rotations.as_quat())
+    asked_ns = np.sort(rng.integers(stamps_ns[0], stamps_ns[-1], 200))
+    there = path.at(asked_ns)
+    by_scipy = Slerp(stamps_ns.astype(float), rotations)(asked_ns.astype(float))
+    np.testing.assert_allclose((there.rotations().inv() * by_scipy).magnitude(), 0, atol=1e-12)
+    line = make_interp_spline(stamps_ns.astype(float), positions, k=1)
+    np.testing.assert_allclose(there.positions, line(asked_ns.astype(float)), atol=1e-12)
+
+
+def test_one_row_is_there_at_its_own_instant_and_no_instants_give_no_rows() -> None:
+    one = turning().rows(slice(1))
+    np.testing.assert_array_equal(one.at(one.stamps_ns).positions, one.positions)
+    assert len(turning().at(np.empty(0, np.int64))) == 0
 
 
 def test_interpolated_poses_claim_no_covariance() -> None:
