@@ -176,7 +176,7 @@ def observe_rows(
             outcomes[row] = PASSED_OVER
             continue
         at = POSE + LANDMARK * slots[row]
-        z, R_z = (range_m[row], azimuth_rad[row]), _noise(noise[row], sonar)
+        z, R_z = (range_m[row], azimuth_rad[row]), logged_noise(noise[row], sonar)
         moment = moment_after(x, motion)
         if at >= n:
             _augment(x, P, n, moment, sonar, z, R_z)
@@ -192,7 +192,7 @@ Noise = tuple[float, float, float]
 
 
 @inlined
-def _noise(logged: Floats, sonar: SonarModel) -> Noise:
+def logged_noise(logged: Floats, sonar: SonarModel) -> Noise:
     """Of range and azimuth: as logged, or the calibration's."""
     if math.isnan(logged[0, 0] + logged[0, 1] + logged[1, 0] + logged[1, 1]):
         return sonar.range_variance_m2, 0.0, sonar.azimuth_variance

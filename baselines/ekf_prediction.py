@@ -142,7 +142,7 @@ def advance_to_node(
     clock[NODE] = node_ns
     clock[DEPTHS:] = 0
     if model.gravity_interval_ns > 0:
-        _extend(interval, motion)
+        extend_interval(interval, motion)
         if clock[NODE] - clock[OPENED] >= model.gravity_interval_ns:
             _correct_gravity(columns, model, x, P, n, clock, interval)
             open_interval(columns, model.dvl_p_imu, interval, clock)
@@ -154,7 +154,7 @@ def advance_to_node(
 
 
 @inlined
-def _extend(interval: GravityInterval, motion: Integral) -> None:
+def extend_interval(interval: GravityInterval, motion: Integral) -> None:
     """Let the running interval reach one node further."""
     i_R_node, impulse = matrix(interval.i_R_node), interval.impulse
     impulse[0], impulse[1], impulse[2] = transformed(vector(impulse), i_R_node, motion.impulse)
@@ -166,12 +166,23 @@ def _correct_gravity(
     columns: Columns, model: VehicleModel, x: Floats, P: Floats, n: int, clock: Ints, interval: GravityInterval
 ) -> None:
     """Correct roll and pitch, where the specific force was measured."""
+    up, sigma = measured_up(columns, model, clock, interval)
+    if math.isnan(sigma):
+        return
+    level = math.hypot(up[1], up[2])
+    _correct_state(x, P, n, 3, math.atan2(up[1], up[2]), (sigma / level) ** 2)
+    _correct_state(x, P, n, 4, math.atan2(-up[0], level), sigma**2)
+
+
+@inlined
+def measured_up(columns: Columns, model: VehicleModel, clock: Ints, interval: GravityInterval) -> tuple[Floats, float]:
+    """The world's up at the node, from the running interval, and the sigma of its tilt (rad); NaN: not measured."""
     duration_s = (clock[NODE] - clock[OPENED]) * 1e-9
     velocity = _velocity_at_node(columns, clock[NODE], model.dvl_p_imu)
     mean_force = interval.impulse / duration_s
     up = up_direction(mean_force, interval.i_R_node, interval.velocity[:3], velocity[:3], duration_s)
     if not np.isfinite(up).all():
-        return
+        return up, math.nan
     velocity_sigma = math.sqrt(0.5 * (velocity[3] + interval.velocity[3]))
     sigma = tilt_sigma(
         duration_s,
@@ -181,9 +192,7 @@ def _correct_gravity(
         model.gyro_noise_density,
         model.gravity_m_s2,
     )
-    level = math.hypot(up[1], up[2])
-    _correct_state(x, P, n, 3, math.atan2(up[1], up[2]), (sigma / level) ** 2)
-    _correct_state(x, P, n, 4, math.atan2(-up[0], level), sigma**2)
+    return up, sigma
 
 
 @inlined

@@ -78,7 +78,7 @@ def process_window(
     outcomes, innovations, covs = np.empty(rows, np.int64), np.full((rows, 2), np.nan), np.full((rows, 2, 2), np.nan)
     sample, row, running = 0, 0, nothing_running()
     while True:
-        kind, event_ns = _next_event(depth[0], sample, frame_ns, row, until_ns)
+        kind, event_ns = next_event(depth[0], sample, frame_ns, row, until_ns)
         node_ns = next_node(columns, clock[NODE], event_ns)
         if node_ns >= 0:
             motion = motion_to_node(columns, vehicle, x, clock[NODE], node_ns)
@@ -106,7 +106,7 @@ def process_window(
 
 
 @inlined
-def _next_event(depth_ns: Ints, sample: int, frame_ns: Ints, row: int, until_ns: int) -> tuple[int, int]:
+def next_event(depth_ns: Ints, sample: int, frame_ns: Ints, row: int, until_ns: int) -> tuple[int, int]:
     """Kind and stamp of the event that comes next."""
     kind, event_ns = END, until_ns
     if row < len(frame_ns):
