@@ -7,23 +7,21 @@ from typing import ClassVar
 
 import gtsam
 import numpy as np
-from pydantic import Field
 
 from baselines.causal import CausalEstimates
-from baselines.ekf_landmarks import GATED, NEW, NO_SLOT, USED, DetectionColumns, SonarModel
-from baselines.ekf_prediction import NODE, GravityInterval, VehicleModel, open_interval
+from baselines.ekf_landmarks import DetectionColumns
+from baselines.ekf_prediction import NODE, GravityInterval, open_interval
 from baselines.ekf_state import LANDMARK, POSE
 from baselines.ekf_window import DepthColumns, DetectionOutcomes, PoseArrays, process_window
 from baselines.euler import euler_from_rates, euler_from_rotation
+from baselines.filter_intake import NO_OUTCOMES, NO_STAMPS, DetectionIntake, check_rows, depth_since
+from baselines.filter_models import FilterParams, sonar_model, vehicle_model
 from sonar_graph.calibration import Calibration, Section, Start
-from sonar_graph.errors import EstimatorError, MeasurementError
-from sonar_graph.measurements import Depth, Floats, Ints, LandmarkDetections, Measurements
-from sonar_graph.navigation.earth import earth_rate_in_world
-from sonar_graph.navigation.gap_motion import gap_values
+from sonar_graph.errors import EstimatorError
+from sonar_graph.measurements import Floats, Ints, Measurements
 from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.triples import ZERO, matrix, minus, vector
-from sonar_graph.slam.association import DetectionJournal, gate_threshold, identify
-from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
+from sonar_graph.navigation.triples import matrix, vector
+from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
 
 ROOM = 8
 """Landmarks that the first arrays have room for; doubled when needed."""
@@ -31,18 +29,10 @@ SPARE_ROWS = 256
 """IMU rows that may be kept longer than needed."""
 SINGULAR_COSINE = 1e-3
 """Below this cosine of the pitch the Euler angles are useless."""
-OUTCOMES = {USED: Outcome.USED, NEW: Outcome.NEW, GATED: Outcome.GATED}
 
 
-class EkfSlamParams(Section):
+class EkfSlamParams(FilterParams):
     """Settings of EKF-SLAM; the paper gives none of them."""
-
-    gate_probability: float = Field(0.999, gt=0, le=1)
-    """Share of true innovations that the gate lets pass; 1: no gate."""
-    minimum_id_probability: float = Field(0.5, ge=0, le=1)
-    """Posterior below which an identity is not believed."""
-    gravity_interval_s: float = Field(1.0, gt=0)
-    """Over which the specific force is averaged for one correction of roll and pitch."""
 
 
 class EkfSlam:
@@ -84,12 +74,11 @@ class EkfSlam:
     def __init__(self, calibration: Calibration, params: EkfSlamParams | None = None) -> None:
         self._calibration = calibration
         self._params = params or EkfSlamParams()
-        self._vehicle = _vehicle_model(calibration, self._params)
-        self._sonar = _sonar_model(calibration, self._params)
+        self._vehicle = vehicle_model(calibration, self._params.gravity_interval_s)
+        self._sonar = sonar_model(calibration, self._params.gate_probability)
         self._odometry = Odometry(calibration)
-        self._journal = DetectionJournal()
+        self._intake = DetectionIntake(self._params.minimum_id_probability)
         self._estimates = CausalEstimates()
-        self._slots: dict[int, int] = {}
         self._most_rows = SPARE_ROWS
         self._x, self._P = _start_state(calibration.start)
         self._n = POSE
@@ -115,18 +104,18 @@ class EkfSlam:
         """
         self._odometry.add(measurements.imu, measurements.dvl)
         self._start()
-        detections, depth = measurements.detections, measurements.depth
-        _check(detections, depth, measurements.end_ns)
-        ids, refusals = self._identify(detections)
+        check_rows(measurements)
+        named = self._intake.name(measurements.detections, self._reached_ns, self._done_ns)
         since_ns = max(self._done_ns, self._reached_ns)
         self._done_ns = max(self._done_ns, measurements.end_ns)
         if measurements.end_ns < max(self._reached_ns, int(self._clock[NODE])):
-            self._record(detections, ids, refusals, _NO_OUTCOMES)
+            self._intake.record(named, NO_OUTCOMES)
             return None
-        columns = self._detection_columns(detections, ids, refusals)
-        frame_ns = _NO_STAMPS if detections is None else np.maximum(detections.stamps_ns, since_ns)
-        outcomes, pose = self._run(_since(depth, since_ns), frame_ns, columns, measurements.end_ns)
-        self._record(detections, ids, refusals, outcomes)
+        columns = self._intake.columns(named)
+        self._make_room()
+        frame_ns = NO_STAMPS if named.detections is None else np.maximum(named.detections.stamps_ns, since_ns)
+        outcomes, pose = self._run(depth_since(measurements.depth, since_ns), frame_ns, columns, measurements.end_ns)
+        self._intake.record(named, outcomes)
         self._forget()
         estimate = Estimate(measurements.end_ns, gtsam.Pose3(gtsam.Rot3(pose[0]), pose[1]), pose[2])
         self._estimates.keep(estimate)
@@ -138,8 +127,9 @@ class EkfSlam:
 
     def landmarks(self) -> LandmarkMap:
         """Landmarks in the state, with their blocks of (5)."""
-        ids = sorted(self._slots)
-        places = [POSE + LANDMARK * self._slots[i] for i in ids]
+        slots = self._intake.slots
+        ids = sorted(slots)
+        places = [POSE + LANDMARK * slots[i] for i in ids]
         return LandmarkMap(
             ids=np.array(ids, dtype=np.int64),
             positions=np.array([self._x[k : k + 3] for k in places]).reshape(-1, 3),
@@ -148,7 +138,7 @@ class EkfSlam:
 
     def detections(self) -> DetectionLog:
         """What became of each detection so far."""
-        return self._journal.log()
+        return self._intake.log()
 
     def state(self) -> tuple[int, Floats, Floats]:
         """Stamp (ns), x of equation (4) and P of (5) at the newest node; copies."""
@@ -167,36 +157,6 @@ class EkfSlam:
         self._reached_ns = int(imu_ns[np.searchsorted(imu_ns, start_ns)])
         self._clock[NODE] = start_ns
         open_interval(columns, self._vehicle.dvl_p_imu, self._interval, self._clock)
-
-    def _identify(self, detections: LandmarkDetections | None) -> tuple[list[int], list[Outcome | None]]:
-        """The most probable identity of each row, and why it is not used, if so."""
-        if detections is None:
-            return [], []
-        identities = identify(detections, self._params.minimum_id_probability)
-        refusals = [
-            self._refusal(stamp_ns) or reason
-            for stamp_ns, reason in zip(detections.stamps_ns.tolist(), identities.refusals, strict=True)
-        ]
-        return identities.ids.tolist(), refusals
-
-    def _refusal(self, stamp_ns: int) -> Outcome | None:
-        """Why nothing stamped then can be used."""
-        if stamp_ns < self._reached_ns:
-            return Outcome.UNLOCATED
-        return Outcome.LATE if stamp_ns < self._done_ns else None
-
-    def _detection_columns(
-        self, detections: LandmarkDetections | None, ids: list[int], refusals: list[Outcome | None]
-    ) -> DetectionColumns:
-        """What compiled code needs of the detections; makes room for those of new landmarks."""
-        if detections is None:
-            return _NO_DETECTIONS
-        slots = [
-            NO_SLOT if reason else self._slots.setdefault(landmark_id, len(self._slots))
-            for landmark_id, reason in zip(ids, refusals, strict=True)
-        ]
-        self._make_room()
-        return np.array(slots), detections.range_m, detections.azimuth_rad, detections.range_azimuth_cov
 
     def _run(
         self, depth: DepthColumns, frame_ns: Ints, detections: DetectionColumns, until_ns: int
@@ -231,25 +191,8 @@ class EkfSlam:
             self._odometry.forget_before(int(self._clock[NODE]))
             self._most_rows = len(self._odometry.columns()[0]) + SPARE_ROWS
 
-    def _record(
-        self,
-        detections: LandmarkDetections | None,
-        ids: list[int],
-        refusals: list[Outcome | None],
-        outcomes: DetectionOutcomes,
-    ) -> None:
-        if detections is None:
-            return
-        kinds, innovations, covs = outcomes[0].tolist(), outcomes[1], outcomes[2]
-        rows = zip(detections.stamps_ns.tolist(), ids, refusals, strict=True)
-        for row, (stamp_ns, landmark_id, reason) in enumerate(rows):
-            if reason:
-                self._journal.record(stamp_ns, landmark_id, reason)
-            else:
-                self._journal.record(stamp_ns, landmark_id, OUTCOMES[kinds[row]], innovations[row], covs[row])
-
     def _make_room(self) -> None:
-        needed, room = POSE + LANDMARK * len(self._slots), len(self._x)
+        needed, room = POSE + LANDMARK * len(self._intake.slots), len(self._x)
         if needed <= room:
             return
         grown = max(2 * room, needed)
@@ -259,30 +202,6 @@ class EkfSlam:
 
 
 _NEVER = int(np.iinfo(np.int64).max)
-_NO_STAMPS = np.empty(0, np.int64)
-_NO_DEPTH = (_NO_STAMPS, np.empty(0), np.empty(0))
-_NO_DETECTIONS = (_NO_STAMPS, np.empty(0), np.empty(0), np.empty((0, 2, 2)))
-_NO_OUTCOMES = (_NO_STAMPS, np.empty((0, 2)), np.empty((0, 2, 2)))
-
-
-def _check(detections: LandmarkDetections | None, depth: Depth | None, end_ns: int) -> None:
-    """Refuse what can only be a mistake of the caller."""
-    for block in (detections, depth):
-        if block is not None and block.stamps_ns[-1] > end_ns:
-            raise MeasurementError(
-                f"Measurements: {type(block).__name__} has a row at {block.stamps_ns[-1]} ns, after end_ns = {end_ns};"
-                " hand it in with the call that reaches it"
-            )
-
-
-def _since(depth: Depth | None, since_ns: int) -> DepthColumns:
-    """Depth samples that are not older than an instant."""
-    if depth is None:
-        return _NO_DEPTH
-    if depth.stamps_ns[0] >= since_ns:
-        return depth.stamps_ns, depth.z_m, depth.variance_m2
-    first = int(np.searchsorted(depth.stamps_ns, since_ns))
-    return depth.stamps_ns[first:], depth.z_m[first:], depth.variance_m2[first:]
 
 
 def _start_state(start: Start) -> tuple[Floats, Floats]:
@@ -295,43 +214,3 @@ def _start_state(start: Start) -> tuple[Floats, Floats]:
     P[:3, :3] = np.diag(np.square(start.position_sigma_m))
     P[3:POSE, 3:POSE] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
     return x, P
-
-
-def _vehicle_model(calibration: Calibration, params: EkfSlamParams) -> VehicleModel:
-    imu, dvl = calibration.imu, calibration.dvl
-    body_p_dvl = dvl.mounting.translation_m
-    plane = calibration.planar
-    earth_rate = earth_rate_in_world(calibration)
-    return VehicleModel(
-        gyro_noise_density=imu.gyro_noise_density,
-        body_p_dvl=body_p_dvl,
-        dvl_p_imu=minus(imu.mounting.translation_m, body_p_dvl),
-        earth_rate=ZERO if earth_rate is None else vector(earth_rate),
-        body_p_port=calibration.depth.port_m,
-        gravity_interval_ns=round(params.gravity_interval_s * 1e9) if calibration.use_gravity else 0,
-        accel_noise_density=imu.accel_noise_density,
-        accel_bias_sigma=imu.accel_bias_sigma,
-        gravity_m_s2=calibration.gravity_m_s2,
-        is_planar=plane is not None,
-        plane_z_m=plane.z_m if plane else 0.0,
-        plane_z_variance=plane.z_sigma_m**2 if plane else 1.0,
-        plane_tilt_variance=plane.tilt_sigma_rad**2 if plane else 1.0,
-        gap=gap_values(calibration),
-        gyro_bias_sigma=imu.gyro_bias_sigma,
-    )
-
-
-def _sonar_model(calibration: Calibration, params: EkfSlamParams) -> SonarModel:
-    body_T_sonar = calibration.sonar.mounting.pose()
-    floor = calibration.floor
-    return SonarModel(
-        body_R_sonar=matrix(body_T_sonar.rotation().matrix()),
-        body_p_sonar=calibration.sonar.mounting.translation_m,
-        gate=gate_threshold(params.gate_probability, 2),
-        aperture_rad=calibration.sonar.elevation_aperture_rad,
-        range_variance_m2=calibration.sonar.range_sigma_m**2,
-        azimuth_variance=calibration.sonar.azimuth_sigma_rad**2,
-        has_floor=floor is not None,
-        floor_z_m=floor.z_m if floor else 0.0,
-        floor_variance_m2=floor.sigma_m**2 if floor else 1.0,
-    )
