@@ -1,7 +1,7 @@
 """Are landmarks recognised in sonar images, and can the posteriors and covariances be believed? On simulated basins.
 
 Every seed is a basin of its own: route, floor, where the landmarks' headings point, what else lies there. The measured
-model that ships comes from other seeds (1001 to 1012). A pass is a stretch of a second or more in which an object is
+model that ships comes from other seeds (1001 to 1016). A pass is a stretch of a second or more in which an object is
 wholly in view. A detection is accepted as estimators accept it by default: its most probable landmark has a posterior
 of at least one half. It is right when that landmark truly lies within 15 cm.
 

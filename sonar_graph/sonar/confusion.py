@@ -16,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
-from scipy.optimize import minimize
+from scipy.optimize import brentq, minimize, minimize_scalar
+from scipy.special import expit
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import CalibrationError
@@ -30,6 +31,8 @@ LEAST_ENTRY = 1e-3
 """Smallest entry of the matrix: a class that never looked like a feature in some hundred frames still may."""
 ASSUMED_RIGHT = 0.9
 """Share of frames in which a landmark that nobody measured looks like itself."""
+ONE_STANDARD_ERROR_NATS = 0.5
+"""Of the total loss: where a Gaussian likelihood is one sigma from its top."""
 LEAST_FRAMES = 20
 """Of every class, for a measured row."""
 
@@ -162,7 +165,8 @@ def estimate_confusion(
             f"too few labelled frames ({'; '.join(poor)}; needed {LEAST_FRAMES} of each): give longer or more logs"
         )
     tracks = np.array([len(np.unique(fits.track[fits.label == k])) for k in range(len(counts))])
-    sharpness, threshold = _fit_scores(fits, _targets(tracks)[fits.label] / (counts[fits.label] * len(counts))[:, None])
+    targets = _targets(tracks)[fits.label] / (counts[fits.label] * len(counts))[:, None]
+    sharpness, threshold = _fit_scores(fits, targets, int(tracks.sum()))
     matrix = _mean_scores(soft_scores(fits.correlation, fits.visible, sharpness, threshold), fits.label)
     sigmas = np.sqrt(np.nanmean((fits.range_azimuth_error * fits.visible[:, None] ** 2) ** 2, axis=0))
     return Confusion(
@@ -199,24 +203,40 @@ def _mean_scores(scores: Floats, label: Ints) -> Floats:
     return np.asarray(matrix / matrix.sum(axis=1, keepdims=True))
 
 
-def _fit_scores(fits: LabelledFits, targets: Floats) -> tuple[float, float]:
-    """Sharpness and threshold with which one frame's posterior comes nearest to weighted targets, shape (n, classes).
+def _fit_scores(fits: LabelledFits, targets: Floats, tracks: int) -> tuple[float, float]:
+    """Sharpness and threshold with which one frame's posterior comes near to weighted targets, shape (n, classes).
 
     It is the posterior that counts, after the confusion matrix and from equal priors: doubt that were in the scores
-    already would count twice.
+    already would count twice. Where nothing was ever confused, any large sharpness is as good as any other; so not the
+    best one is taken but the least whose loss is within one standard error of it, each track counting as one
+    observation (the rule of Breiman, Friedman, Olshen and Stone, "Classification and Regression Trees", 1984, section
+    3.4.3; with a loss in nats, half a nat over all tracks).
     """
     classes = targets.shape[1]
     equal, news = np.full((len(targets), classes), 1.0 / classes), np.ones(len(targets))
 
-    def loss(unbounded: Floats) -> float:
-        sharpness, threshold = float(np.exp(unbounded[0])), float(1 / (1 + np.exp(-unbounded[1])))
-        scores = soft_scores(fits.correlation, fits.visible, sharpness, threshold)
+    def loss(log_sharpness: float, logit: float) -> float:
+        scores = soft_scores(fits.correlation, fits.visible, float(np.exp(log_sharpness)), float(expit(logit)))
         matrix = _mean_scores(scores, fits.label)
         posterior = virtual_evidence(equal, scores, matrix, matrix.mean(axis=0), news)
         return float(-np.sum(targets * np.log(np.maximum(posterior, 1e-12))))
 
-    found = minimize(loss, np.array([np.log(10.0), 1.0]), method="Nelder-Mead")
-    return float(np.exp(found.x[0])), float(1 / (1 + np.exp(-found.x[1])))
+    def both(unbounded: Floats) -> float:
+        return loss(float(unbounded[0]), float(unbounded[1]))
+
+    best = minimize(both, np.array([np.log(10.0), 1.0]), method="Nelder-Mead")
+    allowed = best.fun + ONE_STANDARD_ERROR_NATS / tracks
+
+    def least(log_sharpness: float) -> tuple[float, float]:
+        """Loss and logit of the best threshold for a sharpness."""
+        found = minimize_scalar(lambda x: loss(log_sharpness, x), bounds=(-2.0, 5.0), method="bounded")
+        return float(found.fun), float(found.x)
+
+    blunt = float(best.x[0]) - 1.0
+    while least(blunt)[0] <= allowed:
+        blunt -= 1.0
+    chosen = float(brentq(lambda x: least(x)[0] - allowed, blunt, float(best.x[0]), xtol=1e-3))
+    return float(np.exp(chosen)), float(expit(least(chosen)[1]))
 
 
 def read_confusion(path: Path) -> Confusion:

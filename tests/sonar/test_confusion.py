@@ -66,15 +66,30 @@ def test_matrix_is_the_mean_score_of_each_class():
 
 
 @pytest.mark.parametrize("tracks", [5, 100])
-def test_a_frame_of_classes_that_never_were_confused_is_as_certain_as_their_tracks_allow(tracks: int):
+def test_frames_that_never_were_confused_are_as_sure_as_their_tracks_allow_within_a_standard_error(tracks: int):
+    """With n tracks of a class (n + 1) / (n + 2) is certainty. The loss is the entropy of that, half a nat
+    over all tracks, and a little for what two numbers cannot fit."""
     fits = _fits(200, 0.01)
     model = estimate_confusion(replace(fits, track=np.arange(600) % tracks + 1000 * fits.label), (1, 2), {})
     scores = soft_scores(fits.correlation, fits.visible, model.sharpness, model.threshold)
     posterior = virtual_evidence(np.full((600, 3), 1 / 3), scores, model.array(), model.base(), np.ones(600))
-    right = posterior[np.arange(600), fits.label]
-    assert right[fits.label < 2].mean() == pytest.approx((2 * tracks + 1) / (2 * tracks + 2), abs=0.02)
-    assert right[fits.label == 2].mean() == pytest.approx((tracks + 1) / (tracks + 2), abs=0.02)
+    n = np.array([2 * tracks, 2 * tracks, tracks])[fits.label]
+    sure, unsure = (n + 1) / (n + 2), 1 / (n + 2) / 2
+    own = np.eye(3, dtype=bool)[fits.label]
+    entropy = -(sure * np.log(sure) + 2 * unsure * np.log(unsure)).mean()
+    loss = -np.where(own, sure[:, None], unsure[:, None]) * np.log(posterior)
+    assert 0.5 <= (loss.sum(axis=1).mean() - entropy) * 3 * tracks <= 1.0
+    assert posterior[own].mean() < sure.mean() + 0.001
     assert model.provenance["tracks of landmark 2"] == str(tracks)
+
+
+def test_more_tracks_without_confusion_make_scores_sharper_but_never_hard():
+    fits = _fits(200, 0.01)
+    few, many = (
+        estimate_confusion(replace(fits, track=np.arange(600) % n + 1000 * fits.label), (1, 2), {}).sharpness
+        for n in (5, 100)
+    )
+    assert few < many < 100
 
 
 def test_a_class_with_too_few_frames_is_named():
