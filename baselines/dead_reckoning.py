@@ -15,7 +15,7 @@ from sonar_graph.navigation.earth import earth_rate_in_world
 from sonar_graph.navigation.node_motion import motion_between_nodes, motion_since_node
 from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.slam.association import DetectionJournal
-from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
+from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, RefusedRow, Trajectory
 
 
 class DeadReckoningParams(Section):
@@ -85,6 +85,10 @@ class DeadReckoning:
     def detections(self) -> DetectionLog:
         """Every detection, ignored."""
         return self._journal.log()
+
+    def refused_rows(self) -> list[RefusedRow]:
+        """Rows of IMU and Doppler log that are not used, and why."""
+        return self._odometry.refused
 
     def _ignore(self, detections: LandmarkDetections | None) -> None:
         if detections is None:

@@ -21,7 +21,7 @@ from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, Ints, Measurements
 from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.navigation.triples import matrix, vector
-from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
+from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, RefusedRow, Trajectory
 
 ROOM = 8
 """Landmarks that the first arrays have room for; doubled when needed."""
@@ -139,6 +139,10 @@ class EkfSlam:
     def detections(self) -> DetectionLog:
         """What became of each detection so far."""
         return self._intake.log()
+
+    def refused_rows(self) -> list[RefusedRow]:
+        """Rows of IMU and Doppler log that are not used, and why."""
+        return self._odometry.refused
 
     def state(self) -> tuple[int, Floats, Floats]:
         """Stamp (ns), x of equation (4) and P of (5) at the newest node; copies."""

@@ -19,7 +19,7 @@ from sonar_graph.calibration import Calibration, Section
 from sonar_graph.measurements import Ints, Measurements
 from sonar_graph.navigation.kernels import skew
 from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
+from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, RefusedRow, Trajectory
 
 SPARE_ROWS = 256
 """IMU rows that may be kept longer than needed."""
@@ -118,6 +118,10 @@ class InvariantEkf:
     def detections(self) -> DetectionLog:
         """What became of each detection so far."""
         return self._intake.log()
+
+    def refused_rows(self) -> list[RefusedRow]:
+        """Rows of IMU and Doppler log that are not used, and why."""
+        return self._odometry.refused
 
     def state(self) -> tuple[int, InvariantState]:
         """Stamp (ns) and a copy of the state at the newest node."""

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 from sonar_graph.measurements import Measurements
-from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
+from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, RefusedRow, Trajectory
 from sonar_graph.validation import faults_in
 
 ENTRY_POINT_GROUP = "sonar_graph.estimators"
@@ -56,6 +56,20 @@ class Estimator(Protocol):
     def detections(self) -> DetectionLog:
         """What became of each detection so far."""
         ...
+
+
+@runtime_checkable
+class TellsRefusedRows(Protocol):
+    """What an estimator may have beside the contract: it names the rows of IMU and Doppler log that it does not use."""
+
+    def refused_rows(self) -> list[RefusedRow]:
+        """All so far."""
+        ...
+
+
+def refused_rows_of(estimator: Estimator) -> list[RefusedRow]:
+    """Rows that an estimator names as not used; none where it does not tell."""
+    return list(estimator.refused_rows()) if isinstance(estimator, TellsRefusedRows) else []
 
 
 def installed_estimators() -> dict[str, EntryPoint]:

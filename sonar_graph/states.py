@@ -1,9 +1,10 @@
-"""What an estimator says: poses in time, landmarks, and what became of each detection."""
+"""What an estimator says: poses in time, landmarks, what became of each detection, and which rows were refused."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -139,3 +140,22 @@ class DetectionLog:
 
     def __len__(self) -> int:
         return len(self.outcomes)
+
+
+class Refusal(StrEnum):
+    """Why a row of a sensor other than the sonar is not used."""
+
+    OUTLIER = "refused: no vehicle reaches this velocity from the last"
+    LATE = "refused: the motion that it belongs to was already used"
+    INCOMPLETE = "refused: too few beams, and nothing to complete them with"
+
+
+class RefusedRow(NamedTuple):
+    """A row that is not used."""
+
+    sensor: str
+    """``imu`` or ``dvl``."""
+    stamp_ns: int
+    reason: Refusal
+    distance: float
+    """Squared Mahalanobis distance of an outlier, NaN for other reasons."""

@@ -18,7 +18,7 @@ from sonar_graph.evaluation.atomic import replacing
 from sonar_graph.evaluation.results import ErrorSeries, Kind, MapSoFar, RunResult
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
-from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Trajectory
+from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Refusal, RefusedRow, Trajectory
 
 Arrays = dict[str, np.ndarray]
 T = TypeVar("T")
@@ -74,6 +74,7 @@ def run_arrays(run: RunResult, errors: dict[Kind, ErrorSeries]) -> Arrays:
         arrays |= _pack(kind, getattr(run, kind)) | _pack(f"errors.{kind}", errors.get(kind))
     for number, known in enumerate(run.maps):
         arrays |= {f"maps.{number}.stamp_ns": np.asarray(known.stamp_ns)} | _pack(f"maps.{number}", known.landmarks)
+    arrays |= {f"refused.{name}": np.array([getattr(row, name) for row in run.refused]) for name in RefusedRow._fields}
     return arrays | _pack("landmarks", run.landmarks) | _pack("detections", run.detections)
 
 
@@ -88,6 +89,7 @@ def restore_run(run: RunResult, arrays: Arrays) -> RunResult:
         smoothed=_unpack("smoothed", Trajectory, arrays),
         landmarks=_unpack("landmarks", LandmarkMap, arrays),
         detections=_unpack("detections", DetectionLog, arrays),
+        refused=_restore_refused(arrays),
         maps=_restore_maps(arrays),
         update_s=arrays["update_s"],
         finish_s=run.finish_s,
@@ -101,6 +103,12 @@ def _restore_maps(arrays: Arrays) -> list[MapSoFar]:
     while (landmarks := _unpack(f"maps.{len(maps)}", LandmarkMap, arrays)) is not None:
         maps.append(MapSoFar(int(arrays[f"maps.{len(maps)}.stamp_ns"]), landmarks))
     return maps
+
+
+def _restore_refused(arrays: Arrays) -> list[RefusedRow]:
+    columns = [arrays[f"refused.{name}"].tolist() for name in RefusedRow._fields]
+    rows = zip(*columns, strict=True)
+    return [RefusedRow(sensor, stamp_ns, Refusal(reason), distance) for sensor, stamp_ns, reason, distance in rows]
 
 
 def restore_errors(arrays: Arrays) -> dict[Kind, ErrorSeries]:

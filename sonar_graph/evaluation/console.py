@@ -9,6 +9,7 @@ from rich.text import Text
 
 from sonar_graph.evaluation.landmark_table import PAPER, LandmarkTable, landmark_table
 from sonar_graph.evaluation.published_experiment import repeats_published
+from sonar_graph.evaluation.refusals import refusal_lines
 from sonar_graph.evaluation.results import Comparison, RunResult
 from sonar_graph.evaluation.score_table import LABELS
 from sonar_graph.evaluation.wording import (
@@ -36,7 +37,7 @@ COLUMNS = {
 NEES_LEGEND = (
     f"NEES: 1 fits; ▲ above {TOLERATED_FACTOR:g} over-confident, ▼ below {1 / TOLERATED_FACTOR:g} over-cautious"
 )
-SAID_NOTES = ("log.ending", "log.damage", "log.start")
+SAID_NOTES = ("log.ending", "log.damage", "log.start", "log.stamps")
 """Notes on the log that are said here; the report has all."""
 RECOGNISED_BEFORE = (
     "Sonar images: the detections are those that recognise put into the log; for pictures and outcomes in the report "
@@ -125,6 +126,7 @@ def _heading(comparison: Comparison, key: str, heading: str) -> str:
 def _notes(comparison: Comparison) -> Text:
     lines = [f"{run.estimator} failed: {run.reason}" for run in failed_runs(comparison)]
     lines += lost_runs(comparison)
+    lines += refusal_lines(comparison)
     notes = comparison.sequence.notes
     lines += [f"Log: {notes[subject]}" for subject in SAID_NOTES if subject in notes]
     lines += _recognition(comparison)

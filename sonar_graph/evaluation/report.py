@@ -16,6 +16,7 @@ from sonar_graph.evaluation.illustrations import illustrations
 from sonar_graph.evaluation.landmark_table import PAPER, landmark_table
 from sonar_graph.evaluation.published_experiment import repeats_published
 from sonar_graph.evaluation.recognition_section import recognition_content
+from sonar_graph.evaluation.refusals import by_runs
 from sonar_graph.evaluation.results import Comparison, RunResult
 from sonar_graph.evaluation.score_table import score_blocks
 from sonar_graph.evaluation.wording import ABSENT, TOLERATED_FACTOR, failed_runs, finding, format_value
@@ -61,6 +62,7 @@ def _content(comparison: Comparison) -> dict[str, Any]:
         "landmarks": landmark_table(comparison),
         "paper": PAPER if repeats_published(comparison.sequence) else "",
         "outcomes": _outcomes(comparison),
+        "refused": _refused(comparison),
         "recognition": recognition_content(comparison),
         "files": {run.estimator: _files(run) for run in comparison.runs},
         "settings": {run.estimator: _as_json(run.params) for run in comparison.runs},
@@ -104,6 +106,22 @@ def _share(count: Counter[Outcome] | None, outcome: Outcome) -> str:
         return ABSENT
     percent = 100 * count[outcome] / max(count.total(), 1)
     return f"{count[outcome]} ({percent:.1f} %)"
+
+
+def _refused(comparison: Comparison) -> list[dict[str, str]]:
+    """Rows of IMU and Doppler log that were not used."""
+    start_ns = comparison.sequence.start_ns
+    return [
+        {
+            "sensor": rows.sensor,
+            "count": str(rows.count),
+            "times": rows.times(start_ns),
+            "reason": rows.reason,
+            "distances": rows.distances() or ABSENT,
+            "estimators": ", ".join(names),
+        }
+        for rows, names in by_runs(comparison).items()
+    ]
 
 
 def _files(run: RunResult) -> dict[str, str]:

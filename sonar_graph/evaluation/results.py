@@ -10,7 +10,7 @@ import numpy as np
 from sonar_graph.evaluation.recognition import Recognition
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
-from sonar_graph.states import DetectionLog, LandmarkMap, Trajectory
+from sonar_graph.states import DetectionLog, LandmarkMap, RefusedRow, Trajectory
 
 Kind = Literal["causal", "smoothed"]
 
@@ -39,6 +39,8 @@ class RunResult:
     """What `trajectory` returned at the end: the same instants. A filter's is its causal one."""
     landmarks: LandmarkMap | None = None
     detections: DetectionLog | None = None
+    refused: list[RefusedRow] = field(default_factory=list)
+    """Rows of IMU and Doppler log that it names as not used."""
     maps: list[MapSoFar] = field(default_factory=list)
     """The map at `map_instants`, in order; the last one is `landmarks`."""
     update_s: Floats = field(default_factory=lambda: np.empty(0))

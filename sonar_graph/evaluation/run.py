@@ -12,7 +12,7 @@ import numpy as np
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
-from sonar_graph.estimator import Estimator, load_estimator, make_params
+from sonar_graph.estimator import Estimator, load_estimator, make_params, refused_rows_of
 from sonar_graph.evaluation.instants import map_instants
 from sonar_graph.evaluation.memory import PeakMemory
 from sonar_graph.evaluation.outcome import check_estimate, check_outcome
@@ -156,6 +156,7 @@ class _Replay:
             smoothed=smoothed,
             landmarks=landmarks,
             detections=detections,
+            refused=refused_rows_of(estimator),
             maps=self._maps,
             finish_s=finish_s,
             peak_memory_mb=peak_memory_mb,

@@ -36,6 +36,7 @@ from sonar_graph.evaluation.archive import (
 from sonar_graph.evaluation.atomic import replacing
 from sonar_graph.evaluation.metrics import rmse
 from sonar_graph.evaluation.recognition import read_recognition, write_recognition
+from sonar_graph.evaluation.refusals import gathered
 from sonar_graph.evaluation.results import Comparison, ErrorSeries, Kind, RunResult, Score
 from sonar_graph.evaluation.strict_json import read_json, write_json
 from sonar_graph.logs.tum import write_landmarks_csv, write_tum
@@ -163,6 +164,7 @@ def _state(run: RunResult) -> dict[str, Any]:
         "params": run.params,
         "finish_s": run.finish_s,
         "peak_memory_mb": run.peak_memory_mb,
+        "refused": [asdict(rows) for rows in gathered(run.refused)],
     }
 
 

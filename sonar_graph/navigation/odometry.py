@@ -19,7 +19,7 @@ from sonar_graph.navigation.interpolation import value_at
 from sonar_graph.navigation.row_intake import RowIntake
 from sonar_graph.navigation.stamped_rows import LATEST_NS, WINDOW_NS, node_range
 from sonar_graph.navigation.steps import Columns, Steps, merge_rows
-from sonar_graph.navigation.velocity_gate import RefusedRow
+from sonar_graph.states import RefusedRow
 
 
 class Odometry:
@@ -39,7 +39,7 @@ class Odometry:
 
     @property
     def refused(self) -> list[RefusedRow]:
-        """Rows that are not used, and why."""
+        """Rows that are not used, and why; of too few beams also those that may still be completed."""
         return self._intake.refused
 
     def add(self, imu: Imu | None, dvl: Dvl | None) -> bool:

@@ -26,9 +26,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.doppler_beams import is_partial
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.inertial_carry import Carry, InertialRows, carry
 
@@ -51,20 +51,30 @@ class PartialVelocities:
         self._calibration = calibration
         self._whole: _Row | None = None
         self._waiting: list[_Row] = []
+        self._passed_over_ns: list[int] = []
 
-    def completed(self, stamps_ns: Ints, velocity: Floats, covs: Floats, imu: InertialRows) -> Rows:
+    @property
+    def not_completed_ns(self) -> list[int]:
+        """Stamps of the rows that were passed over, and of those that wait."""
+        return [*self._passed_over_ns, *(row.stamp_ns for row in self._waiting)]
+
+    def completed(
+        self, stamps_ns: Ints, velocity: Floats, covs: Floats, partial: NDArray[np.bool_], imu: InertialRows
+    ) -> Rows:
         """The rows that can be used now, all with a whole velocity; they may be older than those given.
 
         Parameters
         ----------
         stamps_ns, velocity, covs
             In order; no NaN.
+        partial
+            Which of them leave a direction unmeasured, shape (n,).
         imu
             All rows known; of those after a stamp nothing is used for it.
         """
-        partial = is_partial(covs)
-        if not partial.any() and not self._waiting:
-            self._remember(_Row(int(stamps_ns[-1]), velocity[-1], covs[-1]))
+        if not self._waiting and not partial.any():
+            if len(stamps_ns):
+                self._remember(_Row(int(stamps_ns[-1]), velocity[-1], covs[-1]))
             return stamps_ns, velocity, covs
         usable: list[_Row] = []
         for stamp_ns, v, cov, is_part in zip(stamps_ns.tolist(), velocity, covs, partial.tolist(), strict=True):
@@ -83,6 +93,8 @@ class PartialVelocities:
         newest_ns = self._waiting[-1].stamp_ns if self._waiting else self._whole.stamp_ns if self._whole else None
         if newest_ns is not None and row.stamp_ns > newest_ns:
             self._waiting.append(row)
+        else:
+            self._passed_over_ns.append(row.stamp_ns)
 
     def _remember(self, row: _Row) -> None:
         if self._whole is None or row.stamp_ns > self._whole.stamp_ns:
@@ -94,7 +106,10 @@ class PartialVelocities:
         self._waiting = [waiting for waiting in self._waiting if waiting.stamp_ns > row.stamp_ns]
         whole = self._whole
         self._remember(row)
-        if not within or whole is None or row.stamp_ns - whole.stamp_ns > LONGEST_STRETCH_NS:
+        if not within or whole is None:
+            return []
+        if row.stamp_ns - whole.stamp_ns > LONGEST_STRETCH_NS:
+            self._passed_over_ns += [waiting.stamp_ns for waiting in within]
             return []
         return _solved([whole, *within, row], imu, self._calibration)
 

@@ -10,16 +10,20 @@ from __future__ import annotations
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration, Mounting
+from sonar_graph.doppler_beams import is_partial
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.inertial_carry import InertialRows
 from sonar_graph.navigation.kernels import compiled
 from sonar_graph.navigation.partial_velocity import PartialVelocities
 from sonar_graph.navigation.stamped_rows import EARLIEST_NS, LATEST_NS, StampedRows
-from sonar_graph.navigation.velocity_gate import GATE, Refusal, RefusedRow, distances
+from sonar_graph.navigation.velocity_gate import GATE, distances
+from sonar_graph.states import Refusal, RefusedRow
 
 _Rows = TypeVar("_Rows", Imu, Dvl)
+Flags = NDArray[np.bool_]
 
 
 class RowIntake:
@@ -44,8 +48,13 @@ class RowIntake:
         """Velocity of the DVL's origin and its covariance, body axes."""
         self.settled_ns: int = EARLIEST_NS
         """Up to when motion is used and stays as it is."""
-        self.refused: list[RefusedRow] = []
-        """Rows that are not used, and why."""
+        self._refused: list[RefusedRow] = []
+
+    @property
+    def refused(self) -> list[RefusedRow]:
+        """Rows that are not used, and why; of too few beams also those that may still be completed."""
+        incomplete = self._partial.not_completed_ns
+        return [*self._refused, *(RefusedRow("dvl", at_ns, Refusal.INCOMPLETE, np.nan) for at_ns in incomplete)]
 
     def add_imu(self, imu: Imu) -> bool:
         """Returns whether rows were placed before others that are there already."""
@@ -62,12 +71,14 @@ class RowIntake:
         rows = self._in_time(dvl, self.dvl.stamps_ns, "dvl")
         if rows is None:
             return False
-        stamps_ns, velocity, cov = self._believed(rows.stamps_ns, *self._in_body(rows))
-        if not len(stamps_ns):
-            return False
+        velocity, cov = self._in_body(rows)
+        partial = is_partial(cov)
+        believed = self._believed(rows.stamps_ns, velocity, cov, partial)
         inertial = InertialRows(self.imu.stamps_ns, *self.imu.values)
-        stamps_ns, velocity, cov = self._partial.completed(stamps_ns, velocity, cov, inertial)
-        return len(stamps_ns) > 0 and self.dvl.insert(stamps_ns, velocity, cov)
+        whole = self._partial.completed(
+            rows.stamps_ns[believed], velocity[believed], cov[believed], partial[believed], inertial
+        )
+        return len(whole[0]) > 0 and self.dvl.insert(*whole)
 
     def _in_body(self, dvl: Dvl) -> tuple[Floats, Floats]:
         """Velocity and its covariance in body axes."""
@@ -76,17 +87,18 @@ class RowIntake:
             return dvl.velocity, cov
         return dvl.velocity @ self._body_R_dvl.T, self._body_R_dvl @ cov @ self._body_R_dvl.T
 
-    def _believed(self, stamps_ns: Ints, velocity: Floats, cov: Floats) -> tuple[Ints, Floats, Floats]:
+    def _believed(self, stamps_ns: Ints, velocity: Floats, cov: Floats, partial: Flags) -> slice | Flags:
         """Rows that are no outliers, each beside the one before it; held velocities may jump and are all believed."""
         if self._may_jump:
-            return stamps_ns, velocity, cov
-        found = distances(stamps_ns, velocity, cov, *self._row_before(stamps_ns[0], velocity, cov), self._walk)
+            return slice(None)
+        before = self._row_before(stamps_ns[0], velocity, cov)
+        found = distances(stamps_ns, velocity, cov, partial, *before, self._walk)
         is_outlier = found > GATE
         if not is_outlier.any():
-            return stamps_ns, velocity, cov
+            return slice(None)
         for stamp_ns, distance in zip(stamps_ns[is_outlier].tolist(), found[is_outlier].tolist(), strict=True):
-            self.refused.append(RefusedRow("dvl", stamp_ns, Refusal.OUTLIER, distance))
-        return stamps_ns[~is_outlier], velocity[~is_outlier], cov[~is_outlier]
+            self._refused.append(RefusedRow("dvl", stamp_ns, Refusal.OUTLIER, distance))
+        return ~is_outlier
 
     def _row_before(self, stamp_ns: int, velocity: Floats, cov: Floats) -> tuple[int, Floats, Floats]:
         """The row kept before a stamp; where there is none, a row too late to be compared with."""
@@ -100,7 +112,7 @@ class RowIntake:
         if rows.stamps_ns[0] <= self.settled_ns:
             late = rows.between(EARLIEST_NS, self.settled_ns)
             new = [] if late is None else np.setdiff1d(late.stamps_ns, known_ns).tolist()
-            self.refused += [RefusedRow(sensor, stamp_ns, Refusal.LATE, np.nan) for stamp_ns in new]
+            self._refused += [RefusedRow(sensor, stamp_ns, Refusal.LATE, np.nan) for stamp_ns in new]
             later = rows.between(self.settled_ns, LATEST_NS)
             if later is None:
                 return None

@@ -6,15 +6,14 @@ A velocity v, t seconds after the last one u that was believed, both in body axe
 
 since the velocity may change and the vehicle may turn. The squared Mahalanobis distance is gated far out, for what is
 refused is lost; what passes is weighed by its noise. The gate widens while nothing is believed, so that a wrong first
-sample costs seconds, not the run. It knows stamps and velocities alone: what it does not depend on how a log is cut.
+sample costs seconds, not the run. A row that leaves a direction unmeasured is compared, but nothing with it. The gate
+knows stamps and velocities alone: what it refuses does not depend on how a log is cut.
 """
 
 from __future__ import annotations
 
-from enum import StrEnum
-from typing import NamedTuple
-
 import numpy as np
+from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.kernels import compiled
@@ -24,32 +23,23 @@ GATE = 44.8
 """Chi-square quantile of 1 - 1e-9, 3 degrees of freedom."""
 
 
-class Refusal(StrEnum):
-    """Why a row of a sensor is not used."""
-
-    OUTLIER = "refused: no vehicle reaches this velocity from the last"
-    LATE = "refused: the motion that it belongs to was already used"
-
-
-class RefusedRow(NamedTuple):
-    """A row that is not used."""
-
-    sensor: str
-    """``imu`` or ``dvl``."""
-    stamp_ns: int
-    reason: Refusal
-    distance: float
-    """Squared Mahalanobis distance of an outlier; NaN for what was late."""
-
-
 @compiled
 def distances(
-    stamps: Ints, velocity: Floats, cov: Floats, last_ns: int, last_velocity: Floats, last_cov: Floats, walk: float
+    stamps: Ints,
+    velocity: Floats,
+    cov: Floats,
+    partial: NDArray[np.bool_],
+    last_ns: int,
+    last_velocity: Floats,
+    last_cov: Floats,
+    walk: float,
 ) -> Floats:
-    """Squared distance of each row from the last one believed, shape (n,); rows above `GATE` are not believed.
+    """Squared distance of each row from the last whole one believed, shape (n,); rows above `GATE` are not believed.
 
     Parameters
     ----------
+    partial
+        Rows that leave a direction unmeasured, shape (n,).
     last_ns, last_velocity, last_cov
         The row believed before the first; a stamp not before the first row's: there is none.
     walk
@@ -64,6 +54,6 @@ def distances(
             S += np.eye(3) * (walk**2 * t + min(TURNING_RAD_S * t, 2.0) ** 2 * speed2)
             change = velocity[k] - last_velocity
             found[k] = change @ np.linalg.solve(S, change)
-        if found[k] <= GATE:
+        if found[k] <= GATE and not partial[k]:
             last_ns, last_velocity, last_cov = stamps[k], velocity[k], cov[k]
     return found

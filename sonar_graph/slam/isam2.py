@@ -31,7 +31,7 @@ from sonar_graph.slam.joint_covariance import JointCovariance
 from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
 from sonar_graph.slam.sightings import SightingPolicy, Sightings
 from sonar_graph.slam.smoother import Smoother
-from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
+from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, RefusedRow, Trajectory
 
 NO_DERIVATIVE = np.zeros((6, 3))
 
@@ -166,6 +166,10 @@ class Isam2:
     def detections(self) -> DetectionLog:
         """What became of each detection."""
         return self._sightings.journal.log()
+
+    def refused_rows(self) -> list[RefusedRow]:
+        """Rows of IMU and Doppler log that are not used, and why."""
+        return self._keyframes.odometry.refused
 
 
 def _check_noise(calibration: Calibration) -> None:

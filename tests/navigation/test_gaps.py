@@ -12,7 +12,7 @@ from sonar_graph.measurements import Dvl, Imu, Measurements
 from sonar_graph.navigation.dvl_preintegration import Preintegrator
 from sonar_graph.navigation.node_motion import motion_between_nodes, motion_since_node
 from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.velocity_gate import Refusal
+from sonar_graph.states import Refusal
 
 from .rows import NS, T0_NS, stamps
 

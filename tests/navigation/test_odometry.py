@@ -11,7 +11,7 @@ from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.dvl_preintegration import Preintegrator
 from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.navigation.steps import Steps
-from sonar_graph.navigation.velocity_gate import Refusal
+from sonar_graph.states import Refusal
 
 from .rows import NS, T0_NS, dvl, imu, stamps, waves
 

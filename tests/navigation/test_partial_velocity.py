@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.calibration import Calibration, DvlCalibration
-from sonar_graph.doppler_beams import velocity_of_beams
+from sonar_graph.doppler_beams import is_partial, velocity_of_beams
 from sonar_graph.navigation.inertial_carry import InertialRows
 from sonar_graph.navigation.partial_velocity import LONGEST_STRETCH_NS, PartialVelocities
 
@@ -27,7 +27,7 @@ NO_FORCE = InertialRows(np.array([0, 10**12]), np.zeros((2, 3)), np.full((2, 3),
 
 def completed(stamps_ns, velocity, cov, imu=NO_FORCE, calibration=CALIBRATION):
     """All rows in one block."""
-    return PartialVelocities(calibration).completed(stamps_ns, velocity, cov, imu)
+    return PartialVelocities(calibration).completed(stamps_ns, velocity, cov, is_partial(cov), imu)
 
 
 def pings(valid, rng, velocities):
@@ -68,7 +68,7 @@ def test_results_do_not_depend_on_how_rows_are_cut_into_blocks():
     for cut in range(1, 9):
         piecewise = PartialVelocities(CALIBRATION)
         blocks = [
-            piecewise.completed(stamps(10)[rows], velocity[rows], cov[rows], NO_FORCE)
+            piecewise.completed(stamps(10)[rows], velocity[rows], cov[rows], is_partial(cov[rows]), NO_FORCE)
             for rows in (slice(0, cut), slice(cut, cut + 1), slice(cut + 1, 10))
         ]
         for together, column in zip(whole, zip(*blocks, strict=True), strict=True):

@@ -1,0 +1,263 @@
+"""Rows that estimators refuse are named to the user: terminal, page and files, for one estimator and for several."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from sonar_graph.cli import main
+from sonar_graph.estimator import installed_estimators, load_estimator, refused_rows_of
+from sonar_graph.evaluation.console import summary
+from sonar_graph.evaluation.refusals import MOST_NAMED, gathered, refusal_lines
+from sonar_graph.evaluation.report import render_report
+from sonar_graph.evaluation.results import Comparison
+from sonar_graph.evaluation.run import run_estimator
+from sonar_graph.evaluation.storage import read_comparison, write_comparison
+from sonar_graph.logs.writing import write_sequence
+from sonar_graph.measurements import Dvl, Measurements
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import Estimate, Refusal, RefusedRow
+
+from .conftest import straight_sequence
+from .synthetic import basin_comparison, with_run
+
+HELD_NS = 3 * 10**9, 3 * 10**9 + 500_000_000
+ESTIMATORS = list(installed_estimators())
+NS = 10**9
+
+
+def outlier(stamp_ns: int, distance: float = 100.0) -> RefusedRow:
+    return RefusedRow("dvl", stamp_ns, Refusal.OUTLIER, distance)
+
+
+def late(stamp_ns: int) -> RefusedRow:
+    return RefusedRow("imu", stamp_ns, Refusal.LATE, math.nan)
+
+
+def refusing(refused: list[RefusedRow], *names: str) -> Comparison:
+    comparison = basin_comparison(60)
+    for run in comparison.runs:
+        if run.estimator in names:
+            comparison = with_run(comparison, replace(run, refused=refused))
+    return comparison
+
+
+def without_rows(sequence: Sequence, rows: list[int]) -> Sequence:
+    return replace(sequence, dvl=sequence.dvl.rows(np.delete(np.arange(len(sequence.dvl)), rows)))
+
+
+def with_outliers(sequence: Sequence, rows: list[int]) -> Sequence:
+    velocity = sequence.dvl.velocity.copy()
+    velocity[rows, 1] += 3.0
+    return replace(sequence, dvl=Dvl(sequence.dvl.stamps_ns, velocity, sequence.dvl.velocity_cov))
+
+
+def test_few_rows_are_named_each_and_many_are_counted():
+    few = [outlier(k, 50.0 + k) for k in range(MOST_NAMED)]
+    assert [(rows.count, rows.first_ns, rows.distances()) for rows in gathered(few[::-1])] == [
+        (1, k, f"{50 + k}") for k in range(MOST_NAMED)
+    ]
+    (many,) = gathered([*few, outlier(99, 7.5)])
+    assert (many.count, many.first_ns, many.last_ns) == (MOST_NAMED + 1, 0, 99)
+    assert (many.times(-NS), many.distances()) == ("1.000 to 1.000", "7.50 to 54")
+
+
+def test_rows_of_other_sensors_and_reasons_are_counted_apart():
+    rows = [outlier(k) for k in range(9)] + [late(k) for k in range(9)] + [RefusedRow("dvl", 3, Refusal.LATE, math.nan)]
+    found = Counter({(rows.sensor, rows.reason): rows.count for rows in gathered(rows)})
+    assert found == {("dvl", Refusal.OUTLIER): 9, ("imu", Refusal.LATE): 9, ("dvl", Refusal.LATE): 1}
+
+
+def test_a_line_names_sensor_stamp_reason_distance_and_runs():
+    start_ns = basin_comparison(60).sequence.start_ns
+    comparison = refusing([outlier(start_ns + 1_234_000_000, 512.6), late(start_ns)], "isam2", "ekf-slam")
+    assert refusal_lines(comparison) == [
+        f"Warning: dvl, 1.234 s: {Refusal.OUTLIER} (squared distance 513); isam2, ekf-slam",
+        f"Warning: imu, 0.000 s: {Refusal.LATE}; isam2, ekf-slam",
+    ]
+    many = refusing([outlier(start_ns + k * NS, 60.0 + k) for k in range(20)], "isam2")
+    assert refusal_lines(many) == [
+        f"Warning: dvl, 20 rows, 0.000 to 19.000 s: {Refusal.OUTLIER} (squared distance 60 to 79); isam2"
+    ]
+
+
+def test_runs_that_refused_differently_have_lines_of_their_own():
+    comparison = refusing([outlier(0)], "isam2")
+    other = refusing([outlier(0, 70.0)], "ekf-slam")
+    both = with_run(comparison, next(run for run in other.runs if run.estimator == "ekf-slam"))
+    assert [line.rsplit("; ")[-1] for line in refusal_lines(both)] == ["isam2", "ekf-slam"]
+
+
+def test_terminal_and_page_say_the_same_and_nothing_where_nothing_was_refused():
+    start_ns = basin_comparison(60).sequence.start_ns
+    comparison = refusing([outlier(start_ns + NS, 512.6), late(start_ns)], "isam2")
+    below = str(summary(comparison).renderables[1])
+    assert all(line in below for line in refusal_lines(comparison))
+    page = render_report(comparison)
+    section = page[page.index('<h2 id="refused">') : page.index('<h2 id="time">')]
+    for word in ("dvl", "1.000", Refusal.OUTLIER, "513", "imu", "0.000", Refusal.LATE, "isam2"):
+        assert word in section
+    assert "ekf-slam" not in section
+    assert 'id="refused"' not in render_report(basin_comparison(60))
+    assert "Warning" not in str(summary(basin_comparison(60)).renderables[1])
+
+
+def test_files_have_counts_for_people_and_every_row_for_the_report(tmp_path: Path):
+    rows = [outlier(k * NS, 50.0 + k) for k in range(8)] + [late(3)]
+    comparison = refusing(rows, "isam2", "ekf-slam")
+    write_comparison(comparison, tmp_path)
+    for path, entry in (
+        (tmp_path / "comparison.json", lambda content: content["runs"]["isam2"]),
+        (tmp_path / "runs" / "isam2" / "result.json", lambda content: content),
+    ):
+        told = entry(json.loads(path.read_text()))["refused"]
+        assert told[0] == {
+            "sensor": "dvl",
+            "reason": Refusal.OUTLIER.value,
+            "count": 8,
+            "first_ns": 0,
+            "last_ns": 7 * NS,
+            "least_and_largest_distance": [50.0, 57.0],
+        }
+        assert told[1]["least_and_largest_distance"] is None
+    restored = read_comparison(tmp_path)
+    assert refusal_lines(restored) == refusal_lines(comparison)
+    for run, again in zip(comparison.runs, restored.runs, strict=True):
+        assert [row[:3] for row in again.refused] == [row[:3] for row in run.refused]
+        np.testing.assert_array_equal([row.distance for row in again.refused], [row.distance for row in run.refused])
+
+
+def test_an_estimator_that_does_not_tell_has_no_rows(install, make_sequence, offset_estimator):
+    install(silent=offset_estimator)
+    result = run_estimator(make_sequence(), "silent")
+    assert (result.status, result.refused) == ("ok", [])
+
+
+def test_an_estimator_of_others_that_tells_is_heard(install, make_sequence, offset_estimator):
+    class Telling(offset_estimator):
+        def refused_rows(self) -> list[RefusedRow]:
+            return [outlier(7)]
+
+    install(telling=Telling)
+    assert run_estimator(make_sequence(), "telling").refused == [outlier(7)]
+
+
+@pytest.fixture(scope="module")
+def straight() -> Sequence:
+    return straight_sequence(8.0)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_outliers_are_named_and_not_used(straight, name):
+    rows = [20, 41, 42, 60]
+    run = run_estimator(with_outliers(straight, rows), name)
+    clean = run_estimator(without_rows(straight, rows), name)
+    assert run.status == "ok"
+    assert [(row.sensor, row.stamp_ns, row.reason) for row in run.refused] == [
+        ("dvl", int(straight.dvl.stamps_ns[k]), Refusal.OUTLIER) for k in rows
+    ]
+    assert min(row.distance for row in run.refused) > 44.8
+    assert not clean.refused
+    assert run.causal.positions == pytest.approx(clean.causal.positions, abs=1e-9)
+
+
+def live(name: str, sequence: Sequence, late: Measurements | None) -> tuple[Estimate | None, list[RefusedRow]]:
+    """Half a second of both sensors is missing, and perhaps comes at the end."""
+    estimator = load_estimator(name)(sequence.calibration)
+    for after_ns, until_ns in (
+        (0, HELD_NS[0]),
+        (HELD_NS[1], HELD_NS[1] + 4 * NS),
+        (HELD_NS[1] + 4 * NS, sequence.end_ns),
+    ):
+        imu, dvl = sequence.imu.between(after_ns, until_ns), sequence.dvl.between(after_ns, until_ns)
+        estimator.process(Measurements(until_ns, imu, dvl))
+    if late is not None:
+        estimator.process(late)
+    return estimator.process(Measurements(sequence.end_ns)), refused_rows_of(estimator)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_late_rows_are_named_and_not_used(straight, name):
+    imu, dvl = straight.imu.between(*HELD_NS), straight.dvl.between(*HELD_NS)
+    estimate, refused = live(name, straight, Measurements(straight.end_ns, imu, dvl))
+    other, nothing = live(name, straight, None)
+    assert not nothing
+    assert sorted((row.sensor, row.stamp_ns) for row in refused) == [
+        *(("dvl", at_ns) for at_ns in dvl.stamps_ns),
+        *(("imu", at_ns) for at_ns in imu.stamps_ns),
+    ]
+    assert {row.reason for row in refused} == {Refusal.LATE}
+    assert estimate.world_T_body.equals(other.world_T_body, 1e-9)
+
+
+def recorded_late(path: Path, out: Path, delays_ns: dict[str, int]) -> None:
+    """The same messages, but every tenth of some topics is recorded later than it was."""
+    counts: Counter[str] = Counter()
+    messages = []
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        for schema, channel, message in reader.iter_messages():
+            counts[channel.topic] += 1
+            delay_ns = delays_ns.get(channel.topic, 0) if counts[channel.topic] % 10 == 0 else 0
+            messages.append((message.log_time + delay_ns, schema, channel, message))
+        records = list(reader.iter_metadata())
+    with out.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        for record in records:
+            writer.add_metadata(record.name, record.metadata)
+        channels: dict[int, int] = {}
+        for at_ns, schema, channel, message in sorted(messages, key=lambda entry: entry[0]):
+            if channel.id not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
+            writer.add_message(channels[channel.id], at_ns, message.data, at_ns)
+        writer.finish()
+
+
+def test_rows_recorded_late_are_placed_by_their_stamps_and_said(straight, tmp_path, capsys):
+    write_sequence(tmp_path / "log.mcap", straight)
+    with (tmp_path / "log.mcap").open("rb") as file:
+        topics = [channel.topic for channel in make_reader(file).get_summary().channels.values()]
+    delays_ns = {topic: 350_000_000 for topic in topics if "imu" in topic or "dvl" in topic}
+    assert len(delays_ns) == 2
+    recorded_late(tmp_path / "log.mcap", tmp_path / "late.mcap", delays_ns)
+    for name in ("log", "late"):
+        with pytest.raises(SystemExit) as stop:
+            main(["run", str(tmp_path / f"{name}.mcap"), "-o", str(tmp_path / name), "--estimator", "dead-reckoning"])
+        assert not stop.value.code
+        said = " ".join(capsys.readouterr().out.split())
+        assert said.count("backwards, by 0.3 s at most: rows are sorted") == (2 if name == "late" else 0)
+        assert "Warning" not in said
+    one, other = (read_comparison(tmp_path / name).runs[0] for name in ("log", "late"))
+    np.testing.assert_array_equal(one.causal.positions, other.causal.positions)
+
+
+@pytest.fixture(scope="module")
+def spoilt_log(straight, tmp_path_factory) -> Path:
+    """Two velocities are wrong."""
+    path = tmp_path_factory.mktemp("spoilt") / "log.mcap"
+    write_sequence(path, with_outliers(straight, [20, 60]))
+    return path
+
+
+def test_run_and_compare_name_what_was_refused_in_a_log(spoilt_log, tmp_path, capsys):
+    for arguments in (["run", "--estimator", "dead-reckoning"], ["compare", "--estimators", "dead-reckoning,ekf-slam"]):
+        out = tmp_path / arguments[0]
+        with pytest.raises(SystemExit) as stop:
+            main([arguments[0], str(spoilt_log), "-o", str(out), *arguments[1:]])
+        assert not stop.value.code
+        said = " ".join(capsys.readouterr().out.split())
+        for seconds in ("2.000", "6.000"):
+            assert f"Warning: dvl, {seconds} s: {Refusal.OUTLIER} (squared distance" in said
+        index = json.loads((out / "comparison.json").read_text())
+        for entry in index["runs"].values():
+            assert [(rows["sensor"], rows["count"]) for rows in entry["refused"]] == [("dvl", 1), ("dvl", 1)]

@@ -1,0 +1,154 @@
+"""Rows that are not used are named; what is refused does not depend on how a log is cut."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.measurements import Dvl
+from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation.partial_velocity import LONGEST_STRETCH_NS
+from sonar_graph.navigation.row_intake import RowIntake
+from sonar_graph.states import Refusal
+
+from .rows import NS, T0_NS, dvl, imu, stamps
+
+DVL_HZ, SECONDS = 5, 6.0
+SIGMA = 0.01
+BLIND = np.diag([SIGMA**2, 100.0**2, 100.0**2])
+WHOLE = np.eye(3) * SIGMA**2
+
+
+def driven(partial: list[int], outliers: list[int]) -> Dvl:
+    """Straight ahead at 0.8 m/s; some rows measure the surge alone, some are wrong by 3 m/s."""
+    at = stamps(DVL_HZ, SECONDS)
+    velocity, cov = np.tile([0.8, 0.0, 0.0], (len(at), 1)), np.tile(WHOLE, (len(at), 1, 1))
+    cov[partial] = BLIND
+    velocity[outliers, 0] += 3.0
+    return dvl(at, velocity, cov)
+
+
+def told(odometry: Odometry) -> list[tuple[int, Refusal]]:
+    return sorted(((row.stamp_ns - T0_NS) * DVL_HZ // NS, row.reason) for row in odometry.refused)
+
+
+@given(st.lists(st.integers(0, round(SECONDS * NS)), max_size=5))
+@settings(max_examples=20, deadline=None)
+def test_what_is_refused_does_not_depend_on_how_rows_are_cut(cuts):
+    """A row after rows with one beam is compared with the whole one before them, in whatever block that came."""
+    rows = driven(partial=[8, 9, 10, 11, 20], outliers=[5, 10, 12, 21])
+    whole, pieces = Odometry(Calibration()), Odometry(Calibration())
+    whole.add(imu(stamps(50, SECONDS), 0.0), rows)
+    pieces.add(imu(stamps(50, SECONDS), 0.0), None)
+    for after_ns, until_ns in pairwise([0, *(T0_NS + cut for cut in sorted(cuts)), T0_NS + 10 * NS]):
+        pieces.add(None, rows.between(after_ns, until_ns))
+    assert told(whole) == [(k, Refusal.OUTLIER) for k in (5, 10, 12, 21)]
+    assert sorted(pieces.refused) == sorted(whole.refused)
+    for one, other in zip(pieces.columns(), whole.columns(), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_what_a_row_with_one_beam_did_not_measure_hides_no_outlier():
+    """Compared with a row that is blind to the side, any velocity to the side would pass."""
+    rows = driven(partial=[8], outliers=[])
+    velocity = rows.velocity.copy()
+    velocity[9, 1] = 3.0
+    odometry = Odometry(Calibration())
+    odometry.add(imu(stamps(50, SECONDS), 0.0), Dvl(rows.stamps_ns, velocity, rows.velocity_cov))
+    assert told(odometry) == [(9, Refusal.OUTLIER)]
+
+
+def test_rows_of_few_beams_are_named_until_they_are_completed():
+    odometry = Odometry(Calibration())
+    odometry.add(imu(stamps(50, SECONDS), 0.0), None)
+    rows = driven(partial=[0, 1, 8, 9, 28, 29, 30], outliers=[])
+    odometry.add(None, rows.rows(slice(0, 9)))
+    assert told(odometry) == [(k, Refusal.INCOMPLETE) for k in (0, 1, 8)]
+    odometry.add(None, rows.rows(slice(9, None)))
+    assert told(odometry) == [(k, Refusal.INCOMPLETE) for k in (0, 1, 28, 29, 30)]
+    assert np.isnan([row.distance for row in odometry.refused]).all()
+    np.testing.assert_array_equal(odometry.columns()[3], rows.stamps_ns[2:28])
+
+
+def test_rows_of_few_beams_over_too_long_a_stretch_are_named():
+    beyond = T0_NS + LONGEST_STRETCH_NS + 1
+    odometry = Odometry(Calibration())
+    odometry.add(imu(np.array([T0_NS, beyond]), 0.0), None)
+    odometry.add(None, dvl(np.array([T0_NS, T0_NS + NS, beyond]), 0.8, np.array([WHOLE, BLIND, WHOLE])))
+    assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [(T0_NS + NS, Refusal.INCOMPLETE)]
+
+
+def test_a_row_of_few_beams_that_is_overtaken_is_named():
+    odometry = Odometry(Calibration())
+    odometry.add(imu(stamps(50, SECONDS), 0.0), None)
+    rows = driven(partial=[3], outliers=[])
+    odometry.add(None, rows.rows(np.array([2, 4])))
+    odometry.add(None, rows.rows(np.array([3])))
+    assert told(odometry) == [(3, Refusal.INCOMPLETE)]
+
+
+def test_rows_are_late_from_the_settled_stamp_on_and_those_known_already_are_no_news():
+    odometry = Odometry(Calibration())
+    rows = driven([], [])
+    odometry.add(imu(stamps(50, SECONDS), 0.0), rows.rows(np.delete(np.arange(12), 4)))
+    odometry.settle(int(rows.stamps_ns[5]))
+    odometry.settle(int(rows.stamps_ns[2]))
+    odometry.add(None, rows)
+    assert told(odometry) == [(4, Refusal.LATE)]
+    assert odometry.columns()[3][-1] == rows.stamps_ns[-1]
+    again = driven([], [])
+    odometry.add(None, dvl(again.stamps_ns[5:6], 0.8, WHOLE))
+    assert len(odometry.refused) == 1
+
+
+def test_of_equal_stamps_the_first_counts():
+    one, other = dvl(stamps(5, 1.0), [0.8, 0.0, 0.0]), dvl(stamps(5, 1.0), [0.81, 0.0, 0.0])
+    within = dvl(np.repeat(stamps(5, 1.0), 2), np.tile([[0.8, 0, 0], [0.81, 0, 0]], (6, 1)))
+    across, inside = Odometry(Calibration()), Odometry(Calibration())
+    across.add(None, one)
+    assert across.add(None, other)
+    inside.add(None, within)
+    for odometry in (across, inside):
+        np.testing.assert_array_equal(odometry.columns()[3], one.stamps_ns)
+        np.testing.assert_array_equal(odometry.columns()[4], one.velocity)
+
+
+def test_only_rows_before_others_ask_for_motion_anew():
+    rows = driven([], [])
+    odometry = Odometry(Calibration())
+    assert not odometry.add(imu(stamps(50, SECONDS), 0.0), rows.rows(slice(0, 5)))
+    assert not odometry.add(None, rows.rows(slice(6, 8)))
+    assert odometry.add(None, rows.rows(slice(5, 6)))
+    assert odometry.add(imu(stamps(50, SECONDS)[-1:] - 1, 0.0), None)
+
+
+def test_rows_are_turned_into_body_axes():
+    """A sensor whose x axis points along the body's y, and whose y along the body's -x."""
+    quarter = Mounting(rpy_rad=(0.0, 0.0, np.pi / 2))
+    calibration = Calibration(imu=ImuCalibration(mounting=quarter), dvl=DvlCalibration(mounting=quarter))
+    intake = RowIntake(calibration)
+    at = stamps(5, 0.2)
+    intake.add_imu(imu(at, [1.0, 2.0, 3.0], [4.0, 5.0, 6.0]))
+    intake.add_dvl(dvl(at, [0.1, 0.2, 0.3], np.diag([1e-4, 4e-4, 9e-4])))
+    assert intake.imu.values[0][1] == pytest.approx([-2.0, 1.0, 3.0])
+    assert intake.imu.values[1][1] == pytest.approx([-5.0, 4.0, 6.0])
+    assert intake.dvl.values[0][1] == pytest.approx([-0.2, 0.1, 0.3])
+    assert intake.dvl.values[1][1] == pytest.approx(np.diag([4e-4, 1e-4, 9e-4]))
+
+
+def test_noise_that_the_log_does_not_say_is_the_calibrations():
+    intake = RowIntake(Calibration(dvl=DvlCalibration(velocity_sigma_m_s=(0.01, 0.02, 0.03))))
+    intake.add_dvl(dvl(stamps(5, 0.2), 0.0))
+    assert intake.dvl.values[1][0] == pytest.approx(np.diag([1e-4, 4e-4, 9e-4]))
+
+
+def test_held_velocities_may_jump():
+    jumping = driven([], outliers=[5, 12])
+    odometry = Odometry(Calibration(odometry_interpolation="hold-past"))
+    odometry.add(imu(stamps(50, SECONDS), 0.0), jumping)
+    assert not odometry.refused
