@@ -14,9 +14,9 @@ import numpy as np
 from sonar_graph.measurements import Depth, Floats
 from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
-from sonar_graph.navigation.interpolation import rows_until
+from sonar_graph.navigation.instant_motion import motion_between
+from sonar_graph.navigation.node_motion import motion_between_nodes
 from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.steps import Steps, merge_rows
 from sonar_graph.sequence import NS_PER_S, Sequence
 
 GRAVITY_INTERVAL_NS = NS_PER_S
@@ -61,8 +61,7 @@ class _Tilt:
                 self._advance(node_ns)
 
     def _advance(self, node_ns: int) -> None:
-        steps = self._odometry.steps_between_nodes(self.node_ns, node_ns)
-        motion = self._preintegrator.integrate(steps, _NO_BIAS)
+        motion = motion_between_nodes(self._odometry, self._preintegrator, self.node_ns, node_ns, _NO_BIAS, None)
         measured = self._gravity(motion, node_ns)
         self.up, self.variance = self.after(motion)
         if measured is not None:
@@ -170,9 +169,7 @@ class SonarMotions:
         )
 
     def _between(self, start_ns: int, end_ns: int) -> PreintegratedMotion:
-        columns = self._odometry.columns()
-        rows = rows_until(columns[0], end_ns), rows_until(columns[3], end_ns)
-        return self._preintegrator.integrate(Steps(*merge_rows(columns, *rows, start_ns, end_ns)), _NO_BIAS)
+        return motion_between(self._odometry, self._preintegrator, start_ns, end_ns, _NO_BIAS)
 
     def _move_height(self, motion: PreintegratedMotion, up: Floats, stamp_ns: int) -> None:
         """Over the motion since the last frame; its displacement is in the axes of that frame."""

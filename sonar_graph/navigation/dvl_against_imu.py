@@ -13,6 +13,7 @@ velocity as the body sees it: ``d/dtau x = -C dv/dt`` and a constant. Straight a
 
 The velocities that multiply s and psi are those that the accelerometers carry on from a fit over the stretch. The log's
 own would bring their noise into the regression twice, which shrinks s towards nothing (errors in variables).
+Rows that leave a direction unmeasured (`sonar_graph.doppler_beams`) are left out; what remains may have gaps.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.doppler_beams import is_partial
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation.differenced_fit import Stretch
 from sonar_graph.navigation.inertial_path import InertialPath
@@ -79,7 +81,7 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
         return _unknown("no accelerometers")
     path = InertialPath.of(_in_body_axes(imu, calibration))
     seconds = path.since_origin(dvl.stamps_ns)
-    inside = path.covers(seconds - RANGE_S) & path.covers(seconds + RANGE_S)
+    inside = path.covers(seconds - RANGE_S) & path.covers(seconds + RANGE_S) & ~is_partial(dvl.velocity_cov)
     body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
     seconds, velocity = seconds[inside], dvl.velocity[inside] @ body_R_dvl.T
     runs = list(stretches_of(seconds))

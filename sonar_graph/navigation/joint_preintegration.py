@@ -22,6 +22,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.doppler_beams import is_partial
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
@@ -174,8 +175,8 @@ class JointPreintegrator:
         Raises
         ------
         MeasurementError
-            When an end is no Doppler stamp, the inertial rows do not reach both ends, or the rule needs a specific
-            force that was not measured.
+            When an end is no Doppler stamp, the inertial rows do not reach both ends, a Doppler row in between
+            leaves a direction unmeasured, or the rule needs a specific force that was not measured.
         """
         samples, inertial = _doppler_rows(dvl, start_ns, end_ns), _inertial_rows(imu, start_ns, end_ns)
         velocity, cov = self._in_body(samples)
@@ -217,7 +218,14 @@ def _doppler_rows(dvl: Dvl, start_ns: int, end_ns: int) -> Dvl:
         raise MeasurementError(
             f"Dvl.stamps_ns: no motion from {start_ns} to {end_ns} ns; take two of its stamps, the earlier first"
         )
-    return dvl.rows(slice(first, last + 1))
+    samples = dvl.rows(slice(first, last + 1))
+    partial = is_partial(samples.velocity_cov)
+    if partial.any():
+        raise MeasurementError(
+            f"Dvl.velocity_cov: the row at {samples.stamps_ns[np.argmax(partial)]} ns leaves a direction unmeasured"
+            " (one or two beams); leave such rows out, or let sonar_graph.navigation.odometry.Odometry complete them"
+        )
+    return samples
 
 
 def _inertial_rows(imu: Imu, start_ns: int, end_ns: int) -> Imu:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration, Mounting
-from sonar_graph.doppler_beams import is_partial
+from sonar_graph.doppler_beams import finite, is_partial
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.inertial_carry import InertialRows
 from sonar_graph.navigation.kernels import compiled
@@ -71,8 +71,8 @@ class RowIntake:
         rows = self._in_time(dvl, self.dvl.stamps_ns, "dvl")
         if rows is None:
             return False
-        velocity, cov = self._in_body(rows)
-        partial = is_partial(cov)
+        partial = is_partial(rows.velocity_cov)
+        velocity, cov = self._in_body(rows, finite(rows.velocity_cov) if partial.any() else rows.velocity_cov)
         believed = self._believed(rows.stamps_ns, velocity, cov, partial)
         inertial = InertialRows(self.imu.stamps_ns, *self.imu.values)
         whole = self._partial.completed(
@@ -80,9 +80,9 @@ class RowIntake:
         )
         return len(whole[0]) > 0 and self.dvl.insert(*whole)
 
-    def _in_body(self, dvl: Dvl) -> tuple[Floats, Floats]:
-        """Velocity and its covariance in body axes."""
-        cov = np.where(np.isnan(dvl.velocity_cov), self._default_cov, dvl.velocity_cov)
+    def _in_body(self, dvl: Dvl, cov: Floats) -> tuple[Floats, Floats]:
+        """Velocity and a covariance in body axes."""
+        cov = np.where(np.isnan(cov), self._default_cov, cov)
         if self._body_R_dvl is None:
             return dvl.velocity, cov
         return dvl.velocity @ self._body_R_dvl.T, self._body_R_dvl @ cov @ self._body_R_dvl.T

@@ -310,3 +310,19 @@ def test_level_axes_follow_from_up_alone(roll: float, pitch: float, yaw: float):
     found = level_from_up(up)
     np.testing.assert_allclose(found, gtsam.Rot3.RzRyRx(roll, pitch, 0.0).matrix(), atol=1e-9)
     np.testing.assert_allclose(found @ up, [0, 0, 1], atol=1e-9)
+
+
+def test_a_gap_of_the_doppler_log_is_carried_by_the_accelerometers(path, exact):
+    """Seven seconds without bottom lock: a held velocity is wrong by decimetres."""
+    stamps_ns = frames_of(exact)
+    seconds = (exact.dvl.stamps_ns - exact.start_ns) * 1e-9
+    lost = replace(exact, dvl=exact.dvl.rows(np.flatnonzero((seconds < 2.0) | (seconds > 9.0))))
+    held = lost.calibration.model_copy(update={"dvl": MOUNTED.dvl.model_copy(update={"gap_s": 100.0})})
+    errors = {}
+    for name, sequence in (("carried", lost), ("held", replace(lost, calibration=held))):
+        joined, before = gtsam.Pose3(), sonar_pose(path, stamps_ns[0])
+        for motion in along(sequence, stamps_ns)[1:]:
+            joined = joined.compose(motion.previous_T_sonar)
+        errors[name] = np.linalg.norm(before.between(sonar_pose(path, stamps_ns[-1])).between(joined).translation())
+    assert errors["carried"] < 0.01
+    assert errors["held"] > 0.1

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sonar_graph.doppler_beams import UNMEASURED_M_S
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.dvl_against_imu import DvlMatch, match_dvl_to_imu
 from sonar_graph.sequence import Sequence
@@ -60,3 +61,15 @@ def test_without_accelerometers_nothing_can_be_told():
     run = spoilt(1)
     blind = replace(run, imu=Imu(run.imu.stamps_ns, run.imu.angular_velocity, np.full((len(run.imu), 3), np.nan)))
     assert "no accelerometers" in matched(blind).offset.reason
+
+
+def test_rows_of_few_beams_say_what_they_would_say_were_they_not_there():
+    run = spoilt(1)
+    some = np.random.default_rng(0).random(len(run.dvl)) < 0.2
+    velocity, cov = run.dvl.velocity.copy(), run.dvl.velocity_cov.copy()
+    velocity[some, 1:], cov[some] = 0.0, np.diag([1e-4, UNMEASURED_M_S**2, UNMEASURED_M_S**2])
+    found = matched(replace(run, dvl=Dvl(run.dvl.stamps_ns, velocity, cov)))
+    without = matched(replace(run, dvl=run.dvl.rows(np.flatnonzero(~some))))
+    for one, other in ((found.offset, without.offset), (found.yaw, without.yaw), (found.scale, without.scale)):
+        assert one == other
+    assert abs(found.offset.value - OFFSET_S) < 4 * found.offset.sigma < 0.4

@@ -5,6 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.doppler_beams import UNMEASURED_M_S
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.dvl_preintegration import Preintegrator
@@ -201,3 +202,19 @@ def test_longer_blocks_change_nothing():
     a, b = (preintegrator.integrate(*r, int(at[2]), int(at[5]), BIAS) for r in (rows, part))
     assert np.array_equal(a.displacement, b.displacement)
     assert np.array_equal(a.covariance, b.covariance)
+
+
+@pytest.mark.parametrize("unmeasured", [UNMEASURED_M_S**2, np.inf])
+def test_rows_of_few_beams_are_refused_within_the_motion_only(unmeasured):
+    """Their velocity is 0 where nothing was measured: it must not be taken for one."""
+    inertial, doppler = random_rows(8)
+    at, cov = doppler.stamps_ns, np.tile(np.eye(3) * 1e-4, (len(doppler), 1, 1))
+    cov[3] = np.diag([1e-4, unmeasured, unmeasured])
+    partial = Dvl(at, doppler.velocity, cov)
+    preintegrator = JointPreintegrator(GYRO, ACCEL)
+    for ends in ((0, 3), (3, 4), (2, 5)):
+        with pytest.raises(MeasurementError, match=f"row at {at[3]} ns leaves a direction unmeasured"):
+            preintegrator.integrate(inertial, partial, int(at[ends[0]]), int(at[ends[1]]))
+    preintegrator.integrate(inertial, partial, int(at[0]), int(at[2]))
+    left_out = partial.rows(np.delete(np.arange(len(at)), 3))
+    preintegrator.integrate(inertial, left_out, int(at[0]), int(at[5]))

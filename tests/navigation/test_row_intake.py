@@ -152,3 +152,18 @@ def test_held_velocities_may_jump():
     odometry = Odometry(Calibration(odometry_interpolation="hold-past"))
     odometry.add(imu(stamps(50, SECONDS), 0.0), jumping)
     assert not odometry.refused
+
+
+def test_an_infinite_variance_is_completed_like_one_of_a_direction_not_measured():
+    turned = Calibration(dvl=DvlCalibration(mounting=Mounting(rpy_rad=(0.1, 0.2, 0.7))))
+    found = []
+    for unmeasured in (100.0**2, np.inf):
+        rows = driven([4, 5], [])
+        cov = rows.velocity_cov.copy()
+        cov[[4, 5]] = np.diag([SIGMA**2, unmeasured, unmeasured])
+        odometry = Odometry(turned)
+        odometry.add(imu(stamps(50, SECONDS), 0.0), Dvl(rows.stamps_ns, rows.velocity, cov))
+        found.append(odometry.columns())
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert len(found[0][3]) == len(rows)
