@@ -124,13 +124,13 @@ def main() -> None:
         results = in_parallel(partial(one, case), seeds, arguments.workers, f"{case}: seed")
         for quantity, trials in zip(QUANTITIES, zip(*results, strict=True), strict=True):
             errors = np.array([trial.error_sigmas for trial in trials if trial.known])
-            share = float(np.mean(np.abs(errors) < 1.96)) if len(errors) else 0.0
+            share, inner = (float(np.mean(np.abs(errors) < k)) if len(errors) else 0.0 for k in (1.96, 1.0))
             low, high = band(max(len(errors), 1))
             passed &= len(errors) > 0 and share >= low
-            spread = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
-            rows.append((f"{case}: {quantity}", len(errors), share, low, high, spread))
+            spread, mean = (float(np.sqrt(np.mean(errors**2))), float(errors.mean())) if len(errors) else (0.0, 0.0)
+            rows.append((f"{case}: {quantity}", len(errors), share, low, high, inner, spread, mean))
             figures[f"{case}: {quantity}"] = share
-    print_table(("", "told", "held", "band from", "to", "rms error / sigma"), rows)
+    print_table(("", "told", "95 % held", "band from", "to", "68 % held", "rms error / sigma", "mean"), rows)
     conclude({"runs": runs, "coverage": figures, "passed": passed}, is_quick=arguments.quick)
 
 

@@ -89,6 +89,38 @@ def fit(stretches: Sequence[Stretch], prior_sigmas: Floats, ratios: Floats | Non
     return _Reduced.of(stretches, ratios).fit(prior_sigmas, ratios)
 
 
+def rate_noise_power(stretches: Sequence[Stretch], ratios: Floats) -> float:
+    """Expected whitened product of y with its own rates' noise, over sigma²: ``sum tr(P (K - tridiag(-1, 2, -1)))``.
+
+    A column of A that holds the same noise as y, since it was integrated from the same sensor, shifts the parameters by
+    its column of their covariance times this (errors in variables).
+    """
+    return sum(_rate_noise_power(stretch, ratios) for stretch in stretches)
+
+
+def _rate_noise_power(stretch: Stretch, ratios: Floats) -> float:
+    m = len(stretch.y)
+    differences = np.diff(np.eye(m + 1), axis=0)
+    factors = _factors(stretch, ratios)
+    own, _ = _orthonormal(np.concatenate([_whitened(factors[axis], stretch.B[:, axis]) for axis in range(3)]))
+    power = 3.0 * m - own.shape[1]
+    for axis in range(3):
+        of_samples, basis = _whitened(factors[axis], differences), own[axis * m : (axis + 1) * m]
+        power -= float(np.sum(of_samples**2) - np.sum((basis.T @ of_samples) ** 2))
+    return power
+
+
+def _factors(stretch: Stretch, ratios: Floats) -> list[Floats]:
+    """Cholesky factor of K of each axis."""
+    kinds = set(stretch.walks)
+    by_kind = {walks: np.linalg.cholesky(_correlation(stretch.duration_s, ratios, walks)) for walks in kinds}
+    return [np.asarray(by_kind[walks], dtype=np.float64) for walks in stretch.walks]
+
+
+def _whitened(factor: Floats, columns: Floats) -> Floats:
+    return np.asarray(solve_triangular(factor, columns, lower=True, check_finite=False))
+
+
 def _likeliest_ratios(stretches: Sequence[Stretch], prior_sigmas: Floats) -> Floats:
     rate = 1.0 / float(np.concatenate([s.duration_s for s in stretches]).mean())
     units = np.array([rate, rate**3])
@@ -152,14 +184,8 @@ class _Reduced:
 def _reduce(stretch: Stretch, ratios: Floats) -> _Reduced:
     m, _, p = stretch.A.shape
     columns = np.concatenate([stretch.y[:, :, None], stretch.A, stretch.B], axis=2)
-    factors = {
-        walks: np.linalg.cholesky(_correlation(stretch.duration_s, ratios, walks)) for walks in set(stretch.walks)
-    }
-    axes = [
-        solve_triangular(factors[walks], columns[:, axis], lower=True, check_finite=False)
-        for axis, walks in enumerate(stretch.walks)
-    ]
-    white = np.concatenate(axes)
+    factors = _factors(stretch, ratios)
+    white = np.concatenate([_whitened(factors[axis], columns[:, axis]) for axis in range(3)])
     own, size = _orthonormal(white[:, 1 + p :])
     kept = white[:, : 1 + p] - own @ (own.T @ white[:, : 1 + p])
     squares = kept.T @ kept
@@ -168,7 +194,7 @@ def _reduce(stretch: Stretch, ratios: Floats) -> _Reduced:
         squares[1:, 0],
         float(squares[0, 0]),
         3 * m - own.shape[1],
-        2.0 * sum(float(np.log(np.diag(factors[walks])).sum()) for walks in stretch.walks) + size,
+        2.0 * sum(float(np.log(np.diag(factor)).sum()) for factor in factors) + size,
     )
 
 

@@ -4,22 +4,26 @@ Between two Doppler samples the change of velocity is also what the acceleromete
 `sonar_graph.navigation.inertial_path`, with the samples k at their stamps plus the offset tau::
 
     x_k     = C_k (R v_k - w_k x l) - F_k
-    x_{k+1} - x_k = -d(C R v) (s - 1) + d(C [R v]x) psi + d(C [w]x) dl - d(S) b + gamma T + gamma' T t
+    x_{k+1} - x_k = -d(C R v) (s - 1) + d(C [R v]x) psi + d(C [w]x) dl - d(S) b + d(P - [C R v]x S) b_g
+                    + gamma T + gamma' T t
 
 s is the factor on the log's velocities, psi a small turn of its mounting (``Exp(psi) R``), dl a correction to the
-lever arm l from the IMU to the log, b the accelerometers' bias. Gravity and its slow turning, which stands for tilt,
-gyro bias and the Earth's rotation, are fitted anew every half minute. The offset acts through the change of the
-velocity as the body sees it: ``d/dtau x = -C dv/dt`` and a constant. Straight and steady driving says nothing of it.
+lever arm l from the IMU to the log, b and b_g the biases of accelerometers and gyros. Gravity and its slow turning,
+which stands for tilt and the Earth's rotation, are fitted anew every half minute. A gyro bias turns gravity along a
+straight line only while the body keeps its heading: left to gamma', what it does in turns, the same in every stretch,
+would go into psi and s, whose intervals know nothing of it. The offset acts through the change of the velocity as the
+body sees it: ``d/dtau x = -C dv/dt`` and a constant. Straight and steady driving says nothing of it.
 
 The velocities that multiply s and psi are those that the accelerometers carry on from a fit over the stretch. The log's
-own would bring their noise into the regression twice, which shrinks s towards nothing (errors in variables).
+own would bring their noise into the regression twice, which shrinks s towards nothing (errors in variables). The
+accelerometers' noise, which is then in both sides, makes s too large by an amount that is known, and taken off again.
 Rows that leave a direction unmeasured (`sonar_graph.doppler_beams`) are left out; what remains may have gaps.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 
@@ -29,9 +33,9 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration
 from sonar_graph.doppler_beams import is_partial
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation.differenced_fit import Stretch
+from sonar_graph.navigation.differenced_fit import Stretch, rate_noise_power
 from sonar_graph.navigation.inertial_path import InertialPath
-from sonar_graph.navigation.offset_search import RANGE_S, Estimate1D, search_offset
+from sonar_graph.navigation.offset_search import RANGE_S, Estimate1D, OffsetFit, search_offset
 
 STRETCH_S = 30.0
 """Gravity and its turning are fitted anew after so long."""
@@ -42,12 +46,12 @@ LARGEST_INTERVAL = 3.0
 """Times the usual one: a longer time between two samples ends a stretch."""
 LEAST_STRETCHES = 2
 
-PRIOR_SIGMAS = np.array([1.0, 0.05, 0.05, 1.0, *[1.0] * 3, *[0.5] * 3])
-"""Scale; turn, rad, about x and y near what the calibration says; lever arm, m; accelerometer bias, m/s²."""
-SCALE, YAW = 1, 4
+PRIOR_SIGMAS = np.array([1.0, 0.05, 0.05, 1.0, *[1.0] * 3, *[0.5] * 3, *[0.02] * 3])
+"""Scale; turn, rad, about x and y near what the calibration says; lever arm, m; biases, m/s² and rad/s."""
+SCALE, YAW, GYRO_BIAS = 1, 4, slice(11, 14)
 """Places among the parameters, after the offset."""
 LARGEST_STEP_LEFT = 0.01
-"""Of turn (rad) and scale together, after which linearising again changes nothing that matters."""
+"""Of turn (rad), scale and gyro bias over a stretch (rad): linearising again then changes nothing that matters."""
 ROUNDS = 5
 
 OFFSET_LIMIT_S, YAW_LIMIT_RAD, SCALE_LIMIT = 0.1, np.radians(2.0), 0.02
@@ -79,7 +83,8 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
     """
     if not np.isfinite(imu.specific_force).all():
         return _unknown("no accelerometers")
-    path = InertialPath.of(_in_body_axes(imu, calibration))
+    imu = _in_body_axes(imu, calibration)
+    path = InertialPath.of(imu)
     seconds = path.since_origin(dvl.stamps_ns)
     inside = path.covers(seconds - RANGE_S) & path.covers(seconds + RANGE_S) & ~is_partial(dvl.velocity_cov)
     body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
@@ -88,17 +93,20 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
     if len(runs) < LEAST_STRETCHES:
         return _unknown(f"less than {LEAST_STRETCHES * STRETCH_S:g} s with both")
     lever = np.subtract(calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m)
-    return _matched(path, seconds, velocity, runs, lever)
+    return _matched(imu, seconds, velocity, runs, lever)
 
 
-def _matched(path: InertialPath, seconds: Floats, velocity: Floats, runs: list[slice], lever: Floats) -> DvlMatch:
-    yaw, scale = 0.0, 1.0
+def _matched(imu: Imu, seconds: Floats, velocity: Floats, runs: list[slice], lever: Floats) -> DvlMatch:
+    yaw, scale, gyro_bias = 0.0, 1.0, np.zeros(3)
     for _ in range(ROUNDS):
+        path = InertialPath.of(Imu(imu.stamps_ns, imu.angular_velocity - gyro_bias, imu.specific_force))
         turned = scale * Rotation.from_rotvec([0.0, 0.0, yaw]).apply(velocity)
-        found = search_offset(partial(_line_up, path, seconds, turned, runs, lever), PRIOR_SIGMAS)
-        more, turn = found.fit.parameters[[SCALE, YAW]].tolist()
-        yaw, scale = yaw + turn, scale * (1.0 + more)
-        if np.hypot(turn, more) < LARGEST_STEP_LEFT:
+        line_up = partial(_line_up, path, seconds, turned, runs, lever)
+        found = search_offset(line_up, PRIOR_SIGMAS)
+        found = _without_shared_noise(found, line_up(found.offset_s))
+        (more, turn), drift = found.fit.parameters[[SCALE, YAW]].tolist(), found.fit.parameters[GYRO_BIAS]
+        yaw, scale, gyro_bias = yaw + turn, scale * (1.0 + more), gyro_bias + drift
+        if np.linalg.norm([turn, more, *(drift * STRETCH_S)]) < LARGEST_STEP_LEFT:
             break
     else:
         return _unknown(NO_MANOEUVRES)
@@ -108,6 +116,13 @@ def _matched(path: InertialPath, seconds: Floats, velocity: Floats, runs: list[s
         Estimate1D(yaw, float(sigma[YAW])).limited(YAW_LIMIT_RAD, NO_MANOEUVRES),
         Estimate1D(scale, float(sigma[SCALE])).limited(SCALE_LIMIT, NO_MANOEUVRES),
     )
+
+
+def _without_shared_noise(found: OffsetFit, stretches: list[Stretch]) -> OffsetFit:
+    """The noise of the IMU, in the differences and in what multiplies the scale alike, adds a known amount to all."""
+    shift = found.fit.covariance[:, SCALE] * rate_noise_power(stretches, found.fit.ratios)
+    fit = replace(found.fit, parameters=found.fit.parameters - shift)
+    return replace(found, fit=fit, offset_s=found.offset_s - float(shift[0]))
 
 
 def _unknown(reason: str) -> DvlMatch:
@@ -143,19 +158,21 @@ def _line_up(
     C, impulse = path.rotations_at(seconds), path.impulse_at(seconds)
     turning = C @ cross_matrices(path.rate_at(seconds))
     x = np.einsum("nij,nj->ni", C, velocity) - turning @ lever - impulse
-    S = path.turned_time_at(seconds)
-    return [_stretch(seconds[r], x[r], impulse[r], C[r], turning[r], S[r], lever) for r in runs]
+    S, P = path.turned_time_at(seconds), path.tilted_impulse_at(seconds)
+    return [_stretch(seconds[r], x[r], impulse[r], C[r], turning[r], S[r], P[r], lever) for r in runs]
 
 
 def _stretch(
-    seconds: Floats, x: Floats, impulse: Floats, C: Floats, turning: Floats, S: Floats, lever: Floats
+    seconds: Floats, x: Floats, impulse: Floats, C: Floats, turning: Floats, S: Floats, P: Floats, lever: Floats
 ) -> Stretch:
     """Differences of x; their derivatives are taken at the velocity that the IMU carries on, which is free of noise."""
     since = seconds - seconds.mean()
     slow = np.vander(since, 3)
     carried = impulse + slow @ np.linalg.lstsq(slow, x, rcond=None)[0] + turning @ lever
     in_body = np.einsum("nji,nj->ni", C, carried)
-    A = np.concatenate([-carried[:, :, None], C @ cross_matrices(in_body), turning, -S], axis=2)
+    since_first = S - S[0]
+    drifting = P - P[0] - cross_matrices(impulse - impulse[0]) @ S[0] - cross_matrices(carried) @ since_first
+    A = np.concatenate([-carried[:, :, None], C @ cross_matrices(in_body), turning, -since_first, drifting], axis=2)
     together = max(1, round(MEAN_OVER_S / float(np.median(np.diff(since)))))
     return _difference(_levelling(impulse), *(mean_of_successive(values, together) for values in (since, x, A)))
 

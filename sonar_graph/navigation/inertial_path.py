@@ -2,10 +2,11 @@
 
 The frame g is the IMU's own at its first sample. With C = g_R_imu, piecewise linear rates and the trapezoid rule::
 
-    C <- C Exp((w_i + w_{i+1}) / 2 dt),    F(t) = int C f dt,    S(t) = int C dt
+    C <- C Exp((w_i + w_{i+1}) / 2 dt),    F(t) = int C f dt,    S(t) = int C dt,    P(t) = int [C f]x S dt
 
-F is the change of velocity plus gravity's reaction, S what a constant accelerometer bias adds to it. Nothing here knows
-the world: which way is up is left to whoever fits it.
+F is the change of velocity plus gravity's reaction, S what a constant accelerometer bias adds to it. A constant gyro
+bias b turns C by ``Exp(S b)`` and adds ``-P b`` to F. Nothing here knows the world: which way is up is left to whoever
+fits it.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ class InertialPath:
     """F, shape (n, 3), m/s; NaN from the first sample on whose force was not measured."""
     turned_time: Floats
     """S, shape (n, 3, 3), s."""
+    tilted_impulse: Floats
+    """P, shape (n, 3, 3), m."""
     rate: Floats
     """Angular rate as measured, shape (n, 3), rad/s."""
 
@@ -41,8 +44,8 @@ class InertialPath:
         stamps, first = np.unique(imu.stamps_ns, return_index=True)
         seconds = (stamps - stamps[0]) * 1e-9
         rate = imu.angular_velocity[first]
-        rotations, impulse, turned = _integrate(seconds, rate, imu.specific_force[first])
-        return cls(seconds, int(stamps[0]), rotations, impulse, turned, rate)
+        integrals = _integrate(seconds, rate, imu.specific_force[first])
+        return cls(seconds, int(stamps[0]), *integrals, rate)
 
     def since_origin(self, stamps_ns: Ints) -> Floats:
         """Seconds of other stamps on this path's axis, shape (k,)."""
@@ -68,6 +71,10 @@ class InertialPath:
         """S, shape (k, 3, 3)."""
         return interpolated(seconds, self.seconds, self.turned_time)
 
+    def tilted_impulse_at(self, seconds: Floats) -> Floats:
+        """P, shape (k, 3, 3)."""
+        return interpolated(seconds, self.seconds, self.tilted_impulse)
+
     def rate_at(self, seconds: Floats) -> Floats:
         """Angular rate, shape (k, 3)."""
         return interpolated(seconds, self.seconds, self.rate)
@@ -81,14 +88,17 @@ def interpolated(seconds: Floats, own_seconds: Floats, values: Floats) -> Floats
 
 
 @compiled
-def _integrate(seconds: Floats, rate: Floats, force: Floats) -> tuple[Floats, Floats, Floats]:
+def _integrate(seconds: Floats, rate: Floats, force: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     n = len(seconds)
-    rotations, impulse, turned = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3, 3))
+    rotations, impulse, turned, tilted = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
     rotations[0] = np.eye(3)
     for i in range(1, n):
-        dt = seconds[i] - seconds[i - 1]
-        rotations[i] = rotations[i - 1] @ rotation_exp(0.5 * dt * (rate[i - 1] + rate[i]))
+        half = 0.5 * (seconds[i] - seconds[i - 1])
+        rotations[i] = rotations[i - 1] @ rotation_exp(half * (rate[i - 1] + rate[i]))
         before, after = rotations[i - 1] @ force[i - 1], rotations[i] @ force[i]
-        impulse[i] = impulse[i - 1] + 0.5 * dt * (before + after)
-        turned[i] = turned[i - 1] + 0.5 * dt * (rotations[i - 1] + rotations[i])
-    return rotations, impulse, turned
+        impulse[i] = impulse[i - 1] + half * (before + after)
+        turned[i] = turned[i - 1] + half * (rotations[i - 1] + rotations[i])
+        for j in range(3):
+            felt = np.cross(before, turned[i - 1, :, j]) + np.cross(after, turned[i, :, j])
+            tilted[i, :, j] = tilted[i - 1, :, j] + half * felt
+    return rotations, impulse, turned, tilted

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from sonar_graph.navigation.differenced_fit import Stretch, fit
+from sonar_graph.navigation.differenced_fit import Stretch, fit, rate_noise_power
 
 RATIOS = np.array([0.3, 0.02])
 WIDE = np.array([1e4, 1e4])
@@ -54,3 +54,37 @@ def test_fit_is_generalised_least_squares_with_a_walk_on_the_axes_that_walk(walk
 def test_which_axes_walk_matters():
     both = [fit([stretch_of(0, walks)], WIDE, RATIOS).parameters for walks in ((True,) * 3, (True, True, False))]
     assert np.abs(both[0] - both[1]).max() > 1e-3
+
+
+def whitened_power(stretch: Stretch) -> float:
+    """``tr(P (K - D))`` with dense matrices, rows axis by axis; D is the covariance of differences of white samples."""
+    m = len(stretch.y)
+    K = block_diag(*[dense_covariance(m, walks) for walks in stretch.walks])
+    difference = block_diag(*[np.diff(np.eye(m + 1), axis=0)] * 3)
+    B = stretch.B.transpose(1, 0, 2).reshape(3 * m, -1)
+    weight = np.linalg.inv(K)
+    P = weight - weight @ B @ np.linalg.inv(B.T @ weight @ B) @ B.T @ weight
+    return float(np.trace(P @ (K - difference @ difference.T)))
+
+
+def test_power_of_the_rates_noise_is_the_trace_with_dense_matrices():
+    stretches = [stretch_of(0, (True, True, False)), stretch_of(1, (True, True, True))]
+    assert rate_noise_power(stretches, RATIOS) == pytest.approx(sum(map(whitened_power, stretches)), rel=1e-9)
+
+
+def test_a_column_that_holds_the_rates_noise_is_biased_by_its_power():
+    """y is noise alone, its rates' part also in the only column: it takes the bias off to find nothing."""
+    rng = np.random.default_rng(5)
+    m, found, corrected = 20, [], []
+    signal = rng.standard_normal((m, 3, 1))
+    factor = np.linalg.cholesky(dense_covariance(m, True) - dense_covariance(m, False) + RATIOS[0] * np.eye(m))
+    for _ in range(400):
+        rates = factor @ rng.standard_normal((m, 3))
+        y = np.diff(rng.standard_normal((m + 1, 3)), axis=0) + rates
+        stretch = Stretch(y, 4 * signal + rates[:, :, None], np.tile(np.eye(3), (m, 1, 1)), np.ones(m))
+        result = fit([stretch], WIDE[:1], RATIOS)
+        found.append(result.parameters[0])
+        corrected.append(found[-1] - result.covariance[0, 0] * rate_noise_power([stretch], RATIOS))
+    of_mean = np.std(found) / np.sqrt(len(found))
+    assert np.mean(found) > 8 * of_mean
+    assert abs(np.mean(corrected)) < 3 * of_mean

@@ -73,3 +73,14 @@ def test_rows_of_few_beams_say_what_they_would_say_were_they_not_there():
     for one, other in ((found.offset, without.offset), (found.yaw, without.yaw), (found.scale, without.scale)):
         assert one == other
     assert abs(found.offset.value - OFFSET_S) < 4 * found.offset.sigma < 0.4
+
+
+def test_a_gyro_bias_changes_no_estimate():
+    """Ten times a good MEMS gyro's: turning while it tilts gravity must not look like a turn of the mounting."""
+    run = spoilt(1)
+    bias = np.array([2e-3, -2e-3, 1e-3])
+    biased = replace(run, imu=Imu(run.imu.stamps_ns, run.imu.angular_velocity + bias, run.imu.specific_force))
+    here, there = matched(run), matched(biased)
+    for one, other in ((here.offset, there.offset), (here.yaw, there.yaw), (here.scale, there.scale)):
+        assert abs(one.value - other.value) < 0.2 * one.sigma
+        assert other.sigma < 1.1 * one.sigma
