@@ -5,9 +5,11 @@ The reference is computed from the same sensors: agreement with it shows consist
 * Dead reckoning from one initial attitude, once with the stamps as converted and once with the time offsets that
   are found without a reference for the Doppler log (against the accelerometers) and against the gyros for the
   reference. The error is that of the last position, over the distance travelled.
-* The same with 30 s of the Doppler log removed at each of four places: the share in which what is lost against dead
+* The same with 30 s of the Doppler log removed at each of nine places: the share in which what is lost against dead
   reckoning with all data lies in the 99 % ellipse of a run that knows its start; and, literally, in which the error
-  against the reference lies in the one reported with the start's uncertainty.
+  against the reference lies in the one reported with the start's uncertainty, beside the same without a gap. Once with
+  the IMU where the calibration has it, and once where the accelerations of the six other runs say that it is
+  (`akit_imu_place`).
 * Landmarks simulated along the reference: iSAM2, EKF-SLAM and dead reckoning with their NEES (`akit_landmarks`, which
   says what can be expected).
 """
@@ -24,12 +26,15 @@ import numpy as np
 from scipy.stats import chi2
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
+from akit_imu_place import PlaceFit, fit_place, place_of
 from akit_landmarks import ESTIMATORS, MEASURES, PLACINGS, UNSURE_START, reference_wander, sightings, slam
 from common import in_parallel, make_parser, print_figures, print_table, recording
 
+from sonar_graph.calibration import Mounting
 from sonar_graph.evaluation.consistency import world_position_covs
 from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.logs.converters.akit import read_akit
+from sonar_graph.measurements import Dvl, Floats
 from sonar_graph.navigation.dvl_against_imu import match_dvl_to_imu
 from sonar_graph.navigation.reference_match import match_reference_to_imu
 from sonar_graph.sequence import Sequence
@@ -37,26 +42,40 @@ from sonar_graph.states import Trajectory
 
 RUNS = (1, 2, 3, 4, 5, 6, 7)
 GAP_S = 30.0
-GAP_STARTS_S = (60.0, 140.0, 220.0, 300.0)
+GAP_STARTS_S = tuple(20.0 + 40.0 * k for k in range(9))
 LARGEST_SHARE_OF_DISTANCE = 0.01
 Figures = dict[str, Any]
 
 
-def run(folder: Path, number: int) -> Figures:
-    """All figures of one trajectory."""
+def imu_place(folder: Path, number: int) -> PlaceFit:
+    """What one trajectory says about the IMU's place."""
+    recorded = read_akit(folder, number)
+    offset = match_dvl_to_imu(recorded.imu, recorded.dvl, recorded.calibration).offset.value
+    return fit_place(replace(recorded, dvl=shifted(recorded.dvl, offset)))
+
+
+def run(folder: Path, places: dict[int, Floats], number: int) -> Figures:
+    """All figures of one trajectory.
+
+    Parameters
+    ----------
+    places
+        Of the IMU on the body by all other trajectories, by number.
+    """
     recorded = read_akit(folder, number)
     assert recorded.truth is not None
     dvl = match_dvl_to_imu(recorded.imu, recorded.dvl, recorded.calibration)
     reference = match_reference_to_imu(recorded.imu, recorded.truth, recorded.calibration)
     aligned = realigned(recorded, dvl.offset.value, reference.offset.value)
-    whole = reckoned(aligned)
+    whole, placed = reckoned(aligned), with_imu_at(aligned, places[number])
     return {
         "dvl_offset": (dvl.offset.value, dvl.offset.sigma),
         "reference_offset": (reference.offset.value, reference.offset.sigma),
         "start_heading_rad": start_heading(recorded, aligned),
         "as_converted": final_error(recorded, reckoned(recorded)),
         "aligned": final_error(aligned, whole),
-        "gaps": [gap_error(aligned, whole, begin) for begin in GAP_STARTS_S],
+        "gaps": [gap_error(placed, whole, begin) for begin in GAP_STARTS_S],
+        "gaps_as_converted": [gap_error(aligned, whole, begin) for begin in GAP_STARTS_S],
         "reference_wander_m": reference_wander(folder, number, recorded.truth.positions),
         "sightings": sightings(aligned),
         "slam": slam(aligned, number),
@@ -67,7 +86,7 @@ def realigned(recorded: Sequence, dvl_offset_s: float, reference_offset_s: float
     """Stamps of Doppler log and reference on the IMU's clock, and the start taken there."""
     assert recorded.truth is not None
     dvl, truth = recorded.dvl, recorded.truth
-    dvl = replace(dvl, stamps_ns=dvl.stamps_ns + round(dvl_offset_s * 1e9))
+    dvl = shifted(dvl, dvl_offset_s)
     truth = replace(truth, stamps_ns=truth.stamps_ns + round(reference_offset_s * 1e9))
     first_ns = max(int(dvl.stamps_ns[0]), int(truth.stamps_ns[0]))
     dvl = dvl.rows(dvl.stamps_ns >= first_ns)
@@ -76,6 +95,18 @@ def realigned(recorded: Sequence, dvl_offset_s: float, reference_offset_s: float
     yaw, pitch, roll = pose.rotations().as_euler("ZYX")[0].tolist()
     moved = replace(recorded, dvl=dvl, truth=truth)
     return with_start(moved, position_m=(x, y, z), rpy_rad=(roll, pitch, yaw))
+
+
+def shifted(dvl: Dvl, offset_s: float) -> Dvl:
+    """Stamps put right."""
+    return replace(dvl, stamps_ns=dvl.stamps_ns + round(offset_s * 1e9))
+
+
+def with_imu_at(sequence: Sequence, body_p_imu: Floats) -> Sequence:
+    """The IMU at another place of the body."""
+    x, y, z = body_p_imu.tolist()
+    imu = sequence.calibration.imu.model_copy(update={"mounting": Mounting(translation_m=(x, y, z))})
+    return replace(sequence, calibration=sequence.calibration.model_copy(update={"imu": imu}))
 
 
 def reckoned(sequence: Sequence) -> Trajectory:
@@ -108,10 +139,10 @@ def start_heading(recorded: Sequence, aligned: Sequence) -> float:
 
 
 def gap_error(aligned: Sequence, whole: Trajectory, begin_s: float) -> dict[str, float]:
-    """Position lost in a gap, its square by the covariance without that of the start, and the literal square.
+    """Position lost in a gap, its square by the covariance without that of the start, and the literal squares.
 
-    The literal one is of the error against the reference by the whole reported covariance, which the start's heading
-    sigma of 0.03 rad makes wide.
+    The literal ones are of the error against the reference by the whole reported covariance, which the start's heading
+    sigma of 0.03 rad makes wide; one of them where nothing was removed.
     """
     assert aligned.truth is not None
     begin_ns = aligned.start_ns + round(begin_s * 1e9)
@@ -122,14 +153,20 @@ def gap_error(aligned: Sequence, whole: Trajectory, begin_s: float) -> dict[str,
     row = int(np.searchsorted(after.stamps_ns, end_ns + 2_000_000_000))
     other = int(np.flatnonzero(whole.stamps_ns == after.stamps_ns[row])[0])
     lost = after.positions[row] - whole.positions[other]
-    error = after.positions[row] - aligned.truth.at(after.stamps_ns[row : row + 1]).positions[0]
-    own, reported = world_position_covs(sure)[row], world_position_covs(after)[row]
+    truth = aligned.truth.at(after.stamps_ns[row : row + 1]).positions[0]
+    own = world_position_covs(sure)[row]
     return {
         "lost_m": float(np.linalg.norm(lost)),
         "sigma_m": float(np.sqrt(own.trace())),
-        "square": float(lost @ np.linalg.solve(own, lost)),
-        "literal_square": float(error @ np.linalg.solve(reported, error)),
+        "square": square(lost, own),
+        "literal_square": square(after.positions[row] - truth, world_position_covs(after)[row]),
+        "without_gap_square": square(whole.positions[other] - truth, world_position_covs(whole)[other]),
     }
+
+
+def square(error: Floats, cov: Floats) -> float:
+    """Squared Mahalanobis distance."""
+    return float(error @ np.linalg.solve(cov, error))
 
 
 def with_start(sequence: Sequence, **changes: Any) -> Sequence:
@@ -143,16 +180,48 @@ def main() -> None:
     arguments = parser.parse_args()
     numbers = RUNS[:1] if arguments.quick else RUNS
     with recording(arguments.data, "akit_1-7.tar.xz", "akit") as folder:
-        runs = in_parallel(partial(run, folder), numbers, arguments.workers, "trajectory")
-    print_figures(report(numbers, runs))
+        fits = in_parallel(partial(imu_place, folder), RUNS, arguments.workers, "IMU's place by trajectory")
+        places = {n: place_of([fit for m, fit in zip(RUNS, fits, strict=True) if m != n]) for n in RUNS}
+        runs = in_parallel(partial(run, folder, places), numbers, arguments.workers, "trajectory")
+    print_places(fits)
+    figures = report(numbers, runs) | {
+        "imu_place_m": [fit.body_p_imu.tolist() for fit in fits],
+        "imu_place_of_all_m": place_of(fits).tolist(),
+        "accel_bias_m_s2": [fit.accel_bias.tolist() for fit in fits],
+    }
+    print_figures(figures)
+
+
+def print_places(fits: list[PlaceFit]) -> None:
+    """Where each trajectory has the IMU on the body, with standard deviations, and the noise of the Doppler log."""
+    print_table(
+        ("IMU's place", *(f"{axis} m" for axis in "xyz"), "±", "±", "±", "accel bias x mm/s²", "y", "DVL noise m/s"),
+        [
+            (
+                f"trajectory {n}",
+                *fit.body_p_imu.tolist(),
+                *np.sqrt(np.diag(np.linalg.inv(fit.information))).tolist(),
+                *(1e3 * fit.accel_bias[:2]).tolist(),
+                fit.noise_m_s,
+            )
+            for n, fit in zip(RUNS, fits, strict=True)
+        ],
+    )
 
 
 def report(numbers: tuple[int, ...], runs: list[Figures]) -> Figures:
     """Print the tables; the figures by name."""
-    headers = ("", "DVL offset s", "reference offset s", "start heading deg", "converted %", "aligned %", "in ellipse")
-    limit = float(chi2.ppf(0.99, 3))
-    inside = [[gap["square"] <= limit for gap in r["gaps"]] for r in runs]
-    literal = [[gap["literal_square"] <= limit for gap in r["gaps"]] for r in runs]
+    headers = (
+        "",
+        "DVL offset s",
+        "reference offset s",
+        "start heading deg",
+        "converted %",
+        "aligned %",
+        "converted in ellipse",
+        "IMU placed",
+    )
+    inside = inside_ellipse(runs, "gaps", "square")
     rows = [
         (
             f"trajectory {number}",
@@ -161,9 +230,12 @@ def report(numbers: tuple[int, ...], runs: list[Figures]) -> Figures:
             float(np.degrees(r["start_heading_rad"])),
             100 * r["as_converted"]["share"],
             100 * r["aligned"]["share"],
+            f"{sum(before)} of {len(before)}",
             f"{sum(held)} of {len(held)}",
         )
-        for number, r, held in zip(numbers, runs, inside, strict=True)
+        for number, r, before, held in zip(
+            numbers, runs, inside_ellipse(runs, "gaps_as_converted", "square"), inside, strict=True
+        )
     ]
     print_table(headers, rows)
     print_slam(numbers, runs)
@@ -186,13 +258,24 @@ def report(numbers: tuple[int, ...], runs: list[Figures]) -> Figures:
         "gap_lost_m": [[gap["lost_m"] for gap in r["gaps"]] for r in runs],
         "gap_sigma_m": [[gap["sigma_m"] for gap in r["gaps"]] for r in runs],
         "gap_share_inside": gaps_hold,
-        "gap_share_inside_literally": float(np.mean(literal)),
+        "gap_nees_per_dof": float(np.mean([gap["square"] / 3 for r in runs for gap in r["gaps"]])),
+        "gap_share_inside_as_converted": float(np.mean(inside_ellipse(runs, "gaps_as_converted", "square"))),
+        "gap_lost_as_converted_m": [[gap["lost_m"] for gap in r["gaps_as_converted"]] for r in runs],
+        "gap_share_inside_literally": float(np.mean(inside_ellipse(runs, "gaps", "literal_square"))),
+        "share_inside_literally_without_gap": float(np.mean(inside_ellipse(runs, "gaps", "without_gap_square"))),
+        "literal_squares": [[(gap["literal_square"], gap["without_gap_square"]) for gap in r["gaps"]] for r in runs],
         "reference_wander_m": [r["reference_wander_m"] for r in runs],
         "sightings": [r["sightings"] for r in runs],
         "slam": [r["slam"] for r in runs],
         "landmarks_help": helped,
         "passed": max(shares) <= LARGEST_SHARE_OF_DISTANCE and gaps_hold == 1.0 and min(helped.values()) >= 1.0,
     }
+
+
+def inside_ellipse(runs: list[Figures], gaps: str, name: str) -> list[list[bool]]:
+    """Whether each gap's square lies in the 99 % ellipse."""
+    limit = float(chi2.ppf(0.99, 3))
+    return [[gap[name] <= limit for gap in r[gaps]] for r in runs]
 
 
 def print_slam(numbers: tuple[int, ...], runs: list[Figures]) -> None:
