@@ -57,7 +57,8 @@ def fit_place(sequence: Sequence) -> PlaceFit:
     columns = [turning, -path.turned_time_at(seconds), slow, seconds[:, None, None] * slow]
     found, covariance, variance = _least_squares(np.concatenate(columns, axis=2), x)
     place = body_p_imu - found[SHOWN]
-    return PlaceFit(np.linalg.inv(covariance[SHOWN, SHOWN]), place, found[3:6], float(np.sqrt(variance)))
+    information = np.asarray(np.linalg.inv(covariance[SHOWN, SHOWN]), np.float64)
+    return PlaceFit(information, place, found[3:6], float(np.sqrt(variance)))
 
 
 def _least_squares(A: Floats, x: Floats) -> tuple[Floats, Floats, float]:

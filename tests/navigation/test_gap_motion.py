@@ -1,0 +1,231 @@
+"""Motion over gaps against derivatives by differences: of every sample, of biases, of the Earth's rotation."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.navigation.dvl_preintegration import Preintegrator
+from sonar_graph.navigation.node_motion import motion_between_nodes, motion_since_node
+from sonar_graph.navigation.odometry import Odometry
+
+from .rows import NS, T0_NS, stamps
+
+IMU_HZ, DVL_HZ = 10.0, 2.0
+LOST_S, FOUND_S, OPEN_S = 6.0, 11.0, 10.8
+BODY_P_IMU, BODY_P_DVL = np.array([0.2, -0.1, 0.1]), np.array([-0.5, 0.3, -0.2])
+SIGMA_M_S = (0.01, 0.02, 0.005)
+NO_NOISE = {"gyro_noise_density": 0.0, "accel_noise_density": 0.0, "accel_bias_sigma": 0.0}
+BOTH = pytest.mark.parametrize("until_s", [FOUND_S, OPEN_S], ids=["closed", "open"])
+WITH_OR_WITHOUT = pytest.mark.parametrize("is_blind", [False, True], ids=["accelerometers", "walk"])
+
+
+def attitude(t):
+    """Rolling, pitching and turning, by hand."""
+    return Rotation.from_euler(
+        "ZYX", np.column_stack([0.2 * t + 0.1 * np.sin(t), 0.1 * np.sin(0.6 * t), 0.15 * np.cos(0.5 * t)])
+    )
+
+
+def rate_at(t):
+    return (attitude(t - 1e-4).inv() * attitude(t + 1e-4)).as_rotvec() / 2e-4
+
+
+def velocity_at(t):
+    """Of the IMU's point in the world."""
+    return np.column_stack([1.0 + 0.2 * np.sin(t), 0.4 * np.cos(0.5 * t), 0.1 * np.sin(0.8 * t)])
+
+
+def acceleration_at(t):
+    return np.column_stack([0.2 * np.cos(t), -0.2 * np.sin(0.5 * t), 0.08 * np.cos(0.8 * t)])
+
+
+def rows(lever=BODY_P_DVL - BODY_P_IMU, dvl_hz=DVL_HZ):
+    """Without the velocity in two gaps."""
+    imu_ns, dvl_ns = stamps(IMU_HZ, 16.5), stamps(dvl_hz, 16.0)
+    t, s = ((ns - T0_NS) * 1e-9 for ns in (imu_ns, dvl_ns))
+    force = attitude(t).inv().apply(acceleration_at(t) + np.array([0.0, 0.0, 9.8]))
+    velocity = attitude(s).inv().apply(velocity_at(s)) + np.cross(rate_at(s), lever)
+    kept = ((s <= LOST_S) | (s >= FOUND_S)) & ((s <= 12.0) | (s >= 15.0))
+    return Imu(imu_ns, rate_at(t), force), Dvl(dvl_ns[kept], velocity[kept], np.full((int(kept.sum()), 3, 3), np.nan))
+
+
+def at(seconds):
+    return T0_NS + round(seconds * NS)
+
+
+def calibration(imu=None, body_p_imu=BODY_P_IMU, **dvl):
+    sensors = ImuCalibration(**{**NO_NOISE, **(imu or {})}, mounting=Mounting(translation_m=tuple(body_p_imu)))
+    doppler = {"velocity_sigma_m_s": (0.0,) * 3, "velocity_walk_density": 1e-9, **dvl}
+    return Calibration(imu=sensors, dvl=DvlCalibration(**doppler, mounting=Mounting(translation_m=tuple(BODY_P_DVL))))
+
+
+def motion(imu, dvl, known, start_s, until_s, bias=(0.0, 0.0, 0.0), earth=None):
+    """From a node; to a node by the final motion, to anywhere else by the provisional one, which sees no later row."""
+    odometry, preintegrator = Odometry(known), Preintegrator.from_calibration(known)
+    odometry.add(imu, dvl)
+    is_closed = at(until_s) in dvl.stamps_ns
+    function = motion_between_nodes if is_closed else motion_since_node
+    return function(odometry, preintegrator, at(start_s), at(until_s), np.array(bias), earth)
+
+
+def blinded(imu):
+    return Imu(imu.stamps_ns, imu.angular_velocity, np.full((len(imu), 3), np.nan))
+
+
+def change_of(before, after):
+    step = before.i_T_j.between(after.i_T_j)
+    return np.r_[step.rotation().rpy(), step.translation()]
+
+
+def moved(imu, dvl, column, delta):
+    """Rows with one column changed."""
+    if column == "velocity":
+        return imu, Dvl(dvl.stamps_ns, dvl.velocity + delta, dvl.velocity_cov)
+    rate, force = imu.angular_velocity, imu.specific_force
+    return Imu(imu.stamps_ns, *((rate + delta, force) if column == "rate" else (rate, force + delta))), dvl
+
+
+def spread_by(column, sigma, imu, dvl, *how):
+    """``J Q J^T`` of white noise of every number of a column, J by differences."""
+    values = {"rate": imu.angular_velocity, "force": imu.specific_force, "velocity": dvl.velocity}[column]
+    base, total, step = motion(imu, dvl, *how), np.zeros((6, 6)), 1e-5
+    for row, axis in np.ndindex(values.shape):
+        delta = np.zeros_like(values)
+        delta[row, axis] = step
+        j = change_of(base, motion(*moved(imu, dvl, column, delta), *how)) / step
+        total += np.outer(j, j) * sigma[axis] ** 2
+    return total
+
+
+def error_of_spread(column, sigma, imu, dvl, *how):
+    """Largest error of the covariance, each element beside the standard deviations that belong to it."""
+    truth, found = spread_by(column, sigma, imu, dvl, *how), motion(imu, dvl, *how).covariance
+    deviation = np.sqrt(np.diag(truth))
+    used = deviation > 1e-6
+    return np.abs((found - truth)[np.ix_(used, used)] / np.outer(deviation[used], deviation[used])).max()
+
+
+def density(per_root_hz):
+    return [per_root_hz * np.sqrt(IMU_HZ)] * 3
+
+
+@pytest.mark.parametrize(("until_s", "dvl_hz", "tolerance"), [(FOUND_S, 2.0, 0.02), (OPEN_S, 10.0, 0.15)])
+def test_gyro_noise_spreads_a_gap_as_noise_of_every_sample_does(until_s, dvl_hz, tolerance):
+    """IMU and Doppler log in one place: how noise of single rates acts on the lever between them is left out."""
+    known = calibration({"gyro_noise_density": 1e-3}, BODY_P_DVL)
+    measured = rows(np.zeros(3), dvl_hz)
+    assert error_of_spread("rate", density(1e-3), *measured, known, LOST_S, until_s) < tolerance
+
+
+@pytest.mark.parametrize(("until_s", "dvl_hz", "tolerance"), [(FOUND_S, 2.0, 0.04), (OPEN_S, 10.0, 0.06)])
+def test_accelerometer_noise_spreads_a_gap_as_noise_of_every_sample_does(until_s, dvl_hz, tolerance):
+    known = calibration({"accel_noise_density": 1e-2})
+    measured = rows(dvl_hz=dvl_hz)
+    assert error_of_spread("force", density(1e-2), *measured, known, LOST_S, until_s) < tolerance
+
+
+def test_doppler_noise_spreads_an_open_gap_as_noise_of_every_sample_does():
+    known = calibration(velocity_sigma_m_s=(0.01,) * 3)
+    assert error_of_spread("velocity", [0.01] * 3, *rows(), known, LOST_S, OPEN_S) < 1e-6
+
+
+@pytest.mark.parametrize(("is_blind", "tolerance"), [(False, 0.02), (True, 0.08)], ids=["accelerometers", "walk"])
+def test_doppler_noise_spreads_a_chain_with_a_gap_as_noise_of_every_sample_does(is_blind, tolerance):
+    """What the gap's ends share with their neighbours included."""
+    known = calibration(velocity_sigma_m_s=SIGMA_M_S)
+    imu, dvl = rows()
+    imu = blinded(imu) if is_blind else imu
+    assert error_of_spread("velocity", SIGMA_M_S, imu, dvl, known, 5.0, 12.0) < tolerance
+
+
+def test_the_last_velocity_held_keeps_its_error():
+    known = calibration(velocity_sigma_m_s=(0.01,) * 3)
+    imu, dvl = rows()
+    assert error_of_spread("velocity", [0.01] * 3, blinded(imu), dvl, known, LOST_S, OPEN_S) < 0.15
+
+
+@BOTH
+def test_an_accelerometer_bias_spreads_a_gap_as_moving_all_forces_does(until_s):
+    imu, dvl = rows()
+    how = calibration({"accel_bias_sigma": 0.02}), LOST_S, until_s
+    base, step = motion(imu, dvl, *how), 1e-4
+    J = [change_of(base, motion(*moved(imu, dvl, "force", step * axis), *how))[3:] / step for axis in np.eye(3)]
+    assert base.covariance[3:, 3:] == pytest.approx(0.02**2 * np.transpose(J) @ J, rel=1e-3, abs=1e-8)
+
+
+@BOTH
+def test_a_bias_that_is_removed_is_as_if_it_had_not_been(until_s):
+    for imu in (rows()[0], blinded(rows()[0])):
+        dvl, bias, known = rows()[1], np.array([0.03, -0.02, 0.04]), calibration(velocity_sigma_m_s=SIGMA_M_S)
+        clean = motion(imu, dvl, known, LOST_S, until_s)
+        biased = motion(*moved(imu, dvl, "rate", bias), known, LOST_S, until_s, bias)
+        assert biased.i_T_j.equals(clean.i_T_j, 1e-9)
+        assert biased.covariance == pytest.approx(clean.covariance, abs=1e-12)
+
+
+@pytest.mark.parametrize(("start_s", "until_s"), [(LOST_S, FOUND_S), (LOST_S, OPEN_S), (5.0, 16.0)])
+@WITH_OR_WITHOUT
+def test_the_bias_derivative_is_that_of_integrating_again(is_blind, start_s, until_s):
+    """Over one gap, and over a chain with two."""
+    imu, dvl = rows()
+    imu = blinded(imu) if is_blind else imu
+    how = calibration(), start_s, until_s
+    base, step = motion(imu, dvl, *how), 1e-6
+    J = [change_of(base, motion(*moved(imu, dvl, "rate", -step * axis), *how)) / step for axis in np.eye(3)]
+    assert base.D_bias == pytest.approx(np.transpose(J), rel=1e-3, abs=0.02)
+
+
+@pytest.mark.parametrize(("start_s", "until_s"), [(LOST_S, FOUND_S), (LOST_S, OPEN_S), (5.0, 16.0)])
+@WITH_OR_WITHOUT
+def test_earths_rotation_is_removed_as_if_it_stood_still(is_blind, start_s, until_s):
+    """Exaggerated twentyfold, and known in the frame of the first node."""
+    imu, dvl = rows()
+    world_earth = np.array([0.0, 1e-3, 8e-4])
+    turning = attitude((imu.stamps_ns - T0_NS) * 1e-9).inv().apply(world_earth)
+    lever = BODY_P_IMU - BODY_P_DVL
+    at_dvl = attitude((dvl.stamps_ns - T0_NS) * 1e-9).inv().apply(world_earth)
+    felt = moved(*moved(imu, dvl, "rate", turning), "velocity", -np.cross(at_dvl, lever))
+    if is_blind:
+        imu, felt = blinded(imu), (blinded(felt[0]), dvl)
+    known = calibration(body_p_imu=BODY_P_IMU)
+    earth = attitude(np.array([start_s])).inv().apply(world_earth)[0]
+    still = motion(imu, dvl, known, start_s, until_s)
+    found = motion(*felt, known, start_s, until_s, earth=earth)
+    assert found.i_T_j.equals(still.i_T_j, 3e-3)
+
+
+def test_motion_over_two_gaps_is_that_of_the_vehicle():
+    seconds = np.linspace(5.0, 16.0, 20001)
+    track = np.trapezoid(velocity_at(seconds), seconds, axis=0)
+    ends = attitude(np.array([5.0, 16.0]))
+    start, end = ends[0], ends[1]
+    truth = start.inv().apply(track - (end.apply(BODY_P_IMU) - start.apply(BODY_P_IMU)))
+    found = motion(*rows(), calibration(), 5.0, 16.0)
+    assert found.i_T_j.translation() == pytest.approx(truth, abs=0.03)
+    assert found.i_T_j.rotation().matrix() == pytest.approx((start.inv() * end).as_matrix(), abs=2e-3)
+
+
+def test_an_open_gap_uses_nothing_stamped_later():
+    imu, dvl = rows()
+    known = calibration({"gyro_noise_density": 1e-3, "accel_noise_density": 1e-2}, velocity_sigma_m_s=SIGMA_M_S)
+    until_s = OPEN_S + 0.03
+    whole, cut = (motion(part, dvl, known, LOST_S, until_s) for part in (imu, imu.between(0, at(until_s))))
+    assert whole.i_T_j.equals(cut.i_T_j, 0.0)
+    assert np.array_equal(whole.covariance, cut.covariance)
+
+
+def test_a_gap_does_not_inherit_more_of_its_neighbour_than_its_own_length():
+    """An interval before the gap that is longer than it: as if it were as long."""
+    known = calibration(velocity_sigma_m_s=(0.01,) * 3, gap_s=0.9)
+    imu, dvl = rows()
+    first, last = at(5.0), at(LOST_S)
+    found = []
+    for before_ns in (at(4.0), at(2.0)):
+        kept = np.isin(dvl.stamps_ns, [before_ns, first, last])
+        found.append(motion(imu, dvl.rows(kept), known, 5.0, LOST_S).covariance[3:, 3:])
+    assert found[0] == pytest.approx(found[1])
+    assert np.diag(found[0]) == pytest.approx([0.01**2 * 2 * 3 / 4] * 3, rel=1e-6)
+    alone = motion(imu, dvl.rows(np.isin(dvl.stamps_ns, [first, last])), known, 5.0, LOST_S)
+    assert np.diag(alone.covariance)[3:] == pytest.approx([0.01**2 * 2 / 4] * 3, rel=1e-6)
