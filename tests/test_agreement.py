@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from baselines.dead_reckoning import DeadReckoning
 from baselines.ekf_slam import EkfSlam, EkfSlamParams
+from baselines.invariant_ekf import InvariantEkf, InvariantEkfParams
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
 from sonar_graph.estimator import Estimator
 from sonar_graph.measurements import Dvl, Floats, Imu
@@ -57,11 +58,15 @@ def ekf(calibration: Calibration) -> EkfSlam:
     return EkfSlam(calibration, EkfSlamParams(gate_probability=1))
 
 
+def invariant(calibration: Calibration) -> InvariantEkf:
+    return InvariantEkf(calibration, InvariantEkfParams(gate_probability=1))
+
+
 @smoothers
 def test_filter_and_smoother_are_least_squares_where_all_is_linear(params):
     """At every node, with what was measured until then, along x: mean and variance to 1e-6."""
     sequence, numbers = rail(NODES)
-    for estimator in (ekf(sequence.calibration), Isam2(sequence.calibration, params)):
+    for estimator in (ekf(sequence.calibration), invariant(sequence.calibration), Isam2(sequence.calibration, params)):
         for k, estimate in enumerate(run(estimator, sequence), 1):
             mean, variance = numbers.solution(k + 1)
             assert estimate.world_T_body.translation()[0] == pytest.approx(mean[f"x{k}"], abs=1e-6)
@@ -84,7 +89,7 @@ def test_filter_and_smoother_agree_where_all_is_linear(params):
 def test_maps_are_least_squares_where_all_is_linear(params):
     sequence, numbers = rail(NODES)
     mean, variance = numbers.solution(NODES)
-    for estimator in (ekf(sequence.calibration), Isam2(sequence.calibration, params)):
+    for estimator in (ekf(sequence.calibration), invariant(sequence.calibration), Isam2(sequence.calibration, params)):
         run(estimator, sequence)
         found = estimator.landmarks()
         assert found.ids.tolist() == [4, 7]
@@ -142,17 +147,18 @@ def test_without_sightings_all_are_dead_reckoning():
     """Poses and whole covariances, at nodes and between them."""
     sequence = winding()
     reckoned = run(DeadReckoning(sequence.calibration), sequence, 3.7)
-    for estimator in (EkfSlam(sequence.calibration), Isam2(sequence.calibration)):
-        poses, covariances = difference(run(estimator, sequence, 3.7), reckoned)
+    for kind in (EkfSlam, InvariantEkf, Isam2):
+        poses, covariances = difference(run(kind(sequence.calibration), sequence, 3.7), reckoned)
         assert poses < 1e-6
         assert covariances < 1e-6
 
 
-def test_without_sightings_the_smoother_carries_the_bias_as_dead_reckoning_does():
+@pytest.mark.parametrize("kind", [InvariantEkf, Isam2])
+def test_without_sightings_a_state_carries_the_bias_as_dead_reckoning_does(kind):
     """A constant bias of which nothing is learnt: unknown, and the same at all times."""
     sequence = winding(gyro_bias_sigma=2e-3)
     reckoned = run(DeadReckoning(sequence.calibration), sequence, 3.7)
-    poses, covariances = difference(run(Isam2(sequence.calibration), sequence, 3.7), reckoned)
+    poses, covariances = difference(run(kind(sequence.calibration), sequence, 3.7), reckoned)
     assert poses < 1e-6
     assert covariances < 1e-3
     unaware = run(DeadReckoning(winding().calibration), sequence, 3.7)

@@ -35,11 +35,11 @@ def announce(monkeypatch: pytest.MonkeyPatch, **values: str) -> None:
     monkeypatch.setattr(module, "entry_points", lambda group: points if group == module.ENTRY_POINT_GROUP else [])
 
 
-def test_the_three_that_come_along_are_announced() -> None:
-    assert {"dead-reckoning", "ekf-slam", "isam2"} <= set(installed_estimators())
+def test_those_that_come_along_are_announced() -> None:
+    assert {"dead-reckoning", "ekf-slam", "invariant-ekf", "isam2"} <= set(installed_estimators())
 
 
-@pytest.mark.parametrize("name", ["dead-reckoning", "ekf-slam", "isam2"])
+@pytest.mark.parametrize("name", ["dead-reckoning", "ekf-slam", "invariant-ekf", "isam2"])
 def test_what_comes_along_loads_with_default_settings(name: str) -> None:
     kind = load_estimator(name)
     assert make_params(kind, {}, name) == kind.Params()

@@ -241,13 +241,13 @@ def test_broken_estimator_fails_the_check_meant_for_it(broken: type[PlainDeadRec
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-@pytest.mark.parametrize("name", ["dead-reckoning", "ekf-slam", "isam2"])
+@pytest.mark.parametrize("name", ["dead-reckoning", "ekf-slam", "invariant-ekf", "isam2"])
 def test_estimators_that_come_along_keep_the_contract(name: str, check: Check) -> None:
     check(load_estimator(name))
 
 
 @pytest.mark.parametrize("check", FILTER_CHECKS, ids=lambda check: check.__name__)
-@pytest.mark.parametrize("name", ["dead-reckoning", "ekf-slam"])
+@pytest.mark.parametrize("name", ["dead-reckoning", "ekf-slam", "invariant-ekf"])
 def test_filters_that_come_along_do_not_care_how_rows_are_cut(name: str, check: Check) -> None:
     check(load_estimator(name))
 

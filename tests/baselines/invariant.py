@@ -8,13 +8,27 @@ import gtsam
 import numpy as np
 from hypothesis import strategies as st
 
+from baselines.ekf_landmarks import SonarModel
 from baselines.invariant_state import InvariantState
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.gap_motion import GapMotion
-from sonar_graph.navigation.triples import matrix
+from sonar_graph.navigation.triples import matrix, vector
+from sonar_graph.slam.association import gate_threshold
 
 from .motions import motion_of
 
+MOUNTING = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.5, -0.2), np.array([0.4, 0.1, -0.2]))
+SONAR = SonarModel(
+    body_R_sonar=matrix(MOUNTING.rotation().matrix()),
+    body_p_sonar=vector(MOUNTING.translation()),
+    gate=gate_threshold(0.999, 2),
+    aperture_rad=0.244,
+    range_variance_m2=4e-4,
+    azimuth_variance=1e-4,
+    has_floor=False,
+    floor_z_m=0.0,
+    floor_variance_m2=1e-4,
+)
 STEP = 1e-6
 LANDMARKS = np.array([[4.0, -1.0, -1.7], [-2.0, 6.0, -2.5]])
 WRAP_AROUND = st.builds(lambda axis, off: (np.pi - off) * np.eye(3)[axis], st.integers(0, 2), st.floats(-1e-3, 1e-3))

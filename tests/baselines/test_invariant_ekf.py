@@ -15,7 +15,6 @@ from sonar_graph.calibration import (
     SonarCalibration,
     Start,
 )
-from sonar_graph.estimator_checks import CHECKS, FILTER_CHECKS
 from sonar_graph.evaluation.consistency import yaw_variances
 from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections, Measurements
 from sonar_graph.sequence import NS_PER_S, Sequence
@@ -59,11 +58,6 @@ def run(kind, sequence, params=None, rate_hz=1.0):
     for window in sequence.replay(sequence.instants(rate_hz)):
         estimator.process(window)
     return estimator
-
-
-@pytest.mark.parametrize("check", [*CHECKS, *FILTER_CHECKS], ids=lambda check: check.__name__)
-def test_the_contract_is_kept(check):
-    check(InvariantEkf)
 
 
 @pytest.fixture(scope="module")

@@ -6,14 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from baselines.ekf_landmarks import SonarModel
 from baselines.invariant_models import height_of_body_point, height_of_point, location, missed_up, observation
-from sonar_graph.navigation.triples import matrix, vector
-from sonar_graph.slam.association import gate_threshold
+from sonar_graph.navigation.triples import vector
 from sonar_graph.slam.models import locate, range_azimuth
 
 from .invariant import (
     D_BIAS,
+    MOUNTING,
+    SONAR,
     body_after,
     derivative,
     gap_motion_of,
@@ -24,18 +24,6 @@ from .invariant import (
     twists,
 )
 
-MOUNTING = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.5, -0.2), np.array([0.4, 0.1, -0.2]))
-SONAR = SonarModel(
-    body_R_sonar=matrix(MOUNTING.rotation().matrix()),
-    body_p_sonar=vector(MOUNTING.translation()),
-    gate=gate_threshold(0.999, 2),
-    aperture_rad=0.244,
-    range_variance_m2=4e-4,
-    azimuth_variance=1e-4,
-    has_floor=False,
-    floor_z_m=0.0,
-    floor_variance_m2=1e-4,
-)
 PORT = np.array([0.1, 0.2, -0.3])
 views = st.tuples(st.floats(1.0, 10.0), st.floats(-math.pi, math.pi), st.floats(-0.8, 0.8))
 NO_XI, NO_MOTION_XI = np.zeros(15), np.zeros(6)
