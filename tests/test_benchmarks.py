@@ -162,6 +162,24 @@ def test_consistency_names_its_figures_and_draws(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_filter_consistency_names_its_figures_and_tells_filters_apart() -> None:
+    found = figures("validation/filter_consistency.py", "--workers", "2", "--estimators", "ekf,invariant")
+    for basin in ("nominal", "hard", "hard_without_bias"):
+        for quantity in ("position", "yaw"):
+            low, high = found[f"{basin}_band_{quantity}"]
+            assert low < 1 < high
+            for estimator in ("ekf", "invariant"):
+                value = found[f"{basin}_{estimator}_{quantity}_anees"]
+                assert found[f"{basin}_{estimator}_{quantity}_inside"] == (low <= value <= high)
+        assert found[f"{basin}_ekf_yaw_anees"] != pytest.approx(found[f"{basin}_invariant_yaw_anees"], rel=1e-3)
+
+
+def test_filter_consistency_refuses_basins_that_it_does_not_know() -> None:
+    done = run("validation/filter_consistency.py", "--basins", "nominal,deep")
+    assert (done.returncode, done.stderr.strip()) == (2, "--basins, --estimators: unknown: deep")
+
+
+@pytest.mark.slow
 def test_victoria_park_agrees_with_the_batch_solution() -> None:
     found = figures("validation/victoria_park.py", "--workers", "2")
     assert found["cost_ratio"] == pytest.approx(1, abs=5e-3)
