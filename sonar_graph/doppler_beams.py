@@ -59,15 +59,3 @@ def _solution(directions: Floats, sigma_m_s: float) -> tuple[Floats, Floats]:
     inverse = (axes * (per_geometry * is_measured)) @ axes.T @ directions.T
     variances = np.where(is_measured, sigma_m_s**2 * per_geometry, UNMEASURED_M_S**2)
     return inverse, (axes * variances) @ axes.T
-
-
-def finite(velocity_cov: Floats) -> Floats:
-    """Covariances of shape (n, 3, 3) with `UNMEASURED_M_S` along axes whose variance is infinite."""
-    unmeasured = np.isinf(np.diagonal(velocity_cov, axis1=1, axis2=2))
-    either = unmeasured[:, :, None] | unmeasured[:, None, :]
-    return np.where(either, UNMEASURED_M_S**2 * np.eye(3), velocity_cov)
-
-
-def is_partial(velocity_cov: Floats) -> NDArray[np.bool_]:
-    """Rows with a direction of which nothing was measured, shape (n,), from covariances of shape (n, 3, 3)."""
-    return np.asarray(np.trace(velocity_cov, axis1=1, axis2=2) > 0.5 * UNMEASURED_M_S**2)

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.doppler_beams import UNMEASURED_M_S, finite, is_partial, velocity_of_beams
+from sonar_graph.doppler_beams import UNMEASURED_M_S, velocity_of_beams
+from sonar_graph.navigation.velocity_covariances import is_partial
 
 TILT = np.radians(30.0)
 JANUS = np.array(
@@ -71,14 +72,3 @@ def test_rows_do_not_mix():
         alone, cov = velocity_of_beams(JANUS, velocities[k : k + 1] @ JANUS.T, valid[k : k + 1], SIGMA)
         np.testing.assert_allclose(alone[0], together[k], atol=1e-14)
         np.testing.assert_array_equal(cov[0], covs[k])
-
-
-def test_an_infinite_variance_is_that_of_a_direction_not_measured():
-    whole = np.array([[2.0, 0.5, 0.1], [0.5, 3.0, 0.2], [0.1, 0.2, 4.0]])
-    cov = np.array([whole, whole, np.full((3, 3), np.nan)])
-    cov[1, 1], cov[1, :, 1] = np.inf, np.inf
-    found = finite(cov)
-    np.testing.assert_array_equal(found[0], whole)
-    np.testing.assert_array_equal(found[1], [[2.0, 0.0, 0.1], [0.0, UNMEASURED_M_S**2, 0.0], [0.1, 0.0, 4.0]])
-    assert np.isnan(found[2]).all()
-    np.testing.assert_array_equal(is_partial(cov), [False, True, False])

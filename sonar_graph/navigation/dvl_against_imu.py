@@ -31,11 +31,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.doppler_beams import is_partial
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation.differenced_fit import Stretch, rate_noise_power
 from sonar_graph.navigation.inertial_path import InertialPath
 from sonar_graph.navigation.offset_search import RANGE_S, Estimate1D, OffsetFit, search_offset
+from sonar_graph.navigation.velocity_covariances import is_partial
 
 STRETCH_S = 30.0
 """Gravity and its turning are fitted anew after so long."""

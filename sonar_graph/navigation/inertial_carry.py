@@ -5,7 +5,7 @@ IMU's point less F is ``v + g t`` with gravity g. Left out of this line, and tak
 ``walk_density`` instead, over a stretch of T seconds turned by phi in all, are
 
     accelerometer noise          s_a^2
-    gyro noise, tilting g        (g s_g T)^2 / 48           variance of the integral in mid-stretch, both ends known
+    gyro noise, tilting g        (g s_g T)^2 / 12           its integral in mid-stretch, both ends known: T^3 / 48
     gyro bias, tilting g         (g b T)^2 T / 16           peak of the parabola between both ends
     a bias that turns            (b_a phi)^2 T / 16         the same
 
@@ -80,7 +80,7 @@ def _at(imu: InertialRows, values: Floats, stamps_ns: Ints) -> Floats:
 def _walk_density(calibration: Calibration, stretch_s: float, turned_rad: float) -> float:
     imu, g = calibration.imu, calibration.gravity_m_s2
     bias2 = imu.gyro_bias_sigma**2 + EARTH_RATE_RAD_S**2
-    by_gyro = g**2 * (imu.gyro_noise_density**2 * stretch_s**2 / 48.0 + bias2 * stretch_s**3 / 16.0)
+    by_gyro = g**2 * (imu.gyro_noise_density**2 * stretch_s**2 / 12.0 + bias2 * stretch_s**3 / 16.0)
     by_turning = (imu.accel_bias_sigma * turned_rad) ** 2 * stretch_s / 16.0
     return float(np.sqrt(imu.accel_noise_density**2 + by_gyro + by_turning))
 

@@ -22,12 +22,12 @@ import gtsam
 import numpy as np
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.doppler_beams import is_partial
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.navigation.joint_recursion import Inertial, preintegrate
 from sonar_graph.navigation.joint_rules import RULES, DopplerRule
+from sonar_graph.navigation.velocity_covariances import is_partial
 
 ROTATION, VELOCITY, POSITION, DISPLACEMENT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 """Rows of a covariance and of derivatives."""

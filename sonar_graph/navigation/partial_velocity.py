@@ -58,6 +58,16 @@ class PartialVelocities:
         """Stamps of the rows that were passed over, and of those that wait."""
         return [*self._passed_over_ns, *(row.stamp_ns for row in self._waiting)]
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a row waits for the next whole one."""
+        return bool(self._waiting)
+
+    def remember(self, stamps_ns: Ints, velocity: Floats, covs: Floats) -> None:
+        """Take note of rows that are all whole, while none waits: `completed` would give them back as they are."""
+        if self._whole is None or stamps_ns[-1] > self._whole.stamp_ns:
+            self._whole = _Row(int(stamps_ns[-1]), velocity[-1], covs[-1])
+
     def completed(
         self, stamps_ns: Ints, velocity: Floats, covs: Floats, partial: NDArray[np.bool_], imu: InertialRows
     ) -> Rows:
@@ -72,10 +82,6 @@ class PartialVelocities:
         imu
             All rows known; of those after a stamp nothing is used for it.
         """
-        if not self._waiting and not partial.any():
-            if len(stamps_ns):
-                self._remember(_Row(int(stamps_ns[-1]), velocity[-1], covs[-1]))
-            return stamps_ns, velocity, covs
         usable: list[_Row] = []
         for stamp_ns, v, cov, is_part in zip(stamps_ns.tolist(), velocity, covs, partial.tolist(), strict=True):
             row = _Row(stamp_ns, v, cov)
@@ -96,16 +102,13 @@ class PartialVelocities:
         else:
             self._passed_over_ns.append(row.stamp_ns)
 
-    def _remember(self, row: _Row) -> None:
-        if self._whole is None or row.stamp_ns > self._whole.stamp_ns:
-            self._whole = row
-
     def _closed_by(self, row: _Row, imu: InertialRows) -> list[_Row]:
         """The rows that waited for this one."""
         within = [waiting for waiting in self._waiting if waiting.stamp_ns < row.stamp_ns]
         self._waiting = [waiting for waiting in self._waiting if waiting.stamp_ns > row.stamp_ns]
         whole = self._whole
-        self._remember(row)
+        if whole is None or row.stamp_ns > whole.stamp_ns:
+            self._whole = row
         if not within or whole is None:
             return []
         if row.stamp_ns - whole.stamp_ns > LONGEST_STRETCH_NS:

@@ -10,20 +10,18 @@ from __future__ import annotations
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration, Mounting
-from sonar_graph.doppler_beams import finite, is_partial
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.inertial_carry import InertialRows
 from sonar_graph.navigation.kernels import compiled
-from sonar_graph.navigation.partial_velocity import PartialVelocities
+from sonar_graph.navigation.partial_velocity import PartialVelocities, Rows
 from sonar_graph.navigation.stamped_rows import EARLIEST_NS, LATEST_NS, StampedRows
-from sonar_graph.navigation.velocity_gate import GATE, distances
+from sonar_graph.navigation.velocity_covariances import in_numbers
+from sonar_graph.navigation.velocity_gate import GATE, Verdict, judge
 from sonar_graph.states import Refusal, RefusedRow
 
 _Rows = TypeVar("_Rows", Imu, Dvl)
-Flags = NDArray[np.bool_]
 
 
 class RowIntake:
@@ -39,7 +37,7 @@ class RowIntake:
         self._body_R_imu = _rotation(calibration.imu.mounting)
         self._body_R_dvl = _rotation(calibration.dvl.mounting)
         self._default_cov = np.diag(np.square(calibration.dvl.velocity_sigma_m_s))
-        self._may_jump = calibration.odometry_interpolation == "hold-past"
+        self._gate = np.inf if calibration.odometry_interpolation == "hold-past" else GATE  # held velocities may jump
         self._walk = calibration.dvl.velocity_walk_density
         self._partial = PartialVelocities(calibration)
         self.imu = StampedRows((3,), (3,))
@@ -71,41 +69,29 @@ class RowIntake:
         rows = self._in_time(dvl, self.dvl.stamps_ns, "dvl")
         if rows is None:
             return False
-        partial = is_partial(rows.velocity_cov)
-        velocity, cov = self._in_body(rows, finite(rows.velocity_cov) if partial.any() else rows.velocity_cov)
-        believed = self._believed(rows.stamps_ns, velocity, cov, partial)
-        inertial = InertialRows(self.imu.stamps_ns, *self.imu.values)
-        whole = self._partial.completed(
-            rows.stamps_ns[believed], velocity[believed], cov[believed], partial[believed], inertial
-        )
-        return len(whole[0]) > 0 and self.dvl.insert(*whole)
+        stamps_ns, velocity, cov = rows.stamps_ns, *self._in_body(rows)
+        verdict = judge(stamps_ns, velocity, cov, self.dvl.stamps_ns, *self.dvl.values, self._walk, self._gate)
+        if not verdict.is_plain or self._partial.is_waiting:
+            stamps_ns, velocity, cov = self._completed(stamps_ns, velocity, cov, verdict)
+        else:
+            self._partial.remember(stamps_ns, velocity, cov)
+        return len(stamps_ns) > 0 and self.dvl.insert(stamps_ns, velocity, cov)
 
-    def _in_body(self, dvl: Dvl, cov: Floats) -> tuple[Floats, Floats]:
-        """Velocity and a covariance in body axes."""
-        cov = np.where(np.isnan(cov), self._default_cov, cov)
+    def _in_body(self, dvl: Dvl) -> tuple[Floats, Floats]:
+        """Velocity and its covariance in body axes."""
+        cov = in_numbers(dvl.velocity_cov, self._default_cov)
         if self._body_R_dvl is None:
             return dvl.velocity, cov
         return dvl.velocity @ self._body_R_dvl.T, self._body_R_dvl @ cov @ self._body_R_dvl.T
 
-    def _believed(self, stamps_ns: Ints, velocity: Floats, cov: Floats, partial: Flags) -> slice | Flags:
-        """Rows that are no outliers, each beside the one before it; held velocities may jump and are all believed."""
-        if self._may_jump:
-            return slice(None)
-        before = self._row_before(stamps_ns[0], velocity, cov)
-        found = distances(stamps_ns, velocity, cov, partial, *before, self._walk)
-        is_outlier = found > GATE
-        if not is_outlier.any():
-            return slice(None)
-        for stamp_ns, distance in zip(stamps_ns[is_outlier].tolist(), found[is_outlier].tolist(), strict=True):
+    def _completed(self, stamps_ns: Ints, velocity: Floats, cov: Floats, verdict: Verdict) -> Rows:
+        """Rows that are no outliers, without those that wait, and those that have waited for them."""
+        outlier = verdict.is_outlier
+        for stamp_ns, distance in zip(stamps_ns[outlier].tolist(), verdict.distance[outlier].tolist(), strict=True):
             self._refused.append(RefusedRow("dvl", stamp_ns, Refusal.OUTLIER, distance))
-        return ~is_outlier
-
-    def _row_before(self, stamp_ns: int, velocity: Floats, cov: Floats) -> tuple[int, Floats, Floats]:
-        """The row kept before a stamp; where there is none, a row too late to be compared with."""
-        k = int(np.searchsorted(self.dvl.stamps_ns, stamp_ns)) - 1
-        if k < 0:
-            return LATEST_NS, velocity[0], cov[0]
-        return int(self.dvl.stamps_ns[k]), self.dvl.values[0][k], self.dvl.values[1][k]
+        inertial = InertialRows(self.imu.stamps_ns, *self.imu.values)
+        believed = stamps_ns[~outlier], velocity[~outlier], cov[~outlier]
+        return self._partial.completed(*believed, verdict.is_partial[~outlier], inertial)
 
     def _in_time(self, rows: _Rows, known_ns: Ints, sensor: str) -> _Rows | None:
         """Rows that can still be used, each stamp once."""

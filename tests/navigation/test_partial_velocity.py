@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from sonar_graph.calibration import Calibration, DvlCalibration
-from sonar_graph.doppler_beams import is_partial, velocity_of_beams
+from sonar_graph.doppler_beams import velocity_of_beams
 from sonar_graph.navigation.inertial_carry import InertialRows
 from sonar_graph.navigation.partial_velocity import LONGEST_STRETCH_NS, PartialVelocities
+from sonar_graph.navigation.velocity_covariances import is_partial
 
 STEP_NS = 200_000_000
 STEP_S = 0.2
