@@ -167,3 +167,20 @@ def test_an_infinite_variance_is_completed_like_one_of_a_direction_not_measured(
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)
     assert len(found[0][3]) == len(rows)
+
+
+def test_late_rows_ask_for_no_motion_anew():
+    odometry = Odometry(Calibration())
+    rows = driven([], [])
+    odometry.add(imu(stamps(50, SECONDS), 0.0), rows)
+    odometry.settle(T0_NS + 3 * NS)
+    assert not odometry.add(imu(stamps(50, 1.0) + 1, 0.0), dvl(stamps(5, 1.0) + 1, [0.8, 0.0, 0.0]))
+    assert len(odometry.refused) == 51 + 6
+
+
+def test_rows_are_late_at_the_settled_stamp_and_not_after_it():
+    odometry = Odometry(Calibration())
+    odometry.settle(T0_NS)
+    odometry.add(None, dvl(T0_NS + np.array([-1, 0, 1]), [0.8, 0.0, 0.0]))
+    assert [row.stamp_ns - T0_NS for row in odometry.refused] == [-1, 0]
+    assert (odometry.columns()[3] - T0_NS).tolist() == [1]
