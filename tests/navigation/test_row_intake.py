@@ -118,6 +118,15 @@ def test_of_equal_stamps_the_first_counts():
         np.testing.assert_array_equal(odometry.columns()[4], one.velocity)
 
 
+@pytest.mark.parametrize(
+    ("offsets", "kept"), [([0, 0], [0]), ([0, 1, 1], [0, 1]), ([0, 0, 1], [0, 1]), ([0, 1], [0, 1])]
+)
+def test_repeats_are_left_out_wherever_they_are_in_a_block(offsets, kept):
+    odometry = Odometry(Calibration())
+    odometry.add(imu(T0_NS + np.array(offsets), 0.0), None)
+    assert (odometry.columns()[0] - T0_NS).tolist() == kept
+
+
 def test_only_rows_before_others_ask_for_motion_anew():
     rows = driven([], [])
     odometry = Odometry(Calibration())

@@ -76,6 +76,8 @@ def test_the_first_row_of_all_has_nothing_to_be_compared_with():
     assert found([5], [[9.0, 0.0, 0.0]], known=(5, 7)) == pytest.approx([0.0])
     (distance,) = found([NS], [[9.0, 0.0, 0.0]], known=(-NS, 0, NS, 2 * NS))
     assert distance == pytest.approx(81.0 / (COVS[:, 0, 0].sum() + WALK**2))
+    (distance,) = found([NS], [[9.0, 0.0, 0.0]], known=(0, NS - 1))
+    assert distance == pytest.approx(81.0 / COVS[:, 0, 0].sum(), rel=1e-6)
 
 
 def test_rows_are_compared_with_the_last_one_believed():
