@@ -229,3 +229,14 @@ def test_a_gap_does_not_inherit_more_of_its_neighbour_than_its_own_length():
     assert np.diag(found[0]) == pytest.approx([0.01**2 * 2 * 3 / 4] * 3, rel=1e-6)
     alone = motion(imu, dvl.rows(np.isin(dvl.stamps_ns, [first, last])), known, 5.0, LOST_S)
     assert np.diag(alone.covariance)[3:] == pytest.approx([0.01**2 * 2 / 4] * 3, rel=1e-6)
+
+
+def test_a_gap_that_ends_between_inertial_rows_uses_the_row_after_its_end_and_no_later_one():
+    imu, dvl = rows()
+    late = Dvl(dvl.stamps_ns + NS // 20 * (dvl.stamps_ns >= at(FOUND_S)), dvl.velocity, dvl.velocity_cov)
+    how = calibration(), LOST_S, FOUND_S + 0.05
+    base = motion(imu, late, *how).i_T_j
+    for row_s, is_used in ((FOUND_S + 0.1, True), (FOUND_S + 0.2, False)):
+        only = (imu.stamps_ns == at(row_s))[:, None] * np.ones(3)
+        found = motion(*moved(imu, late, "force", only), *how).i_T_j
+        assert found.equals(base, 1e-6) != is_used
