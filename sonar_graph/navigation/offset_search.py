@@ -99,15 +99,25 @@ def _doubt(grid: Floats, chi2: Floats, best: int) -> str:
 
 
 def _refine(line_up: LineUp, prior_sigmas: Floats, ratios: Floats, offset_s: float, reason: str) -> OffsetFit:
+    """Twice: the noises told on the grid, up to half a step from the best offset, hold motion that is not lined up."""
+    limits = offset_s - 2 * GRID_STEP_S, offset_s + 2 * GRID_STEP_S
     sigmas = np.concatenate([[PRIOR_OFFSET_S], prior_sigmas])
-    start_s = offset_s
+    offset_s = _converge(line_up, prior_sigmas, ratios, offset_s, limits).offset_s
+    ratios = fit(_with_offset(line_up, offset_s, prior_sigmas, ratios), sigmas).ratios
+    return replace(_converge(line_up, prior_sigmas, ratios, offset_s, limits), reason=reason)
+
+
+def _converge(
+    line_up: LineUp, prior_sigmas: Floats, ratios: Floats, offset_s: float, limits: tuple[float, float]
+) -> OffsetFit:
+    sigmas = np.concatenate([[PRIOR_OFFSET_S], prior_sigmas])
     for _ in range(ROUNDS):
         found = fit(_with_offset(line_up, offset_s, prior_sigmas, ratios), sigmas, ratios)
         step = float(np.clip(found.parameters[0], -GRID_STEP_S, GRID_STEP_S))
-        offset_s = float(np.clip(offset_s + step, start_s - 2 * GRID_STEP_S, start_s + 2 * GRID_STEP_S))
+        offset_s = float(np.clip(offset_s + step, *limits))
         if abs(step) < 1e-5:
             break
-    return OffsetFit(found, offset_s, reason)
+    return OffsetFit(found, offset_s, "")
 
 
 def _with_offset(line_up: LineUp, offset_s: float, prior_sigmas: Floats, ratios: Floats) -> list[Stretch]:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.measurements import Imu
-from sonar_graph.navigation.allan import allan_deviation, density, noise_densities
+from sonar_graph.navigation.allan import allan_deviation, degrees_of_freedom, density, noise_densities
 
 RATE_HZ = 50.0
 
@@ -32,6 +32,22 @@ def test_interval_holds_the_density_at_its_stated_rate():
         held.append(abs(found.value - true) < 1.96 * found.sigma)
         assert found.sigma < 0.15 * true
     assert 0.90 <= np.mean(held) <= 0.99
+
+
+def test_the_density_does_not_depend_on_how_many_samples_make_a_second():
+    """2.4 Hz: two samples last 0.83 s."""
+    noise = 0.3 * np.sqrt(2.4) * np.random.default_rng(0).standard_normal((20_000, 1))
+    assert density(noise, 2.4).value == pytest.approx(0.3, rel=0.05)
+
+
+@pytest.mark.parametrize(("count", "together"), [(40, 1), (40, 4), (60, 10)])
+def test_degrees_of_freedom_are_those_of_the_quadratic_form(count, together):
+    """``(tr Q)^2 / tr Q^2`` of the sum of squares of white noise; the handbook's formula is within two per cent."""
+    sums = np.vstack([np.zeros(count), np.tril(np.ones((count, count)))])
+    means = (sums[together:] - sums[:-together]) / together
+    steps = means[together:] - means[:-together]
+    Q = steps @ steps.T
+    assert degrees_of_freedom(count, together) == pytest.approx(np.trace(Q) ** 2 / np.trace(Q @ Q), rel=0.02)
 
 
 def imu_of(still_s: float, moving_s: float, seed: int = 0) -> Imu:

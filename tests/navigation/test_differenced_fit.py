@@ -88,3 +88,10 @@ def test_a_column_that_holds_the_rates_noise_is_biased_by_its_power():
     of_mean = np.std(found) / np.sqrt(len(found))
     assert np.mean(found) > 8 * of_mean
     assert abs(np.mean(corrected)) < 3 * of_mean
+
+
+def test_a_narrow_prior_holds_a_parameter_that_the_data_do_not_see():
+    stretch = stretch_of(0, (True, True, True))
+    blind = Stretch(stretch.y, 0 * stretch.A, stretch.B, stretch.duration_s)
+    found = fit([blind], np.array([0.1, 3.0]), RATIOS)
+    assert np.sqrt(np.diag(found.covariance)) == pytest.approx([0.1, 3.0])
