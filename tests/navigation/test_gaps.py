@@ -164,13 +164,16 @@ def estimate(name, imu_rows, dvl_rows, calls, start=KNOWN_START):
 @pytest.mark.parametrize("until_s", [13.0, 18.0])
 def test_every_estimator_moves_alike_over_a_gap(until_s):
     start = Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)
-    found = [estimate(name, *rows(), [at(until_s)], start) for name in ("dead-reckoning", "ekf-slam", "isam2")]
+    found = [
+        estimate(name, *rows(), [at(until_s)], start)
+        for name in ("dead-reckoning", "ekf-slam", "invariant-ekf", "isam2")
+    ]
     for other in found[1:]:
         assert other.world_T_body.translation() == pytest.approx(found[0].world_T_body.translation(), abs=1e-4)
         assert other.covariance == pytest.approx(found[0].covariance, rel=0.01, abs=1e-6)
 
 
-@pytest.mark.parametrize("name", ["dead-reckoning", "ekf-slam"])
+@pytest.mark.parametrize("name", ["dead-reckoning", "ekf-slam", "invariant-ekf"])
 def test_an_estimate_in_a_gap_does_not_depend_on_how_rows_are_cut(name):
     whole = estimate(name, *rows(), [at(14.0)])
     pieces = estimate(name, *rows(), [at(0.37 * k) for k in range(1, 37)] + [at(14.0)])
@@ -203,7 +206,7 @@ def test_a_wrong_first_velocity_costs_seconds():
     assert 0 < len(odometry.refused) < 3 * DVL_HZ
 
 
-@pytest.mark.parametrize("name", ["dead-reckoning", "ekf-slam", "isam2"])
+@pytest.mark.parametrize("name", ["dead-reckoning", "ekf-slam", "invariant-ekf", "isam2"])
 def test_samples_out_of_order_give_the_same_estimate_as_in_order(name):
     """A block of each sensor overtakes the one before it."""
     start = Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)
