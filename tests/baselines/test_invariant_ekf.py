@@ -249,6 +249,77 @@ def test_planar_motion_keeps_height_and_tilt():
     assert np.abs(estimate.world_T_body.rotation().rpy()[:2]).max() < 0.005
 
 
+def in_a_gap(depth=None, detections=None):
+    """At rest, without accelerometer; the Doppler log is silent from 2 s to 12 s."""
+    doppler = dvl(14)
+    seconds = (doppler.stamps_ns - T0_NS) * 1e-9
+    calibration = Calibration(
+        use_gravity=False,
+        depth=DepthCalibration(sigma_m=0.001),
+        start=Start(position_sigma_m=(1.0, 1.0, 1.0)),
+        sonar=SonarCalibration(range_sigma_m=0.001, azimuth_sigma_rad=0.001),
+    )
+    rows = doppler.rows((seconds <= 2.0) | (seconds >= 12.0))
+    return Sequence("gap", calibration, imu(14, force=(np.nan,) * 3), rows, depth, detections)
+
+
+def later(*seconds):
+    return T0_NS + np.round(np.array(seconds) * NS_PER_S).astype(np.int64)
+
+
+def test_many_depths_in_a_gap_tell_less_of_the_start_than_one_exact_one():
+    """All share the motion's error, whose variance in a gap is at least that of the random walk, ``q^2 T^3 / 3``."""
+    t = later(*np.linspace(9.0, 9.9, 10))
+    sequence = in_a_gap(Depth(t, np.zeros(10), np.full(10, np.nan)))
+    filtered = InvariantEkf(sequence.calibration)
+    for window in sequence.replay(later(8.0, 9.95)):
+        filtered.process(window)
+    stamp_ns, state = filtered.state()
+    assert stamp_ns == later(2.0)[0]
+    walked = sequence.calibration.dvl.velocity_walk_density**2 * 7.0**3 / 3
+    assert 1 / (1 + 1 / walked) < state.P[8, 8] < 0.9
+
+
+def test_looks_in_a_gap_count_less_and_less_and_those_after_it_in_full():
+    """``k (k + 1)`` times the motion's covariance, which is nearly all of the innovation's."""
+    t = later(1.5, 9.0, 9.001, 13.0, 13.1)
+    sequence = in_a_gap(detections=seen(t, [3.0] * 5, [0.0] * 5))
+    log = run(InvariantEkf, sequence).detections()
+    assert log.outcomes == [Outcome.NEW, *[Outcome.USED] * 4]
+    variances = log.innovation_covs[:, 0, 0]
+    assert variances[2] / variances[1] == pytest.approx(3.0, rel=0.01)
+    assert variances[4] < 1e-3 * variances[1]
+
+
+def test_a_logged_depth_variance_goes_before_the_calibration_s():
+    t = later(1.0)
+    vague = in_a_gap(Depth(t, np.array([1.0]), np.array([1e6])))
+    sharp = in_a_gap(Depth(t, np.array([1.0]), np.array([np.nan])))
+    heights = [run(InvariantEkf, sequence).state()[1].points[0, 2] for sequence in (vague, sharp)]
+    assert heights == pytest.approx([0.0, 1.0], abs=1e-3)
+
+
+def test_gravity_counts_once_an_interval_with_its_own_variance():
+    """At rest: after n intervals a wide prior has become ``sigma^2 / n``, sigma that of one direction."""
+    seconds, noise = 10, 0.02
+    calibration = Calibration(
+        imu=ImuCalibration(
+            gyro_noise_density=1e-9, gyro_bias_sigma=0.0, accel_noise_density=noise, accel_bias_sigma=0.0
+        ),
+        dvl=DvlCalibration(velocity_sigma_m_s=(1e-6, 1e-6, 1e-6)),
+        start=Start(rpy_sigma_rad=(1.0, 1.0, 1e-3)),
+    )
+    _, state = run(InvariantEkf, Sequence("at rest", calibration, imu(seconds), dvl(seconds))).state()
+    sigma2 = noise**2 / calibration.gravity_m_s2**2
+    assert_allclose(np.diag(state.P)[:2], sigma2 / seconds, rtol=1e-3)
+
+
+def test_a_bias_that_nothing_tells_walks_by_its_density():
+    calibration = Calibration(imu=ImuCalibration(gyro_bias_sigma=1e-3, gyro_bias_walk_density=1e-3), use_gravity=False)
+    _, state = run(InvariantEkf, Sequence("at rest", calibration, imu(20), dvl(20))).state()
+    assert_allclose(np.diag(state.P)[3:6], 1e-6 + 1e-6 * 20, rtol=1e-9)
+
+
 def test_a_detection_far_off_is_gated_and_changes_nothing():
     filtered, end_ns = InvariantEkf(Calibration()), T0_NS + NS_PER_S
     filtered.process(Measurements(end_ns, imu(1), dvl(1), None, seen([end_ns], [2.0], [0.1])))
