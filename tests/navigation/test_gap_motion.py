@@ -194,6 +194,7 @@ def test_earths_rotation_is_removed_as_if_it_stood_still(is_blind, start_s, unti
     still = motion(imu, dvl, known, start_s, until_s)
     found = motion(*felt, known, start_s, until_s, earth=earth)
     assert found.i_T_j.equals(still.i_T_j, 3e-3)
+    assert found.i_T_j.rotation().equals(still.i_T_j.rotation(), 4e-4)
 
 
 def test_motion_over_two_gaps_is_that_of_the_vehicle():
@@ -240,3 +241,24 @@ def test_a_gap_that_ends_between_inertial_rows_uses_the_row_after_its_end_and_no
         only = (imu.stamps_ns == at(row_s))[:, None] * np.ones(3)
         found = motion(*moved(imu, late, "force", only), *how).i_T_j
         assert found.equals(base, 1e-6) != is_used
+
+
+@WITH_OR_WITHOUT
+def test_both_ends_of_a_gap_count_by_their_own_noise(is_blind):
+    """``T (T + 2 d) / 4`` of each one's variance, d the interval before the gap."""
+    imu, dvl = rows()
+    sigma = np.where(dvl.stamps_ns <= at(LOST_S), 0.01, 0.03)
+    noisy = Dvl(dvl.stamps_ns, dvl.velocity, sigma[:, None, None] ** 2 * np.eye(3))
+    found = motion(blinded(imu) if is_blind else imu, noisy, calibration(), LOST_S, FOUND_S)
+    assert np.diag(found.covariance)[3:] == pytest.approx(
+        [(0.01**2 + 0.03**2) * 5.0 * (5.0 + 2 * 0.5) / 4] * 3, rel=1e-3
+    )
+
+
+def test_too_few_samples_for_a_line_leave_a_walk():
+    imu, dvl = rows()
+    known, few = calibration(velocity_walk_density=0.1), dvl.rows(dvl.stamps_ns >= at(LOST_S - 1.0))
+    found, walked = (motion(part, few, known, LOST_S, OPEN_S) for part in (imu, blinded(imu)))
+    assert found.i_T_j.equals(walked.i_T_j, 0.0)
+    assert np.array_equal(found.covariance, walked.covariance)
+    assert not motion(imu, dvl, known, LOST_S, OPEN_S).i_T_j.equals(walked.i_T_j, 0.1)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sonar_graph.measurements import Imu
 from sonar_graph.navigation.line_before import integral, line_before
@@ -10,13 +11,14 @@ from .rows import dvl, imu, stamps
 
 ZERO = (0.0, 0.0, 0.0)
 IMU_HZ, NODE_S = 20.0, 10.0
+ISOTROPIC = 1e-4 * np.eye(3)
 
 
-def fitted(dvl_hz, velocity=None, first_s=0.0, count=None, imu_rows=None):
+def fitted(dvl_hz, velocity=0.0, count=0, imu_rows=None, cov=ISOTROPIC):
     """Line at the last sample of a vehicle at rest."""
     imu_rows = imu_rows or imu(stamps(IMU_HZ, NODE_S + 1.0), ZERO)
-    ns = stamps(dvl_hz, NODE_S - first_s, first_s)[-(count or 0) :]
-    samples = dvl(ns, np.zeros((len(ns), 3)) if velocity is None else velocity, 1e-4 * np.eye(3))
+    ns = stamps(dvl_hz, NODE_S)[-count:]
+    samples = dvl(ns, velocity, cov)
     inertial = imu_rows.stamps_ns, imu_rows.angular_velocity.copy(), imu_rows.specific_force.copy()
     columns = (*inertial, samples.stamps_ns, samples.velocity.copy(), samples.velocity_cov.copy(), False)
     return line_before(columns, ZERO, ZERO, len(ns) - 1, ZERO, ZERO)
@@ -68,3 +70,11 @@ def test_noise_in_the_window_weighs_as_its_integrals_say():
     quiet, forced, turned = (integral(line, T, *noise)[3] for noise in ((0.0, 0.0), (0.0, 1.0), (1.0, 0.0)))
     assert np.subtract(forced, quiet) == pytest.approx(by_force * np.eye(3), rel=1e-6)
     assert np.subtract(turned, quiet) == pytest.approx(by_gyro * np.diag([1.0, 1.0, 0.0]), rel=1e-6)
+
+
+def test_noise_of_a_turning_log_is_turned_to_the_node():
+    turning = imu(stamps(IMU_HZ, NODE_S + 1.0), (0.0, 0.0, 0.3))
+    cov = np.diag([4e-4, 1e-4, 2e-4])
+    found = fitted(4.0, imu_rows=turning, cov=cov).Q
+    R = Rotation.from_rotvec(np.outer(-np.arange(21) / 4.0, [0.0, 0.0, 0.3])).as_matrix()
+    assert np.array(found) == pytest.approx((R @ cov @ R.transpose(0, 2, 1)).sum(axis=0), rel=1e-6, abs=1e-12)
