@@ -17,7 +17,7 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.interpolation import value_at
 from sonar_graph.navigation.row_intake import RowIntake
-from sonar_graph.navigation.stamped_rows import LATEST_NS, WINDOW_NS, node_range
+from sonar_graph.navigation.stamped_rows import LATEST_NS, WINDOW_NS, node_range, rows_before_gaps
 from sonar_graph.navigation.steps import Columns, Steps, merge_rows
 from sonar_graph.states import RefusedRow
 
@@ -108,10 +108,9 @@ class Odometry:
 
     def gaps(self, start_ns: int, end_ns: int) -> list[tuple[int, int]]:
         """Stamps of successive nodes with a gap in between, from one node to another."""
-        first, last = np.searchsorted(self._dvl.stamps_ns, [start_ns, end_ns])
-        within = self._dvl.stamps_ns[first : last + 1]
-        before = np.flatnonzero(np.diff(within) > self._longest_ns)
-        return list(zip(within[before].tolist(), within[before + 1].tolist(), strict=True)) if len(before) else []
+        stamps_ns = self._dvl.stamps_ns
+        rows = rows_before_gaps(stamps_ns, start_ns, end_ns, self._longest_ns)
+        return [(int(stamps_ns[row]), int(stamps_ns[row + 1])) for row in rows]
 
     def _steps(self, start_ns: int, end_ns: int, imu_rows: int, dvl_rows: int) -> Steps:
         return Steps(*merge_rows(self.columns(), imu_rows, dvl_rows, start_ns, end_ns))

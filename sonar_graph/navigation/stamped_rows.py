@@ -64,3 +64,10 @@ def node_range(imu_ns: Ints, dvl_ns: Ints, after_ns: int, until_ns: int) -> tupl
     covered_ns = min(until_ns, imu_ns[seen - 1])
     first = np.searchsorted(dvl_ns, after_ns, side="right")
     return int(first), max(int(first), int(np.searchsorted(dvl_ns, covered_ns, side="right")))
+
+
+@compiled
+def rows_before_gaps(stamps: Ints, start_ns: int, end_ns: int, longest_ns: int) -> Ints:
+    """Rows from one stamp to another whose next one comes more than so long after."""
+    first, last = np.searchsorted(stamps, start_ns), np.searchsorted(stamps, end_ns)
+    return np.flatnonzero(np.diff(stamps[first : last + 1]) > longest_ns) + first

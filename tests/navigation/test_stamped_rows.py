@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.navigation.stamped_rows import StampedRows, node_range
+from sonar_graph.navigation.stamped_rows import StampedRows, node_range, rows_before_gaps
 
 
 def kept(*blocks: list[int]) -> StampedRows:
@@ -51,3 +51,14 @@ def test_nodes_are_after_one_instant_and_covered_by_the_other_sensor_until_anoth
     assert node_range(imu_ns, dvl_ns, 7, 99) == (3, 6)
     assert node_range(imu_ns, dvl_ns, 15, 10) == (5, 5)
     assert node_range(imu_ns, dvl_ns, -6, -1) == (0, 0)
+
+
+@given(
+    st.lists(st.integers(0, 60), min_size=1, unique=True).map(sorted),
+    st.tuples(st.integers(0, 12), st.integers(0, 12)).map(sorted),
+    st.integers(1, 20),
+)
+def test_gaps_are_between_successive_rows_from_one_to_another_that_are_too_far_apart(stamps, ends, longest):
+    start, end = (min(row, len(stamps) - 1) for row in ends)
+    expected = [row for row in range(start, end) if stamps[row + 1] - stamps[row] > longest]
+    assert rows_before_gaps(np.array(stamps), stamps[start], stamps[end], longest).tolist() == expected
