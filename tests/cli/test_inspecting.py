@@ -34,7 +34,8 @@ def test_a_stamp_offset_in_the_configuration_moves_the_offset_found(log: Path, t
     (tmp_path / "late.toml").write_text("[dvl]\nstamp_offset_s = 0.5\n")
     here = sensor(answer(log), "DVL against IMU: time offset")
     there = sensor(answer(log, "--log-config", tmp_path / "late.toml"), "DVL against IMU: time offset")
-    assert there["value"] - here["value"] == pytest.approx(-0.5, abs=0.03)
+    assert there["value"] - here["value"] == pytest.approx(-0.5, abs=there["sigma"])
+    assert there["sigma"] < 0.1
     assert there["act"]
 
 
