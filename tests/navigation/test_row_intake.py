@@ -75,12 +75,14 @@ def test_rows_of_few_beams_are_named_until_they_are_completed():
     np.testing.assert_array_equal(odometry.columns()[3], rows.stamps_ns[2:28])
 
 
-def test_rows_of_few_beams_over_too_long_a_stretch_are_named():
-    beyond = T0_NS + LONGEST_STRETCH_NS + 1
+@pytest.mark.parametrize("more_ns", [0, 1])
+def test_rows_of_few_beams_over_too_long_a_stretch_are_named(more_ns):
+    beyond = T0_NS + LONGEST_STRETCH_NS + more_ns
     odometry = Odometry(Calibration())
     odometry.add(imu(np.array([T0_NS, beyond]), 0.0), None)
     odometry.add(None, dvl(np.array([T0_NS, T0_NS + NS, beyond]), 0.8, np.array([WHOLE, BLIND, WHOLE])))
-    assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [(T0_NS + NS, Refusal.INCOMPLETE)]
+    assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [(T0_NS + NS, Refusal.INCOMPLETE)] * more_ns
+    assert len(odometry.columns()[3]) == 3 - more_ns
 
 
 def test_a_row_of_few_beams_that_is_overtaken_is_named():
