@@ -9,7 +9,8 @@ down and a world of north, east, down. What the files do not say was told from t
 - The time columns spread the rows evenly from 0 to 400 s *inclusive*, which makes the second of the 1 Hz files 0.25 %
   longer than that of the IMU's. Against row number the clocks agree, so rows are timed by their number.
 - Row k of the DVL measures at k + 1 s on the IMU's clock.
-- The DVL sits 1.84 m behind the point whose velocity the reference gives.
+- The DVL sits 1.84 m behind the point whose velocity the reference gives, and the IMU 1.76 m behind
+  that point.
 - The gyros feel the Earth's rotation.
 """
 
@@ -45,6 +46,7 @@ GYRO_BIAS_SIGMA_RAD_S = 3e-6
 GYRO_BIAS_WALK_DENSITY = 1e-8
 VELOCITY_SIGMA_M_S = (0.01, 0.01, 0.005)
 BODY_P_DVL_M = (-1.84, 0.03, -0.1)
+BODY_P_IMU_M = (-1.76, 0.01, 0.1)
 START_RPY_SIGMA_RAD = (0.01, 0.01, 0.03)
 
 FILES = "TrajectoryN/{IMU,DVL,GT}_trajectoryN.csv"
@@ -173,6 +175,7 @@ def _calibration(start: Start, latitude_rad: float) -> Calibration:
             gyro_noise_density=GYRO_NOISE_DENSITY,
             gyro_bias_sigma=GYRO_BIAS_SIGMA_RAD_S,
             gyro_bias_walk_density=GYRO_BIAS_WALK_DENSITY,
+            mounting=Mounting(translation_m=BODY_P_IMU_M),
         ),
         dvl=DvlCalibration(velocity_sigma_m_s=VELOCITY_SIGMA_M_S, mounting=Mounting(translation_m=BODY_P_DVL_M)),
         start=start,

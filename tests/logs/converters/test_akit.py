@@ -3,7 +3,11 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
+from sonar_graph.calibration import Mounting
 from sonar_graph.logs.converters.akit import enu_R_flu, read_akit
+from sonar_graph.navigation.dvl_preintegration import Preintegrator
+from sonar_graph.navigation.node_motion import motion_between_nodes
+from sonar_graph.navigation.odometry import Odometry
 
 IMU_HEADER = "Time [s],ACC X [m/s^2],ACC Y [m/s^2],ACC Z [m/s^2],GYRO X [rad/s],GYRO Y [rad/s],GYRO Z [rad/s]"
 DVL_HEADER = "Time [s],DVL X [m/s],DVL Y [m/s],DVL Z [m/s]"
@@ -123,6 +127,30 @@ class TestRecording:
         assert right < 0.06
         assert right < 0.6 * sideways_error(sequence, np.zeros(3))
         assert right < 0.6 * sideways_error(sequence, lever, dvl_delay_s=-1.0)
+
+    def test_accelerometers_carry_the_dvls_velocity_through_half_a_minute(self, sequence):
+        """With the IMU where the calibration has it, and hardly with it at the reference's point."""
+        assert lost_in_gaps(sequence, sequence.calibration) < 0.4
+        imu = sequence.calibration.imu.model_copy(update={"mounting": Mounting()})
+        elsewhere = sequence.calibration.model_copy(update={"imu": imu})
+        assert lost_in_gaps(sequence, elsewhere) > 1.0
+
+
+def lost_in_gaps(sequence, calibration, gap_s=30):
+    """Root mean square of what motion over a gap differs by from that over all samples, m."""
+    preintegrator, lost, dvl = Preintegrator.from_calibration(calibration), [], sequence.dvl
+    attitude = Slerp(sequence.truth.stamps_ns, sequence.truth.rotations())
+    latitude = calibration.earth_rate_latitude_rad
+    world_earth = EARTH_RATE_RAD_S * np.array([0.0, np.cos(latitude), np.sin(latitude)])
+    for first in range(20, 340, 20):
+        ends = [int(dvl.stamps_ns[k]) for k in (first, first + gap_s)]
+        earth, displacements = attitude(ends[0]).inv().apply(world_earth), []
+        for kept in (slice(None), np.r_[: first + 1, first + gap_s : len(dvl)]):
+            odometry, rows = Odometry(calibration), dvl.rows(kept)
+            odometry.add(sequence.imu, rows)
+            displacements.append(motion_between_nodes(odometry, preintegrator, *ends, np.zeros(3), earth).i_T_j)
+        lost.append(displacements[0].translation() - displacements[1].translation())
+    return np.sqrt(np.mean(np.sum(np.square(lost), axis=1)))
 
 
 def sideways_error(sequence, lever, dvl_delay_s=0.0):
