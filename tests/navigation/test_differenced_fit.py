@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from sonar_graph.navigation.differenced_fit import Stretch, fit, rate_noise_power
+from sonar_graph.navigation.differenced_fit import Stretch, _Reduced, fit, rate_noise_power
 
 RATIOS = np.array([0.3, 0.02])
 WIDE = np.array([1e4, 1e4])
@@ -95,3 +95,59 @@ def test_a_narrow_prior_holds_a_parameter_that_the_data_do_not_see():
     blind = Stretch(stretch.y, 0 * stretch.A, stretch.B, stretch.duration_s)
     found = fit([blind], np.array([0.1, 3.0]), RATIOS)
     assert np.sqrt(np.diag(found.covariance)) == pytest.approx([0.1, 3.0])
+
+
+def noisy_stretch(rng: np.random.Generator, ratios: tuple[float, float], duration_s: float = 1.0) -> Stretch:
+    """Samples of sigma 0.1, a rate's white noise and its walk, with a constant as the stretch's own parameter."""
+    m = 20
+    middle = duration_s * (np.arange(m) + 0.5)
+    walk = np.linalg.cholesky(np.minimum.outer(middle, middle))
+    y = np.diff(rng.standard_normal((m + 1, 3)), axis=0)
+    y = y + np.sqrt(ratios[0] * duration_s) * rng.standard_normal((m, 3))
+    y = y + np.sqrt(ratios[1]) * duration_s * walk @ rng.standard_normal((m, 3))
+    own = duration_s * np.tile(np.eye(3), (m, 1, 1))
+    return Stretch(0.1 * y, rng.standard_normal((m, 3, 2)), own, np.full(m, duration_s))
+
+
+def restricted_likelihood(stretches: list[Stretch], ratios: np.ndarray) -> float:
+    """``-2 log L`` but for a constant: Harville's formula with one dense covariance of everything."""
+    m, n = len(stretches[0].y), len(stretches)
+    duration_s = float(stretches[0].duration_s[0])
+    difference, middle = np.diff(np.eye(m + 1), axis=0), duration_s * (np.arange(m) + 0.5)
+    one = difference @ difference.T + ratios[0] * duration_s * np.eye(m)
+    one = one + ratios[1] * duration_s**2 * np.minimum.outer(middle, middle)
+    K = block_diag(*[one] * (3 * n))
+    A = np.concatenate([s.A.transpose(1, 0, 2).reshape(3 * m, -1) for s in stretches])
+    X = np.hstack([A, block_diag(*[s.B.transpose(1, 0, 2).reshape(3 * m, -1) for s in stretches])])
+    y = np.concatenate([s.y.T.ravel() for s in stretches])
+    weight = np.linalg.inv(K)
+    left = y - X @ np.linalg.solve(X.T @ weight @ X, X.T @ weight @ y)
+    freedom = len(y) - X.shape[1]
+    determinants = np.linalg.slogdet(K)[1] + np.linalg.slogdet(X.T @ weight @ X)[1]
+    return float(freedom * np.log(left @ weight @ left) + determinants)
+
+
+def test_the_criterion_is_the_restricted_likelihood_with_one_dense_covariance():
+    rng = np.random.default_rng(3)
+    stretches = [noisy_stretch(rng, (0.8, 0.3), 0.5) for _ in range(4)]
+    tried = [np.array(ratios) for ratios in ((0.8, 0.3), (0.2, 0.3), (0.8, 0.02), (3.0, 1.0))]
+    ours = [_Reduced.of(stretches, ratios).criterion(WIDE) for ratios in tried]
+    dense = [restricted_likelihood(stretches, ratios) for ratios in tried]
+    assert np.diff(ours) == pytest.approx(np.diff(dense), rel=1e-6)
+
+
+def test_the_ratios_have_the_highest_restricted_likelihood_of_all_about_them():
+    rng = np.random.default_rng(3)
+    stretches = [noisy_stretch(rng, (0.8, 0.3)) for _ in range(12)]
+    found = fit(stretches, WIDE).ratios
+    top = restricted_likelihood(stretches, found)
+    for step in ((1.5, 1.0), (1 / 1.5, 1.0), (1.0, 1.5), (1.0, 1 / 1.5), (1.3, 1.3), (1 / 1.3, 1.3)):
+        assert restricted_likelihood(stretches, found * step) > top
+
+
+@pytest.mark.parametrize("duration_s", [0.5, 1.0])
+def test_ratios_are_those_of_the_noise_that_was_simulated(duration_s: float):
+    rng = np.random.default_rng(4)
+    found = fit([noisy_stretch(rng, (0.8, 0.3), duration_s) for _ in range(300)], WIDE)
+    assert found.ratios == pytest.approx([0.8, 0.3], rel=0.35)
+    assert found.variance == pytest.approx(0.01, rel=0.1)
