@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, DvlCalibration
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.doppler_beams import velocity_of_beams
 from sonar_graph.navigation.inertial_carry import InertialRows
 from sonar_graph.navigation.partial_velocity import LONGEST_STRETCH_NS, PartialVelocities
@@ -120,3 +121,39 @@ def test_more_beams_are_never_less_certain():
         velocity, cov = pings(valid_beams(4, *[count] * 5, 4), rng, truth)
         traces.append(np.trace(completed(stamps(7), velocity, cov)[2].sum(axis=0)))
     assert np.all(np.diff(traces) < 0)
+
+
+def test_accelerometers_and_gyros_complete_what_the_beam_did_not_see_exactly():
+    """A vehicle that turns and speeds up in a world with gravity, levers to both sensors, no noise."""
+    w, a, g = np.array([0.1, -0.2, 0.4]), np.array([0.3, -0.2, 0.1]), np.array([0.0, 0.0, -9.8])
+    calibration = Calibration(
+        imu=ImuCalibration(mounting=Mounting(translation_m=(0.3, 0.1, -0.2))),
+        dvl=DvlCalibration(mounting=Mounting(translation_m=(-0.5, 0.4, 0.2))),
+    )
+    arm = np.subtract(calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m)
+    imu_ns, at = np.arange(0, 801, dtype=np.int64) * 5_000_000, stamps(20)
+
+    def in_body(stamps_ns, vectors):
+        return Rotation.from_rotvec(np.outer(stamps_ns * 1e-9, w)).inv().apply(vectors)
+
+    imu = InertialRows(imu_ns, np.tile(w, (801, 1)), in_body(imu_ns, a - g))
+    true = in_body(at, np.array([0.5, 0.1, 0.0]) + np.outer(at * 1e-9, a)) + np.cross(w, arm)
+    velocity, cov = velocity_of_beams(JANUS, true @ JANUS.T, valid_beams(4, 4, *[1] * 15, 4, 4, 4), SIGMA)
+    kept, found, _ = completed(at, velocity, cov, imu, calibration)
+    assert len(kept) == 20
+    assert np.abs(velocity - true).max() > 0.5
+    assert found == pytest.approx(true, abs=2e-3)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (0, 2, 1), (1, 0, 2)])
+def test_rows_are_completed_from_the_newest_whole_one_in_whatever_blocks_it_came(order):
+    rng = np.random.default_rng(3)
+    velocity, cov = pings(valid_beams(4, 4, 4, 1, 1, 4), rng, walk(6, rng))
+    at = stamps(6)
+    whole = completed(at[2:], velocity[2:], cov[2:])
+    pieces = PartialVelocities(CALIBRATION)
+    for k in order:
+        pieces.remember(at[k : k + 1], velocity[k : k + 1], cov[k : k + 1])
+    found = pieces.completed(at[3:], velocity[3:], cov[3:], is_partial(cov[3:]), NO_FORCE)
+    for one, other in zip(found, whole, strict=True):
+        np.testing.assert_allclose(one, other[1:], rtol=1e-12)
