@@ -16,6 +16,7 @@ from baselines.filter_models import FilterParams, sonar_model, vehicle_model
 from baselines.invariant_state import BARE, BIAS, BODY, InvariantState, landmark_covariance
 from baselines.invariant_window import process_window
 from sonar_graph.calibration import Calibration, Section
+from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Ints, Measurements
 from sonar_graph.navigation.kernels import skew
 from sonar_graph.navigation.odometry import Odometry
@@ -82,6 +83,8 @@ class InvariantEkf:
         ------
         MeasurementError
             When a row is stamped after ``end_ns``.
+        EstimatorError
+            When a variance in the log or the calibration makes an innovation covariance not positive definite.
         """
         self._odometry.add(measurements.imu, measurements.dvl)
         self._start()
@@ -144,20 +147,26 @@ class InvariantEkf:
         self, depth: DepthColumns, frame_ns: Ints, detections: DetectionColumns, until_ns: int
     ) -> tuple[DetectionOutcomes, PoseArrays]:
         """Take the filter to an instant."""
-        state, outcomes, pose = process_window(
-            self._odometry.columns(),
-            self._vehicle_values,
-            self._walk_density,
-            self._sonar_values,
-            (*self._state,),
-            self._clock,
-            self._interval_values,
-            depth,
-            self._depth_variance,
-            frame_ns,
-            detections,
-            until_ns,
-        )
+        try:
+            state, outcomes, pose = process_window(
+                self._odometry.columns(),
+                self._vehicle_values,
+                self._walk_density,
+                self._sonar_values,
+                (*self._state,),
+                self._clock,
+                self._interval_values,
+                depth,
+                self._depth_variance,
+                frame_ns,
+                detections,
+                until_ns,
+            )
+        except np.linalg.LinAlgError as error:
+            raise EstimatorError(
+                f"invariant-ekf: between {int(self._clock[NODE])} and {until_ns} ns the expected covariance of a"
+                " measurement is not positive definite; give variances above zero in log and calibration"
+            ) from error
         self._state = InvariantState(*state)
         return outcomes, pose
 
@@ -176,7 +185,7 @@ def start_state(calibration: Calibration) -> InvariantState:
     ``X = X^ + d`` the error is ``theta = R^ delta`` and ``xi_0 = d + [X^]x theta``.
     """
     start, bias_sigma = calibration.start, calibration.imu.gyro_bias_sigma
-    R, X = np.array(start.pose().rotation().matrix()), np.array(start.position_m)
+    R, X = np.ascontiguousarray(start.pose().rotation().matrix()), np.array(start.position_m)
     P = np.zeros((BARE, BARE))
     P[:BIAS, :BIAS] = R @ np.diag(np.square(start.rpy_sigma_rad)) @ R.T
     P[BODY:, :BIAS] = skew(X) @ P[:BIAS, :BIAS]

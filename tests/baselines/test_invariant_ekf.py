@@ -15,6 +15,7 @@ from sonar_graph.calibration import (
     SonarCalibration,
     Start,
 )
+from sonar_graph.errors import EstimatorError
 from sonar_graph.evaluation.consistency import yaw_variances
 from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections, Measurements
 from sonar_graph.sequence import NS_PER_S, Sequence
@@ -297,6 +298,13 @@ def test_a_logged_depth_variance_goes_before_the_calibration_s():
     sharp = in_a_gap(Depth(t, np.array([1.0]), np.array([np.nan])))
     heights = [run(InvariantEkf, sequence).state()[1].points[0, 2] for sequence in (vague, sharp)]
     assert heights == pytest.approx([0.0, 1.0], abs=1e-3)
+
+
+def test_a_variance_that_is_none_is_an_error_that_says_so():
+    t = later(1.0)
+    negative = in_a_gap(Depth(t, np.zeros(1), np.array([-1e6])))
+    with pytest.raises(EstimatorError, match=r"invariant-ekf: between \d+ and \d+ ns .* variances above zero"):
+        run(InvariantEkf, negative)
 
 
 def test_gravity_counts_once_an_interval_with_its_own_variance():
