@@ -346,7 +346,7 @@ def test_estimators_lists_every_setting(capsys: pytest.CaptureFixture[str]) -> N
 
     assert run("estimators") == 0
     shown = capsys.readouterr().out
-    for name in ("isam2", "ekf-slam", "dead-reckoning"):
+    for name in ("isam2", "invariant-ekf", "ekf-slam", "dead-reckoning"):
         assert name in shown
         for setting in load_estimator(name).Params.model_fields:
             assert setting in shown
