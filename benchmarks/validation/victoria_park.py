@@ -84,7 +84,7 @@ class Step:
             )
         else:
             step, cov = self.edge
-            noise = gtsam.noiseModel.Gaussian.Covariance(reading(step, cov))
+            noise = gtsam.noiseModel.Gaussian.Covariance(reading(step, cov), False)
             graph.push_back(gtsam.BetweenFactorPose2(X(index - 1), X(index), step, noise))
         for landmark, point, cov in self.points:
             for factor in sighter(X(index), L(landmark), point, cov):
@@ -146,7 +146,11 @@ def upper_to_full(entries: list[float], size: int) -> np.ndarray:
 def plain_sighting(pose: int, landmark: int, point: np.ndarray, cov: np.ndarray) -> list[gtsam.NonlinearFactor]:
     """Bearing and range, with the covariance that follows from the point's to first order."""
     bearing, distance, noise = bearing_and_range(point, cov)
-    return [gtsam.BearingRangeFactor2D(pose, landmark, bearing, distance, gtsam.noiseModel.Gaussian.Covariance(noise))]
+    return [
+        gtsam.BearingRangeFactor2D(
+            pose, landmark, bearing, distance, gtsam.noiseModel.Gaussian.Covariance(noise, False)
+        )
+    ]
 
 
 def robust_sighting(pose: int, landmark: int, point: np.ndarray, cov: np.ndarray) -> list[gtsam.NonlinearFactor]:

@@ -49,6 +49,15 @@ Robust = Callable[[gtsam.noiseModel.Base], gtsam.noiseModel.Base]
 """Wraps a noise model in a robust kernel, or returns it as it is."""
 
 
+def gaussian(cov: Floats) -> gtsam.noiseModel.Base:
+    """Noise with this covariance, all of it.
+
+    Left to itself GTSAM takes a matrix for diagonal when no other entry exceeds 1e-9, whatever its unit and scale:
+    motion over a short time would lose all its correlations.
+    """
+    return gtsam.noiseModel.Gaussian.Covariance(cov, False)
+
+
 def start_prior(pose_key: int, calibration: Calibration) -> gtsam.NonlinearFactor:
     """Prior of the first keyframe; position sigmas are along the world's axes, rotation sigmas about the body's."""
     start = calibration.start
@@ -56,7 +65,7 @@ def start_prior(pose_key: int, calibration: Calibration) -> gtsam.NonlinearFacto
     cov = np.zeros((6, 6))
     cov[:3, :3] = np.diag(np.square(start.rpy_sigma_rad))
     cov[3:, 3:] = body_R_world @ np.diag(np.square(start.position_sigma_m)) @ body_R_world.T
-    return gtsam.PriorFactorPose3(pose_key, start.pose(), gtsam.noiseModel.Gaussian.Covariance(cov))
+    return gtsam.PriorFactorPose3(pose_key, start.pose(), gaussian(cov))
 
 
 def bias_prior(bias_key: int, sigma: float) -> gtsam.NonlinearFactor:
@@ -71,7 +80,7 @@ def bias_walk(key_i: int, key_j: int, sigma: float) -> gtsam.NonlinearFactor:
 
 def odometry(key_i: int, key_j: int, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
     """Relative pose from preintegrated gyro and DVL where the gyro has no bias to estimate."""
-    noise = gtsam.noiseModel.Gaussian.Covariance(motion.covariance)
+    noise = gaussian(motion.covariance)
     return gtsam.BetweenFactorPose3(key_i, key_j, motion.i_T_j, noise)
 
 
@@ -87,7 +96,7 @@ def odometry_with_bias(key_i: int, key_j: int, bias_key: int, motion: Preintegra
         X_i, X_j = values.atPose3(key_i), values.atPose3(key_j)
         return odometry_error(X_i, X_j, values.atPoint3(bias_key), motion, inverse_mean, jacobians)
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(motion.covariance), keys, error)
+    return gtsam.CustomFactor(gaussian(motion.covariance), keys, error)
 
 
 def odometry_error(
@@ -177,7 +186,7 @@ def correlated_sighting(
             jacobians[0], jacobians[1] = by_pose, by_landmark
         return np.array([predicted[0] - z[0], wrap_angle(predicted[1] - z[1])])
 
-    return gtsam.CustomFactor(robust(gtsam.noiseModel.Gaussian.Covariance(cov)), [pose_key, landmark_key], error)
+    return gtsam.CustomFactor(robust(gaussian(cov)), [pose_key, landmark_key], error)
 
 
 def first_direction(pose_key: int, landmark_key: int, body_p_landmark: Floats) -> gtsam.NonlinearFactor:

@@ -32,6 +32,7 @@ from sonar_graph.kernels import compiled
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.joint_preintegration import DISPLACEMENT, ROTATION, JointMotion
 from sonar_graph.navigation.kernels import left_jacobian, rotation_exp, skew
+from sonar_graph.slam.factors import gaussian
 
 NO_MOUNTING = np.zeros(3)
 BIAS_ORDER = np.r_[3:6, 0:3]
@@ -84,7 +85,7 @@ def inertial_doppler_odometry(
                 jacobians[n] = H[:, column]
         return e
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(motion.covariance), keys, error)
+    return gtsam.CustomFactor(gaussian(motion.covariance), keys, error)
 
 
 def doppler_odometry(
@@ -107,7 +108,7 @@ def doppler_odometry(
         return e[DOPPLER_ROWS]
 
     cov = motion.covariance[np.ix_(DOPPLER_ROWS, DOPPLER_ROWS)]
-    return gtsam.CustomFactor(gtsam.noiseModel.Gaussian.Covariance(cov), keys, error)
+    return gtsam.CustomFactor(gaussian(cov), keys, error)
 
 
 def _with_calibration(

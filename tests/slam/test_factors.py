@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -112,6 +114,21 @@ def test_odometry_with_the_bias_it_was_integrated_with_is_gtsams_between_factor(
     assert with_bias.error(values) == pytest.approx(without.error(values))
     error = without.unwhitenedError(values)
     assert without.error(values) == pytest.approx(0.5 * error @ np.linalg.solve(motion.covariance, error))
+
+
+@pytest.mark.parametrize("sigma", [0.05, 1e-5, 1e-7])
+def test_odometry_keeps_the_correlations_of_the_shortest_motion(sigma: float):
+    """GTSAM's own choice drops them where all are below 1e-9."""
+    motion, pose = replace(some_motion(3), covariance=full_covariance(6, sigma)), BODY_POSES["random"]
+    off = sigma * np.array([0.3, -0.2, 0.1, 1.0, 2.0, -1.0])
+    values = values_of(X0=pose, X1=pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(off)), B0=motion.bias)
+    expected = 0.5 * off @ np.linalg.solve(motion.covariance, off)
+    for factor in factors.odometry(X(0), X(1), motion), factors.odometry_with_bias(X(0), X(1), B(0), motion):
+        assert factor.error(values) == pytest.approx(expected, rel=1e-5)
+    start = Start(position_sigma_m=(2e-5, 1e-5, 3e-5), rpy_sigma_rad=(1e-5,) * 3, rpy_rad=(0.4, -0.6, 2.2))
+    moved = start.pose().compose(gtsam.Pose3(gtsam.Rot3(), start.pose().rotation().unrotate(np.array([2e-5, 0, 0]))))
+    prior = factors.start_prior(X(0), Calibration(start=start))
+    assert prior.error(values_of(X0=moved)) == pytest.approx(0.5, rel=1e-5)
 
 
 def test_bias_prior_and_walk_weigh_by_their_sigmas():
