@@ -29,6 +29,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_limits
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Dvl, Floats, Imu
@@ -93,7 +94,8 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
     if len(runs) < LEAST_STRETCHES:
         return _unknown(f"less than {LEAST_STRETCHES * STRETCH_S:g} s with both")
     lever = np.subtract(calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m)
-    return _matched(imu, seconds, velocity, runs, lever)
+    with threadpool_limits(1, user_api="blas"):
+        return _matched(imu, seconds, velocity, runs, lever)
 
 
 def _matched(imu: Imu, seconds: Floats, velocity: Floats, runs: list[slice], lever: Floats) -> DvlMatch:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_limits
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats, Imu
@@ -67,7 +68,8 @@ def match_reference_to_imu(imu: Imu, reference: Trajectory, calibration: Calibra
         short = Estimate1D(np.nan, np.inf, f"less than {LEAST_ROWS} poses while the IMU runs")
         return ReferenceMatch(short, short)
     seconds, world_R_imu = seconds[rows], reference.rotations()[rows] * Rotation.from_matrix(body_R_imu)
-    found = search_offset(lambda tau: _line_up(path, seconds, tau, world_R_imu), NO_PARAMETERS)
+    with threadpool_limits(1, user_api="blas"):
+        found = search_offset(lambda tau: _line_up(path, seconds, tau, world_R_imu), NO_PARAMETERS)
     offset = found.offset().limited(OFFSET_LIMIT_S, "too little turning")
     if not offset.is_known:
         return ReferenceMatch(offset, Estimate1D(np.nan, np.inf, "the time offset cannot be told"))
