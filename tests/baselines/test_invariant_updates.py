@@ -12,12 +12,12 @@ from .invariant import D_BIAS, MOUNTING, SONAR, body_after, copied, gap_motion_o
 
 TWIST = np.array([0.02, -0.01, 0.05, 0.1, 0.02, -0.01])
 NOISE = np.diag([0.02**2, 0.01**2])
-MOTION_COV = 1e-6 * np.eye(6)
+MOTION_SIGMA = 0.01
 ATTITUDE = np.array([0.1, 0.2, 0.3])
 
 
 def motion():
-    return gap_motion_of(TWIST, MOTION_COV, D_BIAS)
+    return gap_motion_of(TWIST, MOTION_SIGMA**2 * np.eye(6), D_BIAS)
 
 
 def sonar_pose(state, xi_motion=None):
@@ -48,7 +48,7 @@ def test_a_new_landmark_has_the_covariance_of_many_draws():
     for _ in range(20_000):
         xi = root @ rng.normal(size=9)
         moved = moved_by(before, xi)
-        theta_and_eps = np.kron(np.eye(2), gtsam.Rot3.Expmap(TWIST[:3]).matrix()) @ (1e-3 * rng.normal(size=6))
+        theta_and_eps = np.kron(np.eye(2), gtsam.Rot3.Expmap(TWIST[:3]).matrix()) @ (MOTION_SIGMA * rng.normal(size=6))
         pose = sonar_pose(moved, theta_and_eps + D_BIAS @ xi[3:6])
         z = rng.multivariate_normal([2.0, 0.3], NOISE)
         draws.append(locate(pose, *z, rng.uniform(-0.5, 0.5) * aperture))
@@ -85,7 +85,7 @@ def test_an_observation_is_textbook_and_says_what_it_expected():
         xi = root @ rng.normal(size=15)
         moved = moved_by(state, xi)
         turn = np.kron(np.eye(2), gtsam.Rot3.Expmap(TWIST[:3]).matrix())
-        pose = sonar_pose(moved, turn @ (1e-3 * rng.normal(size=6)) + D_BIAS @ xi[3:6])
+        pose = sonar_pose(moved, turn @ (MOTION_SIGMA * rng.normal(size=6)) + D_BIAS @ xi[3:6])
         seen.append(np.asarray(range_azimuth(pose, moved.points[2])) + np.sqrt(np.diag(NOISE)) * rng.normal(size=2))
     before = copied(state)
     after, outcomes, innovations, covs = frame(state, [1], [z])
@@ -122,10 +122,10 @@ def prior(variances):
 def test_depth_up_and_plane_are_scalar_kalman_updates_where_nothing_correlates():
     """At the origin and level: ``1 / P' = 1 / P + 1 / R``, and the estimate moves by ``P / (P + R)``."""
     variances = np.array([1e-2, 2e-2, 3e-2, 1.0, 1.0, 1.0, 0.1, 0.2, 0.3])
-    still = gap_motion_of(np.zeros(6), np.zeros((6, 6)), np.zeros((6, 3)))
+    still = gap_motion_of(np.zeros(6), 0.02 * np.eye(6), np.zeros((6, 3)))
 
     state = prior(variances)
-    correct_depth(state, still, (0.0, 0.0, 0.0), 0.01, 0.05)
+    correct_depth(state, still, (0.0, 0.0, 0.0), 0.01, 0.03)  # and 0.02 by the motion
     assert state.P[8, 8] == pytest.approx(1 / (1 / 0.3 + 1 / 0.05))
     assert state.points[0, 2] == pytest.approx(0.01 * 0.3 / 0.35)
 
