@@ -65,7 +65,7 @@ class VehicleModel(NamedTuple):
     plane_tilt_variance: float
     gap: GapValues = NO_GAPS
     gyro_bias_sigma: float = 0.0
-    """Of gaps only, rad/s."""
+    """Of gaps and of gravity only, rad/s."""
 
 
 class GravityInterval(NamedTuple):
@@ -190,6 +190,7 @@ def measured_up(columns: Columns, model: VehicleModel, clock: Ints, interval: Gr
         model.accel_noise_density,
         model.accel_bias_sigma,
         model.gyro_noise_density,
+        model.gyro_bias_sigma,
         model.gravity_m_s2,
     )
     return up, sigma

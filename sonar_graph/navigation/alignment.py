@@ -7,10 +7,15 @@ rotation dR = i_R_j::
     mean(i_R(t) f(t)) = (dR v_j - v_i) / T + g up_i
 
     up_j    = dR^T up_i,    a measurement of body_R_world e_z at node j, which has roll and pitch but no yaw
-    sigma^2 = (accel_noise^2 / T + 2 sigma_v^2 / T^2) / g^2 + beta^2 max(1, tau / T)
+    sigma^2 = (accel_noise^2 / T + 2 sigma_v^2 / T^2) / g^2 + N^2 T / 3 + sigma_b^2 T^2 / 4 + beta^2 max(1, tau / T)
 
-Taking the change of velocity out is what lets a moving vehicle measure its tilt; the gyro's noise over a second is far
-below the accelerometer's bias and left out.
+Taking the change of velocity out is what lets a moving vehicle measure its tilt. The gyros, of noise density N and bias
+sigma_b, turn the frame meanwhile: what counts is how far the tilt at the end is from its mean over the interval,
+``var(W(T) - mean W) = N^2 T / 3`` and ``b T - b T / 2``. Over a second that is a hundredth of the accelerometer's bias;
+over a gap of the Doppler log, which is then the interval, it is the larger part.
+
+The gyro and Doppler samples are also in the odometry between the two nodes. Their errors are taken as independent of
+those here: the direction's sigma is mostly the accelerometers'.
 
 The bias does not average out: successive directions share its tilt ``beta = accel_bias / g``. Taken as fresh noise each
 time it would let the estimate believe itself better than the bias allows. A tilt that walks with the gyro noise density
@@ -75,6 +80,7 @@ def gravity_direction(
         imu.accel_noise_density,
         imu.accel_bias_sigma,
         imu.gyro_noise_density,
+        imu.gyro_bias_sigma,
         gravity_m_s2,
     )
 
@@ -102,10 +108,12 @@ def tilt_sigma(
     accel_noise_density: float,
     accel_bias_sigma: float,
     gyro_noise_density: float,
+    gyro_bias_sigma: float,
     gravity: float,
 ) -> float:
     """Standard deviation of the direction's tilt, rad."""
     noise = (accel_noise_density**2 / duration_s + 2.0 * (velocity_sigma_m_s / duration_s) ** 2) / gravity**2
+    noise += gyro_noise_density**2 * duration_s / 3.0 + (gyro_bias_sigma * duration_s) ** 2 / 4.0
     beta = accel_bias_sigma / gravity
     tau_s = (beta / max(gyro_noise_density, LEAST_GYRO_NOISE_DENSITY)) ** 2
     return math.sqrt(noise + beta**2 * max(1.0, tau_s / duration_s))

@@ -74,13 +74,14 @@ def test_gravity_corrects_with_the_velocity_noise_of_both_ends():
     imu_ns = T0_NS + np.arange(4) * NS_PER_S
     dvl_ns = T0_NS + np.array([0, round(duration_s * NS_PER_S)])
     columns = columns_of(imu_ns, dvl_ns, rates=np.zeros((4, 3)), velocities=np.zeros((2, 3)))
-    model = VEHICLE._replace(gravity_interval_ns=NS_PER_S)
+    model = VEHICLE._replace(gravity_interval_ns=NS_PER_S, gyro_bias_sigma=2e-3)
     x, P, clock, interval = np.zeros(6), prior * np.eye(6), np.array([T0_NS, 0, 7, 7]), an_interval()
     open_interval(columns, LEVER, interval, clock)
     motion = NO_MOTION._replace(impulse=(0.0, 0.0, GRAVITY * duration_s))
     advance_to_node(columns, model, x, P, 6, clock, interval, int(dvl_ns[1]), motion)
     velocity_noise = VARIANCES.mean(axis=1).sum()
     tilt = (model.accel_noise_density**2 / duration_s + velocity_noise / duration_s**2) / GRAVITY**2
+    tilt += model.gyro_noise_density**2 * duration_s / 3 + (model.gyro_bias_sigma * duration_s) ** 2 / 4
     expected = 1 / (1 / prior + 1 / tilt)
     assert_allclose(np.diag(P), [prior, prior, prior, expected, expected, prior], rtol=1e-9)
     assert_allclose(x, 0.0, atol=1e-12)

@@ -14,7 +14,7 @@ from sonar_graph.navigation.steps import Steps
 
 G = 9.81
 GRAVITY = np.array([0.0, 0.0, G])
-IMU = ImuCalibration(accel_noise_density=2e-3, accel_bias_sigma=5e-3, gyro_noise_density=1e-2)
+IMU = ImuCalibration(accel_noise_density=2e-3, accel_bias_sigma=5e-3, gyro_noise_density=2e-3, gyro_bias_sigma=1e-3)
 """A gyro that drifts so fast that directions a second apart share next to nothing."""
 T, N = 1.0, 2000
 TILT = Rotation.from_euler("xyz", [0.2, -0.3, 1.1])
@@ -57,10 +57,11 @@ def test_up_is_found_in_a_moving_vehicle():
 
 
 def test_stated_sigma_is_that_of_many_noisy_intervals():
-    """Two-sided, about both horizontal axes, with noise in force, bias and both velocities."""
+    """Two-sided, about both horizontal axes, with noise in force, bias, both velocities, and gyros."""
     motion, v_i, v_j = accelerated()
     truth, runs, rng, velocity_sigma = attitude(T).inv(), 1500, np.random.default_rng(1), 0.004
     level = truth.apply(np.eye(3)[:2])
+    by_gyros = np.hypot(IMU.gyro_noise_density * np.sqrt(T / 3), IMU.gyro_bias_sigma * T / 2)
     squares = []
     for _ in range(runs):
         force = motion.mean_specific_force + IMU.accel_noise_density / np.sqrt(T) * rng.standard_normal(3)
@@ -70,6 +71,7 @@ def test_stated_sigma_is_that_of_many_noisy_intervals():
         )  # fmt: skip
         scatter = velocity_sigma * rng.standard_normal((2, 3))
         up, sigma = gravity_direction(noisy, v_i + scatter[0], v_j + scatter[1], velocity_sigma, IMU, G)
+        up = up + np.cross(by_gyros * rng.standard_normal(3), up)
         squares.append(np.sum((level @ up / sigma) ** 2))
     low, high = chi2.ppf([0.0005, 0.9995], 2 * runs) / runs
     assert low < np.mean(squares) < high
@@ -78,13 +80,14 @@ def test_stated_sigma_is_that_of_many_noisy_intervals():
 @given(st.floats(0.2, 5.0), st.floats(0.0, 0.05))
 @settings(max_examples=30)
 def test_each_source_of_tilt_noise_falls_with_time_as_it_should(duration_s, velocity_sigma):
-    """White force as 1 / sqrt(T), velocities as 1 / T, the bias not at all."""
+    """White force as 1 / sqrt(T), velocities as 1 / T, the bias not at all; the gyros' rises."""
     motion = PreintegratedMotion(
         gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), duration_s, np.array([0, 0, G])
     )
     _, sigma = gravity_direction(motion, np.zeros(3), np.zeros(3), velocity_sigma, IMU, G)
     parts = [2e-3 / np.sqrt(duration_s), np.sqrt(2) * velocity_sigma / duration_s, 5e-3]
-    assert sigma == pytest.approx(np.linalg.norm(parts) / G)
+    by_gyros = IMU.gyro_noise_density * np.sqrt(duration_s / 3), IMU.gyro_bias_sigma * duration_s / 2
+    assert sigma == pytest.approx(np.linalg.norm([np.linalg.norm(parts) / G, *by_gyros]))
 
 
 @pytest.mark.parametrize("duration_s", [1.0, 5.0])
@@ -99,6 +102,24 @@ def test_tilt_settles_at_what_the_accelerometer_bias_allows(duration_s, gyro_den
     settled, naive = (settled_tilt_sigma(s, gyro_density, duration_s) for s in (sigma, 1e-2 / G))
     assert settled == pytest.approx(1e-2 / G, rel=0.03)
     assert naive < 0.6 * settled
+
+
+@pytest.mark.parametrize("duration_s", [1.0, 30.0])
+def test_what_the_gyros_do_meanwhile_is_in_the_tilt(duration_s):
+    """Tilts that walk, and drift by a bias: at the end less their mean, which is what the accelerometers felt."""
+    rng, steps, runs = np.random.default_rng(2), 200, 20_000
+    density, bias = 2e-4, 3e-5
+    walk = np.cumsum(rng.normal(0, density * np.sqrt(duration_s / steps), (runs, steps)), axis=1)
+    drift = rng.normal(0, bias, (runs, 1)) * np.linspace(0, duration_s, steps)
+    tilt = walk + drift
+    imu = ImuCalibration(
+        accel_noise_density=1e-9, accel_bias_sigma=0.0, gyro_noise_density=density, gyro_bias_sigma=bias
+    )
+    motion = PreintegratedMotion(
+        gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), duration_s, np.array([0, 0, G])
+    )
+    _, sigma = gravity_direction(motion, np.zeros(3), np.zeros(3), 0.0, imu, G)
+    assert sigma == pytest.approx((tilt[:, -1] - tilt.mean(axis=1)).std(), rel=0.03)
 
 
 def settled_tilt_sigma(sigma, gyro_density, duration_s):
