@@ -251,8 +251,8 @@ def test_planar_motion_keeps_height_and_tilt():
 
 
 def in_a_gap(depth=None, detections=None):
-    """At rest, without accelerometer; the Doppler log is silent from 2 s to 12 s."""
-    doppler = dvl(14)
+    """At rest, without accelerometer; the Doppler log is silent from 2 s to 12 s and from 14 s to 24 s."""
+    doppler = dvl(25)
     seconds = (doppler.stamps_ns - T0_NS) * 1e-9
     calibration = Calibration(
         use_gravity=False,
@@ -260,8 +260,8 @@ def in_a_gap(depth=None, detections=None):
         start=Start(position_sigma_m=(1.0, 1.0, 1.0)),
         sonar=SonarCalibration(range_sigma_m=0.001, azimuth_sigma_rad=0.001),
     )
-    rows = doppler.rows((seconds <= 2.0) | (seconds >= 12.0))
-    return Sequence("gap", calibration, imu(14, force=(np.nan,) * 3), rows, depth, detections)
+    rows = doppler.rows((seconds <= 2.0) | ((seconds >= 12.0) & (seconds <= 14.0)) | (seconds >= 24.0))
+    return Sequence("gap", calibration, imu(25, force=(np.nan,) * 3), rows, depth, detections)
 
 
 def later(*seconds):
@@ -283,13 +283,14 @@ def test_many_depths_in_a_gap_tell_less_of_the_start_than_one_exact_one():
 
 def test_looks_in_a_gap_count_less_and_less_and_those_after_it_in_full():
     """``k (k + 1)`` times the motion's covariance, which is nearly all of the innovation's."""
-    t = later(1.5, 9.0, 9.001, 13.0, 13.1)
-    sequence = in_a_gap(detections=seen(t, [3.0] * 5, [0.0] * 5))
+    t = later(1.5, 9.0, 9.001, 13.0, 13.1, 21.0)
+    sequence = in_a_gap(detections=seen(t, [3.0] * 6, [0.0] * 6))
     log = run(InvariantEkf, sequence).detections()
-    assert log.outcomes == [Outcome.NEW, *[Outcome.USED] * 4]
+    assert log.outcomes == [Outcome.NEW, *[Outcome.USED] * 5]
     variances = log.innovation_covs[:, 0, 0]
     assert variances[2] / variances[1] == pytest.approx(3.0, rel=0.01)
     assert variances[4] < 1e-3 * variances[1]
+    assert variances[5] == pytest.approx(variances[1], rel=0.01), "the next gap counts anew"
 
 
 def test_a_logged_depth_variance_goes_before_the_calibration_s():
