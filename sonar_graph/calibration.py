@@ -6,18 +6,44 @@ in its name or docstring. Every estimator gets the same one.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from sonar_graph.errors import CalibrationError
 from sonar_graph.validation import faults_in
 
-Vector = tuple[float, float, float]
 STANDARD_GRAVITY = 9.80665
+
+
+def _within_a_turn(angle_rad: float) -> float:
+    if abs(angle_rad) > 2 * np.pi:
+        raise ValueError("expected radians between -2π and 2π (45° are 0.785)")
+    return angle_rad
+
+
+def _latitude(angle_rad: float) -> float:
+    if abs(angle_rad) > np.pi / 2:
+        raise ValueError("expected radians between -π/2 and π/2 (48° are 0.838)")
+    return angle_rad
+
+
+def _earthly(gravity_m_s2: float) -> float:
+    if not 9 <= gravity_m_s2 <= 10.5:
+        raise ValueError("expected m/s² between 9 and 10.5 (9.76 to 9.84 on Earth)")
+    return gravity_m_s2
+
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+NotNegative = Annotated[Number, Field(ge=0)]
+Positive = Annotated[Number, Field(gt=0)]
+Angle = Annotated[Number, AfterValidator(_within_a_turn)]
+Vector = tuple[Number, Number, Number]
+Sigmas = tuple[NotNegative, NotNegative, NotNegative]
+Angles = tuple[Angle, Angle, Angle]
 
 
 class Section(BaseModel):
@@ -31,7 +57,7 @@ class Mounting(Section):
 
     translation_m: Vector = (0.0, 0.0, 0.0)
     """Lever arm: the sensor's origin in the body frame."""
-    rpy_rad: Vector = (0.0, 0.0, 0.0)
+    rpy_rad: Angles = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw: body_R_sensor = Rz(yaw) Ry(pitch) Rx(roll)."""
 
     def pose(self) -> gtsam.Pose3:
@@ -42,15 +68,15 @@ class Mounting(Section):
 class ImuCalibration(Section):
     """Gyroscopes and accelerometers."""
 
-    gyro_noise_density: float = Field(1.2e-4, ge=0)
+    gyro_noise_density: NotNegative = 1.2e-4
     """White noise of angular rate, rad/s/√Hz."""
-    gyro_bias_sigma: float = Field(5e-5, ge=0)
+    gyro_bias_sigma: NotNegative = 5e-5
     """What remains of the bias when the run starts, rad/s; 0 means that there is none to estimate."""
-    gyro_bias_walk_density: float = Field(1e-6, ge=0)
+    gyro_bias_walk_density: NotNegative = 1e-6
     """Random walk of the bias, rad/s²/√Hz."""
-    accel_noise_density: float = Field(1.2e-3, ge=0)
+    accel_noise_density: NotNegative = 1.2e-3
     """White noise of specific force, m/s²/√Hz."""
-    accel_bias_sigma: float = Field(1e-2, ge=0)
+    accel_bias_sigma: NotNegative = 1e-2
     """Bias of specific force, m/s²."""
     mounting: Mounting = Mounting()
 
@@ -58,12 +84,12 @@ class ImuCalibration(Section):
 class DvlCalibration(Section):
     """Doppler velocity log."""
 
-    velocity_sigma_m_s: Vector = (0.01, 0.01, 0.01)
+    velocity_sigma_m_s: tuple[Positive, Positive, Positive] = (0.01, 0.01, 0.01)
     """White noise of one velocity sample along each of the DVL's axes, where the log does not say."""
     mounting: Mounting = Mounting()
-    gap_s: float = Field(1.5, gt=0)
+    gap_s: Positive = 1.5
     """Time without a sample above which the velocity is no longer taken as linear: accelerometers carry it then."""
-    velocity_walk_density: float = Field(0.1, gt=0)
+    velocity_walk_density: Positive = 0.1
     """How the vehicle's velocity may change, as a random walk, m/s/√s: where it bridges gaps that no accelerometer
     measured, and in the gate of outlying velocities."""
 
@@ -71,7 +97,7 @@ class DvlCalibration(Section):
 class DepthCalibration(Section):
     """Pressure sensor."""
 
-    sigma_m: float = Field(0.01, gt=0)
+    sigma_m: Positive = 0.01
     """White noise of one sample, where the log does not say."""
     port_m: Vector = (0.0, 0.0, 0.0)
     """The pressure port in the body frame."""
@@ -82,11 +108,11 @@ class SonarImage(Section):
 
     scale: Literal["decibel", "linear"] = "decibel"
     """``decibel``: samples grow with the logarithm of the echo (DIDSON, ARIS); ``linear``: with its amplitude."""
-    decibel_span: float = Field(80.0, gt=0)
+    decibel_span: Positive = 80.0
     """What the full scale of a sample spans, dB, where samples are logarithmic."""
-    full_scale: float = Field(255.0, gt=0)
+    full_scale: Positive = 255.0
     """The largest sample."""
-    gamma: float = Field(1.0, gt=0)
+    gamma: Positive = 1.0
     """Power to which the echo's amplitude was raised, where samples are linear (Oculus)."""
 
     def decibels(self, samples: NDArray[Any]) -> NDArray[np.float32]:
@@ -109,37 +135,37 @@ class SonarCalibration(Section):
     image: SonarImage = SonarImage()
     lens: Literal["as-logged", "didson", "aris", "aris-telephoto"] = "as-logged"
     """Where the beams of images point: as the log says; or, if a driver spaced them equally, by the maker's table."""
-    range_sigma_m: float = Field(0.02, gt=0)
+    range_sigma_m: Positive = 0.02
     """White noise of range, where the log does not say."""
-    azimuth_sigma_rad: float = Field(0.009, gt=0)
+    azimuth_sigma_rad: Positive = 0.009
     """White noise of azimuth, where the log does not say."""
-    elevation_aperture_rad: float = Field(0.244, gt=0)
+    elevation_aperture_rad: Positive = 0.244
     """Full vertical opening; a detected point's elevation lies within half of it either side of zero."""
 
 
 class FloorPrior(Section):
     """Landmarks lie on a floor whose height is known: landmark z ~ N(z_m, sigma_m²)."""
 
-    z_m: float
-    sigma_m: float = Field(gt=0)
+    z_m: Number
+    sigma_m: Positive
 
 
 class PlanarMotion(Section):
     """The vehicle stays on a horizontal plane: z, roll and pitch are N(0, sigma²) at every keyframe or update."""
 
-    z_m: float = 0.0
-    z_sigma_m: float = Field(1e-3, gt=0)
-    tilt_sigma_rad: float = Field(1e-3, gt=0)
+    z_m: Number = 0.0
+    z_sigma_m: Positive = 1e-3
+    tilt_sigma_rad: Positive = 1e-3
 
 
 class Start(Section):
     """World pose of the body at the first instant with IMU and DVL, as a prior."""
 
     position_m: Vector = (0.0, 0.0, 0.0)
-    rpy_rad: Vector = (0.0, 0.0, 0.0)
-    position_sigma_m: Vector = (1e-3, 1e-3, 1e-3)
+    rpy_rad: Angles = (0.0, 0.0, 0.0)
+    position_sigma_m: Sigmas = (1e-3, 1e-3, 1e-3)
     """Along the world's axes."""
-    rpy_sigma_rad: Vector = (1e-3, 1e-3, 1e-3)
+    rpy_sigma_rad: Sigmas = (1e-3, 1e-3, 1e-3)
     """Small rotations about the body's axes."""
 
     def pose(self) -> gtsam.Pose3:
@@ -164,8 +190,8 @@ class Calibration(Section):
     odometry_interpolation: Literal["linear", "hold-past"] = "linear"
     """What a velocity or rate sample stands for. ``linear``: the value at its stamp, linear in between (Doppler logs,
     gyros); ``hold-past``: the mean over the interval that ends at its stamp (wheel odometry given as displacements)."""
-    gravity_m_s2: float = Field(STANDARD_GRAVITY, gt=0)
-    earth_rate_latitude_rad: float | None = None
+    gravity_m_s2: Annotated[Number, AfterValidator(_earthly)] = STANDARD_GRAVITY
+    earth_rate_latitude_rad: Annotated[Number, AfterValidator(_latitude)] | None = None
     """Latitude for removing the Earth's rotation from the gyros (world x east, y north); None: not removed."""
 
     @classmethod

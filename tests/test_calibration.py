@@ -63,6 +63,36 @@ def test_wrong_field_is_refused_by_source_and_name(values: dict[str, object], fi
     assert "\n" not in message
 
 
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"dvl": {"velocity_sigma_m_s": [0.01, -0.01, 0.01]}}, "velocity_sigma_m_s.1: Input should be greater than 0"),
+        ({"dvl": {"velocity_sigma_m_s": [0, 0, 0]}}, "velocity_sigma_m_s.0: Input should be greater than 0"),
+        (
+            {"start": {"rpy_sigma_rad": [0.01, 0.01, -0.01]}},
+            "rpy_sigma_rad.2: Input should be greater than or equal to 0",
+        ),
+        ({"start": {"position_m": [0, float("nan"), 0]}}, "position_m.1: Input should be a finite number"),
+        ({"imu": {"gyro_noise_density": float("inf")}}, "gyro_noise_density: Input should be a finite number"),
+        ({"imu": {"gyro_noise_density": "1e-4"}}, "gyro_noise_density: Input should be a valid number, not '1e-4'"),
+        ({"earth_rate_latitude_rad": 48.0}, "earth_rate_latitude_rad: expected radians between -π/2 and π/2"),
+        ({"dvl": {"mounting": {"rpy_rad": [0, 0, 45]}}}, "dvl.mounting.rpy_rad.2: expected radians between -2π and 2π"),
+        ({"start": {"rpy_rad": [0, 0, -90]}}, "start.rpy_rad.2: expected radians between -2π and 2π"),
+        ({"gravity_m_s2": 9810}, "gravity_m_s2: expected m/s² between 9 and 10.5"),
+    ],
+)
+def test_a_number_that_nothing_can_have_is_refused(values: dict[str, object], message: str) -> None:
+    with pytest.raises(CalibrationError) as refusal:
+        Calibration.parse(values, "vehicle.toml")
+    assert message in str(refusal.value)
+
+
+def test_numbers_at_the_edge_of_what_can_be_are_taken() -> None:
+    exact = {"start": {"rpy_sigma_rad": [0, 0, 0], "rpy_rad": [0, 0, -2 * np.pi]}, "imu": {"gyro_noise_density": 0}}
+    at_pole = {"earth_rate_latitude_rad": -np.pi / 2, "gravity_m_s2": 9.832}
+    assert Calibration.parse(exact | at_pole, "x").gravity_m_s2 == 9.832
+
+
 def test_every_wrong_field_is_named_at_once() -> None:
     with pytest.raises(CalibrationError, match=r"gravity_m_s2.*nonsense"):
         Calibration.parse({"gravity_m_s2": -1, "nonsense": 1}, "x")

@@ -156,7 +156,7 @@ def test_dvl_noise_is_what_its_covariance_column_says():
 
 
 def test_dvl_scale_error_stretches_velocity():
-    calibration = DvlCalibration(velocity_sigma_m_s=(0, 0, 0))
+    calibration = DvlCalibration(velocity_sigma_m_s=(1e-15, 1e-15, 1e-15))
     path, stamps = moving(), regular_stamps(7, 60)
     stretched = simulate_dvl(path, stamps, calibration, DvlFaults(scale_error=0.05), np.random.default_rng(0))
     exact = dvl_readings(path.at(seconds_since_start(stamps)), Mounting())

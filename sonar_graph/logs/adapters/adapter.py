@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Annotated
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.logs.adapters.axes import Rotation
@@ -12,6 +13,16 @@ from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.container import Topic
 from sonar_graph.logs.schema import Struct
 from sonar_graph.logs.table import Table, field_of
+
+
+def _not_zero(scale: float) -> float:
+    if scale == 0:
+        raise ValueError("expected a factor, 1 where nothing is to be scaled")
+    return scale
+
+
+Scale = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_not_zero)]
+"""What numbers of a driver are multiplied by."""
 
 
 class Adapter(Section):
@@ -25,9 +36,9 @@ class Adapter(Section):
     """false: nothing plays this role, whatever the log has."""
     stamp: str = "header.stamp"
     """Field with the time of validity (a Time or a number), or "log": when the message was recorded."""
-    stamp_unit_s: float = Field(1.0, gt=0)
+    stamp_unit_s: float = Field(1.0, gt=0, allow_inf_nan=False)
     """What one unit of the stamp is, where it is a number; 1e-6 for microseconds."""
-    stamp_offset_s: float = 0.0
+    stamp_offset_s: float = Field(0.0, allow_inf_nan=False)
     """Added to every stamp: minus the delay of a driver that stamps when a message arrives."""
     frame_id_field: str | None = "header.frame_id"
     """Field with the name of the sensor's frame in /tf_static."""

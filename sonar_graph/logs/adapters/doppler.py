@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import model_validator
 
-from sonar_graph.logs.adapters.adapter import Adapter
+from sonar_graph.logs.adapters.adapter import Adapter, Scale
 from sonar_graph.logs.adapters.axes import turn, turn_covariances
 from sonar_graph.logs.adapters.beams import BeamGeometry, unit_vector_warning
 from sonar_graph.logs.adapters.covariance import CovarianceFields
@@ -24,7 +24,7 @@ class DvlAdapter(Adapter):
 
     velocity: tuple[str, str, str] | None = None
     """Fields of the velocity along x, y, z; not used where `beams` have a velocity."""
-    scale: float = 1.0
+    scale: Scale = 1.0
     """Turns it into m/s; 0.001 from mm/s, -1 where the driver gives the bottom's velocity."""
     covariance: CovarianceFields | None = None
     """Of the velocity, before `scale`; without it the calibration's noise holds."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sonar_graph.logs.adapters.adapter import Adapter
+from sonar_graph.logs.adapters.adapter import Adapter, Scale
 from sonar_graph.logs.adapters.axes import turn
 from sonar_graph.logs.table import NOT_FINITE, Dropped, Table, fit_rows, not_finite
 from sonar_graph.measurements import Imu
@@ -19,13 +19,13 @@ class ImuAdapter(Adapter):
 
     angular_velocity: Paths
     """Fields of the rates about x, y, z."""
-    angular_velocity_scale: float = 1.0
+    angular_velocity_scale: Scale = 1.0
     """Turns them into rad/s; 0.017453292519943295 from degrees."""
     angular_velocity_status: str | None = None
     """Field that is -1 where the rate was not measured."""
     linear_acceleration: Paths
     """Fields of the specific force along x, y, z: what accelerometers feel, +9.81 upwards at rest."""
-    linear_acceleration_scale: float = 1.0
+    linear_acceleration_scale: Scale = 1.0
     """Turns them into m/s²; 9.80665 from g, -1 where the driver gives gravity's own direction."""
     linear_acceleration_status: str | None = None
     """Field that is -1 where it was not measured."""

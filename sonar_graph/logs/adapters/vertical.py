@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from pydantic import Field, model_validator
 
-from sonar_graph.logs.adapters.adapter import Adapter
+from sonar_graph.logs.adapters.adapter import Adapter, Scale
 from sonar_graph.logs.adapters.covariance import CovarianceFields
 from sonar_graph.logs.table import NOT_FINITE, Dropped, Table, fit_rows, not_finite
 from sonar_graph.measurements import Depth
@@ -20,7 +20,7 @@ class DepthAdapter(Adapter):
     """Field with a pressure."""
     height: str | None = None
     """Field with a height, instead: metres, upwards; with scale = -1 a depth, downwards."""
-    scale: float = 1.0
+    scale: Scale = 1.0
     """Turns the field into Pa or into metres upwards; 100 from hPa and mbar."""
     atmosphere_pa: float = Field(101_325.0, ge=0)
     """Pressure at the surface; 0 where the driver gives the pressure above it."""

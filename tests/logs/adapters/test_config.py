@@ -45,6 +45,7 @@ MISTAKES = {
         r"\[depth\] .*give either",
     ),
     "a type that is no text": ("[dvl]\ntype = 3", r"\[dvl\] type: expected a text such as 'marine"),
+    "a scale of nothing": ("[dvl]\nscale = 0", r"\[dvl\] scale: expected a factor, .*not 0"),
     "no TOML": ("[dvl", "not TOML"),
 }
 

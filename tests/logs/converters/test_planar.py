@@ -56,7 +56,7 @@ def test_velocity_noise_makes_the_noise_of_the_step():
 
 
 def test_calibrated_turn_noise_is_the_mean_variance_over_a_step():
-    covs = np.zeros((2, 3, 3))
+    covs = np.tile(1e-4 * np.eye(3), (2, 1, 1))
     covs[:, 2, 2] = [1e-4, 3e-4]
     _, dvl = stepped_odometry(np.zeros((2, 3)), covs, 2)
     density = stepped_calibration(dvl, covs, 2).imu.gyro_noise_density
