@@ -40,12 +40,12 @@ def relative(actual: np.ndarray, expected: np.ndarray) -> float:
     return float(np.abs((actual - expected) / np.outer(sigmas, sigmas)).max())
 
 
-@ours
+@every_rule
 @given(seeds)
 @settings(max_examples=5, deadline=None)
 def test_preintegration_equals_dead_reckoning(rule, seed):
     rows = random_rows(seed)
-    motion, truth = made(rows, rule), step_by_step(*rows, rule == "inertial", BIAS)
+    motion, truth = made(rows, rule), step_by_step(*rows, rule, BIAS)
     assert np.allclose(motion.i_R_j.matrix(), truth.R, atol=1e-12)
     assert np.allclose(motion.velocity, truth.v, atol=1e-11)
     assert np.allclose(motion.position, truth.p, atol=1e-11)
@@ -108,23 +108,39 @@ def test_a_chain_has_the_displacement_of_the_whole(rule, seed, cut):
     assert (independent < (1 - 1e-6) * np.trace(expected)) == shares
 
 
-def test_linear_rule_is_the_motion_of_the_gyro_and_doppler_preintegrator():
-    """Mean and bias derivative, lever arm and mountings included; its covariance spreads a sample over time instead."""
-    rows = random_rows(8)
+def both_ways(rows: tuple[Imu, Dvl], gyro_density: float, sigma_m_s: float):
+    """Linear rule and `Preintegrator`, with lever arm and mountings."""
     calibration = Calibration(
-        dvl=DvlCalibration(mounting=Mounting(translation_m=tuple(ARM), rpy_rad=(3.1, 0.1, 0.8))),
-        imu=ImuCalibration(mounting=Mounting(rpy_rad=(0.2, -0.1, 2.0))),
+        dvl=DvlCalibration(
+            velocity_sigma_m_s=(sigma_m_s, 2 * sigma_m_s, 3 * sigma_m_s),
+            mounting=Mounting(translation_m=tuple(ARM), rpy_rad=(3.1, 0.1, 0.8)),
+        ),
+        imu=ImuCalibration(gyro_noise_density=gyro_density, mounting=Mounting(rpy_rad=(0.2, -0.1, 2.0))),
     )
     odometry, samples = Odometry(calibration), rows[1].stamps_ns
     odometry.add(*rows)
     steps = odometry.steps_between_nodes(int(samples[0]), int(samples[-1]))
-    expected = Preintegrator.from_calibration(calibration).integrate(steps, BIAS[:3])
     joint = JointPreintegrator.from_calibration(calibration, "linear")
     actual = joint.integrate(*rows, int(samples[0]), int(samples[-1]), np.r_[BIAS[:3], 0, 0, 0]).relative_pose()
+    return actual, Preintegrator.from_calibration(calibration).integrate(steps, BIAS[:3])
+
+
+def test_linear_rule_is_the_motion_of_the_gyro_and_doppler_preintegrator():
+    """Mean, bias derivative and what gyro noise does, lever arm and mountings included."""
+    inertial, doppler = random_rows(8)
+    actual, expected = both_ways((inertial, dvl(doppler.stamps_ns, doppler.velocity)), GYRO, 1e-9)
     assert actual.i_T_j.equals(expected.i_T_j, 1e-10)
     assert np.allclose(actual.D_bias, expected.D_bias, atol=1e-4)
     assert np.allclose(actual.mean_specific_force, expected.mean_specific_force, atol=1e-9)
-    assert np.allclose(actual.covariance, expected.covariance, rtol=0.3, atol=2e-5)
+    assert relative(actual.covariance, expected.covariance) < 1e-3
+
+
+def test_doppler_noise_of_the_linear_rule_is_half_a_sample_less_than_spread_over_time():
+    """Ten intervals: weights of one, and a half at either end, have 9.5 squares where the other has 10."""
+    at = stamps(5, 2.0)
+    rows = random_rows(8)[0], dvl(at, np.array([0.5, 0.1, 0.0]) + waves(at, 9, 0.3))
+    actual, expected = both_ways(rows, 1e-12, 0.01)
+    assert relative(actual.covariance[3:, 3:], 0.95 * expected.covariance[3:, 3:]) < 0.01
 
 
 def test_inertial_part_is_that_of_gtsam():
