@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -30,29 +31,28 @@ class Block:
     Raises
     ------
     MeasurementError
-        When there is no row, a column's length differs from the number of stamps, a number that must be finite is
-        not, or stamps run backwards.
+        When there is no row, a column has another shape than it says, a number that must be finite is not, or stamps
+        are no integers or run backwards.
     """
 
     stamps_ns: Ints
     """Time of validity, shape (n,), integer nanoseconds, not decreasing."""
     finite_columns: ClassVar[tuple[str, ...]] = ()
     """Columns that have no meaning for "not measured"."""
+    row_shapes: ClassVar[dict[str, tuple[int, ...]]] = {}
+    """Shape of a row of each column whose rows have a fixed one."""
 
     def __post_init__(self) -> None:
-        name = type(self).__name__
-        object.__setattr__(self, "stamps_ns", np.asarray(self.stamps_ns, dtype=np.int64))
+        own: type[Any] = type(self)
+        name = own.__name__
+        object.__setattr__(self, "stamps_ns", _in_nanoseconds(name, np.asarray(self.stamps_ns)))
         n = len(self.stamps_ns)
-        if n == 0:
-            raise MeasurementError(f"{name}: a block needs at least one row; leave the block out instead")
-        for field in fields(self)[1:]:
-            kind = np.int64 if str(field.type) == "Ints" else np.float64
-            column = np.asarray(getattr(self, field.name), dtype=kind)
-            if column.shape[:1] != (n,):
-                raise MeasurementError(
-                    f"{name}.{field.name}: shape {column.shape} has not one row for each of {n} stamps"
-                )
-            object.__setattr__(self, field.name, column)
+        for column, kind in _columns_of(own):
+            values = np.asarray(getattr(self, column), dtype=kind)
+            row_shape = self.row_shapes.get(column, values.shape[1:])
+            if values.shape != (n, *row_shape):
+                raise MeasurementError(f"{name}.{column}: {_wrong_shape(values.shape, n, row_shape)}")
+            object.__setattr__(self, column, values)
         for finite in self.finite_columns:
             whole = np.isfinite(getattr(self, finite).reshape(n, -1)).all(axis=1)
             if not whole.all():
@@ -89,6 +89,32 @@ class Block:
         return cls(*(np.concatenate([getattr(b, field.name) for b in blocks]) for field in fields(cls)))
 
 
+@cache
+def _columns_of(kind: type[Any]) -> tuple[tuple[str, type[np.generic]], ...]:
+    """Name and type of what a kind of block has beside its stamps."""
+    return tuple((f.name, np.int64 if str(f.type) == "Ints" else np.float64) for f in fields(kind)[1:])
+
+
+def _wrong_shape(shape: tuple[int, ...], n: int, row_shape: tuple[int, ...]) -> str:
+    if shape[:1] == (n,):
+        return f"expected shape {(n, *row_shape)}, not {shape}"
+    return f"shape {shape} has not one row for each of {n} stamps" + "; transpose it" * (shape[1:] == (n,))
+
+
+def _in_nanoseconds(name: str, stamps: NDArray[Any]) -> Ints:
+    """The stamps of a block as they are kept; seconds in floating point would be cut to whole nanoseconds."""
+    if stamps.size == 0:
+        raise MeasurementError(f"{name}: a block needs at least one row; leave the block out instead")
+    if stamps.dtype.kind not in "iu":
+        raise MeasurementError(
+            f"{name}.stamps_ns: expected integer nanoseconds, not {stamps.dtype}; of seconds:"
+            " np.round(seconds * 1e9).astype(np.int64)"
+        )
+    if stamps.ndim != 1:
+        raise MeasurementError(f"{name}.stamps_ns: expected shape (n,), not {stamps.shape}")
+    return stamps.astype(np.int64, copy=False)
+
+
 @dataclass(frozen=True, eq=False)
 class Imu(Block):
     """Inertial measurements in the IMU's frame."""
@@ -96,6 +122,7 @@ class Imu(Block):
     angular_velocity: Floats
     """Shape (n, 3), rad/s."""
     finite_columns = ("angular_velocity",)
+    row_shapes: ClassVar[dict[str, tuple[int, ...]]] = {"angular_velocity": (3,), "specific_force": (3,)}
     specific_force: Floats
     """What the accelerometers feel, acceleration minus gravity: +9.81 on z at rest; NaN: not measured.
     Shape (n, 3), m/s²."""
@@ -108,6 +135,7 @@ class Dvl(Block):
     velocity: Floats
     """Shape (n, 3), m/s."""
     finite_columns = ("velocity",)
+    row_shapes: ClassVar[dict[str, tuple[int, ...]]] = {"velocity": (3,), "velocity_cov": (3, 3)}
     velocity_cov: Floats
     """Shape (n, 3, 3), m²/s²; NaN where the log does not say: the calibration's value then holds."""
 
@@ -119,6 +147,7 @@ class Depth(Block):
     z_m: Floats
     """World z of the port (negative below the surface of a world with its origin there), shape (n,)."""
     finite_columns = ("z_m",)
+    row_shapes: ClassVar[dict[str, tuple[int, ...]]] = {"z_m": (), "variance_m2": ()}
     variance_m2: Floats
     """Shape (n,); NaN where the log does not say: the calibration's value then holds."""
 
@@ -132,6 +161,7 @@ class LandmarkDetections(Block):
     azimuth_rad: Floats
     """``atan2(q_y, q_x)`` in the sonar frame, positive to the left, shape (n,)."""
     finite_columns = ("range_m", "azimuth_rad")
+    row_shapes: ClassVar[dict[str, tuple[int, ...]]] = {"range_m": (), "azimuth_rad": (), "range_azimuth_cov": (2, 2)}
     range_azimuth_cov: Floats
     """Covariance of (range, azimuth), shape (n, 2, 2); NaN where the log does not say."""
     candidate_ids: Ints

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from sonar_graph.errors import MeasurementError
-from sonar_graph.measurements import Depth, Imu, LandmarkDetections
+from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections
 
 
 def depth(stamps_ns: list[int]) -> Depth:
@@ -105,3 +106,43 @@ def test_numbers_without_a_meaning_for_not_measured_must_be_finite(bad):
     with pytest.raises(MeasurementError, match=r"Imu.angular_velocity: row 1 is not finite"):
         Imu(np.arange(3), rate, np.zeros((3, 3)))
     Imu(np.arange(3), np.zeros((3, 3)), np.full((3, 3), np.nan))
+
+
+@pytest.mark.parametrize(
+    ("stamps", "expected"),
+    [
+        (np.array([0.0, 0.005, 0.01]), "expected integer nanoseconds, not float64"),
+        (np.array([0.0, 5e6, 1e7]), "expected integer nanoseconds, not float64"),
+        (np.array([[0, 1, 2]]), r"expected shape \(n,\), not \(1, 3\)"),
+    ],
+)
+def test_stamps_that_are_no_row_of_integers_are_refused(stamps, expected):
+    """Also whole numbers in floating point: near an epoch they are off by up to 128 ns."""
+    with pytest.raises(MeasurementError, match=rf"Imu\.stamps_ns: {expected}"):
+        Imu(stamps, np.zeros((3, 3)), np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize("kind", [np.int32, np.uint64])
+def test_any_integers_are_stamps(kind):
+    assert depth(np.array([1, 2], kind)).stamps_ns.dtype == np.int64
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        (lambda n: Imu(n, np.zeros((5, 2)), np.zeros((5, 3))), r"Imu.angular_velocity: expected shape (5, 3)"),
+        (lambda n: Imu(n, np.zeros((5, 3)), np.zeros(5)), r"Imu.specific_force: expected shape (5, 3), not (5,)"),
+        (lambda n: Imu(n, np.zeros((3, 5)), np.zeros((3, 5))), r"one row for each of 5 stamps; transpose it"),
+        (lambda n: Dvl(n, np.zeros(5), np.zeros((5, 3, 3))), r"Dvl.velocity: expected shape (5, 3), not (5,)"),
+        (lambda n: Dvl(n, np.zeros((5, 3)), np.zeros((5, 3))), r"Dvl.velocity_cov: expected shape (5, 3, 3)"),
+        (lambda n: Dvl(n[:3], np.zeros((3, 3)), np.eye(3)), r"Dvl.velocity_cov: expected shape (3, 3, 3)"),
+        (lambda n: Depth(n, np.zeros((5, 1)), np.zeros(5)), r"Depth.z_m: expected shape (5,), not (5, 1)"),
+        (
+            lambda n: LandmarkDetections(n, n, n, np.zeros((5, 2)), np.zeros((5, 1)), np.ones((5, 1))),
+            r"LandmarkDetections.range_azimuth_cov: expected shape (5, 2, 2), not (5, 2)",
+        ),
+    ],
+)
+def test_columns_of_another_shape_are_refused_by_name(made, message):
+    with pytest.raises(MeasurementError, match=re.escape(message)):
+        made(np.arange(5))
