@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
-from functools import cache
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -43,11 +42,11 @@ class Block:
     """Shape of a row of each column whose rows have a fixed one."""
 
     def __post_init__(self) -> None:
-        own: type[Any] = type(self)
-        name = own.__name__
+        name = type(self).__name__
         object.__setattr__(self, "stamps_ns", _in_nanoseconds(name, np.asarray(self.stamps_ns)))
         n = len(self.stamps_ns)
-        for column, kind in _columns_of(own):
+        for field in fields(self)[1:]:
+            column, kind = field.name, np.int64 if str(field.type) == "Ints" else np.float64
             values = np.asarray(getattr(self, column), dtype=kind)
             row_shape = self.row_shapes.get(column, values.shape[1:])
             if values.shape != (n, *row_shape):
@@ -87,12 +86,6 @@ class Block:
     def concatenate(cls, blocks: Sequence[Self]) -> Self:
         """One block from several, in the order given."""
         return cls(*(np.concatenate([getattr(b, field.name) for b in blocks]) for field in fields(cls)))
-
-
-@cache
-def _columns_of(kind: type[Any]) -> tuple[tuple[str, type[np.generic]], ...]:
-    """Name and type of what a kind of block has beside its stamps."""
-    return tuple((f.name, np.int64 if str(f.type) == "Ints" else np.float64) for f in fields(kind)[1:])
 
 
 def _wrong_shape(shape: tuple[int, ...], n: int, row_shape: tuple[int, ...]) -> str:
