@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.measurements import Ints
 from sonar_graph.navigation.interpolation import rows_until, value_among
 from sonar_graph.navigation.joint_nodes import with_inertial_position, with_sample
 from sonar_graph.navigation.joint_state import (
@@ -167,7 +168,7 @@ def _by_accelerometers(
         slopes = Slopes(slopes.M, slopes.N, slopes.v_g, slopes.p_g, s_g, s_a, slopes.s_scale, slopes.s_mounting)
     path, spread, slopes = _carried(columns, model, path, spread, slopes, (start_ns, end_ns), is_closed, bias, earth)
     if is_closed:
-        doppler = _at_both_ends(columns, k, elapsed_s, path.R)
+        doppler = _at_both_ends(columns, model, k, elapsed_s, path.R)
         z = _velocity_at_imu(columns, model, k + 1, bias)
         path, spread, slopes = with_sample(path, spread, slopes, z, elapsed_s / 2, gyro_psd)
     path, spread, slopes = with_inertial_position(path, spread, slopes)
@@ -222,16 +223,25 @@ def _velocity_at_imu(columns: Columns, model: GapModel, k: int, bias: Vector) ->
 
 
 @compiled
-def _at_both_ends(columns: Columns, k: int, elapsed_s: float, R: Matrix) -> Matrix:
-    """Displacement covariance by the samples k and k + 1, half the gap's length each.
+def _at_both_ends(columns: Columns, model: GapModel, k: int, elapsed_s: float, R: Matrix) -> Matrix:
+    """Displacement covariance by the samples k and k + 1, half the gap's length each, with what neighbours share."""
+    first_s, last_s = _neighbours_s(columns[3], k, model.longest_ns)
+    first, last = matrix(columns[5][k]), sandwich(R, matrix(columns[5][k + 1]), R)
+    by_first = multiple_of(elapsed_s * (elapsed_s + 2.0 * first_s) / 4.0, first)
+    return sum_of(by_first, multiple_of(elapsed_s * (elapsed_s + 2.0 * last_s) / 4.0, last))
 
-    Each also ends or begins a neighbouring interval, of length d, and errors add up:
-    ``((T + d) / 2)^2 = (T / 2)^2 (1 + 2 d / T) + (d / 2)^2``, of which the last is the neighbour's own.
+
+@compiled
+def _neighbours_s(dvl_ns: Ints, k: int, longest_ns: int) -> tuple[float, float]:
+    """Lengths of the intervals beside the gap after row k whose errors add to its own.
+
+    Each end also ends or begins a neighbouring interval, of length d, and errors add up:
+    ``((T + d) / 2)^2 = (T / 2)^2 (1 + 2 d / T) + (d / 2)^2``, of which the last is the neighbour's own. What lies after
+    the end is not known yet: as long as what lay before the gap. Of two gaps that follow each other the later one
+    counts what they share.
     """
-    dvl_ns, cov = columns[3], columns[5]
-    neighbour_s = min((dvl_ns[k] - dvl_ns[k - 1]) * 1e-9, elapsed_s) if k > 0 else 0.0
-    both = sum_of(matrix(cov[k]), sandwich(R, matrix(cov[k + 1]), R))
-    return multiple_of(elapsed_s * (elapsed_s + 2.0 * neighbour_s) / 4.0, both)
+    before_ns = dvl_ns[k] - dvl_ns[k - 1] if k > 0 else 0
+    return before_ns * 1e-9, (before_ns if before_ns <= longest_ns else 0) * 1e-9
 
 
 @compiled
@@ -263,9 +273,10 @@ def _by_walk(
     imu_rows, dvl_rows = rows_until(imu_ns, end_ns), k + 1
     if is_closed:
         imu_rows, dvl_rows = min(rows_until(imu_ns, end_ns - 1) + 1, len(imu_ns)), k + 2
-        neighbour_s = min((dvl_ns[k] - dvl_ns[k - 1]) * 1e-9, elapsed_s) if k > 0 else 0.0
-        both = sum_of(matrix(cov[k]), matrix(cov[k + 1]))
-        psd = sum_of(multiple_of((elapsed_s + 2.0 * neighbour_s) / 4.0, both), multiple_of(walk / 12.0, IDENTITY))
+        first_s, last_s = _neighbours_s(dvl_ns, k, model.longest_ns)
+        by_first = multiple_of((elapsed_s + 2.0 * first_s) / 4.0, matrix(cov[k]))
+        by_last = multiple_of((elapsed_s + 2.0 * last_s) / 4.0, matrix(cov[k + 1]))
+        psd = sum_of(sum_of(by_first, by_last), multiple_of(walk / 12.0, IDENTITY))
     motion, D_t, D_r, cursor = NO_MOTION, ZEROS, ZEROS, cursor_at(columns, start_ns)
     while cursor.stamp_ns < end_ns:
         cursor, own = next_step(columns, imu_rows, dvl_rows, cursor, end_ns)

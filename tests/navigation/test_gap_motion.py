@@ -217,18 +217,26 @@ def test_an_open_gap_uses_nothing_stamped_later():
     assert np.array_equal(whole.covariance, cut.covariance)
 
 
-def test_a_gap_does_not_inherit_more_of_its_neighbour_than_its_own_length():
-    """An interval before the gap that is longer than it: as if it were as long."""
+@pytest.mark.parametrize(
+    ("pings_s", "tolerance"),
+    [((5.0, 7.0, 9.0, 11.5), 0.02), ((5.0, 11.0, 12.0), 0.02), ((5.0, 5.5, 8.0, 8.5, 11.5), 0.15)],
+    ids=["pings alone", "long and short", "two pings between"],
+)
+def test_gaps_that_follow_each_other_spread_together_as_noise_of_every_sample_does(pings_s, tolerance):
+    """The sum of all counts once what two of them share; intervals of samples at its ends count as if they went on."""
+    known = calibration(velocity_sigma_m_s=SIGMA_M_S, gap_s=0.9)
+    imu, dvl = rows()
+    s = (stamps(DVL_HZ, 16.0) - T0_NS) * 1e-9
+    velocity = attitude(s).inv().apply(velocity_at(s)) + np.cross(rate_at(s), BODY_P_DVL - BODY_P_IMU)
+    there = np.isin(s, pings_s)
+    few = Dvl(at(0.0) + np.rint(s[there] * NS).astype(np.int64), velocity[there], dvl.velocity_cov[: there.sum()])
+    assert error_of_spread("velocity", SIGMA_M_S, imu, few, known, pings_s[0], pings_s[-1]) < tolerance
+
+
+def test_the_first_gap_of_a_log_has_no_neighbour():
     known = calibration(velocity_sigma_m_s=(0.01,) * 3, gap_s=0.9)
     imu, dvl = rows()
-    first, last = at(5.0), at(LOST_S)
-    found = []
-    for before_ns in (at(4.0), at(2.0)):
-        kept = np.isin(dvl.stamps_ns, [before_ns, first, last])
-        found.append(motion(imu, dvl.rows(kept), known, 5.0, LOST_S).covariance[3:, 3:])
-    assert found[0] == pytest.approx(found[1])
-    assert np.diag(found[0]) == pytest.approx([0.01**2 * 2 * 3 / 4] * 3, rel=1e-6)
-    alone = motion(imu, dvl.rows(np.isin(dvl.stamps_ns, [first, last])), known, 5.0, LOST_S)
+    alone = motion(imu, dvl.rows(np.isin(dvl.stamps_ns, [at(5.0), at(LOST_S)])), known, 5.0, LOST_S)
     assert np.diag(alone.covariance)[3:] == pytest.approx([0.01**2 * 2 / 4] * 3, rel=1e-6)
 
 
