@@ -84,7 +84,7 @@ class ImuCalibration(Section):
 class DvlCalibration(Section):
     """Doppler velocity log."""
 
-    velocity_sigma_m_s: tuple[Positive, Positive, Positive] = (0.01, 0.01, 0.01)
+    velocity_sigma_m_s: tuple[NotNegative, NotNegative, NotNegative] = (0.01, 0.01, 0.01)
     """White noise of one velocity sample along each of the DVL's axes, where the log does not say."""
     mounting: Mounting = Mounting()
     gap_s: Positive = 1.5
