@@ -43,7 +43,7 @@ EQUIDISTANT = gtsam.Cal3Fisheye(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Unit focal lengths; no skew, offset or distortion."""
 BEAM_R_CAMERA = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
 """Columns: image x to the left, image y up, optical axis along the beam."""
-ORIGIN, IMAGE_CENTRE = np.zeros(3), np.zeros(2)
+ORIGIN, IMAGE_CENTRE, UP = np.zeros(3), np.zeros(2), np.array([0.0, 0.0, 1.0])
 
 Robust = Callable[[gtsam.noiseModel.Base], gtsam.noiseModel.Base]
 """Wraps a noise model in a robust kernel, or returns it as it is."""
@@ -219,14 +219,20 @@ def depth(pose_key: int, z_m: float, body_p_port: Floats, sigma_m: float) -> gts
 
 
 def gravity_direction(pose_key: int, up_in_body: Floats, sigma_rad: float) -> gtsam.NonlinearFactor:
-    """World's up, seen in the body as ``up_in_body`` (any length), to sigma_rad about each horizontal axis."""
-    noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma_rad)
-    return gtsam.AttitudeFactorPose3(pose_key, gtsam.Unit3(np.array([0.0, 0.0, 1.0])), noise, gtsam.Unit3(up_in_body))
+    """World's up, seen in the body as ``up_in_body`` (any length), to sigma_rad about each horizontal axis.
+
+    ``R^T e_z - up``, GTSAM's factor for a magnetometer without bias, and not its attitude factor: that one compares the
+    two directions in the world, where a turn about the vertical turns the residual. Linearised, it says of the yaw what
+    it cannot know: the more the larger its residual is beside sigma.
+    """
+    measured = up_in_body / np.linalg.norm(up_in_body)
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma_rad)
+    return gtsam.MagPoseFactorPose3(pose_key, measured, 1.0, UP, ORIGIN, noise)
 
 
 def planar(pose_key: int, motion: PlanarMotion) -> list[gtsam.NonlinearFactor]:
     """The keyframe is level and at the plane's height."""
     return [
-        gravity_direction(pose_key, np.array([0.0, 0.0, 1.0]), motion.tilt_sigma_rad),
+        gravity_direction(pose_key, UP, motion.tilt_sigma_rad),
         depth(pose_key, motion.z_m, np.zeros(3), motion.z_sigma_m),
     ]

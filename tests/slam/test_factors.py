@@ -302,8 +302,25 @@ def test_gravity_direction_weighs_the_tilt_and_leaves_the_yaw(pose, roll, pitch)
     assert np.allclose(truth.unwhitenedError(values_of(X0=yawed)), 0, atol=1e-12)
     tilted = values_of(X0=pose.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, 0), np.zeros(3))))
     angle = np.arccos(np.clip(tilted.atPose3(X(0)).rotation().matrix().T[:, 2] @ up_in_body, -1, 1))
-    assert np.linalg.norm(truth.whitenedError(tilted)) == pytest.approx(np.sin(angle) / sigma, abs=1e-5)
+    assert np.linalg.norm(truth.whitenedError(tilted)) == pytest.approx(2 * np.sin(angle / 2) / sigma, abs=1e-5)
     assert_jacobians(truth, tilted)
+
+
+@poses
+def test_a_gravity_direction_that_does_not_fit_still_says_nothing_of_the_yaw(pose):
+    """GTSAM's factor with both directions in the world says the residual's square."""
+    sigma, up_in_body = 0.01, pose.rotation().matrix().T @ [0, 0, 1.0]
+    tilted = values_of(X0=pose.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(0.03, 0.04, 0), np.zeros(3))))
+    vertical = np.concatenate([tilted.atPose3(X(0)).rotation().matrix().T @ [0, 0, 1.0], np.zeros(3)])
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
+    in_world = gtsam.AttitudeFactorPose3(X(0), gtsam.Unit3(np.array([0, 0, 1.0])), noise, gtsam.Unit3(up_in_body))
+    of_yaw = [
+        vertical @ information([factor], tilted, [X(0)]) @ vertical
+        for factor in (factors.gravity_direction(X(0), up_in_body, sigma), in_world)
+    ]
+    squared = 2 * in_world.error(tilted)
+    assert squared > 10
+    assert of_yaw == pytest.approx([0.0, squared], rel=0.01, abs=1e-9)
 
 
 def test_gravity_direction_says_sigma_about_each_horizontal_axis():

@@ -199,7 +199,7 @@ def test_every_keyframe_has_its_odometry_and_gravity():
     graph = keyframes.smoother.graph
     assert graph.size() == 1 + 3 * 2
     for k in range(1, 4):
-        assert len(factors_on(keyframes, gtsam.AttitudeFactorPose3, X(k))) == 1
+        assert len(factors_on(keyframes, gtsam.MagPoseFactorPose3, X(k))) == 1
     assert [list(graph.at(k).keys()) for k in (1, 3, 5)] == [[X(0), X(1)], [X(1), X(2)], [X(2), X(3)]]
     without = driven(calibration.model_copy(update={"use_gravity": False}), 6.0)
     assert without.smoother.graph.size() == 1 + 3
@@ -219,7 +219,7 @@ def test_gravity_tells_the_tilt_of_a_tilted_vehicle():
     force = np.tile(tilt.inv().apply([0, 0, G]), (len(imu), 1))
     keyframes.add(Imu(imu.stamps_ns, imu.angular_velocity, force), steady_dvl(2.0), None)
     keyframes.advance(int(at(2.0)[0]))
-    (factor,) = factors_on(keyframes, gtsam.AttitudeFactorPose3, X(1))
+    (factor,) = factors_on(keyframes, gtsam.MagPoseFactorPose3, X(1))
     assert np.abs(factor.unwhitenedError(keyframes.smoother.values)).max() < 1e-9
 
 
@@ -234,7 +234,7 @@ def test_velocity_is_taken_to_the_imu_before_gravity_is():
     keyframes = keyframes_of(calibration)
     keyframes.add(Imu(stamps, rate, force), steady_dvl(T, (0, 0, 0)), None)
     keyframes.advance(int(at(T)[0]))
-    (factor,) = factors_on(keyframes, gtsam.AttitudeFactorPose3, X(1))
+    (factor,) = factors_on(keyframes, gtsam.MagPoseFactorPose3, X(1))
     assert np.abs(factor.unwhitenedError(keyframes.smoother.values)).max() < 2e-5
     assert alpha * arm / G > 1e-2
 
@@ -281,7 +281,7 @@ def test_the_plane_holds_every_keyframe_from_the_first():
     keyframes = driven(Calibration(imu=NO_BIAS, planar=PlanarMotion(), use_gravity=False), 4.0)
     for k in range(3):
         assert len(factors_on(keyframes, gtsam.GPSFactorArm, X(k))) == 1
-        assert len(factors_on(keyframes, gtsam.AttitudeFactorPose3, X(k))) == 1
+        assert len(factors_on(keyframes, gtsam.MagPoseFactorPose3, X(k))) == 1
 
 
 def test_the_bias_walks_between_stretches():
