@@ -17,13 +17,15 @@ Derivation: docs/theory/preintegration.md. After Forster et al., TRO 2017, secti
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from math import isfinite
 
 import gtsam
 import numpy as np
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.errors import MeasurementError
+from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Dvl, Floats, Imu
+from sonar_graph.navigation import argument_checks as check
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.navigation.joint_recursion import Inertial, preintegrate
 from sonar_graph.navigation.joint_rules import RULES, DopplerRule
@@ -62,11 +64,19 @@ class JointMotion:
     """What sharing the first sample with the motion before adds to s, shape (3, 3), m²; zero before `after`."""
     bias: Floats
     """Gyro and accelerometer bias that were removed, body axes, shape (6,), rad/s and m/s²."""
-    duration_s: float
+    start_ns: int
+    """Stamp of the first Doppler sample."""
+    end_ns: int
+    """Stamp of the last."""
     body_p_imu: Floats
     """Shape (3,), m."""
     body_p_dvl: Floats
     """Shape (3,), m."""
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last Doppler sample."""
+        return (self.end_ns - self.start_ns) * 1e-9
 
     @property
     def covariance(self) -> Floats:
@@ -83,7 +93,17 @@ class JointMotion:
         The Doppler sample between them moves both, so that their errors are correlated. Charging all of it to the later
         one, ``C + C^T`` with ``C = R^T W_last Q W_first^T``, lets a graph take them as independent: the covariance of
         the chain's displacement is then that of the samples with their weights, however it is cut.
+
+        Raises
+        ------
+        MeasurementError
+            When the motion before does not end where this one begins.
         """
+        if before.end_ns != self.start_ns:
+            raise MeasurementError(
+                f"before: ends at {before.end_ns} ns, this motion begins at {self.start_ns} ns; expected the motion"
+                " that ends with the Doppler sample with which this one begins: later.after(earlier)"
+            )
         C = before.i_R_j.matrix().T @ before.end_weights[1] @ self.end_covariances[0] @ self.end_weights[0].T
         return replace(self, shared_covariance=C + C.T)
 
@@ -95,7 +115,7 @@ class JointMotion:
         change
             Of gyro bias, accelerometer bias, scale and mounting, shape (10,).
         """
-        error = self.D_parameters @ change
+        error = self.D_parameters @ check.vector("change", change, 10)
         return replace(
             self,
             i_R_j=self.i_R_j.compose(gtsam.Rot3.Expmap(error[ROTATION])),
@@ -124,7 +144,13 @@ class JointMotion:
 
 @dataclass(frozen=True, eq=False)
 class JointPreintegrator:
-    """What joint preintegration needs to know of the sensors."""
+    """What joint preintegration needs to know of the sensors.
+
+    Raises
+    ------
+    CalibrationError
+        When a number is negative or not finite, or a mounting or the rule is of another kind.
+    """
 
     gyro_noise_density: float
     """rad/s/√Hz."""
@@ -136,6 +162,16 @@ class JointPreintegrator:
     body_T_dvl: gtsam.Pose3 = field(default_factory=gtsam.Pose3)
     rule: DopplerRule = "inertial"
     """How a velocity is had between samples: `sonar_graph.navigation.joint_rules`."""
+
+    def __post_init__(self) -> None:
+        if self.rule not in RULES:
+            raise CalibrationError(f"rule: there is no {self.rule!r}; there are {', '.join(RULES)}")
+        check.noise("gyro_noise_density", self.gyro_noise_density, 1)
+        check.noise("accel_noise_density", self.accel_noise_density, 1)
+        check.noise("velocity_sigma_m_s", self.velocity_sigma_m_s, 3)
+        for name, mounting in (("body_T_imu", self.body_T_imu), ("body_T_dvl", self.body_T_dvl)):
+            if not isinstance(mounting, gtsam.Pose3):
+                raise CalibrationError(f"{name}: expected a gtsam.Pose3, not {type(mounting).__name__}")
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, rule: DopplerRule = "inertial") -> JointPreintegrator:
@@ -175,15 +211,20 @@ class JointPreintegrator:
         Raises
         ------
         MeasurementError
-            When an end is no Doppler stamp, the inertial rows do not reach both ends, a Doppler row in between
-            leaves a direction unmeasured, or the rule needs a specific force that was not measured.
+            When an end is no Doppler stamp, the inertial rows do not reach both ends, stamps repeat, a Doppler row in
+            between leaves a direction unmeasured or has no possible covariance, the rule needs a specific force that
+            was not measured, or bias or Earth rate are not of their shapes.
         """
+        if not (isinstance(imu, Imu) and isinstance(dvl, Dvl)):
+            raise MeasurementError(f"imu, dvl: expected Imu and Dvl, not {type(imu).__name__} and {type(dvl).__name__}")
+        check.order(start_ns, end_ns)
         samples, inertial = _doppler_rows(dvl, start_ns, end_ns), _inertial_rows(imu, start_ns, end_ns)
         velocity, cov = self._in_body(samples)
-        bias = np.zeros(6) if bias is None else np.asarray(bias, np.float64)
+        bias = np.zeros(6) if bias is None else check.vector("bias", bias, 6)
+        earth = np.zeros(3) if earth_rate is None else check.vector("earth_rate", earth_rate, 3)
         body_R_imu = self.body_T_imu.rotation().matrix()
         force = inertial.specific_force @ body_R_imu.T
-        if self.rule == "inertial" and np.isnan(force).any():
+        if self.rule == "inertial" and not np.isfinite(force).all():
             raise MeasurementError('Imu.specific_force: not measured in every row; use the rule "linear"')
         rows = Inertial(
             inertial.stamps_ns,
@@ -191,16 +232,22 @@ class JointPreintegrator:
             force,
             _vector(bias[:3]),
             _vector(bias[3:]),
-            _vector(np.zeros(3) if earth_rate is None else earth_rate),
+            _vector(earth),
             self.gyro_noise_density**2,
             self.accel_noise_density**2,
         )
         columns = samples.stamps_ns, velocity, cov
         R, (v, p, s), P, D, first, last = preintegrate(rows, *columns, RULES[self.rule])
-        duration_s = (end_ns - start_ns) * 1e-9
+        if not isfinite(sum(s.tolist()) + P.item(9, 9) + P.item(10, 10) + P.item(11, 11)):
+            raise MeasurementError(
+                f"from {start_ns} to {end_ns} ns: the motion is not finite; expected angular velocities in rad/s and"
+                " velocities in m/s that are not beyond all bounds"
+            )
         arms = self.body_T_imu.translation(), self.body_T_dvl.translation()
         ends, unshared = (cov[0], cov[-1]), np.zeros((3, 3))
-        return JointMotion(gtsam.Rot3(R), v, p, s, P, D, (first, last), ends, unshared, bias, duration_s, *arms)
+        return JointMotion(
+            gtsam.Rot3(R), v, p, s, P, D, (first, last), ends, unshared, bias, int(start_ns), int(end_ns), *arms
+        )
 
     def _in_body(self, samples: Dvl) -> tuple[Floats, Floats]:
         """Velocities in body axes and a covariance for each."""
@@ -208,16 +255,18 @@ class JointPreintegrator:
         unsaid = np.isnan(cov)
         if unsaid.any():
             cov = np.where(unsaid, np.diag(np.square(self.velocity_sigma_m_s)), cov)
+        check.covariances("Dvl.velocity_cov", cov, samples.stamps_ns)
         return samples.velocity @ body_R_dvl.T, body_R_dvl @ cov @ body_R_dvl.T
 
 
 def _doppler_rows(dvl: Dvl, start_ns: int, end_ns: int) -> Dvl:
     """Rows from one end to the other."""
     first, last = (int(row) for row in np.searchsorted(dvl.stamps_ns, [start_ns, end_ns]))
-    if end_ns <= start_ns or last == len(dvl) or (dvl.stamps_ns[first], dvl.stamps_ns[last]) != (start_ns, end_ns):
-        raise MeasurementError(
-            f"Dvl.stamps_ns: no motion from {start_ns} to {end_ns} ns; take two of its stamps, the earlier first"
-        )
+    if last == len(dvl) or dvl.stamps_ns[last] != end_ns:
+        raise check.no_stamp("end_ns", end_ns, dvl.stamps_ns)
+    if dvl.stamps_ns[first] != start_ns:
+        raise check.no_stamp("start_ns", start_ns, dvl.stamps_ns)
+    check.rows("Dvl", dvl.stamps_ns, first, last)
     samples = dvl.rows(slice(first, last + 1))
     partial = is_partial(samples.velocity_cov)
     if partial.any():
@@ -230,6 +279,7 @@ def _doppler_rows(dvl: Dvl, start_ns: int, end_ns: int) -> Dvl:
 
 def _inertial_rows(imu: Imu, start_ns: int, end_ns: int) -> Imu:
     """Rows from the last at or before the start to the first at or after the end."""
+    check.unit("Imu", imu.stamps_ns)
     first = int(np.searchsorted(imu.stamps_ns, start_ns, side="right")) - 1
     last = int(np.searchsorted(imu.stamps_ns, end_ns))
     if first < 0 or last == len(imu):
@@ -237,6 +287,7 @@ def _inertial_rows(imu: Imu, start_ns: int, end_ns: int) -> Imu:
             f"Imu.stamps_ns: rows from {imu.stamps_ns[0]} to {imu.stamps_ns[-1]} ns do not reach from {start_ns} to"
             f" {end_ns} ns; begin and end at Doppler samples within them"
         )
+    check.rows("Imu", imu.stamps_ns, first, last)
     return imu.rows(slice(first, last + 1))
 
 

@@ -1,12 +1,13 @@
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.doppler_beams import UNMEASURED_M_S
-from sonar_graph.errors import MeasurementError
+from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.dvl_preintegration import Preintegrator
 from sonar_graph.navigation.joint_preintegration import DISPLACEMENT, JointMotion, JointPreintegrator
@@ -201,13 +202,150 @@ def test_ends_that_are_not_covered_are_refused():
     rows = random_rows(6)
     at = rows[1].stamps_ns
     preintegrator = JointPreintegrator(GYRO, ACCEL)
-    for ends in ((at[0] + 1, at[-1]), (at[0], at[-1] + 1), (at[3], at[3]), (at[4], at[2])):
-        with pytest.raises(MeasurementError, match="take two of its stamps"):
+    for ends, message in (
+        ((at[0] + 1, at[-1]), rf"start_ns: {at[0] + 1} is none of the 9 Doppler stamps .* nearest is {at[0]}$"),
+        ((at[0], at[-1] + 1), rf"end_ns: {at[-1] + 1} is none of the 9 Doppler stamps .* nearest is {at[-1]}$"),
+        ((at[0], at[-1] + 900 * NS), rf"from {at[0]} to {at[-1]} ns"),
+        ((at[3], at[3]), "the earlier first"),
+        ((at[4], at[2]), "the earlier first"),
+    ):
+        with pytest.raises(MeasurementError, match=message):
             preintegrator.integrate(*rows, int(ends[0]), int(ends[1]))
     late, early = rows[0].between(int(at[0]) + 1, int(at[-1]) + NS), rows[0].between(0, int(at[-1]) - 1)
     for part in (late, early):
         with pytest.raises(MeasurementError, match="do not reach"):
             preintegrator.integrate(part, rows[1], int(at[0]), int(at[-1]))
+
+
+def steady(unit_ns: int = 1) -> tuple[Imu, Dvl]:
+    """Ten seconds, 200 Hz and 5 Hz from zero, stamps in a unit of so many nanoseconds."""
+    quick, slow = np.arange(-1, 2002) * (NS // 200), np.arange(51) * (NS // 5)
+    return imu(quick // unit_ns, [0, 0, 0.1]), dvl(slow // unit_ns, [0.5, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("unit_ns", "ends", "message"),
+    [
+        (1, (0.0, 1.0), "start_ns: expected integer nanoseconds, not 0.0"),
+        (1, (0, 1), "it seems to be in seconds: times 1000000000"),
+        (1, (0, 1500), "it seems to be in milliseconds: times 1000000 "),
+        (1, (0, 2_100_000), "it seems to be in microseconds: times 1000 "),
+        (1000, (0, NS), "they seem to be in a larger unit than nanoseconds"),
+        (1000, (0, NS // 1000), r"Imu.stamps_ns: 2003 rows are 5e\+03 ns apart"),
+        (NS // 1000, (0, 1000), r"Imu.stamps_ns: 2003 rows are 5 ns apart"),
+    ],
+)
+def test_another_unit_of_time_is_named(unit_ns, ends, message):
+    with pytest.raises(MeasurementError, match=message):
+        JointPreintegrator(GYRO, ACCEL).integrate(*steady(unit_ns), *ends)
+
+
+@pytest.mark.parametrize("row", [0, 3, 5])
+@pytest.mark.parametrize("other", [0.0, 1.0])
+def test_repeated_doppler_stamps_are_refused_at_the_ends_too(row, other):
+    """Whether or not they say the same; beyond the motion they do no harm."""
+    inertial, doppler = steady()
+    velocity = np.insert(doppler.velocity, row, doppler.velocity[row] + other, axis=0)
+    at = np.insert(doppler.stamps_ns, row, doppler.stamps_ns[row])
+    twice, preintegrator = dvl(at, velocity), JointPreintegrator(GYRO, ACCEL)
+    with pytest.raises(MeasurementError, match=rf"Dvl.stamps_ns: rows {row} and {row + 1} .* {row * NS // 5} ns"):
+        preintegrator.integrate(inertial, twice, 0, NS)
+    preintegrator.integrate(inertial, twice, 2 * NS, 3 * NS)
+    preintegrator.integrate(inertial, twice.rows(np.unique(at, return_index=True)[1]), 0, NS)
+
+
+@pytest.mark.parametrize("row", [1, 50, 201])
+def test_repeated_inertial_stamps_are_refused_at_the_ends_too(row):
+    inertial, doppler = steady()
+    twice, preintegrator = inertial.rows(np.sort(np.r_[np.arange(len(inertial)), row])), JointPreintegrator(GYRO, ACCEL)
+    with pytest.raises(MeasurementError, match=rf"Imu.stamps_ns: rows {row} and {row + 1} are both stamped"):
+        preintegrator.integrate(twice, doppler, 0, NS)
+    preintegrator.integrate(twice, doppler, 2 * NS, 3 * NS)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"gyro_noise_density": -1e-4}, "gyro_noise_density: expected finite numbers of zero or more"),
+        ({"gyro_noise_density": np.nan}, "gyro_noise_density: expected finite"),
+        ({"gyro_noise_density": "1e-4"}, "gyro_noise_density: expected 1 number, not '1e-4'"),
+        ({"accel_noise_density": np.inf}, "accel_noise_density: expected finite"),
+        ({"velocity_sigma_m_s": (0.01, -0.01, 0.01)}, "velocity_sigma_m_s: expected finite"),
+        ({"velocity_sigma_m_s": 0.01}, "velocity_sigma_m_s: expected 3 numbers, not 0.01"),
+        ({"rule": "zoh"}, "rule: there is no 'zoh'; there are inertial, linear"),
+        ({"body_T_dvl": np.eye(4)}, "body_T_dvl: expected a gtsam.Pose3, not ndarray"),
+        ({"body_T_imu": (0.1, 0.0, 0.0)}, "body_T_imu: expected a gtsam.Pose3, not tuple"),
+    ],
+)
+def test_impossible_sensors_are_refused(options, message):
+    with pytest.raises(CalibrationError, match=message):
+        JointPreintegrator(**{"gyro_noise_density": GYRO, "accel_noise_density": ACCEL} | options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"bias": np.zeros(3)}, r"bias: expected shape \(6,\), not \(3,\)"),
+        ({"bias": [0, 0, np.nan, 0, 0, 0]}, "bias: expected finite"),
+        ({"earth_rate": np.zeros(2)}, r"earth_rate: expected shape \(3,\)"),
+    ],
+)
+def test_vectors_of_another_shape_are_refused(options, message):
+    with pytest.raises(MeasurementError, match=message):
+        JointPreintegrator(GYRO, ACCEL).integrate(*steady(), 0, NS, **options)
+
+
+def test_swapped_blocks_are_refused():
+    with pytest.raises(MeasurementError, match="expected Imu and Dvl, not Dvl and Imu"):
+        JointPreintegrator(GYRO, ACCEL).integrate(*steady()[::-1], 0, NS)
+
+
+@given(arrays.arrays(np.float64, (3, 3), elements=st.floats(-1, 1)), st.integers(1, 3))
+@settings(max_examples=60)
+def test_covariances_are_refused_exactly_where_an_eigenvalue_is_negative(A, rank):
+    """Of what is far enough from zero to be told; singular ones are possible."""
+    inertial, doppler = steady()
+    indefinite = A + A.T
+    lowest, size = np.linalg.eigvalsh(indefinite)[0], np.abs(indefinite).max()
+    assume(size > 1e-3)
+    cases = [(A[:, :rank] @ A[:, :rank].T, False)]
+    if lowest < -1e-3 * size or lowest > 0:
+        cases.append((indefinite, bool(lowest < 0)))
+    for cov, is_refused in cases:
+        every = np.tile(np.eye(3) * 1e-4, (51, 1, 1))
+        every[2] = cov
+        rows = inertial, Dvl(doppler.stamps_ns, doppler.velocity, every)
+        if is_refused:
+            with pytest.raises(MeasurementError, match=f"row at {2 * NS // 5} ns is no covariance"):
+                JointPreintegrator(GYRO, ACCEL).integrate(*rows, 0, NS)
+        else:
+            JointPreintegrator(GYRO, ACCEL).integrate(*rows, 0, NS)
+
+
+@pytest.mark.parametrize("cov", [-np.eye(3), [[1, 5, 0], [0, 1, 0], [0, 0, 1]], [[1, 0, 0], [0, 1, 2], [0, 2, 1]]])
+def test_what_is_no_covariance_is_refused(cov):
+    inertial, doppler = steady()
+    with pytest.raises(MeasurementError, match=r"Dvl\.velocity_cov: the row at 0 ns is no covariance"):
+        JointPreintegrator(GYRO, ACCEL).integrate(inertial, dvl(doppler.stamps_ns, 0.0, cov), 0, NS)
+
+
+def test_a_chain_takes_only_the_motion_that_ends_where_the_next_begins():
+    rows, preintegrator = steady(), JointPreintegrator(GYRO, ACCEL)
+    first, second, third = (preintegrator.integrate(*rows, k * NS, (k + 1) * NS) for k in range(3))
+    for later, before in ((first, second), (third, first), (first, first)):
+        with pytest.raises(MeasurementError, match=rf"ends at {before.end_ns} ns, this motion begins at"):
+            later.after(before)
+    assert np.array_equal(second.after(first).after(first).covariance, second.after(first).covariance)
+
+
+def test_motion_beyond_all_bounds_is_refused():
+    inertial, doppler = steady()
+    for rows in (
+        (imu(inertial.stamps_ns, 1e200), doppler),
+        (inertial, dvl(doppler.stamps_ns, 1e308)),
+    ):
+        with pytest.raises(MeasurementError, match="the motion is not finite"):
+            JointPreintegrator(GYRO, ACCEL).integrate(*rows, 0, NS)
 
 
 def test_longer_blocks_change_nothing():
