@@ -30,8 +30,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.ekf_state import LANDMARK, POSE, correct, correct_pair
+from baselines.ekf_state import LANDMARK, POSE, correct, correct_by, correct_pair
 from baselines.euler import rates_from_euler, rotation_from_euler
+from baselines.far_views import by_range_and_azimuth, is_beyond_linear, view_noise
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.kernels import compiled, inlined
 from sonar_graph.navigation.recursion import Integral
@@ -153,6 +154,7 @@ def observe_rows(
     outcomes: Ints,
     innovations: Floats,
     covs: Floats,
+    was_lost: bool = False,
 ) -> int:
     """Take in some rows, all of one instant, one after the other.
 
@@ -165,6 +167,9 @@ def observe_rows(
     outcomes, innovations, covs
         Written: USED, NEW, GATED or PASSED_OVER, shape (m,); innovations (m, 2) and their covariances (m, 2, 2), which
         stay as they are where nothing is predicted.
+    was_lost
+        Whether the Doppler log has lost the bottom: from then on views are linearised as in `baselines.far_views`,
+        where it takes that.
 
     Returns
     -------
@@ -182,6 +187,8 @@ def observe_rows(
             _augment(x, P, n, moment, sonar, z, R_z)
             n += LANDMARK
             outcomes[row] = NEW
+        elif was_lost:
+            outcomes[row] = _observe_far(x, P, n, at, moment, sonar, z, R_z, innovations[row], covs[row])
         else:
             outcomes[row] = _observe(x, P, n, at, moment, sonar, z, R_z, innovations[row], covs[row])
     return n
@@ -239,6 +246,42 @@ def _observe(
     if not squared_distance(innovation, S) <= sonar.gate:
         return GATED
     correct_pair(x, P, n, U, S, innovation)
+    return USED
+
+
+@compiled
+def _observe_far(
+    x: Floats,
+    P: Floats,
+    n: int,
+    at: int,
+    moment: Moment,
+    sonar: SonarModel,
+    z: tuple[float, float],
+    R_z: Noise,
+    innovation: Floats,
+    S: Floats,
+) -> int:
+    """Correct by a landmark that may be far from where it is predicted, inside the gate: `baselines.far_views`."""
+    point, G, by_view = location(moment, sonar, z, 0.0)
+    G_z = np.array(by_view)
+    U, cov, missed = np.empty((LANDMARK, n)), np.empty((LANDMARK, LANDMARK)), np.empty(LANDMARK)
+    for r in range(LANDMARK):
+        missed[r], U[r] = point[r] - x[at + r], P[at + r, :n]
+        add_covariances(P, n, 0, scaled(-1.0, G[r].by_X), U[r])
+        add_covariances(P, n, 3, scaled(-1.0, G[r].by_angles), U[r])
+    for r in range(LANDMARK):
+        for c in range(r + 1):
+            share = dot(G[c].by_X, vector(U[r])) + dot(G[c].by_angles, vector(U[r, 3:]))
+            cov[r, c] = cov[c, r] = U[r, at + c] - share + motion_covariance(moment.motion, G[r], G[c])
+    if not is_beyond_linear(cov, G_z, z[0], R_z):
+        return int(_observe(x, P, n, at, moment, sonar, z, R_z, innovation, S))
+    cov += G_z @ view_noise(z[0], R_z, sonar.aperture_rad) @ G_z.T
+    B = by_range_and_azimuth(G_z, z[0])
+    innovation[:], S[:] = B @ missed, B @ cov @ B.T
+    if not squared_distance(innovation, S) <= sonar.gate:
+        return GATED
+    correct_by(x, P, n, U, cov, missed)
     return USED
 
 

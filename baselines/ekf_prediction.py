@@ -39,9 +39,11 @@ from sonar_graph.navigation.triples import (
 )
 from sonar_graph.slam.models import wrap_angle
 
-NODE, OPENED, DEPTHS, SIGHTINGS = 0, 1, 2, 3
-"""Places in the clock: stamp of the state, stamp at which the running gravity interval began, and how many depth
-samples and detections were used since the Doppler log lost the bottom."""
+NODE, OPENED, DEPTHS, SIGHTINGS, LOST = 0, 1, 2, 3, 4
+"""Places in the clock: stamp of the state, stamp at which the running gravity interval began, how many depth samples
+and detections were used since the Doppler log lost the bottom, and whether it ever did (0 or 1)."""
+CLOCK = 5
+"""Numbers of the clock."""
 
 
 class VehicleModel(NamedTuple):
@@ -140,7 +142,7 @@ def advance_to_node(
     """
     predict(x, P, n, motion)
     clock[NODE] = node_ns
-    clock[DEPTHS:] = 0
+    clock[DEPTHS:LOST] = 0
     if model.gravity_interval_ns > 0:
         extend_interval(interval, motion)
         if clock[NODE] - clock[OPENED] >= model.gravity_interval_ns:

@@ -10,7 +10,7 @@ import numpy as np
 
 from baselines.causal import CausalEstimates
 from baselines.ekf_landmarks import DetectionColumns
-from baselines.ekf_prediction import NODE, GravityInterval, open_interval
+from baselines.ekf_prediction import CLOCK, NODE, GravityInterval, open_interval
 from baselines.ekf_state import LANDMARK, POSE
 from baselines.ekf_window import DepthColumns, DetectionOutcomes, PoseArrays, process_window
 from baselines.euler import euler_from_rates, euler_from_rotation
@@ -82,7 +82,7 @@ class EkfSlam:
         self._most_rows = SPARE_ROWS
         self._x, self._P = _start_state(calibration.start)
         self._n = POSE
-        self._clock: Ints = np.zeros(4, np.int64)
+        self._clock: Ints = np.zeros(CLOCK, np.int64)
         self._interval = GravityInterval(np.eye(3), np.zeros(3), np.zeros(4))
         self._vehicle_values, self._sonar_values = (*self._vehicle,), (*self._sonar,)
         self._interval_values = (*self._interval,)

@@ -28,7 +28,7 @@ import numpy as np
 
 from baselines.euler import euler_from_rates, euler_from_rotation, rates_from_euler, rotation_from_euler
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.kernels import inlined
+from sonar_graph.navigation.kernels import compiled, inlined
 from sonar_graph.navigation.recursion import Integral
 from sonar_graph.navigation.triples import (
     Matrix,
@@ -187,6 +187,23 @@ def correct_pair(x: Floats, P: Floats, n: int, cross_cov: Floats, S: Floats, inn
         for j in range(n):
             P[i, j] -= first[i] * first[j] + second[i] * second[j]
         x[i] += first[i] * y_0 + second[i] * y_1
+    _wrap(x)
+
+
+@compiled
+def correct_by(x: Floats, P: Floats, n: int, cross_cov: Floats, S: Floats, innovation: Floats) -> None:
+    """Correction by m numbers at once: as `correct_pair`, with shapes (m, n), (m, m) and (m,)."""
+    L, w, y = np.linalg.cholesky(S), cross_cov, innovation.copy()
+    for r in range(len(L)):
+        for c in range(r):
+            w[r] -= L[r, c] * w[c]
+            y[r] -= L[r, c] * y[c]
+        w[r] /= L[r, r]
+        y[r] /= L[r, r]
+        for i in range(n):
+            for j in range(n):
+                P[i, j] -= w[r, i] * w[r, j]
+            x[i] += w[r, i] * y[r]
     _wrap(x)
 
 

@@ -12,6 +12,7 @@ from baselines.ekf_landmarks import DetectionColumns, SonarModel, SonarValues, o
 from baselines.ekf_motion import motion_since_node, motion_to_node, nothing_running, told_again
 from baselines.ekf_prediction import (
     DEPTHS,
+    LOST,
     NODE,
     SIGHTINGS,
     GravityInterval,
@@ -80,6 +81,7 @@ def process_window(
     while True:
         kind, event_ns = next_event(depth[0], sample, frame_ns, row, until_ns)
         node_ns = next_node(columns, clock[NODE], event_ns)
+        clock[LOST] |= int((node_ns if node_ns >= 0 else event_ns) - clock[NODE] > vehicle.gap[0])
         if node_ns >= 0:
             motion = motion_to_node(columns, vehicle, x, clock[NODE], node_ns)
             advance_to_node(columns, vehicle, x, P, n, clock, interval, node_ns, motion)
@@ -100,7 +102,8 @@ def process_window(
             if is_gap:
                 clock[SIGHTINGS] += row - first
                 motion = told_again(motion, clock[SIGHTINGS])
-            n = observe_rows(x, P, n, motion, sonar, detections, first, row, outcomes, innovations, covs)
+            was_lost = clock[LOST] > 0
+            n = observe_rows(x, P, n, motion, sonar, detections, first, row, outcomes, innovations, covs, was_lost)
         else:
             return n, (outcomes, innovations, covs), pose_after(x, P, motion)
 

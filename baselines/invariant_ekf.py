@@ -9,7 +9,7 @@ import numpy as np
 
 from baselines.causal import CausalEstimates
 from baselines.ekf_landmarks import DetectionColumns
-from baselines.ekf_prediction import NODE, GravityInterval, open_interval
+from baselines.ekf_prediction import CLOCK, NODE, GravityInterval, open_interval
 from baselines.ekf_window import DepthColumns, DetectionOutcomes, PoseArrays
 from baselines.filter_intake import NO_OUTCOMES, NO_STAMPS, DetectionIntake, check_rows, depth_since
 from baselines.filter_models import FilterParams, sonar_model, vehicle_model
@@ -70,7 +70,7 @@ class InvariantEkf:
         self._estimates = CausalEstimates()
         self._most_rows = SPARE_ROWS
         self._state = start_state(calibration)
-        self._clock: Ints = np.zeros(4, np.int64)
+        self._clock: Ints = np.zeros(CLOCK, np.int64)
         self._interval_values = (*GravityInterval(np.eye(3), np.zeros(3), np.zeros(4)),)
         self._reached_ns, self._done_ns = _NEVER, _LONG_AGO
 

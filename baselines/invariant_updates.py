@@ -23,6 +23,7 @@ from baselines.ekf_landmarks import (
     logged_noise,
     squared_distance,
 )
+from baselines.far_views import by_range_and_azimuth, is_beyond_linear, view_noise
 from baselines.invariant_models import (
     height_of_body_point,
     height_of_point,
@@ -30,7 +31,7 @@ from baselines.invariant_models import (
     missed_up,
     observation,
 )
-from baselines.invariant_state import POINT, InvariantState, correct, motion_matrix, put
+from baselines.invariant_state import BODY, POINT, InvariantState, correct, motion_matrix, put
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.gap_motion import GapMotion
 from sonar_graph.navigation.kernels import compiled
@@ -49,6 +50,7 @@ def observe_rows(
     outcomes: Ints,
     innovations: Floats,
     covs: Floats,
+    was_lost: bool = False,
 ) -> InvariantState:
     """Take in some rows, all of one instant, one after the other.
 
@@ -61,6 +63,9 @@ def observe_rows(
     outcomes, innovations, covs
         Written: USED, NEW, GATED or PASSED_OVER, shape (m,); innovations (m, 2) and their covariances (m, 2, 2), which
         stay as they are where nothing is predicted.
+    was_lost
+        Whether the Doppler log has lost the bottom: from then on views are linearised as in `baselines.far_views`,
+        where it takes that.
 
     Returns
     -------
@@ -75,6 +80,8 @@ def observe_rows(
         elif k == len(state.points):
             state = _augmented(state, motion, sonar, z, R_z)
             outcomes[row] = NEW
+        elif was_lost:
+            outcomes[row] = _observe_far(state, k, motion, sonar, z, R_z, innovations[row], covs[row])
         else:
             outcomes[row] = _observe(state, k, motion, sonar, z, R_z, innovations[row], covs[row])
     return state
@@ -99,6 +106,39 @@ def _observe(
     if not squared_distance(innovation, S) <= sonar.gate:
         return GATED
     correct(state, cross_cov, S, innovation)
+    return USED
+
+
+@compiled
+def _observe_far(
+    state: InvariantState,
+    k: int,
+    motion: GapMotion,
+    sonar: SonarModel,
+    z: tuple[float, float],
+    R_z: Noise,
+    innovation: Floats,
+    S: Floats,
+) -> int:
+    """Correct by a landmark that may be far from where it is predicted, inside the gate: `baselines.far_views`.
+
+    ``Exp(theta)`` turns both points, so that the place where the landmark was seen less the one where it was predicted
+    is ``J_r(theta) (xi_k - xi_new)``: no H of theta, however far they are apart.
+    """
+    point, G, G_m, G_z = location(state, motion, sonar, z, 0.0)
+    missed, H, at = np.array(point) - state.points[k], -G, BODY + POINT * k
+    for r in range(POINT):
+        H[r, at + r] += 1.0
+    cross_cov = H @ state.P
+    cov = _symmetric(cross_cov @ H.T + _blur(G_m, motion))
+    if not is_beyond_linear(cov, G_z, z[0], R_z):
+        return int(_observe(state, k, motion, sonar, z, R_z, innovation, S))
+    cov += _symmetric(G_z @ view_noise(z[0], R_z, sonar.aperture_rad) @ G_z.T)
+    B = by_range_and_azimuth(G_z, z[0])
+    innovation[:], S[:] = B @ missed, _symmetric(B @ cov @ B.T)
+    if not squared_distance(innovation, S) <= sonar.gate:
+        return GATED
+    correct(state, cross_cov, cov, missed)
     return USED
 
 

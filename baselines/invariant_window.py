@@ -10,6 +10,7 @@ import numpy as np
 from baselines.ekf_landmarks import DetectionColumns, SonarModel, SonarValues
 from baselines.ekf_prediction import (
     DEPTHS,
+    LOST,
     NODE,
     OPENED,
     SIGHTINGS,
@@ -80,6 +81,7 @@ def process_window(
     while True:
         kind, event_ns = next_event(depth[0], sample, frame_ns, row, until_ns)
         node_ns = next_node(columns, clock[NODE], event_ns)
+        clock[LOST] |= int((node_ns if node_ns >= 0 else event_ns) - clock[NODE] > vehicle.gap[0])
         if node_ns >= 0:
             _advance_to_node(columns, vehicle, walk_density, state, clock, interval, node_ns)
             continue
@@ -99,7 +101,8 @@ def process_window(
             if is_gap:
                 clock[SIGHTINGS] += row - first
                 motion = told_again_with_bias(motion, clock[SIGHTINGS])
-            state = observe_rows(state, motion, sonar, detections, first, row, outcomes, innovations, covs)
+            was_lost = clock[LOST] > 0
+            state = observe_rows(state, motion, sonar, detections, first, row, outcomes, innovations, covs, was_lost)
         else:
             arrays = state.R, state.points, state.bias, state.P
             return arrays, (outcomes, innovations, covs), pose_after(state, motion)
@@ -119,7 +122,7 @@ def _advance_to_node(
     motion = motion_to_node(columns, vehicle, state.R, state.bias, clock[NODE], node_ns)
     predict(state, motion, walk_density**2 * (node_ns - clock[NODE]) * 1e-9)
     clock[NODE] = node_ns
-    clock[DEPTHS:] = 0
+    clock[DEPTHS:LOST] = 0
     if vehicle.gravity_interval_ns > 0:
         extend_interval(interval, motion.integral)
         if clock[NODE] - clock[OPENED] >= vehicle.gravity_interval_ns:
