@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import DvlCalibration, Start
+from sonar_graph.evaluation.unit_check import wrong_units
 from sonar_graph.logs.adapters.config import LogConfig
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.allan import noise_densities
@@ -52,9 +53,9 @@ class Finding:
     """Whether something should be done."""
 
     def text(self) -> str:
-        """Value with its 95 % interval, and the advice; or why it cannot be told."""
+        """Value with its 95 % interval, and the advice; or why it cannot be told, or what is wrong before that."""
         if not self.estimate.is_known:
-            return f"cannot be told: {self.estimate.reason}"
+            return self.advice if self.acts else f"cannot be told: {self.estimate.reason}"
         return f"{with_interval(self.estimate, self.unit)}: {self.advice}"
 
     def plain(self) -> dict[str, Any]:
@@ -65,7 +66,7 @@ class Finding:
 
 
 def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[Finding]:
-    """Everything that can be told, in the order in which to act.
+    """Everything that can be told, in the order in which to act; wrong units alone, since they spoil the rest.
 
     Parameters
     ----------
@@ -75,6 +76,10 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
         With which it was read: corrections are added to what it says already.
     """
     config = config or LogConfig()
+    faults = wrong_units(sequence, config)
+    if faults:
+        unknown = Estimate1D(np.nan, np.inf, "wrong unit")
+        return [Finding(quantity, unknown, "", advice, acts=True) for quantity, advice in faults]
     of_dvl = list(_of_dvl(sequence, config))
     return [*of_dvl, *_of_reference(sequence, config, of_dvl[0]), *_of_noise(sequence)]
 

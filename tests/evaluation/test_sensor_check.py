@@ -10,8 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.evaluation.sensor_check import Finding, check_sensors, with_interval
+from sonar_graph.evaluation.unit_check import wrong_units
 from sonar_graph.logs.adapters.config import LogConfig
-from sonar_graph.measurements import Dvl
+from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.offset_search import Estimate1D
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
@@ -88,3 +89,49 @@ def test_a_number_that_cannot_be_told_asks_for_nothing():
 def test_digits_are_those_that_the_interval_supports():
     assert with_interval(Estimate1D(1.0312345, 0.0102), "s") == "+1.031 ± 0.020 s"
     assert with_interval(Estimate1D(1.00213, 0.0011), "") == "1.0021 ± 0.0022"
+
+
+UNITS = {  # per unit of the package, what the driver counts, and the name and the line that are to be found
+    "mm/s": ("dvl", 1000.0, "DVL: unit", {"scale": 0.001}),
+    "cm/s": ("dvl", 100.0, "DVL: unit", {"scale": 0.01}),
+    "degrees a second": ("rate", np.degrees(1), "gyro: unit", {"angular_velocity_scale": np.radians(1)}),
+    "g": ("force", 1 / 9.80665, "accelerometer: unit", {"linear_acceleration_scale": 9.80665}),
+    "mm/s²": ("force", 1000.0, "accelerometer: unit", {"linear_acceleration_scale": 0.001}),
+}
+
+
+def in_other_units(sensor: str, factor: float) -> Sequence:
+    imu, dvl = RIGHT.imu, RIGHT.dvl
+    rate = imu.angular_velocity * (factor if sensor == "rate" else 1.0)
+    force = imu.specific_force * (factor if sensor == "force" else 1.0)
+    velocity = dvl.velocity * (factor if sensor == "dvl" else 1.0)
+    return replace(RIGHT, imu=Imu(imu.stamps_ns, rate, force), dvl=Dvl(dvl.stamps_ns, velocity, dvl.velocity_cov))
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_a_wrong_unit_is_named_alone_with_the_line_that_puts_it_right(unit: str):
+    sensor, factor, quantity, line = UNITS[unit]
+    (finding,) = check_sensors(in_other_units(sensor, factor))
+    assert finding.quantity == quantity
+    assert finding.acts
+    assert f": {unit}?" in finding.text()
+    assert tomllib.loads(finding.advice.split("`")[1]) == pytest.approx(line, rel=1e-3)
+
+
+def test_a_wrong_unit_adds_to_what_the_configuration_scales():
+    config = LogConfig.parse({"dvl": {"scale": -2.0}}, "x")
+    (finding,) = check_sensors(in_other_units("dvl", 1000.0), config)
+    assert tomllib.loads(finding.advice.split("`")[1]) == {"scale": -0.002}
+
+
+def test_right_units_are_not_doubted_even_with_spikes_and_rows_that_were_not_measured():
+    rate, force, velocity = (
+        RIGHT.imu.angular_velocity.copy(),
+        RIGHT.imu.specific_force.copy(),
+        RIGHT.dvl.velocity.copy(),
+    )
+    rate[::50], force[::50], velocity[::50] = 1e3, np.nan, 1e3
+    imu = Imu(RIGHT.imu.stamps_ns, rate, force)
+    assert not wrong_units(
+        replace(RIGHT, imu=imu, dvl=Dvl(RIGHT.dvl.stamps_ns, velocity, RIGHT.dvl.velocity_cov)), LogConfig()
+    )
