@@ -37,8 +37,16 @@ COLUMNS = {
 NEES_LEGEND = (
     f"NEES: 1 fits; ▲ above {TOLERATED_FACTOR:g} over-confident, ▼ below {1 / TOLERATED_FACTOR:g} over-cautious"
 )
-SAID_NOTES = ("log.ending", "log.damage", "log.start", "log.stamps")
-"""Notes on the log that are said here; the report has all."""
+SAID_NOTES = {
+    "log.ending": "Log",
+    "log.damage": "Log",
+    "log.start": "Log",
+    "log.stamps": "Log",
+    "log.dropped": "Log, left out",
+    "log.warnings": "Warning",
+    "log.gaps": "Warning",
+}
+"""Notes on the log that are said here, and after which word; the report has all."""
 RECOGNISED_BEFORE = (
     "Sonar images: the detections are those that recognise put into the log; for pictures and outcomes in the report "
     "let compare recognise anew: --rule virtual-evidence"
@@ -128,7 +136,7 @@ def _notes(comparison: Comparison) -> Text:
     lines += lost_runs(comparison)
     lines += refusal_lines(comparison)
     notes = comparison.sequence.notes
-    lines += [f"Log: {notes[subject]}" for subject in SAID_NOTES if subject in notes]
+    lines += [f"{word}: {notes[subject]}" for subject, word in SAID_NOTES.items() if subject in notes]
     lines += _recognition(comparison)
     if not has_detections(comparison):
         lines.append(NO_DETECTIONS)

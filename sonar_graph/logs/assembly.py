@@ -18,18 +18,23 @@ from sonar_graph.logs.adapters.vertical import DepthAdapter
 from sonar_graph.logs.calibration_sources import PartialCalibration, gathered, mounted_by
 from sonar_graph.logs.container import Recording, Topic
 from sonar_graph.logs.decoding import read_detections, read_landmark_map
+from sonar_graph.logs.gaps import gap_warnings
 from sonar_graph.logs.log_record import read_calibration, read_notes, recorded_name
 from sonar_graph.logs.mountings import mounting_of, static_frames
 from sonar_graph.logs.roles import ROLES, Choice
 from sonar_graph.logs.sanity import axes_warning, gravity_warning
+from sonar_graph.logs.spikes import spike_warning
 from sonar_graph.logs.stamp_check import stamp_faults
 from sonar_graph.logs.table import Dropped, Table
+from sonar_graph.logs.usability import require_use, unsaid_noise
 from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
 
 _TABLES = frozenset({"imu", "dvl", "depth", "truth"})
 """Roles whose messages are read as one table."""
+FOUND_ANEW = frozenset({"log.warnings", "log.gaps", "log.noise"})
+"""Notes that say how a log's own rows are; those of an earlier reading may no longer hold."""
 
 T = TypeVar("T")
 A = TypeVar("A", bound=Adapter)
@@ -68,7 +73,7 @@ class Assembly:
         tables = {role: self._table(role, topic) for role, topic in self._topics.items() if role in _TABLES}
         self._tables = {role: table for role, table in tables.items() if table is not None}
         self._is_mounting_known = True
-        self._notes = read_notes(recording)
+        self._notes = {key: note for key, note in read_notes(recording).items() if key not in FOUND_ANEW}
         self._notes["log.topics"] = "; ".join(f"{role}: {topic.name}" for role, topic in self._topics.items())
         changes = list(self._changes())
         if changes:
@@ -84,9 +89,11 @@ class Assembly:
         Raises
         ------
         LogError
-            When no row of IMU or DVL is fit for use, or a message breaks its own rules.
+            When no row of IMU or DVL is fit for use, both have no time in common, no velocity is whole, or a message
+            breaks its own rules.
         """
         imu, dvl = self._needed("imu", self.imu()), self._needed("dvl", self.dvl())
+        require_use(str(self._recording.path), imu, dvl)
         sequence = Sequence(
             name=name or recorded_name(self._recording) or self._recording.path.stem,
             calibration=self.calibration,
@@ -105,9 +112,12 @@ class Assembly:
         stamps = list(self._stamp_faults())
         if stamps:
             self._notes["log.stamps"] = "; ".join(stamps)
-        warnings = list(self.warnings())
-        if warnings:
-            self._notes["log.warnings"] = "; ".join(warnings)
+        found = {
+            "log.warnings": list(self.warnings()),
+            "log.gaps": list(gap_warnings(imu, dvl, self.calibration)),
+            "log.noise": list(unsaid_noise(dvl, sequence.depth, sequence.detections)),
+        }
+        self._notes |= {subject: "; ".join(texts) for subject, texts in found.items() if texts}
         return sequence
 
     def imu(self) -> Imu | None:
@@ -151,11 +161,23 @@ class Assembly:
         for role, table in self._tables.items():
             yield from (f"{role}: {text}" for text in self._adapters[role].warnings(table))
         if "imu" in self._tables and (imu := self.imu()) is not None:
-            text = gravity_warning(imu.specific_force, self.calibration.imu.mounting, self.calibration.gravity_m_s2)
-            yield from [f"imu: {text}"] if text else []
+            yield from (f"imu: {text}" for text in self._inertial_warnings(imu))
         if "dvl" in self._tables and not self._is_mounting_known:
             text = axes_warning(self._adapters["dvl"])
             yield from [f"dvl: {text}"] if text else []
+
+    def _inertial_warnings(self, imu: Imu) -> Iterator[str]:
+        text = gravity_warning(imu.specific_force, self.calibration.imu.mounting, self.calibration.gravity_m_s2)
+        yield from [text] if text else []
+        if self.calibration.odometry_interpolation == "linear":  # held rates may jump
+            text = spike_warning(imu)
+            yield from [text] if text else []
+
+    def _gaps(self) -> Iterator[str]:
+        imu = self.imu() if "imu" in self._tables else None
+        dvl = self.dvl() if "dvl" in self._tables else None
+        if imu is not None and dvl is not None:
+            yield from gap_warnings(imu, dvl, self.calibration)
 
     def _stamp_faults(self) -> Iterator[str]:
         for role, table in self._tables.items():
@@ -163,12 +185,9 @@ class Assembly:
 
     def survey(self) -> tuple[list[str], list[str]]:
         """What is left out and what looks wrong in all that was chosen, be it enough for a sequence or not."""
-        if "imu" in self._tables:
-            self.imu()
-        if "dvl" in self._tables:
-            self.dvl()
+        gaps = list(self._gaps())
         self.depth(), self.detections(), self.truth()
-        return self.left_out(), list(self.warnings())
+        return self.left_out(), [*self.warnings(), *gaps]
 
     def _changes(self) -> Iterator[str]:
         """What was said about topics beyond the adapters that come along."""

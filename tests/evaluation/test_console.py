@@ -73,6 +73,21 @@ def test_a_log_that_is_cut_off_or_has_holes_is_told():
     assert "Log: bytes 3 to 5: chunk 2 is lost" in printed(cut)
 
 
+def test_what_looks_wrong_in_a_log_is_told_and_so_is_what_was_left_out_of_it():
+    comparison = basin_comparison(60)
+    notes = {
+        "log.warnings": "imu: 1 angular rate stands out",
+        "log.gaps": "dvl: no velocity 10.000 to 30.000 s after the start",
+        "log.dropped": "dvl: 5 with values that are not finite",
+        "log.noise": "dvl: 5 of 5 rows say no covariance",
+    }
+    text = printed(replace(comparison, sequence=replace(comparison.sequence, notes=notes)))
+    assert "Warning: imu: 1 angular rate stands out" in text
+    assert "Warning: dvl: no velocity 10.000 to 30.000 s after the start" in text
+    assert "Log, left out: dvl: 5 with values that are not finite" in text
+    assert "say no covariance" not in text
+
+
 def test_a_nees_outside_its_interval_is_marked():
     comparison = basin_comparison(60)
     score = Score(3.0, "1", "By hand.", (0.9, 1.1), "inside")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -277,11 +278,32 @@ def test_a_start_pose_of_the_logs_beginning_is_said_to_be_of_another_instant(
 
 def test_stamps_that_run_backwards_or_beside_the_log_are_in_the_notes(bench: Any) -> None:
     _, dvl = bench.basics()
-    late = [bench.t0_ns + i * STEP_NS - 60 * 10**9 for i in (0, 2, 1, 3)]
+    late = [bench.t0_ns + i * STEP_NS - 60 * 10**9 for i in (0, 2, 1, 3)] + [bench.t0_ns]
     sequence = read_sequence(bench.write(("/imu", "imu", [bench.imu(s) for s in late]), dvl))
     assert "imu: once backwards, by 0.1 s" in sequence.notes["log.stamps"]
     assert "imu: stamped 60 s before recording" in sequence.notes["log.stamps"]
     assert "dvl" not in sequence.notes["log.stamps"]
+
+
+def test_sensors_of_two_clocks_are_refused(bench: Any) -> None:
+    _, dvl = bench.basics()
+    late = [bench.t0_ns + i * STEP_NS - 3600 * 10**9 for i in range(4)]
+    path = bench.write(("/imu", "imu", [bench.imu(s) for s in late]), dvl)
+    with pytest.raises(LogError, match=rf"{path.name}: IMU from .* DVL from .*: no common time"):
+        read_sequence(path)
+
+
+def test_gaps_of_this_reading_count_and_not_those_of_an_earlier_one(make_sequence: Any, tmp_path: Path) -> None:
+    whole = replace(make_sequence(), notes={"log.gaps": "dvl: no velocity for a day", "log.warnings": "of yesterday"})
+    write_sequence(tmp_path / "a.mcap", whole)
+    notes = read_sequence(tmp_path / "a.mcap").notes
+    assert "a day" not in notes.get("log.gaps", "")
+    assert "yesterday" not in notes.get("log.warnings", "")
+    rows = whole.dvl.stamps_ns
+    sparse = whole.dvl.rows((rows == rows[0]) | (rows == rows[-1]))
+    few = Calibration.model_validate(whole.calibration.model_dump() | {"dvl": {"gap_s": 1e-3}})
+    write_sequence(tmp_path / "b.mcap", replace(whole, dvl=sparse, calibration=few))
+    assert "dvl: no velocity 0.000 to" in read_sequence(tmp_path / "b.mcap").notes["log.gaps"]
 
 
 def test_a_flipped_bit_in_the_calibration_is_never_read_as_a_number(make_sequence: Any, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -13,6 +14,8 @@ from sonar_graph.logs.table import Table
 from sonar_graph.measurements import Floats
 
 Reading = Literal["unknown", "invalid"]
+ROUNDING = 1e-6
+"""Of the largest eigenvalue: single precision may leave the smallest this far below zero."""
 
 
 class CovarianceFields(Section):
@@ -36,8 +39,21 @@ class CovarianceFields(Section):
         invalid = (negative & (self.negative == "invalid")) | (zero & (self.zero == "invalid"))
         if self.meaning == "standard deviation":
             matrices = matrices**2 * np.eye(3)
-        unknown = negative | zero | ~np.isfinite(matrices).all(axis=(1, 2))
+        unknown = negative | zero | ~np.isfinite(matrices).all(axis=(1, 2)) | _is_indefinite(matrices)
         return np.where(unknown[:, None, None], np.nan, matrices), invalid
+
+    def warnings(self, table: Table) -> Iterator[str]:
+        """How many messages have what no errors can have."""
+        if self.meaning == "standard deviation":
+            return
+        matrices = self._matrices(table)
+        indefinite: NDArray[np.bool_] = _is_indefinite(matrices) & (matrices[:, 0, 0] >= 0)
+        count = np.count_nonzero(indefinite)
+        if count:
+            yield (
+                f"{', '.join(self.fields)}: no covariance in {count} of {len(table)} messages, since some direction's "
+                f"variance is negative: the calibration's noise is taken there"
+            )
 
     def read_variance(self, table: Table) -> Floats:
         """One variance a row from one field, shape (n,); NaN: unknown (zero, negative, not finite)."""
@@ -59,6 +75,14 @@ class CovarianceFields(Section):
             table.refuse(self.fields[0], f"has {column.shape[1]} numbers; a covariance has 1, 9 or 36")
         side = 3 if column.shape[1] == 9 else 6
         return column.reshape(-1, side, side)[:, :3, :3]
+
+
+def _is_indefinite(matrices: Floats) -> NDArray[np.bool_]:
+    """Matrices with a negative eigenvalue beyond rounding, shape (n,); none where a number is not finite."""
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    symmetric = np.where(np.asarray(finite)[:, None, None], matrices + np.swapaxes(matrices, 1, 2), 0.0)
+    variances: Floats = np.linalg.eigvalsh(symmetric)
+    return np.asarray(variances[:, 0] < -ROUNDING * np.abs(variances).max(axis=1))
 
 
 def _diagonal(values: Floats) -> Floats:

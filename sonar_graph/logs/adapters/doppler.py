@@ -79,6 +79,8 @@ class DvlAdapter(Adapter):
 
     def warnings(self, table: Table) -> Iterator[str]:
         """What in the messages contradicts itself, although it can be read."""
+        if self.covariance is not None and not (self._is_by_beams and self.beams and self.beams.sigma_m_s):
+            yield from self.covariance.warnings(table)
         if self.beam_unit_vectors is not None:
             vectors = np.stack([table.column(path)[0] for path in self.beam_unit_vectors], axis=-1)
             fault = unit_vector_warning(vectors, self.beams)

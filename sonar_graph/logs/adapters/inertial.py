@@ -39,7 +39,7 @@ class ImuAdapter(Adapter):
         """The rows with an angular rate; specific force is NaN where it was not measured."""
         rate = _scaled(table.beside(self.angular_velocity), self.angular_velocity_scale)
         force = _scaled(table.beside(self.linear_acceleration), self.linear_acceleration_scale)
-        unmeasured = _is_marked(table, self.linear_acceleration_status)
+        unmeasured = _is_marked(table, self.linear_acceleration_status) | self._is_force_unfilled(table)
         force = np.where(unmeasured[:, None] | ~np.isfinite(force), np.nan, force)
         faults = {
             "without angular rate": _is_marked(table, self.angular_velocity_status),
@@ -48,6 +48,17 @@ class ImuAdapter(Adapter):
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
         rate, force = turn(self.rotation, rate[rows]), turn(self.rotation, force[rows])
         return (Imu(table.stamps_ns[rows], rate, force) if rows.size else None), dropped
+
+    def warnings(self, table: Table) -> Iterator[str]:
+        """That a driver leaves the specific force as it was made."""
+        if self._is_force_unfilled(table):
+            names = ", ".join(self.linear_acceleration)
+            yield f"{names} are 0 in every message, which no accelerometer measures: taken as not measured"
+
+    def _is_force_unfilled(self, table: Table) -> bool:
+        """Whether it is zero throughout: not even free fall is that."""
+        said = table.beside(self.linear_acceleration)[~_is_marked(table, self.linear_acceleration_status)]
+        return bool(len(said)) and not said.any()
 
 
 def _scaled(values: np.ndarray, scale: float) -> np.ndarray:

@@ -321,3 +321,34 @@ def test_z_down_by_definition_is_mentioned_where_nothing_says_how_the_instrument
     link["transform"] = {"translation": foreign.vector(0, 0, 0), "rotation": {"x": 1.0, "y": 0.0, "z": 0.0, "w": 0.0}}
     tree = ("/tf_static", "tf2_msgs/msg/TFMessage", [{"transforms": [link]}])
     assert "log.warnings" not in read(foreign.imu(), entry, tree).notes
+
+
+INDEFINITE = [1.0, 2.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+
+
+def test_a_covariance_that_no_errors_can_have_is_not_used_and_named(foreign: Any, read: Any) -> None:
+    topic, kind, messages = foreign.dvl()
+    for message, covariance in zip(messages, [KNOWN, INDEFINITE, [0.0] * 9, INDEFINITE, KNOWN], strict=True):
+        message["velocity_covar"] = covariance
+    sequence = read(foreign.imu(), (topic, kind, messages))
+    unknown = np.isnan(sequence.dvl.velocity_cov).all(axis=(1, 2))
+    assert unknown.tolist() == [False, True, True, True, False]
+    assert "dvl: velocity_covar: no covariance in 2 of 5 messages" in sequence.notes["log.warnings"]
+    assert sequence.notes["log.noise"].startswith("dvl: 3 of 5 rows say no covariance, dvl.velocity_sigma_m_s")
+
+
+def test_a_covariance_of_one_direction_only_is_one_to_rounding(foreign: Any, read: Any) -> None:
+    topic, kind, messages = foreign.dvl()
+    along = np.outer([1, 1, 1], [1, 1, 1]) * 1e-4
+    for message in messages:
+        message["velocity_covar"] = along.astype(np.float32).astype(float).ravel().tolist()
+    notes = read(foreign.imu(), (topic, kind, messages)).notes
+    assert "no covariance" not in notes["log.warnings"] + notes.get("log.noise", "")
+
+
+def test_one_beam_throughout_is_refused(foreign: Any, read: Any) -> None:
+    rows = np.full((5, 4), 0.3)
+    rows[:, 1:] = np.nan
+    toml = TABLE + f'beams = {{velocity = "velocity", sigma_m_s = 0.02, {GEOMETRY}}}\nstamp = "log"'
+    with pytest.raises(LogError, match="DVL: too few valid beams in all 5 rows"):
+        read(foreign.imu(), packets(rows.tolist()), toml=toml)

@@ -34,6 +34,29 @@ def test_gravity_that_is_not_felt_upwards_is_mentioned(
     assert warned is None or warned in notes["log.warnings"]
 
 
+def test_a_force_that_is_zero_throughout_was_not_measured(foreign: Any, read: Any) -> None:
+    dvl = '[dvl]\nrotation = "frd"\nsound_speed = false'
+    sequence = read(foreign.imu(force=(0, 0, 0)), foreign.dvl(), toml=dvl)
+    assert np.isnan(sequence.imu.specific_force).all()
+    assert sequence.notes["log.warnings"] == (
+        "imu: linear_acceleration.x, linear_acceleration.y, linear_acceleration.z are 0 in every message, which no "
+        "accelerometer measures: taken as not measured"
+    )
+
+
+def test_a_force_that_is_zero_once_was_measured(foreign: Any, read: Any) -> None:
+    topic, kind, messages = foreign.imu()
+    messages[2]["linear_acceleration"] = foreign.vector(0, 0, 0)
+    np.testing.assert_array_equal(read((topic, kind, messages), foreign.dvl()).imu.specific_force[2], [0, 0, 0])
+
+
+def test_a_wild_angular_rate_is_mentioned(foreign: Any, read: Any) -> None:
+    topic, kind, messages = foreign.imu(rows=300)
+    messages[150]["angular_velocity"] = foreign.vector(0, 0, 30)
+    notes = read((topic, kind, messages), foreign.dvl(rows=300)).notes
+    assert "imu: 1 angular rate stands out from both neighbours, by 30 rad/s" in notes["log.warnings"]
+
+
 @pytest.mark.parametrize("force", [(9.8, 0, 0), (-9.8, 0, 0), (0, 9.8, 0), (0, -9.8, 0), (0, 0, -9.8)])
 def test_the_rotation_that_a_warning_proposes_puts_gravity_right(
     foreign: Any, read: Any, force: tuple[float, ...]

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sonar_graph.calibration import Calibration, DvlCalibration
+from sonar_graph.doppler_beams import UNMEASURED_M_S
+from sonar_graph.logs.gaps import gap_warnings
+from sonar_graph.measurements import Dvl, Floats, Imu
+
+UPWARDS = (0.0, 0.0, 9.8)
+
+
+def stamps(times_s: Floats) -> Any:
+    return np.rint((1000.0 + times_s) * 1e9).astype(np.int64)
+
+
+def imu(times_s: Floats | None = None, force: tuple[float, ...] = UPWARDS) -> Imu:
+    at_s = np.arange(0, 300, 0.01) if times_s is None else times_s
+    return Imu(stamps(at_s), np.zeros((len(at_s), 3)), np.tile(force, (len(at_s), 1)))
+
+
+def dvl(times_s: Floats | None = None, partial: Any = False) -> Dvl:
+    at_s = np.arange(0, 300, 0.2) if times_s is None else times_s
+    cov = np.tile(1e-4 * np.eye(3), (len(at_s), 1, 1))
+    cov[np.broadcast_to(partial, len(at_s)), 1, 1] = UNMEASURED_M_S**2
+    return Dvl(stamps(at_s), np.ones((len(at_s), 3)), cov)
+
+
+def without(times_s: Floats, *spans_s: tuple[float, float]) -> Floats:
+    for first_s, last_s in spans_s:
+        times_s = times_s[(times_s <= first_s) | (times_s >= last_s)]
+    return times_s
+
+
+PINGS, SAMPLES = np.arange(1500) * 0.2, np.arange(30000) * 0.01
+
+
+def test_whole_logs_have_nothing_to_say() -> None:
+    assert list(gap_warnings(imu(), dvl(), Calibration())) == []
+
+
+def test_a_gap_of_the_doppler_log_is_named_with_its_times_and_what_bridges_it() -> None:
+    (text,) = gap_warnings(imu(), dvl(without(PINGS, (100, 220))), Calibration())
+    assert text.startswith("dvl: no velocity 100.000 to 220.000 s after the start: bridged by the IMU")
+    nothing_felt = imu(force=(float("nan"),) * 3)
+    (text,) = gap_warnings(nothing_felt, dvl(without(PINGS, (100, 220))), Calibration())
+    assert "100.000 to 220.000 s after the start, and no accelerometer: bridged by a random walk" in text
+
+
+@pytest.mark.parametrize(("gap_s", "is_named"), [(1.4, False), (1.6, True)])
+def test_a_gap_is_what_the_calibration_calls_one(gap_s: float, is_named: bool) -> None:
+    calibration = Calibration(dvl=DvlCalibration(gap_s=1.5))
+    pings = np.concatenate([PINGS[:500], PINGS[500:] - PINGS[500] + PINGS[499] + gap_s])
+    assert bool(list(gap_warnings(imu(), dvl(pings), calibration))) is is_named
+
+
+def test_pings_of_too_few_beams_are_named_as_such() -> None:
+    (text,) = gap_warnings(imu(), dvl(PINGS, (PINGS > 100) & (PINGS < 130)), Calibration())
+    assert text.startswith("dvl: too few beams for a whole velocity 100.000 to 130.000 s after the start")
+    (text,) = gap_warnings(imu(), dvl(PINGS, PINGS < 12), Calibration())
+    assert text == "dvl: no whole velocity until 12.000 s after the start: too few beams"
+
+
+def test_a_hole_in_the_imu_is_named_with_its_times() -> None:
+    (text,) = gap_warnings(imu(without(SAMPLES, (100, 110))), dvl(), Calibration())
+    assert text.startswith("imu: no sample 100.000 to 110.000 s after the start: the turn in between is guessed")
+
+
+def test_a_few_lost_samples_are_no_hole() -> None:
+    assert list(gap_warnings(imu(without(SAMPLES, (100, 100.04))), dvl(), Calibration())) == []
+
+
+def test_of_many_holes_the_longest_are_named_and_all_are_counted() -> None:
+    holes = [(10.0 * k, 10.0 * k + 0.1 * k) for k in range(1, 7)]
+    (text,) = gap_warnings(imu(without(SAMPLES, *holes)), dvl(), Calibration())
+    expected = "in 6 gaps of 2.1 s together, the longest 40.000 to 40.400, 50.000 to 50.500, 60.000 to 60.600 s"
+    assert expected in text
+
+
+def test_times_count_from_the_first_instant_with_both() -> None:
+    (text,) = gap_warnings(imu(without(SAMPLES, (100, 110))), dvl(PINGS[50:]), Calibration())
+    assert "90.000 to 100.000 s after the start" in text
+
+
+def test_samples_that_hold_for_the_time_before_them_leave_no_gap() -> None:
+    held = Calibration(odometry_interpolation="hold-past")
+    assert list(gap_warnings(imu(without(SAMPLES, (100, 110))), dvl(without(PINGS, (100, 220))), held)) == []
