@@ -9,6 +9,7 @@
     ├── LogError                a file cannot be read as what it should be
     │   ├── MissingTopicError   ... because a needed topic is not in it
     │   └── DatasetError        ... because a data set's folder or file is not what a converter expects
+    ├── AlignmentError          attitude and gyro bias cannot be told from a stretch of a run
     ├── EstimatorError          an estimator cannot be set up or go on
     │   └── UnknownEstimatorError
     └── EvaluationError         a comparison or report cannot be made
@@ -44,6 +45,10 @@ class MissingTopicError(LogError):
 
 class DatasetError(LogError):
     """A data set's folder or file is not what its converter expects."""
+
+
+class AlignmentError(SonarGraphError):
+    """Attitude and gyro bias cannot be told from a stretch of a run."""
 
 
 class EstimatorError(SonarGraphError):

@@ -1,0 +1,135 @@
+"""Simulated vehicles that sway and turn; truth by formulas and by differences of attitudes, no code shared."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.errors import AlignmentError
+from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.navigation import InitialTilt, align_in_motion
+
+G, HZ, DVL_EVERY, LENGTH_S = 9.80665, 100, 20, 15.0
+EARTH, LATITUDE = 7.292115e-5, np.radians(40.0)
+LEVER_M = np.array([0.4, -0.1, 0.2])
+KNOWN = Calibration(
+    imu=ImuCalibration(
+        gyro_noise_density=1e-4,
+        gyro_bias_sigma=1e-3,
+        accel_noise_density=1e-3,
+        accel_bias_sigma=1e-2,
+        mounting=Mounting(translation_m=(0.4, -0.1, 0.2)),
+    ),
+    dvl=DvlCalibration(velocity_sigma_m_s=(0.005, 0.005, 0.005)),
+)
+WITH_EARTH = KNOWN.model_copy(update={"earth_rate_latitude_rad": LATITUDE})
+T = np.arange(round(LENGTH_S * HZ) + 1) / HZ
+FINE_S = 1e-4
+
+
+def attitude(t, yaw):
+    """world_R_body."""
+    angles = np.stack([yaw + 0.25 * t, 0.1 + 0.1 * np.sin(0.7 * t), -0.2 + 0.15 * np.cos(0.5 * t)], axis=-1)
+    return Rotation.from_euler("ZYX", angles)
+
+
+def velocity(t):
+    """In the world, of the IMU's point."""
+    return np.stack([0.5 + 0.3 * np.sin(0.6 * t), 0.4 * np.cos(0.4 * t), 0.1 * np.sin(0.9 * t)], axis=-1)
+
+
+def acceleration(t):
+    return np.stack([0.18 * np.cos(0.6 * t), -0.16 * np.sin(0.4 * t), 0.09 * np.cos(0.9 * t)], axis=-1)
+
+
+def run(rng, yaw=0.0, earth=0.0, noise=1.0) -> tuple[Imu, Dvl, np.ndarray]:
+    """Readings, and what they should give: roll, pitch, gyro bias."""
+    sensors, body_R_world = KNOWN.imu, attitude(T, yaw).inv()
+    world_rate = earth * np.array([0.0, np.cos(LATITUDE), np.sin(LATITUDE)])
+    turn = attitude(T - FINE_S, yaw).inv() * attitude(T + FINE_S, yaw)
+    rate = turn.as_rotvec() / (2 * FINE_S)
+    coriolis = 2.0 * np.cross(world_rate, velocity(T))
+    force = body_R_world.apply(acceleration(T) + coriolis + [0, 0, G])
+    gyro_bias, accel_bias = (
+        noise * np.array([[sensors.gyro_bias_sigma], [sensors.accel_bias_sigma]]) * (rng.standard_normal((2, 3)))
+    )
+    white = noise * np.sqrt(HZ) * rng.standard_normal((2, len(T), 3))
+    stamps_ns = np.round(T * 1e9).astype(np.int64)
+    imu = Imu(
+        stamps_ns,
+        rate + body_R_world.apply(world_rate) + gyro_bias + sensors.gyro_noise_density * white[0],
+        force + accel_bias + sensors.accel_noise_density * white[1],
+    )
+    rows = slice(0, None, DVL_EVERY)
+    at_dvl = (body_R_world.apply(velocity(T)) - np.cross(rate, LEVER_M))[rows]
+    at_dvl = at_dvl + noise * 0.005 * rng.standard_normal(at_dvl.shape)
+    dvl = Dvl(stamps_ns[rows], at_dvl, np.full((len(at_dvl), 3, 3), np.nan))
+    _, pitch, roll = attitude(np.zeros(1), yaw).as_euler("ZYX")[0]
+    return imu, dvl, np.array([roll, pitch, *gyro_bias])
+
+
+def error_of(found: InitialTilt, truth: np.ndarray) -> np.ndarray:
+    return np.array([found.roll_rad, found.pitch_rad, *found.gyro_bias]) - truth
+
+
+def mean_nees(known: Calibration, earth: float, runs: int, seed: int) -> float:
+    rng, squares = np.random.default_rng(seed), []
+    for _ in range(runs):
+        imu, dvl, truth = run(rng, rng.uniform(-np.pi, np.pi), earth)
+        found = align_in_motion(imu, dvl, known)
+        error = error_of(found, truth)
+        squares.append(error @ np.linalg.solve(found.covariance, error))
+    return float(np.mean(squares) / 5)
+
+
+def test_a_noiseless_run_gives_what_was_put_in():
+    imu, dvl, truth = run(np.random.default_rng(0), noise=0.0)
+    assert error_of(align_in_motion(imu, dvl, KNOWN), truth) == pytest.approx(np.zeros(5), abs=2e-6)
+
+
+@pytest.mark.parametrize(("known", "earth"), [(KNOWN, 0.0), (WITH_EARTH, EARTH)])
+def test_what_is_claimed_is_what_many_runs_err_by(known, earth):
+    runs = 150
+    low, high = chi2.ppf([0.0005, 0.9995], 5 * runs) / (5 * runs)
+    assert low < mean_nees(known, earth, runs, 1) < high
+
+
+def test_accelerations_taken_for_gravity_would_tilt_the_vehicle():
+    """The mean force of a moving vehicle is no vertical."""
+    imu, dvl, truth = run(np.random.default_rng(2))
+    found = align_in_motion(imu, dvl, KNOWN)
+    still = Dvl(dvl.stamps_ns, np.zeros_like(dvl.velocity), dvl.velocity_cov)
+    assert np.abs(error_of(found, truth)[:2]).max() < 4 * np.sqrt(np.diag(found.covariance)[:2].max())
+    with pytest.raises(AlignmentError, match="velocities and accelerations differ"):
+        align_in_motion(imu, still, KNOWN)
+
+
+def test_a_bias_of_which_nothing_is_told_keeps_its_prior():
+    """A body that keeps level and straight says nothing of the bias about the vertical."""
+    n = round(20 * HZ)
+    imu = Imu(np.arange(n) * (10**9 // HZ), np.zeros((n, 3)), np.tile([0, 0, G], (n, 1)))
+    dvl = Dvl(np.arange(80) * 200_000_000, np.zeros((80, 3)), np.full((80, 3, 3), np.nan))
+    found = align_in_motion(imu, dvl, KNOWN)
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert found.bias_is_observed.tolist() == [True, True, False]
+    assert sigma[4] == pytest.approx(1e-3, rel=1e-3)
+    assert sigma[:2] == pytest.approx([1e-2 / G] * 2, rel=0.05)  # the accelerometers' bias: it did not turn
+
+
+def test_turning_tells_tilt_from_accelerometer_bias():
+    imu, dvl, _ = run(np.random.default_rng(3))
+    found = align_in_motion(imu, dvl, KNOWN)
+    assert found.bias_is_observed.all()
+    assert np.sqrt(np.diag(found.covariance)[:2]).max() < 0.85 * 1e-2 / G
+
+
+def test_too_few_samples_are_refused():
+    imu, dvl, _ = run(np.random.default_rng(4))
+    with pytest.raises(AlignmentError, match="5 Doppler samples"):
+        align_in_motion(imu, dvl.rows(slice(0, 5)), KNOWN)
+    mute = Imu(imu.stamps_ns, imu.angular_velocity, np.full_like(imu.specific_force, np.nan))
+    with pytest.raises(AlignmentError, match="needs accelerometers"):
+        align_in_motion(mute, dvl, KNOWN)
