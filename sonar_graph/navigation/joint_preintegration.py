@@ -175,7 +175,12 @@ class JointPreintegrator:
 
     @classmethod
     def from_calibration(cls, calibration: Calibration, rule: DopplerRule = "inertial") -> JointPreintegrator:
-        """Pick the numbers from a calibration."""
+        """Pick the numbers from a calibration.
+
+        ``earth_rate_latitude_rad`` is not among them: what the Earth's rotation is in body frame i depends on the
+        attitude there, so `integrate` takes it anew for each motion,
+        ``world_T_i.rotation().unrotate(earth_rate_in_world(calibration))`` (`sonar_graph.navigation.earth`).
+        """
         imu, dvl = calibration.imu, calibration.dvl
         return cls(
             imu.gyro_noise_density,
