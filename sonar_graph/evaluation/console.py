@@ -8,6 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sonar_graph.evaluation.landmark_table import PAPER, LandmarkTable, landmark_table
+from sonar_graph.evaluation.log_doubts import doubt_lines
 from sonar_graph.evaluation.published_experiment import repeats_published
 from sonar_graph.evaluation.refusals import refusal_lines
 from sonar_graph.evaluation.results import Comparison, RunResult
@@ -37,16 +38,6 @@ COLUMNS = {
 NEES_LEGEND = (
     f"NEES: 1 fits; ▲ above {TOLERATED_FACTOR:g} over-confident, ▼ below {1 / TOLERATED_FACTOR:g} over-cautious"
 )
-SAID_NOTES = {
-    "log.ending": "Log",
-    "log.damage": "Log",
-    "log.start": "Log",
-    "log.stamps": "Log",
-    "log.dropped": "Log, left out",
-    "log.warnings": "Warning",
-    "log.gaps": "Warning",
-}
-"""Notes on the log that are said here, and after which word; the report has all."""
 RECOGNISED_BEFORE = (
     "Sonar images: the detections are those that recognise put into the log; for pictures and outcomes in the report "
     "let compare recognise anew: --rule virtual-evidence"
@@ -135,8 +126,7 @@ def _notes(comparison: Comparison) -> Text:
     lines = [f"{run.estimator} failed: {run.reason}" for run in failed_runs(comparison)]
     lines += lost_runs(comparison)
     lines += refusal_lines(comparison)
-    notes = comparison.sequence.notes
-    lines += [f"{word}: {notes[subject]}" for subject, word in SAID_NOTES.items() if subject in notes]
+    lines += doubt_lines(comparison.sequence.notes)
     lines += _recognition(comparison)
     if not has_detections(comparison):
         lines.append(NO_DETECTIONS)

@@ -14,6 +14,7 @@ from markupsafe import Markup
 from sonar_graph.evaluation.figure_style import ESTIMATOR_COLOURS
 from sonar_graph.evaluation.illustrations import illustrations
 from sonar_graph.evaluation.landmark_table import PAPER, landmark_table
+from sonar_graph.evaluation.log_doubts import warning_lines
 from sonar_graph.evaluation.published_experiment import repeats_published
 from sonar_graph.evaluation.recognition_section import recognition_content
 from sonar_graph.evaluation.refusals import by_runs
@@ -54,6 +55,7 @@ def _content(comparison: Comparison) -> dict[str, Any]:
         "summary": _summary(comparison),
         "finding": finding(comparison),
         "failed": failed_runs(comparison),
+        "doubts": warning_lines(comparison.sequence.notes),
         "runs": comparison.runs,
         "colours": len(ESTIMATOR_COLOURS),
         "blocks": score_blocks(comparison),

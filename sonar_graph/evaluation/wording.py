@@ -14,7 +14,7 @@ TOO_CLOSE = 0.05
 CONSISTENCY_KEYS = {"position": "causal.nees_position", "yaw": "causal.nees_yaw"}
 TOLERATED_FACTOR = 2.0
 """How far from 1 a normalised squared error may lie where no interval is known, before it is called inconsistent."""
-NO_DETECTIONS = "The log has no landmark detections; without them every estimator is dead reckoning."
+NO_DETECTIONS = "The log has no landmark detections; without them nothing corrects the drift."
 
 HEADLINES = {
     "ate_se2_m": "RMS after SE(2) alignment",

@@ -60,9 +60,9 @@ def test_a_nees_is_marked_by_the_rule_of_the_legend():
 
 def test_a_log_without_detections_is_told():
     comparison = basin_comparison(60)
-    assert "dead reckoning." not in printed(comparison)
+    assert "corrects the drift." not in printed(comparison)
     blind = replace(comparison, sequence=replace(comparison.sequence, detections=None))
-    assert "without them every estimator is dead reckoning." in " ".join(printed(blind, 120).split())
+    assert "without them nothing corrects the drift." in " ".join(printed(blind, 120).split())
 
 
 def test_a_log_that_is_cut_off_or_has_holes_is_told():

@@ -129,6 +129,15 @@ def test_a_failed_run_is_named_first_with_its_reason_escaped(comparison):
     }
 
 
+def test_what_puts_a_log_in_doubt_stands_at_the_top(comparison):
+    notes = {"log.gaps": "imu: no sample 3.000 to 9.000 s after the start", "log.noise": "dvl: 5 of 5 rows"}
+    page = render_report(replace(comparison, sequence=replace(comparison.sequence, notes=notes)))
+    top = page[: page.index('class="summary"')]
+    assert "Warning: imu: no sample 3.000 to 9.000 s after the start" in top
+    assert "5 of 5 rows" not in top
+    assert "Warning:" not in render_report(replace(comparison, sequence=replace(comparison.sequence, notes={})))
+
+
 def test_what_a_log_or_an_estimator_says_is_escaped_everywhere(comparison):
     hostile = '"><script>alert(1)</script>'
     sequence = replace(comparison.sequence, name=hostile, notes={hostile: hostile})
