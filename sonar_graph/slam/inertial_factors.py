@@ -28,8 +28,10 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
+from sonar_graph.errors import MeasurementError
 from sonar_graph.kernels import compiled
 from sonar_graph.measurements import Floats
+from sonar_graph.navigation import argument_checks as check
 from sonar_graph.navigation.joint_preintegration import DISPLACEMENT, ROTATION, JointMotion
 from sonar_graph.navigation.kernels import left_jacobian, rotation_exp, skew
 from sonar_graph.slam.factors import gaussian
@@ -71,11 +73,22 @@ def inertial_doppler_odometry(
         In the world, shape (3,), m/s²; (0, 0, -9.81) where z is up.
     scale, mounting
         Keys; None: as calibrated.
+
+    Raises
+    ------
+    MeasurementError
+        When gravity is no vector, a key is given twice or is no integer, or the motion's specific force was not
+        measured.
     """
     keys = [pose_i, velocity_i, pose_j, velocity_j, bias]
     columns = [POSE_I, VELOCITY_I, POSE_J, VELOCITY_J, BIAS]
     keys, columns = _with_calibration(keys, columns, scale, mounting)
-    terms = _Terms(motion, gravity)
+    terms = _Terms(motion, check.vector("gravity", gravity, 3))
+    if not np.isfinite(motion.velocity).all():
+        raise MeasurementError(
+            f"motion: from {motion.start_ns} to {motion.end_ns} ns the specific force was not measured in every row;"
+            " use doppler_odometry"
+        )
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
         speeds = values.atPoint3(velocity_i), values.atPoint3(velocity_j)
@@ -116,7 +129,15 @@ def _with_calibration(
 ) -> tuple[list[int], list[slice]]:
     """The keys and columns with those of the calibration that is estimated."""
     extra = [(key, column) for key, column in ((scale, SCALE), (mounting, MOUNTING)) if key is not None]
-    return [*keys, *(key for key, _ in extra)], [*columns, *(column for _, column in extra)]
+    keys = [*keys, *(key for key, _ in extra)]
+    for key in keys:
+        if not isinstance(key, int | np.integer):
+            raise MeasurementError(f"keys: expected integers, such as gtsam.symbol('x', 0), not {key!r}")
+        if keys.count(key) > 1:
+            raise MeasurementError(
+                f"keys: {gtsam.DefaultKeyFormatter(key)} is given twice; each variable needs its own"
+            )
+    return keys, [*columns, *(column for _, column in extra)]
 
 
 class _Terms:

@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, C, M, V, X
 
+from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.joint_preintegration import JointMotion, JointPreintegrator
 from sonar_graph.slam.inertial_factors import doppler_odometry, inertial_doppler_odometry, rotation_log
@@ -137,3 +140,30 @@ def test_rotation_log_is_that_of_gtsam(angle):
     for axis in np.vstack([np.eye(3), -np.eye(3), np.array([[0.6, 0.0, -0.8], [-0.48, 0.6, 0.64]])]):
         R = gtsam.Rot3.Expmap(angle * axis).matrix()
         assert rotation_log(R) == pytest.approx(angle * axis, abs=1e-9)
+
+
+@pytest.mark.parametrize("gravity", [9.81, np.array([0.0, 9.81]), np.array([0.0, 0.0, np.nan])])
+def test_gravity_is_a_vector(gravity):
+    """A number alone was added to all three axes."""
+    with pytest.raises(MeasurementError, match="gravity: expected"):
+        inertial_doppler_odometry(X(0), V(0), X(1), V(1), B(0), some_motion(1), gravity)
+
+
+def test_keys_are_integers_and_differ():
+    motion = some_motion(1)
+    with pytest.raises(MeasurementError, match="keys: x0 is given twice"):
+        doppler_odometry(X(0), X(0), B(0), motion)
+    with pytest.raises(MeasurementError, match="keys: b0 is given twice"):
+        inertial_doppler_odometry(X(0), V(0), X(1), V(1), B(0), motion, GRAVITY, mounting=B(0))
+    with pytest.raises(MeasurementError, match=r"keys: expected integers, .* not 'x0'"):
+        doppler_odometry("x0", "x1", "b0", motion)
+
+
+def test_twelve_rows_need_a_measured_specific_force():
+    """Rows of NaN otherwise; the six rows of the Doppler log do without."""
+    motion = some_motion(1, "linear")
+    unfelt = replace(motion, velocity=np.full(3, np.nan), position=np.full(3, np.nan))
+    with pytest.raises(MeasurementError, match="was not measured in every row; use doppler_odometry"):
+        made(unfelt, True, False)
+    assert np.isfinite(made(unfelt, False, False).unwhitenedError(fitting(motion, 1, 0.1))).all()
+    made(motion, True, False)
