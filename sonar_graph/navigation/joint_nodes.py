@@ -1,12 +1,15 @@
 """What a Doppler sample does to the joint integral.
 
-Rule "inertial". With the velocity v(t) that the accelerometer gives from rest, ``y_k = R_k z_k - v_k`` would be the
-same at every sample k but for gravity, which makes it linear in time. Its trapezoid is therefore exact, and ::
+Rule "inertial". With the velocity v(t) that the accelerometer gives from rest and the velocity z of the IMU's point,
+``y_k = R_k z_k - v_k`` would be the same at every sample k but for gravity, which makes it linear in time. Its
+trapezoid is therefore exact, and ::
 
     s = p + sum_k w_k y_k,     w_k half of the two intervals at sample k
 
 is a displacement in which the accelerometer draws the velocity between samples and the samples its level and slope:
-gravity, the initial velocity and a constant accelerometer bias in frame i all cancel, however long the gap.
+gravity, the initial velocity and an accelerometer bias that is constant in frame i all cancel, however long the gap.
+A Doppler log at another place swings about the IMU's point: over short intervals that is left to the trapezoid, over
+long ones it is drawn by the gyros (`sonar_graph.navigation.long_intervals`).
 
 All other rules. ``s = sum_k W_k z_k``, W_k from the rotations around sample k.
 

@@ -29,6 +29,7 @@ from sonar_graph.navigation import argument_checks as check
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.navigation.joint_recursion import Inertial, preintegrate
 from sonar_graph.navigation.joint_rules import RULES, DopplerRule
+from sonar_graph.navigation.long_intervals import refuse_beyond, with_rate_noise
 from sonar_graph.navigation.velocity_covariances import is_partial
 
 ROTATION, VELOCITY, POSITION, DISPLACEMENT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
@@ -125,10 +126,16 @@ class JointMotion:
             bias=self.bias + change[:6],
         )
 
-    def relative_pose(self) -> PreintegratedMotion:
+    def relative_pose(self, accel_bias_sigma: float = 0.0) -> PreintegratedMotion:
         """Rotation and Doppler displacement alone, as the body's relative pose.
 
         The body's origin moves by ``s - (R - I) d``.
+
+        Parameters
+        ----------
+        accel_bias_sigma
+            What is not known of the accelerometers' bias, on each axis, m/s²: counted in the covariance. With the rule
+            "inertial" it moves s by the cube of the time between Doppler samples; with the others not at all.
         """
         R, arm = self.i_R_j.matrix(), self.body_p_dvl
         translation = self.displacement - R @ arm + arm
@@ -136,7 +143,8 @@ class JointMotion:
         J[:3, ROTATION], J[3:, ROTATION] = np.eye(3), gtsam.SO3.Hat(arm)
         J[3:, DISPLACEMENT] = R.T
         used = np.r_[ROTATION, DISPLACEMENT]
-        cov = J[:, used] @ self.covariance[np.ix_(used, used)] @ J[:, used].T
+        by_bias = J[:, used] @ self.D_parameters[used, ACCEL] * accel_bias_sigma
+        cov = J[:, used] @ self.covariance[np.ix_(used, used)] @ J[:, used].T + by_bias @ by_bias.T
         D = J[:, used] @ self.D_parameters[used, GYRO]
         pose = gtsam.Pose3(self.i_R_j, translation)
         return PreintegratedMotion(pose, cov, D, self.bias[:3], self.duration_s, self.velocity / self.duration_s)
@@ -162,6 +170,8 @@ class JointPreintegrator:
     body_T_dvl: gtsam.Pose3 = field(default_factory=gtsam.Pose3)
     rule: DopplerRule = "inertial"
     """How a velocity is had between samples: `sonar_graph.navigation.joint_rules`."""
+    longest_s: float = 1.5
+    """Between Doppler samples for all rules but "inertial", which know nothing of the velocity there."""
 
     def __post_init__(self) -> None:
         if self.rule not in RULES:
@@ -169,6 +179,7 @@ class JointPreintegrator:
         check.noise("gyro_noise_density", self.gyro_noise_density, 1)
         check.noise("accel_noise_density", self.accel_noise_density, 1)
         check.noise("velocity_sigma_m_s", self.velocity_sigma_m_s, 3)
+        check.noise("longest_s", self.longest_s, 1)
         for name, mounting in (("body_T_imu", self.body_T_imu), ("body_T_dvl", self.body_T_dvl)):
             if not isinstance(mounting, gtsam.Pose3):
                 raise CalibrationError(f"{name}: expected a gtsam.Pose3, not {type(mounting).__name__}")
@@ -189,6 +200,7 @@ class JointPreintegrator:
             imu.mounting.pose(),
             dvl.mounting.pose(),
             rule,
+            dvl.gap_s,
         )
 
     def integrate(
@@ -217,14 +229,20 @@ class JointPreintegrator:
         ------
         MeasurementError
             When an end is no Doppler stamp, the inertial rows do not reach both ends, stamps repeat, a Doppler row in
-            between leaves a direction unmeasured or has no possible covariance, the rule needs a specific force that
-            was not measured, or bias or Earth rate are not of their shapes.
+            between leaves a direction unmeasured or has no possible covariance, Doppler samples are too far apart for
+            the rule, it needs a specific force that was not measured, or bias or Earth rate are not of their shapes.
         """
         if not (isinstance(imu, Imu) and isinstance(dvl, Dvl)):
             raise MeasurementError(f"imu, dvl: expected Imu and Dvl, not {type(imu).__name__} and {type(dvl).__name__}")
         check.order(start_ns, end_ns)
         samples, inertial = _doppler_rows(dvl, start_ns, end_ns), _inertial_rows(imu, start_ns, end_ns)
         velocity, cov = self._in_body(samples)
+        arms = self.body_T_imu.translation(), self.body_T_dvl.translation()
+        arm = arms[1] - arms[0]
+        if self.rule == "inertial":
+            cov = with_rate_noise(cov, samples.stamps_ns, inertial.stamps_ns, self.gyro_noise_density, arm)
+        else:
+            refuse_beyond(self.longest_s, samples.stamps_ns)
         bias = np.zeros(6) if bias is None else check.vector("bias", bias, 6)
         earth = np.zeros(3) if earth_rate is None else check.vector("earth_rate", earth_rate, 3)
         body_R_imu = self.body_T_imu.rotation().matrix()
@@ -238,6 +256,7 @@ class JointPreintegrator:
             _vector(bias[:3]),
             _vector(bias[3:]),
             _vector(earth),
+            _vector(arm),
             self.gyro_noise_density**2,
             self.accel_noise_density**2,
         )
@@ -248,7 +267,6 @@ class JointPreintegrator:
                 f"from {start_ns} to {end_ns} ns: the motion is not finite; expected angular velocities in rad/s and"
                 " velocities in m/s that are not beyond all bounds"
             )
-        arms = self.body_T_imu.translation(), self.body_T_dvl.translation()
         ends, unshared = (cov[0], cov[-1]), np.zeros((3, 3))
         return JointMotion(
             gtsam.Rot3(R), v, p, s, P, D, (first, last), ends, unshared, bias, int(start_ns), int(end_ns), *arms

@@ -33,6 +33,7 @@ from sonar_graph.navigation.triples import (
     ZEROS,
     Matrix,
     Vector,
+    cross,
     difference_of,
     matrix,
     minus,
@@ -64,6 +65,8 @@ class Inertial(NamedTuple):
     accel_bias: Vector
     earth: Vector
     """Earth's rotation in frame i, rad/s."""
+    arm: Vector
+    """From the IMU to the Doppler log, body axes, m."""
     gyro_psd: float
     """Squared noise density, (rad/s)²/Hz."""
     accel_psd: float
@@ -99,6 +102,8 @@ class Motion(NamedTuple):
 
 
 NO_WEIGHTS = Weights(ZEROS, ZEROS)
+LONG_S = 0.4
+"""Between Doppler samples: from here on the rule "inertial" draws the log's way about the IMU's point by the gyros."""
 
 
 @compiled
@@ -125,7 +130,7 @@ def preintegrate(
     for k in range(len(dvl_ns) - 1):
         next_s = (dvl_ns[k + 1] - dvl_ns[k]) * 1e-9
         if rule.inertial:
-            motion = _at_sample(motion, vector(velocity[k]), 0.5 * (past_s + next_s), imu.gyro_psd)
+            motion = _at_sample(motion, imu, dvl_ns[k], vector(velocity[k]), past_s, next_s)
         interval = Interval(dvl_ns[k], dvl_ns[k + 1], vector(velocity[k]), vector(velocity[k + 1]))
         here = multiple_of(0.5 * next_s, motion.path.R)
         motion = _over(motion, imu, interval, rule)
@@ -137,16 +142,41 @@ def preintegrate(
             motion = _with_noise(motion, sandwich(weight, matrix(cov[k]), weight))
         last, past_s = weights.after, next_s
     if rule.inertial:
-        motion = _at_sample(motion, vector(velocity[len(dvl_ns) - 1]), 0.5 * past_s, imu.gyro_psd)
+        motion = _at_sample(motion, imu, dvl_ns[-1], vector(velocity[len(dvl_ns) - 1]), past_s, 0.0)
         path, spread, slopes = with_inertial_position(motion.path, motion.spread, motion.slopes)
         motion = Motion(path, spread, slopes, NO_WEIGHTS, motion.row)
     return _arrays(motion, first, last, imu.gyro_psd)
 
 
 @inlined
-def _at_sample(motion: Motion, z: Vector, weight_s: float, gyro_psd: float) -> Motion:
-    path, spread, slopes = with_sample(motion.path, motion.spread, motion.slopes, z, weight_s, gyro_psd)
-    return Motion(path, spread, slopes, motion.weights, motion.row)
+def _at_sample(motion: Motion, imu: Inertial, at_ns: int, z: Vector, past_s: float, next_s: float) -> Motion:
+    """With a Doppler sample between two intervals; the log's way about the IMU counts in long ones."""
+    weight_s = 0.5 * (past_s + next_s)
+    path, spread, slopes = with_sample(motion.path, motion.spread, motion.slopes, z, weight_s, imu.gyro_psd)
+    motion = Motion(path, spread, slopes, motion.weights, motion.row)
+    if past_s > LONG_S or next_s > LONG_S:
+        motion = _levered(motion, imu, at_ns, past_s if past_s > LONG_S else 0.0, next_s if next_s > LONG_S else 0.0)
+    return motion
+
+
+@inlined
+def _levered(motion: Motion, imu: Inertial, at_ns: int, past_s: float, next_s: float) -> Motion:
+    """One end of long intervals: ``(R_b - R_a) l`` in place of the trapezoid of ``R (w x l)``; 0: not long."""
+    R, weight_s = motion.path.R, 0.5 * (past_s + next_s)
+    rate = minus(value_at(imu.stamps, imu.rate, motion.row, at_ns, False), imu.gyro_bias)
+    rate = minus(rate, times(transposed(R), imu.earth))
+    ends = (1.0 if past_s > 0.0 else 0.0) - (1.0 if next_s > 0.0 else 0.0)
+    c = times(R, minus(scaled(ends, imu.arm), scaled(weight_s, cross(rate, imu.arm))))
+    by = Push(0.0, IDENTITY, ZEROS, ZEROS, ZERO, ZERO, c)
+    M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting = pushed_slopes(motion.slopes, by)
+    s_g = difference_of(s_g, multiple_of(weight_s, times_skew(R, imu.arm)))
+    return Motion(
+        pushed_path(motion.path, by),
+        pushed_spread(motion.spread, by, imu.gyro_psd * motion.path.elapsed_s, 0.0),
+        Slopes(M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting),
+        motion.weights,
+        motion.row,
+    )
 
 
 @inlined

@@ -26,7 +26,7 @@ every_rule = pytest.mark.parametrize("rule", sorted(RULES))
 
 def made(rows: tuple[Imu, Dvl], rule: str, bias=BIAS, **options) -> JointMotion:
     samples = rows[1].stamps_ns
-    preintegrator = JointPreintegrator(GYRO, ACCEL, rule=rule, **options)
+    preintegrator = JointPreintegrator(GYRO, ACCEL, rule=rule, longest_s=2.0, **options)
     return preintegrator.integrate(*rows, int(samples[0]), int(samples[-1]), bias)
 
 
@@ -93,7 +93,7 @@ def test_a_chain_has_the_displacement_of_the_whole(rule, seed, cut):
     """Mean and covariance: whatever is cut, the shared sample counts as it acts. Taken as independent, less."""
     rows = random_rows(seed)
     at = rows[1].stamps_ns
-    preintegrator = JointPreintegrator(0.0, 0.0, rule=rule)
+    preintegrator = JointPreintegrator(0.0, 0.0, rule=rule, longest_s=2.0)
     whole, first, second = (
         preintegrator.integrate(*rows, int(a), int(b), BIAS)
         for a, b in ((at[0], at[-1]), (at[0], at[cut]), (at[cut], at[-1]))
