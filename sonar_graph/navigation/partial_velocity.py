@@ -5,7 +5,7 @@ from the whole row 0 to the whole row m are solved together. With R the rotation
 the accelerometers gain from rest, both in frame 0, the velocity of the IMU's point less F is a straight line whose
 slope is gravity (`sonar_graph.navigation.inertial_carry`), give or take a random walk::
 
-    y_k = R_k z_k - F_k,    y_k+1 = y_k + g T_k + N(0, q T_k I),    z_k ~ N(measured, cov_k)              (1)
+    y_k = R_k z_k - F_k,    y_k+1 = y_k + g T_k + N(0, q^2 T_k I),    z_k ~ N(measured, cov_k)            (1)
 
 Gravity g is unknown and constant. Where a specific force was not measured R = I, F = 0, g = 0, and q is that of
 ``velocity_walk_density``. Least squares gives y and its joint covariance P; completed rows are ``R_k^T (y_k + F_k)``.
@@ -16,7 +16,12 @@ with weights w (half the intervals either side), so that each completed row is g
 
     cov_k = sum_j w_j / w_k (P_kj + P_jk) / 2,    counted twice for j = 0 and m, which keep their own      (2)
 
-With it ``sum w^2 cov`` is the variance of the summed displacement.
+A whole row between two stretches is shared by the rows completed on both its sides. With S the covariance of row 0
+with the summed displacement of the rows that it closed before, axes of row 0, the later stretch counts that as well::
+
+    cov_k += (P_k0 cov_0^-1 S + its transpose) / w_k,    next S = sum_k w_k R_m^T P_mk R_m               (3)
+
+With both ``sum w^2 cov`` is the variance of the summed displacement.
 
 A partial row before the first whole one, late, or in a stretch longer than `LONGEST_STRETCH_NS` is passed over.
 """
@@ -114,28 +119,34 @@ class PartialVelocities:
         if row.stamp_ns - whole.stamp_ns > LONGEST_STRETCH_NS:
             self._passed_over_ns += [waiting.stamp_ns for waiting in within]
             return []
-        return _solved([whole, *within, row], imu, self._calibration)
+        completed, self._whole = _solved([whole, *within, row], imu, self._calibration)
+        return completed
 
 
 class _Row(NamedTuple):
     stamp_ns: int
     velocity: Floats
     cov: Floats
+    with_closed: Floats = np.zeros((3, 3))
+    """S of equation (3), m^2/s: none where the row closed no stretch."""
 
 
-def _solved(rows: list[_Row], imu: InertialRows, calibration: Calibration) -> list[_Row]:
-    """All rows but the first and the last, completed."""
+def _solved(rows: list[_Row], imu: InertialRows, calibration: Calibration) -> tuple[list[_Row], _Row]:
+    """All rows but the first and the last, completed, and the last with what it shares with them."""
     stamps_ns = np.array([row.stamp_ns for row in rows], dtype=np.int64)
     by = carry(imu, stamps_ns, calibration)
     y, P = _least_squares(rows, by, np.diff(stamps_ns) * 1e-9)
     weights_s = _weights(stamps_ns)
+    first_weight_s = weights_s[0] * np.eye(3) + np.linalg.solve(rows[0].cov, rows[0].with_closed)
     completed = []
     for k in range(1, len(rows) - 1):
         R = by.rotation[k]
-        shared = _shared(P, weights_s, k)
+        shared = _shared(P, weights_s, first_weight_s, k)
         velocity = R.T @ (y[k] + by.velocity[k]) - by.from_lever[k]
         completed.append(_Row(rows[k].stamp_ns, velocity, _positive(R.T @ shared @ R)))
-    return completed
+    R = by.rotation[-1]
+    with_closed = np.einsum("akb,k->ab", P[-3:].reshape(3, -1, 3)[:, 1:-1], weights_s[1:-1])
+    return completed, rows[-1]._replace(with_closed=R.T @ with_closed @ R)
 
 
 def _least_squares(rows: list[_Row], by: Carry, intervals_s: Floats) -> tuple[Floats, Floats]:
@@ -165,12 +176,12 @@ def _weights(stamps_ns: Ints) -> Floats:
     return 0.5 * (np.concatenate([intervals_s[:1], intervals_s]) + np.concatenate([intervals_s, intervals_s[-1:]]))
 
 
-def _shared(P: Floats, weights_s: Floats, k: int) -> Floats:
-    """Equation (2), axes of frame 0."""
-    relative = weights_s / weights_s[k]
-    relative[[0, -1]] *= 2.0
-    total = np.einsum("jab,j->ab", P[3 * k : 3 * k + 3].reshape(3, -1, 3).transpose(1, 0, 2), relative)
-    return np.asarray(0.5 * (total + total.T))
+def _shared(P: Floats, weights_s: Floats, first_weight_s: Floats, k: int) -> Floats:
+    """Equations (2) and (3), axes of frame 0; the weight of row 0 is a matrix, since (3) is one more share of it."""
+    with_all = P[3 * k : 3 * k + 3].reshape(3, -1, 3)
+    once = np.einsum("ajb,j->ab", with_all[:, 1:-1], weights_s[1:-1])
+    total = once + 2.0 * (with_all[:, 0] @ first_weight_s + weights_s[-1] * with_all[:, -1])
+    return np.asarray(0.5 * (total + total.T) / weights_s[k])
 
 
 def _positive(cov: Floats) -> Floats:

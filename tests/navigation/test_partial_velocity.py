@@ -1,12 +1,14 @@
 """Velocities of which beams measured a part: completed, and as uncertain as they are."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.doppler_beams import velocity_of_beams
-from sonar_graph.navigation.inertial_carry import InertialRows
+from sonar_graph.navigation.inertial_carry import InertialRows, carry
 from sonar_graph.navigation.partial_velocity import LONGEST_STRETCH_NS, PartialVelocities
 from sonar_graph.navigation.velocity_covariances import is_partial
 
@@ -103,6 +105,54 @@ def test_the_variance_of_a_displacement_is_what_the_rows_say_together(counts):
         variance = STEP_S**2 * covs.sum(axis=0)
     anees = np.mean(np.einsum("ki,ij,kj->k", errors, np.linalg.inv(variance), errors)) / 3
     assert 0.9 < anees < 1.1
+
+
+FLICKERING = [
+    [4, 2] * 6 + [4],
+    [4, 2, 2, 2] * 4 + [4],
+    [4, 1, 1] * 5 + [4],
+    [4, 1, 4, 4, 1, 1, 4, 2, 3, 2, 1, 4, 4, 4, 1, 4],
+]
+TURNING = InertialRows(
+    np.arange(0, 401, dtype=np.int64) * 10_000_000,
+    np.tile([0.8, -0.5, 1.1], (401, 1)),
+    np.tile([0.3, 0.2, 9.8], (401, 1)),
+)
+
+
+@pytest.mark.parametrize("imu", [NO_FORCE, TURNING], ids=["no force", "turning"])
+@pytest.mark.parametrize("counts", FLICKERING, ids=str)
+def test_stretches_side_by_side_have_the_variance_of_every_noise_propagated(counts, imu):
+    """Rows are affine in beams and true velocities: a unit error of each, one by one, gives the exact variance."""
+    n, at, valid = len(counts), stamps(len(counts)), valid_beams(*counts)
+    turned = np.array([1.0, 1.0, 1.0]) if imu is TURNING else np.zeros(3)
+    R = Rotation.from_rotvec(np.outer(at * 1e-9, turned * imu.rate[0]))
+
+    def displaced(true_in_world, beam_errors):
+        """Error of the displacement, and the covariances of the rows, both in the world."""
+        true = R.inv().apply(true_in_world)
+        velocity, cov = velocity_of_beams(JANUS, true @ JANUS.T + beam_errors, valid, SIGMA)
+        kept, velocities, covs = completed(at, velocity, cov, imu)
+        assert len(kept) == n
+        return STEP_S * R.apply(velocities - true).sum(axis=0), R.as_matrix() @ covs @ R.as_matrix().transpose(0, 2, 1)
+
+    still, no_errors = np.zeros((n, 3)), np.zeros((n, 4))
+    offset, covs = displaced(still, no_errors)
+    columns = []
+    for k, beam in zip(*np.nonzero(valid), strict=True):
+        noise = no_errors.copy()
+        noise[k, beam] = 1.0
+        columns.append(SIGMA * (displaced(still, noise)[0] - offset))
+    whole = np.flatnonzero(np.array(counts) > 2)
+    for first, last in pairwise(whole):
+        walked = carry(imu, at[first : last + 1], CALIBRATION).walk_density * np.sqrt(STEP_S)
+        for k in range(first + 1, last + 1):
+            for axis in range(3):
+                true = still.copy()
+                true[k:, axis] = 1.0
+                columns.append(walked * (displaced(true, no_errors)[0] - offset))
+    variance = np.transpose(columns) @ columns
+    np.testing.assert_allclose(STEP_S**2 * covs.sum(axis=0), variance, atol=2e-3 * np.trace(variance))
 
 
 def test_a_row_before_the_first_whole_one_after_the_last_or_in_an_endless_stretch_is_passed_over():
