@@ -9,8 +9,8 @@ in it (a: the IMU, d: the Doppler log)::
     s = i_R_world (d_j - d_i)                     displacement by the Doppler log
 
 with one covariance of all twelve errors, since the gyros turn all of them and, with the rule "inertial", the
-accelerometer draws s between the Doppler samples. Each measurement enters once. Lever arms need no rates: v and p are
-those of the IMU's point, s that of the Doppler log's.
+accelerometer draws s between the Doppler samples. Each measurement enters once. Lever arms need no rates but over long
+intervals (`sonar_graph.navigation.long_intervals`): v and p are those of the IMU's point, s that of the Doppler log's.
 Derivation: docs/theory/preintegration.md. After Forster et al., TRO 2017, section VI.
 """
 
