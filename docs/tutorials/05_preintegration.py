@@ -47,7 +47,8 @@ motion = sensors.integrate(imu, dvl, 0, NS)
 print(f"in 1 s: {motion.displacement.round(4)} m by the Doppler log, the accelerometer between its samples")
 print(f"1 sigma: {np.sqrt(np.diag(motion.covariance)[9:]).round(5)} m")
 
-# Other people's rules, to compare with (never to use): a held velocity is late.
+# Other people's rules, to compare with (never to use): a held velocity is late. Names, and whose rule is whose:
+# docs/theory/preintegration.md.
 held = JointPreintegrator(1e-4, 1e-3, (0.005,) * 3, rule="zoh-previous").integrate(imu, dvl, 0, NS)
 print(f"a held velocity: {1e3 * np.linalg.norm(held.displacement - motion.displacement):.1f} mm away")
 
