@@ -15,8 +15,8 @@ extrapolated. Its slope is gravity with the accelerometers' bias as it was then,
 be known. Errors grow with the time since then squared.
 
 Where a specific force was not measured, or nothing precedes the node to fit a line to, the velocity is a random walk of
-spectral density q between its ends, whose displacement has the variance ``q T^3 / 12`` beside the samples' (closed),
-or from its last value on, ``q T^3 / 3`` (open).
+root density q (m/s/√s) between its ends, whose displacement has the variance ``q^2 T^3 / 12`` beside the samples'
+(closed), or from its last value on, ``q^2 T^3 / 3`` (open).
 
 The covariance holds, beside the noise of the samples: gyro and accelerometer noise, and the bias of the accelerometers,
 constant over the gap. That of the gyros is the derivative's affair. Derivation: docs/theory/gaps.md.

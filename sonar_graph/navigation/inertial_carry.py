@@ -1,15 +1,15 @@
 """What gyros and accelerometers say of a velocity's course between Doppler rows, and how far it may be trusted.
 
 From the first row on, in its frame: R the rotation, F the integral of the turned specific force. The velocity of the
-IMU's point less F is ``v + g t`` with gravity g. Left out of this line, and taken for a random walk of density
-``walk_density`` instead, over a stretch of T seconds turned by phi in all, are
+IMU's point less F is ``v + g t`` with gravity g. Left out of this line, and taken for a random walk of root density
+``walk_density`` (q) instead, with the sum of these for q^2, over a stretch of T seconds turned by phi in all, are
 
     accelerometer noise          s_a^2
     gyro noise, tilting g        (g s_g T)^2 / 12           its integral in mid-stretch, both ends known: T^3 / 48
     gyro bias, tilting g         (g b T)^2 T / 16           peak of the parabola between both ends
     a bias that turns            (b_a phi)^2 T / 16         the same
 
-b holds the Earth's rotation too. Variances of a walk between two known ends peak at ``q T / 4``.
+b holds the Earth's rotation too. Variances of a walk between two known ends peak at ``q^2 T / 4``.
 """
 
 from __future__ import annotations

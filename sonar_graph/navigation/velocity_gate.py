@@ -2,7 +2,7 @@
 
 A velocity v, t seconds after the last one u that was believed, both in body axes, is expected to differ by::
 
-    S = Q_u + Q_v + (q t + (w t |u|)^2) I,    q velocity walk of the calibration, w `TURNING_RAD_S` (w t at most 2)
+    S = Q_u + Q_v + (q^2 t + (w t |u|)^2) I,    q velocity walk of the calibration, w `TURNING_RAD_S` (w t at most 2)
 
 since the velocity may change and the vehicle may turn. The squared Mahalanobis distance is gated far out, for what is
 refused is lost; what passes is weighed by its noise. The gate widens while nothing is believed, so that a wrong first
