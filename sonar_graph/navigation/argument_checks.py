@@ -7,7 +7,7 @@ from math import isfinite
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sonar_graph.errors import CalibrationError, MeasurementError
+from sonar_graph.errors import CalibrationError, MeasurementError, SonarGraphError
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.kernels import compiled
 
@@ -19,19 +19,13 @@ _CLOSEST_SAMPLES_NS = 1_000_000
 """No Doppler log is as quick as 1 kHz; one with stamps in microseconds looks quicker."""
 
 
-def vector(name: str, values: ArrayLike, size: int) -> Floats:
-    """The values as an array.
-
-    Raises
-    ------
-    MeasurementError
-        When they are not so many finite numbers.
-    """
+def vector(name: str, values: ArrayLike, size: int, kind: type[SonarGraphError] = MeasurementError) -> Floats:
+    """The values as an array; an error of this kind where they are not so many finite numbers."""
     found = np.asarray(values, np.float64)
     if found.shape != (size,):
-        raise MeasurementError(f"{name}: expected shape ({size},), not {found.shape}")
+        raise kind(f"{name}: expected shape ({size},), not {found.shape}")
     if not all(map(isfinite, found.tolist())):
-        raise MeasurementError(f"{name}: expected finite numbers, not {found.tolist()}")
+        raise kind(f"{name}: expected finite numbers, not {found.tolist()}")
     return found
 
 

@@ -28,7 +28,9 @@ import gtsam
 import numpy as np
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.errors import CalibrationError
 from sonar_graph.measurements import Floats
+from sonar_graph.navigation import argument_checks as check
 from sonar_graph.navigation.gap_motion import GapValues, bridge, gap_values
 from sonar_graph.navigation.kernels import compiled
 from sonar_graph.navigation.recursion import in_last_frame, integrate_steps, trace_point
@@ -77,7 +79,13 @@ class PreintegratedMotion:
 
 @dataclass(frozen=True, eq=False)
 class Preintegrator:
-    """What preintegration needs to know of the sensors."""
+    """What preintegration needs to know of the sensors.
+
+    Raises
+    ------
+    CalibrationError
+        When the density is negative, or a number is not finite.
+    """
 
     gyro_noise_density: float
     """rad/s/√Hz."""
@@ -85,6 +93,10 @@ class Preintegrator:
     """Lever arm of the DVL, shape (3,), m."""
     gap: GapValues | None = None
     """Of `sonar_graph.navigation.gap_motion`; None: the velocity is linear or held however long a gap lasts."""
+
+    def __post_init__(self) -> None:
+        check.noise("gyro_noise_density", self.gyro_noise_density, 1)
+        check.vector("body_p_dvl", self.body_p_dvl, 3, CalibrationError)
 
     @classmethod
     def from_calibration(cls, calibration: Calibration) -> Preintegrator:
@@ -103,7 +115,13 @@ class Preintegrator:
             Gyro bias in the body frame to remove, shape (3,), rad/s.
         earth_rate
             Earth's rotation in body frame i, shape (3,), rad/s; None: not removed.
+
+        Raises
+        ------
+        MeasurementError
+            When bias or Earth rate are not three finite numbers.
         """
+        bias = check.vector("bias", bias, 3)
         rotation, displacement, cov, D, impulse = integrate_steps(
             steps.duration_s,
             steps.rate,
@@ -111,7 +129,7 @@ class Preintegrator:
             steps.velocity_psd,
             steps.specific_force,
             bias,
-            np.zeros(3) if earth_rate is None else earth_rate,
+            np.zeros(3) if earth_rate is None else check.vector("earth_rate", earth_rate, 3),
             self.body_p_dvl,
             self.gyro_noise_density,
         )
@@ -140,7 +158,8 @@ class Preintegrator:
         bias, earth_rate
             As those of `integrate`.
         """
-        assert self.gap is not None, "made without a calibration"
+        if self.gap is None:
+            raise CalibrationError("gap: a Preintegrator without it bridges no gaps; make it with from_calibration")
         earth = (0.0, 0.0, 0.0) if earth_rate is None else _vector(earth_rate)
         motion = bridge(columns, self.gap, start_ns, end_ns, is_closed, _vector(bias), earth)
         rotation, displacement, cov, D, impulse = in_last_frame(*motion)

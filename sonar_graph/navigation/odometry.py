@@ -14,11 +14,13 @@ from __future__ import annotations
 import numpy as np
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.navigation import argument_checks as check
 from sonar_graph.navigation.interpolation import value_at
 from sonar_graph.navigation.row_intake import RowIntake
 from sonar_graph.navigation.stamped_rows import LATEST_NS, WINDOW_NS, node_range, rows_before_gaps
-from sonar_graph.navigation.steps import Columns, Steps, merge_rows
+from sonar_graph.navigation.steps import Columns, Steps, are_nodes, merge_rows
 from sonar_graph.states import RefusedRow
 
 
@@ -51,7 +53,14 @@ class Odometry:
         Returns
         -------
         Whether rows were placed before others that are there already: provisional motion has to be had anew.
+
+        Raises
+        ------
+        MeasurementError
+            When the blocks are of another kind.
         """
+        if not (isinstance(imu, Imu | None) and isinstance(dvl, Dvl | None)):
+            raise MeasurementError(f"imu, dvl: expected Imu and Dvl, not {type(imu).__name__} and {type(dvl).__name__}")
         placed_imu = imu is not None and self._intake.add_imu(imu)
         placed_dvl = dvl is not None and self._intake.add_dvl(dvl)
         return placed_imu or placed_dvl
@@ -91,13 +100,42 @@ class Odometry:
         return int(self._dvl.stamps_ns[last - 1]) if last > first else None
 
     def steps_between_nodes(self, start_ns: int, end_ns: int) -> Steps:
-        """Final motion from one node to a later, reached one."""
-        imu_rows = int(np.searchsorted(self._imu.stamps_ns, end_ns)) + 1
-        dvl_rows = int(np.searchsorted(self._dvl.stamps_ns, end_ns, side="right"))
-        return self._steps(start_ns, end_ns, imu_rows, dvl_rows)
+        """Final motion from one node to a later, reached one.
+
+        Raises
+        ------
+        MeasurementError
+            When an end is no node or is not covered by IMU rows, or the ends are in the wrong order.
+        """
+        if not are_nodes(self._imu.stamps_ns, self._dvl.stamps_ns, start_ns, end_ns):
+            raise self._no_nodes(start_ns, end_ns, {"start_ns": start_ns, "end_ns": end_ns})
+        return self._final_steps(start_ns, end_ns)
+
+    def steps_to_node(self, since_ns: int, node_ns: int) -> Steps:
+        """Final motion to a reached node from any instant between the rows before it, such as one in a gap.
+
+        Raises
+        ------
+        MeasurementError
+            When the node is none or is not covered by IMU rows, or the instant lies before all rows or after the node.
+        """
+        if not are_nodes(self._imu.stamps_ns, self._dvl.stamps_ns, node_ns, node_ns) or since_ns > node_ns:
+            raise self._no_nodes(since_ns, node_ns, {"node_ns": node_ns})
+        first_ns = max(self._imu.stamps_ns[0], self._dvl.stamps_ns[0])
+        if since_ns < first_ns:
+            raise MeasurementError(f"since_ns: {since_ns} lies before the rows; begin at {first_ns} or later")
+        return self._final_steps(since_ns, node_ns)
 
     def steps_since_node(self, node_ns: int, until_ns: int) -> Steps:
-        """Provisional motion from a reached node to any later instant, from rows stamped no later than that."""
+        """Provisional motion from a reached node to any later instant, from rows stamped no later than that.
+
+        Raises
+        ------
+        MeasurementError
+            When the node is none or is not reached, or the instant lies before it.
+        """
+        if until_ns < node_ns or not are_nodes(self._imu.stamps_ns, self._dvl.stamps_ns, node_ns, node_ns):
+            raise self._no_nodes(node_ns, until_ns, {"node_ns": node_ns})
         imu_rows = int(np.searchsorted(self._imu.stamps_ns, until_ns, side="right"))
         dvl_rows = int(np.searchsorted(self._dvl.stamps_ns, until_ns, side="right"))
         return self._steps(node_ns, until_ns, imu_rows, dvl_rows)
@@ -112,12 +150,34 @@ class Odometry:
         rows = rows_before_gaps(stamps_ns, start_ns, end_ns, self._longest_ns)
         return [(int(stamps_ns[row]), int(stamps_ns[row + 1])) for row in rows]
 
+    def _final_steps(self, start_ns: int, end_ns: int) -> Steps:
+        imu_rows = int(np.searchsorted(self._imu.stamps_ns, end_ns)) + 1
+        dvl_rows = int(np.searchsorted(self._dvl.stamps_ns, end_ns, side="right"))
+        return self._steps(start_ns, end_ns, imu_rows, dvl_rows)
+
     def _steps(self, start_ns: int, end_ns: int, imu_rows: int, dvl_rows: int) -> Steps:
         return Steps(*merge_rows(self.columns(), imu_rows, dvl_rows, start_ns, end_ns))
+
+    def _no_nodes(self, start_ns: int, end_ns: int, nodes: dict[str, int]) -> MeasurementError:
+        """What is wrong with an interval of which these ends have to be nodes."""
+        if end_ns < start_ns:
+            return MeasurementError(f"interval: ends at {end_ns} ns, before its start {start_ns}; the earlier first")
+        for name, instant_ns in nodes.items():
+            if instant_ns not in self._dvl.stamps_ns:
+                return check.no_stamp(name, instant_ns, self._dvl.stamps_ns)
+        covered = (
+            f"from {self._imu.stamps_ns[0]} to {self._imu.stamps_ns[-1]} ns" if len(self._imu.stamps_ns) else "none"
+        )
+        return MeasurementError(
+            f"{', '.join(nodes)}: IMU rows ({covered}) do not cover {', '.join(map(str, nodes.values()))}; take nodes"
+            " from start_ns() on, of nodes()"
+        )
 
     def velocity_at_node(self, node_ns: int) -> tuple[Floats, Floats, Floats]:
         """DVL velocity (body axes), its covariance, and the angular rate at a node; shapes (3,), (3, 3), (3,)."""
         k = int(np.searchsorted(self._dvl.stamps_ns, node_ns))
+        if k == len(self._dvl.stamps_ns) or self._dvl.stamps_ns[k] != node_ns:
+            raise check.no_stamp("node_ns", node_ns, self._dvl.stamps_ns)
         i = int(np.searchsorted(self._imu.stamps_ns, node_ns))
         rate = value_at(self._imu.stamps_ns, self._imu.values[0], i, node_ns, self._hold_past)
         return self._dvl.values[0][k], self._dvl.values[1][k], np.array(rate)

@@ -100,6 +100,15 @@ def next_step(columns: Columns, imu_rows: int, dvl_rows: int, cursor: Cursor, en
 
 
 @compiled
+def are_nodes(imu_ns: Ints, dvl_ns: Ints, start_ns: int, end_ns: int) -> bool:
+    """Whether an interval, the earlier end first, begins and ends at Doppler rows that IMU rows cover."""
+    if end_ns < start_ns or not len(imu_ns) or start_ns < imu_ns[0] or end_ns > imu_ns[-1]:
+        return False
+    first, last = np.searchsorted(dvl_ns, start_ns), np.searchsorted(dvl_ns, end_ns)
+    return bool(last < len(dvl_ns) and dvl_ns[first] == start_ns and dvl_ns[last] == end_ns)
+
+
+@compiled
 def merge_rows(
     columns: Columns, imu_rows: int, dvl_rows: int, start_ns: int, end_ns: int
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:

@@ -218,7 +218,7 @@ class Keyframes:
         start_ns, bias, earth_rate = self.stamps_ns[-1], self.bias(len(self.stamps_ns) - 1), self._earth_rate()
         gaps = self.odometry.gaps(start_ns, node_ns)
         since_ns = gaps[-1][1] - CARRIED_IN_GAP_NS if gaps else start_ns
-        steps = self.odometry.steps_between_nodes(since_ns, node_ns)
+        steps = self.odometry.steps_to_node(since_ns, node_ns)
         motion = self._preintegrator.integrate(steps, bias, earth_rate)
         carried = Carried(since_ns, steps, motion)
         if gaps:

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.navigation.dvl_preintegration import Preintegrator
 from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.navigation.steps import Steps
@@ -254,3 +255,35 @@ def test_mean_force_is_turned_by_the_attitude_in_the_middle_of_a_step():
     steps = Steps(np.full(n, dt), np.tile(rate, (n, 1)), np.zeros((n, 3)), np.zeros((n, 3, 3)), force)
     motion = Preintegrator(1e-4, np.zeros(3)).integrate(steps, np.zeros(3))
     assert motion.mean_specific_force == pytest.approx([0.0, 0.0, 9.81], abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"bias": np.zeros(6)}, r"bias: expected shape \(3,\), not \(6,\)"),
+        ({"bias": np.array([0.0, np.nan, 0.0])}, "bias: expected finite numbers"),
+        ({"bias": BIAS, "earth_rate": np.zeros(1)}, r"earth_rate: expected shape \(3,\)"),
+    ],
+)
+def test_vectors_of_another_shape_are_refused(options, message):
+    with pytest.raises(MeasurementError, match=message):
+        PREINTEGRATOR.integrate(random_steps(1), **options)
+
+
+@pytest.mark.parametrize(
+    ("density", "lever", "message"),
+    [
+        (-1e-4, LEVER, "gyro_noise_density: expected finite numbers of zero or more"),
+        (np.nan, LEVER, "gyro_noise_density: expected finite"),
+        (1e-4, np.zeros(2), r"body_p_dvl: expected shape \(3,\), not \(2,\)"),
+    ],
+)
+def test_impossible_sensors_are_refused(density, lever, message):
+    with pytest.raises(CalibrationError, match=message):
+        Preintegrator(density, lever)
+
+
+def test_gaps_are_bridged_with_a_calibration_only():
+    odometry = Odometry(Calibration())
+    with pytest.raises(CalibrationError, match="from_calibration"):
+        PREINTEGRATOR.bridge(odometry.columns(), 0, NS, True, BIAS)

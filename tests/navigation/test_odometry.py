@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.dvl_preintegration import Preintegrator
 from sonar_graph.navigation.odometry import Odometry
@@ -284,3 +285,67 @@ def test_a_repeated_stamp_counts_once(sensor):
     assert np.array_equal(repeated.nodes(0, T0_NS + 10 * NS), nodes)
     first, last = int(nodes[0]), int(nodes[-1])
     assert same_steps(repeated.steps_between_nodes(first, last), plain.steps_between_nodes(first, last))
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "message"),
+    [
+        (0.0, 900.0, r"end_ns: \d+ is none of the 21 Doppler stamps from \d+ to \d+ ns"),
+        (0.05, 1.0, r"start_ns: \d+ is none of the 21"),
+        (0.5, 1.02, rf"end_ns: \d+ is none of the 21 .* nearest is {T0_NS + NS}$"),
+        (1.0, 0.2, "before its start"),
+        (0.0, 2.0, r"IMU rows \(from .*\) do not cover"),
+        (0.0, 0.3, None),
+        (0.1, 0.1, None),
+    ],
+)
+def test_only_covered_nodes_bound_final_motion(start, end, message):
+    """Far outside the rows a motion was of millions of metres."""
+    odometry = odometry_of(imu(stamps(50, 1.5), 0.0), dvl(stamps(10, 2.0), [0.5, 0, 0]))
+    ends = [T0_NS + round(t * NS) for t in (start, end)]
+    if message is None:
+        assert odometry.steps_between_nodes(*ends).duration_s.sum() == pytest.approx(end - start)
+    else:
+        with pytest.raises(MeasurementError, match=message):
+            odometry.steps_between_nodes(*ends)
+
+
+def test_provisional_motion_begins_at_a_covered_node():
+    odometry = odometry_of(imu(stamps(50, 1.5, 0.15), 0.0), dvl(stamps(10, 3.0), [0.5, 0, 0]))
+    for node, until, message in (
+        (0.25, 0.4, r"node_ns: \d+ is none of the 31"),
+        (0.1, 0.4, r"IMU rows \(from .*\) do not cover"),
+        (1.7, 1.8, r"IMU rows \(from .*\) do not cover"),
+        (0.5, 0.4, "before its start"),
+    ):
+        with pytest.raises(MeasurementError, match=message):
+            odometry.steps_since_node(T0_NS + round(node * NS), T0_NS + round(until * NS))
+    assert odometry.steps_since_node(T0_NS + NS // 5, T0_NS + NS // 4).duration_s.sum() == pytest.approx(0.05)
+    with pytest.raises(MeasurementError, match="is none of the 31"):
+        odometry.velocity_at_node(T0_NS + 1)
+
+
+def test_motion_to_a_node_begins_at_any_instant_among_the_rows():
+    odometry = odometry_of(imu(stamps(50, 3.0), 0.0), dvl(stamps(10, 2.0, 0.05), [0.5, 0, 0]))
+    since, node = (T0_NS + round(t * NS) for t in (0.42, 1.05))
+    assert odometry.steps_to_node(since, node).duration_s.sum() == pytest.approx(0.63)
+    for ends, message in (
+        ((T0_NS + NS // 50, node), "lies before the rows"),
+        ((node + 1, node), "before its start"),
+        ((since, node + 1), "node_ns: .* is none of the 21"),
+    ):
+        with pytest.raises(MeasurementError, match=message):
+            odometry.steps_to_node(*ends)
+
+
+def test_without_rows_there_is_no_motion():
+    with pytest.raises(MeasurementError, match="there are no Doppler rows; add them first"):
+        Odometry(Calibration()).steps_between_nodes(1, 2)
+    with pytest.raises(MeasurementError, match=r"IMU rows \(none\) do not cover"):
+        odometry_of(None, dvl(stamps(10, 1.0), 0.0)).steps_between_nodes(T0_NS, T0_NS + NS)
+
+
+def test_swapped_blocks_are_refused():
+    imu_rows, dvl_rows = recorded()
+    with pytest.raises(MeasurementError, match="expected Imu and Dvl, not Dvl and Imu"):
+        Odometry(Calibration()).add(dvl_rows, imu_rows)
