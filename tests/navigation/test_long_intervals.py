@@ -121,3 +121,36 @@ def test_a_calibration_says_what_a_gap_is(rule):
     whole(rows(6.0, 6.7), sensors)
     with pytest.raises(MeasurementError, match=r"longest_s \(0.7 s\)"):
         whole(rows(6.0, 6.8), sensors)
+
+
+def turning(rate: np.ndarray, arm: tuple[float, float, float]) -> tuple[Imu, Dvl, JointPreintegrator]:
+    """Nothing but rates, 20 Hz, and Doppler samples of zero at 0, 4 and 7 s."""
+    inertial_ns, doppler_ns = stamps(20.0, 7.0), T0_NS + np.array([0, 4, 7]) * NS
+    log = Dvl(doppler_ns, np.zeros((3, 3)), np.zeros((3, 3, 3)))
+    sensors = JointPreintegrator(1e-3, 0.0, body_T_dvl=gtsam.Pose3(gtsam.Rot3(), np.array(arm)))
+    return Imu(inertial_ns, rate * np.ones((len(inertial_ns), 3)), np.zeros((len(inertial_ns), 3))), log, sensors
+
+
+def test_gyro_noise_spreads_the_swing_about_the_imu_as_noise_of_every_row_does():
+    """Row by row by differences; to a tenth, since what a rate and the attitude share at an end is not counted."""
+    inertial, log, sensors = turning(np.array([0.1, -0.2, 0.8]), (1.0, 0.2, -0.3))
+    exact, expected = whole((inertial, log), sensors), np.zeros((3, 3))
+    for row in range(len(inertial)):
+        for axis in range(3):
+            rate = inertial.angular_velocity.copy()
+            rate[row, axis] += 1e-6
+            moved = whole((Imu(inertial.stamps_ns, rate, inertial.specific_force), log), sensors)
+            J = (moved.displacement - exact.displacement) / 1e-6
+            expected += np.outer(J, J) * sensors.gyro_noise_density**2 * 20.0
+    sigmas = np.sqrt(np.diag(expected))
+    off = (exact.covariance[DISPLACEMENT, DISPLACEMENT] - expected) / np.outer(sigmas, sigmas)
+    assert np.abs(off).max() < 0.1
+
+
+def test_earths_rotation_swings_no_doppler_log():
+    """At rest on the Earth gyros read its rate, and the log stays where it is."""
+    earth = np.array([0.04, -0.07, 0.05])
+    inertial, log, sensors = turning(earth, (1.0, 0.2, -0.3))
+    ends = int(log.stamps_ns[0]), int(log.stamps_ns[-1])
+    still = sensors.integrate(inertial, log, *ends, earth_rate=earth)
+    assert np.abs(still.displacement).max() < 1e-12
