@@ -8,8 +8,8 @@ velocity at the IMU's point and u the world's up, velocity less what the acceler
 
 b_a, b_g are the biases, l the lever arm from Doppler log to IMU, and Omega the Earth's rate, ``Omega sin(phi) u`` and a
 level part of unknown direction (`sonar_graph.navigation.initial_tilt`). v and u are free; biases and the level part
-have priors. The noise e holds the Doppler log's own, R, and steps of the IMU's white noise in the intervals m before k,
-with variance a^2 dt and N^2 dt::
+have priors. The noise e holds the Doppler log's own with that of one rate at the lever arm, R, and steps of the IMU's
+white noise in the intervals m before k, with variance a^2 dt and N^2 dt::
 
     cov(e_j, e_k) = R_k [j = k] + sum_{m <= j, k} dt_m (a^2 I + N^2 [x_j + F_m]x [x_k + F_m]x^T)
 
@@ -17,7 +17,7 @@ Least squares, linearised and integrated again with the bias found until it stay
 reference: Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd ed., 2013, chapter
 5.6; K. R. Britting, Inertial Navigation Systems Analysis, 1971, chapter 9.
 
-Left out: Doppler scale and mounting, the walk of the gyro bias, Coriolis acceleration, noise of the rate at the lever.
+Left out: Doppler scale and mounting, the walk of the gyro bias, Coriolis acceleration.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class _Doppler:
     lever: Floats
     """C [l]x, shape (k, 3, 3)."""
     R: Floats
-    """Covariance of C y, shape (k, 3, 3)."""
+    """Covariance of x by what is fresh in each sample, shape (k, 3, 3)."""
 
     @classmethod
     def along(cls, path: InertialPath, seconds: Floats, velocity: Floats, R: Floats, known: Calibration) -> _Doppler:
@@ -77,7 +77,9 @@ class _Doppler:
         at_imu = velocity + np.cross(path.rate_at(seconds), lever)
         turned = np.einsum("kij,kj->ki", C, at_imu)
         skewed = C @ cross_matrices(lever[None])
-        return cls(seconds, turned, turned - path.impulse_at(seconds), skewed, C @ R @ C.transpose(0, 2, 1))
+        rate_variance = known.imu.gyro_noise_density**2 / float(np.median(np.diff(path.seconds)))
+        by_rate = rate_variance * skewed @ skewed.transpose(0, 2, 1)
+        return cls(seconds, turned, turned - path.impulse_at(seconds), skewed, C @ R @ C.transpose(0, 2, 1) + by_rate)
 
 
 @dataclass(frozen=True, eq=False)
