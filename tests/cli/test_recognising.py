@@ -47,7 +47,9 @@ def recognised(lane_log: Path, run: Run, tmp_path_factory: pytest.TempPathFactor
 def strange_designs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of a landmark that is not in the log."""
     path = tmp_path_factory.mktemp("strange") / "mine.toml"
-    path.write_text(DESIGNS.replace("0.3", "2.0").replace("0.15]", "1.0]").replace("id = 4", "id = 9"))
+    bar = "polygon_m = [[-0.3, -0.02], [0.3, -0.02], [0.3, 0.02], [-0.3, 0.02]]"
+    text = DESIGNS.replace("size_m = 0.3", "size_m = 0.6").replace("circle_m = [0.0, 0.0, 0.15]", bar)
+    path.write_text(text.replace("id = 4", "id = 9"))
     return path
 
 
@@ -92,6 +94,16 @@ def test_where_nothing_is_recognised_one_line_says_so_and_what_was_looked_for(
         assert run(command, lane_log, "-o", tmp_path / out, "--designs", strange_designs, *more) == 0
         said = capsys.readouterr().out
         assert "Warning: no landmark was recognised; looked for 9: plate; --designs gives others" in said
+
+
+def test_a_design_that_is_never_a_candidate_is_refused_before_a_frame_is_read(lane_log, run, tmp_path, capsys):
+    path = tmp_path / "large.toml"
+    path.write_text(DESIGNS.replace("size_m = 0.3", "size_m = 2.0").replace("0.15]", "1.0]"))
+    assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--designs", path) == 2
+    said = capsys.readouterr().err
+    assert "plate (id 4) would never be found" in said
+    assert "Traceback" not in said
+    assert not (tmp_path / "out.mcap").exists()
 
 
 def test_a_log_made_with_other_designs_says_so(lane, run, tmp_path, capsys):
