@@ -205,6 +205,15 @@ def test_every_keyframe_has_its_odometry_and_gravity():
     assert without.smoother.graph.size() == 1 + 3
 
 
+def test_gravity_is_as_sure_as_the_mean_component_of_both_velocities():
+    """Accelerometers and gyros without noise: what is left is ``sqrt(2) sigma_v / T`` in units of gravity."""
+    imu = ImuCalibration(gyro_bias_sigma=0.0, gyro_noise_density=1e-9, accel_noise_density=1e-9, accel_bias_sigma=0.0)
+    keyframes = driven(Calibration(imu=imu, dvl=DvlCalibration(velocity_sigma_m_s=(0.01, 0.02, 0.05))), 2.0)
+    (factor,) = factors_on(keyframes, gtsam.MagPoseFactorPose3, X(1))
+    mean_variance = (0.01**2 + 0.02**2 + 0.05**2) / 3
+    assert factor.noiseModel().sigma() == pytest.approx(np.sqrt(2 * mean_variance) / 2.0 / G, rel=1e-4)
+
+
 def test_unmeasured_forces_bring_no_gravity():
     keyframes, imu = keyframes_of(Calibration(imu=NO_BIAS)), level_imu(4.0)
     keyframes.add(Imu(imu.stamps_ns, imu.angular_velocity, imu.specific_force * np.nan), steady_dvl(4.0), None)
