@@ -52,3 +52,14 @@ def test_without_turning_the_offset_cannot_be_told():
     still = Imu(RUN.imu.stamps_ns, 1e-4 * np.ones((len(RUN.imu), 3)), RUN.imu.specific_force)
     level = replace(early(0.1), quaternions_xyzw=np.tile([0.0, 0, 0, 1], (len(early(0.1)), 1)))
     assert not match_reference_to_imu(still, level, RUN.calibration).offset.is_known
+
+
+def test_a_rotation_of_the_world_is_told_apart_from_the_reference():
+    """The Earth's, exaggerated: felt by the gyros along the world's axes, so that it turns in those of the vehicle."""
+    stamps = RUN.imu.stamps_ns
+    world_earth, truth = np.array([2e-3, -1e-3, 3e-3]), RUN.truth.at(np.clip(stamps, *RUN.truth.stamps_ns[[0, -1]]))
+    felt = RUN.imu.angular_velocity + truth.rotations().inv().apply(world_earth)
+    turning = Imu(stamps, felt, RUN.imu.specific_force)
+    without, found = (match_reference_to_imu(imu, early(0.2), RUN.calibration).offset for imu in (RUN.imu, turning))
+    assert found.value == pytest.approx(without.value, abs=0.3 * without.sigma)
+    assert found.sigma < 1.6 * without.sigma
