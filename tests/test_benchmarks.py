@@ -51,7 +51,8 @@ def test_preintegration_names_its_figures() -> None:
     found = figures("performance/preintegration.py")
     assert found["gtsam_cpp_ratio"] == pytest.approx(found["ours_ns"] / found["gtsam_cpp_ns"], rel=1e-3)
     assert found["gtsam_python_ratio"] > 1
-    assert len(found["factor_us"]) == 4
+    assert len(found["factor_us"]) == 5
+    assert found["factor_us"]["odometry_with_bias (Python)"] > found["factor_us"]["BetweenFactorPose3 (compiled)"]
 
 
 def test_preintegration_consistency_tells_rules_apart() -> None:
@@ -195,6 +196,19 @@ def test_mrclam_names_its_figures(recordings: Path) -> None:
     assert found["robots"] == [1]
     assert found["isam2_smoothed_ate_m"][0] < found["dead_reckoning_causal_ate_m"][0]
     assert {"ekf_causal_ate_m", "landmark_error_m", "passed"} <= set(found)
+
+
+@pytest.mark.slow
+@pytest.mark.recording
+def test_odometry_rows_names_what_accelerometers_add(recordings: Path) -> None:
+    found = figures("validation/odometry_rows.py", "--data", str(recordings), "--workers", "2")
+    linear_mm, inertial_mm, linear_nees, inertial_nees = found["brisk, 1 Hz rms_mm, nees"]
+    assert linear_mm > 4 * inertial_mm
+    assert linear_nees > 10
+    assert 0.7 < inertial_nees < 1.3
+    assert 0.8 < found["basin 12"][0] < 1.2
+    # An IMU in the wrong place and an Earth at rest show in chi-square, the right calibration does not.
+    assert found["A-KIT IMU at the reference's point"][0] > found["A-KIT Earth at rest"][0] > 2 > found["A-KIT 12"][0]
 
 
 @pytest.mark.recording

@@ -14,7 +14,10 @@ tangent preintegration (the manifold one: 320 ns), since its Python package take
 ``gtsam_scenario_ns`` bounds it from above in this run: the slope of `ScenarioRunner.integrate`, whose loop is in C++
 but also makes up the samples.
 
-``factor_us``: one linearisation of the two Python factors and of the compiled ones that come nearest.
+``linear_1s_call_us``: a second by the rule "linear", which has the Doppler log alone between its samples.
+
+``factor_us``: one linearisation of the two Python factors, of the one that iSAM2 has for odometry with a gyro bias, and
+of the compiled ones that come nearest.
 
 All take turns, and the fastest round of each counts.
 """
@@ -35,6 +38,7 @@ from common import make_parser, print_figures, print_table
 
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation import JointPreintegrator
+from sonar_graph.slam.factors import odometry_with_bias
 from sonar_graph.slam.inertial_factors import doppler_odometry, inertial_doppler_odometry
 
 NS = 1_000_000_000
@@ -42,7 +46,7 @@ IMU_HZ, DVL_HZ = 200, 5
 GTSAM_CPP_NS = 150.0
 FEW_S, MANY_S = 1, 60
 GRAVITY = np.array([0.0, 0.0, -9.81])
-SENSORS = JointPreintegrator(1e-3, 1e-3)
+SENSORS, LINEAR = JointPreintegrator(1e-3, 1e-3), JointPreintegrator(1e-3, 1e-3, rule="linear")
 
 
 def samples() -> tuple[Imu, Dvl]:
@@ -97,10 +101,12 @@ def factors(rows: tuple[Imu, Dvl]) -> tuple[dict[str, gtsam.NonlinearFactor], gt
     values.insert(X(0), gtsam.Pose3())
     values.insert(X(1), pose.i_T_j)
     values.insert(B(0), gtsam.imuBias.ConstantBias())
+    values.insert(B(1), np.zeros(3))
     for key in (V(0), V(1)):
         values.insert(key, np.zeros(3))
     noise = gtsam.noiseModel.Gaussian.Covariance(pose.covariance)
     return {
+        "odometry_with_bias (Python)": odometry_with_bias(X(0), X(1), B(1), pose),
         "doppler_odometry (Python)": doppler_odometry(X(0), X(1), B(0), motion),
         "inertial_doppler_odometry (Python)": inertial_doppler_odometry(X(0), V(0), X(1), V(1), B(0), motion, GRAVITY),
         "BetweenFactorPose3 (compiled)": gtsam.BetweenFactorPose3(X(0), X(1), pose.i_T_j, noise),
@@ -119,6 +125,7 @@ def preintegration_ns(rows: tuple[Imu, Dvl], rounds: int) -> dict[str, Floats]:
     for seconds in (FEW_S, MANY_S):
         works: dict[str, Callable[[], object]] = {
             "ours": lambda seconds=seconds: SENSORS.integrate(*rows, 0, seconds * NS),
+            "linear": lambda seconds=seconds: LINEAR.integrate(*rows, 0, seconds * NS),
             "gtsam": lambda seconds=seconds: per_sample(rows, seconds),
             "scenario": lambda seconds=seconds: scenario(seconds),
         }
@@ -129,7 +136,8 @@ def preintegration_ns(rows: tuple[Imu, Dvl], rounds: int) -> dict[str, Floats]:
 def main() -> int:
     quick = make_parser(__doc__).parse_args().quick
     rows, rounds = samples(), 10 if quick else 60
-    SENSORS.integrate(*rows, 0, NS)
+    for sensors in (SENSORS, LINEAR):
+        sensors.integrate(*rows, 0, NS)
     cost = preintegration_ns(rows, rounds)
     more = (MANY_S - FEW_S) * IMU_HZ
     slopes = {name: float(np.diff(values)[0]) / more for name, values in cost.items()}
@@ -142,6 +150,7 @@ def main() -> int:
     figures = {
         "ours_ns": slopes["ours"],
         "ours_1s_call_us": float(cost["ours"][0]) / 1e3,
+        "linear_1s_call_us": float(cost["linear"][0]) / 1e3,
         "gtsam_python_ns": slopes["gtsam"],
         "gtsam_scenario_ns": slopes["scenario"],
         "gtsam_cpp_ns": GTSAM_CPP_NS,
