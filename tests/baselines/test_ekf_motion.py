@@ -5,13 +5,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from baselines.ekf_motion import motion_since_node, motion_to_node, nothing_running
+from baselines.ekf_motion import motion_since_node, motion_to_node, nothing_running, told_again
 from baselines.ekf_prediction import VehicleModel
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.dvl_preintegration import Preintegrator
+from sonar_graph.navigation.gap_motion import gap_values
 from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.sequence import NS_PER_S
+
+from .motions import motion_of
 
 T0_NS, SECONDS = 1_700_000_000 * NS_PER_S, 2.0
 LEVER, GYRO_DENSITY = (-0.2, 0.1, -0.15), 1e-3
@@ -95,3 +98,91 @@ def test_a_running_motion_begins_anew_when_the_attitude_that_turns_the_earth_rat
     _, motion = motion_since_node(columns, VEHICLE, turned, running, node_ns, until_ns)
     assert_preintegrated(motion, odometry.steps_since_node(node_ns, until_ns), turned)
     assert np.abs(np.array(before.dR) - np.eye(3)).max() > 1e-3
+
+
+def whole(motion) -> np.ndarray:
+    """Covariance of [theta_i, eps]."""
+    rt = np.array(motion.cov_rt)
+    return np.block([[np.array(motion.cov_tt), rt.T], [rt, np.array(motion.cov_rr)]])
+
+
+def test_measurements_over_one_gap_tell_ever_nearer_what_one_exact_one_would_and_never_more():
+    """A telescoping sum by hand: ``1 / (k (k + 1)) = 1 / k - 1 / (k + 1)``, so that n of them tell ``n / (n + 1)``."""
+    root = np.random.default_rng(4).normal(size=(6, 6))
+    motion = motion_of(np.array([0.3, -0.2, 0.5, 1.0, 2.0, -0.5]), root @ root.T)
+    told, n = np.zeros((6, 6)), 12
+    for k in range(1, n + 1):
+        again = told_again(motion, k)
+        told += np.linalg.inv(whole(again))
+        assert (again.dR, again.dp, again.impulse) == (motion.dR, motion.dp, motion.impulse)
+        assert_allclose(told @ whole(motion), k / (k + 1) * np.eye(6), atol=1e-9)
+
+
+LOST_S, FOUND_S = 1.0, 2.2
+
+
+def lost(rate_error=(0.0, 0.0, 0.0)):
+    """Turning and surging without bottom lock for 1.2 s; gyros read an error."""
+    imu_ns, dvl_ns = (T0_NS + np.arange(round(hz * 3)) * (NS_PER_S // hz) for hz in (50, 10))
+    t, s = (imu_ns - T0_NS) / NS_PER_S, (dvl_ns - T0_NS) / NS_PER_S
+    rates = np.column_stack([0.5 + 0.4 * np.sin(2 * t), 0.9 * np.cos(t), 0.8 + 0.0 * t])
+    rates += np.array(rate_error)
+    forces = np.column_stack([0.5 * np.cos(t), 0.3 * np.sin(2 * t), 9.8 + 0.2 * np.sin(t)])
+    velocities = np.column_stack([0.5 * np.sin(s), 0.2 * np.cos(s), -0.3 * s])
+    has_lock = (s <= LOST_S) | (s >= FOUND_S)
+    rows = Odometry(Calibration())
+    rows.add(
+        Imu(imu_ns, rates, forces),
+        Dvl(dvl_ns[has_lock], velocities[has_lock], np.full((has_lock.sum(), 3, 3), np.nan)),
+    )
+    return rows.columns()
+
+
+def vehicle_with_gaps(bias_sigma, gap_s=0.5):
+    known = Calibration(
+        imu=ImuCalibration(mounting=Mounting(translation_m=(0.3, 0.1, -0.2))),
+        dvl=DvlCalibration(mounting=Mounting(translation_m=LEVER), gap_s=gap_s),
+    )
+    return VEHICLE._replace(gap=gap_values(known), gyro_bias_sigma=bias_sigma)
+
+
+def over_gap(columns, vehicle, until_s, node_s=LOST_S):
+    node_ns, until_ns = (T0_NS + round(s * NS_PER_S) for s in (node_s, until_s))
+    if until_s >= FOUND_S:
+        return motion_to_node(columns, vehicle, X, node_ns, until_ns)
+    return motion_since_node(columns, vehicle, X, nothing_running(), node_ns, until_ns)[1]
+
+
+@pytest.mark.parametrize("until_s", [FOUND_S, 2.0], ids=["closed", "open"])
+def test_a_gap_adds_what_an_unknown_gyro_bias_does_to_the_displacement(until_s):
+    """``sigma^2 J J^T``, J by gyros that err by one axis after the other."""
+    sigma, step = 0.02, 1e-5
+    known, unknown = (over_gap(lost(), vehicle_with_gaps(s), until_s) for s in (0.0, sigma))
+    ends = [
+        [np.array(over_gap(lost(side * step * axis), vehicle_with_gaps(0.0), until_s).dp) for side in (-1, 1)]
+        for axis in np.eye(3)
+    ]
+    J = np.column_stack([(after - before) / (2 * step) for before, after in ends])
+    added = np.array(unknown.cov_rr) - np.array(known.cov_rr)
+    assert_allclose(added, sigma**2 * J @ J.T, atol=5e-3 * sigma**2 * np.linalg.norm(J) ** 2)
+    assert np.abs(J @ J.T - J.T @ J).max() > 0.05 * np.linalg.norm(J) ** 2  # else the order would not be seen
+    assert (unknown.cov_tt, unknown.cov_rt) == (known.cov_tt, known.cov_rt)
+
+
+@pytest.mark.parametrize("until_s", [FOUND_S, 2.0], ids=["closed", "open"])
+def test_the_turn_over_a_gap_is_that_without_one(until_s):
+    """Gyros do not miss the Doppler log; the Earth's rotation is taken out of them too."""
+    gapless, over = (over_gap(lost(), vehicle, until_s) for vehicle in (VEHICLE, vehicle_with_gaps(0.01)))
+    assert_allclose(over.dR, gapless.dR, atol=1e-12)
+    assert not np.allclose(over.dp, gapless.dp, atol=0.01)
+
+
+@pytest.mark.parametrize(("until_s", "node_s"), [(0.9, 0.8), (2.4, 2.3)])
+def test_an_interval_as_long_as_the_longest_is_no_gap(until_s, node_s):
+    """Its bits are those without any model of gaps; in one that is longer they are not."""
+    gapless, over, beyond = (
+        over_gap(lost(), vehicle, until_s, node_s)
+        for vehicle in (VEHICLE, vehicle_with_gaps(0.01, 0.1), vehicle_with_gaps(0.01, 0.0999))
+    )
+    assert over == gapless
+    assert beyond != gapless
