@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from sonar_graph.evaluation.sensor_check import Finding
+    from sonar_graph.evaluation.finding import Finding
     from sonar_graph.logs.adapters.config import LogConfig
     from sonar_graph.logs.calibration_sources import PartialCalibration
     from sonar_graph.logs.inspection import LogSummary, TopicSummary
@@ -38,7 +38,8 @@ def inspect(
     quick: Annotated[
         bool,
         typer.Option(
-            "--quick", help="Do not compare sensors with each other (time offsets, DVL yaw and scale, noise): seconds."
+            "--quick",
+            help="Do not compare sensors with each other (time offsets, DVL mounting, biases, start, noise): seconds.",
         ),
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print everything as one JSON object.")] = False,

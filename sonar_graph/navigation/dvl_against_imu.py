@@ -1,4 +1,4 @@
-"""Time offset, mounting and scale of a Doppler log, from the accelerations that it shares with the IMU.
+"""Time offset, mounting, lever arm and scale of a Doppler log, from the accelerations that it shares with the IMU.
 
 Between two Doppler samples the change of velocity is also what the accelerometers felt, less gravity. In the frame g of
 `sonar_graph.navigation.inertial_path`, with the samples k at their stamps plus the offset tau::
@@ -12,7 +12,8 @@ lever arm l from the IMU to the log, b and b_g the biases of accelerometers and 
 which stands for tilt and the Earth's rotation, are fitted anew every half minute. A gyro bias turns gravity along a
 straight line only while the body keeps its heading: left to gamma', what it does in turns, the same in every stretch,
 would go into psi and s, whose intervals know nothing of it. The offset acts through the change of the velocity as the
-body sees it: ``d/dtau x = -C dv/dt`` and a constant. Straight and steady driving says nothing of it.
+body sees it: ``d/dtau x = -C dv/dt`` and a constant. Straight and steady driving says nothing of it. The lever arm
+acts in turns alone, and along their axis not at all; the gyro bias shows where gravity is seen from changing headings.
 
 The velocities that multiply s and psi are those that the accelerometers carry on from a fit over the stretch. The log's
 own would bring their noise into the regression twice, which shrinks s towards nothing (errors in variables). The
@@ -47,22 +48,28 @@ LARGEST_INTERVAL = 3.0
 """Times the usual one: a longer time between two samples ends a stretch."""
 LEAST_STRETCHES = 2
 
-PRIOR_SIGMAS = np.array([1.0, 0.05, 0.05, 1.0, *[1.0] * 3, *[0.5] * 3, *[0.02] * 3])
+PRIOR_SIGMAS = np.array([1.0, 0.05, 0.05, 1.0, *[3.0] * 3, *[0.5] * 3, *[0.02] * 3])
 """Scale; turn, rad, about x and y near what the calibration says; lever arm, m; biases, m/s² and rad/s."""
-SCALE, YAW, GYRO_BIAS = 1, 4, slice(11, 14)
+SCALE, YAW, LEVER, GYRO_BIAS = 1, 4, slice(5, 8), slice(11, 14)
 """Places among the parameters, after the offset."""
 LARGEST_STEP_LEFT = 0.01
-"""Of turn (rad), scale and gyro bias over a stretch (rad): linearising again then changes nothing that matters."""
+"""Of turn (rad), scale, gyro bias over a stretch (rad) and lever arm times a usual rate (m/s): linearising again then
+changes nothing that matters."""
+USUAL_RATE_RAD_S = 0.1
 ROUNDS = 5
 
 OFFSET_LIMIT_S, YAW_LIMIT_RAD, SCALE_LIMIT = 0.1, np.radians(2.0), 0.02
+LEVER_LIMIT_M, GYRO_BIAS_LIMIT_RAD_S = 0.25, 5e-3
 """What is less certain than this is said not to be told."""
 NO_MANOEUVRES = "too little acceleration"
+NO_TURNS = "too little turning"
+Estimates3D = tuple[Estimate1D, Estimate1D, Estimate1D]
+"""Along x, y and z of the body."""
 
 
 @dataclass(frozen=True)
 class DvlMatch:
-    """What a Doppler log's readings say about its stamps, its mounting and its scale."""
+    """What a Doppler log's readings say about its stamps, its mounting, its scale, and the gyros."""
 
     offset: Estimate1D
     """To be added to its stamps, s."""
@@ -70,6 +77,10 @@ class DvlMatch:
     """To be added to the mounting's yaw, about the body's z axis, rad."""
     scale: Estimate1D
     """Factor by which its velocities must be multiplied."""
+    lever: Estimates3D
+    """From the IMU to the log, body axes, m: the whole arm, not a correction."""
+    gyro_bias: Estimates3D
+    """Body axes, rad/s; the Earth's rotation along an axis that keeps its direction is in it."""
 
 
 def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
@@ -107,17 +118,25 @@ def _matched(imu: Imu, seconds: Floats, velocity: Floats, runs: list[slice], lev
         found = search_offset(line_up, PRIOR_SIGMAS)
         found = _without_shared_noise(found, line_up(found.offset_s))
         (more, turn), drift = found.fit.parameters[[SCALE, YAW]].tolist(), found.fit.parameters[GYRO_BIAS]
-        yaw, scale, gyro_bias = yaw + turn, scale * (1.0 + more), gyro_bias + drift
-        if np.linalg.norm([turn, more, *(drift * STRETCH_S)]) < LARGEST_STEP_LEFT:
+        sigma = np.sqrt(np.diag(found.fit.covariance))
+        longer = np.where(sigma[LEVER] <= LEVER_LIMIT_M, found.fit.parameters[LEVER], 0.0)
+        yaw, scale, gyro_bias, lever = yaw + turn, scale * (1.0 + more), gyro_bias + drift, lever + longer
+        if np.linalg.norm([turn, more, *(drift * STRETCH_S), *(longer * USUAL_RATE_RAD_S)]) < LARGEST_STEP_LEFT:
             break
     else:
         return _unknown(NO_MANOEUVRES)
-    sigma = np.sqrt(np.diag(found.fit.covariance))
     return DvlMatch(
         found.offset().limited(OFFSET_LIMIT_S, NO_MANOEUVRES),
         Estimate1D(yaw, float(sigma[YAW])).limited(YAW_LIMIT_RAD, NO_MANOEUVRES),
         Estimate1D(scale, float(sigma[SCALE])).limited(SCALE_LIMIT, NO_MANOEUVRES),
+        _along_axes(lever, sigma[LEVER], LEVER_LIMIT_M),
+        _along_axes(gyro_bias, sigma[GYRO_BIAS], GYRO_BIAS_LIMIT_RAD_S),
     )
+
+
+def _along_axes(values: Floats, sigmas: Floats, limit: float) -> Estimates3D:
+    x, y, z = (Estimate1D(float(values[i]), float(sigmas[i])).limited(limit, NO_TURNS) for i in range(3))
+    return x, y, z
 
 
 def _without_shared_noise(found: OffsetFit, stretches: list[Stretch]) -> OffsetFit:
@@ -129,7 +148,7 @@ def _without_shared_noise(found: OffsetFit, stretches: list[Stretch]) -> OffsetF
 
 def _unknown(reason: str) -> DvlMatch:
     nothing = Estimate1D(np.nan, np.inf, reason)
-    return DvlMatch(nothing, nothing, nothing)
+    return DvlMatch(nothing, nothing, nothing, (nothing,) * 3, (nothing,) * 3)
 
 
 def _in_body_axes(imu: Imu, calibration: Calibration) -> Imu:

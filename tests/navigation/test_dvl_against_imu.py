@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.doppler_beams import UNMEASURED_M_S
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.dvl_against_imu import DvlMatch, match_dvl_to_imu
@@ -84,3 +85,61 @@ def test_a_gyro_bias_changes_no_estimate():
     for one, other in ((here.offset, there.offset), (here.yaw, there.yaw), (here.scale, there.scale)):
         assert abs(one.value - other.value) < 0.2 * one.sigma
         assert other.sigma < 1.1 * one.sigma
+
+
+def with_imu_at(run: Sequence, place_m: tuple[float, float, float]) -> Sequence:
+    """The same run whose calibration says that the IMU is elsewhere."""
+    imu = run.calibration.imu
+    moved = imu.model_copy(update={"mounting": imu.mounting.model_copy(update={"translation_m": place_m})})
+    return replace(run, calibration=run.calibration.model_copy(update={"imu": moved}))
+
+
+def test_the_lever_arm_is_found_whatever_the_calibration_says():
+    """The simulator's: (-0.2, 0, -0.15) m. From calibrations metres apart comes one arm."""
+    run = spoilt(1)
+    here, there = matched(run), matched(with_imu_at(run, (1.4, -1.2, 1.0)))
+    for found in (here, there):
+        for one, true in zip(found.lever, (-0.2, 0.0, -0.15), strict=True):
+            assert abs(one.value - true) < 4 * one.sigma < 0.4
+    for one, other in zip(here.lever, there.lever, strict=True):
+        assert abs(one.value - other.value) < 0.25 * one.sigma
+    assert there.yaw.value == pytest.approx(here.yaw.value, abs=0.25 * here.yaw.sigma)
+
+
+def on_a_plane(arm_m: np.ndarray) -> tuple[Imu, Dvl]:
+    """By hand: at 1 m/s along a swinging heading a sin(b t), level throughout; IMU at the body's origin."""
+    rng, a, b = np.random.default_rng(0), 1.5, 0.3
+    t, dvl_t = np.arange(0, 150, 0.01), np.arange(0, 150, 0.2)
+    turning = a * b * np.cos(b * t)
+    force = np.column_stack([0.2 * np.cos(0.2 * t), (1 + np.sin(0.2 * t)) * turning, np.full_like(t, 9.81)])
+    rate = np.outer(turning, [0.0, 0.0, 1.0])
+    along = np.outer(1 + np.sin(0.2 * dvl_t), [1.0, 0.0, 0.0])
+    velocity = along + np.cross(np.outer(a * b * np.cos(b * dvl_t), [0.0, 0.0, 1.0]), arm_m)
+    imu_noise, dvl_noise = rng.standard_normal((2, len(t), 3)), rng.standard_normal((len(dvl_t), 3))
+    imu_ns, dvl_ns = (np.round(1e9 * seconds).astype(np.int64) for seconds in (t, dvl_t))
+    unknown = np.full((len(dvl_t), 3, 3), np.nan)
+    imu = Imu(imu_ns, rate + 1e-4 * imu_noise[0], force + 1e-2 * imu_noise[1])
+    return imu, Dvl(dvl_ns, velocity + 0.01 * dvl_noise, unknown)
+
+
+def test_turning_about_one_axis_tells_the_arm_across_it_alone():
+    arm = np.array([0.7, -0.4, 0.5])
+    found = match_dvl_to_imu(*on_a_plane(arm), Calibration())
+    for one, true in zip(found.lever[:2], arm, strict=False):
+        assert abs(one.value - true) < 4 * one.sigma < 0.1
+    assert not found.lever[2].is_known
+    assert found.lever[2].reason == "too little turning"
+
+
+def test_the_gyro_bias_is_found_in_body_axes():
+    """The readings of an IMU that is mounted on its side, with a bias on its own axes."""
+    run, bias = spoilt(1), np.array([2e-3, -3e-3, 4e-3])
+    on_its_side = Rotation.from_euler("ZYX", [0.3, 0.2, 1.5])
+    own = [on_its_side.inv().apply(columns) for columns in (run.imu.angular_velocity, run.imu.specific_force)]
+    mounting = Mounting(rpy_rad=(1.5, 0.2, 0.3))
+    calibration = run.calibration.model_copy(
+        update={"imu": run.calibration.imu.model_copy(update={"mounting": mounting})}
+    )
+    found = match_dvl_to_imu(Imu(run.imu.stamps_ns, own[0] + bias, own[1]), run.dvl, calibration)
+    for one, true in zip(found.gyro_bias, on_its_side.apply(bias), strict=True):
+        assert abs(one.value - true) < 4 * one.sigma < 0.3 * np.linalg.norm(bias)
