@@ -48,6 +48,14 @@ PUBLISHED_LEGEND = (
 )
 
 
+FAR_FROM_FITTING = 6.0
+"""One draw of a chi-square of three, over three, is above 5.4 once in a thousand times."""
+ASK_INSPECT = (
+    "NEES far above 1 without landmarks at work: stamps, start or reference may be off; "
+    "sonar-graph inspect LOG compares reference, clocks and sensors"
+)
+
+
 def summary(comparison: Comparison) -> Group:
     """The runs in rows with position error (causal and smoothed), yaw error, NEES and time; below, why runs failed.
 
@@ -136,7 +144,18 @@ def _notes(comparison: Comparison) -> Text:
     else:
         lines.append(f"causal, smoothed: {LABELS[metric]}")
         lines.append(NEES_LEGEND)
+        lines += _reference_doubt(comparison)
     return Text("\n".join(lines))
+
+
+def _reference_doubt(comparison: Comparison) -> list[str]:
+    """Where odometry alone contradicts the reference, no estimator is to blame."""
+    for run in comparison.runs:
+        score = score_of(comparison, run.estimator, "causal.nees_position")
+        is_odometry = run.estimator == "dead-reckoning" or not has_detections(comparison)
+        if is_odometry and score is not None and score.value > FAR_FROM_FITTING:
+            return [ASK_INSPECT]
+    return []
 
 
 def _recognition(comparison: Comparison) -> list[str]:

@@ -19,7 +19,7 @@ from sonar_graph.evaluation.outcome import check_estimate, check_outcome
 from sonar_graph.evaluation.results import MapSoFar, RunResult
 from sonar_graph.measurements import Ints, LandmarkDetections, Measurements
 from sonar_graph.sequence import Sequence
-from sonar_graph.states import Estimate, Trajectory
+from sonar_graph.states import Estimate, RefusedRow, Trajectory
 
 REASON_WIDTH = 400
 """Characters of a reason at most: one line that a table can hold."""
@@ -109,13 +109,14 @@ class _Replay:
     def run(self, kind: type[Estimator], progress: Callable[[int, int], None] | None) -> RunResult:
         """Everything from construction to the final map."""
         self._warm_up(kind)
-        memory = PeakMemory()
+        memory, estimator = PeakMemory(), None
         try:
             estimator = kind(self._sequence.calibration, self._params)
             self._process(estimator, progress)
             return self._finish(estimator, memory)
         except Exception as error:  # a third party's estimator may fail in any way, and the others still run
-            return self._result("failed", f"{self._stage}: {one_line(error)}", peak_memory_mb=memory.rise_mb())
+            reason, refused = f"{self._stage}: {one_line(error)}", _refused_so_far(estimator)
+            return self._result("failed", reason, refused=refused, peak_memory_mb=memory.rise_mb())
 
     def _warm_up(self, kind: type[Estimator]) -> None:
         """Let an estimator that is thrown away compile what it needs, until landmarks were seen again."""
@@ -165,6 +166,13 @@ class _Replay:
     def _result(self, status: Any, reason: str = "", **outcome: Any) -> RunResult:
         params = self._params.model_dump(mode="json")
         return RunResult(self._name, params, status, reason, update_s=np.array(self._update_s), **outcome)
+
+
+def _refused_so_far(estimator: Estimator | None) -> list[RefusedRow]:
+    """What a run that failed had refused before, often why it failed; nothing where it cannot even say that."""
+    with contextlib.suppress(Exception):
+        return [] if estimator is None else refused_rows_of(estimator)
+    return []
 
 
 def _names(detections: LandmarkDetections) -> bool:

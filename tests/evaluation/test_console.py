@@ -111,3 +111,18 @@ def test_the_published_table_has_a_counterpart_in_80_columns_with_the_numbers_of
     for row in (*table.positions, *table.totals):
         assert all(cell in text for cell in row.cells)
     assert "dead-reckoning x" not in text
+
+
+def test_odometry_far_from_its_reference_asks_for_inspect_and_nothing_else_does():
+    comparison, hint = basin_comparison(60), "sonar-graph inspect LOG compares reference"
+    blind = replace(comparison, sequence=replace(comparison.sequence, detections=None))
+    cases = [
+        (comparison, "dead-reckoning", 30.0, True),
+        (comparison, "dead-reckoning", 4.0, False),
+        (comparison, "isam2", 30.0, False),  # landmarks may be the cause
+        (blind, "isam2", 30.0, True),
+    ]
+    for case, name, nees, is_told in cases:
+        score = Score(nees, "1", "By hand.", better="inside")
+        text = printed(with_score(case, name, "causal.nees_position", score), 200)
+        assert (hint in text) == is_told, (name, nees)

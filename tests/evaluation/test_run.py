@@ -15,7 +15,7 @@ from sonar_graph.evaluation.instants import map_instants
 from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.measurements import LandmarkDetections, Measurements
 from sonar_graph.sequence import Sequence
-from sonar_graph.states import Estimate, LandmarkMap, Trajectory
+from sonar_graph.states import Estimate, LandmarkMap, Refusal, RefusedRow, Trajectory
 
 Make = Callable[..., Sequence]
 Install = Callable[..., None]
@@ -135,6 +135,30 @@ def test_an_exception_becomes_a_reason_of_one_line_with_type_and_time(
     assert result.reason == "3.500 s after the start (4500000000 ns): ZeroDivisionError: the matrix is singular"
     assert result.causal is None
     assert len(result.update_s) == 6
+
+
+@pytest.mark.parametrize("can_tell", [True, False])
+def test_a_failed_run_names_the_rows_that_were_refused_before_it_failed(
+    install: Install, make_sequence: Make, offset_estimator: Any, can_tell: bool
+) -> None:
+    row = RefusedRow("dvl", 2_000_000_000, Refusal.OUTLIER, 100.0)
+
+    class Refuses(offset_estimator):
+        def process(self, measurements: Measurements) -> Estimate | None:
+            if len(self.estimates) == 6:
+                raise ZeroDivisionError("singular")
+            return super().process(measurements)
+
+        def refused_rows(self) -> list[RefusedRow]:
+            if not can_tell:
+                raise ValueError("not even that")
+            return [row]
+
+    install(refuses=Refuses)
+    result = run_estimator(make_sequence(), "refuses")
+    assert result.status == "failed"
+    assert "ZeroDivisionError: singular" in result.reason
+    assert result.refused == ([row] if can_tell else [])
 
 
 def estimate_with(estimate: Estimate, **change: Any) -> Estimate:
