@@ -7,6 +7,7 @@ last call; that is what an estimator processes.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Self
@@ -18,6 +19,9 @@ from sonar_graph.errors import MeasurementError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+NO_TRACK = -1
+"""Track number of a detection that stands for itself."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +165,16 @@ class LandmarkDetections(Block):
     """Identities that the recogniser considers, shape (n, k); -1 fills unused places."""
     id_probability: Floats
     """Posterior of each candidate, shape (n, k). What is missing to 1 is "none of the known landmarks"."""
+    track: Ints = dataclasses.field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """Which uninterrupted watch of one object each row belongs to, shape (n,); `NO_TRACK` (-1): of none.
+
+    Rows of one track show the same object, and each has the posterior that all of the track's evidence so far gives:
+    the last row's is the best. Left out: no row belongs to a track."""
+
+    def __post_init__(self) -> None:
+        if not len(self.track):
+            object.__setattr__(self, "track", np.full(len(self.stamps_ns), NO_TRACK, dtype=np.int64))
+        super().__post_init__()
 
     def frames(self) -> Iterator[LandmarkDetections]:
         """The rows of each sonar frame, that is of each stamp."""

@@ -115,8 +115,13 @@ class Outcome(StrEnum):
 
     USED = "used"
     NEW = "new landmark"
+    USED_LATER = "used later, when its identity was known"
+    MOVED = "used: taken back from one landmark and given to another"
     GATED = "refused: innovation outside the gate"
     NO_IDENTITY = "refused: no identity probable enough"
+    WAITING = "waiting: its identity is not known yet"
+    FORGOTTEN = "refused: its identity did not become known in time"
+    TAKEN_BACK = "taken back: its track is of no known landmark"
     REPEATED = "refused: the frame shows this landmark elsewhere, more probably"
     LATE = "refused: older than what was already processed"
     UNLOCATED = "refused: no odometry covers its stamp"

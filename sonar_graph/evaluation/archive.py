@@ -6,7 +6,7 @@ Fields of one object share a prefix: ``causal.stamps_ns``, ``causal.positions``,
 from __future__ import annotations
 
 import zipfile
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -132,13 +132,14 @@ def _unpack(prefix: str, kind: type[T], arrays: Arrays) -> T | None:
     EvaluationError
         Naming the field that is missing.
     """
-    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]  # every kind here is a dataclass
-    if not any(f"{prefix}.{name}" in arrays for name in names):
+    columns = fields(kind)  # type: ignore[arg-type]  # every kind here is a dataclass
+    stored = [column.name for column in columns if f"{prefix}.{column.name}" in arrays]
+    if not stored:
         return None
-    missing = [name for name in names if f"{prefix}.{name}" not in arrays]
+    missing = [c.name for c in columns if c.name not in stored and c.default_factory is MISSING]
     if missing:
         raise EvaluationError(f"stored {prefix} lacks {', '.join(missing)}; write the comparison anew")
-    return kind(**{name: _plain(name, arrays[f"{prefix}.{name}"]) for name in names})
+    return kind(**{name: _plain(name, arrays[f"{prefix}.{name}"]) for name in stored})
 
 
 def _plain(name: str, array: np.ndarray) -> Any:

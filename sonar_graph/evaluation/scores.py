@@ -151,8 +151,8 @@ def detection_scores(log: DetectionLog) -> dict[str, Score]:
     """What became of the detections, and whether innovations fit their covariances."""
     counts = Counter(log.outcomes)
     new, ignored = counts[Outcome.NEW], counts[Outcome.IGNORED]
-    used = counts[Outcome.USED] + new
-    unnamed = counts[Outcome.NO_IDENTITY]
+    used = counts[Outcome.USED] + counts[Outcome.USED_LATER] + counts[Outcome.MOVED] + new
+    unnamed = counts[Outcome.NO_IDENTITY] + counts[Outcome.WAITING] + counts[Outcome.FORGOTTEN]
     refused = len(log) - used - ignored - unnamed
     of_all = f"of {len(log)}" + (f", {ignored} of which this estimator has no use for" if ignored else "")
     scores = {
@@ -162,7 +162,8 @@ def detection_scores(log: DetectionLog) -> dict[str, Score]:
         "detections.refused": Score(
             float(refused),
             "1",
-            f"Detections of a landmark refused, {of_all}: outside the gate, repeated, too late or without odometry.",
+            f"Detections of a landmark refused, {of_all}: outside the gate, repeated, too late, taken back "
+            "or without odometry.",
             better="none",
         ),
         "detections.unnamed": Score(

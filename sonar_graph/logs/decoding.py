@@ -8,7 +8,7 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.container import Topic
 from sonar_graph.logs.table import NOT_FINITE, Dropped, fit_rows, header_stamps_ns, not_finite
-from sonar_graph.measurements import Ints, LandmarkDetections
+from sonar_graph.measurements import NO_TRACK, Ints, LandmarkDetections
 from sonar_graph.states import LandmarkMap
 
 
@@ -25,19 +25,20 @@ def read_detections(topic: Topic) -> tuple[LandmarkDetections | None, Dropped]:
     if not groups:
         return None, {}
     parts = [_detection_columns(topic, group, log_times_ns) for group in groups]
-    places = max(1, *(ids.shape[1] for *_, ids, _ in parts))
+    places = max(1, *(ids.shape[1] for *_, ids, _, _ in parts))
     order, stamps, ranges, azimuths, covariances = (np.concatenate([p[i] for p in parts]) for i in range(5))
     ids = np.concatenate([_widen(p[5], places, -1) for p in parts])
     probabilities = np.concatenate([_widen(p[6], places, 0) for p in parts])
+    tracks = np.concatenate([p[7] for p in parts])
     faults = {NOT_FINITE: not_finite(ranges, azimuths, probabilities)}
     first = np.argsort(order, kind="stable")
     rows, dropped = fit_rows(stamps[first], {k: v[first] for k, v in faults.items()}, unique=False)
-    columns = (stamps, ranges, azimuths, covariances, ids, probabilities)
+    columns = (stamps, ranges, azimuths, covariances, ids, probabilities, tracks)
     return (LandmarkDetections(*(c[first[rows]] for c in columns)) if rows.size else None), dropped
 
 
 def _detection_columns(topic: Topic, group: Messages, log_times_ns: Ints) -> tuple[np.ndarray, ...]:
-    """Message number, stamp, range, azimuth, covariance, identities and probabilities, one row a detection."""
+    """Message number, stamp, range, azimuth, covariance, identities, probabilities and track, one row a detection."""
     frames, count = group["range_m"].shape
     ids, probabilities = group["candidate_ids"], group["id_probability"]
     sizes = (group["azimuth_rad"].shape[1], group["covariance"].shape[1], ids.shape[1] % count, probabilities.shape[1])
@@ -56,7 +57,22 @@ def _detection_columns(topic: Topic, group: Messages, log_times_ns: Ints) -> tup
         group["covariance"].reshape(total, 2, 2),
         ids.reshape(total, places),
         probabilities.reshape(total, places),
+        _tracks(topic, group),
     )
+
+
+def _tracks(topic: Topic, group: Messages) -> Ints:
+    """Track of each detection, shape (n,); logs of earlier versions have none."""
+    frames, count = group["range_m"].shape
+    tracks = group["track"] if "track" in group.layout.columns else np.empty((frames, 0), np.int64)
+    if tracks.shape[1] == 0:
+        return np.full(frames * count, NO_TRACK, dtype=np.int64)
+    if tracks.shape[1] != count:
+        raise LogError(
+            f"{topic.file}: topic {topic.name}: message {group.rows[0]} has {count} ranges and {tracks.shape[1]} "
+            "tracks; expected as many, or none"
+        )
+    return np.asarray(tracks, dtype=np.int64).reshape(frames * count)
 
 
 def _widen(columns: np.ndarray, places: int, filling: int) -> np.ndarray:

@@ -16,7 +16,7 @@ from sonar_graph.logs.recorder import Outgoing
 from sonar_graph.logs.roles import DETECTIONS, DVL, IMU, LANDMARK_MAP, ODOMETRY, POSE_WITH_COVARIANCE
 from sonar_graph.logs.schema import Struct, parse_definition
 from sonar_graph.logs.table import NS_PER_S
-from sonar_graph.measurements import Depth, Dvl, Floats, Imu, Ints, LandmarkDetections
+from sonar_graph.measurements import NO_TRACK, Depth, Dvl, Floats, Imu, Ints, LandmarkDetections
 from sonar_graph.states import LandmarkMap, Trajectory
 
 WORLD_FRAME = "map"
@@ -102,6 +102,7 @@ def depth_messages(topic: str, depth: Depth) -> Outgoing:
 def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgoing]:
     """``sonar_graph_msgs/LandmarkDetections``, one a frame; frames with equally many detections share an entry."""
     stamps_ns, first, counts = np.unique(detections.stamps_ns, return_index=True, return_counts=True)
+    is_tracked = bool(np.any(detections.track != NO_TRACK))
     entries = []
     for count in np.unique(counts).tolist():
         frames = counts == count
@@ -114,6 +115,7 @@ def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgo
                 ("covariance", detections.range_azimuth_cov),
                 ("candidate_ids", detections.candidate_ids),
                 ("id_probability", detections.id_probability),
+                ("track", detections.track[:, None] if is_tracked else np.empty((len(detections), 0), np.int64)),
             )
         }
         entries.append(outgoing(topic, DETECTIONS, stamps_ns[frames], values))

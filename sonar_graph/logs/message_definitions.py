@@ -135,7 +135,8 @@ float64[] range_m
 float64[] azimuth_rad          # atan2(y, x) in the sonar frame, positive to the left
 float64[] covariance           # 4 a detection, row-major over (range, azimuth); NaN: unknown
 int64[] candidate_ids          # k a detection, row-major; -1 fills unused places
-float64[] id_probability       # k a detection; what is missing to 1 is "no known landmark\"""",
+float64[] id_probability       # k a detection; what is missing to 1 is "no known landmark"
+int64[] track                  # the watch of one object that each belongs to, -1: none; empty: none at all""",
     "sonar_graph_msgs/LandmarkMap": """\
 # Landmarks by identity, in the frame of the header.
 std_msgs/Header header

@@ -3,6 +3,9 @@
 A landmark is seen when it lies inside the sonar's fan; exact three-dimensional geometry decides. Of those seen a share
 is missed, of those detected a share gets another's identity, and some detections are of nothing at all. Misses, wrong
 identities and false detections are independent from frame to frame, which real speckle is not.
+
+A recogniser that tracks is of one mind about a landmark while it sees it: wrong for a while and about whole tracks, and
+it may need time to make up its mind (`sonar_graph.simulation.tracking`).
 """
 
 from __future__ import annotations
@@ -12,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sonar_graph.calibration import SonarCalibration
-from sonar_graph.measurements import Floats, Ints, LandmarkDetections
+from sonar_graph.measurements import NO_TRACK, Floats, Ints, LandmarkDetections
 from sonar_graph.simulation.sensors import body_R_sensor, seconds_since_start
+from sonar_graph.simulation.tracking import Tracking, Watched
 from sonar_graph.simulation.vehicle import VehiclePath
 from sonar_graph.simulation.world import World
 
@@ -44,15 +48,18 @@ class Recogniser:
     """Mean number (Poisson), uniform over range and azimuth."""
     confident_false_fraction: float = 0.0
     """Share of the false detections which are taken for a landmark with the confidence of a right one."""
+    tracking: Tracking | None = None
+    """How it tracks; None: it does not, and each frame stands for itself."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Detections before they become a block: frame index, (range, azimuth), posterior over the landmarks."""
+    """Detections before they become a block: frame index, (range, azimuth), posterior over the landmarks, track."""
 
     frame: Ints
     range_azimuth: Floats
     id_probability: Floats
+    track: Ints
 
 
 def landmarks_in_sonar(path: VehiclePath, stamps_ns: Ints, sonar: SonarCalibration, world: World) -> Floats:
@@ -94,6 +101,7 @@ def simulate_detections(
 
     The posterior of a recognised detection is 0.97 for its identity and 0.02 spread evenly over the other landmarks
     (0.01 says "none of them"); that of a false one is 0.20 spread at random over all landmarks (0.80 says "none").
+    False detections belong to no track.
 
     Parameters
     ----------
@@ -113,7 +121,7 @@ def simulate_detections(
     true_rng, false_rng = rng.spawn(2)
     points = landmarks_in_sonar(path, stamps_ns, sonar, world)
     sigmas = np.array([sonar.range_sigma_m, sonar.azimuth_sigma_rad])
-    true = _true_rows(points, fan, recogniser, sigmas, true_rng)
+    true = _true_rows(points, stamps_ns, fan, recogniser, sigmas, true_rng)
     false = _false_rows(len(stamps_ns), len(world.landmark_ids), fan, recogniser, false_rng)
     frame = np.concatenate([true.frame, false.frame])
     if not len(frame):
@@ -127,17 +135,27 @@ def simulate_detections(
         range_azimuth_cov=np.tile(np.diag(sigmas**2), (len(frame), 1, 1)),
         candidate_ids=np.tile(world.landmark_ids, (len(frame), 1)),
         id_probability=np.concatenate([true.id_probability, false.id_probability])[order],
+        track=np.concatenate([true.track, false.track])[order],
     )
 
 
-def _true_rows(points: Floats, fan: Fan, recogniser: Recogniser, sigmas: Floats, rng: np.random.Generator) -> _Rows:
+def _true_rows(
+    points: Floats, stamps_ns: Ints, fan: Fan, recogniser: Recogniser, sigmas: Floats, rng: np.random.Generator
+) -> _Rows:
     """Detections of landmarks that are there."""
     detected = inside(fan, points) & (rng.random(points.shape[:2]) < recogniser.detection_probability)
     frame, landmark = np.nonzero(detected)
     distance, azimuth, _ = range_azimuth_elevation(points[detected])
-    noise = sigmas * rng.standard_normal((len(frame), 2))
-    taken_for = _mistaken(landmark, points.shape[1], recogniser.wrong_id_rate, rng)
-    return _Rows(frame, np.column_stack([distance, azimuth]) + noise, _confident(taken_for, points.shape[1]))
+    range_azimuth = np.column_stack([distance, azimuth]) + sigmas * rng.standard_normal((len(frame), 2))
+    count, rate = points.shape[1], recogniser.wrong_id_rate
+    if recogniser.tracking is None:
+        taken_for = _mistaken(landmark, count, rate, rng)
+        return _Rows(frame, range_azimuth, _confident(taken_for, count), np.full(len(frame), NO_TRACK))
+    watched = Watched.of(landmark, stamps_ns[frame], recogniser.tracking)
+    first_taken_for = _mistaken(watched.landmark, count, rate, rng)
+    posterior = _confident(watched.believed(first_taken_for), count)
+    posterior[watched.is_undecided()] = 1 / (count + 1)
+    return _Rows(frame, range_azimuth, posterior, watched.track)
 
 
 def _false_rows(frames: int, landmarks: int, fan: Fan, recogniser: Recogniser, rng: np.random.Generator) -> _Rows:
@@ -149,7 +167,8 @@ def _false_rows(frames: int, landmarks: int, fan: Fan, recogniser: Recogniser, r
     confident = rng.random(count) < recogniser.confident_false_fraction
     doubtful = UNRECOGNISED_PROBABILITY * rng.dirichlet(np.ones(landmarks), count)
     certain = _confident(rng.integers(landmarks, size=count), landmarks)
-    return _Rows(frame, np.column_stack([distance, azimuth]), np.where(confident[:, None], certain, doubtful))
+    posterior = np.where(confident[:, None], certain, doubtful)
+    return _Rows(frame, np.column_stack([distance, azimuth]), posterior, np.full(count, NO_TRACK))
 
 
 def _mistaken(landmark: Ints, landmarks: int, rate: float, rng: np.random.Generator) -> Ints:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from typing import Self
+
+from pydantic import Field, model_validator
 
 from sonar_graph.calibration import Section
 from sonar_graph.simulation.presets import DvlName, ImuName
@@ -36,7 +38,13 @@ class SimulationOptions(Section):
     detection_probability: float = Field(0.9, ge=0, le=1)
     """Of a landmark inside the fan, in each frame."""
     wrong_id_rate: float = Field(0.0, ge=0, le=1)
-    """Share of the detected landmarks taken confidently for another one."""
+    """Share of the detected landmarks taken confidently for another one; with ``tracks``, share of the tracks."""
+    tracks: bool = False
+    """Whether the recogniser watches landmarks over frames: detections then carry the number of their track."""
+    id_delay_s: float = Field(0.0, ge=0)
+    """With ``tracks``: nothing is believed of a track until it is that old."""
+    wrong_id_share: float = Field(0.5, ge=0, le=1)
+    """With ``tracks``: share of a track, once something is believed, in which a wrong identity is; 1: to its end."""
     false_detections_per_frame: float = Field(0.02, ge=0)
     """Mean number of detections of nothing."""
     confident_false_fraction: float = Field(0.0, ge=0, le=1)
@@ -47,3 +55,9 @@ class SimulationOptions(Section):
     """The same for its rotation, about each body axis."""
     floor_sigma_m: float = Field(0.01, gt=0)
     """Landmark heights are drawn about the floor with this sigma, and estimators are told so."""
+
+    @model_validator(mode="after")
+    def _delays_tracks(self) -> Self:
+        if self.id_delay_s > 0 and not self.tracks:
+            raise ValueError("id_delay_s is the age of a track: set tracks = true with it")
+        return self

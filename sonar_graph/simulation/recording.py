@@ -35,6 +35,7 @@ from sonar_graph.simulation.sensors import (
     simulate_dvl,
     simulate_imu,
 )
+from sonar_graph.simulation.tracking import Tracking
 from sonar_graph.simulation.vehicle import VehiclePath, rpy_from_rotation
 from sonar_graph.simulation.world import World
 from sonar_graph.states import Trajectory
@@ -136,6 +137,7 @@ def _recogniser(options: SimulationOptions) -> Recogniser:
         wrong_id_rate=options.wrong_id_rate,
         false_detections_per_frame=options.false_detections_per_frame,
         confident_false_fraction=options.confident_false_fraction,
+        tracking=Tracking(options.id_delay_s, options.wrong_id_share) if options.tracks else None,
     )
 
 

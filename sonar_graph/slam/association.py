@@ -80,8 +80,8 @@ class DetectionJournal:
         outcome: Outcome,
         innovation: Floats | None = None,
         innovation_cov: Floats | None = None,
-    ) -> None:
-        """Append a row.
+    ) -> int:
+        """Append a row; its number.
 
         Parameters
         ----------
@@ -96,6 +96,16 @@ class DetectionJournal:
         self._outcomes.append(outcome)
         self._innovations.append(_NO_INNOVATION if innovation is None else innovation)
         self._innovation_covs.append(_NO_COV if innovation_cov is None else innovation_cov)
+        return len(self) - 1
+
+    def amend(self, row: int, outcome: Outcome, landmark_id: int | None = None) -> None:
+        """What has become of a detection since, and of which landmark it is; None: as it was.
+
+        Its innovation, against the landmark that it was taken for when it came, is dropped.
+        """
+        self._outcomes[row] = outcome
+        self._ids[row] = self._ids[row] if landmark_id is None else landmark_id
+        self._innovations[row], self._innovation_covs[row] = _NO_INNOVATION, _NO_COV
 
     def log(self) -> DetectionLog:
         """All rows so far."""

@@ -65,6 +65,12 @@ class Isam2Params(Section):
     gate_probability: float = Field(1.0, gt=0, le=1)
     """A detection whose squared Mahalanobis innovation exceeds this chi-square quantile (2 dof) is refused; 1: none."""
 
+    deferred_identity: bool = True
+    """Detections of one track wait until its identity is known, and are moved when it turns out to be another. Has no
+    effect where detections belong to no track."""
+    longest_wait_s: float = Field(60.0, gt=0)
+    """A detection waits at most so long for its identity. A track not seen for so long keeps the one it has."""
+
 
 class Isam2:
     """Landmark SLAM by incremental smoothing (Kaess et al., iSAM2, IJRR 31(2), 2012).
@@ -87,7 +93,9 @@ class Isam2:
         self._smoother = Smoother(p.lag_s, p.relinearize_threshold, p.stale_shift_m, p.waiting_gain)
         policy = KeyframePolicy(p.max_keyframe_interval_s, p.motion_noise_share, p.bias_interval_s)
         self._keyframes = Keyframes(calibration, policy, self._smoother)
-        sightings = SightingPolicy(p.identity_probability, p.gate_probability, p.kernel, p.kernel_width)
+        sightings = SightingPolicy(
+            p.identity_probability, p.gate_probability, p.kernel, p.kernel_width, p.deferred_identity, p.longest_wait_s
+        )
         self._sightings = Sightings(calibration, sightings, self._smoother, self._keyframes)
         self._asked: list[Anchored] = []
 
@@ -165,6 +173,7 @@ class Isam2:
 
     def detections(self) -> DetectionLog:
         """What became of each detection."""
+        self._sightings.forget()
         return self._sightings.journal.log()
 
     def refused_rows(self) -> list[RefusedRow]:

@@ -10,19 +10,24 @@ import numpy as np
 from gtsam.symbol_shorthand import L
 
 from sonar_graph.calibration import Calibration, FloorPrior
-from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
-from sonar_graph.slam import factors
 from sonar_graph.slam.association import DetectionJournal, Identities, gate_threshold, identify
+from sonar_graph.slam.deferred_identities import DeferredIdentities
 from sonar_graph.slam.keyframes import Keyframes
-from sonar_graph.slam.models import FLOOR_GATE, elevation_on_floor, locate
+from sonar_graph.slam.landmark_sightings import LandmarkSightings
+from sonar_graph.slam.models import FLOOR_GATE, locate
+from sonar_graph.slam.sighting import Sighting, SightingFactors
 from sonar_graph.slam.sightlines import Sightline
 from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.tracks import UNDECIDED, decide
 from sonar_graph.slam.view import View
 from sonar_graph.states import Outcome
 
-Verdict = tuple[Outcome, Floats | None, Floats | None]
-"""What became of a detection, its innovation (2,) and that one's covariance (2, 2); None: nothing was expected."""
+STILL = PreintegratedMotion(
+    gtsam.Pose3(), np.zeros((6, 6)), np.zeros((6, 3)), np.zeros(3), 0.0, mean_specific_force=np.full(3, np.nan)
+)
+"""No motion between keyframe and sonar but what a sighting's tie has in it already."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +38,10 @@ class SightingPolicy:
     gate_probability: float
     kernel: Literal["none", "huber", "cauchy"]
     kernel_width: float
+    deferred_identity: bool = True
+    """Whether detections of tracks are used once their identity is known, and moved when it turns out to be another."""
+    longest_wait_s: float = 60.0
+    """How long they wait for it."""
 
     def estimator(self) -> gtsam.noiseModel.mEstimator.Base | None:
         """The robust kernel; None for none."""
@@ -41,6 +50,19 @@ class SightingPolicy:
         if self.kernel == "cauchy":
             return gtsam.noiseModel.mEstimator.Cauchy.Create(self.kernel_width)
         return None
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What became of a detection when it came."""
+
+    outcome: Outcome
+    innovation: Floats | None = None
+    """Shape (2,); None: nothing was expected."""
+    S: Floats | None = None
+    """Its covariance, shape (2, 2)."""
+    sighting: Sighting | None = None
+    """None where it did not come so far as to be tied to a keyframe."""
 
 
 @dataclass
@@ -52,8 +74,6 @@ class Sightings:
     smoother: Smoother
     keyframes: Keyframes
     journal: DetectionJournal = field(default_factory=DetectionJournal)
-    ids: set[int] = field(default_factory=set)
-    """Landmarks in the graph."""
 
     def __post_init__(self) -> None:
         sonar = self.calibration.sonar
@@ -62,7 +82,16 @@ class Sightings:
         self._kernel = self.policy.estimator()
         probability = self.policy.gate_probability
         self._gate = gate_threshold(probability, 2) if probability < 1 else np.inf
-        self._elevation_sigma_rad = sonar.elevation_aperture_rad / np.sqrt(12.0)
+        self._factors = SightingFactors(sonar, self._robust)
+        self._landmarks = LandmarkSightings(self.smoother, self._factors)
+        self._deferred = DeferredIdentities(
+            self._landmarks, self.smoother, self.journal, self._inside_gate, self.policy.longest_wait_s
+        )
+
+    @property
+    def ids(self) -> set[int]:
+        """Landmarks in the graph."""
+        return self._landmarks.ids
 
     def add(self, frame: LandmarkDetections) -> None:
         """Take in the detections of one frame."""
@@ -74,32 +103,64 @@ class Sightings:
                 self.journal.record(stamp_ns, landmark_id, late)
             return
         identities = identify(frame, self.policy.identity_probability)
-        verdicts: dict[int, Verdict] = {row: (why, None, None) for row, why in enumerate(identities.refusals) if why}
-        if len(verdicts) < len(frame):
-            verdicts |= self._use(stamp_ns, self._with_identity(frame, identities))
-        for row, landmark_id in enumerate(identities.ids.tolist()):
-            self.journal.record(stamp_ns, landmark_id, *verdicts[row])
+        is_tracked = (frame.track != NO_TRACK) & self.policy.deferred_identity
+        if is_tracked.any():
+            self.keyframes.update_if_due()
+            self._deferred.hear(frame, self._decisions(frame, identities), self.keyframes.newest_s)
+        verdicts = self._judge(stamp_ns, frame, identities, is_tracked.tolist())
+        for row, (landmark_id, track) in enumerate(zip(identities.ids.tolist(), frame.track.tolist(), strict=True)):
+            verdict = verdicts[row]
+            number = self.journal.record(stamp_ns, landmark_id, verdict.outcome, verdict.innovation, verdict.S)
+            if verdict.sighting is not None:
+                verdict.sighting.row = number
+                if is_tracked[row]:
+                    self._deferred.remember(track, verdict.sighting)
 
-    def _with_identity(self, frame: LandmarkDetections, identities: Identities) -> Seen:
-        rows = [row for row, refusal in enumerate(identities.refusals) if not refusal]
+    def forget(self) -> None:
+        """Let go of sightings that have waited too long for their identity."""
+        self._deferred.forget(self.keyframes.advanced_ns)
+
+    def _decisions(self, frame: LandmarkDetections, identities: Identities) -> list[int]:
+        """Of each row; one whose landmark is elsewhere, more probably, decides nothing."""
+        decisions = decide(frame, self.policy.identity_probability)
+        return [
+            UNDECIDED if refusal is Outcome.REPEATED else decision
+            for decision, refusal in zip(decisions, identities.refusals, strict=True)
+        ]
+
+    def _judge(
+        self, stamp_ns: int, frame: LandmarkDetections, identities: Identities, is_tracked: list[bool]
+    ) -> dict[int, Verdict]:
+        """Use what has an identity, keep what belongs to a track, refuse the rest; what became of each row."""
+        refusals = identities.refusals
+        verdicts = {row: Verdict(why) for row, why in enumerate(refusals) if why}
+        rows = [row for row, why in enumerate(refusals) if is_tracked[row] or not why]
+        if rows:
+            verdicts |= self._use(stamp_ns, self._seen(frame, identities, is_tracked, rows), refusals)
+        return verdicts
+
+    def _seen(self, frame: LandmarkDetections, identities: Identities, is_tracked: list[bool], rows: list[int]) -> Seen:
         z = np.column_stack((frame.range_m[rows], frame.azimuth_rad[rows]))
         cov = frame.range_azimuth_cov[rows]
         is_unknown = np.isnan(cov).any(axis=(1, 2))
         if is_unknown.any():
             cov[is_unknown] = self._default_cov
         ids: list[int] = identities.ids[rows].tolist()
-        return Seen(rows, ids, [L(i) for i in ids], z, cov)
+        return Seen(rows, ids, [L(i) for i in ids], [is_tracked[row] for row in rows], z, cov)
 
-    def _use(self, stamp_ns: int, seen: Seen) -> dict[int, Verdict]:
-        """Add the factors of a frame's landmarks; what became of each, by row."""
+    def _use(self, stamp_ns: int, seen: Seen, refusals: list[Outcome | None]) -> dict[int, Verdict]:
+        """Add the factors of a frame's landmarks, keep what is refused but tracked; what became of each, by row."""
         self.keyframes.update_if_due()
         motion = self.keyframes.motion_since_newest(stamp_ns)
-        is_known = [i in self.ids for i in seen.ids]
-        known, new = seen.where(is_known), seen.where([not known for known in is_known])
+        kept = seen.where([refusals[row] is not None for row in seen.rows])
+        named = seen.where([refusals[row] is None for row in seen.rows])
+        is_known = [i in self._landmarks for i in named.ids]
+        known, new = named.where(is_known), named.where([not known for known in is_known])
         view = self._view(motion, known.keys)
         motion = self.keyframes.set_for_frame(stamp_ns, motion)
-        tie = Tie.between(motion, self.keyframes.newest_key, self._body_T_sonar)
+        tie = Tie.between(motion, self.keyframes.newest_key, self._body_T_sonar, stamp_ns)
         verdicts = self._sight_again(view, tie, known) | self._sight_first(view, tie, new)
+        verdicts |= self._keep(view, tie, kept, refusals)
         self.keyframes.update_if_due()
         return verdicts
 
@@ -123,29 +184,40 @@ class Sightings:
         found = view.compare(seen.keys, points, seen.z, seen.cov)
         inside: list[bool] = (found.distance <= self._gate).tolist()
         self.smoother.waiting_gain += float(found.gain[inside].sum())
-        self._add_factors(view, tie, seen.where(inside), points[inside], None)
-        outcomes = [Outcome.USED if is_inside else Outcome.GATED for is_inside in inside]
-        return dict(zip(seen.rows, zip(outcomes, found.innovation, found.S, strict=True), strict=True))
+        verdicts = {}
+        for k, sighting in enumerate(self._sightings(view, tie, seen, points)):
+            sighting.outcome = Outcome.USED if inside[k] else Outcome.GATED
+            if inside[k]:
+                self._enter(sighting, seen.ids[k], is_first=False)
+            verdicts[seen.rows[k]] = Verdict(sighting.outcome, found.innovation[k], found.S[k], sighting)
+        return verdicts
 
     def _sight_first(self, view: View, tie: Tie, seen: Seen) -> dict[int, Verdict]:
-        """Add landmarks to the graph."""
-        for k, (key, landmark_id) in enumerate(zip(seen.keys, seen.ids, strict=True)):
-            self.ids.add(landmark_id)
-            self._place(view, tie, seen.where([row == k for row in range(len(seen.ids))]), key)
-        return dict.fromkeys(seen.rows, (Outcome.NEW, None, None))
+        """Add landmarks to the graph: on the floor, where they can stand there, else on the centre beam."""
+        verdicts = {}
+        for k, landmark_id in enumerate(seen.ids):
+            alone = seen.where([row == k for row in range(len(seen.ids))])
+            range_m, azimuth_rad = alone.z[0].tolist()
+            floor = self._floor_under(view, range_m, azimuth_rad)
+            elevation = self._factors.elevation_on(floor, view.world_T_sonar, range_m, azimuth_rad)
+            point = locate(view.world_T_sonar, range_m, azimuth_rad, elevation)
+            self.smoother.add_landmark(seen.keys[k], point)
+            (sighting,) = self._sightings(view, tie, alone, point[None])
+            sighting.floor, sighting.outcome = floor, Outcome.NEW
+            sighting.elevation_rad = 0.0 if seen.is_tracked[k] else elevation
+            self._enter(sighting, landmark_id, is_first=True)
+            verdicts[seen.rows[k]] = Verdict(Outcome.NEW, sighting=sighting)
+        return verdicts
 
-    def _place(self, view: View, tie: Tie, seen: Seen, key: int) -> None:
-        """Add one landmark where it was seen: on the floor, where it can stand there, else on the centre beam."""
-        range_m, azimuth_rad = seen.z[0].tolist()
-        floor = self._floor_under(view, range_m, azimuth_rad)
-        elevation = self._elevation_on(floor, view, range_m, azimuth_rad)
-        point = locate(view.world_T_sonar, range_m, azimuth_rad, elevation)
-        self.smoother.add_landmark(key, point)
-        self._add_factors(view, tie, seen, point[None], None if floor else self._elevation_sigma_rad)
-        on_beam = locate(tie.keyframe_T_sonar, range_m, azimuth_rad, elevation)
-        self.smoother.add([factors.first_direction(tie.pose_key, key, on_beam)])
-        if floor:
-            self.smoother.add([factors.floor_prior(key, floor.z_m, floor.sigma_m)])
+    def _keep(self, view: View, tie: Tie, seen: Seen, refusals: list[Outcome | None]) -> dict[int, Verdict]:
+        """Tie to the keyframe what has no identity yet, or is displaced by a more probable row of the frame."""
+        verdicts = {}
+        sightings = self._sightings(view, tie, seen, np.zeros((len(seen.rows), 3)))
+        for row, sighting in zip(seen.rows, sightings, strict=True):
+            if refusals[row] is Outcome.REPEATED:
+                sighting.outcome = Outcome.REPEATED
+            verdicts[row] = Verdict(sighting.outcome, sighting=sighting)
+        return verdicts
 
     def _floor_under(self, view: View, range_m: float, azimuth_rad: float) -> FloorPrior | None:
         """The known floor, unless it is implausibly far from the point on the centre beam (`FLOOR_GATE`)."""
@@ -153,25 +225,43 @@ class Sightings:
         if floor is None:
             return None
         point = locate(view.world_T_sonar, range_m, azimuth_rad, 0.0)
-        by_elevation = range_m * view.world_T_sonar.rotation().matrix()[2, 2] * self._elevation_sigma_rad
+        by_elevation = range_m * view.world_T_sonar.rotation().matrix()[2, 2] * self._factors.elevation_sigma_rad
         variance = by_elevation**2 + view.height_variance(point) + floor.sigma_m**2
         return floor if (point[2] - floor.z_m) ** 2 <= FLOOR_GATE * variance else None
 
-    def _elevation_on(self, floor: FloorPrior | None, view: View, range_m: float, azimuth_rad: float) -> float:
-        if floor is None:
-            return 0.0
-        aperture = self.calibration.sonar.elevation_aperture_rad
-        return elevation_on_floor(view.world_T_sonar, range_m, azimuth_rad, floor.z_m, aperture) or 0.0
-
-    def _add_factors(self, view: View, tie: Tie, seen: Seen, points: Floats, elevation_sigma_rad: float | None) -> None:
-        added: list[gtsam.NonlinearFactor] = []
+    def _sightings(self, view: View, tie: Tie, seen: Seen, points: Floats) -> list[Sighting]:
+        """Sightings of landmarks at points of the world, shape (m, 3); those of tracks as if at elevation 0."""
+        if not seen.rows:
+            return []
+        points, floors = points.copy(), [self.calibration.floor] * len(seen.rows)
+        for k, (range_m, azimuth_rad) in enumerate(seen.z.tolist()):
+            if seen.is_tracked[k]:
+                points[k] = locate(view.world_T_sonar, range_m, azimuth_rad, 0.0)
+                floors[k] = self._floor_under(view, range_m, azimuth_rad)
         noise = view.blurred(seen.cov, tie.motion, points)
-        for key, z, R in zip(seen.keys, seen.z, noise, strict=True):
-            self.smoother.sightlines.add(key, Sightline(tie.pose_key, tie.keyframe_T_sonar, z))
-            added += factors.landmark_sighting(
-                tie.pose_key, key, tie.keyframe_T_sonar, z, R, self._robust, elevation_sigma_rad
-            )
-        self.smoother.add(added)
+        return [
+            Sighting(tie.stamp_ns, -1, Sightline(tie.pose_key, tie.keyframe_T_sonar, z), R, floor)
+            for z, R, floor in zip(seen.z, noise, floors, strict=True)
+        ]
+
+    def _enter(self, sighting: Sighting, landmark_id: int, *, is_first: bool) -> None:
+        made = self._factors.make(sighting, L(landmark_id), is_first=is_first)
+        self._landmarks.enter(sighting, landmark_id, self.smoother.add(made))
+
+    def _inside_gate(self, sightings: list[Sighting], landmark_id: int) -> list[bool]:
+        """Which late sightings are where a landmark is expected from their keyframes, as these are estimated now."""
+        if not np.isfinite(self._gate):
+            return [True] * len(sightings)
+        key, values = L(landmark_id), self.smoother.values
+        joint = self.smoother.joint_covariance([key, *{sighting.line.pose_key for sighting in sightings}])
+        points = values.atPoint3(key)[None]
+        distances = []
+        for sighting in sightings:
+            line = sighting.line
+            view = View(line.pose_key, None, values.atPose3(line.pose_key), STILL, line.body_T_sonar, joint)
+            found = view.compare([key], points, line.z[None], sighting.noise[None])
+            distances.append(float(found.distance[0]))
+        return [distance <= self._gate for distance in distances]
 
     def _robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
         """The noise model inside the chosen robust kernel."""
@@ -180,13 +270,15 @@ class Sightings:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Detections of one frame that have an identity, each its own."""
+    """Some detections of one frame."""
 
     rows: list[int]
     """In the frame, length m."""
     ids: list[int]
     keys: list[int]
     """Of the landmarks in the graph."""
+    is_tracked: list[bool]
+    """Whether each belongs to a track."""
     z: Floats
     """Range (m) and azimuth (rad), shape (m, 2)."""
     cov: Floats
@@ -198,13 +290,15 @@ class Seen:
             return self
         at = [k for k, is_chosen in enumerate(chosen) if is_chosen]
         rows, ids, keys = ([column[k] for k in at] for column in (self.rows, self.ids, self.keys))
-        return Seen(rows, ids, keys, self.z[at], self.cov[at])
+        return Seen(rows, ids, keys, [self.is_tracked[k] for k in at], self.z[at], self.cov[at])
 
 
 @dataclass(frozen=True, eq=False)
 class Tie:
     """How a frame hangs on the keyframe that gets its factors."""
 
+    stamp_ns: int
+    """Of the frame."""
     pose_key: int
     motion: PreintegratedMotion
     """From that keyframe to the frame; its noise blurs the sightings."""
@@ -212,6 +306,6 @@ class Tie:
     """The sonar at the frame, in the keyframe's body frame."""
 
     @classmethod
-    def between(cls, motion: PreintegratedMotion, pose_key: int, body_T_sonar: gtsam.Pose3) -> Tie:
+    def between(cls, motion: PreintegratedMotion, pose_key: int, body_T_sonar: gtsam.Pose3, stamp_ns: int) -> Tie:
         """Tie by a motion and the sonar's mounting."""
-        return cls(pose_key, motion, motion.i_T_j.compose(body_T_sonar))
+        return cls(stamp_ns, pose_key, motion, motion.i_T_j.compose(body_T_sonar))

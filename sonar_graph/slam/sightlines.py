@@ -51,6 +51,12 @@ class Sightlines:
         """A sighting of a landmark."""
         self._lines[landmark_key].append(sightline)
 
+    def remove(self, landmark_key: int, sightline: Sightline) -> None:
+        """A sighting that is no longer one of this landmark."""
+        self._lines[landmark_key].remove(sightline)
+        if not self._lines[landmark_key]:
+            del self._lines[landmark_key]
+
     def turned_away(self, values: gtsam.Values) -> list[int]:
         """Landmarks that lie behind the sonar in at least half of their sightings."""
         return [key for key, lines in self._lines.items() if 2 * _behind(lines, values, key) >= len(lines)]

@@ -4,12 +4,15 @@ Two solutions share the same factors:
 
 * the *window*: GTSAM's iSAM2 over the poses of the last ``lag_s`` seconds, all landmarks and all biases. Older poses
   are marginalised, so that an update does not walk over all sightings that a landmark ever had.
-* the *history*: every factor ever added, solved by Levenberg-Marquardt when the smoothed result is asked for.
+* the *history*: every factor of the run, solved by Levenberg-Marquardt when the smoothed result is asked for.
 
 Marginalising freezes the linearisation of the landmarks that it touches. When one has since moved by more than
 ``stale_shift_m`` (a loop was closed after much drift), the history is solved at once and the window starts again from
 that solution with fresh linearisations. The graph must have grown by `RESTART_GROWTH` since the last time, which keeps
 the total cost of restarts proportional to that of the last one.
+
+Factors can be exchanged for others. While all their variables are in the window, iSAM2 removes them; what has been
+marginalised cannot be taken out of a marginal, and the window starts again from the history.
 
 GTSAM's Cholesky elimination gives up ("indeterminate") when a variable's absolute sigma is more than 4096 times its
 sigma given its neighbours, which millimetre odometry reaches after some metres of drift. QR does not, at a higher cost;
@@ -18,7 +21,8 @@ once Cholesky has given up the window stays with QR, and so do the marginals of 
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -26,6 +30,7 @@ import numpy as np
 
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.batch import qr_tree, solve
+from sonar_graph.slam.history import History
 from sonar_graph.slam.joint_covariance import JointCovariance
 from sonar_graph.slam.sightlines import Sightlines
 
@@ -33,8 +38,24 @@ RESTART_GROWTH = 1.25
 """Number of factors, relative to that at the last restart, before the next one."""
 FIRST_RESTART = 100
 """Number of factors before the first restart."""
+SETTLING_UPDATES = 2
+"""Further updates after an exchange, each a Gauss-Newton step: what is exchanged may move the estimate far."""
 MAX_PLACEMENTS = 3
 """Times that stuck landmarks are placed anew in one solution."""
+
+
+@dataclass(frozen=True, eq=False)
+class Exchange:
+    """Some factors for others."""
+
+    removed: list[int]
+    """Handles of those that go."""
+    added: list[list[gtsam.NonlinearFactor]]
+    """Those that come, in groups."""
+    new_landmarks: dict[int, Floats]
+    """Keys and first estimates of landmarks that the graph has not yet got."""
+    lost_landmarks: list[int]
+    """Keys of those on which no factor is left."""
 
 
 class Smoother:
@@ -61,8 +82,7 @@ class Smoother:
         self._restart_size = FIRST_RESTART
         self._threshold = relinearize_threshold
         self._factorization = "CHOLESKY"
-        self.graph = gtsam.NonlinearFactorGraph()
-        """Every factor ever added."""
+        self._history = History()
         self.values = gtsam.Values()
         """The newest estimate of every variable; of those that left the window, the last one there."""
         self.sightlines = Sightlines()
@@ -73,6 +93,7 @@ class Smoother:
         self._pending_values = gtsam.Values()
         self._pending_times: dict[int, float] = {}
         self._expiring: dict[int, float] = {}
+        self._held: dict[int, float] = {}
         self._landmarks: list[int] = []
         self._bias: list[int] = []
         self._window = self._new_window()
@@ -80,7 +101,12 @@ class Smoother:
         self._asked: set[int] = set()
         self._asked_before: set[int] = set()
         self._solved: tuple[gtsam.Values, gtsam.Marginals | gtsam.ISAM2] | None = None
-        self._solved_size = 0
+        self._solved_changes = 0
+
+    @property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """Every factor of the run."""
+        return self._history.graph
 
     def _new_window(self) -> gtsam.IncrementalFixedLagSmoother:
         params = gtsam.ISAM2Params()
@@ -109,23 +135,74 @@ class Smoother:
         self.values.insert(key, bias)
         self._bias = [key]
 
-    def add(self, factors: Iterable[gtsam.NonlinearFactor]) -> None:
-        """New factors, used at the next update."""
+    def add(self, factors: Iterable[gtsam.NonlinearFactor]) -> list[int]:
+        """New factors, used at the next update; the handles by which they can be taken out."""
+        handles = []
         for factor in factors:
             self._pending.add(factor)
-            self.graph.add(factor)
+            handles.append(self._history.add(factor))
+        return handles
+
+    def hold(self, until_s: dict[int, float]) -> None:
+        """Keep these keyframes in the window, beyond the lag, until the times given; no others any more."""
+        self._held = until_s
+
+    def exchange(self, what: Exchange, time_s: float) -> list[list[int]]:
+        """Take factors out, put others in, and bring the window up to date; the handles of each group put in."""
+        if self._pending.size():
+            self.update(time_s)
+        slots = self._window_slots(what.removed)
+        self._forget(what.lost_landmarks)
+        self._history.remove(what.removed)
+        for key, point in what.new_landmarks.items():
+            self.add_landmark(key, point)
+        handles = [self.add(group) for group in what.added]
+        keys = self._pending.keyVector()
+        if slots is None or what.lost_landmarks or len(self._inside(keys)) < len(keys):
+            self._clear_pending()
+            self._restart(time_s)
+        else:
+            self.update(time_s, slots)
+            self._settle()
+        return handles
+
+    def _window_slots(self, handles: list[int]) -> list[int] | None:
+        """Where the window has factors; None when it has lost one."""
+        if not handles:
+            return []
+        inside = self._window.getFactors()
+        place = {inside.at(i): i for i in range(inside.size()) if inside.exists(i)}
+        slots = [place.get(self._history.factor(handle)) for handle in handles]
+        return None if None in slots else [slot for slot in slots if slot is not None]
+
+    def _inside(self, keys: list[int]) -> list[int]:
+        """Those of some variables that are in the window, or about to be."""
+        inside = self._window.getLinearizationPoint() if keys else gtsam.Values()
+        return [key for key in keys if inside.exists(key) or self._pending_values.exists(key)]
+
+    def _forget(self, landmark_keys: list[int]) -> None:
+        for key in landmark_keys:
+            self._landmarks.remove(key)
+            self.values.erase(key)
+            self._asked.discard(key)
+
+    def _settle(self) -> None:
+        for _ in range(SETTLING_UPDATES):
+            self._window.update()
+        self.values.update(self._window.calculateEstimate())
 
     @property
     def is_due(self) -> bool:
         """Whether an update is: variables wait for it, or factors that would change the estimate."""
         return self._pending_values.size() > 0 or self.waiting_gain > self._greatest_waiting_gain
 
-    def update(self, time_s: float) -> None:
-        """Bring the window's estimate up to date with what was added."""
-        times: dict[Any, float] = self._pending_times | dict.fromkeys(self._landmarks + self._bias, time_s)
-        self._expiring |= dict.fromkeys(self._bias, time_s)
+    def update(self, time_s: float, removed_slots: Sequence[int] = ()) -> None:
+        """Bring the window's estimate up to date with what was added, without what is in some places of the window."""
+        lasting = self._bias + self._inside(self._held_at(time_s))
+        times: dict[Any, float] = self._pending_times | dict.fromkeys(self._landmarks + lasting, time_s)
+        self._expiring |= dict.fromkeys(lasting, time_s)
         try:
-            self._window.update(self._pending, self._pending_values, times)
+            self._window.update(self._pending, self._pending_values, times, list(removed_slots))
         except RuntimeError:  # Cholesky met a pose 4096 times less certain than its step: QR has no such limit
             self._factorization = "QR"
             self._clear_pending()
@@ -135,6 +212,9 @@ class Smoother:
         self.values.update(self._window.calculateEstimate())
         if self.graph.size() >= self._restart_size and self._is_stale():
             self._restart(time_s)
+
+    def _held_at(self, time_s: float) -> list[int]:
+        return [key for key, until_s in self._held.items() if time_s <= until_s]
 
     def _clear_pending(self) -> None:
         self._pending = gtsam.NonlinearFactorGraph()
@@ -152,7 +232,9 @@ class Smoother:
         self._restart_size = max(FIRST_RESTART, int(RESTART_GROWTH * self.graph.size()))
         self.values = self._solve()
         times: dict[Any, float] = {key: t for key, t in self._expiring.items() if t >= time_s - self._lag_s}
-        times |= dict.fromkeys(self._landmarks, time_s)
+        held = self._held_at(time_s)
+        times |= dict.fromkeys(self._landmarks + held, time_s)
+        self._expiring |= dict.fromkeys(held, time_s)
         inside, outside = _split(self.graph, set(times))
         values = gtsam.Values()
         for key in times:
@@ -196,10 +278,10 @@ class Smoother:
 
         Ask that for ``marginalCovariance(key)`` or ``jointMarginalCovariance(keys)``.
         """
-        if self._solved is None or self._solved_size != self.graph.size():
+        if self._solved is None or self._solved_changes != self._history.changes:
             values = self._solve()
             self._solved = values, _marginals(self.graph, values)
-            self._solved_size = self.graph.size()
+            self._solved_changes = self._history.changes
         return self._solved
 
 

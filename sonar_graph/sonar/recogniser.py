@@ -206,6 +206,7 @@ class Recogniser:
             range_azimuth_cov=np.array([sighting.covariance for _, sighting in reported]),
             candidate_ids=np.tile(self.ids, (len(rows), 1)),
             id_probability=each_once(beliefs[rows])[:, :-1],
+            track=association.track_ids[rows],
         )
 
     def _outcome(self, association: Association, row: int, sighting: Sighting) -> str:

@@ -68,11 +68,11 @@ class Bench:
         pose = {"position": vector(x, 0, 0), "orientation": {**vector(0, 0, 0), "w": 1.0}}
         return {"header": header(ns, "map"), "pose": {"pose": pose}} | other
 
-    def detections(self, ns: int, ranges: list[float], ids: list[int]) -> dict[str, Any]:
+    def detections(self, ns: int, ranges: list[float], ids: list[int], track: tuple[int, ...] = ()) -> dict[str, Any]:
         count = len(ranges)
         message = {"header": header(ns, "sonar_link"), "range_m": ranges, "azimuth_rad": [0.1] * count}
         message |= {"covariance": [0.01, 0, 0, 0.02] * count, "candidate_ids": ids}
-        return message | {"id_probability": [0.5] * len(ids)}
+        return message | {"id_probability": [0.5] * len(ids), "track": list(track)}
 
     def transform(self, parent: str, child: str, xyz: tuple[float, ...], yaw_rad: float = 0.0) -> dict[str, Any]:
         rotation = {**vector(0, 0, np.sin(yaw_rad / 2)), "w": np.cos(yaw_rad / 2)}
@@ -84,12 +84,15 @@ class Bench:
         stamps = [T0_NS + i * 10**8 for i in range(samples)]
         return [("/imu", "imu", [self.imu(s) for s in stamps]), ("/dvl", "dvl", [self.dvl(s) for s in stamps])]
 
-    def write(self, *entries: Entry, name: str = "log.mcap", **settings: Any) -> Path:
+    def write(
+        self, *entries: Entry, name: str = "log.mcap", schemas: dict[str, str] | None = None, **settings: Any
+    ) -> Path:
         path = self._folder / name
         with path.open("wb") as stream:
             writer = Writer(stream, **settings)
             for topic, kind, messages in entries:
-                schema = writer.register_msgdef(TYPES[kind], definition(TYPES[kind]))
+                text = (schemas or {}).get(kind, definition(TYPES[kind]))
+                schema = writer.register_msgdef(TYPES[kind], text)
                 for i, message in enumerate(messages):
                     time_ns = T0_NS + i * 10**8
                     writer.write_message(topic, schema, message, log_time=time_ns, publish_time=time_ns)
@@ -148,6 +151,7 @@ def sequence_with(seed: int = 0, samples: int = 20, candidates: int = 2) -> Sequ
             rng.normal(size=(samples, 2, 2)),
             rng.integers(-1, 9, (samples, candidates)),
             rng.uniform(0, 1, (samples, candidates)),
+            np.arange(samples) % 4 - 1 + 10**12 * (np.arange(samples) % 2),
         ),
         truth=Trajectory.without_covariances(stamps, rng.normal(size=(samples, 3)), quaternions),
         true_landmarks=LandmarkMap(np.array([3, 7]), rng.normal(size=(2, 3)), np.full((2, 3, 3), np.nan)),

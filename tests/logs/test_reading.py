@@ -150,6 +150,36 @@ def test_detections_are_padded_to_the_most_candidates(bench: Any) -> None:
     np.testing.assert_array_equal(sequence.detections.range_azimuth_cov[0], [[0.01, 0], [0, 0.02]])
 
 
+def test_detections_belong_to_tracks_where_the_message_says_so(bench: Any) -> None:
+    """Also when messages of one log differ in it."""
+    t0 = bench.t0_ns
+    frames = [bench.detections(t0, [1.0, 2.0], [5, 6], (4, 3)), bench.detections(t0 + 1, [3.0], [5])]
+    frames += [bench.detections(t0 + 2, [4.0, 5.0], [5, 6], (-1, 3)), bench.detections(t0 + 3, [6.0], [5], (7,))]
+    found = read_sequence(bench.write(*bench.basics(), ("/landmarks", "detections", frames))).detections
+    assert found is not None
+    assert found.range_m.tolist() == [1, 2, 3, 4, 5, 6]
+    assert found.track.tolist() == [4, 3, -1, -1, 3, 7]
+
+
+def test_detections_of_logs_older_than_tracks_belong_to_none(bench: Any) -> None:
+    text = definition("sonar_graph_msgs/msg/LandmarkDetections")
+    older = "\n".join(line for line in text.split("\n") if not line.startswith("int64[] track"))
+    assert older != text
+    frames = [bench.detections(bench.t0_ns, [1.0, 2.0], [5, 6])]
+    del frames[0]["track"]
+    path = bench.write(*bench.basics(), ("/landmarks", "detections", frames), schemas={"detections": older})
+    found = read_sequence(path).detections
+    assert found is not None
+    assert found.range_m.tolist() == [1, 2]
+    assert found.track.tolist() == [-1, -1]
+
+
+def test_tracks_of_another_number_than_detections_are_named(bench: Any) -> None:
+    frames = [bench.detections(bench.t0_ns, [1.0, 2.0], [5, 6], (4,))]
+    with pytest.raises(LogError, match=r"/landmarks: message 0 has 2 ranges and 1 tracks"):
+        read_sequence(bench.write(*bench.basics(), ("/landmarks", "detections", frames)))
+
+
 def test_detections_whose_lists_disagree_are_named(bench: Any) -> None:
     frames = [bench.detections(bench.t0_ns, [1.0], [5]), bench.detections(bench.t0_ns, [1.0, 2.0], [5, 6, 7])]
     with pytest.raises(LogError, match=r"/landmarks: message 1 has 2 ranges.* 3 identities"):
