@@ -56,6 +56,9 @@ class DeferredIdentities:
     def hear(self, frame: LandmarkDetections, decisions: list[int], time_s: float) -> None:
         """Bring earlier sightings in line with what a frame's rows decide, before its own are made.
 
+        Where tracks come to claim one landmark in one earlier frame, that of the more probable row gets it, but what
+        is used already stays.
+
         Parameters
         ----------
         decisions
@@ -65,9 +68,10 @@ class DeferredIdentities:
         """
         stamp_ns = int(frame.stamps_ns[0])
         self.forget(stamp_ns)
+        rows = zip(frame.track.tolist(), decisions, frame.most_probable()[1].tolist(), strict=True)
         seen = [
             (self._tracks.seen(number, stamp_ns), decision)
-            for number, decision in zip(frame.track.tolist(), decisions, strict=True)
+            for number, decision, _ in sorted(rows, key=lambda row: -row[2])
             if number != NO_TRACK
         ]
         decided = [(track, decision) for track, decision in seen if decision != UNDECIDED]

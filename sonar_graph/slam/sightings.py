@@ -20,7 +20,7 @@ from sonar_graph.slam.models import FLOOR_GATE, locate
 from sonar_graph.slam.sighting import Sighting, SightingFactors
 from sonar_graph.slam.sightlines import Sightline
 from sonar_graph.slam.smoother import Smoother
-from sonar_graph.slam.tracks import UNDECIDED, decide
+from sonar_graph.slam.tracks import decide
 from sonar_graph.slam.view import View
 from sonar_graph.states import Outcome
 
@@ -106,7 +106,7 @@ class Sightings:
         is_tracked = (frame.track != NO_TRACK) & self.policy.deferred_identity
         if is_tracked.any():
             self.keyframes.update_if_due()
-            self._deferred.hear(frame, self._decisions(frame, identities), self.keyframes.newest_s)
+            self._deferred.hear(frame, decide(frame, self.policy.identity_probability), self.keyframes.newest_s)
         verdicts = self._judge(stamp_ns, frame, identities, is_tracked.tolist())
         for row, (landmark_id, track) in enumerate(zip(identities.ids.tolist(), frame.track.tolist(), strict=True)):
             verdict = verdicts[row]
@@ -119,14 +119,6 @@ class Sightings:
     def forget(self) -> None:
         """Let go of sightings that have waited too long for their identity."""
         self._deferred.forget(self.keyframes.advanced_ns)
-
-    def _decisions(self, frame: LandmarkDetections, identities: Identities) -> list[int]:
-        """Of each row; one whose landmark is elsewhere, more probably, decides nothing."""
-        decisions = decide(frame, self.policy.identity_probability)
-        return [
-            UNDECIDED if refusal is Outcome.REPEATED else decision
-            for decision, refusal in zip(decisions, identities.refusals, strict=True)
-        ]
 
     def _judge(
         self, stamp_ns: int, frame: LandmarkDetections, identities: Identities, is_tracked: list[bool]
