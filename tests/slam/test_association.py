@@ -54,6 +54,20 @@ def test_a_log_is_a_copy():
     assert len(before) == 1
 
 
+def test_a_row_is_amended_in_its_place_and_loses_its_innovation():
+    journal = DetectionJournal()
+    rows = [journal.record(5, 2, Outcome.USED, np.ones(2), np.eye(2)), journal.record(6, 3, Outcome.WAITING)]
+    assert rows == [0, 1]
+    journal.amend(0, Outcome.MOVED, 7)
+    journal.amend(1, Outcome.FORGOTTEN)
+    log = journal.log()
+    assert log.outcomes == [Outcome.MOVED, Outcome.FORGOTTEN]
+    assert log.landmark_ids.tolist() == [7, 3]
+    assert log.stamps_ns.tolist() == [5, 6]
+    assert np.isnan(log.innovations).all()
+    assert np.isnan(log.innovation_covs).all()
+
+
 def test_of_one_identity_in_one_frame_the_most_probable_row_is_taken():
     """Of equals the first; the same identity in another frame is another matter."""
     rows = detections([[7], [7], [7], [7]], [[0.8], [0.9], [0.9], [0.8]])

@@ -51,6 +51,22 @@ def test_the_camera_of_the_azimuth_factor_goes_blind_exactly_there():
         assert bool(seen(Z).turned_away(values)) == is_blind
 
 
+def test_a_sighting_that_is_taken_away_no_longer_counts():
+    values = one_pose(world_point(5.0, Z[1]))
+    opposite = np.array([2.0, Z[1] + np.pi])
+    lines = seen(Z, opposite)
+    extra = Sightline(X(0), BODY_T_SONAR, opposite)
+    lines.add(L(1), extra)
+    assert lines.turned_away(values) == [L(1)]
+    lines.remove(L(1), extra)
+    lines.add(L(1), Sightline(X(0), BODY_T_SONAR, Z))
+    assert lines.turned_away(values) == []
+    alone = Sightline(X(0), BODY_T_SONAR, opposite)
+    lines.add(L(2), alone)
+    lines.remove(L(2), alone)
+    assert lines.turned_away(values) == []
+
+
 def test_a_landmark_that_most_sightings_have_ahead_is_left_alone():
     values = one_pose(world_point(5.0, Z[1]))
     opposite = np.array([2.0, Z[1] + np.pi])

@@ -11,10 +11,10 @@ from sonar_graph.measurements import Floats
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.slam import factors
 from sonar_graph.slam.batch import solve
-from sonar_graph.slam.smoother import FIRST_RESTART, Smoother
+from sonar_graph.slam.smoother import FIRST_RESTART, Exchange, Smoother
 
 from .graphs import graph_of, information
-from .rail import RANGE_SIGMA_M, STEP_S, VELOCITY_SIGMA_M_S, calibration, rail
+from .rail import RANGE_SIGMA_M, STEP_S, VELOCITY_SIGMA_M_S, Rail, calibration, rail
 
 FOREVER_S = 1e9
 NEVER_M = 1e9
@@ -31,15 +31,21 @@ class Fed:
     def __init__(self, lag_s: float, stale_shift_m: float = NEVER_M) -> None:
         self.smoother = Smoother(lag_s, 1e-6, stale_shift_m)
         self.given: list[gtsam.NonlinearFactor] = []
+        self.handles: list[int] = []
 
     def add(self, new: list[gtsam.NonlinearFactor]) -> None:
         self.given += new
-        self.smoother.add(new)
+        self.handles += self.smoother.add(new)
+
+    def handles_on(self, *keys: int) -> list[int]:
+        """Of the factors on just these variables."""
+        return [h for h, factor in zip(self.handles, self.given, strict=True) if set(factor.keys()) == set(keys)]
 
 
-def on_the_rail(nodes: int, lag_s: float, stale_shift_m: float = NEVER_M) -> Fed:
+def on_the_rail(nodes: int, lag_s: float, stale_shift_m: float = NEVER_M, held: dict[int, float] | None = None) -> Fed:
     _, numbers = rail(nodes)
     fed, seen = Fed(lag_s, stale_shift_m), set()
+    fed.smoother.hold(held or {})
     fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
     fed.add([factors.start_prior(X(0), calibration())])
     cov = np.diag([1e-12] * 3 + [(VELOCITY_SIGMA_M_S * STEP_S) ** 2] * 3)
@@ -426,3 +432,79 @@ def test_a_start_that_is_hardly_known_is_smoothed_to_the_end(monkeypatch):
         fed.smoother.update(float(k))
     assert len(sizes) > 2
     assert np.linalg.norm(fed.smoother.values.atPose3(X(99)).translation() - truth.translation()) < 0.05
+
+
+# Taking back --------------------------------------------------------------------------------------------------------
+
+
+def assert_is_least_squares(fed: Fed, numbers: Rail, nodes: int, landmarks: list[int]) -> None:
+    mean, variance = numbers.solution(nodes)
+    newest = X(nodes - 1)
+    assert fed.smoother.values.atPose3(newest).translation()[0] == pytest.approx(mean[f"x{nodes - 1}"], abs=1e-8)
+    assert joint(fed, [newest])[3, 3] == pytest.approx(variance[f"x{nodes - 1}"], abs=1e-8)
+    for i in landmarks:
+        assert fed.smoother.values.atPoint3(L(i))[0] == pytest.approx(mean[f"l{i}"], abs=1e-8)
+        assert fed.smoother.covariance(L(i))[0, 0] == pytest.approx(variance[f"l{i}"], abs=1e-8)
+    values, _ = fed.smoother.solve_history()
+    assert values.atPose3(X(1)).translation()[0] == pytest.approx(mean["x1"], abs=1e-8)
+
+
+def without(numbers: Rail, gone: list[tuple[int, int]]) -> Rail:
+    return Rail(numbers.displacements_m, [r for r in numbers.ranges if (r[0], r[1]) not in gone])
+
+
+@pytest.mark.parametrize(
+    ("lag_s", "oldest", "solves"), [(FOREVER_S, 7, 0), (2.6, 17, 0), (2.6, 7, 1)], ids=["all", "recent", "marginalised"]
+)
+def test_what_is_taken_out_was_never_there(monkeypatch, lag_s, oldest, solves):
+    """Least squares without those ranges; the history is solved only for what has left the window."""
+    nodes = 21
+    fed, (_, numbers) = on_the_rail(nodes, lag_s), rail(nodes)
+    fed.smoother.solve_history()
+    gone = [(k, i) for k in range(oldest, nodes) for i in (4, 7)]
+    sizes = counted_solves(monkeypatch)
+    removed = [handle for k, i in gone for handle in fed.handles_on(X(k), L(i))]
+    assert len(removed) == 2 * len(gone)
+    fed.smoother.exchange(Exchange(removed, [], {}, []), (nodes - 1) * STEP_S)
+    assert len(sizes) == solves
+    assert_is_least_squares(fed, without(numbers, gone), nodes, [4, 7])
+
+
+def test_a_landmark_without_factors_leaves_the_graph_and_can_come_back():
+    nodes = 21
+    fed, (_, numbers) = on_the_rail(nodes, 2.6), rail(nodes)
+    gone = [(k, 7) for k in range(1, nodes)]
+    removed = [handle for k, i in gone for handle in fed.handles_on(X(k), L(i))]
+    fed.smoother.exchange(Exchange(removed, [], {}, [L(7)]), (nodes - 1) * STEP_S)
+    assert_is_least_squares(fed, without(numbers, gone), nodes, [4])
+    assert not fed.smoother.values.exists(L(7))
+    (distance,) = (r for k, i, r in numbers.ranges if (k, i) == (nodes - 1, 7))
+    z, R = np.array([distance, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e6])
+    again = factors.landmark_sighting(X(nodes - 1), L(7), gtsam.Pose3(), z, R, plain, 3e-4)
+    point = fed.smoother.values.atPose3(X(nodes - 1)).translation() + distance * np.eye(3)[0]
+    fed.smoother.exchange(Exchange([], [again], {L(7): point}, []), (nodes - 1) * STEP_S)
+    assert_is_least_squares(fed, without(numbers, gone[:-1]), nodes, [4, 7])
+
+
+def test_a_held_keyframe_takes_late_factors_without_solving_the_history(monkeypatch):
+    nodes = 21
+    fed, (_, numbers) = on_the_rail(nodes, 0.6, held={X(3): FOREVER_S}), rail(nodes)
+    sizes = counted_solves(monkeypatch)
+    late = 24.0
+    z, R = np.array([late, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e6])
+    new = factors.landmark_sighting(X(3), L(4), gtsam.Pose3(), z, R, plain)
+    (handles,) = fed.smoother.exchange(Exchange([], [new], {}, []), (nodes - 1) * STEP_S)
+    assert not sizes
+    assert_is_least_squares(fed, Rail(numbers.displacements_m, [*numbers.ranges, (3, 4, late)]), nodes, [4, 7])
+    fed.smoother.exchange(Exchange(handles, [], {}, []), (nodes - 1) * STEP_S)
+    assert len(sizes) == 1  # that of the smoothed result above
+    assert_is_least_squares(fed, numbers, nodes, [4, 7])
+
+
+def test_a_keyframe_is_held_until_the_time_given_and_the_lag_after():
+    nodes = 21
+    fed = on_the_rail(nodes, 2.1, held={X(3): 8.0})
+    assert fed.smoother.covariance(X(3))[3, 3] > 0
+    fed = on_the_rail(nodes, 1.1, held={X(3): 8.0})
+    with pytest.raises(IndexError):
+        fed.smoother.covariance(X(3))

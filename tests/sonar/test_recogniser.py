@@ -84,6 +84,21 @@ def test_nothing_is_reported_before_enough_frames_and_the_reason_is_said():
     assert outcomes == [["not reported: seen in fewer than 4 frames"]] * 3 + [[REPORTED]] * 2
 
 
+def test_detections_say_which_track_they_are_of():
+    recogniser = Recogniser(DECIBELS)
+    pass_by(recogniser, DISC, 4, 0.0)
+    for k in range(4, 30):
+        recogniser.process(frame(k, picture(None, 1.7, 0.0, 0.4, k)), aside(0.0), VIEW)
+    tracks = []
+    for k in range(30, 36):
+        found = recogniser.process(frame(k, picture(SQUARE, 1.7, 0.0, 0.4, k)), aside(0.0), VIEW)
+        if found is not None:
+            tracks += found.track.tolist()
+            assert found.track.tolist() == [f.track for f in recogniser.fates if f.outcome == REPORTED]
+    assert len(set(tracks)) == 1
+    assert tracks[0] > 0
+
+
 def test_a_track_that_hardly_exists_is_not_reported():
     recogniser = Recogniser(DECIBELS, params=RecogniserParams(least_frames=1, least_existence=0.5))
     assert recogniser.process(frame(0, picture(SQUARE, 1.7, 0.0, 0.4, 0)), None, VIEW) is None
