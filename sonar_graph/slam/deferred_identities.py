@@ -17,7 +17,7 @@ from sonar_graph.slam.association import DetectionJournal
 from sonar_graph.slam.landmark_sightings import LandmarkSightings
 from sonar_graph.slam.sighting import Sighting
 from sonar_graph.slam.smoother import Smoother
-from sonar_graph.slam.tracks import NO_LANDMARK, UNDECIDED, Track, Tracks
+from sonar_graph.slam.tracks import UNDECIDED, Track, Tracks
 from sonar_graph.states import Outcome
 
 Gate = Callable[[list[Sighting], int], list[bool]]
@@ -99,8 +99,6 @@ class DeferredIdentities:
                 freed[sighting.landmark_id].add(sighting.stamp_ns)
                 sighting.outcome = Outcome.TAKEN_BACK
         if leaving:
-            held = dict.fromkeys((sighting.line.pose_key for sighting in leaving), time_s)
-            self._smoother.hold(self._tracks.held_until_s() | held)
             self._landmarks.exchange(leaving, [], time_s)
         for track, identity in changed:
             self._reopen(track, track.settled)
@@ -131,7 +129,7 @@ class DeferredIdentities:
         coming: list[tuple[Sighting, int]] = []
         taken: dict[int, set[int]] = {}
         for track in tracks:
-            if track.waiting and track.identity != NO_LANDMARK:
+            if track.waiting and track.identity >= 0:
                 stamps_ns = taken.setdefault(track.identity, self._landmarks.stamps_ns(track.identity))
                 coming += [(sighting, track.identity) for sighting in self._settle(track, stamps_ns)]
         if coming:

@@ -245,7 +245,7 @@ class Sightings:
         if not np.isfinite(self._gate):
             return [True] * len(sightings)
         key, values = L(landmark_id), self.smoother.values
-        joint = self.smoother.joint_covariance([key, *{sighting.line.pose_key for sighting in sightings}])
+        joint = self.smoother.joint_covariance_of_any([key, *{sighting.line.pose_key for sighting in sightings}])
         points = values.atPoint3(key)[None]
         distances = []
         for sighting in sightings:

@@ -96,7 +96,7 @@ class Smoother:
         self._held: dict[int, float] = {}
         self._landmarks: list[int] = []
         self._bias: list[int] = []
-        self._window = self._new_window()
+        self._window = self._new_window(lag_s)
         self._joint: JointCovariance | None = None
         self._asked: set[int] = set()
         self._asked_before: set[int] = set()
@@ -108,13 +108,13 @@ class Smoother:
         """Every factor of the run."""
         return self._history.graph
 
-    def _new_window(self) -> gtsam.IncrementalFixedLagSmoother:
+    def _new_window(self, lag_s: float) -> gtsam.IncrementalFixedLagSmoother:
         params = gtsam.ISAM2Params()
         params.setFactorization(self._factorization)
         params.relinearizeSkip = 1
         params.setRelinearizeThreshold(self._threshold)
         params.findUnusedFactorSlots = True
-        return gtsam.IncrementalFixedLagSmoother(self._lag_s, params)
+        return gtsam.IncrementalFixedLagSmoother(lag_s, params)
 
     def add_pose(self, key: int, pose: gtsam.Pose3, time_s: float) -> None:
         """A new keyframe, with its first estimate."""
@@ -144,7 +144,10 @@ class Smoother:
         return handles
 
     def hold(self, until_s: dict[int, float]) -> None:
-        """Keep these keyframes in the window, beyond the lag, until the times given; no others any more."""
+        """Keep keyframes, and all later ones, in the window beyond the lag, each until a time; no others any more.
+
+        All later ones as well: iSAM2 marginalises in order.
+        """
         self._held = until_s
 
     def exchange(self, what: Exchange, time_s: float) -> list[list[int]]:
@@ -198,9 +201,9 @@ class Smoother:
 
     def update(self, time_s: float, removed_slots: Sequence[int] = ()) -> None:
         """Bring the window's estimate up to date with what was added, without what is in some places of the window."""
-        lasting = self._bias + self._inside(self._held_at(time_s))
-        times: dict[Any, float] = self._pending_times | dict.fromkeys(self._landmarks + lasting, time_s)
-        self._expiring |= dict.fromkeys(lasting, time_s)
+        times: dict[Any, float] = self._pending_times | dict.fromkeys(self._landmarks + self._bias, time_s)
+        self._expiring |= dict.fromkeys(self._bias, time_s)
+        self._window.setSmootherLag(self._lag_at(time_s))
         try:
             self._window.update(self._pending, self._pending_values, times, list(removed_slots))
         except RuntimeError:  # Cholesky met a pose 4096 times less certain than its step: QR has no such limit
@@ -213,8 +216,10 @@ class Smoother:
         if self.graph.size() >= self._restart_size and self._is_stale():
             self._restart(time_s)
 
-    def _held_at(self, time_s: float) -> list[int]:
-        return [key for key, until_s in self._held.items() if time_s <= until_s]
+    def _lag_at(self, time_s: float) -> float:
+        """Age (s) from which on poses leave the window."""
+        held = (time_s - self._expiring[key] for key, until_s in self._held.items() if time_s <= until_s)
+        return max([self._lag_s, *held])
 
     def _clear_pending(self) -> None:
         self._pending = gtsam.NonlinearFactorGraph()
@@ -231,17 +236,16 @@ class Smoother:
         """Solve the history; start a window whose prior is the marginal of all that lies before it."""
         self._restart_size = max(FIRST_RESTART, int(RESTART_GROWTH * self.graph.size()))
         self.values = self._solve()
-        times: dict[Any, float] = {key: t for key, t in self._expiring.items() if t >= time_s - self._lag_s}
-        held = self._held_at(time_s)
-        times |= dict.fromkeys(self._landmarks + held, time_s)
-        self._expiring |= dict.fromkeys(held, time_s)
+        lag_s = self._lag_at(time_s)
+        times: dict[Any, float] = {key: t for key, t in self._expiring.items() if t >= time_s - lag_s}
+        times |= dict.fromkeys(self._landmarks, time_s)
         inside, outside = _split(self.graph, set(times))
         values = gtsam.Values()
         for key in times:
             _copy(self.values, key, values)
         for factor in _marginal(outside, self.values, times):
             inside.push_back(factor)
-        self._window = self._new_window()
+        self._window = self._new_window(lag_s)
         self._window.update(inside, values, times)
         self.values.update(self._window.calculateEstimate())
 
@@ -272,6 +276,12 @@ class Smoother:
         if self._joint is None or not self._joint.rows.keys() >= self._asked:
             self._joint = JointCovariance.of(self._window.getISAM2(), sorted(self._asked | self._asked_before))
         return self._joint
+
+    def joint_covariance_of_any(self, keys: list[int]) -> JointCovariance:
+        """Joint marginal covariance of any variables; it costs a solution of the history if one has left the window."""
+        if len(self._inside(keys)) == len(keys):
+            return self.joint_covariance(keys)
+        return JointCovariance.of(self.solve_history()[1], keys)
 
     def solve_history(self) -> tuple[gtsam.Values, gtsam.Marginals | gtsam.ISAM2]:
         """Solve the whole graph from the present values; the solution, and what gives its marginal covariances.

@@ -35,8 +35,8 @@ def decide(frame: LandmarkDetections, least_probability: float) -> list[int]:
 class Track:
     """One object, watched."""
 
-    identity: int = NO_LANDMARK
-    """Of the landmark that it counts as."""
+    identity: int = UNDECIDED
+    """What was decided last: that of a landmark, `NO_LANDMARK`, or nothing yet."""
     newest_ns: int = 0
     """When it was last seen."""
     waiting: list[Sighting] = field(default_factory=list)
@@ -72,10 +72,11 @@ class Tracks:
         return [track for track in self._by_number.values() if track.identity == landmark_id]
 
     def held_until_s(self) -> dict[int, float]:
-        """Keyframes on which sightings wait, by key, and until when (s)."""
+        """Keyframes on which sightings wait that may soon be used, by key, and until when (s)."""
         return {
             sighting.line.pose_key: (sighting.stamp_ns + self._longest_wait_ns) / NS_PER_S
             for track in self._by_number.values()
+            if track.identity != NO_LANDMARK
             for sighting in track.waiting
         }
 

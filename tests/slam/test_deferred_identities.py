@@ -305,6 +305,16 @@ def test_late_sightings_pass_the_gate_one_by_one():
     assert dive.outcomes[3:] == [Outcome.USED_LATER, Outcome.GATED, Outcome.USED]
 
 
+def test_late_sightings_pass_the_gate_at_keyframes_that_have_left_the_window():
+    dive = Dive(lag_s=0.5)
+    for after_s in (0.0, 0.2, 0.4):
+        see(dive, after_s, SURE[5])
+    for after_s, off_m in ((6.0, 0.0), (6.2, 3.0)):
+        see(dive, after_s, SURE[6], track=4, off_m=off_m)
+    see(dive, 9.0, SURE[5], track=4)
+    assert dive.outcomes[3:] == [Outcome.MOVED, Outcome.GATED, Outcome.USED]
+
+
 def test_detections_of_no_track_are_dealt_with_at_once():
     dive = Dive()
     see(dive, 0.0, FLAT, track=-1)

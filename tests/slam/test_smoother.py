@@ -45,7 +45,6 @@ class Fed:
 def on_the_rail(nodes: int, lag_s: float, stale_shift_m: float = NEVER_M, held: dict[int, float] | None = None) -> Fed:
     _, numbers = rail(nodes)
     fed, seen = Fed(lag_s, stale_shift_m), set()
-    fed.smoother.hold(held or {})
     fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
     fed.add([factors.start_prior(X(0), calibration())])
     cov = np.diag([1e-12] * 3 + [(VELOCITY_SIGMA_M_S * STEP_S) ** 2] * 3)
@@ -53,6 +52,8 @@ def on_the_rail(nodes: int, lag_s: float, stale_shift_m: float = NEVER_M, held: 
         moved = gtsam.Pose3(gtsam.Rot3(), np.array([numbers.displacements_m[k - 1], 0, 0]))
         pose = fed.smoother.values.atPose3(X(k - 1)).compose(moved)
         fed.smoother.add_pose(X(k), pose, k * STEP_S)
+        if held and X(k) in held:
+            fed.smoother.hold(held)
         motion = PreintegratedMotion(moved, cov, np.zeros((6, 3)), np.zeros(3), STEP_S, np.zeros(3))
         fed.add([factors.odometry(X(k - 1), X(k), motion)])
         for _, i, distance in (r for r in numbers.ranges if r[0] == k):
@@ -501,10 +502,26 @@ def test_a_held_keyframe_takes_late_factors_without_solving_the_history(monkeypa
     assert_is_least_squares(fed, numbers, nodes, [4, 7])
 
 
-def test_a_keyframe_is_held_until_the_time_given_and_the_lag_after():
+def test_a_keyframe_and_all_later_ones_are_held_until_the_time_given():
     nodes = 21
-    fed = on_the_rail(nodes, 2.1, held={X(3): 8.0})
-    assert fed.smoother.covariance(X(3))[3, 3] > 0
+    fed = on_the_rail(nodes, 1.1, held={X(3): (nodes - 1) * STEP_S})
+    for k in range(3, nodes):
+        assert fed.smoother.covariance(X(k))[3, 3] > 0
+    with pytest.raises(IndexError):
+        fed.smoother.covariance(X(2))
     fed = on_the_rail(nodes, 1.1, held={X(3): 8.0})
     with pytest.raises(IndexError):
-        fed.smoother.covariance(X(3))
+        fed.smoother.covariance(X(17))
+    assert fed.smoother.covariance(X(18))[3, 3] > 0
+
+
+@pytest.mark.parametrize("lag_s", [FOREVER_S, 1.1], ids=["in the window", "not in it"])
+def test_a_joint_covariance_of_any_poses_is_that_of_all_factors(lag_s):
+    fed = in_the_basin(15, lag_s)
+    values, _ = fed.smoother.solve_history()
+    keys = [X(2), X(9), L(5)]
+    found = fed.smoother.joint_covariance_of_any(keys)
+    expected = dense_covariance(fed, values, keys)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    matrix = np.block([[found.at(a, b) for b in keys] for a in keys])
+    assert np.abs((matrix - expected) / scale).max() < 1e-2
