@@ -17,7 +17,7 @@ from sonar_graph.slam.association import DetectionJournal
 from sonar_graph.slam.landmark_sightings import LandmarkSightings
 from sonar_graph.slam.sighting import Sighting
 from sonar_graph.slam.smoother import Smoother
-from sonar_graph.slam.tracks import UNDECIDED, Track, Tracks
+from sonar_graph.slam.tracks import NO_LANDMARK, UNDECIDED, Track, Tracks
 from sonar_graph.states import Outcome
 
 Gate = Callable[[list[Sighting], int], list[bool]]
@@ -86,9 +86,10 @@ class DeferredIdentities:
 
     def forget(self, now_ns: int) -> None:
         """Let go of sightings that have waited too long."""
-        for sighting in self._tracks.forget(now_ns):
+        for sighting, decision in self._tracks.forget(now_ns):
             if sighting.outcome is Outcome.WAITING:
-                self._journal.amend(sighting.row, Outcome.FORGOTTEN)
+                outcome = Outcome.NO_IDENTITY if decision == NO_LANDMARK else Outcome.FORGOTTEN
+                self._journal.amend(sighting.row, outcome)
 
     def _change(self, changed: list[tuple[Track, int]], time_s: float) -> list[Track]:
         """Take back what tracks no longer count as; other tracks that now get what these had displaced."""

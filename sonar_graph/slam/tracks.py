@@ -80,13 +80,13 @@ class Tracks:
             for sighting in track.waiting
         }
 
-    def forget(self, now_ns: int) -> list[Sighting]:
-        """Let go of what is too old: the sightings that waited in vain."""
+    def forget(self, now_ns: int) -> list[tuple[Sighting, int]]:
+        """Let go of what is too old: the sightings that waited in vain, and what their tracks had decided."""
         oldest_ns = now_ns - self._longest_wait_ns
-        forgotten: list[Sighting] = []
+        forgotten: list[tuple[Sighting, int]] = []
         for track in self._by_number.values():
             if track.waiting and track.waiting[0].stamp_ns < oldest_ns:
-                forgotten += [sighting for sighting in track.waiting if sighting.stamp_ns < oldest_ns]
+                forgotten += [(old, track.identity) for old in track.waiting if old.stamp_ns < oldest_ns]
                 track.waiting = [sighting for sighting in track.waiting if sighting.stamp_ns >= oldest_ns]
         over = [number for number, track in self._by_number.items() if track.newest_ns < oldest_ns]
         for number in over:

@@ -265,6 +265,16 @@ def test_what_waits_too_long_is_dropped_and_said():
     assert not dive.sightings.ids
 
 
+def test_what_is_of_no_landmark_to_the_end_is_said_to_have_no_identity():
+    dive = Dive(policy=replace(TRUSTING, longest_wait_s=2.0))
+    see(dive, 0.0, FLAT)
+    see(dive, 1.0, [0.05] * 4)
+    assert dive.outcomes == [Outcome.WAITING, Outcome.WAITING]
+    dive.keyframes.advance(T0_NS + 5 * NS)
+    dive.sightings.forget()
+    assert dive.outcomes == [Outcome.NO_IDENTITY, Outcome.NO_IDENTITY]
+
+
 def test_a_track_that_is_over_keeps_its_identity():
     dive = Dive(policy=replace(TRUSTING, longest_wait_s=1.0))
     see(dive, 0.0, SURE[5])
