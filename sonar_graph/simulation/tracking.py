@@ -57,7 +57,7 @@ class Watched:
                 first_ns.append(stamp_ns)
             newest[index] = number, stamp_ns
             track[row] = number
-        age_s = (stamps_ns - np.array(first_ns, dtype=np.int64)[track]) * 1e-9
+        age_s = np.asarray((stamps_ns - np.array(first_ns, dtype=np.int64)[track]) * 1e-9, dtype=np.float64)
         lifetime_s = np.zeros(len(landmarks))
         np.maximum.at(lifetime_s, track, age_s)
         return cls(np.array(landmarks, dtype=np.int64), track, age_s, lifetime_s, tracking)

@@ -38,7 +38,7 @@ RESTART_GROWTH = 1.25
 """Number of factors, relative to that at the last restart, before the next one."""
 FIRST_RESTART = 100
 """Number of factors before the first restart."""
-SETTLING_UPDATES = 2
+MOST_SETTLING_UPDATES = 10
 """Further updates after an exchange, each a Gauss-Newton step: what is exchanged may move the estimate far."""
 MAX_PLACEMENTS = 3
 """Times that stuck landmarks are placed anew in one solution."""
@@ -187,10 +187,11 @@ class Smoother:
         for key in landmark_keys:
             self._landmarks.remove(key)
             self.values.erase(key)
-            self._asked.discard(key)
 
     def _settle(self) -> None:
-        for _ in range(SETTLING_UPDATES):
+        for _ in range(MOST_SETTLING_UPDATES):
+            if self._window.getDelta().norm() <= self._threshold:
+                break
             self._window.update()
         self.values.update(self._window.calculateEstimate())
 

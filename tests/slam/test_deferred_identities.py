@@ -10,14 +10,16 @@ from gtsam.symbol_shorthand import L
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sonar_graph.calibration import FloorPrior
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.sequence import NS_PER_S, Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam.smoother import Smoother
 from sonar_graph.states import Outcome
 
 from .rail import STEP_S, rail
-from .test_sightings import NS, T0_NS, TRUSTING, Dive, spherical
+from .test_sightings import CALIBRATION, NS, T0_NS, TRUSTING, Dive, spherical
 
 FLAT = [0.2, 0.2, 0.2, 0.2]
 IDS = [4, 5, 6, 7]
@@ -275,6 +277,29 @@ def test_what_is_of_no_landmark_to_the_end_is_said_to_have_no_identity():
     assert dive.outcomes == [Outcome.NO_IDENTITY, Outcome.NO_IDENTITY]
 
 
+def test_what_was_taken_back_is_given_to_no_other_landmark_after_too_long():
+    dive = Dive(policy=replace(TRUSTING, longest_wait_s=2.0))
+    see(dive, 0.0, SURE[5])
+    see(dive, 1.0, FLAT)
+    see(dive, 1.5, [0.0] * 4)
+    see(dive, 2.6, SURE[5])
+    assert dive.outcomes == [Outcome.TAKEN_BACK, Outcome.USED_LATER, Outcome.USED_LATER, Outcome.USED]
+
+
+def test_whether_it_stands_on_the_floor_is_judged_where_it_was_seen():
+    """An object high above the floor and one on it, known late: what is said of heights is as if known at once."""
+    for height_m, factors_on_height in ((OBJECTS[0][2] - 1.2, 0), (OBJECTS[0][2], 1)):
+        floor = FloorPrior(z_m=height_m, sigma_m=0.01)
+        late, known = (Dive(CALIBRATION.model_copy(update={"floor": floor})) for _ in range(2))
+        for dive, first in ((late, FLAT), (known, SURE[5])):
+            see(dive, 0.0, first)
+            see(dive, 0.5, SURE[5])
+        values = known.smoother.values
+        a, b = rows_of(late.smoother.graph, values), rows_of(known.smoother.graph, values)
+        assert {name: len(rows) for name, rows in a.items()} == {name: len(rows) for name, rows in b.items()}
+        assert len(b.get(("PriorFactorPoint3", L(5)), [])) == factors_on_height
+
+
 def test_a_track_that_is_over_keeps_its_identity():
     dive = Dive(policy=replace(TRUSTING, longest_wait_s=1.0))
     see(dive, 0.0, SURE[5])
@@ -305,6 +330,43 @@ def test_a_doubtful_row_of_a_known_track_waits_for_the_next_sure_one():
     assert dive.outcomes == [Outcome.NEW, Outcome.USED_LATER, Outcome.USED]
 
 
+def test_what_was_refused_for_one_landmark_is_not_refused_for_good():
+    dive = Dive()
+    for after_s in (0.0, 0.2, 0.4):
+        see(dive, after_s, SURE[5])
+    see(dive, 0.6, SURE[5], off_m=0.5)
+    assert dive.outcomes[-1] == Outcome.GATED
+    see(dive, 0.8, [0.0] * 4)
+    assert dive.outcomes == [Outcome.TAKEN_BACK] * 3 + [Outcome.WAITING] * 2
+    see(dive, 1.0, SURE[6])
+    assert dive.outcomes[:5] == [Outcome.MOVED] * 3 + [Outcome.USED_LATER] * 2
+
+
+def test_of_tracks_that_claim_a_landmark_at_once_the_more_probable_gets_the_earlier_frames():
+    dive = Watch(policy=replace(TRUSTING, gate_probability=1.0))
+    dive.watch(0, [FLAT, FLAT, FLAT])
+    dive.watch(1, [[0.0, 0.8, 0.0, 0.0], SURE[5], FLAT])
+    repeated, later = Outcome.REPEATED, Outcome.USED_LATER
+    assert dive.outcomes == [repeated, later, Outcome.WAITING, repeated, Outcome.USED, Outcome.WAITING]
+
+
+def test_a_displaced_sighting_is_used_when_its_place_becomes_free_though_its_track_is_gone():
+    dive = Watch(policy=replace(TRUSTING, gate_probability=1.0))
+    known = Watch(policy=replace(TRUSTING, gate_probability=1.0))
+    for each, first in ((dive, SURE[5]), (known, SURE[4])):
+        each.watch(0, [FLAT, SURE[5], FLAT])
+        each.watch(1, [first, [0.0, 0.9, 0.0, 0.0], FLAT])
+    assert dive.outcomes[3:5] == [Outcome.USED, Outcome.REPEATED]
+    for each in (dive, known):
+        see(each, 2 * GAP_S, SURE[4], track=0)
+    assert dive.outcomes[3:5] == [Outcome.MOVED, Outcome.USED_LATER]
+    values = known.smoother.values
+    a, b = rows_of(dive.smoother.graph, values), rows_of(known.smoother.graph, values)
+    assert a.keys() == b.keys()
+    for name, rows in b.items():
+        np.testing.assert_allclose(a[name], rows, atol=1e-7 * max(1.0, np.abs(rows).max()))
+
+
 def test_late_sightings_pass_the_gate_one_by_one():
     dive = Dive()
     for after_s in (0.0, 0.2, 0.4):
@@ -313,6 +375,20 @@ def test_late_sightings_pass_the_gate_one_by_one():
     see(dive, 1.2, FLAT, track=4, off_m=0.5)
     see(dive, 1.4, SURE[5], track=4)
     assert dive.outcomes[3:] == [Outcome.USED_LATER, Outcome.GATED, Outcome.USED]
+
+
+def test_while_sightings_wait_the_window_stays_open_for_them(monkeypatch):
+    """Late factors then cost no solution of the history; of a track that is of no landmark they may."""
+    solves = []
+    solve = Smoother._solve
+    monkeypatch.setattr(Smoother, "_solve", lambda self: solves.append(1) or solve(self))
+    for beliefs, expected in (([FLAT] * 9, 0), ([FLAT] * 2 + [[0.0] * 4] * 7, 1)):
+        dive = Dive(lag_s=0.5)
+        solves.clear()
+        for k, belief in enumerate([*beliefs, SURE[5]]):
+            see(dive, float(k), belief)
+        assert len(solves) == expected
+        assert dive.outcomes == [Outcome.USED_LATER] * 9 + [Outcome.USED]
 
 
 def test_late_sightings_pass_the_gate_at_keyframes_that_have_left_the_window():
@@ -360,3 +436,19 @@ def test_the_causal_estimate_after_a_flip_does_not_wait_for_the_end():
         one, other = ends[0][stamp_ns], ends[1][stamp_ns]
         off = gtsam.Pose3.Logmap(other.world_T_body.between(one.world_T_body))
         assert np.abs(off / np.sqrt(np.diag(other.covariance))).max() < 0.05
+
+
+def test_the_end_does_not_depend_on_how_the_log_is_cut():
+    """Estimates at the whole seconds, asked for alone and among others."""
+    sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["late and wrong"]))
+    estimators = [Isam2(sequence.calibration), Isam2(sequence.calibration)]
+    found: list[dict[int, gtsam.Pose3]] = [{}, {}]
+    for estimator, rate_hz, at in zip(estimators, (1.0, 4.0), found, strict=True):
+        for step in sequence.replay(sequence.instants(rate_hz)):
+            estimate = estimator.process(step)
+            if estimate is not None:
+                at[estimate.stamp_ns] = estimate.world_T_body
+    shared = found[0].keys() & found[1].keys()
+    assert len(shared) > 100
+    assert max(np.abs(found[0][ns].matrix() - found[1][ns].matrix()).max() for ns in shared) < 1e-12
+    assert estimators[0].detections().outcomes == estimators[1].detections().outcomes
