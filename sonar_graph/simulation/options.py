@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Self
-
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.simulation.presets import DvlName, ImuName
@@ -55,9 +53,3 @@ class SimulationOptions(Section):
     """The same for its rotation, about each body axis."""
     floor_sigma_m: float = Field(0.01, gt=0)
     """Landmark heights are drawn about the floor with this sigma, and estimators are told so."""
-
-    @model_validator(mode="after")
-    def _delays_tracks(self) -> Self:
-        if self.id_delay_s > 0 and not self.tracks:
-            raise ValueError("id_delay_s is the age of a track: set tracks = true with it")
-        return self

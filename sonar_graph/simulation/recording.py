@@ -22,6 +22,7 @@ from sonar_graph.calibration import (
     SonarCalibration,
     Start,
 )
+from sonar_graph.errors import SimulationError
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.detections import Fan, Recogniser, simulate_detections
@@ -99,7 +100,16 @@ def record(
         Source of everything random.
     notes
         Provenance to add to generator and options.
+
+    Raises
+    ------
+    SimulationError
+        When identities are to come late without tracks, of which late is the age.
     """
+    if options.id_delay_s > 0 and not options.tracks:
+        raise SimulationError(
+            f"simulate {name}: id_delay_s = {options.id_delay_s:g} is the age of a track; set tracks = true with it"
+        )
     calibration = _calibration(options, vehicle, path, world, streams.start)
     rates_hz = IMU_RATE_HZ, DVL_PRESETS[options.dvl].rate_hz, DEPTH_RATE_HZ, TRUTH_RATE_HZ
     imu_ns, dvl_ns, depth_ns, truth_ns = (regular_stamps(rate, path.duration_s) for rate in rates_hz)

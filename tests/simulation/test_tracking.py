@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import ValidationError
 
+from sonar_graph.errors import SimulationError
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.simulation.tracking import Tracking, Watched
@@ -85,5 +85,5 @@ def test_the_share_of_wrong_tracks_is_as_asked():
 
 
 def test_a_delay_without_tracks_is_refused():
-    with pytest.raises(ValidationError, match="set tracks = true"):
-        BasinOptions(id_delay_s=5.0)
+    with pytest.raises(SimulationError, match="id_delay_s = 5 is the age of a track; set tracks = true"):
+        simulate_basin(BasinOptions(id_delay_s=5.0))
