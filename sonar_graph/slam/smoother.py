@@ -166,7 +166,7 @@ class Smoother:
             self._restart(time_s)
         else:
             self.update(time_s, slots)
-            self._settle()
+            self._settle(time_s)
         return handles
 
     def _window_slots(self, handles: list[int]) -> list[int] | None:
@@ -188,11 +188,14 @@ class Smoother:
             self._landmarks.remove(key)
             self.values.erase(key)
 
-    def _settle(self) -> None:
-        for _ in range(MOST_SETTLING_UPDATES):
-            if self._window.getDelta().norm() <= self._threshold:
-                break
-            self._window.update()
+    def _settle(self, time_s: float) -> None:
+        try:
+            for _ in range(MOST_SETTLING_UPDATES):
+                if self._window.getDelta().norm() <= self._threshold:
+                    break
+                self._window.update()
+        except RuntimeError:
+            self._give_up_cholesky(time_s)
         self.values.update(self._window.calculateEstimate())
 
     @property
@@ -207,15 +210,19 @@ class Smoother:
         self._window.setSmootherLag(self._lag_at(time_s))
         try:
             self._window.update(self._pending, self._pending_values, times, list(removed_slots))
-        except RuntimeError:  # Cholesky met a pose 4096 times less certain than its step: QR has no such limit
-            self._factorization = "QR"
-            self._clear_pending()
-            self._restart(time_s)
+        except RuntimeError:
+            self._give_up_cholesky(time_s)
             return
         self._clear_pending()
         self.values.update(self._window.calculateEstimate())
         if self.graph.size() >= self._restart_size and self._is_stale():
             self._restart(time_s)
+
+    def _give_up_cholesky(self, time_s: float) -> None:
+        """It met a pose 4096 times less certain than its step: QR has no such limit."""
+        self._factorization = "QR"
+        self._clear_pending()
+        self._restart(time_s)
 
     def _lag_at(self, time_s: float) -> float:
         """Age (s) from which on poses leave the window."""
