@@ -44,9 +44,9 @@ class LandmarkSightings:
         """Frames that show a landmark."""
         return {sighting.stamp_ns for sighting in self._of.get(landmark_id, [])}
 
-    def enter(self, sighting: Sighting, landmark_id: int, handles: list[int]) -> None:
+    def enter(self, sighting: Sighting, landmark_id: int, handles: Iterable[int]) -> None:
         """A sighting whose factors were given to the smoother already."""
-        sighting.landmark_id, sighting.handles = landmark_id, handles
+        sighting.landmark_id, sighting.handles = landmark_id, tuple(handles)
         self._of[landmark_id].append(sighting)
         self._smoother.sightlines.add(L(landmark_id), sighting.line)
 
@@ -63,7 +63,7 @@ class LandmarkSightings:
         for sighting in out:
             self._take(sighting)
         for sighting, landmark in new:
-            self.enter(sighting, landmark, [])
+            self.enter(sighting, landmark, ())
         again = self._roles_changed(before, [sighting for sighting, _ in new])
         removed += [handle for sighting in again for handle in sighting.handles]
         self._make([sighting for sighting, _ in new] + again, removed, before, time_s)
@@ -79,7 +79,7 @@ class LandmarkSightings:
         if not self._of[landmark]:
             del self._of[landmark]
         self._smoother.sightlines.remove(L(landmark), sighting.line)
-        sighting.landmark_id, sighting.handles = None, []
+        sighting.landmark_id, sighting.handles = None, ()
 
     def _roles_changed(self, before: dict[int, Sighting | None], new: list[Sighting]) -> list[Sighting]:
         """Sightings that stay in, but no longer are, or now are, the first of their landmark."""
@@ -108,4 +108,4 @@ class LandmarkSightings:
         ]
         groups = self._smoother.exchange(Exchange(removed, made, begun, lost), time_s)
         for sighting, handles in zip(sightings, groups, strict=True):
-            sighting.handles = handles
+            sighting.handles = tuple(handles)

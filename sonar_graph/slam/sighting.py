@@ -7,7 +7,7 @@ the same whenever they are made, and for whichever landmark.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import gtsam
 
@@ -19,7 +19,7 @@ from sonar_graph.slam.sightlines import Sightline
 from sonar_graph.states import Outcome
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class Sighting:
     """Range and azimuth of something, seen from a keyframe."""
 
@@ -35,7 +35,7 @@ class Sighting:
     """Of its direction, when a landmark begins with it."""
     landmark_id: int | None = None
     """Of which it is a sighting; None: not of any."""
-    handles: list[int] = field(default_factory=list)
+    handles: tuple[int, ...] = ()
     """Of its factors."""
     outcome: Outcome = Outcome.WAITING
     """What has become of it so far."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import gtsam
 import numpy as np
@@ -52,8 +52,7 @@ class SightingPolicy:
         return None
 
 
-@dataclass(frozen=True, eq=False)
-class Verdict:
+class Verdict(NamedTuple):
     """What became of a detection when it came."""
 
     outcome: Outcome
@@ -144,7 +143,6 @@ class Sightings:
         """Add the factors of a frame's landmarks, keep what is refused but tracked; what became of each, by row."""
         self.keyframes.update_if_due()
         motion = self.keyframes.motion_since_newest(stamp_ns)
-        kept = seen.where([refusals[row] is not None for row in seen.rows])
         named = seen.where([refusals[row] is None for row in seen.rows])
         is_known = [i in self._landmarks for i in named.ids]
         known, new = named.where(is_known), named.where([not known for known in is_known])
@@ -152,7 +150,9 @@ class Sightings:
         motion = self.keyframes.set_for_frame(stamp_ns, motion)
         tie = Tie.between(motion, self.keyframes.newest_key, self._body_T_sonar, stamp_ns)
         verdicts = self._sight_again(view, tie, known) | self._sight_first(view, tie, new)
-        verdicts |= self._keep(view, tie, kept, refusals)
+        if len(named.rows) < len(seen.rows):
+            kept = seen.where([refusals[row] is not None for row in seen.rows])
+            verdicts |= self._keep(view, tie, kept, refusals)
         self.keyframes.update_if_due()
         return verdicts
 

@@ -17,7 +17,7 @@ import numpy as np
 from sonar_graph.measurements import Floats
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Sightline:
     """One sighting of a landmark."""
 
