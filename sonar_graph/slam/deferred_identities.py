@@ -10,18 +10,15 @@ begins in the right place. What counts as known is in `sonar_graph.slam.tracks`;
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
 
 from sonar_graph.measurements import NO_TRACK, LandmarkDetections
 from sonar_graph.slam.association import DetectionJournal
 from sonar_graph.slam.landmark_sightings import LandmarkSightings
+from sonar_graph.slam.late_gate import LateGate
 from sonar_graph.slam.sighting import Sighting
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.slam.tracks import NO_LANDMARK, UNDECIDED, Track, Tracks
 from sonar_graph.states import Outcome
-
-Gate = Callable[[list[Sighting], int], list[bool]]
-"""Which of some sightings are where a landmark of the graph is expected."""
 
 
 class DeferredIdentities:
@@ -34,7 +31,7 @@ class DeferredIdentities:
     journal
         Its rows are amended when sightings are used, moved, taken back or forgotten.
     gate
-        For sightings that come late to a landmark of the graph, one by one, as for those that come at once.
+        For sightings that come late to a landmark of the graph.
     longest_wait_s
         A sighting waits at most so long. A track that was not seen for so long is over: what it counts as stays.
     """
@@ -44,7 +41,7 @@ class DeferredIdentities:
         landmarks: LandmarkSightings,
         smoother: Smoother,
         journal: DetectionJournal,
-        gate: Gate,
+        gate: LateGate,
         longest_wait_s: float,
     ) -> None:
         self._landmarks = landmarks
@@ -145,13 +142,10 @@ class DeferredIdentities:
             else:
                 taken_ns.add(sighting.stamp_ns)
                 free.append(sighting)
-        for sighting, is_inside in zip(free, self._inside(free, track.identity), strict=True):
+        for sighting, is_inside in zip(free, self._gate.inside(free, track.identity), strict=True):
             used = Outcome.MOVED if sighting.outcome is Outcome.TAKEN_BACK else Outcome.USED_LATER
             sighting.outcome = used if is_inside else Outcome.GATED
         for sighting in track.waiting:
             self._journal.amend(sighting.row, sighting.outcome, track.identity)
         track.settled, track.waiting = track.settled + track.waiting, []
         return [sighting for sighting in free if sighting.outcome is not Outcome.GATED]
-
-    def _inside(self, sightings: list[Sighting], landmark_id: int) -> list[bool]:
-        return self._gate(sightings, landmark_id) if landmark_id in self._landmarks else [True] * len(sightings)

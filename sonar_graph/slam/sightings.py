@@ -14,8 +14,10 @@ from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.slam.association import DetectionJournal, Identities, gate_threshold, identify
 from sonar_graph.slam.deferred_identities import DeferredIdentities
+from sonar_graph.slam.factors import Robust
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmark_sightings import LandmarkSightings
+from sonar_graph.slam.late_gate import LateGate
 from sonar_graph.slam.models import FLOOR_GATE, locate
 from sonar_graph.slam.sighting import Sighting, SightingFactors
 from sonar_graph.slam.sightlines import Sightline
@@ -23,11 +25,6 @@ from sonar_graph.slam.smoother import Smoother
 from sonar_graph.slam.tracks import decide
 from sonar_graph.slam.view import View
 from sonar_graph.states import Outcome
-
-STILL = PreintegratedMotion(
-    gtsam.Pose3(), np.zeros((6, 6)), np.zeros((6, 3)), np.zeros(3), 0.0, mean_specific_force=np.full(3, np.nan)
-)
-"""No motion between keyframe and sonar but what a sighting's tie has in it already."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +39,11 @@ class SightingPolicy:
     """Whether detections of tracks are used once their identity is known, and moved when it turns out to be another."""
     longest_wait_s: float = 60.0
     """How long they wait for it."""
+
+    def robust(self) -> Robust:
+        """What wraps a noise model in the kernel."""
+        kernel = self.estimator()
+        return lambda noise: gtsam.noiseModel.Robust.Create(kernel, noise) if kernel else noise
 
     def estimator(self) -> gtsam.noiseModel.mEstimator.Base | None:
         """The robust kernel; None for none."""
@@ -78,13 +80,13 @@ class Sightings:
         sonar = self.calibration.sonar
         self._body_T_sonar = sonar.mounting.pose()
         self._default_cov = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
-        self._kernel = self.policy.estimator()
         probability = self.policy.gate_probability
         self._gate = gate_threshold(probability, 2) if probability < 1 else np.inf
-        self._factors = SightingFactors(sonar, self._robust)
+        self._factors = SightingFactors(sonar, self.policy.robust())
         self._landmarks = LandmarkSightings(self.smoother, self._factors)
+        gate = LateGate(self.smoother, self._gate)
         self._deferred = DeferredIdentities(
-            self._landmarks, self.smoother, self.journal, self._inside_gate, self.policy.longest_wait_s
+            self._landmarks, self.smoother, self.journal, gate, self.policy.longest_wait_s
         )
 
     @property
@@ -239,25 +241,6 @@ class Sightings:
     def _enter(self, sighting: Sighting, landmark_id: int, *, is_first: bool) -> None:
         made = self._factors.make(sighting, L(landmark_id), is_first=is_first)
         self._landmarks.enter(sighting, landmark_id, self.smoother.add(made))
-
-    def _inside_gate(self, sightings: list[Sighting], landmark_id: int) -> list[bool]:
-        """Which late sightings are where a landmark is expected from their keyframes, as these are estimated now."""
-        if not np.isfinite(self._gate):
-            return [True] * len(sightings)
-        key, values = L(landmark_id), self.smoother.values
-        joint = self.smoother.joint_covariance_of_any([key, *{sighting.line.pose_key for sighting in sightings}])
-        points = values.atPoint3(key)[None]
-        distances = []
-        for sighting in sightings:
-            line = sighting.line
-            view = View(line.pose_key, None, values.atPose3(line.pose_key), STILL, line.body_T_sonar, joint)
-            found = view.compare([key], points, line.z[None], sighting.noise[None])
-            distances.append(float(found.distance[0]))
-        return [distance <= self._gate for distance in distances]
-
-    def _robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
-        """The noise model inside the chosen robust kernel."""
-        return gtsam.noiseModel.Robust.Create(self._kernel, noise) if self._kernel else noise
 
 
 @dataclass(frozen=True, eq=False)
