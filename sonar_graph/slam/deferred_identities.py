@@ -119,7 +119,8 @@ class DeferredIdentities:
             if sighting.outcome is not Outcome.TAKEN_BACK:
                 sighting.outcome = Outcome.WAITING
             self._journal.amend(sighting.row, sighting.outcome)
-        track.settled = [sighting for sighting in track.settled if sighting not in sightings]
+        reopened = set(sightings)
+        track.settled = [sighting for sighting in track.settled if sighting not in reopened]
         track.waiting = sorted(track.waiting + sightings, key=lambda sighting: sighting.stamp_ns)
 
     def _use_late(self, tracks: list[Track], time_s: float) -> None:

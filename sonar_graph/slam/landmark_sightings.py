@@ -30,7 +30,7 @@ class LandmarkSightings:
     def __init__(self, smoother: Smoother, maker: SightingFactors) -> None:
         self._smoother = smoother
         self._maker = maker
-        self._of: dict[int, list[Sighting]] = defaultdict(list)
+        self._of: dict[int, dict[Sighting, None]] = defaultdict(dict)
 
     @property
     def ids(self) -> set[int]:
@@ -42,12 +42,12 @@ class LandmarkSightings:
 
     def stamps_ns(self, landmark_id: int) -> set[int]:
         """Frames that show a landmark."""
-        return {sighting.stamp_ns for sighting in self._of.get(landmark_id, [])}
+        return {sighting.stamp_ns for sighting in self._of.get(landmark_id, {})}
 
     def enter(self, sighting: Sighting, landmark_id: int, handles: Iterable[int]) -> None:
         """A sighting whose factors were given to the smoother already."""
         sighting.landmark_id, sighting.handles = landmark_id, tuple(handles)
-        self._of[landmark_id].append(sighting)
+        self._of[landmark_id][sighting] = None
         self._smoother.sightlines.add(L(landmark_id), sighting.line)
 
     def exchange(self, leaving: Iterable[Sighting], coming: Iterable[tuple[Sighting, int]], time_s: float) -> None:
@@ -64,24 +64,24 @@ class LandmarkSightings:
             self._take(sighting)
         for sighting, landmark in new:
             self.enter(sighting, landmark, ())
-        again = self._roles_changed(before, [sighting for sighting, _ in new])
+        again = self._roles_changed(before, {sighting for sighting, _ in new})
         removed += [handle for sighting in again for handle in sighting.handles]
         self._make([sighting for sighting, _ in new] + again, removed, before, time_s)
 
     def _first(self, landmark_id: int) -> Sighting | None:
-        return min(self._of.get(landmark_id, []), key=lambda s: (s.stamp_ns, s.row), default=None)
+        return min(self._of.get(landmark_id, {}), key=lambda s: (s.stamp_ns, s.row), default=None)
 
     def _take(self, sighting: Sighting) -> None:
         landmark = sighting.landmark_id
         if landmark is None:
             return
-        self._of[landmark].remove(sighting)
+        del self._of[landmark][sighting]
         if not self._of[landmark]:
             del self._of[landmark]
         self._smoother.sightlines.remove(L(landmark), sighting.line)
         sighting.landmark_id, sighting.handles = None, ()
 
-    def _roles_changed(self, before: dict[int, Sighting | None], new: list[Sighting]) -> list[Sighting]:
+    def _roles_changed(self, before: dict[int, Sighting | None], new: set[Sighting]) -> list[Sighting]:
         """Sightings that stay in, but no longer are, or now are, the first of their landmark."""
         changed = []
         for landmark, old in before.items():

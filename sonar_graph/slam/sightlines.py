@@ -9,6 +9,7 @@ that kind nothing pulls it back. Its sightings themselves say where it should be
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import gtsam
@@ -45,15 +46,15 @@ class Sightlines:
     """All sightings that have become factors, by landmark."""
 
     def __init__(self) -> None:
-        self._lines: dict[int, list[Sightline]] = defaultdict(list)
+        self._lines: dict[int, dict[Sightline, None]] = defaultdict(dict)
 
     def add(self, landmark_key: int, sightline: Sightline) -> None:
         """A sighting of a landmark."""
-        self._lines[landmark_key].append(sightline)
+        self._lines[landmark_key][sightline] = None
 
     def remove(self, landmark_key: int, sightline: Sightline) -> None:
         """A sighting that is no longer one of this landmark."""
-        self._lines[landmark_key].remove(sightline)
+        del self._lines[landmark_key][sightline]
         if not self._lines[landmark_key]:
             del self._lines[landmark_key]
 
@@ -69,6 +70,6 @@ class Sightlines:
         return placed
 
 
-def _behind(lines: list[Sightline], values: gtsam.Values, landmark_key: int) -> int:
+def _behind(lines: Iterable[Sightline], values: gtsam.Values, landmark_key: int) -> int:
     landmark = values.atPoint3(landmark_key)
     return sum(line.is_behind(values, landmark) for line in lines)
