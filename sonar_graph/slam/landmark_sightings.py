@@ -56,6 +56,7 @@ class LandmarkSightings:
         Where the earliest sighting of a landmark changes, the factors of the old and of the new one are made anew. A
         landmark that loses its last sighting leaves the graph.
         """
+        self._smoother.flush(time_s)  # it may solve the history, and has to know every landmark of a sightline then
         out, new = [s for s in leaving if s.landmark_id is not None], list(coming)
         touched = {s.landmark_id for s in out if s.landmark_id is not None} | {landmark for _, landmark in new}
         before = {landmark: self._first(landmark) for landmark in touched}

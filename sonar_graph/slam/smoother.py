@@ -150,10 +150,14 @@ class Smoother:
         """
         self._held = until_s
 
-    def exchange(self, what: Exchange, time_s: float) -> list[list[int]]:
-        """Take factors out, put others in, and bring the window up to date; the handles of each group put in."""
+    def flush(self, time_s: float) -> None:
+        """Update with what waits, if anything does."""
         if self._pending.size():
             self.update(time_s)
+
+    def exchange(self, what: Exchange, time_s: float) -> list[list[int]]:
+        """Take factors out, put others in, and bring the window up to date; the handles of each group put in."""
+        self.flush(time_s)
         slots = self._window_slots(what.removed)
         self._forget(what.lost_landmarks)
         self._history.remove(what.removed)

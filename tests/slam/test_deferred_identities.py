@@ -10,6 +10,7 @@ from gtsam.symbol_shorthand import L
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import sonar_graph.slam.smoother as smoother_module
 from sonar_graph.calibration import FloorPrior
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.sequence import NS_PER_S, Sequence
@@ -365,6 +366,21 @@ def test_a_displaced_sighting_is_used_when_its_place_becomes_free_though_its_tra
     assert a.keys() == b.keys()
     for name, rows in b.items():
         np.testing.assert_allclose(a[name], rows, atol=1e-7 * max(1.0, np.abs(rows).max()))
+
+
+def test_a_landmark_may_begin_late_while_what_waits_makes_the_window_restart(monkeypatch):
+    monkeypatch.setattr(smoother_module, "FIRST_RESTART", 5)
+    dive = Dive(smoother=Smoother(1e9, 1e-6, 1e-9, greatest_waiting_gain=1e9))
+    restarts = []
+    restart = Smoother._restart
+    monkeypatch.setattr(Smoother, "_restart", lambda self, time_s: restarts.append(time_s) or restart(self, time_s))
+    for after_s in (0.0, 0.2, 0.4):
+        see(dive, after_s, SURE[4])
+        see(dive, after_s + 0.1, FLAT, track=5, off_m=0.3)
+    see(dive, 0.6, SURE[6], track=5, off_m=0.3)
+    assert restarts
+    assert dive.outcomes[1::2] == [Outcome.USED_LATER] * 3
+    assert dive.sightings.ids == {4, 6}
 
 
 def test_late_sightings_pass_the_gate_one_by_one():

@@ -43,9 +43,13 @@ class Dive:
     """Everything up to the sightings, driving straight on at 0.5 m/s for 10 s."""
 
     def __init__(
-        self, calibration: Calibration = CALIBRATION, policy: SightingPolicy = TRUSTING, lag_s: float = 1e9
+        self,
+        calibration: Calibration = CALIBRATION,
+        policy: SightingPolicy = TRUSTING,
+        lag_s: float = 1e9,
+        smoother: Smoother | None = None,
     ) -> None:
-        self.smoother = Smoother(lag_s, 1e-6, 1e9)
+        self.smoother = smoother or Smoother(lag_s, 1e-6, 1e9)
         self.keyframes = Keyframes(calibration, POLICY, self.smoother)
         self.sightings = Sightings(calibration, policy, self.smoother, self.keyframes)
         stamps = T0_NS + np.arange(0, 101) * NS // 10
