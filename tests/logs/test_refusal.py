@@ -117,7 +117,8 @@ def test_broken_messages_are_counted_and_the_others_are_as_if_alone(
     np.testing.assert_array_equal(getattr(broken, role).stamps_ns, getattr(whole, role).stamps_ns[kept])
     column = {"imu": "angular_velocity", "depth": "z_m", "detections": "range_m"}[role]
     np.testing.assert_array_equal(getattr(getattr(broken, role), column), getattr(getattr(whole, role), column)[kept])
-    assert broken.notes["log.dropped"] == f"{role}: 3 that end before their definition does"
+    where = "track" if role == "detections" else "their definition does"
+    assert broken.notes["log.dropped"] == f"{role}: 3 that end before {where}"
 
 
 @pytest.mark.parametrize(("topic", "role"), [("/pressure", "depth"), ("/landmarks", "detections")])
