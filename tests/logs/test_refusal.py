@@ -84,6 +84,10 @@ def test_the_reason_is_given_where_nothing_else_plays_the_role(bench: Bench, tmp
         read_sequence(path)
 
 
+CUT_BEFORE = {"imu": "their definition does", "depth": "their definition does", "detections": "track"}
+"""What eight bytes less leave out: the length of a list, or a part of a number."""
+
+
 def broken_log(bench: Bench, tmp_path: Path, topic: str, which: set[int]) -> Path:
     """Some messages of a topic cut off by eight bytes."""
     entries = bench.basics(9)
@@ -117,8 +121,7 @@ def test_broken_messages_are_counted_and_the_others_are_as_if_alone(
     np.testing.assert_array_equal(getattr(broken, role).stamps_ns, getattr(whole, role).stamps_ns[kept])
     column = {"imu": "angular_velocity", "depth": "z_m", "detections": "range_m"}[role]
     np.testing.assert_array_equal(getattr(getattr(broken, role), column), getattr(getattr(whole, role), column)[kept])
-    where = "track" if role == "detections" else "their definition does"
-    assert broken.notes["log.dropped"] == f"{role}: 3 that end before {where}"
+    assert broken.notes["log.dropped"] == f"{role}: 3 that end before {CUT_BEFORE[role]}"
 
 
 @pytest.mark.parametrize(("topic", "role"), [("/pressure", "depth"), ("/landmarks", "detections")])
@@ -127,7 +130,7 @@ def test_a_topic_that_is_not_needed_and_wholly_broken_is_left_out(
 ) -> None:
     sequence = read_sequence(broken_log(bench, tmp_path, topic, set(range(9))))
     assert getattr(sequence, role) is None
-    assert sequence.notes["log.dropped"] == f"{role}: 9 that end before their definition does"
+    assert sequence.notes["log.dropped"] == f"{role}: 9 that end before {CUT_BEFORE[role]}"
 
 
 def test_a_needed_topic_that_is_wholly_broken_is_an_error(bench: Bench, tmp_path: Path) -> None:
