@@ -149,7 +149,7 @@ def test_columns_of_another_shape_are_refused_by_name(made, message):
 
 
 def test_detections_belong_to_no_track_unless_said() -> None:
-    columns = np.arange(3), np.ones(3), np.zeros(3), np.zeros((3, 2, 2)), np.ones((3, 1)), np.ones((3, 1))
+    columns = np.array([1, 1, 1]), np.ones(3), np.zeros(3), np.zeros((3, 2, 2)), np.ones((3, 1)), np.ones((3, 1))
     alone, tracked = LandmarkDetections(*columns), LandmarkDetections(*columns, np.array([5, 6, 5]))
     assert alone.track.tolist() == [-1, -1, -1]
     assert LandmarkDetections.concatenate([alone, tracked]).rows(slice(2, 5)).track.tolist() == [-1, 5, 6]
