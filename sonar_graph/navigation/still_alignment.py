@@ -107,12 +107,11 @@ def _length_s(imu: Imu) -> float:
 
 def _check_rest(imu: Imu, calibration: Calibration) -> None:
     seconds = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
-    blocks = int(seconds[-1] / BLOCK_S)
-    if blocks < FEWEST_BLOCKS:
+    if seconds[-1] < FEWEST_BLOCKS * BLOCK_S:
         raise AlignmentError(f"alignment: {seconds[-1]:.1f} s of IMU is too short; give {FEWEST_BLOCKS * BLOCK_S:g} s")
     if np.diff(seconds).max() > 0.5 * BLOCK_S:
         raise AlignmentError(f"Imu: {np.diff(seconds).max():.2f} s without a row; give a stretch without holes")
-    block = np.minimum((seconds / BLOCK_S).astype(np.int64), blocks)
+    block = (seconds / BLOCK_S).astype(np.int64)
     sensors = calibration.imu
     _check_steady("Imu.specific_force", imu.specific_force, block, sensors.accel_noise_density, "accel_noise_density")
     _check_steady("Imu.angular_velocity", imu.angular_velocity, block, sensors.gyro_noise_density, "gyro_noise_density")

@@ -9,6 +9,7 @@ from baselines.ekf_motion import motion_since_node, motion_to_node, nothing_runn
 from baselines.ekf_prediction import VehicleModel
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.navigation import node_motion
 from sonar_graph.navigation.dvl_preintegration import Preintegrator
 from sonar_graph.navigation.gap_motion import gap_values
 from sonar_graph.navigation.odometry import Odometry
@@ -47,9 +48,13 @@ def odometry(request):
 
 
 def assert_preintegrated(motion, steps, x=X):
-    """As the smoother's preintegration has it, its covariance turned into the node's axes."""
+    """As the smoother's preintegration has it."""
     earth = gtsam.Rot3.RzRyRx(x[3:]).matrix().T @ EARTH
-    expected = Preintegrator(GYRO_DENSITY, np.array(LEVER)).integrate(steps, np.zeros(3), earth)
+    assert_same_motion(motion, Preintegrator(GYRO_DENSITY, np.array(LEVER)).integrate(steps, np.zeros(3), earth))
+
+
+def assert_same_motion(motion, expected):
+    """The covariance of one turned into the axes of the other, those of the node."""
     turn = np.kron(np.eye(2), np.array(motion.dR))
     cov, rt = turn @ expected.covariance @ turn.T, np.array(motion.cov_rt)
     sigma = np.sqrt(np.diag(cov))
@@ -121,7 +126,7 @@ def test_measurements_over_one_gap_tell_ever_nearer_what_one_exact_one_would_and
 LOST_S, FOUND_S = 1.0, 2.2
 
 
-def lost(rate_error=(0.0, 0.0, 0.0)):
+def lost(rate_error=(0.0, 0.0, 0.0), calibration=None):
     """Turning and surging without bottom lock for 1.2 s; gyros read an error."""
     imu_ns, dvl_ns = (T0_NS + np.arange(round(hz * 3)) * (NS_PER_S // hz) for hz in (50, 10))
     t, s = (imu_ns - T0_NS) / NS_PER_S, (dvl_ns - T0_NS) / NS_PER_S
@@ -130,27 +135,45 @@ def lost(rate_error=(0.0, 0.0, 0.0)):
     forces = np.column_stack([0.5 * np.cos(t), 0.3 * np.sin(2 * t), 9.8 + 0.2 * np.sin(t)])
     velocities = np.column_stack([0.5 * np.sin(s), 0.2 * np.cos(s), -0.3 * s])
     has_lock = (s <= LOST_S) | (s >= FOUND_S)
-    rows = Odometry(Calibration())
+    rows = Odometry(calibration or Calibration())
     rows.add(
         Imu(imu_ns, rates, forces),
         Dvl(dvl_ns[has_lock], velocities[has_lock], np.full((has_lock.sum(), 3, 3), np.nan)),
     )
-    return rows.columns()
+    return rows
+
+
+def calibration_with_gaps(gap_s=0.5):
+    return Calibration(
+        imu=ImuCalibration(mounting=Mounting(translation_m=(0.3, 0.1, -0.2)), gyro_noise_density=GYRO_DENSITY),
+        dvl=DvlCalibration(mounting=Mounting(translation_m=LEVER), gap_s=gap_s),
+    )
 
 
 def vehicle_with_gaps(bias_sigma, gap_s=0.5):
-    known = Calibration(
-        imu=ImuCalibration(mounting=Mounting(translation_m=(0.3, 0.1, -0.2))),
-        dvl=DvlCalibration(mounting=Mounting(translation_m=LEVER), gap_s=gap_s),
-    )
-    return VEHICLE._replace(gap=gap_values(known), gyro_bias_sigma=bias_sigma)
+    return VEHICLE._replace(gap=gap_values(calibration_with_gaps(gap_s)), gyro_bias_sigma=bias_sigma)
 
 
-def over_gap(columns, vehicle, until_s, node_s=LOST_S):
+def over_gap(rows, vehicle, until_s, node_s=LOST_S):
     node_ns, until_ns = (T0_NS + round(s * NS_PER_S) for s in (node_s, until_s))
     if until_s >= FOUND_S:
-        return motion_to_node(columns, vehicle, X, node_ns, until_ns)
-    return motion_since_node(columns, vehicle, X, nothing_running(), node_ns, until_ns)[1]
+        return motion_to_node(rows.columns(), vehicle, X, node_ns, until_ns)
+    return motion_since_node(rows.columns(), vehicle, X, nothing_running(), node_ns, until_ns)[1]
+
+
+@pytest.mark.parametrize("until_s", [FOUND_S, 2.0], ids=["closed", "open"])
+def test_motion_over_a_gap_is_that_of_the_smoother(until_s):
+    """Where the gyro bias is known, and the Earth too."""
+    known = calibration_with_gaps()
+    rows, bridging = lost(calibration=known), Preintegrator.from_calibration(known)
+    expected = (node_motion.motion_between_nodes if until_s >= FOUND_S else node_motion.motion_since_node)(
+        rows,
+        bridging,
+        *(T0_NS + round(s * NS_PER_S) for s in (LOST_S, until_s)),
+        np.zeros(3),
+        gtsam.Rot3.RzRyRx(X[3:]).matrix().T @ EARTH,
+    )
+    assert_same_motion(over_gap(rows, vehicle_with_gaps(0.0), until_s), expected)
 
 
 @pytest.mark.parametrize("until_s", [FOUND_S, 2.0], ids=["closed", "open"])

@@ -11,6 +11,7 @@ from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation import InitialTilt, align_at_rest
+from sonar_graph.navigation.still_alignment import covariance_at_rest
 
 G, HZ, REST_S = 9.80665, 50, 20.0
 EARTH, LATITUDE = 7.292115e-5, np.radians(40.0)
@@ -47,6 +48,7 @@ def test_a_noiseless_rest_gives_what_was_put_in():
     assert [found.roll_rad, found.pitch_rad] == pytest.approx([ROLL, PITCH], abs=1e-12)
     assert found.gyro_bias == pytest.approx(GYRO_BIAS, abs=1e-15)
     assert found.stamp_ns == (round(REST_S * HZ) - 1) * (10**9 // HZ)
+    assert found.bias_is_observed.all()
 
 
 @pytest.mark.parametrize("latitude", [None, LATITUDE])
@@ -91,6 +93,35 @@ def test_covariance_of_a_level_body_is_what_the_sensors_say():
     assert np.diag(found) == pytest.approx([tilt, tilt, across, across, bias])
     assert found[0, 3] == pytest.approx(-up * tilt)  # roll moves up towards +y
     assert found[1, 2] == pytest.approx(up * tilt)  # pitch moves it towards -x
+
+
+@pytest.mark.parametrize("latitude", [np.pi / 2, -LATITUDE])
+def test_an_unknown_accelerometer_bias_spreads_as_it_moves_what_is_found(latitude):
+    """``sigma^2 J J^T`` with J by differences, of all five; gyros without noise take over the tilt's error alone."""
+    gyros = {"gyro_noise_density": 0.0, "accel_noise_density": 0.0}
+    known = Calibration(imu=SENSORS.model_copy(update=gyros), earth_rate_latitude_rad=latitude)
+    imu, step, ends = rest(NOISELESS, noise=0.0), 1e-4, []
+    still = Calibration(imu=SENSORS, earth_rate_latitude_rad=latitude)
+    for shift in (side * step * axis for axis in np.eye(3) for side in (1, -1)):
+        found = align_at_rest(Imu(imu.stamps_ns, imu.angular_velocity, imu.specific_force + shift), still)
+        ends.append([found.roll_rad, found.pitch_rad, *found.gyro_bias])
+    J = (np.array(ends)[::2] - np.array(ends)[1::2]).T / (2 * step)
+    up = Rotation.from_euler("ZYX", [0.0, PITCH, ROLL]).inv().apply([0, 0, 1.0])
+    of_earth = np.zeros((5, 5))
+    of_earth[2:, 2:] = 0.5 * (EARTH * np.cos(latitude)) ** 2 * (np.eye(3) - np.outer(up, up))
+    expected, size = SENSORS.accel_bias_sigma**2 * J @ J.T, np.array([1.0, 1.0, EARTH, EARTH, EARTH])
+    covariance = covariance_at_rest(up, REST_S, known) - of_earth
+    assert covariance / np.outer(size, size) == pytest.approx(expected / np.outer(size, size), rel=1e-6, abs=1e-13)
+
+
+def test_a_scale_error_of_all_accelerometers_changes_nothing():
+    known = Calibration(imu=SENSORS, earth_rate_latitude_rad=LATITUDE)
+    imu = rest(NOISELESS, noise=0.0)
+    long = Imu(imu.stamps_ns, imu.angular_velocity, 1.04 * imu.specific_force)
+    found, expected = align_at_rest(long, known), align_at_rest(imu, known)
+    assert (found.roll_rad, found.pitch_rad) == pytest.approx((expected.roll_rad, expected.pitch_rad), abs=1e-12)
+    assert found.gyro_bias == pytest.approx(expected.gyro_bias, abs=1e-15)
+    assert found.covariance == pytest.approx(expected.covariance, rel=1e-9)
 
 
 def test_mounting_is_taken_out():
