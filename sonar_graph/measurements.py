@@ -61,7 +61,7 @@ class Block:
             if not whole.all():
                 row = int(np.argmin(whole))
                 raise MeasurementError(f"{name}.{finite}: row {row} is not finite; leave such rows out of the block")
-        backwards = np.flatnonzero(np.diff(self.stamps_ns) < 0)
+        backwards = np.flatnonzero(self.stamps_ns[1:] < self.stamps_ns[:-1])
         if backwards.size:
             raise MeasurementError(f"{name}: stamps run backwards after row {backwards[0]}; sort the rows by stamp")
 
@@ -222,7 +222,7 @@ class SonarFrames:
             raise MeasurementError(
                 f"SonarFrames.intensity: shape {self.intensity.shape}; stamps, beams and bins are {expected}"
             )
-        if np.any(np.diff(self.stamps_ns) < 0):
+        if np.any(self.stamps_ns[1:] < self.stamps_ns[:-1]):
             raise MeasurementError("SonarFrames: stamps run backwards; sort the frames by stamp")
 
     def __len__(self) -> int:

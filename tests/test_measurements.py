@@ -155,3 +155,10 @@ def test_detections_belong_to_no_track_unless_said() -> None:
     assert LandmarkDetections.concatenate([alone, tracked]).rows(slice(2, 5)).track.tolist() == [-1, 5, 6]
     with pytest.raises(MeasurementError, match=r"LandmarkDetections\.track"):
         LandmarkDetections(*columns, np.array([5, 6]))
+
+
+def test_stamps_that_lie_farther_apart_than_an_integer_holds_are_in_order() -> None:
+    far = 2**62
+    assert depth(np.array([-far, far])).stamps_ns.tolist() == [-far, far]
+    with pytest.raises(MeasurementError, match="run backwards after row 0"):
+        depth(np.array([far, -far]))
