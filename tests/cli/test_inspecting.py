@@ -59,3 +59,13 @@ def test_sentences_say_whether_to_act(log: Path):
     assert "sensors against each other (± 95 %)" in result.stdout
     assert "no need to act" in result.stdout
     assert "cannot be told: never still for 30 s" in result.stdout
+    for row in ("lever arm from IMU to DVL, x", "gyro bias, x", "start roll", "start pitch"):
+        assert f"\n{row} " in result.stdout
+
+
+def test_json_has_lever_arm_bias_and_start_as_numbers(log: Path):
+    said = answer(log)
+    assert sensor(said, "lever arm from IMU to DVL, x")["value"] == pytest.approx(-0.2, abs=0.1)
+    assert sensor(said, "lever arm from IMU to DVL, z")["unit"] == "m"
+    assert abs(sensor(said, "gyro bias, x")["value"]) < 1e-3
+    assert 0 < sensor(said, "start pitch")["sigma"] < 0.2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.evaluation.finding import Finding, with_interval
 from sonar_graph.evaluation.sensor_check import check_sensors
+from sonar_graph.evaluation.start_check import find_start_tilt
 from sonar_graph.evaluation.unit_check import wrong_units
 from sonar_graph.logs.adapters.config import LogConfig
 from sonar_graph.measurements import Dvl, Imu
@@ -20,6 +22,8 @@ from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 
 RIGHT = simulate_mission(MissionOptions(seed=4, duration_s=240, landmarks=1))
 OFFSET_S, YAW_RAD, SCALE = 0.4, np.radians(5), 1.04
+FAR_M = (0.9, 0.0, -0.7)
+"""Where a calibration has the IMU that is at the origin; the Doppler log is at (-0.2, 0, -0.15) from it."""
 
 
 def by_name(findings: list[Finding]) -> dict[str, Finding]:
@@ -27,31 +31,58 @@ def by_name(findings: list[Finding]) -> dict[str, Finding]:
 
 
 def spoilt() -> Sequence:
-    """Early stamps, turned and short velocities."""
+    """Early stamps, turned and short velocities, a wrong lever arm."""
     velocity = Rotation.from_euler("z", -YAW_RAD).apply(RIGHT.dvl.velocity) / SCALE
     early = RIGHT.dvl.stamps_ns - round(OFFSET_S * 1e9)
-    return replace(RIGHT, dvl=Dvl(early, velocity, RIGHT.dvl.velocity_cov))
+    run = replace(RIGHT, dvl=Dvl(early, velocity, RIGHT.dvl.velocity_cov))
+    return with_mounting(run, "imu", translation_m=FAR_M)
+
+
+@pytest.fixture(scope="module")
+def found_in_spoilt() -> dict[str, Finding]:
+    return by_name(check_sensors(spoilt()))
+
+
+def with_mounting(run: Sequence, sensor: str, **change: tuple[float, ...]) -> Sequence:
+    section = getattr(run.calibration, sensor)
+    moved = section.model_copy(update={"mounting": section.mounting.model_copy(update=change)})
+    return replace(run, calibration=run.calibration.model_copy(update={sensor: moved}))
+
+
+def line_of(finding: Finding) -> dict[str, Any]:
+    return tomllib.loads(finding.advice.split("`")[1])
 
 
 def corrected(run: Sequence, found: dict[str, Finding]) -> Sequence:
     """The Doppler log as the advice's own lines make it."""
-    lines = {name: tomllib.loads(finding.advice.split("`")[1]) for name, finding in found.items() if finding.acts}
+    lines = {name: line_of(finding) for name, finding in found.items() if finding.acts and "`" in finding.advice}
     shift_s, scale = lines["DVL against IMU: time offset"]["stamp_offset_s"], lines["DVL scale"]["scale"]
     rpy = tuple(lines["DVL mounting yaw"]["dvl"]["mounting"]["rpy_rad"])
-    dvl, calibration = run.dvl, run.calibration
-    mounting = calibration.dvl.mounting.model_copy(update={"rpy_rad": rpy})
-    section = calibration.dvl.model_copy(update={"mounting": mounting})
+    place = tuple(lines["lever arm from IMU to DVL, x"]["imu"]["mounting"]["translation_m"])
+    dvl = run.dvl
     moved = Dvl(dvl.stamps_ns + round(shift_s * 1e9), dvl.velocity * scale, dvl.velocity_cov)
-    return replace(run, dvl=moved, calibration=calibration.model_copy(update={"dvl": section}))
+    return with_mounting(with_mounting(replace(run, dvl=moved), "dvl", rpy_rad=rpy), "imu", translation_m=place)
 
 
-def test_the_advised_lines_put_the_log_right():
-    found = by_name(check_sensors(spoilt()))
+def test_the_advised_lines_put_the_log_right(found_in_spoilt: dict[str, Finding]):
+    found = found_in_spoilt
     again = by_name(check_sensors(corrected(spoilt(), found)))
     for name in ("DVL against IMU: time offset", "DVL mounting yaw", "DVL scale"):
         assert found[name].acts, name
         assert not again[name].acts, again[name].text()
         assert again[name].advice == "no need to act"
+    arms = [finding for name, finding in found.items() if name.startswith("lever arm")]
+    assert [arm.acts for arm in arms] == [True, False, True]
+    assert not any(again[arm.quantity].acts for arm in arms)
+
+
+def test_the_start_is_aligned_with_what_was_found_before(found_in_spoilt: dict[str, Finding]):
+    """With stamps half a second off, velocities and accelerations differ too much for an alignment."""
+    assert RIGHT.truth is not None
+    _, pitch, roll = RIGHT.truth.at(np.array([RIGHT.start_ns])).rotations().as_euler("ZYX", degrees=True)[0]
+    assert found_in_spoilt["start roll"].estimate.value == pytest.approx(roll, abs=0.1)
+    assert found_in_spoilt["start pitch"].estimate.value == pytest.approx(pitch, abs=0.1)
+    assert find_start_tilt(spoilt()).tilt is None
 
 
 def test_corrections_are_added_to_what_the_configuration_says():
@@ -77,6 +108,16 @@ def test_a_start_taken_from_a_late_reference_is_named_with_the_right_one():
         run = replace(turning, calibration=turning.calibration.model_copy(update={"start": start}))
         finding = by_name(check_sensors(run))["start heading of the calibration"]
         assert finding.acts == acts, finding.text()
+
+
+def test_lines_for_the_start_agree_on_roll_pitch_and_heading():
+    assert RIGHT.truth is not None
+    yaw, pitch, roll = RIGHT.truth.at(np.array([RIGHT.start_ns])).rotations().as_euler("ZYX")[0].tolist()
+    start = RIGHT.calibration.start.model_copy(update={"rpy_rad": (roll + 0.1, pitch, yaw + 0.2)})
+    run = replace(RIGHT, calibration=RIGHT.calibration.model_copy(update={"start": start}))
+    found = by_name(check_sensors(run))
+    ours, theirs = (line_of(found[name])["start"] for name in ("start roll", "start heading of the calibration"))
+    assert ours["rpy_rad"] == theirs["rpy_rad"] == pytest.approx([roll, pitch, yaw], abs=2e-3)
 
 
 def test_a_number_that_cannot_be_told_asks_for_nothing():

@@ -1,0 +1,115 @@
+"""Truth by hand: a vehicle that lies tilted and then drives off, and the simulator's moving one."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.calibration import STANDARD_GRAVITY, Calibration, Start
+from sonar_graph.evaluation.start_check import StartTilt, find_start_tilt, right_tilt, tilt_findings
+from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+
+ROLL, PITCH, BIAS = 0.12, -0.07, np.array([3e-4, -2e-4, 1e-4])
+NS = 1_000_000_000
+
+
+def resting(rest_s: float, duration_s: float = 60.0, lay_s: float = 0.0) -> Sequence:
+    """Tilted and still for so long, then off at 0.4 m/s² for two seconds; the Doppler log may begin later."""
+    rng = np.random.default_rng(2)
+    t, dvl_t = np.arange(0, duration_s, 0.01), np.arange(lay_s, duration_s, 0.2)
+    up = Rotation.from_euler("ZYX", [0.0, PITCH, ROLL]).inv().apply([0.0, 0.0, 1.0])
+    off = ((t > rest_s) & (t < rest_s + 2.0))[:, None] * np.array([0.4, 0.0, 0.0])
+    force = STANDARD_GRAVITY * up + off + 1.2e-2 * rng.standard_normal((len(t), 3))
+    rate = BIAS + 1.2e-3 * rng.standard_normal((len(t), 3))
+    speed = 0.4 * np.clip(dvl_t - rest_s, 0.0, 2.0)
+    velocity = np.outer(speed, [1.0, 0.0, 0.0]) + 0.01 * rng.standard_normal((len(dvl_t), 3))
+    imu_ns, dvl_ns = (np.round(NS * seconds).astype(np.int64) for seconds in (t, dvl_t))
+    dvl = Dvl(dvl_ns, velocity, np.full((len(dvl_t), 3, 3), np.nan))
+    return Sequence("by hand", Calibration(), Imu(imu_ns, rate, force), dvl)
+
+
+@pytest.mark.parametrize(("rest_s", "used"), [(15.0, 10), (50.0, 40)])
+def test_a_rest_at_the_start_is_used_as_long_as_it_lasts(rest_s: float, used: int):
+    found = find_start_tilt(resting(rest_s))
+    assert found.said == f"from {used} s of rest"
+    for axis, true in enumerate((ROLL, PITCH)):
+        assert abs(found.angle(axis).value - true) < 4 * found.angle(axis).sigma < 0.01
+    bias = found.gyro_bias()
+    assert bias is not None
+    for one, true in zip(bias, BIAS, strict=True):
+        assert abs(one.value - true) < 4 * one.sigma < 4 * 1.2e-4
+
+
+def test_a_rest_before_the_doppler_log_begins_is_not_the_start():
+    found = find_start_tilt(resting(15.0, lay_s=14.0))
+    assert not found.is_rest
+    assert "in motion" in found.said
+
+
+def test_a_short_rest_is_taken_together_with_the_motion_after_it():
+    found = find_start_tilt(resting(4.0))
+    assert found.said == "from 60 s in motion"
+    assert found.gyro_bias() is None
+    for axis, true in enumerate((ROLL, PITCH)):
+        assert abs(found.angle(axis).value - true) < 4 * found.angle(axis).sigma < 0.01
+
+
+def test_a_moving_start_has_the_tilt_of_the_simulator():
+    run = simulate_mission(MissionOptions(seed=8, duration_s=70, landmarks=1))
+    assert run.truth is not None
+    _, pitch, roll = run.truth.at(np.array([run.start_ns])).rotations().as_euler("ZYX")[0].tolist()
+    found = find_start_tilt(run)
+    assert not found.is_rest
+    for axis, true in enumerate((roll, pitch)):
+        assert abs(found.angle(axis).value - true) < 4 * found.angle(axis).sigma < 0.01
+
+
+def test_a_start_that_contradicts_is_named_with_the_line_that_puts_it_right():
+    found = find_start_tilt(resting(50.0))
+    rows = tilt_findings(found, Start(rpy_rad=(0.0, PITCH, 0.3)), yaw_rad=0.9)
+    assert [row.acts for row in rows] == [True, False]
+    assert "from 40 s of rest, not the calibration's +0.00°" in rows[0].text()
+    assert "the calibration's -4.01° fits, no need to act" in rows[1].text()
+    _, rpy_line, _, sigma_line, _ = rows[0].advice.split("`")
+    rpy, sigma = (tomllib.loads(line)["start"] for line in (rpy_line, sigma_line))
+    assert rpy["rpy_rad"] == pytest.approx([ROLL, PITCH, 0.9], abs=5e-3)
+    assert sigma["rpy_sigma_rad"] == pytest.approx([found.angle(0).sigma, found.angle(1).sigma, 1e-3], rel=0.05)
+    right = Start(rpy_rad=tuple(rpy["rpy_rad"]), rpy_sigma_rad=tuple(sigma["rpy_sigma_rad"]))
+    assert not any(row.acts for row in tilt_findings(found, right, 0.9))
+    assert right_tilt(found, right) is None
+    assert right_tilt(found, Start()) == (found.angle(0).value, found.angle(1).value)
+
+
+def test_what_the_calibration_is_unsure_of_is_not_contradicted():
+    found = find_start_tilt(resting(50.0))
+    assert not any(row.acts for row in tilt_findings(found, Start(rpy_sigma_rad=(0.1, 0.1, 0.1)), 0.0))
+
+
+def test_without_accelerometers_one_row_says_why_there_is_no_tilt():
+    run = resting(50.0)
+    blind = replace(run, imu=Imu(run.imu.stamps_ns, run.imu.angular_velocity, np.full((len(run.imu), 3), np.nan)))
+    found = find_start_tilt(blind)
+    assert found.tilt is None
+    (row,) = tilt_findings(found, Start(), 0.0)
+    assert row.text().startswith("cannot be told: at rest: Imu.specific_force")
+    assert "in motion: Imu.specific_force" in row.text()
+    assert not row.acts
+    assert right_tilt(found, Start()) is None
+
+
+def test_what_speaks_against_both_ways_is_said():
+    """Velocities that have nothing to do with the accelerations."""
+    run = resting(4.0)
+    rng = np.random.default_rng(0)
+    wild = Dvl(run.dvl.stamps_ns, rng.standard_normal((len(run.dvl), 3)), run.dvl.velocity_cov)
+    found = find_start_tilt(replace(run, dvl=wild))
+    assert found == StartTilt(None, found.said)
+    assert "at rest: Imu.specific_force: varies" in found.said
+    assert "in motion: alignment: velocities and accelerations differ" in found.said
+    assert "inspect" not in found.said
