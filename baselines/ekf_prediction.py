@@ -102,7 +102,7 @@ def open_interval(columns: Columns, dvl_p_imu: Vector, interval: GravityInterval
 @inlined
 def _velocity_at_node(columns: Columns, node_ns: int, dvl_p_imu: Vector) -> Floats:
     """Velocity of the IMU's point in body axes, m/s, and the variance of one component, shape (4,)."""
-    imu_ns, rate, _, dvl_ns, velocity, cov, hold_past = columns
+    imu_ns, rate, _, dvl_ns, velocity, cov, hold_past, _ = columns
     k = rows_until(dvl_ns, node_ns - 1)
     w = value_at(imu_ns, rate, rows_until(imu_ns, node_ns - 1), node_ns, hold_past)
     at_imu = np.empty(4)

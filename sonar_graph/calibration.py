@@ -17,6 +17,9 @@ from sonar_graph.errors import CalibrationError
 from sonar_graph.validation import faults_in
 
 STANDARD_GRAVITY = 9.80665
+HOLE_INTERVALS = 5
+"""Typical intervals of the IMU without a sample, above which there is a hole: one lost sample does no harm."""
+SHORTEST_HOLE_S = 0.05
 
 
 def _within_a_turn(angle_rad: float) -> float:
@@ -78,6 +81,11 @@ class ImuCalibration(Section):
     """White noise of specific force, m/s²/√Hz."""
     accel_bias_sigma: NotNegative = 1e-2
     """Bias of specific force, m/s²."""
+    turn_sigma_rad_s: Sigmas = (0.05, 0.05, 0.15)
+    """How the vehicle turns, as a standard deviation about each axis of the body: where it bridges holes that no gyro
+    measured. Zero: holes are taken as any other interval."""
+    turn_time_s: tuple[Positive, Positive, Positive] = (0.5, 0.5, 1.5)
+    """How fast these rates change: sigma over the standard deviation of angular acceleration."""
     mounting: Mounting = Mounting()
 
 

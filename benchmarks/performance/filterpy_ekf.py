@@ -282,6 +282,4 @@ def body_rates(x: Floats) -> Floats:
 
 def _row(steps: Steps, k: int) -> Steps:
     one = slice(k, k + 1)
-    return Steps(
-        steps.duration_s[one], steps.rate[one], steps.velocity[one], steps.velocity_psd[one], steps.specific_force[one]
-    )
+    return Steps(*(column[one] for column in vars(steps).values()))

@@ -74,8 +74,8 @@ class _Tilt:
     def after(self, motion: PreintegratedMotion) -> tuple[Floats, float]:
         """Up in the body, and its variance, after a motion from the last correction."""
         drift = self._calibration.imu.gyro_bias_sigma * motion.duration_s
-        white = self._calibration.imu.gyro_noise_density**2 * motion.duration_s
-        return motion.i_T_j.rotation().matrix().T @ self.up, self.variance + white + drift**2
+        noise = float(np.max(np.diag(motion.covariance)[:3]))
+        return motion.i_T_j.rotation().matrix().T @ self.up, self.variance + noise + drift**2
 
     def _gravity(self, motion: PreintegratedMotion, node_ns: int) -> tuple[Floats, float] | None:
         if not self._calibration.use_gravity:

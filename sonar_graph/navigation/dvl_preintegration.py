@@ -128,6 +128,7 @@ class Preintegrator:
             steps.velocity,
             steps.velocity_psd,
             steps.specific_force,
+            steps.turn_psd,
             bias,
             np.zeros(3) if earth_rate is None else check.vector("earth_rate", earth_rate, 3),
             self.body_p_dvl,

@@ -14,9 +14,10 @@ Open: nothing stamped later is there. The line is fitted to the samples of the l
 extrapolated. Its slope is gravity with the accelerometers' bias as it was then, so that neither attitude nor bias need
 be known. Errors grow with the time since then squared.
 
-Where a specific force was not measured, or nothing precedes the node to fit a line to, the velocity is a random walk of
-root density q (m/s/√s) between its ends, whose displacement has the variance ``q^2 T^3 / 12`` beside the samples'
-(closed), or from its last value on, ``q^2 T^3 / 3`` (open).
+Where a specific force was not measured, also in holes (`sonar_graph.navigation.unmeasured_turns`), or nothing
+precedes the node to fit a line to, the velocity is a random walk of root density q (m/s/√s) between its ends, whose
+displacement has the variance ``q^2 T^3 / 12`` beside the samples' (closed), or from its last value on, ``q^2 T^3 / 3``
+(open).
 
 The covariance holds, beside the noise of the samples: gyro and accelerometer noise, and the bias of the accelerometers,
 constant over the gap. That of the gyros is the derivative's affair. Derivation: docs/theory/gaps.md.
@@ -70,6 +71,7 @@ from sonar_graph.navigation.triples import (
     transposed,
     vector,
 )
+from sonar_graph.navigation.unmeasured_turns import felt
 
 
 class GapModel(NamedTuple):
@@ -140,9 +142,10 @@ def bridge(
         Earth's rotation in frame i, rad/s.
     """
     model = GapModel(*values)
-    motion, is_known = _by_accelerometers(columns, model, start_ns, end_ns, is_closed, bias, earth)
-    if is_known:
-        return motion
+    if is_closed or rows_until(columns[3], end_ns) == rows_until(columns[3], start_ns):
+        motion, is_known = _by_accelerometers(columns, model, start_ns, end_ns, is_closed, bias, earth)
+        if is_known:
+            return motion
     return _by_walk(columns, model, start_ns, end_ns, is_closed, bias, earth)
 
 
@@ -195,7 +198,7 @@ def _carried(
     earth: Vector,
 ) -> tuple[Path, Spread, Slopes]:
     """Over all inertial rows of a gap."""
-    imu_ns, rate, force, hold_past = columns[0], columns[1], columns[2], columns[6]
+    imu_ns, rate, force, hold_past, turns = columns[0], columns[1], columns[2], columns[6], columns[7]
     t, end_ns = span_ns
     rows = rows_until(imu_ns, end_ns - 1) + 1 if is_closed else rows_until(imu_ns, end_ns)
     rows, row = min(rows, len(imu_ns)), rows_until(imu_ns, t)
@@ -204,7 +207,7 @@ def _carried(
         until = min(end_ns, imu_ns[row]) if row < rows else end_ns
         middle = t + (until - t) // 2
         w = minus(value_among(imu_ns, rate, rows, row, middle, hold_past), bias)
-        f = value_among(imu_ns, force, rows, row, middle, hold_past)
+        f = felt(value_among(imu_ns, force, rows, row, middle, hold_past), turns, imu_ns, rows, row, until)
         by = push(path.R, (until - t) * 1e-9, minus(w, times(transposed(path.R), earth)), f)
         spread = pushed_spread(spread, by, gyro_psd * (path.elapsed_s + 0.5 * by.dt), accel_psd)
         slopes = pushed_slopes(slopes, by)
@@ -265,9 +268,14 @@ def _of_body(path: Path, ms: Vector, M: Matrix, s_g: Matrix, ss: Matrix, gyro_ps
 def _by_walk(
     columns: Columns, model: GapModel, start_ns: int, end_ns: int, is_closed: bool, bias: Vector, earth: Vector
 ) -> GapMotion:
-    """Velocity linear between the ends or held since the first, and a random walk about that."""
+    """Velocity linear between the ends or held since the last sample, and a random walk about that.
+
+    An open gap may hold samples, where motion could not be settled for want of inertial rows.
+    """
     imu_ns, dvl_ns, cov = columns[0], columns[3], columns[5]
-    elapsed_s, k = (end_ns - start_ns) * 1e-9, rows_until(dvl_ns, start_ns) - 1
+    k = rows_until(dvl_ns, end_ns if not is_closed else start_ns) - 1
+    since_ns = max(dvl_ns[k], start_ns)
+    elapsed_s = (end_ns - since_ns) * 1e-9
     walk = (model.velocity_walk_density * elapsed_s) ** 2
     psd = sum_of(multiple_of(elapsed_s, matrix(cov[k])), multiple_of(walk / 3.0, IDENTITY))
     imu_rows, dvl_rows = rows_until(imu_ns, end_ns), k + 1
@@ -279,8 +287,10 @@ def _by_walk(
         psd = sum_of(sum_of(by_first, by_last), multiple_of(walk / 12.0, IDENTITY))
     motion, D_t, D_r, cursor = NO_MOTION, ZEROS, ZEROS, cursor_at(columns, start_ns)
     while cursor.stamp_ns < end_ns:
+        is_sampled = cursor.stamp_ns < since_ns
         cursor, own = next_step(columns, imu_rows, dvl_rows, cursor, end_ns)
-        step = Step(own.duration_s, own.rate, own.velocity, psd, own.specific_force)
+        of_velocity = own.velocity_psd if is_sampled else psd
+        step = Step(own.duration_s, own.rate, own.velocity, of_velocity, own.specific_force, own.turn_psd)
         turn = rate_of_turn(step, motion.dR, bias, earth)
         added = increment(motion.dR, step.duration_s, turn, step.velocity, model.body_p_dvl)
         D_r = difference_of(D_r, skew_times(added.displacement, D_t))

@@ -47,6 +47,7 @@ from sonar_graph.navigation.triples import (
     transposed,
     vector,
 )
+from sonar_graph.navigation.unmeasured_turns import felt
 
 FEWEST, SHORTEST_S = 4, 1.0
 """Samples, and the time that they span."""
@@ -87,7 +88,7 @@ def line_before(columns: Columns, body_p_imu: Vector, body_p_dvl: Vector, k: int
     earth
         Earth's rotation in frame i, rad/s.
     """
-    imu_ns, rate, force, dvl_ns, velocity, cov, hold_past = columns
+    imu_ns, rate, force, dvl_ns, velocity, cov, hold_past, turns = columns
     lever, node_ns, t = minus(body_p_imu, body_p_dvl), dvl_ns[k], dvl_ns[k]
     row = rows_until(imu_ns, t - 1)
     path, slopes, sums, Q = AT_REST, NO_SLOPES, NOTHING, ZEROS
@@ -97,6 +98,7 @@ def line_before(columns: Columns, body_p_imu: Vector, body_p_dvl: Vector, k: int
             middle = until + (t - until) // 2
             w = minus(value_among(imu_ns, rate, len(imu_ns), row, middle, hold_past), bias)
             f = value_among(imu_ns, force, len(imu_ns), row, middle, hold_past)
+            f = felt(f, turns, imu_ns, len(imu_ns), row, t)
             by = push(path.R, (until - t) * 1e-9, minus(w, times(transposed(path.R), earth)), f)
             slopes = pushed_slopes(slopes, by)
             path = pushed_path(path, by)

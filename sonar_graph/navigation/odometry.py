@@ -21,6 +21,7 @@ from sonar_graph.navigation.interpolation import value_at
 from sonar_graph.navigation.row_intake import RowIntake
 from sonar_graph.navigation.stamped_rows import LATEST_NS, WINDOW_NS, node_range, rows_before_gaps
 from sonar_graph.navigation.steps import Columns, Steps, are_nodes, merge_rows
+from sonar_graph.navigation.unmeasured_turns import NO_TURNS, ROWS_BEFORE, turn_values
 from sonar_graph.states import RefusedRow
 
 
@@ -37,6 +38,7 @@ class Odometry:
         self._intake = RowIntake(calibration)
         self._imu, self._dvl = self._intake.imu, self._intake.dvl
         self._hold_past = calibration.odometry_interpolation == "hold-past"
+        self._turns = NO_TURNS if self._hold_past else turn_values(calibration.imu)
         self._longest_ns = longest_interval_ns(calibration)
 
     @property
@@ -73,12 +75,19 @@ class Odometry:
         """Drop rows that no motion from this node on can need, gaps after it included."""
         self.settle(node_ns)
         needed_ns = node_ns if self._hold_past else node_ns - WINDOW_NS
-        self._imu.forget_before(needed_ns)
+        self._imu.forget_before(needed_ns, ROWS_BEFORE)
         self._dvl.forget_before(needed_ns)
 
     def columns(self) -> Columns:
         """All rows, for compiled loops over many instants."""
-        return self._imu.stamps_ns, *self._imu.values, self._dvl.stamps_ns, *self._dvl.values, self._hold_past
+        return (
+            self._imu.stamps_ns,
+            *self._imu.values,
+            self._dvl.stamps_ns,
+            *self._dvl.values,
+            self._hold_past,
+            self._turns,
+        )
 
     def start_ns(self) -> int | None:
         """First node that IMU rows cover from both sides; None before there is one."""

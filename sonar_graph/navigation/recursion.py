@@ -55,6 +55,7 @@ class Step(NamedTuple):
     velocity: Vector
     velocity_psd: Matrix
     specific_force: Vector
+    turn_psd: Vector
 
 
 class Integral(NamedTuple):
@@ -121,13 +122,33 @@ def extended(motion: Integral, step: Step, added: Increment, gyro_density: float
     cov_rt = difference_of(motion.cov_rt, skew_times(s, motion.cov_tt))
     cov_rr = difference_of(motion.cov_rr, skew_times(s, transposed(motion.cov_rt)))
     cov_rr = sum_of(cov_rr, times_skew(cov_rt, s))
+    cov_tt = sum_of(motion.cov_tt, multiple_of(gyro, gram(G_t)))
+    cov_rt = sum_of(cov_rt, multiple_of(gyro, product(G_r, transposed(G_t))))
+    cov_rr = sum_of(sum_of(cov_rr, multiple_of(gyro, gram(G_r))), multiple_of(dt, doppler))
+    if step.turn_psd != ZERO:
+        by_turn = scaled(dt, step.turn_psd)
+        t, r = _columns_times(G_t, by_turn), _columns_times(G_r, by_turn)
+        cov_tt = sum_of(cov_tt, product(t, transposed(G_t)))
+        cov_rt = sum_of(cov_rt, product(r, transposed(G_t)))
+        cov_rr = sum_of(cov_rr, product(r, transposed(G_r)))
     return Integral(
         product(motion.dR, added.turn),
         plus(motion.dp, s),
         plus(motion.impulse, scaled(dt, times(G_t, step.specific_force))),
-        sum_of(motion.cov_tt, multiple_of(gyro, gram(G_t))),
-        sum_of(cov_rt, multiple_of(gyro, product(G_r, transposed(G_t)))),
-        sum_of(sum_of(cov_rr, multiple_of(gyro, gram(G_r))), multiple_of(dt, doppler)),
+        cov_tt,
+        cov_rt,
+        cov_rr,
+    )
+
+
+@inlined
+def _columns_times(A: Matrix, v: Vector) -> Matrix:
+    """``A diag(v)``."""
+    x, y, z = A
+    return (
+        (x[0] * v[0], x[1] * v[1], x[2] * v[2]),
+        (y[0] * v[0], y[1] * v[1], y[2] * v[2]),
+        (z[0] * v[0], z[1] * v[1], z[2] * v[2]),
     )
 
 
@@ -144,6 +165,7 @@ def integrate_steps(
     velocity: Floats,
     velocity_psd: Floats,
     force: Floats,
+    turn_psd: Floats,
     bias: Floats,
     earth: Floats,
     lever: Floats,
@@ -153,7 +175,7 @@ def integrate_steps(
 
     Parameters
     ----------
-    duration, rate, velocity, velocity_psd, force
+    duration, rate, velocity, velocity_psd, force, turn_psd
         The columns of `sonar_graph.navigation.steps.Steps`.
     bias
         Gyro bias to remove, body frame, shape (3,), rad/s.
@@ -172,7 +194,8 @@ def integrate_steps(
     motion, D_t, D_r = NO_MOTION, ZEROS, ZEROS
     body_bias, earth_i, arm = vector(bias), vector(earth), vector(lever)
     for k in range(len(duration)):
-        step = Step(duration[k], vector(rate[k]), vector(velocity[k]), matrix(velocity_psd[k]), vector(force[k]))
+        psd = matrix(velocity_psd[k])
+        step = Step(duration[k], vector(rate[k]), vector(velocity[k]), psd, vector(force[k]), vector(turn_psd[k]))
         added = increment(
             motion.dR, step.duration_s, rate_of_turn(step, motion.dR, body_bias, earth_i), step.velocity, arm
         )

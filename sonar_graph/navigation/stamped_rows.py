@@ -46,9 +46,9 @@ class StampedRows:
             self._keep(np.unique(self.stamps_ns, return_index=True)[1])
         return not comes_after
 
-    def forget_before(self, stamp_ns: int) -> None:
-        """Drop rows that are needed for no value from a stamp on."""
-        self._keep(slice(max(int(np.searchsorted(self.stamps_ns, stamp_ns)) - 1, 0), None))
+    def forget_before(self, stamp_ns: int, more: int = 0) -> None:
+        """Drop rows that are needed for no value from a stamp on, but for some more before it."""
+        self._keep(slice(max(int(np.searchsorted(self.stamps_ns, stamp_ns)) - 1 - more, 0), None))
 
     def _keep(self, rows: slice | Ints) -> None:
         self.stamps_ns = self.stamps_ns[rows]

@@ -20,9 +20,11 @@ from sonar_graph.navigation.interpolation import between, bracket, rows_until
 from sonar_graph.navigation.kernels import compiled, inlined
 from sonar_graph.navigation.recursion import Step
 from sonar_graph.navigation.triples import Matrix, matrix, multiple_of, place, sum_of
+from sonar_graph.navigation.unmeasured_turns import TurnValues, felt, turn_psd
 
-Columns = tuple[Ints, Floats, Floats, Ints, Floats, Floats, bool]
-"""IMU: stamps, rate, specific force. DVL: stamps, velocity, covariance. Whether a sample holds for what lies before."""
+Columns = tuple[Ints, Floats, Floats, Ints, Floats, Floats, bool, TurnValues]
+"""IMU: stamps, rate, specific force. DVL: stamps, velocity, covariance. Whether a sample holds for what lies before.
+How the vehicle turns where no gyro tells."""
 
 
 class Cursor(NamedTuple):
@@ -49,6 +51,8 @@ class Steps:
     """Spectral density of its noise, body axes, shape (n, 3, 3), m²/s."""
     specific_force: Floats
     """Mean specific force at the IMU, body axes, shape (n, 3), m/s²; NaN where not measured."""
+    turn_psd: Floats
+    """Spectral density of rates that were not measured, body axes, shape (n, 3), rad²/s; zero where they were."""
 
     def __len__(self) -> int:
         return len(self.duration_s)
@@ -78,7 +82,7 @@ def next_step(columns: Columns, imu_rows: int, dvl_rows: int, cursor: Cursor, en
     columns
         Of `Odometry.columns`, of which only the first ``imu_rows`` and ``dvl_rows`` rows are used.
     """
-    imu_ns, rate, force, dvl_ns, velocity, cov, hold_past = columns
+    imu_ns, rate, force, dvl_ns, velocity, cov, hold_past, turns = columns
     t, i, k = cursor
     until = end_ns
     if i < imu_rows:
@@ -92,7 +96,8 @@ def next_step(columns: Columns, imu_rows: int, dvl_rows: int, cursor: Cursor, en
         between(rate, before, after, share),
         between(velocity, *bracket(dvl_ns, dvl_rows, k, middle, hold_past)),
         _velocity_psd(dvl_ns, cov, dvl_rows, k, hold_past),
-        between(force, before, after, share),
+        felt(between(force, before, after, share), turns, imu_ns, imu_rows, i, until),
+        turn_psd(turns, imu_ns, imu_rows, i, t, until),
     )
     past_imu = i < imu_rows and imu_ns[i] <= until
     past_dvl = k < dvl_rows and dvl_ns[k] <= until
@@ -111,12 +116,12 @@ def are_nodes(imu_ns: Ints, dvl_ns: Ints, start_ns: int, end_ns: int) -> bool:
 @compiled
 def merge_rows(
     columns: Columns, imu_rows: int, dvl_rows: int, start_ns: int, end_ns: int
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
     """Cut (start, end] at every stamp of either sensor and take each sensor's mean over each piece."""
     cursor = cursor_at(columns, start_ns)
     most = max(imu_rows - cursor.imu_row, 0) + max(dvl_rows - cursor.dvl_row, 0) + 1
     duration, rates, velocities = np.empty(most), np.empty((most, 3)), np.empty((most, 3))
-    psds, forces = np.empty((most, 3, 3)), np.empty((most, 3))
+    psds, forces, turns = np.empty((most, 3, 3)), np.empty((most, 3)), np.empty((most, 3))
     n = 0
     while cursor.stamp_ns < end_ns:
         cursor, step = next_step(columns, imu_rows, dvl_rows, cursor, end_ns)
@@ -124,6 +129,7 @@ def merge_rows(
         rates[n, 0], rates[n, 1], rates[n, 2] = step.rate
         velocities[n, 0], velocities[n, 1], velocities[n, 2] = step.velocity
         forces[n, 0], forces[n, 1], forces[n, 2] = step.specific_force
+        turns[n, 0], turns[n, 1], turns[n, 2] = step.turn_psd
         place(step.velocity_psd, psds[n], 0, 0)
         n += 1
-    return duration[:n], rates[:n], velocities[:n], psds[:n], forces[:n]
+    return duration[:n], rates[:n], velocities[:n], psds[:n], forces[:n], turns[:n]

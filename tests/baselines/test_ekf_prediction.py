@@ -6,6 +6,7 @@ from numpy.testing import assert_allclose
 
 from baselines.ekf_prediction import GravityInterval, VehicleModel, advance_to_node, open_interval
 from sonar_graph.navigation.recursion import NO_MOTION
+from sonar_graph.navigation.unmeasured_turns import NO_TURNS
 from sonar_graph.sequence import NS_PER_S
 
 T0_NS = 1_700_000_000 * NS_PER_S
@@ -35,7 +36,7 @@ VARIANCES = np.array([[1e-4, 4e-4, 25e-4], [9e-4, 1e-4, 2e-4]])
 def columns_of(imu_ns, dvl_ns, *, rates=RATES, velocities=VELOCITIES, hold_past=False):
     cov = np.array([np.diag(row) for row in VARIANCES])
     force = np.tile([0.0, 0.0, GRAVITY], (len(imu_ns), 1))
-    return np.array(imu_ns), rates, force, np.array(dvl_ns), velocities, cov, hold_past
+    return np.array(imu_ns), rates, force, np.array(dvl_ns), velocities, cov, hold_past, NO_TURNS
 
 
 def an_interval():

@@ -49,12 +49,12 @@ def random_steps(seed: int, n: int = 60, rate_rad_s: float = 0.8) -> Steps:
         velocity=np.array([0.5, 0.0, 0.0]) + 0.3 * rng.standard_normal((n, 3)),
         velocity_psd=root @ np.swapaxes(root, 1, 2),
         specific_force=np.array([0.0, 0.0, 9.8]) + rng.standard_normal((n, 3)),
+        turn_psd=np.zeros((n, 3)),
     )
 
 
 def part(steps: Steps, first: int, last: int) -> Steps:
-    columns = (steps.duration_s, steps.rate, steps.velocity, steps.velocity_psd, steps.specific_force)
-    return Steps(*(column[first:last] for column in columns))
+    return Steps(*(column[first:last] for column in vars(steps).values()))
 
 
 def dead_reckoned(steps: Steps, bias: Floats, lever: Floats) -> list[gtsam.Pose3]:

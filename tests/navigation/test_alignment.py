@@ -39,7 +39,12 @@ def accelerated() -> tuple[PreintegratedMotion, Floats, Floats]:
     force = [attitude(t).inv().apply(world_acceleration(t) + GRAVITY) for t in middles]
     velocity = [attitude(t).inv().apply(world_velocity(t)) for t in middles]
     steps = Steps(
-        np.full(N, T / N), np.tile(BODY_RATE, (N, 1)), np.array(velocity), np.zeros((N, 3, 3)), np.array(force)
+        np.full(N, T / N),
+        np.tile(BODY_RATE, (N, 1)),
+        np.array(velocity),
+        np.zeros((N, 3, 3)),
+        np.array(force),
+        np.zeros((N, 3)),
     )
     motion = Preintegrator(0.0, np.zeros(3)).integrate(steps, np.zeros(3))
     return motion, attitude(0).inv().apply(world_velocity(0)), attitude(T).inv().apply(world_velocity(T))

@@ -34,6 +34,11 @@ PREINTEGRATOR = Preintegrator(GYRO_DENSITY, LEVER)
 seeds = st.integers(0, 2**32 - 1)
 
 
+def at_rest(n):
+    """Columns of steps, all but their durations."""
+    return np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3))
+
+
 def log(pose: gtsam.Pose3) -> np.ndarray:
     return gtsam.Pose3.Logmap(pose)
 
@@ -76,7 +81,7 @@ def test_covariance_is_that_of_many_noisy_runs():
     for _ in range(runs):
         rate = steps.rate + GYRO_DENSITY / root_dt * rng.standard_normal((100, 3))
         velocity = steps.velocity + (roots @ rng.standard_normal((100, 3, 1)))[..., 0] / root_dt
-        noisy = Steps(steps.duration_s, rate, velocity, steps.velocity_psd, steps.specific_force)
+        noisy = Steps(steps.duration_s, rate, velocity, steps.velocity_psd, steps.specific_force, steps.turn_psd)
         error = log(mean.i_T_j.between(PREINTEGRATOR.integrate(noisy, BIAS).i_T_j))
         nees.append(error @ information @ error)
     low, high = chi2.ppf([0.0005, 0.9995], 6 * runs) / runs
@@ -131,7 +136,7 @@ def test_turning_about_the_doppler_log_leaves_it_where_it_is():
     """The log reads zero; the body's origin goes round it."""
     n = 100
     rate = np.tile([0.3, -0.2, 0.9], (n, 1))
-    steps = Steps(np.full(n, 0.01), rate, np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3)))
+    steps = Steps(np.full(n, 0.01), rate, *at_rest(n)[1:])
     motion = PREINTEGRATOR.integrate(steps, np.zeros(3)).i_T_j
     assert np.allclose(motion.transformFrom(LEVER), LEVER, atol=1e-12)
     assert np.linalg.norm(motion.translation()) > 0.1
@@ -140,7 +145,7 @@ def test_turning_about_the_doppler_log_leaves_it_where_it_is():
 def test_gyro_noise_reaches_the_displacement_through_the_lever_arm():
     """Standing still with an exact log: the origin wanders by the angle times the arm."""
     n, arm_m = 1000, 2.0
-    steps = Steps(np.full(n, 0.01), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3)))
+    steps = Steps(np.full(n, 0.01), *at_rest(n))
     cov = Preintegrator(GYRO_DENSITY, np.array([arm_m, 0.0, 0.0])).integrate(steps, np.zeros(3)).covariance
     angle_variance = GYRO_DENSITY**2 * 10.0
     assert np.diag(cov)[:3] == pytest.approx([angle_variance] * 3)
@@ -153,7 +158,7 @@ def test_noises_of_a_straight_run_are_those_of_hand_algebra():
     n, t, v, psd = 4000, 4.0, 0.5, 4e-6
     steps = Steps(
         np.full(n, t / n), np.zeros((n, 3)), np.tile([v, 0.0, 0.0], (n, 1)), np.tile(psd * np.eye(3), (n, 1, 1)),
-        np.zeros((n, 3)),
+        np.zeros((n, 3)), np.zeros((n, 3)),
     )  # fmt: skip
     cov = Preintegrator(GYRO_DENSITY, np.zeros(3)).integrate(steps, np.zeros(3)).covariance
     assert cov[2, 2] == pytest.approx(GYRO_DENSITY**2 * t)
@@ -179,11 +184,18 @@ def test_earth_rate_is_taken_out_in_the_turning_body():
     """Gyros that feel a (greatly exaggerated) Earth measure the motion over the ground without it."""
     n, dt, earth_i = 2000, 0.002, np.array([0.01, 0.02, -0.015])
     steps = random_steps(3, n=n)
-    over_ground = Steps(np.full(n, dt), steps.rate, steps.velocity, steps.velocity_psd, steps.specific_force)
+    over_ground = Steps(
+        np.full(n, dt), steps.rate, steps.velocity, steps.velocity_psd, steps.specific_force, steps.turn_psd
+    )
     truth = dead_reckoned(over_ground, np.zeros(3), LEVER)
     felt = np.array([pose.rotation().matrix().T @ earth_i for pose in truth[:-1]])
     measured = Steps(
-        over_ground.duration_s, over_ground.rate + felt, steps.velocity, steps.velocity_psd, steps.specific_force
+        over_ground.duration_s,
+        over_ground.rate + felt,
+        steps.velocity,
+        steps.velocity_psd,
+        steps.specific_force,
+        steps.turn_psd,
     )
     assert same_pose(PREINTEGRATOR.integrate(measured, np.zeros(3), earth_i).i_T_j, truth[-1])
     assert not same_pose(PREINTEGRATOR.integrate(measured, np.zeros(3)).i_T_j, truth[-1], 0.02)
@@ -217,7 +229,9 @@ def test_no_steps_are_no_motion():
 
 def test_unmeasured_force_does_not_touch_the_motion():
     steps = random_steps(4)
-    without = Steps(steps.duration_s, steps.rate, steps.velocity, steps.velocity_psd, np.full((60, 3), np.nan))
+    without = Steps(
+        steps.duration_s, steps.rate, steps.velocity, steps.velocity_psd, np.full((60, 3), np.nan), steps.turn_psd
+    )
     measured, unmeasured = (PREINTEGRATOR.integrate(s, BIAS) for s in (steps, without))
     assert same_pose(measured.i_T_j, unmeasured.i_T_j, 1e-15)
     assert np.array_equal(measured.covariance, unmeasured.covariance)
@@ -230,7 +244,9 @@ def displacement_error_m(interpolation: str, dvl_hz: float) -> float:
     fine, slow, quick = stamps(2000, 4.0), stamps(dvl_hz, 4.0), stamps(400, 4.0)
     means = [0.5 * (w[1:] + w[:-1]) for w in (waves(fine, 1, 0.2), waves(fine, 2, 0.1))]
     n = len(fine) - 1
-    truth = dead_reckoned(Steps(np.full(n, 5e-4), *means, np.zeros((n, 3, 3)), means[0]), np.zeros(3), np.zeros(3))[-1]
+    truth = dead_reckoned(
+        Steps(np.full(n, 5e-4), *means, np.zeros((n, 3, 3)), means[0], np.zeros((n, 3))), np.zeros(3), np.zeros(3)
+    )[-1]
     calibration = Calibration(odometry_interpolation=interpolation)
     odometry = Odometry(calibration)
     odometry.add(imu(quick, waves(quick, 1, 0.2)), dvl(slow, waves(slow, 2, 0.1)))
@@ -252,7 +268,7 @@ def test_mean_force_is_turned_by_the_attitude_in_the_middle_of_a_step():
     n, dt, rate = 20, 0.1, np.array([0.0, 0.1, 0.0])
     middles = (np.arange(n) + 0.5) * dt
     force = np.array([gtsam.Rot3.Expmap(rate * t).unrotate(np.array([0.0, 0.0, 9.81])) for t in middles])
-    steps = Steps(np.full(n, dt), np.tile(rate, (n, 1)), np.zeros((n, 3)), np.zeros((n, 3, 3)), force)
+    steps = Steps(np.full(n, dt), np.tile(rate, (n, 1)), np.zeros((n, 3)), np.zeros((n, 3, 3)), force, np.zeros((n, 3)))
     motion = Preintegrator(1e-4, np.zeros(3)).integrate(steps, np.zeros(3))
     assert motion.mean_specific_force == pytest.approx([0.0, 0.0, 9.81], abs=1e-3)
 

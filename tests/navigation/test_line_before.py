@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.measurements import Imu
 from sonar_graph.navigation.line_before import integral, line_before
+from sonar_graph.navigation.unmeasured_turns import NO_TURNS
 
 from .rows import dvl, imu, stamps
 
@@ -20,7 +21,7 @@ def fitted(dvl_hz, velocity=0.0, count=0, imu_rows=None, cov=ISOTROPIC):
     ns = stamps(dvl_hz, NODE_S)[-count:]
     samples = dvl(ns, velocity, cov)
     inertial = imu_rows.stamps_ns, imu_rows.angular_velocity.copy(), imu_rows.specific_force.copy()
-    columns = (*inertial, samples.stamps_ns, samples.velocity.copy(), samples.velocity_cov.copy(), False)
+    columns = (*inertial, samples.stamps_ns, samples.velocity.copy(), samples.velocity_cov.copy(), False, NO_TURNS)
     return line_before(columns, ZERO, ZERO, len(ns) - 1, ZERO, ZERO)
 
 

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.navigation.steps import Columns, cursor_at, merge_rows, next_step
+from sonar_graph.navigation.unmeasured_turns import NO_TURNS
 
 IMU_NS = np.array([0, 10, 20, 32, 40, 50], dtype=np.int64) * 10**7
 DVL_NS = np.array([-5, 20, 36, 52], dtype=np.int64) * 10**7
@@ -18,7 +19,7 @@ COV = ROOTS @ ROOTS.transpose(0, 2, 1)
 
 
 def columns(hold_past: bool = False) -> Columns:
-    return IMU_NS, RATE, FORCE, DVL_NS, VELOCITY, COV, hold_past
+    return IMU_NS, RATE, FORCE, DVL_NS, VELOCITY, COV, hold_past, NO_TURNS
 
 
 def sampled(stamps: np.ndarray, values: np.ndarray, t: np.ndarray, hold_past: bool) -> np.ndarray:
@@ -44,7 +45,7 @@ def test_steps_end_at_every_stamp_of_either_sensor_with_each_ones_mean(start, le
     known = np.concatenate([IMU_NS[:imu_rows], DVL_NS[:dvl_rows]])
     edges = np.unique(np.concatenate([[start_ns, end_ns], known[(known > start_ns) & (known < end_ns)]]))
     middles = (edges[:-1] + np.diff(edges) // 2).astype(float)
-    duration, rate, velocity, psd, force = merge_rows(columns(hold_past), imu_rows, dvl_rows, start_ns, end_ns)
+    duration, rate, velocity, psd, force, _ = merge_rows(columns(hold_past), imu_rows, dvl_rows, start_ns, end_ns)
     assert duration == pytest.approx(np.diff(edges) * 1e-9)
     assert rate == pytest.approx(sampled(IMU_NS[:imu_rows], RATE[:imu_rows], middles, hold_past))
     assert force == pytest.approx(sampled(IMU_NS[:imu_rows], FORCE[:imu_rows], middles, hold_past))
@@ -70,7 +71,7 @@ def test_a_step_moves_the_cursor_past_the_rows_at_its_end():
 
 def test_noise_of_a_sample_in_the_middle_falls_half_on_either_side():
     """The variance of the displacement over a chain is that of its samples with their weights."""
-    duration, _, _, psd, _ = merge_rows(columns(), 6, 4, int(DVL_NS[0]), int(DVL_NS[-1]))
+    duration, _, _, psd, _, _ = merge_rows(columns(), 6, 4, int(DVL_NS[0]), int(DVL_NS[-1]))
     intervals = np.diff(DVL_NS) * 1e-9
     squares = np.concatenate([intervals, [0]]) ** 2 / 2 + np.concatenate([[0], intervals]) ** 2 / 2
     total = np.einsum("n,nij->ij", duration, psd)
