@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from baselines.ekf_landmarks import GATED, USED, SonarModel
@@ -110,6 +111,31 @@ def test_linear_is_what_errs_by_less_than_the_noise():
     assert is_beyond_linear(both, G_z, 10.0, (1.0, 0.0, 0.0099**2))
     assert not is_beyond_linear(1e6 * np.diag([0.0, 0.0, 1.0]), G_z, 10.0, (1e-4, 0.0, 1e-4))
     np.testing.assert_allclose(by_range_and_azimuth(G_z, 10.0) @ [0.3, 0.2, 5.0], [0.3, 0.02])
+
+
+TURNED = Rotation.from_euler("xyz", [0.4, -0.7, 1.9]).as_matrix()
+
+
+def test_the_noise_of_a_view_is_the_detections_where_the_aperture_is_none():
+    V = view_noise(40.0, (0.04, -0.003, 0.0009), 0.0)
+    np.testing.assert_array_equal(V, [[0.04, -0.003, 0.0], [-0.003, 0.0009, 0.0], [0.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("range_m", [10.0, 3.0])
+def test_a_shift_is_the_same_in_range_and_azimuth_wherever_the_sonar_points(range_m):
+    """A left inverse of the derivative by range and azimuth, blind to elevation."""
+    G_z = TURNED @ np.diag([1.0, range_m, range_m])
+    np.testing.assert_allclose(by_range_and_azimuth(G_z, range_m) @ G_z, np.eye(2, 3), atol=1e-12)
+
+
+@pytest.mark.parametrize("range_m", [10.0, 3.0])
+def test_what_is_linear_does_not_depend_on_where_the_sonar_points(range_m):
+    """By (1) with 0.3 m along and 0.2 m across: two per cent of the sigma on either side."""
+    G_z, cov = TURNED @ np.diag([1.0, range_m, range_m]), TURNED @ np.diag([0.09, 0.04, 4.0]) @ TURNED.T
+    longer_m, turned_rad = 0.04 / (2 * range_m), 0.3 * 0.2 / range_m**2
+    for share, is_beyond in ((0.98, True), (1.02, False)):
+        assert is_beyond_linear(cov, G_z, range_m, ((share * longer_m) ** 2, 7.0, 9.0)) == is_beyond
+        assert is_beyond_linear(cov, G_z, range_m, (9.0, 7.0, (share * turned_rad) ** 2)) == is_beyond
 
 
 def nees_after_gap(kind, seed, forgets_gap):
