@@ -200,6 +200,20 @@ def test_mrclam_names_its_figures(recordings: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.recording
+def test_isam2_settings_names_what_they_do(recordings: Path) -> None:
+    found = figures("validation/isam2_settings.py", "--data", str(recordings), "--workers", "2")
+    (frames, keyframes, updates, _), (_, dense, *_), (_, same, all_updates, _) = found["effort"]
+    assert keyframes == same < dense
+    assert updates < all_updates
+    assert 0.9 * frames < dense < 1.1 * frames
+    for world in ("basin", "mission"):
+        ratio, _, sigmas = found[f"{world}, relinearised at 0.0001"]
+        assert ratio == pytest.approx(1.0, abs=1e-3)
+        assert sigmas < found[f"{world}, relinearised at 0.01"][2] < 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.recording
 def test_odometry_rows_names_what_accelerometers_add(recordings: Path) -> None:
     found = figures("validation/odometry_rows.py", "--data", str(recordings), "--workers", "2")
     linear_mm, inertial_mm, linear_nees, inertial_nees = found["brisk, 1 Hz rms_mm, nees"]

@@ -4,7 +4,8 @@
 
 ``log_s``: sum of the durations of `EkfSlam.process` over a 34-minute mission (100 Hz IMU, 7 Hz Doppler log, 10 Hz
 depth, 2 Hz sonar frames, 20 landmarks), asked for an estimate twice a second; the fastest of three runs. A short run
-beforehand on another instance keeps compilation out of it.
+beforehand on another instance keeps compilation out of it. ``invariant_log_s``: the same of `InvariantEkf`; both take
+turns.
 
 ``filterpy_ratio``: time per step of the filter in `filterpy_ekf.py` over ours, on the first part of the same log. A
 step is the prediction from one DVL node to the next, with the corrections (depth, gravity, detections) on the way. All
@@ -35,6 +36,7 @@ import filterpy_ekf
 import numpy as np
 
 from baselines.ekf_slam import EkfSlam
+from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.measurements import Floats, Measurements
 from sonar_graph.sequence import NS_PER_S, Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
@@ -53,13 +55,16 @@ def main() -> int:
     quick = parser.parse_args().quick
     sequence = simulate_mission(MissionOptions(duration_s=QUICK_S if quick else FULL_S, landmarks=20))
     windows = list(sequence.replay(sequence.instants(RATE_HZ)))
-    timed_run(EkfSlam(sequence.calibration), windows[:60])
-
-    durations_s = min((timed_run(EkfSlam(sequence.calibration), windows) for _ in range(ROUNDS)), key=np.sum)
+    kinds = EkfSlam, InvariantEkf
+    for kind in kinds:
+        timed_run(kind(sequence.calibration), windows[:60])
+    rounds = [[timed_run(kind(sequence.calibration), windows) for kind in kinds] for _ in range(ROUNDS)]
+    durations_s, invariant_s = (min(of_kind, key=np.sum) for of_kind in zip(*rounds, strict=True))
     median_us, p99_us = 1e6 * np.percentile(durations_s, [50, 99])
     print(f"{len(windows)} updates: median {median_us:.0f} µs, p99 {p99_us:.0f} µs, sum {durations_s.sum():.3f} s")
     compared = compare_filterpy(sequence, windows, FILTERPY_QUICK_S if quick else FILTERPY_S)
-    figures = {"log_s": float(durations_s.sum()), "mission_s": sequence.duration_s, **compared}
+    own = {"log_s": float(durations_s.sum()), "invariant_log_s": float(invariant_s.sum())}
+    figures = own | {"mission_s": sequence.duration_s, **compared}
     passed = meets_targets(figures)
     print(json.dumps({name: float(f"{value:.4g}") for name, value in figures.items()} | {"passed": passed}))
     return exit_code(figures, quick=quick)
@@ -81,7 +86,7 @@ def exit_code(figures: dict[str, float], *, quick: bool) -> int:
     return 0 if (is_same(figures) if quick else meets_targets(figures)) else 1
 
 
-def timed_run(slam: EkfSlam, windows: list[Measurements]) -> Floats:
+def timed_run(slam: EkfSlam | InvariantEkf, windows: list[Measurements]) -> Floats:
     durations_s = []
     for window in windows:
         before = time.perf_counter()

@@ -4,6 +4,7 @@ Four estimators on the same measurements: dead reckoning, EKF-SLAM as published 
 at the newest estimate), the invariant filter (gyro bias, right-invariant error), and iSAM2. Causal estimates only.
 
 * nominal: the basin as published, gyro and accelerometer biased as their calibration says;
+* without bias: the same with unbiased sensors, where the published filter lacks nothing;
 * hard: ten times the gyro bias, more than three times the noise of gyro and Doppler log, a start known to 3 degrees,
   six laps instead of three;
 * hard without bias: the same with unbiased sensors, so that the plain filter lacks nothing but its linearisation.
@@ -50,6 +51,7 @@ DOF = {"position": 3, "yaw": 1}
 HARD = {"imu": "mti1", "dvl": "explorer", "start_rotation_sigma_rad": 0.05, "laps": 6}
 BASINS: dict[str, dict[str, Any]] = {
     "nominal": {},
+    "without_bias": {"gyro_bias_scale": 0.0, "accel_bias_scale": 0.0},
     "hard": HARD,
     "hard_without_bias": {**HARD, "gyro_bias_scale": 0.0, "accel_bias_scale": 0.0},
 }
