@@ -25,7 +25,7 @@ from sonar_graph.evaluation.start_check import (
 from sonar_graph.evaluation.unit_check import wrong_units
 from sonar_graph.logs.adapters.config import LogConfig
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.allan import noise_densities
+from sonar_graph.navigation.allan import longest_rest, noise_densities
 from sonar_graph.navigation.dvl_against_imu import DvlMatch, Estimates3D, match_dvl_to_imu
 from sonar_graph.navigation.offset_search import Estimate1D
 from sonar_graph.navigation.reference_match import match_reference_to_imu
@@ -40,6 +40,7 @@ LEAST_HEADING_RAD = np.radians(1.0)
 """What is smaller changes nothing that other errors would not hide."""
 LARGEST_DENSITY_RATIO = 1.5
 """Densities further from the calibration's than this, either way, are worth a line."""
+LARGEST_RESTING_M_S = 0.1
 FROM_DRIVE = "from the turns of the drive"
 
 
@@ -131,13 +132,19 @@ def _of_reference(right: Sequence, config: LogConfig, tilt: StartTilt) -> Iterat
 
 
 def _of_noise(sequence: Sequence) -> Iterator[Finding]:
-    found, imu = noise_densities(sequence.imu), sequence.calibration.imu
+    found, imu, speed = noise_densities(sequence.imu), sequence.calibration.imu, _speed_in_rest(sequence)
     rest = f"from {found.still_s:.0f} s of rest"
     known = {
         "gyro noise density": ("gyro_noise_density", found.gyro, imu.gyro_noise_density, "rad/s/√Hz"),
         "accelerometer noise density": ("accel_noise_density", found.accel, imu.accel_noise_density, "m/s²/√Hz"),
     }
-    for quantity, (field, estimate, given, unit) in known.items():
+    for quantity, (field, measured, given, unit) in known.items():
+        driving = measured.is_known and speed > LARGEST_RESTING_M_S
+        estimate = (
+            replace(measured, reason=f"{found.still_s:.0f} s are steady, but at {speed:.1f} m/s")
+            if driving
+            else measured
+        )
         ratio = max(estimate.value / given, given / estimate.value) if estimate.value > 0 and given > 0 else np.inf
         acts = matters(replace(estimate, value=estimate.value - given), 0.0) and ratio > LARGEST_DENSITY_RATIO
         advice = f"{rest}; the calibration's {given:.2g} fits, no need to act"
@@ -146,6 +153,13 @@ def _of_noise(sequence: Sequence) -> Iterator[Finding]:
                 f"{rest}, not the calibration's {given:.2g}: `imu.{field} = {estimate.value:.2g}` in the calibration"
             )
         yield Finding(quantity, estimate, unit, advice, acts)
+
+
+def _speed_in_rest(sequence: Sequence) -> float:
+    """Of the Doppler log, m/s: a steady drive can be as quiet as a rest."""
+    stamps_ns = sequence.imu.stamps_ns[longest_rest(sequence.imu)]
+    during = sequence.dvl.between(int(stamps_ns[0]), int(stamps_ns[-1])) if len(stamps_ns) else None
+    return 0.0 if during is None else float(np.median(np.linalg.norm(during.velocity, axis=1)))
 
 
 def _offset(quantity: str, estimate: Estimate1D, role: str, config: LogConfig) -> Finding:

@@ -56,7 +56,8 @@ LARGEST_STEP_LEFT = 0.01
 """Of turn (rad), scale, gyro bias over a stretch (rad) and lever arm times a usual rate (m/s): linearising again then
 changes nothing that matters."""
 USUAL_RATE_RAD_S = 0.1
-ROUNDS = 5
+ROUNDS, HOPELESS_AFTER = 8, 3
+"""At most, and after how many a log is given up that tells neither offset nor turn nor scale."""
 
 OFFSET_LIMIT_S, YAW_LIMIT_RAD, SCALE_LIMIT = 0.1, np.radians(2.0), 0.02
 LEVER_LIMIT_M, GYRO_BIAS_LIMIT_RAD_S = 0.25, 5e-3
@@ -111,7 +112,7 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
 
 def _matched(imu: Imu, seconds: Floats, velocity: Floats, runs: list[slice], lever: Floats) -> DvlMatch:
     yaw, scale, gyro_bias = 0.0, 1.0, np.zeros(3)
-    for _ in range(ROUNDS):
+    for done in range(1, ROUNDS + 1):
         path = InertialPath.of(Imu(imu.stamps_ns, imu.angular_velocity - gyro_bias, imu.specific_force))
         turned = scale * Rotation.from_rotvec([0.0, 0.0, yaw]).apply(velocity)
         line_up = partial(_line_up, path, seconds, turned, runs, lever)
@@ -123,6 +124,9 @@ def _matched(imu: Imu, seconds: Floats, velocity: Floats, runs: list[slice], lev
         yaw, scale, gyro_bias, lever = yaw + turn, scale * (1.0 + more), gyro_bias + drift, lever + longer
         if np.linalg.norm([turn, more, *(drift * STRETCH_S), *(longer * USUAL_RATE_RAD_S)]) < LARGEST_STEP_LEFT:
             break
+        is_told = not found.reason or sigma[YAW] <= YAW_LIMIT_RAD or sigma[SCALE] <= SCALE_LIMIT
+        if done >= HOPELESS_AFTER and not is_told:
+            return _unknown(NO_MANOEUVRES)
     else:
         return _unknown(NO_MANOEUVRES)
     return DvlMatch(

@@ -177,3 +177,16 @@ def test_right_units_are_not_doubted_even_with_spikes_and_rows_that_were_not_mea
     assert not wrong_units(
         replace(RIGHT, imu=imu, dvl=Dvl(RIGHT.dvl.stamps_ns, velocity, RIGHT.dvl.velocity_cov)), LogConfig()
     )
+
+
+@pytest.mark.parametrize(("speed_m_s", "is_told"), [(0.0, True), (0.05, True), (0.8, False)])
+def test_a_steady_drive_is_no_rest_to_tell_noise_from(speed_m_s: float, is_told: bool):
+    rng, n = np.random.default_rng(0), 5000
+    force = [0, 0, 9.80665] + 0.05 * rng.standard_normal((n, 3))
+    imu = Imu(np.arange(n) * 10_000_000, 0.01 * rng.standard_normal((n, 3)), force)
+    velocity = [speed_m_s, 0, 0] + 0.01 * rng.standard_normal((250, 3))
+    dvl = Dvl(np.arange(250) * 200_000_000, velocity, np.full((250, 3, 3), np.nan))
+    found = by_name(check_sensors(replace(RIGHT, imu=imu, dvl=dvl, truth=None)))
+    for name in ("gyro noise density", "accelerometer noise density"):
+        assert found[name].estimate.is_known == found[name].acts == is_told
+        assert is_told or "steady, but at 0.8 m/s" in found[name].text()
