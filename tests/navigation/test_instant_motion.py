@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.dvl_preintegration import Preintegrator
 from sonar_graph.navigation.instant_motion import motion_between
 from sonar_graph.navigation.node_motion import motion_between_nodes, motion_since_node
 from sonar_graph.navigation.odometry import Odometry
 
+from . import test_gap_motion as tumbling
 from .test_gaps import DVL, FOUND_S, LOST_S, NOISY, QUIET, Vehicle, at, rows
 
 ZERO = np.zeros(3)
@@ -34,7 +36,10 @@ def moved(start_s, end_s, until_s=20.0, imu=QUIET):
 
 @pytest.mark.parametrize(
     ("start_s", "end_s"),
-    [(1.03, 1.17), (5.9, 6.0), (5.93, 8.31), (6.0, 12.0), (8.07, 8.36), (13.0, 15.9), (5.03, 16.53), (16.0, 16.1)],
+    [
+        *((1.03, 1.17), (5.9, 6.0), (5.93, 8.31), (6.0, 12.0), (6.0, 16.0), (6.0, 17.3), (8.07, 8.36), (13.0, 15.9)),
+        *((5.03, 16.53), (16.0, 16.1)),
+    ],
 )
 def test_motion_is_that_of_the_vehicle_before_in_over_and_after_a_gap(start_s, end_s):
     truth, found = Vehicle().displacement(start_s, end_s), moved(start_s, end_s)
@@ -42,6 +47,37 @@ def test_motion_is_that_of_the_vehicle_before_in_over_and_after_a_gap(start_s, e
     turn = Vehicle().attitude([end_s - start_s]).as_matrix()[0]
     assert found.i_T_j.rotation().equals(gtsam.Rot3(turn), 1e-6)
     assert found.duration_s == pytest.approx(end_s - start_s)
+
+
+def in_between(start_s, end_s, bias=(0.0, 0.0, 0.0), gap_s=1.5):
+    """Of a vehicle that rolls, pitches and turns, whose Doppler stamps fall between those of the IMU."""
+    known = tumbling.calibration({"gyro_noise_density": 1e-3}, velocity_sigma_m_s=(0.01,) * 3, gap_s=gap_s)
+    imu_rows, dvl_rows = tumbling.rows()
+    biased = Imu(imu_rows.stamps_ns, imu_rows.angular_velocity + bias, imu_rows.specific_force)
+    odometry = Odometry(known)
+    odometry.add(biased, Dvl(dvl_rows.stamps_ns + 30_000_000, dvl_rows.velocity, dvl_rows.velocity_cov))
+    return motion_between(odometry, Preintegrator.from_calibration(known), at(start_s), at(end_s), np.array(bias))
+
+
+INTERVALS = pytest.mark.parametrize(
+    ("start_s", "end_s"), [(1.11, 1.72), (8.0, 9.0), (6.03, 9.0), (5.58, 8.31), (5.58, 11.7), (4.6, 15.78)]
+)
+
+
+@INTERVALS
+def test_the_turn_is_that_of_the_gyros_whatever_the_doppler_log_does(start_s, end_s):
+    """As if a straight line led over its gaps, to the last digits; the displacement is another one there."""
+    found, straight = in_between(start_s, end_s), in_between(start_s, end_s, gap_s=100.0)
+    assert found.i_T_j.rotation().equals(straight.i_T_j.rotation(), 1e-12)
+    assert found.i_T_j.equals(straight.i_T_j, 1e-3) == (start_s < 2.0)
+
+
+@INTERVALS
+def test_a_bias_that_is_removed_is_as_if_it_had_not_been(start_s, end_s):
+    found, clean = in_between(start_s, end_s, bias=(0.03, -0.02, 0.04)), in_between(start_s, end_s)
+    assert found.i_T_j.equals(clean.i_T_j, 1e-9)
+    assert found.covariance == pytest.approx(clean.covariance, abs=1e-12)
+    assert found.D_bias == pytest.approx(clean.D_bias, abs=1e-9)
 
 
 def test_without_a_gap_motion_is_that_over_the_steps_to_the_bit():
