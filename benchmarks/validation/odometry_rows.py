@@ -1,14 +1,15 @@
 """What the accelerometers add to odometry: twelve rows, six with them between Doppler samples, or six without them.
 
 * Keyframes: error of one displacement by the rules "linear" (what every estimator here takes for odometry) and
-  "inertial", and its normalised square by the covariance, per dimension (1 is consistent), on the vehicles of
+  "inertial", and as the estimators have it where ``dvl.gap_s`` is below the Doppler log's interval, so that each
+  counts as a gap; and its normalised square by the covariance, per dimension (1 is consistent). On the vehicles of
   `preintegration_consistency`, gentle (knots every 3 s) and brisk (every second).
 * Chains of motions alone, biases as unknowns with their priors, each motion ``after`` the one before: basins of 240 s,
   and the A-KIT trajectories with their stamps put right as in `akit`. Twice the graph's error at the solution
   (chi-square) over its degrees of freedom, position, roll and pitch at the end against the truth, and the normalised
   squares of both (of little meaning at sea, where the reference is no truth; trajectory 6, whose start attitude is
-  unsure, is left out of the means). "gravity" has a direction of gravity at
-  each keyframe, as iSAM2 has where the calibration says so.
+  unsure, is left out of the means). "gravity" has a direction of gravity at each keyframe, as iSAM2 has where the
+  calibration says so.
 
 There is no target.
 """
@@ -32,17 +33,21 @@ sys.path.append(str(Path(__file__).resolve().parent))
 from akit import realigned, with_imu_at
 from akit_landmarks import UNSURE_START
 from common import in_parallel, make_parser, print_figures, print_table, recording
-from preintegration_consistency import NS, Case, errors, measure
-from spline_vehicle import make_vehicle
+from preintegration_consistency import ACCEL_DENSITY, NS, Case, errors, measure
+from spline_vehicle import BODY_P_DVL, BODY_P_IMU, BODY_R_DVL, Vehicle, make_vehicle
 
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.logs.converters.akit import read_akit
-from sonar_graph.measurements import Floats, Ints
+from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation import JointMotion, JointPreintegrator
 from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
 from sonar_graph.navigation.dvl_against_imu import match_dvl_to_imu
+from sonar_graph.navigation.dvl_preintegration import Preintegrator
 from sonar_graph.navigation.earth import earth_rate_in_world
 from sonar_graph.navigation.joint_preintegration import DISPLACEMENT
 from sonar_graph.navigation.joint_rules import DopplerRule
+from sonar_graph.navigation.node_motion import motion_between_nodes
+from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.navigation.reference_match import match_reference_to_imu
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
@@ -50,6 +55,7 @@ from sonar_graph.slam import factors
 from sonar_graph.slam.inertial_factors import doppler_odometry, inertial_doppler_odometry
 
 RATES_HZ = (1.0, 2.0, 5.0, 10.0)
+WAYS = ("linear", "inertial", "small gap_s")
 KNOTS_S = {"gentle": 3.0, "brisk": 1.0}
 BASIN_STEP, AKIT_STEP = 14, 5
 """Doppler samples in a motion: 2 s and 5 s."""
@@ -219,20 +225,44 @@ def at_sea(folder: Path, number: int) -> dict[str, Told]:
 
 
 def keyframes(runs: int, case: Case) -> Floats:
-    """Root mean square error of a displacement, m, and its mean normalised square: linear, inertial, shape (2, 2)."""
-    found = []
+    """Root mean square error of a displacement, m, and its mean normalised square, by `WAYS`, shape (3, 2)."""
+    found, end_ns = [], round(case.keyframe_s * NS)
     for run in range(runs):
         rng = np.random.default_rng([run, *case.seed])
         if run % 20 == 0:
             vehicle = make_vehicle(run, case.keyframe_s + 20.0, case.knot_s)
         start_s = rng.uniform(0.0, 20.0)
         rows = measure(vehicle, start_s, case, rng).rows(noisy_gyro=True)
-        made = [case.sensors(rule).integrate(*rows, 0, round(case.keyframe_s * NS)) for rule in ("linear", "inertial")]
-        missed = [errors(vehicle, start_s, motion)[DISPLACEMENT] for motion in made]
-        covs = [motion.covariance[DISPLACEMENT, DISPLACEMENT] for motion in made]
-        found.append([[error @ error, square(error, cov)] for error, cov in zip(missed, covs, strict=True)])
+        made = [case.sensors(rule).integrate(*rows, 0, end_ns) for rule in ("linear", "inertial")]
+        told = [
+            (errors(vehicle, start_s, motion)[DISPLACEMENT], motion.covariance[DISPLACEMENT, DISPLACEMENT])
+            for motion in made
+        ]
+        told.append(as_gaps(vehicle, start_s, case, rows))
+        found.append([[error @ error, square(error, cov)] for error, cov in told])
     means = np.mean(found, axis=0)
     return np.column_stack([np.sqrt(means[:, 0]), means[:, 1]])
+
+
+def as_gaps(vehicle: Vehicle, start_s: float, case: Case, rows: tuple[Imu, Dvl]) -> tuple[Floats, Floats]:
+    """Error and covariance of the body's displacement where every interval counts as a gap."""
+    at_imu, at_dvl = (Mounting(translation_m=tuple(place.tolist())) for place in (BODY_P_IMU, BODY_P_DVL))
+    turned = at_dvl.model_copy(update={"rpy_rad": tuple(BODY_R_DVL.as_euler("xyz").tolist())})
+    sigmas = (case.dvl_sigma,) * 3
+    calibration = Calibration(
+        imu=ImuCalibration(
+            gyro_noise_density=case.gyro_density, accel_noise_density=ACCEL_DENSITY, accel_bias_sigma=0, mounting=at_imu
+        ),
+        dvl=DvlCalibration(velocity_sigma_m_s=sigmas, mounting=turned, gap_s=0.5 / case.dvl_hz),
+    )
+    odometry, end_ns = Odometry(calibration), round(case.keyframe_s * NS)
+    odometry.add(*rows)
+    motion = motion_between_nodes(odometry, Preintegrator.from_calibration(calibration), 0, end_ns, np.zeros(3), None)
+    ends = np.array([start_s, start_s + case.keyframe_s])
+    R_i, R_j = vehicle.attitude(ends)
+    p_i, p_j = vehicle.position(ends)
+    truth = gtsam.Pose3(gtsam.Rot3((R_i.inv() * R_j).as_matrix()), R_i.inv().apply(p_j - p_i))
+    return gtsam.Pose3.Logmap(motion.i_T_j.between(truth))[3:], motion.covariance[3:, 3:]
 
 
 def report_keyframes(runs: int, workers: int) -> dict[str, object]:
@@ -245,7 +275,8 @@ def report_keyframes(runs: int, workers: int) -> dict[str, object]:
     }
     found = in_parallel(partial(keyframes, runs), list(cases.values()), workers, "case")
     rows = [(name, *(of_case * [1e3, 1.0]).T.ravel().tolist()) for name, of_case in zip(cases, found, strict=True)]
-    print_table(("displacement over 1 s", "linear rms mm", "inertial rms mm", "linear NEES", "inertial NEES"), rows)
+    headers = (f"{way} {figure}" for figure in ("rms mm", "NEES") for way in WAYS)
+    print_table(("displacement over 1 s", *headers), rows)
     return {f"{name} rms_mm, nees": row for name, *row in rows}
 
 
