@@ -48,7 +48,8 @@ def check_candidates(designs: Iterable[LandmarkDesign], params: DetectionParams,
                 for area, offset in zip(areas_m2, offsets_m, strict=True)
             )
             raise CalibrationError(
-                f"landmark design {design.name} (id {design.id}) would never be found: its bright parts are {parts or 'all smoothed away'}; "
+                f"landmark design {design.name} (id {design.id}) would never be found: its bright parts are "
+                f"{parts or 'all smoothed away'}; "
                 f"one must have {params.min_area_m2:g} to {params.max_area_m2:g} m², be no longer than "
                 f"{params.max_extent_m:g} m and lie within {reach_m * 100:.0f} cm of the middle; "
                 "join the parts, change their size, or set detection.closing_m, min_area_m2, max_area_m2, max_extent_m"
