@@ -4,7 +4,9 @@ Nodes. The stamps of the DVL rows are *nodes*: between two nodes the velocity is
 final. A node counts as reached at time t when its own row and an IMU row at or after it are stamped at or before t.
 Whatever happens between nodes (a detection, a depth sample, an estimate being asked for) is related to the newest
 reached node by a provisional motion that uses nothing stamped later. Results therefore depend on stamps alone, not on
-how a log is cut into blocks, and nothing peeks ahead.
+how a log is cut into blocks, and nothing peeks ahead. One thing does where rows are added long before they are asked
+for: the first velocities, and those after a long gap, are nodes once later ones have confirmed them
+(`sonar_graph.navigation.velocity_doubt`).
 
 Rows: `sonar_graph.navigation.row_intake`. Motion between them: `sonar_graph.navigation.steps`.
 """

@@ -1,8 +1,9 @@
 """Which rows of IMU and Doppler log are used, and why others are not.
 
 A row is turned into body axes and placed by its stamp. One that belongs to a motion already used is late; a velocity
-that no vehicle reaches is an outlier (`sonar_graph.navigation.velocity_gate`); one of too few beams waits until it can
-be completed (`sonar_graph.navigation.partial_velocity`).
+that no vehicle reaches is an outlier (`sonar_graph.navigation.velocity_gate`); one with none before it waits until it
+is confirmed (`sonar_graph.navigation.velocity_doubt`); one of too few beams waits until it can be completed
+(`sonar_graph.navigation.partial_velocity`).
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from sonar_graph.navigation.inertial_carry import InertialRows
 from sonar_graph.navigation.kernels import compiled
 from sonar_graph.navigation.partial_velocity import PartialVelocities, Rows
 from sonar_graph.navigation.stamped_rows import EARLIEST_NS, LATEST_NS, StampedRows
-from sonar_graph.navigation.velocity_covariances import in_numbers
+from sonar_graph.navigation.velocity_covariances import in_numbers, is_partial
+from sonar_graph.navigation.velocity_doubt import VelocityDoubt
 from sonar_graph.navigation.velocity_gate import GATE, Verdict, judge
 from sonar_graph.states import Refusal, RefusedRow
 
@@ -39,6 +41,7 @@ class RowIntake:
         self._default_cov = np.diag(np.square(calibration.dvl.velocity_sigma_m_s))
         self._gate = np.inf if calibration.odometry_interpolation == "hold-past" else GATE  # held velocities may jump
         self._walk = calibration.dvl.velocity_walk_density
+        self._doubt = None if calibration.odometry_interpolation == "hold-past" else VelocityDoubt(self._walk)
         self._partial = PartialVelocities(calibration)
         self.imu = StampedRows((3,), (3,))
         """Angular rate and specific force, body axes."""
@@ -50,9 +53,13 @@ class RowIntake:
 
     @property
     def refused(self) -> list[RefusedRow]:
-        """Rows that are not used, and why; of too few beams also those that may still be completed."""
-        incomplete = self._partial.not_completed_ns
-        return [*self._refused, *(RefusedRow("dvl", at_ns, Refusal.INCOMPLETE, np.nan) for at_ns in incomplete)]
+        """Rows that are not used, and why; also those that may still be completed or confirmed."""
+        incomplete, waiting = self._partial.not_completed_ns, self._doubt.waiting_ns if self._doubt else []
+        return [
+            *self._refused,
+            *(RefusedRow("dvl", at_ns, Refusal.INCOMPLETE, np.nan) for at_ns in incomplete),
+            *(RefusedRow("dvl", at_ns, Refusal.UNCONFIRMED, np.nan) for at_ns in waiting),
+        ]
 
     def add_imu(self, imu: Imu) -> bool:
         """Returns whether rows were placed before others that are there already."""
@@ -69,7 +76,9 @@ class RowIntake:
         rows = self._in_time(dvl, self.dvl.stamps_ns, "dvl")
         if rows is None:
             return False
-        stamps_ns, velocity, cov = rows.stamps_ns, *self._in_body(rows)
+        stamps_ns, velocity, cov = self._beyond_doubt(rows.stamps_ns, *self._in_body(rows))
+        if not len(stamps_ns):
+            return False
         verdict = judge(stamps_ns, velocity, cov, self.dvl.stamps_ns, *self.dvl.values, self._walk, self._gate)
         if not verdict.is_plain or self._partial.is_waiting:
             stamps_ns, velocity, cov = self._completed(stamps_ns, velocity, cov, verdict)
@@ -83,6 +92,14 @@ class RowIntake:
         if self._body_R_dvl is None:
             return dvl.velocity, cov
         return dvl.velocity @ self._body_R_dvl.T, self._body_R_dvl @ cov @ self._body_R_dvl.T
+
+    def _beyond_doubt(self, stamps_ns: Ints, velocity: Floats, cov: Floats) -> Rows:
+        """Rows for the gate, those that have waited for them among them."""
+        if self._doubt is None:
+            return stamps_ns, velocity, cov
+        rows, outliers = self._doubt.passed((stamps_ns, velocity, cov), is_partial(cov))
+        self._refused += [RefusedRow("dvl", stamp_ns, Refusal.OUTLIER, distance) for stamp_ns, distance in outliers]
+        return rows
 
     def _completed(self, stamps_ns: Ints, velocity: Floats, cov: Floats, verdict: Verdict) -> Rows:
         """Rows that are no outliers, without those that wait, and those that have waited for them."""

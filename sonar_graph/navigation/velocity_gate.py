@@ -5,9 +5,10 @@ A velocity v, t seconds after the last one u that was believed, both in body axe
     S = Q_u + Q_v + (q^2 t + (w t |u|)^2) I,    q velocity walk of the calibration, w `TURNING_RAD_S` (w t at most 2)
 
 since the velocity may change and the vehicle may turn. The squared Mahalanobis distance is gated far out, for what is
-refused is lost; what passes is weighed by its noise. The gate widens while nothing is believed, so that a wrong first
-sample costs seconds, not the run. A row that leaves a direction unmeasured is compared, but nothing with it. The gate
-knows stamps and velocities alone: what it refuses does not depend on how a log is cut.
+refused is lost; what passes is weighed by its noise. The gate widens while nothing is believed; with what it starts, at
+first and after a long gap, `sonar_graph.navigation.velocity_doubt` decides. A row that leaves a direction unmeasured is
+compared, but nothing with it. The gate knows stamps and velocities alone: what it refuses does not depend on how a log
+is cut.
 """
 
 from __future__ import annotations
@@ -97,6 +98,17 @@ def judge(
         else:
             is_plain = False
     return Verdict(distance, partial, outlier, is_plain)
+
+
+@compiled
+def distance_between(u: Floats, Q_u: Floats, v: Floats, Q_v: Floats, t: float, walk: float) -> float:
+    """Squared distance of a velocity v from one u, t seconds apart."""
+    return _squared_distance(vector(u), matrix(Q_u), vector(v), matrix(Q_v), t, walk)
+
+
+def changed(velocity: Floats, t: float, walk: float) -> float:
+    """Variance about each axis of what a velocity may change in t seconds, m²/s²."""
+    return walk**2 * t + min(TURNING_RAD_S * t, 2.0) ** 2 * float(velocity @ velocity)
 
 
 @inlined

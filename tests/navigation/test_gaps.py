@@ -79,7 +79,8 @@ def at(seconds):
 def motion(imu_rows, dvl_rows, imu=QUIET, until_s=FOUND_S, dvl=DVL):
     calibration = Calibration(imu=imu, dvl=dvl)
     odometry, preintegrator = Odometry(calibration), Preintegrator.from_calibration(calibration)
-    odometry.add(imu_rows.between(0, at(until_s) + NS), dvl_rows.between(0, at(until_s)))
+    confirmed_ns = at(until_s) + (NS // 4 if until_s >= FOUND_S else 0)
+    odometry.add(imu_rows.between(0, at(until_s) + NS), dvl_rows.between(0, confirmed_ns))
     ends = at(LOST_S), at(until_s)
     if until_s >= FOUND_S:
         return motion_between_nodes(odometry, preintegrator, *ends, np.zeros(3), None)

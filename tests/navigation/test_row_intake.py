@@ -192,6 +192,6 @@ def test_late_rows_ask_for_no_motion_anew():
 def test_rows_are_late_at_the_settled_stamp_and_not_after_it():
     odometry = Odometry(Calibration())
     odometry.settle(T0_NS)
-    odometry.add(None, dvl(T0_NS + np.array([-1, 0, 1]), [0.8, 0.0, 0.0]))
+    odometry.add(None, dvl(T0_NS + np.array([-1, 0, 1, 2]), [0.8, 0.0, 0.0]))
     assert [row.stamp_ns - T0_NS for row in odometry.refused] == [-1, 0]
-    assert (odometry.columns()[3] - T0_NS).tolist() == [1]
+    assert (odometry.columns()[3] - T0_NS).tolist() == [1, 2]
