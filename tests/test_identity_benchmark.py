@@ -1,0 +1,98 @@
+"""The table of late and wrong identities: what it makes of runs that fail, and of runs that are kept."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+
+
+@pytest.fixture
+def table(monkeypatch: pytest.MonkeyPatch) -> Any:
+    for folder in (BENCHMARKS, BENCHMARKS / "validation"):
+        monkeypatch.syspath_prepend(str(folder))
+    return importlib.import_module("identities")
+
+
+@pytest.fixture
+def kept(table: Any) -> Any:
+    return importlib.import_module("identity_runs")
+
+
+def judged(kept: Any, error_m: float | None) -> Any:
+    nees = {"position": 1.0, "yaw": 2.0}
+    if error_m is None:
+        return kept.Judged("failed", "of a sudden", None, None, None, 0, None, None, None)
+    return kept.Judged("ok", "", error_m, error_m, error_m, 4, nees, nees, nees)
+
+
+def runs(kept: Any, *errors_m: float | None) -> list[dict[str, Any]]:
+    """Dead reckoning off by 0.3 m, and one policy."""
+    return [{"dead reckoning": judged(kept, 0.3), "iSAM2, robust": judged(kept, error)} for error in errors_m]
+
+
+def test_a_mean_over_survivors_is_not_given(table: Any, kept: Any) -> None:
+    clean = runs(kept, 0.1, 0.1, 0.1, 0.1)
+    found = table.summarise(runs(kept, 0.1, None, 0.1, 2.0), clean, "iSAM2, robust")
+    assert (found["failed"], found["lost"]) == (0.25, 0.5)
+    for figure in ("smoothed_m", "causal_m", "landmarks_m", "above_clean_m", "loss", "final_nees_yaw"):
+        assert np.isnan(found[figure])
+    whole = table.summarise(runs(kept, 0.1, 0.3, 0.1, 2.0), clean, "iSAM2, robust")
+    assert (whole["failed"], whole["lost"], whole["final_nees_yaw"]) == (0.0, 0.25, 2.0)
+    assert whole["smoothed_m"] == pytest.approx(0.625)
+
+
+def test_differences_are_paired_by_seed(table: Any, kept: Any) -> None:
+    clean, wrong = runs(kept, 0.1, 0.2, 0.3), runs(kept, 0.15, 0.25, 0.35)
+    found = table.summarise(wrong, clean, "iSAM2, robust")
+    assert found["above_clean_m"] == pytest.approx(0.05)
+    assert found["above_clean_error_m"] == pytest.approx(0, abs=1e-12)
+    assert found["smoothed_error_m"] == pytest.approx(0.1 / np.sqrt(3))
+    assert found["loss"] == pytest.approx(0.25)
+
+
+def test_the_best_policy_is_the_one_whose_worst_case_is_best(table: Any, kept: Any, monkeypatch: Any) -> None:
+    monkeypatch.setattr(table, "ESTIMATORS", dict.fromkeys(("EKF-SLAM", "iSAM2, a", "iSAM2, b")))
+
+    def told(ekf: float, a: float, b: float) -> dict[str, dict[str, float]]:
+        return {"EKF-SLAM": {"loss": ekf}, "iSAM2, a": {"loss": a}, "iSAM2, b": {"loss": b}}
+
+    figures = {kept.Case(0.1): told(0, 0.1, 0.2), kept.Case(0.1, 5.0): told(0, 0.9, 0.3), kept.Case(0.2): told(0, 0, 9)}
+    assert table.best_policy(figures) == ("iSAM2, b", 0.3)
+    figures[kept.Case(0.1, 20.0)] = told(0, 0.1, float("nan"))
+    assert table.best_policy(figures) == ("iSAM2, a", 0.9)
+
+
+def test_what_is_kept_belongs_to_one_run_of_one_version(
+    table: Any, kept: Any, tmp_path: Path, monkeypatch: Any
+) -> None:
+    job = kept.Job(kept.Case(0.1), 3, True, tmp_path)
+    name = "iSAM2, robust"
+    others = [replace(job, seed=4), replace(job, is_quick=False), replace(job, case=kept.Case(0.1, 5.0))]
+    files = [other.file(name) for other in (job, *others)] + [job.file("iSAM2, gate")]
+    monkeypatch.setattr(kept, "source_version", lambda: "another")
+    assert len({*files, job.file(name)}) == 6
+    assert replace(job, folder=None).file(name) is None
+
+
+@pytest.mark.slow
+def test_a_command_that_is_given_again_gives_the_same_table_from_what_is_kept(tmp_path: Path) -> None:
+    script = BENCHMARKS / "validation" / "identities.py"
+    asked = [sys.executable, str(script), "--quick", "--seeds", "2", "--kinds", "0", "--workers", "2"]
+    asked += ["--keep", str(tmp_path)]
+    first = subprocess.run(asked, capture_output=True, text=True, check=True).stdout
+    files = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    lost = sorted(files)[0]
+    lost.unlink()
+    assert subprocess.run(asked, capture_output=True, text=True, check=True).stdout == first
+    assert {path for path in tmp_path.iterdir() if path.stat().st_mtime_ns != files[path]} == {lost}
+    assert json.loads(first.splitlines()[-1])["runs"] == 2
