@@ -22,7 +22,7 @@ FASTEST_TURN_RAD_S = 2.0
 SPEEDS = {"cm/s": 1e-2, "mm/s": 1e-3}
 """Factor to m/s."""
 FORCES = {"g": 9.80665, "mg": 9.80665e-3, "cm/s²": 1e-2, "mm/s²": 1e-3}
-"""Factor to m/s²."""
+"""Factor to m/s²; mg and cm/s² differ by a fiftieth, so that the nearest counts."""
 SHARE_OF_GRAVITY = 0.2
 """By which a typical specific force may differ from gravity."""
 USUAL_SPEED_M_S = 3.0
@@ -83,16 +83,16 @@ def _of_force(imu: Imu, calibration: Calibration, config: LogConfig) -> WrongUni
     lengths = _lengths(imu.specific_force)
     if not len(lengths):
         return None
-    typical = float(np.median(lengths))
-    for unit, factor in FORCES.items():
-        if abs(typical * factor / calibration.gravity_m_s2 - 1) <= SHARE_OF_GRAVITY:
-            scale = float(config.table("imu").get("linear_acceleration_scale", 1.0)) * factor
-            return WrongUnit(
-                "accelerometer: unit",
-                f"specific forces are typically {typical:.4g} instead of {calibration.gravity_m_s2:.4g} m/s²: {unit}? "
-                f"`linear_acceleration_scale = {scale:.6g}` under [imu] in the log configuration",
-            )
-    return None
+    typical, gravity = float(np.median(lengths)), calibration.gravity_m_s2
+    unit = min(FORCES, key=lambda unit: abs(typical * FORCES[unit] - gravity))
+    if abs(typical * FORCES[unit] / gravity - 1) > SHARE_OF_GRAVITY:
+        return None
+    scale = float(config.table("imu").get("linear_acceleration_scale", 1.0)) * FORCES[unit]
+    return WrongUnit(
+        "accelerometer: unit",
+        f"specific forces are typically {typical:.4g} instead of {gravity:.4g} m/s²: {unit}? "
+        f"`linear_acceleration_scale = {scale:.6g}` under [imu] in the log configuration",
+    )
 
 
 def _high(vectors: Floats) -> float:
