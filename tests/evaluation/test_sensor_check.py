@@ -21,6 +21,7 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 
 RIGHT = simulate_mission(MissionOptions(seed=4, duration_s=240, landmarks=1))
+SHORT = simulate_mission(MissionOptions(seed=4, duration_s=120, landmarks=1))
 OFFSET_S, YAW_RAD, SCALE = 0.4, np.radians(5), 1.04
 FAR_M = (0.9, 0.0, -0.7)
 """Where a calibration has the IMU that is at the origin; the Doppler log is at (-0.2, 0, -0.15) from it."""
@@ -97,12 +98,12 @@ def test_corrections_are_added_to_what_the_configuration_says():
 
 def test_a_start_taken_from_a_late_reference_is_named_with_the_right_one():
     """The vehicle turns at the start: half a second late is some degrees off."""
-    assert RIGHT.truth is not None
-    late = replace(RIGHT.truth, stamps_ns=RIGHT.truth.stamps_ns + 500_000_000)
-    turning = replace(RIGHT, truth=late)
+    assert SHORT.truth is not None
+    late = replace(SHORT.truth, stamps_ns=SHORT.truth.stamps_ns + 500_000_000)
+    turning = replace(SHORT, truth=late)
     first_ns = turning.start_ns + 20_000_000_000
-    turning = replace(turning, imu=RIGHT.imu.rows(RIGHT.imu.stamps_ns >= first_ns))
-    for reference, acts in ((late, True), (RIGHT.truth, False)):
+    turning = replace(turning, imu=SHORT.imu.rows(SHORT.imu.stamps_ns >= first_ns))
+    for reference, acts in ((late, True), (SHORT.truth, False)):
         yaw, pitch, roll = reference.at(np.array([turning.start_ns])).rotations().as_euler("ZYX")[0].tolist()
         start = turning.calibration.start.model_copy(update={"rpy_rad": (roll, pitch, yaw)})
         run = replace(turning, calibration=turning.calibration.model_copy(update={"start": start}))
@@ -111,10 +112,10 @@ def test_a_start_taken_from_a_late_reference_is_named_with_the_right_one():
 
 
 def test_lines_for_the_start_agree_on_roll_pitch_and_heading():
-    assert RIGHT.truth is not None
-    yaw, pitch, roll = RIGHT.truth.at(np.array([RIGHT.start_ns])).rotations().as_euler("ZYX")[0].tolist()
-    start = RIGHT.calibration.start.model_copy(update={"rpy_rad": (roll + 0.1, pitch, yaw + 0.2)})
-    run = replace(RIGHT, calibration=RIGHT.calibration.model_copy(update={"start": start}))
+    assert SHORT.truth is not None
+    yaw, pitch, roll = SHORT.truth.at(np.array([SHORT.start_ns])).rotations().as_euler("ZYX")[0].tolist()
+    start = SHORT.calibration.start.model_copy(update={"rpy_rad": (roll + 0.1, pitch, yaw + 0.2)})
+    run = replace(SHORT, calibration=SHORT.calibration.model_copy(update={"start": start}))
     found = by_name(check_sensors(run))
     ours, theirs = (line_of(found[name])["start"] for name in ("start roll", "start heading of the calibration"))
     assert ours["rpy_rad"] == theirs["rpy_rad"] == pytest.approx([roll, pitch, yaw], abs=2e-3)
