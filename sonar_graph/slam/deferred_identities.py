@@ -83,7 +83,14 @@ class DeferredIdentities:
 
     def forget(self, now_ns: int) -> None:
         """Let go of sightings that have waited too long."""
-        for sighting, decision in self._tracks.forget(now_ns):
+        self._give_up(self._tracks.forget(now_ns))
+
+    def leave(self, pose_keys: set[int]) -> None:
+        """Poses leave a bounded window: nothing that was seen from them can be used or taken back any more."""
+        self._give_up(self._tracks.leave(pose_keys))
+
+    def _give_up(self, forgotten: list[tuple[Sighting, int]]) -> None:
+        for sighting, decision in forgotten:
             if sighting.outcome is Outcome.WAITING:
                 outcome = Outcome.NO_IDENTITY if decision == NO_LANDMARK else Outcome.FORGOTTEN
                 self._journal.amend(sighting.row, outcome)

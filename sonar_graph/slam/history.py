@@ -1,10 +1,13 @@
-"""A graph that grows, and from which single factors can be taken out again."""
+"""A graph that grows, and from which single factors can be taken out again: the whole of it, or the window's part."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable
 
 import gtsam
+
+POSE, LANDMARK = ord("x"), ord("l")
 
 
 class History:
@@ -45,3 +48,81 @@ class History:
                 self._slots[last] = slot
             self.graph.resize(len(self._handles))
             self.changes += 1
+
+    def keep(self, window: gtsam.NonlinearFactorGraph, left: Iterable[int]) -> None:
+        """Nothing is given up: what leaves the window stays here."""
+
+
+class Recent:
+    """The same for the factors that are in the window: those on variables that have left are in marginals for good.
+
+    A handle ends when a variable of its factor leaves.
+    """
+
+    def __init__(self) -> None:
+        self.changes = 0
+        """Number of factors ever put in or taken out, and of times that variables left."""
+        self._factors: dict[int, gtsam.NonlinearFactor] = {}
+        self._handles: dict[int, list[int]] = defaultdict(list)
+        self._window = gtsam.NonlinearFactorGraph()
+        self._waiting: list[int] = []
+        self._next = 0
+
+    @property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """Those in the window, marginals among them, and those that wait to be."""
+        graph = gtsam.NonlinearFactorGraph()
+        for i in range(self._window.size()):
+            if self._window.exists(i):
+                graph.push_back(self._window.at(i))
+        for handle in self._waiting:
+            graph.push_back(self._factors[handle])
+        return graph
+
+    def add(self, factor: gtsam.NonlinearFactor) -> int:
+        """Put a factor in; its handle."""
+        handle, self._next = self._next, self._next + 1
+        self._factors[handle] = factor
+        for key in _passing(factor):
+            self._handles[key].append(handle)
+        self._waiting.append(handle)
+        self.changes += 1
+        return handle
+
+    def factor(self, handle: int) -> gtsam.NonlinearFactor:
+        """The factor of a handle."""
+        return self._factors[handle]
+
+    def remove(self, handles: Iterable[int]) -> None:
+        """Take factors out."""
+        gone = [self._factors.pop(handle) for handle in handles]
+        self._waiting = [handle for handle in self._waiting if handle in self._factors]
+        window = gtsam.NonlinearFactorGraph()
+        for i in range(self._window.size()):
+            if self._window.exists(i) and self._window.at(i) not in gone:
+                window.push_back(self._window.at(i))
+        self._window = window
+        self.changes += len(gone)
+
+    def keep(self, window: gtsam.NonlinearFactorGraph, left: Iterable[int]) -> None:
+        """The window has been brought up to date.
+
+        Parameters
+        ----------
+        window
+            All its factors.
+        left
+            Variables that have left it.
+        """
+        self._window, self._waiting = window, []
+        for key in left:
+            for handle in self._handles.pop(key, ()):
+                self._factors.pop(handle, None)
+            self.changes += 1
+
+
+def _passing(factor: gtsam.NonlinearFactor) -> list[int]:
+    """Those of a factor's variables with which it leaves: its poses, else its biases. Landmarks stay."""
+    keys = [(key, gtsam.symbolChr(key)) for key in list(factor.keys())]
+    poses = [key for key, kind in keys if kind == POSE]
+    return poses or [key for key, kind in keys if kind != LANDMARK]

@@ -13,27 +13,21 @@ time of the frame. Keyframes can then be sparser than frames at no loss but the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import groupby
 from typing import Any, ClassVar, Literal
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import L
 from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import CalibrationError
-from sonar_graph.measurements import Floats, Measurements
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
-from sonar_graph.navigation.kernels import compiled
-from sonar_graph.slam.joint_covariance import JointCovariance
+from sonar_graph.measurements import Measurements
+from sonar_graph.slam.asked import Anchored, Asked
 from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
 from sonar_graph.slam.sightings import SightingPolicy, Sightings
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, RefusedRow, Trajectory
-
-NO_DERIVATIVE = np.zeros((6, 3))
 
 
 class Isam2Params(Section):
@@ -42,6 +36,10 @@ class Isam2Params(Section):
     lag_s: float = Field(15.0, gt=0)
     """Poses older than this are marginalised out of the incremental solution; a large value keeps the whole history."""
     max_keyframe_interval_s: float = Field(5.0, gt=0)
+    history: Literal["whole", "bounded"] = "whole"
+    """What is kept of poses older than the lag. "whole": everything, for the batch solution in `Isam2.trajectory`.
+    "bounded": nothing but what they say of landmarks and bias, so that time and memory do not grow with the run;
+    `Isam2.trajectory` is then what the lag allowed (docs/theory/bounded_memory.md)."""
     """A keyframe is set at the latest after this time."""
     motion_noise_share: float = Field(0.1, ge=0)
     """While landmarks are seen, a keyframe is set sooner: once the variance of the motion since the last one exceeds
@@ -90,23 +88,29 @@ class Isam2:
         self._calibration = calibration
         self._params: Isam2Params = params or Isam2Params()
         p = self._params
-        self._smoother = Smoother(p.lag_s, p.relinearize_threshold, p.stale_shift_m, p.waiting_gain)
+        self._smoother = Smoother(
+            p.lag_s, p.relinearize_threshold, p.stale_shift_m, p.waiting_gain, is_bounded=p.history == "bounded"
+        )
+        self._smoother.when_leaving = self._leave
         policy = KeyframePolicy(p.max_keyframe_interval_s, p.motion_noise_share, p.bias_interval_s)
         self._keyframes = Keyframes(calibration, policy, self._smoother)
         sightings = SightingPolicy(
             p.identity_probability, p.gate_probability, p.kernel, p.kernel_width, p.deferred_identity, p.longest_wait_s
         )
         self._sightings = Sightings(calibration, sightings, self._smoother, self._keyframes)
-        self._asked: list[Anchored] = []
+        self._asked = Asked()
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Every factor added so far."""
+        """Every factor added so far; of a bounded history what the window holds."""
         return self._smoother.graph
 
     @property
     def values(self) -> gtsam.Values:
-        """The newest estimate of every variable: ``X(i)`` keyframes, ``L(id)`` landmarks, ``B(i)`` gyro biases."""
+        """The newest estimate of every variable: ``X(i)`` keyframes, ``L(id)`` landmarks, ``B(i)`` gyro biases.
+
+        Of a bounded history those in the window.
+        """
         return self._smoother.values
 
     def process(self, measurements: Measurements) -> Estimate | None:
@@ -114,7 +118,7 @@ class Isam2:
 
         None before IMU and DVL have begun, and for an instant before that of an earlier call.
         """
-        if self._asked and measurements.end_ns < self._asked[-1].stamp_ns:
+        if self._asked.newest_ns is not None and measurements.end_ns < self._asked.newest_ns:
             self._refuse(measurements)
             return None
         self._keyframes.add(measurements.imu, measurements.dvl, measurements.depth)
@@ -127,10 +131,15 @@ class Isam2:
         if self._keyframes.newest_ns is None:
             return None
         motion = self._keyframes.motion_since_newest(measurements.end_ns)
-        if self._asked and self._asked[-1].stamp_ns == measurements.end_ns:
-            self._asked.pop()
-        self._asked.append(Anchored(measurements.end_ns, len(self._keyframes.stamps_ns) - 1, motion))
-        return self._causal_estimate(self._asked[-1])
+        newest = len(self._keyframes.stamps_ns) - 1
+        instant = Anchored(measurements.end_ns, newest, self._keyframes.bias_key(newest), motion)
+        self._asked.add(instant)
+        return instant.carried_on(self._smoother.values, self._smoother.joint_covariance(instant.keys()))
+
+    def _leave(self, keys: set[int]) -> None:
+        """Variables leave a bounded window."""
+        self._asked.leave(keys, self._smoother.values, self._smoother.marginals)
+        self._sightings.leave(keys)
 
     def _refuse(self, measurements: Measurements) -> None:
         """Time does not go back: take the rows that are still new, refuse the detections, estimate nothing."""
@@ -139,27 +148,21 @@ class Isam2:
             for stamp_ns, i in zip(
                 measurements.detections.stamps_ns.tolist(),
                 measurements.detections.most_probable()[0].tolist(),
+    @property
+    def keyframe_count(self) -> int:
+        """Number of keyframes so far."""
+        return len(self._keyframes.stamps_ns)
+
                 strict=True,
             ):
                 self._sightings.journal.record(stamp_ns, i, Outcome.LATE)
-
-    def _causal_estimate(self, asked: Anchored) -> Estimate:
-        X_key, B_key = X(asked.keyframe), self._keyframes.bias_key(asked.keyframe)
-        joint = self._smoother.joint_covariance([X_key] if B_key is None else [X_key, B_key])
-        return asked.carried_on(self._smoother.values, B_key, joint)
 
     def trajectory(self) -> Trajectory:
         """The smoothed pose at every instant at which `process` returned an estimate.
 
         Solves the whole graph. Between keyframes the pose of the keyframe before is carried on by its own odometry.
         """
-        values, marginals = self._smoother.solve_history()
-        estimates = []
-        for keyframe, asked in groupby(self._asked, key=lambda instant: instant.keyframe):
-            bias_key = self._keyframes.bias_key(keyframe)
-            joint = JointCovariance.of(marginals, [k for k in (X(keyframe), bias_key) if k is not None])
-            estimates += [instant.carried_on(values, bias_key, joint) for instant in asked]
-        return Trajectory.from_estimates(estimates)
+        return self._asked.trajectory(*self._smoother.solve_history())
 
     def landmarks(self) -> LandmarkMap:
         """Landmarks by identity after solving the whole graph, with marginal covariances."""
@@ -182,6 +185,7 @@ class Isam2:
 
 
 def _check_noise(calibration: Calibration) -> None:
+        With a bounded history that is the graph of the window; poses before it are as they were when they left.
     """A graph weighs by the inverse of variances: none may be zero."""
     start = calibration.start
     zero = [
@@ -198,38 +202,3 @@ def _check_noise(calibration: Calibration) -> None:
         raise CalibrationError(
             f"isam2: {', '.join(zero)} must be above zero; give a small value for what is known well"
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Anchored:
-    """An instant, tied to the newest keyframe of its time by odometry."""
-
-    stamp_ns: int
-    keyframe: int
-    motion: PreintegratedMotion
-
-    def carried_on(self, values: gtsam.Values, bias_key: int | None, joint: JointCovariance) -> Estimate:
-        """The pose at this instant from that of the keyframe (and the bias, whose error the motion inherits).
-
-        ``X Exp(e_X) M Exp(D e_b) = X M Exp(Ad(M^-1) e_X + D e_b)``, so the covariance is ``J P J^T`` with
-        ``J = [Ad(M^-1) D]`` and P that of keyframe and bias, plus that of the motion.
-        """
-        key, motion, D_bias = X(self.keyframe), self.motion.i_T_j, NO_DERIVATIVE
-        bias_row = 0
-        if bias_key is not None:
-            motion, D_bias = self.motion.corrected(values.atPoint3(bias_key)), self.motion.D_bias
-            bias_row = joint.rows[bias_key]
-        J_pose = motion.inverse().AdjointMap()
-        cov = _carried_on(joint.matrix, joint.rows[key], bias_row, J_pose, D_bias, self.motion.covariance)
-        return Estimate(self.stamp_ns, values.atPose3(key).compose(motion), cov)
-
-
-@compiled
-def _carried_on(
-    joint: Floats, pose_row: int, bias_row: int, J_pose: Floats, D_bias: Floats, motion_cov: Floats
-) -> Floats:
-    pose, bias = slice(pose_row, pose_row + 6), slice(bias_row, bias_row + 3)
-    P_pose, P_cross, P_bias = joint[pose, pose].copy(), joint[pose, bias].copy(), joint[bias, bias].copy()
-    cross = J_pose @ P_cross @ D_bias.T
-    cov = J_pose @ P_pose @ J_pose.T + cross + cross.T + D_bias @ P_bias @ D_bias.T + motion_cov
-    return 0.5 * (cov + cov.T)

@@ -31,6 +31,7 @@ class LandmarkSightings:
         self._smoother = smoother
         self._maker = maker
         self._of: dict[int, dict[Sighting, None]] = defaultdict(dict)
+        self._rooted: dict[int, Sighting] = {}
 
     @property
     def ids(self) -> set[int]:
@@ -54,6 +55,18 @@ class LandmarkSightings:
         """Take sightings out of the graph, and put others in, each for a landmark, in one update of the smoother.
 
         Where the earliest sighting of a landmark changes, the factors of the old and of the new one are made anew. A
+    def leave(self, pose_keys: set[int]) -> None:
+        """Poses leave a bounded window: what was seen from them is part of the graph for good.
+
+        A landmark that was seen from one of them stays, whatever becomes of its other sightings, and none of those
+        becomes its first.
+        """
+        for landmark, sightings in self._of.items():
+            gone = [sighting for sighting in sightings if sighting.line.pose_key in pose_keys]
+            for sighting in gone:
+                self._rooted.setdefault(landmark, sighting)
+                del sightings[sighting]
+
         landmark that loses its last sighting leaves the graph.
         """
         self._smoother.flush(time_s)  # it may solve the history, and has to know every landmark of a sightline then
@@ -74,10 +87,12 @@ class LandmarkSightings:
 
     def _take(self, sighting: Sighting) -> None:
         landmark = sighting.landmark_id
+        if landmark_id in self._rooted:
+            return self._rooted[landmark_id]
         if landmark is None:
             return
         del self._of[landmark][sighting]
-        if not self._of[landmark]:
+        if not self._of[landmark] and landmark not in self._rooted:
             del self._of[landmark]
         self._smoother.sightlines.remove(L(landmark), sighting.line)
         sighting.landmark_id, sighting.handles = None, ()

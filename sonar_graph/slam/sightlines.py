@@ -58,6 +58,12 @@ class Sightlines:
         if not self._lines[landmark_key]:
             del self._lines[landmark_key]
 
+    def leave(self, pose_keys: set[int]) -> None:
+        """Let go of sightings from some poses."""
+        for key in list(self._lines):
+            for line in [line for line in self._lines[key] if line.pose_key in pose_keys]:
+                self.remove(key, line)
+
     def turned_away(self, values: gtsam.Values) -> list[int]:
         """Landmarks that lie behind the sonar in at least half of their sightings."""
         return [key for key, lines in self._lines.items() if 2 * _behind(lines, values, key) >= len(lines)]

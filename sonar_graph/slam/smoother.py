@@ -21,7 +21,7 @@ once Cholesky has given up the window stays with QR, and so do the marginals of 
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,8 +30,9 @@ import numpy as np
 
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.batch import qr_tree, solve
-from sonar_graph.slam.history import History
+from sonar_graph.slam.history import History, Recent
 from sonar_graph.slam.joint_covariance import JointCovariance
+from sonar_graph.slam.new_window import copy, marginal, split
 from sonar_graph.slam.sightlines import Sightlines
 
 RESTART_GROWTH = 1.25
@@ -71,18 +72,30 @@ class Smoother:
         The window restarts when a landmark has moved by more than this from where it was linearised.
     greatest_waiting_gain
         An update is due when `waiting_gain` exceeds this.
+    is_bounded
+        What leaves the window is given up: its factors become marginals for good, its variables are forgotten.
     """
 
     def __init__(
-        self, lag_s: float, relinearize_threshold: float, stale_shift_m: float, greatest_waiting_gain: float = 0.0
+        self,
+        lag_s: float,
+        relinearize_threshold: float,
+        stale_shift_m: float,
+        greatest_waiting_gain: float = 0.0,
+        *,
+        is_bounded: bool = False,
     ) -> None:
-        self._lag_s = lag_s
+        self._lag_s = self._window_lag_s = lag_s
         self._stale_shift_m = stale_shift_m
         self._greatest_waiting_gain = greatest_waiting_gain
         self._restart_size = FIRST_RESTART
         self._threshold = relinearize_threshold
         self._factorization = "CHOLESKY"
-        self._history = History()
+        self._is_bounded = is_bounded
+        self._history: History | Recent = Recent() if is_bounded else History()
+        self._restarted_s = -np.inf
+        self.when_leaving: Callable[[set[int]], None] = lambda _: None
+        """Called with the keys of variables before they leave a bounded window, while they are still in it."""
         self.values = gtsam.Values()
         """The newest estimate of every variable; of those that left the window, the last one there."""
         self.sightlines = Sightlines()
@@ -105,7 +118,7 @@ class Smoother:
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Every factor of the run."""
+        """Every factor of the run; of a bounded one those of the window, marginals among them."""
         return self._history.graph
 
     def _new_window(self, lag_s: float) -> gtsam.IncrementalFixedLagSmoother:
@@ -151,9 +164,9 @@ class Smoother:
         self._held = until_s
 
     def flush(self, time_s: float) -> None:
-        """Update with what waits, if anything does."""
+        """Update with what waits, if anything does; a bounded window keeps what it has."""
         if self._pending.size():
-            self.update(time_s)
+            self._update(time_s, self._exchange_lag_s(time_s))
 
     def exchange(self, what: Exchange, time_s: float) -> list[list[int]]:
         """Take factors out, put others in, and bring the window up to date; the handles of each group put in."""
@@ -165,13 +178,18 @@ class Smoother:
             self.add_landmark(key, point)
         handles = [self.add(group) for group in what.added]
         keys = self._pending.keyVector()
+        self._window_lag_s = self._exchange_lag_s(time_s)
         if slots is None or what.lost_landmarks or len(self._inside(keys)) < len(keys):
             self._clear_pending()
             self._restart(time_s)
         else:
-            self.update(time_s, slots)
+            self._update(time_s, self._window_lag_s, slots)
             self._settle(time_s)
         return handles
+
+    def _exchange_lag_s(self, time_s: float) -> float:
+        """Nothing leaves a bounded window between what an exchange takes out and what it puts in."""
+        return max(self._lag_at(time_s), self._window_lag_s) if self._is_bounded else self._lag_at(time_s)
 
     def _window_slots(self, handles: list[int]) -> list[int] | None:
         """Where the window has factors; None when it has lost one."""
@@ -200,27 +218,59 @@ class Smoother:
                 self._window.update()
         except RuntimeError:
             self._give_up_cholesky(time_s)
-        self.values.update(self._window.calculateEstimate())
+        self._take_estimate()
 
     @property
     def is_due(self) -> bool:
         """Whether an update is: variables wait for it, or factors that would change the estimate."""
         return self._pending_values.size() > 0 or self.waiting_gain > self._greatest_waiting_gain
 
-    def update(self, time_s: float, removed_slots: Sequence[int] = ()) -> None:
-        """Bring the window's estimate up to date with what was added, without what is in some places of the window."""
+    def update(self, time_s: float) -> None:
+        """Bring the window's estimate up to date with what was added; what is older than the lag leaves it."""
+        self._update(time_s, self._lag_at(time_s))
+
+    def _update(self, time_s: float, lag_s: float, removed_slots: Sequence[int] = ()) -> None:
+        """The same without what is in some places of the window."""
         times: dict[Any, float] = self._pending_times | dict.fromkeys(self._landmarks + self._bias, time_s)
         self._expiring |= dict.fromkeys(self._bias, time_s)
-        self._window.setSmootherLag(self._lag_at(time_s))
+        self._announce_leaving(time_s - lag_s)
+        self._window_lag_s = lag_s
+        self._window.setSmootherLag(lag_s)
         try:
             self._window.update(self._pending, self._pending_values, times, list(removed_slots))
         except RuntimeError:
             self._give_up_cholesky(time_s)
             return
         self._clear_pending()
-        self.values.update(self._window.calculateEstimate())
-        if self.graph.size() >= self._restart_size and self._is_stale():
+        self._take_estimate()
+        if self._may_restart(time_s) and self._is_stale():
             self._restart(time_s)
+
+    def _announce_leaving(self, before_s: float) -> None:
+        if self._is_bounded:
+            leaving = {
+                key for key, t in self._expiring.items() if t < before_s and not self._pending_values.exists(key)
+            }
+            if leaving:
+                self.when_leaving(leaving)
+
+    def _take_estimate(self) -> None:
+        """The window's; a bounded one forgets what has left."""
+        estimate = self._window.calculateEstimate()
+        if not self._is_bounded:
+            self.values.update(estimate)
+            return
+        self.values = estimate
+        left = [key for key in self._expiring if not estimate.exists(key)]
+        for key in left:
+            del self._expiring[key]
+        self.sightlines.leave(set(left))
+        self._history.keep(self._window.getFactors(), left)
+
+    def _may_restart(self, time_s: float) -> bool:
+        if self._is_bounded:
+            return time_s >= self._restarted_s + self._lag_s
+        return self.graph.size() >= self._restart_size
 
     def _give_up_cholesky(self, time_s: float) -> None:
         """It met a pose 4096 times less certain than its step: QR has no such limit."""
@@ -246,20 +296,19 @@ class Smoother:
 
     def _restart(self, time_s: float) -> None:
         """Solve the history; start a window whose prior is the marginal of all that lies before it."""
-        self._restart_size = max(FIRST_RESTART, int(RESTART_GROWTH * self.graph.size()))
+        self._restart_size, self._restarted_s = max(FIRST_RESTART, int(RESTART_GROWTH * self.graph.size())), time_s
         self.values = self._solve()
-        lag_s = self._lag_at(time_s)
-        times: dict[Any, float] = {key: t for key, t in self._expiring.items() if t >= time_s - lag_s}
+        times: dict[Any, float] = {key: t for key, t in self._expiring.items() if t >= time_s - self._window_lag_s}
         times |= dict.fromkeys(self._landmarks, time_s)
-        inside, outside = _split(self.graph, set(times))
+        inside, outside = split(self.graph, set(times))
         values = gtsam.Values()
         for key in times:
-            _copy(self.values, key, values)
-        for factor in _marginal(outside, self.values, times):
+            copy(self.values, key, values)
+        for factor in marginal(outside, self.values, times):
             inside.push_back(factor)
-        self._window = self._new_window(lag_s)
+        self._window = self._new_window(self._window_lag_s)
         self._window.update(inside, values, times)
-        self.values.update(self._window.calculateEstimate())
+        self._take_estimate()
 
     def _solve(self) -> gtsam.Values:
         """Solve the history; again while a landmark is stuck behind the sonar and its new start lowers the error."""
@@ -273,6 +322,11 @@ class Smoother:
                 break
             values = retried
         return values
+
+    @property
+    def marginals(self) -> gtsam.ISAM2:
+        """What gives covariances of variables in the window."""
+        return self._window.getISAM2()
 
     def covariance(self, key: int) -> Floats:
         """Marginal covariance of a variable in the window."""
@@ -313,33 +367,3 @@ def _marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam
         return gtsam.Marginals(linear, values)
     except RuntimeError:
         return qr_tree(linear, values)
-
-
-def _split(
-    graph: gtsam.NonlinearFactorGraph, kept: set[int]
-) -> tuple[gtsam.NonlinearFactorGraph, gtsam.NonlinearFactorGraph]:
-    """Factors on kept variables only, and those that touch any other."""
-    inside, outside = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
-    for i in range(graph.size()):
-        factor = graph.at(i)
-        (inside if kept.issuperset(factor.keys()) else outside).push_back(factor)
-    return inside, outside
-
-
-def _marginal(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kept: Container[int]
-) -> list[gtsam.NonlinearFactor]:
-    """What a graph says about the kept variables alone, linearised at the values."""
-    if graph.size() == 0:
-        return []
-    linear = graph.linearize(values)
-    separator = [key for key in linear.keyVector() if key in kept]
-    marginal = linear.marginal(separator)
-    return [gtsam.LinearContainerFactor(marginal.at(i), values) for i in range(marginal.size())]
-
-
-def _copy(source: gtsam.Values, key: int, target: gtsam.Values) -> None:
-    if gtsam.Symbol(key).chr() == ord("x"):
-        target.insert(key, source.atPose3(key))
-    else:
-        target.insert(key, source.atPoint3(key))

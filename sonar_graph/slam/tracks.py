@@ -80,6 +80,15 @@ class Tracks:
             for sighting in track.waiting
         }
 
+    def leave(self, pose_keys: set[int]) -> list[tuple[Sighting, int]]:
+        """Let go of what was seen from some poses: the sightings that waited in vain, and what was decided of them."""
+        forgotten: list[tuple[Sighting, int]] = []
+        for track in self._by_number.values():
+            forgotten += [(old, track.identity) for old in track.waiting if old.line.pose_key in pose_keys]
+            track.waiting = [sighting for sighting in track.waiting if sighting.line.pose_key not in pose_keys]
+            track.settled = [sighting for sighting in track.settled if sighting.line.pose_key not in pose_keys]
+        return forgotten
+
     def forget(self, now_ns: int) -> list[tuple[Sighting, int]]:
         """Let go of what is too old: the sightings that waited in vain, and what their tracks had decided."""
         oldest_ns = now_ns - self._longest_wait_ns

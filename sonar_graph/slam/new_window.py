@@ -1,0 +1,38 @@
+"""What a new window is made of: a graph cut in two, and the part outside replaced by its marginal."""
+
+from __future__ import annotations
+
+from collections.abc import Container
+
+import gtsam
+
+
+def split(
+    graph: gtsam.NonlinearFactorGraph, kept: set[int]
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.NonlinearFactorGraph]:
+    """Factors on kept variables only, and those that touch any other."""
+    inside, outside = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+    for i in range(graph.size()):
+        factor = graph.at(i)
+        (inside if kept.issuperset(factor.keys()) else outside).push_back(factor)
+    return inside, outside
+
+
+def marginal(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kept: Container[int]
+) -> list[gtsam.NonlinearFactor]:
+    """What a graph says about the kept variables alone, linearised at the values."""
+    if graph.size() == 0:
+        return []
+    linear = graph.linearize(values)
+    separator = [key for key in linear.keyVector() if key in kept]
+    found = linear.marginal(separator)
+    return [gtsam.LinearContainerFactor(found.at(i), values) for i in range(found.size())]
+
+
+def copy(source: gtsam.Values, key: int, target: gtsam.Values) -> None:
+    """One variable, a pose or a point, from some values to others."""
+    if gtsam.symbolChr(key) == ord("x"):
+        target.insert(key, source.atPose3(key))
+    else:
+        target.insert(key, source.atPoint3(key))
