@@ -1,0 +1,240 @@
+"""Time and memory of the smoother with a bounded history over a mission of hours, tenth by tenth.
+
+The mission of `sonar_graph.simulation.mission`: a vehicle that goes round a loop of 40 m and passes the same landmarks
+again and again. Another process simulates it and writes its columns to files; this one reads a minute at a time, so
+that the log is never in the memory that is measured. The estimator is asked at each sonar frame, as users would.
+
+* ``decile_ratio``: processor time a keyframe, last tenth of the mission over the first;
+* ``max_update_ms``: the longest single call of `Isam2.process`, by the clock on the wall;
+* ``memory_growth_ratio``: resident memory in the last tenth over that at the end of the first, medians.
+
+Resident memory is that of the whole process. What the estimator keeps on purpose (outcomes of detections, poses at the
+instants asked) is in it; `--trace` counts what Python allocates too, by the line that did, at several times the run
+time.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+import tempfile
+import time
+import tracemalloc
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+import numpy as np
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from common import conclude, make_parser, note, print_table
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.measurements import Block, Depth, Dvl, Imu, LandmarkDetections, Measurements
+from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.states import Estimate
+
+TARGETS = {"decile_ratio": 1.3, "max_update_ms": 100.0, "memory_growth_ratio": 1.1}
+PIECE_S = 60.0
+TENTHS = 10
+BLOCKS: dict[str, type[Block]] = {"imu": Imu, "dvl": Dvl, "depth": Depth, "detections": LandmarkDetections}
+
+
+@dataclass(frozen=True)
+class StoredMission:
+    """A simulated mission in files: one for each column, and the calibration."""
+
+    folder: Path
+
+    @property
+    def calibration(self) -> Calibration:
+        """Of the vehicle."""
+        return Calibration.model_validate_json((self.folder / "calibration.json").read_text())
+
+    @property
+    def frames_ns(self) -> np.ndarray:
+        """Stamps of the frames with detections, within IMU and Doppler log."""
+        stamps = np.unique(np.load(self.folder / "detections.stamps_ns.npy"))
+        ends = [np.load(self.folder / f"{name}.stamps_ns.npy", mmap_mode="r")[-1] for name in ("imu", "dvl")]
+        return stamps[stamps < min(ends)]
+
+    def measurements(self) -> Iterator[Measurements]:
+        """What came between one frame and the next, from pieces of a minute."""
+        frames_ns = self.frames_ns
+        piece_ns = round(PIECE_S * NS_PER_S)
+        after_ns = int(np.iinfo(np.int64).min)
+        for first_ns in range(int(frames_ns[0]), int(frames_ns[-1]) + 1, piece_ns):
+            instants = frames_ns[(frames_ns >= first_ns) & (frames_ns < first_ns + piece_ns)]
+            if not len(instants):
+                continue
+            piece = {name: self._rows(name, after_ns, int(instants[-1])) for name in BLOCKS}
+            for end_ns in instants.tolist():
+                yield Measurements(end_ns, **{n: b.between(after_ns, end_ns) if b else None for n, b in piece.items()})
+                after_ns = end_ns
+
+    def _rows(self, name: str, after_ns: int, until_ns: int) -> Block | None:
+        """Rows after one stamp up to another, in memory of their own."""
+        stamps = np.load(self.folder / f"{name}.stamps_ns.npy", mmap_mode="r")
+        first, last = np.searchsorted(stamps, [after_ns, until_ns], side="right")
+        if first == last:
+            return None
+        columns = (np.load(path, mmap_mode="r")[first:last].copy() for path in _paths(self.folder, name))
+        return BLOCKS[name](*columns)
+
+    def true_positions(self, stamps_ns: np.ndarray) -> np.ndarray:
+        """Shape (n, 3), m."""
+        at, positions = np.load(self.folder / "truth_ns.npy"), np.load(self.folder / "truth.npy")
+        return np.column_stack([np.interp(stamps_ns, at, column) for column in positions.T])
+
+
+def _paths(folder: Path, name: str) -> list[Path]:
+    return [folder / f"{name}.{column.name}.npy" for column in fields(BLOCKS[name])]
+
+
+def store(options: MissionOptions, folder: Path) -> None:
+    """Simulate a mission and write it down."""
+    mission: Sequence = simulate_mission(options)
+    (folder / "calibration.json").write_text(mission.calibration.model_dump_json())
+    for name in BLOCKS:
+        for path in _paths(folder, name):
+            np.save(path, getattr(getattr(mission, name), path.stem.partition(".")[2]))
+    assert mission.truth is not None
+    np.save(folder / "truth_ns.npy", mission.truth.stamps_ns)
+    np.save(folder / "truth.npy", mission.truth.positions)
+
+
+@dataclass
+class Record:
+    """What was measured at each call."""
+
+    cpu_s: list[float] = field(default_factory=list)
+    wall_s: list[float] = field(default_factory=list)
+    keyframes: list[int] = field(default_factory=list)
+    resident_mb: list[float] = field(default_factory=list)
+    stamps_ns: list[int] = field(default_factory=list)
+    positions: list[np.ndarray] = field(default_factory=list)
+
+    def add(self, cpu_s: float, wall_s: float, keyframes: int, estimate: Estimate | None) -> None:
+        """One call."""
+        self.cpu_s.append(cpu_s)
+        self.wall_s.append(wall_s)
+        self.keyframes.append(keyframes)
+        self.resident_mb.append(resident_mb())
+        if estimate is not None:
+            self.stamps_ns.append(estimate.stamp_ns)
+            self.positions.append(estimate.world_T_body.translation())
+
+
+def resident_mb() -> float:
+    """Of this process, 10⁶ bytes."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def run(mission: StoredMission, params: Isam2Params) -> tuple[Isam2, Record]:
+    """The estimator over the whole mission."""
+    estimator, record = Isam2(mission.calibration, params), Record()
+    total, noted = len(mission.frames_ns), time.monotonic()
+    for step in mission.measurements():
+        cpu, wall = time.thread_time(), time.perf_counter()
+        estimate = estimator.process(step)
+        record.add(
+            time.thread_time() - cpu, time.perf_counter() - wall, estimator.keyframe_count, estimate
+        )
+        if time.monotonic() - noted > 10:
+            noted = time.monotonic()
+            note(f"{len(record.cpu_s)} of {total} frames, {record.resident_mb[-1]:.0f} MB")
+    return estimator, record
+
+
+def tenths(record: Record) -> list[dict[str, float]]:
+    """Time and memory of each tenth of the calls."""
+    rows = []
+    for part in np.array_split(np.arange(len(record.cpu_s)), TENTHS):
+        before = record.keyframes[part[0] - 1] if part[0] else 0
+        cpu_ms, wall_ms = 1e3 * np.array(record.cpu_s)[part], 1e3 * np.array(record.wall_s)[part]
+        keyframes = record.keyframes[part[-1]] - before
+        rows.append(
+            {
+                "keyframes": keyframes,
+                "keyframe_ms": float(cpu_ms.sum() / keyframes),
+                "max_cpu_ms": float(cpu_ms.max()),
+                "max_ms": float(wall_ms.max()),
+                "resident_mb": float(np.median(np.array(record.resident_mb)[part])),
+                "resident_end_mb": record.resident_mb[part[-1]],
+            }
+        )
+    return rows
+
+
+def report(mission: StoredMission, estimator: Isam2, record: Record) -> dict[str, float | int | bool]:
+    """Print the table; the figures by name."""
+    rows = tenths(record)
+    print_table(("tenth", *rows[0]), [(str(k), *row.values()) for k, row in enumerate(rows, start=1)])
+    wall_ms, cpu_ms = 1e3 * np.array(record.wall_s), 1e3 * np.array(record.cpu_s)
+    off_m = (np.array(record.positions) - mission.true_positions(np.array(record.stamps_ns)))[:, :2]
+    figures: dict[str, float | int | bool] = {
+        "decile_ratio": rows[-1]["keyframe_ms"] / rows[0]["keyframe_ms"],
+        "max_update_ms": float(wall_ms.max()),
+        "memory_growth_ratio": rows[-1]["resident_mb"] / rows[0]["resident_end_mb"],
+        "max_update_cpu_ms": float(cpu_ms.max()),
+        "p99_update_ms": float(np.quantile(wall_ms, 0.99)),
+        "median_update_ms": float(np.median(wall_ms)),
+        "keyframe_ms": float(cpu_ms.sum() / record.keyframes[-1]),
+        "resident_mb": record.resident_mb[-1],
+        "keyframes": record.keyframes[-1],
+        "frames": len(record.cpu_s),
+        "causal_error_m": float(np.sqrt(np.mean(np.sum(off_m**2, axis=1)))),
+        "process_s": float(cpu_ms.sum() / 1e3),
+    }
+    clock = time.perf_counter()
+    smoothed = estimator.trajectory()
+    figures["trajectory_s"] = time.perf_counter() - clock
+    off_m = (smoothed.positions - mission.true_positions(smoothed.stamps_ns))[:, :2]
+    figures["smoothed_error_m"] = float(np.sqrt(np.mean(np.sum(off_m**2, axis=1))))
+    figures["passed"] = all(figures[name] <= limit for name, limit in TARGETS.items())
+    return figures
+
+
+def simulated(options: MissionOptions, folder: Path) -> StoredMission:
+    """The mission, simulated by a process whose memory is not ours."""
+    child = multiprocessing.get_context("spawn").Process(target=store, args=(options, folder))
+    child.start()
+    child.join()
+    if child.exitcode:
+        raise SystemExit(child.exitcode)
+    return StoredMission(folder)
+
+
+def main() -> None:
+    parser = make_parser(__doc__)
+    parser.add_argument("--hours", type=float, help="of the mission (default: 8; with --quick 0.25)")
+    parser.add_argument("--landmarks", type=int, default=20)
+    parser.add_argument("--history", choices=["bounded", "whole"], default="bounded")
+    parser.add_argument("--trace", action="store_true", help="say which lines hold more memory at the end")
+    arguments = parser.parse_args()
+    hours = arguments.hours or (0.25 if arguments.quick else 8.0)
+    params = Isam2Params(history=arguments.history)
+    with tempfile.TemporaryDirectory() as first, tempfile.TemporaryDirectory() as second:
+        note("warming up: compiled functions load at their first use")
+        run(simulated(MissionOptions(duration_s=60.0), Path(first)), params)
+        note(f"simulating {hours:g} h")
+        options = MissionOptions(duration_s=3600 * hours, landmarks=arguments.landmarks)
+        mission = simulated(options, Path(second))
+        if arguments.trace:
+            tracemalloc.start(5)
+        figures = report(mission, *run(mission, params))
+    if arguments.trace:
+        for line in tracemalloc.take_snapshot().statistics("lineno")[:25]:
+            note(str(line))
+    for name, limit in TARGETS.items():
+        print(f"{name}: {figures[name]:.3f}, target at most {limit:g}")
+    is_quick = arguments.quick or hours < 8 or arguments.history != "bounded"
+    conclude({"hours": hours, "landmarks": arguments.landmarks, **figures}, is_quick=is_quick)
+
+
+if __name__ == "__main__":
+    main()
