@@ -7,15 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import HOLE_INTERVALS, SHORTEST_HOLE_S, Calibration
 from sonar_graph.doppler_beams import UNMEASURED_M_S
 from sonar_graph.measurements import Dvl, Imu, Ints
 
 MOST_NAMED = 3
 """Gaps of one kind that are named one by one; of more the longest."""
-FEW_INTERVALS = 5
-"""Typical intervals of the IMU without a sample, above which there is a hole: one lost sample does no harm."""
-SHORTEST_HOLE_S = 0.05
 
 Gaps = list[tuple[int, int]]
 """Stamps of the samples before and after, ns."""
@@ -25,7 +22,7 @@ def gap_warnings(imu: Imu, dvl: Dvl, calibration: Calibration) -> Iterator[str]:
     """What is assumed while nothing was measured, with times in seconds after the first instant with both.
 
     A Doppler log has a gap where estimators no longer take its velocity as linear (``dvl.gap_s``), an IMU where
-    `FEW_INTERVALS` typical intervals pass without a sample. Samples that hold for the time before them leave none.
+    `HOLE_INTERVALS` typical intervals pass without a sample. Samples that hold for the time before them leave none.
     """
     if calibration.odometry_interpolation == "hold-past":
         return
@@ -34,7 +31,7 @@ def gap_warnings(imu: Imu, dvl: Dvl, calibration: Calibration) -> Iterator[str]:
     if holes:
         yield (
             f"imu: no sample {_times(holes, start_ns)}: the turn in between is guessed from the rates before and "
-            f"after; heading and covariances are not to be trusted from there on"
+            f"after, with an error of imu.turn_sigma_rad_s; heading is as unsure from there on"
         )
     yield from _doppler(imu, dvl, round(calibration.dvl.gap_s * 1e9), start_ns)
 
@@ -72,7 +69,7 @@ def _holes(stamps_ns: Ints) -> Gaps:
     if len(stamps_ns) < 3:
         return []
     typical_ns = float(np.median(np.diff(stamps_ns)))
-    return _longer_than(int(max(FEW_INTERVALS * typical_ns, SHORTEST_HOLE_S * 1e9)), stamps_ns)
+    return _longer_than(int(max(HOLE_INTERVALS * typical_ns, SHORTEST_HOLE_S * 1e9)), stamps_ns)
 
 
 def _longer_than(longest_ns: int, stamps_ns: Ints) -> Gaps:

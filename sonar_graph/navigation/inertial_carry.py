@@ -21,12 +21,13 @@ import numpy as np
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.kernels import compiled, rotation_exp
+from sonar_graph.navigation.unmeasured_turns import UNFELT_NS, row_after_hole
 
 EARTH_RATE_RAD_S = 7.3e-5
 
 
 class InertialRows(NamedTuple):
-    """Of the IMU, body axes; specific forces are NaN where not measured."""
+    """Of the IMU, body axes; specific forces are NaN where not measured, and not used about holes."""
 
     stamps_ns: Ints
     rate: Floats
@@ -54,7 +55,8 @@ def carry(imu: InertialRows, stamps_ns: Ints, calibration: Calibration) -> Carry
     first = max(int(np.searchsorted(imu.stamps_ns, stamps_ns[0], side="right")) - 1, 0)
     rows = slice(first, known)
     imu = InertialRows(imu.stamps_ns[rows], imu.rate[rows], imu.specific_force[rows])
-    if not len(imu.stamps_ns) or not np.isfinite(imu.specific_force).all():
+    with_hole = row_after_hole(imu.stamps_ns, 0, len(imu.stamps_ns) - 1, UNFELT_NS) >= 0
+    if not len(imu.stamps_ns) or with_hole or not np.isfinite(imu.specific_force).all():
         return _nothing(len(stamps_ns), calibration.dvl.velocity_walk_density)
     times_ns = np.union1d(stamps_ns, imu.stamps_ns[imu.stamps_ns > stamps_ns[0]])
     middles_ns = times_ns[:-1] + np.diff(times_ns) // 2

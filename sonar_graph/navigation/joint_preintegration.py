@@ -22,14 +22,14 @@ from math import isfinite
 import gtsam
 import numpy as np
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import SHORTEST_HOLE_S, Calibration
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation import argument_checks as check
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.navigation.joint_recursion import Inertial, preintegrate
 from sonar_graph.navigation.joint_rules import RULES, DopplerRule
-from sonar_graph.navigation.long_intervals import refuse_beyond, with_rate_noise
+from sonar_graph.navigation.long_intervals import refuse_beyond, refuse_holes, with_rate_noise
 from sonar_graph.navigation.velocity_covariances import is_partial
 
 ROTATION, VELOCITY, POSITION, DISPLACEMENT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
@@ -172,6 +172,8 @@ class JointPreintegrator:
     """How a velocity is had between samples: `sonar_graph.navigation.joint_rules`."""
     longest_s: float = 1.5
     """Between Doppler samples for all rules but "inertial", which know nothing of the velocity there."""
+    longest_hole_s: float = SHORTEST_HOLE_S
+    """Between inertial rows where that is more than five typical intervals: nothing tells the turn in there."""
 
     def __post_init__(self) -> None:
         if self.rule not in RULES:
@@ -180,6 +182,7 @@ class JointPreintegrator:
         check.noise("accel_noise_density", self.accel_noise_density, 1)
         check.noise("velocity_sigma_m_s", self.velocity_sigma_m_s, 3)
         check.noise("longest_s", self.longest_s, 1)
+        check.noise("longest_hole_s", self.longest_hole_s, 1)
         for name, mounting in (("body_T_imu", self.body_T_imu), ("body_T_dvl", self.body_T_dvl)):
             if not isinstance(mounting, gtsam.Pose3):
                 raise CalibrationError(f"{name}: expected a gtsam.Pose3, not {type(mounting).__name__}")
@@ -228,14 +231,16 @@ class JointPreintegrator:
         Raises
         ------
         MeasurementError
-            When an end is no Doppler stamp, the inertial rows do not reach both ends, stamps repeat, a Doppler row in
-            between leaves a direction unmeasured or has no possible covariance, Doppler samples are too far apart for
-            the rule, it needs a specific force that was not measured, or bias or Earth rate are not of their shapes.
+            When an end is no Doppler stamp, the inertial rows do not reach both ends or have a hole, stamps repeat, a
+            Doppler row in between leaves a direction unmeasured or has no possible covariance, Doppler samples are too
+            far apart for the rule, it needs a specific force that was not measured, or bias or Earth rate are not of
+            their shapes.
         """
         if not (isinstance(imu, Imu) and isinstance(dvl, Dvl)):
             raise MeasurementError(f"imu, dvl: expected Imu and Dvl, not {type(imu).__name__} and {type(dvl).__name__}")
         check.order(start_ns, end_ns)
-        samples, inertial = _doppler_rows(dvl, start_ns, end_ns), _inertial_rows(imu, start_ns, end_ns)
+        samples = _doppler_rows(dvl, start_ns, end_ns)
+        inertial = _inertial_rows(imu, start_ns, end_ns, self.longest_hole_s)
         velocity, cov = self._in_body(samples)
         arms = self.body_T_imu.translation(), self.body_T_dvl.translation()
         arm = arms[1] - arms[0]
@@ -300,7 +305,7 @@ def _doppler_rows(dvl: Dvl, start_ns: int, end_ns: int) -> Dvl:
     return samples
 
 
-def _inertial_rows(imu: Imu, start_ns: int, end_ns: int) -> Imu:
+def _inertial_rows(imu: Imu, start_ns: int, end_ns: int, longest_hole_s: float) -> Imu:
     """Rows from the last at or before the start to the first at or after the end."""
     check.unit("Imu", imu.stamps_ns)
     first = int(np.searchsorted(imu.stamps_ns, start_ns, side="right")) - 1
@@ -311,6 +316,7 @@ def _inertial_rows(imu: Imu, start_ns: int, end_ns: int) -> Imu:
             f" {end_ns} ns; begin and end at Doppler samples within them"
         )
     check.rows("Imu", imu.stamps_ns, first, last)
+    refuse_holes(longest_hole_s, imu.stamps_ns, first, last)
     return imu.rows(slice(first, last + 1))
 
 

@@ -1,11 +1,12 @@
-"""What long times between Doppler samples ask of joint preintegration.
+"""What long times between rows ask of joint preintegration.
 
 Rule "inertial". What is straight in time is the velocity of the IMU's point less what the accelerometers gained; the
 log's own swings about it. Over long intervals the log's samples are therefore taken to the IMU's point by the gyros,
 ``z - w x l``, and the log's way about that point, ``(R_j - R_i) l``, is added (`joint_recursion`). The gyros' noise at
 the two ends is then one with that of the samples.
 
-All other rules know nothing of the velocity between two samples: they refuse long intervals.
+All other rules know nothing of the velocity between two samples: they refuse long intervals. No rule knows how the
+vehicle turned in a hole of the inertial rows (`sonar_graph.navigation.unmeasured_turns`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.joint_recursion import LONG_S
+from sonar_graph.navigation.unmeasured_turns import row_after_hole
 
 
 def refuse_beyond(longest_s: float, dvl_ns: Ints) -> None:
@@ -32,6 +34,23 @@ def refuse_beyond(longest_s: float, dvl_ns: Ints) -> None:
         raise MeasurementError(
             f"Dvl.stamps_ns: no row for {between_ns[k] * 1e-9:.3g} s after {dvl_ns[k]} ns, more than longest_s"
             f' ({longest_s:g} s); use the rule "inertial", or let sonar_graph.navigation.odometry.Odometry bridge it'
+        )
+
+
+def refuse_holes(longest_s: float, imu_ns: Ints, first: int, last: int) -> None:
+    """Raise where inertial rows, from one to another, are too far apart to tell how the vehicle turned.
+
+    Raises
+    ------
+    MeasurementError
+        Names the hole.
+    """
+    row = row_after_hole(imu_ns, first, last, round(longest_s * 1e9))
+    if row >= 0:
+        raise MeasurementError(
+            f"Imu.stamps_ns: no row for {(imu_ns[row] - imu_ns[row - 1]) * 1e-9:.3g} s after {imu_ns[row - 1]} ns: the"
+            " turn in there is not measured; begin a motion after it, let sonar_graph.navigation.odometry.Odometry"
+            f" bridge it, or set longest_hole_s ({longest_s:g} s) higher if the vehicle hardly turns"
         )
 
 

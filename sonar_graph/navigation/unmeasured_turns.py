@@ -81,6 +81,15 @@ def hole_ns(stamps: Ints, rows: int, row: int, until_ns: int) -> int:
     return length_ns if is_hole else 0
 
 
+@compiled
+def row_after_hole(stamps: Ints, first: int, last: int, longest_ns: int) -> int:
+    """The row after the first hole between two rows that lasts longer; -1 where there is none."""
+    for row in range(first + 1, last + 1):
+        if stamps[row] - stamps[row - 1] > longest_ns and hole_ns(stamps, len(stamps), row, stamps[row]) > 0:
+            return row
+    return -1
+
+
 @inlined
 def felt(force: Vector, turns: TurnValues, stamps: Ints, rows: int, row: int, until_ns: int) -> Vector:
     """The specific force up to an instant; NaN in a hole."""
