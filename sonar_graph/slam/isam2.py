@@ -35,11 +35,11 @@ class Isam2Params(Section):
 
     lag_s: float = Field(15.0, gt=0)
     """Poses older than this are marginalised out of the incremental solution; a large value keeps the whole history."""
-    max_keyframe_interval_s: float = Field(5.0, gt=0)
     history: Literal["whole", "bounded"] = "whole"
     """What is kept of poses older than the lag. "whole": everything, for the batch solution in `Isam2.trajectory`.
     "bounded": nothing but what they say of landmarks and bias, so that time and memory do not grow with the run;
     `Isam2.trajectory` is then what the lag allowed (docs/theory/bounded_memory.md)."""
+    max_keyframe_interval_s: float = Field(5.0, gt=0)
     """A keyframe is set at the latest after this time."""
     motion_noise_share: float = Field(0.1, ge=0)
     """While landmarks are seen, a keyframe is set sooner: once the variance of the motion since the last one exceeds
@@ -113,6 +113,11 @@ class Isam2:
         """
         return self._smoother.values
 
+    @property
+    def keyframe_count(self) -> int:
+        """Number of keyframes so far."""
+        return len(self._keyframes.stamps_ns)
+
     def process(self, measurements: Measurements) -> Estimate | None:
         """Take in measurements; the causal estimate at their end.
 
@@ -148,11 +153,6 @@ class Isam2:
             for stamp_ns, i in zip(
                 measurements.detections.stamps_ns.tolist(),
                 measurements.detections.most_probable()[0].tolist(),
-    @property
-    def keyframe_count(self) -> int:
-        """Number of keyframes so far."""
-        return len(self._keyframes.stamps_ns)
-
                 strict=True,
             ):
                 self._sightings.journal.record(stamp_ns, i, Outcome.LATE)
@@ -161,6 +161,7 @@ class Isam2:
         """The smoothed pose at every instant at which `process` returned an estimate.
 
         Solves the whole graph. Between keyframes the pose of the keyframe before is carried on by its own odometry.
+        With a bounded history that is the graph of the window; poses before it are as they were when they left.
         """
         return self._asked.trajectory(*self._smoother.solve_history())
 
@@ -185,7 +186,6 @@ class Isam2:
 
 
 def _check_noise(calibration: Calibration) -> None:
-        With a bounded history that is the graph of the window; poses before it are as they were when they left.
     """A graph weighs by the inverse of variances: none may be zero."""
     start = calibration.start
     zero = [

@@ -51,10 +51,6 @@ class LandmarkSightings:
         self._of[landmark_id][sighting] = None
         self._smoother.sightlines.add(L(landmark_id), sighting.line)
 
-    def exchange(self, leaving: Iterable[Sighting], coming: Iterable[tuple[Sighting, int]], time_s: float) -> None:
-        """Take sightings out of the graph, and put others in, each for a landmark, in one update of the smoother.
-
-        Where the earliest sighting of a landmark changes, the factors of the old and of the new one are made anew. A
     def leave(self, pose_keys: set[int]) -> None:
         """Poses leave a bounded window: what was seen from them is part of the graph for good.
 
@@ -67,6 +63,10 @@ class LandmarkSightings:
                 self._rooted.setdefault(landmark, sighting)
                 del sightings[sighting]
 
+    def exchange(self, leaving: Iterable[Sighting], coming: Iterable[tuple[Sighting, int]], time_s: float) -> None:
+        """Take sightings out of the graph, and put others in, each for a landmark, in one update of the smoother.
+
+        Where the earliest sighting of a landmark changes, the factors of the old and of the new one are made anew. A
         landmark that loses its last sighting leaves the graph.
         """
         self._smoother.flush(time_s)  # it may solve the history, and has to know every landmark of a sightline then
@@ -83,12 +83,12 @@ class LandmarkSightings:
         self._make([sighting for sighting, _ in new] + again, removed, before, time_s)
 
     def _first(self, landmark_id: int) -> Sighting | None:
+        if landmark_id in self._rooted:
+            return self._rooted[landmark_id]
         return min(self._of.get(landmark_id, {}), key=lambda s: (s.stamp_ns, s.row), default=None)
 
     def _take(self, sighting: Sighting) -> None:
         landmark = sighting.landmark_id
-        if landmark_id in self._rooted:
-            return self._rooted[landmark_id]
         if landmark is None:
             return
         del self._of[landmark][sighting]

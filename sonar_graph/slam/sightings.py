@@ -94,6 +94,11 @@ class Sightings:
         """Landmarks in the graph."""
         return self._landmarks.ids
 
+    def leave(self, pose_keys: set[int]) -> None:
+        """Poses leave a bounded window."""
+        self._landmarks.leave(pose_keys)
+        self._deferred.leave(pose_keys)
+
     def add(self, frame: LandmarkDetections) -> None:
         """Take in the detections of one frame."""
         stamp_ns = int(frame.stamps_ns[0])
@@ -105,11 +110,6 @@ class Sightings:
             return
         identities = identify(frame, self.policy.identity_probability)
         is_tracked = (frame.track != NO_TRACK) & self.policy.deferred_identity
-    def leave(self, pose_keys: set[int]) -> None:
-        """Poses leave a bounded window."""
-        self._landmarks.leave(pose_keys)
-        self._deferred.leave(pose_keys)
-
         if is_tracked.any():
             self.keyframes.update_if_due()
             self._deferred.hear(frame, decide(frame, self.policy.identity_probability), self.keyframes.newest_s)
