@@ -24,6 +24,7 @@ from sonar_graph.simulation.world import World
 RECOGNISED_PROBABILITY = 0.97
 OTHERS_PROBABILITY = 0.02
 UNRECOGNISED_PROBABILITY = 0.20
+NO_IDENTITY = -1
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,8 @@ class Recogniser:
     """Mean number (Poisson), uniform over range and azimuth."""
     confident_false_fraction: float = 0.0
     """Share of the false detections which are taken for a landmark with the confidence of a right one."""
+    anonymous_share: float = 0.0
+    """Share of all detections in which it names nothing."""
     tracking: Tracking | None = None
     """How it tracks; None: it does not, and each frame stands for itself."""
 
@@ -128,13 +131,15 @@ def simulate_detections(
         return None
     order = np.argsort(frame, kind="stable")
     range_azimuth = np.concatenate([true.range_azimuth, false.range_azimuth])[order]
+    is_anonymous = rng.spawn(1)[0].random((len(frame), 1)) < recogniser.anonymous_share
+    id_probability = np.concatenate([true.id_probability, false.id_probability])[order]
     return LandmarkDetections(
         stamps_ns=stamps_ns[frame[order]],
         range_m=range_azimuth[:, 0],
         azimuth_rad=range_azimuth[:, 1],
         range_azimuth_cov=np.tile(np.diag(sigmas**2), (len(frame), 1, 1)),
-        candidate_ids=np.tile(world.landmark_ids, (len(frame), 1)),
-        id_probability=np.concatenate([true.id_probability, false.id_probability])[order],
+        candidate_ids=np.where(is_anonymous, NO_IDENTITY, world.landmark_ids),
+        id_probability=np.where(is_anonymous, 0.0, id_probability),
         track=np.concatenate([true.track, false.track])[order],
     )
 

@@ -43,6 +43,8 @@ class SimulationOptions(Section):
     """With ``tracks``: nothing is believed of a track until it is that old."""
     wrong_id_share: float = Field(0.5, ge=0, le=1)
     """With ``tracks``: share of a track, once something is believed, in which a wrong identity is; 1: to its end."""
+    anonymous_share: float = Field(0.0, ge=0, le=1)
+    """Share of all detections, false ones as well, that come without any identity."""
     false_detections_per_frame: float = Field(0.02, ge=0)
     """Mean number of detections of nothing."""
     confident_false_fraction: float = Field(0.0, ge=0, le=1)

@@ -147,6 +147,7 @@ def _recogniser(options: SimulationOptions) -> Recogniser:
         wrong_id_rate=options.wrong_id_rate,
         false_detections_per_frame=options.false_detections_per_frame,
         confident_false_fraction=options.confident_false_fraction,
+        anonymous_share=options.anonymous_share,
         tracking=Tracking(options.id_delay_s, options.wrong_id_share) if options.tracks else None,
     )
 

@@ -23,6 +23,7 @@ from pydantic import Field
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import CalibrationError
 from sonar_graph.measurements import Measurements
+from sonar_graph.slam.anonymous_landmarks import AnonymousPolicy
 from sonar_graph.slam.asked import Anchored, Asked
 from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
 from sonar_graph.slam.sightings import SightingPolicy, Sightings
@@ -69,6 +70,29 @@ class Isam2Params(Section):
     longest_wait_s: float = Field(60.0, gt=0)
     """A detection waits at most so long for its identity. A track not seen for so long keeps the one it has."""
 
+    unknown_landmarks: Literal["ignore", "associate"] = "ignore"
+    """What becomes of detections that name no landmark: ``ignore`` refuses them; ``associate`` pairs them with
+    landmarks by geometry, and begins landmarks with identities from 3000000000 on (docs/theory/unknown_landmarks.md)."""
+    unknown_gate_probability: float = Field(0.99, gt=0, lt=1)
+    """A true pairing of a frame's detections with landmarks is jointly compatible with this probability."""
+    unknown_density_m2: float = Field(0.05, gt=0)
+    """Landmarks a square metre that may be there and are not in the map: the rival of every pairing."""
+    unknown_sightings: int = Field(5, ge=1)
+    """So many sightings of what is paired with no landmark begin one."""
+    unknown_wait_s: float = Field(10.0, gt=0)
+    """So long, and no longer than ``lag_s``, a sighting waits for them."""
+
+    def anonymous(self) -> AnonymousPolicy | None:
+        """What is believed of landmarks without identities; None: their detections are refused."""
+        if self.unknown_landmarks == "ignore":
+            return None
+        return AnonymousPolicy(
+            self.unknown_gate_probability,
+            self.unknown_density_m2,
+            self.unknown_sightings,
+            min(self.unknown_wait_s, self.lag_s),
+        )
+
 
 class Isam2:
     """Landmark SLAM by incremental smoothing (Kaess et al., iSAM2, IJRR 31(2), 2012).
@@ -95,7 +119,13 @@ class Isam2:
         policy = KeyframePolicy(p.max_keyframe_interval_s, p.motion_noise_share, p.bias_interval_s)
         self._keyframes = Keyframes(calibration, policy, self._smoother)
         sightings = SightingPolicy(
-            p.identity_probability, p.gate_probability, p.kernel, p.kernel_width, p.deferred_identity, p.longest_wait_s
+            p.identity_probability,
+            p.gate_probability,
+            p.kernel,
+            p.kernel_width,
+            p.deferred_identity,
+            p.longest_wait_s,
+            p.anonymous(),
         )
         self._sightings = Sightings(calibration, sightings, self._smoother, self._keyframes)
         self._asked = Asked()

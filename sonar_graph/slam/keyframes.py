@@ -7,6 +7,7 @@ The gyro bias is constant over stretches of ``bias_interval_s`` and walks betwee
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -91,6 +92,12 @@ class Keyframes:
     def newest_key(self) -> int:
         """Key of the newest keyframe."""
         return X(len(self.stamps_ns) - 1)
+
+    def oldest_key(self, age_s: float) -> int:
+        """Key of the first keyframe that is not older than the newest by more than an age (s)."""
+        if not self.stamps_ns:
+            return X(0)
+        return X(bisect_left(self.stamps_ns, self.stamps_ns[-1] - round(age_s / S_PER_NS)))
 
     def add(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None) -> None:
         """Take in rows; depths not newer than those that wait are passed over."""

@@ -41,6 +41,10 @@ class LandmarkSightings:
     def __contains__(self, landmark_id: object) -> bool:
         return landmark_id in self._of
 
+    def sightings(self, landmark_id: int) -> list[Sighting]:
+        """Those of a landmark."""
+        return list(self._of.get(landmark_id, {}))
+
     def stamps_ns(self, landmark_id: int) -> set[int]:
         """Frames that show a landmark."""
         return {sighting.stamp_ns for sighting in self._of.get(landmark_id, {})}

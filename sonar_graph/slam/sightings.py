@@ -12,6 +12,7 @@ from gtsam.symbol_shorthand import L
 from sonar_graph.calibration import Calibration, FloorPrior
 from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
+from sonar_graph.slam.anonymous_landmarks import AnonymousLandmarks, AnonymousPolicy, unnamed
 from sonar_graph.slam.association import DetectionJournal, Identities, gate_threshold, identify
 from sonar_graph.slam.deferred_identities import DeferredIdentities
 from sonar_graph.slam.factors import Robust
@@ -39,6 +40,8 @@ class SightingPolicy:
     """Whether detections of tracks are used once their identity is known, and moved when it turns out to be another."""
     longest_wait_s: float = 60.0
     """How long they wait for it."""
+    anonymous: AnonymousPolicy | None = None
+    """What is believed of landmarks without identities; None: their detections are refused."""
 
     def robust(self) -> Robust:
         """What wraps a noise model in the kernel."""
@@ -62,6 +65,8 @@ class Verdict(NamedTuple):
     """Shape (2,); None: nothing was expected."""
     S: Floats | None = None
     """Its covariance, shape (2, 2)."""
+    landmark_id: int | None = None
+    """Of which it is, where geometry said so."""
     sighting: Sighting | None = None
     """None where it did not come so far as to be tied to a keyframe."""
 
@@ -88,6 +93,12 @@ class Sightings:
         self._deferred = DeferredIdentities(
             self._landmarks, self.smoother, self.journal, gate, self.policy.longest_wait_s
         )
+        anonymous = self.policy.anonymous
+        self._anonymous = (
+            AnonymousLandmarks(self._landmarks, self.smoother, self._factors, self.journal, anonymous)
+            if anonymous
+            else None
+        )
 
     @property
     def ids(self) -> set[int]:
@@ -109,14 +120,20 @@ class Sightings:
                 self.journal.record(stamp_ns, landmark_id, late)
             return
         identities = identify(frame, self.policy.identity_probability)
-        is_tracked = (frame.track != NO_TRACK) & self.policy.deferred_identity
+        is_unnamed = unnamed(frame) & (self._anonymous is not None)
+        is_tracked = (frame.track != NO_TRACK) & self.policy.deferred_identity & ~is_unnamed
         if is_tracked.any():
             self.keyframes.update_if_due()
-            self._deferred.hear(frame, decide(frame, self.policy.identity_probability), self.keyframes.newest_s)
+            tracked = frame.rows(is_tracked)
+            self._deferred.hear(tracked, decide(tracked, self.policy.identity_probability), self.keyframes.newest_s)
         verdicts = self._judge(stamp_ns, frame, identities, is_tracked.tolist())
+        if is_unnamed.any():
+            seen = self._seen(frame, identities, is_unnamed.tolist(), np.flatnonzero(is_unnamed).tolist())
+            verdicts |= self._associate(stamp_ns, seen, verdicts)
         for row, (landmark_id, track) in enumerate(zip(identities.ids.tolist(), frame.track.tolist(), strict=True)):
             verdict = verdicts[row]
-            number = self.journal.record(stamp_ns, landmark_id, verdict.outcome, verdict.innovation, verdict.S)
+            paired_id = landmark_id if verdict.landmark_id is None else verdict.landmark_id
+            number = self.journal.record(stamp_ns, paired_id, verdict.outcome, verdict.innovation, verdict.S)
             if verdict.sighting is not None:
                 verdict.sighting.row = number
                 if is_tracked[row]:
@@ -125,6 +142,8 @@ class Sightings:
     def forget(self) -> None:
         """Let go of sightings that have waited too long for their identity."""
         self._deferred.forget(self.keyframes.advanced_ns)
+        if self._anonymous is not None:
+            self._anonymous.forget(self.keyframes.oldest_key(self._anonymous.longest_wait_s))
 
     def _judge(
         self, stamp_ns: int, frame: LandmarkDetections, identities: Identities, is_tracked: list[bool]
@@ -144,7 +163,7 @@ class Sightings:
         if is_unknown.any():
             cov[is_unknown] = self._default_cov
         ids: list[int] = identities.ids[rows].tolist()
-        return Seen(rows, ids, [L(i) for i in ids], [is_tracked[row] for row in rows], z, cov)
+        return Seen(rows, ids, [L(max(i, 0)) for i in ids], [is_tracked[row] for row in rows], z, cov)
 
     def _use(self, stamp_ns: int, seen: Seen, refusals: list[Outcome | None]) -> dict[int, Verdict]:
         """Add the factors of a frame's landmarks, keep what is refused but tracked; what became of each, by row."""
@@ -188,7 +207,7 @@ class Sightings:
             sighting.outcome = Outcome.USED if inside[k] else Outcome.GATED
             if inside[k]:
                 self._enter(sighting, seen.ids[k], is_first=False)
-            verdicts[seen.rows[k]] = Verdict(sighting.outcome, found.innovation[k], found.S[k], sighting)
+            verdicts[seen.rows[k]] = Verdict(sighting.outcome, found.innovation[k], found.S[k], sighting=sighting)
         return verdicts
 
     def _sight_first(self, view: View, tie: Tie, seen: Seen) -> dict[int, Verdict]:
@@ -217,6 +236,29 @@ class Sightings:
                 sighting.outcome = Outcome.REPEATED
             verdicts[row] = Verdict(sighting.outcome, sighting=sighting)
         return verdicts
+
+    def _associate(self, stamp_ns: int, seen: Seen, named: dict[int, Verdict]) -> dict[int, Verdict]:
+        """Pair what has no identity with landmarks by geometry; what became of each, by row."""
+        anonymous = self._anonymous
+        if anonymous is None:
+            return {}
+        self.keyframes.update_if_due()
+        anonymous.forget(self.keyframes.oldest_key(anonymous.longest_wait_s))
+        motion = self.keyframes.motion_since_newest(stamp_ns)
+        view = self._view(motion, anonymous.keys())
+        if anonymous.merge(view.covariance, self.keyframes.newest_s):
+            view = self._view(motion, anonymous.keys())
+        taken = {v.sighting.landmark_id for v in named.values() if v.sighting and v.sighting.landmark_id is not None}
+        paired = anonymous.pair(view, seen.z, seen.cov, taken)
+        motion = self.keyframes.set_for_frame(stamp_ns, motion)
+        tie = Tie.between(motion, self.keyframes.newest_key, self._body_T_sonar, stamp_ns)
+        sightings = self._sightings(view, tie, seen, np.zeros((len(seen.rows), 3)))
+        anonymous.use(sightings, paired, self.keyframes.newest_s)
+        self.keyframes.update_if_due()
+        return {
+            row: Verdict(s.outcome, found.innovation, found.S, s.landmark_id, s)
+            for row, s, found in zip(seen.rows, sightings, paired, strict=True)
+        }
 
     def _floor_under(self, view: View, range_m: float, azimuth_rad: float) -> FloorPrior | None:
         """The known floor, unless it is implausibly far from the point on the centre beam (`FLOOR_GATE`)."""

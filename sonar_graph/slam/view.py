@@ -31,6 +31,19 @@ class Comparison:
     """The larger of the expected variances relative to the noise, shape (m,): how much a detection has to tell."""
 
 
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A point that is not in the graph, as located from a keyframe that is."""
+
+    pose_key: int
+    point: Floats
+    """In the world, shape (3,), m."""
+    by_pose: Floats
+    """Its derivative by the keyframe, shape (3, 6)."""
+    cov: Floats
+    """Of the point, seen from the keyframe, shape (3, 3), m²."""
+
+
 class View:
     """A frame, seen from a keyframe whose estimate and covariance are known.
 
@@ -66,7 +79,8 @@ class View:
         self.world_T_sonar = world_T_keyframe.compose(keyframe_T_sonar)
         """The sonar at the frame."""
         self._world_T_keyframe = world_T_keyframe
-        self._covariance = covariance
+        self.covariance = covariance
+        """Of the keyframe, the bias and the landmarks, together."""
         self._pose_row = covariance.rows[pose_key]
         self._bias_row = ABSENT if bias_key is None else covariance.rows[bias_key]
         self._world_T_sonar = self.world_T_sonar.matrix()
@@ -82,7 +96,7 @@ class View:
         by_keyframe = _height_derivative(self._world_T_keyframe, point)
         by_body = _height_derivative(self._world_T_keyframe.compose(self._motion.i_T_j), point)
         r = self._pose_row
-        P = self._covariance.matrix[r : r + 6, r : r + 6]
+        P = self.covariance.matrix[r : r + 6, r : r + 6]
         return float(by_keyframe @ P @ by_keyframe + by_body @ self._motion.covariance @ by_body)
 
     def expect(self, keys: list[int], points: Floats) -> tuple[Floats, Floats]:
@@ -92,19 +106,43 @@ class View:
         -------
         Range (m) and azimuth (rad), shape (m, 2), and their covariances, shape (m, 2, 2).
         """
-        rows = np.array([self._covariance.rows[key] for key in keys], dtype=np.int64)
+        rows = np.array([self.covariance.rows[key] for key in keys], dtype=np.int64)
         return _expect(
             points,
             rows,
             self._pose_row,
             self._bias_row,
-            self._covariance.matrix,
+            self.covariance.matrix,
             self._world_T_sonar,
             self._to_keyframe,
             self._to_body,
             self._motion.D_bias,
             self._motion.covariance,
         )
+
+    def expect_jointly(self, keys: list[int], points: Floats, sources: list[Source]) -> tuple[Floats, Floats]:
+        """What landmarks of the graph, shape (m, 3), and points that are not in it are expected to show, all together.
+
+        Returns
+        -------
+        Range (m) and azimuth (rad), shape (m + s, 2), and their joint covariance, shape (2 (m + s), 2 (m + s)).
+        """
+        everywhere = np.concatenate([points.reshape(-1, 3), *(source.point[None] for source in sources)])
+        predicted, by_state, by_motion = _derivatives(
+            everywhere, self._world_T_sonar, self._to_keyframe, self._to_body, self._motion.D_bias
+        )
+        H, own = np.zeros((len(everywhere), 2, len(self.covariance.matrix))), np.zeros((len(everywhere), 2, 2))
+        H[:, :, self._pose_row : self._pose_row + 6] = by_state[:, :, :6]
+        if self._bias_row != ABSENT:
+            H[:, :, self._bias_row : self._bias_row + 3] = by_state[:, :, 6:9]
+        for k, key in enumerate(keys):
+            row = self.covariance.rows[key]
+            H[k, :, row : row + 3] = by_state[k, :, 9:]
+        for k, source in enumerate(sources, start=len(keys)):
+            row, by_point = self.covariance.rows[source.pose_key], by_state[k, :, 9:]
+            H[k, :, row : row + 6] += by_point @ source.by_pose
+            own[k] = by_point @ source.cov @ by_point.T
+        return predicted, _joint_cov(H, self.covariance.matrix, by_motion, self._motion.covariance, own)
 
     def compare(self, keys: list[int], points: Floats, z: Floats, cov: Floats) -> Comparison:
         """Detections z, shape (m, 2), with noise (m, 2, 2), of landmarks at points of the world, shape (m, 3)."""
@@ -116,6 +154,15 @@ class View:
         The motion's part is added to each variance; that it correlates range and azimuth a little is left out.
         """
         return _blurred(cov, points, self._world_T_sonar, self._to_body, motion.covariance)
+
+
+def _joint_cov(H: Floats, P: Floats, by_motion: Floats, motion_cov: Floats, own: Floats) -> Floats:
+    n = 2 * len(H)
+    H, G = H.reshape(n, -1), by_motion.reshape(n, 6)
+    joint = H @ P @ H.T + G @ motion_cov @ G.T
+    for k, cov in enumerate(own):
+        joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += cov
+    return np.asarray(0.5 * (joint + joint.T))
 
 
 def _height_derivative(world_T_body: gtsam.Pose3, point: Floats) -> Floats:
@@ -160,18 +207,11 @@ def _expect(
     D_bias: Floats,
     motion_cov: Floats,
 ) -> tuple[Floats, Floats]:
-    sonar_R_world = np.ascontiguousarray(world_T_sonar[:3, :3].T)
-    predicted, covs = np.empty((len(points), 2)), np.empty((len(points), 2, 2))
+    predicted, by_state, by_body = _derivatives(points, world_T_sonar, to_keyframe, to_body, D_bias)
+    covs = np.empty((len(points), 2, 2))
     place = np.full(12, ABSENT)
-    H, P = np.zeros((2, 12)), np.zeros((12, 12))
+    P = np.zeros((12, 12))
     for k in range(len(points)):
-        q = sonar_R_world @ (points[k] - world_T_sonar[:3, 3])
-        predicted[k], D_q = project(q)
-        by_sonar = _by_sonar_pose(q, D_q)
-        by_body = by_sonar @ to_body
-        H[:, :6] = by_sonar @ to_keyframe
-        H[:, 6:9] = by_body @ D_bias
-        H[:, 9:] = D_q @ sonar_R_world
         for r in range(12):
             place[r] = pose_row + r if r < 6 else rows[k] + r - 9
             if 6 <= r < 9:
@@ -179,8 +219,28 @@ def _expect(
         for r in range(12):
             for c in range(12):
                 P[r, c] = 0.0 if place[r] == ABSENT or place[c] == ABSENT else joint[place[r], place[c]]
-        covs[k] = H @ P @ H.T + by_body @ motion_cov @ by_body.T
+        covs[k] = by_state[k] @ P @ by_state[k].T + by_body[k] @ motion_cov @ by_body[k].T
     return predicted, covs
+
+
+@compiled
+def _derivatives(
+    points: Floats, world_T_sonar: Floats, to_keyframe: Floats, to_body: Floats, D_bias: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """What points show, (m, 2); its derivatives by keyframe, bias and point, (m, 2, 12), and by motion, (m, 2, 6)."""
+    sonar_R_world = np.ascontiguousarray(world_T_sonar[:3, :3].T)
+    predicted = np.empty((len(points), 2))
+    by_state, by_motion = np.empty((len(points), 2, 12)), np.empty((len(points), 2, 6))
+    for k in range(len(points)):
+        q = sonar_R_world @ (points[k] - world_T_sonar[:3, 3])
+        predicted[k], D_q = project(q)
+        by_sonar = _by_sonar_pose(q, D_q)
+        by_body = by_sonar @ to_body
+        by_state[k, :, :6] = by_sonar @ to_keyframe
+        by_state[k, :, 6:9] = by_body @ D_bias
+        by_state[k, :, 9:] = D_q @ sonar_R_world
+        by_motion[k] = by_body
+    return predicted, by_state, by_motion
 
 
 @compiled

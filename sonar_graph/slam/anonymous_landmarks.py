@@ -1,0 +1,240 @@
+"""Landmarks that nothing but their place tells apart.
+
+Detections without an identity are paired with the landmarks of the graph, named ones too, by joint compatibility
+(`sonar_graph.slam.joint_compatibility`). What is left waits, tied to its keyframe, and is paired with what waits of
+earlier frames. Once enough sightings of one candidate place it well enough, they become factors, each on the keyframe
+at which it was made, and the candidate a landmark. Landmarks that turn out to be one are merged
+(`sonar_graph.slam.landmark_merging`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from gtsam.symbol_shorthand import L
+from numpy.typing import NDArray
+
+from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.slam.association import DetectionJournal
+from sonar_graph.slam.joint_compatibility import UNPAIRED, Innovations, believed, pair_jointly
+from sonar_graph.slam.joint_covariance import JointCovariance
+from sonar_graph.slam.landmark_merging import LandmarkMerging
+from sonar_graph.slam.landmark_sightings import LandmarkSightings
+from sonar_graph.slam.models import wrap_angle
+from sonar_graph.slam.placing import place, source
+from sonar_graph.slam.sighting import Sighting, SightingFactors
+from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.view import View
+from sonar_graph.states import Outcome
+
+FIRST_ANONYMOUS_ID = 3_000_000_000
+"""Landmarks without a name get this identity and the following ones; those of designs end at 2^31 - 1."""
+ODDS = 10.0
+"""How much more likely a pairing must be than that the detection is of a landmark which is not in the map."""
+LARGEST_SIGMA_SHARE = 0.1
+"""A candidate is placed well enough when its largest standard deviation, seen from the poses, is this share of its
+range: a point that far off still looks linear."""
+
+
+@dataclass(frozen=True)
+class AnonymousPolicy:
+    """What is believed of landmarks without identities."""
+
+    gate_probability: float
+    """A true pairing is jointly compatible with this probability."""
+    density_m2: float
+    """Landmarks a square metre of floor that may be there and are not in the map."""
+    least_sightings: int
+    """So many of a candidate make a landmark."""
+    longest_wait_s: float
+    """A sighting waits for them until its keyframe is so much older than the newest one."""
+
+    @property
+    def log_rival(self) -> float:
+        """Logarithm of the density, 1/m², that a pairing has to exceed."""
+        return math.log(ODDS * self.density_m2)
+
+
+def unnamed(frame: LandmarkDetections) -> NDArray[np.bool_]:
+    """Which rows name no landmark at all, neither one nor several in doubt, shape (n,)."""
+    return np.asarray((frame.candidate_ids < 0).all(axis=1))
+
+
+@dataclass(eq=False)
+class Candidate:
+    """Sightings of what may be a landmark, in the order of time."""
+
+    sightings: list[Sighting] = field(default_factory=list)
+
+
+class Paired(NamedTuple):
+    """What a detection was paired with."""
+
+    landmark_id: int | None
+    """A landmark of the graph."""
+    candidate: Candidate | None
+    """None beside it: of neither."""
+    innovation: Floats | None = None
+    """Against a landmark, shape (2,)."""
+    S: Floats | None = None
+    """Its covariance, shape (2, 2)."""
+
+
+class AnonymousLandmarks:
+    """Pairs detections without identities, and begins and merges landmarks.
+
+    Parameters
+    ----------
+    landmarks, smoother
+        The graph.
+    maker
+        Makes factors.
+    journal
+        Its rows are amended when sightings are used later, or forgotten, and when landmarks are merged.
+    policy
+        What is believed.
+    """
+
+    def __init__(
+        self,
+        landmarks: LandmarkSightings,
+        smoother: Smoother,
+        maker: SightingFactors,
+        journal: DetectionJournal,
+        policy: AnonymousPolicy,
+    ) -> None:
+        self._landmarks = landmarks
+        self._smoother = smoother
+        self._maker = maker
+        self._journal = journal
+        self._policy = policy
+        self._merging = LandmarkMerging(landmarks, policy.gate_probability, policy.log_rival)
+        self._candidates: list[Candidate] = []
+        self._next_id = FIRST_ANONYMOUS_ID
+
+    @property
+    def longest_wait_s(self) -> float:
+        """Age, against the newest keyframe, of the oldest keyframes on which sightings may wait."""
+        return self._policy.longest_wait_s
+
+    def keys(self) -> list[int]:
+        """Variables whose joint covariance pairing needs: all landmarks, and keyframes that saw candidates."""
+        seen_from = [candidate.sightings[-1].line.pose_key for candidate in self._candidates]
+        return [*(L(i) for i in sorted(self._landmarks.ids)), *sorted(set(seen_from))]
+
+    def pair(self, view: View, z: Floats, noise: Floats, taken: set[int]) -> list[Paired]:
+        """Landmark or candidate of each detection of a frame: landmarks first, candidates for what is left.
+
+        Parameters
+        ----------
+        z, noise
+            Range (m) and azimuth (rad), shape (m, 2), and their covariance, shape (m, 2, 2).
+        taken
+            Landmarks that are named in this frame.
+        """
+        values = self._smoother.values
+        ids = sorted(self._landmarks.ids - taken)
+        keys = [L(i) for i in ids]
+        points = np.array([values.atPoint3(key) for key in keys])
+        sources = [source(candidate.sightings[-1], values, self._maker) for candidate in self._candidates]
+        if not keys and not sources:
+            return [Paired(None, None)] * len(z)
+        expected, cov = view.expect_jointly(keys, points, sources)
+        of_landmarks = _choose(z, noise, expected[: len(ids)], cov[: 2 * len(ids), : 2 * len(ids)], self._policy)
+        left = [i for i, (landmark, *_) in enumerate(of_landmarks) if landmark == UNPAIRED]
+        of_candidates = _choose(
+            z[left], noise[left], expected[len(ids) :], cov[2 * len(ids) :, 2 * len(ids) :], self._policy
+        )
+        paired = [Paired(ids[j], None, e, S) if j != UNPAIRED else Paired(None, None) for j, e, S in of_landmarks]
+        for i, (j, *_) in zip(left, of_candidates, strict=True):
+            paired[i] = Paired(None, self._candidates[j] if j != UNPAIRED else None)
+        return paired
+
+    def use(self, sightings: list[Sighting], paired: list[Paired], time_s: float) -> None:
+        """Add what was paired with landmarks; the rest waits, until a candidate becomes a landmark."""
+        for sighting, (landmark_id, candidate, _, S) in zip(sightings, paired, strict=True):
+            if landmark_id is not None and S is not None:
+                self._smoother.waiting_gain += float((np.diag(S) / np.diag(sighting.noise)).max()) - 1.0
+                made = self._maker.make(sighting, L(landmark_id), is_first=False)
+                self._landmarks.enter(sighting, landmark_id, self._smoother.add(made))
+                sighting.outcome = Outcome.USED
+                continue
+            if candidate is None:
+                candidate = Candidate()
+                self._candidates.append(candidate)
+            candidate.sightings.append(sighting)
+            if self._is_placed(candidate):
+                self._begin(candidate, time_s)
+
+    def _is_placed(self, candidate: Candidate) -> bool:
+        if len(candidate.sightings) < self._policy.least_sightings:
+            return False
+        _, cov = place(candidate.sightings, self._smoother.values, self._maker)
+        range_m = candidate.sightings[-1].line.z[0]
+        return bool(np.linalg.eigvalsh(cov)[-1] <= (LARGEST_SIGMA_SHARE * range_m) ** 2)
+
+    def _begin(self, candidate: Candidate, time_s: float) -> None:
+        """A candidate becomes a landmark. The row of its newest sighting, which has none yet, says so."""
+        landmark_id, self._next_id = self._next_id, self._next_id + 1
+        self._candidates.remove(candidate)
+        *earlier, newest = candidate.sightings
+        for sighting in earlier:
+            sighting.outcome = Outcome.USED_LATER
+            self._journal.amend(sighting.row, sighting.outcome, landmark_id)
+        newest.outcome = Outcome.NEW
+        self._landmarks.exchange([], [(sighting, landmark_id) for sighting in candidate.sightings], time_s)
+
+    def merge(self, covariance: JointCovariance, time_s: float) -> bool:
+        """Merge the two landmarks that are most likely one, if any are; whether any were.
+
+        The sightings of one become those of the other: the graph is then that of a run that had known.
+
+        Parameters
+        ----------
+        covariance
+            Joint, of all landmarks.
+        """
+        anonymous = [i for i in self._landmarks.ids if i >= FIRST_ANONYMOUS_ID]
+        named = [i for i in self._landmarks.ids if i < FIRST_ANONYMOUS_ID]
+        found = self._merging.nearest(self._smoother.values, covariance, sorted(named), anonymous)
+        if found is None:
+            return False
+        stays, goes = found
+        moving = self._landmarks.sightings(goes)
+        for sighting in moving:
+            sighting.outcome = Outcome.MOVED
+            self._journal.amend(sighting.row, sighting.outcome, stays)
+        self._landmarks.exchange(moving, [(sighting, stays) for sighting in moving], time_s)
+        return True
+
+    def forget(self, oldest_pose_key: int) -> None:
+        """Let go of sightings on older keyframes than one."""
+        for candidate in self._candidates:
+            for sighting in candidate.sightings:
+                if sighting.line.pose_key < oldest_pose_key:
+                    sighting.outcome = Outcome.FORGOTTEN
+                    self._journal.amend(sighting.row, sighting.outcome)
+            candidate.sightings = [s for s in candidate.sightings if s.outcome is Outcome.WAITING]
+        self._candidates = [candidate for candidate in self._candidates if candidate.sightings]
+
+
+def _choose(
+    z: Floats, noise: Floats, expected: Floats, cov: Floats, policy: AnonymousPolicy
+) -> list[tuple[int, Floats | None, Floats | None]]:
+    """For each detection the index of what it is paired with, the innovation and its covariance."""
+    if not len(z) or not len(expected):
+        return [(UNPAIRED, None, None)] * len(z)
+    e = z[:, None] - expected[None]
+    for i, j in np.ndindex(e.shape[:2]):
+        e[i, j, 1] = wrap_angle(e[i, j, 1])
+    innovations = Innovations(e, cov, noise)
+    pairing = believed(
+        innovations, pair_jointly(innovations, policy.gate_probability), policy.log_rival + np.log(z[:, 0])
+    )
+    return [
+        (j, e[i, j], cov[2 * j : 2 * j + 2, 2 * j : 2 * j + 2] + noise[i]) if j != UNPAIRED else (UNPAIRED, None, None)
+        for i, j in enumerate(pairing.landmarks)
+    ]
