@@ -11,7 +11,16 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration, Mounting
 from sonar_graph.doppler_beams import UNMEASURED_M_S
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.dvl_against_imu import DvlMatch, match_dvl_to_imu
+from sonar_graph.navigation.differenced_fit import Stretch, fit, rate_noise_power
+from sonar_graph.navigation.dvl_against_imu import (
+    DvlMatch,
+    _line_up,
+    _without_shared_noise,
+    match_dvl_to_imu,
+    stretches_of,
+)
+from sonar_graph.navigation.inertial_path import InertialPath
+from sonar_graph.navigation.offset_search import OffsetFit
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 
@@ -143,3 +152,31 @@ def test_the_gyro_bias_is_found_in_body_axes():
     found = match_dvl_to_imu(Imu(run.imu.stamps_ns, own[0] + bias, own[1]), run.dvl, calibration)
     for one, true in zip(found.gyro_bias, on_its_side.apply(bias), strict=True):
         assert abs(one.value - true) < 4 * one.sigma < 0.3 * np.linalg.norm(bias)
+
+
+def test_what_the_shared_noise_adds_is_taken_off_every_parameter_and_the_offset():
+    """The column of the scale holds it: see the same law, with noise, of `differenced_fit`."""
+    rng, m = np.random.default_rng(3), 30
+    B = np.tile(np.eye(3), (m, 1, 1))
+    stretch = Stretch(rng.standard_normal((m, 3)), rng.standard_normal((m, 3, 14)), B, np.ones(m))
+    found = fit([stretch], np.full(14, 10.0), np.array([0.5, 0.1]))
+    corrected = _without_shared_noise(OffsetFit(found, 0.3, ""), [stretch])
+    added = found.covariance[:, 1] * rate_noise_power([stretch], found.ratios)
+    assert corrected.fit.parameters == pytest.approx(found.parameters - added, rel=1e-9)
+    assert corrected.offset_s == pytest.approx(0.3 - added[0], rel=1e-9)
+    assert added[1] > 0.1 * np.sqrt(found.covariance[1, 1])
+
+
+def test_the_third_axis_of_a_stretch_is_the_vertical_and_does_not_walk():
+    """However the IMU lies: gravity is all in the third, 9.81 m/s in each second, the others have what is driven."""
+    imu, dvl = on_a_plane(np.zeros(3))
+    lying = Rotation.from_euler("ZYX", [0.4, -0.8, 2.0])
+    turned = [lying.apply(columns) for columns in (imu.angular_velocity, imu.specific_force, dvl.velocity)]
+    path = InertialPath.of(Imu(imu.stamps_ns, turned[0], turned[1]))
+    seconds = path.since_origin(dvl.stamps_ns)[:-50]
+    stretches = _line_up(path, seconds, turned[2][:-50], list(stretches_of(seconds)), np.zeros(3), 0.0)
+    assert len(stretches) > 3
+    for stretch in stretches:
+        assert stretch.walks == (True, True, False)
+        assert stretch.y[:, 2] / stretch.duration_s == pytest.approx(-9.81, abs=0.1)
+        assert np.abs(stretch.y[:, :2]).max() < 0.3
