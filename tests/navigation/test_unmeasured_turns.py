@@ -1,0 +1,197 @@
+"""How far a vehicle turns while no inertial row comes: against drawn processes, and what it must not touch."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sonar_graph.calibration import Calibration, ImuCalibration
+from sonar_graph.errors import MeasurementError
+from sonar_graph.measurements import Imu
+from sonar_graph.navigation.dvl_preintegration import Preintegrator
+from sonar_graph.navigation.joint_preintegration import JointPreintegrator
+from sonar_graph.navigation.node_motion import motion_between_nodes, motion_since_node
+from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation.unmeasured_turns import closed_variance, hole_ns, open_variance
+
+from .rows import NS, T0_NS, dvl, imu, stamps
+
+MS = 1_000_000
+STILL = ImuCalibration(turn_sigma_rad_s=(0.0, 0.0, 0.0))
+BEGIN_S, END_S = 3.0, 5.0
+
+
+def at(seconds):
+    return T0_NS + round(seconds * NS)
+
+
+def with_hole(begin_s=BEGIN_S, end_s=END_S, seconds=8.0):
+    """A vehicle that turns evenly; the rows of a 100 Hz IMU but those of the hole."""
+    rows = imu(stamps(100, seconds), [0.01, -0.02, 0.1])
+    t = (rows.stamps_ns - T0_NS) * 1e-9
+    return rows.rows((t <= begin_s + 1e-6) | (t >= end_s - 1e-6))
+
+
+def odometry_of(imu_rows, calibration, velocity=(0.4, 0.0, 0.0), seconds=8.0):
+    odometry = Odometry(calibration)
+    odometry.add(imu_rows, dvl(stamps(5, seconds), velocity))
+    return odometry, Preintegrator.from_calibration(calibration)
+
+
+def turn_variances(imu_rows, start_s, end_s, calibration=None, between=motion_between_nodes):
+    odometry, preintegrator = odometry_of(imu_rows, calibration or Calibration())
+    return np.diag(between(odometry, preintegrator, at(start_s), at(end_s), np.zeros(3), None).covariance)[:3]
+
+
+def drawn_rates(sigma, time_s, seconds, dt, runs):
+    """Of the process of the module, by its covariance function."""
+    t = np.arange(round(seconds / dt) + 1) * dt
+    u = np.abs(t[:, None] - t) / time_s
+    root = np.linalg.cholesky(sigma**2 * ((1 + u) * np.exp(-u) + 1e-10 * np.eye(len(t))))
+    return np.random.default_rng(0).standard_normal((runs, len(t))) @ root.T
+
+
+@pytest.mark.parametrize("length_s", [0.5, 2.0, 10.0])
+def test_the_variances_are_those_of_drawn_rates(length_s):
+    """Of the trapezoid by both ends, and of the first rate held."""
+    sigma, time_s, dt = 0.2, 1.5, length_s / 400
+    w = drawn_rates(sigma, time_s, length_s, dt, 6000)
+    turned = dt * (w.sum(axis=1) - 0.5 * (w[:, 0] + w[:, -1]))
+    closed = np.var(turned - length_s * (w[:, 0] + w[:, -1]) / 2)
+    opened = np.var(turned - length_s * w[:, 0])
+    assert closed_variance(sigma, time_s, length_s) == pytest.approx(closed, rel=0.06)
+    assert open_variance(sigma, time_s, length_s) == pytest.approx(opened, rel=0.06)
+
+
+@pytest.mark.parametrize(("variance", "power", "share"), [(closed_variance, 5, 30), (open_variance, 4, 4)])
+def test_short_holes_follow_their_series_without_a_step(variance, power, share):
+    lengths = np.geomspace(0.003, 0.3, 60)
+    found = np.array([variance(1.0, 1.0, a) for a in lengths])
+    assert found[0] == pytest.approx(lengths[0] ** power / share, rel=3e-3)
+    slopes = np.diff(np.log(found)) / np.diff(np.log(lengths))
+    assert np.all(np.abs(slopes - power) < 0.2)
+
+
+def test_a_hole_is_longer_than_five_typical_intervals_and_a_twentieth_of_a_second():
+    quick = T0_NS + 10 * MS * np.arange(12)
+    assert hole_ns(np.append(quick, quick[-1] + 51 * MS), 13, 12, 0) == 51 * MS
+    assert hole_ns(np.append(quick, quick[-1] + 50 * MS), 13, 12, 0) == 0
+    slow = T0_NS + 100 * MS * np.arange(12)
+    assert hole_ns(np.append(slow, slow[-1] + 499 * MS), 13, 12, 0) == 0
+    assert hole_ns(np.append(slow, slow[-1] + 501 * MS), 13, 12, 0) == 501 * MS
+
+
+def test_an_open_hole_lasts_from_the_last_known_row():
+    """And one that only rows not yet known would close is open as well."""
+    ns = T0_NS + 10 * MS * np.arange(12)
+    later = np.append(ns, ns[-1] + NS)
+    for known in (ns, later):
+        assert hole_ns(known, 12, 12, int(ns[-1]) + 40 * MS) == 0
+        assert hole_ns(known, 12, 12, int(ns[-1]) + 700 * MS) == 700 * MS
+
+
+def test_the_turn_over_a_hole_is_as_unsure_as_the_vehicle_is_lively():
+    """Beside the gyros' noise, wherever Doppler rows cut the hole; about the axes of the body that turned meanwhile."""
+    model = ImuCalibration()
+    extra = turn_variances(with_hole(), 2.0, 6.0) - turn_variances(with_hole(), 2.0, 6.0, Calibration(imu=STILL))
+    s, c = model.turn_sigma_rad_s, model.turn_time_s
+    expected = [closed_variance(s[k], c[k], END_S - BEGIN_S) for k in range(3)]
+    assert extra == pytest.approx(expected, rel=0.06)
+    assert expected[2] > 100 * model.gyro_noise_density**2 * 4.0
+
+
+def test_while_a_hole_lasts_the_turn_is_as_unsure_as_the_last_rate_held():
+    rows = with_hole().between(0, at(4.9))
+    assert rows is not None
+    args = (rows, BEGIN_S, 4.9)
+    extra = turn_variances(*args, between=motion_since_node)
+    extra = extra - turn_variances(*args, Calibration(imu=STILL), between=motion_since_node)
+    assert extra[2] == pytest.approx(open_variance(0.15, 1.5, 1.9), rel=0.06)
+
+
+def test_in_a_hole_with_doppler_rows_the_way_is_by_these():
+    """Longer than a gap: the vehicle gets faster while nothing but the Doppler log tells."""
+    velocity = np.where((stamps(5, 8.0) - T0_NS)[:, None] * 1e-9 > 4.1, [0.6, 0.0, 0.0], [0.4, 0.0, 0.0])
+    rows = imu(stamps(100, 8.0), 0.0).between(0, at(BEGIN_S))
+    assert rows is not None
+    odometry, preintegrator = odometry_of(rows, Calibration(), velocity)
+    found = motion_since_node(odometry, preintegrator, at(BEGIN_S), at(7.0), np.zeros(3), None)
+    assert found.i_T_j.translation()[0] == pytest.approx(0.4 * 1.0 + 0.5 * 0.2 + 0.6 * 2.8, abs=1e-6)
+    assert np.sqrt(found.covariance[3, 3]) < 0.05
+
+
+def test_nothing_changes_where_rows_are_lost_or_jittered():
+    """To the bit, with and without the model: a lost row, three in a row, stamps that wander by a third."""
+    whole = imu(stamps(100, 8.0), [0.01, -0.02, 0.1])
+    lost = whole.rows(~np.isin(np.arange(len(whole)), [50, 300, 301, 302, 420]))
+    jitter = np.random.default_rng(1).integers(-3 * MS, 3 * MS, len(whole))
+    jittered = replace(whole, stamps_ns=whole.stamps_ns + jitter * (np.arange(len(whole)) > 0))
+    for rows in (whole, lost, jittered):
+        one = turn_variances(rows, 1.0, 7.0)
+        assert np.array_equal(one, turn_variances(rows, 1.0, 7.0, Calibration(imu=STILL)))
+
+
+def test_specific_force_is_not_measured_in_a_hole():
+    """Interpolated over it, it would be taken for gravity; over 80 ms it still is."""
+    odometry, preintegrator = odometry_of(with_hole(), Calibration())
+    before, over = (
+        motion_between_nodes(odometry, preintegrator, at(a), at(b), np.zeros(3), None).mean_specific_force
+        for a, b in ((1.0, 3.0), (2.0, 6.0))
+    )
+    assert np.isfinite(before).all()
+    assert np.isnan(over).all()
+    odometry, preintegrator = odometry_of(with_hole(end_s=BEGIN_S + 0.08), Calibration())
+    brief = motion_between_nodes(odometry, preintegrator, at(2.0), at(6.0), np.zeros(3), None)
+    assert np.isfinite(brief.mean_specific_force).all()
+
+
+def test_a_gap_of_the_doppler_log_with_a_hole_in_it_is_a_walk():
+    """Accelerometers that were not there do not carry the velocity."""
+    calibration = Calibration()
+    found = []
+    for rows in (imu(stamps(100, 8.0), 0.0), with_hole(3.0, 5.0)):
+        odometry, ns = Odometry(calibration), stamps(5, 8.0)
+        odometry.add(rows, dvl(ns[(ns <= at(2.6)) | (ns >= at(5.4))], [0.4, 0.0, 0.0]))
+        preintegrator = Preintegrator.from_calibration(calibration)
+        found.append(motion_between_nodes(odometry, preintegrator, at(2.6), at(5.4), np.zeros(3), None))
+    whole, holed = (np.diag(motion.covariance)[3:] for motion in found)
+    walk = calibration.dvl.velocity_walk_density**2 * 2.8**3 / 12
+    assert whole[0] < 0.5 * walk < walk < holed[0]
+
+
+def test_held_samples_leave_no_hole():
+    held = Calibration(odometry_interpolation="hold-past")
+    still = held.model_copy(update={"imu": STILL})
+    one, other = (turn_variances(with_hole(), 2.0, 6.0, calibration) for calibration in (held, still))
+    assert np.array_equal(one, other)
+
+
+def test_forgetting_rows_in_a_hole_changes_nothing():
+    """What is typical is told by rows long before a node in a long hole."""
+    rows = with_hole(2.0, 16.0, 20.0)
+    (whole, preintegrator), (forgetful, _) = (odometry_of(rows, Calibration(), seconds=20.0) for _ in range(2))
+    forgetful.forget_before(at(15.0))
+    assert len(forgetful.columns()[0]) < len(whole.columns()[0])
+    one, other = (
+        motion_between_nodes(odometry, preintegrator, at(15.0), at(18.0), np.zeros(3), None).covariance
+        for odometry in (whole, forgetful)
+    )
+    assert np.array_equal(one, other)
+    assert one[2, 2] > 1e-3
+
+
+def test_joint_preintegration_refuses_a_hole_and_names_it():
+    samples, joint = dvl(stamps(5, 8.0), 0.4, 1e-4 * np.eye(3)), JointPreintegrator(1e-4, 1e-3)
+    with pytest.raises(MeasurementError, match=rf"no row for 2 s after {at(BEGIN_S)} ns"):
+        joint.integrate(with_hole(), samples, at(2.0), at(6.0))
+    assert joint.integrate(with_hole(), samples, at(1.0), at(3.0)).duration_s == 2.0
+    tolerant = replace(joint, longest_hole_s=2.5)
+    assert tolerant.integrate(with_hole(), samples, at(2.0), at(6.0)).duration_s == 4.0
+
+
+def test_joint_preintegration_takes_a_slow_imu_and_lost_rows():
+    samples, joint = dvl(stamps(5, 8.0), 0.4, 1e-4 * np.eye(3)), JointPreintegrator(1e-4, 1e-3)
+    lost = with_hole(end_s=BEGIN_S + 0.05)
+    slow: Imu = imu(stamps(8, 8.0), 0.0)
+    for rows in (lost, slow):
+        assert joint.integrate(rows, samples, at(2.0), at(6.0)).duration_s == 4.0

@@ -1,0 +1,170 @@
+"""The first velocities of a log, and the first after a long gap."""
+
+import numpy as np
+import pytest
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.doppler_beams import UNMEASURED_M_S
+from sonar_graph.measurements import Dvl
+from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation.velocity_doubt import LONG_NS, needed
+from sonar_graph.states import Refusal
+
+from .rows import NS, T0_NS, dvl, imu, stamps
+
+HZ = 7.0
+WRONG = [5.0, 0.0, 0.0]
+FASTER = [[5.0, 0.0, 0.0], [-3.0, 1.0, 0.0], [2.0, -2.0, 2.0]]
+
+
+def told(rows: Dvl, calls: int = 1, calibration: Calibration | None = None) -> Odometry:
+    """Odometry that was given the rows in so many blocks."""
+    odometry = Odometry(calibration or Calibration())
+    odometry.add(imu(stamps(50, 90.0), 0.0), None)
+    for block in np.array_split(np.arange(len(rows)), calls):
+        odometry.add(None, rows.rows(block))
+    return odometry
+
+
+def start(wrong: dict[int, list[float]], speed=0.3, hz=HZ, seconds=3.0) -> Dvl:
+    ns = stamps(hz, seconds)
+    velocity = np.tile([speed, 0.0, 0.0], (len(ns), 1))
+    for row, value in wrong.items():
+        velocity[row] = value
+    return dvl(ns, velocity, 1e-4 * np.eye(3))
+
+
+def refused(odometry: Odometry, rows: Dvl) -> list[int]:
+    stamps_ns = rows.stamps_ns.tolist()
+    assert {row.reason for row in odometry.refused} <= {Refusal.OUTLIER}
+    return sorted(stamps_ns.index(row.stamp_ns) for row in odometry.refused)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {},
+        {0: WRONG},
+        {1: WRONG},
+        {2: WRONG},
+        {0: WRONG, 1: WRONG},
+        {0: WRONG, 2: WRONG},
+        {1: WRONG, 2: WRONG},
+        {0: WRONG, 1: WRONG, 2: WRONG},
+        dict(enumerate(FASTER)),
+        {0: [1.5, 0.0, 0.0]},
+        {0: [0.3, 0.0, -1.2]},
+    ],
+)
+@pytest.mark.parametrize("hz", [HZ, 1.0])
+def test_wrong_ones_of_the_first_rows_are_refused_and_no_others(wrong, hz):
+    rows = start(wrong, hz=hz, seconds=3.0 if hz > 1 else 12.0)
+    odometry = told(rows)
+    assert refused(odometry, rows) == sorted(wrong)
+    assert np.array_equal(odometry.columns()[4][-5:], rows.velocity[-5:])
+    assert np.abs(odometry.columns()[4]).max() == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0])
+def test_a_vehicle_that_moves_from_the_start_is_believed_with_its_first_row(speed):
+    """Once enough rows agree, and never later than the tenth; its own rows are kept to the bit."""
+    rows = start({}, speed)
+    enough = needed(rows.velocity[0])
+    assert enough <= min(10, 2 + speed**2 / 4)
+    assert not len(told(rows.rows(slice(0, enough - 1))).columns()[3])
+    odometry = told(rows.rows(slice(0, enough)))
+    assert np.array_equal(odometry.columns()[3], rows.stamps_ns[:enough])
+    assert np.array_equal(odometry.columns()[4], rows.velocity[:enough])
+    assert np.array_equal(odometry.columns()[5], rows.velocity_cov[:enough])
+
+
+def test_needed_rows_grow_with_the_square_of_the_speed():
+    speeds = np.array([0.0, 1.9, 2.0, 2.8, 3.0, 4.0, 6.0, 50.0])
+    assert [needed(np.array([0.0, speed, 0.0])) for speed in speeds] == [2, 2, 3, 3, 4, 6, 10, 10]
+
+
+def test_the_start_stays_a_node_with_the_velocity_of_the_first_row_believed():
+    """Less surely known: by the walk and what the vehicle may have turned since."""
+    rows = start({0: WRONG, 1: WRONG})
+    stamps_ns, velocity, cov = told(rows).columns()[3:6]
+    assert np.array_equal(stamps_ns, rows.stamps_ns)
+    assert np.array_equal(velocity, np.tile([0.3, 0.0, 0.0], (len(rows), 1)))
+    t = (rows.stamps_ns[2] - rows.stamps_ns[0]) * 1e-9
+    walk = Calibration().dvl.velocity_walk_density
+    assert cov[0] == pytest.approx(np.eye(3) * (1e-4 + walk**2 * t + (0.3 * t * 0.3) ** 2))
+    assert cov[2] == pytest.approx(1e-4 * np.eye(3))
+
+
+@pytest.mark.parametrize("calls", [2, 5, 22])
+def test_blocks_do_not_matter(calls):
+    rows = start({0: WRONG, 1: FASTER[1], 3: WRONG})
+    whole, parts = told(rows), told(rows, calls)
+    assert whole.refused == parts.refused
+    for k in (3, 4, 5):
+        assert np.array_equal(whole.columns()[k], parts.columns()[k])
+
+
+def test_rows_out_of_order_are_believed_as_in_order():
+    rows = start({0: WRONG})
+    odometry = Odometry(Calibration())
+    for row in [1, 0, 3, 2, *range(4, len(rows))]:
+        odometry.add(None, rows.rows(slice(row, row + 1)))
+    assert np.array_equal(odometry.columns()[3], told(rows).columns()[3])
+    assert np.array_equal(odometry.columns()[4], told(rows).columns()[4])
+
+
+def test_a_row_that_waits_is_no_node_and_is_told():
+    rows = start({}).rows(slice(0, 1))
+    odometry = told(rows)
+    assert odometry.start_ns() is None
+    assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [(rows.stamps_ns[0], Refusal.UNCONFIRMED)]
+
+
+def after_gap(gap_s: float, wrong: dict[int, list[float]], speed: float = 0.3) -> tuple[Dvl, int]:
+    """A log with a gap after 10 s, and its first row after that."""
+    ns = stamps(HZ, 10.0 + gap_s + 5.0)
+    t = (ns - T0_NS) * 1e-9
+    ns = ns[(t <= 10.0) | (t > 10.0 + gap_s)]
+    first = int(np.argmax(np.diff(ns))) + 1
+    velocity = np.tile([speed, 0.0, 0.0], (len(ns), 1))
+    for row, value in wrong.items():
+        velocity[first + row] = value
+    return dvl(ns, velocity, 1e-4 * np.eye(3)), first
+
+
+@pytest.mark.parametrize("wrong", [{0: WRONG}, {1: WRONG}, {0: WRONG, 1: WRONG, 2: WRONG}, {0: [2.0, 1.0, 0.0]}])
+@pytest.mark.parametrize("gap_s", [10.0, 60.0])
+def test_wrong_rows_after_a_long_gap_are_refused_and_no_others(gap_s, wrong):
+    rows, first = after_gap(gap_s, wrong)
+    for calls in (1, len(rows)):
+        odometry = told(rows, calls)
+        assert refused(odometry, rows) == [first + row for row in wrong]
+        assert np.abs(odometry.columns()[4]).max() == pytest.approx(0.3)
+
+
+def test_a_gap_lasts_until_its_end_is_confirmed():
+    rows, first = after_gap(30.0, {})
+    assert len(told(rows.rows(slice(0, first + 1))).columns()[3]) == first
+    assert len(told(rows.rows(slice(0, first + 2))).columns()[3]) == first + 2
+
+
+def test_after_a_shorter_gap_one_row_is_enough():
+    rows, first = after_gap(LONG_NS / NS - 0.3, {})
+    assert len(told(rows.rows(slice(0, first + 1))).columns()[3]) == first + 1
+
+
+def test_rows_of_few_beams_wait_with_the_first_whole_ones():
+    """One before the first is passed over, one between two that confirm each other is completed."""
+    rows = start({})
+    cov = rows.velocity_cov.copy()
+    cov[[0, 2]] += np.diag([0.0, UNMEASURED_M_S**2, UNMEASURED_M_S**2])
+    odometry = told(Dvl(rows.stamps_ns, rows.velocity, cov))
+    assert np.array_equal(odometry.columns()[3], rows.stamps_ns[1:])
+    assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [(rows.stamps_ns[0], Refusal.INCOMPLETE)]
+
+
+def test_held_velocities_are_never_in_doubt():
+    rows = start({0: WRONG})
+    odometry = told(rows, calibration=Calibration(odometry_interpolation="hold-past"))
+    assert np.array_equal(odometry.columns()[4], rows.velocity)
+    assert not odometry.refused
