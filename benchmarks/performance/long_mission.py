@@ -22,7 +22,7 @@ import tempfile
 import time
 import tracemalloc
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -106,26 +106,22 @@ def store(options: MissionOptions, folder: Path) -> None:
     np.save(folder / "truth.npy", mission.truth.positions)
 
 
-@dataclass
 class Record:
-    """What was measured at each call."""
+    """What was measured at each call, in memory that is there from the start."""
 
-    cpu_s: list[float] = field(default_factory=list)
-    wall_s: list[float] = field(default_factory=list)
-    keyframes: list[int] = field(default_factory=list)
-    resident_mb: list[float] = field(default_factory=list)
-    stamps_ns: list[int] = field(default_factory=list)
-    positions: list[np.ndarray] = field(default_factory=list)
+    def __init__(self, calls: int) -> None:
+        self.calls = 0
+        self.cpu_s, self.wall_s, self.resident_mb = np.zeros((3, calls))
+        self.keyframes = np.zeros(calls, dtype=np.int64)
+        self.stamps_ns = np.zeros(calls, dtype=np.int64)
+        self.positions = np.full((calls, 3), np.nan)
 
     def add(self, cpu_s: float, wall_s: float, keyframes: int, estimate: Estimate | None) -> None:
         """One call."""
-        self.cpu_s.append(cpu_s)
-        self.wall_s.append(wall_s)
-        self.keyframes.append(keyframes)
-        self.resident_mb.append(resident_mb())
+        k, self.calls = self.calls, self.calls + 1
+        self.cpu_s[k], self.wall_s[k], self.resident_mb[k], self.keyframes[k] = cpu_s, wall_s, resident_mb(), keyframes
         if estimate is not None:
-            self.stamps_ns.append(estimate.stamp_ns)
-            self.positions.append(estimate.world_T_body.translation())
+            self.stamps_ns[k], self.positions[k] = estimate.stamp_ns, estimate.world_T_body.translation()
 
 
 def resident_mb() -> float:
@@ -136,35 +132,33 @@ def resident_mb() -> float:
 
 def run(mission: StoredMission, params: Isam2Params) -> tuple[Isam2, Record]:
     """The estimator over the whole mission."""
-    estimator, record = Isam2(mission.calibration, params), Record()
     total, noted = len(mission.frames_ns), time.monotonic()
+    estimator, record = Isam2(mission.calibration, params), Record(total)
     for step in mission.measurements():
         cpu, wall = time.thread_time(), time.perf_counter()
         estimate = estimator.process(step)
-        record.add(
-            time.thread_time() - cpu, time.perf_counter() - wall, estimator.keyframe_count, estimate
-        )
+        record.add(time.thread_time() - cpu, time.perf_counter() - wall, estimator.keyframe_count, estimate)
         if time.monotonic() - noted > 10:
             noted = time.monotonic()
-            note(f"{len(record.cpu_s)} of {total} frames, {record.resident_mb[-1]:.0f} MB")
+            note(f"{record.calls} of {total} frames, {record.resident_mb[record.calls - 1]:.0f} MB")
     return estimator, record
 
 
 def tenths(record: Record) -> list[dict[str, float]]:
     """Time and memory of each tenth of the calls."""
     rows = []
-    for part in np.array_split(np.arange(len(record.cpu_s)), TENTHS):
+    for part in np.array_split(np.arange(record.calls), TENTHS):
         before = record.keyframes[part[0] - 1] if part[0] else 0
-        cpu_ms, wall_ms = 1e3 * np.array(record.cpu_s)[part], 1e3 * np.array(record.wall_s)[part]
-        keyframes = record.keyframes[part[-1]] - before
+        cpu_ms, wall_ms = 1e3 * record.cpu_s[part], 1e3 * record.wall_s[part]
+        keyframes = int(record.keyframes[part[-1]] - before)
         rows.append(
             {
                 "keyframes": keyframes,
                 "keyframe_ms": float(cpu_ms.sum() / keyframes),
                 "max_cpu_ms": float(cpu_ms.max()),
                 "max_ms": float(wall_ms.max()),
-                "resident_mb": float(np.median(np.array(record.resident_mb)[part])),
-                "resident_end_mb": record.resident_mb[part[-1]],
+                "resident_mb": float(np.median(record.resident_mb[part])),
+                "resident_end_mb": float(record.resident_mb[part[-1]]),
             }
         )
     return rows
@@ -174,8 +168,8 @@ def report(mission: StoredMission, estimator: Isam2, record: Record) -> dict[str
     """Print the table; the figures by name."""
     rows = tenths(record)
     print_table(("tenth", *rows[0]), [(str(k), *row.values()) for k, row in enumerate(rows, start=1)])
-    wall_ms, cpu_ms = 1e3 * np.array(record.wall_s), 1e3 * np.array(record.cpu_s)
-    off_m = (np.array(record.positions) - mission.true_positions(np.array(record.stamps_ns)))[:, :2]
+    wall_ms, cpu_ms = 1e3 * record.wall_s, 1e3 * record.cpu_s
+    off_m = (record.positions - mission.true_positions(record.stamps_ns))[record.stamps_ns > 0, :2]
     figures: dict[str, float | int | bool] = {
         "decile_ratio": rows[-1]["keyframe_ms"] / rows[0]["keyframe_ms"],
         "max_update_ms": float(wall_ms.max()),
@@ -184,9 +178,9 @@ def report(mission: StoredMission, estimator: Isam2, record: Record) -> dict[str
         "p99_update_ms": float(np.quantile(wall_ms, 0.99)),
         "median_update_ms": float(np.median(wall_ms)),
         "keyframe_ms": float(cpu_ms.sum() / record.keyframes[-1]),
-        "resident_mb": record.resident_mb[-1],
-        "keyframes": record.keyframes[-1],
-        "frames": len(record.cpu_s),
+        "resident_mb": rows[-1]["resident_end_mb"],
+        "keyframes": int(record.keyframes[-1]),
+        "frames": record.calls,
         "causal_error_m": float(np.sqrt(np.mean(np.sum(off_m**2, axis=1)))),
         "process_s": float(cpu_ms.sum() / 1e3),
     }
