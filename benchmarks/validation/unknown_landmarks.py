@@ -1,0 +1,187 @@
+"""Landmarks without identities: what geometry alone finds, beside known identities and beside dead reckoning.
+
+The same runs, once with the identities and once without any (`Isam2Params.unknown_landmarks`): the basin of default
+length, in which nothing but the identities differs, and the robots of UTIAS MRCLAM data set 6.
+
+A landmark found is matched to the true one within `FARTHEST_M` of it, one to one; what is left over is a duplicate or
+was never there. A detection is associated wrongly when its landmark is not matched to the true one, or when it is of
+nothing. Errors are horizontal: in the basin rms without alignment, for MRCLAM after the best SE(2) alignment.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from common import conclude, in_parallel, make_parser, print_table, recording
+
+from sonar_graph.evaluation.comparison import judge
+from sonar_graph.evaluation.metrics import landmark_errors, rmse
+from sonar_graph.evaluation.place_matching import named_by_place
+from sonar_graph.evaluation.results import RunResult
+from sonar_graph.evaluation.run import run_estimator
+from sonar_graph.logs.converters.mrclam import read_mrclam
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.states import LandmarkMap, Outcome
+
+Figures = dict[str, float]
+FARTHEST_M = 1.0
+SURE = 0.9
+"""Least posterior of a detection that was of a landmark, before identities were taken away."""
+USED = (Outcome.USED, Outcome.NEW, Outcome.USED_LATER, Outcome.MOVED)
+PLACES: dict[str, dict[str, Any]] = {
+    "basin": {"unknown_density_m2": 0.05},
+    "mrclam": {"unknown_density_m2": 0.15},
+}
+"""Landmarks a square metre, roughly: 4 on the 49 m² that the basin's square encloses; 15 on 100 m²."""
+MOST_ERROR = 1.05
+"""Trajectory error in the basin over that with known identities, at most."""
+
+
+def without_identities(sequence: Sequence) -> Sequence:
+    """The same run from a recogniser that names nothing."""
+    seen = sequence.detections
+    assert seen is not None
+    nothing = replace(
+        seen, candidate_ids=np.full((len(seen), 1), -1, dtype=np.int64), id_probability=np.zeros((len(seen), 1))
+    )
+    return replace(sequence, detections=nothing)
+
+
+def run(sequence: Sequence, rate_hz: float, error: str, settings: dict[str, Any]) -> dict[str, Figures]:
+    """Figures with identities, without, and of dead reckoning."""
+    instants = sequence.instants(rate_hz)
+    unknown = {"unknown_landmarks": "associate", **settings}
+    runs = {
+        "known": run_estimator(sequence, "isam2", instants_ns=instants),
+        "unknown": run_estimator(without_identities(sequence), "isam2", unknown, instants_ns=instants),
+        "dead reckoning": run_estimator(sequence, "dead-reckoning", instants_ns=instants),
+    }
+    found = {}
+    for name, result in runs.items():
+        if result.status == "failed":
+            raise RuntimeError(f"{sequence.name}: {name}: {result.reason}")
+        scores = next(iter(judge(sequence, instants, [result]).scores.values()))
+        found[name] = {key: scores[f"{kind}.{error}"].value for kind, key in KINDS if f"{kind}.{error}" in scores}
+        found[name]["nees"] = scores["causal.nees_position"].value
+        found[name]["seconds"] = float(result.update_s.sum() + result.finish_s)
+        if name != "dead reckoning":
+            found[name] |= of_landmarks(sequence, result)
+    return found
+
+
+KINDS = (("causal", "causal_m"), ("smoothed", "smoothed_m"))
+
+
+def of_landmarks(sequence: Sequence, result: RunResult) -> Figures:
+    """How many landmarks are found, how well, and how many detections go to the wrong one."""
+    true, estimated, log = sequence.true_landmarks, result.landmarks, result.detections
+    assert true is not None
+    assert estimated is not None
+    assert log is not None
+    named = named_by_place(estimated, true, FARTHEST_M)
+    errors = landmark_errors(named, true)
+    name_of = names(estimated, true)
+    is_used = np.isin(np.array(log.outcomes), USED)
+    taken_for = np.array([name_of.get(i, -1) for i in log.landmark_ids.tolist()])
+    meant = true_identities(sequence)
+    return {
+        "landmarks": float(len(estimated)),
+        "matched": float(len(errors)),
+        "spurious": float(len(estimated) - len(errors)),
+        "landmark_m": rmse(errors.horizontal_m) if len(errors) else float("nan"),
+        "used": float(is_used.sum()),
+        "wrong": float((is_used & (taken_for != meant)).sum()),
+    }
+
+
+def names(estimated: LandmarkMap, true: LandmarkMap) -> dict[int, int]:
+    """True identity of each landmark of a map that has one."""
+    named = named_by_place(estimated, true, FARTHEST_M)
+    at = {tuple(position): i for i, position in zip(named.ids.tolist(), named.positions.tolist(), strict=True)}
+    pairs = ((i, at[tuple(p)]) for i, p in zip(estimated.ids.tolist(), estimated.positions.tolist(), strict=True))
+    return {i: identity for i, identity in pairs if identity in true.ids}
+
+
+def true_identities(sequence: Sequence) -> Ints:
+    """Of each detection; -2: of nothing."""
+    assert sequence.detections is not None
+    ids, probability = sequence.detections.most_probable()
+    return np.where(probability >= SURE, ids, -2)
+
+
+def basin(seconds: float | None, seed: int) -> dict[str, Figures]:
+    """One run of the basin; None: of default length."""
+    options = BasinOptions(seed=seed) if seconds is None else BasinOptions(seed=seed, duration_s=seconds, laps=1)
+    return run(simulate_basin(options), 1.0, "ate_raw_m", PLACES["basin"])
+
+
+def mrclam(folder: Path, robot: int) -> dict[str, Figures]:
+    """One robot."""
+    return run(read_mrclam(folder, robot), 2.0, "ate_se2_m", PLACES["mrclam"])
+
+
+def summary(title: str, runs: list[dict[str, Figures]]) -> dict[str, dict[str, float]]:
+    """Means over runs (rms of errors), and a table of them."""
+    table, found = [], {}
+    for name in ("known", "unknown", "dead reckoning"):
+        keys = runs[0][name].keys()
+        columns: dict[str, Floats] = {key: np.array([figures[name][key] for figures in runs]) for key in keys}
+        found[name] = {
+            key: float(np.sqrt(np.mean(values**2)) if key.endswith("_m") else np.mean(values))
+            for key, values in columns.items()
+        }
+        found[name] |= {"worst_m": float(columns["smoothed_m" if "smoothed_m" in columns else "causal_m"].max())}
+        table.append((f"{title}, {name}", *(found[name].get(key, "-") for key in COLUMNS)))
+    print_table(("", *COLUMNS), table)
+    return found
+
+
+COLUMNS = (
+    "landmarks",
+    "matched",
+    "spurious",
+    "used",
+    "wrong",
+    "landmark_m",
+    "causal_m",
+    "smoothed_m",
+    "worst_m",
+    "nees",
+    "seconds",
+)
+
+
+def main() -> None:
+    parser = make_parser(__doc__, data=True, workers=True)
+    parser.add_argument("--seeds", type=int, default=12, help="runs of the basin")
+    arguments = parser.parse_args()
+    seeds, seconds, robots = (2, 200.0, ()) if arguments.quick else (arguments.seeds, None, (1, 2, 3, 4, 5))
+    spread = partial(in_parallel, workers=arguments.workers)
+    figures: dict[str, Any] = {
+        "basin": summary("basin", spread(partial(basin, seconds), range(seeds), what="seed")),
+    }
+    if robots:
+        with recording(arguments.data, "mrclam_ds6.tar.xz", "MRCLAM_Dataset6") as folder:
+            of_robots = spread(partial(mrclam, folder), robots, what="robot")
+        for robot, found in zip(robots, of_robots, strict=True):
+            summary(f"robot {robot}", [found])
+        figures["mrclam"] = summary("MRCLAM", of_robots)
+    known, unknown = figures["basin"]["known"], figures["basin"]["unknown"]
+    figures["error_ratio"] = unknown["smoothed_m"] / known["smoothed_m"]
+    figures["passed"] = bool(
+        figures["error_ratio"] <= MOST_ERROR and unknown["spurious"] == 0 and unknown["landmarks"] == known["landmarks"]
+    )
+    conclude(figures, is_quick=arguments.quick)
+
+
+if __name__ == "__main__":
+    main()
