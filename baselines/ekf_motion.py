@@ -11,15 +11,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from baselines.ekf_prediction import VehicleModel
 from baselines.euler import rotation_from_euler
+from baselines.filter_models import VehicleModel
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.gap_motion import bridge
 from sonar_graph.navigation.interpolation import rows_until
 from sonar_graph.navigation.kernels import compiled, inlined
 from sonar_graph.navigation.recursion import NO_MOTION, Integral, extended, increment, mirrored, rate_of_turn
 from sonar_graph.navigation.steps import Columns, Cursor, cursor_at, next_step
-from sonar_graph.navigation.triples import ZERO, Vector, gram, multiple_of, sum_of, times, transposed, vector
+from sonar_graph.navigation.triples import ZERO, Matrix, Vector, gram, multiple_of, sum_of, times, transposed, vector
 
 
 class RunningMotion(NamedTuple):
@@ -41,9 +41,9 @@ def motion_to_node(columns: Columns, vehicle: VehicleModel, x: Floats, start_ns:
         return _bridged(columns, vehicle, x, start_ns, node_ns, True)
     imu_ns, dvl_ns = columns[0], columns[3]
     imu_rows, dvl_rows = rows_until(imu_ns, node_ns - 1) + 1, rows_until(dvl_ns, node_ns)
-    start, earth = cursor_at(columns, start_ns), earth_in_body(vehicle, x)
+    start, earth = cursor_at(columns, start_ns), _earth(vehicle, x)
     _, motion = _integrate(columns, vehicle, imu_rows, dvl_rows, earth, start, NO_MOTION, node_ns)
-    return _finished(motion)
+    return finished(motion)
 
 
 @compiled
@@ -61,14 +61,14 @@ def motion_since_node(
         return running, _bridged(columns, vehicle, x, node_ns, until_ns, False)
     imu_ns, dvl_ns = columns[0], columns[3]
     imu_rows, dvl_rows = rows_until(imu_ns, until_ns), rows_until(dvl_ns, until_ns)
-    earth = earth_in_body(vehicle, x)
+    earth = _earth(vehicle, x)
     cursor, motion = running.cursor, running.motion
     if (running.node_ns, running.dvl_rows, running.earth) != (node_ns, dvl_rows, earth):
         cursor, motion = cursor_at(columns, node_ns), NO_MOTION
     newest_ns = imu_ns[imu_rows - 1] if imu_rows > 0 else node_ns
     cursor, motion = _integrate(columns, vehicle, imu_rows, dvl_rows, earth, cursor, motion, newest_ns)
     _, until = _integrate(columns, vehicle, imu_rows, dvl_rows, earth, cursor, motion, until_ns)
-    return RunningMotion(node_ns, dvl_rows, earth, cursor, motion), _finished(until)
+    return RunningMotion(node_ns, dvl_rows, earth, cursor, motion), finished(until)
 
 
 @compiled
@@ -80,7 +80,8 @@ def _bridged(
     The state has no bias. Elsewhere its drift is left out, as published; in a gap it tilts gravity, and the
     displacement would be wrong by many times its sigma.
     """
-    motion, _, D = bridge(columns, vehicle.gap, start_ns, end_ns, is_closed, ZERO, earth_in_body(vehicle, x))
+    earth = _earth(vehicle, x)
+    motion, _, D = bridge(columns, vehicle.gap, start_ns, end_ns, is_closed, ZERO, earth)
     cov_rr = sum_of(motion.cov_rr, multiple_of(vehicle.gyro_bias_sigma**2, gram(D)))
     return Integral(motion.dR, motion.dp, motion.impulse, motion.cov_tt, motion.cov_rt, cov_rr)
 
@@ -108,9 +109,14 @@ def nothing_running() -> RunningMotion:
 
 
 @inlined
-def earth_in_body(vehicle: VehicleModel, x: Floats) -> Vector:
+def earth_in_body(vehicle: VehicleModel, R: Matrix) -> Vector:
     """Earth's rotation in the body frame of the state, rad/s."""
-    return times(transposed(rotation_from_euler(vector(x[3:]))), vehicle.earth_rate)
+    return times(transposed(R), vehicle.earth_rate)
+
+
+@inlined
+def _earth(vehicle: VehicleModel, x: Floats) -> Vector:
+    return earth_in_body(vehicle, rotation_from_euler(vector(x[3:])))
 
 
 @inlined
@@ -134,6 +140,6 @@ def _integrate(
 
 
 @inlined
-def _finished(motion: Integral) -> Integral:
+def finished(motion: Integral) -> Integral:
     """With all blocks of the covariance whole."""
     return Integral(motion.dR, motion.dp, motion.impulse, motion.cov_tt, motion.cov_rt, mirrored(motion.cov_rr))

@@ -22,12 +22,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from baselines.filter_detections import Noise
+from baselines.sonar_views import noise_of_view
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.kernels import compiled
 
 
 @compiled
-def is_beyond_linear(cov: Floats, G_z: Floats, range_m: float, R_z: tuple[float, float, float]) -> bool:
+def is_beyond_linear(cov: Floats, G_z: Floats, range_m: float, R_z: Noise) -> bool:
     """Whether (1) is more than the sigma of a detection.
 
     Parameters
@@ -47,13 +49,10 @@ def is_beyond_linear(cov: Floats, G_z: Floats, range_m: float, R_z: tuple[float,
 
 
 @compiled
-def view_noise(range_m: float, R_z: tuple[float, float, float], aperture_rad: float) -> Floats:
+def view_noise(range_m: float, R_z: Noise, aperture_rad: float) -> Floats:
     """V of (2): covariance of range, azimuth and elevation, shape (3, 3)."""
-    V = np.zeros((3, 3))
-    V[0, 0] = R_z[0] + range_m**2 * aperture_rad**4 / 320.0
-    V[0, 1] = V[1, 0] = R_z[1]
-    V[1, 1] = R_z[2]
-    V[2, 2] = aperture_rad**2 / 12.0
+    V = np.array(noise_of_view(R_z, aperture_rad))
+    V[0, 0] += range_m**2 * aperture_rad**4 / 320.0
     return V
 
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.ekf_landmarks import GATED, NEW, NO_SLOT, USED, DetectionColumns
-from baselines.ekf_window import DepthColumns, DetectionOutcomes
+from baselines.filter_detections import GATED, NEW, NO_SLOT, USED, DetectionColumns, DetectionOutcomes
+from baselines.filter_events import DepthColumns
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Depth, LandmarkDetections, Measurements
 from sonar_graph.slam.association import DetectionJournal, identify

@@ -1,15 +1,18 @@
-"""What the filters take from a calibration: the sensors that move the state, and the sonar."""
+"""What the filters take from a calibration: the sensors that move the state, and the sonar.
+
+Compiled code gets a model as the plain tuple of its fields, which enters faster, and makes it anew.
+"""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from pydantic import Field
 
-from baselines.ekf_landmarks import SonarModel
-from baselines.ekf_prediction import VehicleModel
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.navigation.earth import earth_rate_in_world
-from sonar_graph.navigation.gap_motion import gap_values
-from sonar_graph.navigation.triples import ZERO, matrix, minus, vector
+from sonar_graph.navigation.gap_motion import NO_GAPS, GapValues, gap_values
+from sonar_graph.navigation.triples import ZERO, Matrix, Vector, matrix, minus, vector
 from sonar_graph.slam.association import gate_threshold
 
 
@@ -22,6 +25,57 @@ class FilterParams(Section):
     """Posterior below which an identity is not believed."""
     gravity_interval_s: float = Field(1.0, gt=0)
     """Over which the specific force is averaged for one correction of roll and pitch."""
+
+
+class VehicleModel(NamedTuple):
+    """What is known of the sensors that move the state."""
+
+    gyro_noise_density: float
+    body_p_dvl: Vector
+    dvl_p_imu: Vector
+    """Lever arm from DVL to IMU, body axes."""
+    earth_rate: Vector
+    """In the world, rad/s; zero where it is not removed."""
+    body_p_port: Vector
+    gravity_interval_ns: int
+    """0: gravity is not used."""
+    accel_noise_density: float
+    accel_bias_sigma: float
+    gravity_m_s2: float
+    is_planar: bool
+    plane_z_m: float
+    plane_z_variance: float
+    plane_tilt_variance: float
+    gap: GapValues = NO_GAPS
+    gyro_bias_sigma: float = 0.0
+    """Of gaps and of gravity only, rad/s."""
+    depth_variance_m2: float = 1.0
+    """Of a depth sample, where the log does not say."""
+
+
+class SonarModel(NamedTuple):
+    """What is known of sonar and floor."""
+
+    body_R_sonar: Matrix
+    body_p_sonar: Vector
+    gate: float
+    """Squared Mahalanobis distance beyond which an innovation is refused."""
+    aperture_rad: float
+    range_variance_m2: float
+    """Where the log does not say."""
+    azimuth_variance: float
+    """Where the log does not say, rad²."""
+    has_floor: bool
+    floor_z_m: float
+    floor_variance_m2: float
+
+
+VehicleValues = tuple[
+    float, Vector, Vector, Vector, Vector, int, float, float, float, bool, float, float, float, GapValues, float, float
+]
+"""Fields of a `VehicleModel`."""
+SonarValues = tuple[Matrix, Vector, float, float, float, float, bool, float, float]
+"""Fields of a `SonarModel`."""
 
 
 def vehicle_model(calibration: Calibration, gravity_interval_s: float) -> VehicleModel:
@@ -46,6 +100,7 @@ def vehicle_model(calibration: Calibration, gravity_interval_s: float) -> Vehicl
         plane_tilt_variance=plane.tilt_sigma_rad**2 if plane else 1.0,
         gap=gap_values(calibration),
         gyro_bias_sigma=imu.gyro_bias_sigma,
+        depth_variance_m2=calibration.depth.sigma_m**2,
     )
 
 

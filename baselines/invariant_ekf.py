@@ -4,34 +4,26 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import gtsam
 import numpy as np
 
-from baselines.causal import CausalEstimates
-from baselines.ekf_landmarks import DetectionColumns
-from baselines.ekf_prediction import CLOCK, NODE, GravityInterval, open_interval
-from baselines.ekf_window import DepthColumns, DetectionOutcomes, PoseArrays
-from baselines.filter_intake import NO_OUTCOMES, NO_STAMPS, DetectionIntake, check_rows, depth_since
-from baselines.filter_models import FilterParams, sonar_model, vehicle_model
+from baselines.filter_clock import NODE
+from baselines.filter_detections import DetectionOutcomes
+from baselines.filter_events import PoseArrays, Window
+from baselines.filter_models import FilterParams
+from baselines.filter_shell import FilterShell
 from baselines.invariant_state import BARE, BIAS, BODY, InvariantState, landmark_covariance
 from baselines.invariant_window import process_window
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import EstimatorError
-from sonar_graph.measurements import Ints, Measurements
+from sonar_graph.measurements import Floats
 from sonar_graph.navigation.kernels import skew
-from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, RefusedRow, Trajectory
-
-SPARE_ROWS = 256
-"""IMU rows that may be kept longer than needed."""
-_NEVER, _LONG_AGO = int(np.iinfo(np.int64).max), int(np.iinfo(np.int64).min)
 
 
 class InvariantEkfParams(FilterParams):
     """Settings of the invariant filter: the same as those of EKF-SLAM, with the same defaults."""
 
 
-class InvariantEkf:
+class InvariantEkf(FilterShell):
     """Right-invariant extended Kalman filter over pose, gyro bias and landmarks.
 
     Same measurements, gates, floor and gaps as `baselines.ekf_slam.EkfSlam`, and what is known to make a filter
@@ -58,124 +50,53 @@ class InvariantEkf:
     Params: ClassVar[type[Section]] = InvariantEkfParams
 
     def __init__(self, calibration: Calibration, params: InvariantEkfParams | None = None) -> None:
-        self._params = params or InvariantEkfParams()
-        self._vehicle_values = (*vehicle_model(calibration, self._params.gravity_interval_s),)
-        self._sonar_values = (*sonar_model(calibration, self._params.gate_probability),)
-        self._lever_m = self._vehicle_values[2]
-        has_bias = calibration.imu.gyro_bias_sigma > 0
-        self._walk_density = calibration.imu.gyro_bias_walk_density if has_bias else 0.0
-        self._depth_variance = calibration.depth.sigma_m**2
-        self._odometry = Odometry(calibration)
-        self._intake = DetectionIntake(self._params.minimum_id_probability)
-        self._estimates = CausalEstimates()
-        self._most_rows = SPARE_ROWS
-        self._state = start_state(calibration)
-        self._clock: Ints = np.zeros(CLOCK, np.int64)
-        self._interval_values = (*GravityInterval(np.eye(3), np.zeros(3), np.zeros(4)),)
-        self._reached_ns, self._done_ns = _NEVER, _LONG_AGO
-
-    def process(self, measurements: Measurements) -> Estimate | None:
-        """Take in what was measured and return the causal estimate at ``measurements.end_ns``.
-
-        None before the first DVL stamp that IMU rows cover from both sides.
-
-        Raises
-        ------
-        MeasurementError
-            When a row is stamped after ``end_ns``.
-        EstimatorError
-            When a variance in the log or the calibration makes an innovation covariance not positive definite.
-        """
-        self._odometry.add(measurements.imu, measurements.dvl)
-        self._start()
-        check_rows(measurements)
-        named = self._intake.name(measurements.detections, self._reached_ns, self._done_ns)
-        since_ns = max(self._done_ns, self._reached_ns)
-        self._done_ns = max(self._done_ns, measurements.end_ns)
-        if measurements.end_ns < max(self._reached_ns, int(self._clock[NODE])):
-            self._intake.record(named, NO_OUTCOMES)
-            return None
-        columns = self._intake.columns(named)
-        frame_ns = NO_STAMPS if named.detections is None else np.maximum(named.detections.stamps_ns, since_ns)
-        outcomes, pose = self._run(depth_since(measurements.depth, since_ns), frame_ns, columns, measurements.end_ns)
-        self._intake.record(named, outcomes)
-        self._forget()
-        estimate = Estimate(measurements.end_ns, gtsam.Pose3(gtsam.Rot3(pose[0]), pose[1]), pose[2])
-        self._estimates.keep(estimate)
-        return estimate
-
-    def trajectory(self) -> Trajectory:
-        """The causal estimates: a filter does not look back."""
-        return self._estimates.trajectory()
-
-    def landmarks(self) -> LandmarkMap:
-        """Landmarks in the state, with the covariances of their coordinates."""
-        slots = self._intake.slots
-        ids = sorted(slots)
-        return LandmarkMap(
-            ids=np.array(ids, dtype=np.int64),
-            positions=np.array([self._state.points[1 + slots[i]] for i in ids]).reshape(-1, 3),
-            covariances=np.array([landmark_covariance(self._state, 1 + slots[i]) for i in ids]).reshape(-1, 3, 3),
-        )
-
-    def detections(self) -> DetectionLog:
-        """What became of each detection so far."""
-        return self._intake.log()
-
-    def refused_rows(self) -> list[RefusedRow]:
-        """Rows of IMU and Doppler log that are not used, and why."""
-        return self._odometry.refused
+        self._filter = InvariantFilter(calibration)
+        super().__init__(calibration, params or InvariantEkfParams(), self._filter)
 
     def state(self) -> tuple[int, InvariantState]:
         """Stamp (ns) and a copy of the state at the newest node."""
-        return int(self._clock[NODE]), InvariantState(*(part.copy() for part in self._state))
+        return self.node_ns, self._filter.state()
 
-    def _start(self) -> None:
-        """Set the clock once the first node is covered by IMU rows from both sides."""
-        if self._reached_ns < _NEVER:
-            return
-        start_ns = self._odometry.start_ns()
-        if start_ns is None:
-            return
-        columns = self._odometry.columns()
-        imu_ns = columns[0]
-        self._reached_ns = int(imu_ns[np.searchsorted(imu_ns, start_ns)])
-        self._clock[NODE] = start_ns
-        open_interval(columns, self._lever_m, GravityInterval(*self._interval_values), self._clock)
 
-    def _run(
-        self, depth: DepthColumns, frame_ns: Ints, detections: DetectionColumns, until_ns: int
-    ) -> tuple[DetectionOutcomes, PoseArrays]:
-        """Take the filter to an instant."""
+class InvariantFilter:
+    """State of the invariant filter from one window to the next.
+
+    Parameters
+    ----------
+    calibration
+        Start, and how the gyro bias walks.
+    """
+
+    def __init__(self, calibration: Calibration) -> None:
+        has_bias = calibration.imu.gyro_bias_sigma > 0
+        self._walk_density = calibration.imu.gyro_bias_walk_density if has_bias else 0.0
+        self._state = start_state(calibration)
+
+    def run(self, window: Window) -> tuple[DetectionOutcomes, PoseArrays]:
+        """Bring the state to the newest node reached at the window's end.
+
+        Raises
+        ------
+        EstimatorError
+            When a variance in the log or the calibration makes an innovation covariance not positive definite.
+        """
         try:
-            state, outcomes, pose = process_window(
-                self._odometry.columns(),
-                self._vehicle_values,
-                self._walk_density,
-                self._sonar_values,
-                (*self._state,),
-                self._clock,
-                self._interval_values,
-                depth,
-                self._depth_variance,
-                frame_ns,
-                detections,
-                until_ns,
-            )
+            state, outcomes, pose = process_window((*self._state,), self._walk_density, (*window,))
         except np.linalg.LinAlgError as error:
             raise EstimatorError(
-                f"invariant-ekf: between {int(self._clock[NODE])} and {until_ns} ns the expected covariance of a"
+                f"invariant-ekf: between {window.clock[NODE]} and {window.until_ns} ns the expected covariance of a"
                 " measurement is not positive definite; give variances above zero in log and calibration"
             ) from error
         self._state = InvariantState(*state)
         return outcomes, pose
 
-    def _forget(self) -> None:
-        """Drop used rows now and then: that costs as much as keeping a few."""
-        self._odometry.settle(int(self._clock[NODE]))
-        if len(self._odometry.columns()[0]) > self._most_rows:
-            self._odometry.forget_before(int(self._clock[NODE]))
-            self._most_rows = len(self._odometry.columns()[0]) + SPARE_ROWS
+    def landmark(self, slot: int) -> tuple[Floats, Floats]:
+        """Position, and covariance of its coordinates."""
+        return self._state.points[1 + slot], landmark_covariance(self._state, 1 + slot)
+
+    def state(self) -> InvariantState:
+        """A copy."""
+        return InvariantState(*(part.copy() for part in self._state))
 
 
 def start_state(calibration: Calibration) -> InvariantState:

@@ -30,8 +30,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from baselines.ekf_landmarks import SonarModel
+from baselines.filter_models import SonarModel
+from baselines.gravity_interval import UP
 from baselines.invariant_state import BIAS, BODY, POINT, THETA, InvariantState, by_bias, put
+from baselines.sonar_views import point_seen, predicted_view
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.gap_motion import GapMotion
 from sonar_graph.navigation.kernels import compiled
@@ -47,29 +49,21 @@ from sonar_graph.navigation.triples import (
     times,
     times_skew,
     transformed,
-    transposed,
     vector,
 )
-from sonar_graph.slam.models import project, sonar_point, sonar_point_jacobian
-
-UP: Vector = (0.0, 0.0, 1.0)
+from sonar_graph.slam.models import sonar_point_jacobian
 
 
 @compiled
 def observation(state: InvariantState, k: int, motion: GapMotion, sonar: SonarModel) -> tuple[Floats, Floats, Floats]:
     """Predicted range and azimuth (2,), H (2, 9 + 3 N) and H_m (2, 6) of (4)."""
-    R, dR, dp = matrix(state.R), motion.integral.dR, motion.integral.dp
-    p_n = times(transposed(R), minus(vector(state.points[k]), vector(state.points[0])))
-    p_b = times(transposed(dR), minus(p_n, dp))
-    q = times(transposed(sonar.body_R_sonar), minus(p_b, sonar.body_p_sonar))
-    z, D_q = project(np.array(q))
-    node_R_sonar = product(dR, sonar.body_R_sonar)
+    R, X = matrix(state.R), vector(state.points[0])
+    z, p_n, by_range, by_azimuth = predicted_view(X, R, motion.integral, sonar, vector(state.points[k]))
     H, H_m, at = np.zeros((2, len(state.P))), np.empty((2, 6)), BODY + POINT * k
-    for r in range(2):
-        n = times(node_R_sonar, vector(D_q[r]))
+    for r, n in enumerate((by_range, by_azimuth)):
         put(H[r, at:], times(R, n))
         put(H[r, BODY:], times(R, scaled(-1.0, n)))
-        put(H_m[r], cross(n, minus(p_n, dp)))
+        put(H_m[r], cross(n, minus(p_n, motion.integral.dp)))
         put(H_m[r, 3:], scaled(-1.0, n))
     H[:, BIAS:BODY] += by_bias(H_m, motion)
     return z, H, H_m
@@ -87,8 +81,7 @@ def location(
     (3, 3).
     """
     R, dR, dp = matrix(state.R), motion.integral.dR, motion.integral.dp
-    p_b = transformed(sonar.body_p_sonar, sonar.body_R_sonar, vector(sonar_point(z[0], z[1], elevation_rad)))
-    s = transformed(dp, dR, p_b)
+    s = point_seen(motion.integral, sonar, z, elevation_rad)
     G, G_m, G_z = np.zeros((3, len(state.P))), np.empty((3, 6)), np.empty((3, 3))
     place(IDENTITY, G, 0, BODY)
     place(times_skew(R, minus(dp, s)), G_m, 0, 0)

@@ -8,13 +8,13 @@ frame (`sonar_graph.navigation.recursion`) a bias that is larger by db gives ``t
 
 from __future__ import annotations
 
-from baselines.ekf_motion import told_again
-from baselines.ekf_prediction import VehicleModel
+from baselines.ekf_motion import earth_in_body, finished, told_again
+from baselines.filter_models import VehicleModel
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.gap_motion import GapMotion, bridge
 from sonar_graph.navigation.interpolation import rows_until
 from sonar_graph.navigation.kernels import compiled
-from sonar_graph.navigation.recursion import NO_MOTION, Integral, extended, increment, mirrored, rate_of_turn
+from sonar_graph.navigation.recursion import NO_MOTION, extended, increment, rate_of_turn
 from sonar_graph.navigation.steps import Columns, cursor_at, next_step
 from sonar_graph.navigation.triples import (
     ZEROS,
@@ -23,8 +23,6 @@ from sonar_graph.navigation.triples import (
     matrix,
     multiple_of,
     skew_times,
-    times,
-    transposed,
     vector,
 )
 
@@ -34,7 +32,7 @@ def motion_to_node(
     columns: Columns, vehicle: VehicleModel, R: Floats, bias: Floats, start_ns: int, node_ns: int
 ) -> GapMotion:
     """Final motion to the next node, with the first IMU row at or after it."""
-    earth = _earth_in_body(vehicle, R)
+    earth = earth_in_body(vehicle, matrix(R))
     if node_ns - start_ns > vehicle.gap[0]:
         return bridge(columns, vehicle.gap, start_ns, node_ns, True, vector(bias), earth)
     imu_rows = rows_until(columns[0], node_ns - 1) + 1
@@ -46,7 +44,7 @@ def motion_since_node(
     columns: Columns, vehicle: VehicleModel, R: Floats, bias: Floats, node_ns: int, until_ns: int
 ) -> GapMotion:
     """Provisional motion to an instant, from rows stamped no later."""
-    earth = _earth_in_body(vehicle, R)
+    earth = earth_in_body(vehicle, matrix(R))
     if until_ns - node_ns > vehicle.gap[0]:
         return bridge(columns, vehicle.gap, node_ns, until_ns, False, vector(bias), earth)
     return _integrate(columns, vehicle, rows_until(columns[0], until_ns), vector(bias), earth, node_ns, until_ns)
@@ -73,11 +71,4 @@ def _integrate(
         D_t = difference_of(D_t, multiple_of(step.duration_s, added.theta_by_rate))
         D_r = difference_of(D_r, multiple_of(step.duration_s, added.eps_by_rate))
         motion = extended(motion, step, added, vehicle.gyro_noise_density)
-    whole = Integral(motion.dR, motion.dp, motion.impulse, motion.cov_tt, motion.cov_rt, mirrored(motion.cov_rr))
-    return GapMotion(whole, D_t, D_r)
-
-
-@compiled
-def _earth_in_body(vehicle: VehicleModel, R: Floats) -> Vector:
-    """Earth's rotation in the body frame of the state, rad/s."""
-    return times(transposed(matrix(R)), vehicle.earth_rate)
+    return GapMotion(finished(motion), D_t, D_r)

@@ -4,127 +4,80 @@ With H and H_m of `baselines.invariant_models`, C the covariance of the motion s
 
     S = H P H^T + H_m C H_m^T + R_z                                                                           (8)
 
-Gates, the elevation of a new landmark and when it stands on the floor are as in `baselines.ekf_landmarks`.
+The gate and the elevation of a new landmark are those of `baselines.filter_detections` and `baselines.sonar_views`; it
+stands on the floor as in `baselines.ekf_augmentation`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from baselines.ekf_landmarks import (
+from baselines.far_views import by_range_and_azimuth, is_beyond_linear, view_noise
+from baselines.filter_detections import (
     GATED,
     NEW,
     NO_SLOT,
     PASSED_OVER,
     USED,
-    DetectionColumns,
+    Frame,
     Noise,
-    SonarModel,
-    logged_noise,
-    squared_distance,
+    Sighting,
+    is_inside_gate,
+    sighting,
 )
-from baselines.far_views import by_range_and_azimuth, is_beyond_linear, view_noise
-from baselines.invariant_models import (
-    height_of_body_point,
-    height_of_point,
-    location,
-    missed_up,
-    observation,
-)
+from baselines.filter_models import SonarModel
+from baselines.gravity_interval import UP
+from baselines.invariant_models import height_of_body_point, height_of_point, location, missed_up, observation
 from baselines.invariant_state import BODY, POINT, InvariantState, correct, motion_matrix, put
-from sonar_graph.measurements import Floats, Ints
+from baselines.sonar_views import elevation_of_new, noise_of_view
+from sonar_graph.measurements import Floats
 from sonar_graph.navigation.gap_motion import GapMotion
 from sonar_graph.navigation.kernels import compiled
-from sonar_graph.navigation.triples import Vector, matrix, product, transformed, vector
-from sonar_graph.slam.models import FLOOR_GATE, floor_elevation, wrap_angle
+from sonar_graph.navigation.triples import Vector, matrix, vector
+from sonar_graph.slam.models import FLOOR_GATE, wrap_angle
 
 
 @compiled
-def observe_rows(
-    state: InvariantState,
-    motion: GapMotion,
-    sonar: SonarModel,
-    detections: DetectionColumns,
-    first: int,
-    last: int,
-    outcomes: Ints,
-    innovations: Floats,
-    covs: Floats,
-    was_lost: bool = False,
-) -> InvariantState:
-    """Take in some rows, all of one instant, one after the other.
-
-    Parameters
-    ----------
-    motion
-        From the state to that instant.
-    first, last
-        Rows from the first up to, without, the last.
-    outcomes, innovations, covs
-        Written: USED, NEW, GATED or PASSED_OVER, shape (m,); innovations (m, 2) and their covariances (m, 2, 2), which
-        stay as they are where nothing is predicted.
-    was_lost
-        Whether the Doppler log has lost the bottom: from then on views are linearised as in `baselines.far_views`,
-        where it takes that.
-
-    Returns
-    -------
-    The state, larger by what was new.
-    """
-    slots, range_m, azimuth_rad, noise = detections
-    for row in range(first, last):
-        z, R_z = (range_m[row], azimuth_rad[row]), logged_noise(noise[row], sonar)
-        k = 1 + slots[row]
-        if slots[row] == NO_SLOT:
+def observe_rows(state: InvariantState, motion: GapMotion, sonar: SonarModel, frame: Frame) -> InvariantState:
+    """Take in the rows of a frame, a motion after the state, one after the other; what is new makes it larger."""
+    outcomes = frame.told[0]
+    for row in range(frame.first, frame.last):
+        seen = sighting(frame, row, sonar)
+        k = 1 + seen.slot
+        if seen.slot == NO_SLOT:
             outcomes[row] = PASSED_OVER
         elif k == len(state.points):
-            state = _augmented(state, motion, sonar, z, R_z)
+            state = _augmented(state, motion, sonar, seen)
             outcomes[row] = NEW
-        elif was_lost:
-            outcomes[row] = _observe_far(state, k, motion, sonar, z, R_z, innovations[row], covs[row])
+        elif frame.was_lost:
+            outcomes[row] = _observe_far(state, k, motion, sonar, seen)
         else:
-            outcomes[row] = _observe(state, k, motion, sonar, z, R_z, innovations[row], covs[row])
+            outcomes[row] = _observe(state, k, motion, sonar, seen)
     return state
 
 
 @compiled
-def _observe(
-    state: InvariantState,
-    k: int,
-    motion: GapMotion,
-    sonar: SonarModel,
-    z: tuple[float, float],
-    R_z: Noise,
-    innovation: Floats,
-    S: Floats,
-) -> int:
+def _observe(state: InvariantState, k: int, motion: GapMotion, sonar: SonarModel, seen: Sighting) -> int:
     """Correct by a landmark that is in the state, where its innovation is inside the gate."""
+    _, z, R_z, innovation, S = seen
     predicted, H, H_m = observation(state, k, motion, sonar)
     innovation[0], innovation[1] = z[0] - predicted[0], wrap_angle(z[1] - predicted[1])
     cross_cov = H @ state.P
     S[:] = _symmetric(cross_cov @ H.T + _blur(H_m, motion) + _noise_matrix(R_z))
-    if not squared_distance(innovation, S) <= sonar.gate:
+    if not is_inside_gate(seen, sonar):
         return GATED
     correct(state, cross_cov, S, innovation)
     return USED
 
 
 @compiled
-def _observe_far(
-    state: InvariantState,
-    k: int,
-    motion: GapMotion,
-    sonar: SonarModel,
-    z: tuple[float, float],
-    R_z: Noise,
-    innovation: Floats,
-    S: Floats,
-) -> int:
+def _observe_far(state: InvariantState, k: int, motion: GapMotion, sonar: SonarModel, seen: Sighting) -> int:
     """Correct by a landmark that may be far from where it is predicted, inside the gate: `baselines.far_views`.
 
     ``Exp(theta)`` turns both points, so that the place where the landmark was seen less the one where it was predicted
     is ``J_r(theta) (xi_k - xi_new)``: no H of theta, however far they are apart.
     """
+    _, z, R_z, innovation, S = seen
     point, G, G_m, G_z = location(state, motion, sonar, z, 0.0)
     missed, H, at = np.array(point) - state.points[k], -G, BODY + POINT * k
     for r in range(POINT):
@@ -132,25 +85,22 @@ def _observe_far(
     cross_cov = H @ state.P
     cov = _symmetric(cross_cov @ H.T + _blur(G_m, motion))
     if not is_beyond_linear(cov, G_z, z[0], R_z):
-        return int(_observe(state, k, motion, sonar, z, R_z, innovation, S))
+        return int(_observe(state, k, motion, sonar, seen))
     cov += _symmetric(G_z @ view_noise(z[0], R_z, sonar.aperture_rad) @ G_z.T)
     B = by_range_and_azimuth(G_z, z[0])
     innovation[:], S[:] = B @ missed, _symmetric(B @ cov @ B.T)
-    if not squared_distance(innovation, S) <= sonar.gate:
+    if not is_inside_gate(seen, sonar):
         return GATED
     correct(state, cross_cov, cov, missed)
     return USED
 
 
 @compiled
-def _augmented(
-    state: InvariantState, motion: GapMotion, sonar: SonarModel, z: tuple[float, float], R_z: Noise
-) -> InvariantState:
-    """The state with a landmark where it was seen; its elevation from the floor where there is one, else zero."""
-    point, G, G_m, G_z = location(state, motion, sonar, z, _elevation(state, motion, sonar, z))
-    view = np.zeros((3, 3))
-    view[:2, :2] = _noise_matrix(R_z)
-    view[2, 2] = sonar.aperture_rad**2 / 12.0
+def _augmented(state: InvariantState, motion: GapMotion, sonar: SonarModel, seen: Sighting) -> InvariantState:
+    """The state with a landmark where it was seen."""
+    elevation_rad = elevation_of_new(vector(state.points[0]), matrix(state.R), motion.integral, sonar, seen.z)
+    point, G, G_m, G_z = location(state, motion, sonar, seen.z, elevation_rad)
+    view = np.array(noise_of_view(seen.R_z, sonar.aperture_rad))
     n, cross_cov = len(state.P), G @ state.P
     points, P = np.empty((len(state.points) + 1, 3)), np.empty((n + POINT, n + POINT))
     points[:-1], P[:n, :n] = state.points, state.P
@@ -171,19 +121,6 @@ def _stand_on_floor(state: InvariantState, sonar: SonarModel) -> None:
     S = cross_cov @ H.T + sonar.floor_variance_m2
     if innovation[0] ** 2 <= FLOOR_GATE * S[0, 0]:
         correct(state, cross_cov, S, innovation)
-
-
-@compiled
-def _elevation(state: InvariantState, motion: GapMotion, sonar: SonarModel, z: tuple[float, float]) -> float:
-    """Elevation on the floor; 0 without one, or where it is outside the aperture."""
-    if not sonar.has_floor:
-        return 0.0
-    dR, dp = motion.integral.dR, motion.integral.dp
-    node_p_sonar, R = transformed(dp, dR, sonar.body_p_sonar), matrix(state.R)
-    world_R_sonar = product(product(R, dR), sonar.body_R_sonar)
-    height_m = sonar.floor_z_m - transformed(vector(state.points[0]), R, node_p_sonar)[2]
-    elevation = floor_elevation(np.array(world_R_sonar[2]), height_m, z[0], z[1], sonar.aperture_rad)
-    return 0.0 if np.isnan(elevation) else elevation
 
 
 @compiled
@@ -210,7 +147,7 @@ def correct_plane(state: InvariantState, z_m: float, z_variance: float, tilt_var
     height_m, H = height_of_point(state, 0)
     cross_cov = H @ state.P
     correct(state, cross_cov, cross_cov @ H.T + z_variance, np.array([z_m - height_m]))
-    correct_up(state, (0.0, 0.0, 1.0), tilt_variance)
+    correct_up(state, UP, tilt_variance)
 
 
 @compiled

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 from hypothesis import strategies as st
 
-from baselines.ekf_landmarks import SonarModel
+from baselines.filter_models import SonarModel
 from baselines.invariant_state import InvariantState
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.gap_motion import GapMotion

@@ -7,19 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from baselines.ekf_landmarks import (
-    GATED,
-    NEW,
-    NO_SLOT,
-    PASSED_OVER,
-    USED,
-    SonarModel,
-    location,
-    moment_after,
-    motion_covariance,
-    observation,
-    observe_rows,
-)
+from baselines.ekf_augmentation import location
+from baselines.ekf_derivatives import moment_after, motion_covariance
+from baselines.ekf_landmarks import observation, observe_rows
+from baselines.filter_detections import GATED, NEW, NO_SLOT, PASSED_OVER, USED, Frame, nothing_told
+from baselines.filter_models import SonarModel
 from sonar_graph.navigation.triples import matrix, vector
 from sonar_graph.slam.association import gate_threshold
 from sonar_graph.slam.models import FLOOR_GATE, elevation_on_floor, locate, range_azimuth
@@ -87,9 +79,9 @@ def state(angles, *landmarks, room=3):
 def frame(x, P, n, slots, z, model=None, R=NOISE):
     m, (range_m, azimuth) = len(slots), np.array(z).T.copy()
     columns = np.array(slots), range_m, azimuth, np.array([R] * m)
-    outcomes, innovations, covs = np.empty(m, np.int64), np.full((m, 2), np.nan), np.full((m, 2, 2), np.nan)
-    n = observe_rows(x, P, n, motion(), model or sonar(), columns, 0, m, outcomes, innovations, covs)
-    return n, outcomes, innovations, covs
+    told = nothing_told(m)
+    n = observe_rows(x, P, n, motion(), model or sonar(), Frame(columns, 0, m, told, False))
+    return n, *told
 
 
 def difference(ahead, behind):

@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from baselines.ekf_motion import motion_since_node, motion_to_node, nothing_running, told_again
-from baselines.ekf_prediction import VehicleModel
+from baselines.filter_models import VehicleModel
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation import node_motion

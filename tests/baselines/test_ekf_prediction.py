@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from baselines.ekf_prediction import GravityInterval, VehicleModel, advance_to_node, open_interval
+from baselines.ekf_prediction import advance_to_node
+from baselines.filter_models import VehicleModel
+from baselines.gravity_interval import GravityInterval, open_interval
 from sonar_graph.navigation.recursion import NO_MOTION
 from sonar_graph.navigation.unmeasured_turns import NO_TURNS
 from sonar_graph.sequence import NS_PER_S

@@ -5,11 +5,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from baselines.ekf_landmarks import GATED, USED, SonarModel
 from baselines.ekf_landmarks import observe_rows as observe_by_ekf
-from baselines.ekf_prediction import LOST
 from baselines.ekf_slam import EkfSlam
 from baselines.far_views import by_range_and_azimuth, is_beyond_linear, view_noise
+from baselines.filter_clock import LOST
+from baselines.filter_detections import GATED, USED, Frame, nothing_told
+from baselines.filter_models import SonarModel
 from baselines.invariant_ekf import InvariantEkf
 from baselines.invariant_state import InvariantState, landmark_covariance
 from baselines.invariant_updates import observe_rows as observe_by_invariant
@@ -29,14 +30,15 @@ AFTER_S = np.array([3.0, 10.0, 20.0])
 
 
 def by_ekf(P, seen, was_lost):
-    x, outcomes, innovation, S = np.zeros(9), np.empty(1, np.int64), np.full((1, 2), np.nan), np.full((1, 2, 2), np.nan)
+    x, told = np.zeros(9), nothing_told(1)
+    outcomes, innovation, S = told
     x[6:] = LANDMARK
-    observe_by_ekf(x, P, 9, NO_MOTION, SONAR, seen, 0, 1, outcomes, innovation, S, was_lost)
+    observe_by_ekf(x, P, 9, NO_MOTION, SONAR, Frame(seen, 0, 1, told, was_lost))
     return outcomes[0], x[:3], P[:3, :3], innovation[0], S[0]
 
 
 def by_invariant(P, seen, was_lost):
-    outcomes, innovation, S = np.empty(1, np.int64), np.full((1, 2), np.nan), np.full((1, 2, 2), np.nan)
+    outcomes, innovation, S = told = nothing_told(1)
     own = np.r_[3:6, 9:12, 0:3, 6:9]  # [angles, bias, X, p] from [X, angles, p, bias]; the body is at the origin
     wide = np.zeros((12, 12))
     wide[:9, :9] = P
@@ -46,7 +48,7 @@ def by_invariant(P, seen, was_lost):
         np.eye(3), np.vstack([np.zeros(3), LANDMARK]), np.zeros(3), turned @ wide[np.ix_(own, own)] @ turned.T
     )
     still = GapMotion(NO_MOTION, ZEROS, ZEROS)
-    state = observe_by_invariant(state, still, SONAR, seen, 0, 1, outcomes, innovation, S, was_lost)
+    state = observe_by_invariant(state, still, SONAR, Frame(seen, 0, 1, told, was_lost))
     return outcomes[0], state.points[0], landmark_covariance(state, 0), innovation[0], S[0]
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from baselines.ekf_landmarks import NEW, NO_SLOT, USED
+from baselines.filter_detections import NEW, NO_SLOT, USED
 from baselines.filter_intake import DetectionIntake, check_rows, depth_since
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Depth, LandmarkDetections, Measurements

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from baselines.ekf_landmarks import GATED, NEW, NO_SLOT, PASSED_OVER, USED
+from baselines.filter_detections import GATED, NEW, NO_SLOT, PASSED_OVER, USED, Frame, nothing_told
 from baselines.invariant_state import InvariantState, landmark_covariance
 from baselines.invariant_updates import correct_depth, correct_plane, correct_up, observe_rows
 from sonar_graph.slam.models import locate, range_azimuth
@@ -28,8 +28,8 @@ def sonar_pose(state, xi_motion=None):
 def frame(state, slots, z, model=SONAR):
     m, (range_m, azimuth) = len(slots), np.array(z, float).T.copy()
     columns = np.array(slots), range_m, azimuth, np.array([NOISE] * m)
-    outcomes, innovations, covs = np.empty(m, np.int64), np.full((m, 2), np.nan), np.full((m, 2, 2), np.nan)
-    state = observe_rows(state, motion(), model, columns, 0, m, outcomes, innovations, covs)
+    outcomes, innovations, covs = told = nothing_told(m)
+    state = observe_rows(state, motion(), model, Frame(columns, 0, m, told, False))
     return state, outcomes.tolist(), innovations, covs
 
 

@@ -7,7 +7,8 @@ y and heading, and a filter must not think otherwise because its estimates chang
 import numpy as np
 import pytest
 
-from baselines.ekf_landmarks import moment_after, observation
+from baselines.ekf_derivatives import moment_after
+from baselines.ekf_landmarks import observation
 from baselines.euler import euler_from_rotation, rotation_from_euler
 from baselines.invariant_models import height_of_body_point, missed_up
 from baselines.invariant_models import observation as invariant_observation
