@@ -18,10 +18,16 @@ LEAST_LEVER_M = 0.05
 LEAST_BIAS_RAD_S = 1e-4
 """The Earth's rotation, 7.3e-5 rad/s, may be in the bias."""
 AXES = "xyz"
+ARM, BIAS = "lever arm from IMU to DVL", "gyro bias"
 
 
 def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
-    """A row an axis; the arm is the difference of two places, and nothing here says which of them is wrong."""
+    """A row an axis; the arm is the difference of two places, and nothing here says which of them is wrong.
+
+    One row in all where no axis can be told.
+    """
+    if not any(estimate.is_known for estimate in found.lever):
+        return [Finding(ARM, found.lever[0], "m", "")]
     given = _given_arm(calibration)
     wrong = _wrong_by(found, given)
     imu, dvl = calibration.imu.mounting.translation_m, calibration.dvl.mounting.translation_m
@@ -34,7 +40,7 @@ def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
         advice = f"the calibration's {of_calibration:+.2f} m fits, {NO_NEED}"
         if error:
             advice = f"not the calibration's {of_calibration:+.2f} m: {line}"
-        rows.append(Finding(f"lever arm from IMU to DVL, {axis}", estimate, "m", advice, bool(error)))
+        rows.append(Finding(f"{ARM}, {axis}", estimate, "m", advice, bool(error)))
     return said_once(rows)
 
 
@@ -49,7 +55,7 @@ def with_fitted(found: DvlMatch, calibration: Calibration) -> Calibration:
 
 
 def bias_findings(bias: Estimates3D, sources: tuple[str, str, str], imu: ImuCalibration) -> list[Finding]:
-    """A row an axis, against what the calibration lets a bias be.
+    """A row an axis, against what the calibration lets a bias be; one in all where no axis can be told.
 
     Parameters
     ----------
@@ -58,6 +64,8 @@ def bias_findings(bias: Estimates3D, sources: tuple[str, str, str], imu: ImuCali
     sources
         From what each was told, such as "from 12 s of rest".
     """
+    if not any(estimate.is_known for estimate in bias):
+        return [Finding(BIAS, bias[0], "rad/s", "")]
     return said_once(list(_bias_rows(bias, sources, imu)))
 
 
@@ -71,7 +79,7 @@ def _bias_rows(bias: Estimates3D, sources: tuple[str, str, str], imu: ImuCalibra
                 f"{source}, beyond the calibration's sigma of {allowed:.2g}: "
                 f"`imu.gyro_bias_sigma = {_largest(bias):.2g}` in the calibration, for estimators that find the bias"
             )
-        yield Finding(f"gyro bias, {axis}", estimate, "rad/s", advice, acts)
+        yield Finding(f"{BIAS}, {axis}", estimate, "rad/s", advice, acts)
 
 
 def _is_beyond(bias: Estimate1D, imu: ImuCalibration) -> bool:

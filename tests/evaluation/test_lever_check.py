@@ -88,3 +88,9 @@ def test_the_rotation_of_the_earth_is_no_fault_of_a_gyro():
 
 def test_without_any_bias_the_sigma_stays():
     assert with_fitted(match((UNKNOWN,) * 3), GIVEN) == GIVEN
+
+
+def test_where_no_axis_can_be_told_one_row_says_why():
+    rows = [*lever_findings(match((UNKNOWN,) * 3), GIVEN), *bias_findings((UNKNOWN,) * 3, ("",) * 3, GIVEN.imu)]
+    assert [row.quantity for row in rows] == ["lever arm from IMU to DVL", "gyro bias"]
+    assert [row.text() for row in rows] == ["cannot be told: too little turning"] * 2
