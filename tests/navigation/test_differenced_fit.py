@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
@@ -151,3 +153,13 @@ def test_ratios_are_those_of_the_noise_that_was_simulated(duration_s: float):
     found = fit([noisy_stretch(rng, (0.8, 0.3), duration_s) for _ in range(300)], WIDE)
     assert found.ratios == pytest.approx([0.8, 0.3], rel=0.35)
     assert found.variance == pytest.approx(0.01, rel=0.1)
+
+
+def test_a_stretch_own_parameter_that_is_there_twice_counts_once():
+    """As gravity and its turning do in a stretch of one difference: a basis of all columns would take rows away."""
+    stretches = [stretch_of(seed, (True, True, False)) for seed in range(3)]
+    twice = [replace(s, B=np.concatenate([s.B, 3 * s.B[:, :, ::-1]], axis=2)) for s in stretches]
+    once, again = (fit(s, WIDE, RATIOS) for s in (stretches, twice))
+    assert again.parameters == pytest.approx(once.parameters, rel=1e-9)
+    assert again.covariance == pytest.approx(once.covariance, rel=1e-9)
+    assert rate_noise_power(twice, RATIOS) == pytest.approx(rate_noise_power(stretches, RATIOS), rel=1e-9)
