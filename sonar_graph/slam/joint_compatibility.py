@@ -71,8 +71,9 @@ class Innovations:
 def pair_jointly(innovations: Innovations, probability: float) -> Pairing:
     """The largest jointly compatible pairing, the nearest of equally large ones.
 
-    A landmark is in one place: each is paired once at most. The cost is small where few pairs are compatible by
-    themselves, and grows exponentially with the number of detections where many are.
+    Its pairs are also compatible each by itself. A landmark is in one place: each is paired once at most. Part of a
+    pairing may be beyond the gate of its size, where more pairs make up for it. The cost is small where few pairs are
+    compatible by themselves, and grows exponentially with the number of detections where many are.
 
     Parameters
     ----------
@@ -118,21 +119,22 @@ class _Search:
         return self._best
 
     def _branch(self, depth: int, found: _Whitened) -> None:
-        if (found.size, -found.distance) > (self._best_size, -self._best.distance):
+        is_better = (found.size, -found.distance) > (self._best_size, -self._best.distance)
+        if is_better and found.distance <= self._gates[found.size]:
             self._best, self._best_size = Pairing(found.landmarks, found.distance), found.size
-        if self._left[depth] == 0 or self._is_hopeless(depth, found):
+        reach = found.size + self._left[depth]
+        if self._left[depth] == 0 or self._is_hopeless(reach, found):
             return
         i = self._order[depth]
         for j in self._possible[i]:
             if j not in found.landmarks:
                 more = self._with_pair(found, i, j)
-                if more.distance <= self._gates[more.size]:
+                if more.distance <= self._gates[reach]:
                     self._branch(depth + 1, more)
         self._branch(depth + 1, found)
 
-    def _is_hopeless(self, depth: int, found: _Whitened) -> bool:
-        """D² only grows with pairs: nothing below can be better than the best so far."""
-        reach = found.size + self._left[depth]
+    def _is_hopeless(self, reach: int, found: _Whitened) -> bool:
+        """D² only grows with pairs: with so many in the end nothing can be better than the best so far."""
         return reach < self._best_size or (reach == self._best_size and found.distance >= self._best.distance)
 
     def _with_pair(self, found: _Whitened, i: int, j: int) -> _Whitened:

@@ -1,0 +1,157 @@
+"""The pairing found is the one that trying all of them finds."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chi2, multivariate_normal
+
+from sonar_graph.measurements import Floats
+from sonar_graph.slam.joint_compatibility import UNPAIRED, Innovations, Pairing, believed, pair_jointly
+
+PROBABILITY = 0.95
+
+
+def random_case(seed: int, m: int, n: int, spread: float) -> Innovations:
+    """Landmarks seen by one vehicle whose error they share, some so near that many pairings are possible."""
+    rng = np.random.default_rng(seed)
+    expected = spread * rng.standard_normal((n, 2))
+    shared = rng.standard_normal((2 * n, 3))
+    own = 0.2 * rng.standard_normal((2 * n, 2 * n))
+    cov = shared @ shared.T + own @ own.T
+    noise = np.array([0.1 * (root := rng.standard_normal((2, 2))) @ root.T + 0.05 * np.eye(2) for _ in range(m)])
+    error = rng.multivariate_normal(np.zeros(2 * n), cov).reshape(n, 2)
+    seen = rng.permutation(np.concatenate([expected + error, spread * rng.standard_normal((m, 2))]))[:m]
+    return Innovations(seen[:, None] - expected[None], cov, noise)
+
+
+def distance(case: Innovations, landmarks: tuple[int, ...]) -> tuple[int, float]:
+    """Number of pairs and D², of the whole covariance at once."""
+    pairs = [(i, j) for i, j in enumerate(landmarks) if j != UNPAIRED]
+    if not pairs:
+        return 0, 0.0
+    e = np.concatenate([case.innovation[i, j] for i, j in pairs])
+    C = np.zeros((2 * len(pairs), 2 * len(pairs)))
+    for a, (i, j) in enumerate(pairs):
+        for b, (_, k) in enumerate(pairs):
+            block = case.expected_cov[2 * j : 2 * j + 2, 2 * k : 2 * k + 2]
+            C[2 * a : 2 * a + 2, 2 * b : 2 * b + 2] = block + (case.noise[i] if a == b else 0.0)
+    return len(pairs), float(e @ np.linalg.inv(C) @ e)
+
+
+def all_pairings(m: int, n: int) -> list[tuple[int, ...]]:
+    """Every pairing in which no landmark occurs twice."""
+    every = product(range(UNPAIRED, n), repeat=m)
+    return [p for p in every if len({j for j in p if j != UNPAIRED}) == sum(j != UNPAIRED for j in p)]
+
+
+def brute_force(case: Innovations) -> tuple[int, float, tuple[int, ...]]:
+    """The largest compatible pairing of pairs that are compatible alone, the nearest of equals."""
+    m, n = case.innovation.shape[:2]
+
+    def is_compatible(landmarks: tuple[int, ...]) -> bool:
+        size, squared = distance(case, landmarks)
+        return size == 0 or squared <= chi2.ppf(PROBABILITY, 2 * size)
+
+    found = []
+    for landmarks in all_pairings(m, n):
+        alone = [tuple(j if i == k else UNPAIRED for i in range(m)) for k, j in enumerate(landmarks)]
+        if all(map(is_compatible, alone)) and is_compatible(landmarks):
+            size, squared = distance(case, landmarks)
+            found.append((size, -squared, landmarks))
+    size, squared, landmarks = max(found)
+    return size, -squared, landmarks
+
+
+@settings(max_examples=150, deadline=None)
+@given(seed=st.integers(0, 2**31), m=st.integers(1, 4), n=st.integers(1, 4), spread=st.sampled_from([0.5, 1.5, 4.0]))
+def test_the_pairing_is_that_of_trying_all(seed: int, m: int, n: int, spread: float):
+    case = random_case(seed, m, n, spread)
+    found = pair_jointly(case, PROBABILITY)
+    size, squared, landmarks = brute_force(case)
+    assert distance(case, found.landmarks)[0] == found.size
+    assert found.distance == pytest.approx(distance(case, found.landmarks)[1], rel=1e-6, abs=1e-9)
+    assert found.size == size
+    assert found.distance == pytest.approx(squared, rel=1e-6, abs=1e-9)
+    assert found.landmarks == landmarks
+
+
+SPACING = 1.0
+SHIFT = 0.8
+VEHICLE_SIGMA, SIGMA = 1.0, 0.1
+
+
+def shifted() -> Innovations:
+    """Two landmarks a metre apart, both seen, by a vehicle that is off by nearly that metre."""
+    expected = np.array([[0.0, 0.0], [SPACING, 0.0]])
+    z = expected + np.array([SHIFT, 0.0])
+    shared = np.tile(np.eye(2), (2, 1))
+    cov = VEHICLE_SIGMA**2 * shared @ shared.T + 1e-4 * np.eye(4)
+    return Innovations(z[:, None] - expected[None], cov, np.tile(SIGMA**2 * np.eye(2), (2, 1, 1)))
+
+
+def nearest_neighbour(case: Innovations) -> list[int]:
+    """Each detection by itself, within the same gate."""
+    distances = case.distances()
+    nearest = np.argmin(distances, axis=1)
+    return [
+        int(j) if row[j] <= chi2.ppf(PROBABILITY, 2) else UNPAIRED for row, j in zip(distances, nearest, strict=True)
+    ]
+
+
+def test_an_error_that_all_share_does_not_mislead_joint_compatibility():
+    case = shifted()
+    assert nearest_neighbour(case) == [1, 1]
+    assert pair_jointly(case, PROBABILITY).landmarks == (0, 1)
+
+
+def test_with_errors_taken_as_independent_it_would():
+    """Negative control: the crossed pairing's innovations differ by two metres, which only the correlation forbids."""
+    case = shifted()
+    crossed = (1, 0)
+    _, joint = distance(case, crossed)
+    alone = Innovations(case.innovation, np.diag(np.diag(case.expected_cov)), case.noise)
+    _, apart = distance(alone, crossed)
+    assert joint > chi2.ppf(PROBABILITY, 4) > apart
+
+
+def test_a_landmark_is_paired_once():
+    case = Innovations(np.zeros((3, 1, 2)), np.eye(2), np.tile(np.eye(2), (3, 1, 1)))
+    assert pair_jointly(case, PROBABILITY).size == 1
+
+
+# What a pairing must be worth ---------------------------------------------------------------------------------------
+
+
+def alone(sigma: float, error: float = 0.0) -> tuple[Innovations, Pairing]:
+    case = Innovations(np.array([[[error, 0.0]]]), sigma**2 * np.eye(2), 1e-6 * np.eye(2)[None])
+    return case, Pairing((0,), 0.0)
+
+
+@pytest.mark.parametrize("sigma", [0.1, 0.5, 2.0])
+def test_a_pair_is_believed_when_it_is_denser_than_its_rival(sigma: float):
+    case, pairing = alone(sigma, 0.1)
+    density = multivariate_normal.logpdf([0.1, 0.0], cov=(sigma**2 + 1e-6) * np.eye(2))
+    assert believed(case, pairing, np.array([density - 1e-6])).size == 1
+    assert believed(case, pairing, np.array([density + 1e-6])).size == 0
+
+
+def test_two_that_share_a_wide_error_support_each_other():
+    """One alone says nothing beside a rival of 0.2 a unit; two at the right distance from each other do."""
+    rival = np.log(np.full(2, 0.2))
+    case = shifted()
+    both = believed(case, Pairing((0, 1), 0.0), rival)
+    assert both.landmarks == (0, 1)
+    assert believed(case, Pairing((0, UNPAIRED), 0.0), rival).size == 0
+
+
+def test_a_pair_that_the_others_speak_against_is_dropped():
+    """The third lies where the common error of the first two does not let it be."""
+    expected = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    z: Floats = expected + np.array([[0.8, 0.0], [0.8, 0.0], [-0.3, 0.6]])
+    shared = np.tile(np.eye(2), (3, 1))
+    cov = shared @ shared.T + 1e-4 * np.eye(6)
+    case = Innovations(z[:, None] - expected[None], cov, np.tile(SIGMA**2 * np.eye(2), (3, 1, 1)))
+    assert believed(case, Pairing((0, 1, 2), 0.0), np.log(np.full(3, 0.2))).landmarks == (0, 1, UNPAIRED)
