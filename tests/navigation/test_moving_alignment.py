@@ -97,6 +97,16 @@ def test_a_noiseless_run_gives_what_was_put_in():
     assert error_of(align_in_motion(imu, dvl, KNOWN), truth) == pytest.approx(np.zeros(5), abs=2e-6)
 
 
+def test_large_biases_are_found_as_exactly_as_small_ones():
+    """One step from nothing leaves what is not linear in them."""
+    wide = {"gyro_bias_sigma": 0.5, "accel_bias_sigma": 1e-6}
+    known, bias = KNOWN.model_copy(update={"imu": KNOWN.imu.model_copy(update=wide)}), np.array([0.04, -0.03, 0.05])
+    imu, dvl, truth = run(np.random.default_rng(0), noise=0.0)
+    biased = Imu(imu.stamps_ns, imu.angular_velocity + bias, imu.specific_force)
+    error = error_of(align_in_motion(biased, dvl, known), truth + np.r_[0.0, 0.0, bias])
+    assert error == pytest.approx(np.zeros(5), abs=2e-5)
+
+
 @pytest.mark.parametrize(("known", "earth"), [(KNOWN, 0.0), (COARSE, 0.0), (WITH_EARTH, EARTH), (FIBRE, EARTH)])
 def test_what_is_claimed_is_what_many_runs_err_by(known, earth):
     runs = 100

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation import align_in_motion
+from sonar_graph.navigation.inertial_path import InertialPath
+from sonar_graph.navigation.moving_alignment import _Doppler
 
 from .test_moving_alignment import EARTH, LATITUDE, G, acceleration, attitude, velocity
 
@@ -118,3 +120,16 @@ def test_the_covariance_is_that_of_every_reading_and_bias(known, earth, toleranc
     truth, found = error_spread(known, earth), found_from(*readings(known, earth), known)
     size = np.sqrt(np.outer(np.diag(truth), np.diag(truth)))
     assert found.covariance / size == pytest.approx(truth / size, abs=tolerance)
+
+
+def test_noise_of_a_rate_moves_no_velocity_along_the_lever():
+    """However the vehicle has turned since the first sample."""
+    known = calibration(1e-3, 0.0, 0.0, 0.0)
+    rate, force, at_dvl = readings(known, 0.0)
+    path = InertialPath.of(Imu(np.round(T * 1e9).astype(np.int64), rate, force))
+    seconds, lever = T[::DVL_EVERY], IMU_AT - DVL_AT
+    fresh = _Doppler.along(path, seconds, at_dvl, np.zeros((len(seconds), 3, 3)), known).R
+    along = path.rotations_at(seconds) @ lever
+    size = 1e-6 * HZ * lever @ lever
+    assert np.einsum("ki,kij,kj->k", along, fresh, along) == pytest.approx(0.0 * seconds, abs=1e-9 * size)
+    assert np.trace(fresh, axis1=1, axis2=2) == pytest.approx(0.0 * seconds + 2 * size)
