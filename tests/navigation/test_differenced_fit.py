@@ -163,3 +163,13 @@ def test_a_stretch_own_parameter_that_is_there_twice_counts_once():
     assert again.parameters == pytest.approx(once.parameters, rel=1e-9)
     assert again.covariance == pytest.approx(once.covariance, rel=1e-9)
     assert rate_noise_power(twice, RATIOS) == pytest.approx(rate_noise_power(stretches, RATIOS), rel=1e-9)
+
+
+def test_what_fits_nearly_exactly_is_told_as_exactly():
+    """Differences that are the model's but for a ten thousandth: the variance is that of the little left over."""
+    rng, p = np.random.default_rng(6), np.array([2.0, -3.0])
+    exact = [replace(s, y=s.A @ p + s.B @ np.ones(3)) for s in (stretch_of(seed, (True,) * 3) for seed in range(3))]
+    noisy = [replace(s, y=s.y + 1e-4 * np.diff(rng.standard_normal((21, 3)), axis=0)) for s in exact]
+    found = fit(noisy, WIDE, np.array([1e-6, 1e-6]))
+    assert found.parameters == pytest.approx(p, abs=1e-3)
+    assert found.variance == pytest.approx(1e-8, rel=0.5)
