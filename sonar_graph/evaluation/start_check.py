@@ -74,6 +74,8 @@ def find_start_tilt(sequence: Sequence) -> StartTilt:
         tilt = align_in_motion(imu, dvl, sequence.calibration)
     except AlignmentError as error:
         return StartTilt(None, f"at rest: {found.said}; in motion: {_without_advice(error)}")
+    except np.linalg.LinAlgError:
+        return StartTilt(None, f"at rest: {found.said}; in motion: the calibration's noise is zero")
     return StartTilt(tilt, f"from {(imu.stamps_ns[-1] - imu.stamps_ns[0]) / NS_PER_S:.0f} s in motion")
 
 

@@ -113,3 +113,11 @@ def test_what_speaks_against_both_ways_is_said():
     assert "at rest: Imu.specific_force: varies" in found.said
     assert "in motion: alignment: velocities and accelerations differ" in found.said
     assert "inspect" not in found.said
+
+
+def test_a_calibration_without_any_noise_is_a_reason_too():
+    run = resting(4.0)
+    silent = {"imu": {"gyro_noise_density": 0.0, "accel_noise_density": 0.0}, "dvl": {"velocity_sigma_m_s": [0.0] * 3}}
+    found = find_start_tilt(replace(run, calibration=Calibration.parse(silent, "by hand")))
+    assert found.tilt is None
+    assert found.said.endswith("in motion: the calibration's noise is zero")
