@@ -120,6 +120,11 @@ class AnonymousLandmarks:
         """Age, against the newest keyframe, of the oldest keyframes on which sightings may wait."""
         return self._policy.longest_wait_s
 
+    @property
+    def has_landmarks(self) -> bool:
+        """Whether any landmark of the graph is anonymous."""
+        return any(i >= FIRST_ANONYMOUS_ID for i in self._landmarks.ids)
+
     def keys(self) -> list[int]:
         """Variables whose joint covariance pairing needs: all landmarks, and keyframes that saw candidates."""
         seen_from = [candidate.sightings[-1].line.pose_key for candidate in self._candidates]
@@ -187,8 +192,8 @@ class AnonymousLandmarks:
         newest.outcome = Outcome.NEW
         self._landmarks.exchange([], [(sighting, landmark_id) for sighting in candidate.sightings], time_s)
 
-    def merge(self, covariance: JointCovariance, time_s: float) -> bool:
-        """Merge the two landmarks that are most likely one, if any are; whether any were.
+    def merge(self, covariance: JointCovariance, time_s: float) -> None:
+        """Merge the two landmarks that are most likely one, if any are.
 
         The sightings of one become those of the other: the graph is then that of a run that had known.
 
@@ -201,14 +206,13 @@ class AnonymousLandmarks:
         named = [i for i in self._landmarks.ids if i < FIRST_ANONYMOUS_ID]
         found = self._merging.nearest(self._smoother.values, covariance, sorted(named), anonymous)
         if found is None:
-            return False
+            return
         stays, goes = found
         moving = self._landmarks.sightings(goes)
         for sighting in moving:
             sighting.outcome = Outcome.MOVED
             self._journal.amend(sighting.row, sighting.outcome, stays)
         self._landmarks.exchange(moving, [(sighting, stays) for sighting in moving], time_s)
-        return True
 
     def forget(self, oldest_pose_key: int) -> None:
         """Let go of sightings on older keyframes than one."""

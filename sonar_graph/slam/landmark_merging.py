@@ -4,7 +4,7 @@ A landmark that was seen again after much drift may be taken for a new one. When
 the poses, its duplicate comes to lie where it lies. Two landmarks a, b are one when all of this holds:
 
 * at least one of them is anonymous;
-* no frame shows both;
+* no frame shows both, and with a bounded history none of the one that goes has left the window;
 * their difference ``d = p_a - p_b``, with ``S = P_aa + P_bb - P_ab - P_ba``, is compatible with zero: ``d' S^-1 d`` is
   within the chi-square gate, three degrees of freedom;
 * that says something: the density of the horizontal difference ``N(d_xy; 0, S_xy)``, 1/m², exceeds the density that
@@ -62,16 +62,17 @@ class LandmarkMerging:
         d, S = _differences(values, covariance, pairs)
         distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])
         near = [k for k in np.argsort(distance).tolist() if distance[k] <= self._gate]
-        return next((pairs[k] for k in near if self._is_telling(d[k], S[k]) and not self._meet(*pairs[k])), None)
+        return next((pairs[k] for k in near if self._is_telling(d[k], S[k]) and self._may_be_one(*pairs[k])), None)
 
     def _is_telling(self, d: Floats, S: Floats) -> bool:
         level = S[:2, :2]
         log_det = float(np.linalg.slogdet(level)[1])
         return -0.5 * (float(d[:2] @ np.linalg.solve(level, d[:2])) + log_det) - math.log(2 * math.pi) > self._log_rival
 
-    def _meet(self, a: int, b: int) -> bool:
-        """Whether a frame shows both."""
-        return not self._landmarks.stamps_ns(a).isdisjoint(self._landmarks.stamps_ns(b))
+    def _may_be_one(self, stays: int, goes: int) -> bool:
+        """Whether no frame shows both, and all sightings of the one that goes can still be moved."""
+        of_both = self._landmarks.stamps_ns(stays) & self._landmarks.stamps_ns(goes)
+        return not of_both and not self._landmarks.is_rooted(goes)
 
 
 def _differences(

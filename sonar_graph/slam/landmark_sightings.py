@@ -45,6 +45,10 @@ class LandmarkSightings:
         """Those of a landmark."""
         return list(self._of.get(landmark_id, {}))
 
+    def is_rooted(self, landmark_id: int) -> bool:
+        """Whether sightings of it have left a bounded window, so that it stays."""
+        return landmark_id in self._rooted
+
     def stamps_ns(self, landmark_id: int) -> set[int]:
         """Frames that show a landmark."""
         return {sighting.stamp_ns for sighting in self._of.get(landmark_id, {})}

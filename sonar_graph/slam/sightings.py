@@ -130,6 +130,8 @@ class Sightings:
         if is_unnamed.any():
             seen = self._seen(frame, identities, is_unnamed.tolist(), np.flatnonzero(is_unnamed).tolist())
             verdicts |= self._associate(stamp_ns, seen, verdicts)
+        elif self._anonymous is not None and self._anonymous.has_landmarks:
+            self._merge(self._anonymous)
         for row, (landmark_id, track) in enumerate(zip(identities.ids.tolist(), frame.track.tolist(), strict=True)):
             verdict = verdicts[row]
             paired_id = landmark_id if verdict.landmark_id is None else verdict.landmark_id
@@ -237,6 +239,13 @@ class Sightings:
             verdicts[row] = Verdict(sighting.outcome, sighting=sighting)
         return verdicts
 
+    def _merge(self, anonymous: AnonymousLandmarks) -> None:
+        """Make one landmark of two that are one."""
+        self.keyframes.update_if_due()
+        if anonymous.has_landmarks and len(self.ids) > 1:
+            joint = self.smoother.joint_covariance([self.keyframes.newest_key, *anonymous.keys()])
+            anonymous.merge(joint, self.keyframes.newest_s)
+
     def _associate(self, stamp_ns: int, seen: Seen, named: dict[int, Verdict]) -> dict[int, Verdict]:
         """Pair what has no identity with landmarks by geometry; what became of each, by row."""
         anonymous = self._anonymous
@@ -245,9 +254,8 @@ class Sightings:
         self.keyframes.update_if_due()
         anonymous.forget(self.keyframes.oldest_key(anonymous.longest_wait_s))
         motion = self.keyframes.motion_since_newest(stamp_ns)
+        self._merge(anonymous)
         view = self._view(motion, anonymous.keys())
-        if anonymous.merge(view.covariance, self.keyframes.newest_s):
-            view = self._view(motion, anonymous.keys())
         taken = {v.sighting.landmark_id for v in named.values() if v.sighting and v.sighting.landmark_id is not None}
         paired = anonymous.pair(view, seen.z, seen.cov, taken)
         motion = self.keyframes.set_for_frame(stamp_ns, motion)
