@@ -11,11 +11,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.evaluation.finding import Finding, with_interval
-from sonar_graph.evaluation.sensor_check import check_sensors
-from sonar_graph.evaluation.start_check import find_start_tilt
+from sonar_graph.evaluation.sensor_check import _of_dvl, _of_noise, _put_right, _surest_bias, check_sensors
+from sonar_graph.evaluation.start_check import StartTilt, find_start_tilt
 from sonar_graph.evaluation.unit_check import wrong_units
 from sonar_graph.logs.adapters.config import LogConfig
 from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.navigation.dvl_against_imu import DvlMatch
+from sonar_graph.navigation.initial_tilt import InitialTilt
 from sonar_graph.navigation.offset_search import Estimate1D
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
@@ -191,3 +193,49 @@ def test_a_steady_drive_is_no_rest_to_tell_noise_from(speed_m_s: float, is_told:
     for name in ("gyro noise density", "accelerometer noise density"):
         assert found[name].estimate.is_known == found[name].acts == is_told
         assert is_told or "steady, but at 0.8 m/s" in found[name].text()
+
+
+@pytest.mark.parametrize(("factor", "acts"), [(0.5, True), (0.75, False), (1.0, False), (1.35, False), (2.0, True)])
+def test_a_density_matters_by_half_as_much_again_either_way(factor: float, acts: bool):
+    """100 s of rest at 100 Hz, which tells a density to some percent."""
+    rng, n, given = np.random.default_rng(1), 10_000, RIGHT.calibration.imu
+    rate, force = factor * 10 * rng.standard_normal((2, n, 3))
+    at_rest = [0, 0, 9.80665] + given.accel_noise_density * force
+    imu = Imu(np.arange(n) * 10_000_000, given.gyro_noise_density * rate, at_rest)
+    dvl = Dvl(np.arange(500) * 200_000_000, np.zeros((500, 3)), np.full((500, 3, 3), np.nan))
+    for finding in _of_noise(replace(RIGHT, imu=imu, dvl=dvl)):
+        assert finding.acts == acts, finding.text()
+
+
+def told(*values: float, sigma: float = 1e-3) -> tuple[Estimate1D, Estimate1D, Estimate1D]:
+    x, y, z = (Estimate1D(value, sigma) for value in values)
+    return x, y, z
+
+
+@pytest.mark.parametrize("acts", [True, False])
+def test_what_is_put_right_before_the_start_is_what_the_rows_advise(acts: bool):
+    offset, yaw, scale = (0.4, 0.05, 1.04) if acts else (0.004, 0.002, 1.001)
+    numbers = (Estimate1D(value, 1e-5) for value in (offset, yaw, scale))
+    match = DvlMatch(*numbers, lever=told(-0.2, 0.0, -0.15), gyro_bias=told(0.0, 0.0, 0.0, sigma=1e-6))
+    turned = with_mounting(RIGHT, "dvl", rpy_rad=(0.3, 0.1, 0.2))
+    rows = list(_of_dvl(match, turned, LogConfig()))
+    assert [row.acts for row in rows] == [acts] * 3
+    right = _put_right(turned, match, rows)
+    assert right.dvl.stamps_ns - RIGHT.dvl.stamps_ns == pytest.approx(400_000_000 if acts else 0)
+    assert right.dvl.velocity == pytest.approx(RIGHT.dvl.velocity * (1.04 if acts else 1.0))
+    assert right.calibration.dvl.mounting.rpy_rad == pytest.approx((0.3, 0.1, 0.25 if acts else 0.2))
+
+
+def test_of_two_biases_the_surer_is_told_axis_by_axis_with_where_it_is_from():
+    unknown = Estimate1D(np.nan, np.inf, "too little turning")
+    nothing = told(0.0, 0.0, 0.0)
+    x, y, _ = told(1.0, 2.0, 3.0, sigma=1e-4)
+    drive = DvlMatch(unknown, unknown, unknown, nothing, (x, replace(y, sigma=1e-2), unknown))
+    sigmas = np.array([1.0, 1.0, 1e-3, 1e-3, 1e-3])
+    rest = InitialTilt(0, 0.0, 0.0, np.array([10.0, 20.0, 30.0]), np.diag(sigmas**2), np.ones(3, dtype=np.bool_))
+    bias, sources = _surest_bias(drive, StartTilt(rest, "from 20 s of rest", is_rest=True))
+    assert [one.value for one in bias] == [1.0, 20.0, 30.0]
+    assert sources == ("from the turns of the drive", "from 20 s of rest", "from 20 s of rest")
+    moving, sources = _surest_bias(drive, StartTilt(rest, "from 60 s in motion"))
+    assert moving == drive.gyro_bias
+    assert set(sources) == {"from the turns of the drive"}
