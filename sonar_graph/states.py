@@ -123,6 +123,8 @@ class Outcome(StrEnum):
     FORGOTTEN = "refused: its identity did not become known in time"
     TAKEN_BACK = "taken back: its track is of no known landmark"
     REPEATED = "refused: the frame shows this landmark elsewhere, more probably"
+    UNSOUND = "refused: its range is not above zero, or its covariance not positive definite"
+    WITHHELD = "withheld: with it the estimate could not be determined"
     LATE = "refused: older than what was already processed"
     UNLOCATED = "refused: no odometry covers its stamp"
     IGNORED = "ignored: this estimator uses no landmarks"
@@ -153,6 +155,7 @@ class Refusal(StrEnum):
     OUTLIER = "refused: no vehicle reaches this velocity from the last"
     LATE = "refused: the motion that it belongs to was already used"
     UNCONFIRMED = "refused: no other velocity confirms it, and none before it is near enough"
+    UNSOUND = "refused: its covariance is not positive definite"
     INCOMPLETE = "refused: too few beams, and nothing to complete them with"
 
 
@@ -160,7 +163,7 @@ class RefusedRow(NamedTuple):
     """A row that is not used."""
 
     sensor: str
-    """``imu`` or ``dvl``."""
+    """``imu``, ``dvl`` or ``depth``."""
     stamp_ns: int
     reason: Refusal
     distance: float

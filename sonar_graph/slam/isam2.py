@@ -210,9 +210,13 @@ class Isam2:
         self._sightings.forget()
         return self._sightings.journal.log()
 
+    def withheld(self) -> list[str]:
+        """What of the newest detections could not be used in the graph, variable by variable, and what was missing."""
+        return list(self._smoother.withheld)
+
     def refused_rows(self) -> list[RefusedRow]:
-        """Rows of IMU and Doppler log that are not used, and why."""
-        return self._keyframes.odometry.refused
+        """Rows of IMU, Doppler log and depth that are not used, and why."""
+        return self._keyframes.refused
 
 
 def _check_noise(calibration: Calibration) -> None:

@@ -23,6 +23,7 @@ from sonar_graph.slam.models import FLOOR_GATE, locate
 from sonar_graph.slam.sighting import Sighting, SightingFactors
 from sonar_graph.slam.sightlines import Sightline
 from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.sound_rows import without_unsound
 from sonar_graph.slam.tracks import decide
 from sonar_graph.slam.view import View
 from sonar_graph.states import Outcome
@@ -89,6 +90,7 @@ class Sightings:
         self._gate = gate_threshold(probability, 2) if probability < 1 else np.inf
         self._factors = SightingFactors(sonar, self.policy.robust())
         self._landmarks = LandmarkSightings(self.smoother, self._factors)
+        self.smoother.when_withheld = lambda withheld: self._landmarks.withhold(withheld, self.journal)
         gate = LateGate(self.smoother, self._gate)
         self._deferred = DeferredIdentities(
             self._landmarks, self.smoother, self.journal, gate, self.policy.longest_wait_s
@@ -112,6 +114,11 @@ class Sightings:
 
     def add(self, frame: LandmarkDetections) -> None:
         """Take in the detections of one frame."""
+        sound = without_unsound(frame, self.journal)
+        if sound is not None:
+            self._add(sound)
+
+    def _add(self, frame: LandmarkDetections) -> None:
         stamp_ns = int(frame.stamps_ns[0])
         unlocated = self.keyframes.newest_ns is None
         if unlocated or stamp_ns < self.keyframes.advanced_ns:
@@ -135,7 +142,8 @@ class Sightings:
         for row, (landmark_id, track) in enumerate(zip(identities.ids.tolist(), frame.track.tolist(), strict=True)):
             verdict = verdicts[row]
             paired_id = landmark_id if verdict.landmark_id is None else verdict.landmark_id
-            number = self.journal.record(stamp_ns, paired_id, verdict.outcome, verdict.innovation, verdict.S)
+            outcome = verdict.sighting.outcome if verdict.sighting else verdict.outcome
+            number = self.journal.record(stamp_ns, paired_id, outcome, verdict.innovation, verdict.S)
             if verdict.sighting is not None:
                 verdict.sighting.row = number
                 if is_tracked[row]:
