@@ -77,8 +77,8 @@ class Asked:
         count = 0
         while count < len(self._open) and X(self._open[count].keyframe) in pose_keys:
             count += 1
-        for estimate in _estimates(self._open[:count], values, marginals):
-            self._final.add(estimate)
+        if count:
+            self._final.add(Trajectory.from_estimates(_estimates(self._open[:count], values, marginals)))
         del self._open[:count]
 
     def trajectory(self, values: gtsam.Values, marginals: gtsam.Marginals | gtsam.ISAM2) -> Trajectory:
@@ -105,13 +105,12 @@ class FinalPoses:
         self._poses = array("d")
         self._triangles = array("d")
 
-    def add(self, estimate: Estimate) -> None:
-        """The next one: position and quaternion, and the lower triangle of its covariance."""
-        rotation = estimate.world_T_body.rotation().toQuaternion()
-        self._stamps_ns.append(estimate.stamp_ns)
-        self._poses.extend(estimate.world_T_body.translation().tolist())
-        self._poses.extend((rotation.x(), rotation.y(), rotation.z(), rotation.w()))
-        self._triangles.extend(estimate.covariance[TRIANGLE].tolist())
+    def add(self, part: Trajectory) -> None:
+        """The next ones: position and quaternion, and the lower triangle of the covariance."""
+        i, j = TRIANGLE
+        self._stamps_ns.extend(part.stamps_ns.tolist())
+        self._poses.extend(np.hstack([part.positions, part.quaternions_xyzw]).ravel().tolist())
+        self._triangles.extend(part.covariances[:, i, j].ravel().tolist())
 
     def then(self, rest: Trajectory) -> Trajectory:
         """These, and what follows."""

@@ -85,6 +85,15 @@ def qr_tree(linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> gtsam.IS
     return tree
 
 
+def marginals_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Marginals | gtsam.ISAM2:
+    """What gives the covariances of a graph, linearised at the values."""
+    linear = graph.linearize(values)
+    try:
+        return gtsam.Marginals(linear, values)
+    except RuntimeError:
+        return qr_tree(linear, values)
+
+
 def _damped(linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float) -> gtsam.GaussianFactorGraph:
     if damping <= FIRST_DAMPING:
         return linear

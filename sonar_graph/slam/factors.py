@@ -30,6 +30,7 @@ import gtsam
 import numpy as np
 
 from sonar_graph.calibration import Calibration, PlanarMotion
+from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.slam.models import range_azimuth_jacobians, wrap_angle
@@ -53,8 +54,25 @@ def gaussian(cov: Floats) -> gtsam.noiseModel.Base:
     """Noise with this covariance, all of it.
 
     Left to itself GTSAM takes a matrix for diagonal when no other entry exceeds 1e-9, whatever its unit and scale:
-    motion over a short time would lose all its correlations.
+    motion over a short time would lose all its correlations. A matrix that is none it takes as well, and weighs by
+    numbers that are none.
+
+    Raises
+    ------
+    MeasurementError
+        When the matrix is not positive definite.
     """
+    try:
+        np.linalg.cholesky(cov)
+        is_sound = bool(np.isfinite(cov).all())
+    except np.linalg.LinAlgError:
+        is_sound = False
+    if not is_sound:
+        least = np.linalg.eigvalsh(np.nan_to_num(cov))[0]
+        raise MeasurementError(
+            f"noise of a factor: expected a positive definite covariance, not one with an eigenvalue of {least:.3g};"
+            " give every component a variance above zero"
+        )
     return gtsam.noiseModel.Gaussian.Covariance(cov, False)
 
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, X
+from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu
@@ -28,10 +29,13 @@ from sonar_graph.navigation.running_motion import RunningMotion
 from sonar_graph.navigation.steps import Steps
 from sonar_graph.slam import factors
 from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.sound_rows import sound_depths, sound_velocities
+from sonar_graph.states import Refusal, RefusedRow
 
 S_PER_NS = 1e-9
 CARRIED_IN_GAP_NS = 300_000_000
 """Over the end of a gap, straight on, a depth sample is carried no longer than this."""
+Rows = TypeVar("Rows", Dvl, Depth)
 EARLIEST_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 
@@ -76,6 +80,7 @@ class Keyframes:
         self._latest: tuple[int, PreintegratedMotion] | None = None
         self._depths: list[Depth] = []
         self._told = 0
+        self._refused: list[RefusedRow] = []
         self._earth = earth_rate_in_world(self.calibration)
 
     @property
@@ -100,13 +105,33 @@ class Keyframes:
         return X(bisect_left(self.stamps_ns, self.stamps_ns[-1] - round(age_s / S_PER_NS)))
 
     def add(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None) -> None:
-        """Take in rows; depths not newer than those that wait are passed over."""
+        """Take in rows; depths not newer than those that wait are passed over, and what cannot be a measurement."""
+        if dvl is not None:
+            dvl = self._sound("dvl", dvl, sound_velocities(dvl))
+        if depth is not None:
+            depth = self._sound("depth", depth, sound_depths(depth))
         if self.odometry.add(imu, dvl):
             self._running = None
         self._latest = None
         newest_ns = self._depths[-1].stamps_ns[-1] if self._depths else EARLIEST_NS
+        if depth is not None and depth.stamps_ns[0] < newest_ns:
+            late = depth.stamps_ns[depth.stamps_ns < newest_ns]
+            self._refused += [RefusedRow("depth", stamp_ns, Refusal.LATE, np.nan) for stamp_ns in late.tolist()]
         if depth is not None and (in_order := depth.between(newest_ns, LATEST_NS)):
             self._depths.append(in_order)
+
+    def _sound(self, sensor: str, rows: Rows, is_sound: NDArray[np.bool_]) -> Rows | None:
+        """Rows that can be measurements; the others are refused."""
+        if is_sound.all():
+            return rows
+        unsound = rows.stamps_ns[~is_sound].tolist()
+        self._refused += [RefusedRow(sensor, stamp_ns, Refusal.UNSOUND, np.nan) for stamp_ns in unsound]
+        return rows.rows(is_sound) if is_sound.any() else None
+
+    @property
+    def refused(self) -> list[RefusedRow]:
+        """Rows of IMU, Doppler log and depth that are not used, and why."""
+        return self.odometry.refused + self._refused
 
     def advance(self, until_ns: int) -> None:
         """Set the keyframes that are due from nodes reached at an instant; the first starts the graph."""

@@ -12,8 +12,12 @@ from collections.abc import Iterable
 
 from gtsam.symbol_shorthand import L
 
+from sonar_graph.slam.association import DetectionJournal
+from sonar_graph.slam.exchange import Exchange
 from sonar_graph.slam.sighting import Sighting, SightingFactors
-from sonar_graph.slam.smoother import Exchange, Smoother
+from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.withholding import Withheld
+from sonar_graph.states import Outcome
 
 
 class LandmarkSightings:
@@ -70,6 +74,22 @@ class LandmarkSightings:
             for sighting in gone:
                 self._rooted.setdefault(landmark, sighting)
                 del sightings[sighting]
+
+    def withhold(self, withheld: Withheld, journal: DetectionJournal) -> set[int]:
+        """The smoother cannot use some factors: their sightings leave the graph; handles of all factors of those."""
+        gone = [
+            sighting
+            for landmark, sightings in self._of.items()
+            for sighting in sightings
+            if L(landmark) in withheld.keys or not withheld.handles.isdisjoint(sighting.handles)
+        ]
+        handles = {handle for sighting in gone for handle in sighting.handles}
+        for sighting in gone:
+            self._take(sighting)
+            sighting.outcome = Outcome.WITHHELD
+            if sighting.row >= 0:
+                journal.amend(sighting.row, Outcome.WITHHELD)
+        return handles
 
     def exchange(self, leaving: Iterable[Sighting], coming: Iterable[tuple[Sighting, int]], time_s: float) -> None:
         """Take sightings out of the graph, and put others in, each for a landmark, in one update of the smoother.

@@ -6,6 +6,8 @@ from collections.abc import Container
 
 import gtsam
 
+from sonar_graph.slam.pending import Pending
+
 
 def split(
     graph: gtsam.NonlinearFactorGraph, kept: set[int]
@@ -36,3 +38,27 @@ def copy(source: gtsam.Values, key: int, target: gtsam.Values) -> None:
         target.insert(key, source.atPose3(key))
     else:
         target.insert(key, source.atPoint3(key))
+
+
+def without(graph: gtsam.NonlinearFactorGraph, pending: Pending) -> gtsam.NonlinearFactorGraph:
+    """A graph, its holes closed, less the factors that are pending."""
+    new = [pending.graph.at(i) for i in range(len(pending.handles))]
+    kept = gtsam.NonlinearFactorGraph()
+    for i in range(graph.size()):
+        if graph.exists(i) and graph.at(i) not in new:
+            kept.push_back(graph.at(i))
+    return kept
+
+
+def joined(values: gtsam.Values, new: gtsam.Values) -> gtsam.Values:
+    """Values, with new ones where there are none yet."""
+    both = gtsam.Values(values)
+    for key in keys_of(new):
+        if not both.exists(key):
+            copy(new, key, both)
+    return both
+
+
+def keys_of(values: gtsam.Values) -> list[int]:
+    """Of all variables."""
+    return list(values.keys())

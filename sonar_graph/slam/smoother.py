@@ -21,42 +21,34 @@ once Cholesky has given up the window stays with QR, and so do the marginals of 
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import gtsam
 import numpy as np
 
+from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.batch import qr_tree, solve
+from sonar_graph.slam.batch import marginals_of, solve
+from sonar_graph.slam.determinacy import variable_name
+from sonar_graph.slam.exchange import Exchange
 from sonar_graph.slam.history import History, Recent
 from sonar_graph.slam.joint_covariance import JointCovariance
-from sonar_graph.slam.new_window import copy, marginal, split
+from sonar_graph.slam.new_window import copy, joined, keys_of, marginal, split, without
+from sonar_graph.slam.pending import Pending
 from sonar_graph.slam.sightlines import Sightlines
+from sonar_graph.slam.window import Window
+from sonar_graph.slam.withholding import Withheld, culprits, reasons, undetermined
 
 RESTART_GROWTH = 1.25
 """Number of factors, relative to that at the last restart, before the next one."""
 FIRST_RESTART = 100
 """Number of factors before the first restart."""
-MOST_SETTLING_UPDATES = 10
-"""Further updates after an exchange, each a Gauss-Newton step: what is exchanged may move the estimate far."""
+MOST_MESSAGES = 1000
+"""Kept of what was withheld."""
 MAX_PLACEMENTS = 3
 """Times that stuck landmarks are placed anew in one solution."""
-
-
-@dataclass(frozen=True, eq=False)
-class Exchange:
-    """Some factors for others."""
-
-    removed: list[int]
-    """Handles of those that go."""
-    added: list[list[gtsam.NonlinearFactor]]
-    """Those that come, in groups."""
-    new_landmarks: dict[int, Floats]
-    """Keys and first estimates of landmarks that the graph has not yet got."""
-    lost_landmarks: list[int]
-    """Keys of those on which no factor is left."""
 
 
 class Smoother:
@@ -85,15 +77,15 @@ class Smoother:
         *,
         is_bounded: bool = False,
     ) -> None:
-        self._lag_s = self._window_lag_s = lag_s
+        self._lag_s = lag_s
         self._stale_shift_m = stale_shift_m
         self._greatest_waiting_gain = greatest_waiting_gain
         self._restart_size = FIRST_RESTART
-        self._threshold = relinearize_threshold
-        self._factorization = "CHOLESKY"
         self._is_bounded = is_bounded
         self._history: History | Recent = Recent() if is_bounded else History()
-        self._restarted_s = -np.inf
+        self._restarted_s = self._newest_s = -np.inf
+        self.withheld: deque[str] = deque(maxlen=MOST_MESSAGES)
+        """The newest of what was withheld, and why."""
         self.when_leaving: Callable[[set[int]], None] = lambda _: None
         """Called with the keys of variables before they leave a bounded window, while they are still in it."""
         self.values = gtsam.Values()
@@ -102,14 +94,14 @@ class Smoother:
         """Where each landmark was seen from."""
         self.waiting_gain = 0.0
         """What the factors added since the last update would add: a sum of expected over measured variances."""
-        self._pending = gtsam.NonlinearFactorGraph()
-        self._pending_values = gtsam.Values()
-        self._pending_times: dict[int, float] = {}
+        self.when_withheld: Callable[[Withheld], set[int]] = lambda _: set()
+        """Called when new factors cannot be used; returns the handles of others that are nothing without them."""
+        self._pending = Pending()
         self._expiring: dict[int, float] = {}
         self._held: dict[int, float] = {}
         self._landmarks: list[int] = []
         self._bias: list[int] = []
-        self._window = self._new_window(lag_s)
+        self._window = Window(relinearize_threshold, lag_s)
         self._joint: JointCovariance | None = None
         self._asked: set[int] = set()
         self._asked_before: set[int] = set()
@@ -121,39 +113,62 @@ class Smoother:
         """Every factor of the run; of a bounded one those of the window, marginals among them."""
         return self._history.graph
 
-    def _new_window(self, lag_s: float) -> gtsam.IncrementalFixedLagSmoother:
-        params = gtsam.ISAM2Params()
-        params.setFactorization(self._factorization)
-        params.relinearizeSkip = 1
-        params.setRelinearizeThreshold(self._threshold)
-        params.findUnusedFactorSlots = True
-        return gtsam.IncrementalFixedLagSmoother(lag_s, params)
-
     def add_pose(self, key: int, pose: gtsam.Pose3, time_s: float) -> None:
-        """A new keyframe, with its first estimate."""
-        self._pending_values.insert(key, pose)
+        """A new keyframe, with its first estimate, not older than the one before.
+
+        Raises
+        ------
+        EstimatorError
+            When the key is taken, or time runs back; nothing is added.
+        """
+        self._check_new(key)
+        if time_s < self._newest_s:
+            raise EstimatorError(
+                f"isam2: {variable_name(key)} at {time_s:.3f} s is older than the one before ({self._newest_s:.3f} s);"
+                " give keyframes in the order of time"
+            )
+        self._newest_s = time_s
+        self._pending.values.insert(key, pose)
         self.values.insert(key, pose)
-        self._pending_times[key] = time_s
+        self._pending.times_s[key] = time_s
         self._expiring[key] = time_s
 
     def add_landmark(self, key: int, point: Floats) -> None:
-        """A new landmark, which never leaves the window, with its first estimate."""
-        self._pending_values.insert(key, point)
+        """A new landmark, which never leaves the window, with its first estimate.
+
+        Raises
+        ------
+        EstimatorError
+            When the key is taken; nothing is added.
+        """
+        self._check_new(key)
+        self._pending.values.insert(key, point)
         self.values.insert(key, point)
         self._landmarks.append(key)
 
     def add_bias(self, key: int, bias: Floats) -> None:
-        """A new gyro bias, with its first estimate. It stays in the window until the lag after the next one."""
-        self._pending_values.insert(key, bias)
+        """A new gyro bias, with its first estimate. It stays in the window until the lag after the next one.
+
+        Raises
+        ------
+        EstimatorError
+            When the key is taken; nothing is added.
+        """
+        self._check_new(key)
+        self._pending.values.insert(key, bias)
         self.values.insert(key, bias)
         self._bias = [key]
+
+    def _check_new(self, key: int) -> None:
+        if self.values.exists(key):
+            raise EstimatorError(f"isam2: {variable_name(key)} is in the graph already; give each its own key")
 
     def add(self, factors: Iterable[gtsam.NonlinearFactor]) -> list[int]:
         """New factors, used at the next update; the handles by which they can be taken out."""
         handles = []
         for factor in factors:
-            self._pending.add(factor)
             handles.append(self._history.add(factor))
+            self._pending.add(factor, handles[-1])
         return handles
 
     def hold(self, until_s: dict[int, float]) -> None:
@@ -165,45 +180,36 @@ class Smoother:
 
     def flush(self, time_s: float) -> None:
         """Update with what waits, if anything does; a bounded window keeps what it has."""
-        if self._pending.size():
+        if self._pending.handles:
             self._update(time_s, self._exchange_lag_s(time_s))
 
     def exchange(self, what: Exchange, time_s: float) -> list[list[int]]:
         """Take factors out, put others in, and bring the window up to date; the handles of each group put in."""
         self.flush(time_s)
-        slots = self._window_slots(what.removed)
+        slots = self._window.slots([self._history.factor(handle) for handle in what.removed])
         self._forget(what.lost_landmarks)
         self._history.remove(what.removed)
         for key, point in what.new_landmarks.items():
             self.add_landmark(key, point)
         handles = [self.add(group) for group in what.added]
-        keys = self._pending.keyVector()
-        self._window_lag_s = self._exchange_lag_s(time_s)
-        if slots is None or what.lost_landmarks or len(self._inside(keys)) < len(keys):
+        keys = self._pending.graph.keyVector()
+        self._window.lag_s = self._exchange_lag_s(time_s)
+        if slots is None or what.lost_landmarks or len(self.in_window(keys)) < len(keys):
             self._clear_pending()
             self._restart(time_s)
         else:
-            self._update(time_s, self._window_lag_s, slots)
+            self._update(time_s, self._window.lag_s, slots)
             self._settle(time_s)
         return handles
 
     def _exchange_lag_s(self, time_s: float) -> float:
         """Nothing leaves a bounded window between what an exchange takes out and what it puts in."""
-        return max(self._lag_at(time_s), self._window_lag_s) if self._is_bounded else self._lag_at(time_s)
+        return max(self._lag_at(time_s), self._window.lag_s) if self._is_bounded else self._lag_at(time_s)
 
-    def _window_slots(self, handles: list[int]) -> list[int] | None:
-        """Where the window has factors; None when it has lost one."""
-        if not handles:
-            return []
-        inside = self._window.getFactors()
-        place = {inside.at(i): i for i in range(inside.size()) if inside.exists(i)}
-        slots = [place.get(self._history.factor(handle)) for handle in handles]
-        return None if None in slots else [slot for slot in slots if slot is not None]
-
-    def _inside(self, keys: list[int]) -> list[int]:
+    def in_window(self, keys: list[int]) -> list[int]:
         """Those of some variables that are in the window, or about to be."""
-        inside = self._window.getLinearizationPoint() if keys else gtsam.Values()
-        return [key for key in keys if inside.exists(key) or self._pending_values.exists(key)]
+        inside = self._window.isam.getLinearizationPoint() if keys else gtsam.Values()
+        return [key for key in keys if inside.exists(key) or self._pending.values.exists(key)]
 
     def _forget(self, landmark_keys: list[int]) -> None:
         for key in landmark_keys:
@@ -212,10 +218,7 @@ class Smoother:
 
     def _settle(self, time_s: float) -> None:
         try:
-            for _ in range(MOST_SETTLING_UPDATES):
-                if self._window.getDelta().norm() <= self._threshold:
-                    break
-                self._window.update()
+            self._window.settle()
         except RuntimeError:
             self._give_up_cholesky(time_s)
         self._take_estimate()
@@ -223,40 +226,76 @@ class Smoother:
     @property
     def is_due(self) -> bool:
         """Whether an update is: variables wait for it, or factors that would change the estimate."""
-        return self._pending_values.size() > 0 or self.waiting_gain > self._greatest_waiting_gain
+        return self._pending.values.size() > 0 or self.waiting_gain > self._greatest_waiting_gain
 
     def update(self, time_s: float) -> None:
         """Bring the window's estimate up to date with what was added; what is older than the lag leaves it."""
-        self._update(time_s, self._lag_at(time_s))
+        withheld = undetermined(self._pending, self.values, self._expiring)
+        self._withhold(withheld)
+        if self.is_due or not withheld:
+            self._update(time_s, self._lag_at(time_s))
 
     def _update(self, time_s: float, lag_s: float, removed_slots: Sequence[int] = ()) -> None:
         """The same without what is in some places of the window."""
-        times: dict[Any, float] = self._pending_times | dict.fromkeys(self._landmarks + self._bias, time_s)
         self._expiring |= dict.fromkeys(self._bias, time_s)
         self._announce_leaving(time_s - lag_s)
-        self._window_lag_s = lag_s
-        self._window.setSmootherLag(lag_s)
+        self._window.lag_s = lag_s
+        times = self._times(self._pending.times_s, time_s)
         try:
-            self._window.update(self._pending, self._pending_values, times, list(removed_slots))
+            self._window.update(self._pending.graph, self._pending.values, times, removed_slots)
         except RuntimeError:
-            self._give_up_cholesky(time_s)
-            return
+            if not self._go_without(time_s):
+                self._give_up_cholesky(time_s)
+                return
         self._clear_pending()
         self._take_estimate()
-        if self._may_restart(time_s) and self._is_stale():
+        if self._may_restart(time_s) and self._window.largest_shift(self._landmarks) > self._stale_shift_m:
             self._restart(time_s)
+
+    def _times(self, poses_s: dict[int, float], time_s: float) -> dict[Any, float]:
+        """When variables were last seen, from those of poses: landmarks and the newest bias are seen now."""
+        return poses_s | dict.fromkeys(self._landmarks + self._bias, time_s)
+
+    def _withhold(self, found: list[Withheld]) -> None:
+        for withheld in found:
+            handles = (withheld.handles | self.when_withheld(withheld)).intersection(self._pending.handles)
+            self.withheld.append(withheld.message)
+            self._history.remove(handles)
+            self._pending.drop(handles, withheld.keys)
+            self._forget([key for key in withheld.keys if key in self._landmarks])
+
+    def _go_without(self, time_s: float) -> bool:
+        """Solve the window without those new factors that are to blame; whether there are any.
+
+        The window is made anew of the same factors with the same linearisation: nothing else changes.
+        """
+        before, theta = (
+            without(self._window.isam.getFactors(), self._pending),
+            self._window.isam.getLinearizationPoint(),
+        )
+        theta = joined(theta, self._pending.values)
+        if not (found := culprits(before, self._pending, theta, self._expiring)):
+            return False
+        self._withhold(found)
+        self._withhold(more := undetermined(self._pending, self.values, self._expiring))
+        for key in set().union(*(withheld.keys for withheld in found + more)):
+            theta.erase(key)
+        before.push_back(self._pending.graph)
+        kept_s = {key: self._expiring.get(key, time_s) for key in keys_of(theta)}
+        self._begin_window(before, theta, self._times(kept_s, time_s))
+        return True
 
     def _announce_leaving(self, before_s: float) -> None:
         if self._is_bounded:
             leaving = {
-                key for key, t in self._expiring.items() if t < before_s and not self._pending_values.exists(key)
+                key for key, t in self._expiring.items() if t < before_s and not self._pending.values.exists(key)
             }
             if leaving:
                 self.when_leaving(leaving)
 
     def _take_estimate(self) -> None:
         """The window's; a bounded one forgets what has left."""
-        estimate = self._window.calculateEstimate()
+        estimate = self._window.isam.calculateEstimate()
         if not self._is_bounded:
             self.values.update(estimate)
             return
@@ -265,7 +304,7 @@ class Smoother:
         for key in left:
             del self._expiring[key]
         self.sightlines.leave(set(left))
-        self._history.keep(self._window.getFactors(), left)
+        self._history.keep(self._window.isam.getFactors(), left)
 
     def _may_restart(self, time_s: float) -> bool:
         if self._is_bounded:
@@ -273,8 +312,14 @@ class Smoother:
         return self.graph.size() >= self._restart_size
 
     def _give_up_cholesky(self, time_s: float) -> None:
-        """It met a pose 4096 times less certain than its step: QR has no such limit."""
-        self._factorization = "QR"
+        """It met a pose 4096 times less certain than its step: QR has no such limit.
+
+        Raises
+        ------
+        EstimatorError
+            When QR has one here too: which variables are open, and what is missing.
+        """
+        self._window.is_by_qr = True
         self._clear_pending()
         self._restart(time_s)
 
@@ -284,31 +329,30 @@ class Smoother:
         return max([self._lag_s, *held])
 
     def _clear_pending(self) -> None:
-        self._pending = gtsam.NonlinearFactorGraph()
-        self._pending_values = gtsam.Values()
-        self._pending_times = {}
+        self._pending = Pending()
         self.waiting_gain = 0.0
         self._joint, self._asked, self._asked_before = None, set(), self._asked.intersection(self._landmarks)
-
-    def _is_stale(self) -> bool:
-        delta = self._window.getDelta()
-        return any(np.abs(delta.at(key)).max() > self._stale_shift_m for key in self._landmarks)
 
     def _restart(self, time_s: float) -> None:
         """Solve the history; start a window whose prior is the marginal of all that lies before it."""
         self._restart_size, self._restarted_s = max(FIRST_RESTART, int(RESTART_GROWTH * self.graph.size())), time_s
         self.values = self._solve()
-        times: dict[Any, float] = {key: t for key, t in self._expiring.items() if t >= time_s - self._window_lag_s}
-        times |= dict.fromkeys(self._landmarks, time_s)
+        kept_s = {key: t for key, t in self._expiring.items() if t >= time_s - self._window.lag_s}
+        times: dict[Any, float] = kept_s | dict.fromkeys(self._landmarks, time_s)
         inside, outside = split(self.graph, set(times))
         values = gtsam.Values()
         for key in times:
             copy(self.values, key, values)
         for factor in marginal(outside, self.values, times):
             inside.push_back(factor)
-        self._window = self._new_window(self._window_lag_s)
-        self._window.update(inside, values, times)
+        self._begin_window(inside, values, times)
         self._take_estimate()
+
+    def _begin_window(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times: dict[Any, float]) -> None:
+        try:
+            self._window.begin(graph, values, times)
+        except RuntimeError as error:
+            raise EstimatorError(f"isam2: {reasons(graph, values, self._expiring)}") from error
 
     def _solve(self) -> gtsam.Values:
         """Solve the history; again while a landmark is stuck behind the sonar and its new start lowers the error."""
@@ -326,11 +370,11 @@ class Smoother:
     @property
     def marginals(self) -> gtsam.ISAM2:
         """What gives covariances of variables in the window."""
-        return self._window.getISAM2()
+        return self._window.isam.getISAM2()
 
     def covariance(self, key: int) -> Floats:
         """Marginal covariance of a variable in the window."""
-        return self._window.marginalCovariance(key)
+        return self._window.isam.marginalCovariance(key)
 
     def joint_covariance(self, keys: list[int]) -> JointCovariance:
         """Joint marginal covariance of variables in the window, and possibly of more of them.
@@ -340,12 +384,12 @@ class Smoother:
         """
         self._asked.update(keys)
         if self._joint is None or not self._joint.rows.keys() >= self._asked:
-            self._joint = JointCovariance.of(self._window.getISAM2(), sorted(self._asked | self._asked_before))
+            self._joint = JointCovariance.of(self._window.isam.getISAM2(), sorted(self._asked | self._asked_before))
         return self._joint
 
     def joint_covariance_of_any(self, keys: list[int]) -> JointCovariance:
         """Joint marginal covariance of any variables; it costs a solution of the history if one has left the window."""
-        if len(self._inside(keys)) == len(keys):
+        if len(self.in_window(keys)) == len(keys):
             return self.joint_covariance(keys)
         return JointCovariance.of(self.solve_history()[1], keys)
 
@@ -356,14 +400,6 @@ class Smoother:
         """
         if self._solved is None or self._solved_changes != self._history.changes:
             values = self._solve()
-            self._solved = values, _marginals(self.graph, values)
+            self._solved = values, marginals_of(self.graph, values)
             self._solved_changes = self._history.changes
         return self._solved
-
-
-def _marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Marginals | gtsam.ISAM2:
-    linear = graph.linearize(values)
-    try:
-        return gtsam.Marginals(linear, values)
-    except RuntimeError:
-        return qr_tree(linear, values)

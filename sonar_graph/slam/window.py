@@ -1,0 +1,90 @@
+"""GTSAM's fixed-lag smoother, with what it takes to begin it anew."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gtsam
+import numpy as np
+
+MOST_SETTLING_UPDATES = 10
+"""Further updates after an exchange, each a Gauss-Newton step: what is exchanged may move the estimate far."""
+
+
+class Window:
+    """iSAM2 over the variables that were seen in the last seconds.
+
+    It eliminates by Cholesky, and by QR once that has given up.
+
+    Parameters
+    ----------
+    relinearize_threshold
+        A variable is relinearised when any component of its change exceeds this (rad or m).
+    lag_s
+        Age from which on variables leave, to begin with.
+    """
+
+    def __init__(self, relinearize_threshold: float, lag_s: float) -> None:
+        self._threshold = relinearize_threshold
+        self.lag_s = lag_s
+        """Age (s) from which on variables left at the last update."""
+        self.is_by_qr = False
+        self.isam = self._empty()
+
+    def _empty(self) -> gtsam.IncrementalFixedLagSmoother:
+        params = gtsam.ISAM2Params()
+        params.setFactorization("QR" if self.is_by_qr else "CHOLESKY")
+        params.relinearizeSkip = 1
+        params.setRelinearizeThreshold(self._threshold)
+        params.findUnusedFactorSlots = True
+        return gtsam.IncrementalFixedLagSmoother(self.lag_s, params)
+
+    def begin(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times_s: Mapping[Any, float]) -> None:
+        """Anew, with nothing but these factors and variables; by QR where it is needed.
+
+        Raises
+        ------
+        RuntimeError
+            When even that finds no solution.
+        """
+        self.isam = self._empty()
+        try:
+            self.isam.update(graph, values, times_s)
+        except RuntimeError:
+            if self.is_by_qr:
+                raise
+            self.is_by_qr = True
+            self.begin(graph, values, times_s)
+
+    def update(
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        times_s: Mapping[Any, float],
+        removed_slots: Sequence[int],
+    ) -> None:
+        """With new factors and variables, without what is in some places."""
+        self.isam.setSmootherLag(self.lag_s)
+        self.isam.update(graph, values, times_s, list(removed_slots))
+
+    def settle(self) -> None:
+        """Update until nothing would be relinearised any more."""
+        for _ in range(MOST_SETTLING_UPDATES):
+            if self.isam.getDelta().norm() <= self._threshold:
+                break
+            self.isam.update()
+
+    def slots(self, factors: list[gtsam.NonlinearFactor]) -> list[int] | None:
+        """Where factors are; None when one of them is not there."""
+        if not factors:
+            return []
+        inside = self.isam.getFactors()
+        place = {inside.at(i): i for i in range(inside.size()) if inside.exists(i)}
+        found = [place.get(factor) for factor in factors]
+        return None if None in found else [slot for slot in found if slot is not None]
+
+    def largest_shift(self, keys: Sequence[int]) -> float:
+        """How far the farthest of some variables is from where it was linearised: its largest component, rad or m."""
+        delta = self.isam.getDelta()
+        return max((float(np.abs(delta.at(key)).max()) for key in keys), default=0.0)
