@@ -214,12 +214,13 @@ def told(*values: float, sigma: float = 1e-3) -> tuple[Estimate1D, Estimate1D, E
 
 @pytest.mark.parametrize("acts", [True, False])
 def test_what_is_put_right_before_the_start_is_what_the_rows_advise(acts: bool):
-    offset, yaw, scale = (0.4, 0.05, 1.04) if acts else (0.004, 0.002, 1.001)
+    offset, yaw, scale = (0.4, 0.05, 1.04) if acts else (0.008, 0.002, 1.001)
     numbers = (Estimate1D(value, 1e-5) for value in (offset, yaw, scale))
     match = DvlMatch(*numbers, lever=told(-0.2, 0.0, -0.15), gyro_bias=told(0.0, 0.0, 0.0, sigma=1e-6))
     turned = with_mounting(RIGHT, "dvl", rpy_rad=(0.3, 0.1, 0.2))
     rows = list(_of_dvl(match, turned, LogConfig()))
     assert [row.acts for row in rows] == [acts] * 3
+    assert rows[0].estimate.sigma == pytest.approx(0.01 / np.sqrt(12), rel=1e-3), "that of a sample's instant"
     right = _put_right(turned, match, rows)
     assert right.dvl.stamps_ns - RIGHT.dvl.stamps_ns == pytest.approx(400_000_000 if acts else 0)
     assert right.dvl.velocity == pytest.approx(RIGHT.dvl.velocity * (1.04 if acts else 1.0))

@@ -180,3 +180,26 @@ def test_the_third_axis_of_a_stretch_is_the_vertical_and_does_not_walk():
         assert stretch.walks == (True, True, False)
         assert stretch.y[:, 2] / stretch.duration_s == pytest.approx(-9.81, abs=0.1)
         assert np.abs(stretch.y[:, :2]).max() < 0.3
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("kind", ["lever", "force", "gyro"])
+def test_derivatives_are_those_of_what_is_lined_up(kind: str, axis: int):
+    """The first stretch with an arm or a bias of its own, less without: the column, but for gravity and its turning."""
+    column = {"lever": 4, "force": 7, "gyro": 10}[kind] + axis
+    size = {"lever": 0.1, "force": 1e-3, "gyro": 1e-4}[kind]
+    change = size * np.eye(3)[axis]
+
+    def first(arm: np.ndarray, rate: np.ndarray, force: np.ndarray) -> Stretch:
+        imu, dvl = on_a_plane(arm)
+        path = InertialPath.of(Imu(imu.stamps_ns, imu.angular_velocity + rate, imu.specific_force + force))
+        seconds = path.since_origin(dvl.stamps_ns)[:150]
+        return _line_up(path, seconds, dvl.velocity[:150], [slice(0, 150)], np.zeros(3), 0.0)[0]
+
+    nothing = np.zeros(3)
+    before = first(nothing, nothing, nothing)
+    after = first(*(change if kind == name else nothing for name in ("lever", "gyro", "force")))
+    own = np.linalg.qr(before.B.reshape(len(before.y) * 3, -1))[0]
+    shown, said = (after.y - before.y).ravel(), (size * before.A[:, :, column]).ravel()
+    shown, said = (values - own @ (own.T @ values) for values in (shown, said))
+    assert np.linalg.norm(shown - said) < 0.02 * np.linalg.norm(shown) + 1e-4
