@@ -139,8 +139,7 @@ class FilterShell:
         if start_ns is None:
             return
         columns, lever_m = self._odometry.columns(), VehicleModel(*self._vehicle_values).dvl_p_imu
-        imu_ns = columns[0]
-        self._reached_ns = int(imu_ns[np.searchsorted(imu_ns, start_ns)])
+        self._reached_ns = self._odometry.start_reached_ns(start_ns)
         self._clock[NODE] = start_ns
         open_interval(columns, lever_m, GravityInterval(*self._interval_values), self._clock)
 

@@ -100,6 +100,11 @@ class Odometry:
             return None
         return int(self._dvl.stamps_ns[first])
 
+    def start_reached_ns(self, start_ns: int) -> int:
+        """When the first node was reached: an IMU row was at or after it, and its velocity was confirmed."""
+        covered_ns = int(self._imu.stamps_ns[np.searchsorted(self._imu.stamps_ns, start_ns)])
+        return max(covered_ns, self._intake.start_known_ns)
+
     def nodes(self, after_ns: int, until_ns: int) -> Ints:
         """Nodes after one instant that are reached at another, in order."""
         first, last = node_range(self._imu.stamps_ns, self._dvl.stamps_ns, after_ns, until_ns)

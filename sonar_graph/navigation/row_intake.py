@@ -61,6 +61,11 @@ class RowIntake:
             *(RefusedRow("dvl", at_ns, Refusal.UNCONFIRMED, np.nan) for at_ns in waiting),
         ]
 
+    @property
+    def start_known_ns(self) -> int:
+        """When the first velocity was confirmed."""
+        return self._doubt.start_known_ns if self._doubt else EARLIEST_NS
+
     def add_imu(self, imu: Imu) -> bool:
         """Returns whether rows were placed before others that are there already."""
         rows = self._in_time(imu, self.imu.stamps_ns, "imu")

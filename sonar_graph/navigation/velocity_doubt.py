@@ -14,7 +14,8 @@ believed at its third row, one at 10 m/s at its tenth.
 
 The start's pose is that at the first row, which stays a node even where its velocity was wrong: it then has that of the
 first row believed, with the variance of what may have changed since. Rows that wait are no nodes: until the first are
-believed there is no estimate, and a gap lasts until then. Stamps decide, not how a log is cut.
+believed there is no estimate, and a gap lasts until then: of its chain the last row alone is used, since nothing that
+happens before it may know of it. Stamps decide, not how a log is cut.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import numpy as np
 
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.partial_velocity import Rows
+from sonar_graph.navigation.stamped_rows import EARLIEST_NS
 from sonar_graph.navigation.velocity_gate import GATE, changed, distance_between
 
 LONG_NS = 3_000_000_000
@@ -63,12 +65,15 @@ class VelocityDoubt:
     def __init__(self, walk: float) -> None:
         self._walk = walk
         self._last_ns: int | None = None
+        self.start_known_ns = EARLIEST_NS
+        """When the first velocity was confirmed."""
         self._waiting: list[Waiting] = []
+        self._unused_ns: list[int] = []
 
     @property
     def waiting_ns(self) -> list[int]:
-        """Stamps of the rows that wait."""
-        return [row.stamp_ns for row in self._waiting]
+        """Stamps of the rows that wait, and of those that waited after a gap."""
+        return [*self._unused_ns, *(row.stamp_ns for row in self._waiting)]
 
     def passed(self, rows: Rows, is_partial: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Passed:
         """Which rows, given and waiting, may go on."""
@@ -107,7 +112,7 @@ class VelocityDoubt:
             self._last_ns = row.stamp_ns if self._last_ns is None else max(self._last_ns, row.stamp_ns)
 
     def _wait(self, row: Waiting) -> None:
-        if row.stamp_ns not in self.waiting_ns:
+        if all(row.stamp_ns != waiting.stamp_ns for waiting in self._waiting):
             self._waiting = sorted([*self._waiting, row], key=lambda waiting: waiting.stamp_ns)
 
     def _chain(self) -> list[Waiting]:
@@ -136,6 +141,11 @@ class VelocityDoubt:
             outliers.append((row.stamp_ns, min(self._distance(row, other) for other in chain)))
             if self._last_ns is None and row.stamp_ns < chain[0].stamp_ns:
                 found.append(self._replaced(row, chain[0]))
+        if self._last_ns is None:
+            self.start_known_ns = end_ns
+        else:
+            self._unused_ns += [row.stamp_ns for row in found[:-1]]
+            found = found[-1:]
         self._waiting = [row for row in self._waiting if row.stamp_ns > end_ns]
         self._last_ns = end_ns
         return found
