@@ -66,10 +66,10 @@ class Vehicle:
 
 
 def rows(seconds=20.0):
-    """Of the whole run but the Doppler log's gap."""
+    """Of the whole run but the Doppler log's gap; a row before its end, to confirm that."""
     vehicle, dvl_ns = Vehicle(), stamps(DVL_HZ, seconds)
     t = (dvl_ns - T0_NS) * 1e-9
-    return vehicle.imu(stamps(IMU_HZ, seconds + 0.1)), vehicle.dvl(dvl_ns[(t <= LOST_S) | (t >= FOUND_S)])
+    return vehicle.imu(stamps(IMU_HZ, seconds + 0.1)), vehicle.dvl(dvl_ns[(t <= LOST_S) | (t > FOUND_S - 0.3)])
 
 
 def at(seconds):
