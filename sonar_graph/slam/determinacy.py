@@ -75,6 +75,11 @@ def left_open(
         The variables that are not taken as known.
     least_said
         Whitened rows of A shorter than this, such as `LEAST_SAID`, count as zero.
+
+    Returns
+    -------
+    list[Open]
+        Nothing where a derivative is no number (`not_finite`).
     """
     places, size = {}, 0
     for key in keys:
@@ -83,6 +88,8 @@ def left_open(
     if not size:
         return []
     A = np.vstack([np.zeros((1, size)), *(_rows(graph.at(i), values, places, least_said) for i in range(graph.size()))])
+    if not np.isfinite(A).all():
+        return []
     lengths = np.linalg.norm(A, axis=0)
     scale = 1.0 / np.where(lengths > 0, lengths, 1.0)
     _, s, V = np.linalg.svd(A * scale, full_matrices=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Iterable
 
 import gtsam
 
@@ -62,3 +62,11 @@ def joined(values: gtsam.Values, new: gtsam.Values) -> gtsam.Values:
 def keys_of(values: gtsam.Values) -> list[int]:
     """Of all variables."""
     return list(values.keys())
+
+
+def picked(values: gtsam.Values, keys: Iterable[int]) -> gtsam.Values:
+    """Some of the variables. GTSAM copies all that it is given for each factor in Python."""
+    few = gtsam.Values()
+    for key in keys:
+        copy(values, key, few)
+    return few

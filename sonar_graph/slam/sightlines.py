@@ -16,6 +16,10 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
+from sonar_graph.slam.batch import solve
+
+MAX_PLACEMENTS = 3
+"""Times that stuck landmarks are placed anew in one solution."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -79,3 +83,17 @@ class Sightlines:
 def _behind(lines: Iterable[Sightline], values: gtsam.Values, landmark_key: int) -> int:
     landmark = values.atPoint3(landmark_key)
     return sum(line.is_behind(values, landmark) for line in lines)
+
+
+def solve_in_sight(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, sightlines: Sightlines) -> gtsam.Values:
+    """Solve a graph; again while a landmark is stuck behind the sonar and its new start lowers the error."""
+    values = solve(graph, initial)
+    for _ in range(MAX_PLACEMENTS):
+        stuck = sightlines.turned_away(values)
+        if not stuck:
+            break
+        retried = solve(graph, sightlines.placed_anew(values, stuck))
+        if graph.error(retried) >= graph.error(values):
+            break
+        values = retried
+    return values

@@ -30,16 +30,16 @@ import numpy as np
 
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.batch import marginals_of, solve
+from sonar_graph.slam.batch import marginals_of
 from sonar_graph.slam.determinacy import variable_name
 from sonar_graph.slam.exchange import Exchange
 from sonar_graph.slam.history import History, Recent
 from sonar_graph.slam.joint_covariance import JointCovariance
-from sonar_graph.slam.new_window import copy, joined, keys_of, marginal, split, without
+from sonar_graph.slam.new_window import copy, joined, keys_of, marginal, picked, split, without
 from sonar_graph.slam.pending import Pending
-from sonar_graph.slam.sightlines import Sightlines
+from sonar_graph.slam.sightlines import Sightlines, solve_in_sight
 from sonar_graph.slam.window import Window
-from sonar_graph.slam.withholding import Withheld, culprits, reasons, undetermined
+from sonar_graph.slam.withholding import Withheld, culprits, reasons, spoilt, undetermined
 
 RESTART_GROWTH = 1.25
 """Number of factors, relative to that at the last restart, before the next one."""
@@ -47,8 +47,6 @@ FIRST_RESTART = 100
 """Number of factors before the first restart."""
 MOST_MESSAGES = 1000
 """Kept of what was withheld."""
-MAX_PLACEMENTS = 3
-"""Times that stuck landmarks are placed anew in one solution."""
 
 
 class Smoother:
@@ -221,7 +219,7 @@ class Smoother:
             self._window.settle()
         except RuntimeError:
             self._give_up_cholesky(time_s)
-        self._take_estimate()
+        self._take(self._window.isam.calculateEstimate())
 
     @property
     def is_due(self) -> bool:
@@ -230,9 +228,7 @@ class Smoother:
 
     def update(self, time_s: float) -> None:
         """Bring the window's estimate up to date with what was added; what is older than the lag leaves it."""
-        withheld = undetermined(self._pending, self.values, self._expiring)
-        self._withhold(withheld)
-        if self.is_due or not withheld:
+        if not self._withhold_unusable() or self.is_due:
             self._update(time_s, self._lag_at(time_s))
 
     def _update(self, time_s: float, lag_s: float, removed_slots: Sequence[int] = ()) -> None:
@@ -243,18 +239,27 @@ class Smoother:
         times = self._times(self._pending.times_s, time_s)
         try:
             self._window.update(self._pending.graph, self._pending.values, times, removed_slots)
+            estimate = self._window.isam.calculateEstimate()
         except RuntimeError:
             if not self._go_without(time_s):
                 self._give_up_cholesky(time_s)
                 return
+            estimate = self._window.isam.calculateEstimate()
         self._clear_pending()
-        self._take_estimate()
+        self._take(estimate)
         if self._may_restart(time_s) and self._window.largest_shift(self._landmarks) > self._stale_shift_m:
             self._restart(time_s)
 
     def _times(self, poses_s: dict[int, float], time_s: float) -> dict[Any, float]:
         """When variables were last seen, from those of poses: landmarks and the newest bias are seen now."""
         return poses_s | dict.fromkeys(self._landmarks + self._bias, time_s)
+
+    def _withhold_unusable(self) -> bool:
+        """Take new factors out again that the window could not be solved with; whether there were any."""
+        values = picked(self.values, self._pending.graph.keyVector())
+        self._withhold(found := spoilt(self._pending, values, self._expiring))
+        self._withhold(more := undetermined(self._pending, values, self._expiring))
+        return bool(found or more)
 
     def _withhold(self, found: list[Withheld]) -> None:
         for withheld in found:
@@ -269,16 +274,12 @@ class Smoother:
 
         The window is made anew of the same factors with the same linearisation: nothing else changes.
         """
-        before, theta = (
-            without(self._window.isam.getFactors(), self._pending),
-            self._window.isam.getLinearizationPoint(),
-        )
-        theta = joined(theta, self._pending.values)
+        before = without(self._window.isam.getFactors(), self._pending)
+        theta = joined(self._window.isam.getLinearizationPoint(), self._pending.values)
         if not (found := culprits(before, self._pending, theta, self._expiring)):
             return False
         self._withhold(found)
-        self._withhold(more := undetermined(self._pending, self.values, self._expiring))
-        for key in set().union(*(withheld.keys for withheld in found + more)):
+        for key in set().union(*(withheld.keys for withheld in found)):
             theta.erase(key)
         before.push_back(self._pending.graph)
         kept_s = {key: self._expiring.get(key, time_s) for key in keys_of(theta)}
@@ -293,9 +294,8 @@ class Smoother:
             if leaving:
                 self.when_leaving(leaving)
 
-    def _take_estimate(self) -> None:
+    def _take(self, estimate: gtsam.Values) -> None:
         """The window's; a bounded one forgets what has left."""
-        estimate = self._window.isam.calculateEstimate()
         if not self._is_bounded:
             self.values.update(estimate)
             return
@@ -346,7 +346,7 @@ class Smoother:
         for factor in marginal(outside, self.values, times):
             inside.push_back(factor)
         self._begin_window(inside, values, times)
-        self._take_estimate()
+        self._take(self._window.isam.calculateEstimate())
 
     def _begin_window(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times: dict[Any, float]) -> None:
         try:
@@ -355,17 +355,7 @@ class Smoother:
             raise EstimatorError(f"isam2: {reasons(graph, values, self._expiring)}") from error
 
     def _solve(self) -> gtsam.Values:
-        """Solve the history; again while a landmark is stuck behind the sonar and its new start lowers the error."""
-        values = solve(self.graph, self.values)
-        for _ in range(MAX_PLACEMENTS):
-            stuck = self.sightlines.turned_away(values)
-            if not stuck:
-                break
-            retried = solve(self.graph, self.sightlines.placed_anew(values, stuck))
-            if self.graph.error(retried) >= self.graph.error(values):
-                break
-            values = retried
-        return values
+        return solve_in_sight(self.graph, self.values, self.sightlines)
 
     @property
     def marginals(self) -> gtsam.ISAM2:

@@ -1,8 +1,8 @@
 """Which new factors a smoother has to do without, and why, in words.
 
 A landmark whose new factors leave a direction open cannot be solved for; a factor whose error is no number spoils all
-variables. Such factors are withheld, with the landmarks and biases that then have none, and the rest goes on as if they
-had never come. A keyframe cannot be withheld, since later ones hang on it.
+variables, and marginals for good. Such factors are withheld, with the landmarks and biases that then have none, and the
+rest goes on as if they had never come. A keyframe cannot be withheld, since later ones hang on it.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import gtsam
+import numpy as np
 
 from sonar_graph.errors import EstimatorError
 from sonar_graph.slam.determinacy import LEAST_SAID, Open, factor_names, left_open, not_finite, variable_name
@@ -33,6 +34,19 @@ class Withheld:
     """The variable, its factors, and what is missing."""
 
 
+def spoilt(pending: Pending, values: gtsam.Values, times_s: dict[int, float]) -> list[Withheld]:
+    """New factors whose error is no number.
+
+    Parameters
+    ----------
+    values, times_s
+        See `undetermined`.
+    """
+    if np.isfinite(pending.graph.error(values)):
+        return []
+    return [_no_number(pending.handles[i], pending, times_s) for i in not_finite(pending.graph, values)]
+
+
 def undetermined(
     pending: Pending, values: gtsam.Values, times_s: dict[int, float], least_said: float = 0.0
 ) -> list[Withheld]:
@@ -41,7 +55,7 @@ def undetermined(
     Parameters
     ----------
     values
-        Of all variables.
+        Of the variables of the new factors.
     times_s
         Of the keyframes.
     least_said
@@ -71,12 +85,9 @@ def culprits(
     EstimatorError
         When a keyframe, or what was in the window before, is left open.
     """
-    spoilt = [pending.handles[i] for i in not_finite(pending.graph, values)]
-    found = [_no_number(handle, pending, times_s) for handle in spoilt]
     graph = gtsam.NonlinearFactorGraph(window)
-    for i, handle in enumerate(pending.handles):
-        if handle not in spoilt:
-            graph.push_back(pending.graph.at(i))
+    graph.push_back(pending.graph)
+    found: list[Withheld] = []
     used = set(graph.keyVector()) | set(keys_of(pending.values))
     for open_ in left_open(graph, values, sorted(used)):
         if gtsam.symbolChr(open_.key) == ord("x") or not pending.values.exists(open_.key):
@@ -99,7 +110,7 @@ def reasons(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times_s: di
 def explained(open_: Open, factors: list[gtsam.NonlinearFactor], times_s: dict[int, float]) -> str:
     """The variable, its factors, the open directions, and what would close them."""
     kind = chr(gtsam.symbolChr(open_.key))
-    return f"{_placed(open_.key, factors, times_s)}: {factor_names(factors)} leave {open_.axes()} open; {MISSING[kind]}"
+    return f"{_placed(open_.key, factors, times_s)}: {factor_names(factors)}; open: {open_.axes()}; {MISSING[kind]}"
 
 
 def _placed(key: int, factors: list[gtsam.NonlinearFactor], times_s: dict[int, float]) -> str:

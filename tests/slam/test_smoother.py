@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, L, X
 
-import sonar_graph.slam.smoother as smoother_module
+import sonar_graph.slam.sightlines as sightlines_module
 from sonar_graph.calibration import Calibration, Start
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
@@ -196,7 +196,7 @@ def counted_solves(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         sizes.append(graph.size())
         return solve(graph, values)
 
-    monkeypatch.setattr(smoother_module, "solve", counting)
+    monkeypatch.setattr(sightlines_module, "solve", counting)
     return sizes
 
 
