@@ -5,10 +5,13 @@ the poses, its duplicate comes to lie where it lies. Two landmarks a, b are one 
 
 * at least one of them is anonymous;
 * no frame shows both, and with a bounded history none of the one that goes has left the window;
-* their difference ``d = p_a - p_b``, with ``S = P_aa + P_bb - P_ab - P_ba``, is compatible with zero: ``d' S^-1 d`` is
-  within the chi-square gate, three degrees of freedom;
+* their difference ``d = p_a - p_b``, with ``S = P_aa + P_bb - P_ab - P_ba + sigma² I``, is compatible with zero:
+  ``d' S^-1 d`` is within the chi-square gate, three degrees of freedom;
 * that says something: the density of the horizontal difference ``N(d_xy; 0, S_xy)``, 1/m², exceeds the density that
   neighbours which are not in the map are expected to have. Where S is wide it does not.
+
+Sigma is the noise of one sighting. Of two landmarks in one place each gets the sightings on its side, so that they stay
+apart by about that, and P does not know it. Two that really lie so near each other are told apart by frames with both.
 """
 
 from __future__ import annotations
@@ -60,9 +63,15 @@ class LandmarkMerging:
         if not pairs:
             return None
         d, S = _differences(values, covariance, pairs)
+        S = S + np.array([max(map(self._variance, pair)) for pair in pairs])[:, None, None] * np.eye(3)
         distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])
         near = [k for k in np.argsort(distance).tolist() if distance[k] <= self._gate]
         return next((pairs[k] for k in near if self._is_telling(d[k], S[k]) and self._may_be_one(*pairs[k])), None)
+
+    def _variance(self, landmark_id: int) -> float:
+        """Noise of a sighting, across or along its beam, whichever is larger, m²."""
+        sighting = self._landmarks.any_sighting(landmark_id)
+        return float(max(sighting.noise[0, 0], sighting.line.z[0] ** 2 * sighting.noise[1, 1]))
 
     def _is_telling(self, d: Floats, S: Floats) -> bool:
         level = S[:2, :2]

@@ -49,6 +49,10 @@ class LandmarkSightings:
         """Those of a landmark."""
         return list(self._of.get(landmark_id, {}))
 
+    def any_sighting(self, landmark_id: int) -> Sighting:
+        """One of a landmark of the graph."""
+        return next(iter(self._of[landmark_id]), None) or self._rooted[landmark_id]
+
     def is_rooted(self, landmark_id: int) -> bool:
         """Whether sightings of it have left a bounded window, so that it stays."""
         return landmark_id in self._rooted
