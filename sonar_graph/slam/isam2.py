@@ -72,7 +72,8 @@ class Isam2Params(Section):
 
     unknown_landmarks: Literal["ignore", "associate"] = "ignore"
     """What becomes of detections that name no landmark: ``ignore`` refuses them; ``associate`` pairs them with
-    landmarks by geometry, and begins landmarks with identities from 3000000000 on (docs/theory/unknown_landmarks.md)."""
+    landmarks by geometry, and begins landmarks with identities from 3000000000 on; docs/theory/unknown_landmarks.md
+    says on what conditions."""
     unknown_gate_probability: float = Field(0.9999, gt=0, lt=1)
     """A true pairing of a frame's detections with landmarks is jointly compatible with this probability."""
     unknown_density_m2: float = Field(0.05, gt=0)
