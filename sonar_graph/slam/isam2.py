@@ -13,6 +13,7 @@ time of the frame. Keyframes can then be sparser than frames at no loss but the 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, ClassVar, Literal
 
 import gtsam
@@ -21,13 +22,15 @@ from gtsam.symbol_shorthand import L
 from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Section
-from sonar_graph.errors import CalibrationError
-from sonar_graph.measurements import Measurements
+from sonar_graph.errors import CalibrationError, EstimatorError
+from sonar_graph.measurements import Floats, Ints, Measurements
 from sonar_graph.slam.anonymous_landmarks import AnonymousPolicy
 from sonar_graph.slam.asked import Anchored, Asked
+from sonar_graph.slam.joint_covariance import JointCovariance
 from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
 from sonar_graph.slam.sightings import SightingPolicy, Sightings
 from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.uncertainty import Over, joint_covariance
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, RefusedRow, Trajectory
 
 
@@ -187,6 +190,63 @@ class Isam2:
                 strict=True,
             ):
                 self._sightings.journal.record(stamp_ns, i, Outcome.LATE)
+
+    def keyframe_stamps(self) -> Ints:
+        """Stamps of the keyframes, by their numbers, shape (n,), nanoseconds."""
+        return np.array(self._keyframes.stamps_ns, dtype=np.int64)
+
+    def marginal(
+        self,
+        *,
+        keyframe: int | None = None,
+        stamp_ns: int | None = None,
+        landmark: int | None = None,
+        over: Over = "window",
+    ) -> Floats:
+        """Covariance of one keyframe, by its number or stamp, or of one landmark, by its identity.
+
+        Returns
+        -------
+        Floats
+            Of the body-frame perturbation [rotation, translation], shape (6, 6), or of the position in the world,
+            shape (3, 3), m². What holds of `joint_covariance` holds of it.
+        """
+        asked = [[] if one is None else [one] for one in (keyframe, stamp_ns, landmark)]
+        if sum(map(len, asked)) != 1:
+            raise EstimatorError("isam2: marginal() is of one variable; give one of keyframe, stamp_ns and landmark")
+        return self.joint_covariance(*asked, over=over).matrix
+
+    def joint_covariance(
+        self,
+        keyframes: Iterable[int] = (),
+        stamps_ns: Iterable[int] = (),
+        landmarks: Iterable[int] = (),
+        *,
+        over: Over = "window",
+    ) -> JointCovariance:
+        """Joint covariance of keyframes, by their numbers or stamps, and of landmarks, by their identities.
+
+        Poses between keyframes: `trajectory` has their covariances, one by one.
+
+        Parameters
+        ----------
+        over
+            "window": from iSAM2, as of its last update, linearised within ``relinearize_threshold`` of the estimate;
+            what marginals touch, landmarks above all, stays linearised where it was when they were made. Only of what
+            is in the window. "history": from the solution of the whole graph, linearised there, of anything; with a
+            bounded history from the solution of the window's graph.
+
+        Returns
+        -------
+        JointCovariance
+            In the order of GTSAM's keys: landmarks, then keyframes, each by their numbers; ``rows`` says where.
+
+        Raises
+        ------
+        EstimatorError
+            When something is not known, or has left the window; it says what there is.
+        """
+        return joint_covariance(self._smoother, self._keyframes.stamps_ns, over, keyframes, stamps_ns, landmarks)
 
     def trajectory(self) -> Trajectory:
         """The smoothed pose at every instant at which `process` returned an estimate.

@@ -79,7 +79,8 @@ class Smoother:
         self._stale_shift_m = stale_shift_m
         self._greatest_waiting_gain = greatest_waiting_gain
         self._restart_size = FIRST_RESTART
-        self._is_bounded = is_bounded
+        self.is_bounded = is_bounded
+        """Whether what leaves the window is given up."""
         self._history: History | Recent = Recent() if is_bounded else History()
         self._restarted_s = self._newest_s = -np.inf
         self.withheld: deque[str] = deque(maxlen=MOST_MESSAGES)
@@ -202,7 +203,7 @@ class Smoother:
 
     def _exchange_lag_s(self, time_s: float) -> float:
         """Nothing leaves a bounded window between what an exchange takes out and what it puts in."""
-        return max(self._lag_at(time_s), self._window.lag_s) if self._is_bounded else self._lag_at(time_s)
+        return max(self._lag_at(time_s), self._window.lag_s) if self.is_bounded else self._lag_at(time_s)
 
     def in_window(self, keys: list[int]) -> list[int]:
         """Those of some variables that are in the window, or about to be."""
@@ -287,7 +288,7 @@ class Smoother:
         return True
 
     def _announce_leaving(self, before_s: float) -> None:
-        if self._is_bounded:
+        if self.is_bounded:
             leaving = {
                 key for key, t in self._expiring.items() if t < before_s and not self._pending.values.exists(key)
             }
@@ -296,7 +297,7 @@ class Smoother:
 
     def _take(self, estimate: gtsam.Values) -> None:
         """The window's; a bounded one forgets what has left."""
-        if not self._is_bounded:
+        if not self.is_bounded:
             self.values.update(estimate)
             return
         self.values = estimate
@@ -307,7 +308,7 @@ class Smoother:
         self._history.keep(self._window.isam.getFactors(), left)
 
     def _may_restart(self, time_s: float) -> bool:
-        if self._is_bounded:
+        if self.is_bounded:
             return time_s >= self._restarted_s + self._lag_s
         return self.graph.size() >= self._restart_size
 
@@ -356,6 +357,11 @@ class Smoother:
 
     def _solve(self) -> gtsam.Values:
         return solve_in_sight(self.graph, self.values, self.sightlines)
+
+    @property
+    def landmark_ids(self) -> list[int]:
+        """Of the landmarks in the graph, ascending."""
+        return sorted(gtsam.Symbol(key).index() for key in self._landmarks)
 
     @property
     def marginals(self) -> gtsam.ISAM2:
