@@ -66,7 +66,7 @@ class DeadReckoning:
         """
         self._odometry.add(measurements.imu, measurements.dvl)
         self._ignore(measurements.detections)
-        node_ns = self._start(measurements.end_ns) if self._node_ns is None else self._node_ns
+        node_ns = self._odometry.start_by(measurements.end_ns) if self._node_ns is None else self._node_ns
         if node_ns is None or measurements.end_ns < node_ns:
             return None
         node_ns = self._advance(node_ns, measurements.end_ns)
@@ -96,13 +96,6 @@ class DeadReckoning:
         ids, _ = detections.most_probable()
         for stamp_ns, landmark_id in zip(detections.stamps_ns.tolist(), ids.tolist(), strict=True):
             self._journal.record(stamp_ns, landmark_id, Outcome.IGNORED)
-
-    def _start(self, instant_ns: int) -> int | None:
-        """The first node, when it is reached by then."""
-        start_ns = self._odometry.start_ns()
-        if start_ns is None or not len(self._odometry.nodes(start_ns - 1, instant_ns)):
-            return None
-        return start_ns
 
     def _advance(self, node_ns: int, instant_ns: int) -> int:
         """Commit all nodes reached by then; returns the newest."""

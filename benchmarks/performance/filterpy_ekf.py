@@ -259,8 +259,9 @@ def run(sequence: Sequence, until_ns: int, *, predicts_by_node: bool = False) ->
         events += [(int(t), 0, row) for row, t in enumerate(sequence.depth.stamps_ns)]
     if sequence.detections is not None:
         events += [(int(t), 1, row) for row, t in enumerate(sequence.detections.stamps_ns)]
+    reached_ns = odometry.start_reached_ns(start_ns)
     for stamp_ns, kind, row in sorted(events):
-        if stamp_ns > until_ns or not len(odometry.nodes(start_ns - 1, stamp_ns)):
+        if not reached_ns <= stamp_ns <= until_ns:
             continue
         feed.advance(stamp_ns)
         (feed.depth, feed.detection)[kind](row)

@@ -105,6 +105,13 @@ class Odometry:
         covered_ns = int(self._imu.stamps_ns[np.searchsorted(self._imu.stamps_ns, start_ns)])
         return max(covered_ns, self._intake.start_known_ns)
 
+    def start_by(self, until_ns: int) -> int | None:
+        """First node, when it is reached at an instant; None before."""
+        start_ns = self.start_ns()
+        if start_ns is None or self.start_reached_ns(start_ns) > until_ns:
+            return None
+        return start_ns
+
     def nodes(self, after_ns: int, until_ns: int) -> Ints:
         """Nodes after one instant that are reached at another, in order."""
         first, last = node_range(self._imu.stamps_ns, self._dvl.stamps_ns, after_ns, until_ns)

@@ -137,8 +137,8 @@ class Keyframes:
         """Set the keyframes that are due from nodes reached at an instant; the first starts the graph."""
         self.advanced_ns = max(self.advanced_ns, until_ns)
         if not self.stamps_ns:
-            start_ns = self.odometry.start_ns()
-            if start_ns is None or start_ns > until_ns:
+            start_ns = self.odometry.start_by(until_ns)
+            if start_ns is None:
                 return
             self._start(start_ns)
         interval_ns = round(self.policy.max_interval_s / S_PER_NS)

@@ -149,7 +149,8 @@ def nees_after_gap(kind, seed, forgets_gap):
     start_ns = mission.start_ns
     seconds = (mission.dvl.stamps_ns - start_ns) / NS_PER_S
     lost = mission.dvl.rows((seconds <= BEFORE_S) | (seconds >= BEFORE_S + LOST_S))
-    closed_ns = lost.stamps_ns[np.searchsorted(lost.stamps_ns, start_ns + (BEFORE_S + LOST_S) * NS_PER_S)]
+    first_after = np.searchsorted(lost.stamps_ns, start_ns + (BEFORE_S + LOST_S) * NS_PER_S)
+    closed_ns = lost.stamps_ns[first_after + 1]  # the second row confirms the first
     after_ns = closed_ns + np.round(AFTER_S * NS_PER_S).astype(np.int64)
     sequence = Sequence("gap", mission.calibration, mission.imu, lost, None, mission.detections)
     estimator, squares = kind(mission.calibration), []

@@ -124,3 +124,21 @@ def test_velocity_is_told_at_nodes_only(instant_s):
 def test_an_interval_of_no_length_is_not_in_the_wrong_order():
     with pytest.raises(MeasurementError, match=r"start_ns: .* is none of the 9 Doppler stamps"):
         steady().steps_between_nodes(at(0.25), at(0.25))
+
+
+@pytest.mark.parametrize("speed_m_s", [0.0, 3.0])
+def test_the_start_is_reached_at_the_same_time_however_the_log_is_cut(speed_m_s):
+    """When its velocity is confirmed: at 3 m/s by two rows more than at rest."""
+    imu_rows = imu(stamps(100, 3), 0.0)
+    dvl_rows = dvl(stamps(5, 3), (speed_m_s, 0, 0), 1e-4 * np.eye(3))
+    at_once, by_and_by = Odometry(Calibration()), Odometry(Calibration())
+    at_once.add(imu_rows, dvl_rows)
+    reached = []
+    for until_ns in imu_rows.stamps_ns.tolist():
+        by_and_by.add(
+            imu_rows.between(until_ns - NS // 100, until_ns), dvl_rows.between(until_ns - NS // 100, until_ns)
+        )
+        assert by_and_by.start_by(until_ns) == at_once.start_by(until_ns)
+        reached.append(at_once.start_by(until_ns) is not None)
+    assert at_once.start_ns() == T0_NS
+    assert reached.index(True) == (20 if speed_m_s == 0 else 60)
