@@ -167,3 +167,17 @@ def test_a_lone_landmark_cannot_be_mistaken_for_another():
 def test_nothing_in_view_is_no_block():
     far = World(np.array([1]), np.array([[500.0, 0.0, 0.0]]), 0.0)
     assert simulate_detections(PATH, STAMPS, SONAR, FAN, Recogniser(), far, np.random.default_rng(0)) is None
+
+
+def test_a_share_of_all_detections_names_nothing():
+    """The others, and where all of them are, stay as they were."""
+    named = detect(Recogniser(false_detections_per_frame=0.5))
+    some = detect(Recogniser(false_detections_per_frame=0.5, anonymous_share=0.3))
+    is_anonymous = (some.candidate_ids < 0).all(axis=1)
+    assert_binomial(int(is_anonymous.sum()), len(some), 0.3)
+    assert np.all(some.id_probability[is_anonymous] == 0)
+    assert np.array_equal(some.id_probability[~is_anonymous], named.id_probability[~is_anonymous])
+    assert np.array_equal(some.candidate_ids[~is_anonymous], named.candidate_ids[~is_anonymous])
+    assert np.array_equal(some.range_m, named.range_m)
+    assert np.array_equal(some.azimuth_rad, named.azimuth_rad)
+    assert (detect(Recogniser(anonymous_share=1.0)).candidate_ids < 0).all()
