@@ -7,6 +7,8 @@ from collections.abc import Iterable
 
 import gtsam
 
+from sonar_graph.slam.new_window import without
+
 POSE, LANDMARK = ord("x"), ord("l")
 
 
@@ -49,7 +51,7 @@ class History:
             self.graph.resize(len(self._handles))
             self.changes += 1
 
-    def keep(self, window: gtsam.NonlinearFactorGraph, left: Iterable[int]) -> None:
+    def keep(self, window: gtsam.NonlinearFactorGraph, theta: gtsam.Values, left: Iterable[int]) -> None:
         """Nothing is given up: what leaves the window stays here."""
 
 
@@ -64,17 +66,15 @@ class Recent:
         """Number of factors ever put in or taken out, and of times that variables left."""
         self._factors: dict[int, gtsam.NonlinearFactor] = {}
         self._handles: dict[int, list[int]] = defaultdict(list)
-        self._window = gtsam.NonlinearFactorGraph()
+        self._window, self._theta = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._waiting: list[int] = []
+        self._gone: list[gtsam.NonlinearFactor] = []
         self._next = 0
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Those in the window, marginals among them, and those that wait to be."""
-        graph = gtsam.NonlinearFactorGraph()
-        for i in range(self._window.size()):
-            if self._window.exists(i):
-                graph.push_back(self._window.at(i))
+        graph = without(self._window, self._theta, self._gone)
         for handle in self._waiting:
             graph.push_back(self._factors[handle])
         return graph
@@ -96,25 +96,23 @@ class Recent:
     def remove(self, handles: Iterable[int]) -> None:
         """Take factors out."""
         gone = [self._factors.pop(handle) for handle in handles]
+        self._gone += gone
         self._waiting = [handle for handle in self._waiting if handle in self._factors]
-        window = gtsam.NonlinearFactorGraph()
-        for i in range(self._window.size()):
-            if self._window.exists(i) and self._window.at(i) not in gone:
-                window.push_back(self._window.at(i))
-        self._window = window
         self.changes += len(gone)
 
-    def keep(self, window: gtsam.NonlinearFactorGraph, left: Iterable[int]) -> None:
+    def keep(self, window: gtsam.NonlinearFactorGraph, theta: gtsam.Values, left: Iterable[int]) -> None:
         """The window has been brought up to date.
 
         Parameters
         ----------
         window
             All its factors.
+        theta
+            Where its variables are linearised.
         left
             Variables that have left it.
         """
-        self._window, self._waiting = window, []
+        self._window, self._theta, self._waiting, self._gone = window, theta, [], []
         for key in left:
             for handle in self._handles.pop(key, ()):
                 self._factors.pop(handle, None)

@@ -6,8 +6,6 @@ from collections.abc import Container, Iterable
 
 import gtsam
 
-from sonar_graph.slam.pending import Pending
-
 
 def split(
     graph: gtsam.NonlinearFactorGraph, kept: set[int]
@@ -40,13 +38,30 @@ def copy(source: gtsam.Values, key: int, target: gtsam.Values) -> None:
         target.insert(key, source.atPoint3(key))
 
 
-def without(graph: gtsam.NonlinearFactorGraph, pending: Pending) -> gtsam.NonlinearFactorGraph:
-    """A graph, its holes closed, less the factors that are pending."""
-    new = [pending.graph.at(i) for i in range(len(pending.handles))]
-    kept = gtsam.NonlinearFactorGraph()
+def anchored(factor: gtsam.NonlinearFactor, theta: gtsam.Values) -> gtsam.NonlinearFactor:
+    """A factor of a window by itself.
+
+    iSAM2 keeps a marginal without the values at which it holds: those at which the window's variables are linearised.
+    """
+    if isinstance(factor, gtsam.LinearContainerFactor):
+        return gtsam.LinearContainerFactor(factor.linearize(theta), theta)
+    return factor
+
+
+def without(
+    graph: gtsam.NonlinearFactorGraph, theta: gtsam.Values, left_out: Iterable[gtsam.NonlinearFactor] = ()
+) -> gtsam.NonlinearFactorGraph:
+    """A window's graph, its holes closed and its marginals anchored, less some factors.
+
+    Parameters
+    ----------
+    theta
+        Where the window's variables are linearised.
+    """
+    gone, kept = list(left_out), gtsam.NonlinearFactorGraph()
     for i in range(graph.size()):
-        if graph.exists(i) and graph.at(i) not in new:
-            kept.push_back(graph.at(i))
+        if graph.exists(i) and graph.at(i) not in gone:
+            kept.push_back(anchored(graph.at(i), theta))
     return kept
 
 

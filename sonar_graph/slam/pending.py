@@ -16,6 +16,11 @@ class Pending:
         self.times_s: dict[int, float] = {}
         """Of new poses."""
 
+    @property
+    def factors(self) -> list[gtsam.NonlinearFactor]:
+        """All of them."""
+        return [self.graph.at(i) for i in range(len(self.handles))]
+
     def add(self, factor: gtsam.NonlinearFactor, handle: int) -> None:
         """A new factor."""
         self.graph.add(factor)

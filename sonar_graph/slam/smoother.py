@@ -275,8 +275,8 @@ class Smoother:
 
         The window is made anew of the same factors with the same linearisation: nothing else changes.
         """
-        before = without(self._window.isam.getFactors(), self._pending)
         theta = joined(self._window.isam.getLinearizationPoint(), self._pending.values)
+        before = without(self._window.isam.getFactors(), theta, self._pending.factors)
         if not (found := culprits(before, self._pending, theta, self._expiring)):
             return False
         self._withhold(found)
@@ -305,7 +305,7 @@ class Smoother:
         for key in left:
             del self._expiring[key]
         self.sightlines.leave(set(left))
-        self._history.keep(self._window.isam.getFactors(), left)
+        self._history.keep(self._window.isam.getFactors(), self._window.isam.getLinearizationPoint(), left)
 
     def _may_restart(self, time_s: float) -> bool:
         if self.is_bounded:

@@ -14,7 +14,7 @@ import numpy as np
 
 from sonar_graph.errors import EstimatorError
 from sonar_graph.slam.determinacy import LEAST_SAID, Open, factor_names, left_open, not_finite, variable_name
-from sonar_graph.slam.new_window import keys_of, without
+from sonar_graph.slam.new_window import keys_of
 from sonar_graph.slam.pending import Pending
 
 MISSING = {
@@ -98,7 +98,6 @@ def culprits(
 
 def reasons(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times_s: dict[int, float]) -> str:
     """Why a graph has no solution."""
-    graph = without(graph, Pending())
     spoilt = [graph.at(i) for i in not_finite(graph, values)]
     if spoilt:
         where = _placed(list(spoilt[0].keys())[-1], spoilt, times_s)

@@ -1,0 +1,199 @@
+"""What leaves the window is given up, and nothing but that."""
+
+import gc
+from dataclasses import replace
+from functools import cache
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import L, X
+
+from sonar_graph.estimator_checks import check_estimator
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam.smoother import Smoother
+from sonar_graph.states import Estimate, Outcome
+
+from .rail import STEP_S, rail
+from .test_deferred_identities import on_the_rail
+
+LAG_S = 5.0
+
+
+@cache
+def mission(duration_s: float = 120.0) -> Sequence:
+    return simulate_mission(MissionOptions(duration_s=duration_s))
+
+
+def run(sequence: Sequence, history: str, rate_hz: float = 2.0, **params) -> tuple[Isam2, list[Estimate]]:
+    estimator = Isam2(sequence.calibration, Isam2Params(history=history, **{"lag_s": LAG_S, **params}))
+    estimates = [estimator.process(step) for step in sequence.replay(sequence.instants(rate_hz))]
+    return estimator, [estimate for estimate in estimates if estimate is not None]
+
+
+def test_causal_estimates_are_those_of_the_whole_history_to_the_bit():
+    """The window is the same; what is kept beside it is not asked."""
+    (_, whole), (_, bounded) = (run(mission(), history, stale_shift_m=1e9) for history in ("whole", "bounded"))
+    assert len(whole) == len(bounded) > 200
+    for one, other in zip(whole, bounded, strict=True):
+        assert np.array_equal(one.world_T_body.matrix(), other.world_T_body.matrix())
+        assert np.array_equal(one.covariance, other.covariance)
+
+
+def test_poses_that_left_are_those_of_least_squares_as_far_as_the_lag_reached():
+    """On the rail, with a keyframe a node: each pose is that of all that was measured until it left."""
+    nodes, (sequence, numbers) = 31, rail(31)
+    lag_s = 3.25 * STEP_S
+    settings = {"lag_s": lag_s, "kernel": "none", "waiting_gain": 0.0, "motion_noise_share": 0.0}
+    estimator, _ = run(sequence, "bounded", 1 / STEP_S, **settings, max_keyframe_interval_s=STEP_S)
+    found = estimator.trajectory()
+    assert len(found) == nodes - 1
+    for k, (position, cov) in enumerate(zip(found.positions, found.covariances, strict=True), start=1):
+        mean, variance = numbers.solution(min(k + 4, nodes))
+        assert position[0] == pytest.approx(mean[f"x{k}"], abs=1e-7)
+        assert cov[3, 3] == pytest.approx(variance[f"x{k}"], rel=1e-5)
+    all_mean, _ = numbers.solution(nodes)
+    assert abs(found.positions[5, 0] - all_mean["x6"]) > 1e-4
+    for i in (4, 7):
+        assert estimator.landmarks().positions[[4, 7].index(i), 0] == pytest.approx(all_mean[f"l{i}"], abs=1e-7)
+
+
+def test_smoothed_poses_are_better_than_causal_ones_and_worse_than_those_of_the_whole():
+    rms = {}
+    for history in ("whole", "bounded"):
+        estimator, causal = run(mission(), history)
+        smoothed = estimator.trajectory()
+        assert smoothed.stamps_ns.tolist() == [estimate.stamp_ns for estimate in causal]
+        truth = mission().truth.at(smoothed.stamps_ns)
+        rms[history] = np.sqrt(np.mean(np.sum((smoothed.positions - truth.positions) ** 2, axis=1)))
+        assert np.linalg.eigvalsh(smoothed.covariances).min() > 0
+        sigma = np.sqrt(np.trace(smoothed.covariances[:, 3:, 3:], axis1=1, axis2=2))
+        before = np.sqrt([np.trace(estimate.covariance[3:, 3:]) for estimate in causal])
+        assert np.all(sigma < 1.001 * before)
+        assert np.median(sigma / before) < 0.99
+    assert not np.isclose(rms["whole"], rms["bounded"], rtol=1e-6)
+
+
+def held(estimator: Isam2) -> dict[str, int]:
+    """Sizes of all that could grow with the run."""
+    smoother, sightings = estimator._smoother, estimator._sightings
+    window = smoother._window.isam
+    return {
+        "values": smoother.values.size(),
+        "factors": smoother.graph.size(),
+        "slots": window.getFactors().size(),
+        "handles": len(smoother._history._factors) + sum(map(len, smoother._history._handles.values())),
+        "expiring": len(smoother._expiring),
+        "sightlines": sum(len(lines) for lines in smoother.sightlines._lines.values()),
+        "sightings": sum(len(seen) for seen in sightings._landmarks._of.values()),
+        "tracks": sum(len(t.waiting) + len(t.settled) for t in sightings._deferred._tracks._by_number.values()),
+        "asked": len(estimator._asked._open),
+    }
+
+
+@pytest.mark.parametrize("tracks", [False, True])
+def test_nothing_grows_with_the_run(tracks):
+    """What is held after a minute and after four differs by less than a window; of a whole history it does not."""
+    sequence = simulate_mission(MissionOptions(duration_s=240.0, tracks=tracks, id_delay_s=2.0 if tracks else 0.0))
+    sizes, counts = [], []
+    estimator = Isam2(sequence.calibration, Isam2Params(history="bounded", lag_s=LAG_S))
+    for step in sequence.replay(sequence.instants(2.0)):
+        estimator.process(step)
+        if round((step.end_ns - sequence.start_ns) * 1e-9, 3) in (60.0, 120.0, 180.0, 239.0):
+            sizes.append(held(estimator))
+            gc.collect()
+            counts.append(len(gc.get_objects()))
+    first, *later = sizes
+    for name, size in first.items():
+        assert max(each[name] for each in later) < 2.5 * size + 20, name
+    assert counts[-1] - counts[1] < 1000
+    whole, _ = run(sequence, "whole")
+    assert whole.graph.size() > 5 * later[-1]["factors"]
+    assert whole.values.size() > 3 * later[-1]["values"]
+
+
+def test_it_keeps_the_contract():
+    check_estimator(lambda calibration: Isam2(calibration, Isam2Params(history="bounded", lag_s=2.0)))
+
+
+# Identities ---------------------------------------------------------------------------------------------------------
+
+SURE_4, SURE_7 = [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize(("frames", "is_corrected"), [(3, True), (12, False)])
+def test_a_wrong_identity_is_taken_back_as_far_as_the_window_reaches(frames, is_corrected):
+    """Landmark 7 is taken for 6 in its first frames. Corrected within the lag the run is the right one; else not."""
+    wrong = [0.0, 0.0, 1.0, 0.0]
+    settings = {"lag_s": 4.0, "kernel": "none", "waiting_gain": 0.0, "motion_noise_share": 0.0}
+    late, _ = run(on_the_rail([wrong] * frames + [SURE_7], SURE_4), "bounded", **settings)
+    right, _ = run(on_the_rail([SURE_7], SURE_4), "bounded", **settings)
+    maps = [dict(zip(e.landmarks().ids.tolist(), e.landmarks().positions[:, 0], strict=True)) for e in (late, right)]
+    assert (maps[0].keys() == maps[1].keys()) == is_corrected
+    assert set(maps[0]) - set(maps[1]) == (set() if is_corrected else {6})
+    if is_corrected:
+        assert maps[0] == pytest.approx(maps[1], abs=1e-6)
+        assert late.trajectory().positions == pytest.approx(right.trajectory().positions, abs=1e-6)
+    outcomes = late.detections().outcomes
+    assert outcomes.count(Outcome.MOVED) == (frames if is_corrected else outcomes.count(Outcome.MOVED))
+    assert outcomes.count(Outcome.MOVED) <= frames
+    assert all(np.isfinite(late.trajectory().covariances).ravel())
+
+
+def test_a_landmark_whose_sightings_have_left_stays_when_its_last_one_is_taken_back():
+    sequence = on_the_rail([[0.0, 0.0, 1.0, 0.0]] * 12 + [SURE_7], SURE_4)
+    estimator, _ = run(sequence, "bounded", lag_s=2.0, kernel="none", waiting_gain=0.0, motion_noise_share=0.0)
+    assert 6 in estimator.landmarks().ids.tolist()
+    assert estimator.values.exists(L(6))
+
+
+# Restarts -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_window_that_begins_anew_says_the_same():
+    """On the rail all is linear: QR and a restart change nothing."""
+    sequence, _ = rail(31)
+    settings = {"lag_s": 2.0, "kernel": "none", "waiting_gain": 0.0}
+    plain, expected = run(sequence, "bounded", **settings)
+    estimator = Isam2(sequence.calibration, Isam2Params(history="bounded", **settings))
+    for k, step in enumerate(sequence.replay(sequence.instants(2.0))):
+        estimate = estimator.process(step)
+        assert estimate is not None
+        if k in (8, 20):
+            estimator._smoother._give_up_cholesky(estimator._keyframes.newest_s)
+        assert estimate.world_T_body.equals(expected[k].world_T_body, 1e-7)
+        assert np.allclose(estimate.covariance[3, 3], expected[k].covariance[3, 3], rtol=1e-5)
+    assert estimator._smoother._window.is_by_qr
+    assert np.allclose(estimator.trajectory().positions, plain.trajectory().positions, rtol=0, atol=1e-7)
+
+
+def test_landmarks_that_have_moved_are_linearised_anew_once_a_lag(monkeypatch):
+    restarts = []
+    restart = Smoother._restart
+    monkeypatch.setattr(Smoother, "_restart", lambda self, time_s: restarts.append(time_s) or restart(self, time_s))
+    run(mission(), "bounded", stale_shift_m=1e-6)
+    assert len(restarts) > 5
+    assert np.diff(restarts).min() >= LAG_S
+    many = len(restarts)
+    run(mission(), "bounded", stale_shift_m=1e9)
+    assert len(restarts) == many
+
+
+def test_detections_have_the_outcomes_of_a_whole_history():
+    whole, bounded = (run(mission(), h, stale_shift_m=1e9)[0].detections() for h in ("whole", "bounded"))
+    assert whole.outcomes == bounded.outcomes
+    assert np.array_equal(whole.innovations, bounded.innovations, equal_nan=True)
+
+
+def test_without_bias_and_landmarks_it_is_dead_reckoning():
+    still = mission(30.0)
+    imu = still.calibration.imu.model_copy(update={"gyro_bias_sigma": 0.0, "gyro_bias_walk_density": 0.0})
+    calibration = still.calibration.model_copy(update={"imu": imu})
+    alone = replace(still, detections=None, calibration=calibration)
+    (whole, causal), (bounded, same) = run(alone, "whole", lag_s=2.0), run(alone, "bounded", lag_s=2.0)
+    assert np.array_equal(causal[-1].covariance, same[-1].covariance)
+    assert len(bounded.trajectory()) == len(whole.trajectory()) == len(causal)
+    assert not bounded.values.exists(X(0))
+    assert isinstance(bounded.values, gtsam.Values)
