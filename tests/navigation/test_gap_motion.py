@@ -13,7 +13,7 @@ from sonar_graph.navigation.odometry import Odometry
 from .rows import NS, T0_NS, stamps
 
 IMU_HZ, DVL_HZ = 10.0, 2.0
-LOST_S, FOUND_S, OPEN_S = 6.0, 11.0, 10.8
+LOST_S, FOUND_S, OPEN_S, WAITS_S = 6.0, 11.0, 10.8, 1e-3
 BODY_P_IMU, BODY_P_DVL = np.array([0.2, -0.1, 0.1]), np.array([-0.5, 0.3, -0.2])
 SIGMA_M_S = (0.01, 0.02, 0.005)
 NO_NOISE = {"gyro_noise_density": 0.0, "accel_noise_density": 0.0, "accel_bias_sigma": 0.0}
@@ -41,18 +41,19 @@ def acceleration_at(t):
     return np.column_stack([0.2 * np.cos(t), -0.2 * np.sin(0.5 * t), 0.08 * np.cos(0.8 * t)])
 
 
+def at(seconds):
+    return T0_NS + round(seconds * NS)
+
+
 def rows(lever=BODY_P_DVL - BODY_P_IMU, dvl_hz=DVL_HZ):
-    """Without the velocity in two gaps."""
-    imu_ns, dvl_ns = stamps(IMU_HZ, 16.5), stamps(dvl_hz, 16.0)
+    """Without the velocity in two gaps, which end when a row confirms one shortly before it."""
+    imu_ns = stamps(IMU_HZ, 16.5)
+    dvl_ns = np.union1d(stamps(dvl_hz, 16.0), [at(FOUND_S - WAITS_S), at(15.0 - WAITS_S)])
     t, s = ((ns - T0_NS) * 1e-9 for ns in (imu_ns, dvl_ns))
     force = attitude(t).inv().apply(acceleration_at(t) + np.array([0.0, 0.0, 9.8]))
     velocity = attitude(s).inv().apply(velocity_at(s)) + np.cross(rate_at(s), lever)
-    kept = ((s <= LOST_S) | (s >= FOUND_S)) & ((s <= 12.0) | (s >= 15.0))
+    kept = ((s <= LOST_S) | (s > FOUND_S - 2 * WAITS_S)) & ((s <= 12.0) | (s > 15.0 - 2 * WAITS_S))
     return Imu(imu_ns, rate_at(t), force), Dvl(dvl_ns[kept], velocity[kept], np.full((int(kept.sum()), 3, 3), np.nan))
-
-
-def at(seconds):
-    return T0_NS + round(seconds * NS)
 
 
 def calibration(imu=None, body_p_imu=BODY_P_IMU, **dvl):

@@ -8,6 +8,7 @@ import pytest
 from sonar_graph.calibration import Calibration, DvlCalibration
 from sonar_graph.errors import MeasurementError
 from sonar_graph.navigation.odometry import Odometry, longest_interval_ns
+from sonar_graph.navigation.unmeasured_turns import ROWS_BEFORE
 from sonar_graph.states import Refusal
 
 from .rows import NS, T0_NS, dvl, imu, stamps
@@ -55,13 +56,17 @@ def test_what_is_settled_or_forgotten_stays_so():
 
 @pytest.mark.parametrize(("calibration", "kept_s"), [(HELD, 0.0), (Calibration(), 5.0)], ids=["held", "linear"])
 def test_forgetting_drops_rows_of_both_sensors_that_no_motion_needs(calibration, kept_s):
-    """A gap that opens later is bridged by a line through the five seconds before it; held velocities need one row."""
+    """A gap that opens later is bridged by a line through the five seconds before it; held velocities need one row.
+
+    What counts as a hole of the IMU is told from some rows more.
+    """
     odometry = steady(20.0, calibration)
     odometry.forget_before(at(15.0))
     columns = odometry.columns()
-    assert columns[-1] == (calibration is HELD)
-    for stamps_ns in (columns[0], columns[3]):
-        assert at(14.5 - kept_s) <= stamps_ns[0] <= at(15.0 - kept_s)
+    assert columns[6] == (calibration is HELD)
+    more_s = ROWS_BEFORE / 10
+    for stamps_ns, earliest_s in ((columns[0], 15.0 - more_s), (columns[3], 14.5)):
+        assert at(earliest_s - kept_s - 0.1) <= stamps_ns[0] <= at(15.0 - kept_s)
         assert stamps_ns[-1] == at(20.0)
 
 
