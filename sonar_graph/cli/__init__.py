@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from sonar_graph import __version__
+from sonar_graph.cli.benching import bench
 from sonar_graph.cli.comparing import compare, report, run
 from sonar_graph.cli.converting import datasets
 from sonar_graph.cli.demonstrating import demo
@@ -61,6 +62,13 @@ app.command(
 )(recognise)
 app.command(epilog=examples("sonar-graph calibrate dive.mcap -o model.json"))(calibrate)
 app.command(epilog=examples("sonar-graph report comparison"))(report)
+app.command(
+    epilog=examples(
+        "sonar-graph bench suite.toml -o results",
+        "sonar-graph bench suite.toml -o results --workers 2 --timeout 600",
+        "sonar-graph bench suite.toml -o results --scheduler tcp://10.0.0.5:8786",
+    )
+)(bench)
 app.command(epilog=examples("sonar-graph estimators"))(estimators)
 app.command(epilog=examples("sonar-graph demo -o demo"))(demo)
 

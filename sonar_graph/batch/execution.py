@@ -1,0 +1,171 @@
+"""A batch on Dask: a cluster of this machine's processes, or one that exists.
+
+One task a run. What a run leaves travels back to the batch, which alone writes to the store: workers need no common
+file system, except for logs, and a full disk is met in one place.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import dask
+from distributed import Client, Future, LocalCluster, as_completed
+from distributed.client import FutureCancelledError
+from distributed.scheduler import KilledWorker
+
+from sonar_graph.batch.planned import Limits, Outcome, PlannedRun
+from sonar_graph.batch.store import Store
+from sonar_graph.batch.supervision import perform_watched
+from sonar_graph.errors import BatchError, SonarGraphError
+
+CONNECT_S = 30.0
+CLOSE_S = 2.0
+DASK_SETTINGS = {
+    "distributed.scheduler.allowed-failures": 1,
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": False,
+    "distributed.admin.tick.limit": "1h",
+}
+"""One retry for the run of a worker that is killed; memory is that of the runs' own processes, watched there."""
+
+
+@dataclass(frozen=True)
+class Where:
+    """Who does the runs."""
+
+    workers: int | None = None
+    """On this machine; None: one for each of its cores that this process may use."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler that exists, in place of workers here."""
+
+    @property
+    def local_workers(self) -> int:
+        """How many there are on this machine."""
+        return self.workers or len(os.sched_getaffinity(0))
+
+
+Progress = Callable[[PlannedRun, Outcome], None]
+
+
+def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: Where, progress: Progress) -> None:
+    """Do runs and keep each as soon as it is done.
+
+    Parameters
+    ----------
+    runs
+        Those that are not done yet.
+    progress
+        Called after a run is kept.
+
+    Raises
+    ------
+    BatchError
+        When there is no scheduler or no worker, workers cannot do any run, or nothing can be written. What is done by
+        then is kept.
+    KeyboardInterrupt
+        On Ctrl-C, after a few seconds in which workers are ended.
+    """
+    planned = list(runs)
+    if not planned:
+        return
+    with dask.config.set(DASK_SETTINGS), _quiet(), _client(where, len(planned)) as client:
+        futures = {
+            client.submit(perform_watched, run, limits, key=f"run-{run.key}", pure=False): run for run in planned
+        }
+        try:
+            for future in as_completed(list(futures)):
+                _keep(futures.pop(future), future, store, progress)
+                future.release()
+        except FutureCancelledError as error:
+            raise BatchError(f"the scheduler was lost: {error}") from error
+        finally:
+            with contextlib.suppress(Exception):  # the first error is the one to tell
+                client.cancel(list(futures), force=True)
+
+
+def _keep(run: PlannedRun, future: Future, store: Store, progress: Progress) -> None:
+    outcome = _outcome(run, future)
+    try:
+        store.write(run.key, outcome)
+    except OSError as error:
+        raise BatchError(f"{store.folder}: cannot be written: {error.strerror or error}") from error
+    progress(run, outcome)
+
+
+def _outcome(run: PlannedRun, future: Future[Any]) -> Outcome:
+    """What a run left; workers that were killed under it leave a row that says so."""
+    try:
+        outcome = future.result()
+    except KilledWorker:
+        reason = "the workers that did it were killed, one after the other"
+        return Outcome({"status": "killed", "reason": reason}, log=f"{reason}\n")
+    except SonarGraphError as error:
+        raise BatchError(str(error)) from error
+    except OSError as error:
+        raise BatchError(f"a worker cannot do runs: {error}") from error
+    assert isinstance(outcome, Outcome)
+    return outcome
+
+
+@contextlib.contextmanager
+def _client(where: Where, tasks: int) -> Iterator[Client]:
+    """A client of the scheduler there is, or of a cluster that lives as long as the block."""
+    if where.scheduler is not None:
+        client = _connected(where.scheduler)
+        try:
+            yield client
+        finally:
+            client.close(timeout=CLOSE_S)
+        return
+    workers = min(where.local_workers, tasks)
+    with (
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            memory_limit=None,
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+def _connected(address: str) -> Client:
+    """A client of a scheduler that has at least one worker.
+
+    Raises
+    ------
+    BatchError
+        When there is none.
+    """
+    try:
+        client = Client(address, timeout=CONNECT_S)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise BatchError(f"no Dask scheduler at {address}: {error}") from error
+    try:
+        client.wait_for_workers(1, timeout=CONNECT_S)
+    except TimeoutError as error:
+        client.close()
+        raise BatchError(f"the scheduler at {address} has no worker after {CONNECT_S:g} s; start some") from error
+    return client
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without Dask's own messages: workers that come and go are told by rows."""
+    logger = logging.getLogger("distributed")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
