@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import dask
+from dask.system import CPU_COUNT
 from distributed import Client, Future, LocalCluster, as_completed
 from distributed.client import FutureCancelledError
 from distributed.scheduler import KilledWorker
@@ -32,6 +32,7 @@ DASK_SETTINGS = {
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": False,
     "distributed.admin.tick.limit": "1h",
+    "distributed.worker.preload": ["sonar_graph.batch.local_worker"],
 }
 """One retry for the run of a worker that is killed; memory is that of the runs' own processes, watched there."""
 
@@ -48,7 +49,7 @@ class Where:
     @property
     def local_workers(self) -> int:
         """How many there are on this machine."""
-        return self.workers or len(os.sched_getaffinity(0))
+        return self.workers or CPU_COUNT
 
 
 Progress = Callable[[PlannedRun, Outcome], None]
@@ -90,8 +91,8 @@ def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: W
                 client.cancel(list(futures), force=True)
 
 
-def _keep(run: PlannedRun, future: Future, store: Store, progress: Progress) -> None:
-    outcome = _outcome(run, future)
+def _keep(run: PlannedRun, future: Future[Any], store: Store, progress: Progress) -> None:
+    outcome = _outcome(future)
     try:
         store.write(run.key, outcome)
     except OSError as error:
@@ -99,7 +100,7 @@ def _keep(run: PlannedRun, future: Future, store: Store, progress: Progress) -> 
     progress(run, outcome)
 
 
-def _outcome(run: PlannedRun, future: Future[Any]) -> Outcome:
+def _outcome(future: Future[Any]) -> Outcome:
     """What a run left; workers that were killed under it leave a row that says so."""
     try:
         outcome = future.result()

@@ -128,8 +128,8 @@ def _combinations(file: SuiteFile, place: Place, grid: dict[str, list[Any]]) -> 
     for name, values in grid.items():
         if not values:
             file.refuse((*place, "grid", name), "has no values; give at least one")
-    for values in itertools.product(*grid.values()):
-        yield dict(zip(grid, values, strict=True))
+    for chosen in itertools.product(*grid.values()):
+        yield dict(zip(grid, chosen, strict=True))
 
 
 def _checked(

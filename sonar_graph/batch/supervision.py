@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import pickle
+import platform
 import signal
 import subprocess
 import sys
@@ -105,7 +106,7 @@ class Runner:
         try:
             self._wait(Limits(START_S))
         except KilledError as error:
-            raise BatchError(f"no process for runs on {os.uname().nodename}: {error}; {self.log()[-2000:]}") from error
+            raise BatchError(f"no process for runs on {platform.node()}: {error}; {self.log()[-2000:]}") from error
         self._is_busy = False
 
     @property
