@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import dask
+import psutil
 from dask.system import CPU_COUNT
 from distributed import Client, Future, LocalCluster, as_completed
 from distributed.client import FutureCancelledError
@@ -24,7 +26,7 @@ from sonar_graph.batch.supervision import perform_watched
 from sonar_graph.errors import BatchError, SonarGraphError
 
 CONNECT_S = 30.0
-CLOSE_S = 2.0
+CLOSE_S = 5.0
 DASK_SETTINGS = {
     "distributed.scheduler.allowed-failures": 1,
     "distributed.worker.memory.target": False,
@@ -77,9 +79,8 @@ def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: W
     if not planned:
         return
     with dask.config.set(DASK_SETTINGS), _quiet(), _client(where, len(planned)) as client:
-        futures = {
-            client.submit(perform_watched, run, limits, key=f"run-{run.key}", pure=False): run for run in planned
-        }
+        submitted = (client.submit(perform_watched, run, limits, key=f"run-{run.key}", pure=False) for run in planned)
+        futures = dict(zip(submitted, planned, strict=True))
         try:
             for future in as_completed(list(futures)):
                 _keep(futures.pop(future), future, store, progress)
@@ -87,8 +88,7 @@ def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: W
         except FutureCancelledError as error:
             raise BatchError(f"the scheduler was lost: {error}") from error
         finally:
-            with contextlib.suppress(Exception):  # the first error is the one to tell
-                client.cancel(list(futures), force=True)
+            _within_seconds(lambda: client.cancel(list(futures), force=True))
 
 
 def _keep(run: PlannedRun, future: Future[Any], store: Store, progress: Progress) -> None:
@@ -123,21 +123,42 @@ def _client(where: Where, tasks: int) -> Iterator[Client]:
         try:
             yield client
         finally:
-            client.close(timeout=CLOSE_S)
+            _within_seconds(client.close)
         return
-    workers = min(where.local_workers, tasks)
-    with (
-        LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            processes=True,
-            memory_limit=None,
-            dashboard_address=None,
-            silence_logs=logging.CRITICAL,
-        ) as cluster,
-        Client(cluster) as client,
-    ):
+    others = _children()
+    cluster = LocalCluster(
+        n_workers=min(where.local_workers, tasks),
+        threads_per_worker=1,
+        processes=True,
+        memory_limit=None,
+        dashboard_address=":0",
+        silence_logs=logging.CRITICAL,
+    )
+    client = Client(cluster)
+    try:
         yield client
+    finally:
+        _within_seconds(client.close)
+        _within_seconds(cluster.close)
+        for process in _children() - others:
+            with contextlib.suppress(psutil.Error):
+                process.kill()
+
+
+def _children() -> set[psutil.Process]:
+    return set(psutil.Process().children(recursive=True))
+
+
+def _within_seconds(end: Callable[[], object]) -> None:
+    """End something that may wait for what is gone; after some seconds it is left to itself."""
+
+    def end_quietly() -> None:
+        with contextlib.suppress(Exception):  # the first error is the one to tell
+            end()
+
+    thread = threading.Thread(target=end_quietly, daemon=True)
+    thread.start()
+    thread.join(CLOSE_S)
 
 
 def _connected(address: str) -> Client:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
-import gc
 import logging
 import os
 import pickle
@@ -41,7 +40,6 @@ def main() -> None:
             _answer(answers, _outcome(run))
         except Exception as error:  # told to who waits for the answer
             _answer(answers, error)
-        gc.collect()
 
 
 def _outcome(run: PlannedRun) -> Outcome:

@@ -68,7 +68,7 @@ class LogEntry(Section):
     name: str = Field(min_length=1)
     """For tables."""
     log: str | None = None
-    """An MCAP file, from the suite's folder on. Its ``options``: calibration, log_config, topics, start, end, salvage."""
+    """An MCAP file, from the suite's folder on, read with `sonar_graph.batch.sources.LogOptions` as its ``options``."""
     dataset: str | None = None
     """Name of a converter of a public data set."""
     generator: str | None = None

@@ -102,7 +102,9 @@ class Runner:
         self._requests: Any = self._process.stdin
         self._answers: SimpleQueue[Any] = SimpleQueue()
         self._is_busy = True
-        threading.Thread(target=_collect, args=(self._process.stdout, self._answers), daemon=True).start()
+        collector_arguments = (self._process.stdout, self._answers)
+        self._collector = threading.Thread(target=_collect, args=collector_arguments, daemon=True)
+        self._collector.start()
         try:
             self._wait(Limits(START_S))
         except KilledError as error:
@@ -149,6 +151,7 @@ class Runner:
         """End the process now."""
         self._process.kill()
         self._process.wait()
+        self._collector.join()
         with contextlib.suppress(OSError):
             self._requests.close()
         self._log.close()
@@ -190,7 +193,7 @@ def _resident_mb(pid: int) -> float:
 
 def _collect(source: BinaryIO, answers: SimpleQueue[Any]) -> None:
     """Put what a process answers into a queue; None at its end."""
-    with contextlib.suppress(EOFError, OSError, pickle.UnpicklingError):
+    with source, contextlib.suppress(EOFError, OSError, pickle.UnpicklingError):
         while True:
             answers.put(pickle.load(source))
     answers.put(None)

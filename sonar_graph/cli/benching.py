@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -78,8 +80,8 @@ def _run(batch: Batch, where: Where, limits: Limits) -> Counter[str]:
         with _shown(batch) as progress:
             return batch.run(where, limits, progress)
     except KeyboardInterrupt:
-        typer.echo(f"sonar-graph: {batch.resuming()}", err=True)
-        raise typer.Exit(INTERRUPTED) from None
+        print(f"sonar-graph: interrupted; {batch.resuming()}", file=sys.stderr, flush=True)
+        os._exit(INTERRUPTED)  # the ordinary way waits for threads, and those for workers that are gone
 
 
 @contextmanager
