@@ -24,6 +24,7 @@ import psutil
 
 from sonar_graph.batch.planned import Limits, Outcome, PlannedRun, Row
 from sonar_graph.errors import BatchError
+from sonar_graph.evaluation.environment import describe_environment
 
 ONE_THREAD = (
     *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"),
@@ -57,10 +58,17 @@ def perform_watched(run: PlannedRun, limits: Limits) -> Outcome:
     for _ in range(ATTEMPTS):
         with _a_runner() as runner:
             try:
-                return runner.perform(run, limits)
+                outcome = runner.perform(run, limits)
+                return replace(outcome, row=_here() | outcome.row)
             except KilledError as error:
                 reason, log = str(error), runner.log()
-    return Outcome({"status": "killed", "reason": f"{reason}, {ATTEMPTS} times"}, log=log)
+    return Outcome({**_here(), "status": "killed", "reason": f"{reason}, {ATTEMPTS} times"}, log=log)
+
+
+def _here() -> Row:
+    """Where a run is done, also for those that cannot tell any more."""
+    environment = describe_environment()
+    return {"python": environment["python"], "machine": environment["machine"]}
 
 
 _idle: list[Runner] = []

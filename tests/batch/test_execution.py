@@ -22,7 +22,13 @@ import pytest
 from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
 
 ROOT = Path(__file__).parents[2]
-MAIN = "from sonar_graph.cli import main; main()"
+MAIN = """
+import signal
+from sonar_graph.cli import main
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # shells let what they start in the background ignore it
+main()
+"""
 pytestmark = pytest.mark.slow
 
 
