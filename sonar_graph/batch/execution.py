@@ -109,7 +109,7 @@ def _outcome(future: Future[Any]) -> Outcome:
         return Outcome({"status": "killed", "reason": reason}, log=f"{reason}\n")
     except SonarGraphError as error:
         raise BatchError(str(error)) from error
-    except OSError as error:
+    except (OSError, ImportError) as error:
         raise BatchError(f"a worker cannot do runs: {error}") from error
     assert isinstance(outcome, Outcome)
     return outcome
