@@ -29,7 +29,7 @@ reference = "isam2"
 [[logs]]
 name = "short basin"
 generator = "basin"
-options = {{ duration_s = 200, laps = 1 }}
+options = {{ duration_s = 300, laps = 1 }}
 seeds = {seeds}
 
 [[estimators]]

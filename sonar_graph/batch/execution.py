@@ -125,7 +125,6 @@ def _client(where: Where, tasks: int) -> Iterator[Client]:
         finally:
             _within_seconds(client.close)
         return
-    others = _children()
     cluster = LocalCluster(
         n_workers=min(where.local_workers, tasks),
         threads_per_worker=1,
@@ -138,15 +137,18 @@ def _client(where: Where, tasks: int) -> Iterator[Client]:
     try:
         yield client
     finally:
+        workers = _worker_processes(cluster)
         _within_seconds(client.close)
         _within_seconds(cluster.close)
-        for process in _children() - others:
+        for process in workers:
             with contextlib.suppress(psutil.Error):
                 process.kill()
 
 
-def _children() -> set[psutil.Process]:
-    return set(psutil.Process().children(recursive=True))
+def _worker_processes(cluster: Any) -> list[psutil.Process]:
+    """The processes of a cluster of this machine; runs' own processes end when these do."""
+    pids = [nanny.pid for nanny in cluster.workers.values() if nanny.pid is not None]
+    return [psutil.Process(pid) for pid in pids if psutil.pid_exists(pid)]
 
 
 def _within_seconds(end: Callable[[], object]) -> None:
