@@ -226,7 +226,10 @@ class Isam2:
     ) -> JointCovariance:
         """Joint covariance of keyframes, by their numbers or stamps, and of landmarks, by their identities.
 
-        Poses between keyframes: `trajectory` has their covariances, one by one.
+        Poses between keyframes: `trajectory` has their covariances, one by one. Cost, with 20 landmarks after 34 minutes:
+        0.1 ms for one variable and 0.6 ms for the newest keyframe with all landmarks over the window; over the history
+        1 s for its solution, once until there are new measurements, then 3 ms for any one variable and 40 ms for fifty
+        keyframes together (docs/theory/isam2.md).
 
         Parameters
         ----------
