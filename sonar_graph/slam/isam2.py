@@ -26,8 +26,10 @@ from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.measurements import Floats, Ints, Measurements
 from sonar_graph.slam.anonymous_landmarks import AnonymousPolicy
 from sonar_graph.slam.asked import Anchored, Asked
+from sonar_graph.slam.hypotheses import RecogniserErrors
 from sonar_graph.slam.joint_covariance import JointCovariance
 from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
+from sonar_graph.slam.mixture import Kernel, Mixture
 from sonar_graph.slam.sightings import SightingPolicy, Sightings
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.slam.uncertainty import Over, joint_covariance
@@ -64,8 +66,22 @@ class Isam2Params(Section):
     """Width of the kernel, in standard deviations."""
     identity_probability: float = Field(0.7, ge=0, le=1)
     """A detection is used when its most probable identity has at least this posterior."""
-    gate_probability: float = Field(1.0, gt=0, le=1)
+    gate_probability: float = Field(0.999, gt=0, le=1)
     """A detection whose squared Mahalanobis innovation exceeds this chi-square quantile (2 dof) is refused; 1: none."""
+
+    identity_policy: Literal["gate", "robust", "max-mixture", "gnc"] = "robust"
+    """What is made of identities that may be wrong. "robust": what is probable enough is believed, and the kernel keeps
+    a wrong one from pulling for long; assumes that most sightings of every landmark are right. "max-mixture": every
+    detection, or track, is of the landmark that its place and the recogniser's posterior together make most probable,
+    or of none, chosen anew as the estimate moves; assumes `wrong_id_probability` of independent errors, and an estimate
+    near enough for the choice (docs/theory/doubtful_identities.md)."""
+    wrong_id_probability: float = Field(0.05, gt=0, lt=1)
+    """Probability that what the recogniser says has nothing to do with what was seen, beside what its posterior admits.
+    The mixture's other landmarks share one half of it, no landmark has the other."""
+    view_range_m: float = Field(10.0, gt=0)
+    """Detections of no landmark are spread evenly over so much range."""
+    view_azimuth_rad: float = Field(2.0, gt=0)
+    """The same of azimuth."""
 
     deferred_identity: bool = True
     """Detections of one track wait until its identity is known, and are moved when it turns out to be another. Has no
@@ -85,6 +101,13 @@ class Isam2Params(Section):
     """So many sightings of what is paired with no landmark begin one."""
     unknown_wait_s: float = Field(10.0, gt=0)
     """So long, and no longer than ``lag_s``, a sighting waits for them."""
+
+    def mixture(self) -> Mixture | None:
+        """What detections may be of; None: the recogniser is believed, or not."""
+        if self.identity_policy in ("gate", "robust"):
+            return None
+        errors = RecogniserErrors(self.wrong_id_probability, self.view_range_m, self.view_azimuth_rad)
+        return Mixture(errors, Kernel(self.kernel, self.kernel_width))
 
     def anonymous(self) -> AnonymousPolicy | None:
         """What is believed of landmarks without identities; None: their detections are refused."""
@@ -124,11 +147,13 @@ class Isam2:
         self._keyframes = Keyframes(calibration, policy, self._smoother)
         sightings = SightingPolicy(
             p.identity_probability,
-            p.gate_probability,
+            p.gate_probability if p.identity_policy == "gate" else 1.0,
             p.kernel,
             p.kernel_width,
             p.deferred_identity,
             p.longest_wait_s,
+            p.mixture(),
+            p.identity_policy == "gnc",
             p.anonymous(),
         )
         self._sightings = Sightings(calibration, sightings, self._smoother, self._keyframes)
@@ -226,8 +251,8 @@ class Isam2:
     ) -> JointCovariance:
         """Joint covariance of keyframes, by their numbers or stamps, and of landmarks, by their identities.
 
-        Poses between keyframes: `trajectory` has their covariances, one by one. Cost, with 20 landmarks after 34 minutes:
-        0.1 ms for one variable and 0.6 ms for the newest keyframe with all landmarks over the window; over the history
+        Poses between keyframes: `trajectory` has their covariances, one by one. Cost, with 20 landmarks after 34
+        minutes: 0.1 ms for one variable and 0.6 ms for the newest keyframe with all landmarks over the window; over the history
         1 s for its solution, once until there are new measurements, then 3 ms for any one variable and 40 ms for fifty
         keyframes together (docs/theory/isam2.md).
 
@@ -257,10 +282,12 @@ class Isam2:
         Solves the whole graph. Between keyframes the pose of the keyframe before is carried on by its own odometry.
         With a bounded history that is the graph of the window; poses before it are as they were when they left.
         """
+        self._sightings.settle()
         return self._asked.trajectory(*self._smoother.solve_history())
 
     def landmarks(self) -> LandmarkMap:
         """Landmarks by identity after solving the whole graph, with marginal covariances."""
+        self._sightings.settle()
         values, marginals = self._smoother.solve_history()
         ids = sorted(self._sightings.ids)
         return LandmarkMap(

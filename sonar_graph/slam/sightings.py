@@ -15,10 +15,13 @@ from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.slam.anonymous_landmarks import AnonymousLandmarks, AnonymousPolicy, unnamed
 from sonar_graph.slam.association import DetectionJournal, Identities, gate_threshold, identify
 from sonar_graph.slam.deferred_identities import DeferredIdentities
+from sonar_graph.slam.doubtful_identities import DoubtfulIdentities
 from sonar_graph.slam.factors import Robust
+from sonar_graph.slam.hypotheses import Statement
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmark_sightings import LandmarkSightings
 from sonar_graph.slam.late_gate import LateGate
+from sonar_graph.slam.mixture import Mixture
 from sonar_graph.slam.models import FLOOR_GATE, locate
 from sonar_graph.slam.sighting import Sighting, SightingFactors
 from sonar_graph.slam.sightlines import Sightline
@@ -41,6 +44,10 @@ class SightingPolicy:
     """Whether detections of tracks are used once their identity is known, and moved when it turns out to be another."""
     longest_wait_s: float = 60.0
     """How long they wait for it."""
+    mixture: Mixture | None = None
+    """What detections may be of, chosen by where they are; None: the recogniser is believed, or not."""
+    is_graduated: bool = False
+    """Whether that is also sought by graduated non-convexity in the whole history."""
     anonymous: AnonymousPolicy | None = None
     """What is believed of landmarks without identities; None: their detections are refused."""
 
@@ -95,6 +102,10 @@ class Sightings:
         self._deferred = DeferredIdentities(
             self._landmarks, self.smoother, self.journal, gate, self.policy.longest_wait_s
         )
+        mixture = self.policy.mixture
+        parts = self._landmarks, self.smoother, self._factors, self.journal
+        graduated = self.policy.is_graduated
+        self._doubtful = DoubtfulIdentities(*parts, mixture, is_graduated=graduated) if mixture else None
         anonymous = self.policy.anonymous
         self._anonymous = (
             AnonymousLandmarks(self._landmarks, self.smoother, self._factors, self.journal, anonymous)
@@ -128,6 +139,9 @@ class Sightings:
             return
         identities = identify(frame, self.policy.identity_probability)
         is_unnamed = unnamed(frame) & (self._anonymous is not None)
+        if self._doubtful is not None:
+            self._doubt(self._doubtful, stamp_ns, frame)
+            return
         is_tracked = (frame.track != NO_TRACK) & self.policy.deferred_identity & ~is_unnamed
         if is_tracked.any():
             self.keyframes.update_if_due()
@@ -148,6 +162,30 @@ class Sightings:
                 verdict.sighting.row = number
                 if is_tracked[row]:
                     self._deferred.remember(track, verdict.sighting)
+
+    def settle(self) -> None:
+        """Make doubtful identities those that fit the whole history best."""
+        if self._doubtful is not None and self.keyframes.newest_ns is not None:
+            self._doubtful.settle(self.keyframes.newest_s)
+
+    def _doubt(self, doubtful: DoubtfulIdentities, stamp_ns: int, frame: LandmarkDetections) -> None:
+        """Take in a frame whose identities are weighed against where its detections are."""
+        self.keyframes.update_if_due()
+        rows = range(len(frame))
+        statements, tracks = [Statement.of(frame, row) for row in rows], frame.track.tolist()
+        seen = self._seen(frame, identify(frame, 0.0), [True] * len(frame), list(rows))
+        motion = self.keyframes.motion_since_newest(stamp_ns)
+        view = self._view(motion, doubtful.keys)
+        chosen = doubtful.chosen_at_first(view, statements, tracks, seen.z, seen.cov)
+        motion = self.keyframes.set_for_frame(stamp_ns, motion)
+        tie = Tie.between(motion, self.keyframes.newest_key, self._body_T_sonar, stamp_ns)
+        sightings = self._sightings(view, tie, seen, np.zeros((len(frame), 3)))
+        doubtful.enter(statements, tracks, sightings, chosen)
+        for row, sighting in enumerate(sightings):
+            said = statements[row].favourite
+            sighting.row = self.journal.record(stamp_ns, -1 if said is None else said, sighting.outcome)
+        self.keyframes.update_if_due()
+        doubtful.reconsider(self.keyframes.newest_s)
 
     def forget(self) -> None:
         """Let go of sightings that have waited too long for their identity."""

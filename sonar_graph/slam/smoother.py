@@ -33,7 +33,7 @@ from sonar_graph.measurements import Floats
 from sonar_graph.slam.batch import marginals_of
 from sonar_graph.slam.determinacy import variable_name
 from sonar_graph.slam.exchange import Exchange
-from sonar_graph.slam.history import History, Recent
+from sonar_graph.slam.history import History, Recent, rest_of
 from sonar_graph.slam.joint_covariance import JointCovariance
 from sonar_graph.slam.new_window import copy, joined, keys_of, marginal, picked, split, without
 from sonar_graph.slam.pending import Pending
@@ -198,7 +198,7 @@ class Smoother:
             self._restart(time_s)
         else:
             self._update(time_s, self._window.lag_s, slots)
-            self._settle(time_s)
+            self.settle(time_s)
         return handles
 
     def _exchange_lag_s(self, time_s: float) -> float:
@@ -215,7 +215,12 @@ class Smoother:
             self._landmarks.remove(key)
             self.values.erase(key)
 
-    def _settle(self, time_s: float) -> None:
+    def graph_without(self, handles: set[int]) -> gtsam.NonlinearFactorGraph:
+        """Every factor of the run but some."""
+        return rest_of(self._history, handles)
+
+    def settle(self, time_s: float) -> None:
+        """Gauss-Newton steps until nothing would be relinearised any more, ten at most."""
         try:
             self._window.settle()
         except RuntimeError:

@@ -1,0 +1,237 @@
+"""Which landmark each watch shows, chosen and chosen again as the estimate moves: the max-mixture, incrementally.
+
+A watch is all sightings of one track, or one sighting of no track. Its chosen component has its factors in the graph,
+the others have none; a Gauss-Newton step of that graph is one of the max-mixture (`sonar_graph.slam.mixture`). After
+every update the choices of the window are made anew from where the estimate has moved, until none changes.
+
+When a detection comes, the state is not yet conditioned on it. It is then weighed by its predictive density, with the
+covariance ``S = H P H' + R`` of what was expected: a vehicle that has drifted must not mistake its landmarks for none.
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L
+
+from sonar_graph.measurements import NO_TRACK, Floats
+from sonar_graph.slam.association import DetectionJournal
+from sonar_graph.slam.hypotheses import Statement
+from sonar_graph.slam.landmark_sightings import LandmarkSightings
+from sonar_graph.slam.late_gate import STILL
+from sonar_graph.slam.misplaced_landmarks import supporters_elsewhere
+from sonar_graph.slam.mixture import Choices, Mixture, Watch, each_once
+from sonar_graph.slam.rival_history import RivalHistory
+from sonar_graph.slam.sighting import Sighting, SightingFactors
+from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.view import View
+from sonar_graph.states import Outcome
+
+MOST_ROUNDS = 3
+"""Times that choices are made anew after one update."""
+MOST_OPEN = 200
+"""Newest watches that are chosen anew."""
+LEAST_GAIN = 1e-3
+"""Of the cost, for another solution of the history to be taken."""
+MOST_ROUNDS_OF_HISTORY = 10
+"""The same before the history's solution is final."""
+
+
+class DoubtfulIdentities:
+    """Keeps the graph in line with the best component of every watch.
+
+    Parameters
+    ----------
+    landmarks, smoother
+        The graph.
+    maker
+        Makes factors.
+    journal
+        Its rows are amended when choices change.
+    mixture
+        What watches may be of, and how probable that is.
+    is_graduated
+        Whether the choices of the history are also sought by graduated non-convexity.
+    """
+
+    def __init__(
+        self,
+        landmarks: LandmarkSightings,
+        smoother: Smoother,
+        maker: SightingFactors,
+        journal: DetectionJournal,
+        mixture: Mixture,
+        *,
+        is_graduated: bool = False,
+    ) -> None:
+        self._landmarks = landmarks
+        self._smoother = smoother
+        self._maker = maker
+        self._journal = journal
+        self._mixture = mixture
+        self._is_graduated = is_graduated
+        self._tracks: dict[int, Watch] = {}
+        self._disputed: set[int] = set()
+        self._settled: gtsam.Values | None = None
+        self.watches: list[Watch] = []
+        """All so far, in the order in which they began."""
+
+    @property
+    def keys(self) -> list[int]:
+        """Of the landmarks that anything may be of."""
+        return [L(i) for i in sorted(self._landmarks.ids)]
+
+    def chosen_at_first(
+        self, view: View, statements: list[Statement], tracks: list[int], z: Floats, noise: Floats
+    ) -> list[int | None]:
+        """Of which landmark each detection of a frame is; a track's is what the track is of, if it is of any.
+
+        Parameters
+        ----------
+        z, noise
+            Range (m) and azimuth (rad), shape (m, 2), and their covariance, shape (m, 2, 2).
+        """
+        ids = sorted(self._landmarks.ids)
+        points = np.array([self._smoother.values.atPoint3(L(i)) for i in ids]).reshape(-1, 3)
+        expected, cov = view.expect(self.keys, points)
+        scores = [
+            self._mixture.at_first(statement, ids, z[row], expected, cov + noise[row])
+            for row, statement in enumerate(statements)
+        ]
+        for row, track in enumerate(tracks):
+            watch = self._tracks.get(track) if track != NO_TRACK else None
+            if watch is not None and watch.landmark_id is not None:
+                scores[row] = {watch.landmark_id: np.inf}
+        return each_once(scores, [{0}] * len(scores))
+
+    def enter(
+        self, statements: list[Statement], tracks: list[int], sightings: list[Sighting], chosen: list[int | None]
+    ) -> None:
+        """Put a frame's sightings into the graph as they were chosen."""
+        for statement, track, sighting, landmark_id in zip(statements, tracks, sightings, chosen, strict=True):
+            self._watch_of(track, statement).sightings.append(sighting)
+            if landmark_id != statement.favourite and statement.favourite is not None:
+                self._disputed.add(statement.favourite)
+            if landmark_id is None:
+                sighting.outcome = Outcome.UNFIT
+                continue
+            is_first = landmark_id not in self._landmarks
+            sighting.outcome = Outcome.NEW if is_first else Outcome.USED
+            if is_first:
+                self._smoother.add_landmark(L(landmark_id), self._maker.place(sighting, self._smoother.values))
+            made = self._maker.make(sighting, L(landmark_id), is_first=is_first)
+            self._landmarks.enter(sighting, landmark_id, self._smoother.add(made))
+
+    def _watch_of(self, track: int, statement: Statement) -> Watch:
+        watch = self._tracks.get(track) if track != NO_TRACK else None
+        if watch is None:
+            watch = Watch(statement)
+            self.watches.append(watch)
+            if track != NO_TRACK:
+                self._tracks[track] = watch
+        watch.statement = statement
+        return watch
+
+    def reconsider(self, time_s: float) -> None:
+        """Choose anew in the window until nothing changes."""
+        watches = self._open()
+        if self._changes(watches, self._smoother.values):
+            self._smoother.flush(time_s)
+            self._smoother.settle(time_s)  # a step of a robust kernel may end far from where the choices are to be made
+        for _ in range(MOST_ROUNDS):
+            changes = [
+                (watch, new)
+                for watch, new in self._changes(watches, self._smoother.values)
+                if watch.landmark_id is None or self._is_preferred(new, watch)
+            ]
+            if not changes:
+                break
+            self._change(changes, time_s)
+        self._relocate(self._smoother.values, time_s)
+
+    def settle(self, time_s: float) -> None:
+        """Choose anew in the whole history until nothing changes."""
+        for _ in range(MOST_ROUNDS_OF_HISTORY):
+            values, _ = self._smoother.solve_history()
+            if values is self._settled:
+                break
+            self._disputed |= self._landmarks.ids
+            if not self._improve(self.watches, values, time_s) and not self._relocate(values, time_s):
+                self._settled = values if not self._is_graduated or not self._graduate(values, time_s) else None
+
+    def _graduate(self, values: gtsam.Values, time_s: float) -> bool:
+        """Take what graduated non-convexity finds, if that costs less; whether it did."""
+        present = [watch.landmark_id for watch in self.watches]
+        handles = {handle for watch in self.watches for s in watch.sightings for handle in s.handles}
+        rival = RivalHistory(self._smoother.graph_without(handles), self.watches, self._mixture, self._maker)
+        found, choices = rival.graduated(values)
+        if rival.cost(found, choices) >= rival.cost(values, present) - LEAST_GAIN:
+            return False
+        self._smoother.values.update(found)
+        self._change(_differing(self.watches, choices), time_s)
+        return True
+
+    def _improve(self, watches: list[Watch], values: gtsam.Values, time_s: float) -> bool:
+        changes = self._changes(watches, values)
+        if changes:
+            self._change(changes, time_s)
+        return bool(changes)
+
+    def _changes(self, watches: list[Watch], values: gtsam.Values) -> list[tuple[Watch, int | None]]:
+        best = self._mixture.best(watches, values, [watch.landmark_id for watch in watches], self._landmarks.sizes())
+        return _differing(watches, best)
+
+    def _open(self) -> list[Watch]:
+        """Watches whose sightings are all in the window; not those that alone hold a landmark, which suits them."""
+        recent, sizes = self.watches[-MOST_OPEN:], self._landmarks.sizes()
+        inside = set(self._smoother.in_window(sorted({s.line.pose_key for w in recent for s in w.sightings})))
+        return [
+            watch
+            for watch in recent
+            if (watch.landmark_id is None or sizes[watch.landmark_id] > len(watch.sightings))
+            and all(s.line.pose_key in inside for s in watch.sightings)
+        ]
+
+    def _is_preferred(self, new: int | None, watch: Watch) -> bool:
+        """Whether the predictive density of a watch's newest sighting, too, is for another component than the present.
+
+        Where the estimate is uncertain, as when a loop closes, a misfit is not yet one of the identity. A robust kernel
+        may leave it there for some updates.
+        """
+        sighting, values = watch.sightings[-1], self._smoother.values
+        ids = [i for i in (watch.landmark_id, new) if i is not None]
+        line, keys = sighting.line, [L(i) for i in ids]
+        joint = self._smoother.joint_covariance_of_any([line.pose_key, *keys])
+        view = View(line.pose_key, None, values.atPose3(line.pose_key), STILL, line.body_T_sonar, joint)
+        expected, cov = view.expect(keys, np.array([values.atPoint3(key) for key in keys]))
+        scores = self._mixture.at_first(watch.statement, ids, line.z, expected, cov + sighting.noise)
+        return scores[new] > scores[watch.landmark_id]
+
+    def _relocate(self, values: gtsam.Values, time_s: float) -> bool:
+        moved = False
+        for landmark_id in sorted(self._disputed & self._landmarks.ids):
+            naming = [watch for watch in self.watches if watch.statement.favourite == landmark_id]
+            found = supporters_elsewhere(landmark_id, naming, values, self._mixture)
+            if found is not None:
+                moved = True
+                present = [w for w in self.watches if w.landmark_id == landmark_id]
+                self._change([(w, None) for w in present], time_s)
+                self._change([(w, landmark_id) for w in found], time_s)
+        self._disputed.clear()
+        return moved
+
+    def _change(self, changes: list[tuple[Watch, int | None]], time_s: float) -> None:
+        leaving = [s for watch, _ in changes for s in watch.sightings if s.landmark_id is not None]
+        coming = [(s, new) for watch, new in changes if new is not None for s in watch.sightings]
+        self._landmarks.exchange(leaving, coming, time_s)
+        for watch, new in changes:
+            said = watch.statement.favourite
+            if said is not None and new != said:
+                self._disputed.add(said)
+            for sighting in watch.sightings:
+                sighting.outcome = Outcome.UNFIT if new is None else Outcome.MOVED
+                self._journal.amend(sighting.row, sighting.outcome, new)
+
+
+def _differing(watches: list[Watch], choices: Choices) -> list[tuple[Watch, int | None]]:
+    return [(watch, new) for watch, new in zip(watches, choices, strict=True) if new != watch.landmark_id]
