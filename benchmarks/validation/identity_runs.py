@@ -22,7 +22,7 @@ ESTIMATORS: dict[str, tuple[str, dict[str, Any]]] = {
     "dead reckoning": ("dead-reckoning", {}),
     "EKF-SLAM": ("ekf-slam", {}),
     "invariant EKF": ("invariant-ekf", {}),
-    "iSAM2, gate": ("isam2", {"deferred_identity": False, "kernel": "none", "gate_probability": 0.99}),
+    "iSAM2, gate": ("isam2", {"deferred_identity": False, "kernel": "none", "identity_policy": "gate"}),
     "iSAM2, robust": ("isam2", {"deferred_identity": False}),
     "iSAM2, deferred": ("isam2", {}),
 }

@@ -14,12 +14,12 @@ time of the frame. Keyframes can then be sparser than frames at no loss but the 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import CalibrationError, EstimatorError
@@ -67,14 +67,23 @@ class Isam2Params(Section):
     identity_probability: float = Field(0.7, ge=0, le=1)
     """A detection is used when its most probable identity has at least this posterior."""
     gate_probability: float = Field(0.999, gt=0, le=1)
-    """A detection whose squared Mahalanobis innovation exceeds this chi-square quantile (2 dof) is refused; 1: none."""
+    """With `identity_policy` "gate": a detection whose squared Mahalanobis innovation exceeds this chi-square quantile
+    (2 dof) is refused; 1: none."""
 
     identity_policy: Literal["gate", "robust", "max-mixture", "gnc"] = "robust"
-    """What is made of identities that may be wrong. "robust": what is probable enough is believed, and the kernel keeps
-    a wrong one from pulling for long; assumes that most sightings of every landmark are right. "max-mixture": every
-    detection, or track, is of the landmark that its place and the recogniser's posterior together make most probable,
-    or of none, chosen anew as the estimate moves; assumes `wrong_id_probability` of independent errors, and an estimate
-    near enough for the choice (docs/theory/doubtful_identities.md)."""
+    """What is made of identities that may be wrong (docs/theory/doubtful_identities.md).
+
+    "gate": what is probable enough is believed, if it lies where that landmark is expected (`gate_probability`).
+    Assumes that the estimate and its covariance are right when a detection comes; nothing is taken back.
+    "robust": what is probable enough is believed. Assumes that most sightings of every landmark are right, and that
+    wrong ones disagree with each other: the kernel then lets the majority win.
+    "max-mixture": a detection, or a track, is of the landmark that its place and its posterior together make most
+    probable, or of none; chosen anew in the window as the estimate moves, in the whole history for smoothed results.
+    Assumes `wrong_id_probability`, errors that are independent, and an estimate that is near when it chooses.
+    "gnc": the same, and smoothed results also try what graduated non-convexity finds in the whole history, which needs
+    no near estimate; assumes that most of what the recogniser says is right.
+
+    `kernel` is the shape of the noise under all of them."""
     wrong_id_probability: float = Field(0.05, gt=0, lt=1)
     """Probability that what the recogniser says has nothing to do with what was seen, beside what its posterior admits.
     The mixture's other landmarks share one half of it, no landmark has the other."""
@@ -101,6 +110,14 @@ class Isam2Params(Section):
     """So many sightings of what is paired with no landmark begin one."""
     unknown_wait_s: float = Field(10.0, gt=0)
     """So long, and no longer than ``lag_s``, a sighting waits for them."""
+
+    @model_validator(mode="after")
+    def _check_gate(self) -> Self:
+        if self.gate_probability < 1 and "gate_probability" in self.model_fields_set and self.identity_policy != "gate":
+            raise ValueError(
+                f'gate_probability is of no effect with "{self.identity_policy}": set identity_policy = "gate"'
+            )
+        return self
 
     def mixture(self) -> Mixture | None:
         """What detections may be of; None: the recogniser is believed, or not."""
@@ -252,9 +269,9 @@ class Isam2:
         """Joint covariance of keyframes, by their numbers or stamps, and of landmarks, by their identities.
 
         Poses between keyframes: `trajectory` has their covariances, one by one. Cost, with 20 landmarks after 34
-        minutes: 0.1 ms for one variable and 0.6 ms for the newest keyframe with all landmarks over the window; over the history
-        1 s for its solution, once until there are new measurements, then 3 ms for any one variable and 40 ms for fifty
-        keyframes together (docs/theory/isam2.md).
+        minutes: 0.1 ms for one variable and 0.6 ms for the newest keyframe with all landmarks over the window; over the
+        history 1 s for its solution, once until there are new measurements, then 3 ms for any one variable and 40 ms
+        for fifty keyframes together (docs/theory/isam2.md).
 
         Parameters
         ----------
