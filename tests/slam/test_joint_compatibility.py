@@ -149,6 +149,16 @@ def test_two_that_share_a_wide_error_support_each_other():
     assert believed(case, Pairing((0, UNPAIRED), 0.0), rival).size == 0
 
 
+def test_two_that_fit_each_other_but_may_be_anywhere_say_nothing():
+    """Each given the other is denser than a rival of 3 a unit; where both are together is not."""
+    case, both = shifted(), Pairing((0, 1), 0.0)
+    e, C = case.of(both.landmarks)
+    together = multivariate_normal.logpdf(e, cov=C)
+    given_the_other = together - multivariate_normal.logpdf(e[2:], cov=C[2:, 2:])
+    assert given_the_other > np.log(3.0) > together / 2
+    assert believed(case, both, np.log(np.full(2, 3.0))).size == 0
+
+
 def test_a_pair_that_the_others_speak_against_is_dropped():
     """The third lies where the common error of the first two does not let it be."""
     expected = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
