@@ -13,6 +13,7 @@ time of the frame. Keyframes can then be sparser than frames at no loss but the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any, ClassVar, Literal, Self
 
@@ -24,6 +25,7 @@ from pydantic import Field, model_validator
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.measurements import Floats, Ints, Measurements
+from sonar_graph.sequence import NS_PER_S
 from sonar_graph.slam.anonymous_landmarks import AnonymousPolicy
 from sonar_graph.slam.asked import Anchored, Asked
 from sonar_graph.slam.hypotheses import RecogniserErrors
@@ -45,6 +47,9 @@ class Isam2Params(Section):
     """What is kept of poses older than the lag. "whole": everything, for the batch solution in `Isam2.trajectory`.
     "bounded": nothing but what they say of landmarks and bias, so that time and memory do not grow with the run;
     `Isam2.trajectory` is then what the lag allowed (docs/theory/bounded_memory.md)."""
+    remembered_s: float | None = Field(None, gt=0)
+    """With a bounded history: `Isam2.trajectory` and `Isam2.detections` forget what is older than this (and up to a
+    quarter more); None: nothing."""
     max_keyframe_interval_s: float = Field(5.0, gt=0)
     """A keyframe is set at the latest after this time."""
     motion_noise_share: float = Field(0.1, ge=0)
@@ -175,6 +180,7 @@ class Isam2:
         )
         self._sightings = Sightings(calibration, sightings, self._smoother, self._keyframes)
         self._asked = Asked()
+        self._forgot_s = -math.inf
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -221,6 +227,15 @@ class Isam2:
         """Variables leave a bounded window."""
         self._asked.leave(keys, self._smoother.values, self._smoother.marginals)
         self._sightings.leave(keys)
+        self._forget(self._keyframes.newest_s)
+
+    def _forget(self, now_s: float) -> None:
+        """Drop what need not be remembered, a good deal at a time."""
+        remembered_s = self._params.remembered_s
+        if remembered_s is not None and now_s - self._forgot_s > remembered_s / 4:
+            self._forgot_s, oldest_ns = now_s, round((now_s - remembered_s) * NS_PER_S)
+            self._asked.forget_before(oldest_ns)
+            self._sightings.journal.forget_before(oldest_ns)
 
     def _refuse(self, measurements: Measurements) -> None:
         """Time does not go back: take the rows that are still new, refuse the detections, estimate nothing."""
