@@ -24,6 +24,7 @@ from sonar_graph.slam.mixture import Choices, Mixture, Watch, each_once
 from sonar_graph.slam.rival_history import RivalHistory
 from sonar_graph.slam.sighting import Sighting, SightingFactors
 from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.tracks import NS_PER_S
 from sonar_graph.slam.view import View
 from sonar_graph.states import Outcome
 
@@ -50,6 +51,8 @@ class DoubtfulIdentities:
         Its rows are amended when choices change.
     mixture
         What watches may be of, and how probable that is.
+    longest_wait_s
+        A track's sightings wait at most so long in the window; a track that was not seen for so long is over.
     is_graduated
         Whether the choices of the history are also sought by graduated non-convexity.
     """
@@ -61,6 +64,7 @@ class DoubtfulIdentities:
         maker: SightingFactors,
         journal: DetectionJournal,
         mixture: Mixture,
+        longest_wait_s: float,
         *,
         is_graduated: bool = False,
     ) -> None:
@@ -69,6 +73,7 @@ class DoubtfulIdentities:
         self._maker = maker
         self._journal = journal
         self._mixture = mixture
+        self._longest_wait_ns = round(longest_wait_s * NS_PER_S)
         self._is_graduated = is_graduated
         self._tracks: dict[int, Watch] = {}
         self._disputed: set[int] = set()
@@ -105,11 +110,19 @@ class DoubtfulIdentities:
         return each_once(scores, [{0}] * len(scores))
 
     def enter(
-        self, statements: list[Statement], tracks: list[int], sightings: list[Sighting], chosen: list[int | None]
+        self,
+        statements: list[Statement],
+        tracks: list[int],
+        sightings: list[Sighting],
+        chosen: list[int | None],
+        time_s: float,
     ) -> None:
-        """Put a frame's sightings into the graph as they were chosen."""
+        """Put a frame's sightings into the graph as they were chosen, and what waited in their tracks."""
+        late: list[tuple[Sighting, int]] = []
         for statement, track, sighting, landmark_id in zip(statements, tracks, sightings, chosen, strict=True):
-            self._watch_of(track, statement).sightings.append(sighting)
+            watch = self._watch_of(track, statement)
+            waiting = [s for s in watch.sightings if s.outcome is Outcome.UNFIT] if track != NO_TRACK else []
+            watch.sightings.append(sighting)
             if landmark_id != statement.favourite and statement.favourite is not None:
                 self._disputed.add(statement.favourite)
             if landmark_id is None:
@@ -121,6 +134,28 @@ class DoubtfulIdentities:
                 self._smoother.add_landmark(L(landmark_id), self._maker.place(sighting, self._smoother.values))
             made = self._maker.make(sighting, L(landmark_id), is_first=is_first)
             self._landmarks.enter(sighting, landmark_id, self._smoother.add(made))
+            taken_ns = self._landmarks.stamps_ns(landmark_id)
+            late += [(s, landmark_id) for s in waiting if s.stamp_ns not in taken_ns]
+        if late:
+            self._landmarks.exchange([], late, time_s)
+        for sighting, landmark_id in late:
+            sighting.outcome = Outcome.USED_LATER
+            self._journal.amend(sighting.row, sighting.outcome, landmark_id)
+        self._hold(sightings[0].stamp_ns)
+
+    def _hold(self, now_ns: int) -> None:
+        """Keep keyframes on which sightings of tracks wait in the window, and let go of tracks that are over."""
+        oldest_ns = now_ns - self._longest_wait_ns
+        self._tracks = {k: watch for k, watch in self._tracks.items() if watch.sightings[-1].stamp_ns >= oldest_ns}
+        self._smoother.hold(
+            {
+                sighting.line.pose_key: (sighting.stamp_ns + self._longest_wait_ns) / NS_PER_S
+                for watch in self._tracks.values()
+                if watch.landmark_id is None
+                for sighting in watch.sightings
+                if sighting.stamp_ns >= oldest_ns
+            }
+        )
 
     def _watch_of(self, track: int, statement: Statement) -> Watch:
         watch = self._tracks.get(track) if track != NO_TRACK else None
@@ -190,7 +225,11 @@ class DoubtfulIdentities:
             for watch in recent
             if (watch.landmark_id is None or sizes[watch.landmark_id] > len(watch.sightings))
             and all(s.line.pose_key in inside for s in watch.sightings)
-        ]
+        ] + [watch for watch in self._contradicted() if any(s.line.pose_key not in inside for s in watch.sightings)]
+
+    def _contradicted(self) -> list[Watch]:
+        """Watches of tracks of which something else was said since they were chosen."""
+        return [watch for watch in self._tracks.values() if watch.landmark_id not in (None, watch.statement.favourite)]
 
     def _is_preferred(self, new: int | None, watch: Watch) -> bool:
         """Whether the predictive density of a watch's newest sighting, too, is for another component than the present.

@@ -30,6 +30,8 @@ from sonar_graph.slam.sighting import Sighting
 
 LEAST_TRUNCATION = 1.0
 """Of the squared error, where even a perfect fit is less probable than none."""
+REPEATED_LOSS = 3.0
+"""Mean loss, twice or thrice what noise alone gives, to which sightings of one thing that stands still agree."""
 KernelName = Literal["none", "huber", "cauchy"]
 
 
@@ -163,9 +165,8 @@ class Mixture:
     def gains(self, landmark_id: int, watches: list[Watch], points: Floats, values: gtsam.Values) -> Floats:
         """Component of a landmark at each of k points, minus that of no landmark, for n watches, shape (n, k)."""
         fits = self._fits(watches, points, values)
-        sizes = np.array([len(watch.sightings) for watch in watches])
         weights = np.array([watch.statement.log_weights([landmark_id], self._errors) for watch in watches])
-        return np.asarray(fits - (sizes * self._errors.log_density)[:, None] + (weights[:, 0] - weights[:, 1])[:, None])
+        return np.asarray(fits - self._unplaced(watches)[:, None] + (weights[:, 0] - weights[:, 1])[:, None])
 
     def squared_errors(self, watches: list[Watch], ids: list[int], values: gtsam.Values) -> Floats:
         """Of each watch, all its sightings together, were it of the landmark given, shape (n,)."""
@@ -179,13 +180,26 @@ class Mixture:
 
     def truncations(self, watches: list[Watch]) -> Floats:
         """Squared error at which each watch is as probably of no landmark as of the one it names, shape (n,)."""
-        c2 = []
-        for watch in watches:
-            noise = np.array([sighting.noise for sighting in watch.sightings])
-            peak = (self._log_peak - 0.5 * np.linalg.slogdet(noise)[1]).sum()
-            named, none = watch.statement.log_weights([watch.statement.favourite or 0], self._errors)
-            c2.append(2.0 * (peak + named - none - len(watch.sightings) * self._errors.log_density))
-        return np.maximum(np.array(c2), LEAST_TRUNCATION)
+        weights = [w.statement.log_weights([w.statement.favourite or 0], self._errors) for w in watches]
+        gains = np.array(
+            [self._peaks(w).sum() + named - none for w, (named, none) in zip(watches, weights, strict=True)]
+        )
+        return np.maximum(2.0 * (gains - self._unplaced(watches)), LEAST_TRUNCATION)
+
+    def _peaks(self, watch: Watch) -> Floats:
+        """Log density of each sighting where it fits perfectly, shape (n,)."""
+        noise = np.array([sighting.noise for sighting in watch.sightings])
+        return np.asarray(self._log_peak - 0.5 * np.linalg.slogdet(noise)[1])
+
+    def _unplaced(self, watches: list[Watch]) -> Floats:
+        """Log densities of watches of something whose place is not known, shape (n,).
+
+        The first sighting may be anywhere. It tells where the others are: not better than a landmark would, which they
+        fit to `REPEATED_LOSS`. Taken as anywhere themselves, many sightings of an unknown object would prove it to be
+        the landmark that is least far.
+        """
+        u = self._errors.log_density
+        return np.array([u + np.maximum(self._peaks(w)[1:] - REPEATED_LOSS, u).sum() for w in watches])
 
     def _fits(self, watches: list[Watch], points: Floats, values: gtsam.Values) -> Floats:
         """Log densities of watches, for landmarks at points of the world, shape (n, k)."""
@@ -208,14 +222,14 @@ class Mixture:
         sizes
             Number of sightings of each landmark of the graph.
         """
-        ids = sorted(sizes)
+        ids, unplaced = sorted(sizes), self._unplaced(watches)
         points = np.array([values.atPoint3(L(i)) for i in ids]).reshape(-1, 3)
         totals = np.zeros((len(watches), len(ids) + 1))
         totals[:, :-1] = self._fits(watches, points, values)
         for row, (watch, choice) in enumerate(zip(watches, choices, strict=True)):
-            totals[row, -1] = nowhere = self._errors.log_density * len(watch.sightings)
+            totals[row, -1] = unplaced[row]
             if choice is not None and sizes[choice] == len(watch.sightings):
-                totals[row, ids.index(choice)] = nowhere
+                totals[row, ids.index(choice)] = unplaced[row]
             totals[row] += watch.statement.log_weights(ids, self._errors)
         return [dict(zip([*ids, None], row, strict=True)) for row in totals.tolist()]
 

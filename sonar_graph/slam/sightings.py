@@ -105,7 +105,9 @@ class Sightings:
         mixture = self.policy.mixture
         parts = self._landmarks, self.smoother, self._factors, self.journal
         graduated = self.policy.is_graduated
-        self._doubtful = DoubtfulIdentities(*parts, mixture, is_graduated=graduated) if mixture else None
+        self._doubtful = (
+            DoubtfulIdentities(*parts, mixture, self.policy.longest_wait_s, is_graduated=graduated) if mixture else None
+        )
         anonymous = self.policy.anonymous
         self._anonymous = (
             AnonymousLandmarks(self._landmarks, self.smoother, self._factors, self.journal, anonymous)
@@ -180,7 +182,7 @@ class Sightings:
         motion = self.keyframes.set_for_frame(stamp_ns, motion)
         tie = Tie.between(motion, self.keyframes.newest_key, self._body_T_sonar, stamp_ns)
         sightings = self._sightings(view, tie, seen, np.zeros((len(frame), 3)))
-        doubtful.enter(statements, tracks, sightings, chosen)
+        doubtful.enter(statements, tracks, sightings, chosen, self.keyframes.newest_s)
         for row, sighting in enumerate(sightings):
             said = statements[row].favourite
             sighting.row = self.journal.record(stamp_ns, -1 if said is None else said, sighting.outcome)
