@@ -250,3 +250,11 @@ def test_every_script_is_listed() -> None:
         for script in (BENCHMARKS / folder).glob("*.py"):
             if "__main__" in script.read_text(encoding="utf-8"):
                 assert f"{folder}/{script.name}" in listed
+
+
+@pytest.mark.slow
+def test_unknown_landmarks_finds_all_in_a_short_basin() -> None:
+    found = figures("validation/unknown_landmarks.py", "--workers", "1")
+    assert found["passed"]
+    assert found["basin"]["unknown"]["landmarks"] == found["basin"]["known"]["landmarks"] == 4
+    assert found["basin"]["unknown"]["used"] > 0.9 * found["basin"]["known"]["used"]

@@ -141,6 +141,16 @@ def test_without_merging_they_stay_two(monkeypatch: pytest.MonkeyPatch):
     assert len(run(late, **ASSOCIATED).landmarks()) > 4
 
 
+def test_with_a_bounded_history_none_is_merged_that_has_left_the_window():
+    """Factors in a marginal cannot be moved; pairing works all the same."""
+    sequence, late = named_late(0.4)
+    merged, kept = (run(late, **ASSOCIATED, history=history).landmarks() for history in ("whole", "bounded"))
+    assert len(kept) > len(merged) == 4
+    blind = run(anonymous_where(sequence, everywhere(sequence)), **ASSOCIATED, history="bounded")
+    assert len(blind.landmarks()) == 4
+    assert set(blind.detections().outcomes) <= USED
+
+
 def blind_between(first_s: float, last_s: float, estimator_calls: list[int]):
     """No pairing in a number of frames, as if the vehicle's error had led it astray."""
 
