@@ -161,6 +161,11 @@ class Isam2:
         self._calibration = calibration
         self._params: Isam2Params = params or Isam2Params()
         p = self._params
+        if p.history == "bounded" and p.mixture() is not None:
+            raise EstimatorError(
+                f'isam2: identity_policy = "{p.identity_policy}" chooses anew in the whole history; give it'
+                ' history = "whole", or history = "bounded" with identity_policy = "robust"'
+            )
         self._smoother = Smoother(
             p.lag_s, p.relinearize_threshold, p.stale_shift_m, p.waiting_gain, is_bounded=p.history == "bounded"
         )
