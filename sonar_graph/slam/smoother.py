@@ -8,11 +8,16 @@ Two solutions share the same factors:
 
 Marginalising freezes the linearisation of the landmarks that it touches. When one has since moved by more than
 ``stale_shift_m`` (a loop was closed after much drift), the history is solved at once and the window starts again from
-that solution with fresh linearisations. The graph must have grown by `RESTART_GROWTH` since the last time, which keeps
-the total cost of restarts proportional to that of the last one.
+that solution with fresh linearisations. The graph must have grown by `RESTART_GROWTH` since, so that all restarts
+together cost some times the last one.
 
 Factors can be exchanged for others. While all their variables are in the window, iSAM2 removes them; what has been
 marginalised cannot be taken out of a marginal, and the window starts again from the history.
+
+A *bounded* history is that of the window: its factors, and the marginals of what has left. The window then begins anew
+from those, which leaves older marginals linearised where they were.
+
+New factors that cannot be used are taken out again (`sonar_graph.slam.withholding`).
 
 GTSAM's Cholesky elimination gives up ("indeterminate") when a variable's absolute sigma is more than 4096 times its
 sigma given its neighbours, which millimetre odometry reaches after some metres of drift. QR does not, at a higher cost;
@@ -171,10 +176,7 @@ class Smoother:
         return handles
 
     def hold(self, until_s: dict[int, float]) -> None:
-        """Keep keyframes, and all later ones, in the window beyond the lag, each until a time; no others any more.
-
-        All later ones as well: iSAM2 marginalises in order.
-        """
+        """Keep keyframes, and all later ones (iSAM2 marginalises in order), in the window until times; no others."""
         self._held = until_s
 
     def flush(self, time_s: float) -> None:
