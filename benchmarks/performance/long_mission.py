@@ -9,6 +9,9 @@ that the log is never in the memory that is measured. The estimator is asked at 
   the system gave the core to another process meanwhile (``max_wall_ms`` has those calls by the wall too);
 * ``memory_growth_ratio``: resident memory in the last tenth over that at the end of the first, medians.
 
+The mission is run twice, and a call counts by the shorter of its two times: the estimator does the same in both, and
+what else the machine does is seldom in both. Memory is that of the first run.
+
 Resident memory is that of the whole process. Poses and outcomes of a quarter of an hour are remembered; with
 ``--remembered 0`` those of the whole mission, in columns. `--trace` counts what Python allocates, by the line that did,
 at several times the run time.
@@ -154,6 +157,14 @@ def run(mission: StoredMission, params: Isam2Params) -> tuple[Isam2, Record]:
     return estimator, record
 
 
+def shorter(first: Record, second: Record) -> Record:
+    """The first, with the shorter times of both."""
+    first.cpu_s = np.minimum(first.cpu_s, second.cpu_s)
+    first.wall_s = np.minimum(first.wall_s, second.wall_s)
+    first.own_s = np.minimum(first.own_s, second.own_s)
+    return first
+
+
 def tenths(record: Record) -> list[dict[str, float]]:
     """Time and memory of each tenth of the calls."""
     rows = []
@@ -234,7 +245,10 @@ def main() -> None:
         mission = simulated(options, Path(second))
         if arguments.trace:
             tracemalloc.start(5)
-        figures = report(mission, *run(mission, params))
+        estimator, record = run(mission, params)
+        if not arguments.trace:
+            record = shorter(record, run(mission, params)[1])
+        figures = report(mission, estimator, record)
     if arguments.trace:
         for line in tracemalloc.take_snapshot().statistics("lineno")[:25]:
             note(str(line))
