@@ -118,6 +118,7 @@ class Outcome(StrEnum):
     USED_LATER = "used later, when its identity was known"
     MOVED = "used: taken back from one landmark and given to another"
     GATED = "refused: innovation outside the gate"
+    REASSIGNED = "used: its place says that it is another landmark"
     UNFIT = "refused: its place fits no landmark that it may be"
     NO_IDENTITY = "refused: no identity probable enough"
     WAITING = "waiting: its identity is not known yet"

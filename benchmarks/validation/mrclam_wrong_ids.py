@@ -110,8 +110,9 @@ def print_estimators(figures: dict[str, Any]) -> None:
 
 def main() -> None:
     parser = make_parser(__doc__, data=True, workers=True)
+    parser.add_argument("--robots", type=int, nargs="+", default=ROBOTS, help="those to run (default: all five)")
     arguments = parser.parse_args()
-    robots = ROBOTS[:1] if arguments.quick else ROBOTS
+    robots = ROBOTS[:1] if arguments.quick else tuple(arguments.robots)
     cases = [(robot, share, label) for robot in robots for share in (0.0, SHARE) for label in ESTIMATORS]
     with recording(arguments.data, "mrclam_ds6.tar.xz", "MRCLAM_Dataset6") as folder:
         runs = in_parallel(partial(run_case, folder), cases, arguments.workers, "run")

@@ -129,17 +129,19 @@ class DoubtfulIdentities:
                 sighting.outcome = Outcome.UNFIT
                 continue
             is_first = landmark_id not in self._landmarks
-            sighting.outcome = Outcome.NEW if is_first else Outcome.USED
+            sighting.outcome = Outcome.NEW if is_first else _used(statement, landmark_id, Outcome.USED)
             if is_first:
                 self._smoother.add_landmark(L(landmark_id), self._maker.place(sighting, self._smoother.values))
             made = self._maker.make(sighting, L(landmark_id), is_first=is_first)
             self._landmarks.enter(sighting, landmark_id, self._smoother.add(made))
             taken_ns = self._landmarks.stamps_ns(landmark_id)
-            late += [(s, landmark_id) for s in waiting if s.stamp_ns not in taken_ns]
+            fresh = [s for s in waiting if s.stamp_ns not in taken_ns]
+            for waited in fresh:
+                waited.outcome = _used(statement, landmark_id, Outcome.USED_LATER)
+            late += [(waited, landmark_id) for waited in fresh]
         if late:
             self._landmarks.exchange([], late, time_s)
         for sighting, landmark_id in late:
-            sighting.outcome = Outcome.USED_LATER
             self._journal.amend(sighting.row, sighting.outcome, landmark_id)
         self._hold(sightings[0].stamp_ns)
 
@@ -268,8 +270,12 @@ class DoubtfulIdentities:
             if said is not None and new != said:
                 self._disputed.add(said)
             for sighting in watch.sightings:
-                sighting.outcome = Outcome.UNFIT if new is None else Outcome.MOVED
-                self._journal.amend(sighting.row, sighting.outcome, new)
+                sighting.outcome = Outcome.UNFIT if new is None else _used(watch.statement, new, Outcome.USED_LATER)
+                self._journal.amend(sighting.row, sighting.outcome, said if new is None else new)
+
+
+def _used(statement: Statement, landmark_id: int, as_said: Outcome) -> Outcome:
+    return as_said if landmark_id == statement.favourite else Outcome.REASSIGNED
 
 
 def _differing(watches: list[Watch], choices: Choices) -> list[tuple[Watch, int | None]]:

@@ -184,8 +184,8 @@ class Sightings:
         sightings = self._sightings(view, tie, seen, np.zeros((len(frame), 3)))
         doubtful.enter(statements, tracks, sightings, chosen, self.keyframes.newest_s)
         for row, sighting in enumerate(sightings):
-            said = statements[row].favourite
-            sighting.row = self.journal.record(stamp_ns, -1 if said is None else said, sighting.outcome)
+            of = statements[row].favourite if chosen[row] is None else chosen[row]
+            sighting.row = self.journal.record(stamp_ns, -1 if of is None else of, sighting.outcome)
         self.keyframes.update_if_due()
         doubtful.reconsider(self.keyframes.newest_s)
 
