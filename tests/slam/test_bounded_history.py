@@ -151,6 +151,17 @@ def test_a_landmark_whose_sightings_have_left_stays_when_its_last_one_is_taken_b
     assert estimator.values.exists(L(6))
 
 
+def test_sightings_that_left_while_nobody_knew_them_are_not_used_later():
+    """Landmark 7 is first taken for none; nothing holds the window open for it, and the first ones leave."""
+    sequence = on_the_rail([[0.0] * 4] * 10 + [SURE_7], SURE_4)
+    settings = {"lag_s": 2.0, "kernel": "none", "waiting_gain": 0.0, "motion_noise_share": 0.0}
+    whole, bounded = (run(sequence, history, **settings)[0].detections().outcomes for history in ("whole", "bounded"))
+    assert whole.count(Outcome.USED_LATER) == 10
+    assert 0 < bounded.count(Outcome.USED_LATER) < 8
+    assert bounded.count(Outcome.USED_LATER) + bounded.count(Outcome.NO_IDENTITY) == 10
+    assert Outcome.WAITING not in bounded
+
+
 # Restarts -----------------------------------------------------------------------------------------------------------
 
 
@@ -231,5 +242,7 @@ def test_rows_keep_their_numbers_when_older_ones_are_forgotten():
 
 
 def test_a_policy_that_chooses_in_the_whole_history_is_refused():
-    with pytest.raises(EstimatorError, match='identity_policy = "max-mixture" chooses anew in the whole history; give it'):
+    with pytest.raises(
+        EstimatorError, match='identity_policy = "max-mixture" chooses anew in the whole history; give it'
+    ):
         Isam2(mission().calibration, Isam2Params(history="bounded", identity_policy="max-mixture"))
