@@ -8,8 +8,8 @@ All estimators have the same detections. The smoothed trajectory is not aligned;
 Of a run that fails or is lost (`LOST_M`) the share is given. A mean is over all runs or not given: a run without a
 result has no error, and leaving it out would favour whoever gives up. Differences are paired by seed.
 
-``passed``: there is a policy of iSAM2 under which in no kind of case the mean error of the smoothed trajectory, or of the
-map, is at 10 % wrong identities more than 15 % above its own at 0 %.
+``passed``: there is a policy of iSAM2 under which in no kind of case the mean error of the smoothed trajectory, or of
+the map, is at 10 % wrong identities more than 15 % above its own at 0 %.
 """
 
 from __future__ import annotations
