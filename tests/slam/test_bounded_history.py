@@ -109,7 +109,8 @@ def test_nothing_grows_with_the_run(tracks):
             counts.append(len(gc.get_objects()))
     first, *later = sizes
     for name, size in first.items():
-        assert max(each[name] for each in later) < 2.5 * size + 20, name
+        assert max(each[name] for each in later) < 1.6 * size + 15, name
+    assert later[-1]["expiring"] < 12
     assert counts[-1] - counts[1] < 1000
     whole, _ = run(sequence, "whole")
     assert whole.graph.size() > 5 * later[-1]["factors"]
