@@ -33,15 +33,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from sonar_graph.calibration import HOLE_INTERVALS, SHORTEST_HOLE_S, ImuCalibration
+from sonar_graph.calibration import HOLE_INTERVALS, SHORTEST_HOLE_S, UNTYPICAL_S, ImuCalibration
+from sonar_graph.calibration import ROWS_BEFORE as ROWS_BEFORE
 from sonar_graph.measurements import Ints
 from sonar_graph.navigation.kernels import compiled, inlined
 from sonar_graph.navigation.triples import ZERO, Vector, plus, scaled
 
-ROWS_BEFORE = 8
-"""Intervals that tell which one is typical."""
-UNTYPICAL_NS = 1_000_000_000
-"""Longest interval after the very first row that is no hole."""
+UNTYPICAL_NS = round(UNTYPICAL_S * 1e9)
 UNFELT_NS = 100_000_000
 """Holes from here on leave specific force unmeasured: below, a vehicle turns by less than 1e-4 rad unseen."""
 SHORTEST_NS = round(SHORTEST_HOLE_S * 1e9)
