@@ -157,6 +157,7 @@ class Refusal(StrEnum):
     OUTLIER = "refused: no vehicle reaches this velocity from the last"
     LATE = "refused: the motion that it belongs to was already used"
     UNCONFIRMED = "refused: no other velocity confirms it, and none before it is near enough"
+    WAITED = "not used: it came after a gap, and only the velocity that confirmed it was"
     UNSOUND = "refused: its covariance is not positive definite"
     INCOMPLETE = "refused: too few beams, and nothing to complete them with"
 
