@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
 
@@ -111,6 +112,10 @@ class DetectionJournal:
         del self._stamps_ns[:count], self._ids[:count], self._outcomes[:count]
         del self._innovations[: 2 * count], self._innovation_covs[: 4 * count]
         self._forgotten += count
+
+    def copy(self) -> DetectionJournal:
+        """The same rows, to be amended apart."""
+        return deepcopy(self)
 
     def amend(self, row: int, outcome: Outcome, landmark_id: int | None = None) -> None:
         """What has become of a detection since, and of which landmark it is; None: as it was.

@@ -6,9 +6,13 @@ every update the choices of the window are made anew from where the estimate has
 
 When a detection comes, the state is not yet conditioned on it. It is then weighed by its predictive density, with the
 covariance ``S = H P H' + R`` of what was expected: a vehicle that has drifted must not mistake its landmarks for none.
+
+For smoothed results the choices of the whole history are made anew, beside the run (`DoubtfulIdentities.history`).
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -26,16 +30,12 @@ from sonar_graph.slam.sighting import Sighting, SightingFactors
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.slam.tracks import NS_PER_S
 from sonar_graph.slam.view import View
-from sonar_graph.states import Outcome
+from sonar_graph.states import DetectionLog, Outcome
 
 MOST_ROUNDS = 3
 """Times that choices are made anew after one update."""
 MOST_OPEN = 200
 """Newest watches that are chosen anew."""
-LEAST_GAIN = 1e-3
-"""Of the cost, for another solution of the history to be taken."""
-MOST_ROUNDS_OF_HISTORY = 10
-"""The same before the history's solution is final."""
 
 
 class DoubtfulIdentities:
@@ -77,7 +77,8 @@ class DoubtfulIdentities:
         self._is_graduated = is_graduated
         self._tracks: dict[int, Watch] = {}
         self._disputed: set[int] = set()
-        self._settled: gtsam.Values | None = None
+        self._chosen: ChosenHistory | None = None
+        self._chosen_from: gtsam.Values | None = None
         self.watches: list[Watch] = []
         """All so far, in the order in which they began."""
 
@@ -184,35 +185,33 @@ class DoubtfulIdentities:
             if not changes:
                 break
             self._change(changes, time_s)
-        self._relocate(self._smoother.values, time_s)
+        self._relocate(time_s)
 
-    def settle(self, time_s: float) -> None:
-        """Choose anew in the whole history until nothing changes."""
-        for _ in range(MOST_ROUNDS_OF_HISTORY):
-            values, _ = self._smoother.solve_history()
-            if values is self._settled:
-                break
-            self._disputed |= self._landmarks.ids
-            if not self._improve(self.watches, values, time_s) and not self._relocate(values, time_s):
-                self._settled = values if not self._is_graduated or not self._graduate(values, time_s) else None
+    def history(self) -> ChosenHistory:
+        """Choose anew in the whole history until nothing changes; the window's choices stay as they are."""
+        values, marginals = self._smoother.solve_history()
+        heard = sum(len(watch.sightings) for watch in self.watches)
+        if self._chosen is None or self._chosen_from is not values or self._chosen.heard != heard:
+            self._chosen_from, self._chosen = values, self._choose(values, marginals, heard)
+        return self._chosen
 
-    def _graduate(self, values: gtsam.Values, time_s: float) -> bool:
-        """Take what graduated non-convexity finds, if that costs less; whether it did."""
-        present = [watch.landmark_id for watch in self.watches]
-        handles = {handle for watch in self.watches for s in watch.sightings for handle in s.handles}
-        rival = RivalHistory(self._smoother.graph_without(handles), self.watches, self._mixture, self._maker)
-        found, choices = rival.graduated(values)
-        if rival.cost(found, choices) >= rival.cost(values, present) - LEAST_GAIN:
-            return False
-        self._smoother.values.update(found)
-        self._change(_differing(self.watches, choices), time_s)
-        return True
+    def _choose(self, values: gtsam.Values, marginals: gtsam.Marginals | gtsam.ISAM2, heard: int) -> ChosenHistory:
+        watches = [watch for watch in self.watches if not _is_withheld(watch)]
+        present = [watch.landmark_id for watch in watches]
+        handles = {handle for watch in watches for s in watch.sightings for handle in s.handles}
+        rival = RivalHistory(self._smoother.graph_without(handles), watches, self._mixture, self._maker)
+        found, choices = rival.settled(values, present, is_graduated=self._is_graduated)
+        if found is not values:
+            marginals = rival.marginals(found, choices)
+        return ChosenHistory(found, marginals, watches, choices, heard)
 
-    def _improve(self, watches: list[Watch], values: gtsam.Values, time_s: float) -> bool:
-        changes = self._changes(watches, values)
-        if changes:
-            self._change(changes, time_s)
-        return bool(changes)
+    def log(self) -> DetectionLog:
+        """What became of each detection in the whole history."""
+        journal, chosen = self._journal.copy(), self.history()
+        for watch, new in _differing(chosen.watches, chosen.choices):
+            for sighting in watch.sightings:
+                journal.amend(sighting.row, *_what_became(watch.statement, new))
+        return journal.log()
 
     def _changes(self, watches: list[Watch], values: gtsam.Values) -> list[tuple[Watch, int | None]]:
         best = self._mixture.best(watches, values, [watch.landmark_id for watch in watches], self._landmarks.sizes())
@@ -248,18 +247,15 @@ class DoubtfulIdentities:
         scores = self._mixture.at_first(watch.statement, ids, line.z, expected, cov + sighting.noise)
         return scores[new] > scores[watch.landmark_id]
 
-    def _relocate(self, values: gtsam.Values, time_s: float) -> bool:
-        moved = False
+    def _relocate(self, time_s: float) -> None:
         for landmark_id in sorted(self._disputed & self._landmarks.ids):
             naming = [watch for watch in self.watches if watch.statement.favourite == landmark_id]
-            found = supporters_elsewhere(landmark_id, naming, values, self._mixture)
+            present = [watch.landmark_id for watch in naming]
+            found = supporters_elsewhere(landmark_id, naming, present, self._smoother.values, self._mixture)
             if found is not None:
-                moved = True
-                present = [w for w in self.watches if w.landmark_id == landmark_id]
-                self._change([(w, None) for w in present], time_s)
+                self._change([(w, None) for w in self.watches if w.landmark_id == landmark_id], time_s)
                 self._change([(w, landmark_id) for w in found], time_s)
         self._disputed.clear()
-        return moved
 
     def _change(self, changes: list[tuple[Watch, int | None]], time_s: float) -> None:
         leaving = [s for watch, _ in changes for s in watch.sightings if s.landmark_id is not None]
@@ -270,8 +266,38 @@ class DoubtfulIdentities:
             if said is not None and new != said:
                 self._disputed.add(said)
             for sighting in watch.sightings:
-                sighting.outcome = Outcome.UNFIT if new is None else _used(watch.statement, new, Outcome.USED_LATER)
-                self._journal.amend(sighting.row, sighting.outcome, said if new is None else new)
+                sighting.outcome, landmark_id = _what_became(watch.statement, new)
+                self._journal.amend(sighting.row, sighting.outcome, landmark_id)
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenHistory:
+    """The whole history, with what suits it best, and its solution."""
+
+    values: gtsam.Values
+    marginals: gtsam.Marginals | gtsam.ISAM2
+    watches: list[Watch]
+    choices: Choices
+    """Of the watches."""
+    heard: int
+    """Number of sightings from which it was chosen."""
+
+    @property
+    def ids(self) -> set[int]:
+        """Landmarks that are seen in it."""
+        return {choice for choice in self.choices if choice is not None}
+
+
+def _is_withheld(watch: Watch) -> bool:
+    """Whether the smoother cannot use what it would be."""
+    return watch.landmark_id is None and any(s.outcome is Outcome.WITHHELD for s in watch.sightings)
+
+
+def _what_became(statement: Statement, new: int | None) -> tuple[Outcome, int | None]:
+    """Of detections whose landmark is chosen after they came, and the landmark for the journal."""
+    if new is None:
+        return Outcome.UNFIT, statement.favourite
+    return _used(statement, new, Outcome.USED_LATER), new
 
 
 def _used(statement: Statement, landmark_id: int, as_said: Outcome) -> Outcome:

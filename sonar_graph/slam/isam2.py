@@ -87,6 +87,7 @@ class Isam2Params(Section):
     Assumes `wrong_id_probability`, errors that are independent, and an estimate that is near when it chooses.
     "gnc": the same, and smoothed results also try what graduated non-convexity finds in the whole history, which needs
     no near estimate; assumes that most of what the recogniser says is right.
+    The last two want a whole history and take no ``unknown_landmarks = "associate"``.
 
     `kernel` is the shape of the noise under all of them."""
     wrong_id_probability: float = Field(0.05, gt=0, lt=1)
@@ -161,11 +162,7 @@ class Isam2:
         self._calibration = calibration
         self._params: Isam2Params = params or Isam2Params()
         p = self._params
-        if p.history == "bounded" and p.mixture() is not None:
-            raise EstimatorError(
-                f'isam2: identity_policy = "{p.identity_policy}" chooses anew in the whole history; give it'
-                ' history = "whole", or history = "bounded" with identity_policy = "robust"'
-            )
+        _check_policy(p)
         self._smoother = Smoother(
             p.lag_s, p.relinearize_threshold, p.stale_shift_m, p.waiting_gain, is_bounded=p.history == "bounded"
         )
@@ -311,22 +308,25 @@ class Isam2:
         EstimatorError
             When something is not known, or has left the window; it says what there is.
         """
-        return joint_covariance(self._smoother, self._keyframes.stamps_ns, over, keyframes, stamps_ns, landmarks)
+        history = self._sightings.history
+        return joint_covariance(
+            self._smoother, history, self._keyframes.stamps_ns, over, keyframes, stamps_ns, landmarks
+        )
 
     def trajectory(self) -> Trajectory:
         """The smoothed pose at every instant at which `process` returned an estimate.
 
         Solves the whole graph. Between keyframes the pose of the keyframe before is carried on by its own odometry.
         With a bounded history that is the graph of the window; poses before it are as they were when they left.
+        Doubtful identities are those that fit the whole history best, chosen beside the run, which asking leaves as it
+        was.
         """
-        self._sightings.settle()
-        return self._asked.trajectory(*self._smoother.solve_history())
+        values, marginals, _ = self._sightings.history()
+        return self._asked.trajectory(values, marginals)
 
     def landmarks(self) -> LandmarkMap:
         """Landmarks by identity after solving the whole graph, with marginal covariances."""
-        self._sightings.settle()
-        values, marginals = self._smoother.solve_history()
-        ids = sorted(self._sightings.ids)
+        values, marginals, ids = self._sightings.history()
         return LandmarkMap(
             np.array(ids, dtype=np.int64),
             np.array([values.atPoint3(L(i)) for i in ids]).reshape(-1, 3),
@@ -334,9 +334,8 @@ class Isam2:
         )
 
     def detections(self) -> DetectionLog:
-        """What became of each detection."""
-        self._sightings.forget()
-        return self._sightings.journal.log()
+        """What became of each detection; of doubtful identities in the history that `trajectory` is of."""
+        return self._sightings.log()
 
     def withheld(self) -> list[str]:
         """What of the newest detections could not be used in the graph, variable by variable, and what was missing."""
@@ -345,6 +344,22 @@ class Isam2:
     def refused_rows(self) -> list[RefusedRow]:
         """Rows of IMU, Doppler log and depth that are not used, and why."""
         return self._keyframes.refused
+
+
+def _check_policy(p: Isam2Params) -> None:
+    """A mixture is of landmarks that have names, in a history that is kept."""
+    if p.mixture() is None:
+        return
+    if p.history == "bounded":
+        raise EstimatorError(
+            f'isam2: identity_policy = "{p.identity_policy}" chooses anew in the whole history; give it'
+            ' history = "whole", or history = "bounded" with identity_policy = "robust"'
+        )
+    if p.unknown_landmarks == "associate":
+        raise EstimatorError(
+            f'isam2: identity_policy = "{p.identity_policy}" pairs detections by place itself, and begins no landmark'
+            ' without a name; give it unknown_landmarks = "ignore", or "associate" with identity_policy = "robust"'
+        )
 
 
 def _check_noise(calibration: Calibration) -> None:

@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L
 
-from sonar_graph.slam.mixture import Errors, Mixture, Watch
+from sonar_graph.slam.mixture import Choices, Errors, Mixture, Watch
 
 MOST_PROPOSALS = 20
 """Newest sightings whose places are put to the vote."""
@@ -25,7 +25,7 @@ LEAST_MARGIN = 3.0
 
 
 def supporters_elsewhere(
-    landmark_id: int, watches: list[Watch], values: gtsam.Values, mixture: Mixture
+    landmark_id: int, watches: list[Watch], choices: Choices, values: gtsam.Values, mixture: Mixture
 ) -> list[Watch] | None:
     """Watches that put a landmark in a better place than where it is; None where there is no better one.
 
@@ -33,9 +33,11 @@ def supporters_elsewhere(
     ----------
     watches
         Those whose statement favours the landmark.
+    choices
+        What each counts as now.
     """
     voters = watches[-MOST_VOTERS:]
-    proposals = [watch for watch in voters if watch.landmark_id != landmark_id][-MOST_PROPOSALS:]
+    proposals = [w for w, choice in zip(watches, choices, strict=True) if choice != landmark_id][-MOST_PROPOSALS:]
     if len(proposals) < 2:
         return None
     places = Errors([watch.sightings[0] for watch in proposals], values).located()

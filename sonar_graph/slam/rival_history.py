@@ -1,4 +1,8 @@
-"""The history as it would be if watches were of other landmarks, solved beside the one that stands."""
+"""The history as it would be if watches were of other landmarks, solved beside the one that stands.
+
+Nothing here is written to: it is what results are chosen from when they are asked for, and asking must not change the
+run. Factors are shared with it; they are never changed.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +14,19 @@ import numpy as np
 from gtsam.symbol_shorthand import L
 
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.batch import solve
+from sonar_graph.slam.batch import marginals_of
 from sonar_graph.slam.graduated import graduate
+from sonar_graph.slam.misplaced_landmarks import supporters_elsewhere
 from sonar_graph.slam.mixture import Choices, Mixture, Watch
 from sonar_graph.slam.sighting import Sighting, SightingFactors
+from sonar_graph.slam.sightlines import Sightlines, solve_in_sight
 
 MOST_ROUNDS = 10
 """Times that choices are made anew."""
 LEAST_WEIGHT = 1e-6
-"""A watch of less is left out."""
+"""Of a watch in a graph."""
+LEAST_GAIN = 1e-3
+"""Of the cost, for another solution to be taken."""
 
 
 class RivalHistory:
@@ -42,6 +50,25 @@ class RivalHistory:
         self._mixture = mixture
         self._maker = maker
 
+    def settled(self, values: gtsam.Values, choices: Choices, *, is_graduated: bool) -> tuple[gtsam.Values, Choices]:
+        """The nearest fixed point of the max-mixture from a solution with these choices.
+
+        Parameters
+        ----------
+        is_graduated
+            Whether to take what graduated non-convexity finds, if that costs less.
+        """
+        values, choices = self._fixed_point(values, choices)
+        if is_graduated and self._known(values):
+            found, others = self.graduated(values)
+            if self.cost(found, others) < self.cost(values, choices) - LEAST_GAIN:
+                return found, others
+        return values, choices
+
+    def marginals(self, values: gtsam.Values, choices: Choices) -> gtsam.Marginals | gtsam.ISAM2:
+        """What gives the covariances of a solution."""
+        return marginals_of(self._chosen_graph(choices), values)
+
     def cost(self, values: gtsam.Values, choices: Choices) -> float:
         """Of the max-mixture, with these components."""
         scores = self._mixture.scores(self._watches, values, choices, self._sizes(choices))
@@ -49,8 +76,7 @@ class RivalHistory:
 
     def graduated(self, values: gtsam.Values) -> tuple[gtsam.Values, Choices]:
         """From graduated non-convexity on what the recogniser said, the nearest fixed point of the max-mixture."""
-        favourites = [(watch, watch.statement.favourite) for watch in self._watches]
-        known = [(watch, i) for watch, i in favourites if i is not None and values.exists(L(i))]
+        known = self._known(values)
         named, ids = [watch for watch, _ in known], [i for _, i in known]
         plain = self._maker.without_kernel()
         values, weights = graduate(
@@ -60,7 +86,13 @@ class RivalHistory:
             values,
         )
         kept = {w: i for w, i, weight in zip(named, ids, weights.tolist(), strict=True) if weight > 0.5}
-        return self._fixed_point(values, [kept.get(watch) for watch in self._watches])
+        choices: Choices = [kept.get(watch) for watch in self._watches]
+        return self._fixed_point(self._solve(values, choices), choices)
+
+    def _known(self, values: gtsam.Values) -> list[tuple[Watch, int]]:
+        """Watches that name a landmark of the graph, and that."""
+        favourites = [(watch, watch.statement.favourite) for watch in self._watches]
+        return [(watch, i) for watch, i in favourites if i is not None and values.exists(L(i))]
 
     def _sizes(self, choices: Choices) -> dict[int, int]:
         sizes: dict[int, int] = defaultdict(int)
@@ -71,12 +103,38 @@ class RivalHistory:
 
     def _fixed_point(self, values: gtsam.Values, choices: Choices) -> tuple[gtsam.Values, Choices]:
         for _ in range(MOST_ROUNDS):
-            values = solve(self._graph(self._watches, choices, np.ones(len(choices)), self._maker), values)
-            better = self._mixture.best(self._watches, values, choices, self._sizes(choices))
+            start, better = values, self._mixture.best(self._watches, values, choices, self._sizes(choices))
+            if better == choices:
+                start, better = self._relocated(values, choices)
             if better == choices:
                 break
-            choices = better
+            values, choices = self._solve(start, better), better
         return values, choices
+
+    def _relocated(self, values: gtsam.Values, choices: Choices) -> tuple[gtsam.Values, Choices]:
+        """Landmarks that began with something else begin where those that name them agree that they are."""
+        moved = gtsam.Values(values)
+        for landmark_id in sorted(self._sizes(choices)):
+            rows = [row for row, watch in enumerate(self._watches) if watch.statement.favourite == landmark_id]
+            naming, now = [self._watches[row] for row in rows], [choices[row] for row in rows]
+            found = supporters_elsewhere(landmark_id, naming, now, values, self._mixture)
+            if found is not None:
+                without = [None if choice == landmark_id else choice for choice in choices]
+                choices = [landmark_id if w in found else c for w, c in zip(self._watches, without, strict=True)]
+                first = min((s for watch in found for s in watch.sightings), key=lambda s: (s.stamp_ns, s.row))
+                moved.update(L(landmark_id), self._maker.place(first, values))
+        return moved, choices
+
+    def _solve(self, values: gtsam.Values, choices: Choices) -> gtsam.Values:
+        lines = Sightlines()
+        for watch, choice in zip(self._watches, choices, strict=True):
+            if choice is not None:
+                for sighting in watch.sightings:
+                    lines.add(L(choice), sighting.line)
+        return solve_in_sight(self._chosen_graph(choices), values, lines)
+
+    def _chosen_graph(self, choices: Choices) -> gtsam.NonlinearFactorGraph:
+        return self._graph(self._watches, choices, np.ones(len(choices)), self._maker)
 
     def _graph(
         self, watches: list[Watch], choices: Choices, weights: Floats, maker: SightingFactors

@@ -21,15 +21,16 @@ from sonar_graph.slam.hypotheses import Statement
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmark_sightings import LandmarkSightings
 from sonar_graph.slam.late_gate import LateGate
-from sonar_graph.slam.mixture import Mixture
+from sonar_graph.slam.mixture import Kernel, Mixture
 from sonar_graph.slam.models import FLOOR_GATE, locate
 from sonar_graph.slam.sighting import Sighting, SightingFactors
 from sonar_graph.slam.sightlines import Sightline
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.slam.sound_rows import without_unsound
 from sonar_graph.slam.tracks import decide
+from sonar_graph.slam.uncertainty import Solution
 from sonar_graph.slam.view import View
-from sonar_graph.states import Outcome
+from sonar_graph.states import DetectionLog, Outcome
 
 
 @dataclass(frozen=True)
@@ -53,16 +54,8 @@ class SightingPolicy:
 
     def robust(self) -> Robust:
         """What wraps a noise model in the kernel."""
-        kernel = self.estimator()
+        kernel = Kernel(self.kernel, self.kernel_width).estimator()
         return lambda noise: gtsam.noiseModel.Robust.Create(kernel, noise) if kernel else noise
-
-    def estimator(self) -> gtsam.noiseModel.mEstimator.Base | None:
-        """The robust kernel; None for none."""
-        if self.kernel == "huber":
-            return gtsam.noiseModel.mEstimator.Huber.Create(self.kernel_width)
-        if self.kernel == "cauchy":
-            return gtsam.noiseModel.mEstimator.Cauchy.Create(self.kernel_width)
-        return None
 
 
 class Verdict(NamedTuple):
@@ -165,10 +158,17 @@ class Sightings:
                 if is_tracked[row]:
                     self._deferred.remember(track, verdict.sighting)
 
-    def settle(self) -> None:
-        """Make doubtful identities those that fit the whole history best."""
-        if self._doubtful is not None and self.keyframes.newest_ns is not None:
-            self._doubtful.settle(self.keyframes.newest_s)
+    def history(self) -> Solution:
+        """The whole graph solved; of doubtful identities with those that fit it best."""
+        if self._doubtful is None:
+            return Solution(*self.smoother.solve_history(), sorted(self.ids))
+        chosen = self._doubtful.history()
+        return Solution(chosen.values, chosen.marginals, sorted(chosen.ids))
+
+    def log(self) -> DetectionLog:
+        """What became of each detection, in the same history."""
+        self.forget()
+        return self.journal.log() if self._doubtful is None else self._doubtful.log()
 
     def _doubt(self, doubtful: DoubtfulIdentities, stamp_ns: int, frame: LandmarkDetections) -> None:
         """Take in a frame whose identities are weighed against where its detections are."""

@@ -304,6 +304,7 @@ class Smoother:
 
     def _take(self, estimate: gtsam.Values) -> None:
         """The window's; a bounded one forgets what has left."""
+        self._solved = None  # who asked before must not decide where the next solution starts
         if not self.is_bounded:
             self.values.update(estimate)
             return

@@ -60,12 +60,11 @@ def misnamed(policy: SightingPolicy, share: float = 0.25) -> tuple[Dive, list[in
             }
         watch(world, 0.1 * (k + 1), named, rng)
         truth += list(named)
-    world.sightings.settle()
     return world, truth
 
 
 def worst_landmark_m(world: Dive) -> float:
-    values, _ = world.smoother.solve_history()
+    values = world.sightings.history().values
     return max(float(np.linalg.norm(values.atPoint3(L(i)) - p)) for i, p in PLACES.items())
 
 
@@ -73,8 +72,9 @@ def max_mixture(world: Dive) -> gtsam.NonlinearFactorGraph:
     """The same with Python factors that look for their largest component at every linearisation."""
     doubtful = world.sightings._doubtful
     handles = {h for w in doubtful.watches for s in w.sightings for h in s.handles}
-    graph = world.smoother.graph_without(handles)
-    firsts = {i: min(s.row for s in world.sightings._landmarks.sightings(i)) for i in PLACES}
+    graph, chosen = world.smoother.graph_without(handles), doubtful.history()
+    pairs = list(zip(chosen.watches, chosen.choices, strict=True))
+    firsts = {i: min(w.sightings[0].row for w, choice in pairs if choice == i) for i in PLACES}
     for w in doubtful.watches:
         (sighting,) = w.sightings
         first_of = next((i for i, row in firsts.items() if row == sighting.row), None)
@@ -123,7 +123,7 @@ def largest(named: int, components: dict[int, list], sighting) -> gtsam.CustomFa
 
 def test_the_end_is_a_fixed_point_of_the_max_mixture_that_another_solver_finds() -> None:
     world, truth = misnamed(doubting())
-    values, _ = world.smoother.solve_history()
+    values = world.sightings.history().values
     scattered = values.retract(scatter(values))
     params = gtsam.LevenbergMarquardtParams()
     params.setRelativeErrorTol(1e-12)
@@ -131,7 +131,7 @@ def test_the_end_is_a_fixed_point_of_the_max_mixture_that_another_solver_finds()
     for i in PLACES:
         assert np.linalg.norm(scattered.atPoint3(L(i)) - values.atPoint3(L(i))) > 1e-3
         np.testing.assert_allclose(found.atPoint3(L(i)), values.atPoint3(L(i)), atol=1e-5)
-    log = world.sightings.journal.log()
+    log = world.sightings.log()
     assert log.landmark_ids.tolist() == truth
     assert set(log.outcomes) == {Outcome.NEW, Outcome.USED, Outcome.REASSIGNED}
 
@@ -160,7 +160,7 @@ def test_right_names_give_the_graph_of_one_that_believes_them() -> None:
     doubted, believed = misnamed(doubting(), 0.0)[0], misnamed(BELIEVING, 0.0)[0]
     assert doubted.outcomes == believed.outcomes
     for i in PLACES:
-        places = [world.smoother.solve_history()[0].atPoint3(L(i)) for world in (doubted, believed)]
+        places = [world.sightings.history().values.atPoint3(L(i)) for world in (doubted, believed)]
         np.testing.assert_allclose(*places, atol=1e-3)
 
 
