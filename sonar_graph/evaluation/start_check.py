@@ -16,7 +16,7 @@ from sonar_graph.evaluation.finding import NO_NEED, Finding, in_degrees, matters
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.dvl_against_imu import Estimates3D
 from sonar_graph.navigation.initial_tilt import InitialTilt
-from sonar_graph.navigation.moving_alignment import LONGEST_S, align_in_motion
+from sonar_graph.navigation.moving_alignment import LONGEST_S, align_in_motion, until_hole
 from sonar_graph.navigation.offset_search import Estimate1D
 from sonar_graph.navigation.still_alignment import align_at_rest
 from sonar_graph.sequence import NS_PER_S, Sequence
@@ -70,6 +70,7 @@ def find_start_tilt(sequence: Sequence) -> StartTilt:
     imu, dvl = _beginning(sequence, LONGEST_S)
     if imu is None or dvl is None:
         return found
+    imu = until_hole(imu)
     try:
         tilt = align_in_motion(imu, dvl, sequence.calibration)
     except AlignmentError as error:
