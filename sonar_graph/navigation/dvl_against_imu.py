@@ -19,6 +19,7 @@ The velocities that multiply s and psi are those that the accelerometers carry o
 own would bring their noise into the regression twice, which shrinks s towards nothing (errors in variables). The
 accelerometers' noise, which is then in both sides, makes s too large by an amount that is known, and taken off again.
 Rows that leave a direction unmeasured (`sonar_graph.doppler_beams`) are left out; what remains may have gaps.
+So are rows about holes of the IMU's, as far as an offset could carry them into one, and no stretch goes over a hole.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.measurements import Dvl, Floats, Imu
+from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.differenced_fit import Stretch, rate_noise_power
 from sonar_graph.navigation.inertial_path import InertialPath
 from sonar_graph.navigation.offset_search import RANGE_S, Estimate1D, OffsetFit, search_offset
@@ -99,12 +100,12 @@ def match_dvl_to_imu(imu: Imu, dvl: Dvl, calibration: Calibration) -> DvlMatch:
     imu = _in_body_axes(imu, calibration)
     path = InertialPath.of(imu)
     seconds = path.since_origin(dvl.stamps_ns)
-    inside = path.covers(seconds - RANGE_S) & path.covers(seconds + RANGE_S) & ~is_partial(dvl.velocity_cov)
+    inside = path.covers(seconds, RANGE_S) & ~is_partial(dvl.velocity_cov)
     body_R_dvl = calibration.dvl.mounting.pose().rotation().matrix()
     seconds, velocity = seconds[inside], dvl.velocity[inside] @ body_R_dvl.T
-    runs = list(stretches_of(seconds))
+    runs = list(stretches_of(seconds, path.parts_at(seconds)))
     if len(runs) < LEAST_STRETCHES:
-        return _unknown(f"less than {LEAST_STRETCHES * STRETCH_S:g} s with both")
+        return _unknown(f"less than {LEAST_STRETCHES * STRETCH_S:g} s with both and no hole of the IMU")
     lever = np.subtract(calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m)
     with threadpool_limits(1, user_api="blas"):
         return _matched(imu, seconds, velocity, runs, lever)
@@ -160,13 +161,16 @@ def _in_body_axes(imu: Imu, calibration: Calibration) -> Imu:
     return Imu(imu.stamps_ns, imu.angular_velocity @ body_R_imu.T, imu.specific_force @ body_R_imu.T)
 
 
-def stretches_of(seconds: Floats) -> Iterator[slice]:
-    """Runs of samples without a gap, about half a minute each; shorter ones with too few samples are left out."""
+def stretches_of(seconds: Floats, parts: Ints) -> Iterator[slice]:
+    """Runs of samples without a gap, of one part of the path, about half a minute each.
+
+    Shorter ones with too few samples are left out.
+    """
     intervals = np.diff(seconds)
     if not len(intervals):
         return
     usual = float(np.median(intervals))
-    ends = np.flatnonzero(intervals > LARGEST_INTERVAL * usual) + 1
+    ends = np.flatnonzero((intervals > LARGEST_INTERVAL * usual) | (np.diff(parts) > 0)) + 1
     rows = max(LEAST_ROWS, round(STRETCH_S / max(usual, 1e-9)))
     for first, last in zip([0, *ends], [*ends, len(seconds)], strict=True):
         count = max(1, round((last - first - 1) / rows))

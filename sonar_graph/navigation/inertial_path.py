@@ -7,6 +7,10 @@ The frame g is the IMU's own at its first sample. With C = g_R_imu, piecewise li
 F is the change of velocity plus gravity's reaction, S what a constant accelerometer bias adds to it. A constant gyro
 bias b turns C by ``Exp(S b)`` and adds ``-P b`` to F. Nothing here knows the world: which way is up is left to whoever
 fits it.
+
+In a hole of the samples (`sonar_graph.navigation.unmeasured_turns`) nobody knows how the body turned and what it felt.
+The integrals go on over it, so that each part between two holes has a frame and beginnings of its own: only what lies
+within one part can be compared.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.measurements import Floats, Imu, Ints
 from sonar_graph.navigation.kernels import compiled, rotation_exp
+from sonar_graph.navigation.unmeasured_turns import UNFELT_NS, row_after_hole
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +42,8 @@ class InertialPath:
     """P, shape (n, 3, 3), m."""
     rate: Floats
     """Angular rate as measured, shape (n, 3), rad/s."""
+    parts: Ints
+    """How many holes came before each sample, shape (n,)."""
 
     @classmethod
     def of(cls, imu: Imu) -> InertialPath:
@@ -45,15 +52,23 @@ class InertialPath:
         seconds = (stamps - stamps[0]) * 1e-9
         rate = imu.angular_velocity[first]
         integrals = _integrate(seconds, rate, imu.specific_force[first])
-        return cls(seconds, int(stamps[0]), *integrals, rate)
+        return cls(seconds, int(stamps[0]), *integrals, rate, _parts(stamps))
 
     def since_origin(self, stamps_ns: Ints) -> Floats:
         """Seconds of other stamps on this path's axis, shape (k,)."""
         return np.asarray((stamps_ns - self.origin_ns) * 1e-9)
 
-    def covers(self, seconds: Floats) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Which instants lie within the samples."""
-        return np.asarray((seconds >= 0) & (seconds <= self.seconds[-1]))
+    def covers(self, seconds: Floats, margin_s: float = 0.0) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """About which instants samples reach so far either way without a hole."""
+        earliest, latest = seconds - margin_s, seconds + margin_s
+        inside = (earliest >= 0) & (latest <= self.seconds[-1])
+        before = np.clip(np.searchsorted(self.seconds, earliest, side="right") - 1, 0, None)
+        after = np.clip(np.searchsorted(self.seconds, latest), None, len(self.seconds) - 1)
+        return np.asarray(inside & (self.parts[before] == self.parts[after]))
+
+    def parts_at(self, seconds: Floats) -> Ints:
+        """How many holes have ended before each instant, shape (k,)."""
+        return np.asarray(self.parts[np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, None)])
 
     def rotations_at(self, seconds: Floats) -> Floats:
         """C at instants within the samples, along the shortest arc between two, shape (k, 3, 3)."""
@@ -78,6 +93,15 @@ class InertialPath:
     def rate_at(self, seconds: Floats) -> Floats:
         """Angular rate, shape (k, 3)."""
         return interpolated(seconds, self.seconds, self.rate)
+
+
+def _parts(stamps_ns: Ints) -> Ints:
+    is_first = np.zeros(len(stamps_ns), dtype=np.int64)
+    row = row_after_hole(stamps_ns, 0, len(stamps_ns) - 1, UNFELT_NS)
+    while row >= 0:
+        is_first[row] = 1
+        row = row_after_hole(stamps_ns, row, len(stamps_ns) - 1, UNFELT_NS)
+    return np.cumsum(is_first)
 
 
 def interpolated(seconds: Floats, own_seconds: Floats, values: Floats) -> Floats:

@@ -40,6 +40,7 @@ from sonar_graph.navigation.initial_tilt import (
     in_body_axes,
     roll_and_pitch,
 )
+from sonar_graph.navigation.unmeasured_turns import UNFELT_NS, row_after_hole
 from sonar_graph.navigation.velocity_covariances import in_numbers, is_partial
 
 FEWEST, SHORTEST_S, LONGEST_S = 10, 2.0, 60.0
@@ -98,7 +99,8 @@ def align_in_motion(imu: Imu, dvl: Dvl, calibration: Calibration) -> InitialTilt
     Parameters
     ----------
     imu, dvl
-        Of the same stretch; of more than a minute the first is used. The vehicle may move or rest.
+        Of the same stretch; of more than a minute the first is used, and what is before the first hole of the IMU's
+        rows. The vehicle may move or rest.
     calibration
         Densities, sigmas of both biases as priors, Doppler sigma where the log has none, mountings, gravity, latitude.
 
@@ -111,7 +113,7 @@ def align_in_motion(imu: Imu, dvl: Dvl, calibration: Calibration) -> InitialTilt
     AlignmentError
         Where samples are too few, there is no accelerometer, or velocities and accelerations disagree.
     """
-    imu = in_body_axes(imu, calibration)
+    imu = until_hole(in_body_axes(imu, calibration))
     seconds, velocity, R = _doppler_rows(imu, dvl, calibration)
     imu = imu.rows(imu.stamps_ns <= imu.stamps_ns[0] + round((LONGEST_S + 1.0) * 1e9))
     upward, _ = earth_up_and_level(calibration)
@@ -125,6 +127,12 @@ def align_in_motion(imu: Imu, dvl: Dvl, calibration: Calibration) -> InitialTilt
             break
     _check_misfit(misfit, 3 * len(seconds))
     return _result(int(imu.stamps_ns[0]), fit, covariance, calibration)
+
+
+def until_hole(imu: Imu) -> Imu:
+    """The rows before the first hole, in which nobody knows how the vehicle turned."""
+    row = row_after_hole(imu.stamps_ns, 0, len(imu) - 1, UNFELT_NS)
+    return imu if row < 0 else imu.rows(slice(0, row))
 
 
 def _doppler_rows(imu: Imu, dvl: Dvl, calibration: Calibration) -> tuple[Floats, Floats, Floats]:

@@ -9,6 +9,8 @@ rotation e that is constant in the world, such as the Earth's::
 Both are fitted anew every few minutes and of no interest. Once the offset is known, the difference of the two headings
 over the run is a constant and a drift. Where the first part of the run stands out from that line, the reference began
 with a wrong heading (or jumped), since gyros do not jump.
+In a hole of their samples nobody knows how the vehicle turned: poses about holes are left out, no difference goes over
+one, and the beginning is compared with what comes before the first.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.measurements import Floats, Imu
+from sonar_graph.measurements import Floats, Imu, Ints
 from sonar_graph.navigation.differenced_fit import Stretch
 from sonar_graph.navigation.inertial_path import InertialPath
 from sonar_graph.navigation.offset_search import RANGE_S, Estimate1D, search_offset
@@ -30,10 +32,14 @@ LEAST_INTERVAL_S = 0.5
 """Poses closer than this are thinned: their differences would be noise."""
 STRETCH_ROWS = 60
 LEAST_ROWS = 30
+FEWEST_DIFFERENCES = 12
+"""Between two holes of the gyros' samples."""
 NO_PARAMETERS = np.empty(0)
 OFFSET_LIMIT_S = 0.1
 START_SHARE = 0.05
 """Part of the run whose heading is asked for at its beginning."""
+LEAST_PART_SHARE = 0.2
+"""Part of the run before the first hole of the gyros' samples, with which the beginning is compared."""
 LEAST_SPREAD_RAD = 1e-4
 
 
@@ -62,10 +68,10 @@ def match_reference_to_imu(imu: Imu, reference: Trajectory, calibration: Calibra
     path = InertialPath.of(imu)
     body_R_imu = calibration.imu.mounting.pose().rotation().matrix()
     seconds = path.since_origin(reference.stamps_ns)
-    rows = np.flatnonzero(path.covers(seconds - RANGE_S) & path.covers(seconds + RANGE_S))
+    rows = np.flatnonzero(path.covers(seconds, RANGE_S))
     rows = rows[_thinned(seconds[rows])]
-    if len(rows) < LEAST_ROWS:
-        short = Estimate1D(np.nan, np.inf, f"less than {LEAST_ROWS} poses while the IMU runs")
+    if sum(map(len, _stretches_of(path.parts_at(seconds[rows])))) < LEAST_ROWS - 1:
+        short = Estimate1D(np.nan, np.inf, f"less than {LEAST_ROWS} poses while the IMU runs without a hole")
         return ReferenceMatch(short, short)
     seconds, world_R_imu = seconds[rows], reference.rotations()[rows] * Rotation.from_matrix(body_R_imu)
     with threadpool_limits(1, user_api="blas"):
@@ -92,22 +98,36 @@ def _line_up(path: InertialPath, seconds: Floats, offset_s: float, world_R_imu: 
     steady = duration[:, None, None] * np.eye(3)
     from_world = duration[:, None, None] * world_R_imu[:-1].inv().as_matrix()
     B = np.concatenate([steady, from_world], axis=2)
-    count = max(1, len(y) // STRETCH_ROWS)
-    parts = np.array_split(np.arange(len(y)), count)
     nothing = np.empty((len(y), 3, 0))
-    return [Stretch(y[part], nothing[part], B[part], duration[part]) for part in parts]
+    return [Stretch(y[rows], nothing[rows], B[rows], duration[rows]) for rows in _stretches_of(path.parts_at(seconds))]
+
+
+def _stretches_of(parts: Ints) -> list[Ints]:
+    """Differences between poses of one part of the path; of short parts none."""
+    within = np.split(np.arange(len(parts) - 1), np.flatnonzero(np.diff(parts)) + 1)
+    within = [rows[:-1] if k + 1 < len(within) else rows for k, rows in enumerate(within)]
+    return [
+        stretch
+        for rows in within
+        if len(rows) >= FEWEST_DIFFERENCES
+        for stretch in np.array_split(rows, max(1, len(rows) // STRETCH_ROWS))
+    ]
 
 
 def _start_heading(path: InertialPath, reference: Trajectory, body_R_imu: Floats, offset_s: float) -> Estimate1D:
     """How far the beginning stands out from a line through the rest, which is found by medians."""
     seconds = path.since_origin(reference.stamps_ns) + offset_s
     inside = path.covers(seconds)
+    run_s = float(np.ptp(seconds[inside]))
+    inside &= path.parts_at(seconds) == path.parts_at(seconds[inside][:1])
+    if np.ptp(seconds[inside]) < LEAST_PART_SHARE * run_s:
+        return Estimate1D(np.nan, np.inf, "a hole of the IMU comes too soon after the start")
     C = Rotation.from_matrix(path.rotations_at(seconds[inside]))
     world_R_imu = reference.rotations()[np.flatnonzero(inside)] * Rotation.from_matrix(body_R_imu)
     turned = world_R_imu * C.inv()  # world_R_g: constant but for drift
     heading = (turned * turned[len(turned) // 2].inv()).as_rotvec()[:, 2]
     t = seconds[inside]
-    beginning = t <= t[0] + START_SHARE * (t[-1] - t[0])
+    beginning = t <= t[0] + START_SHARE * run_s
     level, slope, spread = _line_by_medians(t[~beginning], heading[~beginning])
     stands_out = float(np.median(heading[beginning] - level - slope * t[beginning]))
     return Estimate1D(stands_out, max(spread, LEAST_SPREAD_RAD))

@@ -96,6 +96,42 @@ def test_a_gyro_bias_changes_no_estimate():
         assert other.sigma < 1.1 * one.sigma
 
 
+HOLE_AT_S = 100.0
+
+
+def without_rows(run: Sequence, hole_s: float) -> Sequence:
+    t = (run.imu.stamps_ns - run.imu.stamps_ns[0]) * 1e-9
+    return replace(run, imu=run.imu.rows((t <= HOLE_AT_S) | (t >= HOLE_AT_S + hole_s)))
+
+
+def errors_over_sigma(found: DvlMatch) -> np.ndarray:
+    """Of offset, yaw, scale and gyro biases; the simulator's gyros have none to speak of."""
+    told = (found.offset, found.yaw, found.scale, *found.gyro_bias)
+    return np.array([(one.value - true) / one.sigma for one, true in zip(told, (0, 0, 1, 0, 0, 0), strict=True)])
+
+
+@pytest.mark.parametrize("hole_s", [2.0, 5.0])
+def test_a_hole_of_the_imu_ends_a_stretch(hole_s: float, monkeypatch: pytest.MonkeyPatch):
+    """What the vehicle did in there is nobody's knowledge; taken as linear it spoils scale and noise."""
+    run = simulate_mission(MissionOptions(seed=4, duration_s=240, landmarks=1))
+    whole, holed = matched(run), matched(without_rows(run, hole_s))
+    assert np.abs(errors_over_sigma(holed)).max() < 2.5
+    assert holed.scale.sigma < 1.5 * whole.scale.sigma
+    assert abs(holed.scale.value - whole.scale.value) < 2 * whole.scale.sigma
+    monkeypatch.setattr("sonar_graph.navigation.inertial_path._parts", np.zeros_like)
+    blind = matched(without_rows(run, hole_s))
+    assert blind.scale.sigma > 1.25 * whole.scale.sigma
+    assert hole_s < 5.0 or abs(blind.scale.value - 1.0) > 2.5 * blind.scale.sigma
+
+
+def test_a_hole_ends_a_stretch_of_a_slow_doppler_log_too():
+    """Of one row in two seconds, whose gaps are no longer than what it always has."""
+    seconds = np.arange(0.0, 200.0, 2.0)
+    parts = (seconds > 101).astype(np.int64)
+    assert not any(run.start <= 50 < run.stop - 1 for run in stretches_of(seconds, parts))
+    assert any(run.start <= 50 < run.stop - 1 for run in stretches_of(seconds, np.zeros_like(parts)))
+
+
 def with_imu_at(run: Sequence, place_m: tuple[float, float, float]) -> Sequence:
     """The same run whose calibration says that the IMU is elsewhere."""
     imu = run.calibration.imu
@@ -174,7 +210,9 @@ def test_the_third_axis_of_a_stretch_is_the_vertical_and_does_not_walk():
     turned = [lying.apply(columns) for columns in (imu.angular_velocity, imu.specific_force, dvl.velocity)]
     path = InertialPath.of(Imu(imu.stamps_ns, turned[0], turned[1]))
     seconds = path.since_origin(dvl.stamps_ns)[:-50]
-    stretches = _line_up(path, seconds, turned[2][:-50], list(stretches_of(seconds)), np.zeros(3), 0.0)
+    stretches = _line_up(
+        path, seconds, turned[2][:-50], list(stretches_of(seconds, path.parts_at(seconds))), np.zeros(3), 0.0
+    )
     assert len(stretches) > 3
     for stretch in stretches:
         assert stretch.walks == (True, True, False)

@@ -36,3 +36,21 @@ def test_integrals_at_samples_are_those_of_the_samples():
     assert path.tilted_impulse_at(T_S[rows]) == pytest.approx(path.tilted_impulse[rows])
     between = 0.5 * (path.rotations[3] + path.rotations[4])
     assert path.rotations_at(T_S[3:4] + 0.01)[0] == pytest.approx(between, abs=1e-4)
+
+
+def test_a_hole_ends_a_part_and_what_is_about_it_is_not_covered():
+    """Between 5 s and 7 s there is no sample; 80 ms are no hole."""
+    kept = ((T_S <= 5.001) | (T_S >= 6.999)) & ((T_S <= 12.001) | (T_S >= 12.079))
+    path = InertialPath.of(Imu(STAMPS_NS[kept], RATE[kept], FORCE[kept]))
+    assert np.flatnonzero(np.diff(path.parts)).tolist() == [250]
+    assert path.parts_at(np.array([0.0, 5.0, 6.9, 7.0, 19.9])).tolist() == [0, 0, 0, 1, 1]
+    asked = np.array([-0.1, 0.0, 5.0, 5.01, 6.99, 7.0, 12.04, 19.98, 20.0])
+    assert path.covers(asked).tolist() == [False, True, True, False, False, True, True, True, False]
+    assert path.covers(np.array([0.9, 3.99, 4.01, 7.99, 8.01, 18.99]), 1.0).tolist() == [
+        False,
+        True,
+        False,
+        False,
+        True,
+        False,
+    ]

@@ -251,3 +251,19 @@ def test_at_sea_it_finds_the_tilt_that_the_reference_has(unpacked):
     assert inside >= 45
     assert roll_deg < 0.045
     assert pitch_deg < 0.025
+
+
+def test_what_comes_after_a_hole_of_the_imu_is_not_used(monkeypatch):
+    """2 s without a row of a turning vehicle: the same to the bit as rows that end there."""
+    imu, dvl, truth = run(np.random.default_rng(3), noise=0.0)
+    seconds = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
+    holed, before = imu.rows((seconds <= 9.0) | (seconds >= 11.0)), imu.rows(seconds <= 9.0)
+    found, expected = align_in_motion(holed, dvl, KNOWN), align_in_motion(before, dvl, KNOWN)
+    assert np.array_equal(found.covariance, expected.covariance)
+    assert (found.roll_rad, found.pitch_rad) == (expected.roll_rad, expected.pitch_rad)
+    assert [found.roll_rad, found.pitch_rad] == pytest.approx(truth[:2], abs=1e-3)
+    with pytest.raises(AlignmentError, match="Doppler samples beside the IMU"):
+        align_in_motion(imu.rows((seconds <= 1.0) | (seconds >= 3.0)), dvl, KNOWN)
+    monkeypatch.setattr("sonar_graph.navigation.moving_alignment.row_after_hole", lambda *_: -1)
+    with pytest.raises(AlignmentError, match="differ"):
+        align_in_motion(holed, dvl, KNOWN)

@@ -63,3 +63,31 @@ def test_a_rotation_of_the_world_is_told_apart_from_the_reference():
     without, found = (match_reference_to_imu(imu, early(0.2), RUN.calibration).offset for imu in (RUN.imu, turning))
     assert found.value == pytest.approx(without.value, abs=0.3 * without.sigma)
     assert found.sigma < 1.6 * without.sigma
+
+
+def test_nothing_is_compared_over_a_hole_of_the_gyros(monkeypatch):
+    """5 s without a row in a turning vehicle."""
+    t = (RUN.imu.stamps_ns - RUN.imu.stamps_ns[0]) * 1e-9
+    holed = RUN.imu.rows((t <= 80.0) | (t >= 85.0))
+    right, wrong = early(0.2), early(0.2, wrong_rad=0.07)
+    offset = match_reference_to_imu(holed, right, RUN.calibration).offset
+    heading = match_reference_to_imu(holed, wrong, RUN.calibration).start_heading
+    assert abs(offset.value - 0.2) < 3 * offset.sigma < 0.01
+    assert heading.value == pytest.approx(0.07, abs=4 * heading.sigma)
+    assert heading.sigma < 0.005
+    monkeypatch.setattr("sonar_graph.navigation.inertial_path._parts", np.zeros_like)
+    assert match_reference_to_imu(holed, right, RUN.calibration).offset.sigma > 1.5 * offset.sigma
+    assert match_reference_to_imu(holed, wrong, RUN.calibration).start_heading.sigma > 0.005
+
+
+def test_a_hole_soon_after_the_start_leaves_its_heading_untold():
+    t = (RUN.imu.stamps_ns - RUN.imu.stamps_ns[0]) * 1e-9
+    found = match_reference_to_imu(RUN.imu.rows((t <= 20.0) | (t >= 22.0)), early(0.2), RUN.calibration)
+    assert found.offset.is_known
+    assert "too soon after the start" in found.start_heading.reason
+
+
+def test_between_many_holes_too_few_poses_are_left():
+    t = (RUN.imu.stamps_ns - RUN.imu.stamps_ns[0]) * 1e-9
+    found = match_reference_to_imu(RUN.imu.rows(t % 8.0 > 0.5), early(0.2), RUN.calibration)
+    assert "without a hole" in found.offset.reason
