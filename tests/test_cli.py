@@ -124,9 +124,19 @@ def test_examples_in_help_are_understood(
     path: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for name in ("dive.mcap", "vehicle.toml", "dive.toml", "dive.bag", "dive.ddf", "dive.aris", "pings.raw"):
+    for name in (
+        "dive.mcap",
+        "vehicle.toml",
+        "dive.toml",
+        "dive.bag",
+        "dive.ddf",
+        "dive.aris",
+        "pings.raw",
+        "reference.json",
+        "suite.toml",
+    ):
         Path(name).touch()
-    for name in ("comparison", "MRCLAM_Dataset6", "DLR", "A-KIT", "ros2_bag_folder"):
+    for name in ("comparison", "MRCLAM_Dataset6", "DLR", "A-KIT", "ros2_bag_folder", "results"):
         Path(name).mkdir()
     command = commands()[path]
     examples = examples_of(command)

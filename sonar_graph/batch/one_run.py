@@ -82,7 +82,7 @@ def _compared(run: PlannedRun, clock: Clock) -> Comparison:
         sequence = _sequence(run.kind, _as_text(run.options), run.seed, _as_text(run.landmarks))
         instants_ns = sequence.instants(run.rate_hz)
     with clock.on("estimate_s"):
-        result = run_estimator(sequence, run.estimator, run.params, instants_ns=instants_ns)
+        result = run_estimator(sequence, run.estimator, run.overrides, instants_ns=instants_ns)
     comparison = judge(sequence, instants_ns, [result])
     environment = comparison.environment | {"command": f"sonar-graph bench: run {run.key} of {run.suite}"}
     return replace(comparison, environment=environment)

@@ -41,6 +41,7 @@ class _Source:
 class _Contestant:
     name: str
     variant: str
+    overrides: dict[str, Any]
     params: dict[str, Any]
 
 
@@ -129,10 +130,10 @@ def _contestants(file: SuiteFile, number: int, entry: EstimatorEntry) -> Iterato
     except EstimatorError:  # its runs fail with the reason, and the others go on
         params = None
     for chosen in _combinations(file, place, entry.grid):
-        values = entry.params | chosen
+        given = values = entry.params | chosen
         if params is not None:
-            values = _checked(file, place, chosen, params, values, "params").model_dump(mode="json")
-        yield _Contestant(entry.name, _label(entry.variant, chosen) or DEFAULT_VARIANT, values)
+            values = _checked(file, place, chosen, params, given, "params").model_dump(mode="json")
+        yield _Contestant(entry.name, _label(entry.variant, chosen) or DEFAULT_VARIANT, given, values)
 
 
 def _combinations(file: SuiteFile, place: Place, grid: dict[str, list[Any]]) -> Iterator[dict[str, Any]]:
@@ -190,6 +191,7 @@ def _planned(file: SuiteFile, source: _Source, seed: int | None, contestant: _Co
         seed=seed,
         estimator=contestant.name,
         variant=contestant.variant,
+        overrides=contestant.overrides,
         params=contestant.params,
         rate_hz=rate_hz,
         versions=versions,

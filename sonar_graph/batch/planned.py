@@ -27,6 +27,8 @@ class PlannedRun:
     seed: int | None
     estimator: str
     variant: str
+    overrides: dict[str, Any]
+    """Settings that were given; an estimator may tell them from equal defaults."""
     params: dict[str, Any]
     """All settings; of an estimator that cannot be loaded those that were given."""
     rate_hz: float
