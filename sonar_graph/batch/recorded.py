@@ -1,0 +1,197 @@
+"""What a batch left behind, as its report and its gate read it: ``results.parquet`` and the suite beside it."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from sonar_graph.errors import EvaluationError
+from sonar_graph.measurements import Floats
+
+RESULTS, SUITE = "results.parquet", "suite.toml"
+DEFAULT_VARIANT = ("", "default")
+DEFAULT_METRICS = (
+    "causal.ate_se2_m",
+    "causal.ate_raw_m",
+    "causal.rpe_10s_m",
+    "causal.yaw_rmse_rad",
+    "landmarks.se2_m",
+)
+NEEDED = ("key", "log", "estimator", "status")
+WORDS = ("key", "suite", "log", "generator", "estimator", "variant", "status", "reason", "log_file", "machine")
+OBJECTS = ("options", "params", "versions")
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """One row of the results."""
+
+    key: str
+    log: str
+    """Name of the log or of the simulated world, with its options where these vary."""
+    seed: int | None
+    estimator: str
+    variant: str
+    status: str
+    reason: str = ""
+    log_file: str = ""
+    texts: dict[str, str] = field(default_factory=dict)
+    """All else that is no number: generator, options, params, versions, machine."""
+    values: dict[str, float] = field(default_factory=dict)
+    """Every number that is known, by column."""
+
+    @property
+    def contestant(self) -> str:
+        """Estimator, with the variant where it is not the default one."""
+        return self.estimator if self.variant in DEFAULT_VARIANT else f"{self.estimator}/{self.variant}"
+
+    @property
+    def ended(self) -> bool:
+        """Whether it came to an end, so that its numbers count."""
+        return self.status == "ok"
+
+    def value(self, key: str) -> float:
+        """A score; infinity where the run did not end or has none."""
+        return self.values.get(key, math.inf) if self.ended else math.inf
+
+
+@dataclass(frozen=True)
+class Batch:
+    """All runs of a batch, and what its suite says about comparing them."""
+
+    name: str
+    runs: list[RecordedRun]
+    reference: str
+    """Contestant with which the others are compared."""
+    metrics: list[str]
+    suite: str = ""
+    """The suite's text."""
+
+    @property
+    def logs(self) -> list[str]:
+        """Names of logs, in the order of the runs."""
+        return list(dict.fromkeys(run.log for run in self.runs))
+
+    @property
+    def contestants(self) -> list[str]:
+        """In the order of the runs."""
+        return list(dict.fromkeys(run.contestant for run in self.runs))
+
+    def group(self, log: str, contestant: str) -> list[RecordedRun]:
+        """Runs of one contestant on one log, one a seed."""
+        return [run for run in self.runs if run.log == log and run.contestant == contestant]
+
+    def values(self, log: str, contestant: str, key: str) -> Floats:
+        """A score of one contestant on one log, shape (runs,); infinity where a run has none."""
+        return np.array([run.value(key) for run in self.group(log, contestant)])
+
+    def pairs(self, log: str, contestant: str, key: str) -> tuple[Floats, Floats]:
+        """A score of one contestant and of the reference with the same log and seed, each shape (n,)."""
+        reference = {run.seed: run for run in self.group(log, self.reference)}
+        found = [(run, reference[run.seed]) for run in self.group(log, contestant) if run.seed in reference]
+        both = np.array([(run.value(key), other.value(key)) for run, other in found]).reshape(-1, 2)
+        return both[:, 0], both[:, 1]
+
+    def is_asked(self, log: str, contestant: str, key: str) -> bool:
+        """Whether a score can be expected: the log has it for somebody, and the contestant on some log.
+
+        A dead reckoning has no map and a log without truth no errors; neither is a failure.
+        """
+        has_score = [run for run in self.runs if math.isfinite(run.value(key))]
+        return any(run.log == log for run in has_score) and any(run.contestant == contestant for run in has_score)
+
+
+def is_batch(folder: Path) -> bool:
+    """Whether a folder holds the results of a batch."""
+    return (folder / RESULTS).is_file()
+
+
+def read_batch(folder: Path, reference: str | None = None) -> Batch:
+    """The batch in a folder.
+
+    Parameters
+    ----------
+    reference
+        Contestant to compare with; None: the suite's, and without a suite that of the first row.
+
+    Raises
+    ------
+    EvaluationError
+        When there are no results, they lack a column, or the reference has no run.
+    """
+    runs = _read_runs(folder / RESULTS)
+    text = (folder / SUITE).read_text("utf-8") if (folder / SUITE).is_file() else ""
+    suite = _parse_suite(text, folder / SUITE)
+    chosen = reference or _plain_name(suite.get("reference")) or runs[0].contestant
+    batch = Batch(
+        name=suite.get("name") or runs[0].texts.get("suite") or folder.name,
+        runs=runs,
+        reference=chosen,
+        metrics=list(suite.get("metrics") or DEFAULT_METRICS),
+        suite=text,
+    )
+    if chosen not in batch.contestants:
+        raise EvaluationError(
+            f"{folder}: no run of the reference {chosen!r}; there are runs of: {', '.join(batch.contestants)}"
+        )
+    return batch
+
+
+def _plain_name(reference: str | None) -> str | None:
+    """A reference as contestants are called."""
+    return reference.removesuffix("/default") if reference else None
+
+
+def _parse_suite(text: str, path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise EvaluationError(f"{path}: not TOML ({error}); copy the suite there again") from error
+
+
+def _read_runs(path: Path) -> list[RecordedRun]:
+    if not path.is_file():
+        raise EvaluationError(f"{path.parent}: no {path.name} in it; it needs a folder that bench wrote to")
+    try:
+        rows = pq.read_table(path).to_pylist()
+    except (pa.ArrowInvalid, OSError) as error:
+        raise EvaluationError(f"{path}: cannot be read as Parquet ({error}); run bench again, it resumes") from error
+    if not rows:
+        raise EvaluationError(f"{path}: has no rows; run bench again, it resumes")
+    missing = [name for name in NEEDED if name not in rows[0]]
+    if missing:
+        raise EvaluationError(f"{path}: no column {', '.join(missing)}; expected results that bench wrote")
+    return [_run(row) for row in rows]
+
+
+def _run(row: dict[str, Any]) -> RecordedRun:
+    words = {name: str(row.pop(name, None) or "") for name in WORDS}
+    seed = row.pop("seed", None)
+    objects = {name: _as_text(row.pop(name)) for name in OBJECTS if row.get(name)}
+    numbers = {name: float(value) for name, value in row.items() if isinstance(value, (int, float))}
+    others = {name: value for name, value in row.items() if isinstance(value, str)}
+    known = {name: words[name] for name in ("suite", "generator", "machine") if words[name]}
+    return RecordedRun(
+        key=words["key"],
+        log=words["log"],
+        seed=None if seed is None else int(seed),
+        estimator=words["estimator"],
+        variant=words["variant"],
+        status=words["status"],
+        reason=words["reason"],
+        log_file=words["log_file"],
+        texts=known | objects | others,
+        values={name: value for name, value in numbers.items() if math.isfinite(value)},
+    )
+
+
+def _as_text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, sort_keys=True, default=str)
