@@ -116,4 +116,6 @@ def _values(column: Column, cell: Cell) -> list[float | str]:
 def _plain(value: float | str) -> str:
     if isinstance(value, str):
         return value
-    return "" if math.isnan(value) else repr(value)
+    if math.isnan(value):
+        return ""
+    return str(value) if isinstance(value, int) else repr(float(value))

@@ -121,8 +121,10 @@ def quantile(values: Floats, share: float) -> float:
 
 
 def standard_error(values: Floats) -> float:
-    """Standard deviation over the root of the number; NaN of fewer than two."""
-    return float(values.std(ddof=1) / math.sqrt(len(values))) if len(values) > 1 else math.nan
+    """Standard deviation over the root of the number; NaN of fewer than two, or where one is infinite."""
+    if len(values) < 2 or not np.isfinite(values).all():
+        return math.nan
+    return float(values.std(ddof=1) / math.sqrt(len(values)))
 
 
 def failure_rate(failed: int, runs: int) -> Rate:
