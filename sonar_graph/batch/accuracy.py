@@ -7,34 +7,42 @@ import math
 import numpy as np
 
 from sonar_graph.batch.catalogue import Metric
-from sonar_graph.batch.recorded import Batch
+from sonar_graph.batch.recorded import ALL_LOGS, Batch
 from sonar_graph.batch.rounding import between, supported, with_error
 from sonar_graph.batch.statistics import Paired, Summary, holm, paired, summarise
 from sonar_graph.batch.tables import Cell, Column, Table, absent, number, words
 
 QUANTILES = ("10_percent", "90_percent")
 Tests = dict[tuple[str, str, str], tuple[Paired, float]]
-"""By column, log and contestant: the differences, and their p value corrected over all that are here."""
+"""By column, log and contestant: the differences, and their p value corrected over the tests of the metric."""
 
 
 def all_tests(batch: Batch, metrics: list[Metric]) -> Tests:
-    """Every contestant against the reference in every metric that has a better side: one family of tests."""
+    """Every contestant against the reference in every metric that has a better side; a metric is a family of tests."""
+    tests: Tests = {}
+    for metric in metrics:
+        if metric.is_error:
+            tests |= _family(batch, metric)
+    return tests
+
+
+def _family(batch: Batch, metric: Metric) -> Tests:
+    """Tests of one metric, with p values corrected over them; a filter's two estimates are one test."""
     found = {
-        (key, log, contestant): paired(*batch.pairs(log, contestant, key))
-        for metric in metrics
-        if metric.is_error
+        (key, log, contestant): batch.pairs(log, contestant, key)
         for key in metric.keys.values()
-        for log in batch.logs
+        for log in _compared_logs(batch)
         for contestant in batch.contestants
-        if contestant != batch.reference and _is_comparable(batch, log, contestant, key)
+        if contestant != batch.reference and len(batch.pairs(log, contestant, key)[0])
     }
-    corrected = holm(np.array([test.p_value for test in found.values()]))
-    return {place: (test, float(p)) for (place, test), p in zip(found.items(), corrected, strict=True)}
+    same = {place: (*place[1:], own.tobytes(), other.tobytes()) for place, (own, other) in found.items()}
+    distinct = {same[place]: paired(*pair) for place, pair in found.items()}
+    corrected = dict(zip(distinct, holm(np.array([test.p_value for test in distinct.values()])).tolist(), strict=True))
+    return {place: (distinct[same[place]], corrected[same[place]]) for place in found}
 
 
-def _is_comparable(batch: Batch, log: str, contestant: str, key: str) -> bool:
-    both = (contestant, batch.reference)
-    return all(batch.is_asked(log, name, key) for name in both) and bool(len(batch.pairs(log, contestant, key)[0]))
+def _compared_logs(batch: Batch) -> list[str]:
+    return [*batch.logs, ALL_LOGS] if len(batch.logs) > 1 else batch.logs
 
 
 def accuracy_table(batch: Batch, metric: Metric) -> Table:
@@ -79,7 +87,7 @@ def difference_table(batch: Batch, metric: Metric, tests: Tests) -> Table:
                 for cell in _difference_cells(tests.get((key, log, contestant)), metric)
             ),
         ]
-        for log in batch.logs
+        for log in _compared_logs(batch)
         for contestant in batch.contestants
         if any((key, log, contestant) in tests for key in metric.keys.values())
     ]
@@ -116,7 +124,7 @@ def _summary_cells(batch: Batch, log: str, contestant: str, key: str, metric: Me
 def summary_cells(told: Summary, factor: float = 1.0) -> list[Cell]:
     """Mean with its error, median, and range of the middle 80 %."""
     note = f"{told.without} of {told.runs} without a value" if told.without else ""
-    error = told.standard_error * factor
+    error = told.rounding_error * factor
     mean = number(told.mean, with_error(told.mean * factor, error), told.standard_error, note=note)
     median = number(told.median, supported(told.median * factor, error))
     if told.runs == 1:
@@ -134,7 +142,7 @@ def _difference_cells(found: tuple[Paired, float] | None, metric: Metric) -> lis
     if found is None:
         return [absent(3), absent(), absent(), absent(2)]
     test, p_holm = found
-    factor, error = metric.factor, test.standard_error * metric.factor
+    factor, error = metric.factor, test.rounding_error * metric.factor
     low, high = test.interval
     note = "" if math.isnan(low) else between(low * factor, high * factor, error)
     return [
@@ -153,7 +161,7 @@ def _median(value: float, error: float) -> str:
 
 def p_text(p_value: float) -> str:
     """A p value with two digits, down to one in a thousand."""
-    return "< 0.001" if p_value < 1e-3 else f"{p_value:.2g}" if p_value < 0.995 else "1"
+    return "< 0.001" if p_value < 1e-3 else f"{p_value:.2g}" if p_value < 0.995 else "1.0"
 
 
 def _title(metric: Metric) -> str:

@@ -22,7 +22,7 @@ PROTOCOLS = {
     "yaw_rmse_rad": "Not aligned: rms of wrapped heading errors.",
     "return_error_m": "Not aligned: norm of estimated minus true displacement from the first to the last instant.",
     "raw_m": "Map at the end, landmarks matched by identity, not aligned: rms of horizontal errors.",
-    "se2_m": "Map at the end, landmarks matched by identity, aligned by SE(2) fitted to them: rms of horizontal errors.",
+    "se2_m": "Map at the end, landmarks matched by identity, aligned by SE(2): rms of horizontal errors.",
     "nees_position": "Normalised squared error of position per degree of freedom, mean over the instants of a run.",
     "nees_yaw": "Normalised squared error of heading, mean over the instants of a run.",
 }

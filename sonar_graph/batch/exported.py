@@ -29,7 +29,6 @@ LATEX_SPECIAL = {
     "\N{MINUS SIGN}": "$-$",
     "\N{EN DASH}": "--",
     "\N{NO-BREAK SPACE}": "~",
-    "σ": r"$\sigma$",
     "²": r"$^2$",
     "χ": r"$\chi$",
 }
@@ -51,7 +50,10 @@ def write_tables(tables: list[Table], folder: Path) -> list[Path]:
 def as_csv(table: Table) -> str:
     """Numbers in full and in the units of the results; empty where there is none."""
     headings = [_joined(column.key, part) for column in table.columns for part in column.parts]
-    rows = [[_plain(value) for pair in zip(table.columns, row, strict=True) for value in _values(*pair)] for row in table.rows]
+    rows = [
+        [_plain(value) for pair in zip(table.columns, row, strict=True) for value in _values(*pair)]
+        for row in table.rows
+    ]
     return csv_text([headings, *rows])
 
 
@@ -63,7 +65,7 @@ def csv_text(rows: list[list[str]]) -> str:
 
 
 def as_latex(table: Table) -> str:
-    """A booktabs ``table``, with the digits that people are shown; it needs ``\\usepackage{booktabs}``."""
+    """A ``table`` with the digits that people are shown; it needs the packages booktabs and textcomp."""
     columns = "".join("r" if column.is_number else "l" for column in table.columns)
     lines = [
         r"% \usepackage{booktabs,textcomp}",

@@ -129,8 +129,8 @@ def consistency_drawing(batch: Batch, what: str) -> Drawing | None:
             for over, mean in known.get((log, contestant), []):
                 _draw_point(panel, mean, place, over)
     caption = (
-        f"Normalised squared error of {what} at the last instant, average over runs per degree of freedom. The grey band "
-        "holds 95 % of the averages of consistent estimators; right of it covariances are too small, left too large. "
+        f"Normalised squared error of {what} at the last instant, average over runs per degree of freedom. The grey "
+        "band holds 95 % of the averages of consistent estimators; right of it covariances are too small, left too large. "
         "Full: causal. Hollow: smoothed. A group with a run that did not end has no average and is not drawn."
     )
     return _drawn(figure, f"anees-{what}", f"Consistency of {what}", caption, rows)
@@ -210,7 +210,7 @@ def _draw_spread(panel: Axes, values: Floats, place: int, over: str) -> None:
 
 def _note(panel: Axes, text: str, row: float) -> None:
     across = panel.get_yaxis_transform()
-    panel.text(1.0, row, text, transform=across, ha="right", va="center", color=MUTED, fontsize=TICK_SIZE - 1)
+    panel.text(1.01, row, text, transform=across, ha="left", va="center", color=MUTED, fontsize=TICK_SIZE - 1)
 
 
 def _draw_interval(panel: Axes, ends: Floats, place: int, over: str) -> None:
@@ -224,7 +224,9 @@ def _draw_interval(panel: Axes, ends: Floats, place: int, over: str) -> None:
 def _draw_point(panel: Axes, value: float, place: int, over: str) -> None:
     own = colour(place)
     face = own if FILLED[over] else "none"
-    panel.plot(value, place + KIND_SHIFT[over], "o", color=own, markerfacecolor=face, markersize=6.5, markeredgewidth=1.6)
+    panel.plot(
+        value, place + KIND_SHIFT[over], "o", color=own, markerfacecolor=face, markersize=6.5, markeredgewidth=1.6
+    )
 
 
 def _finite(batch: Batch, log: str, contestant: str, metric: Metric) -> Floats:
@@ -256,5 +258,3 @@ def _drawn(figure: Figure, name: str, title: str, caption: str, rows: Rows) -> D
     plain_name = name.replace("_", "-").replace(".", "-")
     svg = inline_svg(figure, plain_name, f"{title}. {caption}")
     return Drawing(plain_name, title, caption, svg, csv_text(rows))
-
-

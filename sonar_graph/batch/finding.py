@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 from sonar_graph.batch.accuracy import Tests, p_text
 from sonar_graph.batch.catalogue import Metric
 from sonar_graph.batch.recorded import Batch
 from sonar_graph.batch.rounding import supported, with_error
-from sonar_graph.batch.statistics import least_p, quantile, standard_error
+from sonar_graph.batch.statistics import least_p, quantile, summarise
 
 SIGNIFICANT = 0.05
 
@@ -26,7 +27,7 @@ def failures_told(batch: Batch) -> list[str]:
 
 
 def errors_told(batch: Batch, metrics: list[Metric], tests: Tests) -> list[str]:
-    """For each log the first metric that it has: medians, then which differences to the reference are more than chance."""
+    """For each log the first metric that it has: medians, then differences to the reference that are no chance."""
     sentences = []
     for log in batch.logs:
         found = next(
@@ -39,18 +40,22 @@ def errors_told(batch: Batch, metrics: list[Metric], tests: Tests) -> list[str]:
             ),
             None,
         )
-        sentences.append(f"{log}: no run has an error to compare." if found is None else _log_told(batch, log, *found, tests))
+        sentences.append(
+            f"{log}: no run has an error to compare." if found is None else _log_told(batch, log, *found, tests)
+        )
     return sentences
 
 
 def _log_told(batch: Batch, log: str, metric: Metric, key: str, tests: Tests) -> str:
     medians = [
-        (quantile(values, 0.5), name, standard_error(values) * metric.factor)
+        (quantile(values, 0.5), name, summarise(values).rounding_error * metric.factor)
         for name in batch.contestants
         if len(values := batch.values(log, name, key))
     ]
     listed = ", ".join(
-        f"{name} {supported(value * metric.factor, error)}" for value, name, error in sorted(medians) if value < math.inf
+        f"{name} {supported(value * metric.factor, error)}"
+        for value, name, error in sorted(medians)
+        if value < math.inf
     )
     which = next(over for over, own in metric.keys.items() if own == key).lower()
     unit = f" in {metric.shown_unit}" if metric.shown_unit else ""
@@ -67,7 +72,7 @@ def _differences_told(batch: Batch, log: str, metric: Metric, key: str, tests: T
         if not p_value < SIGNIFICANT:
             alike.append(contestant)
         elif math.isfinite(test.mean):
-            size = with_error(abs(test.mean) * metric.factor, test.standard_error * metric.factor)
+            size = with_error(abs(test.mean) * metric.factor, test.rounding_error * metric.factor)
             side = "below" if test.mean < 0 else "above"
             told.append(f"{contestant} is on average {size} {side} {batch.reference} (p {_p(p_value)}).")
         else:
@@ -79,13 +84,16 @@ def _differences_told(batch: Batch, log: str, metric: Metric, key: str, tests: T
 
 def power_told(tests: Tests) -> list[str]:
     """A warning where there are too few pairs for any finding."""
+    families = Counter(key.rpartition(".")[2] for key, _, _ in tests)
     blind = {
-        place[1]: test.pairs for place, (test, _) in tests.items() if least_p(test.pairs) * len(tests) > SIGNIFICANT
+        place[1]: test.pairs
+        for place, (test, _) in tests.items()
+        if least_p(test.pairs) * families[place[0].rpartition(".")[2]] > SIGNIFICANT
     }
     if not blind:
         return []
     listed = ", ".join(f"{log} ({pairs} pairs)" for log, pairs in blind.items())
-    return [f"Too few pairs for the smallest of {len(tests)} p values to fall below 0.05: {listed}. Add seeds."]
+    return [f"Too few pairs for any corrected p value to fall below {SIGNIFICANT:g}: {listed}. Add seeds."]
 
 
 def _p(p_value: float) -> str:

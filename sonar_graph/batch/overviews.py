@@ -1,4 +1,4 @@
-"""Tables beside those of errors: which runs ended, whether covariances hold, what runs cost, and each run on its own."""
+"""Tables beside those of errors: which runs ended, whether covariances hold, what runs cost, and each run."""
 
 from __future__ import annotations
 
@@ -96,8 +96,8 @@ def consistency_table(batch: Batch) -> Table:
         if (row := _consistency_row(batch, log, contestant, what))
     ]
     caption = (
-        "Average over runs of the normalised squared error at the last instant, per degree of freedom: 1 is consistent, "
-        "above is over-confident. Expected: the chi-square band that holds 95 % of consistent estimators."
+        "Average over runs of the normalised squared error at the last instant, per degree of freedom: 1 is "
+        "consistent, above is over-confident. Expected: the chi-square band that holds 95 % of consistent estimators."
     )
     return Table("consistency", "ANEES of independent runs", caption, columns, rows)
 

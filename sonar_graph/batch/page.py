@@ -7,7 +7,6 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
@@ -26,7 +25,7 @@ from sonar_graph.batch.figures import (
 from sonar_graph.batch.finding import errors_told, failures_told, power_told
 from sonar_graph.batch.overviews import consistency_table, cost_table, failure_table, run_lists
 from sonar_graph.batch.recorded import RESULTS, Batch
-from sonar_graph.batch.statistics import LEAST_FOR_INTERVAL, RESAMPLES
+from sonar_graph.batch.statistics import LEAST_PAIRS, RESAMPLES
 from sonar_graph.batch.tables import Table
 from sonar_graph.evaluation.atomic import replacing
 from sonar_graph.evaluation.figure_style import ESTIMATOR_COLOURS
@@ -75,7 +74,12 @@ def _render(content: dict[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"svg": Markup, "csv_uri": _csv_uri, "table_csv": as_csv, "latex_uri": _latex_uri, "url": quote}
+    environment.filters |= {
+        "svg": Markup,
+        "csv_uri": _csv_uri,
+        "table_csv": as_csv,
+        "latex_uri": _latex_uri,
+    }
     return environment.get_template(TEMPLATE).render(**content)
 
 
@@ -103,9 +107,8 @@ def _content(batch: Batch, metrics: list[Metric], tests: Tests) -> dict[str, Any
         "cost_drawings": _drawn([cost_drawing(batch)]),
         "run_lists": run_lists(batch, metrics),
         "tables": [failures, *(table for chapter in shown for table in chapter.tables), consistency, costs],
-        "tests": len(tests),
         "resamples": RESAMPLES,
-        "least_pairs": LEAST_FOR_INTERVAL,
+        "least_pairs": LEAST_PAIRS,
         "suite": batch.suite,
         "settings": _settings(batch),
         "origins": _origins(batch),
@@ -132,8 +135,8 @@ def _drawn(drawings: Any) -> list[Drawing]:
 def _summary(batch: Batch) -> str:
     seeds = max(len(batch.group(log, name)) for log, name in _places(batch))
     return (
-        f"{len(batch.runs)} runs of {len(batch.contestants)} estimators on {len(batch.logs)} logs, up to {seeds} seeds each, "
-        f"compared with {batch.reference}."
+        f"{len(batch.runs)} runs of {len(batch.contestants)} estimators on {len(batch.logs)} logs, up to {seeds} seeds "
+        f"each, compared with {batch.reference}."
     )
 
 

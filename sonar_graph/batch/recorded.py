@@ -6,6 +6,7 @@ import json
 import math
 import tomllib
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,8 @@ DEFAULT_METRICS = (
     "causal.yaw_rmse_rad",
     "landmarks.se2_m",
 )
+ALL_LOGS = "all logs"
+"""Stands for every log of a batch where they are taken together."""
 NEEDED = ("key", "log", "estimator", "status")
 WORDS = ("key", "suite", "log", "generator", "estimator", "variant", "status", "reason", "log_file", "machine")
 OBJECTS = ("options", "params", "versions")
@@ -75,38 +78,60 @@ class Batch:
     suite: str = ""
     """The suite's text."""
 
-    @property
+    @cached_property
+    def _groups(self) -> dict[tuple[str, str], list[RecordedRun]]:
+        groups: dict[tuple[str, str], list[RecordedRun]] = {}
+        for run in self.runs:
+            groups.setdefault((run.log, run.contestant), []).append(run)
+        return groups
+
+    @cached_property
+    def _log_scores(self) -> set[tuple[str, str]]:
+        return {(key, run.log) for run in self.runs if run.ended for key in run.values}
+
+    @cached_property
+    def _contestant_scores(self) -> set[tuple[str, str]]:
+        return {(key, run.contestant) for run in self.runs if run.ended for key in run.values}
+
+    @cached_property
     def logs(self) -> list[str]:
         """Names of logs, in the order of the runs."""
         return list(dict.fromkeys(run.log for run in self.runs))
 
-    @property
+    @cached_property
     def contestants(self) -> list[str]:
         """In the order of the runs."""
         return list(dict.fromkeys(run.contestant for run in self.runs))
 
     def group(self, log: str, contestant: str) -> list[RecordedRun]:
         """Runs of one contestant on one log, one a seed."""
-        return [run for run in self.runs if run.log == log and run.contestant == contestant]
+        return self._groups.get((log, contestant), [])
 
     def values(self, log: str, contestant: str, key: str) -> Floats:
         """A score of one contestant on one log, shape (runs,); infinity where a run has none."""
         return np.array([run.value(key) for run in self.group(log, contestant)])
 
     def pairs(self, log: str, contestant: str, key: str) -> tuple[Floats, Floats]:
-        """A score of one contestant and of the reference with the same log and seed, each shape (n,)."""
-        reference = {run.seed: run for run in self.group(log, self.reference)}
-        found = [(run, reference[run.seed]) for run in self.group(log, contestant) if run.seed in reference]
-        both = np.array([(run.value(key), other.value(key)) for run, other in found]).reshape(-1, 2)
+        """A score of one contestant and of the reference on the same log and seed, each shape (n,).
+
+        With `ALL_LOGS` those of every log. Logs on which either cannot have the score have no pairs.
+        """
+        logs = self.logs if log == ALL_LOGS else [log]
+        both = np.array([pair for one in logs for pair in self._pairs_on(one, contestant, key)]).reshape(-1, 2)
         return both[:, 0], both[:, 1]
+
+    def _pairs_on(self, log: str, contestant: str, key: str) -> list[tuple[float, float]]:
+        if not all(self.is_asked(log, name, key) for name in (contestant, self.reference)):
+            return []
+        reference = {run.seed: run.value(key) for run in self.group(log, self.reference)}
+        return [(run.value(key), reference[run.seed]) for run in self.group(log, contestant) if run.seed in reference]
 
     def is_asked(self, log: str, contestant: str, key: str) -> bool:
         """Whether a score can be expected: the log has it for somebody, and the contestant on some log.
 
         A dead reckoning has no map and a log without truth no errors; neither is a failure.
         """
-        has_score = [run for run in self.runs if math.isfinite(run.value(key))]
-        return any(run.log == log for run in has_score) and any(run.contestant == contestant for run in has_score)
+        return (key, log) in self._log_scores and (key, contestant) in self._contestant_scores
 
 
 def is_batch(folder: Path) -> bool:

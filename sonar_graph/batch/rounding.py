@@ -11,7 +11,7 @@ MINUS = "\N{MINUS SIGN}"
 
 
 def decimals_of(standard_error: float) -> int:
-    """Decimals down to the first digit of the standard error, one more where that digit is 1; negative before the point.
+    """Decimals down to the first digit of the standard error, one more where that is 1; negative before the point.
 
     0.034 gives 2, 0.012 gives 3, 340 gives -2.
     """

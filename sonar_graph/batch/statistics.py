@@ -1,8 +1,9 @@
-"""What many runs say together: spread, paired differences, failure rates, consistency. Equations: docs/theory/batch_statistics.md.
+"""What many runs say together: spread, paired differences, failure rates, consistency.
 
-A run that did not end, or gave no value, is never left out. It has the value infinity, the worst there is: quantiles and
-rank tests go on with it (Lachin 1999, "Worst-rank score analysis with informatively missing observations in clinical
+A run that did not end, or gave no value, is never left out. It has the value infinity, the worst there is: quantiles
+and rank tests go on with it (Lachin 1999, "Worst-rank score analysis with informatively missing observations in clinical
 trials"), and a mean over such a group does not exist.
+Equations: docs/theory/batch_statistics.md.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ LOW, HIGH = 0.1, 0.9
 RESAMPLES = 9999
 SEED = 20140214
 """Of everything drawn here: the same results make the same report."""
-LEAST_FOR_INTERVAL = 6
-"""Fewer pairs resample to too few different means; and no two-sided rank test of them reaches 5 %."""
+LEAST_PAIRS = 6
+"""Of fewer a bootstrap draws too few different means, and no two-sided rank test reaches 5 %: 2 / 2⁵ = 0.06."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class Summary:
     """NaN where a run has no value."""
     standard_error: float
     """Of the mean; NaN for one run."""
+    rounding_error: float
+    """The same of those runs that have a value: digits beyond it mean nothing."""
     median: float
     low: float
     high: float
@@ -62,13 +65,14 @@ class Paired:
     """Pairs in which the value is smaller than the reference's."""
     mean: float
     """NaN where a pair is without a value."""
-    standard_error: float
+    rounding_error: float
+    """Standard error of those that have a value: digits beyond it mean nothing."""
     interval: tuple[float, float]
     """Of the mean, bootstrap; NaN where there are too few pairs or no mean."""
     median: float
     """Infinite where half of the pairs have no value on one side; NaN where nothing can be said."""
     p_value: float
-    """Of the two-sided signed-rank test, not corrected; NaN without pairs."""
+    """Of the two-sided signed-rank test, not corrected; NaN of too few pairs."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +106,8 @@ def summarise(values: Floats) -> Summary:
         runs=n,
         without=without,
         mean=float(values.mean()) if has_mean else math.nan,
-        standard_error=standard_error(values) if has_mean else math.nan,
+        standard_error=standard_error(values),
+        rounding_error=standard_error(values[np.isfinite(values)]),
         median=median,
         low=low,
         high=high,
@@ -146,7 +151,7 @@ def paired(own: Floats, reference: Floats) -> Paired:
         without=without,
         smaller=int((differences < 0).sum()),
         mean=float(differences.mean()) if has_mean else math.nan,
-        standard_error=standard_error(differences) if has_mean else math.nan,
+        rounding_error=standard_error(differences[np.isfinite(differences)]),
         interval=bootstrap_interval(differences) if has_mean else (math.nan, math.nan),
         median=quantile(differences, 0.5),
         p_value=signed_rank_p(differences),
@@ -159,8 +164,8 @@ def _differences(own: Floats, reference: Floats) -> Floats:
 
 
 def bootstrap_interval(values: Floats) -> tuple[float, float]:
-    """95 % interval of the mean by the bootstrap (bias-corrected and accelerated: Efron 1987); NaN of too few values."""
-    if len(values) < LEAST_FOR_INTERVAL:
+    """95 % interval of the mean by the bootstrap (bias-corrected, accelerated: Efron 1987); NaN of too few values."""
+    if len(values) < LEAST_PAIRS:
         return math.nan, math.nan
     if np.ptp(values) <= 1e-12 * np.abs(values).max():
         return float(values.mean()), float(values.mean())
@@ -178,9 +183,11 @@ def bootstrap_interval(values: Floats) -> tuple[float, float]:
 def signed_rank_p(differences: Floats) -> float:
     """Two-sided p value of Wilcoxon's signed-rank test (zeros as Pratt 1959); infinite differences rank highest.
 
+    NaN of fewer than 6: their smallest possible value is above 5 %, so there is nothing to be found.
+
     Exact where no ranks are tied, or up to 13 differences; otherwise by 9999 random changes of sign.
     """
-    if not len(differences):
+    if len(differences) < LEAST_PAIRS:
         return math.nan
     if not differences.any():
         return 1.0
@@ -190,8 +197,20 @@ def signed_rank_p(differences: Floats) -> float:
     sizes = np.abs(scores)
     if sizes.all() and len(np.unique(sizes)) == len(sizes):
         return float(stats.wilcoxon(scores, method="exact").pvalue)
-    method = stats.PermutationMethod(n_resamples=RESAMPLES, rng=np.random.default_rng(SEED))
-    return float(stats.wilcoxon(scores, zero_method="pratt", method=method).pvalue)
+    return _sign_changes_p(np.sign(scores) * stats.rankdata(sizes))
+
+
+def _sign_changes_p(signed_ranks: Floats) -> float:
+    """Two-sided p value of the sum of signed ranks, over changes of sign."""
+    drawn = stats.permutation_test(
+        (signed_ranks,),
+        np.sum,
+        permutation_type="samples",
+        vectorized=True,
+        n_resamples=RESAMPLES,
+        rng=np.random.default_rng(SEED),
+    )
+    return float(drawn.pvalue)
 
 
 def holm(p_values: Floats) -> Floats:
