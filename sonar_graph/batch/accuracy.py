@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from sonar_graph.batch.catalogue import Metric
-from sonar_graph.batch.recorded import ALL_LOGS, Batch
+from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
 from sonar_graph.batch.rounding import between, supported, with_error
 from sonar_graph.batch.statistics import Paired, Summary, holm, paired, summarise
 from sonar_graph.batch.tables import Cell, Column, Table, absent, number, words
@@ -17,7 +17,7 @@ Tests = dict[tuple[str, str, str], tuple[Paired, float]]
 """By column, log and contestant: the differences, and their p value corrected over the tests of the metric."""
 
 
-def all_tests(batch: Batch, metrics: list[Metric]) -> Tests:
+def all_tests(batch: RecordedBatch, metrics: list[Metric]) -> Tests:
     """Every contestant against the reference in every metric that has a better side; a metric is a family of tests."""
     tests: Tests = {}
     for metric in metrics:
@@ -26,7 +26,7 @@ def all_tests(batch: Batch, metrics: list[Metric]) -> Tests:
     return tests
 
 
-def _family(batch: Batch, metric: Metric) -> Tests:
+def _family(batch: RecordedBatch, metric: Metric) -> Tests:
     """Tests of one metric, with p values corrected over them; a filter's two estimates are one test."""
     found = {
         (key, log, contestant): batch.pairs(log, contestant, key)
@@ -41,11 +41,11 @@ def _family(batch: Batch, metric: Metric) -> Tests:
     return {place: (distinct[same[place]], corrected[same[place]]) for place in found}
 
 
-def _compared_logs(batch: Batch) -> list[str]:
+def _compared_logs(batch: RecordedBatch) -> list[str]:
     return [*batch.logs, ALL_LOGS] if len(batch.logs) > 1 else batch.logs
 
 
-def accuracy_table(batch: Batch, metric: Metric) -> Table:
+def accuracy_table(batch: RecordedBatch, metric: Metric) -> Table:
     """One metric: mean with standard error, median, and the range of the middle 80 % of runs."""
     columns = [*_first_columns(), Column("runs", "Runs")]
     for over, key in metric.keys.items():
@@ -67,7 +67,7 @@ def accuracy_table(batch: Batch, metric: Metric) -> Table:
     return Table(f"accuracy-{_slug(metric)}", _title(metric), _unit_note(metric), columns, rows)
 
 
-def difference_table(batch: Batch, metric: Metric, tests: Tests) -> Table:
+def difference_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
     """One metric: differences to the reference on the same log and seed."""
     columns = [*_first_columns(), Column("pairs", "Pairs")]
     for over, key in metric.keys.items():
@@ -108,14 +108,14 @@ def _first_cells(log: str, contestant: str) -> list[Cell]:
     return [words(log), words(contestant)]
 
 
-def _runs_cell(batch: Batch, log: str, contestant: str) -> Cell:
+def _runs_cell(batch: RecordedBatch, log: str, contestant: str) -> Cell:
     group = batch.group(log, contestant)
     failed = sum(not run.ended for run in group)
     anchor = group_anchor(batch.logs.index(log), batch.contestants.index(contestant))
     return Cell(str(len(group)), (len(group),), note=f"{failed} failed" if failed else "", link=f"#{anchor}")
 
 
-def _summary_cells(batch: Batch, log: str, contestant: str, key: str, metric: Metric) -> list[Cell]:
+def _summary_cells(batch: RecordedBatch, log: str, contestant: str, key: str, metric: Metric) -> list[Cell]:
     if not batch.is_asked(log, contestant, key):
         return [absent(2), absent(), absent(2)]
     return summary_cells(summarise(batch.values(log, contestant, key)), metric.factor)

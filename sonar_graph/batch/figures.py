@@ -16,7 +16,7 @@ from sonar_graph.batch.accuracy import Tests
 from sonar_graph.batch.catalogue import KINDS, Metric
 from sonar_graph.batch.exported import csv_text
 from sonar_graph.batch.overviews import anees_of
-from sonar_graph.batch.recorded import Batch
+from sonar_graph.batch.recorded import RecordedBatch
 from sonar_graph.batch.statistics import failure_rate, quantile
 from sonar_graph.evaluation.figure_style import (
     INK,
@@ -51,7 +51,7 @@ class Drawing:
     """What is drawn, as CSV, in the units of the results."""
 
 
-def spread_drawing(batch: Batch, metric: Metric) -> Drawing | None:
+def spread_drawing(batch: RecordedBatch, metric: Metric) -> Drawing | None:
     """Every run's value as a dot, with the median and the middle 80 %."""
     logs = [log for log in batch.logs if any(_finite(batch, log, name, metric).size for name in batch.contestants)]
     if not logs:
@@ -72,7 +72,7 @@ def spread_drawing(batch: Batch, metric: Metric) -> Drawing | None:
     return _drawn(figure, f"spread-{metric.name}", metric.label, caption, rows)
 
 
-def difference_drawing(batch: Batch, metric: Metric, tests: Tests) -> Drawing | None:
+def difference_drawing(batch: RecordedBatch, metric: Metric, tests: Tests) -> Drawing | None:
     """Mean differences to the reference with their intervals."""
     found = {place: test for place, (test, _) in tests.items() if place[0] in metric.keys.values()}
     logs = [log for log in batch.logs if any(place[1] == log and math.isfinite(t.mean) for place, t in found.items())]
@@ -100,7 +100,7 @@ def difference_drawing(batch: Batch, metric: Metric, tests: Tests) -> Drawing | 
     return _drawn(figure, f"difference-{metric.name}", f"{metric.label}: against {batch.reference}", caption, rows)
 
 
-def consistency_drawing(batch: Batch, what: str) -> Drawing | None:
+def consistency_drawing(batch: RecordedBatch, what: str) -> Drawing | None:
     """ANEES over independent runs against its chi-square band."""
     rows: Rows = [["log", "contestant", "estimate", "runs", "anees", "low", "high"]]
     known: dict[tuple[str, str], list[tuple[str, float]]] = {}
@@ -130,13 +130,13 @@ def consistency_drawing(batch: Batch, what: str) -> Drawing | None:
                 _draw_point(panel, mean, place, over)
     caption = (
         f"Normalised squared error of {what} at the last instant, average over runs per degree of freedom. The grey "
-        "band holds 95 % of the averages of consistent estimators; right of it covariances are too small, left too large. "
-        "Full: causal. Hollow: smoothed. A group with a run that did not end has no average and is not drawn."
+        "band holds 95 % of the averages of consistent estimators; right of it covariances are too small, left "
+        "too large. Full: causal. Hollow: smoothed. A group with a run that did not end has no average and is not drawn."
     )
     return _drawn(figure, f"anees-{what}", f"Consistency of {what}", caption, rows)
 
 
-def failure_drawing(batch: Batch) -> Drawing | None:
+def failure_drawing(batch: RecordedBatch) -> Drawing | None:
     """Failure rates with their intervals; None where every run ended."""
     if all(run.ended for run in batch.runs):
         return None
@@ -156,7 +156,7 @@ def failure_drawing(batch: Batch) -> Drawing | None:
     return _drawn(figure, "failures", "Runs that did not end", caption, rows)
 
 
-def cost_drawing(batch: Batch) -> Drawing | None:
+def cost_drawing(batch: RecordedBatch) -> Drawing | None:
     """Median and 99th percentile of the time of an update, over all runs of a group."""
     keys = ("update_p50_ms", "update_p99_ms")
     if not any(keys[0] in run.values for run in batch.runs):
@@ -176,7 +176,7 @@ def cost_drawing(batch: Batch) -> Drawing | None:
     return _drawn(figure, "costs", "Time of an update", caption, rows)
 
 
-def _panels(batch: Batch, logs: list[str], x_label: str) -> tuple[Figure, list[Axes]]:
+def _panels(batch: RecordedBatch, logs: list[str], x_label: str) -> tuple[Figure, list[Axes]]:
     """A panel a log, with a line for each contestant, the first on top."""
     names = batch.contestants
     height_in = len(logs) * (PANEL_IN + ROW_IN * len(names))
@@ -229,12 +229,12 @@ def _draw_point(panel: Axes, value: float, place: int, over: str) -> None:
     )
 
 
-def _finite(batch: Batch, log: str, contestant: str, metric: Metric) -> Floats:
+def _finite(batch: RecordedBatch, log: str, contestant: str, metric: Metric) -> Floats:
     values = np.concatenate([batch.values(log, contestant, key) for key in metric.keys.values()])
     return np.asarray(values[np.isfinite(values)])
 
 
-def _value_rows(batch: Batch, metric: Metric) -> Rows:
+def _value_rows(batch: RecordedBatch, metric: Metric) -> Rows:
     return [
         [run.log, run.contestant, "" if run.seed is None else str(run.seed), run.key, key, _text(run.value(key))]
         for run in batch.runs

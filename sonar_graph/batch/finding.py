@@ -7,14 +7,14 @@ from collections import Counter
 
 from sonar_graph.batch.accuracy import Tests, p_text
 from sonar_graph.batch.catalogue import Metric
-from sonar_graph.batch.recorded import Batch
+from sonar_graph.batch.recorded import RecordedBatch
 from sonar_graph.batch.rounding import supported, with_error
 from sonar_graph.batch.statistics import least_p, quantile, summarise
 
 SIGNIFICANT = 0.05
 
 
-def failures_told(batch: Batch) -> list[str]:
+def failures_told(batch: RecordedBatch) -> list[str]:
     """A sentence on each contestant with runs that did not end."""
     sentences = []
     for contestant in batch.contestants:
@@ -26,7 +26,7 @@ def failures_told(batch: Batch) -> list[str]:
     return sentences
 
 
-def errors_told(batch: Batch, metrics: list[Metric], tests: Tests) -> list[str]:
+def errors_told(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> list[str]:
     """For each log the first metric that it has: medians, then differences to the reference that are no chance."""
     sentences = []
     for log in batch.logs:
@@ -46,7 +46,7 @@ def errors_told(batch: Batch, metrics: list[Metric], tests: Tests) -> list[str]:
     return sentences
 
 
-def _log_told(batch: Batch, log: str, metric: Metric, key: str, tests: Tests) -> str:
+def _log_told(batch: RecordedBatch, log: str, metric: Metric, key: str, tests: Tests) -> str:
     medians = [
         (quantile(values, 0.5), name, summarise(values).rounding_error * metric.factor)
         for name in batch.contestants
@@ -63,7 +63,7 @@ def _log_told(batch: Batch, log: str, metric: Metric, key: str, tests: Tests) ->
     return " ".join([opening, *_differences_told(batch, log, metric, key, tests)])
 
 
-def _differences_told(batch: Batch, log: str, metric: Metric, key: str, tests: Tests) -> list[str]:
+def _differences_told(batch: RecordedBatch, log: str, metric: Metric, key: str, tests: Tests) -> list[str]:
     told, alike = [], []
     for contestant in batch.contestants:
         if (key, log, contestant) not in tests:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from sonar_graph.batch.accuracy import group_anchor, summary_cells
 from sonar_graph.batch.catalogue import KINDS, Metric
-from sonar_graph.batch.recorded import Batch, RecordedRun
+from sonar_graph.batch.recorded import RecordedBatch, RecordedRun
 from sonar_graph.batch.rounding import supported
 from sonar_graph.batch.statistics import Anees, anees, failure_rate, standard_error, summarise
 from sonar_graph.batch.tables import Cell, Column, Table, absent, number, words
@@ -34,7 +34,7 @@ class RunList:
     table: Table
 
 
-def failure_table(batch: Batch) -> Table:
+def failure_table(batch: RecordedBatch) -> Table:
     """How many runs of each contestant came to an end, and how others ended."""
     columns = [
         Column("log", "Log", is_number=False),
@@ -53,7 +53,7 @@ def failure_table(batch: Batch) -> Table:
     return Table("failures", "Runs that ended", "Rates with 95 % intervals (Wilson).", columns, rows)
 
 
-def _ending_cells(batch: Batch, log: str, contestant: str, group: list[RecordedRun]) -> list[Cell]:
+def _ending_cells(batch: RecordedBatch, log: str, contestant: str, group: list[RecordedRun]) -> list[Cell]:
     counts = Counter(run.status for run in group)
     rate = failure_rate(len(group) - counts["ok"], len(group))
     anchor = group_anchor(batch.logs.index(log), batch.contestants.index(contestant))
@@ -66,7 +66,7 @@ def _ending_cells(batch: Batch, log: str, contestant: str, group: list[RecordedR
     ]
 
 
-def anees_of(batch: Batch, log: str, contestant: str, kind: str, what: str) -> Anees | None:
+def anees_of(batch: RecordedBatch, log: str, contestant: str, kind: str, what: str) -> Anees | None:
     """The ANEES of a group over its runs, at the last instant of each; None where no covariance is reported."""
     key = f"{kind}.nees_{what}{LATEST}"
     if not batch.is_asked(log, contestant, key):
@@ -76,7 +76,7 @@ def anees_of(batch: Batch, log: str, contestant: str, kind: str, what: str) -> A
     return anees(batch.values(log, contestant, key), dofs.pop() if len(dofs) == 1 else math.nan)
 
 
-def consistency_table(batch: Batch) -> Table:
+def consistency_table(batch: RecordedBatch) -> Table:
     """ANEES at the last instant of runs that are independent, with its band."""
     columns = [
         Column("log", "Log", is_number=False),
@@ -102,7 +102,7 @@ def consistency_table(batch: Batch) -> Table:
     return Table("consistency", "ANEES of independent runs", caption, columns, rows)
 
 
-def _consistency_row(batch: Batch, log: str, contestant: str, what: str) -> list[Cell]:
+def _consistency_row(batch: RecordedBatch, log: str, contestant: str, what: str) -> list[Cell]:
     told = {kind: anees_of(batch, log, contestant, kind, what) for kind in KINDS}
     known = [one for one in told.values() if one is not None]
     if not known:
@@ -119,7 +119,7 @@ def _consistency_row(batch: Batch, log: str, contestant: str, what: str) -> list
     return cells
 
 
-def cost_table(batch: Batch) -> Table:
+def cost_table(batch: RecordedBatch) -> Table:
     """Time and memory: median and the range of the middle 80 % of runs."""
     columns = [Column("log", "Log", is_number=False), Column("contestant", "Estimator", is_number=False)]
     known = [key for key in COSTS if any(key in run.values for run in batch.runs)]
@@ -142,7 +142,7 @@ def cost_table(batch: Batch) -> Table:
     return Table("costs", "Time and memory", caption, columns, rows)
 
 
-def run_lists(batch: Batch, metrics: list[Metric]) -> list[RunList]:
+def run_lists(batch: RecordedBatch, metrics: list[Metric]) -> list[RunList]:
     """Every run, by log and contestant."""
     return [
         RunList(group_anchor(i, j), _run_table(f"{log}, {contestant}", f"runs-{i}-{j}", group, metrics))

@@ -24,7 +24,7 @@ from sonar_graph.batch.figures import (
 )
 from sonar_graph.batch.finding import errors_told, failures_told, power_told
 from sonar_graph.batch.overviews import consistency_table, cost_table, failure_table, run_lists
-from sonar_graph.batch.recorded import RESULTS, Batch
+from sonar_graph.batch.recorded import RESULTS, RecordedBatch
 from sonar_graph.batch.statistics import LEAST_PAIRS, RESAMPLES
 from sonar_graph.batch.tables import Table
 from sonar_graph.evaluation.atomic import replacing
@@ -43,7 +43,7 @@ class Chapter:
     tables: list[Table]
 
 
-def write_batch_report(batch: Batch, folder: Path) -> Path:
+def write_batch_report(batch: RecordedBatch, folder: Path) -> Path:
     """Write ``report.html``, and each table as CSV and LaTeX into ``tables/``.
 
     Nothing is run: everything comes from the results.
@@ -60,7 +60,7 @@ def write_batch_report(batch: Batch, folder: Path) -> Path:
     return folder / PAGE
 
 
-def render_batch(batch: Batch) -> str:
+def render_batch(batch: RecordedBatch) -> str:
     """The page as text. Everything that comes from a suite, a log or an estimator is escaped."""
     metrics = metrics_of(batch.metrics)
     return _render(_content(batch, metrics, all_tests(batch, metrics)))
@@ -83,13 +83,14 @@ def _render(content: dict[str, Any]) -> str:
     return environment.get_template(TEMPLATE).render(**content)
 
 
-def _content(batch: Batch, metrics: list[Metric], tests: Tests) -> dict[str, Any]:
+def _content(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> dict[str, Any]:
     """What the template shows, by the names it uses."""
     chapters = [_chapter(batch, metric, tests) for metric in metrics]
     shown = [chapter for chapter in chapters if chapter.drawings or chapter.tables]
     failures, consistency, costs = failure_table(batch), consistency_table(batch), cost_table(batch)
     return {
         "name": batch.name,
+        "description": batch.description,
         "summary": _summary(batch),
         "failed": failures_told(batch),
         "warnings": power_told(tests),
@@ -116,7 +117,7 @@ def _content(batch: Batch, metrics: list[Metric], tests: Tests) -> dict[str, Any
     }
 
 
-def _chapter(batch: Batch, metric: Metric, tests: Tests) -> Chapter:
+def _chapter(batch: RecordedBatch, metric: Metric, tests: Tests) -> Chapter:
     if not any(batch.is_asked(log, name, key) for key in metric.keys.values() for log, name in _places(batch)):
         return Chapter(metric, [], [])
     tables = [accuracy_table(batch, metric), difference_table(batch, metric, tests)]
@@ -124,7 +125,7 @@ def _chapter(batch: Batch, metric: Metric, tests: Tests) -> Chapter:
     return Chapter(metric, drawings, [table for table in tables if table.rows])
 
 
-def _places(batch: Batch) -> list[tuple[str, str]]:
+def _places(batch: RecordedBatch) -> list[tuple[str, str]]:
     return [(log, name) for log in batch.logs for name in batch.contestants]
 
 
@@ -132,7 +133,7 @@ def _drawn(drawings: Any) -> list[Drawing]:
     return [drawing for drawing in drawings if drawing is not None]
 
 
-def _summary(batch: Batch) -> str:
+def _summary(batch: RecordedBatch) -> str:
     seeds = max(len(batch.group(log, name)) for log, name in _places(batch))
     return (
         f"{len(batch.runs)} runs of {len(batch.contestants)} estimators on {len(batch.logs)} logs, up to {seeds} seeds "
@@ -140,7 +141,7 @@ def _summary(batch: Batch) -> str:
     )
 
 
-def _settings(batch: Batch) -> dict[str, str]:
+def _settings(batch: RecordedBatch) -> dict[str, str]:
     """Options of logs and settings of estimators, as recorded with the first run of each."""
     found: dict[str, str] = {}
     for run in batch.runs:
@@ -151,7 +152,7 @@ def _settings(batch: Batch) -> dict[str, str]:
     return found
 
 
-def _origins(batch: Batch) -> dict[str, list[str]]:
+def _origins(batch: RecordedBatch) -> dict[str, list[str]]:
     """Versions and machines, each with the number of runs where they differ."""
     found = {}
     for name in SAME_FOR_ALL:

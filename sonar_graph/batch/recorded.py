@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-import tomllib
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.measurements import Floats
 
 RESULTS, SUITE = "results.parquet", "suite.toml"
+SUITE_METADATA = b"sonar_graph.suite"
 DEFAULT_VARIANT = ("", "default")
 DEFAULT_METRICS = (
     "causal.ate_se2_m",
@@ -67,7 +65,7 @@ class RecordedRun:
 
 
 @dataclass(frozen=True)
-class Batch:
+class RecordedBatch:
     """All runs of a batch, and what its suite says about comparing them."""
 
     name: str
@@ -75,6 +73,7 @@ class Batch:
     reference: str
     """Contestant with which the others are compared."""
     metrics: list[str]
+    description: str = ""
     suite: str = ""
     """The suite's text."""
 
@@ -139,7 +138,7 @@ def is_batch(folder: Path) -> bool:
     return (folder / RESULTS).is_file()
 
 
-def read_batch(folder: Path, reference: str | None = None) -> Batch:
+def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
     """The batch in a folder.
 
     Parameters
@@ -152,16 +151,15 @@ def read_batch(folder: Path, reference: str | None = None) -> Batch:
     EvaluationError
         When there are no results, they lack a column, or the reference has no run.
     """
-    runs = _read_runs(folder / RESULTS)
-    text = (folder / SUITE).read_text("utf-8") if (folder / SUITE).is_file() else ""
-    suite = _parse_suite(text, folder / SUITE)
-    chosen = reference or _plain_name(suite.get("reference")) or runs[0].contestant
-    batch = Batch(
-        name=suite.get("name") or runs[0].texts.get("suite") or folder.name,
+    runs, about = _read_table(folder / RESULTS)
+    chosen = reference or _plain_name(about.get("reference")) or runs[0].contestant
+    batch = RecordedBatch(
+        name=about.get("name") or runs[0].texts.get("suite") or folder.name,
         runs=runs,
         reference=chosen,
-        metrics=list(suite.get("metrics") or DEFAULT_METRICS),
-        suite=text,
+        metrics=list(about.get("metrics") or DEFAULT_METRICS),
+        description=about.get("description", ""),
+        suite=(folder / SUITE).read_text("utf-8") if (folder / SUITE).is_file() else "",
     )
     if chosen not in batch.contestants:
         raise EvaluationError(
@@ -175,33 +173,31 @@ def _plain_name(reference: str | None) -> str | None:
     return reference.removesuffix("/default") if reference else None
 
 
-def _parse_suite(text: str, path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise EvaluationError(f"{path}: not TOML ({error}); copy the suite there again") from error
-
-
-def _read_runs(path: Path) -> list[RecordedRun]:
+def _read_table(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
+    """The runs, and what the suite says about comparing them."""
     if not path.is_file():
         raise EvaluationError(f"{path.parent}: no {path.name} in it; it needs a folder that bench wrote to")
+    import pyarrow as pa  # takes a third of a second, and only batches need it
+    import pyarrow.parquet as pq
+
     try:
-        rows = pq.read_table(path).to_pylist()
+        table = pq.read_table(path)
     except (pa.ArrowInvalid, OSError) as error:
         raise EvaluationError(f"{path}: cannot be read as Parquet ({error}); run bench again, it resumes") from error
-    if not rows:
-        raise EvaluationError(f"{path}: has no rows; run bench again, it resumes")
-    missing = [name for name in NEEDED if name not in rows[0]]
+    missing = [name for name in NEEDED if name not in table.column_names]
     if missing:
         raise EvaluationError(f"{path}: no column {', '.join(missing)}; expected results that bench wrote")
-    return [_run(row) for row in rows]
+    if not table.num_rows:
+        raise EvaluationError(f"{path}: has no rows; run bench again, it resumes")
+    about = json.loads((table.schema.metadata or {}).get(SUITE_METADATA, b"{}"))
+    return [_run(row) for row in table.to_pylist()], about
 
 
 def _run(row: dict[str, Any]) -> RecordedRun:
     words = {name: str(row.pop(name, None) or "") for name in WORDS}
     seed = row.pop("seed", None)
     objects = {name: _as_text(row.pop(name)) for name in OBJECTS if row.get(name)}
-    numbers = {name: float(value) for name, value in row.items() if isinstance(value, (int, float))}
+    numbers = {name: float(value) for name, value in row.items() if isinstance(value, int | float)}
     others = {name: value for name, value in row.items() if isinstance(value, str)}
     known = {name: words[name] for name in ("suite", "generator", "machine") if words[name]}
     return RecordedRun(

@@ -1,8 +1,8 @@
 """What many runs say together: spread, paired differences, failure rates, consistency.
 
 A run that did not end, or gave no value, is never left out. It has the value infinity, the worst there is: quantiles
-and rank tests go on with it (Lachin 1999, "Worst-rank score analysis with informatively missing observations in clinical
-trials"), and a mean over such a group does not exist.
+and rank tests go on with it (Lachin 1999, "Worst-rank score analysis with informatively missing observations in
+clinical trials"), and a mean over such a group does not exist.
 Equations: docs/theory/batch_statistics.md.
 """
 

@@ -1,6 +1,7 @@
 """The commands: thin shells around the library, one module a group.
 
-Exit codes: 0 done; 1 a comparison in which some run failed (everything is written); 2 the user's mistake, told in
+Exit codes: 0 done; 1 a comparison in which some run failed (everything is written), or a batch that
+got worse than its reference; 2 the user's mistake, told in
 one line on stderr; 130 interrupted. Only an error that nobody foresaw ends in a traceback.
 """
 
@@ -16,6 +17,7 @@ from sonar_graph import __version__
 from sonar_graph.cli.comparing import compare, report, run
 from sonar_graph.cli.converting import datasets
 from sonar_graph.cli.demonstrating import demo
+from sonar_graph.cli.gating import benches
 from sonar_graph.cli.inspecting import inspect
 from sonar_graph.cli.listing import estimators
 from sonar_graph.cli.recognising import calibrate, recognise
@@ -39,6 +41,7 @@ app = typer.Typer(
 )
 app.add_typer(worlds)
 app.add_typer(datasets)
+app.add_typer(benches)
 app.command(epilog=examples("sonar-graph inspect dive.mcap", "sonar-graph inspect dive.mcap --toml"))(inspect)
 app.command(
     epilog=examples(

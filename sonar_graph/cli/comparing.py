@@ -142,12 +142,17 @@ def compare(
 
 def report(
     folder: Annotated[
-        Path, typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that compare or run wrote.")
+        Path,
+        typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that compare, run or bench wrote."),
     ],
 ) -> None:
-    """Write report.html anew from what compare or run left in a folder."""
+    """Write report.html, and a batch's tables, anew from what compare, run or bench left in a folder."""
+    from sonar_graph.batch.recorded import is_batch
     from sonar_graph.evaluation.storage import read_comparison
 
+    if is_batch(folder):
+        typer.echo(f"Report: {_write_batch_report(writable_folder(folder))}")
+        return
     comparison = read_comparison(folder)
     typer.echo(f"Report: {_write_report(comparison, writable_folder(folder))}")
 
@@ -256,6 +261,14 @@ def _write_report(comparison: Comparison, folder: Path) -> Path:
     with working("drawing"):
         write_report(comparison, page)
     return page
+
+
+def _write_batch_report(folder: Path) -> Path:
+    from sonar_graph.batch.page import write_batch_report
+    from sonar_graph.batch.recorded import read_batch
+
+    with working("drawing"):
+        return write_batch_report(read_batch(folder), folder)
 
 
 def _print_summary(comparison: Comparison) -> None:

@@ -1,0 +1,76 @@
+"""``sonar-graph bench``, what is done with results: ``bless`` a reference, and ``gate`` a batch by it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer.core import TyperGroup
+
+from sonar_graph.cli.outputs import writable_json
+from sonar_graph.cli.texts import examples
+
+BatchFolder = Annotated[
+    Path, typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that bench wrote.")
+]
+DEFAULT_COMMAND = "run"
+
+
+class SuiteFirst(TyperGroup):
+    """Commands of which `DEFAULT_COMMAND` need not be named: ``bench SUITE.toml`` is ``bench run SUITE.toml``."""
+
+    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
+        """Put the name of the default command where none is given."""
+        is_named = not args or args[0] in self.commands or args[0] in ctx.help_option_names
+        given = args if is_named or DEFAULT_COMMAND not in self.commands else [DEFAULT_COMMAND, *args]
+        return super().parse_args(ctx, given)
+
+
+benches = typer.Typer(
+    name="bench",
+    cls=SuiteFirst,
+    help="Run suites: many logs, seeds, estimators and variants; judge what came out.",
+    epilog=examples("sonar-graph bench gate DIR reference.json", "sonar-graph bench bless DIR reference.json"),
+)
+
+
+@benches.command(epilog=examples("sonar-graph bench bless results benchmarks/reference.json"))
+def bless(
+    folder: BatchFolder,
+    reference: Annotated[Path, typer.Argument(metavar="REFERENCE.json", help="File to write; replaced if it exists.")],
+) -> None:
+    """Make a batch the reference that later ones are held against."""
+    from sonar_graph.batch.gate import bless as write_reference
+    from sonar_graph.batch.recorded import read_batch
+
+    batch = read_batch(folder)
+    write_reference(batch, writable_json(reference, []))
+    failed = sum(not run.ended for run in batch.runs)
+    typer.echo(f"Reference: {reference} ({len(batch.runs)} runs, {failed} of which did not end)")
+
+
+@benches.command(epilog=examples("sonar-graph bench gate results benchmarks/reference.json"))
+def gate(
+    folder: BatchFolder,
+    reference: Annotated[
+        Path, typer.Argument(metavar="REFERENCE.json", exists=True, dir_okay=False, help="What bless wrote.")
+    ],
+) -> None:
+    """Say whether accuracy or consistency got worse beyond noise; exit with 1 if so. Nothing is run."""
+    exit_by_gate(folder, reference)
+
+
+def exit_by_gate(folder: Path, reference: Path) -> None:
+    """Print what got worse, and exit with 1 where anything did."""
+    from sonar_graph.batch.gate import gate as judge
+    from sonar_graph.batch.recorded import read_batch
+
+    verdict = judge(read_batch(folder), reference)
+    for worsening in verdict.worsenings:
+        typer.echo(f"Worse: {worsening}")
+    if verdict.new:
+        typer.echo(f"Not judged: {len(verdict.new)} runs that the reference does not have, first {verdict.new[0]}")
+    typer.echo(f"Gate: {'passed' if verdict.passed else 'failed'}, {verdict.compared} runs held against {reference}")
+    if not verdict.passed:
+        raise typer.Exit(1)
