@@ -131,7 +131,8 @@ def consistency_drawing(batch: RecordedBatch, what: str) -> Drawing | None:
     caption = (
         f"Normalised squared error of {what} at the last instant, average over runs per degree of freedom. The grey "
         "band holds 95 % of the averages of consistent estimators; right of it covariances are too small, left "
-        "too large. Full: causal. Hollow: smoothed. A group with a run that did not end has no average and is not drawn."
+        "too large. Full: causal. Hollow: smoothed. A group with a run that did not end has no average and is "
+        "not drawn."
     )
     return _drawn(figure, f"anees-{what}", f"Consistency of {what}", caption, rows)
 

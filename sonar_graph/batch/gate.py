@@ -102,8 +102,8 @@ def gate(batch: RecordedBatch, reference: Path) -> Verdict:
     missing = sorted(set(blessed["runs"]) - set(runs))
     if missing:
         raise EvaluationError(
-            f"{reference}: {len(missing)} of its runs are not in the batch, first {_told(missing[0])}; run the same suite, "
-            "or bless a new reference"
+            f"{reference}: {len(missing)} of its runs are not in the batch, first {_told(missing[0])}; run the same "
+            "suite, or bless a new reference"
         )
     pairs = [(entry, runs[name]) for name, entry in blessed["runs"].items()]
     worse = [*_failures(pairs), *_worse_groups(pairs, blessed["metrics"])]

@@ -177,9 +177,11 @@ def _read_table(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
     """The runs, and what the suite says about comparing them."""
     if not path.is_file():
         raise EvaluationError(f"{path.parent}: no {path.name} in it; it needs a folder that bench wrote to")
-    import pyarrow as pa  # takes a third of a second, and only batches need it
-    import pyarrow.parquet as pq
-
+    try:
+        import pyarrow as pa  # only batches need it
+        import pyarrow.parquet as pq
+    except ModuleNotFoundError as error:
+        raise EvaluationError(f"{path}: reading it needs pyarrow; pip install 'sonar-graph[bench]'") from error
     try:
         table = pq.read_table(path)
     except (pa.ArrowInvalid, OSError) as error:

@@ -1,8 +1,8 @@
 """The commands: thin shells around the library, one module a group.
 
-Exit codes: 0 done; 1 a comparison in which some run failed (everything is written), or a batch that
-got worse than its reference; 2 the user's mistake, told in
-one line on stderr; 130 interrupted. Only an error that nobody foresaw ends in a traceback.
+Exit codes: 0 done; 1 a comparison in which some run failed (everything is written), or a batch that is worse than its
+reference; 2 the user's mistake, told in one line on stderr; 130 interrupted. Only an error that nobody foresaw ends in
+a traceback.
 """
 
 from __future__ import annotations
