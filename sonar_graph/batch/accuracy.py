@@ -52,7 +52,7 @@ def accuracy_table(batch: RecordedBatch, metric: Metric) -> Table:
         columns += [
             Column(f"{key}_mean", "Mean ± s.e.", over, ("", "se")),
             Column(f"{key}_median", "Median", over),
-            Column(f"{key}_quantile", "10 to 90 %", over, QUANTILES),
+            Column(key, "10 to 90 %", over, QUANTILES),
         ]
     rows = [
         [

@@ -126,7 +126,7 @@ def cost_table(batch: RecordedBatch) -> Table:
     for key in known:
         columns += [
             Column(f"{key}_median", "Median", COSTS[key]),
-            Column(f"{key}_quantile", "10 to 90 %", COSTS[key], ("10_percent", "90_percent")),
+            Column(key, "10 to 90 %", COSTS[key], ("10_percent", "90_percent")),
         ]
     rows = [
         [

@@ -21,6 +21,7 @@ CONFIDENCE = 0.95
 LOW, HIGH = 0.1, 0.9
 """Quantiles that are shown beside the median."""
 RESAMPLES = 9999
+NUMBERS_AT_ONCE = 1_000_000
 SEED = 20140214
 """Of everything drawn here: the same results make the same report."""
 LEAST_PAIRS = 6
@@ -173,6 +174,7 @@ def bootstrap_interval(values: Floats) -> tuple[float, float]:
         (values,),
         np.mean,
         n_resamples=RESAMPLES,
+        batch=_batch(len(values)),
         confidence_level=CONFIDENCE,
         method="BCa",
         rng=np.random.default_rng(SEED),
@@ -208,9 +210,15 @@ def _sign_changes_p(signed_ranks: Floats) -> float:
         permutation_type="samples",
         vectorized=True,
         n_resamples=RESAMPLES,
+        batch=_batch(len(signed_ranks)),
         rng=np.random.default_rng(SEED),
     )
     return float(drawn.pvalue)
+
+
+def _batch(size: int) -> int:
+    """Resamples drawn at once, so that memory does not grow with the number of runs."""
+    return max(1, NUMBERS_AT_ONCE // size)
 
 
 def holm(p_values: Floats) -> Floats:

@@ -18,7 +18,7 @@ LOGS = ("basin", "basin, wrong_id_rate=0.05")
 
 
 def drawn_batch(seeds: int = 10, *, logs: tuple[str, ...] = LOGS) -> RecordedBatch:
-    """Estimators with errors of known size on hard and easy seeds; the last one reports variances four times too small."""
+    """Estimators with errors of known size on hard and easy seeds; ekf-slam reports variances four times too small."""
     rng = np.random.default_rng(3)
     runs = []
     for log in logs:
