@@ -124,9 +124,18 @@ def test_examples_in_help_are_understood(
     path: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for name in ("dive.mcap", "vehicle.toml", "dive.toml", "dive.bag", "dive.ddf", "dive.aris", "pings.raw"):
+    for name in (
+        "dive.mcap",
+        "vehicle.toml",
+        "dive.toml",
+        "dive.bag",
+        "dive.ddf",
+        "dive.aris",
+        "pings.raw",
+        "reference.json",
+    ):
         Path(name).touch()
-    for name in ("comparison", "MRCLAM_Dataset6", "DLR", "A-KIT", "ros2_bag_folder"):
+    for name in ("comparison", "MRCLAM_Dataset6", "DLR", "A-KIT", "ros2_bag_folder", "results"):
         Path(name).mkdir()
     command = commands()[path]
     examples = examples_of(command)
@@ -136,7 +145,7 @@ def test_examples_in_help_are_understood(
         command.make_context(path[-1], words[1 + len(path) :])
 
 
-@pytest.mark.parametrize("group", ["simulate", "convert"])
+@pytest.mark.parametrize("group", ["simulate", "convert", "bench"])
 def test_help_of_a_group_ends_in_examples(group: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(group, "--help") == 0
     assert f"sonar-graph {group} " in capsys.readouterr().out.partition("Examples:")[2]

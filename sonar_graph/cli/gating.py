@@ -31,11 +31,11 @@ benches = typer.Typer(
     name="bench",
     cls=SuiteFirst,
     help="Run suites: many logs, seeds, estimators and variants; judge what came out.",
-    epilog=examples("sonar-graph bench gate DIR reference.json", "sonar-graph bench bless DIR reference.json"),
+    epilog=examples("sonar-graph bench gate results reference.json", "sonar-graph bench bless results reference.json"),
 )
 
 
-@benches.command(epilog=examples("sonar-graph bench bless results benchmarks/reference.json"))
+@benches.command(epilog=examples("sonar-graph bench bless results reference.json"))
 def bless(
     folder: BatchFolder,
     reference: Annotated[Path, typer.Argument(metavar="REFERENCE.json", help="File to write; replaced if it exists.")],
@@ -50,7 +50,7 @@ def bless(
     typer.echo(f"Reference: {reference} ({len(batch.runs)} runs, {failed} of which did not end)")
 
 
-@benches.command(epilog=examples("sonar-graph bench gate results benchmarks/reference.json"))
+@benches.command(epilog=examples("sonar-graph bench gate results reference.json"))
 def gate(
     folder: BatchFolder,
     reference: Annotated[

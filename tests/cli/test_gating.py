@@ -8,8 +8,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from sonar_graph.cli import main
-
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
@@ -36,20 +34,14 @@ def _write(folder: Path, factor: float) -> Path:
     return folder
 
 
-def run(*arguments: str | Path) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    return int(ended.value.code or 0)
-
-
-def test_report_rebuilds_page_and_tables_of_a_batch(folder, capsys):
+def test_report_rebuilds_page_and_tables_of_a_batch(run, folder, capsys):
     assert run("report", folder) == 0
     assert capsys.readouterr().out == f"Report: {folder / 'report.html'}\n"
     assert (folder / "report.html").is_file()
     assert (folder / "tables" / "difference-ate-se2-m.tex").is_file()
 
 
-def test_a_batch_passes_by_the_reference_that_it_became(folder, tmp_path, capsys):
+def test_a_batch_passes_by_the_reference_that_it_became(run, folder, tmp_path, capsys):
     reference = tmp_path / "reference.json"
     assert run("bench", "bless", folder, reference) == 0
     assert run("bench", "gate", folder, reference) == 0
@@ -59,7 +51,7 @@ def test_a_batch_passes_by_the_reference_that_it_became(folder, tmp_path, capsys
     ]
 
 
-def test_a_worse_batch_ends_with_one_and_says_what_is_worse(folder, tmp_path, capsys):
+def test_a_worse_batch_ends_with_one_and_says_what_is_worse(run, folder, tmp_path, capsys):
     reference = tmp_path / "reference.json"
     run("bench", "bless", folder, reference)
     assert run("bench", "gate", _write(tmp_path / "worse", 1.5), reference) == 1
@@ -68,13 +60,13 @@ def test_a_worse_batch_ends_with_one_and_says_what_is_worse(folder, tmp_path, ca
     assert "Gate: failed" in said
 
 
-def test_a_folder_without_results_is_the_users_mistake(tmp_path, capsys):
+def test_a_folder_without_results_is_the_users_mistake(run, tmp_path, capsys):
     assert run("bench", "bless", tmp_path, tmp_path / "reference.json") == 2
     assert "no results.parquet in it" in capsys.readouterr().err
     assert not (tmp_path / "reference.json").exists()
 
 
-def test_a_reference_is_json_that_every_reader_takes(folder, tmp_path):
+def test_a_reference_is_json_that_every_reader_takes(run, folder, tmp_path):
     run("bench", "bless", folder, tmp_path / "reference.json")
     content = json.loads((tmp_path / "reference.json").read_text("utf-8"))
     assert content["format"] == "sonar_graph batch reference 1"
