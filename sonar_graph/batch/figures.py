@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from sonar_graph.batch.accuracy import Tests
 from sonar_graph.batch.catalogue import KINDS, Metric
@@ -60,7 +61,7 @@ def spread_drawing(batch: RecordedBatch, metric: Metric) -> Drawing | None:
     for panel, log in zip(panels, logs, strict=True):
         values = np.concatenate([_finite(batch, log, name, metric) for name in batch.contestants])
         if values.min() > 0 and values.max() > SMALL * values.min():
-            logarithmic(panel, "x")
+            _spread_out(panel)
         for place, contestant in enumerate(batch.contestants):
             for over, key in metric.keys.items():
                 _draw_spread(panel, batch.values(log, contestant, key) * metric.factor, place, over)
@@ -120,7 +121,7 @@ def consistency_drawing(batch: RecordedBatch, what: str) -> Drawing | None:
     logs = [log for log in batch.logs if log in bands]
     figure, panels = _panels(batch, logs, f"ANEES of {what} at the last instant")
     for panel, log in zip(panels, logs, strict=True):
-        logarithmic(panel, "x")
+        _spread_out(panel)
         for low, high in bands[log]:
             if math.isfinite(low):
                 panel.axvspan(low, high, color=TRUTH, alpha=0.25, linewidth=0)
@@ -165,7 +166,7 @@ def cost_drawing(batch: RecordedBatch) -> Drawing | None:
     figure, panels = _panels(batch, batch.logs, "time of an update (ms)")
     rows: Rows = [["log", "contestant", *keys]]
     for panel, log in zip(panels, batch.logs, strict=True):
-        logarithmic(panel, "x")
+        _spread_out(panel)
         for place, contestant in enumerate(batch.contestants):
             ends = [quantile(batch.values(log, contestant, key), 0.5) for key in keys]
             rows.append([log, contestant, *map(_text, ends)])
@@ -190,6 +191,12 @@ def _panels(batch: RecordedBatch, logs: list[str], x_label: str) -> tuple[Figure
             label.set_color(colour(place))
     name_axes(axes[-1, 0], x_label)
     return figure, list(axes[:, 0])
+
+
+def _spread_out(panel: Axes) -> None:
+    """A logarithmic scale with numbers at 1, 2 and 5 of each power of ten."""
+    logarithmic(panel, "x")
+    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
 
 
 def _draw_spread(panel: Axes, values: Floats, place: int, over: str) -> None:

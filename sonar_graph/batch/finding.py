@@ -12,6 +12,7 @@ from sonar_graph.batch.rounding import supported, with_error
 from sonar_graph.batch.statistics import least_p, quantile, summarise
 
 SIGNIFICANT = 0.05
+SCORED = "scored_instants"
 
 
 def failures_told(batch: RecordedBatch) -> list[str]:
@@ -80,6 +81,21 @@ def _differences_told(batch: RecordedBatch, log: str, metric: Metric, key: str, 
     if alike:
         told.append(f"Not told apart from {batch.reference}: {', '.join(alike)}.")
     return told
+
+
+def instants_told(batch: RecordedBatch) -> list[str]:
+    """A warning where runs with the same log and seed are scored at different instants."""
+    uneven = []
+    for log in batch.logs:
+        counts: dict[int | None, set[float]] = {}
+        for run in batch.runs:
+            if run.log == log and run.ended and SCORED in run.values:
+                counts.setdefault(run.seed, set()).add(run.values[SCORED])
+        if any(len(known) > 1 for known in counts.values()):
+            uneven.append(log)
+    if not uneven:
+        return []
+    return [f"Scored at different numbers of instants, which differences then mix in: {', '.join(uneven)}."]
 
 
 def power_told(tests: Tests) -> list[str]:

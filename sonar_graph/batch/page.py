@@ -22,7 +22,7 @@ from sonar_graph.batch.figures import (
     failure_drawing,
     spread_drawing,
 )
-from sonar_graph.batch.finding import errors_told, failures_told, power_told
+from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told
 from sonar_graph.batch.overviews import consistency_table, cost_table, failure_table, run_lists
 from sonar_graph.batch.recorded import RESULTS, RecordedBatch
 from sonar_graph.batch.statistics import LEAST_PAIRS, RESAMPLES
@@ -93,7 +93,7 @@ def _content(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> dict[
         "description": batch.description,
         "summary": _summary(batch),
         "failed": failures_told(batch),
-        "warnings": power_told(tests),
+        "warnings": [*instants_told(batch), *power_told(tests)],
         "finding": errors_told(batch, metrics, tests),
         "reference": batch.reference,
         "colours": len(ESTIMATOR_COLOURS),
@@ -149,7 +149,7 @@ def _settings(batch: RecordedBatch) -> dict[str, str]:
             found.setdefault(f"log {run.log}", options)
         if params := run.texts.get("params"):
             found.setdefault(f"estimator {run.contestant}", params)
-    return found
+    return dict(sorted(found.items(), key=lambda item: item[0].startswith("estimator")))
 
 
 def _origins(batch: RecordedBatch) -> dict[str, list[str]]:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import io
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from sonar_graph.batch.accuracy import accuracy_table, all_tests, difference_table
 from sonar_graph.batch.catalogue import Metric, metrics_of
 from sonar_graph.batch.exported import as_csv, as_latex, latex_text, write_tables
-from sonar_graph.batch.finding import errors_told, failures_told, power_told
+from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told
 from sonar_graph.batch.overviews import consistency_table, cost_table, failure_table, run_lists
 from sonar_graph.batch.recorded import ALL_LOGS
 from sonar_graph.batch.tables import Cell, Column, Table
@@ -161,3 +162,11 @@ def test_too_few_seeds_are_warned_of():
     metrics = metrics_of(METRICS)
     assert "4 pairs" in power_told(all_tests(few, metrics))[0]
     assert power_told(all_tests(many, metrics)) == []
+
+
+def test_runs_that_were_scored_at_other_instants_are_warned_of():
+    batch = drawn_batch(2)
+    even = replace(batch, runs=[replace(run, values=run.values | {"scored_instants": 50.0}) for run in batch.runs])
+    fewer = replace(even.runs[0], values=even.runs[0].values | {"scored_instants": 40.0})
+    assert instants_told(even) == []
+    assert LOGS[0] in instants_told(replace(even, runs=[fewer, *even.runs[1:]]))[0]
