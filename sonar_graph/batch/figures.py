@@ -37,6 +37,8 @@ ROW_IN, PANEL_IN, WIDTH_IN = 0.36, 0.95, 7.4
 KIND_SHIFT = {"": 0.0, "Causal": -0.17, "Smoothed": 0.17}
 FILLED = {"": True, "Causal": True, "Smoothed": False}
 SMALL = 9.0
+LEAST_SPAN = 4.0
+"""Consistency is drawn from a quarter to four times what it should be, or farther: no small deviation fills a panel."""
 Rows = list[list[str]]
 
 
@@ -129,6 +131,8 @@ def consistency_drawing(batch: RecordedBatch, what: str) -> Drawing | None:
         for place, contestant in enumerate(batch.contestants):
             for over, mean in known.get((log, contestant), []):
                 _draw_point(panel, mean, place, over)
+        low, high = panel.get_xlim()
+        panel.set_xlim(min(low, 1 / LEAST_SPAN), max(high, LEAST_SPAN))
     caption = (
         f"Normalised squared error of {what} at the last instant, average over runs per degree of freedom. The grey "
         "band holds 95 % of the averages of consistent estimators; right of it covariances are too small, left "
