@@ -12,7 +12,8 @@
     ├── AlignmentError          attitude and gyro bias cannot be told from a stretch of a run
     ├── EstimatorError          an estimator cannot be set up or go on
     │   └── UnknownEstimatorError
-    └── EvaluationError         a comparison or report cannot be made
+    ├── EvaluationError         a comparison or report cannot be made
+    └── BatchError              a suite cannot be run, or its runs cannot go on
 
 Each message says what was asked, what was found, and what to do. The command line prints it on one line and exits
 with 2; only an unforeseen error ends in a traceback.
@@ -61,3 +62,7 @@ class UnknownEstimatorError(EstimatorError):
 
 class EvaluationError(SonarGraphError):
     """A comparison or report cannot be made."""
+
+
+class BatchError(SonarGraphError):
+    """A suite of runs has a mistake, or the batch cannot go on."""

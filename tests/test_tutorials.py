@@ -151,6 +151,30 @@ def assert_is_simulated(folder: Path) -> None:
     np.testing.assert_allclose(found.depth.z_m, truth.depth.z_m * scale, atol=1e-9)
 
 
+@pytest.mark.slow
+def test_page_on_batches_has_a_suite_a_command_and_a_program_that_work(tmp_path: Path) -> None:
+    page = (TUTORIALS / "07_batches.md").read_text(encoding="utf-8")
+    (suite,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (program,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (command,) = re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE)
+    (tmp_path / "lap.toml").write_text(suite, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-c", "from sonar_graph.cli import main; main()", *command.split()],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stderr
+    printed = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, check=True, capture_output=True, text=True
+    ).stdout
+    assert len(printed.splitlines()) == 2 * 2 * 2
+    assert printed.count("no kernel ok") == 4
+    for cluster in re.findall(r"```python cluster\n(.*?)```", page, re.DOTALL):
+        compile(cluster, "cluster.py", "exec")
+
+
 def test_every_tutorial_is_listed_and_run() -> None:
     listed = (TUTORIALS / "README.md").read_text(encoding="utf-8")
     run_here = Path(__file__).read_text(encoding="utf-8")

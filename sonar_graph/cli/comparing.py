@@ -24,6 +24,7 @@ from sonar_graph.cli.arguments import (
     StartTime,
     TopicChoices,
 )
+from sonar_graph.cli.benching import write_report_of
 from sonar_graph.cli.outputs import writable_folder
 from sonar_graph.cli.progress import Report, progress_bars, working
 from sonar_graph.cli.recognising import no_images, our_recogniser, warn_of_other_designs
@@ -151,7 +152,7 @@ def report(
     from sonar_graph.evaluation.storage import read_comparison
 
     if is_batch(folder):
-        typer.echo(f"Report: {_write_batch_report(writable_folder(folder))}")
+        typer.echo(f"Report: {write_report_of(writable_folder(folder))}")
         return
     comparison = read_comparison(folder)
     typer.echo(f"Report: {_write_report(comparison, writable_folder(folder))}")
@@ -261,14 +262,6 @@ def _write_report(comparison: Comparison, folder: Path) -> Path:
     with working("drawing"):
         write_report(comparison, page)
     return page
-
-
-def _write_batch_report(folder: Path) -> Path:
-    from sonar_graph.batch.page import write_batch_report
-    from sonar_graph.batch.recorded import read_batch
-
-    with working("drawing"):
-        return write_batch_report(read_batch(folder), folder)
 
 
 def _print_summary(comparison: Comparison) -> None:

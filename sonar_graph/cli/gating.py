@@ -1,4 +1,4 @@
-"""``sonar-graph bench``, what is done with results: ``bless`` a reference, and ``gate`` a batch by it."""
+"""``sonar-graph bench``: the group of its commands; ``bless`` a reference, and ``gate`` a batch by it."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from typing import Annotated
 import typer
 from typer.core import TyperGroup
 
+from sonar_graph.cli.benching import BatchFolder, bench, exit_by_gate
 from sonar_graph.cli.outputs import writable_json
 from sonar_graph.cli.texts import examples
 
-BatchFolder = Annotated[
-    Path, typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that bench wrote.")
-]
 DEFAULT_COMMAND = "run"
 
 
@@ -23,16 +21,28 @@ class SuiteFirst(TyperGroup):
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
         """Put the name of the default command where none is given."""
         is_named = not args or args[0] in self.commands or args[0] in ctx.help_option_names
-        given = args if is_named or DEFAULT_COMMAND not in self.commands else [DEFAULT_COMMAND, *args]
-        return super().parse_args(ctx, given)
+        return super().parse_args(ctx, args if is_named else [DEFAULT_COMMAND, *args])
 
 
 benches = typer.Typer(
     name="bench",
     cls=SuiteFirst,
     help="Run suites: many logs, seeds, estimators and variants; judge what came out.",
-    epilog=examples("sonar-graph bench gate results reference.json", "sonar-graph bench bless results reference.json"),
+    epilog=examples(
+        "sonar-graph bench suite.toml -o results",
+        "sonar-graph bench suite.toml -o results --gate reference.json",
+        "sonar-graph bench bless results reference.json",
+    ),
 )
+benches.command(
+    DEFAULT_COMMAND,
+    epilog=examples(
+        "sonar-graph bench run suite.toml -o results",
+        "sonar-graph bench run suite.toml -o results --workers 2 --timeout 600",
+        "sonar-graph bench run suite.toml -o results --scheduler tcp://10.0.0.5:8786",
+        "sonar-graph bench run suite.toml -o results --gate reference.json",
+    ),
+)(bench)
 
 
 @benches.command(epilog=examples("sonar-graph bench bless results reference.json"))
@@ -59,18 +69,3 @@ def gate(
 ) -> None:
     """Say whether accuracy or consistency got worse beyond noise; exit with 1 if so. Nothing is run."""
     exit_by_gate(folder, reference)
-
-
-def exit_by_gate(folder: Path, reference: Path) -> None:
-    """Print what got worse, and exit with 1 where anything did."""
-    from sonar_graph.batch.gate import gate as judge
-    from sonar_graph.batch.recorded import read_batch
-
-    verdict = judge(read_batch(folder), reference)
-    for worsening in verdict.worsenings:
-        typer.echo(f"Worse: {worsening}")
-    if verdict.new:
-        typer.echo(f"Not judged: {len(verdict.new)} runs that the reference does not have, first {verdict.new[0]}")
-    typer.echo(f"Gate: {'passed' if verdict.passed else 'failed'}, {verdict.compared} runs held against {reference}")
-    if not verdict.passed:
-        raise typer.Exit(1)

@@ -5,7 +5,9 @@ Fields of one object share a prefix: ``causal.stamps_ns``, ``causal.positions``,
 
 from __future__ import annotations
 
+import io
 import zipfile
+import zlib
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,13 +24,27 @@ from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Refusal, Refu
 
 Arrays = dict[str, np.ndarray]
 T = TypeVar("T")
+COMPRESSION = 1
+"""Of zlib's levels: arrays of numbers hardly get smaller with higher ones, and take twice as long."""
+WORTHWHILE = 0.8
+TRIED_VALUES = 4096
 KINDS: tuple[Kind, Kind] = ("causal", "smoothed")
 
 
 def write_arrays(path: Path, arrays: Arrays) -> None:
-    """Write named arrays, compressed, whole or not at all."""
-    with replacing(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
+    """Write named arrays, compressed where that makes them smaller, whole or not at all."""
+    with replacing(path) as partial, zipfile.ZipFile(partial, "w", compresslevel=COMPRESSION) as archive:
+        for name, array in arrays.items():
+            content = io.BytesIO()
+            np.lib.format.write_array(content, array, allow_pickle=False)
+            how = zipfile.ZIP_DEFLATED if _gets_smaller(array) else zipfile.ZIP_STORED
+            archive.writestr(f"{name}.npy", content.getbuffer(), how)
+
+
+def _gets_smaller(array: np.ndarray) -> bool:
+    """Whether compressing is worth its time, by the array's beginning: with noise in every digit it is not."""
+    beginning = array.ravel()[:TRIED_VALUES].tobytes()
+    return len(zlib.compress(beginning, COMPRESSION)) < WORTHWHILE * len(beginning)
 
 
 def read_arrays(path: Path) -> Arrays:

@@ -7,6 +7,7 @@ import platform
 import shlex
 import sys
 from datetime import UTC, datetime
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -21,8 +22,14 @@ def describe_environment() -> dict[str, str]:
     return {
         "sonar_graph": sonar_graph.__version__,
         "python": platform.python_version(),
-        **{library: version(library) for library in LIBRARIES},
+        **_library_versions(),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} processors",
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": shlex.join(command),
     }
+
+
+@lru_cache
+def _library_versions() -> dict[str, str]:
+    """Looked up once: each look goes through all that is installed."""
+    return {library: version(library) for library in LIBRARIES}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import textwrap
 import time
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from sonar_graph.measurements import Ints, LandmarkDetections, Measurements
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Estimate, RefusedRow, Trajectory
 
+LOG = logging.getLogger(__name__)
 REASON_WIDTH = 400
 """Characters of a reason at most: one line that a table can hold."""
 WARM_UP_STEPS = 20
@@ -115,6 +117,7 @@ class _Replay:
             self._process(estimator, progress)
             return self._finish(estimator, memory)
         except Exception as error:  # a third party's estimator may fail in any way, and the others still run
+            LOG.info("%s failed %s", self._name, self._stage, exc_info=True)
             reason, refused = f"{self._stage}: {one_line(error)}", _refused_so_far(estimator)
             return self._result("failed", reason, refused=refused, peak_memory_mb=memory.rise_mb())
 

@@ -1,0 +1,87 @@
+"""A suite from its file to its table: planned, resumed, done, collected."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from sonar_graph.batch.execution import Where, run_batch
+from sonar_graph.batch.plan import plan_runs
+from sonar_graph.batch.planned import Limits, Outcome, PlannedRun, Row
+from sonar_graph.batch.results import write_results
+from sonar_graph.batch.store import SUITE, Store
+from sonar_graph.batch.suite import SuiteFile
+from sonar_graph.errors import BatchError
+from sonar_graph.evaluation.atomic import replacing
+
+
+@dataclass(frozen=True)
+class Batch:
+    """A suite and the folder of its runs."""
+
+    file: SuiteFile
+    runs: list[PlannedRun]
+    store: Store
+
+    @classmethod
+    def open(cls, file: SuiteFile, folder: Path) -> Batch:
+        """Plan a suite, then find out what of it is done.
+
+        Raises
+        ------
+        BatchError
+            When the suite has a mistake; the folder is not touched then.
+        """
+        runs = plan_runs(file)
+        store = Store(folder)
+        store.remove_partial()
+        with replacing(folder / SUITE) as partial:
+            partial.write_text(file.text, encoding="utf-8")
+        return cls(file, runs, store)
+
+    def rows(self) -> dict[str, Row]:
+        """The rows of the runs that are done, by key."""
+        return {run.key: row for run in self.runs if (row := self.store.row(run.key)) is not None}
+
+    def discard_failed(self) -> None:
+        """Forget runs that did not succeed, so that they are done anew."""
+        for key, row in self.rows().items():
+            if row["status"] != "ok":
+                self.store.discard(key)
+
+    def run(self, where: Where, limits: Limits, progress: Callable[[PlannedRun, Outcome], None]) -> Counter[str]:
+        """Do what is not done, and write the table, also where the batch ends early.
+
+        Returns
+        -------
+        How many runs have which status.
+
+        Raises
+        ------
+        BatchError
+            When the batch cannot go on; what is done is kept.
+        """
+        done = self.rows()
+        missing = [run for run in self.runs if run.key not in done]
+        try:
+            run_batch(missing, self.store, limits, where, progress)
+        except BatchError as error:
+            raise BatchError(f"{error}; {self.resuming()}") from error
+        finally:
+            self._write_table()
+        return Counter(str(row["status"]) for row in self.rows().values())
+
+    def resuming(self) -> str:
+        """How far it is and how to go on."""
+        return f"{len(self.rows())} of {len(self.runs)} runs are done and kept; the same command goes on from there"
+
+    def _write_table(self) -> None:
+        write_results(self.store, self.file.suite, self.runs)
+
+
+def limits_of(file: SuiteFile, timeout_s: float | None) -> Limits:
+    """What a run of a suite may take; a timeout that is given goes before the suite's."""
+    limits = Limits(file.suite.timeout_s, file.suite.memory_mb)
+    return limits if timeout_s is None else replace(limits, timeout_s=timeout_s)

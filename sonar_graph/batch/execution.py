@@ -1,0 +1,193 @@
+"""A batch on Dask: a cluster of this machine's processes, or one that exists.
+
+One task a run. What a run leaves travels back to the batch, which alone writes to the store: workers need no common
+file system, except for logs, and a full disk is met in one place.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import dask
+import psutil
+from dask.system import CPU_COUNT
+from distributed import Client, Future, LocalCluster, as_completed
+from distributed.client import FutureCancelledError
+from distributed.scheduler import KilledWorker
+
+from sonar_graph.batch.planned import Limits, Outcome, PlannedRun
+from sonar_graph.batch.store import Store
+from sonar_graph.batch.supervision import perform_watched
+from sonar_graph.errors import BatchError, SonarGraphError
+
+CONNECT_S = 30.0
+CLOSE_S = 5.0
+DASK_SETTINGS = {
+    "distributed.scheduler.allowed-failures": 1,
+    "distributed.worker.memory.target": False,
+    "distributed.worker.memory.spill": False,
+    "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.terminate": False,
+    "distributed.admin.tick.limit": "1h",
+    "distributed.worker.preload": ["sonar_graph.batch.local_worker"],
+}
+"""One retry for the run of a worker that is killed; memory is that of the runs' own processes, watched there."""
+
+
+@dataclass(frozen=True)
+class Where:
+    """Who does the runs."""
+
+    workers: int | None = None
+    """On this machine; None: one for each of its cores that this process may use."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler that exists, in place of workers here."""
+
+    @property
+    def local_workers(self) -> int:
+        """How many there are on this machine."""
+        return self.workers or CPU_COUNT
+
+
+Progress = Callable[[PlannedRun, Outcome], None]
+
+
+def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: Where, progress: Progress) -> None:
+    """Do runs and keep each as soon as it is done.
+
+    Parameters
+    ----------
+    runs
+        Those that are not done yet.
+    progress
+        Called after a run is kept.
+
+    Raises
+    ------
+    BatchError
+        When there is no scheduler or no worker, workers cannot do any run, or nothing can be written. What is done by
+        then is kept.
+    KeyboardInterrupt
+        On Ctrl-C, after a few seconds in which workers are ended.
+    """
+    planned = list(runs)
+    if not planned:
+        return
+    with dask.config.set(DASK_SETTINGS), _quiet(), _client(where, len(planned)) as client:
+        submitted = (client.submit(perform_watched, run, limits, key=f"run-{run.key}", pure=False) for run in planned)
+        futures = dict(zip(submitted, planned, strict=True))
+        try:
+            for future in as_completed(list(futures)):
+                _keep(futures.pop(future), future, store, progress)
+                future.release()
+        except FutureCancelledError as error:
+            raise BatchError(f"the scheduler was lost: {error}") from error
+        finally:
+            _within_seconds(lambda: client.cancel(list(futures), force=True))
+
+
+def _keep(run: PlannedRun, future: Future[Any], store: Store, progress: Progress) -> None:
+    outcome = _outcome(future)
+    try:
+        store.write(run.key, outcome)
+    except OSError as error:
+        raise BatchError(f"{store.folder}: cannot be written: {error.strerror or error}") from error
+    progress(run, outcome)
+
+
+def _outcome(future: Future[Any]) -> Outcome:
+    """What a run left; workers that were killed under it leave a row that says so."""
+    try:
+        outcome = future.result()
+    except KilledWorker:
+        reason = "the workers that did it were killed, one after the other"
+        return Outcome({"status": "killed", "reason": reason}, log=f"{reason}\n")
+    except SonarGraphError as error:
+        raise BatchError(str(error)) from error
+    except OSError as error:
+        raise BatchError(f"a worker cannot do runs: {error}") from error
+    assert isinstance(outcome, Outcome)
+    return outcome
+
+
+@contextlib.contextmanager
+def _client(where: Where, tasks: int) -> Iterator[Client]:
+    """A client of the scheduler there is, or of a cluster that lives as long as the block."""
+    if where.scheduler is not None:
+        client = _connected(where.scheduler)
+        try:
+            yield client
+        finally:
+            _within_seconds(client.close)
+        return
+    others = _children()
+    cluster = LocalCluster(
+        n_workers=min(where.local_workers, tasks),
+        threads_per_worker=1,
+        processes=True,
+        memory_limit=None,
+        dashboard_address=":0",
+        silence_logs=logging.CRITICAL,
+    )
+    client = Client(cluster)
+    try:
+        yield client
+    finally:
+        _within_seconds(client.close)
+        _within_seconds(cluster.close)
+        for process in _children() - others:
+            with contextlib.suppress(psutil.Error):
+                process.kill()
+
+
+def _children() -> set[psutil.Process]:
+    return set(psutil.Process().children(recursive=True))
+
+
+def _within_seconds(end: Callable[[], object]) -> None:
+    """End something that may wait for what is gone; after some seconds it is left to itself."""
+
+    def end_quietly() -> None:
+        with contextlib.suppress(Exception):  # the first error is the one to tell
+            end()
+
+    thread = threading.Thread(target=end_quietly, daemon=True)
+    thread.start()
+    thread.join(CLOSE_S)
+
+
+def _connected(address: str) -> Client:
+    """A client of a scheduler that has at least one worker.
+
+    Raises
+    ------
+    BatchError
+        When there is none.
+    """
+    try:
+        client = Client(address, timeout=CONNECT_S)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise BatchError(f"no Dask scheduler at {address}: {error}") from error
+    try:
+        client.wait_for_workers(1, timeout=CONNECT_S)
+    except TimeoutError as error:
+        client.close()
+        raise BatchError(f"the scheduler at {address} has no worker after {CONNECT_S:g} s; start some") from error
+    return client
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without Dask's own messages: workers that come and go are told by rows."""
+    logger = logging.getLogger("distributed")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)

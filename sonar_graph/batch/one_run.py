@@ -1,0 +1,157 @@
+"""One run of a batch: sequence, estimator, scores; a folder as `compare` writes it, and a row."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sonar_graph.batch.plan import versions_of
+from sonar_graph.batch.planned import PlannedRun, Row
+from sonar_graph.batch.sources import read_source
+from sonar_graph.errors import BatchError
+from sonar_graph.evaluation.comparison import judge
+from sonar_graph.evaluation.environment import describe_environment
+from sonar_graph.evaluation.results import Comparison, ErrorSeries, RunResult
+from sonar_graph.evaluation.run import one_line, run_estimator
+from sonar_graph.evaluation.storage import write_comparison
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks
+
+KEPT_SEQUENCES = 2
+"""Estimators of one log mostly follow each other in a process."""
+TWO_DIMENSIONS = 2
+LOG = logging.getLogger(__name__)
+
+
+@dataclass
+class Clock:
+    """Seconds by what they were spent on."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def on(self, what: str) -> Iterator[None]:
+        """Count the time of the block, also where it ends with an error."""
+        before = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[what] = time.perf_counter() - before
+
+
+def perform(run: PlannedRun, folder: Path) -> Row:
+    """Do one run and write what `compare` writes into a folder.
+
+    Returns
+    -------
+    What was measured. A log that cannot be read and an estimator that fails are rows with a reason.
+
+    Raises
+    ------
+    BatchError
+        When this process has other versions than those that the run was planned with.
+    OSError
+        When the folder cannot be written: that is no result.
+    """
+    if versions_of(run.estimator) != run.versions:
+        raise BatchError(f"a worker has {_told(versions_of(run.estimator))}, planned with {_told(run.versions)}")
+    clock, cpu_s = Clock(), time.process_time()
+    try:
+        comparison = _compared(run, clock)
+    except Exception as error:  # a log or a simulator may fail in any way, and the other runs still go on
+        LOG.exception("run %s", run.key)
+        stage = "while judging" if "estimate_s" in clock.seconds else "while reading or simulating the log"
+        return _failed(f"{stage}: {one_line(error)}") | _spent(clock, cpu_s)
+    write_comparison(comparison, folder)
+    return measured(comparison) | _spent(clock, cpu_s)
+
+
+def _compared(run: PlannedRun, clock: Clock) -> Comparison:
+    """The run as a comparison of one."""
+    with clock.on("read_s"):
+        sequence = _sequence(run.kind, _as_text(run.options), run.seed, _as_text(run.landmarks))
+        instants_ns = sequence.instants(run.rate_hz)
+    with clock.on("estimate_s"):
+        result = run_estimator(sequence, run.estimator, run.params, instants_ns=instants_ns)
+    comparison = judge(sequence, instants_ns, [result])
+    environment = comparison.environment | {"command": f"sonar-graph bench: run {run.key} of {run.suite}"}
+    return replace(comparison, environment=environment)
+
+
+@lru_cache(KEPT_SEQUENCES)
+def _sequence(kind: str, options: str, seed: int | None, landmarks: str) -> Sequence:
+    """The same object for the same arguments: estimators cannot change it."""
+    sequence = read_source(kind, json.loads(options), seed)
+    placed = json.loads(landmarks)
+    return sequence if placed is None else add_landmarks(sequence, LandmarkOptions(**(placed | {"seed": seed})))
+
+
+def measured(comparison: Comparison) -> Row:
+    """Scores and times of a comparison of one run, by column."""
+    (run,) = comparison.runs
+    row: Row = {key: score.value for key, score in comparison.scores[run.estimator].items()}
+    row |= _versions(comparison.environment) | _state(run)
+    row["scored_instants"] = 0
+    for kind, errors in comparison.errors.get(run.estimator, {}).items():
+        row["scored_instants"] = len(errors.stamps_ns)
+        row |= _consistency(kind, errors)
+    row |= {f"{key}_dof": TWO_DIMENSIONS for key in ("landmarks.nees", "detections.nis") if key in row}
+    return {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()}
+
+
+def _state(run: RunResult) -> Row:
+    """Status and times."""
+    row: Row = {"status": run.status, "reason": run.reason}
+    if run.status == "failed":
+        out_of_memory = "MemoryError" in run.reason or "bad_alloc" in run.reason
+        return row | {"status": "memory" if out_of_memory else "failed"}
+    p50, p99 = np.quantile(run.update_s * 1e3, [0.5, 0.99]).tolist()
+    return row | {
+        "peak_memory_mb": run.peak_memory_mb,
+        "update_p50_ms": p50,
+        "update_p99_ms": p99,
+        "finish_s": run.finish_s,
+    }
+
+
+def _consistency(kind: str, errors: ErrorSeries) -> Row:
+    """NEES at the last instant, per degree of freedom, and the degrees of freedom of all NEES columns.
+
+    Over the seeds of one simulated run these values are independent, so their average has a chi-square band; an average
+    over the instants of one run has none.
+    """
+    row: Row = {}
+    for key, nees, dof in (("position", errors.nees_position, errors.position_dof), ("yaw", errors.nees_yaw, 1)):
+        row[f"{kind}.nees_{key}_end"] = float(nees[-1] / dof)
+        row |= {f"{kind}.nees_{key}_dof": dof, f"{kind}.nees_{key}_end_dof": dof}
+    return row
+
+
+def _failed(reason: str) -> Row:
+    return {**_versions(describe_environment()), "status": "failed", "reason": reason, "scored_instants": 0}
+
+
+def _versions(environment: dict[str, str]) -> Row:
+    return {key: environment[key] for key in ("sonar_graph", "gtsam", "numpy", "python", "machine")}
+
+
+def _spent(clock: Clock, cpu_before_s: float) -> Row:
+    return {**clock.seconds, "cpu_s": time.process_time() - cpu_before_s}
+
+
+def _as_text(values: dict[str, Any] | None) -> str:
+    return json.dumps(values, sort_keys=True)
+
+
+def _told(versions: dict[str, str]) -> str:
+    return ", ".join(f"{name} {number}" for name, number in sorted(versions.items()))

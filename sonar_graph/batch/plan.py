@@ -1,0 +1,211 @@
+"""From a suite to the list of its runs, each with a key that says what it is."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import version
+from typing import Any
+
+from pydantic import ValidationError
+
+import sonar_graph
+from sonar_graph.batch.planned import PlannedRun
+from sonar_graph.batch.sources import FILES, GENERATORS, KINDS, LOG, fingerprint
+from sonar_graph.batch.suite import EstimatorEntry, LogEntry, SuiteFile
+from sonar_graph.batch.toml_lines import Place
+from sonar_graph.calibration import Section
+from sonar_graph.errors import EstimatorError, SonarGraphError, UnknownEstimatorError
+from sonar_graph.estimator import installed_estimators, load_estimator
+from sonar_graph.simulation.landmarks_on_log import LandmarkOptions
+from sonar_graph.validation import faults_in
+
+KEY_DIGITS = 20
+DEFAULT_VARIANT = "default"
+
+
+@dataclass(frozen=True)
+class _Source:
+    entry: LogEntry
+    name: str
+    options: dict[str, Any]
+    content: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Contestant:
+    name: str
+    variant: str
+    params: dict[str, Any]
+
+
+def plan_runs(file: SuiteFile) -> list[PlannedRun]:
+    """All runs of a suite, in its order; the estimators of one log follow each other.
+
+    Raises
+    ------
+    BatchError
+        When the suite names what does not exist or does not fit, or one run twice.
+    """
+    contestants = [c for n, entry in enumerate(file.suite.estimators) for c in _contestants(file, n, entry)]
+    _check_reference(file, contestants)
+    sources = [s for n, entry in enumerate(file.suite.logs) for s in _sources(file, n, entry)]
+    runs = [
+        _planned(file, source, seed, contestant)
+        for source in sources
+        for seed in source.entry.seed_list()
+        for contestant in contestants
+    ]
+    _check_once(file, runs)
+    return runs
+
+
+@lru_cache
+def versions_of(estimator: str) -> dict[str, str]:
+    """Versions that decide the numbers, with that of the package that brings the estimator."""
+    point = installed_estimators()[estimator]
+    brings = {} if point.dist is None else {point.dist.name: point.dist.version}
+    return brings | {
+        "sonar_graph": sonar_graph.__version__,
+        "gtsam": version("gtsam"),
+        "numpy": version("numpy"),
+        "scipy": version("scipy"),
+    }
+
+
+def _sources(file: SuiteFile, number: int, entry: LogEntry) -> Iterator[_Source]:
+    place = ("logs", number)
+    _check_source(file, place, entry)
+    for chosen in _combinations(file, place, entry.grid):
+        values = entry.options | chosen
+        if entry.log is not None:
+            values = {"log": entry.log, **values}
+        for name in FILES:
+            if isinstance(values.get(name), str):
+                where = (*place, name) if name == "log" else (*place, "options", name)
+                values[name] = file.find(where, values[name])
+        options = _checked(file, place, chosen, KINDS[entry.kind].options, values)
+        try:
+            KINDS[entry.kind].check(options)
+        except SonarGraphError as error:
+            file.refuse((*place, "options"), str(error))
+        plain = options.model_dump(mode="json", exclude={"seed"})
+        yield _Source(entry, _label(entry.name, chosen), plain, fingerprint(entry.kind, plain))
+
+
+def _check_source(file: SuiteFile, place: Place, entry: LogEntry) -> None:
+    known = [name for name in KINDS if name != LOG and (name in GENERATORS) == (entry.generator is not None)]
+    what = "generator" if entry.generator is not None else "dataset"
+    if entry.kind != LOG and entry.kind not in known:
+        file.refuse((*place, what), f"there is no {what} {entry.kind!r}; there are: {', '.join(known)}")
+    for name in {"seed", "image"} & {*entry.options, *entry.grid}:
+        reason = "seeds are given as seeds = [...]" if name == "seed" else "recognise landmarks first, and give the log"
+        file.refuse((*place, "options", name), f"cannot be set in a suite: {reason}")
+    if entry.landmarks is not None:
+        _validated(file, (*place, "landmarks"), LandmarkOptions, entry.landmarks)
+
+
+def _contestants(file: SuiteFile, number: int, entry: EstimatorEntry) -> Iterator[_Contestant]:
+    place: Place = ("estimators", number)
+    try:
+        params: type[Section] | None = load_estimator(entry.name).Params
+    except UnknownEstimatorError as error:
+        file.refuse((*place, "name"), str(error))
+    except EstimatorError:  # its runs fail with the reason, and the others go on
+        params = None
+    for chosen in _combinations(file, place, entry.grid):
+        values = entry.params | chosen
+        if params is not None:
+            values = _checked(file, place, chosen, params, values, "params").model_dump(mode="json")
+        yield _Contestant(entry.name, _label(entry.variant, chosen) or DEFAULT_VARIANT, values)
+
+
+def _combinations(file: SuiteFile, place: Place, grid: dict[str, list[Any]]) -> Iterator[dict[str, Any]]:
+    for name, values in grid.items():
+        if not values:
+            file.refuse((*place, "grid", name), "has no values; give at least one")
+    for chosen in itertools.product(*grid.values()):
+        yield dict(zip(grid, chosen, strict=True))
+
+
+def _checked(
+    file: SuiteFile, place: Place, chosen: dict[str, Any], model: type[Section], values: Any, table: str = "options"
+) -> Section:
+    """Values as their model has them; a fault is told where the suite gives the value."""
+    return _validated(
+        file, place, model, values, lambda name: "grid" if name in chosen else "log" if name == "log" else table
+    )
+
+
+def _validated(
+    file: SuiteFile, place: Place, model: type[Section], values: Any, table: Callable[[str], str] | None = None
+) -> Section:
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        at = error.errors()[0]["loc"]
+        table_name = (table(str(at[0])),) if table and at else ()
+        file.refuse((*place, *table_name, *at), faults_in(error, model))
+
+
+def _label(name: str, chosen: dict[str, Any]) -> str:
+    """A name with what a grid chose."""
+    return ", ".join([*([name] if name else []), *(f"{key}={value}" for key, value in chosen.items())])
+
+
+def _planned(file: SuiteFile, source: _Source, seed: int | None, contestant: _Contestant) -> PlannedRun:
+    versions, rate_hz = versions_of(contestant.name), file.suite.rate_hz
+    decides = {
+        "content": source.content,
+        "landmarks": source.entry.landmarks,
+        "seed": seed,
+        "estimator": contestant.name,
+        "params": contestant.params,
+        "rate_hz": rate_hz,
+        "versions": versions,
+    }
+    text = json.dumps(decides, sort_keys=True, default=str)
+    return PlannedRun(
+        key=hashlib.sha256(text.encode()).hexdigest()[:KEY_DIGITS],
+        suite=file.suite.name,
+        log=source.name,
+        kind=source.entry.kind,
+        options=source.options,
+        landmarks=source.entry.landmarks,
+        seed=seed,
+        estimator=contestant.name,
+        variant=contestant.variant,
+        params=contestant.params,
+        rate_hz=rate_hz,
+        versions=versions,
+    )
+
+
+def _check_reference(file: SuiteFile, contestants: list[_Contestant]) -> None:
+    name, _, variant = file.suite.reference.partition("/")
+    known = [(c.name, c.variant) for c in contestants]
+    if (name, variant or DEFAULT_VARIANT) not in known:
+        texts = [name if variant == DEFAULT_VARIANT else f"{name}/{variant}" for name, variant in known]
+        file.refuse(("reference",), f"{file.suite.reference!r} does not run here; what does: {', '.join(texts)}")
+
+
+def _check_once(file: SuiteFile, runs: list[PlannedRun]) -> None:
+    """Refuse one run under two names, and two runs under one name."""
+    by_key: dict[str, PlannedRun] = {}
+    by_name: dict[tuple[Any, ...], PlannedRun] = {}
+    for run in runs:
+        name = (run.log, run.seed, run.estimator, run.variant)
+        twin = by_key.setdefault(run.key, run)
+        if by_name.setdefault(name, run) is not run:
+            file.refuse(("logs",), f"two runs are called {_told(run)}; give logs and variants names that differ")
+        if twin is not run:
+            file.refuse(("logs",), f"{_told(run)} and {_told(twin)} are the same run; leave one out")
+
+
+def _told(run: PlannedRun) -> str:
+    seed = "" if run.seed is None else f", seed {run.seed}"
+    return f"{run.log!r}{seed}, {run.estimator}/{run.variant}"

@@ -1,0 +1,145 @@
+"""Where the sequences of a batch come from: logs, data sets, simulators.
+
+A source is a kind and its options; with a seed it gives the same sequence on every machine that has the files.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import gtsam
+from pydantic import Field
+
+from sonar_graph.calibration import Section
+from sonar_graph.errors import CalibrationError
+from sonar_graph.logs.adapters.config import read_log_config
+from sonar_graph.logs.calibration_sources import PartialCalibration
+from sonar_graph.logs.converters.akit import read_akit
+from sonar_graph.logs.converters.mrclam import read_mrclam
+from sonar_graph.logs.converters.victoria_park import read_victoria_park
+from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.window import Instant, Window
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.basin import BasinOptions, cruise_speed, simulate_basin
+from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+
+_BLOCK_BYTES = 1 << 20
+
+
+class LogOptions(Section):
+    """An MCAP log with landmark detections, and what is said about reading it, as `sonar-graph compare` takes it."""
+
+    log: str
+    calibration: str | None = None
+    """A TOML file whose fields go before the log's own."""
+    log_config: str | None = None
+    topics: dict[str, str] = Field(default_factory=dict)
+    """By role."""
+    start: str | None = None
+    end: str | None = None
+    salvage: bool = False
+
+
+class MrclamOptions(Section):
+    """A robot of a UTIAS data set."""
+
+    folder: str
+    robot: int = Field(ge=1, le=5)
+
+
+class AkitOptions(Section):
+    """A trajectory of the A-KIT data set."""
+
+    folder: str
+    trajectory: int = Field(ge=1)
+
+
+class VictoriaParkOptions(Section):
+    """Victoria Park: nothing to choose, the file is the one that GTSAM brings."""
+
+
+@dataclass(frozen=True)
+class SourceKind:
+    """A way to get a sequence."""
+
+    options: type[Section]
+    read: Callable[[Any], Sequence]
+    """From options."""
+    check: Callable[[Any], object] = lambda _options: None
+    """Raises for options that fit one by one and not together, without any long work."""
+
+
+def _read_log(options: LogOptions) -> Sequence:
+    return read_sequence(
+        Path(options.log),
+        calibration=None if options.calibration is None else _read_calibration(Path(options.calibration)),
+        topics=options.topics,
+        config=None if options.log_config is None else read_log_config(Path(options.log_config)),
+        window=Window(
+            None if options.start is None else Instant.parse(options.start),
+            None if options.end is None else Instant.parse(options.end),
+        ),
+        salvage=options.salvage,
+    )
+
+
+def _read_calibration(path: Path) -> PartialCalibration:
+    try:
+        return PartialCalibration.parse(tomllib.loads(path.read_text(encoding="utf-8")), str(path))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CalibrationError(f"{path}: not TOML: {error}") from error
+
+
+GENERATORS: dict[str, SourceKind] = {
+    "basin": SourceKind(BasinOptions, simulate_basin, cruise_speed),
+    "mission": SourceKind(MissionOptions, simulate_mission),
+}
+DATASETS: dict[str, SourceKind] = {
+    "akit": SourceKind(AkitOptions, lambda options: read_akit(Path(options.folder), options.trajectory)),
+    "mrclam": SourceKind(MrclamOptions, lambda options: read_mrclam(Path(options.folder), options.robot)),
+    "victoria-park": SourceKind(VictoriaParkOptions, lambda _options: read_victoria_park()),
+}
+LOG = "mcap"
+KINDS: dict[str, SourceKind] = {LOG: SourceKind(LogOptions, _read_log), **DATASETS, **GENERATORS}
+FILES = ("log", "folder", "calibration", "log_config")
+"""Options that name files: of these the content counts, not the place."""
+
+
+def read_source(kind: str, options: dict[str, Any], seed: int | None) -> Sequence:
+    """The sequence of a source; a generator takes the seed.
+
+    Raises
+    ------
+    SonarGraphError
+        As the reader or simulator.
+    """
+    source = KINDS[kind]
+    values = options | {"seed": seed} if kind in GENERATORS else options
+    return source.read(source.options.model_validate(values))
+
+
+def fingerprint(kind: str, options: dict[str, Any]) -> dict[str, Any]:
+    """What makes the sequence what it is: all options, and in place of files what is in them."""
+    content = {name: _hash(Path(options[name])) for name in FILES if options.get(name) is not None}
+    if kind == "victoria-park":
+        content["file"] = _hash(Path(gtsam.findExampleDataFile("victoria_park.txt")))  # type: ignore[no-untyped-call]
+    return {"kind": kind, **options, **content}
+
+
+@lru_cache
+def _hash(path: Path) -> str:
+    """SHA-256 of a file, or of all names and files below a folder."""
+    digest = hashlib.sha256()
+    files: Iterable[Path] = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    for file in files:
+        digest.update(file.relative_to(path).as_posix().encode())
+        with file.open("rb") as content:
+            while block := content.read(_BLOCK_BYTES):
+                digest.update(block)
+    return digest.hexdigest()

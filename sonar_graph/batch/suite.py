@@ -1,0 +1,207 @@
+"""A suite: which logs or simulations, seeds, estimators and variants are run, and what is asked of them.
+
+::
+
+    name = "smoke"
+    reference = "dead-reckoning"
+
+    [[logs]]
+    name = "short basin"
+    generator = "basin"
+    options = { duration_s = 130, laps = 1 }
+    grid = { wrong_id_rate = [0.0, 0.05] }
+    seeds = 3
+
+    [[estimators]]
+    name = "isam2"
+    grid = { lag_s = [5, 15] }
+
+    [[estimators]]
+    name = "dead-reckoning"
+
+Every mistake is found here, before anything runs, and told with file, line and key.
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+from pydantic import Field, ValidationError, model_validator
+
+from sonar_graph.batch.toml_lines import Place, line_of
+from sonar_graph.calibration import Section
+from sonar_graph.errors import BatchError
+from sonar_graph.validation import faults_in
+
+DATA_VARIABLE = "SONAR_GRAPH_DATA"
+"""Environment variable with the folder in which data sets are looked for that do not lie beside the suite."""
+DEFAULT_METRICS = (
+    "causal.ate_se2_m",
+    "causal.ate_raw_m",
+    "causal.rpe_10s_m",
+    "causal.yaw_rmse_rad",
+    "smoothed.ate_se2_m",
+    "smoothed.ate_raw_m",
+    "landmarks.se2_m",
+)
+_TRAJECTORY_METRICS = (
+    *("ate_raw_m", "ate_yaw_m", "ate_se2_m", "ate_se3_m", "yaw_rmse_rad", "return_error_m"),
+    *("rpe_1s_m", "rpe_1s_rad", "rpe_10s_m", "rpe_10s_rad", "nees_position", "nees_yaw"),
+)
+METRICS = (
+    *(f"{kind}.{key}" for kind in ("causal", "smoothed") for key in _TRAJECTORY_METRICS),
+    *(f"landmarks.{key}" for key in ("raw_m", "se2_m", "count", "nees")),
+    *(f"detections.{key}" for key in ("used", "refused", "unnamed", "nis")),
+    *(f"time.{key}" for key in ("update_median_ms", "update_p99_ms", "update_max_ms", "total_s", "real_time_factor")),
+    "memory.peak_mb",
+)
+"""Every key that a score can have."""
+
+
+class LogEntry(Section):
+    """One log, data set or generator; with a grid, several of them."""
+
+    name: str = Field(min_length=1)
+    """For tables."""
+    log: str | None = None
+    """An MCAP file, from the suite's folder on, read with `sonar_graph.batch.sources.LogOptions` as its ``options``."""
+    dataset: str | None = None
+    """Name of a converter of a public data set."""
+    generator: str | None = None
+    """Name of a simulator."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    grid: dict[str, list[Any]] = Field(default_factory=dict)
+    """Options that take each of several values, in every combination."""
+    seeds: int | list[int] | None = None
+    """Of a generator, or of ``landmarks``: so many from 0 on, or these."""
+    landmarks: dict[str, Any] | None = None
+    """Options of landmarks that are simulated on a recorded log."""
+
+    @model_validator(mode="after")
+    def _check(self) -> LogEntry:
+        if sum(source is not None for source in (self.log, self.dataset, self.generator)) != 1:
+            raise ValueError("expected exactly one of log, dataset and generator")
+        if self.landmarks is not None and self.generator is not None:
+            raise ValueError("landmarks are put on a log or dataset; a generator has its own")
+        if self.seeds is not None and self.generator is None and self.landmarks is None:
+            raise ValueError("seeds are for a generator, or for landmarks simulated on a log")
+        return self
+
+    @property
+    def kind(self) -> str:
+        """Name of the source, as `sonar_graph.batch.sources.KINDS` has it."""
+        return self.generator or self.dataset or "mcap"
+
+    def seed_list(self) -> list[int | None]:
+        """Seeds to run; one None where nothing is random."""
+        if self.generator is None and self.landmarks is None:
+            return [None]
+        return list(range(self.seeds)) if isinstance(self.seeds, int) else list(self.seeds or [0])
+
+
+class EstimatorEntry(Section):
+    """One estimator; with a grid, several variants of it."""
+
+    name: str
+    """Under which it is installed."""
+    variant: str = ""
+    """Name of these settings, for tables."""
+    params: dict[str, Any] = Field(default_factory=dict)
+    """Settings that differ from its defaults."""
+    grid: dict[str, list[Any]] = Field(default_factory=dict)
+    """Settings that take each of several values, in every combination."""
+
+
+class Suite(Section):
+    """Content of a suite's file."""
+
+    name: str = Field(min_length=1)
+    description: str = ""
+    rate_hz: float = Field(2.0, gt=0, le=1000)
+    """How often every estimator is asked for its estimate."""
+    reference: str
+    """Estimator with which the others are compared: its name, or ``name/variant``."""
+    metrics: tuple[str, ...] = DEFAULT_METRICS
+    """Keys of the scores that are compared; all are recorded."""
+    timeout_s: float = Field(3600.0, gt=0)
+    """A run that takes longer is ended."""
+    memory_mb: float | None = Field(None, gt=0)
+    """A run whose process needs more (10⁶ bytes) is ended; None: no limit but the machine's."""
+    logs: list[LogEntry] = Field(min_length=1)
+    estimators: list[EstimatorEntry] = Field(min_length=1)
+
+
+@dataclass(frozen=True)
+class SuiteFile:
+    """A suite with the text that it was read from."""
+
+    path: Path
+    text: str
+    suite: Suite
+
+    def refuse(self, place: Place, fault: str) -> NoReturn:
+        """Raise for a mistake at a place of the file.
+
+        Raises
+        ------
+        BatchError
+            With file, line and key.
+        """
+        refuse(self.path, self.text, place, f"{'.'.join(map(str, place))}: {fault}")
+
+    def find(self, place: Place, name: str) -> str:
+        """Where a file or folder is: from the suite's folder on, else in the folder of data sets.
+
+        Raises
+        ------
+        BatchError
+            When it is in neither.
+        """
+        roots = [self.path.parent, *([Path(os.environ[DATA_VARIABLE])] if os.environ.get(DATA_VARIABLE) else [])]
+        found = [root / name for root in roots if (root / name).exists()]
+        if not found:
+            looked = " or ".join(str(root.resolve()) for root in roots)
+            more = "" if len(roots) > 1 else f"; {DATA_VARIABLE} can name another folder to look in"
+            self.refuse(place, f"{name} is not in {looked}{more}")
+        return str(found[0].resolve())
+
+
+def read_suite(path: Path) -> SuiteFile:
+    """A suite from its file, its values checked one by one; `sonar_graph.batch.plan` checks what they name.
+
+    Raises
+    ------
+    BatchError
+        When it cannot be read, is no TOML, or a value is missing, unknown or does not fit.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        values = tomllib.loads(text)
+    except (OSError, UnicodeDecodeError) as error:
+        raise BatchError(f"{path}: cannot be read: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise BatchError(f"{path}: not TOML: {error}") from error
+    try:
+        suite = Suite.model_validate(values)
+    except ValidationError as error:
+        refuse(path, text, error.errors()[0]["loc"], faults_in(error, Suite))
+    found = SuiteFile(path, text, suite)
+    for number, metric in enumerate(suite.metrics):
+        if metric not in METRICS:
+            found.refuse(("metrics", number), f"there is no score {metric!r}; there are: {', '.join(METRICS)}")
+    return found
+
+
+def refuse(path: Path, text: str, place: Place, fault: str) -> NoReturn:
+    """Raise for a mistake, with the line of its place.
+
+    Raises
+    ------
+    BatchError
+        Always.
+    """
+    raise BatchError(f"{path}, line {line_of(text, place)}: {fault}")

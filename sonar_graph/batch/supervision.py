@@ -1,0 +1,207 @@
+"""Runs watched from outside: ended when they take too long or too much memory, repeated once when they are killed.
+
+A run is done in a process of its own kind (`sonar_graph.batch.runner`), because native code cannot be stopped from
+within, and because a crash must not take the Dask worker with it. The process is kept for the next run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import platform
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import replace
+from queue import Empty, SimpleQueue
+from typing import Any, BinaryIO
+
+import psutil
+
+from sonar_graph.batch.planned import Limits, Outcome, PlannedRun, Row
+from sonar_graph.errors import BatchError
+from sonar_graph.evaluation.environment import describe_environment
+
+ONE_THREAD = (
+    *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"),
+    *("VECLIB_MAXIMUM_THREADS", "TBB_NUM_THREADS"),
+)
+LOOK_EVERY_S = 0.2
+START_S = 300.0
+"""A process that is not ready by then is broken; the first one on a machine may compile kernels."""
+ATTEMPTS = 2
+LOG_CHARACTERS = 100_000
+"""Of a run's log its end is kept."""
+
+
+class KilledError(Exception):
+    """The process of a run ended by itself, or was ended by somebody else."""
+
+
+def perform_watched(run: PlannedRun, limits: Limits) -> Outcome:
+    """Do a run in one of this process's runners; one that is killed is done once more.
+
+    Returns
+    -------
+    Its outcome; that of a run which is killed again, takes too long or needs too much memory is a row that says so.
+
+    Raises
+    ------
+    BatchError, OSError
+        When no run could be done here: other versions, no process, no space.
+    """
+    reason, log = "", ""
+    for _ in range(ATTEMPTS):
+        with _a_runner() as runner:
+            try:
+                outcome = runner.perform(run, limits)
+                return replace(outcome, row=_here() | outcome.row)
+            except KilledError as error:
+                reason, log = str(error), runner.log()
+    return Outcome({**_here(), "status": "killed", "reason": f"{reason}, {ATTEMPTS} times"}, log=log)
+
+
+def _here() -> Row:
+    """Where a run is done, also for those that cannot tell any more."""
+    environment = describe_environment()
+    return {"python": environment["python"], "machine": environment["machine"]}
+
+
+_idle: list[Runner] = []
+_idle_lock = threading.Lock()
+
+
+@contextlib.contextmanager
+def _a_runner() -> Any:
+    """A process of one's own for the block; kept afterwards for the next run if it is fit for it."""
+    with _idle_lock:
+        runner = _idle.pop() if _idle else None
+    if runner is None or not runner.is_fit():
+        runner = Runner()
+    try:
+        yield runner
+    finally:
+        if runner.is_fit():
+            with _idle_lock:
+                _idle.append(runner)
+        else:
+            runner.end()
+
+
+class Runner:
+    """A process that does one run after the other."""
+
+    def __init__(self) -> None:
+        self._log = tempfile.TemporaryFile(mode="a+b")  # noqa: SIM115  it is open as long as the process runs
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "sonar_graph.batch.runner"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._log,
+            env=os.environ | dict.fromkeys(ONE_THREAD, "1") | {"PYTHONHASHSEED": "0"},
+            start_new_session=True,  # Ctrl-C in a terminal goes to the batch, which ends this one in its own way
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._requests: Any = self._process.stdin
+        self._answers: SimpleQueue[Any] = SimpleQueue()
+        self._is_busy = True
+        collector_arguments = (self._process.stdout, self._answers)
+        self._collector = threading.Thread(target=_collect, args=collector_arguments, daemon=True)
+        self._collector.start()
+        try:
+            self._wait(Limits(START_S))
+        except KilledError as error:
+            raise BatchError(f"no process for runs on {platform.node()}: {error}; {self.log()[-2000:]}") from error
+        self._is_busy = False
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._process.pid
+
+    def is_fit(self) -> bool:
+        """Whether it can take a run."""
+        return not self._is_busy and self._process.poll() is None
+
+    def perform(self, run: PlannedRun, limits: Limits) -> Outcome:
+        """Do one run.
+
+        Raises
+        ------
+        KilledError
+            When the process ended during the run.
+        BatchError, OSError
+            When the run could not be done at all.
+        """
+        self._is_busy = True
+        self._log.truncate(0)
+        began = time.monotonic()
+        with contextlib.suppress(OSError):  # a process that is gone is told by its missing answer
+            pickle.dump(run, self._requests)
+            self._requests.flush()
+        answer = self._wait(limits)
+        if isinstance(answer, Exception):
+            raise answer
+        wall_s = time.monotonic() - began
+        return replace(answer, row=answer.row | {"wall_s": wall_s}, log=self.log())
+
+    def log(self) -> str:
+        """What the process printed since the run began."""
+        self._log.seek(0)
+        return self._log.read().decode("utf-8", "replace")[-LOG_CHARACTERS:]
+
+    def end(self) -> None:
+        """End the process now."""
+        self._process.kill()
+        self._process.wait()
+        self._collector.join()
+        with contextlib.suppress(OSError):
+            self._requests.close()
+        self._log.close()
+
+    def _wait(self, limits: Limits) -> Any:
+        """The answer to what was asked; for a run that exceeds its limits an outcome, and the process stays busy."""
+        deadline = time.monotonic() + limits.timeout_s
+        while True:
+            with contextlib.suppress(Empty):
+                answer = self._answers.get(timeout=LOOK_EVERY_S)
+                if answer is None:
+                    raise KilledError(self._ending())
+                self._is_busy = False
+                return answer
+            excess = self._excess(limits, deadline)
+            if excess is not None:
+                return Outcome(excess)
+
+    def _excess(self, limits: Limits, deadline: float) -> Row | None:
+        """The row of a run that exceeds its limits."""
+        if time.monotonic() > deadline:
+            return {"status": "timeout", "reason": f"took longer than {limits.timeout_s:g} s"}
+        if limits.memory_mb is not None and _resident_mb(self.pid) > limits.memory_mb:
+            return {"status": "memory", "reason": f"its process needed more than {limits.memory_mb:g} MB"}
+        return None
+
+    def _ending(self) -> str:
+        code = self._process.wait()
+        if code >= 0:
+            return f"its process ended with code {code}"
+        return f"its process was ended by {signal.Signals(-code).name}"
+
+
+def _resident_mb(pid: int) -> float:
+    with contextlib.suppress(psutil.Error):
+        return float(psutil.Process(pid).memory_info().rss / 1e6)
+    return 0.0
+
+
+def _collect(source: BinaryIO, answers: SimpleQueue[Any]) -> None:
+    """Put what a process answers into a queue; None at its end."""
+    with source, contextlib.suppress(EOFError, OSError, pickle.UnpicklingError):
+        while True:
+            answers.put(pickle.load(source))
+    answers.put(None)

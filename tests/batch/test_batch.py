@@ -1,0 +1,139 @@
+from __future__ import annotations
+
+import errno
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from sonar_graph.batch import batch as batch_module
+from sonar_graph.batch.batch import Batch, limits_of
+from sonar_graph.batch.execution import Where
+from sonar_graph.batch.one_run import perform
+from sonar_graph.batch.planned import Limits, Outcome, PlannedRun
+from sonar_graph.batch.results import RESULTS, is_timing
+from sonar_graph.batch.store import Store
+from sonar_graph.batch.suite import read_suite
+from sonar_graph.errors import BatchError
+
+from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
+
+LIMITS = Limits(600.0)
+HERE = Where(1)
+Interrupted = KeyboardInterrupt
+
+
+def nobody(_run: PlannedRun, _outcome: Outcome) -> None:
+    """Is told of progress."""
+
+
+def table(folder: Path) -> list[dict[str, Any]]:
+    rows = pq.read_table(folder / RESULTS).to_pylist()
+    return [{name: value for name, value in row.items() if not is_timing(name)} for row in rows]
+
+
+def do_here(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
+    """As `run_batch`, in this process."""
+    for run in runs:
+        with tempfile.TemporaryDirectory() as scratch:
+            row = perform(run, Path(scratch))
+            store.write(run.key, Outcome(row))
+
+
+@pytest.fixture
+def suite(write_suite: WriteSuite) -> Path:
+    return write_suite(HEADER, BASIN, "seeds = 4\n", DEAD_RECKONING)
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch_module, "run_batch", do_here)
+
+
+def finished(suite: Path, folder: Path) -> list[dict[str, Any]]:
+    counts = Batch.open(read_suite(suite), folder).run(HERE, LIMITS, nobody)
+    assert counts == {"ok": 4}
+    return table(folder)
+
+
+def test_resumed_batch_has_the_table_of_an_undisturbed_one(
+    suite: Path, tmp_path: Path, in_this_process: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    undisturbed = finished(suite, tmp_path / "a")
+    assert len({row["causal.ate_raw_m"] for row in undisturbed}) == 4
+    done: list[str] = []
+
+    def interrupted(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
+        do_here(runs[:1], store)
+        done.append(runs[0].key)
+        raise Interrupted
+
+    for count in (1, 2, 3):
+        monkeypatch.setattr(batch_module, "run_batch", interrupted)
+        batch = Batch.open(read_suite(suite), tmp_path / "b")
+        with pytest.raises(Interrupted):
+            batch.run(HERE, LIMITS, nobody)
+        assert len(table(tmp_path / "b")) == count
+        assert batch.resuming().startswith(f"{count} of 4 runs are done and kept")
+    monkeypatch.setattr(batch_module, "run_batch", do_here)
+    assert finished(suite, tmp_path / "b") == undisturbed
+    assert len(set(done)) == 3
+
+
+def test_full_disk_is_told_and_loses_no_run_that_is_done(
+    suite: Path, tmp_path: Path, in_this_process: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sonar_graph.batch import execution
+
+    class Full(Store):
+        def write(self, key: str, outcome: Outcome) -> None:
+            if len(list((self.folder / "runs").iterdir())) == 2:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            super().write(key, outcome)
+
+    class Done:
+        def __init__(self, run: PlannedRun) -> None:
+            self.run = run
+
+        def result(self) -> Outcome:
+            return Outcome(perform(self.run, tmp_path / "scratch" / self.run.key))
+
+    def kept(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
+        for run in runs:
+            execution._keep(run, Done(run), store, nobody)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(batch_module, "run_batch", kept)
+    folder = tmp_path / "out"
+    batch = Batch.open(read_suite(suite), folder)
+    with pytest.raises(BatchError, match=r"No space left.*2 of 4 runs are done and kept; the same command"):
+        Batch(batch.file, batch.runs, Full(folder)).run(HERE, LIMITS, nobody)
+    assert len(table(folder)) == 2
+    stamps = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*/row.json")}
+    monkeypatch.setattr(batch_module, "run_batch", do_here)
+    finished(suite, folder)
+    assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
+
+
+def test_mistake_in_a_suite_leaves_the_folder_alone(write_suite: WriteSuite, tmp_path: Path) -> None:
+    suite = write_suite(HEADER, BASIN, '[[estimators]]\nname = "no such"\n')
+    with pytest.raises(BatchError):
+        Batch.open(read_suite(suite), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_failed_runs_are_kept_until_they_are_discarded(suite: Path, tmp_path: Path, in_this_process: None) -> None:
+    batch = Batch.open(read_suite(suite), tmp_path)
+    batch.store.write(batch.runs[0].key, Outcome({"status": "timeout", "reason": "took longer than 1 s"}))
+    assert batch.run(HERE, LIMITS, nobody) == {"ok": 3, "timeout": 1}
+    assert batch.run(HERE, LIMITS, nobody) == {"ok": 3, "timeout": 1}
+    batch.discard_failed()
+    assert batch.run(HERE, LIMITS, nobody) == {"ok": 4}
+
+
+def test_timeout_that_is_given_goes_before_the_one_of_the_suite(write_suite: WriteSuite) -> None:
+    file = read_suite(write_suite(HEADER, "timeout_s = 7\nmemory_mb = 900\n", BASIN, DEAD_RECKONING))
+    assert limits_of(file, None) == Limits(7.0, 900.0)
+    assert limits_of(file, 3.0) == Limits(3.0, 900.0)

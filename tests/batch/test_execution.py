@@ -1,0 +1,120 @@
+"""Batches on real clusters. Kills at random moments, and the same through a scheduler of its own: the benchmark
+`batch_faults`, whose short version is run here."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
+
+ROOT = Path(__file__).parents[2]
+MAIN = """
+import signal
+from sonar_graph.cli import main
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # shells let what they start in the background ignore it
+main()
+"""
+pytestmark = pytest.mark.slow
+
+
+def bench(suite: Path, folder: Path, *options: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", MAIN, "bench", str(suite), "-o", str(folder), *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
+def test_faults_lose_no_run_and_change_no_number() -> None:
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "benchmarks" / "validation" / "batch_faults.py"), "--quick"],
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert done.returncode == 0, done.stderr
+    figures = json.loads(done.stdout.splitlines()[-1])
+    assert figures["rows_equal"] is True
+    assert figures["runs_lost"] == 0
+    assert figures["all_ok"] is True
+
+
+def test_rows_that_differ_are_told_apart_and_times_are_not_compared(tmp_path: Path) -> None:
+    faults = load_faults()
+    tables = []
+    for number, changed in enumerate(({}, {"wall_s": 2.0}, {"causal.ate_raw_m": math.nextafter(0.1, 1)})):
+        (tmp_path / str(number)).mkdir()
+        row = {"key": "a", "causal.ate_raw_m": 0.1, "wall_s": 1.0} | changed
+        pq.write_table(pa.Table.from_pylist([row]), tmp_path / str(number) / "results.parquet")
+        tables.append(faults.table(tmp_path / str(number)))
+    assert tables[0] == tables[1] != tables[2]
+
+
+def load_faults() -> Any:
+    path = ROOT / "benchmarks" / "validation" / "batch_faults.py"
+    spec = importlib.util.spec_from_file_location("batch_faults", path)
+    assert spec is not None
+    assert spec.loader is not None
+    faults = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(faults)
+    return faults
+
+
+def test_interrupt_ends_in_seconds_says_how_to_go_on_and_leaves_no_process(
+    write_suite: WriteSuite, misbehaving: None, tmp_path: Path
+) -> None:
+    sleeps = '[[estimators]]\nname = "sleeps"\n'
+    suite = write_suite(HEADER, BASIN, "seeds = 2\n", DEAD_RECKONING, sleeps)
+    with bench(suite, tmp_path / "out", "--workers", "1") as process:
+        while not list((tmp_path / "out").glob("runs/*/row.json")):
+            assert process.poll() is None
+            time.sleep(0.05)
+        time.sleep(1.0)
+        family = psutil.Process(process.pid).children(recursive=True)
+        assert family
+        began = time.monotonic()
+        os.killpg(process.pid, signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert time.monotonic() - began < 20
+    assert process.returncode == 130
+    (line,) = said.splitlines()
+    assert line == "sonar-graph: interrupted; 1 of 4 runs are done and kept; the same command goes on from there"
+    _, alive = psutil.wait_procs(family, timeout=10)
+    assert not alive
+    assert len(pq.read_table(tmp_path / "out" / "results.parquet")) == 1
+
+
+def test_failures_are_rows_and_the_exit_code_says_so(
+    write_suite: WriteSuite, misbehaving: None, tmp_path: Path
+) -> None:
+    failing = "".join(f'[[estimators]]\nname = "{name}"\n' for name in ("sleeps", "broken", "dies"))
+    suite = write_suite(HEADER, BASIN, DEAD_RECKONING, failing)
+    with bench(suite, tmp_path / "out", "--workers", "1", "--timeout", "20") as process:
+        answer, said = process.communicate(timeout=300)
+    assert process.returncode == 1
+    assert said == ""
+    assert answer.splitlines()[0] == "Runs: 1 ok, 1 failed, 1 killed, 1 timeout"
+    rows = pq.read_table(tmp_path / "out" / "results.parquet").to_pylist()
+    assert [row["status"] for row in rows] == ["ok", "timeout", "failed", "killed"]
+    assert all(row["reason"] for row in rows[1:])
+    assert all((tmp_path / "out" / row["log_file"]).is_file() for row in rows)
+
+
+def test_missing_scheduler_is_one_line(write_suite: WriteSuite, tmp_path: Path) -> None:
+    with bench(write_suite(), tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9") as process:
+        _, said = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert len(said.splitlines()) == 1
+    assert "no Dask scheduler at tcp://127.0.0.1:9" in said

@@ -1,0 +1,89 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sonar_graph.batch import plan
+from sonar_graph.batch.plan import plan_runs
+from sonar_graph.batch.planned import PlannedRun
+from sonar_graph.batch.sources import LOG, fingerprint
+from sonar_graph.batch.suite import read_suite
+
+from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
+
+ISAM2 = '[[estimators]]\nname = "isam2"\n'
+HEADER_OF_ISAM2 = HEADER.replace("dead-reckoning", "isam2")
+
+
+def planned(write_suite: WriteSuite, *parts: str) -> list[PlannedRun]:
+    return plan_runs(read_suite(write_suite(*parts)))
+
+
+def key(write_suite: WriteSuite, *parts: str) -> str:
+    (run,) = planned(write_suite, *parts)
+    return run.key
+
+
+def test_every_combination_is_planned_once_in_order(write_suite: WriteSuite) -> None:
+    runs = planned(
+        write_suite,
+        HEADER,
+        BASIN,
+        "grid = { wrong_id_rate = [0.0, 0.1], frame_rate_hz = [1, 2] }\nseeds = 2\n",
+        DEAD_RECKONING,
+        ISAM2 + 'variant = "short"\ngrid = { lag_s = [5, 15] }\n',
+    )
+    assert len({run.key for run in runs}) == len(runs) == 4 * 2 * 3
+    assert [run.variant for run in runs[:3]] == ["default", "short, lag_s=5", "short, lag_s=15"]
+    assert [run.seed for run in runs[:6]] == [0, 0, 0, 1, 1, 1]
+    assert runs[-1].log == "basin, wrong_id_rate=0.1, frame_rate_hz=2"
+    assert runs[-1].options["wrong_id_rate"] == 0.1
+    assert runs[-1].params["lag_s"] == 15
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        (HEADER_OF_ISAM2, BASIN.replace("120", "121"), ISAM2),
+        (HEADER_OF_ISAM2, BASIN, "seeds = [1]\n", ISAM2),
+        (HEADER_OF_ISAM2, BASIN, ISAM2, "params = { lag_s = 14 }\n"),
+        (HEADER_OF_ISAM2, "rate_hz = 1\n", BASIN, ISAM2),
+        (HEADER, BASIN, DEAD_RECKONING),
+    ],
+)
+def test_key_changes_with_all_that_decides_the_numbers(write_suite: WriteSuite, parts: tuple[str, ...]) -> None:
+    assert key(write_suite, *parts) != key(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2)
+
+
+def test_key_changes_with_the_version(write_suite: WriteSuite, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = key(write_suite)
+    monkeypatch.setattr(plan, "versions_of", lambda _name: {"sonar_graph": "another"})
+    assert key(write_suite) != before
+
+
+def test_key_does_not_change_with_names_or_with_defaults_written_out(write_suite: WriteSuite) -> None:
+    same = key(
+        write_suite,
+        HEADER_OF_ISAM2.replace("short", "another") + "timeout_s = 9\n",
+        BASIN.replace('"basin"\ngen', '"pool"\ngen').replace("laps = 1", "laps = 1, wrong_id_rate = 0.0"),
+        "seeds = [0]\n",
+        ISAM2,
+        "params = { lag_s = 15.0 }\n",
+    )
+    assert same == key(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2)
+
+
+def test_of_a_log_the_content_counts_and_not_the_place(tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    paths = [tmp_path / "a.mcap", tmp_path / "other" / "b.mcap", tmp_path / "c.mcap"]
+    for path, content in zip(paths, (b"log", b"log", b"lob"), strict=True):
+        path.write_bytes(content)
+    first, moved, changed = (fingerprint(LOG, {"log": str(path)}) for path in paths)
+    assert first == moved
+    assert first != changed
+
+
+def test_estimator_that_cannot_be_loaded_is_planned(write_suite: WriteSuite, misbehaving: None) -> None:
+    runs = planned(write_suite, HEADER, BASIN, DEAD_RECKONING, '[[estimators]]\nname = "broken"\nparams = { a = 1 }\n')
+    assert runs[1].params == {"a": 1}

@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from sonar_graph.batch.plan import plan_runs
+from sonar_graph.batch.planned import Outcome
+from sonar_graph.batch.results import COLUMNS, SUITE_METADATA, is_timing, write_results
+from sonar_graph.batch.store import Store
+from sonar_graph.batch.suite import read_suite
+
+from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
+
+
+def test_table_has_a_row_for_each_run_that_is_done_in_the_order_of_the_plan(
+    write_suite: WriteSuite, tmp_path: Path
+) -> None:
+    file = read_suite(write_suite(HEADER, BASIN, "seeds = 4\n", DEAD_RECKONING))
+    runs, store = plan_runs(file), Store(tmp_path / "out")
+    for run, error_m in ((runs[2], 0.3), (runs[0], 0.1)):
+        store.write(run.key, Outcome({"status": "ok", "causal.ate_raw_m": error_m, "causal.nees_yaw_dof": 1}))
+    store.write(runs[3].key, Outcome({"status": "timeout", "reason": "took longer than 1 s"}))
+    table = pq.read_table(write_results(store, file.suite, runs))
+    assert table.column_names == [*COLUMNS, "causal.ate_raw_m", "causal.nees_yaw_dof"]
+    assert table["seed"].to_pylist() == [0, 2, 3]
+    assert table["causal.ate_raw_m"].to_pylist() == [0.1, 0.3, None]
+    assert table["status"].to_pylist() == ["ok", "ok", "timeout"]
+    assert table["sonar_graph"].null_count == 0
+    assert table["causal.nees_yaw_dof"].type == pa.int64()
+    assert json.loads(table["options"][0].as_py())["duration_s"] == 120
+    assert (store.folder / table["log_file"][0].as_py()).is_file()
+    about = json.loads(table.schema.metadata[SUITE_METADATA])
+    assert about["reference"] == "dead-reckoning"
+
+
+def test_table_of_a_batch_without_any_run_has_the_columns(write_suite: WriteSuite, tmp_path: Path) -> None:
+    file = read_suite(write_suite())
+    assert pq.read_table(write_results(Store(tmp_path), file.suite, plan_runs(file))).column_names == [*COLUMNS]
+
+
+def test_times_and_memory_alone_may_differ_between_equal_runs() -> None:
+    timings = {"wall_s", "cpu_s", "peak_memory_mb", "update_p99_ms", "time.total_s", "memory.peak_mb"}
+    assert all(map(is_timing, timings))
+    assert not any(map(is_timing, ("key", "causal.ate_raw_m", "scored_instants", "machine", "status")))

@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sonar_graph.batch.planned import Outcome
+from sonar_graph.batch.store import Store
+
+OUTCOME = Outcome({"status": "ok", "causal.ate_raw_m": 0.1}, {"runs/isam2/series.npz": b"123", "a.json": b"{}"}, "said")
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    assert store.row("k") is None
+    store.write("k", OUTCOME)
+    assert store.row("k") == OUTCOME.row
+    assert names(tmp_path) == [f"runs/k/{name}" for name in ("a.json", "log.txt", "row.json", "runs/isam2/series.npz")]
+    assert (tmp_path / store.log_file("k")).read_text() == "said"
+
+
+@pytest.mark.parametrize("last", range(4))
+def test_full_disk_leaves_nothing_of_the_run_and_all_of_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, last: int
+) -> None:
+    store = Store(tmp_path)
+    store.write("done", OUTCOME)
+    before = names(tmp_path)
+    written = 0
+    write, write_text = Path.write_bytes, Path.write_text
+
+    def full(self: Path, *content: Any) -> int:
+        nonlocal written
+        if written == last:
+            write(self, b"half")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        written += 1
+        return (write if isinstance(content[0], bytes) else write_text)(self, *content)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match="No space"):
+        store.write("next", OUTCOME)
+    assert names(tmp_path) == before
+    assert not list((tmp_path / "runs").glob(".*"))
+
+
+def test_process_that_dies_before_the_rename_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = Store(tmp_path)
+
+    class Died(BaseException):
+        pass
+
+    def die(_self: Path, _target: Path) -> None:
+        raise Died
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", die)
+        patch.setattr("shutil.rmtree", lambda *_arguments, **_options: None)  # a killed process cleans nothing up
+        with pytest.raises(Died):
+            store.write("k", OUTCOME)
+    assert store.row("k") is None
+    assert list((tmp_path / "runs").iterdir())
+    store.remove_partial()
+    assert not list((tmp_path / "runs").iterdir())
+
+
+def test_row_that_the_machine_lost_counts_as_not_done(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.write("k", OUTCOME)
+    (store.run_folder("k") / "row.json").write_bytes(b"")
+    assert store.row("k") is None
+    store.write("k", OUTCOME)
+    assert store.row("k") == OUTCOME.row

@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+import psutil
+import pytest
+
+from sonar_graph.batch import supervision
+from sonar_graph.batch.planned import Limits, PlannedRun
+from sonar_graph.batch.supervision import perform_watched
+
+Planned = Callable[..., PlannedRun]
+AMPLE = Limits(600.0)
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(autouse=True)
+def no_process_left() -> Iterator[None]:
+    yield
+    for runner in supervision._idle:
+        runner.end()
+    supervision._idle.clear()
+    time.sleep(0.1)  # the thread that listens to it ends
+
+
+def runners() -> list[psutil.Process]:
+    return [p for p in psutil.Process().children() if "sonar_graph.batch.runner" in p.cmdline()]
+
+
+def test_run_that_takes_too_long_is_ended_and_the_next_one_is_done(planned: Planned, misbehaving: None) -> None:
+    perform_watched(planned(), AMPLE)  # compiled from here on
+    began = time.monotonic()
+    outcome = perform_watched(planned("sleeps"), Limits(2.0))
+    assert outcome.row["status"] == "timeout"
+    assert outcome.row["reason"] == "took longer than 2 s"
+    assert time.monotonic() - began < 30
+    assert not runners()
+    assert perform_watched(planned(), AMPLE).row["status"] == "ok"
+
+
+def test_run_that_needs_too_much_memory_is_ended(planned: Planned, misbehaving: None) -> None:
+    outcome = perform_watched(planned("hungry"), Limits(120.0, memory_mb=700.0))
+    assert outcome.row["status"] == "memory"
+    assert outcome.row["reason"] == "its process needed more than 700 MB"
+
+
+def test_run_whose_process_is_killed_once_costs_a_retry_and_nothing_else(planned: Planned, misbehaving: None) -> None:
+    outcome = perform_watched(planned("dies-once"), AMPLE)
+    assert outcome.row["status"] == "ok"
+
+
+def test_run_whose_process_is_killed_twice_is_a_row(planned: Planned, misbehaving: None) -> None:
+    outcome = perform_watched(planned("dies"), AMPLE)
+    assert outcome.row["status"] == "killed"
+    assert outcome.row["reason"] == "its process was ended by SIGKILL, 2 times"
+
+
+def test_log_has_the_traceback_and_what_native_code_wrote_of_this_run_alone(
+    planned: Planned, misbehaving: None
+) -> None:
+    outcome = perform_watched(planned("prints"), AMPLE)
+    assert outcome.row["status"] == "failed"
+    assert "written by native code" in outcome.log
+    assert "RuntimeError: diverged" in outcome.log
+    assert "Traceback" in outcome.log
+    assert "runs/prints/result.json" in outcome.files
+    (runner,) = runners()
+    assert "diverged" not in perform_watched(planned(), AMPLE).log
+    assert runners() == [runner]
+
+
+def test_process_of_runs_does_not_outlive_who_started_it() -> None:
+    code = (
+        "from sonar_graph.batch.supervision import Runner; import time;"
+        "print(Runner().pid, flush=True); time.sleep(1000)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as starter:
+        assert starter.stdout is not None
+        runner = psutil.Process(int(starter.stdout.readline()))
+        starter.kill()
+    assert runner.wait(timeout=30) is None
