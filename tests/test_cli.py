@@ -133,6 +133,7 @@ def test_examples_in_help_are_understood(
         "dive.aris",
         "pings.raw",
         "reference.json",
+        "suite.toml",
     ):
         Path(name).touch()
     for name in ("comparison", "MRCLAM_Dataset6", "DLR", "A-KIT", "ros2_bag_folder", "results"):
