@@ -125,7 +125,9 @@ def summary_cells(told: Summary, factor: float = 1.0) -> list[Cell]:
     """Mean with its error, median, and range of the middle 80 %."""
     note = f"{told.without} of {told.runs} without a value" if told.without else ""
     error = told.rounding_error * factor
-    mean = number(told.mean, with_error(told.mean * factor, error), told.standard_error, note=note)
+    mean = number(
+        told.mean, with_error(told.mean * factor, told.standard_error * factor), told.standard_error, note=note
+    )
     median = number(told.median, supported(told.median * factor, error))
     if told.runs == 1:
         return [mean, median, absent(2)]

@@ -91,9 +91,9 @@ def difference_drawing(batch: RecordedBatch, metric: Metric, tests: Tests) -> Dr
                     ends = np.array([test.mean, *test.interval]) * metric.factor
                     _draw_interval(panel, ends, place, over)
     caption = (
-        f"{metric.label}: mean of the differences on the same log and seed, with 95 % bootstrap intervals; left of the "
-        f"line the error is smaller than that of {batch.reference}. {_kinds_told(metric)}A group in which a run has no "
-        "value has no mean difference and is not drawn."
+        f"{metric.label}: mean of the differences on the same log and seed, with 95 % bootstrap intervals (of few "
+        f"pairs none); left of the line the error is smaller than that of {batch.reference}. {_kinds_told(metric)}A "
+        "group in which a run has no value has no mean difference and is not drawn."
     )
     rows = [["log", "contestant", "column", "pairs", "mean_difference", "low", "high"]]
     rows += [

@@ -40,7 +40,7 @@ class Summary:
     standard_error: float
     """Of the mean; NaN for one run."""
     rounding_error: float
-    """The same of those runs that have a value: digits beyond it mean nothing."""
+    """Digits beyond it mean nothing: the standard error of those runs that have a value, for few not below 1 %."""
     median: float
     low: float
     high: float
@@ -67,7 +67,7 @@ class Paired:
     mean: float
     """NaN where a pair is without a value."""
     rounding_error: float
-    """Standard error of those that have a value: digits beyond it mean nothing."""
+    """Digits beyond it mean nothing: the standard error of pairs that have a value, for few not below 1 %."""
     interval: tuple[float, float]
     """Of the mean, bootstrap; NaN where there are too few pairs or no mean."""
     median: float
@@ -108,7 +108,7 @@ def summarise(values: Floats) -> Summary:
         without=without,
         mean=float(values.mean()) if has_mean else math.nan,
         standard_error=standard_error(values),
-        rounding_error=standard_error(values[np.isfinite(values)]),
+        rounding_error=_rounding_error(values[np.isfinite(values)]),
         median=median,
         low=low,
         high=high,
@@ -133,6 +133,13 @@ def standard_error(values: Floats) -> float:
     return float(values.std(ddof=1) / math.sqrt(len(values)))
 
 
+def _rounding_error(values: Floats) -> float:
+    """Standard error; of few values at least a hundredth of their mean, as two may agree by chance."""
+    if not len(values) or len(values) >= LEAST_PAIRS:
+        return standard_error(values)
+    return max(standard_error(values), 0.01 * abs(float(values.mean()))) if len(values) > 1 else math.nan
+
+
 def failure_rate(failed: int, runs: int) -> Rate:
     """Share of runs that did not end, with its 95 % interval (Wilson 1927)."""
     interval = stats.binomtest(failed, runs).proportion_ci(CONFIDENCE, method="wilson")
@@ -152,7 +159,7 @@ def paired(own: Floats, reference: Floats) -> Paired:
         without=without,
         smaller=int((differences < 0).sum()),
         mean=float(differences.mean()) if has_mean else math.nan,
-        rounding_error=standard_error(differences[np.isfinite(differences)]),
+        rounding_error=_rounding_error(differences[np.isfinite(differences)]),
         interval=bootstrap_interval(differences) if has_mean else (math.nan, math.nan),
         median=quantile(differences, 0.5),
         p_value=signed_rank_p(differences),

@@ -86,15 +86,19 @@ def test_all_figures_are_drawn_in_the_colours_of_the_page(browser, page_file, sc
 
 
 def test_tables_sort_by_number_and_back_with_the_keyboard(browser, page_file):
-    values = "[...document.querySelectorAll('#table-accuracy-ate-se2-m tbody tr')].map(r => r.children[4].dataset.sort)"
+    rows = "document.querySelectorAll('#table-difference-ate-se2-m tbody tr')"
+    values = f"[...{rows}].map(row => row.children[3].dataset.sort).filter(text => text)"
+    last = f"[...{rows}].at(-1).children[3].dataset.sort"
     with opened(browser, page_file, DESKTOP) as (page, _):
-        button = page.locator("#table-accuracy-ate-se2-m th button").nth(4)
+        button = page.locator("#table-difference-ate-se2-m th button").nth(3)
         button.focus()
         page.keyboard.press("Enter")
         upwards = page.evaluate(values)
         assert button.locator("..").get_attribute("aria-sort") == "ascending"
         page.keyboard.press("Enter")
         downwards = page.evaluate(values)
+        assert page.evaluate(last) == "", "what has no mean stays at the end"
+    assert len(upwards) > 3
     assert list(map(float, upwards)) == sorted(map(float, upwards))
     assert list(map(float, downwards)) == sorted(map(float, downwards), reverse=True)
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -40,6 +41,17 @@ def test_a_run_that_did_not_end_has_no_value_whatever_is_recorded():
     batch = with_failures(drawn_batch(3), "isam2", LOGS[0], 1)
     assert math.isinf(batch.group(LOGS[0], "isam2")[0].value("causal.ate_se2_m"))
     assert len(batch.pairs(LOGS[0], "isam2", "causal.ate_se2_m")[0]) == 3, "it is not left out"
+
+
+def test_what_a_run_recorded_before_it_was_ended_does_not_count():
+    batch = drawn_batch(2)
+    assert math.isinf(replace(batch.runs[0], status="timeout").value("causal.ate_se2_m"))
+
+
+def test_a_seed_that_the_reference_lacks_makes_no_pair():
+    batch = drawn_batch(3)
+    fewer = replace(batch, runs=[run for run in batch.runs if (run.contestant, run.seed) != ("dead-reckoning", 1)])
+    assert len(fewer.pairs(LOGS[0], "isam2", "causal.ate_se2_m")[0]) == 2
 
 
 def test_a_score_that_a_contestant_never_has_is_no_failure():

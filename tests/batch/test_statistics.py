@@ -142,6 +142,12 @@ def test_a_group_with_a_run_without_a_value_has_no_mean():
     assert (short.runs, short.without, short.median) == (4, 1, 3.0)
 
 
+def test_two_values_that_agree_by_chance_do_not_make_digits():
+    assert summarise(np.array([10.54003, 10.54024])).rounding_error == pytest.approx(0.105, abs=1e-3)
+    many = np.tile([10.54003, 10.54024], 5)
+    assert summarise(many).rounding_error == pytest.approx(stats.sem(many))
+
+
 def test_standard_error_of_one_run_is_unknown():
     assert math.isnan(standard_error(np.array([1.0])))
 

@@ -157,6 +157,24 @@ def test_the_finding_names_failures_and_only_differences_beyond_chance():
     assert "Not told apart from dead-reckoning: isam2" in errors_told(alike, metrics, all_tests(alike, metrics))[0]
 
 
+def test_the_finding_gives_no_mean_over_survivors():
+    batch = with_failures(drawn_batch(18), "isam2", LOGS[0], 1)
+    metrics = metrics_of(METRICS)
+    told = errors_told(batch, metrics, all_tests(batch, metrics))[0]
+    assert "isam2 differs from dead-reckoning (p = " in told
+    assert "isam2 is on average" not in told
+
+
+def test_angles_are_degrees_for_people_and_radians_in_files():
+    batch = drawn_batch()
+    table = accuracy_table(batch, metrics_of(["causal.yaw_rmse_rad"])[0])
+    mean = batch.values(LOGS[0], "isam2", "causal.yaw_rmse_rad").mean()
+    cell = next(line[3] for line in table.rows if line[1].text == "isam2")
+    assert cell.numbers[0] == mean
+    assert float(cell.text.split(" ± ")[0]) == pytest.approx(np.degrees(mean), rel=0.1)
+    assert table.title.endswith("°")
+
+
 def test_too_few_seeds_are_warned_of():
     few, many = drawn_batch(4, logs=LOGS[:1]), drawn_batch(12, logs=LOGS[:1])
     metrics = metrics_of(METRICS)
