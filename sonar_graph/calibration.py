@@ -20,6 +20,10 @@ STANDARD_GRAVITY = 9.80665
 HOLE_INTERVALS = 5
 """Typical intervals of the IMU without a sample, above which there is a hole: one lost sample does no harm."""
 SHORTEST_HOLE_S = 0.05
+ROWS_BEFORE = 8
+"""Intervals before one that tell which is typical."""
+UNTYPICAL_S = 1.0
+"""Longest interval after the very first sample that is no hole."""
 
 
 def _within_a_turn(angle_rad: float) -> float:

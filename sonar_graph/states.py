@@ -118,6 +118,8 @@ class Outcome(StrEnum):
     USED_LATER = "used later, when its identity was known"
     MOVED = "used: taken back from one landmark and given to another"
     GATED = "refused: innovation outside the gate"
+    REASSIGNED = "used: its place says that it is another landmark"
+    UNFIT = "refused: its place fits no landmark that it may be"
     NO_IDENTITY = "refused: no identity probable enough"
     WAITING = "waiting: its identity is not known yet"
     FORGOTTEN = "refused: its identity did not become known in time"
@@ -155,6 +157,7 @@ class Refusal(StrEnum):
     OUTLIER = "refused: no vehicle reaches this velocity from the last"
     LATE = "refused: the motion that it belongs to was already used"
     UNCONFIRMED = "refused: no other velocity confirms it, and none before it is near enough"
+    WAITED = "not used: it came after a gap, and only the velocity that confirmed it was"
     UNSOUND = "refused: its covariance is not positive definite"
     INCOMPLETE = "refused: too few beams, and nothing to complete them with"
 

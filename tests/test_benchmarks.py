@@ -47,6 +47,14 @@ def test_isam2_mission_names_its_figures() -> None:
     assert found["plain_error_m"] < 0.3
 
 
+def test_long_mission_names_its_figures() -> None:
+    found = figures("performance/long_mission.py", "--hours", "0.05")
+    assert {"decile_ratio", "max_update_ms", "memory_growth_ratio", "passed"} <= set(found)
+    assert 0 < found["max_cpu_ms"] <= found["max_wall_ms"] + 1
+    assert found["causal_error_m"] < 0.3
+    assert found["smoothed_error_m"] < 0.3
+
+
 def test_preintegration_names_its_figures() -> None:
     found = figures("performance/preintegration.py")
     assert found["gtsam_cpp_ratio"] == pytest.approx(found["ours_ns"] / found["gtsam_cpp_ns"], rel=1e-3)
@@ -242,3 +250,11 @@ def test_every_script_is_listed() -> None:
         for script in (BENCHMARKS / folder).glob("*.py"):
             if "__main__" in script.read_text(encoding="utf-8"):
                 assert f"{folder}/{script.name}" in listed
+
+
+@pytest.mark.slow
+def test_unknown_landmarks_finds_all_in_a_short_basin() -> None:
+    found = figures("validation/unknown_landmarks.py", "--workers", "1")
+    assert found["passed"]
+    assert found["basin"]["unknown"]["landmarks"] == found["basin"]["known"]["landmarks"] == 4
+    assert found["basin"]["unknown"]["used"] > 0.9 * found["basin"]["known"]["used"]

@@ -63,11 +63,14 @@ def test_differences_are_paired_by_seed(table: Any, kept: Any) -> None:
 def test_the_best_policy_is_the_one_whose_worst_case_is_best(table: Any, kept: Any, monkeypatch: Any) -> None:
     monkeypatch.setattr(table, "ESTIMATORS", dict.fromkeys(("EKF-SLAM", "iSAM2, a", "iSAM2, b")))
 
-    def told(ekf: float, a: float, b: float) -> dict[str, dict[str, float]]:
-        return {"EKF-SLAM": {"loss": ekf}, "iSAM2, a": {"loss": a}, "iSAM2, b": {"loss": b}}
+    def told(ekf: float, a: float, b: float, b_map: float = 0.0) -> dict[str, dict[str, float]]:
+        losses = {"EKF-SLAM": (ekf, ekf), "iSAM2, a": (a, 0.0), "iSAM2, b": (b, b_map)}
+        return {name: {"loss": track, "landmark_loss": map_} for name, (track, map_) in losses.items()}
 
     figures = {kept.Case(0.1): told(0, 0.1, 0.2), kept.Case(0.1, 5.0): told(0, 0.9, 0.3), kept.Case(0.2): told(0, 0, 9)}
     assert table.best_policy(figures) == ("iSAM2, b", 0.3)
+    figures[kept.Case(0.1, 5.0, 5.0)] = told(0, 0.1, 0.1, b_map=0.8)
+    assert table.best_policy(figures) == ("iSAM2, b", 0.8)
     figures[kept.Case(0.1, 20.0)] = told(0, 0.1, float("nan"))
     assert table.best_policy(figures) == ("iSAM2, a", 0.9)
 

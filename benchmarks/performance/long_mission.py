@@ -9,9 +9,12 @@ that the log is never in the memory that is measured. The estimator is asked at 
   the system gave the core to another process meanwhile (``max_wall_ms`` has those calls by the wall too);
 * ``memory_growth_ratio``: resident memory in the last tenth over that at the end of the first, medians.
 
-Resident memory is that of the whole process. What the estimator keeps on purpose (outcomes of detections, poses at the
-instants asked) is in it; `--trace` counts what Python allocates too, by the line that did, at several times the run
-time.
+The mission is run twice, and a call counts by the shorter of its two times: the estimator does the same in both, and
+what else the machine does is seldom in both. Memory is that of the first run.
+
+Resident memory is that of the whole process. Poses and outcomes of a quarter of an hour are remembered; with
+``--remembered 0`` those of the whole mission, in columns. `--trace` counts what Python allocates, by the line that did,
+at several times the run time.
 """
 
 from __future__ import annotations
@@ -154,6 +157,14 @@ def run(mission: StoredMission, params: Isam2Params) -> tuple[Isam2, Record]:
     return estimator, record
 
 
+def shorter(first: Record, second: Record) -> Record:
+    """The first, with the shorter times of both."""
+    first.cpu_s = np.minimum(first.cpu_s, second.cpu_s)
+    first.wall_s = np.minimum(first.wall_s, second.wall_s)
+    first.own_s = np.minimum(first.own_s, second.own_s)
+    return first
+
+
 def tenths(record: Record) -> list[dict[str, float]]:
     """Time and memory of each tenth of the calls."""
     rows = []
@@ -179,6 +190,8 @@ def report(mission: StoredMission, estimator: Isam2, record: Record) -> dict[str
     rows = tenths(record)
     print_table(("tenth", *rows[0]), [(str(k), *row.values()) for k, row in enumerate(rows, start=1)])
     wall_ms, own_ms, cpu_ms = 1e3 * record.wall_s, 1e3 * record.own_s, 1e3 * record.cpu_s
+    longest = int(np.argmax(own_ms))
+    print(f"longest call: number {longest} of {record.calls}, {own_ms[longest]:.1f} ms\n")
     off_m = (record.positions - mission.true_positions(record.stamps_ns))[record.stamps_ns > 0, :2]
     figures: dict[str, float | int | bool] = {
         "decile_ratio": rows[-1]["keyframe_ms"] / rows[0]["keyframe_ms"],
@@ -219,10 +232,11 @@ def main() -> None:
     parser.add_argument("--hours", type=float, help="of the mission (default: 8; with --quick 0.25)")
     parser.add_argument("--landmarks", type=int, default=20)
     parser.add_argument("--history", choices=["bounded", "whole"], default="bounded")
+    parser.add_argument("--remembered", type=float, default=900.0, help="seconds of poses and outcomes; 0: all")
     parser.add_argument("--trace", action="store_true", help="say which lines hold more memory at the end")
     arguments = parser.parse_args()
     hours = arguments.hours or (0.25 if arguments.quick else 8.0)
-    params = Isam2Params(history=arguments.history)
+    params = Isam2Params(history=arguments.history, remembered_s=arguments.remembered or None)
     with tempfile.TemporaryDirectory() as first, tempfile.TemporaryDirectory() as second:
         note("warming up: compiled functions load at their first use")
         run(simulated(MissionOptions(duration_s=60.0), Path(first)), params)
@@ -231,7 +245,10 @@ def main() -> None:
         mission = simulated(options, Path(second))
         if arguments.trace:
             tracemalloc.start(5)
-        figures = report(mission, *run(mission, params))
+        estimator, record = run(mission, params)
+        if not arguments.trace:
+            record = shorter(record, run(mission, params)[1])
+        figures = report(mission, estimator, record)
     if arguments.trace:
         for line in tracemalloc.take_snapshot().statistics("lineno")[:25]:
             note(str(line))

@@ -22,9 +22,11 @@ ESTIMATORS: dict[str, tuple[str, dict[str, Any]]] = {
     "dead reckoning": ("dead-reckoning", {}),
     "EKF-SLAM": ("ekf-slam", {}),
     "invariant EKF": ("invariant-ekf", {}),
-    "iSAM2, gate": ("isam2", {"deferred_identity": False, "kernel": "none", "gate_probability": 0.99}),
+    "iSAM2, gate": ("isam2", {"identity_policy": "gate", "kernel": "none", "deferred_identity": False}),
     "iSAM2, robust": ("isam2", {"deferred_identity": False}),
     "iSAM2, deferred": ("isam2", {}),
+    "iSAM2, max-mixture": ("isam2", {"identity_policy": "max-mixture"}),
+    "iSAM2, gnc": ("isam2", {"identity_policy": "gnc"}),
 }
 """By the name in the table: entry point and settings."""
 LOST_M = 1.0

@@ -47,7 +47,7 @@ EFFORTS: dict[str, dict[str, Any]] = {
     "gain 0": {"waiting_gain": 0.0},
 }
 KERNELS: dict[str, dict[str, Any]] = {
-    "huber 2.0, gate 0.999": {"kernel": "huber", "kernel_width": 2.0, "gate_probability": 0.999},
+    "huber 2.0, gate 0.999": {"identity_policy": "gate", "kernel": "huber", "kernel_width": 2.0},
     "cauchy 1.5, no gate": {},
     "cauchy 1.0, no gate": {"kernel_width": 1.0},
     "no kernel, no gate": {"kernel": "none"},

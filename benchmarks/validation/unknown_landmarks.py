@@ -31,7 +31,7 @@ from sonar_graph.logs.converters.mrclam import read_mrclam
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.states import Outcome
+from sonar_graph.states import DetectionLog, Outcome
 
 Figures = dict[str, float]
 FARTHEST_M = 1.0
@@ -90,7 +90,7 @@ def of_landmarks(sequence: Sequence, result: RunResult) -> Figures:
     assert log is not None
     errors = landmark_errors(named_by_place(estimated, true, FARTHEST_M), true)
     is_used = np.isin(np.array(log.outcomes), USED)
-    taken_for, meant = log.landmark_ids[is_used], true_identities(sequence)[is_used]
+    taken_for, meant = log.landmark_ids[is_used], true_identities(sequence, log)[is_used]
     stands_for = {i: most_frequent(meant[taken_for == i]) for i in estimated.ids.tolist()}
     real = {identity for identity in stands_for.values() if identity >= 0}
     right = sum(int(np.sum(meant[taken_for == i] == identity)) for i, identity in stands_for.items() if identity >= 0)
@@ -110,10 +110,10 @@ def most_frequent(identities: Ints) -> int:
     return int(values[np.argmax(counts)]) if len(values) else -2
 
 
-def true_identities(sequence: Sequence) -> Ints:
-    """Of each detection; -2: of nothing."""
+def true_identities(sequence: Sequence, log: DetectionLog) -> Ints:
+    """Of each detection of a log; -2: of nothing."""
     assert sequence.detections is not None
-    ids, probability = sequence.detections.most_probable()
+    ids, probability = sequence.detections.rows(np.isin(sequence.detections.stamps_ns, log.stamps_ns)).most_probable()
     return np.where(probability >= SURE, ids, -2)
 
 

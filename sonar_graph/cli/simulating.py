@@ -23,12 +23,13 @@ if TYPE_CHECKING:
 
 _OTHERS = (
     "gyro_bias_scale, accel_bias_scale, dvl_scale_error, dvl_dropouts_per_hour, dvl_dropout_s, frame_rate_hz, "
-    "range_sigma_m, azimuth_sigma_rad, detection_probability, wrong_id_rate, false_detections_per_frame, "
-    "confident_false_fraction, start_position_sigma_m, start_rotation_sigma_rad, floor_sigma_m, speed_m_s; and with "
-    "--images image.NAME: sonar, designs, speckle, side_lobes, cross_talk_db, measured_lens, floor_db, "
-    "absorption_db_m, tvg_error_db, texture_shape, joints, shadows, multipath, surface_path_db, floor_reflection, "
-    "noise_db, drop_probability, time_offset_s, sound_speed_error, stones, decoys. image.designs is a TOML file of at "
-    "least four landmarks; the four lowest ids are laid, in their order"
+    "range_sigma_m, azimuth_sigma_rad, detection_probability, wrong_id_rate, tracks, id_delay_s, wrong_id_share, "
+    "anonymous_share, false_detections_per_frame, confident_false_fraction, start_position_sigma_m, "
+    "start_rotation_sigma_rad, floor_sigma_m, speed_m_s; and with --images image.NAME: sonar, designs, speckle, "
+    "side_lobes, cross_talk_db, measured_lens, floor_db, absorption_db_m, tvg_error_db, texture_shape, joints, "
+    "shadows, multipath, surface_path_db, floor_reflection, noise_db, drop_probability, time_offset_s, "
+    "sound_speed_error, stones, decoys. image.designs is a TOML file of at least four landmarks; the four lowest ids "
+    "are laid, in their order"
 )
 """Written out, because help must not wait for the simulator to be imported."""
 worlds = typer.Typer(

@@ -1,4 +1,4 @@
-"""Two small worlds with known truth: a gentle left turn past three landmarks, and a vehicle at rest.
+"""Small worlds with known truth: a gentle left turn past three landmarks, also misnamed, and a vehicle at rest.
 
 Body velocity and angular rate are constant in the first, so that its truth is a circle in closed form.
 """
@@ -6,6 +6,7 @@ Body velocity and angular rate are constant in the first, so that its truth is a
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,6 +26,8 @@ LANDMARKS_M = {4: (7.0, 3.0), 9: (3.0, 7.0), 11: (5.5, 5.5)}
 STILL_START = Start(position_m=(1.0, -2.0, HEIGHT_M), rpy_rad=(0.1, -0.05, 0.7))
 IMU_HZ, DVL_HZ, DEPTH_HZ, FRAME_HZ = 50, 5, 5, 2
 SEED = 20
+TRACK_FRAMES = 4
+MISNAMED_FRAMES = 8
 
 
 def small_world(dvl_delay_s: float = 0.0) -> Sequence:
@@ -42,6 +45,28 @@ def small_world(dvl_delay_s: float = 0.0) -> Sequence:
         truth=truth,
         true_landmarks=_true_landmarks(),
     )
+
+
+def misnamed_world(*, is_tracked: bool = False) -> Sequence:
+    """The left turn, where all first names are surely wrong, later a fifth of them, and a few landmarks have none.
+
+    Parameters
+    ----------
+    is_tracked
+        Whether each landmark is seen in tracks of `TRACK_FRAMES` frames, and a name is wrong for a whole track.
+    """
+    world, noise = small_world(), np.random.default_rng(SEED)
+    rows = world.detections
+    assert rows is not None
+    frame, place = np.divmod(np.arange(len(rows)), len(LANDMARKS_M))
+    track = frame // TRACK_FRAMES * len(LANDMARKS_M) + place
+    said = noise.choice(["right", "wrong", "nothing"], len(rows), p=[0.7, 0.2, 0.1])
+    said = np.where(frame < MISNAMED_FRAMES, "wrong", said[track] if is_tracked else said)
+    names = np.array(list(LANDMARKS_M), dtype=np.int64)
+    wrong = names[(place + 1) % len(names)]
+    ids = np.select([said == "wrong", said == "nothing"], [wrong, -1], names[place])
+    misnamed = replace(rows, candidate_ids=ids[:, None], track=track if is_tracked else rows.track)
+    return replace(world, detections=misnamed)
 
 
 def still_world() -> Sequence:

@@ -151,7 +151,7 @@ def detection_scores(log: DetectionLog) -> dict[str, Score]:
     """What became of the detections, and whether innovations fit their covariances."""
     counts = Counter(log.outcomes)
     new, ignored = counts[Outcome.NEW], counts[Outcome.IGNORED]
-    used = counts[Outcome.USED] + counts[Outcome.USED_LATER] + counts[Outcome.MOVED] + new
+    used = counts[Outcome.USED] + counts[Outcome.USED_LATER] + counts[Outcome.MOVED] + counts[Outcome.REASSIGNED] + new
     unnamed = counts[Outcome.NO_IDENTITY] + counts[Outcome.WAITING] + counts[Outcome.FORGOTTEN]
     refused = len(log) - used - ignored - unnamed
     of_all = f"of {len(log)}" + (f", {ignored} of which this estimator has no use for" if ignored else "")

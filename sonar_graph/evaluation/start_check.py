@@ -27,7 +27,7 @@ RESTS_S = (10, 20, 40, 80, 160)
 LEAST_TILT_RAD = np.radians(0.25)
 LEAST_HEADING_RAD = np.radians(1.0)
 """What is smaller changes nothing that other errors would not hide."""
-TURN_OVER_NS = NS_PER_S // 2
+TURN_OVER_NS = NS_PER_S
 LEAST_SPREAD_RAD = np.radians(0.1)
 
 
@@ -151,14 +151,22 @@ def find_start_heading(sequence: Sequence, reference: Trajectory, offset: Estima
     """
     first_ns, last_ns = reference.stamps_ns[[0, -1]].tolist()
     at_ns = min(max(sequence.start_ns - round(offset.value * NS_PER_S), first_ns), last_ns)
-    pose, ends_ns = reference.at(np.array([at_ns])), np.array([at_ns - TURN_OVER_NS, at_ns + TURN_OVER_NS])
-    ends = reference.at(np.unique(np.clip(ends_ns, first_ns, last_ns))).rotations()
-    turn_rate = (ends[0].inv() * ends[-1]).magnitude() * NS_PER_S / TURN_OVER_NS
+    pose = reference.at(np.array([at_ns]))
     yaw, pitch, roll = pose.rotations().as_euler("ZYX")[0].tolist()
     x, y, z = pose.positions[0].tolist()
     error = _wrapped(sequence.calibration.start.rpy_rad[2] - yaw)
-    spread = float(np.hypot(LEAST_SPREAD_RAD, turn_rate * offset.sigma))
+    spread = float(np.hypot(LEAST_SPREAD_RAD, _turn_rate(reference, at_ns) * offset.sigma))
     return StartHeading((roll, pitch, yaw), (x, y, z), Estimate1D(error, spread))
+
+
+def _turn_rate(reference: Trajectory, at_ns: int) -> float:
+    """About an instant, or as near to it as the reference lasts, rad/s."""
+    first_ns, last_ns = reference.stamps_ns[[0, -1]].tolist()
+    begin_ns, end_ns = max(at_ns - TURN_OVER_NS // 2, first_ns), min(at_ns + TURN_OVER_NS // 2, last_ns)
+    if end_ns <= begin_ns:
+        return 0.0
+    begin, end = reference.at(np.array([begin_ns, end_ns])).rotations()
+    return float((begin.inv() * end).magnitude()) * NS_PER_S / (end_ns - begin_ns)
 
 
 def _wrapped(angle_rad: float) -> float:

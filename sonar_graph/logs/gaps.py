@@ -7,13 +7,14 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.calibration import HOLE_INTERVALS, SHORTEST_HOLE_S, Calibration
+from sonar_graph.calibration import HOLE_INTERVALS, ROWS_BEFORE, SHORTEST_HOLE_S, UNTYPICAL_S, Calibration
 from sonar_graph.doppler_beams import UNMEASURED_M_S
 from sonar_graph.measurements import Dvl, Imu, Ints
 
 MOST_NAMED = 3
 """Gaps of one kind that are named one by one; of more the longest."""
 
+_GUESSED = "the turn in between is guessed from the rates before and after"
 Gaps = list[tuple[int, int]]
 """Stamps of the samples before and after, ns."""
 
@@ -21,18 +22,19 @@ Gaps = list[tuple[int, int]]
 def gap_warnings(imu: Imu, dvl: Dvl, calibration: Calibration) -> Iterator[str]:
     """What is assumed while nothing was measured, with times in seconds after the first instant with both.
 
-    A Doppler log has a gap where estimators no longer take its velocity as linear (``dvl.gap_s``), an IMU where
-    `HOLE_INTERVALS` typical intervals pass without a sample. Samples that hold for the time before them leave none.
+    A Doppler log has a gap where estimators no longer take its velocity as linear (``dvl.gap_s``), an IMU has a
+    hole where they count with turns that were not measured (`sonar_graph.navigation.unmeasured_turns`). Samples that
+    hold for the time before them leave none.
     """
     if calibration.odometry_interpolation == "hold-past":
         return
     start_ns = int(max(imu.stamps_ns[0], dvl.stamps_ns[0]))
-    holes = _holes(imu.stamps_ns[imu.stamps_ns >= start_ns])
+    end_ns = int(min(imu.stamps_ns[-1], dvl.stamps_ns[-1]))
+    holes = [
+        (max(first, start_ns), last) for first, last in _holes(imu.stamps_ns) if first < end_ns and last > start_ns
+    ]
     if holes:
-        yield (
-            f"imu: no sample {_times(holes, start_ns)}: the turn in between is guessed from the rates before and "
-            f"after, with an error of imu.turn_sigma_rad_s; heading is as unsure from there on"
-        )
+        yield f"imu: no sample {_times(holes, start_ns)}: {_GUESSED}, {_error_of_turns(calibration)}"
     yield from _doppler(imu, dvl, round(calibration.dvl.gap_s * 1e9), start_ns)
 
 
@@ -65,15 +67,29 @@ def _doppler(imu: Imu, dvl: Dvl, longest_ns: int, start_ns: int) -> Iterator[str
         )
 
 
+def _error_of_turns(calibration: Calibration) -> str:
+    if any(calibration.imu.turn_sigma_rad_s):
+        return "with an error of imu.turn_sigma_rad_s; heading is as unsure from there on"
+    return "and counts as measured, since imu.turn_sigma_rad_s is zero; heading may be wrong from there on"
+
+
 def _holes(stamps_ns: Ints) -> Gaps:
-    if len(stamps_ns) < 3:
-        return []
-    typical_ns = float(np.median(np.diff(stamps_ns)))
-    return _longer_than(int(max(HOLE_INTERVALS * typical_ns, SHORTEST_HOLE_S * 1e9)), stamps_ns)
+    """By the rule of `sonar_graph.navigation.unmeasured_turns.hole_ns`: the median of the intervals before each."""
+    intervals = np.diff(stamps_ns)
+    shorter, before = np.zeros(len(intervals)), np.minimum(np.arange(len(intervals)), ROWS_BEFORE)
+    for lag in range(1, min(ROWS_BEFORE + 1, len(intervals))):
+        shorter[lag:] += HOLE_INTERVALS * intervals[:-lag] < intervals[lag:]
+    is_hole = (intervals > SHORTEST_HOLE_S * 1e9) & (2 * shorter >= before)
+    is_hole[:1] &= intervals[:1] > UNTYPICAL_S * 1e9
+    return _intervals_where(is_hole, stamps_ns)
 
 
 def _longer_than(longest_ns: int, stamps_ns: Ints) -> Gaps:
-    before = np.flatnonzero(np.diff(stamps_ns) > longest_ns)
+    return _intervals_where(np.diff(stamps_ns) > longest_ns, stamps_ns)
+
+
+def _intervals_where(chosen: NDArray[np.bool_], stamps_ns: Ints) -> Gaps:
+    before = np.flatnonzero(chosen)
     return list(zip(stamps_ns[before].tolist(), stamps_ns[before + 1].tolist(), strict=True))
 
 

@@ -53,9 +53,9 @@ def carry(imu: InertialRows, stamps_ns: Ints, calibration: Calibration) -> Carry
     """From the first to each of the rows, with IMU rows stamped no later than the last."""
     known = int(np.searchsorted(imu.stamps_ns, stamps_ns[-1], side="right"))
     first = max(int(np.searchsorted(imu.stamps_ns, stamps_ns[0], side="right")) - 1, 0)
+    with_hole = row_after_hole(imu.stamps_ns, first, known - 1, UNFELT_NS) >= 0  # typical is told by rows before
     rows = slice(first, known)
     imu = InertialRows(imu.stamps_ns[rows], imu.rate[rows], imu.specific_force[rows])
-    with_hole = row_after_hole(imu.stamps_ns, 0, len(imu.stamps_ns) - 1, UNFELT_NS) >= 0
     if not len(imu.stamps_ns) or with_hole or not np.isfinite(imu.specific_force).all():
         return _nothing(len(stamps_ns), calibration.dvl.velocity_walk_density)
     times_ns = np.union1d(stamps_ns, imu.stamps_ns[imu.stamps_ns > stamps_ns[0]])

@@ -18,7 +18,7 @@ from sonar_graph.navigation.inertial_carry import InertialRows
 from sonar_graph.navigation.kernels import compiled
 from sonar_graph.navigation.partial_velocity import PartialVelocities, Rows
 from sonar_graph.navigation.stamped_rows import EARLIEST_NS, LATEST_NS, StampedRows
-from sonar_graph.navigation.velocity_covariances import in_numbers, is_partial
+from sonar_graph.navigation.velocity_covariances import in_numbers
 from sonar_graph.navigation.velocity_doubt import VelocityDoubt
 from sonar_graph.navigation.velocity_gate import GATE, Verdict, judge
 from sonar_graph.states import Refusal, RefusedRow
@@ -81,15 +81,39 @@ class RowIntake:
         rows = self._in_time(dvl, self.dvl.stamps_ns, "dvl")
         if rows is None:
             return False
-        stamps_ns, velocity, cov = self._beyond_doubt(rows.stamps_ns, *self._in_body(rows))
-        if not len(stamps_ns):
-            return False
-        verdict = judge(stamps_ns, velocity, cov, self.dvl.stamps_ns, *self.dvl.values, self._walk, self._gate)
+        columns = rows.stamps_ns, *self._in_body(rows)
+        verdict = self._judged(columns)
+        if self._doubt is None:
+            return self._place(columns, verdict)
+        whole_ns = rows.stamps_ns[~(verdict.is_outlier | verdict.is_partial)]
+        if self._doubt.is_none(rows.stamps_ns, whole_ns):
+            self._doubt.believe(whole_ns)
+            return self._place(columns, verdict)
+        before = [self._place_beyond(self._doubt, *row) for row in zip(*columns, verdict.is_partial, strict=True)]
+        return any(before)
+
+    def _judged(self, rows: Rows) -> Verdict:
+        return judge(*rows, self.dvl.stamps_ns, *self.dvl.values, self._walk, self._gate)
+
+    def _place(self, rows: Rows, verdict: Verdict) -> bool:
+        """Whether rows were placed before others, of those that the gate lets pass and that are, or can be, whole."""
         if not verdict.is_plain or self._partial.is_waiting:
-            stamps_ns, velocity, cov = self._completed(stamps_ns, velocity, cov, verdict)
+            rows = self._completed(*rows, verdict)
         else:
-            self._partial.remember(stamps_ns, velocity, cov)
-        return len(stamps_ns) > 0 and self.dvl.insert(stamps_ns, velocity, cov)
+            self._partial.remember(*rows)
+        return len(rows[0]) > 0 and self.dvl.insert(*rows)
+
+    def _place_beyond(
+        self, doubt: VelocityDoubt, stamp_ns: np.int64, velocity: Floats, cov: Floats, is_partial: np.bool_
+    ) -> bool:
+        """The same of one row, and of those that have waited for it."""
+        rows, refused = doubt.passed(int(stamp_ns), velocity, cov, is_partial=bool(is_partial))
+        self._refused += refused
+        if not len(rows[0]):
+            return False
+        verdict = self._judged(rows)
+        doubt.believe(rows[0][~(verdict.is_outlier | verdict.is_partial)])
+        return self._place(rows, verdict)
 
     def _in_body(self, dvl: Dvl) -> tuple[Floats, Floats]:
         """Velocity and its covariance in body axes."""
@@ -97,14 +121,6 @@ class RowIntake:
         if self._body_R_dvl is None:
             return dvl.velocity, cov
         return dvl.velocity @ self._body_R_dvl.T, self._body_R_dvl @ cov @ self._body_R_dvl.T
-
-    def _beyond_doubt(self, stamps_ns: Ints, velocity: Floats, cov: Floats) -> Rows:
-        """Rows for the gate, those that have waited for them among them."""
-        if self._doubt is None:
-            return stamps_ns, velocity, cov
-        rows, outliers = self._doubt.passed((stamps_ns, velocity, cov), is_partial(cov))
-        self._refused += [RefusedRow("dvl", stamp_ns, Refusal.OUTLIER, distance) for stamp_ns, distance in outliers]
-        return rows
 
     def _completed(self, stamps_ns: Ints, velocity: Floats, cov: Floats, verdict: Verdict) -> Rows:
         """Rows that are no outliers, without those that wait, and those that have waited for them."""

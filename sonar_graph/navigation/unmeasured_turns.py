@@ -18,41 +18,43 @@ guesses err by::
                                   = s^2 c^2 (a^2 - 6 + (6 + 6 a + 2 a^2) exp(-a))
 
 short ones by ``s^2 c^2 a^5 / 30`` and ``s^2 c^2 a^4 / 4``, long ones by a rate that was guessed wrong from end to end.
-Over a closed hole this variance is spread evenly, as white noise is; an open one gets what it has grown by since its
-last row. Errors about the three axes are independent, and not those of the gyros.
+The rows beside it stand for the whole hole, and so does their noise. Gyros of density n at intervals of dt have
+``n^2 / dt`` in one row, hence the angle ``n^2 T^2 / (2 dt)`` more in a closed hole and ``n^2 T^2 / dt`` in an open one:
+0.8 and 1.1 degrees for 2 s of a coarse gyro (1e-3 rad/s/sqrt(Hz) at 100 Hz), where ``n^2 T`` is 0.08 squared.
 
-Left out: the noise of the two rows whose rates stand for the whole, ``n^2 T^2 / (2 dt)`` of density n and interval dt,
-a tenth of a degree for 2 s of a coarse gyro.
+Over a closed hole all this is spread evenly, as white noise is; an open one gets what it has grown by since its last
+row. Errors about the three axes are independent.
+
+Left out: the noise of the very first row of a log with a hole after it, since nothing tells its interval; and that two
+motions which share a hole share its errors.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from sonar_graph.calibration import HOLE_INTERVALS, SHORTEST_HOLE_S, ImuCalibration
+from sonar_graph.calibration import HOLE_INTERVALS, SHORTEST_HOLE_S, UNTYPICAL_S, ImuCalibration
+from sonar_graph.calibration import ROWS_BEFORE as ROWS_BEFORE
 from sonar_graph.measurements import Ints
 from sonar_graph.navigation.kernels import compiled, inlined
-from sonar_graph.navigation.triples import ZERO, Vector, scaled
+from sonar_graph.navigation.triples import ZERO, Vector, plus, scaled
 
-ROWS_BEFORE = 8
-"""Intervals that tell which one is typical."""
-UNTYPICAL_NS = 1_000_000_000
-"""Longest interval after the very first row that is no hole."""
+UNTYPICAL_NS = round(UNTYPICAL_S * 1e9)
 UNFELT_NS = 100_000_000
 """Holes from here on leave specific force unmeasured: below, a vehicle turns by less than 1e-4 rad unseen."""
 SHORTEST_NS = round(SHORTEST_HOLE_S * 1e9)
 SHORT = 0.03
 """Length over time below which two terms of a series are exact to 1e-3 and differences of large numbers are not."""
 
-TurnValues = tuple[Vector, Vector]
-"""About each body axis: standard deviation of the rate, rad/s, and its time, s."""
-NO_TURNS: TurnValues = (ZERO, (1.0, 1.0, 1.0))
+TurnValues = tuple[Vector, Vector, float]
+"""About each body axis: standard deviation of the rate, rad/s, and its time, s. White noise of the gyros, rad/s/√Hz."""
+NO_TURNS: TurnValues = (ZERO, (1.0, 1.0, 1.0), 0.0)
 """No interval is a hole."""
 
 
 def turn_values(imu: ImuCalibration) -> TurnValues:
     """What a calibration says."""
-    return imu.turn_sigma_rad_s, imu.turn_time_s
+    return imu.turn_sigma_rad_s, imu.turn_time_s, imu.gyro_noise_density
 
 
 @compiled
@@ -105,24 +107,36 @@ def turn_psd(turns: TurnValues, stamps: Ints, rows: int, row: int, t: int, until
     if turns[0] != ZERO:
         length_ns = hole_ns(stamps, rows, row, until_ns)
         if length_ns > 0:
-            psd = _in_hole(turns, length_ns * 1e-9, (until_ns - t) * 1e-9, row < rows)
+            row_variance = _row_variance(turns[2], stamps, min(row, rows) - 1)
+            psd = _in_hole(turns, row_variance, length_ns * 1e-9, (until_ns - t) * 1e-9, row < rows)
     return psd
 
 
 @compiled
-def _in_hole(turns: TurnValues, length_s: float, step_s: float, is_closed: bool) -> Vector:
+def _row_variance(gyro_density: float, stamps: Ints, row: int) -> float:
+    """Noise of one rate by the typical interval before it, (rad/s)²; zero where there is none."""
+    first = max(row - ROWS_BEFORE, 0)
+    if row <= first:
+        return 0.0
+    return gyro_density * gyro_density / (np.median(np.diff(stamps[first : row + 1])) * 1e-9)
+
+
+@compiled
+def _in_hole(turns: TurnValues, row_variance: float, length_s: float, step_s: float, is_closed: bool) -> Vector:
     """Of a closed hole, evenly; of an open one what the last step adds."""
-    (x, y, z), (c_x, c_y, c_z) = turns
+    (x, y, z), (c_x, c_y, c_z), _ = turns
     if is_closed:
+        by_rows = 0.5 * row_variance * length_s
         grown = closed_variance(x, c_x, length_s), closed_variance(y, c_y, length_s), closed_variance(z, c_z, length_s)
-        return scaled(1.0 / length_s, grown)
+        return plus(scaled(1.0 / length_s, grown), (by_rows, by_rows, by_rows))
     before_s = length_s - step_s
+    by_row = row_variance * (length_s + before_s)
     grown = (
         open_variance(x, c_x, length_s) - open_variance(x, c_x, before_s),
         open_variance(y, c_y, length_s) - open_variance(y, c_y, before_s),
         open_variance(z, c_z, length_s) - open_variance(z, c_z, before_s),
     )
-    return scaled(1.0 / step_s, grown)
+    return plus(scaled(1.0 / step_s, grown), (by_row, by_row, by_row))
 
 
 @compiled

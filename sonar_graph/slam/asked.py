@@ -7,6 +7,7 @@ bounded window it cannot change any more once it leaves, and only the pose is ke
 from __future__ import annotations
 
 from array import array
+from bisect import bisect_left
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -81,6 +82,10 @@ class Asked:
             self._final.add(Trajectory.from_estimates(_estimates(self._open[:count], values, marginals)))
         del self._open[:count]
 
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop poses that cannot change any more and are older."""
+        self._final.forget_before(stamp_ns)
+
     def trajectory(self, values: gtsam.Values, marginals: gtsam.Marginals | gtsam.ISAM2) -> Trajectory:
         """Through all instants."""
         return self._final.then(Trajectory.from_estimates(_estimates(self._open, values, marginals)))
@@ -111,6 +116,11 @@ class FinalPoses:
         self._stamps_ns.extend(part.stamps_ns.tolist())
         self._poses.extend(np.hstack([part.positions, part.quaternions_xyzw]).ravel().tolist())
         self._triangles.extend(part.covariances[:, i, j].ravel().tolist())
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop older ones."""
+        count = bisect_left(self._stamps_ns, stamp_ns)
+        del self._stamps_ns[:count], self._poses[: 7 * count], self._triangles[: 21 * count]
 
     def then(self, rest: Trajectory) -> Trajectory:
         """These, and what follows."""

@@ -17,7 +17,9 @@ DAMPING_FACTOR = 10.0
 MAX_DAMPING = 1e9
 
 
-def solve(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values) -> gtsam.Values:
+def solve(
+    graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, most_iterations: int = MAX_ITERATIONS
+) -> gtsam.Values:
     """Levenberg–Marquardt from ``initial``.
 
     Minimises the sum of squared whitened (and robustly weighted) errors. Damping multiplies the identity; it starts
@@ -31,7 +33,7 @@ def solve(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values) -> gtsam.Val
     """
     values, error = initial, graph.error(initial)
     damping = FIRST_DAMPING
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(most_iterations):
         linear = graph.linearize(values)
         candidate, candidate_error, damping = _lower(graph, linear, values, error, damping)
         if candidate is None:

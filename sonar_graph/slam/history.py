@@ -119,6 +119,15 @@ class Recent:
             self.changes += 1
 
 
+def rest_of(history: History | Recent, handles: set[int]) -> gtsam.NonlinearFactorGraph:
+    """All factors but those of some handles."""
+    gone, graph, rest = {history.factor(handle) for handle in handles}, history.graph, gtsam.NonlinearFactorGraph()
+    for i in range(graph.size()):
+        if graph.at(i) not in gone:
+            rest.push_back(graph.at(i))
+    return rest
+
+
 def _passing(factor: gtsam.NonlinearFactor) -> list[int]:
     """Those of a factor's variables with which it leaves: its poses, else its biases. Landmarks stay."""
     keys = [(key, gtsam.symbolChr(key)) for key in list(factor.keys())]

@@ -57,6 +57,10 @@ class LandmarkSightings:
         """Whether sightings of it have left a bounded window, so that it stays."""
         return landmark_id in self._rooted
 
+    def sizes(self) -> dict[int, int]:
+        """Number of sightings of each landmark; those that are in the graph for good count as one."""
+        return {i: len(sightings) + (i in self._rooted) for i, sightings in self._of.items()}
+
     def stamps_ns(self, landmark_id: int) -> set[int]:
         """Frames that show a landmark."""
         return {sighting.stamp_ns for sighting in self._of.get(landmark_id, {})}

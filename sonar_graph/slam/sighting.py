@@ -7,6 +7,7 @@ the same whenever they are made, and for whichever landmark.
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass
 
 import gtsam
@@ -57,6 +58,12 @@ class SightingFactors:
         """Standard deviation of an elevation that is uniform over the aperture."""
         self._aperture_rad = sonar.elevation_aperture_rad
         self._robust = robust
+
+    def without_kernel(self) -> SightingFactors:
+        """One that makes the same factors with Gaussian noise."""
+        plain = copy(self)
+        plain._robust = lambda noise: noise
+        return plain
 
     def make(self, sighting: Sighting, key: int, *, is_first: bool) -> list[gtsam.NonlinearFactor]:
         """Range and azimuth; the first sighting of a landmark also says what is known of its height and direction."""

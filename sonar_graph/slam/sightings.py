@@ -15,18 +15,22 @@ from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
 from sonar_graph.slam.anonymous_landmarks import AnonymousLandmarks, AnonymousPolicy, unnamed
 from sonar_graph.slam.association import DetectionJournal, Identities, gate_threshold, identify
 from sonar_graph.slam.deferred_identities import DeferredIdentities
+from sonar_graph.slam.doubtful_identities import DoubtfulIdentities
 from sonar_graph.slam.factors import Robust
+from sonar_graph.slam.hypotheses import Statement
 from sonar_graph.slam.keyframes import Keyframes
 from sonar_graph.slam.landmark_sightings import LandmarkSightings
 from sonar_graph.slam.late_gate import LateGate
+from sonar_graph.slam.mixture import Kernel, Mixture
 from sonar_graph.slam.models import FLOOR_GATE, locate
 from sonar_graph.slam.sighting import Sighting, SightingFactors
 from sonar_graph.slam.sightlines import Sightline
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.slam.sound_rows import without_unsound
 from sonar_graph.slam.tracks import decide
+from sonar_graph.slam.uncertainty import Solution
 from sonar_graph.slam.view import View
-from sonar_graph.states import Outcome
+from sonar_graph.states import DetectionLog, Outcome
 
 
 @dataclass(frozen=True)
@@ -41,21 +45,17 @@ class SightingPolicy:
     """Whether detections of tracks are used once their identity is known, and moved when it turns out to be another."""
     longest_wait_s: float = 60.0
     """How long they wait for it."""
+    mixture: Mixture | None = None
+    """What detections may be of, chosen by where they are; None: the recogniser is believed, or not."""
+    is_graduated: bool = False
+    """Whether that is also sought by graduated non-convexity in the whole history."""
     anonymous: AnonymousPolicy | None = None
     """What is believed of landmarks without identities; None: their detections are refused."""
 
     def robust(self) -> Robust:
         """What wraps a noise model in the kernel."""
-        kernel = self.estimator()
+        kernel = Kernel(self.kernel, self.kernel_width).estimator()
         return lambda noise: gtsam.noiseModel.Robust.Create(kernel, noise) if kernel else noise
-
-    def estimator(self) -> gtsam.noiseModel.mEstimator.Base | None:
-        """The robust kernel; None for none."""
-        if self.kernel == "huber":
-            return gtsam.noiseModel.mEstimator.Huber.Create(self.kernel_width)
-        if self.kernel == "cauchy":
-            return gtsam.noiseModel.mEstimator.Cauchy.Create(self.kernel_width)
-        return None
 
 
 class Verdict(NamedTuple):
@@ -95,6 +95,12 @@ class Sightings:
         self._deferred = DeferredIdentities(
             self._landmarks, self.smoother, self.journal, gate, self.policy.longest_wait_s
         )
+        mixture = self.policy.mixture
+        parts = self._landmarks, self.smoother, self._factors, self.journal
+        graduated = self.policy.is_graduated
+        self._doubtful = (
+            DoubtfulIdentities(*parts, mixture, self.policy.longest_wait_s, is_graduated=graduated) if mixture else None
+        )
         anonymous = self.policy.anonymous
         self._anonymous = (
             AnonymousLandmarks(self._landmarks, self.smoother, self._factors, self.journal, anonymous)
@@ -128,6 +134,9 @@ class Sightings:
             return
         identities = identify(frame, self.policy.identity_probability)
         is_unnamed = unnamed(frame) & (self._anonymous is not None)
+        if self._doubtful is not None:
+            self._doubt(self._doubtful, stamp_ns, frame)
+            return
         is_tracked = (frame.track != NO_TRACK) & self.policy.deferred_identity & ~is_unnamed
         if is_tracked.any():
             self.keyframes.update_if_due()
@@ -148,6 +157,37 @@ class Sightings:
                 verdict.sighting.row = number
                 if is_tracked[row]:
                     self._deferred.remember(track, verdict.sighting)
+
+    def history(self) -> Solution:
+        """The whole graph solved; of doubtful identities with those that fit it best."""
+        if self._doubtful is None:
+            return Solution(*self.smoother.solve_history(), sorted(self.ids))
+        chosen = self._doubtful.history()
+        return Solution(chosen.values, chosen.marginals, sorted(chosen.ids))
+
+    def log(self) -> DetectionLog:
+        """What became of each detection, in the same history."""
+        self.forget()
+        return self.journal.log() if self._doubtful is None else self._doubtful.log()
+
+    def _doubt(self, doubtful: DoubtfulIdentities, stamp_ns: int, frame: LandmarkDetections) -> None:
+        """Take in a frame whose identities are weighed against where its detections are."""
+        self.keyframes.update_if_due()
+        rows = range(len(frame))
+        statements, tracks = [Statement.of(frame, row) for row in rows], frame.track.tolist()
+        seen = self._seen(frame, identify(frame, 0.0), [True] * len(frame), list(rows))
+        motion = self.keyframes.motion_since_newest(stamp_ns)
+        view = self._view(motion, doubtful.keys)
+        chosen = doubtful.chosen_at_first(view, statements, tracks, seen.z, seen.cov)
+        motion = self.keyframes.set_for_frame(stamp_ns, motion)
+        tie = Tie.between(motion, self.keyframes.newest_key, self._body_T_sonar, stamp_ns)
+        sightings = self._sightings(view, tie, seen, np.zeros((len(frame), 3)))
+        doubtful.enter(statements, tracks, sightings, chosen, self.keyframes.newest_s)
+        for row, sighting in enumerate(sightings):
+            of = statements[row].favourite if chosen[row] is None else chosen[row]
+            sighting.row = self.journal.record(stamp_ns, -1 if of is None else of, sighting.outcome)
+        self.keyframes.update_if_due()
+        doubtful.reconsider(self.keyframes.newest_s)
 
     def forget(self) -> None:
         """Let go of sightings that have waited too long for their identity."""

@@ -8,11 +8,16 @@ Two solutions share the same factors:
 
 Marginalising freezes the linearisation of the landmarks that it touches. When one has since moved by more than
 ``stale_shift_m`` (a loop was closed after much drift), the history is solved at once and the window starts again from
-that solution with fresh linearisations. The graph must have grown by `RESTART_GROWTH` since the last time, which keeps
-the total cost of restarts proportional to that of the last one.
+that solution with fresh linearisations. The graph must have grown by `RESTART_GROWTH` since, so that all restarts
+together cost some times the last one.
 
 Factors can be exchanged for others. While all their variables are in the window, iSAM2 removes them; what has been
 marginalised cannot be taken out of a marginal, and the window starts again from the history.
+
+A *bounded* history is that of the window: its factors, and the marginals of what has left. The window then begins anew
+from those, which leaves older marginals linearised where they were.
+
+New factors that cannot be used are taken out again (`sonar_graph.slam.withholding`).
 
 GTSAM's Cholesky elimination gives up ("indeterminate") when a variable's absolute sigma is more than 4096 times its
 sigma given its neighbours, which millimetre odometry reaches after some metres of drift. QR does not, at a higher cost;
@@ -33,7 +38,7 @@ from sonar_graph.measurements import Floats
 from sonar_graph.slam.batch import marginals_of
 from sonar_graph.slam.determinacy import variable_name
 from sonar_graph.slam.exchange import Exchange
-from sonar_graph.slam.history import History, Recent
+from sonar_graph.slam.history import History, Recent, rest_of
 from sonar_graph.slam.joint_covariance import JointCovariance
 from sonar_graph.slam.new_window import copy, joined, keys_of, marginal, picked, split, without
 from sonar_graph.slam.pending import Pending
@@ -171,10 +176,7 @@ class Smoother:
         return handles
 
     def hold(self, until_s: dict[int, float]) -> None:
-        """Keep keyframes, and all later ones, in the window beyond the lag, each until a time; no others any more.
-
-        All later ones as well: iSAM2 marginalises in order.
-        """
+        """Keep keyframes, and all later ones (iSAM2 marginalises in order), in the window until times; no others."""
         self._held = until_s
 
     def flush(self, time_s: float) -> None:
@@ -198,7 +200,7 @@ class Smoother:
             self._restart(time_s)
         else:
             self._update(time_s, self._window.lag_s, slots)
-            self._settle(time_s)
+            self.settle(time_s)
         return handles
 
     def _exchange_lag_s(self, time_s: float) -> float:
@@ -215,7 +217,12 @@ class Smoother:
             self._landmarks.remove(key)
             self.values.erase(key)
 
-    def _settle(self, time_s: float) -> None:
+    def graph_without(self, handles: set[int]) -> gtsam.NonlinearFactorGraph:
+        """Every factor of the run but some."""
+        return rest_of(self._history, handles)
+
+    def settle(self, time_s: float) -> None:
+        """Gauss-Newton steps until nothing would be relinearised any more, ten at most."""
         try:
             self._window.settle()
         except RuntimeError:
@@ -297,6 +304,7 @@ class Smoother:
 
     def _take(self, estimate: gtsam.Values) -> None:
         """The window's; a bounded one forgets what has left."""
+        self._solved = None  # who asked before must not decide where the next solution starts
         if not self.is_bounded:
             self.values.update(estimate)
             return

@@ -10,21 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.measurements import Depth, Dvl, Floats, LandmarkDetections
+from sonar_graph.navigation.kernels import compiled
 from sonar_graph.navigation.velocity_covariances import in_numbers
 from sonar_graph.slam.association import DetectionJournal
 from sonar_graph.states import Outcome
 
-ROUNDING = 1e-15
-"""Share of the largest eigenvalue below which the smallest is taken for zero."""
+ROUNDING = 1e-13
+"""Share of the largest variance below which what is left of another is taken for zero."""
 
 Flags = NDArray[np.bool_]
 
 
 def sound_detections(frame: LandmarkDetections) -> Flags:
     """Shape (n,)."""
-    said = np.asarray(~np.isnan(frame.range_azimuth_cov).any(axis=(1, 2)))
-    covs = np.where(said[:, None, None], frame.range_azimuth_cov, np.eye(2))
-    return (frame.range_m > 0) & positive_definite(covs)
+    unsaid = np.asarray(np.isnan(frame.range_azimuth_cov).any(axis=(1, 2)))
+    return (frame.range_m > 0) & (unsaid | positive_definite(frame.range_azimuth_cov))
 
 
 def without_unsound(frame: LandmarkDetections, journal: DetectionJournal) -> LandmarkDetections | None:
@@ -48,8 +48,25 @@ def sound_depths(depth: Depth) -> Flags:
     return (variance > 0) & np.isfinite(variance)
 
 
+@compiled
 def positive_definite(covs: Floats) -> Flags:
-    """Which of some symmetric matrices, shape (n, k, k), are finite and positive definite."""
-    finite = np.asarray(np.isfinite(covs).all(axis=(1, 2)))
-    eigenvalues = np.linalg.eigvalsh(np.where(finite[:, None, None], covs, 0.0))
-    return np.asarray(finite & (eigenvalues[:, 0] > ROUNDING * eigenvalues[:, -1]))
+    """Which of some symmetric matrices, shape (n, k, k), are finite and positive definite: Cholesky takes them."""
+    n, k = covs.shape[:2]
+    found = np.ones(n, np.bool_)
+    for row in range(n):
+        L, largest = np.zeros((k, k)), 0.0
+        for i in range(k):
+            largest = max(largest, covs[row, i, i])
+        for i in range(k):
+            for j in range(i + 1):
+                rest = covs[row, i, j]
+                for m in range(j):
+                    rest -= L[i, m] * L[j, m]
+                if i > j:
+                    L[i, j] = rest / L[j, j]
+                elif rest > ROUNDING * largest and rest < np.inf:
+                    L[i, i] = np.sqrt(rest)
+                else:  # NaN ends here too
+                    found[row] = False
+                    L[i, i] = 1.0
+    return found

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterable, Sequence
-from typing import Literal
+from collections.abc import Callable, Iterable, Sequence
+from typing import Literal, NamedTuple
 
+import gtsam
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.errors import EstimatorError
@@ -17,8 +18,18 @@ MOST_LISTED = 12
 """Landmarks that a message lists."""
 
 
+class Solution(NamedTuple):
+    """Of the whole graph."""
+
+    values: gtsam.Values
+    marginals: gtsam.Marginals | gtsam.ISAM2
+    ids: list[int]
+    """Of the landmarks in it, ascending."""
+
+
 def joint_covariance(
     smoother: Smoother,
+    history: Callable[[], Solution],
     stamps_ns: Sequence[int],
     over: Over,
     keyframes: Iterable[int],
@@ -29,6 +40,8 @@ def joint_covariance(
 
     Parameters
     ----------
+    history
+        Solves the whole graph.
     stamps_ns
         Of all keyframes of the run.
     at_ns
@@ -38,7 +51,8 @@ def joint_covariance(
     for number in poses:
         if not 0 <= number < len(stamps_ns):
             raise EstimatorError(f"isam2: there is no keyframe {number}; {_existing(len(stamps_ns))}")
-    keys = list(dict.fromkeys([*map(X, poses), *map(L, _known(landmarks, smoother))]))
+    known_ids = smoother.landmark_ids if over == "window" else history().ids
+    keys = list(dict.fromkeys([*map(X, poses), *map(L, _known(landmarks, known_ids))]))
     if not keys:
         raise EstimatorError("isam2: the covariance of nothing was asked for; give keyframes, stamps or landmarks")
     held = set(smoother.in_window(keys))
@@ -51,7 +65,7 @@ def joint_covariance(
         )
     if over == "window":
         return JointCovariance.of(smoother.marginals, sorted(keys))
-    return JointCovariance.of(smoother.solve_history()[1], sorted(keys))
+    return JointCovariance.of(history().marginals, sorted(keys))
 
 
 def _number_at(stamp_ns: int, stamps_ns: Sequence[int]) -> int:
@@ -63,11 +77,10 @@ def _number_at(stamp_ns: int, stamps_ns: Sequence[int]) -> int:
     raise EstimatorError(f"isam2: no keyframe at {stamp_ns} ns; {nearest}")
 
 
-def _known(landmarks: Iterable[int], smoother: Smoother) -> list[int]:
+def _known(landmarks: Iterable[int], ids: list[int]) -> list[int]:
     asked = list(landmarks)
-    unknown = [i for i in asked if i < 0 or not smoother.values.exists(L(i))]
+    unknown = [i for i in asked if i not in set(ids)]
     if unknown:
-        ids = smoother.landmark_ids
         listed = ", ".join(map(str, ids[:MOST_LISTED])) + (", ..." if len(ids) > MOST_LISTED else "")
         raise EstimatorError(f"isam2: landmark {unknown[0]} is not in the graph; it holds {listed or 'none yet'}")
     return asked

@@ -10,10 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import STANDARD_GRAVITY, Calibration, Start
-from sonar_graph.evaluation.start_check import StartTilt, find_start_tilt, right_tilt, tilt_findings
+from sonar_graph.evaluation.start_check import StartTilt, find_start_heading, find_start_tilt, right_tilt, tilt_findings
 from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.navigation.offset_search import Estimate1D
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.states import Trajectory
 
 ROLL, PITCH, BIAS = 0.12, -0.07, np.array([3e-4, -2e-4, 1e-4])
 NS = 1_000_000_000
@@ -121,3 +123,15 @@ def test_a_calibration_without_any_noise_is_a_reason_too():
     found = find_start_tilt(replace(run, calibration=Calibration.parse(silent, "by hand")))
     assert found.tilt is None
     assert found.said.endswith("in motion: the calibration's noise is zero")
+
+
+@pytest.mark.parametrize("begin_s", [-5.0, 0.0, 0.2, -60.0], ids=["within", "first", "after", "last"])
+def test_a_heading_is_as_unsure_as_the_offset_times_the_turn_rate(begin_s: float):
+    """0.1 rad/s and an offset of 0.1 s: 0.01 rad beside a tenth of a degree, wherever the reference begins or ends."""
+    run, t = resting(50.0), np.arange(0.0, 60.01, 0.1)
+    turning = Rotation.from_euler("z", 0.1 * (t + begin_s)[:, None]).as_quat()
+    stamps_ns = run.start_ns + np.round(NS * (t + begin_s)).astype(np.int64)
+    reference = Trajectory.without_covariances(stamps_ns, np.zeros((len(t), 3)), turning)
+    found = find_start_heading(run, reference, Estimate1D(0.0, 0.1))
+    assert found.error.sigma == pytest.approx(np.hypot(np.radians(0.1), 0.01), rel=1e-6)
+    assert found.rpy_rad[2] == pytest.approx(0.1 * max(begin_s, 0.0) if begin_s > -60.0 else 0.0, abs=1e-6)

@@ -5,10 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sonar_graph.calibration import Calibration, DvlCalibration
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration
 from sonar_graph.doppler_beams import UNMEASURED_M_S
 from sonar_graph.logs.gaps import gap_warnings
 from sonar_graph.measurements import Dvl, Floats, Imu
+from sonar_graph.navigation.unmeasured_turns import hole_ns
 
 UPWARDS = (0.0, 0.0, 9.8)
 
@@ -67,6 +68,47 @@ def test_pings_of_too_few_beams_are_named_as_such() -> None:
 def test_a_hole_in_the_imu_is_named_with_its_times() -> None:
     (text,) = gap_warnings(imu(without(SAMPLES, (100, 110))), dvl(), Calibration())
     assert text.startswith("imu: no sample 100.000 to 110.000 s after the start: the turn in between is guessed")
+
+
+def test_only_the_first_steps_of_a_slower_imu_are_holes() -> None:
+    """100 Hz, 5 Hz for 50 s, 100 Hz: until more than four of the eight intervals before are slow."""
+    slow = np.concatenate([SAMPLES[:10000], 100 + 0.2 * np.arange(250), 150 + SAMPLES[:15000]])
+    (text,) = gap_warnings(imu(slow), dvl(), Calibration())
+    assert "in 5 gaps of 1.0 s together" in text
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_holes_named_are_those_that_estimators_count_with(seed: int) -> None:
+    """Intervals of all sizes, from the very first on; all told by their number and sum."""
+    rng = np.random.default_rng(seed)
+    at_s = np.cumsum(np.round(10.0 ** rng.uniform(-2.3, 0.3, 60), 3))
+    rows, pings = imu(at_s), dvl(np.array([at_s[0], at_s[-1]]))
+    ns = rows.stamps_ns
+    lengths = [hole_ns(ns, len(ns), row, int(ns[row])) for row in range(1, len(ns))]
+    count, sum_s = np.count_nonzero(lengths), sum(lengths) * 1e-9
+    assert count > 3
+    found = [text for text in gap_warnings(rows, pings, Calibration()) if text.startswith("imu")]
+    assert f"in {count} gaps of {sum_s:.1f} s together" in found[0]
+
+
+@pytest.mark.parametrize(("first_s", "is_hole"), [(0.9, False), (1.1, True)])
+def test_the_first_interval_has_none_before_it(first_s: float, is_hole: bool) -> None:
+    at_s = np.concatenate([[0.0], first_s + SAMPLES])
+    assert bool(list(gap_warnings(imu(at_s), dvl(), Calibration()))) is is_hole
+
+
+def test_a_hole_is_named_as_far_as_it_is_used() -> None:
+    """Not before the first velocity, nor after the last."""
+    holed = imu(without(SAMPLES, (5, 7), (9, 11), (290, 291)))
+    (text,) = gap_warnings(holed, dvl(PINGS[50:1449]), Calibration())
+    assert text.startswith("imu: no sample 0.000 to 1.000 s after the start: ")
+
+
+def test_where_no_turns_are_allowed_for_no_growth_is_promised() -> None:
+    still = Calibration(imu=ImuCalibration(turn_sigma_rad_s=(0.0, 0.0, 0.0)))
+    (text,) = gap_warnings(imu(without(SAMPLES, (100, 110))), dvl(), still)
+    assert "unsure" not in text
+    assert "counts as measured, since imu.turn_sigma_rad_s is zero" in text
 
 
 def test_a_few_lost_samples_are_no_hole() -> None:

@@ -96,6 +96,21 @@ def test_without_a_force_nothing_is_carried(missing):
     np.testing.assert_array_equal(found.from_lever, np.zeros((3, 3)))
 
 
+def without(begin_s: float, end_s: float) -> InertialRows:
+    rows = steady()
+    kept = (rows.stamps_ns <= at(begin_s)) | (rows.stamps_ns >= at(end_s))
+    return InertialRows(*(column[kept] for column in rows))
+
+
+@pytest.mark.parametrize("begin_s", [1.0, 2.0])
+def test_over_a_hole_nothing_is_carried_wherever_it_begins(begin_s):
+    """Right after the first row too, which alone tells no typical interval; one of five intervals is no hole."""
+    stamps_ns = at(1.0, 2.5, 4.0)
+    assert not carry(without(begin_s, begin_s + 0.9), stamps_ns, MOUNTED).is_inertial
+    assert carry(without(begin_s, begin_s + 0.1), stamps_ns, MOUNTED).is_inertial
+    assert carry(without(5.0, 5.9), stamps_ns, MOUNTED).is_inertial
+
+
 def test_a_force_that_is_missing_elsewhere_does_not_matter():
     rows = steady()
     force = rows.specific_force.copy()

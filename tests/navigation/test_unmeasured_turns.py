@@ -12,12 +12,14 @@ from sonar_graph.navigation.dvl_preintegration import Preintegrator
 from sonar_graph.navigation.joint_preintegration import JointPreintegrator
 from sonar_graph.navigation.node_motion import motion_between_nodes, motion_since_node
 from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.unmeasured_turns import closed_variance, hole_ns, open_variance
+from sonar_graph.navigation.unmeasured_turns import closed_variance, hole_ns, open_variance, turn_psd
 
 from .rows import NS, T0_NS, dvl, imu, stamps
 
 MS = 1_000_000
 STILL = ImuCalibration(turn_sigma_rad_s=(0.0, 0.0, 0.0))
+UNMODELLED = Calibration(imu=STILL)
+UNLIKE = ImuCalibration(turn_sigma_rad_s=(0.05, 0.08, 0.15), turn_time_s=(0.5, 0.9, 1.5))
 BEGIN_S, END_S = 3.0, 5.0
 
 
@@ -92,8 +94,8 @@ def test_an_open_hole_lasts_from_the_last_known_row():
 
 def test_the_turn_over_a_hole_is_as_unsure_as_the_vehicle_is_lively():
     """Beside the gyros' noise, wherever Doppler rows cut the hole; about the axes of the body that turned meanwhile."""
-    model = ImuCalibration()
-    extra = turn_variances(with_hole(), 2.0, 6.0) - turn_variances(with_hole(), 2.0, 6.0, Calibration(imu=STILL))
+    lively, model = Calibration(imu=UNLIKE), UNLIKE
+    extra = turn_variances(with_hole(), 2.0, 6.0, lively) - turn_variances(with_hole(), 2.0, 6.0, UNMODELLED)
     s, c = model.turn_sigma_rad_s, model.turn_time_s
     expected = [closed_variance(s[k], c[k], END_S - BEGIN_S) for k in range(3)]
     assert extra == pytest.approx(expected, rel=0.06)
@@ -104,9 +106,43 @@ def test_while_a_hole_lasts_the_turn_is_as_unsure_as_the_last_rate_held():
     rows = with_hole().between(0, at(4.9))
     assert rows is not None
     args = (rows, BEGIN_S, 4.9)
-    extra = turn_variances(*args, between=motion_since_node)
-    extra = extra - turn_variances(*args, Calibration(imu=STILL), between=motion_since_node)
-    assert extra[2] == pytest.approx(open_variance(0.15, 1.5, 1.9), rel=0.06)
+    extra = turn_variances(*args, Calibration(imu=UNLIKE), motion_since_node)
+    extra = extra - turn_variances(*args, UNMODELLED, motion_since_node)
+    s, c = UNLIKE.turn_sigma_rad_s, UNLIKE.turn_time_s
+    assert extra == pytest.approx([open_variance(s[k], c[k], 1.9) for k in range(3)], rel=0.06)
+
+
+@pytest.mark.parametrize(
+    ("start_s", "until_s", "between"), [(2.0, 4.0, motion_between_nodes), (2.0, 3.46, motion_since_node)]
+)
+@pytest.mark.parametrize("is_modelled", [True, False])
+def test_a_coarse_gyros_rows_beside_a_hole_err_for_all_of_it(start_s, until_s, between, is_modelled):
+    """Against rates drawn for a vehicle at rest, a hole of half a second that is closed, and one that is open."""
+    known = with_hole(3.0, 3.5).between(0, at(until_s))
+    assert known is not None
+    rng = np.random.default_rng(3)
+    coarse = ImuCalibration(gyro_noise_density=1e-3, turn_sigma_rad_s=(1e-6 * is_modelled,) * 3)
+    turned = []
+    for _ in range(150):
+        rates = rng.normal(0.0, 1e-3 / np.sqrt(0.01), (len(known), 3))
+        odometry, preintegrator = odometry_of(replace(known, angular_velocity=rates), Calibration(imu=coarse))
+        motion = between(odometry, preintegrator, at(start_s), at(until_s), np.zeros(3), None)
+        turned.append(motion.i_T_j.rotation().rpy() / np.sqrt(np.diag(motion.covariance)[:3]))
+    nees = np.mean(np.square(turned))
+    assert nees == pytest.approx(1.0, abs=0.2) if is_modelled else nees > 4.0
+
+
+def test_the_noise_of_rows_goes_by_the_interval_that_is_typical():
+    """By hand: density 2, rows 10 ms apart but for one lost, and the third of three steps of an open hole."""
+    ns = T0_NS + MS * np.array([0, 10, 20, 30, 50, 60, 70, 80, 90])
+    turns = ((1e-9,) * 3, (1.0,) * 3, 2.0)
+    until_ns = int(ns[-1]) + 300 * MS
+    opened = turn_psd(turns, ns, 9, 9, until_ns - 100 * MS, until_ns)
+    assert opened == pytest.approx((4.0 / 0.01 * (0.3**2 - 0.2**2) / 0.1,) * 3)
+    closed = turn_psd(turns, np.append(ns, until_ns), 10, 9, until_ns - 100 * MS, until_ns)
+    assert closed == pytest.approx((4.0 / 0.01 * 0.3 / 2,) * 3)
+    alone = turn_psd(turns, ns[:1], 1, 1, int(ns[0]) + 2000 * MS, int(ns[0]) + 2100 * MS)
+    assert max(alone) < 1e-15
 
 
 def test_in_a_hole_with_doppler_rows_the_way_is_by_these():

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.doppler_beams import UNMEASURED_M_S
 from sonar_graph.measurements import Dvl
 from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.velocity_doubt import LONG_NS, needed
+from sonar_graph.navigation.velocity_doubt import LONG_NS, MOST_WAITING, needed
 from sonar_graph.states import Refusal
 
 from .rows import NS, T0_NS, dvl, imu, stamps
@@ -112,6 +114,67 @@ def test_rows_out_of_order_are_believed_as_in_order():
     assert np.array_equal(odometry.columns()[4], told(rows).columns()[4])
 
 
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.permutations(range(12)), st.sets(st.integers(1, 11)))
+def test_blocks_out_of_order_are_believed_as_in_order(seed, order, cuts):
+    """Gaps, wrong rows and slow stretches; blocks of any sizes come in any order, before any motion is used."""
+    rng = np.random.default_rng(seed)
+    ns = T0_NS + np.cumsum(rng.choice([NS // 5, NS, 4 * NS], 12, p=[0.7, 0.15, 0.15]))
+    velocity = np.array([0.4, 0.0, 0.0]) + 0.02 * rng.standard_normal((12, 3))
+    rows = dvl(ns, velocity, 1e-4 * np.eye(3))
+    odometry = Odometry(Calibration())
+    for block in np.split(np.array(order), sorted(cuts)):
+        odometry.add(None, rows.rows(np.sort(block)))
+    stamps_ns = odometry.columns()[3]
+    assert (np.diff(stamps_ns) > 0).all()
+    told_of = [row.stamp_ns for row in odometry.refused]
+    assert sorted([*stamps_ns.tolist(), *told_of]) == ns.tolist()
+
+
+def test_a_gap_inside_a_block_is_one():
+    rows, first = after_gap(30.0, {0: WRONG})
+    assert refused(told(rows), rows) == [first]
+
+
+def test_wrong_rows_that_go_on_for_long_are_never_believed():
+    """The gate widens from the last row that it believed, and doubt begins there too, however the log is cut."""
+    ns = stamps(5.0, 60.0)
+    t = (ns - T0_NS) * 1e-9
+    wrong = (t > 10.0) & (t < 30.0)
+    directions = np.random.default_rng(0).standard_normal((len(ns), 3))
+    velocity = np.where(wrong[:, None], 5.0 * directions / np.linalg.norm(directions, axis=1)[:, None], [0.5, 0.0, 0.0])
+    rows = dvl(ns, velocity, 1e-4 * np.eye(3))
+    for calls in (1, 7, len(ns)):
+        used = np.isin(ns, told(rows, calls).columns()[3])
+        assert not used[wrong].any()
+        assert used[~wrong].sum() >= np.count_nonzero(~wrong) - 2
+
+
+@pytest.mark.parametrize("interval_s", [4.0, 10.0])
+def test_a_slow_log_is_not_in_doubt_for_ever(interval_s):
+    ns = T0_NS + np.round(np.arange(20) * interval_s * NS).astype(np.int64)
+    rows = dvl(ns, np.tile([1.0, 0.0, 0.0], (20, 1)), 1e-4 * np.eye(3))
+    for calls in (1, 20):
+        assert told(rows, calls).columns()[3].tolist() == ns.tolist()
+
+
+def test_rows_that_confirm_each_other_here_and_there_are_no_majority():
+    """Every third row agrees, the two between contradict it: each time differently."""
+    value = {k: [-3.0 + 0.9 * k, 4.0 - 1.1 * k, 0.0] for k in range(12) if k % 3}
+    rows = start(value, speed=0.3, seconds=11 / HZ)
+    assert told(rows).start_ns() is None
+
+
+def test_not_more_than_so_many_rows_wait():
+    ns = stamps(HZ, 30.0)
+    cov = np.tile(np.diag([UNMEASURED_M_S**2, UNMEASURED_M_S**2, 1e-4]), (len(ns), 1, 1))
+    cov[0] = 1e-4 * np.eye(3)
+    odometry = told(Dvl(ns, np.tile([0.3, 0.0, 0.0], (len(ns), 1)), cov))
+    assert odometry.start_ns() is None
+    assert [row.stamp_ns for row in odometry.refused] == ns.tolist()
+    assert len(odometry._intake._doubt.waiting_ns) == MOST_WAITING
+
+
 def test_a_row_that_waits_is_no_node_and_is_told():
     rows = start({}).rows(slice(0, 1))
     odometry = told(rows)
@@ -146,7 +209,7 @@ def test_a_gap_lasts_until_its_end_is_confirmed():
     assert len(told(rows.rows(slice(0, first + 1))).columns()[3]) == first
     ended = told(rows.rows(slice(0, first + 2)))
     assert ended.columns()[3][first:].tolist() == [rows.stamps_ns[first + 1]]
-    assert [(row.stamp_ns, row.reason) for row in ended.refused] == [(rows.stamps_ns[first], Refusal.UNCONFIRMED)]
+    assert [(row.stamp_ns, row.reason) for row in ended.refused] == [(rows.stamps_ns[first], Refusal.WAITED)]
 
 
 def test_after_a_shorter_gap_one_row_is_enough():

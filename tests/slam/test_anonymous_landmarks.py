@@ -86,6 +86,20 @@ def test_a_landmark_begins_with_as_many_sightings_as_asked():
         assert outcomes[Outcome.NEW] == 4
 
 
+def test_the_wider_the_aperture_the_later_a_landmark_begins():
+    """Without a floor the elevation has to come from views, unless the aperture bounds it."""
+    sequence = simulate_basin(BasinOptions(**TWO_LAPS, **CLEAN, range_sigma_m=0.08))
+    blind = anonymous_where(sequence, everywhere(sequence))
+    later = []
+    for aperture_rad in (0.2, 0.8):
+        sonar = blind.calibration.sonar.model_copy(update={"elevation_aperture_rad": aperture_rad})
+        calibration = blind.calibration.model_copy(update={"sonar": sonar, "floor": None})
+        estimator = run(replace(blind, calibration=calibration), **ASSOCIATED)
+        later.append(Counter(estimator.detections().outcomes)[Outcome.USED_LATER] / len(estimator.landmarks()))
+    assert later[0] == 4
+    assert later[1] > 6
+
+
 def test_scattered_detections_of_nothing_begin_no_landmark():
     """As many in a place as would begin one do not come within the time that they may wait."""
     sequence = simulate_basin(BasinOptions(**TWO_LAPS, false_detections_per_frame=0.05, detection_probability=0.0))
@@ -125,6 +139,16 @@ def test_without_merging_they_stay_two(monkeypatch: pytest.MonkeyPatch):
     _, late = named_late(0.4)
     monkeypatch.setattr(module.LandmarkMerging, "nearest", lambda *_: None)
     assert len(run(late, **ASSOCIATED).landmarks()) > 4
+
+
+def test_with_a_bounded_history_none_is_merged_that_has_left_the_window():
+    """Factors in a marginal cannot be moved; pairing works all the same."""
+    sequence, late = named_late(0.4)
+    merged, kept = (run(late, **ASSOCIATED, history=history).landmarks() for history in ("whole", "bounded"))
+    assert len(kept) > len(merged) == 4
+    blind = run(anonymous_where(sequence, everywhere(sequence)), **ASSOCIATED, history="bounded")
+    assert len(blind.landmarks()) == 4
+    assert set(blind.detections().outcomes) <= USED
 
 
 def blind_between(first_s: float, last_s: float, estimator_calls: list[int]):

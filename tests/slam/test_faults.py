@@ -321,3 +321,28 @@ def test_a_sighting_that_places_no_landmark_is_withheld_and_its_landmark_begins_
     if history == "whole":
         assert found[0].graph.size() == expected[0].graph.size()
         assert np.allclose(found[0].trajectory().positions, expected[0].trajectory().positions, rtol=0, atol=1e-5)
+
+
+@MODES
+def test_all_factors_of_a_sighting_go_with_the_one_that_is_no_number(monkeypatch, history):
+    """A range that is no number gets into a factor: the azimuth beside it is not used either."""
+    detections = mission().detections
+    ids, stamps = detections.most_probable()[0], detections.stamps_ns
+    row = next(k for k in range(ROW, len(ids)) if ids[k] in ids[:k] and np.sum(stamps == stamps[k]) > 2 and ids[k] >= 0)
+    expected = run(replace(mission(), detections=detections.rows(np.delete(np.arange(len(detections)), row))), history)
+    make = SightingFactors.make
+
+    def spoilt(self, sighting, key, *, is_first):
+        made = make(self, sighting, key, is_first=is_first)
+        if sighting.stamp_ns == stamps[row] and key == L(ids[row]):
+            lost = gtsam.RangeFactor3D(sighting.line.pose_key, key, np.nan, gtsam.noiseModel.Isotropic.Sigma(1, 0.1))
+            return [*made[:-1], lost]
+        return made
+
+    monkeypatch.setattr(SightingFactors, "make", spoilt)
+    found = run(mission(), history)
+    log = found[0].detections()
+    assert [k for k, outcome in enumerate(log.outcomes) if outcome is Outcome.WITHHELD] == [row]
+    assert re.match(rf"landmark {ids[row]}, from .*: 1 range gives an error that is no number", found[0].withheld()[0])
+    assert found[0].graph.size() == expected[0].graph.size()
+    assert np.allclose(numbers(found), numbers(expected), rtol=0, atol=1e-8)

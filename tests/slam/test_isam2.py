@@ -253,7 +253,7 @@ def test_a_detection_far_off_is_gated_and_changes_nothing():
         range_m=last.range_m + 2.0,
         id_probability=last.id_probability * 0 + 1,
     )
-    gated = Isam2Params(gate_probability=0.999)
+    gated = Isam2Params(identity_policy="gate", gate_probability=0.999)
     haunted, plain = Isam2(sequence.calibration, gated), Isam2(sequence.calibration, gated)
     ends = run(haunted, replace(sequence, detections=LandmarkDetections.concatenate([sequence.detections, ghost])))
     expected = run(plain, sequence)

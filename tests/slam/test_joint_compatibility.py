@@ -4,7 +4,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2, multivariate_normal
 
@@ -65,6 +65,8 @@ def brute_force(case: Innovations) -> tuple[int, float, tuple[int, ...]]:
     return size, -squared, landmarks
 
 
+@example(seed=928, m=3, n=3, spread=1.5)  # two pairs beyond their gate, and the third finds its landmark taken
+@example(seed=15, m=3, n=3, spread=1.5)  # two pairs beyond their gate, three inside
 @settings(max_examples=150, deadline=None)
 @given(seed=st.integers(0, 2**31), m=st.integers(1, 4), n=st.integers(1, 4), spread=st.sampled_from([0.5, 1.5, 4.0]))
 def test_the_pairing_is_that_of_trying_all(seed: int, m: int, n: int, spread: float):
@@ -145,6 +147,16 @@ def test_two_that_share_a_wide_error_support_each_other():
     both = believed(case, Pairing((0, 1), 0.0), rival)
     assert both.landmarks == (0, 1)
     assert believed(case, Pairing((0, UNPAIRED), 0.0), rival).size == 0
+
+
+def test_two_that_fit_each_other_but_may_be_anywhere_say_nothing():
+    """Each given the other is denser than a rival of 3 a unit; where both are together is not."""
+    case, both = shifted(), Pairing((0, 1), 0.0)
+    e, C = case.of(both.landmarks)
+    together = multivariate_normal.logpdf(e, cov=C)
+    given_the_other = together - multivariate_normal.logpdf(e[2:], cov=C[2:, 2:])
+    assert given_the_other > np.log(3.0) > together / 2
+    assert believed(case, both, np.log(np.full(2, 3.0))).size == 0
 
 
 def test_a_pair_that_the_others_speak_against_is_dropped():

@@ -23,6 +23,7 @@ from sonar_graph.states import Outcome
 
 NS = 1_000_000_000
 T0_NS = 1_500_000_000 * NS
+START_NS = T0_NS - 1
 POLICY = KeyframePolicy(max_interval_s=5.0, motion_noise_share=1e9, bias_interval_s=60.0)
 TRUSTING = SightingPolicy(identity_probability=0.7, gate_probability=0.99, kernel="none", kernel_width=2.0)
 SONAR = SonarCalibration(
@@ -52,7 +53,7 @@ class Dive:
         self.smoother = smoother or Smoother(lag_s, 1e-6, 1e9)
         self.keyframes = Keyframes(calibration, POLICY, self.smoother)
         self.sightings = Sightings(calibration, policy, self.smoother, self.keyframes)
-        stamps = T0_NS + np.arange(0, 101) * NS // 10
+        stamps = np.r_[START_NS, T0_NS + np.arange(0, 101) * NS // 10]  # the second row confirms the first
         n = len(stamps)
         velocity = np.tile([0.5, 0.0, 0.0], (n, 1))
         self.keyframes.add(
@@ -152,7 +153,7 @@ def test_a_frame_between_keyframes_is_seen_from_where_the_vehicle_was():
     dive = Dive()
     dive.see(0.35, (5, 3.0, 0.0))
     beam = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
-    assert dive.keyframes.stamps_ns == [T0_NS]
+    assert dive.keyframes.stamps_ns == [START_NS]
     assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(np.array([0.475, 0.1, -0.1]) + 3.0 * beam)
 
 
@@ -376,7 +377,7 @@ def test_a_frame_that_brings_a_keyframe_hangs_on_it():
     dive = Dive()
     dive.keyframes.policy = replace(POLICY, motion_noise_share=0.0)
     dive.see(1.05, (5, 3.0, 0.0))
-    assert dive.keyframes.stamps_ns == [T0_NS, T0_NS + NS]
+    assert dive.keyframes.stamps_ns == [START_NS, T0_NS + NS]
     graph = dive.smoother.graph
     assert {tuple(graph.at(k).keys()) for k in range(graph.size())} == {(X(0),), (X(0), X(1)), (X(1), L(5))}
     beam = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])

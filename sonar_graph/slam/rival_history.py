@@ -1,0 +1,154 @@
+"""The history as it would be if watches were of other landmarks, solved beside the one that stands.
+
+Nothing here is written to: it is what results are chosen from when they are asked for, and asking must not change the
+run. Factors are shared with it; they are never changed.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L
+
+from sonar_graph.measurements import Floats
+from sonar_graph.slam.batch import marginals_of
+from sonar_graph.slam.graduated import graduate
+from sonar_graph.slam.misplaced_landmarks import supporters_elsewhere
+from sonar_graph.slam.mixture import Choices, Mixture, Watch
+from sonar_graph.slam.sighting import Sighting, SightingFactors
+from sonar_graph.slam.sightlines import Sightlines, solve_in_sight
+
+MOST_ROUNDS = 10
+"""Times that choices are made anew."""
+LEAST_WEIGHT = 1e-6
+"""Of a watch in a graph."""
+LEAST_GAIN = 1e-3
+"""Of the cost, for another solution to be taken."""
+
+
+class RivalHistory:
+    """All watches, and all factors that are not of their sightings.
+
+    Parameters
+    ----------
+    rest
+        Those factors.
+    watches, mixture
+        What is chosen, and by what.
+    maker
+        Makes factors of sightings.
+    """
+
+    def __init__(
+        self, rest: gtsam.NonlinearFactorGraph, watches: list[Watch], mixture: Mixture, maker: SightingFactors
+    ) -> None:
+        self._rest = rest
+        self._watches = watches
+        self._mixture = mixture
+        self._maker = maker
+
+    def settled(self, values: gtsam.Values, choices: Choices, *, is_graduated: bool) -> tuple[gtsam.Values, Choices]:
+        """The nearest fixed point of the max-mixture from a solution with these choices.
+
+        Parameters
+        ----------
+        is_graduated
+            Whether to take what graduated non-convexity finds, if that costs less.
+        """
+        values, choices = self._fixed_point(values, choices)
+        if is_graduated and self._known(values):
+            found, others = self.graduated(values)
+            if self.cost(found, others) < self.cost(values, choices) - LEAST_GAIN:
+                return found, others
+        return values, choices
+
+    def marginals(self, values: gtsam.Values, choices: Choices) -> gtsam.Marginals | gtsam.ISAM2:
+        """What gives the covariances of a solution."""
+        return marginals_of(self._chosen_graph(choices), values)
+
+    def cost(self, values: gtsam.Values, choices: Choices) -> float:
+        """Of the max-mixture, with these components."""
+        scores = self._mixture.scores(self._watches, values, choices, self._sizes(choices))
+        return float(self._rest.error(values)) - sum(s[choice] for s, choice in zip(scores, choices, strict=True))
+
+    def graduated(self, values: gtsam.Values) -> tuple[gtsam.Values, Choices]:
+        """From graduated non-convexity on what the recogniser said, the nearest fixed point of the max-mixture."""
+        known = self._known(values)
+        named, ids = [watch for watch, _ in known], [i for _, i in known]
+        plain = self._maker.without_kernel()
+        values, weights = graduate(
+            lambda weights: self._graph(named, [*ids], weights, plain),
+            lambda values: self._mixture.squared_errors(named, ids, values),
+            self._mixture.truncations(named),
+            values,
+        )
+        kept = {w: i for w, i, weight in zip(named, ids, weights.tolist(), strict=True) if weight > 0.5}
+        choices: Choices = [kept.get(watch) for watch in self._watches]
+        return self._fixed_point(self._solve(values, choices), choices)
+
+    def _known(self, values: gtsam.Values) -> list[tuple[Watch, int]]:
+        """Watches that name a landmark of the graph, and that."""
+        favourites = [(watch, watch.statement.favourite) for watch in self._watches]
+        return [(watch, i) for watch, i in favourites if i is not None and values.exists(L(i))]
+
+    def _sizes(self, choices: Choices) -> dict[int, int]:
+        sizes: dict[int, int] = defaultdict(int)
+        for watch, choice in zip(self._watches, choices, strict=True):
+            if choice is not None:
+                sizes[choice] += len(watch.sightings)
+        return sizes
+
+    def _fixed_point(self, values: gtsam.Values, choices: Choices) -> tuple[gtsam.Values, Choices]:
+        for _ in range(MOST_ROUNDS):
+            start, better = values, self._mixture.best(self._watches, values, choices, self._sizes(choices))
+            if better == choices:
+                start, better = self._relocated(values, choices)
+            if better == choices:
+                break
+            values, choices = self._solve(start, better), better
+        return values, choices
+
+    def _relocated(self, values: gtsam.Values, choices: Choices) -> tuple[gtsam.Values, Choices]:
+        """Landmarks that began with something else begin where those that name them agree that they are."""
+        moved = gtsam.Values(values)
+        for landmark_id in sorted(self._sizes(choices)):
+            rows = [row for row, watch in enumerate(self._watches) if watch.statement.favourite == landmark_id]
+            naming, now = [self._watches[row] for row in rows], [choices[row] for row in rows]
+            found = supporters_elsewhere(landmark_id, naming, now, values, self._mixture)
+            if found is not None:
+                without = [None if choice == landmark_id else choice for choice in choices]
+                choices = [landmark_id if w in found else c for w, c in zip(self._watches, without, strict=True)]
+                first = min((s for watch in found for s in watch.sightings), key=lambda s: (s.stamp_ns, s.row))
+                moved.update(L(landmark_id), self._maker.place(first, values))
+        return moved, choices
+
+    def _solve(self, values: gtsam.Values, choices: Choices) -> gtsam.Values:
+        lines = Sightlines()
+        for watch, choice in zip(self._watches, choices, strict=True):
+            if choice is not None:
+                for sighting in watch.sightings:
+                    lines.add(L(choice), sighting.line)
+        return solve_in_sight(self._chosen_graph(choices), values, lines)
+
+    def _chosen_graph(self, choices: Choices) -> gtsam.NonlinearFactorGraph:
+        return self._graph(self._watches, choices, np.ones(len(choices)), self._maker)
+
+    def _graph(
+        self, watches: list[Watch], choices: Choices, weights: Floats, maker: SightingFactors
+    ) -> gtsam.NonlinearFactorGraph:
+        """The history with these watches of these landmarks; weights divide their covariances."""
+        graph = gtsam.NonlinearFactorGraph(self._rest)
+        of: dict[int, list[tuple[Sighting, float]]] = defaultdict(list)
+        for watch, landmark_id, weight in zip(watches, choices, weights.tolist(), strict=True):
+            if landmark_id is not None:
+                of[landmark_id] += [(sighting, max(weight, LEAST_WEIGHT)) for sighting in watch.sightings]
+        for landmark_id, sightings in of.items():
+            sightings.sort(key=lambda pair: (pair[0].stamp_ns, pair[0].row))
+            for k, (sighting, weight) in enumerate(sightings):
+                weighed = sighting if weight == 1.0 else replace(sighting, noise=sighting.noise / weight)
+                for factor in maker.make(weighed, L(landmark_id), is_first=k == 0):
+                    graph.push_back(factor)
+        return graph

@@ -1,0 +1,216 @@
+"""Which landmark is meant, chosen by posterior and place; truth from how the world was made and from another solver."""
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import L, X
+from pydantic import ValidationError
+
+from sonar_graph.measurements import LandmarkDetections
+from sonar_graph.slam import doubtful_identities, mixture
+from sonar_graph.slam.hypotheses import RecogniserErrors, Statement
+from sonar_graph.slam.isam2 import Isam2Params
+from sonar_graph.slam.mixture import Kernel, Mixture, Watch
+from sonar_graph.slam.sighting import Sighting
+from sonar_graph.slam.sightings import SightingPolicy
+from sonar_graph.slam.sightlines import Sightline
+from sonar_graph.states import Outcome
+from tests.slam.test_sightings import CALIBRATION, FLOOR, T0_NS, Dive, spherical
+
+PLACES = {7: np.array([2.6, 0.5, -1.0]), 4: np.array([2.9, 1.4, -1.0]), 9: np.array([3.2, 0.1, -1.0])}
+"""Of landmarks, in the world of `Dive`: on the floor, within its sonar's fan."""
+ERRORS = RecogniserErrors(0.05, 10.0, 2.0)
+MIXTURE = Mixture(ERRORS, Kernel("none", 1.0))
+BELIEVING = SightingPolicy(0.7, 1.0, "none", 2.0)
+
+
+def doubting(kernel: str = "none", **settings) -> SightingPolicy:
+    return SightingPolicy(0.7, 1.0, kernel, 1.5, mixture=Mixture(ERRORS, Kernel(kernel, 1.5)), **settings)
+
+
+def dive(policy: SightingPolicy) -> Dive:
+    return Dive(CALIBRATION.model_copy(update={"floor": FLOOR}), policy)
+
+
+def watch(world: Dive, after_s: float, said: dict[int, int], rng: np.random.Generator, track: int = -1) -> None:
+    """A frame with the landmarks that are the keys, each named as the value says, and as surely as can be."""
+    z = [spherical(0.5 * after_s, PLACES[i]) + [0.02, 0.01] * rng.standard_normal(2) for i in said]
+    show(world, after_s, np.array(z), list(said.values()), [track] * len(z))
+
+
+def show(world: Dive, after_s: float, z, named: list[int], tracks: list[int]) -> None:
+    stamp, n = T0_NS + round(after_s * 1e9), len(z)
+    world.keyframes.advance(stamp)
+    candidates, unknown = np.array(named)[:, None], np.full((n, 2, 2), np.nan)
+    rows = LandmarkDetections(
+        np.full(n, stamp), z[:, 0], z[:, 1], unknown, candidates, np.ones((n, 1)), np.array(tracks)
+    )
+    world.sightings.add(rows)
+
+
+def misnamed(policy: SightingPolicy, share: float = 0.25) -> tuple[Dive, list[int]]:
+    """Thirty frames in which a share of the names, not of the first two frames, is wrong; the true ones in order."""
+    world, rng, truth = dive(policy), np.random.default_rng(5), []
+    for k in range(30):
+        named = {i: i for i in PLACES}
+        if k > 1 and rng.random() < 3 * share:
+            wrong = int(rng.choice(list(PLACES)))
+            named = {wrong: int(rng.choice([i for i in PLACES if i != wrong]))} | {
+                i: i for i in PLACES if i not in (wrong,)
+            }
+        watch(world, 0.1 * (k + 1), named, rng)
+        truth += list(named)
+    return world, truth
+
+
+def worst_landmark_m(world: Dive) -> float:
+    values = world.sightings.history().values
+    return max(float(np.linalg.norm(values.atPoint3(L(i)) - p)) for i, p in PLACES.items())
+
+
+def max_mixture(world: Dive) -> gtsam.NonlinearFactorGraph:
+    """The same with Python factors that look for their largest component at every linearisation."""
+    doubtful = world.sightings._doubtful
+    handles = {h for w in doubtful.watches for s in w.sightings for h in s.handles}
+    graph, chosen = world.smoother.graph_without(handles), doubtful.history()
+    pairs = list(zip(chosen.watches, chosen.choices, strict=True))
+    firsts = {i: min(w.sightings[0].row for w, choice in pairs if choice == i) for i in PLACES}
+    for w in doubtful.watches:
+        (sighting,) = w.sightings
+        first_of = next((i for i, row in firsts.items() if row == sighting.row), None)
+        maker = doubtful._maker
+        if first_of is not None:  # what is said once of a landmark does not depend on a choice
+            for factor in maker.make(sighting, L(first_of), is_first=True)[2:]:
+                graph.push_back(factor)
+        graph.push_back(
+            largest(w.statement.favourite, {i: maker.make(sighting, L(i), is_first=False) for i in PLACES}, sighting)
+        )
+    return graph
+
+
+def largest(named: int, components: dict[int, list], sighting) -> gtsam.CustomFactor:
+    keys = [sighting.line.pose_key, *(L(i) for i in PLACES)]
+    q, u = 0.05, 1.0 / (10.0 * 2.0)
+    peak = 1.0 / (2.0 * np.pi * np.sqrt(np.linalg.det(sighting.noise)))
+    least = -2.0 * np.log((q / 2) * u / ((1 - q + q / 40) * peak))
+
+    def error(_, values, jacobians):
+        best, cost = None, least
+        for i, factors in components.items():
+            weight = (1 - q) * (i == named) + q / 40
+            own = 2 * sum(f.error(values) for f in factors) - 2 * np.log(weight / (1 - q + q / 40))
+            if own < cost:
+                best, cost = i, own
+        e, blocks = np.zeros(4), {key: np.zeros((4, 6 if key == keys[0] else 3)) for key in keys}
+        e[3] = np.sqrt(least)
+        if best is not None:
+            e[3] = np.sqrt(max(cost - 2 * sum(f.error(values) for f in components[best]), 0.0))
+            camera, distance = components[best]
+            for rows, factor in ((slice(0, 2), camera), (slice(2, 3), distance)):
+                A, b = factor.linearize(values).jacobian()
+                e[rows], column = -b, 0
+                for key in list(factor.keys()):
+                    width = 6 if key == keys[0] else 3
+                    blocks[key][rows] = A[:, column : column + width]
+                    column += width
+        if jacobians is not None:
+            for k, key in enumerate(keys):
+                jacobians[k] = blocks[key]
+        return e
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(4), keys, error)
+
+
+def test_the_end_is_a_fixed_point_of_the_max_mixture_that_another_solver_finds() -> None:
+    world, truth = misnamed(doubting())
+    values = world.sightings.history().values
+    scattered = values.retract(scatter(values))
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-12)
+    found = gtsam.LevenbergMarquardtOptimizer(max_mixture(world), scattered, params).optimize()
+    for i in PLACES:
+        assert np.linalg.norm(scattered.atPoint3(L(i)) - values.atPoint3(L(i))) > 1e-3
+        np.testing.assert_allclose(found.atPoint3(L(i)), values.atPoint3(L(i)), atol=1e-5)
+    log = world.sightings.log()
+    assert log.landmark_ids.tolist() == truth
+    assert set(log.outcomes) == {Outcome.NEW, Outcome.USED, Outcome.REASSIGNED}
+
+
+def scatter(values: gtsam.Values) -> gtsam.VectorValues:
+    rng, delta = np.random.default_rng(1), values.zeroVectors()
+    for key in list(values.keys()):
+        delta.update(gtsam_vector(key, 3e-3 * rng.standard_normal(len(delta.at(key)))))
+    return delta
+
+
+def gtsam_vector(key: int, change) -> gtsam.VectorValues:
+    one = gtsam.VectorValues()
+    one.insert(key, change)
+    return one
+
+
+@pytest.mark.parametrize("kernel", ["none", "cauchy"])
+def test_wrong_names_cost_nothing_and_believing_them_does(kernel: str) -> None:
+    right_m = worst_landmark_m(misnamed(BELIEVING, 0.0)[0])
+    assert worst_landmark_m(misnamed(doubting(kernel))[0]) < right_m + 0.02
+    assert worst_landmark_m(misnamed(BELIEVING)[0]) > right_m + 0.1
+
+
+def test_right_names_give_the_graph_of_one_that_believes_them() -> None:
+    doubted, believed = misnamed(doubting(), 0.0)[0], misnamed(BELIEVING, 0.0)[0]
+    assert doubted.outcomes == believed.outcomes
+    for i in PLACES:
+        places = [world.sightings.history().values.atPoint3(L(i)) for world in (doubted, believed)]
+        np.testing.assert_allclose(*places, atol=1e-3)
+
+
+@pytest.mark.parametrize("can_move", [True, False])
+def test_a_landmark_that_begins_in_a_wrong_place_is_moved_by_those_who_name_it(can_move: bool, monkeypatch) -> None:
+    if not can_move:
+        monkeypatch.setattr(doubtful_identities, "supporters_elsewhere", lambda *_: None)
+    world, rng = dive(doubting()), np.random.default_rng(2)
+    watch(world, 0.3, {4: 7}, rng)
+    for k in range(2, 8):
+        watch(world, 0.3 * k, {7: 7}, rng)
+    values, _ = world.smoother.solve_history()
+    off_m = float(np.linalg.norm(values.atPoint3(L(7)) - PLACES[7]))
+    assert (off_m < 0.1) is can_move
+    assert world.outcomes.count(Outcome.UNFIT) == (1 if can_move else 6)
+
+
+@pytest.mark.parametrize(("off_sigma", "is_of_7"), [(0.0, True), (1.5, True), (3.0, False)])
+def test_many_sightings_of_another_object_do_not_prove_it_to_be_a_landmark(
+    off_sigma: float, is_of_7: bool, monkeypatch
+) -> None:
+    """Something unnamed, seen again and again a little beside a landmark whose place is known."""
+    values, noise = gtsam.Values(), np.diag([4e-4, 1e-4])
+    values.insert(X(0), gtsam.Pose3())
+    values.insert(L(7), np.array([3.0, 0.0, 0.0]))
+    line = Sightline(X(0), gtsam.Pose3(), np.array([3.0, 0.01 * off_sigma]))
+    seen = Watch(Statement({}), [Sighting(k, k, line, noise, None) for k in range(20)])
+    assert MIXTURE.best([seen], values, [None], {7: 50}) == [7 if is_of_7 else None]
+    monkeypatch.setattr(mixture, "REPEATED_LOSS", 1e3)
+    assert MIXTURE.best([seen], values, [None], {7: 50}) == [7], "as if each sighting were anywhere"
+
+
+def test_a_late_name_brings_all_sightings_of_its_track() -> None:
+    world, rng = dive(doubting()), np.random.default_rng(2)
+    for k, name in enumerate([-1, -1, -1, 7, 7], start=1):
+        watch(world, 0.3 * k, {7: name}, rng, track=2)
+    assert world.outcomes == [Outcome.USED_LATER] * 3 + [Outcome.NEW, Outcome.USED]
+
+
+def test_one_name_that_changes_moves_all_sightings_of_its_track() -> None:
+    world, rng = dive(doubting()), np.random.default_rng(2)
+    for k in range(1, 5):
+        watch(world, 0.3 * k, {4: 4, 9: 9}, rng)
+    for k, name in enumerate([9, 9, 7, 7, 7], start=5):
+        watch(world, 0.3 * k, {7: name}, rng, track=2)
+    assert len(world.sightings._landmarks.sightings(7)) == 5
+    assert worst_landmark_m(world) < 0.1
+
+
+def test_a_gate_that_would_do_nothing_is_refused() -> None:
+    with pytest.raises(ValidationError, match='set identity_policy = "gate"'):
+        Isam2Params(gate_probability=0.99)
+    assert Isam2Params(gate_probability=0.99, identity_policy="gate").gate_probability == 0.99

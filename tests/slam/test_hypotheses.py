@@ -1,0 +1,38 @@
+"""What a detection may be of before its place is looked at."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonar_graph.measurements import LandmarkDetections
+from sonar_graph.slam.hypotheses import LEAST_LANDMARKS, RecogniserErrors, Statement
+
+CHANCES = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=4)
+
+
+def statement(ids: list[int], probability: list[float]) -> Statement:
+    n = len(ids)
+    rows = LandmarkDetections(
+        np.zeros(1, dtype=int), np.ones(1), np.ones(1), np.ones((1, 2, 2)), np.array([ids]), np.array([probability])
+    )
+    assert n == len(probability)
+    return Statement.of(rows, 0)
+
+
+@given(CHANCES, st.floats(0.001, 0.999), st.integers(LEAST_LANDMARKS, 60))
+def test_weights_are_a_distribution_with_none_impossible(chances: list[float], q: float, count: int) -> None:
+    ids = list(range(count))
+    weights = np.exp(statement(ids[: len(chances)], chances).log_weights(ids, RecogniserErrors(q, 10.0, 2.0)))
+    assert weights.sum() == pytest.approx(1.0)
+    assert weights.min() >= min(0.5 * q / count, 0.5 * q) * (1 - 1e-9)
+
+
+def test_the_order_of_weights_is_that_of_the_posterior() -> None:
+    weights = statement([5, 3, -1], [0.2, 0.7, 0.1]).log_weights([3, 4, 5], RecogniserErrors(0.1, 10.0, 2.0))
+    assert np.exp(weights) == pytest.approx([0.63 + 0.0025, 0.0025, 0.18 + 0.0025, 0.9 * 0.1 + 0.05])
+
+
+def test_what_is_no_number_or_no_landmark_is_not_stated() -> None:
+    assert statement([5, -1, 3], [np.nan, 0.9, 0.1]).probability == {3: 0.1}
+    assert statement([-1], [1.0]).favourite is None
