@@ -75,7 +75,8 @@ def test_commands_are_understood(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     from sonar_graph.cli import app
 
     monkeypatch.chdir(tmp_path)
-    for name in ("dive.mcap", "vehicle.toml"):
+    Path("benchmarks/suites").mkdir(parents=True)
+    for name in ("dive.mcap", "vehicle.toml", "benchmarks/suites/smoke.toml"):
         Path(name).touch()
     group = typer.main.get_command(app)
     lines = re.findall(r"^    sonar-graph (.+)$|`sonar-graph ([a-z]+ [^`]*\.mcap[^`]*)`", README, flags=re.MULTILINE)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -67,10 +68,13 @@ class Batch:
         missing = [run for run in self.runs if run.key not in done]
         try:
             run_batch(missing, self.store, limits, where, progress)
-        except BatchError as error:
-            raise BatchError(f"{error}; {self.resuming()}") from error
-        finally:
-            self._write_table()
+        except (BatchError, KeyboardInterrupt) as error:
+            with contextlib.suppress(OSError):  # why the batch ends is what has to be told
+                self._write_table()
+            if isinstance(error, BatchError):
+                raise BatchError(f"{error}; {self.resuming()}") from error
+            raise
+        self._write_table()
         return Counter(str(row["status"]) for row in self.rows().values())
 
     def resuming(self) -> str:

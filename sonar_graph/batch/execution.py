@@ -109,7 +109,7 @@ def _outcome(future: Future[Any]) -> Outcome:
         return Outcome({"status": "killed", "reason": reason}, log=f"{reason}\n")
     except SonarGraphError as error:
         raise BatchError(str(error)) from error
-    except OSError as error:
+    except (OSError, ImportError) as error:
         raise BatchError(f"a worker cannot do runs: {error}") from error
     assert isinstance(outcome, Outcome)
     return outcome
@@ -184,10 +184,12 @@ def _connected(address: str) -> Client:
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Without Dask's own messages: workers that come and go are told by rows."""
-    logger = logging.getLogger("distributed")
-    before = logger.level
-    logger.setLevel(logging.CRITICAL)
+    names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
+    before = {name: logging.getLogger(name).level for name in names}
+    for name in names:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         yield
     finally:
-        logger.setLevel(before)
+        for name, level in before.items():
+            logging.getLogger(name).setLevel(level)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import platform
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -19,7 +20,7 @@ from sonar_graph.batch.sources import FILES, GENERATORS, KINDS, LOG, fingerprint
 from sonar_graph.batch.suite import EstimatorEntry, LogEntry, SuiteFile
 from sonar_graph.batch.toml_lines import Place
 from sonar_graph.calibration import Section
-from sonar_graph.errors import EstimatorError, SonarGraphError, UnknownEstimatorError
+from sonar_graph.errors import BatchError, EstimatorError, SonarGraphError, UnknownEstimatorError
 from sonar_graph.estimator import installed_estimators, load_estimator
 from sonar_graph.simulation.landmarks_on_log import LandmarkOptions
 from sonar_graph.validation import faults_in
@@ -66,8 +67,16 @@ def plan_runs(file: SuiteFile) -> list[PlannedRun]:
 
 @lru_cache
 def versions_of(estimator: str) -> dict[str, str]:
-    """Versions that decide the numbers, with that of the package that brings the estimator."""
-    point = installed_estimators()[estimator]
+    """Versions that decide the numbers, with that of the package that brings the estimator.
+
+    Raises
+    ------
+    BatchError
+        When this machine does not have the estimator.
+    """
+    point = installed_estimators().get(estimator)
+    if point is None:
+        raise BatchError(f"{platform.node()}: no estimator is called {estimator!r}; install what brings it")
     brings = {} if point.dist is None else {point.dist.name: point.dist.version}
     return brings | {
         "sonar_graph": sonar_graph.__version__,
@@ -106,6 +115,8 @@ def _check_source(file: SuiteFile, place: Place, entry: LogEntry) -> None:
         reason = "seeds are given as seeds = [...]" if name == "seed" else "recognise landmarks first, and give the log"
         file.refuse((*place, "options", name), f"cannot be set in a suite: {reason}")
     if entry.landmarks is not None:
+        if "seed" in entry.landmarks:
+            file.refuse((*place, "landmarks", "seed"), "cannot be set in a suite: seeds are given as seeds = [...]")
         _validated(file, (*place, "landmarks"), LandmarkOptions, entry.landmarks)
 
 

@@ -112,6 +112,32 @@ def test_failures_are_rows_and_the_exit_code_says_so(
     assert all((tmp_path / "out" / row["log_file"]).is_file() for row in rows)
 
 
+def test_scheduler_that_is_lost_is_told_and_what_is_done_is_kept(
+    write_suite: WriteSuite, misbehaving: None, tmp_path: Path
+) -> None:
+    suite = write_suite(HEADER, BASIN, DEAD_RECKONING, '[[estimators]]\nname = "sleeps"\n')
+    told = ["--scheduler-file", str(tmp_path / "scheduler.json"), "--no-dashboard"]
+    quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
+    with subprocess.Popen([*dask, *told], **quiet) as scheduler:
+        while not (tmp_path / "scheduler.json").exists():
+            time.sleep(0.05)
+        address = json.loads((tmp_path / "scheduler.json").read_text())["address"]
+        dask = [sys.executable, "-m", "distributed.cli.dask_worker", "--nthreads", "1"]
+        with subprocess.Popen([*dask, *told], **quiet) as worker:
+            with bench(suite, tmp_path / "out", "--scheduler", address) as process:
+                while not list((tmp_path / "out").glob("runs/*/row.json")):
+                    assert process.poll() is None
+                    time.sleep(0.05)
+                scheduler.kill()
+                _, said = process.communicate(timeout=120)
+            worker.terminate()
+    assert process.returncode == 2
+    (line,) = said.splitlines()
+    assert "the scheduler was lost" in line
+    assert line.endswith("1 of 2 runs are done and kept; the same command goes on from there")
+
+
 def test_missing_scheduler_is_one_line(write_suite: WriteSuite, tmp_path: Path) -> None:
     with bench(write_suite(), tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9") as process:
         _, said = process.communicate(timeout=120)

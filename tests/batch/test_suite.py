@@ -55,6 +55,11 @@ def line(text: str, word: str) -> int:
         ),
         (HEADER + '[[logs]]\nname = "a"\nlog = "no.mcap"\n' + DEAD_RECKONING, "no.mcap", "no.mcap is not in"),
         (HEADER + '[[logs]]\nname = "a"\ndataset = "mrclam"\n' + DEAD_RECKONING, "[[logs]]", "robot: is missing"),
+        (
+            HEADER + '[[logs]]\nname = "a"\ndataset = "victoria-park"\nlandmarks = { seed = 1 }\n' + DEAD_RECKONING,
+            "landmarks",
+            "logs.0.landmarks.seed: cannot be set",
+        ),
         (HEADER + "[[logs]\n", "[[logs]", "not TOML"),
     ],
 )
