@@ -18,7 +18,8 @@ import numpy as np
 from sonar_graph.batch.plan import versions_of
 from sonar_graph.batch.planned import PlannedRun, Row
 from sonar_graph.batch.sources import read_source
-from sonar_graph.errors import BatchError
+from sonar_graph.errors import BatchError, EstimatorError
+from sonar_graph.estimator import load_estimator
 from sonar_graph.evaluation.comparison import judge
 from sonar_graph.evaluation.environment import describe_environment
 from sonar_graph.evaluation.results import Comparison, ErrorSeries, RunResult
@@ -82,10 +83,19 @@ def _compared(run: PlannedRun, clock: Clock) -> Comparison:
         sequence = _sequence(run.kind, _as_text(run.options), run.seed, _as_text(run.landmarks))
         instants_ns = sequence.instants(run.rate_hz)
     with clock.on("estimate_s"):
-        result = run_estimator(sequence, run.estimator, run.params, instants_ns=instants_ns)
+        result = run_estimator(sequence, run.estimator, _differing(run), instants_ns=instants_ns)
     comparison = judge(sequence, instants_ns, [result])
     environment = comparison.environment | {"command": f"sonar-graph bench: run {run.key} of {run.suite}"}
     return replace(comparison, environment=environment)
+
+
+def _differing(run: PlannedRun) -> dict[str, Any]:
+    """Settings that are not the defaults: an estimator may refuse a default that is given beside what excludes it."""
+    try:
+        defaults = load_estimator(run.estimator).Params().model_dump(mode="json")
+    except EstimatorError:
+        return run.params
+    return {name: value for name, value in run.params.items() if name not in defaults or defaults[name] != value}
 
 
 @lru_cache(KEPT_SEQUENCES)
