@@ -146,7 +146,7 @@ def test_examples_in_help_are_understood(
         command.make_context(path[-1], words[1 + len(path) :])
 
 
-@pytest.mark.parametrize("group", ["simulate", "convert"])
+@pytest.mark.parametrize("group", ["simulate", "convert", "bench"])
 def test_help_of_a_group_ends_in_examples(group: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(group, "--help") == 0
     assert f"sonar-graph {group} " in capsys.readouterr().out.partition("Examples:")[2]

@@ -1,7 +1,8 @@
 """The commands: thin shells around the library, one module a group.
 
-Exit codes: 0 done; 1 a comparison in which some run failed (everything is written); 2 the user's mistake, told in
-one line on stderr; 130 interrupted. Only an error that nobody foresaw ends in a traceback.
+Exit codes: 0 done; 1 a comparison in which some run failed (everything is written), or a batch that is worse than its
+reference; 2 the user's mistake, told in one line on stderr; 130 interrupted. Only an error that nobody foresaw ends in
+a traceback.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ from typing import Annotated, Any
 import typer
 
 from sonar_graph import __version__
-from sonar_graph.cli.benching import bench
 from sonar_graph.cli.comparing import compare, report, run
 from sonar_graph.cli.converting import datasets
 from sonar_graph.cli.demonstrating import demo
+from sonar_graph.cli.gating import benches
 from sonar_graph.cli.inspecting import inspect
 from sonar_graph.cli.listing import estimators
 from sonar_graph.cli.recognising import calibrate, recognise
@@ -40,6 +41,7 @@ app = typer.Typer(
 )
 app.add_typer(worlds)
 app.add_typer(datasets)
+app.add_typer(benches)
 app.command(epilog=examples("sonar-graph inspect dive.mcap", "sonar-graph inspect dive.mcap --toml"))(inspect)
 app.command(
     epilog=examples(
@@ -62,13 +64,6 @@ app.command(
 )(recognise)
 app.command(epilog=examples("sonar-graph calibrate dive.mcap -o model.json"))(calibrate)
 app.command(epilog=examples("sonar-graph report comparison"))(report)
-app.command(
-    epilog=examples(
-        "sonar-graph bench suite.toml -o results",
-        "sonar-graph bench suite.toml -o results --workers 2 --timeout 600",
-        "sonar-graph bench suite.toml -o results --scheduler tcp://10.0.0.5:8786",
-    )
-)(bench)
 app.command(epilog=examples("sonar-graph estimators"))(estimators)
 app.command(epilog=examples("sonar-graph demo -o demo"))(demo)
 

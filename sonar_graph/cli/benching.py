@@ -14,6 +14,7 @@ import typer
 
 from sonar_graph.cli.arguments import OutputFolder
 from sonar_graph.cli.outputs import writable_folder
+from sonar_graph.cli.progress import working
 from sonar_graph.errors import BatchError
 
 if TYPE_CHECKING:
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
     from sonar_graph.batch.planned import Limits
 
 INTERRUPTED = 130
+BatchFolder = Annotated[
+    Path, typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that bench wrote.")
+]
 INSTALL = "pip install 'sonar-graph[bench]'"
 
 
@@ -43,10 +47,21 @@ def bench(
     retry_failed: Annotated[
         bool, typer.Option("--retry-failed", help="Do runs anew that failed, timed out or were killed.")
     ] = False,
+    reference: Annotated[
+        Path | None,
+        typer.Option(
+            "--gate",
+            metavar="REFERENCE.json",
+            exists=True,
+            dir_okay=False,
+            help="What `bench bless` wrote: exit with 1 where accuracy or consistency got worse, and only then.",
+        ),
+    ] = None,
 ) -> None:
     """Run a suite: logs or simulations, seeds, estimators and variants. Runs that are done already are kept.
 
-    Writes results.parquet, one row a run, and runs/KEY/ with what compare writes and the log of the run.
+    Writes report.html, its tables, results.parquet with one row a run, and runs/KEY/ with what compare writes and the
+    log of the run.
     """
     if workers is not None and scheduler is not None:
         raise typer.BadParameter("--workers is for this machine, --scheduler for a cluster; give one of them")
@@ -56,8 +71,35 @@ def bench(
     counts = _run(batch, where, limits)
     typer.echo(f"Runs: {_told(counts)}")
     typer.echo(f"Results: {output / 'results.parquet'}")
-    if set(counts) - {"ok"}:
+    typer.echo(f"Report: {write_report_of(output)}")
+    if reference is not None:
+        exit_by_gate(output, reference)
+    elif set(counts) - {"ok"}:
         raise typer.Exit(1)
+
+
+def exit_by_gate(folder: Path, reference: Path) -> None:
+    """Print what got worse, and exit with 1 where anything did."""
+    from sonar_graph.batch.gate import gate as judge
+    from sonar_graph.batch.recorded import read_batch
+
+    verdict = judge(read_batch(folder), reference)
+    for worsening in verdict.worsenings:
+        typer.echo(f"Worse: {worsening}")
+    if verdict.new:
+        typer.echo(f"Not judged: {len(verdict.new)} runs that the reference does not have, first {verdict.new[0]}")
+    typer.echo(f"Gate: {'passed' if verdict.passed else 'failed'}, {verdict.compared} runs held against {reference}")
+    if not verdict.passed:
+        raise typer.Exit(1)
+
+
+def write_report_of(folder: Path) -> Path:
+    """Write the page and the tables of a batch from its results."""
+    from sonar_graph.batch.page import write_batch_report
+    from sonar_graph.batch.recorded import read_batch
+
+    with working("drawing"):
+        return write_batch_report(read_batch(folder), folder)
 
 
 def _opened(

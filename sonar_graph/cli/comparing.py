@@ -24,6 +24,7 @@ from sonar_graph.cli.arguments import (
     StartTime,
     TopicChoices,
 )
+from sonar_graph.cli.benching import write_report_of
 from sonar_graph.cli.outputs import writable_folder
 from sonar_graph.cli.progress import Report, progress_bars, working
 from sonar_graph.cli.recognising import no_images, our_recogniser, warn_of_other_designs
@@ -142,12 +143,17 @@ def compare(
 
 def report(
     folder: Annotated[
-        Path, typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that compare or run wrote.")
+        Path,
+        typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that compare or bench wrote."),
     ],
 ) -> None:
-    """Write report.html anew from what compare or run left in a folder."""
+    """Write report.html, and a batch's tables, anew from what compare, run or bench left in a folder."""
+    from sonar_graph.batch.recorded import is_batch
     from sonar_graph.evaluation.storage import read_comparison
 
+    if is_batch(folder):
+        typer.echo(f"Report: {write_report_of(writable_folder(folder))}")
+        return
     comparison = read_comparison(folder)
     typer.echo(f"Report: {_write_report(comparison, writable_folder(folder))}")
 

@@ -63,6 +63,26 @@ def test_ate_agrees_with_evo(seed: int) -> None:
     assert se3 < raw / 2
 
 
+def flat(trajectory: Trajectory) -> Trajectory:
+    level = Rotation.from_euler("z", trajectory.rotations().as_euler("ZYX")[:, :1])
+    return Trajectory.without_covariances(trajectory.stamps_ns, trajectory.positions * [1, 1, 0], level.as_quat())
+
+
+@settings(max_examples=20)
+@given(seeds)
+def test_errors_on_a_plane_agree_with_evo(seed: int) -> None:
+    truth = flat(random_walk(seed))
+    estimate = moved(flat(disturbed(truth, seed + 1)), Rotation.from_euler("z", 0.4), (1.0, 2.0, 0.0))
+    aligned = as_evo(estimate)
+    aligned.align(as_evo(truth))
+    se2 = evo_rmse(APE(PoseRelation.translation_part), as_evo(truth), aligned)
+    assert metrics.ate_se2_m(estimate, truth) == pytest.approx(se2, abs=1e-9)
+    turns = RPE(PoseRelation.rotation_angle_rad, delta=2, delta_unit=Unit.frames, all_pairs=True)
+    expected = evo_rmse(turns, as_evo(truth), as_evo(estimate))
+    assert metrics.rmse(metrics.relative_errors(estimate, truth, 1).yaw_rad) == pytest.approx(expected, abs=1e-9)
+    assert expected > 0.01
+
+
 @settings(max_examples=20)
 @given(seeds, st.sampled_from([1, 10]))
 def test_relative_error_agrees_with_evo(seed: int, delta_s: int) -> None:

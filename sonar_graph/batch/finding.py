@@ -1,0 +1,117 @@
+"""What a batch found, in sentences made from its numbers: failures first, then errors against the reference."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+from sonar_graph.batch.accuracy import Tests, p_text
+from sonar_graph.batch.catalogue import Metric
+from sonar_graph.batch.recorded import RecordedBatch
+from sonar_graph.batch.rounding import supported, with_error
+from sonar_graph.batch.statistics import least_p, quantile, summarise
+
+SIGNIFICANT = 0.05
+SCORED = "scored_instants"
+
+
+def failures_told(batch: RecordedBatch) -> list[str]:
+    """A sentence on each contestant with runs that did not end."""
+    sentences = []
+    for contestant in batch.contestants:
+        runs = [run for run in batch.runs if run.contestant == contestant]
+        failed = [run for run in runs if not run.ended]
+        if failed:
+            logs = ", ".join(dict.fromkeys(run.log for run in failed))
+            sentences.append(f"{contestant}: {len(failed)} of {len(runs)} runs did not end ({logs}).")
+    return sentences
+
+
+def errors_told(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> list[str]:
+    """For each log the first metric that it has: medians, then differences to the reference that are no chance."""
+    sentences = []
+    for log in batch.logs:
+        found = next(
+            (
+                (metric, key)
+                for metric in metrics
+                if metric.is_error
+                for key in metric.keys.values()
+                if any(batch.is_asked(log, name, key) for name in batch.contestants)
+            ),
+            None,
+        )
+        sentences.append(
+            f"{log}: no run has an error to compare." if found is None else _log_told(batch, log, *found, tests)
+        )
+    return sentences
+
+
+def _log_told(batch: RecordedBatch, log: str, metric: Metric, key: str, tests: Tests) -> str:
+    medians = [
+        (quantile(values, 0.5), name, summarise(values).rounding_error * metric.factor)
+        for name in batch.contestants
+        if len(values := batch.values(log, name, key))
+    ]
+    listed = ", ".join(
+        f"{name} {supported(value * metric.factor, error)}"
+        for value, name, error in sorted(medians)
+        if value < math.inf
+    )
+    which = next(over for over, own in metric.keys.items() if own == key).lower()
+    unit = f" in {metric.shown_unit}" if metric.shown_unit else ""
+    opening = f"{log}, median {f'{which} ' if which else ''}error{unit} ({metric.label}): {listed}."
+    return " ".join([opening, *_differences_told(batch, log, metric, key, tests)])
+
+
+def _differences_told(batch: RecordedBatch, log: str, metric: Metric, key: str, tests: Tests) -> list[str]:
+    told, alike = [], []
+    for contestant in batch.contestants:
+        if (key, log, contestant) not in tests:
+            continue
+        test, p_value = tests[key, log, contestant]
+        if not p_value < SIGNIFICANT:
+            alike.append(contestant)
+        elif math.isfinite(test.mean):
+            size = with_error(abs(test.mean) * metric.factor, test.rounding_error * metric.factor)
+            side = "below" if test.mean < 0 else "above"
+            told.append(f"{contestant} is on average {size} {side} {batch.reference} (p {_p(p_value)}).")
+        else:
+            told.append(f"{contestant} differs from {batch.reference} (p {_p(p_value)}).")
+    if alike:
+        told.append(f"Not told apart from {batch.reference}: {', '.join(alike)}.")
+    return told
+
+
+def instants_told(batch: RecordedBatch) -> list[str]:
+    """A warning where runs with the same log and seed are scored at different instants."""
+    uneven = []
+    for log in batch.logs:
+        counts: dict[int | None, set[float]] = {}
+        for run in batch.runs:
+            if run.log == log and run.ended and SCORED in run.values:
+                counts.setdefault(run.seed, set()).add(run.values[SCORED])
+        if any(len(known) > 1 for known in counts.values()):
+            uneven.append(log)
+    if not uneven:
+        return []
+    return [f"Scored at different numbers of instants, which differences then mix in: {', '.join(uneven)}."]
+
+
+def power_told(tests: Tests) -> list[str]:
+    """A warning where there are too few pairs for any finding."""
+    families = Counter(key.rpartition(".")[2] for key, _, _ in tests)
+    blind = {
+        place[1]: test.pairs
+        for place, (test, _) in tests.items()
+        if least_p(test.pairs) * families[place[0].rpartition(".")[2]] > SIGNIFICANT
+    }
+    if not blind:
+        return []
+    listed = ", ".join(f"{log} ({pairs} pairs)" for log, pairs in blind.items())
+    return [f"Too few pairs for any corrected p value to fall below {SIGNIFICANT:g}: {listed}. Add seeds."]
+
+
+def _p(p_value: float) -> str:
+    text = p_text(p_value)
+    return text if text.startswith("<") else f"= {text}"

@@ -1,0 +1,220 @@
+"""What a batch left behind, as its report and its gate read it: ``results.parquet`` and the suite beside it."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sonar_graph.errors import EvaluationError
+from sonar_graph.measurements import Floats
+
+RESULTS, SUITE = "results.parquet", "suite.toml"
+SUITE_METADATA = b"sonar_graph.suite"
+DEFAULT_VARIANT = ("", "default")
+DEFAULT_METRICS = (
+    "causal.ate_se2_m",
+    "causal.ate_raw_m",
+    "causal.rpe_10s_m",
+    "causal.yaw_rmse_rad",
+    "landmarks.se2_m",
+)
+ALL_LOGS = "all logs"
+"""Stands for every log of a batch where they are taken together."""
+NEEDED = ("key", "log", "estimator", "status")
+WORDS = ("key", "suite", "log", "generator", "estimator", "variant", "status", "reason", "log_file", "machine")
+OBJECTS = ("options", "params", "versions")
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """One row of the results."""
+
+    key: str
+    log: str
+    """Name of the log or of the simulated world, with its options where these vary."""
+    seed: int | None
+    estimator: str
+    variant: str
+    status: str
+    reason: str = ""
+    log_file: str = ""
+    texts: dict[str, str] = field(default_factory=dict)
+    """All else that is no number: generator, options, params, versions, machine."""
+    values: dict[str, float] = field(default_factory=dict)
+    """Every number that is known, by column."""
+
+    @property
+    def contestant(self) -> str:
+        """Estimator, with the variant where it is not the default one."""
+        return self.estimator if self.variant in DEFAULT_VARIANT else f"{self.estimator}/{self.variant}"
+
+    @property
+    def ended(self) -> bool:
+        """Whether it came to an end, so that its numbers count."""
+        return self.status == "ok"
+
+    def value(self, key: str) -> float:
+        """A score; infinity where the run did not end or has none."""
+        return self.values.get(key, math.inf) if self.ended else math.inf
+
+
+@dataclass(frozen=True)
+class RecordedBatch:
+    """All runs of a batch, and what its suite says about comparing them."""
+
+    name: str
+    runs: list[RecordedRun]
+    reference: str
+    """Contestant with which the others are compared."""
+    metrics: list[str]
+    description: str = ""
+    suite: str = ""
+    """The suite's text."""
+
+    @cached_property
+    def _groups(self) -> dict[tuple[str, str], list[RecordedRun]]:
+        groups: dict[tuple[str, str], list[RecordedRun]] = {}
+        for run in self.runs:
+            groups.setdefault((run.log, run.contestant), []).append(run)
+        return groups
+
+    @cached_property
+    def _log_scores(self) -> set[tuple[str, str]]:
+        return {(key, run.log) for run in self.runs if run.ended for key in run.values}
+
+    @cached_property
+    def _contestant_scores(self) -> set[tuple[str, str]]:
+        return {(key, run.contestant) for run in self.runs if run.ended for key in run.values}
+
+    @cached_property
+    def logs(self) -> list[str]:
+        """Names of logs, in the order of the runs."""
+        return list(dict.fromkeys(run.log for run in self.runs))
+
+    @cached_property
+    def contestants(self) -> list[str]:
+        """In the order of the runs."""
+        return list(dict.fromkeys(run.contestant for run in self.runs))
+
+    def group(self, log: str, contestant: str) -> list[RecordedRun]:
+        """Runs of one contestant on one log, one a seed."""
+        return self._groups.get((log, contestant), [])
+
+    def values(self, log: str, contestant: str, key: str) -> Floats:
+        """A score of one contestant on one log, shape (runs,); infinity where a run has none."""
+        return np.array([run.value(key) for run in self.group(log, contestant)])
+
+    def pairs(self, log: str, contestant: str, key: str) -> tuple[Floats, Floats]:
+        """A score of one contestant and of the reference on the same log and seed, each shape (n,).
+
+        With `ALL_LOGS` those of every log. Logs on which either cannot have the score have no pairs.
+        """
+        logs = self.logs if log == ALL_LOGS else [log]
+        both = np.array([pair for one in logs for pair in self._pairs_on(one, contestant, key)]).reshape(-1, 2)
+        return both[:, 0], both[:, 1]
+
+    def _pairs_on(self, log: str, contestant: str, key: str) -> list[tuple[float, float]]:
+        if not all(self.is_asked(log, name, key) for name in (contestant, self.reference)):
+            return []
+        reference = {run.seed: run.value(key) for run in self.group(log, self.reference)}
+        return [(run.value(key), reference[run.seed]) for run in self.group(log, contestant) if run.seed in reference]
+
+    def is_asked(self, log: str, contestant: str, key: str) -> bool:
+        """Whether a score can be expected: the log has it for somebody, and the contestant on some log.
+
+        A dead reckoning has no map and a log without truth no errors; neither is a failure.
+        """
+        return (key, log) in self._log_scores and (key, contestant) in self._contestant_scores
+
+
+def is_batch(folder: Path) -> bool:
+    """Whether a folder holds the results of a batch."""
+    return (folder / RESULTS).is_file()
+
+
+def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
+    """The batch in a folder.
+
+    Parameters
+    ----------
+    reference
+        Contestant to compare with; None: the suite's, and without a suite that of the first row.
+
+    Raises
+    ------
+    EvaluationError
+        When there are no results, they lack a column, or the reference has no run.
+    """
+    runs, about = _read_table(folder / RESULTS)
+    chosen = reference or _plain_name(about.get("reference")) or runs[0].contestant
+    batch = RecordedBatch(
+        name=about.get("name") or runs[0].texts.get("suite") or folder.name,
+        runs=runs,
+        reference=chosen,
+        metrics=list(about.get("metrics") or DEFAULT_METRICS),
+        description=about.get("description", ""),
+        suite=(folder / SUITE).read_text("utf-8") if (folder / SUITE).is_file() else "",
+    )
+    if chosen not in batch.contestants:
+        raise EvaluationError(
+            f"{folder}: no run of the reference {chosen!r}; there are runs of: {', '.join(batch.contestants)}"
+        )
+    return batch
+
+
+def _plain_name(reference: str | None) -> str | None:
+    """A reference as contestants are called."""
+    return reference.removesuffix("/default") if reference else None
+
+
+def _read_table(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
+    """The runs, and what the suite says about comparing them."""
+    if not path.is_file():
+        raise EvaluationError(f"{path.parent}: no {path.name} in it; it needs a folder that bench wrote to")
+    try:
+        import pyarrow as pa  # only batches need it
+        import pyarrow.parquet as pq
+    except ModuleNotFoundError as error:
+        raise EvaluationError(f"{path}: reading it needs pyarrow; pip install 'sonar-graph[bench]'") from error
+    try:
+        table = pq.read_table(path)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise EvaluationError(f"{path}: cannot be read as Parquet ({error}); run bench again, it resumes") from error
+    missing = [name for name in NEEDED if name not in table.column_names]
+    if missing:
+        raise EvaluationError(f"{path}: no column {', '.join(missing)}; expected results that bench wrote")
+    if not table.num_rows:
+        raise EvaluationError(f"{path}: has no rows; run bench again, it resumes")
+    about = json.loads((table.schema.metadata or {}).get(SUITE_METADATA, b"{}"))
+    return [_run(row) for row in table.to_pylist()], about
+
+
+def _run(row: dict[str, Any]) -> RecordedRun:
+    words = {name: str(row.pop(name, None) or "") for name in WORDS}
+    seed = row.pop("seed", None)
+    objects = {name: _as_text(row.pop(name)) for name in OBJECTS if row.get(name)}
+    numbers = {name: float(value) for name, value in row.items() if isinstance(value, int | float)}
+    others = {name: value for name, value in row.items() if isinstance(value, str)}
+    known = {name: words[name] for name in ("suite", "generator", "machine") if words[name]}
+    return RecordedRun(
+        key=words["key"],
+        log=words["log"],
+        seed=None if seed is None else int(seed),
+        estimator=words["estimator"],
+        variant=words["variant"],
+        status=words["status"],
+        reason=words["reason"],
+        log_file=words["log_file"],
+        texts=known | objects | others,
+        values={name: value for name, value in numbers.items() if math.isfinite(value)},
+    )
+
+
+def _as_text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value, sort_keys=True, default=str)

@@ -1,0 +1,263 @@
+"""What many runs say together: spread, paired differences, failure rates, consistency.
+
+A run that did not end, or gave no value, is never left out. It has the value infinity, the worst there is: quantiles
+and rank tests go on with it (Lachin 1999, "Worst-rank score analysis with informatively missing observations in
+clinical trials"), and a mean over such a group does not exist.
+Equations: docs/theory/batch_statistics.md.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from sonar_graph.evaluation.consistency import anees_interval
+from sonar_graph.measurements import Floats
+
+CONFIDENCE = 0.95
+LOW, HIGH = 0.1, 0.9
+"""Quantiles that are shown beside the median."""
+RESAMPLES = 9999
+NUMBERS_AT_ONCE = 1_000_000
+SEED = 20140214
+"""Of everything drawn here: the same results make the same report."""
+LEAST_PAIRS = 6
+"""Of fewer a bootstrap draws too few different means, and no two-sided rank test reaches 5 %: 2 / 2⁵ = 0.06."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Values of one group of runs; infinity for a run without a value."""
+
+    runs: int
+    without: int
+    """Runs that did not end or gave no value."""
+    mean: float
+    """NaN where a run has no value."""
+    standard_error: float
+    """Of the mean; NaN for one run."""
+    rounding_error: float
+    """Digits beyond it mean nothing: the standard error of those runs that have a value, for few not below 1 %."""
+    median: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A share of runs with its Wilson interval."""
+
+    share: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Paired:
+    """Differences of one group to the reference on the same cases; negative: smaller than the reference."""
+
+    pairs: int
+    without: int
+    """Pairs in which either has no value."""
+    smaller: int
+    """Pairs in which the value is smaller than the reference's."""
+    mean: float
+    """NaN where a pair is without a value."""
+    rounding_error: float
+    """Digits beyond it mean nothing: the standard error of pairs that have a value, for few not below 1 %."""
+    interval: tuple[float, float]
+    """Of the mean, bootstrap; NaN where there are too few pairs or no mean."""
+    median: float
+    """Infinite where half of the pairs have no value on one side; NaN where nothing can be said."""
+    p_value: float
+    """Of the two-sided signed-rank test, not corrected; NaN of too few pairs."""
+
+
+@dataclass(frozen=True)
+class Anees:
+    """Average normalised squared error of independent runs, per degree of freedom, and where it should lie."""
+
+    runs: int
+    mean: float
+    band: tuple[float, float]
+
+    @property
+    def verdict(self) -> str:
+        """In a word, or empty where nothing is known."""
+        if math.isnan(self.mean) or math.isnan(self.band[0]):
+            return ""
+        if self.mean > self.band[1]:
+            return "over-confident"
+        return "over-cautious" if self.mean < self.band[0] else "consistent"
+
+
+def summarise(values: Floats) -> Summary:
+    """Mean with standard error, median and quantiles of values, shape (n,); infinity where a run has none.
+
+    Quantiles are values that occur or lie between two that do (linear between order statistics, as numpy's default);
+    they are infinite where they fall among runs without a value.
+    """
+    n, without = len(values), int(np.isinf(values).sum())
+    has_mean = n > 0 and not without
+    low, median, high = (quantile(values, share) for share in (LOW, 0.5, HIGH))
+    return Summary(
+        runs=n,
+        without=without,
+        mean=float(values.mean()) if has_mean else math.nan,
+        standard_error=standard_error(values),
+        rounding_error=_rounding_error(values[np.isfinite(values)]),
+        median=median,
+        low=low,
+        high=high,
+    )
+
+
+def quantile(values: Floats, share: float) -> float:
+    """Linear between order statistics; infinite as soon as an infinite value takes part; NaN of nothing."""
+    if not len(values):
+        return math.nan
+    ordered, place = np.sort(values), share * (len(values) - 1)
+    below, above = float(ordered[math.floor(place)]), float(ordered[math.ceil(place)])
+    if below == above or not math.isfinite(above):
+        return above
+    return below + (place - math.floor(place)) * (above - below) if math.isfinite(below) else below
+
+
+def standard_error(values: Floats) -> float:
+    """Standard deviation over the root of the number; NaN of fewer than two, or where one is infinite."""
+    if len(values) < 2 or not np.isfinite(values).all():
+        return math.nan
+    return float(values.std(ddof=1) / math.sqrt(len(values)))
+
+
+def _rounding_error(values: Floats) -> float:
+    """Standard error; of few values at least a hundredth of their mean, as two may agree by chance."""
+    if not len(values) or len(values) >= LEAST_PAIRS:
+        return standard_error(values)
+    return max(standard_error(values), 0.01 * abs(float(values.mean()))) if len(values) > 1 else math.nan
+
+
+def failure_rate(failed: int, runs: int) -> Rate:
+    """Share of runs that did not end, with its 95 % interval (Wilson 1927)."""
+    interval = stats.binomtest(failed, runs).proportion_ci(CONFIDENCE, method="wilson")
+    return Rate(failed / runs, float(interval.low), float(interval.high))
+
+
+def paired(own: Floats, reference: Floats) -> Paired:
+    """Differences own minus reference, each shape (n,), infinity where a run has no value.
+
+    A run without a value is worse than any with one; where both have none they are equal.
+    """
+    differences = _differences(own, reference)
+    without = int((np.isinf(own) | np.isinf(reference)).sum())
+    has_mean = len(differences) > 0 and not without
+    return Paired(
+        pairs=len(differences),
+        without=without,
+        smaller=int((differences < 0).sum()),
+        mean=float(differences.mean()) if has_mean else math.nan,
+        rounding_error=_rounding_error(differences[np.isfinite(differences)]),
+        interval=bootstrap_interval(differences) if has_mean else (math.nan, math.nan),
+        median=quantile(differences, 0.5),
+        p_value=signed_rank_p(differences),
+    )
+
+
+def _differences(own: Floats, reference: Floats) -> Floats:
+    both = np.isinf(own) & np.isinf(reference)
+    return np.where(both, 0.0, np.where(both, 0.0, own) - np.where(both, 0.0, reference))
+
+
+def bootstrap_interval(values: Floats) -> tuple[float, float]:
+    """95 % interval of the mean by the bootstrap (bias-corrected, accelerated: Efron 1987); NaN of too few values."""
+    if len(values) < LEAST_PAIRS:
+        return math.nan, math.nan
+    if np.ptp(values) <= 1e-12 * np.abs(values).max():
+        return float(values.mean()), float(values.mean())
+    drawn = stats.bootstrap(
+        (values,),
+        np.mean,
+        n_resamples=RESAMPLES,
+        batch=_batch(len(values)),
+        confidence_level=CONFIDENCE,
+        method="BCa",
+        rng=np.random.default_rng(SEED),
+    )
+    return float(drawn.confidence_interval.low), float(drawn.confidence_interval.high)
+
+
+def signed_rank_p(differences: Floats) -> float:
+    """Two-sided p value of Wilcoxon's signed-rank test (zeros as Pratt 1959); infinite differences rank highest.
+
+    NaN of fewer than 6: their smallest possible value is above 5 %, so there is nothing to be found.
+
+    Exact where no ranks are tied, or up to 13 differences; otherwise by 9999 random changes of sign.
+    """
+    if len(differences) < LEAST_PAIRS:
+        return math.nan
+    if not differences.any():
+        return 1.0
+    finite = np.abs(differences[np.isfinite(differences)])
+    beyond = 2 * finite.max(initial=0.0) + 1
+    scores = np.clip(differences, -beyond, beyond)
+    sizes = np.abs(scores)
+    if sizes.all() and len(np.unique(sizes)) == len(sizes):
+        return float(stats.wilcoxon(scores, method="exact").pvalue)
+    return _sign_changes_p(np.sign(scores) * stats.rankdata(sizes))
+
+
+def _sign_changes_p(signed_ranks: Floats) -> float:
+    """Two-sided p value of the sum of signed ranks, over changes of sign."""
+    drawn = stats.permutation_test(
+        (signed_ranks,),
+        np.sum,
+        permutation_type="samples",
+        vectorized=True,
+        n_resamples=RESAMPLES,
+        batch=_batch(len(signed_ranks)),
+        rng=np.random.default_rng(SEED),
+    )
+    return float(drawn.pvalue)
+
+
+def _batch(size: int) -> int:
+    """Resamples drawn at once, so that memory does not grow with the number of runs."""
+    return max(1, NUMBERS_AT_ONCE // size)
+
+
+def holm(p_values: Floats) -> Floats:
+    """P values of a family of tests, corrected so that 5 % bounds the chance of any false finding (Holm 1979).
+
+    Sorted upwards, the i-th of m (from 0) is multiplied by m - i; none may be below one before it, none above 1. NaN
+    stays NaN and does not count.
+    """
+    corrected = np.full(len(p_values), np.nan)
+    known = np.flatnonzero(~np.isnan(p_values))
+    order = known[np.argsort(p_values[known], kind="stable")]
+    factors = np.arange(len(order), 0, -1)
+    corrected[order] = np.minimum(1.0, np.maximum.accumulate(factors * p_values[order]))
+    return corrected
+
+
+def least_p(pairs: int) -> float:
+    """The smallest p value that the signed-rank test of so many pairs can have: all of one sign."""
+    return float(2.0 ** (1 - pairs)) if pairs else 1.0
+
+
+def anees(nees: Floats, dof: float) -> Anees:
+    """Average over independent runs, with the chi-square band of a consistent estimator.
+
+    Parameters
+    ----------
+    nees
+        Normalised squared error of each run at one instant, divided by ``dof``, shape (n,); infinity for a run without.
+    dof
+        Degrees of freedom; NaN: not known, and no band.
+    """
+    if not len(nees) or np.isinf(nees).any():
+        return Anees(len(nees), math.nan, (math.nan, math.nan))
+    band = (math.nan, math.nan) if math.isnan(dof) else anees_interval(len(nees), int(dof), CONFIDENCE)
+    return Anees(len(nees), float(nees.mean()), band)

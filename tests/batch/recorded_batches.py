@@ -1,0 +1,100 @@
+"""Batches as `bench` would leave them, with numbers drawn from known distributions."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from sonar_graph.batch.recorded import RESULTS, SUITE, RecordedBatch, RecordedRun
+
+METRICS = ["causal.ate_se2_m", "causal.yaw_rmse_rad", "landmarks.se2_m"]
+ESTIMATORS = {"dead-reckoning": 0.4, "isam2": 0.1, "ekf-slam": 0.12}
+LOGS = ("basin", "basin, wrong_id_rate=0.05")
+
+
+def drawn_batch(seeds: int = 10, *, logs: tuple[str, ...] = LOGS) -> RecordedBatch:
+    """Estimators with errors of known size on hard and easy seeds; ekf-slam reports variances four times too small."""
+    rng = np.random.default_rng(3)
+    runs = []
+    for log in logs:
+        for seed in range(seeds):
+            hardness = rng.lognormal(0, 0.3)
+            for name, size_m in ESTIMATORS.items():
+                runs.append(_run(rng, log, seed, name, size_m * hardness))
+    return RecordedBatch("drawn", runs, "dead-reckoning", METRICS, "Drawn, not run.", 'name = "drawn"\n')
+
+
+def failed(run: RecordedRun, status: str = "timeout", reason: str = "took longer than 60 s") -> RecordedRun:
+    """The run, had it not ended."""
+    return replace(run, status=status, reason=reason, values={})
+
+
+def with_failures(batch: RecordedBatch, contestant: str, log: str, count: int) -> RecordedBatch:
+    """The batch, had the first runs of a group not ended."""
+    gone = {id(run) for run in batch.group(log, contestant)[:count]}
+    return replace(batch, runs=[failed(run) if id(run) in gone else run for run in batch.runs])
+
+
+def changed(batch: RecordedBatch, contestant: str, column: str, factors: np.ndarray | float) -> RecordedBatch:
+    """The batch, had one column of a contestant been multiplied."""
+    own = iter(np.broadcast_to(factors, len([run for run in batch.runs if run.contestant == contestant])).tolist())
+    runs = []
+    for run in batch.runs:
+        if run.contestant == contestant:
+            factor = next(own)
+            run = replace(run, values=run.values | {column: run.values[column] * factor})
+        runs.append(run)
+    return replace(batch, runs=runs)
+
+
+def write_batch(batch: RecordedBatch, folder: Path) -> Path:
+    """``results.parquet`` and ``suite.toml`` in a folder."""
+    rows = [
+        {
+            "key": run.key,
+            "suite": batch.name,
+            "log": run.log,
+            "generator": "basin",
+            "options": json.dumps({"laps": 1}),
+            "seed": run.seed,
+            "variant": run.variant,
+            "params": "{}",
+            "estimator": run.estimator,
+            "status": run.status,
+            "reason": run.reason,
+            "log_file": run.log_file,
+            "sonar_graph": "0.1",
+            "machine": "Linux, 4 processors",
+            **{key: run.values.get(key) for key in batch.runs[-1].values},
+        }
+        for run in batch.runs
+    ]
+    about = {"name": batch.name, "reference": batch.reference, "metrics": batch.metrics}
+    table = pa.Table.from_pylist(rows).replace_schema_metadata({b"sonar_graph.suite": json.dumps(about).encode()})
+    folder.mkdir(exist_ok=True)
+    pq.write_table(table, folder / RESULTS)
+    (folder / SUITE).write_text(batch.suite, "utf-8")
+    return folder
+
+
+def _run(rng: np.random.Generator, log: str, seed: int, name: str, error_m: float) -> RecordedRun:
+    causal_m, smoothed_m = error_m * rng.lognormal(0, 0.1), 0.6 * error_m * rng.lognormal(0, 0.1)
+    values = {"causal.ate_se2_m": causal_m, "smoothed.ate_se2_m": smoothed_m, "causal.yaw_rmse_rad": 0.1 * causal_m}
+    values |= {"smoothed.yaw_rmse_rad": 0.1 * smoothed_m}
+    if name != "dead-reckoning":
+        values["landmarks.se2_m"] = 0.5 * causal_m
+    scale = 4.0 if name == "ekf-slam" else 1.0
+    for kind in ("causal", "smoothed"):
+        for what, dof in (("position", 2), ("yaw", 1)):
+            key = f"{kind}.nees_{what}"
+            values |= {key: scale * rng.chisquare(20) / 20, f"{key}_end": scale * rng.chisquare(dof) / dof}
+            values[f"{key}_end_dof"] = float(dof)
+    values |= {"update_p50_ms": 1.0 + rng.random(), "update_p99_ms": 4.0 + rng.random(), "wall_s": 3.0, "cpu_s": 2.9}
+    values["peak_memory_mb"] = 20.0
+    key = f"{name}-{seed}-{len(log)}"
+    return RecordedRun(key, log, seed, name, "default", "ok", log_file=f"runs/{key}/log.txt", values=values)

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import re
+from dataclasses import replace
+
+import pytest
+
+from sonar_graph.batch.page import render_batch, write_batch_report
+from sonar_graph.batch.recorded import read_batch
+
+from .recorded_batches import LOGS, drawn_batch, failed, with_failures, write_batch
+
+
+@pytest.fixture(scope="module")
+def batch():
+    return with_failures(drawn_batch(), "ekf-slam", LOGS[1], 2)
+
+
+@pytest.fixture(scope="module")
+def html(batch):
+    return render_batch(batch)
+
+
+def test_the_page_fetches_nothing(html):
+    addresses = re.findall(r'(?:src|href)="([^"]*)"', html)
+    outside = [address for address in addresses if re.match(r"(?!data:)[a-z]+:|//|/", address)]
+    assert len(addresses) > 50
+    assert outside == []
+    assert "@import" not in html
+    assert re.findall(r"url\((?!#)", html) == []
+    assert "<script src" not in html
+
+
+def test_links_within_the_page_lead_somewhere_and_ids_are_unique(html):
+    ids = re.findall(r'\sid="([^"]+)"', html)
+    assert len(ids) == len(set(ids))
+    assert set(re.findall(r'href="#([^"]+)"', html)) <= set(ids)
+
+
+def test_every_figure_has_its_data(html, batch):
+    figures = re.findall(r'<figure id="figure-([^"]+)"', html)
+    addresses = dict(re.findall(r'href="(data:text/csv[^"]+)" download="([^"]+)\.csv"', html))
+    by_name = {name: address for address, name in addresses.items()}
+    assert {"failures", "spread-ate-se2-m", "difference-ate-se2-m", "anees-position", "costs"} <= set(figures)
+    assert set(figures) <= set(by_name)
+    text = base64.b64decode(by_name["spread-ate-se2-m"].partition("base64,")[2]).decode()
+    rows = list(csv.DictReader(io.StringIO(text)))
+    recorded = {
+        (run.key, key): run.value(key) for run in batch.runs for key in ("causal.ate_se2_m", "smoothed.ate_se2_m")
+    }
+    assert {(row["key"], row["column"]) for row in rows} == set(recorded)
+    assert all(float(row["value"] or "inf") == recorded[row["key"], row["column"]] for row in rows)
+
+
+def test_reading_comes_before_numbers_and_the_protocol_is_told(html):
+    assert html.index("How to read this page") < html.index("<figure")
+    for said in ("Wilcoxon", "Holm (1979)", "BCa", "Wilson", "chi-square", "Lachin 1999", "causal.ate_se2_m"):
+        assert said in html
+
+
+def test_what_a_suite_or_an_estimator_says_is_escaped(batch):
+    hostile = '"><script>alert(1)</script>'
+    runs = [failed(replace(run, log=hostile), reason=hostile) for run in batch.runs[:3]]
+    html = render_batch(replace(batch, name=hostile, description=hostile, suite=hostile, runs=[*runs, *batch.runs]))
+    assert html.count("<script>") == 1
+    assert "alert(1)" in html
+
+
+def test_the_same_results_make_the_same_page(batch, html):
+    assert render_batch(batch) == html
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_few_runs_and_runs_that_all_failed_make_a_page(count):
+    batch = drawn_batch(count, logs=LOGS[:1])
+    assert "Every run ended well" in render_batch(batch)
+    nothing = replace(batch, runs=[failed(run) for run in batch.runs])
+    html = render_batch(nothing)
+    assert "no run has an error to compare" in html
+    assert "nan" not in re.sub(r"<svg.*?</svg>|base64,[^\"]*", "", html, flags=re.DOTALL).lower().split()
+
+
+def test_the_report_is_rebuilt_from_results_alone(tmp_path, batch):
+    write_batch(batch, tmp_path)
+    page = write_batch_report(read_batch(tmp_path), tmp_path)
+    assert page == tmp_path / "report.html"
+    assert page.read_text("utf-8").startswith("<!DOCTYPE html>")
+    assert {path.suffix for path in (tmp_path / "tables").iterdir()} == {".csv", ".tex"}

@@ -1,0 +1,154 @@
+"""The page in Chromium: nothing in the console, nothing cut off, figures drawn, tables sort, axe finds nothing serious.
+
+Chromium comes from the system; axe-core from npm: ``SONAR_GRAPH_AXE`` names its ``axe.min.js``, or it lies in
+``node_modules``.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sonar_graph.batch.page import write_batch_report
+
+from .recorded_batches import LOGS, drawn_batch, with_failures
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+AXE = Path(os.environ.get("SONAR_GRAPH_AXE", Path(__file__).parents[2] / "node_modules/axe-core/axe.min.js"))
+PHONE, DESKTOP = 390, 1280
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium: apt install chromium")
+
+
+@pytest.fixture(scope="module")
+def page_file(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("batch")
+    return write_batch_report(with_failures(drawn_batch(), "ekf-slam", LOGS[1], 2), folder)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with sync_api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()
+
+
+@contextmanager
+def opened(browser: Any, file: Path, width: int, scheme: str = "light") -> Iterator[tuple[Any, list[str]]]:
+    """The page, and what its console says."""
+    page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    said: list[str] = []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.goto(file.as_uri())
+    yield page, said
+    page.close()
+
+
+@pytest.mark.parametrize("width", [PHONE, DESKTOP])
+def test_nothing_is_said_in_the_console_and_nothing_sticks_out(browser, page_file, width):
+    with opened(browser, page_file, width) as (page, said):
+        page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert said == []
+
+
+def test_the_checks_notice_what_they_look_for(browser, page_file, tmp_path):
+    broken = tmp_path / "broken.html"
+    text = page_file.read_text("utf-8").replace("</main>", '<div style="width: 3000px">wide</div></main>')
+    broken.write_text(text.replace("<script>", "<script>nothing();"), "utf-8")
+    with opened(browser, broken, PHONE) as (page, said):
+        assert page.evaluate("document.documentElement.scrollWidth") > PHONE
+        assert any("nothing is not defined" in line for line in said)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_all_figures_are_drawn_in_the_colours_of_the_page(browser, page_file, scheme):
+    with opened(browser, page_file, DESKTOP, scheme) as (page, _):
+        boxes = page.evaluate(
+            "[...document.querySelectorAll('figure svg')].map(svg => "
+            "({width: svg.getBoundingClientRect().width, marks: svg.querySelectorAll('path, use').length}))"
+        )
+        ink, paper = page.evaluate(
+            "[getComputedStyle(document.querySelector('figure svg text')).fill, "
+            "getComputedStyle(document.body).backgroundColor]"
+        )
+    assert len(boxes) >= 8
+    assert all(box["width"] > 300 and box["marks"] > 10 for box in boxes)
+    assert (sum(_rgb(ink)) > sum(_rgb(paper))) == (scheme == "dark")
+
+
+def test_tables_sort_by_number_and_back_with_the_keyboard(browser, page_file):
+    rows = "document.querySelectorAll('#table-difference-ate-se2-m tbody tr')"
+    values = f"[...{rows}].map(row => row.children[3].dataset.sort).filter(text => text)"
+    last = f"[...{rows}].at(-1).children[3].dataset.sort"
+    with opened(browser, page_file, DESKTOP) as (page, _):
+        button = page.locator("#table-difference-ate-se2-m th button").nth(3)
+        button.focus()
+        page.keyboard.press("Enter")
+        upwards = page.evaluate(values)
+        assert button.locator("..").get_attribute("aria-sort") == "ascending"
+        page.keyboard.press("Enter")
+        downwards = page.evaluate(values)
+        assert page.evaluate(last) == "", "what has no mean stays at the end"
+    assert len(upwards) > 3
+    assert list(map(float, upwards)) == sorted(map(float, upwards))
+    assert list(map(float, downwards)) == sorted(map(float, downwards), reverse=True)
+
+
+def test_a_number_of_runs_opens_the_list_of_them(browser, page_file):
+    with opened(browser, page_file, DESKTOP) as (page, _):
+        page.locator("#table-failures tbody a").first.click()
+        page.wait_for_function("document.querySelector('#runs-0-0').closest('details').open")
+        assert page.evaluate("document.querySelectorAll('details[open]').length") == 1
+
+
+def test_data_of_a_figure_can_be_downloaded(browser, page_file):
+    with opened(browser, page_file, DESKTOP) as (page, _):
+        with page.expect_download() as download:
+            page.get_by_label("Data of this figure (CSV): spread-ate-se2-m").click()
+        text = Path(download.value.path()).read_text("utf-8")
+    assert text.startswith("log,contestant,seed,key,column,value\n")
+
+
+def test_paper_has_no_buttons_and_light_colours(browser, page_file, tmp_path):
+    with opened(browser, page_file, DESKTOP, "dark") as (page, _):
+        page.emulate_media(media="print")
+        shown = page.evaluate("getComputedStyle(document.querySelector('.downloads')).display")
+        paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        page.pdf(path=str(tmp_path / "page.pdf"), format="A4")
+    assert shown == "none"
+    assert sum(_rgb(paper)) == 3 * 255
+    assert (tmp_path / "page.pdf").stat().st_size > 10_000
+
+
+@pytest.mark.skipif(not AXE.is_file(), reason="no axe-core: npm install axe-core, or set SONAR_GRAPH_AXE")
+@pytest.mark.parametrize(("width", "scheme"), [(PHONE, "light"), (DESKTOP, "dark")])
+def test_axe_finds_nothing_serious(browser, page_file, width, scheme):
+    with opened(browser, page_file, width, scheme) as (page, _):
+        page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+        page.evaluate(AXE.read_text("utf-8"))
+        found = _serious(page)
+        page.evaluate("document.querySelector('figure svg').removeAttribute('aria-label')")
+        assert found == []
+        assert _serious(page), "a figure without a name is found: the check can fail"
+
+
+def _serious(page: Any) -> list[str]:
+    violations = page.evaluate("axe.run().then(outcome => outcome.violations)")
+    return [
+        f"{one['id']}: {one['nodes'][0]['html'][:200]}"
+        for one in violations
+        if one["impact"] in ("serious", "critical")
+    ]
+
+
+def _rgb(colour: str) -> list[float]:
+    return [float(part) for part in colour[colour.index("(") + 1 : -1].split(",")[:3]]

@@ -1,0 +1,41 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonar_graph.batch.rounding import between, decimals_of, supported, with_error
+
+
+@pytest.mark.parametrize(("error", "decimals"), [(0.034, 2), (0.012, 3), (340.0, -2), (1.0, 1), (0.2, 1), (9.9e-5, 5)])
+def test_digits_end_where_the_standard_error_begins(error, decimals):
+    assert decimals_of(error) == decimals
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e3))
+def test_rounding_changes_a_value_by_less_than_half_its_standard_error(value, error):
+    shown = float(supported(value, error).replace("\N{MINUS SIGN}", "-"))
+    assert abs(shown - value) <= 0.5 * error + 1e-9 * abs(value)
+
+
+def test_value_and_error_have_the_same_digits():
+    assert with_error(0.123456, 0.0034) == "0.123 ± 0.003"
+    assert with_error(1234.5, 86.0) == "1230 ± 90"
+    assert with_error(-2.0, 0.15) == "\N{MINUS SIGN}2.00 ± 0.15"
+
+
+def test_a_value_without_an_error_has_three_digits():
+    assert supported(0.123456, math.nan) == "0.123"
+    assert with_error(0.123456, math.nan) == "0.123"
+
+
+def test_what_rounds_to_zero_has_no_sign():
+    assert supported(-0.001, 0.3) == "0.0"
+
+
+def test_what_is_infinite_is_no_number():
+    assert supported(math.inf, 0.1) == "no value"
+    assert between(0.1, math.inf) == "0.100 to no value"
+    assert between(math.nan, math.nan) == "\N{EN DASH}"

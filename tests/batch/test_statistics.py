@@ -1,0 +1,202 @@
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from sonar_graph.batch.statistics import (
+    anees,
+    bootstrap_interval,
+    failure_rate,
+    holm,
+    least_p,
+    paired,
+    quantile,
+    signed_rank_p,
+    standard_error,
+    summarise,
+)
+
+INF = math.inf
+shares = st.floats(0, 1)
+
+
+def closed_testing(p_values: list[float]) -> list[float]:
+    """Holm by its other definition: a hypothesis falls when Bonferroni refuses every intersection that has it."""
+    every = range(len(p_values))
+    subsets = [s for size in range(1, len(p_values) + 1) for s in itertools.combinations(every, size)]
+    return [max(min(1.0, len(s) * min(p_values[j] for j in s)) for s in subsets if i in s) for i in every]
+
+
+def enumerated_p(differences: np.ndarray) -> float:
+    """The signed-rank test by all sign patterns; zeros have a rank and no sign."""
+    ranks = stats.rankdata(np.abs(differences))
+    observed = abs((np.sign(differences) * ranks).sum())
+    ranks = ranks[differences != 0]
+    sums = [abs(np.dot(signs, ranks)) for signs in itertools.product((-1, 1), repeat=len(ranks))]
+    return float(np.mean([total >= observed - 1e-9 for total in sums]))
+
+
+@given(st.lists(shares, min_size=1, max_size=6))
+def test_holm_is_closed_testing_with_bonferroni(p_values):
+    assert holm(np.array(p_values)).tolist() == pytest.approx(closed_testing(p_values))
+
+
+def test_holm_of_a_worked_example():
+    corrected = holm(np.array([0.01, 0.04, 0.03, 0.005]))
+    assert corrected.tolist() == pytest.approx([0.03, 0.06, 0.06, 0.02])
+
+
+def test_holm_does_not_count_what_was_not_tested():
+    corrected = holm(np.array([math.nan, 0.01, math.nan, 0.5]))
+    assert corrected[[1, 3]].tolist() == pytest.approx([0.02, 0.5])
+    assert np.isnan(corrected[[0, 2]]).all()
+
+
+@given(st.integers(1, 60).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
+def test_failure_rate_solves_wilsons_equation(counts):
+    failed, runs = counts
+    rate = failure_rate(failed, runs)
+    z = stats.norm.ppf(0.975)
+    for bound in (rate.low, rate.high):
+        assert (rate.share - bound) ** 2 == pytest.approx(z**2 * bound * (1 - bound) / runs, abs=1e-9)
+    assert 0 <= rate.low <= rate.share <= rate.high <= 1
+
+
+def test_no_failure_in_few_runs_is_no_proof_of_none():
+    assert failure_rate(0, 10).high == pytest.approx(0.2775, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("kind", ["distinct", "ties", "zeros", "infinite"])
+def test_signed_rank_p_counts_sign_patterns(seed, kind):
+    rng = np.random.default_rng(seed)
+    differences = rng.normal(0.4, 1, 9)
+    if kind == "ties":
+        differences = np.round(differences) + 0.5
+    elif kind == "zeros":
+        differences[:2] = 0.0
+    elif kind == "infinite":
+        differences[:3] = [INF, -INF, INF]
+    finite = np.where(np.isinf(differences), np.sign(differences) * 100.0, differences)
+    assert signed_rank_p(differences) == pytest.approx(enumerated_p(finite), abs=1e-12)
+
+
+def test_signed_rank_p_of_equal_runs_is_one_and_of_few_is_unknown():
+    assert signed_rank_p(np.zeros(8)) == 1.0
+    assert math.isnan(signed_rank_p(np.array([1.0, 2.0, 3.0, 4.0, 5.0])))
+    assert signed_rank_p(np.arange(1.0, 9.0)) == pytest.approx(least_p(8))
+
+
+def test_one_false_finding_in_twenty_families_and_not_more():
+    rng = np.random.default_rng(0)
+    families = rng.normal(size=(300, 4, 10))
+    single = np.array([[signed_rank_p(test) for test in family] for family in families])
+    found = np.mean([(holm(p) < 0.05).any() for p in single])
+    assert found < 0.05 + 2 * math.sqrt(0.05 * 0.95 / 300)
+    assert np.mean((single < 0.05).any(axis=1)) > 0.12, "uncorrected tests find more: the check can fail"
+
+
+def test_bootstrap_interval_holds_the_mean_as_often_as_it_says():
+    rng = np.random.default_rng(1)
+    intervals = np.array([bootstrap_interval(rng.normal(0.3, 1, 25)) for _ in range(200)])
+    inside = np.mean((intervals[:, 0] < 0.3) & (intervals[:, 1] > 0.3))
+    middle, half = intervals.mean(axis=1), 0.25 * np.ptp(intervals, axis=1)
+    assert 0.89 < inside < 0.99
+    assert np.mean(np.abs(middle - 0.3) < half) < 0.8, "intervals half as wide do not: the check can fail"
+
+
+def test_bootstrap_interval_of_equal_differences_is_a_point_and_of_few_unknown():
+    assert bootstrap_interval(np.full(8, 0.25)) == (0.25, 0.25)
+    assert math.isnan(bootstrap_interval(np.arange(5.0))[0])
+
+
+def test_the_same_numbers_give_the_same_interval():
+    values = np.random.default_rng(2).normal(size=12)
+    assert bootstrap_interval(values) == bootstrap_interval(values.copy())
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=20), shares)
+def test_quantile_of_finite_values_is_numpys(values, share):
+    assert quantile(np.array(values), share) == pytest.approx(float(np.quantile(values, share)), rel=1e-9, abs=1e-6)
+
+
+def test_runs_without_a_value_are_the_worst_ones_in_quantiles():
+    assert quantile(np.array([1.0, 2.0, 3.0, INF, INF]), 0.5) == 3.0
+    assert quantile(np.array([1.0, 2.0, INF, INF]), 0.5) == INF
+    assert quantile(np.array([INF, 1.0]), 0.1) == INF
+    assert math.isnan(quantile(np.empty(0), 0.5))
+
+
+def test_a_group_with_a_run_without_a_value_has_no_mean():
+    complete, short = summarise(np.array([1.0, 2.0, 3.0, 4.0])), summarise(np.array([1.0, 2.0, INF, 4.0]))
+    assert complete.mean == 2.5
+    assert complete.standard_error == pytest.approx(stats.sem([1.0, 2.0, 3.0, 4.0]))
+    assert math.isnan(short.mean)
+    assert math.isnan(short.standard_error)
+    assert (short.runs, short.without, short.median) == (4, 1, 3.0)
+
+
+def test_two_values_that_agree_by_chance_do_not_make_digits():
+    assert summarise(np.array([10.54003, 10.54024])).rounding_error == pytest.approx(0.105, abs=1e-3)
+    many = np.tile([10.54003, 10.54024], 5)
+    assert summarise(many).rounding_error == pytest.approx(stats.sem(many))
+
+
+def test_standard_error_of_one_run_is_unknown():
+    assert math.isnan(standard_error(np.array([1.0])))
+
+
+def test_pairing_takes_away_what_hard_seeds_cost_everybody():
+    rng = np.random.default_rng(4)
+    hardness = rng.normal(0, 5, 20)
+    reference = hardness + rng.normal(0, 0.1, 20)
+    own = hardness - 0.3 + rng.normal(0, 0.1, 20)
+    told = paired(own, reference)
+    assert told.p_value < 0.001
+    assert told.interval[0] < -0.3 < told.interval[1] < 0
+    assert told.smaller >= 18
+    assert paired(rng.permutation(own), reference).p_value > 0.05, "without pairs the seeds hide it"
+
+
+def test_failing_where_it_was_worse_makes_nobody_better():
+    rng = np.random.default_rng(5)
+    reference = rng.normal(1, 0.1, 12)
+    own = reference - 0.05 + rng.normal(0, 0.1, 12)
+    worst = np.argsort(own - reference)[-4:]
+    survivors = own.copy()
+    survivors[worst] = INF
+    whole, told = paired(own, reference), paired(survivors, reference)
+    kept = np.delete(np.arange(12), worst)
+    assert paired(own[kept], reference[kept]).mean < whole.mean, "over survivors it would look better"
+    assert math.isnan(told.mean)
+    assert math.isnan(told.interval[0])
+    assert told.without == 4
+    assert told.median >= whole.median - 1e-12
+    assert told.smaller <= whole.smaller
+
+
+def test_two_failures_on_one_seed_are_equal():
+    told = paired(np.array([INF, 1.0]), np.array([INF, 2.0]))
+    assert (told.smaller, told.without, told.median) == (1, 1, -0.5)
+
+
+def test_anees_of_consistent_runs_lies_in_its_band_and_of_confident_ones_does_not():
+    rng = np.random.default_rng(6)
+    consistent = [anees(rng.chisquare(2, 15) / 2, 2).verdict for _ in range(400)]
+    confident = [anees(4 * rng.chisquare(2, 15) / 2, 2).verdict for _ in range(50)]
+    cautious = [anees(0.2 * rng.chisquare(2, 15) / 2, 2).verdict for _ in range(50)]
+    assert 0.92 < np.mean([verdict == "consistent" for verdict in consistent]) < 0.98
+    assert np.mean([verdict == "over-confident" for verdict in confident]) > 0.95
+    assert np.mean([verdict == "over-cautious" for verdict in cautious]) > 0.95
+
+
+def test_anees_is_not_of_survivors_and_has_no_band_without_its_degrees_of_freedom():
+    assert math.isnan(anees(np.array([1.0, INF]), 2).mean)
+    assert anees(np.array([1.0, INF]), 2).verdict == ""
+    assert anees(np.array([9.0, 9.0]), math.nan).verdict == ""

@@ -1,0 +1,190 @@
+from __future__ import annotations
+
+import csv
+import io
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sonar_graph.batch.accuracy import accuracy_table, all_tests, difference_table
+from sonar_graph.batch.catalogue import Metric, metrics_of
+from sonar_graph.batch.exported import as_csv, as_latex, latex_text, write_tables
+from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told
+from sonar_graph.batch.overviews import consistency_table, cost_table, failure_table, run_lists
+from sonar_graph.batch.recorded import ALL_LOGS
+from sonar_graph.batch.tables import Cell, Column, Table
+
+from .recorded_batches import LOGS, METRICS, changed, drawn_batch, with_failures
+
+ATE = metrics_of(["causal.ate_se2_m"])[0]
+
+
+def rows_of(table: Table) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(as_csv(table))))
+
+
+def row_of(table: Table, contestant: str, log: str = LOGS[0]) -> dict[str, str]:
+    return next(row for row in rows_of(table) if (row["log"], row["contestant"]) == (log, contestant))
+
+
+def test_causal_and_smoothed_have_columns_of_their_own():
+    batch = drawn_batch()
+    row = row_of(accuracy_table(batch, ATE), "isam2")
+    for kind in ("causal", "smoothed"):
+        values = batch.values(LOGS[0], "isam2", f"{kind}.ate_se2_m")
+        assert float(row[f"{kind}.ate_se2_m_mean"]) == pytest.approx(values.mean())
+        assert float(row[f"{kind}.ate_se2_m_mean_se"]) == pytest.approx(values.std(ddof=1) / np.sqrt(10))
+        assert float(row[f"{kind}.ate_se2_m_median"]) == pytest.approx(np.median(values))
+        assert float(row[f"{kind}.ate_se2_m_10_percent"]) == pytest.approx(np.quantile(values, 0.1))
+        assert float(row[f"{kind}.ate_se2_m_90_percent"]) == pytest.approx(np.quantile(values, 0.9))
+
+
+def test_no_mean_is_given_over_survivors_and_the_table_says_why():
+    batch = with_failures(drawn_batch(), "isam2", LOGS[0], 2)
+    table = accuracy_table(batch, ATE)
+    row = row_of(table, "isam2")
+    assert row["causal.ate_se2_m_mean"] == ""
+    assert row["runs"] == "10"
+    notes = [cell.note for line in table.rows for cell in line if cell.note]
+    assert notes.count("2 of 10 without a value") == 2
+    assert row_of(table, "ekf-slam")["causal.ate_se2_m_mean"] != ""
+
+
+def test_a_column_that_a_contestant_cannot_have_is_a_dash_without_a_complaint():
+    table = accuracy_table(drawn_batch(), metrics_of(["landmarks.se2_m"])[0])
+    cells = next(line for line in table.rows if line[1].text == "dead-reckoning")
+    assert [cell.text for cell in cells[3:]] == ["\N{EN DASH}"] * 3
+    assert all(not cell.note for cell in cells)
+
+
+def test_differences_are_paired_and_their_tests_corrected_within_a_metric():
+    batch = drawn_batch()
+    metrics = metrics_of(METRICS)
+    tests = all_tests(batch, metrics)
+    own, reference = batch.pairs(LOGS[0], "isam2", "causal.ate_se2_m")
+    row = row_of(difference_table(batch, ATE, tests), "isam2")
+    assert float(row["causal.ate_se2_m_difference"]) == pytest.approx((own - reference).mean())
+    assert float(row["causal.ate_se2_m_difference_low"]) < float(row["causal.ate_se2_m_difference"])
+    single, corrected = float(row["causal.ate_se2_m_p_holm_single"]), float(row["causal.ate_se2_m_p_holm"])
+    assert single == pytest.approx(2**-9)
+    assert single < corrected <= 12 * single + 1e-12
+    assert {log for _, log, _ in tests} == {*LOGS, ALL_LOGS}
+
+
+def test_a_filters_two_estimates_are_one_test():
+    batch = drawn_batch()
+    alone = all_tests(batch, [Metric("ate_se2_m", {"Causal": "causal.ate_se2_m"})])
+    doubled = all_tests(batch, [Metric("ate_se2_m", {"Causal": "causal.ate_se2_m", "Smoothed": "causal.ate_se2_m"})])
+    assert {place: p for place, (_, p) in doubled.items()} == {place: p for place, (_, p) in alone.items()}
+
+
+def test_failures_are_counted_by_kind_with_their_interval():
+    row = row_of(failure_table(with_failures(drawn_batch(), "isam2", LOGS[0], 2)), "isam2")
+    assert (row["ended"], row["timeout"], row["memory"]) == ("8", "2", "0")
+    assert float(row["failure_rate"]) == 0.2
+    assert float(row["failure_rate_low"]) < 0.2 < float(row["failure_rate_high"])
+
+
+def test_consistency_is_judged_over_runs_by_the_chi_square_band():
+    table = consistency_table(drawn_batch(40))
+    verdicts = {(row["log"], row["contestant"], row["of"]): row["causal_verdict"] for row in rows_of(table)}
+    assert verdicts[LOGS[0], "ekf-slam", "position"] == "over-confident"
+    assert verdicts[LOGS[0], "isam2", "position"] == "consistent"
+    failed = consistency_table(with_failures(drawn_batch(40), "isam2", LOGS[0], 1))
+    row = next(row for row in rows_of(failed) if row["contestant"] == "isam2")
+    assert (row["causal_anees"], row["causal_verdict"]) == ("", "")
+
+
+def test_every_run_is_listed_once_and_leads_to_its_log():
+    batch = drawn_batch(4)
+    lists = run_lists(batch, metrics_of(METRICS))
+    links = [cell.link for one in lists for line in one.table.rows for cell in line if cell.link]
+    assert sorted(links) == sorted(run.log_file for run in batch.runs)
+    anchors = {one.anchor for one in lists}
+    targets = {cell.link.removeprefix("#") for line in accuracy_table(batch, ATE).rows for cell in line if cell.link}
+    assert targets == anchors
+
+
+def test_costs_are_medians():
+    row = row_of(cost_table(drawn_batch()), "isam2")
+    assert 1 < float(row["update_p50_ms_median"]) < 2
+
+
+def test_latex_has_as_many_cells_as_columns_in_every_row():
+    table = accuracy_table(with_failures(drawn_batch(), "isam2", LOGS[0], 2), metrics_of(["causal.yaw_rmse_rad"])[0])
+    text = as_latex(table)
+    body = text[text.index(r"\midrule") : text.index(r"\bottomrule")]
+    lines = [line for line in body.splitlines() if line.endswith(r"\\")]
+    assert len(lines) == len(table.rows)
+    assert {len(re.findall(r"(?<!\\)&", line)) + 1 for line in lines} == {len(table.columns)}
+    assert r"\multicolumn{3}{c}{Causal}" in text
+    assert r"\cmidrule(lr){4-6}\cmidrule(lr){7-9}" in text
+    assert re.search(r"[±°]", text) is None
+
+
+def test_latex_takes_no_commands_from_names():
+    table = Table("t", "100 % of $x_1$", "", [Column("a", r"\input{x}")], [[Cell("a&b#c")]])
+    text = as_latex(table)
+    assert r"100 \% of \$x\_1\$" in text
+    assert r"\input" not in text
+    assert r"a\&b\#c" in text
+    assert latex_text("±") == r"$\pm$"
+
+
+def test_csv_has_full_precision_in_the_units_of_the_results():
+    batch = drawn_batch()
+    row = row_of(accuracy_table(batch, metrics_of(["causal.yaw_rmse_rad"])[0]), "isam2")
+    values = batch.values(LOGS[0], "isam2", "causal.yaw_rmse_rad")
+    assert float(row["causal.yaw_rmse_rad_mean"]) == float(values.mean())
+
+
+def test_tables_are_written_under_their_names(tmp_path):
+    written = write_tables([accuracy_table(drawn_batch(2), ATE)], tmp_path)
+    assert [path.name for path in written] == ["accuracy-ate-se2-m.csv", "accuracy-ate-se2-m.tex"]
+    assert all(path.stat().st_size for path in written)
+
+
+def test_the_finding_names_failures_and_only_differences_beyond_chance():
+    batch = with_failures(drawn_batch(), "ekf-slam", LOGS[1], 3)
+    metrics = metrics_of(METRICS)
+    assert failures_told(batch) == [f"ekf-slam: 3 of 20 runs did not end ({LOGS[1]})."]
+    told = errors_told(batch, metrics, all_tests(batch, metrics))
+    assert "isam2 is on average" in told[0]
+    assert "below dead-reckoning" in told[0]
+    alike = changed(batch, "isam2", "causal.ate_se2_m", 4.0)
+    assert "Not told apart from dead-reckoning: isam2" in errors_told(alike, metrics, all_tests(alike, metrics))[0]
+
+
+def test_the_finding_gives_no_mean_over_survivors():
+    batch = with_failures(drawn_batch(18), "isam2", LOGS[0], 1)
+    metrics = metrics_of(METRICS)
+    told = errors_told(batch, metrics, all_tests(batch, metrics))[0]
+    assert "isam2 differs from dead-reckoning (p = " in told
+    assert "isam2 is on average" not in told
+
+
+def test_angles_are_degrees_for_people_and_radians_in_files():
+    batch = drawn_batch()
+    table = accuracy_table(batch, metrics_of(["causal.yaw_rmse_rad"])[0])
+    mean = batch.values(LOGS[0], "isam2", "causal.yaw_rmse_rad").mean()
+    cell = next(line[3] for line in table.rows if line[1].text == "isam2")
+    assert cell.numbers[0] == mean
+    assert float(cell.text.split(" ± ")[0]) == pytest.approx(np.degrees(mean), rel=0.1)
+    assert table.title.endswith("°")
+
+
+def test_too_few_seeds_are_warned_of():
+    few, many = drawn_batch(4, logs=LOGS[:1]), drawn_batch(12, logs=LOGS[:1])
+    metrics = metrics_of(METRICS)
+    assert "4 pairs" in power_told(all_tests(few, metrics))[0]
+    assert power_told(all_tests(many, metrics)) == []
+
+
+def test_runs_that_were_scored_at_other_instants_are_warned_of():
+    batch = drawn_batch(2)
+    even = replace(batch, runs=[replace(run, values=run.values | {"scored_instants": 50.0}) for run in batch.runs])
+    fewer = replace(even.runs[0], values=even.runs[0].values | {"scored_instants": 40.0})
+    assert instants_told(even) == []
+    assert LOGS[0] in instants_told(replace(even, runs=[fewer, *even.runs[1:]]))[0]

@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    return _write(tmp_path / "batch", 1.0)
+
+
+def _write(folder: Path, factor: float) -> Path:
+    rng = np.random.default_rng(0)
+    rows = [
+        {
+            "key": f"{name}-{seed}",
+            "log": "basin",
+            "seed": seed,
+            "estimator": name,
+            "variant": "default",
+            "status": "ok",
+            "causal.ate_se2_m": size_m * (factor if name == "isam2" else 1.0) * rng.lognormal(0, 0.2),
+        }
+        for seed in range(8)
+        for name, size_m in (("dead-reckoning", 0.4), ("isam2", 0.1))
+    ]
+    folder.mkdir()
+    pq.write_table(pa.Table.from_pylist(rows), folder / "results.parquet")
+    return folder
+
+
+def test_report_rebuilds_page_and_tables_of_a_batch(run, folder, capsys):
+    assert run("report", folder) == 0
+    assert capsys.readouterr().out == f"Report: {folder / 'report.html'}\n"
+    assert (folder / "report.html").is_file()
+    assert (folder / "tables" / "difference-ate-se2-m.tex").is_file()
+
+
+def test_a_batch_passes_by_the_reference_that_it_became(run, folder, tmp_path, capsys):
+    reference = tmp_path / "reference.json"
+    assert run("bench", "bless", folder, reference) == 0
+    assert run("bench", "gate", folder, reference) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"Reference: {reference} (16 runs, 0 of which did not end)",
+        f"Gate: passed, 16 runs held against {reference}",
+    ]
+
+
+def test_a_worse_batch_ends_with_one_and_says_what_is_worse(run, folder, tmp_path, capsys):
+    reference = tmp_path / "reference.json"
+    run("bench", "bless", folder, reference)
+    assert run("bench", "gate", _write(tmp_path / "worse", 1.5), reference) == 1
+    said = capsys.readouterr().out
+    assert "Worse: basin, isam2, causal.ate_se2_m: +50.0% in the mean of 8 pairs" in said
+    assert "Gate: failed" in said
+
+
+def test_a_folder_without_results_is_the_users_mistake(run, tmp_path, capsys):
+    assert run("bench", "bless", tmp_path, tmp_path / "reference.json") == 2
+    assert "no results.parquet in it" in capsys.readouterr().err
+    assert not (tmp_path / "reference.json").exists()
+
+
+def test_a_reference_is_json_that_every_reader_takes(run, folder, tmp_path):
+    run("bench", "bless", folder, tmp_path / "reference.json")
+    content = json.loads((tmp_path / "reference.json").read_text("utf-8"))
+    assert content["format"] == "sonar_graph batch reference 1"
+    assert len(content["runs"]) == 16
