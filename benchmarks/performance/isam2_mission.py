@@ -83,10 +83,10 @@ class PlainIsam2:
         """Take in measurements that end with a frame; the newest pose."""
         self._odometry.add(measurements.imu, measurements.dvl)
         if self._node_ns is None:
-            self._start()
-        if measurements.detections is not None:
+            self._start(measurements.end_ns)
+        if self._node_ns is not None and measurements.detections is not None:
             frame_ns = int(measurements.detections.stamps_ns[-1])
-            nodes = self._odometry.nodes(self._node_ns or 0, frame_ns)
+            nodes = self._odometry.nodes(self._node_ns, frame_ns)
             if len(nodes):
                 self._add_pose(int(nodes[-1]), measurements)
             self._add_sightings(measurements.detections)
@@ -95,8 +95,10 @@ class PlainIsam2:
             self._pose = self._isam.calculateEstimatePose3(X(self._index))
         return self._pose
 
-    def _start(self) -> None:
-        self._node_ns = self._odometry.start_ns()
+    def _start(self, until_ns: int) -> None:
+        self._node_ns = self._odometry.start_by(until_ns)
+        if self._node_ns is None:
+            return
         self._values.insert(X(0), self._pose)
         self._graph.push_back(factors.start_prior(X(0), self._calibration))
 
@@ -119,7 +121,7 @@ class PlainIsam2:
 
     def _add_sightings(self, detections: LandmarkDetections) -> None:
         motion = self._preintegrator.integrate(
-            self._odometry.steps_since_node(self._node_ns or 0, int(detections.stamps_ns[-1])), NO_BIAS
+            self._odometry.steps_since_node(self._node_ns, int(detections.stamps_ns[-1])), NO_BIAS
         )
         body_T_sonar = motion.i_T_j.compose(self._body_T_sonar)
         ids, probabilities = detections.most_probable()
@@ -144,8 +146,10 @@ class PlainIsam2:
 class PlainIsam2WithBias(PlainIsam2):
     """The same with one gyro bias for the whole run."""
 
-    def _start(self) -> None:
-        super()._start()
+    def _start(self, until_ns: int) -> None:
+        super()._start(until_ns)
+        if self._node_ns is None:
+            return
         self._values.insert(B(0), NO_BIAS)
         self._graph.push_back(factors.bias_prior(B(0), self._calibration.imu.gyro_bias_sigma))
 

@@ -43,6 +43,8 @@ from sonar_graph.states import Trajectory
 
 RUNS = (1, 2, 3, 4, 5, 6, 7)
 GAP_S = 30.0
+CONFIRMED_NS = 4_000_000_000
+"""After a gap: at 2 m/s three velocities, one a second, have confirmed each other by then."""
 GAP_STARTS_S = tuple(20.0 + 40.0 * k for k in range(9))
 LARGEST_SHARE_OF_DISTANCE = 0.01
 Figures = dict[str, Any]
@@ -159,7 +161,7 @@ def gap_error(aligned: Sequence, whole: Trajectory, begin_s: float) -> dict[str,
     stamps = aligned.dvl.stamps_ns
     bridged = replace(aligned, dvl=aligned.dvl.rows((stamps <= begin_ns) | (stamps >= end_ns)))
     after, sure = reckoned(bridged), reckoned(with_start(bridged, rpy_sigma_rad=(1e-5,) * 3))
-    row = int(np.searchsorted(after.stamps_ns, end_ns + 2_000_000_000))
+    row = int(np.searchsorted(after.stamps_ns, end_ns + CONFIRMED_NS))
     other = int(np.flatnonzero(whole.stamps_ns == after.stamps_ns[row])[0])
     lost = after.positions[row] - whole.positions[other]
     truth = aligned.truth.at(after.stamps_ns[row : row + 1]).positions[0]

@@ -19,7 +19,6 @@ from sonar_graph.evaluation.start_check import (
     StartTilt,
     find_start_heading,
     find_start_tilt,
-    right_tilt,
     tilt_findings,
 )
 from sonar_graph.evaluation.unit_check import wrong_units
@@ -128,7 +127,7 @@ def _of_reference(right: Sequence, config: LogConfig, tilt: StartTilt) -> Iterat
     heading = find_start_heading(right, right.truth, offset) if is_compared else None
     yield from tilt_findings(tilt, start, heading.rpy_rad[2] if heading and heading.acts else start.rpy_rad[2])
     if heading:
-        yield heading.finding(right_tilt(tilt, start))
+        yield heading.finding(tilt)
 
 
 def _of_noise(sequence: Sequence) -> Iterator[Finding]:

@@ -99,13 +99,6 @@ def tilt_findings(found: StartTilt, start: Start, yaw_rad: float) -> list[Findin
     return said_once(rows)
 
 
-def right_tilt(found: StartTilt, start: Start) -> tuple[float, float] | None:
-    """Roll and pitch to write instead of the calibration's; None where these fit, or nothing is known."""
-    if not any(_contradicts(found, start, axis) for axis in (0, 1)):
-        return None
-    return found.angle(0).value, found.angle(1).value
-
-
 def _contradicts(found: StartTilt, start: Start, axis: int) -> bool:
     told = found.angle(axis)
     sigma = float(np.hypot(told.sigma, start.rpy_sigma_rad[axis]))
@@ -126,16 +119,17 @@ class StartHeading:
         """Whether the calibration's heading should be changed."""
         return matters(self.error, LEAST_HEADING_RAD)
 
-    def finding(self, tilt: tuple[float, float] | None) -> Finding:
-        """A row, with this roll and pitch, or with the reference's."""
+    def finding(self, tilt: StartTilt) -> Finding:
+        """A row, with roll and pitch of the alignment, so that no row contradicts another; else the reference's."""
         advice = NO_NEED
         if self.acts:
-            roll, pitch = tilt or self.rpy_rad[:2]
+            rpy = (tilt.angle(0).value, tilt.angle(1).value, self.rpy_rad[2]) if tilt.tilt else self.rpy_rad
+            of_tilt = f", with roll and pitch {tilt.said}" if tilt.tilt else ""
+            turns = ", ".join(f"{angle:.4f}" for angle in rpy)
             place = ", ".join(f"{metres:.2f}" for metres in self.position_m)
             advice = (
-                "the start heading is wrong; the reference, its stamps put right, says "
-                f"`start.rpy_rad = [{roll:.4f}, {pitch:.4f}, {self.rpy_rad[2]:.4f}]`, "
-                f"`start.position_m = [{place}]` in the calibration"
+                f"the start heading is wrong; by the reference, its stamps put right{of_tilt}: "
+                f"`start.rpy_rad = [{turns}]`, `start.position_m = [{place}]` in the calibration"
             )
         return Finding("start heading of the calibration", in_degrees(self.error), "°", advice, self.acts)
 

@@ -25,6 +25,7 @@ from sonar_graph.logs.roles import ROLES, Choice
 from sonar_graph.logs.sanity import axes_warning, gravity_warning
 from sonar_graph.logs.spikes import spike_warning
 from sonar_graph.logs.stamp_check import stamp_faults
+from sonar_graph.logs.stuck import stuck_warning
 from sonar_graph.logs.table import Dropped, Table
 from sonar_graph.logs.usability import require_use, unsaid_noise
 from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections
@@ -162,6 +163,10 @@ class Assembly:
             yield from (f"{role}: {text}" for text in self._adapters[role].warnings(table))
         if "imu" in self._tables and (imu := self.imu()) is not None:
             yield from (f"imu: {text}" for text in self._inertial_warnings(imu))
+        is_linear = self.calibration.odometry_interpolation == "linear"  # wheels may turn evenly
+        if is_linear and "dvl" in self._tables and (dvl := self.dvl()) is not None:
+            text = stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")
+            yield from [f"dvl: {text}"] if text else []
         if "dvl" in self._tables and not self._is_mounting_known:
             text = axes_warning(self._adapters["dvl"])
             yield from [f"dvl: {text}"] if text else []
@@ -171,6 +176,8 @@ class Assembly:
         yield from [text] if text else []
         if self.calibration.odometry_interpolation == "linear":  # held rates may jump
             text = spike_warning(imu)
+            yield from [text] if text else []
+            text = stuck_warning(imu.stamps_ns, imu.angular_velocity, "angular rate")
             yield from [text] if text else []
 
     def _gaps(self) -> Iterator[str]:

@@ -24,8 +24,10 @@ def gap_warnings(imu: Imu, dvl: Dvl, calibration: Calibration) -> Iterator[str]:
 
     A Doppler log has a gap where estimators no longer take its velocity as linear (``dvl.gap_s``), an IMU has a
     hole where they count with turns that were not measured (`sonar_graph.navigation.unmeasured_turns`). Samples that
-    hold for the time before them leave none.
+    hold for the time before them leave none. First, where one sensor begins or ends more than ``dvl.gap_s`` apart from
+    the other.
     """
+    yield from _apart(imu, dvl, calibration.dvl.gap_s)
     if calibration.odometry_interpolation == "hold-past":
         return
     start_ns = int(max(imu.stamps_ns[0], dvl.stamps_ns[0]))
@@ -42,6 +44,16 @@ def is_partial(dvl: Dvl) -> NDArray[np.bool_]:
     """Rows that leave a direction of the velocity unmeasured, shape (n,)."""
     variances = np.trace(dvl.velocity_cov, axis1=1, axis2=2)
     return np.asarray(variances > 0.5 * UNMEASURED_M_S**2)
+
+
+def _apart(imu: Imu, dvl: Dvl, gap_s: float) -> Iterator[str]:
+    begin_s, end_s = ((int(imu.stamps_ns[row]) - int(dvl.stamps_ns[row])) * 1e-9 for row in (0, -1))
+    if abs(begin_s) > gap_s:
+        late, early = ("IMU", "Doppler log") if begin_s > 0 else ("Doppler log", "IMU")
+        yield f"{late} begins {abs(begin_s):.1f} s after the {early}; not estimated until then"
+    if abs(end_s) > gap_s:
+        early, late = ("IMU", "Doppler log") if end_s < 0 else ("Doppler log", "IMU")
+        yield f"{early} ends {abs(end_s):.1f} s before the {late}; not estimated from there"
 
 
 def _doppler(imu: Imu, dvl: Dvl, longest_ns: int, start_ns: int) -> Iterator[str]:

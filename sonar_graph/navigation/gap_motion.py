@@ -142,7 +142,7 @@ def bridge(
         Earth's rotation in frame i, rad/s.
     """
     model = GapModel(*values)
-    if is_closed or rows_until(columns[3], end_ns) == rows_until(columns[3], start_ns):
+    if is_closed or not _is_sampled(columns, model, start_ns, end_ns):
         motion, is_known = _by_accelerometers(columns, model, start_ns, end_ns, is_closed, bias, earth)
         if is_known:
             return motion
@@ -265,6 +265,17 @@ def _of_body(path: Path, ms: Vector, M: Matrix, s_g: Matrix, ss: Matrix, gyro_ps
 
 
 @compiled
+def _is_sampled(columns: Columns, model: GapModel, start_ns: int, end_ns: int) -> bool:
+    """Whether velocities go on after a node, and it is inertial rows that are missing.
+
+    A sample that ends a gap of the velocity, but is no node yet, does not count.
+    """
+    dvl_ns = columns[3]
+    row = rows_until(dvl_ns, start_ns)
+    return bool(row < len(dvl_ns) and dvl_ns[row] <= end_ns and dvl_ns[row] - start_ns <= model.longest_ns)
+
+
+@compiled
 def _by_walk(
     columns: Columns, model: GapModel, start_ns: int, end_ns: int, is_closed: bool, bias: Vector, earth: Vector
 ) -> GapMotion:
@@ -273,7 +284,8 @@ def _by_walk(
     An open gap may hold samples, where motion could not be settled for want of inertial rows.
     """
     imu_ns, dvl_ns, cov = columns[0], columns[3], columns[5]
-    k = rows_until(dvl_ns, end_ns if not is_closed else start_ns) - 1
+    is_over = not is_closed and _is_sampled(columns, model, start_ns, end_ns)
+    k = rows_until(dvl_ns, end_ns if is_over else start_ns) - 1
     since_ns = max(dvl_ns[k], start_ns)
     elapsed_s = (end_ns - since_ns) * 1e-9
     walk = (model.velocity_walk_density * elapsed_s) ** 2

@@ -131,6 +131,20 @@ def test_a_number_that_cannot_be_told_asks_for_nothing():
         assert finding.plain()["value"] is None
 
 
+@pytest.mark.parametrize("hole_s", [2.0, 5.0])
+def test_a_hole_of_the_imu_asks_for_nothing(hole_s: float, monkeypatch: pytest.MonkeyPatch):
+    """Drawn straight across, 5 s of manoeuvres make a wrong scale and a wrong offset of the reference."""
+    t = (RIGHT.imu.stamps_ns - RIGHT.imu.stamps_ns[0]) * 1e-9
+    run = replace(RIGHT, imu=RIGHT.imu.rows((t <= 100.0) | (t >= 100.0 + hole_s)))
+    found = by_name(check_sensors(run))
+    assert [finding.text() for finding in found.values() if finding.acts] == []
+    assert found["DVL scale"].estimate.is_known
+    assert found["reference against IMU: time offset"].estimate.is_known
+    monkeypatch.setattr("sonar_graph.navigation.inertial_path._parts", np.zeros_like)
+    blind = by_name(check_sensors(run))
+    assert blind["DVL scale"].acts == blind["reference against IMU: time offset"].acts == (hole_s > 2.0)
+
+
 def test_digits_are_those_that_the_interval_supports():
     assert with_interval(Estimate1D(1.0312345, 0.0102), "s") == "+1.031 ± 0.020 s"
     assert with_interval(Estimate1D(1.00213, 0.0011), "") == "1.0021 ± 0.0022"

@@ -10,7 +10,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import STANDARD_GRAVITY, Calibration, Start
-from sonar_graph.evaluation.start_check import StartTilt, find_start_heading, find_start_tilt, right_tilt, tilt_findings
+from sonar_graph.evaluation.start_check import (
+    StartHeading,
+    StartTilt,
+    find_start_heading,
+    find_start_tilt,
+    tilt_findings,
+)
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.offset_search import Estimate1D
 from sonar_graph.sequence import Sequence
@@ -84,8 +90,6 @@ def test_a_start_that_contradicts_is_named_with_the_line_that_puts_it_right():
     assert sigma["rpy_sigma_rad"] == pytest.approx([found.angle(0).sigma, found.angle(1).sigma, 1e-3], rel=0.05)
     right = Start(rpy_rad=tuple(rpy["rpy_rad"]), rpy_sigma_rad=tuple(sigma["rpy_sigma_rad"]))
     assert not any(row.acts for row in tilt_findings(found, right, 0.9))
-    assert right_tilt(found, right) is None
-    assert right_tilt(found, Start()) == (found.angle(0).value, found.angle(1).value)
 
 
 def test_what_the_calibration_is_unsure_of_is_not_contradicted():
@@ -102,7 +106,6 @@ def test_without_accelerometers_one_row_says_why_there_is_no_tilt():
     assert row.text().startswith("cannot be told: at rest: Imu.specific_force")
     assert "in motion: Imu.specific_force" in row.text()
     assert not row.acts
-    assert right_tilt(found, Start()) is None
 
 
 def test_what_speaks_against_both_ways_is_said():
@@ -135,3 +138,19 @@ def test_a_heading_is_as_unsure_as_the_offset_times_the_turn_rate(begin_s: float
     found = find_start_heading(run, reference, Estimate1D(0.0, 0.1))
     assert found.error.sigma == pytest.approx(np.hypot(np.radians(0.1), 0.01), rel=1e-6)
     assert found.rpy_rad[2] == pytest.approx(0.1 * max(begin_s, 0.0) if begin_s > -60.0 else 0.0, abs=1e-6)
+
+
+def test_a_wrong_heading_has_the_roll_and_pitch_of_the_alignment_also_where_the_calibrations_fit():
+    """The reference's contradict the row of the alignment; they are written only where there is none."""
+    found = find_start_tilt(resting(50.0))
+    heading = StartHeading((ROLL - 0.04, PITCH + 0.03, 0.9), (1.0, 2.0, -3.0), Estimate1D(0.2, 0.002))
+    assert not any(row.acts for row in tilt_findings(found, Start(rpy_rad=(ROLL, PITCH, 0.7)), 0.9))
+    row = heading.finding(found)
+    _, rpy_line, _, place_line, _ = row.advice.split("`")
+    expected = [found.angle(0).value, found.angle(1).value, 0.9]
+    assert tomllib.loads(rpy_line)["start"]["rpy_rad"] == pytest.approx(expected, abs=1e-4)
+    assert tomllib.loads(place_line)["start"]["position_m"] == [1.0, 2.0, -3.0]
+    assert "with roll and pitch from 40 s of rest" in row.text()
+    alone = heading.finding(StartTilt(None, "no rows"))
+    assert tomllib.loads(alone.advice.split("`")[1])["start"]["rpy_rad"] == pytest.approx(heading.rpy_rad, abs=1e-4)
+    assert "roll and pitch" not in alone.text()

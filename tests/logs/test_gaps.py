@@ -100,7 +100,7 @@ def test_the_first_interval_has_none_before_it(first_s: float, is_hole: bool) ->
 def test_a_hole_is_named_as_far_as_it_is_used() -> None:
     """Not before the first velocity, nor after the last."""
     holed = imu(without(SAMPLES, (5, 7), (9, 11), (290, 291)))
-    (text,) = gap_warnings(holed, dvl(PINGS[50:1449]), Calibration())
+    *_, text = gap_warnings(holed, dvl(PINGS[50:1449]), Calibration())
     assert text.startswith("imu: no sample 0.000 to 1.000 s after the start: ")
 
 
@@ -123,10 +123,31 @@ def test_of_many_holes_the_longest_are_named_and_all_are_counted() -> None:
 
 
 def test_times_count_from_the_first_instant_with_both() -> None:
-    (text,) = gap_warnings(imu(without(SAMPLES, (100, 110))), dvl(PINGS[50:]), Calibration())
+    _, text = gap_warnings(imu(without(SAMPLES, (100, 110))), dvl(PINGS[50:]), Calibration())
     assert "90.000 to 100.000 s after the start" in text
 
 
 def test_samples_that_hold_for_the_time_before_them_leave_no_gap() -> None:
     held = Calibration(odometry_interpolation="hold-past")
     assert list(gap_warnings(imu(without(SAMPLES, (100, 110))), dvl(without(PINGS, (100, 220))), held)) == []
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "hold-past"])
+def test_a_sensor_that_ends_or_begins_apart_is_named(interpolation: Any) -> None:
+    calibration = Calibration(odometry_interpolation=interpolation)
+    of_imu = list(gap_warnings(imu(SAMPLES[300:29000]), dvl(PINGS[:1451]), calibration))
+    assert of_imu == ["IMU begins 3.0 s after the Doppler log; not estimated until then"]
+    of_imu = list(gap_warnings(imu(SAMPLES[:28001]), dvl(PINGS[:1451]), calibration))
+    assert of_imu == ["IMU ends 10.0 s before the Doppler log; not estimated from there"]
+    of_dvl = list(gap_warnings(imu(SAMPLES[:29001]), dvl(PINGS[20:1401]), calibration))
+    assert of_dvl == [
+        "Doppler log begins 4.0 s after the IMU; not estimated until then",
+        "Doppler log ends 10.0 s before the IMU; not estimated from there",
+    ]
+
+
+@pytest.mark.parametrize(("apart_s", "is_named"), [(1.4, False), (1.6, True)])
+def test_apart_is_more_than_a_gap(apart_s: float, is_named: bool) -> None:
+    for shift_s in (apart_s, -apart_s):
+        found = list(gap_warnings(imu(SAMPLES[1000:20001]), dvl(10.0 + shift_s + PINGS[:951]), Calibration()))
+        assert len(found) == 2 * is_named

@@ -130,6 +130,14 @@ def test_what_the_user_says_is_what_is_inspected(bench: Any) -> None:
     assert role(summary, "dvl") == (None, "switched off in my.toml")
 
 
+def test_stuck_sensors_are_named(bench: Any) -> None:
+    """The bench's rows are all alike."""
+    assert not any("as measured" in text for text in inspect_log(bench.write(*bench.basics(10))).warnings)
+    warnings = inspect_log(bench.write(*bench.basics(30), name="long.mcap")).warnings
+    for start in ("dvl: velocity the same to the last bit", "imu: angular rate the same to the last bit"):
+        assert any(text.startswith(f"{start} in 30 rows, 0.000 to 2.900 s") for text in warnings)
+
+
 def test_what_this_package_wrote_gives_no_warning(tmp_path: Path) -> None:
     write_sequence(tmp_path / "a.mcap", read_victoria_park())
     write_sequence(tmp_path / "b.mcap", simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1)))

@@ -141,6 +141,22 @@ def test_doppler_noise_spreads_a_chain_with_a_gap_as_noise_of_every_sample_does(
     assert error_of_spread("velocity", SIGMA_M_S, imu, dvl, known, 5.0, 12.0) < tolerance
 
 
+@WITH_OR_WITHOUT
+def test_a_sample_that_ends_a_gap_counts_only_once_inertial_rows_cover_it(is_blind):
+    """Before, there is no node at it, and the gap is as open as without it."""
+    known = calibration({"accel_noise_density": 1e-2}, velocity_sigma_m_s=(0.01,) * 3, velocity_walk_density=0.02)
+    imu, dvl = rows()
+    imu = blinded(imu) if is_blind else imu
+    seen = imu.between(0, at(FOUND_S) - 1)
+    until_s = FOUND_S + 0.05
+    open_gap = motion(seen, dvl.between(0, at(LOST_S)), known, LOST_S, until_s)
+    found = motion(seen, dvl.between(0, at(FOUND_S)), known, LOST_S, until_s)
+    assert found.i_T_j.equals(open_gap.i_T_j, 0.0)
+    assert np.array_equal(found.covariance, open_gap.covariance)
+    covered = motion(imu, dvl.between(0, at(FOUND_S)), known, LOST_S, FOUND_S)
+    assert np.trace(covered.covariance[3:, 3:]) < 0.5 * np.trace(open_gap.covariance[3:, 3:])
+
+
 def test_the_last_velocity_held_keeps_its_error():
     known = calibration(velocity_sigma_m_s=(0.01,) * 3)
     imu, dvl = rows()

@@ -12,16 +12,14 @@ from sonar_graph.navigation.dvl_preintegration import Preintegrator
 from sonar_graph.navigation.joint_preintegration import JointPreintegrator
 from sonar_graph.navigation.node_motion import motion_between_nodes, motion_since_node
 from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.unmeasured_turns import closed_variance, hole_ns, open_variance, turn_psd, turn_psd
+from sonar_graph.navigation.unmeasured_turns import closed_variance, hole_ns, open_variance, turn_psd
 
 from .rows import NS, T0_NS, dvl, imu, stamps
 
 MS = 1_000_000
 STILL = ImuCalibration(turn_sigma_rad_s=(0.0, 0.0, 0.0))
 UNMODELLED = Calibration(imu=STILL)
-UNLIKE = ImuCalibration(turn_sigma_rad_s=(0.05, 0.1, 0.15), turn_time_s=(0.5, 0.6, 1.5))
-UNMODELLED = Calibration(imu=STILL)
-UNLIKE = ImuCalibration(turn_sigma_rad_s=(0.05, 0.1, 0.15), turn_time_s=(0.5, 0.6, 1.5))
+UNLIKE = ImuCalibration(turn_sigma_rad_s=(0.05, 0.06, 0.15), turn_time_s=(0.5, 0.55, 1.5))
 BEGIN_S, END_S = 3.0, 5.0
 
 

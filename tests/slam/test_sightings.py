@@ -53,12 +53,13 @@ class Dive:
         self.smoother = smoother or Smoother(lag_s, 1e-6, 1e9)
         self.keyframes = Keyframes(calibration, POLICY, self.smoother)
         self.sightings = Sightings(calibration, policy, self.smoother, self.keyframes)
-        stamps = np.r_[START_NS, T0_NS + np.arange(0, 101) * NS // 10]  # the second row confirms the first
+        stamps = T0_NS + np.arange(-1, 101) * NS // 10
+        doppler = np.r_[START_NS, stamps[1:]]  # the second row confirms the first
         n = len(stamps)
         velocity = np.tile([0.5, 0.0, 0.0], (n, 1))
         self.keyframes.add(
             Imu(stamps, np.zeros((n, 3)), np.full((n, 3), np.nan)),
-            Dvl(stamps, velocity, np.full((n, 3, 3), np.nan)),
+            Dvl(doppler, velocity, np.full((n, 3, 3), np.nan)),
             None,
         )
 
