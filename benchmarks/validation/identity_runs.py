@@ -56,8 +56,8 @@ class Case:
         return f"delay {self.id_delay_s:g} s, bias {self.gyro_bias_scale:g}, {kind}"
 
     def options(self, seed: int, *, is_quick: bool) -> BasinOptions:
-        """Of the simulated basin: its laps, but less hovering and fewer frames, for thousands of runs to be affordable."""
-        route = {"duration_s": 240.0, "laps": 1} if is_quick else {"duration_s": DURATION_S}
+        """Of the simulated basin: its laps with less hovering and fewer frames, to afford thousands of runs."""
+        route: dict[str, Any] = {"duration_s": 240.0, "laps": 1} if is_quick else {"duration_s": DURATION_S}
         return BasinOptions(seed=seed, frame_rate_hz=FRAME_RATE_HZ, **route, **asdict(self))
 
 
