@@ -32,6 +32,8 @@ ESTIMATORS: dict[str, tuple[str, dict[str, Any]]] = {
 LOST_M = 1.0
 """A run whose smoothed trajectory is farther off than this (rms) is lost: of no use in a basin of 20 by 14 m."""
 RATE_HZ = 0.5
+DURATION_S, FRAME_RATE_HZ = 1000.0, 2.0
+"""Of the three laps; they take 728 s without hovering."""
 SETTLING_S = 60.0
 """Instants before this are not judged: the start is known."""
 
@@ -54,9 +56,9 @@ class Case:
         return f"delay {self.id_delay_s:g} s, bias {self.gyro_bias_scale:g}, {kind}"
 
     def options(self, seed: int, *, is_quick: bool) -> BasinOptions:
-        """Of the simulated basin; two frames a second, so that thousands of runs are affordable."""
-        short = {"duration_s": 240.0, "laps": 1} if is_quick else {}
-        return BasinOptions(seed=seed, frame_rate_hz=2.0, **short, **asdict(self))
+        """Of the simulated basin: its laps with less hovering and fewer frames, to afford thousands of runs."""
+        route: dict[str, Any] = {"duration_s": 240.0, "laps": 1} if is_quick else {"duration_s": DURATION_S}
+        return BasinOptions(seed=seed, frame_rate_hz=FRAME_RATE_HZ, **route, **asdict(self))
 
 
 @dataclass(frozen=True)
