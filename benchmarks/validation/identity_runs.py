@@ -126,7 +126,7 @@ def run_job(job: Job) -> dict[str, Judged]:
         sequence = simulate_basin(job.case.options(job.seed, is_quick=job.is_quick))
         instants_ns = sequence.instants(RATE_HZ)
         for name in missing:
-            run = run_estimator(sequence, *ESTIMATORS[name], instants_ns=instants_ns)
+            run = run_estimator(sequence, *ESTIMATORS[name], instants_ns=instants_ns, interim_maps=False)
             judged[name] = _judged(run, judge(sequence, instants_ns, [run]), sequence.true_landmarks)
             _write(files[name], judged[name])
     return judged

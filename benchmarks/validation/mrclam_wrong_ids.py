@@ -59,7 +59,7 @@ def run_case(folder: Path, case: tuple[int, float, str]) -> Errors:
     sequence = falsified(read_mrclam(folder, robot), share, [SEED, robot])
     instants = sequence.instants(RATE_HZ)
     name, settings = ESTIMATORS[label]
-    run = run_estimator(sequence, name, settings, instants_ns=instants)
+    run = run_estimator(sequence, name, settings, instants_ns=instants, interim_maps=False)
     if run.status == "failed":
         return dict.fromkeys(("smoothed", "causal", "landmarks", "time_s"), float("nan"))
     (scores,) = judge(sequence, instants, [run]).scores.values()

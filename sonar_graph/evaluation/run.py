@@ -39,6 +39,7 @@ def run_estimator(
     *,
     instants_ns: Ints | None = None,
     rate_hz: float = 2.0,
+    interim_maps: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> RunResult:
     """Replay a sequence into an estimator and keep what it said, with the duration of each call.
@@ -56,6 +57,8 @@ def run_estimator(
         Settings that differ from the estimator's defaults.
     instants_ns
         When estimates are asked for, increasing; None: ``sequence.instants(rate_hz)``.
+    interim_maps
+        Whether the map is asked for before the end too. For a smoother each costs a solution of the whole history.
     progress
         Called after each step with the number of steps done and their total.
 
@@ -79,7 +82,8 @@ def run_estimator(
     except EstimatorError as error:
         return RunResult(name, dict(overrides or {}), "failed", one_line(error))
     params = make_params(kind, overrides or {}, name)
-    return _Replay(sequence, list(sequence.replay(instants)), name, params).run(kind, progress)
+    replay = _Replay(sequence, list(sequence.replay(instants)), name, params, interim_maps=interim_maps)
+    return replay.run(kind, progress)
 
 
 def check_request(name: str, overrides: dict[str, Any] | None = None) -> None:
@@ -96,7 +100,9 @@ def check_request(name: str, overrides: dict[str, Any] | None = None) -> None:
 class _Replay:
     """A run in progress: what has been said and how long it took."""
 
-    def __init__(self, sequence: Sequence, steps: list[Measurements], name: str, params: Section) -> None:
+    def __init__(
+        self, sequence: Sequence, steps: list[Measurements], name: str, params: Section, *, interim_maps: bool
+    ) -> None:
         self._sequence = sequence
         self._steps = steps
         self._name = name
@@ -104,7 +110,8 @@ class _Replay:
         self._estimates: list[Estimate] = []
         self._update_s: list[float] = []
         ends_ns = np.array([step.end_ns for step in steps], dtype=np.int64)
-        self._map_at_ns = set(map_instants(ends_ns, sequence.start_ns).tolist()[:-1])
+        interim_ns = map_instants(ends_ns, sequence.start_ns).tolist()[:-1]
+        self._map_at_ns = set(interim_ns if interim_maps else [])
         self._maps: list[MapSoFar] = []
         self._stage = "at the start"
 

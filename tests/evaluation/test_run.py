@@ -305,6 +305,22 @@ def test_the_map_is_kept_on_the_way_as_it_was_known_then(
     assert result.landmarks is result.maps[-1].landmarks
 
 
+def test_without_interim_maps_only_the_last_is_asked_for(
+    install: Install, make_sequence: Make, offset_estimator: Any
+) -> None:
+    asked = []
+
+    class Counting(offset_estimator):
+        def landmarks(self) -> LandmarkMap:
+            asked.append(len(self.estimates))
+            return super().landmarks()
+
+    install(counting=Counting)
+    result = run_estimator(make_sequence(), "counting", rate_hz=2.0, interim_maps=False)
+    assert asked == [len(result.causal)]
+    assert [known.stamp_ns for known in result.maps] == [result.causal.stamps_ns[-1]]
+
+
 def test_asking_for_the_map_on_the_way_is_not_timed(
     install: Install, make_sequence: Make, offset_estimator: Any
 ) -> None:
