@@ -63,7 +63,9 @@ def run(sequence: Sequence, rate_hz: float, error: str, settings: dict[str, Any]
     unknown = {"unknown_landmarks": "associate", **settings}
     runs = {
         "known": run_estimator(sequence, "isam2", instants_ns=instants, interim_maps=False),
-        "unknown": run_estimator(without_identities(sequence), "isam2", unknown, instants_ns=instants, interim_maps=False),
+        "unknown": run_estimator(
+            without_identities(sequence), "isam2", unknown, instants_ns=instants, interim_maps=False
+        ),
         "dead reckoning": run_estimator(sequence, "dead-reckoning", instants_ns=instants, interim_maps=False),
     }
     found = {}
