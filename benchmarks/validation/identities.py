@@ -25,6 +25,7 @@ import numpy as np
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 sys.path.append(str(Path(__file__).resolve().parent))
 from common import conclude, in_parallel, make_parser, print_table, refuse
+from identity_figure import Figures, draw
 from identity_runs import ESTIMATORS, Case, Job, Judged, run_job
 
 RATES = (0.0, 0.05, 0.1, 0.2)
@@ -76,7 +77,9 @@ def summarise(runs: Runs, clean: Runs, name: str) -> dict[str, float]:
         "smoothed_m": float(smoothed.mean()),
         "smoothed_error_m": mean_and_error(smoothed)[1],
         "causal_m": float(causal.mean()),
+        "causal_error_m": mean_and_error(causal)[1],
         "landmarks_m": float(landmarks.mean()),
+        "landmarks_error_m": mean_and_error(landmarks)[1],
         "lost": float(np.mean([run[name].is_lost for run in runs])),
         "failed": float(np.mean([run[name].status == "failed" for run in runs])),
         "above_clean_m": cost,
@@ -118,7 +121,7 @@ def report(case: Case, runs: Runs, clean: Runs) -> dict[str, dict[str, float]]:
     return summaries
 
 
-def best_policy(figures: dict[Case, dict[str, dict[str, float]]]) -> tuple[str, float]:
+def best_policy(figures: Figures) -> tuple[str, float]:
     """The policy of iSAM2 whose greatest loss at the held rate is least, and that loss.
 
     Of trajectory and map; where a run has no figure it counts as infinite.
@@ -133,7 +136,7 @@ def best_policy(figures: dict[Case, dict[str, dict[str, float]]]) -> tuple[str, 
     return best, float(worst[best])
 
 
-def flat(figures: dict[Case, dict[str, dict[str, float]]]) -> dict[str, float | None]:
+def flat(figures: Figures) -> dict[str, float | None]:
     """Mean errors by case and estimator; None where a run has none."""
     return {
         f"{case.wrong_id_rate:.0%} wrong, {case.name}: {name}: {key}": value
@@ -152,6 +155,7 @@ def main() -> None:
     parser.add_argument(
         "--keep", type=Path, help="folder that keeps runs that are done: the same command goes on there"
     )
+    parser.add_argument("--figure", type=Path, help="draw errors against the share of wrong identities into this file")
     arguments = parser.parse_args()
     count = arguments.seeds or (3 if arguments.quick else 100)
     if count < 2:
@@ -163,10 +167,12 @@ def main() -> None:
     jobs = [Job(case, seed, arguments.quick, arguments.keep) for seed in range(count) for case in chosen]
     done = in_parallel(run_job, jobs, arguments.workers, "run")
     runs = {case: [told for job, told in zip(jobs, done, strict=True) if job.case == case] for case in chosen}
-    figures: dict[Case, dict[str, dict[str, float]]] = {}
+    figures: Figures = {}
     for case in chosen:
         clean = Case(0.0, case.id_delay_s, case.gyro_bias_scale, case.wrong_id_share, case.tracks)
         figures[case] = report(case, runs[case], runs[clean])
+    if arguments.figure:
+        draw(figures, arguments.figure)
     policy, loss = best_policy(figures)
     told: dict[str, Any] = {"runs": count, "cases": len(chosen), "best_policy": policy}
     told |= {"greatest_loss": None if np.isinf(loss) else loss, "passed": loss <= MOST_LOSS}

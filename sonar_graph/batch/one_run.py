@@ -59,12 +59,11 @@ def perform(run: PlannedRun, folder: Path) -> Row:
     Raises
     ------
     BatchError
-        When this process has other versions than those that the run was planned with.
+        When this process has other versions or another source than those that the run was planned with.
     OSError
         When the folder cannot be written: that is no result.
     """
-    if versions_of(run.estimator) != run.versions:
-        raise BatchError(f"a worker has {_told(versions_of(run.estimator))}, planned with {_told(run.versions)}")
+    _check_versions(run)
     clock, cpu_s = Clock(), time.process_time()
     try:
         comparison = _compared(run, clock)
@@ -74,6 +73,15 @@ def perform(run: PlannedRun, folder: Path) -> Row:
         return _failed(f"{stage}: {one_line(error)}") | _spent(clock, cpu_s)
     write_comparison(comparison, folder)
     return measured(comparison) | _spent(clock, cpu_s)
+
+
+def _check_versions(run: PlannedRun) -> None:
+    here = versions_of(run.estimator)
+    if differing := [name for name in sorted(here | run.versions) if here.get(name) != run.versions.get(name)]:
+        raise BatchError(
+            f"a worker has {_told(here, differing)}, planned with {_told(run.versions, differing)}; "
+            "install the same everywhere and start the workers anew"
+        )
 
 
 def _compared(run: PlannedRun, clock: Clock) -> Comparison:
@@ -153,5 +161,5 @@ def _as_text(values: dict[str, Any] | None) -> str:
     return json.dumps(values, sort_keys=True)
 
 
-def _told(versions: dict[str, str]) -> str:
-    return ", ".join(f"{name} {number}" for name, number in sorted(versions.items()))
+def _told(versions: dict[str, str], names: list[str]) -> str:
+    return ", ".join(f"{name} {versions.get(name, 'missing')}" for name in names)

@@ -31,7 +31,10 @@ from sonar_graph.evaluation.atomic import replacing
 from sonar_graph.evaluation.figure_style import ESTIMATOR_COLOURS
 
 TEMPLATE, PAGE = "batch.html", "report.html"
-SAME_FOR_ALL = ("machine", "versions", "sonar_graph", "gtsam", "numpy", "scipy", "python")
+SAME_FOR_ALL = (
+    *("machine", "versions", "sonar_graph", "source", "estimator_source"),
+    *("gtsam", "numpy", "scipy", "python"),
+)
 
 
 @dataclass(frozen=True)

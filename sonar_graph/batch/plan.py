@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 import sonar_graph
 from sonar_graph.batch.planned import PlannedRun
+from sonar_graph.batch.source_hash import source_hash
 from sonar_graph.batch.sources import FILES, GENERATORS, KINDS, LOG, fingerprint
 from sonar_graph.batch.suite import EstimatorEntry, LogEntry, SuiteFile
 from sonar_graph.batch.toml_lines import Place
@@ -68,7 +69,7 @@ def plan_runs(file: SuiteFile) -> list[PlannedRun]:
 
 @lru_cache
 def versions_of(estimator: str) -> dict[str, str]:
-    """Versions that decide the numbers, with that of the package that brings the estimator.
+    """Versions that decide the numbers, with that of the package that brings the estimator, and hashes of both sources.
 
     Raises
     ------
@@ -84,6 +85,9 @@ def versions_of(estimator: str) -> dict[str, str]:
         "gtsam": version("gtsam"),
         "numpy": version("numpy"),
         "scipy": version("scipy"),
+        "numba": version("numba"),
+        "source": source_hash("sonar_graph"),
+        "estimator_source": source_hash(point.module.partition(".")[0]),
     }
 
 

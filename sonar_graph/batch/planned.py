@@ -16,7 +16,7 @@ class PlannedRun:
 
     key: str
     """Of everything that decides its outcome: content of the log or options of the simulator, seed, estimator,
-    settings, rate, versions. Equal keys, equal numbers."""
+    settings, rate, versions, source. Equal keys, equal numbers."""
     suite: str
     log: str
     """Name with the values of its grid."""

@@ -67,8 +67,10 @@ def test_estimator_that_fails_is_a_row_with_a_reason(planned: Planned, misbehavi
 
 def test_other_versions_than_planned_are_no_result(planned: Planned, tmp_path: Path) -> None:
     run = planned()
-    with pytest.raises(BatchError, match="planned with"):
+    with pytest.raises(BatchError, match=r"a worker has gtsam 4\.3\S*, planned with gtsam 4\.2; install the same"):
         perform(replace(run, versions=run.versions | {"gtsam": "4.2"}), tmp_path / "run")
+    with pytest.raises(BatchError, match=r"a worker has source \w+, planned with source changed; "):
+        perform(replace(run, versions=run.versions | {"source": "changed"}), tmp_path / "run")
 
 
 def test_folder_that_cannot_be_written_is_no_result(planned: Planned, tmp_path: Path) -> None:

@@ -1,0 +1,75 @@
+"""The picture of identities.py: errors against the share of wrong identities, by estimator."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from identity_runs import ESTIMATORS, Case
+from matplotlib.axes import Axes
+
+from sonar_graph.evaluation.figure_style import (
+    MUTED,
+    blank_panels,
+    colour,
+    head_panel,
+    legend_above,
+    logarithmic,
+    name_axes,
+)
+
+Figures = dict[Case, dict[str, dict[str, float]]]
+"""By case, estimator and figure."""
+SHOWN = {
+    "tracks corrected halfway": Case(0.0, 5.0),
+    "tracks never corrected": Case(0.0, 5.0, wrong_id_share=1.0),
+    "frame by frame": Case(0.0, tracks=False),
+}
+"""Kinds of cases, a column each; of these alone all differ."""
+ROWS = {"smoothed": "trajectory, m", "causal": "causal trajectory, m", "landmarks": "map, m"}
+"""Errors, a row each, and their axis."""
+DRAWN = {
+    "EKF-SLAM": (0, "-"),
+    "invariant EKF": (4, "-"),
+    "iSAM2, gate": (1, (0, (5, 1.6))),
+    "iSAM2, deferred": (2, "-"),
+    "iSAM2, max-mixture": (3, "-"),
+    "iSAM2, gnc": (5, (0, (1.2, 1.2))),
+}
+"""Estimators beside dead reckoning: colour and line."""
+
+
+def draw(figures: Figures, path: Path) -> None:
+    """Draw what is there of `SHOWN` into a file."""
+    shown = {title: kind for title, kind in SHOWN.items() if any(_is_of(case, kind) for case in figures)}
+    figure, panels = blank_panels(len(ROWS), max(len(shown), 1), (10.0, 8.4), sharex=True, sharey="row")
+    for column, (title, kind) in enumerate(shown.items()):
+        cases = {case.wrong_id_rate: told for case, told in figures.items() if _is_of(case, kind)}
+        for row, (error, label) in enumerate(ROWS.items()):
+            _panel(panels[row, column], cases, error)
+            name_axes(panels[row, column], "wrong, %" if row == len(ROWS) - 1 else "", label if column == 0 else "")
+        head_panel(panels[0, column], title)
+    legend_above(figure, panels[0, 0], columns=4)
+    figure.savefig(path, dpi=110, facecolor="white")
+
+
+def _is_of(case: Case, kind: Case) -> bool:
+    return (case.id_delay_s, case.gyro_bias_scale, case.wrong_id_share, case.tracks) == (
+        kind.id_delay_s,
+        kind.gyro_bias_scale,
+        kind.wrong_id_share,
+        kind.tracks,
+    )
+
+
+def _panel(panel: Axes, cases: dict[float, dict[str, dict[str, float]]], error: str) -> None:
+    """Mean and standard error at each rate; where a run has no figure there is no mean, and no point."""
+    assert set(DRAWN) < set(ESTIMATORS)
+    percent = [100 * rate for rate in cases]
+    if error != "landmarks":
+        means = [told["dead reckoning"][f"{error}_m"] for told in cases.values()]
+        panel.plot(percent, means, color=MUTED, linewidth=1.0, label="dead reckoning")
+    for name, (index, line) in DRAWN.items():
+        means, errors = ([told[name][f"{error}{of}_m"] for told in cases.values()] for of in ("", "_error"))
+        own = colour(index)
+        panel.errorbar(percent, means, errors, color=own, linestyle=line, linewidth=1.4, capsize=2, label=name)
+    logarithmic(panel, "y")
