@@ -67,9 +67,9 @@ class Stopwatch:
 def measure(suite: Path, folder: Path, workers: int) -> Stopwatch:
     """All runs by so many workers."""
     file = read_suite(suite)
-    batch = Batch.open(file, folder)
     watch = Stopwatch()
-    batch.run(Where(workers), limits_of(file, None), watch.keep)
+    with Batch.opened(file, folder) as batch:
+        batch.run(Where(workers), limits_of(file, None), watch.keep)
     note(f"{workers} workers: {watch.total_s():.1f} s")
     return watch
 

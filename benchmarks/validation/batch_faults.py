@@ -153,14 +153,14 @@ class FullDisk(Store):
 
 def full_disk(suite: Path, folder: Path) -> int:
     """How many runs are lost when the disk is full for a while; the batch must say so."""
-    batch = Batch.open(read_suite(suite), folder)
-    full = Batch(batch.file, batch.runs, FullDisk(folder))
-    try:
-        full.run(Where(WORKERS), Limits(3600.0), lambda _run, _outcome: None)
-    except BatchError as error:
-        note(str(error))
-    else:
-        raise RuntimeError("a full disk went unnoticed")
+    with Batch.opened(read_suite(suite), folder) as batch:
+        full = Batch(batch.file, batch.runs, FullDisk(folder))
+        try:
+            full.run(Where(WORKERS), Limits(3600.0), lambda _run, _outcome: None)
+        except BatchError as error:
+            note(str(error))
+        else:
+            raise RuntimeError("a full disk went unnoticed")
     kept = done(folder)
     finish(suite, folder)
     return len(kept - done(folder))

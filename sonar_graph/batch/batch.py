@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sonar_graph.batch.execution import Where, run_batch
+from sonar_graph.batch.lock import only_batch_in
 from sonar_graph.batch.plan import plan_runs
 from sonar_graph.batch.planned import Limits, Outcome, PlannedRun, Row
 from sonar_graph.batch.results import write_results
@@ -27,20 +28,22 @@ class Batch:
     store: Store
 
     @classmethod
-    def open(cls, file: SuiteFile, folder: Path) -> Batch:
-        """Plan a suite, then find out what of it is done.
+    @contextlib.contextmanager
+    def opened(cls, file: SuiteFile, folder: Path) -> Iterator[Batch]:
+        """Plan a suite, find out what of it is done, and keep other batches out of the folder while the block runs.
 
         Raises
         ------
         BatchError
-            When the suite has a mistake; the folder is not touched then.
+            When the suite has a mistake, or another batch runs in the folder; no file in it is touched then.
         """
         runs = plan_runs(file)
         store = Store(folder)
-        store.remove_partial()
-        with replacing(folder / SUITE) as partial:
-            partial.write_text(file.text, encoding="utf-8")
-        return cls(file, runs, store)
+        with only_batch_in(folder):
+            store.remove_partial()
+            with replacing(folder / SUITE) as partial:
+                partial.write_text(file.text, encoding="utf-8")
+            yield cls(file, runs, store)
 
     def rows(self) -> dict[str, Row]:
         """The rows of the runs that are done, by key."""

@@ -2,6 +2,7 @@
 
 ::
 
+    DIR/.lock                   held by the batch that runs
     DIR/suite.toml              the suite, as it was given
     DIR/results.parquet         one row a run
     DIR/runs/KEY/row.json       the row of a run

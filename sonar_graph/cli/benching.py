@@ -65,13 +65,13 @@ def bench(
     """
     if workers is not None and scheduler is not None:
         raise typer.BadParameter("--workers is for this machine, --scheduler for a cluster; give one of them")
-    batch, limits, where = _opened(suite, output, workers, scheduler, timeout_s)
-    if retry_failed:
-        batch.discard_failed()
-    counts = _run(batch, where, limits)
-    typer.echo(f"Runs: {_told(counts)}")
-    typer.echo(f"Results: {output / 'results.parquet'}")
-    typer.echo(f"Report: {write_report_of(output)}")
+    with _opened(suite, output, timeout_s) as (batch, limits):
+        if retry_failed:
+            batch.discard_failed()
+        counts = _run(batch, _where(workers, scheduler), limits)
+        typer.echo(f"Runs: {_told(counts)}")
+        typer.echo(f"Results: {output / 'results.parquet'}")
+        typer.echo(f"Report: {write_report_of(output)}")
     if reference is not None:
         exit_by_gate(output, reference)
     elif set(counts) - {"ok"}:
@@ -102,18 +102,22 @@ def write_report_of(folder: Path) -> Path:
         return write_batch_report(read_batch(folder), folder)
 
 
-def _opened(
-    suite: Path, output: Path, workers: int | None, scheduler: str | None, timeout_s: float | None
-) -> tuple[Batch, Limits, Where]:
+@contextmanager
+def _opened(suite: Path, output: Path, timeout_s: float | None) -> Iterator[tuple[Batch, Limits]]:
     try:
         from sonar_graph.batch.batch import Batch, limits_of
-        from sonar_graph.batch.execution import Where
         from sonar_graph.batch.suite import read_suite
     except ModuleNotFoundError as error:
         raise BatchError(f"bench needs {error.name}, which is not installed: {INSTALL}") from error
     file = read_suite(suite)
-    batch = Batch.open(file, writable_folder(output))
-    return batch, limits_of(file, timeout_s), Where(workers, scheduler)
+    with Batch.opened(file, writable_folder(output)) as batch:
+        yield batch, limits_of(file, timeout_s)
+
+
+def _where(workers: int | None, scheduler: str | None) -> Where:
+    from sonar_graph.batch.execution import Where
+
+    return Where(workers, scheduler)
 
 
 def _run(batch: Batch, where: Where, limits: Limits) -> Counter[str]:

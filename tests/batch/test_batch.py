@@ -54,8 +54,8 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def finished(suite: Path, folder: Path) -> list[dict[str, Any]]:
-    counts = Batch.open(read_suite(suite), folder).run(HERE, LIMITS, nobody)
-    assert counts == {"ok": 4}
+    with Batch.opened(read_suite(suite), folder) as batch:
+        assert batch.run(HERE, LIMITS, nobody) == {"ok": 4}
     return table(folder)
 
 
@@ -73,8 +73,7 @@ def test_resumed_batch_has_the_table_of_an_undisturbed_one(
 
     for count in (1, 2, 3):
         monkeypatch.setattr(batch_module, "run_batch", interrupted)
-        batch = Batch.open(read_suite(suite), tmp_path / "b")
-        with pytest.raises(Interrupted):
+        with Batch.opened(read_suite(suite), tmp_path / "b") as batch, pytest.raises(Interrupted):
             batch.run(HERE, LIMITS, nobody)
         assert len(table(tmp_path / "b")) == count
         assert batch.resuming().startswith(f"{count} of 4 runs are done and kept")
@@ -110,8 +109,7 @@ def test_full_disk_is_told_and_loses_no_run_that_is_done(
 
     monkeypatch.setattr(batch_module, "run_batch", kept)
     folder = tmp_path / "out"
-    batch = Batch.open(read_suite(suite), folder)
-    with monkeypatch.context() as patch:
+    with Batch.opened(read_suite(suite), folder) as batch, monkeypatch.context() as patch:
         patch.setattr(batch_module, "write_results", no_space)
         with pytest.raises(BatchError, match=r"No space left.*2 of 4 runs are done and kept; the same command"):
             Batch(batch.file, batch.runs, Full(folder)).run(HERE, LIMITS, nobody)
@@ -123,18 +121,32 @@ def test_full_disk_is_told_and_loses_no_run_that_is_done(
 
 def test_mistake_in_a_suite_leaves_the_folder_alone(write_suite: WriteSuite, tmp_path: Path) -> None:
     suite = write_suite(HEADER, BASIN, '[[estimators]]\nname = "no such"\n')
-    with pytest.raises(BatchError):
-        Batch.open(read_suite(suite), tmp_path / "out")
+    with pytest.raises(BatchError), Batch.opened(read_suite(suite), tmp_path / "out"):
+        pass
     assert not (tmp_path / "out").exists()
 
 
 def test_failed_runs_are_kept_until_they_are_discarded(suite: Path, tmp_path: Path, in_this_process: None) -> None:
-    batch = Batch.open(read_suite(suite), tmp_path)
-    batch.store.write(batch.runs[0].key, Outcome({"status": "timeout", "reason": "took longer than 1 s"}))
-    assert batch.run(HERE, LIMITS, nobody) == {"ok": 3, "timeout": 1}
-    assert batch.run(HERE, LIMITS, nobody) == {"ok": 3, "timeout": 1}
-    batch.discard_failed()
-    assert batch.run(HERE, LIMITS, nobody) == {"ok": 4}
+    with Batch.opened(read_suite(suite), tmp_path) as batch:
+        batch.store.write(batch.runs[0].key, Outcome({"status": "timeout", "reason": "took longer than 1 s"}))
+        assert batch.run(HERE, LIMITS, nobody) == {"ok": 3, "timeout": 1}
+        assert batch.run(HERE, LIMITS, nobody) == {"ok": 3, "timeout": 1}
+        batch.discard_failed()
+        assert batch.run(HERE, LIMITS, nobody) == {"ok": 4}
+
+
+def test_second_batch_in_a_folder_is_refused_and_touches_nothing(suite: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    with Batch.opened(read_suite(suite), folder) as batch:
+        half_written = folder / "runs" / f".partial-{batch.runs[0].key}-1"
+        half_written.mkdir()
+        suite.write_text(suite.read_text().replace("short", "other"))
+        with pytest.raises(BatchError, match="another batch is running"), Batch.opened(read_suite(suite), folder):
+            pass
+        assert half_written.is_dir()
+        assert 'name = "short"' in (folder / "suite.toml").read_text()
+    with Batch.opened(read_suite(suite), folder):
+        assert not half_written.exists()
 
 
 def test_timeout_that_is_given_goes_before_the_one_of_the_suite(write_suite: WriteSuite) -> None:
