@@ -81,16 +81,26 @@ def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], worke
     """``function`` of every item, in the order of the items, by one-thread processes; one worker: in this one."""
     for variable in THREAD_VARIABLES:
         os.environ[variable] = "1"
-    if workers <= 1:
-        return [function(item) for item in items]
+    results: dict[int, Result] = {}
+    for place, result in _one_by_one(function, items) if workers <= 1 else _by_processes(function, items, workers):
+        results[place] = result
+        note(f"{what} {items[place]}: {len(results)} of {len(items)}")
+    return [results[place] for place in range(len(items))]
+
+
+def _one_by_one(function: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+    for place, item in enumerate(items):
+        yield place, function(item)
+
+
+def _by_processes(
+    function: Callable[[Item], Result], items: Sequence[Item], workers: int
+) -> Iterator[tuple[int, Result]]:
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(workers, len(items)), mp_context=context) as pool:
         jobs = {pool.submit(function, item): place for place, item in enumerate(items)}
-        results: dict[int, Result] = {}
         for job in as_completed(jobs):
-            results[jobs[job]] = job.result()
-            note(f"{what} {items[jobs[job]]}: {len(results)} of {len(items)}")
-    return [results[place] for place in range(len(items))]
+            yield jobs[job], job.result()
 
 
 def print_table(headers: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

@@ -14,7 +14,8 @@ from sonar_graph.slam.anonymous_landmarks import FIRST_ANONYMOUS_ID
 from sonar_graph.slam.joint_compatibility import UNPAIRED, Innovations, Pairing, pair_jointly
 from sonar_graph.states import Outcome
 
-from .test_deferred_identities import assert_marginals_agree, assert_outcomes_account, largest_difference, run
+from .graph_comparison import assert_marginals_agree, largest_difference
+from .late_identities import assert_outcomes_account, run
 
 TWO_LAPS = {"duration_s": 260.0, "laps": 2, "speed_m_s": 0.4, "seed": 3, "gyro_bias_scale": 0.0}
 CLEAN = {"tracks": True, "detection_probability": 1.0, "false_detections_per_frame": 0.0}

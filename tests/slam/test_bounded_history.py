@@ -18,8 +18,8 @@ from sonar_graph.slam.isam2 import Isam2, Isam2Params
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.states import Estimate, Outcome
 
+from .late_identities import on_the_rail
 from .rail import STEP_S, rail
-from .test_deferred_identities import on_the_rail
 
 LAG_S = 5.0
 

@@ -15,7 +15,8 @@ from sonar_graph.slam.sighting import Sighting
 from sonar_graph.slam.sightings import SightingPolicy
 from sonar_graph.slam.sightlines import Sightline
 from sonar_graph.states import Outcome
-from tests.slam.test_sightings import CALIBRATION, FLOOR, T0_NS, Dive, spherical
+
+from .dive import CALIBRATION, FLOOR, T0_NS, Dive, spherical
 
 PLACES = {7: np.array([2.6, 0.5, -1.0]), 4: np.array([2.9, 1.4, -1.0]), 9: np.array([3.2, 0.1, -1.0])}
 """Of landmarks, in the world of `Dive`: on the floor, within its sonar's fan."""

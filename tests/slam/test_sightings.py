@@ -1,3 +1,5 @@
+"""What becomes of each detection of a frame, and with what noise it is believed."""
+
 from dataclasses import replace
 
 import gtsam
@@ -7,170 +9,17 @@ from gtsam.symbol_shorthand import L, X
 from scipy.stats import chi2
 
 from sonar_graph.calibration import (
-    Calibration,
     DvlCalibration,
-    FloorPrior,
-    ImuCalibration,
     Mounting,
     SonarCalibration,
     Start,
 )
-from sonar_graph.measurements import Dvl, Floats, Imu, LandmarkDetections
-from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
-from sonar_graph.slam.sightings import SightingPolicy, Sightings
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.measurements import Floats
+from sonar_graph.slam.keyframes import KeyframePolicy
+from sonar_graph.slam.sightings import SightingPolicy
 from sonar_graph.states import Outcome
 
-NS = 1_000_000_000
-T0_NS = 1_500_000_000 * NS
-START_NS = T0_NS - 1
-POLICY = KeyframePolicy(max_interval_s=5.0, motion_noise_share=1e9, bias_interval_s=60.0)
-TRUSTING = SightingPolicy(identity_probability=0.7, gate_probability=0.99, kernel="none", kernel_width=2.0)
-SONAR = SonarCalibration(
-    mounting=Mounting(translation_m=(0.3, 0.1, -0.1), rpy_rad=(0.0, 0.4, 0.2)),
-    range_sigma_m=0.02,
-    azimuth_sigma_rad=0.01,
-)
-FLOOR = FloorPrior(z_m=-1.0, sigma_m=0.01)
-CALIBRATION = Calibration(
-    imu=ImuCalibration(gyro_bias_sigma=0.0),
-    sonar=SONAR,
-    start=Start(position_sigma_m=(0.05, 0.02, 0.01), rpy_sigma_rad=(0.01, 0.01, 0.03)),
-    use_gravity=False,
-)
-
-
-class Dive:
-    """Everything up to the sightings, driving straight on at 0.5 m/s for 10 s."""
-
-    def __init__(
-        self,
-        calibration: Calibration = CALIBRATION,
-        policy: SightingPolicy = TRUSTING,
-        lag_s: float = 1e9,
-        smoother: Smoother | None = None,
-    ) -> None:
-        self.smoother = smoother or Smoother(lag_s, 1e-6, 1e9)
-        self.keyframes = Keyframes(calibration, POLICY, self.smoother)
-        self.sightings = Sightings(calibration, policy, self.smoother, self.keyframes)
-        stamps = T0_NS + np.arange(-1, 101) * NS // 10
-        doppler = np.r_[START_NS, stamps[1:]]  # the second row confirms the first
-        n = len(stamps)
-        velocity = np.tile([0.5, 0.0, 0.0], (n, 1))
-        self.keyframes.add(
-            Imu(stamps, np.zeros((n, 3)), np.full((n, 3), np.nan)),
-            Dvl(doppler, velocity, np.full((n, 3, 3), np.nan)),
-            None,
-        )
-
-    def see(
-        self, after_s: float, *rows: tuple[int, float, float], probability: float = 0.9, cov: Floats | None = None
-    ) -> None:
-        stamp = T0_NS + round(after_s * NS)
-        self.keyframes.advance(stamp)
-        self.sightings.add(frame(stamp, rows, probability, cov))
-
-    @property
-    def outcomes(self) -> list[Outcome]:
-        return self.sightings.journal.log().outcomes
-
-
-def frame(stamp: int, rows, probability: float = 0.9, cov: Floats | None = None) -> LandmarkDetections:
-    n = len(rows)
-    ids, ranges, azimuths = zip(*rows, strict=True)
-    return LandmarkDetections(
-        np.full(n, stamp),
-        np.array(ranges),
-        np.array(azimuths),
-        np.tile(np.full((2, 2), np.nan) if cov is None else cov, (n, 1, 1)),
-        np.array(ids)[:, None],
-        np.full((n, 1), probability),
-    )
-
-
-def spherical(x: float, p: Floats) -> tuple[float, float]:
-    """Range and azimuth of a point from the mounted sonar of a level vehicle at (x, 0, 0), by scipy-free algebra."""
-    (roll, pitch, yaw), t = SONAR.mounting.rpy_rad, np.array(SONAR.mounting.translation_m)
-    assert roll == 0
-    Ry = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
-    Rz = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    q = (Rz @ Ry).T @ (p - [x, 0, 0] - t)
-    return float(np.linalg.norm(q)), float(np.arctan2(q[1], q[0]))
-
-
-def test_a_first_sighting_places_a_landmark_on_the_centre_beam():
-    """Range 3 m straight ahead of a sonar that looks 0.4 rad down and 0.2 rad to the left."""
-    dive = Dive()
-    dive.see(0.0, (5, 3.0, 0.0))
-    beam = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
-    assert dive.outcomes == [Outcome.NEW]
-    assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(np.array([0.3, 0.1, -0.1]) + 3.0 * beam)
-
-
-def test_a_known_floor_gives_the_elevation():
-    dive = Dive(CALIBRATION.model_copy(update={"floor": FLOOR}))
-    truth = np.array([2.6, 0.9, FLOOR.z_m])
-    dive.see(0.0, (5, *spherical(0.0, truth)))
-    assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(truth, abs=1e-9)
-    assert dive.smoother.graph.size() == 1 + 4
-    dive.smoother.update(dive.keyframes.newest_s)
-    assert np.sqrt(dive.smoother.covariance(L(5))[2, 2]) == pytest.approx(FLOOR.sigma_m, rel=1e-3)
-
-
-def test_a_floor_out_of_the_aperture_is_believed_all_the_same():
-    """0.2 rad below the centre beam, where half the aperture is 0.12 rad: first put on the beam, then on the floor."""
-    dive = Dive(CALIBRATION.model_copy(update={"floor": FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.6), sigma_m=0.01)}))
-    dive.see(0.0, (5, 3.0, 0.0))
-    for _ in range(5):
-        dive.smoother.update(dive.keyframes.newest_s)
-    assert dive.outcomes == [Outcome.NEW]
-    assert dive.smoother.values.atPoint3(L(5))[2] == pytest.approx(-0.1 - 3.0 * np.sin(0.6), abs=1e-3)
-    assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-3)
-
-
-def test_a_landmark_that_cannot_stand_on_the_floor_does_not_drag_the_vehicle_there():
-    """0.5 rad below the centre beam is seven sigmas of the aperture: no floor is said, but the aperture is."""
-    floor = FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.9), sigma_m=0.01)
-    dive, without = Dive(CALIBRATION.model_copy(update={"floor": floor})), Dive()
-    for each in (dive, without):
-        each.see(0.0, (5, 3.0, 0.0))
-        each.smoother.update(each.keyframes.newest_s)
-    assert dive.smoother.graph.equals(without.smoother.graph, 1e-12)
-    assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-9)
-
-
-def test_a_doubtful_height_of_the_vehicle_lets_the_floor_be_farther():
-    floor = FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.9), sigma_m=0.01)
-    start = Start(position_sigma_m=(0.05, 0.02, 2.0), rpy_sigma_rad=(0.01, 0.01, 0.03))
-    dive = Dive(CALIBRATION.model_copy(update={"floor": floor, "start": start}))
-    dive.see(0.0, (5, 3.0, 0.0))
-    for _ in range(5):
-        dive.smoother.update(dive.keyframes.newest_s)
-    assert dive.smoother.values.atPoint3(L(5))[2] == pytest.approx(floor.z_m, abs=1e-2)
-
-
-def test_a_frame_between_keyframes_is_seen_from_where_the_vehicle_was():
-    """0.35 s after the keyframe the vehicle is 0.175 m further on."""
-    dive = Dive()
-    dive.see(0.35, (5, 3.0, 0.0))
-    beam = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
-    assert dive.keyframes.stamps_ns == [START_NS]
-    assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(np.array([0.475, 0.1, -0.1]) + 3.0 * beam)
-
-
-def test_elevation_is_said_once_for_a_landmark():
-    """It does not vary as noise would: many sightings from one place leave its height as unknown as the first."""
-    dive = Dive(
-        CALIBRATION.model_copy(update={"start": Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)})
-    )
-    for k in range(9):
-        dive.see(0.01 * k, (5, 3.0, 0.0))
-    dive.smoother.update(dive.keyframes.newest_s)
-    up = np.array([np.cos(0.2) * np.sin(0.4), np.sin(0.2) * np.sin(0.4), np.cos(0.4)])
-    cov = dive.smoother.covariance(L(5))
-    elevation_sigma = SONAR.elevation_aperture_rad / np.sqrt(12)
-    assert np.sqrt(up @ cov @ up) == pytest.approx(3.0 * np.tan(elevation_sigma), rel=0.01)
-    assert dive.outcomes == [Outcome.NEW] + [Outcome.USED] * 8
+from .dive import CALIBRATION, NS, POLICY, SONAR, T0_NS, Dive, frame, spherical
 
 
 def test_innovation_and_its_covariance_are_those_of_the_joint_prediction():
@@ -320,72 +169,6 @@ def test_azimuths_either_side_of_pi_are_near_each_other():
     assert log.innovations[-1] == pytest.approx([0.0, 0.01], abs=1e-6)
 
 
-def waiting(greatest_gain: float) -> Dive:
-    """A landmark that has been seen once by a vehicle that is sure of where it is."""
-    sure = Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)
-    dive = Dive(CALIBRATION.model_copy(update={"start": sure}))
-    dive.smoother = dive.keyframes.smoother = dive.sightings.smoother = Smoother(1e9, 1e-6, 1e9, greatest_gain)
-    dive.see(0.0, (5, 3.0, 0.0))
-    return dive
-
-
-def range_variance(dive: Dive) -> float:
-    beam = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
-    return float(beam @ dive.smoother.covariance(L(5)) @ beam)
-
-
-def test_sightings_wait_until_together_they_have_something_to_tell():
-    """After n sightings range and azimuth are known to 1/n of the noise: the next would add 1/n, and so on."""
-    dive, known, waited = waiting(0.45), [], []
-    for _ in range(6):
-        known.append(0.02**2 / range_variance(dive))
-        dive.see(0.0, (5, 3.0, 0.0))
-        waited.append(dive.smoother.waiting_gain)
-    assert known == pytest.approx([1, 2, 3, 3, 5, 5], rel=1e-3)
-    assert waited == pytest.approx([0, 0, 1 / 3, 0, 1 / 5, 2 / 5], rel=1e-3, abs=1e-9)
-    assert dive.outcomes == [Outcome.NEW] + [Outcome.USED] * 6
-
-
-def test_with_no_gain_to_wait_for_none_waits():
-    dive = waiting(0.0)
-    for n in range(1, 7):
-        assert 0.02**2 / range_variance(dive) == pytest.approx(n, rel=1e-3)
-        dive.see(0.0, (5, 3.0, 0.0))
-
-
-@pytest.mark.parametrize("what", ["keyframe", "landmark"])
-def test_what_waits_is_used_with_the_next_keyframe_or_landmark(what):
-    dive = waiting(1e9)
-    for _ in range(3):
-        dive.see(0.0, (5, 3.0, 0.0))
-    assert range_variance(dive) == pytest.approx(0.02**2, rel=1e-3)
-    if what == "keyframe":
-        dive.keyframes.advance(T0_NS + 5 * NS)
-        dive.keyframes.update_if_due()
-    else:
-        dive.see(0.0, (6, 3.0, 0.3))
-    assert range_variance(dive) == pytest.approx(0.02**2 / 4, rel=0.01)
-
-
-def test_a_refused_detection_does_not_add_to_what_waits():
-    dive = waiting(1e9)
-    dive.see(0.0, (5, 9.0, 0.0))
-    assert dive.outcomes[-1] is Outcome.GATED
-    assert dive.smoother.waiting_gain == 0.0
-
-
-def test_a_frame_that_brings_a_keyframe_hangs_on_it():
-    dive = Dive()
-    dive.keyframes.policy = replace(POLICY, motion_noise_share=0.0)
-    dive.see(1.05, (5, 3.0, 0.0))
-    assert dive.keyframes.stamps_ns == [START_NS, T0_NS + NS]
-    graph = dive.smoother.graph
-    assert {tuple(graph.at(k).keys()) for k in range(graph.size())} == {(X(0),), (X(0), X(1)), (X(1), L(5))}
-    beam = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
-    seen = np.array([0.3 + 0.5 * 1.05, 0.1, -0.1]) + 3.0 * beam
-    assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(seen, abs=1e-6)
-
-
 def factor_of(dive: Dive, kind: type) -> gtsam.NonlinearFactor:
     graph = dive.smoother.graph
     (factor,) = [graph.at(k) for k in range(graph.size()) if isinstance(graph.at(k), kind)]
@@ -405,13 +188,6 @@ def test_factors_of_a_frame_off_its_keyframe_carry_the_noise_of_the_motion():
     assert sigmas[0] == pytest.approx(SONAR.range_sigma_m)
     assert sigmas[1] == pytest.approx(np.sqrt(SONAR.range_sigma_m**2 + motion.covariance[3, 3]), rel=1e-2)
     assert sigmas[1] > 1.5 * sigmas[0]
-
-
-def test_a_sightline_begins_where_the_sonar_was_at_the_frame():
-    dive = Dive()
-    dive.see(0.35, (5, 3.0, 0.0))
-    placed = dive.smoother.sightlines.placed_anew(dive.smoother.values, [L(5)])
-    assert placed.atPoint3(L(5)) == pytest.approx(dive.smoother.values.atPoint3(L(5)))
 
 
 def test_rows_of_one_frame_keep_their_own_covariance():
