@@ -108,7 +108,7 @@ def power_told(tests: Tests) -> list[str]:
     }
     if not blind:
         return []
-    listed = ", ".join(f"{log} ({pairs} pairs)" for log, pairs in blind.items())
+    listed = ", ".join(f"{log} ({pairs} pair{'s' * (pairs != 1)})" for log, pairs in blind.items())
     return [f"Too few pairs for any corrected p value to fall below {SIGNIFICANT:g}: {listed}. Add seeds."]
 
 

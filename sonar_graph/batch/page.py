@@ -139,8 +139,8 @@ def _drawn(drawings: Any) -> list[Drawing]:
 def _summary(batch: RecordedBatch) -> str:
     seeds = max(len(batch.group(log, name)) for log, name in _places(batch))
     return (
-        f"{len(batch.runs)} runs of {len(batch.contestants)} estimators on {len(batch.logs)} logs, up to {seeds} seeds "
-        f"each, compared with {batch.reference}."
+        f"{len(batch.runs)} runs of {len(batch.contestants)} estimators on {len(batch.logs)} logs, up to {seeds} "
+        f"seed{'s' * (seeds != 1)} each, compared with {batch.reference}."
     )
 
 
