@@ -8,12 +8,7 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 from scipy.stats import chi2
 
-from sonar_graph.calibration import (
-    DvlCalibration,
-    Mounting,
-    SonarCalibration,
-    Start,
-)
+from sonar_graph.calibration import DvlCalibration, Mounting, SonarCalibration, Start
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.keyframes import KeyframePolicy
 from sonar_graph.slam.sightings import SightingPolicy

@@ -1,0 +1,88 @@
+"""A straight dive past objects, taken in up to the sightings."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sonar_graph.calibration import Calibration, FloorPrior, ImuCalibration, Mounting, SonarCalibration, Start
+from sonar_graph.measurements import Dvl, Floats, Imu, LandmarkDetections
+from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
+from sonar_graph.slam.sightings import SightingPolicy, Sightings
+from sonar_graph.slam.smoother import Smoother
+from sonar_graph.states import Outcome
+
+NS = 1_000_000_000
+T0_NS = 1_500_000_000 * NS
+START_NS = T0_NS - 1
+POLICY = KeyframePolicy(max_interval_s=5.0, motion_noise_share=1e9, bias_interval_s=60.0)
+TRUSTING = SightingPolicy(identity_probability=0.7, gate_probability=0.99, kernel="none", kernel_width=2.0)
+SONAR = SonarCalibration(
+    mounting=Mounting(translation_m=(0.3, 0.1, -0.1), rpy_rad=(0.0, 0.4, 0.2)),
+    range_sigma_m=0.02,
+    azimuth_sigma_rad=0.01,
+)
+FLOOR = FloorPrior(z_m=-1.0, sigma_m=0.01)
+CALIBRATION = Calibration(
+    imu=ImuCalibration(gyro_bias_sigma=0.0),
+    sonar=SONAR,
+    start=Start(position_sigma_m=(0.05, 0.02, 0.01), rpy_sigma_rad=(0.01, 0.01, 0.03)),
+    use_gravity=False,
+)
+
+
+class Dive:
+    """Everything up to the sightings, driving straight on at 0.5 m/s for 10 s."""
+
+    def __init__(
+        self,
+        calibration: Calibration = CALIBRATION,
+        policy: SightingPolicy = TRUSTING,
+        lag_s: float = 1e9,
+        smoother: Smoother | None = None,
+    ) -> None:
+        self.smoother = smoother or Smoother(lag_s, 1e-6, 1e9)
+        self.keyframes = Keyframes(calibration, POLICY, self.smoother)
+        self.sightings = Sightings(calibration, policy, self.smoother, self.keyframes)
+        stamps = T0_NS + np.arange(-1, 101) * NS // 10
+        doppler = np.r_[START_NS, stamps[1:]]  # the second row confirms the first
+        n = len(stamps)
+        velocity = np.tile([0.5, 0.0, 0.0], (n, 1))
+        self.keyframes.add(
+            Imu(stamps, np.zeros((n, 3)), np.full((n, 3), np.nan)),
+            Dvl(doppler, velocity, np.full((n, 3, 3), np.nan)),
+            None,
+        )
+
+    def see(
+        self, after_s: float, *rows: tuple[int, float, float], probability: float = 0.9, cov: Floats | None = None
+    ) -> None:
+        stamp = T0_NS + round(after_s * NS)
+        self.keyframes.advance(stamp)
+        self.sightings.add(frame(stamp, rows, probability, cov))
+
+    @property
+    def outcomes(self) -> list[Outcome]:
+        return self.sightings.journal.log().outcomes
+
+
+def frame(stamp: int, rows, probability: float = 0.9, cov: Floats | None = None) -> LandmarkDetections:
+    n = len(rows)
+    ids, ranges, azimuths = zip(*rows, strict=True)
+    return LandmarkDetections(
+        np.full(n, stamp),
+        np.array(ranges),
+        np.array(azimuths),
+        np.tile(np.full((2, 2), np.nan) if cov is None else cov, (n, 1, 1)),
+        np.array(ids)[:, None],
+        np.full((n, 1), probability),
+    )
+
+
+def spherical(x: float, p: Floats) -> tuple[float, float]:
+    """Range and azimuth of a point from the mounted sonar of a level vehicle at (x, 0, 0), by scipy-free algebra."""
+    (roll, pitch, yaw), t = SONAR.mounting.rpy_rad, np.array(SONAR.mounting.translation_m)
+    assert roll == 0
+    Ry = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
+    Rz = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    q = (Rz @ Ry).T @ (p - [x, 0, 0] - t)
+    return float(np.linalg.norm(q)), float(np.arctan2(q[1], q[0]))

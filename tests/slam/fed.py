@@ -1,0 +1,138 @@
+"""Smoothers that were fed a run, with every factor that they were given, and what these say by numpy."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import B, L, X
+
+import sonar_graph.slam.sightlines as sightlines_module
+from sonar_graph.measurements import Floats
+from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
+from sonar_graph.slam import factors
+from sonar_graph.slam.batch import solve
+from sonar_graph.slam.smoother import Smoother
+
+from .graphs import information
+from .rail import RANGE_SIGMA_M, STEP_S, VELOCITY_SIGMA_M_S, calibration, rail
+
+FOREVER_S = 1e9
+NEVER_M = 1e9
+SONAR = gtsam.Pose3(gtsam.Rot3.Ry(0.4), np.array([0.3, 0.0, -0.1]))
+
+
+def plain(noise):
+    return noise
+
+
+class Fed:
+    """A smoother, and on the side every factor that it was given."""
+
+    def __init__(self, lag_s: float, stale_shift_m: float = NEVER_M) -> None:
+        self.smoother = Smoother(lag_s, 1e-6, stale_shift_m)
+        self.given: list[gtsam.NonlinearFactor] = []
+        self.handles: list[int] = []
+
+    def add(self, new: list[gtsam.NonlinearFactor]) -> None:
+        self.given += new
+        self.handles += self.smoother.add(new)
+
+    def handles_on(self, *keys: int) -> list[int]:
+        """Of the factors on just these variables."""
+        return [h for h, factor in zip(self.handles, self.given, strict=True) if set(factor.keys()) == set(keys)]
+
+
+def on_the_rail(nodes: int, lag_s: float, stale_shift_m: float = NEVER_M, held: dict[int, float] | None = None) -> Fed:
+    _, numbers = rail(nodes)
+    fed, seen = Fed(lag_s, stale_shift_m), set()
+    fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
+    fed.add([factors.start_prior(X(0), calibration())])
+    cov = np.diag([1e-12] * 3 + [(VELOCITY_SIGMA_M_S * STEP_S) ** 2] * 3)
+    for k in range(1, nodes):
+        moved = gtsam.Pose3(gtsam.Rot3(), np.array([numbers.displacements_m[k - 1], 0, 0]))
+        pose = fed.smoother.values.atPose3(X(k - 1)).compose(moved)
+        fed.smoother.add_pose(X(k), pose, k * STEP_S)
+        if held and X(k) in held:
+            fed.smoother.hold(held)
+        motion = PreintegratedMotion(moved, cov, np.zeros((6, 3)), np.zeros(3), STEP_S, np.zeros(3))
+        fed.add([factors.odometry(X(k - 1), X(k), motion)])
+        for _, i, distance in (r for r in numbers.ranges if r[0] == k):
+            if i not in seen:
+                fed.smoother.add_landmark(L(i), pose.translation() + distance * np.eye(3)[0])
+            z, R = np.array([distance, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e6])
+            fed.add(factors.landmark_sighting(X(k), L(i), gtsam.Pose3(), z, R, plain, None if i in seen else 3e-4))
+            seen.add(i)
+        fed.smoother.update(k * STEP_S)
+    return fed
+
+
+def in_the_basin(
+    steps: int, lag_s: float, stale_shift_m: float = NEVER_M, seed: int = 0, bias_steps: int = 1000
+) -> Fed:
+    """Circles past three landmarks with a gyro bias that walks between stretches; nothing about it is linear."""
+    rng = np.random.default_rng(seed)
+    turn = gtsam.Pose3(gtsam.Rot3.Rz(0.25), np.array([0.5, 0.0, 0.0]))
+    landmarks = {3: np.array([3.0, 1.0, -1.0]), 5: np.array([2.0, 4.0, -0.8]), 8: np.array([-1.0, 2.5, -1.2])}
+    cov = np.diag([1e-4] * 3 + [4e-4] * 3)
+    fed, truth, seen = Fed(lag_s, stale_shift_m), gtsam.Pose3(), set()
+    fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
+    fed.smoother.add_bias(B(0), np.zeros(3))
+    prior = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01] * 3 + [0.02] * 3))
+    fed.add([gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), prior), factors.bias_prior(B(0), 0.01)])
+    for k in range(1, steps):
+        truth = truth.compose(turn)
+        moved = turn.compose(gtsam.Pose3.Expmap(np.sqrt(np.diag(cov)) * rng.standard_normal(6)))
+        D_bias = np.vstack([-np.eye(3), np.zeros((3, 3))])
+        motion = PreintegratedMotion(moved, cov, D_bias, np.zeros(3), 1.0, np.zeros(3))
+        fed.smoother.add_pose(X(k), fed.smoother.values.atPose3(X(k - 1)).compose(moved), float(k))
+        fed.add([factors.odometry_with_bias(X(k - 1), X(k), B((k - 1) // bias_steps), motion)])
+        if k % bias_steps == 0:
+            new = k // bias_steps
+            fed.smoother.add_bias(B(new), fed.smoother.values.atPoint3(B(new - 1)))
+            fed.add([factors.bias_walk(B(new - 1), B(new), 0.003)])
+        for i, p in landmarks.items():
+            q = truth.compose(SONAR).transformTo(p)
+            z = np.array([np.linalg.norm(q), np.arctan2(q[1], q[0])]) + [0.02, 0.009] * rng.standard_normal(2)
+            if i not in seen:
+                fed.smoother.add_landmark(L(i), p + 0.3 * rng.standard_normal(3))
+            new = factors.landmark_sighting(
+                X(k), L(i), SONAR, z, np.diag([4e-4, 8e-5]), plain, None if i in seen else 0.3
+            )
+            fed.add(new)
+            seen.add(i)
+        fed.smoother.update(float(k))
+    return fed
+
+
+def dense_covariance(fed: Fed, values: gtsam.Values, keys: list[int]) -> Floats:
+    """Block of the inverse of the information of all factors that were given, by numpy."""
+    every = sorted({key for factor in fed.given for key in list(factor.keys())})
+    sizes = [len(values.zeroVectors().at(key)) for key in every]
+    ends = dict(zip(every, np.cumsum(sizes).tolist(), strict=True))
+    wanted = np.concatenate([np.arange(ends[k] - sizes[every.index(k)], ends[k]) for k in keys])
+    return np.linalg.inv(information(fed.given, values, every))[np.ix_(wanted, wanted)]
+
+
+def settled(fed: Fed, time_s: float) -> Fed:
+    """Updated until nothing is relinearised any more."""
+    for _ in range(8):
+        fed.smoother.update(time_s)
+    return fed
+
+
+def joint(fed: Fed, keys: list[int]) -> Floats:
+    found = fed.smoother.joint_covariance(keys)
+    return np.block([[found.at(a, b) for b in keys] for a in keys])
+
+
+def counted_solves(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Sizes of the graphs that the smoother solves from now on."""
+    sizes: list[int] = []
+
+    def counting(graph, values):
+        sizes.append(graph.size())
+        return solve(graph, values)
+
+    monkeypatch.setattr(sightlines_module, "solve", counting)
+    return sizes

@@ -1,0 +1,99 @@
+"""Runs whose identities come late, change, or never come."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.sequence import Sequence
+from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.states import Outcome
+
+from .dive import NS, T0_NS, Dive, spherical
+from .rail import rail
+
+FLAT = [0.2, 0.2, 0.2, 0.2]
+IDS = [4, 5, 6, 7]
+LATE = {Outcome.USED_LATER, Outcome.MOVED}
+SURE = {i: [float(i == j) for j in IDS] for i in IDS}
+BASIN = {"duration_s": 130.0, "laps": 1, "seed": 3, "tracks": True}
+TROUBLES = {
+    "late": {"id_delay_s": 4.0},
+    "wrong": {"wrong_id_rate": 1.0, "wrong_id_share": 0.8},
+    "late and wrong": {"id_delay_s": 2.0, "wrong_id_rate": 1.0, "wrong_id_share": 0.6},
+}
+OBJECTS = np.array([[4.0, 0.8, -1.4], [5.0, 0.2, -1.6], [4.5, 1.6, -1.5]])
+GAP_S = 0.7
+
+
+def believing(sequence: Sequence, id_probability: Floats) -> Sequence:
+    assert sequence.detections is not None
+    return replace(sequence, detections=replace(sequence.detections, id_probability=id_probability))
+
+
+def from_the_start(sequence: Sequence) -> Sequence:
+    """The same, had each track's last belief been its first."""
+    seen = sequence.detections
+    assert seen is not None
+    beliefs = seen.id_probability.copy()
+    for number in set(seen.track.tolist()) - {-1}:
+        rows = np.flatnonzero(seen.track == number)
+        beliefs[rows] = beliefs[rows[-1]]
+    return believing(sequence, beliefs)
+
+
+def run(sequence: Sequence, rate_hz: float = 2.0, **params) -> Isam2:
+    estimator = Isam2(sequence.calibration, Isam2Params(**params))
+    for step in sequence.replay(sequence.instants(rate_hz)):
+        estimator.process(step)
+    return estimator
+
+
+def assert_outcomes_account(estimator: Isam2, sequence: Sequence) -> Counter:
+    """One row a detection, in order."""
+    log = estimator.detections()
+    assert sequence.detections is not None
+    assert log.stamps_ns.tolist() == sequence.detections.stamps_ns.tolist()
+    return Counter(log.outcomes)
+
+
+def on_the_rail(beliefs_of_7: list[list[float]], beliefs_of_4: list[float]) -> Sequence:
+    """One track a landmark; what is believed of 7 in its first, second, ... frame, the last for the rest."""
+    sequence, _ = rail()
+    seen = sequence.detections
+    assert seen is not None
+    track = np.where(seen.candidate_ids[:, 0] == 7, 70, 40)
+    beliefs = np.tile(np.array(beliefs_of_4), (len(seen), 1))
+    for n, row in enumerate(np.flatnonzero(track == 70)):
+        beliefs[row] = beliefs_of_7[min(n, len(beliefs_of_7) - 1)]
+    ids = np.tile(IDS, (len(seen), 1))
+    return replace(sequence, detections=replace(seen, candidate_ids=ids, id_probability=beliefs, track=track))
+
+
+class Watch(Dive):
+    """Three objects, each watched in every frame."""
+
+    def watch(self, number: int, beliefs: list[list[float]]) -> None:
+        stamp = T0_NS + round(number * GAP_S * NS)
+        z = np.array([spherical(0.5 * number * GAP_S, p) for p in OBJECTS])
+        self.keyframes.advance(stamp)
+        self.sightings.add(detected(stamp, z, beliefs, np.arange(3)))
+        self.keyframes.update_if_due()
+
+
+def detected(stamp: int, z: Floats, beliefs: list[list[float]], track) -> LandmarkDetections:
+    n = len(z)
+    ids = np.tile(IDS, (n, 1))
+    return LandmarkDetections(
+        np.full(n, stamp), z[:, 0], z[:, 1], np.full((n, 2, 2), np.nan), ids, np.array(beliefs, float), np.array(track)
+    )
+
+
+def see(dive: Dive, after_s: float, belief: list[float], track: int = 3, off_m: float = 0.0) -> None:
+    stamp = T0_NS + round(after_s * NS)
+    range_m, azimuth_rad = spherical(0.5 * after_s, OBJECTS[0])
+    dive.keyframes.advance(stamp)
+    dive.sightings.add(detected(stamp, np.array([[range_m + off_m, azimuth_rad]]), [belief], [track]))
