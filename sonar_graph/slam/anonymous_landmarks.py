@@ -25,8 +25,7 @@ from sonar_graph.slam.landmark_merging import LandmarkMerging
 from sonar_graph.slam.landmark_sightings import LandmarkSightings
 from sonar_graph.slam.models import wrap_angle
 from sonar_graph.slam.placing import place, source
-from sonar_graph.slam.sighting import Sighting, SightingFactors
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.sighting import Sighting
 from sonar_graph.slam.view import View
 from sonar_graph.states import Outcome
 
@@ -88,27 +87,17 @@ class AnonymousLandmarks:
 
     Parameters
     ----------
-    landmarks, smoother
-        The graph.
-    maker
-        Makes factors.
+    landmarks
+        Of the graph.
     journal
         Its rows are amended when sightings are used later, or forgotten, and when landmarks are merged.
     policy
         What is believed.
     """
 
-    def __init__(
-        self,
-        landmarks: LandmarkSightings,
-        smoother: Smoother,
-        maker: SightingFactors,
-        journal: DetectionJournal,
-        policy: AnonymousPolicy,
-    ) -> None:
+    def __init__(self, landmarks: LandmarkSightings, journal: DetectionJournal, policy: AnonymousPolicy) -> None:
         self._landmarks = landmarks
-        self._smoother = smoother
-        self._maker = maker
+        self._smoother, self._maker = landmarks.smoother, landmarks.maker
         self._journal = journal
         self._policy = policy
         self._merging = LandmarkMerging(landmarks, policy.gate_probability, policy.log_rival)

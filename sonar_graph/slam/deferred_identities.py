@@ -16,7 +16,6 @@ from sonar_graph.slam.association import DetectionJournal
 from sonar_graph.slam.landmark_sightings import LandmarkSightings
 from sonar_graph.slam.late_gate import LateGate
 from sonar_graph.slam.sighting import Sighting
-from sonar_graph.slam.smoother import Smoother
 from sonar_graph.slam.tracks import NO_LANDMARK, UNDECIDED, Track, Tracks
 from sonar_graph.states import Outcome
 
@@ -26,8 +25,8 @@ class DeferredIdentities:
 
     Parameters
     ----------
-    landmarks, smoother
-        The graph.
+    landmarks
+        Of the graph.
     journal
         Its rows are amended when sightings are used, moved, taken back or forgotten.
     gate
@@ -37,15 +36,10 @@ class DeferredIdentities:
     """
 
     def __init__(
-        self,
-        landmarks: LandmarkSightings,
-        smoother: Smoother,
-        journal: DetectionJournal,
-        gate: LateGate,
-        longest_wait_s: float,
+        self, landmarks: LandmarkSightings, journal: DetectionJournal, gate: LateGate, longest_wait_s: float
     ) -> None:
         self._landmarks = landmarks
-        self._smoother = smoother
+        self._smoother = landmarks.smoother
         self._journal = journal
         self._gate = gate
         self._tracks = Tracks(longest_wait_s)

@@ -26,8 +26,7 @@ from sonar_graph.slam.late_gate import STILL
 from sonar_graph.slam.misplaced_landmarks import supporters_elsewhere
 from sonar_graph.slam.mixture import Choices, Mixture, Watch, each_once
 from sonar_graph.slam.rival_history import RivalHistory
-from sonar_graph.slam.sighting import Sighting, SightingFactors
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.sighting import Sighting
 from sonar_graph.slam.tracks import NS_PER_S
 from sonar_graph.slam.view import View
 from sonar_graph.states import DetectionLog, Outcome
@@ -43,10 +42,8 @@ class DoubtfulIdentities:
 
     Parameters
     ----------
-    landmarks, smoother
-        The graph.
-    maker
-        Makes factors.
+    landmarks
+        Of the graph.
     journal
         Its rows are amended when choices change.
     mixture
@@ -60,8 +57,6 @@ class DoubtfulIdentities:
     def __init__(
         self,
         landmarks: LandmarkSightings,
-        smoother: Smoother,
-        maker: SightingFactors,
         journal: DetectionJournal,
         mixture: Mixture,
         longest_wait_s: float,
@@ -69,8 +64,7 @@ class DoubtfulIdentities:
         is_graduated: bool = False,
     ) -> None:
         self._landmarks = landmarks
-        self._smoother = smoother
-        self._maker = maker
+        self._smoother, self._maker = landmarks.smoother, landmarks.maker
         self._journal = journal
         self._mixture = mixture
         self._longest_wait_ns = round(longest_wait_s * NS_PER_S)

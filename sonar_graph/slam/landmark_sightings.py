@@ -32,8 +32,10 @@ class LandmarkSightings:
     """
 
     def __init__(self, smoother: Smoother, maker: SightingFactors) -> None:
-        self._smoother = smoother
-        self._maker = maker
+        self.smoother = smoother
+        """Whose graph has their factors."""
+        self.maker = maker
+        """Of their factors."""
         self._of: dict[int, dict[Sighting, None]] = defaultdict(dict)
         self._rooted: dict[int, Sighting] = {}
 
@@ -69,7 +71,7 @@ class LandmarkSightings:
         """A sighting whose factors were given to the smoother already."""
         sighting.landmark_id, sighting.handles = landmark_id, tuple(handles)
         self._of[landmark_id][sighting] = None
-        self._smoother.sightlines.add(L(landmark_id), sighting.line)
+        self.smoother.sightlines.add(L(landmark_id), sighting.line)
 
     def leave(self, pose_keys: set[int]) -> None:
         """Poses leave a bounded window: what was seen from them is part of the graph for good.
@@ -105,7 +107,7 @@ class LandmarkSightings:
         Where the earliest sighting of a landmark changes, the factors of the old and of the new one are made anew. A
         landmark that loses its last sighting leaves the graph.
         """
-        self._smoother.flush(time_s)  # it may solve the history, and has to know every landmark of a sightline then
+        self.smoother.flush(time_s)  # it may solve the history, and has to know every landmark of a sightline then
         out, new = [s for s in leaving if s.landmark_id is not None], list(coming)
         touched = {s.landmark_id for s in out if s.landmark_id is not None} | {landmark for _, landmark in new}
         before = {landmark: self._first(landmark) for landmark in touched}
@@ -130,7 +132,7 @@ class LandmarkSightings:
         del self._of[landmark][sighting]
         if not self._of[landmark] and landmark not in self._rooted:
             del self._of[landmark]
-        self._smoother.sightlines.remove(L(landmark), sighting.line)
+        self.smoother.sightlines.remove(L(landmark), sighting.line)
         sighting.landmark_id, sighting.handles = None, ()
 
     def _roles_changed(self, before: dict[int, Sighting | None], new: set[Sighting]) -> list[Sighting]:
@@ -148,16 +150,16 @@ class LandmarkSightings:
         """Exchange factors for those of the sightings; landmarks begin and end with their sightings."""
         firsts = {landmark: self._first(landmark) for landmark in before}
         begun = {
-            L(landmark): self._maker.place(first, self._smoother.values)
+            L(landmark): self.maker.place(first, self.smoother.values)
             for landmark, first in firsts.items()
             if first is not None and before[landmark] is None
         }
         lost = [L(landmark) for landmark, first in firsts.items() if first is None and before[landmark] is not None]
         made = [
-            self._maker.make(s, L(s.landmark_id), is_first=s is firsts[s.landmark_id])
+            self.maker.make(s, L(s.landmark_id), is_first=s is firsts[s.landmark_id])
             for s in sightings
             if s.landmark_id is not None
         ]
-        groups = self._smoother.exchange(Exchange(removed, made, begun, lost), time_s)
+        groups = self.smoother.exchange(Exchange(removed, made, begun, lost), time_s)
         for sighting, handles in zip(sightings, groups, strict=True):
             sighting.handles = tuple(handles)

@@ -89,24 +89,16 @@ class Sightings:
         probability = self.policy.gate_probability
         self._gate = gate_threshold(probability, 2) if probability < 1 else np.inf
         self._factors = SightingFactors(sonar, self.policy.robust())
-        self._landmarks = LandmarkSightings(self.smoother, self._factors)
+        landmarks = self._landmarks = LandmarkSightings(self.smoother, self._factors)
         self.smoother.when_withheld = lambda withheld: self._landmarks.withhold(withheld, self.journal)
         gate = LateGate(self.smoother, self._gate)
-        self._deferred = DeferredIdentities(
-            self._landmarks, self.smoother, self.journal, gate, self.policy.longest_wait_s
-        )
-        mixture = self.policy.mixture
-        parts = self._landmarks, self.smoother, self._factors, self.journal
+        wait_s, mixture, anonymous = self.policy.longest_wait_s, self.policy.mixture, self.policy.anonymous
         graduated = self.policy.is_graduated
+        self._deferred = DeferredIdentities(landmarks, self.journal, gate, wait_s)
         self._doubtful = (
-            DoubtfulIdentities(*parts, mixture, self.policy.longest_wait_s, is_graduated=graduated) if mixture else None
+            DoubtfulIdentities(landmarks, self.journal, mixture, wait_s, is_graduated=graduated) if mixture else None
         )
-        anonymous = self.policy.anonymous
-        self._anonymous = (
-            AnonymousLandmarks(self._landmarks, self.smoother, self._factors, self.journal, anonymous)
-            if anonymous
-            else None
-        )
+        self._anonymous = AnonymousLandmarks(landmarks, self.journal, anonymous) if anonymous else None
 
     @property
     def ids(self) -> set[int]:

@@ -132,8 +132,7 @@ class Smoother:
                 " give keyframes in the order of time"
             )
         self._newest_s = time_s
-        self._pending.values.insert(key, pose)
-        self.values.insert(key, pose)
+        self._insert(key, pose)
         self._pending.times_s[key] = time_s
         self._expiring[key] = time_s
 
@@ -146,8 +145,7 @@ class Smoother:
             When the key is taken; nothing is added.
         """
         self._check_new(key)
-        self._pending.values.insert(key, point)
-        self.values.insert(key, point)
+        self._insert(key, point)
         self._landmarks.append(key)
 
     def add_bias(self, key: int, bias: Floats) -> None:
@@ -159,13 +157,17 @@ class Smoother:
             When the key is taken; nothing is added.
         """
         self._check_new(key)
-        self._pending.values.insert(key, bias)
-        self.values.insert(key, bias)
+        self._insert(key, bias)
         self._bias = [key]
 
     def _check_new(self, key: int) -> None:
         if self.values.exists(key):
             raise EstimatorError(f"isam2: {variable_name(key)} is in the graph already; give each its own key")
+
+    def _insert(self, key: int, first: gtsam.Pose3 | Floats) -> None:
+        """A first estimate, for the window and for who asks meanwhile."""
+        self._pending.values.insert(key, first)
+        self.values.insert(key, first)
 
     def add(self, factors: Iterable[gtsam.NonlinearFactor]) -> list[int]:
         """New factors, used at the next update; the handles by which they can be taken out."""
