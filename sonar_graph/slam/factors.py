@@ -146,7 +146,7 @@ def landmark_sighting(
     cov: Floats,
     robust: Robust,
     elevation_sigma_rad: float | None = None,
-) -> list[gtsam.NonlinearFactor]:
+) -> list[gtsam.NoiseModelFactor]:
     """Range and azimuth of a landmark.
 
     Parameters
@@ -160,18 +160,30 @@ def landmark_sighting(
         frames as noise would, so that repeating it would invent information.
     """
     range_var, azimuth_var, covariance = float(cov[0, 0]), float(cov[1, 1]), float(cov[0, 1])
-    factors = [
+    factors: list[gtsam.NoiseModelFactor] = [
         _camera(pose_key, landmark_key, body_T_sonar, float(z[1]), math.sqrt(azimuth_var), elevation_sigma_rad, robust)
     ]
     if abs(covariance) < CORRELATION_LIMIT * math.sqrt(range_var * azimuth_var):
         noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, math.sqrt(range_var)))
         return [*factors, gtsam.RangeFactorWithTransform3D(pose_key, landmark_key, float(z[0]), noise, body_T_sonar)]
     elevation_only = (
-        [_camera(pose_key, landmark_key, body_T_sonar, float(z[1]), UNINFORMATIVE_RAD, elevation_sigma_rad, robust)]
+        [elevation(pose_key, landmark_key, body_T_sonar, float(z[1]), elevation_sigma_rad, robust)]
         if elevation_sigma_rad
         else []
     )
     return [*elevation_only, correlated_sighting(pose_key, landmark_key, body_T_sonar, z, cov, robust)]
+
+
+def elevation(
+    pose_key: int,
+    landmark_key: int,
+    body_T_sonar: gtsam.Pose3,
+    azimuth_rad: float,
+    elevation_sigma_rad: float,
+    robust: Robust,
+) -> gtsam.NoiseModelFactor:
+    """Elevation of a landmark at this azimuth is N(0, sigma²); the azimuth is not said."""
+    return _camera(pose_key, landmark_key, body_T_sonar, azimuth_rad, UNINFORMATIVE_RAD, elevation_sigma_rad, robust)
 
 
 def _camera(
@@ -182,7 +194,7 @@ def _camera(
     azimuth_sigma_rad: float,
     elevation_sigma_rad: float | None,
     robust: Robust,
-) -> gtsam.NonlinearFactor:
+) -> gtsam.NoiseModelFactor:
     sonar_R_camera = gtsam.Rot3.Rz(azimuth_rad).compose(BEAM_R_CAMERA)
     body_T_camera = body_T_sonar.compose(gtsam.Pose3(sonar_R_camera, ORIGIN))
     vertical = UNINFORMATIVE_RAD if elevation_sigma_rad is None else elevation_sigma_rad
@@ -194,7 +206,7 @@ def _camera(
 
 def correlated_sighting(
     pose_key: int, landmark_key: int, body_T_sonar: gtsam.Pose3, z: Floats, cov: Floats, robust: Robust
-) -> gtsam.NonlinearFactor:
+) -> gtsam.NoiseModelFactor:
     """Range and azimuth whose noises are correlated, as one factor: ``h(X, L) - z``, azimuth wrapped."""
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:

@@ -7,24 +7,20 @@ run. Factors are shared with it; they are never changed.
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import replace
 
 import gtsam
-import numpy as np
 from gtsam.symbol_shorthand import L
 
-from sonar_graph.measurements import Floats
 from sonar_graph.slam.batch import marginals_of
 from sonar_graph.slam.graduated import graduate
 from sonar_graph.slam.misplaced_landmarks import supporters_elsewhere
 from sonar_graph.slam.mixture import Choices, Mixture, Watch
 from sonar_graph.slam.sighting import Sighting, SightingFactors
 from sonar_graph.slam.sightlines import Sightlines, solve_in_sight
+from sonar_graph.slam.weighed_history import WeighedHistory
 
 MOST_ROUNDS = 10
 """Times that choices are made anew."""
-LEAST_WEIGHT = 1e-6
-"""Of a watch in a graph."""
 LEAST_GAIN = 1e-3
 """Of the cost, for another solution to be taken."""
 
@@ -78,9 +74,9 @@ class RivalHistory:
         """From graduated non-convexity on what the recogniser said, the nearest fixed point of the max-mixture."""
         known = self._known(values)
         named, ids = [watch for watch, _ in known], [i for _, i in known]
-        plain = self._maker.without_kernel()
+        weighed = WeighedHistory(self._rest, named, ids, self._maker.without_kernel())
         values, weights = graduate(
-            lambda weights: self._graph(named, [*ids], weights, plain),
+            weighed.graph,
             lambda values: self._mixture.squared_errors(named, ids, values),
             self._mixture.truncations(named),
             values,
@@ -134,21 +130,15 @@ class RivalHistory:
         return solve_in_sight(self._chosen_graph(choices), values, lines)
 
     def _chosen_graph(self, choices: Choices) -> gtsam.NonlinearFactorGraph:
-        return self._graph(self._watches, choices, np.ones(len(choices)), self._maker)
-
-    def _graph(
-        self, watches: list[Watch], choices: Choices, weights: Floats, maker: SightingFactors
-    ) -> gtsam.NonlinearFactorGraph:
-        """The history with these watches of these landmarks; weights divide their covariances."""
+        """The history with the watches of these landmarks."""
         graph = gtsam.NonlinearFactorGraph(self._rest)
-        of: dict[int, list[tuple[Sighting, float]]] = defaultdict(list)
-        for watch, landmark_id, weight in zip(watches, choices, weights.tolist(), strict=True):
+        of: dict[int, list[Sighting]] = defaultdict(list)
+        for watch, landmark_id in zip(self._watches, choices, strict=True):
             if landmark_id is not None:
-                of[landmark_id] += [(sighting, max(weight, LEAST_WEIGHT)) for sighting in watch.sightings]
+                of[landmark_id] += watch.sightings
         for landmark_id, sightings in of.items():
-            sightings.sort(key=lambda pair: (pair[0].stamp_ns, pair[0].row))
-            for k, (sighting, weight) in enumerate(sightings):
-                weighed = sighting if weight == 1.0 else replace(sighting, noise=sighting.noise / weight)
-                for factor in maker.make(weighed, L(landmark_id), is_first=k == 0):
+            sightings.sort(key=lambda sighting: (sighting.stamp_ns, sighting.row))
+            for k, sighting in enumerate(sightings):
+                for factor in self._maker.make(sighting, L(landmark_id), is_first=k == 0):
                     graph.push_back(factor)
         return graph

@@ -67,14 +67,34 @@ class SightingFactors:
 
     def make(self, sighting: Sighting, key: int, *, is_first: bool) -> list[gtsam.NonlinearFactor]:
         """Range and azimuth; the first sighting of a landmark also says what is known of its height and direction."""
-        line, elevation = sighting.line, None if sighting.floor or not is_first else self.elevation_sigma_rad
-        made = factors.landmark_sighting(
-            line.pose_key, key, line.body_T_sonar, line.z, sighting.noise, self._robust, elevation
-        )
-        return [*made, *self._beginning(sighting, key)] if is_first else made
+        elevation = None if sighting.floor or not is_first else self.elevation_sigma_rad
+        made = self._measured(sighting, key, elevation)
+        return [*made, *(self._placed(sighting, key) if is_first else [])]
 
-    def _beginning(self, sighting: Sighting, key: int) -> list[gtsam.NonlinearFactor]:
-        """What is said once about a landmark."""
+    def measured(self, sighting: Sighting, key: int) -> list[gtsam.NoiseModelFactor]:
+        """Range and azimuth alone."""
+        return self._measured(sighting, key, None)
+
+    def beginning(self, sighting: Sighting, key: int) -> list[gtsam.NonlinearFactor]:
+        """What the first sighting of a landmark says beside range and azimuth, with a kernel as they have it."""
+        line = sighting.line
+        if sighting.floor:
+            return self._placed(sighting, key)
+        elevation = factors.elevation(
+            line.pose_key, key, line.body_T_sonar, float(line.z[1]), self.elevation_sigma_rad, self._robust
+        )
+        return [elevation, *self._placed(sighting, key)]
+
+    def _measured(
+        self, sighting: Sighting, key: int, elevation_sigma_rad: float | None
+    ) -> list[gtsam.NoiseModelFactor]:
+        line = sighting.line
+        return factors.landmark_sighting(
+            line.pose_key, key, line.body_T_sonar, line.z, sighting.noise, self._robust, elevation_sigma_rad
+        )
+
+    def _placed(self, sighting: Sighting, key: int) -> list[gtsam.NonlinearFactor]:
+        """Where, and on which floor, a landmark is said to be once."""
         line = sighting.line
         range_m, azimuth_rad = line.z.tolist()
         on_beam = locate(line.body_T_sonar, range_m, azimuth_rad, sighting.elevation_rad)
