@@ -27,6 +27,7 @@ import math
 import numpy as np
 
 from baselines.euler import euler_from_rates, euler_from_rotation, rates_from_euler, rotation_from_euler
+from baselines.joint_correction import correct_jointly
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.kernels import compiled, inlined
 from sonar_graph.navigation.recursion import Integral
@@ -193,17 +194,7 @@ def correct_pair(x: Floats, P: Floats, n: int, cross_cov: Floats, S: Floats, inn
 @compiled
 def correct_by(x: Floats, P: Floats, n: int, cross_cov: Floats, S: Floats, innovation: Floats) -> None:
     """Correction by m numbers at once: as `correct_pair`, with shapes (m, n), (m, m) and (m,)."""
-    L, w, y = np.linalg.cholesky(S), cross_cov, innovation.copy()
-    for r in range(len(L)):
-        for c in range(r):
-            w[r] -= L[r, c] * w[c]
-            y[r] -= L[r, c] * y[c]
-        w[r] /= L[r, r]
-        y[r] /= L[r, r]
-        for i in range(n):
-            for j in range(n):
-                P[i, j] -= w[r, i] * w[r, j]
-            x[i] += w[r, i] * y[r]
+    correct_jointly(P, n, cross_cov, S, innovation, x)
     _wrap(x)
 
 

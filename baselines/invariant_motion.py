@@ -1,9 +1,8 @@
 """How the body moved, for the invariant filter: motions from a node, and their derivatives by the gyro bias.
 
 The steps are every estimator's (`sonar_graph.navigation.steps`). With the perturbation [theta_i, eps] in the node's
-frame (`sonar_graph.navigation.recursion`) a bias that is larger by db gives ``theta_i = D_t db`` and ``eps = D_r db``::
-
-    D_r <- D_r - [s]x D_t - dt (eps by rate),    D_t <- D_t - dt (theta_i by rate)
+frame a bias that is larger by db gives ``theta_i = D_t db`` and ``eps = D_r db``
+(`sonar_graph.navigation.recursion.extended_by_bias`).
 """
 
 from __future__ import annotations
@@ -14,15 +13,12 @@ from sonar_graph.measurements import Floats
 from sonar_graph.navigation.gap_motion import GapMotion, bridge
 from sonar_graph.navigation.interpolation import rows_until
 from sonar_graph.navigation.kernels import compiled
-from sonar_graph.navigation.recursion import NO_MOTION, extended, increment, rate_of_turn
+from sonar_graph.navigation.recursion import NO_MOTION, extended, extended_by_bias, increment, rate_of_turn
 from sonar_graph.navigation.steps import Columns, cursor_at, next_step
 from sonar_graph.navigation.triples import (
     ZEROS,
     Vector,
-    difference_of,
     matrix,
-    multiple_of,
-    skew_times,
     vector,
 )
 
@@ -67,8 +63,6 @@ def _integrate(
         cursor, step = next_step(columns, imu_rows, dvl_rows, cursor, end_ns)
         turn = rate_of_turn(step, motion.dR, bias, earth)
         added = increment(motion.dR, step.duration_s, turn, step.velocity, vehicle.body_p_dvl)
-        D_r = difference_of(D_r, skew_times(added.displacement, D_t))
-        D_t = difference_of(D_t, multiple_of(step.duration_s, added.theta_by_rate))
-        D_r = difference_of(D_r, multiple_of(step.duration_s, added.eps_by_rate))
+        D_t, D_r = extended_by_bias(D_t, D_r, step, added)
         motion = extended(motion, step, added, vehicle.gyro_noise_density)
     return GapMotion(finished(motion), D_t, D_r)

@@ -29,6 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from baselines.joint_correction import correct_jointly
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.gap_motion import GapMotion
 from sonar_graph.navigation.kernels import compiled, inlined, skew
@@ -151,9 +152,6 @@ def _add_products(P: Floats, D: Floats, P_bias: Floats, J: Floats, C: Floats) ->
 def correct(state: InvariantState, cross_cov: Floats, S: Floats, innovation: Floats) -> None:
     """Correction by m numbers: ``xi = K e`` with ``K = P H^T S^-1``, ``P <- P - K S K^T``, estimate moved by (1).
 
-    With the Cholesky factor ``S = L L^T`` and ``W = L^-1 H P``: ``P <- P - W^T W`` and ``xi = W^T L^-1 e``, whose
-    products commute, so that P stays symmetric to the last bit.
-
     Parameters
     ----------
     cross_cov
@@ -163,18 +161,8 @@ def correct(state: InvariantState, cross_cov: Floats, S: Floats, innovation: Flo
     innovation
         Measured minus predicted, shape (m,).
     """
-    P, W, L = state.P, cross_cov, np.linalg.cholesky(S)
-    xi, y = np.zeros(len(P)), innovation.copy()
-    for r in range(len(L)):
-        for c in range(r):
-            W[r] -= L[r, c] * W[c]
-            y[r] -= L[r, c] * y[c]
-        W[r] /= L[r, r]
-        y[r] /= L[r, r]
-        xi += y[r] * W[r]
-        for i in range(len(P)):
-            for j in range(len(P)):
-                P[i, j] -= W[r, i] * W[r, j]
+    xi = np.zeros(len(state.P))
+    correct_jointly(state.P, len(xi), cross_cov, S, innovation, xi)
     retract(state, xi)
 
 

@@ -48,7 +48,16 @@ from sonar_graph.navigation.joint_state import (
 from sonar_graph.navigation.kernels import compiled
 from sonar_graph.navigation.line_before import integral, line_before
 from sonar_graph.navigation.odometry import longest_interval_ns
-from sonar_graph.navigation.recursion import NO_MOTION, Integral, Step, extended, increment, mirrored, rate_of_turn
+from sonar_graph.navigation.recursion import (
+    NO_MOTION,
+    Integral,
+    Step,
+    extended,
+    extended_by_bias,
+    increment,
+    mirrored,
+    rate_of_turn,
+)
 from sonar_graph.navigation.steps import Columns, cursor_at, next_step
 from sonar_graph.navigation.triples import (
     IDENTITY,
@@ -305,9 +314,7 @@ def _by_walk(
         step = Step(own.duration_s, own.rate, own.velocity, of_velocity, own.specific_force, own.turn_psd)
         turn = rate_of_turn(step, motion.dR, bias, earth)
         added = increment(motion.dR, step.duration_s, turn, step.velocity, model.body_p_dvl)
-        D_r = difference_of(D_r, skew_times(added.displacement, D_t))
-        D_t = difference_of(D_t, multiple_of(step.duration_s, added.theta_by_rate))
-        D_r = difference_of(D_r, multiple_of(step.duration_s, added.eps_by_rate))
+        D_t, D_r = extended_by_bias(D_t, D_r, step, added)
         motion = extended(motion, step, added, model.gyro_noise_density)
     whole = Integral(motion.dR, motion.dp, motion.impulse, motion.cov_tt, motion.cov_rt, mirrored(motion.cov_rr))
     return GapMotion(whole, D_t, D_r)

@@ -153,6 +153,17 @@ def _columns_times(A: Matrix, v: Vector) -> Matrix:
 
 
 @inlined
+def extended_by_bias(D_t: Matrix, D_r: Matrix, step: Step, added: Increment) -> tuple[Matrix, Matrix]:
+    """Derivatives of [theta_i, eps] by the gyro bias, one step further.
+
+    ``D_r <- D_r - [s]x D_t - dt (eps by rate)``, ``D_t <- D_t - dt (theta_i by rate)``.
+    """
+    D_r = difference_of(D_r, skew_times(added.displacement, D_t))
+    D_t = difference_of(D_t, multiple_of(step.duration_s, added.theta_by_rate))
+    return D_t, difference_of(D_r, multiple_of(step.duration_s, added.eps_by_rate))
+
+
+@inlined
 def mirrored(A: Matrix) -> Matrix:
     """The upper half in both places."""
     return A[0], (A[0][1], A[1][1], A[1][2]), (A[0][2], A[1][2], A[2][2])
@@ -199,9 +210,7 @@ def integrate_steps(
         added = increment(
             motion.dR, step.duration_s, rate_of_turn(step, motion.dR, body_bias, earth_i), step.velocity, arm
         )
-        D_r = difference_of(D_r, skew_times(added.displacement, D_t))
-        D_t = difference_of(D_t, multiple_of(step.duration_s, added.theta_by_rate))
-        D_r = difference_of(D_r, multiple_of(step.duration_s, added.eps_by_rate))
+        D_t, D_r = extended_by_bias(D_t, D_r, step, added)
         motion = extended(motion, step, added, gyro_density)
     return in_last_frame(motion, D_t, D_r)
 
