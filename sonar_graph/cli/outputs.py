@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from tempfile import TemporaryFile
 
-from sonar_graph.errors import EvaluationError, LogError
+from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
 
 _WRITTEN = ("report.html", "comparison.json", "sequence.npz", "result.mcap", "result.foxglove.json", "result.rviz")
 _WRITTEN_FOR_A_RUN = ("trajectory.tum", "causal.tum", "landmarks.csv", "result.json", "series.npz")
@@ -38,10 +38,7 @@ def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = Fa
         raise LogError(f"{path}: is what is read, and would be overwritten; choose another name with -o")
     if not (overwrite or _is_replaceable(path)):
         raise LogError(f"{path}: exists, and sonar-graph did not write it; choose another name, or give --overwrite")
-    try:
-        _try_writing_in(path.parent)
-    except OSError as error:
-        raise LogError(f"{path}: cannot be written: {error.strerror}; choose another place with -o") from error
+    _require_writing_in(path.parent, path, LogError)
     return path
 
 
@@ -64,10 +61,7 @@ def writable_json(path: Path, sources: Iterable[Path]) -> Path:
         raise EvaluationError(f"{path}: expected the name of a file that ends in .json")
     if any(_is_part_of(path, source) for source in sources):
         raise EvaluationError(f"{path}: is what is read, and would be overwritten; choose another name with -o")
-    try:
-        _try_writing_in(path.parent)
-    except OSError as error:
-        raise EvaluationError(f"{path}: cannot be written: {error.strerror}; choose another place with -o") from error
+    _require_writing_in(path.parent, path, EvaluationError)
     return path
 
 
@@ -96,10 +90,7 @@ def writable_folder(path: Path, sources: Iterable[Path | None] = ()) -> Path:
             )
         if written.suffix == ".mcap" and not _is_replaceable(written):
             raise EvaluationError(f"{written}: exists, and sonar-graph did not write it; choose another folder with -o")
-    try:
-        _try_writing_in(path)
-    except OSError as error:
-        raise EvaluationError(f"{path}: cannot be written: {error.strerror}; choose another place with -o") from error
+    _require_writing_in(path, path, EvaluationError)
     return path
 
 
@@ -124,7 +115,11 @@ def _is_replaceable(path: Path) -> bool:
     return not path.exists() or path.stat().st_size == 0 or is_own_log(path)
 
 
-def _try_writing_in(folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    with TemporaryFile(dir=folder):
-        pass
+def _require_writing_in(folder: Path, path: Path, refusal: type[SonarGraphError]) -> None:
+    """Make a folder and try to write there, on behalf of a path."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise refusal(f"{path}: cannot be written: {error.strerror}; choose another place with -o") from error
