@@ -30,6 +30,7 @@ from sonar_graph.logs.recorder import LIBRARY, Outgoing
 from sonar_graph.logs.records import LogFile
 from sonar_graph.logs.summary import parse
 from sonar_graph.logs.topic import Keep
+from sonar_graph.logs.whole_file import written_whole
 
 _CHUNK_BYTES = 1 << 20
 _Message = tuple[int, int, str, bytes, int]
@@ -82,16 +83,8 @@ def write_amended(
     """
     if target.exists() and target.samefile(source):
         raise LogError(f"{target}: is the log itself; give another name with -o")
-    partial = target.with_name(target.name + ".part")
-    try:
-        with LogFile(source) as log, partial.open("wb") as out:
-            amended = _Copy(log, out, anew or {}, {entry.topic for entry in added}).run(added, metadata or {}, salvage)
-        partial.replace(target)
-    except OSError as error:
-        raise LogError(f"{target} cannot be written: {error.strerror}") from error
-    finally:
-        partial.unlink(missing_ok=True)
-    return amended
+    with LogFile(source) as log, written_whole(target) as out:
+        return _Copy(log, out, anew or {}, {entry.topic for entry in added}).run(added, metadata or {}, salvage)
 
 
 class _Copy:

@@ -21,10 +21,10 @@ from typing import BinaryIO
 import numpy as np
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from sonar_graph.errors import LogError
 from sonar_graph.logs.layout import Bytes
 from sonar_graph.logs.message_definitions import definition
 from sonar_graph.logs.metadata import seal
+from sonar_graph.logs.whole_file import written_whole
 from sonar_graph.measurements import Ints
 
 _CHUNK_BYTES = 1 << 20
@@ -109,21 +109,12 @@ def recording(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> Iterator
     LogError
         When the file cannot be written.
     """
-    partial = path.with_name(path.name + ".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with partial.open("wb") as stream:
-                out = RecordingWriter(stream)
-                for name, record in metadata.items():
-                    out.add_metadata(name, record)
-                yield out
-                out.finish()
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
-    except OSError as error:
-        raise LogError(f"{path} cannot be written: {error.strerror}") from error
+    with written_whole(path) as stream:
+        out = RecordingWriter(stream)
+        for name, record in metadata.items():
+            out.add_metadata(name, record)
+        yield out
+        out.finish()
 
 
 def is_own_log(path: Path) -> bool:

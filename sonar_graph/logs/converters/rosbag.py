@@ -19,6 +19,7 @@ from mcap.writer import Writer
 from sonar_graph.errors import LogError
 from sonar_graph.logs.other_files import START_BYTES, why_no_bag
 from sonar_graph.logs.recorder import LIBRARY, ROSBAG2_METADATA, TRANSIENT_LOCAL
+from sonar_graph.logs.whole_file import written_whole
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -65,17 +66,8 @@ def convert_rosbag(source: Path, output: Path, progress: Progress | None = None)
     LogError
         When the rosbags library is not installed, the bag cannot be read, or the log cannot be written.
     """
-    with _bag(Path(source)) as bag:
-        partial_output = output.with_name(output.name + ".part")
-        try:
-            with partial_output.open("wb") as stream:
-                conversion = _Copy(bag, Writer(stream, chunk_size=_CHUNK_BYTES)).run(progress)
-            partial_output.replace(output)
-        except OSError as error:
-            raise LogError(f"{output} cannot be written: {error.strerror}") from error
-        finally:
-            partial_output.unlink(missing_ok=True)
-    return conversion
+    with _bag(Path(source)) as bag, written_whole(output) as stream:
+        return _Copy(bag, Writer(stream, chunk_size=_CHUNK_BYTES)).run(progress)
 
 
 @contextmanager
