@@ -29,8 +29,8 @@ def plain(noise):
 class Fed:
     """A smoother, and on the side every factor that it was given."""
 
-    def __init__(self, lag_s: float, stale_shift_m: float = NEVER_M) -> None:
-        self.smoother = Smoother(lag_s, 1e-6, stale_shift_m)
+    def __init__(self, lag_s: float, stale_shift_m: float = NEVER_M, *, is_bounded: bool = False) -> None:
+        self.smoother = Smoother(lag_s, 1e-6, stale_shift_m, is_bounded=is_bounded)
         self.given: list[gtsam.NonlinearFactor] = []
         self.handles: list[int] = []
 
@@ -43,9 +43,16 @@ class Fed:
         return [h for h, factor in zip(self.handles, self.given, strict=True) if set(factor.keys()) == set(keys)]
 
 
-def on_the_rail(nodes: int, lag_s: float, stale_shift_m: float = NEVER_M, held: dict[int, float] | None = None) -> Fed:
+def on_the_rail(
+    nodes: int,
+    lag_s: float,
+    stale_shift_m: float = NEVER_M,
+    held: dict[int, float] | None = None,
+    *,
+    is_bounded: bool = False,
+) -> Fed:
     _, numbers = rail(nodes)
-    fed, seen = Fed(lag_s, stale_shift_m), set()
+    fed, seen = Fed(lag_s, stale_shift_m, is_bounded=is_bounded), set()
     fed.smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
     fed.add([factors.start_prior(X(0), calibration())])
     cov = np.diag([1e-12] * 3 + [(VELOCITY_SIGMA_M_S * STEP_S) ** 2] * 3)

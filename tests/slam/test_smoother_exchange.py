@@ -22,6 +22,10 @@ def assert_is_least_squares(fed: Fed, numbers: Rail, nodes: int, landmarks: list
     for i in landmarks:
         assert fed.smoother.values.atPoint3(L(i))[0] == pytest.approx(mean[f"l{i}"], abs=1e-8)
         assert fed.smoother.covariance(L(i))[0, 0] == pytest.approx(variance[f"l{i}"], abs=1e-8)
+
+
+def assert_history_is_least_squares(fed: Fed, numbers: Rail, nodes: int) -> None:
+    mean, _ = numbers.solution(nodes)
     values, _ = fed.smoother.solve_history()
     assert values.atPose3(X(1)).translation()[0] == pytest.approx(mean["x1"], abs=1e-8)
 
@@ -58,6 +62,7 @@ def test_what_is_taken_out_was_never_there(monkeypatch, lag_s, oldest, solves):
     fed.smoother.exchange(Exchange(removed, [], {}, []), (nodes - 1) * STEP_S)
     assert len(sizes) == solves
     assert_is_least_squares(fed, without(numbers, gone), nodes, [4, 7])
+    assert_history_is_least_squares(fed, without(numbers, gone), nodes)
 
 
 class Refusing:
@@ -108,6 +113,7 @@ def test_what_has_just_been_put_in_is_taken_out_without_solving_the_history(monk
     fed.smoother.exchange(Exchange(handles, [], {}, []), (nodes - 1) * STEP_S)
     assert not sizes
     assert_is_least_squares(fed, numbers, nodes, [4, 7])
+    assert_history_is_least_squares(fed, numbers, nodes)
 
 
 def test_a_landmark_without_factors_leaves_the_graph_and_can_come_back():
@@ -117,6 +123,7 @@ def test_a_landmark_without_factors_leaves_the_graph_and_can_come_back():
     removed = [handle for k, i in gone for handle in fed.handles_on(X(k), L(i))]
     fed.smoother.exchange(Exchange(removed, [], {}, [L(7)]), (nodes - 1) * STEP_S)
     assert_is_least_squares(fed, without(numbers, gone), nodes, [4])
+    assert_history_is_least_squares(fed, without(numbers, gone), nodes)
     assert not fed.smoother.values.exists(L(7))
     (distance,) = (r for k, i, r in numbers.ranges if (k, i) == (nodes - 1, 7))
     z, R = np.array([distance, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e6])
@@ -124,6 +131,7 @@ def test_a_landmark_without_factors_leaves_the_graph_and_can_come_back():
     point = fed.smoother.values.atPose3(X(nodes - 1)).translation() + distance * np.eye(3)[0]
     fed.smoother.exchange(Exchange([], [again], {L(7): point}, []), (nodes - 1) * STEP_S)
     assert_is_least_squares(fed, without(numbers, gone[:-1]), nodes, [4, 7])
+    assert_history_is_least_squares(fed, without(numbers, gone[:-1]), nodes)
 
 
 def test_a_held_keyframe_takes_late_factors_without_solving_the_history(monkeypatch):
@@ -136,9 +144,11 @@ def test_a_held_keyframe_takes_late_factors_without_solving_the_history(monkeypa
     (handles,) = fed.smoother.exchange(Exchange([], [new], {}, []), (nodes - 1) * STEP_S)
     assert not sizes
     assert_is_least_squares(fed, Rail(numbers.displacements_m, [*numbers.ranges, (3, 4, late)]), nodes, [4, 7])
+    assert_history_is_least_squares(fed, Rail(numbers.displacements_m, [*numbers.ranges, (3, 4, late)]), nodes)
     fed.smoother.exchange(Exchange(handles, [], {}, []), (nodes - 1) * STEP_S)
     assert len(sizes) == 1  # that of the smoothed result above
     assert_is_least_squares(fed, numbers, nodes, [4, 7])
+    assert_history_is_least_squares(fed, numbers, nodes)
 
 
 def test_a_keyframe_and_all_later_ones_are_held_until_the_time_given():
@@ -152,3 +162,29 @@ def test_a_keyframe_and_all_later_ones_are_held_until_the_time_given():
     with pytest.raises(IndexError):
         fed.smoother.covariance(X(17))
     assert fed.smoother.covariance(X(18))[3, 3] > 0
+
+
+@pytest.mark.parametrize("is_bounded", [False, True])
+def test_a_hold_that_is_over_ends_at_an_exchange_only_where_what_left_can_be_taken_out(is_bounded):
+    """A bounded window would have given up what the exchange takes out; it lets go at the next update instead.
+
+    Either way the end is least squares, with a range on the keyframe that was held exchanged for another.
+    """
+    nodes, late_m, waiting_m = 21, 24.0, 30.0
+    end_s = (nodes - 1) * STEP_S
+    fed = on_the_rail(nodes, 1.1, held={X(3): FOREVER_S}, is_bounded=is_bounded)
+    _, numbers = rail(nodes)
+    ranges = [r for r in numbers.ranges if r[:2] != (3, 4)] + [(3, 4, late_m), (nodes - 1, 4, waiting_m)]
+    removed, R = fed.handles_on(X(3), L(4)), np.diag([RANGE_SIGMA_M**2, 1e6])
+    waiting, late = (
+        factors.landmark_sighting(X(k), L(4), gtsam.Pose3(), np.array([z, 0.0]), R, plain)
+        for k, z in ((nodes - 1, waiting_m), (3, late_m))
+    )
+    fed.add(waiting)
+    fed.smoother.hold({})
+    fed.smoother.exchange(Exchange(removed, [late], {}, []), end_s)
+    assert fed.smoother.in_window([X(3)]) == ([X(3)] if is_bounded else [])
+    assert_is_least_squares(fed, Rail(numbers.displacements_m, ranges), nodes, [4, 7])
+    fed.smoother.update(end_s)
+    assert not fed.smoother.in_window([X(3)])
+    assert_is_least_squares(fed, Rail(numbers.displacements_m, ranges), nodes, [4, 7])
