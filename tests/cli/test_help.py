@@ -1,0 +1,111 @@
+"""What ``--help`` says of every command."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer.main
+
+import sonar_graph
+from sonar_graph.cli import app
+
+Run = Callable[..., int]
+
+
+def commands(group: Any = None, path: tuple[str, ...] = ()) -> dict[tuple[str, ...], Any]:
+    """Every command by its path, groups left out."""
+    group = group or typer.main.get_command(app)
+    found: dict[tuple[str, ...], Any] = {}
+    for name, command in group.commands.items():
+        deeper = hasattr(command, "commands")
+        found |= commands(command, (*path, name)) if deeper else {(*path, name): command}
+    return found
+
+
+def examples_of(command: Any) -> list[list[str]]:
+    return [line.split() for line in command.epilog.splitlines() if line.startswith("sonar-graph ")]
+
+
+def test_no_argument_shows_the_commands(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run() == 0
+    shown = capsys.readouterr().out
+    for path in commands():
+        assert path[0] in shown
+
+
+def test_help_does_not_wait_for_heavy_imports(run: Run) -> None:
+    heavy = "{'gtsam', 'matplotlib', 'numba', 'numpy', 'scipy'}"
+    code = f"import sys, sonar_graph.cli; print(sorted({heavy} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_version_is_that_of_the_package(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--version") == 0
+    assert capsys.readouterr().out == f"sonar-graph {sonar_graph.__version__}\n"
+
+
+@pytest.mark.parametrize("path", commands(), ids=" ".join)
+def test_every_command_has_help_that_ends_in_examples(
+    run: Run, path: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(*path, "--help") == 0
+    assert f"sonar-graph {' '.join(path)}" in capsys.readouterr().out.partition("Examples:")[2]
+
+
+@pytest.mark.parametrize("path", commands(), ids=" ".join)
+def test_examples_in_help_are_understood(
+    path: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in (
+        "dive.mcap",
+        "vehicle.toml",
+        "dive.toml",
+        "dive.bag",
+        "dive.ddf",
+        "dive.aris",
+        "pings.raw",
+        "reference.json",
+        "suite.toml",
+    ):
+        Path(name).touch()
+    for name in ("comparison", "MRCLAM_Dataset6", "DLR", "A-KIT", "ros2_bag_folder", "results"):
+        Path(name).mkdir()
+    command = commands()[path]
+    examples = examples_of(command)
+    assert examples
+    for words in examples:
+        assert tuple(words[1 : 1 + len(path)]) == path
+        command.make_context(path[-1], words[1 + len(path) :])
+
+
+@pytest.mark.parametrize("group", ["simulate", "convert", "bench"])
+def test_help_of_a_group_ends_in_examples(run: Run, group: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(group, "--help") == 0
+    assert f"sonar-graph {group} " in capsys.readouterr().out.partition("Examples:")[2]
+
+
+def test_help_names_defaults_presets_and_roles_as_they_are() -> None:
+    from sonar_graph.logs.roles import ROLES
+    from sonar_graph.simulation.basin import BasinOptions
+    from sonar_graph.simulation.image_options import ImageOptions
+    from sonar_graph.simulation.presets import DVL_PRESETS, IMU_PRESETS
+
+    options = BasinOptions()
+    helps = {option.name: option.help for option in commands()["simulate", "basin"].params}
+    for name in ("seed", "duration_s", "laps"):
+        assert helps[name].endswith(f" Default: {getattr(options, name):g}.")
+    for name, presets in (("imu", IMU_PRESETS), ("dvl", DVL_PRESETS)):
+        assert f"{getattr(options, name)} (default)" in helps[name]
+        assert all(preset in helps[name] for preset in presets)
+    said = set(re.findall(r"[a-z_]+", helps["settings"].partition("repeated: ")[2].partition(". ")[0]))
+    others = BasinOptions.model_fields.keys() - {"seed", "imu", "dvl", "duration_s", "laps", "image"}
+    assert said - {"and", "with", "images", "image"} == others | ImageOptions.model_fields.keys()
+    topic = next(option.help for option in commands()["compare",].params if option.name == "topics")
+    assert topic.endswith(f" Roles: {', '.join(ROLES)}.")
