@@ -24,11 +24,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from akit_imu_place import PlaceFit, fit_place, place_of
-from akit_landmarks import ESTIMATORS, MEASURES, PLACINGS, UNSURE_START, reference_wander, sightings, slam
+from akit_landmarks import reference_wander, sightings, slam
+from akit_report import report
 from common import in_parallel, make_parser, print_figures, print_table, recording
 
 from sonar_graph.calibration import Mounting
@@ -46,7 +46,6 @@ GAP_S = 30.0
 CONFIRMED_NS = 4_000_000_000
 """After a gap: at 2 m/s three velocities, one a second, have confirmed each other by then."""
 GAP_STARTS_S = tuple(20.0 + 40.0 * k for k in range(9))
-LARGEST_SHARE_OF_DISTANCE = 0.01
 Figures = dict[str, Any]
 
 
@@ -218,122 +217,6 @@ def print_places(fits: list[PlaceFit]) -> None:
             for n, fit in zip(RUNS, fits, strict=True)
         ],
     )
-
-
-def report(numbers: tuple[int, ...], runs: list[Figures]) -> Figures:
-    """Print the tables; the figures by name."""
-    headers = (
-        "",
-        "DVL offset s",
-        "reference offset s",
-        "start heading deg",
-        "converted %",
-        "aligned %",
-        "IMU at reference",
-        "IMU as converted",
-        "IMU by others",
-    )
-    inside, unplaced, converted = (
-        inside_ellipse(runs, gaps, "square") for gaps in ("gaps", "gaps_unplaced", "gaps_as_converted")
-    )
-    rows = [
-        (
-            f"trajectory {number}",
-            r["dvl_offset"][0],
-            r["reference_offset"][0],
-            float(np.degrees(r["start_heading_rad"])),
-            100 * r["as_converted"]["share"],
-            100 * r["aligned"]["share"],
-            *(f"{sum(held)} of {len(held)}" for held in of_run),
-        )
-        for number, r, *of_run in zip(numbers, runs, unplaced, converted, inside, strict=True)
-    ]
-    print_table(headers, rows)
-    widths = {name: gap_width(runs, name) for name in ("gaps", "gaps_unbiased")}
-    print_table(
-        ("IMU by others", "lost rms m", "sigma rms m", "least", "largest", "NEES"),
-        [("as calibrated", *widths["gaps"]), ("no accel bias", *widths["gaps_unbiased"])],
-    )
-    print_slam(numbers, runs)
-    shares = [r["aligned"]["share"] for r in runs]
-    helped = {
-        f"{placing} {kind}": min(
-            error_ratio(r["slam"][placing], kind) for n, r in zip(numbers, runs, strict=True) if n not in UNSURE_START
-        )
-        for placing in ("near", "far")
-        for kind in ("causal", "smoothed")
-    }
-    gaps_hold, converted_hold = float(np.mean(inside)), float(np.mean(converted))
-    held = (
-        max(shares) <= LARGEST_SHARE_OF_DISTANCE,
-        gaps_hold == 1.0,
-        converted_hold == 1.0,
-        min(helped.values()) >= 1.0,
-    )
-    return {
-        "trajectories": numbers,
-        "aligned_shares": shares,
-        "converted_shares": [r["as_converted"]["share"] for r in runs],
-        "start_heading_rad": [r["start_heading_rad"] for r in runs],
-        "dvl_offset_s": [r["dvl_offset"] for r in runs],
-        "reference_offset_s": [r["reference_offset"] for r in runs],
-        "gap_lost_m": [[gap["lost_m"] for gap in r["gaps"]] for r in runs],
-        "gap_sigma_m": [[gap["sigma_m"] for gap in r["gaps"]] for r in runs],
-        "gap_share_inside": gaps_hold,
-        "gap_nees_per_dof": widths["gaps"][-1],
-        "gap_unbiased_sigma_rms_m": widths["gaps_unbiased"][1],
-        "gap_unbiased_nees_per_dof": widths["gaps_unbiased"][-1],
-        "gap_share_inside_as_converted": converted_hold,
-        "gap_lost_as_converted_m": [[gap["lost_m"] for gap in r["gaps_as_converted"]] for r in runs],
-        "gap_share_inside_unplaced": float(np.mean(unplaced)),
-        "gap_lost_unplaced_m": [[gap["lost_m"] for gap in r["gaps_unplaced"]] for r in runs],
-        "gap_share_inside_literally": float(np.mean(inside_ellipse(runs, "gaps", "literal_square"))),
-        "share_inside_literally_without_gap": float(np.mean(inside_ellipse(runs, "gaps", "without_gap_square"))),
-        "literal_squares": [[(gap["literal_square"], gap["without_gap_square"]) for gap in r["gaps"]] for r in runs],
-        "reference_wander_m": [r["reference_wander_m"] for r in runs],
-        "sightings": [r["sightings"] for r in runs],
-        "slam": [r["slam"] for r in runs],
-        "landmarks_help": helped,
-        "passed": all(held),
-    }
-
-
-def inside_ellipse(runs: list[Figures], gaps: str, name: str) -> list[list[bool]]:
-    """Whether each gap's square lies in the 99 % ellipse."""
-    limit = float(chi2.ppf(0.99, 3))
-    return [[gap[name] <= limit for gap in r[gaps]] for r in runs]
-
-
-def gap_width(runs: list[Figures], gaps: str) -> tuple[float, float, float, float, float]:
-    """What is lost and its sigma, root mean square, the least and largest sigma, m, and the NEES per dimension."""
-    lost, sigma, squares = (
-        np.array([gap[of] for r in runs for gap in r[gaps]]) for of in ("lost_m", "sigma_m", "square")
-    )
-    rms = (float(np.sqrt(np.mean(values**2))) for values in (lost, sigma))
-    return (*rms, float(sigma.min()), float(sigma.max()), float(squares.mean()) / 3)
-
-
-def print_slam(numbers: tuple[int, ...], runs: list[Figures]) -> None:
-    """Causal and smoothed scores of all estimators in each placing."""
-    print_table(
-        ("", "reference wanders m/s", "at most m", *(f"{name}: times, s" for name in PLACINGS)),
-        [
-            (f"trajectory {n}", *r["reference_wander_m"], *(f"{t:.0f}, {s:.0f}" for t, s in r["sightings"].values()))
-            for n, r in zip(numbers, runs, strict=True)
-        ],
-    )
-    for placing in PLACINGS:
-        rows = [
-            (f"trajectory {n} {name} {kind}", *(r["slam"][placing][name][f"{kind}.{m}"] for m in MEASURES))
-            for n, r in zip(numbers, runs, strict=True)
-            for name, kind in (("isam2", "smoothed"), *((name, "causal") for name in ESTIMATORS))
-        ]
-        print_table((placing, "raw m", "SE(2) m", "10 s m", "NEES", "yaw NEES"), rows)
-
-
-def error_ratio(scores: dict[str, dict[str, float]], kind: str) -> float:
-    """Dead reckoning's error after SE(2) alignment over iSAM2's."""
-    return scores["dead-reckoning"]["causal.ate_se2_m"] / scores["isam2"][f"{kind}.ate_se2_m"]
 
 
 if __name__ == "__main__":
