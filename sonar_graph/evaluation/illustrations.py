@@ -41,8 +41,13 @@ class Illustration:
 
 def illustrations(comparison: Comparison) -> dict[str, Illustration]:
     """All figures of the report, by name."""
-    no_errors = NO_TRUTH if comparison.sequence.truth is None else NO_ERRORS
-    drawn = [
+    drawn = [*_of_paths(comparison), *_of_errors(comparison), *_of_updates(comparison)]
+    return {illustration.name: illustration for illustration in drawn}
+
+
+def _of_paths(comparison: Comparison) -> list[Illustration]:
+    """Where vehicle and landmarks are, at the end and on the way."""
+    return [
         _draw(comparison, "map", "Map", map_figure, _map_caption(comparison), "No run has a path to draw."),
         _draw(
             comparison,
@@ -52,6 +57,13 @@ def illustrations(comparison: Comparison) -> dict[str, Illustration]:
             _growth_caption(comparison),
             "No run kept its map on the way.",
         ),
+    ]
+
+
+def _of_errors(comparison: Comparison) -> list[Illustration]:
+    """Estimates against the truth, and the yaw with or without one."""
+    no_errors = NO_TRUTH if comparison.sequence.truth is None else NO_ERRORS
+    return [
         _draw(
             comparison,
             "errors",
@@ -80,6 +92,12 @@ def illustrations(comparison: Comparison) -> dict[str, Illustration]:
             "hint and not a test.",
             f"{no_errors} NEES needs them.",
         ),
+    ]
+
+
+def _of_updates(comparison: Comparison) -> list[Illustration]:
+    """What detections say against what was predicted, and how long updates take."""
+    return [
         _draw(
             comparison,
             "innovations",
@@ -107,7 +125,6 @@ def illustrations(comparison: Comparison) -> dict[str, Illustration]:
             "No run reports durations.",
         ),
     ]
-    return {illustration.name: illustration for illustration in drawn}
 
 
 def _draw(

@@ -250,13 +250,21 @@ class JointPreintegrator:
             refuse_beyond(self.longest_s, samples.stamps_ns)
         bias = np.zeros(6) if bias is None else check.vector("bias", bias, 6)
         earth = np.zeros(3) if earth_rate is None else check.vector("earth_rate", earth_rate, 3)
+        rows = self._inertial(inertial, bias, earth, arm)
+        R, (v, p, s), P, D, first, last = preintegrate(rows, samples.stamps_ns, velocity, cov, RULES[self.rule])
+        _refuse_infinite(s, P, start_ns, end_ns)
+        ends, span = (cov[0], cov[-1]), (int(start_ns), int(end_ns))
+        return JointMotion(gtsam.Rot3(R), v, p, s, P, D, (first, last), ends, np.zeros((3, 3)), bias, *span, *arms)
+
+    def _inertial(self, imu: Imu, bias: Floats, earth: Floats, arm: Floats) -> Inertial:
+        """Rows in body axes, with what is to be removed from them."""
         body_R_imu = self.body_T_imu.rotation().matrix()
-        force = inertial.specific_force @ body_R_imu.T
+        force = imu.specific_force @ body_R_imu.T
         if self.rule == "inertial" and not np.isfinite(force).all():
             raise MeasurementError('Imu.specific_force: not measured in every row; use the rule "linear"')
-        rows = Inertial(
-            inertial.stamps_ns,
-            inertial.angular_velocity @ body_R_imu.T,
+        return Inertial(
+            imu.stamps_ns,
+            imu.angular_velocity @ body_R_imu.T,
             force,
             _vector(bias[:3]),
             _vector(bias[3:]),
@@ -264,17 +272,6 @@ class JointPreintegrator:
             _vector(arm),
             self.gyro_noise_density**2,
             self.accel_noise_density**2,
-        )
-        columns = samples.stamps_ns, velocity, cov
-        R, (v, p, s), P, D, first, last = preintegrate(rows, *columns, RULES[self.rule])
-        if not isfinite(sum(s.tolist()) + P.item(9, 9) + P.item(10, 10) + P.item(11, 11)):
-            raise MeasurementError(
-                f"from {start_ns} to {end_ns} ns: the motion is not finite; expected angular velocities in rad/s and"
-                " velocities in m/s that are not beyond all bounds"
-            )
-        ends, unshared = (cov[0], cov[-1]), np.zeros((3, 3))
-        return JointMotion(
-            gtsam.Rot3(R), v, p, s, P, D, (first, last), ends, unshared, bias, int(start_ns), int(end_ns), *arms
         )
 
     def _in_body(self, samples: Dvl) -> tuple[Floats, Floats]:
@@ -285,6 +282,14 @@ class JointPreintegrator:
             cov = np.where(unsaid, np.diag(np.square(self.velocity_sigma_m_s)), cov)
         check.covariances("Dvl.velocity_cov", cov, samples.stamps_ns)
         return samples.velocity @ body_R_dvl.T, body_R_dvl @ cov @ body_R_dvl.T
+
+
+def _refuse_infinite(s: Floats, P: Floats, start_ns: int, end_ns: int) -> None:
+    if not isfinite(sum(s.tolist()) + P.item(9, 9) + P.item(10, 10) + P.item(11, 11)):
+        raise MeasurementError(
+            f"from {start_ns} to {end_ns} ns: the motion is not finite; expected angular velocities in rad/s and"
+            " velocities in m/s that are not beyond all bounds"
+        )
 
 
 def _doppler_rows(dvl: Dvl, start_ns: int, end_ns: int) -> Dvl:

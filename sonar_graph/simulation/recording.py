@@ -106,10 +106,7 @@ def record(
     SimulationError
         When identities are to come late without tracks, of which late is the age.
     """
-    if options.id_delay_s > 0 and not options.tracks:
-        raise SimulationError(
-            f"simulate {name}: id_delay_s = {options.id_delay_s:g} is the age of a track; set tracks = true with it"
-        )
+    _require_tracks(name, options)
     calibration = _calibration(options, vehicle, path, world, streams.start)
     rates_hz = IMU_RATE_HZ, DVL_PRESETS[options.dvl].rate_hz, DEPTH_RATE_HZ, TRUTH_RATE_HZ
     imu_ns, dvl_ns, depth_ns, truth_ns = (regular_stamps(rate, path.duration_s) for rate in rates_hz)
@@ -128,6 +125,13 @@ def record(
         true_landmarks=world.landmark_map(),
         notes={"generator": f"sonar_graph {__version__}, {name}", "options": options.model_dump_json(), **notes},
     )
+
+
+def _require_tracks(name: str, options: SimulationOptions) -> None:
+    if options.id_delay_s > 0 and not options.tracks:
+        raise SimulationError(
+            f"simulate {name}: id_delay_s = {options.id_delay_s:g} is the age of a track; set tracks = true with it"
+        )
 
 
 def frame_stamps(rate_hz: float, duration_s: float) -> Ints:

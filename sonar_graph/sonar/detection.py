@@ -81,12 +81,7 @@ def select_candidates(
         When the shapes do not belong together, or a level is not finite.
     """
     params = params or DetectionParams()
-    if image_db.shape != (len(azimuths_rad), len(ranges_m)) or min(image_db.shape) < 2:
-        raise MeasurementError(
-            f"sonar frame: shape {image_db.shape}; beams and bins are {(len(azimuths_rad), len(ranges_m))}, 2 or more"
-        )
-    if not np.isfinite(cv2.sumElems(image_db)[0]):
-        raise MeasurementError("sonar frame: levels that are not finite; leave the frame out")
+    _require_image(image_db, (len(azimuths_rad), len(ranges_m)))
     cell_m = _cell_m(ranges_m, azimuths_rad)
     smoothing = _odd(params.smoothing_m, cell_m)
     smooth = np.asarray(cv2.blur(image_db, smoothing[::-1], borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
@@ -108,6 +103,13 @@ def select_candidates(
         view,
         params,
     )
+
+
+def _require_image(image_db: Floats32, beams_and_bins: tuple[int, int]) -> None:
+    if image_db.shape != beams_and_bins or min(image_db.shape) < 2:
+        raise MeasurementError(f"sonar frame: shape {image_db.shape}; beams and bins are {beams_and_bins}, 2 or more")
+    if not np.isfinite(cv2.sumElems(image_db)[0]):
+        raise MeasurementError("sonar frame: levels that are not finite; leave the frame out")
 
 
 def false_alarm_offset_db(spread_db: float, false_alarm: float) -> float:
