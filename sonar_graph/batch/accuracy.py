@@ -12,6 +12,7 @@ from sonar_graph.batch.rounding import between, supported, with_error
 from sonar_graph.batch.statistics import Paired, Summary, holm, paired, summarise
 from sonar_graph.batch.tables import Cell, Column, Table, absent, number, words
 
+SIGNIFICANT = 0.05
 QUANTILES = ("10_percent", "90_percent")
 Tests = dict[tuple[str, str, str], tuple[Paired, float]]
 """By column, log and contestant: the differences, and their p value corrected over the tests of the metric."""

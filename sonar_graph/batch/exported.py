@@ -30,6 +30,9 @@ LATEX_SPECIAL = {
     "\N{EN DASH}": "--",
     "\N{NO-BREAK SPACE}": "~",
     "²": r"$^2$",
+    "\N{DOWNWARDS ARROW}": r"$\downarrow$",
+    "\N{UPWARDS ARROW}": r"$\uparrow$",
+    "\N{NOT EQUAL TO}": r"$\neq$",
     "χ": r"$\chi$",
 }
 

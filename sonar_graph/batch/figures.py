@@ -1,6 +1,6 @@
 """Figures of a batch: each a pure function to a drawing with its own data, None where there is nothing to draw.
 
-A contestant keeps its colour and its place in every figure. Logs stand below each other with a scale of their own.
+A contestant keeps its colour and its place in every figure. Each log has a panel with a scale of its own.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
 
 from sonar_graph.batch.accuracy import Tests
 from sonar_graph.batch.catalogue import KINDS, Metric
 from sonar_graph.batch.exported import csv_text
 from sonar_graph.batch.overviews import anees_of
+from sonar_graph.batch.panels import log_panels, spread_out
 from sonar_graph.batch.recorded import RecordedBatch
 from sonar_graph.batch.statistics import failure_rate, quantile
 from sonar_graph.evaluation.figure_style import (
@@ -24,16 +24,11 @@ from sonar_graph.evaluation.figure_style import (
     MUTED,
     TICK_SIZE,
     TRUTH,
-    blank_panels,
     colour,
-    head_panel,
-    logarithmic,
-    name_axes,
 )
 from sonar_graph.evaluation.svg import inline_svg
 from sonar_graph.measurements import Floats
 
-ROW_IN, PANEL_IN, WIDTH_IN = 0.36, 0.95, 7.4
 KIND_SHIFT = {"": 0.0, "Causal": -0.17, "Smoothed": 0.17}
 FILLED = {"": True, "Causal": True, "Smoothed": False}
 SMALL = 9.0
@@ -59,11 +54,11 @@ def spread_drawing(batch: RecordedBatch, metric: Metric) -> Drawing | None:
     logs = [log for log in batch.logs if any(_finite(batch, log, name, metric).size for name in batch.contestants)]
     if not logs:
         return None
-    figure, panels = _panels(batch, logs, f"{metric.label}{_unit(metric)}")
+    figure, panels = log_panels(batch, logs, f"{metric.label}{_unit(metric)}")
     for panel, log in zip(panels, logs, strict=True):
         values = np.concatenate([_finite(batch, log, name, metric) for name in batch.contestants])
         if values.min() > 0 and values.max() > SMALL * values.min():
-            _spread_out(panel)
+            spread_out(panel)
         for place, contestant in enumerate(batch.contestants):
             for over, key in metric.keys.items():
                 _draw_spread(panel, batch.values(log, contestant, key) * metric.factor, place, over)
@@ -81,7 +76,7 @@ def difference_drawing(batch: RecordedBatch, metric: Metric, tests: Tests) -> Dr
     logs = [log for log in batch.logs if any(place[1] == log and math.isfinite(t.mean) for place, t in found.items())]
     if not logs:
         return None
-    figure, panels = _panels(batch, logs, f"difference to {batch.reference}{_unit(metric)}")
+    figure, panels = log_panels(batch, logs, f"difference to {batch.reference}{_unit(metric)}")
     for panel, log in zip(panels, logs, strict=True):
         panel.axvline(0, color=TRUTH, linewidth=1.6)
         for place, contestant in enumerate(batch.contestants):
@@ -121,9 +116,9 @@ def consistency_drawing(batch: RecordedBatch, what: str) -> Drawing | None:
     if not known:
         return None
     logs = [log for log in batch.logs if log in bands]
-    figure, panels = _panels(batch, logs, f"ANEES of {what} at the last instant")
+    figure, panels = log_panels(batch, logs, f"ANEES of {what} at the last instant")
     for panel, log in zip(panels, logs, strict=True):
-        _spread_out(panel)
+        spread_out(panel)
         for low, high in bands[log]:
             if math.isfinite(low):
                 panel.axvspan(low, high, color=TRUTH, alpha=0.25, linewidth=0)
@@ -146,7 +141,7 @@ def failure_drawing(batch: RecordedBatch) -> Drawing | None:
     """Failure rates with their intervals; None where every run ended."""
     if all(run.ended for run in batch.runs):
         return None
-    figure, panels = _panels(batch, batch.logs, "runs that did not end (%)")
+    figure, panels = log_panels(batch, batch.logs, "runs that did not end (%)")
     rows: Rows = [["log", "contestant", "runs", "failed", "failure_rate", "low", "high"]]
     for panel, log in zip(panels, batch.logs, strict=True):
         panel.set_xlim(-3, 103)
@@ -167,10 +162,10 @@ def cost_drawing(batch: RecordedBatch) -> Drawing | None:
     keys = ("update_p50_ms", "update_p99_ms")
     if not any(keys[0] in run.values for run in batch.runs):
         return None
-    figure, panels = _panels(batch, batch.logs, "time of an update (ms)")
+    figure, panels = log_panels(batch, batch.logs, "time of an update (ms)")
     rows: Rows = [["log", "contestant", *keys]]
     for panel, log in zip(panels, batch.logs, strict=True):
-        _spread_out(panel)
+        spread_out(panel)
         for place, contestant in enumerate(batch.contestants):
             ends = [quantile(batch.values(log, contestant, key), 0.5) for key in keys]
             rows.append([log, contestant, *map(_text, ends)])
@@ -180,27 +175,6 @@ def cost_drawing(batch: RecordedBatch) -> Drawing | None:
                 panel.plot(ends[1], place, "|", color=colour(place), markersize=11, markeredgewidth=2.4)
     caption = "Dot: median over runs of the median time of an update. Stroke: median over runs of the 99th percentile."
     return _drawn(figure, "costs", "Time of an update", caption, rows)
-
-
-def _panels(batch: RecordedBatch, logs: list[str], x_label: str) -> tuple[Figure, list[Axes]]:
-    """A panel a log, with a line for each contestant, the first on top."""
-    names = batch.contestants
-    height_in = len(logs) * (PANEL_IN + ROW_IN * len(names))
-    figure, axes = blank_panels(len(logs), 1, (WIDTH_IN, height_in))
-    for panel, log in zip(axes[:, 0], logs, strict=True):
-        head_panel(panel, log)
-        panel.set(ylim=(len(names) - 0.5, -0.5), yticks=range(len(names)), yticklabels=names)
-        panel.grid(False, axis="y")
-        for place, label in enumerate(panel.get_yticklabels()):
-            label.set_color(colour(place))
-    name_axes(axes[-1, 0], x_label)
-    return figure, list(axes[:, 0])
-
-
-def _spread_out(panel: Axes) -> None:
-    """A logarithmic scale with numbers at 1, 2 and 5 of each power of ten."""
-    logarithmic(panel, "x")
-    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
 
 
 def _draw_spread(panel: Axes, values: Floats, place: int, over: str) -> None:

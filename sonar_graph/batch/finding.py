@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections import Counter
 
-from sonar_graph.batch.accuracy import Tests, p_text
+from sonar_graph.batch.accuracy import SIGNIFICANT, Tests, p_text
 from sonar_graph.batch.catalogue import Metric
 from sonar_graph.batch.recorded import RecordedBatch
 from sonar_graph.batch.rounding import supported, with_error
 from sonar_graph.batch.statistics import least_p, quantile, summarise
 
-SIGNIFICANT = 0.05
 SCORED = "scored_instants"
+NAMED = 3
+"""Logs that a warning names; of more it tells the number."""
 
 
 def failures_told(batch: RecordedBatch) -> list[str]:
@@ -22,7 +23,7 @@ def failures_told(batch: RecordedBatch) -> list[str]:
         runs = [run for run in batch.runs if run.contestant == contestant]
         failed = [run for run in runs if not run.ended]
         if failed:
-            logs = ", ".join(dict.fromkeys(run.log for run in failed))
+            logs = _few(list(dict.fromkeys(run.log for run in failed)))
             sentences.append(f"{contestant}: {len(failed)} of {len(runs)} runs did not end ({logs}).")
     return sentences
 
@@ -95,12 +96,13 @@ def instants_told(batch: RecordedBatch) -> list[str]:
             uneven.append(log)
     if not uneven:
         return []
-    return [f"Scored at different numbers of instants, which differences then mix in: {', '.join(uneven)}."]
+    return [f"Scored at different numbers of instants, which differences then mix in: {_few(uneven)}."]
 
 
 def power_told(tests: Tests) -> list[str]:
     """A warning where there are too few pairs for any finding."""
-    families = Counter(key.rpartition(".")[2] for key, _, _ in tests)
+    distinct = {(key.rpartition(".")[2], log, name, id(test)) for (key, log, name), (test, _) in tests.items()}
+    families = Counter(family for family, *_ in distinct)
     blind = {
         place[1]: test.pairs
         for place, (test, _) in tests.items()
@@ -108,8 +110,14 @@ def power_told(tests: Tests) -> list[str]:
     }
     if not blind:
         return []
-    listed = ", ".join(f"{log} ({pairs} pair{'s' * (pairs != 1)})" for log, pairs in blind.items())
+    listed = _few([f"{log} ({pairs} pair{'s' * (pairs != 1)})" for log, pairs in blind.items()])
     return [f"Too few pairs for any corrected p value to fall below {SIGNIFICANT:g}: {listed}. Add seeds."]
+
+
+def _few(names: list[str]) -> str:
+    """The first names, and how many more there are."""
+    more = len(names) - NAMED
+    return ", ".join(names) if more < 1 else f"{', '.join(names[:NAMED])} and {more} more"
 
 
 def _p(p_value: float) -> str:

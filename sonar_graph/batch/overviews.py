@@ -30,6 +30,7 @@ LATEST = "_end"
 class RunList:
     """The runs of one contestant on one log."""
 
+    log: str
     anchor: str
     table: Table
 
@@ -145,7 +146,7 @@ def cost_table(batch: RecordedBatch) -> Table:
 def run_lists(batch: RecordedBatch, metrics: list[Metric]) -> list[RunList]:
     """Every run, by log and contestant."""
     return [
-        RunList(group_anchor(i, j), _run_table(f"{log}, {contestant}", f"runs-{i}-{j}", group, metrics))
+        RunList(log, group_anchor(i, j), _run_table(f"{log}, {contestant}", f"runs-{i}-{j}", group, metrics))
         for i, log in enumerate(batch.logs)
         for j, contestant in enumerate(batch.contestants)
         if (group := batch.group(log, contestant))

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections import Counter
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, select_autoescape
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from sonar_graph.batch.accuracy import Tests, accuracy_table, all_tests, difference_table
 from sonar_graph.batch.catalogue import Metric, estimate_sentences, metrics_of
@@ -23,6 +25,7 @@ from sonar_graph.batch.figures import (
     spread_drawing,
 )
 from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told
+from sonar_graph.batch.headline import head_metric, headlines, overview_table
 from sonar_graph.batch.overviews import consistency_table, cost_table, failure_table, run_lists
 from sonar_graph.batch.recorded import RESULTS, RecordedBatch
 from sonar_graph.batch.statistics import LEAST_PAIRS, RESAMPLES
@@ -30,6 +33,9 @@ from sonar_graph.batch.tables import Table
 from sonar_graph.evaluation.atomic import replacing
 from sonar_graph.evaluation.figure_style import ESTIMATOR_COLOURS
 
+FOLDED_ROWS = 24
+"""Tables with more rows are folded on the screen: what is in them is drawn above them."""
+FEW_LOGS = 2
 TEMPLATE, PAGE = "batch.html", "report.html"
 SAME_FOR_ALL = (
     *("machine", "versions", "sonar_graph", "source", "estimator_source"),
@@ -82,6 +88,7 @@ def _render(content: dict[str, Any]) -> str:
         "csv_uri": _csv_uri,
         "table_csv": as_csv,
         "latex_uri": _latex_uri,
+        "breakable": _breakable,
     }
     return environment.get_template(TEMPLATE).render(**content)
 
@@ -90,6 +97,8 @@ def _content(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> dict[
     """What the template shows, by the names it uses."""
     chapters = [_chapter(batch, metric, tests) for metric in metrics]
     shown = [chapter for chapter in chapters if chapter.drawings or chapter.tables]
+    head = head_metric(batch, metrics)
+    overview = overview_table(batch, head, tests) if head else None
     failures, consistency, costs = failure_table(batch), consistency_table(batch), cost_table(batch)
     return {
         "name": batch.name,
@@ -97,7 +106,11 @@ def _content(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> dict[
         "summary": _summary(batch),
         "failed": failures_told(batch),
         "warnings": [*instants_told(batch), *power_told(tests)],
-        "finding": errors_told(batch, metrics, tests),
+        "headlines": headlines(batch, head, tests) if head else [],
+        "overview": overview,
+        "log_findings": errors_told(batch, metrics, tests),
+        "few_logs": len(batch.logs) <= FEW_LOGS,
+        "folded_rows": FOLDED_ROWS,
         "reference": batch.reference,
         "colours": len(ESTIMATOR_COLOURS),
         "contestants": batch.contestants,
@@ -109,8 +122,8 @@ def _content(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> dict[
         "consistency_drawings": _drawn(consistency_drawing(batch, what) for what in ("position", "yaw")),
         "costs": costs,
         "cost_drawings": _drawn([cost_drawing(batch)]),
-        "run_lists": run_lists(batch, metrics),
-        "tables": [failures, *(table for chapter in shown for table in chapter.tables), consistency, costs],
+        "run_lists": [(log, list(lists)) for log, lists in groupby(run_lists(batch, metrics), lambda one: one.log)],
+        "tables": [*filter(None, [overview]), failures, *_chapter_tables(shown), consistency, costs],
         "resamples": RESAMPLES,
         "least_pairs": LEAST_PAIRS,
         "suite": batch.suite,
@@ -118,6 +131,10 @@ def _content(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> dict[
         "origins": _origins(batch),
         "results": RESULTS,
     }
+
+
+def _chapter_tables(chapters: list[Chapter]) -> list[Table]:
+    return [table for chapter in chapters for table in chapter.tables]
 
 
 def _chapter(batch: RecordedBatch, metric: Metric, tests: Tests) -> Chapter:
@@ -163,6 +180,11 @@ def _origins(batch: RecordedBatch) -> dict[str, list[str]]:
         many = len(counts) > 1
         found[name] = [f"{text} ({count} runs)" if many else text for text, count in counts.items()]
     return {name: texts for name, texts in found.items() if texts}
+
+
+def _breakable(name: str) -> Markup:
+    """A name that may go on in the next line after the signs that join its parts."""
+    return Markup(re.sub(r"([/=_,])", r"\1<wbr>", str(escape(name))))
 
 
 def _csv_uri(text: str) -> str:

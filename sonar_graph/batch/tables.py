@@ -19,6 +19,8 @@ class Column:
     parts: tuple[str, ...] = ("",)
     """Suffixes of the numbers in a cell."""
     is_number: bool = True
+    contestant: str = ""
+    """Whom the column is about: its heading has their colour."""
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,12 @@ def page_file(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def page_of_many_logs(tmp_path_factory) -> Path:
+    logs = tuple(f"tracks, wrong_id_rate={rate}" for rate in range(9))
+    return write_batch_report(drawn_batch(6, logs=logs), tmp_path_factory.mktemp("many"))
+
+
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     with sync_api.sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
@@ -67,6 +73,27 @@ def test_the_checks_notice_what_they_look_for(browser, page_file, tmp_path):
     with opened(browser, broken, PHONE) as (page, said):
         assert page.evaluate("document.documentElement.scrollWidth") > PHONE
         assert any("nothing is not defined" in line for line in said)
+
+
+@pytest.mark.parametrize("width", [PHONE, DESKTOP])
+def test_many_logs_have_a_head_of_one_screen_and_a_page_that_can_be_scrolled(browser, page_of_many_logs, width):
+    with opened(browser, page_of_many_logs, width) as (page, said):
+        height = page.evaluate("document.documentElement.scrollHeight")
+        below = page.evaluate("document.querySelector('#table-overview').getBoundingClientRect().bottom")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert said == []
+    assert below <= 900
+    assert height < 25_000
+
+
+def test_folded_tables_are_printed(browser, page_of_many_logs):
+    shown = "document.querySelector('#table-consistency').checkVisibility()"
+    with opened(browser, page_of_many_logs, DESKTOP) as (page, _):
+        assert not page.evaluate(shown)
+        page.evaluate("dispatchEvent(new Event('beforeprint'))")
+        assert page.evaluate(shown)
+        page.evaluate("dispatchEvent(new Event('afterprint'))")
+        assert not page.evaluate(shown)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -107,7 +134,9 @@ def test_a_number_of_runs_opens_the_list_of_them(browser, page_file):
     with opened(browser, page_file, DESKTOP) as (page, _):
         page.locator("#table-failures tbody a").first.click()
         page.wait_for_function("document.querySelector('#runs-0-0').closest('details').open")
-        assert page.evaluate("document.querySelectorAll('details[open]').length") == 1
+        opened_ones = "[...document.querySelectorAll('#runs ~ details[open], #runs ~ details details[open]')]"
+        assert page.evaluate(f"{opened_ones}.every(one => one.contains(document.querySelector('#runs-0-0')))")
+        assert page.evaluate(f"{opened_ones}.length") == 2, "the log's and the contestant's"
 
 
 def test_data_of_a_figure_can_be_downloaded(browser, page_file):

@@ -14,3 +14,7 @@ for (const button of document.querySelectorAll(".sortable th button")) {
     body.append(...[...body.rows].sort(compare));
   });
 }
+const folded = () => document.querySelectorAll("details.folded:not([open])");
+let unfolded = [];
+addEventListener("beforeprint", () => { unfolded = [...folded()]; for (const one of unfolded) one.open = true; });
+addEventListener("afterprint", () => { for (const one of unfolded) one.open = false; });

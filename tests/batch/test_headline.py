@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sonar_graph.batch.accuracy import all_tests
+from sonar_graph.batch.catalogue import metrics_of
+from sonar_graph.batch.exported import as_csv, as_latex
+from sonar_graph.batch.headline import HIGHER, LOWER, head_metric, headlines, overview_table
+from sonar_graph.batch.recorded import RecordedBatch
+from sonar_graph.batch.tables import Cell, Table
+
+from .recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, with_failures
+
+ATE = metrics_of(["causal.ate_se2_m"])[0]
+
+
+def overview_of(batch: RecordedBatch) -> Table:
+    return overview_table(batch, ATE, all_tests(batch, [ATE]))
+
+
+def cell_of(table: Table, log: str, over: str, contestant: str) -> Cell:
+    place = next(i for i, c in enumerate(table.columns) if (c.over, c.contestant) == (over, contestant))
+    return next(row[place] for row in table.rows if row[0].text == log)
+
+
+def without_smoothing(batch: RecordedBatch, contestant: str) -> RecordedBatch:
+    """The batch, were the smoothed estimate of a contestant its causal one."""
+    same = {"smoothed.ate_se2_m": "causal.ate_se2_m"}
+    runs = [
+        replace(run, values=run.values | {own: run.values[other] for own, other in same.items()})
+        if run.contestant == contestant
+        else run
+        for run in batch.runs
+    ]
+    return replace(batch, runs=runs)
+
+
+def test_overview_has_the_median_of_every_log_and_contestant():
+    batch = drawn_batch()
+    row = next(csv.DictReader(io.StringIO(as_csv(overview_of(batch)))))
+    for contestant in batch.contestants:
+        for kind in ("causal", "smoothed"):
+            key = f"{kind}.ate_se2_m"
+            assert float(row[f"{key} {contestant}"]) == np.median(batch.values(LOGS[0], contestant, key))
+
+
+def test_arrows_point_to_the_side_of_the_difference_and_only_where_it_is_no_chance():
+    batch = replace(changed(drawn_batch(), "dead-reckoning", "causal.ate_se2_m", 3.0), reference="ekf-slam")
+    batch = changed(batch, "isam2", "causal.ate_se2_m", 0.2)
+    table = overview_of(batch)
+    assert cell_of(table, LOGS[0], "Causal", "isam2").text.endswith(LOWER)
+    assert cell_of(table, LOGS[0], "Causal", "dead-reckoning").text.endswith(HIGHER)
+    assert LOWER not in cell_of(table, LOGS[0], "Causal", "ekf-slam").text
+    few = overview_of(replace(batch, runs=[run for run in batch.runs if run.seed in (0, 1, 2)]))
+    assert not any(arrow in cell.text for row in few.rows for cell in row for arrow in (LOWER, HIGHER))
+
+
+def test_a_filter_has_no_smoothed_column_and_the_reference_is_named():
+    table = overview_of(without_smoothing(drawn_batch(), "ekf-slam"))
+    smoothed = [column.contestant for column in table.columns if column.over == "Smoothed"]
+    assert smoothed == ["dead-reckoning", "isam2"]
+    assert next(column.heading for column in table.columns if column.over == "Causal") == "dead-reckoning (reference)"
+
+
+def test_a_median_over_failed_runs_says_so():
+    cell = cell_of(overview_of(with_failures(drawn_batch(), "isam2", LOGS[0], 6)), LOGS[0], "Causal", "isam2")
+    assert cell.text.startswith("no value")
+    assert cell.note == "6 of 10 without a value"
+
+
+def test_the_sentence_counts_logs():
+    batch = drawn_batch(logs=("one", "two", "three"))
+    worse = [
+        replace(run, values=run.values | {"causal.ate_se2_m": 9.0 + 0.01 * run.seed})
+        if (run.contestant, run.log) == ("isam2", "two")
+        else run
+        for run in batch.runs
+    ]
+    causal, smoothed = headlines(batch, ATE, all_tests(batch, [ATE]))
+    assert (
+        causal
+        == "Causal error beside that of dead-reckoning (on how many of 3 logs): lower with isam2 (3), ekf-slam (3)."
+    )
+    assert smoothed.startswith("Smoothed error beside that of dead-reckoning")
+    mixed = replace(batch, runs=worse)
+    told = headlines(mixed, ATE, all_tests(mixed, [ATE]))[0]
+    assert "lower with isam2 (2), ekf-slam (3); higher with isam2 (1)" in told
+
+
+def test_one_log_is_not_counted_and_few_seeds_tell_nothing():
+    batch = drawn_batch(logs=LOGS[:1])
+    assert headlines(batch, ATE, all_tests(batch, [ATE]))[0] == (
+        "Causal error beside that of dead-reckoning: lower with isam2, ekf-slam."
+    )
+    few = drawn_batch(3)
+    (told,) = headlines(few, ATE, all_tests(few, [ATE]))
+    assert told.endswith("no estimator is told apart from dead-reckoning.")
+
+
+def test_the_head_shows_the_first_error_that_most_logs_have():
+    batch, metrics = drawn_batch(), metrics_of(METRICS)
+    assert head_metric(batch, metrics) == metrics[0]
+    partly = replace(
+        batch,
+        runs=[
+            replace(run, values={key: value for key, value in run.values.items() if "ate" not in key})
+            if run.log == LOGS[0]
+            else run
+            for run in batch.runs
+        ],
+    )
+    assert head_metric(partly, metrics) == metrics[1]
+    assert head_metric(replace(batch, runs=[failed(run) for run in batch.runs]), metrics) is None
+
+
+@pytest.mark.parametrize("arrow", [r"$\downarrow$"])
+def test_latex_has_arrows_as_commands(arrow):
+    text = as_latex(overview_of(drawn_batch()))
+    assert arrow in text
+    assert LOWER not in text
