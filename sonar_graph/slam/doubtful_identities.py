@@ -174,7 +174,7 @@ class DoubtfulIdentities:
             changes = [
                 (watch, new)
                 for watch, new in self._changes(watches, self._smoother.values)
-                if watch.landmark_id is None or self._is_preferred(new, watch)
+                if watch.landmark_id is None or self._is_alone(watch) or self._is_preferred(new, watch)
             ]
             if not changes:
                 break
@@ -212,19 +212,28 @@ class DoubtfulIdentities:
         return _differing(watches, best)
 
     def _open(self) -> list[Watch]:
-        """Watches whose sightings are all in the window; not those that alone hold a landmark, which suits them."""
-        recent, sizes = self.watches[-MOST_OPEN:], self._landmarks.sizes()
+        """Contradicted watches, and those whose sightings are all in the window, unless they alone hold a landmark."""
+        recent, contradicted = self.watches[-MOST_OPEN:], self._contradicted()
         inside = set(self._smoother.in_window(sorted({s.line.pose_key for w in recent for s in w.sightings})))
-        return [
+        return contradicted + [
             watch
             for watch in recent
-            if (watch.landmark_id is None or sizes[watch.landmark_id] > len(watch.sightings))
+            if not self._is_alone(watch)
             and all(s.line.pose_key in inside for s in watch.sightings)
-        ] + [watch for watch in self._contradicted() if any(s.line.pose_key not in inside for s in watch.sightings)]
+            and watch not in contradicted
+        ]
+
+    def _is_alone(self, watch: Watch) -> bool:
+        """Whether its landmark is where it, and no other watch, has put it."""
+        return watch.landmark_id is not None and self._landmarks.sizes()[watch.landmark_id] == len(watch.sightings)
 
     def _contradicted(self) -> list[Watch]:
-        """Watches of tracks of which something else was said since they were chosen."""
-        return [watch for watch in self._tracks.values() if watch.landmark_id not in (None, watch.statement.favourite)]
+        """Watches of tracks that are now named as something else than what they count as."""
+        return [
+            watch
+            for watch in self._tracks.values()
+            if watch.landmark_id is not None and watch.statement.favourite not in (None, watch.landmark_id)
+        ]
 
     def _is_preferred(self, new: int | None, watch: Watch) -> bool:
         """Whether the predictive density of a watch's newest sighting, too, is for another component than the present.
@@ -233,7 +242,7 @@ class DoubtfulIdentities:
         may leave it there for some updates.
         """
         sighting, values = watch.sightings[-1], self._smoother.values
-        ids = [i for i in (watch.landmark_id, new) if i is not None]
+        ids = [i for i in (watch.landmark_id, new) if i is not None and i in self._landmarks]
         line, keys = sighting.line, [L(i) for i in ids]
         joint = self._smoother.joint_covariance_of_any([line.pose_key, *keys])
         view = View(line.pose_key, None, values.atPose3(line.pose_key), STILL, line.body_T_sonar, joint)

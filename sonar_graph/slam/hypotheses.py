@@ -58,8 +58,8 @@ class Statement:
 
     @property
     def favourite(self) -> int | None:
-        """The most probable landmark; None where it names none."""
-        return max(self.probability, key=self.probability.__getitem__, default=None)
+        """The landmark that is more probable than all else together; None where there is none: it names nothing."""
+        return next((landmark_id for landmark_id, p in self.probability.items() if p > 0.5), None)
 
     def log_weights(self, ids: list[int], errors: RecogniserErrors) -> Floats:
         """Logarithms of w of some landmarks, and of none, shape (K + 1,); K is their number."""

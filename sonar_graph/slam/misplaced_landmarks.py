@@ -32,7 +32,7 @@ def supporters_elsewhere(
     Parameters
     ----------
     watches
-        Those whose statement favours the landmark.
+        Those that name the landmark.
     choices
         What each counts as now.
     """

@@ -213,7 +213,7 @@ class Mixture:
         """Components of watches where the estimate is.
 
         A landmark that has no sightings but those of one watch is where they have put it. To that watch it is a
-        landmark of unknown place.
+        landmark of unknown place, as one is that it may be and that is not in the graph.
 
         Parameters
         ----------
@@ -224,20 +224,33 @@ class Mixture:
         """
         ids, unplaced = sorted(sizes), self._unplaced(watches)
         points = np.array([values.atPoint3(L(i)) for i in ids]).reshape(-1, 3)
-        totals = np.zeros((len(watches), len(ids) + 1))
-        totals[:, :-1] = self._fits(watches, points, values)
-        for row, (watch, choice) in enumerate(zip(watches, choices, strict=True)):
-            totals[row, -1] = unplaced[row]
+        fits, scores = self._fits(watches, points, values), []
+        for watch, choice, own, anywhere in zip(watches, choices, fits, unplaced.tolist(), strict=True):
             if choice is not None and sizes[choice] == len(watch.sightings):
-                totals[row, ids.index(choice)] = unplaced[row]
-            totals[row] += watch.statement.log_weights(ids, self._errors)
-        return [dict(zip([*ids, None], row, strict=True)) for row in totals.tolist()]
+                own[ids.index(choice)] = anywhere
+            new = [i for i in watch.statement.probability if i not in sizes]
+            totals = np.append(own, np.full(len(new) + 1, anywhere))
+            totals += watch.statement.log_weights([*ids, *new], self._errors)
+            scores.append(dict(zip([*ids, *new, None], totals.tolist(), strict=True)))
+        return scores
 
     def best(self, watches: list[Watch], values: gtsam.Values, choices: Choices, sizes: dict[int, int]) -> Choices:
-        """Largest component of each watch where the estimate is; no landmark twice in a frame."""
+        """Largest component of each watch where the estimate is; no landmark twice in a frame.
+
+        A landmark that is not in the graph begins with one watch, that with most sightings. Others keep what they have:
+        only then is known where it is.
+        """
         if not watches:
             return []
-        return each_once(self.scores(watches, values, choices, sizes), [watch.stamps_ns for watch in watches])
+        found = each_once(self.scores(watches, values, choices, sizes), [watch.stamps_ns for watch in watches])
+        beginning: dict[int, Watch] = {}
+        for watch, new in sorted(zip(watches, found, strict=True), key=lambda pair: -len(pair[0].sightings)):
+            if new is not None and new not in sizes:
+                beginning.setdefault(new, watch)
+        return [
+            old if new in beginning and beginning[new] is not watch else new
+            for watch, old, new in zip(watches, choices, found, strict=True)
+        ]
 
 
 def _starts(watches: list[Watch]) -> list[int]:

@@ -122,12 +122,14 @@ class RivalHistory:
         return moved, choices
 
     def _solve(self, values: gtsam.Values, choices: Choices) -> gtsam.Values:
-        lines = Sightlines()
+        lines, start = Sightlines(), gtsam.Values(values)
         for watch, choice in zip(self._watches, choices, strict=True):
             if choice is not None:
                 for sighting in watch.sightings:
                     lines.add(L(choice), sighting.line)
-        return solve_in_sight(self._chosen_graph(choices), values, lines)
+                if not start.exists(L(choice)):
+                    start.insert(L(choice), self._maker.place(watch.sightings[0], values))
+        return solve_in_sight(self._chosen_graph(choices), start, lines)
 
     def _chosen_graph(self, choices: Choices) -> gtsam.NonlinearFactorGraph:
         """The history with the watches of these landmarks."""

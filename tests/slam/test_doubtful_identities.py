@@ -33,18 +33,20 @@ def dive(policy: SightingPolicy) -> Dive:
     return Dive(CALIBRATION.model_copy(update={"floor": FLOOR}), policy)
 
 
-def watch(world: Dive, after_s: float, said: dict[int, int], rng: np.random.Generator, track: int = -1) -> None:
-    """A frame with the landmarks that are the keys, each named as the value says, and as surely as can be."""
+def watch(
+    world: Dive, after_s: float, said: dict[int, int], rng: np.random.Generator, track: int = -1, surely: float = 1.0
+) -> None:
+    """A frame with the landmarks that are the keys, each named as the value says."""
     z = [spherical(0.5 * after_s, PLACES[i]) + [0.02, 0.01] * rng.standard_normal(2) for i in said]
-    show(world, after_s, np.array(z), list(said.values()), [track] * len(z))
+    show(world, after_s, np.array(z), list(said.values()), [track] * len(z), surely)
 
 
-def show(world: Dive, after_s: float, z, named: list[int], tracks: list[int]) -> None:
+def show(world: Dive, after_s: float, z, named: list[int], tracks: list[int], surely: float = 1.0) -> None:
     stamp, n = T0_NS + round(after_s * 1e9), len(z)
     world.keyframes.advance(stamp)
     candidates, unknown = np.array(named)[:, None], np.full((n, 2, 2), np.nan)
     rows = LandmarkDetections(
-        np.full(n, stamp), z[:, 0], z[:, 1], unknown, candidates, np.ones((n, 1)), np.array(tracks)
+        np.full(n, stamp), z[:, 0], z[:, 1], unknown, candidates, np.full((n, 1), surely), np.array(tracks)
     )
     world.sightings.add(rows)
 
@@ -209,6 +211,42 @@ def test_one_name_that_changes_moves_all_sightings_of_its_track() -> None:
         watch(world, 0.3 * k, {7: name}, rng, track=2)
     assert len(world.sightings._landmarks.sightings(7)) == 5
     assert worst_landmark_m(world) < 0.1
+
+
+def test_a_landmark_that_alone_was_named_wrongly_gets_its_name_with_all_sightings() -> None:
+    """A landmark 4 that nothing else was seen of becomes 9 when its track is named so."""
+    world, rng = dive(doubting()), np.random.default_rng(2)
+    for k in range(1, 4):
+        watch(world, 0.3 * k, {7: 7}, rng)
+    for k, name in enumerate([4, 4, 4, 9, 9], start=4):
+        watch(world, 0.3 * k, {9: name}, rng, track=2)
+    assert world.sightings.ids == {7, 9}
+    assert len(world.sightings._landmarks.sightings(9)) == 5
+    values = world.sightings.history().values
+    assert np.linalg.norm(values.atPoint3(L(9)) - PLACES[9]) < 0.1
+
+
+@pytest.mark.parametrize(("surely", "where"), [(0.3, 7), (0.9, 4)], ids=["not named", "named"])
+def test_what_names_no_landmark_has_no_vote_on_its_place(surely: float, where: int) -> None:
+    """Landmark 7 is seen three times; then another thing thirty times, which is more or less surely said to be 7."""
+    world, rng = dive(doubting()), np.random.default_rng(2)
+    for k in range(1, 4):
+        watch(world, 0.3 * k, {7: 7}, rng)
+    for k in range(4, 34):
+        watch(world, 0.3 * k, {4: 7}, rng, surely=surely)
+    assert np.linalg.norm(world.sightings.history().values.atPoint3(L(7)) - PLACES[where]) < 0.1
+
+
+def test_a_landmark_begins_with_one_of_those_that_name_it() -> None:
+    """The longest; where the others are is only known then, and one far from it is of no landmark."""
+    values, noise = gtsam.Values(), np.diag([4e-4, 1e-4])
+    values.insert(X(0), gtsam.Pose3())
+    near, far = (Sightline(X(0), gtsam.Pose3(), np.array(z)) for z in ([3.0, 0.0], [3.0, 0.4]))
+    single = Watch(Statement({7: 0.9}), [Sighting(0, 0, far, noise, None)])
+    longest = Watch(Statement({7: 0.9}), [Sighting(k, k, near, noise, None) for k in range(1, 4)])
+    assert MIXTURE.best([single, longest], values, [None, None], {}) == [None, 7]
+    values.insert(L(7), np.array([3.0, 0.0, 0.0]))
+    assert MIXTURE.best([single, longest], values, [None, 7], {7: 3}) == [None, 7]
 
 
 def test_a_gate_that_would_do_nothing_is_refused() -> None:

@@ -36,3 +36,18 @@ def test_the_order_of_weights_is_that_of_the_posterior() -> None:
 def test_what_is_no_number_or_no_landmark_is_not_stated() -> None:
     assert statement([5, -1, 3], [np.nan, 0.9, 0.1]).probability == {3: 0.1}
     assert statement([-1], [1.0]).favourite is None
+
+
+@pytest.mark.parametrize(
+    ("probability", "named"),
+    [
+        ([0.97, 0.01], 5),
+        ([0.2, 0.2], None),
+        ([0.4, 0.1], None),
+        ([0.5, 0.5], None),
+        ([0.1, 0.6], 3),
+        ([0.0, 0.0], None),
+    ],
+)
+def test_only_what_is_more_probable_than_all_else_is_named(probability: list[float], named: int | None) -> None:
+    assert statement([5, 3][: len(probability)], probability).favourite == named
