@@ -17,7 +17,7 @@ from sonar_graph.slam.misplaced_landmarks import supporters_elsewhere
 from sonar_graph.slam.mixture import Choices, Mixture, Watch
 from sonar_graph.slam.sighting import Sighting, SightingFactors
 from sonar_graph.slam.sightlines import Sightlines, solve_in_sight
-from sonar_graph.slam.weighed_history import WeighedHistory
+from sonar_graph.slam.weighed_history import WeighedHistory, earliest
 
 MOST_ROUNDS = 10
 """Times that choices are made anew."""
@@ -66,9 +66,16 @@ class RivalHistory:
         return marginals_of(self._chosen_graph(choices), values)
 
     def cost(self, values: gtsam.Values, choices: Choices) -> float:
-        """Of the max-mixture, with these components."""
+        """Of the max-mixture, with these components; what is said once of a landmark is of all other factors there."""
         scores = self._mixture.scores(self._watches, values, choices, self._sizes(choices))
-        return float(self._rest.error(values)) - sum(s[choice] for s, choice in zip(scores, choices, strict=True))
+        chosen = [(watch, choice) for watch, choice in zip(self._watches, choices, strict=True) if choice is not None]
+        said_once = sum(
+            factor.error(values)
+            for landmark_id, first in earliest([w for w, _ in chosen], [i for _, i in chosen]).items()
+            for factor in self._maker.beginning(first, L(landmark_id))
+        )
+        components = sum(score[choice] for score, choice in zip(scores, choices, strict=True))
+        return float(self._rest.error(values)) + said_once - components
 
     def graduated(self, values: gtsam.Values) -> tuple[gtsam.Values, Choices]:
         """From graduated non-convexity on what the recogniser said, the nearest fixed point of the max-mixture."""

@@ -35,7 +35,7 @@ class WeighedHistory:
         self, rest: gtsam.NonlinearFactorGraph, watches: list[Watch], ids: list[int], maker: SightingFactors
     ) -> None:
         self._unweighed = gtsam.NonlinearFactorGraph(rest)
-        for landmark_id, first in _earliest(watches, ids).items():
+        for landmark_id, first in earliest(watches, ids).items():
             for factor in maker.beginning(first, L(landmark_id)):
                 self._unweighed.push_back(factor)
         self._maker = maker
@@ -62,8 +62,8 @@ class WeighedHistory:
         return [_with_sigmas(factor, factor.noiseModel().sigmas() / math.sqrt(weight)) for factor in factors]
 
 
-def _earliest(watches: list[Watch], ids: list[int]) -> dict[int, Sighting]:
-    """The first sighting of each landmark."""
+def earliest(watches: list[Watch], ids: list[int]) -> dict[int, Sighting]:
+    """The first sighting of each landmark, for watches that are each of one."""
     first: dict[int, Sighting] = {}
     for watch, landmark_id in zip(watches, ids, strict=True):
         for sighting in watch.sightings:
