@@ -20,7 +20,7 @@ from sonar_graph.batch.planned import PlannedRun, Row
 from sonar_graph.batch.sources import read_source
 from sonar_graph.errors import BatchError
 from sonar_graph.evaluation.comparison import judge
-from sonar_graph.evaluation.environment import describe_environment
+from sonar_graph.evaluation.environment import LIBRARIES, describe_environment
 from sonar_graph.evaluation.results import Comparison, ErrorSeries, RunResult
 from sonar_graph.evaluation.run import one_line, run_estimator
 from sonar_graph.evaluation.storage import write_comparison
@@ -150,7 +150,7 @@ def _failed(reason: str) -> Row:
 
 
 def _versions(environment: dict[str, str]) -> Row:
-    return {key: environment[key] for key in ("sonar_graph", "gtsam", "numpy", "python", "machine")}
+    return {key: environment[key] for key in ("sonar_graph", *LIBRARIES, "python", "machine")}
 
 
 def _spent(clock: Clock, cpu_before_s: float) -> Row:

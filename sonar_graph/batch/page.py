@@ -39,7 +39,7 @@ FEW_LOGS = 2
 TEMPLATE, PAGE = "batch.html", "report.html"
 SAME_FOR_ALL = (
     *("machine", "versions", "sonar_graph", "source", "estimator_source"),
-    *("gtsam", "numpy", "scipy", "python"),
+    *("gtsam", "numpy", "scipy", "numba", "python"),
 )
 
 

@@ -94,7 +94,7 @@ def versions_of(estimator: str) -> dict[str, str]:
 def _sources(file: SuiteFile, number: int, entry: LogEntry) -> Iterator[_Source]:
     place = ("logs", number)
     _check_source(file, place, entry)
-    for chosen in _combinations(file, place, entry.grid):
+    for chosen in _combinations(file, place, entry.grid, entry.options, "options"):
         values = entry.options | chosen
         if entry.log is not None:
             values = {"log": entry.log, **values}
@@ -106,7 +106,7 @@ def _sources(file: SuiteFile, number: int, entry: LogEntry) -> Iterator[_Source]
         try:
             KINDS[entry.kind].check(options)
         except SonarGraphError as error:
-            file.refuse((*place, "options"), str(error))
+            file.refuse((*place, "log" if entry.log is not None else "options"), str(error))
         plain = options.model_dump(mode="json", exclude={"seed"})
         yield _Source(entry, _label(entry.name, chosen), plain, fingerprint(entry.kind, plain))
 
@@ -119,6 +119,8 @@ def _check_source(file: SuiteFile, place: Place, entry: LogEntry) -> None:
     for name in {"seed", "image"} & {*entry.options, *entry.grid}:
         reason = "seeds are given as seeds = [...]" if name == "seed" else "recognise landmarks first, and give the log"
         file.refuse((*place, "options", name), f"cannot be set in a suite: {reason}")
+    if not entry.seed_list():
+        file.refuse((*place, "seeds"), "has no seeds; give a number from 1 on, or a list of them")
     if entry.landmarks is not None:
         if "seed" in entry.landmarks:
             file.refuse((*place, "landmarks", "seed"), "cannot be set in a suite: seeds are given as seeds = [...]")
@@ -133,15 +135,19 @@ def _contestants(file: SuiteFile, number: int, entry: EstimatorEntry) -> Iterato
         file.refuse((*place, "name"), str(error))
     except EstimatorError:  # its runs fail with the reason, and the others go on
         params = None
-    for chosen in _combinations(file, place, entry.grid):
+    for chosen in _combinations(file, place, entry.grid, entry.params, "params"):
         given = values = entry.params | chosen
         if params is not None:
             values = _checked(file, place, chosen, params, given, "params").model_dump(mode="json")
         yield _Contestant(entry.name, _label(entry.variant, chosen) or DEFAULT_VARIANT, given, values)
 
 
-def _combinations(file: SuiteFile, place: Place, grid: dict[str, list[Any]]) -> Iterator[dict[str, Any]]:
+def _combinations(
+    file: SuiteFile, place: Place, grid: dict[str, list[Any]], fixed: dict[str, Any], table: str
+) -> Iterator[dict[str, Any]]:
     for name, values in grid.items():
+        if name in fixed:
+            file.refuse((*place, "grid", name), f"is also in {table}; give it in one of them")
         if not values:
             file.refuse((*place, "grid", name), "has no values; give at least one")
     for chosen in itertools.product(*grid.values()):

@@ -23,7 +23,7 @@ RESULTS = "results.parquet"
 SUITE_METADATA = b"sonar_graph.suite"
 TEXTS = ("key", "suite", "log", "generator", "options")
 SETTINGS = ("variant", "params", "estimator", "status", "reason", "log_file")
-VERSIONS = ("sonar_graph", "source", "estimator_source", "gtsam", "numpy", "python", "machine")
+VERSIONS = ("sonar_graph", "source", "estimator_source", "gtsam", "numpy", "scipy", "numba", "python", "machine")
 TIMINGS = (
     *("wall_s", "read_s", "estimate_s", "cpu_s", "peak_memory_mb"),
     *("update_p50_ms", "update_p99_ms", "finish_s"),

@@ -18,12 +18,13 @@ from pydantic import Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import CalibrationError
-from sonar_graph.logs.adapters.config import read_log_config
+from sonar_graph.logs.adapters.config import LogConfig, read_log_config
 from sonar_graph.logs.calibration_sources import PartialCalibration
 from sonar_graph.logs.converters.akit import read_akit
 from sonar_graph.logs.converters.mrclam import read_mrclam
 from sonar_graph.logs.converters.victoria_park import read_victoria_park
 from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.records import LogFile
 from sonar_graph.logs.window import Instant, Window
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, cruise_speed, simulate_basin
@@ -78,18 +79,35 @@ class SourceKind:
 def _read_log(options: LogOptions) -> Sequence:
     return read_sequence(
         Path(options.log),
-        calibration=None if options.calibration is None else _read_calibration(Path(options.calibration)),
+        calibration=_read_calibration(options.calibration),
         topics=options.topics,
-        config=None if options.log_config is None else read_log_config(Path(options.log_config)),
-        window=Window(
-            None if options.start is None else Instant.parse(options.start),
-            None if options.end is None else Instant.parse(options.end),
-        ),
+        config=_read_config(options.log_config),
+        window=_window(options),
         salvage=options.salvage,
     )
 
 
-def _read_calibration(path: Path) -> PartialCalibration:
+def _check_log(options: LogOptions) -> None:
+    """Raise for what is no log, and for what is said about it that cannot be understood."""
+    with LogFile(Path(options.log)):
+        _read_calibration(options.calibration)
+        _read_config(options.log_config)
+        _window(options)
+
+
+def _window(options: LogOptions) -> Window:
+    first, last = (None if text is None else Instant.parse(text) for text in (options.start, options.end))
+    return Window(first, last)
+
+
+def _read_config(name: str | None) -> LogConfig | None:
+    return None if name is None else read_log_config(Path(name))
+
+
+def _read_calibration(name: str | None) -> PartialCalibration | None:
+    if name is None:
+        return None
+    path = Path(name)
     try:
         return PartialCalibration.parse(tomllib.loads(path.read_text(encoding="utf-8")), str(path))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -106,7 +124,7 @@ DATASETS: dict[str, SourceKind] = {
     "victoria-park": SourceKind(VictoriaParkOptions, lambda _options: read_victoria_park()),
 }
 LOG = "mcap"
-KINDS: dict[str, SourceKind] = {LOG: SourceKind(LogOptions, _read_log), **DATASETS, **GENERATORS}
+KINDS: dict[str, SourceKind] = {LOG: SourceKind(LogOptions, _read_log, _check_log), **DATASETS, **GENERATORS}
 FILES = ("log", "folder", "calibration", "log_config")
 """Options that name files: of these the content counts, not the place."""
 

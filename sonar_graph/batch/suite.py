@@ -100,7 +100,7 @@ class LogEntry(Section):
         """Seeds to run; one None where nothing is random."""
         if self.generator is None and self.landmarks is None:
             return [None]
-        return list(range(self.seeds)) if isinstance(self.seeds, int) else list(self.seeds or [0])
+        return list(range(self.seeds)) if isinstance(self.seeds, int) else [0] if self.seeds is None else [*self.seeds]
 
 
 class EstimatorEntry(Section):

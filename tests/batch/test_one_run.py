@@ -29,6 +29,14 @@ def test_scores_are_those_of_compare_bit_for_bit(planned: Planned, tmp_path: Pat
     assert set(row) - set(METRICS) - set(COLUMNS) == {name for name in row if name.endswith(("_dof", "_end"))}
 
 
+def test_all_libraries_that_are_in_the_key_are_in_the_row(planned: Planned, tmp_path: Path) -> None:
+    run = planned()
+    row = perform(run, tmp_path / "run")
+    libraries = {"gtsam", "numpy", "scipy", "numba"}
+    assert {name: row[name] for name in libraries} == {name: run.versions[name] for name in libraries}
+    assert libraries <= set(COLUMNS)
+
+
 def test_nees_at_the_end_is_that_of_the_last_error(planned: Planned, tmp_path: Path) -> None:
     row = perform(planned(), tmp_path / "run")
     (errors,) = read_comparison(tmp_path / "run").errors.values()

@@ -9,6 +9,7 @@ from sonar_graph.batch.plan import plan_runs
 from sonar_graph.batch.planned import PlannedRun
 from sonar_graph.batch.sources import LOG, fingerprint
 from sonar_graph.batch.suite import read_suite
+from sonar_graph.errors import BatchError
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
 
@@ -87,3 +88,9 @@ def test_of_a_log_the_content_counts_and_not_the_place(tmp_path: Path) -> None:
 def test_estimator_that_cannot_be_loaded_is_planned(write_suite: WriteSuite, misbehaving: None) -> None:
     runs = planned(write_suite, HEADER, BASIN, DEAD_RECKONING, '[[estimators]]\nname = "broken"\nparams = { a = 1 }\n')
     assert runs[1].params == {"a": 1}
+
+
+def test_settings_that_exclude_each_other_are_told_with_line_and_key(write_suite: WriteSuite) -> None:
+    text = 'params = { identity_policy = "gnc" }\ngrid = { history = ["whole", "bounded"] }\n'
+    with pytest.raises(BatchError, match=r'line 14: estimators\.0\.grid\.history: .*"gnc" chooses anew'):
+        planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2, text)

@@ -37,6 +37,14 @@ def line(text: str, word: str) -> int:
         (HEADER + BASIN.replace("laps = 1", "seed = 1") + DEAD_RECKONING, "seed =", "seeds = [...]"),
         (HEADER + BASIN + "grid = { wrong_id_rate = [2.0] }\n" + DEAD_RECKONING, "grid", "grid.wrong_id_rate"),
         (HEADER + BASIN + "grid = { wrong_id_rate = [] }\n" + DEAD_RECKONING, "grid", "has no values"),
+        (HEADER + BASIN + "grid = { laps = [1, 2] }\n" + DEAD_RECKONING, "grid", "grid.laps: is also in options"),
+        (
+            HEADER + BASIN + DEAD_RECKONING + ISAM2 + "params = { lag_s = 3 }\ngrid = { lag_s = [4] }\n",
+            "grid",
+            "grid.lag_s: is also in params",
+        ),
+        (HEADER + BASIN + "seeds = 0\n" + DEAD_RECKONING, "seeds", "has no seeds"),
+        (HEADER + BASIN + "seeds = []\n" + DEAD_RECKONING, "seeds", "has no seeds"),
         (HEADER + BASIN + "landmarks = {}\n" + DEAD_RECKONING, "[[logs]]", "a generator has its own"),
         (
             HEADER + BASIN + DEAD_RECKONING.replace("dead-", "deaf-"),
@@ -54,6 +62,16 @@ def line(text: str, word: str) -> int:
             "are the same run",
         ),
         (HEADER + '[[logs]]\nname = "a"\nlog = "no.mcap"\n' + DEAD_RECKONING, "no.mcap", "no.mcap is not in"),
+        (
+            HEADER + '[[logs]]\nname = "a"\nlog = "suite.toml"\n' + DEAD_RECKONING,
+            "suite.toml",
+            "not an MCAP file but a text",
+        ),
+        (
+            HEADER + '[[logs]]\nname = "a"\nlog = "."\n' + DEAD_RECKONING,
+            "log =",
+            "is a folder; give the .mcap file in it",
+        ),
         (HEADER + '[[logs]]\nname = "a"\ndataset = "mrclam"\n' + DEAD_RECKONING, "[[logs]]", "robot: is missing"),
         (
             HEADER + '[[logs]]\nname = "a"\ndataset = "victoria-park"\nlandmarks = { seed = 1 }\n' + DEAD_RECKONING,
