@@ -186,7 +186,10 @@ def _p_worse(group: Group, values: Floats) -> float:
 def _judge(group: Group, values: Floats, p_value: float) -> Worsening | None:
     log, contestant, column = group
     old, new = values[:, 0], values[:, 1]
-    change = f"{np.expm1(log_ratios(old, new, column).mean()):+.1%} in the mean of {len(old)} pairs"
+    share = f"{np.expm1(log_ratios(old, new, column).mean()):.1%}"
+    change = (
+        f"{f'{share} farther from 1' if column in CONSISTENCY_KEYS else f'+{share}'} in the mean of {len(old)} pairs"
+    )
     if column not in CONSISTENCY_KEYS and new.max() > FAR * old.max() > 0:
         told = f"{new.max():.3g} in a run; the reference's worst is {old.max():.3g}"
         return Worsening(log, contestant, column, told)
@@ -194,5 +197,6 @@ def _judge(group: Group, values: Floats, p_value: float) -> Worsening | None:
         is_worse = log_ratios(old, new, column).mean() > math.log1p(ALONE)
         return Worsening(log, contestant, column, f"{change}, too few for a test") if is_worse else None
     if p_value < SIGNIFICANT:
-        return Worsening(log, contestant, column, f"{change}, p = {p_value:.2g} (Holm)")
+        certainty = f"p = {p_value:.2g} (Holm)" if p_value > 0 else "alike in all of them"
+        return Worsening(log, contestant, column, f"{change}, {certainty}")
     return None

@@ -92,5 +92,5 @@ def test_estimator_that_cannot_be_loaded_is_planned(write_suite: WriteSuite, mis
 
 def test_settings_that_exclude_each_other_are_told_with_line_and_key(write_suite: WriteSuite) -> None:
     text = 'params = { identity_policy = "gnc" }\ngrid = { history = ["whole", "bounded"] }\n'
-    with pytest.raises(BatchError, match=r'line 14: estimators\.0\.grid\.history: .*"gnc" chooses anew'):
+    with pytest.raises(BatchError, match=r'line 11: estimators\.0\.grid\.history: .*"gnc" chooses anew'):
         planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2, text)
