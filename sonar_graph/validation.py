@@ -9,11 +9,12 @@ from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 Place = tuple[int | str, ...]
 _SHOWN_CHARACTERS = 60
 _LEAST_SIMILARITY = 0.7
+_MISFIT = "misfit"
 
 
 def faults_in(error: ValidationError, model: type[BaseModel]) -> str:
@@ -32,8 +33,25 @@ def faults_in(error: ValidationError, model: type[BaseModel]) -> str:
     return "; ".join([*texts, *(_wrong_length(place, errors) for place in short)])
 
 
+def misfits(model: type[BaseModel], reasons: dict[str, str]) -> ValidationError:
+    """The error to raise in a model's validator where fields do not fit each other.
+
+    Parameters
+    ----------
+    reasons
+        By field, so that a file's line can be told; each is shown as it is.
+    """
+    found = [
+        InitErrorDetails(type=PydanticCustomError(_MISFIT, "{reason}", {"reason": reason}), loc=(name,), input=None)
+        for name, reason in reasons.items()
+    ]
+    return ValidationError.from_exception_data(model.__name__, found)
+
+
 def _describe(error: ErrorDetails, model: type[BaseModel]) -> str:
     place = error["loc"]
+    if error["type"] == _MISFIT:
+        return error["msg"]
     if error["type"] == "extra_forbidden":
         return unknown_field(place, model)
     if error["type"] == "missing":

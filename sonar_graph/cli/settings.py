@@ -39,11 +39,10 @@ def nested_settings(texts: list[str]) -> dict[str, Any]:
     Raises
     ------
     EstimatorError
-        When there is no name or no ``=``.
+        When there is no name or no ``=``, or one comes again with another value.
     """
     settings: dict[str, Any] = {}
-    for text in texts:
-        path, value = parse_setting(text)
+    for path, value in _each_once(texts).items():
         _put(settings, path.split("."), value)
     return settings
 
@@ -63,17 +62,27 @@ def estimator_settings(texts: list[str], names: list[str]) -> dict[str, dict[str
     Raises
     ------
     EstimatorError
-        When a text does not begin with one of the estimators that run.
+        When a text does not begin with one of the estimators that run, or one setting comes again with another value.
     """
     settings: dict[str, dict[str, Any]] = {}
-    for text in texts:
-        path, value = parse_setting(text)
+    for path, value in _each_once(texts).items():
         estimator, dot, setting = path.partition(".")
         if dot and estimator not in names:
-            raise EstimatorError(f"--set {text}: {estimator} is not among the estimators that run: {', '.join(names)}")
+            raise EstimatorError(f"--set {path}: {estimator} is not among the estimators that run: {', '.join(names)}")
         if not dot or not all(setting.split(".")):
-            raise EstimatorError(f"--set {text}: expected ESTIMATOR.setting=value with one of {', '.join(names)}")
+            raise EstimatorError(f"--set {path}: expected ESTIMATOR.setting=value with one of {', '.join(names)}")
         _put(settings.setdefault(estimator, {}), setting.split("."), value)
+    return settings
+
+
+def _each_once(texts: list[str]) -> dict[str, Any]:
+    """Values by the names before ``=``; one name may come again only with the same value."""
+    settings: dict[str, Any] = {}
+    for text in texts:
+        path, value = parse_setting(text)
+        if path in settings and settings[path] != value:
+            raise EstimatorError(f"--set {text}: {path} is also set to {settings[path]}; give it once")
+        settings[path] = value
     return settings
 
 

@@ -132,6 +132,11 @@ def _require_tracks(name: str, options: SimulationOptions) -> None:
         raise SimulationError(
             f"simulate {name}: id_delay_s = {options.id_delay_s:g} is the age of a track; set tracks = true with it"
         )
+    usual = type(options).model_fields["wrong_id_share"].default
+    if options.wrong_id_share != usual and not options.tracks:
+        raise SimulationError(
+            f"simulate {name}: wrong_id_share = {options.wrong_id_share:g} is a share of a track; set tracks = true"
+        )
 
 
 def frame_stamps(rate_hz: float, duration_s: float) -> Ints:

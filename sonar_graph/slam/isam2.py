@@ -32,10 +32,12 @@ from sonar_graph.slam.hypotheses import RecogniserErrors
 from sonar_graph.slam.joint_covariance import JointCovariance
 from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
 from sonar_graph.slam.mixture import Kernel, Mixture
+from sonar_graph.slam.setting_conflicts import conflicts
 from sonar_graph.slam.sightings import SightingPolicy, Sightings
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.slam.uncertainty import Over, joint_covariance
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, RefusedRow, Trajectory
+from sonar_graph.validation import misfits
 
 
 class Isam2Params(Section):
@@ -118,11 +120,10 @@ class Isam2Params(Section):
     """So long, and no longer than ``lag_s``, a sighting waits for them."""
 
     @model_validator(mode="after")
-    def _check_gate(self) -> Self:
-        if self.gate_probability < 1 and "gate_probability" in self.model_fields_set and self.identity_policy != "gate":
-            raise ValueError(
-                f'gate_probability is of no effect with "{self.identity_policy}": set identity_policy = "gate"'
-            )
+    def _check_conflicts(self) -> Self:
+        found = conflicts(self)
+        if found:
+            raise misfits(type(self), {conflict.setting: conflict.reason for conflict in found})
         return self
 
     def mixture(self) -> Mixture | None:
@@ -162,7 +163,6 @@ class Isam2:
         self._calibration = calibration
         self._params: Isam2Params = params or Isam2Params()
         p = self._params
-        _check_policy(p)
         self._smoother = Smoother(
             p.lag_s, p.relinearize_threshold, p.stale_shift_m, p.waiting_gain, is_bounded=p.history == "bounded"
         )
@@ -344,22 +344,6 @@ class Isam2:
     def refused_rows(self) -> list[RefusedRow]:
         """Rows of IMU, Doppler log and depth that are not used, and why."""
         return self._keyframes.refused
-
-
-def _check_policy(p: Isam2Params) -> None:
-    """A mixture is of landmarks that have names, in a history that is kept."""
-    if p.mixture() is None:
-        return
-    if p.history == "bounded":
-        raise EstimatorError(
-            f'isam2: identity_policy = "{p.identity_policy}" chooses anew in the whole history; give it'
-            ' history = "whole", or history = "bounded" with identity_policy = "robust"'
-        )
-    if p.unknown_landmarks == "associate":
-        raise EstimatorError(
-            f'isam2: identity_policy = "{p.identity_policy}" pairs detections by place itself, and begins no landmark'
-            ' without a name; give it unknown_landmarks = "ignore", or "associate" with identity_policy = "robust"'
-        )
 
 
 def _check_noise(calibration: Calibration) -> None:

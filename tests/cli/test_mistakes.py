@@ -44,6 +44,26 @@ MISTAKES = {
     ),
     "setting without name": (["run", "LOG", "-o", "OUT", "--set", "isam2.=1"], "expected ESTIMATOR.setting=value"),
     "unknown setting": (["run", "LOG", "-o", "OUT", "--set", "isam2.nonsense=1"], "nonsense"),
+    "setting twice": (
+        ["run", "LOG", "-o", "OUT", "--set", "isam2.lag_s=5", "--set", "isam2.lag_s=6"],
+        "isam2.lag_s is also set to 5; give it once",
+    ),
+    "simulation option twice": (
+        ["simulate", "basin", "-o", "new.mcap", "--set", "tracks=true", "--set", "tracks=false"],
+        "tracks is also set to True; give it once",
+    ),
+    "share of tracks without tracks": (
+        ["simulate", "basin", "-o", "new.mcap", "--set", "wrong_id_share=0.3"],
+        "wrong_id_share = 0.3 is a share of a track; set tracks = true",
+    ),
+    "settings that exclude each other": (
+        ["run", "TEXT", "-o", "OUT", "--set", "isam2.identity_policy=gnc", "--set", "isam2.history=bounded"],
+        'settings of isam2: identity_policy = "gnc" chooses anew in the whole history',
+    ),
+    "setting that does nothing": (
+        ["run", "TEXT", "-o", "OUT", "--set", "isam2.remembered_s=10"],
+        'remembered_s is of no effect with history = "whole"',
+    ),
     "topic without role": (["run", "LOG", "-o", "OUT", "--topic", "/imu/data"], "expected ROLE=TOPIC"),
     "topic of no such role": (["run", "LOG", "-o", "OUT", "--topic", "smell=/imu/data"], "smell"),
     "topic that is not there": (["run", "LOG", "-o", "OUT", "--topic", "imu=/imu/raw"], "/imu/raw"),

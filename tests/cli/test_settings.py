@@ -80,9 +80,9 @@ def test_setting_that_is_no_toml_is_text(text: str, value: object) -> None:
 
 
 def test_settings_go_to_their_estimator_at_any_depth() -> None:
-    texts = ["one.gain=1", "two.gate.sigma=3", "two.gate.kind=hard", "one.gain=2"]
+    texts = ["one.gain=1", "two.gate.sigma=3", "two.gate.kind=hard", "one.gain=1.0"]
     assert estimator_settings(texts, ["one", "two"]) == {
-        "one": {"gain": 2},
+        "one": {"gain": 1.0},
         "two": {"gate": {"sigma": 3, "kind": "hard"}},
     }
 

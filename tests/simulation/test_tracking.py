@@ -87,3 +87,8 @@ def test_the_share_of_wrong_tracks_is_as_asked():
 def test_a_delay_without_tracks_is_refused():
     with pytest.raises(SimulationError, match="id_delay_s = 5 is the age of a track; set tracks = true"):
         simulate_basin(BasinOptions(id_delay_s=5.0))
+
+
+def test_a_share_of_tracks_without_tracks_is_refused():
+    with pytest.raises(SimulationError, match=r"wrong_id_share = 0\.3 is a share of a track; set tracks = true"):
+        simulate_basin(BasinOptions(wrong_id_share=0.3))

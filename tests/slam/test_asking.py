@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L
 
-from sonar_graph.errors import EstimatorError
 from sonar_graph.estimator_checks import laws
 from sonar_graph.estimator_checks.outcome import run, unlike
 from sonar_graph.estimator_checks.world import misnamed_world, small_world
@@ -68,9 +67,3 @@ def test_answers_that_differ_in_one_bit_are_unlike() -> None:
     assert unlike(one, other) == ["trajectory()", "landmarks()", "detections()"]
     del other.estimates[-1]
     assert "causal estimates" in unlike(one, other)
-
-
-@pytest.mark.parametrize("policy", ["max-mixture", "gnc"])
-def test_a_mixture_that_is_to_begin_landmarks_without_names_is_refused(policy: str) -> None:
-    with pytest.raises(EstimatorError, match=f'"{policy}" pairs detections by place itself.*unknown_landmarks = "ign'):
-        Isam2(small_world().calibration, settings(policy, "whole", "associate"))

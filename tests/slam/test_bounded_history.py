@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
 
-from sonar_graph.errors import EstimatorError
 from sonar_graph.estimator_checks import check_estimator
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
@@ -240,10 +239,3 @@ def test_rows_keep_their_numbers_when_older_ones_are_forgotten():
     assert log.landmark_ids.tolist() == [3, 70, 5, 6]
     assert log.outcomes == [Outcome.WAITING, Outcome.USED_LATER, Outcome.WAITING, Outcome.USED]
     assert np.isnan(log.innovations).all(axis=1).tolist() == [False, True, False, True]
-
-
-def test_a_policy_that_chooses_in_the_whole_history_is_refused():
-    with pytest.raises(
-        EstimatorError, match='identity_policy = "max-mixture" chooses anew in the whole history; give it'
-    ):
-        Isam2(mission().calibration, Isam2Params(history="bounded", identity_policy="max-mixture"))
