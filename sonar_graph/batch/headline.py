@@ -37,7 +37,8 @@ def headlines(batch: RecordedBatch, metric: Metric, tests: Tests) -> list[str]:
     """For each estimate who is told apart from the reference, to which side, and on how many logs."""
     own = {place: test for place, test in tests.items() if place[0] in metric.keys.values() and place[1] in batch.logs}
     if own and not any(map(mark_of, own.values())):
-        return [f"{metric.label}: no estimator is told apart from {batch.reference}."]
+        place = " on any one log" if len(batch.logs) > 1 else ""
+        return [f"{metric.label}: no estimator is told apart from {batch.reference}{place}."]
     sentences = [_headline(batch, metric, own, over, key) for over, key in metric.keys.items()]
     return [sentence for sentence in sentences if sentence]
 

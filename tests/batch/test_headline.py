@@ -10,8 +10,8 @@ import pytest
 from sonar_graph.batch.accuracy import all_tests
 from sonar_graph.batch.catalogue import metrics_of
 from sonar_graph.batch.exported import as_csv, as_latex
-from sonar_graph.batch.headline import HIGHER, LOWER, head_metric, headlines, overview_table
-from sonar_graph.batch.recorded import RecordedBatch
+from sonar_graph.batch.headline import HIGHER, LOWER, head_metric, headlines, mark_of, overview_table
+from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
 from sonar_graph.batch.tables import Cell, Table
 
 from .recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, with_failures
@@ -97,9 +97,17 @@ def test_one_log_is_not_counted_and_few_seeds_tell_nothing():
     assert headlines(batch, ATE, all_tests(batch, [ATE]))[0] == (
         "Causal error beside that of dead-reckoning: lower with isam2, ekf-slam."
     )
-    few = drawn_batch(3)
+    few = drawn_batch(3, logs=LOGS[:1])
     (told,) = headlines(few, ATE, all_tests(few, [ATE]))
     assert told.endswith("no estimator is told apart from dead-reckoning.")
+
+
+def test_what_only_all_logs_together_tell_is_no_count_of_logs():
+    batch = drawn_batch(5)
+    tests = all_tests(batch, [ATE])
+    assert mark_of(tests["causal.ate_se2_m", ALL_LOGS, "isam2"]) == LOWER
+    (told,) = headlines(batch, ATE, tests)
+    assert told.endswith("no estimator is told apart from dead-reckoning on any one log.")
 
 
 def test_the_head_shows_the_first_error_that_most_logs_have():

@@ -182,6 +182,22 @@ def test_too_few_seeds_are_warned_of():
     assert power_told(all_tests(many, metrics)) == []
 
 
+def test_a_filters_two_estimates_do_not_ask_for_more_seeds():
+    batch = drawn_batch(7, logs=LOGS[:1])
+    same = [
+        replace(run, values=run.values | {"smoothed.ate_se2_m": run.values["causal.ate_se2_m"]}) for run in batch.runs
+    ]
+    assert "7 pairs" in power_told(all_tests(batch, [ATE]))[0], "four tests: 4 / 2**6 is above 5 %"
+    assert power_told(all_tests(replace(batch, runs=same), [ATE])) == [], "two tests"
+
+
+def test_a_warning_names_few_logs():
+    batch = drawn_batch(1, logs=tuple("abcdefg"))
+    for log in batch.logs:
+        batch = with_failures(batch, "isam2", log, 1)
+    assert failures_told(batch) == ["isam2: 7 of 7 runs did not end (a, b, c and 4 more)."]
+
+
 def test_runs_that_were_scored_at_other_instants_are_warned_of():
     batch = drawn_batch(2)
     even = replace(batch, runs=[replace(run, values=run.values | {"scored_instants": 50.0}) for run in batch.runs])
