@@ -263,7 +263,6 @@ class DoubtfulIdentities:
     def _change(self, changes: list[tuple[Watch, int | None]], time_s: float) -> None:
         leaving = [s for watch, _ in changes for s in watch.sightings if s.landmark_id is not None]
         coming = [(s, new) for watch, new in changes if new is not None for s in watch.sightings]
-        self._landmarks.exchange(leaving, coming, time_s)
         for watch, new in changes:
             said = watch.statement.favourite
             if said is not None and new != said:
@@ -271,6 +270,7 @@ class DoubtfulIdentities:
             for sighting in watch.sightings:
                 sighting.outcome, landmark_id = _what_became(watch.statement, new)
                 self._journal.amend(sighting.row, sighting.outcome, landmark_id)
+        self._landmarks.exchange(leaving, coming, time_s)
 
 
 @dataclass(frozen=True, eq=False)

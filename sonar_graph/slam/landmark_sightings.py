@@ -160,6 +160,9 @@ class LandmarkSightings:
             for s in sightings
             if s.landmark_id is not None
         ]
-        groups = self.smoother.exchange(Exchange(removed, made, begun, lost), time_s)
-        for sighting, handles in zip(sightings, groups, strict=True):
-            sighting.handles = tuple(handles)
+
+        def entered(groups: list[list[int]]) -> None:
+            for sighting, handles in zip(sightings, groups, strict=True):
+                sighting.handles = tuple(handles)
+
+        self.smoother.exchange(Exchange(removed, made, begun, lost), time_s, entered)

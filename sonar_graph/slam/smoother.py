@@ -52,6 +52,8 @@ FIRST_RESTART = 100
 """Number of factors before the first restart."""
 MOST_MESSAGES = 1000
 """Kept of what was withheld."""
+ROUNDING_S = 1e-6
+"""Longer than differences of times are wrong by: what is exactly as old as the lag stays."""
 
 
 class Smoother:
@@ -183,11 +185,20 @@ class Smoother:
 
     def flush(self, time_s: float) -> None:
         """Update with what waits, if anything does; a bounded window keeps what it has."""
+        self._withhold_unusable()
         if self._pending.handles:
             self._update(time_s, self._exchange_lag_s(time_s))
 
-    def exchange(self, what: Exchange, time_s: float) -> list[list[int]]:
-        """Take factors out, put others in, and bring the window up to date; the handles of each group put in."""
+    def exchange(
+        self, what: Exchange, time_s: float, entered: Callable[[list[list[int]]], None] = lambda _: None
+    ) -> list[list[int]]:
+        """Take factors out, put others in, and bring the window up to date; the handles of each group put in.
+
+        Parameters
+        ----------
+        entered
+            Is told these handles before anything is solved: `when_withheld` may be about one of them.
+        """
         self.flush(time_s)
         slots = self._window.slots([self._history.factor(handle) for handle in what.removed])
         self._forget(what.lost_landmarks)
@@ -195,6 +206,8 @@ class Smoother:
         for key, point in what.new_landmarks.items():
             self.add_landmark(key, point)
         handles = [self.add(group) for group in what.added]
+        entered(handles)
+        self._withhold_unusable()
         keys = self._pending.graph.keyVector()
         self._window.lag_s = self._exchange_lag_s(time_s)
         if slots is None or what.lost_landmarks or len(self.in_window(keys)) < len(keys):
@@ -207,7 +220,8 @@ class Smoother:
 
     def _exchange_lag_s(self, time_s: float) -> float:
         """Nothing leaves a bounded window between what an exchange takes out and what it puts in."""
-        return max(self._lag_at(time_s), self._window.lag_s) if self.is_bounded else self._lag_at(time_s)
+        inside_s = [time_s - t + ROUNDING_S for t in self._expiring.values()] if self.is_bounded else []
+        return max([self._lag_at(time_s), *inside_s])
 
     def in_window(self, keys: list[int]) -> list[int]:
         """Those of some variables that are in the window, or about to be."""
@@ -336,7 +350,7 @@ class Smoother:
 
     def _lag_at(self, time_s: float) -> float:
         """Age (s) from which on poses leave the window."""
-        held = (time_s - self._expiring[key] for key, until_s in self._held.items() if time_s <= until_s)
+        held = (time_s - self._expiring[key] + ROUNDING_S for key, until_s in self._held.items() if time_s <= until_s)
         return max([self._lag_s, *held])
 
     def _clear_pending(self) -> None:

@@ -14,6 +14,7 @@ from sonar_graph.measurements import Measurements
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam import factors
+from sonar_graph.slam.exchange import Exchange
 from sonar_graph.slam.isam2 import Isam2, Isam2Params
 from sonar_graph.slam.sighting import SightingFactors
 from sonar_graph.slam.smoother import Smoother
@@ -271,6 +272,37 @@ def test_what_has_no_solution_is_withheld_by_name_and_changes_nothing(fault, is_
     same(*smoothers)
 
 
+NEW_LANDMARKS = {fault: {L(7): np.array([5.0, 0.0, 0.0])} for fault in (lone_range, infinite)}
+
+
+@pytest.mark.parametrize("comes_by", ["flush", "exchange"])
+@pytest.mark.parametrize("is_bounded", [False, True], ids=["whole", "bounded"])
+@pytest.mark.parametrize("fault", [lone_range, no_number, infinite], ids=lambda fault: fault.__name__)
+def test_what_has_no_solution_is_withheld_by_whichever_way_it_comes(fault, is_bounded, comes_by):
+    smoothers = [begun(is_bounded=is_bounded) for _ in range(2)]
+    for smoother, add in zip(smoothers, (fault, nothing), strict=True):
+        step(smoother, 2)
+        if comes_by == "flush":
+            smoother.add(add(smoother))
+            smoother.flush(2.0)
+        else:
+            smoother.exchange(Exchange([], [add(begun())], dict(NEW_LANDMARKS.get(add, {})), []), 2.0)
+        for k in range(3, 6):
+            step(smoother, k)
+    assert re.fullmatch(SAID[fault], smoothers[0].withheld[0]), smoothers[0].withheld
+    assert not smoothers[1].withheld
+    same(*smoothers)
+
+
+def test_handles_are_known_before_one_of_them_is_withheld():
+    smoother, order = begun(), []
+    smoother.when_withheld = lambda withheld: order.append(withheld.handles) or set()
+    step(smoother, 2)
+    smoother.exchange(Exchange([], [no_number(smoother)], {}, []), 2.0, lambda groups: order.append(set(groups[0])))
+    assert len(order) == 2
+    assert order[0] == order[1]
+
+
 def test_a_landmark_that_was_withheld_can_come_again():
     smoother = begun()
     step(smoother, 2, *lone_range(smoother))
@@ -299,7 +331,7 @@ def test_a_sighting_that_places_no_landmark_is_withheld_and_its_landmark_begins_
     ids = detections.most_probable()[0]
     seen_often = [landmark for landmark in set(ids.tolist()) if np.sum(ids == landmark) > 5]
     row = max(int(np.argmax(ids == landmark)) for landmark in seen_often)
-    beginning, faulty = SightingFactors._beginning, []
+    beginning, faulty = SightingFactors._placed, []
 
     def without_once(self, sighting, key):
         if sighting.stamp_ns == detections.stamps_ns[row] and key == L(ids[row]):
@@ -308,7 +340,7 @@ def test_a_sighting_that_places_no_landmark_is_withheld_and_its_landmark_begins_
         return beginning(self, sighting, key)
 
     expected = run(replace(mission(), detections=detections.rows(np.delete(np.arange(len(detections)), row))), history)
-    monkeypatch.setattr(SightingFactors, "_beginning", without_once)
+    monkeypatch.setattr(SightingFactors, "_placed", without_once)
     found = run(mission(), history)
     assert len(faulty) == 1
     assert found[0].detections().outcomes[row] is Outcome.WITHHELD

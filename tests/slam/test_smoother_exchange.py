@@ -8,6 +8,7 @@ from gtsam.symbol_shorthand import L, X
 from sonar_graph.slam import factors
 from sonar_graph.slam.batch import solve
 from sonar_graph.slam.exchange import Exchange
+from sonar_graph.slam.smoother import Smoother
 
 from .fed import FOREVER_S, SONAR, Fed, counted_solves, in_the_basin, joint, on_the_rail, plain
 from .graphs import graph_of
@@ -164,8 +165,9 @@ def test_a_keyframe_and_all_later_ones_are_held_until_the_time_given():
     assert fed.smoother.covariance(X(18))[3, 3] > 0
 
 
+@pytest.mark.parametrize("later_s", [0.0, 0.1])
 @pytest.mark.parametrize("is_bounded", [False, True])
-def test_a_hold_that_is_over_ends_at_an_exchange_only_where_what_left_can_be_taken_out(is_bounded):
+def test_a_hold_that_is_over_ends_at_an_exchange_only_where_what_left_can_be_taken_out(is_bounded, later_s):
     """A bounded window would have given up what the exchange takes out; it lets go at the next update instead.
 
     Either way the end is least squares, with a range on the keyframe that was held exchanged for another.
@@ -182,9 +184,27 @@ def test_a_hold_that_is_over_ends_at_an_exchange_only_where_what_left_can_be_tak
     )
     fed.add(waiting)
     fed.smoother.hold({})
-    fed.smoother.exchange(Exchange(removed, [late], {}, []), end_s)
+    fed.smoother.exchange(Exchange(removed, [late], {}, []), end_s + later_s)
     assert fed.smoother.in_window([X(3)]) == ([X(3)] if is_bounded else [])
     assert_is_least_squares(fed, Rail(numbers.displacements_m, ranges), nodes, [4, 7])
-    fed.smoother.update(end_s)
+    fed.smoother.update(end_s + later_s)
     assert not fed.smoother.in_window([X(3)])
     assert_is_least_squares(fed, Rail(numbers.displacements_m, ranges), nodes, [4, 7])
+
+
+@pytest.mark.parametrize("is_bounded", [False, True], ids=["whole", "bounded"])
+@pytest.mark.parametrize("start_s", [0.001, 3.137, 30.7, 1.7e9])
+def test_a_held_keyframe_stays_however_its_time_is_rounded(start_s: float, is_bounded: bool) -> None:
+    """Its age is exactly the lag then; differences of times near 0 are rounded up as often as down."""
+    smoother, sigmas = Smoother(2.0, 1e-3, 1e9, is_bounded=is_bounded), gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
+    smoother.add_pose(X(0), gtsam.Pose3(), start_s)
+    smoother.add([gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), sigmas)])
+    smoother.hold({X(0): np.inf})
+    for k in range(1, 400):
+        smoother.add_pose(X(k), gtsam.Pose3(), start_s + 0.1 * k)
+        smoother.add([gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), sigmas)])
+        smoother.update(start_s + 0.1 * k)
+        assert smoother.in_window([X(0)]) == [X(0)]
+    smoother.hold({})
+    smoother.update(start_s + 40.0)
+    assert smoother.in_window([X(0)]) == []
