@@ -13,6 +13,9 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats, Ints
 
+FIRST_ANONYMOUS_ID = 3_000_000_000
+"""Landmarks without a name get this identity and the following ones; those of designs end at 2^31 - 1."""
+
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
@@ -116,6 +119,7 @@ class Outcome(StrEnum):
     USED = "used"
     NEW = "new landmark"
     USED_LATER = "used later, when its identity was known"
+    PLACED_LATER = "used later, when its landmark, of unknown identity, had been seen often enough"
     MOVED = "used: taken back from one landmark and given to another"
     GATED = "refused: innovation outside the gate"
     REASSIGNED = "used: its place says that it is another landmark"

@@ -37,7 +37,7 @@ Figures = dict[str, float]
 FARTHEST_M = 1.0
 SURE = 0.9
 """Least posterior of a detection that was of a landmark, before identities were taken away."""
-USED = (Outcome.USED, Outcome.NEW, Outcome.USED_LATER, Outcome.MOVED)
+USED = (Outcome.USED, Outcome.NEW, Outcome.PLACED_LATER, Outcome.USED_LATER, Outcome.MOVED)
 PLACES: dict[str, dict[str, Any]] = {
     "basin": {"unknown_density_m2": 0.05},
     "mrclam": {"unknown_density_m2": 0.15},

@@ -7,6 +7,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from sonar_graph.evaluation.identity_doubts import doubt_of_identities, nameless_landmarks
 from sonar_graph.evaluation.landmark_table import PAPER, LandmarkTable, landmark_table
 from sonar_graph.evaluation.log_doubts import doubt_lines
 from sonar_graph.evaluation.published_experiment import repeats_published
@@ -134,6 +135,8 @@ def _notes(comparison: Comparison) -> Text:
     lines = [f"{run.estimator} failed: {run.reason}" for run in failed_runs(comparison)]
     lines += lost_runs(comparison)
     lines += refusal_lines(comparison)
+    lines += doubt_of_identities(comparison)
+    lines += nameless_landmarks(comparison)
     lines += doubt_lines(comparison.sequence.notes)
     lines += _recognition(comparison)
     if not has_detections(comparison):

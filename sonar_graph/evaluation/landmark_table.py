@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sonar_graph.evaluation.metrics import landmark_errors, rmse
+from sonar_graph.evaluation.place_matching import anonymous_named
 from sonar_graph.evaluation.published_experiment import RETURN_M, published_maps, repeats_published
 from sonar_graph.evaluation.results import Comparison
 from sonar_graph.evaluation.wording import ABSENT
@@ -78,8 +79,12 @@ def landmark_table(comparison: Comparison) -> LandmarkTable | None:
 
 def _columns(comparison: Comparison) -> dict[str, _Column]:
     """Runs with a map; where the published experiment is repeated all that have a path, and the paper."""
-    runs = comparison.runs
-    mapped = {run.estimator: run.landmarks for run in runs if run.landmarks is not None and len(run.landmarks)}
+    runs, true = comparison.runs, comparison.sequence.true_landmarks
+    mapped = {
+        run.estimator: anonymous_named(run.landmarks, true)
+        for run in runs
+        if run.landmarks is not None and len(run.landmarks)
+    }
     if not repeats_published(comparison.sequence):
         return {name: _Column(landmarks, None, DECIMALS) for name, landmarks in mapped.items()}
     walked = {run.estimator: run.causal for run in runs if run.causal is not None and len(run.causal)}

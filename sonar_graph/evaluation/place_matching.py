@@ -1,7 +1,7 @@
 """Landmarks that an estimator has named itself, matched to the true ones by their place.
 
-An estimator that is not told identities gives its landmarks some of its own. Scores compare maps by identity and leave
-such landmarks out, so that none is ever mistaken for a known one; to score them, name them first.
+An estimator that is not told identities gives its landmarks some of its own, from `FIRST_ANONYMOUS_ID` on. Maps are
+compared by identity, so that no landmark is ever mistaken for a known one; to score these, they are named first.
 """
 
 from __future__ import annotations
@@ -9,7 +9,15 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from sonar_graph.states import LandmarkMap
+from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap
+
+FARTHEST_M = 1.0
+"""Farther from a true landmark than this, horizontally, one without a name is not taken for it when it is scored."""
+
+
+def anonymous_named(estimated: LandmarkMap, true: LandmarkMap | None) -> LandmarkMap:
+    """The map as it is scored: landmarks without a name get that of the true one within `FARTHEST_M`."""
+    return estimated if true is None else named_by_place(estimated, true, FARTHEST_M)
 
 
 def named_by_place(estimated: LandmarkMap, true: LandmarkMap, farthest_m: float) -> LandmarkMap:
@@ -24,7 +32,7 @@ def named_by_place(estimated: LandmarkMap, true: LandmarkMap, farthest_m: float)
     farthest_m
         Farther apart than this nothing is matched. Neither map is aligned.
     """
-    unknown = np.flatnonzero(~np.isin(estimated.ids, true.ids))
+    unknown = np.flatnonzero((estimated.ids >= FIRST_ANONYMOUS_ID) & ~np.isin(estimated.ids, true.ids))
     free = np.flatnonzero(~np.isin(true.ids, estimated.ids))
     apart = estimated.positions[unknown, None, :2] - true.positions[None, free, :2]
     squared = np.sum(apart**2, axis=-1)

@@ -12,6 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from markupsafe import Markup
 
 from sonar_graph.evaluation.figure_style import ESTIMATOR_COLOURS
+from sonar_graph.evaluation.identity_doubts import doubt_of_identities, nameless_landmarks
 from sonar_graph.evaluation.illustrations import illustrations
 from sonar_graph.evaluation.landmark_table import PAPER, landmark_table
 from sonar_graph.evaluation.log_doubts import warning_lines
@@ -55,13 +56,14 @@ def _content(comparison: Comparison) -> dict[str, Any]:
         "summary": _summary(comparison),
         "finding": finding(comparison),
         "failed": failed_runs(comparison),
-        "doubts": warning_lines(comparison.sequence.notes),
+        "doubts": [*doubt_of_identities(comparison), *warning_lines(comparison.sequence.notes)],
         "runs": comparison.runs,
         "colours": len(ESTIMATOR_COLOURS),
         "blocks": score_blocks(comparison),
         "nees_limits": [f"{1 / TOLERATED_FACTOR:g}", f"{TOLERATED_FACTOR:g}"],
         "figures": illustrations(comparison),
         "landmarks": landmark_table(comparison),
+        "nameless": nameless_landmarks(comparison),
         "paper": PAPER if repeats_published(comparison.sequence) else "",
         "outcomes": _outcomes(comparison),
         "refused": _refused(comparison),

@@ -19,6 +19,7 @@ from sonar_graph.evaluation.metrics import (
     rmse,
     yaw_errors_rad,
 )
+from sonar_graph.evaluation.place_matching import FARTHEST_M, anonymous_named
 from sonar_graph.evaluation.results import ErrorSeries, Kind, RunResult, Score
 from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Trajectory
 
@@ -28,6 +29,11 @@ ESTIMATES: dict[str, str] = {
     "causal": "Causal estimate (what could be known at each instant)",
     "smoothed": "Smoothed estimate (what is known at the end about each instant)",
 }
+USED = {
+    *(Outcome.USED, Outcome.NEW, Outcome.USED_LATER),
+    *(Outcome.PLACED_LATER, Outcome.MOVED, Outcome.REASSIGNED),
+}
+"""Outcomes of detections that are in the estimate."""
 IN_TIME = "instants of one run are correlated, so no band is given for their average"
 
 
@@ -121,12 +127,13 @@ def landmark_scores(estimated: LandmarkMap, true: LandmarkMap | None) -> dict[st
     count = Score(float(len(estimated)), "1", "Landmarks in the map at the end.", better="none")
     if true is None:
         return {"landmarks.count": count}
-    errors = landmark_errors(estimated, true)
+    named = anonymous_named(estimated, true)
+    errors = landmark_errors(named, true)
     if not len(errors):
         return {"landmarks.count": count}
-    which = (
-        f"Map at the end, {len(errors)} landmarks matched by identity ({len(true)} true, {len(estimated)} estimated)"
-    )
+    by_place = len(np.setdiff1d(named.ids, estimated.ids))
+    how = f"by identity, {by_place} of them by place within {FARTHEST_M:g} m" if by_place else "by identity"
+    which = f"Map at the end, {len(errors)} landmarks matched {how} ({len(true)} true, {len(estimated)} estimated)"
     nees = normalised_squares(errors.horizontal_m, errors.horizontal_covs)
     scores = {
         "landmarks.raw_m": Score(rmse(errors.horizontal_m), "m", f"{which}, not aligned: rms of horizontal error."),
@@ -151,7 +158,7 @@ def detection_scores(log: DetectionLog) -> dict[str, Score]:
     """What became of the detections, and whether innovations fit their covariances."""
     counts = Counter(log.outcomes)
     new, ignored = counts[Outcome.NEW], counts[Outcome.IGNORED]
-    used = counts[Outcome.USED] + counts[Outcome.USED_LATER] + counts[Outcome.MOVED] + counts[Outcome.REASSIGNED] + new
+    used = sum(counts[outcome] for outcome in USED)
     unnamed = counts[Outcome.NO_IDENTITY] + counts[Outcome.WAITING] + counts[Outcome.FORGOTTEN]
     refused = len(log) - used - ignored - unnamed
     of_all = f"of {len(log)}" + (f", {ignored} of which this estimator has no use for" if ignored else "")

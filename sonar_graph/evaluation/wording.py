@@ -95,9 +95,14 @@ def lost_runs(comparison: Comparison) -> list[str]:
         if gated > GATED_SHARE * max(len(outcomes), 1):
             said.append(
                 f"{run.estimator} refused {gated} of {len(outcomes)} detections as outside its gate: it has lost its "
-                "way, or noise is set far too small; its NIS only tells of what the gate let through."
+                f"way, identities are wrong{_advice(run)}, or noise is set far too small; its NIS only tells of what "
+                "the gate let through."
             )
     return said
+
+
+def _advice(run: RunResult) -> str:
+    return ' (try identity_policy = "max-mixture")' if run.params.get("identity_policy") == "gate" else ""
 
 
 def score_of(comparison: Comparison, name: str, key: str) -> Score | None:

@@ -27,10 +27,8 @@ from sonar_graph.slam.models import wrap_angle
 from sonar_graph.slam.placing import place, source
 from sonar_graph.slam.sighting import Sighting
 from sonar_graph.slam.view import View
-from sonar_graph.states import Outcome
+from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 
-FIRST_ANONYMOUS_ID = 3_000_000_000
-"""Landmarks without a name get this identity and the following ones; those of designs end at 2^31 - 1."""
 ODDS = 10.0
 """How much more likely a pairing must be than that the detection is of a landmark which is not in the map."""
 LARGEST_SIGMA_SHARE = 0.1
@@ -176,7 +174,7 @@ class AnonymousLandmarks:
         self._candidates.remove(candidate)
         *earlier, newest = candidate.sightings
         for sighting in earlier:
-            sighting.outcome = Outcome.USED_LATER
+            sighting.outcome = Outcome.PLACED_LATER
             self._journal.amend(sighting.row, sighting.outcome, landmark_id)
         newest.outcome = Outcome.NEW
         self._landmarks.exchange([], [(sighting, landmark_id) for sighting in candidate.sightings], time_s)

@@ -10,10 +10,18 @@ from hypothesis import strategies as st
 
 from sonar_graph.evaluation.results import Score
 from sonar_graph.evaluation.scores import detection_scores
-from sonar_graph.evaluation.wording import NO_DETECTIONS, consistency, display_value, finding, format_value, with_unit
+from sonar_graph.evaluation.wording import (
+    NO_DETECTIONS,
+    consistency,
+    display_value,
+    finding,
+    format_value,
+    lost_runs,
+    with_unit,
+)
 from sonar_graph.states import DetectionLog, Outcome
 
-from .synthetic import basin_comparison, only, with_failure, with_score
+from .synthetic import basin_comparison, only, with_failure, with_run, with_score
 
 MINUS = "\N{MINUS SIGN}"
 KEY = "causal.ate_se2_m"
@@ -156,3 +164,18 @@ def test_without_truth_innovations_tell_whether_covariances_hold():
         basin_comparison(60, truth=False), "isam2", "detections.nis", Score(6.9, "1", "By hand.", (0.9, 1.1), "inside")
     )
     assert "isam2 6.90 (over-confident)" in finding(comparison)[-1]
+
+
+def test_a_gate_that_refuses_much_may_have_three_causes():
+    comparison = only(basin_comparison(60), "isam2")
+    run = comparison.runs[0]
+    gated = replace(run.detections, outcomes=[Outcome.GATED] * 30 + [Outcome.USED] * 30)
+    for policy, advice in (
+        ("gate", 'identities are wrong (try identity_policy = "max-mixture"), or'),
+        (None, "wrong, or"),
+    ):
+        params = {} if policy is None else {"identity_policy": policy}
+        (sentence,) = lost_runs(with_run(comparison, replace(run, detections=gated, params=params)))
+        assert "refused 30 of 60 detections as outside its gate: it has lost its way, identities are wrong" in sentence
+        assert advice in sentence
+        assert "or noise is set far too small" in sentence

@@ -20,7 +20,7 @@ from .late_identities import assert_outcomes_account, run
 TWO_LAPS = {"duration_s": 260.0, "laps": 2, "speed_m_s": 0.4, "seed": 3, "gyro_bias_scale": 0.0}
 CLEAN = {"tracks": True, "detection_probability": 1.0, "false_detections_per_frame": 0.0}
 ASSOCIATED = {"unknown_landmarks": "associate", "unknown_gate_probability": 1 - 1e-9}
-USED = {Outcome.USED, Outcome.NEW, Outcome.USED_LATER, Outcome.MOVED}
+USED = {Outcome.USED, Outcome.NEW, Outcome.PLACED_LATER, Outcome.USED_LATER, Outcome.MOVED}
 
 
 def detections_of(sequence: Sequence) -> LandmarkDetections:
@@ -83,7 +83,8 @@ def test_a_landmark_begins_with_as_many_sightings_as_asked():
     blind = anonymous_where(sequence, everywhere(sequence))
     for least in (1, 3, 8):
         outcomes = Counter(run(blind, **ASSOCIATED, unknown_sightings=least).detections().outcomes)
-        assert outcomes[Outcome.USED_LATER] == 4 * (least - 1)
+        assert outcomes[Outcome.PLACED_LATER] == 4 * (least - 1)
+        assert outcomes[Outcome.USED_LATER] == 0
         assert outcomes[Outcome.NEW] == 4
 
 
@@ -96,7 +97,7 @@ def test_the_wider_the_aperture_the_later_a_landmark_begins():
         sonar = blind.calibration.sonar.model_copy(update={"elevation_aperture_rad": aperture_rad})
         calibration = blind.calibration.model_copy(update={"sonar": sonar, "floor": None})
         estimator = run(replace(blind, calibration=calibration), **ASSOCIATED)
-        later.append(Counter(estimator.detections().outcomes)[Outcome.USED_LATER] / len(estimator.landmarks()))
+        later.append(Counter(estimator.detections().outcomes)[Outcome.PLACED_LATER] / len(estimator.landmarks()))
     assert later[0] == 4
     assert later[1] > 6
 

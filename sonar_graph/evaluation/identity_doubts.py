@@ -1,0 +1,127 @@
+"""What a reader must know first of identities: that none came, that a map is wrong, what landmarks without a name are.
+
+A squared error, or a squared innovation, of two degrees of freedom is above `ABSURD` with a probability of 10⁻⁹ where
+covariances hold. So no landmark of a consistent estimator is named here in practice, and none whose noise is set wrong
+by less than about four times.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from sonar_graph.evaluation.consistency import normalised_squares
+from sonar_graph.evaluation.metrics import landmark_errors
+from sonar_graph.evaluation.place_matching import anonymous_named
+from sonar_graph.evaluation.results import Comparison, RunResult
+from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap, Outcome
+
+QUANTILE = 1 - 1e-9
+ABSURD = float(chi2.ppf(QUANTILE, 2))
+"""41.4: the chi-square quantile of two degrees of freedom at `QUANTILE`."""
+CONTRADICTING_SHARE = 0.2
+"""Above this share of its innovations above `ABSURD` a landmark's sightings contradict each other; below it they are
+outliers, which a robust estimator outvotes."""
+MOST_NAMED = 5
+NAMELESS = {Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNFIT}
+"""Outcomes of detections of which an estimator does not know what they are of."""
+POLICY, UNKNOWN = "identity_policy", "unknown_landmarks"
+
+
+def doubt_of_identities(comparison: Comparison) -> list[str]:
+    """Warnings, a line each: detections without identities, then runs whose map is wrong."""
+    return [*_nothing_named(comparison), *_wrong_maps(comparison)]
+
+
+def nameless_landmarks(comparison: Comparison) -> list[str]:
+    """A sentence for each run that has landmarks without a name: how many, and which they are by their place."""
+    said = []
+    for run in comparison.runs:
+        ids = [] if run.landmarks is None else run.landmarks.ids[run.landmarks.ids >= FIRST_ANONYMOUS_ID].tolist()
+        if run.landmarks is not None and ids:
+            counted = "1 landmark" if len(ids) == 1 else f"{len(ids)} landmarks"
+            which = _by_place(run.landmarks, comparison.sequence.true_landmarks)
+            said.append(f"{run.estimator} found {counted} without a name ({UNKNOWN}); {which}.")
+    return said
+
+
+def _by_place(landmarks: LandmarkMap, true: LandmarkMap | None) -> str:
+    if true is None:
+        return f"identities from {FIRST_ANONYMOUS_ID} on are made up"
+    named = anonymous_named(landmarks, true)
+    found = np.setdiff1d(named.ids, landmarks.ids).tolist()
+    return f"scored by place, as {_listed(found)}" if found else "none is at the place of a true one"
+
+
+def _nothing_named(comparison: Comparison) -> list[str]:
+    """That no detection had an identity that a run could use."""
+    blind = [run for run in comparison.runs if run.detections and set(run.detections.outcomes) <= NAMELESS]
+    if not blind:
+        return []
+    hint = "" if any(run.params.get(UNKNOWN) == "associate" for run in blind) else _associate()
+    names = ", ".join(run.estimator for run in blind)
+    count = max(len(run.detections) for run in blind if run.detections)
+    return [f"Warning: none of {count} detections has an identity that {names} can use: no landmark is mapped{hint}"]
+
+
+def _associate() -> str:
+    return f'; isam2 maps them by place with {UNKNOWN} = "associate"'
+
+
+def _wrong_maps(comparison: Comparison) -> list[str]:
+    """With true landmarks those that are not where a run says; without, those whose sightings contradict it."""
+    said = []
+    for run in comparison.runs:
+        misplaced, contradicting = _misplaced(run, comparison.sequence.true_landmarks), _contradicting(run)
+        if misplaced:
+            far = f"far outside its covariance (NEES up to {max(misplaced.values()):.0f})"
+            said.append(f"Warning: {run.estimator} puts {_landmarks(misplaced)} {far}; {_look_at(run)}")
+        elif comparison.sequence.true_landmarks is None and contradicting:
+            sightings = f"sightings of {_landmarks(contradicting)} contradict its map"
+            nis = f"(mean NIS up to {max(contradicting.values()):.0f})"
+            said.append(f"Warning: {run.estimator}: {sightings} {nis}; {_look_at(run)}")
+    return said
+
+
+def _misplaced(run: RunResult, true: LandmarkMap | None) -> dict[int, float]:
+    """NEES, per degree of freedom, of landmarks for which it is absurd."""
+    if run.landmarks is None or true is None:
+        return {}
+    errors = landmark_errors(anonymous_named(run.landmarks, true), true)
+    squares = normalised_squares(errors.horizontal_m, errors.horizontal_covs)
+    return {
+        id_: square / 2 for id_, square in zip(errors.ids.tolist(), squares.tolist(), strict=True) if square > ABSURD
+    }
+
+
+def _contradicting(run: RunResult) -> dict[int, float]:
+    """Mean NIS, per degree of freedom, of landmarks for which too many innovations are absurd."""
+    log = run.detections
+    if log is None or run.landmarks is None:
+        return {}
+    squares = normalised_squares(log.innovations, log.innovation_covs)
+    used = np.array([outcome is Outcome.USED for outcome in log.outcomes], dtype=bool) & np.isfinite(squares)
+    found = {}
+    for id_ in run.landmarks.ids.tolist():
+        own = squares[used & (log.landmark_ids == id_)]
+        if own.size and np.mean(own > ABSURD) > CONTRADICTING_SHARE:
+            found[id_] = float(own.mean() / 2)
+    return found
+
+
+def _look_at(run: RunResult) -> str:
+    policy = run.params.get(POLICY)
+    if policy is None:
+        return "look at identities, then at noise and start"
+    return f'look at identities ({POLICY} is "{policy}"), then at noise and start'
+
+
+def _landmarks(ids: dict[int, float]) -> str:
+    return f"landmark{'s' if len(ids) > 1 else ''} {_listed(list(ids))}"
+
+
+def _listed(ids: list[int]) -> str:
+    if len(ids) > MOST_NAMED:
+        return f"{', '.join(map(str, ids[:MOST_NAMED]))} and {len(ids) - MOST_NAMED} more"
+    *first, last = map(str, ids)
+    return f"{', '.join(first)} and {last}" if first else last
