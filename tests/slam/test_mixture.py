@@ -1,0 +1,247 @@
+"""Components of the mixture: densities by scipy, kernels by integration and by GTSAM, choices by trying all."""
+
+from itertools import product
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import L, X
+from scipy.integrate import trapezoid
+from scipy.stats import multivariate_normal
+
+from sonar_graph.measurements import Floats
+from sonar_graph.slam import factors
+from sonar_graph.slam.hypotheses import RecogniserErrors, Statement
+from sonar_graph.slam.mixture import LEAST_TRUNCATION, REPEATED_LOSS, Choices, Errors, Kernel, Mixture, Watch
+from sonar_graph.slam.sighting import Sighting
+from sonar_graph.slam.sightlines import Sightline
+
+ERRORS = RecogniserErrors(0.05, 10.0, 2.0)
+LOG_U = -np.log(20.0)
+MIXTURE = Mixture(ERRORS, Kernel("none", 1.0))
+KERNELS = [Kernel("none", 1.0), Kernel("huber", 1.3), Kernel("cauchy", 1.5)]
+NAMES = [kernel.name for kernel in KERNELS]
+MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.4, 0.2), np.array([0.3, 0.1, -0.1]))
+R = np.array([[4e-4, 1.2e-4], [1.2e-4, 1e-4]])
+PLACES = {7: np.array([3.0, 0.5, -1.0]), 4: np.array([3.2, 1.4, -1.1]), 9: np.array([2.6, -0.6, -0.9])}
+
+
+def world() -> gtsam.Values:
+    values = gtsam.Values()
+    for k in range(6):
+        values.insert(X(k), gtsam.Pose3(gtsam.Rot3.Ypr(3.0 + 0.1 * k, 0.05, -0.03), np.array([6.0, 1.0, -0.2 * k])))
+    for i, place in PLACES.items():
+        values.insert(L(i), place)
+    return values
+
+
+def shown(values: gtsam.Values, k: int, point: Floats) -> Floats:
+    """Range and azimuth of a point from pose k."""
+    x, y, z = values.atPose3(X(k)).compose(MOUNTED).transformTo(point)
+    return np.array([np.sqrt(x * x + y * y + z * z), np.arctan2(y, x)])
+
+
+def wrapped(e: Floats) -> Floats:
+    return np.array([e[0], (e[1] + np.pi) % (2 * np.pi) - np.pi])
+
+
+def watch(values: gtsam.Values, point: Floats, frames: list[int], off: Floats, said: dict[int, float]) -> Watch:
+    """Something seen in some frames, off by this, shape (n, 2), in standard deviations."""
+    noise = np.linalg.cholesky(R)
+    return Watch(
+        Statement(said),
+        [
+            Sighting(k, k, Sightline(X(k), MOUNTED, shown(values, k, point) + noise @ e), R, None)
+            for k, e in zip(frames, off, strict=True)
+        ],
+    )
+
+
+def log_density(values: gtsam.Values, seen: Watch, point: Floats) -> float:
+    """Of all sightings of a watch, were they of something at a point."""
+    at = [(s.line.z, shown(values, s.stamp_ns, point)) for s in seen.sightings]
+    return sum(float(multivariate_normal.logpdf(wrapped(z - h), np.zeros(2), R)) for z, h in at)
+
+
+def log_weights(said: dict[int, float], i: int, count: int = 20) -> tuple[float, float]:
+    """Of a landmark and of none, q = 0.05."""
+    none = 0.95 * (1.0 - sum(said.values())) + 0.025
+    return np.log(0.95 * said.get(i, 0.0) + 0.025 / count), np.log(none)
+
+
+def of_nothing(seen: Watch) -> float:
+    """Log density of a watch of something whose place is not known."""
+    peak = float(multivariate_normal.logpdf(np.zeros(2), np.zeros(2), R))
+    return LOG_U + (len(seen.sightings) - 1) * max(LOG_U, peak - REPEATED_LOSS)
+
+
+def some_watches(values: gtsam.Values) -> list[Watch]:
+    rng = np.random.default_rng(4)
+    return [
+        watch(values, PLACES[7], [0, 1, 2], rng.standard_normal((3, 2)), {7: 0.9}),
+        watch(values, PLACES[4], [3], 3.0 * rng.standard_normal((1, 2)), {7: 0.6, 4: 0.3}),
+        watch(values, PLACES[9], [1, 4], rng.standard_normal((2, 2)), {}),
+    ]
+
+
+# Kernels ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=NAMES)
+def test_a_kernels_density_integrates_to_one(kernel: Kernel) -> None:
+    e = np.sinh(np.linspace(-18.0, 18.0, 400_001))  # as far as Cauchy's tails matter
+    assert trapezoid(np.exp(kernel.log_normaliser - kernel.loss(e)), e) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("kernel", KERNELS[1:], ids=NAMES[1:])
+def test_a_kernels_loss_is_that_of_gtsam(kernel: Kernel) -> None:
+    estimator = kernel.estimator()
+    assert estimator is not None
+    for e in [-30.0, -2.0, -1.31, -1.29, -0.4, 0.0, 0.7, 1.5, 8.0]:
+        assert float(kernel.loss(np.array(e))) == pytest.approx(estimator.loss(e), rel=1e-12)
+
+
+def losses(kernel: Kernel, noise: Floats) -> Floats:
+    """That of the graph's factors and that of the mixture, shape (n, 2), of points at elevation 0 all about one."""
+    estimator, values, found = kernel.estimator(), gtsam.Values(), []
+    values.insert(X(0), gtsam.Pose3())
+    z = np.array([3.0, 0.2])
+    robust = (lambda model: gtsam.noiseModel.Robust.Create(estimator, model)) if estimator else (lambda model: model)
+    made = factors.landmark_sighting(X(0), L(7), gtsam.Pose3(), z, noise, robust)
+    errors = Errors([Sighting(0, 0, Sightline(X(0), gtsam.Pose3(), z), noise, None)], values)
+    values.insert(L(7), np.zeros(3))
+    for size, angle in product([0.3, 1.0, 3.0, 12.0], np.linspace(0.0, 2 * np.pi, 13)):
+        r, a = z + np.linalg.cholesky(noise) @ (size * np.array([np.cos(angle), np.sin(angle)]))
+        point = np.array([r * np.cos(a), r * np.sin(a), 0.0])
+        values.update(L(7), point)
+        theirs = sum(factor.error(values) for factor in made)
+        found.append((theirs, float(kernel.loss(errors.of(point[None])).sum())))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=NAMES)
+def test_the_mixtures_loss_is_that_of_the_graphs_factors(kernel: Kernel) -> None:
+    """Of independent noise under every kernel."""
+    theirs, ours = losses(kernel, np.diag(np.diag(R))).T
+    np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-7)
+
+
+def test_it_is_of_correlated_noise_too_without_a_kernel() -> None:
+    theirs, ours = losses(KERNELS[0], R).T
+    np.testing.assert_allclose(ours, theirs, rtol=1e-9)
+
+
+@pytest.mark.parametrize("kernel", KERNELS[1:], ids=NAMES[1:])
+def test_a_kernel_on_correlated_noise_is_once_to_twice_as_strict_in_the_mixture(kernel: Kernel) -> None:
+    """The factor's is of the norm, the mixture's of both components: a loss that is concave in e² adds up to more."""
+    theirs, ours = losses(kernel, R).T
+    assert (ours >= theirs * (1 - 1e-9)).all()
+    assert (ours <= 2.0 * theirs * (1 + 1e-9)).all()
+    assert (ours / theirs).max() > 1.15, "else one of the two has come to be the other"
+
+
+# Components ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_new_detections_components_are_predictive_densities() -> None:
+    """Of three landmarks, one of them across the cut of the azimuth; of one that is not in the graph, and of none."""
+    rng = np.random.default_rng(2)
+    A = rng.standard_normal((3, 2, 2))
+    S = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(2)
+    z, expected = np.array([3.0, 3.1]), np.array([[3.2, 3.0], [2.0, -3.1], [3.5, 2.0]])
+    said = {4: 0.6, 5: 0.3}
+    found = MIXTURE.at_first(Statement(said), [7, 4, 9], z, expected, S)
+    for k, i in enumerate((7, 4, 9)):
+        density = multivariate_normal.logpdf(wrapped(z - expected[k]), np.zeros(2), S[k])
+        assert found[i] == pytest.approx(density + log_weights(said, i)[0])
+    assert found[5] == pytest.approx(LOG_U + log_weights(said, 5)[0])
+    assert found[None] == pytest.approx(LOG_U + log_weights(said, 5)[1])
+    assert found.keys() == {7, 4, 9, 5, None}
+
+
+def test_gains_are_densities_over_that_of_no_landmark() -> None:
+    values = world()
+    watches, points = some_watches(values), np.array([PLACES[7], PLACES[4] + [0.0, 0.05, 0.0]])
+    found = MIXTURE.gains(7, watches, points, values)
+    for n, seen in enumerate(watches):
+        named, none = log_weights(seen.statement.probability, 7)
+        for k, point in enumerate(points):
+            expected = named + log_density(values, seen, point) - none - of_nothing(seen)
+            assert found[n, k] == pytest.approx(expected, rel=1e-9)
+
+
+def test_squared_errors_are_of_the_landmark_that_each_is_given() -> None:
+    values = world()
+    watches, ids = some_watches(values), [9, 4, 7]
+    information = np.linalg.inv(R)
+    for seen, i, found in zip(watches, ids, MIXTURE.squared_errors(watches, ids, values), strict=True):
+        off = [wrapped(s.line.z - shown(values, s.stamp_ns, PLACES[i])) for s in seen.sightings]
+        assert found == pytest.approx(sum(e @ information @ e for e in off), rel=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_the_truncation_is_where_a_landmark_is_as_probable_as_none(count: int, share: float) -> None:
+    values, said, frames = world(), {4: 0.1, 7: 0.8}, [0, 1, 2]
+    perfect = watch(values, PLACES[7], frames[:count], np.zeros((count, 2)), said)
+    (c2,) = MIXTURE.truncations([perfect])
+    off = np.sqrt(share * c2 / count) * np.tile([0.6, 0.8], (count, 1))
+    seen = watch(values, PLACES[7], frames[:count], off, said)
+    assert MIXTURE.squared_errors([seen], [7], values)[0] == pytest.approx(share * c2)
+    gain = log_weights(said, 7)[0] + log_density(values, seen, PLACES[7]) - log_weights(said, 7)[1] - of_nothing(seen)
+    assert gain == pytest.approx(0.5 * (1.0 - share) * c2, rel=1e-6)
+
+
+def test_the_truncation_is_never_nothing() -> None:
+    """Noise so wide that no fit is as good as none."""
+    wide = Sighting(0, 0, Sightline(X(0), MOUNTED, np.array([3.0, 0.0])), np.diag([100.0, 100.0]), None)
+    assert MIXTURE.truncations([Watch(Statement({7: 0.6}), [wide])]).tolist() == [LEAST_TRUNCATION]
+
+
+@pytest.mark.parametrize("is_alone", [True, False])
+def test_a_landmark_that_one_watch_has_put_where_it_is_has_no_place_for_it(is_alone: bool) -> None:
+    """Else its perfect fit would be praised; others fit it, or do not, as any landmark."""
+    values = world()
+    watches = some_watches(values)
+    own, other, third = watches
+    sizes = {7: 3 if is_alone else 4, 4: 6}
+    found = MIXTURE.scores(watches, values, [7, 4, None], sizes)
+    in_place = log_density(values, own, PLACES[7])
+    weight, none = log_weights({7: 0.9}, 7)
+    assert found[0][7] == pytest.approx(weight + (of_nothing(own) if is_alone else in_place))
+    assert found[0][4] == pytest.approx(log_weights({7: 0.9}, 4)[0] + log_density(values, own, PLACES[4]))
+    assert found[0][None] == pytest.approx(none + of_nothing(own))
+    others_weight = log_weights(other.statement.probability, 7)[0]
+    assert found[1][7] == pytest.approx(others_weight + log_density(values, other, PLACES[7]))
+    assert found[2][4] == pytest.approx(log_weights({}, 4)[0] + log_density(values, third, PLACES[4]))
+    assert [list(row) for row in found] == [[4, 7, None]] * 3
+
+
+# Choices ------------------------------------------------------------------------------------------------------------
+
+
+def total(values: gtsam.Values, watches: list[Watch], choices: Choices) -> float:
+    """Log probability of choices, minus infinity where a landmark is twice in a frame."""
+    frames = [(i, k) for seen, i in zip(watches, choices, strict=True) if i is not None for k in seen.stamps_ns]
+    if len(set(frames)) < len(frames):
+        return -np.inf
+    return sum(
+        log_weights(seen.statement.probability, i if i is not None else 0)[i is None]
+        + (of_nothing(seen) if i is None else log_density(values, seen, PLACES[i]))
+        for seen, i in zip(watches, choices, strict=True)
+    )
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_best_choices_are_the_most_probable_of_all(seed: int) -> None:
+    """Five watches of three landmarks or of something else, half of them misnamed, two of them in the same frames."""
+    values, rng = world(), np.random.default_rng(seed)
+    watches = []
+    for frames in ([0, 1], [0, 1], [2], [3], [4, 5]):
+        place = [*PLACES.values(), np.array([3.5, 0.9, -1.0])][int(rng.integers(4))]
+        said = {int(rng.choice(list(PLACES))): float(rng.choice([0.4, 0.9]))}
+        watches.append(watch(values, place, frames, rng.standard_normal((len(frames), 2)), said))
+    found = MIXTURE.best(watches, values, [None] * 5, dict.fromkeys(PLACES, 9))
+    ranked = sorted((total(values, watches, list(c)) for c in product([*PLACES, None], repeat=5)), reverse=True)
+    assert total(values, watches, found) == pytest.approx(ranked[0])
+    assert ranked[0] > ranked[1] + 1e-3
