@@ -129,6 +129,7 @@ class Outcome(StrEnum):
     FORGOTTEN = "refused: its identity did not become known in time"
     TAKEN_BACK = "taken back: its track is of no known landmark"
     REPEATED = "refused: the frame shows this landmark elsewhere, more probably"
+    TRACK_REPEATED = "refused: the frame has another row of its track, of which one object is seen"
     UNSOUND = "refused: its range is not above zero, or its covariance not positive definite"
     WITHHELD = "withheld: with it the estimate could not be determined"
     LATE = "refused: older than what was already processed"

@@ -52,6 +52,8 @@ class DeferredIdentities:
 
         Parameters
         ----------
+        frame
+            No track has two rows in it (`sonar_graph.slam.repeated_tracks`).
         decisions
             Of each row: an identity, `NO_LANDMARK` or `UNDECIDED`.
         time_s
@@ -68,6 +70,10 @@ class DeferredIdentities:
         decided = [(track, decision) for track, decision in seen if decision != UNDECIDED]
         displaced = self._change([(track, new) for track, new in decided if new != track.identity], time_s)
         self._use_late([track for track, _ in decided] + displaced, time_s)
+
+    def identity_of(self, number: int) -> int:
+        """What a track counts as: an identity, `NO_LANDMARK` or `UNDECIDED`."""
+        return self._tracks.identity_of(number)
 
     def remember(self, number: int, sighting: Sighting) -> None:
         """A sighting of a track's newest frame."""

@@ -23,6 +23,7 @@ from sonar_graph.slam.landmark_sightings import LandmarkSightings
 from sonar_graph.slam.late_gate import LateGate
 from sonar_graph.slam.mixture import Kernel, Mixture
 from sonar_graph.slam.models import FLOOR_GATE, locate
+from sonar_graph.slam.repeated_tracks import of_no_landmark, once_a_track
 from sonar_graph.slam.sighting import Sighting, SightingFactors
 from sonar_graph.slam.sightlines import Sightline
 from sonar_graph.slam.smoother import Smoother
@@ -124,6 +125,9 @@ class Sightings:
             for landmark_id in frame.most_probable()[0].tolist():
                 self.journal.record(stamp_ns, landmark_id, late)
             return
+        if self.policy.deferred_identity or self._doubtful is not None:
+            known = of_no_landmark if self._doubtful is not None else self._deferred.identity_of
+            frame = once_a_track(frame, known, self.journal)
         identities = identify(frame, self.policy.identity_probability)
         is_unnamed = unnamed(frame) & (self._anonymous is not None)
         if self._doubtful is not None:

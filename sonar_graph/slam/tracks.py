@@ -67,6 +67,11 @@ class Tracks:
         track.newest_ns = stamp_ns
         return track
 
+    def identity_of(self, number: int) -> int:
+        """What the track of a number counts as, if there is one."""
+        track = self._by_number.get(number)
+        return UNDECIDED if track is None else track.identity
+
     def counting_as(self, landmark_id: int) -> list[Track]:
         """Tracks that count as a landmark."""
         return [track for track in self._by_number.values() if track.identity == landmark_id]
