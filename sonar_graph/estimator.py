@@ -72,6 +72,20 @@ def refused_rows_of(estimator: Estimator) -> list[RefusedRow]:
     return list(estimator.refused_rows()) if isinstance(estimator, TellsRefusedRows) else []
 
 
+@runtime_checkable
+class TellsWithheld(Protocol):
+    """What an estimator may have beside the contract: it says what it could not use for want of something else."""
+
+    def withheld(self) -> list[str]:
+        """All so far, or the newest of it: what, and what was missing, in one line each."""
+        ...
+
+
+def withheld_of(estimator: Estimator) -> list[str]:
+    """What an estimator says that it could not use; nothing where it does not tell."""
+    return list(estimator.withheld()) if isinstance(estimator, TellsWithheld) else []
+
+
 def installed_estimators() -> dict[str, EntryPoint]:
     """Entry points by name; nothing is imported. Of two with one name the first found wins."""
     found: dict[str, EntryPoint] = {}

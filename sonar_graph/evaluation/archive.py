@@ -106,6 +106,7 @@ def restore_run(run: RunResult, arrays: Arrays) -> RunResult:
         landmarks=_unpack("landmarks", LandmarkMap, arrays),
         detections=_unpack("detections", DetectionLog, arrays),
         refused=_restore_refused(arrays),
+        withheld=run.withheld,
         maps=_restore_maps(arrays),
         update_s=arrays["update_s"],
         finish_s=run.finish_s,

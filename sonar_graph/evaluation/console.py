@@ -11,7 +11,7 @@ from sonar_graph.evaluation.identity_doubts import doubt_of_identities, nameless
 from sonar_graph.evaluation.landmark_table import PAPER, LandmarkTable, landmark_table
 from sonar_graph.evaluation.log_doubts import doubt_lines
 from sonar_graph.evaluation.published_experiment import repeats_published
-from sonar_graph.evaluation.refusals import refusal_lines
+from sonar_graph.evaluation.refusals import refusal_lines, withheld_lines
 from sonar_graph.evaluation.results import Comparison, RunResult
 from sonar_graph.evaluation.score_table import LABELS
 from sonar_graph.evaluation.wording import (
@@ -135,6 +135,7 @@ def _notes(comparison: Comparison) -> Text:
     lines = [f"{run.estimator} failed: {run.reason}" for run in failed_runs(comparison)]
     lines += lost_runs(comparison)
     lines += refusal_lines(comparison)
+    lines += withheld_lines(comparison)
     lines += doubt_of_identities(comparison)
     lines += nameless_landmarks(comparison)
     lines += doubt_lines(comparison.sequence.notes)

@@ -1,4 +1,4 @@
-"""Rows of IMU and Doppler log that runs did not use: gathered where they are many, and in words."""
+"""What runs did not use: rows of IMU and Doppler log, gathered where they are many, and what was withheld; in words."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sonar_graph.evaluation.wording import format_value
 from sonar_graph.states import Refusal, RefusedRow
 
 MOST_NAMED = 5
-"""Rows of one sensor and reason that are named one by one; more are gathered."""
+"""Rows of one sensor and reason that are named one by one, more are gathered; of what was withheld the first ones."""
 
 
 @dataclass(frozen=True)
@@ -72,4 +72,15 @@ def refusal_lines(comparison: Comparison) -> list[str]:
         distance = f" (squared distance {refused.distances()})" if refused.distances() else ""
         at = f"{count}{refused.times(start_ns)} s"
         lines.append(f"Warning: {refused.sensor}, {at}: {refused.reason}{distance}; {', '.join(names)}")
+    return lines
+
+
+def withheld_lines(comparison: Comparison) -> list[str]:
+    """What runs could not use for want of something else, in their own words: the first ones, and how many more."""
+    lines = []
+    for run in comparison.runs:
+        lines += [f"Warning: {run.estimator}: {message}" for message in run.withheld[:MOST_NAMED]]
+        more = len(run.withheld) - MOST_NAMED
+        if more > 0:
+            lines.append(f"Warning: {run.estimator} withheld {more} more: runs/{run.estimator}/result.json has all")
     return lines

@@ -18,7 +18,7 @@ from sonar_graph.evaluation.landmark_table import PAPER, landmark_table
 from sonar_graph.evaluation.log_doubts import warning_lines
 from sonar_graph.evaluation.published_experiment import repeats_published
 from sonar_graph.evaluation.recognition_section import recognition_content
-from sonar_graph.evaluation.refusals import by_runs
+from sonar_graph.evaluation.refusals import by_runs, withheld_lines
 from sonar_graph.evaluation.results import Comparison, RunResult
 from sonar_graph.evaluation.score_table import score_blocks
 from sonar_graph.evaluation.wording import ABSENT, TOLERATED_FACTOR, failed_runs, finding, format_value
@@ -56,7 +56,11 @@ def _content(comparison: Comparison) -> dict[str, Any]:
         "summary": _summary(comparison),
         "finding": finding(comparison),
         "failed": failed_runs(comparison),
-        "doubts": [*doubt_of_identities(comparison), *warning_lines(comparison.sequence.notes)],
+        "doubts": [
+            *doubt_of_identities(comparison),
+            *withheld_lines(comparison),
+            *warning_lines(comparison.sequence.notes),
+        ],
         "runs": comparison.runs,
         "colours": len(ESTIMATOR_COLOURS),
         "blocks": score_blocks(comparison),

@@ -41,6 +41,8 @@ class RunResult:
     detections: DetectionLog | None = None
     refused: list[RefusedRow] = field(default_factory=list)
     """Rows of IMU and Doppler log that it names as not used."""
+    withheld: list[str] = field(default_factory=list)
+    """What it says that it could not use for want of something else, a line each."""
     maps: list[MapSoFar] = field(default_factory=list)
     """The map at `map_instants`, in order; the last one is `landmarks`."""
     update_s: Floats = field(default_factory=lambda: np.empty(0))

@@ -13,14 +13,14 @@ import numpy as np
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
-from sonar_graph.estimator import Estimator, load_estimator, make_params, refused_rows_of
+from sonar_graph.estimator import Estimator, load_estimator, make_params, refused_rows_of, withheld_of
 from sonar_graph.evaluation.instants import map_instants
 from sonar_graph.evaluation.memory import PeakMemory
 from sonar_graph.evaluation.outcome import check_estimate, check_outcome
 from sonar_graph.evaluation.results import MapSoFar, RunResult
 from sonar_graph.measurements import Ints, LandmarkDetections, Measurements
 from sonar_graph.sequence import Sequence
-from sonar_graph.states import Estimate, RefusedRow, Trajectory
+from sonar_graph.states import Estimate, Trajectory
 
 LOG = logging.getLogger(__name__)
 REASON_WIDTH = 400
@@ -125,8 +125,8 @@ class _Replay:
             return self._finish(estimator, memory)
         except Exception as error:  # a third party's estimator may fail in any way, and the others still run
             LOG.info("%s failed %s", self._name, self._stage, exc_info=True)
-            reason, refused = f"{self._stage}: {one_line(error)}", _refused_so_far(estimator)
-            return self._result("failed", reason, refused=refused, peak_memory_mb=memory.rise_mb())
+            reason, told = f"{self._stage}: {one_line(error)}", _told_so_far(estimator)
+            return self._result("failed", reason, **told, peak_memory_mb=memory.rise_mb())
 
     def _warm_up(self, kind: type[Estimator]) -> None:
         """Let an estimator that is thrown away compile what it needs, until landmarks were seen again."""
@@ -168,6 +168,7 @@ class _Replay:
             landmarks=landmarks,
             detections=detections,
             refused=refused_rows_of(estimator),
+            withheld=withheld_of(estimator),
             maps=self._maps,
             finish_s=finish_s,
             peak_memory_mb=peak_memory_mb,
@@ -178,11 +179,15 @@ class _Replay:
         return RunResult(self._name, params, status, reason, update_s=np.array(self._update_s), **outcome)
 
 
-def _refused_so_far(estimator: Estimator | None) -> list[RefusedRow]:
-    """What a run that failed had refused before, often why it failed; nothing where it cannot even say that."""
-    with contextlib.suppress(Exception):
-        return [] if estimator is None else refused_rows_of(estimator)
-    return []
+def _told_so_far(estimator: Estimator | None) -> dict[str, Any]:
+    """What a run that failed had not used before, often why it failed; nothing where it cannot even say that."""
+    told: dict[str, Any] = {}
+    if estimator is not None:
+        with contextlib.suppress(Exception):
+            told["refused"] = refused_rows_of(estimator)
+        with contextlib.suppress(Exception):
+            told["withheld"] = withheld_of(estimator)
+    return told
 
 
 def _names(detections: LandmarkDetections) -> bool:

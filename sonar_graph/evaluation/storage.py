@@ -126,6 +126,7 @@ def _plain_run(name: str, entry: dict[str, Any]) -> RunResult:
         entry["params"],
         entry["status"],
         entry["reason"],
+        withheld=entry.get("withheld", []),
         finish_s=entry["finish_s"],
         peak_memory_mb=float("nan") if memory is None else memory,
     )
@@ -165,6 +166,7 @@ def _state(run: RunResult) -> dict[str, Any]:
         "finish_s": run.finish_s,
         "peak_memory_mb": run.peak_memory_mb,
         "refused": [asdict(rows) for rows in gathered(run.refused)],
+        "withheld": run.withheld,
     }
 
 
