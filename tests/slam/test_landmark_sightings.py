@@ -1,0 +1,113 @@
+"""Which factors are in the graph depends on which sightings are of which landmark, not on how they came there."""
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import L, X
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sonar_graph.calibration import FloorPrior, SonarCalibration
+from sonar_graph.slam.landmark_sightings import LandmarkSightings
+from sonar_graph.slam.sighting import Sighting, SightingFactors
+from sonar_graph.slam.sightlines import Sightline
+from sonar_graph.slam.smoother import Smoother
+
+POSES = 5
+PLACES = {7: np.array([3.0, 0.5, -0.8]), 9: np.array([3.0, -0.4, -0.8])}
+MAKER = SightingFactors(SonarCalibration(elevation_aperture_rad=0.3), lambda noise: noise)
+NOISE = np.diag([4e-4, 1e-4])
+FLOOR = FloorPrior(z_m=-0.8, sigma_m=0.05)
+
+
+def begun() -> LandmarkSightings:
+    """Keyframes whose poses are known, and no landmark yet."""
+    smoother = Smoother(1e9, 0.1, 1e9)
+    for k in range(POSES):
+        pose = gtsam.Pose3(gtsam.Rot3.Ypr(0.1 * k, 0.2, 0.0), np.array([0.2 * k, 0.1 * k, 0.0]))
+        smoother.add_pose(X(k), pose, float(k))
+        smoother.add([gtsam.PriorFactorPose3(X(k), pose, gtsam.noiseModel.Isotropic.Sigma(6, 0.01))])
+    smoother.update(float(POSES))
+    return LandmarkSightings(smoother, MAKER)
+
+
+def sighting_of(landmark_id: int, k: int, floor: FloorPrior | None, landmarks: LandmarkSightings) -> Sighting:
+    x, y, z = landmarks.smoother.values.atPose3(X(k)).transformTo(PLACES[landmark_id])
+    seen = np.array([np.sqrt(x * x + y * y + z * z), np.arctan2(y, x)])
+    return Sighting(k, k, Sightline(X(k), gtsam.Pose3(), seen), NOISE, floor)
+
+
+def errors(graph: gtsam.NonlinearFactorGraph, ids: list[int], landmarks: LandmarkSightings) -> list[float]:
+    """Of a graph at some estimates."""
+    rng, found = np.random.default_rng(0), []
+    for _ in range(4):
+        values = gtsam.Values()
+        for k in range(POSES):
+            pose = landmarks.smoother.values.atPose3(X(k))
+            values.insert(X(k), pose.compose(gtsam.Pose3.Expmap(0.1 * rng.standard_normal(6))))
+        for i in PLACES:
+            point = PLACES[i] + 0.3 * rng.standard_normal(3)
+            if i in ids:
+                values.insert(L(i), point)
+        found.append(graph.error(values))
+    return found
+
+
+def known_from_the_start(of: dict[Sighting, int], landmarks: LandmarkSightings) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph()
+    for k in range(POSES):
+        graph.push_back(landmarks.smoother.graph.at(k))
+    for i in set(of.values()):
+        mine = sorted((s for s, landmark in of.items() if landmark == i), key=lambda s: s.stamp_ns)
+        for s in mine:
+            for factor in MAKER.make(s, L(i), is_first=s is mine[0]):
+                graph.push_back(factor)
+    return graph
+
+
+@pytest.mark.parametrize("floor", [None, FLOOR], ids=["no floor", "floor"])
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.lists(st.sampled_from([7, 9, None]), min_size=POSES, max_size=POSES), min_size=1, max_size=3))
+def test_whatever_came_and_went_the_graph_is_that_of_what_is_left(floor: FloorPrior | None, stages: list) -> None:
+    """Each stage says of which landmark each sighting is from now on; the first to come is often not the earliest."""
+    landmarks = begun()
+    seen, of = [sighting_of(7, k, floor, landmarks) for k in range(POSES)], dict[Sighting, int]()
+    for stage in stages:
+        changed = [(s, i) for s, i in zip(seen, stage, strict=True) if s.landmark_id != i]
+        coming = [(s, i) for s, i in changed if i is not None]
+        landmarks.exchange([s for s, _ in changed], coming, float(POSES))
+        of = {s: i for s, i in zip(seen, stage, strict=True) if i is not None}
+        expected = known_from_the_start(of, landmarks)
+        ids = sorted(set(of.values()))
+        assert landmarks.smoother.graph.nrFactors() == expected.nrFactors()
+        assert errors(landmarks.smoother.graph, ids, landmarks) == pytest.approx(errors(expected, ids, landmarks))
+        assert sorted(landmarks.ids) == landmarks.smoother.landmark_ids == ids
+
+
+@pytest.mark.parametrize("earliest_first", [True, False])
+def test_what_is_said_once_is_said_by_the_earliest(earliest_first: bool) -> None:
+    """Also when it comes last, and when it goes again; without a floor the elevation is of it."""
+    landmarks = begun()
+    early, middle, late = (sighting_of(7, k, None, landmarks) for k in (0, 2, 4))
+    for s in (early, middle, late) if earliest_first else (late, middle, early):
+        landmarks.exchange([], [(s, 7)], float(POSES))
+    counts = [len(s.handles) for s in (early, middle, late)]
+    assert counts == [3, 2, 2]  # first_direction beside range and azimuth
+    landmarks.exchange([early], [], float(POSES))
+    assert [len(s.handles) for s in (early, middle, late)] == [0, 3, 2]
+
+
+def test_a_landmark_whose_sightings_have_left_counts_as_one_more() -> None:
+    """So it is not alone with one that came later, and stays when that one goes."""
+    landmarks = begun()
+    first, second, third = (sighting_of(7, k, None, landmarks) for k in (0, 1, 4))
+    other = sighting_of(9, 3, None, landmarks)
+    landmarks.exchange([], [(first, 7), (second, 7), (third, 7), (other, 9)], float(POSES))
+    assert landmarks.sizes() == {7: 3, 9: 1}
+    landmarks.leave({X(0), X(1)})
+    assert landmarks.sizes() == {7: 2, 9: 1}
+    assert landmarks.is_rooted(7)
+    assert not landmarks.is_rooted(9)
+    landmarks.exchange([third, other], [], float(POSES))
+    assert landmarks.sizes() == {7: 1}
+    assert landmarks.any_sighting(7) is first

@@ -1,0 +1,37 @@
+"""How far variables of a window are from where it was linearised."""
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import L
+
+from sonar_graph.slam.window import Window
+
+
+def pulled(shift: list[float], threshold: float) -> Window:
+    """Landmark 1 stays, landmark 2 is pulled after it was linearised."""
+    window, values, graph = Window(threshold, 1e9), gtsam.Values(), gtsam.NonlinearFactorGraph()
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0)
+    for i in (1, 2):
+        values.insert(L(i), np.zeros(3))
+        graph.push_back(gtsam.PriorFactorPoint3(L(i), np.zeros(3), noise))
+    window.begin(graph, values, {L(1): 0.0, L(2): 0.0})
+    more = gtsam.NonlinearFactorGraph()
+    more.push_back(gtsam.PriorFactorPoint3(L(2), 2.0 * np.array(shift), noise))
+    window.update(more, gtsam.Values(), {}, [])
+    return window
+
+
+@pytest.mark.parametrize("shift", [[0.3, 0.1, 0.2], [-0.3, 0.1, 0.0], [0.0, -0.2, -0.3]])
+def test_the_largest_shift_is_the_largest_component_in_either_direction(shift: list[float]) -> None:
+    window = pulled(shift, threshold=10.0)
+    assert window.largest_shift([L(1)]) == pytest.approx(0.0, abs=1e-12)
+    assert window.largest_shift([L(1), L(2)]) == pytest.approx(0.3)
+    assert window.largest_shift([]) == 0.0
+
+
+def test_what_settles_is_linearised_where_it_is() -> None:
+    window = pulled([-0.3, 0.0, 0.0], threshold=1e-3)
+    window.settle()
+    assert window.largest_shift([L(2)]) < 1e-3
+    assert window.isam.calculateEstimate().atPoint3(L(2))[0] == pytest.approx(-0.3)
