@@ -27,8 +27,9 @@ def nearest(
     named: list[int],
     frames: dict[int, list[int]],
     log_rival: float = LIKELY,
+    range_m: float = 2.0,
 ) -> tuple[int, int] | None:
-    """Of landmarks at points with a joint covariance, each seen in some frames from 2 m."""
+    """Of landmarks at points with a joint covariance, each seen in some frames."""
     smoother = Smoother(1e9, 0.1, 1e9)
     landmarks = LandmarkSightings(smoother, SightingFactors(SonarCalibration(), lambda noise: noise))
     values = gtsam.Values()
@@ -36,7 +37,7 @@ def nearest(
         values.insert(L(i), np.array(point))
         for stamp_ns in frames[i]:
             noise = np.diag([NOISE_M**2, (NOISE_M / 2) ** 2])
-            sighting = Sighting(stamp_ns, 0, Sightline(X(0), gtsam.Pose3(), np.array([2.0, 0.0])), noise, None)
+            sighting = Sighting(stamp_ns, 0, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.0])), noise, None)
             landmarks.enter(sighting, i, [])
     joint = JointCovariance(cov, {L(i): 3 * k for k, i in enumerate(points)})
     merging = LandmarkMerging(landmarks, PROBABILITY, log_rival)
@@ -90,3 +91,13 @@ def test_a_wide_difference_says_nothing(own_sigma: float):
 def test_of_several_pairs_the_nearest():
     points = {5: [0.0, 0.0, 0.0], 7: [0.1, 0.0, 0.0], 9: [0.13, 0.0, 0.0]}
     assert nearest(points, shared(3, 1.0, 0.05), [], APART) == (7, 9)
+
+
+@pytest.mark.parametrize("range_m", [0.5, 2.0, 6.0])
+def test_the_noise_of_a_sighting_is_across_the_beam_where_that_is_larger(range_m: float):
+    """``max(range sigma, range times azimuth sigma)`` beside two landmarks that are known well."""
+    sigma = max(NOISE_M, range_m * NOISE_M / 2)
+    reach = math.sqrt(chi2.ppf(PROBABILITY, 3) * (2 * 0.001**2 + sigma**2))
+    for factor, merged in ((0.98, (5, 7)), (1.02, None)):
+        points = {5: [1.0, 2.0, 0.0], 7: [1.0 + factor * reach, 2.0, 0.0]}
+        assert nearest(points, shared(2, 1.0, 0.001), [], APART, log_rival=-10.0, range_m=range_m) == merged
