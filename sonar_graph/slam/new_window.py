@@ -19,14 +19,20 @@ def split(
 
 
 def marginal(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kept: Container[int]
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kept: Container[int], *, is_by_qr: bool = False
 ) -> list[gtsam.NonlinearFactor]:
-    """What a graph says about the kept variables alone, linearised at the values."""
+    """What a graph says about the kept variables alone, linearised at the values.
+
+    Raises
+    ------
+    RuntimeError
+        When elimination gives up: QR on what is not determined, Cholesky also on what is determined weakly.
+    """
     if graph.size() == 0:
         return []
     linear = graph.linearize(values)
     separator = [key for key in linear.keyVector() if key in kept]
-    found = linear.marginal(separator)
+    found = linear.marginal(separator, gtsam.EliminateQR) if is_by_qr else linear.marginal(separator)
     return [gtsam.LinearContainerFactor(found.at(i), values) for i in range(found.size())]
 
 

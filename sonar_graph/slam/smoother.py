@@ -368,10 +368,37 @@ class Smoother:
         values = gtsam.Values()
         for key in times:
             copy(self.values, key, values)
-        for factor in marginal(outside, self.values, times):
-            inside.push_back(factor)
-        self._begin_window(inside, values, times)
+        self._begin_after(outside, inside, values, times)
         self._take(self._window.isam.calculateEstimate())
+
+    def _begin_after(
+        self,
+        outside: gtsam.NonlinearFactorGraph,
+        inside: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        times: dict[Any, float],
+    ) -> None:
+        """A window after what lies outside, whose marginal Cholesky makes while it is able to, then QR."""
+        try:
+            self._try_to_begin(outside, inside, values, times)
+        except RuntimeError:
+            self._window.is_by_qr = True  # a marginal by Cholesky may also have lost what is weak without a word
+            try:
+                self._try_to_begin(outside, inside, values, times)
+            except RuntimeError as error:
+                raise EstimatorError(f"isam2: {reasons(self.graph, self.values, self._expiring)}") from error
+
+    def _try_to_begin(
+        self,
+        outside: gtsam.NonlinearFactorGraph,
+        inside: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        times: dict[Any, float],
+    ) -> None:
+        graph = gtsam.NonlinearFactorGraph(inside)
+        for factor in marginal(outside, self.values, times, is_by_qr=self._window.is_by_qr):
+            graph.push_back(factor)
+        self._window.begin(graph, values, times)
 
     def _begin_window(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times: dict[Any, float]) -> None:
         try:

@@ -1,0 +1,91 @@
+"""What lies outside a window is said within it as hand algebra has it, however weakly it is determined."""
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import L, X
+
+import sonar_graph.slam.smoother as smoother_module
+from sonar_graph.errors import EstimatorError
+from sonar_graph.slam.exchange import Exchange
+from sonar_graph.slam.new_window import marginal
+from sonar_graph.slam.smoother import Smoother
+
+PRIOR_M, TIGHT_M, WEAK_M = 3.0, 2e-8, 1e3
+
+
+def isotropic(size: int, sigma: float) -> gtsam.noiseModel.Base:
+    return gtsam.noiseModel.Isotropic.Sigma(size, sigma)
+
+
+def chain() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Three points: the first known to a metre, the second nearly the first, the third somewhere near."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.push_back(gtsam.PriorFactorPoint3(L(0), np.zeros(3), isotropic(3, PRIOR_M)))
+    graph.push_back(gtsam.BetweenFactorPoint3(L(0), L(1), np.zeros(3), isotropic(3, TIGHT_M)))
+    graph.push_back(gtsam.BetweenFactorPoint3(L(1), L(2), np.zeros(3), isotropic(3, WEAK_M)))
+    for k in range(3):
+        values.insert(L(k), np.zeros(3))
+    return graph, values
+
+
+def test_by_qr_a_marginal_has_the_sum_of_a_weak_chains_variances():
+    graph, values = chain()
+    (found,) = marginal(graph, values, [L(2)], is_by_qr=True)
+    information = found.linearize(values).augmentedInformation()[:3, :3]
+    assert np.linalg.inv(information) == pytest.approx((PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2) * np.eye(3), rel=1e-9)
+
+
+def test_cholesky_loses_it():
+    graph, values = chain()
+    (found,) = marginal(graph, values, [L(2)])
+    assert not found.linearize(values).augmentedInformation()[:3, :3].any()
+
+
+def begun_anew(tight_m: float) -> Smoother:
+    """Three keyframes like the chain; a factor on the first, which has left, is exchanged for its like."""
+    smoother = Smoother(lag_s=0.5, relinearize_threshold=1e-6, stale_shift_m=1e9)
+    handles = []
+    for k, sigma in enumerate([PRIOR_M, tight_m, WEAK_M]):
+        smoother.add_pose(X(k), gtsam.Pose3(), float(k))
+        handles += smoother.add([factor(k, sigma)])
+        if k:
+            smoother.update(float(k))
+    smoother.exchange(Exchange([handles[0]], [[factor(0, PRIOR_M)]], {}, []), 2.0)
+    return smoother
+
+
+def factor(k: int, sigma: float) -> gtsam.NonlinearFactor:
+    if k == 0:
+        return gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), isotropic(6, sigma))
+    return gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), isotropic(6, sigma))
+
+
+def test_a_window_begins_anew_after_what_only_qr_eliminates():
+    expected = (PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2) * np.eye(6)
+    assert begun_anew(TIGHT_M).covariance(X(2)) == pytest.approx(expected, rel=1e-6)
+
+
+def test_where_cholesky_gives_up_on_the_marginal_qr_makes_it(monkeypatch: pytest.MonkeyPatch):
+    ways = []
+
+    def giving_up(*arguments, is_by_qr: bool):
+        ways.append(is_by_qr)
+        if not is_by_qr:
+            raise RuntimeError("Indeterminate linear system")
+        return marginal(*arguments, is_by_qr=True)
+
+    monkeypatch.setattr(smoother_module, "marginal", giving_up)
+    smoother = begun_anew(0.1)
+    assert ways == [False, True]
+    assert smoother.covariance(X(2)) == pytest.approx((PRIOR_M**2 + 0.1**2 + WEAK_M**2) * np.eye(6), rel=1e-6)
+    assert not smoother.withheld
+
+
+def test_where_qr_gives_up_too_the_error_is_the_estimators(monkeypatch: pytest.MonkeyPatch):
+    def giving_up(*_, **__):
+        raise RuntimeError("Indeterminate linear system")
+
+    monkeypatch.setattr(smoother_module, "marginal", giving_up)
+    with pytest.raises(EstimatorError, match=r"^isam2: the graph is determined too weakly"):
+        begun_anew(0.1)
