@@ -65,7 +65,9 @@ def test_the_best_policy_is_the_one_whose_worst_case_is_best(table: Any, kept: A
 
     def told(ekf: float, a: float, b: float, b_map: float = 0.0) -> dict[str, dict[str, float]]:
         losses = {"EKF-SLAM": (ekf, ekf), "iSAM2, a": (a, 0.0), "iSAM2, b": (b, b_map)}
-        return {name: {"loss": track, "landmark_loss": map_} for name, (track, map_) in losses.items()}
+        return {
+            name: {"loss": track, "landmark_loss": map_, "more_missing": 0.0} for name, (track, map_) in losses.items()
+        }
 
     figures = {kept.Case(0.1): told(0, 0.1, 0.2), kept.Case(0.1, 5.0): told(0, 0.9, 0.3), kept.Case(0.2): told(0, 0, 9)}
     assert table.best_policy(figures) == ("iSAM2, b", 0.3)
@@ -73,6 +75,17 @@ def test_the_best_policy_is_the_one_whose_worst_case_is_best(table: Any, kept: A
     assert table.best_policy(figures) == ("iSAM2, b", 0.8)
     figures[kept.Case(0.1, 20.0)] = told(0, 0.1, float("nan"))
     assert table.best_policy(figures) == ("iSAM2, a", 0.9)
+    figures[kept.Case(0.1)]["iSAM2, a"]["more_missing"] = 0.01
+    assert table.best_policy(figures)[1] == np.inf
+
+
+def test_landmarks_that_are_not_found_are_no_gain(table: Any, kept: Any) -> None:
+    """One of four landmarks, the best: a small error of the map, and three missing."""
+    clean, wrong = runs(kept, 0.1, 0.2), runs(kept, 0.1, 0.05)
+    wrong[1]["iSAM2, robust"] = replace(wrong[1]["iSAM2, robust"], landmarks=1)
+    found = table.summarise(wrong, clean, "iSAM2, robust")
+    assert (found["missing"], found["more_missing"]) == (1.5, 1.5)
+    assert found["landmark_loss"] < 0
 
 
 def test_what_is_kept_belongs_to_one_run_of_one_version(
