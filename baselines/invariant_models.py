@@ -23,7 +23,8 @@ Direction u of the world's up, measured in the body: by how much R u misses the 
 
     y = (R^ u)_xy = [ -theta_y, theta_x ] + noise                                                             (7)
 
-No H of these changes when the world is moved along x and y, or turned about its vertical.
+Each H is zero along a shift of vehicle and landmarks in x and y and a turn of all about the vertical, at any estimate:
+what cannot be observed stays so, however often it is linearised.
 """
 
 from __future__ import annotations
