@@ -67,8 +67,9 @@ class Isam2Params(Section):
     stale_shift_m: float = Field(0.1, gt=0)
     """The window is linearised anew, from a solution of the whole graph, when a landmark has moved farther."""
     kernel: Literal["none", "huber", "cauchy"] = "cauchy"
-    """Robust kernel on range and on azimuth. It lets an outlier at a landmark's first sighting be outvoted later, which
-    a gate cannot; where noise is Gaussian it costs next to nothing (measured in docs/theory/isam2.md)."""
+    """Robust kernel on range and on azimuth. It may let an outlier at a landmark's first sighting be outvoted later,
+    which a gate cannot, unless it lies too far off; where noise is Gaussian it costs next to nothing (measured in
+    docs/theory/isam2.md)."""
     kernel_width: float = Field(1.5, gt=0)
     """Width of the kernel, in standard deviations."""
     identity_probability: float = Field(0.7, ge=0, le=1)
@@ -83,7 +84,8 @@ class Isam2Params(Section):
     "gate": what is probable enough is believed, if it lies where that landmark is expected (`gate_probability`).
     Assumes that the estimate and its covariance are right when a detection comes; nothing is taken back.
     "robust": what is probable enough is believed. Assumes that most sightings of every landmark are right, and that
-    wrong ones disagree with each other: the kernel then lets the majority win.
+    wrong ones disagree with each other: the kernel then lets the majority win, unless a landmark's first sighting is
+    so far off that the others hardly pull.
     "max-mixture": a detection, or a track, is of the landmark that its place and its posterior together make most
     probable, or of none; chosen anew in the window as the estimate moves, in the whole history for smoothed results.
     Assumes `wrong_id_probability`, errors that are independent, and an estimate that is near when it chooses.
@@ -161,7 +163,7 @@ class Isam2:
     def __init__(self, calibration: Calibration, params: Any = None) -> None:
         _check_noise(calibration)
         self._calibration = calibration
-        self._params: Isam2Params = params or Isam2Params()
+        self._params = _settings(params)
         p = self._params
         self._smoother = Smoother(
             p.lag_s, p.relinearize_threshold, p.stale_shift_m, p.waiting_gain, is_bounded=p.history == "bounded"
@@ -344,6 +346,17 @@ class Isam2:
     def refused_rows(self) -> list[RefusedRow]:
         """Rows of IMU, Doppler log and depth that are not used, and why."""
         return self._keyframes.refused
+
+
+def _settings(params: Any) -> Isam2Params:
+    if params is None:
+        return Isam2Params()
+    if not isinstance(params, Isam2Params):
+        raise EstimatorError(
+            f"isam2: params: expected Isam2Params or None, not {type(params).__name__}; of a dict:"
+            " Isam2Params(**params)"
+        )
+    return params
 
 
 def _check_noise(calibration: Calibration) -> None:
