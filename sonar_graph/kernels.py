@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterable
 from pathlib import Path
 from types import FunctionType
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import event
 
+LOG = logging.getLogger(__name__)
+NOTICE = "compiling, once: the first use takes minutes, later ones find the code in __pycache__"
 Compiled = TypeVar("Compiled")
 _sources: set[Path] = set()
 
@@ -41,3 +46,28 @@ def _compiled(function: Compiled, *, forceinline: bool) -> Compiled:
         if index.stat().st_mtime_ns < newest_ns:
             index.unlink(missing_ok=True)
     return cast(Compiled, numba.njit(cache=True, error_model="numpy", forceinline=forceinline)(function))
+
+
+def nothing_is_cached(folders: Iterable[Path]) -> bool:
+    """Whether none of the folders of sources has compiled code of any function."""
+    return not any(any((folder / "__pycache__").glob("*.nbi")) for folder in folders)
+
+
+class _Notice(event.Listener):
+    """Says before the first compilation of a process that it takes long, where nothing is cached yet."""
+
+    def __init__(self) -> None:
+        self._is_first = True
+
+    def on_start(self, event: Any) -> None:
+        source = Path(event.data["dispatcher"].py_func.__code__.co_filename)
+        if self._is_first and source in _sources:
+            self._is_first = False
+            if nothing_is_cached({source.parent for source in _sources}):
+                LOG.warning(NOTICE)
+
+    def on_end(self, event: Any) -> None:
+        """Nothing is to be said then."""
+
+
+event.register("numba:compile", _Notice())  # type: ignore[no-untyped-call]  # numba has no types

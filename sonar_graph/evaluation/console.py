@@ -16,7 +16,6 @@ from sonar_graph.evaluation.results import Comparison, RunResult
 from sonar_graph.evaluation.score_table import LABELS
 from sonar_graph.evaluation.wording import (
     ABSENT,
-    NO_DETECTIONS,
     TOLERATED_FACTOR,
     consistency,
     display_unit,
@@ -25,6 +24,7 @@ from sonar_graph.evaluation.wording import (
     has_detections,
     headline_metric,
     lost_runs,
+    no_detections,
     score_of,
 )
 
@@ -141,7 +141,7 @@ def _notes(comparison: Comparison) -> Text:
     lines += doubt_lines(comparison.sequence.notes)
     lines += _recognition(comparison)
     if not has_detections(comparison):
-        lines.append(NO_DETECTIONS)
+        lines.append(no_detections(comparison))
     metric = headline_metric(comparison)
     if metric is None:
         lines.append("No position errors: the report says why.")

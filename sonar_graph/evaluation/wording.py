@@ -81,6 +81,14 @@ def has_detections(comparison: Comparison) -> bool:
     return bool(comparison.sequence.detections)
 
 
+def no_detections(comparison: Comparison) -> str:
+    """That nothing corrects the drift, in the log or in the part of it that was chosen."""
+    part = comparison.sequence.notes.get("log.part")
+    if not part:
+        return NO_DETECTIONS
+    return f"The part of the log that was chosen ({part}) has no landmark detections; nothing corrects the drift in it."
+
+
 def failed_runs(comparison: Comparison) -> list[RunResult]:
     """Runs that did not come to an end."""
     return [run for run in comparison.runs if run.status == "failed"]
@@ -128,7 +136,7 @@ def finding(comparison: Comparison) -> list[str]:
     """
     sentences = [f"{run.estimator} failed: {run.reason.rstrip('.')}." for run in failed_runs(comparison)]
     if not has_detections(comparison):
-        sentences.append(NO_DETECTIONS)
+        sentences.append(no_detections(comparison))
     sentences += lost_runs(comparison)
     metric = headline_metric(comparison)
     if metric is None:

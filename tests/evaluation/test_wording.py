@@ -143,6 +143,9 @@ def test_finding_says_that_there_were_no_detections(truth):
     assert NO_DETECTIONS not in finding(comparison)
     none = replace(comparison.sequence, detections=None)
     assert finding(replace(comparison, sequence=none))[0] == NO_DETECTIONS
+    part = replace(none, notes={"log.part": "the beginning to 10.000 s"})
+    said = "The part of the log that was chosen (the beginning to 10.000 s) has no landmark detections"
+    assert finding(replace(comparison, sequence=part))[0].startswith(said)
 
 
 @pytest.mark.parametrize(("gated", "is_told"), [(19, False), (21, True)])
