@@ -184,3 +184,40 @@ def test_every_tutorial_is_listed_and_run() -> None:
     for script in TUTORIALS.glob("0*"):
         assert script.name in listed
         assert script.name in run_here
+
+
+def test_page_on_doubtful_identities_has_commands_and_programs_that_show_what_it_says(tmp_path: Path) -> None:
+    pytest.importorskip("dask", reason="needs sonar-graph[bench]")
+    page = (TUTORIALS / "08_doubtful_identities.md").read_text(encoding="utf-8")
+    (suite,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "policies.toml").write_text(suite, encoding="utf-8")
+    printed = {}
+    for words in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE):
+        command = [Path(sys.executable).parent / "sonar-graph", *words.split()]
+        done = subprocess.run(
+            command, cwd=tmp_path, capture_output=True, text=True, timeout=300, env={**os.environ, "COLUMNS": "300"}
+        )
+        assert done.returncode == 0, done.stderr
+        printed[words] = done.stdout
+    assert (
+        "Warning: isam2 puts landmark 4 far outside its covariance (NEES up to " in printed["run basin.mcap -o robust"]
+    )
+    assert "none of 1" in printed["run blind.mcap -o ignored"]
+    associated = printed["run blind.mcap -o found --set isam2.unknown_landmarks=associate"]
+    assert (
+        "isam2 found 4 landmarks without a name (unknown_landmarks); scored by place, as 1, 2, 3 and 4." in associated
+    )
+    compared, asked = (
+        subprocess.run(
+            [sys.executable, "-W", "error", "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True
+        ).stdout
+        for program in re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    )
+    off_m = [number_after(compared, rf"{name} [\d.]+") for name in ("default", "gate", "max-mixture", "gnc")]
+    assert min(off_m[:2]) > 2
+    assert max(off_m[2:]) < 0.1
+    seen = re.findall(r"landmark (\d) at (-?[\d.]+), (-?[\d.]+)", asked)
+    assert len(seen) == 4
+    for landmark, x_m, y_m in seen:
+        assert (float(x_m), float(y_m)) == pytest.approx(TRUE_LANDMARKS[int(landmark)], abs=0.2)
+    assert "withheld: []" in asked
