@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from sonar_graph.detection_rules import ID_ADVICE, no_posterior, too_large
 from sonar_graph.errors import MeasurementError
 
 Floats = NDArray[np.float64]
@@ -50,8 +51,8 @@ class Block:
         object.__setattr__(self, "stamps_ns", _in_nanoseconds(name, np.asarray(self.stamps_ns)))
         n = len(self.stamps_ns)
         for field in fields(self)[1:]:
-            column, kind = field.name, np.int64 if str(field.type) == "Ints" else np.float64
-            values = np.asarray(getattr(self, column), dtype=kind)
+            column, is_whole = field.name, str(field.type) == "Ints"
+            values = _numbers(f"{name}.{column}", np.asarray(getattr(self, column)), is_whole=is_whole)
             row_shape = self.row_shapes.get(column, values.shape[1:])
             if values.shape != (n, *row_shape):
                 raise MeasurementError(f"{name}.{column}: {_wrong_shape(values.shape, n, row_shape)}")
@@ -90,6 +91,16 @@ class Block:
     def concatenate(cls, blocks: Sequence[Self]) -> Self:
         """One block from several, in the order given."""
         return cls(*(np.concatenate([getattr(b, field.name) for b in blocks]) for field in fields(cls)))
+
+
+def _numbers(place: str, values: NDArray[Any], *, is_whole: bool) -> NDArray[Any]:
+    """A column as it is kept; whole numbers in floating point would be cut without a word."""
+    kinds, expected = ("iu", "integers") if is_whole else ("iufb", "numbers")
+    if values.dtype.kind not in kinds and values.size:
+        raise MeasurementError(f"{place}: expected {expected}, not {values.dtype}")
+    if is_whole and values.dtype.kind == "u" and values.size and int(values.max()) > np.iinfo(np.int64).max:
+        raise MeasurementError(f"{place}: expected integers below 2^63, not {values.max()}")
+    return values.astype(np.int64 if is_whole else np.float64, copy=False)
 
 
 def _wrong_shape(shape: tuple[int, ...], n: int, row_shape: tuple[int, ...]) -> str:
@@ -175,6 +186,25 @@ class LandmarkDetections(Block):
         if not len(self.track):
             object.__setattr__(self, "track", np.full(len(self.stamps_ns), NO_TRACK, dtype=np.int64))
         super().__post_init__()
+        self._check_identities()
+
+    def _check_identities(self) -> None:
+        for column in ("candidate_ids", "id_probability"):
+            shape = getattr(self, column).shape
+            if len(shape) != 2 or shape != self.candidate_ids.shape or not shape[1]:
+                raise MeasurementError(
+                    f"LandmarkDetections.{column}: expected shape (n, k), k >= 1 identities of each row with their"
+                    f" probabilities, not {shape}"
+                )
+        self._refuse("candidate_ids", too_large(self.candidate_ids), f"an identity of 2^56 or more; {ID_ADVICE}")
+        refused = "probabilities that are not between 0 and 1, or more than 1 in sum; 97 % is 0.97"
+        self._refuse("id_probability", no_posterior(self.id_probability), refused)
+
+    def _refuse(self, column: str, has_it: NDArray[np.bool_], fault: str) -> None:
+        if has_it.any():
+            row = int(np.argmax(has_it))
+            values = getattr(self, column)[row].tolist()
+            raise MeasurementError(f"LandmarkDetections.{column}: row {row} ({values}) has {fault}")
 
     def frames(self) -> Iterator[LandmarkDetections]:
         """The rows of each sonar frame, that is of each stamp."""
@@ -231,7 +261,13 @@ class SonarFrames:
 
 @dataclass(frozen=True)
 class Measurements:
-    """All that was measured since the previous call, up to and including ``end_ns``."""
+    """All that was measured since the previous call, up to and including ``end_ns``.
+
+    Raises
+    ------
+    MeasurementError
+        When ``end_ns`` is no integer.
+    """
 
     end_ns: int
     """The instant up to which the blocks are complete, and for which an estimate is wanted."""
@@ -239,3 +275,10 @@ class Measurements:
     dvl: Dvl | None = None
     depth: Depth | None = None
     detections: LandmarkDetections | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.end_ns, bool) or not isinstance(self.end_ns, (int, np.integer)):
+            raise MeasurementError(
+                f"Measurements.end_ns: expected an integer, nanoseconds, not {self.end_ns!r}; of seconds:"
+                " round(seconds * 1e9)"
+            )

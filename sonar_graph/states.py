@@ -130,7 +130,7 @@ class Outcome(StrEnum):
     TAKEN_BACK = "taken back: its track is of no known landmark"
     REPEATED = "refused: the frame shows this landmark elsewhere, more probably"
     TRACK_REPEATED = "refused: the frame has another row of its track, of which one object is seen"
-    UNSOUND = "refused: its range is not above zero, or its covariance not positive definite"
+    UNSOUND = "refused: its range is not above 0 and at most 100 km, or its covariance not positive definite"
     WITHHELD = "withheld: with it the estimate could not be determined"
     LATE = "refused: older than what was already processed"
     UNLOCATED = "refused: no odometry covers its stamp"

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from sonar_graph.errors import MeasurementError
-from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections
+from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections, Measurements
 
 
 def depth(stamps_ns: list[int]) -> Depth:
@@ -82,7 +82,7 @@ def test_whole_number_columns_become_floats_and_identities_stay_whole() -> None:
     assert block.candidate_ids.dtype == np.int64
 
 
-@given(arrays.arrays(np.float64, (6, 4), elements=st.floats(0, 1)))
+@given(arrays.arrays(np.float64, (6, 4), elements=st.floats(0, 0.25)))
 def test_most_probable_identity_has_the_largest_posterior(posterior: np.ndarray) -> None:
     ids = np.arange(24).reshape(6, 4)
     block = LandmarkDetections(np.arange(6), np.ones(6), np.zeros(6), np.zeros((6, 2, 2)), ids, posterior)
@@ -149,7 +149,7 @@ def test_columns_of_another_shape_are_refused_by_name(made, message):
 
 
 def test_detections_belong_to_no_track_unless_said() -> None:
-    columns = np.array([1, 1, 1]), np.ones(3), np.zeros(3), np.zeros((3, 2, 2)), np.ones((3, 1)), np.ones((3, 1))
+    columns = np.array([1, 1, 1]), np.ones(3), np.zeros(3), np.zeros((3, 2, 2)), np.ones((3, 1), int), np.ones((3, 1))
     alone, tracked = LandmarkDetections(*columns), LandmarkDetections(*columns, np.array([5, 6, 5]))
     assert alone.track.tolist() == [-1, -1, -1]
     assert LandmarkDetections.concatenate([alone, tracked]).rows(slice(2, 5)).track.tolist() == [-1, 5, 6]
@@ -162,3 +162,53 @@ def test_stamps_that_lie_farther_apart_than_an_integer_holds_are_in_order() -> N
     assert depth(np.array([-far, far])).stamps_ns.tolist() == [-far, far]
     with pytest.raises(MeasurementError, match="run backwards after row 0"):
         depth(np.array([far, -far]))
+
+
+def seen(**columns) -> LandmarkDetections:
+    two = {"stamps_ns": [1, 1], "range_m": [3.0, 4.0], "azimuth_rad": [0.0, 0.1], "range_azimuth_cov": UNSAID}
+    return LandmarkDetections(
+        **(two | {"candidate_ids": [[1, 2], [1, 2]], "id_probability": [[0.9, 0.1]] * 2} | columns)
+    )
+
+
+UNSAID = np.full((2, 2, 2), np.nan)
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        ({"candidate_ids": [[1.0, 2.0]] * 2}, r"candidate_ids: expected integers, not float64"),
+        ({"candidate_ids": [["a", "b"]] * 2}, r"candidate_ids: expected integers, not <U1"),
+        ({"range_m": ["near", "far"]}, r"range_m: expected numbers, not <U4"),
+        ({"track": [0.5, 1.5]}, r"track: expected integers, not float64"),
+        ({"candidate_ids": [1, 2]}, r"candidate_ids: expected shape \(n, k\).*not \(2,\)"),
+        ({"id_probability": [[0.9]] * 2}, r"id_probability: expected shape \(n, k\).*not \(2, 1\)"),
+        ({"candidate_ids": np.empty((2, 0)), "id_probability": np.empty((2, 0))}, r"candidate_ids: expected shape"),
+        ({"candidate_ids": [[1, 2], [1, 2**56]]}, r"candidate_ids: row 1 .* has an identity of 2\^56 or more; number"),
+        ({"candidate_ids": np.array([[1, 2], [1, 2**63]], np.uint64)}, r"candidate_ids: expected integers below 2\^63"),
+        ({"id_probability": [[0.9, 0.1], [97.0, 1.0]]}, r"id_probability: row 1 .* has probabilities .* 97 % is 0\.97"),
+        ({"id_probability": [[0.9, 0.2], [0.9, 0.1]]}, r"id_probability: row 0 .* more than 1 in sum"),
+        ({"id_probability": [[0.9, -0.1], [0.9, 0.1]]}, r"id_probability: row 0 .* not between 0 and 1"),
+        ({"id_probability": [[np.nan, 0.1], [0.9, 0.1]]}, r"id_probability: row 0"),
+    ],
+)
+def test_detections_that_cannot_be_are_named_in_one_line(columns: dict, said: str) -> None:
+    assert len(seen()) == 2
+    with pytest.raises(MeasurementError, match=rf"^LandmarkDetections\.{said}") as caught:
+        seen(**columns)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_largest_identity_and_rounding_of_single_precision_pass() -> None:
+    single = np.array([[0.9, 0.1], [0.7, 0.3]], np.float32)
+    assert seen(candidate_ids=[[1, 2**56 - 1]] * 2, id_probability=single * np.float32(1 + 1e-7)).track.tolist() == [
+        -1,
+        -1,
+    ]
+
+
+@pytest.mark.parametrize("end", [1.5, 2.0, "3", None, True])
+def test_an_end_is_an_integer(end: object) -> None:
+    with pytest.raises(MeasurementError, match=r"^Measurements\.end_ns: expected an integer, nanoseconds"):
+        Measurements(end)  # type: ignore[arg-type]
+    assert Measurements(np.int64(3)).end_ns == 3  # type: ignore[arg-type]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import cached_property
 from typing import TypeVar
 
 from sonar_graph.calibration import Calibration, Mounting
@@ -18,6 +19,7 @@ from sonar_graph.logs.adapters.vertical import DepthAdapter
 from sonar_graph.logs.calibration_sources import PartialCalibration, gathered, mounted_by
 from sonar_graph.logs.container import Recording, Topic
 from sonar_graph.logs.decoding import read_detections, read_landmark_map
+from sonar_graph.logs.detection_faults import detection_warnings
 from sonar_graph.logs.gaps import gap_warnings
 from sonar_graph.logs.log_record import read_calibration, read_notes, recorded_name
 from sonar_graph.logs.mountings import mounting_of, static_frames
@@ -141,6 +143,10 @@ class Assembly:
 
     def detections(self) -> LandmarkDetections | None:
         """The landmark detections; None where no topic or no row is fit."""
+        return self._detections
+
+    @cached_property
+    def _detections(self) -> LandmarkDetections | None:
         if "detections" not in self._topics:
             return None
         adapter, topic = self._adapters["detections"], self._topics["detections"]
@@ -170,6 +176,14 @@ class Assembly:
         if "dvl" in self._tables and not self._is_mounting_known:
             text = axes_warning(self._adapters["dvl"])
             yield from [f"dvl: {text}"] if text else []
+
+        yield from (f"detections: {text}" for text in self._detection_warnings())
+
+    def _detection_warnings(self) -> Iterator[str]:
+        odometry = [self._tables[role].stamps_ns for role in ("imu", "dvl") if role in self._tables]
+        if (seen := self.detections()) is not None and len(odometry) == 2:
+            first_ns, last_ns = max(stamps.min() for stamps in odometry), min(stamps.max() for stamps in odometry)
+            yield from detection_warnings(seen, int(first_ns), int(last_ns))
 
     def _inertial_warnings(self, imu: Imu) -> Iterator[str]:
         text = gravity_warning(imu.specific_force, self.calibration.imu.mounting, self.calibration.gravity_m_s2)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from sonar_graph.detection_rules import no_posterior
 from sonar_graph.errors import LogError
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.container import Topic
+from sonar_graph.logs.detection_faults import NO_POSTERIOR, refuse_large_ids
 from sonar_graph.logs.table import NOT_FINITE, Dropped, fit_rows, header_stamps_ns, not_finite
 from sonar_graph.measurements import NO_TRACK, Ints, LandmarkDetections
 from sonar_graph.states import LandmarkMap
@@ -30,7 +32,8 @@ def read_detections(topic: Topic) -> tuple[LandmarkDetections | None, Dropped]:
     ids = np.concatenate([_widen(p[5], places, -1) for p in parts])
     probabilities = np.concatenate([_widen(p[6], places, 0) for p in parts])
     tracks = np.concatenate([p[7] for p in parts])
-    faults = {NOT_FINITE: not_finite(ranges, azimuths, probabilities)}
+    refuse_large_ids(topic, order, ids)
+    faults = {NOT_FINITE: not_finite(ranges, azimuths, probabilities), NO_POSTERIOR: no_posterior(probabilities)}
     first = np.argsort(order, kind="stable")
     rows, dropped = fit_rows(stamps[first], {k: v[first] for k, v in faults.items()}, unique=False)
     columns = (stamps, ranges, azimuths, covariances, ids, probabilities, tracks)

@@ -17,6 +17,7 @@ import numpy as np
 from gtsam.symbol_shorthand import L
 from numpy.typing import NDArray
 
+from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.slam.association import DetectionJournal
 from sonar_graph.slam.joint_compatibility import UNPAIRED, Innovations, believed, pair_jointly
@@ -58,6 +59,23 @@ class AnonymousPolicy:
 def unnamed(frame: LandmarkDetections) -> NDArray[np.bool_]:
     """Which rows name no landmark at all, neither one nor several in doubt, shape (n,)."""
     return np.asarray((frame.candidate_ids < 0).all(axis=1))
+
+
+def refuse_taken_ids(frame: LandmarkDetections) -> None:
+    """Refuse names that are those of landmarks without names.
+
+    Raises
+    ------
+    EstimatorError
+        Naming the identity.
+    """
+    largest = int(frame.candidate_ids.max())
+    if largest >= FIRST_ANONYMOUS_ID:
+        raise EstimatorError(
+            f"isam2: a detection at {frame.stamps_ns[0]} ns has identity {largest}; with unknown_landmarks ="
+            f' "associate" those from {FIRST_ANONYMOUS_ID} on are of landmarks without names: number the landmarks'
+            ' below that, or give it unknown_landmarks = "ignore"'
+        )
 
 
 @dataclass(eq=False)

@@ -33,7 +33,7 @@ def best_of_tracks(frame: LandmarkDetections, identity_of: Callable[[int], int])
     best: dict[int, tuple[float, float, int]] = {}
     for row, track in enumerate(frame.track.tolist()):
         if track != NO_TRACK:
-            posterior = np.nan_to_num(frame.id_probability[row])
+            posterior = frame.id_probability[row]
             of_track = frame.candidate_ids[row] == identity_of(track)
             score = float(posterior[of_track].sum()), float(posterior.max(initial=0.0)), -row
             best[track] = max(best.get(track, score), score)

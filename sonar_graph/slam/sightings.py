@@ -12,7 +12,7 @@ from gtsam.symbol_shorthand import L
 from sonar_graph.calibration import Calibration, FloorPrior
 from sonar_graph.measurements import NO_TRACK, Floats, LandmarkDetections
 from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
-from sonar_graph.slam.anonymous_landmarks import AnonymousLandmarks, AnonymousPolicy, unnamed
+from sonar_graph.slam.anonymous_landmarks import AnonymousLandmarks, AnonymousPolicy, refuse_taken_ids, unnamed
 from sonar_graph.slam.association import DetectionJournal, Identities, gate_threshold, identify
 from sonar_graph.slam.deferred_identities import DeferredIdentities
 from sonar_graph.slam.doubtful_identities import DoubtfulIdentities
@@ -113,6 +113,8 @@ class Sightings:
 
     def add(self, frame: LandmarkDetections) -> None:
         """Take in the detections of one frame."""
+        if self._anonymous is not None:
+            refuse_taken_ids(frame)
         sound = without_unsound(frame, self.journal)
         if sound is not None:
             self._add(sound)

@@ -1,4 +1,4 @@
-"""Rows that can be measurements at all: variances above zero, covariances positive definite, ranges above zero.
+"""Rows that can be measurements at all: variances above zero, covariances positive definite, ranges that can be.
 
 A block of measurements checks shapes, order and that numbers are finite (`sonar_graph.measurements`). What is checked
 here depends on what a number means. NaN is sound: it says that the log does not know, and the calibration does.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sonar_graph.detection_rules import possible_ranges
 from sonar_graph.measurements import Depth, Dvl, Floats, LandmarkDetections
 from sonar_graph.navigation.kernels import compiled
 from sonar_graph.navigation.velocity_covariances import in_numbers
@@ -24,7 +25,7 @@ Flags = NDArray[np.bool_]
 def sound_detections(frame: LandmarkDetections) -> Flags:
     """Shape (n,)."""
     unsaid = np.asarray(np.isnan(frame.range_azimuth_cov).any(axis=(1, 2)))
-    return (frame.range_m > 0) & (unsaid | positive_definite(frame.range_azimuth_cov))
+    return possible_ranges(frame.range_m) & (unsaid | positive_definite(frame.range_azimuth_cov))
 
 
 def without_unsound(frame: LandmarkDetections, journal: DetectionJournal) -> LandmarkDetections | None:

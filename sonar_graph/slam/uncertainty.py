@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import gtsam
+import numpy as np
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.errors import EstimatorError
@@ -47,6 +48,11 @@ def joint_covariance(
     at_ns
         Stamps of those that are asked for beside ``keyframes``.
     """
+    if over not in get_args(Over):
+        raise EstimatorError(f'isam2: over is {over!r}; expected "window" or "history"')
+    keyframes, at_ns, landmarks = (
+        _numbers(*asked) for asked in (("keyframes", keyframes), ("stamps_ns", at_ns), ("landmarks", landmarks))
+    )
     poses = [*keyframes, *(_number_at(stamp_ns, stamps_ns) for stamp_ns in at_ns)]
     for number in poses:
         if not 0 <= number < len(stamps_ns):
@@ -66,6 +72,13 @@ def joint_covariance(
     if over == "window":
         return JointCovariance.of(smoother.marginals, sorted(keys))
     return JointCovariance.of(history().marginals, sorted(keys))
+
+
+def _numbers(field: str, asked: object) -> list[int]:
+    found = np.asarray(list(asked) if isinstance(asked, Iterable) else asked)
+    if found.ndim != 1 or (found.size and found.dtype.kind not in "iu"):
+        raise EstimatorError(f"isam2: {field}: expected a list of integers, such as [1, 2], not {asked!r}")
+    return [int(number) for number in found.tolist()]
 
 
 def _number_at(stamp_ns: int, stamps_ns: Sequence[int]) -> int:

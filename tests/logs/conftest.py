@@ -72,7 +72,7 @@ class Bench:
         count = len(ranges)
         message = {"header": header(ns, "sonar_link"), "range_m": ranges, "azimuth_rad": [0.1] * count}
         message |= {"covariance": [0.01, 0, 0, 0.02] * count, "candidate_ids": ids}
-        return message | {"id_probability": [0.5] * len(ids), "track": list(track)}
+        return message | {"id_probability": [min(0.5, len(ranges) / max(len(ids), 1))] * len(ids), "track": list(track)}
 
     def transform(self, parent: str, child: str, xyz: tuple[float, ...], yaw_rad: float = 0.0) -> dict[str, Any]:
         rotation = {**vector(0, 0, np.sin(yaw_rad / 2)), "w": np.cos(yaw_rad / 2)}
@@ -150,7 +150,7 @@ def sequence_with(seed: int = 0, samples: int = 20, candidates: int = 2) -> Sequ
             rng.normal(size=samples),
             rng.normal(size=(samples, 2, 2)),
             rng.integers(-1, 9, (samples, candidates)),
-            rng.uniform(0, 1, (samples, candidates)),
+            rng.uniform(0, 1 / candidates, (samples, candidates)),
             np.arange(samples) % 4 - 1 + 10**12 * (np.arange(samples) % 2),
         ),
         truth=Trajectory.without_covariances(stamps, rng.normal(size=(samples, 3)), quaternions),

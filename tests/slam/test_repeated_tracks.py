@@ -101,11 +101,6 @@ def test_of_a_track_that_counts_as_nothing_the_most_probable_row_stays_and_of_eq
     assert best_of_tracks(rows, of_no_landmark).tolist() == [False, True, False, True, True]
 
 
-def test_a_posterior_that_is_no_number_is_never_the_best():
-    rows = frame([3, 3], [[np.nan] * 4, FLAT])
-    assert best_of_tracks(rows, of_no_landmark).tolist() == [False, True]
-
-
 def test_where_tracks_are_not_used_all_rows_are():
     sequence = said([0] * ROWS, [SURE[4] if i == 0 else SURE[7] for i in first_of_frame()])
     outcomes = assert_outcomes_account(run(sequence, 1 / STEP_S, deferred_identity=False), sequence)

@@ -14,11 +14,13 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from sonar_graph.detection_rules import FIRST_TOO_LARGE_ID
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters.adapter import Adapter
 from sonar_graph.logs.adapters.axes import turn, turn_covariances
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.container import Topic
+from sonar_graph.logs.detection_faults import refuse_large_ids
 from sonar_graph.logs.table import NOT_FINITE, Dropped, fit_rows, header_stamps_ns, not_finite
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections
 
@@ -56,6 +58,7 @@ class DetectionArrayAdapter(Adapter):
         columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
         message, stamps_ns, positions, covariances, ids, scores = columns
         _check_posterior(topic, scores)
+        refuse_large_ids(topic, message, ids)
         ranges, azimuths, spread = range_and_azimuth(
             turn(self.rotation, positions), turn_covariances(self.rotation, covariances)
         )
@@ -115,7 +118,7 @@ class DetectionArrayAdapter(Adapter):
         if name in self.ids:
             return self.ids[name]
         try:
-            return int(name)
+            return min(int(name), FIRST_TOO_LARGE_ID)
         except ValueError:
             raise LogError(
                 f"{topic.file}: topic {topic.name}: class {name!r} is no integer identity; say in a log "
