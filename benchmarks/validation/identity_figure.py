@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from identity_runs import ESTIMATORS, Case
+import numpy as np
+from identity_runs import Case
 from matplotlib.axes import Axes
 
 from sonar_graph.evaluation.figure_style import (
@@ -31,11 +32,13 @@ DRAWN = {
     "EKF-SLAM": (0, "-"),
     "invariant EKF": (4, "-"),
     "iSAM2, gate": (1, (0, (5, 1.6))),
+    "iSAM2, robust": (5, (0, (1.2, 1.2))),
     "iSAM2, deferred": (2, "-"),
     "iSAM2, max-mixture": (3, "-"),
-    "iSAM2, gnc": (5, (0, (1.2, 1.2))),
 }
-"""Estimators beside dead reckoning: colour and line."""
+"""Estimators beside dead reckoning: colour and line. Graduated non-convexity lies on the max-mixture here."""
+ASIDE_PERCENT = 0.3
+"""By which points of estimators stand apart, so that each interval is seen."""
 
 
 def draw(figures: Figures, path: Path) -> None:
@@ -63,13 +66,15 @@ def _is_of(case: Case, kind: Case) -> bool:
 
 def _panel(panel: Axes, cases: dict[float, dict[str, dict[str, float]]], error: str) -> None:
     """Mean and standard error at each rate; where a run has no figure there is no mean, and no point."""
-    assert set(DRAWN) < set(ESTIMATORS)
-    percent = [100 * rate for rate in cases]
+    percent = 100 * np.array(list(cases))
     if error != "landmarks":
         means = [told["dead reckoning"][f"{error}_m"] for told in cases.values()]
         panel.plot(percent, means, color=MUTED, linewidth=1.0, label="dead reckoning")
-    for name, (index, line) in DRAWN.items():
+        panel.set_ylim(bottom=0.0)
+    else:
+        logarithmic(panel, "y")
+    for place, (name, (index, line)) in enumerate(DRAWN.items()):
         means, errors = ([told[name][f"{error}{of}_m"] for told in cases.values()] for of in ("", "_error"))
-        own = colour(index)
-        panel.errorbar(percent, means, errors, color=own, linestyle=line, linewidth=1.4, capsize=2, label=name)
-    logarithmic(panel, "y")
+        x = percent + ASIDE_PERCENT * (place - 0.5 * (len(DRAWN) - 1))
+        panel.errorbar(x, means, errors, color=colour(index), linestyle=line, linewidth=1.4, capsize=2, label=name)
+    panel.set_xticks(percent)
