@@ -75,7 +75,12 @@ def _sequence(stamps: Ints, truth: Trajectory | None, planar: bool) -> Sequence:
         imu=Imu(ends, np.zeros((2, 3)), np.zeros((2, 3))),
         dvl=Dvl(ends, np.zeros((2, 3)), np.zeros((2, 3, 3))),
         detections=LandmarkDetections(
-            stamps, np.ones(n), np.zeros(n), np.full((n, 2, 2), np.nan), np.ones((n, 1)), np.ones((n, 1))
+            stamps,
+            np.ones(n),
+            np.zeros(n),
+            np.full((n, 2, 2), np.nan),
+            np.ones((n, 1), dtype=np.int64),
+            np.ones((n, 1)),
         ),
         truth=truth,
         true_landmarks=LandmarkMap(IDS, LANDMARKS, np.full((4, 3, 3), np.nan)) if truth else None,
