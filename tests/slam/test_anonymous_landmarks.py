@@ -190,7 +190,8 @@ def test_two_that_one_frame_shows_are_never_merged():
     ids = doubled.candidate_ids[:, :1].copy()
     ids[::2, 0] = doubled.most_probable()[0][::2]
     ids[1::2, 0] = -1
-    doubled = replace(doubled, candidate_ids=ids, id_probability=(ids >= 0).astype(float))
+    tracks = np.where((doubled.track >= 0) & (np.arange(len(doubled)) % 2 == 1), doubled.track + 1000, doubled.track)
+    doubled = replace(doubled, candidate_ids=ids, id_probability=(ids >= 0).astype(float), track=tracks)
     estimator = run(replace(sequence, detections=doubled), **ASSOCIATED)
     assert estimator.landmarks().ids.tolist() == [1, 2, 3, 4, *(FIRST_ANONYMOUS_ID + k for k in range(4))]
 
