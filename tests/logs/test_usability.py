@@ -48,7 +48,7 @@ def test_rows_that_do_not_say_their_noise_are_counted() -> None:
     cov = np.tile(1e-4 * np.eye(3), (5, 1, 1))
     depth = Depth(stamps(0), np.zeros(5), np.full(5, 1e-4))
     detections = LandmarkDetections(
-        stamps(0), np.ones(5), np.zeros(5), np.tile(np.eye(2), (5, 1, 1)), np.ones((5, 1)), np.ones((5, 1))
+        stamps(0), np.ones(5), np.zeros(5), np.tile(np.eye(2), (5, 1, 1)), np.ones((5, 1), dtype=int), np.ones((5, 1))
     )
     assert list(unsaid_noise(dvl(0, cov), depth, detections)) == []
     cov[1:3, 2, 2] = np.nan
