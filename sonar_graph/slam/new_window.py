@@ -36,6 +36,21 @@ def marginal(
     return [gtsam.LinearContainerFactor(found.at(i), values) for i in range(found.size())]
 
 
+def joined_with_marginal(
+    inside: gtsam.NonlinearFactorGraph,
+    outside: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    kept: Container[int],
+    *,
+    is_by_qr: bool,
+) -> gtsam.NonlinearFactorGraph:
+    """A graph, with what another says about the kept variables."""
+    graph = gtsam.NonlinearFactorGraph(inside)
+    for factor in marginal(outside, values, kept, is_by_qr=is_by_qr):
+        graph.push_back(factor)
+    return graph
+
+
 def copy(source: gtsam.Values, key: int, target: gtsam.Values) -> None:
     """One variable, a pose or a point, from some values to others."""
     if gtsam.symbolChr(key) == ord("x"):

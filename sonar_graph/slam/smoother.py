@@ -40,7 +40,7 @@ from sonar_graph.slam.determinacy import variable_name
 from sonar_graph.slam.exchange import Exchange
 from sonar_graph.slam.history import History, Recent, rest_of
 from sonar_graph.slam.joint_covariance import JointCovariance
-from sonar_graph.slam.new_window import copy, joined, keys_of, marginal, picked, split, without
+from sonar_graph.slam.new_window import copy, joined, keys_of, picked, split, without
 from sonar_graph.slam.pending import Pending
 from sonar_graph.slam.sightlines import Sightlines, solve_in_sight
 from sonar_graph.slam.window import Window
@@ -368,37 +368,11 @@ class Smoother:
         values = gtsam.Values()
         for key in times:
             copy(self.values, key, values)
-        self._begin_after(outside, inside, values, times)
-        self._take(self._window.isam.calculateEstimate())
-
-    def _begin_after(
-        self,
-        outside: gtsam.NonlinearFactorGraph,
-        inside: gtsam.NonlinearFactorGraph,
-        values: gtsam.Values,
-        times: dict[Any, float],
-    ) -> None:
-        """A window after what lies outside, whose marginal Cholesky makes while it is able to, then QR."""
         try:
-            self._try_to_begin(outside, inside, values, times)
-        except RuntimeError:
-            self._window.is_by_qr = True  # a marginal by Cholesky may also have lost what is weak without a word
-            try:
-                self._try_to_begin(outside, inside, values, times)
-            except RuntimeError as error:
-                raise EstimatorError(f"isam2: {reasons(self.graph, self.values, self._expiring)}") from error
-
-    def _try_to_begin(
-        self,
-        outside: gtsam.NonlinearFactorGraph,
-        inside: gtsam.NonlinearFactorGraph,
-        values: gtsam.Values,
-        times: dict[Any, float],
-    ) -> None:
-        graph = gtsam.NonlinearFactorGraph(inside)
-        for factor in marginal(outside, self.values, times, is_by_qr=self._window.is_by_qr):
-            graph.push_back(factor)
-        self._window.begin(graph, values, times)
+            self._window.begin_after(outside, self.values, inside, values, times)
+        except RuntimeError as error:
+            raise EstimatorError(f"isam2: {reasons(self.graph, self.values, self._expiring)}") from error
+        self._take(self._window.isam.calculateEstimate())
 
     def _begin_window(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times: dict[Any, float]) -> None:
         try:

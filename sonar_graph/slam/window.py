@@ -8,6 +8,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from sonar_graph.slam.new_window import joined_with_marginal
+
 MOST_SETTLING_UPDATES = 10
 """Further updates after an exchange, each a Gauss-Newton step: what is exchanged may move the estimate far."""
 
@@ -56,6 +58,35 @@ class Window:
                 raise
             self.is_by_qr = True
             self.begin(graph, values, times_s)
+
+    def begin_after(
+        self,
+        outside: gtsam.NonlinearFactorGraph,
+        solved: gtsam.Values,
+        inside: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        times_s: Mapping[Any, float],
+    ) -> None:
+        """Anew, with the marginal of what lies outside: by Cholesky while that is able to, then by QR.
+
+        Parameters
+        ----------
+        solved
+            Values of all variables, at which the marginal is linearised.
+
+        Raises
+        ------
+        RuntimeError
+            When even QR finds no solution.
+        """
+        was_by_qr = self.is_by_qr
+        try:
+            self.begin(joined_with_marginal(inside, outside, solved, times_s, is_by_qr=was_by_qr), values, times_s)
+        except RuntimeError:
+            if was_by_qr:
+                raise
+            self.is_by_qr = True  # a marginal by Cholesky may also have lost what is weak without a word
+            self.begin(joined_with_marginal(inside, outside, solved, times_s, is_by_qr=True), values, times_s)
 
     def update(
         self,

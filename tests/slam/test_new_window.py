@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
 
-import sonar_graph.slam.smoother as smoother_module
+import sonar_graph.slam.new_window as new_window_module
 from sonar_graph.errors import EstimatorError
 from sonar_graph.slam.exchange import Exchange
 from sonar_graph.slam.new_window import marginal
@@ -75,7 +75,7 @@ def test_where_cholesky_gives_up_on_the_marginal_qr_makes_it(monkeypatch: pytest
             raise RuntimeError("Indeterminate linear system")
         return marginal(*arguments, is_by_qr=True)
 
-    monkeypatch.setattr(smoother_module, "marginal", giving_up)
+    monkeypatch.setattr(new_window_module, "marginal", giving_up)
     smoother = begun_anew(0.1)
     assert ways == [False, True]
     assert smoother.covariance(X(2)) == pytest.approx((PRIOR_M**2 + 0.1**2 + WEAK_M**2) * np.eye(6), rel=1e-6)
@@ -86,6 +86,6 @@ def test_where_qr_gives_up_too_the_error_is_the_estimators(monkeypatch: pytest.M
     def giving_up(*_, **__):
         raise RuntimeError("Indeterminate linear system")
 
-    monkeypatch.setattr(smoother_module, "marginal", giving_up)
+    monkeypatch.setattr(new_window_module, "marginal", giving_up)
     with pytest.raises(EstimatorError, match=r"^isam2: the graph is determined too weakly"):
         begun_anew(0.1)
