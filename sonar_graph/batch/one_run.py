@@ -7,7 +7,7 @@ import logging
 import math
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from sonar_graph.batch.plan import versions_of
+from sonar_graph.batch.plan import sources_now, versions_of
 from sonar_graph.batch.planned import PlannedRun, Row
 from sonar_graph.batch.sources import read_source
-from sonar_graph.errors import BatchError
+from sonar_graph.errors import BatchError, EstimatorError
+from sonar_graph.estimator import load_estimator
 from sonar_graph.evaluation.comparison import judge
 from sonar_graph.evaluation.environment import LIBRARIES, describe_environment
 from sonar_graph.evaluation.results import Comparison, ErrorSeries, RunResult
@@ -59,11 +60,19 @@ def perform(run: PlannedRun, folder: Path) -> Row:
     Raises
     ------
     BatchError
-        When this process has other versions or another source than those that the run was planned with.
+        When this process has other versions or another source than those that the run was planned with, before the
+        estimator is loaded or after the run.
     OSError
         When the folder cannot be written: that is no result.
     """
     _check_versions(run)
+    _load(run.estimator)
+    row = _performed(run, folder)
+    _check_source_now(run)
+    return row
+
+
+def _performed(run: PlannedRun, folder: Path) -> Row:
     clock, cpu_s = Clock(), time.process_time()
     try:
         comparison = _compared(run, clock)
@@ -81,6 +90,22 @@ def _check_versions(run: PlannedRun) -> None:
         raise BatchError(
             f"a worker has {_told(here, differing)}, planned with {_told(run.versions, differing)}; "
             "install the same everywhere and start the workers anew"
+        )
+
+
+def _load(estimator: str) -> None:
+    """Import it between the two looks at its source; one that cannot be loaded fails later, with the reason."""
+    with suppress(EstimatorError):
+        load_estimator(estimator)
+
+
+def _check_source_now(run: PlannedRun) -> None:
+    """Modules may be imported as late as during the run: what they were is known only if nothing changed."""
+    now = sources_now(run.estimator)
+    if differing := [name for name in sorted(now) if now[name] != run.versions.get(name)]:
+        raise BatchError(
+            f"the code changed during a run: {_told(now, differing)}, planned with {_told(run.versions, differing)}; "
+            "leave it alone while a batch runs, and start the workers anew"
         )
 
 

@@ -3,15 +3,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from sonar_graph.batch import one_run
 from sonar_graph.batch.one_run import perform
 from sonar_graph.batch.planned import PlannedRun
 from sonar_graph.batch.results import COLUMNS, is_timing
 from sonar_graph.batch.suite import METRICS
 from sonar_graph.errors import BatchError
+from sonar_graph.estimator import load_estimator
 from sonar_graph.evaluation.comparison import compare
 from sonar_graph.evaluation.storage import read_comparison
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
@@ -79,6 +82,40 @@ def test_other_versions_than_planned_are_no_result(planned: Planned, tmp_path: P
         perform(replace(run, versions=run.versions | {"gtsam": "4.2"}), tmp_path / "run")
     with pytest.raises(BatchError, match=r"a worker has source \w+, planned with source changed; "):
         perform(replace(run, versions=run.versions | {"source": "changed"}), tmp_path / "run")
+
+
+def test_estimator_that_changes_during_a_run_gives_no_result(
+    planned: Planned, misbehaving: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its package imports a module that is changed after the first look at the source, and before the import."""
+    module = tmp_path / "site" / "misbehaving.py"
+    run = planned("prints")
+    assert perform(run, tmp_path / "before")["status"] == "failed"
+
+    def changed_and_loaded(name: str) -> object:
+        with module.open("a") as file:
+            file.write("GAIN = 2\n")
+        return load_estimator(name)
+
+    monkeypatch.setattr(one_run, "load_estimator", changed_and_loaded)
+    with pytest.raises(BatchError, match=r"the code changed during a run: estimator_source \w+, planned with "):
+        perform(run, tmp_path / "after")
+
+
+def test_estimator_is_loaded_between_two_looks_at_its_source(
+    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, order = planned(), []
+    for name in ("_check_versions", "load_estimator", "run_estimator", "_check_source_now"):
+        real = getattr(one_run, name)
+
+        def noted(*given: Any, name: str = name, real: Any = real, **named: Any) -> Any:
+            order.append(name)
+            return real(*given, **named)
+
+        monkeypatch.setattr(one_run, name, noted)
+    perform(run, tmp_path / "run")
+    assert order == ["_check_versions", "load_estimator", "run_estimator", "_check_source_now"]
 
 
 def test_folder_that_cannot_be_written_is_no_result(planned: Planned, tmp_path: Path) -> None:
