@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import platform
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -17,7 +18,7 @@ import numpy as np
 
 from sonar_graph.batch.plan import sources_now, versions_of
 from sonar_graph.batch.planned import PlannedRun, Row
-from sonar_graph.batch.sources import read_source
+from sonar_graph.batch.sources import fingerprint, read_source
 from sonar_graph.errors import BatchError, EstimatorError
 from sonar_graph.estimator import load_estimator
 from sonar_graph.evaluation.comparison import judge
@@ -61,7 +62,7 @@ def perform(run: PlannedRun, folder: Path) -> Row:
     ------
     BatchError
         When this process has other versions or another source than those that the run was planned with, before the
-        estimator is loaded or after the run.
+        estimator is loaded or after the run, or its files have another content.
     OSError
         When the folder cannot be written: that is no result.
     """
@@ -76,6 +77,8 @@ def _performed(run: PlannedRun, folder: Path) -> Row:
     clock, cpu_s = Clock(), time.process_time()
     try:
         comparison = _compared(run, clock)
+    except BatchError:
+        raise
     except Exception as error:  # a log or a simulator may fail in any way, and the other runs still go on
         LOG.exception("run %s", run.key)
         stage = "while judging" if "estimate_s" in clock.seconds else "while reading or simulating the log"
@@ -112,7 +115,7 @@ def _check_source_now(run: PlannedRun) -> None:
 def _compared(run: PlannedRun, clock: Clock) -> Comparison:
     """The run as a comparison of one."""
     with clock.on("read_s"):
-        sequence = _sequence(run.kind, _as_text(run.options), run.seed, _as_text(run.landmarks))
+        sequence = _sequence(run.kind, _as_text(run.options), _as_text(run.content), run.seed, _as_text(run.landmarks))
         instants_ns = sequence.instants(run.rate_hz)
     with clock.on("estimate_s"):
         result = run_estimator(sequence, run.estimator, run.overrides, instants_ns=instants_ns)
@@ -122,11 +125,27 @@ def _compared(run: PlannedRun, clock: Clock) -> Comparison:
 
 
 @lru_cache(KEPT_SEQUENCES)
-def _sequence(kind: str, options: str, seed: int | None, landmarks: str) -> Sequence:
-    """The same object for the same arguments: estimators cannot change it."""
-    sequence = read_source(kind, json.loads(options), seed)
+def _sequence(kind: str, options: str, content: str, seed: int | None, landmarks: str) -> Sequence:
+    """The same object for the same arguments: estimators cannot change it.
+
+    Raises
+    ------
+    BatchError
+        When files are not, before or after they were read, what they were when the run was planned.
+    """
+    values = json.loads(options)
+    _check_content(kind, values, content)
+    sequence = read_source(kind, values, seed)
+    _check_content(kind, values, content)
     placed = json.loads(landmarks)
     return sequence if placed is None else add_landmarks(sequence, LandmarkOptions(**(placed | {"seed": seed})))
+
+
+def _check_content(kind: str, options: dict[str, Any], content: str) -> None:
+    here, planned = fingerprint(kind, options), json.loads(content)
+    if differing := [name for name in sorted(here | planned) if here.get(name) != planned.get(name)]:
+        names = ", ".join(f"{name} {options.get(name, '')}".rstrip() for name in differing)
+        raise BatchError(f"{platform.node()}: {names}: not what it was when the run was planned; start the batch anew")
 
 
 def measured(comparison: Comparison) -> Row:

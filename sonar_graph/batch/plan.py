@@ -216,6 +216,7 @@ def _planned(file: SuiteFile, source: _Source, seed: int | None, contestant: _Co
         log=source.name,
         kind=source.entry.kind,
         options=source.options,
+        content=source.content,
         landmarks=source.entry.landmarks,
         seed=seed,
         estimator=contestant.name,

@@ -23,6 +23,8 @@ class PlannedRun:
     kind: str
     """Generator, data set, or ``mcap``."""
     options: dict[str, Any]
+    content: dict[str, Any]
+    """`sonar_graph.batch.sources.fingerprint` of kind and options when the run was planned."""
     landmarks: dict[str, Any] | None
     seed: int | None
     estimator: str

@@ -63,6 +63,15 @@ def test_key_changes_with_the_version(write_suite: WriteSuite, monkeypatch: pyte
     assert key(write_suite) != before
 
 
+def test_key_changes_with_landmarks_on_a_log(write_suite: WriteSuite) -> None:
+    log = '[[logs]]\nname = "park"\ndataset = "victoria-park"\n'
+    placed = [
+        key(write_suite, HEADER, log, f"landmarks = {{ {text} }}\n", DEAD_RECKONING)
+        for text in ("", "frame_rate_hz = 3")
+    ]
+    assert len({key(write_suite, HEADER, log, DEAD_RECKONING), *placed}) == 3
+
+
 def test_key_does_not_change_with_names_or_with_defaults_written_out(write_suite: WriteSuite) -> None:
     same = key(
         write_suite,
@@ -83,6 +92,13 @@ def test_of_a_log_the_content_counts_and_not_the_place(tmp_path: Path) -> None:
     first, moved, changed = (fingerprint(LOG, {"log": str(path)}) for path in paths)
     assert first == moved
     assert first != changed
+    paths[0].write_bytes(b"lob")
+    assert fingerprint(LOG, {"log": str(paths[0])}) == changed
+
+
+def test_run_has_the_content_that_its_key_is_made_of(write_suite: WriteSuite) -> None:
+    (run,) = planned(write_suite)
+    assert run.content == fingerprint(run.kind, run.options)
 
 
 def test_estimator_that_cannot_be_loaded_is_planned(write_suite: WriteSuite, misbehaving: None) -> None:
