@@ -23,6 +23,7 @@ from typing import Any, BinaryIO
 import psutil
 
 from sonar_graph.batch.planned import Limits, Outcome, PlannedRun, Row
+from sonar_graph.batch.runner import READY
 from sonar_graph.errors import BatchError
 from sonar_graph.evaluation.environment import describe_environment
 
@@ -113,11 +114,19 @@ class Runner:
         collector_arguments = (self._process.stdout, self._answers)
         self._collector = threading.Thread(target=_collect, args=collector_arguments, daemon=True)
         self._collector.start()
+        self._await_readiness()
+
+    def _await_readiness(self) -> None:
+        """Return when the process has loaded everything; one that does not come so far is ended."""
         try:
-            self._wait(Limits(START_S))
+            answer = self._wait(Limits(START_S))
+            reason = "" if answer == READY else f"it was not ready after {START_S:g} s"
         except KilledError as error:
-            raise BatchError(f"no process for runs on {platform.node()}: {error}; {self.log()[-2000:]}") from error
-        self._is_busy = False
+            reason = str(error)
+        if reason:
+            said = self.log()[-2000:]
+            self.end()
+            raise BatchError(f"no process for runs on {platform.node()}: {reason}; {said}")
 
     @property
     def pid(self) -> int:

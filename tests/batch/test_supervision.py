@@ -10,7 +10,8 @@ import pytest
 
 from sonar_graph.batch import supervision
 from sonar_graph.batch.planned import Limits, PlannedRun
-from sonar_graph.batch.supervision import perform_watched
+from sonar_graph.batch.supervision import Runner, perform_watched
+from sonar_graph.errors import BatchError
 
 Planned = Callable[..., PlannedRun]
 AMPLE = Limits(600.0)
@@ -70,6 +71,13 @@ def test_log_has_the_traceback_and_what_native_code_wrote_of_this_run_alone(
     (runner,) = runners()
     assert "diverged" not in perform_watched(planned(), AMPLE).log
     assert runners() == [runner]
+
+
+def test_process_that_is_not_ready_in_time_is_ended_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(supervision, "START_S", 0.0)
+    with pytest.raises(BatchError, match=r"no process for runs on .*: it was not ready after 0 s"):
+        Runner()
+    assert not runners()
 
 
 def test_process_of_runs_does_not_outlive_who_started_it() -> None:
