@@ -43,7 +43,7 @@ class Limits:
 
     timeout_s: float
     memory_mb: float | None = None
-    """Resident memory of its process, 10⁶ bytes; None: no limit but the machine's."""
+    """Resident memory of its process and of those that it starts, 10⁶ bytes; None: no limit but the machine's."""
 
 
 @dataclass(frozen=True)

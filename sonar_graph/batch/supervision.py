@@ -34,6 +34,8 @@ ONE_THREAD = (
 LOOK_EVERY_S = 0.2
 START_S = 300.0
 """A process that is not ready by then is broken; the first one on a machine may compile kernels."""
+JOIN_S = 5.0
+"""For the thread that listens to a process that was ended; what left the process's session may keep it listening."""
 ATTEMPTS = 2
 LOG_CHARACTERS = 100_000
 """Of a run's log its end is kept."""
@@ -165,10 +167,11 @@ class Runner:
         return self._log.read().decode("utf-8", "replace")[-LOG_CHARACTERS:]
 
     def end(self) -> None:
-        """End the process now."""
-        self._process.kill()
+        """End the process now, and all that it started: they hold its pipe open."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.pid, signal.SIGKILL)
         self._process.wait()
-        self._collector.join()
+        self._collector.join(JOIN_S)
         with contextlib.suppress(OSError):
             self._requests.close()
         self._log.close()
@@ -177,12 +180,15 @@ class Runner:
         """The answer to what was asked; for a run that exceeds its limits an outcome, and the process stays busy."""
         deadline = time.monotonic() + limits.timeout_s
         while True:
+            is_gone = self._process.poll() is not None
             with contextlib.suppress(Empty):
                 answer = self._answers.get(timeout=LOOK_EVERY_S)
                 if answer is None:
                     raise KilledError(self._ending())
                 self._is_busy = False
                 return answer
+            if is_gone:  # what it started may live on and keep the end of its answers from being seen
+                raise KilledError(self._ending())
             excess = self._excess(limits, deadline)
             if excess is not None:
                 return Outcome(excess)
@@ -192,7 +198,7 @@ class Runner:
         if time.monotonic() > deadline:
             return {"status": "timeout", "reason": f"took longer than {limits.timeout_s:g} s"}
         if limits.memory_mb is not None and _resident_mb(self.pid) > limits.memory_mb:
-            return {"status": "memory", "reason": f"its process needed more than {limits.memory_mb:g} MB"}
+            return {"status": "memory", "reason": f"its processes needed more than {limits.memory_mb:g} MB"}
         return None
 
     def _ending(self) -> str:
@@ -203,9 +209,15 @@ class Runner:
 
 
 def _resident_mb(pid: int) -> float:
+    """Of a process and of all that it started; of these without what they may share with it."""
+    total_bytes = 0
     with contextlib.suppress(psutil.Error):
-        return float(psutil.Process(pid).memory_info().rss / 1e6)
-    return 0.0
+        process = psutil.Process(pid)
+        total_bytes += process.memory_info().rss
+        for child in process.children(recursive=True):
+            with contextlib.suppress(psutil.Error):
+                total_bytes += child.memory_full_info().uss
+    return float(total_bytes / 1e6)
 
 
 def _collect(source: BinaryIO, answers: SimpleQueue[Any]) -> None:
