@@ -84,6 +84,8 @@ def versions_of(estimator: str) -> dict[str, str]:
         "numpy": version("numpy"),
         "scipy": version("scipy"),
         "numba": version("numba"),
+        "python": platform.python_version(),
+        "estimator_target": point.value,
         "source": source_hash("sonar_graph"),
         "estimator_source": source_hash(point.module.partition(".")[0]),
     }

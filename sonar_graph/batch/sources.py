@@ -161,7 +161,8 @@ def _hash(path: Path) -> str:
 def _digest(path: Path, files: tuple[tuple[Path, Stamp], ...]) -> str:
     digest = hashlib.sha256()
     for file, _ in files:
-        digest.update(file.relative_to(path).as_posix().encode())
+        name = file.relative_to(path).as_posix().encode()
+        digest.update(f"{len(name)} {file.stat().st_size} ".encode() + name)
         with file.open("rb") as content:
             while block := content.read(_BLOCK_BYTES):
                 digest.update(block)
