@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+import uuid
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -79,7 +80,11 @@ def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: W
     if not planned:
         return
     with dask.config.set(DASK_SETTINGS), _quiet(), _client(where, len(planned)) as client:
-        submitted = (client.submit(perform_watched, run, limits, key=f"run-{run.key}", pure=False) for run in planned)
+        this_batch = uuid.uuid4().hex  # tasks of equal keys are one for a scheduler, which other batches use too
+        submitted = (
+            client.submit(perform_watched, run, limits, key=f"run-{run.key}-{this_batch}", pure=False)
+            for run in planned
+        )
         futures = dict(zip(submitted, planned, strict=True))
         try:
             for future in as_completed(list(futures)):
@@ -88,7 +93,7 @@ def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: W
         except FutureCancelledError as error:
             raise BatchError(f"the scheduler was lost: {error}") from error
         finally:
-            _within_seconds(lambda: client.cancel(list(futures), force=True))
+            _within_seconds(lambda: client.cancel(list(futures)))
 
 
 def _keep(run: PlannedRun, future: Future[Any], store: Store, progress: Progress) -> None:

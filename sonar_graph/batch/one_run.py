@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import logging
 import math
+import platform
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from sonar_graph.batch.plan import versions_of
+from sonar_graph.batch.plan import sources_now, versions_of
 from sonar_graph.batch.planned import PlannedRun, Row
-from sonar_graph.batch.sources import read_source
-from sonar_graph.errors import BatchError
+from sonar_graph.batch.sources import fingerprint, read_source
+from sonar_graph.errors import BatchError, EstimatorError
+from sonar_graph.estimator import load_estimator
 from sonar_graph.evaluation.comparison import judge
 from sonar_graph.evaluation.environment import LIBRARIES, describe_environment
 from sonar_graph.evaluation.results import Comparison, ErrorSeries, RunResult
@@ -59,14 +61,24 @@ def perform(run: PlannedRun, folder: Path) -> Row:
     Raises
     ------
     BatchError
-        When this process has other versions or another source than those that the run was planned with.
+        When this process has other versions or another source than those that the run was planned with, before the
+        estimator is loaded or after the run, or its files have another content.
     OSError
         When the folder cannot be written: that is no result.
     """
     _check_versions(run)
+    _load(run.estimator)
+    row = _performed(run, folder)
+    _check_source_now(run)
+    return row
+
+
+def _performed(run: PlannedRun, folder: Path) -> Row:
     clock, cpu_s = Clock(), time.process_time()
     try:
         comparison = _compared(run, clock)
+    except BatchError:
+        raise
     except Exception as error:  # a log or a simulator may fail in any way, and the other runs still go on
         LOG.exception("run %s", run.key)
         stage = "while judging" if "estimate_s" in clock.seconds else "while reading or simulating the log"
@@ -84,10 +96,26 @@ def _check_versions(run: PlannedRun) -> None:
         )
 
 
+def _load(estimator: str) -> None:
+    """Import it between the two looks at its source; one that cannot be loaded fails later, with the reason."""
+    with suppress(EstimatorError):
+        load_estimator(estimator)
+
+
+def _check_source_now(run: PlannedRun) -> None:
+    """Modules may be imported as late as during the run: what they were is known only if nothing changed."""
+    now = sources_now(run.estimator)
+    if differing := [name for name in sorted(now) if now[name] != run.versions.get(name)]:
+        raise BatchError(
+            f"the code changed during a run: {_told(now, differing)}, planned with {_told(run.versions, differing)}; "
+            "leave it alone while a batch runs, and start the workers anew"
+        )
+
+
 def _compared(run: PlannedRun, clock: Clock) -> Comparison:
     """The run as a comparison of one."""
     with clock.on("read_s"):
-        sequence = _sequence(run.kind, _as_text(run.options), run.seed, _as_text(run.landmarks))
+        sequence = _sequence(run.kind, _as_text(run.options), _as_text(run.content), run.seed, _as_text(run.landmarks))
         instants_ns = sequence.instants(run.rate_hz)
     with clock.on("estimate_s"):
         result = run_estimator(sequence, run.estimator, run.overrides, instants_ns=instants_ns)
@@ -97,11 +125,27 @@ def _compared(run: PlannedRun, clock: Clock) -> Comparison:
 
 
 @lru_cache(KEPT_SEQUENCES)
-def _sequence(kind: str, options: str, seed: int | None, landmarks: str) -> Sequence:
-    """The same object for the same arguments: estimators cannot change it."""
-    sequence = read_source(kind, json.loads(options), seed)
+def _sequence(kind: str, options: str, content: str, seed: int | None, landmarks: str) -> Sequence:
+    """The same object for the same arguments: estimators cannot change it.
+
+    Raises
+    ------
+    BatchError
+        When files are not, before or after they were read, what they were when the run was planned.
+    """
+    values = json.loads(options)
+    _check_content(kind, values, content)
+    sequence = read_source(kind, values, seed)
+    _check_content(kind, values, content)
     placed = json.loads(landmarks)
     return sequence if placed is None else add_landmarks(sequence, LandmarkOptions(**(placed | {"seed": seed})))
+
+
+def _check_content(kind: str, options: dict[str, Any], content: str) -> None:
+    here, planned = fingerprint(kind, options), json.loads(content)
+    if differing := [name for name in sorted(here | planned) if here.get(name) != planned.get(name)]:
+        names = ", ".join(f"{name} {options.get(name, '')}".rstrip() for name in differing)
+        raise BatchError(f"{platform.node()}: {names}: not what it was when the run was planned; start the batch anew")
 
 
 def measured(comparison: Comparison) -> Row:

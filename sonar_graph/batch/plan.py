@@ -9,14 +9,14 @@ import platform
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import version
+from importlib.metadata import EntryPoint, version
 from typing import Any
 
 from pydantic import ValidationError
 
 import sonar_graph
 from sonar_graph.batch.planned import PlannedRun
-from sonar_graph.batch.source_hash import source_hash
+from sonar_graph.batch.source_hash import source_hash, source_hash_now
 from sonar_graph.batch.sources import FILES, GENERATORS, KINDS, LOG, fingerprint
 from sonar_graph.batch.suite import EstimatorEntry, LogEntry, SuiteFile
 from sonar_graph.batch.toml_lines import Place
@@ -76,9 +76,7 @@ def versions_of(estimator: str) -> dict[str, str]:
     BatchError
         When this machine does not have the estimator.
     """
-    point = installed_estimators().get(estimator)
-    if point is None:
-        raise BatchError(f"{platform.node()}: no estimator is called {estimator!r}; install what brings it")
+    point = _installed(estimator)
     brings = {} if point.dist is None else {point.dist.name: point.dist.version}
     return brings | {
         "sonar_graph": sonar_graph.__version__,
@@ -86,9 +84,32 @@ def versions_of(estimator: str) -> dict[str, str]:
         "numpy": version("numpy"),
         "scipy": version("scipy"),
         "numba": version("numba"),
+        "python": platform.python_version(),
+        "estimator_target": point.value,
         "source": source_hash("sonar_graph"),
         "estimator_source": source_hash(point.module.partition(".")[0]),
     }
+
+
+def sources_now(estimator: str) -> dict[str, str]:
+    """The hashes of `versions_of` as the disk has them at this moment.
+
+    Raises
+    ------
+    BatchError
+        When this machine does not have the estimator any more.
+    """
+    return {
+        "source": source_hash_now("sonar_graph"),
+        "estimator_source": source_hash_now(_installed(estimator).module.partition(".")[0]),
+    }
+
+
+def _installed(estimator: str) -> EntryPoint:
+    point = installed_estimators().get(estimator)
+    if point is None:
+        raise BatchError(f"{platform.node()}: no estimator is called {estimator!r}; install what brings it")
+    return point
 
 
 def _sources(file: SuiteFile, number: int, entry: LogEntry) -> Iterator[_Source]:
@@ -197,6 +218,7 @@ def _planned(file: SuiteFile, source: _Source, seed: int | None, contestant: _Co
         log=source.name,
         kind=source.entry.kind,
         options=source.options,
+        content=source.content,
         landmarks=source.entry.landmarks,
         seed=seed,
         estimator=contestant.name,

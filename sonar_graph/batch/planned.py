@@ -23,6 +23,8 @@ class PlannedRun:
     kind: str
     """Generator, data set, or ``mcap``."""
     options: dict[str, Any]
+    content: dict[str, Any]
+    """`sonar_graph.batch.sources.fingerprint` of kind and options when the run was planned."""
     landmarks: dict[str, Any] | None
     seed: int | None
     estimator: str
@@ -41,7 +43,7 @@ class Limits:
 
     timeout_s: float
     memory_mb: float | None = None
-    """Resident memory of its process, 10⁶ bytes; None: no limit but the machine's."""
+    """Resident memory of its process and of those that it starts, 10⁶ bytes; None: no limit but the machine's."""
 
 
 @dataclass(frozen=True)

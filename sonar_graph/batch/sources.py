@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import Any
 import gtsam
 from pydantic import Field
 
+from sonar_graph.batch.file_stamp import Stamp, stamp_of
 from sonar_graph.calibration import Section
 from sonar_graph.errors import CalibrationError
 from sonar_graph.logs.adapters.config import LogConfig, read_log_config
@@ -150,13 +151,18 @@ def fingerprint(kind: str, options: dict[str, Any]) -> dict[str, Any]:
     return {"kind": kind, **options, **content}
 
 
-@lru_cache
 def _hash(path: Path) -> str:
-    """SHA-256 of a file, or of all names and files below a folder."""
+    """SHA-256 of a file, or of all names and files below a folder; read again only where stamps changed."""
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    return _digest(path, tuple((file, stamp_of(file)) for file in files))
+
+
+@lru_cache
+def _digest(path: Path, files: tuple[tuple[Path, Stamp], ...]) -> str:
     digest = hashlib.sha256()
-    files: Iterable[Path] = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
-    for file in files:
-        digest.update(file.relative_to(path).as_posix().encode())
+    for file, _ in files:
+        name = file.relative_to(path).as_posix().encode()
+        digest.update(f"{len(name)} {file.stat().st_size} ".encode() + name)
         with file.open("rb") as content:
             while block := content.read(_BLOCK_BYTES):
                 digest.update(block)

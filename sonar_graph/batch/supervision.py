@@ -23,6 +23,7 @@ from typing import Any, BinaryIO
 import psutil
 
 from sonar_graph.batch.planned import Limits, Outcome, PlannedRun, Row
+from sonar_graph.batch.runner import READY
 from sonar_graph.errors import BatchError
 from sonar_graph.evaluation.environment import describe_environment
 
@@ -33,6 +34,8 @@ ONE_THREAD = (
 LOOK_EVERY_S = 0.2
 START_S = 300.0
 """A process that is not ready by then is broken; the first one on a machine may compile kernels."""
+JOIN_S = 5.0
+"""For the thread that listens to a process that was ended; what left the process's session may keep it listening."""
 ATTEMPTS = 2
 LOG_CHARACTERS = 100_000
 """Of a run's log its end is kept."""
@@ -113,11 +116,19 @@ class Runner:
         collector_arguments = (self._process.stdout, self._answers)
         self._collector = threading.Thread(target=_collect, args=collector_arguments, daemon=True)
         self._collector.start()
+        self._await_readiness()
+
+    def _await_readiness(self) -> None:
+        """Return when the process has loaded everything; one that does not come so far is ended."""
         try:
-            self._wait(Limits(START_S))
+            answer = self._wait(Limits(START_S))
+            reason = "" if answer == READY else f"it was not ready after {START_S:g} s"
         except KilledError as error:
-            raise BatchError(f"no process for runs on {platform.node()}: {error}; {self.log()[-2000:]}") from error
-        self._is_busy = False
+            reason = str(error)
+        if reason:
+            said = self.log()[-2000:]
+            self.end()
+            raise BatchError(f"no process for runs on {platform.node()}: {reason}; {said}")
 
     @property
     def pid(self) -> int:
@@ -156,10 +167,11 @@ class Runner:
         return self._log.read().decode("utf-8", "replace")[-LOG_CHARACTERS:]
 
     def end(self) -> None:
-        """End the process now."""
-        self._process.kill()
+        """End the process now, and all that it started: they hold its pipe open."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.pid, signal.SIGKILL)
         self._process.wait()
-        self._collector.join()
+        self._collector.join(JOIN_S)
         with contextlib.suppress(OSError):
             self._requests.close()
         self._log.close()
@@ -168,12 +180,15 @@ class Runner:
         """The answer to what was asked; for a run that exceeds its limits an outcome, and the process stays busy."""
         deadline = time.monotonic() + limits.timeout_s
         while True:
+            is_gone = self._process.poll() is not None
             with contextlib.suppress(Empty):
                 answer = self._answers.get(timeout=LOOK_EVERY_S)
                 if answer is None:
                     raise KilledError(self._ending())
                 self._is_busy = False
                 return answer
+            if is_gone:  # what it started may live on and keep the end of its answers from being seen
+                raise KilledError(self._ending())
             excess = self._excess(limits, deadline)
             if excess is not None:
                 return Outcome(excess)
@@ -183,7 +198,7 @@ class Runner:
         if time.monotonic() > deadline:
             return {"status": "timeout", "reason": f"took longer than {limits.timeout_s:g} s"}
         if limits.memory_mb is not None and _resident_mb(self.pid) > limits.memory_mb:
-            return {"status": "memory", "reason": f"its process needed more than {limits.memory_mb:g} MB"}
+            return {"status": "memory", "reason": f"its processes needed more than {limits.memory_mb:g} MB"}
         return None
 
     def _ending(self) -> str:
@@ -194,9 +209,15 @@ class Runner:
 
 
 def _resident_mb(pid: int) -> float:
+    """Of a process and of all that it started; of these without what they may share with it."""
+    total_bytes = 0
     with contextlib.suppress(psutil.Error):
-        return float(psutil.Process(pid).memory_info().rss / 1e6)
-    return 0.0
+        process = psutil.Process(pid)
+        total_bytes += process.memory_info().rss
+        for child in process.children(recursive=True):
+            with contextlib.suppress(psutil.Error):
+                total_bytes += child.memory_full_info().uss
+    return float(total_bytes / 1e6)
 
 
 def _collect(source: BinaryIO, answers: SimpleQueue[Any]) -> None:

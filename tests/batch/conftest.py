@@ -51,6 +51,28 @@ class Hungry(DeadReckoning):
         time.sleep(1000)
 
 
+class Forks(DeadReckoning):
+    def process(self, measurements):
+        if os.fork() == 0:
+            time.sleep(1000)
+        time.sleep(1000)
+
+
+class DiesAfterForking(DeadReckoning):
+    def process(self, measurements):
+        if os.fork() == 0:
+            time.sleep(1000)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+class HungryChild(DeadReckoning):
+    def process(self, measurements):
+        if os.fork() == 0:
+            self.eaten = bytearray(os.urandom(1)) * 700_000_000
+            time.sleep(1000)
+        time.sleep(1000)
+
+
 class Dies(DeadReckoning):
     def process(self, measurements):
         os.kill(os.getpid(), signal.SIGKILL)
@@ -68,6 +90,9 @@ ENTRY_POINTS = """[sonar_graph.estimators]
 sleeps = misbehaving:Sleeps
 prints = misbehaving:Prints
 hungry = misbehaving:Hungry
+forks = misbehaving:Forks
+dies-after-forking = misbehaving:DiesAfterForking
+hungry-child = misbehaving:HungryChild
 dies = misbehaving:Dies
 dies-once = misbehaving:DiesOnce
 broken = not_there:Broken

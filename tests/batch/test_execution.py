@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import math
@@ -10,7 +11,9 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,13 @@ import psutil
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from distributed import LocalCluster
+
+from sonar_graph.batch import execution
+from sonar_graph.batch.execution import Where, run_batch
+from sonar_graph.batch.planned import Limits, Outcome, PlannedRun
+from sonar_graph.batch.store import Store
+from sonar_graph.errors import BatchError
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
 
@@ -136,6 +146,37 @@ def test_scheduler_that_is_lost_is_told_and_what_is_done_is_kept(
     (line,) = said.splitlines()
     assert "the scheduler was lost" in line
     assert line.endswith("1 of 2 runs are done and kept; the same command goes on from there")
+
+
+def test_end_of_a_batch_leaves_the_equal_runs_of_another_on_the_scheduler(
+    planned: Callable[..., PlannedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first batch is waiting while the second one, of the same run, fails and cancels what it asked for."""
+    done: list[str] = []
+    run = planned()
+
+    def told(planned_run: PlannedRun, _outcome: Outcome) -> None:
+        done.append(planned_run.key)
+
+    monkeypatch.setattr(execution, "perform_watched", wait_a_second)
+    with LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster:
+        where = Where(scheduler=cluster.scheduler_address)
+        first = threading.Thread(target=run_batch, args=([run], Store(tmp_path / "a"), Limits(9.0), where, told))
+        first.start()
+        time.sleep(0.5)
+        with contextlib.suppress(BatchError):
+            run_batch([run], Store(tmp_path / "b"), Limits(0.0), where, told)
+        first.join(20)
+    assert not first.is_alive()
+    assert done == [run.key]
+
+
+def wait_a_second(_run: PlannedRun, limits: Limits) -> Outcome:
+    """In place of a run; one without time cannot be done."""
+    if limits.timeout_s == 0:
+        raise BatchError("no time")
+    time.sleep(1.0)
+    return Outcome({"status": "ok"})
 
 
 def test_missing_scheduler_is_one_line(write_suite: WriteSuite, tmp_path: Path) -> None:

@@ -3,18 +3,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from sonar_graph.batch import one_run
 from sonar_graph.batch.one_run import perform
 from sonar_graph.batch.planned import PlannedRun
 from sonar_graph.batch.results import COLUMNS, is_timing
+from sonar_graph.batch.sources import fingerprint
 from sonar_graph.batch.suite import METRICS
 from sonar_graph.errors import BatchError
+from sonar_graph.estimator import load_estimator
 from sonar_graph.evaluation.comparison import compare
+from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.storage import read_comparison
+from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks
 
 Planned = Callable[..., PlannedRun]
 
@@ -60,10 +67,89 @@ def test_same_run_gives_the_same_bits(planned: Planned, tmp_path: Path) -> None:
 def test_log_that_cannot_be_read_is_a_row_with_a_reason(planned: Planned, tmp_path: Path) -> None:
     log = tmp_path / "dive.mcap"
     log.write_bytes(b"not a log")
-    row = perform(replace(planned(), kind="mcap", options={"log": str(log)}, seed=None), tmp_path / "run")
+    row = perform(of_log(planned(), log), tmp_path / "run")
     assert row["status"] == "failed"
     assert str(row["reason"]).startswith("while reading or simulating the log: LogError: ")
     assert "dive.mcap" in str(row["reason"])
+
+
+def of_log(run: PlannedRun, log: Path) -> PlannedRun:
+    options = {"log": str(log)}
+    return replace(run, kind="mcap", options=options, content=fingerprint("mcap", options), seed=None)
+
+
+def test_run_of_a_changed_log_uses_the_new_content(
+    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that has the old sequence in hand gets a run that was planned with the new file."""
+    log = log_with_duration(tmp_path, monkeypatch, 120)
+    short = perform(of_log(planned(), log), tmp_path / "short")
+    log.write_text("150")
+    long = perform(of_log(planned(), log), tmp_path / "long")
+    assert long["scored_instants"] > short["scored_instants"] > 0
+
+
+def test_log_that_changed_since_it_was_planned_gives_no_result(
+    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = log_with_duration(tmp_path, monkeypatch, 120)
+    run = of_log(planned(), log)
+    log.write_text("150")
+    with pytest.raises(BatchError, match=r"log \S+dive\.mcap: not what it was when the run was planned"):
+        perform(run, tmp_path / "run")
+
+
+def test_log_that_changes_while_it_is_read_gives_no_result(
+    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = log_with_duration(tmp_path, monkeypatch, 120)
+    run, read = of_log(planned(), log), one_run.read_source
+
+    def read_and_changed(*given: Any) -> Sequence:
+        sequence = read(*given)
+        log.write_text("150")
+        return sequence
+
+    monkeypatch.setattr(one_run, "read_source", read_and_changed)
+    with pytest.raises(BatchError, match="not what it was when the run was planned"):
+        perform(run, tmp_path / "run")
+
+
+def log_with_duration(folder: Path, monkeypatch: pytest.MonkeyPatch, duration_s: int) -> Path:
+    """A file with a number in it, which is read as a simulated basin that lasts so long."""
+
+    def read(kind: str, options: dict[str, Any], _seed: int | None) -> Sequence:
+        assert kind == "mcap"
+        return simulate_basin(BasinOptions(duration_s=int(Path(options["log"]).read_text()), laps=1))
+
+    monkeypatch.setattr(one_run, "read_source", read)
+    log = folder / "dive.mcap"
+    log.write_text(str(duration_s))
+    return log
+
+
+def test_landmarks_on_a_log_are_those_of_the_seed(
+    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = log_with_duration(tmp_path, monkeypatch, 120)
+    run = replace(of_log(planned(), log), landmarks={}, seed=1)
+    used: list[Sequence] = []
+
+    def noted(sequence: Sequence, *given: Any, **named: Any) -> Any:
+        used.append(sequence)
+        return run_estimator(sequence, *given, **named)
+
+    monkeypatch.setattr(one_run, "run_estimator", noted)
+    assert perform(run, tmp_path / "run")["status"] == "ok"
+    recorded = simulate_basin(BasinOptions(duration_s=120, laps=1))
+    expected, other = (add_landmarks(recorded, LandmarkOptions(seed=seed)) for seed in (1, 0))
+    assert map_of(used[0]) == map_of(expected) != map_of(other)
+
+
+def map_of(sequence: Sequence) -> list[list[float]]:
+    assert sequence.true_landmarks is not None
+    positions: list[list[float]] = sequence.true_landmarks.positions.tolist()
+    return positions
 
 
 def test_estimator_that_fails_is_a_row_with_a_reason(planned: Planned, misbehaving: None, tmp_path: Path) -> None:
@@ -79,6 +165,40 @@ def test_other_versions_than_planned_are_no_result(planned: Planned, tmp_path: P
         perform(replace(run, versions=run.versions | {"gtsam": "4.2"}), tmp_path / "run")
     with pytest.raises(BatchError, match=r"a worker has source \w+, planned with source changed; "):
         perform(replace(run, versions=run.versions | {"source": "changed"}), tmp_path / "run")
+
+
+def test_estimator_that_changes_during_a_run_gives_no_result(
+    planned: Planned, misbehaving: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its package imports a module that is changed after the first look at the source, and before the import."""
+    module = tmp_path / "site" / "misbehaving.py"
+    run = planned("prints")
+    assert perform(run, tmp_path / "before")["status"] == "failed"
+
+    def changed_and_loaded(name: str) -> object:
+        with module.open("a") as file:
+            file.write("GAIN = 2\n")
+        return load_estimator(name)
+
+    monkeypatch.setattr(one_run, "load_estimator", changed_and_loaded)
+    with pytest.raises(BatchError, match=r"the code changed during a run: estimator_source \w+, planned with "):
+        perform(run, tmp_path / "after")
+
+
+def test_estimator_is_loaded_between_two_looks_at_its_source(
+    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, order = planned(), []
+    for name in ("_check_versions", "load_estimator", "run_estimator", "_check_source_now"):
+        real = getattr(one_run, name)
+
+        def noted(*given: Any, name: str = name, real: Any = real, **named: Any) -> Any:
+            order.append(name)
+            return real(*given, **named)
+
+        monkeypatch.setattr(one_run, name, noted)
+    perform(run, tmp_path / "run")
+    assert order == ["_check_versions", "load_estimator", "run_estimator", "_check_source_now"]
 
 
 def test_folder_that_cannot_be_written_is_no_result(planned: Planned, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from sonar_graph.batch import plan
-from sonar_graph.batch.plan import plan_runs
+from sonar_graph.batch.plan import plan_runs, versions_of
 from sonar_graph.batch.planned import PlannedRun
 from sonar_graph.batch.sources import LOG, fingerprint
 from sonar_graph.batch.suite import read_suite
@@ -63,6 +63,15 @@ def test_key_changes_with_the_version(write_suite: WriteSuite, monkeypatch: pyte
     assert key(write_suite) != before
 
 
+def test_key_changes_with_landmarks_on_a_log(write_suite: WriteSuite) -> None:
+    log = '[[logs]]\nname = "park"\ndataset = "victoria-park"\n'
+    placed = [
+        key(write_suite, HEADER, log, f"landmarks = {{ {text} }}\n", DEAD_RECKONING)
+        for text in ("", "frame_rate_hz = 3")
+    ]
+    assert len({key(write_suite, HEADER, log, DEAD_RECKONING), *placed}) == 3
+
+
 def test_key_does_not_change_with_names_or_with_defaults_written_out(write_suite: WriteSuite) -> None:
     same = key(
         write_suite,
@@ -83,6 +92,42 @@ def test_of_a_log_the_content_counts_and_not_the_place(tmp_path: Path) -> None:
     first, moved, changed = (fingerprint(LOG, {"log": str(path)}) for path in paths)
     assert first == moved
     assert first != changed
+    paths[0].write_bytes(b"lob")
+    assert fingerprint(LOG, {"log": str(paths[0])}) == changed
+
+
+def test_folders_whose_files_end_elsewhere_have_another_content(tmp_path: Path) -> None:
+    """Names and contents of both are the same characters one after the other."""
+    for name, files in (("one", {"a": "b", "c": ""}), ("two", {"a": "", "bc": ""}), ("three", {"abc": ""})):
+        (tmp_path / name).mkdir()
+        for file, content in files.items():
+            (tmp_path / name / file).write_text(content)
+    folders = [fingerprint("mrclam", {"folder": str(tmp_path / name)})["folder"] for name in ("one", "two", "three")]
+    assert len(set(folders)) == 3
+
+
+def test_key_changes_with_the_class_behind_the_name(write_suite: WriteSuite, misbehaving: None, tmp_path: Path) -> None:
+    suite = (HEADER.replace("dead-reckoning", "dies"), BASIN, '[[estimators]]\nname = "dies"\n')
+    before = key(write_suite, *suite)
+    points = tmp_path / "site" / "misbehaving-1.0.dist-info" / "entry_points.txt"
+    points.write_text(points.read_text().replace("misbehaving:Dies\n", "misbehaving:Prints\n"))
+    versions_of.cache_clear()
+    assert key(write_suite, *suite) != before
+    versions_of.cache_clear()
+
+
+def test_key_changes_with_the_version_of_python(write_suite: WriteSuite, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = key(write_suite)
+    versions_of.cache_clear()
+    with monkeypatch.context() as patch:
+        patch.setattr("platform.python_version", lambda: "3.99.0")
+        assert key(write_suite) != before
+    versions_of.cache_clear()
+
+
+def test_run_has_the_content_that_its_key_is_made_of(write_suite: WriteSuite) -> None:
+    (run,) = planned(write_suite)
+    assert run.content == fingerprint(run.kind, run.options)
 
 
 def test_estimator_that_cannot_be_loaded_is_planned(write_suite: WriteSuite, misbehaving: None) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sonar_graph.batch.plan import plan_runs, versions_of
-from sonar_graph.batch.source_hash import source_hash
+from sonar_graph.batch.source_hash import source_hash, source_hash_now
 from sonar_graph.batch.suite import read_suite
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
@@ -79,7 +80,27 @@ def test_hash_is_taken_once_in_a_process(package: Path, hashed: Hashed) -> None:
     before = hashed()
     (package / "__init__.py").write_text("")
     assert source_hash("hashed_package") == before
-    assert hashed() != before
+    assert source_hash_now("hashed_package") == hashed() != before
+
+
+def test_look_at_the_disk_sees_a_change_of_equal_size_and_time(package: Path, hashed: Hashed) -> None:
+    before, code = hashed(), package / "__init__.py"
+    state = code.stat()
+    code.write_text("raise RuntimeError('Imported')\n")
+    os.utime(code, ns=(state.st_atime_ns, state.st_mtime_ns))
+    assert (code.stat().st_size, code.stat().st_mtime_ns) == (state.st_size, state.st_mtime_ns)
+    assert source_hash_now("hashed_package") != before
+
+
+def test_files_that_differ_in_where_name_and_content_end_have_another_hash(package: Path, hashed: Hashed) -> None:
+    """Without lengths, the names and contents of both packages are the same characters one after the other."""
+    (package / "__init__.py").write_text("")
+    (package / "inner" / "data.json").unlink()
+    (package / "a").write_text("b")
+    first = hashed()
+    (package / "a").rename(package / "ab")
+    (package / "ab").write_text("")
+    assert hashed() != first
 
 
 def test_key_changes_with_a_changed_checkout(write_suite: WriteSuite, tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import contextlib
+import os
 import subprocess
 import sys
 import time
@@ -10,7 +12,8 @@ import pytest
 
 from sonar_graph.batch import supervision
 from sonar_graph.batch.planned import Limits, PlannedRun
-from sonar_graph.batch.supervision import perform_watched
+from sonar_graph.batch.supervision import Runner, perform_watched
+from sonar_graph.errors import BatchError
 
 Planned = Callable[..., PlannedRun]
 AMPLE = Limits(600.0)
@@ -44,7 +47,31 @@ def test_run_that_takes_too_long_is_ended_and_the_next_one_is_done(planned: Plan
 def test_run_that_needs_too_much_memory_is_ended(planned: Planned, misbehaving: None) -> None:
     outcome = perform_watched(planned("hungry"), Limits(120.0, memory_mb=700.0))
     assert outcome.row["status"] == "memory"
-    assert outcome.row["reason"] == "its process needed more than 700 MB"
+    assert outcome.row["reason"] == "its processes needed more than 700 MB"
+
+
+@pytest.mark.parametrize(
+    ("estimator", "limits", "status"),
+    [
+        ("forks", Limits(5.0), "timeout"),
+        ("dies-after-forking", Limits(120.0), "killed"),
+        ("hungry-child", Limits(120.0, memory_mb=700.0), "memory"),
+    ],
+)
+def test_processes_that_a_run_starts_count_and_end_with_it(
+    planned: Planned, misbehaving: None, estimator: str, limits: Limits, status: str
+) -> None:
+    outcome = perform_watched(planned(estimator), limits)
+    assert outcome.row["status"] == status
+    assert not [p for p in psutil.process_iter() if is_runner_of_this_test(p)]
+
+
+def is_runner_of_this_test(process: psutil.Process) -> bool:
+    """Children of a runner have its command and environment."""
+    with contextlib.suppress(psutil.Error):
+        is_runner = "sonar_graph.batch.runner" in process.cmdline()
+        return is_runner and process.environ().get("SONAR_GRAPH_TEST_MARK") == os.environ["SONAR_GRAPH_TEST_MARK"]
+    return False
 
 
 def test_run_whose_process_is_killed_once_costs_a_retry_and_nothing_else(planned: Planned, misbehaving: None) -> None:
@@ -70,6 +97,13 @@ def test_log_has_the_traceback_and_what_native_code_wrote_of_this_run_alone(
     (runner,) = runners()
     assert "diverged" not in perform_watched(planned(), AMPLE).log
     assert runners() == [runner]
+
+
+def test_process_that_is_not_ready_in_time_is_ended_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(supervision, "START_S", 0.0)
+    with pytest.raises(BatchError, match=r"no process for runs on .*: it was not ready after 0 s"):
+        Runner()
+    assert not runners()
 
 
 def test_process_of_runs_does_not_outlive_who_started_it() -> None:
