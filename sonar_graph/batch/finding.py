@@ -8,8 +8,8 @@ from collections import Counter
 from sonar_graph.batch.accuracy import SIGNIFICANT, Tests, p_text
 from sonar_graph.batch.catalogue import Metric
 from sonar_graph.batch.recorded import RecordedBatch
-from sonar_graph.batch.rounding import supported, with_error
-from sonar_graph.batch.statistics import least_p, quantile, summarise
+from sonar_graph.batch.rounding import quantile_text, with_error
+from sonar_graph.batch.statistics import least_p, quantile, quantile_error
 
 SCORED = "scored_instants"
 NAMED = 3
@@ -50,12 +50,12 @@ def errors_told(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> li
 
 def _log_told(batch: RecordedBatch, log: str, metric: Metric, key: str, tests: Tests) -> str:
     medians = [
-        (quantile(values, 0.5), name, summarise(values).rounding_error * metric.factor)
+        (quantile(values, 0.5), name, quantile_error(values, 0.5) * metric.factor)
         for name in batch.contestants
         if len(values := batch.values(log, name, key))
     ]
     listed = ", ".join(
-        f"{name} {supported(value * metric.factor, error)}"
+        f"{name} {quantile_text(value * metric.factor, error)}"
         for value, name, error in sorted(medians)
         if value < math.inf
     )

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.batch.accuracy import all_tests
+from sonar_graph.batch.accuracy import accuracy_table, all_tests
 from sonar_graph.batch.catalogue import metrics_of
 from sonar_graph.batch.exported import as_csv, as_latex
 from sonar_graph.batch.headline import HIGHER, LOWER, head_metric, headlines, mark_of, overview_table
@@ -71,6 +71,15 @@ def test_a_median_over_failed_runs_says_so():
     cell = cell_of(overview_of(with_failures(drawn_batch(), "isam2", LOGS[0], 6)), LOGS[0], "Causal", "isam2")
     assert cell.text.startswith("no value")
     assert cell.note == "6 of 10 without a value"
+
+
+def test_a_median_keeps_its_digits_beside_a_run_that_lost_its_way():
+    batch = changed(drawn_batch(logs=LOGS[:1]), "isam2", "causal.ate_se2_m", np.append(np.ones(9), 1e5))
+    shown = float(cell_of(overview_of(batch), LOGS[0], "Causal", "isam2").text.split()[0])
+    assert shown == pytest.approx(np.median(batch.values(LOGS[0], "isam2", "causal.ate_se2_m")), rel=0.1)
+    row = next(row for row in accuracy_table(batch, ATE).rows if row[1].text == "isam2")
+    assert float(row[4].text) == shown
+    assert 0 < float(row[5].text.partition(" to ")[0]) <= shown
 
 
 def test_the_sentence_counts_logs():

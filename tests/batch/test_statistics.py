@@ -17,6 +17,7 @@ from sonar_graph.batch.statistics import (
     least_p,
     paired,
     quantile,
+    quantile_error,
     signed_rank_p,
     standard_error,
     summarise,
@@ -143,9 +144,32 @@ def test_a_group_with_a_run_without_a_value_has_no_mean():
 
 
 def test_two_values_that_agree_by_chance_do_not_make_digits():
-    assert summarise(np.array([10.54003, 10.54024])).rounding_error == pytest.approx(0.105, abs=1e-3)
-    many = np.tile([10.54003, 10.54024], 5)
-    assert summarise(many).rounding_error == pytest.approx(stats.sem(many))
+    few, many = np.array([10.54003, 10.54024]), np.tile([10.54003, 10.54024], 5)
+    assert summarise(few).median_error == pytest.approx(0.105, abs=1e-3)
+    assert summarise(many).median_error == pytest.approx(0.5 * np.ptp(few))
+    assert paired(few, np.zeros(2)).rounding_error == pytest.approx(0.105, abs=1e-3)
+    assert paired(many, np.zeros(10)).rounding_error == pytest.approx(stats.sem(many))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_the_error_of_a_quantile_is_how_much_it_scatters(share):
+    draws = np.random.default_rng(8).normal(size=(600, 40))
+    scatter = np.quantile(draws, share, axis=1).std()
+    errors = [quantile_error(values, share) for values in draws]
+    assert np.mean(errors) == pytest.approx(scatter, rel=0.2)
+
+
+def test_one_lost_run_does_not_take_the_digits_of_the_median():
+    values = np.append(np.random.default_rng(9).normal(0.2, 0.01, 19), 5000.0)
+    assert standard_error(values) > 100
+    assert summarise(values).median_error < 0.01
+    assert paired(values, np.zeros(20)).median_error < 0.01
+
+
+def test_the_error_of_a_median_beside_runs_without_a_value_is_that_of_the_lower_side():
+    values = np.array([1.0, 2.0, 3.0, 4.0, INF, INF, INF])
+    assert quantile_error(values, 0.5) == pytest.approx(math.sqrt(7) / 2)
+    assert math.isnan(quantile_error(values, 0.9))
 
 
 def test_standard_error_of_one_run_is_unknown():
