@@ -19,7 +19,7 @@ Tests = dict[tuple[str, str, str], tuple[Paired, float]]
 
 
 def all_tests(batch: RecordedBatch, metrics: list[Metric]) -> Tests:
-    """Every contestant against the reference in every metric that has a better side; a metric is a family of tests."""
+    """Every contestant against the reference in every error; a metric is a family of tests."""
     tests: Tests = {}
     for metric in metrics:
         if metric.is_error:

@@ -12,6 +12,7 @@ from sonar_graph.batch.accuracy import accuracy_table, all_tests, difference_tab
 from sonar_graph.batch.catalogue import Metric, metrics_of
 from sonar_graph.batch.exported import as_csv, as_latex, latex_text, write_tables
 from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told
+from sonar_graph.batch.headline import head_metric
 from sonar_graph.batch.overviews import consistency_table, cost_table, failure_table, run_lists
 from sonar_graph.batch.recorded import ALL_LOGS
 from sonar_graph.batch.tables import Cell, Column, Table
@@ -189,6 +190,18 @@ def test_a_filters_two_estimates_do_not_ask_for_more_seeds():
     ]
     assert "7 pairs" in power_told(all_tests(batch, [ATE]))[0], "four tests: 4 / 2**6 is above 5 %"
     assert power_told(all_tests(replace(batch, runs=same), [ATE])) == [], "two tests"
+
+
+@pytest.mark.parametrize("key", ["time.total_s", "memory.peak_mb", "wall_s", "peak_memory_mb"])
+def test_time_and_memory_are_shown_and_not_tested(key):
+    batch = drawn_batch(12, logs=LOGS[:1])
+    batch = replace(
+        batch, runs=[replace(r, values=r.values | {key: len(r.estimator) + 0.01 * r.seed}) for r in batch.runs]
+    )
+    (metric,) = metrics_of([key])
+    assert all_tests(batch, [metric]) == {}
+    assert accuracy_table(batch, metric).rows
+    assert head_metric(batch, [metric]) is None
 
 
 def test_a_warning_names_few_logs():
