@@ -28,6 +28,18 @@ def failures_told(batch: RecordedBatch) -> list[str]:
     return sentences
 
 
+def reference_told(batch: RecordedBatch) -> list[str]:
+    """A warning where the reference never ended: then differences tell of its failure and of nothing else."""
+    groups = {log: batch.group(log, batch.reference) for log in batch.logs}
+    lost = [log for log, group in groups.items() if group and not any(run.ended for run in group)]
+    if not lost:
+        return []
+    return [
+        f"The reference {batch.reference} never ended on {_few(lost)}: whoever ended is better there, by no known "
+        "amount."
+    ]
+
+
 def errors_told(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> list[str]:
     """For each log the first metric that it has: medians, then differences to the reference that are no chance."""
     sentences = []

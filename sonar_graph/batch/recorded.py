@@ -93,6 +93,10 @@ class RecordedBatch:
         return {(key, run.contestant) for run in self.runs if run.ended for key in run.values}
 
     @cached_property
+    def _ended_contestants(self) -> set[str]:
+        return {run.contestant for run in self.runs if run.ended}
+
+    @cached_property
     def logs(self) -> list[str]:
         """Names of logs, in the order of the runs."""
         return list(dict.fromkeys(run.log for run in self.runs))
@@ -128,9 +132,11 @@ class RecordedBatch:
     def is_asked(self, log: str, contestant: str, key: str) -> bool:
         """Whether a score can be expected: the log has it for somebody, and the contestant on some log.
 
-        A dead reckoning has no map and a log without truth no errors; neither is a failure.
+        A dead reckoning has no map and a log without truth no errors; neither is a failure. Of a contestant that never
+        ended nobody knows what it would have, so everything is expected of it.
         """
-        return (key, log) in self._log_scores and (key, contestant) in self._contestant_scores
+        is_known = (key, contestant) in self._contestant_scores or contestant not in self._ended_contestants
+        return (key, log) in self._log_scores and is_known
 
 
 def is_batch(folder: Path) -> bool:

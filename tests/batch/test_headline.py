@@ -82,6 +82,12 @@ def test_a_median_keeps_its_digits_beside_a_run_that_lost_its_way():
     assert 0 < float(row[5].text.partition(" to ")[0]) <= shown
 
 
+def test_who_never_ended_is_higher_than_the_reference_and_not_left_out():
+    batch = with_failures(drawn_batch(logs=LOGS[:1]), "isam2", LOGS[0], 10)
+    assert cell_of(overview_of(batch), LOGS[0], "Causal", "isam2").text == f"no value {HIGHER}"
+    assert "higher with isam2" in headlines(batch, ATE, all_tests(batch, [ATE]))[0]
+
+
 def test_the_sentence_counts_logs():
     batch = drawn_batch(logs=("one", "two", "three"))
     worse = [

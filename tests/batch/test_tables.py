@@ -11,7 +11,7 @@ import pytest
 from sonar_graph.batch.accuracy import accuracy_table, all_tests, difference_table
 from sonar_graph.batch.catalogue import Metric, metrics_of
 from sonar_graph.batch.exported import as_csv, as_latex, latex_text, write_tables
-from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told
+from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told, reference_told
 from sonar_graph.batch.headline import head_metric
 from sonar_graph.batch.overviews import consistency_table, cost_table, failure_table, run_lists
 from sonar_graph.batch.recorded import ALL_LOGS
@@ -202,6 +202,17 @@ def test_time_and_memory_are_shown_and_not_tested(key):
     assert all_tests(batch, [metric]) == {}
     assert accuracy_table(batch, metric).rows
     assert head_metric(batch, [metric]) is None
+
+
+def test_a_reference_that_never_ended_is_warned_of():
+    batch = drawn_batch(8)
+    assert reference_told(with_failures(batch, "dead-reckoning", LOGS[0], 7)) == []
+    lost = with_failures(batch, "dead-reckoning", LOGS[0], 8)
+    assert reference_told(lost) == [
+        "The reference dead-reckoning never ended on basin: whoever ended is better there, by no known amount."
+    ]
+    (told,) = difference_table(lost, ATE, all_tests(lost, [ATE])).rows[:1]
+    assert told[4].text == "better: reference has no value"
 
 
 def test_a_warning_names_few_logs():
