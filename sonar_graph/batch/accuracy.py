@@ -37,9 +37,16 @@ def _family(batch: RecordedBatch, metric: Metric) -> Tests:
         if contestant != batch.reference and len(batch.pairs(log, contestant, key)[0])
     }
     same = {place: (*place[1:], own.tobytes(), other.tobytes()) for place, (own, other) in found.items()}
-    distinct = {same[place]: paired(*pair) for place, pair in found.items()}
+    first = {same[place]: place for place in reversed(found)}
+    distinct = {numbers: _tested(batch, *first[numbers]) for numbers in dict.fromkeys(same.values())}
     corrected = dict(zip(distinct, holm(np.array([test.p_value for test in distinct.values()])).tolist(), strict=True))
     return {place: (distinct[same[place]], corrected[same[place]]) for place in found}
+
+
+def _tested(batch: RecordedBatch, key: str, log: str, contestant: str) -> Paired:
+    """The test of one column; of all logs together one difference a seed."""
+    cases = batch.cases(log, contestant, key) if log == ALL_LOGS else None
+    return paired(*batch.pairs(log, contestant, key), cases)
 
 
 def _compared_logs(batch: RecordedBatch) -> list[str]:

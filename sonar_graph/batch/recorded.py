@@ -120,14 +120,24 @@ class RecordedBatch:
         With `ALL_LOGS` those of every log. Logs on which either cannot have the score have no pairs.
         """
         logs = self.logs if log == ALL_LOGS else [log]
-        both = np.array([pair for one in logs for pair in self._pairs_on(one, contestant, key)]).reshape(-1, 2)
-        return both[:, 0], both[:, 1]
+        both = [pair for one in logs for pair in self._pairs_on(one, contestant, key)]
+        values = np.array([(own.value(key), other.value(key)) for own, other in both]).reshape(-1, 2)
+        return values[:, 0], values[:, 1]
 
-    def _pairs_on(self, log: str, contestant: str, key: str) -> list[tuple[float, float]]:
+    def cases(self, log: str, contestant: str, key: str) -> list[str | int]:
+        """What each of `pairs` is a case of: its seed, and where there is none its log.
+
+        Pairs with one seed on several logs depend on each other: worlds of a grid share what the seed drew.
+        """
+        logs = self.logs if log == ALL_LOGS else [log]
+        runs = [own for one in logs for own, _ in self._pairs_on(one, contestant, key)]
+        return [run.log if run.seed is None else run.seed for run in runs]
+
+    def _pairs_on(self, log: str, contestant: str, key: str) -> list[tuple[RecordedRun, RecordedRun]]:
         if not all(self.is_asked(log, name, key) for name in (contestant, self.reference)):
             return []
-        reference = {run.seed: run.value(key) for run in self.group(log, self.reference)}
-        return [(run.value(key), reference[run.seed]) for run in self.group(log, contestant) if run.seed in reference]
+        reference = {run.seed: run for run in self.group(log, self.reference)}
+        return [(run, reference[run.seed]) for run in self.group(log, contestant) if run.seed in reference]
 
     def is_asked(self, log: str, contestant: str, key: str) -> bool:
         """Whether a score can be expected: the log has it for somebody, and the contestant on some log.

@@ -9,6 +9,7 @@ Equations: docs/theory/batch_statistics.md.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -170,20 +171,30 @@ def failure_rate(failed: int, runs: int) -> Rate:
     return Rate(failed / runs, float(interval.low), float(interval.high))
 
 
-def paired(own: Floats, reference: Floats) -> Paired:
+def paired(own: Floats, reference: Floats, cases: Sequence[str | int] | None = None) -> Paired:
     """Differences own minus reference, each shape (n,), infinity where a run has no value.
 
     A run without a value is worse than any with one; where both have none they are equal.
+
+    Parameters
+    ----------
+    cases
+        What each pair is a case of. Pairs of one case depend on each other and make one difference, their mean. None:
+        each pair is its own.
     """
-    differences = _differences(own, reference)
-    without = int((np.isinf(own) | np.isinf(reference)).sum())
+    differences, lost = _differences(own, reference), np.isinf(own) | np.isinf(reference)
+    if cases is not None:
+        members = [np.array([one == case for one in cases]) for case in dict.fromkeys(cases)]
+        differences = np.array([_difference_of_case(differences[which]) for which in members])
+        lost = np.array([lost[which].any() for which in members], dtype=bool)
+    without = int(lost.sum())
     has_mean = len(differences) > 0 and not without
     return Paired(
         pairs=len(differences),
         without=without,
         smaller=int((differences < 0).sum()),
         mean=float(differences.mean()) if has_mean else math.nan,
-        rounding_error=_rounding_error(differences[np.isfinite(differences)]),
+        rounding_error=_rounding_error(differences[~lost]),
         interval=bootstrap_interval(differences) if has_mean else (math.nan, math.nan),
         median=quantile(differences, 0.5),
         median_error=quantile_error(differences, 0.5),
@@ -194,6 +205,15 @@ def paired(own: Floats, reference: Floats) -> Paired:
 def _differences(own: Floats, reference: Floats) -> Floats:
     both = np.isinf(own) & np.isinf(reference)
     return np.where(both, 0.0, np.where(both, 0.0, own) - np.where(both, 0.0, reference))
+
+
+def _difference_of_case(differences: Floats) -> float:
+    """Mean; with infinite ones infinite to the side that has more of them, and if none has, the mean of the others."""
+    infinite = np.isinf(differences)
+    side = float(np.sign(differences[infinite]).sum())
+    if side:
+        return math.copysign(math.inf, side)
+    return float(differences[~infinite].mean()) if not infinite.all() else 0.0
 
 
 def bootstrap_interval(values: Floats) -> tuple[float, float]:

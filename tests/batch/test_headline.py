@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -118,8 +119,11 @@ def test_one_log_is_not_counted_and_few_seeds_tell_nothing():
 
 
 def test_what_only_all_logs_together_tell_is_no_count_of_logs():
-    batch = drawn_batch(5)
+    batch = drawn_batch(1, logs=tuple("abcdefgh"))
+    assert math.isnan(all_tests(batch, [ATE])["causal.ate_se2_m", ALL_LOGS, "isam2"][1]), "one seed is one case"
+    batch = replace(batch, runs=[replace(run, seed=None) for run in batch.runs])
     tests = all_tests(batch, [ATE])
+    assert tests["causal.ate_se2_m", ALL_LOGS, "isam2"][0].pairs == 8
     assert mark_of(tests["causal.ate_se2_m", ALL_LOGS, "isam2"]) == LOWER
     (told,) = headlines(batch, ATE, tests)
     assert told.endswith("no estimator is told apart from dead-reckoning on any one log.")

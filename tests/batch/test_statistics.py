@@ -205,6 +205,30 @@ def test_failing_where_it_was_worse_makes_nobody_better():
     assert told.smaller <= whole.smaller
 
 
+def test_what_logs_share_by_their_seed_is_no_finding():
+    rng = np.random.default_rng(12)
+    cases = list(range(10)) * 4
+    single, clustered = [], []
+    for _ in range(200):
+        own = np.tile(rng.normal(size=10), 4) + rng.normal(0, 0.3, 40)
+        single.append(paired(own, np.zeros(40)).p_value < 0.05)
+        clustered.append(paired(own, np.zeros(40), cases).p_value < 0.05)
+    assert np.mean(clustered) < 0.05 + 2 * math.sqrt(0.05 * 0.95 / 200)
+    assert np.mean(single) > 0.2, "pairs taken as independent find more: the check can fail"
+
+
+def test_pairs_of_one_case_make_one_difference():
+    own, cases = np.array([1.0, 3.0, INF, 1.0, INF, INF]), [0, 0, 1, 1, "a", "a"]
+    reference = np.array([0.0, 0.0, 5.0, INF, 1.0, INF])
+    told = paired(own, reference, cases)
+    assert (told.pairs, told.without, told.smaller) == (3, 2, 0)
+    assert told.median == 2.0, "of 2, 0 (each failed once) and infinity"
+    assert math.isnan(told.mean)
+    own, reference = np.arange(12.0), np.array([1.0, 0.0] * 6)
+    halves = paired(own, reference, [i // 2 for i in range(12)])
+    assert halves == paired((own - reference).reshape(6, 2).mean(axis=1), np.zeros(6))
+
+
 def test_two_failures_on_one_seed_are_equal():
     told = paired(np.array([INF, 1.0]), np.array([INF, 2.0]))
     assert (told.smaller, told.without, told.median) == (1, 1, -0.5)
