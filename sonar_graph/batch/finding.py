@@ -8,8 +8,8 @@ from collections import Counter
 from sonar_graph.batch.accuracy import SIGNIFICANT, Tests, p_text
 from sonar_graph.batch.catalogue import Metric
 from sonar_graph.batch.recorded import RecordedBatch
-from sonar_graph.batch.rounding import quantile_text, with_error
-from sonar_graph.batch.statistics import least_p, quantile, quantile_error
+from sonar_graph.batch.rounding import quantile_text
+from sonar_graph.batch.statistics import Paired, least_p, quantile, quantile_error
 
 SCORED = "scored_instants"
 NAMED = 3
@@ -85,15 +85,23 @@ def _differences_told(batch: RecordedBatch, log: str, metric: Metric, key: str, 
         test, p_value = tests[key, log, contestant]
         if not p_value < SIGNIFICANT:
             alike.append(contestant)
-        elif math.isfinite(test.mean):
-            size = with_error(abs(test.mean) * metric.factor, test.rounding_error * metric.factor)
-            side = "below" if test.mean < 0 else "above"
-            told.append(f"{contestant} is on average {size} {side} {batch.reference} (p {_p(p_value)}).")
         else:
-            told.append(f"{contestant} differs from {batch.reference} (p {_p(p_value)}).")
+            told.append(f"{contestant} {_side_told(batch, metric, test)} (p {_p(p_value)}).")
     if alike:
         told.append(f"Not told apart from {batch.reference}: {', '.join(alike)}.")
     return told
+
+
+def _side_told(batch: RecordedBatch, metric: Metric, test: Paired) -> str:
+    """What the rank test is about: the side of most differences, not of their mean, which one run can turn."""
+    counted = f"smaller in {test.smaller} of {test.pairs}"
+    if math.isnan(test.median) or test.median == 0:
+        return f"differs from {batch.reference}, {counted}"
+    side = f"is {'below' if test.median < 0 else 'above'} {batch.reference}"
+    if math.isinf(test.median):
+        return f"{side}, {counted}"
+    size = quantile_text(abs(test.median) * metric.factor, test.median_error * metric.factor)
+    return f"{side} by {size} in the median, {counted}"
 
 
 def instants_told(batch: RecordedBatch) -> list[str]:

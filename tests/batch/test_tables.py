@@ -152,7 +152,7 @@ def test_the_finding_names_failures_and_only_differences_beyond_chance():
     metrics = metrics_of(METRICS)
     assert failures_told(batch) == [f"ekf-slam: 3 of 20 runs did not end ({LOGS[1]})."]
     told = errors_told(batch, metrics, all_tests(batch, metrics))
-    assert "isam2 is on average" in told[0]
+    assert "isam2 is below dead-reckoning by " in told[0]
     assert "below dead-reckoning" in told[0]
     alike = changed(batch, "isam2", "causal.ate_se2_m", 4.0)
     assert "Not told apart from dead-reckoning: isam2" in errors_told(alike, metrics, all_tests(alike, metrics))[0]
@@ -162,8 +162,27 @@ def test_the_finding_gives_no_mean_over_survivors():
     batch = with_failures(drawn_batch(18), "isam2", LOGS[0], 1)
     metrics = metrics_of(METRICS)
     told = errors_told(batch, metrics, all_tests(batch, metrics))[0]
-    assert "isam2 differs from dead-reckoning (p = " in told
-    assert "isam2 is on average" not in told
+    differences = np.subtract(*batch.pairs(LOGS[0], "isam2", "causal.ate_se2_m"))
+    found = re.search(r"isam2 is below dead-reckoning by (\S+) in the median, smaller in 17 of 18 \(p ", told)
+    assert float(found[1]) == pytest.approx(-np.median(differences), rel=0.1)
+
+
+def test_the_finding_tells_the_side_of_the_test_and_not_of_a_mean_that_one_run_turned():
+    lost = np.append(np.ones(17), 1e4)
+    batch = changed(drawn_batch(18, logs=LOGS[:1]), "isam2", "causal.ate_se2_m", lost)
+    metrics = metrics_of(METRICS)
+    tests = all_tests(batch, metrics)
+    test, p_value = tests["causal.ate_se2_m", LOGS[0], "isam2"]
+    assert test.mean > 0 > test.median
+    assert p_value < 0.05
+    assert "isam2 is below dead-reckoning by 0." in errors_told(batch, metrics, tests)[0]
+
+
+def test_the_finding_of_who_never_ended_has_a_side_and_no_size():
+    batch = with_failures(drawn_batch(18, logs=LOGS[:1]), "isam2", LOGS[0], 18)
+    metrics = metrics_of(METRICS)
+    told = errors_told(batch, metrics, all_tests(batch, metrics))[0]
+    assert "isam2 is above dead-reckoning, smaller in 0 of 18 (p " in told
 
 
 def test_angles_are_degrees_for_people_and_radians_in_files():
