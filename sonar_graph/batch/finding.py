@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+
+import numpy as np
 
 from sonar_graph.batch.accuracy import SIGNIFICANT, Tests, p_text
 from sonar_graph.batch.catalogue import Metric
 from sonar_graph.batch.recorded import RecordedBatch
 from sonar_graph.batch.rounding import quantile_text
-from sonar_graph.batch.statistics import Paired, least_p, quantile, quantile_error
+from sonar_graph.batch.statistics import LEAST_PAIRS, Paired, holm, least_p, quantile, quantile_error
 
 SCORED = "scored_instants"
 NAMED = 3
@@ -120,18 +121,23 @@ def instants_told(batch: RecordedBatch) -> list[str]:
 
 
 def power_told(tests: Tests) -> list[str]:
-    """A warning where there are too few pairs for any finding."""
-    distinct = {(key.rpartition(".")[2], log, name, id(test)) for (key, log, name), (test, _) in tests.items()}
-    families = Counter(family for family, *_ in distinct)
-    blind = {
-        place[1]: test.pairs
-        for place, (test, _) in tests.items()
-        if least_p(test.pairs) * families[place[0].rpartition(".")[2]] > SIGNIFICANT
-    }
+    """A warning where there are too few pairs for any finding, even if every test of the family were at its best."""
+    families: dict[str, dict[tuple[str, int], Paired]] = {}
+    for (key, log, _), (test, _) in tests.items():
+        families.setdefault(key.rpartition(".")[2], {})[log, id(test)] = test
+    blind: dict[str, int] = {}
+    for family in families.values():
+        best = holm(np.array([_best_p(test.pairs) for test in family.values()]))
+        found = zip(family.items(), best.tolist(), strict=True)
+        blind |= {log: test.pairs for ((log, _), test), p_value in found if not p_value < SIGNIFICANT}
     if not blind:
         return []
     listed = _few([f"{log} ({pairs} pair{'s' * (pairs != 1)})" for log, pairs in blind.items()])
     return [f"Too few pairs for any corrected p value to fall below {SIGNIFICANT:g}: {listed}. Add seeds."]
+
+
+def _best_p(pairs: int) -> float:
+    return least_p(pairs) if pairs >= LEAST_PAIRS else math.nan
 
 
 def _few(names: list[str]) -> str:

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from sonar_graph.batch.accuracy import accuracy_table, all_tests, difference_table
-from sonar_graph.batch.catalogue import Metric, metrics_of
+from sonar_graph.batch.catalogue import KINDS, Metric, metrics_of
 from sonar_graph.batch.exported import as_csv, as_latex, latex_text, write_tables
 from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told, reference_told
 from sonar_graph.batch.headline import head_metric
 from sonar_graph.batch.overviews import consistency_table, cost_table, failure_table, run_lists
-from sonar_graph.batch.recorded import ALL_LOGS
+from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
 from sonar_graph.batch.tables import Cell, Column, Table
 
 from .recorded_batches import LOGS, METRICS, changed, drawn_batch, with_failures
@@ -200,6 +200,25 @@ def test_too_few_seeds_are_warned_of():
     metrics = metrics_of(METRICS)
     assert "4 pairs" in power_told(all_tests(few, metrics))[0]
     assert power_told(all_tests(many, metrics)) == []
+
+
+def uneven_batch(most: int, fewest: int) -> RecordedBatch:
+    """Two logs, of which the second has fewer seeds."""
+    batch = drawn_batch(most)
+    return replace(batch, runs=[run for run in batch.runs if run.log == LOGS[0] or run.seed < fewest])
+
+
+@pytest.mark.parametrize(("fewest", "blind"), [(8, False), (7, True), (5, True)])
+def test_seeds_are_called_too_few_only_where_the_best_differences_find_nothing(fewest, blind):
+    batch = changed(uneven_batch(20, fewest), "isam2", "causal.ate_se2_m", 1e-3)
+    for name, column in (("isam2", "smoothed.ate_se2_m"), *(("ekf-slam", f"{k}.ate_se2_m") for k in KINDS)):
+        batch = changed(batch, name, column, 1e-3)
+    tests = all_tests(batch, [ATE])
+    assert len(tests) == 12
+    assert (tests["causal.ate_se2_m", LOGS[1], "isam2"][1] < 0.05) is not blind
+    told = power_told(tests)
+    assert bool(told) is blind
+    assert not any(LOGS[0] + " (" in one for one in told)
 
 
 def test_a_filters_two_estimates_do_not_ask_for_more_seeds():
