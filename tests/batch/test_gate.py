@@ -130,6 +130,22 @@ def test_a_slower_machine_passes_also_by_a_reference_that_has_times(batch, tmp_p
     assert gate(slower(batch, 4.0), path).passed
 
 
+@pytest.mark.parametrize(("factor", "passes"), [(1.09, True), (1.11, False)])
+def test_consistency_may_move_by_a_tenth(batch, tmp_path, factor, passes):
+    level = replace(batch, runs=[replace(r, values=r.values | {"causal.nees_position": 1.5}) for r in batch.runs])
+    bless(level, tmp_path / "level.json")
+    assert gate(changed(level, "isam2", "causal.nees_position", factor), tmp_path / "level.json").passed is passes
+
+
+@pytest.mark.parametrize(("factor", "passes"), [(1.95, True), (2.05, False)])
+def test_a_run_twice_as_bad_as_the_worst_is_lost(batch, tmp_path, factor, passes):
+    level = replace(batch, runs=[replace(r, values=r.values | {ATE: 0.5}) for r in batch.runs])
+    bless(level, tmp_path / "level.json")
+    factors = np.full(24, 0.8)
+    factors[7] = factor
+    assert gate(changed(level, "isam2", ATE, factors), tmp_path / "level.json").passed is passes
+
+
 def test_missing_runs_are_refused_and_new_ones_named(batch, reference, tmp_path):
     with pytest.raises(
         EvaluationError, match="1 of its runs are not in the batch, first basin, dead-reckoning, seed 0"

@@ -11,8 +11,9 @@ import pytest
 from sonar_graph.batch.accuracy import accuracy_table, all_tests
 from sonar_graph.batch.catalogue import metrics_of
 from sonar_graph.batch.exported import as_csv, as_latex
-from sonar_graph.batch.headline import HIGHER, LOWER, head_metric, headlines, mark_of, overview_table
+from sonar_graph.batch.headline import DIFFERENT, HIGHER, LOWER, head_metric, headlines, mark_of, overview_table
 from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
+from sonar_graph.batch.statistics import paired
 from sonar_graph.batch.tables import Cell, Table
 
 from .recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, with_failures
@@ -59,6 +60,16 @@ def test_arrows_point_to_the_side_of_the_difference_and_only_where_it_is_no_chan
     assert LOWER not in cell_of(table, LOGS[0], "Causal", "ekf-slam").text
     few = overview_of(replace(batch, runs=[run for run in batch.runs if run.seed in (0, 1, 2)]))
     assert not any(arrow in cell.text for row in few.rows for cell in row for arrow in (LOWER, HIGHER))
+
+
+@pytest.mark.parametrize(
+    ("median", "mark"), [(-0.1, LOWER), (0.1, HIGHER), (-math.inf, LOWER), (math.inf, HIGHER), (0.0, DIFFERENT)]
+)
+def test_the_mark_is_of_the_median_and_only_below_five_percent(median, mark):
+    test = replace(paired(np.arange(8.0), np.zeros(8)), mean=-7.0 * median, median=median)
+    assert mark_of((test, 0.049)) == mark
+    assert mark_of((replace(test, median=math.nan), 0.049)) == DIFFERENT
+    assert mark_of((test, 0.05)) == mark_of((test, math.nan)) == mark_of(None) == ""
 
 
 def test_a_filter_has_no_smoothed_column_and_the_reference_is_named():

@@ -9,7 +9,22 @@ from hypothesis import strategies as st
 from sonar_graph.batch.rounding import between, decimals_of, quantile_text, supported, with_error
 
 
-@pytest.mark.parametrize(("error", "decimals"), [(0.034, 2), (0.012, 3), (340.0, -2), (1.0, 1), (0.2, 1), (9.9e-5, 5)])
+@pytest.mark.parametrize(
+    ("error", "decimals"),
+    [
+        (0.034, 2),
+        (0.012, 3),
+        (340.0, -2),
+        (1.0, 1),
+        (0.2, 1),
+        (9.9e-5, 5),
+        (1.99, 1),
+        (2.0, 0),
+        (0.3, 1),
+        (1e-3, 4),
+        (2e-3, 3),
+    ],
+)
 def test_digits_end_where_the_standard_error_begins(error, decimals):
     assert decimals_of(error) == decimals
 

@@ -112,6 +112,25 @@ def test_bootstrap_interval_holds_the_mean_as_often_as_it_says():
     assert np.mean(np.abs(middle - 0.3) < half) < 0.8, "intervals half as wide do not: the check can fail"
 
 
+def test_bootstrap_interval_is_corrected_for_bias_and_skewness():
+    values = np.random.default_rng(13).lognormal(0, 1.2, 20)
+    low, high = bootstrap_interval(values)
+    draws = np.random.default_rng(0).choice(values, (20000, 20)).mean(axis=1)
+    plain_low, plain_high = np.quantile(draws, [0.025, 0.975])
+    scatter = draws.std()
+    assert low - plain_low > 0.1 * scatter
+    assert high - plain_high > 0.2 * scatter
+    whole = stats.bootstrap((values,), np.mean, n_resamples=20000, method="BCa", rng=np.random.default_rng(0))
+    assert [low, high] == pytest.approx(list(whole.confidence_interval), abs=0.1 * scatter)
+
+
+def test_signed_rank_p_of_many_with_a_zero_is_by_changes_of_sign():
+    differences = np.append(0.0, np.arange(1.0, 8.0))
+    assert signed_rank_p(differences) == pytest.approx(2 * 0.5**7)
+    mixed = np.array([0.0, 1.0, -2.0, 3.0, 4.0, 5.0, 6.0])
+    assert signed_rank_p(mixed) == pytest.approx(enumerated_p(mixed))
+
+
 def test_bootstrap_interval_of_equal_differences_is_a_point_and_of_few_unknown():
     assert bootstrap_interval(np.full(8, 0.25)) == (0.25, 0.25)
     assert math.isnan(bootstrap_interval(np.arange(5.0))[0])
