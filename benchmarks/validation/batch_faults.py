@@ -27,9 +27,10 @@ import pyarrow.parquet as pq
 from common import conclude, make_parser, note, print_table
 
 from sonar_graph.batch.batch import Batch
+from sonar_graph.batch.catalogue import is_timing
 from sonar_graph.batch.execution import Where
 from sonar_graph.batch.planned import Limits, Outcome
-from sonar_graph.batch.results import RESULTS, is_timing
+from sonar_graph.batch.results import RESULTS
 from sonar_graph.batch.store import Store
 from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import BatchError

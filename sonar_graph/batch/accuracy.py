@@ -8,7 +8,7 @@ import numpy as np
 
 from sonar_graph.batch.catalogue import Metric
 from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
-from sonar_graph.batch.rounding import between, supported, with_error
+from sonar_graph.batch.rounding import between, quantile_text, supported, with_error
 from sonar_graph.batch.statistics import Paired, Summary, holm, paired, summarise
 from sonar_graph.batch.tables import Cell, Column, Table, absent, number, words
 
@@ -19,7 +19,7 @@ Tests = dict[tuple[str, str, str], tuple[Paired, float]]
 
 
 def all_tests(batch: RecordedBatch, metrics: list[Metric]) -> Tests:
-    """Every contestant against the reference in every metric that has a better side; a metric is a family of tests."""
+    """Every contestant against the reference in every error; a metric is a family of tests."""
     tests: Tests = {}
     for metric in metrics:
         if metric.is_error:
@@ -37,9 +37,16 @@ def _family(batch: RecordedBatch, metric: Metric) -> Tests:
         if contestant != batch.reference and len(batch.pairs(log, contestant, key)[0])
     }
     same = {place: (*place[1:], own.tobytes(), other.tobytes()) for place, (own, other) in found.items()}
-    distinct = {same[place]: paired(*pair) for place, pair in found.items()}
+    first = {same[place]: place for place in reversed(found)}
+    distinct = {numbers: _tested(batch, *first[numbers]) for numbers in dict.fromkeys(same.values())}
     corrected = dict(zip(distinct, holm(np.array([test.p_value for test in distinct.values()])).tolist(), strict=True))
     return {place: (distinct[same[place]], corrected[same[place]]) for place in found}
+
+
+def _tested(batch: RecordedBatch, key: str, log: str, contestant: str) -> Paired:
+    """The test of one column; of all logs together one difference a seed."""
+    cases = batch.cases(log, contestant, key) if log == ALL_LOGS else None
+    return paired(*batch.pairs(log, contestant, key), cases)
 
 
 def _compared_logs(batch: RecordedBatch) -> list[str]:
@@ -125,14 +132,15 @@ def _summary_cells(batch: RecordedBatch, log: str, contestant: str, key: str, me
 def summary_cells(told: Summary, factor: float = 1.0) -> list[Cell]:
     """Mean with its error, median, and range of the middle 80 %."""
     note = f"{told.without} of {told.runs} without a value" if told.without else ""
-    error = told.rounding_error * factor
     mean = number(
         told.mean, with_error(told.mean * factor, told.standard_error * factor), told.standard_error, note=note
     )
-    median = number(told.median, supported(told.median * factor, error))
+    median = number(told.median, quantile_text(told.median * factor, told.median_error * factor))
     if told.runs == 1:
         return [mean, median, absent(2)]
-    return [mean, median, number(told.low, between(told.low * factor, told.high * factor, error), told.high)]
+    low = quantile_text(told.low * factor, told.low_error * factor)
+    high = quantile_text(told.high * factor, told.high_error * factor)
+    return [mean, median, number(told.low, f"{low} to {high}", told.high)]
 
 
 def _pairs_cell(metric: Metric, tests: Tests, log: str, contestant: str) -> Cell:
@@ -150,7 +158,7 @@ def _difference_cells(found: tuple[Paired, float] | None, metric: Metric) -> lis
     note = "" if math.isnan(low) else between(low * factor, high * factor, error)
     return [
         number(test.mean, supported(test.mean * factor, error), low, high, note=note),
-        number(test.median, _median(test.median * factor, error)),
+        number(test.median, _median(test.median * factor, test.median_error * factor)),
         Cell(f"{test.smaller} of {test.pairs}", (test.smaller,)),
         number(p_holm, p_text(p_holm), test.p_value),
     ]
@@ -159,7 +167,7 @@ def _difference_cells(found: tuple[Paired, float] | None, metric: Metric) -> lis
 def _median(value: float, error: float) -> str:
     if math.isinf(value):
         return "worse: no value" if value > 0 else "better: reference has no value"
-    return supported(value, error)
+    return quantile_text(value, error)
 
 
 def p_text(p_value: float) -> str:

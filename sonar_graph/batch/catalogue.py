@@ -29,6 +29,11 @@ PROTOCOLS = {
 HIGHER_IS_BETTER = {"real_time_factor"}
 NO_BETTER = {"count", "used", "refused", "unnamed"}
 INSIDE = {"nees", "nis", "nees_position", "nees_yaw"}
+TIMINGS = (
+    *("wall_s", "read_s", "estimate_s", "cpu_s", "peak_memory_mb"),
+    *("update_p50_ms", "update_p99_ms", "finish_s"),
+)
+"""Columns of the results that every run has, of time and memory."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +76,11 @@ class Metric:
 
     @property
     def is_error(self) -> bool:
-        """Whether smaller is better, so that differences can be called better and worse."""
-        return self.direction == "lower is better"
+        """Whether smaller is better and the same run always gives it, so that differences can be tested.
+
+        Time and memory depend on the machine and on what else it does: they are shown, and not tested.
+        """
+        return self.direction == "lower is better" and not any(map(is_timing, self.keys.values()))
 
     @property
     def protocol(self) -> str:
@@ -81,6 +89,11 @@ class Metric:
         if set(self.keys) <= {""}:
             return said
         return f"{said} Separately for the causal and the smoothed estimate."
+
+
+def is_timing(column: str) -> bool:
+    """Whether a column may differ between two runs of the same: time and memory."""
+    return column in TIMINGS or column.startswith(("time.", "memory."))
 
 
 def metrics_of(keys: list[str]) -> list[Metric]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+
+import numpy as np
 
 from sonar_graph.batch.accuracy import SIGNIFICANT, Tests, p_text
 from sonar_graph.batch.catalogue import Metric
 from sonar_graph.batch.recorded import RecordedBatch
-from sonar_graph.batch.rounding import supported, with_error
-from sonar_graph.batch.statistics import least_p, quantile, summarise
+from sonar_graph.batch.rounding import quantile_text
+from sonar_graph.batch.statistics import LEAST_PAIRS, Paired, holm, least_p, quantile, quantile_error
 
 SCORED = "scored_instants"
 NAMED = 3
@@ -26,6 +27,18 @@ def failures_told(batch: RecordedBatch) -> list[str]:
             logs = _few(list(dict.fromkeys(run.log for run in failed)))
             sentences.append(f"{contestant}: {len(failed)} of {len(runs)} runs did not end ({logs}).")
     return sentences
+
+
+def reference_told(batch: RecordedBatch) -> list[str]:
+    """A warning where the reference never ended: then differences tell of its failure and of nothing else."""
+    groups = {log: batch.group(log, batch.reference) for log in batch.logs}
+    lost = [log for log, group in groups.items() if group and not any(run.ended for run in group)]
+    if not lost:
+        return []
+    return [
+        f"The reference {batch.reference} never ended on {_few(lost)}: whoever ended is better there, by no known "
+        "amount."
+    ]
 
 
 def errors_told(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> list[str]:
@@ -50,12 +63,12 @@ def errors_told(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> li
 
 def _log_told(batch: RecordedBatch, log: str, metric: Metric, key: str, tests: Tests) -> str:
     medians = [
-        (quantile(values, 0.5), name, summarise(values).rounding_error * metric.factor)
+        (quantile(values, 0.5), name, quantile_error(values, 0.5) * metric.factor)
         for name in batch.contestants
         if len(values := batch.values(log, name, key))
     ]
     listed = ", ".join(
-        f"{name} {supported(value * metric.factor, error)}"
+        f"{name} {quantile_text(value * metric.factor, error)}"
         for value, name, error in sorted(medians)
         if value < math.inf
     )
@@ -73,15 +86,23 @@ def _differences_told(batch: RecordedBatch, log: str, metric: Metric, key: str, 
         test, p_value = tests[key, log, contestant]
         if not p_value < SIGNIFICANT:
             alike.append(contestant)
-        elif math.isfinite(test.mean):
-            size = with_error(abs(test.mean) * metric.factor, test.rounding_error * metric.factor)
-            side = "below" if test.mean < 0 else "above"
-            told.append(f"{contestant} is on average {size} {side} {batch.reference} (p {_p(p_value)}).")
         else:
-            told.append(f"{contestant} differs from {batch.reference} (p {_p(p_value)}).")
+            told.append(f"{contestant} {_side_told(batch, metric, test)} (p {_p(p_value)}).")
     if alike:
         told.append(f"Not told apart from {batch.reference}: {', '.join(alike)}.")
     return told
+
+
+def _side_told(batch: RecordedBatch, metric: Metric, test: Paired) -> str:
+    """What the rank test is about: the side of most differences, not of their mean, which one run can turn."""
+    counted = f"smaller in {test.smaller} of {test.pairs}"
+    if math.isnan(test.median) or test.median == 0:
+        return f"differs from {batch.reference}, {counted}"
+    side = f"is {'below' if test.median < 0 else 'above'} {batch.reference}"
+    if math.isinf(test.median):
+        return f"{side}, {counted}"
+    size = quantile_text(abs(test.median) * metric.factor, test.median_error * metric.factor)
+    return f"{side} by {size} in the median, {counted}"
 
 
 def instants_told(batch: RecordedBatch) -> list[str]:
@@ -100,18 +121,23 @@ def instants_told(batch: RecordedBatch) -> list[str]:
 
 
 def power_told(tests: Tests) -> list[str]:
-    """A warning where there are too few pairs for any finding."""
-    distinct = {(key.rpartition(".")[2], log, name, id(test)) for (key, log, name), (test, _) in tests.items()}
-    families = Counter(family for family, *_ in distinct)
-    blind = {
-        place[1]: test.pairs
-        for place, (test, _) in tests.items()
-        if least_p(test.pairs) * families[place[0].rpartition(".")[2]] > SIGNIFICANT
-    }
+    """A warning where there are too few pairs for any finding, even if every test of the family were at its best."""
+    families: dict[str, dict[tuple[str, int], Paired]] = {}
+    for (key, log, _), (test, _) in tests.items():
+        families.setdefault(key.rpartition(".")[2], {})[log, id(test)] = test
+    blind: dict[str, int] = {}
+    for family in families.values():
+        best = holm(np.array([_best_p(test.pairs) for test in family.values()]))
+        found = zip(family.items(), best.tolist(), strict=True)
+        blind |= {log: test.pairs for ((log, _), test), p_value in found if not p_value < SIGNIFICANT}
     if not blind:
         return []
     listed = _few([f"{log} ({pairs} pair{'s' * (pairs != 1)})" for log, pairs in blind.items()])
     return [f"Too few pairs for any corrected p value to fall below {SIGNIFICANT:g}: {listed}. Add seeds."]
+
+
+def _best_p(pairs: int) -> float:
+    return least_p(pairs) if pairs >= LEAST_PAIRS else math.nan
 
 
 def _few(names: list[str]) -> str:

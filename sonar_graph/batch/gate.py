@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from sonar_graph.batch.catalogue import KINDS, metrics_of
+from sonar_graph.batch.catalogue import KINDS, is_timing, metrics_of
 from sonar_graph.batch.recorded import RecordedBatch, RecordedRun
 from sonar_graph.batch.statistics import holm
 from sonar_graph.errors import EvaluationError
@@ -106,8 +106,13 @@ def gate(batch: RecordedBatch, reference: Path) -> Verdict:
             "suite, or bless a new reference"
         )
     pairs = [(entry, runs[name]) for name, entry in blessed["runs"].items()]
-    worse = [*_failures(pairs), *_worse_groups(pairs, blessed["metrics"])]
+    worse = [*_failures(pairs), *_worse_groups(pairs, _judged(blessed["metrics"]))]
     return Verdict(worse, len(pairs), [_told(name) for name in runs if name not in blessed["runs"]])
+
+
+def _judged(keys: list[str]) -> list[str]:
+    """Columns of a reference without time and memory, which one of an earlier version may have."""
+    return [key for key in keys if not is_timing(key)]
 
 
 def _entry(run: RecordedRun, keys: list[str]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import numpy as np
 from sonar_graph.batch.accuracy import SIGNIFICANT, Tests
 from sonar_graph.batch.catalogue import Metric
 from sonar_graph.batch.recorded import RecordedBatch
-from sonar_graph.batch.rounding import supported
+from sonar_graph.batch.rounding import quantile_text
 from sonar_graph.batch.statistics import Paired, summarise
 from sonar_graph.batch.tables import Cell, Column, Table, absent, number, words
 
@@ -115,6 +115,6 @@ def _median_cell(batch: RecordedBatch, metric: Metric, tests: Tests, place: tupl
         return absent(2)
     told = summarise(batch.values(log, contestant, key))
     found = tests.get(place)
-    text = supported(told.median * metric.factor, told.rounding_error * metric.factor)
+    text = quantile_text(told.median * metric.factor, told.median_error * metric.factor)
     note = f"{told.without} of {told.runs} without a value" if told.without else ""
     return number(told.median, f"{text} {mark_of(found)}".rstrip(), found[1] if found else math.nan, note=note)

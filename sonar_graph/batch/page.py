@@ -24,7 +24,7 @@ from sonar_graph.batch.figures import (
     failure_drawing,
     spread_drawing,
 )
-from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told
+from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told, reference_told
 from sonar_graph.batch.headline import head_metric, headlines, overview_table
 from sonar_graph.batch.overviews import consistency_table, cost_table, failure_table, run_lists
 from sonar_graph.batch.recorded import RESULTS, RecordedBatch
@@ -105,7 +105,7 @@ def _content(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> dict[
         "description": batch.description,
         "summary": _summary(batch),
         "failed": failures_told(batch),
-        "warnings": [*instants_told(batch), *power_told(tests)],
+        "warnings": [*reference_told(batch), *instants_told(batch), *power_told(tests)],
         "headlines": headlines(batch, head, tests) if head else [],
         "overview": overview,
         "log_findings": errors_told(batch, metrics, tests),

@@ -93,6 +93,10 @@ class RecordedBatch:
         return {(key, run.contestant) for run in self.runs if run.ended for key in run.values}
 
     @cached_property
+    def _ended_contestants(self) -> set[str]:
+        return {run.contestant for run in self.runs if run.ended}
+
+    @cached_property
     def logs(self) -> list[str]:
         """Names of logs, in the order of the runs."""
         return list(dict.fromkeys(run.log for run in self.runs))
@@ -116,21 +120,33 @@ class RecordedBatch:
         With `ALL_LOGS` those of every log. Logs on which either cannot have the score have no pairs.
         """
         logs = self.logs if log == ALL_LOGS else [log]
-        both = np.array([pair for one in logs for pair in self._pairs_on(one, contestant, key)]).reshape(-1, 2)
-        return both[:, 0], both[:, 1]
+        both = [pair for one in logs for pair in self._pairs_on(one, contestant, key)]
+        values = np.array([(own.value(key), other.value(key)) for own, other in both]).reshape(-1, 2)
+        return values[:, 0], values[:, 1]
 
-    def _pairs_on(self, log: str, contestant: str, key: str) -> list[tuple[float, float]]:
+    def cases(self, log: str, contestant: str, key: str) -> list[str | int]:
+        """What each of `pairs` is a case of: its seed, and where there is none its log.
+
+        Pairs with one seed on several logs depend on each other: worlds of a grid share what the seed drew.
+        """
+        logs = self.logs if log == ALL_LOGS else [log]
+        runs = [own for one in logs for own, _ in self._pairs_on(one, contestant, key)]
+        return [run.log if run.seed is None else run.seed for run in runs]
+
+    def _pairs_on(self, log: str, contestant: str, key: str) -> list[tuple[RecordedRun, RecordedRun]]:
         if not all(self.is_asked(log, name, key) for name in (contestant, self.reference)):
             return []
-        reference = {run.seed: run.value(key) for run in self.group(log, self.reference)}
-        return [(run.value(key), reference[run.seed]) for run in self.group(log, contestant) if run.seed in reference]
+        reference = {run.seed: run for run in self.group(log, self.reference)}
+        return [(run, reference[run.seed]) for run in self.group(log, contestant) if run.seed in reference]
 
     def is_asked(self, log: str, contestant: str, key: str) -> bool:
         """Whether a score can be expected: the log has it for somebody, and the contestant on some log.
 
-        A dead reckoning has no map and a log without truth no errors; neither is a failure.
+        A dead reckoning has no map and a log without truth no errors; neither is a failure. Of a contestant that never
+        ended nobody knows what it would have, so everything is expected of it.
         """
-        return (key, log) in self._log_scores and (key, contestant) in self._contestant_scores
+        is_known = (key, contestant) in self._contestant_scores or contestant not in self._ended_contestants
+        return (key, log) in self._log_scores and is_known
 
 
 def is_batch(folder: Path) -> bool:

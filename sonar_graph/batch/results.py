@@ -14,6 +14,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from sonar_graph.batch.catalogue import TIMINGS
 from sonar_graph.batch.planned import PlannedRun, Row
 from sonar_graph.batch.store import Store
 from sonar_graph.batch.suite import Suite
@@ -24,10 +25,6 @@ SUITE_METADATA = b"sonar_graph.suite"
 TEXTS = ("key", "suite", "log", "generator", "options")
 SETTINGS = ("variant", "params", "estimator", "status", "reason", "log_file")
 VERSIONS = ("sonar_graph", "source", "estimator_source", "gtsam", "numpy", "scipy", "numba", "python", "machine")
-TIMINGS = (
-    *("wall_s", "read_s", "estimate_s", "cpu_s", "peak_memory_mb"),
-    *("update_p50_ms", "update_p99_ms", "finish_s"),
-)
 COLUMNS: dict[str, pa.DataType] = {
     **dict.fromkeys(TEXTS, pa.string()),
     "seed": pa.int64(),
@@ -37,11 +34,6 @@ COLUMNS: dict[str, pa.DataType] = {
     **dict.fromkeys(TIMINGS, pa.float64()),
     "scored_instants": pa.int64(),
 }
-
-
-def is_timing(column: str) -> bool:
-    """Whether a column may differ between two runs of the same: time and memory."""
-    return column in TIMINGS or column.startswith(("time.", "memory."))
 
 
 def write_results(store: Store, suite: Suite, runs: list[PlannedRun]) -> Path:

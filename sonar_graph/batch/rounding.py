@@ -7,6 +7,8 @@ import math
 from sonar_graph.evaluation.wording import ABSENT, format_value
 
 MOST_DECIMALS = 12
+LEAST_DIGITS = 2
+"""Of a value that stands without its error: with fewer it may look like nothing at all."""
 MINUS = "\N{MINUS SIGN}"
 
 
@@ -31,6 +33,20 @@ def supported(value: float, standard_error: float) -> str:
     if not math.isfinite(value) or not math.isfinite(standard_error) or standard_error <= 0:
         return shown(value)
     return fixed(value, decimals_of(standard_error))
+
+
+def quantile_text(value: float, error: float) -> str:
+    """A median or another quantile, rounded where its error begins, but with two significant digits at least.
+
+    Examples
+    --------
+    >>> quantile_text(0.123456, 0.0034), quantile_text(0.123456, 40.0), quantile_text(0.123456, float("nan"))
+    ('0.123', '0.12', '0.123')
+    """
+    if not math.isfinite(value) or not math.isfinite(error) or error <= 0:
+        return shown(value)
+    least = LEAST_DIGITS - 1 - math.floor(math.log10(abs(value))) if value else 0
+    return fixed(value, min(MOST_DECIMALS, max(decimals_of(error), least)))
 
 
 def with_error(value: float, standard_error: float) -> str:

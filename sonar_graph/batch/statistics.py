@@ -9,6 +9,7 @@ Equations: docs/theory/batch_statistics.md.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,11 +40,13 @@ class Summary:
     """NaN where a run has no value."""
     standard_error: float
     """Of the mean; NaN for one run."""
-    rounding_error: float
-    """Digits beyond it mean nothing: the standard error of those runs that have a value, for few not below 1 %."""
     median: float
     low: float
     high: float
+    median_error: float
+    """Of the median, `quantile_error`; digits beyond it mean nothing."""
+    low_error: float
+    high_error: float
 
 
 @dataclass(frozen=True)
@@ -67,11 +70,13 @@ class Paired:
     mean: float
     """NaN where a pair is without a value."""
     rounding_error: float
-    """Digits beyond it mean nothing: the standard error of pairs that have a value, for few not below 1 %."""
+    """Of the mean: the standard error of pairs that have a value, for few not below 1 %."""
     interval: tuple[float, float]
     """Of the mean, bootstrap; NaN where there are too few pairs or no mean."""
     median: float
     """Infinite where half of the pairs have no value on one side; NaN where nothing can be said."""
+    median_error: float
+    """Of the median, `quantile_error`."""
     p_value: float
     """Of the two-sided signed-rank test, not corrected; NaN of too few pairs."""
 
@@ -108,10 +113,12 @@ def summarise(values: Floats) -> Summary:
         without=without,
         mean=float(values.mean()) if has_mean else math.nan,
         standard_error=standard_error(values),
-        rounding_error=_rounding_error(values[np.isfinite(values)]),
         median=median,
         low=low,
         high=high,
+        median_error=quantile_error(values, 0.5),
+        low_error=quantile_error(values, LOW),
+        high_error=quantile_error(values, HIGH),
     )
 
 
@@ -124,6 +131,24 @@ def quantile(values: Floats, share: float) -> float:
     if below == above or not math.isfinite(above):
         return above
     return below + (place - math.floor(place)) * (above - below) if math.isfinite(below) else below
+
+
+def quantile_error(values: Floats, share: float) -> float:
+    """Standard error of a quantile, without assuming a distribution; NaN of one value or where it is infinite.
+
+    The number of values below the true quantile is binomial with deviation ``sqrt(n q (1 - q))``; the error is half the
+    distance between the order statistics that many places below and above (David, Nagaraja 2003, section 7.1). Where
+    the upper one is infinite it is the distance to the lower one. Of few values it is at least a hundredth of the
+    quantile, as two may agree by chance.
+    """
+    n, middle = len(values), quantile(values, share)
+    if n < 2 or not math.isfinite(middle):
+        return math.nan
+    places = math.sqrt(n * share * (1 - share)) / (n - 1)
+    below, above = quantile(values, max(0.0, share - places)), quantile(values, min(1.0, share + places))
+    sides = [abs(side - middle) for side in (below, above) if math.isfinite(side)]
+    error = sum(sides) / len(sides) if sides else math.nan
+    return max(error, 0.01 * abs(middle)) if n < LEAST_PAIRS else error
 
 
 def standard_error(values: Floats) -> float:
@@ -146,22 +171,33 @@ def failure_rate(failed: int, runs: int) -> Rate:
     return Rate(failed / runs, float(interval.low), float(interval.high))
 
 
-def paired(own: Floats, reference: Floats) -> Paired:
+def paired(own: Floats, reference: Floats, cases: Sequence[str | int] | None = None) -> Paired:
     """Differences own minus reference, each shape (n,), infinity where a run has no value.
 
     A run without a value is worse than any with one; where both have none they are equal.
+
+    Parameters
+    ----------
+    cases
+        What each pair is a case of. Pairs of one case depend on each other and make one difference, their mean. None:
+        each pair is its own.
     """
-    differences = _differences(own, reference)
-    without = int((np.isinf(own) | np.isinf(reference)).sum())
+    differences, lost = _differences(own, reference), np.isinf(own) | np.isinf(reference)
+    if cases is not None:
+        members = [np.array([one == case for one in cases]) for case in dict.fromkeys(cases)]
+        differences = np.array([_difference_of_case(differences[which]) for which in members])
+        lost = np.array([lost[which].any() for which in members], dtype=bool)
+    without = int(lost.sum())
     has_mean = len(differences) > 0 and not without
     return Paired(
         pairs=len(differences),
         without=without,
         smaller=int((differences < 0).sum()),
         mean=float(differences.mean()) if has_mean else math.nan,
-        rounding_error=_rounding_error(differences[np.isfinite(differences)]),
+        rounding_error=_rounding_error(differences[~lost]),
         interval=bootstrap_interval(differences) if has_mean else (math.nan, math.nan),
         median=quantile(differences, 0.5),
+        median_error=quantile_error(differences, 0.5),
         p_value=signed_rank_p(differences),
     )
 
@@ -169,6 +205,15 @@ def paired(own: Floats, reference: Floats) -> Paired:
 def _differences(own: Floats, reference: Floats) -> Floats:
     both = np.isinf(own) & np.isinf(reference)
     return np.where(both, 0.0, np.where(both, 0.0, own) - np.where(both, 0.0, reference))
+
+
+def _difference_of_case(differences: Floats) -> float:
+    """Mean; with infinite ones infinite to the side that has more of them, and if none has, the mean of the others."""
+    infinite = np.isinf(differences)
+    side = float(np.sign(differences[infinite]).sum())
+    if side:
+        return math.copysign(math.inf, side)
+    return float(differences[~infinite].mean()) if not infinite.all() else 0.0
 
 
 def bootstrap_interval(values: Floats) -> tuple[float, float]:

@@ -11,10 +11,11 @@ import pytest
 
 from sonar_graph.batch import batch as batch_module
 from sonar_graph.batch.batch import Batch, limits_of
+from sonar_graph.batch.catalogue import is_timing
 from sonar_graph.batch.execution import Where
 from sonar_graph.batch.one_run import perform
 from sonar_graph.batch.planned import Limits, Outcome, PlannedRun
-from sonar_graph.batch.results import RESULTS, is_timing
+from sonar_graph.batch.results import RESULTS
 from sonar_graph.batch.store import Store
 from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import BatchError

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -109,6 +110,40 @@ def test_single_runs_are_judged_by_a_wide_limit(tmp_path):
     bless(batch, tmp_path / "reference.json")
     assert gate(changed(batch, "isam2", ATE, 1.2), tmp_path / "reference.json").passed
     assert not gate(changed(batch, "isam2", ATE, 1.3), tmp_path / "reference.json").passed
+
+
+def slower(batch: RecordedBatch, factor: float) -> RecordedBatch:
+    """The batch, on a machine that takes so many times as long."""
+    runs = [replace(run, values=run.values | {"time.total_s": factor * (3 + 0.1 * run.seed)}) for run in batch.runs]
+    return replace(batch, runs=runs, metrics=[ATE, "time.total_s"])
+
+
+def test_a_slower_machine_passes_also_by_a_reference_that_has_times(batch, tmp_path):
+    path = tmp_path / "reference.json"
+    bless(slower(batch, 1.0), path)
+    assert "time.total_s" not in path.read_text()
+    content = json.loads(path.read_text())
+    content["metrics"].append("time.total_s")
+    for entry, run in zip(content["runs"], slower(batch, 1.0).runs, strict=True):
+        entry["scores"]["time.total_s"] = run.values["time.total_s"]
+    path.write_text(json.dumps(content))
+    assert gate(slower(batch, 4.0), path).passed
+
+
+@pytest.mark.parametrize(("factor", "passes"), [(1.09, True), (1.11, False)])
+def test_consistency_may_move_by_a_tenth(batch, tmp_path, factor, passes):
+    level = replace(batch, runs=[replace(r, values=r.values | {"causal.nees_position": 1.5}) for r in batch.runs])
+    bless(level, tmp_path / "level.json")
+    assert gate(changed(level, "isam2", "causal.nees_position", factor), tmp_path / "level.json").passed is passes
+
+
+@pytest.mark.parametrize(("factor", "passes"), [(1.95, True), (2.05, False)])
+def test_a_run_twice_as_bad_as_the_worst_is_lost(batch, tmp_path, factor, passes):
+    level = replace(batch, runs=[replace(r, values=r.values | {ATE: 0.5}) for r in batch.runs])
+    bless(level, tmp_path / "level.json")
+    factors = np.full(24, 0.8)
+    factors[7] = factor
+    assert gate(changed(level, "isam2", ATE, factors), tmp_path / "level.json").passed is passes
 
 
 def test_missing_runs_are_refused_and_new_ones_named(batch, reference, tmp_path):

@@ -2,16 +2,18 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sonar_graph.batch.accuracy import all_tests
+from sonar_graph.batch.accuracy import accuracy_table, all_tests
 from sonar_graph.batch.catalogue import metrics_of
 from sonar_graph.batch.exported import as_csv, as_latex
-from sonar_graph.batch.headline import HIGHER, LOWER, head_metric, headlines, mark_of, overview_table
+from sonar_graph.batch.headline import DIFFERENT, HIGHER, LOWER, head_metric, headlines, mark_of, overview_table
 from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
+from sonar_graph.batch.statistics import paired
 from sonar_graph.batch.tables import Cell, Table
 
 from .recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, with_failures
@@ -60,6 +62,16 @@ def test_arrows_point_to_the_side_of_the_difference_and_only_where_it_is_no_chan
     assert not any(arrow in cell.text for row in few.rows for cell in row for arrow in (LOWER, HIGHER))
 
 
+@pytest.mark.parametrize(
+    ("median", "mark"), [(-0.1, LOWER), (0.1, HIGHER), (-math.inf, LOWER), (math.inf, HIGHER), (0.0, DIFFERENT)]
+)
+def test_the_mark_is_of_the_median_and_only_below_five_percent(median, mark):
+    test = replace(paired(np.arange(8.0), np.zeros(8)), mean=-7.0 * median, median=median)
+    assert mark_of((test, 0.049)) == mark
+    assert mark_of((replace(test, median=math.nan), 0.049)) == DIFFERENT
+    assert mark_of((test, 0.05)) == mark_of((test, math.nan)) == mark_of(None) == ""
+
+
 def test_a_filter_has_no_smoothed_column_and_the_reference_is_named():
     table = overview_of(without_smoothing(drawn_batch(), "ekf-slam"))
     smoothed = [column.contestant for column in table.columns if column.over == "Smoothed"]
@@ -71,6 +83,21 @@ def test_a_median_over_failed_runs_says_so():
     cell = cell_of(overview_of(with_failures(drawn_batch(), "isam2", LOGS[0], 6)), LOGS[0], "Causal", "isam2")
     assert cell.text.startswith("no value")
     assert cell.note == "6 of 10 without a value"
+
+
+def test_a_median_keeps_its_digits_beside_a_run_that_lost_its_way():
+    batch = changed(drawn_batch(logs=LOGS[:1]), "isam2", "causal.ate_se2_m", np.append(np.ones(9), 1e5))
+    shown = float(cell_of(overview_of(batch), LOGS[0], "Causal", "isam2").text.split()[0])
+    assert shown == pytest.approx(np.median(batch.values(LOGS[0], "isam2", "causal.ate_se2_m")), rel=0.1)
+    row = next(row for row in accuracy_table(batch, ATE).rows if row[1].text == "isam2")
+    assert float(row[4].text) == shown
+    assert 0 < float(row[5].text.partition(" to ")[0]) <= shown
+
+
+def test_who_never_ended_is_higher_than_the_reference_and_not_left_out():
+    batch = with_failures(drawn_batch(logs=LOGS[:1]), "isam2", LOGS[0], 10)
+    assert cell_of(overview_of(batch), LOGS[0], "Causal", "isam2").text == f"no value {HIGHER}"
+    assert "higher with isam2" in headlines(batch, ATE, all_tests(batch, [ATE]))[0]
 
 
 def test_the_sentence_counts_logs():
@@ -103,8 +130,11 @@ def test_one_log_is_not_counted_and_few_seeds_tell_nothing():
 
 
 def test_what_only_all_logs_together_tell_is_no_count_of_logs():
-    batch = drawn_batch(5)
+    batch = drawn_batch(1, logs=tuple("abcdefgh"))
+    assert math.isnan(all_tests(batch, [ATE])["causal.ate_se2_m", ALL_LOGS, "isam2"][1]), "one seed is one case"
+    batch = replace(batch, runs=[replace(run, seed=None) for run in batch.runs])
     tests = all_tests(batch, [ATE])
+    assert tests["causal.ate_se2_m", ALL_LOGS, "isam2"][0].pairs == 8
     assert mark_of(tests["causal.ate_se2_m", ALL_LOGS, "isam2"]) == LOWER
     (told,) = headlines(batch, ATE, tests)
     assert told.endswith("no estimator is told apart from dead-reckoning on any one log.")

@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -59,6 +60,17 @@ def test_a_score_that_a_contestant_never_has_is_no_failure():
     assert not batch.is_asked(LOGS[0], "dead-reckoning", "landmarks.se2_m")
     assert batch.is_asked(LOGS[0], "isam2", "landmarks.se2_m")
     assert len(batch.pairs(LOGS[0], "isam2", "landmarks.se2_m")[0]) == 0
+
+
+def test_a_contestant_that_never_ended_is_compared_as_one_that_failed():
+    batch = drawn_batch(6)
+    for log in LOGS:
+        batch = with_failures(batch, "isam2", log, 6)
+    own, reference = batch.pairs(LOGS[0], "isam2", "causal.ate_se2_m")
+    assert np.isinf(own).tolist() == [True] * 6
+    assert np.isfinite(reference).all()
+    assert not batch.is_asked(LOGS[0], "isam2", "depth_m"), "nobody has it"
+    assert not batch.is_asked(LOGS[0], "dead-reckoning", "landmarks.se2_m"), "it ended, and has no map"
 
 
 def test_another_reference_can_be_chosen_and_an_unknown_one_is_refused(tmp_path):

@@ -6,9 +6,10 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from sonar_graph.batch.catalogue import is_timing
 from sonar_graph.batch.plan import plan_runs
 from sonar_graph.batch.planned import Outcome
-from sonar_graph.batch.results import COLUMNS, SUITE_METADATA, is_timing, write_results
+from sonar_graph.batch.results import COLUMNS, SUITE_METADATA, write_results
 from sonar_graph.batch.store import Store
 from sonar_graph.batch.suite import read_suite
 

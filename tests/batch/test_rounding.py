@@ -6,10 +6,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.batch.rounding import between, decimals_of, supported, with_error
+from sonar_graph.batch.rounding import between, decimals_of, quantile_text, supported, with_error
 
 
-@pytest.mark.parametrize(("error", "decimals"), [(0.034, 2), (0.012, 3), (340.0, -2), (1.0, 1), (0.2, 1), (9.9e-5, 5)])
+@pytest.mark.parametrize(
+    ("error", "decimals"),
+    [
+        (0.034, 2),
+        (0.012, 3),
+        (340.0, -2),
+        (1.0, 1),
+        (0.2, 1),
+        (9.9e-5, 5),
+        (1.99, 1),
+        (2.0, 0),
+        (0.3, 1),
+        (1e-3, 4),
+        (2e-3, 3),
+    ],
+)
 def test_digits_end_where_the_standard_error_begins(error, decimals):
     assert decimals_of(error) == decimals
 
@@ -29,6 +44,16 @@ def test_value_and_error_have_the_same_digits():
 def test_a_value_without_an_error_has_three_digits():
     assert supported(0.123456, math.nan) == "0.123"
     assert with_error(0.123456, math.nan) == "0.123"
+
+
+@pytest.mark.parametrize(("value", "text"), [(0.123456, "0.12"), (-0.00098765, "\N{MINUS SIGN}0.00099"), (0.0, "0")])
+def test_a_quantile_has_two_digits_however_large_its_error(value, text):
+    assert quantile_text(value, 40.0) == text
+
+
+@given(st.floats(0.1, 1e6), st.floats(1e-6, 1e-2))
+def test_a_quantile_with_a_small_error_is_rounded_by_it(value, error):
+    assert quantile_text(value, error) == supported(value, error)
 
 
 def test_what_rounds_to_zero_has_no_sign():

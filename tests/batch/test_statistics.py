@@ -17,6 +17,7 @@ from sonar_graph.batch.statistics import (
     least_p,
     paired,
     quantile,
+    quantile_error,
     signed_rank_p,
     standard_error,
     summarise,
@@ -111,6 +112,25 @@ def test_bootstrap_interval_holds_the_mean_as_often_as_it_says():
     assert np.mean(np.abs(middle - 0.3) < half) < 0.8, "intervals half as wide do not: the check can fail"
 
 
+def test_bootstrap_interval_is_corrected_for_bias_and_skewness():
+    values = np.random.default_rng(13).lognormal(0, 1.2, 20)
+    low, high = bootstrap_interval(values)
+    draws = np.random.default_rng(0).choice(values, (20000, 20)).mean(axis=1)
+    plain_low, plain_high = np.quantile(draws, [0.025, 0.975])
+    scatter = draws.std()
+    assert low - plain_low > 0.1 * scatter
+    assert high - plain_high > 0.2 * scatter
+    whole = stats.bootstrap((values,), np.mean, n_resamples=20000, method="BCa", rng=np.random.default_rng(0))
+    assert [low, high] == pytest.approx(list(whole.confidence_interval), abs=0.1 * scatter)
+
+
+def test_signed_rank_p_of_many_with_a_zero_is_by_changes_of_sign():
+    differences = np.append(0.0, np.arange(1.0, 8.0))
+    assert signed_rank_p(differences) == pytest.approx(2 * 0.5**7)
+    mixed = np.array([0.0, 1.0, 2.0, 3.0, -4.0, 5.0, 6.0])
+    assert signed_rank_p(mixed) == pytest.approx(enumerated_p(mixed))
+
+
 def test_bootstrap_interval_of_equal_differences_is_a_point_and_of_few_unknown():
     assert bootstrap_interval(np.full(8, 0.25)) == (0.25, 0.25)
     assert math.isnan(bootstrap_interval(np.arange(5.0))[0])
@@ -143,9 +163,32 @@ def test_a_group_with_a_run_without_a_value_has_no_mean():
 
 
 def test_two_values_that_agree_by_chance_do_not_make_digits():
-    assert summarise(np.array([10.54003, 10.54024])).rounding_error == pytest.approx(0.105, abs=1e-3)
-    many = np.tile([10.54003, 10.54024], 5)
-    assert summarise(many).rounding_error == pytest.approx(stats.sem(many))
+    few, many = np.array([10.54003, 10.54024]), np.tile([10.54003, 10.54024], 5)
+    assert summarise(few).median_error == pytest.approx(0.105, abs=1e-3)
+    assert summarise(many).median_error == pytest.approx(0.5 * np.ptp(few))
+    assert paired(few, np.zeros(2)).rounding_error == pytest.approx(0.105, abs=1e-3)
+    assert paired(many, np.zeros(10)).rounding_error == pytest.approx(stats.sem(many))
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_the_error_of_a_quantile_is_how_much_it_scatters(share):
+    draws = np.random.default_rng(8).normal(size=(600, 40))
+    scatter = np.quantile(draws, share, axis=1).std()
+    errors = [quantile_error(values, share) for values in draws]
+    assert np.mean(errors) == pytest.approx(scatter, rel=0.2)
+
+
+def test_one_lost_run_does_not_take_the_digits_of_the_median():
+    values = np.append(np.random.default_rng(9).normal(0.2, 0.01, 19), 5000.0)
+    assert standard_error(values) > 100
+    assert summarise(values).median_error < 0.01
+    assert paired(values, np.zeros(20)).median_error < 0.01
+
+
+def test_the_error_of_a_median_beside_runs_without_a_value_is_that_of_the_lower_side():
+    values = np.array([1.0, 2.0, 3.0, 4.0, INF, INF, INF])
+    assert quantile_error(values, 0.5) == pytest.approx(math.sqrt(7) / 2)
+    assert math.isnan(quantile_error(values, 0.9))
 
 
 def test_standard_error_of_one_run_is_unknown():
@@ -179,6 +222,30 @@ def test_failing_where_it_was_worse_makes_nobody_better():
     assert told.without == 4
     assert told.median >= whole.median - 1e-12
     assert told.smaller <= whole.smaller
+
+
+def test_what_logs_share_by_their_seed_is_no_finding():
+    rng = np.random.default_rng(12)
+    cases = list(range(10)) * 4
+    single, clustered = [], []
+    for _ in range(200):
+        own = np.tile(rng.normal(size=10), 4) + rng.normal(0, 0.3, 40)
+        single.append(paired(own, np.zeros(40)).p_value < 0.05)
+        clustered.append(paired(own, np.zeros(40), cases).p_value < 0.05)
+    assert np.mean(clustered) < 0.05 + 2 * math.sqrt(0.05 * 0.95 / 200)
+    assert np.mean(single) > 0.2, "pairs taken as independent find more: the check can fail"
+
+
+def test_pairs_of_one_case_make_one_difference():
+    own, cases = np.array([1.0, 3.0, INF, 1.0, INF, INF]), [0, 0, 1, 1, "a", "a"]
+    reference = np.array([0.0, 0.0, 5.0, INF, 1.0, INF])
+    told = paired(own, reference, cases)
+    assert (told.pairs, told.without, told.smaller) == (3, 2, 0)
+    assert told.median == 2.0, "of 2, 0 (each failed once) and infinity"
+    assert math.isnan(told.mean)
+    own, reference = np.arange(12.0), np.array([1.0, 0.0] * 6)
+    halves = paired(own, reference, [i // 2 for i in range(12)])
+    assert halves == paired((own - reference).reshape(6, 2).mean(axis=1), np.zeros(6))
 
 
 def test_two_failures_on_one_seed_are_equal():

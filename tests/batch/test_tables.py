@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from sonar_graph.batch.accuracy import accuracy_table, all_tests, difference_table
-from sonar_graph.batch.catalogue import Metric, metrics_of
+from sonar_graph.batch.catalogue import KINDS, Metric, metrics_of
 from sonar_graph.batch.exported import as_csv, as_latex, latex_text, write_tables
-from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told
+from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told, reference_told
+from sonar_graph.batch.headline import head_metric
 from sonar_graph.batch.overviews import consistency_table, cost_table, failure_table, run_lists
-from sonar_graph.batch.recorded import ALL_LOGS
+from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
 from sonar_graph.batch.tables import Cell, Column, Table
 
 from .recorded_batches import LOGS, METRICS, changed, drawn_batch, with_failures
@@ -151,7 +152,7 @@ def test_the_finding_names_failures_and_only_differences_beyond_chance():
     metrics = metrics_of(METRICS)
     assert failures_told(batch) == [f"ekf-slam: 3 of 20 runs did not end ({LOGS[1]})."]
     told = errors_told(batch, metrics, all_tests(batch, metrics))
-    assert "isam2 is on average" in told[0]
+    assert "isam2 is below dead-reckoning by " in told[0]
     assert "below dead-reckoning" in told[0]
     alike = changed(batch, "isam2", "causal.ate_se2_m", 4.0)
     assert "Not told apart from dead-reckoning: isam2" in errors_told(alike, metrics, all_tests(alike, metrics))[0]
@@ -161,8 +162,27 @@ def test_the_finding_gives_no_mean_over_survivors():
     batch = with_failures(drawn_batch(18), "isam2", LOGS[0], 1)
     metrics = metrics_of(METRICS)
     told = errors_told(batch, metrics, all_tests(batch, metrics))[0]
-    assert "isam2 differs from dead-reckoning (p = " in told
-    assert "isam2 is on average" not in told
+    differences = np.subtract(*batch.pairs(LOGS[0], "isam2", "causal.ate_se2_m"))
+    found = re.search(r"isam2 is below dead-reckoning by (\S+) in the median, smaller in 17 of 18 \(p ", told)
+    assert float(found[1]) == pytest.approx(-np.median(differences), rel=0.1)
+
+
+def test_the_finding_tells_the_side_of_the_test_and_not_of_a_mean_that_one_run_turned():
+    lost = np.append(np.ones(17), 1e4)
+    batch = changed(drawn_batch(18, logs=LOGS[:1]), "isam2", "causal.ate_se2_m", lost)
+    metrics = metrics_of(METRICS)
+    tests = all_tests(batch, metrics)
+    test, p_value = tests["causal.ate_se2_m", LOGS[0], "isam2"]
+    assert test.mean > 0 > test.median
+    assert p_value < 0.05
+    assert "isam2 is below dead-reckoning by 0." in errors_told(batch, metrics, tests)[0]
+
+
+def test_the_finding_of_who_never_ended_has_a_side_and_no_size():
+    batch = with_failures(drawn_batch(18, logs=LOGS[:1]), "isam2", LOGS[0], 18)
+    metrics = metrics_of(METRICS)
+    told = errors_told(batch, metrics, all_tests(batch, metrics))[0]
+    assert "isam2 is above dead-reckoning, smaller in 0 of 18 (p " in told
 
 
 def test_angles_are_degrees_for_people_and_radians_in_files():
@@ -182,6 +202,25 @@ def test_too_few_seeds_are_warned_of():
     assert power_told(all_tests(many, metrics)) == []
 
 
+def uneven_batch(most: int, fewest: int) -> RecordedBatch:
+    """Two logs, of which the second has fewer seeds."""
+    batch = drawn_batch(most)
+    return replace(batch, runs=[run for run in batch.runs if run.log == LOGS[0] or run.seed < fewest])
+
+
+@pytest.mark.parametrize(("fewest", "blind"), [(8, False), (7, True), (5, True)])
+def test_seeds_are_called_too_few_only_where_the_best_differences_find_nothing(fewest, blind):
+    batch = changed(uneven_batch(20, fewest), "isam2", "causal.ate_se2_m", 1e-3)
+    for name, column in (("isam2", "smoothed.ate_se2_m"), *(("ekf-slam", f"{k}.ate_se2_m") for k in KINDS)):
+        batch = changed(batch, name, column, 1e-3)
+    tests = all_tests(batch, [ATE])
+    assert len(tests) == 12
+    assert (tests["causal.ate_se2_m", LOGS[1], "isam2"][1] < 0.05) is not blind
+    told = power_told(tests)
+    assert bool(told) is blind
+    assert not any(LOGS[0] + " (" in one for one in told)
+
+
 def test_a_filters_two_estimates_do_not_ask_for_more_seeds():
     batch = drawn_batch(7, logs=LOGS[:1])
     same = [
@@ -189,6 +228,29 @@ def test_a_filters_two_estimates_do_not_ask_for_more_seeds():
     ]
     assert "7 pairs" in power_told(all_tests(batch, [ATE]))[0], "four tests: 4 / 2**6 is above 5 %"
     assert power_told(all_tests(replace(batch, runs=same), [ATE])) == [], "two tests"
+
+
+@pytest.mark.parametrize("key", ["time.total_s", "memory.peak_mb", "wall_s", "peak_memory_mb"])
+def test_time_and_memory_are_shown_and_not_tested(key):
+    batch = drawn_batch(12, logs=LOGS[:1])
+    batch = replace(
+        batch, runs=[replace(r, values=r.values | {key: len(r.estimator) + 0.01 * r.seed}) for r in batch.runs]
+    )
+    (metric,) = metrics_of([key])
+    assert all_tests(batch, [metric]) == {}
+    assert accuracy_table(batch, metric).rows
+    assert head_metric(batch, [metric]) is None
+
+
+def test_a_reference_that_never_ended_is_warned_of():
+    batch = drawn_batch(8)
+    assert reference_told(with_failures(batch, "dead-reckoning", LOGS[0], 7)) == []
+    lost = with_failures(batch, "dead-reckoning", LOGS[0], 8)
+    assert reference_told(lost) == [
+        "The reference dead-reckoning never ended on basin: whoever ended is better there, by no known amount."
+    ]
+    (told,) = difference_table(lost, ATE, all_tests(lost, [ATE])).rows[:1]
+    assert told[4].text == "better: reference has no value"
 
 
 def test_a_warning_names_few_logs():
