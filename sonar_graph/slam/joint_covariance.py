@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import gtsam
@@ -34,6 +35,29 @@ class JointCovariance:
         """The block of two variables."""
         i, j = self.rows[a], self.rows[b]
         return self.matrix[i : i + _size(a), j : j + _size(b)]
+
+
+class KeptCovariance:
+    """One joint covariance for all questions between two updates.
+
+    It also covers what was asked for before the last update, since successive frames show mostly the same landmarks.
+    """
+
+    def __init__(self) -> None:
+        self._joint: JointCovariance | None = None
+        self._asked: set[int] = set()
+        self._asked_before: set[int] = set()
+
+    def of(self, marginals: gtsam.Marginals | gtsam.ISAM2, keys: list[int]) -> JointCovariance:
+        """Of these variables, and possibly of more of them."""
+        self._asked.update(keys)
+        if self._joint is None or not self._joint.rows.keys() >= self._asked:
+            self._joint = JointCovariance.of(marginals, sorted(self._asked | self._asked_before))
+        return self._joint
+
+    def renew(self, lasting: Iterable[int]) -> None:
+        """The graph has changed; of what was asked for only some variables last."""
+        self._joint, self._asked, self._asked_before = None, set(), self._asked.intersection(lasting)
 
 
 def _size(key: int) -> int:

@@ -51,7 +51,7 @@ def joined_with_marginal(
     return graph
 
 
-def copy(source: gtsam.Values, key: int, target: gtsam.Values) -> None:
+def _copy(source: gtsam.Values, key: int, target: gtsam.Values) -> None:
     """One variable, a pose or a point, from some values to others."""
     if gtsam.symbolChr(key) == ord("x"):
         target.insert(key, source.atPose3(key))
@@ -91,7 +91,7 @@ def joined(values: gtsam.Values, new: gtsam.Values) -> gtsam.Values:
     both = gtsam.Values(values)
     for key in keys_of(new):
         if not both.exists(key):
-            copy(new, key, both)
+            _copy(new, key, both)
     return both
 
 
@@ -104,5 +104,5 @@ def picked(values: gtsam.Values, keys: Iterable[int]) -> gtsam.Values:
     """Some of the variables. GTSAM copies all that it is given for each factor in Python."""
     few = gtsam.Values()
     for key in keys:
-        copy(values, key, few)
+        _copy(values, key, few)
     return few

@@ -18,10 +18,6 @@ A *bounded* history is that of the window: its factors, and the marginals of wha
 from those, which leaves older marginals linearised where they were.
 
 New factors that cannot be used are taken out again (`sonar_graph.slam.withholding`).
-
-GTSAM's Cholesky elimination gives up ("indeterminate") when a variable's absolute sigma is more than 4096 times its
-sigma given its neighbours, which millimetre odometry reaches after some metres of drift. QR does not, at a higher cost;
-once Cholesky has given up the window stays with QR, and so do the marginals of the history.
 """
 
 from __future__ import annotations
@@ -39,8 +35,8 @@ from sonar_graph.slam.batch import marginals_of
 from sonar_graph.slam.determinacy import variable_name
 from sonar_graph.slam.exchange import Exchange
 from sonar_graph.slam.history import History, Recent, rest_of
-from sonar_graph.slam.joint_covariance import JointCovariance
-from sonar_graph.slam.new_window import copy, joined, keys_of, picked, split, without
+from sonar_graph.slam.joint_covariance import JointCovariance, KeptCovariance
+from sonar_graph.slam.new_window import joined, keys_of, picked, split, without
 from sonar_graph.slam.pending import Pending
 from sonar_graph.slam.sightlines import Sightlines, solve_in_sight
 from sonar_graph.slam.window import Window
@@ -108,9 +104,7 @@ class Smoother:
         self._landmarks: list[int] = []
         self._bias: list[int] = []
         self._window = Window(relinearize_threshold, lag_s)
-        self._joint: JointCovariance | None = None
-        self._asked: set[int] = set()
-        self._asked_before: set[int] = set()
+        self._kept_covariance = KeptCovariance()
         self._solved: tuple[gtsam.Values, gtsam.Marginals | gtsam.ISAM2] | None = None
         self._solved_changes = 0
 
@@ -311,12 +305,11 @@ class Smoother:
         return True
 
     def _announce_leaving(self, before_s: float) -> None:
-        if self.is_bounded:
-            leaving = {
-                key for key, t in self._expiring.items() if t < before_s and not self._pending.values.exists(key)
-            }
-            if leaving:
-                self.when_leaving(leaving)
+        if not self.is_bounded:
+            return
+        old = (key for key, t in self._expiring.items() if t < before_s)
+        if leaving := {key for key in old if not self._pending.values.exists(key)}:
+            self.when_leaving(leaving)
 
     def _take(self, estimate: gtsam.Values) -> None:
         """The window's; a bounded one forgets what has left."""
@@ -337,7 +330,7 @@ class Smoother:
         return self.graph.size() >= self._restart_size
 
     def _give_up_cholesky(self, time_s: float) -> None:
-        """It met a pose 4096 times less certain than its step: QR has no such limit.
+        """It met a pose far less certain than its step (`sonar_graph.slam.window`): QR has no such limit.
 
         Raises
         ------
@@ -356,7 +349,7 @@ class Smoother:
     def _clear_pending(self) -> None:
         self._pending = Pending()
         self.waiting_gain = 0.0
-        self._joint, self._asked, self._asked_before = None, set(), self._asked.intersection(self._landmarks)
+        self._kept_covariance.renew(self._landmarks)
 
     def _restart(self, time_s: float) -> None:
         """Solve the history; start a window whose prior is the marginal of all that lies before it."""
@@ -365,11 +358,8 @@ class Smoother:
         kept_s = {key: t for key, t in self._expiring.items() if t >= time_s - self._window.lag_s}
         times: dict[Any, float] = kept_s | dict.fromkeys(self._landmarks, time_s)
         inside, outside = split(self.graph, set(times))
-        values = gtsam.Values()
-        for key in times:
-            copy(self.values, key, values)
         try:
-            self._window.begin_after(outside, self.values, inside, values, times)
+            self._window.begin_after(outside, self.values, inside, picked(self.values, times), times)
         except RuntimeError as error:
             raise EstimatorError(f"isam2: {reasons(self.graph, self.values, self._expiring)}") from error
         self._take(self._window.isam.calculateEstimate())
@@ -398,15 +388,8 @@ class Smoother:
         return self._window.isam.marginalCovariance(key)
 
     def joint_covariance(self, keys: list[int]) -> JointCovariance:
-        """Joint marginal covariance of variables in the window, and possibly of more of them.
-
-        One computation serves until the next update: it also covers the landmarks that were asked for before the last
-        one, since successive frames show mostly the same.
-        """
-        self._asked.update(keys)
-        if self._joint is None or not self._joint.rows.keys() >= self._asked:
-            self._joint = JointCovariance.of(self._window.isam.getISAM2(), sorted(self._asked | self._asked_before))
-        return self._joint
+        """Joint marginal covariance of variables in the window, and possibly of more of them."""
+        return self._kept_covariance.of(self.marginals, keys)
 
     def joint_covariance_of_any(self, keys: list[int]) -> JointCovariance:
         """Joint marginal covariance of any variables; it costs a solution of the history if one has left the window."""
