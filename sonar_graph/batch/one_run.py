@@ -104,7 +104,7 @@ def _load(estimator: str) -> None:
 
 def _check_source_now(run: PlannedRun) -> None:
     """Modules may be imported as late as during the run: what they were is known only if nothing changed."""
-    now = sources_now(run.estimator)
+    now = sources_now(run.versions["estimator_target"])
     if differing := [name for name in sorted(now) if now[name] != run.versions.get(name)]:
         raise BatchError(
             f"the code changed during a run: {_told(now, differing)}, planned with {_told(run.versions, differing)}; "

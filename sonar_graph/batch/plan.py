@@ -87,22 +87,20 @@ def versions_of(estimator: str) -> dict[str, str]:
         "python": platform.python_version(),
         "estimator_target": point.value,
         "source": source_hash("sonar_graph"),
-        "estimator_source": source_hash(point.module.partition(".")[0]),
+        "estimator_source": source_hash(_package(point.value)),
     }
 
 
-def sources_now(estimator: str) -> dict[str, str]:
-    """The hashes of `versions_of` as the disk has them at this moment.
+def sources_now(target: str) -> dict[str, str]:
+    """The hashes of `versions_of` as the disk has them at this moment, of its ``estimator_target``."""
+    packages = {"source": "sonar_graph", "estimator_source": _package(target)}
+    hashes = {package: source_hash_now(package) for package in set(packages.values())}
+    return {name: hashes[package] for name, package in packages.items()}
 
-    Raises
-    ------
-    BatchError
-        When this machine does not have the estimator any more.
-    """
-    return {
-        "source": source_hash_now("sonar_graph"),
-        "estimator_source": source_hash_now(_installed(estimator).module.partition(".")[0]),
-    }
+
+def _package(target: str) -> str:
+    """The top-level package of what an entry point leads to."""
+    return target.partition(":")[0].partition(".")[0]
 
 
 def _installed(estimator: str) -> EntryPoint:

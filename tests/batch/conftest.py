@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from sonar_graph.batch.plan import plan_runs
+from sonar_graph.batch.plan import plan_runs, versions_of
 from sonar_graph.batch.planned import PlannedRun
+from sonar_graph.batch.source_hash import source_hash
 from sonar_graph.batch.suite import read_suite
 
 WriteSuite = Callable[..., Path]
@@ -121,6 +123,9 @@ def misbehaving(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     )
     (folder / "misbehaving-1.0.dist-info" / "entry_points.txt").write_text(ENTRY_POINTS)
     (folder / "misbehaving.py").write_text(MISBEHAVING)
+    monkeypatch.delitem(sys.modules, "misbehaving", raising=False)  # the one of an earlier test's folder
+    source_hash.cache_clear()
+    versions_of.cache_clear()
     monkeypatch.syspath_prepend(folder)
     monkeypatch.setenv(
         "PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
