@@ -77,6 +77,8 @@ def test_signed_rank_p_of_equal_runs_is_one_and_of_few_is_unknown():
     assert signed_rank_p(np.zeros(8)) == 1.0
     assert math.isnan(signed_rank_p(np.array([1.0, 2.0, 3.0, 4.0, 5.0])))
     assert signed_rank_p(np.arange(1.0, 9.0)) == pytest.approx(least_p(8))
+    assert signed_rank_p(np.arange(1.0, 7.0)) == pytest.approx(least_p(6)) == 2**-5
+    assert signed_rank_p(np.array([1.0, -2.0, -3.0, 4.0, 5.0, -6.0, -7.0, 8.0])) == 1.0
 
 
 def test_signed_rank_p_of_many_with_a_zero_is_by_changes_of_sign():
@@ -138,6 +140,16 @@ def test_what_is_not_exact_is_close_to_it(kind, share):
     exact = exact_tail(ranks, most)
     assert 1e-4 < exact < 0.5
     assert near_tail(ranks, most) == pytest.approx(exact, rel=0.01)
+
+
+def test_the_sum_has_the_variance_of_drawing_without_replacement():
+    ranks, most = np.array([1, 2, 4, 7, 9, 9]), 13
+    chance = 0.0
+    for count in range(len(ranks) + 1):
+        sums = np.array([sum(drawn) for drawn in itertools.combinations(ranks.tolist(), count)])
+        below = stats.norm.cdf(most + 0.5, sums.mean(), sums.std()) if np.ptp(sums) else float(sums[0] <= most)
+        chance += math.comb(len(ranks), count) / 2 ** len(ranks) * below
+    assert near_tail(ranks, most) == pytest.approx(chance, rel=1e-9)
 
 
 def test_equal_ranks_keep_their_steps():
