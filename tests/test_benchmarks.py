@@ -111,6 +111,16 @@ def test_actag_names_its_figures_or_the_extra() -> None:
     assert found["range_rms_m"] < 0.01
 
 
+def test_batch_intervals_tell_methods_apart() -> None:
+    found = figures("validation/batch_intervals.py", "--workers", "1")
+    assert found["pairs"] == [6, 10, 20, 50]
+    for shares in found["held"].values():
+        assert all(len(of_kind) == 4 and 0.5 < min(of_kind) <= max(of_kind) <= 1 for of_kind in shares.values())
+    assert found["held"]["BCa"]["normal"][0] < found["held"]["reported"]["normal"][0] - 0.03
+    assert found["length"]["Student"]["normal"] == [1.0] * 4
+    assert found["length"]["BCa"]["normal"][0] < 0.85 < 1 < found["length"]["reported"]["normal"][0]
+
+
 def test_damaged_logs_names_its_figures() -> None:
     found = figures("validation/damaged_logs.py", "--workers", "2")
     assert found["files"] == 60

@@ -77,7 +77,7 @@ def accuracy_table(batch: RecordedBatch, metric: Metric) -> Table:
 
 def difference_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
     """One metric: differences to the reference on the same log and seed."""
-    columns = [*_first_columns(), Column("pairs", "Pairs")]
+    columns = [*_first_columns(), Column("pairs", "Compared", parts=("", "of"))]
     for over, key in metric.keys.items():
         columns += [
             Column(f"{key}_difference", "Mean difference", over, ("", "low", "high")),
@@ -146,7 +146,7 @@ def summary_cells(told: Summary, factor: float = 1.0) -> list[Cell]:
 def _pairs_cell(metric: Metric, tests: Tests, log: str, contestant: str) -> Cell:
     found = [tests[place][0] for key in metric.keys.values() if (place := (key, log, contestant)) in tests]
     without = max(test.without for test in found)
-    return Cell(str(found[0].pairs), (found[0].pairs,), note=f"{without} without a value" if without else "")
+    return Cell(found[0].counted, (found[0].pairs, found[0].each), note=f"{without} without a value" if without else "")
 
 
 def _difference_cells(found: tuple[Paired, float] | None, metric: Metric) -> list[Cell]:
@@ -159,7 +159,7 @@ def _difference_cells(found: tuple[Paired, float] | None, metric: Metric) -> lis
     return [
         number(test.mean, supported(test.mean * factor, error), low, high, note=note),
         number(test.median, _median(test.median * factor, test.median_error * factor)),
-        Cell(f"{test.smaller} of {test.pairs}", (test.smaller,)),
+        Cell(f"{test.smaller} of {test.counted}", (test.smaller,)),
         number(p_holm, p_text(p_holm), test.p_value),
     ]
 
@@ -171,8 +171,13 @@ def _median(value: float, error: float) -> str:
 
 
 def p_text(p_value: float) -> str:
-    """A p value with two digits, down to one in a thousand."""
-    return "< 0.001" if p_value < 1e-3 else f"{p_value:.2g}" if p_value < 0.995 else "1.0"
+    """A p value with two digits, down to one in a thousand; with more where it would else look like 5 % and is not."""
+    if p_value < 1e-3:
+        return "< 0.001"
+    if not p_value < 0.995:
+        return "1.0"
+    texts = [f"{p_value:.{digits}g}" for digits in range(2, 18)]
+    return next(text for text in texts if np.sign(float(text) - SIGNIFICANT) == np.sign(p_value - SIGNIFICANT))
 
 
 def _title(metric: Metric) -> str:

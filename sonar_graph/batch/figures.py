@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from sonar_graph.batch.accuracy import Tests
 from sonar_graph.batch.catalogue import KINDS, Metric
 from sonar_graph.batch.exported import csv_text
-from sonar_graph.batch.overviews import anees_of
+from sonar_graph.batch.overviews import SAME_EVIDENCE, anees_of, is_evidence
 from sonar_graph.batch.panels import log_panels, spread_out
 from sonar_graph.batch.recorded import RecordedBatch
 from sonar_graph.batch.statistics import failure_rate, quantile
@@ -86,13 +86,13 @@ def difference_drawing(batch: RecordedBatch, metric: Metric, tests: Tests) -> Dr
                     ends = np.array([test.mean, *test.interval]) * metric.factor
                     _draw_interval(panel, ends, place, over)
     caption = (
-        f"{metric.label}: mean of the differences on the same log and seed, with 95 % bootstrap intervals (of few "
-        f"pairs none); left of the line the error is smaller than that of {batch.reference}. {_kinds_told(metric)}A "
+        f"{metric.label}: mean of the differences on the same log and seed, with 95 % intervals (of few pairs none); "
+        f"left of the line the error is smaller than that of {batch.reference}. {_kinds_told(metric)}A "
         "group in which a run has no value has no mean difference and is not drawn."
     )
-    rows = [["log", "contestant", "column", "pairs", "mean_difference", "low", "high"]]
+    rows = [["log", "contestant", "column", "pairs", "pairs_of", "mean_difference", "low", "high"]]
     rows += [
-        [log, name, key, str(test.pairs), *map(_text, (test.mean, *test.interval))]
+        [log, name, key, str(test.pairs), test.each, *map(_text, (test.mean, *test.interval))]
         for (key, log, name), test in found.items()
     ]
     return _drawn(figure, f"difference-{metric.name}", f"{metric.label}: against {batch.reference}", caption, rows)
@@ -105,12 +105,12 @@ def consistency_drawing(batch: RecordedBatch, what: str) -> Drawing | None:
     bands: dict[str, set[tuple[float, float]]] = {}
     for log in batch.logs:
         for contestant in batch.contestants:
-            for kind in KINDS:
-                told = anees_of(batch, log, contestant, kind, what)
+            both = {kind: anees_of(batch, log, contestant, kind, what) for kind in KINDS}
+            for kind, told in both.items():
                 if told is None:
                     continue
                 rows.append([log, contestant, kind, str(told.runs), _text(told.mean), *map(_text, told.band)])
-                if math.isfinite(told.mean):
+                if math.isfinite(told.mean) and is_evidence(both, kind):
                     known.setdefault((log, contestant), []).append((kind.capitalize(), told.mean))
                     bands.setdefault(log, set()).add(told.band)
     if not known:
@@ -131,8 +131,8 @@ def consistency_drawing(batch: RecordedBatch, what: str) -> Drawing | None:
     caption = (
         f"Normalised squared error of {what} at the last instant, average over runs per degree of freedom. The grey "
         "band holds 95 % of the averages of consistent estimators; right of it covariances are too small, left "
-        "too large. Full: causal. Hollow: smoothed. A group with a run that did not end has no average and is "
-        "not drawn."
+        f"too large. Full: causal. Hollow: smoothed. {SAME_EVIDENCE} A group with a run that did not end has no "
+        "average and is not drawn."
     )
     return _drawn(figure, f"anees-{what}", f"Consistency of {what}", caption, rows)
 

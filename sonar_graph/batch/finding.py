@@ -10,7 +10,8 @@ from sonar_graph.batch.accuracy import SIGNIFICANT, Tests, p_text
 from sonar_graph.batch.catalogue import Metric
 from sonar_graph.batch.recorded import RecordedBatch
 from sonar_graph.batch.rounding import quantile_text
-from sonar_graph.batch.statistics import LEAST_PAIRS, Paired, holm, least_p, quantile, quantile_error
+from sonar_graph.batch.signed_rank import LEAST_PAIRS, least_p
+from sonar_graph.batch.statistics import Paired, holm, quantile, quantile_error
 
 SCORED = "scored_instants"
 NAMED = 3
@@ -95,7 +96,7 @@ def _differences_told(batch: RecordedBatch, log: str, metric: Metric, key: str, 
 
 def _side_told(batch: RecordedBatch, metric: Metric, test: Paired) -> str:
     """What the rank test is about: the side of most differences, not of their mean, which one run can turn."""
-    counted = f"smaller in {test.smaller} of {test.pairs}"
+    counted = f"smaller in {test.smaller} of {test.counted}"
     if math.isnan(test.median) or test.median == 0:
         return f"differs from {batch.reference}, {counted}"
     side = f"is {'below' if test.median < 0 else 'above'} {batch.reference}"
@@ -125,14 +126,14 @@ def power_told(tests: Tests) -> list[str]:
     families: dict[str, dict[tuple[str, int], Paired]] = {}
     for (key, log, _), (test, _) in tests.items():
         families.setdefault(key.rpartition(".")[2], {})[log, id(test)] = test
-    blind: dict[str, int] = {}
+    blind: dict[str, str] = {}
     for family in families.values():
         best = holm(np.array([_best_p(test.pairs) for test in family.values()]))
         found = zip(family.items(), best.tolist(), strict=True)
-        blind |= {log: test.pairs for ((log, _), test), p_value in found if not p_value < SIGNIFICANT}
+        blind |= {log: test.counted for ((log, _), test), p_value in found if not p_value < SIGNIFICANT}
     if not blind:
         return []
-    listed = _few([f"{log} ({pairs} pair{'s' * (pairs != 1)})" for log, pairs in blind.items()])
+    listed = _few([f"{log} ({counted})" for log, counted in blind.items()])
     return [f"Too few pairs for any corrected p value to fall below {SIGNIFICANT:g}: {listed}. Add seeds."]
 
 

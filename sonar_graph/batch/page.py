@@ -26,9 +26,9 @@ from sonar_graph.batch.figures import (
 )
 from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told, reference_told
 from sonar_graph.batch.headline import head_metric, headlines, overview_table
-from sonar_graph.batch.overviews import consistency_table, cost_table, failure_table, run_lists
+from sonar_graph.batch.overviews import SAME_EVIDENCE, consistency_table, cost_table, failure_table, run_lists
 from sonar_graph.batch.recorded import RESULTS, RecordedBatch
-from sonar_graph.batch.statistics import LEAST_PAIRS, RESAMPLES
+from sonar_graph.batch.signed_rank import LEAST_PAIRS
 from sonar_graph.batch.tables import Table
 from sonar_graph.evaluation.atomic import replacing
 from sonar_graph.evaluation.figure_style import ESTIMATOR_COLOURS
@@ -124,8 +124,8 @@ def _content(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> dict[
         "cost_drawings": _drawn([cost_drawing(batch)]),
         "run_lists": [(log, list(lists)) for log, lists in groupby(run_lists(batch, metrics), lambda one: one.log)],
         "tables": [*filter(None, [overview]), failures, *_chapter_tables(shown), consistency, costs],
-        "resamples": RESAMPLES,
         "least_pairs": LEAST_PAIRS,
+        "same_evidence": SAME_EVIDENCE,
         "suite": batch.suite,
         "settings": _settings(batch),
         "origins": _origins(batch),

@@ -7,6 +7,7 @@ import math
 from sonar_graph.evaluation.wording import ABSENT, format_value
 
 MOST_DECIMALS = 12
+"""What is nothing at so many decimals has three significant digits and a power of ten."""
 LEAST_DIGITS = 2
 """Of a value that stands without its error: with fewer it may look like nothing at all."""
 MINUS = "\N{MINUS SIGN}"
@@ -17,9 +18,8 @@ def decimals_of(standard_error: float) -> int:
 
     0.034 gives 2, 0.012 gives 3, 340 gives -2.
     """
-    exponent = math.floor(math.log10(standard_error))
-    leading = round(standard_error / 10.0**exponent, 6)
-    return min(MOST_DECIMALS, -exponent + (1 if leading < 2 else 0))
+    leading, exponent = f"{standard_error:.6e}".split("e")
+    return (1 if float(leading) < 2 else 0) - int(exponent)
 
 
 def supported(value: float, standard_error: float) -> str:
@@ -46,7 +46,7 @@ def quantile_text(value: float, error: float) -> str:
     if not math.isfinite(value) or not math.isfinite(error) or error <= 0:
         return shown(value)
     least = LEAST_DIGITS - 1 - math.floor(math.log10(abs(value))) if value else 0
-    return fixed(value, min(MOST_DECIMALS, max(decimals_of(error), least)))
+    return fixed(value, max(decimals_of(error), least))
 
 
 def with_error(value: float, standard_error: float) -> str:
@@ -65,7 +65,10 @@ def between(low: float, high: float, standard_error: float = math.nan) -> str:
 
 
 def fixed(value: float, decimals: int) -> str:
-    """Rounded to so many decimals; negative ones round before the point."""
+    """Rounded to so many decimals, at most 12; negative ones round before the point."""
+    if decimals > MOST_DECIMALS and round(value, MOST_DECIMALS) == 0:
+        return shown(value)
+    decimals = min(decimals, MOST_DECIMALS)
     rounded = round(value, decimals)
     text = f"{rounded:.{max(0, decimals)}f}"
     if float(text) == 0:

@@ -15,18 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from sonar_graph.batch.signed_rank import LEAST_PAIRS, signed_rank_p
 from sonar_graph.evaluation.consistency import anees_interval
 from sonar_graph.measurements import Floats
 
 CONFIDENCE = 0.95
 LOW, HIGH = 0.1, 0.9
 """Quantiles that are shown beside the median."""
-RESAMPLES = 9999
-NUMBERS_AT_ONCE = 1_000_000
-SEED = 20140214
-"""Of everything drawn here: the same results make the same report."""
-LEAST_PAIRS = 6
-"""Of fewer a bootstrap draws too few different means, and no two-sided rank test reaches 5 %: 2 / 2⁵ = 0.06."""
 
 
 @dataclass(frozen=True)
@@ -63,22 +58,30 @@ class Paired:
     """Differences of one group to the reference on the same cases; negative: smaller than the reference."""
 
     pairs: int
+    """Differences: pairs of runs, or seeds where a seed has several pairs."""
+    each: str
+    """What each difference is of: ``pair``, ``seed``, ``log``; ``case`` where some are of seeds and some of logs."""
     without: int
-    """Pairs in which either has no value."""
+    """Differences for which a value is missing."""
     smaller: int
-    """Pairs in which the value is smaller than the reference's."""
+    """Differences below zero."""
     mean: float
     """NaN where a pair is without a value."""
     rounding_error: float
     """Of the mean: the standard error of pairs that have a value, for few not below 1 %."""
     interval: tuple[float, float]
-    """Of the mean, bootstrap; NaN where there are too few pairs or no mean."""
+    """Of the mean, `mean_interval`; NaN where there are too few pairs or no mean."""
     median: float
     """Infinite where half of the pairs have no value on one side; NaN where nothing can be said."""
     median_error: float
     """Of the median, `quantile_error`."""
     p_value: float
     """Of the two-sided signed-rank test, not corrected; NaN of too few pairs."""
+
+    @property
+    def counted(self) -> str:
+        """How many differences of what, such as ``10 seeds``."""
+        return f"{self.pairs} {self.each}{'s' * (self.pairs != 1)}"
 
 
 @dataclass(frozen=True)
@@ -191,15 +194,24 @@ def paired(own: Floats, reference: Floats, cases: Sequence[str | int] | None = N
     has_mean = len(differences) > 0 and not without
     return Paired(
         pairs=len(differences),
+        each=_kind_of(cases),
         without=without,
         smaller=int((differences < 0).sum()),
         mean=float(differences.mean()) if has_mean else math.nan,
         rounding_error=_rounding_error(differences[~lost]),
-        interval=bootstrap_interval(differences) if has_mean else (math.nan, math.nan),
+        interval=mean_interval(differences) if has_mean else (math.nan, math.nan),
         median=quantile(differences, 0.5),
         median_error=quantile_error(differences, 0.5),
         p_value=signed_rank_p(differences),
     )
+
+
+def _kind_of(cases: Sequence[str | int] | None) -> str:
+    """Seeds are numbers, and logs stand for runs that have none."""
+    if cases is None:
+        return "pair"
+    kinds = {"log" if isinstance(case, str) else "seed" for case in cases}
+    return kinds.pop() if len(kinds) == 1 else "case"
 
 
 def _differences(own: Floats, reference: Floats) -> Floats:
@@ -216,61 +228,29 @@ def _difference_of_case(differences: Floats) -> float:
     return float(differences[~infinite].mean()) if not infinite.all() else 0.0
 
 
-def bootstrap_interval(values: Floats) -> tuple[float, float]:
-    """95 % interval of the mean by the bootstrap (bias-corrected, accelerated: Efron 1987); NaN of too few values."""
-    if len(values) < LEAST_PAIRS:
-        return math.nan, math.nan
-    if np.ptp(values) <= 1e-12 * np.abs(values).max():
-        return float(values.mean()), float(values.mean())
-    drawn = stats.bootstrap(
-        (values,),
-        np.mean,
-        n_resamples=RESAMPLES,
-        batch=_batch(len(values)),
-        confidence_level=CONFIDENCE,
-        method="BCa",
-        rng=np.random.default_rng(SEED),
-    )
-    return float(drawn.confidence_interval.low), float(drawn.confidence_interval.high)
+def mean_interval(values: Floats) -> tuple[float, float]:
+    """95 % interval of the mean of values that may be skewed (Hall 1992); NaN of too few.
 
-
-def signed_rank_p(differences: Floats) -> float:
-    """Two-sided p value of Wilcoxon's signed-rank test (zeros as Pratt 1959); infinite differences rank highest.
-
-    NaN of fewer than 6: their smallest possible value is above 5 %, so there is nothing to be found.
-
-    Exact where no ranks are tied, or up to 13 differences; otherwise by 9999 random changes of sign.
+    Student's ``t`` supposes symmetry. With the sample's skewness ``g`` and ``W = (mean - true mean) / s``,
+    ``W + g W² / 3 + g² W³ / 27 + g / (6 n)`` has none to first order; times ``√n`` it is held against Student's
+    quantiles. Its roots are the bounds.
     """
-    if len(differences) < LEAST_PAIRS:
-        return math.nan
-    if not differences.any():
-        return 1.0
-    finite = np.abs(differences[np.isfinite(differences)])
-    beyond = 2 * finite.max(initial=0.0) + 1
-    scores = np.clip(differences, -beyond, beyond)
-    sizes = np.abs(scores)
-    if sizes.all() and len(np.unique(sizes)) == len(sizes):
-        return float(stats.wilcoxon(scores, method="exact").pvalue)
-    return _sign_changes_p(np.sign(scores) * stats.rankdata(sizes))
+    n = len(values)
+    if n < LEAST_PAIRS:
+        return math.nan, math.nan
+    mean, deviation = float(values.mean()), float(values.std(ddof=1))
+    if deviation <= 1e-12 * float(np.abs(values).max()):
+        return mean, mean
+    skewness = float((((values - mean) / values.std()) ** 3).mean())
+    bound = float(stats.t.ppf(0.5 + CONFIDENCE / 2, n - 1)) / math.sqrt(n)
+    return mean - deviation * _unskewed(bound, skewness, n), mean - deviation * _unskewed(-bound, skewness, n)
 
 
-def _sign_changes_p(signed_ranks: Floats) -> float:
-    """Two-sided p value of the sum of signed ranks, over changes of sign."""
-    drawn = stats.permutation_test(
-        (signed_ranks,),
-        np.sum,
-        permutation_type="samples",
-        vectorized=True,
-        n_resamples=RESAMPLES,
-        batch=_batch(len(signed_ranks)),
-        rng=np.random.default_rng(SEED),
-    )
-    return float(drawn.pvalue)
-
-
-def _batch(size: int) -> int:
-    """Resamples drawn at once, so that memory does not grow with the number of runs."""
-    return max(1, NUMBERS_AT_ONCE // size)
+def _unskewed(bound: float, skewness: float, n: int) -> float:
+    """``W`` at which the cubic that takes away skewness reaches a bound."""
+    if abs(skewness) < 1e-6:
+        return bound
+    return 3 * (math.cbrt(1 + skewness * (bound - skewness / (6 * n))) - 1) / skewness
 
 
 def holm(p_values: Floats) -> Floats:
@@ -285,11 +265,6 @@ def holm(p_values: Floats) -> Floats:
     factors = np.arange(len(order), 0, -1)
     corrected[order] = np.minimum(1.0, np.maximum.accumulate(factors * p_values[order]))
     return corrected
-
-
-def least_p(pairs: int) -> float:
-    """The smallest p value that the signed-rank test of so many pairs can have: all of one sign."""
-    return float(2.0 ** (1 - pairs)) if pairs else 1.0
 
 
 def anees(nees: Floats, dof: float) -> Anees:

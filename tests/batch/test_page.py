@@ -57,8 +57,19 @@ def test_every_figure_has_its_data(html, batch):
 
 def test_reading_comes_before_numbers_and_the_protocol_is_told(html):
     assert html.index("How to read this page") < html.index("<figure")
-    for said in ("Wilcoxon", "Holm (1979)", "BCa", "Wilson", "chi-square", "Lachin 1999", "causal.ate_se2_m"):
+    for said in ("Wilcoxon", "Holm (1979)", "Hall 1992", "Wilson", "chi-square", "Lachin 1999", "causal.ate_se2_m"):
         assert said in html
+
+
+def test_the_page_says_what_its_counts_are_of(html):
+    text = " ".join(html.split())
+    assert "from 6 pairs on, and only where both runs of every pair have a value" in text
+    assert "No test of fewer than 6 pairs, or seeds." in text
+    assert "All logs together have one difference a seed" in text
+    assert "of all logs together they count seeds" in text
+    assert "it is no second evidence" in text
+    assert "60 runs of 3 estimators on 2 logs, up to 10 seeds each, compared with dead-reckoning." in text
+    assert ">8 of 10 seeds<" in text or ">10 of 10 seeds<" in text
 
 
 def test_what_a_suite_or_an_estimator_says_is_escaped(batch):

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.batch.rounding import between, decimals_of, quantile_text, supported, with_error
+from sonar_graph.batch.rounding import between, decimals_of, fixed, quantile_text, supported, with_error
 
 
 @pytest.mark.parametrize(
@@ -23,6 +23,10 @@ from sonar_graph.batch.rounding import between, decimals_of, quantile_text, supp
         (0.3, 1),
         (1e-3, 4),
         (2e-3, 3),
+        (1.999996, 1),
+        (1.9999996, 0),
+        (5e-324, 324),
+        (3e-320, 320),
     ],
 )
 def test_digits_end_where_the_standard_error_begins(error, decimals):
@@ -54,6 +58,29 @@ def test_a_quantile_has_two_digits_however_large_its_error(value, text):
 @given(st.floats(0.1, 1e6), st.floats(1e-6, 1e-2))
 def test_a_quantile_with_a_small_error_is_rounded_by_it(value, error):
     assert quantile_text(value, error) == supported(value, error)
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        (with_error(3.21e-20, 4e-22), "3.21e-20 ± 4.00e-22"),
+        (with_error(0.25, 5e-324), "0.250000000000 ± 4.94e-324"),
+        (quantile_text(5e-324, 1.0), "4.94e-324"),
+        (quantile_text(0.25, 5e-324), "0.250000000000"),
+        (supported(0.0, 5e-324), "0"),
+        (fixed(3e-12, 12), "0.000000000003"),
+        (fixed(3e-13, 12), "0.000000000000"),
+    ],
+)
+def test_what_is_nothing_at_twelve_decimals_has_a_power_of_ten(text, shown):
+    assert text.replace("\N{MINUS SIGN}", "-") == shown
+
+
+@given(st.floats(-1e300, 1e300), st.floats(0.0, 1e300))
+def test_every_number_can_be_written(value, error):
+    for text in (supported(value, error), quantile_text(value, error), with_error(value, error)):
+        assert text
+        assert "nan" not in text
 
 
 def test_what_rounds_to_zero_has_no_sign():

@@ -2,23 +2,23 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import stats
 
+from sonar_graph.batch.signed_rank import signed_rank_p
 from sonar_graph.batch.statistics import (
     anees,
-    bootstrap_interval,
     failure_rate,
     holm,
-    least_p,
+    mean_interval,
     paired,
     quantile,
     quantile_error,
-    signed_rank_p,
     standard_error,
     summarise,
 )
@@ -32,15 +32,6 @@ def closed_testing(p_values: list[float]) -> list[float]:
     every = range(len(p_values))
     subsets = [s for size in range(1, len(p_values) + 1) for s in itertools.combinations(every, size)]
     return [max(min(1.0, len(s) * min(p_values[j] for j in s)) for s in subsets if i in s) for i in every]
-
-
-def enumerated_p(differences: np.ndarray) -> float:
-    """The signed-rank test by all sign patterns; zeros have a rank and no sign."""
-    ranks = stats.rankdata(np.abs(differences))
-    observed = abs((np.sign(differences) * ranks).sum())
-    ranks = ranks[differences != 0]
-    sums = [abs(np.dot(signs, ranks)) for signs in itertools.product((-1, 1), repeat=len(ranks))]
-    return float(np.mean([total >= observed - 1e-9 for total in sums]))
 
 
 @given(st.lists(shares, min_size=1, max_size=6))
@@ -73,27 +64,6 @@ def test_no_failure_in_few_runs_is_no_proof_of_none():
     assert failure_rate(0, 10).high == pytest.approx(0.2775, abs=1e-4)
 
 
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("kind", ["distinct", "ties", "zeros", "infinite"])
-def test_signed_rank_p_counts_sign_patterns(seed, kind):
-    rng = np.random.default_rng(seed)
-    differences = rng.normal(0.4, 1, 9)
-    if kind == "ties":
-        differences = np.round(differences) + 0.5
-    elif kind == "zeros":
-        differences[:2] = 0.0
-    elif kind == "infinite":
-        differences[:3] = [INF, -INF, INF]
-    finite = np.where(np.isinf(differences), np.sign(differences) * 100.0, differences)
-    assert signed_rank_p(differences) == pytest.approx(enumerated_p(finite), abs=1e-12)
-
-
-def test_signed_rank_p_of_equal_runs_is_one_and_of_few_is_unknown():
-    assert signed_rank_p(np.zeros(8)) == 1.0
-    assert math.isnan(signed_rank_p(np.array([1.0, 2.0, 3.0, 4.0, 5.0])))
-    assert signed_rank_p(np.arange(1.0, 9.0)) == pytest.approx(least_p(8))
-
-
 def test_one_false_finding_in_twenty_families_and_not_more():
     rng = np.random.default_rng(0)
     families = rng.normal(size=(300, 4, 10))
@@ -103,42 +73,49 @@ def test_one_false_finding_in_twenty_families_and_not_more():
     assert np.mean((single < 0.05).any(axis=1)) > 0.12, "uncorrected tests find more: the check can fail"
 
 
-def test_bootstrap_interval_holds_the_mean_as_often_as_it_says():
+@pytest.mark.parametrize("pairs", [6, 10, 25])
+def test_the_interval_holds_the_mean_as_often_as_it_says(pairs):
     rng = np.random.default_rng(1)
-    intervals = np.array([bootstrap_interval(rng.normal(0.3, 1, 25)) for _ in range(200)])
+    intervals = np.array([mean_interval(rng.normal(0.3, 1, pairs)) for _ in range(2000)])
     inside = np.mean((intervals[:, 0] < 0.3) & (intervals[:, 1] > 0.3))
     middle, half = intervals.mean(axis=1), 0.25 * np.ptp(intervals, axis=1)
-    assert 0.89 < inside < 0.99
-    assert np.mean(np.abs(middle - 0.3) < half) < 0.8, "intervals half as wide do not: the check can fail"
+    assert inside == pytest.approx(0.95, abs=0.017)
+    assert np.mean(np.abs(middle - 0.3) < half) < 0.85, "intervals half as wide do not: the check can fail"
 
 
-def test_bootstrap_interval_is_corrected_for_bias_and_skewness():
-    values = np.random.default_rng(13).lognormal(0, 1.2, 20)
-    low, high = bootstrap_interval(values)
-    draws = np.random.default_rng(0).choice(values, (20000, 20)).mean(axis=1)
-    plain_low, plain_high = np.quantile(draws, [0.025, 0.975])
-    scatter = draws.std()
-    assert low - plain_low > 0.1 * scatter
-    assert high - plain_high > 0.2 * scatter
-    whole = stats.bootstrap((values,), np.mean, n_resamples=20000, method="BCa", rng=np.random.default_rng(0))
-    assert [low, high] == pytest.approx(list(whole.confidence_interval), abs=0.1 * scatter)
+def test_the_interval_of_skewed_differences_holds_their_mean_more_often_than_students():
+    draws = np.random.default_rng(2).lognormal(0, 1, (2000, 10))
+    mean = math.exp(0.5)
+    own = np.array([mean_interval(values) for values in draws])
+    students = np.stack(stats.t.interval(0.95, 9, draws.mean(axis=1), stats.sem(draws, axis=1)), axis=1)
+    held, held_by_student = (np.mean((low < mean) & (mean < high)) for low, high in (own.T, students.T))
+    assert held > 0.89
+    assert held_by_student < held - 0.03
 
 
-def test_signed_rank_p_of_many_with_a_zero_is_by_changes_of_sign():
-    differences = np.append(0.0, np.arange(1.0, 8.0))
-    assert signed_rank_p(differences) == pytest.approx(2 * 0.5**7)
-    mixed = np.array([0.0, 1.0, 2.0, 3.0, -4.0, 5.0, 6.0])
-    assert signed_rank_p(mixed) == pytest.approx(enumerated_p(mixed))
+@given(st.lists(st.floats(-1e3, 1e3), min_size=6, max_size=30))
+def test_the_interval_solves_halls_equation(listed):
+    values = np.array(listed)
+    n, mean, deviation = len(values), values.mean(), values.std(ddof=1)
+    assume(deviation > max(1e-9, 1e-6 * np.abs(values).max()))
+    g = stats.skew(values)
+    for bound, side in zip(mean_interval(values), (1, -1), strict=True):
+        w = (mean - bound) / deviation
+        transformed = math.sqrt(n) * (w + g * w**2 / 3 + g**2 * w**3 / 27 + g / (6 * n))
+        assert transformed == pytest.approx(side * stats.t.ppf(0.975, n - 1), rel=1e-6, abs=1e-6)
 
 
-def test_bootstrap_interval_of_equal_differences_is_a_point_and_of_few_unknown():
-    assert bootstrap_interval(np.full(8, 0.25)) == (0.25, 0.25)
-    assert math.isnan(bootstrap_interval(np.arange(5.0))[0])
+def test_the_interval_of_symmetric_differences_is_students():
+    values = np.array([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0]) + 0.5
+    assert mean_interval(values) == pytest.approx(stats.t.interval(0.95, 5, 0.5, stats.sem(values)))
+    askew = mean_interval(np.append(values, 9.0))
+    assert askew[1] - np.append(values, 9.0).mean() > np.append(values, 9.0).mean() - askew[0]
 
 
-def test_the_same_numbers_give_the_same_interval():
-    values = np.random.default_rng(2).normal(size=12)
-    assert bootstrap_interval(values) == bootstrap_interval(values.copy())
+def test_the_interval_of_equal_differences_is_a_point_and_of_few_unknown():
+    assert mean_interval(np.full(8, 0.25)) == (0.25, 0.25)
+    assert np.isnan(mean_interval(np.arange(5.0))).all()
+    assert np.isfinite(mean_interval(np.arange(6.0))).all()
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=20), shares)
@@ -245,7 +222,15 @@ def test_pairs_of_one_case_make_one_difference():
     assert math.isnan(told.mean)
     own, reference = np.arange(12.0), np.array([1.0, 0.0] * 6)
     halves = paired(own, reference, [i // 2 for i in range(12)])
-    assert halves == paired((own - reference).reshape(6, 2).mean(axis=1), np.zeros(6))
+    assert halves == replace(paired((own - reference).reshape(6, 2).mean(axis=1), np.zeros(6)), each="seed")
+
+
+@pytest.mark.parametrize(
+    ("cases", "counted"), [(None, "2 pairs"), ([3, 3], "1 seed"), ([3, 4], "2 seeds"), (["a", "b"], "2 logs")]
+)
+def test_differences_say_what_they_are_of(cases, counted):
+    assert paired(np.ones(2), np.zeros(2), cases).counted == counted
+    assert paired(np.ones(3), np.zeros(3), [1, 2, "a"]).counted == "3 cases"
 
 
 def test_two_failures_on_one_seed_are_equal():

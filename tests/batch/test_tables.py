@@ -8,13 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.batch.accuracy import accuracy_table, all_tests, difference_table
+from sonar_graph.batch.accuracy import accuracy_table, all_tests, difference_table, p_text
 from sonar_graph.batch.catalogue import KINDS, Metric, metrics_of
 from sonar_graph.batch.exported import as_csv, as_latex, latex_text, write_tables
+from sonar_graph.batch.figures import consistency_drawing, difference_drawing
 from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told, reference_told
 from sonar_graph.batch.headline import head_metric
-from sonar_graph.batch.overviews import consistency_table, cost_table, failure_table, run_lists
+from sonar_graph.batch.overviews import SAME_EVIDENCE, consistency_table, cost_table, failure_table, run_lists
 from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
+from sonar_graph.batch.rounding import quantile_text
+from sonar_graph.batch.statistics import paired, quantile_error
 from sonar_graph.batch.tables import Cell, Column, Table
 
 from .recorded_batches import LOGS, METRICS, changed, drawn_batch, with_failures
@@ -74,6 +77,46 @@ def test_differences_are_paired_and_their_tests_corrected_within_a_metric():
     assert {log for _, log, _ in tests} == {*LOGS, ALL_LOGS}
 
 
+def test_of_all_logs_together_seeds_are_counted():
+    batch = drawn_batch(8)
+    tests = all_tests(batch, [ATE])
+    table = difference_table(batch, ATE, tests)
+    shown = {row[0].text: (row[2].text, row[5].text) for row in table.rows if row[1].text == "isam2"}
+    assert shown == {
+        LOGS[0]: ("8 pairs", "8 of 8 pairs"),
+        LOGS[1]: ("8 pairs", "8 of 8 pairs"),
+        ALL_LOGS: ("8 seeds", "8 of 8 seeds"),
+    }
+    assert [column.heading for column in table.columns[2:6]] == ["Compared", "Mean difference", "Median", "Smaller in"]
+    row = row_of(table, "isam2", ALL_LOGS)
+    assert (row["pairs"], row["pairs_of"], row["causal.ate_se2_m_smaller"]) == ("8", "seed", "8")
+    drawing = difference_drawing(batch, ATE, tests)
+    counted = {(row["log"], row["pairs"], row["pairs_of"]) for row in csv.DictReader(io.StringIO(drawing.data))}
+    assert counted == {(LOGS[0], "8", "pair"), (LOGS[1], "8", "pair"), (ALL_LOGS, "8", "seed")}
+    unseeded = replace(batch, runs=[replace(run, seed=None) for run in batch.runs if run.seed == 0])
+    rows = difference_table(unseeded, ATE, all_tests(unseeded, [ATE])).rows
+    assert [row[2].text for row in rows if row[1].text == "isam2"] == ["1 pair", "1 pair", "2 logs"]
+
+
+@pytest.mark.parametrize(
+    ("p_value", "text"),
+    [
+        (0.0496, "0.0496"),
+        (0.04996, "0.04996"),
+        (0.0504, "0.0504"),
+        (0.05, "0.05"),
+        (0.0512, "0.051"),
+        (0.0488, "0.049"),
+        (0.123, "0.12"),
+        (0.00099, "< 0.001"),
+        (0.9999, "1.0"),
+        (np.nextafter(0.05, 0.0), "0.049999999999999996"),
+    ],
+)
+def test_a_p_value_shows_its_side_of_five_percent(p_value, text):
+    assert p_text(p_value) == text
+
+
 def test_a_filters_two_estimates_are_one_test():
     batch = drawn_batch()
     alone = all_tests(batch, [Metric("ate_se2_m", {"Causal": "causal.ate_se2_m"})])
@@ -96,6 +139,48 @@ def test_consistency_is_judged_over_runs_by_the_chi_square_band():
     failed = consistency_table(with_failures(drawn_batch(40), "isam2", LOGS[0], 1))
     row = next(row for row in rows_of(failed) if row["contestant"] == "isam2")
     assert (row["causal_anees"], row["causal_verdict"]) == ("", "")
+
+
+def with_one_end(batch: RecordedBatch, contestants: tuple[str, ...], factor: float = 1.0) -> RecordedBatch:
+    """The batch, were the smoothed error at the end of contestants the causal one times a factor."""
+    ends = [f"nees_{what}_end" for what in ("position", "yaw")]
+    return replace(
+        batch,
+        runs=[
+            replace(run, values=run.values | {f"smoothed.{e}": factor * run.values[f"causal.{e}"] for e in ends})
+            if run.contestant in contestants
+            else run
+            for run in batch.runs
+        ],
+    )
+
+
+@pytest.mark.parametrize(("factor", "shown"), [(1.0, False), (1.09, False), (0.91, False), (1.11, True), (0.89, True)])
+def test_a_smoothed_error_at_the_end_is_no_second_evidence(factor, shown):
+    batch = with_one_end(drawn_batch(logs=LOGS[:1]), ("dead-reckoning", "isam2", "ekf-slam"))
+    table = consistency_table(batch)
+    assert SAME_EVIDENCE in table.caption
+    assert [name for name, _ in table.groups] == ["", "Causal"]
+    mixed = with_one_end(batch, ("isam2",), factor)
+    assert ("Smoothed" in [name for name, _ in consistency_table(mixed).groups]) is shown
+    points = [one.svg.count("<use ") for drawn in (batch, mixed) if (one := consistency_drawing(drawn, "position"))]
+    assert (points[1] > points[0]) is shown
+    for row in consistency_table(mixed).rows if shown else []:
+        is_told = row[1].text == "isam2"
+        assert (row[-2].text != "as causal") is is_told
+        assert bool(row[-1].text) is is_told
+        assert row[-2].numbers[0] == pytest.approx(row[-4].numbers[0] * (factor if is_told else 1.0))
+
+
+def test_who_has_but_a_smoothed_covariance_is_judged_by_it():
+    batch = drawn_batch(logs=LOGS[:1])
+    only = [
+        replace(run, values={key: value for key, value in run.values.items() if not key.startswith("causal.nees")})
+        for run in batch.runs
+    ]
+    rows = rows_of(consistency_table(replace(batch, runs=only)))
+    assert all(row["smoothed_verdict"] for row in rows)
+    assert "causal_anees" not in rows[0]
 
 
 def test_every_run_is_listed_once_and_leads_to_its_log():
@@ -163,7 +248,7 @@ def test_the_finding_gives_no_mean_over_survivors():
     metrics = metrics_of(METRICS)
     told = errors_told(batch, metrics, all_tests(batch, metrics))[0]
     differences = np.subtract(*batch.pairs(LOGS[0], "isam2", "causal.ate_se2_m"))
-    found = re.search(r"isam2 is below dead-reckoning by (\S+) in the median, smaller in 17 of 18 \(p ", told)
+    found = re.search(r"isam2 is below dead-reckoning by (\S+) in the median, smaller in 17 of 18 pairs \(p ", told)
     assert float(found[1]) == pytest.approx(-np.median(differences), rel=0.1)
 
 
@@ -182,7 +267,7 @@ def test_the_finding_of_who_never_ended_has_a_side_and_no_size():
     batch = with_failures(drawn_batch(18, logs=LOGS[:1]), "isam2", LOGS[0], 18)
     metrics = metrics_of(METRICS)
     told = errors_told(batch, metrics, all_tests(batch, metrics))[0]
-    assert "isam2 is above dead-reckoning, smaller in 0 of 18 (p " in told
+    assert "isam2 is above dead-reckoning, smaller in 0 of 18 pairs (p " in told
 
 
 def test_angles_are_degrees_for_people_and_radians_in_files():
@@ -195,11 +280,34 @@ def test_angles_are_degrees_for_people_and_radians_in_files():
     assert table.title.endswith("°")
 
 
+def test_sentences_on_angles_are_in_degrees():
+    batch = changed(drawn_batch(12, logs=LOGS[:1]), "isam2", "causal.yaw_rmse_rad", 0.5)
+    (metric,) = metrics_of(["causal.yaw_rmse_rad"])
+    (told,) = errors_told(batch, [metric], all_tests(batch, [metric]))
+    own, reference = np.degrees(batch.pairs(LOGS[0], "isam2", "causal.yaw_rmse_rad"))
+    size = quantile_text(-np.median(own - reference), quantile_error(own - reference, 0.5))
+    assert f"isam2 {quantile_text(np.median(own), quantile_error(own, 0.5))}, " in told
+    assert f"isam2 is below dead-reckoning by {size} in the median, smaller in 12 of 12 pairs" in told
+    assert " in °" in told
+    assert float(size) == pytest.approx(57.3 * -np.median(np.radians(own - reference)), rel=0.1)
+
+
 def test_too_few_seeds_are_warned_of():
     few, many = drawn_batch(4, logs=LOGS[:1]), drawn_batch(12, logs=LOGS[:1])
     metrics = metrics_of(METRICS)
     assert "4 pairs" in power_told(all_tests(few, metrics))[0]
     assert power_told(all_tests(many, metrics)) == []
+    assert f"{ALL_LOGS} (4 seeds)" in power_told(all_tests(drawn_batch(4), metrics))[0]
+
+
+def test_what_has_too_few_pairs_for_a_test_costs_others_nothing():
+    tests = {
+        ("causal.ate_se2_m", f"{pairs} of them", "isam2"): (paired(np.arange(pairs) + 1.0, np.zeros(pairs)), 1.0)
+        for pairs in (5, 6)
+    }
+    assert power_told(tests) == [
+        "Too few pairs for any corrected p value to fall below 0.05: 5 of them (5 pairs). Add seeds."
+    ]
 
 
 def uneven_batch(most: int, fewest: int) -> RecordedBatch:
