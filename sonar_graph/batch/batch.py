@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sonar_graph.batch.execution import Where, run_batch
+from sonar_graph.batch.interrupts import deferred_interrupt
 from sonar_graph.batch.lock import only_batch_in
 from sonar_graph.batch.plan import plan_runs
 from sonar_graph.batch.planned import Limits, Outcome, PlannedRun, Row
@@ -95,9 +96,10 @@ class Batch:
         return f"{len(self.rows())} of {len(self.runs)} runs are done and kept; the same command goes on from there"
 
     def _write_table(self) -> None:
-        with replacing(self.store.folder / SUITE) as partial:
-            partial.write_text(self.file.text, encoding="utf-8")
-        write_results(self.store, self.file.suite, self.runs)
+        with deferred_interrupt():
+            with replacing(self.store.folder / SUITE) as partial:
+                partial.write_text(self.file.text, encoding="utf-8")
+            write_results(self.store, self.file.suite, self.runs)
 
     def _write_table_if_it_can_be(self) -> bool:
         """Whether there is something to tell and space to tell it."""
