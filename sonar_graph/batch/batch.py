@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sonar_graph.batch.execution import Where, run_batch
+from sonar_graph.batch.interrupts import deferred_interrupt
 from sonar_graph.batch.lock import only_batch_in
 from sonar_graph.batch.plan import plan_runs
 from sonar_graph.batch.planned import Limits, Outcome, PlannedRun, Row
@@ -35,14 +37,14 @@ class Batch:
         Raises
         ------
         BatchError
-            When the suite has a mistake, or another batch runs in the folder; no file in it is touched then.
+            When the suite has a mistake, another batch runs in the folder, or it holds the batch of another suite; no
+            file in it is touched then.
         """
         runs = plan_runs(file)
         store = Store(folder)
         with only_batch_in(folder):
+            _check_same_suite(file, folder)
             store.remove_partial()
-            with replacing(folder / SUITE) as partial:
-                partial.write_text(file.text, encoding="utf-8")
             yield cls(file, runs, store)
 
     def rows(self) -> dict[str, Row]:
@@ -58,6 +60,9 @@ class Batch:
     def run(self, where: Where, limits: Limits, progress: Callable[[PlannedRun, Outcome], None]) -> Counter[str]:
         """Do what is not done, and write the table, also where the batch ends early.
 
+        Suite and table in the folder are replaced as soon as a run of this plan is done, and not before: the table then
+        names all runs, so that what a batch left that is killed can be read without the code that planned it.
+
         Returns
         -------
         How many runs have which status.
@@ -69,11 +74,17 @@ class Batch:
         """
         done = self.rows()
         missing = [run for run in self.runs if run.key not in done]
+        is_begun = self._write_table_if_it_can_be()
+
+        def begun(run: PlannedRun, outcome: Outcome) -> None:
+            nonlocal is_begun
+            is_begun = is_begun or self._write_table_if_it_can_be()
+            progress(run, outcome)
+
         try:
-            run_batch(missing, self.store, limits, where, progress)
+            run_batch(missing, self.store, limits, where, begun)
         except (BatchError, KeyboardInterrupt) as error:
-            with contextlib.suppress(OSError):  # why the batch ends is what has to be told
-                self._write_table()
+            self._write_table_if_it_can_be()  # why the batch ends is what has to be told
             if isinstance(error, BatchError):
                 raise BatchError(f"{error}; {self.resuming()}") from error
             raise
@@ -85,7 +96,32 @@ class Batch:
         return f"{len(self.rows())} of {len(self.runs)} runs are done and kept; the same command goes on from there"
 
     def _write_table(self) -> None:
-        write_results(self.store, self.file.suite, self.runs)
+        with deferred_interrupt():
+            with replacing(self.store.folder / SUITE) as partial:
+                partial.write_text(self.file.text, encoding="utf-8")
+            write_results(self.store, self.file.suite, self.runs)
+
+    def _write_table_if_it_can_be(self) -> bool:
+        """Whether there is something to tell and space to tell it."""
+        if not any(self.store.row(run.key) for run in self.runs):
+            return False
+        with contextlib.suppress(OSError):
+            self._write_table()
+            return True
+        return False
+
+
+def _check_same_suite(file: SuiteFile, folder: Path) -> None:
+    """Refuse the folder of another suite; one that was changed, and has its name still, goes on there."""
+    try:
+        name = tomllib.loads((folder / SUITE).read_text(encoding="utf-8")).get("name")
+    except (OSError, ValueError):  # none, or none that could be gone on with
+        return
+    if name != file.suite.name:
+        raise BatchError(
+            f"{folder}: holds the batch of suite {name!r}, and {file.path} is suite {file.suite.name!r}; choose "
+            f"another folder with -o, or, where it only has a new name, give it that name in {folder / SUITE} too"
+        )
 
 
 def limits_of(file: SuiteFile, timeout_s: float | None) -> Limits:

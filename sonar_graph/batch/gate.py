@@ -18,6 +18,7 @@ import numpy as np
 from scipy import stats
 
 from sonar_graph.batch.catalogue import KINDS, is_timing, metrics_of
+from sonar_graph.batch.incomplete import require_complete
 from sonar_graph.batch.recorded import RecordedBatch, RecordedRun
 from sonar_graph.batch.statistics import holm
 from sonar_graph.errors import EvaluationError
@@ -70,7 +71,14 @@ class Verdict:
 
 
 def bless(batch: RecordedBatch, path: Path) -> None:
-    """Write what this batch reached as the reference of later ones; a deliberate act."""
+    """Write what this batch reached as the reference of later ones; a deliberate act.
+
+    Raises
+    ------
+    EvaluationError
+        When a planned run was not done.
+    """
+    require_complete(batch, path, "become a reference")
     write_json(
         path,
         {
@@ -95,8 +103,10 @@ def gate(batch: RecordedBatch, reference: Path) -> Verdict:
     Raises
     ------
     EvaluationError
-        When the file is no reference, or the batch lacks a run that the reference has: what is missing is not passed.
+        When the file is no reference, a run of the batch was not done, or the batch lacks a run that the reference
+        has: what is missing is not passed.
     """
+    require_complete(batch, reference, "be held against it")
     blessed = _read_reference(reference)
     runs = {_name(run): run for run in batch.runs}
     missing = sorted(set(blessed["runs"]) - set(runs))

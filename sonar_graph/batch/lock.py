@@ -8,9 +8,8 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from sonar_graph.batch.store import LOCK
 from sonar_graph.errors import BatchError
-
-LOCK = ".lock"
 
 
 @contextmanager

@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import platform
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -29,8 +30,9 @@ from sonar_graph.evaluation.storage import write_comparison
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks
 
-KEPT_SEQUENCES = 2
-"""Estimators of one log mostly follow each other in a process."""
+KEPT_SEQUENCES = 3
+"""Estimators of one log mostly follow each other in a process; one is that of the warm-up."""
+WARM_UP_LOG = ("basin", {"duration_s": 120.0, "laps": 1, "wrong_id_rate": 0.1})
 TWO_DIMENSIONS = 2
 LOG = logging.getLogger(__name__)
 
@@ -71,6 +73,17 @@ def perform(run: PlannedRun, folder: Path) -> Row:
     row = _performed(run, folder)
     _check_source_now(run)
     return row
+
+
+def warm_up(run: PlannedRun) -> None:
+    """Do the run of an estimator on a short simulated log, so that what it needs is compiled and loaded.
+
+    What fails here fails in the run itself, and is told there.
+    """
+    with suppress(Exception), tempfile.TemporaryDirectory(prefix="sonar-graph-warm-up-") as scratch:
+        kind, options = WARM_UP_LOG
+        content = fingerprint(kind, options)
+        perform(replace(run, kind=kind, options=options, content=content, landmarks=None, seed=0), Path(scratch))
 
 
 def _performed(run: PlannedRun, folder: Path) -> Row:

@@ -50,17 +50,23 @@ def failure_table(batch: RecordedBatch) -> Table:
         Column("ended", "Ended well"),
         *(Column(status, status.capitalize(), "Did not") for status in FAILURES),
         Column("failure_rate", "Failure rate", parts=("", "low", "high")),
+        *([Column("not_run", "Not run")] if batch.missing else []),
     ]
+    missing = Counter((run.log, run.contestant) for run in batch.missing)
     rows = []
     for log in batch.logs:
         for contestant in batch.contestants:
-            group = batch.group(log, contestant)
-            if group:
-                rows.append([words(log), words(contestant), *_ending_cells(batch, log, contestant, group)])
+            group, not_run = batch.group(log, contestant), missing[log, contestant]
+            if group or not_run:
+                row = [words(log), words(contestant), *_ending_cells(batch, log, contestant, group)]
+                rows.append([*row, *([Cell(str(not_run), (not_run,))] if batch.missing else [])])
     return Table("failures", "Runs that ended", "Rates with 95 % intervals (Wilson).", columns, rows)
 
 
 def _ending_cells(batch: RecordedBatch, log: str, contestant: str, group: list[RecordedRun]) -> list[Cell]:
+    """How the runs of a group ended; runs that were not done are not in it."""
+    if not group:
+        return [Cell("0", (0,)), *[absent()] * (1 + len(FAILURES)), absent(3)]
     counts = Counter(run.status for run in group)
     rate = failure_rate(len(group) - counts["ok"], len(group))
     anchor = group_anchor(batch.logs.index(log), batch.contestants.index(contestant))

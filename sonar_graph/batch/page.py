@@ -26,6 +26,7 @@ from sonar_graph.batch.figures import (
 )
 from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told, reference_told
 from sonar_graph.batch.headline import head_metric, headlines, overview_table
+from sonar_graph.batch.incomplete import marked, missing_told
 from sonar_graph.batch.overviews import SAME_EVIDENCE, consistency_table, cost_table, failure_table, run_lists
 from sonar_graph.batch.recorded import RESULTS, RecordedBatch
 from sonar_graph.batch.signed_rank import LEAST_PAIRS
@@ -98,13 +99,15 @@ def _content(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> dict[
     chapters = [_chapter(batch, metric, tests) for metric in metrics]
     shown = [chapter for chapter in chapters if chapter.drawings or chapter.tables]
     head = head_metric(batch, metrics)
-    overview = overview_table(batch, head, tests) if head else None
-    failures, consistency, costs = failure_table(batch), consistency_table(batch), cost_table(batch)
+    overview = marked(batch, overview_table(batch, head, tests)) if head else None
+    others = (failure_table(batch), consistency_table(batch), cost_table(batch))
+    failures, consistency, costs = (marked(batch, table) for table in others)
     return {
         "name": batch.name,
         "description": batch.description,
         "summary": _summary(batch),
-        "failed": failures_told(batch),
+        "failed": [*missing_told(batch), *failures_told(batch)],
+        "is_complete": not batch.missing,
         "warnings": [*reference_told(batch), *instants_told(batch), *power_told(tests)],
         "headlines": headlines(batch, head, tests) if head else [],
         "overview": overview,
@@ -142,7 +145,7 @@ def _chapter(batch: RecordedBatch, metric: Metric, tests: Tests) -> Chapter:
         return Chapter(metric, [], [])
     tables = [accuracy_table(batch, metric), difference_table(batch, metric, tests)]
     drawings = _drawn([spread_drawing(batch, metric), difference_drawing(batch, metric, tests)])
-    return Chapter(metric, drawings, [table for table in tables if table.rows])
+    return Chapter(metric, drawings, [marked(batch, table) for table in tables if table.rows])
 
 
 def _places(batch: RecordedBatch) -> list[tuple[str, str]]:

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 Status = Literal["ok", "failed", "timeout", "memory", "killed"]
+NOT_RUN = "not run"
+"""In place of the status of a run that is planned and was not done: the table has a row for it too."""
 Row = dict[str, str | int | float | None]
 """Of the table of results, by column."""
 
@@ -35,6 +37,13 @@ class PlannedRun:
     """All settings; of an estimator that cannot be loaded those that were given."""
     rate_hz: float
     versions: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What a process is asked before the first run of an estimator, and before the clock of that run starts."""
+
+    run: PlannedRun
 
 
 @dataclass(frozen=True)

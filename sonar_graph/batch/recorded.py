@@ -1,7 +1,12 @@
-"""What a batch left behind, as its report and its gate read it: ``results.parquet`` and the suite beside it."""
+"""What a batch left behind, as its report and its gate read it: ``results.parquet`` and the suite beside it.
+
+The table names every run that is planned. One that it has as not done may have been done since, by a batch that was
+killed: its row is then read from where the run is kept.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from dataclasses import dataclass, field
@@ -11,10 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from sonar_graph.batch.planned import NOT_RUN
+from sonar_graph.batch.store import LOCK, LOG, ROW, RUNS, SUITE
 from sonar_graph.errors import EvaluationError
+from sonar_graph.evaluation.strict_json import read_json
 from sonar_graph.measurements import Floats
 
-RESULTS, SUITE = "results.parquet", "suite.toml"
+RESULTS = "results.parquet"
 SUITE_METADATA = b"sonar_graph.suite"
 DEFAULT_VARIANT = ("", "default")
 DEFAULT_METRICS = (
@@ -24,6 +32,7 @@ DEFAULT_METRICS = (
     "causal.yaw_rmse_rad",
     "landmarks.se2_m",
 )
+GOING_ON = "give the bench command that began it again: it goes on from there"
 ALL_LOGS = "all logs"
 """Stands for every log of a batch where they are taken together."""
 NEEDED = ("key", "log", "estimator", "status")
@@ -48,6 +57,8 @@ class RecordedRun:
     """All else that is no number: generator, options, params, versions, machine."""
     values: dict[str, float] = field(default_factory=dict)
     """Every number that is known, by column."""
+    place: int = 0
+    """In the plan: groups are told in its order, whichever of their runs are done."""
 
     @property
     def contestant(self) -> str:
@@ -70,12 +81,15 @@ class RecordedBatch:
 
     name: str
     runs: list[RecordedRun]
+    """Those that were done, whatever came of them. Statistics are of these alone."""
     reference: str
     """Contestant with which the others are compared."""
     metrics: list[str]
     description: str = ""
     suite: str = ""
     """The suite's text."""
+    missing: list[RecordedRun] = field(default_factory=list)
+    """Those that are planned and were not done; not failures."""
 
     @cached_property
     def _groups(self) -> dict[tuple[str, str], list[RecordedRun]]:
@@ -98,16 +112,20 @@ class RecordedBatch:
 
     @cached_property
     def logs(self) -> list[str]:
-        """Names of logs, in the order of the runs."""
-        return list(dict.fromkeys(run.log for run in self.runs))
+        """Names of logs, in the order of the plan."""
+        return list(dict.fromkeys(run.log for run in self._planned))
 
     @cached_property
     def contestants(self) -> list[str]:
-        """In the order of the runs."""
-        return list(dict.fromkeys(run.contestant for run in self.runs))
+        """In the order of the plan."""
+        return list(dict.fromkeys(run.contestant for run in self._planned))
+
+    @property
+    def _planned(self) -> list[RecordedRun]:
+        return sorted([*self.runs, *self.missing], key=lambda run: run.place)
 
     def group(self, log: str, contestant: str) -> list[RecordedRun]:
-        """Runs of one contestant on one log, one a seed."""
+        """Runs of one contestant on one log that were done, one a seed."""
         return self._groups.get((log, contestant), [])
 
     def values(self, log: str, contestant: str, key: str) -> Floats:
@@ -143,15 +161,16 @@ class RecordedBatch:
         """Whether a score can be expected: the log has it for somebody, and the contestant on some log.
 
         A dead reckoning has no map and a log without truth no errors; neither is a failure. Of a contestant that never
-        ended nobody knows what it would have, so everything is expected of it.
+        ended nobody knows what it would have, so everything is expected of it. Where none of its runs was done there is
+        nothing to expect.
         """
         is_known = (key, contestant) in self._contestant_scores or contestant not in self._ended_contestants
-        return (key, log) in self._log_scores and is_known
+        return (key, log) in self._log_scores and is_known and (log, contestant) in self._groups
 
 
 def is_batch(folder: Path) -> bool:
-    """Whether a folder holds the results of a batch."""
-    return (folder / RESULTS).is_file()
+    """Whether a batch was begun in a folder."""
+    return any((folder / name).is_file() for name in (RESULTS, SUITE, LOCK))
 
 
 def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
@@ -165,10 +184,13 @@ def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
     Raises
     ------
     EvaluationError
-        When there are no results, they lack a column, or the reference has no run.
+        When there are no results, no run was done yet, the table lacks a column, or the reference is not planned.
     """
-    runs, about = _read_table(folder / RESULTS)
-    chosen = reference or _plain_name(about.get("reference")) or runs[0].contestant
+    planned, about = _read_table(folder / RESULTS)
+    runs = [run for run in planned if run.status != NOT_RUN]
+    if not runs:
+        raise EvaluationError(f"{folder}: none of its {len(planned)} runs has been done yet; {GOING_ON}")
+    chosen = reference or _plain_name(about.get("reference")) or planned[0].contestant
     batch = RecordedBatch(
         name=about.get("name") or runs[0].texts.get("suite") or folder.name,
         runs=runs,
@@ -176,6 +198,7 @@ def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
         metrics=list(about.get("metrics") or DEFAULT_METRICS),
         description=about.get("description", ""),
         suite=(folder / SUITE).read_text("utf-8") if (folder / SUITE).is_file() else "",
+        missing=[run for run in planned if run.status == NOT_RUN],
     )
     if chosen not in batch.contestants:
         raise EvaluationError(
@@ -192,7 +215,7 @@ def _plain_name(reference: str | None) -> str | None:
 def _read_table(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
     """The runs, and what the suite says about comparing them."""
     if not path.is_file():
-        raise EvaluationError(f"{path.parent}: no {path.name} in it; it needs a folder that bench wrote to")
+        raise EvaluationError(_absence_told(path))
     try:
         import pyarrow as pa  # only batches need it
         import pyarrow.parquet as pq
@@ -208,10 +231,28 @@ def _read_table(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
     if not table.num_rows:
         raise EvaluationError(f"{path}: has no rows; run bench again, it resumes")
     about = json.loads((table.schema.metadata or {}).get(SUITE_METADATA, b"{}"))
-    return [_run(row) for row in table.to_pylist()], about
+    rows = [_row_now(row, path.parent) for row in table.to_pylist()]
+    return [_run(row, place) for place, row in enumerate(rows)], about
 
 
-def _run(row: dict[str, Any]) -> RecordedRun:
+def _absence_told(path: Path) -> str:
+    """What a folder without a table is."""
+    if not is_batch(path.parent):
+        return f"{path.parent}: no {path.name} in it; it needs a folder that bench wrote to"
+    return f"{path.parent}: no {path.name} in it: the batch was ended before any of its runs was done; {GOING_ON}"
+
+
+def _row_now(row: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """A row of the table, with what was measured if the run was done after the table was written."""
+    if row["status"] != NOT_RUN:
+        return row
+    kept = Path(RUNS) / str(row["key"])
+    with contextlib.suppress(EvaluationError):
+        return row | {"reason": None, "log_file": f"{kept.as_posix()}/{LOG}"} | read_json(folder / kept / ROW)
+    return row
+
+
+def _run(row: dict[str, Any], place: int) -> RecordedRun:
     words = {name: str(row.pop(name, None) or "") for name in WORDS}
     seed = row.pop("seed", None)
     objects = {name: _as_text(row.pop(name)) for name in OBJECTS if row.get(name)}
@@ -229,6 +270,7 @@ def _run(row: dict[str, Any]) -> RecordedRun:
         log_file=words["log_file"],
         texts=known | objects | others,
         values={name: value for name, value in numbers.items() if math.isfinite(value)},
+        place=place,
     )
 
 

@@ -1,8 +1,9 @@
-"""The table of a batch: one row a run, as Parquet.
+"""The table of a batch: one row for each planned run, as Parquet.
 
 Columns in this order: what was run, how it went, on what, how long it took, and then every score by its key, in
-alphabetical order. What was not measured is null. The file's metadata say under ``sonar_graph.suite`` what the suite
-compares: its name, description, reference, metrics and rate, as JSON.
+alphabetical order. What was not measured is null. A run that was not done has the status ``not run`` and no numbers.
+The file's metadata say under ``sonar_graph.suite`` what the suite compares: its name, description, reference, metrics
+and rate, as JSON.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sonar_graph.batch.catalogue import TIMINGS
-from sonar_graph.batch.planned import PlannedRun, Row
+from sonar_graph.batch.planned import NOT_RUN, PlannedRun, Row
 from sonar_graph.batch.store import Store
 from sonar_graph.batch.suite import Suite
 from sonar_graph.evaluation.atomic import replacing
@@ -37,8 +38,8 @@ COLUMNS: dict[str, pa.DataType] = {
 
 
 def write_results(store: Store, suite: Suite, runs: list[PlannedRun]) -> Path:
-    """Write the table of those runs that are done, in the order of the plan; whole or not at all."""
-    rows = [_described(run, store) | row for run in runs if (row := store.row(run.key)) is not None]
+    """Write the table of all runs, also of those that are not done, in the order of the plan; whole or not at all."""
+    rows = [_described(run) | _came_of(run, store) for run in runs]
     scores = sorted({name for row in rows for name in row} - set(COLUMNS))
     types = COLUMNS | {name: pa.int64() if name.endswith("_dof") else pa.float64() for name in scores}
     about = suite.model_dump(mode="json", include={"name", "description", "reference", "metrics", "rate_hz"})
@@ -49,7 +50,15 @@ def write_results(store: Store, suite: Suite, runs: list[PlannedRun]) -> Path:
     return path
 
 
-def _described(run: PlannedRun, store: Store) -> Row:
+def _came_of(run: PlannedRun, store: Store) -> Row:
+    """What was measured and where its log is, or that nothing was."""
+    row = store.row(run.key)
+    if row is None:
+        return {"status": NOT_RUN, "reason": "not done when this table was written"}
+    return {"log_file": store.log_file(run.key), **row}
+
+
+def _described(run: PlannedRun) -> Row:
     """What was run; versions are told again by the run itself, where it came so far."""
     return {
         "key": run.key,
@@ -61,7 +70,6 @@ def _described(run: PlannedRun, store: Store) -> Row:
         "variant": run.variant,
         "params": _plain(run.params),
         "estimator": run.estimator,
-        "log_file": store.log_file(run.key),
         "rate_hz": run.rate_hz,
         **{name: number for name, number in run.versions.items() if name in VERSIONS},
     }

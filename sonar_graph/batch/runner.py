@@ -1,7 +1,8 @@
 """The process in which runs are done, one after the other: ``python -m sonar_graph.batch.runner``.
 
-Planned runs come pickled on stdin, outcomes go pickled to what was stdout; whatever is printed, also by native code,
-goes to stderr, which is the run's log. The process ends when stdin does, so it never outlives who started it.
+Planned runs and preparations come pickled on stdin, outcomes go pickled to what was stdout; whatever is printed, also
+by native code, goes to stderr, which is the run's log. The process ends when stdin does, so it never outlives who
+started it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import BinaryIO
 
-from sonar_graph.batch.planned import Outcome, PlannedRun
+from sonar_graph.batch.planned import Outcome, PlannedRun, Preparation
 
 READY = "ready"
 
@@ -29,15 +30,15 @@ def main() -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     faulthandler.enable()
     logging.basicConfig(stream=sys.stderr, level=logging.INFO)
-    requests: SimpleQueue[PlannedRun] = SimpleQueue()
+    requests: SimpleQueue[PlannedRun | Preparation] = SimpleQueue()
     from sonar_graph.batch import one_run  # noqa: F401  imported before the first run is timed
 
     threading.Thread(target=_listen, args=(sys.stdin.buffer, requests), daemon=True).start()
     _answer(answers, READY)
     while True:
-        run = requests.get()
+        request = requests.get()
         try:
-            _answer(answers, _outcome(run))
+            _answer(answers, _prepared(request) if isinstance(request, Preparation) else _outcome(request))
         except Exception as error:  # told to who waits for the answer
             _answer(answers, error)
 
@@ -52,7 +53,14 @@ def _outcome(run: PlannedRun) -> Outcome:
         return Outcome(row, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths})
 
 
-def _listen(source: BinaryIO, requests: SimpleQueue[PlannedRun]) -> None:
+def _prepared(preparation: Preparation) -> str:
+    from sonar_graph.batch.one_run import warm_up
+
+    warm_up(preparation.run)
+    return READY
+
+
+def _listen(source: BinaryIO, requests: SimpleQueue[PlannedRun | Preparation]) -> None:
     with contextlib.suppress(EOFError, OSError):
         while True:
             requests.put(pickle.load(source))

@@ -22,7 +22,7 @@ from typing import Any, BinaryIO
 
 import psutil
 
-from sonar_graph.batch.planned import Limits, Outcome, PlannedRun, Row
+from sonar_graph.batch.planned import Limits, Outcome, PlannedRun, Preparation, Row
 from sonar_graph.batch.runner import READY
 from sonar_graph.errors import BatchError
 from sonar_graph.evaluation.environment import describe_environment
@@ -31,9 +31,16 @@ ONE_THREAD = (
     *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"),
     *("VECLIB_MAXIMUM_THREADS", "TBB_NUM_THREADS"),
 )
+ONE_ORDER = {"PYTHONHASHSEED": "0"}
+"""An estimator may sum over a set of texts: its order, and so the last digits, would be another one in each process."""
 LOOK_EVERY_S = 0.2
 START_S = 300.0
-"""A process that is not ready by then is broken; the first one on a machine may compile kernels."""
+"""A process that is not ready by then is broken."""
+WARM_UP_S = 3600.0
+"""The first process on a machine compiles kernels, beside others that do the same."""
+OWN = "sonar-graph"
+"""Name among the versions of a run whose estimator this package brings. Others are not warmed up: they may take any
+time, and that is their runs'."""
 JOIN_S = 5.0
 """For the thread that listens to a process that was ended; what left the process's session may keep it listening."""
 ATTEMPTS = 2
@@ -105,7 +112,7 @@ class Runner:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._log,
-            env=os.environ | dict.fromkeys(ONE_THREAD, "1") | {"PYTHONHASHSEED": "0"},
+            env=os.environ | dict.fromkeys(ONE_THREAD, "1") | ONE_ORDER,
             start_new_session=True,  # Ctrl-C in a terminal goes to the batch, which ends this one in its own way
         )
         assert self._process.stdin is not None
@@ -113,6 +120,7 @@ class Runner:
         self._requests: Any = self._process.stdin
         self._answers: SimpleQueue[Any] = SimpleQueue()
         self._is_busy = True
+        self._warm: set[str] = set()
         collector_arguments = (self._process.stdout, self._answers)
         self._collector = threading.Thread(target=_collect, args=collector_arguments, daemon=True)
         self._collector.start()
@@ -140,7 +148,7 @@ class Runner:
         return not self._is_busy and self._process.poll() is None
 
     def perform(self, run: PlannedRun, limits: Limits) -> Outcome:
-        """Do one run.
+        """Do one run, after a warm-up where it is the first of its estimator here.
 
         Raises
         ------
@@ -149,17 +157,26 @@ class Runner:
         BatchError, OSError
             When the run could not be done at all.
         """
-        self._is_busy = True
+        if OWN in run.versions and run.estimator not in self._warm:
+            self._warm.add(run.estimator)
+            answer = self._ask(Preparation(run), Limits(WARM_UP_S))
+            if answer != READY:
+                return Outcome(answer.row, log=self.log())
         self._log.truncate(0)
         began = time.monotonic()
+        answer = self._ask(run, limits)
+        wall_s = time.monotonic() - began
+        return replace(answer, row=answer.row | {"wall_s": wall_s}, log=self.log())
+
+    def _ask(self, request: PlannedRun | Preparation, limits: Limits) -> Any:
+        self._is_busy = True
         with contextlib.suppress(OSError):  # a process that is gone is told by its missing answer
-            pickle.dump(run, self._requests)
+            pickle.dump(request, self._requests)
             self._requests.flush()
         answer = self._wait(limits)
         if isinstance(answer, Exception):
             raise answer
-        wall_s = time.monotonic() - began
-        return replace(answer, row=answer.row | {"wall_s": wall_s}, log=self.log())
+        return answer
 
     def log(self) -> str:
         """What the process printed since the run began."""

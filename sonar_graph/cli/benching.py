@@ -94,12 +94,17 @@ def exit_by_gate(folder: Path, reference: Path) -> None:
 
 
 def write_report_of(folder: Path) -> Path:
-    """Write the page and the tables of a batch from its results."""
+    """Write the page and the tables of a batch from its results, and say where runs are missing in them."""
+    from sonar_graph.batch.incomplete import missing_told
     from sonar_graph.batch.page import write_batch_report
     from sonar_graph.batch.recorded import read_batch
 
     with working("drawing"):
-        return write_batch_report(read_batch(folder), folder)
+        batch = read_batch(folder)
+        page = write_batch_report(batch, folder)
+    for sentence in missing_told(batch):
+        typer.echo(f"Warning: {sentence}", err=True)
+    return page
 
 
 @contextmanager

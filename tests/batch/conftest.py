@@ -75,6 +75,11 @@ class HungryChild(DeadReckoning):
         time.sleep(1000)
 
 
+class SumsOverASet(DeadReckoning):
+    def process(self, measurements):
+        raise RuntimeError("-".join({f"mine {number}" for number in range(20)}))
+
+
 class Dies(DeadReckoning):
     def process(self, measurements):
         os.kill(os.getpid(), signal.SIGKILL)
@@ -96,6 +101,7 @@ forks = misbehaving:Forks
 dies-after-forking = misbehaving:DiesAfterForking
 hungry-child = misbehaving:HungryChild
 dies = misbehaving:Dies
+sums-over-a-set = misbehaving:SumsOverASet
 dies-once = misbehaving:DiesOnce
 broken = not_there:Broken
 """

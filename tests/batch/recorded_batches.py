@@ -26,6 +26,7 @@ def drawn_batch(seeds: int = 10, *, logs: tuple[str, ...] = LOGS) -> RecordedBat
             hardness = rng.lognormal(0, 0.3)
             for name, size_m in ESTIMATORS.items():
                 runs.append(_run(rng, log, seed, name, size_m * hardness))
+    runs = [replace(run, place=place) for place, run in enumerate(runs)]
     return RecordedBatch("drawn", runs, "dead-reckoning", METRICS, "Drawn, not run.", 'name = "drawn"\n')
 
 
@@ -38,6 +39,15 @@ def with_failures(batch: RecordedBatch, contestant: str, log: str, count: int) -
     """The batch, had the first runs of a group not ended."""
     gone = {id(run) for run in batch.group(log, contestant)[:count]}
     return replace(batch, runs=[failed(run) if id(run) in gone else run for run in batch.runs])
+
+
+def with_missing(batch: RecordedBatch, contestant: str, log: str, count: int) -> RecordedBatch:
+    """The batch, had the last runs of a group not been done."""
+    group = batch.group(log, contestant)
+    gone = {id(run) for run in group[len(group) - count :]}
+    lacking = [replace(run, status="not run", values={}, log_file="") for run in batch.runs if id(run) in gone]
+    done = [run for run in batch.runs if id(run) not in gone]
+    return replace(batch, runs=done, missing=[*batch.missing, *lacking])
 
 
 def changed(batch: RecordedBatch, contestant: str, column: str, factors: np.ndarray | float) -> RecordedBatch:
@@ -70,9 +80,9 @@ def write_batch(batch: RecordedBatch, folder: Path) -> Path:
             "log_file": run.log_file,
             "sonar_graph": "0.1",
             "machine": "Linux, 4 processors",
-            **{key: run.values.get(key) for key in batch.runs[-1].values},
+            **{key: run.values.get(key) for key in (batch.runs or batch.missing)[-1].values},
         }
-        for run in batch.runs
+        for run in sorted([*batch.runs, *batch.missing], key=lambda run: run.place)
     ]
     about = {"name": batch.name, "reference": batch.reference, "metrics": batch.metrics}
     table = pa.Table.from_pylist(rows).replace_schema_metadata({b"sonar_graph.suite": json.dumps(about).encode()})

@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import os
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +13,24 @@ import pytest
 from sonar_graph.batch import batch as batch_module
 from sonar_graph.batch.batch import Batch, limits_of
 from sonar_graph.batch.catalogue import is_timing
-from sonar_graph.batch.execution import Where
+from sonar_graph.batch.execution import Progress, Where
 from sonar_graph.batch.one_run import perform
 from sonar_graph.batch.planned import Limits, Outcome, PlannedRun
+from sonar_graph.batch.recorded import is_batch, read_batch
 from sonar_graph.batch.results import RESULTS
 from sonar_graph.batch.store import Store
 from sonar_graph.batch.suite import read_suite
-from sonar_graph.errors import BatchError
+from sonar_graph.errors import BatchError, EvaluationError
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
 
 LIMITS = Limits(600.0)
 HERE = Where(1)
 Interrupted = KeyboardInterrupt
+
+
+class Killed(BaseException):
+    """Ends a process as SIGKILL does: nobody hears of it."""
 
 
 def nobody(_run: PlannedRun, _outcome: Outcome) -> None:
@@ -76,7 +82,8 @@ def test_resumed_batch_has_the_table_of_an_undisturbed_one(
         monkeypatch.setattr(batch_module, "run_batch", interrupted)
         with Batch.opened(read_suite(suite), tmp_path / "b") as batch, pytest.raises(Interrupted):
             batch.run(HERE, LIMITS, nobody)
-        assert len(table(tmp_path / "b")) == count
+        statuses = [row["status"] for row in table(tmp_path / "b")]
+        assert statuses == ["ok"] * count + ["not run"] * (4 - count)
         assert batch.resuming().startswith(f"{count} of 4 runs are done and kept")
     monkeypatch.setattr(batch_module, "run_batch", do_here)
     assert finished(suite, tmp_path / "b") == undisturbed
@@ -145,9 +152,88 @@ def test_second_batch_in_a_folder_is_refused_and_touches_nothing(suite: Path, tm
         with pytest.raises(BatchError, match="another batch is running"), Batch.opened(read_suite(suite), folder):
             pass
         assert half_written.is_dir()
-        assert 'name = "short"' in (folder / "suite.toml").read_text()
+        assert not (folder / "suite.toml").exists()
     with Batch.opened(read_suite(suite), folder):
         assert not half_written.exists()
+
+
+def killed_after(count: int) -> Callable[..., None]:
+    """In place of `run_batch`: some runs are done and told, and then the process is gone."""
+
+    def killed(runs: list[PlannedRun], store: Store, _limits: Limits, _where: Where, progress: Progress) -> None:
+        for run in runs[:count]:
+            do_here([run], store)
+            progress(run, Outcome({"status": "ok"}))
+        raise Killed
+
+    return killed
+
+
+def kill(suite: Path, folder: Path, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch_module, "run_batch", killed_after(count))
+    with Batch.opened(read_suite(suite), folder) as batch, pytest.raises(Killed):
+        batch.run(HERE, LIMITS, nobody)
+
+
+def test_what_a_killed_batch_did_is_read_with_what_it_did_not_do(
+    suite: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "out"
+    kill(suite, folder, 3, monkeypatch)
+    batch = read_batch(folder)
+    assert [(run.seed, run.status) for run in batch.runs] == [(0, "ok"), (1, "ok"), (2, "ok")]
+    assert [(run.seed, run.status) for run in batch.missing] == [(3, "not run")]
+    monkeypatch.setattr(batch_module, "run_batch", do_here)
+    finished(suite, folder)
+    whole = read_batch(folder)
+    assert not whole.missing
+    assert whole.runs[:3] == batch.runs
+
+
+def test_batch_killed_before_any_run_is_done_says_what_to_do(
+    suite: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kill(suite, tmp_path / "out", 0, monkeypatch)
+    assert is_batch(tmp_path / "out")
+    with pytest.raises(EvaluationError, match=r"before any of its runs was done; give the bench command .* again"):
+        read_batch(tmp_path / "out")
+
+
+def test_suite_with_more_seeds_goes_on_in_the_folder_and_another_suite_is_refused(
+    suite: Path, tmp_path: Path, in_this_process: None
+) -> None:
+    folder = tmp_path / "out"
+    before = finished(suite, folder)
+    suite.write_text(suite.read_text().replace("seeds = 4", "seeds = 5"))
+    with Batch.opened(read_suite(suite), folder) as batch:
+        assert len(batch.rows()) == 4
+        batch.run(HERE, LIMITS, nobody)
+    assert table(folder)[:4] == before
+    assert "seeds = 5" in (folder / "suite.toml").read_text()
+    kept = contents(folder)
+    suite.write_text(suite.read_text().replace("short", "other"))
+    told = r"holds the batch of suite 'short', and .* is suite 'other'; choose another"
+    with pytest.raises(BatchError, match=told), Batch.opened(read_suite(suite), folder):
+        pass
+    assert contents(folder) == kept
+
+
+def test_nothing_in_the_folder_is_replaced_before_a_run_is_done(
+    suite: Path, tmp_path: Path, in_this_process: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "out"
+    finished(suite, folder)
+    kept = contents(folder)
+    suite.write_text(suite.read_text().replace("duration_s = 120", "duration_s = 125"))
+    kill(suite, folder, 0, monkeypatch)
+    assert contents(folder) == kept
+    kill(suite, folder, 1, monkeypatch)
+    assert "duration_s = 125" in (folder / "suite.toml").read_text()
+    assert [row["status"] for row in table(folder)] == ["ok", "not run", "not run", "not run"]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix in (".toml", ".parquet")}
 
 
 def test_timeout_that_is_given_goes_before_the_one_of_the_suite(write_suite: WriteSuite) -> None:

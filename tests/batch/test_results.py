@@ -16,9 +16,7 @@ from sonar_graph.batch.suite import read_suite
 from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
 
 
-def test_table_has_a_row_for_each_run_that_is_done_in_the_order_of_the_plan(
-    write_suite: WriteSuite, tmp_path: Path
-) -> None:
+def test_table_has_a_row_for_each_planned_run_in_the_order_of_the_plan(write_suite: WriteSuite, tmp_path: Path) -> None:
     file = read_suite(write_suite(HEADER, BASIN, "seeds = 4\n", DEAD_RECKONING))
     runs, store = plan_runs(file), Store(tmp_path / "out")
     for run, error_m in ((runs[2], 0.3), (runs[0], 0.1)):
@@ -26,9 +24,11 @@ def test_table_has_a_row_for_each_run_that_is_done_in_the_order_of_the_plan(
     store.write(runs[3].key, Outcome({"status": "timeout", "reason": "took longer than 1 s"}))
     table = pq.read_table(write_results(store, file.suite, runs))
     assert table.column_names == [*COLUMNS, "causal.ate_raw_m", "causal.nees_yaw_dof"]
-    assert table["seed"].to_pylist() == [0, 2, 3]
-    assert table["causal.ate_raw_m"].to_pylist() == [0.1, 0.3, None]
-    assert table["status"].to_pylist() == ["ok", "ok", "timeout"]
+    assert table["seed"].to_pylist() == [0, 1, 2, 3]
+    assert table["causal.ate_raw_m"].to_pylist() == [0.1, None, 0.3, None]
+    assert table["status"].to_pylist() == ["ok", "not run", "ok", "timeout"]
+    assert table["log_file"].null_count == 1
+    assert table["reason"].to_pylist()[1] == "not done when this table was written"
     assert table["sonar_graph"].null_count == 0
     assert table["causal.nees_yaw_dof"].type == pa.int64()
     assert json.loads(table["options"][0].as_py())["duration_s"] == 120
@@ -39,7 +39,9 @@ def test_table_has_a_row_for_each_run_that_is_done_in_the_order_of_the_plan(
 
 def test_table_of_a_batch_without_any_run_has_the_columns(write_suite: WriteSuite, tmp_path: Path) -> None:
     file = read_suite(write_suite())
-    assert pq.read_table(write_results(Store(tmp_path), file.suite, plan_runs(file))).column_names == [*COLUMNS]
+    table = pq.read_table(write_results(Store(tmp_path), file.suite, plan_runs(file)))
+    assert table.column_names == [*COLUMNS]
+    assert table["status"].to_pylist() == ["not run"]
 
 
 def test_times_and_memory_alone_may_differ_between_equal_runs() -> None:

@@ -72,6 +72,32 @@ def test_process_that_dies_before_the_rename_leaves_no_run(tmp_path: Path, monke
     assert not list((tmp_path / "runs").iterdir())
 
 
+@pytest.mark.parametrize("act", ["discard", "write"])
+def test_process_that_dies_while_it_removes_a_run_leaves_it_whole_or_not_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, act: str
+) -> None:
+    store = Store(tmp_path)
+    store.write("k", OUTCOME)
+    whole = names(store.run_folder("k"))
+
+    class Died(BaseException):
+        pass
+
+    def die(folder: Path, **_options: Any) -> None:
+        next(path for path in folder.rglob("*.npz")).unlink()
+        raise Died
+
+    with monkeypatch.context() as patch:
+        patch.setattr("shutil.rmtree", die)
+        with pytest.raises(Died):
+            store.discard("k") if act == "discard" else store.write("k", OUTCOME)
+    assert (store.row("k") is None) == (not store.run_folder("k").exists())
+    assert not store.run_folder("k").exists() or names(store.run_folder("k")) == whole
+    store.remove_partial()
+    store.write("k", OUTCOME)
+    assert names(tmp_path) == [f"runs/k/{name}" for name in whole]
+
+
 def test_row_that_the_machine_lost_counts_as_not_done(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.write("k", OUTCOME)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import psutil
 import pytest
@@ -97,6 +98,43 @@ def test_log_has_the_traceback_and_what_native_code_wrote_of_this_run_alone(
     (runner,) = runners()
     assert "diverged" not in perform_watched(planned(), AMPLE).log
     assert runners() == [runner]
+
+
+def test_order_of_sets_does_not_hang_on_who_started_the_process(
+    planned: Planned, misbehaving: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reasons = set()
+    for seed in ("1", "2"):
+        monkeypatch.setenv("PYTHONHASHSEED", seed)
+        runner = Runner()
+        reasons.add(runner.perform(planned("sums-over-a-set"), AMPLE).row["reason"])
+        runner.end()
+    (reason,) = reasons
+    assert "mine 7" in str(reason)
+
+
+def test_first_run_of_an_estimator_is_warmed_up_before_its_clock_starts(
+    planned: Planned, misbehaving: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    ask = Runner._ask
+
+    def told(self: Runner, request: Any, limits: Limits) -> Any:
+        asked.append(f"{type(request).__name__} {limits.timeout_s:g}")
+        return ask(self, request, limits)
+
+    monkeypatch.setattr(Runner, "_ask", told)
+    rows = [perform_watched(planned(name), AMPLE).row for name in ("dead-reckoning", "dead-reckoning", "prints")]
+    assert asked == ["Preparation 3600", "PlannedRun 600", "PlannedRun 600", "PlannedRun 600"]
+    assert rows[0]["causal.ate_raw_m"] == rows[1]["causal.ate_raw_m"]
+
+
+def test_warm_up_that_does_not_end_is_told(planned: Planned, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = planned()
+    monkeypatch.setattr(supervision, "WARM_UP_S", 0.0)
+    row = perform_watched(run, AMPLE).row
+    assert (row["status"], row["reason"]) == ("timeout", "took longer than 0 s")
+    assert not runners()
 
 
 def test_process_that_is_not_ready_in_time_is_ended_and_told(monkeypatch: pytest.MonkeyPatch) -> None:

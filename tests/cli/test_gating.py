@@ -14,6 +14,16 @@ def folder(tmp_path) -> Path:
     return _write(tmp_path / "batch", 1.0)
 
 
+@pytest.fixture
+def incomplete(folder) -> Path:
+    """The batch, had the last three runs not been done."""
+    rows = pq.read_table(folder / "results.parquet").to_pylist()
+    for row in rows[-3:]:
+        row |= {"status": "not run", "causal.ate_se2_m": None}
+    pq.write_table(pa.Table.from_pylist(rows), folder / "results.parquet")
+    return folder
+
+
 def _write(folder: Path, factor: float) -> Path:
     rng = np.random.default_rng(0)
     rows = [
@@ -58,6 +68,32 @@ def test_a_worse_batch_ends_with_one_and_says_what_is_worse(run, folder, tmp_pat
     said = capsys.readouterr().out
     assert "Worse: basin, isam2, causal.ate_se2_m: +50.0% in the mean of 8 pairs" in said
     assert "Gate: failed" in said
+
+
+def test_report_of_an_incomplete_batch_warns_and_is_written(run, incomplete, capsys):
+    assert run("report", incomplete) == 0
+    said = capsys.readouterr()
+    assert said.out == f"Report: {incomplete / 'report.html'}\n"
+    assert "Warning: This batch is not complete: 3 of 16 runs have not been done (dead-reckoning 1 of 8" in said.err
+    assert "3 of 16 runs" in (incomplete / "report.html").read_text("utf-8")
+
+
+def test_an_incomplete_batch_is_neither_blessed_nor_judged(run, incomplete, tmp_path, capsys):
+    reference = tmp_path / "reference.json"
+    assert run("bench", "bless", incomplete, reference) == 2
+    assert not reference.exists()
+    run("bench", "bless", _write(tmp_path / "whole", 1.0), reference)
+    capsys.readouterr()
+    assert run("bench", "gate", incomplete, reference) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "3 of 16 runs have not been done" in line
+    assert line.endswith("give the bench command that began it again: it goes on from there")
+
+
+def test_report_of_a_batch_that_was_killed_at_once_says_what_to_do(run, tmp_path, capsys):
+    (tmp_path / ".lock").touch()
+    assert run("report", tmp_path) == 2
+    assert "before any of its runs was done; give the bench command that began it again" in capsys.readouterr().err
 
 
 def test_a_folder_without_results_is_the_users_mistake(run, tmp_path, capsys):

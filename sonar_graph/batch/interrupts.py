@@ -1,0 +1,34 @@
+"""Ctrl-C that comes at a bad moment, and is not lost."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+
+@contextmanager
+def deferred_interrupt() -> Iterator[None]:
+    """Let a Ctrl-C that comes during the block count at its end.
+
+    Compiled code without a way to raise (pyarrow has some) swallows the exception, and the batch would go on.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        At the end of the block, when the signal came meanwhile.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(handler):
+        yield
+        return
+    came: list[tuple[int, FrameType | None]] = []
+    signal.signal(signal.SIGINT, lambda number, frame: came.append((number, frame)))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    if came:
+        handler(*came[0])

@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+import os
+import signal
+import threading
+
+import pytest
+
+from sonar_graph.batch.interrupts import deferred_interrupt
+
+
+def interrupt() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def interrupted_block(steps: list[str]) -> None:
+    with deferred_interrupt():
+        try:
+            interrupt()
+        except KeyboardInterrupt:
+            pytest.fail("swallowed here, and lost")
+        steps.append("went on")
+
+
+def test_interrupt_within_the_block_is_told_at_its_end() -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    steps: list[str] = []
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            interrupted_block(steps)
+        assert steps == ["went on"]
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_block_without_interrupt_and_in_another_thread_is_as_without() -> None:
+    handler = signal.getsignal(signal.SIGINT)
+    done = []
+
+    def block() -> None:
+        with deferred_interrupt():
+            done.append(signal.getsignal(signal.SIGINT) is handler)
+
+    thread = threading.Thread(target=block)
+    thread.start()
+    thread.join()
+    with deferred_interrupt():
+        done.append(True)
+    assert done == [True, True]
+    assert signal.getsignal(signal.SIGINT) is handler
