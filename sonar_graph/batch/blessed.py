@@ -77,7 +77,7 @@ def check_comparable(entry: dict[str, Any], run: RecordedRun, path: Path) -> Non
     """
     before, now = _flat(entry["asked"]), _flat(asked_of(run))
     for field in sorted(before | now):
-        if before.get(field) != now.get(field):
+        if (field in before, before.get(field)) != (field in now, now.get(field)):
             raise EvaluationError(
                 f"{path}: {told(name_of(run))}: {field} is {_value(now, field)}, in the reference "
                 f"{_value(before, field)}; these are different experiments: run the suite of the reference, or bless a "
@@ -86,12 +86,12 @@ def check_comparable(entry: dict[str, Any], run: RecordedRun, path: Path) -> Non
 
 
 def _flat(asked: dict[str, Any]) -> dict[str, Any]:
-    """Fields by name; ``landmarks`` that are not simulated count as a value, so that they differ from default ones."""
+    """Fields by name; landmarks that are simulated with nothing stated of them are ``landmarks``, which is ``{}``."""
     flat: dict[str, Any] = {}
     for name, value in asked.items():
         if isinstance(value, dict) and value:
             flat |= {f"{name}.{inner}": content for inner, content in value.items()}
-        elif value != {} or name == "landmarks":
+        elif value is not None and (value != {} or name == "landmarks"):
             flat[name] = value
     return flat
 

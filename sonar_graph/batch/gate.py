@@ -222,6 +222,5 @@ def _worsening(group: Group, ratios: Ratios, p_value: float) -> Worsening:
     columns = [other for at, name, other in ratios if (at, name) == group[:2] and ratios[at, name, other] == own]
     share = f"{np.expm1(np.mean(list(own.values()))):.1%}"
     change = f"{share} farther from 1" if column in CONSISTENCY_KEYS else f"+{share}"
-    told_p = f"p = {p_value:.2g}" if p_value >= 1e-3 else "p < 0.001"
-    explanation = f"{change} in the mean of {len(own)} cases, {told_p} of the whole batch"
+    explanation = f"{change} in the mean of {len(own)} cases, p = {p_value:.2g} (of the whole batch)"
     return Worsening(log, contestant, ", ".join(columns), explanation)
