@@ -29,7 +29,7 @@ DRAWN = 1999
 SEED = 20140214
 PRIOR_WEIGHT = 2.0
 """Degrees of freedom that the deviations of like groups have beside the group's own."""
-CLIP = 3.0
+CLIP = 1.5
 """Ratios beyond so many median sizes of their group count as this: a lost run is one bad run, not the mean."""
 Indices = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 Case = str | int
