@@ -100,8 +100,8 @@ def verdict_lines(verdict: Verdict) -> list[str]:
     """What got worse, what a person should look at, and what the tests could have seen."""
     lines = [f"Worse: {worsening}" for worsening in verdict.worsenings]
     lines += [f"Look at: {line}" for line in verdict.look_at[:SHOWN]]
-    if more := len(verdict.look_at) - SHOWN:
-        lines += [f"Look at: {more} more such runs"] if more > 0 else []
+    if len(verdict.look_at) > SHOWN:
+        lines.append(f"Look at: {len(verdict.look_at) - SHOWN} more such lines are not shown")
     if verdict.new:
         lines.append(f"Not judged: {len(verdict.new)} runs that the reference does not have, first {verdict.new[0]}")
     if verdict.untested:

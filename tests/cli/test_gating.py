@@ -62,6 +62,18 @@ def test_a_worse_batch_ends_with_one_and_says_what_is_worse(run, folder, tmp_pat
         "Worse: basin, isam2, causal.ate_se2_m: +50.0% in the mean of 8 cases, p = 0.0039 (of the whole batch)" in said
     )
     assert "Gate: failed" in said
+    assert "Would have been found in four of five batches: one error larger on all logs by about" in said
+    assert "Hardly different from the reference: dead-reckoning" in said
+
+
+def test_no_more_than_ten_runs_that_stand_out_are_printed():
+    from sonar_graph.batch.gate import Verdict
+    from sonar_graph.cli.benching import verdict_lines
+
+    lines = verdict_lines(Verdict([], [f"run {n}" for n in range(12)], 24, {"isam2": 2}, {}, []))
+    assert len([line for line in lines if line.startswith("Look at: run")]) == 10
+    assert "Look at: 2 more such lines are not shown" in lines
+    assert any("No test of errors: isam2 (2)" in line for line in lines)
 
 
 def test_a_folder_without_results_is_the_users_mistake(run, tmp_path, capsys):
