@@ -254,6 +254,13 @@ def test_real_frames_names_its_figures(recordings: Path, tmp_path: Path) -> None
     assert figure.stat().st_size > 10_000
 
 
+def test_batch_gate_names_its_figures() -> None:
+    found = figures("validation/batch_gate.py", "--workers", "1")
+    assert found["false_alarms"] <= found["false_alarms_allowed"]
+    assert found["power_50_percent_3_seeds"] > 0
+    assert {"told_power_median", "power_20_percent_20_seeds", "passed"} <= set(found)
+
+
 def test_every_script_is_listed() -> None:
     listed = (BENCHMARKS / "README.md").read_text(encoding="utf-8")
     for folder in ("performance", "validation"):

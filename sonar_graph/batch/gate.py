@@ -1,10 +1,10 @@
 """Did accuracy or consistency get worse beyond noise? A batch against a reference that somebody blessed.
 
-The same suite is run before and after a change. Runs are paired by log, estimator and seed, and each pair gives a log
+The same suite is run before and after a change. Runs are paired by log, contestant and seed, and each pair gives a log
 ratio: of errors, ``ln(new / old)``; of consistency, ``|ln(new)| - |ln(old)|`` of the normalised squared error (1 is
-consistent). A group is worse where the mean of its log ratios is beyond ``ln(1 + tolerance)`` by a one-sided t test,
-corrected by Holm over all groups, where a run fails that did not, or where an error is far beyond all that the
-reference ever had in the group. Method: docs/theory/batch_statistics.md.
+consistent). What the ratios of a log, or of all logs together, say of a contestant and column is tested with
+`sonar_graph.batch.worsening_tests`: where nothing got truly worse 5 % of batches fail. A run that fails now and did not
+is worse without any test. Method: docs/theory/batch_statistics.md.
 """
 
 from __future__ import annotations
@@ -15,29 +15,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
+from sonar_graph.batch.blessed import check_comparable, name_of, read_reference, told, write_reference
 from sonar_graph.batch.catalogue import KINDS, is_timing, metrics_of
+from sonar_graph.batch.detectable import detectable
 from sonar_graph.batch.incomplete import require_complete
 from sonar_graph.batch.recorded import RecordedBatch, RecordedRun
-from sonar_graph.batch.statistics import holm
+from sonar_graph.batch.standing_out import Pair, standing_out
+from sonar_graph.batch.worsening_tests import (
+    LEAST_CASES,
+    SIGNIFICANT,
+    Case,
+    Family,
+    Group,
+    Ratios,
+    families,
+    with_all_logs,
+)
 from sonar_graph.errors import EvaluationError
-from sonar_graph.evaluation.strict_json import read_json, write_json
 from sonar_graph.measurements import Floats
 
-FORMAT = "sonar_graph batch reference 1"
 TOLERANCE = 0.02
 """Relative worsening of an error that nobody minds."""
 CONSISTENCY_TOLERANCE = 0.1
-SIGNIFICANT = 0.05
-FAR = 2.0
-"""An error so many times the worst that the reference has in the group is a regression by itself."""
-LEAST_PAIRS = 3
-ALONE = 0.25
-"""With fewer pairs there is no test: a worsening by more than this share is a regression."""
 CONSISTENCY_KEYS = tuple(f"{kind}.{name}" for kind in KINDS for name in ("nees_position", "nees_yaw"))
-Group = tuple[str, str, str]
-"""Log, contestant and column."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Worsening:
     log: str
     contestant: str
     column: str
-    """Of the results; ``status`` for runs that failed."""
+    """Of the results, several where their numbers are the same; ``status`` for runs that failed."""
     explanation: str
 
     def __str__(self) -> str:
@@ -59,8 +60,14 @@ class Verdict:
     """What the gate says."""
 
     worsenings: list[Worsening]
+    look_at: list[str]
+    """What no test can judge: single runs, and contestants with fewer than 3 cases. Nothing of it fails a batch."""
     compared: int
     """Pairs of runs."""
+    cases: dict[str, int]
+    """Of each contestant that was compared: seeds, and logs without seeds."""
+    detectable: dict[str, float]
+    """Worsening that would have been found with 80 % probability, by contestant that has a test and moved."""
     new: list[str]
     """Runs that the reference does not know, which are not judged."""
 
@@ -69,6 +76,16 @@ class Verdict:
         """Whether nothing got worse."""
         return not self.worsenings
 
+    @property
+    def untested(self) -> list[str]:
+        """Contestants with too few cases for a test."""
+        return [contestant for contestant, cases in self.cases.items() if cases < LEAST_CASES]
+
+    @property
+    def unmoved(self) -> list[str]:
+        """Contestants that have a test and whose scores are all within the tolerance of the reference's."""
+        return [name for name in self.cases if name not in self.detectable and name not in self.untested]
+
 
 def bless(batch: RecordedBatch, path: Path) -> None:
     """Write what this batch reached as the reference of later ones; a deliberate act.
@@ -76,19 +93,14 @@ def bless(batch: RecordedBatch, path: Path) -> None:
     Raises
     ------
     EvaluationError
-        When a planned run was not done.
+        When a planned run was not done, no run ended, or the results do not say what was asked for.
     """
     require_complete(batch, path, "become a reference")
-    write_json(
-        path,
-        {
-            "format": FORMAT,
-            "suite": batch.name,
-            "versions": batch.runs[0].texts,
-            "metrics": gated_keys(batch),
-            "runs": [_entry(run, gated_keys(batch)) for run in batch.runs],
-        },
-    )
+    if not any(run.ended for run in batch.runs):
+        raise EvaluationError(
+            f"{batch.name}: none of its {len(batch.runs)} runs ended, so every batch would pass by it"
+        )
+    write_reference(batch, gated_keys(batch), path)
 
 
 def gated_keys(batch: RecordedBatch) -> list[str]:
@@ -103,75 +115,59 @@ def gate(batch: RecordedBatch, reference: Path) -> Verdict:
     Raises
     ------
     EvaluationError
-        When the file is no reference, a run of the batch was not done, or the batch lacks a run that the reference
-        has: what is missing is not passed.
+        When the file is no reference, a run of the batch was not done, the batch lacks a run that the reference has
+        (what is missing is not passed), or a run was asked for something else.
     """
     require_complete(batch, reference, "be held against it")
-    blessed = _read_reference(reference)
-    runs = {_name(run): run for run in batch.runs}
-    missing = sorted(set(blessed["runs"]) - set(runs))
+    blessed = read_reference(reference)
+    runs = {name_of(run): run for run in batch.runs}
+    missing = sorted(set(blessed["runs"]) - set(runs), key=told)
     if missing:
         raise EvaluationError(
-            f"{reference}: {len(missing)} of its runs are not in the batch, first {_told(missing[0])}; run the same "
+            f"{reference}: {len(missing)} of its runs are not in the batch, first {told(missing[0])}; run the same "
             "suite, or bless a new reference"
         )
-    pairs = [(entry, runs[name]) for name, entry in blessed["runs"].items()]
-    worse = [*_failures(pairs), *_worse_groups(pairs, _judged(blessed["metrics"]))]
-    return Verdict(worse, len(pairs), [_told(name) for name in runs if name not in blessed["runs"]])
+    entries = [(entry, runs[name]) for name, entry in blessed["runs"].items()]
+    for entry, run in entries:
+        check_comparable(entry, run, reference)
+    columns = [key for key in blessed["metrics"] if not is_timing(key)]
+    new = [told(name) for name in runs if name not in blessed["runs"]]
+    return _verdict(entries, columns, new)
 
 
-def _judged(keys: list[str]) -> list[str]:
-    """Columns of a reference without time and memory, which one of an earlier version may have."""
-    return [key for key in keys if not is_timing(key)]
+def _verdict(entries: list[tuple[dict[str, Any], RecordedRun]], columns: list[str], new: list[str]) -> Verdict:
+    pairs = [pair for entry, run in entries for pair in _pairs(entry, run, columns)]
+    ratios = with_all_logs(_ratios(pairs))
+    tested = families(movable(ratios))
+    cases: dict[str, set[Case]] = {run.contestant: set() for _, run in entries}
+    for (_, contestant, _), values in ratios.items():
+        cases[contestant].update(values)
+    errors = [column for column in columns if column not in CONSISTENCY_KEYS]
+    return Verdict(
+        worsenings=[*_failures(entries), *worse_groups(ratios, tested)],
+        look_at=standing_out(pairs, ratios, CONSISTENCY_KEYS),
+        compared=len(entries),
+        cases={contestant: len(own) for contestant, own in cases.items()},
+        detectable=detectable(tested, errors, math.log1p(TOLERANCE)),
+        new=new,
+    )
 
 
-def _entry(run: RecordedRun, keys: list[str]) -> dict[str, Any]:
-    scores = {key: run.values[key] for key in keys if run.ended and key in run.values}
-    return {"log": run.log, "estimator": run.contestant, "seed": run.seed, "status": run.status, "scores": scores}
+def _pairs(entry: dict[str, Any], run: RecordedRun, columns: list[str]) -> list[Pair]:
+    values = [(column, entry["scores"].get(column, math.inf), run.value(column)) for column in columns]
+    return [Pair(run, *value) for value in values if all(map(math.isfinite, value[1:]))]
 
 
-def _read_reference(path: Path) -> dict[str, Any]:
-    content = read_json(path)
-    if content.get("format") != FORMAT:
-        raise EvaluationError(
-            f"{path}: format is {content.get('format')!r}, expected {FORMAT!r}; bless a batch to make a reference"
-        )
-    runs = {(entry["log"], entry["estimator"], entry["seed"]): entry for entry in content["runs"]}
-    return content | {"runs": runs}
-
-
-def _name(run: RecordedRun) -> tuple[str, str, int | None]:
-    return run.log, run.contestant, run.seed
-
-
-def _told(name: tuple[str, str, int | None]) -> str:
-    log, contestant, seed = name
-    return f"{log}, {contestant}" + ("" if seed is None else f", seed {seed}")
-
-
-def _failures(pairs: list[tuple[dict[str, Any], RecordedRun]]) -> list[Worsening]:
+def _failures(entries: list[tuple[dict[str, Any], RecordedRun]]) -> list[Worsening]:
     """Runs that ended in the reference and do not now, or have lost a score."""
     found = []
-    for entry, run in pairs:
+    for entry, run in entries:
         seed = "" if run.seed is None else f"seed {run.seed}: "
         if entry["status"] == "ok" and not run.ended:
             found.append(Worsening(run.log, run.contestant, "status", f"{seed}{run.status}, {run.reason}"))
         elif lost := [key for key in entry["scores"] if key not in run.values and run.ended]:
             found.append(Worsening(run.log, run.contestant, ", ".join(lost), f"{seed}no value, the reference has one"))
     return found
-
-
-def _worse_groups(pairs: list[tuple[dict[str, Any], RecordedRun]], keys: list[str]) -> list[Worsening]:
-    groups: dict[Group, list[tuple[float, float]]] = {}
-    for entry, run in pairs:
-        for key in keys:
-            old, new = entry["scores"].get(key, math.inf), run.value(key)
-            if math.isfinite(old) and math.isfinite(new):
-                groups.setdefault((run.log, run.contestant, key), []).append((old, new))
-    arrays = {group: np.array(values) for group, values in groups.items()}
-    p_values = holm(np.array([_p_worse(group, values) for group, values in arrays.items()]))
-    judged = [_judge(group, values, p) for (group, values), p in zip(arrays.items(), p_values.tolist(), strict=True)]
-    return [worsening for worsening in judged if worsening is not None]
 
 
 def log_ratios(old: Floats, new: Floats, column: str) -> Floats:
@@ -183,35 +179,51 @@ def log_ratios(old: Floats, new: Floats, column: str) -> Floats:
     return np.asarray(new_log - old_log)
 
 
-def _limit(column: str) -> float:
+def _ratios(pairs: list[Pair]) -> Ratios:
+    """Log ratios by group and case: a seed, and where there is none a log."""
+    found: Ratios = {}
+    for pair in pairs:
+        ratio = log_ratios(np.array([pair.old]), np.array([pair.new]), pair.column)[0]
+        case = pair.run.log if pair.run.seed is None else pair.run.seed
+        found.setdefault((pair.run.log, pair.run.contestant, pair.column), {})[case] = float(ratio)
+    return found
+
+
+def limit_of(column: str) -> float:
+    """Log ratio that is allowed."""
     return math.log1p(CONSISTENCY_TOLERANCE if column in CONSISTENCY_KEYS else TOLERANCE)
 
 
-def _p_worse(group: Group, values: Floats) -> float:
-    """One-sided p value of the mean log ratio being no more than the tolerance; NaN of too few pairs."""
-    ratios = log_ratios(values[:, 0], values[:, 1], group[2])
-    if len(ratios) < LEAST_PAIRS:
-        return math.nan
-    beyond = ratios - _limit(group[2])
-    if np.ptp(beyond) <= 1e-12:
-        return 0.0 if beyond.mean() > 0 else 1.0
-    return float(stats.ttest_1samp(beyond, 0.0, alternative="greater").pvalue)
+def movable(ratios: Ratios) -> Ratios:
+    """Ratios beyond the limit, of groups that can be worse, each set of numbers once.
+
+    The mean is at most the root of the mean square: where this is within the limit there is nothing to test, and no
+    test to correct for. It looks at sizes alone, so old and new may be exchanged.
+    """
+    distinct = {(group[1], tuple(cases.items())): group for group, cases in reversed(ratios.items())}
+    return {
+        group: {case: ratio - limit_of(group[2]) for case, ratio in cases.items()}
+        for group, cases in ratios.items()
+        if distinct[group[1], tuple(cases.items())] == group
+        and math.sqrt(np.square(list(cases.values())).mean()) > limit_of(group[2])
+    }
 
 
-def _judge(group: Group, values: Floats, p_value: float) -> Worsening | None:
+def worse_groups(ratios: Ratios, tested: list[Family]) -> list[Worsening]:
+    """Groups that are significantly beyond the limit."""
+    worse = []
+    for family in tested:
+        for group, p_value in zip(family.groups, family.p_values.tolist(), strict=True):
+            if p_value <= SIGNIFICANT:
+                worse.append(_worsening(group, ratios, p_value))
+    return worse
+
+
+def _worsening(group: Group, ratios: Ratios, p_value: float) -> Worsening:
     log, contestant, column = group
-    old, new = values[:, 0], values[:, 1]
-    share = f"{np.expm1(log_ratios(old, new, column).mean()):.1%}"
-    change = (
-        f"{f'{share} farther from 1' if column in CONSISTENCY_KEYS else f'+{share}'} in the mean of {len(old)} pairs"
-    )
-    if column not in CONSISTENCY_KEYS and new.max() > FAR * old.max() > 0:
-        told = f"{new.max():.3g} in a run; the reference's worst is {old.max():.3g}"
-        return Worsening(log, contestant, column, told)
-    if math.isnan(p_value):
-        is_worse = log_ratios(old, new, column).mean() > math.log1p(ALONE)
-        return Worsening(log, contestant, column, f"{change}, too few for a test") if is_worse else None
-    if p_value < SIGNIFICANT:
-        certainty = f"p = {p_value:.2g} (Holm)" if p_value > 0 else "alike in all of them"
-        return Worsening(log, contestant, column, f"{change}, {certainty}")
-    return None
+    own = ratios[group]
+    columns = [other for at, name, other in ratios if (at, name) == group[:2] and ratios[at, name, other] == own]
+    share = f"{np.expm1(np.mean(list(own.values()))):.1%}"
+    change = f"{share} farther from 1" if column in CONSISTENCY_KEYS else f"+{share}"
+    explanation = f"{change} in the mean of {len(own)} cases, p = {p_value:.2g} (of the whole batch)"
+    return Worsening(log, contestant, ", ".join(columns), explanation)

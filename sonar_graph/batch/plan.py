@@ -17,7 +17,7 @@ from pydantic import ValidationError
 import sonar_graph
 from sonar_graph.batch.planned import PlannedRun
 from sonar_graph.batch.source_hash import source_hash, source_hash_now
-from sonar_graph.batch.sources import FILES, GENERATORS, KINDS, LOG, fingerprint
+from sonar_graph.batch.sources import FILE, FILES, GENERATORS, KINDS, LOG, fingerprint
 from sonar_graph.batch.suite import EstimatorEntry, LogEntry, SuiteFile
 from sonar_graph.batch.toml_lines import Place
 from sonar_graph.calibration import Section
@@ -36,6 +36,8 @@ class _Source:
     name: str
     options: dict[str, Any]
     content: dict[str, Any]
+    stated: dict[str, Any]
+    """Options that the suite gives, without those that name files."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,8 @@ def _sources(file: SuiteFile, number: int, entry: LogEntry) -> Iterator[_Source]
         except SonarGraphError as error:
             file.refuse((*place, "log" if entry.log is not None else "options"), str(error))
         plain = options.model_dump(mode="json", exclude={"seed"})
-        yield _Source(entry, _label(entry.name, chosen), plain, fingerprint(entry.kind, plain))
+        stated = {name: value for name, value in values.items() if name not in FILES}
+        yield _Source(entry, _label(entry.name, chosen), plain, fingerprint(entry.kind, plain), stated)
 
 
 def _check_source(file: SuiteFile, place: Place, entry: LogEntry) -> None:
@@ -225,7 +228,19 @@ def _planned(file: SuiteFile, source: _Source, seed: int | None, contestant: _Co
         params=contestant.params,
         rate_hz=rate_hz,
         versions=versions,
+        asked=_asked(source, contestant, rate_hz),
     )
+
+
+def _asked(source: _Source, contestant: _Contestant, rate_hz: float) -> dict[str, Any]:
+    return {
+        "generator": source.entry.kind,
+        "options": source.stated,
+        "files": {name: hashed for name, hashed in source.content.items() if name in (*FILES, FILE)},
+        "landmarks": source.entry.landmarks,
+        "settings": contestant.overrides,
+        "rate_hz": rate_hz,
+    }
 
 
 def _check_reference(file: SuiteFile, contestants: list[_Contestant]) -> None:

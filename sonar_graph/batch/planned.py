@@ -37,6 +37,9 @@ class PlannedRun:
     """All settings; of an estimator that cannot be loaded those that were given."""
     rate_hz: float
     versions: dict[str, str]
+    asked: dict[str, Any]
+    """What the suite states of it, of files their content, without what it leaves to defaults: two runs of one name are
+    comparable where these are equal, though a default or the code was changed between them."""
 
 
 @dataclass(frozen=True)

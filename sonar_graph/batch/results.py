@@ -23,7 +23,7 @@ from sonar_graph.evaluation.atomic import replacing
 
 RESULTS = "results.parquet"
 SUITE_METADATA = b"sonar_graph.suite"
-TEXTS = ("key", "suite", "log", "generator", "options")
+TEXTS = ("key", "suite", "log", "generator", "options", "asked")
 SETTINGS = ("variant", "params", "estimator", "status", "reason", "log_file")
 VERSIONS = ("sonar_graph", "source", "estimator_source", "gtsam", "numpy", "scipy", "numba", "python", "machine")
 COLUMNS: dict[str, pa.DataType] = {
@@ -66,6 +66,7 @@ def _described(run: PlannedRun) -> Row:
         "log": run.log,
         "generator": run.kind,
         "options": _plain(run.options if run.landmarks is None else run.options | {"landmarks": run.landmarks}),
+        "asked": _plain(run.asked),
         "seed": run.seed,
         "variant": run.variant,
         "params": _plain(run.params),

@@ -128,6 +128,8 @@ LOG = "mcap"
 KINDS: dict[str, SourceKind] = {LOG: SourceKind(LogOptions, _read_log, _check_log), **DATASETS, **GENERATORS}
 FILES = ("log", "folder", "calibration", "log_config")
 """Options that name files: of these the content counts, not the place."""
+FILE = "file"
+"""In fingerprints, the file of a data set that has no option to name one."""
 
 
 def read_source(kind: str, options: dict[str, Any], seed: int | None) -> Sequence:
@@ -147,7 +149,7 @@ def fingerprint(kind: str, options: dict[str, Any]) -> dict[str, Any]:
     """What makes the sequence what it is: all options, and in place of files what is in them."""
     content = {name: _hash(Path(options[name])) for name in FILES if options.get(name) is not None}
     if kind == "victoria-park":
-        content["file"] = _hash(Path(gtsam.findExampleDataFile("victoria_park.txt")))  # type: ignore[no-untyped-call]
+        content[FILE] = _hash(Path(gtsam.findExampleDataFile("victoria_park.txt")))  # type: ignore[no-untyped-call]
     return {"kind": kind, **options, **content}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections import Counter
@@ -20,9 +21,12 @@ from sonar_graph.errors import BatchError
 if TYPE_CHECKING:
     from sonar_graph.batch.batch import Batch
     from sonar_graph.batch.execution import Where
+    from sonar_graph.batch.gate import Verdict
     from sonar_graph.batch.planned import Limits
 
 INTERRUPTED = 130
+SHOWN = 10
+"""Lines about runs that stand out; the report lists every run."""
 BatchFolder = Annotated[
     Path, typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that bench wrote.")
 ]
@@ -83,14 +87,37 @@ def exit_by_gate(folder: Path, reference: Path) -> None:
     from sonar_graph.batch.gate import gate as judge
     from sonar_graph.batch.recorded import read_batch
 
-    verdict = judge(read_batch(folder), reference)
-    for worsening in verdict.worsenings:
-        typer.echo(f"Worse: {worsening}")
-    if verdict.new:
-        typer.echo(f"Not judged: {len(verdict.new)} runs that the reference does not have, first {verdict.new[0]}")
+    with working("judging"):
+        verdict = judge(read_batch(folder), reference)
+    for line in verdict_lines(verdict):
+        typer.echo(line)
     typer.echo(f"Gate: {'passed' if verdict.passed else 'failed'}, {verdict.compared} runs held against {reference}")
     if not verdict.passed:
         raise typer.Exit(1)
+
+
+def verdict_lines(verdict: Verdict) -> list[str]:
+    """What got worse, what a person should look at, and what the tests could have seen."""
+    lines = [f"Worse: {worsening}" for worsening in verdict.worsenings]
+    lines += [f"Look at: {line}" for line in verdict.look_at[:SHOWN]]
+    if len(verdict.look_at) > SHOWN:
+        lines.append(f"Look at: {len(verdict.look_at) - SHOWN} more such lines are not shown")
+    if verdict.new:
+        lines.append(f"Not judged: {len(verdict.new)} runs that the reference does not have, first {verdict.new[0]}")
+    if verdict.untested:
+        told = ", ".join(f"{name} ({verdict.cases[name]})" for name in verdict.untested)
+        lines.append(f"No test of errors: {told}: it needs 3 cases, which are seeds, or logs without seeds")
+    if verdict.unmoved:
+        lines.append(f"Hardly different from the reference: {', '.join(verdict.unmoved)}")
+    if verdict.detectable:
+        told = ", ".join(_seen(name, share, verdict.cases[name]) for name, share in verdict.detectable.items())
+        lines.append(f"Would have been found in four of five batches: one error larger on all logs by {told}")
+    return lines
+
+
+def _seen(contestant: str, share: float, cases: int) -> str:
+    size = f"about {share:.0%}" if math.isfinite(share) else "more than ten times"
+    return f"{size} ({contestant}, {cases} cases)"
 
 
 def write_report_of(folder: Path) -> Path:

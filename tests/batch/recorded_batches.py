@@ -14,6 +14,7 @@ from sonar_graph.batch.recorded import RESULTS, SUITE, RecordedBatch, RecordedRu
 
 METRICS = ["causal.ate_se2_m", "causal.yaw_rmse_rad", "landmarks.se2_m"]
 ESTIMATORS = {"dead-reckoning": 0.4, "isam2": 0.1, "ekf-slam": 0.12}
+ASKED = {"generator": "basin", "options": {"laps": 1}, "landmarks": None, "settings": {}, "rate_hz": 2.0, "files": {}}
 LOGS = ("basin", "basin, wrong_id_rate=0.05")
 
 
@@ -71,6 +72,7 @@ def write_batch(batch: RecordedBatch, folder: Path) -> Path:
             "log": run.log,
             "generator": "basin",
             "options": json.dumps({"laps": 1}),
+            "asked": run.texts["asked"],
             "seed": run.seed,
             "variant": run.variant,
             "params": "{}",
@@ -107,4 +109,5 @@ def _run(rng: np.random.Generator, log: str, seed: int, name: str, error_m: floa
     values |= {"update_p50_ms": 1.0 + rng.random(), "update_p99_ms": 4.0 + rng.random(), "wall_s": 3.0, "cpu_s": 2.9}
     values["peak_memory_mb"] = 20.0
     key = f"{name}-{seed}-{len(log)}"
-    return RecordedRun(key, log, seed, name, "default", "ok", log_file=f"runs/{key}/log.txt", values=values)
+    texts = {"asked": json.dumps(ASKED)}
+    return RecordedRun(key, log, seed, name, "default", "ok", "", f"runs/{key}/log.txt", texts, values)

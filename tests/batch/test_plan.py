@@ -139,3 +139,32 @@ def test_settings_that_exclude_each_other_are_told_with_line_and_key(write_suite
     text = 'params = { identity_policy = "gnc" }\ngrid = { history = ["whole", "bounded"] }\n'
     with pytest.raises(BatchError, match=r'line 11: estimators\.0\.grid\.history: .*"gnc" chooses anew'):
         planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2, text)
+
+
+def test_what_was_asked_for_is_what_the_suite_states(write_suite: WriteSuite) -> None:
+    (run,) = planned(
+        write_suite, HEADER_OF_ISAM2, BASIN, "grid = { wrong_id_rate = [0.1] }\n", ISAM2, "params = { lag_s = 14 }\n"
+    )
+    assert run.asked == {
+        "generator": "basin",
+        "options": {"duration_s": 120, "laps": 1, "wrong_id_rate": 0.1},
+        "files": {},
+        "landmarks": None,
+        "settings": {"lag_s": 14},
+        "rate_hz": 2.0,
+    }
+
+
+def test_files_are_asked_for_by_content_and_landmarks_as_they_are_stated(
+    write_suite: WriteSuite, tmp_path: Path
+) -> None:
+    park = '[[logs]]\nname = "park"\ndataset = "victoria-park"\nlandmarks = { frame_rate_hz = 3 }\n'
+    (run,) = planned(write_suite, HEADER, park, DEAD_RECKONING)
+    assert run.asked["files"] == {"file": fingerprint("victoria-park", {})["file"]}
+    assert run.asked["landmarks"] == {"frame_rate_hz": 3}
+    (tmp_path / "robots").mkdir()
+    (tmp_path / "robots" / "Robot1.dat").write_text("1\n")
+    robots = '[[logs]]\nname = "x"\ndataset = "mrclam"\noptions = { folder = "robots", robot = 1 }\n'
+    (run,) = planned(write_suite, HEADER, robots, DEAD_RECKONING)
+    assert run.asked["options"] == {"robot": 1}
+    assert len(run.asked["files"]["folder"]) == 64

@@ -34,6 +34,7 @@ def _write(folder: Path, factor: float) -> Path:
             "estimator": name,
             "variant": "default",
             "status": "ok",
+            "asked": json.dumps({"generator": "basin", "options": {}}),
             "causal.ate_se2_m": size_m * (factor if name == "isam2" else 1.0) * rng.lognormal(0, 0.2),
         }
         for seed in range(8)
@@ -57,6 +58,7 @@ def test_a_batch_passes_by_the_reference_that_it_became(run, folder, tmp_path, c
     assert run("bench", "gate", folder, reference) == 0
     assert capsys.readouterr().out.splitlines() == [
         f"Reference: {reference} (16 runs, 0 of which did not end)",
+        "Hardly different from the reference: dead-reckoning, isam2",
         f"Gate: passed, 16 runs held against {reference}",
     ]
 
@@ -66,8 +68,22 @@ def test_a_worse_batch_ends_with_one_and_says_what_is_worse(run, folder, tmp_pat
     run("bench", "bless", folder, reference)
     assert run("bench", "gate", _write(tmp_path / "worse", 1.5), reference) == 1
     said = capsys.readouterr().out
-    assert "Worse: basin, isam2, causal.ate_se2_m: +50.0% in the mean of 8 pairs" in said
+    assert (
+        "Worse: basin, isam2, causal.ate_se2_m: +50.0% in the mean of 8 cases, p = 0.0039 (of the whole batch)" in said
+    )
     assert "Gate: failed" in said
+    assert "Would have been found in four of five batches: one error larger on all logs by about" in said
+    assert "Hardly different from the reference: dead-reckoning" in said
+
+
+def test_no_more_than_ten_runs_that_stand_out_are_printed():
+    from sonar_graph.batch.gate import Verdict
+    from sonar_graph.cli.benching import verdict_lines
+
+    lines = verdict_lines(Verdict([], [f"run {n}" for n in range(12)], 24, {"isam2": 2}, {}, []))
+    assert len([line for line in lines if line.startswith("Look at: run")]) == 10
+    assert "Look at: 2 more such lines are not shown" in lines
+    assert any("No test of errors: isam2 (2)" in line for line in lines)
 
 
 def test_report_of_an_incomplete_batch_warns_and_is_written(run, incomplete, capsys):
@@ -105,5 +121,5 @@ def test_a_folder_without_results_is_the_users_mistake(run, tmp_path, capsys):
 def test_a_reference_is_json_that_every_reader_takes(run, folder, tmp_path):
     run("bench", "bless", folder, tmp_path / "reference.json")
     content = json.loads((tmp_path / "reference.json").read_text("utf-8"))
-    assert content["format"] == "sonar_graph batch reference 1"
+    assert content["format"] == "sonar_graph batch reference 2"
     assert len(content["runs"]) == 16

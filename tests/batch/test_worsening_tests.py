@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from sonar_graph.batch.gate import movable, worse_groups
+from sonar_graph.batch.recorded import ALL_LOGS
+from sonar_graph.batch.worsening_tests import Family, clipped, families, with_all_logs
+
+
+def family(beyond: np.ndarray) -> Family:
+    return Family([(f"log {n}", "isam2", "error") for n in range(beyond.shape[1])], beyond, 1.0)
+
+
+def test_one_group_of_three_normal_ratios_has_the_p_value_of_the_t_test():
+    beyond = np.array([[0.3], [0.1], [0.5]])
+    expected = stats.ttest_1samp(beyond[:, 0], 0.0, alternative="greater").pvalue
+    assert family(beyond).p_values[0] == pytest.approx(expected, abs=3 * math.sqrt(expected / 2000))
+
+
+def test_one_group_of_five_has_the_share_of_sign_changes_with_a_larger_mean():
+    beyond = np.array([0.5, 0.4, -0.3, 0.35, 0.25])
+    means = [np.mean(np.array(signs) * beyond) for signs in itertools.product([1, -1], repeat=5)]
+    assert family(beyond[:, None]).p_values[0] == np.mean(np.array(means) >= beyond.mean() - 1e-12)
+
+
+def test_groups_that_go_together_cost_no_correction_and_others_do():
+    rng = np.random.default_rng(0)
+    own = np.array([0.5, 0.4, -0.3, 0.35, 0.25, 0.6, -0.1, 0.4])[:, None]
+    alone = family(own).p_values[0]
+    assert family(np.repeat(own, 30, axis=1)).p_values[0] == alone
+    assert family(np.hstack([own, rng.normal(0, 0.4, (8, 60))])).p_values[0] > 5 * alone
+
+
+def test_families_share_the_five_per_cent():
+    beyond = np.array([[0.3], [0.1], [0.5], [0.2], [0.3], [0.35]])
+    half = Family(family(beyond).groups, beyond, 0.5)
+    assert half.p_values[0] == 2 * family(beyond).p_values[0]
+
+
+def test_a_lost_run_counts_as_one_bad_run():
+    beyond = np.array([0.1, -0.1, 0.12, 0.09, 4.6])[:, None]
+    assert clipped(beyond)[:, 0].tolist() == pytest.approx([0.1, -0.1, 0.12, 0.09, 0.15])
+    assert np.array_equal(clipped(-beyond), -clipped(beyond))
+
+
+def test_all_logs_have_one_ratio_a_seed_and_logs_without_seeds_are_cases():
+    grid = {(log, "isam2", "error"): {0: value, 1: 2 * value} for log, value in (("a", 1.0), ("b", 3.0))}
+    assert with_all_logs(grid)[ALL_LOGS, "isam2", "error"] == {0: 2.0, 1: 4.0}
+    recorded = {(log, "isam2", "error"): {log: 1.0} for log in "abc"}
+    together = with_all_logs(recorded)
+    assert together[ALL_LOGS, "isam2", "error"] == {"a": 1.0, "b": 1.0, "c": 1.0}
+    (tested,) = families(together)
+    assert tested.groups == [(ALL_LOGS, "isam2", "error")]
+
+
+def test_a_family_by_signs_and_one_by_rotations_share_what_there_is():
+    many = {("a", "isam2", "error"): dict.fromkeys(range(6), 0.1)}
+    few = {("a", "ekf-slam", "error"): dict.fromkeys(range(4), 0.1), ("a", "other", "error"): {0: 1.0, 1: 1.0}}
+    found = families(many | few)
+    assert [(one.cases, one.share) for one in found] == [(6, 0.5), (4, 0.5)]
+    assert ("a", "other", "error") not in [group for one in found for group in one.groups]
+
+
+def drawn(rng: np.random.Generator, seeds: int, *, lost: float, worse: float = 0.0):
+    errors = rng.normal(0, 0.1, (2, 3, 2, seeds)) + math.log(100) * (rng.random((2, 3, 2, seeds)) < lost)
+    ratios = errors[1] - errors[0]
+    ratios[0] += math.log1p(worse)
+    return with_all_logs(
+        {
+            (f"log {n}", f"contestant {c}", "error"): dict(enumerate(ratios[c, n].tolist()))
+            for c in range(3)
+            for n in range(2)
+        }
+    )
+
+
+def share_of_failures(seeds: int, *, lost: float, worse: float = 0.0, batches: int = 150) -> float:
+    rng = np.random.default_rng(7)
+    batch = [drawn(rng, seeds, lost=lost, worse=worse) for _ in range(batches)]
+    return float(np.mean([bool(worse_groups(ratios, families(movable(ratios)))) for ratios in batch]))
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.1])
+@pytest.mark.parametrize("seeds", [1, 3, 5, 8])
+def test_another_draw_of_the_same_fails_in_no_more_than_five_per_cent(seeds, lost):
+    assert share_of_failures(seeds, lost=lost) <= stats.binom.ppf(0.999, 150, 0.05) / 150
+
+
+@pytest.mark.parametrize(("seeds", "least"), [(3, 0.6), (5, 0.8), (8, 0.95)])
+def test_half_as_large_again_is_found_with_few_seeds(seeds, least):
+    assert share_of_failures(seeds, lost=0.0, worse=0.5, batches=60) >= least
