@@ -30,6 +30,9 @@ SHOWN = 10
 BatchFolder = Annotated[
     Path, typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that bench wrote.")
 ]
+Strict = Annotated[
+    bool, typer.Option("--strict", help="Fail the gate by lines that say 'look at' too: these are no tests.")
+]
 INSTALL = "pip install 'sonar-graph[bench]'"
 
 
@@ -61,6 +64,7 @@ def bench(
             help="What `bench bless` wrote: exit with 1 where accuracy or consistency got worse, and only then.",
         ),
     ] = None,
+    is_strict: Strict = False,
 ) -> None:
     """Run a suite: logs or simulations, seeds, estimators and variants. Runs that are done already are kept.
 
@@ -69,6 +73,8 @@ def bench(
     """
     if workers is not None and scheduler is not None:
         raise typer.BadParameter("--workers is for this machine, --scheduler for a cluster; give one of them")
+    if is_strict and reference is None:
+        raise typer.BadParameter("--strict is about the gate; give it with --gate")
     with _opened(suite, output, timeout_s) as (batch, limits):
         if retry_failed:
             batch.discard_failed()
@@ -77,13 +83,13 @@ def bench(
         typer.echo(f"Results: {output / 'results.parquet'}")
         typer.echo(f"Report: {write_report_of(output)}")
     if reference is not None:
-        exit_by_gate(output, reference)
+        exit_by_gate(output, reference, is_strict=is_strict)
     elif set(counts) - {"ok"}:
         raise typer.Exit(1)
 
 
-def exit_by_gate(folder: Path, reference: Path) -> None:
-    """Print what got worse, and exit with 1 where anything did."""
+def exit_by_gate(folder: Path, reference: Path, *, is_strict: bool) -> None:
+    """Print what got worse, and exit with 1 where anything did; if strict also where there is something to look at."""
     from sonar_graph.batch.gate import gate as judge
     from sonar_graph.batch.recorded import read_batch
 
@@ -91,8 +97,9 @@ def exit_by_gate(folder: Path, reference: Path) -> None:
         verdict = judge(read_batch(folder), reference)
     for line in verdict_lines(verdict):
         typer.echo(line)
-    typer.echo(f"Gate: {'passed' if verdict.passed else 'failed'}, {verdict.compared} runs held against {reference}")
-    if not verdict.passed:
+    is_passed = verdict.passed and not (is_strict and verdict.look_at)
+    typer.echo(f"Gate: {'passed' if is_passed else 'failed'}, {verdict.compared} runs held against {reference}")
+    if not is_passed:
         raise typer.Exit(1)
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from typer.core import TyperGroup
 
-from sonar_graph.cli.benching import BatchFolder, bench, exit_by_gate
+from sonar_graph.cli.benching import BatchFolder, Strict, bench, exit_by_gate
 from sonar_graph.cli.outputs import writable_json
 from sonar_graph.cli.texts import examples
 
@@ -66,6 +66,7 @@ def gate(
     reference: Annotated[
         Path, typer.Argument(metavar="REFERENCE.json", exists=True, dir_okay=False, help="What bless wrote.")
     ],
+    is_strict: Strict = False,
 ) -> None:
     """Say whether accuracy or consistency got worse beyond noise; exit with 1 if so. Nothing is run."""
-    exit_by_gate(folder, reference)
+    exit_by_gate(folder, reference, is_strict=is_strict)

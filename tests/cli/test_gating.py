@@ -24,7 +24,7 @@ def incomplete(folder) -> Path:
     return folder
 
 
-def _write(folder: Path, factor: float) -> Path:
+def _write(folder: Path, factor: float, seeds: int = 8) -> Path:
     rng = np.random.default_rng(0)
     rows = [
         {
@@ -37,7 +37,7 @@ def _write(folder: Path, factor: float) -> Path:
             "asked": json.dumps({"generator": "basin", "options": {}}),
             "causal.ate_se2_m": size_m * (factor if name == "isam2" else 1.0) * rng.lognormal(0, 0.2),
         }
-        for seed in range(8)
+        for seed in range(seeds)
         for name, size_m in (("dead-reckoning", 0.4), ("isam2", 0.1))
     ]
     folder.mkdir()
@@ -74,6 +74,18 @@ def test_a_worse_batch_ends_with_one_and_says_what_is_worse(run, folder, tmp_pat
     assert "Gate: failed" in said
     assert "Would have been found in four of five batches: one error larger on all logs by about" in said
     assert "Hardly different from the reference: dead-reckoning" in said
+
+
+def test_only_a_strict_gate_fails_by_a_difference_that_no_test_can_judge(run, tmp_path, capsys):
+    """Two seeds: twice the error is a line to look at."""
+    reference = tmp_path / "reference.json"
+    run("bench", "bless", _write(tmp_path / "before", 1.0, seeds=2), reference)
+    after = _write(tmp_path / "after", 2.0, seeds=2)
+    assert run("bench", "gate", after, reference) == 0
+    assert "Look at: basin, isam2" in capsys.readouterr().out
+    assert run("bench", "gate", after, reference, "--strict") == 1
+    assert "Gate: failed, 4 runs" in capsys.readouterr().out
+    assert run("bench", "gate", tmp_path / "before", reference, "--strict") == 0
 
 
 def test_no_more_than_ten_runs_that_stand_out_are_printed():
