@@ -8,7 +8,7 @@ from gtsam.symbol_shorthand import L, X
 import sonar_graph.slam.new_window as new_window_module
 from sonar_graph.errors import EstimatorError
 from sonar_graph.slam.exchange import Exchange
-from sonar_graph.slam.new_window import marginal
+from sonar_graph.slam.new_window import marginal, picked
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.slam.window import Window
 
@@ -67,18 +67,32 @@ def test_a_window_begins_anew_after_what_only_qr_eliminates():
     assert begun_anew(TIGHT_M).covariance(X(2)) == pytest.approx(expected, rel=1e-6)
 
 
+def begun_after(outside: gtsam.NonlinearFactorGraph, tight_m: float, *, is_by_qr: bool) -> Window:
+    """A third and a fourth point, near each other; inside, the third is known to a kilometre."""
+    _, solved = chain()
+    solved.insert(L(3), np.zeros(3))
+    inside = gtsam.NonlinearFactorGraph()
+    inside.push_back(gtsam.PriorFactorPoint3(L(2), np.zeros(3), isotropic(3, WEAK_M)))
+    inside.push_back(gtsam.BetweenFactorPoint3(L(2), L(3), np.zeros(3), isotropic(3, tight_m)))
+    window = Window(1e-6, 1e9)
+    window.is_by_qr = is_by_qr
+    window.begin_after(outside, solved, inside, picked(solved, [L(2), L(3)]), {L(2): 0.0, L(3): 0.0})
+    return window
+
+
+def test_what_lies_outside_counts_once_where_cholesky_gives_up_on_the_window():
+    outside = gtsam.NonlinearFactorGraph()
+    outside.push_back(gtsam.PriorFactorPoint3(L(2), np.zeros(3), isotropic(3, WEAK_M)))
+    window = begun_after(outside, 1e-6, is_by_qr=False)
+    assert window.is_by_qr
+    assert window.isam.marginalCovariance(L(2)) == pytest.approx(0.5 * WEAK_M**2 * np.eye(3), rel=1e-5)
+
+
 @pytest.mark.parametrize("is_by_qr", [False, True])
 def test_a_window_that_cholesky_cannot_begin_has_what_its_marginal_had_lost(is_by_qr: bool):
     """Two sources say where the third point is: the chain outside, and a prior inside."""
-    outside, solved = chain()
-    inside, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    inside.push_back(gtsam.PriorFactorPoint3(L(2), np.zeros(3), isotropic(3, WEAK_M)))
-    inside.push_back(gtsam.BetweenFactorPoint3(L(2), L(3), np.zeros(3), isotropic(3, 0.1)))
-    for key in (L(2), L(3)):
-        values.insert(key, np.zeros(3))
-    window = Window(1e-6, 1e9)
-    window.is_by_qr = is_by_qr
-    window.begin_after(outside, solved, inside, values, {L(2): 0.0, L(3): 0.0})
+    outside, _ = chain()
+    window = begun_after(outside, 0.1, is_by_qr=is_by_qr)
     expected = 1.0 / (1.0 / WEAK_M**2 + 1.0 / (PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2))
     assert window.is_by_qr
     assert window.isam.marginalCovariance(L(2)) == pytest.approx(expected * np.eye(3), rel=1e-6)
