@@ -115,10 +115,9 @@ class DetectionArrayAdapter(Adapter):
         return positions, covariances
 
     def _identity(self, topic: Topic, name: str) -> int:
-        if name in self.ids:
-            return self.ids[name]
         try:
-            return min(int(name), FIRST_TOO_LARGE_ID)
+            identity = self.ids[name] if name in self.ids else int(name)
+            return max(-1, min(identity, FIRST_TOO_LARGE_ID))  # what no array of integers holds is refused as well
         except ValueError:
             raise LogError(
                 f"{topic.file}: topic {topic.name}: class {name!r} is no integer identity; say in a log "
