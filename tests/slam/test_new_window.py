@@ -8,7 +8,7 @@ from gtsam.symbol_shorthand import L, X
 import sonar_graph.slam.new_window as new_window_module
 from sonar_graph.errors import EstimatorError
 from sonar_graph.slam.exchange import Exchange
-from sonar_graph.slam.new_window import marginal, picked
+from sonar_graph.slam.new_window import joined, marginal, picked, without
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.slam.window import Window
 
@@ -41,6 +41,26 @@ def test_cholesky_loses_it():
     graph, values = chain()
     (found,) = marginal(graph, values, [L(2)])
     assert not found.linearize(values).augmentedInformation()[:3, :3].any()
+
+
+def test_values_are_joined_in_others_of_their_own():
+    values, new = gtsam.Values(), gtsam.Values()
+    values.insert(L(1), np.ones(3))
+    new.insert(L(1), np.full(3, 9.0))
+    new.insert(X(0), gtsam.Pose3())
+    both = joined(values, new)
+    assert both.atPoint3(L(1)) == pytest.approx(np.ones(3))
+    assert set(both.keys()) == {L(1), X(0)}
+    assert (list(values.keys()), new.size()) == ([L(1)], 2)
+
+
+def test_a_graph_without_factors_given_once_lacks_all_of_them_and_has_no_holes():
+    graph, factors = gtsam.NonlinearFactorGraph(), [factor(k, 1.0) for k in range(4)]
+    for each in factors:
+        graph.push_back(each)
+    graph.remove(1)
+    rest = without(graph, gtsam.Values(), (factors[k] for k in (3, 0)))
+    assert [rest.at(i) for i in range(rest.size())] == [factors[2]]
 
 
 def begun_anew(tight_m: float) -> Smoother:
