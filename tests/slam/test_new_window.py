@@ -108,8 +108,38 @@ def test_what_lies_outside_counts_once_where_cholesky_gives_up_on_the_window():
     assert window.isam.marginalCovariance(L(2)) == pytest.approx(0.5 * WEAK_M**2 * np.eye(3), rel=1e-5)
 
 
+def test_a_window_without_an_outside_begins_by_qr_where_cholesky_gives_up():
+    window, (graph, values) = Window(1e-6, 1e9), chain()
+    window.begin(graph, values, {L(k): 0.0 for k in range(3)})
+    expected = (PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2) * np.eye(3)
+    assert window.is_by_qr
+    assert window.isam.marginalCovariance(L(2)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_window_that_is_not_determined_does_not_begin():
+    window, (graph, values) = Window(1e-6, 1e9), chain()
+    graph.remove(0)
+    with pytest.raises(RuntimeError):
+        window.begin(graph, values, {L(k): 0.0 for k in range(3)})
+
+
 @pytest.mark.parametrize("is_by_qr", [False, True])
-def test_a_window_that_cholesky_cannot_begin_has_what_its_marginal_had_lost(is_by_qr: bool):
+def test_a_marginal_holds_where_it_was_made_though_the_window_is_linearised_elsewhere(is_by_qr: bool):
+    """One says 0 m and one 3 m, equally surely."""
+    outside, values, inside = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.NonlinearFactorGraph()
+    outside.push_back(gtsam.PriorFactorPoint3(L(2), np.zeros(3), isotropic(3, 1.0)))
+    inside.push_back(gtsam.PriorFactorPoint3(L(2), np.full(3, 3.0), isotropic(3, 1.0)))
+    values.insert(L(2), np.zeros(3))
+    window = Window(1e-6, 1e9)
+    window.is_by_qr = is_by_qr
+    window.begin_after(outside, values, inside, values, {L(2): 0.0})
+    window.settle()
+    assert window.isam.getLinearizationPoint().atPoint3(L(2)) == pytest.approx(np.full(3, 1.5), abs=1e-5)
+    assert window.isam.calculateEstimate().atPoint3(L(2)) == pytest.approx(np.full(3, 1.5))
+
+
+@pytest.mark.parametrize("is_by_qr", [False, True])
+def test_a_window_that_cholesky_cholesky_cannot_begin_has_what_its_marginal_had_lost(is_by_qr: bool):
     """Two sources say where the third point is: the chain outside, and a prior inside."""
     outside, _ = chain()
     window = begun_after(outside, 0.1, is_by_qr=is_by_qr)

@@ -104,8 +104,8 @@ def test_of_a_track_that_counts_as_nothing_the_most_probable_row_stays_and_of_eq
 
 
 def test_an_identity_that_a_row_names_twice_has_the_sum_of_both_posteriors():
-    rows = replace(frame([3, 3], [[0, 0.6, 0, 0], [0.4, 0.4, 0, 0]]), candidate_ids=np.full((2, 4), 5))
-    assert best_of_tracks(rows, lambda _: 5).tolist() == [False, True]
+    rows = replace(frame([3, 3], [[0, 0.6, 0, 0], [0.4, 0.4, 0, 0]]), candidate_ids=np.zeros((2, 4), int))
+    assert best_of_tracks(rows, lambda _: 0).tolist() == [False, True]
 
 
 def test_rows_that_are_not_used_stand_in_the_journal_with_frame_identity_and_reason():

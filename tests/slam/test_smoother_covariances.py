@@ -60,6 +60,15 @@ def test_landmarks_asked_for_before_an_update_come_with_the_first_question_after
     assert np.allclose(joint(fed, keys), expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max())
 
 
+def test_what_was_asked_for_is_known_after_settling(monkeypatch):
+    fed, asked = in_the_basin(6, FOREVER_S), counted_marginals(monkeypatch)
+    joint(fed, [X(5), L(3)])
+    fed.smoother.settle(5.0)
+    fed.smoother.update(5.0)
+    joint(fed, [X(5)])
+    assert asked == [{X(5), L(3)}] * 2
+
+
 def test_landmarks_that_are_no_longer_asked_for_are_let_go(monkeypatch):
     """Remembered over one update, not for ever; poses not at all, since they may have left the window."""
     fed, asked = in_the_basin(6, FOREVER_S), counted_marginals(monkeypatch)
