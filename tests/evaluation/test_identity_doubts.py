@@ -99,8 +99,9 @@ def test_five_landmarks_are_named_and_more_are_counted(count: int, listed: str) 
     assert f"sightings of landmarks {listed} contradict its map" in line
 
 
-def test_innovations_that_were_refused_say_nothing_of_the_map() -> None:
-    log = log_of([Outcome.GATED] * 10, [1.0] * 10)
+@pytest.mark.parametrize("outcome", [Outcome.GATED, Outcome.WITHHELD, Outcome.REPEATED])
+def test_innovations_that_were_refused_say_nothing_of_the_map(outcome: Outcome) -> None:
+    log = log_of([outcome] * 10, [1.0] * 10)
     assert doubt_of_identities(with_map(IDS, [0.0] * 4, has_truth=False, detections=log)) == []
 
 

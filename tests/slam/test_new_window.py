@@ -63,6 +63,14 @@ def test_a_graph_without_factors_given_once_lacks_all_of_them_and_has_no_holes()
     assert [rest.at(i) for i in range(rest.size())] == [factors[2]]
 
 
+@pytest.mark.parametrize("is_by_qr", [False, True])
+def test_nothing_says_nothing_and_what_touches_nothing_inside_neither(is_by_qr: bool):
+    graph, values = chain()
+    assert marginal(gtsam.NonlinearFactorGraph(), values, [L(2)], is_by_qr=is_by_qr) == []
+    graph.resize(1)
+    assert marginal(graph, values, [L(2)], is_by_qr=is_by_qr) == []
+
+
 def begun_anew(tight_m: float) -> Smoother:
     """Three keyframes like the chain; a factor on the first, which has left, is exchanged for its like."""
     smoother = Smoother(lag_s=0.5, relinearize_threshold=1e-6, stale_shift_m=1e9)

@@ -109,7 +109,7 @@ def test_an_identity_that_a_row_names_twice_has_the_sum_of_both_posteriors():
 
 
 def test_rows_that_are_not_used_stand_in_the_journal_with_frame_identity_and_reason():
-    rows, journal = frame([3, 3, NO_TRACK, 3], [SURE[4], SURE[6], SURE[7], SURE[5]]), DetectionJournal()
+    rows, journal = frame([-7, -7, NO_TRACK, -7], [SURE[4], SURE[6], SURE[7], SURE[5]]), DetectionJournal()
     rows = replace(rows, stamps_ns=np.full(4, 8))
     kept, log = once_a_track(rows, lambda _: 6, journal), journal.log()
     assert kept.most_probable()[0].tolist() == [6, 7]
