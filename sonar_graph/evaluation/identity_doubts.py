@@ -1,8 +1,9 @@
 """What a reader must know first of identities: that none came, that a map is wrong, what landmarks without a name are.
 
 A squared error, or a squared innovation, of two degrees of freedom is above `ABSURD` with a probability of 10⁻⁹ where
-covariances hold. So no landmark of a consistent estimator is named here in practice, and none whose noise is set wrong
-by less than about four times.
+covariances hold, so that no landmark of a consistent estimator is named here in practice. Where sigmas are f times too
+small it is 10⁻⁹ to the power of 1/f²: a landmark is then named for its error in one case of 180 at f = 2 and of ten at
+f = 3, for its sightings from f = 3.6 on.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ outliers, which a robust estimator outvotes."""
 MOST_NAMED = 5
 NAMELESS = {Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNFIT}
 """Outcomes of detections of which an estimator does not know what they are of."""
+UNHEARD = {Outcome.UNSOUND, Outcome.LATE, Outcome.UNLOCATED, Outcome.TRACK_REPEATED}
+"""Outcomes of detections that were refused before what they are of mattered."""
 POLICY, UNKNOWN = "identity_policy", "unknown_landmarks"
 
 
@@ -54,14 +57,19 @@ def _by_place(landmarks: LandmarkMap, true: LandmarkMap | None) -> str:
 
 
 def _nothing_named(comparison: Comparison) -> list[str]:
-    """That no detection had an identity that a run could use."""
-    blind = [run for run in comparison.runs if run.detections and set(run.detections.outcomes) <= NAMELESS]
+    """That of the detections that a run could use none had an identity."""
+    heard = [(run, _heard(run)) for run in comparison.runs]
+    blind = [(run, outcomes) for run, outcomes in heard if outcomes and set(outcomes) <= NAMELESS]
     if not blind:
         return []
-    hint = "" if any(run.params.get(UNKNOWN) == "associate" for run in blind) else _associate()
-    names = ", ".join(run.estimator for run in blind)
-    count = max(len(run.detections) for run in blind if run.detections)
+    hint = "" if any(run.params.get(UNKNOWN) == "associate" for run, _ in blind) else _associate()
+    names = ", ".join(run.estimator for run, _ in blind)
+    count = max(len(outcomes) for _, outcomes in blind)
     return [f"Warning: none of {count} detections has an identity that {names} can use: no landmark is mapped{hint}"]
+
+
+def _heard(run: RunResult) -> list[Outcome]:
+    return [outcome for outcome in run.detections.outcomes if outcome not in UNHEARD] if run.detections else []
 
 
 def _associate() -> str:

@@ -61,11 +61,11 @@ def detection_warnings(detections: LandmarkDetections, first_ns: int, last_ns: i
 
 
 def _no_covariance(covs: Floats) -> NDArray[np.bool_]:
-    """Of range and azimuth, shape (n, 2, 2); unknown ones are none too few."""
-    a, b, c = covs[:, 0, 0], covs[:, 0, 1], covs[:, 1, 1]
-    is_known = np.isfinite(covs).all(axis=(1, 2))
+    """Of range and azimuth, shape (n, 2, 2); unknown ones (NaN) are none too few."""
+    a, b, c = covs[:, 0, 0], covs[:, 1, 0], covs[:, 1, 1]
+    is_unknown, is_finite = np.isnan(covs).any(axis=(1, 2)), np.isfinite(covs).all(axis=(1, 2))
     with np.errstate(invalid="ignore", over="ignore"):
-        return np.asarray(is_known & ~((a > 0) & (c > 0) & (a * c > b * b)))
+        return np.asarray(~is_unknown & ~(is_finite & (a > 0) & (c > 0) & (a * c > b * b)))
 
 
 def _repeated_tracks(detections: LandmarkDetections) -> str | None:

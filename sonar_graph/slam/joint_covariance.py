@@ -55,6 +55,10 @@ class KeptCovariance:
             self._joint = JointCovariance.of(marginals, sorted(self._asked | self._asked_before))
         return self._joint
 
+    def outdate(self) -> None:
+        """The same graph is linearised elsewhere."""
+        self._joint = None
+
     def renew(self, lasting: Iterable[int]) -> None:
         """The graph has changed; of what was asked for only some variables last."""
         self._joint, self._asked, self._asked_before = None, set(), self._asked.intersection(lasting)

@@ -28,8 +28,6 @@ def marginal(
     RuntimeError
         When elimination gives up: QR on what is not determined, Cholesky also on what is determined weakly.
     """
-    if graph.size() == 0:
-        return []
     linear = graph.linearize(values)
     separator = [key for key in linear.keyVector() if key in kept]
     found = linear.marginal(separator, gtsam.EliminateQR) if is_by_qr else linear.marginal(separator)

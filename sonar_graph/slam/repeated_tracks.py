@@ -33,9 +33,9 @@ def best_of_tracks(frame: LandmarkDetections, identity_of: Callable[[int], int])
     best: dict[int, tuple[float, float, int]] = {}
     for row, track in enumerate(frame.track.tolist()):
         if track != NO_TRACK:
-            posterior = frame.id_probability[row]
-            of_track = frame.candidate_ids[row] == identity_of(track)
-            score = float(posterior[of_track].sum()), float(posterior.max(initial=0.0)), -row
+            is_landmark = frame.candidate_ids[row] >= 0
+            ids, posterior = frame.candidate_ids[row, is_landmark], frame.id_probability[row, is_landmark]
+            score = float(posterior[ids == identity_of(track)].sum()), float(posterior.max(initial=0.0)), -row
             best[track] = max(best.get(track, score), score)
     is_kept = frame.track == NO_TRACK
     is_kept[[-score[2] for score in best.values()]] = True

@@ -237,6 +237,7 @@ class Smoother:
             self._window.settle()
         except RuntimeError:
             self._give_up_cholesky(time_s)
+        self._kept_covariance.outdate()
         self._take(self._window.isam.calculateEstimate())
 
     @property
@@ -404,6 +405,5 @@ class Smoother:
         """
         if self._solved is None or self._solved_changes != self._history.changes:
             values = self._solve()
-            self._solved = values, marginals_of(self.graph, values)
-            self._solved_changes = self._history.changes
+            self._solved, self._solved_changes = (values, marginals_of(self.graph, values)), self._history.changes
         return self._solved

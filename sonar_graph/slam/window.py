@@ -55,14 +55,19 @@ class Window:
         RuntimeError
             When even that finds no solution.
         """
-        self.isam = self._empty()
         try:
-            self.isam.update(graph, values, times_s)
+            self._begin_once(graph, values, times_s)
         except RuntimeError:
             if self.is_by_qr:
                 raise
             self.is_by_qr = True
-            self.begin(graph, values, times_s)
+            self._begin_once(graph, values, times_s)
+
+    def _begin_once(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times_s: Mapping[Any, float]
+    ) -> None:
+        self.isam = self._empty()
+        self.isam.update(graph, values, times_s)
 
     def begin_after(
         self,
@@ -84,14 +89,15 @@ class Window:
         RuntimeError
             When even QR finds no solution.
         """
-        was_by_qr = self.is_by_qr
-        try:
-            self.begin(joined_with_marginal(inside, outside, solved, times_s, is_by_qr=was_by_qr), values, times_s)
-        except RuntimeError:
-            if was_by_qr:
-                raise
-            self.is_by_qr = True  # a marginal by Cholesky may also have lost what is weak without a word
-            self.begin(joined_with_marginal(inside, outside, solved, times_s, is_by_qr=True), values, times_s)
+        if not self.is_by_qr:
+            try:
+                graph = joined_with_marginal(inside, outside, solved, times_s, is_by_qr=False)
+                self._begin_once(graph, values, times_s)
+            except RuntimeError:
+                self.is_by_qr = True  # a marginal by Cholesky may also have lost what is weak without a word
+            else:
+                return
+        self._begin_once(joined_with_marginal(inside, outside, solved, times_s, is_by_qr=True), values, times_s)
 
     def update(
         self,

@@ -74,12 +74,34 @@ def test_without_true_landmarks_the_innovations_tell() -> None:
         log = log_of(used, [1.0] * far + [0.01] * (10 - far))
         lines = doubt_of_identities(with_map(IDS, [0.0] * 4, has_truth=False, detections=log))
         assert bool(lines) == is_told, far
+        if far == 3:
+            assert "(mean NIS up to 375)" in lines[0]  # (3 * 50² + 7 * 0.5²) / 10 / 2
         assert not doubt_of_identities(with_map(IDS, [0.0] * 4, detections=log))  # the truth says that all is well
     assert lines[0].startswith("Warning: isam2: sightings of landmark 2 contradict its map (mean NIS up to 1250); look")
 
 
-def test_innovations_that_were_refused_say_nothing_of_the_map() -> None:
-    log = log_of([Outcome.GATED] * 10, [1.0] * 10)
+def test_sightings_contradict_a_map_where_sigmas_are_four_times_too_small_but_not_where_three() -> None:
+    n, rng = 2000, np.random.default_rng(2)
+    unit = replace(log_of([Outcome.USED] * n, [0.0] * n), innovations=SIGMA_M * rng.standard_normal((n, 2)))
+    for factor, is_told in ((3.0, False), (4.0, True)):
+        log = replace(unit, innovations=factor * unit.innovations)
+        assert bool(doubt_of_identities(with_map(IDS, [0.0] * 4, has_truth=False, detections=log))) == is_told
+
+
+@pytest.mark.parametrize(
+    ("count", "listed"), [(2, "1 and 2"), (5, "1, 2, 3, 4 and 5"), (6, "1, 2, 3, 4, 5 and 1 more")]
+)
+def test_five_landmarks_are_named_and_more_are_counted(count: int, listed: str) -> None:
+    ids, blank = np.arange(1, count + 1), with_map(IDS, [0.0] * 4, has_truth=False)
+    log = replace(log_of([Outcome.USED] * count, [1.0] * count), landmark_ids=ids)
+    landmarks = LandmarkMap(ids, np.zeros((count, 3)), np.zeros((count, 3, 3)))
+    (line,) = doubt_of_identities(with_run(blank, replace(blank.runs[0], landmarks=landmarks, detections=log)))
+    assert f"sightings of landmarks {listed} contradict its map" in line
+
+
+@pytest.mark.parametrize("outcome", [Outcome.GATED, Outcome.WITHHELD, Outcome.REPEATED])
+def test_innovations_that_were_refused_say_nothing_of_the_map(outcome: Outcome) -> None:
+    log = log_of([outcome] * 10, [1.0] * 10)
     assert doubt_of_identities(with_map(IDS, [0.0] * 4, has_truth=False, detections=log)) == []
 
 
@@ -96,6 +118,26 @@ def test_a_log_without_any_identity_is_told_with_what_to_do(outcome: Outcome) ->
     assert "none of 6 detections has an identity" in render_report(blind)
     one_used = log_of([outcome] * 5 + [Outcome.NEW], [np.nan] * 6)
     assert doubt_of_identities(with_map(IDS, [0.0] * 4, detections=one_used)) == []
+
+
+def test_detections_that_were_refused_before_their_identity_mattered_do_not_hide_that_none_has_one() -> None:
+    before = [Outcome.UNSOUND, Outcome.LATE, Outcome.UNLOCATED, Outcome.TRACK_REPEATED]
+    mixed = log_of([*before, Outcome.WAITING, Outcome.NO_IDENTITY, Outcome.WAITING], [np.nan] * 7)
+    (line,) = doubt_of_identities(with_map(IDS, [0.0] * 4, detections=mixed))
+    assert line.startswith("Warning: none of 3 detections has an identity that isam2 can use")
+    assert doubt_of_identities(with_map(IDS, [0.0] * 4, detections=log_of(before, [np.nan] * 4))) == []
+
+
+def test_runs_that_know_no_identity_are_named_together_with_the_most_that_any_was_given() -> None:
+    comparison = only(basin_comparison(60), "isam2", "ekf-slam")
+    for run, n in zip(comparison.runs, (4, 6), strict=True):
+        blind = replace(run, detections=log_of([Outcome.NO_IDENTITY] * n, [np.nan] * n))
+        comparison = with_run(comparison, blind)
+    (line,) = doubt_of_identities(comparison)
+    assert line.startswith("Warning: none of 6 detections has an identity that isam2, ekf-slam can use")
+    assert "associate" in line
+    comparison = with_run(comparison, replace(comparison.runs[0], params={"unknown_landmarks": "associate"}))
+    assert not any("associate" in line for line in doubt_of_identities(comparison))
 
 
 def test_what_is_asked_for_already_is_not_advised() -> None:
@@ -117,6 +159,12 @@ def test_landmarks_without_a_name_are_counted_and_scored_by_place() -> None:
     scores = landmark_scores(nameless.runs[0].landmarks, nameless.sequence.true_landmarks)
     assert scores["landmarks.raw_m"].value == pytest.approx(np.sqrt((0.01**2 + 0.02**2 + 0.01**2) / 3))
     assert "3 landmarks matched by identity, 3 of them by place within 1 m" in scores["landmarks.raw_m"].protocol
+
+
+def test_a_landmark_without_a_name_is_wrong_where_its_place_names_it_but_its_covariance_rules_it_out() -> None:
+    nameless = with_map(np.arange(4) + FIRST_ANONYMOUS_ID, [0.01, 0.5, 3.0, 0.01])  # the third is nobody's
+    (line,) = doubt_of_identities(nameless)
+    assert "puts landmark 2 far outside its covariance" in line
 
 
 def test_an_identity_that_is_merely_wrong_is_not_named_by_place() -> None:

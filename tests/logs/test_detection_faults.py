@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import LogError
+from sonar_graph.logs.detection_faults import detection_warnings
 from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.reading import read_sequence
+from sonar_graph.measurements import LandmarkDetections
+from sonar_graph.slam.sound_rows import sound_detections
 
 
 def one_of(bench: Any, **changed: Any) -> Any:
@@ -61,6 +64,16 @@ def test_what_estimators_do_not_use_is_told_and_kept(bench: Any, changed: dict[s
     assert sequence.detections is not None
     assert len(sequence.detections) == 3
     assert told in sequence.notes["log.warnings"]
+
+
+@pytest.mark.parametrize("cross", [0.0, 0.9, -1.1, np.inf, np.nan])
+@pytest.mark.parametrize(
+    "variances", [(1.0, 1.0), (-1.0, -1.0), (0.0, 1.0), (np.inf, 1.0), (1.0, np.inf), (np.nan, 1.0)]
+)
+def test_a_covariance_is_told_of_where_estimators_refuse_it(variances: tuple[float, float], cross: float) -> None:
+    cov = np.array([[[variances[0], cross], [cross, variances[1]]]])
+    row = LandmarkDetections(np.array([5]), np.ones(1), np.zeros(1), cov, np.array([[1]]), np.array([[0.9]]))
+    assert bool(list(detection_warnings(row, 0, 9))) == (not sound_detections(row)[0])
 
 
 def test_unknown_covariances_and_tracks_that_come_again_later_are_sound(bench: Any) -> None:

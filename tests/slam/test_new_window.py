@@ -8,8 +8,9 @@ from gtsam.symbol_shorthand import L, X
 import sonar_graph.slam.new_window as new_window_module
 from sonar_graph.errors import EstimatorError
 from sonar_graph.slam.exchange import Exchange
-from sonar_graph.slam.new_window import marginal
+from sonar_graph.slam.new_window import joined, marginal, picked, without
 from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.window import Window
 
 PRIOR_M, TIGHT_M, WEAK_M = 3.0, 2e-8, 1e3
 
@@ -42,6 +43,34 @@ def test_cholesky_loses_it():
     assert not found.linearize(values).augmentedInformation()[:3, :3].any()
 
 
+def test_values_are_joined_in_others_of_their_own():
+    values, new = gtsam.Values(), gtsam.Values()
+    values.insert(L(1), np.ones(3))
+    new.insert(L(1), np.full(3, 9.0))
+    new.insert(X(0), gtsam.Pose3())
+    both = joined(values, new)
+    assert both.atPoint3(L(1)) == pytest.approx(np.ones(3))
+    assert set(both.keys()) == {L(1), X(0)}
+    assert (list(values.keys()), new.size()) == ([L(1)], 2)
+
+
+def test_a_graph_without_factors_given_once_lacks_all_of_them_and_has_no_holes():
+    graph, factors = gtsam.NonlinearFactorGraph(), [factor(k, 1.0) for k in range(4)]
+    for each in factors:
+        graph.push_back(each)
+    graph.remove(1)
+    rest = without(graph, gtsam.Values(), (factors[k] for k in (3, 0)))
+    assert [rest.at(i) for i in range(rest.size())] == [factors[2]]
+
+
+@pytest.mark.parametrize("is_by_qr", [False, True])
+def test_nothing_says_nothing_and_what_touches_nothing_inside_neither(is_by_qr: bool):
+    graph, values = chain()
+    assert marginal(gtsam.NonlinearFactorGraph(), values, [L(2)], is_by_qr=is_by_qr) == []
+    graph.resize(1)
+    assert marginal(graph, values, [L(2)], is_by_qr=is_by_qr) == []
+
+
 def begun_anew(tight_m: float) -> Smoother:
     """Three keyframes like the chain; a factor on the first, which has left, is exchanged for its like."""
     smoother = Smoother(lag_s=0.5, relinearize_threshold=1e-6, stale_shift_m=1e9)
@@ -64,6 +93,67 @@ def factor(k: int, sigma: float) -> gtsam.NonlinearFactor:
 def test_a_window_begins_anew_after_what_only_qr_eliminates():
     expected = (PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2) * np.eye(6)
     assert begun_anew(TIGHT_M).covariance(X(2)) == pytest.approx(expected, rel=1e-6)
+
+
+def begun_after(outside: gtsam.NonlinearFactorGraph, tight_m: float, *, is_by_qr: bool) -> Window:
+    """A third and a fourth point, near each other; inside, the third is known to a kilometre."""
+    _, solved = chain()
+    solved.insert(L(3), np.zeros(3))
+    inside = gtsam.NonlinearFactorGraph()
+    inside.push_back(gtsam.PriorFactorPoint3(L(2), np.zeros(3), isotropic(3, WEAK_M)))
+    inside.push_back(gtsam.BetweenFactorPoint3(L(2), L(3), np.zeros(3), isotropic(3, tight_m)))
+    window = Window(1e-6, 1e9)
+    window.is_by_qr = is_by_qr
+    window.begin_after(outside, solved, inside, picked(solved, [L(2), L(3)]), {L(2): 0.0, L(3): 0.0})
+    return window
+
+
+def test_what_lies_outside_counts_once_where_cholesky_gives_up_on_the_window():
+    outside = gtsam.NonlinearFactorGraph()
+    outside.push_back(gtsam.PriorFactorPoint3(L(2), np.zeros(3), isotropic(3, WEAK_M)))
+    window = begun_after(outside, 1e-6, is_by_qr=False)
+    assert window.is_by_qr
+    assert window.isam.marginalCovariance(L(2)) == pytest.approx(0.5 * WEAK_M**2 * np.eye(3), rel=1e-5)
+
+
+def test_a_window_without_an_outside_begins_by_qr_where_cholesky_gives_up():
+    window, (graph, values) = Window(1e-6, 1e9), chain()
+    window.begin(graph, values, {L(k): 0.0 for k in range(3)})
+    expected = (PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2) * np.eye(3)
+    assert window.is_by_qr
+    assert window.isam.marginalCovariance(L(2)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_window_that_is_not_determined_does_not_begin():
+    window, (graph, values) = Window(1e-6, 1e9), chain()
+    graph.remove(0)
+    with pytest.raises(RuntimeError):
+        window.begin(graph, values, {L(k): 0.0 for k in range(3)})
+
+
+@pytest.mark.parametrize("is_by_qr", [False, True])
+def test_a_marginal_holds_where_it_was_made_though_the_window_is_linearised_elsewhere(is_by_qr: bool):
+    """One says 0 m and one 3 m, equally surely."""
+    outside, values, inside = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.NonlinearFactorGraph()
+    outside.push_back(gtsam.PriorFactorPoint3(L(2), np.zeros(3), isotropic(3, 1.0)))
+    inside.push_back(gtsam.PriorFactorPoint3(L(2), np.full(3, 3.0), isotropic(3, 1.0)))
+    values.insert(L(2), np.zeros(3))
+    window = Window(1e-6, 1e9)
+    window.is_by_qr = is_by_qr
+    window.begin_after(outside, values, inside, values, {L(2): 0.0})
+    window.settle()
+    assert window.isam.getLinearizationPoint().atPoint3(L(2)) == pytest.approx(np.full(3, 1.5), abs=1e-5)
+    assert window.isam.calculateEstimate().atPoint3(L(2)) == pytest.approx(np.full(3, 1.5))
+
+
+@pytest.mark.parametrize("is_by_qr", [False, True])
+def test_a_window_that_cholesky_cholesky_cannot_begin_has_what_its_marginal_had_lost(is_by_qr: bool):
+    """Two sources say where the third point is: the chain outside, and a prior inside."""
+    outside, _ = chain()
+    window = begun_after(outside, 0.1, is_by_qr=is_by_qr)
+    expected = 1.0 / (1.0 / WEAK_M**2 + 1.0 / (PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2))
+    assert window.is_by_qr
+    assert window.isam.marginalCovariance(L(2)) == pytest.approx(expected * np.eye(3), rel=1e-6)
 
 
 def test_where_cholesky_gives_up_on_the_marginal_qr_makes_it(monkeypatch: pytest.MonkeyPatch):

@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 import sonar_graph.slam.sightings as sightings_module
 from sonar_graph.measurements import NO_TRACK, LandmarkDetections
 from sonar_graph.sequence import Sequence
+from sonar_graph.slam.association import DetectionJournal
 from sonar_graph.slam.isam2 import Isam2
 from sonar_graph.slam.repeated_tracks import best_of_tracks, of_no_landmark, once_a_track
+from sonar_graph.slam.tracks import NO_LANDMARK, UNDECIDED
 from sonar_graph.states import Outcome
 
 from .late_identities import FLAT, IDS, SURE, assert_outcomes_account, run
@@ -99,6 +101,26 @@ def test_the_row_stays_that_the_tracks_identity_explains_best():
 def test_of_a_track_that_counts_as_nothing_the_most_probable_row_stays_and_of_equals_the_first():
     rows = frame([3, 3, 3, NO_TRACK, NO_TRACK], [FLAT, [0, 0.8, 0, 0], [0, 0, 0.8, 0], FLAT, FLAT])
     assert best_of_tracks(rows, of_no_landmark).tolist() == [False, True, False, True, True]
+
+
+def test_an_identity_that_a_row_names_twice_has_the_sum_of_both_posteriors():
+    rows = replace(frame([3, 3], [[0, 0.6, 0, 0], [0.4, 0.4, 0, 0]]), candidate_ids=np.zeros((2, 4), int))
+    assert best_of_tracks(rows, lambda _: 0).tolist() == [False, True]
+
+
+def test_rows_that_are_not_used_stand_in_the_journal_with_frame_identity_and_reason():
+    rows, journal = frame([-7, -7, NO_TRACK, -7], [SURE[4], SURE[6], SURE[7], SURE[5]]), DetectionJournal()
+    rows = replace(rows, stamps_ns=np.full(4, 8))
+    kept, log = once_a_track(rows, lambda _: 6, journal), journal.log()
+    assert kept.most_probable()[0].tolist() == [6, 7]
+    assert (log.stamps_ns.tolist(), log.landmark_ids.tolist()) == ([8, 8], [4, 5])
+    assert log.outcomes == [Outcome.TRACK_REPEATED] * 2
+
+
+@pytest.mark.parametrize("counts_as", [UNDECIDED, NO_LANDMARK])
+def test_the_posterior_of_no_identity_speaks_for_no_row(counts_as: int):
+    rows = replace(frame([3, 3], [[0.9, 0.1, 0, 0], [0, 0.5, 0, 0]]), candidate_ids=np.array([[-1, *IDS[1:]]] * 2))
+    assert best_of_tracks(rows, lambda _: counts_as).tolist() == [False, True]
 
 
 def test_where_tracks_are_not_used_all_rows_are():

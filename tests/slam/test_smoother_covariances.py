@@ -22,6 +22,17 @@ def test_one_computation_of_covariances_serves_until_the_next_update():
     assert fed.smoother.joint_covariance([L(5)]).at(L(5), L(5))[0, 0] < 1e-5
 
 
+def test_covariances_are_those_of_where_the_window_has_settled():
+    """A landmark that is pulled away by decimetres lies at other angles to all that see it."""
+    fed, keys = in_the_basin(12, FOREVER_S), [X(11), L(3)]
+    fed.add([gtsam.PriorFactorPoint3(L(5), np.array([2.6, 4.3, -0.8]), gtsam.noiseModel.Isotropic.Sigma(3, 0.01))])
+    fed.smoother.update(11.0)
+    joint(fed, keys)
+    fed.smoother.settle(11.0)
+    expected = dense_covariance(fed, fed.smoother.values, keys)
+    assert np.allclose(joint(fed, keys), expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max())
+
+
 def counted_marginals(monkeypatch: pytest.MonkeyPatch) -> list[set[int]]:
     """Keys of each joint covariance that is computed from now on."""
     asked: list[set[int]] = []
@@ -47,6 +58,15 @@ def test_landmarks_asked_for_before_an_update_come_with_the_first_question_after
     keys = [X(5), L(5)]
     expected = dense_covariance(fed, fed.smoother.values, keys)
     assert np.allclose(joint(fed, keys), expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max())
+
+
+def test_what_was_asked_for_is_known_after_settling(monkeypatch):
+    fed, asked = in_the_basin(6, FOREVER_S), counted_marginals(monkeypatch)
+    joint(fed, [X(5), L(3)])
+    fed.smoother.settle(5.0)
+    fed.smoother.update(5.0)
+    joint(fed, [X(5)])
+    assert asked == [{X(5), L(3)}] * 2
 
 
 def test_landmarks_that_are_no_longer_asked_for_are_let_go(monkeypatch):

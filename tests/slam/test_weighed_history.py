@@ -6,11 +6,12 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
+from sonar_graph.slam.batch import solve
 from sonar_graph.slam.hypotheses import Statement
 from sonar_graph.slam.mixture import Watch
 from sonar_graph.slam.sighting import Sighting, SightingFactors
 from sonar_graph.slam.sightlines import Sightline
-from sonar_graph.slam.weighed_history import LEAST_WEIGHT, WeighedHistory
+from sonar_graph.slam.weighed_history import LEAST_WEIGHT, WeighedHistory, earliest
 
 MAKER = SightingFactors(SonarCalibration(elevation_aperture_rad=0.3), lambda noise: noise)
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.4, 0.0), np.array([0.3, 0.0, -0.1]))
@@ -56,6 +57,27 @@ def test_each_watch_counts_by_its_weight_and_the_beginning_of_landmarks_in_full(
     for weights in ([1.0, 1.0, 1.0, 1.0], [0.0, 1.0, 0.3, 0.02], [0.5, 0.25, 0.0, 0.9]):
         expected = said_once + np.maximum(weights, LEAST_WEIGHT) @ alone
         assert weighed.graph(np.array(weights)).error(values) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_watch_of_no_weight_moves_a_landmark_by_micrometres_and_holds_its_own() -> None:
+    rest, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    rest.push_back(gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)))
+    values.insert(X(0), gtsam.Pose3())
+    watches = []
+    for row, (landmark_id, range_m) in enumerate([(7, 3.0), (7, 4.0), (9, 5.0)]):
+        line = Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.0]))
+        watches.append(Watch(Statement({}), [Sighting(row, row, line, NOISE["independent"], None)]))
+        if not values.exists(L(landmark_id)):
+            values.insert(L(landmark_id), np.array([range_m, 0.0, 0.0]))
+    found = solve(WeighedHistory(rest, watches, [7, 7, 9], MAKER).graph(np.array([1.0, 0.0, 0.0])), values)
+    assert np.linalg.norm(found.atPoint3(L(7))) == pytest.approx(3.0, abs=1e-5)
+    assert np.linalg.norm(found.atPoint3(L(9))) == pytest.approx(5.0, abs=1e-5)
+
+
+def test_of_sightings_of_one_frame_the_earliest_is_the_first_in_the_journal() -> None:
+    line = Sightline(X(0), MOUNTED, np.array([3.0, 0.1]))
+    watches = [Watch(Statement({}), [Sighting(100, row, line, NOISE["independent"], None)]) for row in (5, 3, 4)]
+    assert earliest(watches, [7, 7, 7])[7].row == 3
 
 
 @pytest.mark.parametrize("floor", FLOORS)

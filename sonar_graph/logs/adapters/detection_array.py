@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sonar_graph.detection_rules import FIRST_TOO_LARGE_ID
+from sonar_graph.detection_rules import FIRST_TOO_LARGE_ID, ROUNDING
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters.adapter import Adapter
 from sonar_graph.logs.adapters.axes import turn, turn_covariances
@@ -115,10 +115,9 @@ class DetectionArrayAdapter(Adapter):
         return positions, covariances
 
     def _identity(self, topic: Topic, name: str) -> int:
-        if name in self.ids:
-            return self.ids[name]
         try:
-            return min(int(name), FIRST_TOO_LARGE_ID)
+            identity = self.ids[name] if name in self.ids else int(name)
+            return max(-1, min(identity, FIRST_TOO_LARGE_ID))  # what no array of integers holds is refused as well
         except ValueError:
             raise LogError(
                 f"{topic.file}: topic {topic.name}: class {name!r} is no integer identity; say in a log "
@@ -157,7 +156,7 @@ def range_and_azimuth(positions: Floats, covariances: Floats) -> tuple[Floats, F
 def _check_posterior(topic: Topic, scores: Floats) -> None:
     """A posterior over identities adds up to 1 at most; detectors' scores need not."""
     worst = float(np.nanmax(scores.sum(axis=1), initial=0.0))
-    if worst > 1 + 1e-6 or (scores < 0).any():
+    if worst > 1 + ROUNDING or (scores < 0).any():
         raise LogError(
             f"{topic.file}: topic {topic.name}: scores of one detection add up to {worst:g}; the posterior over "
             f"identities must be between 0 and 1 in sum: normalise the scores where the log is made"

@@ -66,6 +66,17 @@ def test_classes_with_names_need_identities(foreign: Any, read: Any) -> None:
     assert found.candidate_ids.tolist() == [[42, 3]]
 
 
+def test_identities_of_more_digits_than_integers_have_are_refused_as_too_large_or_none(foreign: Any, read: Any) -> None:
+    digits = "9" * 30
+    frame = [detection(foreign, (i, 0, 0), [(name, 0.9)]) for i, name in enumerate((f"-{digits}", "3"), start=1)]
+    found = read(foreign.imu(), foreign.dvl(), arrays(foreign, [frame])).detections
+    assert (found.range_m.tolist(), found.candidate_ids.tolist()) == ([2.0], [[3]])
+    for name, toml in ((digits, ""), ("buoy", f'[detections]\nids = {{"buoy" = {digits}}}')):
+        entry = arrays(foreign, [[detection(foreign, (1, 0, 0), [(name, 0.9)])]])
+        with pytest.raises(LogError, match=r"has an identity of 2\^56 or more"):
+            read(foreign.imu(), foreign.dvl(), entry, toml=toml)
+
+
 def test_scores_that_are_no_posterior_are_refused(foreign: Any, read: Any) -> None:
     entry = arrays(foreign, [[detection(foreign, (1, 0, 0), [("1", 0.9), ("2", 0.8)])]])
     with pytest.raises(LogError, match=r"/landmarks: scores of one detection add up to 1\.7"):
