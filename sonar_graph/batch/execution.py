@@ -122,7 +122,13 @@ def _outcome(future: Future[Any]) -> Outcome:
 
 @contextlib.contextmanager
 def _client(where: Where, tasks: int) -> Iterator[Client]:
-    """A client of the scheduler there is, or of a cluster that lives as long as the block."""
+    """A client of the scheduler there is, or of a cluster that lives as long as the block.
+
+    Raises
+    ------
+    BatchError
+        When the scheduler cannot be reached, or no worker can be started here.
+    """
     if where.scheduler is not None:
         client = _connected(where.scheduler)
         try:
@@ -130,14 +136,7 @@ def _client(where: Where, tasks: int) -> Iterator[Client]:
         finally:
             _within_seconds(client.close)
         return
-    cluster = LocalCluster(
-        n_workers=min(where.local_workers, tasks),
-        threads_per_worker=1,
-        processes=True,
-        memory_limit=None,
-        dashboard_address=":0",
-        silence_logs=logging.CRITICAL,
-    )
+    cluster = _local_cluster(min(where.local_workers, tasks))
     client = Client(cluster)
     try:
         yield client
@@ -148,6 +147,23 @@ def _client(where: Where, tasks: int) -> Iterator[Client]:
         for process in workers:
             with contextlib.suppress(psutil.Error):
                 process.kill()
+
+
+def _local_cluster(workers: int) -> LocalCluster:
+    try:
+        return LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            memory_limit=None,
+            dashboard_address=":0",
+            silence_logs=logging.CRITICAL,
+        )
+    except RuntimeError as error:
+        raise BatchError(
+            f"no worker could be started ({error}); a script that runs a batch does so under "
+            '`if __name__ == "__main__":`, since workers import it'
+        ) from error
 
 
 def _worker_processes(cluster: Any) -> list[psutil.Process]:

@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import platform
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -69,7 +70,7 @@ def perform(run: PlannedRun, folder: Path) -> Row:
         When the folder cannot be written: that is no result.
     """
     _check_versions(run)
-    _load(run.estimator)
+    _load(run)
     row = _performed(run, folder)
     _check_source_now(run)
     return row
@@ -109,10 +110,11 @@ def _check_versions(run: PlannedRun) -> None:
         )
 
 
-def _load(estimator: str) -> None:
-    """Import it between the two looks at its source; one that cannot be loaded fails later, with the reason."""
-    with suppress(EstimatorError):
-        load_estimator(estimator)
+def _load(run: PlannedRun) -> None:
+    """Import the estimator between two looks at its source; one that cannot be loaded fails later, with the reason."""
+    if run.versions["estimator_target"].partition(":")[0] not in sys.modules:
+        with suppress(EstimatorError):
+            load_estimator(run.estimator)
 
 
 def _check_source_now(run: PlannedRun) -> None:

@@ -13,6 +13,8 @@ from sonar_graph.batch.file_stamp import Stamp, stamp_of
 
 DIGITS = 16
 BYTECODE = "__pycache__"
+StampedFile = tuple[tuple[str, ...], str, Stamp]
+"""Parts of its name within the package, path, and stamp."""
 
 
 @lru_cache
@@ -32,39 +34,39 @@ def source_hash(package: str) -> str:
 
 def source_hash_now(package: str) -> str:
     """`source_hash` of what is on the disk at this moment; files are read again only where their stamps changed."""
-    files = tuple((name, path, stamp_of(path)) for name, path in _named_files(package) if path.is_file())
+    files = tuple(sorted(_stamped_files(package)))
     return _digest(files) if files else ""
 
 
 @lru_cache(maxsize=8)
-def _digest(files: tuple[tuple[str, Path, Stamp], ...]) -> str:
+def _digest(files: tuple[StampedFile, ...]) -> str:
     digest = hashlib.sha256()
-    for name, path, _ in files:
-        _add(digest, name, path)
+    for parts, path, _ in files:
+        _add(digest, "/".join(parts), Path(path))
     return digest.hexdigest()[:DIGITS]
 
 
-def _named_files(package: str) -> Iterator[tuple[str, Path]]:
-    """Names within the package, in their order, and paths."""
+def _stamped_files(package: str) -> Iterator[StampedFile]:
     spec = find_spec(package)
     if spec is None:
         return
-    folders = [Path(folder) for folder in spec.submodule_search_locations or ()]
+    folders = list(spec.submodule_search_locations or ())
     for folder in folders:
-        for parts in _files(folder):
-            yield "/".join(parts), folder.joinpath(*parts)
-    if not folders and spec.origin is not None and Path(spec.origin).is_file():
-        yield Path(spec.origin).name, Path(spec.origin)
+        yield from _below(folder, ())
+    if not folders and spec.origin is not None and (module := Path(spec.origin)).is_file():
+        yield (module.name,), spec.origin, stamp_of(module)
 
 
-def _files(folder: Path) -> list[tuple[str, ...]]:
-    """Parts of their paths below the folder; without a `Path` for each, since runs wait for this list."""
-    found: list[tuple[str, ...]] = []
-    for place, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if name != BYTECODE and not name.startswith(".")]
-        within = Path(place).relative_to(folder).parts
-        found += [(*within, name) for name in names if not name.startswith(".")]
-    return sorted(found)
+def _below(folder: str, within: tuple[str, ...]) -> Iterator[StampedFile]:
+    """Without a `Path` for each file, since runs wait for this list."""
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.name == BYTECODE or entry.name.startswith("."):
+                continue
+            if entry.is_dir(follow_symlinks=False):
+                yield from _below(entry.path, (*within, entry.name))
+            elif entry.is_file():
+                yield (*within, entry.name), entry.path, stamp_of(entry)
 
 
 def _add(digest: hashlib._Hash, name: str, path: Path) -> None:

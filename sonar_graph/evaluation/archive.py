@@ -5,7 +5,6 @@ Fields of one object share a prefix: ``causal.stamps_ns``, ``causal.positions``,
 
 from __future__ import annotations
 
-import io
 import zipfile
 import zlib
 from dataclasses import MISSING, fields
@@ -26,8 +25,9 @@ Arrays = dict[str, np.ndarray]
 T = TypeVar("T")
 COMPRESSION = 1
 """Of zlib's levels: arrays of numbers hardly get smaller with higher ones, and take twice as long."""
-WORTHWHILE = 0.8
-TRIED_VALUES = 4096
+WORTHWHILE = 0.5
+"""Share of its size that an array must get below; with noise in every digit it stays above, and only costs time."""
+TRIED_VALUES = 512
 KINDS: tuple[Kind, Kind] = ("causal", "smoothed")
 
 
@@ -35,14 +35,13 @@ def write_arrays(path: Path, arrays: Arrays) -> None:
     """Write named arrays, compressed where that makes them smaller, whole or not at all."""
     with replacing(path) as partial, zipfile.ZipFile(partial, "w", compresslevel=COMPRESSION) as archive:
         for name, array in arrays.items():
-            content = io.BytesIO()
-            np.lib.format.write_array(content, array, allow_pickle=False)
-            how = zipfile.ZIP_DEFLATED if _gets_smaller(array) else zipfile.ZIP_STORED
-            archive.writestr(f"{name}.npy", content.getbuffer(), how)
+            archive.compression = zipfile.ZIP_DEFLATED if _gets_smaller(array) else zipfile.ZIP_STORED
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, array, allow_pickle=False)
 
 
 def _gets_smaller(array: np.ndarray) -> bool:
-    """Whether compressing is worth its time, by the array's beginning: with noise in every digit it is not."""
+    """Whether compressing is worth its time, by the array's beginning."""
     beginning = array.ravel()[:TRIED_VALUES].tobytes()
     return len(zlib.compress(beginning, COMPRESSION)) < WORTHWHILE * len(beginning)
 

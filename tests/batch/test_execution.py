@@ -186,3 +186,25 @@ def test_missing_scheduler_is_one_line(write_suite: WriteSuite, tmp_path: Path) 
     assert process.returncode == 2
     assert len(said.splitlines()) == 1
     assert "no Dask scheduler at tcp://127.0.0.1:9" in said
+
+
+def test_a_script_that_workers_cannot_import_is_told_what_to_write(write_suite: WriteSuite, tmp_path: Path) -> None:
+    """Without a guard of its main part each worker would begin the batch again."""
+    script = tmp_path / "script.py"
+    script.write_text(f"""
+from pathlib import Path
+from sonar_graph.batch.batch import Batch, limits_of
+from sonar_graph.batch.execution import Where
+from sonar_graph.batch.suite import read_suite
+from sonar_graph.errors import BatchError
+
+file = read_suite(Path({str(write_suite())!r}))
+with Batch.opened(file, Path({str(tmp_path / "batch")!r})) as batch:
+    try:
+        batch.run(Where(1), limits_of(file, None), lambda *_: None)
+    except BatchError as error:
+        print(error)
+""")
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120)
+    assert "no worker could be started" in done.stdout
+    assert '`if __name__ == "__main__":`' in done.stdout

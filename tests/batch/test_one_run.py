@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,6 @@ from sonar_graph.batch.results import COLUMNS
 from sonar_graph.batch.sources import fingerprint
 from sonar_graph.batch.suite import METRICS
 from sonar_graph.errors import BatchError
-from sonar_graph.estimator import load_estimator
 from sonar_graph.evaluation.comparison import compare
 from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.storage import read_comparison
@@ -171,17 +171,17 @@ def test_other_versions_than_planned_are_no_result(planned: Planned, tmp_path: P
 def test_estimator_that_changes_during_a_run_gives_no_result(
     planned: Planned, misbehaving: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its package imports a module that is changed after the first look at the source, and before the import."""
+    """It is changed after the first look at its source, and before it runs: it may import more of it only then."""
     module = tmp_path / "site" / "misbehaving.py"
     run = planned("prints")
     assert perform(run, tmp_path / "before")["status"] == "failed"
 
-    def changed_and_loaded(name: str) -> object:
+    def changed_and_run(*given: Any, **named: Any) -> object:
         with module.open("a") as file:
             file.write("GAIN = 2\n")
-        return load_estimator(name)
+        return run_estimator(*given, **named)
 
-    monkeypatch.setattr(one_run, "load_estimator", changed_and_loaded)
+    monkeypatch.setattr(one_run, "run_estimator", changed_and_run)
     with pytest.raises(BatchError, match=r"the code changed during a run: estimator_source \w+, planned with "):
         perform(run, tmp_path / "after")
 
@@ -190,6 +190,7 @@ def test_estimator_is_loaded_between_two_looks_at_its_source(
     planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, order = planned(), []
+    monkeypatch.delitem(sys.modules, "baselines.dead_reckoning")
     for name in ("_check_versions", "load_estimator", "run_estimator", "_check_source_now"):
         real = getattr(one_run, name)
 
