@@ -109,3 +109,9 @@ def test_help_names_defaults_presets_and_roles_as_they_are() -> None:
     assert said - {"and", "with", "images", "image"} == others | ImageOptions.model_fields.keys()
     topic = next(option.help for option in commands()["compare",].params if option.name == "topics")
     assert topic.endswith(f" Roles: {', '.join(ROLES)}.")
+
+
+def test_the_package_can_be_run_as_a_module():
+    done = subprocess.run([sys.executable, "-m", "sonar_graph", "--version"], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert sonar_graph.__version__ in done.stdout

@@ -1,0 +1,6 @@
+"""``python -m sonar_graph`` is ``sonar-graph``, for whom its folder is not on the path."""
+
+from sonar_graph.cli import main
+
+if __name__ == "__main__":
+    main()
