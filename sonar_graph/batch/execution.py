@@ -34,10 +34,14 @@ DASK_SETTINGS = {
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": False,
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
     "distributed.admin.tick.limit": "1h",
+    "distributed.admin.system-monitor.interval": "10s",
     "distributed.worker.preload": ["sonar_graph.batch.local_worker"],
 }
-"""One retry for the run of a worker that is killed; memory is that of the runs' own processes, watched there."""
+"""One retry for the run of a worker that is killed; memory is that of the runs' own processes, watched there; and
+Dask's looking at itself, made for many small tasks, is rare: it takes time from the runs."""
 
 
 @dataclass(frozen=True)

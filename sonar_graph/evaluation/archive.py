@@ -6,7 +6,6 @@ Fields of one object share a prefix: ``causal.stamps_ns``, ``causal.positions``,
 from __future__ import annotations
 
 import zipfile
-import zlib
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,27 +22,15 @@ from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Refusal, Refu
 
 Arrays = dict[str, np.ndarray]
 T = TypeVar("T")
-COMPRESSION = 1
-"""Of zlib's levels: arrays of numbers hardly get smaller with higher ones, and take twice as long."""
-WORTHWHILE = 0.5
-"""Share of its size that an array must get below; with noise in every digit it stays above, and only costs time."""
-TRIED_VALUES = 512
 KINDS: tuple[Kind, Kind] = ("causal", "smoothed")
 
 
 def write_arrays(path: Path, arrays: Arrays) -> None:
-    """Write named arrays, compressed where that makes them smaller, whole or not at all."""
-    with replacing(path) as partial, zipfile.ZipFile(partial, "w", compresslevel=COMPRESSION) as archive:
+    """Write named arrays, whole or not at all; not compressed, since noise in every digit hardly gets smaller."""
+    with replacing(path) as partial, zipfile.ZipFile(partial, "w") as archive:
         for name, array in arrays.items():
-            archive.compression = zipfile.ZIP_DEFLATED if _gets_smaller(array) else zipfile.ZIP_STORED
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, array, allow_pickle=False)
-
-
-def _gets_smaller(array: np.ndarray) -> bool:
-    """Whether compressing is worth its time, by the array's beginning."""
-    beginning = array.ravel()[:TRIED_VALUES].tobytes()
-    return len(zlib.compress(beginning, COMPRESSION)) < WORTHWHILE * len(beginning)
 
 
 def read_arrays(path: Path) -> Arrays:
@@ -65,7 +52,7 @@ def sequence_arrays(sequence: Sequence) -> Arrays:
     """Truth and detections, and of IMU and Doppler log the first and last row: what they measured is in the log."""
     ends = np.array([0, -1])
     arrays = _pack("imu", sequence.imu.rows(ends)) | _pack("dvl", sequence.dvl.rows(ends))
-    arrays |= _pack("truth", sequence.truth) | _pack("true_landmarks", sequence.true_landmarks)
+    arrays |= _pack_truth(sequence.truth) | _pack("true_landmarks", sequence.true_landmarks)
     return arrays | _pack("detections", sequence.detections)
 
 
@@ -74,12 +61,28 @@ def restore_sequence(name: str, calibration: Calibration, notes: dict[str, str],
     imu, dvl = _unpack("imu", Imu, arrays), _unpack("dvl", Dvl, arrays)
     if imu is None or dvl is None:
         raise EvaluationError("sequence.npz: the first and last rows of imu and dvl are missing")
-    truth = _unpack("truth", Trajectory, arrays)
+    truth = _unpack_truth(arrays)
     true_landmarks = _unpack("true_landmarks", LandmarkMap, arrays)
     detections = _unpack("detections", LandmarkDetections, arrays)
     return Sequence(
         name, calibration, imu, dvl, detections=detections, truth=truth, true_landmarks=true_landmarks, notes=notes
     )
+
+
+def _pack_truth(truth: Trajectory | None) -> Arrays:
+    """Without covariances where none is known: they would be most of the file."""
+    arrays = _pack("truth", truth)
+    if truth is not None and np.isnan(truth.covariances).all():
+        del arrays["truth.covariances"]
+    return arrays
+
+
+def _unpack_truth(arrays: Arrays) -> Trajectory | None:
+    stamps_ns = arrays.get("truth.stamps_ns")
+    if stamps_ns is None or "truth.covariances" in arrays:
+        return _unpack("truth", Trajectory, arrays)
+    unknown = np.full((len(stamps_ns), 6, 6), np.nan)
+    return _unpack("truth", Trajectory, arrays | {"truth.covariances": unknown})
 
 
 def run_arrays(run: RunResult, errors: dict[Kind, ErrorSeries]) -> Arrays:

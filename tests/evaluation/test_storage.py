@@ -3,7 +3,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +75,26 @@ def test_a_comparison_without_truth_survives(
     assert restored.sequence.truth is None
     assert restored.errors == {}
     assert_same(written.scores, restored.scores)
+
+
+@pytest.mark.parametrize("are_known", [False, True])
+def test_truth_keeps_its_covariances_and_unknown_ones_take_no_space(
+    install: Callable[..., None], make_sequence: Make, offset_estimator: Any, tmp_path: Path, are_known: bool
+) -> None:
+    install(offset=offset_estimator)
+    sequence = make_sequence()
+    assert sequence.truth is not None
+    assert np.isnan(sequence.truth.covariances).all()
+    covariances = sequence.truth.covariances.copy()
+    if are_known:
+        covariances[-1] = np.diag(np.arange(1.0, 7.0))
+    truth = replace(sequence.truth, covariances=covariances)
+    write_comparison(compare(replace(sequence, truth=truth), ["offset"]), tmp_path)
+    restored = read_comparison(tmp_path).sequence.truth
+    assert restored is not None
+    np.testing.assert_array_equal(restored.covariances, covariances)
+    with np.load(tmp_path / "sequence.npz") as archive:
+        assert ("truth.covariances" in archive.files) == are_known
 
 
 def test_json_is_strict_and_tells_units_and_protocol(comparison: Comparison, tmp_path: Path) -> None:
