@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from typing import NamedTuple
 
 import gtsam
@@ -67,6 +68,11 @@ class Trajectory:
     def rotations(self) -> Rotation:
         """world_R_body of every row."""
         return Rotation.from_quat(self.quaternions_xyzw)
+
+    @cached_property
+    def matrices(self) -> Floats:
+        """world_R_body of every row, shape (n, 3, 3); metrics ask for it again and again."""
+        return np.asarray(self.rotations().as_matrix())
 
     def rows(self, selection: slice | Ints) -> Trajectory:
         """The trajectory with only the selected rows."""

@@ -83,7 +83,7 @@ def true_ranges_azimuths(run: Run, stamp_ns: int) -> tuple[Floats, Floats]:
     assert run.true_landmarks is not None
     pose = run.truth.at(np.array([stamp_ns]))
     mounting = run.calibration.sonar.mounting.pose()
-    world_R_body = pose.rotations().as_matrix()[0]
+    world_R_body = pose.matrices[0]
     origin = pose.positions[0] + world_R_body @ mounting.translation()
     q = (run.true_landmarks.positions - origin) @ (world_R_body @ mounting.rotation().matrix())
     return np.linalg.norm(q, axis=1), np.arctan2(q[:, 1], q[:, 0])

@@ -50,7 +50,7 @@ def world_position_covs(trajectory: Trajectory) -> Floats:
 
     To first order ``mean @ Exp([theta, rho])`` has its origin at ``t + R rho``, so the covariance is ``R P_rho R^T``.
     """
-    R = trajectory.rotations().as_matrix()
+    R = trajectory.matrices
     return np.asarray(R @ trajectory.covariances[:, 3:, 3:] @ R.transpose(0, 2, 1))
 
 
@@ -60,7 +60,7 @@ def yaw_variances(trajectory: Trajectory) -> Floats:
     With ``R Exp(theta)`` its derivative is ``[0, R21, R22] / (R00² + R10²)``: a turn about the body's own z moves
     the heading of a level vehicle by as much, of a tilted one by another amount. NaN at a vertical x axis.
     """
-    R = trajectory.rotations().as_matrix()
+    R = trajectory.matrices
     jacobian = np.zeros((len(trajectory), 3))
     with np.errstate(divide="ignore", invalid="ignore"):
         jacobian[:, 1:] = R[:, 2, 1:] / (R[:, 0, 0] ** 2 + R[:, 1, 0] ** 2)[:, None]

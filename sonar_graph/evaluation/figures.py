@@ -216,7 +216,7 @@ def _draw_error(
 
 def _headings(comparison: Comparison, path: Trajectory) -> tuple[Floats, Floats]:
     """Seconds and degrees, with a gap wherever the heading passes ±180°."""
-    degrees = np.degrees(yaw_rad(path.rotations()))
+    degrees = np.degrees(yaw_rad(path.matrices))
     rows = np.union1d(evenly(len(degrees), 2 * SERIES_POINTS), thinned(degrees))
     seconds, degrees = seconds_since_start(comparison, path.stamps_ns)[rows], degrees[rows]
     jumps = np.flatnonzero(np.abs(np.diff(degrees)) > 180) + 1

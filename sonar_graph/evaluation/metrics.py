@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.alignment import align_se3, align_yaw
@@ -30,9 +29,8 @@ def wrapped(angles_rad: Floats) -> Floats:
     return np.asarray((angles_rad + np.pi) % (2 * np.pi) - np.pi)
 
 
-def yaw_rad(rotations: Rotation) -> Floats:
+def yaw_rad(matrices: Floats) -> Floats:
     """Heading of the body's x axis, ``atan2(R[1, 0], R[0, 0])``, shape (n,)."""
-    matrices = rotations.as_matrix()
     return np.asarray(np.arctan2(matrices[:, 1, 0], matrices[:, 0, 0]))
 
 
@@ -63,7 +61,7 @@ def ate_se3_m(estimate: Trajectory, truth: Trajectory) -> float:
 def yaw_errors_rad(estimate: Trajectory, truth: Trajectory) -> Floats:
     """Estimated minus true heading, wrapped, shape (n,)."""
     check_paired(estimate, truth)
-    return wrapped(yaw_rad(estimate.rotations()) - yaw_rad(truth.rotations()))
+    return wrapped(yaw_rad(estimate.matrices) - yaw_rad(truth.matrices))
 
 
 def return_error_m(estimate: Trajectory, truth: Trajectory) -> float:
@@ -159,5 +157,4 @@ def check_paired(estimate: Trajectory, truth: Trajectory) -> None:
 def _body_displacement(trajectory: Trajectory, first: Ints, second: Ints) -> Floats:
     """Position at ``second`` in the body frame at ``first``, shape (k, 3)."""
     step = trajectory.positions[second] - trajectory.positions[first]
-    matrices = trajectory.rotations().as_matrix()[first]
-    return np.asarray(np.einsum("kji,kj->ki", matrices, step))
+    return np.asarray(np.einsum("kji,kj->ki", trajectory.matrices[first], step))

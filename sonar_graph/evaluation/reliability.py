@@ -79,7 +79,7 @@ def true_identities(sequence: Sequence, detections: LandmarkDetections) -> Ints:
     if not len(stamps_ns):
         return labels
     poses = truth.at(stamps_ns)
-    world_R_body, mounting = poses.rotations().as_matrix(), sequence.calibration.sonar.mounting.pose()
+    world_R_body, mounting = poses.matrices, sequence.calibration.sonar.mounting.pose()
     origin = poses.positions + world_R_body @ mounting.translation()
     from_sonar = landmarks.positions[None] - origin[:, None]
     q = np.einsum("nji,nmj->nmi", world_R_body @ mounting.rotation().matrix(), from_sonar)[frame]

@@ -124,7 +124,7 @@ def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgo
 
 def pose_columns(trajectory: Trajectory) -> dict[str, Value]:
     """Columns of a ``PoseWithCovariance`` called ``pose``; a covariance of zeros: unknown."""
-    covariances = body_to_ros(trajectory.covariances, trajectory.rotations().as_matrix())
+    covariances = body_to_ros(trajectory.covariances, trajectory.matrices)
     values = fields("pose.pose.position", "xyz", trajectory.positions)
     values |= fields("pose.pose.orientation", "xyzw", trajectory.quaternions_xyzw)
     return values | {"pose.covariance": covariances.reshape(-1, 36)}

@@ -92,7 +92,7 @@ def landmark_markers(
 def position_ellipsoids(topic: str, trajectory: Trajectory, colour: Colour) -> Outgoing:
     """For each pose whose covariance is known one message: where the position is, as an ellipsoid."""
     known = trajectory.rows(np.flatnonzero(~_unknown(trajectory.covariances[:, 3:, 3:])))
-    world_axes = body_to_ros(known.covariances, known.rotations().as_matrix()) if len(known) else known.covariances
+    world_axes = body_to_ros(known.covariances, known.matrices) if len(known) else known.covariances
     diameters, quaternions = ellipsoids(world_axes[:, :3, :3])
     columns = encoding.header(known.stamps_ns, encoding.WORLD_FRAME, "markers.header")
     columns |= encoding.fields("markers.pose.position", "xyz", known.positions)

@@ -19,6 +19,8 @@ from sonar_graph.states import LandmarkMap, Trajectory
 LANDMARK_COLUMNS = ("id", "x_m", "y_m", "z_m", "cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
 _UPPER = np.triu_indices(3)
 _VALUES = 8
+_LINE = "%s" + " %.17g" * (_VALUES - 1) + "\n"
+"""17 digits: no bit of a double is lost, and they take less than half the time of the fewest digits that keep it."""
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
@@ -30,10 +32,8 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
         When the file cannot be written.
     """
     poses = np.hstack([trajectory.positions, trajectory.quaternions_xyzw]).tolist()
-    lines = [
-        f"{_seconds(stamp_ns)} {' '.join(map(repr, pose))}\n"
-        for stamp_ns, pose in zip(trajectory.stamps_ns.tolist(), poses, strict=True)
-    ]
+    stamps_ns = trajectory.stamps_ns.tolist()
+    lines = [_LINE % (_seconds(stamp_ns), *pose) for stamp_ns, pose in zip(stamps_ns, poses, strict=True)]
     _write(path, "".join(lines))
 
 

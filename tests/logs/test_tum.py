@@ -32,7 +32,7 @@ def test_not_a_nanosecond_nor_a_bit_is_lost(tmp_path_factory: Any, stamps: list[
 def test_the_line_is_the_one_that_tum_describes(tmp_path: Path) -> None:
     pose = Trajectory.without_covariances(np.array([1_700_000_000_000_000_001]), np.array([[1, 2, 3.5]]), np.eye(4)[3:])
     write_tum(tmp_path / "t.tum", pose)
-    assert (tmp_path / "t.tum").read_text() == "1700000000.000000001 1.0 2.0 3.5 0.0 0.0 0.0 1.0\n"
+    assert (tmp_path / "t.tum").read_text() == "1700000000.000000001 1 2 3.5 0 0 0 1\n"
 
 
 def test_evo_reads_the_same_poses(make_sequence: Any, tmp_path: Path) -> None:

@@ -51,7 +51,7 @@ class TruthAdapter(Adapter):
         quaternions = (quaternions / scale[:, None])[rows]
         truth = Trajectory.without_covariances(table.stamps_ns[rows], *self._in_our_axes(positions[rows], quaternions))
         covariances = self._covariances(table)[rows]
-        covariances = ros_to_body(covariances, truth.rotations().as_matrix())
+        covariances = ros_to_body(covariances, truth.matrices)
         return Trajectory(truth.stamps_ns, truth.positions, truth.quaternions_xyzw, covariances), dropped
 
     def _in_our_axes(self, positions: Floats, quaternions: Floats) -> tuple[Floats, Floats]:
