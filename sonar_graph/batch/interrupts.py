@@ -18,7 +18,7 @@ def deferred_interrupt() -> Iterator[None]:
     Raises
     ------
     KeyboardInterrupt
-        At the end of the block, when the signal came meanwhile.
+        At the end of the block, when the signal came meanwhile; an error of the block is its context.
     """
     handler = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(handler):
@@ -30,5 +30,5 @@ def deferred_interrupt() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, handler)
-    if came:
-        handler(*came[0])
+        if came:  # also where the block fails: whoever passes over its error would pass over the interrupt
+            handler(*came[0])

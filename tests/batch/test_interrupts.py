@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import threading
@@ -30,6 +31,21 @@ def test_interrupt_within_the_block_is_told_at_its_end() -> None:
             interrupted_block(steps)
         assert steps == ["went on"]
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def failing_block() -> None:
+    with contextlib.suppress(OSError), deferred_interrupt():
+        interrupt()
+        raise OSError("disk full")
+
+
+def test_interrupt_of_a_block_that_fails_outlives_its_error() -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            failing_block()
     finally:
         signal.signal(signal.SIGINT, before)
 
