@@ -3,11 +3,12 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from sonar_graph.batch.gate import bless, gate, log_ratios
+from sonar_graph.batch.gate import bless, gate, log_ratios, worse_groups
 from sonar_graph.batch.recorded import RecordedBatch
 from sonar_graph.errors import EvaluationError
 
@@ -226,3 +227,95 @@ def test_what_is_no_reference_is_refused(batch, tmp_path):
 def test_a_batch_in_which_all_failed_does_not_pass(batch, reference):
     verdict = gate(replace(batch, runs=[failed(run) for run in batch.runs]), reference)
     assert len(verdict.worsenings) == len(batch.runs)
+
+
+def level(batch: RecordedBatch, column: str, value: float) -> RecordedBatch:
+    """The batch, had a column the same value in every run."""
+    return replace(batch, runs=[replace(run, values=run.values | {column: value}) for run in batch.runs])
+
+
+def test_five_per_cent_fails_and_anything_more_passes():
+    groups = [("basin", "isam2", ATE), ("basin", "ekf-slam", ATE)]
+    family = SimpleNamespace(groups=groups, p_values=np.array([0.05, np.nextafter(0.05, 1)]))
+    (worse,) = worse_groups({group: {0: 1.0} for group in groups}, [family])
+    assert worse.contestant == "isam2"
+
+
+def test_an_error_of_nothing_has_a_ratio():
+    ratios = log_ratios(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), ATE)
+    assert np.isfinite(ratios).all()
+    assert ratios[0] == 0
+    assert ratios[1] < 0 < ratios[2]
+
+
+def test_equal_numbers_are_told_once(batch, tmp_path):
+    smoothed = "smoothed.ate_se2_m"
+    filters = replace(batch, runs=[replace(r, values=r.values | {smoothed: r.values[ATE]}) for r in batch.runs])
+    bless(filters, tmp_path / "filters.json")
+    worse = changed(changed(filters, "isam2", ATE, 1.5), "isam2", smoothed, 1.5)
+    found = [(one.log, one.column) for one in gate(worse, tmp_path / "filters.json").worsenings]
+    assert len(found) == len(set(found)) == 3
+
+
+@pytest.mark.parametrize(("seeds", "has_test"), [(2, False), (3, True)])
+def test_three_cases_have_a_test_and_two_are_neither_tested_nor_unmoved(tmp_path, seeds, has_test):
+    batch = drawn_batch(seeds)
+    bless(batch, tmp_path / "reference.json")
+    verdict = gate(batch, tmp_path / "reference.json")
+    assert verdict.untested == ([] if has_test else batch.contestants)
+    assert verdict.unmoved == (batch.contestants if has_test else [])
+
+
+def test_a_score_that_the_reference_lacks_is_not_judged(batch, tmp_path):
+    runs = [replace(run, values={k: v for k, v in run.values.items() if k != ATE}) for run in batch.runs]
+    lacking = replace(batch, runs=runs)
+    bless(lacking, tmp_path / "reference.json")
+    verdict = gate(batch, tmp_path / "reference.json")
+    assert verdict.passed
+    assert not verdict.look_at
+
+
+def test_a_run_that_did_not_end_leaves_no_score_in_a_reference(batch, tmp_path):
+    ended_late = [replace(batch.runs[0], status="timeout"), *batch.runs[1:]]
+    bless(replace(batch, runs=ended_late), tmp_path / "reference.json")
+    content = json.loads((tmp_path / "reference.json").read_text())
+    assert content["runs"][0]["scores"] == {}
+    assert content["versions"] == batch.runs[0].texts
+
+
+def test_a_run_is_held_against_the_worst_of_its_group_and_not_against_itself(batch, tmp_path):
+    even = level(batch, ATE, 0.5)
+    hard = changed(even, "isam2", ATE, np.where(np.arange(24) == 3, 4.0, 1.0))
+    bless(hard, tmp_path / "reference.json")
+    other = changed(even, "isam2", ATE, np.where(np.arange(24) == 7, 6.0, 1.0))
+    assert not gate(other, tmp_path / "reference.json").look_at
+    bless(even, tmp_path / "even.json")
+    assert len(gate(other, tmp_path / "even.json").look_at) == 1
+
+
+def test_the_farthest_run_is_told_first_and_by_its_farthest_column(batch, tmp_path):
+    yaw = "causal.yaw_rmse_rad"
+    even = level(level(batch, ATE, 0.5), yaw, 0.01)
+    bless(even, tmp_path / "reference.json")
+    factors = np.where(np.arange(24) == 2, 3.0, np.where(np.arange(24) == 9, 8.0, 1.0))
+    far = changed(changed(even, "isam2", ATE, factors), "isam2", yaw, factors**2)
+    assert [line.split(" is ")[0] for line in gate(far, tmp_path / "reference.json").look_at] == [
+        f"{LOGS[0]}, isam2, seed 9: {yaw}",
+        f"{LOGS[0]}, isam2, seed 2: {yaw}",
+    ]
+
+
+def test_a_covariance_that_is_far_off_is_no_error_that_stands_out(batch, reference):
+    factors = np.where(np.arange(24) == 7, 50.0, 1.0)
+    assert not gate(changed(batch, "isam2", "causal.nees_position", factors), reference).look_at
+
+
+def test_without_a_test_a_log_is_told_once_by_what_is_up_most(tmp_path):
+    yaw = "causal.yaw_rmse_rad"
+    batch = drawn_batch(2, logs=LOGS[:1])
+    bless(batch, tmp_path / "reference.json")
+    for first, second in ((1.3, 1.5), (1.5, 1.3)):
+        up = changed(changed(batch, "isam2", ATE, first), "isam2", yaw, second)
+        (line,) = gate(up, tmp_path / "reference.json").look_at
+        assert line.startswith(f"{LOGS[0]}, isam2: {ATE if first > second else yaw} is 50% worse")
+    assert len(gate(changed(batch, "isam2", ATE, [1.0, 9.0]), tmp_path / "reference.json").look_at) == 1

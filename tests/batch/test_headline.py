@@ -13,7 +13,8 @@ from sonar_graph.batch.catalogue import metrics_of
 from sonar_graph.batch.exported import as_csv, as_latex
 from sonar_graph.batch.headline import DIFFERENT, HIGHER, LOWER, head_metric, headlines, mark_of, overview_table
 from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
-from sonar_graph.batch.statistics import paired
+from sonar_graph.batch.rounding import quantile_text
+from sonar_graph.batch.statistics import paired, quantile_error
 from sonar_graph.batch.tables import Cell, Table
 
 from .recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, with_failures
@@ -161,3 +162,25 @@ def test_latex_has_arrows_as_commands(arrow):
     text = as_latex(overview_of(drawn_batch()))
     assert arrow in text
     assert LOWER not in text
+
+
+def test_what_is_no_error_is_no_head():
+    assert head_metric(drawn_batch(1), metrics_of(["causal.nees_position"])) is None
+    assert head_metric(drawn_batch(1), metrics_of(["causal.nees_position", "causal.ate_se2_m"])).name == ATE.name
+
+
+def test_logs_are_counted_only_where_somebody_is_told_apart():
+    batch, rng = drawn_batch(), np.random.default_rng(16)
+    runs = [replace(run, values=run.values | {"smoothed.ate_se2_m": rng.lognormal()}) for run in batch.runs]
+    batch = replace(batch, runs=runs)
+    causal, smoothed = headlines(batch, ATE, all_tests(batch, [ATE]))
+    assert causal.startswith("Causal error beside that of dead-reckoning (on how many of 2 logs): lower with")
+    assert smoothed == "Smoothed error beside that of dead-reckoning: never told apart: isam2, ekf-slam."
+
+
+def test_an_angle_has_the_digits_of_its_error_in_degrees():
+    batch, yaw = drawn_batch(), metrics_of(["causal.yaw_rmse_rad"])[0]
+    values = batch.values(LOGS[0], "isam2", "causal.yaw_rmse_rad")
+    expected = quantile_text(math.degrees(np.median(values)), math.degrees(quantile_error(values, 0.5)))
+    cell = cell_of(overview_table(batch, yaw, {}), LOGS[0], "Causal", "isam2")
+    assert cell.text == expected

@@ -125,3 +125,13 @@ def test_an_incomplete_batch_is_no_reference_and_passes_no_gate(incomplete: Reco
     extended = with_missing(drawn_batch(10), "isam2", LOGS[0], 1)
     with pytest.raises(EvaluationError, match="1 of 60 runs has not been done"):
         gate(extended, reference)
+
+
+@pytest.mark.parametrize(("count", "named"), [(3, "log 0; log 1; log 2."), (5, "log 0; log 1; log 2 and 2 more.")])
+def test_the_warning_names_three_logs_and_counts_the_others(count: int, named: str) -> None:
+    logs = tuple(f"log {place}" for place in range(count))
+    batch = drawn_batch(2, logs=logs)
+    for log in logs:
+        batch = with_missing(batch, "isam2", log, 1)
+    (told,) = missing_told(batch)
+    assert f", on {named} All numbers" in told

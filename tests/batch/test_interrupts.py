@@ -65,3 +65,20 @@ def test_block_without_interrupt_and_in_another_thread_is_as_without() -> None:
         done.append(True)
     assert done == [True, True]
     assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_error_within_the_block_gives_the_handler_back() -> None:
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(OSError, match="full"), deferred_interrupt():
+        raise OSError("full")
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_interrupt_that_is_ignored_stays_so() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with deferred_interrupt():
+            interrupt()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)

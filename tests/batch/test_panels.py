@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from sonar_graph.batch.panels import WIDTH_IN, folded, log_panels
+from sonar_graph.batch.panels import WIDTH_IN, folded, log_panels, spread_out
+from sonar_graph.evaluation.figure_style import colour
 
 from .recorded_batches import drawn_batch
 
@@ -32,3 +33,29 @@ def test_folding_loses_no_letter(name: str) -> None:
     lines = folded(name, 18).split("\n")
     assert "".join(lines).replace(" ", "") == name.replace(" ", "")
     assert all(len(line) <= 18 or not any(sign in line[:-1] for sign in "/=,") for line in lines)
+
+
+def test_the_first_contestant_is_on_top_and_each_has_its_colour() -> None:
+    batch = drawn_batch(1)
+    _, panels = log_panels(batch, batch.logs, "")
+    bottom, top = panels[0].get_ylim()
+    assert top < 0 < len(batch.contestants) - 1 < bottom
+    colours = [label.get_color() for label in panels[0].get_yticklabels()]
+    assert colours == [colour(place) for place in range(len(batch.contestants))]
+    assert len(set(colours)) == len(colours)
+
+
+def test_headings_are_folded_over_small_panels_alone() -> None:
+    names = tuple(f"tracks, wrong_id_rate=0.0{index}" for index in range(3))
+    batch = drawn_batch(1, logs=names)
+    for logs in (names[:2], names):
+        _, panels = log_panels(batch, list(logs), "")
+        assert ["\n" in panel.get_title(loc="left") for panel in panels] == [len(logs) > 2] * len(logs)
+
+
+def test_a_spread_out_scale_has_numbers_at_one_two_and_five() -> None:
+    _, (panel, *_) = log_panels(drawn_batch(1), ["basin"], "")
+    spread_out(panel)
+    panel.set_xlim(0.9, 11)
+    shown = [place for place in panel.xaxis.get_majorticklocs() if 0.9 < place < 11]
+    assert shown == pytest.approx([1, 2, 5, 10])

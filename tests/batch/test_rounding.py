@@ -91,3 +91,12 @@ def test_what_is_infinite_is_no_number():
     assert supported(math.inf, 0.1) == "no value"
     assert between(0.1, math.inf) == "0.100 to no value"
     assert between(math.nan, math.nan) == "\N{EN DASH}"
+
+
+def test_an_error_of_zero_is_none_that_is_known():
+    assert supported(0.123456, 0.0) == quantile_text(0.123456, 0.0) == with_error(0.123456, 0.0) == "0.123"
+
+
+def test_two_bounds_are_rounded_alike_and_one_alone_is_a_dash():
+    assert between(0.123456, 0.987654, 0.03) == "0.12 to 0.99"
+    assert between(0.1, math.nan) == between(math.nan, 0.1) == "\N{EN DASH}"

@@ -252,3 +252,45 @@ def test_anees_is_not_of_survivors_and_has_no_band_without_its_degrees_of_freedo
     assert math.isnan(anees(np.array([1.0, INF]), 2).mean)
     assert anees(np.array([1.0, INF]), 2).verdict == ""
     assert anees(np.array([9.0, 9.0]), math.nan).verdict == ""
+
+
+@pytest.mark.parametrize("far", [1e3, -1e6])
+def test_the_interval_moves_with_the_differences_however_far(far):
+    values = np.random.default_rng(14).exponential(0.1, 12)
+    moved = np.array(mean_interval(values + far)) - far
+    assert moved == pytest.approx(mean_interval(values), abs=1e-6)
+
+
+@pytest.mark.parametrize("pairs", [6, 7, 10, 49])
+def test_the_interval_of_equal_differences_is_a_point_where_their_mean_is_rounded(pairs):
+    low, high = mean_interval(np.full(pairs, 0.1))
+    assert low == high == pytest.approx(0.1)
+
+
+def test_five_values_may_agree_by_chance_and_six_do_not():
+    alike = np.tile([10.54003, 10.54024], 3)
+    for values in (alike, -alike):
+        five, six = paired(values[:5], np.zeros(5)), paired(values, np.zeros(6))
+        assert five.rounding_error == pytest.approx(0.105, abs=1e-3)
+        assert five.median_error == pytest.approx(0.105, abs=1e-3)
+        assert six.rounding_error == pytest.approx(stats.sem(alike))
+        assert six.median_error < 1e-3
+
+
+def test_a_seed_that_failed_on_one_of_its_logs_is_without_a_value():
+    told = paired(np.array([1.0, INF, 2.0, 3.0]), np.zeros(4), [0, 0, 1, 1])
+    assert (told.pairs, told.without) == (2, 1)
+    assert math.isnan(told.mean)
+
+
+def test_each_quantile_has_the_error_of_its_own():
+    values = np.random.default_rng(15).lognormal(0, 1, 30)
+    told = summarise(values)
+    assert told.low_error == quantile_error(values, 0.1) != told.high_error
+    assert told.high_error == quantile_error(values, 0.9) != told.median_error
+
+
+def test_a_quantile_beside_runs_that_only_the_reference_lost_is_infinite_to_the_other_side():
+    assert quantile(np.array([-INF, 1.0]), 0.5) == -INF
+    assert quantile(np.array([-INF, -INF, 1.0, 2.0]), 0.5) == -INF
+    assert quantile(np.array([-INF, 1.0, 2.0]), 0.5) == 1.0

@@ -9,7 +9,7 @@ from scipy import stats
 
 from sonar_graph.batch.gate import movable, worse_groups
 from sonar_graph.batch.recorded import ALL_LOGS
-from sonar_graph.batch.worsening_tests import Family, clipped, families, with_all_logs
+from sonar_graph.batch.worsening_tests import ALL_SIGNS, DRAWN, Family, clipped, families, with_all_logs
 
 
 def family(beyond: np.ndarray) -> Family:
@@ -94,3 +94,33 @@ def test_another_draw_of_the_same_fails_in_no_more_than_five_per_cent(seeds, los
 @pytest.mark.parametrize(("seeds", "least"), [(3, 0.6), (5, 0.8), (8, 0.95)])
 def test_half_as_large_again_is_found_with_few_seeds(seeds, least):
     assert share_of_failures(seeds, lost=0.0, worse=0.5, batches=60) >= least
+
+
+def test_the_statistic_is_students_with_a_variance_that_like_groups_support():
+    beyond = np.random.default_rng(3).normal(0.1, 0.2, (6, 4))
+    groups = [("a", "isam2", "error"), ("b", "isam2", "error"), (ALL_LOGS, "isam2", "error"), ("a", "isam2", "other")]
+    scored = clipped(beyond)
+    squares = (scored**2).mean(axis=0)
+    supporting = np.array([math.sqrt(squares[0] * squares[1])] * 2 + [squares[2], squares[3]])
+    mean = scored.mean(axis=0)
+    spread = (2.0 * supporting + ((scored - mean) ** 2).sum(axis=0)) / (2.0 + 6 - 1)
+    assert Family(groups, beyond, 1.0).statistics[0] == pytest.approx(math.sqrt(6) * mean / np.sqrt(spread))
+
+
+def test_the_least_p_value_is_one_of_all_changes_of_sign_and_of_those_that_are_drawn():
+    up = np.linspace(1.0, 2.0, ALL_SIGNS + 1)[:, None]
+    assert family(up[:-1]).p_values[0] == 2.0**-10
+    many = np.linspace(1.0, 2.0, 30)[:, None]
+    assert family(many).p_values[0] == 1 / (DRAWN + 1) == 1 / 2000
+
+
+def test_no_p_value_is_above_one():
+    down = np.array([[-0.3], [-0.1], [-0.5], [-0.2], [-0.3], [-0.35]])
+    assert Family(family(down).groups, down, 0.25).p_values.tolist() == [1.0]
+
+
+def test_groups_of_three_cases_are_rotated_with_those_that_have_the_same():
+    alike = {("a", name, "error"): dict.fromkeys((0, 1, 2), 0.1) for name in ("isam2", "other")}
+    found = families(alike | {("a", "ekf-slam", "error"): dict.fromkeys((2, 3, 4), 0.1)})
+    assert [(len(one.groups), one.cases, one.share) for one in found] == [(2, 3, 0.5), (1, 3, 0.5)]
+    assert not any(np.isnan(one.beyond).any() for one in found)
