@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from difflib import SequenceMatcher
 from functools import partial
 from types import UnionType
@@ -56,6 +56,8 @@ def _describe(error: ErrorDetails, model: type[BaseModel]) -> str:
         return unknown_field(place, model)
     if error["type"] == "missing":
         return f"{_path(place)}: is missing"
+    if error["type"] in ("list_type", "tuple_type") and isinstance(error["input"], dict):
+        return f"{_path(place)}: expected a list of tables, [[{_path(place)}]] in TOML, not one table"
     if error["type"] == "too_long" and not isinstance(error["input"], str):
         return f"{_path(place)}: expected {error['ctx']['max_length']} values, not {_shown(error['input'])}"
     message = error["msg"].removeprefix("Value error, ")
@@ -66,10 +68,16 @@ def unknown_field(place: Place, model: type[BaseModel]) -> str:
     """That a field does not exist, which one may be meant, and which its section has."""
     section = section_at(model, place[:-1])
     names = list(section.model_fields) if section else []
-    similar = max(names, key=partial(_similarity, str(place[-1])), default="")
-    is_meant = _similarity(str(place[-1]), similar) >= _LEAST_SIMILARITY
+    return f"{_path(place)}: there is no such field{choice(str(place[-1]), names, _path(place[:-1]) or 'it')}"
+
+
+def choice(name: str, known: Iterable[str], owner: str = "") -> str:
+    """After a name that does not exist: which one may be meant, and all that its owner has, or that there are."""
+    names = list(known)
+    similar = max(names, key=partial(_similarity, name), default="")
+    is_meant = _similarity(name, similar) >= _LEAST_SIMILARITY
     suggestion = f"; did you mean {similar}?" if is_meant else ";"
-    return f"{_path(place)}: there is no such field{suggestion} {_path(place[:-1]) or 'it'} has: {', '.join(names)}"
+    return f"{suggestion} {f'{owner} has' if owner else 'there are'}: {', '.join(names) or 'none'}"
 
 
 def _similarity(name: str, known: str) -> float:

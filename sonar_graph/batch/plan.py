@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 import sonar_graph
 from sonar_graph.batch.planned import PlannedRun
+from sonar_graph.batch.recorded import ALL_LOGS
 from sonar_graph.batch.source_hash import source_hash, source_hash_now
 from sonar_graph.batch.sources import FILE, FILES, GENERATORS, KINDS, LOG, fingerprint
 from sonar_graph.batch.suite import EstimatorEntry, LogEntry, SuiteFile
@@ -32,6 +33,7 @@ DEFAULT_VARIANT = "default"
 
 @dataclass(frozen=True)
 class _Source:
+    place: Place
     entry: LogEntry
     name: str
     options: dict[str, Any]
@@ -42,6 +44,7 @@ class _Source:
 
 @dataclass(frozen=True)
 class _Contestant:
+    place: Place
     name: str
     variant: str
     overrides: dict[str, Any]
@@ -57,16 +60,16 @@ def plan_runs(file: SuiteFile) -> list[PlannedRun]:
         When the suite names what does not exist or does not fit, or one run twice.
     """
     contestants = [c for n, entry in enumerate(file.suite.estimators) for c in _contestants(file, n, entry)]
+    _check_contestants_once(file, contestants)
     _check_reference(file, contestants)
     sources = [s for n, entry in enumerate(file.suite.logs) for s in _sources(file, n, entry)]
-    runs = [
+    _check_sources_once(file, sources)
+    return [
         _planned(file, source, seed, contestant)
         for source in sources
         for seed in source.entry.seed_list()
         for contestant in contestants
     ]
-    _check_once(file, runs)
-    return runs
 
 
 @lru_cache
@@ -130,7 +133,7 @@ def _sources(file: SuiteFile, number: int, entry: LogEntry) -> Iterator[_Source]
             file.refuse((*place, "log" if entry.log is not None else "options"), str(error))
         plain = options.model_dump(mode="json", exclude={"seed"})
         stated = {name: value for name, value in values.items() if name not in FILES}
-        yield _Source(entry, _label(entry.name, chosen), plain, fingerprint(entry.kind, plain), stated)
+        yield _Source(place, entry, _label(entry.name, chosen), plain, fingerprint(entry.kind, plain), stated)
 
 
 def _check_source(file: SuiteFile, place: Place, entry: LogEntry) -> None:
@@ -161,7 +164,7 @@ def _contestants(file: SuiteFile, number: int, entry: EstimatorEntry) -> Iterato
         given = values = entry.params | chosen
         if params is not None:
             values = _checked(file, place, chosen, params, given, "params").model_dump(mode="json")
-        yield _Contestant(entry.name, _label(entry.variant, chosen) or DEFAULT_VARIANT, given, values)
+        yield _Contestant(place, entry.name, _label(entry.variant, chosen) or DEFAULT_VARIANT, given, values)
 
 
 def _combinations(
@@ -172,6 +175,10 @@ def _combinations(
             file.refuse((*place, "grid", name), f"is also in {table}; give it in one of them")
         if not values:
             file.refuse((*place, "grid", name), "has no values; give at least one")
+        texts = [json.dumps(value, default=str) for value in values]
+        if len(set(texts)) < len(texts):
+            twice = next(text for text in texts if texts.count(text) > 1)
+            file.refuse((*place, "grid", name), f"has {twice} more than once; leave one out")
     for chosen in itertools.product(*grid.values()):
         yield dict(zip(grid, chosen, strict=True))
 
@@ -251,19 +258,30 @@ def _check_reference(file: SuiteFile, contestants: list[_Contestant]) -> None:
         file.refuse(("reference",), f"{file.suite.reference!r} does not run here; what does: {', '.join(texts)}")
 
 
-def _check_once(file: SuiteFile, runs: list[PlannedRun]) -> None:
-    """Refuse one run under two names, and two runs under one name."""
-    by_key: dict[str, PlannedRun] = {}
-    by_name: dict[tuple[Any, ...], PlannedRun] = {}
-    for run in runs:
-        name = (run.log, run.seed, run.estimator, run.variant)
-        twin = by_key.setdefault(run.key, run)
-        if by_name.setdefault(name, run) is not run:
-            file.refuse(("logs",), f"two runs are called {_told(run)}; give logs and variants names that differ")
-        if twin is not run:
-            file.refuse(("logs",), f"{_told(run)} and {_told(twin)} are the same run; leave one out")
+def _check_contestants_once(file: SuiteFile, contestants: list[_Contestant]) -> None:
+    """Refuse two contestants of one name, and one under two names."""
+    by_name: dict[str, _Contestant] = {}
+    by_settings: dict[str, str] = {}
+    for contestant in contestants:
+        name = f"{contestant.name}/{contestant.variant}"
+        if by_name.setdefault(name, contestant) is not contestant:
+            file.refuse(contestant.place, f"{name} is there twice; give variants names that differ, or leave one out")
+        settings = json.dumps([contestant.name, contestant.params], sort_keys=True, default=str)
+        if (twin := by_settings.setdefault(settings, name)) != name:
+            file.refuse(contestant.place, f"{name} and {twin} have the same settings; leave one out")
 
 
-def _told(run: PlannedRun) -> str:
-    seed = "" if run.seed is None else f", seed {run.seed}"
-    return f"{run.log!r}{seed}, {run.estimator}/{run.variant}"
+def _check_sources_once(file: SuiteFile, sources: list[_Source]) -> None:
+    """Refuse two logs of one name, and one log, with the same seed, under two names."""
+    by_name: dict[str, _Source] = {}
+    by_content: dict[str, str] = {}
+    for source in sources:
+        if source.name == ALL_LOGS:
+            file.refuse((*source.place, "name"), f"{ALL_LOGS!r} stands for all logs together; give another name")
+        if by_name.setdefault(source.name, source) is not source:
+            file.refuse(source.place, f"two logs are called {source.name!r}; give them names that differ")
+        for seed in source.entry.seed_list():
+            content = json.dumps([source.content, source.entry.landmarks, seed], sort_keys=True, default=str)
+            if (twin := by_content.setdefault(content, source.name)) != source.name:
+                which = "" if seed is None else f" with seed {seed}"
+                file.refuse(source.place, f"{source.name!r} and {twin!r} are the same{which}; leave one out")

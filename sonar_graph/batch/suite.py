@@ -30,12 +30,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from sonar_graph.batch.toml_lines import Place, line_of
 from sonar_graph.calibration import Section
 from sonar_graph.errors import BatchError
-from sonar_graph.validation import faults_in
+from sonar_graph.validation import choice, faults_in
 
 DATA_VARIABLE = "SONAR_GRAPH_DATA"
 """Environment variable with the folder in which data sets are looked for that do not lie beside the suite."""
@@ -60,6 +60,9 @@ METRICS = (
     "memory.peak_mb",
 )
 """Every key that a score can have."""
+MOST_SEEDS = 1_000_000
+LARGEST_SEED = 2**63 - 1
+"""That a column of the results can hold."""
 
 
 class LogEntry(Section):
@@ -80,6 +83,19 @@ class LogEntry(Section):
     """Of a generator, or of ``landmarks``: so many from 0 on, or these."""
     landmarks: dict[str, Any] | None = None
     """Options of landmarks that are simulated on a recorded log."""
+
+    @field_validator("seeds", mode="before")
+    @classmethod
+    def _check_seeds(cls, value: Any) -> Any:
+        seeds = value if isinstance(value, list) else [value] if value is not None else []
+        largest = LARGEST_SEED if isinstance(value, list) else MOST_SEEDS
+        are_numbers = all(type(seed) is int and 0 <= seed <= largest for seed in seeds)
+        if not are_numbers or len(set(seeds)) < len(seeds):
+            raise ValueError(
+                f"expected the number of seeds, up to {MOST_SEEDS}, or a list of different whole numbers from 0 to "
+                f"{LARGEST_SEED}"
+            )
+        return value
 
     @model_validator(mode="after")
     def _check(self) -> LogEntry:
@@ -125,7 +141,7 @@ class Suite(Section):
     """How often every estimator is asked for its estimate."""
     reference: str
     """Estimator with which the others are compared: its name, or ``name/variant``."""
-    metrics: tuple[str, ...] = DEFAULT_METRICS
+    metrics: tuple[str, ...] = Field(DEFAULT_METRICS, min_length=1)
     """Keys of the scores that are compared; all are recorded."""
     timeout_s: float = Field(3600.0, gt=0)
     """A run that takes longer is ended."""
@@ -192,7 +208,7 @@ def read_suite(path: Path) -> SuiteFile:
     found = SuiteFile(path, text, suite)
     for number, metric in enumerate(suite.metrics):
         if metric not in METRICS:
-            found.refuse(("metrics", number), f"there is no score {metric!r}; there are: {', '.join(METRICS)}")
+            found.refuse(("metrics", number), f"there is no score {metric!r}{choice(metric, METRICS)}")
     return found
 
 

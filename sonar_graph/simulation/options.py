@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.simulation.presets import DvlName, ImuName
@@ -10,6 +10,8 @@ from sonar_graph.simulation.presets import DvlName, ImuName
 
 class SimulationOptions(Section):
     """Sensors and their faults, and how often the landmark recogniser is right."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
 
     seed: int = Field(0, ge=0)
     """Of everything random; equal options give equal bits."""

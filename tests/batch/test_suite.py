@@ -19,6 +19,10 @@ def line(text: str, word: str) -> int:
     return next(number for number, content in enumerate(text.splitlines(), 1) if word in content)
 
 
+def second(entry: str) -> str:
+    return entry.replace("]]", "]]  # second", 1)
+
+
 @pytest.mark.parametrize(
     ("text", "at", "words"),
     [
@@ -55,11 +59,42 @@ def line(text: str, word: str) -> int:
         (HEADER + BASIN + DEAD_RECKONING + ISAM2 + "[estimators.grid]\n\nlag_s = [1, -1]\n", "lag_s", "grid.lag_s"),
         (HEADER + BASIN + ISAM2, "reference", "'dead-reckoning' does not run here; what does: isam2"),
         (HEADER + 'metrics = ["ate"]\n' + BASIN + DEAD_RECKONING, "metrics", "there is no score 'ate'"),
-        (HEADER + BASIN + BASIN + DEAD_RECKONING, "[[logs]]", "two runs are called"),
+        (HEADER + BASIN + second(BASIN) + DEAD_RECKONING, "# second", "logs.1: two logs are called 'basin'"),
         (
-            HEADER + BASIN + BASIN.replace('"basin"\ngen', '"pool"\ngen') + DEAD_RECKONING,
-            "[[logs]]",
-            "are the same run",
+            HEADER + BASIN + second(BASIN.replace('"basin"\ngen', '"pool"\ngen')) + DEAD_RECKONING,
+            "# second",
+            "logs.1: 'pool' and 'basin' are the same with seed 0",
+        ),
+        (
+            HEADER + BASIN + DEAD_RECKONING + second(DEAD_RECKONING),
+            "# second",
+            "estimators.1: dead-reckoning/default is there twice",
+        ),
+        (
+            HEADER + BASIN + DEAD_RECKONING + ISAM2 + second(ISAM2) + 'variant = "again"\n',
+            "# second",
+            "estimators.2: isam2/again and isam2/default have the same settings",
+        ),
+        (HEADER + BASIN + "seeds = [1, 1]\n" + DEAD_RECKONING, "seeds", "list of different whole numbers"),
+        (HEADER + BASIN + "seeds = [-1]\n" + DEAD_RECKONING, "seeds", "logs.0.seeds: expected the number of seeds"),
+        (HEADER + BASIN + "seeds = [9223372036854775808]\n" + DEAD_RECKONING, "seeds", "to 9223372036854775807"),
+        (HEADER + BASIN + "seeds = 1000001\n" + DEAD_RECKONING, "seeds", "up to 1000000"),
+        (HEADER + BASIN + "seeds = true\n" + DEAD_RECKONING, "seeds", "not True"),
+        (HEADER + BASIN + 'seeds = "2"\n' + DEAD_RECKONING, "seeds", "not '2'"),
+        (HEADER + BASIN.replace("120", "inf") + DEAD_RECKONING, "options", "options.duration_s"),
+        (HEADER + BASIN + "grid = { wrong_id_rate = [0.1, 0.1] }\n" + DEAD_RECKONING, "grid", "has 0.1 more than once"),
+        (
+            HEADER + BASIN.replace("[[logs]]", "[logs]") + DEAD_RECKONING,
+            "[logs]",
+            "expected a list of tables, [[logs]]",
+        ),
+        (HEADER + BASIN.replace('"basin"\ngen', '"all logs"\ngen') + DEAD_RECKONING, "all logs", "stands for all logs"),
+        (HEADER + BASIN + DEAD_RECKONING + "params = { lag = 3 }\n", "lag = 3", "it has: none"),
+        (HEADER + "metrics = []\n" + BASIN + DEAD_RECKONING, "metrics", "metrics"),
+        (
+            HEADER + 'metrics = ["causal.ate_se3"]\n' + BASIN + DEAD_RECKONING,
+            "metrics",
+            "did you mean causal.ate_se3_m?",
         ),
         (HEADER + '[[logs]]\nname = "a"\nlog = "no.mcap"\n' + DEAD_RECKONING, "no.mcap", "no.mcap is not in"),
         (
