@@ -61,7 +61,7 @@ class Verdict:
 
     worsenings: list[Worsening]
     look_at: list[str]
-    """What no test can judge: single runs, and contestants with fewer than 3 cases. Nothing of it fails a batch."""
+    """What no test can judge: single runs, and logs with too few cases. Nothing of it fails a batch."""
     compared: int
     """Pairs of runs."""
     cases: dict[str, int]

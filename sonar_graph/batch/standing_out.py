@@ -1,4 +1,4 @@
-"""What a person should look at, because no test can judge it: single runs, and contestants with hardly any cases.
+"""What a person should look at, because no test can judge it: single runs, and logs with hardly any cases.
 
 Of two draws from one distribution the second has the worst run as often as the first, however far off it is. So none of
 this fails a batch. Where runs are deterministic and only the code changed, it is a finding all the same.
@@ -13,12 +13,12 @@ import numpy as np
 
 from sonar_graph.batch.blessed import name_of, told
 from sonar_graph.batch.recorded import ALL_LOGS, RecordedRun
-from sonar_graph.batch.worsening_tests import LEAST_CASES, Case, Group, Ratios
+from sonar_graph.batch.worsening_tests import Group, Ratios, testable
 
 FAR = 2.0
 """An error so many times the worst that the reference has of a contestant on a log stands out."""
 ALONE = 0.25
-"""With too few cases for a test, a worsening by more than this share is told."""
+"""Where there is no test, a worsening by more than this share is told."""
 
 
 @dataclass(frozen=True)
@@ -59,17 +59,16 @@ def _far_runs(pairs: list[Pair]) -> list[Pair]:
 
 
 def _untested(ratios: Ratios, known: set[tuple[str, str]]) -> list[str]:
-    """Contestants and logs that are up without a test, each with the column that is up most."""
-    cases: dict[tuple[str, str], set[Case]] = {}
-    for (_, contestant, column), own in ratios.items():
-        cases.setdefault((contestant, column), set()).update(own)
-    most: dict[tuple[str, str], tuple[float, str]] = {}
+    """Contestants and logs that are up without a test of their own, each with the column that is up most."""
+    have_test = testable(ratios)
+    most: dict[tuple[str, str], tuple[float, int, str]] = {}
     for (log, contestant, column), own in ratios.items():
-        is_told = log == ALL_LOGS or (log, contestant) in known or len(cases[contestant, column]) >= LEAST_CASES
+        is_told = log == ALL_LOGS or (log, contestant) in known or (log, contestant, column) in have_test
         mean = float(np.mean(list(own.values())))
         if not is_told and mean > np.log1p(ALONE):
-            most[log, contestant] = max(most.get((log, contestant), (0.0, "")), (mean, column))
+            most[log, contestant] = max(most.get((log, contestant), (0.0, 0, "")), (mean, len(own), column))
     return [
-        f"{log}, {contestant}: {column} is {np.expm1(mean):.0%} worse; fewer than {LEAST_CASES} cases, no test"
-        for (log, contestant), (mean, column) in most.items()
+        f"{log}, {contestant}: {column} is {np.expm1(mean):.0%} worse; {cases} {'case' if cases == 1 else 'cases'} "
+        "here, which no test judges"
+        for (log, contestant), (mean, cases, column) in most.items()
     ]

@@ -105,8 +105,19 @@ def families(ratios: Ratios) -> list[Family]:
     """Groups that have a test, those together that can be tested together.
 
     A contestant and column with 5 cases or more over all logs is tested by signs, each of its groups of that size too;
-    with 3 or 4 by rotations, its groups that have all of these cases. Fewer have no test.
+    with 3 or 4 by rotations, its groups that have all of these cases. Others have no test.
     """
+    members = _members(ratios)
+    return [_family(groups, ratios, 1 / len(members)) for groups in members]
+
+
+def testable(ratios: Ratios) -> set[Group]:
+    """Groups that have a test, were they to move."""
+    return {group for groups in _members(ratios) for group in groups}
+
+
+def _members(ratios: Ratios) -> list[list[Group]]:
+    """Groups that are tested together."""
     most: dict[tuple[str, str], set[Case]] = {}
     for (_, contestant, column), cases in ratios.items():
         most.setdefault((contestant, column), set()).update(cases)
@@ -117,7 +128,7 @@ def families(ratios: Ratios) -> list[Family]:
             members.setdefault(frozenset(), []).append(group)
         elif LEAST_CASES <= len(own) == len(whole):
             members.setdefault(whole, []).append(group)
-    return [_family(groups, ratios, 1 / len(members)) for groups in members.values()]
+    return list(members.values())
 
 
 def _family(groups: list[Group], ratios: Ratios, share: float) -> Family:

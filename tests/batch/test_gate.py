@@ -103,7 +103,7 @@ def test_single_runs_have_no_test_and_are_told_from_a_quarter_on(tmp_path):
     assert not gate(changed(batch, "isam2", ATE, 1.24), tmp_path / "reference.json").look_at
     verdict = gate(changed(batch, "isam2", ATE, 1.26), tmp_path / "reference.json")
     assert verdict.passed
-    assert verdict.look_at == [f"{log}, isam2: {ATE} is 26% worse; fewer than 3 cases, no test" for log in LOGS]
+    assert verdict.look_at == [f"{log}, isam2: {ATE} is 26% worse; 2 cases here, which no test judges" for log in LOGS]
     assert verdict.untested == ["dead-reckoning", "isam2", "ekf-slam"]
 
 
@@ -232,6 +232,18 @@ def test_a_batch_in_which_all_failed_does_not_pass(batch, reference):
 def level(batch: RecordedBatch, column: str, value: float) -> RecordedBatch:
     """The batch, had a column the same value in every run."""
     return replace(batch, runs=[replace(run, values=run.values | {column: value}) for run in batch.runs])
+
+
+@pytest.mark.parametrize(("seeds", "told"), [(1, "1 case here"), (2, "2 cases here"), (4, "4 cases here")])
+def test_a_log_with_few_seeds_beside_one_with_many_is_told(tmp_path, seeds, told):
+    many = drawn_batch(10)
+    batch = replace(many, runs=[run for run in many.runs if run.log == LOGS[0] or run.seed < seeds])
+    bless(batch, tmp_path / "reference.json")
+    factors = [1.0] * 10 + [1.9] * seeds
+    verdict = gate(changed(batch, "isam2", ATE, factors), tmp_path / "reference.json")
+    assert verdict.passed
+    assert not verdict.untested
+    assert verdict.look_at == [f"{LOGS[1]}, isam2: {ATE} is 90% worse; {told}, which no test judges"]
 
 
 def test_five_per_cent_fails_and_anything_more_passes():
