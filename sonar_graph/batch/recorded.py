@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -230,6 +231,8 @@ def _read_table(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
         raise EvaluationError(f"{path}: no column {', '.join(missing)}; expected results that bench wrote")
     if not table.num_rows:
         raise EvaluationError(f"{path}: has no rows; run bench again, it resumes")
+    if repeated := [key for key, count in Counter(table["key"].to_pylist()).items() if count > 1]:
+        raise EvaluationError(f"{path}: run {repeated[0]} has more than one row; run bench again, it resumes")
     about = json.loads((table.schema.metadata or {}).get(SUITE_METADATA, b"{}"))
     rows = [_row_now(row, path.parent) for row in table.to_pylist()]
     return [_run(row, place) for place, row in enumerate(rows)], about

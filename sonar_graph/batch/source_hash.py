@@ -9,12 +9,12 @@ from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 
-from sonar_graph.batch.file_stamp import Stamp, stamp_of
+from sonar_graph.batch.file_stamp import Stamp, files_below, stamp_of
 
 DIGITS = 16
 BYTECODE = "__pycache__"
-StampedFile = tuple[tuple[str, ...], str, Stamp]
-"""Parts of its name within the package, path, and stamp."""
+StampedFile = tuple[str, str, Stamp]
+"""Its name within the package, path, and stamp."""
 
 
 @lru_cache
@@ -41,8 +41,8 @@ def source_hash_now(package: str) -> str:
 @lru_cache(maxsize=8)
 def _digest(files: tuple[StampedFile, ...]) -> str:
     digest = hashlib.sha256()
-    for parts, path, _ in files:
-        _add(digest, "/".join(parts), Path(path))
+    for name, path, _ in files:
+        _add(digest, name, Path(path))
     return digest.hexdigest()[:DIGITS]
 
 
@@ -52,21 +52,14 @@ def _stamped_files(package: str) -> Iterator[StampedFile]:
         return
     folders = list(spec.submodule_search_locations or ())
     for folder in folders:
-        yield from _below(folder, ())
+        for entry in files_below(folder, _is_no_source):
+            yield entry.path[len(folder) + 1 :].replace(os.sep, "/"), entry.path, stamp_of(entry)
     if not folders and spec.origin is not None and (module := Path(spec.origin)).is_file():
-        yield (module.name,), spec.origin, stamp_of(module)
+        yield module.name, spec.origin, stamp_of(module)
 
 
-def _below(folder: str, within: tuple[str, ...]) -> Iterator[StampedFile]:
-    """Without a `Path` for each file, since runs wait for this list."""
-    with os.scandir(folder) as entries:
-        for entry in entries:
-            if entry.name == BYTECODE or entry.name.startswith("."):
-                continue
-            if entry.is_dir(follow_symlinks=False):
-                yield from _below(entry.path, (*within, entry.name))
-            elif entry.is_file():
-                yield (*within, entry.name), entry.path, stamp_of(entry)
+def _is_no_source(name: str) -> bool:
+    return name == BYTECODE or name.startswith(".")
 
 
 def _add(digest: hashlib._Hash, name: str, path: Path) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import gtsam
 from pydantic import Field
 
-from sonar_graph.batch.file_stamp import Stamp, stamp_of
+from sonar_graph.batch.file_stamp import Stamp, files_below, stamp_of
 from sonar_graph.calibration import Section
 from sonar_graph.errors import CalibrationError
 from sonar_graph.logs.adapters.config import LogConfig, read_log_config
@@ -155,7 +155,7 @@ def fingerprint(kind: str, options: dict[str, Any]) -> dict[str, Any]:
 
 def _hash(path: Path) -> str:
     """SHA-256 of a file, or of all names and files below a folder; read again only where stamps changed."""
-    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    files = sorted(Path(entry.path) for entry in files_below(str(path))) if path.is_dir() else [path]
     return _digest(path, tuple((file, stamp_of(file)) for file in files))
 
 

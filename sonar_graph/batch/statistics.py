@@ -126,11 +126,13 @@ def summarise(values: Floats) -> Summary:
 
 
 def quantile(values: Floats, share: float) -> float:
-    """Linear between order statistics; infinite as soon as an infinite value takes part; NaN of nothing."""
+    """Linear between order statistics, infinite where an infinite value takes part; NaN of nothing and between both."""
     if not len(values):
         return math.nan
     ordered, place = np.sort(values), share * (len(values) - 1)
     below, above = float(ordered[math.floor(place)]), float(ordered[math.ceil(place)])
+    if math.isinf(below) and below == -above:
+        return math.nan
     if below == above or not math.isfinite(above):
         return above
     return below + (place - math.floor(place)) * (above - below) if math.isfinite(below) else below

@@ -25,6 +25,7 @@ from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.strict_json import read_json, write_json
 
 RUNS, ROW, LOG = "runs", "row.json", "log.txt"
+KEY = "key"
 SUITE, LOCK = "suite.toml", ".lock"
 _PARTIAL = ".partial-"
 
@@ -42,11 +43,12 @@ class Store:
             shutil.rmtree(path)
 
     def row(self, key: str) -> Row | None:
-        """What was measured in a run; None where it is not done, or its row was lost by the machine."""
+        """What was measured in a run; None where it is not done, or its row was lost or is that of another run."""
         try:
-            return dict(read_json(self.run_folder(key) / ROW))
+            row = dict(read_json(self.run_folder(key) / ROW))
         except EvaluationError:
             return None
+        return row if row.pop(KEY, None) == key else None
 
     def write(self, key: str, outcome: Outcome) -> None:
         """Keep a run.
@@ -62,7 +64,7 @@ class Store:
                 path = partial / name
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(content)
-            write_json(partial / ROW, outcome.row)
+            write_json(partial / ROW, {KEY: key, **outcome.row})
             self.discard(key)
             partial.rename(self.run_folder(key))
         finally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import logging
 import textwrap
 import time
@@ -49,6 +50,8 @@ def run_estimator(
     cause. The map is kept at `map_instants`; asking for it before the end is not timed, and changes nothing in an
     estimator that keeps its contract.
 
+    An estimator gets a copy of the measurements, since one that corrects them in place would alter those of the next.
+
     Parameters
     ----------
     name
@@ -82,7 +85,8 @@ def run_estimator(
     except EstimatorError as error:
         return RunResult(name, dict(overrides or {}), "failed", one_line(error))
     params = make_params(kind, overrides or {}, name)
-    replay = _Replay(sequence, list(sequence.replay(instants)), name, params, interim_maps=interim_maps)
+    own = copy.deepcopy(sequence)
+    replay = _Replay(sequence, list(own.replay(instants)), name, params, interim_maps=interim_maps)
     return replay.run(kind, progress)
 
 
@@ -135,7 +139,7 @@ class _Replay:
         with contextlib.suppress(Exception):  # what fails here fails again below, where it is reported
             estimator = kind(self._sequence.calibration, self._params)
             for step in self._steps[: min(last, MAX_WARM_UP_STEPS) + 1]:
-                estimator.process(step)
+                estimator.process(copy.deepcopy(step))
 
     def _process(self, estimator: Estimator, progress: Callable[[int, int], None] | None) -> None:
         for done, step in enumerate(self._steps, start=1):

@@ -168,3 +168,13 @@ def test_files_are_asked_for_by_content_and_landmarks_as_they_are_stated(
     (run,) = planned(write_suite, HEADER, robots, DEAD_RECKONING)
     assert run.asked["options"] == {"robot": 1}
     assert len(run.asked["files"]["folder"]) == 64
+
+
+def test_content_of_a_folder_has_what_lies_behind_links(tmp_path: Path) -> None:
+    for name in ("data", "elsewhere"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "elsewhere" / "a.csv").write_text("1")
+    (tmp_path / "data" / "run").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
+    before = fingerprint("mrclam", {"folder": str(tmp_path / "data")})
+    (tmp_path / "elsewhere" / "a.csv").write_text("2")
+    assert fingerprint("mrclam", {"folder": str(tmp_path / "data")}) != before

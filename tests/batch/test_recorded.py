@@ -91,3 +91,11 @@ def test_what_is_no_batch_is_refused_with_the_file_at_fault(tmp_path):
     pq.write_table(pa.table({"key": ["a"], "log": ["b"]}), tmp_path / RESULTS)
     with pytest.raises(EvaluationError, match="no column estimator, status"):
         read_batch(tmp_path)
+
+
+def test_a_run_with_two_rows_is_refused(tmp_path):
+    write_batch(drawn_batch(2), tmp_path)
+    table = pq.read_table(tmp_path / RESULTS)
+    pq.write_table(pa.concat_tables([table, table.slice(0, 1)]), tmp_path / RESULTS)
+    with pytest.raises(EvaluationError, match="has more than one row"):
+        read_batch(tmp_path)

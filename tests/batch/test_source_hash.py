@@ -139,3 +139,14 @@ def test_estimator_of_another_package_has_the_hash_of_that(misbehaving: None) ->
     assert versions_of("dies")["estimator_source"] == source_hash("misbehaving") != ""
     assert versions_of("broken")["estimator_source"] == ""
     assert versions_of("isam2")["estimator_source"] == versions_of("dies")["source"] == source_hash("sonar_graph")
+
+
+def test_code_behind_a_link_counts_and_links_in_a_circle_end(package: Path, hashed: Hashed, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "linked.py").write_text("a = 1\n")
+    (package / "linked").symlink_to(elsewhere, target_is_directory=True)
+    (elsewhere / "around").symlink_to(package, target_is_directory=True)
+    before = hashed()
+    (elsewhere / "linked.py").write_text("a = 2\n")
+    assert hashed() != before

@@ -294,3 +294,10 @@ def test_a_quantile_beside_runs_that_only_the_reference_lost_is_infinite_to_the_
     assert quantile(np.array([-INF, 1.0]), 0.5) == -INF
     assert quantile(np.array([-INF, -INF, 1.0, 2.0]), 0.5) == -INF
     assert quantile(np.array([-INF, 1.0, 2.0]), 0.5) == 1.0
+
+
+def test_where_each_side_lost_half_of_the_seeds_nothing_can_be_said():
+    own, other = np.array([INF, 1.0] * 5), np.array([1.0, INF] * 5)
+    assert math.isnan(paired(own, other).median)
+    assert math.isnan(paired(other, own).median)
+    assert math.isnan(quantile(np.array([-INF, INF]), 0.5))

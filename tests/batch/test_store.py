@@ -105,3 +105,14 @@ def test_row_that_the_machine_lost_counts_as_not_done(tmp_path: Path) -> None:
     assert store.row("k") is None
     store.write("k", OUTCOME)
     assert store.row("k") == OUTCOME.row
+
+
+def test_row_of_another_run_counts_as_not_done(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    for key, error_m in (("a", 1.0), ("b", 2.0)):
+        store.write(key, Outcome({"status": "ok", "error_m": error_m}))
+    folders = {key: store.run_folder(key) for key in ("a", "b")}
+    folders["a"].rename(tmp_path / "aside")
+    folders["b"].rename(folders["a"])
+    (tmp_path / "aside").rename(folders["b"])
+    assert store.row("a") is store.row("b") is None

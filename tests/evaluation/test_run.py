@@ -3,7 +3,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import gtsam
 import numpy as np
@@ -387,3 +387,26 @@ def test_the_instance_that_warms_up_waits_for_landmarks_that_can_be_named(
     warmed_up, judged = instances
     assert warmed_up[-1] >= stamps_ns[11]
     assert len(warmed_up) < len(judged)
+
+
+def test_what_an_estimator_does_to_its_measurements_no_other_sees(
+    install: Install, make_sequence: Make, offset_estimator: Any
+) -> None:
+    class Correcting(offset_estimator):
+        given: ClassVar[list[float]] = []
+
+        def process(self, measurements: Measurements) -> Estimate | None:
+            self.given.append(float(np.abs(measurements.imu.specific_force).sum()))
+            measurements.imu.specific_force[:] *= 2
+            return super().process(measurements)
+
+    install(correcting=Correcting)
+    sequence = make_sequence()
+    before = sequence.imu.specific_force.copy()
+    run_estimator(sequence, "correcting")
+    np.testing.assert_array_equal(sequence.imu.specific_force, before)
+    steps = len(sequence.instants(2.0))
+    assert len(Correcting.given) > steps
+    assert (
+        Correcting.given[: len(Correcting.given) - steps] == Correcting.given[-steps:][: len(Correcting.given) - steps]
+    )
