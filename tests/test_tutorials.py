@@ -168,7 +168,7 @@ def test_page_on_batches_has_a_suite_a_command_and_a_program_that_work(tmp_path:
             timeout=600,
         )
         assert done.returncode == 0, done.stdout + done.stderr
-    assert "Gate: passed, 8 runs" in done.stdout
+    assert "Gate: passed, without any test of errors, 8 runs" in done.stdout
     printed = subprocess.run(
         [sys.executable, "-c", program], cwd=tmp_path, check=True, capture_output=True, text=True
     ).stdout

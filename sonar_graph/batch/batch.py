@@ -31,8 +31,13 @@ class Batch:
 
     @classmethod
     @contextlib.contextmanager
-    def opened(cls, file: SuiteFile, folder: Path) -> Iterator[Batch]:
+    def opened(cls, file: SuiteFile, folder: Path, runs: list[PlannedRun] | None = None) -> Iterator[Batch]:
         """Plan a suite, find out what of it is done, and keep other batches out of the folder while the block runs.
+
+        Parameters
+        ----------
+        runs
+            The suite's plan, where it was made already.
 
         Raises
         ------
@@ -40,7 +45,7 @@ class Batch:
             When the suite has a mistake, another batch runs in the folder, or it holds the batch of another suite; no
             file in it is touched then.
         """
-        runs = plan_runs(file)
+        runs = plan_runs(file) if runs is None else runs
         store = Store(folder)
         with only_batch_in(folder):
             _check_same_suite(file, folder)

@@ -82,6 +82,11 @@ class Verdict:
         return [contestant for contestant, cases in self.cases.items() if cases < LEAST_CASES]
 
     @property
+    def has_test(self) -> bool:
+        """Whether a worsening of any contestant could have failed the batch."""
+        return len(self.untested) < len(self.cases)
+
+    @property
     def unmoved(self) -> list[str]:
         """Contestants that have a test and whose scores are all within the tolerance of the reference's."""
         return [name for name in self.cases if name not in self.detectable and name not in self.untested]

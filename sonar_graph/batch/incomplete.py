@@ -1,4 +1,4 @@
-"""Batches of which not every planned run was done: what is said of them, and what they cannot be."""
+"""Batches of which not every planned run was done, or is there any more: what is said of them, what they cannot be."""
 
 from __future__ import annotations
 
@@ -28,6 +28,17 @@ def missing_told(batch: RecordedBatch) -> list[str]:
     return [
         f"This batch is not complete: {_count_told(batch)} ({whose}), on {'; '.join(logs[:NAMED])}{more}. All numbers "
         f"are of the other runs, and may change. To complete it, {GOING_ON}."
+    ]
+
+
+def lost_told(batch: RecordedBatch) -> list[str]:
+    """How many runs have left their row and nothing else."""
+    lost = [run.key for run in batch.runs if not run.log_file]
+    if not lost:
+        return []
+    return [
+        f"The table has {len(lost)} {'run' if len(lost) == 1 else 'runs'} whose folder is not here, first {lost[0]}: "
+        "their numbers can be told and not be followed. Where it was removed, the bench command does them anew."
     ]
 
 

@@ -1,4 +1,4 @@
-"""Ctrl-C that comes at a bad moment, and is not lost."""
+"""Ctrl-C that comes at a bad moment and is not lost, and SIGTERM that counts like it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,24 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+
+
+@contextmanager
+def terminations_as_interrupts() -> Iterator[None]:
+    """Let SIGTERM, by which SLURM, Kubernetes and ``timeout`` end a job, do in the block what Ctrl-C does."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        handler = signal.getsignal(signal.SIGINT)
+        (handler if callable(handler) else signal.default_int_handler)(number, frame)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager

@@ -20,7 +20,7 @@ COSTS = {
     "update_p99_ms": "Update, 99 % (ms)",
     "wall_s": "Whole run (s)",
     "cpu_s": "Processor (s)",
-    "peak_memory_mb": "Memory (MB)",
+    "peak_memory_mb": "Memory, rise (MB)",
 }
 LATEST = "_end"
 """Of columns with the normalised squared error at a run's last instant."""

@@ -246,9 +246,13 @@ def _absence_told(path: Path) -> str:
 
 
 def _row_now(row: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """A row of the table, with what was measured if the run was done after the table was written."""
+    """A row of the table, with what was measured if the run was done after the table was written.
+
+    A run that is not where the table says has no log.
+    """
     if row["status"] != NOT_RUN:
-        return row
+        is_here = row.get("log_file") and (folder / row["log_file"]).is_file()
+        return row if is_here else row | {"log_file": None}
     kept = Path(RUNS) / str(row["key"])
     with contextlib.suppress(EvaluationError):
         return row | {"reason": None, "log_file": f"{kept.as_posix()}/{LOG}"} | read_json(folder / kept / ROW)

@@ -98,7 +98,8 @@ def exit_by_gate(folder: Path, reference: Path, *, is_strict: bool) -> None:
     for line in verdict_lines(verdict):
         typer.echo(line)
     is_passed = verdict.passed and not (is_strict and verdict.look_at)
-    typer.echo(f"Gate: {'passed' if is_passed else 'failed'}, {verdict.compared} runs held against {reference}")
+    outcome = "failed" if not is_passed else "passed" if verdict.has_test else "passed, without any test of errors"
+    typer.echo(f"Gate: {outcome}, {verdict.compared} runs held against {reference}")
     if not is_passed:
         raise typer.Exit(1)
 
@@ -129,14 +130,14 @@ def _seen(contestant: str, share: float, cases: int) -> str:
 
 def write_report_of(folder: Path) -> Path:
     """Write the page and the tables of a batch from its results, and say where runs are missing in them."""
-    from sonar_graph.batch.incomplete import missing_told
+    from sonar_graph.batch.incomplete import lost_told, missing_told
     from sonar_graph.batch.page import write_batch_report
     from sonar_graph.batch.recorded import read_batch
 
     with working("drawing"):
         batch = read_batch(folder)
         page = write_batch_report(batch, folder)
-    for sentence in missing_told(batch):
+    for sentence in [*missing_told(batch), *lost_told(batch)]:
         typer.echo(f"Warning: {sentence}", err=True)
     return page
 
@@ -145,11 +146,13 @@ def write_report_of(folder: Path) -> Path:
 def _opened(suite: Path, output: Path, timeout_s: float | None) -> Iterator[tuple[Batch, Limits]]:
     try:
         from sonar_graph.batch.batch import Batch, limits_of
+        from sonar_graph.batch.plan import plan_runs
         from sonar_graph.batch.suite import read_suite
     except ModuleNotFoundError as error:
         raise BatchError(f"bench needs {error.name}, which is not installed: {INSTALL}") from error
     file = read_suite(suite)
-    with Batch.opened(file, writable_folder(output)) as batch:
+    runs = plan_runs(file)  # before the folder is made, which a suite with a mistake does not need
+    with Batch.opened(file, writable_folder(output), runs) as batch:
         yield batch, limits_of(file, timeout_s)
 
 
@@ -160,9 +163,11 @@ def _where(workers: int | None, scheduler: str | None) -> Where:
 
 
 def _run(batch: Batch, where: Where, limits: Limits) -> Counter[str]:
-    """All runs; on Ctrl-C it says how to go on."""
+    """All runs; on Ctrl-C, and where a scheduler of jobs ends it, it says how to go on."""
+    from sonar_graph.batch.interrupts import terminations_as_interrupts
+
     try:
-        with _shown(batch) as progress:
+        with terminations_as_interrupts(), _shown(batch) as progress:
             return batch.run(where, limits, progress)
     except KeyboardInterrupt:
         print(f"sonar-graph: interrupted; {batch.resuming()}", file=sys.stderr, flush=True)

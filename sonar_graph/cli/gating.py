@@ -27,7 +27,8 @@ class SuiteFirst(TyperGroup):
 benches = typer.Typer(
     name="bench",
     cls=SuiteFirst,
-    help="Run suites: many logs, seeds, estimators and variants; judge what came out.",
+    help="Run suites: many logs, seeds, estimators and variants; judge what came out. For the options of a run: "
+    "sonar-graph bench run --help.",
     epilog=examples(
         "sonar-graph bench suite.toml -o results",
         "sonar-graph bench suite.toml -o results --gate reference.json",

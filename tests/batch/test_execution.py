@@ -82,8 +82,9 @@ def load_faults() -> Any:
     return faults
 
 
+@pytest.mark.parametrize("ended_by", [signal.SIGINT, signal.SIGTERM])
 def test_interrupt_ends_in_seconds_says_how_to_go_on_and_leaves_no_process(
-    write_suite: WriteSuite, misbehaving: None, tmp_path: Path
+    write_suite: WriteSuite, misbehaving: None, tmp_path: Path, ended_by: signal.Signals
 ) -> None:
     sleeps = '[[estimators]]\nname = "sleeps"\n'
     suite = write_suite(HEADER, BASIN, "seeds = 2\n", DEAD_RECKONING, sleeps)
@@ -95,7 +96,7 @@ def test_interrupt_ends_in_seconds_says_how_to_go_on_and_leaves_no_process(
         family = psutil.Process(process.pid).children(recursive=True)
         assert family
         began = time.monotonic()
-        os.killpg(process.pid, signal.SIGINT)
+        os.kill(process.pid, ended_by)
         _, said = process.communicate(timeout=60)
     assert time.monotonic() - began < 20
     assert process.returncode == 130

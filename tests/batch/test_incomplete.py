@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import io
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from sonar_graph.batch.accuracy import all_tests
 from sonar_graph.batch.catalogue import metrics_of
 from sonar_graph.batch.gate import bless, gate
-from sonar_graph.batch.incomplete import marked, missing_told
+from sonar_graph.batch.incomplete import lost_told, marked, missing_told
 from sonar_graph.batch.overviews import failure_table
 from sonar_graph.batch.page import render_batch, write_batch_report
 from sonar_graph.batch.recorded import RecordedBatch, read_batch
@@ -135,3 +136,16 @@ def test_the_warning_names_three_logs_and_counts_the_others(count: int, named: s
         batch = with_missing(batch, "isam2", log, 1)
     (told,) = missing_told(batch)
     assert f", on {named} All numbers" in told
+
+
+def test_rows_whose_runs_are_not_here_are_told_and_lead_nowhere(tmp_path: Path) -> None:
+    batch = drawn_batch(2)
+    write_batch(batch, tmp_path)
+    for run in batch.runs[1:]:
+        (tmp_path / run.log_file).parent.mkdir(parents=True)
+        (tmp_path / run.log_file).write_text("")
+    back = read_batch(tmp_path)
+    assert [run.log_file for run in back.runs] == ["", *(run.log_file for run in batch.runs[1:])]
+    (sentence,) = lost_told(back)
+    assert sentence.startswith(f"The table has 1 run whose folder is not here, first {batch.runs[0].key}")
+    assert lost_told(batch) == []

@@ -4,10 +4,11 @@ import contextlib
 import os
 import signal
 import threading
+from typing import Any
 
 import pytest
 
-from sonar_graph.batch.interrupts import deferred_interrupt
+from sonar_graph.batch.interrupts import deferred_interrupt, terminations_as_interrupts
 
 
 def interrupt() -> None:
@@ -48,6 +49,34 @@ def test_interrupt_of_a_block_that_fails_outlives_its_error() -> None:
             failing_block()
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("handler", [signal.default_int_handler, signal.SIG_IGN])
+def test_termination_counts_like_an_interrupt_also_where_shells_let_it_be_ignored(handler: Any) -> None:
+    before = signal.signal(signal.SIGINT, handler), signal.getsignal(signal.SIGTERM)
+    try:
+        with pytest.raises(KeyboardInterrupt), terminations_as_interrupts():
+            os.kill(os.getpid(), signal.SIGTERM)
+        assert signal.getsignal(signal.SIGTERM) is before[1]
+    finally:
+        signal.signal(signal.SIGINT, before[0])
+
+
+def test_termination_is_deferred_like_an_interrupt() -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    steps: list[str] = []
+
+    def terminated_block() -> None:
+        with terminations_as_interrupts(), deferred_interrupt():
+            os.kill(os.getpid(), signal.SIGTERM)
+            steps.append("went on")
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            terminated_block()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert steps == ["went on"]
 
 
 def test_block_without_interrupt_and_in_another_thread_is_as_without() -> None:

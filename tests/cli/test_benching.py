@@ -16,11 +16,18 @@ def code(*arguments: str) -> int:
 
 def test_mistake_in_a_suite_is_one_line_and_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     suite = tmp_path / "suite.toml"
-    suite.write_text('name = "x"\nreference = "isam2"\nlogs = 3\n')
-    assert code(str(suite), "-o", str(tmp_path / "out")) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert f"{suite}, line 3: logs" in line
-    assert not (tmp_path / "out").exists()
+    for text, told in (
+        ('name = "x"\nreference = "isam2"\nlogs = 3\n', "line 3: logs"),
+        (
+            'name = "x"\nreference = "b"\n[[logs]]\nname = "a"\nlog = "a.mcap"\n[[estimators]]\nname = "b"\n',
+            "line 7: est",
+        ),
+    ):
+        suite.write_text(text)
+        assert code(str(suite), "-o", str(tmp_path / "out")) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"{suite}, {told}" in line
+        assert not (tmp_path / "out").exists()
 
 
 def test_missing_packages_are_named_with_how_to_get_them(
