@@ -38,6 +38,7 @@ def test_missing_recordings_are_one_line_and_exit_code_2(tmp_path: Path) -> None
         assert done.stdout == ""
 
 
+@pytest.mark.slow
 def test_isam2_mission_names_its_figures() -> None:
     found = figures("performance/isam2_mission.py")
     assert {"plain_ratio", "p99_ms", "decile_ratio", "ours_s", "plain_s", "passed"} <= set(found)
@@ -47,6 +48,7 @@ def test_isam2_mission_names_its_figures() -> None:
     assert found["plain_error_m"] < 0.3
 
 
+@pytest.mark.slow
 def test_long_mission_names_its_figures() -> None:
     found = figures("performance/long_mission.py", "--hours", "0.05")
     assert {"decile_ratio", "max_update_ms", "memory_growth_ratio", "passed"} <= set(found)
@@ -55,6 +57,7 @@ def test_long_mission_names_its_figures() -> None:
     assert found["smoothed_error_m"] < 0.3
 
 
+@pytest.mark.slow
 def test_preintegration_names_its_figures() -> None:
     found = figures("performance/preintegration.py")
     assert found["gtsam_cpp_ratio"] == pytest.approx(found["ours_ns"] / found["gtsam_cpp_ns"], rel=1e-3)
@@ -63,6 +66,7 @@ def test_preintegration_names_its_figures() -> None:
     assert found["factor_us"]["odometry_with_bias (Python)"] > found["factor_us"]["BetweenFactorPose3 (compiled)"]
 
 
+@pytest.mark.slow
 def test_preintegration_consistency_tells_rules_apart() -> None:
     found = figures("validation/preintegration_consistency.py", "--workers", "2")
     low, high = found["keyframe_joint_anees"]
@@ -72,6 +76,7 @@ def test_preintegration_consistency_tells_rules_apart() -> None:
     assert {"chain_joint_anees", "brisk_linear_anees", "passed"} <= set(found)
 
 
+@pytest.mark.slow
 def test_nested_messages_are_the_same_in_both_libraries() -> None:
     found = figures("performance/nested_messages.py")
     assert found["same"]
@@ -79,6 +84,7 @@ def test_nested_messages_are_the_same_in_both_libraries() -> None:
     assert {f"{kind}_{share}" for kind in kinds for share in ("ratio", "shared_ratio")} <= set(found)
 
 
+@pytest.mark.slow
 def test_log_reading_names_its_figures_and_agrees_with_rosbags() -> None:
     found = figures("performance/log_reading.py")
     assert found["agrees"]
@@ -88,6 +94,7 @@ def test_log_reading_names_its_figures_and_agrees_with_rosbags() -> None:
     assert 10 < found["peak_rss_mb"] < 150
 
 
+@pytest.mark.slow
 def test_recognition_names_its_figures() -> None:
     found = figures("performance/recognition.py")
     parts = sum(found[f"{part}_ms"] for part in ("selection", "tracking", "look", "beliefs"))
@@ -99,6 +106,7 @@ def test_recognition_names_its_figures() -> None:
     assert (found["actag_ratio"] is not None) == is_compared
 
 
+@pytest.mark.slow
 def test_actag_names_its_figures_or_the_extra() -> None:
     if importlib.util.find_spec("actag") is None:
         done = run("validation/actag_reading.py", "--quick")
@@ -111,6 +119,7 @@ def test_actag_names_its_figures_or_the_extra() -> None:
     assert found["range_rms_m"] < 0.01
 
 
+@pytest.mark.slow
 def test_batch_intervals_tell_methods_apart() -> None:
     found = figures("validation/batch_intervals.py", "--workers", "1")
     assert found["pairs"] == [6, 10, 20, 50]
@@ -121,6 +130,7 @@ def test_batch_intervals_tell_methods_apart() -> None:
     assert found["length"]["BCa"]["normal"][0] < 0.85 < 1 < found["length"]["reported"]["normal"][0]
 
 
+@pytest.mark.slow
 def test_damaged_logs_names_its_figures() -> None:
     found = figures("validation/damaged_logs.py", "--workers", "2")
     assert found["files"] == 60
@@ -128,6 +138,7 @@ def test_damaged_logs_names_its_figures() -> None:
     assert found["recovered_share"] == 1
 
 
+@pytest.mark.slow
 def test_damaged_sonar_files_names_its_figures() -> None:
     found = figures("validation/damaged_sonar_files.py")
     assert found["files"] == 60
@@ -243,6 +254,7 @@ def test_odometry_rows_names_what_accelerometers_add(recordings: Path) -> None:
     assert found["A-KIT IMU at the reference's point"][0] > found["A-KIT Earth at rest"][0] > 2 > found["A-KIT 12"][0]
 
 
+@pytest.mark.slow
 @pytest.mark.recording
 def test_real_frames_names_its_figures(recordings: Path, tmp_path: Path) -> None:
     figure = tmp_path / "curve.png"
@@ -254,6 +266,7 @@ def test_real_frames_names_its_figures(recordings: Path, tmp_path: Path) -> None
     assert figure.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_batch_gate_names_its_figures() -> None:
     found = figures("validation/batch_gate.py", "--workers", "1")
     assert found["false_alarms"] <= found["false_alarms_allowed"]

@@ -23,7 +23,7 @@ sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 AXE = Path(os.environ.get("SONAR_GRAPH_AXE", Path(__file__).parents[2] / "node_modules/axe-core/axe.min.js"))
 PHONE, DESKTOP = 390, 1280
-pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium: apt install chromium")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(BROWSER is None, reason="no Chromium: apt install chromium")]
 
 
 @pytest.fixture(scope="module")
