@@ -161,7 +161,7 @@ def test_end_of_a_batch_leaves_the_equal_runs_of_another_on_the_scheduler(
         done.append(planned_run.key)
 
     monkeypatch.setattr(execution, "perform_watched", wait_a_second)
-    with LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster:
+    with LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=":0") as cluster:
         where = Where(scheduler=cluster.scheduler_address)
         first = threading.Thread(target=run_batch, args=([run], Store(tmp_path / "a"), Limits(9.0), where, told))
         first.start()
