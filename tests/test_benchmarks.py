@@ -29,6 +29,7 @@ def figures(script: str, *arguments: str) -> dict[str, Any]:
     return last
 
 
+@pytest.mark.slow
 def test_missing_recordings_are_one_line_and_exit_code_2(tmp_path: Path) -> None:
     for arguments in ((), ("--data", str(tmp_path))):
         done = run("validation/mrclam.py", *arguments)
@@ -204,6 +205,7 @@ def test_filter_consistency_names_its_figures_and_tells_filters_apart() -> None:
         assert found[f"{basin}_ekf_yaw_anees"] != pytest.approx(found[f"{basin}_invariant_yaw_anees"], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_filter_consistency_refuses_basins_that_it_does_not_know() -> None:
     done = run("validation/filter_consistency.py", "--basins", "nominal,deep")
     assert (done.returncode, done.stderr.strip()) == (2, "--basins, --estimators: unknown: deep")

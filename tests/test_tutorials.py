@@ -29,6 +29,7 @@ def number_after(text: str, pattern: str) -> float:
     return float(found[1])
 
 
+@pytest.mark.slow
 def test_first_comparison_finds_the_landmarks_and_writes_a_page_about_every_estimator(tmp_path: Path) -> None:
     printed = run("01_first_comparison.py", tmp_path)
     for landmark, true in TRUE_LANDMARKS.items():
@@ -62,6 +63,7 @@ def test_preintegration_page_finds_the_bias_and_the_way(tmp_path: Path) -> None:
     assert "6 rows instead of 12" in printed
 
 
+@pytest.mark.slow
 def test_recogniser_page_finds_the_landmark_where_it_is(tmp_path: Path) -> None:
     printed = run("06_recogniser.py", tmp_path)
     last = printed[printed.index("frame 29:") :]
@@ -73,6 +75,7 @@ def test_recogniser_page_finds_the_landmark_where_it_is(tmp_path: Path) -> None:
     assert azimuth_deg == pytest.approx(number_after(last, r"true: landmark 3 at [\d.]+ m,"), abs=0.3)
 
 
+@pytest.mark.slow
 def test_page_on_viewers_has_commands_and_a_program_that_work(tmp_path: Path) -> None:
     page = (TUTORIALS / "03_viewers.md").read_text(encoding="utf-8")
     here = Path(sys.executable).parent
@@ -97,6 +100,7 @@ def test_page_on_viewers_has_commands_and_a_program_that_work(tmp_path: Path) ->
         assert (float(x_m), float(y_m)) == pytest.approx(TRUE_LANDMARKS[int(landmark)], abs=0.3)
 
 
+@pytest.mark.slow
 def test_page_on_own_logs_has_programs_a_configuration_and_commands_that_work(tmp_path: Path) -> None:
     page = (TUTORIALS / "04_your_own_log.md").read_text(encoding="utf-8")
     making, *others = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

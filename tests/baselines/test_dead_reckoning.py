@@ -66,6 +66,7 @@ def test_a_circle_is_a_circle():
         assert estimate.world_T_body.equals(circle_pose((end_ns - T0_NS) * 1e-9), 1e-9)
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_many_runs_with_a_constant_bias():
     bias_sigma, noise = 2e-3, 1e-3
     known = calibration(gyro_bias_sigma=bias_sigma, gyro_bias_walk_density=0.0)

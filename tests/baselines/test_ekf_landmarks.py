@@ -139,6 +139,7 @@ def test_the_covariance_of_a_motion_is_that_of_its_six_numbers():
     assert_allclose(actual, H_m @ turn @ cov @ turn.T @ H_m.T, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_new_landmark_has_the_covariance_of_many_draws():
     rng = np.random.default_rng(5)
     x, P, n = state(np.array([0.1, 0.2, 0.3]))

@@ -67,6 +67,7 @@ def test_the_contract_is_kept(check):
     check(EkfSlam)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("predicts_by_node", [False, True])
 def test_the_same_filter_on_filterpy_ends_in_the_same_state(mission, monkeypatch, predicts_by_node):
     monkeypatch.syspath_prepend(str(BENCHMARKS))

@@ -64,6 +64,7 @@ def look(observe, X, position_sigma_m, was_lost, wrong_m=0.0):
     return observe(P, seen, was_lost)
 
 
+@pytest.mark.slow
 @FILTERS
 def test_one_look_finds_a_vehicle_that_is_far_from_where_it_was_expected(observe):
     """And linearised where it was expected it is sure of a wrong place."""
@@ -166,6 +167,7 @@ def nees_after_gap(kind, seed, forgets_gap):
     return np.array(squares)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [EkfSlam, InvariantEkf])
 def test_after_a_long_gap_landmarks_make_the_position_as_sure_as_it_is_right(kind):
     """Over short missions, two-sided 99.9 % of a chi-square; instants of a run share their errors and count as one."""

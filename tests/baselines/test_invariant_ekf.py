@@ -94,6 +94,7 @@ def sure_and_unsure(kind, mission):
     return [run(kind, level(mission, sigma), NO_GATE[kind]) for sigma in (1e-4, 0.5)]
 
 
+@pytest.mark.slow
 def test_not_knowing_where_the_world_is_changes_no_estimate(mission):
     """Invariance under a stochastic rigid transformation: only covariances differ, by the start's and no more."""
     sure, unsure = sure_and_unsure(InvariantEkf, mission)

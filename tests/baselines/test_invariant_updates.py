@@ -37,6 +37,7 @@ def bare(scale=0.003):
     return state_at(ATTITUDE, landmarks=np.empty((0, 3)), scale=scale)
 
 
+@pytest.mark.slow
 def test_a_new_landmark_has_the_covariance_of_many_draws():
     """Of state, bias, motion, range and azimuth, and an elevation anywhere in the aperture."""
     rng, aperture = np.random.default_rng(5), 0.05

@@ -103,6 +103,7 @@ def test_files_that_differ_in_where_name_and_content_end_have_another_hash(packa
     assert hashed() != first
 
 
+@pytest.mark.slow
 def test_key_changes_with_a_changed_checkout(write_suite: WriteSuite, tmp_path: Path) -> None:
     """Another process has a copy of the package in which one comment was added, under the same version."""
     import baselines

@@ -30,6 +30,7 @@ def sensor(said: dict, quantity: str) -> dict:
     return next(entry for entry in said["sensors"] if entry["quantity"] == quantity)
 
 
+@pytest.mark.slow
 def test_a_stamp_offset_in_the_configuration_moves_the_offset_found(log: Path, tmp_path: Path):
     (tmp_path / "late.toml").write_text("[dvl]\nstamp_offset_s = 0.5\n")
     here = sensor(answer(log), "DVL against IMU: time offset")

@@ -16,6 +16,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "theory" / "datasets.md"
 FOLDER = os.environ.get("SONAR_GRAPH_DATA")
 
 
+@pytest.mark.slow
 @pytest.mark.recording
 @pytest.mark.skipif(not FOLDER, reason="SONAR_GRAPH_DATA is not set")
 def test_the_documented_commands_convert_inspect_and_reckon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

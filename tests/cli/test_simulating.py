@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from typer.testing import CliRunner
@@ -38,6 +39,7 @@ def test_images_and_other_sensors_are_those_of_the_library(tmp_path: Path):
     assert sequence.true_landmarks is not None
 
 
+@pytest.mark.slow
 def test_same_seed_gives_the_same_bytes(tmp_path: Path):
     for name, seed in (("a", "3"), ("b", "3"), ("c", "4")):
         simulate(tmp_path / f"{name}.mcap", "--seed", seed)

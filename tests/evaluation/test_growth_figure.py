@@ -86,6 +86,7 @@ def test_a_failed_run_has_no_row():
     assert len(figure.axes) == 3
 
 
+@pytest.mark.slow
 def test_only_the_repeated_experiment_names_the_papers_figures():
     other = grown(60)
     same = replace(other, sequence=replace(other.sequence, true_landmarks=published_maps()[1]))

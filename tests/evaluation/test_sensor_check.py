@@ -67,6 +67,7 @@ def corrected(run: Sequence, found: dict[str, Finding]) -> Sequence:
     return with_mounting(with_mounting(replace(run, dvl=moved), "dvl", rpy_rad=rpy), "imu", translation_m=place)
 
 
+@pytest.mark.slow
 def test_the_advised_lines_put_the_log_right(found_in_spoilt: dict[str, Finding]):
     found = found_in_spoilt
     again = by_name(check_sensors(corrected(spoilt(), found)))
@@ -131,6 +132,7 @@ def test_a_number_that_cannot_be_told_asks_for_nothing():
         assert finding.plain()["value"] is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hole_s", [2.0, 5.0])
 def test_a_hole_of_the_imu_asks_for_nothing(hole_s: float, monkeypatch: pytest.MonkeyPatch):
     """Drawn straight across, 5 s of manoeuvres make a wrong scale and a wrong offset of the reference."""

@@ -73,6 +73,7 @@ def test_without_accelerometers_nothing_can_be_told():
     assert "no accelerometers" in matched(blind).offset.reason
 
 
+@pytest.mark.slow
 def test_rows_of_few_beams_say_what_they_would_say_were_they_not_there():
     run = spoilt(1)
     some = np.random.default_rng(0).random(len(run.dvl)) < 0.2
@@ -85,6 +86,7 @@ def test_rows_of_few_beams_say_what_they_would_say_were_they_not_there():
     assert abs(found.offset.value - OFFSET_S) < 4 * found.offset.sigma < 0.4
 
 
+@pytest.mark.slow
 def test_a_gyro_bias_changes_no_estimate():
     """Ten times a good MEMS gyro's: turning while it tilts gravity must not look like a turn of the mounting."""
     run = spoilt(1)
@@ -110,6 +112,7 @@ def errors_over_sigma(found: DvlMatch) -> np.ndarray:
     return np.array([(one.value - true) / one.sigma for one, true in zip(told, (0, 0, 1, 0, 0, 0), strict=True)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hole_s", [2.0, 5.0])
 def test_a_hole_of_the_imu_ends_a_stretch(hole_s: float, monkeypatch: pytest.MonkeyPatch):
     """What the vehicle did in there is nobody's knowledge; taken as linear it spoils scale and noise."""
@@ -139,6 +142,7 @@ def with_imu_at(run: Sequence, place_m: tuple[float, float, float]) -> Sequence:
     return replace(run, calibration=run.calibration.model_copy(update={"imu": moved}))
 
 
+@pytest.mark.slow
 def test_the_lever_arm_is_found_whatever_the_calibration_says():
     """The simulator's: (-0.2, 0, -0.15) m. From calibrations metres apart comes one arm."""
     run = spoilt(1)

@@ -107,6 +107,7 @@ def test_large_biases_are_found_as_exactly_as_small_ones():
     assert error == pytest.approx(np.zeros(5), abs=2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("known", "earth"), [(KNOWN, 0.0), (COARSE, 0.0), (WITH_EARTH, EARTH), (FIBRE, EARTH)])
 def test_what_is_claimed_is_what_many_runs_err_by(known, earth):
     runs = 100

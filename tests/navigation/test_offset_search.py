@@ -50,6 +50,7 @@ def test_sigma_is_the_textbooks_wherever_the_offset_lies_between_grid_points(off
     assert abs(found.value - offset_s) < 4 * found.sigma
 
 
+@pytest.mark.slow
 def test_errors_spread_as_sigma_says():
     found = [searched(swaying, 0.25, seed).offset() for seed in range(20)]
     errors = np.array([(f.value - 0.25) / f.sigma for f in found])

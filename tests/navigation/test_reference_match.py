@@ -34,6 +34,7 @@ def test_offset_is_found(offset_s):
     assert abs(found.value - offset_s) < 4 * found.sigma < 0.1
 
 
+@pytest.mark.slow
 def test_interval_holds_the_offset_at_its_stated_rate():
     found = [match_reference_to_imu(RUN.imu, early(0.2, seed), RUN.calibration).offset for seed in range(40)]
     held = [abs(f.value - 0.2) < 1.96 * f.sigma for f in found]

@@ -72,6 +72,7 @@ def test_a_wrong_identity_is_that_of_one_other_landmark_for_a_share_of_the_track
         assert len(set(ids[is_wrong].tolist())) <= 1
 
 
+@pytest.mark.slow
 def test_the_share_of_wrong_tracks_is_as_asked():
     """Thirty runs of eight tracks or more: 0.3 give or take four standard errors."""
     wrong = []

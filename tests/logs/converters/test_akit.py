@@ -114,6 +114,7 @@ class TestRecording:
     def sequence(self, request, unpacked):
         return read_akit(next(unpacked("akit_1-7.tar.xz").rglob("Trajectory1")).parent, request.param)
 
+    @pytest.mark.slow
     def test_gyros_follow_the_reference_once_the_earths_rotation_is_removed(self, sequence):
         latitude = sequence.calibration.earth_rate_latitude_rad
         removed = best_drift(sequence, EARTH_RATE_RAD_S * np.array([0, np.cos(latitude), np.sin(latitude)]))
