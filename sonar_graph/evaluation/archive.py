@@ -5,6 +5,7 @@ Fields of one object share a prefix: ``causal.stamps_ns``, ``causal.positions``,
 
 from __future__ import annotations
 
+import io
 import zipfile
 from dataclasses import MISSING, fields
 from pathlib import Path
@@ -26,11 +27,17 @@ KINDS: tuple[Kind, Kind] = ("causal", "smoothed")
 
 
 def write_arrays(path: Path, arrays: Arrays) -> None:
-    """Write named arrays, whole or not at all; not compressed, since noise in every digit hardly gets smaller."""
-    with replacing(path) as partial, zipfile.ZipFile(partial, "w") as archive:
+    """Write named arrays, whole or not at all; not compressed, since noise in every digit hardly gets smaller.
+
+    In memory first: an archive goes back to the head of each entry, and there are many small ones.
+    """
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, array, allow_pickle=False)
+    with replacing(path) as partial:
+        partial.write_bytes(content.getbuffer())
 
 
 def read_arrays(path: Path) -> Arrays:
