@@ -275,6 +275,7 @@ def test_three_cases_have_a_test_and_two_are_neither_tested_nor_unmoved(tmp_path
     bless(batch, tmp_path / "reference.json")
     verdict = gate(batch, tmp_path / "reference.json")
     assert verdict.untested == ([] if has_test else batch.contestants)
+    assert verdict.has_test is has_test
     assert verdict.unmoved == (batch.contestants if has_test else [])
 
 
