@@ -7,15 +7,13 @@ from typing import ClassVar
 import gtsam
 import numpy as np
 
-from baselines.causal import CausalEstimates
 from sonar_graph.calibration import Calibration, Section
+from sonar_graph.estimator import CausalEstimates
 from sonar_graph.measurements import Floats, LandmarkDetections, Measurements
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
-from sonar_graph.navigation.earth import earth_rate_in_world
-from sonar_graph.navigation.node_motion import motion_between_nodes, motion_since_node
-from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.slam.association import DetectionJournal
-from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, RefusedRow, Trajectory
+from sonar_graph.navigation import Odometry, motion_between_nodes, motion_since_node
+from sonar_graph.navigation.alignment import earth_rate_in_world
+from sonar_graph.navigation.preintegration import PreintegratedMotion, Preintegrator
+from sonar_graph.states import DetectionJournal, DetectionLog, Estimate, LandmarkMap, Outcome, RefusedRow, Trajectory
 
 
 class DeadReckoningParams(Section):
@@ -26,7 +24,7 @@ class DeadReckoning:
     """Composes preintegrated motions and carries their covariance, with that of a gyro bias that it never learns.
 
     From one DVL stamp to the next, with the motion i_T_j of covariance C and bias derivative D
-    (`sonar_graph.navigation.dvl_preintegration`)::
+    (`sonar_graph.navigation.preintegration.motion`)::
 
         world_T_j = world_T_i i_T_j
         P <- F P F^T + Q,    F = [ Ad(j_T_i)  D ],    Q = diag(C, walk^2 T I)

@@ -1,4 +1,7 @@
-"""EKF-SLAM as published, in its textbook form: the baseline that a smoother has to beat."""
+"""EKF-SLAM as published, in its textbook form: the baseline that a smoother has to beat.
+
+EKF-SLAM over a window of measurements, in one compiled call: what each event of `baselines.filter_events` does.
+"""
 
 from __future__ import annotations
 
@@ -7,18 +10,68 @@ from typing import ClassVar
 
 import numpy as np
 
-from baselines.ekf_state import LANDMARK, POSE
-from baselines.ekf_window import process_window
-from baselines.euler import euler_from_rates, euler_from_rotation
-from baselines.filter_clock import NODE
-from baselines.filter_detections import DetectionOutcomes
-from baselines.filter_events import PoseArrays, Window
-from baselines.filter_models import FilterParams
-from baselines.filter_shell import FilterShell
+from baselines.ekf_equations import LANDMARK, POSE, advance_to_node, correct_depth, pose_after
+from baselines.ekf_landmarks import observe_rows
+from baselines.filter import FilterShell
+from baselines.filter_events import (
+    BEFORE_ALL,
+    DEPTH,
+    FRAME,
+    NODE,
+    NODE_REACHED,
+    GravityInterval,
+    MeasurementWindow,
+    PoseArrays,
+    WindowValues,
+    depth_sample,
+    frame_at,
+    next_event,
+    stamps_of,
+)
+from baselines.filter_inputs import DetectionOutcomes, FilterParams, SonarModel, VehicleModel, nothing_told
+from baselines.filter_motion import inflate_shared_motion, motion_since_node, motion_to_node, nothing_running
 from sonar_graph.calibration import Calibration, Section, Start
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.triples import matrix, vector
+from sonar_graph.numerics import compiled, euler_from_rates, euler_from_rotation, matrix, vector
+
+
+@compiled
+def process_window(x: Floats, P: Floats, n: int, values: WindowValues) -> tuple[int, DetectionOutcomes, PoseArrays]:
+    """Bring the state to the newest node reached at the window's end, with all that was measured on the way.
+
+    Parameters
+    ----------
+    x, P, n
+        Filter state; changed. With room for all landmarks of the window.
+    values
+        Fields of a `MeasurementWindow`.
+
+    Returns
+    -------
+    Length of the state, what became of the detections, and the pose at the window's end.
+    """
+    window = MeasurementWindow(*values)
+    columns, clock, interval = window.columns, window.clock, GravityInterval(*window.interval)
+    vehicle, sonar = VehicleModel(*window.vehicle), SonarModel(*window.sonar)
+    stamps, told, event, running = stamps_of(window), nothing_told(len(window.frame_ns)), BEFORE_ALL, nothing_running()
+    while True:
+        event = next_event(stamps, clock, vehicle.gap[0], event)
+        if event.kind == NODE_REACHED:
+            motion = motion_to_node(columns, vehicle, x, clock[NODE], event.stamp_ns)
+            advance_to_node(columns, vehicle, x, P, n, clock, interval, event.stamp_ns, motion)
+            continue
+        running, motion = motion_since_node(columns, vehicle, x, running, clock[NODE], event.stamp_ns)
+        if event.times_told > 0:
+            motion = inflate_shared_motion(motion, event.times_told)
+        if event.kind == DEPTH:
+            z_m, variance_m2 = depth_sample(window.depth, event, vehicle)
+            correct_depth(x, P, n, motion, vehicle.body_p_port, z_m, variance_m2)
+        elif event.kind == FRAME:
+            n = observe_rows(x, P, n, motion, sonar, frame_at(window.detections, event, told, clock))
+        else:
+            return n, told, pose_after(x, P, motion)
+
 
 ROOM = 8
 """Landmarks that the first arrays have room for; doubled when needed."""
@@ -35,8 +88,8 @@ class EkfSlam(FilterShell):
 
     State (4) and covariance (5), prediction by gyros and Doppler log, observation (6) and innovation (7) of range and
     azimuth, augmentation at first sight; the numbers are those of "Experimental Results of Real-time Sonar-based
-    Underwater Localization Using Landmarks". Equations: `baselines.ekf_state`, `baselines.ekf_landmarks`,
-    `baselines.ekf_augmentation`, `baselines.ekf_prediction`. Derivation: docs/theory/ekf_slam.md.
+    Underwater Localization Using Landmarks". Equations: `baselines.ekf_equations`, `baselines.ekf_landmarks`,
+    `baselines.ekf_landmarks`, `baselines.ekf_equations`. Derivation: docs/theory/ekf_slam.md.
 
     What the paper leaves open, and how it is settled here:
 
@@ -45,9 +98,9 @@ class EkfSlam(FilterShell):
       the integrated gyro and Doppler noise, lever arms included.
     - There is no gyro bias in the state (4). Its drift is not in the covariance either: with a biased gyro this filter
       trusts its heading too much, and gates true detections sooner or later.
-    - While the Doppler log has no bottom lock the prediction is that of `sonar_graph.navigation.gap_motion`, common to
+    - While the Doppler log has no bottom lock the prediction is that of `sonar_graph.navigation.preintegration.dvl_gaps`, common to
       all estimators; only there Q holds the gyro bias, which tilts gravity. The state does not grow: what is measured
-      in a gap is related to the state before it, ever more weakly (`baselines.ekf_motion.told_again`).
+      in a gap is related to the state before it, ever more weakly (`baselines.filter_motion.inflate_shared_motion`).
     - A new landmark's elevation comes from the floor where its height is known, else it is 0; its sigma is the
       aperture over sqrt(12). A known floor enters once for each landmark, as a measurement of its height.
     - Identities need a posterior, innovations a gate (`EkfSlamParams`). A refused detection changes nothing.
@@ -88,7 +141,7 @@ class EkfFilter:
         self._x, self._P = start_state(start)
         self._n = POSE
 
-    def run(self, window: Window) -> tuple[DetectionOutcomes, PoseArrays]:
+    def run(self, window: MeasurementWindow) -> tuple[DetectionOutcomes, PoseArrays]:
         """Bring the state to the newest node reached at the window's end.
 
         Raises

@@ -1,38 +1,161 @@
-"""The order of events in a window of measurements, the same for both filters.
+"""The clock of a filter: integers that compiled code writes to.
+
+The direction of the world's up in the body, from the specific force over an interval between two nodes.
+
+Over about a second the specific force less the change of the Doppler velocity is that of gravity
+(`sonar_graph.navigation.alignment.gravity`). Both filters measure it so; how it corrects a state is their own.
+
+The order of events in a window of measurements, the same for both filters.
 
 Events happen in the order of their stamps: first all nodes that are reached by then, then the depth sample or the
 detections of a sonar frame, at a provisional motion from the newest node. At equal stamps depth comes first. Nodes are
 the stamps of the Doppler log (`sonar_graph.navigation.odometry`).
 
 Measurements that are related to the state over the same gap of the Doppler log are counted, those of depth and those of
-landmarks each for themselves: `baselines.ekf_motion.told_again`.
+landmarks each for themselves: `baselines.filter_motion.inflate_shared_motion`.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from baselines.filter_clock import DEPTHS, LOST, NODE, SIGHTINGS
-from baselines.filter_detections import DetectionColumns, DetectionOutcomes, Frame
-from baselines.filter_models import SonarValues, VehicleModel, VehicleValues
-from baselines.gravity_interval import GravityValues
+from baselines.filter_inputs import DetectionColumns, DetectionOutcomes, Frame, SonarValues, VehicleModel, VehicleValues
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.navigation.interpolation import rows_until
-from sonar_graph.navigation.kernels import inlined
-from sonar_graph.navigation.steps import Columns
+from sonar_graph.navigation import rows_until, value_at
+from sonar_graph.navigation.alignment import tilt_sigma, up_direction
+from sonar_graph.navigation.preintegration import Columns, Integral
+from sonar_graph.numerics import (
+    IDENTITY,
+    Vector,
+    compiled,
+    cross,
+    inlined,
+    matrix,
+    place,
+    plus,
+    product,
+    transformed,
+    vector,
+)
+
+NODE, OPENED, DEPTHS, SIGHTINGS, LOST = 0, 1, 2, 3, 4
+"""Places in the clock: stamp of the state, stamp at which the running gravity interval began, how many depth samples
+and detections were used since the Doppler log lost the bottom, and whether it ever did (0 or 1)."""
+CLOCK = 5
+"""Numbers of the clock."""
+
+
+@inlined
+def reach_node(clock: Ints, node_ns: int) -> None:
+    """The state is at a node; what was told over a gap before it counts no longer."""
+    clock[NODE] = node_ns
+    clock[DEPTHS:LOST] = 0
+
+
+UP: Vector = (0.0, 0.0, 1.0)
+
+
+class GravityInterval(NamedTuple):
+    """What has run up since the last use of gravity."""
+
+    i_R_node: Floats
+    """Rotation since the interval began, shape (3, 3)."""
+    impulse: Floats
+    """Integral of the specific force in the interval's first frame, shape (3,), m/s."""
+    velocity: Floats
+    """Of the IMU's point when it began, shape (3,), and the variance of one component: shape (4,)."""
+
+
+GravityValues = tuple[Floats, Floats, Floats]
+"""Fields of a `GravityInterval`."""
+
+
+@compiled
+def open_interval(columns: Columns, dvl_p_imu: Vector, interval: GravityInterval, clock: Ints) -> None:
+    """Begin a gravity interval at the node."""
+    velocity = _velocity_at_node(columns, clock[NODE], dvl_p_imu)
+    place(IDENTITY, interval.i_R_node, 0, 0)
+    for r in range(3):
+        interval.impulse[r] = 0.0
+    for r in range(4):
+        interval.velocity[r] = velocity[r]
+    clock[OPENED] = clock[NODE]
+
+
+@inlined
+def _velocity_at_node(columns: Columns, node_ns: int, dvl_p_imu: Vector) -> Floats:
+    """Velocity of the IMU's point in body axes, m/s, and the variance of one component, shape (4,)."""
+    imu_ns, rate, _, dvl_ns, velocity, cov, hold_past, _ = columns
+    k = rows_until(dvl_ns, node_ns - 1)
+    w = value_at(imu_ns, rate, rows_until(imu_ns, node_ns - 1), node_ns, hold_past)
+    at_imu = np.empty(4)
+    at_imu[0], at_imu[1], at_imu[2] = plus(vector(velocity[k]), cross(w, dvl_p_imu))
+    at_imu[3] = (cov[k, 0, 0] + cov[k, 1, 1] + cov[k, 2, 2]) / 3.0
+    return at_imu
+
+
+@inlined
+def up_at_node(
+    columns: Columns, vehicle: VehicleModel, motion: Integral, clock: Ints, interval: GravityInterval
+) -> tuple[Vector, float]:
+    """The world's up at the node that a motion has led to, and the sigma of its tilt (rad).
+
+    NaN: not measured there, or the interval is to go on.
+    """
+    if vehicle.gravity_interval_ns <= 0:
+        return UP, math.nan
+    _extend(interval, motion)
+    if clock[NODE] - clock[OPENED] < vehicle.gravity_interval_ns:
+        return UP, math.nan
+    up, sigma = _measured_up(columns, vehicle, clock, interval)
+    open_interval(columns, vehicle.dvl_p_imu, interval, clock)
+    return up, sigma
+
+
+@inlined
+def _extend(interval: GravityInterval, motion: Integral) -> None:
+    """Let the running interval reach one node further."""
+    i_R_node, impulse = matrix(interval.i_R_node), interval.impulse
+    impulse[0], impulse[1], impulse[2] = transformed(vector(impulse), i_R_node, motion.impulse)
+    place(product(i_R_node, motion.dR), interval.i_R_node, 0, 0)
+
+
+@inlined
+def _measured_up(
+    columns: Columns, vehicle: VehicleModel, clock: Ints, interval: GravityInterval
+) -> tuple[Vector, float]:
+    """From the running interval; NaN: the specific force was not measured all along."""
+    duration_s = (clock[NODE] - clock[OPENED]) * 1e-9
+    velocity = _velocity_at_node(columns, clock[NODE], vehicle.dvl_p_imu)
+    mean_force = interval.impulse / duration_s
+    up = up_direction(mean_force, interval.i_R_node, interval.velocity[:3], velocity[:3], duration_s)
+    if not np.isfinite(up).all():
+        return UP, math.nan
+    velocity_sigma = math.sqrt(0.5 * (velocity[3] + interval.velocity[3]))
+    sigma = tilt_sigma(
+        duration_s,
+        velocity_sigma,
+        vehicle.accel_noise_density,
+        vehicle.accel_bias_sigma,
+        vehicle.gyro_noise_density,
+        vehicle.gyro_bias_sigma,
+        vehicle.gravity_m_s2,
+    )
+    return vector(up), sigma
+
 
 DepthColumns = tuple[Ints, Floats, Floats]
 """Stamps in ns, heights of the port in m, variances in m² (NaN where the log does not say), each (m,)."""
 PoseArrays = tuple[Floats, Floats, Floats]
 """world_R_body (3, 3), position (3,), covariance of [theta, rho] (6, 6)."""
-
 END, NODE_REACHED, DEPTH, FRAME = 0, 1, 2, 3
 """Kinds of events."""
 
 
-class Window(NamedTuple):
+class MeasurementWindow(NamedTuple):
     """What a filter is to take in, and how far."""
 
     columns: Columns
@@ -84,7 +207,7 @@ BEFORE_ALL = Event(END, 0, 0, 0, 0, 0)
 
 
 @inlined
-def stamps_of(window: Window) -> Stamps:
+def stamps_of(window: MeasurementWindow) -> Stamps:
     """All that the order of events depends on."""
     return Stamps(window.columns[0], window.columns[3], window.depth[0], window.frame_ns, window.until_ns)
 

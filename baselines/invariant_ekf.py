@@ -1,22 +1,110 @@
-"""The strongest filter to compare with: right-invariant EKF-SLAM with the gyro bias in its state."""
+"""The strongest filter to compare with: right-invariant EKF-SLAM with the gyro bias in its state.
+
+The invariant filter over a window of measurements, in one compiled call: what each event of `filter_events` does.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import numpy as np
 
-from baselines.filter_clock import NODE
-from baselines.filter_detections import DetectionOutcomes
-from baselines.filter_events import PoseArrays, Window
-from baselines.filter_models import FilterParams
-from baselines.filter_shell import FilterShell
-from baselines.invariant_state import BARE, BIAS, BODY, InvariantState, landmark_covariance
-from baselines.invariant_window import process_window
+from baselines.filter import FilterShell
+from baselines.filter_events import (
+    BEFORE_ALL,
+    DEPTH,
+    FRAME,
+    NODE,
+    NODE_REACHED,
+    GravityInterval,
+    MeasurementWindow,
+    PoseArrays,
+    WindowValues,
+    depth_sample,
+    frame_at,
+    next_event,
+    reach_node,
+    stamps_of,
+    up_at_node,
+)
+from baselines.filter_inputs import DetectionOutcomes, FilterParams, SonarModel, VehicleModel, nothing_told
+from baselines.filter_motion import (
+    inflate_shared_motion_with_bias,
+    motion_since_node_with_bias,
+    motion_to_node_with_bias,
+)
+from baselines.invariant_equations import BARE, BIAS, BODY, InvariantState, landmark_covariance, pose_after, predict
+from baselines.invariant_updates import correct_depth, correct_plane, correct_up, observe_rows
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import EstimatorError
-from sonar_graph.measurements import Floats
-from sonar_graph.navigation.kernels import skew
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.navigation.preintegration import Columns
+from sonar_graph.numerics import compiled, skew
+
+StateValues = tuple[Floats, Floats, Floats, Floats]
+"""Fields of an `InvariantState`."""
+
+
+@compiled
+def process_window(
+    state_values: StateValues, walk_density: float, values: WindowValues
+) -> tuple[StateValues, DetectionOutcomes, PoseArrays]:
+    """Bring the state to the newest node reached at the window's end, with all that was measured on the way.
+
+    Parameters
+    ----------
+    state_values
+        Fields of an `InvariantState`; changed.
+    walk_density
+        Of the gyro bias, rad/s²/√Hz.
+    values
+        Fields of a `MeasurementWindow`.
+
+    Returns
+    -------
+    The state, what became of the detections, and the pose at the window's end.
+    """
+    window, state = MeasurementWindow(*values), InvariantState(*state_values)
+    columns, clock, interval = window.columns, window.clock, GravityInterval(*window.interval)
+    vehicle, sonar = VehicleModel(*window.vehicle), SonarModel(*window.sonar)
+    stamps, told, event = stamps_of(window), nothing_told(len(window.frame_ns)), BEFORE_ALL
+    while True:
+        event = next_event(stamps, clock, vehicle.gap[0], event)
+        if event.kind == NODE_REACHED:
+            _advance_to_node(columns, vehicle, walk_density, state, clock, interval, event.stamp_ns)
+            continue
+        motion = motion_since_node_with_bias(columns, vehicle, state.R, state.bias, clock[NODE], event.stamp_ns)
+        if event.times_told > 0:
+            motion = inflate_shared_motion_with_bias(motion, event.times_told)
+        if event.kind == DEPTH:
+            z_m, variance_m2 = depth_sample(window.depth, event, vehicle)
+            correct_depth(state, motion, vehicle.body_p_port, z_m, variance_m2)
+        elif event.kind == FRAME:
+            state = observe_rows(state, motion, sonar, frame_at(window.detections, event, told, clock))
+        else:
+            return (state.R, state.points, state.bias, state.P), told, pose_after(state, motion)
+
+
+@compiled
+def _advance_to_node(
+    columns: Columns,
+    vehicle: VehicleModel,
+    walk_density: float,
+    state: InvariantState,
+    clock: Ints,
+    interval: GravityInterval,
+    node_ns: int,
+) -> None:
+    """Predict to a node and apply what holds there."""
+    motion = motion_to_node_with_bias(columns, vehicle, state.R, state.bias, clock[NODE], node_ns)
+    predict(state, motion, walk_density**2 * (node_ns - clock[NODE]) * 1e-9)
+    reach_node(clock, node_ns)
+    up, sigma = up_at_node(columns, vehicle, motion.integral, clock, interval)
+    if not math.isnan(sigma):
+        correct_up(state, up, sigma**2)
+    if vehicle.is_planar:
+        correct_plane(state, vehicle.plane_z_m, vehicle.plane_z_variance, vehicle.plane_tilt_variance)
 
 
 class InvariantEkfParams(FilterParams):
@@ -29,7 +117,7 @@ class InvariantEkf(FilterShell):
     Same measurements, gates, floor and gaps as `baselines.ekf_slam.EkfSlam`, and what is known to make a filter
     consistent beside it:
 
-    - The error is that of the world's frame (`baselines.invariant_state`). Directions that nothing observes, the
+    - The error is that of the world's frame (`baselines.invariant_equations`). Directions that nothing observes, the
       world's position and heading, are then the same at every estimate, and no linearisation, however wrong, tells
       anything about them (Barrau and Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015; in three
       dimensions Zhang, Wu, Song, Huang and Dissanayake, RA-L 2(2), 2017).
@@ -37,7 +125,7 @@ class InvariantEkf(FilterShell):
     - Attitude is a rotation matrix and has no singular pitch.
 
     It still linearises once, cannot go back to an association, and has no accelerometer bias: the sigma of gravity's
-    direction is widened as everywhere (`sonar_graph.navigation.alignment`). Derivation: docs/theory/invariant_ekf.md.
+    direction is widened as everywhere (`sonar_graph.navigation.alignment.gravity`). Derivation: docs/theory/invariant_ekf.md.
 
     Parameters
     ----------
@@ -72,7 +160,7 @@ class InvariantFilter:
         self._walk_density = calibration.imu.gyro_bias_walk_density if has_bias else 0.0
         self._state = start_state(calibration)
 
-    def run(self, window: Window) -> tuple[DetectionOutcomes, PoseArrays]:
+    def run(self, window: MeasurementWindow) -> tuple[DetectionOutcomes, PoseArrays]:
         """Bring the state to the newest node reached at the window's end.
 
         Raises

@@ -1,39 +1,48 @@
 """Corrections of the invariant filter, and augmentation by a new landmark.
 
-With H and H_m of `baselines.invariant_models`, C the covariance of the motion since the state, R_z the sensor's::
+With H and H_m of `baselines.invariant_equations`, C the covariance of the motion since the state, R_z the sensor's::
 
     S = H P H^T + H_m C H_m^T + R_z                                                                           (8)
 
-The gate and the elevation of a new landmark are those of `baselines.filter_detections` and `baselines.sonar_views`; it
-stands on the floor as in `baselines.ekf_augmentation`.
+The gate and the elevation of a new landmark are those of `baselines.filter_inputs` and `baselines.sonar_update`; it
+stands on the floor as in `baselines.ekf_landmarks`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from baselines.far_views import by_range_and_azimuth, is_beyond_linear, view_noise
-from baselines.filter_detections import (
+from baselines.filter_events import UP
+from baselines.filter_inputs import (
     GATED,
     NEW,
     NO_SLOT,
     PASSED_OVER,
     USED,
+    DetectionRow,
     Frame,
     Noise,
-    Sighting,
+    SonarModel,
     is_inside_gate,
     sighting,
 )
-from baselines.filter_models import SonarModel
-from baselines.gravity_interval import UP
-from baselines.invariant_models import height_of_body_point, height_of_point, location, missed_up, observation
-from baselines.invariant_state import BODY, POINT, InvariantState, correct, motion_matrix, put
-from baselines.sonar_views import elevation_of_new, noise_of_view
+from baselines.invariant_equations import (
+    BODY,
+    POINT,
+    InvariantState,
+    correct,
+    height_of_body_point,
+    height_of_point,
+    location,
+    missed_up,
+    motion_matrix,
+    observation,
+    put,
+)
+from baselines.sonar_update import by_range_and_azimuth, elevation_of_new, is_beyond_linear, noise_of_view, view_noise
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.gap_motion import GapMotion
-from sonar_graph.navigation.kernels import compiled
-from sonar_graph.navigation.triples import Vector, matrix, vector
+from sonar_graph.navigation.preintegration import GapMotion
+from sonar_graph.numerics import Vector, compiled, matrix, vector
 from sonar_graph.slam.models import FLOOR_GATE, wrap_angle
 
 
@@ -57,7 +66,7 @@ def observe_rows(state: InvariantState, motion: GapMotion, sonar: SonarModel, fr
 
 
 @compiled
-def _observe(state: InvariantState, k: int, motion: GapMotion, sonar: SonarModel, seen: Sighting) -> int:
+def _observe(state: InvariantState, k: int, motion: GapMotion, sonar: SonarModel, seen: DetectionRow) -> int:
     """Correct by a landmark that is in the state, where its innovation is inside the gate."""
     _, z, R_z, innovation, S = seen
     predicted, H, H_m = observation(state, k, motion, sonar)
@@ -71,8 +80,8 @@ def _observe(state: InvariantState, k: int, motion: GapMotion, sonar: SonarModel
 
 
 @compiled
-def _observe_far(state: InvariantState, k: int, motion: GapMotion, sonar: SonarModel, seen: Sighting) -> int:
-    """Correct by a landmark that may be far from where it is predicted, inside the gate: `baselines.far_views`.
+def _observe_far(state: InvariantState, k: int, motion: GapMotion, sonar: SonarModel, seen: DetectionRow) -> int:
+    """Correct by a landmark that may be far from where it is predicted, inside the gate: `baselines.sonar_update`.
 
     ``Exp(theta)`` turns both points, so that the place where the landmark was seen less the one where it was predicted
     is ``J_r(theta) (xi_k - xi_new)``: no H of theta, however far they are apart.
@@ -96,7 +105,7 @@ def _observe_far(state: InvariantState, k: int, motion: GapMotion, sonar: SonarM
 
 
 @compiled
-def _augmented(state: InvariantState, motion: GapMotion, sonar: SonarModel, seen: Sighting) -> InvariantState:
+def _augmented(state: InvariantState, motion: GapMotion, sonar: SonarModel, seen: DetectionRow) -> InvariantState:
     """The state with a landmark where it was seen."""
     elevation_rad = elevation_of_new(vector(state.points[0]), matrix(state.R), motion.integral, sonar, seen.z)
     point, G, G_m, G_z = location(state, motion, sonar, seen.z, elevation_rad)

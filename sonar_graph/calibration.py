@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from sonar_graph.errors import CalibrationError
-from sonar_graph.validation import faults_in
+from sonar_graph.settings import faults_in
 
 STANDARD_GRAVITY = 9.80665
 HOLE_INTERVALS = 5

@@ -6,7 +6,9 @@ An estimator is any class with the methods of `Estimator`, announced by its pack
     [project.entry-points."sonar_graph.estimators"]
     my-filter = "my_package.my_module:MyFilter"
 
-It then takes part in ``sonar-graph compare`` under that name. `sonar_graph.estimator_checks` tests the contract.
+It then takes part in ``sonar-graph compare`` under that name. `sonar_graph.testing.laws` tests the contract.
+
+What a filter has said so far: one estimate for each instant that was asked for.
 """
 
 from __future__ import annotations
@@ -19,8 +21,8 @@ from pydantic import ValidationError
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 from sonar_graph.measurements import Measurements
+from sonar_graph.settings import faults_in
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, RefusedRow, Trajectory
-from sonar_graph.validation import faults_in
 
 ENTRY_POINT_GROUP = "sonar_graph.estimators"
 
@@ -130,3 +132,22 @@ def make_params(estimator: type[Estimator], overrides: dict[str, Any], name: str
         return estimator.Params.model_validate(overrides)
     except ValidationError as error:
         raise EstimatorError(f"settings of {name}: {faults_in(error, estimator.Params)}") from error
+
+
+class CausalEstimates:
+    """Estimates in the order of their instants."""
+
+    def __init__(self) -> None:
+        self._estimates: list[Estimate] = []
+
+    def keep(self, estimate: Estimate) -> None:
+        """Append; an estimate for the instant of the last one takes its place, an earlier one is passed over."""
+        last_ns = self._estimates[-1].stamp_ns if self._estimates else None
+        if last_ns is None or estimate.stamp_ns > last_ns:
+            self._estimates.append(estimate)
+        elif estimate.stamp_ns == last_ns:
+            self._estimates[-1] = estimate
+
+    def trajectory(self) -> Trajectory:
+        """All of them."""
+        return Trajectory.from_estimates(self._estimates)

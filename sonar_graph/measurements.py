@@ -1,4 +1,9 @@
-"""What the sensors said: columnar blocks of n >= 1 samples.
+"""What ranges, identities and their posteriors must be, wherever they come from.
+
+A posterior is from 0 to 1, and so is its sum over the identities of a row. An identity becomes part of a variable's key
+in a graph, which has 56 bits for it.
+
+What the sensors said: columnar blocks of n >= 1 samples.
 
 A live caller passes blocks of one row, a replay passes all rows between two instants: the same code, without a
 Python call for every IMU sample. Rows are sorted by stamp. `Measurements` bundles the blocks that arrived since the
@@ -15,12 +20,35 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.detection_rules import ID_ADVICE, no_posterior, too_large
 from sonar_graph.errors import MeasurementError
+
+ROUNDING = 1e-6
+"""By which a sum of posteriors may exceed 1: single precision."""
+FIRST_TOO_LARGE_ID = 2**56
+FARTHEST_M = 100_000.0
+"""No sonar sees farther, and the square of a range must remain a number."""
+ID_ADVICE = "number the landmarks from 0 on, such as 1, 2, 3, where identities are made (a hash has no place)"
+
+
+def no_posterior(probability: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Rows, shape (n, k), that are none: below 0, above 1 in sum, or no number, shape (n,)."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        is_one = (probability >= 0).all(axis=1) & (probability.sum(axis=1) <= 1.0 + ROUNDING)
+    return np.asarray(~is_one)
+
+
+def too_large(ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Rows, shape (n, k), with an identity for which a key has no room, shape (n,)."""
+    return np.asarray((ids >= FIRST_TOO_LARGE_ID).any(axis=1))
+
+
+def possible_ranges(range_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which ranges a sonar can have measured, shape (n,)."""
+    return np.asarray((range_m > 0) & (range_m <= FARTHEST_M))
+
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
 NO_TRACK = -1
 """Track number of a detection that stands for itself."""
 

@@ -11,22 +11,19 @@ from pathlib import Path
 
 import numpy as np
 
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS
-from sonar_graph.logs.recorder import Outgoing
-from sonar_graph.logs.sonar_encoding import sonar_image_messages
-from sonar_graph.logs.writing import write_sequence
+from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.logs.mcap.writer import Outgoing
+from sonar_graph.logs.writing import sonar_image_messages, write_sequence
 from sonar_graph.measurements import SonarFrames
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BODY_Z_M, FLOOR_Z_M, YSHARK
-from sonar_graph.simulation.image_options import ImageOptions
-from sonar_graph.simulation.imaging import FrameTruth, image_along
+from sonar_graph.simulation.detections import World, world_on_floor
 from sonar_graph.simulation.options import SimulationOptions
 from sonar_graph.simulation.recording import Streams, frame_stamps, record
-from sonar_graph.simulation.route import drive, follow
-from sonar_graph.simulation.seabed import place_landmark, scattered_objects
-from sonar_graph.simulation.sonar_image import FrameSimulator
-from sonar_graph.simulation.vehicle import VehiclePath, smooth_noise
-from sonar_graph.simulation.world import World, world_on_floor
+from sonar_graph.simulation.sonar_image.frames import FrameSimulator, FrameTruth, image_along
+from sonar_graph.simulation.sonar_image.imaging_sonar import ImageOptions
+from sonar_graph.simulation.sonar_image.scene import place_landmark, scattered_objects
+from sonar_graph.simulation.vehicle import VehiclePath, drive, follow, smooth_noise
 
 LANDMARKS_XY_M = np.array([[2.4, 0.05], [4.0, -0.12], [5.6, 0.1], [6.4, -0.08]])
 OTHERS_M = np.array([[3.2, 0.1, FLOOR_Z_M], [4.8, -0.1, FLOOR_Z_M]])

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonar_graph.beam_tables import aris_azimuths, didson_azimuths, even_azimuths
+from sonar_graph.devices.sonar_lenses import aris_azimuths, didson_azimuths, even_azimuths
 
 PUBLISHED_DEG = {
     (48, False): {1: -13.1419, 6: -10.7921, 14: -6.2897, 22: -1.0343, 30: 4.3823, 47: 13.5735},

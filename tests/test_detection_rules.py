@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from sonar_graph.detection_rules import FIRST_TOO_LARGE_ID, no_posterior, possible_ranges, too_large
+from sonar_graph.measurements import FIRST_TOO_LARGE_ID, no_posterior, possible_ranges, too_large
 
 
 def test_a_range_is_above_zero_and_at_most_100_km():

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.doppler_beams import UNMEASURED_M_S, velocity_of_beams
-from sonar_graph.navigation.velocity_covariances import is_partial
+from sonar_graph.devices.dvl_beams import UNMEASURED_M_S, is_partial, velocity_of_beams
 
 TILT = np.radians(30.0)
 JANUS = np.array(

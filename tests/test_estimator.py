@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import pytest
 
-import sonar_graph.estimator as module
+from sonar_graph import estimator as module
 from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 from sonar_graph.estimator import Estimator, installed_estimators, load_estimator, make_params

@@ -12,10 +12,10 @@ import pytest
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.estimator import load_estimator
-from sonar_graph.estimator_checks import CHECKS, FILTER_CHECKS, Check, ContractError, check_estimator, laws
-from sonar_graph.estimator_checks.outcome import require_covariance
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections, Measurements
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
+from sonar_graph.testing import laws
+from sonar_graph.testing.laws import CHECKS, FILTER_CHECKS, Check, ContractError, check_estimator, require_covariance
 
 
 class PlainDeadReckoning:

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from sonar_graph.kernels import NOTICE, nothing_is_cached
+from sonar_graph.numerics.jit import NOTICE, nothing_is_cached
 
 KERNELS = """
 from sonar_graph.kernels import compiled
@@ -43,7 +43,7 @@ def test_the_first_compilation_is_told_once_and_later_ones_are_not(tmp_path: Pat
 
 
 def test_other_functions_of_numba_are_none_of_ours(tmp_path: Path) -> None:
-    program = "import numba, sonar_graph.kernels; assert numba.njit(lambda x: 2 * x)(2) == 4"
+    program = "import numba, sonar_graph.numerics.jit; assert numba.njit(lambda x: 2 * x)(2) == 4"
     assert told(tmp_path, program) == ""
 
 

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
+from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign, load_designs
 from sonar_graph.errors import CalibrationError
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign, load_designs
 
 HALF = """
 [[landmark]]

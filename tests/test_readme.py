@@ -36,7 +36,7 @@ def test_example_calibration_is_one() -> None:
 
 
 def test_table_of_topics_has_every_type_and_word_that_is_found_without_being_asked_for() -> None:
-    from sonar_graph.logs.adapters.shipped import SHIPPED
+    from sonar_graph.logs.adapters.drivers import SHIPPED
     from sonar_graph.logs.roles import ROLES
 
     names = {"imu": "IMU", "dvl": "Doppler log", "detections": "landmarks", "sonar": "sonar images"}
@@ -72,7 +72,7 @@ def test_names_imported_in_examples_exist() -> None:
 def test_commands_are_understood(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import typer.main
 
-    from sonar_graph.cli import app
+    from sonar_graph.cli.main import app
 
     monkeypatch.chdir(tmp_path)
     Path("benchmarks/suites").mkdir(parents=True)

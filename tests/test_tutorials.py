@@ -140,7 +140,7 @@ def write_ros1_bag(path: Path) -> None:
 
 def assert_is_simulated(folder: Path) -> None:
     """What is read from the log that the page makes is what was simulated, whatever the axes and units between."""
-    from sonar_graph.logs.adapters.config import read_log_config
+    from sonar_graph.logs.adapters.log_config import read_log_config
     from sonar_graph.logs.reading import read_sequence
     from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
@@ -165,7 +165,7 @@ def test_page_on_batches_has_a_suite_a_command_and_a_program_that_work(tmp_path:
     (tmp_path / "lap.toml").write_text(suite, encoding="utf-8")
     for command in commands:
         done = subprocess.run(
-            [sys.executable, "-c", "from sonar_graph.cli import main; main()", *command.split()],
+            [sys.executable, "-c", "from sonar_graph.cli.main import main; main()", *command.split()],
             cwd=tmp_path,
             capture_output=True,
             text=True,

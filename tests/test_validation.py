@@ -6,7 +6,7 @@ import pytest
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.validation import faults_in, section_at
+from sonar_graph.settings import faults_in, section_at
 
 
 def told(text: str) -> str:

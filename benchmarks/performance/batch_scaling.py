@@ -17,10 +17,8 @@ import numpy as np
 from common import conclude, make_parser, note, print_table
 from dask.system import CPU_COUNT
 
-from sonar_graph.batch.batch import Batch, limits_of
-from sonar_graph.batch.execution import Where
-from sonar_graph.batch.planned import Outcome, PlannedRun
-from sonar_graph.batch.suite import read_suite
+from sonar_graph.batch import Batch, Where, limits_of, read_suite
+from sonar_graph.batch.store import PlannedRun, RunOutcome
 
 SUITE = """
 name = "scaling"
@@ -48,7 +46,7 @@ class Stopwatch:
         self._began = time.perf_counter()
         self._kept: list[tuple[float, float]] = []
 
-    def keep(self, _run: PlannedRun, outcome: Outcome) -> None:
+    def keep(self, _run: PlannedRun, outcome: RunOutcome) -> None:
         """Note a run."""
         row = outcome.row
         assert row["status"] == "ok", row["reason"]

@@ -39,7 +39,7 @@ from baselines.ekf_slam import EkfSlam
 from baselines.invariant_ekf import InvariantEkf
 from sonar_graph.measurements import Floats, Measurements
 from sonar_graph.sequence import NS_PER_S, Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 
 FULL_S, QUICK_S = 2040.0, 120.0
 FILTERPY_S, FILTERPY_QUICK_S = 120.0, 30.0

@@ -30,13 +30,12 @@ from common import conclude, make_parser, note, print_table
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import LandmarkDetections, Measurements
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
-from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation import Odometry
+from sonar_graph.navigation.preintegration import PreintegratedMotion, Preintegrator
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
-from sonar_graph.slam import factors
+from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam.isam2 import Isam2
-from sonar_graph.slam.models import elevation_on_floor, locate
+from sonar_graph.slam.models import elevation_on_floor, factors, locate
 from sonar_graph.states import Estimate
 
 FRAME_RATE_HZ = 2.0

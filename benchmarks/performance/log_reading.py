@@ -45,7 +45,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from common import make_parser, note, print_figures, print_table
 from mission_log import DEPTH, DVL, IMU, ODOMETRY, TYPES, write_mission
 
-from sonar_graph.logs.container import Keep, stream
+from sonar_graph.logs.mcap import Keep, stream
 
 FULL = (2039.0, 2000)
 QUICK = (60.0, 60)
@@ -105,7 +105,7 @@ def add_up(path: Path) -> float:
 
 
 def read_with_sequence(path: Path) -> None:
-    from sonar_graph.logs.reading import read_sequence
+    from sonar_graph.logs import read_sequence
 
     read_sequence(path)
 

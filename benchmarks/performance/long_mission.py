@@ -38,7 +38,7 @@ from common import conclude, make_parser, note, print_table
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Block, Depth, Dvl, Imu, LandmarkDetections, Measurements
 from sonar_graph.sequence import NS_PER_S, Sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import MissionOptions, simulate_mission
 from sonar_graph.slam.isam2 import Isam2, Isam2Params
 from sonar_graph.states import Estimate
 

@@ -10,9 +10,7 @@ from typing import Any
 import numpy as np
 from mcap.writer import Writer
 
-from sonar_graph.logs.cdr import Bytes, encode
-from sonar_graph.logs.message_definitions import definition
-from sonar_graph.logs.schema import parse_definition
+from sonar_graph.logs.cdr import Bytes, definition, encode, parse_definition
 from sonar_graph.measurements import Floats, Ints
 
 CHUNK_BYTES = 1 << 20

@@ -22,9 +22,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 
-from sonar_graph.logs.cdr import decode
-from sonar_graph.logs.message_definitions import DEFINITIONS
-from sonar_graph.logs.schema import parse_definition
+from sonar_graph.logs.cdr import decode, parse_definition
+from sonar_graph.logs.cdr.definitions import DEFINITIONS
 
 FULL, QUICK = 1000, 100
 ROUNDS = 5

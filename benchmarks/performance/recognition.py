@@ -48,21 +48,18 @@ os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
 import cv2
 import numpy as np
 
-from sonar_graph.evaluation.recognising import one_by_one, recognise, step_of, view_of
-from sonar_graph.evaluation.sonar_motion import SonarMotions
-from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.sonar_encoding import sonar_image_messages
-from sonar_graph.logs.sonar_reading import read_sonar_frames
-from sonar_graph.logs.writing import write_sequence
+from sonar_graph.logs import read_sequence, read_sonar_frames, sonar_image_messages, write_sequence
 from sonar_graph.measurements import SonarFrames
+from sonar_graph.recognition import recognise
+from sonar_graph.recognition.session import one_by_one, step_of, view_of
+from sonar_graph.recognition.sonar_motion import SonarMotions
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin, simulate_basin_frames
-from sonar_graph.simulation.image_options import ImageOptions
-from sonar_graph.sonar import recogniser
+from sonar_graph.simulation import BasinOptions, simulate_basin, simulate_basin_frames
+from sonar_graph.simulation.sonar_image import ImageOptions
+from sonar_graph.sonar import Recogniser, recogniser
+from sonar_graph.sonar.appearance import CandidateFit
 from sonar_graph.sonar.beliefs import Beliefs
-from sonar_graph.sonar.look import Look
-from sonar_graph.sonar.recogniser import Recogniser
-from sonar_graph.sonar.tracking import Tracker
+from sonar_graph.sonar.tracker import Tracker
 
 TOPIC = "/sonar/image"
 FULL = BasinOptions(duration_s=680.0, laps=1, frame_rate_hz=5.0, seed=1, image=ImageOptions())
@@ -75,7 +72,7 @@ LEAST_ACTAG_RATIO = 30.0
 PARTS = {
     "selection": (recogniser, "select_candidates"),
     "tracking": (Tracker, "step"),
-    "look": (Look, "at"),
+    "look": (CandidateFit, "at"),
     "beliefs": (Beliefs, "step"),
 }
 

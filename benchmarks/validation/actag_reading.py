@@ -1,7 +1,7 @@
 """How well AcTag's detector reads AcTags in simulated DIDSON frames.
 
 A lap of the simulated basin with four AcTags on its floor instead of landmarks, stones and rough patches beside them.
-Frames go through `sonar_graph.sonar.actag_recogniser`, with the true motion between frames.
+Frames go through `sonar_graph.sonar.actag`, with the true motion between frames.
 """
 
 from __future__ import annotations
@@ -21,11 +21,10 @@ from common import conclude, make_parser, note, print_table, refuse
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError
 from sonar_graph.measurements import LandmarkDetections
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin_frames
-from sonar_graph.simulation.imaging import FrameTruth
-from sonar_graph.sonar.actag_designs import FOAM_DB, PLATE_DB, tag_design
-from sonar_graph.sonar.actag_recogniser import AcTagRecogniser, AcTagSettings
-from sonar_graph.sonar.tracks import SonarStep
+from sonar_graph.simulation import BasinOptions, simulate_basin_frames
+from sonar_graph.simulation.sonar_image.frames import FrameTruth
+from sonar_graph.sonar import AcTagRecogniser, AcTagSettings, SonarStep
+from sonar_graph.sonar.actag import FOAM_DB, PLATE_DB, tag_design
 
 TAGS = (1, 2, 3, 4)
 FAR_M = 0.1

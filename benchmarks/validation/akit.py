@@ -32,12 +32,11 @@ from akit_report import report
 from common import in_parallel, make_parser, print_figures, print_table, recording
 
 from sonar_graph.calibration import Mounting
+from sonar_graph.evaluation import run_estimator
 from sonar_graph.evaluation.consistency import world_position_covs
-from sonar_graph.evaluation.run import run_estimator
-from sonar_graph.logs.converters.akit import read_akit
+from sonar_graph.logs.convert import read_akit
 from sonar_graph.measurements import Dvl, Floats
-from sonar_graph.navigation.dvl_against_imu import match_dvl_to_imu
-from sonar_graph.navigation.reference_match import match_reference_to_imu
+from sonar_graph.navigation.alignment import match_dvl_to_imu, match_reference_to_imu
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
 

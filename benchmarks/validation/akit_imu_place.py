@@ -19,8 +19,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.dvl_against_imu import cross_matrices
-from sonar_graph.navigation.inertial_path import InertialPath
+from sonar_graph.navigation.alignment.dvl_imu import InertialPath, cross_matrices
 from sonar_graph.sequence import Sequence
 
 SHOWN = slice(0, 3)

@@ -24,13 +24,12 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from sonar_graph.evaluation.comparison import judge
-from sonar_graph.evaluation.run import run_estimator
-from sonar_graph.logs.converters.akit import REFERENCE_COLUMNS
-from sonar_graph.logs.converters.tables import read_table
+from sonar_graph.evaluation import judge, run_estimator
+from sonar_graph.logs.convert.akit import REFERENCE_COLUMNS
+from sonar_graph.logs.convert.text_tables import read_table
 from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks
+from sonar_graph.simulation import LandmarkOptions, add_landmarks
 
 ESTIMATORS = ("isam2", "ekf-slam", "dead-reckoning")
 KINDS = ("causal", "smoothed")

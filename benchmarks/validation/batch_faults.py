@@ -26,13 +26,9 @@ import psutil
 import pyarrow.parquet as pq
 from common import conclude, make_parser, note, print_table
 
-from sonar_graph.batch.batch import Batch
-from sonar_graph.batch.catalogue import is_timing
-from sonar_graph.batch.execution import Where
-from sonar_graph.batch.planned import Limits, Outcome
-from sonar_graph.batch.results import RESULTS
-from sonar_graph.batch.store import Store
-from sonar_graph.batch.suite import read_suite
+from sonar_graph.batch import RESULTS, Batch, Limits, Where, read_suite
+from sonar_graph.batch.result_table import is_timing
+from sonar_graph.batch.store import RunOutcome, Store
 from sonar_graph.errors import BatchError
 
 SUITE = """
@@ -62,7 +58,7 @@ START_S = 120.0
 
 def command(suite: Path, folder: Path, *options: str) -> list[str]:
     """The command line of a batch."""
-    code = "from sonar_graph.cli import main; main()"
+    code = "from sonar_graph.cli.main import main; main()"
     where = options or ("--workers", str(WORKERS))
     return [sys.executable, "-c", code, "bench", str(suite), "-o", str(folder), *where]
 
@@ -131,7 +127,7 @@ def kill_one(batch: int, is_victim: Callable[[list[str]], bool]) -> None:
 
 
 def is_runner(arguments: list[str]) -> bool:
-    return "sonar_graph.batch.runner" in arguments
+    return "sonar_graph.batch.one_run" in arguments
 
 
 def is_worker(arguments: list[str]) -> bool:
@@ -143,7 +139,7 @@ class FullDisk(Store):
 
     left = 3
 
-    def write(self, key: str, outcome: Outcome) -> None:
+    def write(self, key: str, outcome: RunOutcome) -> None:
         """As on a full disk: a part is written, then an error comes."""
         self.left -= 1
         if self.left < 0:

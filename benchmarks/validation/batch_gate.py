@@ -26,9 +26,8 @@ from scipy.stats import binom
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import conclude, in_parallel, make_parser, print_table
 
-from sonar_graph.batch.detectable import detectable
 from sonar_graph.batch.gate import TOLERANCE, movable, worse_groups
-from sonar_graph.batch.worsening_tests import Case, Ratios, families, with_all_logs
+from sonar_graph.batch.permutation import Case, Ratios, detectable, families, with_all_logs
 
 SIGMA = 0.1
 LOST_SHARE, LOST_FACTOR = 0.1, 100.0

@@ -22,8 +22,7 @@ from common import in_parallel, make_parser, print_figures, print_table
 
 from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import BasinOptions, MissionOptions, simulate_basin, simulate_mission
 from sonar_graph.slam.isam2 import Isam2, Isam2Params
 from sonar_graph.states import LandmarkMap, Trajectory
 

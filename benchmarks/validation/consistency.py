@@ -23,9 +23,9 @@ from matplotlib.figure import Figure
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import conclude, in_parallel, make_parser, print_table, refuse
 
-from sonar_graph.evaluation.comparison import compare
-from sonar_graph.evaluation.consistency import anees_interval, anees_over_runs
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.evaluation import anees_interval, compare
+from sonar_graph.evaluation.consistency import anees_over_runs
+from sonar_graph.simulation import BasinOptions, simulate_basin
 
 ESTIMATORS = {"ekf": "ekf-slam", "isam2": "isam2"}
 QUANTITIES = {"position": 3, "yaw": 1}

@@ -38,11 +38,8 @@ from sonar_damages import BY_A_FRAME, DAMAGES, Convert, Frame, Source
 from sonar_recordings import Aris, Ddf, Oculus, images
 
 from sonar_graph.errors import SonarGraphError
-from sonar_graph.logs.converters.aris import convert_aris
-from sonar_graph.logs.converters.didson import convert_didson
-from sonar_graph.logs.converters.oculus import convert_oculus
-from sonar_graph.logs.converters.sonar_conversion import SonarConversion
-from sonar_graph.logs.sonar_reading import read_sonar_frames
+from sonar_graph.logs import read_sonar_frames
+from sonar_graph.logs.convert import SonarConversion, convert_aris, convert_didson, convert_oculus
 
 FILES, QUICK_FILES = 1000, 60
 FRAMES = 8

@@ -24,11 +24,11 @@ from scipy.stats import chi2
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import conclude, in_parallel, make_parser, print_table
 
+from sonar_graph.evaluation import run_estimator
 from sonar_graph.evaluation.consistency import world_position_covs
-from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.simulation import BasinOptions, simulate_basin
 
 GAPS_S = (3.0, 10.0, 30.0, 60.0)
 MODES = ("accelerometers", "no accelerometer", "straight")

@@ -33,11 +33,8 @@ sys.path.append(str(Path(__file__).resolve().parent))
 from common import conclude, in_parallel, make_parser, note, print_table, refuse
 from consistency import SETTLING_S, judge
 
-from sonar_graph.evaluation.comparison import compare
-from sonar_graph.evaluation.consistency import normalised_squares
-from sonar_graph.evaluation.metrics import landmark_errors, rmse
-from sonar_graph.evaluation.results import ErrorSeries, RunResult
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.evaluation import ErrorSeries, RunResult, compare, landmark_errors, normalised_squares, rmse
+from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.states import LandmarkMap, Outcome
 
 ESTIMATORS = {

@@ -30,7 +30,7 @@ from common import conclude, in_parallel, make_parser, print_table, refuse
 from identity_figure import Figures, draw
 from identity_runs import ESTIMATORS, Case, Job, Judged, run_job
 
-from sonar_graph.simulation.basin import LANDMARKS_XY_M
+from sonar_graph.simulation import LANDMARKS_XY_M
 
 RATES = (0.0, 0.05, 0.1, 0.2)
 KINDS = [Case(0.0, delay_s, bias) for delay_s, bias in product((0.0, 5.0, 20.0), (1.0, 5.0))]

@@ -8,7 +8,7 @@ import numpy as np
 from identity_runs import Case
 from matplotlib.axes import Axes
 
-from sonar_graph.evaluation.figure_style import (
+from sonar_graph.report.figure_style import (
     MUTED,
     blank_panels,
     colour,

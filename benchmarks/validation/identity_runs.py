@@ -11,11 +11,8 @@ from typing import Any
 
 import baselines
 import sonar_graph
-from sonar_graph.evaluation.comparison import judge
-from sonar_graph.evaluation.metrics import landmark_errors, rmse
-from sonar_graph.evaluation.results import Comparison, ErrorSeries, RunResult
-from sonar_graph.evaluation.run import run_estimator
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.evaluation import Comparison, ErrorSeries, RunResult, judge, landmark_errors, rmse, run_estimator
+from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.states import LandmarkMap
 
 ESTIMATORS: dict[str, tuple[str, dict[str, Any]]] = {

@@ -27,14 +27,12 @@ from gtsam.symbol_shorthand import X
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import in_parallel, make_parser, print_figures, print_table, recording
 
-from sonar_graph.evaluation.comparison import compare
-from sonar_graph.logs.converters.mrclam import read_mrclam
+from sonar_graph.evaluation import compare
+from sonar_graph.logs.convert import read_mrclam
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
-from sonar_graph.slam.batch import solve
+from sonar_graph.simulation import BasinOptions, MissionOptions, simulate_basin, simulate_mission
 from sonar_graph.slam.isam2 import Isam2, Isam2Params
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.smoother import Smoother, solve
 
 RATE_HZ, LONG_S, SHORT_S = 2.0, 600.0, 300.0
 ALONE = {"lag_s": 1e6, "waiting_gain": 0.0, "stale_shift_m": 1e3}

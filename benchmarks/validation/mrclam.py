@@ -25,9 +25,8 @@ import numpy as np
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import conclude, in_parallel, make_parser, print_table, recording
 
-from sonar_graph.evaluation.comparison import judge
-from sonar_graph.evaluation.run import run_estimator
-from sonar_graph.logs.converters.mrclam import read_mrclam
+from sonar_graph.evaluation import judge, run_estimator
+from sonar_graph.logs.convert import read_mrclam
 from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence
 

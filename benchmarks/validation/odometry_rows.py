@@ -37,22 +37,23 @@ from preintegration_consistency import ACCEL_DENSITY, NS, Case, errors, measure
 from spline_vehicle import BODY_P_DVL, BODY_P_IMU, BODY_R_DVL, Vehicle, make_vehicle
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
-from sonar_graph.logs.converters.akit import read_akit
+from sonar_graph.logs.convert import read_akit
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
-from sonar_graph.navigation import JointMotion, JointPreintegrator
-from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
-from sonar_graph.navigation.dvl_against_imu import match_dvl_to_imu
-from sonar_graph.navigation.dvl_preintegration import Preintegrator
-from sonar_graph.navigation.earth import earth_rate_in_world
-from sonar_graph.navigation.joint_preintegration import DISPLACEMENT
-from sonar_graph.navigation.joint_rules import DopplerRule
-from sonar_graph.navigation.node_motion import motion_between_nodes
-from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.reference_match import match_reference_to_imu
+from sonar_graph.navigation import Odometry, motion_between_nodes
+from sonar_graph.navigation.alignment import (
+    earth_rate_in_world,
+    gravity_direction,
+    match_dvl_to_imu,
+    match_reference_to_imu,
+    velocity_at_imu,
+)
+from sonar_graph.navigation.preintegration import DISPLACEMENT, JointMotion, Preintegrator
+from sonar_graph.navigation.preintegration.joint_preintegration import JointPreintegrator
+from sonar_graph.navigation.preintegration.joint_recursion import DopplerRule
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.slam import factors
-from sonar_graph.slam.inertial_factors import doppler_odometry, inertial_doppler_odometry
+from sonar_graph.simulation import BasinOptions, simulate_basin
+from sonar_graph.slam.models import factors
+from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry
 
 RATES_HZ = (1.0, 2.0, 5.0, 10.0)
 WAYS = ("linear", "inertial", "small gap_s")

@@ -12,7 +12,7 @@ from pathlib import Path
 from log_truth import Payload
 
 from sonar_graph.errors import SonarGraphError
-from sonar_graph.logs.container import Keep, Topic, scan
+from sonar_graph.logs.mcap import Keep, Topic, scan
 
 TIME_LIMIT_S = 20.0
 

@@ -4,7 +4,7 @@
 frames are Cartesian fans without ranges; apex and edges of the fan are fitted in every frame, and all detectors get the
 same polar image (128 beams, one bin a pixel). Lengths are in pixels, counted as centimetres.
 
-* ``ours``: `sonar_graph.sonar.detection.select_candidates`; the probability of a false alarm is swept.
+* ``ours``: `sonar_graph.sonar.cfar.select_candidates`; the probability of a false alarm is swept.
 * ``soca``: smallest-of cell averaging along range (40 training, 10 guard cells, Pfa 0.1, gate 65 of 255: the values
   that bruce_slam publishes) on the samples as they are; Pfa and, along with it, the gate are swept.
 * ``soca-power``: the same on the echo's power, ``10^(dB / 10)``, without a gate; Pfa is swept.
@@ -41,7 +41,7 @@ from common import conclude, in_parallel, make_parser, note, print_table, record
 
 from sonar_graph.calibration import SonarImage
 from sonar_graph.measurements import Floats
-from sonar_graph.sonar.detection import DetectionParams, select_candidates
+from sonar_graph.sonar.cfar import DetectionParams, select_candidates
 from sonar_graph.sonar.regions import measure_regions
 
 Image = NDArray[np.uint8]

@@ -40,10 +40,11 @@ from recognition_runs import NONE, UNJUDGED, Detections, Passes, Run, kept_run
 from scipy.stats import chi2
 
 import sonar_graph
-from sonar_graph.evaluation.recognition_section import reliability_figure
-from sonar_graph.evaluation.reliability import Reliability, reliability
-from sonar_graph.simulation.basin import BasinOptions
-from sonar_graph.simulation.image_options import ImageOptions
+from sonar_graph.evaluation import Reliability
+from sonar_graph.evaluation.consistency import reliability
+from sonar_graph.report.figures import reliability_figure
+from sonar_graph.simulation import BasinOptions
+from sonar_graph.simulation.sonar_image import ImageOptions
 
 OURS, LITERAL = "virtual-evidence", "jeffrey"
 ACCEPTED = 0.5

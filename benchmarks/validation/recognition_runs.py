@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from sonar_graph.evaluation.recognising import RecognitionSession, one_by_one
-from sonar_graph.evaluation.reliability import confidences
+from sonar_graph.evaluation import confidences
 from sonar_graph.measurements import LandmarkDetections
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin, simulate_basin_frames
-from sonar_graph.simulation.imaging import FrameTruth
+from sonar_graph.recognition.session import RecognitionSession, one_by_one
+from sonar_graph.simulation import BasinOptions, simulate_basin, simulate_basin_frames
+from sonar_graph.simulation.sonar_image.frames import FrameTruth
+from sonar_graph.sonar import RecogniserParams
 from sonar_graph.sonar.beliefs import IdentityParams
-from sonar_graph.sonar.recogniser import RecogniserParams
 
 WHOLE = 0.9
 """Share of an object that must be in view for it to be in view."""

@@ -27,9 +27,8 @@ from spline_vehicle import BODY_P_DVL, BODY_P_IMU, BODY_R_DVL, make_vehicle
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.dvl_against_imu import match_dvl_to_imu
-from sonar_graph.navigation.reference_match import match_reference_to_imu
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.navigation.alignment import match_dvl_to_imu, match_reference_to_imu
+from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.states import Trajectory
 
 NS = 1_000_000_000

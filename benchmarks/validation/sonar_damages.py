@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sonar_graph.logs.converters.sonar_conversion import SonarConversion
+from sonar_graph.logs.convert import SonarConversion
 
 Convert = Callable[[Path, Path], SonarConversion]
 Frame = tuple[bytes, int, bytes]

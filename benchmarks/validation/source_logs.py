@@ -15,8 +15,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "performance"))
 from log_truth import Truth, read_truth
 from mission_log import write_mission
 
-from sonar_graph.logs.writing import write_sequence
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.logs import write_sequence
+from sonar_graph.simulation import MissionOptions, simulate_mission
 
 CHUNK_BYTES = 1 << 16
 DURATION_S, FRAMES = 20.0, 5

@@ -22,15 +22,12 @@ import numpy as np
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import conclude, in_parallel, make_parser, print_table, recording
 
-from sonar_graph.evaluation.comparison import judge
-from sonar_graph.evaluation.metrics import landmark_errors, rmse
-from sonar_graph.evaluation.place_matching import named_by_place
-from sonar_graph.evaluation.results import RunResult
-from sonar_graph.evaluation.run import run_estimator
-from sonar_graph.logs.converters.mrclam import read_mrclam
+from sonar_graph.evaluation import RunResult, judge, landmark_errors, rmse, run_estimator
+from sonar_graph.evaluation.metrics import named_by_place
+from sonar_graph.logs.convert import read_mrclam
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.states import DetectionLog, Outcome
 
 Figures = dict[str, float]

@@ -34,10 +34,9 @@ from gtsam.symbol_shorthand import L, X
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import conclude, in_parallel, make_parser, note, print_table
 
-from sonar_graph.evaluation.alignment import align_yaw
-from sonar_graph.evaluation.results import RunResult
-from sonar_graph.evaluation.run import run_estimator
-from sonar_graph.logs.converters.victoria_park import read_victoria_park
+from sonar_graph.evaluation import RunResult, run_estimator
+from sonar_graph.evaluation.metrics import align_yaw
+from sonar_graph.logs.convert import read_victoria_park
 from sonar_graph.states import Outcome
 
 LIKE_FOR_LIKE = {

@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sonar_graph.evaluation.figure_style import MUTED, blank_panels, colour, name_axes
 from sonar_graph.measurements import Floats
-from sonar_graph.sonar.identity import jeffrey, virtual_evidence
+from sonar_graph.report.figure_style import MUTED, blank_panels, colour, name_axes
+from sonar_graph.sonar.bayes import jeffrey, virtual_evidence
 
 Update = Callable[[Floats, Floats], Floats]
 """Belief after a frame, from the belief before it and the frame's scores; shapes (1, 4)."""

@@ -9,13 +9,10 @@ Run it in any folder: ``python 01_first_comparison.py``. It takes some seconds a
 
 from pathlib import Path
 
-from sonar_graph.evaluation.comparison import compare
-from sonar_graph.evaluation.report import write_report
-from sonar_graph.evaluation.storage import write_comparison
-from sonar_graph.evaluation.viewer_files import write_viewer_files
-from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.writing import write_sequence
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.evaluation import compare, write_comparison, write_viewer_files
+from sonar_graph.logs import read_sequence, write_sequence
+from sonar_graph.report import write_report
+from sonar_graph.simulation import BasinOptions, simulate_basin
 
 # A log. One lap of four minutes around four landmarks, with the worse of the two gyros, so that there is drift to
 # correct. A simulated log knows the truth; a recorded one may, and then the report has errors as well.

@@ -9,13 +9,12 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, X
 
-from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.writing import write_sequence
-from sonar_graph.navigation.dvl_preintegration import Preintegrator
-from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.slam import factors
+from sonar_graph.logs import read_sequence, write_sequence
+from sonar_graph.navigation import Odometry
+from sonar_graph.navigation.preintegration import Preintegrator
+from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam.models import factors
 
 # 1. A log: blocks of columns, stamps in integer nanoseconds. `help(sonar_graph)` states frames and units.
 log = Path("basin.mcap")

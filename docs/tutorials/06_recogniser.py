@@ -10,14 +10,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.devices import DEFAULT_DESIGNS
 from sonar_graph.measurements import SonarFrames
-from sonar_graph.simulation.image_options import ImageOptions
-from sonar_graph.simulation.seabed import place_landmark
-from sonar_graph.simulation.sonar_image import FrameSimulator
-from sonar_graph.sonar.geometry import FloorView
-from sonar_graph.sonar.recogniser import Recogniser
-from sonar_graph.sonar.tracking import SonarStep
+from sonar_graph.simulation.sonar_image import FrameSimulator, ImageOptions, place_landmark
+from sonar_graph.sonar import FloorView, Recogniser, SonarStep
 
 # 1. What you bring for each frame: samples, and the pose of the sonar in a world with z up (x along its axis, y left).
 FLOOR_Z_M, PERIOD_NS = -2.0, 200_000_000

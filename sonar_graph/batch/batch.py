@@ -1,24 +1,71 @@
-"""A suite from its file to its table: planned, resumed, done, collected."""
+"""A suite from its file to its table: planned, resumed, done, collected.
+
+Ctrl-C that comes at a bad moment and is not lost, and SIGTERM that counts like it.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import signal
+import threading
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import FrameType
 
-from sonar_graph.batch.execution import Where, run_batch
-from sonar_graph.batch.interrupts import deferred_interrupt
-from sonar_graph.batch.lock import only_batch_in
+from sonar_graph.batch.cluster import Where, run_batch
 from sonar_graph.batch.plan import plan_runs
-from sonar_graph.batch.planned import Limits, Outcome, PlannedRun, Row
-from sonar_graph.batch.results import write_results
-from sonar_graph.batch.store import SUITE, Store
+from sonar_graph.batch.result_table import write_results
+from sonar_graph.batch.store import SUITE, Limits, PlannedRun, Row, RunOutcome, Store, only_batch_in
 from sonar_graph.batch.suite import SuiteFile
 from sonar_graph.errors import BatchError
-from sonar_graph.evaluation.atomic import replacing
+from sonar_graph.files import replacing
+
+
+@contextmanager
+def terminations_as_interrupts() -> Iterator[None]:
+    """Let SIGTERM, by which SLURM, Kubernetes and ``timeout`` end a job, do in the block what Ctrl-C does."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        handler = signal.getsignal(signal.SIGINT)
+        (handler if callable(handler) else signal.default_int_handler)(number, frame)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def deferred_interrupt() -> Iterator[None]:
+    """Let a Ctrl-C that comes during the block count at its end.
+
+    Compiled code without a way to raise (pyarrow has some) swallows the exception, and the batch would go on.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        At the end of the block, when the signal came meanwhile; an error of the block is its context.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(handler):
+        yield
+        return
+    came: list[tuple[int, FrameType | None]] = []
+    signal.signal(signal.SIGINT, lambda number, frame: came.append((number, frame)))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        if came:  # also where the block fails: whoever passes over its error would pass over the interrupt
+            handler(*came[0])
 
 
 @dataclass(frozen=True)
@@ -62,7 +109,7 @@ class Batch:
             if row["status"] != "ok":
                 self.store.discard(key)
 
-    def run(self, where: Where, limits: Limits, progress: Callable[[PlannedRun, Outcome], None]) -> Counter[str]:
+    def run(self, where: Where, limits: Limits, progress: Callable[[PlannedRun, RunOutcome], None]) -> Counter[str]:
         """Do what is not done, and write the table, also where the batch ends early.
 
         Suite and table in the folder are replaced as soon as a run of this plan is done, and not before: the table then
@@ -81,7 +128,7 @@ class Batch:
         missing = [run for run in self.runs if run.key not in done]
         is_begun = self._write_table_if_it_can_be()
 
-        def begun(run: PlannedRun, outcome: Outcome) -> None:
+        def begun(run: PlannedRun, outcome: RunOutcome) -> None:
             nonlocal is_begun
             is_begun = is_begun or self._write_table_if_it_can_be()
             progress(run, outcome)

@@ -3,37 +3,205 @@
 The same suite is run before and after a change. Runs are paired by log, contestant and seed, and each pair gives a log
 ratio: of errors, ``ln(new / old)``; of consistency, ``|ln(new)| - |ln(old)|`` of the normalised squared error (1 is
 consistent). What the ratios of a log, or of all logs together, say of a contestant and column is tested with
-`sonar_graph.batch.worsening_tests`: where nothing got truly worse 5 % of batches fail. A run that fails now and did not
+`sonar_graph.batch.permutation`: where nothing got truly worse 5 % of batches fail. A run that fails now and did not
 is worse without any test. Method: docs/theory/batch_statistics.md.
+
+The file of a reference: what each run of a blessed batch was asked for, and what it reached.
+
+What a person should look at, because no test can judge it: single runs, and logs with hardly any cases.
+
+Of two draws from one distribution the second has the worst run as often as the first, however far off it is. So none of
+this fails a batch. Where runs are deterministic and only the code changed, it is a finding all the same.
 """
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sonar_graph.batch.blessed import check_comparable, name_of, read_reference, told, write_reference
-from sonar_graph.batch.catalogue import KINDS, is_timing, metrics_of
-from sonar_graph.batch.detectable import detectable
-from sonar_graph.batch.incomplete import require_complete
-from sonar_graph.batch.recorded import RecordedBatch, RecordedRun
-from sonar_graph.batch.standing_out import Pair, standing_out
-from sonar_graph.batch.worsening_tests import (
+from sonar_graph.batch.permutation import (
     LEAST_CASES,
     SIGNIFICANT,
     Case,
     Family,
     Group,
     Ratios,
+    detectable,
     families,
+    testable,
     with_all_logs,
 )
+from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch, RecordedRun, require_complete
+from sonar_graph.batch.result_table import KINDS, is_timing, metrics_of
 from sonar_graph.errors import EvaluationError
+from sonar_graph.files import read_json, write_json
 from sonar_graph.measurements import Floats
+
+FORMAT = "sonar_graph batch reference 2"
+Name = tuple[str, str, int | None]
+"""Log, contestant and seed."""
+
+
+def write_reference(batch: RecordedBatch, keys: list[str], path: Path) -> None:
+    """Write all runs with the scores under these keys.
+
+    Raises
+    ------
+    EvaluationError
+        When the results do not say what was asked for.
+    """
+    content = {"format": FORMAT, "suite": batch.name, "versions": batch.runs[0].texts, "metrics": keys}
+    write_json(path, content | {"runs": [_entry(run, keys) for run in batch.runs]})
+
+
+def _entry(run: RecordedRun, keys: list[str]) -> dict[str, Any]:
+    scores = {key: run.values[key] for key in keys if run.ended and key in run.values}
+    names = {"log": run.log, "estimator": run.contestant, "seed": run.seed}
+    return {**names, "asked": asked_of(run), "status": run.status, "scores": scores}
+
+
+def asked_of(run: RecordedRun) -> dict[str, Any]:
+    """What the suite stated of a run.
+
+    Raises
+    ------
+    EvaluationError
+        When the results are of a version that did not record it.
+    """
+    if "asked" not in run.texts:
+        raise EvaluationError(
+            f"{told(name_of(run))}: the results have no column asked, so nobody knows what they are comparable with; "
+            "run bench again in that folder"
+        )
+    return dict(json.loads(run.texts["asked"]))
+
+
+def read_reference(path: Path) -> dict[str, Any]:
+    """Content of a reference, its runs by name.
+
+    Raises
+    ------
+    EvaluationError
+        When the file is no reference of this version.
+    """
+    content = read_json(path)
+    if content.get("format") != FORMAT:
+        raise EvaluationError(
+            f"{path}: format is {content.get('format')!r}, expected {FORMAT!r}; make it again with bench bless, from a "
+            "batch run with the code that it stands for"
+        )
+    runs = {(entry["log"], entry["estimator"], entry["seed"]): entry for entry in content["runs"]}
+    return content | {"runs": runs}
+
+
+def check_comparable(entry: dict[str, Any], run: RecordedRun, path: Path) -> None:
+    """Refuse a run that was asked for something else than the reference's of its name.
+
+    Raises
+    ------
+    EvaluationError
+        With run, field and both values.
+    """
+    before, now = _flat(entry["asked"]), _flat(asked_of(run))
+    for field in sorted(before | now):
+        if (field in before, before.get(field)) != (field in now, now.get(field)):
+            raise EvaluationError(
+                f"{path}: {told(name_of(run))}: {field} is {_value(now, field)}, in the reference "
+                f"{_value(before, field)}; these are different experiments: run the suite of the reference, or bless a "
+                "new one"
+            )
+
+
+def _flat(asked: dict[str, Any]) -> dict[str, Any]:
+    """Fields by name; landmarks that are simulated with nothing stated of them are ``landmarks``, which is ``{}``."""
+    flat: dict[str, Any] = {}
+    for name, value in asked.items():
+        if isinstance(value, dict) and value:
+            flat |= {f"{name}.{inner}": content for inner, content in value.items()}
+        elif value is not None and (value != {} or name == "landmarks"):
+            flat[name] = value
+    return flat
+
+
+def _value(fields: dict[str, Any], field: str) -> str:
+    return json.dumps(fields[field]) if field in fields else "not given"
+
+
+def name_of(run: RecordedRun) -> Name:
+    """Under which a run is found again in another batch of its suite."""
+    return run.log, run.contestant, run.seed
+
+
+def told(name: Name) -> str:
+    """A run in words."""
+    log, contestant, seed = name
+    return f"{log}, {contestant}" + ("" if seed is None else f", seed {seed}")
+
+
+FAR = 2.0
+"""An error so many times the worst that the reference has of a contestant on a log stands out."""
+ALONE = 0.25
+"""Where there is no test, a worsening by more than this share is told."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One score of a run, and what the reference has."""
+
+    run: RecordedRun
+    column: str
+    old: float
+    new: float
+
+
+def standing_out(pairs: list[Pair], ratios: Ratios, consistency: Collection[str]) -> list[str]:
+    """Runs far beyond all that the reference has, the farthest first, then what has too few cases; one line each."""
+    far = _far_runs([pair for pair in pairs if pair.column not in consistency])
+    known = {(pair.run.log, pair.run.contestant) for pair in far}
+    lines = [
+        f"{told(name_of(pair.run))}: {pair.column} is {pair.new:.3g}, before {pair.old:.3g}; more than {FAR:g} times "
+        "the worst of the reference"
+        for pair in far
+    ]
+    return [*lines, *_untested(ratios, known)]
+
+
+def _far_runs(pairs: list[Pair]) -> list[Pair]:
+    """Of each run that is far off in any column the one in which it is farthest."""
+    worst: dict[Group, float] = {}
+    for pair in pairs:
+        group = (pair.run.log, pair.run.contestant, pair.column)
+        worst[group] = max(worst.get(group, 0.0), pair.old)
+    farthest: dict[str, tuple[float, Pair]] = {}
+    for pair in pairs:
+        base = worst[pair.run.log, pair.run.contestant, pair.column]
+        if pair.new > FAR * base > 0:
+            name = told(name_of(pair.run))
+            farthest[name] = max(farthest.get(name, (0.0, pair)), (pair.new / base, pair), key=lambda one: one[0])
+    return [pair for _, pair in sorted(farthest.values(), key=lambda one: -one[0])]
+
+
+def _untested(ratios: Ratios, known: set[tuple[str, str]]) -> list[str]:
+    """Contestants and logs that are up without a test of their own, each with the column that is up most."""
+    have_test = testable(ratios)
+    most: dict[tuple[str, str], tuple[float, int, str]] = {}
+    for (log, contestant, column), own in ratios.items():
+        is_told = log == ALL_LOGS or (log, contestant) in known or (log, contestant, column) in have_test
+        mean = float(np.mean(list(own.values())))
+        if not is_told and mean > np.log1p(ALONE):
+            most[log, contestant] = max(most.get((log, contestant), (0.0, 0, "")), (mean, len(own), column))
+    return [
+        f"{log}, {contestant}: {column} is {np.expm1(mean):.0%} worse; {cases} {'case' if cases == 1 else 'cases'} "
+        "here, which no test judges"
+        for (log, contestant), (mean, cases, column) in most.items()
+    ]
+
 
 TOLERANCE = 0.02
 """Relative worsening of an error that nobody minds."""
@@ -56,7 +224,7 @@ class Worsening:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class GateVerdict:
     """What the gate says."""
 
     worsenings: list[Worsening]
@@ -114,7 +282,7 @@ def gated_keys(batch: RecordedBatch) -> list[str]:
     return [*errors, *CONSISTENCY_KEYS]
 
 
-def gate(batch: RecordedBatch, reference: Path) -> Verdict:
+def gate(batch: RecordedBatch, reference: Path) -> GateVerdict:
     """Judge a batch by a blessed reference.
 
     Raises
@@ -140,7 +308,7 @@ def gate(batch: RecordedBatch, reference: Path) -> Verdict:
     return _verdict(entries, columns, new)
 
 
-def _verdict(entries: list[tuple[dict[str, Any], RecordedRun]], columns: list[str], new: list[str]) -> Verdict:
+def _verdict(entries: list[tuple[dict[str, Any], RecordedRun]], columns: list[str], new: list[str]) -> GateVerdict:
     pairs = [pair for entry, run in entries for pair in _pairs(entry, run, columns)]
     ratios = with_all_logs(_ratios(pairs))
     tested = families(movable(ratios))
@@ -148,7 +316,7 @@ def _verdict(entries: list[tuple[dict[str, Any], RecordedRun]], columns: list[st
     for (_, contestant, _), values in ratios.items():
         cases[contestant].update(values)
     errors = [column for column in columns if column not in CONSISTENCY_KEYS]
-    return Verdict(
+    return GateVerdict(
         worsenings=[*_failures(entries), *worse_groups(ratios, tested)],
         look_at=standing_out(pairs, ratios, CONSISTENCY_KEYS),
         compared=len(entries),

@@ -1,35 +1,54 @@
-"""One run of a batch: sequence, estimator, scores; a folder as `compare` writes it, and a row."""
+"""One run of a batch: sequence, estimator, scores; a folder as `compare` writes it, and a row.
+
+The process in which runs are done, one after the other: ``python -m sonar_graph.batch.one_run``.
+
+Planned runs and preparations come pickled on stdin, outcomes go pickled to what was stdout; whatever is printed, also
+by native code, goes to stderr, which is the run's log. The process ends when stdin does, so it never outlives who
+started it.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import faulthandler
 import json
 import logging
 import math
+import os
+import pickle
 import platform
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from queue import SimpleQueue
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from sonar_graph.batch.plan import sources_now, versions_of
-from sonar_graph.batch.planned import PlannedRun, Row
 from sonar_graph.batch.sources import fingerprint, read_source
+from sonar_graph.batch.store import PlannedRun, Preparation, Row, RunOutcome
 from sonar_graph.errors import BatchError, EstimatorError
 from sonar_graph.estimator import load_estimator
-from sonar_graph.evaluation.comparison import judge
-from sonar_graph.evaluation.environment import LIBRARIES, describe_environment
-from sonar_graph.evaluation.results import Comparison, ErrorSeries, RunResult
-from sonar_graph.evaluation.run import one_line, run_estimator
-from sonar_graph.evaluation.storage import write_comparison
+from sonar_graph.evaluation import (
+    LIBRARIES,
+    Comparison,
+    ErrorSeries,
+    RunResult,
+    describe_environment,
+    judge,
+    one_line,
+    run_estimator,
+    write_comparison,
+)
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks
+from sonar_graph.simulation import LandmarkOptions, add_landmarks
 
 KEPT_SEQUENCES = 3
 """Estimators of one log mostly follow each other in a process; one is that of the warm-up."""
@@ -222,3 +241,55 @@ def _as_text(values: dict[str, Any] | None) -> str:
 
 def _told(versions: dict[str, str], names: list[str]) -> str:
     return ", ".join(f"{name} {versions.get(name, 'missing')}" for name in names)
+
+
+READY = "ready"
+
+
+def main() -> None:
+    """Do runs until there are no more."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    faulthandler.enable()
+    logging.basicConfig(stream=sys.stderr, level=logging.INFO)
+    requests: SimpleQueue[PlannedRun | Preparation] = SimpleQueue()
+
+    threading.Thread(target=_listen, args=(sys.stdin.buffer, requests), daemon=True).start()
+    _answer(answers, READY)
+    while True:
+        request = requests.get()
+        try:
+            _answer(answers, _prepared(request) if isinstance(request, Preparation) else _outcome(request))
+        except Exception as error:  # told to who waits for the answer
+            _answer(answers, error)
+
+
+def _outcome(run: PlannedRun) -> RunOutcome:
+
+    with tempfile.TemporaryDirectory(prefix="sonar-graph-run-") as scratch:
+        folder = Path(scratch)
+        row = perform(run, folder)
+        paths = sorted(path for path in folder.rglob("*") if path.is_file())
+        return RunOutcome(row, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths})
+
+
+def _prepared(preparation: Preparation) -> str:
+
+    warm_up(preparation.run)
+    return READY
+
+
+def _listen(source: BinaryIO, requests: SimpleQueue[PlannedRun | Preparation]) -> None:
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            requests.put(pickle.load(source))
+    os._exit(0)
+
+
+def _answer(answers: BinaryIO, content: object) -> None:
+    pickle.dump(content, answers)
+    answers.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -17,10 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from sonar_graph.batch.planned import NOT_RUN
-from sonar_graph.batch.store import LOCK, LOG, ROW, RUNS, SUITE
+from sonar_graph.batch.store import LOCK, LOG, NOT_RUN, ROW, RUNS, SUITE
 from sonar_graph.errors import EvaluationError
-from sonar_graph.evaluation.strict_json import read_json
+from sonar_graph.files import read_json
 from sonar_graph.measurements import Floats
 
 RESULTS = "results.parquet"
@@ -283,3 +282,27 @@ def _run(row: dict[str, Any], place: int) -> RecordedRun:
 
 def _as_text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, sort_keys=True, default=str)
+
+
+def require_complete(batch: RecordedBatch, subject: str | Path, purpose: str) -> None:
+    """Refuse a batch with missing runs.
+
+    Parameters
+    ----------
+    subject
+        What the message begins with.
+    purpose
+        What the batch cannot do, for the message.
+
+    Raises
+    ------
+    EvaluationError
+        When a planned run was not done.
+    """
+    if batch.missing:
+        raise EvaluationError(f"{subject}: the batch {batch.name!r} cannot {purpose}, {_count_told(batch)}; {GOING_ON}")
+
+
+def _count_told(batch: RecordedBatch) -> str:
+    planned = len(batch.runs) + len(batch.missing)
+    return f"{len(batch.missing)} of {planned} runs {'has' if len(batch.missing) == 1 else 'have'} not been done"

@@ -1,13 +1,16 @@
 """Where the sequences of a batch come from: logs, data sets, simulators.
 
 A source is a kind and its options; with a seed it gives the same sequence on every machine that has the files.
+
+Whether a file is still the one that was read, told without reading it again.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -16,20 +19,43 @@ from typing import Any
 import gtsam
 from pydantic import Field
 
-from sonar_graph.batch.file_stamp import Stamp, files_below, stamp_of
 from sonar_graph.calibration import Section
 from sonar_graph.errors import CalibrationError
-from sonar_graph.logs.adapters.config import LogConfig, read_log_config
-from sonar_graph.logs.calibration_sources import PartialCalibration
-from sonar_graph.logs.converters.akit import read_akit
-from sonar_graph.logs.converters.mrclam import read_mrclam
-from sonar_graph.logs.converters.victoria_park import read_victoria_park
-from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.records import LogFile
-from sonar_graph.logs.window import Instant, Window
+from sonar_graph.logs import PartialCalibration, read_sequence
+from sonar_graph.logs.adapters import LogConfig, read_log_config
+from sonar_graph.logs.convert import read_akit, read_mrclam, read_victoria_park
+from sonar_graph.logs.mcap import Instant, LogFile, TimeWindow
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.basin import BasinOptions, cruise_speed, simulate_basin
-from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.simulation import BasinOptions, MissionOptions, cruise_speed, simulate_basin, simulate_mission
+
+Stamp = tuple[int, int, int, int]
+
+
+def stamp_of(path: Path | os.DirEntry[str]) -> Stamp:
+    """Inode, size, and the times in ns of the last change of content and of status; the last one cannot be set back."""
+    state = path.stat()
+    return state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns
+
+
+def files_below(
+    folder: str, is_passed_over: Callable[[str], bool] = lambda _name: False, around: tuple[str, ...] = ()
+) -> Iterator[os.DirEntry[str]]:
+    """Files in a folder and in those within, linked ones too, since readers and imports follow links.
+
+    Entries rather than paths: runs wait for this list. A link to a folder around it is passed over.
+    """
+    here = os.path.realpath(folder)
+    if here in around:
+        return
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if is_passed_over(entry.name):
+                continue
+            if entry.is_dir():
+                yield from files_below(entry.path, is_passed_over, (*around, here))
+            elif entry.is_file():
+                yield entry
+
 
 _BLOCK_BYTES = 1 << 20
 
@@ -96,9 +122,9 @@ def _check_log(options: LogOptions) -> None:
         _window(options)
 
 
-def _window(options: LogOptions) -> Window:
+def _window(options: LogOptions) -> TimeWindow:
     first, last = (None if text is None else Instant.parse(text) for text in (options.start, options.end))
-    return Window(first, last)
+    return TimeWindow(first, last)
 
 
 def _read_config(name: str | None) -> LogConfig | None:

@@ -1,4 +1,6 @@
-"""Runs on disk: each written once, whole or not at all, under its key.
+"""What is done, under which limits, and what comes of it: the words that batch, workers and processes share.
+
+Runs on disk: each written once, whole or not at all, under its key.
 
 ::
 
@@ -11,6 +13,8 @@
 
 A run's folder is filled under another name and then renamed, and has another name again before it is removed. So a
 folder that has its name is complete.
+
+One batch at a time in a folder: two would remove each other's half-written runs, and write one table.
 """
 
 from __future__ import annotations
@@ -18,11 +22,78 @@ from __future__ import annotations
 import contextlib
 import shutil
 import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Literal
 
-from sonar_graph.batch.planned import Outcome, Row
-from sonar_graph.errors import EvaluationError
-from sonar_graph.evaluation.strict_json import read_json, write_json
+from filelock import FileLock, Timeout
+
+from sonar_graph.errors import BatchError, EvaluationError
+from sonar_graph.files import read_json, write_json
+
+Status = Literal["ok", "failed", "timeout", "memory", "killed"]
+NOT_RUN = "not run"
+"""In place of the status of a run that is planned and was not done: the table has a row for it too."""
+Row = dict[str, str | int | float | None]
+"""Of the table of results, by column."""
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run: all that a process needs to do it, and nothing that it would have to ask for."""
+
+    key: str
+    """Of everything that decides its outcome: content of the log or options of the simulator, seed, estimator,
+    settings, rate, versions, source. Equal keys, equal numbers."""
+    suite: str
+    log: str
+    """Name with the values of its grid."""
+    kind: str
+    """Generator, data set, or ``mcap``."""
+    options: dict[str, Any]
+    content: dict[str, Any]
+    """`sonar_graph.batch.sources.fingerprint` of kind and options when the run was planned."""
+    landmarks: dict[str, Any] | None
+    seed: int | None
+    estimator: str
+    variant: str
+    overrides: dict[str, Any]
+    """Settings that were given; an estimator may tell them from equal defaults."""
+    params: dict[str, Any]
+    """All settings; of an estimator that cannot be loaded those that were given."""
+    rate_hz: float
+    versions: dict[str, str]
+    asked: dict[str, Any]
+    """What the suite states of it, of files their content, without what it leaves to defaults: two runs of one name are
+    comparable where these are equal, though a default or the code was changed between them."""
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What a process is asked before the first run of an estimator, and before the clock of that run starts."""
+
+    run: PlannedRun
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a run may take."""
+
+    timeout_s: float
+    memory_mb: float | None = None
+    """Resident memory of its process and of those that it starts, 10⁶ bytes; None: no limit but the machine's."""
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """What a run left: a row of what was measured, files by their path within its folder, and its log."""
+
+    row: Row
+    files: dict[str, bytes] = field(default_factory=dict)
+    log: str = ""
+
 
 RUNS, ROW, LOG = "runs", "row.json", "log.txt"
 KEY = "key"
@@ -50,7 +121,7 @@ class Store:
             return None
         return row if row.pop(KEY, None) == key else None
 
-    def write(self, key: str, outcome: Outcome) -> None:
+    def write(self, key: str, outcome: RunOutcome) -> None:
         """Keep a run.
 
         Raises
@@ -88,3 +159,32 @@ class Store:
     def log_file(self, key: str) -> str:
         """Where the log of a run is, from the store's folder on."""
         return f"{RUNS}/{key}/{LOG}"
+
+
+@contextmanager
+def only_batch_in(folder: Path) -> Iterator[None]:
+    """Keep every other batch out of a folder while the block runs.
+
+    The operating system holds the lock and gives it up with the process, however that ends. The file stays behind and
+    means nothing.
+
+    Raises
+    ------
+    BatchError
+        When another batch runs there, or the file system has no locks.
+    """
+    lock = FileLock(folder / LOCK, timeout=0, fallback_to_soft=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise BatchError(
+            f"{folder}: another batch is running in this folder; wait for its end, or choose another folder with -o"
+        ) from None
+    except (OSError, NotImplementedError) as error:
+        raise BatchError(
+            f"{folder}: cannot be locked against a second batch ({error}); choose another file system with -o"
+        ) from error
+    try:
+        yield
+    finally:
+        lock.release()

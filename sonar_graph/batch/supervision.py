@@ -1,6 +1,6 @@
 """Runs watched from outside: ended when they take too long or too much memory, repeated once when they are killed.
 
-A run is done in a process of its own kind (`sonar_graph.batch.runner`), because native code cannot be stopped from
+A run is done in a process of its own kind (`sonar_graph.batch.one_run`), because native code cannot be stopped from
 within, and because a crash must not take the Dask worker with it. The process is kept for the next run.
 """
 
@@ -22,10 +22,10 @@ from typing import Any, BinaryIO
 
 import psutil
 
-from sonar_graph.batch.planned import Limits, Outcome, PlannedRun, Preparation, Row
-from sonar_graph.batch.runner import READY
+from sonar_graph.batch.one_run import READY
+from sonar_graph.batch.store import Limits, PlannedRun, Preparation, Row, RunOutcome
 from sonar_graph.errors import BatchError
-from sonar_graph.evaluation.environment import describe_environment
+from sonar_graph.evaluation import describe_environment
 
 ONE_THREAD = (
     *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"),
@@ -52,7 +52,7 @@ class KilledError(Exception):
     """The process of a run ended by itself, or was ended by somebody else."""
 
 
-def perform_watched(run: PlannedRun, limits: Limits) -> Outcome:
+def perform_watched(run: PlannedRun, limits: Limits) -> RunOutcome:
     """Do a run in one of this process's runners; one that is killed is done once more.
 
     Returns
@@ -72,7 +72,7 @@ def perform_watched(run: PlannedRun, limits: Limits) -> Outcome:
                 return replace(outcome, row=_here() | outcome.row)
             except KilledError as error:
                 reason, log = str(error), runner.log()
-    return Outcome({**_here(), "status": "killed", "reason": f"{reason}, {ATTEMPTS} times"}, log=log)
+    return RunOutcome({**_here(), "status": "killed", "reason": f"{reason}, {ATTEMPTS} times"}, log=log)
 
 
 def _here() -> Row:
@@ -108,7 +108,7 @@ class Runner:
     def __init__(self) -> None:
         self._log = tempfile.TemporaryFile(mode="a+b")  # noqa: SIM115  it is open as long as the process runs
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "sonar_graph.batch.runner"],
+            [sys.executable, "-P", "-m", "sonar_graph.batch.one_run"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._log,
@@ -147,7 +147,7 @@ class Runner:
         """Whether it can take a run."""
         return not self._is_busy and self._process.poll() is None
 
-    def perform(self, run: PlannedRun, limits: Limits) -> Outcome:
+    def perform(self, run: PlannedRun, limits: Limits) -> RunOutcome:
         """Do one run, after a warm-up where it is the first of its estimator here.
 
         Raises
@@ -161,7 +161,7 @@ class Runner:
             self._warm.add(run.estimator)
             answer = self._ask(Preparation(run), Limits(WARM_UP_S))
             if answer != READY:
-                return Outcome(answer.row, log=self.log())
+                return RunOutcome(answer.row, log=self.log())
         self._log.truncate(0)
         began = time.monotonic()
         answer = self._ask(run, limits)
@@ -208,7 +208,7 @@ class Runner:
                 raise KilledError(self._ending())
             excess = self._excess(limits, deadline)
             if excess is not None:
-                return Outcome(excess)
+                return RunOutcome(excess)
 
     def _excess(self, limits: Limits, deadline: float) -> Row | None:
         """The row of a run that exceeds its limits."""

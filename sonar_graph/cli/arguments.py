@@ -1,11 +1,28 @@
-"""Arguments and options that several commands share."""
+"""Arguments and options that several commands share.
+
+Settings given on the command line or in a file: ``--set``, ``--topic``, ``--log-config``, ``--start``.
+
+What commands say in the same way everywhere.
+"""
 
 from __future__ import annotations
 
+import json
+import tomllib
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
+
+from sonar_graph.errors import CalibrationError, EstimatorError, EvaluationError, LogError
+
+if TYPE_CHECKING:
+    from sonar_graph.logs import PartialCalibration
+    from sonar_graph.logs.adapters import LogConfig
+    from sonar_graph.logs.mcap import TimeWindow
+    from sonar_graph.sequence import Sequence
+
 
 LogPath = Annotated[
     Path, typer.Argument(metavar="LOG", exists=True, dir_okay=False, readable=True, help="MCAP log to read.")
@@ -102,3 +119,178 @@ RuleName = Annotated[
         help="How beliefs are updated: virtual-evidence (ours, the default) or jeffrey (the 2014 paper's equations).",
     ),
 ]
+_SLACK = 1.01
+"""For a rate that is counted, not stated."""
+
+
+def parse_setting(text: str) -> tuple[str, Any]:
+    """Name and value of ``name=value``; the value is read as TOML, and as plain text where it is none.
+
+    Raises
+    ------
+    EstimatorError
+        When there is no name or no ``=``.
+    """
+    name, equals, value = text.partition("=")
+    if not equals or not name.strip():
+        raise EstimatorError(f"--set {text}: expected name=value")
+    return name.strip(), _plain_value(value.strip())
+
+
+def nested_settings(texts: list[str]) -> dict[str, Any]:
+    """Settings by name, from texts such as ``laps=2``; dots go into nested settings: ``image.noise_db=20``.
+
+    Raises
+    ------
+    EstimatorError
+        When there is no name or no ``=``, or one comes again with another value.
+    """
+    settings: dict[str, Any] = {}
+    for path, value in _each_once(texts).items():
+        _put(settings, path.split("."), value)
+    return settings
+
+
+def _plain_value(text: str) -> Any:
+    if "\n" in text:
+        return text
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def estimator_settings(texts: list[str], names: list[str]) -> dict[str, dict[str, Any]]:
+    """Settings by estimator, from texts such as ``isam2.lag_s=20``; deeper dots go into nested settings.
+
+    Raises
+    ------
+    EstimatorError
+        When a text does not begin with one of the estimators that run, or one setting comes again with another value.
+    """
+    settings: dict[str, dict[str, Any]] = {}
+    for path, value in _each_once(texts).items():
+        estimator, dot, setting = path.partition(".")
+        if dot and estimator not in names:
+            raise EstimatorError(f"--set {path}: {estimator} is not among the estimators that run: {', '.join(names)}")
+        if not dot or not all(setting.split(".")):
+            raise EstimatorError(f"--set {path}: expected ESTIMATOR.setting=value with one of {', '.join(names)}")
+        _put(settings.setdefault(estimator, {}), setting.split("."), value)
+    return settings
+
+
+def _each_once(texts: list[str]) -> dict[str, Any]:
+    """Values by the names before ``=``; one name may come again only with the same value."""
+    settings: dict[str, Any] = {}
+    for text in texts:
+        path, value = parse_setting(text)
+        if path in settings and settings[path] != value:
+            raise EstimatorError(f"--set {text}: {path} is also set to {settings[path]}; give it once")
+        settings[path] = value
+    return settings
+
+
+def _put(tree: dict[str, Any], path: list[str], value: Any) -> None:
+    for name in path[:-1]:
+        if not isinstance(tree.get(name), dict):
+            tree[name] = {}
+        tree = tree[name]
+    tree[path[-1]] = value
+
+
+def topic_choices(texts: list[str]) -> dict[str, str]:
+    """Topics by role, from texts such as ``imu=/imu/data``.
+
+    Raises
+    ------
+    LogError
+        When there is no role, no ``=`` or no topic.
+    """
+    choices = {}
+    for text in texts:
+        role, _, topic = text.partition("=")
+        if not role or not topic:
+            raise LogError(f"--topic {text}: expected ROLE=TOPIC such as imu=/imu/data")
+        choices[role] = topic
+    return choices
+
+
+def check_rate(rate_hz: float, sequence: Sequence, default_hz: float) -> None:
+    """Refuse to ask for estimates more often than the IMU measures; the default rate holds for any log.
+
+    Raises
+    ------
+    EvaluationError
+        Naming the highest rate.
+    """
+    stamps_ns = sequence.imu.stamps_ns
+    imu_hz = len(stamps_ns) / max(float(stamps_ns[-1] - stamps_ns[0]) * 1e-9, 1.0)
+    highest_hz = max(default_hz, imu_hz)
+    if rate_hz > highest_hz * _SLACK:
+        raise EvaluationError(
+            f"--rate-hz {rate_hz:g}: the IMU of {sequence.name} measures {imu_hz:.4g} times a second; "
+            f"give at most {highest_hz:.4g}"
+        )
+
+
+def read_config(path: Path | None) -> LogConfig | None:
+    """What a TOML file says about a log's topics; None where no file is given.
+
+    Raises
+    ------
+    LogError
+        When the file is not TOML, or says something that cannot be.
+    """
+    from sonar_graph.logs.adapters import read_log_config
+
+    return None if path is None else read_log_config(path)
+
+
+def read_calibration(path: Path | None) -> PartialCalibration | None:
+    """What a TOML or JSON file says of the calibration, before the log's own; None where no file is given.
+
+    Raises
+    ------
+    CalibrationError
+        When the file is neither TOML nor JSON, or a field does not fit.
+    """
+    from sonar_graph.logs import PartialCalibration
+
+    if path is None:
+        return None
+    try:
+        text = path.read_text(encoding="utf-8")
+        values = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except (json.JSONDecodeError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        kind = "JSON" if path.suffix == ".json" else "TOML"
+        raise CalibrationError(f"{path}: not {kind}: {error}") from error
+    if not isinstance(values, dict):
+        raise CalibrationError(f"{path}: expected an object with sections such as imu, not {json.dumps(values):.40}")
+    return PartialCalibration.parse(values, str(path))
+
+
+def window_of(start: str | None, end: str | None) -> TimeWindow:
+    """The part of a log that ``--start`` and ``--end`` name.
+
+    Raises
+    ------
+    LogError
+        When one is no time.
+    """
+    from sonar_graph.logs.mcap import Instant, TimeWindow
+
+    return TimeWindow(Instant.parse(start) if start else None, Instant.parse(end) if end else None)
+
+
+WIDTH_OF_A_FILE = 200
+
+
+def examples(*commands: str) -> str:
+    """Commands to copy, for the end of a help page; an empty line keeps each on a line of its own."""
+    return "\n\n".join(["Examples:", *commands])
+
+
+def answers() -> Console:
+    """Where results go: stdout, and where that is no terminal, wide enough for lines to stay whole."""
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=WIDTH_OF_A_FILE)

@@ -1,10 +1,17 @@
-"""Places to write to, tried before any long work begins; nothing that the user wrote is overwritten."""
+"""Places to write to, tried before any long work begins; nothing that the user wrote is overwritten.
+
+Progress on stderr, for people only: silent where stderr is no terminal.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryFile
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sonar_graph.errors import EvaluationError, LogError, SonarGraphError
 
@@ -110,7 +117,7 @@ def _is_part_of(path: Path, source: Path) -> bool:
 
 def _is_replaceable(path: Path) -> bool:
     """Whether a file holds nothing, or what this package can make again."""
-    from sonar_graph.logs.recorder import is_own_log
+    from sonar_graph.logs.mcap import is_own_log
 
     return not path.exists() or path.stat().st_size == 0 or is_own_log(path)
 
@@ -123,3 +130,35 @@ def _require_writing_in(folder: Path, path: Path, refusal: type[SonarGraphError]
             pass
     except OSError as error:
         raise refusal(f"{path}: cannot be written: {error.strerror}; choose another place with -o") from error
+
+
+Report = Callable[[str, int, int], None]
+"""Called with what is being done, how many steps are done, and how many there are (0: not known)."""
+
+
+@contextmanager
+def progress_bars() -> Iterator[Report]:
+    """One bar for each thing that is reported on, while the context is open."""
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(elapsed_when_finished=True))
+    bars = Progress(*columns, console=console, disable=not console.is_terminal, transient=True)
+    tasks = {}
+
+    def show(what: str, done: int, total: int) -> None:
+        if what not in tasks:
+            tasks[what] = bars.add_task(what, total=total or None)
+        bars.update(tasks[what], completed=done, total=total or None)
+
+    with bars:
+        yield show
+
+
+@contextmanager
+def working(what: str) -> Iterator[None]:
+    """A spinner beside ``what``, for work whose length is not known."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield
+        return
+    with console.status(what):
+        yield

@@ -1,20 +1,53 @@
-"""Several estimators on the same measurements, asked at the same instants, judged by the same truth."""
+"""Several estimators on the same measurements, asked at the same instants, judged by the same truth.
+
+What a comparison ran on: versions, machine, date, command.
+"""
 
 from __future__ import annotations
 
+import os
+import platform
+import shlex
+import sys
 from collections.abc import Callable
+from datetime import UTC, datetime
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
+import sonar_graph
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.consistency import error_series
-from sonar_graph.evaluation.environment import describe_environment
-from sonar_graph.evaluation.instants import ScoredInstants, rows_at, scored_instants
 from sonar_graph.evaluation.results import Comparison, ErrorSeries, Kind, RunResult, Score
 from sonar_graph.evaluation.run import check_request, run_estimator
+from sonar_graph.evaluation.scored_instants import ScoredInstants, rows_at, scored_instants
 from sonar_graph.evaluation.scores import detection_scores, landmark_scores, resource_scores, trajectory_scores
 from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Trajectory
+
+LIBRARIES = ("gtsam", "numpy", "scipy", "numba")
+
+
+def describe_environment() -> dict[str, str]:
+    """Versions, machine, date (UTC) and command, each as text."""
+    command = [Path(sys.argv[0]).name, *sys.argv[1:]]
+    return {
+        "sonar_graph": sonar_graph.__version__,
+        "python": platform.python_version(),
+        **_library_versions(),
+        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} processors",
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": shlex.join(command),
+    }
+
+
+@lru_cache
+def _library_versions() -> dict[str, str]:
+    """Looked up once: each look goes through all that is installed."""
+    return {library: version(library) for library in LIBRARIES}
+
 
 LEAST_INSTANTS = 2
 """Fewer scored instants than this make no trajectory."""

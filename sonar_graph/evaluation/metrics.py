@@ -1,6 +1,13 @@
 """Errors of trajectories and maps against the truth. Equations: docs/theory/metrics.md.
 
 Every function of two trajectories takes them at the same instants; `Trajectory.at` brings a truth there.
+
+Rigid alignment of an estimate with the truth: what is left of an error without the choice of world frame.
+
+Landmarks that an estimator has named itself, matched to the true ones by their place.
+
+An estimator that is not told identities gives its landmarks some of its own, from `FIRST_ANONYMOUS_ID` on. Maps are
+compared by identity, so that no landmark is ever mistaken for a known one; to score these, they are named first.
 """
 
 from __future__ import annotations
@@ -8,12 +15,79 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from sonar_graph.errors import EvaluationError
-from sonar_graph.evaluation.alignment import align_se3, align_yaw
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import NS_PER_S
-from sonar_graph.states import LandmarkMap, Trajectory
+from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap, Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A rigid motion of the estimate's world into the truth's: ``p_truth = rotation @ p_estimate + translation``."""
+
+    rotation: Floats
+    """Shape (3, 3)."""
+    translation: Floats
+    """Shape (3,), metres."""
+
+    def apply(self, points: Floats) -> Floats:
+        """Points moved into the truth's world, shape (n, 3)."""
+        return np.asarray(points @ self.rotation.T + self.translation)
+
+
+def umeyama(points: Floats, targets: Floats) -> tuple[Floats, Floats]:
+    """The rotation and translation that minimise ``sum |targets - (R points + t)|²``, without scale.
+
+    Where the points leave the rotation open (all in one place, or in 3-D on one line) it is one of the best.
+
+    Parameters
+    ----------
+    points, targets
+        Paired, shape (n, d), n >= 1.
+
+    Returns
+    -------
+    R : shape (d, d), determinant +1
+    t : shape (d,)
+
+    Raises
+    ------
+    EvaluationError
+        When there is no pair, or the shapes differ.
+
+    References
+    ----------
+    S. Umeyama, Least-squares estimation of transformation parameters between two point patterns, IEEE Transactions
+    on Pattern Analysis and Machine Intelligence 13(4), 1991. Equation numbers below are his.
+    """
+    if points.shape != targets.shape or not len(points):
+        raise EvaluationError(f"alignment needs paired points, at least one; got {points.shape} and {targets.shape}")
+    mean_x, mean_y = points.mean(axis=0), targets.mean(axis=0)  # (34), (35)
+    covariance = (targets - mean_y).T @ (points - mean_x) / len(points)  # (38)
+    U, _, Vt = np.linalg.svd(covariance)
+    S = np.ones(points.shape[1])
+    S[-1] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))  # (43), which (39) equals at full rank
+    R = (U * S) @ Vt  # (40)
+    return R, mean_y - R @ mean_x  # (41) with c = 1
+
+
+def align_se3(points: Floats, targets: Floats) -> Alignment:
+    """The best rotation and translation in three dimensions, from points of shape (n, 3)."""
+    return Alignment(*umeyama(points, targets))
+
+
+def align_yaw(points: Floats, targets: Floats) -> Alignment:
+    """The best rotation about the vertical and translation: the four directions that sonar, IMU and Doppler cannot see.
+
+    Height and heading do not meet in the sum of squares, so its horizontal part is also the best SE(2) alignment.
+    Points have shape (n, 3).
+    """
+    rotation, translation = np.eye(3), (targets - points).mean(axis=0)
+    rotation[:2, :2], translation[:2] = umeyama(points[:, :2], targets[:, :2])
+    return Alignment(rotation, translation)
+
 
 PAIRING_TOLERANCE = 0.01
 """A pair for the relative error may be this fraction of the delta longer or shorter than it."""
@@ -158,3 +232,38 @@ def _body_displacement(trajectory: Trajectory, first: Ints, second: Ints) -> Flo
     """Position at ``second`` in the body frame at ``first``, shape (k, 3)."""
     step = trajectory.positions[second] - trajectory.positions[first]
     return np.asarray(np.einsum("kji,kj->ki", trajectory.matrices[first], step))
+
+
+FARTHEST_M = 1.0
+"""Farther from a true landmark than this, horizontally, one without a name is not taken for it when it is scored."""
+
+
+def anonymous_named(estimated: LandmarkMap, true: LandmarkMap | None) -> LandmarkMap:
+    """The map as it is scored: landmarks without a name get that of the true one within `FARTHEST_M`."""
+    return estimated if true is None else named_by_place(estimated, true, FARTHEST_M)
+
+
+def named_by_place(estimated: LandmarkMap, true: LandmarkMap, farthest_m: float) -> LandmarkMap:
+    """The estimated map, in which landmarks of unknown identity get that of the true landmark at their place.
+
+    Of all matchings one to one between landmarks of unknown identity and true ones that no identity of the map names,
+    the one with the most pairs within ``farthest_m``, horizontally, and of these the one with the least sum of squared
+    distances (Kuhn, Naval Research Logistics 2, 1955). What is matched with none keeps its identity.
+
+    Parameters
+    ----------
+    farthest_m
+        Farther apart than this nothing is matched. Neither map is aligned.
+    """
+    unknown = np.flatnonzero((estimated.ids >= FIRST_ANONYMOUS_ID) & ~np.isin(estimated.ids, true.ids))
+    free = np.flatnonzero(~np.isin(true.ids, estimated.ids))
+    apart = estimated.positions[unknown, None, :2] - true.positions[None, free, :2]
+    squared = np.sum(apart**2, axis=-1)
+    is_near = squared <= farthest_m**2
+    too_far = farthest_m**2 * (min(squared.shape) + 1)
+    rows, columns = linear_sum_assignment(np.where(is_near, squared, too_far))
+    matched = is_near[rows, columns]
+    ids = estimated.ids.copy()
+    ids[unknown[rows[matched]]] = true.ids[free[columns[matched]]]
+    order = np.argsort(ids)
+    return LandmarkMap(ids[order], estimated.positions[order], estimated.covariances[order])

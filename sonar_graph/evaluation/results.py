@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any, Literal
 
 import numpy as np
 
-from sonar_graph.evaluation.recognition import Recognition
 from sonar_graph.measurements import Floats, Ints
+from sonar_graph.recognition import Recognition
 from sonar_graph.sequence import Sequence
-from sonar_graph.states import DetectionLog, LandmarkMap, RefusedRow, Trajectory
+from sonar_graph.states import DetectionLog, LandmarkMap, Refusal, RefusedRow, Trajectory
 
 Kind = Literal["causal", "smoothed"]
 
@@ -103,3 +106,98 @@ class Comparison:
     """Versions, machine, date, and the command that made it."""
     recognition: Recognition | None = None
     """How the detections came from sonar images; None where the log had detections or no images."""
+
+
+ABSENT = "\N{EN DASH}"
+
+
+def format_value(value: float) -> str:
+    """A number with three significant digits; whole numbers and thousands in full; a dash where there is none."""
+    if math.isnan(value):
+        return ABSENT
+    if math.isinf(value):
+        return "∞" if value > 0 else "\N{MINUS SIGN}∞"
+    if float(value).is_integer() or abs(value) >= 1000:
+        text = f"{value:.0f}"
+    elif abs(value) < 1e-3:
+        mantissa, exponent = f"{value:.2e}".split("e")
+        text = f"{mantissa}e{int(exponent)}"
+    else:
+        rounded = float(f"{value:.3g}")
+        text = f"{rounded:.{max(0, 2 - math.floor(math.log10(abs(rounded))))}f}"
+    return text.replace("-", "\N{MINUS SIGN}")
+
+
+MOST_ROWS_NAMED = 5
+"""Rows of one sensor and reason that are named one by one, more are gathered; of what was withheld the first ones."""
+
+
+@dataclass(frozen=True)
+class RefusedRows:
+    """One row, or several of one sensor that were refused for one reason."""
+
+    sensor: str
+    reason: Refusal
+    count: int
+    first_ns: int
+    last_ns: int
+    least_and_largest_distance: tuple[float, float] | None
+    """Squared Mahalanobis distances; None where the reason has none."""
+
+    @classmethod
+    def of(cls, rows: list[RefusedRow]) -> RefusedRows:
+        """From rows with the same sensor and reason."""
+        stamps_ns = [row.stamp_ns for row in rows]
+        distances = [row.distance for row in rows if not math.isnan(row.distance)]
+        ends = (min(distances), max(distances)) if distances else None
+        return cls(rows[0].sensor, rows[0].reason, len(rows), min(stamps_ns), max(stamps_ns), ends)
+
+    def times(self, start_ns: int) -> str:
+        """In seconds after the start, from the first to the last."""
+        return " to ".join(f"{(stamp_ns - start_ns) * 1e-9:.3f}" for stamp_ns in sorted({self.first_ns, self.last_ns}))
+
+    def distances(self) -> str:
+        """From the least to the largest; empty where the reason has none."""
+        return " to ".join(format_value(distance) for distance in sorted(set(self.least_and_largest_distance or ())))
+
+
+def gathered(rows: Iterable[RefusedRow]) -> list[RefusedRows]:
+    """Each row where a sensor has few for a reason, else all in one; in order of sensors, reasons and stamps."""
+    ordered = sorted(rows, key=lambda row: (row.sensor, row.reason, row.stamp_ns))
+    found: list[RefusedRows] = []
+    for _, alike in groupby(ordered, key=lambda row: (row.sensor, row.reason)):
+        several = list(alike)
+        found += (
+            [RefusedRows.of(several)] if len(several) > MOST_ROWS_NAMED else [RefusedRows.of([row]) for row in several]
+        )
+    return found
+
+
+LABELS = {
+    "ate_raw_m": "Position error, not aligned (ATE, RMS)",
+    "ate_yaw_m": "Position error, yaw and translation aligned (ATE, RMS)",
+    "ate_se2_m": "Horizontal position error, SE(2) aligned (ATE, RMS)",
+    "ate_se3_m": "Position error, SE(3) aligned (ATE, RMS)",
+    "rpe_1s_m": "Drift over 1 s (RPE, RMS)",
+    "rpe_10s_m": "Drift over 10 s (RPE, RMS)",
+    "rpe_1s_rad": "Yaw drift over 1 s (RPE, RMS)",
+    "rpe_10s_rad": "Yaw drift over 10 s (RPE, RMS)",
+    "yaw_rmse_rad": "Yaw error (RMS)",
+    "return_error_m": "Return error: last position",
+    "nees_position": "Position NEES per degree of freedom",
+    "nees_yaw": "Yaw NEES",
+    "raw_m": "Horizontal landmark error, not aligned (RMS)",
+    "se2_m": "Horizontal landmark error, SE(2) aligned (RMS)",
+    "count": "Landmarks mapped",
+    "nees": "Landmark NEES per degree of freedom",
+    "used": "Detections used",
+    "refused": "Detections refused",
+    "unnamed": "Detections of no landmark that is probable enough",
+    "nis": "NIS per degree of freedom",
+    "update_median_ms": "Per update, median",
+    "update_p99_ms": "Per update, 99th percentile",
+    "update_max_ms": "Per update, longest",
+    "total_s": "Whole run",
+    "real_time_factor": "Real-time factor: log duration over run time",
+    "peak_mb": "Peak memory added by the run",
+}

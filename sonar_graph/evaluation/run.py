@@ -1,4 +1,9 @@
-"""One estimator over one sequence: replayed, timed, checked. Its failure is a result with a reason."""
+"""One estimator over one sequence: replayed, timed, checked. Its failure is a result with a reason.
+
+The process's resident memory, where the operating system tells it.
+
+What an estimator handed back, checked before anyone judges it.
+"""
 
 from __future__ import annotations
 
@@ -8,20 +13,118 @@ import logging
 import textwrap
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sonar_graph.calibration import Section
-from sonar_graph.errors import EstimatorError, UnknownEstimatorError
+from sonar_graph.errors import EstimatorError, EvaluationError, UnknownEstimatorError
 from sonar_graph.estimator import Estimator, load_estimator, make_params, refused_rows_of, withheld_of
-from sonar_graph.evaluation.instants import map_instants
-from sonar_graph.evaluation.memory import PeakMemory
-from sonar_graph.evaluation.outcome import check_estimate, check_outcome
 from sonar_graph.evaluation.results import MapSoFar, RunResult
-from sonar_graph.measurements import Ints, LandmarkDetections, Measurements
+from sonar_graph.evaluation.scored_instants import map_instants
+from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measurements
 from sonar_graph.sequence import Sequence
-from sonar_graph.states import Estimate, Trajectory
+from sonar_graph.states import Estimate, LandmarkMap, Trajectory
+
+STATUS = Path("/proc/self/status")
+CLEAR_REFS = Path("/proc/self/clear_refs")
+RESET_PEAK = "5"
+"""What Linux takes for "start the high-water mark anew"."""
+
+
+class PeakMemory:
+    """Highest resident memory of this process from now on, above what is resident now.
+
+    Known on Linux only. It is the whole process's: memory that an earlier run left free for reuse is not counted
+    again, and caches that fill meanwhile are. It shows orders of magnitude, not kilobytes.
+    """
+
+    def __init__(self) -> None:
+        self._start_mb = float("nan")
+        try:
+            CLEAR_REFS.write_text(RESET_PEAK)
+            self._start_mb = _status_mb("VmRSS")
+        except OSError:
+            return
+
+    def rise_mb(self) -> float:
+        """Megabytes (10⁶ bytes) at the peak above the start; NaN where the system does not tell."""
+        return max(_status_mb("VmHWM") - self._start_mb, 0.0) if self._start_mb == self._start_mb else float("nan")
+
+
+def _status_mb(field: str) -> float:
+    """A field of the process's status, given there in kibibytes."""
+    for line in STATUS.read_text().splitlines():
+        if line.startswith(f"{field}:"):
+            return int(line.split()[1]) * 1024 / 1e6
+    return float("nan")
+
+
+Flags = NDArray[np.bool_]
+NEGATIVE_TOLERANCE = 1e-9
+"""An eigenvalue may be this far below zero, as a fraction of the largest: rounding."""
+
+
+def check_estimate(estimate: Estimate | None, end_ns: int) -> None:
+    """Refuse an estimate for another instant than the one asked for.
+
+    Raises
+    ------
+    EvaluationError
+        Naming both stamps.
+    """
+    if estimate is not None and estimate.stamp_ns != end_ns:
+        raise EvaluationError(f"process returned an estimate for {estimate.stamp_ns} ns when asked for {end_ns} ns")
+
+
+def check_outcome(causal: Trajectory, smoothed: Trajectory, landmarks: LandmarkMap) -> None:
+    """Refuse what cannot be scored.
+
+    Raises
+    ------
+    EvaluationError
+        When there is no estimate; the smoothed trajectory is not at the causal one's instants; a pose or landmark is
+        not finite; a covariance is neither unknown (all NaN) nor symmetric and positive semidefinite.
+    """
+    if not len(causal):
+        raise EvaluationError("process never returned an estimate")
+    if not np.array_equal(causal.stamps_ns, smoothed.stamps_ns):
+        raise EvaluationError(
+            f"trajectory() has {len(smoothed)} instants, not the {len(causal)} for which process returned estimates"
+        )
+    for kind, trajectory in (("causal", causal), ("smoothed", smoothed)):
+        rows = np.column_stack([trajectory.positions, trajectory.quaternions_xyzw])
+        _refuse(_not_finite(rows), f"{kind} pose is not finite", trajectory.stamps_ns, "ns")
+        _refuse(_impossible(trajectory.covariances), f"{kind} covariance is impossible", trajectory.stamps_ns, "ns")
+    _refuse(_not_finite(landmarks.positions), "position is not finite", landmarks.ids, "landmark")
+    _refuse(_impossible(landmarks.covariances), "covariance is impossible", landmarks.ids, "landmark")
+
+
+def _refuse(bad: Flags, fault: str, labels: Ints, unit: str) -> None:
+    """Raise for the first bad row, naming it and how many there are."""
+    rows = np.flatnonzero(bad)
+    if rows.size:
+        raise EvaluationError(f"{fault} in {rows.size} of {len(bad)} rows, first at {unit} {labels[rows[0]]}")
+
+
+def _not_finite(rows: Floats) -> Flags:
+    return np.asarray(~np.all(np.isfinite(rows), axis=1))
+
+
+def _impossible(covs: Floats) -> Flags:
+    """Which of the covariances, shape (n, d, d), are partly NaN, infinite, asymmetric or not positive semidefinite."""
+    n = len(covs)
+    rows = covs.reshape(n, covs.shape[1] * covs.shape[2])
+    unknown, finite = np.all(np.isnan(rows), axis=1), ~_not_finite(rows)
+    filled = np.where(finite[:, None, None], covs, 0.0)
+    size = np.abs(filled).max(axis=(1, 2), initial=0.0)
+    asymmetry = np.abs(filled - filled.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
+    smallest = np.linalg.eigvalsh(filled)[:, 0] if n else np.zeros(0)
+    sound = finite & (asymmetry <= 1e-6 * size) & (smallest >= -NEGATIVE_TOLERANCE * size)
+    return np.asarray(~(unknown | sound))
+
 
 LOG = logging.getLogger(__name__)
 REASON_WIDTH = 400

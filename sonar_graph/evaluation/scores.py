@@ -9,6 +9,8 @@ import numpy as np
 
 from sonar_graph.evaluation.consistency import GATED_SHARE, anees_interval, mean_normalised, nis, normalised_squares
 from sonar_graph.evaluation.metrics import (
+    FARTHEST_M,
+    anonymous_named,
     ate_raw_m,
     ate_se2_m,
     ate_se3_m,
@@ -19,7 +21,6 @@ from sonar_graph.evaluation.metrics import (
     rmse,
     yaw_errors_rad,
 )
-from sonar_graph.evaluation.place_matching import FARTHEST_M, anonymous_named
 from sonar_graph.evaluation.results import ErrorSeries, Kind, RunResult, Score
 from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Trajectory
 

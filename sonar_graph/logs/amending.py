@@ -1,6 +1,6 @@
 """A log written anew with more messages in it: everything that was there, byte by byte, and what was added.
 
-The log is read as every log is (`sonar_graph.logs.passage`), so that of one that is cut off what is whole is copied.
+The log is read as every log is (`sonar_graph.logs.mcap.file_pass`), so that of one that is cut off what is whole is copied.
 """
 
 from __future__ import annotations
@@ -22,15 +22,9 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.container import Recording
-from sonar_graph.logs.message_definitions import definition, short_name
-from sonar_graph.logs.metadata import seal
-from sonar_graph.logs.passage import Passage, Piece
-from sonar_graph.logs.recorder import LIBRARY, Outgoing
-from sonar_graph.logs.records import LogFile
-from sonar_graph.logs.summary import parse
-from sonar_graph.logs.topic import Keep
-from sonar_graph.logs.whole_file import written_whole
+from sonar_graph.files import written_whole
+from sonar_graph.logs.cdr import definition, short_name
+from sonar_graph.logs.mcap import LIBRARY, ChunkPart, Keep, LogFile, Outgoing, Passage, Recording, parse, seal
 
 _CHUNK_BYTES = 1 << 20
 _Message = tuple[int, int, str, bytes, int]
@@ -84,10 +78,10 @@ def write_amended(
     if target.exists() and target.samefile(source):
         raise LogError(f"{target}: is the log itself; give another name with -o")
     with LogFile(source) as log, written_whole(target) as out:
-        return _Copy(log, out, anew or {}, {entry.topic for entry in added}).run(added, metadata or {}, salvage)
+        return _AmendedCopy(log, out, anew or {}, {entry.topic for entry in added}).run(added, metadata or {}, salvage)
 
 
-class _Copy:
+class _AmendedCopy:
     """One log on its way into another file."""
 
     def __init__(self, log: LogFile, out: BinaryIO, anew: Mapping[str, str], added: Set[str]) -> None:
@@ -121,11 +115,11 @@ class _Copy:
         for _, pieces in groupby(self._passage, key=lambda piece: id(piece.data)):
             yield from _sorted([piece for piece in pieces if self._is_copied(piece)])
 
-    def _note_time(self, piece: Piece) -> None:
+    def _note_time(self, piece: ChunkPart) -> None:
         first_ns = int(piece.found.log_times_ns.min())
         self._beginning_ns = first_ns if self._beginning_ns is None else min(first_ns, self._beginning_ns)
 
-    def _is_copied(self, piece: Piece) -> bool:
+    def _is_copied(self, piece: ChunkPart) -> bool:
         self._note_time(piece)
         topic = piece.topic
         wanted = self._anew.get(topic.name)
@@ -174,7 +168,7 @@ class _Copy:
             self._writer.add_attachment(file.create_time, file.log_time, file.name, file.media_type, file.data)
 
 
-def _sorted(pieces: Sequence[Piece]) -> Iterator[_Message]:
+def _sorted(pieces: Sequence[ChunkPart]) -> Iterator[_Message]:
     """Messages of one stretch of bytes in the order of their times; before each payload is the head of its record."""
     if not pieces:
         return

@@ -16,6 +16,11 @@ For each estimator ``NAME`` (as `source_names` spells it), in the frame ``map``:
                            frame in ``/tf``, where known
 ``/sonar/recognised``      ``sensor_msgs/CompressedImage``: sonar images with the recognised identities drawn in
 =========================  ==============================================================================
+
+``/tf``: where several estimates of one body are, as one tree below the world frame.
+
+Every body frame has one parent, the world. The transforms of one instant share a message, because a viewer that jumps
+in time gets only the last message of a topic.
 """
 
 from __future__ import annotations
@@ -27,17 +32,59 @@ from pathlib import Path
 
 import numpy as np
 
-from sonar_graph.logs import encoding
-from sonar_graph.logs.body_frames import body_transforms
-from sonar_graph.logs.landmark_cloud import landmark_cloud
-from sonar_graph.logs.markers import BLUE, GREEN, GREY, ORANGE, PURPLE, Colour, landmark_markers, position_ellipsoids
-from sonar_graph.logs.mountings import encode_mountings
-from sonar_graph.logs.pictures import PICTURES, Picture, picture_messages
-from sonar_graph.logs.recorder import Attachment, Outgoing, write_recording
+from sonar_graph.logs import writing as encoding
+from sonar_graph.logs.cdr import Value
+from sonar_graph.logs.mcap import Attachment, Outgoing, write_recording
 from sonar_graph.logs.roles import TF
-from sonar_graph.logs.viewer_layouts import PATH, Layer, Scene, write_layouts
+from sonar_graph.logs.vehicle_setup import encode_mountings
+from sonar_graph.logs.viewer_messages import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PATH,
+    PICTURES,
+    PURPLE,
+    Colour,
+    Layer,
+    Picture,
+    Scene,
+    landmark_cloud,
+    landmark_markers,
+    picture_messages,
+    position_ellipsoids,
+    write_layouts,
+)
+from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import LandmarkMap, Trajectory
+
+
+def body_transforms(topic: str, bodies: Mapping[str, Trajectory]) -> list[Outgoing]:
+    """``tf2_msgs/TFMessage`` at every instant at which a body has a pose; by child frame."""
+    if not bodies:
+        return []
+    trajectories = list(bodies.values())
+    stamps_ns = np.unique(np.concatenate([t.stamps_ns for t in trajectories]))
+    present = np.column_stack([np.isin(stamps_ns, t.stamps_ns) for t in trajectories])
+    entries = []
+    for pattern in np.unique(present, axis=0):
+        at_ns = stamps_ns[(present == pattern).all(axis=1)]
+        chosen = {name: body for (name, body), is_there in zip(bodies.items(), pattern, strict=True) if is_there}
+        entries.append(_messages(topic, at_ns, chosen))
+    return entries
+
+
+def _messages(topic: str, stamps_ns: Ints, bodies: Mapping[str, Trajectory]) -> Outgoing:
+    """One message a stamp, with all bodies."""
+    rows = [body.rows(np.searchsorted(body.stamps_ns, stamps_ns)) for body in bodies.values()]
+    columns = encoding.header(np.tile(stamps_ns[:, None], len(rows)), encoding.WORLD_FRAME, "transforms.header")
+    columns |= encoding.fields("transforms.transform.translation", "xyz", np.stack([r.positions for r in rows], 1))
+    quaternions = np.stack([r.quaternions_xyzw for r in rows], 1)
+    columns |= encoding.fields("transforms.transform.rotation", "xyzw", quaternions)
+    values: dict[str, Value] = {**columns, "transforms.child_frame_id": list(bodies)}
+    return encoding.outgoing(topic, TF, stamps_ns, values, {"transforms": len(rows)})
+
 
 RESULT_RECORD = "sonar_graph_result"
 TRUTH = "ground_truth"
@@ -48,7 +95,6 @@ _MOST_CAUSAL_POSES = 1000
 _PATH_STEP_NS = 10**8
 _MOST_POSES = 5000
 _COLOURS: tuple[Colour, ...] = (BLUE, ORANGE, PURPLE, GREEN)
-
 Estimates = tuple[Trajectory, Trajectory, LandmarkMap]
 """Causal trajectory, smoothed trajectory, landmarks; any of them may be empty."""
 

@@ -1,4 +1,7 @@
-"""Which topic of a log plays which part: as the user said, or found by type, and by name where that says too little."""
+"""Which topic of a log plays which part: as the user said, or found by type, and by name where that says too little.
+
+Why the messages of a topic cannot be decoded.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,30 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.logs.adapters.adapter import Adapter
-from sonar_graph.logs.adapters.config import LogConfig
-from sonar_graph.logs.adapters.shipped import SHIPPED, Shipped
-from sonar_graph.logs.container import Recording, Topic
-from sonar_graph.logs.message_definitions import short_name
-from sonar_graph.logs.refusal import refusal
+from sonar_graph.logs.adapters import SHIPPED, Adapter, LogConfig, Shipped
+from sonar_graph.logs.cdr import parse_definition, short_name
+from sonar_graph.logs.mcap import Recording, Topic
+
+_ADVICE = {
+    "ros2idl": "record it again where the type's .msg file is installed, or publish a type that is defined by one",
+}
+
+
+def refusal(topic: Topic) -> str | None:
+    """What is in the way, which completes "/imu ..."; None where nothing is."""
+    if topic.encoding != "cdr":
+        return f"has messages in {topic.encoding or 'no named encoding'}; only ROS 2 CDR is read"
+    if not topic.schema_encoding:
+        return "has no definition of its messages"
+    if topic.schema_encoding != "ros2msg":
+        advice = _ADVICE.get(topic.schema_encoding)
+        return f"has a definition in {topic.schema_encoding}; only ros2msg is read" + (f": {advice}" if advice else "")
+    try:
+        parse_definition(topic.type_name, topic.schema_text)
+    except LogError as error:
+        return f"has a definition that cannot be read: {error}"
+    return None
+
 
 IMU = "sensor_msgs/msg/Imu"
 DVL = "marine_acoustic_msgs/msg/Dvl"
@@ -21,7 +42,6 @@ DETECTIONS = "sonar_graph_msgs/msg/LandmarkDetections"
 LANDMARK_MAP = "sonar_graph_msgs/msg/LandmarkMap"
 SONAR_IMAGE = "marine_acoustic_msgs/msg/ProjectedSonarImage"
 TF = "tf2_msgs/msg/TFMessage"
-
 SONAR = "sonar"
 """The role of sonar images."""
 _DEFAULTS = LogConfig()

@@ -1,20 +1,168 @@
-"""From a `Sequence` to an MCAP log."""
+"""From a `Sequence` to an MCAP log.
+
+Measurements and poses as messages: the reverse of decoding, and what viewers draw.
+
+Sonar images as ``marine_acoustic_msgs/ProjectedSonarImage``, read back by `read_sonar_frames`.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from sonar_graph.logs import encoding
-from sonar_graph.logs.log_record import METADATA
-from sonar_graph.logs.mountings import encode_mountings
-from sonar_graph.logs.recorder import Outgoing, recording
-from sonar_graph.logs.roles import TF
+from sonar_graph.errors import LogError
+from sonar_graph.logs.adapters import SAMPLE_TYPES, body_to_ros
+from sonar_graph.logs.cdr import Bytes, Struct, Value, definition, encode, parse_definition
+from sonar_graph.logs.mcap import Outgoing, recording
+from sonar_graph.logs.message_table import NS_PER_S
+from sonar_graph.logs.roles import DETECTIONS, DVL, IMU, LANDMARK_MAP, ODOMETRY, POSE_WITH_COVARIANCE, SONAR_IMAGE, TF
+from sonar_graph.logs.vehicle_setup import METADATA, encode_mountings
+from sonar_graph.measurements import NO_TRACK, Depth, Dvl, Floats, Imu, Ints, LandmarkDetections, SonarFrames
 from sonar_graph.sequence import Sequence
+from sonar_graph.states import LandmarkMap, Trajectory
+
+WORLD_FRAME = "map"
+BODY_FRAME = "base_link"
+_Z_VARIANCE = 14
+_SECONDS = np.iinfo(np.int32)
+
+
+@lru_cache
+def own_definition(type_name: str) -> Struct:
+    """The tree of one of the types that this package writes."""
+    return parse_definition(type_name, definition(type_name))
+
+
+def header(stamps_ns: Ints, frame_id: str, prefix: str = "header") -> dict[str, Value]:
+    """Columns of a header.
+
+    Raises
+    ------
+    LogError
+        When a stamp lies outside what ROS 2 can express (years 1901 to 2038).
+    """
+    seconds, nanoseconds = np.divmod(stamps_ns, NS_PER_S)
+    if len(seconds) and not (_SECONDS.min <= seconds.min() and seconds.max() <= _SECONDS.max):
+        raise LogError(f"stamp {stamps_ns.max()} ns: ROS 2 stamps have 32-bit seconds; give stamps of another epoch")
+    return {
+        f"{prefix}.stamp.sec": seconds,
+        f"{prefix}.stamp.nanosec": nanoseconds,
+        f"{prefix}.frame_id": frame_id,
+    }
+
+
+def fields(prefix: str, names: str, columns: Floats) -> dict[str, Value]:
+    """Columns side by side as fields: ``fields("velocity", "xyz", v)``."""
+    return {f"{prefix}.{name}": columns[..., i] for i, name in enumerate(names)}
+
+
+def outgoing(
+    topic: str,
+    type_name: str,
+    stamps_ns: Ints,
+    values: Mapping[str, Value],
+    lengths: Mapping[str, int] | None = None,
+    *,
+    is_latched: bool = False,
+) -> Outgoing:
+    """Messages recorded at the stamps given; values and lengths as in `encode`."""
+    payloads = encode(own_definition(type_name), len(stamps_ns), values, lengths)
+    return Outgoing(topic, type_name, stamps_ns, payloads, is_latched)
+
+
+def imu_messages(topic: str, imu: Imu) -> Outgoing:
+    """``sensor_msgs/Imu`` without orientation."""
+    unmeasured = np.isnan(imu.specific_force).all(axis=1)
+    no_orientation = np.array([-1.0] + [0.0] * 8)
+    values = header(imu.stamps_ns, "imu")
+    values |= {"orientation.w": 1.0, "orientation_covariance": no_orientation[None, :]}
+    values |= fields("angular_velocity", "xyz", imu.angular_velocity)
+    values |= fields("linear_acceleration", "xyz", imu.specific_force)
+    values["linear_acceleration_covariance"] = np.outer(unmeasured, no_orientation)
+    return outgoing(topic, IMU, imu.stamps_ns, values)
+
+
+def dvl_messages(topic: str, dvl: Dvl) -> Outgoing:
+    """``marine_acoustic_msgs/Dvl`` over the bottom, without single beams."""
+    covariances = dvl.velocity_cov.reshape(-1, 9).copy()
+    covariances[np.isnan(covariances).any(axis=1)] = [-1.0] + [0.0] * 8
+    values = header(dvl.stamps_ns, "dvl") | fields("velocity", "xyz", dvl.velocity)
+    values |= {"velocity_mode": 1, "velocity_covar": covariances, "num_good_beams": 4}
+    values |= {"sound_speed": np.nan}  # not known; 0 is what drivers leave that do not fill it
+    return outgoing(topic, DVL, dvl.stamps_ns, values)
+
+
+def depth_messages(topic: str, depth: Depth) -> Outgoing:
+    """``PoseWithCovarianceStamped`` of which only z counts: it keeps the height to the bit, which pressure does not."""
+    covariances = np.zeros((len(depth), 36))
+    covariances[:, _Z_VARIANCE] = np.where(np.isnan(depth.variance_m2), 0.0, depth.variance_m2)
+    values = header(depth.stamps_ns, WORLD_FRAME)
+    values |= {"pose.pose.position.z": depth.z_m, "pose.pose.orientation.w": 1.0, "pose.covariance": covariances}
+    return outgoing(topic, POSE_WITH_COVARIANCE, depth.stamps_ns, values)
+
+
+def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgoing]:
+    """``sonar_graph_msgs/LandmarkDetections``, one a frame; frames with equally many detections share an entry."""
+    stamps_ns, first, counts = np.unique(detections.stamps_ns, return_index=True, return_counts=True)
+    is_tracked = bool(np.any(detections.track != NO_TRACK))
+    entries = []
+    for count in np.unique(counts).tolist():
+        frames = counts == count
+        rows = first[frames][:, None] + np.arange(count)
+        values = header(stamps_ns[frames], "sonar") | {
+            name: column[rows].reshape(len(rows), -1)
+            for name, column in (
+                ("range_m", detections.range_m),
+                ("azimuth_rad", detections.azimuth_rad),
+                ("covariance", detections.range_azimuth_cov),
+                ("candidate_ids", detections.candidate_ids),
+                ("id_probability", detections.id_probability),
+                ("track", detections.track[:, None] if is_tracked else np.empty((len(detections), 0), np.int64)),
+            )
+        }
+        entries.append(outgoing(topic, DETECTIONS, stamps_ns[frames], values))
+    return entries
+
+
+def pose_columns(trajectory: Trajectory) -> dict[str, Value]:
+    """Columns of a ``PoseWithCovariance`` called ``pose``; a covariance of zeros: unknown."""
+    covariances = body_to_ros(trajectory.covariances, trajectory.matrices)
+    values = fields("pose.pose.position", "xyz", trajectory.positions)
+    values |= fields("pose.pose.orientation", "xyzw", trajectory.quaternions_xyzw)
+    return values | {"pose.covariance": covariances.reshape(-1, 36)}
+
+
+def odometry_messages(topic: str, trajectory: Trajectory, body_frame: str = BODY_FRAME) -> Outgoing:
+    """``nav_msgs/Odometry`` without a twist."""
+    values = header(trajectory.stamps_ns, WORLD_FRAME) | pose_columns(trajectory) | {"child_frame_id": body_frame}
+    return outgoing(topic, ODOMETRY, trajectory.stamps_ns, values)
+
+
+def pose_messages(topic: str, trajectory: Trajectory) -> Outgoing:
+    """``geometry_msgs/PoseWithCovarianceStamped``."""
+    values = header(trajectory.stamps_ns, WORLD_FRAME) | pose_columns(trajectory)
+    return outgoing(topic, POSE_WITH_COVARIANCE, trajectory.stamps_ns, values)
+
+
+def landmark_map_message(topic: str, landmarks: LandmarkMap, stamp_ns: int) -> Outgoing:
+    """One ``sonar_graph_msgs/LandmarkMap``."""
+    stamps_ns = np.array([stamp_ns])
+    values = header(stamps_ns, WORLD_FRAME) | {
+        "ids": landmarks.ids[None, :],
+        "position": landmarks.positions.reshape(1, -1),
+        "covariance": landmarks.covariances.reshape(1, -1),
+    }
+    return outgoing(topic, LANDMARK_MAP, stamps_ns, values)
+
+
+def static_message(topic: str, type_name: str, stamp_ns: int, payload: Bytes) -> Outgoing:
+    """One message that was encoded already and holds from then on."""
+    return Outgoing(topic, type_name, np.array([stamp_ns]), payload, is_latched=True)
 
 
 def write_sequence(path: Path, sequence: Sequence, more: Iterable[Outgoing] = ()) -> None:
@@ -62,15 +210,55 @@ def _rows(entry: Outgoing, first: int, end: int) -> Outgoing:
 
 def _messages(sequence: Sequence) -> list[Outgoing]:
     first_ns = int(min(sequence.imu.stamps_ns[0], sequence.dvl.stamps_ns[0]))
-    messages = [encoding.static_message("/tf_static", TF, first_ns, encode_mountings(sequence.calibration))]
+    messages = [static_message("/tf_static", TF, first_ns, encode_mountings(sequence.calibration))]
     if sequence.true_landmarks is not None:
-        messages.append(encoding.landmark_map_message("/ground_truth/landmarks", sequence.true_landmarks, first_ns))
-    messages.append(encoding.imu_messages("/imu/data", sequence.imu))
-    messages.append(encoding.dvl_messages("/dvl/data", sequence.dvl))
+        messages.append(landmark_map_message("/ground_truth/landmarks", sequence.true_landmarks, first_ns))
+    messages.append(imu_messages("/imu/data", sequence.imu))
+    messages.append(dvl_messages("/dvl/data", sequence.dvl))
     if sequence.depth is not None:
-        messages.append(encoding.depth_messages("/depth/pose", sequence.depth))
+        messages.append(depth_messages("/depth/pose", sequence.depth))
     if sequence.detections is not None:
-        messages += encoding.detection_messages("/sonar/landmarks", sequence.detections)
+        messages += detection_messages("/sonar/landmarks", sequence.detections)
     if sequence.truth is not None:
-        messages.append(encoding.odometry_messages("/ground_truth/odometry", sequence.truth))
+        messages.append(odometry_messages("/ground_truth/odometry", sequence.truth))
     return messages
+
+
+def sonar_image_messages(
+    topic: str, frames: SonarFrames, *, frequency_hz: float = 0.0, sound_speed_m_s: float = 0.0
+) -> Outgoing:
+    """One message a frame, recorded at the frame's stamp.
+
+    A beam points to ``(x, y, z) = (0, -sin azimuth, cos azimuth)``: z forward, x up, y to the right. Samples keep their
+    type, little-endian, all beams of the first range first. Ranges are float32 in this message.
+
+    Parameters
+    ----------
+    topic
+        Such as ``/sonar/image``.
+    frames
+        A block of frames.
+    frequency_hz, sound_speed_m_s
+        What the sonar says; 0: unknown.
+
+    Raises
+    ------
+    LogError
+        When the samples have a type that the message does not know, or a stamp does not fit into it.
+    """
+    count, beams, _ = frames.intensity.shape
+    kind = f"{frames.intensity.dtype.kind}{frames.intensity.dtype.itemsize}"
+    if kind not in SAMPLE_TYPES:
+        raise LogError(f"{topic}: samples of type {frames.intensity.dtype} cannot be written; give {SAMPLE_TYPES}")
+    samples = np.ascontiguousarray(frames.intensity.transpose(0, 2, 1), dtype=f"<{kind}")
+    values = header(frames.stamps_ns, "sonar") | {
+        "ping_info.frequency": frequency_hz,
+        "ping_info.sound_speed": sound_speed_m_s,
+        "beam_directions.y": -np.sin(frames.azimuths_rad)[None, :],
+        "beam_directions.z": np.cos(frames.azimuths_rad)[None, :],
+        "ranges": frames.ranges_m[None, :],
+        "image.dtype": SAMPLE_TYPES.index(kind),
+        "image.beam_count": beams,
+        "image.data": samples.reshape(count, -1).view(np.uint8),
+    }
+    return outgoing(topic, SONAR_IMAGE, frames.stamps_ns, values, {"beam_directions": beams})

@@ -3,19 +3,13 @@
 Of use in any GTSAM program (docs/tutorials/05_preintegration.py); factors: `sonar_graph.slam.inertial_factors`.
 """
 
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
-from sonar_graph.navigation.initial_tilt import InitialTilt
-from sonar_graph.navigation.joint_preintegration import JointMotion, JointPreintegrator
-from sonar_graph.navigation.joint_rules import DopplerRule
-from sonar_graph.navigation.moving_alignment import align_in_motion
-from sonar_graph.navigation.still_alignment import align_at_rest
+# fmt: off
+from sonar_graph.navigation.odometry import (
+    Odometry, RunningMotion, motion_between, motion_between_nodes, motion_since_node,
+)
+from sonar_graph.navigation.samples import finite_vector, rows_until, value_at, weights_at_end
 
 __all__ = [
-    "DopplerRule",
-    "InitialTilt",
-    "JointMotion",
-    "JointPreintegrator",
-    "PreintegratedMotion",
-    "align_at_rest",
-    "align_in_motion",
+    "Odometry", "RunningMotion", "finite_vector", "motion_between", "motion_between_nodes", "motion_since_node",
+    "rows_until", "value_at", "weights_at_end",
 ]

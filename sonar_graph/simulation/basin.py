@@ -23,48 +23,47 @@ import numpy as np
 from pydantic import Field
 
 from sonar_graph.calibration import Calibration, Mounting, SonarImage
+from sonar_graph.devices import DEFAULT_DESIGNS, OWN_DESIGNS, LandmarkDesign, load_designs
 from sonar_graph.errors import SimulationError
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS, OWN_DESIGNS, LandmarkDesign, load_designs
 from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.detections import Fan
-from sonar_graph.simulation.image_options import ImageOptions
-from sonar_graph.simulation.imaging import ImagedFrames, image_along
+from sonar_graph.simulation.detections import FieldOfView, World, world_on_floor
 from sonar_graph.simulation.options import SimulationOptions
 from sonar_graph.simulation.recording import Streams, Vehicle, frame_stamps, record
-from sonar_graph.simulation.route import Piece, PlanarPose, drive, follow, hover, turn
-from sonar_graph.simulation.seabed import SeabedObject, place_landmark, scattered_objects
-from sonar_graph.simulation.sonar_image import SONARS, FrameSimulator
-from sonar_graph.simulation.vehicle import VehiclePath, smooth_noise
-from sonar_graph.simulation.world import World, world_on_floor
+from sonar_graph.simulation.sonar_image import (
+    SONARS,
+    FrameSimulator,
+    ImagedFrames,
+    ImageOptions,
+    SeabedObject,
+    image_along,
+    place_landmark,
+    scattered_objects,
+)
+from sonar_graph.simulation.vehicle import PlanarPose, RouteLeg, VehiclePath, drive, follow, hover, smooth_noise, turn
 
 LANDMARKS_XY_M = np.array([[5.0, 0.0], [7.0, -5.0], [2.0, -7.0], [0.0, -2.0]])
 FLOOR_Z_M = -1.7
 SIDE_M = 7.0
 LANDMARK_ALONG_SIDE_M = 5.0
 SIDES = 4
-
 BODY_Z_M = -0.70
 YSHARK = Vehicle(
     sonar=Mounting(translation_m=(0.40, 0.0, -0.05), rpy_rad=(0.0, math.radians(30), 0.0)),
-    fan=Fan(1.25, 2.5, math.radians(14.4), math.radians(7)),
+    fan=FieldOfView(1.25, 2.5, math.radians(14.4), math.radians(7)),
     dvl=Mounting(translation_m=(-0.20, 0.0, -0.15), rpy_rad=(0.0, 0.0, math.radians(45))),
     depth_port_m=(0.10, 0.05, 0.10),
 )
 WATCHING_M = 1.8
 """Horizontal distance from sonar to landmark while hovering: a slant range of 2.04 m."""
-
 OBJECTS_ALONG_SIDE_M = (2.2, 3.5, 6.5)
 OBJECTS_ASIDE_M = 0.3
 """Stones and patches that are no landmarks lie about there along each side, up to so far to either side of it."""
-
 RAMP_S = 3.0
 TURN_S = 8.0
 FASTEST_M_S = 0.45
 KNOT_S = 0.5
-
 PAPER_DURATION_S, PAPER_LAPS, PAPER_SPEED_M_S = 2039.0, 3, 0.15
-
 NOTES = {
     "truth": "exact: a quintic spline",
     "earth rotation": "neither simulated nor to be removed",
@@ -243,12 +242,12 @@ def _path(options: BasinOptions, rng: np.random.Generator) -> VehiclePath:
     return VehiclePath.through(seconds, intended + _wobble(seconds, rng))
 
 
-def _route(options: BasinOptions, rng: np.random.Generator) -> list[Piece]:
+def _route(options: BasinOptions, rng: np.random.Generator) -> list[RouteLeg]:
     """Sides of the square: drive into sight of the landmark, watch, drive over it to the corner, turn right."""
     speed = cruise_speed(options)
     stop_m = LANDMARK_ALONG_SIDE_M - WATCHING_M - YSHARK.sonar.translation_m[0]
     pose: PlanarPose = (0.0, 0.0, 0.0)
-    pieces: list[Piece] = []
+    pieces: list[RouteLeg] = []
     for watch_s in _watching_s(options, speed, rng).tolist():
         pieces.append(drive(pose, stop_m, speed, RAMP_S))
         pieces.append(hover(pieces[-1].goal, watch_s))

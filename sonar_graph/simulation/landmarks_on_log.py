@@ -20,10 +20,9 @@ from sonar_graph.calibration import Mounting, Section, SonarCalibration
 from sonar_graph.errors import SimulationError
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.sequence import NS_PER_S, Sequence
-from sonar_graph.simulation.detections import Fan, Recogniser, simulate_detections
+from sonar_graph.simulation.detections import FieldOfView, SimulatedRecogniser, World, simulate_detections
 from sonar_graph.simulation.sensors import EPOCH_NS, regular_stamps
 from sonar_graph.simulation.vehicle import VehiclePath, rpy_from_rotation
-from sonar_graph.simulation.world import World
 
 LEAST_POSES = 6
 """A quintic spline needs as many."""
@@ -175,8 +174,8 @@ def _sonar(options: LandmarkOptions) -> SonarCalibration:
     )
 
 
-def _fan(options: LandmarkOptions) -> Fan:
-    return Fan(
+def _fan(options: LandmarkOptions) -> FieldOfView:
+    return FieldOfView(
         options.range_min_m,
         options.range_max_m,
         options.azimuth_aperture_rad / 2,
@@ -184,8 +183,8 @@ def _fan(options: LandmarkOptions) -> Fan:
     )
 
 
-def _recogniser(options: LandmarkOptions) -> Recogniser:
-    return Recogniser(
+def _recogniser(options: LandmarkOptions) -> SimulatedRecogniser:
+    return SimulatedRecogniser(
         detection_probability=options.detection_probability,
         wrong_id_rate=options.wrong_id_rate,
         false_detections_per_frame=options.false_detections_per_frame,

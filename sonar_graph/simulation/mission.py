@@ -14,11 +14,10 @@ from pydantic import Field
 from sonar_graph.calibration import Mounting
 from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.detections import Fan
+from sonar_graph.simulation.detections import FieldOfView, world_on_floor
 from sonar_graph.simulation.options import SimulationOptions
 from sonar_graph.simulation.recording import Streams, Vehicle, record
 from sonar_graph.simulation.vehicle import VehiclePath, smooth_noise
-from sonar_graph.simulation.world import world_on_floor
 
 FLOOR_Z_M = -5.0
 BODY_Z_M = -3.0
@@ -28,7 +27,6 @@ LOBES = 3
 FIELD_RADIUS_M = 11.0
 KNOT_S = 0.5
 GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
-
 NOTES = {"ours": "everything: a synthetic mission", "truth": "exact: a quintic spline"}
 
 
@@ -70,7 +68,7 @@ def _vehicle(options: MissionOptions) -> Vehicle:
     """A survey vehicle with a wide sonar tilted 10° down."""
     return Vehicle(
         sonar=Mounting(translation_m=(0.40, 0.0, -0.05), rpy_rad=(0.0, math.radians(10), 0.0)),
-        fan=Fan(0.5, options.range_max_m, options.azimuth_aperture_rad / 2, options.elevation_aperture_rad / 2),
+        fan=FieldOfView(0.5, options.range_max_m, options.azimuth_aperture_rad / 2, options.elevation_aperture_rad / 2),
         dvl=Mounting(translation_m=(-0.20, 0.0, -0.15)),
         depth_port_m=(0.10, 0.05, 0.10),
     )

@@ -25,9 +25,8 @@ from sonar_graph.calibration import (
 from sonar_graph.errors import SimulationError
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.detections import Fan, Recogniser, simulate_detections
-from sonar_graph.simulation.options import SimulationOptions
-from sonar_graph.simulation.presets import DEPTH_RATE_HZ, DVL_PRESETS, IMU_PRESETS, IMU_RATE_HZ
+from sonar_graph.simulation.detections import FieldOfView, SimulatedRecogniser, Tracking, World, simulate_detections
+from sonar_graph.simulation.options import DEPTH_RATE_HZ, DVL_PRESETS, IMU_PRESETS, IMU_RATE_HZ, SimulationOptions
 from sonar_graph.simulation.sensors import (
     DvlFaults,
     regular_stamps,
@@ -36,9 +35,7 @@ from sonar_graph.simulation.sensors import (
     simulate_dvl,
     simulate_imu,
 )
-from sonar_graph.simulation.tracking import Tracking
 from sonar_graph.simulation.vehicle import VehiclePath, rpy_from_rotation
-from sonar_graph.simulation.world import World
 from sonar_graph.states import Trajectory
 
 TRUTH_RATE_HZ = 50.0
@@ -51,7 +48,7 @@ class Vehicle:
     """Where the sensors sit, and what the sonar sees."""
 
     sonar: Mounting
-    fan: Fan
+    fan: FieldOfView
     dvl: Mounting
     depth_port_m: tuple[float, float, float]
 
@@ -149,9 +146,9 @@ def _dvl_faults(options: SimulationOptions) -> DvlFaults:
     return DvlFaults(options.dvl_scale_error, options.dvl_dropouts_per_hour, options.dvl_dropout_s)
 
 
-def _recogniser(options: SimulationOptions) -> Recogniser:
+def _recogniser(options: SimulationOptions) -> SimulatedRecogniser:
     """How often detections are right."""
-    return Recogniser(
+    return SimulatedRecogniser(
         detection_probability=options.detection_probability,
         wrong_id_rate=options.wrong_id_rate,
         false_detections_per_frame=options.false_detections_per_frame,

@@ -9,13 +9,15 @@ Flow of one call of `Isam2.process`::
 
 A frame is tied to its keyframe through the odometry between them: the sonar's pose in the keyframe's body frame at the
 time of the frame. Keyframes can then be sparser than frames at no loss but the (included) noise of that short motion.
+
+Settings of the smoother that exclude each other, or do nothing beside another: all reasons, in one place.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import gtsam
 import numpy as np
@@ -26,18 +28,13 @@ from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import CalibrationError, EstimatorError
 from sonar_graph.measurements import Floats, Ints, Measurements
 from sonar_graph.sequence import NS_PER_S
-from sonar_graph.slam.anonymous_landmarks import AnonymousPolicy
-from sonar_graph.slam.asked import Anchored, Asked
-from sonar_graph.slam.hypotheses import RecogniserErrors
-from sonar_graph.slam.joint_covariance import JointCovariance
+from sonar_graph.settings import misfits
+from sonar_graph.slam.estimates import AnchoredPose, Over, PoseHistory, joint_covariance
+from sonar_graph.slam.frontend import SightingPolicy, Sightings
 from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
-from sonar_graph.slam.mixture import Kernel, Mixture
-from sonar_graph.slam.setting_conflicts import conflicts
-from sonar_graph.slam.sightings import SightingPolicy, Sightings
-from sonar_graph.slam.smoother import Smoother
-from sonar_graph.slam.uncertainty import Over, joint_covariance
+from sonar_graph.slam.landmarks import AnonymousPolicy, Kernel, Mixture, RecogniserErrors
+from sonar_graph.slam.smoother import JointCovariance, Smoother
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, RefusedRow, Trajectory
-from sonar_graph.validation import misfits
 
 
 class Isam2Params(Section):
@@ -183,7 +180,7 @@ class Isam2:
             p.anonymous(),
         )
         self._sightings = Sightings(calibration, sightings, self._smoother, self._keyframes)
-        self._asked = Asked()
+        self._asked = PoseHistory()
         self._forgot_s = -math.inf
 
     @property
@@ -223,7 +220,7 @@ class Isam2:
             return None
         motion = self._keyframes.motion_since_newest(measurements.end_ns)
         newest = len(self._keyframes.stamps_ns) - 1
-        instant = Anchored(measurements.end_ns, newest, self._keyframes.bias_key(newest), motion)
+        instant = AnchoredPose(measurements.end_ns, newest, self._keyframes.bias_key(newest), motion)
         self._asked.add(instant)
         return instant.carried_on(self._smoother.values, self._smoother.joint_covariance(instant.keys()))
 
@@ -376,3 +373,69 @@ def _check_noise(calibration: Calibration) -> None:
         raise CalibrationError(
             f"isam2: {', '.join(zero)} must be above zero; give a small value for what is known well"
         )
+
+
+_OF_MIXTURES = ("wrong_id_probability", "view_range_m", "view_azimuth_rad")
+_OF_UNKNOWN = ("unknown_gate_probability", "unknown_density_m2", "unknown_sightings", "unknown_wait_s")
+
+
+class Conflict(NamedTuple):
+    """A setting that cannot stand beside the others."""
+
+    setting: str
+    reason: str
+    """With what it collides, and what to do: one line that names the setting."""
+
+
+def conflicts(params: Isam2Params) -> list[Conflict]:
+    """What excludes each other, then what was set on purpose and does nothing."""
+    return [*_excluding(params), *_idle(params)]
+
+
+def _excluding(params: Isam2Params) -> list[Conflict]:
+    """A mixture is of landmarks that have names, in a history that is kept."""
+    if params.mixture() is None:
+        return []
+    policy, found = f'identity_policy = "{params.identity_policy}"', []
+    if params.history == "bounded":
+        reason = (
+            f"{policy} chooses anew in the whole history; give it"
+            ' history = "whole", or history = "bounded" with identity_policy = "robust"'
+        )
+        found.append(Conflict("history", reason))
+    if params.unknown_landmarks == "associate":
+        reason = (
+            f"{policy} pairs detections by place itself, and begins no landmark"
+            ' without a name; give it unknown_landmarks = "ignore", or "associate" with identity_policy = "robust"'
+        )
+        found.append(Conflict("unknown_landmarks", reason))
+    return found
+
+
+def _idle(params: Isam2Params) -> list[Conflict]:
+    """Settings that were given and that nothing asks for; what says the same as the others is let through."""
+    given = params.model_fields_set
+    idle = {name: why for name, why in _without_effect(params).items() if name in given}
+    return [Conflict(name, f"{name} is of no effect with {why}") for name, why in idle.items()]
+
+
+def _without_effect(params: Isam2Params) -> dict[str, str]:
+    """Beside which setting each of them does nothing, and what to set for it to do something."""
+    policy, idle = f'"{params.identity_policy}"', {}
+    if params.identity_policy != "gate" and params.gate_probability < 1:
+        idle["gate_probability"] = f'{policy}: set identity_policy = "gate"'
+    if params.mixture() is None:
+        idle |= dict.fromkeys(_OF_MIXTURES, f'{policy}: set identity_policy = "max-mixture" or "gnc"')
+        if not params.deferred_identity:
+            idle["longest_wait_s"] = "deferred_identity = false: leave one of them out"
+    else:
+        idle["identity_probability"] = f"{policy}, which weighs every posterior: leave it out"
+        if not params.deferred_identity:
+            idle["deferred_identity"] = f"{policy}, which always decides on whole tracks: leave it out"
+    if params.unknown_landmarks == "ignore":
+        idle |= dict.fromkeys(_OF_UNKNOWN, 'unknown_landmarks = "ignore": set unknown_landmarks = "associate"')
+    if params.kernel == "none":
+        idle["kernel_width"] = 'kernel = "none": set kernel = "cauchy" or "huber"'
+    if params.history == "whole" and params.remembered_s is not None:
+        idle["remembered_s"] = 'history = "whole": set history = "bounded"'
+    return idle

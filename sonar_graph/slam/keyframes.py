@@ -3,6 +3,11 @@
 A keyframe sits at a node of the odometry (a DVL stamp). One is due ``max_interval_s`` after the last, and sooner when
 landmarks are seen and the motion since has blurred what the sonar sees: then sightings would lose by hanging on it.
 The gyro bias is constant over stretches of ``bias_interval_s`` and walks between them.
+
+Rows that can be measurements at all: variances above zero, covariances positive definite, ranges that can be.
+
+A block of measurements checks shapes, order and that numbers are finite (`sonar_graph.measurements`). What is checked
+here depends on what a number means. NaN is sound: it says that the log does not know, and the calibration does.
 """
 
 from __future__ import annotations
@@ -17,20 +22,71 @@ from gtsam.symbol_shorthand import B, X
 from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.measurements import Depth, Dvl, Floats, Imu
-from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
-from sonar_graph.navigation.depth_mean import weights_at_end
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
-from sonar_graph.navigation.earth import earth_rate_in_world
-from sonar_graph.navigation.kernels import compiled
-from sonar_graph.navigation.node_motion import motion_between_nodes
-from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.running_motion import RunningMotion
-from sonar_graph.navigation.steps import Steps
-from sonar_graph.slam import factors
+from sonar_graph.devices import in_numbers
+from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections, possible_ranges
+from sonar_graph.navigation import Odometry, RunningMotion, motion_between_nodes, weights_at_end
+from sonar_graph.navigation.alignment import earth_rate_in_world, gravity_direction, velocity_at_imu
+from sonar_graph.navigation.preintegration import PreintegratedMotion, Preintegrator, Steps
+from sonar_graph.numerics import compiled
+from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother import Smoother
-from sonar_graph.slam.sound_rows import sound_depths, sound_velocities
-from sonar_graph.states import Refusal, RefusedRow
+from sonar_graph.states import DetectionJournal, Outcome, Refusal, RefusedRow
+
+ROUNDING = 1e-13
+"""Share of the largest variance below which what is left of another is taken for zero."""
+Flags = NDArray[np.bool_]
+
+
+def sound_detections(frame: LandmarkDetections) -> Flags:
+    """Shape (n,)."""
+    unsaid = np.asarray(np.isnan(frame.range_azimuth_cov).any(axis=(1, 2)))
+    return possible_ranges(frame.range_m) & (unsaid | positive_definite(frame.range_azimuth_cov))
+
+
+def without_unsound(frame: LandmarkDetections, journal: DetectionJournal) -> LandmarkDetections | None:
+    """A frame without what no sonar can have measured, which goes to the journal; None: nothing is left."""
+    is_sound = sound_detections(frame)
+    if is_sound.all():
+        return frame
+    for landmark_id in frame.most_probable()[0][~is_sound].tolist():
+        journal.record(int(frame.stamps_ns[0]), landmark_id, Outcome.UNSOUND)
+    return frame.rows(is_sound) if is_sound.any() else None
+
+
+def sound_velocities(dvl: Dvl) -> Flags:
+    """Shape (n,). An infinite variance is sound: of an axis that was not measured."""
+    return positive_definite(in_numbers(dvl.velocity_cov, np.eye(3)))
+
+
+def sound_depths(depth: Depth) -> Flags:
+    """Shape (n,)."""
+    variance = np.where(np.isnan(depth.variance_m2), 1.0, depth.variance_m2)
+    return (variance > 0) & np.isfinite(variance)
+
+
+@compiled
+def positive_definite(covs: Floats) -> Flags:
+    """Which of some symmetric matrices, shape (n, k, k), are finite and positive definite: Cholesky takes them."""
+    n, k = covs.shape[:2]
+    found = np.ones(n, np.bool_)
+    for row in range(n):
+        L, largest = np.zeros((k, k)), 0.0
+        for i in range(k):
+            largest = max(largest, covs[row, i, i])
+        for i in range(k):
+            for j in range(i + 1):
+                rest = covs[row, i, j]
+                for m in range(j):
+                    rest -= L[i, m] * L[j, m]
+                if i > j:
+                    L[i, j] = rest / L[j, j]
+                elif rest > ROUNDING * largest and rest < np.inf:
+                    L[i, i] = np.sqrt(rest)
+                else:  # NaN ends here too
+                    found[row] = False
+                    L[i, i] = 1.0
+    return found
+
 
 S_PER_NS = 1e-9
 CARRIED_IN_GAP_NS = 300_000_000

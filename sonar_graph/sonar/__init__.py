@@ -1,1 +1,14 @@
 """From polar sonar images to recognised landmarks with identity probabilities."""
+
+# fmt: off
+from sonar_graph.sonar.actag import AcTagRecogniser, AcTagSettings
+from sonar_graph.sonar.appearance import ObjectSighting
+from sonar_graph.sonar.confusion import Confusion, LabelledFits, estimate_confusion, read_confusion
+from sonar_graph.sonar.geometry import Fan, FloorView, with_lens
+from sonar_graph.sonar.recogniser import Fate, Recogniser, RecogniserParams
+from sonar_graph.sonar.track_filter import SonarStep
+
+__all__ = [
+    "AcTagRecogniser", "AcTagSettings", "Confusion", "Fan", "Fate", "FloorView", "LabelledFits", "ObjectSighting",
+    "Recogniser", "RecogniserParams", "SonarStep", "estimate_confusion", "read_confusion", "with_lens",
+]

@@ -4,6 +4,8 @@ The image around a candidate is sampled on a square grid of the floor, so that f
 out; each sample is a mean of decibels over a stretch of range as long as a cell. Every design is a template on the same
 grid (`sonar_graph.sonar.templates`). Patch and template are compared by their correlation c over the cells in view,
 which neither gain nor the floor's level changes, at all small shifts.
+
+A closer look at the candidates that tracks took: which design fits, and where its centre is.
 """
 
 from __future__ import annotations
@@ -16,11 +18,13 @@ import numpy as np
 from pydantic import Field
 
 from sonar_graph.calibration import Section
-from sonar_graph.kernels import compiled
-from sonar_graph.landmark_designs import LandmarkDesign
-from sonar_graph.measurements import Floats, Ints
-from sonar_graph.sonar.floor_patch import Patch
-from sonar_graph.sonar.templates import Floats32, Templates
+from sonar_graph.devices import LandmarkDesign
+from sonar_graph.measurements import Floats, Ints, SonarFrames
+from sonar_graph.numerics import compiled
+from sonar_graph.sonar.confusion import Confusion, soft_scores
+from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar.regions import Candidates
+from sonar_graph.sonar.templates import Floats32, Patch, PolarGrid, Templates
 
 MOST_MULTIPLICATIONS = 250_000
 """OpenBLAS uses several cores from 262,144 on."""
@@ -44,7 +48,7 @@ class AppearanceParams(Section):
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class DesignFit:
     """How well each design fits a patch."""
 
     correlation: Floats
@@ -85,7 +89,7 @@ class Appearance:
         self._sums = self._pictures.sum(axis=0), self._squares.sum(axis=0)
         self._first_of_design = np.searchsorted(self.templates.design, np.arange(self.designs))
 
-    def fit(self, patch: Patch) -> Fit:
+    def fit(self, patch: Patch) -> DesignFit:
         """The designs at their best headings and shifts."""
         visible = _visible(patch.seen.ravel(), self._cells, self._offsets)
         at = self._correlations(patch, visible)
@@ -93,7 +97,7 @@ class Appearance:
         offset = self._between_points(at[:, best_template], best_shift)
         by_design = np.maximum.reduceat(at.max(axis=0), self._first_of_design)
         share = float(visible[best_shift])
-        return Fit(
+        return DesignFit(
             by_design if share >= self.params.least_visible else np.full_like(by_design, -1.0),
             share,
             int(self.templates.design[best_template]),
@@ -177,3 +181,94 @@ def _top(values: Floats32, at: int) -> float:
     before, here, after = (float(v) for v in values[at - 1 : at + 2])
     bend = before - 2 * here + after
     return 0.5 * (before - after) / bend if bend < 0 else 0.0
+
+
+CENTROID_SIGMA_M = 0.04
+"""Of a candidate's own centroid, along and across, where no design fits: a landmark's middle may be elsewhere."""
+SLANT_PLANE = FloorView(np.eye(3), 1e-3)
+"""Where no floor is known, patches lie in the plane of the image."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectSighting:
+    """A track's candidate in one frame, and how the designs fit it."""
+
+    fit: DesignFit | None
+    """None where too little of it is in the image."""
+    range_m: float
+    azimuth_rad: float
+    covariance: Floats
+    """Of both, shape (2, 2)."""
+    is_fitted: bool = False
+    """Whether range and azimuth are those of a design's centre, not of the candidate's centroid."""
+
+
+class CandidateFit:
+    """Compares candidates with the designs.
+
+    Parameters
+    ----------
+    appearance
+        The designs.
+    confusion
+        The measured model.
+    elevation_aperture_rad
+        Full vertical opening of the sonar.
+    """
+
+    def __init__(self, appearance: Appearance, confusion: Confusion, elevation_aperture_rad: float) -> None:
+        self._appearance, self._confusion = appearance, confusion
+        self._aperture_rad = elevation_aperture_rad
+        self._grid: PolarGrid | None = None
+        self._shape: tuple[Floats, Floats] | None = None
+
+    def at(
+        self,
+        image_db: Floats32,
+        frame: SonarFrames,
+        view: FloorView | None,
+        candidates: Candidates,
+        rows: Ints,
+    ) -> list[ObjectSighting | None]:
+        """What each track took; None for a row of -1."""
+        grid, floor = self._grid_of(frame), view or SLANT_PLANE
+        return [None if row < 0 else self._one(image_db, grid, floor, candidates, row) for row in rows.tolist()]
+
+    def scores(self, sightings: Sequence[ObjectSighting | None]) -> Floats:
+        """Soft scores of the features, shape (M, designs + 1); rows of 0 where nothing was compared."""
+        scores = np.zeros((len(sightings), self._appearance.designs + 1))
+        for row, sighting in enumerate(sightings):
+            if sighting is not None and (fit := sighting.fit) is not None:
+                model = self._confusion
+                found = soft_scores(fit.correlation[None], np.array([fit.visible]), model.sharpness, model.threshold)
+                scores[row] = found[0]
+        return scores
+
+    def _grid_of(self, frame: SonarFrames) -> PolarGrid:
+        """The lookup of the frame's beams and bins, made once for all frames that share them."""
+        shape = (frame.ranges_m, frame.azimuths_rad)
+        if self._grid is None or self._shape is None or not all(map(_is_same, self._shape, shape)):
+            self._grid, self._shape = PolarGrid(*shape, self._aperture_rad), shape
+        return self._grid
+
+    def _one(
+        self, image_db: Floats32, grid: PolarGrid, view: FloorView, candidates: Candidates, row: int
+    ) -> ObjectSighting:
+        range_m, azimuth_rad = float(candidates.range_m[row]), float(candidates.azimuth_rad[row])
+        loose = np.square([CENTROID_SIGMA_M, CENTROID_SIGMA_M / range_m])
+        unfitted = ObjectSighting(None, range_m, azimuth_rad, np.diag(loose))
+        centre = view.floor_point(range_m, azimuth_rad)
+        if centre is None:
+            return unfitted
+        appearance = self._appearance
+        fit = appearance.fit(grid.patch(image_db, view, centre, appearance.patch_side, appearance.params.cell_m))
+        if fit.correlation.max() < 0:
+            return unfitted
+        if fit.correlation.max() < self._confusion.threshold:
+            return ObjectSighting(fit, range_m, azimuth_rad, unfitted.covariance)
+        covariance = self._confusion.range_azimuth_cov(fit.visible)
+        return ObjectSighting(fit, *view.range_azimuth(fit.centre_m), covariance, is_fitted=True)
+
+
+def _is_same(one: Floats, other: Floats) -> bool:
+    return one is other or np.array_equal(one, other)

@@ -15,9 +15,9 @@ from pydantic import Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.measurements import Floats
-from sonar_graph.sonar.association import Association
+from sonar_graph.sonar.bayes import Rule, news_of_motion, predict, update
 from sonar_graph.sonar.confusion import Confusion
-from sonar_graph.sonar.identity import Rule, news_of_motion, predict, update
+from sonar_graph.sonar.track_filter import Association
 
 
 class IdentityParams(Section):

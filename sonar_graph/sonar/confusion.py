@@ -5,6 +5,17 @@ is the mean soft score of feature j over the labelled frames of class k: rows su
 make scores of correlations, and the accuracy of range and azimuth, all measured on the same frames. The file says
 where those came from, and what the landmarks look like for which it was measured. The one that ships,
 ``default_confusion.json``, was measured on simulated basins with the designs that ship.
+
+From how well designs fit to probabilities of what a frame looks like.
+
+With noise of unknown strength the likelihood of a design whose correlation with a patch of n independent samples is c
+is ``(1 - c^2)^(-n/2)``. Samples are not independent and designs do not fit exactly, so that the exponent and the
+correlation below which nothing fits are measured (`sonar_graph.sonar.confusion`)::
+
+    s_j     ~  (1 - max(c_j, 0)^2)^(-sharpness visible)
+    s_none  ~  (1 - threshold^2)^(-sharpness visible)
+
+where ``visible`` is the share of the template's cells that the image holds.
 """
 
 from __future__ import annotations
@@ -20,12 +31,39 @@ from scipy.optimize import brentq, minimize, minimize_scalar
 from scipy.special import expit
 
 from sonar_graph.calibration import Section
+from sonar_graph.devices import LandmarkDesign
 from sonar_graph.errors import CalibrationError
-from sonar_graph.landmark_designs import LandmarkDesign
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.sonar.identity import virtual_evidence
-from sonar_graph.sonar.scores import soft_scores
-from sonar_graph.validation import faults_in
+from sonar_graph.settings import faults_in
+from sonar_graph.sonar.bayes import virtual_evidence
+
+BEST_CORRELATION = 0.999
+"""A perfect fit is no reason to divide by zero."""
+
+
+def soft_scores(correlation: Floats, visible: Floats, sharpness: float, threshold: float) -> Floats:
+    """Probabilities of the features: each design, and last "none of the above".
+
+    Parameters
+    ----------
+    correlation
+        Of each design with each patch, shape (n, designs).
+    visible
+        Share of the template in view, shape (n,).
+    sharpness, threshold
+        As above.
+
+    Returns
+    -------
+    Floats
+        Shape (n, designs + 1), rows sum to 1.
+    """
+    known = np.clip(correlation, 0.0, BEST_CORRELATION)
+    none = np.full((len(known), 1), threshold)
+    logits = -sharpness * visible[:, None] * np.log1p(-(np.hstack([known, none]) ** 2))
+    odds = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return np.asarray(odds / odds.sum(axis=1, keepdims=True))
+
 
 LEAST_ENTRY = 1e-3
 """Smallest entry of the matrix: a class that never looked like a feature in some hundred frames still may."""

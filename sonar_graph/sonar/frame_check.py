@@ -26,17 +26,17 @@ MOST_WINDOWS = 64
 """So many are remembered."""
 
 
-class Window(NamedTuple):
+class RangeWindow(NamedTuple):
     """Where the samples of a frame lie."""
 
     ranges_m: Floats
     azimuths_rad: Floats
 
-    def shares_arrays(self, other: Window | None) -> bool:
+    def shares_arrays(self, other: RangeWindow | None) -> bool:
         """Whether both are of one block of frames."""
         return other is not None and all(own is others for own, others in zip(self, other, strict=True))
 
-    def is_like(self, other: Window) -> bool:
+    def is_like(self, other: RangeWindow) -> bool:
         """Whether bins and beams are the same, but for what a driver computes anew for every ping."""
         return self.shares_arrays(other) or all(
             len(own) == len(others) and bool(np.abs(own - others).max() <= SAME_PLACE * _step(own))
@@ -74,15 +74,15 @@ class FrameCheck:
         self._scale = image or SonarImage()
         self._stamp_ns: int | None = None
         self._image: NDArray[np.generic] | None = None
-        self._window: Window | None = None
-        self._seen: list[Window] = []
+        self._window: RangeWindow | None = None
+        self._seen: list[RangeWindow] = []
         self.change: str | None = None
         """How the window of the frame last found good differs from that of the one before."""
 
     def fault(self, frame: SonarFrames) -> str | None:
         """Why a frame (a block of one) must not be used; None for a good one, with which later ones are compared."""
         stamp_ns, image = int(frame.stamps_ns[0]), frame.intensity[0]
-        window = Window(frame.ranges_m, frame.azimuths_rad)
+        window = RangeWindow(frame.ranges_m, frame.azimuths_rad)
         reason = (
             self._fault_of_stamp(stamp_ns)
             or (None if window.shares_arrays(self._window) else _fault_of_places(window))
@@ -101,7 +101,7 @@ class FrameCheck:
             return None
         return "duplicated: same stamp as the frame before" if stamp_ns == self._stamp_ns else "out of order"
 
-    def _fault_of_window(self, window: Window) -> str | None:
+    def _fault_of_window(self, window: RangeWindow) -> str | None:
         """A window counts from its second frame on; the first of all is taken as it is."""
         if self._window is not None and window.is_like(self._window):
             return None
@@ -128,7 +128,7 @@ class FrameCheck:
         return None
 
 
-def _fault_of_places(window: Window) -> str | None:
+def _fault_of_places(window: RangeWindow) -> str | None:
     """What is wrong with ranges and azimuths themselves."""
     ranges_m, azimuths_rad = window
     if len(azimuths_rad) < LEAST_BEAMS or len(ranges_m) < LEAST_BINS:

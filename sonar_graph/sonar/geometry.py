@@ -23,10 +23,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.beam_tables import DIDSON_BEAMS, aris_azimuths, didson_azimuths
+from sonar_graph.devices import DIDSON_BEAMS, aris_azimuths, didson_azimuths
 from sonar_graph.errors import CalibrationError
-from sonar_graph.kernels import compiled
 from sonar_graph.measurements import Floats, SonarFrames
+from sonar_graph.numerics import compiled
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,8 +2,8 @@
 
     frame -> decibels -> candidates -> tracks -> how well each design fits -> beliefs -> detections
 
-The steps are those of the 2014 paper: candidate selection (`sonar_graph.sonar.detection`), elimination of noisy data
-(`sonar_graph.sonar.tracking`), Bayesian feature estimation (`sonar_graph.sonar.identity`). Nothing that is seen
+The steps are those of the 2014 paper: candidate selection (`sonar_graph.sonar.cfar`), elimination of noisy data
+(`sonar_graph.sonar.tracker`), Bayesian feature estimation (`sonar_graph.sonar.bayes`). Nothing that is seen
 disappears without a row that says why.
 """
 
@@ -18,19 +18,17 @@ from pydantic import Field
 from scipy.optimize import linear_sum_assignment
 
 from sonar_graph.calibration import Calibration, Section
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, SonarFrames
-from sonar_graph.sonar.appearance import Appearance, AppearanceParams
-from sonar_graph.sonar.association import Association
+from sonar_graph.sonar.appearance import Appearance, AppearanceParams, CandidateFit, ObjectSighting
 from sonar_graph.sonar.beliefs import Beliefs, IdentityParams
-from sonar_graph.sonar.candidate_design import check_candidates
-from sonar_graph.sonar.candidates import Candidates, Verdict
+from sonar_graph.sonar.cfar import DetectionParams, check_candidates, select_candidates
 from sonar_graph.sonar.confusion import Confusion, confusion_for
-from sonar_graph.sonar.detection import DetectionParams, select_candidates
 from sonar_graph.sonar.frame_check import FrameCheck, check_block
 from sonar_graph.sonar.geometry import FloorView
-from sonar_graph.sonar.look import Look, Sighting
-from sonar_graph.sonar.tracking import SonarStep, Tracker, TrackingParams
+from sonar_graph.sonar.regions import Candidates, CandidateVerdict
+from sonar_graph.sonar.track_filter import Association, SonarStep
+from sonar_graph.sonar.tracker import Tracker, TrackingParams
 
 
 class RecogniserParams(Section):
@@ -62,7 +60,7 @@ class Fate(NamedTuple):
 
 
 REPORTED = "reported"
-REJECTED = {int(v): f"candidate rejected: {v.name.lower().replace('_', ' ')}" for v in Verdict}
+REJECTED = {int(v): f"candidate rejected: {v.name.lower().replace('_', ' ')}" for v in CandidateVerdict}
 
 
 class Recogniser:
@@ -96,7 +94,7 @@ class Recogniser:
         self.confusion.check_designs(self.designs)
         check_candidates(self.designs, self.params.detection, self.params.appearance.search_m)
         self._calibration = calibration
-        self._look = Look(
+        self._look = CandidateFit(
             Appearance(self.designs, self.params.appearance),
             self.confusion,
             calibration.sonar.elevation_aperture_rad,
@@ -109,7 +107,7 @@ class Recogniser:
         """What became of everything in the frame last processed."""
         self.stamp_ns: int | None = None
         """Of the frame last processed."""
-        self.sightings: list[Sighting | None] = []
+        self.sightings: list[ObjectSighting | None] = []
         """How the designs fitted each track of that frame; None where it had no candidate."""
         self.track_ids: Ints = np.empty(0, dtype=np.int64)
         """Numbers of those tracks."""
@@ -209,7 +207,7 @@ class Recogniser:
             track=association.track_ids[rows],
         )
 
-    def _outcome(self, association: Association, row: int, sighting: Sighting) -> str:
+    def _outcome(self, association: Association, row: int, sighting: ObjectSighting) -> str:
         if sighting.fit is None:
             return "not reported: too little of it is in view"
         if association.frames_seen[row] < self.params.least_frames:
@@ -246,5 +244,5 @@ def _fates_of_candidates(stamp_ns: int, candidates: Candidates) -> list[Fate]:
     return [
         Fate(stamp_ns, -1, range_m, azimuth_rad, REJECTED[verdict])
         for verdict, range_m, azimuth_rad in zip(*columns, strict=True)
-        if verdict != Verdict.ACCEPTED
+        if verdict != CandidateVerdict.ACCEPTED
     ]

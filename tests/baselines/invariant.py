@@ -8,12 +8,12 @@ import gtsam
 import numpy as np
 from hypothesis import strategies as st
 
-from baselines.filter_models import SonarModel
-from baselines.invariant_state import InvariantState
+from baselines.filter_inputs import SonarModel
+from baselines.invariant_equations import InvariantState
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.gap_motion import GapMotion
-from sonar_graph.navigation.triples import matrix, vector
-from sonar_graph.slam.association import gate_threshold
+from sonar_graph.navigation.preintegration.dvl_gaps import GapMotion
+from sonar_graph.numerics.mat3 import matrix, vector
+from sonar_graph.slam.landmarks.association import gate_threshold
 
 from .motions import motion_of
 

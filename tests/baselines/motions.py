@@ -6,8 +6,8 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.recursion import Integral
-from sonar_graph.navigation.triples import ZERO, matrix, vector
+from sonar_graph.navigation.preintegration.recursion import Integral
+from sonar_graph.numerics.mat3 import ZERO, matrix, vector
 
 
 def motion_of(twist: Floats, cov: Floats) -> Integral:

@@ -1,7 +1,7 @@
 import gtsam
 import numpy as np
 
-from baselines.causal import CausalEstimates
+from sonar_graph.estimator import CausalEstimates
 from sonar_graph.states import Estimate
 
 

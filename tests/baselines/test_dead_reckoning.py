@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from baselines.dead_reckoning import DeadReckoning
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting, Start
-from sonar_graph.estimator_checks import CHECKS
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections, Measurements
 from sonar_graph.sequence import NS_PER_S
 from sonar_graph.states import Outcome
+from sonar_graph.testing.laws import CHECKS
 
 T0_NS = 1_700_000_000 * NS_PER_S
 SECONDS, IMU_HZ, DVL_HZ = 20, 50, 5

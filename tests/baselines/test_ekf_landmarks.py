@@ -7,14 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from baselines.ekf_augmentation import location
-from baselines.ekf_derivatives import moment_after, motion_covariance
-from baselines.ekf_landmarks import observation, observe_rows
-from baselines.filter_detections import GATED, NEW, NO_SLOT, PASSED_OVER, USED, Frame, nothing_told
-from baselines.filter_models import SonarModel
-from sonar_graph.navigation.triples import matrix, vector
-from sonar_graph.slam.association import gate_threshold
-from sonar_graph.slam.models import FLOOR_GATE, elevation_on_floor, locate, range_azimuth
+from baselines.ekf_equations import moment_after, motion_covariance
+from baselines.ekf_landmarks import location, observation, observe_rows
+from baselines.filter_inputs import GATED, NEW, NO_SLOT, PASSED_OVER, USED, Frame, SonarModel, nothing_told
+from sonar_graph.numerics.mat3 import matrix, vector
+from sonar_graph.slam.landmarks.association import gate_threshold
+from sonar_graph.slam.models.sonar_model import FLOOR_GATE, elevation_on_floor, locate, range_azimuth
 
 from .motions import motion_of
 

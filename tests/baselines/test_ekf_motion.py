@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from baselines.ekf_motion import motion_since_node, motion_to_node, nothing_running, told_again
-from baselines.filter_models import VehicleModel
+from baselines.filter_inputs import VehicleModel
+from baselines.filter_motion import inflate_shared_motion, motion_since_node, motion_to_node, nothing_running
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation import node_motion
-from sonar_graph.navigation.dvl_preintegration import Preintegrator
-from sonar_graph.navigation.gap_motion import gap_values
+from sonar_graph.navigation import odometry as node_motion
 from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation.preintegration.dvl_gaps import gap_values
+from sonar_graph.navigation.preintegration.motion import Preintegrator
 from sonar_graph.sequence import NS_PER_S
 
 from .motions import motion_of
@@ -117,7 +117,7 @@ def test_measurements_over_one_gap_tell_ever_nearer_what_one_exact_one_would_and
     motion = motion_of(np.array([0.3, -0.2, 0.5, 1.0, 2.0, -0.5]), root @ root.T)
     told, n = np.zeros((6, 6)), 12
     for k in range(1, n + 1):
-        again = told_again(motion, k)
+        again = inflate_shared_motion(motion, k)
         told += np.linalg.inv(whole(again))
         assert (again.dR, again.dp, again.impulse) == (motion.dR, motion.dp, motion.impulse)
         assert_allclose(told @ whole(motion), k / (k + 1) * np.eye(6), atol=1e-9)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from baselines.ekf_prediction import advance_to_node
-from baselines.filter_models import VehicleModel
-from baselines.gravity_interval import GravityInterval, open_interval
-from sonar_graph.navigation.recursion import NO_MOTION
-from sonar_graph.navigation.unmeasured_turns import NO_TURNS
+from baselines.ekf_equations import advance_to_node
+from baselines.filter_events import GravityInterval, open_interval
+from baselines.filter_inputs import VehicleModel
+from sonar_graph.navigation.imu_gaps import NO_TURNS
+from sonar_graph.navigation.preintegration.recursion import NO_MOTION
 from sonar_graph.sequence import NS_PER_S
 
 T0_NS = 1_700_000_000 * NS_PER_S

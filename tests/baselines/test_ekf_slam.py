@@ -19,11 +19,11 @@ from sonar_graph.calibration import (
     Start,
 )
 from sonar_graph.errors import EstimatorError, MeasurementError
-from sonar_graph.estimator_checks import CHECKS
 from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections, Measurements
 from sonar_graph.sequence import NS_PER_S, Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.states import Outcome
+from sonar_graph.testing.laws import CHECKS
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks" / "performance"
 T0_NS = 1_700_000_000 * NS_PER_S

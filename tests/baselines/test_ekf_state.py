@@ -5,9 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from baselines.ekf_state import correct, correct_pair, pose_after, predict
-from baselines.euler import euler_from_rates, euler_from_rotation, rotation_from_euler
-from sonar_graph.navigation.triples import matrix, vector
+from baselines.ekf_equations import correct, correct_pair, pose_after, predict
+from sonar_graph.numerics.mat3 import euler_from_rates, euler_from_rotation, matrix, rotation_from_euler, vector
 
 from .motions import motion_of
 

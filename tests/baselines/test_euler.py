@@ -4,8 +4,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from baselines.euler import euler_from_rates, euler_from_rotation, rates_from_euler, rotation_from_euler
-from sonar_graph.navigation.triples import matrix, product
+from sonar_graph.numerics.mat3 import (
+    euler_from_rates,
+    euler_from_rotation,
+    matrix,
+    product,
+    rates_from_euler,
+    rotation_from_euler,
+)
 
 attitudes = st.tuples(st.floats(-3.1, 3.1), st.floats(-1.4, 1.4), st.floats(-3.1, 3.1))
 STEP = 1e-6

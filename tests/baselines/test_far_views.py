@@ -7,20 +7,18 @@ from scipy.stats import chi2
 
 from baselines.ekf_landmarks import observe_rows as observe_by_ekf
 from baselines.ekf_slam import EkfSlam
-from baselines.far_views import by_range_and_azimuth, is_beyond_linear, view_noise
-from baselines.filter_clock import LOST
-from baselines.filter_detections import GATED, USED, Frame, nothing_told
-from baselines.filter_models import SonarModel
+from baselines.filter_events import LOST
+from baselines.filter_inputs import GATED, USED, Frame, SonarModel, nothing_told
 from baselines.invariant_ekf import InvariantEkf
-from baselines.invariant_state import InvariantState, landmark_covariance
+from baselines.invariant_equations import InvariantState, landmark_covariance
 from baselines.invariant_updates import observe_rows as observe_by_invariant
-from sonar_graph.navigation.gap_motion import GapMotion
-from sonar_graph.navigation.kernels import skew
-from sonar_graph.navigation.recursion import NO_MOTION
-from sonar_graph.navigation.triples import IDENTITY, ZERO, ZEROS
+from baselines.sonar_update import by_range_and_azimuth, is_beyond_linear, view_noise
+from sonar_graph.navigation.preintegration.dvl_gaps import GapMotion
+from sonar_graph.navigation.preintegration.recursion import NO_MOTION
+from sonar_graph.numerics.mat3 import IDENTITY, ZERO, ZEROS, skew
 from sonar_graph.sequence import NS_PER_S, Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
-from sonar_graph.slam.association import gate_threshold
+from sonar_graph.slam.landmarks.association import gate_threshold
 
 APERTURE_RAD = 0.3
 SONAR = SonarModel(IDENTITY, ZERO, gate_threshold(0.999, 2), APERTURE_RAD, 0.02**2, 0.01**2, False, 0.0, 1.0)

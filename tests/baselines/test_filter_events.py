@@ -1,9 +1,22 @@
 import numpy as np
 import pytest
 
-from baselines.filter_clock import CLOCK, DEPTHS, LOST, NODE, SIGHTINGS, reach_node
-from baselines.filter_events import BEFORE_ALL, DEPTH, END, FRAME, NODE_REACHED, Stamps, next_event
-from sonar_graph.navigation.kernels import compiled
+from baselines.filter_events import (
+    BEFORE_ALL,
+    CLOCK,
+    DEPTH,
+    DEPTHS,
+    END,
+    FRAME,
+    LOST,
+    NODE,
+    NODE_REACHED,
+    SIGHTINGS,
+    Stamps,
+    next_event,
+    reach_node,
+)
+from sonar_graph.numerics.jit import compiled
 
 
 @compiled

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from baselines.filter_detections import NEW, NO_SLOT, USED
-from baselines.filter_intake import DetectionIntake, check_rows, depth_since
+from baselines.filter import DetectionIntake, check_rows, depth_since
+from baselines.filter_inputs import NEW, NO_SLOT, USED
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Depth, LandmarkDetections, Measurements
 from sonar_graph.states import Outcome

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from baselines.invariant_models import height_of_body_point, height_of_point, location, missed_up, observation
-from sonar_graph.navigation.triples import vector
-from sonar_graph.slam.models import locate, range_azimuth
+from baselines.invariant_equations import height_of_body_point, height_of_point, location, missed_up, observation
+from sonar_graph.numerics.mat3 import vector
+from sonar_graph.slam.models.sonar_model import locate, range_azimuth
 
 from .invariant import (
     D_BIAS,

@@ -2,15 +2,18 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from baselines.filter_models import vehicle_model
-from baselines.invariant_motion import motion_since_node, motion_to_node, told_again_with_bias
+from baselines.filter_inputs import vehicle_model
+from baselines.filter_motion import (
+    inflate_shared_motion_with_bias,
+    motion_since_node_with_bias,
+    motion_to_node_with_bias,
+)
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.dvl_preintegration import Preintegrator
-from sonar_graph.navigation.node_motion import motion_between_nodes
-from sonar_graph.navigation.node_motion import motion_since_node as provisional_motion
-from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.recursion import in_last_frame
+from sonar_graph.navigation.odometry import Odometry, motion_between_nodes
+from sonar_graph.navigation.odometry import motion_since_node_with_bias as provisional_motion
+from sonar_graph.navigation.preintegration.motion import Preintegrator
+from sonar_graph.navigation.preintegration.recursion import in_last_frame
 
 NS = 1_000_000_000
 T0_NS = 1_700_000_000 * NS
@@ -58,7 +61,7 @@ def test_motion_to_a_node_is_that_of_every_estimator(odometry, node):
     nodes = odometry.nodes(0, T0_NS + 10 * NS)
     start_ns, end_ns = nodes[node], nodes[node + 1]
     assert odometry.is_gap(start_ns, end_ns) == (node == 26)
-    motion = motion_to_node(odometry.columns(), VEHICLE, ATTITUDE, BIAS, start_ns, end_ns)
+    motion = motion_to_node_with_bias(odometry.columns(), VEHICLE, ATTITUDE, BIAS, start_ns, end_ns)
     preintegrator = Preintegrator.from_calibration(CALIBRATION)
     check_same(motion, motion_between_nodes(odometry, preintegrator, start_ns, end_ns, BIAS, earth()))
 
@@ -67,7 +70,7 @@ def test_motion_to_a_node_is_that_of_every_estimator(odometry, node):
 def test_motion_since_a_node_is_that_of_every_estimator(odometry, node, later_s):
     start_ns = odometry.nodes(0, T0_NS + 10 * NS)[node]
     until_ns = start_ns + round(later_s * NS)
-    motion = motion_since_node(odometry.columns(), VEHICLE, ATTITUDE, BIAS, start_ns, until_ns)
+    motion = motion_since_node_with_bias(odometry.columns(), VEHICLE, ATTITUDE, BIAS, start_ns, until_ns)
     preintegrator = Preintegrator.from_calibration(CALIBRATION)
     check_same(motion, provisional_motion(odometry, preintegrator, start_ns, until_ns, BIAS, earth()))
 
@@ -75,8 +78,8 @@ def test_motion_since_a_node_is_that_of_every_estimator(odometry, node, later_s)
 def test_what_is_told_again_in_a_gap_counts_less_and_less(odometry):
     """``k (k + 1)`` times the covariance; mean and derivative stay."""
     start_ns, end_ns = odometry.nodes(0, T0_NS + 10 * NS)[26:28]
-    motion = motion_to_node(odometry.columns(), VEHICLE, ATTITUDE, BIAS, start_ns, end_ns)
-    again = told_again_with_bias(motion, 3)
+    motion = motion_to_node_with_bias(odometry.columns(), VEHICLE, ATTITUDE, BIAS, start_ns, end_ns)
+    again = inflate_shared_motion_with_bias(motion, 3)
     assert_allclose(again.integral.cov_rr, 12 * np.array(motion.integral.cov_rr), rtol=1e-12)
     assert_allclose(again.integral.cov_tt, 12 * np.array(motion.integral.cov_tt), rtol=1e-12)
     assert (again.integral.dp, again.D_t, again.D_r) == (motion.integral.dp, motion.D_t, motion.D_r)

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from numpy.testing import assert_allclose, assert_array_equal
 
-from baselines.invariant_state import InvariantState, correct, landmark_covariance, pose_after, predict, retract
+from baselines.invariant_equations import InvariantState, correct, landmark_covariance, pose_after, predict, retract
 
 from .invariant import (
     D_BIAS,

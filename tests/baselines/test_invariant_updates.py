@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from baselines.filter_detections import GATED, NEW, NO_SLOT, PASSED_OVER, USED, Frame, nothing_told
-from baselines.invariant_state import InvariantState, landmark_covariance
+from baselines.filter_inputs import GATED, NEW, NO_SLOT, PASSED_OVER, USED, Frame, nothing_told
+from baselines.invariant_equations import InvariantState, landmark_covariance
 from baselines.invariant_updates import correct_depth, correct_plane, correct_up, observe_rows
-from sonar_graph.slam.models import locate, range_azimuth
+from sonar_graph.slam.models.sonar_model import locate, range_azimuth
 
 from .invariant import D_BIAS, MOUNTING, SONAR, body_after, copied, gap_motion_of, moved_by, state_at
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from baselines.joint_correction import correct_jointly
+from baselines.sonar_update import correct_jointly
 
 
 @pytest.mark.parametrize("m", [1, 2, 5])

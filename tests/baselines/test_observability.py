@@ -7,14 +7,12 @@ y and heading, and a filter must not think otherwise because its estimates chang
 import numpy as np
 import pytest
 
-from baselines.ekf_derivatives import moment_after
+from baselines.ekf_equations import moment_after
 from baselines.ekf_landmarks import observation
-from baselines.euler import euler_from_rotation, rotation_from_euler
-from baselines.invariant_models import height_of_body_point, missed_up
-from baselines.invariant_models import observation as invariant_observation
-from baselines.invariant_state import InvariantState, by_bias, motion_jacobian
-from sonar_graph.navigation.recursion import NO_MOTION
-from sonar_graph.navigation.triples import matrix, vector
+from baselines.invariant_equations import InvariantState, by_bias, height_of_body_point, missed_up, motion_jacobian
+from baselines.invariant_equations import observation as invariant_observation
+from sonar_graph.navigation.preintegration.recursion import NO_MOTION
+from sonar_graph.numerics.mat3 import euler_from_rotation, matrix, rotation_from_euler, vector
 
 from .invariant import LANDMARKS, SONAR, derivative, gap_motion_of, gauge, rotation
 

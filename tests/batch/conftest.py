@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from sonar_graph.batch.plan import plan_runs, versions_of
-from sonar_graph.batch.planned import PlannedRun
-from sonar_graph.batch.source_hash import source_hash
+from sonar_graph.batch.plan import plan_runs, source_hash, versions_of
+from sonar_graph.batch.store import PlannedRun
 from sonar_graph.batch.suite import read_suite
 
 WriteSuite = Callable[..., Path]

@@ -10,7 +10,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sonar_graph.batch.recorded import RESULTS, SUITE, RecordedBatch, RecordedRun
+from sonar_graph.batch.recorded import RESULTS, RecordedBatch, RecordedRun
+from sonar_graph.batch.store import SUITE
 
 METRICS = ["causal.ate_se2_m", "causal.yaw_rmse_rad", "landmarks.se2_m"]
 ESTIMATORS = {"dead-reckoning": 0.4, "isam2": 0.1, "ekf-slam": 0.12}

@@ -12,13 +12,11 @@ import pytest
 
 from sonar_graph.batch import batch as batch_module
 from sonar_graph.batch.batch import Batch, limits_of
-from sonar_graph.batch.catalogue import is_timing
-from sonar_graph.batch.execution import Progress, Where
+from sonar_graph.batch.cluster import Progress, Where
 from sonar_graph.batch.one_run import perform
-from sonar_graph.batch.planned import Limits, Outcome, PlannedRun
 from sonar_graph.batch.recorded import is_batch, read_batch
-from sonar_graph.batch.results import RESULTS
-from sonar_graph.batch.store import Store
+from sonar_graph.batch.result_table import RESULTS, is_timing
+from sonar_graph.batch.store import Limits, PlannedRun, RunOutcome, Store
 from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import BatchError, EvaluationError
 
@@ -33,7 +31,7 @@ class Killed(BaseException):
     """Ends a process as SIGKILL does: nobody hears of it."""
 
 
-def nobody(_run: PlannedRun, _outcome: Outcome) -> None:
+def nobody(_run: PlannedRun, _outcome: RunOutcome) -> None:
     """Is told of progress."""
 
 
@@ -47,7 +45,7 @@ def do_here(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
     for run in runs:
         with tempfile.TemporaryDirectory() as scratch:
             row = perform(run, Path(scratch))
-            store.write(run.key, Outcome(row))
+            store.write(run.key, RunOutcome(row))
 
 
 @pytest.fixture
@@ -93,10 +91,10 @@ def test_resumed_batch_has_the_table_of_an_undisturbed_one(
 def test_full_disk_is_told_and_loses_no_run_that_is_done(
     suite: Path, tmp_path: Path, in_this_process: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sonar_graph.batch import execution
+    from sonar_graph.batch import cluster as execution
 
     class Full(Store):
-        def write(self, key: str, outcome: Outcome) -> None:
+        def write(self, key: str, outcome: RunOutcome) -> None:
             if len(list((self.folder / "runs").iterdir())) == 2:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             super().write(key, outcome)
@@ -105,8 +103,8 @@ def test_full_disk_is_told_and_loses_no_run_that_is_done(
         def __init__(self, run: PlannedRun) -> None:
             self.run = run
 
-        def result(self) -> Outcome:
-            return Outcome(perform(self.run, tmp_path / "scratch" / self.run.key))
+        def result(self) -> RunOutcome:
+            return RunOutcome(perform(self.run, tmp_path / "scratch" / self.run.key))
 
     def kept(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
         for run in runs:
@@ -136,7 +134,7 @@ def test_mistake_in_a_suite_leaves_the_folder_alone(write_suite: WriteSuite, tmp
 
 def test_failed_runs_are_kept_until_they_are_discarded(suite: Path, tmp_path: Path, in_this_process: None) -> None:
     with Batch.opened(read_suite(suite), tmp_path) as batch:
-        batch.store.write(batch.runs[0].key, Outcome({"status": "timeout", "reason": "took longer than 1 s"}))
+        batch.store.write(batch.runs[0].key, RunOutcome({"status": "timeout", "reason": "took longer than 1 s"}))
         assert batch.run(HERE, LIMITS, nobody) == {"ok": 3, "timeout": 1}
         assert batch.run(HERE, LIMITS, nobody) == {"ok": 3, "timeout": 1}
         batch.discard_failed()
@@ -163,7 +161,7 @@ def killed_after(count: int) -> Callable[..., None]:
     def killed(runs: list[PlannedRun], store: Store, _limits: Limits, _where: Where, progress: Progress) -> None:
         for run in runs[:count]:
             do_here([run], store)
-            progress(run, Outcome({"status": "ok"}))
+            progress(run, RunOutcome({"status": "ok"}))
         raise Killed
 
     return killed

@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from sonar_graph.batch.detectable import detectable
+from sonar_graph.batch.permutation import Family, Group, detectable
 from sonar_graph.batch.recorded import ALL_LOGS
-from sonar_graph.batch.worsening_tests import Family, Group
 
 
 def noise(scatter: float, seed: int, cases: int = 8) -> np.ndarray:

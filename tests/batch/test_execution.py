@@ -23,10 +23,9 @@ import pyarrow.parquet as pq
 import pytest
 from distributed import LocalCluster
 
-from sonar_graph.batch import execution
-from sonar_graph.batch.execution import Where, run_batch
-from sonar_graph.batch.planned import Limits, Outcome, PlannedRun
-from sonar_graph.batch.store import Store
+from sonar_graph.batch import cluster as execution
+from sonar_graph.batch.cluster import Where, run_batch
+from sonar_graph.batch.store import Limits, PlannedRun, RunOutcome, Store
 from sonar_graph.errors import BatchError
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
@@ -157,7 +156,7 @@ def test_end_of_a_batch_leaves_the_equal_runs_of_another_on_the_scheduler(
     done: list[str] = []
     run = planned()
 
-    def told(planned_run: PlannedRun, _outcome: Outcome) -> None:
+    def told(planned_run: PlannedRun, _outcome: RunOutcome) -> None:
         done.append(planned_run.key)
 
     monkeypatch.setattr(execution, "perform_watched", wait_a_second)
@@ -173,12 +172,12 @@ def test_end_of_a_batch_leaves_the_equal_runs_of_another_on_the_scheduler(
     assert done == [run.key]
 
 
-def wait_a_second(_run: PlannedRun, limits: Limits) -> Outcome:
+def wait_a_second(_run: PlannedRun, limits: Limits) -> RunOutcome:
     """In place of a run; one without time cannot be done."""
     if limits.timeout_s == 0:
         raise BatchError("no time")
     time.sleep(1.0)
-    return Outcome({"status": "ok"})
+    return RunOutcome({"status": "ok"})
 
 
 def test_missing_scheduler_is_one_line(write_suite: WriteSuite, tmp_path: Path) -> None:

@@ -8,14 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.batch.accuracy import accuracy_table, all_tests
-from sonar_graph.batch.catalogue import metrics_of
-from sonar_graph.batch.exported import as_csv, as_latex
-from sonar_graph.batch.headline import DIFFERENT, HIGHER, LOWER, head_metric, headlines, mark_of, overview_table
 from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
-from sonar_graph.batch.rounding import quantile_text
+from sonar_graph.batch.result_table import metrics_of
 from sonar_graph.batch.statistics import paired, quantile_error
-from sonar_graph.batch.tables import Cell, Table
+from sonar_graph.report.batch_summary import DIFFERENT, HIGHER, LOWER, head_metric, headlines, mark_of, overview_table
+from sonar_graph.report.batch_tables import accuracy_table, all_tests
+from sonar_graph.report.tables import Cell, Table, as_csv, as_latex
+from sonar_graph.report.wording import quantile_text
 
 from .recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, with_failures
 

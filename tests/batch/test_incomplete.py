@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonar_graph.batch.accuracy import all_tests
-from sonar_graph.batch.catalogue import metrics_of
 from sonar_graph.batch.gate import bless, gate
-from sonar_graph.batch.incomplete import lost_told, marked, missing_told
-from sonar_graph.batch.overviews import failure_table
-from sonar_graph.batch.page import render_batch, write_batch_report
 from sonar_graph.batch.recorded import RecordedBatch, read_batch
+from sonar_graph.batch.result_table import metrics_of
 from sonar_graph.errors import EvaluationError
+from sonar_graph.report.batch_page import render_batch, write_batch_report
+from sonar_graph.report.batch_summary import lost_told, marked, missing_told
+from sonar_graph.report.batch_tables import all_tests, failure_table
 
 from .recorded_batches import ESTIMATORS, LOGS, drawn_batch, with_failures, with_missing, write_batch
 

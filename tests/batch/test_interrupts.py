@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from sonar_graph.batch.interrupts import deferred_interrupt, terminations_as_interrupts
+from sonar_graph.batch.batch import deferred_interrupt, terminations_as_interrupts
 
 
 def interrupt() -> None:

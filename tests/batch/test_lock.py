@@ -11,7 +11,7 @@ from pathlib import Path
 import filelock
 import pytest
 
-from sonar_graph.batch.lock import only_batch_in
+from sonar_graph.batch.store import only_batch_in
 from sonar_graph.errors import BatchError
 
 HOLDER = """

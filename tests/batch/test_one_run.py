@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from sonar_graph.batch import one_run
-from sonar_graph.batch.catalogue import is_timing
 from sonar_graph.batch.one_run import perform
-from sonar_graph.batch.planned import PlannedRun
-from sonar_graph.batch.results import COLUMNS
+from sonar_graph.batch.result_table import COLUMNS, is_timing
 from sonar_graph.batch.sources import fingerprint
+from sonar_graph.batch.store import PlannedRun
 from sonar_graph.batch.suite import METRICS
 from sonar_graph.errors import BatchError
 from sonar_graph.evaluation.comparison import compare

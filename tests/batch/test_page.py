@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import pytest
 
-from sonar_graph.batch.page import render_batch, write_batch_report
 from sonar_graph.batch.recorded import read_batch
+from sonar_graph.report.batch_page import render_batch, write_batch_report
 
 from .recorded_batches import LOGS, drawn_batch, failed, with_failures, write_batch
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from sonar_graph.batch.page import write_batch_report
+from sonar_graph.report.batch_page import write_batch_report
 
 from .recorded_batches import LOGS, drawn_batch, with_failures
 

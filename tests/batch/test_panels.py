@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from sonar_graph.batch.panels import WIDTH_IN, folded, log_panels, spread_out
-from sonar_graph.evaluation.figure_style import colour
+from sonar_graph.report.batch_figures import WIDTH_IN, folded, log_panels, spread_out
+from sonar_graph.report.figure_style import colour
 
 from .recorded_batches import drawn_batch
 

@@ -6,8 +6,8 @@ import pytest
 
 from sonar_graph.batch import plan
 from sonar_graph.batch.plan import plan_runs, versions_of
-from sonar_graph.batch.planned import PlannedRun
 from sonar_graph.batch.sources import LOG, fingerprint
+from sonar_graph.batch.store import PlannedRun
 from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import BatchError
 

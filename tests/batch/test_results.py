@@ -6,11 +6,9 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sonar_graph.batch.catalogue import is_timing
 from sonar_graph.batch.plan import plan_runs
-from sonar_graph.batch.planned import Outcome
-from sonar_graph.batch.results import COLUMNS, SUITE_METADATA, write_results
-from sonar_graph.batch.store import Store
+from sonar_graph.batch.result_table import COLUMNS, SUITE_METADATA, is_timing, write_results
+from sonar_graph.batch.store import RunOutcome, Store
 from sonar_graph.batch.suite import read_suite
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
@@ -20,8 +18,8 @@ def test_table_has_a_row_for_each_planned_run_in_the_order_of_the_plan(write_sui
     file = read_suite(write_suite(HEADER, BASIN, "seeds = 4\n", DEAD_RECKONING))
     runs, store = plan_runs(file), Store(tmp_path / "out")
     for run, error_m in ((runs[2], 0.3), (runs[0], 0.1)):
-        store.write(run.key, Outcome({"status": "ok", "causal.ate_raw_m": error_m, "causal.nees_yaw_dof": 1}))
-    store.write(runs[3].key, Outcome({"status": "timeout", "reason": "took longer than 1 s"}))
+        store.write(run.key, RunOutcome({"status": "ok", "causal.ate_raw_m": error_m, "causal.nees_yaw_dof": 1}))
+    store.write(runs[3].key, RunOutcome({"status": "timeout", "reason": "took longer than 1 s"}))
     table = pq.read_table(write_results(store, file.suite, runs))
     assert table.column_names == [*COLUMNS, "causal.ate_raw_m", "causal.nees_yaw_dof"]
     assert table["seed"].to_pylist() == [0, 1, 2, 3]

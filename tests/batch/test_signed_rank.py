@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from sonar_graph.batch.signed_rank import exact_tail, least_p, near_tail, signed_rank_p
+from sonar_graph.batch.statistics import exact_tail, least_p, near_tail, signed_rank_p
 
 INF = math.inf
 KINDS = ("distinct", "ties", "zeros", "infinite", "mostly zeros", "one size")

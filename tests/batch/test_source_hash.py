@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sonar_graph.batch.plan import plan_runs, versions_of
-from sonar_graph.batch.source_hash import source_hash, source_hash_now
+from sonar_graph.batch.plan import plan_runs, source_hash, source_hash_now, versions_of
 from sonar_graph.batch.suite import read_suite
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite

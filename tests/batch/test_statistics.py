@@ -10,7 +10,6 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import stats
 
-from sonar_graph.batch.signed_rank import signed_rank_p
 from sonar_graph.batch.statistics import (
     anees,
     failure_rate,
@@ -19,6 +18,7 @@ from sonar_graph.batch.statistics import (
     paired,
     quantile,
     quantile_error,
+    signed_rank_p,
     standard_error,
     summarise,
 )

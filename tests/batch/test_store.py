@@ -7,10 +7,11 @@ from typing import Any
 
 import pytest
 
-from sonar_graph.batch.planned import Outcome
-from sonar_graph.batch.store import Store
+from sonar_graph.batch.store import RunOutcome, Store
 
-OUTCOME = Outcome({"status": "ok", "causal.ate_raw_m": 0.1}, {"runs/isam2/series.npz": b"123", "a.json": b"{}"}, "said")
+OUTCOME = RunOutcome(
+    {"status": "ok", "causal.ate_raw_m": 0.1}, {"runs/isam2/series.npz": b"123", "a.json": b"{}"}, "said"
+)
 
 
 def names(folder: Path) -> list[str]:
@@ -110,7 +111,7 @@ def test_row_that_the_machine_lost_counts_as_not_done(tmp_path: Path) -> None:
 def test_row_of_another_run_counts_as_not_done(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for key, error_m in (("a", 1.0), ("b", 2.0)):
-        store.write(key, Outcome({"status": "ok", "error_m": error_m}))
+        store.write(key, RunOutcome({"status": "ok", "error_m": error_m}))
     folders = {key: store.run_folder(key) for key in ("a", "b")}
     folders["a"].rename(tmp_path / "aside")
     folders["b"].rename(folders["a"])

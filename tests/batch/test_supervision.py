@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from sonar_graph.batch import supervision
-from sonar_graph.batch.planned import Limits, PlannedRun
+from sonar_graph.batch.store import Limits, PlannedRun
 from sonar_graph.batch.supervision import Runner, perform_watched
 from sonar_graph.errors import BatchError
 
@@ -31,7 +31,7 @@ def no_process_left() -> Iterator[None]:
 
 
 def runners() -> list[psutil.Process]:
-    return [p for p in psutil.Process().children() if "sonar_graph.batch.runner" in p.cmdline()]
+    return [p for p in psutil.Process().children() if "sonar_graph.batch.one_run" in p.cmdline()]
 
 
 def test_run_that_takes_too_long_is_ended_and_the_next_one_is_done(planned: Planned, misbehaving: None) -> None:
@@ -70,7 +70,7 @@ def test_processes_that_a_run_starts_count_and_end_with_it(
 def is_runner_of_this_test(process: psutil.Process) -> bool:
     """Children of a runner have its command and environment."""
     with contextlib.suppress(psutil.Error):
-        is_runner = "sonar_graph.batch.runner" in process.cmdline()
+        is_runner = "sonar_graph.batch.one_run" in process.cmdline()
         return is_runner and process.environ().get("SONAR_GRAPH_TEST_MARK") == os.environ["SONAR_GRAPH_TEST_MARK"]
     return False
 

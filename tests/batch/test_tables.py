@@ -8,17 +8,31 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.batch.accuracy import accuracy_table, all_tests, difference_table, p_text
-from sonar_graph.batch.catalogue import KINDS, Metric, metrics_of
-from sonar_graph.batch.exported import as_csv, as_latex, latex_text, write_tables
-from sonar_graph.batch.figures import consistency_drawing, difference_drawing
-from sonar_graph.batch.finding import errors_told, failures_told, instants_told, power_told, reference_told
-from sonar_graph.batch.headline import head_metric
-from sonar_graph.batch.overviews import SAME_EVIDENCE, consistency_table, cost_table, failure_table, run_lists
 from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
-from sonar_graph.batch.rounding import quantile_text
+from sonar_graph.batch.result_table import KINDS, Metric, metrics_of
 from sonar_graph.batch.statistics import paired, quantile_error
-from sonar_graph.batch.tables import Cell, Column, Table
+from sonar_graph.report.batch_figures import consistency_drawing, difference_drawing
+from sonar_graph.report.batch_summary import (
+    errors_told,
+    failures_told,
+    head_metric,
+    instants_told,
+    power_told,
+    reference_told,
+)
+from sonar_graph.report.batch_tables import (
+    SAME_EVIDENCE,
+    accuracy_table,
+    all_tests,
+    consistency_table,
+    cost_table,
+    difference_table,
+    failure_table,
+    p_text,
+    run_lists,
+)
+from sonar_graph.report.tables import Cell, Column, Table, as_csv, as_latex, latex_text, write_tables
+from sonar_graph.report.wording import quantile_text
 
 from .recorded_batches import LOGS, METRICS, changed, drawn_batch, with_failures
 

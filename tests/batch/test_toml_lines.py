@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from sonar_graph.batch.toml_lines import Place, line_of
+from sonar_graph.batch.suite import Place, line_of
 
 TEXT = '''name = "a"
 note = """

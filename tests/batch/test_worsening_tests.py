@@ -8,8 +8,8 @@ import pytest
 from scipy import stats
 
 from sonar_graph.batch.gate import movable, worse_groups
+from sonar_graph.batch.permutation import ALL_SIGNS, DRAWN, Family, clipped, families, with_all_logs
 from sonar_graph.batch.recorded import ALL_LOGS
-from sonar_graph.batch.worsening_tests import ALL_SIGNS, DRAWN, Family, clipped, families, with_all_logs
 
 
 def family(beyond: np.ndarray) -> Family:

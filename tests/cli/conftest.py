@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sonar_graph.cli import main
+from sonar_graph.cli.main import main
 from sonar_graph.logs.writing import write_sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 

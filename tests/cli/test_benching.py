@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sonar_graph.cli import main
+from sonar_graph.cli.main import main
 
 
 def code(*arguments: str) -> int:

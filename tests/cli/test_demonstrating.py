@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sonar_graph.cli.demonstrating import DEMO
+from sonar_graph.cli.compare import DEMO
 from sonar_graph.evaluation.storage import read_comparison
 from sonar_graph.logs.reading import read_sequence
 from sonar_graph.simulation.basin import FASTEST_M_S, PAPER_LAPS, BasinOptions, cruise_speed
@@ -19,7 +19,7 @@ Run = Callable[..., int]
 def test_demo_goes_from_images_to_the_papers_table(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sonar_graph.cli.demonstrating.DEMO", DEMO | {"duration_s": 130.0, "laps": 1})
+    monkeypatch.setattr("sonar_graph.cli.compare.DEMO", DEMO | {"duration_s": 130.0, "laps": 1})
     assert run("demo", "-o", tmp_path) == 0
     told = capsys.readouterr().out
     assert f"Report: {tmp_path / 'report.html'}" in told

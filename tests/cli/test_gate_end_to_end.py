@@ -56,7 +56,7 @@ def install(site: Path, default: float) -> None:
 
 def command(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     path = os.pathsep.join([str(folder / "site"), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
-    program = "from sonar_graph.cli import main; main()"
+    program = "from sonar_graph.cli.main import main; main()"
     return subprocess.run(
         [sys.executable, "-c", program, "bench", *arguments],
         cwd=folder,

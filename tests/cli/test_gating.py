@@ -89,10 +89,10 @@ def test_only_a_strict_gate_fails_by_a_difference_that_no_test_can_judge(run, tm
 
 
 def test_no_more_than_ten_runs_that_stand_out_are_printed():
-    from sonar_graph.batch.gate import Verdict
-    from sonar_graph.cli.benching import verdict_lines
+    from sonar_graph.batch.gate import GateVerdict
+    from sonar_graph.cli.bench import verdict_lines
 
-    lines = verdict_lines(Verdict([], [f"run {n}" for n in range(12)], 24, {"isam2": 2}, {}, []))
+    lines = verdict_lines(GateVerdict([], [f"run {n}" for n in range(12)], 24, {"isam2": 2}, {}, []))
     assert len([line for line in lines if line.startswith("Look at: run")]) == 10
     assert "Look at: 2 more such lines are not shown" in lines
     assert any("No test of errors: isam2 (2)" in line for line in lines)

@@ -13,7 +13,7 @@ import pytest
 import typer.main
 
 import sonar_graph
-from sonar_graph.cli import app
+from sonar_graph.cli.main import app
 
 Run = Callable[..., int]
 
@@ -41,7 +41,7 @@ def test_no_argument_shows_the_commands(run: Run, capsys: pytest.CaptureFixture[
 
 def test_help_does_not_wait_for_heavy_imports(run: Run) -> None:
     heavy = "{'gtsam', 'matplotlib', 'numba', 'numpy', 'scipy'}"
-    code = f"import sys, sonar_graph.cli; print(sorted({heavy} & set(sys.modules)))"
+    code = f"import sys, sonar_graph.cli.main; print(sorted({heavy} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
@@ -94,8 +94,8 @@ def test_help_of_a_group_ends_in_examples(run: Run, group: str, capsys: pytest.C
 def test_help_names_defaults_presets_and_roles_as_they_are() -> None:
     from sonar_graph.logs.roles import ROLES
     from sonar_graph.simulation.basin import BasinOptions
-    from sonar_graph.simulation.image_options import ImageOptions
-    from sonar_graph.simulation.presets import DVL_PRESETS, IMU_PRESETS
+    from sonar_graph.simulation.options import DVL_PRESETS, IMU_PRESETS
+    from sonar_graph.simulation.sonar_image.imaging_sonar import ImageOptions
 
     options = BasinOptions()
     helps = {option.name: option.help for option in commands()["simulate", "basin"].params}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from sonar_graph.cli import app
+from sonar_graph.cli.main import app
 from sonar_graph.logs.writing import write_sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from sonar_graph.cli import main
+from sonar_graph.cli.main import main
 
 Run = Callable[..., int]
 

@@ -169,7 +169,7 @@ def test_every_command_that_writes_a_log_from_a_file_is_tried_here() -> None:
     """A command that joins later must not be forgotten."""
     import typer.main
 
-    from sonar_graph.cli import app
+    from sonar_graph.cli.main import app
 
     def commands(group: Any) -> Iterator[Any]:
         for command in group.commands.values():

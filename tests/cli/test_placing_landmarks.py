@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sonar_graph.cli import app
+from sonar_graph.cli.main import app
 from sonar_graph.logs.reading import read_sequence
 from sonar_graph.logs.writing import write_sequence
 from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks

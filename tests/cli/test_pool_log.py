@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from sonar_graph.cli import app
+from sonar_graph.cli.main import app
 
 PAGE = Path(__file__).parents[2] / "docs" / "theory" / "datasets.md"
 FOLDER = os.environ.get("SONAR_GRAPH_DATA")

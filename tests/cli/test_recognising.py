@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from sonar_graph.logs.mcap.writer import write_recording
 from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.recorder import write_recording
-from sonar_graph.logs.sonar_encoding import sonar_image_messages
-from sonar_graph.logs.writing import write_sequence
+from sonar_graph.logs.writing import sonar_image_messages, write_sequence
 from sonar_graph.sonar import confusion
 from sonar_graph.sonar.confusion import read_confusion
 

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.cli.settings import check_rate, estimator_settings, parse_setting, read_calibration, topic_choices
+from sonar_graph.cli.arguments import check_rate, estimator_settings, parse_setting, read_calibration, topic_choices
 from sonar_graph.errors import CalibrationError, EstimatorError, EvaluationError
-from sonar_graph.logs.calibration_sources import PartialCalibration
+from sonar_graph.logs.vehicle_setup import PartialCalibration
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.sequence import Sequence
 

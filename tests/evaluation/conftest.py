@@ -9,9 +9,9 @@ import gtsam
 import numpy as np
 import pytest
 
-import sonar_graph.evaluation.run as run_module
 from sonar_graph.calibration import Calibration, PlanarMotion, Section
 from sonar_graph.errors import UnknownEstimatorError
+from sonar_graph.evaluation import run as run_module
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections, Measurements
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory

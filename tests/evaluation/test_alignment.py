@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.errors import EvaluationError
-from sonar_graph.evaluation.alignment import align_se3, align_yaw, umeyama
-from sonar_graph.evaluation.metrics import rmse
+from sonar_graph.evaluation.metrics import align_se3, align_yaw, rmse, umeyama
 
 seeds = st.integers(0, 2**32 - 1)
 

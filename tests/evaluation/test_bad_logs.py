@@ -11,14 +11,13 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.evaluation.recognising import LEAPT, NO_FLOOR, recognise
-from sonar_graph.evaluation.recognition import Recognition
+from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
+from sonar_graph.logs.mcap.writer import Outgoing
 from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.recorder import Outgoing
-from sonar_graph.logs.sonar_encoding import sonar_image_messages
-from sonar_graph.logs.window import Instant, Window
-from sonar_graph.logs.writing import write_sequence
+from sonar_graph.logs.writing import sonar_image_messages, write_sequence
 from sonar_graph.measurements import SonarFrames
+from sonar_graph.recognition.recognition_record import Recognition
+from sonar_graph.recognition.session import LEAPT, NO_FLOOR, recognise
 
 if TYPE_CHECKING:
     from tests.imaged_lane import Lane
@@ -125,7 +124,7 @@ def test_of_two_sonars_one_must_be_chosen_before_any_image_is_read(lane, tmp_pat
 def test_only_the_part_that_was_read_is_recognised(lane, tmp_path):
     log = tmp_path / "log.mcap"
     write_sequence(log, lane.sequence, [message(f) for f in frames_of(lane)])
-    window = Window(Instant.parse("2"), Instant.parse("8"))
+    window = TimeWindow(Instant.parse("2"), Instant.parse("8"))
     found = recognise(log, read_sequence(log, window=window), window=window)
     assert 28 <= found.frames <= 31
     assert not [reason for _, reason in found.warnings if "out of order" in reason]

@@ -8,8 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
 from sonar_graph.errors import CalibrationError
-from sonar_graph.evaluation.calibrating import (
+from sonar_graph.logs.reading import read_sequence
+from sonar_graph.recognition.calibrate import (
     NO_LABEL,
     NONE,
     LabelledSightings,
@@ -17,21 +19,18 @@ from sonar_graph.evaluation.calibrating import (
     label_of,
     true_ranges_azimuths,
 )
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS
-from sonar_graph.logs.reading import read_sequence
 from sonar_graph.sonar import confusion
-from sonar_graph.sonar.appearance import Fit
+from sonar_graph.sonar.appearance import DesignFit, ObjectSighting
 from sonar_graph.sonar.confusion import Confusion
-from sonar_graph.sonar.look import Sighting
 from sonar_graph.sonar.recogniser import Recogniser, RecogniserParams
 
 IDS = np.array([5, 3])
 RANGE_M, AZIMUTH_RAD = np.array([2.0, 1.5]), np.array([0.1, -0.2])
 
 
-def sighting(range_m: float, azimuth_rad: float, *, is_fitted: bool = True, is_compared: bool = True) -> Sighting:
-    fit = Fit(np.array([0.9, 0.3]), 0.95, 0, 0.0, np.zeros(2)) if is_compared else None
-    return Sighting(fit, range_m, azimuth_rad, np.eye(2), is_fitted)
+def sighting(range_m: float, azimuth_rad: float, *, is_fitted: bool = True, is_compared: bool = True) -> ObjectSighting:
+    fit = DesignFit(np.array([0.9, 0.3]), 0.95, 0, 0.0, np.zeros(2)) if is_compared else None
+    return ObjectSighting(fit, range_m, azimuth_rad, np.eye(2), is_fitted)
 
 
 @pytest.mark.parametrize(

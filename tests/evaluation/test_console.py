@@ -7,11 +7,11 @@ from typing import Any
 
 from rich.console import Console
 
-from sonar_graph.evaluation.console import published_counterpart, summary
-from sonar_graph.evaluation.landmark_table import landmark_table
-from sonar_graph.evaluation.published_experiment import published_maps
 from sonar_graph.evaluation.results import Comparison, Score
-from sonar_graph.evaluation.wording import display_value
+from sonar_graph.evaluation.scored_instants import published_maps
+from sonar_graph.report.console import published_counterpart, summary
+from sonar_graph.report.landmark_table import landmark_table
+from sonar_graph.report.wording import display_value
 
 from .synthetic import basin_comparison, with_failure, with_score
 

@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from sonar_graph.errors import EvaluationError
-from sonar_graph.evaluation.figure_style import colour, evenly, thinned
-from sonar_graph.evaluation.figures import (
+from sonar_graph.evaluation.results import Comparison, RunResult
+from sonar_graph.report.figure_style import colour, evenly, inline_svg, thinned
+from sonar_graph.report.figures import (
     error_figure,
     innovation_figure,
     nees_figure,
@@ -24,9 +25,7 @@ from sonar_graph.evaluation.figures import (
     write_map_png,
     yaw_figure,
 )
-from sonar_graph.evaluation.map_figure import map_figure, paths_cut_off
-from sonar_graph.evaluation.results import Comparison, RunResult
-from sonar_graph.evaluation.svg import inline_svg
+from sonar_graph.report.maps import map_figure, paths_cut_off
 from sonar_graph.states import Trajectory
 
 from .synthetic import basin_comparison, only, with_failure, with_run

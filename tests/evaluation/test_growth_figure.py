@@ -7,12 +7,10 @@ import pytest
 from matplotlib.patches import Ellipse
 from scipy.stats import chi2
 
-from sonar_graph.evaluation.growth_figure import LARGEST_ELLIPSE, enlargement, growth_figure, growth_instants
-from sonar_graph.evaluation.illustrations import illustrations
-from sonar_graph.evaluation.instants import map_instants
-from sonar_graph.evaluation.map_figure import seen_from_above
-from sonar_graph.evaluation.published_experiment import published_maps
 from sonar_graph.evaluation.results import Comparison, MapSoFar
+from sonar_graph.evaluation.scored_instants import map_instants, published_maps
+from sonar_graph.report.maps import LARGEST_ELLIPSE, enlargement, growth_figure, growth_instants, seen_from_above
+from sonar_graph.report.page import illustrations
 from sonar_graph.states import LandmarkMap
 
 from .synthetic import basin_comparison, with_failure

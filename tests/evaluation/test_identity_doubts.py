@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation.identity_doubts import ABSURD, doubt_of_identities, nameless_landmarks
-from sonar_graph.evaluation.landmark_table import landmark_table
-from sonar_graph.evaluation.report import render_report
-from sonar_graph.evaluation.results import Comparison, RunResult
+from sonar_graph.evaluation.results import ABSENT, Comparison, RunResult
 from sonar_graph.evaluation.scores import landmark_scores
-from sonar_graph.evaluation.wording import ABSENT
+from sonar_graph.report.landmark_table import landmark_table
+from sonar_graph.report.page import render_report
+from sonar_graph.report.warnings import ABSURD, doubt_of_identities, nameless_landmarks
 from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionLog, LandmarkMap, Outcome
 
 from .synthetic import IDS, LANDMARKS, basin_comparison, only, with_run

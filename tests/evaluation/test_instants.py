@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation.instants import gap_limit_s, map_instants, rows_at, scored_instants
 from sonar_graph.evaluation.results import RunResult
+from sonar_graph.evaluation.scored_instants import gap_limit_s, map_instants, rows_at, scored_instants
 from sonar_graph.states import Trajectory
 
 

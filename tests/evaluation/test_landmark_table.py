@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation.landmark_table import MOST_LANDMARKS, PAPER, landmark_table
-from sonar_graph.evaluation.published_experiment import published_maps
-from sonar_graph.evaluation.results import Comparison
-from sonar_graph.evaluation.wording import ABSENT
+from sonar_graph.evaluation.results import ABSENT, Comparison
+from sonar_graph.evaluation.scored_instants import published_maps
+from sonar_graph.report.landmark_table import MOST_LANDMARKS, PAPER, landmark_table
 from sonar_graph.states import LandmarkMap, Trajectory
 
 from .synthetic import basin_comparison, only, with_run

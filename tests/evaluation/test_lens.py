@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation.recognising import RecognitionSession, one_by_one
-from sonar_graph.simulation.imaging_sonar import DIDSON
+from sonar_graph.recognition.session import RecognitionSession, one_by_one
+from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
 
 
 @pytest.mark.parametrize(("lens", "is_right"), [("didson", True), ("as-logged", False)])

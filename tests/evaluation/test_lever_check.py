@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from sonar_graph.calibration import Calibration, ImuCalibration
-from sonar_graph.evaluation.lever_check import bias_findings, lever_findings, with_fitted
-from sonar_graph.navigation.dvl_against_imu import DvlMatch
-from sonar_graph.navigation.offset_search import Estimate1D
+from sonar_graph.diagnosis.findings import bias_findings, lever_findings, with_fitted
+from sonar_graph.navigation.alignment.dvl_imu import DvlMatch
+from sonar_graph.navigation.alignment.time_offset import Estimate1D
 
 UNKNOWN = Estimate1D(np.nan, np.inf, "too little turning")
 GIVEN = Calibration.parse(

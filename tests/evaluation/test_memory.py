@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation import memory
-from sonar_graph.evaluation.memory import PeakMemory
+from sonar_graph.evaluation import run as memory
+from sonar_graph.evaluation.run import PeakMemory
 
 MEGABYTES = 80
 

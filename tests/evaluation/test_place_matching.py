@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sonar_graph.evaluation.metrics import landmark_errors
-from sonar_graph.evaluation.place_matching import named_by_place
+from sonar_graph.evaluation.metrics import landmark_errors, named_by_place
 from sonar_graph.states import LandmarkMap
 
 UNKNOWN = 3_000_000_000

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sonar_graph.devices.landmark_designs import OWN_DESIGNS
 from sonar_graph.evaluation.metrics import rmse
-from sonar_graph.evaluation.published_experiment import (
+from sonar_graph.evaluation.scored_instants import (
     DURATION_S,
     ESTIMATED_XY_M,
     IDS,
@@ -16,7 +17,6 @@ from sonar_graph.evaluation.published_experiment import (
     published_maps,
     repeats_published,
 )
-from sonar_graph.landmark_designs import OWN_DESIGNS
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import LANDMARKS_XY_M, BasinOptions, simulate_basin
 from sonar_graph.states import LandmarkMap

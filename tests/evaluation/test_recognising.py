@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.evaluation.comparison import compare
-from sonar_graph.evaluation.recognising import RecognitionSession, one_by_one, recognise, with_detections
-from sonar_graph.evaluation.recognition import Recognition
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.logs.reading import read_sequence
 from sonar_graph.logs.writing import write_sequence
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, SonarFrames
+from sonar_graph.recognition.recognition_record import Recognition
+from sonar_graph.recognition.session import RecognitionSession, one_by_one, recognise, with_detections
 from sonar_graph.sonar.beliefs import IdentityParams
 from sonar_graph.sonar.confusion import confusion_for
 from sonar_graph.sonar.recogniser import REPORTED, RecogniserParams
@@ -152,7 +152,7 @@ def test_a_log_without_images_gives_nothing(lane, tmp_path):
 
 def test_both_estimators_are_given_the_same_detections(lane, lane_recognition, monkeypatch):
     """The very same block, which adds to the notes and leaves the rest of the sequence alone."""
-    import sonar_graph.evaluation.run as module
+    from sonar_graph.evaluation import run as module
 
     sequence = with_detections(lane.sequence, lane_recognition)
     assert sequence.detections is lane_recognition.detections
@@ -195,7 +195,7 @@ def test_pictures_come_once_a_second_and_show_what_was_recognised(lane, lane_rec
 
 
 def test_of_many_pictures_every_second_one_is_given_up(lane, monkeypatch):
-    import sonar_graph.evaluation.recognising as module
+    from sonar_graph.recognition import session as module
 
     monkeypatch.setattr(module, "MOST_PICTURES", 6)
     session = RecognitionSession(lane.sequence)
@@ -306,7 +306,7 @@ def test_frames_without_odometry_are_named_and_the_others_are_used(lane):
 
 
 def test_warnings_are_counted_although_not_all_are_kept(lane, monkeypatch):
-    import sonar_graph.evaluation.recognising as module
+    from sonar_graph.recognition import session as module
 
     monkeypatch.setattr(module, "MOST_WARNINGS", 3)
     zero = np.zeros_like(lane.one(0).intensity)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sonar_graph.evaluation.recognition import DrawnFrame, Recognition, read_recognition, write_recognition
+from sonar_graph.recognition.recognition_record import DrawnFrame, Recognition, read_recognition, write_recognition
 
 JPEG = b"\xff\xd8 a picture \xff\xd9"
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation.recognising import with_detections
-from sonar_graph.evaluation.recognition_section import recognition_content, reliability_figure
-from sonar_graph.evaluation.reliability import reliability, reliability_of
-from sonar_graph.evaluation.report import render_report
+from sonar_graph.evaluation.consistency import reliability, reliability_of
 from sonar_graph.evaluation.results import Comparison
+from sonar_graph.recognition.session import with_detections
+from sonar_graph.report.figures import recognition_content, reliability_figure
+from sonar_graph.report.page import render_report
 
 from .synthetic import basin_comparison
 

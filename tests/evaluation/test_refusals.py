@@ -13,16 +13,16 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from sonar_graph.cli import main
+from sonar_graph.cli.main import main
 from sonar_graph.estimator import installed_estimators, load_estimator, refused_rows_of
-from sonar_graph.evaluation.console import summary
-from sonar_graph.evaluation.refusals import MOST_NAMED, gathered, refusal_lines
-from sonar_graph.evaluation.report import render_report
-from sonar_graph.evaluation.results import Comparison
+from sonar_graph.evaluation.results import MOST_ROWS_NAMED, Comparison, gathered
 from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.storage import read_comparison, write_comparison
 from sonar_graph.logs.writing import write_sequence
 from sonar_graph.measurements import Dvl, Measurements
+from sonar_graph.report.console import summary
+from sonar_graph.report.page import render_report
+from sonar_graph.report.warnings import refusal_lines
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Estimate, Refusal, RefusedRow
 
@@ -61,12 +61,12 @@ def with_outliers(sequence: Sequence, rows: list[int]) -> Sequence:
 
 
 def test_few_rows_are_named_each_and_many_are_counted():
-    few = [outlier(k, 50.0 + k) for k in range(MOST_NAMED)]
+    few = [outlier(k, 50.0 + k) for k in range(MOST_ROWS_NAMED)]
     assert [(rows.count, rows.first_ns, rows.distances()) for rows in gathered(few[::-1])] == [
-        (1, k, f"{50 + k}") for k in range(MOST_NAMED)
+        (1, k, f"{50 + k}") for k in range(MOST_ROWS_NAMED)
     ]
     (many,) = gathered([*few, outlier(99, 7.5)])
-    assert (many.count, many.first_ns, many.last_ns) == (MOST_NAMED + 1, 0, 99)
+    assert (many.count, many.first_ns, many.last_ns) == (MOST_ROWS_NAMED + 1, 0, 99)
     assert (many.times(-NS), many.distances()) == ("1.000 to 1.000", "7.50 to 54")
 
 

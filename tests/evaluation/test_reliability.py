@@ -10,14 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binned_statistic
 
 from sonar_graph.calibration import Calibration, Mounting, SonarCalibration
-from sonar_graph.evaluation.reliability import (
-    NONE,
-    UNJUDGED,
-    confidences,
-    reliability,
-    reliability_of,
-    true_identities,
-)
+from sonar_graph.evaluation.consistency import NONE, UNJUDGED, confidences, reliability, reliability_of, true_identities
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import LandmarkMap, Trajectory

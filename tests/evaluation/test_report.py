@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation.published_experiment import published_maps
-from sonar_graph.evaluation.report import render_report, write_report
 from sonar_graph.evaluation.results import Comparison, Score
-from sonar_graph.evaluation.score_table import score_blocks
+from sonar_graph.evaluation.scored_instants import published_maps
+from sonar_graph.report.page import render_report, write_report
+from sonar_graph.report.tables import score_blocks
 from sonar_graph.states import Outcome
 
 from .synthetic import REFUSALS, basin_comparison, only, with_failure, with_run, with_score

@@ -9,10 +9,10 @@ import gtsam
 import numpy as np
 import pytest
 
-import sonar_graph.evaluation.run as run_module
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
-from sonar_graph.evaluation.instants import map_instants
+from sonar_graph.evaluation import run as run_module
 from sonar_graph.evaluation.run import run_estimator
+from sonar_graph.evaluation.scored_instants import map_instants
 from sonar_graph.measurements import LandmarkDetections, Measurements
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Estimate, LandmarkMap, Refusal, RefusedRow, Trajectory

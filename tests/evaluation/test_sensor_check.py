@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.evaluation.finding import Finding, with_interval
-from sonar_graph.evaluation.sensor_check import _of_dvl, _of_noise, _put_right, _surest_bias, check_sensors
-from sonar_graph.evaluation.start_check import StartTilt, find_start_tilt
-from sonar_graph.evaluation.unit_check import wrong_units
-from sonar_graph.logs.adapters.config import LogConfig
+from sonar_graph.diagnosis.findings import Finding, StartTilt, find_start_tilt, with_interval
+from sonar_graph.diagnosis.sensor_check import _of_dvl, _of_noise, _put_right, _surest_bias, check_sensors, wrong_units
+from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.dvl_against_imu import DvlMatch
-from sonar_graph.navigation.initial_tilt import InitialTilt
-from sonar_graph.navigation.offset_search import Estimate1D
+from sonar_graph.navigation.alignment.dvl_imu import DvlMatch
+from sonar_graph.navigation.alignment.gravity import InitialTilt
+from sonar_graph.navigation.alignment.time_offset import Estimate1D
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 
@@ -142,7 +140,7 @@ def test_a_hole_of_the_imu_asks_for_nothing(hole_s: float, monkeypatch: pytest.M
     assert [finding.text() for finding in found.values() if finding.acts] == []
     assert found["DVL scale"].estimate.is_known
     assert found["reference against IMU: time offset"].estimate.is_known
-    monkeypatch.setattr("sonar_graph.navigation.inertial_path._parts", np.zeros_like)
+    monkeypatch.setattr("sonar_graph.navigation.alignment.dvl_imu._parts", np.zeros_like)
     blind = by_name(check_sensors(run))
     assert blind["DVL scale"].acts == blind["reference against IMU: time offset"].acts == (hole_s > 2.0)
 

@@ -18,9 +18,9 @@ from sonar_graph.calibration import (
     SonarCalibration,
     Start,
 )
-from sonar_graph.evaluation.recognising import step_of, view_of
-from sonar_graph.evaluation.sonar_motion import SonarMotion, SonarMotions, level_from_up
 from sonar_graph.measurements import Depth, Dvl, Imu
+from sonar_graph.recognition.session import step_of, view_of
+from sonar_graph.recognition.sonar_motion import SonarMotion, SonarMotions, level_from_up
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.sensors import dvl_readings, imu_readings, regular_stamps, seconds_since_start
 from sonar_graph.simulation.vehicle import VehiclePath, rpy_from_rotation, smooth_noise

@@ -10,15 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import STANDARD_GRAVITY, Calibration, Start
-from sonar_graph.evaluation.start_check import (
-    StartHeading,
-    StartTilt,
-    find_start_heading,
-    find_start_tilt,
-    tilt_findings,
-)
+from sonar_graph.diagnosis.findings import StartHeading, StartTilt, find_start_heading, find_start_tilt, tilt_findings
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.offset_search import Estimate1D
+from sonar_graph.navigation.alignment.time_offset import Estimate1D
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.states import Trajectory

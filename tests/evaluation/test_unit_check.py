@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.evaluation.unit_check import WrongUnit, wrong_units
-from sonar_graph.logs.adapters.config import LogConfig
+from sonar_graph.diagnosis.sensor_check import WrongUnit, wrong_units
+from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.sequence import Sequence
 

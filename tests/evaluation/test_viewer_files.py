@@ -9,8 +9,7 @@ import pytest
 from mcap.reader import make_reader
 
 from sonar_graph.evaluation.comparison import compare
-from sonar_graph.evaluation.storage import write_comparison
-from sonar_graph.evaluation.viewer_files import write_viewer_files
+from sonar_graph.evaluation.storage import write_comparison, write_viewer_files
 from sonar_graph.measurements import Measurements
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Estimate

@@ -13,15 +13,15 @@ from gtsam.symbol_shorthand import L
 
 from sonar_graph.estimator import load_estimator, withheld_of
 from sonar_graph.evaluation.comparison import compare
-from sonar_graph.evaluation.refusals import MOST_NAMED, withheld_lines
-from sonar_graph.evaluation.report import render_report
-from sonar_graph.evaluation.results import Comparison
+from sonar_graph.evaluation.results import MOST_ROWS_NAMED, Comparison
 from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.storage import read_comparison, write_comparison
 from sonar_graph.measurements import Measurements
+from sonar_graph.report.page import render_report
+from sonar_graph.report.warnings import withheld_lines
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
-from sonar_graph.slam.sighting import SightingFactors
+from sonar_graph.slam.landmarks.sighting import SightingFactors
 from sonar_graph.states import Estimate
 
 from .synthetic import basin_comparison, with_run
@@ -48,8 +48,8 @@ def test_terminal_page_and_files_say_what_was_withheld(tmp_path: Path) -> None:
 
 
 def test_of_many_the_first_are_told_and_the_others_counted() -> None:
-    lines = withheld_lines(withholding([f"{MESSAGE} {k}" for k in range(MOST_NAMED + 2)]))
-    assert len(lines) == MOST_NAMED + 1
+    lines = withheld_lines(withholding([f"{MESSAGE} {k}" for k in range(MOST_ROWS_NAMED + 2)]))
+    assert len(lines) == MOST_ROWS_NAMED + 1
     assert lines[-1] == "Warning: isam2 withheld 2 more: runs/isam2/result.json has all"
 
 

@@ -8,17 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.evaluation.results import Score
+from sonar_graph.evaluation.results import Score, format_value
 from sonar_graph.evaluation.scores import detection_scores
-from sonar_graph.evaluation.wording import (
-    NO_DETECTIONS,
-    consistency,
-    display_value,
-    finding,
-    format_value,
-    lost_runs,
-    with_unit,
-)
+from sonar_graph.report.wording import NO_DETECTIONS, consistency, display_value, finding, lost_runs, with_unit
 from sonar_graph.states import DetectionLog, Outcome
 
 from .synthetic import basin_comparison, only, with_failure, with_run, with_score

@@ -13,7 +13,7 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 
 from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
-from sonar_graph.logs.message_definitions import definition
+from sonar_graph.logs.cdr.definitions import definition
 from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import LandmarkMap, Trajectory

@@ -10,7 +10,8 @@ from mcap.reader import make_reader
 from mcap.records import ChunkIndex
 from mcap.writer import Writer
 
-from sonar_graph.logs.container import Keep, Recording, Topic, scan
+from sonar_graph.logs.mcap.reader import Recording, scan
+from sonar_graph.logs.mcap.topic import Keep, Topic
 
 TEXT = b"uint8[] data\n"
 Entry = tuple[int, bytes]

@@ -16,8 +16,8 @@ from mcap_ros2._dynamic import generate_dynamic
 from rosbags.interfaces import Typestore
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from sonar_graph.logs.cdr import Messages, decode, encode
-from sonar_graph.logs.schema import PRIMITIVES, STRING, Struct, parse_definition
+from sonar_graph.logs.cdr.definitions import PRIMITIVES, STRING, Struct, parse_definition
+from sonar_graph.logs.cdr.messages import Messages, decode, encode
 
 ROOT = "fuzz_msgs/msg/Root"
 TEXTS = ["", "a", "base_link", "ψ → 深い", "with \0 inside", "\U0001f420", "x" * 40]

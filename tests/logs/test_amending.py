@@ -14,9 +14,10 @@ from mcap.writer import Writer
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.amending import write_amended
-from sonar_graph.logs.container import Keep, scan
-from sonar_graph.logs.encoding import landmark_map_message
-from sonar_graph.logs.recorder import Outgoing, is_own_log
+from sonar_graph.logs.mcap.reader import scan
+from sonar_graph.logs.mcap.topic import Keep
+from sonar_graph.logs.mcap.writer import Outgoing, is_own_log
+from sonar_graph.logs.writing import landmark_map_message
 from sonar_graph.states import LandmarkMap
 
 MAP = "sonar_graph_msgs/msg/LandmarkMap"

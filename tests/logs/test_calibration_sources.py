@@ -11,14 +11,11 @@ from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.errors import CalibrationError
-from sonar_graph.logs.calibration_sources import PartialCalibration, gathered
-from sonar_graph.logs.encoding import dvl_messages, imu_messages, static_message
-from sonar_graph.logs.log_record import METADATA
-from sonar_graph.logs.mountings import encode_mountings
+from sonar_graph.logs.mcap.writer import write_recording
 from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.recorder import write_recording
 from sonar_graph.logs.roles import TF
-from sonar_graph.logs.writing import write_sequence
+from sonar_graph.logs.vehicle_setup import METADATA, PartialCalibration, encode_mountings, gathered
+from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message, write_sequence
 
 TREE_M = (1.0, 2.0, 3.0)
 

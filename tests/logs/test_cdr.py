@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.logs import plan
-from sonar_graph.logs.cdr import Decoded, Decoder, decode, encode
-from sonar_graph.logs.layout import Layout
-from sonar_graph.logs.schema import parse_definition
+from sonar_graph.logs.cdr import layout as plan
+from sonar_graph.logs.cdr.definitions import parse_definition
+from sonar_graph.logs.cdr.layout import Layout
+from sonar_graph.logs.cdr.messages import Decoded, Decoder, decode, encode
 
 from .random_schemas import check, stacked
 

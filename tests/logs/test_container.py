@@ -8,9 +8,10 @@ import pytest
 from mcap.writer import CompressionType, IndexType, Writer
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.logs.container import Keep, scan, stream
+from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
+from sonar_graph.logs.mcap.reader import scan, stream
+from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.window import Instant, Window
 
 from .containers import chunk_indexes, entries, flip, read, scan_all, write, write_apart
 
@@ -177,13 +178,13 @@ def test_chunks_without_a_wanted_topic_are_not_even_read(tmp_path: Path) -> None
 def test_a_window_holds_what_was_recorded_in_it_and_latched_topics(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     write_apart(path)
-    recording = scan(path, lambda _: Keep.ALL, Window(Instant.parse("10"), Instant.parse("20")))
+    recording = scan(path, lambda _: Keep.ALL, TimeWindow(Instant.parse("10"), Instant.parse("20")))
     times_s = sorted(t for name in ("/a", "/b") for t in (recording.topics[name].log_times_ns // 10**9).tolist())
     assert times_s == list(range(11, 21))
     assert entries(recording.topics["/tf_static"]) == [(10**9, b"static")]
     assert recording.skipped_chunks == 89
     assert recording.notes()["log.part"] == "10.000 s to 20.000 s of the recording"
-    absolute = Window(Instant.parse("1970-01-01T00:01:31Z"))
+    absolute = TimeWindow(Instant.parse("1970-01-01T00:01:31Z"))
     assert sum(len(t) for t in scan(path, lambda _: Keep.ALL, absolute).topics.values()) == 11
 
 
@@ -194,7 +195,7 @@ def test_a_window_is_the_same_without_summary(tmp_path: Path, summary: bool) -> 
     if not summary:
         path.write_bytes(path.read_bytes()[: chunk_indexes(path)[-1].chunk_start_offset])
         written = read(path)
-    window = Window(Instant.parse("100e-9"), Instant.parse("150e-9"))
+    window = TimeWindow(Instant.parse("100e-9"), Instant.parse("150e-9"))
     recording = scan(path, lambda _: Keep.ALL, window)
     assert entries(recording.topics["/bytes"]) == [entry for entry in written if 1100 <= entry[0] < 1150]
     assert (recording.skipped_chunks > 0) == summary
@@ -204,7 +205,7 @@ def test_an_empty_window_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     write_apart(path)
     with pytest.raises(LogError, match=r"nothing was recorded from 1000\.000 s to the end"):
-        scan(path, lambda _: Keep.ALL, Window(Instant.parse("1000")))
+        scan(path, lambda _: Keep.ALL, TimeWindow(Instant.parse("1000")))
 
 
 @pytest.mark.parametrize("part", ["time", "offset", "channel", "missing"])
@@ -242,7 +243,7 @@ def test_a_summary_that_lies_about_chunks_is_not_used_to_skip(tmp_path: Path) ->
     at = content.index(entry)
     content[at : at + len(entry)] = struct.pack("<IHQ", 10, 2, index.message_index_offsets[1])
     path.write_bytes(content)
-    recording = scan(path, lambda _: Keep.ALL, Window(Instant.parse("3"), Instant.parse("7")))
+    recording = scan(path, lambda _: Keep.ALL, TimeWindow(Instant.parse("3"), Instant.parse("7")))
     assert (recording.topics["/a"].log_times_ns // 10**9).tolist() == [5, 7]
     assert any("the summary's index does not fit chunk 5" in remark for remark in recording.damage.remarks)
     assert recording.skipped_chunks == 0

@@ -15,10 +15,9 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
-from sonar_graph.logs.container import Keep, scan
-from sonar_graph.logs.damage import Damage, Loss, settle
-from sonar_graph.logs.metadata import seal
-from sonar_graph.logs.topic import Topic
+from sonar_graph.logs.mcap.reader import scan
+from sonar_graph.logs.mcap.records import seal
+from sonar_graph.logs.mcap.topic import Damage, Keep, Loss, Topic, settle
 
 from .containers import chunk_indexes, entries, flip, read, scan_all, write
 

@@ -2,8 +2,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from sonar_graph.logs.container import Keep, scan
-from sonar_graph.logs.decoding import read_landmark_map
+from sonar_graph.logs.adapters.landmark_messages import read_landmark_map
+from sonar_graph.logs.mcap.reader import scan
+from sonar_graph.logs.mcap.topic import Keep
 
 from .conftest import Bench, header
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.detection_faults import detection_warnings
+from sonar_graph.logs.adapters.landmark_messages import detection_warnings
 from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.reading import read_sequence
 from sonar_graph.measurements import LandmarkDetections
-from sonar_graph.slam.sound_rows import sound_detections
+from sonar_graph.slam.keyframes import sound_detections
 
 
 def one_of(bench: Any, **changed: Any) -> Any:

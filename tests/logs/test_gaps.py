@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration
-from sonar_graph.doppler_beams import UNMEASURED_M_S
-from sonar_graph.logs.gaps import gap_warnings
+from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
+from sonar_graph.logs.checks import gap_warnings
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation.unmeasured_turns import hole_ns
+from sonar_graph.navigation.imu_gaps import hole_ns
 
 UPWARDS = (0.0, 0.0, 9.8)
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from sonar_graph.logs.adapters.config import LogConfig
-from sonar_graph.logs.converters.victoria_park import read_victoria_park
+from sonar_graph.logs.adapters.log_config import LogConfig
+from sonar_graph.logs.convert.victoria_park import read_victoria_park
 from sonar_graph.logs.inspection import LogSummary, inspect_log
 from sonar_graph.logs.reading import read_sequence
 from sonar_graph.logs.writing import write_sequence

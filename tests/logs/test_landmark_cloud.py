@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sonar_graph.logs.landmark_cloud import landmark_cloud
-from sonar_graph.logs.recorder import write_recording
+from sonar_graph.logs.mcap.writer import write_recording
+from sonar_graph.logs.viewer_messages import landmark_cloud
 from sonar_graph.states import LandmarkMap
 
 IDS = [3, 2**40 + 1]

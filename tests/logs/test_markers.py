@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.logs.markers import GREY, UNKNOWN_DIAMETER_M, ellipsoids, landmark_markers, position_ellipsoids
-from sonar_graph.logs.recorder import write_recording
+from sonar_graph.logs.mcap.writer import write_recording
+from sonar_graph.logs.viewer_messages import GREY, UNKNOWN_DIAMETER_M, ellipsoids, landmark_markers, position_ellipsoids
 from sonar_graph.states import LandmarkMap, Trajectory
 
 

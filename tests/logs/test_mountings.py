@@ -9,12 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration, DepthCalibration, DvlCalibration, Mounting
-from sonar_graph.logs.container import Keep, scan
-from sonar_graph.logs.encoding import dvl_messages, imu_messages, static_message
-from sonar_graph.logs.mountings import encode_mountings, mounting_of, static_frames
+from sonar_graph.logs.mcap.reader import scan
+from sonar_graph.logs.mcap.topic import Keep
+from sonar_graph.logs.mcap.writer import write_recording
 from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.recorder import write_recording
 from sonar_graph.logs.roles import TF
+from sonar_graph.logs.vehicle_setup import encode_mountings, mounting_of, static_frames
+from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message
 
 ANGLES = st.tuples(st.floats(-3, 3), st.floats(-1.5, 1.5), st.floats(-3, 3))
 OFFSETS = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-5, 5))

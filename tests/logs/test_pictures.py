@@ -7,8 +7,8 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from sonar_graph.logs.pictures import PICTURES, Picture, picture_messages
-from sonar_graph.logs.recorder import write_recording
+from sonar_graph.logs.mcap.writer import write_recording
+from sonar_graph.logs.viewer_messages import PICTURES, Picture, picture_messages
 
 
 def jpeg(width: int, grey: int) -> bytes:

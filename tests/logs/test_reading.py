@@ -10,13 +10,12 @@ import pytest
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError, LogError, MissingTopicError
-from sonar_graph.logs.calibration_sources import PartialCalibration
-from sonar_graph.logs.encoding import dvl_messages, imu_messages
-from sonar_graph.logs.message_definitions import definition
+from sonar_graph.logs.cdr.definitions import definition
+from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
+from sonar_graph.logs.mcap.writer import write_recording
 from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.recorder import write_recording
-from sonar_graph.logs.window import Instant, Window
-from sonar_graph.logs.writing import write_sequence
+from sonar_graph.logs.vehicle_setup import PartialCalibration
+from sonar_graph.logs.writing import dvl_messages, imu_messages, write_sequence
 
 from .containers import chunk_indexes, flip
 
@@ -276,7 +275,7 @@ def test_a_window_is_the_same_part_of_every_block(make_sequence: Any, tmp_path: 
     write_sequence(path, sequence)
     first_ns = int(min(sequence.imu.stamps_ns[0], sequence.dvl.stamps_ns[0]))
     start_ns, end_ns = first_ns + 2 * 10**9, first_ns + 4 * 10**9
-    found = read_sequence(path, window=Window(Instant.parse("2"), Instant.parse("4")))
+    found = read_sequence(path, window=TimeWindow(Instant.parse("2"), Instant.parse("4")))
     for name in ("imu", "dvl", "depth", "truth"):
         whole, part = getattr(sequence, name), getattr(found, name)
         is_inside = (whole.stamps_ns >= start_ns) & (whole.stamps_ns < end_ns)
@@ -290,7 +289,7 @@ def test_a_start_pose_of_the_logs_beginning_is_said_to_be_of_another_instant(
 ) -> None:
     path = tmp_path / "a.mcap"
     write_sequence(path, make_sequence(samples=20_000))
-    later = Window(Instant.parse("2"))
+    later = TimeWindow(Instant.parse("2"))
     said = read_sequence(path, window=later).notes["log.start"]
     assert re.search(r"of its beginning, 2\.000 s before .*\[start\] position_m and rpy_rad .*--calibration", said)
     given = PartialCalibration.parse({"start": {"position_m": [1.0, 0.0, 0.0]}}, "x.toml")
@@ -299,8 +298,8 @@ def test_a_start_pose_of_the_logs_beginning_is_said_to_be_of_another_instant(
     for harmless in (
         {"window": later, "calibration": given},
         {"window": later, "calibration": Calibration()},
-        {"window": Window(end=Instant.parse("2"))},
-        {"window": Window(Instant.parse("0"))},
+        {"window": TimeWindow(end=Instant.parse("2"))},
+        {"window": TimeWindow(Instant.parse("0"))},
         {},
     ):
         assert "log.start" not in read_sequence(path, **harmless).notes

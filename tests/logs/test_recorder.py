@@ -9,11 +9,10 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from sonar_graph.logs.encoding import pose_messages, static_message
-from sonar_graph.logs.metadata import open_seal
-from sonar_graph.logs.recorder import Attachment, Outgoing, write_recording
-from sonar_graph.logs.records import LogFile
-from sonar_graph.logs.summary import read_summary
+from sonar_graph.logs.mcap.file_summary import read_summary
+from sonar_graph.logs.mcap.records import LogFile, open_seal
+from sonar_graph.logs.mcap.writer import Attachment, Outgoing, write_recording
+from sonar_graph.logs.writing import pose_messages, static_message
 from sonar_graph.states import Trajectory
 
 T0_NS = 1_700_000_000_000_000_000

@@ -8,10 +8,11 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.logs.container import Keep, scan
 from sonar_graph.logs.inspection import inspect_log
+from sonar_graph.logs.mcap.reader import scan
+from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.refusal import refusal
+from sonar_graph.logs.roles import refusal
 
 from .conftest import Bench
 

@@ -4,8 +4,7 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.message_definitions import DEFINITIONS, definition
-from sonar_graph.logs.schema import STRING, Struct, parse_definition
+from sonar_graph.logs.cdr.definitions import DEFINITIONS, STRING, Struct, definition, parse_definition
 
 NAME = "some_msgs/msg/Thing"
 RULE = "=" * 80

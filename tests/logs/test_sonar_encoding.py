@@ -8,9 +8,9 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.recorder import recording
-from sonar_graph.logs.sonar_encoding import sonar_image_messages
-from sonar_graph.logs.sonar_reading import read_sonar_frames
+from sonar_graph.logs.mcap.writer import recording
+from sonar_graph.logs.sonar_frames import read_sonar_frames
+from sonar_graph.logs.writing import sonar_image_messages
 from sonar_graph.measurements import SonarFrames
 
 KINDS = ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8"]

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap_ros2._dynamic import generate_dynamic
 
-from sonar_graph.logs.cdr import decode, encode
-from sonar_graph.logs.schema import parse_definition
+from sonar_graph.logs.cdr.definitions import parse_definition
+from sonar_graph.logs.cdr.messages import decode, encode
 
 from .random_schemas import stacked
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonar_graph.logs.spikes import spike_warning
+from sonar_graph.logs.checks import spike_warning
 from sonar_graph.measurements import Floats, Imu
 
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonar_graph.logs.stamp_check import stamp_faults
+from sonar_graph.logs.checks import stamp_faults
 
 SECOND = 10**9
 EVEN = np.arange(100) * SECOND // 10 + 10**18

@@ -6,17 +6,18 @@ from typing import Any
 
 import pytest
 
-from sonar_graph.cli import main
-from sonar_graph.logs.adapters.config import LogConfig
+from sonar_graph.cli.main import main
+from sonar_graph.logs.adapters.log_config import LogConfig
+from sonar_graph.logs.cdr.definitions import definition
 from sonar_graph.logs.inspection import inspect_log
-from sonar_graph.logs.message_definitions import definition
 from sonar_graph.logs.reading import read_sequence
 from sonar_graph.logs.roles import ROLES, Choice, choose_topic
 from sonar_graph.logs.writing import write_sequence
 
 
 def choices(path: Path, config: LogConfig) -> dict[str, Choice]:
-    from sonar_graph.logs.container import Keep, scan
+    from sonar_graph.logs.mcap.reader import scan
+    from sonar_graph.logs.mcap.topic import Keep
 
     recording = scan(path, lambda _: Keep.STAMP)
     return {name: choose_topic(role, recording, config) for name, role in ROLES.items()}

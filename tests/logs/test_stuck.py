@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonar_graph.logs.stuck import stuck_warning
+from sonar_graph.logs.checks import stuck_warning
 from sonar_graph.measurements import Floats
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.tum import read_landmarks_csv, read_tum, write_landmarks_csv, write_tum
+from sonar_graph.logs.trajectory_files import read_landmarks_csv, read_tum, write_landmarks_csv, write_tum
 from sonar_graph.states import LandmarkMap, Trajectory
 
 STAMPS = st.lists(st.integers(-(2**62), 2**62), min_size=1, max_size=20, unique=True).map(sorted)

@@ -5,9 +5,9 @@ import re
 import numpy as np
 import pytest
 
-from sonar_graph.doppler_beams import UNMEASURED_M_S
+from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.errors import LogError
-from sonar_graph.logs.usability import require_use, unsaid_noise
+from sonar_graph.logs.reading import require_use, unsaid_noise
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections
 
 SECOND = 1_000_000_000

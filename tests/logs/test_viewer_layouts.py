@@ -11,7 +11,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from sonar_graph.logs.result_log import write_result
-from sonar_graph.logs.viewer_layouts import Layer, Scene, foxglove_layout
+from sonar_graph.logs.viewer_messages import Layer, Scene, foxglove_layout
 from sonar_graph.states import LandmarkMap, Trajectory
 
 T0_NS = 1_700_000_000_000_000_000

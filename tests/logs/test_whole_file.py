@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.whole_file import written_whole
+from sonar_graph.files import written_whole
 
 
 def test_a_file_has_its_name_only_when_it_is_whole(tmp_path: Path) -> None:

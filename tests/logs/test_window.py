@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.window import Instant, Window
+from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
 
 BEGINNING_NS = 1_700_000_000_000_000_001
 
@@ -36,4 +36,4 @@ def test_other_texts_are_refused_with_an_example(text: str) -> None:
 
 def test_an_end_before_the_start_is_refused() -> None:
     with pytest.raises(LogError, match="ends before it starts"):
-        Window(Instant.parse("2"), Instant.parse("2")).resolve(BEGINNING_NS)
+        TimeWindow(Instant.parse("2"), Instant.parse("2")).resolve(BEGINNING_NS)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
-from sonar_graph.navigation.steps import Steps
+from sonar_graph.navigation.preintegration.recursion import Steps
 
 NS = 1_000_000_000
 T0_NS = 1_700_000_000 * NS

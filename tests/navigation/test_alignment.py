@@ -8,9 +8,9 @@ from scipy.stats import chi2
 
 from sonar_graph.calibration import ImuCalibration
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
-from sonar_graph.navigation.steps import Steps
+from sonar_graph.navigation.alignment.gravity import gravity_direction, velocity_at_imu
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion, Preintegrator
+from sonar_graph.navigation.preintegration.recursion import Steps
 
 G = 9.81
 GRAVITY = np.array([0.0, 0.0, G])

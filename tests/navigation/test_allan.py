@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.measurements import Imu
-from sonar_graph.navigation.allan import allan_deviation, degrees_of_freedom, density, noise_densities
+from sonar_graph.navigation.alignment.allan import allan_deviation, degrees_of_freedom, density, noise_densities
 
 RATE_HZ = 50.0
 

@@ -6,47 +6,55 @@ import numpy as np
 import pytest
 
 from sonar_graph.errors import CalibrationError, MeasurementError
-from sonar_graph.navigation import argument_checks as check
+from sonar_graph.navigation.samples import (
+    finite_vector,
+    no_doppler_stamp,
+    require_covariances,
+    require_distinct_stamps,
+    require_nanoseconds,
+    require_noise,
+    require_order,
+)
 
 AT = np.array([10, 20, 30, 40, 50]) * 1_000_000_000
 """Five stamps, ten seconds apart."""
 
 
 def test_a_vector_is_so_many_finite_numbers_in_one_row():
-    assert check.vector("bias", [1, 2, 3], 3).tolist() == [1.0, 2.0, 3.0]
+    assert finite_vector("bias", [1, 2, 3], 3).tolist() == [1.0, 2.0, 3.0]
     for values in ([1, 2], [[1], [2], [3]], 1.0):
         with pytest.raises(MeasurementError, match=r"bias: expected shape \(3,\)"):
-            check.vector("bias", values, 3)
+            finite_vector("bias", values, 3)
     for kind in (MeasurementError, CalibrationError):
         with pytest.raises(kind, match=r"bias: expected finite numbers, not \[0.0, inf, 0.0\]"):
-            check.vector("bias", [0, np.inf, 0], 3, kind)
+            finite_vector("bias", [0, np.inf, 0], 3, kind)
 
 
 def test_noise_is_so_many_numbers_of_zero_or_more():
     for numbers, size in ((0.0, 1), (2, 1), ([0.0, 1.0, 2.0], 3), (np.ones(3, np.int64), 3)):
-        check.noise("sigma", numbers, size)
+        require_noise("sigma", numbers, size)
     for numbers, size in ((True, 1), ([1.0], 1), (1.0, 3), ([1.0, 2.0], 3), ("1", 1), ([True] * 3, 3)):
         with pytest.raises(CalibrationError, match=rf"sigma: expected {size} number{'s' if size > 1 else ''}, not"):
-            check.noise("sigma", numbers, size)
+            require_noise("sigma", numbers, size)
     for numbers, size in ((-1e-9, 1), (np.inf, 1), (np.nan, 1), ([1.0, 1.0, -1.0], 3), ([-1.0, 1.0, 1.0], 3)):
         with pytest.raises(CalibrationError, match="sigma: expected finite numbers of zero or more"):
-            check.noise("sigma", numbers, size)
+            require_noise("sigma", numbers, size)
 
 
 def test_an_interval_is_of_integers_the_earlier_first():
-    check.order(1, 2)
-    check.order(np.int64(1), np.int32(2))
+    require_order(1, 2)
+    require_order(np.int64(1), np.int32(2))
     for ends, name in (((1.0, 2), "start_ns"), ((1, 2.0), "end_ns"), ((1, np.float64(2)), "end_ns")):
         with pytest.raises(MeasurementError, match=f"^{name}: expected integer nanoseconds"):
-            check.order(*ends)
+            require_order(*ends)
     for end_ns in (5, 4):
         with pytest.raises(MeasurementError, match=f"end_ns: {end_ns} is not after start_ns 5"):
-            check.order(5, end_ns)
+            require_order(5, end_ns)
 
 
 @pytest.mark.parametrize(("instant_s", "nearest_s"), [(1, 10), (24, 20), (26, 30), (99, 50)])
 def test_the_nearest_stamp_is_named_from_either_side(instant_s, nearest_s):
-    text = str(check.no_stamp("end_ns", instant_s * 10**9, AT))
+    text = str(no_doppler_stamp("end_ns", instant_s * 10**9, AT))
     assert text.endswith(f"the nearest is {nearest_s * 10**9}")
 
 
@@ -62,20 +70,20 @@ def test_the_nearest_stamp_is_named_from_either_side(instant_s, nearest_s):
     ],
 )
 def test_an_instant_that_lies_among_the_stamps_in_another_unit_is_taken_for_it(instant, hint):
-    text = str(check.no_stamp("end_ns", instant, AT))
+    text = str(no_doppler_stamp("end_ns", instant, AT))
     assert (f"; it seems to be {hint}" in text) if hint else "seems" not in text
 
 
 def test_zero_is_of_no_unit():
-    assert "seems" not in str(check.no_stamp("start_ns", 0, AT - 30 * 10**9 - 1))
+    assert "seems" not in str(no_doppler_stamp("start_ns", 0, AT - 30 * 10**9 - 1))
 
 
 @pytest.mark.parametrize(("spacing_ns", "is_close"), [(999_000, True), (1_001_000, False)])
 def test_doppler_stamps_closer_than_a_millisecond_are_in_a_larger_unit(spacing_ns, is_close):
     """In the mean over all; a single one tells nothing."""
-    text = str(check.no_stamp("end_ns", -5, np.arange(5) * spacing_ns))
+    text = str(no_doppler_stamp("end_ns", -5, np.arange(5) * spacing_ns))
     assert ("the stamps are so close" in text) == is_close
-    assert "the stamps are so close" not in str(check.no_stamp("end_ns", 5, np.array([9])))
+    assert "the stamps are so close" not in str(no_doppler_stamp("end_ns", 5, np.array([9])))
 
 
 def test_stamps_repeated_from_the_row_before_to_the_row_after_are_refused():
@@ -88,15 +96,15 @@ def test_stamps_repeated_from_the_row_before_to_the_row_after_are_refused():
             with pytest.raises(
                 MeasurementError, match=f"Imu.stamps_ns: rows {row} and {row + 1} are both .* {row}00 ns"
             ):
-                check.rows("Imu", twice, 2, 4)
+                require_distinct_stamps("Imu", twice, 2, 4)
         else:
-            check.rows("Imu", twice, 2, 4)
+            require_distinct_stamps("Imu", twice, 2, 4)
     for first, last in ((0, 8), (0, 0), (8, 8)):
-        check.rows("Imu", stamps, first, last)
+        require_distinct_stamps("Imu", stamps, first, last)
     with pytest.raises(MeasurementError, match="rows 0 and 1"):
-        check.rows("Imu", np.array([0, 0, 100]), 0, 2)
+        require_distinct_stamps("Imu", np.array([0, 0, 100]), 0, 2)
     with pytest.raises(MeasurementError, match="rows 1 and 2"):
-        check.rows("Imu", np.array([0, 100, 100]), 0, 2)
+        require_distinct_stamps("Imu", np.array([0, 100, 100]), 0, 2)
 
 
 @pytest.mark.parametrize(("spacing_ns", "rows", "is_close"), [(49_900, 3, True), (50_100, 3, False), (10, 2, False)])
@@ -105,9 +113,9 @@ def test_inertial_rows_closer_than_those_of_any_imu_are_in_a_larger_unit(spacing
     stamps = 7 + np.arange(rows) * spacing_ns
     if is_close:
         with pytest.raises(MeasurementError, match=r"Imu.stamps_ns: 3 rows are 4.99e\+04 ns apart"):
-            check.unit("Imu", stamps)
+            require_nanoseconds("Imu", stamps)
     else:
-        check.unit("Imu", stamps)
+        require_nanoseconds("Imu", stamps)
 
 
 def correlated(xy: float, yz: float, zx: float, sigmas: tuple[float, float, float] = (0.01, 0.02, 0.05)) -> np.ndarray:
@@ -116,7 +124,7 @@ def correlated(xy: float, yz: float, zx: float, sigmas: tuple[float, float, floa
 
 def is_covariance(cov: np.ndarray) -> bool:
     try:
-        check.covariances("cov", cov[None], AT)
+        require_covariances("cov", cov[None], AT)
     except MeasurementError:
         return False
     return True
@@ -128,7 +136,7 @@ def test_an_impossible_covariance_is_found_in_every_row(row):
     every = np.tile(np.eye(3), (3, 1, 1))
     every[row] = -np.eye(3)
     with pytest.raises(MeasurementError, match=f"cov: the row at {AT[row]} ns is no covariance"):
-        check.covariances("cov", every, AT)
+        require_covariances("cov", every, AT)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3, 1e3])

@@ -5,11 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
-from sonar_graph.doppler_beams import velocity_of_beams
+from sonar_graph.devices.dvl_beams import velocity_of_beams
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.dvl_preintegration import Preintegrator
-from sonar_graph.navigation.node_motion import motion_between_nodes
-from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation.odometry import Odometry, motion_between_nodes
+from sonar_graph.navigation.preintegration.motion import Preintegrator
 
 SIGMA = 0.01
 TILT = np.radians(30.0)

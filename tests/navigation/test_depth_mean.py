@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.navigation.depth_mean import weights_at_end
+from sonar_graph.navigation.samples import weights_at_end
 
 
 @given(

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from sonar_graph.navigation.differenced_fit import Stretch, _Reduced, fit, rate_noise_power
+from sonar_graph.navigation.alignment.time_offset import SampleSeries, _Reduced, fit, rate_noise_power
 
 RATIOS = np.array([0.3, 0.02])
 WIDE = np.array([1e4, 1e4])
 
 
-def stretch_of(seed: int, walks: tuple[bool, bool, bool]) -> Stretch:
+def stretch_of(seed: int, walks: tuple[bool, bool, bool]) -> SampleSeries:
     rng = np.random.default_rng(seed)
     m = 20
-    return Stretch(
+    return SampleSeries(
         rng.standard_normal((m, 3)), rng.standard_normal((m, 3, 2)), np.tile(np.eye(3), (m, 1, 1)), np.ones(m), walks
     )
 
@@ -29,7 +29,7 @@ def dense_covariance(m: int, walks: bool) -> np.ndarray:
     return difference @ difference.T + RATIOS[0] * np.eye(m) + RATIOS[1] * walk * walks
 
 
-def textbook(stretches: list[Stretch]) -> tuple[np.ndarray, np.ndarray]:
+def textbook(stretches: list[SampleSeries]) -> tuple[np.ndarray, np.ndarray]:
     """Common parameters and covariance, each stretch's own as columns of one large problem; rows axis by axis."""
     m = len(stretches[0].y)
     A = np.concatenate([s.A.transpose(1, 0, 2).reshape(3 * m, -1) for s in stretches])
@@ -58,7 +58,7 @@ def test_which_axes_walk_matters():
     assert np.abs(both[0] - both[1]).max() > 1e-3
 
 
-def whitened_power(stretch: Stretch) -> float:
+def whitened_power(stretch: SampleSeries) -> float:
     """``tr(P (K - D))`` with dense matrices, rows axis by axis; D is the covariance of differences of white samples."""
     m = len(stretch.y)
     K = block_diag(*[dense_covariance(m, walks) for walks in stretch.walks])
@@ -83,7 +83,7 @@ def test_a_column_that_holds_the_rates_noise_is_biased_by_its_power():
     for _ in range(400):
         rates = factor @ rng.standard_normal((m, 3))
         y = np.diff(rng.standard_normal((m + 1, 3)), axis=0) + rates
-        stretch = Stretch(y, 4 * signal + rates[:, :, None], np.tile(np.eye(3), (m, 1, 1)), np.ones(m))
+        stretch = SampleSeries(y, 4 * signal + rates[:, :, None], np.tile(np.eye(3), (m, 1, 1)), np.ones(m))
         result = fit([stretch], WIDE[:1], RATIOS)
         found.append(result.parameters[0])
         corrected.append(found[-1] - result.covariance[0, 0] * rate_noise_power([stretch], RATIOS))
@@ -94,12 +94,12 @@ def test_a_column_that_holds_the_rates_noise_is_biased_by_its_power():
 
 def test_a_narrow_prior_holds_a_parameter_that_the_data_do_not_see():
     stretch = stretch_of(0, (True, True, True))
-    blind = Stretch(stretch.y, 0 * stretch.A, stretch.B, stretch.duration_s)
+    blind = SampleSeries(stretch.y, 0 * stretch.A, stretch.B, stretch.duration_s)
     found = fit([blind], np.array([0.1, 3.0]), RATIOS)
     assert np.sqrt(np.diag(found.covariance)) == pytest.approx([0.1, 3.0])
 
 
-def noisy_stretch(rng: np.random.Generator, ratios: tuple[float, float], duration_s: float = 1.0) -> Stretch:
+def noisy_stretch(rng: np.random.Generator, ratios: tuple[float, float], duration_s: float = 1.0) -> SampleSeries:
     """Samples of sigma 0.1, a rate's white noise and its walk, with a constant as the stretch's own parameter."""
     m = 20
     middle = duration_s * (np.arange(m) + 0.5)
@@ -108,10 +108,10 @@ def noisy_stretch(rng: np.random.Generator, ratios: tuple[float, float], duratio
     y = y + np.sqrt(ratios[0] * duration_s) * rng.standard_normal((m, 3))
     y = y + np.sqrt(ratios[1]) * duration_s * walk @ rng.standard_normal((m, 3))
     own = duration_s * np.tile(np.eye(3), (m, 1, 1))
-    return Stretch(0.1 * y, rng.standard_normal((m, 3, 2)), own, np.full(m, duration_s))
+    return SampleSeries(0.1 * y, rng.standard_normal((m, 3, 2)), own, np.full(m, duration_s))
 
 
-def restricted_likelihood(stretches: list[Stretch], ratios: np.ndarray) -> float:
+def restricted_likelihood(stretches: list[SampleSeries], ratios: np.ndarray) -> float:
     """``-2 log L`` but for a constant: Harville's formula with one dense covariance of everything."""
     m, n = len(stretches[0].y), len(stretches)
     duration_s = float(stretches[0].duration_s[0])

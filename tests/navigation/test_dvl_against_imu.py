@@ -9,18 +9,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, Mounting
-from sonar_graph.doppler_beams import UNMEASURED_M_S
+from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.differenced_fit import Stretch, fit, rate_noise_power
-from sonar_graph.navigation.dvl_against_imu import (
+from sonar_graph.navigation.alignment.dvl_imu import (
     DvlMatch,
+    InertialPath,
     _line_up,
     _without_shared_noise,
     match_dvl_to_imu,
     stretches_of,
 )
-from sonar_graph.navigation.inertial_path import InertialPath
-from sonar_graph.navigation.offset_search import OffsetFit
+from sonar_graph.navigation.alignment.time_offset import OffsetFit, SampleSeries, fit, rate_noise_power
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 
@@ -121,7 +120,7 @@ def test_a_hole_of_the_imu_ends_a_stretch(hole_s: float, monkeypatch: pytest.Mon
     assert np.abs(errors_over_sigma(holed)).max() < 2.5
     assert holed.scale.sigma < 1.5 * whole.scale.sigma
     assert abs(holed.scale.value - whole.scale.value) < 2 * whole.scale.sigma
-    monkeypatch.setattr("sonar_graph.navigation.inertial_path._parts", np.zeros_like)
+    monkeypatch.setattr("sonar_graph.navigation.alignment.dvl_imu._parts", np.zeros_like)
     blind = matched(without_rows(run, hole_s))
     assert blind.scale.sigma > 1.25 * whole.scale.sigma
     assert hole_s < 5.0 or abs(blind.scale.value - 1.0) > 2.5 * blind.scale.sigma
@@ -198,7 +197,7 @@ def test_what_the_shared_noise_adds_is_taken_off_every_parameter_and_the_offset(
     """The column of the scale holds it: see the same law, with noise, of `differenced_fit`."""
     rng, m = np.random.default_rng(3), 30
     B = np.tile(np.eye(3), (m, 1, 1))
-    stretch = Stretch(rng.standard_normal((m, 3)), rng.standard_normal((m, 3, 14)), B, np.ones(m))
+    stretch = SampleSeries(rng.standard_normal((m, 3)), rng.standard_normal((m, 3, 14)), B, np.ones(m))
     found = fit([stretch], np.full(14, 10.0), np.array([0.5, 0.1]))
     corrected = _without_shared_noise(OffsetFit(found, 0.3, ""), [stretch])
     added = found.covariance[:, 1] * rate_noise_power([stretch], found.ratios)
@@ -232,7 +231,7 @@ def test_derivatives_are_those_of_what_is_lined_up(kind: str, axis: int):
     size = {"lever": 0.1, "force": 1e-3, "gyro": 1e-4}[kind]
     change = size * np.eye(3)[axis]
 
-    def first(arm: np.ndarray, rate: np.ndarray, force: np.ndarray) -> Stretch:
+    def first(arm: np.ndarray, rate: np.ndarray, force: np.ndarray) -> SampleSeries:
         imu, dvl = on_a_plane(arm)
         path = InertialPath.of(Imu(imu.stamps_ns, imu.angular_velocity + rate, imu.specific_force + force))
         seconds = path.since_origin(dvl.stamps_ns)[:150]

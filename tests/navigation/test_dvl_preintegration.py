@@ -9,9 +9,9 @@ from scipy.stats import chi2
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError, MeasurementError
-from sonar_graph.navigation.dvl_preintegration import Preintegrator
 from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.steps import Steps
+from sonar_graph.navigation.preintegration.motion import Preintegrator
+from sonar_graph.navigation.preintegration.recursion import Steps
 
 from .rows import (
     NS,

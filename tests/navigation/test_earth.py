@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.navigation.earth import earth_rate_in_world
+from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
 
 
 def rate_deg_h(latitude_deg: float) -> np.ndarray:

@@ -6,9 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.dvl_preintegration import Preintegrator
-from sonar_graph.navigation.node_motion import motion_between_nodes, motion_since_node
-from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation.odometry import Odometry, motion_between_nodes, motion_since_node
+from sonar_graph.navigation.preintegration.motion import Preintegrator
 
 from .rows import NS, T0_NS, stamps
 

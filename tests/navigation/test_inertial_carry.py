@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
-from sonar_graph.navigation.inertial_carry import EARTH_RATE_RAD_S, InertialRows, carry
+from sonar_graph.navigation.dvl_screening.partial_beams import EARTH_RATE_RAD_S, InertialRows, carry
 
 NS = 10**9
 T0_NS = 1_700_000_000 * NS

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.measurements import Imu
-from sonar_graph.navigation.inertial_path import InertialPath
+from sonar_graph.navigation.alignment.dvl_imu import InertialPath
 
 T_S = np.arange(0, 20, 0.02)
 STAMPS_NS = np.round(T_S * 1e9).astype(np.int64)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Imu
-from sonar_graph.navigation.initial_tilt import angles_by_up, earth_up_and_level, in_body_axes, roll_and_pitch
+from sonar_graph.navigation.alignment.gravity import angles_by_up, earth_up_and_level, in_body_axes, roll_and_pitch
 
 from .rows import derivative
 

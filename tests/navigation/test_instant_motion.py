@@ -10,10 +10,8 @@ import pytest
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.dvl_preintegration import Preintegrator
-from sonar_graph.navigation.instant_motion import motion_between
-from sonar_graph.navigation.node_motion import motion_between_nodes, motion_since_node
-from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation.odometry import Odometry, motion_between, motion_between_nodes, motion_since_node
+from sonar_graph.navigation.preintegration.motion import Preintegrator
 
 from . import test_gap_motion as tumbling
 from .test_gaps import DVL, FOUND_S, LOST_S, NOISY, QUIET, Vehicle, at, rows

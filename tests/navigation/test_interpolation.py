@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.navigation.interpolation import rows_until, value_among, value_at
+from sonar_graph.navigation.samples import rows_until, value_among, value_at
 
 STAMPS = np.array([0, 10, 14, 30, 31], dtype=np.int64)
 VALUES = np.random.default_rng(0).standard_normal((5, 3))

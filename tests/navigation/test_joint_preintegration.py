@@ -6,13 +6,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
-from sonar_graph.doppler_beams import UNMEASURED_M_S
+from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.dvl_preintegration import Preintegrator
-from sonar_graph.navigation.joint_preintegration import DISPLACEMENT, JointMotion, JointPreintegrator
-from sonar_graph.navigation.joint_rules import RULES
 from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation.preintegration.joint_preintegration import DISPLACEMENT, JointMotion, JointPreintegrator
+from sonar_graph.navigation.preintegration.joint_recursion import RULES
+from sonar_graph.navigation.preintegration.motion import Preintegrator
 
 from .joint_rows import ACCEL, GYRO, random_rows, step_by_step
 from .rows import NS, T0_NS, derivative, dvl, imu, stamps, waves

@@ -6,8 +6,13 @@ import pytest
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.joint_preintegration import DISPLACEMENT, ROTATION, JointMotion, JointPreintegrator
-from sonar_graph.navigation.joint_rules import RULES
+from sonar_graph.navigation.preintegration.joint_preintegration import (
+    DISPLACEMENT,
+    ROTATION,
+    JointMotion,
+    JointPreintegrator,
+)
+from sonar_graph.navigation.preintegration.joint_recursion import RULES
 
 from .joint_rows import ACCEL, GYRO, StepByStep, random_rows, step_by_step
 from .rows import dvl, imu, stamps

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from sonar_graph import kernels
-from sonar_graph.navigation.kernels import SMALL_ANGLE_RAD, left_jacobian, rotation_exp, skew
+from sonar_graph.numerics import jit as kernels
+from sonar_graph.numerics.mat3 import SMALL_ANGLE_RAD, left_jacobian, rotation_exp, skew
 
 ANGLES_RAD = [0.0, 1e-9, 0.99 * SMALL_ANGLE_RAD, 1.01 * SMALL_ANGLE_RAD, 0.01, 1.0, np.pi - 1e-6, np.pi, 5.0]
 
@@ -63,7 +63,7 @@ from callee import inner
 def outer(x):
     return 10.0 * inner(x)
 """
-CHECKED = {"imported": "from sonar_graph.kernels import compiled", "decorator": "compiled"}
+CHECKED = {"imported": "from sonar_graph.numerics.jit import compiled", "decorator": "compiled"}
 UNCHECKED = {"imported": "import numba", "decorator": "numba.njit(cache=True, error_model='numpy')"}
 
 

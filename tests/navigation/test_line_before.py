@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.measurements import Imu
-from sonar_graph.navigation.line_before import integral, line_before
-from sonar_graph.navigation.unmeasured_turns import NO_TURNS
+from sonar_graph.navigation.imu_gaps import NO_TURNS
+from sonar_graph.navigation.preintegration.dvl_gaps import integral, line_before
 
 from .rows import dvl, imu, stamps
 

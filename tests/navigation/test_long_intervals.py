@@ -7,9 +7,15 @@ import pytest
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.joint_preintegration import ACCEL, DISPLACEMENT, GYRO, JointMotion, JointPreintegrator
-from sonar_graph.navigation.joint_rules import RULES
-from sonar_graph.navigation.long_intervals import with_rate_noise
+from sonar_graph.navigation.preintegration.joint_preintegration import (
+    ACCEL,
+    DISPLACEMENT,
+    GYRO,
+    JointMotion,
+    JointPreintegrator,
+    with_rate_noise,
+)
+from sonar_graph.navigation.preintegration.joint_recursion import RULES
 
 from .rows import NS, T0_NS, derivative, stamps
 from .test_gaps import DVL, QUIET, Vehicle, at

@@ -9,9 +9,10 @@ from scipy.stats import chi2
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.errors import AlignmentError
-from sonar_graph.logs.converters.akit import read_akit
+from sonar_graph.logs.convert.akit import read_akit
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation import InitialTilt, align_in_motion
+from sonar_graph.navigation.alignment.gravity import InitialTilt
+from sonar_graph.navigation.alignment.in_motion import align_in_motion
 
 G, HZ, DVL_EVERY, LENGTH_S = 9.80665, 100, 20, 15.0
 EARTH, LATITUDE = 7.292115e-5, np.radians(40.0)
@@ -265,6 +266,6 @@ def test_what_comes_after_a_hole_of_the_imu_is_not_used(monkeypatch):
     assert [found.roll_rad, found.pitch_rad] == pytest.approx(truth[:2], abs=1e-3)
     with pytest.raises(AlignmentError, match="Doppler samples beside the IMU"):
         align_in_motion(imu.rows((seconds <= 1.0) | (seconds >= 3.0)), dvl, KNOWN)
-    monkeypatch.setattr("sonar_graph.navigation.moving_alignment.row_after_hole", lambda *_: -1)
+    monkeypatch.setattr("sonar_graph.navigation.alignment.in_motion.row_after_hole", lambda *_: -1)
     with pytest.raises(AlignmentError, match="differ"):
         align_in_motion(holed, dvl, KNOWN)

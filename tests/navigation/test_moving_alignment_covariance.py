@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation import align_in_motion
-from sonar_graph.navigation.inertial_path import InertialPath
-from sonar_graph.navigation.moving_alignment import _Doppler
+from sonar_graph.navigation.alignment.dvl_imu import InertialPath
+from sonar_graph.navigation.alignment.in_motion import _Doppler, align_in_motion
 
 from .test_moving_alignment import EARTH, LATITUDE, G, acceleration, attitude, velocity
 

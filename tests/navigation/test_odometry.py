@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.dvl_preintegration import Preintegrator
 from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.steps import Steps
+from sonar_graph.navigation.preintegration.motion import Preintegrator
+from sonar_graph.navigation.preintegration.recursion import Steps
 from sonar_graph.states import Refusal
 
 from .rows import NS, T0_NS, dvl, imu, stamps, waves

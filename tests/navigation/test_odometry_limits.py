@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonar_graph.calibration import Calibration, DvlCalibration
+from sonar_graph.calibration import ROWS_BEFORE, Calibration, DvlCalibration
 from sonar_graph.errors import MeasurementError
-from sonar_graph.navigation.odometry import Odometry, longest_interval_ns
-from sonar_graph.navigation.unmeasured_turns import ROWS_BEFORE
+from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation.samples import longest_interval_ns
 from sonar_graph.states import Refusal
 
 from .rows import NS, T0_NS, dvl, imu, stamps

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from sonar_graph.navigation.differenced_fit import Stretch
-from sonar_graph.navigation.offset_search import Estimate1D, OffsetFit, _doubt, search_offset
+from sonar_graph.navigation.alignment.time_offset import Estimate1D, OffsetFit, SampleSeries, _doubt, search_offset
 
 T_S, NOISE = np.arange(200.0), 0.01
 NOTHING, STEADY = np.empty((len(T_S) - 1, 3, 0)), np.tile(np.eye(3), (len(T_S) - 1, 1, 1))
@@ -27,9 +26,9 @@ def turning_every_second(t_s: np.ndarray) -> np.ndarray:
 def searched(signal: Callable[[np.ndarray], np.ndarray], offset_s: float, seed: int = 0) -> OffsetFit:
     measured = signal(T_S + offset_s) + NOISE * np.random.default_rng(seed).standard_normal((len(T_S), 3))
 
-    def line_up(at_s: float) -> list[Stretch]:
+    def line_up(at_s: float) -> list[SampleSeries]:
         y = np.diff(signal(T_S + at_s) - measured, axis=0)
-        return [Stretch(y, NOTHING, STEADY, np.diff(T_S))]
+        return [SampleSeries(y, NOTHING, STEADY, np.diff(T_S))]
 
     return search_offset(line_up, NONE)
 
@@ -116,9 +115,11 @@ def scaled(offset_s: float, noise: float, seed: int) -> OffsetFit:
     measured = (1 + SCALE) * swaying(T_S + offset_s)
     measured = measured + noise * np.random.default_rng(seed).standard_normal(measured.shape)
 
-    def line_up(at_s: float) -> list[Stretch]:
+    def line_up(at_s: float) -> list[SampleSeries]:
         signal = swaying(T_S + at_s)
-        return [Stretch(np.diff(measured - signal, axis=0), np.diff(signal, axis=0)[:, :, None], STEADY, np.diff(T_S))]
+        return [
+            SampleSeries(np.diff(measured - signal, axis=0), np.diff(signal, axis=0)[:, :, None], STEADY, np.diff(T_S))
+        ]
 
     return search_offset(line_up, np.array([SCALE_SIGMA]))
 

@@ -7,10 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
-from sonar_graph.doppler_beams import velocity_of_beams
-from sonar_graph.navigation.inertial_carry import InertialRows, carry
-from sonar_graph.navigation.partial_velocity import LONGEST_STRETCH_NS, PartialVelocities
-from sonar_graph.navigation.velocity_covariances import is_partial
+from sonar_graph.devices.dvl_beams import is_partial, velocity_of_beams
+from sonar_graph.navigation.dvl_screening.partial_beams import (
+    LONGEST_STRETCH_NS,
+    InertialRows,
+    PartialVelocities,
+    carry,
+)
 
 STEP_NS = 200_000_000
 STEP_S = 0.2

@@ -5,9 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion, Preintegrator
-from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.running_motion import RunningMotion
+from sonar_graph.navigation.odometry import Odometry, RunningMotion
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion, Preintegrator
 
 from .rows import NS, T0_NS, dvl, imu, part, random_steps, stamps, waves
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from sonar_graph.navigation import dvl_against_imu, reference_match
+from sonar_graph.navigation.alignment import dvl_imu as dvl_against_imu
+from sonar_graph.navigation.alignment import reference_offset as reference_match
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.navigation.stamped_rows import StampedRows, node_range, rows_before_gaps
+from sonar_graph.navigation.samples import StampedRows, node_range, rows_before_gaps
 
 
 def kept(*blocks: list[int]) -> StampedRows:

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.navigation.steps import Columns, cursor_at, merge_rows, next_step
-from sonar_graph.navigation.unmeasured_turns import NO_TURNS
+from sonar_graph.navigation.imu_gaps import NO_TURNS
+from sonar_graph.navigation.preintegration.recursion import Columns, cursor_at, merge_rows, next_step
 
 IMU_NS = np.array([0, 10, 20, 32, 40, 50], dtype=np.int64) * 10**7
 DVL_NS = np.array([-5, 20, 36, 52], dtype=np.int64) * 10**7

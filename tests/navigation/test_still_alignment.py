@@ -10,8 +10,8 @@ from scipy.stats import chi2
 from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation import InitialTilt, align_at_rest
-from sonar_graph.navigation.still_alignment import covariance_at_rest
+from sonar_graph.navigation.alignment.at_rest import align_at_rest, covariance_at_rest
+from sonar_graph.navigation.alignment.gravity import InitialTilt
 
 G, HZ, REST_S = 9.80665, 50, 20.0
 EARTH, LATITUDE = 7.292115e-5, np.radians(40.0)

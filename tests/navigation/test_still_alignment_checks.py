@@ -10,7 +10,7 @@ import pytest
 from sonar_graph.calibration import Calibration, DvlCalibration
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation import align_at_rest
+from sonar_graph.navigation.alignment.at_rest import align_at_rest
 
 from .test_still_alignment import HZ, NOISELESS, SENSORS, rest
 

@@ -3,8 +3,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from sonar_graph.navigation import triples
-from sonar_graph.navigation.kernels import skew
+from sonar_graph.numerics import mat3 as triples
+from sonar_graph.numerics.mat3 import skew
 
 vectors = st.tuples(*[st.floats(-10, 10)] * 3)
 matrices = st.tuples(*[vectors] * 3)

@@ -8,11 +8,10 @@ import pytest
 from sonar_graph.calibration import Calibration, ImuCalibration
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Imu
-from sonar_graph.navigation.dvl_preintegration import Preintegrator
-from sonar_graph.navigation.joint_preintegration import JointPreintegrator
-from sonar_graph.navigation.node_motion import motion_between_nodes, motion_since_node
-from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.unmeasured_turns import closed_variance, hole_ns, open_variance, turn_psd
+from sonar_graph.navigation.imu_gaps import closed_variance, hole_ns, open_variance, turn_psd
+from sonar_graph.navigation.odometry import Odometry, motion_between_nodes, motion_since_node
+from sonar_graph.navigation.preintegration.joint_preintegration import JointPreintegrator
+from sonar_graph.navigation.preintegration.motion import Preintegrator
 
 from .rows import NS, T0_NS, dvl, imu, stamps
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from sonar_graph.doppler_beams import UNMEASURED_M_S
-from sonar_graph.navigation.velocity_covariances import in_numbers, is_partial
+from sonar_graph.devices.dvl_beams import UNMEASURED_M_S, in_numbers, is_partial
 
 
 def test_an_infinite_variance_is_that_of_a_direction_not_measured_and_nan_is_not_said():

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.doppler_beams import UNMEASURED_M_S
+from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.measurements import Dvl
+from sonar_graph.navigation.dvl_screening.dvl_gate import LONG_NS, MOST_WAITING, needed
 from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.velocity_doubt import LONG_NS, MOST_WAITING, needed
 from sonar_graph.states import Refusal
 
 from .rows import NS, T0_NS, dvl, imu, stamps

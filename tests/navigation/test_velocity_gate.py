@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from sonar_graph.doppler_beams import UNMEASURED_M_S
-from sonar_graph.navigation.velocity_gate import GATE, Verdict, judge
+from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
+from sonar_graph.navigation.dvl_screening.dvl_gate import GATE, VelocityVerdict, judge
 
 NS = 10**9
 WALK = 0.1
@@ -28,7 +28,7 @@ def judged(
     partial: tuple[int, ...] = (),
     known: tuple[int, ...] = (),
     gate: float = GATE,
-) -> Verdict:
+) -> VelocityVerdict:
     """Rows with the covariances above in turn; those known before are at rest."""
     cov = COVS[np.arange(len(stamps_ns)) % 2].copy()
     cov[list(partial)] += np.diag([0.0, UNMEASURED_M_S**2, UNMEASURED_M_S**2])

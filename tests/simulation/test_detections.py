@@ -10,8 +10,9 @@ from scipy import stats
 from sonar_graph.calibration import Mounting, SonarCalibration
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.simulation.detections import (
-    Fan,
-    Recogniser,
+    FieldOfView,
+    SimulatedRecogniser,
+    World,
     inside,
     landmarks_in_sonar,
     range_azimuth_elevation,
@@ -19,14 +20,13 @@ from sonar_graph.simulation.detections import (
 )
 from sonar_graph.simulation.sensors import regular_stamps, seconds_since_start
 from sonar_graph.simulation.vehicle import VehiclePath, smooth_noise
-from sonar_graph.simulation.world import World
 
 SONAR = SonarCalibration(
     mounting=Mounting(translation_m=(0.4, 0.1, -0.05), rpy_rad=(0.02, 0.5, -0.1)),
     range_sigma_m=0.015,
     azimuth_sigma_rad=0.007,
 )
-FAN = Fan(1.0, 6.0, 0.6, 0.3)
+FAN = FieldOfView(1.0, 6.0, 0.6, 0.3)
 WORLD = World(np.array([3, 7, 8]), np.array([[3.0, 0.5, -2.0], [4.0, -1.0, -2.1], [2.5, 0.0, -1.5]]), -2.0)
 STAMPS = regular_stamps(10.0, 600.0, 0.013)
 
@@ -40,7 +40,9 @@ def path() -> VehiclePath:
 PATH = path()
 
 
-def detect(recogniser: Recogniser, sonar: SonarCalibration = SONAR, world: World = WORLD) -> LandmarkDetections:
+def detect(
+    recogniser: SimulatedRecogniser, sonar: SonarCalibration = SONAR, world: World = WORLD
+) -> LandmarkDetections:
     found = simulate_detections(PATH, STAMPS, sonar, FAN, recogniser, world, np.random.default_rng(12))
     assert found is not None
     return found
@@ -103,7 +105,7 @@ def test_fan_ends_at_its_edges(range_m: float, azimuth_rad: float, elevation_rad
 
 
 def test_a_perfect_recogniser_reports_exactly_what_is_in_view():
-    found = detect(Recogniser())
+    found = detect(SimulatedRecogniser())
     seen = in_view()
     ids, _ = found.most_probable()
     reported = set(zip(found.stamps_ns.tolist(), ids.tolist(), strict=True))
@@ -113,8 +115,8 @@ def test_a_perfect_recogniser_reports_exactly_what_is_in_view():
 
 
 def test_range_and_azimuth_carry_the_noise_of_their_covariance():
-    noisy = detect(Recogniser())
-    quiet = detect(Recogniser(), SONAR.model_copy(update={"range_sigma_m": 1e-12, "azimuth_sigma_rad": 1e-12}))
+    noisy = detect(SimulatedRecogniser())
+    quiet = detect(SimulatedRecogniser(), SONAR.model_copy(update={"range_sigma_m": 1e-12, "azimuth_sigma_rad": 1e-12}))
     sigmas = np.sqrt(np.diagonal(noisy.range_azimuth_cov, axis1=1, axis2=2))
     np.testing.assert_allclose(sigmas, np.tile([0.015, 0.007], (len(noisy), 1)))
     error = np.column_stack([noisy.range_m - quiet.range_m, noisy.azimuth_rad - quiet.azimuth_rad]) / sigmas
@@ -125,11 +127,11 @@ def test_range_and_azimuth_carry_the_noise_of_their_covariance():
 
 def test_landmarks_are_missed_at_the_stated_rate():
     trials = int(in_view().sum())
-    assert_binomial(len(detect(Recogniser(detection_probability=0.7))), trials, 0.7)
+    assert_binomial(len(detect(SimulatedRecogniser(detection_probability=0.7))), trials, 0.7)
 
 
 def test_identities_are_mistaken_at_the_stated_rate_and_for_all_others_alike():
-    right, wrong = detect(Recogniser()), detect(Recogniser(wrong_id_rate=0.2))
+    right, wrong = detect(SimulatedRecogniser()), detect(SimulatedRecogniser(wrong_id_rate=0.2))
     true_ids, ids = right.most_probable()[0], wrong.most_probable()[0]
     mistaken = true_ids != ids
     assert_binomial(int(mistaken.sum()), len(ids), 0.2)
@@ -138,12 +140,12 @@ def test_identities_are_mistaken_at_the_stated_rate_and_for_all_others_alike():
 
 
 def test_recognised_posteriors_are_confident_and_leave_room_for_none():
-    found = detect(Recogniser())
+    found = detect(SimulatedRecogniser())
     np.testing.assert_allclose(np.sort(found.id_probability, axis=1), np.tile([0.01, 0.01, 0.97], (len(found), 1)))
 
 
 def test_false_detections_come_at_the_stated_rate_all_over_the_fan():
-    found = detect(Recogniser(detection_probability=0, false_detections_per_frame=0.5))
+    found = detect(SimulatedRecogniser(detection_probability=0, false_detections_per_frame=0.5))
     low, high = stats.poisson.interval(0.9999, 0.5 * len(STAMPS))
     assert low < len(found) < high
     uniform_range = stats.kstest(found.range_m, stats.uniform(1.0, 5.0).cdf).pvalue
@@ -152,27 +154,27 @@ def test_false_detections_come_at_the_stated_rate_all_over_the_fan():
 
 
 def test_false_detections_say_none_of_the_known_unless_confusion_is_asked_for():
-    doubtful = detect(Recogniser(detection_probability=0, false_detections_per_frame=0.5))
+    doubtful = detect(SimulatedRecogniser(detection_probability=0, false_detections_per_frame=0.5))
     np.testing.assert_allclose(doubtful.id_probability.sum(axis=1), 0.2)
-    confused = detect(Recogniser(0, 0, false_detections_per_frame=0.5, confident_false_fraction=0.3))
+    confused = detect(SimulatedRecogniser(0, 0, false_detections_per_frame=0.5, confident_false_fraction=0.3))
     assert_binomial(int((confused.most_probable()[1] > 0.9).sum()), len(confused), 0.3)
 
 
 def test_a_lone_landmark_cannot_be_mistaken_for_another():
     lone = World(WORLD.landmark_ids[:1], WORLD.landmark_positions[:1], -2.0)
-    found = detect(Recogniser(wrong_id_rate=1.0), world=lone)
+    found = detect(SimulatedRecogniser(wrong_id_rate=1.0), world=lone)
     assert np.all(found.most_probable()[0] == 3)
 
 
 def test_nothing_in_view_is_no_block():
     far = World(np.array([1]), np.array([[500.0, 0.0, 0.0]]), 0.0)
-    assert simulate_detections(PATH, STAMPS, SONAR, FAN, Recogniser(), far, np.random.default_rng(0)) is None
+    assert simulate_detections(PATH, STAMPS, SONAR, FAN, SimulatedRecogniser(), far, np.random.default_rng(0)) is None
 
 
 def test_a_share_of_all_detections_names_nothing():
     """The others, and where all of them are, stay as they were."""
-    named = detect(Recogniser(false_detections_per_frame=0.5))
-    some = detect(Recogniser(false_detections_per_frame=0.5, anonymous_share=0.3))
+    named = detect(SimulatedRecogniser(false_detections_per_frame=0.5))
+    some = detect(SimulatedRecogniser(false_detections_per_frame=0.5, anonymous_share=0.3))
     is_anonymous = (some.candidate_ids < 0).all(axis=1)
     assert_binomial(int(is_anonymous.sum()), len(some), 0.3)
     assert np.all(some.id_probability[is_anonymous] == 0)
@@ -180,4 +182,4 @@ def test_a_share_of_all_detections_names_nothing():
     assert np.array_equal(some.candidate_ids[~is_anonymous], named.candidate_ids[~is_anonymous])
     assert np.array_equal(some.range_m, named.range_m)
     assert np.array_equal(some.azimuth_rad, named.azimuth_rad)
-    assert (detect(Recogniser(anonymous_share=1.0)).candidate_ids < 0).all()
+    assert (detect(SimulatedRecogniser(anonymous_share=1.0)).candidate_ids < 0).all()

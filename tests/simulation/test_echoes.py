@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.simulation.image_options import ImageOptions
-from sonar_graph.simulation.seabed import place
-from sonar_graph.simulation.sonar_image import FrameSimulator
+from sonar_graph.simulation.sonar_image.frames import FrameSimulator
+from sonar_graph.simulation.sonar_image.imaging_sonar import ImageOptions
+from sonar_graph.simulation.sonar_image.scene import place
 
 HEIGHT_M, MIDDLE_M, FRAMES = 0.95, 1.6, 16
 LENGTH_M, WIDTH_M = 0.06, 0.2

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sonar_graph.devices.landmark_designs import OWN_DESIGNS
 from sonar_graph.errors import CalibrationError, SimulationError
-from sonar_graph.landmark_designs import OWN_DESIGNS
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin, simulate_basin_frames
-from sonar_graph.simulation.image_options import ImageOptions
-from sonar_graph.simulation.imaging import ImagedFrames, frame_truth
-from sonar_graph.simulation.seabed import block, place
-from sonar_graph.simulation.sonar_image import FrameSimulator
+from sonar_graph.simulation.sonar_image.frames import FrameSimulator, ImagedFrames, frame_truth
+from sonar_graph.simulation.sonar_image.imaging_sonar import ImageOptions
+from sonar_graph.simulation.sonar_image.scene import block, place
 
 SLOW = {"duration_s": 130, "laps": 1, "frame_rate_hz": 1.0}
 

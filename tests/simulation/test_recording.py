@@ -8,7 +8,7 @@ from scipy import stats
 from sonar_graph.calibration import Calibration
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.simulation.presets import DVL_PRESETS, IMU_PRESETS
+from sonar_graph.simulation.options import DVL_PRESETS, IMU_PRESETS
 
 
 def short(**options: object) -> Sequence:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.simulation.route import drive, follow, hover, turn
+from sonar_graph.simulation.vehicle import drive, follow, hover, turn
 
 START = (1.0, -2.0, 0.5)
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonar_graph.simulation.scatterers import CELL_M, CELLS, scatterers
+from sonar_graph.simulation.sonar_image.scene import CELL_M, CELLS, scatterers
 
 
 def correlation(field: np.ndarray) -> np.ndarray:

@@ -10,12 +10,11 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import SonarImage
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.simulation.image_options import ImageOptions
-from sonar_graph.simulation.imaging_sonar import ImagingSonar
-from sonar_graph.simulation.seabed import SeabedObject, block, place, place_landmark
-from sonar_graph.simulation.sonar_image import SONARS, FrameSimulator, drawn_gain_error_db
+from sonar_graph.simulation.sonar_image.frames import SONARS, FrameSimulator, drawn_gain_error_db
+from sonar_graph.simulation.sonar_image.imaging_sonar import ImageOptions, ImagingSonar
+from sonar_graph.simulation.sonar_image.scene import SeabedObject, block, place, place_landmark
 
 HEIGHT_M = 0.95
 TILT = Rotation.from_euler("ZYX", [0, 30, 0], degrees=True)

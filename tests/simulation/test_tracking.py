@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from sonar_graph.errors import SimulationError
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.simulation.tracking import Tracking, Watched
+from sonar_graph.simulation.detections import Tracking, Watched
 
 NS = 1_000_000_000
 

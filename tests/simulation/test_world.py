@@ -3,7 +3,7 @@
 import numpy as np
 from scipy import stats
 
-from sonar_graph.simulation.world import world_on_floor
+from sonar_graph.simulation.detections import world_on_floor
 
 
 def test_landmark_heights_obey_the_floor_prior():

@@ -6,9 +6,9 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration, FloorPrior, ImuCalibration, Mounting, SonarCalibration, Start
 from sonar_graph.measurements import Dvl, Floats, Imu, LandmarkDetections
+from sonar_graph.slam.frontend import SightingPolicy, Sightings
 from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
-from sonar_graph.slam.sightings import SightingPolicy, Sightings
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import Outcome
 
 NS = 1_000_000_000

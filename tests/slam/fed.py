@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, L, X
 
-import sonar_graph.slam.sightlines as sightlines_module
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
-from sonar_graph.slam import factors
-from sonar_graph.slam.batch import solve
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
+from sonar_graph.slam.models import factors
+from sonar_graph.slam.smoother import batch_solution as sightlines_module
+from sonar_graph.slam.smoother.batch_solution import solve
+from sonar_graph.slam.smoother.incremental import Smoother
 
 from .graphs import information
 from .rail import RANGE_SIGMA_M, STEP_S, VELOCITY_SIGMA_M_S, calibration, rail

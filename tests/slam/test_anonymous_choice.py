@@ -9,15 +9,13 @@ from gtsam.symbol_shorthand import L, X
 from scipy.stats import multivariate_normal
 
 from sonar_graph.calibration import SonarCalibration
-from sonar_graph.slam.anonymous_landmarks import ODDS, AnonymousLandmarks, AnonymousPolicy, Paired
-from sonar_graph.slam.association import DetectionJournal
-from sonar_graph.slam.landmark_sightings import LandmarkSightings
-from sonar_graph.slam.late_gate import STILL
-from sonar_graph.slam.sighting import Sighting, SightingFactors
-from sonar_graph.slam.sightlines import Sightline
-from sonar_graph.slam.smoother import Smoother
-from sonar_graph.slam.view import View
-from sonar_graph.states import Outcome
+from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors
+from sonar_graph.slam.landmarks.tracked import STILL
+from sonar_graph.slam.landmarks.unknown import ODDS, AnonymousLandmarks, AnonymousPolicy, PairedDetection
+from sonar_graph.slam.models.prediction import PredictedView
+from sonar_graph.slam.smoother.batch_solution import Sightline
+from sonar_graph.slam.smoother.incremental import Smoother
+from sonar_graph.states import DetectionJournal, Outcome
 
 NOISE = np.diag([4e-4, 1e-4])
 
@@ -44,7 +42,7 @@ def test_a_landmark_has_to_be_denser_than_what_is_not_in_the_map(range_m: float,
     """So many a square metre are ``range`` times as many a metre of range and radian of azimuth."""
     z = np.array([range_m + 0.02, 0.01])
     _, smoother = anonymous(range_m, 1.0)
-    view = View(X(0), None, gtsam.Pose3(), STILL, gtsam.Pose3(), smoother.joint_covariance([X(0), L(7)]))
+    view = PredictedView(X(0), None, gtsam.Pose3(), STILL, gtsam.Pose3(), smoother.joint_covariance([X(0), L(7)]))
     expected, cov = view.expect([L(7)], smoother.values.atPoint3(L(7))[None])
     density = multivariate_normal.pdf(z, expected[0], cov[0] + NOISE)
     policied, _ = anonymous(range_m, share * density / (ODDS * z[0]))
@@ -58,5 +56,5 @@ def test_a_candidate_begins_a_landmark_when_it_is_known_to_a_tenth_of_its_range(
     """One sighting in an aperture whose standard deviation is about 0.1 rad."""
     made, _ = anonymous(range_m, 1e-3, aperture_rad=share * 0.1 * math.sqrt(12.0))
     sighting = Sighting(1, 1, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.4])), NOISE, None)
-    made.use([sighting], [Paired(None, None)], 0.0)
+    made.use([sighting], [PairedDetection(None, None)], 0.0)
     assert sighting.outcome is (Outcome.NEW if share < 1.0 else Outcome.WAITING)

@@ -6,13 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import sonar_graph.slam.anonymous_landmarks as module
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.slam.anonymous_landmarks import FIRST_ANONYMOUS_ID
-from sonar_graph.slam.joint_compatibility import UNPAIRED, Innovations, Pairing, pair_jointly
-from sonar_graph.states import Outcome
+from sonar_graph.slam.landmarks import unknown as module
+from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, Pairing, pair_jointly
+from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 
 from .graph_comparison import assert_marginals_agree, largest_difference
 from .late_identities import assert_outcomes_account, run

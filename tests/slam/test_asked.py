@@ -6,9 +6,9 @@ import pytest
 from gtsam.symbol_shorthand import B, X
 
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
-from sonar_graph.slam.asked import Anchored
-from sonar_graph.slam.joint_covariance import JointCovariance
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
+from sonar_graph.slam.estimates import AnchoredPose
+from sonar_graph.slam.smoother.batch_solution import JointCovariance
 
 KEYFRAME = gtsam.Pose3(gtsam.Rot3.Ypr(0.4, -0.1, 0.05), np.array([3.0, -2.0, -1.0]))
 BIAS = np.array([1e-3, -2e-3, 5e-3])
@@ -43,7 +43,7 @@ def test_the_pose_and_its_covariance_are_those_of_keyframe_bias_and_motion(bias_
     """``J P J'`` with J by differences, P joint of keyframe and bias: what both share counts."""
     moved, P = motion(), covariance(9, 1e-4, 3)
     joint = JointCovariance(P, {B(0): 6, X(3): 0})
-    found = Anchored(7, 3, bias_key, moved).carried_on(values(), joint)
+    found = AnchoredPose(7, 3, bias_key, moved).carried_on(values(), joint)
 
     def carried(state: Floats) -> gtsam.Pose3:
         pose = KEYFRAME.compose(gtsam.Pose3.Expmap(state[:6]))

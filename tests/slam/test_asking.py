@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L
 
-from sonar_graph.estimator_checks import laws
-from sonar_graph.estimator_checks.outcome import run, unlike
-from sonar_graph.estimator_checks.world import misnamed_world, small_world
 from sonar_graph.slam.isam2 import Isam2, Isam2Params
 from sonar_graph.states import Outcome
+from sonar_graph.testing import laws
+from sonar_graph.testing.drives import misnamed_world, small_world
+from sonar_graph.testing.laws import run, unlike
 
 LAG_S = 3.0
 """Much less than the worlds last: what is wrong leaves the window before it is known to be."""

@@ -4,8 +4,8 @@ from numpy.testing import assert_array_equal
 from scipy.stats import chi2
 
 from sonar_graph.measurements import LandmarkDetections
-from sonar_graph.slam.association import DetectionJournal, gate_threshold, identify
-from sonar_graph.states import Outcome
+from sonar_graph.slam.landmarks.association import gate_threshold, identify
+from sonar_graph.states import DetectionJournal, Outcome
 
 
 def detections(ids, probabilities):

@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, L, X
 
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
-from sonar_graph.slam import factors
-from sonar_graph.slam.batch import MAX_ITERATIONS, solve
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
+from sonar_graph.slam.models import factors
+from sonar_graph.slam.smoother.batch_solution import MAX_ITERATIONS, solve
 
 TURN = gtsam.Pose3(gtsam.Rot3.Rz(0.3), np.array([0.5, 0.0, 0.02]))
 SONAR = gtsam.Pose3(gtsam.Rot3.Ry(0.4), np.array([0.3, 0.0, -0.1]))
@@ -167,7 +167,7 @@ def test_where_nothing_lowers_the_error_the_initial_values_are_returned():
 
 def test_what_cholesky_refuses_is_solved_in_one_step(monkeypatch):
     """A pose known to 20 m with steps of 2 mm is linear enough for one undamped step."""
-    monkeypatch.setattr("sonar_graph.slam.batch.MAX_ITERATIONS", 1)
+    monkeypatch.setattr("sonar_graph.slam.smoother.batch_solution.MAX_ITERATIONS", 1)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     wide, narrow = (gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-3] * 3 + [s] * 3)) for s in (20.0, 0.002))
     graph.push_back(gtsam.PriorFactorPose3(0, gtsam.Pose3(gtsam.Rot3(), np.array([9.0, 0.0, 0.0])), wide))

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
 
-from sonar_graph.estimator_checks import check_estimator
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
-from sonar_graph.slam.association import DetectionJournal
 from sonar_graph.slam.isam2 import Isam2, Isam2Params
-from sonar_graph.slam.smoother import Smoother
-from sonar_graph.states import Estimate, Outcome
+from sonar_graph.slam.smoother.incremental import Smoother
+from sonar_graph.states import DetectionJournal, Estimate, Outcome
+from sonar_graph.testing.laws import check_estimator
 
 from .late_identities import on_the_rail
 from .rail import STEP_S, rail

@@ -5,8 +5,8 @@ from dataclasses import replace
 import gtsam
 from gtsam.symbol_shorthand import L
 
-import sonar_graph.slam.smoother as smoother_module
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.smoother import incremental as smoother_module
+from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import Outcome
 
 from .dive import NS, T0_NS, TRUSTING, Dive

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
 
-from sonar_graph.slam.determinacy import LEAST_SAID, left_open
+from sonar_graph.slam.smoother.observability import LEAST_SAID, left_open
 
 from .graphs import graph_of
 

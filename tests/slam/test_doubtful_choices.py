@@ -9,15 +9,13 @@ from gtsam.symbol_shorthand import X
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.association import DetectionJournal
-from sonar_graph.slam.doubtful_identities import DoubtfulIdentities
-from sonar_graph.slam.hypotheses import Statement
-from sonar_graph.slam.landmark_sightings import LandmarkSightings
-from sonar_graph.slam.mixture import Watch
-from sonar_graph.slam.sighting import Sighting, SightingFactors
-from sonar_graph.slam.sightlines import Sightline
-from sonar_graph.slam.smoother import Smoother
-from sonar_graph.states import Outcome
+from sonar_graph.slam.landmarks.association import IdentityPosterior
+from sonar_graph.slam.landmarks.mixture import TrackedObject
+from sonar_graph.slam.landmarks.mixture_policy import DoubtfulIdentities
+from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors
+from sonar_graph.slam.smoother.batch_solution import Sightline
+from sonar_graph.slam.smoother.incremental import Smoother
+from sonar_graph.states import DetectionJournal, Outcome
 
 from . import dive as dive_module
 from .dive import CALIBRATION, FLOOR, Dive, spherical
@@ -125,7 +123,7 @@ def test_a_misfit_is_one_of_the_identity_only_where_the_estimate_is_sure(sigma_m
         landmarks.exchange([], [(first, 7)], 1.0)
     off = Sighting(2, 2, Sightline(X(1), gtsam.Pose3(), np.array([3.3, 0.1])), noise, floor)
     landmarks.enter(off, 7, ())
-    seen, journal = Watch(Statement({7: 0.9}), [off]), DetectionJournal()
+    seen, journal = TrackedObject(IdentityPosterior({7: 0.9}), [off]), DetectionJournal()
     off.row = journal.record(off.stamp_ns, 7, Outcome.USED)
     doubtful = DoubtfulIdentities(landmarks, journal, MIXTURE, 60.0)
     doubtful.watches.append(seen)

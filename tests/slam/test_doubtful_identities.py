@@ -7,13 +7,14 @@ from gtsam.symbol_shorthand import L, X
 from pydantic import ValidationError
 
 from sonar_graph.measurements import LandmarkDetections
-from sonar_graph.slam import doubtful_identities, mixture
-from sonar_graph.slam.hypotheses import RecogniserErrors, Statement
+from sonar_graph.slam.frontend import SightingPolicy
 from sonar_graph.slam.isam2 import Isam2Params
-from sonar_graph.slam.mixture import Kernel, Mixture, Watch
-from sonar_graph.slam.sighting import Sighting
-from sonar_graph.slam.sightings import SightingPolicy
-from sonar_graph.slam.sightlines import Sightline
+from sonar_graph.slam.landmarks import mixture
+from sonar_graph.slam.landmarks import mixture_policy as doubtful_identities
+from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
+from sonar_graph.slam.landmarks.mixture import Kernel, Mixture, TrackedObject
+from sonar_graph.slam.landmarks.sighting import Sighting
+from sonar_graph.slam.smoother.batch_solution import Sightline
 from sonar_graph.states import Outcome
 
 from .dive import CALIBRATION, FLOOR, T0_NS, Dive, spherical
@@ -190,7 +191,7 @@ def test_many_sightings_of_another_object_do_not_prove_it_to_be_a_landmark(
     values.insert(X(0), gtsam.Pose3())
     values.insert(L(7), np.array([3.0, 0.0, 0.0]))
     line = Sightline(X(0), gtsam.Pose3(), np.array([3.0, 0.01 * off_sigma]))
-    seen = Watch(Statement({}), [Sighting(k, k, line, noise, None) for k in range(20)])
+    seen = TrackedObject(IdentityPosterior({}), [Sighting(k, k, line, noise, None) for k in range(20)])
     assert MIXTURE.best([seen], values, [None], {7: 50}) == [7 if is_of_7 else None]
     monkeypatch.setattr(mixture, "REPEATED_LOSS", 1e3)
     assert MIXTURE.best([seen], values, [None], {7: 50}) == [7], "as if each sighting were anywhere"
@@ -242,8 +243,8 @@ def test_a_landmark_begins_with_one_of_those_that_name_it() -> None:
     values, noise = gtsam.Values(), np.diag([4e-4, 1e-4])
     values.insert(X(0), gtsam.Pose3())
     near, far = (Sightline(X(0), gtsam.Pose3(), np.array(z)) for z in ([3.0, 0.0], [3.0, 0.4]))
-    single = Watch(Statement({7: 0.9}), [Sighting(0, 0, far, noise, None)])
-    longest = Watch(Statement({7: 0.9}), [Sighting(k, k, near, noise, None) for k in range(1, 4)])
+    single = TrackedObject(IdentityPosterior({7: 0.9}), [Sighting(0, 0, far, noise, None)])
+    longest = TrackedObject(IdentityPosterior({7: 0.9}), [Sighting(k, k, near, noise, None) for k in range(1, 4)])
     assert MIXTURE.best([single, longest], values, [None, None], {}) == [None, 7]
     values.insert(L(7), np.array([3.0, 0.0, 0.0]))
     assert MIXTURE.best([single, longest], values, [None, 7], {7: 3}) == [None, 7]

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, PlanarMotion, Start
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
-from sonar_graph.slam import factors
-from sonar_graph.slam.models import range_azimuth
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
+from sonar_graph.slam.models import factors
+from sonar_graph.slam.models.sonar_model import range_azimuth
 
 from .graphs import assert_jacobians, graph_of, information
 

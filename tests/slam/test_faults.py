@@ -13,11 +13,11 @@ from sonar_graph.errors import EstimatorError, MeasurementError
 from sonar_graph.measurements import Measurements
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
-from sonar_graph.slam import factors
-from sonar_graph.slam.exchange import Exchange
 from sonar_graph.slam.isam2 import Isam2, Isam2Params
-from sonar_graph.slam.sighting import SightingFactors
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.landmarks.sighting import SightingFactors
+from sonar_graph.slam.models import factors
+from sonar_graph.slam.smoother.factor_store import GraphEdit
+from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import Estimate, Outcome, Refusal
 
 ROW = 40
@@ -286,7 +286,7 @@ def test_what_has_no_solution_is_withheld_by_whichever_way_it_comes(fault, is_bo
             smoother.add(add(smoother))
             smoother.flush(2.0)
         else:
-            smoother.exchange(Exchange([], [add(begun())], dict(NEW_LANDMARKS.get(add, {})), []), 2.0)
+            smoother.exchange(GraphEdit([], [add(begun())], dict(NEW_LANDMARKS.get(add, {})), []), 2.0)
         for k in range(3, 6):
             step(smoother, k)
     assert re.fullmatch(SAID[fault], smoothers[0].withheld[0]), smoothers[0].withheld
@@ -298,7 +298,7 @@ def test_handles_are_known_before_one_of_them_is_withheld():
     smoother, order = begun(), []
     smoother.when_withheld = lambda withheld: order.append(withheld.handles) or set()
     step(smoother, 2)
-    smoother.exchange(Exchange([], [no_number(smoother)], {}, []), 2.0, lambda groups: order.append(set(groups[0])))
+    smoother.exchange(GraphEdit([], [no_number(smoother)], {}, []), 2.0, lambda groups: order.append(set(groups[0])))
     assert len(order) == 2
     assert order[0] == order[1]
 

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from sonar_graph.slam.graduated import graduate, truncated_weights
+from sonar_graph.slam.landmarks.mixture_history import graduated_weights, truncated_weights
 
 C2 = 9.0
 
@@ -35,7 +35,7 @@ def ours(z):
     def squared(values):
         return (values.atPoint3(0)[0] - z) ** 2
 
-    values, weights = graduate(lambda w: graph_of(z, w), squared, np.full(len(z), C2), start())
+    values, weights = graduated_weights(lambda w: graph_of(z, w), squared, np.full(len(z), C2), start())
     return values.atPoint3(0)[0], weights
 
 

@@ -5,7 +5,7 @@ from gtsam.symbol_shorthand import B, L, X
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.slam.history import History, Recent
+from sonar_graph.slam.smoother.factor_store import History, Recent
 
 
 def prior(number: int) -> gtsam.NonlinearFactor:

@@ -6,18 +6,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.measurements import LandmarkDetections
-from sonar_graph.slam.hypotheses import LEAST_LANDMARKS, RecogniserErrors, Statement
+from sonar_graph.slam.landmarks.association import LEAST_LANDMARKS, IdentityPosterior, RecogniserErrors
 
 CHANCES = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=4).map(lambda p: [x / max(sum(p), 1.0) for x in p])
 
 
-def statement(ids: list[int], probability: list[float]) -> Statement:
+def statement(ids: list[int], probability: list[float]) -> IdentityPosterior:
     n = len(ids)
     rows = LandmarkDetections(
         np.zeros(1, dtype=int), np.ones(1), np.ones(1), np.ones((1, 2, 2)), np.array([ids]), np.array([probability])
     )
     assert n == len(probability)
-    return Statement.of(rows, 0)
+    return IdentityPosterior.of(rows, 0)
 
 
 @given(CHANCES, st.floats(0.001, 0.999), st.integers(LEAST_LANDMARKS, 60))

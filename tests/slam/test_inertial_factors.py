@@ -7,8 +7,8 @@ from gtsam.symbol_shorthand import B, C, M, V, X
 
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.joint_preintegration import JointMotion, JointPreintegrator
-from sonar_graph.slam.inertial_factors import doppler_odometry, inertial_doppler_odometry, rotation_log
+from sonar_graph.navigation.preintegration.joint_preintegration import JointMotion, JointPreintegrator
+from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry, rotation_log
 
 NS = 1_000_000_000
 GRAVITY = np.array([0.0, 0.0, -9.81])

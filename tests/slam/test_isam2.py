@@ -8,14 +8,14 @@ from scipy.stats import chi2
 
 from sonar_graph.calibration import Calibration, ImuCalibration, PlanarMotion, Start
 from sonar_graph.errors import CalibrationError
-from sonar_graph.estimator_checks.world import small_world, still_world
 from sonar_graph.evaluation.consistency import normalised_squares
-from sonar_graph.logs.converters.mrclam import read_mrclam
+from sonar_graph.logs.convert.mrclam import read_mrclam
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections, Measurements
 from sonar_graph.sequence import NS_PER_S, Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam.isam2 import Isam2, Isam2Params
 from sonar_graph.states import Estimate, Outcome
+from sonar_graph.testing.drives import small_world, still_world
 
 BASIN_S = 130.0
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2, multivariate_normal
 
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.joint_compatibility import UNPAIRED, Innovations, Pairing, believed, pair_jointly
+from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, Pairing, believed, pair_jointly
 
 PROBABILITY = 0.95
 

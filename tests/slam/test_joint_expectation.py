@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, L, X
 
-from sonar_graph.slam.view import Source
+from sonar_graph.slam.models.prediction import Source
 
 from .test_view import (
     KEYFRAMES,

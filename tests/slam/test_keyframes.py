@@ -17,11 +17,11 @@ from sonar_graph.calibration import (
     Start,
 )
 from sonar_graph.measurements import Depth, Dvl, Imu
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
-from sonar_graph.navigation.earth import earth_rate_in_world
-from sonar_graph.slam import factors
+from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
 from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes, largest_variances
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.models import factors
+from sonar_graph.slam.smoother.incremental import Smoother
 
 NS = 1_000_000_000
 T0_NS = 1_500_000_000 * NS

@@ -7,9 +7,9 @@ import pytest
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
 from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.smoother.incremental import Smoother
 
 NS = 1_000_000_000
 G = 9.80665

@@ -9,12 +9,10 @@ from gtsam.symbol_shorthand import L, X
 from scipy.stats import chi2
 
 from sonar_graph.calibration import SonarCalibration
-from sonar_graph.slam.joint_covariance import JointCovariance
-from sonar_graph.slam.landmark_merging import LandmarkMerging
-from sonar_graph.slam.landmark_sightings import LandmarkSightings
-from sonar_graph.slam.sighting import Sighting, SightingFactors
-from sonar_graph.slam.sightlines import Sightline
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors
+from sonar_graph.slam.landmarks.unknown import LandmarkMerging
+from sonar_graph.slam.smoother.batch_solution import JointCovariance, Sightline
+from sonar_graph.slam.smoother.incremental import Smoother
 
 PROBABILITY = 0.99
 NOISE_M = 0.02

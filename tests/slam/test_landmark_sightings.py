@@ -8,10 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
-from sonar_graph.slam.landmark_sightings import LandmarkSightings
-from sonar_graph.slam.sighting import Sighting, SightingFactors
-from sonar_graph.slam.sightlines import Sightline
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors
+from sonar_graph.slam.smoother.batch_solution import Sightline
+from sonar_graph.slam.smoother.incremental import Smoother
 
 POSES = 5
 PLACES = {7: np.array([3.0, 0.5, -0.8]), 9: np.array([3.0, -0.4, -0.8])}

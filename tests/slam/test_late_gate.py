@@ -6,10 +6,10 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.late_gate import LateGate
-from sonar_graph.slam.sighting import Sighting
-from sonar_graph.slam.sightlines import Sightline
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.landmarks.sighting import Sighting
+from sonar_graph.slam.landmarks.tracked import LateGate
+from sonar_graph.slam.smoother.batch_solution import Sightline
+from sonar_graph.slam.smoother.incremental import Smoother
 
 THRESHOLD = 9.21
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.3, 0.1), np.array([0.3, 0.0, -0.1]))

@@ -5,8 +5,7 @@ import pytest
 from gtsam.symbol_shorthand import L
 
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.misplaced_landmarks import LEAST_MARGIN, supporters_elsewhere
-from sonar_graph.slam.mixture import Watch
+from sonar_graph.slam.landmarks.mixture import LEAST_MARGIN, TrackedObject, supporters_elsewhere
 
 from .test_mixture import MIXTURE, PLACES, log_density, log_weights, of_nothing, watch, world
 
@@ -14,24 +13,24 @@ SAID = {7: 0.9}
 HERE, THERE = PLACES[7], PLACES[7] + np.array([0.0, 0.4, 0.0])
 
 
-def named(points: list[Floats], seed: int = 3) -> list[Watch]:
+def named(points: list[Floats], seed: int = 3) -> list[TrackedObject]:
     values, rng = world(), np.random.default_rng(seed)
     return [watch(values, p, [0], 0.3 * rng.standard_normal((1, 2)), SAID) for p in points]
 
 
-def found_for(watches: list[Watch], here: int) -> list[Watch] | None:
+def found_for(watches: list[TrackedObject], here: int) -> list[TrackedObject] | None:
     """Landmark 7 is where the first of them have it."""
     values = world()
     values.update(L(7), HERE)
     return supporters_elsewhere(7, watches, [7] * here + [None] * (len(watches) - here), values, MIXTURE)
 
 
-def on_plane(values, seen: Watch) -> Floats:
+def on_plane(values, seen: TrackedObject) -> Floats:
     """Where a watch of one sighting has the landmark, at elevation 0: the same for all of one pose."""
     return seen.sightings[0].line.point(values)
 
 
-def vote(watches: list[Watch], point: Floats) -> float:
+def vote(watches: list[TrackedObject], point: Floats) -> float:
     values, (weight, none) = world(), log_weights(SAID, 7)
     gains = (weight + log_density(values, w, point) - none - of_nothing(w) for w in watches)
     return sum(max(gain, 0.0) for gain in gains)

@@ -10,11 +10,19 @@ from scipy.integrate import trapezoid
 from scipy.stats import multivariate_normal
 
 from sonar_graph.measurements import Floats
-from sonar_graph.slam import factors
-from sonar_graph.slam.hypotheses import RecogniserErrors, Statement
-from sonar_graph.slam.mixture import LEAST_TRUNCATION, REPEATED_LOSS, Choices, Errors, Kernel, Mixture, Watch
-from sonar_graph.slam.sighting import Sighting
-from sonar_graph.slam.sightlines import Sightline
+from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
+from sonar_graph.slam.landmarks.mixture import (
+    LEAST_TRUNCATION,
+    REPEATED_LOSS,
+    Choices,
+    Errors,
+    Kernel,
+    Mixture,
+    TrackedObject,
+)
+from sonar_graph.slam.landmarks.sighting import Sighting
+from sonar_graph.slam.models import factors
+from sonar_graph.slam.smoother.batch_solution import Sightline
 
 ERRORS = RecogniserErrors(0.05, 10.0, 2.0)
 LOG_U = -np.log(20.0)
@@ -45,11 +53,11 @@ def wrapped(e: Floats) -> Floats:
     return np.array([e[0], (e[1] + np.pi) % (2 * np.pi) - np.pi])
 
 
-def watch(values: gtsam.Values, point: Floats, frames: list[int], off: Floats, said: dict[int, float]) -> Watch:
+def watch(values: gtsam.Values, point: Floats, frames: list[int], off: Floats, said: dict[int, float]) -> TrackedObject:
     """Something seen in some frames, off by this, shape (n, 2), in standard deviations."""
     noise = np.linalg.cholesky(R)
-    return Watch(
-        Statement(said),
+    return TrackedObject(
+        IdentityPosterior(said),
         [
             Sighting(k, k, Sightline(X(k), MOUNTED, shown(values, k, point) + noise @ e), R, None)
             for k, e in zip(frames, off, strict=True)
@@ -57,7 +65,7 @@ def watch(values: gtsam.Values, point: Floats, frames: list[int], off: Floats, s
     )
 
 
-def log_density(values: gtsam.Values, seen: Watch, point: Floats) -> float:
+def log_density(values: gtsam.Values, seen: TrackedObject, point: Floats) -> float:
     """Of all sightings of a watch, were they of something at a point."""
     at = [(s.line.z, shown(values, s.stamp_ns, point)) for s in seen.sightings]
     return sum(float(multivariate_normal.logpdf(wrapped(z - h), np.zeros(2), R)) for z, h in at)
@@ -69,13 +77,13 @@ def log_weights(said: dict[int, float], i: int, count: int = 20) -> tuple[float,
     return np.log(0.95 * said.get(i, 0.0) + 0.025 / count), np.log(none)
 
 
-def of_nothing(seen: Watch) -> float:
+def of_nothing(seen: TrackedObject) -> float:
     """Log density of a watch of something whose place is not known."""
     peak = float(multivariate_normal.logpdf(np.zeros(2), np.zeros(2), R))
     return LOG_U + (len(seen.sightings) - 1) * max(LOG_U, peak - REPEATED_LOSS)
 
 
-def some_watches(values: gtsam.Values) -> list[Watch]:
+def some_watches(values: gtsam.Values) -> list[TrackedObject]:
     rng = np.random.default_rng(4)
     return [
         watch(values, PLACES[7], [0, 1, 2], rng.standard_normal((3, 2)), {7: 0.9}),
@@ -150,7 +158,7 @@ def test_a_new_detections_components_are_predictive_densities() -> None:
     S = A @ A.transpose(0, 2, 1) + 0.1 * np.eye(2)
     z, expected = np.array([3.0, 3.1]), np.array([[3.2, 3.0], [2.0, -3.1], [3.5, 2.0]])
     said = {4: 0.6, 5: 0.3}
-    found = MIXTURE.at_first(Statement(said), [7, 4, 9], z, expected, S)
+    found = MIXTURE.at_first(IdentityPosterior(said), [7, 4, 9], z, expected, S)
     for k, i in enumerate((7, 4, 9)):
         density = multivariate_normal.logpdf(wrapped(z - expected[k]), np.zeros(2), S[k])
         assert found[i] == pytest.approx(density + log_weights(said, i)[0])
@@ -193,7 +201,7 @@ def test_the_truncation_is_where_a_landmark_is_as_probable_as_none(count: int, s
 def test_the_truncation_is_never_nothing() -> None:
     """Noise so wide that no fit is as good as none."""
     wide = Sighting(0, 0, Sightline(X(0), MOUNTED, np.array([3.0, 0.0])), np.diag([100.0, 100.0]), None)
-    assert MIXTURE.truncations([Watch(Statement({7: 0.6}), [wide])]).tolist() == [LEAST_TRUNCATION]
+    assert MIXTURE.truncations([TrackedObject(IdentityPosterior({7: 0.6}), [wide])]).tolist() == [LEAST_TRUNCATION]
 
 
 @pytest.mark.parametrize("is_alone", [True, False])
@@ -217,12 +225,12 @@ def test_a_landmark_that_one_watch_has_put_where_it_is_has_no_place_for_it(is_al
 # Choices ------------------------------------------------------------------------------------------------------------
 
 
-def component(values: gtsam.Values, seen: Watch, i: int | None) -> float:
+def component(values: gtsam.Values, seen: TrackedObject, i: int | None) -> float:
     named, none = log_weights(seen.statement.probability, 0 if i is None else i)
     return none + of_nothing(seen) if i is None else named + log_density(values, seen, PLACES[i])
 
 
-def is_possible(watches: list[Watch], choices: Choices) -> bool:
+def is_possible(watches: list[TrackedObject], choices: Choices) -> bool:
     """No landmark is twice in a frame."""
     frames = [(i, k) for seen, i in zip(watches, choices, strict=True) if i is not None for k in seen.stamps_ns]
     return len(set(frames)) == len(frames)

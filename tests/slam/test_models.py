@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from sonar_graph.slam.models import (
+from sonar_graph.slam.models.sonar_model import (
     elevation_on_floor,
     locate,
     locate_jacobians,

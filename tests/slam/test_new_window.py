@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
 
-import sonar_graph.slam.new_window as new_window_module
 from sonar_graph.errors import EstimatorError
-from sonar_graph.slam.exchange import Exchange
-from sonar_graph.slam.new_window import joined, marginal, picked, without
-from sonar_graph.slam.smoother import Smoother
-from sonar_graph.slam.window import Window
+from sonar_graph.slam.smoother import fixed_lag as new_window_module
+from sonar_graph.slam.smoother.factor_store import GraphEdit
+from sonar_graph.slam.smoother.fixed_lag import SmootherWindow, joined, marginal, picked, without
+from sonar_graph.slam.smoother.incremental import Smoother
 
 PRIOR_M, TIGHT_M, WEAK_M = 3.0, 2e-8, 1e3
 
@@ -80,7 +79,7 @@ def begun_anew(tight_m: float) -> Smoother:
         handles += smoother.add([factor(k, sigma)])
         if k:
             smoother.update(float(k))
-    smoother.exchange(Exchange([handles[0]], [[factor(0, PRIOR_M)]], {}, []), 2.0)
+    smoother.exchange(GraphEdit([handles[0]], [[factor(0, PRIOR_M)]], {}, []), 2.0)
     return smoother
 
 
@@ -95,14 +94,14 @@ def test_a_window_begins_anew_after_what_only_qr_eliminates():
     assert begun_anew(TIGHT_M).covariance(X(2)) == pytest.approx(expected, rel=1e-6)
 
 
-def begun_after(outside: gtsam.NonlinearFactorGraph, tight_m: float, *, is_by_qr: bool) -> Window:
+def begun_after(outside: gtsam.NonlinearFactorGraph, tight_m: float, *, is_by_qr: bool) -> SmootherWindow:
     """A third and a fourth point, near each other; inside, the third is known to a kilometre."""
     _, solved = chain()
     solved.insert(L(3), np.zeros(3))
     inside = gtsam.NonlinearFactorGraph()
     inside.push_back(gtsam.PriorFactorPoint3(L(2), np.zeros(3), isotropic(3, WEAK_M)))
     inside.push_back(gtsam.BetweenFactorPoint3(L(2), L(3), np.zeros(3), isotropic(3, tight_m)))
-    window = Window(1e-6, 1e9)
+    window = SmootherWindow(1e-6, 1e9)
     window.is_by_qr = is_by_qr
     window.begin_after(outside, solved, inside, picked(solved, [L(2), L(3)]), {L(2): 0.0, L(3): 0.0})
     return window
@@ -117,7 +116,7 @@ def test_what_lies_outside_counts_once_where_cholesky_gives_up_on_the_window():
 
 
 def test_a_window_without_an_outside_begins_by_qr_where_cholesky_gives_up():
-    window, (graph, values) = Window(1e-6, 1e9), chain()
+    window, (graph, values) = SmootherWindow(1e-6, 1e9), chain()
     window.begin(graph, values, {L(k): 0.0 for k in range(3)})
     expected = (PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2) * np.eye(3)
     assert window.is_by_qr
@@ -125,7 +124,7 @@ def test_a_window_without_an_outside_begins_by_qr_where_cholesky_gives_up():
 
 
 def test_a_window_that_is_not_determined_does_not_begin():
-    window, (graph, values) = Window(1e-6, 1e9), chain()
+    window, (graph, values) = SmootherWindow(1e-6, 1e9), chain()
     graph.remove(0)
     with pytest.raises(RuntimeError):
         window.begin(graph, values, {L(k): 0.0 for k in range(3)})
@@ -138,7 +137,7 @@ def test_a_marginal_holds_where_it_was_made_though_the_window_is_linearised_else
     outside.push_back(gtsam.PriorFactorPoint3(L(2), np.zeros(3), isotropic(3, 1.0)))
     inside.push_back(gtsam.PriorFactorPoint3(L(2), np.full(3, 3.0), isotropic(3, 1.0)))
     values.insert(L(2), np.zeros(3))
-    window = Window(1e-6, 1e9)
+    window = SmootherWindow(1e-6, 1e9)
     window.is_by_qr = is_by_qr
     window.begin_after(outside, values, inside, values, {L(2): 0.0})
     window.settle()

@@ -10,9 +10,8 @@ from scipy.optimize import least_squares
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.placing import place, source
-from sonar_graph.slam.sighting import Sighting, SightingFactors
-from sonar_graph.slam.sightlines import Sightline
+from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors, place, source
+from sonar_graph.slam.smoother.batch_solution import Sightline
 
 APERTURE_RAD = 0.3
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.4, 0.0), np.array([0.3, 0.0, -0.1]))

@@ -7,14 +7,12 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-import sonar_graph.slam.sightings as sightings_module
 from sonar_graph.measurements import NO_TRACK, LandmarkDetections
 from sonar_graph.sequence import Sequence
-from sonar_graph.slam.association import DetectionJournal
+from sonar_graph.slam import frontend as sightings_module
 from sonar_graph.slam.isam2 import Isam2
-from sonar_graph.slam.repeated_tracks import best_of_tracks, of_no_landmark, once_a_track
-from sonar_graph.slam.tracks import NO_LANDMARK, UNDECIDED
-from sonar_graph.states import Outcome
+from sonar_graph.slam.landmarks.tracked import NO_LANDMARK, UNDECIDED, best_of_tracks, of_no_landmark, once_a_track
+from sonar_graph.states import DetectionJournal, Outcome
 
 from .late_identities import FLAT, IDS, SURE, assert_outcomes_account, run
 from .rail import STEP_S, rail

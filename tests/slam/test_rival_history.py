@@ -10,10 +10,10 @@ from gtsam.symbol_shorthand import L, X
 from scipy.stats import multivariate_normal
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
-from sonar_graph.slam import rival_history
-from sonar_graph.slam.mixture import Choices, Watch
-from sonar_graph.slam.rival_history import RivalHistory
-from sonar_graph.slam.sighting import SightingFactors
+from sonar_graph.slam.landmarks import mixture_history as rival_history
+from sonar_graph.slam.landmarks.mixture import Choices, TrackedObject
+from sonar_graph.slam.landmarks.mixture_history import RivalHistory
+from sonar_graph.slam.landmarks.sighting import SightingFactors
 
 from . import dive as dive_module
 from . import test_mixture as small
@@ -66,14 +66,14 @@ IDS = (7, 4, None)
 MAKER = SightingFactors(SonarCalibration(elevation_aperture_rad=0.3), lambda noise: noise)
 
 
-def named(k: int, place: int, said: int, values: gtsam.Values) -> Watch:
+def named(k: int, place: int, said: int, values: gtsam.Values) -> TrackedObject:
     """One sighting from pose k of landmark 7 or 4, surely named."""
     found = small.watch(values, small.PLACES[place], [k], np.zeros((1, 2)), {said: 0.9})
     found.sightings[0].floor = FloorPrior(z_m=float(small.PLACES[place][2]), sigma_m=0.05)
     return found
 
 
-def small_rival(watches: list[Watch]) -> tuple[RivalHistory, gtsam.Values]:
+def small_rival(watches: list[TrackedObject]) -> tuple[RivalHistory, gtsam.Values]:
     """Poses that are known to a centimetre, and no landmark yet."""
     rest, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k in range(6):

@@ -5,7 +5,7 @@ import pytest
 from gtsam.symbol_shorthand import L
 
 from sonar_graph.calibration import Start
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import Outcome
 
 from .dive import CALIBRATION, NS, T0_NS, Dive

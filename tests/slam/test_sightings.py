@@ -10,8 +10,8 @@ from scipy.stats import chi2
 
 from sonar_graph.calibration import DvlCalibration, Mounting, SonarCalibration, Start
 from sonar_graph.measurements import Floats
+from sonar_graph.slam.frontend import SightingPolicy
 from sonar_graph.slam.keyframes import KeyframePolicy
-from sonar_graph.slam.sightings import SightingPolicy
 from sonar_graph.states import Outcome
 
 from .dive import CALIBRATION, NS, POLICY, SONAR, T0_NS, Dive, frame, spherical

@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
 
-from sonar_graph.slam import factors
-from sonar_graph.slam.batch import solve
-from sonar_graph.slam.sightlines import Sightline, Sightlines
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.models import factors
+from sonar_graph.slam.smoother.batch_solution import Sightline, Sightlines, solve
+from sonar_graph.slam.smoother.incremental import Smoother
 
 BODY_T_SONAR = gtsam.Pose3(gtsam.Rot3.Ypr(0.3, 0.4, 0.0), np.array([0.8, 0.1, -0.2]))
 POSE = gtsam.Pose3(gtsam.Rot3.Ypr(2.0, 0.05, -0.03), np.array([3.0, -4.0, -1.0]))

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, L, X
 
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
-from sonar_graph.slam import factors
-from sonar_graph.slam.batch import solve
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
+from sonar_graph.slam.models import factors
+from sonar_graph.slam.smoother.batch_solution import solve
+from sonar_graph.slam.smoother.incremental import Smoother
 
 from .fed import FOREVER_S, NEVER_M, dense_covariance, in_the_basin, joint, on_the_rail, settled
 from .graphs import graph_of

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
 
-from sonar_graph.slam import factors
-from sonar_graph.slam.batch import solve
-from sonar_graph.slam.exchange import Exchange
-from sonar_graph.slam.smoother import Smoother
+from sonar_graph.slam.models import factors
+from sonar_graph.slam.smoother.batch_solution import solve
+from sonar_graph.slam.smoother.factor_store import GraphEdit
+from sonar_graph.slam.smoother.incremental import Smoother
 
 from .fed import FOREVER_S, SONAR, Fed, counted_solves, in_the_basin, joint, on_the_rail, plain
 from .graphs import graph_of
@@ -42,9 +42,9 @@ def test_the_history_is_solved_anew_when_as_much_came_as_went():
         gtsam.PriorFactorPoint3(L(3), np.array([x, 1.0, -1.0]), gtsam.noiseModel.Isotropic.Sigma(3, 1e-3))
         for x in (3.0, 3.5)
     )
-    (handles,) = fed.smoother.exchange(Exchange([], [[near]], {}, []), 7.0)
+    (handles,) = fed.smoother.exchange(GraphEdit([], [[near]], {}, []), 7.0)
     assert fed.smoother.solve_history()[0].atPoint3(L(3))[0] == pytest.approx(3.0, abs=0.01)
-    fed.smoother.exchange(Exchange(handles, [[far]], {}, []), 7.0)
+    fed.smoother.exchange(GraphEdit(handles, [[far]], {}, []), 7.0)
     assert fed.smoother.solve_history()[0].atPoint3(L(3))[0] == pytest.approx(3.5, abs=0.02)
 
 
@@ -60,7 +60,7 @@ def test_what_is_taken_out_was_never_there(monkeypatch, lag_s, oldest, solves):
     sizes = counted_solves(monkeypatch)
     removed = [handle for k, i in gone for handle in fed.handles_on(X(k), L(i))]
     assert len(removed) == 2 * len(gone)
-    fed.smoother.exchange(Exchange(removed, [], {}, []), (nodes - 1) * STEP_S)
+    fed.smoother.exchange(GraphEdit(removed, [], {}, []), (nodes - 1) * STEP_S)
     assert len(sizes) == solves
     assert_is_least_squares(fed, without(numbers, gone), nodes, [4, 7])
     assert_history_is_least_squares(fed, without(numbers, gone), nodes)
@@ -98,7 +98,7 @@ def test_after_wrong_factors_are_taken_out_the_estimate_is_that_of_the_others_at
     sizes = counted_solves(monkeypatch)
     if gives_up:
         fed.smoother._window.isam = Refusing(fed.smoother._window.isam)
-    fed.smoother.exchange(Exchange(wrong, [], {}, []), 14.0)
+    fed.smoother.exchange(GraphEdit(wrong, [], {}, []), 14.0)
     off_m.append(np.linalg.norm(fed.smoother.values.atPoint3(L(3)) - batch.atPoint3(L(3))))
     assert off_m[0] > 0.5
     assert off_m[1] < 1e-3 * off_m[0]
@@ -111,7 +111,7 @@ def test_what_has_just_been_put_in_is_taken_out_without_solving_the_history(monk
     z, R = np.array([30.0, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e6])
     handles = fed.smoother.add(factors.landmark_sighting(X(nodes - 1), L(4), gtsam.Pose3(), z, R, plain))
     sizes = counted_solves(monkeypatch)
-    fed.smoother.exchange(Exchange(handles, [], {}, []), (nodes - 1) * STEP_S)
+    fed.smoother.exchange(GraphEdit(handles, [], {}, []), (nodes - 1) * STEP_S)
     assert not sizes
     assert_is_least_squares(fed, numbers, nodes, [4, 7])
     assert_history_is_least_squares(fed, numbers, nodes)
@@ -122,7 +122,7 @@ def test_a_landmark_without_factors_leaves_the_graph_and_can_come_back():
     fed, (_, numbers) = on_the_rail(nodes, 2.6), rail(nodes)
     gone = [(k, 7) for k in range(1, nodes)]
     removed = [handle for k, i in gone for handle in fed.handles_on(X(k), L(i))]
-    fed.smoother.exchange(Exchange(removed, [], {}, [L(7)]), (nodes - 1) * STEP_S)
+    fed.smoother.exchange(GraphEdit(removed, [], {}, [L(7)]), (nodes - 1) * STEP_S)
     assert_is_least_squares(fed, without(numbers, gone), nodes, [4])
     assert_history_is_least_squares(fed, without(numbers, gone), nodes)
     assert not fed.smoother.values.exists(L(7))
@@ -130,7 +130,7 @@ def test_a_landmark_without_factors_leaves_the_graph_and_can_come_back():
     z, R = np.array([distance, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e6])
     again = factors.landmark_sighting(X(nodes - 1), L(7), gtsam.Pose3(), z, R, plain, 3e-4)
     point = fed.smoother.values.atPose3(X(nodes - 1)).translation() + distance * np.eye(3)[0]
-    fed.smoother.exchange(Exchange([], [again], {L(7): point}, []), (nodes - 1) * STEP_S)
+    fed.smoother.exchange(GraphEdit([], [again], {L(7): point}, []), (nodes - 1) * STEP_S)
     assert_is_least_squares(fed, without(numbers, gone[:-1]), nodes, [4, 7])
     assert_history_is_least_squares(fed, without(numbers, gone[:-1]), nodes)
 
@@ -142,11 +142,11 @@ def test_a_held_keyframe_takes_late_factors_without_solving_the_history(monkeypa
     late = 24.0
     z, R = np.array([late, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e6])
     new = factors.landmark_sighting(X(3), L(4), gtsam.Pose3(), z, R, plain)
-    (handles,) = fed.smoother.exchange(Exchange([], [new], {}, []), (nodes - 1) * STEP_S)
+    (handles,) = fed.smoother.exchange(GraphEdit([], [new], {}, []), (nodes - 1) * STEP_S)
     assert not sizes
     assert_is_least_squares(fed, Rail(numbers.displacements_m, [*numbers.ranges, (3, 4, late)]), nodes, [4, 7])
     assert_history_is_least_squares(fed, Rail(numbers.displacements_m, [*numbers.ranges, (3, 4, late)]), nodes)
-    fed.smoother.exchange(Exchange(handles, [], {}, []), (nodes - 1) * STEP_S)
+    fed.smoother.exchange(GraphEdit(handles, [], {}, []), (nodes - 1) * STEP_S)
     assert len(sizes) == 1  # that of the smoothed result above
     assert_is_least_squares(fed, numbers, nodes, [4, 7])
     assert_history_is_least_squares(fed, numbers, nodes)
@@ -184,7 +184,7 @@ def test_a_hold_that_is_over_ends_at_an_exchange_only_where_what_left_can_be_tak
     )
     fed.add(waiting)
     fed.smoother.hold({})
-    fed.smoother.exchange(Exchange(removed, [late], {}, []), end_s + later_s)
+    fed.smoother.exchange(GraphEdit(removed, [late], {}, []), end_s + later_s)
     assert fed.smoother.in_window([X(3)]) == ([X(3)] if is_bounded else [])
     assert_is_least_squares(fed, Rail(numbers.displacements_m, ranges), nodes, [4, 7])
     fed.smoother.update(end_s + later_s)

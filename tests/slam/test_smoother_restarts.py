@@ -8,10 +8,10 @@ import pytest
 from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.calibration import Calibration, Start
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
-from sonar_graph.slam import factors
-from sonar_graph.slam.batch import solve
-from sonar_graph.slam.smoother import FIRST_RESTART, Smoother
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
+from sonar_graph.slam.models import factors
+from sonar_graph.slam.smoother.batch_solution import solve
+from sonar_graph.slam.smoother.incremental import FIRST_RESTART, Smoother
 
 from .fed import (
     FOREVER_S,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sonar_graph.slam.sound_rows import positive_definite
+from sonar_graph.slam.keyframes import positive_definite
 
 
 @pytest.mark.parametrize("k", [2, 3])

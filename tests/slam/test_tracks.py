@@ -6,9 +6,9 @@ import pytest
 from gtsam.symbol_shorthand import X
 
 from sonar_graph.measurements import LandmarkDetections
-from sonar_graph.slam.sighting import Sighting
-from sonar_graph.slam.sightlines import Sightline
-from sonar_graph.slam.tracks import NO_LANDMARK, NS_PER_S, UNDECIDED, Tracks, decide
+from sonar_graph.slam.landmarks.sighting import Sighting
+from sonar_graph.slam.landmarks.tracked import NO_LANDMARK, NS_PER_S, UNDECIDED, ObjectTracks, decide
+from sonar_graph.slam.smoother.batch_solution import Sightline
 
 LEAST = 0.75
 WAIT_S = 2.0
@@ -51,7 +51,7 @@ def sighting(stamp_ns: int) -> Sighting:
 def test_a_track_is_over_and_its_sightings_forgotten_after_the_longest_wait_and_not_at_it(
     late_ns: int, is_over: bool
 ) -> None:
-    tracks, seen_ns = Tracks(WAIT_S), 5 * NS_PER_S
+    tracks, seen_ns = ObjectTracks(WAIT_S), 5 * NS_PER_S
     before, waiting = sighting(seen_ns - 2), sighting(seen_ns)
     tracks.seen(3, seen_ns).waiting += [before, waiting]
     tracks.seen(8, seen_ns + NS_PER_S)

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.dvl_preintegration import PreintegratedMotion
-from sonar_graph.slam.joint_covariance import JointCovariance
-from sonar_graph.slam.view import View, weigh
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
+from sonar_graph.slam.models.prediction import PredictedView, weigh
+from sonar_graph.slam.smoother.batch_solution import JointCovariance
 
 BODY_T_SONAR = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.4, -0.3), np.array([0.4, 0.1, -0.2]))
 KEYFRAMES = {
@@ -47,11 +47,11 @@ def ahead(keyframe: gtsam.Pose3, motion: PreintegratedMotion, azimuth_rad: float
     return keyframe.compose(motion.i_T_j).compose(BODY_T_SONAR).transformFrom(q)
 
 
-def made(keyframe, motion, joint, bias: bool = True) -> View:
-    return View(X(2), B(0) if bias else None, keyframe, motion, BODY_T_SONAR, joint)
+def made(keyframe, motion, joint, bias: bool = True) -> PredictedView:
+    return PredictedView(X(2), B(0) if bias else None, keyframe, motion, BODY_T_SONAR, joint)
 
 
-def expected_of(view: View, landmarks: dict[int, Floats], *ids: int) -> tuple[Floats, Floats]:
+def expected_of(view: PredictedView, landmarks: dict[int, Floats], *ids: int) -> tuple[Floats, Floats]:
     return view.expect([L(i) for i in ids], np.array([landmarks[i] for i in ids]))
 
 

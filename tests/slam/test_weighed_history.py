@@ -6,12 +6,11 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
-from sonar_graph.slam.batch import solve
-from sonar_graph.slam.hypotheses import Statement
-from sonar_graph.slam.mixture import Watch
-from sonar_graph.slam.sighting import Sighting, SightingFactors
-from sonar_graph.slam.sightlines import Sightline
-from sonar_graph.slam.weighed_history import LEAST_WEIGHT, WeighedHistory, earliest
+from sonar_graph.slam.landmarks.association import IdentityPosterior
+from sonar_graph.slam.landmarks.mixture import TrackedObject
+from sonar_graph.slam.landmarks.mixture_history import LEAST_WEIGHT, WeighedHistory, earliest
+from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors
+from sonar_graph.slam.smoother.batch_solution import Sightline, solve
 
 MAKER = SightingFactors(SonarCalibration(elevation_aperture_rad=0.3), lambda noise: noise)
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.4, 0.0), np.array([0.3, 0.0, -0.1]))
@@ -37,7 +36,7 @@ def history(noise: str, floor: str):
             Sighting(100 - 10 * row + k, row, Sightline(X(k), MOUNTED, z[k]), NOISE[noise], FLOORS[floor])
             for k in range(3)
         ]
-        watches.append(Watch(Statement({}), sightings))
+        watches.append(TrackedObject(IdentityPosterior({}), sightings))
     return rest, watches, values
 
 
@@ -66,7 +65,7 @@ def test_a_watch_of_no_weight_moves_a_landmark_by_micrometres_and_holds_its_own(
     watches = []
     for row, (landmark_id, range_m) in enumerate([(7, 3.0), (7, 4.0), (9, 5.0)]):
         line = Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.0]))
-        watches.append(Watch(Statement({}), [Sighting(row, row, line, NOISE["independent"], None)]))
+        watches.append(TrackedObject(IdentityPosterior({}), [Sighting(row, row, line, NOISE["independent"], None)]))
         if not values.exists(L(landmark_id)):
             values.insert(L(landmark_id), np.array([range_m, 0.0, 0.0]))
     found = solve(WeighedHistory(rest, watches, [7, 7, 9], MAKER).graph(np.array([1.0, 0.0, 0.0])), values)
@@ -76,7 +75,10 @@ def test_a_watch_of_no_weight_moves_a_landmark_by_micrometres_and_holds_its_own(
 
 def test_of_sightings_of_one_frame_the_earliest_is_the_first_in_the_journal() -> None:
     line = Sightline(X(0), MOUNTED, np.array([3.0, 0.1]))
-    watches = [Watch(Statement({}), [Sighting(100, row, line, NOISE["independent"], None)]) for row in (5, 3, 4)]
+    watches = [
+        TrackedObject(IdentityPosterior({}), [Sighting(100, row, line, NOISE["independent"], None)])
+        for row in (5, 3, 4)
+    ]
     assert earliest(watches, [7, 7, 7])[7].row == 3
 
 

@@ -6,12 +6,12 @@ import pytest
 from gtsam.symbol_shorthand import L
 
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.window import Window
+from sonar_graph.slam.smoother.fixed_lag import SmootherWindow
 
 
-def pulled(shift: list[float], threshold: float) -> Window:
+def pulled(shift: list[float], threshold: float) -> SmootherWindow:
     """Landmark 1 stays, landmark 2 is pulled after it was linearised."""
-    window, values, graph = Window(threshold, 1e9), gtsam.Values(), gtsam.NonlinearFactorGraph()
+    window, values, graph = SmootherWindow(threshold, 1e9), gtsam.Values(), gtsam.NonlinearFactorGraph()
     noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0)
     for i in (1, 2):
         values.insert(L(i), np.zeros(3))
@@ -21,7 +21,7 @@ def pulled(shift: list[float], threshold: float) -> Window:
     return window
 
 
-def pull(window: Window, point: Floats) -> None:
+def pull(window: SmootherWindow, point: Floats) -> None:
     more = gtsam.NonlinearFactorGraph()
     more.push_back(gtsam.PriorFactorPoint3(L(2), point, gtsam.noiseModel.Isotropic.Sigma(3, 1.0)))
     window.update(more, gtsam.Values(), {}, [])
@@ -47,7 +47,7 @@ def test_every_update_linearises_anew_what_has_moved() -> None:
 
 
 def test_factors_are_found_from_the_first_place_on_until_they_are_taken_out() -> None:
-    window, values, graph = Window(1e-3, 1e9), gtsam.Values(), gtsam.NonlinearFactorGraph()
+    window, values, graph = SmootherWindow(1e-3, 1e9), gtsam.Values(), gtsam.NonlinearFactorGraph()
     noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0)
     values.insert(L(1), np.zeros(3))
     factors = [gtsam.PriorFactorPoint3(L(1), np.full(3, x), noise) for x in (1.0, 2.0, 3.0)]

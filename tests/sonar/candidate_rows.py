@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sonar_graph.measurements import Floats
-from sonar_graph.sonar.candidates import Candidates, Verdict
+from sonar_graph.sonar.regions import Candidates, CandidateVerdict
 
 RANGES_M = 1.26 + (np.arange(512) + 0.5) * 1.25 / 512
 AZIMUTHS_RAD = np.radians(np.linspace(14.25, -14.25, 96))
@@ -16,7 +16,7 @@ def candidates_at(range_m: list[float], azimuth_rad: list[float], rejected: tupl
     """Candidates with these positions and an elevation known to 0.07 rad."""
     n = len(range_m)
     verdicts = np.zeros(n, dtype=np.int64)
-    verdicts[list(rejected)] = Verdict.TOO_SMALL
+    verdicts[list(rejected)] = CandidateVerdict.TOO_SMALL
     zero = np.zeros(n)
     return Candidates(
         verdicts=verdicts,

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from sonar_graph.landmark_designs import LandmarkDesign
+from sonar_graph.devices.landmark_designs import LandmarkDesign
 
 RANGES_M = 1.26 + 1.25 / 512 * (np.arange(512) + 0.5)
 AZIMUTHS_RAD = np.radians(np.linspace(-14.25, 14.25, 96))

@@ -12,14 +12,12 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import SonarFrames
-from sonar_graph.simulation.image_options import ImageOptions
-from sonar_graph.simulation.imaging_sonar import DIDSON
-from sonar_graph.simulation.seabed import place_landmark
-from sonar_graph.simulation.sonar_image import FrameSimulator
-from sonar_graph.sonar.actag_designs import tag_design
-from sonar_graph.sonar.actag_recogniser import AcTagRecogniser, AcTagSettings, evenly_sampled
+from sonar_graph.simulation.sonar_image.frames import FrameSimulator
+from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON, ImageOptions
+from sonar_graph.simulation.sonar_image.scene import place_landmark
+from sonar_graph.sonar.actag import AcTagRecogniser, AcTagSettings, evenly_sampled, tag_design
 from sonar_graph.sonar.recogniser import REPORTED
-from sonar_graph.sonar.tracks import SonarStep
+from sonar_graph.sonar.track_filter import SonarStep
 
 FAMILY = "AcTag24h10"
 RANGES_M, AZIMUTHS_RAD = DIDSON.ranges_m(), DIDSON.azimuths_rad()

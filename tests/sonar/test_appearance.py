@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
-from sonar_graph.sonar.appearance import Appearance, AppearanceParams, Fit
-from sonar_graph.sonar.floor_patch import Patch, PolarGrid
+from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.sonar.appearance import Appearance, AppearanceParams, DesignFit
 from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar.templates import Patch, PolarGrid
 
 from .polar_images import AZIMUTHS_RAD, HEIGHT_M, RANGES_M, image_db, level_R_sonar
 
@@ -18,7 +18,7 @@ def appearance() -> Appearance:
     return Appearance(DEFAULT_DESIGNS)
 
 
-def _fit(appearance: Appearance, image: np.ndarray, rotation: np.ndarray, near_m: tuple[float, float]) -> Fit:
+def _fit(appearance: Appearance, image: np.ndarray, rotation: np.ndarray, near_m: tuple[float, float]) -> DesignFit:
     view = FloorView(rotation, HEIGHT_M)
     patch = GRID.patch(image, view, np.array(near_m), appearance.patch_side, appearance.params.cell_m)
     return appearance.fit(patch)

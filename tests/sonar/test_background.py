@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
-from sonar_graph.sonar.background import MEDIAN_TO_SIGMA, background_of
+from sonar_graph.sonar.regions import MEDIAN_TO_SIGMA, background_of
 
 BEAMS, BINS = 3, 5
 WINDOW = 9

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonar_graph.sonar.association import Association
 from sonar_graph.sonar.beliefs import Beliefs, IdentityParams
 from sonar_graph.sonar.confusion import Confusion
+from sonar_graph.sonar.track_filter import Association
 
 CONFUSION = Confusion(
     ids=(1, 2),

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter
 
+from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.errors import CalibrationError
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
-from sonar_graph.sonar.candidate_design import _bright_parts, check_candidates
-from sonar_graph.sonar.detection import DetectionParams, select_candidates
+from sonar_graph.sonar.cfar import DetectionParams, _bright_parts, check_candidates, select_candidates
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.recogniser import Recogniser, RecogniserParams
 

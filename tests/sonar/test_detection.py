@@ -5,8 +5,7 @@ import pytest
 from scipy import stats
 
 from sonar_graph.errors import MeasurementError
-from sonar_graph.sonar.candidates import Verdict
-from sonar_graph.sonar.detection import (
+from sonar_graph.sonar.cfar import (
     DetectionParams,
     _cell_m,
     _odd,
@@ -15,7 +14,7 @@ from sonar_graph.sonar.detection import (
     select_candidates,
 )
 from sonar_graph.sonar.geometry import FloorView
-from sonar_graph.sonar.regions import measure_regions
+from sonar_graph.sonar.regions import CandidateVerdict, measure_regions
 
 from .candidate_rows import AZIMUTHS_RAD, RANGES_M, speckle_db
 
@@ -183,9 +182,9 @@ def test_the_area_of_all_of_a_tilted_and_rolled_image_is_that_of_its_outline():
 @pytest.mark.parametrize(
     ("settings", "verdict"),
     [
-        ({"min_area_m2": 0.2, "max_area_m2": 1.0}, Verdict.TOO_SMALL),
-        ({"max_area_m2": 0.05}, Verdict.TOO_LARGE),
-        ({"max_extent_m": 0.2}, Verdict.TOO_LONG),
+        ({"min_area_m2": 0.2, "max_area_m2": 1.0}, CandidateVerdict.TOO_SMALL),
+        ({"max_area_m2": 0.05}, CandidateVerdict.TOO_LARGE),
+        ({"max_extent_m": 0.2}, CandidateVerdict.TOO_LONG),
     ],
 )
 def test_each_gate_is_the_reason_that_it_gives(settings, verdict):
@@ -199,7 +198,7 @@ def test_each_gate_is_the_reason_that_it_gives(settings, verdict):
 def test_a_plate_cut_by_the_edge_is_rejected_unless_wanted(x, y):
     image = frame_with_plate(x, y)
     cut = select(image)
-    assert Verdict.AT_EDGE in cut.verdicts[cut.area_m2 > 0.01]
+    assert CandidateVerdict.AT_EDGE in cut.verdicts[cut.area_m2 > 0.01]
     assert len(cut.accepted) == 0
     assert len(select(image, keep_at_edge=True).accepted) == 1
 
@@ -212,7 +211,7 @@ def test_beyond_the_limit_the_strongest_are_kept():
     by_azimuth = both.accepted[np.argsort(both.azimuth_rad[both.accepted])]
     assert np.diff(both.area_m2[by_azimuth])[0] > 0  # the weaker one is larger
     assert both.azimuth_rad[row] < 0
-    assert np.sum(select(image, max_candidates=1).verdicts == Verdict.BEYOND_LIMIT) == 1
+    assert np.sum(select(image, max_candidates=1).verdicts == CandidateVerdict.BEYOND_LIMIT) == 1
 
 
 def test_what_lies_nearer_than_the_floor_is_off_it():
@@ -221,7 +220,7 @@ def test_what_lies_nearer_than_the_floor_is_off_it():
     image[40:56, 20:60] += 15
     found = select(image.astype(np.float32), view=view)
     near = np.flatnonzero(found.boxes[:, 3] * found.boxes[:, 2] > 200)
-    assert found.verdicts[near].tolist() == [Verdict.OFF_FLOOR]
+    assert found.verdicts[near].tolist() == [CandidateVerdict.OFF_FLOOR]
 
 
 def test_a_region_covers_the_pixels_of_its_label():

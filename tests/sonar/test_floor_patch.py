@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sonar_graph.sonar.floor_patch import PolarGrid
 from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar.templates import PolarGrid
 
 from .polar_images import AZIMUTHS_RAD, HEIGHT_M, RANGES_M, floor_points, level_R_sonar
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from sonar_graph.errors import CalibrationError
 from sonar_graph.measurements import SonarFrames
-from sonar_graph.simulation.imaging_sonar import DIDSON
+from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
 from sonar_graph.sonar.geometry import (
     Fan,
     FloorView,

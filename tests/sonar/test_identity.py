@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.sonar.identity import Rule, jeffrey, news_of_motion, predict, update, virtual_evidence
+from sonar_graph.sonar.bayes import Rule, jeffrey, news_of_motion, predict, update, virtual_evidence
 
 RULES: list[Rule] = ["jeffrey", "virtual-evidence"]
 

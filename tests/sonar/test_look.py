@@ -3,13 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS
+from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
 from sonar_graph.measurements import SonarFrames
-from sonar_graph.sonar.appearance import Appearance, Fit
-from sonar_graph.sonar.confusion import Confusion, confusion_for
+from sonar_graph.sonar.appearance import CENTROID_SIGMA_M, Appearance, CandidateFit, DesignFit, ObjectSighting
+from sonar_graph.sonar.confusion import Confusion, confusion_for, soft_scores
 from sonar_graph.sonar.geometry import FloorView
-from sonar_graph.sonar.look import CENTROID_SIGMA_M, Look, Sighting
-from sonar_graph.sonar.scores import soft_scores
 
 from .candidate_rows import candidates_at
 from .polar_images import AZIMUTHS_RAD, HEIGHT_M, RANGES_M, image_db, level_R_sonar
@@ -37,10 +35,10 @@ def look_at(
     near_m: tuple[float, float],
     model: Confusion = MODEL,
     view: FloorView | None = VIEW,
-) -> Sighting:
+) -> ObjectSighting:
     """A look at a candidate near a point of the floor."""
     r, a = VIEW.range_azimuth(np.array(near_m))
-    look = Look(appearance, model, APERTURE_RAD)
+    look = CandidateFit(appearance, model, APERTURE_RAD)
     (sighting,) = look.at(image, frame(image), view, candidates_at([r], [a]), np.array([0]))
     assert sighting is not None
     return sighting
@@ -85,12 +83,12 @@ def test_what_is_hardly_in_the_image_is_compared_with_nothing(appearance, triang
     found = look_at(appearance, triangle, (1.7, 0.75))
     assert found.fit is None
     assert (found.range_m, found.azimuth_rad, found.is_fitted) == (r, a, False)
-    look = Look(appearance, MODEL, APERTURE_RAD)
+    look = CandidateFit(appearance, MODEL, APERTURE_RAD)
     assert look.scores([found]).tolist() == [[0.0] * 5]
 
 
 def test_what_no_ray_finds_on_the_floor_is_compared_with_nothing(appearance, triangle):
-    look = Look(appearance, MODEL, APERTURE_RAD)
+    look = CandidateFit(appearance, MODEL, APERTURE_RAD)
     (found,) = look.at(triangle, frame(triangle), FloorView(ROTATION, 2.0), candidates_at([1.3], [0.0]), np.array([0]))
     assert found is not None
     assert found.fit is None
@@ -98,7 +96,7 @@ def test_what_no_ray_finds_on_the_floor_is_compared_with_nothing(appearance, tri
 
 def test_a_track_that_was_not_seen_has_no_sighting_and_rows_say_which_candidate(appearance, triangle):
     r, a = VIEW.range_azimuth(np.array([1.7, 0.05]))
-    look = Look(appearance, MODEL, APERTURE_RAD)
+    look = CandidateFit(appearance, MODEL, APERTURE_RAD)
     candidates = candidates_at([2.05, r], [-0.1, a])
     found = look.at(triangle, frame(triangle), VIEW, candidates, np.array([-1, 1, 0]))
     assert found[0] is None
@@ -114,16 +112,16 @@ def test_a_track_that_was_not_seen_has_no_sighting_and_rows_say_which_candidate(
 
 
 def test_scores_are_those_of_the_model(appearance):
-    fit = Fit(np.array([0.5, 0.8, 0.2, -1.0]), 0.9, 1, 0.0, np.zeros(2))
-    look = Look(appearance, MODEL, APERTURE_RAD)
-    found = look.scores([Sighting(fit, 2.0, 0.0, np.eye(2)), None])
+    fit = DesignFit(np.array([0.5, 0.8, 0.2, -1.0]), 0.9, 1, 0.0, np.zeros(2))
+    look = CandidateFit(appearance, MODEL, APERTURE_RAD)
+    found = look.scores([ObjectSighting(fit, 2.0, 0.0, np.eye(2)), None])
     expected = soft_scores(fit.correlation[None], np.array([0.9]), MODEL.sharpness, MODEL.threshold)[0]
     np.testing.assert_allclose(found, [expected, np.zeros(5)])
 
 
 def test_other_beams_and_bins_are_looked_up_anew(appearance, triangle):
     """A log may change its window on the way."""
-    look = Look(appearance, MODEL, APERTURE_RAD)
+    look = CandidateFit(appearance, MODEL, APERTURE_RAD)
     r, a = VIEW.range_azimuth(np.array([1.7, 0.05]))
     first = look.at(triangle, frame(triangle), VIEW, candidates_at([r], [a]), np.array([0]))[0]
     turned = look.at(
@@ -150,7 +148,9 @@ def test_the_aperture_hides_what_lies_outside_of_it(appearance, triangle):
     """The same landmark in a fan of a third of the opening: only a strip of it counts as seen."""
     r, a = VIEW.range_azimuth(np.array([1.95, 0.05]))
     wide, narrow = (
-        Look(appearance, MODEL, aperture).at(triangle, frame(triangle), VIEW, candidates_at([r], [a]), np.array([0]))[0]
+        CandidateFit(appearance, MODEL, aperture).at(
+            triangle, frame(triangle), VIEW, candidates_at([r], [a]), np.array([0])
+        )[0]
         for aperture in (0.244, 0.05)
     )
     assert wide is not None
@@ -167,7 +167,7 @@ def test_without_a_floor_the_patch_lies_in_the_plane_of_the_image(appearance):
     image = (level + 10 * np.log10(np.random.default_rng(3).exponential(size=level.shape))).astype(np.float32)
     candidates = candidates_at([float(np.hypot(1.9, 0.1))], [float(np.arctan2(0.1, 1.9))])
     flat, tilted = (
-        Look(appearance, MODEL, APERTURE_RAD).at(image, frame(image), view, candidates, np.array([0]))[0]
+        CandidateFit(appearance, MODEL, APERTURE_RAD).at(image, frame(image), view, candidates, np.array([0]))[0]
         for view in (None, VIEW)
     )
     assert flat is not None

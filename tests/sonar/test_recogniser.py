@@ -10,15 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
+from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
 from sonar_graph.errors import CalibrationError, MeasurementError
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS
 from sonar_graph.measurements import SonarFrames
 from sonar_graph.sonar.beliefs import IdentityParams
+from sonar_graph.sonar.cfar import DetectionParams
 from sonar_graph.sonar.confusion import confusion_for
-from sonar_graph.sonar.detection import DetectionParams
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.recogniser import REPORTED, Recogniser, RecogniserParams, each_once
-from sonar_graph.sonar.tracks import SonarStep
+from sonar_graph.sonar.track_filter import SonarStep
 
 from .polar_images import AZIMUTHS_RAD, HEIGHT_M, RANGES_M, image_db, level_R_sonar
 
@@ -114,7 +114,7 @@ def test_what_is_hardly_in_view_is_not_reported_and_the_reason_is_said():
 
 
 def test_nothing_that_stands_out_disappears_without_a_row(monkeypatch: pytest.MonkeyPatch):
-    import sonar_graph.sonar.recogniser as module
+    from sonar_graph.sonar import recogniser as module
 
     seen = []
     select = module.select_candidates

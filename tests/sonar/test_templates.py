@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from sonar_graph.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.sonar.templates import Templates, material_radius_m
 
 

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from sonar_graph.errors import MeasurementError
-from sonar_graph.sonar.tracking import SonarStep, Tracker, TrackingParams
-from sonar_graph.sonar.tracks import Expected, Tracks, corrected
+from sonar_graph.sonar.track_filter import Expected, SonarStep, TrackStates, corrected
+from sonar_graph.sonar.tracker import Tracker, TrackingParams
 
 from .candidate_rows import WINDOW, candidates_at
 
@@ -136,7 +136,7 @@ def test_a_new_track_is_as_uncertain_as_its_candidate_and_its_elevation():
 
 def test_a_covariance_turns_with_the_sonar_and_drift_adds_to_it():
     P = np.diag([1e-3, 2e-3, 4e-3])
-    tracks = Tracks(np.array([0]), np.array([[2.0, 0.0, 0.0]]), P[None], np.array([0.5]), np.array([1]))
+    tracks = TrackStates(np.array([0]), np.array([[2.0, 0.0, 0.0]]), P[None], np.array([0.5]), np.array([1]))
     quarter = SonarStep(gtsam.Pose3(gtsam.Rot3.Rz(np.pi / 2), np.zeros(3)), np.zeros((6, 6)))
     found = tracks.moved(quarter, 0.1)
     assert np.allclose(found.position_cov[0], np.diag([2e-3, 1e-3, 4e-3]) + 0.01 * np.eye(3))
@@ -209,7 +209,7 @@ def test_covariance_of_a_moved_track_is_that_of_samples():
     rng = np.random.default_rng(9)
     step = SonarStep(moved_by(0.3, 0.1, 0.4).previous_T_sonar, CORRELATED)
     q, P = np.array([2.0, 0.3, -0.2]), np.diag([1e-3, 2e-3, 4e-3])
-    tracks = Tracks(np.array([0]), q[None], P[None], np.array([0.5]), np.array([1]))
+    tracks = TrackStates(np.array([0]), q[None], P[None], np.array([0.5]), np.array([1]))
     found = tracks.moved(step, 0.0)
     points = rng.multivariate_normal(q, P, 8_000)
     noise = rng.multivariate_normal(np.zeros(6), step.covariance, 8_000)
@@ -221,7 +221,7 @@ def test_covariance_of_a_moved_track_is_that_of_samples():
 
 def test_a_track_at_rest_grows_less_certain_by_its_drift():
     P = np.diag([1e-2, 3e-2, 2e-2])
-    tracks = Tracks(np.array([0]), np.array([[1.9, 0.2, -0.3]]), P[None], np.array([0.5]), np.array([1]))
+    tracks = TrackStates(np.array([0]), np.array([[1.9, 0.2, -0.3]]), P[None], np.array([0.5]), np.array([1]))
     after = tracks.moved(STILL, 0.02)
     assert after.position_m == pytest.approx(tracks.position_m)
     assert after.position_cov[0] == pytest.approx(P + 4e-4 * np.eye(3))
@@ -230,7 +230,7 @@ def test_a_track_at_rest_grows_less_certain_by_its_drift():
 def test_a_density_ends_at_the_gate():
     """Inside it is the normal density, just outside 0."""
     P = np.ascontiguousarray(CORRELATED[:3, :3])[None]
-    tracks = Tracks(np.array([0]), np.array([[1.9, 0.2, -0.3]]), P, np.ones(1), np.ones(1, int))
+    tracks = TrackStates(np.array([0]), np.array([[1.9, 0.2, -0.3]]), P, np.ones(1), np.ones(1, int))
     expected = Expected.of(tracks, np.diag([9e-4, 2e-4]))
     along = np.linalg.cholesky(expected.S[0])[:, 0]
     z = expected.z + np.array([2.99, 3.01])[:, None] * along
@@ -242,7 +242,7 @@ def test_a_density_ends_at_the_gate():
 def test_a_correction_is_that_of_the_information_form():
     """P^-1 grows by H^T R^-1 H; H by differences of range and azimuth."""
     q, P, R = np.array([1.9, 0.2, -0.3]), np.diag([1e-2, 3e-2, 2e-2]), np.diag([9e-4, 2e-4])
-    tracks = Tracks(np.array([0]), q[None], P[None], np.array([0.5]), np.array([1]))
+    tracks = TrackStates(np.array([0]), q[None], P[None], np.array([0.5]), np.array([1]))
     expected = Expected.of(tracks, R)
 
     def seen(point):
@@ -259,7 +259,7 @@ def test_a_correction_is_that_of_the_information_form():
 
 def test_innovations_wrap_behind_the_sonar():
     R = np.diag([1e-4, 1e-6])
-    tracks = Tracks(
+    tracks = TrackStates(
         np.array([0]), np.array([[-2.0, 1e-3, 0.0]]), 1e-4 * np.eye(3)[None], np.array([0.5]), np.array([1])
     )
     expected = Expected.of(tracks, R)

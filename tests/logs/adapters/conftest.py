@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from mcap_ros2.writer import Writer
 
-from sonar_graph.logs.message_definitions import definition
+from sonar_graph.logs.cdr.definitions import definition
 
 T0_NS = 1_700_000_000_000_000_000
 STEP_NS = 10**8
@@ -221,7 +221,7 @@ def foreign(tmp_path: Path) -> Foreign:
 @pytest.fixture
 def read(foreign: Foreign) -> Callable[..., Any]:
     """Reads a log of these entries, with a configuration as text, as a sequence."""
-    from sonar_graph.logs.adapters.config import read_log_config
+    from sonar_graph.logs.adapters.log_config import read_log_config
     from sonar_graph.logs.reading import read_sequence
 
     def read_log(*entries: Entry, toml: str = "", **settings: Any) -> Any:

@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.logs.adapters.config import LogConfig, read_log_config
-from sonar_graph.logs.adapters.shipped import SHIPPED
-from sonar_graph.logs.adapters.toml_text import table_text, toml_value
+from sonar_graph.logs.adapters.drivers import SHIPPED
+from sonar_graph.logs.adapters.log_config import LogConfig, read_log_config, table_text, toml_value
 from sonar_graph.logs.inspection import inspect_log
 
 MISTAKES = {

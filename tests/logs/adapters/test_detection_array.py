@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.adapters.detection_array import range_and_azimuth
+from sonar_graph.logs.adapters.landmark_messages import range_and_azimuth
 
 KIND = "vision_msgs/msg/Detection3DArray"
 Results = list[tuple[str, float]]

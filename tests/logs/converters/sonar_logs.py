@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.logs.container import Keep, Recording, scan
-from sonar_graph.logs.converters.aris import convert_aris
-from sonar_graph.logs.converters.didson import convert_didson
-from sonar_graph.logs.converters.oculus import convert_oculus
-from sonar_graph.logs.converters.sonar_conversion import SonarConversion
-from sonar_graph.logs.log_record import read_calibration, read_notes
-from sonar_graph.logs.sonar_reading import read_sonar_frames
+from sonar_graph.logs.convert.aris import convert_aris
+from sonar_graph.logs.convert.didson import convert_didson
+from sonar_graph.logs.convert.oculus import convert_oculus
+from sonar_graph.logs.convert.sonar_file import SonarConversion
+from sonar_graph.logs.mcap.reader import Recording, scan
+from sonar_graph.logs.mcap.topic import Keep
+from sonar_graph.logs.sonar_frames import read_sonar_frames
+from sonar_graph.logs.vehicle_setup import read_calibration, read_notes
 from sonar_graph.measurements import SonarFrames
 
 CONVERTERS: dict[str, Callable[..., SonarConversion]] = {

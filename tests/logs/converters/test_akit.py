@@ -4,10 +4,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from sonar_graph.calibration import Mounting
-from sonar_graph.logs.converters.akit import enu_R_flu, read_akit
-from sonar_graph.navigation.dvl_preintegration import Preintegrator
-from sonar_graph.navigation.node_motion import motion_between_nodes
-from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.logs.convert.akit import enu_R_flu, read_akit
+from sonar_graph.navigation.odometry import Odometry, motion_between_nodes
+from sonar_graph.navigation.preintegration.motion import Preintegrator
 
 IMU_HEADER = "Time [s],ACC X [m/s^2],ACC Y [m/s^2],ACC Z [m/s^2],GYRO X [rad/s],GYRO Y [rad/s],GYRO Z [rad/s]"
 DVL_HEADER = "Time [s],DVL X [m/s],DVL Y [m/s],DVL Z [m/s]"

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sonar_graph.logs.converters.dlr import read_dlr
+from sonar_graph.logs.convert.dlr import read_dlr
 
 COV = "1e-5 2e-6 2e-5 3e-6 4e-6 1e-4"
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.logs.converters.geodesy import earth_centred, east_north_up, enu_R_earth
+from sonar_graph.logs.convert.akit import earth_centred, east_north_up, enu_R_earth
 
 
 def test_earth_centred_reproduces_known_points():

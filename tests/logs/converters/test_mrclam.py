@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sonar_graph.logs.converters.mrclam import read_mrclam
+from sonar_graph.logs.convert.mrclam import read_mrclam
 
 T0 = 1248444187
 NS = 10**9

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from sonar_graph.logs.converters.planar import (
+from sonar_graph.logs.convert.planar import (
     planar_trajectory,
     range_azimuth,
     stepped_calibration,

@@ -15,8 +15,8 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.adapters.config import LogConfig
-from sonar_graph.logs.converters.rosbag import convert_rosbag
+from sonar_graph.logs.adapters.log_config import LogConfig
+from sonar_graph.logs.convert.rosbag import convert_rosbag
 from sonar_graph.logs.reading import read_sequence
 
 T0_NS = 1_447_550_804_242_631_687

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sonar_graph.cli import main
+from sonar_graph.cli.main import main
 from sonar_graph.errors import DatasetError, LogError
-from sonar_graph.logs.converters.didson import convert_didson
-from sonar_graph.logs.sonar_reading import read_sonar_frames
+from sonar_graph.logs.convert.didson import convert_didson
+from sonar_graph.logs.sonar_frames import read_sonar_frames
 
 from .sonar_logs import converted
 from .sonar_recordings import START_NS, STEP_NS, Aris, Ddf, Oculus, images

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from sonar_graph.errors import DatasetError
-from sonar_graph.logs.converters.sonar_file import ByteSource, Lost, may_be_numbered_header
+from sonar_graph.logs.convert.sonar_file import ByteSource, Lost, may_be_numbered_header
 
 MIB = 1 << 20
 

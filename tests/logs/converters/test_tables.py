@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.logs.converters.tables import decimal_ns, read_table
+from sonar_graph.logs.convert.text_tables import decimal_ns, read_table
 
 
 @given(st.integers(-(2**62), 2**62))

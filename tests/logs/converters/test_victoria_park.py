@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from sonar_graph.logs.converters.victoria_park import read_victoria_park
+from sonar_graph.logs.convert.victoria_park import read_victoria_park
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,188 @@
+"""The table of a batch: one row for each planned run, as Parquet.
+
+Columns in this order: what was run, how it went, on what, how long it took, and then every score by its key, in
+alphabetical order. What was not measured is null. A run that was not done has the status ``not run`` and no numbers.
+The file's metadata say under ``sonar_graph.suite`` what the suite compares: its name, description, reference, metrics
+and rate, as JSON.
+
+Scores that a batch compares: their names, units and protocols, the same for every run.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from sonar_graph.batch.store import NOT_RUN, PlannedRun, Row, Store
+from sonar_graph.batch.suite import Suite
+from sonar_graph.evaluation import ESTIMATES, LABELS
+from sonar_graph.files import replacing
+
+KINDS = ("causal", "smoothed")
+UNITS = {"m": "m", "rad": "rad", "ms": "ms", "s": "s", "mb": "MB"}
+PROTOCOLS = {
+    "ate_raw_m": "Not aligned: root of the mean square of 3-D position errors.",
+    "ate_yaw_m": "Aligned by yaw and translation without scale (Umeyama 1991): rms of 3-D position errors.",
+    "ate_se2_m": "Aligned by SE(2) without scale (Umeyama 1991): rms of horizontal position errors.",
+    "ate_se3_m": "Aligned by SE(3) without scale (Umeyama 1991): rms of 3-D position errors.",
+    "rpe_1s_m": "Rms of the error of body-frame displacement over 1 s, overlapping pairs.",
+    "rpe_10s_m": "Rms of the error of body-frame displacement over 10 s, overlapping pairs.",
+    "rpe_1s_rad": "Rms of the error of heading change over 1 s, overlapping pairs.",
+    "rpe_10s_rad": "Rms of the error of heading change over 10 s, overlapping pairs.",
+    "yaw_rmse_rad": "Not aligned: rms of wrapped heading errors.",
+    "return_error_m": "Not aligned: norm of estimated minus true displacement from the first to the last instant.",
+    "raw_m": "Map at the end, landmarks matched by identity, not aligned: rms of horizontal errors.",
+    "se2_m": "Map at the end, landmarks matched by identity, aligned by SE(2): rms of horizontal errors.",
+    "nees_position": "Normalised squared error of position per degree of freedom, mean over the instants of a run.",
+    "nees_yaw": "Normalised squared error of heading, mean over the instants of a run.",
+}
+HIGHER_IS_BETTER = {"real_time_factor"}
+NO_BETTER = {"count", "used", "refused", "unnamed"}
+INSIDE = {"nees", "nis", "nees_position", "nees_yaw"}
+TIMINGS = (
+    *("wall_s", "read_s", "estimate_s", "cpu_s", "peak_memory_mb"),
+    *("update_p50_ms", "update_p99_ms", "finish_s"),
+)
+"""Columns of the results that every run has, of time and memory."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One kind of score, of the causal and the smoothed estimate or of neither."""
+
+    name: str
+    """Key without its prefix, such as ``ate_se2_m``."""
+    keys: dict[str, str]
+    """Column of the results by what it is of: ``Causal``, ``Smoothed``; empty where there is no such distinction."""
+
+    @property
+    def label(self) -> str:
+        """For people."""
+        return LABELS.get(self.name, self.name)
+
+    @property
+    def unit(self) -> str:
+        """Of the stored value."""
+        return UNITS.get(self.name.rpartition("_")[2], "")
+
+    @property
+    def shown_unit(self) -> str:
+        """Of the value on the page: degrees for radians."""
+        return "°" if self.unit == "rad" else self.unit
+
+    @property
+    def factor(self) -> float:
+        """From the stored to the shown value."""
+        return math.degrees(1) if self.unit == "rad" else 1.0
+
+    @property
+    def direction(self) -> str:
+        """Which values are better."""
+        if self.name in INSIDE:
+            return "1 is consistent"
+        if self.name in NO_BETTER:
+            return ""
+        return "higher is better" if self.name in HIGHER_IS_BETTER else "lower is better"
+
+    @property
+    def is_error(self) -> bool:
+        """Whether smaller is better and the same run always gives it, so that differences can be tested.
+
+        Time and memory depend on the machine and on what else it does: they are shown, and not tested.
+        """
+        return self.direction == "lower is better" and not any(map(is_timing, self.keys.values()))
+
+    @property
+    def protocol(self) -> str:
+        """How it was got, in a sentence."""
+        said = PROTOCOLS.get(self.name, f"As compare writes it: the run's comparison.json, {self.name}.")
+        if set(self.keys) <= {""}:
+            return said
+        return f"{said} Separately for the causal and the smoothed estimate."
+
+
+def is_timing(column: str) -> bool:
+    """Whether a column may differ between two runs of the same: time and memory."""
+    return column in TIMINGS or column.startswith(("time.", "memory."))
+
+
+def metrics_of(keys: list[str]) -> list[Metric]:
+    """Metrics in the order in which a suite names them; a trajectory score named once is shown causal and smoothed."""
+    found: dict[str, Metric] = {}
+    for key in keys:
+        prefix, _, name = key.partition(".")
+        if prefix in KINDS:
+            found[f"trajectory.{name}"] = Metric(name, {kind.capitalize(): f"{kind}.{name}" for kind in KINDS})
+        else:
+            found[key] = Metric(name, {"": key})
+    return list(found.values())
+
+
+def estimate_sentences() -> list[str]:
+    """What causal and smoothed mean."""
+    return [f"{sentence}." for sentence in ESTIMATES.values()]
+
+
+RESULTS = "results.parquet"
+SUITE_METADATA = b"sonar_graph.suite"
+TEXTS = ("key", "suite", "log", "generator", "options", "asked")
+SETTINGS = ("variant", "params", "estimator", "status", "reason", "log_file")
+VERSIONS = ("sonar_graph", "source", "estimator_source", "gtsam", "numpy", "scipy", "numba", "python", "machine")
+COLUMNS: dict[str, pa.DataType] = {
+    **dict.fromkeys(TEXTS, pa.string()),
+    "seed": pa.int64(),
+    **dict.fromkeys(SETTINGS, pa.string()),
+    "rate_hz": pa.float64(),
+    **dict.fromkeys(VERSIONS, pa.string()),
+    **dict.fromkeys(TIMINGS, pa.float64()),
+    "scored_instants": pa.int64(),
+}
+
+
+def write_results(store: Store, suite: Suite, runs: list[PlannedRun]) -> Path:
+    """Write the table of all runs, also of those that are not done, in the order of the plan; whole or not at all."""
+    rows = [_described(run) | _came_of(run, store) for run in runs]
+    scores = sorted({name for row in rows for name in row} - set(COLUMNS))
+    types = COLUMNS | {name: pa.int64() if name.endswith("_dof") else pa.float64() for name in scores}
+    about = suite.model_dump(mode="json", include={"name", "description", "reference", "metrics", "rate_hz"})
+    schema = pa.schema(types, metadata={SUITE_METADATA: json.dumps(about).encode()})
+    path = store.folder / RESULTS
+    with replacing(path) as partial:
+        pq.write_table(pa.Table.from_pylist(rows, schema=schema), partial)
+    return path
+
+
+def _came_of(run: PlannedRun, store: Store) -> Row:
+    """What was measured and where its log is, or that nothing was."""
+    row = store.row(run.key)
+    if row is None:
+        return {"status": NOT_RUN, "reason": "not done when this table was written"}
+    return {"log_file": store.log_file(run.key), **row}
+
+
+def _described(run: PlannedRun) -> Row:
+    """What was run; versions are told again by the run itself, where it came so far."""
+    return {
+        "key": run.key,
+        "suite": run.suite,
+        "log": run.log,
+        "generator": run.kind,
+        "options": _plain(run.options if run.landmarks is None else run.options | {"landmarks": run.landmarks}),
+        "asked": _plain(run.asked),
+        "seed": run.seed,
+        "variant": run.variant,
+        "params": _plain(run.params),
+        "estimator": run.estimator,
+        "rate_hz": run.rate_hz,
+        **{name: number for name, number in run.versions.items() if name in VERSIONS},
+    }
+
+
+def _plain(values: dict[str, Any]) -> str:
+    return json.dumps(values, sort_keys=True)

@@ -1,0 +1,265 @@
+"""``sonar-graph bench``: a suite of runs, done on all cores or on a cluster.
+
+``sonar-graph bench``: the group of its commands; ``bless`` a reference, and ``gate`` a batch by it.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from sonar_graph.cli.arguments import OutputFolder, examples
+from sonar_graph.cli.outputs import working, writable_folder, writable_json
+from sonar_graph.errors import BatchError
+
+if TYPE_CHECKING:
+    from sonar_graph.batch import Batch, GateVerdict, Limits, Where
+
+
+INTERRUPTED = 130
+SHOWN = 10
+"""Lines about runs that stand out; the report lists every run."""
+BatchFolder = Annotated[
+    Path, typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that bench wrote.")
+]
+Strict = Annotated[
+    bool, typer.Option("--strict", help="Fail the gate by lines that say 'look at' too: these are no tests.")
+]
+INSTALL = "pip install 'sonar-graph[bench]'"
+
+
+def bench(
+    suite: Annotated[
+        Path,
+        typer.Argument(metavar="SUITE.toml", exists=True, dir_okay=False, help="What is run: see benchmarks/suites."),
+    ],
+    output: OutputFolder,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes on this machine. Default: one a core.")] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="A Dask scheduler that exists, such as tcp://10.0.0.5:8786, instead."),
+    ] = None,
+    timeout_s: Annotated[
+        float | None,
+        typer.Option("--timeout", metavar="S", min=1e-3, help="End a run after so long. Default: the suite's."),
+    ] = None,
+    retry_failed: Annotated[
+        bool, typer.Option("--retry-failed", help="Do runs anew that failed, timed out or were killed.")
+    ] = False,
+    reference: Annotated[
+        Path | None,
+        typer.Option(
+            "--gate",
+            metavar="REFERENCE.json",
+            exists=True,
+            dir_okay=False,
+            help="What `bench bless` wrote: exit with 1 where accuracy or consistency got worse, and only then.",
+        ),
+    ] = None,
+    is_strict: Strict = False,
+) -> None:
+    """Run a suite: logs or simulations, seeds, estimators and variants. Runs that are done already are kept.
+
+    Writes report.html, its tables, results.parquet with one row a run, and runs/KEY/ with what compare writes and the
+    log of the run.
+    """
+    if workers is not None and scheduler is not None:
+        raise typer.BadParameter("--workers is for this machine, --scheduler for a cluster; give one of them")
+    if is_strict and reference is None:
+        raise typer.BadParameter("--strict is about the gate; give it with --gate")
+    with _opened(suite, output, timeout_s) as (batch, limits):
+        if retry_failed:
+            batch.discard_failed()
+        counts = _run(batch, _where(workers, scheduler), limits)
+        typer.echo(f"Runs: {_told(counts)}")
+        typer.echo(f"Results: {output / 'results.parquet'}")
+        typer.echo(f"Report: {write_report_of(output)}")
+    if reference is not None:
+        exit_by_gate(output, reference, is_strict=is_strict)
+    elif set(counts) - {"ok"}:
+        raise typer.Exit(1)
+
+
+def exit_by_gate(folder: Path, reference: Path, *, is_strict: bool) -> None:
+    """Print what got worse, and exit with 1 where anything did; if strict also where there is something to look at."""
+    from sonar_graph.batch import gate as judge
+    from sonar_graph.batch import read_batch
+
+    with working("judging"):
+        verdict = judge(read_batch(folder), reference)
+    for line in verdict_lines(verdict):
+        typer.echo(line)
+    is_passed = verdict.passed and not (is_strict and verdict.look_at)
+    outcome = "failed" if not is_passed else "passed" if verdict.has_test else "passed, without any test of errors"
+    typer.echo(f"Gate: {outcome}, {verdict.compared} runs held against {reference}")
+    if not is_passed:
+        raise typer.Exit(1)
+
+
+def verdict_lines(verdict: GateVerdict) -> list[str]:
+    """What got worse, what a person should look at, and what the tests could have seen."""
+    lines = [f"Worse: {worsening}" for worsening in verdict.worsenings]
+    lines += [f"Look at: {line}" for line in verdict.look_at[:SHOWN]]
+    if len(verdict.look_at) > SHOWN:
+        lines.append(f"Look at: {len(verdict.look_at) - SHOWN} more such lines are not shown")
+    if verdict.new:
+        lines.append(f"Not judged: {len(verdict.new)} runs that the reference does not have, first {verdict.new[0]}")
+    if verdict.untested:
+        told = ", ".join(f"{name} ({verdict.cases[name]})" for name in verdict.untested)
+        lines.append(f"No test of errors: {told}: it needs 3 cases, which are seeds, or logs without seeds")
+    if verdict.unmoved:
+        lines.append(f"Hardly different from the reference: {', '.join(verdict.unmoved)}")
+    if verdict.detectable:
+        told = ", ".join(_seen(name, share, verdict.cases[name]) for name, share in verdict.detectable.items())
+        lines.append(f"Would have been found in four of five batches: one error larger on all logs by {told}")
+    return lines
+
+
+def _seen(contestant: str, share: float, cases: int) -> str:
+    size = f"about {share:.0%}" if math.isfinite(share) else "more than ten times"
+    return f"{size} ({contestant}, {cases} cases)"
+
+
+def write_report_of(folder: Path) -> Path:
+    """Write the page and the tables of a batch from its results, and say where runs are missing in them."""
+    from sonar_graph.batch import read_batch
+    from sonar_graph.report import lost_told, missing_told, write_batch_report
+
+    with working("drawing"):
+        batch = read_batch(folder)
+        page = write_batch_report(batch, folder)
+    for sentence in [*missing_told(batch), *lost_told(batch)]:
+        typer.echo(f"Warning: {sentence}", err=True)
+    return page
+
+
+@contextmanager
+def _opened(suite: Path, output: Path, timeout_s: float | None) -> Iterator[tuple[Batch, Limits]]:
+    try:
+        from sonar_graph.batch import Batch, limits_of, plan_runs, read_suite
+    except ModuleNotFoundError as error:
+        raise BatchError(f"bench needs {error.name}, which is not installed: {INSTALL}") from error
+    file = read_suite(suite)
+    runs = plan_runs(file)  # before the folder is made, which a suite with a mistake does not need
+    with Batch.opened(file, writable_folder(output), runs) as batch:
+        yield batch, limits_of(file, timeout_s)
+
+
+def _where(workers: int | None, scheduler: str | None) -> Where:
+    from sonar_graph.batch import Where
+
+    return Where(workers, scheduler)
+
+
+def _run(batch: Batch, where: Where, limits: Limits) -> Counter[str]:
+    """All runs; on Ctrl-C, and where a scheduler of jobs ends it, it says how to go on."""
+    from sonar_graph.batch import terminations_as_interrupts
+
+    try:
+        with terminations_as_interrupts(), _shown(batch) as progress:
+            return batch.run(where, limits, progress)
+    except KeyboardInterrupt:
+        print(f"sonar-graph: interrupted; {batch.resuming()}", file=sys.stderr, flush=True)
+        os._exit(INTERRUPTED)  # the ordinary way waits for threads, and those for workers that are gone
+
+
+@contextmanager
+def _shown(batch: Batch) -> Iterator[Callable[[Any, Any], None]]:
+    """Runs done, failed, and the time that is left, for people only: silent where stderr is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("runs"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[failed]}"))
+    statuses = Counter(str(row["status"]) for row in batch.rows().values())
+    with Progress(
+        *columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal, transient=True
+    ) as bar:
+        task = bar.add_task("runs", total=len(batch.runs), completed=statuses.total(), failed=_failures(statuses))
+
+        def show(_run: Any, outcome: Any) -> None:
+            statuses[str(outcome.row["status"])] += 1
+            bar.update(task, completed=statuses.total(), failed=_failures(statuses))
+
+        yield show
+
+
+def _failures(statuses: Counter[str]) -> str:
+    failed = statuses.total() - statuses["ok"]
+    return f"{failed} failed" if failed else ""
+
+
+def _told(counts: Counter[str]) -> str:
+    return ", ".join(
+        f"{count} {status}" for status, count in sorted(counts.items(), key=lambda c: (c[0] != "ok", c[0]))
+    )
+
+
+DEFAULT_COMMAND = "run"
+
+
+class SuiteFirst(TyperGroup):
+    """Commands of which `DEFAULT_COMMAND` need not be named: ``bench SUITE.toml`` is ``bench run SUITE.toml``."""
+
+    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
+        """Put the name of the default command where none is given."""
+        is_named = not args or args[0] in self.commands or args[0] in ctx.help_option_names
+        return super().parse_args(ctx, args if is_named else [DEFAULT_COMMAND, *args])
+
+
+benches = typer.Typer(
+    name="bench",
+    cls=SuiteFirst,
+    help="Run suites: many logs, seeds, estimators and variants; judge what came out. For the options of a run: "
+    "sonar-graph bench run --help.",
+    epilog=examples(
+        "sonar-graph bench suite.toml -o results",
+        "sonar-graph bench suite.toml -o results --gate reference.json",
+        "sonar-graph bench bless results reference.json",
+    ),
+)
+benches.command(
+    DEFAULT_COMMAND,
+    epilog=examples(
+        "sonar-graph bench run suite.toml -o results",
+        "sonar-graph bench run suite.toml -o results --workers 2 --timeout 600",
+        "sonar-graph bench run suite.toml -o results --scheduler tcp://10.0.0.5:8786",
+        "sonar-graph bench run suite.toml -o results --gate reference.json",
+    ),
+)(bench)
+
+
+@benches.command(epilog=examples("sonar-graph bench bless results reference.json"))
+def bless(
+    folder: BatchFolder,
+    reference: Annotated[Path, typer.Argument(metavar="REFERENCE.json", help="File to write; replaced if it exists.")],
+) -> None:
+    """Make a batch the reference that later ones are held against."""
+    from sonar_graph.batch import bless as write_reference
+    from sonar_graph.batch import read_batch
+
+    batch = read_batch(folder)
+    write_reference(batch, writable_json(reference, []))
+    failed = sum(not run.ended for run in batch.runs)
+    typer.echo(f"Reference: {reference} ({len(batch.runs)} runs, {failed} of which did not end)")
+
+
+@benches.command(epilog=examples("sonar-graph bench gate results reference.json"))
+def gate(
+    folder: BatchFolder,
+    reference: Annotated[
+        Path, typer.Argument(metavar="REFERENCE.json", exists=True, dir_okay=False, help="What bless wrote.")
+    ],
+    is_strict: Strict = False,
+) -> None:
+    """Say whether accuracy or consistency got worse beyond noise; exit with 1 if so. Nothing is run."""
+    exit_by_gate(folder, reference, is_strict=is_strict)

@@ -1,0 +1,179 @@
+"""``sonar-graph convert``: public data sets, ROS bags and recordings of sonars as MCAP logs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from sonar_graph.cli.arguments import OutputLog, Overwrite, examples
+from sonar_graph.cli.outputs import progress_bars, working, writable_log
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from sonar_graph.logs.convert import Progress, SonarConversion
+    from sonar_graph.sequence import Sequence
+
+
+datasets = typer.Typer(
+    name="convert",
+    help="Convert a public data set, a ROS bag or a sonar's recording to an MCAP log.",
+    epilog=examples(
+        "sonar-graph convert victoria-park -o victoria_park.mcap",
+        "sonar-graph convert mrclam MRCLAM_Dataset6 --robot 3 -o mrclam_6_3.mcap",
+        "sonar-graph convert rosbag dive.bag -o dive.mcap",
+        "sonar-graph convert aris dive.aris -o dive_sonar.mcap",
+    ),
+)
+_MOST_LOSSES_SHOWN = 10
+DatasetFolder = Annotated[
+    Path, typer.Argument(metavar="DATASET_DIR", exists=True, file_okay=False, help="Folder of the data set.")
+]
+
+
+@datasets.command(epilog=examples("sonar-graph convert mrclam MRCLAM_Dataset6 --robot 3 -o mrclam_6_3.mcap"))
+def mrclam(
+    dataset: DatasetFolder,
+    output: OutputLog,
+    robot: Annotated[int, typer.Option(help="Robot, 1 to 5.")],
+    overwrite: Overwrite = False,
+) -> None:
+    """UTIAS multi-robot data set: odometry, ranges and bearings to landmarks, motion-capture truth."""
+    from sonar_graph.logs.convert import read_mrclam
+
+    _convert(lambda: read_mrclam(dataset, robot), dataset, output, overwrite)
+
+
+@datasets.command("victoria-park", epilog=examples("sonar-graph convert victoria-park -o victoria_park.mcap"))
+def victoria_park(
+    output: OutputLog,
+    source: Annotated[
+        Path | None,
+        typer.Option("--file", exists=True, dir_okay=False, help="Default: the one which the gtsam package brings."),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Victoria Park: a truck among trees, odometry and landmarks, no truth."""
+    from sonar_graph.logs.convert import read_victoria_park
+
+    _convert(lambda: read_victoria_park(source), source, output, overwrite)
+
+
+@datasets.command(epilog=examples("sonar-graph convert dlr DLR -o dlr.mcap"))
+def dlr(
+    dataset: Annotated[
+        Path, typer.Argument(metavar="PATH", exists=True, help="Folder of the data set, or its map.circles file.")
+    ],
+    output: OutputLog,
+    overwrite: Overwrite = False,
+) -> None:
+    """DLR Spatial Cognition: a robot in an office building, artificial landmarks with IDs, no truth."""
+    from sonar_graph.logs.convert import read_dlr
+
+    _convert(lambda: read_dlr(dataset), dataset, output, overwrite)
+
+
+@datasets.command(epilog=examples("sonar-graph convert akit A-KIT --trajectory 1 -o akit_1.mcap"))
+def akit(
+    dataset: DatasetFolder,
+    output: OutputLog,
+    trajectory: Annotated[int, typer.Option(help="Trajectory, counted from 1.")],
+    overwrite: Overwrite = False,
+) -> None:
+    """A-KIT: an autonomous underwater vehicle at sea, fibre-optic IMU and DVL, navigation-system reference."""
+    from sonar_graph.logs.convert import read_akit
+
+    _convert(lambda: read_akit(dataset, trajectory), dataset, output, overwrite)
+
+
+@datasets.command(
+    epilog=examples(
+        "sonar-graph convert rosbag dive.bag -o dive.mcap", "sonar-graph convert rosbag ros2_bag_folder -o dive.mcap"
+    )
+)
+def rosbag(
+    bag: Annotated[Path, typer.Argument(metavar="BAG", exists=True, help="ROS 1 .bag, or folder of a ROS 2 bag.")],
+    output: OutputLog,
+    overwrite: Overwrite = False,
+) -> None:
+    """Any ROS 1 bag, or ROS 2 bag of the sqlite3 kind, with all its topics."""
+    from sonar_graph.logs.convert import convert_rosbag
+
+    path = writable_log(output, bag, overwrite=overwrite)
+    with progress_bars() as progress:
+        done = convert_rosbag(bag, path, lambda number, total: progress(f"converting {bag.name}", number, total))
+    typer.echo(f"{bag.name}: {done.duration_s:.1f} s, {done.messages} messages on {done.topics} topics")
+    for topic, reason in done.left_out.items():
+        typer.echo(f"left out: {topic}: {reason}")
+    typer.echo(f"Log: {path}\nWhat is in it: sonar-graph inspect {path}")
+
+
+SonarRecording = Annotated[
+    Path,
+    typer.Argument(metavar="FILE", exists=True, dir_okay=False, help="Recording as the sonar's software wrote it."),
+]
+
+
+@datasets.command(
+    epilog=examples(
+        "sonar-graph convert didson dive.ddf -o dive_sonar.mcap",
+        "sonar-graph convert didson dive.ddf --sound-speed 1482 -o dive_sonar.mcap",
+    )
+)
+def didson(
+    recording: SonarRecording,
+    output: OutputLog,
+    sound_speed: Annotated[
+        float | None,
+        typer.Option(min=1350, max=1650, help="Of the water, m/s; default: ranges as the sonar names them (1465 m/s)."),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Images of a DIDSON (.ddf, versions 3 and 4)."""
+    from sonar_graph.logs.convert import convert_didson
+
+    def convert(log: Path, progress: Progress) -> SonarConversion:
+        return convert_didson(recording, log, progress, sound_speed_m_s=sound_speed)
+
+    _convert_sonar(convert, recording, output, overwrite)
+
+
+@datasets.command(epilog=examples("sonar-graph convert aris dive.aris -o dive_sonar.mcap"))
+def aris(recording: SonarRecording, output: OutputLog, overwrite: Overwrite = False) -> None:
+    """Images of an ARIS (.aris)."""
+    from sonar_graph.logs.convert import convert_aris
+
+    _convert_sonar(lambda log, progress: convert_aris(recording, log, progress), recording, output, overwrite)
+
+
+@datasets.command(epilog=examples("sonar-graph convert oculus pings.raw -o dive_sonar.mcap"))
+def oculus(recording: SonarRecording, output: OutputLog, overwrite: Overwrite = False) -> None:
+    """Images of an Oculus: its network messages, one after another in a file."""
+    from sonar_graph.logs.convert import convert_oculus
+
+    _convert_sonar(lambda log, progress: convert_oculus(recording, log, progress), recording, output, overwrite)
+
+
+def _convert_sonar(
+    convert: Callable[[Path, Progress], SonarConversion], recording: Path, output: Path, overwrite: bool
+) -> None:
+    path = writable_log(output, recording, overwrite=overwrite)
+    with progress_bars() as progress:
+        done = convert(path, lambda at, size: progress(f"converting {recording.name}", at, size))
+    typer.echo(f"{recording.name}: {done.frames} frames, {done.duration_s:.1f} s")
+    for line in done.shortcomings(_MOST_LOSSES_SHOWN):
+        typer.echo(line)
+    typer.echo(f"Log: {path}\nWhat is in it: sonar-graph inspect {path}")
+
+
+def _convert(read: Callable[[], Sequence], source: Path | None, output: Path, overwrite: bool) -> None:
+    from sonar_graph.logs import write_sequence
+
+    path = writable_log(output, source, overwrite=overwrite)
+    with working("converting"):
+        sequence = read()
+        write_sequence(path, sequence)
+    detections = len(sequence.detections) if sequence.detections else 0
+    typer.echo(f"{sequence.name}: {sequence.duration_s:.1f} s, {detections} landmark detections\nLog: {path}")

@@ -1,0 +1,114 @@
+"""The commands: thin shells around the library, one module a group.
+
+Exit codes: 0 done; 1 a comparison in which some run failed (everything is written), or a batch that is worse than its
+reference; 2 the user's mistake, told in one line on stderr; 130 interrupted. Only an error that nobody foresaw ends in
+a traceback.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import typer
+
+from sonar_graph import __version__
+from sonar_graph.cli.arguments import examples
+from sonar_graph.cli.bench import benches
+from sonar_graph.cli.compare import compare, demo, estimators, report, run
+from sonar_graph.cli.convert_data import datasets
+from sonar_graph.cli.inspect_log import inspect
+from sonar_graph.cli.recognise import calibrate, recognise
+from sonar_graph.cli.simulate import worlds
+from sonar_graph.errors import SonarGraphError
+
+INTERRUPTED = 130
+MISTAKE = 2
+app = typer.Typer(
+    name="sonar-graph",
+    help="Landmark SLAM for underwater vehicles: estimators compared on the same log.",
+    epilog=examples(
+        "sonar-graph demo -o demo",
+        "sonar-graph inspect dive.mcap",
+        "sonar-graph compare dive.mcap -o comparison",
+    ),
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+app.add_typer(worlds)
+app.add_typer(datasets)
+app.add_typer(benches)
+app.command(epilog=examples("sonar-graph inspect dive.mcap", "sonar-graph inspect dive.mcap --toml"))(inspect)
+app.command(
+    epilog=examples(
+        "sonar-graph run dive.mcap --estimator isam2 -o out",
+        "sonar-graph run dive.mcap --estimator ekf-slam -o out --calibration vehicle.toml",
+    )
+)(run)
+app.command(
+    epilog=examples(
+        "sonar-graph compare dive.mcap -o comparison",
+        "sonar-graph compare dive.mcap --estimators isam2,dead-reckoning --rate-hz 5 -o comparison",
+        "sonar-graph compare dive.mcap --log-config dive.toml -o comparison",
+    )
+)(compare)
+app.command(
+    epilog=examples(
+        "sonar-graph recognise dive.mcap -o recognised.mcap",
+        "sonar-graph recognise dive.mcap -o recognised.mcap --rule jeffrey",
+    )
+)(recognise)
+app.command(epilog=examples("sonar-graph calibrate dive.mcap -o model.json"))(calibrate)
+app.command(epilog=examples("sonar-graph report comparison"))(report)
+app.command(epilog=examples("sonar-graph estimators"))(estimators)
+app.command(epilog=examples("sonar-graph demo -o demo"))(demo)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"sonar-graph {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Landmark SLAM for underwater vehicles: estimators compared on the same log."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one command and exit with its code; the entry point of ``sonar-graph``."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    sys.exit(_exit_code(given or ["--help"]))
+
+
+def _exit_code(arguments: list[str]) -> int:
+    try:
+        code = app(arguments, prog_name="sonar-graph", standalone_mode=False)
+    except (SonarGraphError, OSError) as error:
+        return _complain(str(error), MISTAKE)
+    except KeyboardInterrupt:
+        return _complain("interrupted", INTERRUPTED)
+    except Exception as error:
+        return _complain_of_usage(error)
+    if code == INTERRUPTED:  # typer turns Ctrl-C into this code without a word
+        return _complain("interrupted", INTERRUPTED)
+    return int(code or 0)
+
+
+def _complain_of_usage(error: Any) -> int:
+    """A wrong option or argument, in one line; what is not typer's own is unforeseen and goes on."""
+    if not hasattr(error, "format_message"):
+        raise error
+    context = getattr(error, "ctx", None)
+    command = context.command_path if context else "sonar-graph"
+    return _complain(f"{error.format_message().rstrip('.')}; see {command} --help", MISTAKE)
+
+
+def _complain(message: str, code: int) -> int:
+    print(f"sonar-graph: {' '.join(message.split())}", file=sys.stderr)
+    return code

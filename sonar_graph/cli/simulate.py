@@ -1,0 +1,210 @@
+"""``sonar-graph simulate``: worlds with known truth.
+
+``sonar-graph simulate landmarks``: simulated landmarks on a recorded run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sonar_graph.cli.arguments import (
+    CalibrationPath,
+    LogConfigPath,
+    OutputLog,
+    Overwrite,
+    TopicChoices,
+    examples,
+    nested_settings,
+    read_calibration,
+    read_config,
+    topic_choices,
+)
+from sonar_graph.cli.outputs import Report, progress_bars, working, writable_log
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+    from sonar_graph.logs.mcap import Outgoing
+    from sonar_graph.simulation import BasinOptions, LandmarkOptions
+
+
+def landmarks(
+    log: Annotated[
+        Path,
+        typer.Option("--on", metavar="LOG", exists=True, dir_okay=False, help="MCAP log with a reference trajectory."),
+    ],
+    output: OutputLog,
+    seed: Annotated[int | None, typer.Option(min=0, help="Same seed, same log. Default: 0.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Any other option of the landmarks; may be repeated."),
+    ] = None,
+    calibration: CalibrationPath = None,
+    log_config: LogConfigPath = None,
+    topics: TopicChoices = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Landmarks along a recorded run, and the detections of a sonar; IMU and DVL stay as recorded."""
+    from sonar_graph.logs import read_sequence, write_sequence
+    from sonar_graph.simulation import add_landmarks
+
+    options = _landmark_options(({} if seed is None else {"seed": seed}) | nested_settings(settings or []))
+    path = writable_log(output, log, overwrite=overwrite)
+    with working("simulating"):
+        recorded = read_sequence(
+            log,
+            calibration=read_calibration(calibration),
+            config=read_config(log_config),
+            topics=topic_choices(topics or []),
+        )
+        sequence = add_landmarks(recorded, options)
+        write_sequence(path, sequence)
+    detections, placed = sequence.detections, sequence.true_landmarks
+    typer.echo(f"{len(placed or ())} landmarks, {len(detections or ())} detections\nLog: {path}")
+
+
+def _landmark_options(values: dict[str, Any]) -> LandmarkOptions:
+    from pydantic import ValidationError
+
+    from sonar_graph.simulation import LandmarkOptions
+
+    try:
+        return LandmarkOptions.model_validate(values)
+    except ValidationError as error:
+        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        raise typer.BadParameter(f"{faults}. There are: {', '.join(LandmarkOptions.model_fields)}") from error
+
+
+_OTHERS = (
+    "gyro_bias_scale, accel_bias_scale, dvl_scale_error, dvl_dropouts_per_hour, dvl_dropout_s, frame_rate_hz, "
+    "range_sigma_m, azimuth_sigma_rad, detection_probability, wrong_id_rate, tracks, id_delay_s, wrong_id_share, "
+    "anonymous_share, false_detections_per_frame, confident_false_fraction, start_position_sigma_m, "
+    "start_rotation_sigma_rad, floor_sigma_m, speed_m_s; and with --images image.NAME: sonar, designs, speckle, "
+    "side_lobes, cross_talk_db, measured_lens, floor_db, absorption_db_m, tvg_error_db, texture_shape, joints, "
+    "shadows, multipath, surface_path_db, floor_reflection, noise_db, drop_probability, time_offset_s, "
+    "sound_speed_error, stones, decoys. image.designs is a TOML file of at least four landmarks; the four lowest ids "
+    "are laid, in their order"
+)
+"""Written out, because help must not wait for the simulator to be imported."""
+worlds = typer.Typer(
+    name="simulate",
+    help="Simulate a run with known truth and write it as an MCAP log.",
+    epilog=examples(
+        "sonar-graph simulate basin -o basin.mcap",
+        "sonar-graph simulate basin -o images.mcap --images",
+        "sonar-graph simulate landmarks --on dive.mcap -o with_landmarks.mcap",
+    ),
+)
+worlds.command(
+    epilog=examples(
+        "sonar-graph simulate landmarks --on dive.mcap -o with_landmarks.mcap",
+        "sonar-graph simulate landmarks --on dive.mcap -o hard.mcap --seed 7 --set wrong_id_rate=0.05",
+    )
+)(landmarks)
+
+
+@worlds.command(
+    epilog=examples(
+        "sonar-graph simulate basin -o basin.mcap",
+        "sonar-graph simulate basin -o short.mcap --duration-s 300 --laps 1 --seed 7",
+        "sonar-graph simulate basin -o hard.mcap --imu mti1 --dvl explorer --set wrong_id_rate=0.05",
+        "sonar-graph simulate basin -o images.mcap --images --duration-s 130 --laps 1",
+        "sonar-graph simulate basin -o bare.mcap --images --set image.multipath=false --set image.stones=0",
+    )
+)
+def basin(
+    output: OutputLog,
+    seed: Annotated[int | None, typer.Option(min=0, help="Same seed, same log. Default: 0.")] = None,
+    duration_s: Annotated[float | None, typer.Option(help="Length of the run in seconds. Default: 2039.")] = None,
+    laps: Annotated[int | None, typer.Option(min=1, help="Times round the landmarks. Default: 3.")] = None,
+    imu: Annotated[str | None, typer.Option(help="Preset of the inertial sensor: hg1700 (default) or mti1.")] = None,
+    dvl: Annotated[str | None, typer.Option(help="Preset of the Doppler log: workhorse (default) or explorer.")] = None,
+    no_bias: Annotated[bool, typer.Option("--no-bias", help="Gyros without bias.")] = False,
+    images: Annotated[
+        bool,
+        typer.Option("--images", help="Record sonar images, in which landmarks are still to be found, not detections."),
+    ] = False,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help=f"Any other option of the basin; may be repeated: {_OTHERS}."),
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """A vehicle drives round four landmarks in a basin, with IMU, DVL, depth and landmark detections or images."""
+    flags = {"seed": seed, "duration_s": duration_s, "laps": laps, "imu": imu, "dvl": dvl}
+    values: dict[str, Any] = {name: value for name, value in flags.items() if value is not None}
+    if no_bias:
+        values["gyro_bias_scale"] = 0.0
+    given = nested_settings(settings or [])
+    if "image" in given and not images:
+        raise typer.BadParameter("--set image.NAME=VALUE is for sonar images: give --images too, or leave it out")
+    if images:
+        values["image"] = {}
+    options = _basin_options(values | given)
+    path = writable_log(output, overwrite=overwrite)
+    write_basin(path, options)
+    if options.image is not None:
+        typer.echo(f"Landmarks: {_laid(options)}")
+    typer.echo(f"Log: {path}")
+
+
+def _laid(options: BasinOptions) -> str:
+    """Which landmarks lie where."""
+    from sonar_graph.simulation import LANDMARKS_XY_M, designs_laid
+
+    placed = zip(designs_laid(options.image), LANDMARKS_XY_M.tolist(), strict=True)
+    return ", ".join(f"{design.id} {design.name} at ({x:g}, {y:g})" for design, (x, y) in placed)
+
+
+def write_basin(path: Path, options: BasinOptions) -> None:
+    """Write the log of a simulated basin, with images where its options ask for them."""
+    from sonar_graph.logs import write_sequence
+    from sonar_graph.simulation import simulate_basin
+
+    if options.image is None:
+        with working("simulating"):
+            write_sequence(path, simulate_basin(options))
+        return
+    with progress_bars() as report:
+        write_sequence(path, simulate_basin(options), _image_messages(options, report))
+
+
+def _image_messages(options: BasinOptions, report: Report) -> Iterator[Outgoing]:
+    """Images of the basin, a block at a time."""
+    from sonar_graph.logs import sonar_image_messages
+    from sonar_graph.simulation import simulate_basin_frames
+    from sonar_graph.simulation.sonar_image import SONARS, SOUND_SPEED_M_S
+
+    assert options.image is not None
+    frequency_hz = SONARS[options.image.sonar].frequency_hz
+    told_m_s = SOUND_SPEED_M_S * (1 + options.image.sound_speed_error)
+    total, done = round(options.duration_s * options.frame_rate_hz), 0
+    for block in simulate_basin_frames(options):
+        yield sonar_image_messages("/sonar/image", block.frames, frequency_hz=frequency_hz, sound_speed_m_s=told_m_s)
+        done += len(block.frames)
+        report("simulating images", done, total)
+
+
+def _basin_options(values: dict[str, Any]) -> BasinOptions:
+    from pydantic import ValidationError
+
+    from sonar_graph.simulation import BasinOptions
+    from sonar_graph.simulation.sonar_image import ImageOptions
+
+    try:
+        return BasinOptions.model_validate(values)
+    except ValidationError as error:
+        faults = "; ".join(map(_fault, error.errors()))
+        names = [*BasinOptions.model_fields, *(f"image.{name}" for name in ImageOptions.model_fields)]
+        raise typer.BadParameter(f"{faults}. The basin has: {', '.join(names)}") from error
+
+
+def _fault(error: ErrorDetails) -> str:
+    name = ".".join(map(str, error["loc"]))
+    if error["type"] == "extra_forbidden":
+        return f"there is no option {name}"
+    return f"{name}: {error['msg']}, not {error['input']!r}"

@@ -1,0 +1,14 @@
+"""Devices."""
+
+# fmt: off
+from sonar_graph.devices.dvl_beams import UNMEASURED_M_S, in_numbers, is_partial, velocity_of_beams
+from sonar_graph.devices.landmark_designs import (
+    DEFAULT_DESIGNS, LEAST_BRIGHT_DB, OWN_DESIGNS, LandmarkDesign, load_designs,
+)
+from sonar_graph.devices.sonar_lenses import DIDSON_BEAMS, aris_azimuths, didson_azimuths, even_azimuths
+
+__all__ = [
+    "DEFAULT_DESIGNS", "DIDSON_BEAMS", "LEAST_BRIGHT_DB", "LandmarkDesign", "OWN_DESIGNS", "UNMEASURED_M_S",
+    "aris_azimuths", "didson_azimuths", "even_azimuths", "in_numbers", "is_partial", "load_designs",
+    "velocity_of_beams",
+]

@@ -1,0 +1,99 @@
+"""What one ping of a Doppler log's beams says about the velocity, be there four valid beams or one.
+
+A beam of unit direction b measures ``z = b . v + n``, n ~ N(0, sigma²). Valid beams together have the information
+
+    Lambda = sum b b^T / sigma^2,      Lambda v = sum b z / sigma^2
+
+With three beams or more, not in one plane, that is a velocity with the covariance ``Lambda^-1``. With fewer, directions
+remain of which nothing was measured: there the velocity is given as 0 with a sigma of `UNMEASURED_M_S`, which says
+nothing to whoever weighs by covariances. `sonar_graph.navigation.dvl_screening.partial_beams` completes such rows.
+
+Covariances of Doppler velocities: what holds where they are not said, and which say that a part was measured.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_graph.measurements import Floats
+from sonar_graph.numerics import compiled
+
+UNMEASURED_M_S = 100.0
+"""Sigma along a direction that no beam measured."""
+_LEAST_SHARE = 1e-6
+"""Of the largest information, below which a direction counts as not measured."""
+
+
+def velocity_of_beams(
+    directions: Floats, along_m_s: Floats, valid: NDArray[np.bool_], sigma_m_s: float
+) -> tuple[Floats, Floats]:
+    """Velocity and covariance of each ping.
+
+    Parameters
+    ----------
+    directions
+        Unit vectors, shape (beams, 3).
+    along_m_s
+        Velocity along each beam, shape (n, beams); what is not valid may be anything.
+    valid
+        Shape (n, beams).
+    sigma_m_s
+        White noise of a beam.
+
+    Returns
+    -------
+    Velocity, shape (n, 3), m/s, and covariance, shape (n, 3, 3), m²/s², along the axes of the directions.
+    """
+    velocity = np.zeros((len(valid), 3))
+    covariance = np.empty((len(valid), 3, 3))
+    for pattern in np.unique(valid, axis=0):
+        rows = (valid == pattern).all(axis=1)
+        inverse, covariance[rows] = _solution(directions[pattern], sigma_m_s)
+        velocity[rows] = along_m_s[rows][:, pattern] @ inverse.T
+    return velocity, covariance
+
+
+def _solution(directions: Floats, sigma_m_s: float) -> tuple[Floats, Floats]:
+    """Of some beams: what turns their velocities into one, shape (3, beams), and its covariance."""
+    geometry, axes = np.linalg.eigh(directions.T @ directions)
+    is_measured = geometry > max(_LEAST_SHARE * geometry[-1], np.finfo(float).tiny)
+    per_geometry = 1.0 / np.where(is_measured, geometry, 1.0)
+    inverse = (axes * (per_geometry * is_measured)) @ axes.T @ directions.T
+    variances = np.where(is_measured, sigma_m_s**2 * per_geometry, UNMEASURED_M_S**2)
+    return inverse, (axes * variances) @ axes.T
+
+
+@compiled
+def in_numbers(velocity_cov: Floats, unsaid: Floats) -> Floats:
+    """Covariances of shape (n, 3, 3) to compute with.
+
+    Parameters
+    ----------
+    unsaid
+        What holds where a number is NaN, shape (3, 3).
+
+    Returns
+    -------
+    The same, with `UNMEASURED_M_S` and no correlation along axes whose variance is infinite.
+    """
+    numbers = np.empty(velocity_cov.shape)
+    for k in range(len(numbers)):
+        said = velocity_cov[k]
+        for i in range(3):
+            for j in range(3):
+                if np.isinf(said[i, i]) or np.isinf(said[j, j]):
+                    numbers[k, i, j] = UNMEASURED_M_S**2 if i == j else 0.0
+                else:
+                    numbers[k, i, j] = unsaid[i, j] if np.isnan(said[i, j]) else said[i, j]
+    return numbers
+
+
+@compiled
+def is_partial(velocity_cov: Floats) -> NDArray[np.bool_]:
+    """Rows with a direction of which nothing was measured, shape (n,), from covariances of shape (n, 3, 3)."""
+    partial = np.empty(len(velocity_cov), np.bool_)
+    for k in range(len(partial)):
+        cov = velocity_cov[k]
+        partial[k] = cov[0, 0] + cov[1, 1] + cov[2, 2] > 0.5 * UNMEASURED_M_S**2
+    return partial

@@ -1,0 +1,139 @@
+"""At which instants estimators are scored: the same for all, and nothing dropped without being counted.
+
+And at which their maps are kept: those of the 2014 paper's Fig. 4, or the same fractions of another run.
+
+The numbers that the 2014 paper publishes of its basin experiment, to stand beside what is estimated here.
+
+Landmark positions are those of its Table I, times those of its Fig. 4. Errors of its map are computed from the table,
+which gives centimetres; the paper itself states none. Its vehicle had no reference for its own path.
+
+Source: "Experimental Results of Real-time Sonar-based Underwater Localization Using Landmarks", 2014.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sonar_graph.devices import OWN_DESIGNS
+from sonar_graph.evaluation.metrics import LandmarkErrors, landmark_errors
+from sonar_graph.evaluation.results import RunResult
+from sonar_graph.measurements import Ints
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import LandmarkMap, Trajectory
+
+IDS = np.array([1, 2, 3, 4])
+TRUE_XY_M = np.array([[5.00, 0.00], [7.00, -5.00], [2.00, -7.00], [0.00, -2.00]])
+ESTIMATED_XY_M = np.array([[4.81, -0.07], [6.74, -5.01], [1.85, -6.85], [-0.14, -1.82]])
+RETURN_M = (-0.3013, -0.1758)
+"""Last minus first estimated position, x and y: error of the estimate and of steering back by hand together."""
+DURATION_S = 2039.0
+MAP_TIMES_S = (833.1, 1369.4, 2039.0)
+"""When Fig. 4 shows path and map."""
+SAME_M = 1e-3
+"""A true landmark this near to the published one in x and in y is that landmark."""
+
+
+def published_maps() -> tuple[LandmarkMap, LandmarkMap]:
+    """Table I as maps: estimated and true. Heights and covariances are not published: 0 and NaN."""
+    unknown = np.full((len(IDS), 3, 3), np.nan)
+    on_floor = np.zeros((len(IDS), 1))
+    estimated, true = (LandmarkMap(IDS, np.hstack([xy, on_floor]), unknown) for xy in (ESTIMATED_XY_M, TRUE_XY_M))
+    return estimated, true
+
+
+def published_errors() -> LandmarkErrors:
+    """The errors of the published map, raw and after SE(2) alignment."""
+    return landmark_errors(*published_maps())
+
+
+def repeats_published(sequence: Sequence) -> bool:
+    """Whether a sequence's true landmarks are those of the paper, by identity and horizontal position.
+
+    Landmarks of one's own design in their places are another experiment.
+    """
+    true = sequence.true_landmarks
+    if true is None or OWN_DESIGNS in sequence.notes or not np.array_equal(true.ids, IDS):
+        return False
+    return bool(np.abs(true.positions[:, :2] - TRUE_XY_M).max() < SAME_M)
+
+
+TRUTH_GAP_S = 0.5
+"""Between truth samples further apart than this the truth is not interpolated (an occluded tracking system)."""
+GAP_TO_SPACING = 1.5
+"""... unless the truth is that sparse throughout: a gap is also this many times its median spacing."""
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredInstants:
+    """The instants that count, and how many of those asked for do not."""
+
+    stamps_ns: Ints
+    """Shape (n,)."""
+    asked: int
+    outside_truth: int
+    """Before the truth's first or after its last sample."""
+    in_truth_gap: int
+    gap_s: float
+    """What counts as a gap, seconds."""
+    not_estimated: int
+    """Of the rest, those at which some run that did not fail returned no estimate."""
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def __str__(self) -> str:
+        """The clause that protocols quote."""
+        left_out = (
+            (self.outside_truth, "outside the truth's time span"),
+            (self.in_truth_gap, f"in gaps of the truth longer than {self.gap_s:.2g} s"),
+            (self.not_estimated, "without an estimate from every estimator"),
+        )
+        reasons = ", ".join(f"{count} {why}" for count, why in left_out if count)
+        return f"{len(self)} of {self.asked} instants" + (f" (left out: {reasons})" if reasons else "")
+
+
+def scored_instants(asked_ns: Ints, truth: Trajectory, runs: list[RunResult]) -> ScoredInstants:
+    """Of the instants asked for, those with truth nearby and an estimate from each run that did not fail."""
+    inside = (asked_ns >= truth.stamps_ns[0]) & (asked_ns <= truth.stamps_ns[-1])
+    gap_s = gap_limit_s(truth)
+    covered = inside & ~_in_gap(asked_ns, truth, gap_s)
+    estimated = np.ones(len(asked_ns), dtype=bool)
+    for run in runs:
+        if run.causal is not None:
+            estimated &= np.isin(asked_ns, run.causal.stamps_ns)
+    return ScoredInstants(
+        stamps_ns=asked_ns[covered & estimated],
+        asked=len(asked_ns),
+        outside_truth=int((~inside).sum()),
+        in_truth_gap=int((inside & ~covered).sum()),
+        gap_s=gap_s,
+        not_estimated=int((covered & ~estimated).sum()),
+    )
+
+
+def map_instants(asked_ns: Ints, start_ns: int) -> Ints:
+    """Of the instants asked for, those nearest to the published times scaled to the run's length; the last included."""
+    if not len(asked_ns):
+        return asked_ns
+    wanted_ns = start_ns + (asked_ns[-1] - start_ns) * np.array(MAP_TIMES_S) / DURATION_S
+    return np.unique(asked_ns[np.abs(asked_ns[None, :] - wanted_ns[:, None]).argmin(axis=1)])
+
+
+def gap_limit_s(truth: Trajectory) -> float:
+    """The distance between truth samples beyond which nothing is interpolated, seconds."""
+    spacing_s = np.diff(truth.stamps_ns) * 1e-9
+    return max(TRUTH_GAP_S, GAP_TO_SPACING * float(np.median(spacing_s))) if spacing_s.size else TRUTH_GAP_S
+
+
+def rows_at(trajectory: Trajectory, stamps_ns: Ints) -> Trajectory:
+    """The rows of a trajectory that has all of these stamps."""
+    return trajectory.rows(np.searchsorted(trajectory.stamps_ns, stamps_ns))
+
+
+def _in_gap(stamps_ns: Ints, truth: Trajectory, gap_s: float) -> np.ndarray:
+    """Which stamps lie strictly between two truth samples that are more than the gap apart."""
+    after = np.clip(np.searchsorted(truth.stamps_ns, stamps_ns, side="left"), 0, len(truth) - 1)
+    before = np.clip(np.searchsorted(truth.stamps_ns, stamps_ns, side="right") - 1, 0, len(truth) - 1)
+    return np.asarray((truth.stamps_ns[after] - truth.stamps_ns[before]) * 1e-9 > gap_s)

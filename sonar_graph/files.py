@@ -1,0 +1,91 @@
+"""Files that appear whole or not at all.
+
+JSON that every reader accepts: no NaN, no infinity.
+
+Logs that appear whole or not at all.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from sonar_graph.errors import EvaluationError, LogError
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A path beside ``path`` to write to; it takes the name when the block ends without an error.
+
+    Its suffix is that of ``path``, for writers that look at it.
+    """
+    partial = path.with_name(f".partial-{path.name}")
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write whole or not at all; what is not a finite number becomes null."""
+    with replacing(path) as partial:
+        partial.write_text(strict_json(content) + "\n", "utf-8")
+
+
+def strict_json(content: dict[str, Any]) -> str:
+    """The text; what is not a finite number becomes null."""
+    return json.dumps(_strict(content), indent=2, allow_nan=False, ensure_ascii=False)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a file.
+
+    Raises
+    ------
+    EvaluationError
+        When the file is missing or is not a JSON object.
+    """
+    try:
+        content = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise EvaluationError(f"{path}: cannot be read as JSON ({error}); write the comparison anew") from error
+    if not isinstance(content, dict):
+        raise EvaluationError(f"{path}: expected a JSON object, found {type(content).__name__}")
+    return content
+
+
+def _strict(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _strict(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_strict(inner) for inner in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[BinaryIO]:
+    """A file beside ``path`` to write to, with the folder made; it takes the name when the block ends without an error.
+
+    Raises
+    ------
+    LogError
+        When the file cannot be written.
+    """
+    partial = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with partial.open("wb") as stream:
+                yield stream
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as error:
+        raise LogError(f"{path} cannot be written: {error.strerror}") from error

@@ -1,0 +1,146 @@
+"""The adapters that come along: types of common drivers, with what is known of how those fill them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields
+from sonar_graph.logs.adapters.dvl_messages import DvlAdapter
+from sonar_graph.logs.adapters.landmark_messages import DetectionArrayAdapter, DetectionListsAdapter, LandmarkMapAdapter
+from sonar_graph.logs.adapters.sonar_messages import SonarAdapter
+from sonar_graph.logs.adapters.vehicle_messages import DepthAdapter, ImuAdapter, TruthAdapter
+
+TRUTH_WORDS = ("truth",)
+_DVL_WORDS = ("dvl", "doppler")
+_DEPTH_WORDS = ("depth",)
+_LANDMARK_WORDS = ("landmark", "sonar")
+_UUV_DVL_TYPES = (
+    "uuv_sensor_ros_plugins_msgs/msg/DVL",
+    "stonefish_ros2/msg/DVL",
+    "cola2_msgs/msg/DVL",
+    "smarc_msgs/msg/DVL",
+)
+Z_DOWN_TYPES = frozenset({"marine_acoustic_msgs/msg/Dvl"})
+"""Types whose definition says that z points downwards, which not all drivers follow."""
+
+
+@dataclass(frozen=True)
+class Shipped:
+    """An adapter and when it is taken without being asked for."""
+
+    adapter: Adapter
+    words: tuple[str, ...] = ()
+    """A topic's name must hold one of these; none: any name fits."""
+    is_general: bool = False
+    """Its type says little about the sensor: counts only where no topic of a more telling type fits."""
+
+
+def _xyz(prefix: str) -> tuple[str, str, str]:
+    return f"{prefix}.x", f"{prefix}.y", f"{prefix}.z"
+
+
+def _poses(type_name: str, prefix: str, covariance: str | None) -> TruthAdapter:
+    orientation = (*_xyz(f"{prefix}.orientation"), f"{prefix}.orientation.w")
+    return TruthAdapter(
+        type=type_name, position=_xyz(f"{prefix}.position"), orientation=orientation, covariance=covariance
+    )
+
+
+def _water_linked(*covariance: str, meaning: str = "variance") -> DvlAdapter:
+    return DvlAdapter(
+        type="dvl_msgs/msg/DVL",
+        velocity=_xyz("velocity"),
+        covariance=CovarianceFields.model_validate({"fields": covariance, "meaning": meaning}),
+        valid_where={"velocity_valid": True},
+    )
+
+
+def _uuv(type_name: str) -> DvlAdapter:
+    covariance = CovarianceFields(fields=("velocity_covariance",), negative="invalid", zero="unknown")
+    return DvlAdapter(type=type_name, velocity=_xyz("velocity"), covariance=covariance)
+
+
+IMU = ImuAdapter(
+    type="sensor_msgs/msg/Imu",
+    angular_velocity=_xyz("angular_velocity"),
+    angular_velocity_status="angular_velocity_covariance[0]",
+    linear_acceleration=_xyz("linear_acceleration"),
+    linear_acceleration_status="linear_acceleration_covariance[0]",
+)
+MARINE_DVL = DvlAdapter(
+    type="marine_acoustic_msgs/msg/Dvl",
+    velocity=_xyz("velocity"),
+    covariance=CovarianceFields(fields=("velocity_covar",)),
+    valid_where={"velocity_mode": 1},
+    good_beams="num_good_beams",
+    beam_unit_vectors=_xyz("beam_unit_vec"),
+    beam_ranges="range",
+    beam_ranges_valid="beam_ranges_valid",
+    sound_speed="sound_speed",
+)
+TWIST = DvlAdapter(
+    type="geometry_msgs/msg/TwistWithCovarianceStamped",
+    velocity=_xyz("twist.twist.linear"),
+    covariance=CovarianceFields(fields=("twist.covariance",)),
+)
+ODOMETRY_TWIST = TWIST.model_copy(update={"type": "nav_msgs/msg/Odometry", "frame_id_field": "child_frame_id"})
+PRESSURE = DepthAdapter(
+    type="sensor_msgs/msg/FluidPressure", pressure="fluid_pressure", variance=CovarianceFields(fields=("variance",))
+)
+HEIGHT_OF_POSE = DepthAdapter(type="geometry_msgs/msg/PoseStamped", height="pose.position.z", frame_id_field=None)
+HEIGHT_OF_POSE_WITH_COVARIANCE = DepthAdapter(
+    type="geometry_msgs/msg/PoseWithCovarianceStamped",
+    height="pose.pose.position.z",
+    variance=CovarianceFields(fields=("pose.covariance[14]",)),
+    frame_id_field=None,
+)
+ODOMETRY_TRUTH = _poses("nav_msgs/msg/Odometry", "pose.pose", "pose.covariance")
+POSE_TRUTH = _poses("geometry_msgs/msg/PoseStamped", "pose", None)
+POSE_WITH_COVARIANCE_TRUTH = _poses("geometry_msgs/msg/PoseWithCovarianceStamped", "pose.pose", "pose.covariance")
+PROJECTED_SONAR_IMAGE = SonarAdapter(
+    type="marine_acoustic_msgs/msg/ProjectedSonarImage",
+    data="image.data",
+    ranges="ranges",
+    directions=_xyz("beam_directions"),
+    sample_type="image.dtype",
+    big_endian="image.is_bigendian",
+)
+OCULUS_PING = SonarAdapter(
+    type="oculus_interfaces/msg/Ping",
+    data="ping_data",
+    range_resolution="range_resolution",
+    bearings="bearings",
+    bearing_unit_deg=0.01,
+    sample_bytes="sample_size",
+    row_gains="has_gains",
+    row_bytes="step",
+)
+SHIPPED: dict[str, tuple[Shipped, ...]] = {
+    "imu": (Shipped(IMU),),
+    "dvl": (
+        Shipped(MARINE_DVL),
+        Shipped(_water_linked("cov.x", "cov.y", "cov.z")),
+        Shipped(_water_linked("covariance")),
+        Shipped(_water_linked("fom", meaning="standard deviation")),
+        *(Shipped(_uuv(name)) for name in _UUV_DVL_TYPES),
+        Shipped(TWIST, _DVL_WORDS, is_general=True),
+        Shipped(ODOMETRY_TWIST, _DVL_WORDS, is_general=True),
+    ),
+    "depth": (
+        Shipped(PRESSURE),
+        Shipped(HEIGHT_OF_POSE_WITH_COVARIANCE, _DEPTH_WORDS),
+        Shipped(HEIGHT_OF_POSE, _DEPTH_WORDS),
+    ),
+    "detections": (
+        Shipped(DetectionListsAdapter(type="sonar_graph_msgs/msg/LandmarkDetections")),
+        Shipped(DetectionArrayAdapter(type="vision_msgs/msg/Detection3DArray"), _LANDMARK_WORDS, is_general=True),
+    ),
+    "truth": (
+        Shipped(ODOMETRY_TRUTH, TRUTH_WORDS),
+        Shipped(POSE_WITH_COVARIANCE_TRUTH, TRUTH_WORDS, is_general=True),
+        Shipped(POSE_TRUTH, TRUTH_WORDS, is_general=True),
+    ),
+    "true_landmarks": (Shipped(LandmarkMapAdapter(type="sonar_graph_msgs/msg/LandmarkMap"), TRUTH_WORDS),),
+    "sonar": (Shipped(PROJECTED_SONAR_IMAGE), Shipped(OCULUS_PING)),
+}
+"""By role; of several for one type the first whose fields a message has is taken."""

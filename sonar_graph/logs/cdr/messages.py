@@ -1,0 +1,280 @@
+"""ROS 2 messages as columns: CDR payloads read and written many at a time.
+
+The `Layout` of a payload is worked out once, by walking the type's `Plan`; all payloads whose length words are the same
+share it, and a field of all of them is one strided view of their bytes. The same walk, given the lengths instead of
+reading them, tells where to put each column when writing.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import as_strided
+from numpy.typing import NDArray
+
+from sonar_graph.logs.cdr.definitions import Struct
+from sonar_graph.logs.cdr.layout import (
+    ENCAPSULATIONS,
+    LENGTH_BYTES,
+    Bytes,
+    DecodingStep,
+    Layout,
+    PayloadColumn,
+    Text,
+    UnsoundMessageError,
+    layout_of,
+    plan_of,
+    unsound_contents,
+)
+from sonar_graph.measurements import Ints
+
+Value = NDArray[Any] | float | str | Sequence[str]
+Lengths = Mapping[str, int | Sequence[int]]
+_ROWS_COMPARED_PER_WALK = 32
+"""Comparing a payload with a layout costs about this much less than walking it."""
+_LAYOUTS_REMEMBERED = 8
+"""Of each payload length, from one part of a topic to the next."""
+
+
+@dataclass(frozen=True)
+class Messages:
+    """Decoded messages of one type that share a layout; ``messages["angular_velocity.x"]`` is a column."""
+
+    rows: Ints
+    """Which messages of the topic these are, counted from 0 in the order of the log; shape (n,)."""
+    payloads: Bytes
+    """Shape (n, size)."""
+    layout: Layout
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, path: str) -> NDArray[Any]:
+        """Values of a numeric field: shape (n,) for a single one, (n, m) within arrays.
+
+        Raises
+        ------
+        KeyError
+            When the type has no such field, or it holds no values itself.
+        """
+        column = self.layout.column(path)
+        values = _view(self.payloads, column)
+        if values is None:
+            values = np.ascontiguousarray(self.payloads[:, _places(column)]).view(column.dtype)
+        return values[:, 0] if column.is_single else values
+
+    def lengths(self, path: str) -> list[int]:
+        """Numbers of elements of an array or sequence: one each time it occurs in a message, the same in all."""
+        return self.layout.lengths(path)
+
+    def strings(self, path: str) -> list[list[str]]:
+        """Values of a string field, for each message one of each occurrence."""
+        column = self.layout.column(path)
+        runs = [(start, start + count - 1) for start, count in zip(column.starts, column.counts, strict=True)]
+        contents = (payload.tobytes() for payload in self.payloads)
+        return [
+            [str(content[start:end], "utf-8") if end > start else "" for start, end in runs] for content in contents
+        ]
+
+    def first_string(self, path: str) -> str:
+        """A string field's value in the first message; empty where there is none."""
+        if path not in self.layout.columns:
+            return ""
+        return next(iter(Messages(self.rows[:1], self.payloads[:1], self.layout).strings(path)[0]), "")
+
+
+class Decoded(NamedTuple):
+    """What became of payloads."""
+
+    groups: list[Messages]
+    """Sound messages by layout."""
+    unsound: dict[str, Ints]
+    """Rows of the others by what is wrong with them, which completes "3 messages ..."."""
+
+
+def decode(definition: Struct, payloads: Iterable[tuple[Ints, Bytes]]) -> Decoded:
+    """Messages grouped by layout; those that are not what their definition says are named and left out.
+
+    Parameters
+    ----------
+    definition
+        Of the messages' type.
+    payloads
+        For each length that occurs: which messages have it, shape (n,), and their bytes, shape (n, length).
+    """
+    return Decoder(definition).decode(payloads)
+
+
+class Decoder:
+    """Decodes messages of one type part by part; layouts met before are tried first."""
+
+    def __init__(self, definition: Struct) -> None:
+        self._plan = plan_of(definition)
+        self._known: dict[int, list[Layout]] = defaultdict(list)
+        self._unsound: dict[str, list[Ints]] = defaultdict(list)
+
+    def decode(self, payloads: Iterable[tuple[Ints, Bytes]]) -> Decoded:
+        """As the function `decode`."""
+        self._unsound.clear()
+        groups = [group for rows, stack in payloads for group in self._groups(rows, stack)]
+        return Decoded(groups, {fault: np.concatenate(parts) for fault, parts in self._unsound.items()})
+
+    def _groups(self, rows: Ints, stack: Bytes) -> Iterator[Messages]:
+        for layout, members in self._by_layout(rows, stack):
+            payloads = _members(stack, members)
+            is_sound = np.ones(len(members), bool)
+            for fault, has_it in unsound_contents(layout, payloads):
+                self._unsound[fault].append(rows[members[has_it & is_sound]])
+                is_sound &= ~has_it
+            if is_sound.all():
+                yield Messages(rows[members], payloads, layout)
+            elif is_sound.any():
+                yield Messages(rows[members[is_sound]], payloads[is_sound], layout)
+
+    def _by_layout(self, rows: Ints, stack: Bytes) -> Iterator[tuple[Layout, Ints]]:
+        known = self._known[stack.shape[1]]
+        left = np.arange(len(stack))
+        for layout in known:
+            same = layout.same(stack, left)
+            if same.any():
+                yield layout, left[same]
+                left = left[~same]
+        while left.size:
+            found = self._layout(rows[left[0]], stack[left[0]])
+            if found is None:
+                left = left[1:]
+                continue
+            same = found.same(stack, left) if left.size > 1 else np.ones(1, bool)
+            yield found, left[same]
+            if np.count_nonzero(same) * _ROWS_COMPARED_PER_WALK < left.size:
+                yield from self._one_by_one(rows, stack, left[~same])
+                return
+            left = left[~same]
+            known[_LAYOUTS_REMEMBERED - 1 :] = [found]
+
+    def _one_by_one(self, rows: Ints, stack: Bytes, left: Ints) -> Iterator[tuple[Layout, Ints]]:
+        """Walk every payload, where hardly two have the same layout."""
+        found: dict[tuple[object, ...], tuple[Layout, list[int]]] = {}
+        for member in left.tolist():
+            layout = self._layout(rows[member], stack[member])
+            if layout is not None:
+                found.setdefault((layout.byte_order, *layout.words), (layout, []))[1].append(member)
+        for layout, members in found.values():
+            yield layout, np.array(members)
+
+    def _layout(self, row: int, payload: Bytes) -> Layout | None:
+        try:
+            return layout_of(self._plan, payload.data)
+        except UnsoundMessageError as fault:
+            self._unsound[str(fault)].append(np.array([row]))
+            return None
+
+
+def _members(stack: Bytes, members: Ints) -> Bytes:
+    """Some payloads, as a view where they lie side by side."""
+    first, last = int(members[0]), int(members[-1])
+    return stack[first : last + 1] if last - first + 1 == len(members) else stack[members]
+
+
+def encode(definition: Struct, n: int, values: Mapping[str, Value], lengths: Lengths | None = None) -> Bytes:
+    """Payloads of n messages that share a layout; what is not given is zero or empty.
+
+    Parameters
+    ----------
+    definition
+        Of the messages' type.
+    n
+        Number of messages.
+    values
+        By path. Numbers: anything that broadcasts to shape (n,), or (n, m) within arrays, where m also is the length
+        of a sequence of numbers. Strings: one for all, or a list with one for each occurrence in a message.
+    lengths
+        Number of elements of sequences by path, for all occurrences in a message or for each; needed for sequences of
+        structs, and of numbers within those.
+
+    Returns
+    -------
+    NDArray[uint8]
+        Shape (n, size).
+
+    Raises
+    ------
+    ValueError
+        For a field that the type does not have, and a number that does not fit into its field.
+    """
+    plan = plan_of(definition)
+    unknown = values.keys() - plan.leaves.keys()
+    if unknown:
+        raise ValueError(f"{definition.name} has no field {', '.join(sorted(unknown))}")
+    layout = Layout(plan, "<", plan.walk(_given_lengths(values, lengths or {})))
+    payloads = np.zeros((n, layout.size), np.uint8)
+    payloads[:, : len(ENCAPSULATIONS["<"])] = np.frombuffer(ENCAPSULATIONS["<"], np.uint8)
+    for at, length in layout.words:
+        payloads[:, at : at + LENGTH_BYTES] = np.frombuffer(length.to_bytes(LENGTH_BYTES, "little"), np.uint8)
+    for path, value in values.items():
+        _fill(payloads, path, layout.column(path), value)
+    return payloads
+
+
+def _given_lengths(values: Mapping[str, Value], lengths: Lengths) -> Callable[[DecodingStep, int], int]:
+    texts = {path: iter(value) for path, value in values.items() if isinstance(value, list)}
+    each = {path: iter(length) for path, length in lengths.items() if not isinstance(length, int)}
+
+    def length_of(step: DecodingStep, _: int) -> int:
+        value = values.get(step.path)
+        if isinstance(step, Text):
+            text = next(texts[step.path]) if step.path in texts else value or ""
+            return len(str(text).encode()) + 1
+        if step.path in each:
+            return next(each[step.path])
+        given = lengths.get(step.path)
+        if isinstance(given, int):
+            return given
+        return value.shape[1] if isinstance(value, np.ndarray) else len(value) if isinstance(value, list) else 0
+
+    return length_of
+
+
+def _fill(payloads: Bytes, path: str, column: PayloadColumn, value: Value) -> None:
+    if isinstance(value, str | list):
+        texts = [value] * len(column.starts) if isinstance(value, str) else value
+        characters = b"".join(str(text).encode() + b"\0" for text in texts)
+        payloads[:, _places(column)] = np.frombuffer(characters, np.uint8)
+        return
+    given = np.asarray(value)
+    with np.errstate(invalid="ignore"):  # the next line finds it
+        numbers = given.astype(column.dtype)
+    if column.dtype.kind in "iu" and not np.array_equal(numbers, given):
+        raise ValueError(f"{path}: a number does not fit into {column.dtype}")
+    numbers = numbers.reshape(-1, 1) if numbers.ndim == 1 and column.is_single else numbers
+    numbers = np.broadcast_to(numbers, (len(payloads), sum(column.counts)))
+    view = _view(payloads, column)
+    if view is None:
+        payloads[:, _places(column)] = np.ascontiguousarray(numbers).view(np.uint8)
+    else:
+        view[...] = numbers
+
+
+def _view(payloads: Bytes, column: PayloadColumn) -> NDArray[Any] | None:
+    """A column without copying, shape (n, m); None where its stretches are not evenly spaced single values."""
+    starts, size = column.starts, column.dtype.itemsize
+    if not starts:
+        return np.empty((len(payloads), 0), column.dtype)
+    values = payloads[:, starts[0] : starts[0] + column.counts[0] * size].view(column.dtype)
+    if len(starts) == 1:
+        return values
+    spacing = starts[1] - starts[0]
+    if any(count != 1 for count in column.counts) or starts != list(range(starts[0], starts[-1] + 1, spacing)):
+        return None
+    return as_strided(values, (len(payloads), len(starts)), (values.strides[0], spacing))
+
+
+def _places(column: PayloadColumn) -> Ints:
+    """Offsets of all bytes of a column, in order."""
+    sizes = np.array(column.counts, np.int64) * column.dtype.itemsize
+    within = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return np.repeat(np.array(column.starts, np.int64), sizes) + within

@@ -1,0 +1,131 @@
+"""Text files of numbers, read with errors that name the file and the line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from sonar_graph.errors import DatasetError
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.sequence import NS_PER_S
+
+
+@dataclass(frozen=True, eq=False)
+class NumberTable:
+    """Rows of a text file."""
+
+    path: Path
+    first: list[str]
+    """First field of every row, as written; length n."""
+    values: Floats
+    """All fields of every row, shape (n, number of columns)."""
+
+    def stamps_ns(self) -> Ints:
+        """The first field as integer nanoseconds, shape (n,)."""
+        return np.array([decimal_ns(text) for text in self.first], dtype=np.int64)
+
+
+def decimal_ns(seconds: str) -> int:
+    """Nanoseconds of a decimal number of seconds, rounded once.
+
+    A double cannot tell apart neighbouring nanoseconds of times counted from 1970; the text can.
+
+    Raises
+    ------
+    ValueError
+        When the text is no finite number.
+    """
+    try:
+        return int((Decimal(seconds) * NS_PER_S).to_integral_value())
+    except (InvalidOperation, OverflowError, ValueError) as error:
+        raise ValueError(f"{seconds!r} is no finite decimal number") from error
+
+
+def read_table(
+    path: Path, columns: tuple[str, ...], *, delimiter: str | None = None, header_lines: int = 0
+) -> NumberTable:
+    """Read a table whose every field is a finite number.
+
+    Parameters
+    ----------
+    path
+        Text file; blank lines and lines that begin with ``#`` are passed over.
+    columns
+        Names of the columns, for the error and for their number.
+    delimiter
+        None: white space.
+    header_lines
+        Lines at the top that are no data.
+
+    Raises
+    ------
+    DatasetError
+        When the file is missing, has no row, or a row does not hold as many numbers as there are columns.
+    """
+    first: list[str] = []
+    rows: list[list[float]] = []
+    for number, fields in read_lines(path, f"rows of {', '.join(columns)}", delimiter, header_lines):
+        rows.append(numbers(path, number, fields, columns))
+        first.append(fields[0])
+    return NumberTable(path, first, np.array(rows))
+
+
+def read_lines(
+    path: Path, expected: str, delimiter: str | None = None, header_lines: int = 0
+) -> Iterator[tuple[int, list[str]]]:
+    """Line number (from 1) and fields of every line with content.
+
+    Raises
+    ------
+    DatasetError
+        When the file cannot be read or holds no such line; ``expected`` says what should have been there.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(
+            f"{path}: cannot be read as text ({getattr(error, 'strerror', None) or error}); expected {expected}"
+        ) from error
+    empty = True
+    for number, line in enumerate(lines[header_lines:], start=header_lines + 1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            empty = False
+            yield number, line.split(delimiter)
+    if empty:
+        raise DatasetError(f"{path}: holds no data; expected {expected}")
+
+
+def numbers(path: Path, number: int, fields: list[str], columns: tuple[str, ...]) -> list[float]:
+    """The fields of one line as finite numbers.
+
+    Raises
+    ------
+    DatasetError
+        Naming the line and the columns expected.
+    """
+    expected = f"expected {len(columns)} numbers: {', '.join(columns)}"
+    if len(fields) != len(columns):
+        raise DatasetError(f"{path}, line {number}: {len(fields)} fields; {expected}")
+    try:
+        values = [float(field) for field in fields]
+    except ValueError as error:
+        raise DatasetError(f"{path}, line {number}: {error}; {expected}") from error
+    if not np.isfinite(values).all():
+        raise DatasetError(f"{path}, line {number}: a number is not finite; {expected}")
+    return values
+
+
+def require_folder(folder: Path, expected: str) -> None:
+    """Refuse a data set's folder that is none.
+
+    Raises
+    ------
+    DatasetError
+        Saying what the folder should hold.
+    """
+    if not folder.is_dir():
+        raise DatasetError(f"{folder}: is not a folder; give the folder that holds {expected}")

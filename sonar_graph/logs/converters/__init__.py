@@ -1,1 +1,0 @@
-"""Public data sets as sequences, one module a data set."""

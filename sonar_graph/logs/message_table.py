@@ -1,0 +1,175 @@
+"""The messages of a topic as one table: columns over all rows, stamps, and which rows are fit for use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_graph.errors import LogError
+from sonar_graph.logs.cdr import Messages
+from sonar_graph.logs.mcap import Topic
+from sonar_graph.measurements import Ints
+
+NS_PER_S = 1_000_000_000
+Dropped = dict[str, int]
+"""How many rows were left out, by reason."""
+NOT_FINITE = "with values that are not finite"
+LOG_TIME = "log"
+"""In the place of a stamp's field: the time of recording."""
+
+
+def header_stamps_ns(group: Messages, log_times_ns: Ints, prefix: str = "header.stamp.") -> Ints:
+    """Stamps of messages from their headers, shape (n,); the log's time where a header's stamp is zero.
+
+    Parameters
+    ----------
+    group
+        n messages.
+    log_times_ns
+        Of all messages of the topic.
+    prefix
+        Of the stamp's two fields.
+    """
+    stamps_ns = group[f"{prefix}sec"].astype(np.int64) * NS_PER_S + group[f"{prefix}nanosec"]
+    return np.where(stamps_ns == 0, log_times_ns[group.rows], stamps_ns)
+
+
+class MessageTable:
+    """All messages of a topic whose fields of interest have the same size in each.
+
+    Parameters
+    ----------
+    topic
+        With its payloads.
+    stamp
+        The field with the time of validity: a Time, or a number; ``log`` takes the time of recording.
+    stamp_unit_s
+        Of the stamp, where it is a number.
+    stamp_offset_s
+        Added to every stamp.
+
+    Raises
+    ------
+    LogError
+        Naming file, topic and field where the messages are not what their definition says.
+    """
+
+    def __init__(
+        self, topic: Topic, stamp: str = "header.stamp", stamp_unit_s: float = 1.0, stamp_offset_s: float = 0.0
+    ) -> None:
+        self.topic = topic
+        self.groups = topic.messages()
+        if not self.groups:
+            faults = ", ".join(f"{count} {fault}" for fault, count in topic.unsound.items())
+            raise LogError(f"{topic.file}: topic {topic.name}: no message is what its definition says: {faults}")
+        log_times_ns = topic.log_times_ns
+        if stamp == LOG_TIME:
+            self.stamps_ns = log_times_ns
+        elif self.has(stamp):
+            self.stamps_ns = _nanoseconds(self.column(stamp), stamp_unit_s)
+        else:
+            self._require(f"{stamp}.sec")
+            self.stamps_ns = np.empty(len(topic), np.int64)
+            for group in self.groups:
+                self.stamps_ns[group.rows] = header_stamps_ns(group, log_times_ns, f"{stamp}.")
+        if stamp_offset_s:
+            self.stamps_ns = self.stamps_ns + round(stamp_offset_s * NS_PER_S)
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def has(self, path: str) -> bool:
+        """Whether every message has a field with values."""
+        return all(field_of(path)[0] in group.layout.columns for group in self.groups)
+
+    def column(self, path: str) -> NDArray[Any]:
+        """A field over all rows, shape (n,) or (n, m); ``a.b[2]`` is one element of an array, shape (n,)."""
+        self._require(path)
+        name, index = field_of(path)
+        parts = [group[name] for group in self.groups]
+        if len({part.shape[1:] for part in parts}) > 1:
+            self.refuse(name, "has more elements in some messages than in others")
+        values = np.empty((len(self.topic), *parts[0].shape[1:]), parts[0].dtype.newbyteorder("="))
+        for group, part in zip(self.groups, parts, strict=True):
+            values[group.rows] = part
+        if index is None:
+            return values
+        if values.ndim == 1 or index >= values.shape[1]:
+            self.refuse(path, f"has {values.shape[1] if values.ndim > 1 else 'no'} elements")
+        return values[:, index]
+
+    def columns(self, prefix: str, names: str) -> NDArray[Any]:
+        """Fields side by side, shape (n, m): ``columns("velocity", "xyz")``."""
+        return self.beside([f"{prefix}.{name}" for name in names])
+
+    def beside(self, paths: Sequence[str]) -> NDArray[Any]:
+        """Fields of one number a message side by side, shape (n, m)."""
+        found = [self.column(path) for path in paths]
+        for path, column in zip(paths, found, strict=True):
+            if column.ndim > 1:
+                self.refuse(path, f"is an array of {column.shape[1]}; name one element, such as {path}[0]")
+        return np.column_stack(found)
+
+    def first_string(self, path: str) -> str:
+        """A string field of the first message; empty where there is no such field."""
+        return self.groups[0].first_string(path)
+
+    def refuse(self, path: str, fault: str) -> NoReturn:
+        """Raise a `LogError` about a field."""
+        topic = self.topic
+        raise LogError(f"{topic.file}: topic {topic.name}: field {path} of {topic.type_name} {fault}")
+
+    def _require(self, path: str) -> None:
+        if not self.has(path):
+            topic = self.topic
+            raise LogError(f"{topic.file}: topic {topic.name}: its {topic.type_name} has no field {path}")
+
+
+def field_of(path: str) -> tuple[str, int | None]:
+    """Field and index of a path: ``("a.b", 2)`` for ``a.b[2]``."""
+    name, bracket, rest = path.partition("[")
+    return name, int(rest.rstrip("]")) if bracket else None
+
+
+def _nanoseconds(values: NDArray[Any], unit_s: float) -> Ints:
+    """Exact where the unit is a whole number of nanoseconds; what is not finite counts as 0."""
+    unit_ns = unit_s * NS_PER_S
+    finite = np.where(np.isfinite(values), values, 0)
+    if unit_ns < 1 or abs(unit_ns - round(unit_ns)) > 1e-9 * unit_ns:
+        return np.rint(finite * unit_ns).astype(np.int64)
+    whole = np.floor(finite)
+    return whole.astype(np.int64) * round(unit_ns) + np.rint((finite - whole) * unit_ns).astype(np.int64)
+
+
+def not_finite(*columns: NDArray[Any]) -> NDArray[np.bool_]:
+    """Rows in which some column has a value that is not finite, shape (n,)."""
+    return ~np.all([np.isfinite(c).reshape(len(c), -1).all(axis=1) for c in columns], axis=0)
+
+
+def fit_rows(stamps_ns: Ints, faults: Mapping[str, NDArray[np.bool_]], *, unique: bool) -> tuple[Ints, dict[str, int]]:
+    """The rows fit for use in the order of their stamps, and how many are not, by fault.
+
+    Parameters
+    ----------
+    stamps_ns
+        Shape (n,).
+    faults
+        Which rows have it, shape (n,), by the fault's name; a row counts for the first only.
+    unique
+        Refuse all but the first of rows with the same stamp.
+    """
+    fit = np.ones(len(stamps_ns), bool)
+    counts = {}
+    for fault, has_it in faults.items():
+        counts[fault] = int(np.count_nonzero(fit & has_it))
+        fit &= ~has_it
+    rows: Ints = np.flatnonzero(fit).astype(np.int64)
+    rows = rows[np.argsort(stamps_ns[rows], kind="stable")]
+    if unique and rows.size:
+        again = np.diff(stamps_ns[rows], prepend=stamps_ns[rows[0]] - 1) == 0
+        counts["with the stamp of another"] = int(np.count_nonzero(again))
+        rows = rows[~again]
+    return rows, {fault: count for fault, count in counts.items() if count}

@@ -1,0 +1,119 @@
+"""Trajectories in the TUM format and landmarks as CSV: text files that other tools read.
+
+TUM: one line a pose, ``t x y z qx qy qz qw``, seconds and metres
+(https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats).
+"""
+
+from __future__ import annotations
+
+import csv
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from sonar_graph.errors import LogError
+from sonar_graph.logs.message_table import NS_PER_S
+from sonar_graph.states import LandmarkMap, Trajectory
+
+LANDMARK_COLUMNS = ("id", "x_m", "y_m", "z_m", "cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
+_UPPER = np.triu_indices(3)
+_VALUES = 8
+_LINE = "%s" + " %.17g" * (_VALUES - 1) + "\n"
+"""17 digits: no bit of a double is lost, and they take less than half the time of the fewest digits that keep it."""
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write poses; stamps with nine decimals made from integers, so that no nanosecond is lost.
+
+    Raises
+    ------
+    LogError
+        When the file cannot be written.
+    """
+    poses = np.hstack([trajectory.positions, trajectory.quaternions_xyzw]).tolist()
+    stamps_ns = trajectory.stamps_ns.tolist()
+    lines = [_LINE % (_seconds(stamp_ns), *pose) for stamp_ns, pose in zip(stamps_ns, poses, strict=True)]
+    _write(path, "".join(lines))
+
+
+def _seconds(stamp_ns: int) -> str:
+    sign = "-" if stamp_ns < 0 else ""
+    seconds, nanoseconds = divmod(abs(stamp_ns), NS_PER_S)
+    return f"{sign}{seconds}.{nanoseconds:09d}"
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read poses; blank lines and those that begin with ``#`` are passed over. Covariances are unknown.
+
+    Raises
+    ------
+    LogError
+        Naming the line that is not a pose; or when the file cannot be read or its stamps do not increase.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise LogError(f"{path} cannot be read as a text file: {error}") from error
+    rows = [
+        _pose(path, number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")
+    ]
+    stamps_ns = np.array([stamp for stamp, _ in rows], np.int64)
+    values = np.array([pose for _, pose in rows]).reshape(-1, _VALUES - 1)
+    backwards = np.flatnonzero(np.diff(stamps_ns) <= 0)
+    if backwards.size:
+        raise LogError(f"{path}: pose {backwards[0] + 2} is not later than the one before; sort the lines by time")
+    return Trajectory.without_covariances(stamps_ns, values[:, :3], values[:, 3:])
+
+
+def _pose(path: Path, number: int, line: str) -> tuple[int, list[float]]:
+    try:
+        stamp, *pose = line.split()
+        if len(pose) == _VALUES - 1:
+            return int((Decimal(stamp) * NS_PER_S).to_integral_value()), [float(value) for value in pose]
+    except (InvalidOperation, ValueError, OverflowError) as error:
+        raise LogError(f"{path}, line {number}: {line!r} has something that is no number") from error
+    raise LogError(f"{path}, line {number}: {len(pose) + 1} values; a pose has {_VALUES}: t x y z qx qy qz qw")
+
+
+def write_landmarks_csv(path: Path, landmarks: LandmarkMap) -> None:
+    """Write positions and the upper triangles of their covariances (m, m²), one line a landmark.
+
+    Raises
+    ------
+    LogError
+        When the file cannot be written.
+    """
+    lines = [",".join(LANDMARK_COLUMNS)]
+    triangles = landmarks.covariances[:, _UPPER[0], _UPPER[1]]
+    numbers = np.hstack([landmarks.positions, triangles]).tolist()
+    lines += [f"{i},{','.join(map(repr, row))}" for i, row in zip(landmarks.ids.tolist(), numbers, strict=True)]
+    _write(path, "\n".join(lines) + "\n")
+
+
+def read_landmarks_csv(path: Path) -> LandmarkMap:
+    """Read what `write_landmarks_csv` wrote.
+
+    Raises
+    ------
+    LogError
+        When the file cannot be read, or a column is missing or not a number.
+    """
+    try:
+        with Path(path).open(encoding="utf-8", newline="") as stream:
+            rows = [[float(row[name]) for name in LANDMARK_COLUMNS] for row in csv.DictReader(stream)]
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise LogError(f"{path} is not a landmark table with columns {','.join(LANDMARK_COLUMNS)}: {error}") from error
+    table = np.array(rows).reshape(-1, len(LANDMARK_COLUMNS))
+    covariances = np.empty((len(table), 3, 3))
+    covariances[:, _UPPER[0], _UPPER[1]] = covariances[:, _UPPER[1], _UPPER[0]] = table[:, 4:]
+    order = np.argsort(table[:, 0])
+    return LandmarkMap(table[order, 0].astype(np.int64), table[order, 1:4], covariances[order])
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise LogError(f"{path} cannot be written: {error.strerror}") from error

@@ -1,0 +1,121 @@
+"""Noise density of a still sensor, by the overlapping Allan deviation.
+
+With means over tau, ``y_i``, of a signal sampled every dt, m = tau / dt and N samples::
+
+    sigma^2(tau) = 1 / (2 (N - 2 m + 1)) sum_i (y_{i+m} - y_i)^2
+
+White noise of root spectral density N has ``sigma(tau) = N / sqrt(tau)``: at one second the deviation is the density
+(IEEE Std 952). How far it can be trusted follows from the equivalent degrees of freedom of overlapping estimates of
+white noise (W. J. Riley, Handbook of Frequency Stability Analysis, NIST SP 1065, 2008, table 5)::
+
+    edf = [3 (N' - 1) / (2 m) - 2 (N' - 2) / N'] 4 m^2 / (4 m^2 + 5),    N' = N + 1
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sonar_graph.measurements import Floats, Imu
+from sonar_graph.navigation.alignment.time_offset import Estimate1D
+
+TAU_S = 1.0
+LEAST_STILL_S = 30.0
+WINDOW_S = 1.0
+GYRO_MOTION_RAD_S = 0.005
+ACCEL_MOTION_M_S2 = 0.05
+"""A second whose mean differs from the last by more than this and five times what noise does is no rest."""
+QUIET_SHARE = 0.1
+LARGEST_SPREAD = 1.5
+"""Times the spread within the quietest tenth of all seconds."""
+
+
+@dataclass(frozen=True)
+class NoiseDensities:
+    """Of the noisiest axis of each kind."""
+
+    still_s: float
+    """Length of the longest rest; the densities are from there."""
+    gyro: Estimate1D
+    """rad/s/√Hz."""
+    accel: Estimate1D
+    """m/s²/√Hz."""
+
+
+def allan_deviation(samples: Floats, together: int) -> Floats:
+    """Overlapping Allan deviation over so many samples of each column, shape (columns,).
+
+    Parameters
+    ----------
+    samples
+        Shape (n, columns), n at least twice ``together``.
+    """
+    sums = np.cumsum(np.concatenate([np.zeros((1, samples.shape[1])), samples]), axis=0)
+    means = (sums[together:] - sums[:-together]) / together
+    steps = means[together:] - means[:-together]
+    return np.asarray(np.sqrt(0.5 * np.mean(steps**2, axis=0)))
+
+
+def degrees_of_freedom(count: int, together: int) -> float:
+    """Of an overlapping estimate over so many samples together, of white noise."""
+    n, m = count + 1, together
+    return (3 * (n - 1) / (2 * m) - 2 * (n - 2) / n) * 4 * m**2 / (4 * m**2 + 5)
+
+
+def density(samples: Floats, rate_hz: float) -> Estimate1D:
+    """Root spectral density of the noisiest column at one second.
+
+    Parameters
+    ----------
+    samples
+        Of a still sensor, shape (n, columns), over at least some seconds.
+    """
+    together = max(1, round(TAU_S * rate_hz))
+    tau_s = together / rate_hz
+    value = float(allan_deviation(samples, together).max()) * np.sqrt(tau_s)
+    return Estimate1D(value, value / np.sqrt(2 * degrees_of_freedom(len(samples), together)))
+
+
+def noise_densities(imu: Imu) -> NoiseDensities:
+    """Densities from the longest rest in a log, if it is long enough."""
+    rest = longest_rest(imu)
+    seconds = (imu.stamps_ns[rest] - imu.stamps_ns[0]) * 1e-9
+    still_s = float(seconds[-1] - seconds[0]) if len(seconds) > 1 else 0.0
+    if still_s < LEAST_STILL_S:
+        moving = Estimate1D(np.nan, np.inf, f"never still for {LEAST_STILL_S:g} s")
+        return NoiseDensities(still_s, moving, moving)
+    rate_hz = (len(seconds) - 1) / still_s
+    force = imu.specific_force[rest]
+    measured = np.isfinite(force).all()
+    accel = density(force, rate_hz) if measured else Estimate1D(np.nan, np.inf, "no accelerometers")
+    return NoiseDensities(still_s, density(imu.angular_velocity[rest], rate_hz), accel)
+
+
+def longest_rest(imu: Imu) -> slice:
+    """The longest run of rows in which the means over a second hardly change."""
+    second = ((imu.stamps_ns - imu.stamps_ns[0]) * (1e-9 / WINDOW_S)).astype(np.int64)
+    names, first, count = np.unique(second, return_index=True, return_counts=True)
+    still = _steady(imu.angular_velocity, first, count, GYRO_MOTION_RAD_S)
+    if np.isfinite(imu.specific_force).all():
+        still &= _steady(imu.specific_force, first, count, ACCEL_MOTION_M_S2)
+    still[1:] &= np.diff(names) == 1  # a hole in the log is no rest
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
+    if not len(edges):
+        return slice(0, 0)
+    begins, ends = edges[::2], edges[1::2]
+    longest = int(np.argmax(ends - begins))
+    last = ends[longest] - 1
+    return slice(int(first[begins[longest]]), int(first[last] + count[last]))
+
+
+def _steady(
+    values: Floats, first: np.ndarray, count: np.ndarray, least: float
+) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Seconds that vary no more than the quietest do, and whose mean is near that of the second before."""
+    means = np.add.reduceat(values, first, axis=0) / count[:, None]
+    spread = np.sqrt(np.maximum(np.add.reduceat(values**2, first, axis=0) / count[:, None] - means**2, 0.0))
+    quiet = np.quantile(spread, QUIET_SHARE, axis=0)
+    steps = np.abs(np.diff(means, axis=0, prepend=means[:1]))
+    near = steps <= least + 5.0 * quiet * np.sqrt(2.0 / np.median(count))
+    return np.asarray((near & (spread <= LARGEST_SPREAD * quiet + least)).all(axis=1))

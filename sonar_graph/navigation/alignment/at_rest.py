@@ -1,0 +1,154 @@
+"""Roll, pitch and gyro bias from a rest.
+
+At rest accelerometers feel gravity's reaction and gyros the Earth. With means over the length T of the rest, in body
+axes, u the world's up there, b_a and b_g the biases, a and N the noise densities, K the walk of the gyro bias::
+
+    mean f = g u + b_a + e_a,               cov(e_a) = a^2 / T
+    mean w = b_g + Omega sin(phi) u + Omega cos(phi) n + e_g,    cov(e_g) = N^2 / T + K^2 T / 3
+
+Hence ``u = mean f / |mean f|``, with the variance ``(sigma_a^2 + a^2 / T) / g^2`` across u, and at the end of the rest
+``b_g = mean w - Omega sin(phi) u``. It takes over the tilt's error, -Omega sin(phi) times it, and the level part of
+the Earth's rate, whose direction n needs a heading (`sonar_graph.navigation.alignment.gravity`). Without a latitude, the
+bias holds the Earth's rotation as the body lies; it is not in the covariance.
+
+Coarse levelling: P. D. Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd ed.,
+Artech House 2013, chapter 5.6.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.errors import AlignmentError
+from sonar_graph.measurements import Dvl, Floats, Imu
+from sonar_graph.navigation.alignment.gravity import (
+    InitialTilt,
+    angles_by_up,
+    earth_up_and_level,
+    in_body_axes,
+    roll_and_pitch,
+)
+
+BLOCK_S = 0.5
+"""Vibration above some hertz is not motion: means over so long are compared."""
+FEWEST_BLOCKS = 4
+LARGEST_NOISE_RATIO = 1.5
+"""Of the means' standard deviation to what the densities say, beyond chance."""
+FALSE_ALARM = 1e-6
+LARGEST_RATE_RAD_S = 0.02
+"""No bias is as large: the vehicle turns steadily."""
+LARGEST_SPEED_M_S = 0.02
+LARGEST_GRAVITY_ERROR = 0.05
+"""Share of gravity; beyond it units are others, or gravity was taken out."""
+
+
+def align_at_rest(imu: Imu, calibration: Calibration, dvl: Dvl | None = None) -> InitialTilt:
+    """Roll, pitch and gyro bias of a vehicle that does not move.
+
+    Parameters
+    ----------
+    imu
+        Of the rest, at least two seconds, and nothing else.
+    calibration
+        Noise densities, accelerometer bias, mountings, gravity, and the latitude if the Earth's rotation is to be
+        taken out of the bias. `gyro_bias_sigma` is not used: what is said of the bias is from the rest alone.
+    dvl
+        Velocities of the same time, as a further check that the vehicle rested.
+
+    Returns
+    -------
+    At the last row's stamp.
+
+    Raises
+    ------
+    AlignmentError
+        Where the vehicle moved, the rest is too short or has a hole, or there is no accelerometer.
+    """
+    imu = in_body_axes(imu, calibration)
+    _check_rest(imu, calibration)
+    if dvl is not None:
+        _check_speed(dvl, imu, calibration)
+    force, rate = imu.specific_force.mean(axis=0), imu.angular_velocity.mean(axis=0)
+    up = force / np.linalg.norm(force)
+    upward, _ = earth_up_and_level(calibration)
+    return InitialTilt(
+        int(imu.stamps_ns[-1]),
+        *roll_and_pitch(up),
+        rate - upward * up,
+        covariance_at_rest(up, _length_s(imu), calibration),
+        np.ones(3, dtype=np.bool_),
+    )
+
+
+def covariance_at_rest(up: Floats, rest_s: float, calibration: Calibration) -> Floats:
+    """Of [roll, pitch, gyro bias] after a rest of such a length, shape (5, 5).
+
+    Parameters
+    ----------
+    up
+        Unit vector ``body_R_world e_z``, shape (3,).
+    """
+    upward, level = earth_up_and_level(calibration)
+    sensors, across = calibration.imu, np.eye(3) - np.outer(up, up)
+    tilt = (sensors.accel_bias_sigma**2 + sensors.accel_noise_density**2 / rest_s) / calibration.gravity_m_s2**2
+    by_up = np.concatenate([angles_by_up(up), -upward * np.eye(3)])
+    covariance = by_up @ (tilt * across) @ by_up.T
+    noise = sensors.gyro_noise_density**2 / rest_s + sensors.gyro_bias_walk_density**2 * rest_s / 3.0
+    covariance[2:, 2:] += noise * np.eye(3) + 0.5 * level**2 * across
+    return np.asarray(covariance)
+
+
+def _length_s(imu: Imu) -> float:
+    """A mean of n samples is one over n intervals."""
+    return float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 * len(imu) / (len(imu) - 1)
+
+
+def _check_rest(imu: Imu, calibration: Calibration) -> None:
+    seconds = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
+    if seconds[-1] < FEWEST_BLOCKS * BLOCK_S:
+        raise AlignmentError(f"alignment: {seconds[-1]:.1f} s of IMU is too short; give {FEWEST_BLOCKS * BLOCK_S:g} s")
+    if np.diff(seconds).max() > 0.5 * BLOCK_S:
+        raise AlignmentError(f"Imu: {np.diff(seconds).max():.2f} s without a row; give a stretch without holes")
+    block = (seconds / BLOCK_S).astype(np.int64)
+    sensors = calibration.imu
+    _check_steady("Imu.specific_force", imu.specific_force, block, sensors.accel_noise_density, "accel_noise_density")
+    _check_steady("Imu.angular_velocity", imu.angular_velocity, block, sensors.gyro_noise_density, "gyro_noise_density")
+    rate = float(np.linalg.norm(imu.angular_velocity.mean(axis=0)))
+    if rate > LARGEST_RATE_RAD_S:
+        raise AlignmentError(
+            f"Imu.angular_velocity: turns at {rate:.3f} rad/s on average; no rest, give another stretch"
+        )
+    force, gravity = float(np.linalg.norm(imu.specific_force.mean(axis=0))), calibration.gravity_m_s2
+    if abs(force / gravity - 1.0) > LARGEST_GRAVITY_ERROR:
+        raise AlignmentError(
+            f"Imu.specific_force: {force:.2f} m/s² on average, not {gravity:.2f}; "
+            "check its unit, and that gravity is in it"
+        )
+
+
+def _check_steady(name: str, values: Floats, block: np.ndarray, density: float, field: str) -> None:
+    """Means over blocks vary as white noise of the density does."""
+    _, first, count = np.unique(block, return_index=True, return_counts=True)
+    means = (np.add.reduceat(values, first, axis=0) / count[:, None])[:-1]
+    freedom = means.size - means.shape[1]
+    ratio = np.sqrt(np.sum((means - means.mean(axis=0)) ** 2) * BLOCK_S / freedom)
+    allowed = LARGEST_NOISE_RATIO * np.sqrt(chi2.isf(FALSE_ALARM, freedom) / freedom) * density
+    if ratio > allowed:
+        raise AlignmentError(
+            f"{name}: varies as a density of {ratio:.2g}, not imu.{field} = {density:.2g}; "
+            "the vehicle moved (give another stretch, or align in motion), or the density is too small"
+        )
+
+
+def _check_speed(dvl: Dvl, imu: Imu, calibration: Calibration) -> None:
+    during = dvl.between(int(imu.stamps_ns[0]) - 1, int(imu.stamps_ns[-1]))
+    if during is None:
+        return
+    speed = float(np.linalg.norm(during.velocity.mean(axis=0)))
+    sigma = float(np.linalg.norm(calibration.dvl.velocity_sigma_m_s)) / np.sqrt(len(during))
+    if speed > LARGEST_SPEED_M_S + 5.0 * sigma:
+        raise AlignmentError(
+            f"Dvl.velocity: {speed:.3f} m/s on average; no rest, give another stretch or align in motion"
+        )

@@ -1,0 +1,408 @@
+"""Joint preintegration of gyro, accelerometer and Doppler log between two keyframes.
+
+From body frame i to body frame j, t seconds later, with world gravity g and every point of the body known by its place
+in it (a: the IMU, d: the Doppler log)::
+
+    R = i_R_j                              rotation
+    v = i_R_world (v_a,j - v_a,i - g t)           velocity that the accelerometer gained
+    p = i_R_world (a_j - a_i - v_a,i t - g t^2 / 2)     position that it gained
+    s = i_R_world (d_j - d_i)                     displacement by the Doppler log
+
+with one covariance of all twelve errors, since the gyros turn all of them and, with the rule "inertial", the
+accelerometer draws s between the Doppler samples. Each measurement enters once. Lever arms need no rates but over long
+intervals (`sonar_graph.navigation.preintegration.joint_preintegration`): v and p are those of the IMU's point, s that of the Doppler log's.
+Derivation: docs/theory/preintegration.md. After Forster et al., TRO 2017, section VI.
+
+What long times between rows ask of joint preintegration.
+
+Rule "inertial". What is straight in time is the velocity of the IMU's point less what the accelerometers gained; the
+log's own swings about it. Over long intervals the log's samples are therefore taken to the IMU's point by the gyros,
+``z - w x l``, and the log's way about that point, ``(R_j - R_i) l``, is added (`joint_recursion`). The gyros' noise at
+the two ends is then one with that of the samples.
+
+All other rules know nothing of the velocity between two samples: they refuse long intervals. No rule knows how the
+vehicle turned in a hole of the inertial rows (`sonar_graph.navigation.imu_gaps`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from math import isfinite
+
+import gtsam
+import numpy as np
+
+from sonar_graph.calibration import SHORTEST_HOLE_S, Calibration
+from sonar_graph.devices import is_partial
+from sonar_graph.errors import CalibrationError, MeasurementError
+from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.navigation.imu_gaps import row_after_hole
+from sonar_graph.navigation.preintegration.joint_recursion import LONG_S, RULES, DopplerRule, Inertial, preintegrate
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
+from sonar_graph.navigation.samples import (
+    finite_vector,
+    no_doppler_stamp,
+    require_covariances,
+    require_distinct_stamps,
+    require_nanoseconds,
+    require_noise,
+    require_order,
+)
+
+
+def refuse_beyond(longest_s: float, dvl_ns: Ints) -> None:
+    """Raise where Doppler samples are too far apart for a velocity that they alone shape.
+
+    Raises
+    ------
+    MeasurementError
+        Names the interval.
+    """
+    between_ns = np.diff(dvl_ns)
+    k = int(between_ns.argmax())
+    if between_ns[k] > longest_s * 1e9:
+        raise MeasurementError(
+            f"Dvl.stamps_ns: no row for {between_ns[k] * 1e-9:.3g} s after {dvl_ns[k]} ns, more than longest_s"
+            f' ({longest_s:g} s); use the rule "inertial", or let sonar_graph.navigation.odometry.Odometry bridge it'
+        )
+
+
+def refuse_holes(longest_s: float, imu_ns: Ints, first: int, last: int) -> None:
+    """Raise where inertial rows, from one to another, are too far apart to tell how the vehicle turned.
+
+    Raises
+    ------
+    MeasurementError
+        Names the hole.
+    """
+    row = row_after_hole(imu_ns, first, last, round(longest_s * 1e9))
+    if row >= 0:
+        raise MeasurementError(
+            f"Imu.stamps_ns: no row for {(imu_ns[row] - imu_ns[row - 1]) * 1e-9:.3g} s after {imu_ns[row - 1]} ns: the"
+            " turn in there is not measured; begin a motion after it, let sonar_graph.navigation.odometry.Odometry"
+            f" bridge it, or set longest_hole_s ({longest_s:g} s) higher if the vehicle hardly turns"
+        )
+
+
+def with_rate_noise(cov: Floats, dvl_ns: Ints, imu_ns: Ints, gyro_density: float, arm: Floats) -> Floats:
+    """Covariances of ``z - w x l`` at samples that begin or end a long interval, of z at others.
+
+    Parameters
+    ----------
+    cov
+        Of the samples z, body axes, shape (n, 3, 3), m²/s².
+    dvl_ns, imu_ns
+        Stamps.
+    gyro_density
+        rad/s/√Hz.
+    arm
+        l, from the IMU to the Doppler log, body axes, shape (3,), m.
+
+    Returns
+    -------
+    Shape (n, 3, 3), m²/s²: more by ``n_g² / dt [l]x [l]x^T`` with the mean time dt between inertial rows.
+    """
+    is_long = np.diff(dvl_ns) > LONG_S * 1e9
+    if not is_long.any():
+        return cov
+    at_end = np.r_[False, is_long] | np.r_[is_long, False]
+    rows_per_s = (len(imu_ns) - 1) * 1e9 / (imu_ns[-1] - imu_ns[0])
+    turned = gyro_density * gtsam.SO3.Hat(arm)
+    return cov + np.where(at_end[:, None, None], rows_per_s * turned @ turned.T, 0.0)
+
+
+ROTATION, VELOCITY, POSITION, DISPLACEMENT = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+"""Rows of a covariance and of derivatives."""
+GYRO, ACCEL, SCALE, MOUNTING = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 10)
+"""Columns of derivatives."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointMotion:
+    """Motion from body frame i to body frame j, a Doppler sample at either end.
+
+    Errors are ``[theta, dv, dp, ds]``: theta in frame j (``R Exp(theta)``), the others added in frame i. Where the
+    specific force was not measured, velocity and position and all that belongs to them are NaN.
+    """
+
+    i_R_j: gtsam.Rot3
+    velocity: Floats
+    """v, shape (3,), m/s."""
+    position: Floats
+    """p, shape (3,), m."""
+    displacement: Floats
+    """s, shape (3,), m."""
+    inner_covariance: Floats
+    """Shape (12, 12), without the noise of the two Doppler samples at the ends."""
+    D_parameters: Floats
+    """Derivatives of the errors by gyro bias, accelerometer bias, scale and mounting, shape (12, 10)."""
+    end_weights: tuple[Floats, Floats]
+    """Derivative of s by the velocity (body axes) of the first and of the last Doppler sample, shape (3, 3), s."""
+    end_covariances: tuple[Floats, Floats]
+    """Of these two samples, shape (3, 3), m²/s²."""
+    shared_covariance: Floats
+    """What sharing the first sample with the motion before adds to s, shape (3, 3), m²; zero before `after`."""
+    bias: Floats
+    """Gyro and accelerometer bias that were removed, body axes, shape (6,), rad/s and m/s²."""
+    start_ns: int
+    """Stamp of the first Doppler sample."""
+    end_ns: int
+    """Stamp of the last."""
+    body_p_imu: Floats
+    """Shape (3,), m."""
+    body_p_dvl: Floats
+    """Shape (3,), m."""
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last Doppler sample."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    @property
+    def covariance(self) -> Floats:
+        """Of the errors, shape (12, 12)."""
+        P = self.inner_covariance.copy()
+        for W, Q in zip(self.end_weights, self.end_covariances, strict=True):
+            P[DISPLACEMENT, DISPLACEMENT] += W @ Q @ W.T
+        P[DISPLACEMENT, DISPLACEMENT] += self.shared_covariance
+        return P
+
+    def after(self, before: JointMotion) -> JointMotion:
+        """The same motion in a chain, next to the one before.
+
+        The Doppler sample between them moves both, so that their errors are correlated. Charging all of it to the later
+        one, ``C + C^T`` with ``C = R^T W_last Q W_first^T``, lets a graph take them as independent: the covariance of
+        the chain's displacement is then that of the samples with their weights, however it is cut.
+
+        Raises
+        ------
+        MeasurementError
+            When the motion before does not end where this one begins.
+        """
+        if before.end_ns != self.start_ns:
+            raise MeasurementError(
+                f"before: ends at {before.end_ns} ns, this motion begins at {self.start_ns} ns; expected the motion"
+                " that ends with the Doppler sample with which this one begins: later.after(earlier)"
+            )
+        C = before.i_R_j.matrix().T @ before.end_weights[1] @ self.end_covariances[0] @ self.end_weights[0].T
+        return replace(self, shared_covariance=C + C.T)
+
+    def corrected(self, change: Floats) -> JointMotion:
+        """For other parameters, to first order.
+
+        Parameters
+        ----------
+        change
+            Of gyro bias, accelerometer bias, scale and mounting, shape (10,).
+        """
+        error = self.D_parameters @ finite_vector("change", change, 10)
+        return replace(
+            self,
+            i_R_j=self.i_R_j.compose(gtsam.Rot3.Expmap(error[ROTATION])),
+            velocity=self.velocity + error[VELOCITY],
+            position=self.position + error[POSITION],
+            displacement=self.displacement + error[DISPLACEMENT],
+            bias=self.bias + change[:6],
+        )
+
+    def relative_pose(self, accel_bias_sigma: float = 0.0) -> PreintegratedMotion:
+        """Rotation and Doppler displacement alone, as the body's relative pose.
+
+        The body's origin moves by ``s - (R - I) d``.
+
+        Parameters
+        ----------
+        accel_bias_sigma
+            What is not known of the accelerometers' bias, on each axis, m/s²: counted in the covariance. With the rule
+            "inertial" it moves s by the cube of the time between Doppler samples; with the others not at all.
+        """
+        R, arm = self.i_R_j.matrix(), self.body_p_dvl
+        translation = self.displacement - R @ arm + arm
+        J = np.zeros((6, 12))
+        J[:3, ROTATION], J[3:, ROTATION] = np.eye(3), gtsam.SO3.Hat(arm)
+        J[3:, DISPLACEMENT] = R.T
+        used = np.r_[ROTATION, DISPLACEMENT]
+        by_bias = J[:, used] @ self.D_parameters[used, ACCEL] * accel_bias_sigma
+        cov = J[:, used] @ self.covariance[np.ix_(used, used)] @ J[:, used].T + by_bias @ by_bias.T
+        D = J[:, used] @ self.D_parameters[used, GYRO]
+        pose = gtsam.Pose3(self.i_R_j, translation)
+        return PreintegratedMotion(pose, cov, D, self.bias[:3], self.duration_s, self.velocity / self.duration_s)
+
+
+@dataclass(frozen=True, eq=False)
+class JointPreintegrator:
+    """What joint preintegration needs to know of the sensors.
+
+    Raises
+    ------
+    CalibrationError
+        When a number is negative or not finite, or a mounting or the rule is of another kind.
+    """
+
+    gyro_noise_density: float
+    """rad/s/√Hz."""
+    accel_noise_density: float
+    """m/s²/√Hz."""
+    velocity_sigma_m_s: tuple[float, float, float] = (0.01, 0.01, 0.01)
+    """Of a Doppler sample along the log's axes, where its covariance is NaN."""
+    body_T_imu: gtsam.Pose3 = field(default_factory=gtsam.Pose3)
+    body_T_dvl: gtsam.Pose3 = field(default_factory=gtsam.Pose3)
+    rule: DopplerRule = "inertial"
+    """How a velocity is had between samples: `sonar_graph.navigation.preintegration.joint_recursion`."""
+    longest_s: float = 1.5
+    """Between Doppler samples for all rules but "inertial", which know nothing of the velocity there."""
+    longest_hole_s: float = SHORTEST_HOLE_S
+    """Between inertial rows where that is more than five typical intervals: nothing tells the turn in there."""
+
+    def __post_init__(self) -> None:
+        if self.rule not in RULES:
+            raise CalibrationError(f"rule: there is no {self.rule!r}; there are {', '.join(RULES)}")
+        require_noise("gyro_noise_density", self.gyro_noise_density, 1)
+        require_noise("accel_noise_density", self.accel_noise_density, 1)
+        require_noise("velocity_sigma_m_s", self.velocity_sigma_m_s, 3)
+        require_noise("longest_s", self.longest_s, 1)
+        require_noise("longest_hole_s", self.longest_hole_s, 1)
+        for name, mounting in (("body_T_imu", self.body_T_imu), ("body_T_dvl", self.body_T_dvl)):
+            if not isinstance(mounting, gtsam.Pose3):
+                raise CalibrationError(f"{name}: expected a gtsam.Pose3, not {type(mounting).__name__}")
+
+    @classmethod
+    def from_calibration(cls, calibration: Calibration, rule: DopplerRule = "inertial") -> JointPreintegrator:
+        """Pick the numbers from a calibration.
+
+        ``earth_rate_latitude_rad`` is not among them: what the Earth's rotation is in body frame i depends on the
+        attitude there, so `integrate` takes it anew for each motion,
+        ``world_T_i.rotation().unrotate(earth_rate_in_world(calibration))`` (`sonar_graph.navigation.alignment.gravity`).
+        """
+        imu, dvl = calibration.imu, calibration.dvl
+        return cls(
+            imu.gyro_noise_density,
+            imu.accel_noise_density,
+            dvl.velocity_sigma_m_s,
+            imu.mounting.pose(),
+            dvl.mounting.pose(),
+            rule,
+            dvl.gap_s,
+        )
+
+    def integrate(
+        self,
+        imu: Imu,
+        dvl: Dvl,
+        start_ns: int,
+        end_ns: int,
+        bias: Floats | None = None,
+        earth_rate: Floats | None = None,
+    ) -> JointMotion:
+        """Motion between the stamps of two Doppler samples.
+
+        Parameters
+        ----------
+        imu, dvl
+            Rows that hold the interval; longer blocks cost nothing.
+        start_ns, end_ns
+            Stamps of rows of ``dvl``.
+        bias
+            Gyro and accelerometer bias in body axes to remove, shape (6,), rad/s and m/s²; None: zero.
+        earth_rate
+            Earth's rotation in body frame i, shape (3,), rad/s; None: not removed.
+
+        Raises
+        ------
+        MeasurementError
+            When an end is no Doppler stamp, the inertial rows do not reach both ends or have a hole, stamps repeat, a
+            Doppler row in between leaves a direction unmeasured or has no possible covariance, Doppler samples are too
+            far apart for the rule, it needs a specific force that was not measured, or bias or Earth rate are not of
+            their shapes.
+        """
+        if not (isinstance(imu, Imu) and isinstance(dvl, Dvl)):
+            raise MeasurementError(f"imu, dvl: expected Imu and Dvl, not {type(imu).__name__} and {type(dvl).__name__}")
+        require_order(start_ns, end_ns)
+        samples = _doppler_rows(dvl, start_ns, end_ns)
+        inertial = _inertial_rows(imu, start_ns, end_ns, self.longest_hole_s)
+        velocity, cov = self._in_body(samples)
+        arms = self.body_T_imu.translation(), self.body_T_dvl.translation()
+        arm = arms[1] - arms[0]
+        if self.rule == "inertial":
+            cov = with_rate_noise(cov, samples.stamps_ns, inertial.stamps_ns, self.gyro_noise_density, arm)
+        else:
+            refuse_beyond(self.longest_s, samples.stamps_ns)
+        bias = np.zeros(6) if bias is None else finite_vector("bias", bias, 6)
+        earth = np.zeros(3) if earth_rate is None else finite_vector("earth_rate", earth_rate, 3)
+        rows = self._inertial(inertial, bias, earth, arm)
+        R, (v, p, s), P, D, first, last = preintegrate(rows, samples.stamps_ns, velocity, cov, RULES[self.rule])
+        _refuse_infinite(s, P, start_ns, end_ns)
+        ends, span = (cov[0], cov[-1]), (int(start_ns), int(end_ns))
+        return JointMotion(gtsam.Rot3(R), v, p, s, P, D, (first, last), ends, np.zeros((3, 3)), bias, *span, *arms)
+
+    def _inertial(self, imu: Imu, bias: Floats, earth: Floats, arm: Floats) -> Inertial:
+        """Rows in body axes, with what is to be removed from them."""
+        body_R_imu = self.body_T_imu.rotation().matrix()
+        force = imu.specific_force @ body_R_imu.T
+        if self.rule == "inertial" and not np.isfinite(force).all():
+            raise MeasurementError('Imu.specific_force: not measured in every row; use the rule "linear"')
+        return Inertial(
+            imu.stamps_ns,
+            imu.angular_velocity @ body_R_imu.T,
+            force,
+            _vector(bias[:3]),
+            _vector(bias[3:]),
+            _vector(earth),
+            _vector(arm),
+            self.gyro_noise_density**2,
+            self.accel_noise_density**2,
+        )
+
+    def _in_body(self, samples: Dvl) -> tuple[Floats, Floats]:
+        """Velocities in body axes and a covariance for each."""
+        body_R_dvl, cov = self.body_T_dvl.rotation().matrix(), samples.velocity_cov
+        unsaid = np.isnan(cov)
+        if unsaid.any():
+            cov = np.where(unsaid, np.diag(np.square(self.velocity_sigma_m_s)), cov)
+        require_covariances("Dvl.velocity_cov", cov, samples.stamps_ns)
+        return samples.velocity @ body_R_dvl.T, body_R_dvl @ cov @ body_R_dvl.T
+
+
+def _refuse_infinite(s: Floats, P: Floats, start_ns: int, end_ns: int) -> None:
+    if not isfinite(sum(s.tolist()) + P.item(9, 9) + P.item(10, 10) + P.item(11, 11)):
+        raise MeasurementError(
+            f"from {start_ns} to {end_ns} ns: the motion is not finite; expected angular velocities in rad/s and"
+            " velocities in m/s that are not beyond all bounds"
+        )
+
+
+def _doppler_rows(dvl: Dvl, start_ns: int, end_ns: int) -> Dvl:
+    """Rows from one end to the other."""
+    first, last = (int(row) for row in np.searchsorted(dvl.stamps_ns, [start_ns, end_ns]))
+    if last == len(dvl) or dvl.stamps_ns[last] != end_ns:
+        raise no_doppler_stamp("end_ns", end_ns, dvl.stamps_ns)
+    if dvl.stamps_ns[first] != start_ns:
+        raise no_doppler_stamp("start_ns", start_ns, dvl.stamps_ns)
+    require_distinct_stamps("Dvl", dvl.stamps_ns, first, last)
+    samples = dvl.rows(slice(first, last + 1))
+    partial = is_partial(samples.velocity_cov)
+    if partial.any():
+        raise MeasurementError(
+            f"Dvl.velocity_cov: the row at {samples.stamps_ns[np.argmax(partial)]} ns leaves a direction unmeasured"
+            " (one or two beams); leave such rows out, or let sonar_graph.navigation.odometry.Odometry complete them"
+        )
+    return samples
+
+
+def _inertial_rows(imu: Imu, start_ns: int, end_ns: int, longest_hole_s: float) -> Imu:
+    """Rows from the last at or before the start to the first at or after the end."""
+    require_nanoseconds("Imu", imu.stamps_ns)
+    first = int(np.searchsorted(imu.stamps_ns, start_ns, side="right")) - 1
+    last = int(np.searchsorted(imu.stamps_ns, end_ns))
+    if first < 0 or last == len(imu):
+        raise MeasurementError(
+            f"Imu.stamps_ns: rows from {imu.stamps_ns[0]} to {imu.stamps_ns[-1]} ns do not reach from {start_ns} to"
+            f" {end_ns} ns; begin and end at Doppler samples within them"
+        )
+    require_distinct_stamps("Imu", imu.stamps_ns, first, last)
+    refuse_holes(longest_hole_s, imu.stamps_ns, first, last)
+    return imu.rows(slice(first, last + 1))
+
+
+def _vector(a: Floats) -> tuple[float, float, float]:
+    return float(a[0]), float(a[1]), float(a[2])

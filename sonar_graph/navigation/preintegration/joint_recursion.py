@@ -1,0 +1,357 @@
+"""How a velocity is had between two Doppler samples: our two rules, and those of others.
+
+=============== ====================================== ================================ ==============================
+rule            velocity between samples a and b       rotation that turns it           whose
+=============== ====================================== ================================ ==============================
+inertial        through both samples, in between the   at every IMU sample              ours, with an accelerometer
+                shape that the accelerometer felt
+linear          linear from a to b, in the body        at every IMU sample              ours, gyro and Doppler alone
+hold-previous   that of a                              at every IMU sample              AQUA-SLAM
+zoh-previous    that of a                              in the middle of the interval    coug_fgo, tight integrator
+zoh-current     that of b                              at the end of the interval       TURTLMap
+trapezoid       mean of a and b                        in the middle of the interval    sonar-SLAM's dead reckoning
+=============== ====================================== ================================ ==============================
+
+The last four are here to be compared with. A hold is late or early by half an interval, which costs half of it times
+the change of velocity over the motion.
+
+The loop of joint preintegration as machine code: inertial steps between Doppler samples, then the next sample.
+
+Equations: `sonar_graph.navigation.preintegration.joint_steps` (steps) and `sonar_graph.navigation.preintegration.joint_steps` (samples).
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.navigation.preintegration.joint_steps import (
+    AT_REST,
+    NO_SLOPES,
+    NO_SPREAD,
+    Path,
+    Push,
+    Slopes,
+    Spread,
+    push,
+    pushed_path,
+    pushed_slopes,
+    pushed_spread,
+    with_inertial_position,
+    with_sample,
+)
+from sonar_graph.navigation.samples import rows_until, value_at
+from sonar_graph.numerics import (
+    IDENTITY,
+    ZERO,
+    ZEROS,
+    Matrix,
+    Vector,
+    compiled,
+    cross,
+    difference_of,
+    inlined,
+    matrix,
+    minus,
+    multiple_of,
+    place,
+    plus,
+    product,
+    sandwich,
+    scaled,
+    sum_of,
+    symmetric,
+    times,
+    times_skew,
+    transposed,
+    vector,
+)
+
+DopplerRule = Literal["inertial", "linear", "hold-previous", "zoh-previous", "zoh-current", "trapezoid"]
+
+
+class Turning(IntEnum):
+    """Which rotation turns a velocity into frame i."""
+
+    EVERY_SAMPLE = 0
+    MIDDLE = 1
+    END = 2
+
+
+class Rule(NamedTuple):
+    """A row of the table, for compiled code."""
+
+    inertial: bool
+    """Whether the accelerometer shapes the velocity between samples."""
+    interpolated: bool
+    """Whether the later sample's share grows from 0 to 1 over the interval."""
+    share: float
+    """The later sample's share where it is constant."""
+    turning: int
+
+
+RULES: dict[DopplerRule, Rule] = {
+    "inertial": Rule(True, False, 0.5, Turning.EVERY_SAMPLE.value),
+    "linear": Rule(False, True, 0.5, Turning.EVERY_SAMPLE.value),
+    "hold-previous": Rule(False, False, 0.0, Turning.EVERY_SAMPLE.value),
+    "zoh-previous": Rule(False, False, 0.0, Turning.MIDDLE.value),
+    "zoh-current": Rule(False, False, 1.0, Turning.END.value),
+    "trapezoid": Rule(False, False, 0.5, Turning.MIDDLE.value),
+}
+EVERY_SAMPLE, MIDDLE = 0, 1
+"""Of `sonar_graph.navigation.preintegration.joint_recursion.Turning`."""
+
+
+class Inertial(NamedTuple):
+    """Inertial rows in body axes, and what is taken out of them."""
+
+    stamps: Ints
+    rate: Floats
+    force: Floats
+    gyro_bias: Vector
+    accel_bias: Vector
+    earth: Vector
+    """Earth's rotation in frame i, rad/s."""
+    arm: Vector
+    """From the IMU to the Doppler log, body axes, m."""
+    gyro_psd: float
+    """Squared noise density, (rad/s)²/Hz."""
+    accel_psd: float
+    """Squared noise density, (m/s²)²/Hz."""
+
+
+class Interval(NamedTuple):
+    """Two Doppler samples in body axes and their stamps."""
+
+    start_ns: int
+    end_ns: int
+    z: Vector
+    z_next: Vector
+
+
+class Weights(NamedTuple):
+    """``s = before z_a + after z_b`` over an interval between samples a and b."""
+
+    before: Matrix
+    after: Matrix
+
+
+class Motion(NamedTuple):
+    """From frame i to an instant."""
+
+    path: Path
+    spread: Spread
+    slopes: Slopes
+    weights: Weights
+    """Of the interval at hand."""
+    row: int
+    """First inertial row after the instant."""
+
+
+NO_WEIGHTS = Weights(ZEROS, ZEROS)
+LONG_S = 0.4
+"""Between Doppler samples: from here on the rule "inertial" draws the log's way about the IMU's point by the gyros."""
+
+
+@compiled
+def preintegrate(
+    imu: Inertial, dvl_ns: Ints, velocity: Floats, cov: Floats, rule: Rule
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+    """Motion from the first to the last Doppler row.
+
+    Parameters
+    ----------
+    imu
+        Rows that reach from before the first Doppler row to after the last.
+    dvl_ns, velocity, cov
+        Doppler rows in body axes.
+
+    Returns
+    -------
+    R (3, 3); v, p, s as rows (3, 3); covariance (12, 12) of [theta in frame j, v, p, s] without the noise of the first
+    and the last Doppler row; derivatives (12, 10) by gyro bias, accelerometer bias, scale, mounting; weights (3, 3) of
+    the first and of the last row in s.
+    """
+    motion = Motion(AT_REST, NO_SPREAD, NO_SLOPES, NO_WEIGHTS, rows_until(imu.stamps, dvl_ns[0]))
+    first, last, past_s = ZEROS, ZEROS, 0.0
+    for k in range(len(dvl_ns) - 1):
+        next_s = (dvl_ns[k + 1] - dvl_ns[k]) * 1e-9
+        if rule.inertial:
+            motion = _at_sample(motion, imu, dvl_ns[k], vector(velocity[k]), past_s, next_s)
+        interval = Interval(dvl_ns[k], dvl_ns[k + 1], vector(velocity[k]), vector(velocity[k + 1]))
+        here = multiple_of(0.5 * next_s, motion.path.R)
+        motion = _over(motion, imu, interval, rule)
+        weights = Weights(here, multiple_of(0.5 * next_s, motion.path.R)) if rule.inertial else motion.weights
+        if k == 0:
+            first = weights.before
+        else:
+            weight = sum_of(last, weights.before)
+            motion = _with_noise(motion, sandwich(weight, matrix(cov[k]), weight))
+        last, past_s = weights.after, next_s
+    if rule.inertial:
+        motion = _at_sample(motion, imu, dvl_ns[-1], vector(velocity[len(dvl_ns) - 1]), past_s, 0.0)
+        path, spread, slopes = with_inertial_position(motion.path, motion.spread, motion.slopes)
+        motion = Motion(path, spread, slopes, NO_WEIGHTS, motion.row)
+    return _arrays(motion, first, last, imu.gyro_psd)
+
+
+@inlined
+def _at_sample(motion: Motion, imu: Inertial, at_ns: int, z: Vector, past_s: float, next_s: float) -> Motion:
+    """With a Doppler sample between two intervals; the log's way about the IMU counts in long ones."""
+    weight_s = 0.5 * (past_s + next_s)
+    path, spread, slopes = with_sample(motion.path, motion.spread, motion.slopes, z, weight_s, imu.gyro_psd)
+    motion = Motion(path, spread, slopes, motion.weights, motion.row)
+    if past_s > LONG_S or next_s > LONG_S:
+        motion = _levered(motion, imu, at_ns, past_s if past_s > LONG_S else 0.0, next_s if next_s > LONG_S else 0.0)
+    return motion
+
+
+@inlined
+def _levered(motion: Motion, imu: Inertial, at_ns: int, past_s: float, next_s: float) -> Motion:
+    """One end of long intervals: ``(R_b - R_a) l`` in place of the trapezoid of ``R (w x l)``; 0: not long."""
+    R, weight_s = motion.path.R, 0.5 * (past_s + next_s)
+    rate = minus(value_at(imu.stamps, imu.rate, motion.row, at_ns, False), imu.gyro_bias)
+    rate = minus(rate, times(transposed(R), imu.earth))
+    ends = (1.0 if past_s > 0.0 else 0.0) - (1.0 if next_s > 0.0 else 0.0)
+    c = times(R, minus(scaled(ends, imu.arm), scaled(weight_s, cross(rate, imu.arm))))
+    by = Push(0.0, IDENTITY, ZEROS, ZEROS, ZERO, ZERO, c)
+    M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting = pushed_slopes(motion.slopes, by)
+    s_g = difference_of(s_g, multiple_of(weight_s, times_skew(R, imu.arm)))
+    return Motion(
+        pushed_path(motion.path, by),
+        pushed_spread(motion.spread, by, imu.gyro_psd * motion.path.elapsed_s, 0.0),
+        Slopes(M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting),
+        motion.weights,
+        motion.row,
+    )
+
+
+@inlined
+def _over(motion: Motion, imu: Inertial, interval: Interval, rule: Rule) -> Motion:
+    """All inertial steps between two Doppler samples; a fixed rotation acts at its own instant."""
+    motion = Motion(motion.path, motion.spread, motion.slopes, NO_WEIGHTS, motion.row)
+    start_ns, end_ns, z, z_next = interval
+    if rule.turning == EVERY_SAMPLE:
+        motion = _stepped(motion, imu, interval, start_ns, end_ns, rule)
+    else:
+        at_ns = start_ns + (end_ns - start_ns) // 2 if rule.turning == MIDDLE else end_ns
+        motion = _stepped(motion, imu, interval, start_ns, at_ns, rule)
+        turned = multiple_of((end_ns - start_ns) * 1e-9, motion.path.R)
+        motion = _displaced(motion, turned, interval, rule.share, imu.gyro_psd)
+        motion = _stepped(motion, imu, interval, at_ns, end_ns, rule)
+    if rule.inertial:
+        return motion
+    slopes = _with_calibration(motion.slopes, motion.weights, z, z_next)
+    return Motion(motion.path, motion.spread, slopes, motion.weights, motion.row)
+
+
+@inlined
+def _stepped(motion: Motion, imu: Inertial, interval: Interval, t: int, end_ns: int, rule: Rule) -> Motion:
+    """Inertial steps, cut at every row; with the Doppler displacement where it turns with every row."""
+    path, spread, slopes, (A, B), row = motion
+    moving = not rule.inertial and rule.turning == EVERY_SAMPLE
+    while t < end_ns:
+        until = min(end_ns, imu.stamps[row]) if row < len(imu.stamps) else end_ns
+        middle = t + (until - t) // 2
+        by = _push_at(path.R, imu, row, t, until)
+        if moving:
+            span_ns = interval.end_ns - interval.start_ns
+            later = (middle - interval.start_ns) / span_ns if rule.interpolated else rule.share
+            A, B = sum_of(A, multiple_of(1.0 - later, by.G)), sum_of(B, multiple_of(later, by.G))
+            by = Push(by.dt, by.turn, by.G, by.H, by.a, by.b, times(by.G, _mixed(interval, later)))
+        spread = pushed_spread(spread, by, imu.gyro_psd * (path.elapsed_s + 0.5 * by.dt), imu.accel_psd)
+        slopes = pushed_slopes(slopes, by)
+        path = pushed_path(path, by)
+        row += int(row < len(imu.stamps) and imu.stamps[row] <= until)
+        t = until
+    return Motion(path, spread, slopes, Weights(A, B), row)
+
+
+@inlined
+def _push_at(R: Matrix, imu: Inertial, row: int, t: int, until: int) -> Push:
+    """The step between two instants of which no row lies in between."""
+    middle = t + (until - t) // 2
+    rate = minus(value_at(imu.stamps, imu.rate, row, middle, False), imu.gyro_bias)
+    force = minus(value_at(imu.stamps, imu.force, row, middle, False), imu.accel_bias)
+    return push(R, (until - t) * 1e-9, minus(rate, times(transposed(R), imu.earth)), force)
+
+
+@inlined
+def _displaced(motion: Motion, turned: Matrix, interval: Interval, later: float, gyro_psd: float) -> Motion:
+    """A whole interval's displacement at once, by a rotation times the interval's length."""
+    by = Push(0.0, IDENTITY, ZEROS, ZEROS, ZERO, ZERO, times(turned, _mixed(interval, later)))
+    return Motion(
+        pushed_path(motion.path, by),
+        pushed_spread(motion.spread, by, gyro_psd * motion.path.elapsed_s, 0.0),
+        pushed_slopes(motion.slopes, by),
+        Weights(multiple_of(1.0 - later, turned), multiple_of(later, turned)),
+        motion.row,
+    )
+
+
+@inlined
+def _mixed(interval: Interval, later: float) -> Vector:
+    """Between the two samples, by the later one's share."""
+    return plus(interval.z, scaled(later, minus(interval.z_next, interval.z)))
+
+
+@inlined
+def _with_calibration(slopes: Slopes, weights: Weights, z: Vector, z_next: Vector) -> Slopes:
+    """``s_scale`` and ``s_mounting`` after an interval."""
+    scale = plus(slopes.s_scale, plus(times(weights.before, z), times(weights.after, z_next)))
+    mounting = difference_of(slopes.s_mounting, times_skew(weights.before, z))
+    mounting = difference_of(mounting, times_skew(weights.after, z_next))
+    M, N, v_g, p_g, s_g, s_a, _, _ = slopes
+    return Slopes(M, N, v_g, p_g, s_g, s_a, scale, mounting)
+
+
+@inlined
+def _with_noise(motion: Motion, noise: Matrix) -> Motion:
+    """The motion with a Doppler sample's part of the covariance of s."""
+    mv, mp, ms, vv, vp, pp, sv, sp, ss = motion.spread
+    spread = Spread(mv, mp, ms, vv, vp, pp, sv, sp, sum_of(ss, noise))
+    return Motion(motion.path, spread, motion.slopes, motion.weights, motion.row)
+
+
+@inlined
+def _arrays(
+    motion: Motion, first: Matrix, last: Matrix, gyro_psd: float
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+    """Arrays of `preintegrate`; theta turned from frame i into frame j."""
+    path, spread, slopes = motion.path, motion.spread, motion.slopes
+    R, vectors, weights = np.empty((3, 3)), np.empty((3, 3)), np.empty((2, 3, 3))
+    P, D = np.zeros((12, 12)), np.zeros((12, 10))
+    j_R_i = transposed(path.R)
+    place(path.R, R, 0, 0)
+    place((path.v, path.p, path.s), vectors, 0, 0)
+    place(first, weights[0], 0, 0)
+    place(last, weights[1], 0, 0)
+    place(multiple_of(gyro_psd * path.elapsed_s, IDENTITY), P, 0, 0)
+    _place_pair(times_skew(j_R_i, spread.mv), P, 0, 3)
+    _place_pair(times_skew(j_R_i, spread.mp), P, 0, 6)
+    _place_pair(times_skew(j_R_i, spread.ms), P, 0, 9)
+    _place_pair(spread.vp, P, 3, 6)
+    _place_pair(spread.sv, P, 9, 3)
+    _place_pair(spread.sp, P, 9, 6)
+    place(symmetric(spread.vv), P, 3, 3)
+    place(symmetric(spread.pp), P, 6, 6)
+    place(symmetric(spread.ss), P, 9, 9)
+    place(multiple_of(-1.0, product(j_R_i, slopes.M)), D, 0, 0)
+    place(slopes.v_g, D, 3, 0)
+    place(slopes.p_g, D, 6, 0)
+    place(slopes.s_g, D, 9, 0)
+    place(multiple_of(-1.0, slopes.M), D, 3, 3)
+    place(multiple_of(-1.0, slopes.N), D, 6, 3)
+    place(slopes.s_a, D, 9, 3)
+    D[9, 6], D[10, 6], D[11, 6] = slopes.s_scale
+    place(slopes.s_mounting, D, 9, 7)
+    return R, vectors, P, D, weights[0], weights[1]
+
+
+@inlined
+def _place_pair(A: Matrix, out: Floats, row: int, column: int) -> None:
+    place(A, out, row, column)
+    place(transposed(A), out, column, row)

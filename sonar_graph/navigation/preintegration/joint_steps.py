@@ -1,0 +1,304 @@
+"""One inertial step: rotation, velocity, position and Doppler displacement, their covariance and derivatives.
+
+All errors are in frame i: ``R_true = Exp(theta) R``, ``v + dv``, ``p + dp``, ``s + ds``. Over a step of duration dt
+with constant rate and specific force f, and with ``G`` the integral and ``H`` the double integral of the rotation::
+
+    a = G f,  b = H f,  c = G u         u velocity of the DVL in body axes
+    v <- v + a,    p <- p + v dt + b,    s <- s + c
+    dv <- dv - [a]x theta,    dp <- dp + dv dt - [b]x theta,    ds <- ds - [c]x theta
+
+Isotropic gyro noise stays isotropic however the body turns: ``cov(theta) = n_g^2 t I``. A covariance with theta is then
+a vector m, ``cov(dx, theta) = -[m]x``, and one of two integrals x and y with increments a_x, a_y changes by::
+
+    cov(dx, dy) <- cov(dx, dy) - (h_y a_x^T + a_y h_x^T) + (a_x . h_y + a_y . h_x) I,     h = m + q a / 2
+
+where q is the variance of theta in the middle of the step. That is why a step costs little more than its mean.
+
+What a Doppler sample does to the joint integral.
+
+Rule "inertial". With the velocity v(t) that the accelerometer gives from rest and the velocity z of the IMU's point,
+``y_k = R_k z_k - v_k`` would be the same at every sample k but for gravity, which makes it linear in time. Its
+trapezoid is therefore exact, and ::
+
+    s = p + sum_k w_k y_k,     w_k half of the two intervals at sample k
+
+is a displacement in which the accelerometer draws the velocity between samples and the samples its level and slope:
+gravity, the initial velocity and an accelerometer bias that is constant in frame i all cancel, however long the gap.
+A Doppler log at another place swings about the IMU's point: over short intervals that is left to the trapezoid, over
+long ones it is drawn by the gyros (`sonar_graph.navigation.preintegration.joint_preintegration`).
+
+All other rules. ``s = sum_k W_k z_k``, W_k from the rotations around sample k.
+
+Either way sample k enters by one weight matrix W_k, ``cov(ds) += W_k Q_k W_k^T``. Those of the first and last sample
+are kept apart: the neighbouring motion has the same sample.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from sonar_graph.navigation.preintegration.recursion import SERIES_ANGLE2, rotation_series, sine_series
+from sonar_graph.numerics import (
+    IDENTITY,
+    ZERO,
+    ZEROS,
+    Matrix,
+    Vector,
+    difference_of,
+    dot,
+    inlined,
+    minus,
+    multiple_of,
+    plus,
+    product,
+    scaled,
+    skew_times,
+    sum_of,
+    times,
+    times_skew,
+    transposed,
+)
+
+
+class Path(NamedTuple):
+    """The mean, in frame i."""
+
+    elapsed_s: float
+    R: Matrix
+    v: Vector
+    p: Vector
+    s: Vector
+
+
+class Spread(NamedTuple):
+    """Covariances; rows belong to the first letter, columns to the second."""
+
+    mv: Vector
+    mp: Vector
+    ms: Vector
+    vv: Matrix
+    vp: Matrix
+    pp: Matrix
+    sv: Matrix
+    sp: Matrix
+    ss: Matrix
+
+
+class Slopes(NamedTuple):
+    """Derivatives by the biases of gyros (g) and accelerometers (a), the Doppler scale and the mounting."""
+
+    M: Matrix
+    """Integral of R: minus the derivative of theta by g and of v by a."""
+    N: Matrix
+    """Double integral of R: minus the derivative of p by a."""
+    v_g: Matrix
+    p_g: Matrix
+    s_g: Matrix
+    s_a: Matrix
+    s_scale: Vector
+    s_mounting: Matrix
+
+
+class Push(NamedTuple):
+    """What a step adds, in frame i."""
+
+    dt: float
+    turn: Matrix
+    G: Matrix
+    H: Matrix
+    a: Vector
+    b: Vector
+    c: Vector
+
+
+AT_REST = Path(0.0, IDENTITY, ZERO, ZERO, ZERO)
+NO_SPREAD = Spread(ZERO, ZERO, ZERO, ZEROS, ZEROS, ZEROS, ZEROS, ZEROS, ZEROS)
+NO_SLOPES = Slopes(ZEROS, ZEROS, ZEROS, ZEROS, ZEROS, ZEROS, ZERO, ZEROS)
+
+
+@inlined
+def push(R: Matrix, dt: float, rate: Vector, force: Vector) -> Push:
+    """A step of constant rate and specific force; without a displacement."""
+    phi = scaled(dt, rate)
+    angle2 = dot(phi, phi)
+    s1, s2, s3 = sine_series(angle2)
+    s4 = (0.5 - s2) / angle2 if angle2 > SERIES_ANGLE2 else 1 / 24 - angle2 * (1 / 720 - angle2 / 40320)
+    G = multiple_of(dt, product(R, rotation_series(phi, angle2, s2, s3)))
+    H = multiple_of(0.5 * dt * dt, product(R, rotation_series(phi, angle2, 2.0 * s3, 2.0 * s4)))
+    return Push(dt, rotation_series(phi, angle2, s1, s2), G, H, times(G, force), times(H, force), ZERO)
+
+
+@inlined
+def pushed_path(path: Path, by: Push) -> Path:
+    """The mean after a step."""
+    return Path(
+        path.elapsed_s + by.dt,
+        product(path.R, by.turn),
+        plus(path.v, by.a),
+        plus(plus(path.p, scaled(by.dt, path.v)), by.b),
+        plus(path.s, by.c),
+    )
+
+
+@inlined
+def pushed_spread(spread: Spread, by: Push, theta_variance: float, accel_psd: float) -> Spread:
+    """The covariance after a step.
+
+    Parameters
+    ----------
+    theta_variance
+        In the middle of the step, rad².
+    accel_psd
+        Spectral density of the accelerometers' noise, (m/s²)²/Hz.
+    """
+    dt, half = by.dt, 0.5 * theta_variance
+    mp = plus(spread.mp, scaled(dt, spread.mv))
+    pp = sum_of(spread.pp, multiple_of(dt, sum_of(spread.vp, transposed(spread.vp))))
+    pp = sum_of(pp, multiple_of(dt * dt, spread.vv))
+    vp = sum_of(spread.vp, multiple_of(dt, spread.vv))
+    sp = sum_of(spread.sp, multiple_of(dt, spread.sv))
+    hv, hp, hs = (
+        plus(spread.mv, scaled(half, by.a)),
+        plus(mp, scaled(half, by.b)),
+        plus(spread.ms, scaled(half, by.c)),
+    )
+    noise = accel_psd * dt
+    return Spread(
+        plus(spread.mv, scaled(theta_variance, by.a)),
+        plus(mp, scaled(theta_variance, by.b)),
+        plus(spread.ms, scaled(theta_variance, by.c)),
+        _coupled(spread.vv, by.a, hv, by.a, hv, noise),
+        _coupled(vp, by.a, hv, by.b, hp, noise * dt / 2.0),
+        _coupled(pp, by.b, hp, by.b, hp, noise * dt * dt / 3.0),
+        _coupled(spread.sv, by.c, hs, by.a, hv, 0.0),
+        _coupled(sp, by.c, hs, by.b, hp, 0.0),
+        _coupled(spread.ss, by.c, hs, by.c, hs, 0.0),
+    )
+
+
+@inlined
+def _coupled(P: Matrix, ax: Vector, hx: Vector, ay: Vector, hy: Vector, noise: float) -> Matrix:
+    d = dot(ax, hy) + dot(ay, hx) + noise
+    x, y, z = P
+    return (
+        (
+            x[0] + d - hy[0] * ax[0] - ay[0] * hx[0],
+            x[1] - hy[0] * ax[1] - ay[0] * hx[1],
+            x[2] - hy[0] * ax[2] - ay[0] * hx[2],
+        ),
+        (
+            y[0] - hy[1] * ax[0] - ay[1] * hx[0],
+            y[1] + d - hy[1] * ax[1] - ay[1] * hx[1],
+            y[2] - hy[1] * ax[2] - ay[1] * hx[2],
+        ),
+        (
+            z[0] - hy[2] * ax[0] - ay[2] * hx[0],
+            z[1] - hy[2] * ax[1] - ay[2] * hx[1],
+            z[2] + d - hy[2] * ax[2] - ay[2] * hx[2],
+        ),
+    )
+
+
+@inlined
+def pushed_slopes(slopes: Slopes, by: Push) -> Slopes:
+    """The derivatives after a step; the rotation's own change within it counts by its mean."""
+    half = sum_of(slopes.M, multiple_of(0.5, by.G))
+    third = sum_of(slopes.M, multiple_of(1.0 / 3.0, by.G))
+    p_g = sum_of(slopes.p_g, multiple_of(by.dt, slopes.v_g))
+    return Slopes(
+        sum_of(slopes.M, by.G),
+        sum_of(sum_of(slopes.N, multiple_of(by.dt, slopes.M)), by.H),
+        sum_of(slopes.v_g, skew_times(by.a, half)),
+        sum_of(p_g, skew_times(by.b, third)),
+        sum_of(slopes.s_g, skew_times(by.c, half)),
+        slopes.s_a,
+        slopes.s_scale,
+        slopes.s_mounting,
+    )
+
+
+@inlined
+def with_sample(
+    path: Path, spread: Spread, slopes: Slopes, z: Vector, weight_s: float, gyro_psd: float
+) -> tuple[Path, Spread, Slopes]:
+    """After ``w_k y_k`` is added; the sample's own noise is not in the spread.
+
+    With ``e = -w ([R z]x theta + dv)`` the error that is added.
+    """
+    w, turned = weight_s, times(path.R, z)
+    variance = gyro_psd * path.elapsed_s
+    by_v = _skew_product(turned, spread.mv)
+    e_v = multiple_of(-w, sum_of(by_v, spread.vv))
+    e_p = multiple_of(-w, sum_of(_skew_product(turned, spread.mp), spread.vp))
+    e_s = multiple_of(-w, sum_of(_skew_product(turned, spread.ms), transposed(spread.sv)))
+    e_e = difference_of(sum_of(by_v, transposed(by_v)), multiple_of(variance, _skew_product(turned, turned)))
+    e_e = multiple_of(w * w, sum_of(e_e, spread.vv))
+    y = minus(turned, path.v)
+    after = Path(path.elapsed_s, path.R, path.v, path.p, plus(path.s, scaled(w, y)))
+    e_m = scaled(w, minus(scaled(variance, turned), spread.mv))
+    ss = sum_of(sum_of(spread.ss, e_e), sum_of(e_s, transposed(e_s)))
+    return (
+        after,
+        Spread(
+            spread.mv,
+            spread.mp,
+            plus(spread.ms, e_m),
+            spread.vv,
+            spread.vp,
+            spread.pp,
+            sum_of(spread.sv, e_v),
+            sum_of(spread.sp, e_p),
+            ss,
+        ),
+        Slopes(
+            slopes.M,
+            slopes.N,
+            slopes.v_g,
+            slopes.p_g,
+            sum_of(slopes.s_g, multiple_of(w, difference_of(skew_times(turned, slopes.M), slopes.v_g))),
+            sum_of(slopes.s_a, multiple_of(w, slopes.M)),
+            plus(slopes.s_scale, scaled(w, turned)),
+            difference_of(slopes.s_mounting, multiple_of(w, times_skew(path.R, z))),
+        ),
+    )
+
+
+@inlined
+def _skew_product(a: Vector, b: Vector) -> Matrix:
+    """``[a]x [b]x = b a^T - (a . b) I``."""
+    d = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return (
+        (b[0] * a[0] - d, b[0] * a[1], b[0] * a[2]),
+        (b[1] * a[0], b[1] * a[1] - d, b[1] * a[2]),
+        (b[2] * a[0], b[2] * a[1], b[2] * a[2] - d),
+    )
+
+
+@inlined
+def with_inertial_position(path: Path, spread: Spread, slopes: Slopes) -> tuple[Path, Spread, Slopes]:
+    """At the end, ``s <- p + s``."""
+    sp = sum_of(spread.pp, spread.sp)
+    return (
+        Path(path.elapsed_s, path.R, path.v, path.p, plus(path.p, path.s)),
+        Spread(
+            spread.mv,
+            spread.mp,
+            plus(spread.mp, spread.ms),
+            spread.vv,
+            spread.vp,
+            spread.pp,
+            sum_of(transposed(spread.vp), spread.sv),
+            sp,
+            sum_of(sum_of(spread.ss, transposed(spread.sp)), sp),
+        ),
+        Slopes(
+            slopes.M,
+            slopes.N,
+            slopes.v_g,
+            slopes.p_g,
+            sum_of(slopes.p_g, slopes.s_g),
+            difference_of(slopes.s_a, slopes.N),
+            slopes.s_scale,
+            slopes.s_mounting,
+        ),
+    )

@@ -1,0 +1,294 @@
+"""Rows of a sensor as they are kept: in the order of their stamps, whatever the order in which they came.
+
+Values of a sensor between its rows.
+
+``linear``: rate and velocity are piecewise linear through the samples; the mean over a step is the value at its middle.
+``hold-past``: a sample is the mean over the interval that ends at its stamp.
+
+What is wrong with instants, vectors and noise that a caller hands to preintegration, in one line.
+
+What depth samples over an interval say about its end.
+
+Each sample is carried to the end by the vehicle's own odometry. Its noise is white, r, but the error of carrying it
+grows as a random walk of q m²/s, and is shared by all samples that are older. The best weights are those of a Kalman
+filter for a random walk, started from nothing::
+
+    P <- P + q dt,    K = P / (P + r_k),    w <- (1 - K) w,  w_k = K,    P <- (1 - K) P
+
+so that samples count for as long as q lets them: about sqrt(r dt / q). For q = 0 the weights are the inverse variances.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.errors import CalibrationError, MeasurementError, SonarGraphError
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.numerics import Vector, compiled, inlined, minus, plus, scaled, vector
+
+EARLIEST_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
+WINDOW_NS = 5_000_000_000
+"""Rows kept before a node, where gravity is found should bottom lock be lost there: enough for 1 mm/s² with samples of
+5 mm/s at 7 Hz, short enough for an accelerometer's bias not to have turned."""
+
+
+class StampedRows:
+    """Each stamp once, with two values.
+
+    Parameters
+    ----------
+    shapes
+        Of either value's rows.
+    """
+
+    def __init__(self, *shapes: tuple[int, ...]) -> None:
+        self.stamps_ns: Ints = np.empty(0, np.int64)
+        one, other = shapes
+        self.values: tuple[Floats, Floats] = np.empty((0, *one)), np.empty((0, *other))
+
+    def insert(self, stamps_ns: Ints, one: Floats, other: Floats) -> bool:
+        """Place rows by their stamps; of equal stamps the first counts.
+
+        Parameters
+        ----------
+        stamps_ns
+            At least one, increasing.
+
+        Returns
+        -------
+        Whether the first comes before a row that was there already, or is one.
+        """
+        comes_after = not len(self.stamps_ns) or bool(stamps_ns[0] > self.stamps_ns[-1])
+        self.stamps_ns = np.concatenate([self.stamps_ns, stamps_ns])
+        self.values = np.concatenate([self.values[0], one]), np.concatenate([self.values[1], other])
+        if not comes_after:
+            self._keep(np.unique(self.stamps_ns, return_index=True)[1])
+        return not comes_after
+
+    def forget_before(self, stamp_ns: int, more: int = 0) -> None:
+        """Drop rows that are needed for no value from a stamp on, but for some more before it."""
+        self._keep(slice(max(int(np.searchsorted(self.stamps_ns, stamp_ns)) - 1 - more, 0), None))
+
+    def _keep(self, rows: slice | Ints) -> None:
+        self.stamps_ns = self.stamps_ns[rows]
+        self.values = self.values[0][rows], self.values[1][rows]
+
+
+@compiled
+def node_range(imu_ns: Ints, dvl_ns: Ints, after_ns: int, until_ns: int) -> tuple[int, int]:
+    """Rows of the DVL that are nodes after one instant and reached at another: first, and one past the last."""
+    seen = np.searchsorted(imu_ns, until_ns, side="right")
+    if seen == 0:
+        return 0, 0
+    covered_ns = min(until_ns, imu_ns[seen - 1])
+    first = np.searchsorted(dvl_ns, after_ns, side="right")
+    return int(first), max(int(first), int(np.searchsorted(dvl_ns, covered_ns, side="right")))
+
+
+@compiled
+def rows_before_gaps(stamps: Ints, start_ns: int, end_ns: int, longest_ns: int) -> Ints:
+    """Rows from one stamp to another whose next one comes more than so long after."""
+    first, last = np.searchsorted(stamps, start_ns), np.searchsorted(stamps, end_ns)
+    return np.flatnonzero(np.diff(stamps[first : last + 1]) > longest_ns) + first
+
+
+@inlined
+def rows_until(stamps: Ints, instant_ns: int) -> int:
+    """Number of rows stamped at or before an instant; numpy's search takes its side as text, slow to compile."""
+    low, high = 0, len(stamps)
+    while low < high:
+        middle = (low + high) // 2
+        if stamps[middle] <= instant_ns:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@inlined
+def bracket(stamps: Ints, n: int, i: int, t: int, hold_past: bool) -> tuple[int, int, float]:
+    """Rows before and after t and the share of the later, where ``stamps[i - 1] < t <= stamps[i]``.
+
+    Outside the first n rows the nearest end's value holds.
+    """
+    if i >= n:
+        return n - 1, n - 1, 0.0
+    if hold_past or i == 0:
+        return i, i, 0.0
+    return i - 1, i, (t - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
+
+
+@inlined
+def value_at(stamps: Ints, values: Floats, i: int, t: int, hold_past: bool) -> Vector:
+    """Value at t, where ``stamps[i - 1] < t <= stamps[i]``; the nearest end's value outside the rows."""
+    return value_among(stamps, values, len(stamps), i, t, hold_past)
+
+
+@inlined
+def value_among(stamps: Ints, values: Floats, rows: int, i: int, t: int, hold_past: bool) -> Vector:
+    """The same, of the first rows only."""
+    return between(values, *bracket(stamps, rows, i, t, hold_past))
+
+
+@inlined
+def between(values: Floats, before: int, after: int, share: float) -> Vector:
+    """Between two rows."""
+    a, b = vector(values[before]), vector(values[after])
+    return plus(a, scaled(share, minus(b, a)))
+
+
+UNITS_NS = {"seconds": 1_000_000_000, "milliseconds": 1_000_000, "microseconds": 1_000}
+_CLOSEST_ROWS_NS = 50_000
+"""No IMU is as quick as 20 kHz; one of 20 Hz or more with stamps in microseconds looks quicker."""
+_CLOSEST_SAMPLES_NS = 1_000_000
+"""No Doppler log is as quick as 1 kHz; one with stamps in microseconds looks quicker."""
+
+
+def finite_vector(name: str, values: ArrayLike, size: int, kind: type[SonarGraphError] = MeasurementError) -> Floats:
+    """The values as an array; an error of this kind where they are not so many finite numbers."""
+    found = np.asarray(values, np.float64)
+    if found.shape != (size,):
+        raise kind(f"{name}: expected shape ({size},), not {found.shape}")
+    if not all(map(isfinite, found.tolist())):
+        raise kind(f"{name}: expected finite numbers, not {found.tolist()}")
+    return found
+
+
+def require_noise(name: str, numbers: ArrayLike, size: int) -> None:
+    """Refuse what is no standard deviation.
+
+    Raises
+    ------
+    CalibrationError
+        When the numbers are not so many, or one is negative or not finite.
+    """
+    found = np.asarray(numbers)
+    if found.dtype.kind not in "iuf" or found.shape != ((size,) if size > 1 else ()):
+        raise CalibrationError(f"{name}: expected {size} number{'s' * (size > 1)}, not {numbers!r}")
+    if not (np.isfinite(found) & (found >= 0)).all():
+        raise CalibrationError(f"{name}: expected finite numbers of zero or more, not {numbers!r}")
+
+
+def require_order(start_ns: int, end_ns: int) -> None:
+    """Refuse an interval whose ends are not integers, the earlier first."""
+    for name, instant in (("start_ns", start_ns), ("end_ns", end_ns)):
+        if not isinstance(instant, int | np.integer):
+            raise MeasurementError(f"{name}: expected integer nanoseconds, not {instant!r}; take the stamp of a row")
+    if end_ns <= start_ns:
+        raise MeasurementError(f"end_ns: {end_ns} is not after start_ns {start_ns}; the earlier first")
+
+
+def no_doppler_stamp(name: str, instant_ns: int, stamps_ns: Ints) -> MeasurementError:
+    """That an end of an interval is not the stamp of a Doppler row, which there are, and which unit may be meant."""
+    if not len(stamps_ns):
+        return MeasurementError(f"{name}: {instant_ns} is no Doppler stamp: there are no Doppler rows; add them first")
+    first, last = int(stamps_ns[0]), int(stamps_ns[-1])
+    nearest = int(stamps_ns[np.argmin(np.abs(stamps_ns - instant_ns))])
+    return MeasurementError(
+        f"{name}: {instant_ns} is none of the {len(stamps_ns)} Doppler stamps from {first} to {last} ns; take one of"
+        f" them, the nearest is {nearest}{_other_unit(int(instant_ns), stamps_ns)}"
+    )
+
+
+def _other_unit(instant: int, stamps_ns: Ints) -> str:
+    first, last = int(stamps_ns[0]), int(stamps_ns[-1])
+    if len(stamps_ns) > 1 and last - first < _CLOSEST_SAMPLES_NS * (len(stamps_ns) - 1):
+        return "; the stamps are so close that they seem to be in a larger unit than nanoseconds"
+    for require_nanoseconds, factor in UNITS_NS.items():
+        if instant and first <= instant * factor <= last:
+            return f"; it seems to be in {require_nanoseconds}: times {factor} it lies among them"
+    return ""
+
+
+def require_distinct_stamps(name: str, stamps_ns: Ints, first: int, last: int) -> None:
+    """Refuse repeated stamps from one row to another and next to these."""
+    repeated = _repeated_row(stamps_ns, max(first - 1, 0), min(last + 2, len(stamps_ns)))
+    if repeated >= 0:
+        raise MeasurementError(
+            f"{name}.stamps_ns: rows {repeated} and {repeated + 1} are both stamped {stamps_ns[repeated]} ns; leave one"
+            " out: rows(numpy.unique(stamps_ns, return_index=True)[1]) keeps the first of each"
+        )
+
+
+def require_nanoseconds(name: str, stamps_ns: Ints) -> None:
+    """Refuse rows so close that their stamps must be in another unit."""
+    mean_ns = float(stamps_ns[-1] - stamps_ns[0]) / max(len(stamps_ns) - 1, 1)
+    if len(stamps_ns) > 2 and mean_ns < _CLOSEST_ROWS_NS:
+        raise MeasurementError(
+            f"{name}.stamps_ns: {len(stamps_ns)} rows are {mean_ns:.3g} ns apart in the mean; stamps are nanoseconds,"
+            " these seem to be in a larger unit: multiply them"
+        )
+
+
+def require_covariances(name: str, cov: Floats, stamps_ns: Ints) -> None:
+    """Refuse what no errors can have: not symmetric, or negative in a direction; shape (n, 3, 3)."""
+    row = _impossible_row(cov)
+    if row >= 0:
+        raise MeasurementError(
+            f"{name}: the row at {stamps_ns[row]} ns is no covariance: expected a symmetric matrix without negative"
+            f" eigenvalues, not {cov[row].round(9).tolist()}; NaN means not said"
+        )
+
+
+@compiled
+def _repeated_row(stamps_ns: Ints, first: int, end: int) -> int:
+    for row in range(first, end - 1):
+        if stamps_ns[row + 1] == stamps_ns[row]:
+            return row
+    return -1
+
+
+@compiled
+def _impossible_row(cov: Floats) -> int:
+    """By all principal minors, each relative to the size that its variances give it."""
+    for k in range(len(cov)):
+        P = cov[k]
+        determinant, scale = 0.0, P[0, 0] * P[1, 1] * P[2, 2]
+        for i in range(3):
+            j, other = (i + 1) % 3, (i + 2) % 3
+            product = P[i, i] * P[j, j]
+            if not (P[i, i] >= 0 and np.abs(P[i, j] - P[j, i]) <= 1e-6 * np.sqrt(np.abs(product)) + 1e-15):
+                return k
+            if not product - P[i, j] ** 2 >= -1e-6 * product - 1e-24:
+                return k
+            determinant += P[0, i] * (P[1, j] * P[2, other] - P[1, other] * P[2, j])
+        if not determinant >= -1e-6 * scale - 1e-36:
+            return k
+    return -1
+
+
+@compiled
+def weights_at_end(variance_m2: Floats, before_end_s: Floats, wander_m2_s: float) -> tuple[Floats, float]:
+    """Weights of the samples in the height at the end, and that height's variance.
+
+    Parameters
+    ----------
+    variance_m2
+        r of each sample, in order of time, shape (n,), n >= 1.
+    before_end_s
+        Time from each sample to the end, not increasing, shape (n,).
+    wander_m2_s
+        q, the spectral density of the odometry's vertical velocity noise, m²/s.
+
+    Returns
+    -------
+    Weights with sum 1, shape (n,), and the variance, m².
+    """
+    weights = np.zeros(len(variance_m2))
+    weights[0], P = 1.0, variance_m2[0]
+    for k in range(1, len(variance_m2)):
+        P += wander_m2_s * (before_end_s[k - 1] - before_end_s[k])
+        gain = P / (P + variance_m2[k])
+        weights *= 1.0 - gain
+        weights[k] = gain
+        P *= 1.0 - gain
+    return weights, P + wander_m2_s * max(before_end_s[-1], 0.0)
+
+
+def longest_interval_ns(calibration: Calibration) -> int:
+    """Between velocity samples that is no gap; held samples leave none."""
+    return LATEST_NS if calibration.odometry_interpolation == "hold-past" else round(calibration.dvl.gap_s * 1e9)

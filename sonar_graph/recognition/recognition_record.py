@@ -1,0 +1,176 @@
+"""What was made of the sonar images of a log: data that recognising fills and that reports and viewers show.
+
+A sonar frame as a picture of its fan, with the recognised identities drawn where they were seen.
+
+The counterpart of Fig. 6 of the 2014 paper. Pixels are looked up in the polar image (nearest beam and bin), for
+display only: nothing is measured in such a picture.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_graph.files import read_json, write_json
+from sonar_graph.measurements import LandmarkDetections
+from sonar_graph.sonar import Fan
+from sonar_graph.states import LandmarkMap
+
+RECOGNITION, PICTURES = "recognition.json", "recognised"
+MOST_SHOWN = 6
+NONE = -1
+LEAST_NAMED = 0.5
+"""Posterior above which a detection names a landmark."""
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnFrame:
+    """A frame with what was recognised drawn into it."""
+
+    stamp_ns: int
+    jpeg: bytes
+    landmark_ids: tuple[int, ...]
+    """Most probable identity of each detection in it."""
+    probabilities: tuple[float, ...]
+    """Posterior of each of them."""
+
+
+@dataclass(eq=False)
+class Recognition:
+    """What was made of the images of a log."""
+
+    frames: int = 0
+    detections: LandmarkDetections | None = None
+    outcomes: Counter[str] = field(default_factory=Counter)
+    """How often each thing became of a candidate, track or frame."""
+    warnings: list[tuple[int, str]] = field(default_factory=list)
+    """Stamp and reason: frames that were not used, and changes of the sonar's window; the first of each reason, and of
+    all others the earliest."""
+    pictures: list[DrawnFrame] = field(default_factory=list)
+    """Evenly over the run."""
+    notes: dict[str, str] = field(default_factory=dict)
+    """Which model and settings."""
+
+    def warned(self) -> dict[str, int]:
+        """How often frames were warned about, by reason; most frequent first."""
+        reasons = {reason for _, reason in self.warnings}
+        return {outcome: count for outcome, count in self.outcomes.most_common() if outcome in reasons}
+
+    def naming(self, true_landmarks: LandmarkMap | None = None) -> list[str]:
+        """Lines on how often each landmark was the most probable class, and a warning where none ever was.
+
+        Parameters
+        ----------
+        true_landmarks
+            Those that the log says to be there, if it does.
+        """
+        named: Counter[int] = Counter()
+        if self.detections is not None:
+            ids, probability = self.detections.most_probable()
+            named.update(np.where(probability > LEAST_NAMED, ids, NONE).tolist())
+        counts = [f"landmark {i}: {n}" for i, n in sorted(named.items()) if i != NONE]
+        lines = [f"Most probable: {', '.join([*counts, f'none of them: {named[NONE]}'])}"] if named else []
+        if not counts:
+            designs = self.notes.get("detections.designs", "those given")
+            lines.append(f"Warning: no landmark was recognised; looked for {designs}; --designs gives others")
+        looked_for = set() if self.detections is None else set(np.unique(self.detections.candidate_ids).tolist())
+        if true_landmarks is not None and looked_for:
+            unknown = sorted(set(true_landmarks.ids.tolist()) - looked_for)
+            if unknown:
+                listed = ", ".join(map(str, unknown))
+                lines.append(f"Warning: the log has landmarks {listed}, of which there is no design; give --designs")
+        return lines
+
+    def entry(self) -> dict[str, Any]:
+        """All but detections and pictures, as it stands in JSON."""
+        outcomes = dict(self.outcomes.most_common())
+        return {"frames": self.frames, "outcomes": outcomes, "warnings": self.warnings, "notes": self.notes}
+
+    def shown(self) -> list[DrawnFrame]:
+        """The surest picture of each landmark, at most six, in order of identity."""
+        surest: dict[int, tuple[float, DrawnFrame]] = {}
+        for picture in self.pictures:
+            for landmark, probability in zip(picture.landmark_ids, picture.probabilities, strict=True):
+                if probability > surest.get(landmark, (0.5, None))[0]:
+                    surest[landmark] = probability, picture
+        return [picture for _, (_, picture) in sorted(surest.items())][:MOST_SHOWN]
+
+
+def write_recognition(recognition: Recognition | None, folder: Path) -> None:
+    """Write ``recognition.json`` and the pictures that the report shows; remove those of an earlier comparison."""
+    (folder / RECOGNITION).unlink(missing_ok=True)
+    for old in (folder / PICTURES).glob("*.jpg"):
+        old.unlink()
+    if recognition is None:
+        return
+    (folder / PICTURES).mkdir(exist_ok=True)
+    shown = recognition.shown()
+    for picture in shown:
+        (folder / PICTURES / f"{picture.stamp_ns}.jpg").write_bytes(picture.jpeg)
+    pictures = [[p.stamp_ns, p.landmark_ids, p.probabilities] for p in shown]
+    write_json(folder / RECOGNITION, recognition.entry() | {"pictures": pictures})
+
+
+def read_recognition(folder: Path) -> Recognition | None:
+    """What `write_recognition` left, without detections; None where it left nothing."""
+    if not (folder / RECOGNITION).is_file():
+        return None
+    entry: dict[str, Any] = read_json(folder / RECOGNITION)
+    pictures = [
+        DrawnFrame(stamp, (folder / PICTURES / f"{stamp}.jpg").read_bytes(), tuple(ids), tuple(probabilities))
+        for stamp, ids, probabilities in entry["pictures"]
+    ]
+    warnings = [(stamp, reason) for stamp, reason in entry["warnings"]]
+    return Recognition(entry["frames"], None, Counter(entry["outcomes"]), warnings, pictures, entry["notes"])
+
+
+Picture = NDArray[np.uint8]
+MARGIN = 6
+SURE = 0.9
+"""Posterior from which on an identity is drawn as recognised."""
+RECOGNISED, DOUBTFUL = (60, 220, 255), (190, 190, 190)
+"""Blue, green, red."""
+JPEG_QUALITY = 85
+TEXT_SIZE = 0.85
+"""Of letters that can still be read where a page shows four pictures in a row."""
+
+
+def draw_fan(image_db: NDArray[np.floating], fan: Fan, detections: LandmarkDetections | None) -> Picture:
+    """The frame in grey, the detections as rings with identity and posterior; shape (height, width, 3)."""
+    low, high = np.percentile(image_db, [5, 99.7])
+    grey = np.clip((image_db - low) / max(high - low, 1e-6) * 255, 0, 255).astype(np.uint8)
+    shown = np.where(fan.beam >= 0, grey[np.maximum(fan.beam, 0), fan.bin], 0).astype(np.uint8)
+    picture = np.asarray(cv2.cvtColor(cv2.medianBlur(shown, 3), cv2.COLOR_GRAY2BGR), np.uint8)
+    if detections is not None:
+        ids, probabilities = detections.most_probable()
+        for i, (landmark, probability) in enumerate(zip(ids.tolist(), probabilities.tolist(), strict=True)):
+            place = fan.pixel(float(detections.range_m[i]), float(detections.azimuth_rad[i]))
+            _draw_detection(picture, place, landmark, probability, round(0.23 * fan.pixels_per_m))
+    return picture
+
+
+def _draw_detection(picture: Picture, place: tuple[int, int], landmark: int, probability: float, radius: int) -> None:
+    is_sure = probability >= SURE
+    colour = RECOGNISED if is_sure else DOUBTFUL
+    text = f"ID {landmark}" if is_sure else f"ID {landmark}?  {probability:.2f}"
+    cv2.circle(picture, place, radius, colour, 2 if is_sure else 1, cv2.LINE_AA)
+    cv2.drawMarker(picture, place, colour, cv2.MARKER_CROSS, 9, 1)
+    (width, height), descent = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, 2)
+    left = int(np.clip(place[0] - width // 2, MARGIN, picture.shape[1] - width - MARGIN))
+    foot = max(place[1] - radius - 2 * MARGIN, height + MARGIN)
+    cv2.rectangle(
+        picture, (left - MARGIN, foot - height - MARGIN), (left + width + MARGIN, foot + descent), (0, 0, 0), -1
+    )
+    cv2.putText(picture, text, (left, foot), cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, colour, 2, cv2.LINE_AA)
+
+
+def as_jpeg(picture: Picture) -> bytes:
+    """The picture as the bytes of a JPEG file."""
+    _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return encoded.tobytes()

@@ -1,0 +1,308 @@
+"""Figures of a batch: each a pure function to a drawing with its own data, None where there is nothing to draw.
+
+A contestant keeps its colour and its place in every figure. Each log has a panel with a scale of its own.
+
+Panels of a batch's figures: one a log, a line for each contestant; many logs stand beside each other.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
+
+from sonar_graph.batch import KINDS, Metric, RecordedBatch, failure_rate, quantile
+from sonar_graph.measurements import Floats
+from sonar_graph.report.batch_tables import SAME_EVIDENCE, Tests, anees_of, is_evidence
+from sonar_graph.report.figure_style import (
+    INK,
+    LABEL_SIZE,
+    MUTED,
+    TICK_SIZE,
+    TRUTH,
+    blank_panels,
+    colour,
+    head_panel,
+    inline_svg,
+    logarithmic,
+)
+from sonar_graph.report.tables import csv_text
+
+ROW_IN, PANEL_IN, WIDTH_IN = 0.36, 0.95, 7.4
+STACKED = 2
+"""So many logs stand below each other; more make small multiples."""
+COLUMNS = 3
+NAME_LETTERS, HEADING_LETTERS = 18, 20
+"""Width of names beside and headings above small panels."""
+
+
+def log_panels(batch: RecordedBatch, logs: list[str], x_label: str) -> tuple[Figure, list[Axes]]:
+    """A panel a log with a scale of its own; in each a line for each contestant, the first on top."""
+    names = batch.contestants
+    columns = 1 if len(logs) <= STACKED else min(COLUMNS, len(logs) - 1)
+    rows = -(-len(logs) // columns)
+    height_in = rows * (PANEL_IN + ROW_IN * len(names))
+    figure, axes = blank_panels(rows, columns, (WIDTH_IN, height_in))
+    panels: list[Axes] = list(axes.flat)
+    for panel in panels[len(logs) :]:
+        panel.remove()
+    for index, log in enumerate(logs):
+        _name_lines(panels[index], names if index % columns == 0 else [""] * len(names), narrow=columns > 1)
+        head_panel(panels[index], folded(log, HEADING_LETTERS) if columns > 1 else log)
+    figure.supxlabel(x_label, color=INK, fontsize=LABEL_SIZE)
+    return figure, panels[: len(logs)]
+
+
+def _name_lines(panel: Axes, names: list[str], *, narrow: bool) -> None:
+    labels = [folded(name, NAME_LETTERS) if narrow else name for name in names]
+    panel.set(ylim=(len(names) - 0.5, -0.5), yticks=range(len(names)), yticklabels=labels)
+    panel.grid(False, axis="y")
+    for place, label in enumerate(panel.get_yticklabels()):
+        label.set_color(colour(place))
+        label.set_linespacing(0.95)
+
+
+def folded(name: str, letters: int) -> str:
+    r"""A name in lines of at most so many letters where it can be: they end after a slash, an equals sign or a comma.
+
+    Examples
+    --------
+    >>> folded("isam2/identity_policy=gnc", 18)
+    'isam2/\nidentity_policy=\ngnc'
+    >>> folded("tracks, wrong_id_rate=0.05", 20)
+    'tracks,\nwrong_id_rate=0.05'
+    """
+    lines = [""]
+    for part in re.findall(r"[^/=,]+[/=,]?\s*|[/=,]\s*", name):
+        if lines[-1] and len((lines[-1] + part).rstrip()) > letters:
+            lines.append("")
+        lines[-1] += part
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def spread_out(panel: Axes) -> None:
+    """A logarithmic scale with numbers at 1, 2 and 5 of each power of ten."""
+    logarithmic(panel, "x")
+    panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+
+
+KIND_SHIFT = {"": 0.0, "Causal": -0.17, "Smoothed": 0.17}
+FILLED = {"": True, "Causal": True, "Smoothed": False}
+SMALL = 9.0
+LEAST_SPAN = 4.0
+"""Consistency is drawn from a quarter to four times what it should be, or farther: no small deviation fills a panel."""
+Rows = list[list[str]]
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """One figure as the page shows it."""
+
+    name: str
+    title: str
+    caption: str
+    svg: str
+    data: str
+    """What is drawn, as CSV, in the units of the results."""
+
+
+def spread_drawing(batch: RecordedBatch, metric: Metric) -> Drawing | None:
+    """Every run's value as a dot, with the median and the middle 80 %."""
+    logs = [log for log in batch.logs if any(_finite(batch, log, name, metric).size for name in batch.contestants)]
+    if not logs:
+        return None
+    figure, panels = log_panels(batch, logs, f"{metric.label}{_unit(metric)}")
+    for panel, log in zip(panels, logs, strict=True):
+        values = np.concatenate([_finite(batch, log, name, metric) for name in batch.contestants])
+        if values.min() > 0 and values.max() > SMALL * values.min():
+            spread_out(panel)
+        for place, contestant in enumerate(batch.contestants):
+            for over, key in metric.keys.items():
+                _draw_spread(panel, batch.values(log, contestant, key) * metric.factor, place, over)
+    caption = (
+        f"{metric.protocol} A dot is a run, the stroke their median, the bar the middle 80 %. {_kinds_told(metric)}"
+        "Runs without a value have no dot; their number stands at the right."
+    )
+    rows = [["log", "contestant", "seed", "key", "column", "value"], *_value_rows(batch, metric)]
+    return _drawn(figure, f"spread-{metric.name}", metric.label, caption, rows)
+
+
+def difference_drawing(batch: RecordedBatch, metric: Metric, tests: Tests) -> Drawing | None:
+    """Mean differences to the reference with their intervals."""
+    found = {place: test for place, (test, _) in tests.items() if place[0] in metric.keys.values()}
+    logs = [log for log in batch.logs if any(place[1] == log and math.isfinite(t.mean) for place, t in found.items())]
+    if not logs:
+        return None
+    figure, panels = log_panels(batch, logs, f"difference to {batch.reference}{_unit(metric)}")
+    for panel, log in zip(panels, logs, strict=True):
+        panel.axvline(0, color=TRUTH, linewidth=1.6)
+        for place, contestant in enumerate(batch.contestants):
+            for over, key in metric.keys.items():
+                test = found.get((key, log, contestant))
+                if test is not None and math.isfinite(test.mean):
+                    ends = np.array([test.mean, *test.interval]) * metric.factor
+                    _draw_interval(panel, ends, place, over)
+    caption = (
+        f"{metric.label}: mean of the differences on the same log and seed, with 95 % intervals (of few pairs none); "
+        f"left of the line the error is smaller than that of {batch.reference}. {_kinds_told(metric)}A "
+        "group in which a run has no value has no mean difference and is not drawn."
+    )
+    rows = [["log", "contestant", "column", "pairs", "pairs_of", "mean_difference", "low", "high"]]
+    rows += [
+        [log, name, key, str(test.pairs), test.each, *map(_text, (test.mean, *test.interval))]
+        for (key, log, name), test in found.items()
+    ]
+    return _drawn(figure, f"difference-{metric.name}", f"{metric.label}: against {batch.reference}", caption, rows)
+
+
+def consistency_drawing(batch: RecordedBatch, what: str) -> Drawing | None:
+    """ANEES over independent runs against its chi-square band."""
+    rows: Rows = [["log", "contestant", "estimate", "runs", "anees", "low", "high"]]
+    known: dict[tuple[str, str], list[tuple[str, float]]] = {}
+    bands: dict[str, set[tuple[float, float]]] = {}
+    for log in batch.logs:
+        for contestant in batch.contestants:
+            both = {kind: anees_of(batch, log, contestant, kind, what) for kind in KINDS}
+            for kind, told in both.items():
+                if told is None:
+                    continue
+                rows.append([log, contestant, kind, str(told.runs), _text(told.mean), *map(_text, told.band)])
+                if math.isfinite(told.mean) and is_evidence(both, kind):
+                    known.setdefault((log, contestant), []).append((kind.capitalize(), told.mean))
+                    bands.setdefault(log, set()).add(told.band)
+    if not known:
+        return None
+    logs = [log for log in batch.logs if log in bands]
+    figure, panels = log_panels(batch, logs, f"ANEES of {what} at the last instant")
+    for panel, log in zip(panels, logs, strict=True):
+        spread_out(panel)
+        for low, high in bands[log]:
+            if math.isfinite(low):
+                panel.axvspan(low, high, color=TRUTH, alpha=0.25, linewidth=0)
+        panel.axvline(1, color=TRUTH, linewidth=1.6)
+        for place, contestant in enumerate(batch.contestants):
+            for over, mean in known.get((log, contestant), []):
+                _draw_point(panel, mean, place, over)
+        low, high = panel.get_xlim()
+        panel.set_xlim(min(low, 1 / LEAST_SPAN), max(high, LEAST_SPAN))
+    caption = (
+        f"Normalised squared error of {what} at the last instant, average over runs per degree of freedom. The grey "
+        "band holds 95 % of the averages of consistent estimators; right of it covariances are too small, left "
+        f"too large. Full: causal. Hollow: smoothed. {SAME_EVIDENCE} A group with a run that did not end has no "
+        "average and is not drawn."
+    )
+    return _drawn(figure, f"anees-{what}", f"Consistency of {what}", caption, rows)
+
+
+def failure_drawing(batch: RecordedBatch) -> Drawing | None:
+    """Failure rates with their intervals; None where every run ended."""
+    if all(run.ended for run in batch.runs):
+        return None
+    figure, panels = log_panels(batch, batch.logs, "runs that did not end (%)")
+    rows: Rows = [["log", "contestant", "runs", "failed", "failure_rate", "low", "high"]]
+    for panel, log in zip(panels, batch.logs, strict=True):
+        panel.set_xlim(-3, 103)
+        for place, contestant in enumerate(batch.contestants):
+            group = batch.group(log, contestant)
+            if group:
+                failed = sum(not run.ended for run in group)
+                rate = failure_rate(failed, len(group))
+                _draw_interval(panel, 100 * np.array([rate.share, rate.low, rate.high]), place, "")
+                numbers = [str(len(group)), str(failed), *map(_text, (rate.share, rate.low, rate.high))]
+                rows.append([log, contestant, *numbers])
+    caption = "Share of runs that failed, took too long, needed too much memory or were killed, with 95 % intervals."
+    return _drawn(figure, "failures", "Runs that did not end", caption, rows)
+
+
+def cost_drawing(batch: RecordedBatch) -> Drawing | None:
+    """Median and 99th percentile of the time of an update, over all runs of a group."""
+    keys = ("update_p50_ms", "update_p99_ms")
+    if not any(keys[0] in run.values for run in batch.runs):
+        return None
+    figure, panels = log_panels(batch, batch.logs, "time of an update (ms)")
+    rows: Rows = [["log", "contestant", *keys]]
+    for panel, log in zip(panels, batch.logs, strict=True):
+        spread_out(panel)
+        for place, contestant in enumerate(batch.contestants):
+            ends = [quantile(batch.values(log, contestant, key), 0.5) for key in keys]
+            rows.append([log, contestant, *map(_text, ends)])
+            if all(map(math.isfinite, ends)):
+                panel.plot(ends, [place, place], color=colour(place), linewidth=2.4)
+                panel.plot(ends[0], place, "o", color=colour(place), markersize=6)
+                panel.plot(ends[1], place, "|", color=colour(place), markersize=11, markeredgewidth=2.4)
+    caption = "Dot: median over runs of the median time of an update. Stroke: median over runs of the 99th percentile."
+    return _drawn(figure, "costs", "Time of an update", caption, rows)
+
+
+def _draw_spread(panel: Axes, values: Floats, place: int, over: str) -> None:
+    known, row = values[np.isfinite(values)], place + KIND_SHIFT[over]
+    own = colour(place)
+    if not known.size:
+        return
+    inside = [quantile(values, share) for share in (0.1, 0.9)]
+    if all(map(math.isfinite, inside)) and len(values) > 1:
+        panel.plot(inside, [row, row], color=own, alpha=0.3, linewidth=7, solid_capstyle="butt")
+    shifts = row + 0.05 * np.cos(2.4 * np.arange(len(known)))
+    panel.plot(known, shifts, "o", color=own, markersize=3.6, markerfacecolor=own if FILLED[over] else "none")
+    middle = quantile(values, 0.5)
+    if math.isfinite(middle):
+        panel.plot(middle, row, "|", color=INK, markersize=12, markeredgewidth=1.6)
+    if len(known) < len(values):
+        _note(panel, f"{len(values) - len(known)} without", row)
+
+
+def _note(panel: Axes, text: str, row: float) -> None:
+    across = panel.get_yaxis_transform()
+    panel.text(1.01, row, text, transform=across, ha="left", va="center", color=MUTED, fontsize=TICK_SIZE - 1)
+
+
+def _draw_interval(panel: Axes, ends: Floats, place: int, over: str) -> None:
+    """A point with the interval about it, shape (3,): point, low, high."""
+    row = place + KIND_SHIFT[over]
+    if np.isfinite(ends[1:]).all():
+        panel.plot(ends[1:], [row, row], color=colour(place), linewidth=1.8)
+    _draw_point(panel, float(ends[0]), place, over)
+
+
+def _draw_point(panel: Axes, value: float, place: int, over: str) -> None:
+    own = colour(place)
+    face = own if FILLED[over] else "none"
+    panel.plot(
+        value, place + KIND_SHIFT[over], "o", color=own, markerfacecolor=face, markersize=6.5, markeredgewidth=1.6
+    )
+
+
+def _finite(batch: RecordedBatch, log: str, contestant: str, metric: Metric) -> Floats:
+    values = np.concatenate([batch.values(log, contestant, key) for key in metric.keys.values()])
+    return np.asarray(values[np.isfinite(values)])
+
+
+def _value_rows(batch: RecordedBatch, metric: Metric) -> Rows:
+    return [
+        [run.log, run.contestant, "" if run.seed is None else str(run.seed), run.key, key, _text(run.value(key))]
+        for run in batch.runs
+        for key in metric.keys.values()
+    ]
+
+
+def _kinds_told(metric: Metric) -> str:
+    return "" if "" in metric.keys else "Full dots, above: causal; hollow, below: smoothed. "
+
+
+def _unit(metric: Metric) -> str:
+    return f" ({metric.shown_unit})" if metric.shown_unit else ""
+
+
+def _text(value: float) -> str:
+    return repr(float(value)) if math.isfinite(value) else ""
+
+
+def _drawn(figure: Figure, name: str, title: str, caption: str, rows: Rows) -> Drawing:
+    plain_name = name.replace("_", "-").replace(".", "-")
+    svg = inline_svg(figure, plain_name, f"{title}. {caption}")
+    return Drawing(plain_name, title, caption, svg, csv_text(rows))

@@ -1,0 +1,278 @@
+"""The coherent sum of all echoes from the floor and what lies on it.
+
+A scatterer with complex amplitude a, at distance r in direction (azimuth, elevation e), seen under the angle i from its
+facet's normal N = (-dz/dx, -dz/dy, 1), adds to the column of its azimuth at range bin b::
+
+    a gain (u · N) / sqrt(|N|) pattern(e) pulse(r_b - r) exp(4 pi j r / wavelength)
+
+with u the unit vector to the sonar: the intensity of Lambert's rule, cos² i times the facet's area |N|. What depends
+on range alone, and the beams' pattern in azimuth, is applied to the sum.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.numerics import compiled
+from sonar_graph.simulation.sonar_image.scene import Floats32
+
+TAPS = 6
+"""Bins that one echo reaches."""
+PULSE_STEPS = 32
+PHASE_STEPS = 1024
+ELEVATION_STEPS = 512
+STEEP = 0.25
+"""Facets with ``1 - 1/|N|`` above it see the floor in front of them."""
+
+
+class Tables(NamedTuple):
+    """What does not change from frame to frame."""
+
+    cell_m: float
+    """Of the scatterers' grid."""
+    columns_per_rad: float
+    """Columns of azimuth; see `columns`."""
+    columns: int
+    """Centred on azimuth 0."""
+    range_start_m: float
+    """Edge of the first bin."""
+    bin_m: float
+    bins_per_m: float
+    bins: int
+    waves_per_m: float
+    """Of the way there and back: 2 / wavelength."""
+    phasor: Floats32
+    """Cosine and sine, shape (PHASE_STEPS, 2)."""
+    pulse: Floats32
+    """Amplitude at TAPS bins for positions within a bin, shape (PULSE_STEPS, TAPS)."""
+    elevation: Floats32
+    """Two-way amplitude over the sine of elevation from -0.5 to 0.5, shape (ELEVATION_STEPS,)."""
+
+
+class SonarPlacement(NamedTuple):
+    """Where the sonar is and which cells it can see."""
+
+    position_m: Floats
+    """In the world, shape (3,)."""
+    sonar_R_world: Floats
+    """Shape (3, 3)."""
+    heading: Floats
+    """Horizontal unit vector of its axis, shape (2,)."""
+    floor_z_m: float
+    first_row: int
+    spans: Ints
+    """First and last column (not included) of each row, shape (rows, 2)."""
+    shift: Ints
+    """Added to row and column of the amplitudes: (0, 0) where speckle belongs to the world."""
+
+
+class Surface(NamedTuple):
+    """What lies in view, cell by cell; arrays without a row where there is only floor."""
+
+    first_column: int
+    amplitude: Floats32
+    """NaN: floor."""
+    relief_m: Floats32
+
+
+class Horizon(NamedTuple):
+    """Highest line of sight that something blocks, over bearing and horizontal distance."""
+
+    tangent: Floats32
+    """Rise over run of the highest blocked ray, shape (bearings, distances); without a row: no shadows."""
+    half_tangent: float
+    """Tangents of bearings from minus to plus this one."""
+    distance_m: float
+    """Size of a step."""
+
+
+@compiled
+def block_rays(view: SonarPlacement, surface: Surface, horizon: Horizon, raised_m: float, cell_m: float) -> None:
+    """Fill the horizon: what lies behind something raised is blocked below the ray over its top."""
+    bearings, distances = horizon.tangent.shape
+    for row in range(surface.relief_m.shape[0]):
+        y = (view.first_row + row + 0.5) * cell_m - view.position_m[1]
+        for column in range(surface.relief_m.shape[1]):
+            relief = surface.relief_m[row, column]
+            if relief < raised_m:
+                continue
+            x = (surface.first_column + column + 0.5) * cell_m - view.position_m[0]
+            ahead = view.heading[0] * x + view.heading[1] * y
+            aside = view.heading[0] * y - view.heading[1] * x
+            run = np.sqrt(x * x + y * y)
+            bearing = int((aside / ahead / horizon.half_tangent + 1.0) * 0.5 * bearings)
+            distance = int(run / horizon.distance_m)
+            if ahead > 0 and 0 <= bearing < bearings and distance < distances:
+                rise = (view.floor_z_m + relief - view.position_m[2]) / run
+                horizon.tangent[bearing, distance] = max(horizon.tangent[bearing, distance], rise)
+    for bearing in range(bearings):
+        for distance in range(1, distances):
+            before = horizon.tangent[bearing, distance - 1]
+            horizon.tangent[bearing, distance] = max(horizon.tangent[bearing, distance], before)
+
+
+@compiled
+def add_echo(
+    tables: Tables, echoes: Floats32, column: int, range_m: float, amplitude: float, re: float, im: float
+) -> None:
+    """One echo with its phase, spread over the bins that the pulse reaches."""
+    waves = range_m * tables.waves_per_m
+    step = int((waves - np.floor(waves)) * PHASE_STEPS)
+    cos, sin = tables.phasor[step, 0] * amplitude, tables.phasor[step, 1] * amplitude
+    real, imaginary = re * cos - im * sin, re * sin + im * cos
+    place = (range_m - tables.range_start_m) * tables.bins_per_m - 0.5 * TAPS + 0.5
+    first = int(np.floor(place))
+    within = int((place - first) * PULSE_STEPS)
+    if first < -TAPS or first >= tables.bins:
+        return
+    for tap in range(TAPS):
+        at = first + tap + TAPS
+        echoes[column, at, 0] += real * tables.pulse[within, tap]
+        echoes[column, at, 1] += imaginary * tables.pulse[within, tap]
+
+
+@compiled
+def is_blocked(view: SonarPlacement, horizon: Horizon, x: float, y: float, z: float) -> bool:
+    """Whether something nearer hides a point from the sonar."""
+    bearings, distances = horizon.tangent.shape
+    ahead = view.heading[0] * x + view.heading[1] * y
+    aside = view.heading[0] * y - view.heading[1] * x
+    run = np.sqrt(x * x + y * y)
+    bearing = int((aside / ahead / horizon.half_tangent + 1.0) * 0.5 * bearings)
+    distance = int(run / horizon.distance_m) - 1
+    if not 0 <= bearing < bearings or distance < 0:
+        return False
+    return z < run * horizon.tangent[bearing, min(distance, distances - 1)]
+
+
+@compiled
+def slopes(relief_m: Floats32, row: int, column: int, cell_m: float) -> tuple[float, float]:
+    """Rise per metre along x and y; 0 at the border of what is in view."""
+    rows, columns = relief_m.shape
+    if not (0 < row < rows - 1 and 0 < column < columns - 1):
+        return 0.0, 0.0
+    along_x = relief_m[row, column + 1] - relief_m[row, column - 1]
+    along_y = relief_m[row + 1, column] - relief_m[row - 1, column]
+    return along_x / (2 * cell_m), along_y / (2 * cell_m)
+
+
+@compiled
+def table_places(R: Floats, x: float, y: float, z: float, per_range: float, tables: Tables) -> tuple[int, int]:
+    """Column of azimuth and step of elevation of a point at distance 1 / per_range, (-1, -1) outside of the tables."""
+    forward = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
+    left = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
+    up = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
+    if forward <= 0:
+        return -1, -1
+    t = left / forward
+    t2 = t * t
+    azimuth = t * (1 - t2 * (1 / 3 - t2 * (1 / 5 - t2 * (1 / 7 - t2 / 9)))) if t2 < 0.1 else np.arctan(t)
+    column = int(np.floor(azimuth * tables.columns_per_rad + 0.5 * tables.columns))
+    lift = int((up * per_range + 0.5) * ELEVATION_STEPS)
+    if not 0 <= column < tables.columns or not 0 <= lift < ELEVATION_STEPS:
+        return -1, -1
+    return column, lift
+
+
+@compiled
+def sum_echoes(
+    view: SonarPlacement,
+    points: Floats32,
+    texture: Floats32,
+    surface: Surface,
+    horizon: Horizon,
+    tables: Tables,
+    floor_reflection: float,
+    echoes: Floats32,
+) -> None:
+    """Add every echo in view to ``echoes``, shape (columns, TAPS + bins + TAPS, 2), real and imaginary part."""
+    cell_m, cells = tables.cell_m, points.shape[0]
+    has_objects = surface.amplitude.shape[0] > 0
+    has_shadows = horizon.tangent.shape[0] > 0
+    least_m2 = (tables.range_start_m - TAPS * tables.bin_m) ** 2
+    most_m2 = (tables.range_start_m + (tables.bins + TAPS) * tables.bin_m) ** 2
+    height_m = view.position_m[2] - view.floor_z_m
+    for row in range(view.spans.shape[0]):
+        i = (view.first_row + row) % cells
+        point_row = (i + view.shift[0]) % cells
+        y_row = (view.first_row + row) * cell_m - view.position_m[1]
+        j = (view.spans[row, 0] - 1) % cells
+        point_column = (j + view.shift[1]) % cells
+        for column in range(view.spans[row, 0], view.spans[row, 1]):
+            j = j + 1 if j + 1 < cells else 0  # a remainder costs as much as all else here
+            point_column = point_column + 1 if point_column + 1 < cells else 0
+            point = points[point_row, point_column]
+            x = column * cell_m - view.position_m[0] + cell_m * point[2]
+            y = y_row + cell_m * point[3]
+            gain, relief, slope_x, slope_y, area = texture[i, j], 0.0, 0.0, 0.0, 1.0
+            if has_objects:
+                at = column - surface.first_column
+                relief = surface.relief_m[row, at]
+                slope_x, slope_y = slopes(surface.relief_m, row, at, cell_m)
+                if not np.isnan(surface.amplitude[row, at]):
+                    gain = surface.amplitude[row, at]
+                area = np.sqrt(1 + slope_x * slope_x + slope_y * slope_y)
+            z = relief - height_m
+            range_m2, toward = x * x + y * y + z * z, x * slope_x + y * slope_y - z
+            if range_m2 < least_m2 or range_m2 > most_m2 or toward <= 0:
+                continue
+            if has_shadows and is_blocked(view, horizon, x, y, z):
+                continue
+            range_m = np.sqrt(range_m2)
+            beam_column, lift = table_places(view.sonar_R_world, x, y, z, 1 / range_m, tables)
+            if beam_column < 0:
+                continue
+            amplitude = gain * toward / (range_m * np.sqrt(area)) * tables.elevation[lift]
+            add_echo(tables, echoes, beam_column, range_m, amplitude, point[0], point[1])
+            steepness = 1 - 1 / area
+            if steepness > STEEP and relief > 0 and floor_reflection > 0:
+                image_m = np.sqrt(x * x + y * y + (height_m + relief) ** 2)
+                ghost = 2 * floor_reflection * steepness * amplitude
+                add_echo(tables, echoes, beam_column, 0.5 * (range_m + image_m), ghost, point[0], point[1])
+
+
+@compiled
+def through_beams(beam_matrix: Floats32, bands: Ints, echoes: Floats32, seen: Floats32) -> None:
+    """Matrix product ``seen += beam_matrix @ echoes``, on one core and always in the same order.
+
+    Shapes (beams, columns), (columns, samples), (beams, samples). Of each beam only the columns of its band count, from
+    the first to the last (not included), whose number is divisible by 4. A BLAS would use all cores for a product this
+    small, and its bytes would depend on their number.
+    """
+    samples = echoes.shape[1]
+    for beam in range(beam_matrix.shape[0]):
+        for column in range(bands[beam, 0], bands[beam, 1], 4):
+            a, b = beam_matrix[beam, column], beam_matrix[beam, column + 1]
+            c, d = beam_matrix[beam, column + 2], beam_matrix[beam, column + 3]
+            for k in range(samples):
+                seen[beam, k] += (a * echoes[column, k] + b * echoes[column + 1, k]) + (
+                    c * echoes[column + 2, k] + d * echoes[column + 3, k]
+                )
+
+
+def no_surface() -> Surface:
+    """Nothing but floor."""
+    none = np.empty((0, 0), np.float32)
+    return Surface(0, none, none)
+
+
+def no_horizon() -> Horizon:
+    """Nothing that hides anything."""
+    return Horizon(np.empty((0, 0), np.float32), 1.0, 1.0)
+
+
+def phasors() -> Floats32:
+    """One turn in PHASE_STEPS steps."""
+    angle = 2 * np.pi * (np.arange(PHASE_STEPS) + 0.5) / PHASE_STEPS
+    return np.column_stack([np.cos(angle), np.sin(angle)]).astype(np.float32)
+
+
+def pulses(sigma_bins: float) -> Floats32:
+    """A Gaussian pulse at TAPS bins around each position within a bin."""
+    within = (np.arange(PULSE_STEPS) + 0.5) / PULSE_STEPS
+    offset: NDArray[np.float64] = np.arange(TAPS) + 1 - 0.5 * TAPS - within[:, None]
+    return np.exp(-((offset / sigma_bins) ** 2) / 2).astype(np.float32)

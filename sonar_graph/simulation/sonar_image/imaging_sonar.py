@@ -1,0 +1,177 @@
+"""Imaging sonars by their parameters: beams, lens, window and scale.
+
+The two-way pattern of a focused lens of width D is ``w(t) = sinc²(D sin(t) / wavelength)``, with D from the one-way
+width of a beam at half power, ``D = 0.886 wavelength / width``: its first side lobe lies at -26 dB.
+
+What can be chosen about simulated images: every effect has a switch and a documented value.
+
+No value is published for the 2014 experiment beyond the sonar's window and tilt; all are ours. Where they come from is
+in docs/theory/sonar_image.md.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from sonar_graph.calibration import Section
+from sonar_graph.measurements import Floats
+
+SOUND_SPEED_M_S = 1480.0
+"""Fresh water of 20 °C; nothing here depends on it strongly."""
+_FINE_DEG = np.linspace(-20, 20, 8001)
+
+
+class ImagingSonar(Section):
+    """What a multibeam imaging sonar is, apart from its surroundings."""
+
+    frequency_hz: float = Field(gt=0)
+    beams: int = Field(gt=1)
+    azimuth_span_rad: float = Field(gt=0, lt=np.pi)
+    """Of all beams together, where the lens is linear."""
+    beam_width_rad: float = Field(gt=0)
+    """Of one beam, one way, between half powers."""
+    elevation_span_rad: float = Field(gt=0, lt=np.pi)
+    """One way, between half powers."""
+    bins: int = Field(gt=1)
+    range_start_m: float = Field(gt=0)
+    range_length_m: float = Field(gt=0)
+    range_resolution_m: float = Field(gt=0)
+    """Length of a pulse in range, between half powers."""
+    firing_groups: int = Field(1, ge=1)
+    """Beams whose numbers are equal modulo this are fired together."""
+    lens_cubic: tuple[float, float, float, float] | None = None
+    """Beam number, from 1 at the left, as a cubic of degrees to the right, lowest order last; None: beams are equally
+    spaced."""
+    decibel_span: float = Field(80.0, gt=0)
+    """Decibels over the 255 counts of a sample."""
+
+    @property
+    def wavelength_m(self) -> float:
+        """In water."""
+        return SOUND_SPEED_M_S / self.frequency_hz
+
+    @property
+    def aperture_m(self) -> float:
+        """Width of the lens."""
+        return 0.886 * self.wavelength_m / self.beam_width_rad
+
+    def ranges_m(self) -> Floats:
+        """Middle of each range bin, shape (bins,)."""
+        return self.range_start_m + (np.arange(self.bins) + 0.5) * self.range_length_m / self.bins
+
+    def linear_azimuths_rad(self) -> Floats:
+        """Equally spaced beams over the span, rightmost first, shape (beams,)."""
+        return ((np.arange(self.beams) + 0.5) / self.beams - 0.5) * self.azimuth_span_rad
+
+    def azimuths_rad(self) -> Floats:
+        """Where the beams truly point, positive to the left, rightmost first, shape (beams,)."""
+        if self.lens_cubic is None:
+            return self.linear_azimuths_rad()
+        numbers = np.polyval(self.lens_cubic, _FINE_DEG)
+        return np.radians(-np.interp(np.arange(1, self.beams + 1), numbers, _FINE_DEG)[::-1])
+
+    def two_way_pattern(self, offset_rad: Floats, side_lobes: bool) -> Floats:
+        """Amplitude over the angle from a beam's centre, 1 there; without side lobes a Gaussian of equal width."""
+        if side_lobes:
+            return np.sinc(self.aperture_m * np.sin(offset_rad) / self.wavelength_m) ** 2
+        return np.exp2(-((2 * offset_rad / self.beam_width_rad) ** 2))
+
+    def elevation_pattern(self, elevation_rad: Floats) -> Floats:
+        """Two-way amplitude over elevation, 1 at 0: ``sinc²(0.886 sin e / sin span)``."""
+        return np.sinc(0.886 * np.sin(elevation_rad) / np.sin(self.elevation_span_rad)) ** 2
+
+
+DIDSON = ImagingSonar(
+    frequency_hz=1.8e6,
+    beams=96,
+    azimuth_span_rad=np.radians(28.8),
+    beam_width_rad=np.radians(0.3),
+    elevation_span_rad=np.radians(14.0),
+    bins=512,
+    range_start_m=1.26,
+    range_length_m=1.25,
+    range_resolution_m=0.004,
+    firing_groups=8,
+    lens_cubic=(1.012 * 0.0030, 1.012 * -0.0055, 1.012 * 2.6829, 1.012 * 48.04 + 1),
+)
+"""High frequency, shortest extended window. The lens is the measured one: beams 0.37° apart at the centre, 0.21° at the
+edge. Length of the pulse: ours."""
+ARIS_3000 = ImagingSonar(
+    frequency_hz=3.0e6,
+    beams=128,
+    azimuth_span_rad=np.radians(30.0),
+    beam_width_rad=np.radians(0.2),
+    elevation_span_rad=np.radians(15.0),
+    bins=512,
+    range_start_m=1.26,
+    range_length_m=1.25,
+    range_resolution_m=0.004,
+    firing_groups=8,
+)
+"""ARIS Explorer 3000 with all beams, over the same window. Beams equally spaced: its lens is not simulated."""
+OCULUS_M1200D = ImagingSonar(
+    frequency_hz=2.1e6,
+    beams=512,
+    azimuth_span_rad=np.radians(60.0),
+    beam_width_rad=np.radians(0.4),
+    elevation_span_rad=np.radians(12.0),
+    bins=512,
+    range_start_m=1.26,
+    range_length_m=1.25,
+    range_resolution_m=0.004,
+)
+"""Oculus M1200d, high frequency; an electronic array, which forms all beams from one ping."""
+SonarName = Literal["didson", "aris3000", "oculus1200"]
+
+
+class ImageOptions(Section):
+    """Surroundings and faults of an imaging sonar."""
+
+    sonar: SonarName = "didson"
+    """Which sonar; the window is the same for all."""
+    designs: str | None = None
+    """TOML file, or folder of such files, with the landmarks that lie in the basin. It needs four; of more, those with
+    the four lowest identities lie there, in the order of their identities at (5, 0), (7, -5), (2, -7) and (0, -2).
+    None: those that ship."""
+    speckle: Literal["world", "frame"] = "world"
+    """world: scatterers stay where they are, so that speckle changes only as the vehicle moves; frame: drawn anew for
+    each frame, as many simulators do."""
+    side_lobes: bool = True
+    """Of the beams' pattern in azimuth; off: Gaussian beams of the same width."""
+    cross_talk_db: float | None = -25.0
+    """Power from all beams fired together with one, against its own; None: none."""
+    measured_lens: bool = True
+    """Whether the log says where the beams truly point; off: it says that they are equally spaced."""
+    floor_db: float = 40.0
+    """Level of the floor at 2 m in the middle of the fan, over the lowest sample."""
+    absorption_db_m: float = Field(0.8, ge=0)
+    """One way: fresh water of 17 °C at 1.8 MHz."""
+    tvg_error_db: float = Field(1.5, ge=0)
+    """Sigma of the tilt from one end of the window to the other which time-varied gain leaves; 0: exact gain."""
+    texture_shape: float | None = Field(5.0, gt=0)
+    """Shape of the floor's K-distribution: its strength is Gamma(shape) over patches of 3 cm; None: even floor."""
+    joints: bool = True
+    """Bright joints between the plates of the floor, every 0.5 m."""
+    shadows: bool = True
+    """Behind what stands above the floor."""
+    multipath: bool = True
+    """Echoes by way of the surface, and by way of the floor in front of steep faces."""
+    surface_path_db: float = -15.0
+    """Echo by way of the surface against the direct one, after the sonar's pattern."""
+    floor_reflection: float = Field(0.5, ge=0, le=1)
+    """Amplitude that a floor mirrors forward."""
+    noise_db: float | None = 15.0
+    """Level of the receiver's noise at 2 m, in the scale of `floor_db`; None: none."""
+    drop_probability: float = Field(0.01, ge=0, lt=1)
+    """Share of the frames that are never recorded."""
+    time_offset_s: float = 0.0
+    """By how much stamps are late; estimators are not told. Real drivers: 0.02 to 0.1."""
+    sound_speed_error: float = Field(0.0, gt=-0.1, lt=0.1)
+    """Relative error of the sound speed with which times become ranges; estimators are not told."""
+    stones: int = Field(4, ge=0, le=6)
+    """Rounded stones on the route, up to 6 cm high."""
+    decoys: int = Field(4, ge=0, le=6)
+    """Flat rough patches on the route, as large as landmarks and as bright, of irregular outline."""

@@ -1,0 +1,308 @@
+"""What lies on the floor: landmarks, stones, and flat patches that are no landmarks.
+
+Each is turned once into a patch of the scatterers' grid, which says how strongly each cell scatters and how high it is.
+
+Scatterers that stay where they are: what makes speckle belong to the world.
+
+The floor is a square grid with one scatterer a cell, at a random place in it, with a complex amplitude drawn from
+CN(0, 1). Both repeat every 4 m, beyond what a sonar sees at once, so that a basin of any size needs the same memory.
+Many such echoes in one resolution cell give an exponentially distributed intensity; a floor of varying strength
+multiplies it, and Gamma(shape) strength makes it K-distributed.
+
+Source: Abraham and Lyons, "Novel physical interpretations of K-distributed reverberation", IEEE JOE 27(4), 2002.
+
+Which cells of the floor a sonar can see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.devices import LandmarkDesign
+from sonar_graph.measurements import Floats, Ints
+
+Floats32 = NDArray[np.float32]
+CELL_M = 0.0032
+CELLS = 1250
+TEXTURE_M = 0.03
+"""Correlation length of the floor's strength."""
+JOINT_SPACING_M, JOINT_WIDTH_M, JOINT_DB = 0.5, 0.008, 6.0
+
+
+@dataclass(frozen=True, eq=False)
+class Scatterers:
+    """One period of the floor: cell (row i, column j) covers y from 3.2 mm · i and x from 3.2 mm · j on."""
+
+    points: Floats32
+    """Real and imaginary part of the amplitude, then x and y within the cell as shares of it; (1250, 1250, 4)."""
+    texture: Floats32
+    """Amplitude of the bare floor, mean square 1 but for joints, shape (1250, 1250)."""
+
+
+def scatterers(texture_shape: float | None, joints: bool, rng: np.random.Generator) -> Scatterers:
+    """Draw a floor.
+
+    Parameters
+    ----------
+    texture_shape
+        Shape of the Gamma distribution of its strength; None: even.
+    joints
+        Whether there are bright lines every half metre.
+    rng
+        Source of everything random.
+    """
+    points_rng, texture_rng = rng.spawn(2)
+    points = np.empty((CELLS, CELLS, 4), np.float32)
+    points[..., :2] = points_rng.standard_normal((CELLS, CELLS, 2), np.float32) * np.float32(np.sqrt(0.5))
+    points[..., 2:] = points_rng.random((CELLS, CELLS, 2), np.float32)
+    strength = np.ones((CELLS, CELLS)) if texture_shape is None else _gamma_field(texture_shape, texture_rng)
+    if joints:
+        strength = np.where(_on_joint(), strength * 10 ** (JOINT_DB / 10), strength)
+    return Scatterers(points, np.sqrt(strength).astype(np.float32))
+
+
+def _gamma_field(shape: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Strength with mean 1, Gamma-distributed at each point, smooth over `TEXTURE_M` and periodic."""
+    frequency = np.fft.fftfreq(CELLS, CELL_M), np.fft.rfftfreq(CELLS, CELL_M)
+    smoothing = np.exp(-((np.pi * TEXTURE_M) ** 2) * np.add.outer(frequency[0] ** 2, frequency[1] ** 2) / 2)
+    field = np.fft.irfft2(smoothing * np.fft.rfft2(rng.standard_normal((CELLS, CELLS))), (CELLS, CELLS))
+    quantiles = np.linspace(-6, 6, 2001)
+    levels = stats.gamma.ppf(stats.norm.cdf(quantiles), shape, scale=1 / shape)
+    return np.interp(field / field.std(), quantiles, levels)
+
+
+def _on_joint() -> NDArray[np.bool_]:
+    """Cells on the grid of joints."""
+    middle_m = (np.arange(CELLS) + 0.5) * CELL_M
+    on_line = (middle_m + JOINT_WIDTH_M / 2) % JOINT_SPACING_M < JOINT_WIDTH_M
+    return np.asarray(on_line[:, None] | on_line[None, :])
+
+
+Shape = Callable[[Floats, Floats], tuple[Floats, Floats]]
+"""Level over the floor in dB (NaN: floor) and height over it in metres, at points of the object's own frame."""
+SLOPE_M = 0.4
+"""Over which the floor rises or falls to the bottom of a landmark."""
+
+
+@dataclass(frozen=True, eq=False)
+class SeabedObject:
+    """Something on the floor."""
+
+    id: int
+    """Of a landmark its identity, otherwise negative."""
+    kind: str
+    position_m: Floats
+    """World position of the centre of its face, or of its foot, shape (3,)."""
+    yaw_rad: float
+    extent_m: float
+    """Radius of the disc that its material covers."""
+    radius_m: float
+    """Of a circle around its patch, in which the floor may slope."""
+    first_row: int
+    """Where its patch begins on the grid of scatterers."""
+    first_column: int
+    amplitude: Floats32
+    """Over the even floor, shape (rows, columns); NaN: floor."""
+    relief_m: Floats32
+    """Height over the even floor, same shape."""
+
+
+def place(
+    id_: int, kind: str, shape: Shape, extent_m: float, position_m: Floats, yaw_rad: float, margin_m: float = 0.0
+) -> SeabedObject:
+    """Put a shape on the grid.
+
+    Parameters
+    ----------
+    id_, kind
+        What it is.
+    shape
+        Its level and height.
+    extent_m
+        Radius that holds its material.
+    position_m
+        World position of its origin.
+    yaw_rad
+        Turns it, positive to the left.
+    margin_m
+        How far the floor around it slopes.
+    """
+    radius_m = extent_m + margin_m
+    first = np.floor((position_m[:2] - radius_m) / CELL_M).astype(int) - 1
+    cells = int(np.ceil(2 * radius_m / CELL_M)) + 3
+    x = (first[0] + np.arange(cells) + 0.5) * CELL_M - position_m[0]
+    y = (first[1] + np.arange(cells) + 0.5) * CELL_M - position_m[1]
+    world_x, world_y = np.meshgrid(x, y)
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    level_db, height_m = shape(cos * world_x + sin * world_y, cos * world_y - sin * world_x)
+    amplitude = (10 ** (level_db / 20)).astype(np.float32)
+    position_m = np.asarray(position_m, float)
+    relief = height_m.astype(np.float32)
+    row, column = int(first[1]), int(first[0])
+    return SeabedObject(id_, kind, position_m, yaw_rad, extent_m, radius_m, row, column, amplitude, relief)
+
+
+def place_landmark(design: LandmarkDesign, position_m: Floats, yaw_rad: float, floor_z_m: float) -> SeabedObject:
+    """A landmark whose face lies at its true position.
+
+    It stands on the floor, which rises or falls around it by a smooth cosine as far as that needs.
+    """
+    bottom_m = float(position_m[2]) - design.height_m - floor_z_m
+    plate_m = _material_radius_m(design)
+
+    def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
+        level_db = design.level_db(x_m, y_m)
+        away = np.clip((np.hypot(x_m, y_m) - plate_m) / SLOPE_M, 0, 1)
+        ground_m = bottom_m * 0.5 * (1 + np.cos(np.pi * away))
+        return level_db, ground_m + np.where(np.isnan(level_db), 0.0, design.height_m)
+
+    return place(design.id, design.name, shape, plate_m, position_m, yaw_rad, SLOPE_M)
+
+
+def _material_radius_m(design: LandmarkDesign) -> float:
+    """Of the circle about its centre that holds all of its material."""
+    pixels = len(design.mask)
+    middle_m = ((np.arange(pixels) + 0.5) / pixels - 0.5) * design.size_m
+    away_m = np.hypot(middle_m[:, None], middle_m[None, :]) + design.size_m / pixels
+    return float(away_m[~np.isnan(design.mask)].max(initial=0.0))
+
+
+def stone(radius_m: float, height_m: float, level_db: float) -> Shape:
+    """Half an ellipsoid."""
+
+    def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
+        from_top = (x_m**2 + y_m**2) / radius_m**2
+        height = height_m * np.sqrt(np.clip(1 - from_top, 0, None))
+        return np.where(from_top < 1, level_db, np.nan), height
+
+    return shape
+
+
+def block(length_m: float, width_m: float, height_m: float, level_db: float) -> Shape:
+    """A box; its upright sides scatter as steeply as the grid can show."""
+
+    def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
+        inside = (np.abs(x_m) < length_m / 2) & (np.abs(y_m) < width_m / 2)
+        return np.where(inside, level_db, np.nan), np.where(inside, height_m, 0.0)
+
+    return shape
+
+
+def ragged_patch(radius_m: float, level_db: float, rng: np.random.Generator) -> Shape:
+    """A flat rough patch whose radius varies irregularly with direction, from about half to one and a half."""
+    order = np.arange(1, 6)
+    waves = rng.normal(0, 0.28 / np.sqrt(order), (2, len(order)))
+
+    def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
+        angle = np.arctan2(y_m, x_m)[..., None] * order
+        outline = radius_m * np.clip(1 + np.cos(angle) @ waves[0] + np.sin(angle) @ waves[1], 0.3, 1.7)
+        inside = np.hypot(x_m, y_m) < outline
+        return np.where(inside, level_db, np.nan), np.where(inside, 0.005, 0.0)
+
+    return shape
+
+
+def scattered_objects(spots_m: Floats, stones: int, rng: np.random.Generator) -> list[SeabedObject]:
+    """Stones at the first spots, ragged patches at the others, with identities -1, -2, ...
+
+    Parameters
+    ----------
+    spots_m
+        World positions on the floor, shape (n, 3).
+    stones
+        How many of them.
+    rng
+        Source of sizes, levels and outlines.
+    """
+    objects = []
+    for number, spot in enumerate(spots_m):
+        if number < stones:
+            radius_m = rng.uniform(0.08, 0.16)
+            kind, shape = "stone", stone(radius_m, rng.uniform(0.02, 0.06), rng.uniform(4, 10))
+        else:
+            mean_radius_m = rng.uniform(0.10, 0.16)
+            kind, shape = "patch", ragged_patch(mean_radius_m, rng.uniform(9, 13), rng)
+            radius_m = 1.7 * mean_radius_m
+        objects.append(place(-1 - number, kind, shape, radius_m, spot, rng.uniform(-np.pi, np.pi)))
+    return objects
+
+
+def within(objects: Sequence[SeabedObject], centre_m: Floats, reach_m: float) -> list[SeabedObject]:
+    """Those that a circle on the floor touches."""
+    return [o for o in objects if np.hypot(*(o.position_m[:2] - centre_m[:2])) < reach_m + o.radius_m]
+
+
+class Sector(NamedTuple):
+    """Part of the floor as the sonar's foot sees it."""
+
+    heading: Floats
+    """Horizontal unit vector of the sonar's axis, shape (2,)."""
+    half_bearing_rad: float
+    nearest_m: float
+    """Horizontal distances."""
+    farthest_m: float
+
+
+class Cells(NamedTuple):
+    """Cells row by row."""
+
+    first_row: int
+    spans: Ints
+    """First and last column (not included) of each row, shape (rows, 2)."""
+
+
+def lit_sector(
+    world_R_sonar: Rotation,
+    height_m: float,
+    ranges_m: tuple[float, float],
+    half_azimuth_rad: float,
+    half_lift_rad: float,
+) -> Sector | None:
+    """Floor within the ranges and within the angles either side of the axis; None where there is none."""
+    axis = world_R_sonar.apply([1.0, 0.0, 0.0])
+    azimuth, lift = np.meshgrid(
+        np.linspace(-half_azimuth_rad, half_azimuth_rad, 5), np.linspace(-half_lift_rad, half_lift_rad, 5)
+    )
+    rays = world_R_sonar.apply(
+        np.stack([np.cos(lift) * np.cos(azimuth), np.cos(lift) * np.sin(azimuth), np.sin(lift)], -1).reshape(-1, 3)
+    )
+    run = np.hypot(rays[:, 0], rays[:, 1])
+    nearest, farthest = (np.sqrt(max(r**2 - height_m**2, 0.0)) for r in ranges_m)
+    drop = -rays[:, 2] / run
+    nearest = max(nearest, height_m / max(drop.max(), 1e-6))
+    if drop.min() > 0:
+        farthest = min(farthest, height_m / drop.min())
+    if nearest >= farthest or height_m <= 0:
+        return None
+    heading = axis[:2] / np.hypot(*axis[:2])
+    bearings = np.arctan2(heading[0] * rays[:, 1] - heading[1] * rays[:, 0], rays[:, :2] @ heading)
+    return Sector(heading, float(np.abs(bearings).max()), float(nearest), float(farthest))
+
+
+def cells_of(sector: Sector, foot_m: Floats) -> Cells:
+    """Cells of a four-cornered part of the floor that holds the sector; ``foot_m`` is what lies below the sonar."""
+    bearing = sector.half_bearing_rad * np.array([1, 1, 0, -1, -1])
+    far_m = sector.farthest_m / np.cos(sector.half_bearing_rad / 2)
+    reach_m = np.array([sector.nearest_m, far_m, far_m, far_m, sector.nearest_m])
+    ahead, aside = reach_m * np.cos(bearing), reach_m * np.sin(bearing)
+    x = (foot_m[0] + sector.heading[0] * ahead - sector.heading[1] * aside) / CELL_M
+    y = (foot_m[1] + sector.heading[1] * ahead + sector.heading[0] * aside) / CELL_M
+    first_row, end_row = int(np.floor(y.min())), int(np.ceil(y.max()))
+    middle = np.arange(first_row, end_row) + 0.5
+    left, right = np.full(len(middle), np.inf), np.full(len(middle), -np.inf)
+    for x1, y1, x2, y2 in zip(x, y, np.roll(x, -1), np.roll(y, -1), strict=True):
+        if abs(y2 - y1) < 1e-9:
+            continue
+        crosses = (middle >= min(y1, y2)) & (middle <= max(y1, y2))
+        at = x1 + (middle[crosses] - y1) * (x2 - x1) / (y2 - y1)
+        left[crosses], right[crosses] = np.minimum(left[crosses], at), np.maximum(right[crosses], at)
+    empty = left > right
+    left[empty], right[empty] = x[0], x[0]
+    return Cells(first_row, np.column_stack([np.floor(left), np.ceil(right)]).astype(np.int64))

@@ -1,0 +1,125 @@
+"""Which landmark a detection belongs to, whether it may be believed, and the record of what became of it.
+
+What a detection may be of, and how probable each is before anyone looks where it was seen.
+
+A recogniser states a posterior p over landmarks; what is missing to 1 is none of them. It may be wrong, and says
+nothing of that. With the probability ``q`` that its statement has nothing to do with what was seen, K landmarks in the
+graph, and half of the errors being of no landmark at all::
+
+    w_i    = (1 - q) p_i + q / (2 K)          landmark i
+    w_none = (1 - q) (1 - sum p) + q / 2      no landmark
+
+So no weight is zero: no identity is so sure that its place cannot refute it. A detection of no landmark may be anywhere
+that the sonar looks, with the density ``u`` over range and azimuth (1/(m rad)).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from scipy.stats import chi2
+
+from sonar_graph.measurements import Floats, Ints, LandmarkDetections
+from sonar_graph.states import Outcome
+
+
+@dataclass(frozen=True, eq=False)
+class Identities:
+    """The identity of each detection of a block, or the reason why it has none."""
+
+    ids: Ints
+    """Most probable identity, shape (n,)."""
+    refusals: list[Outcome | None]
+    """None where the identity is accepted, length n."""
+
+
+def identify(detections: LandmarkDetections, minimum_probability: float) -> Identities:
+    """Accept the most probable identity of each row where its posterior is high enough.
+
+    A landmark is in one place: of several rows of one frame with one identity the most probable is accepted, the first
+    of equals.
+
+    Parameters
+    ----------
+    minimum_probability
+        Rows whose highest posterior is below it, or is not a number, or belongs to no identity (-1), are refused.
+    """
+    ids, probability = detections.most_probable()
+    refusals = [
+        None if p >= minimum_probability and landmark_id >= 0 else Outcome.NO_IDENTITY
+        for p, landmark_id in zip(probability.tolist(), ids.tolist(), strict=True)
+    ]
+    return Identities(ids, _once_a_frame(detections.stamps_ns.tolist(), ids.tolist(), probability.tolist(), refusals))
+
+
+def _once_a_frame(
+    stamps_ns: list[int], ids: list[int], probability: list[float], refusals: list[Outcome | None]
+) -> list[Outcome | None]:
+    best: dict[tuple[int, int], int] = {}
+    for row, place in enumerate(zip(stamps_ns, ids, strict=True)):
+        if refusals[row] is None and (place not in best or probability[row] > probability[best[place]]):
+            best[place] = row
+    return [
+        refusal if refusal or best[stamp_ns, landmark_id] == row else Outcome.REPEATED
+        for row, (stamp_ns, landmark_id, refusal) in enumerate(zip(stamps_ns, ids, refusals, strict=True))
+    ]
+
+
+@cache
+def gate_threshold(probability: float, dof: int) -> float:
+    """Squared Mahalanobis distance that a true innovation of ``dof`` components stays below with this probability."""
+    return float(chi2.ppf(probability, dof))
+
+
+LEAST_LANDMARKS = 20
+"""K at least: while a graph has few landmarks, a mistake is more probably of one that it has not yet got."""
+
+
+@dataclass(frozen=True)
+class RecogniserErrors:
+    """How often a recogniser is wrong, and where something that is no landmark may be seen."""
+
+    wrong_id_probability: float
+    """q: probability that a statement has nothing to do with what was seen."""
+    view_range_m: float
+    view_azimuth_rad: float
+    """Extent of range and azimuth over which detections of no landmark are spread."""
+
+    @property
+    def log_density(self) -> float:
+        """Logarithm of u."""
+        return -math.log(self.view_range_m * self.view_azimuth_rad)
+
+
+@dataclass(frozen=True)
+class IdentityPosterior:
+    """What a recogniser said of one detection, or last said of a track."""
+
+    probability: dict[int, float]
+    """Posterior of each landmark that it considered; 0 of all others."""
+
+    @classmethod
+    def of(cls, frame: LandmarkDetections, row: int) -> IdentityPosterior:
+        """Of a row; probabilities that are no numbers count as 0, and more than 1 in sum as 1."""
+        stated: dict[int, float] = {}
+        for landmark_id, p in zip(frame.candidate_ids[row].tolist(), frame.id_probability[row].tolist(), strict=True):
+            if landmark_id >= 0 and p > 0:
+                stated[landmark_id] = stated.get(landmark_id, 0.0) + p
+        return cls({landmark_id: p / max(sum(stated.values()), 1.0) for landmark_id, p in stated.items()})
+
+    @property
+    def favourite(self) -> int | None:
+        """The landmark that is more probable than all else together; None where there is none: it names nothing."""
+        return next((landmark_id for landmark_id, p in self.probability.items() if p > 0.5), None)
+
+    def log_weights(self, ids: list[int], errors: RecogniserErrors) -> Floats:
+        """Logarithms of w of some landmarks, and of none, shape (K + 1,); K is their number."""
+        q, p = errors.wrong_id_probability, self.probability
+        none = (1.0 - q) * (1.0 - min(sum(p.values()), 1.0)) + 0.5 * q
+        share = 0.5 * q / max(len(ids), LEAST_LANDMARKS)
+        weights = np.array([(1.0 - q) * p.get(landmark_id, 0.0) + share for landmark_id in ids] + [none])
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.log(weights))

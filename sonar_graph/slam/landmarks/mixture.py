@@ -1,0 +1,318 @@
+"""The max-mixture of what sightings may be of, and the choice that maximises it.
+
+Olson and Agarwal, "Inference on networks of mixtures for robust robot mapping", IJRR 32(7), 2013: of a mixture only its
+largest component is kept, at every point of the state space. For a watch g (all sightings j of one track, or a single
+sighting), landmarks i and none::
+
+    l_i(x)    = log w_i + sum_j [ log n - 1/2 log det R_j - rho(e_range) - rho(e_azimuth) ]        e = e(x, j, L_i)
+    l_none(x) = log w_none + log density of the watch if it is of no landmark
+    cost(x)   = sum_g min_k -l_k(x)  +  what all other factors cost
+
+rho is the kernel's loss (e^2 / 2 for none) and n normalises ``n^2 / sqrt(det R) exp(-rho)`` to one.
+
+Landmarks that began with sightings of something else, and where those that name them agree that they are.
+
+Choosing components is a descent: each watch goes where it fits best now. A landmark that began in a wrong place fits
+none of its own sightings, and nothing moves it. So the sightings that name it vote on its place. With the component l_i
+of the mixture for the landmark at a point p, and that of no landmark::
+
+    vote(p) = sum over watches that name i of max(l_i(p), l_none)
+
+at the point where it is, and where each sighting that does not fit has it. The best wins.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import accumulate
+from typing import Literal
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L
+from scipy.integrate import quad
+
+from sonar_graph.measurements import Floats
+from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
+from sonar_graph.slam.landmarks.sighting import Sighting
+
+LEAST_TRUNCATION = 1.0
+"""Of the squared error, where even a perfect fit is less probable than none."""
+REPEATED_LOSS = 3.0
+"""Mean loss, twice or thrice what noise alone gives, to which sightings of one thing that stands still agree."""
+KernelName = Literal["none", "huber", "cauchy"]
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """The shape of the noise of range and of azimuth."""
+
+    name: KernelName
+    width: float
+    """In standard deviations."""
+
+    def estimator(self) -> gtsam.noiseModel.mEstimator.Base | None:
+        """As GTSAM has it; None for Gaussian noise."""
+        if self.name == "huber":
+            return gtsam.noiseModel.mEstimator.Huber.Create(self.width)
+        return gtsam.noiseModel.mEstimator.Cauchy.Create(self.width) if self.name == "cauchy" else None
+
+    def loss(self, e: Floats) -> Floats:
+        """The loss rho of errors in standard deviations."""
+        k, size = self.width, np.abs(e)
+        if self.name == "huber":
+            return np.where(size <= k, 0.5 * size**2, k * (size - 0.5 * k))
+        if self.name == "cauchy":
+            return np.asarray(0.5 * k**2 * np.log1p((size / k) ** 2))
+        return np.asarray(0.5 * size**2)
+
+    @property
+    def log_normaliser(self) -> float:
+        """Logarithm of n, of a density ``n / sigma exp(-rho(e / sigma))``. A Cauchy kernel needs a width above 1."""
+        area, _ = quad(lambda e: math.exp(-float(self.loss(np.array(e)))), -math.inf, math.inf)
+        return -math.log(area)
+
+
+@dataclass(eq=False)
+class TrackedObject:
+    """One object: what the recogniser last said of it, and its sightings, at least one."""
+
+    statement: IdentityPosterior
+    sightings: list[Sighting] = field(default_factory=list)
+
+    @property
+    def landmark_id(self) -> int | None:
+        """What it counts as; None: no landmark."""
+        return next((s.landmark_id for s in self.sightings if s.landmark_id is not None), None)
+
+    @property
+    def stamps_ns(self) -> set[int]:
+        """Frames in which it is."""
+        return {sighting.stamp_ns for sighting in self.sightings}
+
+
+Choices = list[int | None]
+"""What watches count as; None: no landmark."""
+Scores = dict[int | None, float]
+"""The component l of each component of a watch; None: no landmark."""
+
+
+class Errors:
+    """Errors of sightings against landmarks, whitened, for poses as they are estimated.
+
+    Parameters
+    ----------
+    sightings
+        n of them.
+    values
+        With the poses that they hang on.
+    """
+
+    def __init__(self, sightings: Sequence[Sighting], values: gtsam.Values) -> None:
+        n = len(sightings)
+        self._origin, self._axes = np.empty((n, 3)), np.empty((n, 3, 3))
+        poses: dict[int, gtsam.Pose3] = {}
+        for j, sighting in enumerate(sightings):
+            line = sighting.line
+            if line.pose_key not in poses:
+                poses[line.pose_key] = values.atPose3(line.pose_key)
+            world_T_sonar = poses[line.pose_key].compose(line.body_T_sonar)
+            self._origin[j], self._axes[j] = world_T_sonar.translation(), world_T_sonar.rotation().matrix()
+        self._z = np.array([sighting.line.z for sighting in sightings]).reshape(n, 2)
+        noise = np.array([sighting.noise for sighting in sightings]).reshape(n, 2, 2)
+        self._whitener = np.linalg.inv(np.linalg.cholesky(noise))
+        self.half_log_det = 0.5 * np.linalg.slogdet(noise)[1]
+        """Of each sighting's noise, shape (n,)."""
+
+    def of(self, points: Floats) -> Floats:
+        """Against landmarks at points of the world, shape (K, 3): range and azimuth, shape (n, K, 2)."""
+        q = np.einsum("nji,nkj->nki", self._axes, points[None] - self._origin[:, None])
+        azimuth = np.arctan2(q[..., 1], q[..., 0]) - self._z[:, None, 1]
+        e = np.stack([np.linalg.norm(q, axis=2) - self._z[:, None, 0], np.arctan2(np.sin(azimuth), np.cos(azimuth))], 2)
+        return np.einsum("nij,nkj->nki", self._whitener, e)
+
+    def located(self) -> Floats:
+        """Where each was seen if at elevation 0, in the world, shape (n, 3)."""
+        r, a = self._z.T
+        on_beam = np.column_stack((r * np.cos(a), r * np.sin(a), np.zeros_like(r)))
+        return self._origin + np.einsum("nij,nj->ni", self._axes, on_beam)
+
+
+class Mixture:
+    """The components of watches, and which is largest.
+
+    Parameters
+    ----------
+    errors
+        How often the recogniser is wrong.
+    kernel
+        The shape of a sighting's noise.
+    """
+
+    def __init__(self, errors: RecogniserErrors, kernel: Kernel) -> None:
+        self._errors = errors
+        self._kernel = kernel
+        self._log_peak = 2.0 * kernel.log_normaliser
+
+    def at_first(self, statement: IdentityPosterior, ids: list[int], z: Floats, expected: Floats, S: Floats) -> Scores:
+        """Of a detection that the state is not yet conditioned on, with the covariances of its innovations."""
+        e = z - expected
+        e[:, 1] = np.arctan2(np.sin(e[:, 1]), np.cos(e[:, 1]))
+        whitener = np.linalg.inv(np.linalg.cholesky(S))
+        log_densities = (
+            self._log_peak
+            - 0.5 * np.linalg.slogdet(S)[1]
+            - self._kernel.loss(np.einsum("kij,kj->ki", whitener, e)).sum(axis=1)
+        )
+        new = [i for i in statement.probability if i not in set(ids)]
+        totals = statement.log_weights(ids + new, self._errors)
+        totals[: len(ids)] += log_densities
+        totals[len(ids) :] += self._errors.log_density
+        return dict(zip([*ids, *new, None], totals.tolist(), strict=True))
+
+    def gains(self, landmark_id: int, watches: list[TrackedObject], points: Floats, values: gtsam.Values) -> Floats:
+        """Component of a landmark at each of k points, minus that of no landmark, for n watches, shape (n, k)."""
+        fits = self._fits(watches, points, values)
+        weights = np.array([watch.statement.log_weights([landmark_id], self._errors) for watch in watches])
+        return np.asarray(fits - self._unplaced(watches)[:, None] + (weights[:, 0] - weights[:, 1])[:, None])
+
+    def squared_errors(self, watches: list[TrackedObject], ids: list[int], values: gtsam.Values) -> Floats:
+        """Of each watch, all its sightings together, were it of the landmark given, shape (n,)."""
+        squares = []
+        errors = Errors([s for watch in watches for s in watch.sightings], values)
+        keys = sorted(set(ids))
+        points = np.array([values.atPoint3(L(i)) for i in keys]).reshape(-1, 3)
+        column = np.repeat([keys.index(i) for i in ids], [len(watch.sightings) for watch in watches])
+        squares = (errors.of(points)[np.arange(len(column)), column] ** 2).sum(axis=1)
+        return np.asarray(np.add.reduceat(squares, _starts(watches)))
+
+    def truncations(self, watches: list[TrackedObject]) -> Floats:
+        """Squared error at which each watch is as probably of no landmark as of the one it names, shape (n,)."""
+        weights = [w.statement.log_weights([w.statement.favourite or 0], self._errors) for w in watches]
+        gains = np.array(
+            [self._peaks(w).sum() + named - none for w, (named, none) in zip(watches, weights, strict=True)]
+        )
+        return np.maximum(2.0 * (gains - self._unplaced(watches)), LEAST_TRUNCATION)
+
+    def _peaks(self, watch: TrackedObject) -> Floats:
+        """Log density of each sighting where it fits perfectly, shape (n,)."""
+        noise = np.array([sighting.noise for sighting in watch.sightings])
+        return np.asarray(self._log_peak - 0.5 * np.linalg.slogdet(noise)[1])
+
+    def _unplaced(self, watches: list[TrackedObject]) -> Floats:
+        """Log densities of watches of something whose place is not known, shape (n,).
+
+        The first sighting may be anywhere. It tells where the others are: not better than a landmark would, which they
+        fit to `REPEATED_LOSS`. Taken as anywhere themselves, many sightings of an unknown object would prove it to be
+        the landmark that is least far.
+        """
+        u = self._errors.log_density
+        return np.array([u + np.maximum(self._peaks(w)[1:] - REPEATED_LOSS, u).sum() for w in watches])
+
+    def _fits(self, watches: list[TrackedObject], points: Floats, values: gtsam.Values) -> Floats:
+        """Log densities of watches, for landmarks at points of the world, shape (n, k)."""
+        errors = Errors([s for watch in watches for s in watch.sightings], values)
+        single = self._log_peak - errors.half_log_det[:, None] - self._kernel.loss(errors.of(points)).sum(axis=2)
+        return np.asarray(np.add.reduceat(single, _starts(watches), axis=0))
+
+    def scores(
+        self, watches: list[TrackedObject], values: gtsam.Values, choices: Choices, sizes: dict[int, int]
+    ) -> list[Scores]:
+        """Components of watches where the estimate is.
+
+        A landmark that has no sightings but those of one watch is where they have put it. To that watch it is a
+        landmark of unknown place, as one is that it may be and that is not in the graph.
+
+        Parameters
+        ----------
+        choices
+            What each counts as now.
+        sizes
+            Number of sightings of each landmark of the graph.
+        """
+        ids, unplaced = sorted(sizes), self._unplaced(watches)
+        points = np.array([values.atPoint3(L(i)) for i in ids]).reshape(-1, 3)
+        fits, scores = self._fits(watches, points, values), []
+        for watch, choice, own, anywhere in zip(watches, choices, fits, unplaced.tolist(), strict=True):
+            if choice is not None and sizes[choice] == len(watch.sightings):
+                own[ids.index(choice)] = anywhere
+            new = [i for i in watch.statement.probability if i not in sizes]
+            totals = np.append(own, np.full(len(new) + 1, anywhere))
+            totals += watch.statement.log_weights([*ids, *new], self._errors)
+            scores.append(dict(zip([*ids, *new, None], totals.tolist(), strict=True)))
+        return scores
+
+    def best(
+        self, watches: list[TrackedObject], values: gtsam.Values, choices: Choices, sizes: dict[int, int]
+    ) -> Choices:
+        """Largest component of each watch where the estimate is; no landmark twice in a frame.
+
+        A landmark that is not in the graph begins with one watch, that with most sightings. Others keep what they have:
+        only then is known where it is.
+        """
+        if not watches:
+            return []
+        found = each_once(self.scores(watches, values, choices, sizes), [watch.stamps_ns for watch in watches])
+        beginning: dict[int, TrackedObject] = {}
+        for watch, new in sorted(zip(watches, found, strict=True), key=lambda pair: -len(pair[0].sightings)):
+            if new is not None and new not in sizes:
+                beginning.setdefault(new, watch)
+        return [
+            old if new in beginning and beginning[new] is not watch else new
+            for watch, old, new in zip(watches, choices, found, strict=True)
+        ]
+
+
+def _starts(watches: list[TrackedObject]) -> list[int]:
+    """Where the sightings of each begin, when all are in one row."""
+    return list(accumulate((len(watch.sightings) for watch in watches[:-1]), initial=0))
+
+
+def each_once(scores: list[Scores], stamps_ns: list[set[int]]) -> list[int | None]:
+    """The best of each, those that are surest first; a landmark is once in a frame."""
+    chosen: list[int | None] = [None] * len(scores)
+    taken: dict[int, set[int]] = {}
+    for row in sorted(range(len(scores)), key=lambda row: -max(scores[row].values())):
+        for landmark_id in sorted(scores[row], key=scores[row].__getitem__, reverse=True):
+            if landmark_id is None:
+                break
+            if taken.setdefault(landmark_id, set()).isdisjoint(stamps_ns[row]):
+                taken[landmark_id] |= stamps_ns[row]
+                chosen[row] = landmark_id
+                break
+    return chosen
+
+
+MOST_PROPOSALS = 20
+"""Newest sightings whose places are put to the vote."""
+MOST_VOTERS = 400
+LEAST_MARGIN = 3.0
+"""A new place has to be e to this power times as probable."""
+
+
+def supporters_elsewhere(
+    landmark_id: int, watches: list[TrackedObject], choices: Choices, values: gtsam.Values, mixture: Mixture
+) -> list[TrackedObject] | None:
+    """Watches that put a landmark in a better place than where it is; None where there is no better one.
+
+    Parameters
+    ----------
+    watches
+        Those that name the landmark.
+    choices
+        What each counts as now.
+    """
+    voters = watches[-MOST_VOTERS:]
+    proposals = [w for w, choice in zip(watches, choices, strict=True) if choice != landmark_id][-MOST_PROPOSALS:]
+    if len(proposals) < 2:
+        return None
+    places = Errors([watch.sightings[0] for watch in proposals], values).located()
+    points = np.vstack([values.atPoint3(L(landmark_id)), places])
+    gains = mixture.gains(landmark_id, voters, points, values)
+    votes = np.maximum(gains, 0.0).sum(axis=0)
+    winner = int(np.argmax(votes))
+    if votes[winner] < votes[0] + LEAST_MARGIN:
+        return None
+    return [watch for watch, gain in zip(voters, gains[:, winner].tolist(), strict=True) if gain > 0.0]

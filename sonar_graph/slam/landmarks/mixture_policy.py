@@ -1,0 +1,307 @@
+"""Which landmark each watch shows, chosen and chosen again as the estimate moves: the max-mixture, incrementally.
+
+A watch is all sightings of one track, or one sighting of no track. Its chosen component has its factors in the graph,
+the others have none; a Gauss-Newton step of that graph is one of the max-mixture (`sonar_graph.slam.landmarks.mixture`). After
+every update the choices of the window are made anew from where the estimate has moved, until none changes.
+
+When a detection comes, the state is not yet conditioned on it. It is then weighed by its predictive density, with the
+covariance ``S = H P H' + R`` of what was expected: a vehicle that has drifted must not mistake its landmarks for none.
+
+For smoothed results the choices of the whole history are made anew, beside the run (`DoubtfulIdentities.history`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L
+
+from sonar_graph.measurements import NO_TRACK, Floats
+from sonar_graph.slam.landmarks.association import IdentityPosterior
+from sonar_graph.slam.landmarks.mixture import Choices, Mixture, TrackedObject, each_once, supporters_elsewhere
+from sonar_graph.slam.landmarks.mixture_history import RivalHistory
+from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting
+from sonar_graph.slam.landmarks.tracked import NS_PER_S, STILL
+from sonar_graph.slam.models import PredictedView
+from sonar_graph.states import DetectionJournal, DetectionLog, Outcome
+
+MOST_ROUNDS = 3
+"""Times that choices are made anew after one update."""
+MOST_OPEN = 200
+"""Newest watches that are chosen anew."""
+
+
+class DoubtfulIdentities:
+    """Keeps the graph in line with the best component of every watch.
+
+    Parameters
+    ----------
+    landmarks
+        Of the graph.
+    journal
+        Its rows are amended when choices change.
+    mixture
+        What watches may be of, and how probable that is.
+    longest_wait_s
+        A track's sightings wait at most so long in the window; a track that was not seen for so long is over.
+    is_graduated
+        Whether the choices of the history are also sought by graduated non-convexity.
+    """
+
+    def __init__(
+        self,
+        landmarks: LandmarkSightings,
+        journal: DetectionJournal,
+        mixture: Mixture,
+        longest_wait_s: float,
+        *,
+        is_graduated: bool = False,
+    ) -> None:
+        self._landmarks = landmarks
+        self._smoother, self._maker = landmarks.smoother, landmarks.maker
+        self._journal = journal
+        self._mixture = mixture
+        self._longest_wait_ns = round(longest_wait_s * NS_PER_S)
+        self._is_graduated = is_graduated
+        self._tracks: dict[int, TrackedObject] = {}
+        self._disputed: set[int] = set()
+        self._chosen: ChosenHistory | None = None
+        self._chosen_from: gtsam.Values | None = None
+        self.watches: list[TrackedObject] = []
+        """All so far, in the order in which they began."""
+
+    @property
+    def keys(self) -> list[int]:
+        """Of the landmarks that anything may be of."""
+        return [L(i) for i in sorted(self._landmarks.ids)]
+
+    def chosen_at_first(
+        self, view: PredictedView, statements: list[IdentityPosterior], tracks: list[int], z: Floats, noise: Floats
+    ) -> list[int | None]:
+        """Of which landmark each detection of a frame is; a track's is what the track is of, if it is of any.
+
+        Parameters
+        ----------
+        z, noise
+            Range (m) and azimuth (rad), shape (m, 2), and their covariance, shape (m, 2, 2).
+        """
+        ids = sorted(self._landmarks.ids)
+        points = np.array([self._smoother.values.atPoint3(L(i)) for i in ids]).reshape(-1, 3)
+        expected, cov = view.expect(self.keys, points)
+        scores = [
+            self._mixture.at_first(statement, ids, z[row], expected, cov + noise[row])
+            for row, statement in enumerate(statements)
+        ]
+        for row, track in enumerate(tracks):
+            watch = self._tracks.get(track) if track != NO_TRACK else None
+            if watch is not None and watch.landmark_id is not None:
+                scores[row] = {watch.landmark_id: np.inf}
+        return each_once(scores, [{0}] * len(scores))
+
+    def enter(
+        self,
+        statements: list[IdentityPosterior],
+        tracks: list[int],
+        sightings: list[Sighting],
+        chosen: list[int | None],
+        time_s: float,
+    ) -> None:
+        """Put a frame's sightings into the graph as they were chosen, and what waited in their tracks."""
+        late: list[tuple[Sighting, int]] = []
+        for statement, track, sighting, landmark_id in zip(statements, tracks, sightings, chosen, strict=True):
+            watch = self._watch_of(track, statement)
+            waiting = [s for s in watch.sightings if s.outcome is Outcome.UNFIT] if track != NO_TRACK else []
+            watch.sightings.append(sighting)
+            if landmark_id != statement.favourite and statement.favourite is not None:
+                self._disputed.add(statement.favourite)
+            if landmark_id is None:
+                sighting.outcome = Outcome.UNFIT
+                continue
+            is_first = landmark_id not in self._landmarks
+            sighting.outcome = Outcome.NEW if is_first else _used(statement, landmark_id, Outcome.USED)
+            if is_first:
+                self._smoother.add_landmark(L(landmark_id), self._maker.place(sighting, self._smoother.values))
+            made = self._maker.make(sighting, L(landmark_id), is_first=is_first)
+            self._landmarks.enter(sighting, landmark_id, self._smoother.add(made))
+            taken_ns = self._landmarks.stamps_ns(landmark_id)
+            fresh = [s for s in waiting if s.stamp_ns not in taken_ns]
+            for waited in fresh:
+                waited.outcome = _used(statement, landmark_id, Outcome.USED_LATER)
+            late += [(waited, landmark_id) for waited in fresh]
+        if late:
+            self._landmarks.exchange([], late, time_s)
+        for sighting, landmark_id in late:
+            self._journal.amend(sighting.row, sighting.outcome, landmark_id)
+        self._hold(sightings[0].stamp_ns)
+
+    def _hold(self, now_ns: int) -> None:
+        """Keep keyframes on which sightings of tracks wait in the window, and let go of tracks that are over."""
+        oldest_ns = now_ns - self._longest_wait_ns
+        self._tracks = {k: watch for k, watch in self._tracks.items() if watch.sightings[-1].stamp_ns >= oldest_ns}
+        self._smoother.hold(
+            {
+                sighting.line.pose_key: (sighting.stamp_ns + self._longest_wait_ns) / NS_PER_S
+                for watch in self._tracks.values()
+                if watch.landmark_id is None
+                for sighting in watch.sightings
+                if sighting.stamp_ns >= oldest_ns
+            }
+        )
+
+    def _watch_of(self, track: int, statement: IdentityPosterior) -> TrackedObject:
+        watch = self._tracks.get(track) if track != NO_TRACK else None
+        if watch is None:
+            watch = TrackedObject(statement)
+            self.watches.append(watch)
+            if track != NO_TRACK:
+                self._tracks[track] = watch
+        watch.statement = statement
+        return watch
+
+    def reconsider(self, time_s: float) -> None:
+        """Choose anew in the window until nothing changes."""
+        watches = self._open()
+        if self._changes(watches, self._smoother.values):
+            self._smoother.flush(time_s)
+            self._smoother.settle(time_s)  # a step of a robust kernel may end far from where the choices are to be made
+        for _ in range(MOST_ROUNDS):
+            changes = [
+                (watch, new)
+                for watch, new in self._changes(watches, self._smoother.values)
+                if watch.landmark_id is None or self._is_alone(watch) or self._is_preferred(new, watch)
+            ]
+            if not changes:
+                break
+            self._change(changes, time_s)
+        self._relocate(time_s)
+
+    def history(self) -> ChosenHistory:
+        """Choose anew in the whole history until nothing changes; the window's choices stay as they are."""
+        values, marginals = self._smoother.solve_history()
+        heard = sum(len(watch.sightings) for watch in self.watches)
+        if self._chosen is None or self._chosen_from is not values or self._chosen.heard != heard:
+            self._chosen_from, self._chosen = values, self._choose(values, marginals, heard)
+        return self._chosen
+
+    def _choose(self, values: gtsam.Values, marginals: gtsam.Marginals | gtsam.ISAM2, heard: int) -> ChosenHistory:
+        watches = [watch for watch in self.watches if not _is_withheld(watch)]
+        present = [watch.landmark_id for watch in watches]
+        handles = {handle for watch in watches for s in watch.sightings for handle in s.handles}
+        rival = RivalHistory(self._smoother.graph_without(handles), watches, self._mixture, self._maker)
+        found, choices = rival.settled(values, present, is_graduated=self._is_graduated)
+        if found is not values:
+            marginals = rival.marginals(found, choices)
+        return ChosenHistory(found, marginals, watches, choices, heard)
+
+    def log(self) -> DetectionLog:
+        """What became of each detection in the whole history."""
+        journal, chosen = self._journal.copy(), self.history()
+        for watch, new in _differing(chosen.watches, chosen.choices):
+            for sighting in watch.sightings:
+                journal.amend(sighting.row, *_what_became(watch.statement, new))
+        return journal.log()
+
+    def _changes(self, watches: list[TrackedObject], values: gtsam.Values) -> list[tuple[TrackedObject, int | None]]:
+        best = self._mixture.best(watches, values, [watch.landmark_id for watch in watches], self._landmarks.sizes())
+        return _differing(watches, best)
+
+    def _open(self) -> list[TrackedObject]:
+        """Contradicted watches, and those whose sightings are all in the window, unless they alone hold a landmark."""
+        recent, contradicted = self.watches[-MOST_OPEN:], self._contradicted()
+        inside = set(self._smoother.in_window(sorted({s.line.pose_key for w in recent for s in w.sightings})))
+        return contradicted + [
+            watch
+            for watch in recent
+            if not self._is_alone(watch)
+            and all(s.line.pose_key in inside for s in watch.sightings)
+            and watch not in contradicted
+        ]
+
+    def _is_alone(self, watch: TrackedObject) -> bool:
+        """Whether its landmark is where it, and no other watch, has put it."""
+        return watch.landmark_id is not None and self._landmarks.sizes()[watch.landmark_id] == len(watch.sightings)
+
+    def _contradicted(self) -> list[TrackedObject]:
+        """Watches of tracks that are now named as something else than what they count as."""
+        return [
+            watch
+            for watch in self._tracks.values()
+            if watch.landmark_id is not None and watch.statement.favourite not in (None, watch.landmark_id)
+        ]
+
+    def _is_preferred(self, new: int | None, watch: TrackedObject) -> bool:
+        """Whether the predictive density of a watch's newest sighting, too, is for another component than the present.
+
+        Where the estimate is uncertain, as when a loop closes, a misfit is not yet one of the identity. A robust kernel
+        may leave it there for some updates.
+        """
+        sighting, values = watch.sightings[-1], self._smoother.values
+        ids = [i for i in (watch.landmark_id, new) if i is not None and i in self._landmarks]
+        line, keys = sighting.line, [L(i) for i in ids]
+        joint = self._smoother.joint_covariance_of_any([line.pose_key, *keys])
+        view = PredictedView(line.pose_key, None, values.atPose3(line.pose_key), STILL, line.body_T_sonar, joint)
+        expected, cov = view.expect(keys, np.array([values.atPoint3(key) for key in keys]))
+        scores = self._mixture.at_first(watch.statement, ids, line.z, expected, cov + sighting.noise)
+        return scores[new] > scores[watch.landmark_id]
+
+    def _relocate(self, time_s: float) -> None:
+        for landmark_id in sorted(self._disputed & self._landmarks.ids):
+            naming = [watch for watch in self.watches if watch.statement.favourite == landmark_id]
+            present = [watch.landmark_id for watch in naming]
+            found = supporters_elsewhere(landmark_id, naming, present, self._smoother.values, self._mixture)
+            if found is not None:
+                self._change([(w, None) for w in self.watches if w.landmark_id == landmark_id], time_s)
+                self._change([(w, landmark_id) for w in found], time_s)
+        self._disputed.clear()
+
+    def _change(self, changes: list[tuple[TrackedObject, int | None]], time_s: float) -> None:
+        leaving = [s for watch, _ in changes for s in watch.sightings if s.landmark_id is not None]
+        coming = [(s, new) for watch, new in changes if new is not None for s in watch.sightings]
+        for watch, new in changes:
+            said = watch.statement.favourite
+            if said is not None and new != said:
+                self._disputed.add(said)
+            for sighting in watch.sightings:
+                sighting.outcome, landmark_id = _what_became(watch.statement, new)
+                self._journal.amend(sighting.row, sighting.outcome, landmark_id)
+        self._landmarks.exchange(leaving, coming, time_s)
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenHistory:
+    """The whole history, with what suits it best, and its solution."""
+
+    values: gtsam.Values
+    marginals: gtsam.Marginals | gtsam.ISAM2
+    watches: list[TrackedObject]
+    choices: Choices
+    """Of the watches."""
+    heard: int
+    """Number of sightings from which it was chosen."""
+
+    @property
+    def ids(self) -> set[int]:
+        """Landmarks that are seen in it."""
+        return {choice for choice in self.choices if choice is not None}
+
+
+def _is_withheld(watch: TrackedObject) -> bool:
+    """Whether the smoother cannot use what it would be."""
+    return watch.landmark_id is None and any(s.outcome is Outcome.WITHHELD for s in watch.sightings)
+
+
+def _what_became(statement: IdentityPosterior, new: int | None) -> tuple[Outcome, int | None]:
+    """Of detections whose landmark is chosen after they came, and the landmark for the journal."""
+    if new is None:
+        return Outcome.UNFIT, statement.favourite
+    return _used(statement, new, Outcome.USED_LATER), new
+
+
+def _used(statement: IdentityPosterior, landmark_id: int, as_said: Outcome) -> Outcome:
+    return as_said if landmark_id == statement.favourite else Outcome.REASSIGNED
+
+
+def _differing(watches: list[TrackedObject], choices: Choices) -> list[tuple[TrackedObject, int | None]]:
+    return [(watch, new) for watch, new in zip(watches, choices, strict=True) if new != watch.landmark_id]

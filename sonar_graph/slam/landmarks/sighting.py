@@ -1,0 +1,327 @@
+"""One detection, tied to a keyframe, and the factors that it becomes.
+
+A sighting holds only what was measured, not what was believed of the landmark when it was made. Its factors are thus
+the same whenever they are made, and for whichever landmark.
+
+Which sighting is of which landmark, and what of that is in the graph.
+
+The earliest sighting of a landmark carries what is said of it once (`SightingFactors`). Whatever is
+put in and taken out, and in whatever order, the factors depend only on which sightings are of which landmark: they are
+those of a graph that had known from the start.
+
+Where sightings alone put a point, seen from keyframes that are taken as they are.
+
+A sonar measures range and azimuth. One sighting leaves the elevation to the aperture, or to a known floor; sightings
+from other places narrow it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable
+from copy import copy
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L
+
+from sonar_graph.calibration import FloorPrior, SonarCalibration
+from sonar_graph.measurements import Floats
+from sonar_graph.slam.models import (
+    Source,
+    elevation_on_floor,
+    factors,
+    locate,
+    locate_jacobians,
+    range_azimuth_jacobians,
+    wrap_angle,
+)
+from sonar_graph.slam.smoother import GraphEdit, Sightline, Smoother, Withheld
+from sonar_graph.states import DetectionJournal, Outcome
+
+
+@dataclass(eq=False, slots=True)
+class Sighting:
+    """Range and azimuth of something, seen from a keyframe."""
+
+    stamp_ns: int
+    row: int
+    """In the journal."""
+    line: Sightline
+    noise: Floats
+    """Covariance of range and azimuth, with that of the motion since the keyframe, shape (2, 2)."""
+    floor: FloorPrior | None
+    """On which it may stand, judged from where it was seen."""
+    elevation_rad: float = 0.0
+    """Of its direction, when a landmark begins with it."""
+    landmark_id: int | None = None
+    """Of which it is a sighting; None: not of any."""
+    handles: tuple[int, ...] = ()
+    """Of its factors."""
+    outcome: Outcome = Outcome.WAITING
+    """What has become of it so far."""
+
+
+class SightingFactors:
+    """Makes the factors of sightings.
+
+    Parameters
+    ----------
+    sonar
+        For its vertical aperture.
+    robust
+        Wraps a noise model in the chosen kernel.
+    """
+
+    def __init__(self, sonar: SonarCalibration, robust: factors.Robust) -> None:
+        self.elevation_sigma_rad = sonar.elevation_aperture_rad / math.sqrt(12.0)
+        """Standard deviation of an elevation that is uniform over the aperture."""
+        self._aperture_rad = sonar.elevation_aperture_rad
+        self._robust = robust
+
+    def without_kernel(self) -> SightingFactors:
+        """One that makes the same factors with Gaussian noise."""
+        plain = copy(self)
+        plain._robust = lambda noise: noise
+        return plain
+
+    def make(self, sighting: Sighting, key: int, *, is_first: bool) -> list[gtsam.NonlinearFactor]:
+        """Range and azimuth; the first sighting of a landmark also says what is known of its height and direction."""
+        elevation = None if sighting.floor or not is_first else self.elevation_sigma_rad
+        made = self._measured(sighting, key, elevation)
+        return [*made, *(self._placed(sighting, key) if is_first else [])]
+
+    def measured(self, sighting: Sighting, key: int) -> list[gtsam.NoiseModelFactor]:
+        """Range and azimuth alone."""
+        return self._measured(sighting, key, None)
+
+    def beginning(self, sighting: Sighting, key: int) -> list[gtsam.NonlinearFactor]:
+        """What the first sighting of a landmark says beside range and azimuth, with a kernel as they have it."""
+        line = sighting.line
+        if sighting.floor:
+            return self._placed(sighting, key)
+        elevation = factors.elevation(
+            line.pose_key, key, line.body_T_sonar, float(line.z[1]), self.elevation_sigma_rad, self._robust
+        )
+        return [elevation, *self._placed(sighting, key)]
+
+    def _measured(
+        self, sighting: Sighting, key: int, elevation_sigma_rad: float | None
+    ) -> list[gtsam.NoiseModelFactor]:
+        line = sighting.line
+        return factors.landmark_sighting(
+            line.pose_key, key, line.body_T_sonar, line.z, sighting.noise, self._robust, elevation_sigma_rad
+        )
+
+    def _placed(self, sighting: Sighting, key: int) -> list[gtsam.NonlinearFactor]:
+        """Where, and on which floor, a landmark is said to be once."""
+        line = sighting.line
+        range_m, azimuth_rad = line.z.tolist()
+        on_beam = locate(line.body_T_sonar, range_m, azimuth_rad, sighting.elevation_rad)
+        made = [factors.first_direction(line.pose_key, key, on_beam)]
+        if sighting.floor:
+            made.append(factors.floor_prior(key, sighting.floor.z_m, sighting.floor.sigma_m))
+        return made
+
+    def place(self, sighting: Sighting, values: gtsam.Values) -> Floats:
+        """Where a landmark that begins with this sighting is to start: on its floor, else on the centre beam."""
+        line = sighting.line
+        range_m, azimuth_rad = line.z.tolist()
+        world_T_sonar = values.atPose3(line.pose_key).compose(line.body_T_sonar)
+        elevation = self.elevation_on(sighting.floor, world_T_sonar, range_m, azimuth_rad)
+        return locate(world_T_sonar, range_m, azimuth_rad, elevation)
+
+    def elevation_on(
+        self, floor: FloorPrior | None, world_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float
+    ) -> float:
+        """Elevation (rad) of a floor at a range and azimuth; 0 where there is none, or not in the aperture."""
+        if floor is None:
+            return 0.0
+        return elevation_on_floor(world_T_sonar, range_m, azimuth_rad, floor.z_m, self._aperture_rad) or 0.0
+
+
+class LandmarkSightings:
+    """The sightings that are in the graph, by landmark.
+
+    Parameters
+    ----------
+    smoother
+        Gets their factors.
+    maker
+        Makes them.
+    """
+
+    def __init__(self, smoother: Smoother, maker: SightingFactors) -> None:
+        self.smoother = smoother
+        """Whose graph has their factors."""
+        self.maker = maker
+        """Of their factors."""
+        self._of: dict[int, dict[Sighting, None]] = defaultdict(dict)
+        self._rooted: dict[int, Sighting] = {}
+
+    @property
+    def ids(self) -> set[int]:
+        """Landmarks in the graph."""
+        return set(self._of)
+
+    def __contains__(self, landmark_id: object) -> bool:
+        return landmark_id in self._of
+
+    def sightings(self, landmark_id: int) -> list[Sighting]:
+        """Those of a landmark."""
+        return list(self._of.get(landmark_id, {}))
+
+    def any_sighting(self, landmark_id: int) -> Sighting:
+        """One of a landmark of the graph."""
+        return next(iter(self._of[landmark_id]), None) or self._rooted[landmark_id]
+
+    def is_rooted(self, landmark_id: int) -> bool:
+        """Whether sightings of it have left a bounded window, so that it stays."""
+        return landmark_id in self._rooted
+
+    def sizes(self) -> dict[int, int]:
+        """Number of sightings of each landmark; those that are in the graph for good count as one."""
+        return {i: len(sightings) + (i in self._rooted) for i, sightings in self._of.items()}
+
+    def stamps_ns(self, landmark_id: int) -> set[int]:
+        """Frames that show a landmark."""
+        return {sighting.stamp_ns for sighting in self._of.get(landmark_id, {})}
+
+    def enter(self, sighting: Sighting, landmark_id: int, handles: Iterable[int]) -> None:
+        """A sighting whose factors were given to the smoother already."""
+        sighting.landmark_id, sighting.handles = landmark_id, tuple(handles)
+        self._of[landmark_id][sighting] = None
+        self.smoother.sightlines.add(L(landmark_id), sighting.line)
+
+    def leave(self, pose_keys: set[int]) -> None:
+        """Poses leave a bounded window: what was seen from them is part of the graph for good.
+
+        A landmark that was seen from one of them stays, whatever becomes of its other sightings, and none of those
+        becomes its first.
+        """
+        for landmark, sightings in self._of.items():
+            gone = [sighting for sighting in sightings if sighting.line.pose_key in pose_keys]
+            for sighting in gone:
+                self._rooted.setdefault(landmark, sighting)
+                del sightings[sighting]
+
+    def withhold(self, withheld: Withheld, journal: DetectionJournal) -> set[int]:
+        """The smoother cannot use some factors: their sightings leave the graph; handles of all factors of those."""
+        gone = [
+            sighting
+            for landmark, sightings in self._of.items()
+            for sighting in sightings
+            if L(landmark) in withheld.keys or not withheld.handles.isdisjoint(sighting.handles)
+        ]
+        handles = {handle for sighting in gone for handle in sighting.handles}
+        for sighting in gone:
+            self._take(sighting)
+            sighting.outcome = Outcome.WITHHELD
+            if sighting.row >= 0:
+                journal.amend(sighting.row, Outcome.WITHHELD)
+        return handles
+
+    def exchange(self, leaving: Iterable[Sighting], coming: Iterable[tuple[Sighting, int]], time_s: float) -> None:
+        """Take sightings out of the graph, and put others in, each for a landmark, in one update of the smoother.
+
+        Where the earliest sighting of a landmark changes, the factors of the old and of the new one are made anew. A
+        landmark that loses its last sighting leaves the graph.
+        """
+        self.smoother.flush(time_s)  # it may solve the history, and has to know every landmark of a sightline then
+        out, new = [s for s in leaving if s.landmark_id is not None], list(coming)
+        touched = {s.landmark_id for s in out if s.landmark_id is not None} | {landmark for _, landmark in new}
+        before = {landmark: self._first(landmark) for landmark in touched}
+        removed = [handle for sighting in out for handle in sighting.handles]
+        for sighting in out:
+            self._take(sighting)
+        for sighting, landmark in new:
+            self.enter(sighting, landmark, ())
+        again = self._roles_changed(before, {sighting for sighting, _ in new})
+        removed += [handle for sighting in again for handle in sighting.handles]
+        self._make([sighting for sighting, _ in new] + again, removed, before, time_s)
+
+    def _first(self, landmark_id: int) -> Sighting | None:
+        if landmark_id in self._rooted:
+            return self._rooted[landmark_id]
+        return min(self._of.get(landmark_id, {}), key=lambda s: (s.stamp_ns, s.row), default=None)
+
+    def _take(self, sighting: Sighting) -> None:
+        landmark = sighting.landmark_id
+        if landmark is None:
+            return
+        del self._of[landmark][sighting]
+        if not self._of[landmark] and landmark not in self._rooted:
+            del self._of[landmark]
+        self.smoother.sightlines.remove(L(landmark), sighting.line)
+        sighting.landmark_id, sighting.handles = None, ()
+
+    def _roles_changed(self, before: dict[int, Sighting | None], new: set[Sighting]) -> list[Sighting]:
+        """Sightings that stay in, but no longer are, or now are, the first of their landmark."""
+        changed = []
+        for landmark, old in before.items():
+            first = self._first(landmark)
+            if first is not old:
+                changed += [s for s in (old, first) if s is not None and s.landmark_id == landmark and s not in new]
+        return changed
+
+    def _make(
+        self, sightings: list[Sighting], removed: list[int], before: dict[int, Sighting | None], time_s: float
+    ) -> None:
+        """Exchange factors for those of the sightings; landmarks begin and end with their sightings."""
+        firsts = {landmark: self._first(landmark) for landmark in before}
+        begun = {
+            L(landmark): self.maker.place(first, self.smoother.values)
+            for landmark, first in firsts.items()
+            if first is not None and before[landmark] is None
+        }
+        lost = [L(landmark) for landmark, first in firsts.items() if first is None and before[landmark] is not None]
+        made = [
+            self.maker.make(s, L(s.landmark_id), is_first=s is firsts[s.landmark_id])
+            for s in sightings
+            if s.landmark_id is not None
+        ]
+
+        def entered(groups: list[list[int]]) -> None:
+            for sighting, handles in zip(sightings, groups, strict=True):
+                sighting.handles = tuple(handles)
+
+        self.smoother.exchange(GraphEdit(removed, made, begun, lost), time_s, entered)
+
+
+def source(sighting: Sighting, values: gtsam.Values, maker: SightingFactors) -> Source:
+    """The point as located by one sighting.
+
+    With ``p = g(X, range, azimuth, elevation)``: ``cov = g_z diag(R, sigma_e²) g_z'``, sigma_e that of an elevation
+    anywhere in the aperture; on a floor narrowed by its height, ``p_z ~ N(floor z, sigma²)``.
+    """
+    line = sighting.line
+    range_m, azimuth_rad = line.z.tolist()
+    X = values.atPose3(line.pose_key)
+    elevation = maker.elevation_on(sighting.floor, X.compose(line.body_T_sonar), range_m, azimuth_rad)
+    point, by_pose, by_polar = locate_jacobians(X, line.body_T_sonar, range_m, azimuth_rad, elevation)
+    polar_cov = np.zeros((3, 3))
+    polar_cov[:2, :2], polar_cov[2, 2] = sighting.noise, maker.elevation_sigma_rad**2
+    cov = by_polar @ polar_cov @ by_polar.T
+    if sighting.floor is not None:
+        cov = cov - np.outer(cov[:, 2], cov[2]) / (cov[2, 2] + sighting.floor.sigma_m**2)
+    return Source(line.pose_key, point, by_pose, cov)
+
+
+def place(sightings: list[Sighting], values: gtsam.Values, maker: SightingFactors) -> tuple[Floats, Floats]:
+    """The point of several sightings, shape (3,), m, and its covariance, shape (3, 3), m².
+
+    That of the first, corrected by one after the other::
+
+        K = P H' (H P H' + R)^-1,    p <- p + K (z - h(p)),    P <- (I - K H) P
+    """
+    first = source(sightings[0], values, maker)
+    point, P = first.point, first.cov
+    for sighting in sightings[1:]:
+        line = sighting.line
+        predicted, _, H = range_azimuth_jacobians(values.atPose3(line.pose_key), line.body_T_sonar, point)
+        K = np.linalg.solve(H @ P @ H.T + sighting.noise, H @ P).T
+        innovation = np.array([line.z[0] - predicted[0], wrap_angle(line.z[1] - predicted[1])])
+        point, P = point + K @ innovation, P - K @ H @ P
+    return point, P

@@ -1,0 +1,333 @@
+"""Landmarks that nothing but their place tells apart.
+
+Detections without an identity are paired with the landmarks of the graph, named ones too, by joint compatibility
+(`sonar_graph.slam.landmarks.joint_compatibility`). What is left waits, tied to its keyframe, and is paired with what waits of
+earlier frames. Once enough sightings of one candidate place it well enough, they become factors, each on the keyframe
+at which it was made, and the candidate a landmark. Landmarks that turn out to be one are merged
+(`sonar_graph.slam.landmarks.unknown`).
+
+Two landmarks of the graph that are one.
+
+A landmark that was seen again after much drift may be taken for a new one. When other evidence has since corrected
+the poses, its duplicate comes to lie where it lies. Two landmarks a, b are one when all of this holds:
+
+* at least one of them is anonymous;
+* no frame shows both, and with a bounded history none of the one that goes has left the window;
+* their difference ``d = p_a - p_b``, with ``S = P_aa + P_bb - P_ab - P_ba + sigma² I``, is compatible with zero:
+  ``d' S^-1 d`` is within the chi-square gate, three degrees of freedom;
+* that says something: the density of the horizontal difference ``N(d_xy; 0, S_xy)``, 1/m², exceeds the density that
+  neighbours which are not in the map are expected to have. Where S is wide it does not.
+
+Sigma is the noise of one sighting. Of two landmarks in one place each gets the sightings on its side, so that they stay
+apart by about that, and P does not know it. Two that really lie so near each other are told apart by frames with both.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L
+from numpy.typing import NDArray
+
+from sonar_graph.errors import EstimatorError
+from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.slam.landmarks.association import gate_threshold
+from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, believed, pair_jointly
+from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, place, source
+from sonar_graph.slam.models import PredictedView, wrap_angle
+from sonar_graph.slam.smoother import JointCovariance
+from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionJournal, Outcome
+
+
+class LandmarkMerging:
+    """Finds landmarks that are one.
+
+    Parameters
+    ----------
+    landmarks
+        Those of the graph, with their frames.
+    gate_probability
+        Two that are one pass the gate with this probability.
+    log_rival
+        Logarithm of the density, 1/m², which the horizontal difference has to exceed.
+    """
+
+    def __init__(self, landmarks: LandmarkSightings, gate_probability: float, log_rival: float) -> None:
+        self._landmarks = landmarks
+        self._gate = gate_threshold(gate_probability, 3)
+        self._log_rival = log_rival
+
+    def nearest(
+        self, values: gtsam.Values, covariance: JointCovariance, named: list[int], anonymous: list[int]
+    ) -> tuple[int, int] | None:
+        """The pair of landmarks that are most likely one: which stays, and which becomes part of it; None: no pair.
+
+        A named landmark stays, of two anonymous ones that of the lower identity.
+
+        Parameters
+        ----------
+        covariance
+            Joint, of all these landmarks.
+        """
+        pairs = [(a, b) for b in anonymous for a in named] + list(combinations(sorted(anonymous), 2))
+        if not pairs:
+            return None
+        d, S = _differences(values, covariance, pairs)
+        S = S + np.array([max(map(self._variance, pair)) for pair in pairs])[:, None, None] * np.eye(3)
+        distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])
+        near = [k for k in np.argsort(distance).tolist() if distance[k] <= self._gate]
+        return next((pairs[k] for k in near if self._is_telling(d[k], S[k]) and self._may_be_one(*pairs[k])), None)
+
+    def _variance(self, landmark_id: int) -> float:
+        """Noise of a sighting, across or along its beam, whichever is larger, m²."""
+        sighting = self._landmarks.any_sighting(landmark_id)
+        return float(max(sighting.noise[0, 0], sighting.line.z[0] ** 2 * sighting.noise[1, 1]))
+
+    def _is_telling(self, d: Floats, S: Floats) -> bool:
+        level = S[:2, :2]
+        log_det = float(np.linalg.slogdet(level)[1])
+        return -0.5 * (float(d[:2] @ np.linalg.solve(level, d[:2])) + log_det) - math.log(2 * math.pi) > self._log_rival
+
+    def _may_be_one(self, stays: int, goes: int) -> bool:
+        """Whether no frame shows both, and all sightings of the one that goes can still be moved."""
+        of_both = self._landmarks.stamps_ns(stays) & self._landmarks.stamps_ns(goes)
+        return not of_both and not self._landmarks.is_rooted(goes)
+
+
+def _differences(
+    values: gtsam.Values, covariance: JointCovariance, pairs: list[tuple[int, int]]
+) -> tuple[Floats, Floats]:
+    """Difference of each pair and its covariance, shapes (k, 3) and (k, 3, 3)."""
+    points = {i: values.atPoint3(L(i)) for i in {i for pair in pairs for i in pair}}
+    rows = {i: covariance.rows[L(i)] + np.arange(3) for i in points}
+    a, b = (np.array([rows[pair[side]] for pair in pairs]) for side in (0, 1))
+    P = covariance.matrix
+    S = sum(sign * P[i[:, :, None], j[:, None, :]] for sign, i, j in ((1, a, a), (1, b, b), (-1, a, b), (-1, b, a)))
+    return np.array([points[i] - points[j] for i, j in pairs]), np.asarray(S)
+
+
+ODDS = 10.0
+"""How much more likely a pairing must be than that the detection is of a landmark which is not in the map."""
+LARGEST_SIGMA_SHARE = 0.1
+"""A candidate is placed well enough when its largest standard deviation, seen from the poses, is this share of its
+range: a point that far off still looks linear."""
+
+
+@dataclass(frozen=True)
+class AnonymousPolicy:
+    """What is believed of landmarks without identities."""
+
+    gate_probability: float
+    """A true pairing is jointly compatible with this probability."""
+    density_m2: float
+    """Landmarks a square metre of floor that may be there and are not in the map."""
+    least_sightings: int
+    """So many of a candidate make a landmark."""
+    longest_wait_s: float
+    """A sighting waits for them until its keyframe is so much older than the newest one."""
+
+    @property
+    def log_rival(self) -> float:
+        """Logarithm of the density, 1/m², that a pairing has to exceed."""
+        return math.log(ODDS * self.density_m2)
+
+
+def unnamed(frame: LandmarkDetections) -> NDArray[np.bool_]:
+    """Which rows name no landmark at all, neither one nor several in doubt, shape (n,)."""
+    return np.asarray((frame.candidate_ids < 0).all(axis=1))
+
+
+def refuse_taken_ids(frame: LandmarkDetections) -> None:
+    """Refuse names that are those of landmarks without names.
+
+    Raises
+    ------
+    EstimatorError
+        Naming the identity.
+    """
+    largest = int(frame.candidate_ids.max())
+    if largest >= FIRST_ANONYMOUS_ID:
+        raise EstimatorError(
+            f"isam2: a detection at {frame.stamps_ns[0]} ns has identity {largest}; with unknown_landmarks ="
+            f' "associate" those from {FIRST_ANONYMOUS_ID} on are of landmarks without names: number the landmarks'
+            ' below that, or give it unknown_landmarks = "ignore"'
+        )
+
+
+@dataclass(eq=False)
+class Candidate:
+    """Sightings of what may be a landmark, in the order of time."""
+
+    sightings: list[Sighting] = field(default_factory=list)
+
+
+class PairedDetection(NamedTuple):
+    """What a detection was paired with."""
+
+    landmark_id: int | None
+    """A landmark of the graph."""
+    candidate: Candidate | None
+    """None beside it: of neither."""
+    innovation: Floats | None = None
+    """Against a landmark, shape (2,)."""
+    S: Floats | None = None
+    """Its covariance, shape (2, 2)."""
+
+
+class AnonymousLandmarks:
+    """Pairs detections without identities, and begins and merges landmarks.
+
+    Parameters
+    ----------
+    landmarks
+        Of the graph.
+    journal
+        Its rows are amended when sightings are used later, or forgotten, and when landmarks are merged.
+    policy
+        What is believed.
+    """
+
+    def __init__(self, landmarks: LandmarkSightings, journal: DetectionJournal, policy: AnonymousPolicy) -> None:
+        self._landmarks = landmarks
+        self._smoother, self._maker = landmarks.smoother, landmarks.maker
+        self._journal = journal
+        self._policy = policy
+        self._merging = LandmarkMerging(landmarks, policy.gate_probability, policy.log_rival)
+        self._candidates: list[Candidate] = []
+        self._next_id = FIRST_ANONYMOUS_ID
+
+    @property
+    def longest_wait_s(self) -> float:
+        """Age, against the newest keyframe, of the oldest keyframes on which sightings may wait."""
+        return self._policy.longest_wait_s
+
+    @property
+    def has_landmarks(self) -> bool:
+        """Whether any landmark of the graph is anonymous."""
+        return any(i >= FIRST_ANONYMOUS_ID for i in self._landmarks.ids)
+
+    def keys(self) -> list[int]:
+        """Variables whose joint covariance pairing needs: all landmarks, and keyframes that saw candidates."""
+        seen_from = [candidate.sightings[-1].line.pose_key for candidate in self._candidates]
+        return [*(L(i) for i in sorted(self._landmarks.ids)), *sorted(set(seen_from))]
+
+    def pair(self, view: PredictedView, z: Floats, noise: Floats, taken: set[int]) -> list[PairedDetection]:
+        """Landmark or candidate of each detection of a frame: landmarks first, candidates for what is left.
+
+        Parameters
+        ----------
+        z, noise
+            Range (m) and azimuth (rad), shape (m, 2), and their covariance, shape (m, 2, 2).
+        taken
+            Landmarks that are named in this frame.
+        """
+        values = self._smoother.values
+        ids = sorted(self._landmarks.ids - taken)
+        keys = [L(i) for i in ids]
+        points = np.array([values.atPoint3(key) for key in keys])
+        sources = [source(candidate.sightings[-1], values, self._maker) for candidate in self._candidates]
+        if not keys and not sources:
+            return [PairedDetection(None, None)] * len(z)
+        expected, cov = view.expect_jointly(keys, points, sources)
+        of_landmarks = _choose(z, noise, expected[: len(ids)], cov[: 2 * len(ids), : 2 * len(ids)], self._policy)
+        left = [i for i, (landmark, *_) in enumerate(of_landmarks) if landmark == UNPAIRED]
+        of_candidates = _choose(
+            z[left], noise[left], expected[len(ids) :], cov[2 * len(ids) :, 2 * len(ids) :], self._policy
+        )
+        paired = [
+            PairedDetection(ids[j], None, e, S) if j != UNPAIRED else PairedDetection(None, None)
+            for j, e, S in of_landmarks
+        ]
+        for i, (j, *_) in zip(left, of_candidates, strict=True):
+            paired[i] = PairedDetection(None, self._candidates[j] if j != UNPAIRED else None)
+        return paired
+
+    def use(self, sightings: list[Sighting], paired: list[PairedDetection], time_s: float) -> None:
+        """Add what was paired with landmarks; the rest waits, until a candidate becomes a landmark."""
+        for sighting, (landmark_id, candidate, _, S) in zip(sightings, paired, strict=True):
+            if landmark_id is not None and S is not None:
+                self._smoother.waiting_gain += float((np.diag(S) / np.diag(sighting.noise)).max()) - 1.0
+                made = self._maker.make(sighting, L(landmark_id), is_first=False)
+                self._landmarks.enter(sighting, landmark_id, self._smoother.add(made))
+                sighting.outcome = Outcome.USED
+                continue
+            if candidate is None:
+                candidate = Candidate()
+                self._candidates.append(candidate)
+            candidate.sightings.append(sighting)
+            if self._is_placed(candidate):
+                self._begin(candidate, time_s)
+
+    def _is_placed(self, candidate: Candidate) -> bool:
+        if len(candidate.sightings) < self._policy.least_sightings:
+            return False
+        _, cov = place(candidate.sightings, self._smoother.values, self._maker)
+        range_m = candidate.sightings[-1].line.z[0]
+        return bool(np.linalg.eigvalsh(cov)[-1] <= (LARGEST_SIGMA_SHARE * range_m) ** 2)
+
+    def _begin(self, candidate: Candidate, time_s: float) -> None:
+        """A candidate becomes a landmark. The row of its newest sighting, which has none yet, says so."""
+        landmark_id, self._next_id = self._next_id, self._next_id + 1
+        self._candidates.remove(candidate)
+        *earlier, newest = candidate.sightings
+        for sighting in earlier:
+            sighting.outcome = Outcome.PLACED_LATER
+            self._journal.amend(sighting.row, sighting.outcome, landmark_id)
+        newest.outcome = Outcome.NEW
+        self._landmarks.exchange([], [(sighting, landmark_id) for sighting in candidate.sightings], time_s)
+
+    def merge(self, covariance: JointCovariance, time_s: float) -> None:
+        """Merge the two landmarks that are most likely one, if any are.
+
+        The sightings of one become those of the other: the graph is then that of a run that had known.
+
+        Parameters
+        ----------
+        covariance
+            Joint, of all landmarks.
+        """
+        anonymous = [i for i in self._landmarks.ids if i >= FIRST_ANONYMOUS_ID]
+        named = [i for i in self._landmarks.ids if i < FIRST_ANONYMOUS_ID]
+        found = self._merging.nearest(self._smoother.values, covariance, sorted(named), anonymous)
+        if found is None:
+            return
+        stays, goes = found
+        moving = self._landmarks.sightings(goes)
+        for sighting in moving:
+            sighting.outcome = Outcome.MOVED
+            self._journal.amend(sighting.row, sighting.outcome, stays)
+        self._landmarks.exchange(moving, [(sighting, stays) for sighting in moving], time_s)
+
+    def forget(self, oldest_pose_key: int) -> None:
+        """Let go of sightings on older keyframes than one."""
+        for candidate in self._candidates:
+            for sighting in candidate.sightings:
+                if sighting.line.pose_key < oldest_pose_key:
+                    sighting.outcome = Outcome.FORGOTTEN
+                    self._journal.amend(sighting.row, sighting.outcome)
+            candidate.sightings = [s for s in candidate.sightings if s.outcome is Outcome.WAITING]
+        self._candidates = [candidate for candidate in self._candidates if candidate.sightings]
+
+
+def _choose(
+    z: Floats, noise: Floats, expected: Floats, cov: Floats, policy: AnonymousPolicy
+) -> list[tuple[int, Floats | None, Floats | None]]:
+    """For each detection the index of what it is paired with, the innovation and its covariance."""
+    if not len(z) or not len(expected):
+        return [(UNPAIRED, None, None)] * len(z)
+    e = z[:, None] - expected[None]
+    for i, j in np.ndindex(e.shape[:2]):
+        e[i, j, 1] = wrap_angle(e[i, j, 1])
+    innovations = Innovations(e, cov, noise)
+    pairing = believed(
+        innovations, pair_jointly(innovations, policy.gate_probability), policy.log_rival + np.log(z[:, 0])
+    )
+    return [
+        (j, e[i, j], cov[2 * j : 2 * j + 2, 2 * j : 2 * j + 2] + noise[i]) if j != UNPAIRED else (UNPAIRED, None, None)
+        for i, j in enumerate(pairing.landmarks)
+    ]

@@ -1,0 +1,267 @@
+"""The factors of the graph, each from a measurement and its noise.
+
+::
+
+    start prior ── X0 ──odometry── X1 ──odometry── X2 ── ...        X  world_T_body at a keyframe
+                   │ ╲            ╱ │                                B  gyro bias, one a stretch of time
+                   │   B0 ──walk── B1                                L  landmark in the world
+                   └── range, azimuth ── L7 ── floor prior
+    depth, gravity direction and the planar constraint: one keyframe each
+
+All but the odometry factor with a gyro bias are GTSAM's own (compiled) factors; each is checked numerically in the
+tests against `sonar_graph.slam.models.sonar_model`. Range and azimuth are two factors, so that elevation stays unknown:
+
+* range: ``RangeFactorWithTransform3D``.
+* azimuth: a camera whose optical axis lies in the sonar's fan plane along the measured azimuth, with the equidistant
+  projection (Kannala and Brandt, IEEE PAMI 28(8), 2006, equation 6 without distortion): a direction at angle ``t`` from
+  the axis has an image point at distance ``t`` from its centre. The horizontal coordinate of a point at elevation 0 is
+  ``azimuth - measured``; at a small elevation ``e`` it is that times ``e / tan(e)`` (0.995 at 7 degrees), zero where
+  the azimuth is as measured, whatever ``e``. The vertical coordinate is ``e`` near the axis. A horizontal and a
+  vertical sigma thus say what is known. A pinhole, with tangents for angles, lets an azimuth that is wrong by tens of
+  degrees pull much harder.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import gtsam
+import numpy as np
+
+from sonar_graph.calibration import Calibration, PlanarMotion
+from sonar_graph.errors import MeasurementError
+from sonar_graph.measurements import Floats
+from sonar_graph.navigation.preintegration import PreintegratedMotion
+from sonar_graph.slam.models.sonar_model import range_azimuth_jacobians, wrap_angle
+
+UNINFORMATIVE_M = 1e5
+UNINFORMATIVE_RAD = 1e3
+"""Sigmas that leave a direction to the other factors."""
+CORRELATION_LIMIT = 1e-6
+"""Above it, range and azimuth noise are taken together."""
+EQUIDISTANT = gtsam.Cal3Fisheye(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""Unit focal lengths; no skew, offset or distortion."""
+BEAM_R_CAMERA = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
+"""Columns: image x to the left, image y up, optical axis along the beam."""
+ORIGIN, IMAGE_CENTRE, UP = np.zeros(3), np.zeros(2), np.array([0.0, 0.0, 1.0])
+Robust = Callable[[gtsam.noiseModel.Base], gtsam.noiseModel.Base]
+"""Wraps a noise model in a robust kernel, or returns it as it is."""
+
+
+def gaussian(cov: Floats) -> gtsam.noiseModel.Base:
+    """Noise with this covariance, all of it.
+
+    Left to itself GTSAM takes a matrix for diagonal when no other entry exceeds 1e-9, whatever its unit and scale:
+    motion over a short time would lose all its correlations. A matrix that is none it takes as well, and weighs by
+    numbers that are none.
+
+    Raises
+    ------
+    MeasurementError
+        When the matrix is not positive definite.
+    """
+    try:
+        np.linalg.cholesky(cov)
+        is_sound = bool(np.isfinite(cov).all())
+    except np.linalg.LinAlgError:
+        is_sound = False
+    if not is_sound:
+        least = np.linalg.eigvalsh(np.nan_to_num(cov))[0]
+        raise MeasurementError(
+            f"noise of a factor: expected a positive definite covariance, not one with an eigenvalue of {least:.3g};"
+            " give every component a variance above zero"
+        )
+    return gtsam.noiseModel.Gaussian.Covariance(cov, False)
+
+
+def start_prior(pose_key: int, calibration: Calibration) -> gtsam.NonlinearFactor:
+    """Prior of the first keyframe; position sigmas are along the world's axes, rotation sigmas about the body's."""
+    start = calibration.start
+    body_R_world = start.pose().rotation().matrix().T
+    cov = np.zeros((6, 6))
+    cov[:3, :3] = np.diag(np.square(start.rpy_sigma_rad))
+    cov[3:, 3:] = body_R_world @ np.diag(np.square(start.position_sigma_m)) @ body_R_world.T
+    return gtsam.PriorFactorPose3(pose_key, start.pose(), gaussian(cov))
+
+
+def bias_prior(bias_key: int, sigma: float) -> gtsam.NonlinearFactor:
+    """Gyro bias is N(0, sigma²) on each axis, rad/s."""
+    return gtsam.PriorFactorPoint3(bias_key, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, sigma))
+
+
+def bias_walk(key_i: int, key_j: int, sigma: float) -> gtsam.NonlinearFactor:
+    """Gyro bias of the next stretch is that of the last, give or take sigma on each axis, rad/s."""
+    return gtsam.BetweenFactorPoint3(key_i, key_j, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, sigma))
+
+
+def odometry(key_i: int, key_j: int, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
+    """Relative pose from preintegrated gyro and DVL where the gyro has no bias to estimate."""
+    noise = gaussian(motion.covariance)
+    return gtsam.BetweenFactorPose3(key_i, key_j, motion.i_T_j, noise)
+
+
+def odometry_with_bias(key_i: int, key_j: int, bias_key: int, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
+    """Relative pose from preintegrated gyro and DVL, and its gyro bias.
+
+    Error ``Log(corrected(b)^-1 X_i^-1 X_j)``, shape (6,), with ``corrected(b) = i_T_j Exp(D_bias (b - bias))``.
+    """
+    keys = [key_i, key_j, bias_key]
+    inverse_mean = motion.i_T_j.inverse()
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
+        X_i, X_j = values.atPose3(key_i), values.atPose3(key_j)
+        return odometry_error(X_i, X_j, values.atPoint3(bias_key), motion, inverse_mean, jacobians)
+
+    return gtsam.CustomFactor(gaussian(motion.covariance), keys, error)
+
+
+def odometry_error(
+    X_i: gtsam.Pose3,
+    X_j: gtsam.Pose3,
+    bias: Floats,
+    motion: PreintegratedMotion,
+    inverse_mean: gtsam.Pose3,
+    jacobians: list[Floats] | None = None,
+) -> Floats:
+    """Error of `odometry_with_bias`, shape (6,); fills the derivatives by X_i (6, 6), X_j (6, 6), bias (6, 3)."""
+    correction = motion.D_bias @ (bias - motion.bias)
+    E = gtsam.Pose3.Expmap(-correction).compose(inverse_mean).compose(X_i.between(X_j))
+    error = gtsam.Pose3.Logmap(E)
+    if jacobians is not None:
+        D_log = gtsam.Pose3.LogmapDerivative(error)
+        E_inverse = E.inverse()
+        jacobians[0] = -D_log @ X_j.between(X_i).AdjointMap()
+        jacobians[1] = D_log
+        jacobians[2] = -D_log @ E_inverse.AdjointMap() @ gtsam.Pose3.ExpmapDerivative(correction) @ motion.D_bias
+    return error
+
+
+def landmark_sighting(
+    pose_key: int,
+    landmark_key: int,
+    body_T_sonar: gtsam.Pose3,
+    z: Floats,
+    cov: Floats,
+    robust: Robust,
+    elevation_sigma_rad: float | None = None,
+) -> list[gtsam.NoiseModelFactor]:
+    """Range and azimuth of a landmark.
+
+    Parameters
+    ----------
+    body_T_sonar
+        Sonar in the keyframe's body frame when the frame was taken.
+    z, cov
+        Range (m) and azimuth (rad), shape (2,), and their covariance, shape (2, 2).
+    elevation_sigma_rad
+        Elevation is N(0, sigma²); None: not said here. Say it once a landmark: its elevation does not vary between
+        frames as noise would, so that repeating it would invent information.
+    """
+    range_var, azimuth_var, covariance = float(cov[0, 0]), float(cov[1, 1]), float(cov[0, 1])
+    factors: list[gtsam.NoiseModelFactor] = [
+        _camera(pose_key, landmark_key, body_T_sonar, float(z[1]), math.sqrt(azimuth_var), elevation_sigma_rad, robust)
+    ]
+    if abs(covariance) < CORRELATION_LIMIT * math.sqrt(range_var * azimuth_var):
+        noise = robust(gtsam.noiseModel.Isotropic.Sigma(1, math.sqrt(range_var)))
+        return [*factors, gtsam.RangeFactorWithTransform3D(pose_key, landmark_key, float(z[0]), noise, body_T_sonar)]
+    elevation_only = (
+        [elevation(pose_key, landmark_key, body_T_sonar, float(z[1]), elevation_sigma_rad, robust)]
+        if elevation_sigma_rad
+        else []
+    )
+    return [*elevation_only, correlated_sighting(pose_key, landmark_key, body_T_sonar, z, cov, robust)]
+
+
+def elevation(
+    pose_key: int,
+    landmark_key: int,
+    body_T_sonar: gtsam.Pose3,
+    azimuth_rad: float,
+    elevation_sigma_rad: float,
+    robust: Robust,
+) -> gtsam.NoiseModelFactor:
+    """Elevation of a landmark at this azimuth is N(0, sigma²); the azimuth is not said."""
+    return _camera(pose_key, landmark_key, body_T_sonar, azimuth_rad, UNINFORMATIVE_RAD, elevation_sigma_rad, robust)
+
+
+def _camera(
+    pose_key: int,
+    landmark_key: int,
+    body_T_sonar: gtsam.Pose3,
+    azimuth_rad: float,
+    azimuth_sigma_rad: float,
+    elevation_sigma_rad: float | None,
+    robust: Robust,
+) -> gtsam.NoiseModelFactor:
+    sonar_R_camera = gtsam.Rot3.Rz(azimuth_rad).compose(BEAM_R_CAMERA)
+    body_T_camera = body_T_sonar.compose(gtsam.Pose3(sonar_R_camera, ORIGIN))
+    vertical = UNINFORMATIVE_RAD if elevation_sigma_rad is None else elevation_sigma_rad
+    noise = robust(gtsam.noiseModel.Diagonal.Sigmas(np.array([azimuth_sigma_rad, vertical])))
+    return gtsam.GenericProjectionFactorCal3Fisheye(
+        IMAGE_CENTRE, noise, pose_key, landmark_key, EQUIDISTANT, False, False, body_T_camera
+    )
+
+
+def correlated_sighting(
+    pose_key: int, landmark_key: int, body_T_sonar: gtsam.Pose3, z: Floats, cov: Floats, robust: Robust
+) -> gtsam.NoiseModelFactor:
+    """Range and azimuth whose noises are correlated, as one factor: ``h(X, L) - z``, azimuth wrapped."""
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Floats] | None) -> Floats:
+        X, p = values.atPose3(pose_key), values.atPoint3(landmark_key)
+        predicted, by_pose, by_landmark = range_azimuth_jacobians(X, body_T_sonar, p)
+        if jacobians is not None:
+            jacobians[0], jacobians[1] = by_pose, by_landmark
+        return np.array([predicted[0] - z[0], wrap_angle(predicted[1] - z[1])])
+
+    return gtsam.CustomFactor(robust(gaussian(cov)), [pose_key, landmark_key], error)
+
+
+def first_direction(pose_key: int, landmark_key: int, body_p_landmark: Floats) -> gtsam.NonlinearFactor:
+    """A landmark is somewhere about where it was first seen: direction to a radian, range to its whole length.
+
+    Beside a sonar's noise that says nothing. But the azimuth factor is blind to what lies behind it, and where a wrong
+    identity contradicts a right one a solution may lie behind both: without this factor nothing but two ranges would
+    then hold the landmark, and the system would have no solution.
+
+    Parameters
+    ----------
+    body_p_landmark
+        In the keyframe's body frame, shape (3,), m.
+    """
+    range_m = float(np.linalg.norm(body_p_landmark))
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([1.0, 1.0, range_m]))
+    return gtsam.BearingRangeFactor3D(pose_key, landmark_key, gtsam.Unit3(body_p_landmark), range_m, noise)
+
+
+def floor_prior(landmark_key: int, z_m: float, sigma_m: float) -> gtsam.NonlinearFactor:
+    """Landmark z is N(z_m, sigma_m²); x and y are left to the other factors."""
+    sigmas = np.array([UNINFORMATIVE_M, UNINFORMATIVE_M, sigma_m])
+    return gtsam.PriorFactorPoint3(landmark_key, np.array([0.0, 0.0, z_m]), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+
+
+def depth(pose_key: int, z_m: float, body_p_port: Floats, sigma_m: float) -> gtsam.NonlinearFactor:
+    """World z of a point of the body, shape (3,) in the body frame, is N(z_m, sigma_m²)."""
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([UNINFORMATIVE_M, UNINFORMATIVE_M, sigma_m]))
+    return gtsam.GPSFactorArm(pose_key, np.array([0.0, 0.0, z_m]), body_p_port, noise)
+
+
+def gravity_direction(pose_key: int, up_in_body: Floats, sigma_rad: float) -> gtsam.NonlinearFactor:
+    """World's up, seen in the body as ``up_in_body`` (any length), to sigma_rad about each horizontal axis.
+
+    ``R^T e_z - up``, GTSAM's factor for a magnetometer without bias, and not its attitude factor: that one compares the
+    two directions in the world, where a turn about the vertical turns the residual. Linearised, it says of the yaw what
+    it cannot know: the more the larger its residual is beside sigma.
+    """
+    measured = up_in_body / np.linalg.norm(up_in_body)
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma_rad)
+    return gtsam.MagPoseFactorPose3(pose_key, measured, 1.0, UP, ORIGIN, noise)
+
+
+def planar(pose_key: int, motion: PlanarMotion) -> list[gtsam.NonlinearFactor]:
+    """The keyframe is level and at the plane's height."""
+    return [
+        gravity_direction(pose_key, UP, motion.tilt_sigma_rad),
+        depth(pose_key, motion.z_m, np.zeros(3), motion.z_sigma_m),
+    ]

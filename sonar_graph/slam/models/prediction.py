@@ -1,0 +1,257 @@
+"""What the graph expects a sonar frame to show, and how surely."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.navigation.preintegration import PreintegratedMotion
+from sonar_graph.numerics import compiled, skew
+from sonar_graph.slam.models.sonar_model import project, wrap_angle
+from sonar_graph.slam.smoother import JointCovariance
+
+ABSENT = -1
+"""Row of a variable that is not estimated."""
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedRow:
+    """Detections of a frame beside what was expected of them."""
+
+    innovation: Floats
+    """Measured minus expected range (m) and azimuth (rad, wrapped), shape (m, 2)."""
+    S: Floats
+    """Covariance of the innovation, shape (m, 2, 2)."""
+    distance: Floats
+    """Squared Mahalanobis distance of the innovation, shape (m,)."""
+    gain: Floats
+    """The larger of the expected variances relative to the noise, shape (m,): how much a detection has to tell."""
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A point that is not in the graph, as located from a keyframe that is."""
+
+    pose_key: int
+    point: Floats
+    """In the world, shape (3,), m."""
+    by_pose: Floats
+    """Its derivative by the keyframe, shape (3, 6)."""
+    cov: Floats
+    """Of the point, seen from the keyframe, shape (3, 3), m²."""
+
+
+class PredictedView:
+    """A frame, seen from a keyframe whose estimate and covariance are known.
+
+    With the motion M from that keyframe X to the frame, its noise covariance Q and its derivative D by the gyro bias b,
+    and the sonar mounted at T, the landmark p is expected at ``h(X M T, p)``. What is expected has the covariance
+    ``H P H' + H_M Q H_M'``: P of (X, b, p) together, ``H = [H_X, H_M D, H_p]``, H_M the derivative by the body's pose
+    at the frame.
+
+    Parameters
+    ----------
+    pose_key, bias_key
+        The keyframe, and the gyro bias since then; None when there is none to estimate.
+    world_T_keyframe
+        The keyframe's estimate.
+    motion
+        From the keyframe to the frame.
+    body_T_sonar
+        The sonar's mounting.
+    covariance
+        Of the keyframe, the bias and the landmarks that are compared, together.
+    """
+
+    def __init__(
+        self,
+        pose_key: int,
+        bias_key: int | None,
+        world_T_keyframe: gtsam.Pose3,
+        motion: PreintegratedMotion,
+        body_T_sonar: gtsam.Pose3,
+        covariance: JointCovariance,
+    ) -> None:
+        keyframe_T_sonar = motion.i_T_j.compose(body_T_sonar)
+        self.world_T_sonar = world_T_keyframe.compose(keyframe_T_sonar)
+        """The sonar at the frame."""
+        self._world_T_keyframe = world_T_keyframe
+        self.covariance = covariance
+        """Of the keyframe, the bias and the landmarks, together."""
+        self._pose_row = covariance.rows[pose_key]
+        self._bias_row = ABSENT if bias_key is None else covariance.rows[bias_key]
+        self._world_T_sonar = self.world_T_sonar.matrix()
+        self._to_keyframe = keyframe_T_sonar.inverse().AdjointMap()
+        self._to_body = body_T_sonar.inverse().AdjointMap()
+        self._motion = motion
+
+    def height_variance(self, point: Floats) -> float:
+        """Variance of the world z of a point fixed to the body at the frame, shape (3,) in the world, m².
+
+        Of keyframe and motion; that of the gyro bias, which turns about the vertical most of all, is left out.
+        """
+        by_keyframe = _height_derivative(self._world_T_keyframe, point)
+        by_body = _height_derivative(self._world_T_keyframe.compose(self._motion.i_T_j), point)
+        r = self._pose_row
+        P = self.covariance.matrix[r : r + 6, r : r + 6]
+        return float(by_keyframe @ P @ by_keyframe + by_body @ self._motion.covariance @ by_body)
+
+    def expect(self, keys: list[int], points: Floats) -> tuple[Floats, Floats]:
+        """What landmarks at points of the world, shape (m, 3), are expected to show.
+
+        Returns
+        -------
+        Range (m) and azimuth (rad), shape (m, 2), and their covariances, shape (m, 2, 2).
+        """
+        rows = np.array([self.covariance.rows[key] for key in keys], dtype=np.int64)
+        return _expect(
+            points,
+            rows,
+            self._pose_row,
+            self._bias_row,
+            self.covariance.matrix,
+            self._world_T_sonar,
+            self._to_keyframe,
+            self._to_body,
+            self._motion.D_bias,
+            self._motion.covariance,
+        )
+
+    def expect_jointly(self, keys: list[int], points: Floats, sources: list[Source]) -> tuple[Floats, Floats]:
+        """What landmarks of the graph, shape (m, 3), and points that are not in it are expected to show, all together.
+
+        Returns
+        -------
+        Range (m) and azimuth (rad), shape (m + s, 2), and their joint covariance, shape (2 (m + s), 2 (m + s)).
+        """
+        everywhere = np.concatenate([points.reshape(-1, 3), *(source.point[None] for source in sources)])
+        predicted, by_state, by_motion = _derivatives(
+            everywhere, self._world_T_sonar, self._to_keyframe, self._to_body, self._motion.D_bias
+        )
+        H, own = np.zeros((len(everywhere), 2, len(self.covariance.matrix))), np.zeros((len(everywhere), 2, 2))
+        H[:, :, self._pose_row : self._pose_row + 6] = by_state[:, :, :6]
+        if self._bias_row != ABSENT:
+            H[:, :, self._bias_row : self._bias_row + 3] = by_state[:, :, 6:9]
+        for k, key in enumerate(keys):
+            row = self.covariance.rows[key]
+            H[k, :, row : row + 3] = by_state[k, :, 9:]
+        for k, source in enumerate(sources, start=len(keys)):
+            row, by_point = self.covariance.rows[source.pose_key], by_state[k, :, 9:]
+            H[k, :, row : row + 6] += by_point @ source.by_pose
+            own[k] = by_point @ source.cov @ by_point.T
+        return predicted, _joint_cov(H, self.covariance.matrix, by_motion, self._motion.covariance, own)
+
+    def compare(self, keys: list[int], points: Floats, z: Floats, cov: Floats) -> ComparedRow:
+        """Detections z, shape (m, 2), with noise (m, 2, 2), of landmarks at points of the world, shape (m, 3)."""
+        return ComparedRow(*weigh(z, *self.expect(keys, points), cov))
+
+    def blurred(self, cov: Floats, motion: PreintegratedMotion, points: Floats) -> Floats:
+        """Noise of range and azimuth of points of the world, (m, 2, 2), with that of a motion that ends at the frame.
+
+        The motion's part is added to each variance; that it correlates range and azimuth a little is left out.
+        """
+        return _blurred(cov, points, self._world_T_sonar, self._to_body, motion.covariance)
+
+
+def _joint_cov(H: Floats, P: Floats, by_motion: Floats, motion_cov: Floats, own: Floats) -> Floats:
+    n = 2 * len(H)
+    H, G = H.reshape(n, -1), by_motion.reshape(n, 6)
+    joint = H @ P @ H.T + G @ motion_cov @ G.T
+    for k, cov in enumerate(own):
+        joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += cov
+    return np.asarray(0.5 * (joint + joint.T))
+
+
+def _height_derivative(world_T_body: gtsam.Pose3, point: Floats) -> Floats:
+    """Derivative of the world z of a point of the body by the right perturbation of its pose, shape (6,)."""
+    up = world_T_body.rotation().matrix()[2]
+    return np.concatenate([np.cross(world_T_body.transformTo(point), up), up])
+
+
+@compiled
+def weigh(z: Floats, predicted: Floats, prior_cov: Floats, cov: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Compare m detections with what was expected: the fields of `Comparison`."""
+    S = prior_cov + cov
+    innovation, distance, gain = np.empty(z.shape), np.empty(len(z)), np.empty(len(z))
+    for k in range(len(z)):
+        r, alpha = z[k, 0] - predicted[k, 0], wrap_angle(z[k, 1] - predicted[k, 1])
+        innovation[k, 0], innovation[k, 1] = r, alpha
+        a, b, c = S[k, 0, 0], 0.5 * (S[k, 0, 1] + S[k, 1, 0]), S[k, 1, 1]
+        distance[k] = (c * r**2 - 2.0 * b * r * alpha + a * alpha**2) / (a * c - b * b)
+        gain[k] = max(prior_cov[k, 0, 0] / cov[k, 0, 0], prior_cov[k, 1, 1] / cov[k, 1, 1])
+    return innovation, S, distance, gain
+
+
+@compiled
+def _by_sonar_pose(q: Floats, D_q: Floats) -> Floats:
+    """Derivative of range and azimuth by the right perturbation of the sonar's pose, shape (2, 6)."""
+    H = np.empty((2, 6))
+    H[:, :3] = D_q @ skew(q)
+    H[:, 3:] = -D_q
+    return H
+
+
+@compiled
+def _expect(
+    points: Floats,
+    rows: Ints,
+    pose_row: int,
+    bias_row: int,
+    joint: Floats,
+    world_T_sonar: Floats,
+    to_keyframe: Floats,
+    to_body: Floats,
+    D_bias: Floats,
+    motion_cov: Floats,
+) -> tuple[Floats, Floats]:
+    predicted, by_state, by_body = _derivatives(points, world_T_sonar, to_keyframe, to_body, D_bias)
+    covs = np.empty((len(points), 2, 2))
+    place = np.full(12, ABSENT)
+    P = np.zeros((12, 12))
+    for k in range(len(points)):
+        for r in range(12):
+            place[r] = pose_row + r if r < 6 else rows[k] + r - 9
+            if 6 <= r < 9:
+                place[r] = ABSENT if bias_row == ABSENT else bias_row + r - 6
+        for r in range(12):
+            for c in range(12):
+                P[r, c] = 0.0 if place[r] == ABSENT or place[c] == ABSENT else joint[place[r], place[c]]
+        covs[k] = by_state[k] @ P @ by_state[k].T + by_body[k] @ motion_cov @ by_body[k].T
+    return predicted, covs
+
+
+@compiled
+def _derivatives(
+    points: Floats, world_T_sonar: Floats, to_keyframe: Floats, to_body: Floats, D_bias: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """What points show, (m, 2); its derivatives by keyframe, bias and point, (m, 2, 12), and by motion, (m, 2, 6)."""
+    sonar_R_world = np.ascontiguousarray(world_T_sonar[:3, :3].T)
+    predicted = np.empty((len(points), 2))
+    by_state, by_motion = np.empty((len(points), 2, 12)), np.empty((len(points), 2, 6))
+    for k in range(len(points)):
+        q = sonar_R_world @ (points[k] - world_T_sonar[:3, 3])
+        predicted[k], D_q = project(q)
+        by_sonar = _by_sonar_pose(q, D_q)
+        by_body = by_sonar @ to_body
+        by_state[k, :, :6] = by_sonar @ to_keyframe
+        by_state[k, :, 6:9] = by_body @ D_bias
+        by_state[k, :, 9:] = D_q @ sonar_R_world
+        by_motion[k] = by_body
+    return predicted, by_state, by_motion
+
+
+@compiled
+def _blurred(cov: Floats, points: Floats, world_T_sonar: Floats, to_body: Floats, motion_cov: Floats) -> Floats:
+    sonar_R_world = np.ascontiguousarray(world_T_sonar[:3, :3].T)
+    blurred = cov.copy()
+    for k in range(len(points)):
+        q = sonar_R_world @ (points[k] - world_T_sonar[:3, 3])
+        _, D_q = project(q)
+        by_body = _by_sonar_pose(q, D_q) @ to_body
+        noise = by_body @ motion_cov @ by_body.T
+        for r in range(2):
+            blurred[k, r, r] += noise[r, r]
+    return blurred

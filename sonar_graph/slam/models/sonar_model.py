@@ -1,0 +1,177 @@
+"""Range and azimuth of a landmark, seen by a sonar on a body: the model, its inverse, and their derivatives.
+
+With the landmark p in the world and the sonar at ``world_T_sonar = world_T_body body_T_sonar``::
+
+    q       = sonar_R_world (p - world_p_sonar)
+    range   = |q|
+    azimuth = atan2(q_y, q_x)
+
+    D_q     = [ q^T / |q|                             ]     D_q: derivative of (range, azimuth) by q, shape (2, 3)
+              [ -q_y / rho^2,  q_x / rho^2,  0        ]     rho^2 = q_x^2 + q_y^2
+
+    by the body pose    D_q [ [q]x | -I ] Ad(sonar_T_body)      right perturbation [theta, rho], shape (2, 6)
+    by the landmark     D_q sonar_R_world                       shape (2, 3)
+
+The inverse model needs the elevation, which a sonar does not measure: ``elevation = asin(q_z / |q|)``. On a floor of
+known height it follows from range and azimuth. Azimuth has no derivative on the sonar's vertical axis (rho = 0); a
+landmark there is outside every aperture.
+"""
+
+from __future__ import annotations
+
+import math
+
+import gtsam
+import numpy as np
+
+from sonar_graph.measurements import Floats
+from sonar_graph.numerics import compiled, skew
+
+FLOOR_GATE = 10.83
+"""0.999 of the chi-square distribution with one degree of freedom. A landmark whose height on the centre of the
+aperture is farther from the floor than this, squared and in variances of elevation, pose and floor, does not stand on
+it."""
+
+
+@compiled
+def wrap_angle(angle_rad: float) -> float:
+    """The same direction in (-pi, pi]."""
+    return angle_rad - 2.0 * math.pi * math.ceil((angle_rad - math.pi) / (2.0 * math.pi))
+
+
+@compiled
+def project(q: Floats) -> tuple[Floats, Floats]:
+    """Range and azimuth of a point in the sonar frame.
+
+    Parameters
+    ----------
+    q
+        Shape (3,), m.
+
+    Returns
+    -------
+    (range m, azimuth rad), shape (2,), and D_q, their derivative by q, shape (2, 3).
+    """
+    rho2 = q[0] * q[0] + q[1] * q[1]
+    range_m = math.sqrt(rho2 + q[2] * q[2])
+    z = np.array([range_m, math.atan2(q[1], q[0])])
+    D_q = np.zeros((2, 3))
+    for axis in range(3):
+        D_q[0, axis] = q[axis] / range_m
+    D_q[1, 0], D_q[1, 1] = -q[1] / rho2, q[0] / rho2
+    return z, D_q
+
+
+@compiled
+def sonar_point(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
+    """The point in the sonar frame with these spherical coordinates, shape (3,), m."""
+    level = range_m * math.cos(elevation_rad)
+    return np.array([level * math.cos(azimuth_rad), level * math.sin(azimuth_rad), range_m * math.sin(elevation_rad)])
+
+
+@compiled
+def sonar_point_jacobian(range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
+    """Derivative of `sonar_point` by (range, azimuth, elevation), shape (3, 3)."""
+    ca, sa, ce, se = math.cos(azimuth_rad), math.sin(azimuth_rad), math.cos(elevation_rad), math.sin(elevation_rad)
+    return np.array(
+        [
+            [ce * ca, -range_m * ce * sa, -range_m * se * ca],
+            [ce * sa, range_m * ce * ca, -range_m * se * sa],
+            [se, 0.0, range_m * ce],
+        ]
+    )
+
+
+def range_azimuth(world_T_sonar: gtsam.Pose3, p_world: Floats) -> Floats:
+    """Range (m) and azimuth (rad) at which a sonar sees a point, shape (2,)."""
+    z, _ = project(np.asarray(world_T_sonar.transformTo(p_world), dtype=np.float64))
+    return z
+
+
+def range_azimuth_jacobians(
+    world_T_body: gtsam.Pose3, body_T_sonar: gtsam.Pose3, p_world: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Range and azimuth with derivatives.
+
+    Returns
+    -------
+    (range m, azimuth rad), shape (2,); the derivative by the body pose's right perturbation [theta, rho], shape (2, 6);
+    the derivative by the landmark, shape (2, 3).
+    """
+    world_T_sonar = world_T_body.compose(body_T_sonar)
+    q = np.asarray(world_T_sonar.transformTo(p_world), dtype=np.float64)
+    z, D_q = project(q)
+    by_sonar_pose = D_q @ np.hstack([skew(q), -np.eye(3)])
+    return z, by_sonar_pose @ body_T_sonar.inverse().AdjointMap(), D_q @ world_T_sonar.rotation().matrix().T
+
+
+def locate(world_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, elevation_rad: float) -> Floats:
+    """The point in the world that a sonar sees there, shape (3,), m."""
+    return np.asarray(world_T_sonar.transformFrom(sonar_point(range_m, azimuth_rad, elevation_rad)))
+
+
+def locate_jacobians(
+    world_T_body: gtsam.Pose3,
+    body_T_sonar: gtsam.Pose3,
+    range_m: float,
+    azimuth_rad: float,
+    elevation_rad: float,
+) -> tuple[Floats, Floats, Floats]:
+    """A located point with derivatives.
+
+    Returns
+    -------
+    The point, shape (3,), m; its derivative by the body pose's right perturbation [theta, rho], shape (3, 6); its
+    derivative by (range, azimuth, elevation), shape (3, 3).
+    """
+    world_T_sonar = world_T_body.compose(body_T_sonar)
+    R_body, R_sonar = world_T_body.rotation().matrix(), world_T_sonar.rotation().matrix()
+    point = locate(world_T_sonar, range_m, azimuth_rad, elevation_rad)
+    p_body = np.asarray(world_T_body.transformTo(point), dtype=np.float64)
+    by_pose = R_body @ np.hstack([-skew(p_body), np.eye(3)])
+    return point, by_pose, R_sonar @ sonar_point_jacobian(range_m, azimuth_rad, elevation_rad)
+
+
+@compiled
+def floor_elevation(
+    down_row: Floats, height_m: float, range_m: float, azimuth_rad: float, aperture_rad: float
+) -> float:
+    """Elevation at which a point of given range and azimuth lies on a horizontal plane; NaN outside the aperture.
+
+    With the last row (a, b, c) of world_R_sonar and the plane at ``height_m`` above the sonar::
+
+        (a cos(azimuth) + b sin(azimuth)) cos(e) + c sin(e) = height / range
+
+    which is ``A cos(e - e0) = height / range``: of its two solutions the one nearer to the centre beam.
+    """
+    level = down_row[0] * math.cos(azimuth_rad) + down_row[1] * math.sin(azimuth_rad)
+    amplitude = math.hypot(level, down_row[2])
+    ratio = height_m / (range_m * amplitude) if range_m * amplitude > 0.0 else math.inf
+    if abs(ratio) > 1.0:
+        return math.nan
+    middle, half = math.atan2(down_row[2], level), math.acos(ratio)
+    first, second = wrap_angle(middle + half), wrap_angle(middle - half)
+    nearest = first if abs(first) < abs(second) else second
+    return nearest if abs(nearest) <= 0.5 * aperture_rad else math.nan
+
+
+def elevation_on_floor(
+    world_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, floor_z_m: float, aperture_rad: float
+) -> float | None:
+    """Elevation (rad) at which a detected point lies on the floor.
+
+    Parameters
+    ----------
+    floor_z_m
+        World z of the floor.
+    aperture_rad
+        Full vertical opening of the sonar.
+
+    Returns
+    -------
+    None when the floor is not within the aperture at that range and azimuth.
+    """
+    row = np.ascontiguousarray(world_T_sonar.rotation().matrix()[2])
+    height_m = floor_z_m - float(world_T_sonar.translation()[2])
+    elevation = floor_elevation(row, height_m, range_m, azimuth_rad, aperture_rad)
+    return None if math.isnan(elevation) else elevation

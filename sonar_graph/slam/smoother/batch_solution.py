@@ -1,0 +1,263 @@
+"""Solving a whole graph at once, when some of its factors are Python functions.
+
+GTSAM's optimisers hand each Python factor a copy of all values, which makes their cost quadratic in the length of a
+run. Linearising from Python does not; so the loop is here, and the linear algebra is GTSAM's.
+
+Landmarks that an estimate has put behind the sonar that saw them, and where to start them instead.
+
+The azimuth factor is a camera along the measured azimuth (`sonar_graph.slam.models.factors`). It holds in the half space ahead
+of the sonar; for a landmark behind, GTSAM's camera has a constant error and no gradient. A landmark gets there when a
+large correction, such as a loop closed after much drift, turns the poses that saw it, and if all its sightings are of
+that kind nothing pulls it back. Its sightings themselves say where it should be.
+
+The joint covariance of several variables, by their keys.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from sonar_graph.measurements import Floats
+
+MAX_ITERATIONS = 50
+RELATIVE_DECREASE = 1e-7
+"""Stop when an iteration lowers the error by less than this share of it."""
+FIRST_DAMPING = 1e-9
+DAMPING_FACTOR = 10.0
+MAX_DAMPING = 1e9
+
+
+def solve(
+    graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, most_iterations: int = MAX_ITERATIONS
+) -> gtsam.Values:
+    """Levenberg–Marquardt from ``initial``.
+
+    Minimises the sum of squared whitened (and robustly weighted) errors. Damping multiplies the identity; it starts
+    negligible (a Gauss–Newton step) and grows tenfold while a step does not lower the error (Nocedal and Wright,
+    Numerical Optimization, section 10.3).
+
+    Returns
+    -------
+    gtsam.Values
+        The solution; the initial values where no step lowers the error.
+    """
+    values, error = initial, graph.error(initial)
+    damping = FIRST_DAMPING
+    for _ in range(most_iterations):
+        linear = graph.linearize(values)
+        candidate, candidate_error, damping = _lower(graph, linear, values, error, damping)
+        if candidate is None:
+            break
+        decrease = error - candidate_error
+        values, error = candidate, candidate_error
+        if decrease <= RELATIVE_DECREASE * error:
+            break
+    return values
+
+
+def _lower(
+    graph: gtsam.NonlinearFactorGraph,
+    linear: gtsam.GaussianFactorGraph,
+    values: gtsam.Values,
+    error: float,
+    damping: float,
+) -> tuple[gtsam.Values | None, float, float]:
+    while damping <= MAX_DAMPING:
+        try:
+            candidate = _step(linear, values, damping)
+            candidate_error = graph.error(candidate)
+        except RuntimeError:  # GTSAM: indeterminate for this damping
+            candidate_error = np.inf
+        if candidate_error < error:
+            return candidate, candidate_error, max(damping / DAMPING_FACTOR, FIRST_DAMPING)
+        damping *= DAMPING_FACTOR
+    return None, error, damping
+
+
+def _step(linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float) -> gtsam.Values:
+    damped = _damped(linear, values, damping)
+    try:
+        return values.retract(damped.optimize())
+    except RuntimeError:  # Cholesky refuses what is determined, but weakly
+        return qr_tree(damped, values).calculateEstimate()
+
+
+def qr_tree(linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> gtsam.ISAM2:
+    """A linear graph, eliminated by QR: for its solution and marginals where Cholesky refuses it.
+
+    GTSAM's Python interface offers QR only inside ISAM2; the factors are held there at the values they came from.
+    """
+    params = gtsam.ISAM2Params()
+    params.setFactorization("QR")
+    tree = gtsam.ISAM2(params)
+    held = gtsam.NonlinearFactorGraph()
+    for i in range(linear.size()):
+        held.push_back(gtsam.LinearContainerFactor(linear.at(i), values))
+    tree.update(held, values)
+    return tree
+
+
+def marginals_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Marginals | gtsam.ISAM2:
+    """What gives the covariances of a graph, linearised at the values."""
+    linear = graph.linearize(values)
+    try:
+        return gtsam.Marginals(linear, values)
+    except RuntimeError:
+        return qr_tree(linear, values)
+
+
+def _damped(linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float) -> gtsam.GaussianFactorGraph:
+    if damping <= FIRST_DAMPING:
+        return linear
+    damped = linear.clone()
+    zero = values.zeroVectors()
+    for key in linear.keyVector():
+        n = len(zero.at(key))
+        damped.push_back(
+            gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n))
+        )
+    return damped
+
+
+MAX_PLACEMENTS = 3
+"""Times that stuck landmarks are placed anew in one solution."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Sightline:
+    """One sighting of a landmark."""
+
+    pose_key: int
+    body_T_sonar: gtsam.Pose3
+    """The sonar in the body frame of that keyframe."""
+    z: Floats
+    """Range (m) and azimuth (rad), shape (2,)."""
+
+    def point(self, values: gtsam.Values) -> Floats:
+        """Where in the world the landmark was measured, at elevation 0, shape (3,), m."""
+        on_beam = self.z[0] * np.array([np.cos(self.z[1]), np.sin(self.z[1]), 0.0])
+        return self._world_T_sonar(values).transformFrom(on_beam)
+
+    def is_behind(self, values: gtsam.Values, landmark: Floats) -> bool:
+        """Whether a point of the world is more than a right angle off the measured azimuth."""
+        x, y, _ = self._world_T_sonar(values).transformTo(landmark)
+        return bool(x * np.cos(self.z[1]) + y * np.sin(self.z[1]) <= 0)
+
+    def _world_T_sonar(self, values: gtsam.Values) -> gtsam.Pose3:
+        return values.atPose3(self.pose_key).compose(self.body_T_sonar)
+
+
+class Sightlines:
+    """All sightings that have become factors, by landmark."""
+
+    def __init__(self) -> None:
+        self._lines: dict[int, dict[Sightline, None]] = defaultdict(dict)
+
+    def add(self, landmark_key: int, sightline: Sightline) -> None:
+        """A sighting of a landmark."""
+        self._lines[landmark_key][sightline] = None
+
+    def remove(self, landmark_key: int, sightline: Sightline) -> None:
+        """A sighting that is no longer one of this landmark."""
+        del self._lines[landmark_key][sightline]
+        if not self._lines[landmark_key]:
+            del self._lines[landmark_key]
+
+    def leave(self, pose_keys: set[int]) -> None:
+        """Let go of sightings from some poses."""
+        for key in list(self._lines):
+            for line in [line for line in self._lines[key] if line.pose_key in pose_keys]:
+                self.remove(key, line)
+
+    def turned_away(self, values: gtsam.Values) -> list[int]:
+        """Landmarks that lie behind the sonar in at least half of their sightings."""
+        return [key for key, lines in self._lines.items() if 2 * _behind(lines, values, key) >= len(lines)]
+
+    def placed_anew(self, values: gtsam.Values, landmark_keys: list[int]) -> gtsam.Values:
+        """The values, with each of the landmarks at the median of where its sightings, from these poses, say it is."""
+        placed = gtsam.Values(values)
+        for key in landmark_keys:
+            placed.update(key, np.median([line.point(values) for line in self._lines[key]], axis=0))
+        return placed
+
+
+def _behind(lines: Iterable[Sightline], values: gtsam.Values, landmark_key: int) -> int:
+    landmark = values.atPoint3(landmark_key)
+    return sum(line.is_behind(values, landmark) for line in lines)
+
+
+def solve_in_sight(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, sightlines: Sightlines) -> gtsam.Values:
+    """Solve a graph; again while a landmark is stuck behind the sonar and its new start lowers the error."""
+    values = solve(graph, initial)
+    for _ in range(MAX_PLACEMENTS):
+        stuck = sightlines.turned_away(values)
+        if not stuck:
+            break
+        retried = solve(graph, sightlines.placed_anew(values, stuck))
+        if graph.error(retried) >= graph.error(values):
+            break
+        values = retried
+    return values
+
+
+@dataclass(frozen=True, eq=False)
+class JointCovariance:
+    """Joint covariance of some variables of a graph, in the tangent space of each.
+
+    One matrix, so that compiled code can pick what it needs; GTSAM's `JointMarginal` hands out one block a call.
+    """
+
+    matrix: Floats
+    """Shape (n, n), in the order in which the variables were asked for."""
+    rows: dict[int, int]
+    """The first row of each variable, by key."""
+
+    @classmethod
+    def of(cls, marginals: gtsam.Marginals | gtsam.ISAM2, keys: list[int]) -> JointCovariance:
+        """Ask for poses (6 rows each) and points (3 rows each)."""
+        rows, n = {}, 0
+        for key in keys:
+            rows[key] = n
+            n += _size(key)
+        return cls(marginals.jointMarginalCovariance(keys).fullMatrix(), rows)
+
+    def at(self, a: int, b: int) -> Floats:
+        """The block of two variables."""
+        i, j = self.rows[a], self.rows[b]
+        return self.matrix[i : i + _size(a), j : j + _size(b)]
+
+
+class KeptCovariance:
+    """One joint covariance for all questions between two updates.
+
+    It also covers what was asked for before the last update, since successive frames show mostly the same landmarks.
+    """
+
+    def __init__(self) -> None:
+        self._joint: JointCovariance | None = None
+        self._asked: set[int] = set()
+        self._asked_before: set[int] = set()
+
+    def of(self, marginals: gtsam.Marginals | gtsam.ISAM2, keys: list[int]) -> JointCovariance:
+        """Of these variables, and possibly of more of them."""
+        self._asked.update(keys)
+        if self._joint is None or not self._joint.rows.keys() >= self._asked:
+            self._joint = JointCovariance.of(marginals, sorted(self._asked | self._asked_before))
+        return self._joint
+
+    def outdate(self) -> None:
+        """The same graph is linearised elsewhere."""
+        self._joint = None
+
+    def renew(self, lasting: Iterable[int]) -> None:
+        """The graph has changed; of what was asked for only some variables last."""
+        self._joint, self._asked, self._asked_before = None, set(), self._asked.intersection(lasting)
+
+
+def _size(key: int) -> int:
+    return 6 if gtsam.symbolChr(key) == ord("x") else 3

@@ -1,0 +1,196 @@
+"""A graph that grows, and from which single factors can be taken out again: the whole of it, or the window's part.
+
+What is taken out of a graph, and what comes in its place.
+
+What waits for the next update of a smoother.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import gtsam
+
+from sonar_graph.measurements import Floats
+from sonar_graph.slam.smoother.fixed_lag import without
+
+POSE, LANDMARK = ord("x"), ord("l")
+
+
+class History:
+    """Factors, each with a handle that stays the same while others come and go.
+
+    A place that becomes free is filled with the last factor, so that the graph has no holes, whatever is taken out.
+    """
+
+    def __init__(self) -> None:
+        self.graph = gtsam.NonlinearFactorGraph()
+        """The factors that are in."""
+        self.changes = 0
+        """Number of factors ever put in or taken out."""
+        self._handles: list[int] = []
+        self._slots: dict[int, int] = {}
+        self._next = 0
+
+    def add(self, factor: gtsam.NonlinearFactor) -> int:
+        """Put a factor in; its handle."""
+        handle, self._next = self._next, self._next + 1
+        self._slots[handle] = len(self._handles)
+        self._handles.append(handle)
+        self.graph.add(factor)
+        self.changes += 1
+        return handle
+
+    def factor(self, handle: int) -> gtsam.NonlinearFactor:
+        """The factor of a handle."""
+        return self.graph.at(self._slots[handle])
+
+    def remove(self, handles: Iterable[int]) -> None:
+        """Take factors out."""
+        for handle in handles:
+            slot, last = self._slots.pop(handle), self._handles.pop()
+            if last != handle:
+                self.graph.replace(slot, self.graph.at(len(self._handles)))
+                self._handles[slot] = last
+                self._slots[last] = slot
+            self.graph.resize(len(self._handles))
+            self.changes += 1
+
+    def keep(self, window: gtsam.NonlinearFactorGraph, theta: gtsam.Values, left: Iterable[int]) -> None:
+        """Nothing is given up: what leaves the window stays here."""
+
+
+class Recent:
+    """The same for the factors that are in the window: those on variables that have left are in marginals for good.
+
+    A handle ends when a variable of its factor leaves.
+    """
+
+    def __init__(self) -> None:
+        self.changes = 0
+        """Number of factors ever put in or taken out, and of times that variables left."""
+        self._factors: dict[int, gtsam.NonlinearFactor] = {}
+        self._handles: dict[int, list[int]] = defaultdict(list)
+        self._window, self._theta = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._waiting: list[int] = []
+        self._gone: list[gtsam.NonlinearFactor] = []
+        self._next = 0
+
+    @property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """Those in the window, marginals among them, and those that wait to be."""
+        graph = without(self._window, self._theta, self._gone)
+        for handle in self._waiting:
+            graph.push_back(self._factors[handle])
+        return graph
+
+    def add(self, factor: gtsam.NonlinearFactor) -> int:
+        """Put a factor in; its handle."""
+        handle, self._next = self._next, self._next + 1
+        self._factors[handle] = factor
+        for key in _passing(factor):
+            self._handles[key].append(handle)
+        self._waiting.append(handle)
+        self.changes += 1
+        return handle
+
+    def factor(self, handle: int) -> gtsam.NonlinearFactor:
+        """The factor of a handle."""
+        return self._factors[handle]
+
+    def remove(self, handles: Iterable[int]) -> None:
+        """Take factors out."""
+        gone = [self._factors.pop(handle) for handle in handles]
+        self._gone += gone
+        self._waiting = [handle for handle in self._waiting if handle in self._factors]
+        self.changes += len(gone)
+
+    def keep(self, window: gtsam.NonlinearFactorGraph, theta: gtsam.Values, left: Iterable[int]) -> None:
+        """The window has been brought up to date.
+
+        Parameters
+        ----------
+        window
+            All its factors.
+        theta
+            Where its variables are linearised.
+        left
+            Variables that have left it.
+        """
+        self._window, self._theta, self._waiting, self._gone = window, theta, [], []
+        for key in left:
+            for handle in self._handles.pop(key, ()):
+                self._factors.pop(handle, None)
+            self.changes += 1
+
+
+def rest_of(history: History | Recent, handles: set[int]) -> gtsam.NonlinearFactorGraph:
+    """All factors but those of some handles."""
+    gone, graph, rest = {history.factor(handle) for handle in handles}, history.graph, gtsam.NonlinearFactorGraph()
+    for i in range(graph.size()):
+        if graph.at(i) not in gone:
+            rest.push_back(graph.at(i))
+    return rest
+
+
+def _passing(factor: gtsam.NonlinearFactor) -> list[int]:
+    """Those of a factor's variables with which it leaves: its poses, else its biases. Landmarks stay."""
+    keys = [(key, gtsam.symbolChr(key)) for key in list(factor.keys())]
+    poses = [key for key, kind in keys if kind == POSE]
+    return poses or [key for key, kind in keys if kind != LANDMARK]
+
+
+@dataclass(frozen=True, eq=False)
+class GraphEdit:
+    """Some factors for others."""
+
+    removed: list[int]
+    """Handles of those that go."""
+    added: list[list[gtsam.NonlinearFactor]]
+    """Those that come, in groups."""
+    new_landmarks: dict[int, Floats]
+    """Keys and first estimates of landmarks that the graph has not yet got."""
+    lost_landmarks: list[int]
+    """Keys of those on which no factor is left."""
+
+
+class Pending:
+    """New factors with their handles, and new variables with their first estimates."""
+
+    def __init__(self) -> None:
+        self.graph = gtsam.NonlinearFactorGraph()
+        self.handles: list[int] = []
+        """Of the factors, in their order."""
+        self.values = gtsam.Values()
+        self.times_s: dict[int, float] = {}
+        """Of new poses."""
+
+    @property
+    def factors(self) -> list[gtsam.NonlinearFactor]:
+        """All of them."""
+        return [self.graph.at(i) for i in range(len(self.handles))]
+
+    def add(self, factor: gtsam.NonlinearFactor, handle: int) -> None:
+        """A new factor."""
+        self.graph.add(factor)
+        self.handles.append(handle)
+
+    def on(self, key: int) -> list[int]:
+        """Handles of the factors on a variable."""
+        return [handle for i, handle in enumerate(self.handles) if key in list(self.graph.at(i).keys())]
+
+    def factor(self, handle: int) -> gtsam.NonlinearFactor:
+        """The factor of a handle."""
+        return self.graph.at(self.handles.index(handle))
+
+    def drop(self, handles: set[int], keys: set[int]) -> None:
+        """Take factors and variables out again."""
+        kept = [(handle, self.graph.at(i)) for i, handle in enumerate(self.handles) if handle not in handles]
+        self.graph, self.handles = gtsam.NonlinearFactorGraph(), []
+        for handle, factor in kept:
+            self.add(factor, handle)
+        for key in keys:
+            if self.values.exists(key):
+                self.values.erase(key)

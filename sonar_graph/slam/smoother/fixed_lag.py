@@ -1,0 +1,232 @@
+"""GTSAM's fixed-lag smoother, with what it takes to begin it anew.
+
+GTSAM's Cholesky elimination gives up ("indeterminate") when a variable's absolute sigma is more than 4096 times its
+sigma given its neighbours, which millimetre odometry reaches after some metres of drift. QR does not, at a higher cost;
+once Cholesky has given up the window stays with QR.
+
+What a new window is made of: a graph cut in two, and the part outside replaced by its marginal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterable, Mapping, Sequence
+from typing import Any
+
+import gtsam
+import numpy as np
+
+
+def split(
+    graph: gtsam.NonlinearFactorGraph, kept: set[int]
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.NonlinearFactorGraph]:
+    """Factors on kept variables only, and those that touch any other."""
+    inside, outside = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+    for i in range(graph.size()):
+        factor = graph.at(i)
+        (inside if kept.issuperset(factor.keys()) else outside).push_back(factor)
+    return inside, outside
+
+
+def marginal(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kept: Container[int], *, is_by_qr: bool = False
+) -> list[gtsam.NonlinearFactor]:
+    """What a graph says about the kept variables alone, linearised at the values.
+
+    Raises
+    ------
+    RuntimeError
+        When elimination gives up: QR on what is not determined, Cholesky also on what is determined weakly.
+    """
+    linear = graph.linearize(values)
+    separator = [key for key in linear.keyVector() if key in kept]
+    found = linear.marginal(separator, gtsam.EliminateQR) if is_by_qr else linear.marginal(separator)
+    return [gtsam.LinearContainerFactor(found.at(i), values) for i in range(found.size())]
+
+
+def joined_with_marginal(
+    inside: gtsam.NonlinearFactorGraph,
+    outside: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    kept: Container[int],
+    *,
+    is_by_qr: bool,
+) -> gtsam.NonlinearFactorGraph:
+    """A graph, with what another says about the kept variables."""
+    graph = gtsam.NonlinearFactorGraph(inside)
+    for factor in marginal(outside, values, kept, is_by_qr=is_by_qr):
+        graph.push_back(factor)
+    return graph
+
+
+def _copy(source: gtsam.Values, key: int, target: gtsam.Values) -> None:
+    """One variable, a pose or a point, from some values to others."""
+    if gtsam.symbolChr(key) == ord("x"):
+        target.insert(key, source.atPose3(key))
+    else:
+        target.insert(key, source.atPoint3(key))
+
+
+def anchored(factor: gtsam.NonlinearFactor, theta: gtsam.Values) -> gtsam.NonlinearFactor:
+    """A factor of a window by itself.
+
+    iSAM2 keeps a marginal without the values at which it holds: those at which the window's variables are linearised.
+    """
+    if isinstance(factor, gtsam.LinearContainerFactor):
+        return gtsam.LinearContainerFactor(factor.linearize(theta), theta)
+    return factor
+
+
+def without(
+    graph: gtsam.NonlinearFactorGraph, theta: gtsam.Values, left_out: Iterable[gtsam.NonlinearFactor] = ()
+) -> gtsam.NonlinearFactorGraph:
+    """A window's graph, its holes closed and its marginals anchored, less some factors.
+
+    Parameters
+    ----------
+    theta
+        Where the window's variables are linearised.
+    """
+    gone, kept = list(left_out), gtsam.NonlinearFactorGraph()
+    for i in range(graph.size()):
+        if graph.exists(i) and graph.at(i) not in gone:
+            kept.push_back(anchored(graph.at(i), theta))
+    return kept
+
+
+def joined(values: gtsam.Values, new: gtsam.Values) -> gtsam.Values:
+    """Values, with new ones where there are none yet."""
+    both = gtsam.Values(values)
+    for key in keys_of(new):
+        if not both.exists(key):
+            _copy(new, key, both)
+    return both
+
+
+def keys_of(values: gtsam.Values) -> list[int]:
+    """Of all variables."""
+    return list(values.keys())
+
+
+def picked(values: gtsam.Values, keys: Iterable[int]) -> gtsam.Values:
+    """Some of the variables. GTSAM copies all that it is given for each factor in Python."""
+    few = gtsam.Values()
+    for key in keys:
+        _copy(values, key, few)
+    return few
+
+
+MOST_SETTLING_UPDATES = 10
+"""Further updates after an exchange, each a Gauss-Newton step: what is exchanged may move the estimate far."""
+
+
+class SmootherWindow:
+    """iSAM2 over the variables that were seen in the last seconds.
+
+    It eliminates by Cholesky, and by QR once that has given up.
+
+    Parameters
+    ----------
+    relinearize_threshold
+        A variable is relinearised when any component of its change exceeds this (rad or m).
+    lag_s
+        Age from which on variables leave, to begin with.
+    """
+
+    def __init__(self, relinearize_threshold: float, lag_s: float) -> None:
+        self._threshold = relinearize_threshold
+        self.lag_s = lag_s
+        """Age (s) from which on variables left at the last update."""
+        self.is_by_qr = False
+        self.isam = self._empty()
+
+    def _empty(self) -> gtsam.IncrementalFixedLagSmoother:
+        params = gtsam.ISAM2Params()
+        params.setFactorization("QR" if self.is_by_qr else "CHOLESKY")
+        params.relinearizeSkip = 1
+        params.setRelinearizeThreshold(self._threshold)
+        params.findUnusedFactorSlots = True
+        return gtsam.IncrementalFixedLagSmoother(self.lag_s, params)
+
+    def begin(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times_s: Mapping[Any, float]) -> None:
+        """Anew, with nothing but these factors and variables; by QR where it is needed.
+
+        Raises
+        ------
+        RuntimeError
+            When even that finds no solution.
+        """
+        try:
+            self._begin_once(graph, values, times_s)
+        except RuntimeError:
+            if self.is_by_qr:
+                raise
+            self.is_by_qr = True
+            self._begin_once(graph, values, times_s)
+
+    def _begin_once(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times_s: Mapping[Any, float]
+    ) -> None:
+        self.isam = self._empty()
+        self.isam.update(graph, values, times_s)
+
+    def begin_after(
+        self,
+        outside: gtsam.NonlinearFactorGraph,
+        solved: gtsam.Values,
+        inside: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        times_s: Mapping[Any, float],
+    ) -> None:
+        """Anew, with the marginal of what lies outside: by Cholesky while that is able to, then by QR.
+
+        Parameters
+        ----------
+        solved
+            Values of all variables, at which the marginal is linearised.
+
+        Raises
+        ------
+        RuntimeError
+            When even QR finds no solution.
+        """
+        if not self.is_by_qr:
+            try:
+                graph = joined_with_marginal(inside, outside, solved, times_s, is_by_qr=False)
+                self._begin_once(graph, values, times_s)
+            except RuntimeError:
+                self.is_by_qr = True  # a marginal by Cholesky may also have lost what is weak without a word
+            else:
+                return
+        self._begin_once(joined_with_marginal(inside, outside, solved, times_s, is_by_qr=True), values, times_s)
+
+    def update(
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        times_s: Mapping[Any, float],
+        removed_slots: Sequence[int],
+    ) -> None:
+        """With new factors and variables, without what is in some places."""
+        self.isam.setSmootherLag(self.lag_s)
+        self.isam.update(graph, values, times_s, list(removed_slots))
+
+    def settle(self) -> None:
+        """Update until nothing would be relinearised any more."""
+        for _ in range(MOST_SETTLING_UPDATES):
+            if self.isam.getDelta().norm() <= self._threshold:
+                break
+            self.isam.update()
+
+    def slots(self, factors: list[gtsam.NonlinearFactor]) -> list[int] | None:
+        """Where factors are; None when one of them is not there."""
+        if not factors:
+            return []
+        inside = self.isam.getFactors()
+        place = {inside.at(i): i for i in range(inside.size()) if inside.exists(i)}
+        found = [place.get(factor) for factor in factors]
+        return None if None in found else [slot for slot in found if slot is not None]
+
+    def largest_shift(self, keys: Sequence[int]) -> float:
+        """How far the farthest of some variables is from where it was linearised: its largest component, rad or m."""
+        delta = self.isam.getDelta()
+        return max((float(np.abs(delta.at(key)).max()) for key in keys), default=0.0)

@@ -1,0 +1,273 @@
+"""AcTag fiducials in sonar images, decoded by AcTag's own detector (the extra ``actag``).
+
+AcTag wants rows and columns that are equally spaced in range and azimuth, the farthest range and the leftmost azimuth
+first, and its filters have a size in pixels. Frames are therefore sampled anew: by the log's own table of beams, and
+with as many pixels a bit of the tag as `AcTagSettings.pixels_per_bit` says. AcTag looks at each frame for itself and
+decodes clutter now and then; a tag is reported from the second frame on that has it in the same place.
+
+Source: K. Norman, D. Butterfield, J. Mangelson, "AcTag: Opti-Acoustic Fiducial Markers for Underwater Localization and
+Mapping", IROS 2023; PyPI ``actag`` (BSD-2-Clause).
+
+AcTags as landmark designs, for simulating them: drawn from the bits of AcTag's own families.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import cv2
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from sonar_graph.calibration import Calibration, Section
+from sonar_graph.devices import LandmarkDesign
+from sonar_graph.errors import CalibrationError
+from sonar_graph.measurements import Floats, LandmarkDetections, SonarFrames
+from sonar_graph.sonar.frame_check import FrameCheck, check_block
+from sonar_graph.sonar.geometry import FloorView, points
+from sonar_graph.sonar.recogniser import REPORTED, Fate
+from sonar_graph.sonar.track_filter import SonarStep
+
+INSTALL = "pip install 'sonar-graph[actag]'"
+BITS_OF_INNER_SQUARE = 3
+"""Of a tag with 24 bits, which is 7 bits wide."""
+COUNTS_A_DECIBEL = 255 / 80
+"""AcTag's threshold has an offset of one count; so fine is a DIDSON's or ARIS' scale."""
+SEED = 1
+"""AcTag fits quadrilaterals to random points; the same frame gives the same tags."""
+
+
+class AcTagSettings(Section):
+    """Which tags there are, and how AcTag is used."""
+
+    family: str = "AcTag24h10"
+    """AcTag24h4, 24h6, 24h8 or 24h10: bits, and the least number of bits in which two tags differ."""
+    tag_size_m: float = Field(0.1306, gt=0)
+    """Side of the inner square; the whole tag is 7/3 of it."""
+    bit_corrections: int = Field(3, ge=0)
+    """Wrong bits that are put right: fewer than half of those in which two tags differ."""
+    pixels_per_bit: float = Field(8.0, ge=4)
+    """Size of a bit in the image that AcTag gets."""
+    least_frames: int = Field(2, ge=1)
+    """Frames in which a tag must have been decoded in one place before it is reported."""
+    same_place_m: float = Field(0.5, gt=0)
+    """How far apart one place may seem: the elevation of a tag is not known."""
+    probability: float = Field(0.99, gt=0, lt=1)
+    """Posterior of a decoded identity."""
+    range_sigma_m: float = Field(0.003, gt=0)
+    """Of a tag's centre."""
+    azimuth_sigma_rad: float = Field(0.001, gt=0)
+    """The same in azimuth."""
+
+
+class Tag(NamedTuple):
+    """A decoded tag, and where its centre is."""
+
+    id: int
+    range_m: float
+    azimuth_rad: float
+
+
+class AcTagRecogniser:
+    """Recognises AcTags, one frame after another, as `sonar_graph.sonar.recogniser.Recogniser` does its landmarks.
+
+    Parameters
+    ----------
+    calibration
+        Of the sonar: the scale of its samples.
+    settings
+        None: the defaults.
+
+    Raises
+    ------
+    CalibrationError
+        When AcTag is not installed, or refuses the settings.
+    """
+
+    def __init__(self, calibration: Calibration, settings: AcTagSettings | None = None) -> None:
+        self.settings = settings or AcTagSettings()
+        self._image = calibration.sonar.image
+        self._check = FrameCheck(calibration.sonar.image)
+        self._make = _actag()
+        try:
+            self._detector(np.array([1.0, 2.0]), np.array([-0.25, 0.25]))
+        except (ValueError, FileNotFoundError) as error:
+            raise CalibrationError(f"AcTag: family {self.settings.family}: {error}") from error
+        self._start_T_sonar = gtsam.Pose3()
+        self._seen: dict[int, tuple[Floats, int]] = {}
+        self.fates: list[Fate] = []
+        """What became of everything in the frame last processed."""
+
+    def process(
+        self, frame: SonarFrames, motion: SonarStep | None = None, view: FloorView | None = None
+    ) -> LandmarkDetections | None:
+        """The tags in a block of one frame; motion as for `Recogniser`, the floor is of no use to AcTag.
+
+        Raises
+        ------
+        MeasurementError
+            When the block is not one frame.
+        """
+        del view
+        check_block(frame)
+        stamp_ns = int(frame.stamps_ns[0])
+        if motion is not None:
+            self._start_T_sonar = self._start_T_sonar.compose(motion.previous_T_sonar)
+        if (fault := self._check.fault(frame)) is not None:
+            self.fates = [Fate(stamp_ns, -1, np.nan, np.nan, f"frame not used: {fault}")]
+            return None
+        tags = self._decoded(frame)
+        outcomes = [self._outcome(tag, [other.id for other in tags[:n]]) for n, tag in enumerate(tags)]
+        self.fates = [
+            Fate(stamp_ns, -1, tag.range_m, tag.azimuth_rad, outcome)
+            for tag, outcome in zip(tags, outcomes, strict=True)
+        ]
+        if self._check.change is not None:
+            self.fates.append(Fate(stamp_ns, -1, np.nan, np.nan, self._check.change))
+        reported = [tag for tag, outcome in zip(tags, outcomes, strict=True) if outcome == REPORTED]
+        return self._detections(stamp_ns, reported) if reported else None
+
+    def _outcome(self, tag: Tag, earlier_ids: list[int]) -> str:
+        """What becomes of a tag; remembers where it was decoded."""
+        if tag.id in earlier_ids:
+            return "not reported: decoded already in this frame"
+        q = points(np.array([tag.range_m]), np.array([tag.azimuth_rad]))[0]
+        place = np.asarray(self._start_T_sonar.transformFrom(q))
+        before, frames = self._seen.get(tag.id, (place, 0))
+        frames = frames + 1 if np.linalg.norm(place - before) <= self.settings.same_place_m else 1
+        self._seen[tag.id] = place, frames
+        if frames < self.settings.least_frames:
+            return f"not reported: decoded in fewer than {self.settings.least_frames} frames in one place"
+        return REPORTED
+
+    def notes(self) -> dict[str, str]:
+        """How detections come about, for a log's notes."""
+        return {
+            "detections.rule": f"AcTag, decoded in {self.settings.least_frames} frames in one place",
+            "detections.designs": f"{self.settings.family}, inner square {self.settings.tag_size_m:g} m",
+        }
+
+    def _decoded(self, frame: SonarFrames) -> list[Tag]:
+        bit_m = self.settings.tag_size_m / BITS_OF_INNER_SQUARE
+        image_db = self._image.decibels(frame.intensity[0])
+        picture_db, rows_m, columns_rad = evenly_sampled(
+            image_db, frame.ranges_m, frame.azimuths_rad, bit_m / self.settings.pixels_per_bit
+        )
+        counts = np.clip(np.rint(picture_db * COUNTS_A_DECIBEL), 0, 255).astype(np.int64)
+        found = self._detector(rows_m, columns_rad).run_detection(counts)
+        return [Tag(int(id_), *np.mean(range_azimuth, axis=0).tolist()) for id_, _, range_azimuth in found]
+
+    def _detector(self, rows_m: Floats, columns_rad: Floats) -> Any:
+        return self._make(
+            min_range=float(rows_m.min()),
+            max_range=float(rows_m.max()),
+            horizontal_aperture=float(np.ptp(columns_rad)),
+            tag_family=self.settings.family,
+            tag_size=self.settings.tag_size_m,
+            decoding_num_bit_corrections=self.settings.bit_corrections,
+            quads_random_seed=SEED,
+        )
+
+    def _detections(self, stamp_ns: int, tags: list[Tag]) -> LandmarkDetections:
+        settings, n = self.settings, len(tags)
+        covariance = np.diag([settings.range_sigma_m**2, settings.azimuth_sigma_rad**2])
+        return LandmarkDetections(
+            stamps_ns=np.full(n, stamp_ns),
+            range_m=np.array([tag.range_m for tag in tags]),
+            azimuth_rad=np.array([tag.azimuth_rad for tag in tags]),
+            range_azimuth_cov=np.tile(covariance, (n, 1, 1)),
+            candidate_ids=np.array([[tag.id] for tag in tags]),
+            id_probability=np.full((n, 1), settings.probability),
+        )
+
+
+def evenly_sampled(
+    image_db: NDArray[np.float32], ranges_m: Floats, azimuths_rad: Floats, pixel_m: float
+) -> tuple[NDArray[np.float32], Floats, Floats]:
+    """A polar image on equally spaced ranges and azimuths, as long and (in the middle of the window) as wide.
+
+    Levels are averaged over as many bins as a pixel covers, and interpolated between beams.
+
+    Parameters
+    ----------
+    image_db
+        Shape (beams, bins).
+    ranges_m, azimuths_rad
+        Of bins (equally spaced) and beams (in any order, however spaced).
+    pixel_m
+        Side of a pixel.
+
+    Returns
+    -------
+    picture_db
+        Shape (rows, columns).
+    rows_m
+        Range of each row, farthest first.
+    columns_rad
+        Azimuth of each column, leftmost first, positive to the left and 0 in the middle as AcTag has it.
+    """
+    first_m, last_m = float(ranges_m[0]), float(ranges_m[-1])
+    widest_rad = float(np.abs(azimuths_rad).max())
+    rows_m = np.linspace(last_m, first_m, max(2, round((last_m - first_m) / pixel_m)))
+    columns = max(2, round(2 * widest_rad * 0.5 * (first_m + last_m) / pixel_m))
+    columns_rad = np.linspace(widest_rad, -widest_rad, columns)
+    order = np.argsort(azimuths_rad)
+    bin_m = (last_m - first_m) / (len(ranges_m) - 1)
+    smooth_db = cv2.blur(image_db, (max(1, round(pixel_m / bin_m)), 1))
+    bins = np.repeat(((rows_m - first_m) / bin_m)[:, None], columns, axis=1).astype(np.float32)
+    beams = np.repeat(np.interp(columns_rad, azimuths_rad[order], order)[None], len(rows_m), axis=0).astype(np.float32)
+    picture = cv2.remap(smooth_db, bins, beams, cv2.INTER_LINEAR)
+    return np.asarray(picture, np.float32), rows_m, columns_rad
+
+
+def _actag() -> Callable[..., Any]:
+    """AcTag's class."""
+    try:
+        return import_module("actag").AcTag
+    except ImportError as error:
+        raise CalibrationError(f"recognising AcTags needs the package actag: {INSTALL} ({error})") from error
+
+
+BITS_ACROSS, PIXELS_A_BIT = 7, 20
+FOAM_DB, PLATE_DB = 12.0, -8.0
+"""Over the floor: as of the landmarks that ship."""
+RING = (
+    *((0, column) for column in range(7)),
+    *((row, 6) for row in range(1, 7)),
+    *((6, column) for column in range(5, -1, -1)),
+    *((row, 0) for row in range(5, 0, -1)),
+)
+"""Row and column of each of 24 bits, clockwise from the upper left corner of the tag's picture."""
+
+
+def tag_design(family: str, tag: int, tag_size_m: float) -> LandmarkDesign:
+    """A tag of foam and metal: 24 bits about a dark ring about a square of foam.
+
+    Parameters
+    ----------
+    family
+        Such as AcTag24h10.
+    tag
+        Its number in the family, and the landmark's identity.
+    tag_size_m
+        Side of the inner square.
+
+    Raises
+    ------
+    CalibrationError
+        When AcTag is not installed.
+    """
+    try:
+        parameters = import_module("actag.tag_parameters")
+    except ImportError as error:
+        raise CalibrationError(f"drawing AcTags needs the package actag: {INSTALL} ({error})") from error
+    levels = np.full((BITS_ACROSS, BITS_ACROSS), PLATE_DB)
+    for bit, place in zip(parameters.AcTagParams(family, tag_size_m).tags_in_family[tag], RING, strict=True):
+        levels[place] = FOAM_DB if bit else PLATE_DB
+    levels[2:5, 2:5] = FOAM_DB
+    mask = np.kron(levels, np.ones((PIXELS_A_BIT, PIXELS_A_BIT)))
+    return LandmarkDesign(tag, f"{family} {tag}", tag_size_m * BITS_ACROSS / BITS_OF_INNER_SQUARE, mask)

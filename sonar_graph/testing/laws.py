@@ -1,0 +1,391 @@
+"""What an estimator made of a sequence, and what is demanded of it.
+
+The laws of the contract, one function each.
+
+The contract of an estimator as tests that its author can run.
+
+Each check takes something that makes an estimator from a calibration, such as its class, and raises
+`ContractError` where the contract is broken. With pytest::
+
+    import pytest
+    from sonar_graph.estimator_checks import CHECKS
+
+    @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+    def test_my_filter_keeps_the_contract(check):
+        check(MyFilter)
+
+and without: ``check_estimator(MyFilter)``. A filter, or whatever else never iterates, should pass `FILTER_CHECKS` as
+well. The checks bring their own small world, a vehicle that turns gently to the
+left past three landmarks at its own depth, so that they need no data and no simulator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.estimator import Estimator
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
+from sonar_graph.testing.drives import (
+    DURATION_S,
+    LANDMARKS_M,
+    START_NS,
+    STILL_START,
+    blocks,
+    every_stamp,
+    misnamed_world,
+    small_world,
+    still_world,
+)
+
+MakeEstimator = Callable[[Calibration], Estimator]
+ASK_HZ = 1.0
+SYMMETRY = 1e-9
+"""Largest asymmetry or negative eigenvalue of a covariance, relative to its largest entry."""
+
+
+class ContractError(AssertionError):
+    """An estimator does not keep the contract; the message says how."""
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatorRun:
+    """All that an estimator said about one sequence."""
+
+    estimates: list[Estimate]
+    trajectory: Trajectory
+    landmarks: LandmarkMap
+    detections: DetectionLog
+
+    def causal(self, stamps_ns: list[int]) -> Trajectory:
+        """The causal estimates at some of the instants."""
+        wanted = set(stamps_ns)
+        return Trajectory.from_estimates([e for e in self.estimates if e.stamp_ns in wanted])
+
+
+def run(
+    make: MakeEstimator, sequence: Sequence, instants_ns: Ints | None = None, *, ask_every: int = 0
+) -> EstimatorRun:
+    """Feed a sequence to a fresh estimator, cut at the instants, and ask for everything at the end.
+
+    Parameters
+    ----------
+    ask_every
+        Also ask after so many steps, twice, and again at the end; 0: do not.
+
+    Raises
+    ------
+    ContractError
+        When the answers to one question, asked twice, differ.
+    """
+    estimator = make(sequence.calibration)
+    estimates: list[Estimate] = []
+    steps = sequence.replay(sequence.instants(ASK_HZ) if instants_ns is None else instants_ns)
+    for number, step in enumerate(steps, start=1):
+        estimate = estimator.process(step)
+        estimates += [] if estimate is None else [estimate]
+        if ask_every and number % ask_every == 0:
+            _answer_twice(estimator, estimates)
+    return _answer_twice(estimator, estimates) if ask_every else _answer(estimator, estimates)
+
+
+def _answer(estimator: Estimator, estimates: list[Estimate]) -> EstimatorRun:
+    return EstimatorRun(estimates, estimator.trajectory(), estimator.landmarks(), estimator.detections())
+
+
+def _answer_twice(estimator: Estimator, estimates: list[Estimate]) -> EstimatorRun:
+    first, second = _answer(estimator, estimates), _answer(estimator, estimates)
+    differing = unlike(first, second)
+    require(not differing, f"asked twice, {', '.join(differing)} differ")
+    return second
+
+
+def unlike(one: EstimatorRun, other: EstimatorRun) -> list[str]:
+    """What differs, in any bit: causal estimates, trajectory, landmarks, detections."""
+    parts: dict[str, tuple[object, object]] = {
+        "causal estimates": (Trajectory.from_estimates(one.estimates), Trajectory.from_estimates(other.estimates)),
+        "trajectory()": (one.trajectory, other.trajectory),
+        "landmarks()": (one.landmarks, other.landmarks),
+        "detections()": (one.detections, other.detections),
+    }
+    return [name for name, (mine, theirs) in parts.items() if not _is_same(mine, theirs)]
+
+
+def _is_same(mine: object, theirs: object) -> bool:
+    """Whether all columns of two tables are equal to the last bit."""
+    for name, column in vars(mine).items():
+        theirs_too = vars(theirs)[name]
+        if isinstance(column, np.ndarray):
+            is_same = np.array_equal(column, theirs_too, equal_nan=column.dtype.kind == "f")
+        else:
+            is_same = column == theirs_too
+        if not is_same:
+            return False
+    return True
+
+
+def difference(one: EstimatorRun, other: EstimatorRun) -> float:
+    """Largest difference of causal estimates at the instants of ``one``, and of landmarks at the end.
+
+    Infinite where an instant or a landmark is missing from ``other``.
+    """
+    mine, theirs = _at_same_instants(one, other)
+    if len(mine) != len(theirs) or not np.array_equal(one.landmarks.ids, other.landmarks.ids):
+        return float("inf")
+    pairs = (
+        (_perturbation(mine, theirs), 0.0),
+        (mine.covariances, theirs.covariances),
+        (one.landmarks.positions, other.landmarks.positions),
+    )
+    return max(float(np.max(np.abs(a - b), initial=0.0)) for a, b in pairs)
+
+
+def deviation(one: EstimatorRun, other: EstimatorRun) -> tuple[float, float]:
+    """Largest deviation of causal poses, and of their covariances, relative to the standard deviations of ``one``.
+
+    Infinite where an instant is missing from ``other``.
+    """
+    mine, theirs = _at_same_instants(one, other)
+    if len(mine) != len(theirs):
+        return float("inf"), float("inf")
+    sigmas = np.sqrt(np.einsum("nii->ni", mine.covariances))
+    products = np.einsum("ni,nj->nij", sigmas, sigmas)
+    return (
+        float(np.max(np.abs(_perturbation(mine, theirs)) / sigmas, initial=0.0)),
+        float(np.max(np.abs(mine.covariances - theirs.covariances) / products, initial=0.0)),
+    )
+
+
+def _at_same_instants(one: EstimatorRun, other: EstimatorRun) -> tuple[Trajectory, Trajectory]:
+    stamps_ns = [estimate.stamp_ns for estimate in one.estimates]
+    return one.causal(stamps_ns), other.causal(stamps_ns)
+
+
+def _perturbation(mine: Trajectory, theirs: Trajectory) -> Floats:
+    """[rotation, translation] from one trajectory to another in the body frame of the first, shape (n, 6)."""
+    if not len(mine):
+        return np.empty((0, 6))
+    into_body = mine.rotations().inv()
+    return np.hstack([(into_body * theirs.rotations()).as_rotvec(), into_body.apply(theirs.positions - mine.positions)])
+
+
+def require(kept: bool, violation: str) -> None:
+    """Raise `ContractError` unless ``kept``."""
+    if not kept:
+        raise ContractError(violation)
+
+
+def require_covariance(matrix: Floats, size: int, name: str) -> None:
+    """Raise unless ``matrix`` is finite, symmetric and positive semi-definite, shape (size, size)."""
+    require(matrix.shape == (size, size), f"{name}: shape {matrix.shape}, not {(size, size)}")
+    require(bool(np.isfinite(matrix).all()), f"{name} is not finite")
+    scale = float(np.abs(matrix).max())
+    asymmetry = float(np.abs(matrix - matrix.T).max())
+    require(asymmetry <= SYMMETRY * scale, f"{name} is not symmetric: {asymmetry:.1e}")
+    least = float(np.linalg.eigvalsh(matrix).min())
+    require(least >= -SYMMETRY * scale, f"{name} has a negative eigenvalue: {least:.1e}")
+
+
+Check = Callable[[MakeEstimator], None]
+STILL_DRIFT_M = 0.02
+STILL_TURN_RAD = 2e-3
+SAME = 1e-6
+LIVE_SIGMAS = 1.0
+LIVE_COVARIANCE = 0.25
+
+
+def settings_have_defaults(make: MakeEstimator) -> None:
+    """``Params()`` can be made without arguments."""
+    try:
+        make(small_world().calibration).Params()
+    except Exception as error:
+        raise ContractError(f"Params() fails: {error}") from error
+
+
+def knows_nothing_before_the_first_measurement(make: MakeEstimator) -> None:
+    """A fresh estimator has no pose, no landmark and no detection."""
+    estimator = make(small_world().calibration)
+    sizes = len(estimator.trajectory()), len(estimator.landmarks()), len(estimator.detections())
+    require(sizes == (0, 0, 0), f"a fresh estimator has {sizes} poses, landmarks, detections")
+
+
+def answers_from_the_first_imu_and_dvl_on(make: MakeEstimator) -> None:
+    """`process` returns None before there is an IMU and a DVL sample, and afterwards an estimate at ``end_ns``."""
+    world = small_world(dvl_delay_s=1.0)
+    estimator = make(world.calibration)
+    instants = np.arange(START_NS + NS_PER_S // 4, world.end_ns, NS_PER_S // 4)
+    for step in world.replay(instants):
+        estimate = estimator.process(step)
+        if step.end_ns < world.start_ns:
+            require(estimate is None, "an estimate is returned before the first DVL sample")
+        elif step.end_ns > world.start_ns:
+            _require_answer(estimate, step.end_ns)
+
+
+def _require_answer(estimate: Estimate | None, end_ns: int) -> None:
+    if estimate is None:
+        raise ContractError("nothing is returned although there are IMU and DVL")
+    require(isinstance(estimate, Estimate), f"{type(estimate).__name__} is returned, not an Estimate")
+    require(estimate.stamp_ns == end_ns, f"asked for {end_ns}, answered for {estimate.stamp_ns}")
+
+
+def covariances_are_covariances(make: MakeEstimator) -> None:
+    """Covariances of poses and landmarks are finite, symmetric, positive semi-definite, 6 × 6 and 3 × 3."""
+    outcome = run(make, small_world())
+    for estimate in outcome.estimates:
+        require_covariance(estimate.covariance, 6, "covariance of an estimate")
+    for covariance in outcome.trajectory.covariances:
+        require_covariance(covariance, 6, "covariance in trajectory()")
+    for covariance in outcome.landmarks.covariances:
+        require_covariance(covariance, 3, "covariance in landmarks()")
+
+
+def trajectory_has_the_instants_of_the_estimates(make: MakeEstimator) -> None:
+    """`trajectory` has one pose for each instant at which `process` returned an estimate."""
+    outcome = run(make, small_world())
+    asked = [estimate.stamp_ns for estimate in outcome.estimates]
+    require(outcome.trajectory.stamps_ns.tolist() == asked, "the stamps of trajectory() are not those of the estimates")
+
+
+def frames_and_signs_are_those_of_the_vocabulary(make: MakeEstimator) -> None:
+    """In a world with little noise the estimate stays with the truth, and so do the landmarks.
+
+    Their height is left out: elevation is not measured.
+    """
+    world = small_world()
+    outcome = run(make, world)
+    assert world.truth is not None
+    assert world.true_landmarks is not None
+    off_m = np.linalg.norm(
+        outcome.trajectory.positions - world.truth.at(outcome.trajectory.stamps_ns).positions, axis=1
+    )
+    require(off_m.max() < 0.3, f"the trajectory leaves the truth by {off_m.max():.2f} m in {DURATION_S} s")
+    known = np.isin(world.true_landmarks.ids, outcome.landmarks.ids)
+    if not known.any():
+        return
+    off_m = np.linalg.norm((outcome.landmarks.positions - world.true_landmarks.positions[known])[:, :2], axis=1)
+    require(off_m.max() < 0.5, f"a landmark is {off_m.max():.2f} m from the truth, horizontally")
+
+
+def landmarks_are_sorted_and_unique(make: MakeEstimator) -> None:
+    """Identities in `landmarks` ascend, and are among those that were detected."""
+    found = run(make, small_world()).landmarks
+    require(bool(np.all(np.diff(found.ids) > 0)), f"landmark ids do not ascend strictly: {found.ids.tolist()}")
+    strangers = set(found.ids.tolist()) - set(LANDMARKS_M)
+    require(not strangers, f"landmarks that nobody detected: {sorted(strangers)}")
+    require(found.positions.shape == (len(found), 3), f"positions of landmarks have shape {found.positions.shape}")
+
+
+def every_detection_has_an_outcome(make: MakeEstimator) -> None:
+    """`detections` has one row for each detection that was handed in, at its stamp."""
+    world = small_world()
+    assert world.detections is not None
+    log = run(make, world).detections
+    given, told = world.detections.stamps_ns.tolist(), sorted(log.stamps_ns.tolist())
+    require(told == given, f"{len(given)} detections were given, {len(told)} are accounted for")
+    rows = {len(log.outcomes), len(log.landmark_ids), len(log.innovations), len(log.innovation_covs)}
+    require(rows == {len(given)}, f"the columns of detections() have {sorted(rows)} rows")
+
+
+def same_input_gives_same_output(make: MakeEstimator) -> None:
+    """Two estimators that are fed alike agree to the last bit."""
+    first, second = run(make, small_world()), run(make, small_world())
+    require(difference(first, second) == 0.0, "two runs on the same measurements differ")
+
+
+def asking_changes_nothing(make: MakeEstimator) -> None:
+    """Trajectory, landmarks and detections may be asked for at any time, and twice: not a bit of anything changes.
+
+    Also where identities are wrong, or missing, and an estimator may think better of them when it is asked.
+    """
+    for world, every in ((small_world(), 1), (misnamed_world(), 3), (misnamed_world(is_tracked=True), 7)):
+        differing = unlike(run(make, world), run(make, world, ask_every=every))
+        require(not differing, f"asking after every {every} steps changes {', '.join(differing)}")
+
+
+def live_agrees_with_replay(make: MakeEstimator) -> None:
+    """Rows that arrive one by one and rows that arrive in windows lead to estimates within each other's doubt.
+
+    An estimator that iterates may linearise elsewhere when it is called more often. It may not count anything twice,
+    nor lose it: a deviation beyond its standard deviation, or another covariance, comes from that.
+    """
+    world = small_world()
+    windows, live = run(make, world), run(make, world, every_stamp(world))
+    mean, covariance = deviation(windows, live)
+    require(mean < LIVE_SIGMAS, f"cut row by row the estimate moves by {mean:.2f} of its standard deviation")
+    require(covariance < LIVE_COVARIANCE, f"cut row by row the covariance changes by {covariance:.0%}")
+
+
+def live_equals_replay(make: MakeEstimator) -> None:
+    """The same to rounding: for estimators that never iterate, such as filters."""
+    world = small_world()
+    differ = difference(run(make, world), run(make, world, every_stamp(world)))
+    require(differ < SAME, f"cut row by row the outcome differs by {differ:.1e}")
+
+
+def input_stays_as_it_was(make: MakeEstimator) -> None:
+    """No array of the measurements is written to."""
+    world, untouched = small_world(), small_world()
+    run(make, world)
+    for block, before in zip(blocks(world), blocks(untouched), strict=True):
+        for field in fields(block):
+            same = np.array_equal(getattr(block, field.name), getattr(before, field.name), equal_nan=True)
+            require(same, f"{type(block).__name__}.{field.name} was changed")
+
+
+def still_vehicle_stays_still(make: MakeEstimator) -> None:
+    """A tilted vehicle at rest, its IMU feeling nothing but gravity, is where it was after 60 s."""
+    estimates = run(make, still_world()).estimates
+    start = STILL_START.pose()
+    for estimate in estimates:
+        moved = start.between(estimate.world_T_body)
+        drift_m = float(np.linalg.norm(moved.translation()))
+        turn_rad = float(np.linalg.norm(Rotation.from_matrix(moved.rotation().matrix()).as_rotvec()))
+        require(drift_m < STILL_DRIFT_M, f"a still vehicle drifts by {drift_m:.3f} m")
+        require(turn_rad < STILL_TURN_RAD, f"a still vehicle turns by {turn_rad:.4f} rad")
+
+
+FILTER_CHECKS: tuple[Check, ...] = (live_equals_replay,)
+"""Further demands on estimators that never iterate."""
+CHECKS: tuple[Check, ...] = (
+    settings_have_defaults,
+    knows_nothing_before_the_first_measurement,
+    answers_from_the_first_imu_and_dvl_on,
+    covariances_are_covariances,
+    trajectory_has_the_instants_of_the_estimates,
+    frames_and_signs_are_those_of_the_vocabulary,
+    landmarks_are_sorted_and_unique,
+    every_detection_has_an_outcome,
+    same_input_gives_same_output,
+    asking_changes_nothing,
+    live_agrees_with_replay,
+    input_stays_as_it_was,
+    still_vehicle_stays_still,
+)
+__all__ = ["CHECKS", "FILTER_CHECKS", "Check", "ContractError", "MakeEstimator", "check_estimator"]
+
+
+def check_estimator(make: MakeEstimator) -> None:
+    """Run every check of `CHECKS`.
+
+    Raises
+    ------
+    ContractError
+        At the first check that fails, with its name; also where the estimator itself raises.
+    """
+    for check in CHECKS:
+        try:
+            check(make)
+        except ContractError as violation:
+            raise ContractError(f"{check.__name__}: {violation}") from violation
+        except Exception as error:
+            said = f"{type(error).__name__}: {error}"
+            raise ContractError(
+                f"{check.__name__}: the estimator raised {said}; any block of Measurements may be None"
+            ) from error
