@@ -3,7 +3,8 @@
 All happens at the instant of a frame, which lies a provisional motion (dR, dp, cov) after the state. For a landmark at
 p_n in the axes of the state's body, with n as in `baselines.sonar_update` and row(n, s) of `baselines.ekf_equations`::
 
-    z     = h(x_v, p)                                     (6)  range and azimuth, `sonar_graph.slam.models.sonar_model.project`
+    z     = h(x_v, p)                                     (6)  range and azimuth,
+    `sonar_graph.slam.models.sonar_model.project`
     e     = z_measured - z, azimuth wrapped               (7)
     H_v | H_m = row(-n, p_n),   H_p = (R n)^T             for n of range and azimuth each
     S     = H P H^T + R_z + H_m cov H_m^T

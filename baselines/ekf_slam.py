@@ -98,7 +98,8 @@ class EkfSlam(FilterShell):
       the integrated gyro and Doppler noise, lever arms included.
     - There is no gyro bias in the state (4). Its drift is not in the covariance either: with a biased gyro this filter
       trusts its heading too much, and gates true detections sooner or later.
-    - While the Doppler log has no bottom lock the prediction is that of `sonar_graph.navigation.preintegration.dvl_gaps`, common to
+    - While the Doppler log has no bottom lock the prediction is that of
+    `sonar_graph.navigation.preintegration.dvl_gaps`, common to
       all estimators; only there Q holds the gyro bias, which tilts gravity. The state does not grow: what is measured
       in a gap is related to the state before it, ever more weakly (`baselines.filter_motion.inflate_shared_motion`).
     - A new landmark's elevation comes from the floor where its height is known, else it is 0; its sigma is the

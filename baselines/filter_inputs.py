@@ -149,7 +149,8 @@ class Frame(NamedTuple):
     told: DetectionOutcomes
     """Written at these rows."""
     was_lost: bool
-    """Whether the Doppler log has lost the bottom: from then on views are linearised as in `baselines.sonar_update`, where
+    """Whether the Doppler log has lost the bottom: from then on views are linearised as in
+    `baselines.sonar_update`, where
     it takes that."""
 
 

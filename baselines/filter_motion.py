@@ -8,7 +8,8 @@ newest IMU row, is integrated once and extended: the sums are the same to the la
 
 How the body moved, for the invariant filter: motions from a node, and their derivatives by the gyro bias.
 
-The steps are every estimator's (`sonar_graph.navigation.preintegration.recursion`). With the perturbation [theta_i, eps] in the node's
+The steps are every estimator's (`sonar_graph.navigation.preintegration.recursion`). With the perturbation [theta_i,
+eps] in the node's
 frame a bias that is larger by db gives ``theta_i = D_t db`` and ``eps = D_r db``
 (`sonar_graph.navigation.preintegration.recursion.extended_by_bias`).
 """
@@ -203,7 +204,7 @@ def motion_since_node_with_bias(
 
 @compiled
 def inflate_shared_motion_with_bias(motion: GapMotion, times_told: int) -> GapMotion:
-    """The motion to the k-th measurement in one gap: `inflate_shared_motion`; the bias is in the state and needs no such care."""
+    """Motion to the k-th measurement in one gap; the bias is in the state and needs no inflation."""
     return GapMotion(inflate_shared_motion(motion.integral, times_told), motion.D_t, motion.D_r)
 
 

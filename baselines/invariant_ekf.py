@@ -125,7 +125,8 @@ class InvariantEkf(FilterShell):
     - Attitude is a rotation matrix and has no singular pitch.
 
     It still linearises once, cannot go back to an association, and has no accelerometer bias: the sigma of gravity's
-    direction is widened as everywhere (`sonar_graph.navigation.alignment.gravity`). Derivation: docs/theory/invariant_ekf.md.
+    direction is widened as everywhere (`sonar_graph.navigation.alignment.gravity`). Derivation:
+    docs/theory/invariant_ekf.md.
 
     Parameters
     ----------

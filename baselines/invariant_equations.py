@@ -31,7 +31,8 @@ Landmark k. Its place in the axes of the state's body depends on no rotation of 
 
     p_n = R^T (x_k - X) = p_n^ + R^^T (xi_k - xi_0),    p_b = dR^T (p_n - dp),    q = sonar_T_body p_b
 
-Range and azimuth change along ``n = dR body_R_sonar D_q^T``, one row of D_q each (`sonar_graph.slam.models.sonar_model`)::
+Range and azimuth change along ``n = dR body_R_sonar D_q^T``, one row of D_q each
+(`sonar_graph.slam.models.sonar_model`)::
 
     H_xi_k = n^T R^T = -H_xi_0,    H_theta = 0,    H_m = [ (n x (p_n - dp))^T   -n^T ]                        (4)
 

@@ -233,7 +233,7 @@ def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
         return
     steps_ns = np.diff(stamps_ns)
     if (steps_ns < 0).any():
-        yield f"{_times_stamp_check(steps_ns < 0)} backwards, by {-steps_ns.min() / _NS_PER_S:.3g} s at most: rows are sorted"
+        yield f"{_occasions(steps_ns < 0)} backwards, by {-steps_ns.min() / _NS_PER_S:.3g} s at most: rows are sorted"
     again = len(stamps_ns) - len(np.unique(stamps_ns))
     if again:
         yield f"{_messages(again)} with the stamp of another"
@@ -255,7 +255,7 @@ def _messages(count: int) -> str:
     return "1 message" if count == 1 else f"{count} messages"
 
 
-def _times_stamp_check(which: np.ndarray) -> str:
+def _occasions(which: np.ndarray) -> str:
     count = int(np.count_nonzero(which))
     return "once" if count == 1 else f"{count} times"
 

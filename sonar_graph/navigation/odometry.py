@@ -8,7 +8,8 @@ how a log is cut into blocks, and nothing peeks ahead. One thing does where rows
 for: the first velocities, and those after a long gap, are nodes once later ones have confirmed them
 (`sonar_graph.navigation.dvl_screening.dvl_gate`).
 
-Rows: `sonar_graph.navigation.dvl_screening.row_intake`. Motion between them: `sonar_graph.navigation.preintegration.recursion`.
+Rows: `sonar_graph.navigation.dvl_screening.row_intake`. Motion between them:
+`sonar_graph.navigation.preintegration.recursion`.
 
 Motion from a node of the odometry, over whatever lies behind it: Doppler samples, and gaps without them.
 
@@ -83,7 +84,8 @@ class Odometry:
         """Take in rows and place them by their stamps.
 
         Of rows with equal stamps the first counts. A row that comes after motion up to its stamp was settled is late,
-        and a velocity may be an outlier (`sonar_graph.navigation.dvl_screening.dvl_gate`): these become rows of `refused`.
+        and a velocity may be an outlier (`sonar_graph.navigation.dvl_screening.dvl_gate`): these become rows of
+        `refused`.
 
         Returns
         -------

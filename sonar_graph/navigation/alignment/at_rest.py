@@ -8,7 +8,8 @@ axes, u the world's up there, b_a and b_g the biases, a and N the noise densitie
 
 Hence ``u = mean f / |mean f|``, with the variance ``(sigma_a^2 + a^2 / T) / g^2`` across u, and at the end of the rest
 ``b_g = mean w - Omega sin(phi) u``. It takes over the tilt's error, -Omega sin(phi) times it, and the level part of
-the Earth's rate, whose direction n needs a heading (`sonar_graph.navigation.alignment.gravity`). Without a latitude, the
+the Earth's rate, whose direction n needs a heading (`sonar_graph.navigation.alignment.gravity`). Without a latitude,
+the
 bias holds the Earth's rotation as the body lies; it is not in the covariance.
 
 Coarse levelling: P. D. Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd ed.,

@@ -1,13 +1,15 @@
 """Roll, pitch and gyro bias at the first sample of a moving vehicle, from accelerations shared with its Doppler log.
 
-In the body's frame at the first IMU sample, with C, F, S and P of `sonar_graph.navigation.alignment.dvl_imu`, y the Doppler
+In the body's frame at the first IMU sample, with C, F, S and P of `sonar_graph.navigation.alignment.dvl_imu`, y the
+Doppler
 velocity at the IMU's point and u the world's up, velocity less what the accelerometers felt is a straight line::
 
     x_k = C_k y_k - F_k = v - g t_k u - S_k b_a + B_k b_g + E_k Omega + e_k
     B_k = P_k - [C_k y_k]x S_k - C_k [l]x,    E_k = Q_k - [C_k y_k]x t_k,    Q = int [C f]x t dt
 
 b_a, b_g are the biases, l the lever arm from Doppler log to IMU, and Omega the Earth's rate, ``Omega sin(phi) u`` and a
-level part of unknown direction (`sonar_graph.navigation.alignment.gravity`). v and u are free; biases and the level part
+level part of unknown direction (`sonar_graph.navigation.alignment.gravity`). v and u are free; biases and the level
+part
 have priors. The noise e holds the Doppler log's own with that of one rate at the lever arm, R, and steps of the IMU's
 white noise in the intervals m before k, with variance a^2 dt and N^2 dt::
 

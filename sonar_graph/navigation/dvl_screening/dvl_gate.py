@@ -6,13 +6,15 @@ A velocity v, t seconds after the last one u that was believed, both in body axe
 
 since the velocity may change and the vehicle may turn. The squared Mahalanobis distance is gated far out, for what is
 refused is lost; what passes is weighed by its noise. The gate widens while nothing is believed; with what it starts, at
-first and after a long gap, `sonar_graph.navigation.dvl_screening.dvl_gate` decides. A row that leaves a direction unmeasured is
+first and after a long gap, `sonar_graph.navigation.dvl_screening.dvl_gate` decides. A row that leaves a direction
+unmeasured is
 compared, but nothing with it. The gate knows stamps and velocities alone: what it refuses does not depend on how a log
 is cut.
 
 The first velocities, and the first after a long gap: not believed until others confirm them.
 
-The gate (`sonar_graph.navigation.dvl_screening.dvl_gate`) compares a velocity with the last that was believed. At the start
+The gate (`sonar_graph.navigation.dvl_screening.dvl_gate`) compares a velocity with the last that was believed. At the
+start
 there is none, and long after it the gate lets nearly all pass. A row in doubt therefore waits. Of the rows that wait,
 chains are formed in which each is within the gate of the one before it. A chain is believed when it has more than half
 of the rows of its own stretch, and, for a speed v of its last row, at least::

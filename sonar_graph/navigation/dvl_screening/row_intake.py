@@ -1,7 +1,8 @@
 """Which rows of IMU and Doppler log are used, and why others are not.
 
 A row is turned into body axes and placed by its stamp. One that belongs to a motion already used is late; a velocity
-that no vehicle reaches is an outlier (`sonar_graph.navigation.dvl_screening.dvl_gate`); one with none before it waits until it
+that no vehicle reaches is an outlier (`sonar_graph.navigation.dvl_screening.dvl_gate`); one with none before it waits
+until it
 is confirmed (`sonar_graph.navigation.dvl_screening.dvl_gate`); one of too few beams waits until it can be completed
 (`sonar_graph.navigation.dvl_screening.partial_beams`).
 """

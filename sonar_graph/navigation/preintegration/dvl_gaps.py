@@ -1,7 +1,8 @@
 """Motion while the Doppler log has no bottom lock, carried by the accelerometers.
 
 From node i on, with everything in frame i: R the rotation by the gyros, F and P the velocity and position that the
-accelerometers gain from rest (`sonar_graph.navigation.preintegration.joint_steps`), g gravity. The velocity of the IMU's point less F
+accelerometers gain from rest (`sonar_graph.navigation.preintegration.joint_steps`), g gravity. The velocity of the
+IMU's point less F
 is then a straight line whose slope is gravity, and a Doppler sample z at time t measures a point of it::
 
     y(t) = R z - F = v + g t
@@ -25,7 +26,8 @@ constant over the gap. That of the gyros is the derivative's affair. Derivation:
 The straight line on which the velocity less the accelerometers' gain lay before bottom lock was lost.
 
 Backwards from node i, in frame i, every Doppler sample z_k of the last seconds gives ``y_k = R_k z_k - F_k``, which is
-``v + g t_k`` but for noise (`sonar_graph.navigation.preintegration.dvl_gaps`). The line is fitted by least squares; over the next T
+``v + g t_k`` but for noise (`sonar_graph.navigation.preintegration.dvl_gaps`). The line is fitted by least squares;
+over the next T
 seconds it moves the vehicle by::
 
     s = T (mean + slope (T / 2 - mean t)) = sum_k w_k y_k

@@ -10,7 +10,8 @@ in it (a: the IMU, d: the Doppler log)::
 
 with one covariance of all twelve errors, since the gyros turn all of them and, with the rule "inertial", the
 accelerometer draws s between the Doppler samples. Each measurement enters once. Lever arms need no rates but over long
-intervals (`sonar_graph.navigation.preintegration.joint_preintegration`): v and p are those of the IMU's point, s that of the Doppler log's.
+intervals (`sonar_graph.navigation.preintegration.joint_preintegration`): v and p are those of the IMU's point, s that
+of the Doppler log's.
 Derivation: docs/theory/preintegration.md. After Forster et al., TRO 2017, section VI.
 
 What long times between rows ask of joint preintegration.
@@ -272,7 +273,8 @@ class JointPreintegrator:
 
         ``earth_rate_latitude_rad`` is not among them: what the Earth's rotation is in body frame i depends on the
         attitude there, so `integrate` takes it anew for each motion,
-        ``world_T_i.rotation().unrotate(earth_rate_in_world(calibration))`` (`sonar_graph.navigation.alignment.gravity`).
+        ``world_T_i.rotation().unrotate(earth_rate_in_world(calibration))``
+        (`sonar_graph.navigation.alignment.gravity`).
         """
         imu, dvl = calibration.imu, calibration.dvl
         return cls(

@@ -17,7 +17,8 @@ the change of velocity over the motion.
 
 The loop of joint preintegration as machine code: inertial steps between Doppler samples, then the next sample.
 
-Equations: `sonar_graph.navigation.preintegration.joint_steps` (steps) and `sonar_graph.navigation.preintegration.joint_steps` (samples).
+Equations: `sonar_graph.navigation.preintegration.joint_steps` (steps) and
+`sonar_graph.navigation.preintegration.joint_steps` (samples).
 """
 
 from __future__ import annotations

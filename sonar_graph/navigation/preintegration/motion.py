@@ -91,7 +91,7 @@ class Preintegrator:
     body_p_dvl: Floats
     """Lever arm of the DVL, shape (3,), m."""
     gap: GapValues | None = None
-    """Of `sonar_graph.navigation.preintegration.dvl_gaps`; None: the velocity is linear or held however long a gap lasts."""
+    """Model of DVL gaps; None: the velocity is linear or held however long a gap lasts."""
 
     def __post_init__(self) -> None:
         require_noise("gyro_noise_density", self.gyro_noise_density, 1)

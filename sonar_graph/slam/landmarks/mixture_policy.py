@@ -1,7 +1,8 @@
 """Which landmark each watch shows, chosen and chosen again as the estimate moves: the max-mixture, incrementally.
 
 A watch is all sightings of one track, or one sighting of no track. Its chosen component has its factors in the graph,
-the others have none; a Gauss-Newton step of that graph is one of the max-mixture (`sonar_graph.slam.landmarks.mixture`). After
+the others have none; a Gauss-Newton step of that graph is one of the max-mixture
+(`sonar_graph.slam.landmarks.mixture`). After
 every update the choices of the window are made anew from where the estimate has moved, until none changes.
 
 When a detection comes, the state is not yet conditioned on it. It is then weighed by its predictive density, with the

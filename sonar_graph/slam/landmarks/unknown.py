@@ -1,7 +1,8 @@
 """Landmarks that nothing but their place tells apart.
 
 Detections without an identity are paired with the landmarks of the graph, named ones too, by joint compatibility
-(`sonar_graph.slam.landmarks.joint_compatibility`). What is left waits, tied to its keyframe, and is paired with what waits of
+(`sonar_graph.slam.landmarks.joint_compatibility`). What is left waits, tied to its keyframe, and is paired with what
+waits of
 earlier frames. Once enough sightings of one candidate place it well enough, they become factors, each on the keyframe
 at which it was made, and the candidate a landmark. Landmarks that turn out to be one are merged
 (`sonar_graph.slam.landmarks.unknown`).

@@ -5,7 +5,8 @@ run. Linearising from Python does not; so the loop is here, and the linear algeb
 
 Landmarks that an estimate has put behind the sonar that saw them, and where to start them instead.
 
-The azimuth factor is a camera along the measured azimuth (`sonar_graph.slam.models.factors`). It holds in the half space ahead
+The azimuth factor is a camera along the measured azimuth (`sonar_graph.slam.models.factors`). It holds in the half
+space ahead
 of the sonar; for a landmark behind, GTSAM's camera has a constant error and no gradient. A landmark gets there when a
 large correction, such as a loop closed after much drift, turns the poses that saw it, and if all its sightings are of
 that kind nothing pulls it back. Its sightings themselves say where it should be.
