@@ -11,7 +11,7 @@ from baselines.filter_motion import (
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.odometry import Odometry, motion_between_nodes
-from sonar_graph.navigation.odometry import motion_since_node_with_bias as provisional_motion
+from sonar_graph.navigation.odometry import motion_since_node as provisional_motion
 from sonar_graph.navigation.preintegration.motion import Preintegrator
 from sonar_graph.navigation.preintegration.recursion import in_last_frame
 
