@@ -13,7 +13,7 @@ import numpy as np
 
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
 from sonar_graph.logs.mcap.writer import Outgoing
-from sonar_graph.logs.writing import sonar_image_messages, write_sequence
+from sonar_graph.logs.writing import sonar_image_messages, write_log
 from sonar_graph.measurements import SonarFrames
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BODY_Z_M, FLOOR_Z_M, YSHARK
@@ -46,7 +46,7 @@ class Lane:
     def write(self, log: Path, frames: Iterable[SonarFrames] | None = None) -> Path:
         """As a log, with images in the order given, whatever their stamps say."""
         blocks = [self.one(row) for row in range(len(self.frames))] if frames is None else frames
-        write_sequence(log, self.sequence, _in_this_order(blocks))
+        write_log(log, self.sequence, _in_this_order(blocks))
         return log
 
     def one(self, row: int) -> SonarFrames:

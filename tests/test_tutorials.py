@@ -141,11 +141,11 @@ def write_ros1_bag(path: Path) -> None:
 def assert_is_simulated(folder: Path) -> None:
     """What is read from the log that the page makes is what was simulated, whatever the axes and units between."""
     from sonar_graph.logs.adapters.log_config import read_log_config
-    from sonar_graph.logs.reading import read_sequence
+    from sonar_graph.logs.reading import read_log
     from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
     truth = simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1))
-    found = read_sequence(folder / "dive.mcap", config=read_log_config(folder / "dive.toml"))
+    found = read_log(folder / "dive.mcap", config=read_log_config(folder / "dive.toml"))
     assert truth.depth
     assert found.depth
     np.testing.assert_allclose(found.imu.angular_velocity, truth.imu.angular_velocity, atol=1e-12)

@@ -16,10 +16,10 @@ rosbags, mcap-ros2-support
     Decode the messages of the same four topics one by one, and do nothing with them.
 
 ``limit_ratio`` is our time over the limit's, ``rosbags_ratio`` and ``mcap_ros2_ratio`` theirs over ours.
-``sequence_ratio`` is the time of `read_sequence` over the limit's; it sorts, checks and rotates covariances besides.
+``sequence_ratio`` is the time of `read_log` over the limit's; it sorts, checks and rotates covariances besides.
 ``peak_rss_mb`` is the largest resident memory (Linux only) of a process that does nothing but load the same columns and
 add them up chunk by chunk; ``arrays_rss_mb`` of one that keeps them; ``sequence_rss_mb`` of one that runs
-`read_sequence`. The arrays themselves take ``arrays_mb``.
+`read_log`. The arrays themselves take ``arrays_mb``.
 
 The figures are void, and the exit code 1, unless the arrays hold what rosbags decodes.
 """
@@ -105,9 +105,9 @@ def add_up(path: Path) -> float:
 
 
 def read_with_sequence(path: Path) -> None:
-    from sonar_graph.logs import read_sequence
+    from sonar_graph.logs import read_log
 
-    read_sequence(path)
+    read_log(path)
 
 
 def rosbags(path: Path) -> Iterator[tuple[str, Any]]:

@@ -48,7 +48,7 @@ os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
 import cv2
 import numpy as np
 
-from sonar_graph.logs import read_sequence, read_sonar_frames, sonar_image_messages, write_sequence
+from sonar_graph.logs import read_log, read_sonar_frames, sonar_image_messages, write_log
 from sonar_graph.measurements import SonarFrames
 from sonar_graph.recognition import recognise
 from sonar_graph.recognition.session import one_by_one, step_of, view_of
@@ -111,7 +111,7 @@ class Clocks:
             yield
 
 
-def write_log(path: Path, options: BasinOptions, clocks: Clocks) -> int:
+def write_lane_log(path: Path, options: BasinOptions, clocks: Clocks) -> int:
     """Simulate a basin and write it; the number of frames."""
     blocks = simulate_basin_frames(options)
     next(simulate_basin_frames(options, 1))  # compiles
@@ -129,7 +129,7 @@ def write_log(path: Path, options: BasinOptions, clocks: Clocks) -> int:
             yield sonar_image_messages(TOPIC, block.frames)
             note(f"{made} frames simulated")
 
-    write_sequence(path, simulate_basin(options), messages())
+    write_log(path, simulate_basin(options), messages())
     return made
 
 
@@ -137,7 +137,7 @@ def shorten(path: Path, shorter: Path, frames: int) -> None:
     """The log with its first frames only."""
     every = (frame for block in read_sonar_frames(path) for frame in one_by_one(block))
     messages = (sonar_image_messages(TOPIC, frame) for frame in islice(every, frames))
-    write_sequence(shorter, read_sequence(path), messages)
+    write_log(shorter, read_log(path), messages)
 
 
 def make_actag(frames: SonarFrames) -> Any:
@@ -187,7 +187,7 @@ def peak_rss_mb(path: Path) -> float:
 
 
 def measure(path: Path) -> None:
-    recognise(path, read_sequence(path))
+    recognise(path, read_log(path))
     status = Path("/proc/self/status").read_text(encoding="ascii")
     peak = re.search(r"VmHWM:\s+(\d+) kB", status)
     assert peak is not None
@@ -243,9 +243,9 @@ def measured(options: BasinOptions) -> dict[str, Any]:
     clocks = Clocks()
     with tempfile.TemporaryDirectory() as folder:
         path, shorter = Path(folder) / "basin.mcap", Path(folder) / "shorter.mcap"
-        frames = write_log(path, options, clocks)
+        frames = write_lane_log(path, options, clocks)
         shorten(path, shorter, frames // 4)
-        sequence = read_sequence(path)
+        sequence = read_log(path)
         race(shorter, sequence, Clocks())
         with clocks.timing_parts():
             detections = race(path, sequence, clocks)

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "performance"))
 from log_truth import Truth, read_truth
 from mission_log import write_mission
 
-from sonar_graph.logs import write_sequence
+from sonar_graph.logs import write_log
 from sonar_graph.simulation import MissionOptions, simulate_mission
 
 CHUNK_BYTES = 1 << 16
@@ -52,7 +52,7 @@ def source_logs(folder: Path) -> list[Path]:
         paths.append(folder / f"{name}.mcap")
         write_mission(paths[-1], DURATION_S, FRAMES, chunk_bytes=CHUNK_BYTES, **settings)
     paths.append(folder / "own.mcap")
-    write_sequence(paths[-1], simulate_mission(MissionOptions(duration_s=120.0, landmarks=5)))
+    write_log(paths[-1], simulate_mission(MissionOptions(duration_s=120.0, landmarks=5)))
     return paths
 
 

@@ -10,7 +10,7 @@ Run it in any folder: ``python 01_first_comparison.py``. It takes some seconds a
 from pathlib import Path
 
 from sonar_graph.evaluation import compare, write_comparison, write_viewer_files
-from sonar_graph.logs import read_sequence, write_sequence
+from sonar_graph.logs import read_log, write_log
 from sonar_graph.report import write_report
 from sonar_graph.simulation import BasinOptions, simulate_basin
 
@@ -18,10 +18,10 @@ from sonar_graph.simulation import BasinOptions, simulate_basin
 # correct. A simulated log knows the truth; a recorded one may, and then the report has errors as well.
 simulated = simulate_basin(BasinOptions(seed=1, duration_s=240.0, laps=1, imu="mti1"))
 log = Path("basin.mcap")
-write_sequence(log, simulated)
+write_log(log, simulated)
 
 # From here on nothing is known that is not in the file: measurements, calibration, and what is called truth in it.
-sequence = read_sequence(log)
+sequence = read_log(log)
 print(f"{log}: {sequence.duration_s:.0f} s, {len(sequence.imu)} IMU rows, {len(sequence.dvl)} DVL rows")
 
 # Every estimator sees the same measurements, cut at the same instants, and is scored at the same instants.

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, X
 
-from sonar_graph.logs import read_sequence, write_sequence
+from sonar_graph.logs import read_log, write_log
 from sonar_graph.navigation import Odometry
 from sonar_graph.navigation.preintegration import Preintegrator
 from sonar_graph.simulation import BasinOptions, simulate_basin
@@ -18,8 +18,8 @@ from sonar_graph.slam.models import factors
 
 # 1. A log: blocks of columns, stamps in integer nanoseconds. `help(sonar_graph)` states frames and units.
 log = Path("basin.mcap")
-write_sequence(log, simulate_basin(BasinOptions(seed=2, duration_s=120.0, laps=1)))
-sequence = read_sequence(log)
+write_log(log, simulate_basin(BasinOptions(seed=2, duration_s=120.0, laps=1)))
+sequence = read_log(log)
 calibration = sequence.calibration
 print(f"IMU: angular velocity {sequence.imu.angular_velocity.shape} rad/s, from {sequence.imu.stamps_ns[0]} ns")
 

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import CalibrationError
-from sonar_graph.logs import PartialCalibration, read_sequence
+from sonar_graph.logs import PartialCalibration, read_log
 from sonar_graph.logs.adapters import LogConfig, read_log_config
 from sonar_graph.logs.convert import read_akit, read_mrclam, read_victoria_park
 from sonar_graph.logs.mcap import Instant, LogFile, TimeWindow
@@ -104,7 +104,7 @@ class SourceKind:
 
 
 def _read_log(options: LogOptions) -> Sequence:
-    return read_sequence(
+    return read_log(
         Path(options.log),
         calibration=_read_calibration(options.calibration),
         topics=options.topics,

@@ -82,10 +82,10 @@ class LogSource:
 
     def read(self, progress: Report) -> Sequence:
         """The log as a sequence; the errors are those of reading a log, a calibration, or choices of topics."""
-        from sonar_graph.logs import read_sequence
+        from sonar_graph.logs import read_log
 
         topics, config = topic_choices(self.topics or []), read_config(self.config)
-        return read_sequence(
+        return read_log(
             self.path,
             calibration=read_calibration(self.calibration),
             topics=topics,

@@ -169,11 +169,11 @@ def _convert_sonar(
 
 
 def _convert(read: Callable[[], Sequence], source: Path | None, output: Path, overwrite: bool) -> None:
-    from sonar_graph.logs import write_sequence
+    from sonar_graph.logs import write_log
 
     path = writable_log(output, source, overwrite=overwrite)
     with working("converting"):
         sequence = read()
-        write_sequence(path, sequence)
+        write_log(path, sequence)
     detections = len(sequence.detections) if sequence.detections else 0
     typer.echo(f"{sequence.name}: {sequence.duration_s:.1f} s, {detections} landmark detections\nLog: {path}")

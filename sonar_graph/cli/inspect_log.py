@@ -83,13 +83,13 @@ def _compare_sensors(
     """What sensors say about each other, or why they were not asked."""
     from sonar_graph.diagnosis import check_sensors
     from sonar_graph.errors import SonarGraphError
-    from sonar_graph.logs import read_sequence
+    from sonar_graph.logs import read_log
 
     if summary.obstacles:
         return [], f"not compared: {', '.join(summary.obstacles)}"
     try:
         with working("comparing sensors"):
-            sequence = read_sequence(log, calibration=calibration, config=config, topics=topics, window=window)
+            sequence = read_log(log, calibration=calibration, config=config, topics=topics, window=window)
             return check_sensors(sequence, config), ""
     except SonarGraphError as error:
         return [], f"not compared: {error}"

@@ -296,7 +296,7 @@ def _designs(path: Path | None) -> tuple[LandmarkDesign, ...] | None:
 def _read(
     log: Path, calibration: Path | None, topics: dict[str, str], log_config: Path | None, *, salvage: bool = False
 ) -> Sequence:
-    from sonar_graph.logs import read_sequence
+    from sonar_graph.logs import read_log
 
     given, config = read_calibration(calibration), read_config(log_config)
-    return read_sequence(log, calibration=given, topics=topics, config=config, salvage=salvage)
+    return read_log(log, calibration=given, topics=topics, config=config, salvage=salvage)

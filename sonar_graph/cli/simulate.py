@@ -49,20 +49,20 @@ def landmarks(
     overwrite: Overwrite = False,
 ) -> None:
     """Landmarks along a recorded run, and the detections of a sonar; IMU and DVL stay as recorded."""
-    from sonar_graph.logs import read_sequence, write_sequence
+    from sonar_graph.logs import read_log, write_log
     from sonar_graph.simulation import add_landmarks
 
     options = _landmark_options(({} if seed is None else {"seed": seed}) | nested_settings(settings or []))
     path = writable_log(output, log, overwrite=overwrite)
     with working("simulating"):
-        recorded = read_sequence(
+        recorded = read_log(
             log,
             calibration=read_calibration(calibration),
             config=read_config(log_config),
             topics=topic_choices(topics or []),
         )
         sequence = add_landmarks(recorded, options)
-        write_sequence(path, sequence)
+        write_log(path, sequence)
     detections, placed = sequence.detections, sequence.true_landmarks
     typer.echo(f"{len(placed or ())} landmarks, {len(detections or ())} detections\nLog: {path}")
 
@@ -162,15 +162,15 @@ def _laid(options: BasinOptions) -> str:
 
 def write_basin(path: Path, options: BasinOptions) -> None:
     """Write the log of a simulated basin, with images where its options ask for them."""
-    from sonar_graph.logs import write_sequence
+    from sonar_graph.logs import write_log
     from sonar_graph.simulation import simulate_basin
 
     if options.image is None:
         with working("simulating"):
-            write_sequence(path, simulate_basin(options))
+            write_log(path, simulate_basin(options))
         return
     with progress_bars() as report:
-        write_sequence(path, simulate_basin(options), _image_messages(options, report))
+        write_log(path, simulate_basin(options), _image_messages(options, report))
 
 
 def _image_messages(options: BasinOptions, report: Report) -> Iterator[Outgoing]:

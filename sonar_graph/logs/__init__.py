@@ -3,17 +3,33 @@
 # fmt: off
 from sonar_graph.logs.amending import Amended, write_amended
 from sonar_graph.logs.inspection import LogSummary, TopicSummary, inspect_log
-from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.result_log import write_result
 from sonar_graph.logs.roles import DETECTIONS
 from sonar_graph.logs.sonar_frames import read_sonar_frames
 from sonar_graph.logs.trajectory_files import write_landmarks_csv, write_tum
 from sonar_graph.logs.vehicle_setup import METADATA, PartialCalibration, with_notes
 from sonar_graph.logs.viewer_messages import PICTURES, Picture
-from sonar_graph.logs.writing import detection_messages, sonar_image_messages, write_sequence
+from sonar_graph.logs.writing import detection_messages, sonar_image_messages, write_log
 
 __all__ = [
-    "Amended", "DETECTIONS", "LogSummary", "METADATA", "PICTURES", "PartialCalibration", "Picture", "TopicSummary",
-    "detection_messages", "inspect_log", "read_sequence", "read_sonar_frames", "sonar_image_messages", "with_notes",
-    "write_amended", "write_landmarks_csv", "write_result", "write_sequence", "write_tum",
+    "DETECTIONS",
+    "METADATA",
+    "PICTURES",
+    "Amended",
+    "LogSummary",
+    "PartialCalibration",
+    "Picture",
+    "TopicSummary",
+    "detection_messages",
+    "inspect_log",
+    "read_log",
+    "read_sonar_frames",
+    "sonar_image_messages",
+    "with_notes",
+    "write_amended",
+    "write_landmarks_csv",
+    "write_log",
+    "write_result",
+    "write_tum",
 ]

@@ -196,7 +196,7 @@ def inspect_log(
     path
         The log.
     config, topics
-        What the user says about topics, as of `read_sequence`.
+        What the user says about topics, as of `read_log`.
     window
         Only what was recorded then.
 

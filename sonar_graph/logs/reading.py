@@ -356,7 +356,7 @@ def _list(dropped: Dropped) -> str:
     return ", ".join(f"{count} {fault}" for fault, count in dropped.items())
 
 
-def read_sequence(
+def read_log(
     path: Path,
     *,
     calibration: Calibration | PartialCalibration | None = None,

@@ -35,7 +35,7 @@ def read_sonar_frames(
     config
         What the topics of a foreign log are; its table is ``[sonar]``.
     window, salvage
-        As of `read_sequence`.
+        As of `read_log`.
     refused
         Called with stamp and reason of each message that is no image; None: the first is an error.
 

@@ -165,8 +165,8 @@ def static_message(topic: str, type_name: str, stamp_ns: int, payload: Bytes) ->
     return Outgoing(topic, type_name, np.array([stamp_ns]), payload, is_latched=True)
 
 
-def write_sequence(path: Path, sequence: Sequence, more: Iterable[Outgoing] = ()) -> None:
-    """Write a log of ROS 2 messages from which `read_sequence` gives the same sequence.
+def write_log(path: Path, sequence: Sequence, more: Iterable[Outgoing] = ()) -> None:
+    """Write a log of ROS 2 messages from which `read_log` gives the same sequence.
 
     Parameters
     ----------

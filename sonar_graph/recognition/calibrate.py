@@ -111,7 +111,7 @@ def calibrate(
     params
         Of the recogniser that will use the model; None: the defaults.
     salvage
-        As of `read_sequence`, and as the sequences were read.
+        As of `read_log`, and as the sequences were read.
 
     Raises
     ------

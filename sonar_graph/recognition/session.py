@@ -79,7 +79,7 @@ def recognise(
     recogniser
         In place of a `Recogniser` with those designs and params.
     window, salvage
-        As of `read_sequence`, and as the sequence was read.
+        As of `read_log`, and as the sequence was read.
     progress
         Called with the number of frames done.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sonar_graph.cli.main import main
-from sonar_graph.logs.writing import write_sequence
+from sonar_graph.logs.writing import write_log
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
 
@@ -27,7 +27,7 @@ def run() -> Callable[..., int]:
 @pytest.fixture(scope="session")
 def basin_content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     log = tmp_path_factory.mktemp("log") / "basin.mcap"
-    write_sequence(log, simulate_basin(BasinOptions(seed=3, duration_s=120.0, laps=1)))
+    write_log(log, simulate_basin(BasinOptions(seed=3, duration_s=120.0, laps=1)))
     return log.read_bytes()
 
 

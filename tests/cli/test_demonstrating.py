@@ -9,7 +9,7 @@ import pytest
 
 from sonar_graph.cli.compare import DEMO
 from sonar_graph.evaluation.storage import read_comparison
-from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.reading import read_log
 from sonar_graph.simulation.basin import FASTEST_M_S, PAPER_LAPS, BasinOptions, cruise_speed
 
 Run = Callable[..., int]
@@ -24,7 +24,7 @@ def test_demo_goes_from_images_to_the_papers_table(
     told = capsys.readouterr().out
     assert f"Report: {tmp_path / 'report.html'}" in told
     assert "2014 paper x" in told
-    sequence = read_sequence(tmp_path / "basin.mcap")
+    sequence = read_log(tmp_path / "basin.mcap")
     assert sequence.detections is None, "the log holds images, not what is in them"
     comparison = read_comparison(tmp_path)
     assert comparison.recognition is not None

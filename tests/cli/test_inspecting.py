@@ -9,14 +9,14 @@ import pytest
 from typer.testing import CliRunner
 
 from sonar_graph.cli.main import app
-from sonar_graph.logs.writing import write_sequence
+from sonar_graph.logs.writing import write_log
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("inspect") / "mission.mcap"
-    write_sequence(path, simulate_mission(MissionOptions(seed=6, duration_s=150, landmarks=2)))
+    write_log(path, simulate_mission(MissionOptions(seed=6, duration_s=150, landmarks=2)))
     return path
 
 

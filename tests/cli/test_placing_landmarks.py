@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from sonar_graph.cli.main import app
-from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.writing import write_sequence
+from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.writing import write_log
 from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 
@@ -20,7 +20,7 @@ from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("landmarks") / "recorded.mcap"
     run = simulate_mission(MissionOptions(seed=5, duration_s=60))
-    write_sequence(path, replace(run, detections=None, true_landmarks=None))
+    write_log(path, replace(run, detections=None, true_landmarks=None))
     return path
 
 
@@ -32,7 +32,7 @@ def place(*words: str | Path) -> tuple[int, str]:
 def test_the_log_gets_what_the_library_places_and_keeps_its_sensors(log: Path, tmp_path: Path):
     code, said = place("--on", log, "-o", tmp_path / "new.mcap", "--seed", "3", "--set", "spacing_m=4")
     assert code == 0, said
-    read, recorded = read_sequence(tmp_path / "new.mcap"), read_sequence(log)
+    read, recorded = read_log(tmp_path / "new.mcap"), read_log(log)
     expected = add_landmarks(recorded, LandmarkOptions(seed=3, spacing_m=4.0))
     assert read.detections is not None
     assert expected.detections is not None
@@ -46,7 +46,7 @@ def test_another_seed_is_another_map(log: Path, tmp_path: Path):
     maps = []
     for seed in "12":
         assert place("--on", log, "-o", tmp_path / f"{seed}.mcap", "--seed", seed)[0] == 0
-        maps.append(read_sequence(tmp_path / f"{seed}.mcap").true_landmarks)
+        maps.append(read_log(tmp_path / f"{seed}.mcap").true_landmarks)
     assert maps[0] is not None
     assert maps[1] is not None
     assert not np.array_equal(maps[0].positions, maps[1].positions)

@@ -8,7 +8,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.reading import read_log
 
 
 class Decoder:
@@ -32,7 +32,7 @@ def actag(monkeypatch):
 def test_tags_are_written_as_landmarks(lane_log, actag, run, tmp_path):
     written = tmp_path / "tags.mcap"
     assert run("recognise", lane_log, "-o", written, "--recogniser", "actag", "--set", "tag_size_m=0.15") == 0
-    sequence = read_sequence(written)
+    sequence = read_log(written)
     found = sequence.detections
     assert found is not None
     assert len(found) > 50
@@ -68,4 +68,4 @@ def test_wrong_choices_are_named(lane_log, arguments, named, actag, run, tmp_pat
 def test_settings_reach_the_recogniser(lane_log, run, tmp_path):
     written = tmp_path / "none.mcap"
     assert run("recognise", lane_log, "-o", written, "--set", "least_frames=10000") == 0
-    assert read_sequence(written).detections is None
+    assert read_log(written).detections is None

@@ -15,8 +15,8 @@ import pytest
 from mcap.reader import make_reader
 
 from sonar_graph.logs.mcap.writer import write_recording
-from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.writing import sonar_image_messages, write_sequence
+from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.writing import sonar_image_messages, write_log
 from sonar_graph.sonar import confusion
 from sonar_graph.sonar.confusion import read_confusion
 
@@ -62,7 +62,7 @@ def test_recognise_adds_detections_and_leaves_the_rest_as_it_was(lane_log, recog
     assert before - after == Counter()
     added = after - before
     assert {topic for topic, _, _ in added} == {"/sonar/landmarks"}
-    found, expected = read_sequence(recognised).detections, lane_recognition.detections
+    found, expected = read_log(recognised).detections, lane_recognition.detections
     assert found is not None
     np.testing.assert_array_equal(found.stamps_ns, expected.stamps_ns)
     np.testing.assert_allclose(found.range_m, expected.range_m, atol=1e-4)
@@ -118,7 +118,7 @@ def test_a_log_made_with_other_designs_says_so(lane, run, tmp_path, capsys):
 def test_recognising_again_replaces_what_was_there(recognised, run, tmp_path, capsys):
     assert run("recognise", recognised, "-o", tmp_path / "again.mcap", "--rule", "jeffrey") == 0
     assert "Replaced: " in capsys.readouterr().out
-    one, other = read_sequence(recognised).detections, read_sequence(tmp_path / "again.mcap").detections
+    one, other = read_log(recognised).detections, read_log(tmp_path / "again.mcap").detections
     assert one is not None
     assert other is not None
     assert len(one) == len(other)
@@ -154,7 +154,7 @@ def test_a_model_that_calibrate_wrote_is_used(lane_log, run, tmp_path, monkeypat
     model = read_confusion(tmp_path / "model.json")
     assert model.provenance["logs"] == "lane.mcap"
     assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--model", tmp_path / "model.json") == 0
-    found = read_sequence(tmp_path / "out.mcap").detections
+    found = read_log(tmp_path / "out.mcap").detections
     assert found is not None
     assert np.median(found.range_azimuth_cov[:, 0, 0]) < 0.05**2
 
@@ -163,7 +163,7 @@ def test_designs_of_ones_own_need_no_code(lane_log, run, tmp_path, capsys):
     (tmp_path / "mine.toml").write_text(DESIGNS)
     assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--designs", tmp_path / "mine.toml") == 0
     assert "Warning: the log has landmarks 1, 2, 3, of which there is no design" in capsys.readouterr().out
-    found = read_sequence(tmp_path / "out.mcap").detections
+    found = read_log(tmp_path / "out.mcap").detections
     assert found is not None
     assert np.unique(found.candidate_ids).tolist() == [4]
 
@@ -178,7 +178,7 @@ def images_alone(lane: Lane, path: Path) -> Path:
 def files(lane: Lane, lane_log: Path, strange_designs: Path, tmp_path: Path) -> dict[str, object]:
     """What a user may give by mistake."""
     bare, blind = tmp_path / "bare.mcap", tmp_path / "blind.mcap"
-    write_sequence(bare, lane.sequence)
+    write_log(bare, lane.sequence)
     short = replace(lane, sequence=replace(lane.sequence, truth=None))
     short.write(blind, [lane.one(k) for k in range(3)])
     (tmp_path / "words.json").write_text("{ no")

@@ -48,7 +48,7 @@ def test_simulation_flags_and_settings_reach_the_simulator(
 ) -> None:
     given_options = []
     monkeypatch.setattr("sonar_graph.simulation.basin.simulate_basin", given_options.append)
-    monkeypatch.setattr("sonar_graph.logs.writing.write_sequence", lambda path, _: path.touch())
+    monkeypatch.setattr("sonar_graph.logs.writing.write_log", lambda path, _: path.touch())
     flags = ("--seed", 7, "--laps", 2, "--imu", "mti1", "--no-bias", "--set", "wrong_id_rate=0.05")
     assert run("simulate", "basin", "-o", tmp_path / "new" / "basin.mcap", *flags) == 0
     options = given_options[0]

@@ -9,7 +9,7 @@ from mcap.stream_reader import StreamReader
 from typer.testing import CliRunner
 
 from sonar_graph.cli.main import app
-from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.sonar_frames import read_sonar_frames
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin, simulate_basin_frames
 
@@ -33,7 +33,7 @@ def test_images_and_other_sensors_are_those_of_the_library(tmp_path: Path):
     images = np.concatenate([read[k].intensity for k in order])
     np.testing.assert_array_equal(images, np.concatenate([block.frames.intensity for block in made]))
     np.testing.assert_allclose(read[0].azimuths_rad, made[0].frames.azimuths_rad, atol=1e-12)
-    sequence, expected = read_sequence(tmp_path / "a.mcap"), simulate_basin(options)
+    sequence, expected = read_log(tmp_path / "a.mcap"), simulate_basin(options)
     assert sequence.detections is None
     np.testing.assert_array_equal(sequence.imu.angular_velocity, expected.imu.angular_velocity)
     assert sequence.true_landmarks is not None

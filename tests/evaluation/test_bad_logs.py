@@ -13,8 +13,8 @@ import pytest
 from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
 from sonar_graph.logs.mcap.writer import Outgoing
-from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.writing import sonar_image_messages, write_sequence
+from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.writing import sonar_image_messages, write_log
 from sonar_graph.measurements import SonarFrames
 from sonar_graph.recognition.recognition_record import Recognition
 from sonar_graph.recognition.session import LEAPT, NO_FLOOR, recognise
@@ -38,9 +38,9 @@ def frames_of(lane: Lane) -> list[SonarFrames]:
 
 
 def recognised(lane: Lane, log: Path, messages: list[Outgoing], **settings: object) -> Recognition:
-    write_sequence(log, lane.sequence, messages)
+    write_log(log, lane.sequence, messages)
     salvage = {"salvage": settings["salvage"]} if "salvage" in settings else {}
-    found = recognise(log, read_sequence(log, **salvage), **settings)
+    found = recognise(log, read_log(log, **salvage), **settings)
     assert found is not None
     return found
 
@@ -111,8 +111,8 @@ def test_bad_frames_are_never_drawn(lane, tmp_path):
 def test_of_two_sonars_one_must_be_chosen_before_any_image_is_read(lane, tmp_path, plain):
     log = tmp_path / "log.mcap"
     messages = [message(f, topic) for f in frames_of(lane) for topic in (TOPIC, "/other/image")]
-    write_sequence(log, lane.sequence, messages)
-    sequence, done = read_sequence(log), []
+    write_log(log, lane.sequence, messages)
+    sequence, done = read_log(log), []
     with pytest.raises(LogError, match=r"2 topics fit: /other/image, /sonar/image; choose one: --topic sonar="):
         recognise(log, sequence, progress=done.append)
     assert done == []
@@ -123,22 +123,22 @@ def test_of_two_sonars_one_must_be_chosen_before_any_image_is_read(lane, tmp_pat
 
 def test_only_the_part_that_was_read_is_recognised(lane, tmp_path):
     log = tmp_path / "log.mcap"
-    write_sequence(log, lane.sequence, [message(f) for f in frames_of(lane)])
+    write_log(log, lane.sequence, [message(f) for f in frames_of(lane)])
     window = TimeWindow(Instant.parse("2"), Instant.parse("8"))
-    found = recognise(log, read_sequence(log, window=window), window=window)
+    found = recognise(log, read_log(log, window=window), window=window)
     assert 28 <= found.frames <= 31
     assert not [reason for _, reason in found.warnings if "out of order" in reason]
 
 
 def test_a_hole_is_refused_and_with_salvage_named_and_the_rest_is_used(lane, tmp_path):
     log = tmp_path / "log.mcap"
-    write_sequence(log, lane.sequence, [message(f) for f in frames_of(lane)])
+    write_log(log, lane.sequence, [message(f) for f in frames_of(lane)])
     data = bytearray(log.read_bytes())
     data[len(data) // 2] ^= 0xFF
     log.write_bytes(data)
     with pytest.raises(LogError, match="--salvage"):
-        read_sequence(log)
-    sequence = read_sequence(log, salvage=True)
+        read_log(log)
+    sequence = read_log(log, salvage=True)
     assert "lost" in sequence.notes["log.damage"]
     found = recognise(log, sequence, salvage=True)
     assert COUNT / 2 < found.frames < COUNT
@@ -147,8 +147,8 @@ def test_a_hole_is_refused_and_with_salvage_named_and_the_rest_is_used(lane, tmp
 def test_a_log_without_depth_and_floor_is_recognised_in_the_image_plane(lane, tmp_path):
     log = tmp_path / "log.mcap"
     bare = replace(lane.sequence, depth=None, calibration=lane.sequence.calibration.model_copy(update={"floor": None}))
-    write_sequence(log, bare, [message(f) for f in frames_of(lane)])
-    found = recognise(log, read_sequence(log))
+    write_log(log, bare, [message(f) for f in frames_of(lane)])
+    found = recognise(log, read_log(log))
     assert found.frames == COUNT
     assert found.warnings == []
     assert found.outcomes[NO_FLOOR] == COUNT

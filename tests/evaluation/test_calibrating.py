@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
 from sonar_graph.errors import CalibrationError
-from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.reading import read_log
 from sonar_graph.recognition.calibrate import (
     NO_LABEL,
     NONE,
@@ -104,7 +104,7 @@ def few_frames_are_enough():
 
 @pytest.fixture(scope="module")
 def measured(lane_log) -> Confusion:
-    return calibrate([(lane_log, read_sequence(lane_log))])
+    return calibrate([(lane_log, read_log(lane_log))])
 
 
 def test_a_model_measured_on_a_log_is_of_its_landmarks_and_says_where_it_comes_from(lane, measured):
@@ -128,7 +128,7 @@ def test_a_measured_model_is_one_that_the_recogniser_takes(lane, measured):
 
 
 def test_logs_count_together(lane_log, measured):
-    run = read_sequence(lane_log)
+    run = read_log(lane_log)
     twice = calibrate([(lane_log, run), (lane_log, replace(run, notes={}))])
     assert twice.provenance["logs"] == "lane.mcap, lane.mcap"
     assert twice.provenance["what they are"] == "a lane; recorded"
@@ -143,7 +143,7 @@ def test_logs_count_together(lane_log, measured):
 
 @pytest.mark.parametrize("missing", ["truth", "true_landmarks"])
 def test_a_log_without_truth_is_refused_by_name(lane_log, missing):
-    run = replace(read_sequence(lane_log), **{missing: None})
+    run = replace(read_log(lane_log), **{missing: None})
     with pytest.raises(CalibrationError, match=r"lane\.mcap: without true trajectory and true landmarks"):
         calibrate([(lane_log, run)])
 
@@ -153,12 +153,12 @@ def test_frames_that_come_too_late_count_nothing_again(lane, measured, tmp_path)
     rows = [row for k in range(len(lane.frames)) for row in ([k, k - 3] if k % 5 == 4 else [k])]
     late = lane.write(tmp_path / "lane.mcap", [lane.one(row) for row in rows])
     assert len(rows) > len(lane.frames) + 20
-    assert calibrate([(late, read_sequence(late))]) == measured
+    assert calibrate([(late, read_log(late))]) == measured
 
 
 def test_landmarks_that_are_not_in_the_log_are_named(lane_log):
     """The designs of two landmarks under other identities."""
-    run = read_sequence(lane_log)
+    run = read_log(lane_log)
     strangers = tuple(replace(d, id=d.id + 6) for d in DEFAULT_DESIGNS[:2])
     with pytest.raises(
         CalibrationError, match=r"lane\.mcap: its true landmarks are 1, 2, 3, 4, the designs are 7, 8: "
@@ -169,7 +169,7 @@ def test_landmarks_that_are_not_in_the_log_are_named(lane_log):
 
 
 def test_frames_outside_the_truth_are_not_labelled(lane_log, measured):
-    run = read_sequence(lane_log)
+    run = read_log(lane_log)
     middle_ns = int(run.truth.stamps_ns[len(run.truth.stamps_ns) // 3])
     cut = replace(run, truth=run.truth.rows(run.truth.stamps_ns >= middle_ns))
     with pytest.raises(CalibrationError, match="landmark 1: "):

@@ -12,8 +12,8 @@ import pytest
 
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.evaluation.comparison import compare
-from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.writing import write_sequence
+from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, SonarFrames
 from sonar_graph.recognition.recognition_record import Recognition
 from sonar_graph.recognition.session import RecognitionSession, one_by_one, recognise, with_detections
@@ -121,7 +121,7 @@ def test_both_rules_name_landmarks_and_the_notes_say_which_was_used(lane):
 
 def test_a_log_gives_what_its_images_give(lane, lane_log, lane_recognition):
     counts: list[int] = []
-    sequence = read_sequence(lane_log)
+    sequence = read_log(lane_log)
     assert sequence.detections is None
     result = recognise(lane_log, sequence, progress=counts.append)
     assert counts == list(range(1, len(lane.frames) + 1))
@@ -146,7 +146,7 @@ def test_rows_account_for_every_frame_and_detection(lane, lane_recognition):
 
 
 def test_a_log_without_images_gives_nothing(lane, tmp_path):
-    write_sequence(tmp_path / "bare.mcap", lane.sequence)
+    write_log(tmp_path / "bare.mcap", lane.sequence)
     assert recognise(tmp_path / "bare.mcap", lane.sequence) is None
 
 
@@ -277,7 +277,7 @@ def test_a_frame_that_is_not_finite_is_named_in_a_warning_and_not_used(lane, wit
 
 def recognised_in_log(lane: Lane, folder: Path, frames: list[SonarFrames]) -> Recognition:
     log = lane.write(folder / "bad.mcap", frames)
-    return recognise(log, read_sequence(log))
+    return recognise(log, read_log(log))
 
 
 def test_a_bad_first_frame_costs_hardly_more_than_itself(lane):

@@ -18,7 +18,7 @@ from sonar_graph.estimator import installed_estimators, load_estimator, refused_
 from sonar_graph.evaluation.results import MOST_ROWS_NAMED, Comparison, gathered
 from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.storage import read_comparison, write_comparison
-from sonar_graph.logs.writing import write_sequence
+from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import Dvl, Measurements
 from sonar_graph.report.console import summary
 from sonar_graph.report.page import render_report
@@ -224,7 +224,7 @@ def recorded_late(path: Path, out: Path, delays_ns: dict[str, int]) -> None:
 
 
 def test_rows_recorded_late_are_placed_by_their_stamps_and_said(straight, tmp_path, capsys):
-    write_sequence(tmp_path / "log.mcap", straight)
+    write_log(tmp_path / "log.mcap", straight)
     with (tmp_path / "log.mcap").open("rb") as file:
         topics = [channel.topic for channel in make_reader(file).get_summary().channels.values()]
     delays_ns = {topic: 350_000_000 for topic in topics if "imu" in topic or "dvl" in topic}
@@ -245,7 +245,7 @@ def test_rows_recorded_late_are_placed_by_their_stamps_and_said(straight, tmp_pa
 def spoilt_log(straight, tmp_path_factory) -> Path:
     """Two velocities are wrong."""
     path = tmp_path_factory.mktemp("spoilt") / "log.mcap"
-    write_sequence(path, with_outliers(straight, [20, 60]))
+    write_log(path, with_outliers(straight, [20, 60]))
     return path
 
 

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.errors import CalibrationError
 from sonar_graph.logs.mcap.writer import write_recording
-from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.roles import TF
 from sonar_graph.logs.vehicle_setup import METADATA, PartialCalibration, encode_mountings, gathered
-from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message, write_sequence
+from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message, write_log
 
 TREE_M = (1.0, 2.0, 3.0)
 
@@ -74,9 +74,9 @@ def test_every_field_comes_from_the_first_that_says_it(
 
 def test_what_a_file_leaves_out_stays_as_the_log_says(make_sequence: Any, tmp_path: Path) -> None:
     sequence = make_sequence()
-    write_sequence(tmp_path / "a.mcap", sequence)
+    write_log(tmp_path / "a.mcap", sequence)
     changes = said(imu={"gyro_noise_density": 0.5}, gravity_m_s2=9.7)
-    found = read_sequence(tmp_path / "a.mcap", calibration=changes)
+    found = read_log(tmp_path / "a.mcap", calibration=changes)
     imu = sequence.calibration.imu.model_copy(update={"gyro_noise_density": 0.5})
     assert imu.mounting != Mounting()
     assert found.calibration == sequence.calibration.model_copy(update={"imu": imu, "gravity_m_s2": 9.7})
@@ -89,7 +89,7 @@ def test_what_a_file_leaves_out_stays_as_tf_static_says(bench: Any) -> None:
     tree = [bench.transform("base_link", "imu_link", (1, 0, 0)), bench.transform("base_link", "dvl_link", (0, 2, 0), 1)]
     log = bench.write(*bench.basics(), ("/tf_static", "tf", [{"transforms": tree}]))
     changes = said(dvl={"mounting": {"translation_m": [0, 3, 0]}})
-    found = read_sequence(log, calibration=changes)
+    found = read_log(log, calibration=changes)
     assert found.calibration.imu.mounting.translation_m == (1, 0, 0)
     assert found.calibration.dvl.mounting.translation_m == (0, 3, 0)
     np.testing.assert_allclose(found.calibration.dvl.mounting.rpy_rad, (0, 0, 1), atol=1e-12)
@@ -100,13 +100,13 @@ def test_what_a_file_leaves_out_stays_as_tf_static_says(bench: Any) -> None:
 
 def test_a_sensor_mounted_by_the_file_is_not_told_to_be_missing(bench: Any) -> None:
     log = bench.write(*bench.basics())
-    plain, given_ = read_sequence(log), read_sequence(log, calibration=said(dvl={"mounting": {"rpy_rad": [0, 0, 1]}}))
+    plain, given_ = read_log(log), read_log(log, calibration=said(dvl={"mounting": {"rpy_rad": [0, 0, 1]}}))
     assert "dvl (dvl_link)" in plain.notes["log.calibration"]
     assert "dvl (dvl_link)" not in given_.notes["log.calibration"]
     assert "imu (imu_link)" in given_.notes["log.calibration"]
     assert "z downwards" in plain.notes["log.warnings"]
     assert "z downwards" not in given_.notes.get("log.warnings", "")
-    other = read_sequence(log, calibration=said(gravity_m_s2=9.81))
+    other = read_log(log, calibration=said(gravity_m_s2=9.81))
     assert "z downwards" in other.notes["log.warnings"], "the file says nothing of how the instrument sits"
 
 
@@ -123,7 +123,7 @@ def test_a_record_that_says_little_leaves_the_rest_to_tf_static(make_sequence: A
         ],
         {METADATA: {"calibration": json.dumps({"imu": {"mounting": {"translation_m": [7, 8, 9]}}})}},
     )
-    calibration = read_sequence(tmp_path / "a.mcap").calibration
+    calibration = read_log(tmp_path / "a.mcap").calibration
     assert calibration.imu.mounting.translation_m == (7, 8, 9)
     assert calibration.dvl.mounting.translation_m == TREE_M
 

@@ -11,7 +11,7 @@ from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
 from sonar_graph.logs.mcap.reader import scan, stream
 from sonar_graph.logs.mcap.topic import Keep
-from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.reading import read_log
 
 from .containers import chunk_indexes, entries, flip, read, scan_all, write, write_apart
 
@@ -87,7 +87,7 @@ def test_a_file_cut_off_before_its_first_message_says_so(tmp_path: Path) -> None
     assert ending.startswith("the file is cut off: ")
     assert ending.endswith("; no message is there")
     with pytest.raises(MissingTopicError, match=r"log\.mcap: has no messages: the file is cut off: "):
-        read_sequence(path)
+        read_log(path)
 
 
 def test_a_writer_killed_between_records_is_noticed(tmp_path: Path) -> None:

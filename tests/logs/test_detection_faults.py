@@ -8,7 +8,7 @@ import pytest
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters.landmark_messages import detection_warnings
 from sonar_graph.logs.inspection import inspect_log
-from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.reading import read_log
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.slam.keyframes import sound_detections
 
@@ -27,7 +27,7 @@ def test_a_sound_log_gives_no_warning(bench: Any) -> None:
 @pytest.mark.parametrize("wrong", [[97.0, 0.5], [0.5, -0.1], [1.1, 0.5]])
 def test_rows_with_impossible_probabilities_are_left_out_and_told(bench: Any, wrong: list[float]) -> None:
     path = one_of(bench, id_probability=wrong)
-    detections = read_sequence(path).detections
+    detections = read_log(path).detections
     assert detections is not None
     assert len(detections) == 2
     (told,) = [text for text in inspect_log(path).left_out if "probabilities" in text]
@@ -40,10 +40,10 @@ def test_an_identity_for_which_no_key_has_room_is_named_with_its_message(bench: 
     with pytest.raises(
         LogError, match=r"topic /landmarks: message 1 has an identity of 2\^56 or more; number"
     ) as caught:
-        read_sequence(path)
+        read_log(path)
     assert "\n" not in str(caught.value)
     assert str(caught.value) in inspect_log(path).damage
-    assert read_sequence(one_of(bench, candidate_ids=[5, 2**56 - 1])).detections is not None
+    assert read_log(one_of(bench, candidate_ids=[5, 2**56 - 1])).detections is not None
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_what_estimators_do_not_use_is_told_and_kept(bench: Any, changed: dict[s
     path = one_of(bench, **changed)
     (told,) = [text for text in inspect_log(path).warnings if "detections" in text]
     assert told.startswith(f"detections: {said}")
-    sequence = read_sequence(path)
+    sequence = read_log(path)
     assert sequence.detections is not None
     assert len(sequence.detections) == 3
     assert told in sequence.notes["log.warnings"]

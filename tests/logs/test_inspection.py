@@ -11,8 +11,8 @@ from mcap.reader import make_reader
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.logs.convert.victoria_park import read_victoria_park
 from sonar_graph.logs.inspection import LogSummary, inspect_log
-from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.writing import write_sequence
+from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.writing import write_log
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
 
@@ -48,9 +48,9 @@ def test_roles_are_explained_whether_filled_or_not(bench: Any) -> None:
 
 def test_the_roles_are_those_that_reading_uses(make_sequence: Any, tmp_path: Path) -> None:
     sequence = make_sequence()
-    write_sequence(tmp_path / "a.mcap", sequence)
+    write_log(tmp_path / "a.mcap", sequence)
     summary = inspect_log(tmp_path / "a.mcap")
-    used = read_sequence(tmp_path / "a.mcap").notes["log.topics"]
+    used = read_log(tmp_path / "a.mcap").notes["log.topics"]
     assert used == "; ".join(f"{r.role}: {r.topic}" for r in summary.roles if r.topic)
     assert summary.calibration == "in the log"
     assert summary.name == sequence.name
@@ -76,7 +76,7 @@ def test_mountings_in_the_log_are_mentioned(bench: Any) -> None:
 
 def test_damage_is_reported_instead_of_raised(make_sequence: Any, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    write_sequence(path, make_sequence(samples=20_000))
+    write_log(path, make_sequence(samples=20_000))
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2])
     (ending,) = inspect_log(path).damage
@@ -104,7 +104,7 @@ def test_what_a_run_would_leave_out_and_doubt_is_told_before(bench: Any) -> None
     dvl = ("/dvl", "dvl", [bench.dvl(bench.t0_ns + i * 10**8, velocity_mode=1 + (i == 2)) for i in range(5)])
     path = bench.write(("/imu", "imu", sideways), dvl)
     summary = inspect_log(path)
-    notes = read_sequence(path).notes
+    notes = read_log(path).notes
     assert summary.left_out == ("dvl: 1 with velocity_mode not 1",)
     assert "; ".join(summary.left_out) == notes["log.dropped"]
     assert "; ".join(summary.warnings) == notes["log.warnings"]
@@ -139,11 +139,11 @@ def test_stuck_sensors_are_named(bench: Any) -> None:
 
 
 def test_what_this_package_wrote_gives_no_warning(tmp_path: Path) -> None:
-    write_sequence(tmp_path / "a.mcap", read_victoria_park())
-    write_sequence(tmp_path / "b.mcap", simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1)))
+    write_log(tmp_path / "a.mcap", read_victoria_park())
+    write_log(tmp_path / "b.mcap", simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1)))
     for name in ("a.mcap", "b.mcap"):
         summary = inspect_log(tmp_path / name)
         assert summary.warnings == ()
         assert [topic.stamp_faults for topic in summary.topics if topic.stamp_faults] == []
         assert summary.damage == ()
-        assert not {"log.stamps", "log.warnings"} & read_sequence(tmp_path / name).notes.keys()
+        assert not {"log.stamps", "log.warnings"} & read_log(tmp_path / name).notes.keys()

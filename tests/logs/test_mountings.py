@@ -12,7 +12,7 @@ from sonar_graph.calibration import Calibration, DepthCalibration, DvlCalibratio
 from sonar_graph.logs.mcap.reader import scan
 from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.mcap.writer import write_recording
-from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.roles import TF
 from sonar_graph.logs.vehicle_setup import encode_mountings, mounting_of, static_frames
 from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message
@@ -31,7 +31,7 @@ def test_mountings_survive_tf_static(
     tree = static_message("/tf_static", TF, 0, encode_mountings(calibration))
     path = tmp_path_factory.mktemp("log") / "a.mcap"
     write_recording(path, [tree, imu_messages("/imu", sequence.imu), dvl_messages("/dvl", sequence.dvl)], {})
-    found = read_sequence(path).calibration
+    found = read_log(path).calibration
     assert found.dvl.mounting.pose().equals(mounting.pose(), 1e-9)
     assert found.imu.mounting.pose().equals(gtsam.Pose3(), 1e-9)
     assert mounting_of("depth", static_frames(scan(path, lambda _: Keep.ALL))).translation_m == port

@@ -11,7 +11,7 @@ from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.inspection import inspect_log
 from sonar_graph.logs.mcap.reader import scan
 from sonar_graph.logs.mcap.topic import Keep
-from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.roles import refusal
 
 from .conftest import Bench
@@ -74,7 +74,7 @@ def test_inspection_lists_what_is_not_read_with_number_and_reason(mixed: Path) -
 
 
 def test_topics_of_other_kinds_do_not_touch_ours(mixed: Path, bench: Bench) -> None:
-    alone, beside = read_sequence(bench.write(*bench.basics(), name="alone.mcap")), read_sequence(mixed)
+    alone, beside = read_log(bench.write(*bench.basics(), name="alone.mcap")), read_log(mixed)
     np.testing.assert_array_equal(alone.imu.stamps_ns, beside.imu.stamps_ns)
     np.testing.assert_array_equal(alone.imu.angular_velocity, beside.imu.angular_velocity)
 
@@ -82,7 +82,7 @@ def test_topics_of_other_kinds_do_not_touch_ours(mixed: Path, bench: Bench) -> N
 def test_the_reason_is_given_where_nothing_else_plays_the_role(bench: Bench, tmp_path: Path) -> None:
     path = copy_with_foreign(bench.write(*bench.basics()), tmp_path / "mixed.mcap", without=("/imu",))
     with pytest.raises(MissingTopicError, match=r"nothing for imu: .*/idl has a definition in ros2idl"):
-        read_sequence(path)
+        read_log(path)
 
 
 CUT_BEFORE = {"imu": "their definition does", "depth": "their definition does", "detections": "track"}
@@ -117,7 +117,7 @@ def test_broken_messages_are_counted_and_the_others_are_as_if_alone(
     bench: Bench, tmp_path: Path, topic: str, role: str
 ) -> None:
     path = broken_log(bench, tmp_path, topic, {0, 4, 5})
-    broken, whole = read_sequence(path), read_sequence(tmp_path / "whole.mcap")
+    broken, whole = read_log(path), read_log(tmp_path / "whole.mcap")
     kept = [1, 2, 3, 6, 7, 8]
     np.testing.assert_array_equal(getattr(broken, role).stamps_ns, getattr(whole, role).stamps_ns[kept])
     column = {"imu": "angular_velocity", "depth": "z_m", "detections": "range_m"}[role]
@@ -129,11 +129,11 @@ def test_broken_messages_are_counted_and_the_others_are_as_if_alone(
 def test_a_topic_that_is_not_needed_and_wholly_broken_is_left_out(
     bench: Bench, tmp_path: Path, topic: str, role: str
 ) -> None:
-    sequence = read_sequence(broken_log(bench, tmp_path, topic, set(range(9))))
+    sequence = read_log(broken_log(bench, tmp_path, topic, set(range(9))))
     assert getattr(sequence, role) is None
     assert sequence.notes["log.dropped"] == f"{role}: 9 that end before {CUT_BEFORE[role]}"
 
 
 def test_a_needed_topic_that_is_wholly_broken_is_an_error(bench: Bench, tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"topic /imu: no message .* 9 that end before their definition does"):
-        read_sequence(broken_log(bench, tmp_path, "/imu", set(range(9))))
+        read_log(broken_log(bench, tmp_path, "/imu", set(range(9))))

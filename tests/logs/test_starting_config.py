@@ -10,9 +10,9 @@ from sonar_graph.cli.main import main
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.logs.cdr.definitions import definition
 from sonar_graph.logs.inspection import inspect_log
-from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.roles import ROLES, Choice, choose_topic
-from sonar_graph.logs.writing import write_sequence
+from sonar_graph.logs.writing import write_log
 
 
 def choices(path: Path, config: LogConfig) -> dict[str, Choice]:
@@ -33,7 +33,7 @@ def test_read_back_unchanged_it_makes_the_same_choices(bench: Any, make_sequence
         bench.write(imu, name="half.mcap"),
         tmp_path / "own.mcap",
     ]
-    write_sequence(logs[-1], make_sequence())
+    write_log(logs[-1], make_sequence())
     said = [
         LogConfig(),
         LogConfig.parse({"dvl": {"rotation": [1, 2, 3], "covariance": False}, "depth": {"use": False}}, "x"),
@@ -60,7 +60,7 @@ def test_what_is_changed_in_it_counts(bench: Any) -> None:
     text = inspect_log(path).toml
     assert 'rotation = "flu"' in text
     turned = LogConfig.parse(tomllib.loads(text.replace('rotation = "flu"', 'rotation = "frd"')), "x")
-    plain, frd = read_sequence(path), read_sequence(path, config=turned)
+    plain, frd = read_log(path), read_log(path, config=turned)
     assert (frd.imu.specific_force == plain.imu.specific_force * [1, -1, -1]).all()
 
 
@@ -84,7 +84,7 @@ def test_an_unknown_type_is_proposed_with_its_fields(bench: Any, monkeypatch: py
     assert "#   time\n#   speed[3]\n#   beams[]" in text
     filled = "\n".join(line.removeprefix("# ") for line in text.splitlines() if "my_dvl is" not in line)
     table = filled[filled.index("[dvl]") : filled.index("[depth]")].replace('"..."', '"speed[{}]"').format(0, 1, 2)
-    sequence = read_sequence(path, config=LogConfig.parse(tomllib.loads(table), "x"))
+    sequence = read_log(path, config=LogConfig.parse(tomllib.loads(table), "x"))
     assert sequence.dvl.velocity.tolist() == [[1, 2, 3]] * 3
 
 

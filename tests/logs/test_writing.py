@@ -13,8 +13,8 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.reading import read_sequence
-from sonar_graph.logs.writing import write_sequence
+from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import Imu
 
 BLOCKS = ("imu", "dvl", "depth", "detections", "truth", "true_landmarks")
@@ -32,8 +32,8 @@ def test_reading_what_was_written_is_the_identity(
 ) -> None:
     sequence = replace(make_sequence(seed, samples, candidates), **dict.fromkeys(left_out))
     path = tmp_path_factory.mktemp("log") / "log.mcap"
-    write_sequence(path, sequence)
-    found = read_sequence(path)
+    write_log(path, sequence)
+    found = read_log(path)
     for name in BLOCKS:
         expected, actual = getattr(sequence, name), getattr(found, name)
         assert (expected is None) == (actual is None), name
@@ -49,15 +49,15 @@ def test_known_covariances_of_the_truth_survive(make_sequence: Any, tmp_path: Pa
     sequence = make_sequence()
     root = np.random.default_rng(0).normal(size=(len(sequence.truth), 6, 6))
     truth = replace(sequence.truth, covariances=root @ root.transpose(0, 2, 1))
-    write_sequence(tmp_path / "a.mcap", replace(sequence, truth=truth))
-    found = read_sequence(tmp_path / "a.mcap").truth
+    write_log(tmp_path / "a.mcap", replace(sequence, truth=truth))
+    found = read_log(tmp_path / "a.mcap").truth
     assert found is not None
     np.testing.assert_allclose(found.covariances, truth.covariances, atol=1e-12)
 
 
 def test_mcap_ros2_support_decodes_what_is_written(make_sequence: Any, tmp_path: Path, decoded: Any) -> None:
     sequence = make_sequence()
-    write_sequence(tmp_path / "a.mcap", sequence)
+    write_log(tmp_path / "a.mcap", sequence)
     messages = decoded(tmp_path / "a.mcap")
     assert set(messages) == {"/imu/data", "/dvl/data", "/depth/pose", "/sonar/landmarks", "/tf_static",
                              "/ground_truth/odometry", "/ground_truth/landmarks"}  # fmt: skip
@@ -78,7 +78,7 @@ def test_mcap_ros2_support_decodes_what_is_written(make_sequence: Any, tmp_path:
 
 
 def test_rosbags_re_encodes_all_that_is_written_to_the_same_bytes(make_sequence: Any, tmp_path: Path) -> None:
-    write_sequence(tmp_path / "a.mcap", make_sequence())
+    write_log(tmp_path / "a.mcap", make_sequence())
     count = 0
     with AnyReader([tmp_path / "a.mcap"]) as reader:
         for connection, _, raw in reader.messages():
@@ -89,7 +89,7 @@ def test_rosbags_re_encodes_all_that_is_written_to_the_same_bytes(make_sequence:
 
 
 def test_messages_lie_in_the_order_of_their_times(make_sequence: Any, tmp_path: Path) -> None:
-    write_sequence(tmp_path / "a.mcap", make_sequence())
+    write_log(tmp_path / "a.mcap", make_sequence())
     with (tmp_path / "a.mcap").open("rb") as stream:
         times = [r.log_time for r in StreamReader(stream).records if isinstance(r, Message)]
     assert len(times) > 80
@@ -100,11 +100,11 @@ def test_messages_lie_in_the_order_of_their_times(make_sequence: Any, tmp_path: 
 def test_stamps_that_ros_cannot_express_are_refused(make_sequence: Any, tmp_path: Path, stamp_ns: int) -> None:
     sequence = replace(make_sequence(), imu=Imu(np.array([stamp_ns]), np.zeros((1, 3)), np.zeros((1, 3))))
     with pytest.raises(LogError, match="32-bit seconds"):
-        write_sequence(tmp_path / "a.mcap", sequence)
+        write_log(tmp_path / "a.mcap", sequence)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_file_that_cannot_be_written_is_named(make_sequence: Any, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(LogError, match=r"file/a\.mcap cannot be written"):
-        write_sequence(tmp_path / "file" / "a.mcap", make_sequence())
+        write_log(tmp_path / "file" / "a.mcap", make_sequence())

@@ -6,6 +6,13 @@ from sonar_graph.simulation.sonar_image.imaging_sonar import SOUND_SPEED_M_S, Im
 from sonar_graph.simulation.sonar_image.scene import SeabedObject, place_landmark, scattered_objects
 
 __all__ = [
-    "FrameSimulator", "ImageOptions", "ImagedFrames", "SONARS", "SOUND_SPEED_M_S", "SeabedObject", "image_along",
-    "place_landmark", "scattered_objects",
+    "SONARS",
+    "SOUND_SPEED_M_S",
+    "FrameSimulator",
+    "ImageOptions",
+    "ImagedFrames",
+    "SeabedObject",
+    "image_along",
+    "place_landmark",
+    "scattered_objects",
 ]

@@ -222,9 +222,9 @@ def foreign(tmp_path: Path) -> Foreign:
 def read(foreign: Foreign) -> Callable[..., Any]:
     """Reads a log of these entries, with a configuration as text, as a sequence."""
     from sonar_graph.logs.adapters.log_config import read_log_config
-    from sonar_graph.logs.reading import read_sequence
+    from sonar_graph.logs.reading import read_log
 
-    def read_log(*entries: Entry, toml: str = "", **settings: Any) -> Any:
-        return read_sequence(foreign.write(*entries), config=read_log_config(foreign.config(toml)), **settings)
+    def read_these(*entries: Entry, toml: str = "", **settings: Any) -> Any:
+        return read_log(foreign.write(*entries), config=read_log_config(foreign.config(toml)), **settings)
 
-    return read_log
+    return read_these

@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.logs.convert.rosbag import convert_rosbag
-from sonar_graph.logs.reading import read_sequence
+from sonar_graph.logs.reading import read_log
 
 T0_NS = 1_447_550_804_242_631_687
 STEP_NS = 20_000_001
@@ -204,7 +204,7 @@ def test_the_pool_run_of_sonia_is_a_sequence_with_a_few_lines_of_configuration(
     convert_rosbag(recordings / "bags" / "sonia_imu_dvl.bag", tmp_path / "new.mcap")
     table = {"topic": "/provider_dvl_PD0Packet", "type": "provider_dvl/msg/PD0Packet", "stamp": "log"}
     table["velocity"] = [f"velocity[{i}]" for i in range(3)]  # type: ignore[assignment]
-    sequence = read_sequence(tmp_path / "new.mcap", config=LogConfig.parse({"dvl": table}, "x"))
+    sequence = read_log(tmp_path / "new.mcap", config=LogConfig.parse({"dvl": table}, "x"))
     assert len(sequence.imu) == 9377
     assert len(sequence.dvl) == 643
     assert sequence.notes["log.dropped"] == "dvl: 1 with values that are not finite"
@@ -216,10 +216,10 @@ def test_the_pool_run_of_sonia_is_a_sequence_with_a_few_lines_of_configuration(
 def test_gravity_of_husky_is_on_the_side_and_a_rotation_puts_it_up(recordings: Path, tmp_path: Path) -> None:
     convert_rosbag(recordings / "bags" / "husky.bag", tmp_path / "new.mcap")
     topics = {"dvl": "/husky_velocity_controller/odom"}
-    plain = read_sequence(tmp_path / "new.mcap", topics=topics)
+    plain = read_log(tmp_path / "new.mcap", topics=topics)
     assert "gravity is felt along +y" in plain.notes["log.warnings"]
     turned = LogConfig.parse({"imu": {"rotation": [90, 0, 0]}}, "x")
-    sequence = read_sequence(tmp_path / "new.mcap", topics=topics, config=turned)
+    sequence = read_log(tmp_path / "new.mcap", topics=topics, config=turned)
     assert "gravity" not in sequence.notes["log.warnings"]
     assert "to the last bit in" in sequence.notes["log.warnings"]  # wheels at rest
     assert np.median(sequence.imu.specific_force[:, 2]) == pytest.approx(9.8, abs=0.1)
