@@ -8,17 +8,7 @@ from sonar_graph.devices.landmark_designs import (
 from sonar_graph.devices.sonar_lenses import DIDSON_BEAMS, aris_azimuths, didson_azimuths, even_azimuths
 
 __all__ = [
-    "DEFAULT_DESIGNS",
-    "DIDSON_BEAMS",
-    "LEAST_BRIGHT_DB",
-    "OWN_DESIGNS",
-    "UNMEASURED_M_S",
-    "LandmarkDesign",
-    "aris_azimuths",
-    "didson_azimuths",
-    "even_azimuths",
-    "in_numbers",
-    "is_partial",
-    "load_designs",
+    "DEFAULT_DESIGNS", "DIDSON_BEAMS", "LEAST_BRIGHT_DB", "LandmarkDesign", "OWN_DESIGNS", "UNMEASURED_M_S",
+    "aris_azimuths", "didson_azimuths", "even_azimuths", "in_numbers", "is_partial", "load_designs",
     "velocity_of_beams",
 ]

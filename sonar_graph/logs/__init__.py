@@ -13,23 +13,7 @@ from sonar_graph.logs.viewer_messages import PICTURES, Picture
 from sonar_graph.logs.writing import detection_messages, sonar_image_messages, write_log
 
 __all__ = [
-    "DETECTIONS",
-    "METADATA",
-    "PICTURES",
-    "Amended",
-    "LogSummary",
-    "PartialCalibration",
-    "Picture",
-    "TopicSummary",
-    "detection_messages",
-    "inspect_log",
-    "read_log",
-    "read_sonar_frames",
-    "sonar_image_messages",
-    "with_notes",
-    "write_amended",
-    "write_landmarks_csv",
-    "write_log",
-    "write_result",
-    "write_tum",
+    "Amended", "DETECTIONS", "LogSummary", "METADATA", "PICTURES", "PartialCalibration", "Picture", "TopicSummary",
+    "detection_messages", "inspect_log", "read_log", "read_sonar_frames", "sonar_image_messages", "with_notes",
+    "write_amended", "write_landmarks_csv", "write_result", "write_log", "write_tum",
 ]

@@ -8,13 +8,6 @@ from sonar_graph.recognition.recognition_record import (
 from sonar_graph.recognition.session import LandmarkRecogniser, recognise, with_detections
 
 __all__ = [
-    "SURE",
-    "DrawnFrame",
-    "LandmarkRecogniser",
-    "Recognition",
-    "calibrate",
-    "read_recognition",
-    "recognise",
-    "with_detections",
-    "write_recognition",
+    "DrawnFrame", "LandmarkRecogniser", "Recognition", "SURE", "calibrate", "read_recognition", "recognise",
+    "with_detections", "write_recognition",
 ]

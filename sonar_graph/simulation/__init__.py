@@ -8,14 +8,6 @@ from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmar
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 
 __all__ = [
-    "LANDMARKS_XY_M",
-    "BasinOptions",
-    "LandmarkOptions",
-    "MissionOptions",
-    "add_landmarks",
-    "cruise_speed",
-    "designs_laid",
-    "simulate_basin",
-    "simulate_basin_frames",
-    "simulate_mission",
+    "BasinOptions", "LANDMARKS_XY_M", "LandmarkOptions", "MissionOptions", "add_landmarks", "cruise_speed",
+    "designs_laid", "simulate_basin", "simulate_basin_frames", "simulate_mission",
 ]

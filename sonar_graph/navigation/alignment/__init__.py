@@ -12,21 +12,7 @@ from sonar_graph.navigation.alignment.reference_offset import match_reference_to
 from sonar_graph.navigation.alignment.time_offset import Estimate1D
 
 __all__ = [
-    "LONGEST_S",
-    "DvlMatch",
-    "Estimate1D",
-    "Estimates3D",
-    "InitialTilt",
-    "align_at_rest",
-    "align_in_motion",
-    "earth_rate_in_world",
-    "gravity_direction",
-    "longest_rest",
-    "match_dvl_to_imu",
-    "match_reference_to_imu",
-    "noise_densities",
-    "tilt_sigma",
-    "until_hole",
-    "up_direction",
-    "velocity_at_imu",
+    "DvlMatch", "Estimate1D", "Estimates3D", "InitialTilt", "LONGEST_S", "align_at_rest", "align_in_motion",
+    "earth_rate_in_world", "gravity_direction", "longest_rest", "match_dvl_to_imu", "match_reference_to_imu",
+    "noise_densities", "tilt_sigma", "until_hole", "up_direction", "velocity_at_imu",
 ]

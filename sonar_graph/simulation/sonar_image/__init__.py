@@ -6,13 +6,6 @@ from sonar_graph.simulation.sonar_image.imaging_sonar import SOUND_SPEED_M_S, Im
 from sonar_graph.simulation.sonar_image.scene import SeabedObject, place_landmark, scattered_objects
 
 __all__ = [
-    "SONARS",
-    "SOUND_SPEED_M_S",
-    "FrameSimulator",
-    "ImageOptions",
-    "ImagedFrames",
-    "SeabedObject",
-    "image_along",
-    "place_landmark",
-    "scattered_objects",
+    "FrameSimulator", "ImageOptions", "ImagedFrames", "SONARS", "SOUND_SPEED_M_S", "SeabedObject", "image_along",
+    "place_landmark", "scattered_objects",
 ]
