@@ -50,8 +50,8 @@ import numpy as np
 
 from sonar_graph.logs import read_log, read_sonar_frames, sonar_image_messages, write_log
 from sonar_graph.measurements import SonarFrames
-from sonar_graph.recognition import recognise
-from sonar_graph.recognition.session import one_by_one, step_of, view_of
+from sonar_graph.recognition import recognise_images
+from sonar_graph.recognition.session import one_by_one
 from sonar_graph.recognition.sonar_motion import SonarMotions
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin, simulate_basin_frames
@@ -111,7 +111,7 @@ class Clocks:
             yield
 
 
-def write_lane_log(path: Path, options: BasinOptions, clocks: Clocks) -> int:
+def write_basin(path: Path, options: BasinOptions, clocks: Clocks) -> int:
     """Simulate a basin and write it; the number of frames."""
     blocks = simulate_basin_frames(options)
     next(simulate_basin_frames(options, 1))  # compiles
@@ -162,7 +162,7 @@ def race(path: Path, sequence: Sequence, clocks: Clocks) -> int:
         for frame in seen:
             with clocks.timing("motion"):
                 motion = motions.at(int(frame.stamps_ns[0]))
-                known.append((step_of(motion), view_of(motion)))
+                known.append((motion.step(), motion.floor_view()))
         compared = [(number + k) % ACTAG_EVERY == 0 for k in range(len(seen))]
         number += len(seen)
         for frame, (step, view), is_compared in zip(seen, known, compared, strict=True):
@@ -187,7 +187,7 @@ def peak_rss_mb(path: Path) -> float:
 
 
 def measure(path: Path) -> None:
-    recognise(path, read_log(path))
+    recognise_images(path, read_log(path))
     status = Path("/proc/self/status").read_text(encoding="ascii")
     peak = re.search(r"VmHWM:\s+(\d+) kB", status)
     assert peak is not None
@@ -243,7 +243,7 @@ def measured(options: BasinOptions) -> dict[str, Any]:
     clocks = Clocks()
     with tempfile.TemporaryDirectory() as folder:
         path, shorter = Path(folder) / "basin.mcap", Path(folder) / "shorter.mcap"
-        frames = write_lane_log(path, options, clocks)
+        frames = write_basin(path, options, clocks)
         shorten(path, shorter, frames // 4)
         sequence = read_log(path)
         race(shorter, sequence, Clocks())

@@ -40,7 +40,7 @@ from sonar_graph.cli.arguments import (
 )
 from sonar_graph.cli.bench import write_report_of
 from sonar_graph.cli.outputs import Report, progress_bars, working, writable_folder, writable_log
-from sonar_graph.cli.recognise import no_images, our_recogniser, warn_of_other_designs
+from sonar_graph.cli.recognise import our_recogniser, warn_of_other_designs
 from sonar_graph.cli.simulate import write_basin
 from sonar_graph.errors import EstimatorError, LogError, UnknownEstimatorError
 
@@ -211,13 +211,13 @@ def _with_recognised(source: LogSource, sequence: Sequence) -> tuple[Sequence, R
     LogError
         When it is asked for and there are no images.
     """
-    from sonar_graph.recognition import recognise, with_detections
+    from sonar_graph.recognition import no_images, recognise_images, with_detections
 
     if sequence.detections is not None and not source.is_recognised_anew:
         return sequence, None
     topic = topic_choices(source.topics or []).get("sonar")
     with progress_bars() as progress:
-        found = recognise(
+        found = recognise_images(
             source.path,
             sequence,
             topic=topic,

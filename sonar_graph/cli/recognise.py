@@ -87,10 +87,10 @@ def recognise(
     choices, config = topic_choices(topics or []), read_config(log_config)
     others = {role: topic for role, topic in choices.items() if role != "sonar"}
     sequence = _read(log, calibration, others, log_config, salvage=salvage)
-    from sonar_graph.recognition import recognise as recognise_log
+    from sonar_graph.recognition import no_images, recognise_images
 
     with progress_bars() as progress:
-        found = recognise_log(
+        found = recognise_images(
             log,
             sequence,
             topic=choices.get("sonar"),
@@ -243,11 +243,6 @@ def _with_settings(kind: type[_Kind], values: dict[str, Any], whose: str) -> _Ki
         return kind.model_validate(values)
     except ValidationError as error:
         raise typer.BadParameter(f"settings of the {whose}: {faults_in(error, kind)}") from error
-
-
-def no_images(log: Path) -> str:
-    """Words for a log in which nothing can be recognised."""
-    return f"{log}: has no sonar images; `sonar-graph inspect {log}` lists what it has"
 
 
 def print_outcomes(found: Recognition, sequence: Sequence) -> None:

@@ -1,13 +1,15 @@
-"""Recognition."""
+"""Landmark detections from the sonar images of a log, their record, and the measuring of the recognition model."""
 
 # fmt: off
 from sonar_graph.recognition.calibrate import calibrate
 from sonar_graph.recognition.recognition_record import (
     SURE, DrawnFrame, Recognition, read_recognition, write_recognition,
 )
-from sonar_graph.recognition.session import LandmarkRecogniser, recognise, with_detections
+from sonar_graph.recognition.session import (
+    LandmarkRecogniser, no_images, recognise, recognise_images, with_detections,
+)
 
 __all__ = [
-    "DrawnFrame", "LandmarkRecogniser", "Recognition", "SURE", "calibrate", "read_recognition", "recognise",
-    "with_detections", "write_recognition",
+    "DrawnFrame", "LandmarkRecogniser", "Recognition", "SURE", "calibrate", "no_images", "read_recognition",
+    "recognise", "recognise_images", "with_detections", "write_recognition",
 ]

@@ -17,7 +17,7 @@ from sonar_graph.errors import CalibrationError, LogError
 from sonar_graph.logs import read_sonar_frames
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.recognition.session import RecognitionSession, one_by_one, without_leaps
+from sonar_graph.recognition.session import RecognitionSession, no_images
 from sonar_graph.sequence import Sequence as Run
 from sonar_graph.sonar import Confusion, LabelledFits, ObjectSighting, Recogniser, RecogniserParams, estimate_confusion
 
@@ -128,15 +128,11 @@ def calibrate(
         _require_common(path, run.true_landmarks.ids, gathered.ids)
         recogniser = Recogniser(run.calibration, designs, params)
         session = RecognitionSession(run, recogniser=recogniser, pictures=False)
-        blocks = read_sonar_frames(path, topic, config, salvage=salvage)
-        frames = (frame for block in blocks for frame in one_by_one(block))
-        for frame in without_leaps(frames, session.refuse):
-            stamp_ns = int(frame.stamps_ns[0])
-            session.take(frame)
+        for stamp_ns in session.run(read_sonar_frames(path, topic, config, salvage=salvage)):
             if recogniser.stamp_ns == stamp_ns:
                 _gather(gathered, log, recogniser, run, stamp_ns)
         if not session.result.frames:
-            raise LogError(f"{path}: has no sonar images; `sonar-graph inspect {path}` lists what it has")
+            raise LogError(no_images(path))
     names = ", ".join(path.name for path, _ in logs)
     kinds = "; ".join(dict.fromkeys(run.notes.get("ours", "recorded") for _, run in logs))
     return estimate_confusion(gathered.fits(), gathered.ids, {"logs": names, "what they are": kinds}, designs)

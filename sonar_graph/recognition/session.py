@@ -1,25 +1,29 @@
-"""From a log's sonar images to landmark detections.
+"""Landmark detections from the sonar images of a log, as `sonar-graph recognise` and `sonar-graph compare` make them.
 
-Images are streamed and never held together; motion, tilt and height come from the sequence's other sensors
-(`sonar_graph.recognition.sonar_motion`). Detections are computed once for a log and are the same for all estimators.
+    images -> one frame at a time -> motion, tilt and height at its stamp -> Recogniser.process -> LandmarkDetections
+
+Images are streamed. Motion, tilt and height come from the other sensors (`sonar_graph.recognition.sonar_motion`).
+Detections are made once for a log, and are the same for all estimators. Design: docs/design/0009-recognition.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
+from sonar_graph.calibration import Calibration
 from sonar_graph.devices import LandmarkDesign
-from sonar_graph.logs import read_sonar_frames
+from sonar_graph.errors import LogError, MeasurementError
+from sonar_graph.logs import PartialCalibration, read_log, read_sonar_frames
 from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.logs.mcap import TimeWindow
 from sonar_graph.measurements import LandmarkDetections, SonarFrames
 from sonar_graph.recognition.recognition_record import DrawnFrame, Recognition, as_jpeg, draw_fan
-from sonar_graph.recognition.sonar_motion import SonarMotion, SonarMotions
+from sonar_graph.recognition.sonar_motion import SonarMotions
 from sonar_graph.sequence import NS_PER_S
 from sonar_graph.sequence import Sequence as Run
 from sonar_graph.sonar import Fan, Fate, FloorView, Recogniser, RecogniserParams, SonarStep, with_lens
@@ -35,24 +39,109 @@ NO_ODOMETRY = "no IMU and Doppler log at its stamp"
 
 
 class LandmarkRecogniser(Protocol):
-    """What makes detections of frames: `Recogniser`, or another one in its place."""
+    """Interface of `Recogniser` and of anything used in its place."""
 
     fates: list[Fate]
-    """What became of everything in the frame last processed."""
+    """Outcome of every candidate, track and fault in the last frame."""
 
     def process(
         self, frame: SonarFrames, motion: SonarStep | None = None, view: FloorView | None = None
     ) -> LandmarkDetections | None:
-        """Take in one frame; what is recognised in it."""
+        """Detections in one frame."""
         ...
 
     def notes(self) -> dict[str, str]:
-        """How detections come about, for a log's notes."""
+        """Rule, designs and model, for the notes of a log."""
         ...
 
 
 def recognise(
-    log: Path,
+    images: Path | str | Iterable[SonarFrames],
+    sequence: Run | None = None,
+    *,
+    designs: Sequence[LandmarkDesign] | None = None,
+    params: RecogniserParams | None = None,
+    recogniser: LandmarkRecogniser | None = None,
+    calibration: Calibration | PartialCalibration | None = None,
+    topics: Mapping[str, str] | None = None,
+    config: LogConfig | None = None,
+    window: TimeWindow | None = None,
+    salvage: bool = False,
+) -> Run:
+    """Recognise landmarks in sonar images; give the sequence with the detections in it.
+
+    Parameters
+    ----------
+    images
+        An MCAP file with sonar images, or blocks of frames in the order of their stamps.
+    sequence
+        The other sensors, which give motion, tilt and height. None: read from the same log.
+    designs
+        Landmarks to look for; None: those that ship (`sonar_graph.devices.load_designs` reads others).
+    params
+        Settings of the `Recogniser`; None: the defaults.
+    recogniser
+        Another recogniser, such as `AcTagRecogniser`; then `designs` and `params` are not used.
+    calibration, config, window, salvage
+        As of `sonar_graph.logs.read_log`.
+    topics
+        Topics by role, as of `read_log`; the role of the images is ``sonar``.
+
+    Returns
+    -------
+    Sequence
+        A copy of the sequence; earlier detections are replaced, and the notes say how these were made.
+
+    Raises
+    ------
+    LogError
+        When the log has no sonar images, or cannot be read.
+    MeasurementError
+        When frames come without a sequence.
+    CalibrationError
+        When designs and measured model do not belong together.
+
+    See Also
+    --------
+    recognise_images : the same with a record of what became of every candidate and frame.
+
+    Examples
+    --------
+    The first minute in a simulated basin. From a log: ``recognise("dive.mcap").detections``.
+
+    >>> from itertools import islice
+    >>> from sonar_graph.recognition import recognise
+    >>> from sonar_graph.simulation import BasinOptions, simulate_basin, simulate_basin_frames
+    >>> options = BasinOptions(duration_s=240.0, laps=1)
+    >>> blocks = islice(simulate_basin_frames(options), 10)  # 32 frames each
+    >>> run = recognise((block.frames for block in blocks), simulate_basin(options))
+    >>> ids, probability = run.detections.most_probable()
+    """
+    others = {role: topic for role, topic in (topics or {}).items() if role != "sonar"}
+    if sequence is None:
+        if not isinstance(images, Path | str):
+            raise MeasurementError("recognise: frames need a sequence with IMU and DVL; give one, or the path of a log")
+        sequence = read_log(
+            Path(images), calibration=calibration, topics=others, config=config, window=window, salvage=salvage
+        )
+    found = recognise_images(
+        images,
+        sequence,
+        topic=(topics or {}).get("sonar"),
+        config=config,
+        designs=designs,
+        params=params,
+        recogniser=recogniser,
+        window=window,
+        salvage=salvage,
+    )
+    if found is None:
+        raise LogError(no_images(images) if isinstance(images, Path | str) else "recognise: no sonar frame was given")
+    return with_detections(sequence, found)
+
+
+def recognise_images(
+    images: Path | str | Iterable[SonarFrames],
     sequence: Run,
     *,
     topic: str | None = None,
@@ -64,50 +153,52 @@ def recognise(
     salvage: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> Recognition | None:
-    """Recognise landmarks in the sonar images of a log.
+    """Recognise landmarks in sonar images, with a record of what became of every candidate and frame.
 
     Parameters
     ----------
-    log
-        An MCAP file with sonar images.
+    images
+        An MCAP file with sonar images, or blocks of frames in order.
     sequence
-        The rest of the log.
+        The other sensors.
     topic, config
-        As of `read_sonar_frames`.
-    designs, params
-        As of `Recogniser`.
-    recogniser
-        In place of a `Recogniser` with those designs and params.
+        As of `sonar_graph.logs.read_sonar_frames`.
+    designs, params, recogniser
+        As of `recognise`.
     window, salvage
-        As of `read_log`, and as the sequence was read.
+        As of `sonar_graph.logs.read_log`, and as the sequence was read.
     progress
         Called with the number of frames done.
 
     Returns
     -------
     Recognition | None
-        None where the log has no images.
+        None where there are no images.
 
     Raises
     ------
     LogError
-        As `read_sonar_frames`.
+        As `sonar_graph.logs.read_sonar_frames`.
     CalibrationError
         When designs and measured model do not belong together.
     """
     session = RecognitionSession(sequence, designs, params, recogniser=recogniser)
-    blocks = read_sonar_frames(log, topic, config, window=window, salvage=salvage, refused=session.refuse)
-    frames = (frame for block in blocks for frame in one_by_one(block))
-    for frame in without_leaps(frames, session.refuse):
-        session.take(frame)
+    if isinstance(images, Path | str):
+        images = read_sonar_frames(Path(images), topic, config, window=window, salvage=salvage, refused=session.refuse)
+    for _ in session.run(images):
         if progress is not None:
             progress(session.result.frames)
     return session.finish() if session.result.frames else None
 
 
 def with_detections(sequence: Run, recognition: Recognition) -> Run:
-    """The sequence with what was recognised; its notes say how."""
+    """The sequence with the detections of a recognition, and its notes."""
     return replace(sequence, detections=recognition.detections, notes=sequence.notes | recognition.notes)
+
+
+def no_images(log: Path | str) -> str:
+    """Message for a log without sonar images."""
+    return f"{log}: has no sonar images; `sonar-graph inspect {log}` lists what it has"
 
 
 def one_by_one(block: SonarFrames) -> Iterator[SonarFrames]:
@@ -119,10 +210,10 @@ def one_by_one(block: SonarFrames) -> Iterator[SonarFrames]:
 
 
 def without_leaps(frames: Iterable[SonarFrames], refuse: Callable[[int, str], None]) -> Iterator[SonarFrames]:
-    """Frames, blocks of one, without those whose stamp is wrong by so much that the frames after would be late.
+    """Frames (blocks of one) without those whose stamp leaps ahead.
 
-    A frame that is ahead of the next one, while that one is ahead of all before, is refused: of the two stamps one is
-    wrong, and this way only one frame is lost.
+    A frame ahead of the next one is refused if that one is ahead of all before. One of the two stamps is wrong, and
+    this way only one frame is lost.
     """
     latest_ns, held = -1, None
     for frame in frames:
@@ -139,7 +230,15 @@ def without_leaps(frames: Iterable[SonarFrames], refuse: Callable[[int, str], No
 
 
 class RecognitionSession:
-    """Recognises frame by frame and gathers what came of it; what is kept does not grow with the images."""
+    """Recognition frame by frame; its memory does not grow with the number of images.
+
+    Parameters
+    ----------
+    sequence, designs, params, recogniser
+        As of `recognise_images`.
+    pictures
+        Draw frames for the report.
+    """
 
     def __init__(
         self,
@@ -153,28 +252,33 @@ class RecognitionSession:
         self._draws = pictures
         self.result = Recognition()
         self.recogniser = recogniser or Recogniser(sequence.calibration, designs, params)
-        self.motion: SonarMotion | None = None
-        self._image_scale = sequence.calibration.sonar.image
-        self._lens = sequence.calibration.sonar.lens
+        self._sonar = sequence.calibration.sonar
         self._motions = SonarMotions(sequence)
         self._blocks: list[LandmarkDetections] = []
         self._fan: Fan | None = None
         self._fan_of: tuple[object, object] = (None, None)
         self._picture_period_ns = PICTURE_PERIOD_NS
 
+    def run(self, blocks: Iterable[SonarFrames]) -> Iterator[int]:
+        """Take in blocks of frames; the stamp of each frame after it is taken."""
+        frames = (frame for block in blocks for frame in one_by_one(block))
+        for frame in without_leaps(frames, self.refuse):
+            self.take(frame)
+            yield int(frame.stamps_ns[0])
+
     def take(self, frame: SonarFrames) -> LandmarkDetections | None:
-        """One frame, a block of one."""
+        """Take in a block of one frame."""
         self.result.frames += 1
         stamp_ns = int(frame.stamps_ns[0])
         if not self._motions.covers(stamp_ns):
             reason = OUT_OF_ORDER if self._motions.passed(stamp_ns) else NO_ODOMETRY
             self._warn(stamp_ns, f"{NOT_USED}: {reason}")
             return None
-        self.motion = motion = self._motions.at(stamp_ns)
-        frame = with_lens(frame, self._lens)
-        view = view_of(motion)
+        motion = self._motions.at(stamp_ns)
+        frame = with_lens(frame, self._sonar.lens)
+        view = motion.floor_view()
         self.result.outcomes[NO_FLOOR] += view is None
-        found = self.recogniser.process(frame, step_of(motion), view)
+        found = self.recogniser.process(frame, motion.step(), view)
         is_used = True
         for fate in self.recogniser.fates:
             if np.isnan(fate.range_m) and fate.track < 0:
@@ -189,16 +293,16 @@ class RecognitionSession:
         return found
 
     def refuse(self, stamp_ns: int, reason: str) -> None:
-        """Count a message that is no frame."""
+        """Count a message that is not a usable frame."""
         self.result.frames += 1
         self._warn(stamp_ns, f"{NOT_USED}: {reason}")
 
     def finish(self) -> Recognition:
-        """All that was gathered."""
+        """The whole record."""
         result = self.result
         result.detections = LandmarkDetections.concatenate(self._blocks) if self._blocks else None
         result.notes = {"detections": f"recognised in {result.frames} sonar images"} | self.recogniser.notes()
-        result.outcomes = +result.outcomes  # without what never happened
+        result.outcomes = +result.outcomes  # drops zero counts
         result.warnings.sort(key=lambda row: row[0])
         if result.warnings:
             result.notes["detections.warnings"] = "; ".join(f"{n} x {reason}" for reason, n in result.warned().items())
@@ -210,7 +314,7 @@ class RecognitionSession:
         self.result.outcomes[reason] += 1
 
     def _draw(self, frame: SonarFrames, found: LandmarkDetections | None) -> None:
-        """A picture now and then; of too many every second one is given up."""
+        """Draw one frame a period; of too many pictures every second is dropped and the period doubled."""
         pictures, stamp_ns = self.result.pictures, int(frame.stamps_ns[0])
         if pictures and stamp_ns - pictures[-1].stamp_ns < self._picture_period_ns:
             return
@@ -218,20 +322,8 @@ class RecognitionSession:
             self._fan = Fan.of(frame.ranges_m, frame.azimuths_rad)
             self._fan_of = (id(frame.ranges_m), id(frame.azimuths_rad))
         ids, probabilities = found.most_probable() if found is not None else (np.empty(0, int), np.empty(0))
-        picture = draw_fan(self._image_scale.decibels(frame.intensity[0]), self._fan, found)
+        picture = draw_fan(self._sonar.image.decibels(frame.intensity[0]), self._fan, found)
         pictures.append(DrawnFrame(stamp_ns, as_jpeg(picture), tuple(ids.tolist()), tuple(probabilities.tolist())))
         if len(pictures) > MOST_PICTURES:
             del pictures[1::2]
             self._picture_period_ns *= 2
-
-
-def step_of(motion: SonarMotion) -> SonarStep | None:
-    """The motion since the frame before, as the tracker wants it."""
-    return None if motion.previous_T_sonar is None else SonarStep(motion.previous_T_sonar, motion.covariance)
-
-
-def view_of(motion: SonarMotion) -> FloorView | None:
-    """The floor, where the height over it is known."""
-    if motion.height_m is None or motion.height_m <= 0:
-        return None
-    return FloorView(motion.level_R_sonar, motion.height_m, motion.height_sigma_m, motion.tilt_sigma_rad)

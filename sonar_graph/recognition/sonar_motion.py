@@ -16,6 +16,7 @@ from sonar_graph.navigation import Odometry, motion_between, motion_between_node
 from sonar_graph.navigation.alignment import gravity_direction, velocity_at_imu
 from sonar_graph.navigation.preintegration import PreintegratedMotion, Preintegrator
 from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.sonar import FloorView, SonarStep
 
 GRAVITY_INTERVAL_NS = NS_PER_S
 """Shortest time over which accelerometers are averaged: the noise of velocity at its ends fades with its square."""
@@ -37,6 +38,16 @@ class SonarMotion:
     height_m: float | None
     """Of the sonar over the floor; None where it is not known."""
     height_sigma_m: float
+
+    def step(self) -> SonarStep | None:
+        """Motion since the frame before, for the tracker; None for the first frame."""
+        return None if self.previous_T_sonar is None else SonarStep(self.previous_T_sonar, self.covariance)
+
+    def floor_view(self) -> FloorView | None:
+        """The floor; None where the height over it is not known or not positive."""
+        if self.height_m is None or self.height_m <= 0:
+            return None
+        return FloorView(self.level_R_sonar, self.height_m, self.height_sigma_m, self.tilt_sigma_rad)
 
 
 class _Tilt:

@@ -1,7 +1,6 @@
 """Elimination of noisy data: candidates that persist where the motion predicts them are tracks of something real.
 
-A track is a point at rest (`sonar_graph.sonar.track_filter`) with a probability p that something persistent is behind
-it. The
+A track is a point at rest (`track_filter`) with a probability p that something persistent is behind it. The
 motion between two frames is handed in. After it, candidates z_m meet tracks j, whose innovations have the density
 ``N_mj = N(z_m; h(q_j), S_j)`` in (range, azimuth)::
 

@@ -17,7 +17,7 @@ from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.writing import sonar_image_messages, write_log
 from sonar_graph.measurements import SonarFrames
 from sonar_graph.recognition.recognition_record import Recognition
-from sonar_graph.recognition.session import LEAPT, NO_FLOOR, recognise
+from sonar_graph.recognition.session import LEAPT, NO_FLOOR, recognise_images
 
 if TYPE_CHECKING:
     from tests.imaged_lane import Lane
@@ -40,7 +40,7 @@ def frames_of(lane: Lane) -> list[SonarFrames]:
 def recognised(lane: Lane, log: Path, messages: list[Outgoing], **settings: object) -> Recognition:
     write_log(log, lane.sequence, messages)
     salvage = {"salvage": settings["salvage"]} if "salvage" in settings else {}
-    found = recognise(log, read_log(log, **salvage), **settings)
+    found = recognise_images(log, read_log(log, **salvage), **settings)
     assert found is not None
     return found
 
@@ -114,18 +114,18 @@ def test_of_two_sonars_one_must_be_chosen_before_any_image_is_read(lane, tmp_pat
     write_log(log, lane.sequence, messages)
     sequence, done = read_log(log), []
     with pytest.raises(LogError, match=r"2 topics fit: /other/image, /sonar/image; choose one: --topic sonar="):
-        recognise(log, sequence, progress=done.append)
+        recognise_images(log, sequence, progress=done.append)
     assert done == []
-    assert recognise(log, sequence, topic=TOPIC).frames == COUNT
+    assert recognise_images(log, sequence, topic=TOPIC).frames == COUNT
     with pytest.raises(MissingTopicError, match="/none was chosen but is not in the log"):
-        recognise(log, sequence, topic="/none")
+        recognise_images(log, sequence, topic="/none")
 
 
 def test_only_the_part_that_was_read_is_recognised(lane, tmp_path):
     log = tmp_path / "log.mcap"
     write_log(log, lane.sequence, [message(f) for f in frames_of(lane)])
     window = TimeWindow(Instant.parse("2"), Instant.parse("8"))
-    found = recognise(log, read_log(log, window=window), window=window)
+    found = recognise_images(log, read_log(log, window=window), window=window)
     assert 28 <= found.frames <= 31
     assert not [reason for _, reason in found.warnings if "out of order" in reason]
 
@@ -140,7 +140,7 @@ def test_a_hole_is_refused_and_with_salvage_named_and_the_rest_is_used(lane, tmp
         read_log(log)
     sequence = read_log(log, salvage=True)
     assert "lost" in sequence.notes["log.damage"]
-    found = recognise(log, sequence, salvage=True)
+    found = recognise_images(log, sequence, salvage=True)
     assert COUNT / 2 < found.frames < COUNT
 
 
@@ -148,7 +148,7 @@ def test_a_log_without_depth_and_floor_is_recognised_in_the_image_plane(lane, tm
     log = tmp_path / "log.mcap"
     bare = replace(lane.sequence, depth=None, calibration=lane.sequence.calibration.model_copy(update={"floor": None}))
     write_log(log, bare, [message(f) for f in frames_of(lane)])
-    found = recognise(log, read_log(log))
+    found = recognise_images(log, read_log(log))
     assert found.frames == COUNT
     assert found.warnings == []
     assert found.outcomes[NO_FLOOR] == COUNT

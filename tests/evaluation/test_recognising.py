@@ -11,15 +11,17 @@ import numpy as np
 import pytest
 
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.errors import LogError, MeasurementError
 from sonar_graph.evaluation.comparison import compare
 from sonar_graph.logs.reading import read_log
 from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, SonarFrames
 from sonar_graph.recognition.recognition_record import Recognition
-from sonar_graph.recognition.session import RecognitionSession, one_by_one, recognise, with_detections
+from sonar_graph.recognition.session import RecognitionSession, one_by_one, recognise, recognise_images, with_detections
 from sonar_graph.sonar.beliefs import IdentityParams
 from sonar_graph.sonar.confusion import confusion_for
 from sonar_graph.sonar.recogniser import REPORTED, RecogniserParams
+from tests.imaged_lane import TOPIC
 
 if TYPE_CHECKING:
     from tests.imaged_lane import Lane
@@ -123,13 +125,30 @@ def test_a_log_gives_what_its_images_give(lane, lane_log, lane_recognition):
     counts: list[int] = []
     sequence = read_log(lane_log)
     assert sequence.detections is None
-    result = recognise(lane_log, sequence, progress=counts.append)
+    result = recognise_images(lane_log, sequence, progress=counts.append)
     assert counts == list(range(1, len(lane.frames) + 1))
     assert result.frames == len(lane.frames)
     assert result.outcomes == lane_recognition.outcomes
     for name in ("stamps_ns", "range_m", "azimuth_rad", "range_azimuth_cov", "candidate_ids", "id_probability"):
         expected = getattr(lane_recognition.detections, name)
         np.testing.assert_allclose(getattr(result.detections, name), expected, atol=1e-4, err_msg=name)
+
+
+def test_recognise_gives_the_sequence_with_the_detections_of_its_log_or_frames(lane, tmp_path):
+    frames = [lane.one(k) for k in range(FRAMES)]
+    expected = with_detections(lane.sequence, recognised(lane, frames))
+    log = lane.write(tmp_path / "lane.mcap", frames)
+    for found in (recognise(frames, lane.sequence), recognise(log), recognise(str(log), topics={"sonar": TOPIC})):
+        assert_same_detections(found.detections, expected.detections)
+        assert found.notes["detections"] == f"recognised in {FRAMES} sonar images"
+        np.testing.assert_array_equal(found.imu.stamps_ns, lane.sequence.imu.stamps_ns)
+    write_log(tmp_path / "bare.mcap", lane.sequence)
+    with pytest.raises(LogError, match=r"bare\.mcap: has no sonar images; `sonar-graph inspect"):
+        recognise(tmp_path / "bare.mcap")
+    with pytest.raises(LogError, match="no sonar frame"):
+        recognise([], lane.sequence)
+    with pytest.raises(MeasurementError, match="need a sequence"):
+        recognise(frames)
 
 
 def test_rows_account_for_every_frame_and_detection(lane, lane_recognition):
@@ -147,7 +166,7 @@ def test_rows_account_for_every_frame_and_detection(lane, lane_recognition):
 
 def test_a_log_without_images_gives_nothing(lane, tmp_path):
     write_log(tmp_path / "bare.mcap", lane.sequence)
-    assert recognise(tmp_path / "bare.mcap", lane.sequence) is None
+    assert recognise_images(tmp_path / "bare.mcap", lane.sequence) is None
 
 
 def test_both_estimators_are_given_the_same_detections(lane, lane_recognition, monkeypatch):
@@ -277,7 +296,7 @@ def test_a_frame_that_is_not_finite_is_named_in_a_warning_and_not_used(lane, wit
 
 def recognised_in_log(lane: Lane, folder: Path, frames: list[SonarFrames]) -> Recognition:
     log = lane.write(folder / "bad.mcap", frames)
-    return recognise(log, read_log(log))
+    return recognise_images(log, read_log(log))
 
 
 def test_a_bad_first_frame_costs_hardly_more_than_itself(lane):

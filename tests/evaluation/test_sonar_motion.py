@@ -19,7 +19,6 @@ from sonar_graph.calibration import (
     Start,
 )
 from sonar_graph.measurements import Depth, Dvl, Imu
-from sonar_graph.recognition.session import step_of, view_of
 from sonar_graph.recognition.sonar_motion import SonarMotion, SonarMotions, level_from_up
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.sensors import dvl_readings, imu_readings, regular_stamps, seconds_since_start
@@ -274,13 +273,13 @@ def test_without_floor_or_depth_the_height_is_not_known(exact):
     ):
         (motion,) = along(run, frames_of(run, 1))
         assert motion.height_m is None
-        assert view_of(motion) is None
+        assert motion.floor_view() is None
 
 
 def test_the_recogniser_is_given_the_motion_and_the_view(exact):
     first, second = along(exact, frames_of(exact, 2))
-    assert step_of(first) is None
-    step, view = step_of(second), view_of(second)
+    assert first.step() is None
+    step, view = second.step(), second.floor_view()
     assert step is not None
     assert view is not None
     assert step.previous_T_sonar is second.previous_T_sonar
@@ -288,7 +287,7 @@ def test_the_recogniser_is_given_the_motion_and_the_view(exact):
     np.testing.assert_array_equal(view.level_R_sonar, second.level_R_sonar)
     said = (view.height_m, view.height_sigma_m, view.tilt_sigma_rad)
     assert said == (second.height_m, second.height_sigma_m, second.tilt_sigma_rad)
-    assert view_of(replace(second, height_m=-0.1)) is None
+    assert replace(second, height_m=-0.1).floor_view() is None
 
 
 def test_only_instants_with_odometry_and_in_order_are_covered(exact):
