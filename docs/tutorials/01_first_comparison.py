@@ -9,7 +9,7 @@ Run it in any folder: ``python 01_first_comparison.py``. It takes some seconds a
 
 from pathlib import Path
 
-from sonar_graph.evaluation import compare, write_comparison, write_viewer_files
+from sonar_graph.evaluation import compare
 from sonar_graph.logs import read_log, write_log
 from sonar_graph.report import write_report
 from sonar_graph.simulation import BasinOptions, simulate_basin
@@ -54,12 +54,8 @@ for landmark, position, covariance in zip(landmarks.ids, landmarks.positions, la
     print(f"{landmark:8} {position[0]:10.3f} {position[1]:9.3f} {sigma:13.3f}")
 
 # Everything as files, and one page that shows it.
-folder = Path("comparison")
-folder.mkdir(exist_ok=True)
-write_comparison(comparison, folder)
-write_viewer_files(comparison, sequence, folder)
-write_report(comparison, folder / "report.html")
-print(f"\nreport: {folder / 'report.html'}")
+page = write_report(comparison, "comparison")
+print(f"\nreport: {page}")
 
 # The page from top to bottom: what was found, in a sentence; the scores, each with its protocol under it; the map, true
 # and estimated, with 95 % ellipses; errors over time within the three sigma that the estimator claimed; NEES over time;

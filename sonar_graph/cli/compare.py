@@ -199,7 +199,7 @@ def _compare_log(
     with progress_bars() as progress:
         comparison = compare_runs(sequence, names, overrides, rate_hz=rate_hz, progress=progress)
     comparison = replace(comparison, recognition=recognition)
-    _write_results(comparison, sequence, output)
+    _write_results(comparison, output)
     return comparison
 
 
@@ -253,21 +253,19 @@ def _check_settings(names: list[str], overrides: dict[str, dict[str, Any]]) -> N
         make_params(estimator, overrides.get(name, {}), name)
 
 
-def _write_results(comparison: Comparison, sequence: Sequence, folder: Path) -> None:
+def _write_results(comparison: Comparison, folder: Path) -> None:
     from sonar_graph.evaluation import write_comparison, write_viewer_files
 
     with working("writing results"):
         write_comparison(comparison, folder)
-        write_viewer_files(comparison, sequence, folder)
+        write_viewer_files(comparison, folder)
 
 
 def _write_report(comparison: Comparison, folder: Path) -> Path:
-    from sonar_graph.report import write_report
+    from sonar_graph.report import write_page
 
-    page = folder / "report.html"
     with working("drawing"):
-        write_report(comparison, page)
-    return page
+        return write_page(comparison, folder)
 
 
 def _print_summary(comparison: Comparison) -> None:

@@ -387,7 +387,7 @@ def _check_folder_name(name: str) -> None:
 RESULT_LOG = "result.mcap"
 
 
-def write_viewer_files(comparison: Comparison, sequence: Sequence, folder: Path) -> None:
+def write_viewer_files(comparison: Comparison, folder: Path) -> None:
     """Write ``result.mcap``, ``result.foxglove.json`` and ``result.rviz`` beside what `write_comparison` wrote.
 
     Raises
@@ -409,4 +409,4 @@ def write_viewer_files(comparison: Comparison, sequence: Sequence, folder: Path)
     drawn = comparison.recognition.pictures if comparison.recognition else []
     pictures = [Picture(picture.stamp_ns, picture.jpeg) for picture in drawn]
     about = comparison.environment | settings
-    write_result(folder / RESULT_LOG, sequence, estimates, about, attachments, pictures)
+    write_result(folder / RESULT_LOG, comparison.sequence, estimates, about, attachments, pictures)

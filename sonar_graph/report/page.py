@@ -25,7 +25,10 @@ from sonar_graph.evaluation import (
     RunResult,
     format_value,
     repeats_published,
+    write_comparison,
+    write_viewer_files,
 )
+from sonar_graph.files import replacing
 from sonar_graph.report.figure_style import ESTIMATOR_COLOURS, inline_svg
 from sonar_graph.report.figures import (
     error_figure,
@@ -215,13 +218,60 @@ def _in_numbers(comparison: Comparison, name: str) -> str:
 TEMPLATE = "report.html"
 
 
-def write_report(comparison: Comparison, path: Path) -> None:
-    """Write the page that shows a comparison.
+PAGE = "report.html"
+
+
+def write_report(comparison: Comparison, folder: str | Path) -> Path:
+    """Write a comparison into a folder: all the files that ``sonar-graph compare`` writes.
+
+    The folder is made where it does not exist. It gets ``report.html``, ``comparison.json``, ``sequence.npz``,
+    ``runs/NAME/`` for each estimator, the pictures of recognised landmarks, and ``result.mcap`` with its layouts for
+    Foxglove and RViz. An earlier comparison in the folder is replaced; other files stay.
+
+    Parameters
+    ----------
+    comparison
+        From `sonar_graph.evaluation.compare`.
+    folder
+        Path of the folder.
+
+    Returns
+    -------
+    Path of ``report.html``.
+
+    Raises
+    ------
+    EvaluationError
+        When the name of an estimator cannot be the name of a folder.
+    LogError
+        When ``result.mcap`` cannot be written, or a stamp does not fit into a ROS 2 message.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from sonar_graph.evaluation import compare
+    >>> from sonar_graph.report import write_report
+    >>> from sonar_graph.simulation import MissionOptions, simulate_mission
+    >>> comparison = compare(simulate_mission(MissionOptions(duration_s=10.0)), ["dead-reckoning"])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_report(comparison, folder).name
+    'report.html'
+    """
+    folder = Path(folder)
+    write_comparison(comparison, folder)
+    write_viewer_files(comparison, folder)
+    return write_page(comparison, folder)
+
+
+def write_page(comparison: Comparison, folder: Path) -> Path:
+    """Write only ``report.html``, beside the other files of a comparison, and return its path.
 
     The page needs nothing but itself: figures are inline SVG in the page's colours, style is inline, there is no
     script. Links lead to the files beside it (``comparison.json``, ``result.mcap``, ``runs/NAME/``).
     """
-    path.write_text(render_report(comparison), encoding="utf-8")
+    with replacing(folder / PAGE) as partial:
+        partial.write_text(render_report(comparison), encoding="utf-8")
+    return folder / PAGE
 
 
 def render_report(comparison: Comparison) -> str:

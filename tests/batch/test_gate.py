@@ -11,8 +11,7 @@ import pytest
 from sonar_graph.batch.gate import bless, gate, log_ratios, worse_groups
 from sonar_graph.batch.recorded import RecordedBatch
 from sonar_graph.errors import EvaluationError
-
-from .recorded_batches import ASKED, LOGS, changed, drawn_batch, failed, with_failures
+from tests.recorded_batches import ASKED, LOGS, changed, drawn_batch, failed, with_failures
 
 ATE = "causal.ate_se2_m"
 

@@ -10,8 +10,7 @@ import pytest
 
 from sonar_graph.batch.recorded import ALL_LOGS, RESULTS, is_batch, read_batch
 from sonar_graph.errors import EvaluationError
-
-from .recorded_batches import LOGS, drawn_batch, with_failures, write_batch
+from tests.recorded_batches import LOGS, drawn_batch, with_failures, write_batch
 
 
 def test_a_batch_is_read_as_it_was_written(tmp_path):

@@ -20,8 +20,7 @@ from sonar_graph.evaluation.scored_instants import (
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import LANDMARKS_XY_M, BasinOptions, simulate_basin
 from sonar_graph.states import LandmarkMap
-
-from .synthetic import basin_comparison
+from tests.synthetic import basin_comparison
 
 DIFFERENCES_M = [[-0.19, -0.07], [-0.26, -0.01], [-0.15, 0.15], [-0.14, 0.18]]
 """As Table I prints them, in brackets."""

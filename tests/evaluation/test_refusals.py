@@ -25,9 +25,9 @@ from sonar_graph.report.page import render_report
 from sonar_graph.report.warnings import refusal_lines
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Estimate, Refusal, RefusedRow
+from tests.synthetic import basin_comparison, with_run
 
 from .conftest import straight_sequence
-from .synthetic import basin_comparison, with_run
 
 HELD_NS = 3 * 10**9, 3 * 10**9 + 500_000_000
 ESTIMATORS = list(installed_estimators())

@@ -27,7 +27,7 @@ def folder(
     sequence = make_sequence()
     comparison = compare(sequence, ["offset", "broken"], {"offset": {"offset_m": 0.4}})
     write_comparison(comparison, tmp_path)
-    write_viewer_files(comparison, sequence, tmp_path)
+    write_viewer_files(comparison, tmp_path)
     return tmp_path
 
 

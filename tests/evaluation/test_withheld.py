@@ -23,9 +23,8 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam.landmarks.sighting import SightingFactors
 from sonar_graph.states import Estimate
-
-from .synthetic import basin_comparison, with_run
-from .test_console import printed
+from tests.report.test_console import printed
+from tests.synthetic import basin_comparison, with_run
 
 MESSAGE = "landmark 3, from keyframe 1 at 1.000 s: 1 range; open: z; an elevation is missing; withheld"
 

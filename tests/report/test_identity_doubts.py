@@ -13,8 +13,8 @@ from sonar_graph.report.landmark_table import landmark_table
 from sonar_graph.report.page import render_report
 from sonar_graph.report.warnings import ABSURD, doubt_of_identities, nameless_landmarks
 from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionLog, LandmarkMap, Outcome
+from tests.synthetic import IDS, LANDMARKS, basin_comparison, only, with_run
 
-from .synthetic import IDS, LANDMARKS, basin_comparison, only, with_run
 from .test_console import printed
 
 SIGMA_M = 0.02

@@ -15,8 +15,7 @@ from sonar_graph.errors import EvaluationError
 from sonar_graph.report.batch_page import render_batch, write_batch_report
 from sonar_graph.report.batch_summary import lost_told, marked, missing_told
 from sonar_graph.report.batch_tables import all_tests, failure_table
-
-from .recorded_batches import ESTIMATORS, LOGS, drawn_batch, with_failures, with_missing, write_batch
+from tests.recorded_batches import ESTIMATORS, LOGS, drawn_batch, with_failures, with_missing, write_batch
 
 ATE = "causal.ate_se2_m"
 

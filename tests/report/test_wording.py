@@ -12,8 +12,7 @@ from sonar_graph.evaluation.results import Score, format_value
 from sonar_graph.evaluation.scores import detection_scores
 from sonar_graph.report.wording import NO_DETECTIONS, consistency, display_value, finding, lost_runs, with_unit
 from sonar_graph.states import DetectionLog, Outcome
-
-from .synthetic import basin_comparison, only, with_failure, with_run, with_score
+from tests.synthetic import basin_comparison, only, with_failure, with_run, with_score
 
 MINUS = "\N{MINUS SIGN}"
 KEY = "causal.ate_se2_m"

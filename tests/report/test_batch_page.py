@@ -10,8 +10,7 @@ import pytest
 
 from sonar_graph.batch.recorded import read_batch
 from sonar_graph.report.batch_page import render_batch, write_batch_report
-
-from .recorded_batches import LOGS, drawn_batch, failed, with_failures, write_batch
+from tests.recorded_batches import LOGS, drawn_batch, failed, with_failures, write_batch
 
 
 @pytest.fixture(scope="module")

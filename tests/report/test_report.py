@@ -11,11 +11,10 @@ import pytest
 
 from sonar_graph.evaluation.results import Comparison, Score
 from sonar_graph.evaluation.scored_instants import published_maps
-from sonar_graph.report.page import render_report, write_report
+from sonar_graph.report.page import render_report, write_page
 from sonar_graph.report.tables import score_blocks
 from sonar_graph.states import Outcome
-
-from .synthetic import REFUSALS, basin_comparison, only, with_failure, with_run, with_score
+from tests.synthetic import REFUSALS, basin_comparison, only, with_failure, with_run, with_score
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
 REASON = "gave up at 12.5 s <script>alert(1)</script> & more"
@@ -237,7 +236,7 @@ def test_text_and_lines_stand_out_from_the_paper(html, scheme):
 
 @pytest.mark.slow
 def test_a_long_mission_still_makes_a_small_page(tmp_path: Path):
-    write_report(basin_comparison(4078), tmp_path / "report.html")
+    write_page(basin_comparison(4078), tmp_path)
     assert (tmp_path / "report.html").stat().st_size < 3_000_000
 
 

@@ -12,8 +12,7 @@ from sonar_graph.evaluation.scored_instants import published_maps
 from sonar_graph.report.console import published_counterpart, summary
 from sonar_graph.report.landmark_table import landmark_table
 from sonar_graph.report.wording import display_value
-
-from .synthetic import basin_comparison, with_failure, with_score
+from tests.synthetic import basin_comparison, with_failure, with_score
 
 
 def printed(comparison: Comparison, width: int = 80, shown: Any = None) -> str:

@@ -16,8 +16,7 @@ from typing import Any
 import pytest
 
 from sonar_graph.report.batch_page import write_batch_report
-
-from .recorded_batches import LOGS, drawn_batch, with_failures
+from tests.recorded_batches import LOGS, drawn_batch, with_failures
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

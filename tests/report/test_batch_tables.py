@@ -33,8 +33,7 @@ from sonar_graph.report.batch_tables import (
 )
 from sonar_graph.report.tables import Cell, Column, Table, as_csv, as_latex, latex_text, write_tables
 from sonar_graph.report.wording import quantile_text
-
-from .recorded_batches import LOGS, METRICS, changed, drawn_batch, with_failures
+from tests.recorded_batches import LOGS, METRICS, changed, drawn_batch, with_failures
 
 ATE = metrics_of(["causal.ate_se2_m"])[0]
 

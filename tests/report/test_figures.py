@@ -27,8 +27,7 @@ from sonar_graph.report.figures import (
 )
 from sonar_graph.report.maps import map_figure, paths_cut_off
 from sonar_graph.states import Trajectory
-
-from .synthetic import basin_comparison, only, with_failure, with_run
+from tests.synthetic import basin_comparison, only, with_failure, with_run
 
 FIGURES = [map_figure, error_figure, yaw_figure, nees_figure, innovation_figure, nis_figure, timing_figure]
 

@@ -11,8 +11,7 @@ from sonar_graph.evaluation.results import Comparison
 from sonar_graph.recognition.session import with_detections
 from sonar_graph.report.figures import recognition_content, reliability_figure
 from sonar_graph.report.page import render_report
-
-from .synthetic import basin_comparison
+from tests.synthetic import basin_comparison
 
 
 @pytest.fixture(scope="module")

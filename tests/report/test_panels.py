@@ -4,8 +4,7 @@ import pytest
 
 from sonar_graph.report.batch_figures import WIDTH_IN, folded, log_panels, spread_out
 from sonar_graph.report.figure_style import colour
-
-from .recorded_batches import drawn_batch
+from tests.recorded_batches import drawn_batch
 
 
 @pytest.mark.parametrize(("logs", "shape"), [(1, (1, 1)), (2, (2, 1)), (3, (2, 2)), (4, (2, 3)), (9, (3, 3))])

@@ -12,8 +12,7 @@ from sonar_graph.evaluation.scored_instants import map_instants, published_maps
 from sonar_graph.report.maps import LARGEST_ELLIPSE, enlargement, growth_figure, growth_instants, seen_from_above
 from sonar_graph.report.page import illustrations
 from sonar_graph.states import LandmarkMap
-
-from .synthetic import basin_comparison, with_failure
+from tests.synthetic import basin_comparison, with_failure
 
 
 def grown(instants: int = 240, sigma_m: float = 0.05) -> Comparison:

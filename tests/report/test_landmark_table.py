@@ -9,8 +9,7 @@ from sonar_graph.evaluation.results import ABSENT, Comparison
 from sonar_graph.evaluation.scored_instants import published_maps
 from sonar_graph.report.landmark_table import MOST_LANDMARKS, PAPER, landmark_table
 from sonar_graph.states import LandmarkMap, Trajectory
-
-from .synthetic import basin_comparison, only, with_run
+from tests.synthetic import basin_comparison, only, with_run
 
 MINUS = "\N{MINUS SIGN}"
 UNKNOWN = np.full((3, 3), np.nan)

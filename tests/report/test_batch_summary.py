@@ -15,8 +15,7 @@ from sonar_graph.report.batch_summary import DIFFERENT, HIGHER, LOWER, head_metr
 from sonar_graph.report.batch_tables import accuracy_table, all_tests
 from sonar_graph.report.tables import Cell, Table, as_csv, as_latex
 from sonar_graph.report.wording import quantile_text
-
-from .recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, with_failures
+from tests.recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, with_failures
 
 ATE = metrics_of(["causal.ate_se2_m"])[0]
 
