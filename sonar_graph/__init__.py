@@ -1,11 +1,25 @@
-"""Landmark SLAM for underwater vehicles.
+"""Landmark SLAM for underwater vehicles: iSAM2 and EKF-SLAM on the same sonar, IMU and Doppler log.
 
-Vocabulary
-----------
-Every docstring in this package uses these words, frames and units without repeating them.
+From a log to a report::
+
+    import sonar_graph as sg
+
+    sequence = sg.read_log("dive.mcap")  # IMU, DVL, depth, detections, truth where there is one
+    sequence = sg.recognise("dive.mcap")  # or: with landmarks recognised in its sonar images
+    result = sg.run_estimator(sequence, "isam2")  # one estimator
+    comparison = sg.compare(sequence, ["isam2", "ekf-slam", "dead-reckoning"])  # several, on the same measurements
+    sg.write_report(comparison, "comparison")  # page, numbers, trajectories, log for viewers
+
+The rooms: `sonar_graph.navigation` (motion from IMU and DVL), `sonar_graph.slam` (models, factors, iSAM2),
+`sonar_graph.sonar` (recognition in images), `sonar_graph.simulation`, `sonar_graph.evaluation` (scores),
+`sonar_graph.testing` (checks for your own estimators and factors). Filters are in the package `baselines`.
+
+Conventions
+-----------
+Every docstring in this package uses these frames, names and units without repeating them.
 
 Frames (REP-103)
-    ``world``  local, z up, x and y horizontal. Where the data set or the start pose puts its origin.
+    ``world``  local, z up, x and y horizontal. The data set or the start pose sets its origin.
     ``body``   fixed to the vehicle: x forward, y left, z up.
     ``imu``, ``dvl``  the sensors' own axes, x forward, y left, z up unless their mounting says otherwise.
     ``sonar``  x along the centre beam; azimuth positive to the left, elevation positive up.
@@ -15,7 +29,7 @@ Names
     ``world_R_body``   its rotation.
     ``*_m``, ``*_rad``, ``*_ns``  units, wherever they could be mistaken.
     ``*_sigma``        a standard deviation; ``*_cov`` a covariance; never one in the name of the other.
-    ``*_density``      the root spectral density of white noise: sigma of its integral over T is ``density * sqrt(T)``.
+    ``*_density``      root spectral density of white noise: the sigma of its integral over T is ``density * sqrt(T)``.
 
 Units
     Metres, radians, seconds, m/s, rad/s, m/s². Time stamps are integer nanoseconds of the sensor's own clock;
@@ -29,6 +43,107 @@ Tangent space
 Azimuth and range
     For a point ``q`` in the sonar frame: ``range = |q|`` and ``azimuth = atan2(q_y, q_x)``.
     Elevation is not measured; it is known only to lie within the sonar's aperture.
+
+Glossary
+--------
+block           rows of one sensor as columns with a stamp each; n >= 1
+bottom lock     state in which a DVL measures velocity over the bottom
+candidate       region of one sonar frame that stands out of its background
+causal          known at an instant from what was measured until then; *smoothed*: known at the end
+design          shape, size and brightness of an artificial landmark
+detection       range, azimuth and identity posterior of a landmark in one sonar frame
+DVL             Doppler velocity log
+DVL gap         time without bottom lock, bridged by accelerometers or a random walk
+epoch           stamp of a DVL row at which motions begin and end
+gate            threshold on the squared Mahalanobis distance of an innovation
+identity        number of a landmark; the recogniser gives a posterior over identities
+IMU hole        time without IMU rows
+innovation      measured minus predicted
+keyframe        pose in the graph
+lever arm       translation of a mounting, in the body frame
+NEES, NIS       normalised squared error of a state, of an innovation; 1 per degree of freedom if consistent
+preintegration  motion between two instants with covariance and bias derivatives, independent of the start state
+sequence        a run: calibration, measurements, truth
+sighting        a detection tied to a keyframe, and the factors made of it
+suite, batch    file that says which runs are wanted; the runs and their table
+track           succession of detections of one object
+window          part of the graph that is still optimised
 """
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sonar_graph.batch import run_suite
+    from sonar_graph.calibration import Calibration
+    from sonar_graph.estimator import Estimator, load_estimator
+    from sonar_graph.evaluation import Comparison, RunResult, compare, run_estimator
+    from sonar_graph.logs import inspect_log, read_log, write_log
+    from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections, Measurements, SonarFrames
+    from sonar_graph.recognition import recognise
+    from sonar_graph.report import write_report
+    from sonar_graph.sequence import Sequence
+    from sonar_graph.simulation import simulate_basin
+    from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
+
 __version__ = "0.1.0"
+__all__ = [
+    "Calibration",
+    "Comparison",
+    "Depth",
+    "DetectionLog",
+    "Dvl",
+    "Estimate",
+    "Estimator",
+    "Imu",
+    "LandmarkDetections",
+    "LandmarkMap",
+    "Measurements",
+    "RunResult",
+    "Sequence",
+    "SonarFrames",
+    "Trajectory",
+    "compare",
+    "inspect_log",
+    "load_estimator",
+    "read_log",
+    "recognise",
+    "run_estimator",
+    "run_suite",
+    "simulate_basin",
+    "write_log",
+    "write_report",
+]
+
+_PLACES = {
+    "batch": ("run_suite",),
+    "calibration": ("Calibration",),
+    "estimator": ("Estimator", "load_estimator"),
+    "evaluation": ("Comparison", "RunResult", "compare", "run_estimator"),
+    "logs": ("inspect_log", "read_log", "write_log"),
+    "measurements": ("Depth", "Dvl", "Imu", "LandmarkDetections", "Measurements", "SonarFrames"),
+    "recognition": ("recognise",),
+    "report": ("write_report",),
+    "sequence": ("Sequence",),
+    "simulation": ("simulate_basin",),
+    "states": ("DetectionLog", "Estimate", "LandmarkMap", "Trajectory"),
+}
+_ROOMS = {"navigation", "numerics", "slam", "sonar", "devices", "diagnosis", "testing", "errors"} | set(_PLACES)
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name, or a room, at its first use: ``import sonar_graph`` alone loads nothing."""
+    for module, names in _PLACES.items():
+        if name in names:
+            found = getattr(import_module(f"sonar_graph.{module}"), name)
+            globals()[name] = found
+            return found
+    if name in _ROOMS:
+        return import_module(f"sonar_graph.{name}")
+    raise AttributeError(f"sonar_graph has no {name!r}; it has: {', '.join(__all__)}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__, *_ROOMS])

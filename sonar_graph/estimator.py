@@ -1,4 +1,4 @@
-"""The contract of an estimator, and how estimators are found.
+"""Contract of an estimator, and discovery of installed estimators.
 
 An estimator is any class with the methods of `Estimator`, announced by its package under the entry-point group
 ``sonar_graph.estimators``::
@@ -6,9 +6,7 @@ An estimator is any class with the methods of `Estimator`, announced by its pack
     [project.entry-points."sonar_graph.estimators"]
     my-filter = "my_package.my_module:MyFilter"
 
-It then takes part in ``sonar-graph compare`` under that name. `sonar_graph.testing.laws` tests the contract.
-
-What a filter has said so far: one estimate for each instant that was asked for.
+It then takes part in ``sonar-graph compare`` under that name. `sonar_graph.testing.check_estimator` tests the contract.
 """
 
 from __future__ import annotations
@@ -29,62 +27,71 @@ ENTRY_POINT_GROUP = "sonar_graph.estimators"
 
 @runtime_checkable
 class Estimator(Protocol):
-    """Turns measurements into poses and landmarks.
+    """Protocol of a class that turns measurements into poses and landmarks.
 
-    The outcome must not depend on how the measurements are cut into calls, only on the instants ``end_ns`` at which
-    estimates are asked for being returned.
+    Results must not depend on how the measurements are cut into calls.
+
+    Examples
+    --------
+    Run an estimator by hand, as `sonar_graph.run_estimator` does:
+
+    >>> from sonar_graph import load_estimator
+    >>> from sonar_graph.testing import small_world
+    >>> world = small_world()
+    >>> estimator = load_estimator("dead-reckoning")(world.calibration)
+    >>> for step in world.replay(world.instants(rate_hz=1.0)):
+    ...     estimate = estimator.process(step)
+    >>> len(estimator.trajectory())
+    20
     """
 
     Params: ClassVar[type[Section]]
-    """Settings of this estimator; all have defaults."""
+    """Settings of this estimator; each has a default."""
 
     def __init__(self, calibration: Calibration, params: Any = None) -> None: ...
 
     def process(self, measurements: Measurements) -> Estimate | None:
-        """Take in what was measured and return the causal estimate at ``measurements.end_ns``.
-
-        None before the first instant with IMU and DVL.
-        """
+        """Process measurements; causal estimate at ``end_ns``, None before the first instant with IMU and DVL."""
         ...
 
     def trajectory(self) -> Trajectory:
-        """The best that is known now about every instant at which `process` returned an estimate."""
+        """Best present estimate of the pose at every instant at which `process` returned an estimate."""
         ...
 
     def landmarks(self) -> LandmarkMap:
-        """The best that is known now about every landmark."""
+        """Best present estimate of every landmark."""
         ...
 
     def detections(self) -> DetectionLog:
-        """What became of each detection so far."""
+        """Outcome of every detection so far."""
         ...
 
 
 @runtime_checkable
 class TellsRefusedRows(Protocol):
-    """What an estimator may have beside the contract: it names the rows of IMU and Doppler log that it does not use."""
+    """Optional part of the contract: an estimator that names the rows of IMU and Doppler log that it does not use."""
 
     def refused_rows(self) -> list[RefusedRow]:
-        """All so far."""
+        """Refused rows so far."""
         ...
 
 
 def refused_rows_of(estimator: Estimator) -> list[RefusedRow]:
-    """Rows that an estimator names as not used; none where it does not tell."""
+    """Rows that an estimator names as not used; empty where it does not implement `TellsRefusedRows`."""
     return list(estimator.refused_rows()) if isinstance(estimator, TellsRefusedRows) else []
 
 
 @runtime_checkable
 class TellsWithheld(Protocol):
-    """What an estimator may have beside the contract: it says what it could not use for want of something else."""
+    """Optional part of the contract: an estimator that names measurements which it could not use yet."""
 
     def withheld(self) -> list[str]:
-        """All so far, or the newest of it: what, and what was missing, in one line each."""
+        """Messages, a line each: what is withheld, and what is missing."""
         ...
 
 
 def withheld_of(estimator: Estimator) -> list[str]:
-    """What an estimator says that it could not use; nothing where it does not tell."""
+    """Messages about withheld measurements; empty where an estimator does not implement `TellsWithheld`."""
     return list(estimator.withheld()) if isinstance(estimator, TellsWithheld) else []
 
 
@@ -97,7 +104,7 @@ def installed_estimators() -> dict[str, EntryPoint]:
 
 
 def load_estimator(name: str) -> type[Estimator]:
-    """The class behind an estimator's name.
+    """Class of an installed estimator.
 
     Raises
     ------
@@ -105,6 +112,12 @@ def load_estimator(name: str) -> type[Estimator]:
         Listing the names that exist.
     EstimatorError
         When its package cannot be imported or does not keep the contract.
+
+    Examples
+    --------
+    >>> from sonar_graph import load_estimator
+    >>> load_estimator("ekf-slam").__name__
+    'EkfSlam'
     """
     installed = installed_estimators()
     if name not in installed:
@@ -135,13 +148,13 @@ def make_params(estimator: type[Estimator], overrides: dict[str, Any], name: str
 
 
 class CausalEstimates:
-    """Estimates in the order of their instants."""
+    """Causal estimates of a filter in order of time, one an instant."""
 
     def __init__(self) -> None:
         self._estimates: list[Estimate] = []
 
     def keep(self, estimate: Estimate) -> None:
-        """Append; an estimate for the instant of the last one takes its place, an earlier one is passed over."""
+        """Append an estimate; one for the same instant replaces the last, an earlier one is ignored."""
         last_ns = self._estimates[-1].stamp_ns if self._estimates else None
         if last_ns is None or estimate.stamp_ns > last_ns:
             self._estimates.append(estimate)
@@ -149,5 +162,5 @@ class CausalEstimates:
             self._estimates[-1] = estimate
 
     def trajectory(self) -> Trajectory:
-        """All of them."""
+        """Trajectory through all estimates."""
         return Trajectory.from_estimates(self._estimates)

@@ -1,9 +1,4 @@
-"""Files that appear whole or not at all.
-
-JSON that every reader accepts: no NaN, no infinity.
-
-Logs that appear whole or not at all.
-"""
+"""Atomic writing of files, and JSON without NaN or infinity."""
 
 from __future__ import annotations
 
@@ -19,10 +14,7 @@ from sonar_graph.errors import EvaluationError, LogError
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A path beside ``path`` to write to; it takes the name when the block ends without an error.
-
-    Its suffix is that of ``path``, for writers that look at it.
-    """
+    """Temporary path with the suffix of ``path``, which replaces ``path`` when the block ends without an error."""
     partial = path.with_name(f".partial-{path.name}")
     try:
         yield partial
@@ -32,18 +24,18 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write whole or not at all; what is not a finite number becomes null."""
+    """Write JSON atomically; NaN and infinity become null."""
     with replacing(path) as partial:
         partial.write_text(strict_json(content) + "\n", "utf-8")
 
 
 def strict_json(content: dict[str, Any]) -> str:
-    """The text; what is not a finite number becomes null."""
+    """JSON text; NaN and infinity become null."""
     return json.dumps(_strict(content), indent=2, allow_nan=False, ensure_ascii=False)
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The object in a file.
+    """JSON object in a file.
 
     Raises
     ------
@@ -71,7 +63,7 @@ def _strict(value: Any) -> Any:
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[BinaryIO]:
-    """A file beside ``path`` to write to, with the folder made; it takes the name when the block ends without an error.
+    """Open a temporary file beside ``path``, which replaces ``path`` when the block ends without an error.
 
     Raises
     ------

@@ -1,9 +1,4 @@
-"""What ranges, identities and their posteriors must be, wherever they come from.
-
-A posterior is from 0 to 1, and so is its sum over the identities of a row. An identity becomes part of a variable's key
-in a graph, which has 56 bits for it.
-
-What the sensors said: columnar blocks of n >= 1 samples.
+"""Measurements as columnar blocks of n >= 1 rows, one class for each kind of sensor.
 
 A live caller passes blocks of one row, a replay passes all rows between two instants: the same code, without a
 Python call for every IMU sample. Rows are sorted by stamp. `Measurements` bundles the blocks that arrived since the
@@ -23,42 +18,43 @@ from numpy.typing import NDArray
 from sonar_graph.errors import MeasurementError
 
 ROUNDING = 1e-6
-"""By which a sum of posteriors may exceed 1: single precision."""
+"""Tolerance of a sum of posteriors above 1: single precision."""
 FIRST_TOO_LARGE_ID = 2**56
+"""An identity is part of a variable's key in a graph, which has 56 bits for it."""
 FARTHEST_M = 100_000.0
-"""No sonar sees farther, and the square of a range must remain a number."""
+"""Largest range accepted; no sonar sees farther."""
 ID_ADVICE = "number the landmarks from 0 on, such as 1, 2, 3, where identities are made (a hash has no place)"
 
 
 def no_posterior(probability: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Rows, shape (n, k), that are none: below 0, above 1 in sum, or no number, shape (n,)."""
+    """Mask, shape (n,), of rows of ``probability``, shape (n, k), that are below 0, NaN, or above 1 in sum."""
     with np.errstate(invalid="ignore", over="ignore"):
         is_one = (probability >= 0).all(axis=1) & (probability.sum(axis=1) <= 1.0 + ROUNDING)
     return np.asarray(~is_one)
 
 
 def too_large(ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Rows, shape (n, k), with an identity for which a key has no room, shape (n,)."""
+    """Mask, shape (n,), of rows of ``ids``, shape (n, k), with an identity of 2^56 or more."""
     return np.asarray((ids >= FIRST_TOO_LARGE_ID).any(axis=1))
 
 
 def possible_ranges(range_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which ranges a sonar can have measured, shape (n,)."""
+    """Mask of ranges above 0 and at most `FARTHEST_M`, shape (n,)."""
     return np.asarray((range_m > 0) & (range_m <= FARTHEST_M))
 
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 NO_TRACK = -1
-"""Track number of a detection that stands for itself."""
+"""Track number of a detection that belongs to no track."""
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Rows with a stamp each; the base of every measurement.
+    """Base class of the measurements: rows with a stamp each.
 
-    Every field is an array whose first axis runs over the rows. Constructing a block copies nothing that already has
-    the right type, and checks the rules below.
+    Every field is an array whose first axis runs over the rows. The constructor converts types where needed (without a
+    copy where not) and checks shapes, finiteness and the order of stamps.
 
     Raises
     ------
@@ -70,9 +66,9 @@ class Block:
     stamps_ns: Ints
     """Time of validity, shape (n,), integer nanoseconds, not decreasing."""
     finite_columns: ClassVar[tuple[str, ...]] = ()
-    """Columns that have no meaning for "not measured"."""
+    """Columns in which NaN is refused; in others it means "not measured"."""
     row_shapes: ClassVar[dict[str, tuple[int, ...]]] = {}
-    """Shape of a row of each column whose rows have a fixed one."""
+    """Shape of one row of each column with a fixed row shape."""
 
     def __post_init__(self) -> None:
         name = type(self).__name__
@@ -82,8 +78,13 @@ class Block:
             column, is_whole = field.name, str(field.type) == "Ints"
             values = _numbers(f"{name}.{column}", np.asarray(getattr(self, column)), is_whole=is_whole)
             row_shape = self.row_shapes.get(column, values.shape[1:])
+            if values.shape[:1] == (n,) and values.shape[1:] != row_shape:
+                raise MeasurementError(f"{name}.{column}: expected shape {(n, *row_shape)}, not {values.shape}")
             if values.shape != (n, *row_shape):
-                raise MeasurementError(f"{name}.{column}: {_wrong_shape(values.shape, n, row_shape)}")
+                advice = "; transpose it" * (values.shape[1:] == (n,))
+                raise MeasurementError(
+                    f"{name}.{column}: shape {values.shape} has not one row for each of {n} stamps{advice}"
+                )
             object.__setattr__(self, column, values)
         for finite in self.finite_columns:
             whole = np.isfinite(getattr(self, finite).reshape(n, -1)).all(axis=1)
@@ -100,15 +101,11 @@ class Block:
     def rows(self, selection: slice | NDArray[np.bool_] | Ints) -> Self:
         """The block with only the selected rows."""
         if isinstance(selection, slice) and (selection.step or 1) > 0 and len(self.stamps_ns[selection]):
-            return self._run_of_rows(selection)
+            block = object.__new__(type(self))  # a run of rows of a valid block is valid
+            for name, column in vars(self).items():
+                object.__setattr__(block, name, column[selection])
+            return block
         return type(self)(*(getattr(self, field.name)[selection] for field in fields(self)))
-
-    def _run_of_rows(self, selection: slice) -> Self:
-        """A run of rows of a valid block is valid: made without checking again."""
-        block = object.__new__(type(self))
-        for name, column in vars(self).items():
-            object.__setattr__(block, name, column[selection])
-        return block
 
     def between(self, after_ns: int, until_ns: int) -> Self | None:
         """The rows with ``after_ns < stamp <= until_ns``, or None where there is none."""
@@ -122,7 +119,7 @@ class Block:
 
 
 def _numbers(place: str, values: NDArray[Any], *, is_whole: bool) -> NDArray[Any]:
-    """A column as it is kept; whole numbers in floating point would be cut without a word."""
+    """Column as int64 or float64; refuses floats where integers are expected, instead of truncating them."""
     kinds, expected = ("iu", "integers") if is_whole else ("iufb", "numbers")
     if values.dtype.kind not in kinds and values.size:
         raise MeasurementError(f"{place}: expected {expected}, not {values.dtype}")
@@ -131,14 +128,8 @@ def _numbers(place: str, values: NDArray[Any], *, is_whole: bool) -> NDArray[Any
     return values.astype(np.int64 if is_whole else np.float64, copy=False)
 
 
-def _wrong_shape(shape: tuple[int, ...], n: int, row_shape: tuple[int, ...]) -> str:
-    if shape[:1] == (n,):
-        return f"expected shape {(n, *row_shape)}, not {shape}"
-    return f"shape {shape} has not one row for each of {n} stamps" + "; transpose it" * (shape[1:] == (n,))
-
-
 def _in_nanoseconds(name: str, stamps: NDArray[Any]) -> Ints:
-    """The stamps of a block as they are kept; seconds in floating point would be cut to whole nanoseconds."""
+    """Stamps as int64; refuses floats, which would be seconds."""
     if stamps.size == 0:
         raise MeasurementError(f"{name}: a block needs at least one row; leave the block out instead")
     if stamps.dtype.kind not in "iu":
@@ -153,44 +144,94 @@ def _in_nanoseconds(name: str, stamps: NDArray[Any]) -> Ints:
 
 @dataclass(frozen=True, eq=False)
 class Imu(Block):
-    """Inertial measurements in the IMU's frame."""
+    """Inertial measurements in the IMU's frame.
+
+    Examples
+    --------
+    Two samples of a vehicle at rest, 10 ms apart:
+
+    >>> import numpy as np
+    >>> imu = Imu(
+    ...     stamps_ns=np.array([0, 10_000_000]),
+    ...     angular_velocity=np.zeros((2, 3)),
+    ...     specific_force=np.tile([0.0, 0.0, 9.81], (2, 1)),
+    ... )
+    >>> len(imu)
+    2
+    """
 
     angular_velocity: Floats
     """Shape (n, 3), rad/s."""
     finite_columns = ("angular_velocity",)
     row_shapes: ClassVar[dict[str, tuple[int, ...]]] = {"angular_velocity": (3,), "specific_force": (3,)}
     specific_force: Floats
-    """What the accelerometers feel, acceleration minus gravity: +9.81 on z at rest; NaN: not measured.
-    Shape (n, 3), m/s²."""
+    """Acceleration minus gravity, shape (n, 3), m/s²: +9.81 on z at rest; NaN: not measured."""
 
 
 @dataclass(frozen=True, eq=False)
 class Dvl(Block):
-    """Doppler velocity over the bottom, in the DVL's frame. Rows without bottom lock are not in the block."""
+    """Velocity over the bottom by the Doppler log, in the DVL's frame; rows without bottom lock are left out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> dvl = Dvl(
+    ...     stamps_ns=np.array([0, 200_000_000]),
+    ...     velocity=np.array([[0.15, 0.0, 0.0], [0.16, 0.0, 0.0]]),
+    ...     velocity_cov=np.full((2, 3, 3), np.nan),
+    ... )
+    >>> dvl.between(0, 200_000_000).velocity
+    array([[0.16, 0.  , 0.  ]])
+    """
 
     velocity: Floats
     """Shape (n, 3), m/s."""
     finite_columns = ("velocity",)
     row_shapes: ClassVar[dict[str, tuple[int, ...]]] = {"velocity": (3,), "velocity_cov": (3, 3)}
     velocity_cov: Floats
-    """Shape (n, 3, 3), m²/s²; NaN where the log does not say: the calibration's value then holds."""
+    """Shape (n, 3, 3), m²/s²; NaN where unknown: the calibration's value then holds."""
 
 
 @dataclass(frozen=True, eq=False)
 class Depth(Block):
-    """Height of the pressure sensor's port in the world, from pressure."""
+    """Height of the pressure sensor's port in the world, from pressure.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> depth = Depth(stamps_ns=np.array([0]), z_m=np.array([-0.5]), variance_m2=np.array([1e-4]))
+    >>> depth.z_m
+    array([-0.5])
+    """
 
     z_m: Floats
     """World z of the port (negative below the surface of a world with its origin there), shape (n,)."""
     finite_columns = ("z_m",)
     row_shapes: ClassVar[dict[str, tuple[int, ...]]] = {"z_m": (), "variance_m2": ()}
     variance_m2: Floats
-    """Shape (n,); NaN where the log does not say: the calibration's value then holds."""
+    """Shape (n,); NaN where unknown: the calibration's value then holds."""
 
 
 @dataclass(frozen=True, eq=False)
 class LandmarkDetections(Block):
-    """Recognised landmarks in sonar frames; one row a detection, rows of one frame share a stamp."""
+    """Landmarks recognised in sonar frames: one row per detection; rows of one frame share a stamp.
+
+    Examples
+    --------
+    One detection, 2 m ahead and 10° to the left, probably landmark 3:
+
+    >>> import numpy as np
+    >>> detections = LandmarkDetections(
+    ...     stamps_ns=np.array([0]),
+    ...     range_m=np.array([2.0]),
+    ...     azimuth_rad=np.array([np.deg2rad(10.0)]),
+    ...     range_azimuth_cov=np.diag([0.02**2, 0.009**2])[None],
+    ...     candidate_ids=np.array([[3, 4]]),
+    ...     id_probability=np.array([[0.95, 0.04]]),
+    ... )
+    >>> detections.most_probable()
+    (array([3]), array([0.95]))
+    """
 
     range_m: Floats
     """Slant range, shape (n,)."""
@@ -199,24 +240,21 @@ class LandmarkDetections(Block):
     finite_columns = ("range_m", "azimuth_rad")
     row_shapes: ClassVar[dict[str, tuple[int, ...]]] = {"range_m": (), "azimuth_rad": (), "range_azimuth_cov": (2, 2)}
     range_azimuth_cov: Floats
-    """Covariance of (range, azimuth), shape (n, 2, 2); NaN where the log does not say."""
+    """Covariance of (range, azimuth), shape (n, 2, 2); NaN where unknown: the calibration's value then holds."""
     candidate_ids: Ints
     """Identities that the recogniser considers, shape (n, k); -1 fills unused places."""
     id_probability: Floats
-    """Posterior of each candidate, shape (n, k). What is missing to 1 is "none of the known landmarks"."""
+    """Posterior of each candidate, shape (n, k), in sum at most 1; the rest is "none of the known landmarks"."""
     track: Ints = dataclasses.field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    """Which uninterrupted watch of one object each row belongs to, shape (n,); `NO_TRACK` (-1): of none.
+    """Track of each row, shape (n,); `NO_TRACK` (-1) or left out: no track.
 
-    Rows of one track show the same object, and each has the posterior that all of the track's evidence so far gives:
-    the last row's is the best. Left out: no row belongs to a track."""
+    Rows of one track show the same object. Each row has the posterior given all evidence of the track so far, so the
+    last row's is the best."""
 
     def __post_init__(self) -> None:
         if not len(self.track):
             object.__setattr__(self, "track", np.full(len(self.stamps_ns), NO_TRACK, dtype=np.int64))
         super().__post_init__()
-        self._check_identities()
-
-    def _check_identities(self) -> None:
         for column in ("candidate_ids", "id_probability"):
             shape = getattr(self, column).shape
             if len(shape) != 2 or shape != self.candidate_ids.shape or not shape[1]:
@@ -235,7 +273,7 @@ class LandmarkDetections(Block):
             raise MeasurementError(f"LandmarkDetections.{column}: row {row} ({values}) has {fault}")
 
     def frames(self) -> Iterator[LandmarkDetections]:
-        """The rows of each sonar frame, that is of each stamp."""
+        """Rows of each sonar frame, that is of each stamp."""
         if self.stamps_ns[0] == self.stamps_ns[-1]:
             yield self
             return
@@ -244,7 +282,7 @@ class LandmarkDetections(Block):
             yield self.rows(slice(first, last))
 
     def most_probable(self) -> tuple[Ints, Floats]:
-        """Identity with the highest posterior and that posterior, shapes (n,) and (n,)."""
+        """Identity with the highest posterior, and that posterior, shapes (n,) and (n,)."""
         best = np.argmax(self.id_probability, axis=1)
         row = np.arange(len(self))
         return self.candidate_ids[row, best], self.id_probability[row, best]
@@ -254,25 +292,36 @@ class LandmarkDetections(Block):
 class SonarFrames:
     """Polar images of an imaging sonar, as recorded; frames of one block share their beams and range bins.
 
-    ``intensity`` has shape (n, beams, bins), any integer or real type; row b holds the samples of the beam at
-    ``azimuths_rad[b]``, its column r those at ``ranges_m[r]``. Azimuths are ``atan2(y, x)`` in the sonar's frame
-    (x along its axis, y to its left): positive to the left, in radians. What samples mean (decibels or amplitudes, and
-    their full scale) says ``calibration.sonar.image``. A frame alone is a block with n = 1: ``image[None]``.
+    ``intensity[i, b, r]`` is the sample of frame i in the beam at ``azimuths_rad[b]`` and the bin at ``ranges_m[r]``.
+    ``calibration.sonar.image`` says whether samples are decibels or amplitudes, and their full scale. A single frame
+    is a block with n = 1: ``image[None]``.
 
     Raises
     ------
     MeasurementError
         When there is no frame, or the shapes do not belong together.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> frames = SonarFrames(
+    ...     stamps_ns=np.array([0]),
+    ...     intensity=np.zeros((1, 96, 512), np.uint8),
+    ...     ranges_m=np.linspace(1.26, 2.51, 512),
+    ...     azimuths_rad=np.linspace(0.25, -0.25, 96),
+    ... )
+    >>> len(frames)
+    1
     """
 
     stamps_ns: Ints
-    """When each ping was sent, shape (n,), not decreasing."""
+    """Time at which each ping was sent, shape (n,), integer nanoseconds, not decreasing."""
     intensity: NDArray[Any]
     """Shape (n, beams, bins), in the sonar's own type and scale."""
     ranges_m: Floats
     """Middle of each range bin, shape (bins,)."""
     azimuths_rad: Floats
-    """Of each beam, positive to the left, in the order of the image, shape (beams,)."""
+    """Azimuth of each beam, ``atan2(y, x)`` in the sonar frame, positive to the left, shape (beams,)."""
 
     def __post_init__(self) -> None:
         expected = (len(self.stamps_ns), len(self.azimuths_rad), len(self.ranges_m))
@@ -289,16 +338,21 @@ class SonarFrames:
 
 @dataclass(frozen=True)
 class Measurements:
-    """All that was measured since the previous call, up to and including ``end_ns``.
+    """Input of `Estimator.process`: all that was measured since the previous call, up to and including ``end_ns``.
 
     Raises
     ------
     MeasurementError
         When ``end_ns`` is no integer.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> Measurements(end_ns=10_000_000, depth=Depth(np.array([5_000_000]), np.array([-0.5]), np.array([np.nan]))).imu
     """
 
     end_ns: int
-    """The instant up to which the blocks are complete, and for which an estimate is wanted."""
+    """Instant up to which the blocks are complete, and for which an estimate is wanted."""
     imu: Imu | None = None
     dvl: Dvl | None = None
     depth: Depth | None = None

@@ -1,4 +1,4 @@
-"""A recorded or simulated run: what logs and the simulator produce and estimators consume."""
+"""A recorded or simulated run: produced by logs and simulator, consumed by estimators."""
 
 from __future__ import annotations
 
@@ -17,7 +17,22 @@ NS_PER_S = 1_000_000_000
 
 @dataclass(frozen=True, eq=False)
 class Sequence:
-    """Calibration, time-ordered measurements, and truth where there is one."""
+    """Calibration, measurements in order of time, and truth where it is known.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph import Calibration, Dvl, Imu
+    >>> stamps_ns = np.arange(0, 2_000_000_001, 100_000_000)
+    >>> n = len(stamps_ns)
+    >>> imu = Imu(stamps_ns, np.zeros((n, 3)), np.tile([0.0, 0.0, 9.81], (n, 1)))
+    >>> dvl = Dvl(stamps_ns, np.tile([0.15, 0.0, 0.0], (n, 1)), np.full((n, 3, 3), np.nan))
+    >>> straight = Sequence("straight", Calibration(), imu, dvl)
+    >>> straight.duration_s
+    2.0
+    >>> [step.end_ns for step in straight.replay(straight.instants(rate_hz=1.0))]
+    [1000000000, 2000000000]
+    """
 
     name: str
     """Short, for tables and file names."""
@@ -27,10 +42,10 @@ class Sequence:
     depth: Depth | None = None
     detections: LandmarkDetections | None = None
     truth: Trajectory | None = None
-    """Reference poses of the body; where they come from is in `notes`."""
+    """Reference poses of the body; `notes` says where they come from."""
     true_landmarks: LandmarkMap | None = None
     notes: dict[str, str] = field(default_factory=dict)
-    """Provenance, by subject: data set, licence, what was simulated, seed."""
+    """Provenance by subject: data set, licence, options of a simulation, seed."""
 
     @property
     def start_ns(self) -> int:
@@ -48,12 +63,12 @@ class Sequence:
         return (self.end_ns - self.start_ns) * 1e-9
 
     def instants(self, rate_hz: float) -> Ints:
-        """Equally spaced instants after the start until the end, shape (n,), nanoseconds.
+        """Equally spaced instants from one step after the start until the end, shape (n,), nanoseconds.
 
         Raises
         ------
         MeasurementError
-            When the rate is none, or the sequence is shorter than one step.
+            When the rate is not positive, or the sequence is shorter than one step.
         """
         if not 0 < rate_hz <= NS_PER_S:
             raise MeasurementError(
@@ -68,10 +83,7 @@ class Sequence:
         return instants
 
     def replay(self, instants_ns: Ints) -> Iterator[Measurements]:
-        """Measurements cut at the instants: each item holds what came after the previous instant, up to this one.
-
-        The first item holds everything up to the first instant. Every estimator sees the same items in the same order.
-        """
+        """Measurements between successive instants; the first item holds everything up to the first instant."""
         after_ns = np.iinfo(np.int64).min
         for end_ns in instants_ns.tolist():
             yield Measurements(

@@ -1,4 +1,4 @@
-"""What is wrong with settings that a user gave, in words that name each field and those that exist."""
+"""Sections of settings, and messages about wrong ones that name each field and those that exist."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _MISFIT = "misfit"
 
 
 def faults_in(error: ValidationError, model: type[BaseModel]) -> str:
-    """Every wrong field with what was expected, in one line.
+    """Message naming every wrong field and the expected value, in one line.
 
     Parameters
     ----------
     error
-        Of validating plain values.
+        From validating plain values.
     model
-        What they were validated against.
+        Model against which they were validated.
     """
     errors = error.errors()
     short = dict.fromkeys(_list_of(e) for e in errors if _is_short_list(e))
@@ -34,12 +34,12 @@ def faults_in(error: ValidationError, model: type[BaseModel]) -> str:
 
 
 def misfits(model: type[BaseModel], reasons: dict[str, str]) -> ValidationError:
-    """The error to raise in a model's validator where fields do not fit each other.
+    """Error for a model's validator to raise where fields exclude each other.
 
     Parameters
     ----------
     reasons
-        By field, so that a file's line can be told; each is shown as it is.
+        Message for each field, so that the line in a file can be named.
     """
     found = [
         InitErrorDetails(type=PydanticCustomError(_MISFIT, "{reason}", {"reason": reason}), loc=(name,), input=None)
@@ -65,14 +65,14 @@ def _describe(error: ErrorDetails, model: type[BaseModel]) -> str:
 
 
 def unknown_field(place: Place, model: type[BaseModel]) -> str:
-    """That a field does not exist, which one may be meant, and which its section has."""
+    """Message that a field does not exist, with the most similar one and those that exist."""
     section = section_at(model, place[:-1])
     names = list(section.model_fields) if section else []
     return f"{_path(place)}: there is no such field{choice(str(place[-1]), names, _path(place[:-1]) or 'it')}"
 
 
 def choice(name: str, known: Iterable[str], owner: str = "") -> str:
-    """After a name that does not exist: which one may be meant, and all that its owner has, or that there are."""
+    """Message after an unknown name: the most similar known name, and all that exist."""
     names = list(known)
     similar = max(names, key=partial(_similarity, name), default="")
     is_meant = _similarity(name, similar) >= _LEAST_SIMILARITY
@@ -81,7 +81,7 @@ def choice(name: str, known: Iterable[str], owner: str = "") -> str:
 
 
 def _similarity(name: str, known: str) -> float:
-    """1 for what is meant beyond doubt; a beginning of the name counts, since units at its end are forgotten."""
+    """Similarity from 0 to 1; the beginning of a name counts as well, since units at its end are forgotten."""
     return max(SequenceMatcher(None, name, text).ratio() for text in (known, known[: len(name)]))
 
 
@@ -105,12 +105,12 @@ def _shown(value: Any) -> str:
 
 
 def _path(place: Place) -> str:
-    """Names with dots; what pydantic adds for the branch of a union is left out."""
+    """Dotted names, without what pydantic adds for the branch of a union."""
     return ".".join(str(part) for part in place if isinstance(part, int) or part.isidentifier())
 
 
 def section_at(model: type[BaseModel], place: Place) -> type[BaseModel] | None:
-    """The section at a place within a model; None where there is none."""
+    """Section at a place within a model, or None."""
     section: type[BaseModel] | None = model
     for name in place:
         if section is None:

@@ -1,4 +1,4 @@
-"""What an estimator says: poses in time, landmarks, what became of each detection, and which rows were refused."""
+"""Output of an estimator: poses, landmarks, the outcome of each detection, and refused rows."""
 
 from __future__ import annotations
 
@@ -18,22 +18,44 @@ from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats, Ints
 
 FIRST_ANONYMOUS_ID = 3_000_000_000
-"""Landmarks without a name get this identity and the following ones; those of designs end at 2^31 - 1."""
+"""First identity given to landmarks that the recogniser has not named; identities of designs end at 2^31 - 1."""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A causal estimate: what could be known at ``stamp_ns`` from what was measured until then."""
+    """Causal estimate of the pose at ``stamp_ns``, from what was measured until then.
+
+    Examples
+    --------
+    >>> import gtsam, numpy as np
+    >>> estimate = Estimate(stamp_ns=0, world_T_body=gtsam.Pose3(), covariance=1e-6 * np.eye(6))
+    >>> estimate.world_T_body.translation()
+    array([0., 0., 0.])
+    """
 
     stamp_ns: int
     world_T_body: gtsam.Pose3
     covariance: Floats
-    """Of the body-frame perturbation [rotation, translation], shape (6, 6)."""
+    """Covariance of the body-frame perturbation [rotation, translation], shape (6, 6), rad and m."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses of the body in the world over time, with their covariances where known."""
+    """Poses of the body in the world over time, with their covariances where known.
+
+    Examples
+    --------
+    Two seconds of straight motion, and the pose in the middle:
+
+    >>> import numpy as np
+    >>> path = Trajectory.without_covariances(
+    ...     stamps_ns=np.array([0, 2_000_000_000]),
+    ...     positions=np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]),
+    ...     quaternions_xyzw=np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]]),
+    ... )
+    >>> path.at(np.array([1_000_000_000])).positions
+    array([[0.5, 0. , 0. ]])
+    """
 
     stamps_ns: Ints
     """Shape (n,), strictly increasing."""
@@ -42,7 +64,7 @@ class Trajectory:
     quaternions_xyzw: Floats
     """world_R_body, shape (n, 4), unit length, scalar last."""
     covariances: Floats
-    """Of the body-frame perturbation [rotation, translation], shape (n, 6, 6); NaN where unknown."""
+    """Covariances of the body-frame perturbation [rotation, translation], shape (n, 6, 6); NaN where unknown."""
 
     def __post_init__(self) -> None:
         if np.any(np.diff(self.stamps_ns) <= 0):
@@ -53,7 +75,7 @@ class Trajectory:
 
     @classmethod
     def from_estimates(cls, estimates: list[Estimate]) -> Trajectory:
-        """The trajectory through a list of estimates in time order."""
+        """Trajectory through a list of estimates in time order."""
         n = len(estimates)
         rotations = np.array([e.world_T_body.rotation().matrix() for e in estimates])
         return cls(
@@ -65,7 +87,7 @@ class Trajectory:
 
     @classmethod
     def without_covariances(cls, stamps_ns: Ints, positions: Floats, quaternions_xyzw: Floats) -> Trajectory:
-        """A trajectory whose uncertainty is unknown, such as a reference."""
+        """Trajectory of unknown uncertainty, such as a reference."""
         return cls(stamps_ns, positions, quaternions_xyzw, np.full((len(stamps_ns), 6, 6), np.nan))
 
     def rotations(self) -> Rotation:
@@ -74,7 +96,7 @@ class Trajectory:
 
     @cached_property
     def matrices(self) -> Floats:
-        """world_R_body of every row, shape (n, 3, 3); metrics ask for it again and again."""
+        """world_R_body of every row, shape (n, 3, 3), computed once."""
         return np.asarray(self.rotations().as_matrix())
 
     def rows(self, selection: slice | Ints) -> Trajectory:
@@ -109,7 +131,15 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class LandmarkMap:
-    """Landmarks by identity."""
+    """Positions of landmarks, with their covariances, by identity.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> landmarks = LandmarkMap(np.array([1, 2]), np.array([[5.0, 0.0, -1.0], [7.0, -5.0, -1.0]]), np.zeros((2, 3, 3)))
+    >>> len(landmarks)
+    2
+    """
 
     ids: Ints
     """Shape (m,), each once, ascending."""
@@ -123,7 +153,7 @@ class LandmarkMap:
 
 
 class Outcome(StrEnum):
-    """What an estimator did with a detection."""
+    """Outcome of a detection in an estimator."""
 
     USED = "used"
     NEW = "new landmark"
@@ -148,7 +178,15 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class DetectionLog:
-    """What became of each detection, in the order processed: one row each, nothing left out."""
+    """Outcome of every detection, one row each, in the order processed.
+
+    Examples
+    --------
+    Detections used, and NIS of those that were predicted, of an estimator that has run:
+
+    >>> def used(log: DetectionLog) -> int:
+    ...     return sum(outcome is Outcome.USED for outcome in log.outcomes)
+    """
 
     stamps_ns: Ints
     """Shape (n,)."""
@@ -166,7 +204,7 @@ class DetectionLog:
 
 
 class Refusal(StrEnum):
-    """Why a row of a sensor other than the sonar is not used."""
+    """Reason for which a row of IMU, Doppler log or depth sensor is not used."""
 
     OUTLIER = "refused: no vehicle reaches this velocity from the last"
     LATE = "refused: the motion that it belongs to was already used"
@@ -177,7 +215,7 @@ class Refusal(StrEnum):
 
 
 class RefusedRow(NamedTuple):
-    """A row that is not used."""
+    """Row of a sensor that is not used, with the reason."""
 
     sensor: str
     """``imu``, ``dvl`` or ``depth``."""
@@ -188,10 +226,7 @@ class RefusedRow(NamedTuple):
 
 
 class DetectionJournal:
-    """Rows about detections, in the order in which an estimator deals with them; 73 bytes each.
-
-    A log of hours has hundreds of thousands: they are kept as columns of numbers, not as objects.
-    """
+    """Growing `DetectionLog` of an estimator, as columns of numbers: 73 bytes a row in logs of hours."""
 
     def __init__(self) -> None:
         self._stamps_ns = array("q")
@@ -212,12 +247,12 @@ class DetectionJournal:
         innovation: Floats | None = None,
         innovation_cov: Floats | None = None,
     ) -> int:
-        """Append a row; its number.
+        """Append a row, and return its number.
 
         Parameters
         ----------
         innovation
-            Measured minus predicted (range m, azimuth rad), shape (2,); None: nothing was predicted.
+            Measured minus predicted (range m, azimuth rad), shape (2,); None without a prediction.
         innovation_cov
             Shape (2, 2).
         """
@@ -229,7 +264,7 @@ class DetectionJournal:
         return self._forgotten + len(self) - 1
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Drop the rows up to the first one that is not older; the others keep their numbers."""
+        """Drop rows until the first that is not older than ``stamp_ns``; the others keep their numbers."""
         count = 0
         while count < len(self) and self._stamps_ns[count] < stamp_ns:
             count += 1
@@ -238,13 +273,13 @@ class DetectionJournal:
         self._forgotten += count
 
     def copy(self) -> DetectionJournal:
-        """The same rows, to be amended apart."""
+        """Independent copy."""
         return deepcopy(self)
 
     def amend(self, row: int, outcome: Outcome, landmark_id: int | None = None) -> None:
-        """What has become of a detection since, and of which landmark it is; None: as it was.
+        """Change the outcome of a row, and its landmark unless None.
 
-        Its innovation, against the landmark that it was taken for when it came, is dropped.
+        The innovation is dropped: it was against the landmark that the detection was first taken for.
         """
         row -= self._forgotten
         if row < 0:
@@ -255,7 +290,7 @@ class DetectionJournal:
         self._innovation_covs[4 * row : 4 * row + 4] = array("d", _UNKNOWN)
 
     def log(self) -> DetectionLog:
-        """All rows that are not forgotten."""
+        """Rows that are not forgotten."""
         n = len(self)
         return DetectionLog(
             stamps_ns=np.array(self._stamps_ns, dtype=np.int64),

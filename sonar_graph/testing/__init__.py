@@ -1,1 +1,13 @@
-"""Testing."""
+"""Checks for your own estimators, factors and covariances, and small worlds with known truth to try them on."""
+
+# fmt: off
+from sonar_graph.testing.drives import misnamed_world, small_world, still_world
+from sonar_graph.testing.laws import (
+    CHECKS, FILTER_CHECKS, Check, ContractError, MakeEstimator, check_estimator,
+)
+from sonar_graph.testing.numerical import check_consistent, check_jacobians
+
+__all__ = [
+    "CHECKS", "FILTER_CHECKS", "Check", "ContractError", "MakeEstimator", "check_consistent", "check_estimator",
+    "check_jacobians", "misnamed_world", "small_world", "still_world",
+]

@@ -1,6 +1,6 @@
-"""Small worlds with known truth: a gentle left turn past three landmarks, also misnamed, and a vehicle at rest.
+"""Small sequences with known truth: a left turn past three landmarks, with right or wrong identities, and a rest.
 
-Body velocity and angular rate are constant in the first, so that its truth is a circle in closed form.
+In the turn body velocity and angular rate are constant, so that the truth is a circle in closed form.
 """
 
 from __future__ import annotations
@@ -31,7 +31,13 @@ MISNAMED_FRAMES = 8
 
 
 def small_world(dvl_delay_s: float = 0.0) -> Sequence:
-    """The left turn, with little noise; the DVL may begin later than the IMU."""
+    """Left turn of 20 s with little noise.
+
+    Parameters
+    ----------
+    dvl_delay_s
+        Time by which the DVL begins after the IMU.
+    """
     noise = np.random.default_rng(SEED)
     calibration = Calibration(start=_circle_start(dvl_delay_s), imu=ImuCalibration(gyro_bias_sigma=1e-5))
     truth = _circle(_stamps(0, IMU_HZ, DURATION_S))
@@ -48,12 +54,12 @@ def small_world(dvl_delay_s: float = 0.0) -> Sequence:
 
 
 def misnamed_world(*, is_tracked: bool = False) -> Sequence:
-    """The left turn, where all first names are surely wrong, later a fifth of them, and a few landmarks have none.
+    """Left turn in which all first identities are wrong, later a fifth of them, and some detections have none.
 
     Parameters
     ----------
     is_tracked
-        Whether each landmark is seen in tracks of `TRACK_FRAMES` frames, and a name is wrong for a whole track.
+        Landmarks are seen in tracks of `TRACK_FRAMES` frames, and an identity is wrong for a whole track.
     """
     world, noise = small_world(), np.random.default_rng(SEED)
     rows = world.detections
@@ -70,7 +76,7 @@ def misnamed_world(*, is_tracked: bool = False) -> Sequence:
 
 
 def still_world() -> Sequence:
-    """A tilted vehicle at rest; every sensor is exact, the IMU feels gravity alone."""
+    """Tilted vehicle at rest for 60 s, without noise."""
     calibration = Calibration(start=STILL_START)
     imu_stamps, slow_stamps = _stamps(0, IMU_HZ, STILL_S), _stamps(0, DVL_HZ, STILL_S)
     up_in_body = Rotation.from_euler("xyz", STILL_START.rpy_rad).inv().apply([0.0, 0.0, calibration.gravity_m_s2])
@@ -85,13 +91,13 @@ def still_world() -> Sequence:
 
 
 def every_stamp(sequence: Sequence) -> Ints:
-    """Each instant from the start to the end at which anything was measured, shape (n,)."""
+    """Stamps of all measurements after the start until the end, shape (n,)."""
     stamps_ns = np.unique(np.concatenate([block.stamps_ns for block in blocks(sequence)]))
     return stamps_ns[(stamps_ns > sequence.start_ns) & (stamps_ns <= sequence.end_ns)]
 
 
 def blocks(sequence: Sequence) -> Iterator[Block]:
-    """The blocks of a sequence that are there."""
+    """Blocks that a sequence has."""
     for block in (sequence.imu, sequence.dvl, sequence.depth, sequence.detections):
         if block is not None:
             yield block

@@ -1,22 +1,18 @@
-"""What an estimator made of a sequence, and what is demanded of it.
-
-The laws of the contract, one function each.
-
-The contract of an estimator as tests that its author can run.
+"""Laws of the estimator contract as checks that an author can run on an estimator.
 
 Each check takes something that makes an estimator from a calibration, such as its class, and raises
-`ContractError` where the contract is broken. With pytest::
+`ContractError` where the law is broken. With pytest::
 
     import pytest
-    from sonar_graph.estimator_checks import CHECKS
+    from sonar_graph.testing import CHECKS
 
     @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
     def test_my_filter_keeps_the_contract(check):
         check(MyFilter)
 
-and without: ``check_estimator(MyFilter)``. A filter, or whatever else never iterates, should pass `FILTER_CHECKS` as
-well. The checks bring their own small world, a vehicle that turns gently to the
-left past three landmarks at its own depth, so that they need no data and no simulator.
+and without: ``check_estimator(MyFilter)``. An estimator that never iterates, such as a filter, should pass
+`FILTER_CHECKS` as well. The checks bring their own worlds (`sonar_graph.testing.drives`), so that they need neither
+data nor simulator.
 """
 
 from __future__ import annotations
@@ -51,12 +47,12 @@ SYMMETRY = 1e-9
 
 
 class ContractError(AssertionError):
-    """An estimator does not keep the contract; the message says how."""
+    """An estimator breaks the contract; the message says how."""
 
 
 @dataclass(frozen=True, eq=False)
 class EstimatorRun:
-    """All that an estimator said about one sequence."""
+    """Output of an estimator on one sequence."""
 
     estimates: list[Estimate]
     trajectory: Trajectory
@@ -64,7 +60,7 @@ class EstimatorRun:
     detections: DetectionLog
 
     def causal(self, stamps_ns: list[int]) -> Trajectory:
-        """The causal estimates at some of the instants."""
+        """Causal estimates at some of the instants."""
         wanted = set(stamps_ns)
         return Trajectory.from_estimates([e for e in self.estimates if e.stamp_ns in wanted])
 
@@ -72,12 +68,12 @@ class EstimatorRun:
 def run(
     make: MakeEstimator, sequence: Sequence, instants_ns: Ints | None = None, *, ask_every: int = 0
 ) -> EstimatorRun:
-    """Feed a sequence to a fresh estimator, cut at the instants, and ask for everything at the end.
+    """Run a fresh estimator over a sequence, cut at the instants, and ask for all results at the end.
 
     Parameters
     ----------
     ask_every
-        Also ask after so many steps, twice, and again at the end; 0: do not.
+        Also ask twice after every so many steps, and again at the end; 0: only at the end.
 
     Raises
     ------
@@ -107,7 +103,7 @@ def _answer_twice(estimator: Estimator, estimates: list[Estimate]) -> EstimatorR
 
 
 def unlike(one: EstimatorRun, other: EstimatorRun) -> list[str]:
-    """What differs, in any bit: causal estimates, trajectory, landmarks, detections."""
+    """Names of the results that differ in any bit."""
     parts: dict[str, tuple[object, object]] = {
         "causal estimates": (Trajectory.from_estimates(one.estimates), Trajectory.from_estimates(other.estimates)),
         "trajectory()": (one.trajectory, other.trajectory),
@@ -118,7 +114,7 @@ def unlike(one: EstimatorRun, other: EstimatorRun) -> list[str]:
 
 
 def _is_same(mine: object, theirs: object) -> bool:
-    """Whether all columns of two tables are equal to the last bit."""
+    """Equality of all columns to the last bit."""
     for name, column in vars(mine).items():
         theirs_too = vars(theirs)[name]
         if isinstance(column, np.ndarray):
@@ -182,7 +178,7 @@ def require(kept: bool, violation: str) -> None:
 
 
 def require_covariance(matrix: Floats, size: int, name: str) -> None:
-    """Raise unless ``matrix`` is finite, symmetric and positive semi-definite, shape (size, size)."""
+    """Raise `ContractError` unless finite, symmetric, positive semi-definite, shape (size, size)."""
     require(matrix.shape == (size, size), f"{name}: shape {matrix.shape}, not {(size, size)}")
     require(bool(np.isfinite(matrix).all()), f"{name} is not finite")
     scale = float(np.abs(matrix).max())
@@ -302,7 +298,7 @@ def same_input_gives_same_output(make: MakeEstimator) -> None:
 def asking_changes_nothing(make: MakeEstimator) -> None:
     """Trajectory, landmarks and detections may be asked for at any time, and twice: not a bit of anything changes.
 
-    Also where identities are wrong, or missing, and an estimator may think better of them when it is asked.
+    Also where identities are wrong or missing, and an estimator may revise them when it is asked.
     """
     for world, every in ((small_world(), 1), (misnamed_world(), 3), (misnamed_world(is_tracked=True), 7)):
         differing = unlike(run(make, world), run(make, world, ask_every=every))
@@ -310,10 +306,10 @@ def asking_changes_nothing(make: MakeEstimator) -> None:
 
 
 def live_agrees_with_replay(make: MakeEstimator) -> None:
-    """Rows that arrive one by one and rows that arrive in windows lead to estimates within each other's doubt.
+    """Rows that arrive one by one and rows that arrive in windows lead to estimates that agree within their sigmas.
 
-    An estimator that iterates may linearise elsewhere when it is called more often. It may not count anything twice,
-    nor lose it: a deviation beyond its standard deviation, or another covariance, comes from that.
+    An estimator that iterates may linearise elsewhere when it is called more often. A deviation beyond a standard
+    deviation, or another covariance, shows that something was counted twice or lost.
     """
     world = small_world()
     windows, live = run(make, world), run(make, world, every_stamp(world))
@@ -323,7 +319,7 @@ def live_agrees_with_replay(make: MakeEstimator) -> None:
 
 
 def live_equals_replay(make: MakeEstimator) -> None:
-    """The same to rounding: for estimators that never iterate, such as filters."""
+    """Rows that arrive one by one give the same result to rounding; for estimators that never iterate."""
     world = small_world()
     differ = difference(run(make, world), run(make, world, every_stamp(world)))
     require(differ < SAME, f"cut row by row the outcome differs by {differ:.1e}")
@@ -340,7 +336,7 @@ def input_stays_as_it_was(make: MakeEstimator) -> None:
 
 
 def still_vehicle_stays_still(make: MakeEstimator) -> None:
-    """A tilted vehicle at rest, its IMU feeling nothing but gravity, is where it was after 60 s."""
+    """A tilted vehicle at rest, whose IMU measures gravity alone, has not moved after 60 s."""
     estimates = run(make, still_world()).estimates
     start = STILL_START.pose()
     for estimate in estimates:
@@ -368,16 +364,26 @@ CHECKS: tuple[Check, ...] = (
     input_stays_as_it_was,
     still_vehicle_stays_still,
 )
-__all__ = ["CHECKS", "FILTER_CHECKS", "Check", "ContractError", "MakeEstimator", "check_estimator"]
 
 
 def check_estimator(make: MakeEstimator) -> None:
-    """Run every check of `CHECKS`.
+    """Run every check of `CHECKS` on an estimator.
+
+    Parameters
+    ----------
+    make
+        Makes an estimator from a calibration; the class of an estimator does.
 
     Raises
     ------
     ContractError
         At the first check that fails, with its name; also where the estimator itself raises.
+
+    Examples
+    --------
+    >>> from sonar_graph import load_estimator
+    >>> from sonar_graph.testing import check_estimator
+    >>> check_estimator(load_estimator("dead-reckoning"))
     """
     for check in CHECKS:
         try:

@@ -1,0 +1,112 @@
+"""Numerical checks of factors and covariances: Jacobians by central differences, NEES by its two-sided band."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import chi2
+
+
+def check_jacobians(
+    factor: gtsam.NoiseModelFactor, values: gtsam.Values, *, step: float = 1e-5, tolerance: float = 1e-5
+) -> None:
+    """Compare the Jacobians of a factor with central differences of its error.
+
+    With ``x (+) d`` the retraction of GTSAM and ``u_k`` the unit vector of tangent direction k, column k of a Jacobian
+    must be ``(e(x (+) step u_k) - e(x (+) -step u_k)) / (2 step)``.
+
+    Parameters
+    ----------
+    factor
+        Any factor with a Gaussian noise model, native or `gtsam.CustomFactor`; wrapped in no robust kernel.
+    values
+        Point of linearisation; has all variables of the factor. Check random, near-identity and wrap-around states.
+    step
+        Length of the differences, in the tangent space (rad, m).
+    tolerance
+        Largest difference allowed, relative to the largest entry of both Jacobians, and at least absolute.
+
+    Raises
+    ------
+    AssertionError
+        Naming the variable, row and column of the largest difference, with both numbers.
+
+    Examples
+    --------
+    >>> import gtsam, numpy as np
+    >>> from sonar_graph.testing import check_jacobians
+    >>> measured = gtsam.Pose3(gtsam.Rot3.Yaw(0.3), np.array([1.0, 0.0, 0.0]))
+    >>> factor = gtsam.BetweenFactorPose3(0, 1, measured, gtsam.noiseModel.Isotropic.Sigma(6, 0.1))
+    >>> values = gtsam.Values()
+    >>> values.insert(0, gtsam.Pose3())
+    >>> values.insert(1, gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, -0.2, 0.4), np.array([1.1, 0.1, -0.1])))
+    >>> check_jacobians(factor, values)
+    """
+    whitened, _ = factor.linearize(values).jacobian()
+    jacobians = np.linalg.solve(factor.noiseModel().R(), whitened)  # of linearize: R J, with R^T R the information
+    zero, column = values.zeroVectors(), 0
+    for key in factor.keys():  # noqa: SIM118  # no dictionary
+        size = len(zero.at(key))
+        analytic = jacobians[:, column : column + size]
+        numeric = np.empty_like(analytic)
+        for k, direction in enumerate(np.eye(size)):
+            ahead, behind = gtsam.VectorValues(), gtsam.VectorValues()
+            ahead.insert(key, step * direction)
+            behind.insert(key, -step * direction)
+            change = factor.unwhitenedError(values.retract(ahead)) - factor.unwhitenedError(values.retract(behind))
+            numeric[:, k] = change / (2 * step)
+        scale = max(1.0, float(np.abs(analytic).max(initial=0.0)), float(np.abs(numeric).max(initial=0.0)))
+        off = np.abs(analytic - numeric)
+        if not off.max(initial=0.0) <= tolerance * scale:
+            row, k = np.unravel_index(int(np.nanargmax(np.where(np.isnan(off), np.inf, off))), off.shape)
+            raise AssertionError(
+                f"derivative of error {row} by direction {k} of {gtsam.DefaultKeyFormatter(key)}: the factor says"
+                f" {analytic[row, k]:.9g}, differences say {numeric[row, k]:.9g}"
+            )
+        column += size
+
+
+def check_consistent(nees: ArrayLike, dof: int, *, confidence: float = 0.99) -> None:
+    """Check that squared normalised errors fit their covariances: neither too large nor too small in the mean.
+
+    The sum of n independent NEES of ``dof`` degrees of freedom each is chi-squared with ``n dof`` degrees of freedom;
+    it must lie inside the two-sided interval of this probability (Bar-Shalom et al., *Estimation with Applications to
+    Tracking and Navigation*, 2001, section 5.4.2).
+
+    Parameters
+    ----------
+    nees
+        ``e^T P^-1 e`` of independent errors, shape (n,): of runs with different seeds, not of instants of one run.
+    dof
+        Length of each error.
+    confidence
+        Probability with which a consistent estimator passes.
+
+    Raises
+    ------
+    AssertionError
+        With the mean per degree of freedom and the interval; also where there is no finite NEES.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.testing import check_consistent
+    >>> errors = np.random.default_rng(1).standard_normal((200, 3))
+    >>> check_consistent((errors**2).sum(axis=1), dof=3)
+    >>> check_consistent((0.5 * errors**2).sum(axis=1), dof=3)
+    Traceback (most recent call last):
+        ...
+    AssertionError: NEES per degree of freedom is 0.500, below 0.856 to 1.155 (99 %): covariances are too large
+    """
+    squares = np.asarray(nees, np.float64).ravel()
+    if not len(squares) or not np.isfinite(squares).all():
+        raise AssertionError(f"expected finite NEES, not {squares[~np.isfinite(squares)].tolist() or 'none'}")
+    lowest, highest = chi2.interval(confidence, len(squares) * dof) / np.float64(len(squares) * dof)
+    mean = float(squares.mean() / dof)
+    if not lowest <= mean <= highest:
+        side, sizes = ("below", "large") if mean < lowest else ("above", "small")
+        raise AssertionError(
+            f"NEES per degree of freedom is {mean:.3f}, {side} {lowest:.3f} to {highest:.3f} ({confidence:.0%}):"
+            f" covariances are too {sizes}"
+        )

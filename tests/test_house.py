@@ -1,0 +1,139 @@
+"""Rules of the house: who may import what, how large a table of contents is, how docstrings begin, what runs."""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from types import FunctionType, ModuleType
+
+import pytest
+
+import sonar_graph
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("sonar_graph", "baselines")
+FILES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
+USERS = [path for folder in ("benchmarks", "docs") for path in sorted((ROOT / folder).rglob("*.py"))]
+QUESTION_WORDS = {"what", "which", "whether", "how", "of", "those", "it", "that", "where", "who", "whose", "so", "as"}
+ROOMS_WITH_EXAMPLES = ("testing", "navigation", "slam", "sonar", "evaluation", "simulation")
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports(path: Path) -> Iterator[tuple[str, list[str]]]:
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in PACKAGES:
+            yield node.module, [alias.name for alias in node.names]
+
+
+MODULES = {module_name(path): path for path in FILES}
+
+
+def imports_past_a_table_of_contents(path: Path) -> list[str]:
+    """Modules of a package that are imported from outside of it, instead of the package."""
+    own = module_name(path)
+    past = []
+    for module, _ in imports(path):
+        package = module.rpartition(".")[0]
+        is_module = module in MODULES and MODULES[module].name != "__init__.py"
+        if is_module and package not in PACKAGES and not own.startswith(package + "."):
+            past.append(module)
+    return past
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_nobody_imports_past_the_table_of_contents_of_a_package(path: Path) -> None:
+    assert not imports_past_a_table_of_contents(path)
+
+
+def test_an_import_past_a_table_of_contents_is_found() -> None:
+    navigation = next(path for path in FILES if path.parent.name == "navigation" and path.name == "odometry.py")
+    assert imports_past_a_table_of_contents(navigation) == []
+    assert imports_past_a_table_of_contents(Path(__file__).parent / "slam" / "test_factors.py")
+
+
+@pytest.mark.parametrize("path", [p for p in FILES if p.name == "__init__.py"], ids=module_name)
+def test_a_package_is_a_short_table_of_contents_with_few_modules(path: Path) -> None:
+    if path.parent != ROOT / "sonar_graph":
+        assert path.read_text("utf-8").count("\n") <= 30
+    assert len([p for p in path.parent.glob("*.py") if p.name != "__init__.py"]) <= 13
+
+
+def test_names_of_files_and_of_public_classes_occur_once() -> None:
+    stems = Counter(path.stem for path in FILES if not path.stem.startswith("__"))
+    classes = Counter(
+        node.name
+        for path in FILES
+        for node in ast.parse(path.read_text("utf-8")).body
+        if isinstance(node, ast.ClassDef)
+    )
+    assert [name for name, count in (stems + classes).items() if count > 1] == []
+
+
+def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
+    asking, total = [], 0
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
+                total += 1
+                if text.split()[0].strip(":,.").lower() in QUESTION_WORDS:
+                    asking.append(f"{path.relative_to(ROOT)}: {text.splitlines()[0]}")
+    assert len(asking) <= 0.02 * total, "\n".join(asking)
+
+
+def test_the_front_door_loads_nothing_heavy() -> None:
+    heavy = ("gtsam", "numba", "matplotlib", "scipy", "numpy", "cv2", "pydantic")
+    code = f"import sys, sonar_graph; print([m for m in {heavy} if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_names_for_type_checkers_are_those_of_the_front_door() -> None:
+    assert sonar_graph.__file__
+    tree = ast.parse(Path(sonar_graph.__file__).read_text("utf-8"))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    typed = {a.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for a in node.names}
+    lazy = {name: f"sonar_graph.{place}" for place, names in sonar_graph._PLACES.items() for name in names}
+    assert typed == lazy
+    assert set(sonar_graph.__all__) == set(lazy)
+
+
+def test_an_unknown_name_is_answered_with_those_that_exist() -> None:
+    with pytest.raises(AttributeError, match="no 'read_bag'; it has: .*read_log"):
+        _ = sonar_graph.read_bag
+
+
+def run_examples(found: object, name: str) -> int:
+    """Run the examples in a docstring, as a user who has imported nothing; the number of examples."""
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
+    module = sys.modules[getattr(found, "__module__", "sonar_graph")]
+    for test in doctest.DocTestFinder(recurse=False).find(found, name, module=module, globs=dict(vars(module))):
+        runner.run(test)
+    assert runner.failures == 0, name
+    return runner.tries
+
+
+@pytest.mark.parametrize("name", sonar_graph.__all__)
+def test_every_public_name_has_an_example_that_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run_examples(getattr(sonar_graph, name), name) > 0
+
+
+def public_objects(room: str) -> list[tuple[str, object]]:
+    module: ModuleType = import_module(f"sonar_graph.{room}")
+    named = ((name, getattr(module, name)) for name in module.__all__)
+    return [(f"{room}.{name}", found) for name, found in named if isinstance(found, type | FunctionType)]
+
+
+@pytest.mark.parametrize("room", ROOMS_WITH_EXAMPLES)
+def test_examples_of_a_room_run(room: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert sum(run_examples(found, name) for name, found in public_objects(room)) > 0
