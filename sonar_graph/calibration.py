@@ -1,4 +1,4 @@
-"""What is known about vehicle and sensors before a run: noise, mountings, gravity, the start.
+"""Prior knowledge of vehicle and sensors: noise, mountings, gravity, the start.
 
 A `Calibration` travels inside the log (a metadata record) or comes from a TOML or JSON file; every field has a unit
 in its name or docstring. Every estimator gets the same one.
@@ -21,7 +21,7 @@ HOLE_INTERVALS = 5
 """Typical intervals of the IMU without a sample, above which there is a hole: one lost sample does no harm."""
 SHORTEST_HOLE_S = 0.05
 ROWS_BEFORE = 8
-"""Intervals before one that tell which is typical."""
+"""Number of preceding intervals that define the typical one."""
 UNTYPICAL_S = 1.0
 """Longest interval after the very first sample that is no hole."""
 
@@ -78,7 +78,7 @@ class ImuCalibration(Section):
     gyro_noise_density: NotNegative = 1.2e-4
     """White noise of angular rate, rad/s/√Hz."""
     gyro_bias_sigma: NotNegative = 5e-5
-    """What remains of the bias when the run starts, rad/s; 0 means that there is none to estimate."""
+    """Bias left when the run starts, rad/s; 0: no bias is estimated."""
     gyro_bias_walk_density: NotNegative = 1e-6
     """Random walk of the bias, rad/s²/√Hz."""
     accel_noise_density: NotNegative = 1.2e-3
@@ -86,10 +86,10 @@ class ImuCalibration(Section):
     accel_bias_sigma: NotNegative = 1e-2
     """Bias of specific force, m/s²."""
     turn_sigma_rad_s: Sigmas = (0.05, 0.05, 0.15)
-    """How the vehicle turns, as a standard deviation about each axis of the body: where it bridges holes that no gyro
-    measured. Zero: holes are taken as any other interval."""
+    """Standard deviation of the vehicle's angular rate about each axis of the body, used in IMU holes; 0: a hole is
+    treated as any other interval."""
     turn_time_s: tuple[Positive, Positive, Positive] = (0.5, 0.5, 1.5)
-    """How fast these rates change: sigma over the standard deviation of angular acceleration."""
+    """Time constant of these rates: their sigma over the standard deviation of angular acceleration."""
     mounting: Mounting = Mounting()
 
 
@@ -97,38 +97,38 @@ class DvlCalibration(Section):
     """Doppler velocity log."""
 
     velocity_sigma_m_s: tuple[NotNegative, NotNegative, NotNegative] = (0.01, 0.01, 0.01)
-    """White noise of one velocity sample along each of the DVL's axes, where the log does not say."""
+    """White noise of one velocity sample along each axis of the DVL, where the log has no covariance."""
     mounting: Mounting = Mounting()
     gap_s: Positive = 1.5
-    """Time without a sample above which the velocity is no longer taken as linear: accelerometers carry it then."""
+    """Time without a sample above which there is a DVL gap, bridged by accelerometers."""
     velocity_walk_density: Positive = 0.1
-    """How the vehicle's velocity may change, as a random walk, m/s/√s: where it bridges gaps that no accelerometer
-    measured, and in the gate of outlying velocities."""
+    """Random walk of the vehicle's velocity, m/s/√s: for DVL gaps without accelerometers, and for the gate of
+    outliers."""
 
 
 class DepthCalibration(Section):
     """Pressure sensor."""
 
     sigma_m: Positive = 0.01
-    """White noise of one sample, where the log does not say."""
+    """White noise of one sample, where the log has no variance."""
     port_m: Vector = (0.0, 0.0, 0.0)
     """The pressure port in the body frame."""
 
 
 class SonarImage(Section):
-    """What the samples of sonar images mean."""
+    """Scale of the samples of sonar images."""
 
     scale: Literal["decibel", "linear"] = "decibel"
     """``decibel``: samples grow with the logarithm of the echo (DIDSON, ARIS); ``linear``: with its amplitude."""
     decibel_span: Positive = 80.0
-    """What the full scale of a sample spans, dB, where samples are logarithmic."""
+    """Span of the full scale, dB, of logarithmic samples."""
     full_scale: Positive = 255.0
     """The largest sample."""
     gamma: Positive = 1.0
-    """Power to which the echo's amplitude was raised, where samples are linear (Oculus)."""
+    """Power to which the amplitude was raised, of linear samples (Oculus)."""
 
     def decibels(self, samples: NDArray[Any]) -> NDArray[np.float32]:
-        """Levels of samples, in dB over the smallest one; only their differences mean something.
+        """Levels of samples in dB over the smallest one; only differences have a meaning.
 
         ``samples * decibel_span / full_scale``, or ``20 / gamma log10(samples)`` of linear ones; linear samples of 0
         count as one count, real ones below 1/100000 of the full scale as that.
@@ -146,13 +146,13 @@ class SonarCalibration(Section):
     mounting: Mounting = Mounting()
     image: SonarImage = SonarImage()
     lens: Literal["as-logged", "didson", "aris", "aris-telephoto"] = "as-logged"
-    """Where the beams of images point: as the log says; or, if a driver spaced them equally, by the maker's table."""
+    """Azimuths of beams: as logged, or by the maker's table where a driver spaced them equally."""
     range_sigma_m: Positive = 0.02
-    """White noise of range, where the log does not say."""
+    """White noise of range, where the log has no covariance."""
     azimuth_sigma_rad: Positive = 0.009
-    """White noise of azimuth, where the log does not say."""
+    """White noise of azimuth, where the log has no covariance."""
     elevation_aperture_rad: Positive = 0.244
-    """Full vertical opening; a detected point's elevation lies within half of it either side of zero."""
+    """Full vertical aperture; elevations of detected points lie within half of it on either side of zero."""
 
 
 class FloorPrior(Section):
@@ -186,7 +186,18 @@ class Start(Section):
 
 
 class Calibration(Section):
-    """All that is known before a run. Every field has a default, so that a log without one still runs."""
+    """Prior knowledge of a run; every field has a default.
+
+    Examples
+    --------
+    >>> calibration = Calibration(imu=ImuCalibration(gyro_bias_sigma=1e-4), floor=FloorPrior(z_m=-1.7, sigma_m=0.02))
+    >>> calibration.dvl.mounting.pose().translation()
+    array([0., 0., 0.])
+    >>> Calibration.parse({"imu": {"gyro_bias": 1e-4}}, "vehicle.toml")
+    Traceback (most recent call last):
+        ...
+    sonar_graph.errors.CalibrationError: vehicle.toml: imu.gyro_bias: there is no such field; ...
+    """
 
     imu: ImuCalibration = ImuCalibration()
     dvl: DvlCalibration = DvlCalibration()
@@ -200,8 +211,8 @@ class Calibration(Section):
     use_gravity: bool = True
     """Take roll and pitch from the accelerometers, where they measure."""
     odometry_interpolation: Literal["linear", "hold-past"] = "linear"
-    """What a velocity or rate sample stands for. ``linear``: the value at its stamp, linear in between (Doppler logs,
-    gyros); ``hold-past``: the mean over the interval that ends at its stamp (wheel odometry given as displacements)."""
+    """Meaning of velocity and rate samples. ``linear``: values at their stamps, linear in between (Doppler logs,
+    gyros); ``hold-past``: means over the interval that ends at the stamp (wheel odometry given as displacements)."""
     gravity_m_s2: Annotated[Number, AfterValidator(_earthly)] = STANDARD_GRAVITY
     earth_rate_latitude_rad: Annotated[Number, AfterValidator(_latitude)] | None = None
     """Latitude for removing the Earth's rotation from the gyros (world x east, y north); None: not removed."""

@@ -45,7 +45,7 @@ def imports_past_a_table_of_contents(path: Path) -> list[str]:
     for module, _ in imports(path):
         package = module.rpartition(".")[0]
         is_module = module in MODULES and MODULES[module].name != "__init__.py"
-        if is_module and package not in PACKAGES and not own.startswith(package + "."):
+        if is_module and package not in PACKAGES and not f"{own}.".startswith(f"{package}."):
             past.append(module)
     return past
 
@@ -107,7 +107,7 @@ def test_names_for_type_checkers_are_those_of_the_front_door() -> None:
 
 
 def test_an_unknown_name_is_answered_with_those_that_exist() -> None:
-    with pytest.raises(AttributeError, match="no 'read_bag'; it has: .*read_log"):
+    with pytest.raises(AttributeError, match=r"no 'read_bag'; it has: .*read_log"):
         _ = sonar_graph.read_bag
 
 

@@ -97,7 +97,7 @@ def check_consistent(nees: ArrayLike, dof: int, *, confidence: float = 0.99) -> 
     >>> check_consistent((0.5 * errors**2).sum(axis=1), dof=3)
     Traceback (most recent call last):
         ...
-    AssertionError: NEES per degree of freedom is 0.500, below 0.856 to 1.155 (99 %): covariances are too large
+    AssertionError: NEES per degree of freedom is 0.451, below 0.858 to 1.155 (99%): covariances are too large
     """
     squares = np.asarray(nees, np.float64).ravel()
     if not len(squares) or not np.isfinite(squares).all():
