@@ -1,0 +1,241 @@
+"""Share of small random faults in the code that no fast test finds.
+
+Lines are chosen at random by a seed, each is broken alone in a copy of the checkout, and the fast tests that import
+the broken module or its package are run until the first failure. A fault is one of: a comparison turned or shifted, a
+sign or an operator exchanged, a number changed, ``and`` and ``or`` exchanged, a condition negated, a returned value
+dropped, a call left out. Messages, docstrings, annotations and defaults of tests are not touched.
+
+``--root`` judges another checkout, such as an older commit, in the same way. ``--keep`` holds results, so that a run
+that was interrupted goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from common import conclude, note, print_table
+
+PACKAGES = ("sonar_graph", "baselines")
+COMPARISONS = {
+    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
+}  # fmt: skip
+OPERATORS = {
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult,
+    ast.Pow: ast.Mult, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd, ast.MatMult: ast.Add,
+}  # fmt: skip
+TIMEOUT_S = 600
+
+
+class Mutant(NamedTuple):
+    """One fault: where, and the line before and after."""
+
+    path: str
+    line: int
+    before: str
+    after: str
+    source: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.path}:{self.line}"
+
+
+def sites(tree: ast.Module) -> Iterator[tuple[ast.AST, str, int]]:
+    """Nodes that can be broken, with the kind of fault and a number where a node has several."""
+    untouched: set[int] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            annotations = [a.annotation for a in ast.walk(node.args) if isinstance(a, ast.arg)] + [node.returns]
+            untouched |= {id(n) for a in (*annotations, *node.decorator_list) if a for n in ast.walk(a)}
+        elif isinstance(node, ast.AnnAssign):
+            untouched |= {id(n) for n in ast.walk(node.annotation)}
+        elif isinstance(node, ast.Raise | ast.JoinedStr):
+            untouched |= {id(n) for n in ast.walk(node)}
+    for function in ast.walk(tree):
+        if not isinstance(function, ast.FunctionDef):
+            continue
+        for node in (n for statement in function.body for n in ast.walk(statement)):
+            if id(node) in untouched:
+                continue
+            if isinstance(node, ast.Compare):
+                yield from ((node, "comparison", k) for k in range(len(node.ops)))
+            elif isinstance(node, ast.BinOp) and type(node.op) in OPERATORS and not _is_text(node):
+                yield node, "operator", 0
+            elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+                yield node, "sign", 0
+            elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
+                yield node, "number", 0
+            elif isinstance(node, ast.BoolOp):
+                yield node, "and/or", 0
+            elif isinstance(node, ast.If | ast.IfExp | ast.While):
+                yield node, "condition", 0
+            elif isinstance(node, ast.Return) and node.value is not None and not isinstance(node.value, ast.Constant):
+                yield node, "return", 0
+            elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
+                yield node, "call", 0
+
+
+def _is_text(node: ast.BinOp) -> bool:
+    return any(
+        isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, str))
+        for n in ast.walk(node)
+    )
+
+
+def broken(node: ast.AST, number: int) -> ast.AST:
+    """The node with its fault."""
+    if isinstance(node, ast.Compare):
+        node.ops[number] = COMPARISONS[type(node.ops[number])]()
+    elif isinstance(node, ast.BinOp):
+        node.op = OPERATORS[type(node.op)]()
+    elif isinstance(node, ast.UnaryOp):
+        return node.operand
+    elif isinstance(node, ast.Constant):
+        return ast.Constant(node.value + 1)
+    elif isinstance(node, ast.BoolOp):
+        node.op = ast.Or() if isinstance(node.op, ast.And) else ast.And()
+    elif isinstance(node, ast.If | ast.IfExp | ast.While):
+        node.test = ast.UnaryOp(ast.Not(), node.test)
+    elif isinstance(node, ast.Return):
+        node.value = ast.Constant(None)
+    else:
+        return ast.Pass()
+    return node
+
+
+class _Replace(ast.NodeTransformer):
+    def __init__(self, target: int, number: int) -> None:
+        self._target, self._number = target, number
+
+    def visit(self, node: ast.AST) -> ast.AST:
+        if getattr(node, "_site", None) == self._target:
+            return ast.copy_location(broken(node, self._number), node)
+        return self.generic_visit(node)
+
+
+def choose(root: Path, count: int, seed: int) -> list[Mutant]:
+    """Faults drawn over all lines that can be broken, so that long files have more."""
+    places: list[tuple[Path, int]] = []
+    for package in PACKAGES:
+        for path in sorted((root / package).rglob("*.py")):
+            n = len(list(sites(ast.parse(path.read_text("utf-8")))))
+            places += [(path, k) for k in range(n)]
+    drawn = random.Random(seed).sample(places, count)
+    return [_mutant(root, path, k) for path, k in drawn]
+
+
+def _mutant(root: Path, path: Path, k: int) -> Mutant:
+    text = path.read_text("utf-8")
+    tree = ast.parse(text)
+    node, kind, number = list(sites(tree))[k]
+    statement = _statement_of(tree, node)
+    before = ast.get_source_segment(text, statement) or ""
+    first, last = statement.lineno, statement.end_lineno or statement.lineno
+    node._site = k  # type: ignore[attr-defined]  # a mark for the transformer
+    line = getattr(node, "lineno", first)
+    changed = ast.unparse(ast.fix_missing_locations(_Replace(k, number).visit(statement)))
+    indent = text.splitlines()[first - 1][: statement.col_offset]
+    lines = text.split("\n")
+    lines[first - 1 : last] = [indent + row for row in changed.split("\n")]
+    old, new = before.split("\n"), changed.split("\n")
+    shown = next(((a, b) for a, b in zip(old, new, strict=False) if a.split() != b.split()), (old[0], new[0]))
+    return Mutant(str(path.relative_to(root)), line, shown[0].strip(), f"{kind}: {shown[1].strip()}", "\n".join(lines))
+
+
+def _statement_of(tree: ast.Module, node: ast.AST) -> ast.stmt:
+    """The innermost simple statement, or compound one by its head, that holds a node."""
+    holders = [s for s in ast.walk(tree) if isinstance(s, ast.stmt) and any(n is node for n in ast.walk(s))]
+    return min(holders, key=lambda s: sum(1 for _ in ast.walk(s)))
+
+
+def tests_of(root: Path, path: str) -> list[str]:
+    """Test files that import the module or its package, those that import the module first."""
+    module = path.removesuffix(".py").replace("/", ".").removesuffix(".__init__")
+    package = module.rpartition(".")[0]
+    direct, near = [], []
+    for test in sorted((root / "tests").rglob("test_*.py")):
+        imported = set()
+        for node in ast.walk(ast.parse(test.read_text("utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                imported |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+            elif isinstance(node, ast.Import):
+                imported |= {alias.name for alias in node.names}
+        name = str(test.relative_to(root))
+        if module in imported:
+            direct.append(name)
+        elif any(i == package or i.startswith(package + ".") for i in imported) and package not in PACKAGES:
+            near.append(name)
+    room = root / "tests" / Path(path).parts[1 if path.startswith("sonar_graph") else 0]
+    inside = [str(p.relative_to(root)) for p in sorted(room.rglob("test_*.py"))] if room.is_dir() else []
+    return list(dict.fromkeys([*direct, *near, *inside])) or ["tests"]
+
+
+def judge(root: Path, mutant: Mutant, tests: list[str]) -> str:
+    """``killed``, ``survived`` or ``timeout``, which counts as killed; in a copy of the checkout, compiled code too."""
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder, "checkout")
+        shutil.copytree(root, copy, ignore=shutil.ignore_patterns(".git", ".venv", "build", "demo", "node_modules"))
+        (copy / mutant.path).write_text(mutant.source, "utf-8")
+        return run_tests(copy, tests)
+
+
+def run_tests(copy: Path, tests: list[str]) -> str:
+    """Outcome of the tests, until the first that fails."""
+    environment = os.environ | {"PYTHONPATH": str(copy)}
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
+    process = subprocess.Popen(
+        command, cwd=copy, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    try:
+        return "survived" if process.wait(TIMEOUT_S) == 0 else "killed"
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        return "timeout"
+
+
+def main() -> None:
+    """Choose, break, test, count."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--root", type=Path, default=Path(__file__).parents[2], help="the checkout to judge")
+    parser.add_argument("--mutants", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=16)
+    parser.add_argument("--keep", type=Path, help="JSON file with the results so far")
+    parser.add_argument("--quick", action="store_true", help="three mutants, to see that it runs")
+    arguments = parser.parse_args()
+    root = arguments.root.resolve()
+    mutants = choose(root, 3 if arguments.quick else arguments.mutants, arguments.seed)
+    kept = json.loads(arguments.keep.read_text()) if arguments.keep and arguments.keep.exists() else {}
+    for number, mutant in enumerate(mutants, start=1):
+        key = f"{mutant.name} {mutant.after}"
+        if key not in kept:
+            began = time.perf_counter()
+            kept[key] = judge(root, mutant, tests_of(root, mutant.path))
+            note(f"{number}/{len(mutants)} {kept[key]:8s} {time.perf_counter() - began:4.0f} s  {key}")
+            if arguments.keep:
+                arguments.keep.write_text(json.dumps(kept, indent=1))
+    outcomes = [kept[f"{m.name} {m.after}"] for m in mutants]
+    survivors = [m for m, outcome in zip(mutants, outcomes, strict=True) if outcome == "survived"]
+    print_table(["survivor", "before", "fault"], [[m.name, m.before[:60], m.after[:80]] for m in survivors])
+    survival = len(survivors) / len(mutants)
+    figures = {"mutants": len(mutants), "survived": len(survivors), "survival": round(survival, 3), "passed": True}
+    conclude(figures, is_quick=arguments.quick)
+
+
+if __name__ == "__main__":
+    main()
