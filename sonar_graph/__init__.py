@@ -76,7 +76,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sonar_graph.batch import run_suite
     from sonar_graph.calibration import Calibration
     from sonar_graph.estimator import Estimator, load_estimator
     from sonar_graph.evaluation import Comparison, RunResult, compare, run_estimator
@@ -111,14 +110,12 @@ __all__ = [
     "read_log",
     "recognise",
     "run_estimator",
-    "run_suite",
     "simulate_basin",
     "write_log",
     "write_report",
 ]
 
 _PLACES = {
-    "batch": ("run_suite",),
     "calibration": ("Calibration",),
     "estimator": ("Estimator", "load_estimator"),
     "evaluation": ("Comparison", "RunResult", "compare", "run_estimator"),
@@ -130,7 +127,9 @@ _PLACES = {
     "simulation": ("simulate_basin",),
     "states": ("DetectionLog", "Estimate", "LandmarkMap", "Trajectory"),
 }
-_ROOMS = {"navigation", "numerics", "slam", "sonar", "devices", "diagnosis", "testing", "errors"} | set(_PLACES)
+_ROOMS = {"navigation", "numerics", "slam", "sonar", "devices", "diagnosis", "testing", "errors", "batch"} | set(
+    _PLACES
+)
 
 
 def __getattr__(name: str) -> Any:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import re
 import tomllib
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -14,11 +13,16 @@ from sonar_graph.calibration import Calibration
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+MESSAGES = (ROOT / "docs" / "messages.md").read_text(encoding="utf-8")
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+    return re.findall(rf"```{language}\n(.*?)```", README + MESSAGES, flags=re.DOTALL)
+
+
+def test_readme_fits_on_two_screens() -> None:
+    assert README.count("\n") <= 100
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -40,7 +44,7 @@ def test_table_of_topics_has_every_type_and_word_that_is_found_without_being_ask
     from sonar_graph.logs.roles import ROLES
 
     names = {"imu": "IMU", "dvl": "Doppler log", "detections": "landmarks", "sonar": "sonar images"}
-    rows = {row.split(" | ")[0].removeprefix("| "): row for row in README.splitlines() if row.startswith("| ")}
+    rows = {row.split(" | ")[0].removeprefix("| "): row for row in MESSAGES.splitlines() if row.startswith("| ")}
     for role, offers in SHIPPED.items():
         row = rows[names.get(role, role.replace("_", " "))]
         for offer in offers:
@@ -60,13 +64,14 @@ def test_example_entry_point_joins_the_group() -> None:
 
 
 def test_names_imported_in_examples_exist() -> None:
-    imports = [
-        node for block in blocks("python") for node in ast.walk(ast.parse(block)) if isinstance(node, ast.ImportFrom)
+    import sonar_graph
+
+    nodes = [node for block in blocks("python") for node in ast.walk(ast.parse(block))]
+    used = [
+        n.attr for n in nodes if isinstance(n, ast.Attribute) and isinstance(n.value, ast.Name) and n.value.id == "sg"
     ]
-    assert imports
-    for node in imports:
-        for name in node.names:
-            assert hasattr(import_module(str(node.module)), name.name)
+    assert {"recognise", "compare", "write_report"} <= set(used)
+    assert [name for name in used if not hasattr(sonar_graph, name)] == []
 
 
 def test_commands_are_understood(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,7 +84,9 @@ def test_commands_are_understood(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     for name in ("dive.mcap", "vehicle.toml", "benchmarks/suites/smoke.toml"):
         Path(name).touch()
     group = typer.main.get_command(app)
-    lines = re.findall(r"^    sonar-graph (.+)$|`sonar-graph ([a-z]+ [^`]*\.mcap[^`]*)`", README, flags=re.MULTILINE)
+    lines = re.findall(
+        r"^    sonar-graph (.+)$|`sonar-graph ([a-z]+ [^`]*\.mcap[^`]*)`", README + MESSAGES, flags=re.MULTILINE
+    )
     assert len(lines) >= 4
     for words in ((indented or inline).split() for indented, inline in lines):
         group.commands[words[0]].make_context(words[0], words[1:])  # type: ignore[attr-defined]

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
+from sonar_graph.measurements import Floats
+
 
 def check_jacobians(
     factor: gtsam.NoiseModelFactor, values: gtsam.Values, *, step: float = 1e-5, tolerance: float = 1e-5
@@ -29,6 +31,8 @@ def check_jacobians(
 
     Raises
     ------
+    TypeError
+        When the noise model is robust: a kernel weights Jacobian and error.
     AssertionError
         Naming the variable, row and column of the largest difference, with both numbers.
 
@@ -43,8 +47,13 @@ def check_jacobians(
     >>> values.insert(1, gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, -0.2, 0.4), np.array([1.1, 0.1, -0.1])))
     >>> check_jacobians(factor, values)
     """
-    whitened, _ = factor.linearize(values).jacobian()
-    jacobians = np.linalg.solve(factor.noiseModel().R(), whitened)  # of linearize: R J, with R^T R the information
+    noise = factor.noiseModel()
+    if not isinstance(noise, gtsam.noiseModel.Gaussian):
+        raise TypeError(
+            f"expected a factor with a Gaussian noise model, not {type(noise).__name__}; leave out its kernel"
+        )
+    whitened = np.asarray(factor.linearize(values).jacobian()[0])
+    jacobians = np.linalg.solve(np.asarray(noise.R()), whitened)  # linearize gives R J, R^T R the information
     zero, column = values.zeroVectors(), 0
     for key in factor.keys():  # noqa: SIM118  # no dictionary
         size = len(zero.at(key))
@@ -59,7 +68,7 @@ def check_jacobians(
         scale = max(1.0, float(np.abs(analytic).max(initial=0.0)), float(np.abs(numeric).max(initial=0.0)))
         off = np.abs(analytic - numeric)
         if not off.max(initial=0.0) <= tolerance * scale:
-            row, k = np.unravel_index(int(np.nanargmax(np.where(np.isnan(off), np.inf, off))), off.shape)
+            row, k = divmod(int(np.argmax(np.where(np.isnan(off), np.inf, off))), size)
             raise AssertionError(
                 f"derivative of error {row} by direction {k} of {gtsam.DefaultKeyFormatter(key)}: the factor says"
                 f" {analytic[row, k]:.9g}, differences say {numeric[row, k]:.9g}"
@@ -99,10 +108,11 @@ def check_consistent(nees: ArrayLike, dof: int, *, confidence: float = 0.99) -> 
         ...
     AssertionError: NEES per degree of freedom is 0.451, below 0.858 to 1.155 (99%): covariances are too large
     """
-    squares = np.asarray(nees, np.float64).ravel()
+    squares: Floats = np.asarray(nees, np.float64).ravel()
     if not len(squares) or not np.isfinite(squares).all():
         raise AssertionError(f"expected finite NEES, not {squares[~np.isfinite(squares)].tolist() or 'none'}")
-    lowest, highest = chi2.interval(confidence, len(squares) * dof) / np.float64(len(squares) * dof)
+    total_dof = len(squares) * dof
+    lowest, highest = (float(bound) / total_dof for bound in chi2.interval(confidence, total_dof))
     mean = float(squares.mean() / dof)
     if not lowest <= mean <= highest:
         side, sizes = ("below", "large") if mean < lowest else ("above", "small")

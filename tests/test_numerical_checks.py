@@ -1,0 +1,84 @@
+"""The checks that users run on factors and covariances tell right from wrong."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from sonar_graph.testing import check_consistent, check_jacobians
+
+NOISE = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.1, 0.2]))
+
+
+def bearing_range_like(wrong: float) -> tuple[gtsam.CustomFactor, gtsam.Values]:
+    """Range and azimuth of a point, with one entry of the Jacobian off by a factor."""
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+        x, y = values.atPoint2(factor.keys()[0])
+        rho = np.hypot(x, y)
+        if jacobians is not None:
+            jacobians[0] = np.array([[x / rho, y / rho], [-y / rho**2 * wrong, x / rho**2]])
+        return np.array([rho - 2.0, np.arctan2(y, x)])
+
+    values = gtsam.Values()
+    values.insert(7, np.array([1.5, 1.2]))
+    return gtsam.CustomFactor(NOISE, [7], error), values
+
+
+def test_right_derivatives_pass_and_a_wrong_one_is_named() -> None:
+    check_jacobians(*bearing_range_like(1.0))
+    with pytest.raises(
+        AssertionError, match=r"error 1 by direction 0 of 7: the factor says -0\.325\d+, differences say"
+    ):
+        check_jacobians(*bearing_range_like(1.001))
+
+
+def test_a_nan_in_a_jacobian_does_not_pass() -> None:
+    with pytest.raises(AssertionError, match="nan"):
+        check_jacobians(*bearing_range_like(np.nan))
+
+
+def test_columns_belong_to_their_variables() -> None:
+    values = gtsam.Values()
+    values.insert(3, gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.7, 3.1), np.array([1.0, 2.0, 3.0])))
+    values.insert(1, np.array([2.0, -1.0, 0.5]))
+    factor = gtsam.RangeFactor3D(3, 1, 2.0, gtsam.noiseModel.Isotropic.Sigma(1, 0.01))
+    check_jacobians(factor, values)
+
+
+def test_a_robust_kernel_is_refused_with_advice() -> None:
+    robust = gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Huber.Create(1.0), gtsam.noiseModel.Unit.Create(3)
+    )
+    values = gtsam.Values()
+    values.insert(0, np.zeros(3))
+    with pytest.raises(TypeError, match="leave out its kernel"):
+        check_jacobians(gtsam.PriorFactorPoint3(0, np.ones(3), robust), values)
+
+
+@pytest.mark.parametrize(("scale", "said"), [(1.0, None), (0.7, "too large"), (1.4, "too small")])
+def test_covariances_are_judged_on_both_sides(scale: float, said: str | None) -> None:
+    nees = scale * (np.random.default_rng(3).standard_normal((200, 3)) ** 2).sum(axis=1)
+    if said is None:
+        check_consistent(nees, dof=3)
+    else:
+        with pytest.raises(AssertionError, match=said):
+            check_consistent(nees, dof=3)
+
+
+def test_consistent_errors_fail_as_often_as_stated() -> None:
+    rng = np.random.default_rng(5)
+    failed = 0
+    for _ in range(1000):
+        try:
+            check_consistent((rng.standard_normal((20, 2)) ** 2).sum(axis=1), dof=2, confidence=0.9)
+        except AssertionError:
+            failed += 1
+    assert 70 <= failed <= 130
+
+
+@pytest.mark.parametrize("nees", [[], [1.0, np.nan]])
+def test_nothing_and_nan_are_no_evidence(nees: list[float]) -> None:
+    with pytest.raises(AssertionError, match="expected finite NEES"):
+        check_consistent(nees, dof=1)
