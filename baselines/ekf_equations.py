@@ -1,40 +1,31 @@
-"""State and covariance of EKF-SLAM: the paper's equations (4) and (5), their prediction, and how a correction enters.
+"""Equations (4) to (7) of the paper's EKF-SLAM: state, prediction, observation and innovation, augmentation.
 
 ::
 
     x = [X, Y, Z, phi, theta, psi, p_1, ..., p_N]            (4)  p_i: landmark in the world, 3 numbers
+    P = [ P_vv  P_vm ; P_vm^T  P_mm ]                        (5)
+    z = h(x_v, p)                                            (6)  range and azimuth
+    e = z_measured - z, azimuth wrapped                      (7)
 
-    P = [ P_vv    P_vm ]                                     (5)
-        [ P_vm^T  P_mm ]
+Prediction over the motion (dR, dp, C) to the next DVL stamp, with ``R = Rz(psi) Ry(theta) Rx(phi)``::
 
-Prediction from one DVL stamp to the next, with the motion (dR, dp) that gyros and Doppler log measured in between::
+    X' = X + R dp,  R' = R dR,   P_vv' = F P_vv F^T + G C G^T,  P_vm' = F P_vm
+    F = [ I  -R [dp]x W  ]      G = [ 0         R ]
+        [ 0   E' dR^T W  ]          [ E' dR^T   0 ]
 
-    X'    = X + R dp                    R = Rz(psi) Ry(theta) Rx(phi)
-    R'    = R dR                        the exact integral of the Euler kinematics for a constant rate
-    P_vv' = F P_vv F^T + Q,  P_vm' = F P_vm
-
-    F = [ I  -R [dp]x W  ]      Q = G cov G^T,  G = [ 0         R ]
-        [ 0   E' dR^T W  ]                          [ E' dR^T   0 ]
-
-W, E: see `sonar_graph.numerics.mat3`; cov: of the motion's perturbation [theta_i, eps], see `baselines.filter_motion`.
-Arrays have room for more landmarks than there are; ``n`` is the length of the state. Everything happens in place.
-
-Derivatives of what is measured, in EKF-SLAM.
-
-All is measured a provisional motion (dR, dp, cov) after the state. It depends on state and motion through how far a
-point s fixed in the body (in the axes of the state's body) moves along a direction n (in the same axes)::
+Everything measured is a function of how far a point s of the body, a provisional motion after the state, moves along a
+direction n (both in the axes of the state's body)::
 
     row(n, s) = [ (R n)^T   (s x n)^T W | ((s - dp) x n)^T   n^T ]     by X, (phi, theta, psi) | theta_i, eps
 
-EKF-SLAM without landmarks: prediction from node to node, depth, gravity and the planar constraint.
+Update: ``S = H P H^T + R_z + H_m C H_m^T``, with ``H_v | H_m = row(-n, p_n)`` and ``H_p = (R n)^T`` for n of range and
+azimuth each (`baselines.sonar_update`). Augmentation by a new landmark at ``g = X + R s``, with
+``G_v | G_m = row(n, s)`` for the world's three axes n::
 
-Nodes are the stamps of the Doppler log (`sonar_graph.navigation.odometry`); a depth sample between two of them is
-related to the earlier by a provisional motion.
+    P_pv = G_v P_v.,   P_pp = G_v P_vv G_v^T + G_m C G_m^T + G_z diag(R_z, elevation_sigma^2) G_z^T
 
-Gravity. From the specific force over about a second follows the direction of the world's up in the body
-(`sonar_graph.navigation.alignment.gravity`), of which roll and pitch are ``atan2(up_y, up_z)`` and
-``atan2(-up_x, hypot(up_y, up_z))``: corrections of one state each, with the variance of the tilt (for roll over
-``cos(theta)^2``).
+W, E: `sonar_graph.numerics`. Arrays have room for more landmarks than there are; ``n`` is the length of the state.
+Derivation and the choices the paper leaves open: docs/theory/ekf_slam.md.
 """
 
 from __future__ import annotations
@@ -44,11 +35,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.filter_events import GravityInterval, reach_node, up_at_node
-from baselines.filter_inputs import VehicleModel
-from baselines.sonar_update import correct_jointly
-from sonar_graph.measurements import Floats, Ints
-from sonar_graph.navigation.preintegration import Columns, Integral
+from baselines.sonar_update import (
+    GATED,
+    NEW,
+    NO_SLOT,
+    PASSED_OVER,
+    USED,
+    DetectionRow,
+    Frame,
+    SonarModel,
+    correct_jointly,
+    detection_row,
+    elevation_of_new,
+    far_polar_covariance,
+    is_beyond_linear,
+    is_inside_gate,
+    point_seen,
+    polar_covariance,
+    predicted_view,
+    range_azimuth_jacobian,
+)
+from sonar_graph.measurements import Floats
+from sonar_graph.navigation.preintegration import Integral
 from sonar_graph.numerics import (
     Matrix,
     Vector,
@@ -75,52 +83,40 @@ from sonar_graph.numerics import (
     transposed,
     vector,
 )
-from sonar_graph.slam.models import wrap_angle
+from sonar_graph.slam.models import FLOOR_GATE, sonar_point_jacobian, wrap_angle
 
 POSE = 6
-"""Numbers of x_v."""
+"""Length of x_v."""
 LANDMARK = 3
-"""Numbers of p_i."""
+"""Length of p_i."""
 
 
 @inlined
 def predict(x: Floats, P: Floats, n: int, motion: Integral) -> None:
-    """Carry state and covariance over a motion."""
+    """Carry state and covariance over a motion, with ``F = [[I, A], [0, B]]`` on the pose."""
     angles = vector(x[3:])
     R, W = rotation_from_euler(angles), rates_from_euler(angles)
     angles_after = euler_from_rotation(product(R, motion.dR))
     E_dR = product(euler_from_rates(angles_after), transposed(motion.dR))
-    X_by_angles, angles_by_angles = product(R, skew_times(scaled(-1.0, motion.dp), W)), product(E_dR, W)
+    A, B = product(R, skew_times(scaled(-1.0, motion.dp), W)), product(E_dR, W)
     _set_triple(x, 0, transformed(vector(x), R, motion.dp))
     _set_triple(x, 3, angles_after)
-    _predict_pose(P, X_by_angles, angles_by_angles, motion, R, E_dR)
-    _predict_landmarks(P, n, X_by_angles, angles_by_angles)
-
-
-@inlined
-def _predict_pose(P: Floats, A: Matrix, B: Matrix, motion: Integral, R: Matrix, E_dR: Matrix) -> None:
-    """``P_vv <- F P_vv F^T + Q`` with ``F = [[I, A], [0, B]]``."""
     XX, XE, EE = matrix(P[:, :3]), matrix(P[:, 3:]), matrix(P[3:, 3:])
     XE_carried = sum_of(XE, product(A, EE))
     XX = sum_of(sum_of(XX, product(XE_carried, transposed(A))), product(A, transposed(XE)))
     XX = sum_of(XX, sandwich(R, motion.cov_rr, R))
     XE = sum_of(product(XE_carried, transposed(B)), sandwich(R, motion.cov_rt, E_dR))
     EE = sum_of(sandwich(B, EE, B), sandwich(E_dR, motion.cov_tt, E_dR))
-    place_symmetric(symmetric(XX), transposed(XE), symmetric(EE), P)
-
-
-@inlined
-def _predict_landmarks(P: Floats, n: int, A: Matrix, B: Matrix) -> None:
-    """``P_vm <- F P_vm``, and its transpose."""
+    _place_symmetric(symmetric(XX), transposed(XE), symmetric(EE), P)
     for c in range(POSE, n):
-        angles = (P[3, c], P[4, c], P[5, c])
-        column = plus((P[0, c], P[1, c], P[2, c]), times(A, angles)) + times(B, angles)
+        carried = (P[3, c], P[4, c], P[5, c])
+        column = plus((P[0, c], P[1, c], P[2, c]), times(A, carried)) + times(B, carried)
         for r in range(POSE):
             P[r, c] = P[c, r] = column[r]
 
 
 @inlined
-def place_symmetric(first: Matrix, mixed: Matrix, second: Matrix, out: Floats) -> None:
+def _place_symmetric(first: Matrix, mixed: Matrix, second: Matrix, out: Floats) -> None:
     """Write ``[[first, mixed^T], [mixed, second]]``."""
     place(first, out, 0, 0)
     place(transposed(mixed), out, 0, 3)
@@ -130,7 +126,7 @@ def place_symmetric(first: Matrix, mixed: Matrix, second: Matrix, out: Floats) -
 
 @inlined
 def pose_after(x: Floats, P: Floats, motion: Integral) -> tuple[Floats, Floats, Floats]:
-    """The body a motion after the state, and the covariance of its perturbation [theta, rho].
+    """Pose of the body a motion after the state, with the covariance of its perturbation [theta, rho].
 
     ``theta = dR^T (W d(angles) + theta_i)`` and ``rho = dR^T (R^T dX - [dp]x W d(angles) + eps)``.
 
@@ -148,7 +144,7 @@ def pose_after(x: Floats, P: Floats, motion: Integral) -> tuple[Floats, Floats, 
     rr = sum_of(sandwich(node_R_world, XX, node_R_world), motion.cov_rr)
     rr = sum_of(rr, sum_of(product(XE_carried, transposed(V)), product(V, transposed(XE))))
     own = np.empty((POSE, POSE))
-    place_symmetric(
+    _place_symmetric(
         symmetric(sandwich(j_R_i, tt, j_R_i)),
         sandwich(j_R_i, rt, j_R_i),
         symmetric(sandwich(j_R_i, rr, j_R_i)),
@@ -159,24 +155,15 @@ def pose_after(x: Floats, P: Floats, motion: Integral) -> tuple[Floats, Floats, 
 
 @inlined
 def _set_triple(x: Floats, at: int, value: Vector) -> None:
-    """Three numbers of the state."""
+    """Write three numbers of the state."""
     x[at], x[at + 1], x[at + 2] = value
 
 
 @inlined
 def correct(x: Floats, P: Floats, n: int, cross_cov: Floats, S: float, innovation: float) -> None:
-    """Correction by one number.
+    """Update by one number: ``w = P H^T / sqrt(S)``, ``P <- P - w w^T``, ``x <- x + w innovation / sqrt(S)``.
 
-    ``w = P H^T / sqrt(S)``, ``P <- P - w w^T``, ``x <- x + w innovation / sqrt(S)``: the textbook's ``(I - K H) P`` in
-    a form whose products commute, so that P stays symmetric to the last bit. Joseph's form, which also keeps P positive
-    for a wrong gain, costs several times as much and is not needed for the optimal one in double precision.
-
-    Parameters
-    ----------
-    cross_cov
-        ``P H^T``, shape (n,); overwritten.
-    S
-        Innovation variance.
+    The products commute, so that P stays symmetric to the last bit. ``cross_cov`` is ``P H^T`` (n,), overwritten.
     """
     root = math.sqrt(S)
     w, share = cross_cov, innovation / root
@@ -191,16 +178,9 @@ def correct(x: Floats, P: Floats, n: int, cross_cov: Floats, S: float, innovatio
 
 @inlined
 def correct_pair(x: Floats, P: Floats, n: int, cross_cov: Floats, S: Floats, innovation: Floats) -> None:
-    """Correction by two numbers at once: as `correct`, with the Cholesky factor of S in place of the root.
+    """Update by two numbers at once: as `correct`, with the Cholesky factor of S (2, 2) in place of the root.
 
-    Parameters
-    ----------
-    cross_cov
-        ``H P``, shape (2, n); overwritten.
-    S
-        Innovation covariance, shape (2, 2).
-    innovation
-        Shape (2,).
+    ``cross_cov`` is ``H P`` (2, n), overwritten.
     """
     l_00 = math.sqrt(S[0, 0])
     l_10 = S[1, 0] / l_00
@@ -220,7 +200,7 @@ def correct_pair(x: Floats, P: Floats, n: int, cross_cov: Floats, S: Floats, inn
 
 @compiled
 def correct_by(x: Floats, P: Floats, n: int, cross_cov: Floats, S: Floats, innovation: Floats) -> None:
-    """Correction by m numbers at once: as `correct_pair`, with shapes (m, n), (m, m) and (m,)."""
+    """Update by m numbers at once: as `correct_pair`, with shapes (m, n), (m, m) and (m,)."""
     correct_jointly(P, n, cross_cov, S, innovation, x)
     _wrap(x)
 
@@ -232,7 +212,7 @@ def _wrap(x: Floats) -> None:
 
 
 class Moment(NamedTuple):
-    """The state, and what lies between it and the instant of a frame."""
+    """Pose of the state, and the motion from it to the instant of a frame."""
 
     X: Vector
     R: Matrix
@@ -251,14 +231,14 @@ class MeasurementRow(NamedTuple):
 
 @compiled
 def moment_after(x: Floats, motion: Integral) -> Moment:
-    """The state and a motion after it."""
+    """The moment a motion after the state."""
     angles = vector(x[3:])
     return Moment(vector(x), rotation_from_euler(angles), rates_from_euler(angles), motion)
 
 
 @inlined
 def row_along(moment: Moment, n: Vector, s: Vector) -> MeasurementRow:
-    """``row(n, s)`` of the module's docstring."""
+    """The derivatives ``row(n, s)``."""
     by_angles = times(transposed(moment.W), cross(s, n))
     return MeasurementRow(times(moment.R, n), by_angles, cross(minus(s, moment.motion.dp), n), n)
 
@@ -280,55 +260,24 @@ def add_covariances(P: Floats, n: int, at: int, factors: Vector, out: Floats) ->
             out[c] += factor * P[at + k, c]
 
 
-@compiled
-def advance_to_node(
-    columns: Columns,
-    vehicle: VehicleModel,
-    x: Floats,
-    P: Floats,
-    n: int,
-    clock: Ints,
-    interval: GravityInterval,
-    node_ns: int,
-    motion: Integral,
-) -> None:
-    """Predict over a motion to a node and apply what holds there.
-
-    Parameters
-    ----------
-    x, P, n, clock, interval
-        Filter state; changed.
-    """
-    predict(x, P, n, motion)
-    reach_node(clock, node_ns)
-    up, sigma = up_at_node(columns, vehicle, motion, clock, interval)
-    if not math.isnan(sigma):
-        _correct_up(x, P, n, up, sigma)
-    if vehicle.is_planar:
-        values = (vehicle.plane_z_m, 0.0, 0.0)
-        variances = (vehicle.plane_z_variance, vehicle.plane_tilt_variance, vehicle.plane_tilt_variance)
-        for k in range(3):
-            _correct_state(x, P, n, 2 + k, values[k], variances[k])
-
-
 @inlined
-def _correct_up(x: Floats, P: Floats, n: int, up: Vector, sigma: float) -> None:
-    """Correct roll and pitch."""
+def correct_up(x: Floats, P: Floats, n: int, up: Vector, sigma: float) -> None:
+    """Update roll and pitch by the direction of the world's up in the body."""
     level = math.hypot(up[1], up[2])
-    _correct_state(x, P, n, 3, math.atan2(up[1], up[2]), (sigma / level) ** 2)
-    _correct_state(x, P, n, 4, math.atan2(-up[0], level), sigma**2)
+    correct_state(x, P, n, 3, math.atan2(up[1], up[2]), (sigma / level) ** 2)
+    correct_state(x, P, n, 4, math.atan2(-up[0], level), sigma**2)
 
 
 @inlined
-def _correct_state(x: Floats, P: Floats, n: int, at: int, value: float, variance: float) -> None:
-    """Correct by a direct measurement of Z or of an angle."""
+def correct_state(x: Floats, P: Floats, n: int, at: int, value: float, variance: float) -> None:
+    """Update by a direct measurement of Z or of an angle."""
     innovation = value - x[at] if at < 3 else wrap_angle(value - x[at])
     correct(x, P, n, P[at, :n].copy(), P[at, at] + variance, innovation)
 
 
 @inlined
 def correct_depth(x: Floats, P: Floats, n: int, motion: Integral, port: Vector, z_m: float, variance_m2: float) -> None:
-    """Correct by the height of the pressure port, ``(X + R s)_z`` with ``s = dp + dR port``: row(n, s) along up."""
+    """Update by the height of the pressure port, ``(X + R s)_z`` with ``s = dp + dR port``: row(n, s) along up."""
     moment = moment_after(x, motion)
     s = transformed(motion.dp, motion.dR, port)
     row = row_along(moment, moment.R[2], s)
@@ -337,3 +286,134 @@ def correct_depth(x: Floats, P: Floats, n: int, motion: Integral, port: Vector, 
     add_covariances(P, n, 3, row.by_angles, U)
     S = dot(row.by_X, vector(U)) + dot(row.by_angles, vector(U[3:])) + motion_covariance(motion, row, row) + variance_m2
     correct(x, P, n, U, S, z_m - x[2] - dot(moment.R[2], s))
+
+
+@inlined
+def augment(x: Floats, P: Floats, n: int, moment: Moment, sonar: SonarModel, seen: DetectionRow) -> None:
+    """Append a landmark where it was seen.
+
+    On a floor of known height its height is measured once, with the variance ``P_pp[z, z] + floor_sigma^2``, unless the
+    floor's gate refuses it: a point far from the floor is something in the water or a false detection.
+    """
+    elevation_rad = elevation_of_new(moment.X, moment.R, moment.motion, sonar, seen.z)
+    point, G, G_z = location(moment, sonar, seen.z, elevation_rad)
+    noise = polar_covariance(seen.R_z, sonar.aperture_rad)
+    own = np.empty((LANDMARK, LANDMARK))
+    place(symmetric(sandwich(G_z, noise, G_z)), own, 0, 0)
+    for r in range(LANDMARK):
+        x[n + r] = point[r]
+        P[n + r, :n] = 0.0
+        add_covariances(P, n, 0, G[r].by_X, P[n + r])
+        add_covariances(P, n, 3, G[r].by_angles, P[n + r])
+        for c in range(n):
+            P[c, n + r] = P[n + r, c]
+    for r in range(LANDMARK):
+        for c in range(r + 1):
+            own[r, c] += motion_covariance(moment.motion, G[r], G[c])
+            own[r, c] += dot(G[c].by_X, vector(P[n + r])) + dot(G[c].by_angles, vector(P[n + r, 3:]))
+            P[n + r, n + c] = P[n + c, n + r] = own[r, c]
+    if sonar.has_floor:
+        n += LANDMARK
+        innovation, S = sonar.floor_z_m - x[n - 1], P[n - 1, n - 1] + sonar.floor_variance_m2
+        if innovation * innovation <= FLOOR_GATE * S:
+            correct(x, P, n, P[n - 1, :n].copy(), S, innovation)
+
+
+@compiled
+def location(
+    moment: Moment, sonar: SonarModel, z: tuple[float, float], elevation_rad: float
+) -> tuple[Vector, tuple[MeasurementRow, MeasurementRow, MeasurementRow], Matrix]:
+    """The point g that a detection shows, its ``G_v | G_m``, and G_z by (range, azimuth, elevation)."""
+    motion = moment.motion
+    s = point_seen(motion, sonar, z, elevation_rad)
+    G = (row_along(moment, moment.R[0], s), row_along(moment, moment.R[1], s), row_along(moment, moment.R[2], s))
+    world_R_sonar = product(product(moment.R, motion.dR), sonar.body_R_sonar)
+    G_z = product(world_R_sonar, matrix(sonar_point_jacobian(z[0], z[1], elevation_rad)))
+    return transformed(moment.X, moment.R, s), G, G_z
+
+
+@compiled
+def observe_rows(x: Floats, P: Floats, n: int, motion: Integral, sonar: SonarModel, frame: Frame) -> int:
+    """Update by the rows of a frame, a motion after the state, one after the other; returns the state's length."""
+    outcomes = frame.outcomes[0]
+    for row in range(frame.first, frame.last):
+        seen, moment = detection_row(frame, row, sonar), moment_after(x, motion)
+        at = POSE + LANDMARK * seen.slot
+        if seen.slot == NO_SLOT:
+            outcomes[row] = PASSED_OVER
+        elif at >= n:
+            augment(x, P, n, moment, sonar, seen)
+            n += LANDMARK
+            outcomes[row] = NEW
+        elif frame.was_lost:
+            outcomes[row] = observe_far(x, P, n, at, moment, sonar, seen)
+        else:
+            outcomes[row] = _observe(x, P, n, at, moment, sonar, seen)
+    return n
+
+
+@compiled
+def observation(moment: Moment, p: Vector, sonar: SonarModel) -> tuple[Floats, MeasurementRow, MeasurementRow]:
+    """(6): predicted range and azimuth (2,), and ``H_v | H_m`` of each; ``H_p`` is the opposite of its ``by_X``."""
+    z, p_n, by_range, by_azimuth = predicted_view(moment.X, moment.R, moment.motion, sonar, p)
+    return z, row_along(moment, scaled(-1.0, by_range), p_n), row_along(moment, scaled(-1.0, by_azimuth), p_n)
+
+
+@inlined
+def _observe(x: Floats, P: Floats, n: int, at: int, moment: Moment, sonar: SonarModel, seen: DetectionRow) -> int:
+    """Update by a landmark of the state where its innovation is inside the gate."""
+    predicted, by_range, by_azimuth = observation(moment, vector(x[at:]), sonar)
+    _, z, R_z, innovation, S = seen
+    innovation[0], innovation[1] = z[0] - predicted[0], wrap_angle(z[1] - predicted[1])  # (7)
+    U = np.zeros((2, n))
+    _add_row_covariances(P, n, at, by_range, U[0])
+    _add_row_covariances(P, n, at, by_azimuth, U[1])
+    motion = moment.motion
+    S[0, 0] = _variance_share(U[0], at, by_range) + R_z[0] + motion_covariance(motion, by_range, by_range)
+    S[0, 1] = _variance_share(U[0], at, by_azimuth) + R_z[1] + motion_covariance(motion, by_range, by_azimuth)
+    S[1, 1] = _variance_share(U[1], at, by_azimuth) + R_z[2] + motion_covariance(motion, by_azimuth, by_azimuth)
+    S[1, 0] = S[0, 1]
+    if not is_inside_gate(seen, sonar):
+        return GATED
+    correct_pair(x, P, n, U, S, innovation)
+    return USED
+
+
+@compiled
+def observe_far(x: Floats, P: Floats, n: int, at: int, moment: Moment, sonar: SonarModel, seen: DetectionRow) -> int:
+    """Update by a landmark that may be far from where it is predicted, (2) of `baselines.sonar_update`."""
+    _, z, R_z, innovation, S = seen
+    point, G, by_view = location(moment, sonar, z, 0.0)
+    G_z = np.array(by_view)
+    U, cov, missed = np.empty((LANDMARK, n)), np.empty((LANDMARK, LANDMARK)), np.empty(LANDMARK)
+    for r in range(LANDMARK):
+        missed[r], U[r] = point[r] - x[at + r], P[at + r, :n]
+        add_covariances(P, n, 0, scaled(-1.0, G[r].by_X), U[r])
+        add_covariances(P, n, 3, scaled(-1.0, G[r].by_angles), U[r])
+    for r in range(LANDMARK):
+        for c in range(r + 1):
+            share = dot(G[c].by_X, vector(U[r])) + dot(G[c].by_angles, vector(U[r, 3:]))
+            cov[r, c] = cov[c, r] = U[r, at + c] - share + motion_covariance(moment.motion, G[r], G[c])
+    if not is_beyond_linear(cov, G_z, z[0], R_z):
+        return int(_observe(x, P, n, at, moment, sonar, seen))
+    cov += G_z @ far_polar_covariance(z[0], R_z, sonar.aperture_rad) @ G_z.T
+    B = range_azimuth_jacobian(G_z, z[0])
+    innovation[:], S[:] = B @ missed, B @ cov @ B.T
+    if not is_inside_gate(seen, sonar):
+        return GATED
+    correct_by(x, P, n, U, cov, missed)
+    return USED
+
+
+@inlined
+def _add_row_covariances(P: Floats, n: int, at: int, row: MeasurementRow, out: Floats) -> None:
+    """``out += H P`` for a row of H with a landmark, shape (n,); only columns of pose and landmark are not zero."""
+    add_covariances(P, n, 0, row.by_X, out)
+    add_covariances(P, n, 3, row.by_angles, out)
+    add_covariances(P, n, at, scaled(-1.0, row.by_X), out)
+
+
+@inlined
+def _variance_share(U: Floats, at: int, row: MeasurementRow) -> float:
+    """``U H^T`` for a row of H with a landmark."""
+    return dot(row.by_X, minus(vector(U), vector(U[at:]))) + dot(row.by_angles, vector(U[3:]))

@@ -1,26 +1,28 @@
-"""How the body moved, for EKF-SLAM: final motions from node to node, provisional ones to what happens in between.
+"""Motion of the body and direction of gravity, from the IMU and the Doppler log; for both filters.
 
-Every motion begins at the node of the state, and its covariance is that of the perturbation [theta_i, eps] in that
-node's frame (`sonar_graph.navigation.preintegration.recursion`): ``Exp(theta_i) dR`` and ``dp + eps``.
+A motion (dR, dp) begins at the node of the state. Its covariance is that of the perturbation [theta_i, eps] in that
+node's frame: ``Exp(theta_i) dR`` and ``dp + eps``. A gyro bias larger by db adds ``theta_i = D_t db`` and
+``eps = D_r db``; only the invariant filter has a bias in its state. Steps and gaps are those of every estimator
+(`sonar_graph.navigation.preintegration`, docs/theory/preintegration.md, docs/theory/gaps.md).
 
-Between two nodes several depth samples and frames follow each other. What they have in common, the steps up to the
-newest IMU row, is integrated once and extended: the sums are the same to the last bit as those from the node on.
+Between two nodes EKF-SLAM integrates the steps up to the newest IMU row once and extends them to each depth sample and
+frame: the sums are the same to the last bit as those from the node on.
 
-How the body moved, for the invariant filter: motions from a node, and their derivatives by the gyro bias.
-
-The steps are every estimator's (`sonar_graph.navigation.preintegration.recursion`). With the perturbation [theta_i,
-eps] in the node's
-frame a bias that is larger by db gives ``theta_i = D_t db`` and ``eps = D_r db``
-(`sonar_graph.navigation.preintegration.recursion.extended_by_bias`).
+Over about a second the mean specific force less the change of the Doppler velocity is that of gravity, which gives the
+direction of the world's up in the body (`sonar_graph.navigation.alignment`, docs/theory/ekf_slam.md).
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
-from baselines.filter_inputs import VehicleModel
-from sonar_graph.measurements import Floats
-from sonar_graph.navigation import rows_until
+import numpy as np
+
+from baselines.filter_window import NODE, OPENED, GravityInterval, VehicleModel
+from sonar_graph.measurements import Floats, Ints
+from sonar_graph.navigation import rows_until, value_at
+from sonar_graph.navigation.alignment import tilt_sigma, up_direction
 from sonar_graph.navigation.preintegration import (
     NO_MOTION,
     Columns,
@@ -37,29 +39,37 @@ from sonar_graph.navigation.preintegration import (
     rate_of_turn,
 )
 from sonar_graph.numerics import (
+    IDENTITY,
     ZERO,
     ZEROS,
     Matrix,
     Vector,
     compiled,
+    cross,
     gram,
     inlined,
     matrix,
     multiple_of,
+    place,
+    plus,
+    product,
     rotation_from_euler,
     sum_of,
     times,
+    transformed,
     transposed,
     vector,
 )
 
+UP: Vector = (0.0, 0.0, 1.0)
+
 
 class ProvisionalMotion(NamedTuple):
-    """Motion since a node over the steps that later instants share, and what it holds for."""
+    """Motion since a node over the steps that later instants share, and the conditions under which it holds."""
 
     node_ns: int
     dvl_rows: int
-    """Rows that it has seen: one more changes the velocity that was held so far."""
+    """Doppler rows used: one more changes the velocity that was held."""
     earth: Vector
     """Earth's rotation in the node's frame, rad/s; a correction of the attitude changes it."""
     cursor: Cursor
@@ -73,9 +83,9 @@ def motion_to_node(columns: Columns, vehicle: VehicleModel, x: Floats, start_ns:
         return _bridged(columns, vehicle, x, start_ns, node_ns, True)
     imu_ns, dvl_ns = columns[0], columns[3]
     imu_rows, dvl_rows = rows_until(imu_ns, node_ns - 1) + 1, rows_until(dvl_ns, node_ns)
-    start, earth = cursor_at(columns, start_ns), _earth(vehicle, x)
+    start, earth = cursor_at(columns, start_ns), _earth_in_body(vehicle, rotation_from_euler(vector(x[3:])))
     _, motion = _integrate(columns, vehicle, imu_rows, dvl_rows, earth, start, NO_MOTION, node_ns)
-    return finished(motion)
+    return _finished(motion)
 
 
 @compiled
@@ -87,20 +97,20 @@ def motion_since_node(
     Parameters
     ----------
     running
-        As returned for an earlier instant, or by `nothing_running`.
+        As returned for an earlier instant, or by `no_provisional_motion`.
     """
     if until_ns - node_ns > vehicle.gap[0]:
         return running, _bridged(columns, vehicle, x, node_ns, until_ns, False)
     imu_ns, dvl_ns = columns[0], columns[3]
     imu_rows, dvl_rows = rows_until(imu_ns, until_ns), rows_until(dvl_ns, until_ns)
-    earth = _earth(vehicle, x)
+    earth = _earth_in_body(vehicle, rotation_from_euler(vector(x[3:])))
     cursor, motion = running.cursor, running.motion
     if (running.node_ns, running.dvl_rows, running.earth) != (node_ns, dvl_rows, earth):
         cursor, motion = cursor_at(columns, node_ns), NO_MOTION
     newest_ns = imu_ns[imu_rows - 1] if imu_rows > 0 else node_ns
     cursor, motion = _integrate(columns, vehicle, imu_rows, dvl_rows, earth, cursor, motion, newest_ns)
     _, until = _integrate(columns, vehicle, imu_rows, dvl_rows, earth, cursor, motion, until_ns)
-    return ProvisionalMotion(node_ns, dvl_rows, earth, cursor, motion), finished(until)
+    return ProvisionalMotion(node_ns, dvl_rows, earth, cursor, motion), _finished(until)
 
 
 @compiled
@@ -109,46 +119,37 @@ def _bridged(
 ) -> Integral:
     """Motion over a gap of the Doppler log, with what an unknown gyro bias adds to the displacement.
 
-    The state has no bias. Elsewhere its drift is left out, as published; in a gap it tilts gravity, and the
-    displacement would be wrong by many times its sigma.
+    EKF-SLAM's state has no bias, and its drift is left out elsewhere, as published. In a gap the bias tilts gravity:
+    without its share the displacement would be wrong by many times its sigma.
     """
-    earth = _earth(vehicle, x)
+    earth = _earth_in_body(vehicle, rotation_from_euler(vector(x[3:])))
     motion, _, D = bridge(columns, vehicle.gap, start_ns, end_ns, is_closed, ZERO, earth)
     cov_rr = sum_of(motion.cov_rr, multiple_of(vehicle.gyro_bias_sigma**2, gram(D)))
     return Integral(motion.dR, motion.dp, motion.impulse, motion.cov_tt, motion.cov_rt, cov_rr)
 
 
 @compiled
-def inflate_shared_motion(motion: Integral, times_told: int) -> Integral:
+def inflate_shared_motion(motion: Integral, k: int) -> Integral:
     """The motion to the k-th measurement that is related to the state over the same gap.
 
-    All share its error. Taken as independent, many of them would tell more than one exact one can: with k (k + 1) times
-    the covariance the information of all together stays below that, since ``sum 1 / (k (k + 1)) = 1``.
+    All of them share its error. With k (k + 1) times the covariance they together carry no more information than one
+    exact measurement: ``sum 1 / (k (k + 1)) = 1``.
     """
-    share = float(times_told * (times_told + 1))
-    tt, rt, rr = (
-        multiple_of(share, motion.cov_tt),
-        multiple_of(share, motion.cov_rt),
-        multiple_of(share, motion.cov_rr),
-    )
-    return Integral(motion.dR, motion.dp, motion.impulse, tt, rt, rr)
+    factor = float(k * (k + 1))
+    tt, rt = multiple_of(factor, motion.cov_tt), multiple_of(factor, motion.cov_rt)
+    return Integral(motion.dR, motion.dp, motion.impulse, tt, rt, multiple_of(factor, motion.cov_rr))
 
 
 @compiled
-def nothing_running() -> ProvisionalMotion:
-    """Before the first provisional motion."""
+def no_provisional_motion() -> ProvisionalMotion:
+    """Placeholder before the first provisional motion."""
     return ProvisionalMotion(-1, -1, ZERO, Cursor(-1, 0, 0), NO_MOTION)
 
 
 @inlined
-def earth_in_body(vehicle: VehicleModel, R: Matrix) -> Vector:
-    """Earth's rotation in the body frame of the state, rad/s."""
+def _earth_in_body(vehicle: VehicleModel, R: Matrix) -> Vector:
+    """Earth's rotation in the body frame, rad/s."""
     return times(transposed(R), vehicle.earth_rate)
-
-
-@inlined
-def _earth(vehicle: VehicleModel, x: Floats) -> Vector:
-    return earth_in_body(vehicle, rotation_from_euler(vector(x[3:])))
 
 
 @inlined
@@ -162,7 +163,7 @@ def _integrate(
     motion: Integral,
     until_ns: int,
 ) -> tuple[Cursor, Integral]:
-    """A motion and its place among the rows, taken on to an instant."""
+    """Extend a motion, and its cursor among the rows, to an instant."""
     while cursor.stamp_ns < until_ns:
         cursor, step = next_step(columns, imu_rows, dvl_rows, cursor, until_ns)
         rate = rate_of_turn(step, motion.dR, ZERO, earth)
@@ -172,8 +173,8 @@ def _integrate(
 
 
 @inlined
-def finished(motion: Integral) -> Integral:
-    """With all blocks of the covariance whole."""
+def _finished(motion: Integral) -> Integral:
+    """The motion with its covariance made symmetric."""
     return Integral(motion.dR, motion.dp, motion.impulse, motion.cov_tt, motion.cov_rt, mirrored(motion.cov_rr))
 
 
@@ -182,11 +183,11 @@ def motion_to_node_with_bias(
     columns: Columns, vehicle: VehicleModel, R: Floats, bias: Floats, start_ns: int, node_ns: int
 ) -> GapMotion:
     """Final motion to the next node, with the first IMU row at or after it."""
-    earth = earth_in_body(vehicle, matrix(R))
+    earth = _earth_in_body(vehicle, matrix(R))
     if node_ns - start_ns > vehicle.gap[0]:
         return bridge(columns, vehicle.gap, start_ns, node_ns, True, vector(bias), earth)
     imu_rows = rows_until(columns[0], node_ns - 1) + 1
-    return _integrate_invariant_motion(columns, vehicle, imu_rows, vector(bias), earth, start_ns, node_ns)
+    return _integrate_with_bias(columns, vehicle, imu_rows, vector(bias), earth, start_ns, node_ns)
 
 
 @compiled
@@ -194,25 +195,25 @@ def motion_since_node_with_bias(
     columns: Columns, vehicle: VehicleModel, R: Floats, bias: Floats, node_ns: int, until_ns: int
 ) -> GapMotion:
     """Provisional motion to an instant, from rows stamped no later."""
-    earth = earth_in_body(vehicle, matrix(R))
+    earth = _earth_in_body(vehicle, matrix(R))
     if until_ns - node_ns > vehicle.gap[0]:
         return bridge(columns, vehicle.gap, node_ns, until_ns, False, vector(bias), earth)
-    return _integrate_invariant_motion(
+    return _integrate_with_bias(
         columns, vehicle, rows_until(columns[0], until_ns), vector(bias), earth, node_ns, until_ns
     )
 
 
 @compiled
-def inflate_shared_motion_with_bias(motion: GapMotion, times_told: int) -> GapMotion:
-    """Motion to the k-th measurement in one gap; the bias is in the state and needs no inflation."""
-    return GapMotion(inflate_shared_motion(motion.integral, times_told), motion.D_t, motion.D_r)
+def inflate_shared_motion_with_bias(motion: GapMotion, k: int) -> GapMotion:
+    """The same as `inflate_shared_motion`; the bias is in the state and its derivatives stay."""
+    return GapMotion(inflate_shared_motion(motion.integral, k), motion.D_t, motion.D_r)
 
 
 @compiled
-def _integrate_invariant_motion(
+def _integrate_with_bias(
     columns: Columns, vehicle: VehicleModel, imu_rows: int, bias: Vector, earth: Vector, start_ns: int, end_ns: int
 ) -> GapMotion:
-    """Over all steps, from the rows that may be known."""
+    """Integrate all steps and the derivatives by the bias."""
     dvl_rows = rows_until(columns[3], end_ns)
     cursor, motion, D_t, D_r = cursor_at(columns, start_ns), NO_MOTION, ZEROS, ZEROS
     while cursor.stamp_ns < end_ns:
@@ -221,4 +222,61 @@ def _integrate_invariant_motion(
         added = increment(motion.dR, step.duration_s, turn, step.velocity, vehicle.body_p_dvl)
         D_t, D_r = extended_by_bias(D_t, D_r, step, added)
         motion = extended(motion, step, added, vehicle.gyro_noise_density)
-    return GapMotion(finished(motion), D_t, D_r)
+    return GapMotion(_finished(motion), D_t, D_r)
+
+
+@compiled
+def open_interval(columns: Columns, dvl_p_imu: Vector, interval: GravityInterval, clock: Ints) -> None:
+    """Begin a gravity interval at the node."""
+    velocity = _imu_velocity(columns, clock[NODE], dvl_p_imu)
+    place(IDENTITY, interval.i_R_node, 0, 0)
+    for r in range(3):
+        interval.impulse[r] = 0.0
+    for r in range(4):
+        interval.velocity[r] = velocity[r]
+    clock[OPENED] = clock[NODE]
+
+
+@inlined
+def _imu_velocity(columns: Columns, node_ns: int, dvl_p_imu: Vector) -> Floats:
+    """Velocity of the IMU at a node in body axes, m/s, and the variance of one component, shape (4,)."""
+    imu_ns, rate, _, dvl_ns, velocity, cov, hold_past, _ = columns
+    k = rows_until(dvl_ns, node_ns - 1)
+    w = value_at(imu_ns, rate, rows_until(imu_ns, node_ns - 1), node_ns, hold_past)
+    at_imu = np.empty(4)
+    at_imu[0], at_imu[1], at_imu[2] = plus(vector(velocity[k]), cross(w, dvl_p_imu))
+    at_imu[3] = (cov[k, 0, 0] + cov[k, 1, 1] + cov[k, 2, 2]) / 3.0
+    return at_imu
+
+
+@inlined
+def up_at_node(
+    columns: Columns, vehicle: VehicleModel, motion: Integral, clock: Ints, interval: GravityInterval
+) -> tuple[Vector, float]:
+    """Direction of the world's up in the body at the node that a motion has led to, and the sigma of its tilt (rad).
+
+    The sigma is NaN while the interval goes on, and where the specific force was not measured all along.
+    """
+    if vehicle.gravity_interval_ns <= 0:
+        return UP, math.nan
+    i_R_node, impulse = matrix(interval.i_R_node), interval.impulse
+    impulse[0], impulse[1], impulse[2] = transformed(vector(impulse), i_R_node, motion.impulse)
+    place(product(i_R_node, motion.dR), interval.i_R_node, 0, 0)
+    if clock[NODE] - clock[OPENED] < vehicle.gravity_interval_ns:
+        return UP, math.nan
+    duration_s = (clock[NODE] - clock[OPENED]) * 1e-9
+    velocity = _imu_velocity(columns, clock[NODE], vehicle.dvl_p_imu)
+    up = up_direction(impulse / duration_s, interval.i_R_node, interval.velocity[:3], velocity[:3], duration_s)
+    sigma = tilt_sigma(
+        duration_s,
+        math.sqrt(0.5 * (velocity[3] + interval.velocity[3])),
+        vehicle.accel_noise_density,
+        vehicle.accel_bias_sigma,
+        vehicle.gyro_noise_density,
+        vehicle.gyro_bias_sigma,
+        vehicle.gravity_m_s2,
+    )
+    open_interval(columns, vehicle.dvl_p_imu, interval, clock)
+    if not np.isfinite(up).all():
+        return UP, math.nan
+    return vector(up), sigma

@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 from hypothesis import strategies as st
 
-from baselines.filter_inputs import SonarModel
 from baselines.invariant_equations import InvariantState
+from baselines.sonar_update import SonarModel
 from sonar_graph.measurements import Floats
 from sonar_graph.navigation.preintegration.dvl_gaps import GapMotion
 from sonar_graph.numerics.mat3 import matrix, vector

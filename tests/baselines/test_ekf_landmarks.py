@@ -7,9 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from baselines.ekf_equations import moment_after, motion_covariance
-from baselines.ekf_landmarks import location, observation, observe_rows
-from baselines.filter_inputs import GATED, NEW, NO_SLOT, PASSED_OVER, USED, Frame, SonarModel, nothing_told
+from baselines.ekf_equations import location, moment_after, motion_covariance, observation, observe_rows
+from baselines.sonar_update import GATED, NEW, NO_SLOT, PASSED_OVER, USED, Frame, SonarModel, no_outcomes
 from sonar_graph.numerics.mat3 import matrix, vector
 from sonar_graph.slam.landmarks.association import gate_threshold
 from sonar_graph.slam.models.sonar_model import FLOOR_GATE, elevation_on_floor, locate, range_azimuth
@@ -77,7 +76,7 @@ def state(angles, *landmarks, room=3):
 def frame(x, P, n, slots, z, model=None, R=NOISE):
     m, (range_m, azimuth) = len(slots), np.array(z).T.copy()
     columns = np.array(slots), range_m, azimuth, np.array([R] * m)
-    told = nothing_told(m)
+    told = no_outcomes(m)
     n = observe_rows(x, P, n, motion(), model or sonar(), Frame(columns, 0, m, told, False))
     return n, *told
 

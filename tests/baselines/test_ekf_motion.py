@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from baselines.filter_inputs import VehicleModel
-from baselines.filter_motion import inflate_shared_motion, motion_since_node, motion_to_node, nothing_running
+from baselines.filter_motion import inflate_shared_motion, motion_since_node, motion_to_node, no_provisional_motion
+from baselines.filter_window import VehicleModel
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation import odometry as node_motion
@@ -82,7 +82,7 @@ def instants(odometry):
 
 def test_a_running_motion_is_the_preintegrated_one(odometry):
     """From one instant to the next, across nodes and DVL rows that come before they are nodes."""
-    columns, running, waiting = odometry.columns(), nothing_running(), 0
+    columns, running, waiting = odometry.columns(), no_provisional_motion(), 0
     for node_ns, until_ns in instants(odometry):
         running, motion = motion_since_node(columns, VEHICLE, X, running, node_ns, until_ns)
         assert_preintegrated(motion, odometry.steps_since_node(node_ns, until_ns))
@@ -91,15 +91,15 @@ def test_a_running_motion_is_the_preintegrated_one(odometry):
 
 
 def test_a_running_motion_is_the_same_to_the_last_bit_as_one_from_the_node(odometry):
-    columns, running = odometry.columns(), nothing_running()
+    columns, running = odometry.columns(), no_provisional_motion()
     for node_ns, until_ns in instants(odometry):
         running, motion = motion_since_node(columns, VEHICLE, X, running, node_ns, until_ns)
-        assert motion == motion_since_node(columns, VEHICLE, X, nothing_running(), node_ns, until_ns)[1]
+        assert motion == motion_since_node(columns, VEHICLE, X, no_provisional_motion(), node_ns, until_ns)[1]
 
 
 def test_a_running_motion_begins_anew_when_the_attitude_that_turns_the_earth_rate_has_changed(odometry):
     columns, (node_ns, until_ns), turned = odometry.columns(), instants(odometry)[8], X + 0.3
-    running, before = motion_since_node(columns, VEHICLE, X, nothing_running(), node_ns, until_ns - 1_000_000)
+    running, before = motion_since_node(columns, VEHICLE, X, no_provisional_motion(), node_ns, until_ns - 1_000_000)
     _, motion = motion_since_node(columns, VEHICLE, turned, running, node_ns, until_ns)
     assert_preintegrated(motion, odometry.steps_since_node(node_ns, until_ns), turned)
     assert np.abs(np.array(before.dR) - np.eye(3)).max() > 1e-3
@@ -158,7 +158,7 @@ def over_gap(rows, vehicle, until_s, node_s=LOST_S):
     node_ns, until_ns = (T0_NS + round(s * NS_PER_S) for s in (node_s, until_s))
     if until_s >= FOUND_S:
         return motion_to_node(rows.columns(), vehicle, X, node_ns, until_ns)
-    return motion_since_node(rows.columns(), vehicle, X, nothing_running(), node_ns, until_ns)[1]
+    return motion_since_node(rows.columns(), vehicle, X, no_provisional_motion(), node_ns, until_ns)[1]
 
 
 @pytest.mark.parametrize("until_s", [FOUND_S, 2.0], ids=["closed", "open"])

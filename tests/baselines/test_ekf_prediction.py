@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from baselines.ekf_equations import advance_to_node
-from baselines.filter_events import GravityInterval, open_interval
-from baselines.filter_inputs import VehicleModel
+from baselines.ekf_equations import correct_state, correct_up
+from baselines.filter_motion import open_interval, up_at_node
+from baselines.filter_window import NODE, OPENED, GravityInterval, VehicleModel
 from sonar_graph.navigation.imu_gaps import NO_TURNS
 from sonar_graph.navigation.preintegration.recursion import NO_MOTION
+from sonar_graph.numerics.jit import compiled
 from sonar_graph.sequence import NS_PER_S
 
 T0_NS = 1_700_000_000 * NS_PER_S
@@ -71,38 +72,48 @@ def test_a_component_of_the_velocity_has_the_mean_variance_of_the_three():
         assert interval.velocity[3] == pytest.approx(mean)
 
 
-def test_gravity_corrects_with_the_velocity_noise_of_both_ends():
-    """Level and at rest but for its prior: ``1 / P' = 1 / P + 1 / sigma^2``, sigma as the theory page has it."""
-    duration_s, prior = 2.0, 0.02**2
+@compiled
+def up_measured(columns, vehicle, motion, clock, interval):
+    return up_at_node(columns, vehicle, motion, clock, interval)
+
+
+def test_gravity_has_the_velocity_noise_of_both_ends():
+    """Level and at rest; sigma as the theory page has it. A node before the interval is over measures nothing."""
+    duration_s = 2.0
     imu_ns = T0_NS + np.arange(4) * NS_PER_S
     dvl_ns = T0_NS + np.array([0, round(duration_s * NS_PER_S)])
     columns = columns_of(imu_ns, dvl_ns, rates=np.zeros((4, 3)), velocities=np.zeros((2, 3)))
     model = VEHICLE._replace(gravity_interval_ns=NS_PER_S, gyro_bias_sigma=2e-3)
-    x, P, clock, interval = np.zeros(6), prior * np.eye(6), np.array([T0_NS, 0, 7, 7]), an_interval()
+    clock, interval = np.array([T0_NS, 0, 7, 7, 0]), an_interval()
     open_interval(columns, LEVER, interval, clock)
+    assert np.isnan(up_measured(columns, model, NO_MOTION, clock, interval)[1])
+    clock[NODE] = dvl_ns[1]
     motion = NO_MOTION._replace(impulse=(0.0, 0.0, GRAVITY * duration_s))
-    advance_to_node(columns, model, x, P, 6, clock, interval, int(dvl_ns[1]), motion)
+    up, sigma = up_measured(columns, model, motion, clock, interval)
     velocity_noise = VARIANCES.mean(axis=1).sum()
     tilt = (model.accel_noise_density**2 / duration_s + velocity_noise / duration_s**2) / GRAVITY**2
     tilt += model.gyro_noise_density**2 * duration_s / 3 + (model.gyro_bias_sigma * duration_s) ** 2 / 4
-    expected = 1 / (1 / prior + 1 / tilt)
-    assert_allclose(np.diag(P), [prior, prior, prior, expected, expected, prior], rtol=1e-9)
-    assert_allclose(x, 0.0, atol=1e-12)
-    assert clock.tolist() == [dvl_ns[1], dvl_ns[1], 0, 0]
+    assert sigma**2 == pytest.approx(tilt, rel=1e-9)
+    assert_allclose(up, [0.0, 0.0, 1.0], atol=1e-12)
+    assert clock[OPENED] == dvl_ns[1]
     assert interval.velocity[3] == pytest.approx(VARIANCES[1].mean())
 
 
-def test_a_plane_is_measured_in_height_roll_and_pitch_each_with_its_own_noise():
-    """Independent numbers: ``x' = x + P / (P + R) (plane - x)`` for each of the three; the others stay."""
-    model = VEHICLE._replace(is_planar=True, plane_z_m=0.5, plane_z_variance=4e-2, plane_tilt_variance=9e-4)
+def test_up_and_a_state_are_scalar_kalman_updates_where_nothing_correlates():
+    """``x' = x + P / (P + R) (z - x)``; roll has the variance of the tilt over ``cos(theta)^2``."""
     before, prior = np.array([1.0, 2.0, 0.7, 0.05, -0.08, 0.3]), np.array([1e-2, 2e-2, 3e-2, 1e-3, 2e-3, 3e-3])
+    roll, pitch, sigma = 0.1, -0.5, 0.03
+    up = -np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)
+    z, R = np.array([0.5, roll, pitch]), np.array([4e-2, (sigma / np.cos(pitch)) ** 2, sigma**2])
     x, P = before.copy(), np.diag(prior)
-    columns = columns_of(T0_NS + np.arange(4), T0_NS + np.array([0, 2]))
-    advance_to_node(columns, model, x, P, 6, np.array([T0_NS, 0, 7, 7]), an_interval(), T0_NS + 2, NO_MOTION)
-    noise, plane = np.array([4e-2, 9e-4, 9e-4]), np.array([0.5, 0.0, 0.0])
-    gain = prior[2:5] / (prior[2:5] + noise)
-    assert_allclose(x[2:5], before[2:5] + gain * (plane - before[2:5]), atol=1e-12)
-    assert_allclose(np.diag(P)[2:5], (1 - gain) * prior[2:5], atol=1e-15)
+    corrected(x, P, up, sigma)
+    gain = prior[2:5] / (prior[2:5] + R)
+    assert_allclose(x[2:5], before[2:5] + gain * (z - before[2:5]), atol=1e-12)
+    assert_allclose(P, np.diag([*prior[:2], *((1 - gain) * prior[2:5]), prior[5]]), atol=1e-15)
     assert_allclose(x[[0, 1, 5]], before[[0, 1, 5]], atol=1e-12)
-    assert_allclose(np.diag(P)[[0, 1, 5]], prior[[0, 1, 5]], atol=1e-15)
-    assert_allclose(P - np.diag(np.diag(P)), 0.0, atol=1e-15)
+
+
+@compiled
+def corrected(x, P, up, sigma):
+    correct_up(x, P, 6, up, sigma)
+    correct_state(x, P, 6, 2, 0.5, 4e-2)

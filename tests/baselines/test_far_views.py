@@ -5,14 +5,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from baselines.ekf_landmarks import observe_rows as observe_by_ekf
+from baselines.ekf_equations import observe_rows as observe_by_ekf
 from baselines.ekf_slam import EkfSlam
-from baselines.filter_events import LOST
-from baselines.filter_inputs import GATED, USED, Frame, SonarModel, nothing_told
+from baselines.filter_window import LOST
 from baselines.invariant_ekf import InvariantEkf
 from baselines.invariant_equations import InvariantState, landmark_covariance
-from baselines.invariant_updates import observe_rows as observe_by_invariant
-from baselines.sonar_update import by_range_and_azimuth, is_beyond_linear, view_noise
+from baselines.invariant_equations import observe_rows as observe_by_invariant
+from baselines.sonar_update import (
+    GATED,
+    USED,
+    Frame,
+    SonarModel,
+    far_polar_covariance,
+    is_beyond_linear,
+    no_outcomes,
+    range_azimuth_jacobian,
+)
 from sonar_graph.navigation.preintegration.dvl_gaps import GapMotion
 from sonar_graph.navigation.preintegration.recursion import NO_MOTION
 from sonar_graph.numerics.mat3 import IDENTITY, ZERO, ZEROS, skew
@@ -28,7 +36,7 @@ AFTER_S = np.array([3.0, 10.0, 20.0])
 
 
 def by_ekf(P, seen, was_lost):
-    x, told = np.zeros(9), nothing_told(1)
+    x, told = np.zeros(9), no_outcomes(1)
     outcomes, innovation, S = told
     x[6:] = LANDMARK
     observe_by_ekf(x, P, 9, NO_MOTION, SONAR, Frame(seen, 0, 1, told, was_lost))
@@ -36,7 +44,7 @@ def by_ekf(P, seen, was_lost):
 
 
 def by_invariant(P, seen, was_lost):
-    outcomes, innovation, S = told = nothing_told(1)
+    outcomes, innovation, S = told = no_outcomes(1)
     own = np.r_[3:6, 9:12, 0:3, 6:9]  # [angles, bias, X, p] from [X, angles, p, bias]; the body is at the origin
     wide = np.zeros((12, 12))
     wide[:9, :9] = P
@@ -95,7 +103,7 @@ def test_what_no_vehicle_in_reach_sees_is_refused(observe):
 def test_the_noise_of_a_view_holds_that_of_many_beams():
     """Of elevations anywhere in the aperture, for a length that is taken at elevation zero."""
     elevation = np.random.default_rng(3).uniform(-APERTURE_RAD / 2, APERTURE_RAD / 2, 200_000)
-    V = view_noise(40.0, (0.0, 0.0, 0.0), APERTURE_RAD)
+    V = far_polar_covariance(40.0, (0.0, 0.0, 0.0), APERTURE_RAD)
     assert V[0, 0] == pytest.approx(np.mean(np.square(40.0 * (1 - np.cos(elevation)))), rel=0.02)
     assert V[2, 2] == pytest.approx(np.var(elevation), rel=0.02)
 
@@ -111,14 +119,14 @@ def test_linear_is_what_errs_by_less_than_the_noise():
     assert not is_beyond_linear(both, G_z, 10.0, (1.0, 0.0, 0.0101**2))
     assert is_beyond_linear(both, G_z, 10.0, (1.0, 0.0, 0.0099**2))
     assert not is_beyond_linear(1e6 * np.diag([0.0, 0.0, 1.0]), G_z, 10.0, (1e-4, 0.0, 1e-4))
-    np.testing.assert_allclose(by_range_and_azimuth(G_z, 10.0) @ [0.3, 0.2, 5.0], [0.3, 0.02])
+    np.testing.assert_allclose(range_azimuth_jacobian(G_z, 10.0) @ [0.3, 0.2, 5.0], [0.3, 0.02])
 
 
 TURNED = Rotation.from_euler("xyz", [0.4, -0.7, 1.9]).as_matrix()
 
 
 def test_the_noise_of_a_view_is_the_detections_where_the_aperture_is_none():
-    V = view_noise(40.0, (0.04, -0.003, 0.0009), 0.0)
+    V = far_polar_covariance(40.0, (0.04, -0.003, 0.0009), 0.0)
     np.testing.assert_array_equal(V, [[0.04, -0.003, 0.0], [-0.003, 0.0009, 0.0], [0.0, 0.0, 0.0]])
 
 
@@ -126,7 +134,7 @@ def test_the_noise_of_a_view_is_the_detections_where_the_aperture_is_none():
 def test_a_shift_is_the_same_in_range_and_azimuth_wherever_the_sonar_points(range_m):
     """A left inverse of the derivative by range and azimuth, blind to elevation."""
     G_z = TURNED @ np.diag([1.0, range_m, range_m])
-    np.testing.assert_allclose(by_range_and_azimuth(G_z, range_m) @ G_z, np.eye(2, 3), atol=1e-12)
+    np.testing.assert_allclose(range_azimuth_jacobian(G_z, range_m) @ G_z, np.eye(2, 3), atol=1e-12)
 
 
 @pytest.mark.parametrize("range_m", [10.0, 3.0])

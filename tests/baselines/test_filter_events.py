@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from baselines.filter_events import (
+from baselines.filter_window import (
     BEFORE_ALL,
     CLOCK,
     DEPTH,
@@ -54,16 +54,16 @@ def test_a_node_waits_for_the_imu_row_that_reaches_it():
     assert [event.kind for event in found] == [DEPTH, NODE_REACHED, DEPTH, END]
 
 
-@pytest.mark.parametrize(("longest_ns", "times_told"), [(100, [0, 0, 0]), (20, [1, 3, 2])])
-def test_what_is_told_over_a_gap_is_counted_depth_and_detections_each_for_themselves(longest_ns, times_told):
+@pytest.mark.parametrize(("longest_ns", "count_in_gap"), [(100, [0, 0, 0]), (20, [1, 3, 2])])
+def test_what_is_told_over_a_gap_is_counted_depth_and_detections_each_for_themselves(longest_ns, count_in_gap):
     found, clock = events([0], [25, 30], [28, 28, 28], 40, longest_ns)
-    assert [(event.kind, event.times_told) for event in found[:3]] == list(
-        zip([DEPTH, FRAME, DEPTH], times_told, strict=True)
+    assert [(event.kind, event.count_in_gap) for event in found[:3]] == list(
+        zip([DEPTH, FRAME, DEPTH], count_in_gap, strict=True)
     )
     assert clock.tolist()[DEPTHS : LOST + 1] == ([2, 3, 1] if longest_ns == 20 else [0, 0, 0])
 
 
 def test_the_counts_begin_anew_at_a_node_and_the_loss_is_remembered():
     found, clock = events([0, 50], [25, 60, 65], [], 66, 20)
-    assert [event.times_told for event in found if event.kind == DEPTH] == [1, 0, 0]
+    assert [event.count_in_gap for event in found if event.kind == DEPTH] == [1, 0, 0]
     assert (clock[DEPTHS], clock[SIGHTINGS], clock[LOST]) == (0, 0, 1)

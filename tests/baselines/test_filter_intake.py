@@ -3,7 +3,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from baselines.filter import DetectionIntake, check_rows, depth_since
-from baselines.filter_inputs import NEW, NO_SLOT, USED
+from baselines.sonar_update import NEW, NO_SLOT, USED
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Depth, LandmarkDetections, Measurements
 from sonar_graph.states import Outcome
@@ -23,17 +23,17 @@ def detections(stamps_ns, ids, probability=0.9):
 
 def test_landmarks_get_places_in_the_order_of_their_first_use():
     intake = DetectionIntake(0.5)
-    named = intake.name(detections([10, 20, 30], [7, 3, 7]), 0, 0)
-    assert intake.columns(named)[0].tolist() == [0, 1, 0]
+    identified = intake.identify(detections([10, 20, 30], [7, 3, 7]), 0, 0)
+    assert intake.columns(identified)[0].tolist() == [0, 1, 0]
     assert intake.slots == {7: 0, 3: 1}
 
 
 def test_what_is_refused_gets_no_place_and_its_reason():
     """Before the first node, before what is done, and without an identity."""
     intake = DetectionIntake(0.5)
-    early = intake.name(detections([10, 20, 30], [1, 2, 3]), 15, 25)
+    early = intake.identify(detections([10, 20, 30], [1, 2, 3]), 15, 25)
     assert early.refusals == [Outcome.UNLOCATED, Outcome.LATE, None]
-    doubtful = intake.name(detections([40], [4], 0.3), 15, 25)
+    doubtful = intake.identify(detections([40], [4], 0.3), 15, 25)
     assert doubtful.refusals == [Outcome.NO_IDENTITY]
     assert intake.columns(early)[0].tolist() == [NO_SLOT, NO_SLOT, 0]
     assert intake.columns(doubtful)[0].tolist() == [NO_SLOT]
@@ -42,9 +42,9 @@ def test_what_is_refused_gets_no_place_and_its_reason():
 
 def test_every_row_is_remembered_with_what_became_of_it():
     intake = DetectionIntake(0.5)
-    named = intake.name(detections([10, 20, 30], [1, 2, 2]), 15, 0)
+    identified = intake.identify(detections([10, 20, 30], [1, 2, 2]), 15, 0)
     innovations, covs = np.array([[np.nan] * 2] * 2 + [[0.1, 0.2]]), np.tile(np.eye(2), (3, 1, 1))
-    intake.record(named, (np.array([0, NEW, USED]), innovations, covs))
+    intake.record(identified, (np.array([0, NEW, USED]), innovations, covs))
     log = intake.log()
     assert log.outcomes == [Outcome.UNLOCATED, Outcome.NEW, Outcome.USED]
     assert log.landmark_ids.tolist() == [1, 2, 2]
@@ -52,10 +52,10 @@ def test_every_row_is_remembered_with_what_became_of_it():
     assert np.isnan(log.innovations[0]).all()
 
 
-def test_nothing_seen_is_nothing_told():
+def test_no_detections_are_no_outcomes():
     intake = DetectionIntake(0.5)
-    named = intake.name(None, 0, 0)
-    assert len(intake.columns(named)[0]) == 0
+    identified = intake.identify(None, 0, 0)
+    assert len(intake.columns(identified)[0]) == 0
     assert len(intake.log()) == 0
 
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from baselines.invariant_equations import height_of_body_point, height_of_point, location, missed_up, observation
+from baselines.invariant_equations import height_of_body_point, height_of_point, location, observation, up_innovation
 from sonar_graph.numerics.mat3 import vector
 from sonar_graph.slam.models.sonar_model import locate, range_azimuth
 
@@ -117,10 +117,10 @@ def test_what_is_missed_of_the_up_direction_is_linear_in_the_error(attitude, tur
 
     def missed(xi):
         up = moved_by(estimate, xi).R.T @ [0.0, 0.0, 1.0]
-        return missed_up(estimate, vector(up))[0]
+        return up_innovation(estimate, vector(up))[0]
 
     numerical = derivative(missed, 15)
-    _, H = missed_up(estimate, vector(direction))
+    _, H = up_innovation(estimate, vector(direction))
     assert_allclose(missed(NO_XI), 0.0, atol=1e-12)
     assert_allclose(H, numerical, atol=1e-6)
 
@@ -133,7 +133,7 @@ def test_no_measurement_tells_where_the_world_is_or_which_way_it_is_turned(attit
         observation(state, 2, motion(twist), SONAR)[1],
         height_of_body_point(state, motion(twist), vector(PORT))[1],
         height_of_point(state, 1)[1],
-        missed_up(state, (0.1, 0.2, 0.9))[1],
+        up_innovation(state, (0.1, 0.2, 0.9))[1],
     ]
     H = np.vstack(rows)
     assert_allclose(H @ gauge(3), 0.0, atol=1e-10)

@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from baselines.filter_inputs import vehicle_model
 from baselines.filter_motion import (
     inflate_shared_motion_with_bias,
     motion_since_node_with_bias,
     motion_to_node_with_bias,
 )
+from baselines.filter_window import vehicle_model
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.odometry import Odometry, motion_between_nodes

@@ -3,9 +3,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from baselines.filter_inputs import GATED, NEW, NO_SLOT, PASSED_OVER, USED, Frame, nothing_told
-from baselines.invariant_equations import InvariantState, landmark_covariance
-from baselines.invariant_updates import correct_depth, correct_plane, correct_up, observe_rows
+from baselines.invariant_equations import (
+    InvariantState,
+    correct_depth,
+    correct_plane,
+    correct_up,
+    landmark_covariance,
+    observe_rows,
+)
+from baselines.sonar_update import GATED, NEW, NO_SLOT, PASSED_OVER, USED, Frame, no_outcomes
 from sonar_graph.slam.models.sonar_model import locate, range_azimuth
 
 from .invariant import D_BIAS, MOUNTING, SONAR, body_after, copied, gap_motion_of, moved_by, state_at
@@ -28,7 +34,7 @@ def sonar_pose(state, xi_motion=None):
 def frame(state, slots, z, model=SONAR):
     m, (range_m, azimuth) = len(slots), np.array(z, float).T.copy()
     columns = np.array(slots), range_m, azimuth, np.array([NOISE] * m)
-    outcomes, innovations, covs = told = nothing_told(m)
+    outcomes, innovations, covs = told = no_outcomes(m)
     state = observe_rows(state, motion(), model, Frame(columns, 0, m, told, False))
     return state, outcomes.tolist(), innovations, covs
 

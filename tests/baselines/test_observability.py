@@ -7,9 +7,8 @@ y and heading, and a filter must not think otherwise because its estimates chang
 import numpy as np
 import pytest
 
-from baselines.ekf_equations import moment_after
-from baselines.ekf_landmarks import observation
-from baselines.invariant_equations import InvariantState, by_bias, height_of_body_point, missed_up, motion_jacobian
+from baselines.ekf_equations import moment_after, observation
+from baselines.invariant_equations import InvariantState, by_bias, height_of_body_point, motion_jacobian, up_innovation
 from baselines.invariant_equations import observation as invariant_observation
 from sonar_graph.navigation.preintegration.recursion import NO_MOTION
 from sonar_graph.numerics.mat3 import euler_from_rotation, matrix, rotation_from_euler, vector
@@ -38,7 +37,7 @@ def invariant(wander):
         state = InvariantState(R, np.vstack([X, landmarks]), np.zeros(3), np.eye(len(F)))
         still = gap_motion_of(np.zeros(6), np.zeros((6, 6)), np.zeros((6, 3)))
         seen = [invariant_observation(state, k, still, SONAR)[1] for k in (1, 2)]
-        others = height_of_body_point(state, still, (0.0, 0.0, 0.0))[1], missed_up(state, vector(R[2]))[1]
+        others = height_of_body_point(state, still, (0.0, 0.0, 0.0))[1], up_innovation(state, vector(R[2]))[1]
         rows += [H @ F for H in (*seen, *others)]
         after = np.vstack([X + R @ TWIST[3:], landmarks])
         step = np.eye(len(F))
