@@ -13,7 +13,8 @@ from sonar_graph.cli.outputs import progress_bars, working, writable_log
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from sonar_graph.logs.convert import Progress, SonarConversion
+    from sonar_graph.logs.convert import SonarConversion
+    from sonar_graph.logs.mcap import Progress
     from sonar_graph.sequence import Sequence
 
 

@@ -271,3 +271,16 @@ def test_half_a_chunk_gives_its_whole_messages(tmp_path: Path, compression: Comp
     assert found == written[: len(found)]
     assert len(found) > before + 0.2 * before
     assert "which no CRC covers" in (scan_all(path).ending or "")
+
+
+def test_messages_outside_chunks_may_be_larger_than_what_is_read_at_a_time(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    payloads = [bytes([i]) * (3 << 20) for i in range(3)]
+    with path.open("wb") as stream:
+        writer = Writer(stream, use_chunking=False)
+        writer.start("ros2", "test")
+        channel = writer.register_channel("/a", "cdr", writer.register_schema("a/msg/A", "ros2msg", b"uint8[] data"))
+        for i, payload in enumerate(payloads):
+            writer.add_message(channel, i, payload, i)
+        writer.finish()  # type: ignore[no-untyped-call]
+    assert entries(scan_all(path).topics["/a"]) == list(enumerate(payloads))

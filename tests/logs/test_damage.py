@@ -260,15 +260,15 @@ for n in range(10**9):
 """,
     "ours": """
 import numpy as np
-from sonar_graph.logs import recorder
-from sonar_graph.logs.recorder import Outgoing, write_recording
+from sonar_graph.logs.mcap import writer
+from sonar_graph.logs.mcap.writer import Outgoing, write_recording
 
 class Telling(Writer):
     def add_message(self, channel, time_ns, data, publish_ns):
         super().add_message(channel, time_ns, data, publish_ns)
         os.write(1, b"%d\\n" % time_ns)
 
-recorder.Writer, recorder._CHUNK_BYTES = Telling, 65536
+writer.Writer, writer._CHUNK_BYTES = Telling, 65536
 payloads = np.zeros((50_000, 1000), np.uint8)  # small when compressed: a chunk fits into a buffer
 write_recording(Path(path), [Outgoing("/n", "std_msgs/msg/Header", np.arange(50_000), payloads)], {})
 """,

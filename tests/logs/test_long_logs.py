@@ -15,8 +15,7 @@ PROBE = """
 import json, re, sys, time
 from pathlib import Path
 import numpy as np
-from sonar_graph.logs.container import Keep, stream, scan
-from sonar_graph.logs.window import Instant, Window
+from sonar_graph.logs.mcap import Instant, Keep, TimeWindow, scan, stream
 
 def peak_mb():
     status = Path("/proc/self/status").read_text()  # getrusage would count the parent's memory too
@@ -24,7 +23,7 @@ def peak_mb():
 
 path = Path(sys.argv[1])
 before_s = time.perf_counter()
-part = scan(path, lambda _: Keep.ALL, Window(Instant.parse("100"), Instant.parse("110")))
+part = scan(path, lambda _: Keep.ALL, TimeWindow(Instant.parse("100"), Instant.parse("110")))
 part_s, start_mb = time.perf_counter() - before_s, peak_mb()
 before_s, total = time.perf_counter(), 0
 for piece in stream(path, lambda kind: Keep.ALL if kind.endswith("Image") else Keep.NONE):

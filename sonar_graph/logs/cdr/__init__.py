@@ -1,4 +1,4 @@
-"""Cdr."""
+"""CDR payloads of ROS 2 messages as columns, by the message definition in the log."""
 
 # fmt: off
 from sonar_graph.logs.cdr.definitions import Struct, definition, parse_definition, short_name

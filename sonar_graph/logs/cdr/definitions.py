@@ -1,13 +1,9 @@
-"""Interface definitions of ROS 2 messages (``ros2msg`` text) as trees of fields.
+"""Definitions of ROS 2 messages: those that this package writes, and the parsing of those in a log.
 
-The text in an MCAP schema is the message's own definition followed by those of the types that it uses, each after a
-line of ``=`` and a line ``MSG: package/Type`` (https://mcap.dev/spec/registry#ros2msg).
-
-The ROS 2 messages that this package writes, as interface text.
-
-`definition` gives the text which travels in a log beside the messages, so that any reader understands them without
-ROS. Field names and order are those of ROS 2 Jazzy's ``common_interfaces`` and of ``marine_acoustic_msgs`` 2.1;
-``sonar_graph_msgs`` is this package's own and documented in ``docs/design/0004-logs.md``.
+A definition is ``ros2msg`` text (https://mcap.dev/spec/registry#ros2msg): the message's own fields, then those of the
+types that it uses, each after a line of ``=`` and a line ``MSG: package/Type``. It travels with the messages, so that
+any reader understands them without ROS. Field names and order are those of ROS 2 Jazzy's ``common_interfaces`` and of
+``marine_acoustic_msgs`` 2.1; ``sonar_graph_msgs`` is this package's own (``docs/design/0004-logs.md``).
 """
 
 from __future__ import annotations
@@ -157,7 +153,7 @@ _FIELD_TYPE = re.compile(r"^(\w+/\w+)(?:\[.*?\])?\s", re.MULTILINE)
 
 
 def definition(type_name: str) -> str:
-    """The interface text of a message with all that it depends on, as it stands in an MCAP schema.
+    """Interface text of a message with all types that it uses, as in an MCAP schema.
 
     Parameters
     ----------
@@ -173,7 +169,7 @@ def definition(type_name: str) -> str:
 
 
 def short_name(type_name: str) -> str:
-    """``sensor_msgs/Imu`` for ``sensor_msgs/msg/Imu``: how interface texts refer to each other."""
+    """Type name as interface texts use it: ``sensor_msgs/Imu`` for ``sensor_msgs/msg/Imu``."""
     return type_name.replace("/msg/", "/")
 
 
@@ -192,7 +188,7 @@ PRIMITIVES = {
     "float32": "f4",
     "float64": "f8",
 }
-"""numpy's type of each primitive, without its byte order."""
+"""Type in numpy of each primitive, without the byte order."""
 STRING = "string"
 _MOST_FIELDS = 10_000
 _DEEPEST = 50
@@ -204,7 +200,7 @@ _FIELD = re.compile(
 
 @dataclass(frozen=True, eq=False)
 class Struct:
-    """A message type: its fields in order."""
+    """A message type with its fields in order."""
 
     name: str
     fields: tuple[Field, ...]
@@ -216,16 +212,16 @@ class Field:
 
     name: str
     kind: str | Struct
-    """A key of `PRIMITIVES`, `STRING`, or a nested type."""
+    """Key of `PRIMITIVES`, `STRING`, or a nested type."""
     length: int | None
-    """1 for a single value, the number of values of a fixed array, None for a sequence."""
+    """Number of values: 1 for a single value, None for a sequence."""
     is_array: bool
-    """Whether it is an array or sequence."""
+    """True for an array or sequence."""
 
 
 @lru_cache(maxsize=256)
 def parse_definition(type_name: str, text: str) -> Struct:
-    """The tree of a message type from its interface text.
+    """Tree of a message type from its interface text.
 
     Parameters
     ----------
@@ -247,7 +243,7 @@ def parse_definition(type_name: str, text: str) -> Struct:
 
 
 class _Parser:
-    """Puts the texts of types together; each type is parsed once."""
+    """Tree of types from their texts; each type is parsed once."""
 
     def __init__(self, texts: dict[str, str]) -> None:
         self._texts = texts
@@ -255,42 +251,35 @@ class _Parser:
         self._sizes: dict[str, int] = {}
 
     def struct(self, name: str, users: tuple[str, ...]) -> Struct:
+        """Type of some name; ``users`` are the types around it, from the outermost on."""
         if name in users:
             raise LogError(f"the definition of {users[0]} uses {name} within itself, which no ROS 2 message can")
         if len(users) > _DEEPEST:
             raise LogError(f"the definition of {users[0]} nests types more than {_DEEPEST} deep; no real one does")
-        if name not in self._done:
-            lines = (line.split("#", 1)[0].strip() for line in self._texts[name].splitlines())
-            found = (self._field(line, name, (*users, name)) for line in lines if line)
-            struct = Struct(name, tuple(entry for entry in found if entry is not None))
-            self._check(struct)
-            self._done[name] = struct
-        return self._done[name]
-
-    def _check(self, struct: Struct) -> None:
-        names = [entry.name for entry in struct.fields]
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise LogError(f"the definition of {struct.name} has two fields called {twice}")
-        size = sum(self._sizes[entry.kind.name] if isinstance(entry.kind, Struct) else 1 for entry in struct.fields)
-        if size > _MOST_FIELDS:
-            raise LogError(f"the definition of {struct.name} has more than {_MOST_FIELDS} fields; no real one has")
-        self._sizes[struct.name] = size
-
-    def _field(self, line: str, owner: str, users: tuple[str, ...]) -> Field | None:
-        """The field of one line, or None for a constant."""
-        match = _FIELD.match(line)
-        if match is None or match["length"] == "0":
-            raise LogError(f"the definition of {owner} has the line {line!r}, which is no ros2msg field")
-        if match["rest"].startswith("="):
-            return None
-        kind = self._kind(match["type"], owner, users)
-        if match["array"] is None:
-            return Field(match["name"], kind, 1, is_array=False)
-        length = match["length"]
-        return Field(match["name"], kind, int(length) if length.isdigit() else None, is_array=True)
+        if name in self._done:
+            return self._done[name]
+        fields: dict[str, Field] = {}
+        for line in (line.split("#", 1)[0].strip() for line in self._texts[name].splitlines()):
+            match = _FIELD.match(line)
+            if line and (match is None or match["length"] == "0"):
+                raise LogError(f"the definition of {name} has the line {line!r}, which is no ros2msg field")
+            if match is None or match["rest"].startswith("="):  # an empty line, a constant
+                continue
+            kind = self._kind(match["type"], name, users)
+            length = 1 if match["array"] is None else int(match["length"]) if match["length"].isdigit() else None
+            if match["name"] in fields:
+                raise LogError(f"the definition of {name} has two fields called {match['name']}")
+            fields[match["name"]] = Field(match["name"], kind, length, is_array=match["array"] is not None)
+        struct = self._done[name] = Struct(name, tuple(fields.values()))
+        self._sizes[name] = sum(
+            self._sizes[entry.kind.name] if isinstance(entry.kind, Struct) else 1 for entry in struct.fields
+        )
+        if self._sizes[name] > _MOST_FIELDS:
+            raise LogError(f"the definition of {name} has more than {_MOST_FIELDS} fields; no real one has")
+        return struct
 
     def _kind(self, type_name: str, owner: str, users: tuple[str, ...]) -> str | Struct:
+        """Primitive, string or nested type of a field of ``owner``."""
         if type_name in PRIMITIVES or type_name == STRING:
             return type_name
         package = owner.split("/", 1)[0]
@@ -300,4 +289,4 @@ class _Parser:
             self._texts[wanted] = DEFINITIONS[wanted]  # some recorders leave these two out
         if wanted not in self._texts:
             raise LogError(f"the definition of {owner} uses {type_name}, whose own definition is not in the log")
-        return self.struct(wanted, users)
+        return self.struct(wanted, (*users, owner))

@@ -1,21 +1,17 @@
-"""A ROS 2 message type made ready for going through payloads.
+"""Layout of CDR payloads: the place of every field of a ROS 2 message type, and whether payloads follow their type.
 
-Where a field lies in a payload depends on the type's definition and on the lengths of the strings and sequences before
-it, on nothing else. A `Plan` is the definition as steps: neighbouring values of fixed number are one step, whatever
-types they are nested in; every string, sequence, and array of strings or types is another. A `Walk` takes the steps
-once, with the lengths read from a payload or given, and notes where each begins.
+The place of a field depends only on the type and on the lengths of the strings and sequences before it. A `Plan` is the
+type as steps: neighbouring values of fixed number are one step, whatever types they are nested in; each string, each
+sequence, and each array of strings or types is another. A `PayloadWalk` takes the steps once, with lengths read from a
+payload or given, and notes where each begins. The `Layout` that results holds for all payloads with the same lengths.
 
 Encoding is plain CDR (XCDR1, OMG DDS-XTypes 1.3, 7.4.1): a four-byte encapsulation header, then primitives aligned to
 their own size counted from after that header; a string is its length with the closing NUL as uint32 and its bytes; a
 type without fields is one byte.
 
-Where everything lies in payloads of one type whose strings and sequences have the same lengths.
-
-Whether payloads are what their definition says.
-
-A message that is not is left out and counted by what is wrong with it; those around it are read. Checked are the
-encapsulation, that everything lies within the payload, that the payload ends where its definition ends (but for the
-padding to four bytes that DDS adds), that booleans are 0 or 1, and that strings are UTF-8 and closed by a NUL.
+A payload is sound when its encapsulation is plain CDR, everything lies within it, it ends where its definition ends
+(but for the padding to four bytes that DDS adds), booleans are 0 or 1, and strings are UTF-8 and closed by a NUL.
+Other messages are left out and counted by their fault.
 """
 
 from __future__ import annotations
@@ -40,16 +36,16 @@ _PHASES = 8
 
 
 def padding(at: int, size: int) -> int:
-    """Bytes left free before a primitive of ``size`` bytes that follows byte ``at``."""
+    """Bytes of padding before a primitive of ``size`` bytes at byte ``at``."""
     return -(at - HEADER_BYTES) % size
 
 
 class PayloadWalk:
-    """Notes where things lie while the steps of a plan are taken."""
+    """Places of the parts of a payload, noted while the steps of a plan are taken."""
 
     def __init__(self, steps: int, length_of: Callable[[DecodingStep, int], int], most_elements: int | None) -> None:
         self.found: list[list[int]] = [[] for _ in range(steps)]
-        """By step: the start of each block; start and count in turn of all else."""
+        """By step: the start of each block; for other steps start and count in turn."""
         self.words: list[tuple[int, int]] = []
         """Byte offset and value of each length word."""
         self.end = HEADER_BYTES
@@ -57,7 +53,7 @@ class PayloadWalk:
         self._length_of = length_of
 
     def length(self, step: DecodingStep, at: int) -> tuple[int, int]:
-        """The byte after a step's length word, and the word's value."""
+        """Byte after a step's length word, and the value of the word."""
         at += -at % LENGTH_BYTES  # as much as after the header, which is as long
         count = self._length_of(step, at)
         self.words.append((at, count))
@@ -65,7 +61,7 @@ class PayloadWalk:
 
 
 class DecodingStep(ABC):
-    """A part of a message type."""
+    """Part of a message type."""
 
     def __init__(self, index: int, path: str) -> None:
         self.index = index
@@ -73,28 +69,28 @@ class DecodingStep(ABC):
 
     @abstractmethod
     def take(self, at: int, walk: PayloadWalk) -> int:
-        """Note where the part after byte ``at`` lies; the byte after it."""
+        """Note the place of the part at byte ``at``; returns the byte after it."""
 
 
 @dataclass(frozen=True)
 class Value:
-    """One field of fixed number within a block."""
+    """Field with a fixed number of values within a block."""
 
     path: str
     kind: str
-    """numpy's type, without its byte order."""
+    """Type in numpy, without the byte order."""
     count: int
     is_single: bool
-    """No array or sequence on the path: one value a message."""
+    """True without an array or sequence on the path: one value a message."""
 
 
 class FieldBlock(DecodingStep):
-    """Values of fixed number side by side."""
+    """Neighbouring values of fixed number."""
 
     def __init__(self, index: int, values: list[Value]) -> None:
         super().__init__(index, values[0].path)
         self.offsets = {value.path: [0] * _PHASES for value in values}
-        """From the block's start, by the remainder of that start after division by 8."""
+        """Offsets from the start of the block, by that start modulo 8."""
         self.counts = {value.path: value.count for value in values}
         self._sizes = [0] * _PHASES
         for phase in range(_PHASES):
@@ -107,20 +103,20 @@ class FieldBlock(DecodingStep):
             self._sizes[phase] = at - start
 
     def take(self, at: int, walk: PayloadWalk) -> int:
-        """Note where the block begins, before any padding."""
+        """Note the start of the block, before any padding."""
         walk.found[self.index].append(at)
         return at + self._sizes[at % _PHASES]
 
 
 class Numbers(DecodingStep):
-    """A sequence of numbers."""
+    """Sequence of numbers."""
 
     def __init__(self, index: int, path: str, kind: str) -> None:
         super().__init__(index, path)
         self._size = np.dtype(kind).itemsize
 
     def take(self, at: int, walk: PayloadWalk) -> int:
-        """Note where the first number lies, and how many there are."""
+        """Note the place of the first number and their count."""
         at, count = walk.length(self, at)
         if count:
             at += padding(at, self._size)
@@ -129,17 +125,17 @@ class Numbers(DecodingStep):
 
 
 class Text(DecodingStep):
-    """A string."""
+    """String."""
 
     def take(self, at: int, walk: PayloadWalk) -> int:
-        """Note where the characters lie, and how many there are with the closing NUL."""
+        """Note the place of the characters and their count, with the closing NUL."""
         at, count = walk.length(self, at)
         walk.found[self.index] += (at, count)
         return at + count
 
 
 class Repeated(DecodingStep):
-    """An array or sequence of strings or of another type."""
+    """Array or sequence of strings or of another type."""
 
     def __init__(self, index: int, path: str, count: int | None, steps: list[DecodingStep]) -> None:
         super().__init__(index, path)
@@ -147,7 +143,7 @@ class Repeated(DecodingStep):
         self._steps = steps
 
     def take(self, at: int, walk: PayloadWalk) -> int:
-        """Note where the elements begin and how many there are, and go through them."""
+        """Note the start and count of the elements, and walk through them."""
         at, count = walk.length(self, at) if self._count is None else (at, self._count)
         walk.found[self.index] += (at, count)
         if walk.most_elements is not None and count > walk.most_elements:
@@ -159,13 +155,13 @@ class Repeated(DecodingStep):
 
 
 class Leaf(NamedTuple):
-    """A field that holds values."""
+    """Field that holds values."""
 
     step: DecodingStep
     dtypes: Mapping[str, np.dtype[Any]]
-    """Of one value, by byte order; for a string, one byte."""
+    """Type of one value by byte order; for a string, one byte."""
     is_single: bool
-    """No array or sequence on the path: one value a message."""
+    """True without an array or sequence on the path: one value a message."""
 
 
 @cache
@@ -174,14 +170,14 @@ def _dtypes(kind: str) -> Mapping[str, np.dtype[Any]]:
 
 
 class Plan:
-    """A message type as steps."""
+    """Message type as steps."""
 
     def __init__(self, definition: Struct) -> None:
         self.name = definition.name
         self.leaves: dict[str, Leaf] = {}
-        """By path, such as ``header.stamp.sec``; a field within a sequence has one path for all elements."""
+        """Leaves by path, such as ``header.stamp.sec``; all elements of a sequence share one path."""
         self.sequences: dict[str, DecodingStep] = {}
-        """By path, arrays and sequences but for arrays of numbers."""
+        """Arrays and sequences by path, without arrays of numbers."""
         self._parts = 0
         self._steps = self._compile(definition, "", is_single=True)
         self.texts = [path for path, leaf in self.leaves.items() if isinstance(leaf.step, Text)]
@@ -193,9 +189,9 @@ class Plan:
         Parameters
         ----------
         length_of
-            The value of a step's length word, which lies at a byte.
+            Value of the length word of a step, given its byte offset.
         most_elements
-            What no array can exceed, because the payload ends.
+            Limit of the elements of an array, because the payload ends.
         """
         walk = PayloadWalk(self._parts, length_of, most_elements)
         for step in self._steps:
@@ -247,7 +243,7 @@ class Plan:
             block = FieldBlock(self._next(), values)
             steps.append(block)
             for value in values:
-                if value.path and not value.path.endswith("."):  # that is the byte of a type without fields
+                if value.path and not value.path.endswith("."):  # else it is the byte of a type without fields
                     self.leaves[value.path] = Leaf(block, _dtypes(value.kind), value.is_single)
             values.clear()
 
@@ -258,22 +254,22 @@ class Plan:
 
 @lru_cache(maxsize=256)
 def plan_of(definition: Struct) -> Plan:
-    """The plan of a message type."""
+    """Plan of a message type."""
     return Plan(definition)
 
 
 Bytes = NDArray[np.uint8]
 ENCAPSULATIONS = {">": bytes([0, 0]), "<": bytes([0, 1])}
-"""How a payload begins, by byte order."""
+"""First bytes of a payload by byte order."""
 
 
 class PayloadColumn(NamedTuple):
-    """Where the values of one field lie."""
+    """Places of the values of one field."""
 
     dtype: np.dtype[Any]
-    """Of one value; for a string, one byte."""
+    """Type of one value; for a string, one byte."""
     is_single: bool
-    """No array or sequence on the path: one value a message."""
+    """True without an array or sequence on the path: one value a message."""
     starts: list[int]
     """Byte offset of each stretch."""
     counts: list[int]
@@ -281,11 +277,11 @@ class PayloadColumn(NamedTuple):
 
 
 class Layout:
-    """What a walk found."""
+    """Places of all fields in payloads with the same lengths of strings and sequences."""
 
     def __init__(self, plan: Plan, byte_order: str, walk: PayloadWalk) -> None:
         self.columns = plan.leaves
-        """The fields that hold values, by path, such as ``header.stamp.sec``."""
+        """Fields that hold values by path, such as ``header.stamp.sec``."""
         self.byte_order = byte_order
         self.size = walk.end
         self.words = walk.words
@@ -293,7 +289,7 @@ class Layout:
         self._found = walk.found
 
     def column(self, path: str) -> PayloadColumn:
-        """Where a field's values lie.
+        """Places of the values of a field.
 
         Raises
         ------
@@ -320,15 +316,15 @@ class Layout:
         return self.column(path).counts if sequence is None else self._found[sequence.index][1::2]
 
     def texts(self) -> Iterator[tuple[str, PayloadColumn]]:
-        """Every string field with its path; the closing NUL counts as one of its bytes."""
+        """Every string field with its path; the closing NUL counts as a byte."""
         return ((path, self.column(path)) for path in self._plan.texts)
 
     def booleans(self) -> Iterator[tuple[str, PayloadColumn]]:
-        """Every field of booleans with its path."""
+        """Every boolean field with its path."""
         return ((path, self.column(path)) for path in self._plan.booleans)
 
     def same(self, payloads: Bytes, rows: Ints) -> NDArray[np.bool_]:
-        """Which rows of payloads, shape (n, size), have this layout."""
+        """True for each of some rows of payloads, shape (n, size), that has this layout."""
         words = np.array(self.words, np.int64).reshape(-1, 2)
         places = np.concatenate([[0, 1], (words[:, :1] + np.arange(LENGTH_BYTES)).reshape(-1)])
         lengths = words[:, 1].astype(f"{self.byte_order}u{LENGTH_BYTES}").view(np.uint8)
@@ -344,18 +340,23 @@ _OTHER_ENCAPSULATIONS = {2: "PL_CDR", 3: "PL_CDR", **dict.fromkeys(range(6, 12),
 
 
 class UnsoundMessageError(Exception):
-    """A payload is not what its definition says; the text completes "3 messages ..."."""
+    """Payload that does not follow its definition; the text completes "3 messages ..."."""
 
 
 def layout_of(plan: Plan, payload: memoryview) -> Layout:
-    """The layout of a payload.
+    """Layout of a payload.
 
     Raises
     ------
     UnsoundMessageError
         When it is not plain CDR, or shorter or longer than its definition says.
     """
-    order = _byte_order(payload)
+    if len(payload) < HEADER_BYTES:
+        raise UnsoundMessageError("without an encapsulation header")
+    order = _BYTE_ORDERS.get(bytes(payload[:2]))
+    if order is None:
+        kind = _OTHER_ENCAPSULATIONS.get(payload[1]) if payload[0] == 0 else None
+        raise UnsoundMessageError(f"encoded as {kind or payload[:HEADER_BYTES].hex()} instead of plain CDR")
     unpack, size = _UNPACK_LENGTH[order], len(payload)
 
     def read_length(step: DecodingStep, at: int) -> int:
@@ -374,18 +375,8 @@ def layout_of(plan: Plan, payload: memoryview) -> Layout:
     return Layout(plan, order, walk)
 
 
-def _byte_order(payload: memoryview) -> str:
-    if len(payload) < HEADER_BYTES:
-        raise UnsoundMessageError("without an encapsulation header")
-    order = _BYTE_ORDERS.get(bytes(payload[:2]))
-    if order is None:
-        kind = _OTHER_ENCAPSULATIONS.get(payload[1]) if payload[0] == 0 else None
-        raise UnsoundMessageError(f"encoded as {kind or payload[:HEADER_BYTES].hex()} instead of plain CDR")
-    return order
-
-
 def unsound_contents(layout: Layout, payloads: Bytes) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """What is wrong with booleans and strings of payloads that share a layout, and which have it, shape (n,)."""
+    """Faults of booleans and strings of payloads that share a layout, and the rows that have them, shape (n,)."""
     for path, column in layout.booleans():
         for start, count in zip(column.starts, column.counts, strict=True):
             has_it = np.asarray((payloads[:, start : start + count] > 1).any(axis=1))

@@ -1,8 +1,8 @@
 """ROS 2 messages as columns: CDR payloads read and written many at a time.
 
-The `Layout` of a payload is worked out once, by walking the type's `Plan`; all payloads whose length words are the same
-share it, and a field of all of them is one strided view of their bytes. The same walk, given the lengths instead of
-reading them, tells where to put each column when writing.
+The `Layout` of a payload is found once, by a walk through the type's `Plan`; all payloads with the same length words
+share it, and a field of all of them is one strided view of their bytes. For writing, the same walk with given lengths
+finds the place of each column.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from sonar_graph.measurements import Ints
 Value = NDArray[Any] | float | str | Sequence[str]
 Lengths = Mapping[str, int | Sequence[int]]
 _ROWS_COMPARED_PER_WALK = 32
-"""Comparing a payload with a layout costs about this much less than walking it."""
+"""Cost of a walk through a payload over that of comparing it with a layout, about."""
 _LAYOUTS_REMEMBERED = 8
-"""Of each payload length, from one part of a topic to the next."""
+"""Layouts remembered of each payload length, from one part of a topic to the next."""
 
 
 @dataclass(frozen=True)
 class Messages:
-    """Decoded messages of one type that share a layout; ``messages["angular_velocity.x"]`` is a column."""
+    """Decoded messages of one type with the same layout; ``messages["angular_velocity.x"]`` is a column."""
 
     rows: Ints
-    """Which messages of the topic these are, counted from 0 in the order of the log; shape (n,)."""
+    """Numbers of these messages in the topic, from 0 in the order of the log, shape (n,)."""
     payloads: Bytes
     """Shape (n, size)."""
     layout: Layout
@@ -72,7 +72,7 @@ class Messages:
         return self.layout.lengths(path)
 
     def strings(self, path: str) -> list[list[str]]:
-        """Values of a string field, for each message one of each occurrence."""
+        """Values of a string field: for each message one of each occurrence."""
         column = self.layout.column(path)
         runs = [(start, start + count - 1) for start, count in zip(column.starts, column.counts, strict=True)]
         contents = (payload.tobytes() for payload in self.payloads)
@@ -88,29 +88,29 @@ class Messages:
 
 
 class Decoded(NamedTuple):
-    """What became of payloads."""
+    """Result of decoding payloads."""
 
     groups: list[Messages]
     """Sound messages by layout."""
     unsound: dict[str, Ints]
-    """Rows of the others by what is wrong with them, which completes "3 messages ..."."""
+    """Rows of the others by their fault, which completes "3 messages ..."."""
 
 
 def decode(definition: Struct, payloads: Iterable[tuple[Ints, Bytes]]) -> Decoded:
-    """Messages grouped by layout; those that are not what their definition says are named and left out.
+    """Messages grouped by layout; those that do not follow their definition are left out and named.
 
     Parameters
     ----------
     definition
-        Of the messages' type.
+        Definition of the messages' type.
     payloads
-        For each length that occurs: which messages have it, shape (n,), and their bytes, shape (n, length).
+        For each payload length: rows of the messages, shape (n,), and their bytes, shape (n, length).
     """
     return Decoder(definition).decode(payloads)
 
 
 class Decoder:
-    """Decodes messages of one type part by part; layouts met before are tried first."""
+    """Decoder of messages of one type part by part; known layouts are tried first."""
 
     def __init__(self, definition: Struct) -> None:
         self._plan = plan_of(definition)
@@ -118,24 +118,26 @@ class Decoder:
         self._unsound: dict[str, list[Ints]] = defaultdict(list)
 
     def decode(self, payloads: Iterable[tuple[Ints, Bytes]]) -> Decoded:
-        """As the function `decode`."""
+        """Messages grouped by layout, as by the function `decode`."""
         self._unsound.clear()
-        groups = [group for rows, stack in payloads for group in self._groups(rows, stack)]
+        groups = []
+        for rows, stack in payloads:
+            for layout, members in self._by_layout(rows, stack):
+                first, last = int(members[0]), int(members[-1])
+                # a view where they lie side by side
+                found = stack[first : last + 1] if last - first + 1 == len(members) else stack[members]
+                is_sound = np.ones(len(members), bool)
+                for fault, has_it in unsound_contents(layout, found):
+                    self._unsound[fault].append(rows[members[has_it & is_sound]])
+                    is_sound &= ~has_it
+                if is_sound.all():
+                    groups.append(Messages(rows[members], found, layout))
+                elif is_sound.any():
+                    groups.append(Messages(rows[members[is_sound]], found[is_sound], layout))
         return Decoded(groups, {fault: np.concatenate(parts) for fault, parts in self._unsound.items()})
 
-    def _groups(self, rows: Ints, stack: Bytes) -> Iterator[Messages]:
-        for layout, members in self._by_layout(rows, stack):
-            payloads = _members(stack, members)
-            is_sound = np.ones(len(members), bool)
-            for fault, has_it in unsound_contents(layout, payloads):
-                self._unsound[fault].append(rows[members[has_it & is_sound]])
-                is_sound &= ~has_it
-            if is_sound.all():
-                yield Messages(rows[members], payloads, layout)
-            elif is_sound.any():
-                yield Messages(rows[members[is_sound]], payloads[is_sound], layout)
-
     def _by_layout(self, rows: Ints, stack: Bytes) -> Iterator[tuple[Layout, Ints]]:
+        """Layouts of payloads of one length, each with the places of its payloads in the stack."""
         known = self._known[stack.shape[1]]
         left = np.arange(len(stack))
         for layout in known:
@@ -174,19 +176,13 @@ class Decoder:
             return None
 
 
-def _members(stack: Bytes, members: Ints) -> Bytes:
-    """Some payloads, as a view where they lie side by side."""
-    first, last = int(members[0]), int(members[-1])
-    return stack[first : last + 1] if last - first + 1 == len(members) else stack[members]
-
-
 def encode(definition: Struct, n: int, values: Mapping[str, Value], lengths: Lengths | None = None) -> Bytes:
-    """Payloads of n messages that share a layout; what is not given is zero or empty.
+    """Payloads of n messages with the same layout; fields that are not given are zero or empty.
 
     Parameters
     ----------
     definition
-        Of the messages' type.
+        Definition of the messages' type.
     n
         Number of messages.
     values
@@ -216,11 +212,29 @@ def encode(definition: Struct, n: int, values: Mapping[str, Value], lengths: Len
     for at, length in layout.words:
         payloads[:, at : at + LENGTH_BYTES] = np.frombuffer(length.to_bytes(LENGTH_BYTES, "little"), np.uint8)
     for path, value in values.items():
-        _fill(payloads, path, layout.column(path), value)
+        column = layout.column(path)
+        if isinstance(value, str | list):
+            texts = [value] * len(column.starts) if isinstance(value, str) else value
+            characters = b"".join(str(text).encode() + b"\0" for text in texts)
+            payloads[:, _places(column)] = np.frombuffer(characters, np.uint8)
+            continue
+        given = np.asarray(value)
+        with np.errstate(invalid="ignore"):  # checked in the next line
+            numbers = given.astype(column.dtype)
+        if column.dtype.kind in "iu" and not np.array_equal(numbers, given):
+            raise ValueError(f"{path}: a number does not fit into {column.dtype}")
+        numbers = numbers.reshape(-1, 1) if numbers.ndim == 1 and column.is_single else numbers
+        numbers = np.broadcast_to(numbers, (n, sum(column.counts)))
+        view = _view(payloads, column)
+        if view is None:
+            payloads[:, _places(column)] = np.ascontiguousarray(numbers).view(np.uint8)
+        else:
+            view[...] = numbers
     return payloads
 
 
 def _given_lengths(values: Mapping[str, Value], lengths: Lengths) -> Callable[[DecodingStep, int], int]:
+    """Length of each string and sequence in turn, from the values and lengths to be written."""
     texts = {path: iter(value) for path, value in values.items() if isinstance(value, list)}
     each = {path: iter(length) for path, length in lengths.items() if not isinstance(length, int)}
 
@@ -239,28 +253,8 @@ def _given_lengths(values: Mapping[str, Value], lengths: Lengths) -> Callable[[D
     return length_of
 
 
-def _fill(payloads: Bytes, path: str, column: PayloadColumn, value: Value) -> None:
-    if isinstance(value, str | list):
-        texts = [value] * len(column.starts) if isinstance(value, str) else value
-        characters = b"".join(str(text).encode() + b"\0" for text in texts)
-        payloads[:, _places(column)] = np.frombuffer(characters, np.uint8)
-        return
-    given = np.asarray(value)
-    with np.errstate(invalid="ignore"):  # the next line finds it
-        numbers = given.astype(column.dtype)
-    if column.dtype.kind in "iu" and not np.array_equal(numbers, given):
-        raise ValueError(f"{path}: a number does not fit into {column.dtype}")
-    numbers = numbers.reshape(-1, 1) if numbers.ndim == 1 and column.is_single else numbers
-    numbers = np.broadcast_to(numbers, (len(payloads), sum(column.counts)))
-    view = _view(payloads, column)
-    if view is None:
-        payloads[:, _places(column)] = np.ascontiguousarray(numbers).view(np.uint8)
-    else:
-        view[...] = numbers
-
-
 def _view(payloads: Bytes, column: PayloadColumn) -> NDArray[Any] | None:
-    """A column without copying, shape (n, m); None where its stretches are not evenly spaced single values."""
+    """Column without copying, shape (n, m); None where its parts are not evenly spaced single values."""
     starts, size = column.starts, column.dtype.itemsize
     if not starts:
         return np.empty((len(payloads), 0), column.dtype)

@@ -1,17 +1,16 @@
-"""Convert."""
+"""Converters of data sets, sonar recordings and ROS bags, each a function."""
 
 # fmt: off
 from sonar_graph.logs.convert.akit import read_akit
-from sonar_graph.logs.convert.aris import convert_aris
-from sonar_graph.logs.convert.didson import convert_didson
+from sonar_graph.logs.convert.didson_aris import convert_aris, convert_didson
 from sonar_graph.logs.convert.dlr import read_dlr
 from sonar_graph.logs.convert.mrclam import read_mrclam
 from sonar_graph.logs.convert.oculus import convert_oculus
 from sonar_graph.logs.convert.rosbag import convert_rosbag
-from sonar_graph.logs.convert.sonar_file import Progress, SonarConversion
+from sonar_graph.logs.convert.sonar_file import SonarConversion
 from sonar_graph.logs.convert.victoria_park import read_victoria_park
 
 __all__ = [
-    "Progress", "SonarConversion", "convert_aris", "convert_didson", "convert_oculus", "convert_rosbag",
+    "SonarConversion", "convert_aris", "convert_didson", "convert_oculus", "convert_rosbag",
     "read_akit", "read_dlr", "read_mrclam", "read_victoria_park",
 ]

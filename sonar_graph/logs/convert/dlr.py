@@ -6,13 +6,12 @@ Kurlbaum, Frese, "A benchmark data set for data association", Universität Breme
 ``STEP image dx dy dφ  c_xx c_xy c_yy c_xφ c_yφ c_φφ``        the pose after the step in the frame before it
 ``LANDMARK_C px py quality  c_xx c_xy c_yy  id [id ...]``     a disc in the frame of the newest pose
 
-with −y forward and x to the right. Body axes (x forward, y left) are therefore ``(x, y)_body = (−y, −x)_file``; that is
-a reflection, so that angles change their sign: ``θ = −φ``. Seen from above, the file's angles grow to the right.
+with −y forward and x to the right. Body axes (x forward, y left) are therefore ``(x, y)_body = (−y, −x)_file``, a
+reflection, so that angles change their sign: ``θ = −φ``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,6 @@ from sonar_graph.logs.convert.planar import (
     symmetric,
 )
 from sonar_graph.logs.convert.text_tables import numbers, read_lines
-from sonar_graph.measurements import Floats, Ints, LandmarkDetections
 from sonar_graph.sequence import Sequence
 
 FILE_NAME = "map.circles"
@@ -37,11 +35,11 @@ EXPECTED = "lines 'STEP image dX dY dPhi + 6 covariances' and 'LANDMARK_C pX pY 
 STEP_COV_PLACES = [[0, 1, 3], [1, 2, 4], [3, 4, 5]]
 POINT_COV_PLACES = [[0, 1], [1, 2]]
 BODY_OF_FILE = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-"""(x, y, θ) of the body's axes from (x, y, φ) of the file's."""
+"""(x, y, θ) in body axes from (x, y, φ) in the file's."""
 
 
 def read_dlr(path: Path) -> Sequence:
-    """The run, one odometry step a second.
+    """Sequence of the run, one odometry step a second.
 
     Parameters
     ----------
@@ -61,16 +59,53 @@ def read_dlr(path: Path) -> Sequence:
     """
     if path.is_dir() and not (path / FILE_NAME).exists():
         raise DatasetError(f"{path}: holds no {FILE_NAME} ({EXPECTED}); give the folder that does, or the file itself")
-    lines = _read(path / FILE_NAME if path.is_dir() else path)
-    steps = np.array(lines.steps)
-    covs = symmetric(steps[:, 3:], STEP_COV_PLACES)
-    imu, dvl = stepped_odometry(steps[:, :3] @ BODY_OF_FILE.T, BODY_OF_FILE @ covs @ BODY_OF_FILE.T, STEP_S)
+    path = path / FILE_NAME if path.is_dir() else path
+    steps: list[list[float]] = []
+    points: list[list[float]] = []
+    ids: list[list[int]] = []
+    poses: list[int] = []  # number of steps before each landmark
+    for number, (kind, *rest) in read_lines(path, EXPECTED):
+        if kind == "STEP":
+            steps.append(numbers(path, number, rest[1:], STEP_COLUMNS))
+            continue
+        if kind not in ("LANDMARK", "LANDMARK_C"):
+            raise DatasetError(f"{path}, line {number}: begins with {kind!r}; expected {EXPECTED}")
+        if not steps:
+            raise DatasetError(f"{path}, line {number}: a landmark before the first STEP; expected {EXPECTED}")
+        points.append(numbers(path, number, rest[: len(POINT_COLUMNS)], POINT_COLUMNS))
+        try:
+            ids.append([int(text) for text in rest[len(POINT_COLUMNS) :]])
+        except ValueError as error:
+            raise DatasetError(f"{path}, line {number}: {error}; expected whole numbers as landmark IDs") from error
+        if not ids[-1]:
+            raise DatasetError(f"{path}, line {number}: no landmark ID after the covariances; expected {EXPECTED}")
+        poses.append(len(steps))
+    if not steps:
+        raise DatasetError(f"{path}: holds no STEP line; expected {EXPECTED}")
+    rows = np.array(steps)
+    covs = symmetric(rows[:, 3:], STEP_COV_PLACES)
+    imu, dvl = stepped_odometry(rows[:, :3] @ BODY_OF_FILE.T, BODY_OF_FILE @ covs @ BODY_OF_FILE.T, STEP_S)
+    detections = None
+    if points:
+        candidate_ids = np.full((len(ids), max(map(len, ids))), -1, dtype=np.int64)
+        for row, found in enumerate(ids):
+            known = [identity for identity in found if identity >= 0]
+            candidate_ids[row, : len(known)] = known
+        is_known = candidate_ids >= 0
+        seen, plane = np.array(points), BODY_OF_FILE[:2, :2]
+        detections = point_detections(
+            step_stamps_ns(len(rows), STEP_S)[poses],
+            seen[:, :2] @ plane.T,
+            plane @ symmetric(seen[:, 3:], POINT_COV_PLACES) @ plane.T,
+            candidate_ids,
+            is_known / np.maximum(is_known.sum(axis=1, keepdims=True), 1),
+        )
     return Sequence(
         name="dlr_spatial_cognition",
         calibration=stepped_calibration(dvl, covs, STEP_S),
         imu=imu,
         dvl=dvl,
-        detections=_detections(lines, step_stamps_ns(len(steps), STEP_S)) if lines.points else None,
+        detections=detections,
         notes={
             "data set": "DLR Spatial Cognition; Kurlbaum, Frese, SFB/TR 8 report, 2009",
             "licence": "none stated",
@@ -78,64 +113,6 @@ def read_dlr(path: Path) -> Sequence:
             "truth": "none",
             "odometry": "each step as the constant twist that makes it in one second",
             "noise": "the file's covariances; of the turn their mean, and not their correlation with the displacement",
-            "detections": f"{sum(ids == [-1] for ids in lines.ids)} of {len(lines.ids)} have no identity (-1)",
+            "detections": f"{sum(found == [-1] for found in ids)} of {len(ids)} have no identity (-1)",
         },
     )
-
-
-@dataclass
-class _Lines:
-    """What the file's lines say, in their order, in the file's frame."""
-
-    steps: list[list[float]] = field(default_factory=list)
-    poses: list[int] = field(default_factory=list)
-    points: list[list[float]] = field(default_factory=list)
-    ids: list[list[int]] = field(default_factory=list)
-
-
-def _read(path: Path) -> _Lines:
-    lines = _Lines()
-    for number, (kind, *rest) in read_lines(path, EXPECTED):
-        if kind == "STEP":
-            lines.steps.append(numbers(path, number, rest[1:], STEP_COLUMNS))
-        elif kind not in ("LANDMARK", "LANDMARK_C"):
-            raise DatasetError(f"{path}, line {number}: begins with {kind!r}; expected {EXPECTED}")
-        elif not lines.steps:
-            raise DatasetError(f"{path}, line {number}: a landmark before the first STEP; expected {EXPECTED}")
-        else:
-            lines.points.append(numbers(path, number, rest[: len(POINT_COLUMNS)], POINT_COLUMNS))
-            lines.ids.append(_ids(path, number, rest[len(POINT_COLUMNS) :]))
-            lines.poses.append(len(lines.steps))
-    if not lines.steps:
-        raise DatasetError(f"{path}: holds no STEP line; expected {EXPECTED}")
-    return lines
-
-
-def _ids(path: Path, number: int, fields: list[str]) -> list[int]:
-    try:
-        ids = [int(text) for text in fields]
-    except ValueError as error:
-        raise DatasetError(f"{path}, line {number}: {error}; expected whole numbers as landmark IDs") from error
-    if not ids:
-        raise DatasetError(f"{path}, line {number}: no landmark ID after the covariances; expected {EXPECTED}")
-    return ids
-
-
-def _detections(lines: _Lines, stamps_ns: Ints) -> LandmarkDetections:
-    points = np.array(lines.points)
-    candidate_ids, id_probability = _candidates(lines.ids)
-    plane = BODY_OF_FILE[:2, :2]
-    covs = symmetric(points[:, 3:], POINT_COV_PLACES)
-    return point_detections(
-        stamps_ns[lines.poses], points[:, :2] @ plane.T, plane @ covs @ plane.T, candidate_ids, id_probability
-    )
-
-
-def _candidates(ids: list[list[int]]) -> tuple[Ints, Floats]:
-    """Candidates padded with -1, shape (n, k), and equal shares for those that are identities."""
-    candidate_ids = np.full((len(ids), max(map(len, ids))), -1, dtype=np.int64)
-    for row, found in enumerate(ids):
-        known = [identity for identity in found if identity >= 0]
-        candidate_ids[row, : len(known)] = known
-    known_places = candidate_ids >= 0
-    return candidate_ids, known_places / np.maximum(known_places.sum(axis=1, keepdims=True), 1)

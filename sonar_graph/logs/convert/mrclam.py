@@ -11,13 +11,12 @@ Leung, Halpern, Barfoot, Liu, "The UTIAS multi-robot cooperative localization an
 ========================  =================================================================================
 
 A command holds from its stamp to the next. Samples of a `Sequence` hold over the interval that *ends* at their stamp,
-so the row at each stamp carries the command of the stamp before; stamps and values stay the data set's own. How that
-was told from the other readings, and where the noise parameters come from: ``docs/theory/datasets.md``.
+so the row at each stamp carries the command of the stamp before. ``docs/theory/datasets.md`` has the evidence for that
+and the origin of the noise parameters.
 """
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +30,6 @@ from sonar_graph.calibration import (
     SonarCalibration,
     Start,
 )
-from sonar_graph.errors import DatasetError
 from sonar_graph.logs.convert.planar import (
     FLOOR_SIGMA_M,
     VERTICAL_VELOCITY_SIGMA_M_S,
@@ -39,29 +37,29 @@ from sonar_graph.logs.convert.planar import (
     planar_imu,
     planar_trajectory,
 )
-from sonar_graph.logs.convert.text_tables import NumberTable, read_table, require_folder
-from sonar_graph.measurements import Dvl, Imu, Ints, LandmarkDetections
+from sonar_graph.logs.convert.text_tables import NumberTable, numbered_run, read_table
+from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
-from sonar_graph.states import LandmarkMap, Trajectory
+from sonar_graph.states import LandmarkMap
 
 ROBOT_SUBJECTS = frozenset(range(1, 6))
 # The same for every robot; estimated from robots 1 to 5 of set 6 against motion capture (docs/theory/datasets.md).
 FORWARD_NOISE_M_SQRT_S = 0.02
-"""Wheel slip along the heading: sigma of the distance over T is this times sqrt(T)."""
+"""Wheel slip along the heading: the sigma of the distance over T is this times sqrt(T)."""
 SIDEWAYS_NOISE_M_SQRT_S = 0.005
-"""The same across the heading."""
+"""Wheel slip across the heading."""
 GYRO_NOISE_DENSITY = 0.04
 GYRO_BIAS_SIGMA_RAD_S = 0.003
 GYRO_BIAS_WALK_DENSITY = 1e-5
 RANGE_SIGMA_M = 0.18
 AZIMUTH_SIGMA_RAD = 0.0125
 TYPICAL_INTERVAL_S = 0.0145
-"""Mean time between commands: the interval given to the first row, which has none, and to the calibration."""
+"""Mean time between commands, used for the first row, which has no interval, and for the calibration."""
 FILES = "Barcodes.dat, Landmark_Groundtruth.dat, RobotN_Odometry.dat and RobotN_Measurement.dat"
 
 
 def read_mrclam(dataset_dir: Path, robot: int) -> Sequence:
-    """One robot's run.
+    """Sequence of one robot's run.
 
     Parameters
     ----------
@@ -81,40 +79,70 @@ def read_mrclam(dataset_dir: Path, robot: int) -> Sequence:
     DatasetError
         When the folder or the robot does not exist, or a file is missing or malformed.
     """
-    require_folder(dataset_dir, FILES)
-    prefix = _robot_prefix(dataset_dir, robot)
+    prefix = str(numbered_run(dataset_dir, "RobotN_Odometry.dat", robot, "robot", FILES)).removesuffix("_Odometry.dat")
     imu, dvl = _odometry(read_table(Path(f"{prefix}_Odometry.dat"), ("time", "forward velocity", "angular velocity")))
-    detections, dropped = _detections(
+    detections, left_out = _detections(
         read_table(Path(f"{prefix}_Measurement.dat"), ("time", "bar code", "range", "bearing")),
-        _subjects_by_barcode(dataset_dir),
+        read_table(dataset_dir / "Barcodes.dat", ("subject", "bar code")),
     )
-    truth = _truth(Path(f"{prefix}_Groundtruth.dat"))
-    start = _start(truth, int(imu.stamps_ns[0]))
+    truth, start = None, None
+    if Path(f"{prefix}_Groundtruth.dat").exists():
+        table = read_table(Path(f"{prefix}_Groundtruth.dat"), ("time", "x", "y", "orientation"))
+        stamps_ns, rows = np.unique(table.stamps_ns(), return_index=True)
+        truth = planar_trajectory(stamps_ns, table.values[rows, 1:])
+        start_ns = int(imu.stamps_ns[0])
+        if truth.stamps_ns[0] <= start_ns <= truth.stamps_ns[-1]:
+            pose = truth.at(np.array([start_ns]))
+            x, y, z = pose.positions[0].tolist()
+            yaw = float(pose.rotations().as_euler("ZYX")[0, 0])
+            start = Start(position_m=(x, y, z), rpy_rad=(0.0, 0.0, yaw))
+    columns = ("subject", "x", "y", "sigma of x", "sigma of y")
+    values = read_table(dataset_dir / "Landmark_Groundtruth.dat", columns).values
+    values = values[np.argsort(values[:, 0])]
+    covariances = np.zeros((len(values), 3, 3))
+    covariances[:, 0, 0], covariances[:, 1, 1] = values[:, 3] ** 2, values[:, 4] ** 2
+    positions = np.column_stack([values[:, 1:3], np.zeros(len(values))])
+    per_sample = np.sqrt(TYPICAL_INTERVAL_S)
+    forward_sigma_m_s = float(FORWARD_NOISE_M_SQRT_S / per_sample)
+    sideways_sigma_m_s = float(SIDEWAYS_NOISE_M_SQRT_S / per_sample)
     return Sequence(
         name=f"{dataset_dir.resolve().name}_robot{robot}",
-        calibration=_calibration(start or Start()),
+        calibration=Calibration(
+            imu=ImuCalibration(
+                gyro_noise_density=GYRO_NOISE_DENSITY,
+                gyro_bias_sigma=GYRO_BIAS_SIGMA_RAD_S,
+                gyro_bias_walk_density=GYRO_BIAS_WALK_DENSITY,
+            ),
+            dvl=DvlCalibration(velocity_sigma_m_s=(forward_sigma_m_s, sideways_sigma_m_s, VERTICAL_VELOCITY_SIGMA_M_S)),
+            sonar=SonarCalibration(range_sigma_m=RANGE_SIGMA_M, azimuth_sigma_rad=AZIMUTH_SIGMA_RAD),
+            start=start or Start(),
+            floor=FloorPrior(z_m=0.0, sigma_m=FLOOR_SIGMA_M),
+            planar=PlanarMotion(),
+            use_gravity=False,
+            odometry_interpolation="hold-past",
+        ),
         imu=imu,
         dvl=dvl,
         detections=detections,
         truth=truth,
-        true_landmarks=_true_landmarks(dataset_dir),
-        notes=_notes(dropped, has_truth=truth is not None, true_start=start is not None),
+        true_landmarks=LandmarkMap(values[:, 0].astype(np.int64), positions, covariances),
+        notes={
+            "data set": "UTIAS MRCLAM; Leung, Halpern, Barfoot, Liu, IJRR 30(8), 2011",
+            "licence": "none stated; the authors ask to be cited",
+            "truth": "motion capture" if truth is not None else "of the landmarks only; this set has no robot truth",
+            "start": "true pose at the first odometry stamp" if start else "origin: no truth at the first stamp",
+            "odometry": "commanded velocities, each held until the next; "
+            "the row at a stamp holds the command before it",
+            "detections": left_out,
+            "noise": "estimated from robots 1-5 of set 6 against motion capture; the same for every robot",
+        },
     )
 
 
-def _robot_prefix(dataset_dir: Path, robot: int) -> str:
-    found = (re.fullmatch(r"Robot(\d+)_Odometry\.dat", path.name) for path in dataset_dir.iterdir())
-    robots = sorted(int(match[1]) for match in found if match)
-    if not robots:
-        raise DatasetError(f"{dataset_dir}: holds no RobotN_Odometry.dat; give the folder that holds {FILES}")
-    if robot not in robots:
-        raise DatasetError(f"{dataset_dir}: has no robot {robot}; it has {', '.join(map(str, robots))}")
-    return str(dataset_dir / f"Robot{robot}")
-
-
 def _odometry(table: NumberTable) -> tuple[Imu, Dvl]:
-    stamps_ns, rows = _last_of_each_stamp(table.stamps_ns())
-    commands = table.values[rows, 1:]
+    """Sensor rows of the commanded velocities; of several commands at one stamp the last counts."""
+    stamps_ns, first_from_end = np.unique(table.stamps_ns()[::-1], return_index=True)
+    commands = table.values[len(table.values) - 1 - first_from_end, 1:]
     in_force = np.concatenate([commands[:1], commands[:-1]])
     interval_s = np.concatenate([[TYPICAL_INTERVAL_S], np.diff(stamps_ns) * 1e-9])
     noise = np.diag(np.square([FORWARD_NOISE_M_SQRT_S, SIDEWAYS_NOISE_M_SQRT_S]))
@@ -125,26 +153,17 @@ def _odometry(table: NumberTable) -> tuple[Imu, Dvl]:
     )
 
 
-def _last_of_each_stamp(stamps_ns: Ints) -> tuple[Ints, Ints]:
-    """Stamps in order, each once, and the row that was written last for each: the command that then held."""
-    stamps, first_from_end = np.unique(stamps_ns[::-1], return_index=True)
-    return stamps, len(stamps_ns) - 1 - first_from_end
-
-
-def _subjects_by_barcode(dataset_dir: Path) -> dict[int, int]:
-    table = read_table(dataset_dir / "Barcodes.dat", ("subject", "bar code"))
-    return {int(barcode): int(subject) for subject, barcode in table.values}
-
-
-def _detections(table: NumberTable, subjects: dict[int, int]) -> tuple[LandmarkDetections | None, dict[str, int]]:
+def _detections(table: NumberTable, barcodes: NumberTable) -> tuple[LandmarkDetections | None, str]:
+    """Detections of landmarks in the order of time, and a note about those left out."""
+    subjects = {int(barcode): int(subject) for subject, barcode in barcodes.values}
     stamps_ns = table.stamps_ns()
     order = np.argsort(stamps_ns, kind="stable")
     seen = np.array([subjects.get(int(barcode), -1) for barcode in table.values[:, 1]], dtype=np.int64)
     of_robot = np.isin(seen, list(ROBOT_SUBJECTS))
-    dropped = {"robots": int(of_robot.sum()), "unknown": int((seen < 0).sum())}
+    note = f"left out: {of_robot.sum()} of other robots, {(seen < 0).sum()} with unknown bar codes"
     rows = order[(~of_robot & (seen >= 0))[order]]
     if not len(rows):
-        return None, dropped
+        return None, note
     detections = LandmarkDetections(
         stamps_ns=stamps_ns[rows],
         range_m=table.values[rows, 2],
@@ -153,67 +172,4 @@ def _detections(table: NumberTable, subjects: dict[int, int]) -> tuple[LandmarkD
         candidate_ids=seen[rows, None],
         id_probability=np.ones((len(rows), 1)),
     )
-    return detections, dropped
-
-
-def _truth(path: Path) -> Trajectory | None:
-    if not path.exists():
-        return None
-    table = read_table(path, ("time", "x", "y", "orientation"))
-    stamps_ns, rows = np.unique(table.stamps_ns(), return_index=True)
-    return planar_trajectory(stamps_ns, table.values[rows, 1:])
-
-
-def _true_landmarks(dataset_dir: Path) -> LandmarkMap:
-    columns = ("subject", "x", "y", "sigma of x", "sigma of y")
-    values = read_table(dataset_dir / "Landmark_Groundtruth.dat", columns).values
-    values = values[np.argsort(values[:, 0])]
-    covariances = np.zeros((len(values), 3, 3))
-    covariances[:, 0, 0], covariances[:, 1, 1] = values[:, 3] ** 2, values[:, 4] ** 2
-    positions = np.column_stack([values[:, 1:3], np.zeros(len(values))])
-    return LandmarkMap(values[:, 0].astype(np.int64), positions, covariances)
-
-
-def _start(truth: Trajectory | None, start_ns: int) -> Start | None:
-    if truth is None or not truth.stamps_ns[0] <= start_ns <= truth.stamps_ns[-1]:
-        return None
-    pose = truth.at(np.array([start_ns]))
-    x, y, z = pose.positions[0].tolist()
-    yaw = float(pose.rotations().as_euler("ZYX")[0, 0])
-    return Start(position_m=(x, y, z), rpy_rad=(0.0, 0.0, yaw))
-
-
-def _calibration(start: Start) -> Calibration:
-    per_sample = np.sqrt(TYPICAL_INTERVAL_S)
-    return Calibration(
-        imu=ImuCalibration(
-            gyro_noise_density=GYRO_NOISE_DENSITY,
-            gyro_bias_sigma=GYRO_BIAS_SIGMA_RAD_S,
-            gyro_bias_walk_density=GYRO_BIAS_WALK_DENSITY,
-        ),
-        dvl=DvlCalibration(
-            velocity_sigma_m_s=(
-                float(FORWARD_NOISE_M_SQRT_S / per_sample),
-                float(SIDEWAYS_NOISE_M_SQRT_S / per_sample),
-                VERTICAL_VELOCITY_SIGMA_M_S,
-            )
-        ),
-        sonar=SonarCalibration(range_sigma_m=RANGE_SIGMA_M, azimuth_sigma_rad=AZIMUTH_SIGMA_RAD),
-        start=start,
-        floor=FloorPrior(z_m=0.0, sigma_m=FLOOR_SIGMA_M),
-        planar=PlanarMotion(),
-        use_gravity=False,
-        odometry_interpolation="hold-past",
-    )
-
-
-def _notes(dropped: dict[str, int], *, has_truth: bool, true_start: bool) -> dict[str, str]:
-    return {
-        "data set": "UTIAS MRCLAM; Leung, Halpern, Barfoot, Liu, IJRR 30(8), 2011",
-        "licence": "none stated; the authors ask to be cited",
-        "truth": "motion capture" if has_truth else "of the landmarks only; this set has no robot truth",
-        "start": "true pose at the first odometry stamp" if true_start else "origin: no truth at the first stamp",
-        "odometry": "commanded velocities, each held until the next; the row at a stamp holds the command before it",
-        "detections": f"left out: {dropped['robots']} of other robots, {dropped['unknown']} with unknown bar codes",
-        "noise": "estimated from robots 1-5 of set 6 against motion capture; the same for every robot",
-    }
+    return detections, note

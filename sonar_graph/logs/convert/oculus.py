@@ -1,8 +1,8 @@
 """Recordings of Blueprint Subsea's Oculus sonars: the network messages of the sonar, one after another.
 
-A message is a header of 16 bytes with the size of what follows. Ping results (two layouts, by the header's version)
+A message is a header of 16 bytes with the size of what follows. Ping results, in two layouts by the header's version,
 hold the settings, the bearing of each beam in hundredths of a degree, and the image: all beams of the first range
-first.
+first. See ``docs/theory/sonar_files.md``.
 
 Source: liboculus and oculus_driver (both BSD-3), which quote the manufacturer's description.
 """
@@ -22,12 +22,13 @@ from sonar_graph.logs.convert.sonar_file import (
     DamagedFrameError,
     FrameGeometry,
     FrameHead,
-    Progress,
     Settings,
     SonarConversion,
+    SonarFormat,
     convert_sonar_file,
     first_sound,
 )
+from sonar_graph.logs.mcap import Progress
 from sonar_graph.measurements import Floats
 
 SIGNATURE = struct.pack("<H", 0x4F53)
@@ -40,16 +41,16 @@ MOST_OTHER_BYTES = 1 << 16
 MOST_BEAMS = 1024
 MOST_BEARING = 9000
 CLOCK_PERIOD_NS = 1 << 32
-"""The older pings' clock is a 32-bit number. Its unit is not documented: as nanoseconds, the sample has 16 pings a
-second; microseconds would make it one a minute."""
+"""Period of the older pings' 32-bit clock. Its unit is not documented: in nanoseconds, the sample has 16 pings a
+second; in microseconds it would have one a minute."""
 FIRE = struct.Struct("<5B4d")
 """Mode, rate, network speed, gamma, flags; range, gain, speed of sound, salinity."""
 RESULTS = {0: struct.Struct("<2I4dIBd2H3I"), 1: struct.Struct("<2I4dIBd2H3I"), 2: struct.Struct("<2I8dBd2H4I3I")}
 RESULT_AT = {0: 53, 1: 53, 2: 89}
-"""What was measured, by version: where, and number, status, frequency, temperature, pressure, (heading, pitch, roll),
-speed of sound, time, bytes a sample - 1, bin, ranges, beams, (spare), where the image is, its size, that of all."""
+"""Offset and fields of the result by version: number, status, frequency, temperature, pressure, (heading, pitch, roll),
+speed of sound, time, bytes a sample - 1, bin, ranges, beams, (spare), offset and size of the image, size of all."""
 NO_GAMMA = (0, 255)
-"""Codes for none; others are 255ths."""
+"""Codes for no gamma; others are 255ths."""
 HAS_GAINS = 0b100
 GAIN_BYTES = 4
 
@@ -68,10 +69,10 @@ def convert_oculus(path: Path, output: Path, progress: Progress | None = None) -
         return convert_sonar_file(source, OculusFormat(source), Path(output), progress)
 
 
-class OculusFormat:
+class OculusFormat(SonarFormat):
     """Headers, samples and geometry of a recording of network messages."""
 
-    first_at = frames_promised = 0
+    first_at = 0
     head_bytes = RESULT_AT[2] + RESULTS[2].size + 2 * MOST_BEAMS
     signature, signature_at = SIGNATURE, 0
 
@@ -95,7 +96,7 @@ class OculusFormat:
         }
 
     def head(self, content: bytes, at: int) -> FrameHead:
-        """The header of a message."""
+        """Header of a message."""
         if len(content) < HEADER.size:
             raise DamagedFrameError(f"a message cut off, {len(content)} bytes of its header are there")
         signature, _, _, kind, version, payload, _ = HEADER.unpack_from(content)
@@ -105,21 +106,70 @@ class OculusFormat:
             return FrameHead(at, HEADER.size + payload, 0, 0, (), has_image=False)
         if kind != PING or version not in RESULTS:
             raise DamagedFrameError(f"a message of kind {kind:#x}, version {version}")
-        return _ping(content, at, version, HEADER.size + payload)
+        total = HEADER.size + payload
+        start, layout = RESULT_AT[version], RESULTS[version]
+        if len(content) < start + layout.size:
+            raise DamagedFrameError(f"a ping cut off, {len(content)} of {total} bytes are there")
+        mode, _, _, gamma, flags, *_ = FIRE.unpack_from(content, HEADER.size)
+        number, _, frequency_hz, temperature, pressure, *others = layout.unpack_from(content, start)
+        attitude = others[:3] if version == 2 else ()
+        sound_speed, clock, size_code, bin_m, ranges, beams = others[len(attitude) :][:6]
+        offset, image_bytes, message_bytes = others[-3:]
+        size = size_code + 1
+        bearings_at = start + layout.size
+        bearings = content[bearings_at : bearings_at + 2 * beams]
+        row_gain = GAIN_BYTES if flags & HAS_GAINS else 0
+        if len(content) < min(total, bearings_at + 2 * beams):
+            raise DamagedFrameError(f"ping {number} cut off, {len(content)} of {total} bytes are there")
+        hundredths = np.frombuffer(bearings[: len(bearings) // 2 * 2], "<i2").astype(np.int64)
+        increase = bool(np.all(np.diff(hundredths) > 0) and np.abs(hundredths).max(initial=0) <= MOST_BEARING)
+        faults = {
+            f"{size} bytes a sample": size not in (1, 2, 4),
+            f"{beams} beams": not 0 < beams <= MOST_BEAMS,
+            f"{ranges} ranges": ranges == 0,
+            f"an image of {image_bytes} bytes": image_bytes != ranges * (beams * size + row_gain),
+            f"a message of {message_bytes} bytes": message_bytes != total or offset + image_bytes > total,
+            f"an image from byte {offset}": offset < bearings_at + 2 * beams,
+            "bearings that do not increase": len(bearings) < 2 * beams or not increase,
+            f"bins of {bin_m:g} m": not 1e-5 <= bin_m <= 1.0,
+            f"a sound speed of {sound_speed:g} m/s": not 1300 <= sound_speed <= 1700,
+            f"a time of {clock:g}": not 0 <= clock < 1 << 32,
+        }
+        if any(faults.values()):
+            raise DamagedFrameError(f"a ping with {', '.join(text for text, wrong in faults.items() if wrong)}")
+        settings = (
+            version,
+            mode,
+            gamma,
+            flags,
+            size,
+            offset,
+            ranges,
+            beams,
+            bin_m,
+            sound_speed,
+            frequency_hz,
+            bearings,
+        )
+        clock_ns = round(clock * 1e9) if version == 2 else clock
+        readings = dict(zip(("heading", "pitch", "roll"), attitude, strict=False))
+        if version == 2:
+            readings |= {"temperature": temperature, "pressure": pressure}
+        return FrameHead(at, total, number, clock_ns, settings, readings)
 
     def may_follow(self, content: bytes, earlier: FrameHead) -> bool:  # noqa: ARG002
-        """Whether some bytes can begin the message after."""
+        """True where some bytes can begin the message after."""
         return SIGNATURE.startswith(content[: len(SIGNATURE)])
 
     def geometry(self, settings: Settings) -> FrameGeometry:
-        """Bins begin at the sonar; bearings are positive to the right."""
+        """Bins from the sonar on, and azimuths from the bearings, which are positive to the right."""
         *_, ranges, _, bin_m, sound_speed, frequency_hz, bearings = settings
         middles_m = (np.arange(int(ranges), dtype=float) + 0.5) * float(bin_m)
         right_rad: Floats = np.radians(np.frombuffer(bytes(bearings), "<i2") / 100)  # type: ignore[arg-type]
         return FrameGeometry(middles_m, -right_rad, float(frequency_hz), float(sound_speed))
 
     def samples(self, frame: bytes, settings: Settings) -> NDArray[np.generic]:
-        """Shape (beams, bins); where each row has a gain, divided by its root, as in `read_sonar_frames`."""
+        """Image, shape (beams, bins); rows with a gain are divided by its root, as in `read_sonar_frames`."""
         _, _, _, flags, size, offset, ranges, beams, *_ = map(int, settings[:8])
         kind = np.dtype(f"<u{size}")
         row_gain = GAIN_BYTES if flags & HAS_GAINS else 0
@@ -130,45 +180,3 @@ class OculusFormat:
             return values.T
         gains = np.ascontiguousarray(rows[:, :row_gain]).view("<u4").astype(np.float32)
         return (values / np.sqrt(np.maximum(gains, 1))).astype(np.float32).T
-
-
-def _ping(content: bytes, at: int, version: int, total: int) -> FrameHead:
-    start, layout = RESULT_AT[version], RESULTS[version]
-    if len(content) < start + layout.size:
-        raise DamagedFrameError(f"a ping cut off, {len(content)} of {total} bytes are there")
-    mode, _, _, gamma, flags, *_ = FIRE.unpack_from(content, HEADER.size)
-    number, _, frequency_hz, temperature, pressure, *others = layout.unpack_from(content, start)
-    attitude = others[:3] if version == 2 else ()
-    sound_speed, clock, size_code, bin_m, ranges, beams = others[len(attitude) :][:6]
-    offset, image_bytes, message_bytes = others[-3:]
-    size = size_code + 1
-    bearings_at = start + layout.size
-    bearings = content[bearings_at : bearings_at + 2 * beams]
-    row_gain = GAIN_BYTES if flags & HAS_GAINS else 0
-    if len(content) < min(total, bearings_at + 2 * beams):
-        raise DamagedFrameError(f"ping {number} cut off, {len(content)} of {total} bytes are there")
-    faults = {
-        f"{size} bytes a sample": size not in (1, 2, 4),
-        f"{beams} beams": not 0 < beams <= MOST_BEAMS,
-        f"{ranges} ranges": ranges == 0,
-        f"an image of {image_bytes} bytes": image_bytes != ranges * (beams * size + row_gain),
-        f"a message of {message_bytes} bytes": message_bytes != total or offset + image_bytes > total,
-        f"an image from byte {offset}": offset < bearings_at + 2 * beams,
-        "bearings that do not increase": len(bearings) < 2 * beams or not _increase(bearings),
-        f"bins of {bin_m:g} m": not 1e-5 <= bin_m <= 1.0,
-        f"a sound speed of {sound_speed:g} m/s": not 1300 <= sound_speed <= 1700,
-        f"a time of {clock:g}": not 0 <= clock < 1 << 32,
-    }
-    if any(faults.values()):
-        raise DamagedFrameError(f"a ping with {', '.join(text for text, wrong in faults.items() if wrong)}")
-    settings = (version, mode, gamma, flags, size, offset, ranges, beams, bin_m, sound_speed, frequency_hz, bearings)
-    clock_ns = round(clock * 1e9) if version == 2 else clock
-    readings = dict(zip(("heading", "pitch", "roll"), attitude, strict=False))
-    if version == 2:
-        readings |= {"temperature": temperature, "pressure": pressure}
-    return FrameHead(at, total, number, clock_ns, settings, readings)
-
-
-def _increase(bearings: bytes) -> bool:
-    hundredths = np.frombuffer(bearings, "<i2").astype(np.int64)
-    return bool(np.all(np.diff(hundredths) > 0) and np.abs(hundredths).max(initial=0) <= MOST_BEARING)

@@ -1,13 +1,12 @@
 """Planar robots as vehicles whose Doppler log measures (v_x, v_y, 0) and whose gyro measures (0, 0, ω).
 
-A step of odometry ``(dx, dy, dθ)`` is the constant twist that makes it in the step's duration T. With
-``p = V(dθ) v T`` and ``V(θ) = 1/θ [[sin θ, cos θ - 1], [1 - cos θ, sin θ]]`` (the left Jacobian of SO(2))::
+A step of odometry ``(dx, dy, dθ)`` becomes the constant twist that makes it in the step's duration T, the logarithm of
+SE(2). With ``p = V(dθ) v T`` and ``V`` the left Jacobian of SO(2)::
 
     ω = dθ / T
     v = V(dθ)^-1 (dx, dy) / T,    V(θ)^-1 = [[h, θ/2], [-θ/2, h]],    h = (θ/2) / tan(θ/2)
 
-which is the logarithm of SE(2) (Solà, Deray, Atchuthan, "A micro Lie theory", 2018, example 3 and appendix A).
-Held over the step, it composes to the step exactly.
+Held over the step, it composes to the step exactly. See ``docs/theory/datasets.md``.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ from sonar_graph.sequence import NS_PER_S
 from sonar_graph.states import Trajectory
 
 FLOOR_SIGMA_M = 1e-3
-"""Of a landmark's height over the plane in which it was measured."""
+"""Sigma of a landmark's height over the plane in which it was measured."""
 SMALL_ANGLE_RAD = 1e-4
-"""Below it the series for h is exact to 1e-18."""
+"""Angle below which the series for h is exact to 1e-18."""
 VERTICAL_VELOCITY_SIGMA_M_S = 1e-3
-"""Of the vertical velocity, which is zero by construction; the planar prior does the rest."""
+"""Sigma of the vertical velocity, which is zero by construction; the planar prior does the rest."""
 
 
 def inverse_left_jacobian(angle_rad: Floats) -> Floats:
@@ -45,8 +44,8 @@ def twists_of_steps(steps: Floats, duration_s: float) -> tuple[Floats, Floats]:
 def velocity_cov_of_steps(steps: Floats, covs: Floats, duration_s: float) -> Floats:
     """Covariance of the steps' velocity given their turn, shape (n, 2, 2), m²/s².
 
-    ``V^-1 S V^-T / T²`` with S the covariance of (dx, dy). What the file says of a correlation with the turn has no
-    place in two independent sensors and is left out.
+    ``V^-1 S V^-T / T²`` with S the covariance of (dx, dy). The correlation with the turn is left out, since the two
+    sensors are independent.
     """
     V_inverse = inverse_left_jacobian(steps[:, 2]) / duration_s
     return V_inverse @ covs[:, :2, :2] @ np.swapaxes(V_inverse, -1, -2)
@@ -58,14 +57,14 @@ def step_stamps_ns(steps: int, step_s: int) -> Ints:
 
 
 def stepped_odometry(steps: Floats, covs: Floats, step_s: int) -> tuple[Imu, Dvl]:
-    """Sensor rows at the end of each step, and a row without motion at 0 where the run begins.
+    """Sensor rows at the end of each step, after a row without motion at 0.
 
     Parameters
     ----------
     steps
         (dx, dy, dθ) in the frame before the step (x forward, y left), shape (n, 3), metres and radians.
     covs
-        Covariances of the same, shape (n, 3, 3).
+        Covariances of the steps, shape (n, 3, 3).
     step_s
         Duration of a step.
     """
@@ -120,7 +119,7 @@ def point_detections(
 
 
 def stepped_calibration(dvl: Dvl, step_covs: Floats, step_s: int) -> Calibration:
-    """What a file of steps says about its vehicle: planar, known without bias, landmarks on its own plane.
+    """Calibration of a planar vehicle from the covariances of its steps, without gyro bias.
 
     The turn's noise is one density whose integral over a step has the mean variance of dθ,
     ``sqrt(mean(c_θθ) / T)``; that of the velocity is in the rows, and here their root mean square.

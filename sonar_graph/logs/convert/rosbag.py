@@ -1,8 +1,8 @@
 """ROS 1 bags and the sqlite3 bags of ROS 2 as MCAP logs, through the rosbags library.
 
-Every topic is taken over. Payloads become CDR; types get the definition of ROS 2 Jazzy where it has them, the fields
-mapped where the two differ, and otherwise the definition that stands in the bag. Stamps, in messages and of recording,
-stay what they are to the nanosecond. The type and MD5 sum that a ROS 1 bag stated are kept in a metadata record.
+Every topic is converted. Payloads become CDR. Types get the definition of ROS 2 Jazzy where it has them, with fields
+mapped where the two differ, and otherwise the definition in the bag. Stamps, in messages and of recording, stay the
+same to the nanosecond. The types and MD5 sums of a ROS 1 bag are kept in a metadata record.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mcap.writer import Writer
 
 from sonar_graph.errors import LogError
 from sonar_graph.files import written_whole
-from sonar_graph.logs.mcap import LIBRARY, ROSBAG2_METADATA, START_BYTES, TRANSIENT_LOCAL, why_no_bag
+from sonar_graph.logs.mcap import LIBRARY, ROSBAG2_METADATA, START_BYTES, TRANSIENT_LOCAL, Progress, why_no_bag
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -27,29 +27,27 @@ if TYPE_CHECKING:
 
 
 SOURCE_METADATA = "rosbag"
-"""Metadata record: by topic, the type and MD5 sum in the bag."""
+"""Metadata record of the type and MD5 sum of each topic in the bag."""
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 _CHUNK_BYTES = 1 << 20
 _STEPS = 1000
 _INSTALL = "pip install 'sonar-graph[rosbag]'"
 Recode = Callable[[bytes], memoryview]
-Progress = Callable[[int, int], None]
-"""Called with the number of messages that are done and that there are."""
 
 
 @dataclass
 class Conversion:
-    """What became of a bag."""
+    """Result of the conversion of a bag."""
 
     topics: int
     messages: int = 0
     duration_s: float = 0.0
     left_out: dict[str, str] = field(default_factory=dict)
-    """Topics of which something is missing, with the reason."""
+    """Topics without some or all of their messages, with the reason."""
 
 
 def convert_rosbag(source: Path, output: Path, progress: Progress | None = None) -> Conversion:
-    """Write an MCAP log with all that is in a bag; an existing file is replaced only when the new one is complete.
+    """Write an MCAP log of a whole bag; an existing file is replaced only when the new one is complete.
 
     Parameters
     ----------
@@ -58,53 +56,44 @@ def convert_rosbag(source: Path, output: Path, progress: Progress | None = None)
     output
         The MCAP file.
     progress
-        Is told now and then how far the work is.
+        Called now and then with the number of messages done and in all.
 
     Raises
     ------
     LogError
         When the rosbags library is not installed, the bag cannot be read, or the log cannot be written.
     """
-    with _bag(Path(source)) as bag, written_whole(output) as stream:
+    with _open_bag(Path(source)) as bag, written_whole(output) as stream:
         return _BagCopy(bag, Writer(stream, chunk_size=_CHUNK_BYTES)).run(progress)
 
 
 @contextmanager
-def _bag(source: Path) -> Iterator[AnyReader]:
+def _open_bag(source: Path) -> Iterator[AnyReader]:
     try:
         from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise LogError(f"{source}: bags are read by the rosbags library, which is not installed: {_INSTALL}") from error
-    _refuse_other_files(source)
+    if source.is_file():
+        with source.open("rb") as stream:
+            fault = why_no_bag(source, stream.read(START_BYTES))
+        if fault is not None:
+            raise LogError(f"{source} is {fault}")
     is_file_in_bag = source.suffix == ".db3" and (source.parent / "metadata.yaml").exists()
     path = source.parent if is_file_in_bag else source
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as bag:
             yield bag
     except (AnyReaderError, FileNotFoundError) as error:
-        raise LogError(f"{source} cannot be read as a bag: {error}{_advice(source)}") from error
-
-
-def _refuse_other_files(source: Path) -> None:
-    if not source.is_file():
-        return
-    with source.open("rb") as stream:
-        fault = why_no_bag(source, stream.read(START_BYTES))
-    if fault is not None:
-        raise LogError(f"{source} is {fault}")
-
-
-def _advice(source: Path) -> str:
-    if source.suffix == ".bag":
-        return "; of one that was not closed `rosbag reindex` makes a whole one"
-    if source.suffix == ".db3":
-        return "; give the folder with the .db3 file and its metadata.yaml (`ros2 bag reindex` makes one)"
-    return "; give a ROS 1 .bag, or the folder of a ROS 2 bag with its metadata.yaml"
+        advice = {
+            ".bag": "of one that was not closed `rosbag reindex` makes a whole one",
+            ".db3": "give the folder with the .db3 file and its metadata.yaml (`ros2 bag reindex` makes one)",
+        }.get(source.suffix, "give a ROS 1 .bag, or the folder of a ROS 2 bag with its metadata.yaml")
+        raise LogError(f"{source} cannot be read as a bag: {error}; {advice}") from error
 
 
 class _BagCopy:
-    """Copies messages from a bag to a log."""
+    """Copy of the messages of a bag to a log."""
 
     def __init__(self, bag: AnyReader, writer: Writer) -> None:
         from rosbags.typesys import Stores, get_typestore
@@ -122,7 +111,9 @@ class _BagCopy:
 
         bag, writer = self._bag, self._writer
         writer.start(profile="ros2", library=LIBRARY)
-        self._add_source()
+        writer.add_metadata("rosbag2", ROSBAG2_METADATA)
+        stated = {c.topic: f"{c.msgtype.replace('/msg/', '/')} {c.digest}" for c in bag.connections}
+        writer.add_metadata(SOURCE_METADATA, stated)
         connections = [c for c in bag.connections if c.msgtype in bag.typestore.fielddefs]
         missing = {c.topic: f"{c.msgtype} is not defined in the bag" for c in bag.connections if c not in connections}
         channels = {(c.id, id(c.owner)): self._channel(c) for c in connections}
@@ -145,22 +136,27 @@ class _BagCopy:
         writer.finish()  # type: ignore[no-untyped-call]  # of the mcap package
         return conversion
 
-    def _add_source(self) -> None:
-        stated = {c.topic: f"{c.msgtype.replace('/msg/', '/')} {c.digest}" for c in self._bag.connections}
-        self._writer.add_metadata("rosbag2", ROSBAG2_METADATA)
-        self._writer.add_metadata(SOURCE_METADATA, stated)
-
     def _channel(self, connection: Connection) -> int:
+        """Channel of a connection, and the conversion of its messages.
+
+        Late subscribers get the last message where the connection is ``latching`` in ROS 1, "transient local" in ROS 2.
+        """
+        from rosbags.interfaces import ConnectionExtRosbag2
+
         type_name = _RENAMED.get(connection.msgtype, connection.msgtype)
         self._recoders[connection.msgtype] = self._recoder(connection.msgtype, type_name)
         if type_name not in self._schemas:
             text, _ = self._store.generate_msgdef(type_name, ros_version=2)
             self._schemas[type_name] = self._writer.register_schema(type_name, "ros2msg", text.encode())
-        offers = {"offered_qos_profiles": TRANSIENT_LOCAL} if _is_latched(connection) else {}
+        if isinstance(connection.ext, ConnectionExtRosbag2):
+            is_latched = any(profile.durability.value == 1 for profile in connection.ext.offered_qos_profiles)
+        else:
+            is_latched = bool(connection.ext.latching)
+        offers = {"offered_qos_profiles": TRANSIENT_LOCAL} if is_latched else {}
         return self._writer.register_channel(connection.topic, "cdr", self._schemas[type_name], offers)
 
     def _recoder(self, own: str, type_name: str) -> Recode:
-        """From a payload in the bag to CDR of the type as the log defines it."""
+        """Conversion of a payload in the bag to CDR of the type as the log defines it."""
         from rosbags.convert.converter import is_same_wireformat, migrate_bytes
 
         store: Typestore = self._bag.typestore
@@ -173,12 +169,3 @@ class _BagCopy:
             return migrate_bytes(store, self._store, own, type_name, cache, raw, **sides)
 
         return migrate
-
-
-def _is_latched(connection: Connection) -> bool:
-    """Whether those that join late get the last message: ``latching`` in ROS 1, "transient local" in ROS 2."""
-    from rosbags.interfaces import ConnectionExtRosbag2
-
-    if isinstance(connection.ext, ConnectionExtRosbag2):
-        return any(profile.durability.value == 1 for profile in connection.ext.offered_qos_profiles)
-    return bool(connection.ext.latching)

@@ -1,72 +1,80 @@
-"""What recordings of imaging sonars have in common, whoever made them: frames one after another, without checksums.
+"""Recordings of imaging sonars, of whatever maker, as MCAP logs of sonar images.
 
-From frame to frame through a sonar's file, believing none that its neighbours contradict.
-
-The formats have no checksums. What can be checked is checked: a frame is whole when its header makes sense and another
-sensible header, or the end of the file, follows where it should; a frame has a damaged header whose settings are those
-of none of its neighbours (some sonars alternate between two), or whose time is not between theirs. What cannot be told:
-samples that were overwritten in place, and bytes that are missing or too many by exactly the length of frames.
-
-A sonar's recording as an MCAP log of sonar images, a few frames at a time.
+The files are frames one after another, without checksums. A frame is whole when its header is plausible and another
+plausible header, or the end of the file, follows at its end. A frame is damaged when its settings are those of none of
+its neighbours (some sonars alternate between two), or when its time is not between theirs. Not detectable are samples
+that were overwritten in place, and missing or additional bytes of exactly the length of frames. See
+``docs/theory/sonar_files.md``.
 """
 
 from __future__ import annotations
 
 import json
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import chain, combinations, repeat
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import DatasetError
-from sonar_graph.logs.mcap import RecordingWriter, recording
+from sonar_graph.logs.mcap import Progress, recording
 from sonar_graph.logs.vehicle_setup import METADATA
 from sonar_graph.logs.writing import sonar_image_messages
 from sonar_graph.measurements import Floats, SonarFrames
 
-_BLOCK_BYTES = 1 << 20
+TOPIC = "/sonar/image"
+_SEARCH_BYTES = 1 << 20
+_IMAGE_BYTES = 1 << 22
+_MOST_MISSING = 100_000
+"""A larger jump of the frame number means that counting began anew."""
+_NEIGHBOURS = 4
+"""Number of frames on either side with which a frame's settings are compared."""
+_DRIFT = 1e-3
+"""Relative change below which settings given as floats (speed of sound) agree."""
+_ODD_GAP, _ODD_GAP_NS = 10, 1_000_000_000
+"""The first and last interval may be this many times the one beside it, and this much more."""
 Settings = tuple[int | float | bytes, ...]
 
 
 class DamagedFrameError(Exception):
-    """A frame's header cannot be one; the text says why."""
+    """Bytes that cannot be the header of a frame; the text tells why."""
 
 
 @dataclass(frozen=True)
 class FrameHead:
-    """What the header of a frame says."""
+    """Header of a frame."""
 
     at: int
-    """Byte of the file where the header begins."""
+    """Offset of the header in the file."""
     size: int
     """Bytes of header and samples."""
     number: int
-    """As the sonar counts."""
+    """Number of the frame, as counted by the sonar."""
     clock_ns: int
-    """The sonar's own time of the frame."""
+    """Time of the frame by the sonar's own clock."""
     settings: Settings
-    """All that samples and geometry depend on; those that may drift are floats."""
+    """All on which samples and geometry depend; settings that may drift are floats."""
     readings: Mapping[str, float] = field(default_factory=dict)
-    """What other sensors said, such as depth."""
+    """Readings of other sensors, such as depth."""
     has_image: bool = True
-    """Messages of other kinds between the frames have none."""
+    """False for messages of other kinds between the frames."""
 
     @property
     def end(self) -> int:
-        """Byte after the last."""
+        """Offset after the last byte."""
         return self.at + self.size
 
 
 @dataclass(frozen=True)
 class Lost:
-    """A stretch of the file of which nothing is used."""
+    """Bytes of the file that are not used."""
 
     at: int
     end: int
@@ -78,90 +86,61 @@ class Lost:
 
 @dataclass(frozen=True, eq=False)
 class FrameGeometry:
-    """Where the samples of a frame lie."""
+    """Ranges and azimuths of the samples of a frame."""
 
     ranges_m: Floats
     """Middle of each bin, shape (bins,)."""
     azimuths_rad: Floats
-    """Of each beam in the order of the samples, positive to the left, shape (beams,)."""
+    """Azimuth of each beam in the order of the samples, positive to the left, shape (beams,)."""
     frequency_hz: float = 0.0
     sound_speed_m_s: float = 0.0
 
 
-class SonarFormat(Protocol):
-    """A kind of file, opened."""
+class SonarFormat(ABC):
+    """Format of a sonar's file, opened."""
 
-    @property
-    def calibration(self) -> Calibration:
-        """What the kind of sonar says about its images."""
-        ...
+    calibration: Calibration
+    """Calibration of the sonar's images."""
+    notes: Mapping[str, str]
+    """Interpretation of the file, for users of the log."""
+    first_at: int
+    """Offset of the first frame."""
+    head_bytes: int
+    """Bytes enough to read any frame's header."""
+    signature: bytes
+    """Bytes in every frame's header."""
+    signature_at: int
+    """Offset of the signature in the header."""
+    clock_period_ns: int | None = None
+    """Period after which the sonar's clock wraps around; None: never."""
+    frames_promised: int = 0
+    """Number of frames by the file's header; 0: not stated."""
 
-    @property
-    def notes(self) -> Mapping[str, str]:
-        """How the file is understood, for whoever reads the log."""
-        ...
-
-    @property
-    def first_at(self) -> int:
-        """Where the first frame is."""
-        ...
-
-    @property
-    def head_bytes(self) -> int:
-        """Enough to read any frame's header."""
-        ...
-
-    @property
-    def signature(self) -> bytes:
-        """Bytes that every frame's header has."""
-        ...
-
-    @property
-    def signature_at(self) -> int:
-        """Where in the header they are."""
-        ...
-
-    @property
-    def clock_period_ns(self) -> int | None:
-        """What the sonar's clock wraps around at; None: it does not."""
-        ...
-
-    @property
-    def frames_promised(self) -> int:
-        """Number of frames by the file's header; 0: it does not say."""
-        ...
-
+    @abstractmethod
     def head(self, content: bytes, at: int) -> FrameHead:
-        """The header at the beginning of some bytes, which lie at ``at`` in the file.
+        """Header at the beginning of some bytes, which lie at ``at`` in the file.
 
         Raises
         ------
         DamagedFrameError
-            When it cannot be one.
+            When the bytes cannot be a header.
         """
-        ...
 
+    @abstractmethod
     def may_follow(self, content: bytes, earlier: FrameHead) -> bool:
-        """Whether bytes at the end of the file, fewer than a header, can be the beginning of the next frame."""
-        ...
+        """True where bytes at the end of the file, fewer than a header, can be the beginning of the next frame."""
 
+    @abstractmethod
     def geometry(self, settings: Settings) -> FrameGeometry:
-        """Ranges and azimuths of frames with these settings."""
-        ...
+        """Ranges and azimuths of frames with some settings."""
 
+    @abstractmethod
     def samples(self, frame: bytes, settings: Settings) -> NDArray[np.generic]:
-        """The image in a frame's bytes, shape (beams, bins)."""
-        ...
-
-
-def may_be_numbered_header(content: bytes, signature: bytes, signature_at: int, number: int) -> bool:
-    """Whether bytes begin like a header with a number in its first four bytes and a signature later on."""
-    signed = content[signature_at:]
-    return number.to_bytes(4, "little").startswith(content[:4]) and signature.startswith(signed[: len(signature)])
+        """Image in a frame's bytes, shape (beams, bins)."""
 
 
 class ByteSource:
-    """A file that is read where it is wanted."""
+    """File open for reading at any offset."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -186,99 +165,78 @@ class ByteSource:
             raise DatasetError(f"{self.path}: cannot be read at byte {at}: {error.strerror}") from error
 
     def places(self, pattern: bytes, start: int) -> Iterator[int]:
-        """Where a pattern begins, from ``start`` on."""
-        for at in range(start, self.size, _BLOCK_BYTES):
-            block = self.read(at, _BLOCK_BYTES + len(pattern) - 1)
+        """Offsets of a pattern, from ``start`` on."""
+        for at in range(start, self.size, _SEARCH_BYTES):
+            block = self.read(at, _SEARCH_BYTES + len(pattern) - 1)
             found = block.find(pattern)
             while found >= 0:
                 yield at + found
                 found = block.find(pattern, found + 1)
 
 
-_NEIGHBOURS = 4
-"""On either side, with which a frame's settings are compared."""
-_DRIFT = 1e-3
-"""Relative change of a setting given as a float (speed of sound) between neighbours that is none."""
-_ODD_GAP = 10
-"""How many times longer the first and last interval may be than the one beside it, before its time counts as damaged,
-with ..."""
-_ODD_GAP_NS = 1_000_000_000
-"""... this much to spare."""
-
-
-def frames_and_losses(source: ByteSource, kind: SonarFormat) -> Iterator[FrameHead | Lost]:
-    """Headers of all frames that can be believed, in the order of the file, and what is lost between."""
-    accepted: deque[FrameHead] = deque(maxlen=_NEIGHBOURS)
-    waiting: deque[FrameHead] = deque()
-    for found in _whole(source, kind):
-        if isinstance(found, Lost):
-            yield found
-            continue
-        waiting.append(found)
-        if len(waiting) > _NEIGHBOURS:
-            yield _judged(accepted, waiting, kind.clock_period_ns)
-    while waiting:
-        yield _judged(accepted, waiting, kind.clock_period_ns)
-
-
-def _judged(accepted: deque[FrameHead], waiting: deque[FrameHead], period_ns: int | None) -> FrameHead | Lost:
-    """The first that waits: believed, or lost."""
-    head = waiting.popleft()
-    fault = _fault(accepted, head, waiting, period_ns)
-    if fault:
-        return Lost(head.at, head.end, f"frame {head.number}: {fault}")
-    accepted.append(head)
-    return head
-
-
 def first_sound(source: ByteSource, kind: SonarFormat) -> FrameHead | None:
-    """The first header with an image that makes sense, wherever it is; None: there is none."""
+    """First plausible header with an image, anywhere in the file; None without any."""
     head = _next_sound(source, kind, 0)
     while head is not None and not head.has_image:
         head = _next_sound(source, kind, head.at + 1)
     return head
 
 
-def _whole(source: ByteSource, kind: SonarFormat) -> Iterator[FrameHead | Lost]:
-    """Frames after which the file goes on as it should, with their neighbours not yet compared."""
+def frames_and_losses(source: ByteSource, kind: SonarFormat) -> Iterator[FrameHead | Lost]:
+    """Headers of all trustworthy frames in the order of the file, and the losses between them."""
+    accepted: deque[FrameHead] = deque(maxlen=_NEIGHBOURS)
+    waiting: deque[FrameHead] = deque()
+    for found in chain(_whole_frames(source, kind), repeat(None, _NEIGHBOURS)):
+        if isinstance(found, Lost):
+            yield found
+            continue
+        if found is not None:
+            waiting.append(found)
+        if len(waiting) > _NEIGHBOURS or (found is None and waiting):
+            head = waiting.popleft()
+            fault = _fault(accepted, head, waiting, kind.clock_period_ns)
+            if fault:
+                yield Lost(head.at, head.end, f"frame {head.number}: {fault}")
+            else:
+                accepted.append(head)
+                yield head
+
+
+def _whole_frames(source: ByteSource, kind: SonarFormat) -> Iterator[FrameHead | Lost]:
+    """Frames followed by another header or the end of the file; not yet compared with their neighbours."""
     at, pending = kind.first_at, None
     while at < source.size:
         try:
-            head = _head(source, kind, at)
+            head = kind.head(source.read(at, kind.head_bytes), at)
+            if head.end > source.size and _next_sound(source, kind, at + 1):
+                reason = f"frame {head.number} claims to be longer than the file, in which others follow"
+                raise DamagedFrameError(reason)
         except DamagedFrameError as error:
-            found = _next_sound(source, kind, _search_start(kind, pending, at), but_not=at)
-            is_shifted = pending is not None and _is_shifted(source, kind, pending, found)
-            yield from _around_damage(pending, at, found.at if found else source.size, str(error), is_shifted)
-            pending, at = None, found.at if found else source.size
+            # bytes may be missing from the frame before, or from the file's header
+            start = pending.at + 1 if pending else 0 if at == kind.first_at else at + 1
+            found = _next_sound(source, kind, start, but_not=at)
+            end = found.at if found else source.size
+            if pending and _is_shifted(source, kind, pending, found):
+                yield Lost(pending.at, end, f"frame {pending.number} and what follows: bytes are missing or too many")
+            else:
+                if pending and pending.has_image:
+                    yield pending
+                too_short = f"the file's header is {at - end} bytes too short"
+                yield Lost(at, end, str(error)) if end > at else Lost(0, end, too_short)
+            pending, at = None, end
             continue
         if pending and pending.has_image:
             yield pending
         pending, at = head, head.end
     if pending and pending.end > source.size:
-        have = source.size - pending.at
-        yield Lost(
-            pending.at, source.size, f"frame {pending.number}: cut off, {have} of {pending.size} bytes are there"
-        )
+        have = f"{source.size - pending.at} of {pending.size} bytes are there"
+        yield Lost(pending.at, source.size, f"frame {pending.number}: cut off, {have}")
     elif pending and pending.has_image:
         yield pending
 
 
-def _search_start(kind: SonarFormat, pending: FrameHead | None, at: int) -> int:
-    """Within the frame before, from which bytes may be missing, or within the file's header, from which too."""
-    if pending:
-        return pending.at + 1
-    return 0 if at == kind.first_at else at + 1
-
-
-def _head(source: ByteSource, kind: SonarFormat, at: int) -> FrameHead:
-    head = kind.head(source.read(at, kind.head_bytes), at)
-    if head.end > source.size and _next_sound(source, kind, at + 1):
-        raise DamagedFrameError(f"frame {head.number} claims to be longer than the file, in which others follow")
-    return head
-
-
 def _is_shifted(source: ByteSource, kind: SonarFormat, pending: FrameHead, found: FrameHead | None) -> bool:
-    """Whether bytes may be missing from the frame before a bad header, or too many be in it."""
+    """True where the frame before a bad header may lack bytes, or have too many."""
     if found is not None:
         return (found.at - pending.end) % pending.size != 0
     rest = source.size - pending.end
@@ -287,20 +245,8 @@ def _is_shifted(source: ByteSource, kind: SonarFormat, pending: FrameHead, found
     return rest % pending.size != 0
 
 
-def _around_damage(
-    pending: FrameHead | None, at: int, end: int, reason: str, is_shifted: bool
-) -> Iterator[FrameHead | Lost]:
-    """What becomes of the frame before a bad header at ``at``, and of all up to the next good one or the end."""
-    if pending and is_shifted:
-        yield Lost(pending.at, end, f"frame {pending.number} and what follows: bytes are missing or too many")
-        return
-    if pending and pending.has_image:
-        yield pending
-    yield Lost(at, end, reason) if end > at else Lost(0, end, f"the file's header is {at - end} bytes too short")
-
-
 def _next_sound(source: ByteSource, kind: SonarFormat, start: int, but_not: int = -1) -> FrameHead | None:
-    """The first header from ``start`` on that makes sense, one place left out."""
+    """First plausible header from ``start`` on, one offset left out."""
     for at in source.places(kind.signature, start + kind.signature_at):
         begin = at - kind.signature_at
         try:
@@ -314,46 +260,35 @@ def _next_sound(source: ByteSource, kind: SonarFormat, start: int, but_not: int 
 def _fault(
     accepted: Sequence[FrameHead], judged: FrameHead, waiting: Sequence[FrameHead], period_ns: int | None
 ) -> str | None:
-    """Why a frame's header is not believed; None: it is."""
+    """Reason not to trust a frame's header, from the frames before and after it; None: trusted."""
     if accepted and (accepted[-1].number, accepted[-1].clock_ns) == (judged.number, judged.clock_ns):
         return f"a repetition of the frame at byte {accepted[-1].at}"
-    if _is_odd(judged, [*accepted, *waiting]):
+    others = [*accepted, *waiting]
+    is_like_another = any(_agree(judged, other) for other in others)
+    if not is_like_another and any(_agree(one, other) for one, other in combinations(others, 2)):
         return "its settings are those of no frame beside it"
     if accepted and waiting:
-        is_right = _is_between(accepted[-1], judged, waiting[0], period_ns)
-    elif len(waiting) > 1:
-        is_right = _is_near(_elapsed(judged, waiting[0], period_ns), _elapsed(waiting[0], waiting[1], period_ns))
-    elif len(accepted) > 1:
-        is_right = _is_near(_elapsed(accepted[-1], judged, period_ns), _elapsed(accepted[-2], accepted[-1], period_ns))
+        before, after = _elapsed(accepted[-1], judged, period_ns), _elapsed(judged, waiting[0], period_ns)
+        total = _elapsed(accepted[-1], waiting[0], period_ns)
+        # where time runs back over both steps, the clock was set, and nothing can be told
+        fits = total < 0 or (before >= 0 and after >= 0 and before + after == total)
+    elif len(others) > 1:  # the first or last frame: its interval against the one beside it, unless that runs back
+        row = (judged, *waiting) if waiting else (*accepted, judged)
+        first, middle, last = row[:3] if waiting else row[-3:]
+        before, after = _elapsed(first, middle, period_ns), _elapsed(middle, last, period_ns)
+        gap_ns, usual_ns = (before, after) if waiting else (after, before)
+        fits = usual_ns < 0 or 0 <= gap_ns <= _ODD_GAP * usual_ns + _ODD_GAP_NS
     else:
         return None
-    return None if is_right else "its time does not fit those of the frames beside it"
-
-
-def _is_odd(judged: FrameHead, others: list[FrameHead]) -> bool:
-    """Whether no other has its settings although some agree among themselves."""
-    if any(_agree(judged, other) for other in others):
-        return False
-    return any(_agree(one, other) for one, other in combinations(others, 2))
-
-
-def _is_near(gap_ns: int, usual_ns: int) -> bool:
-    """Whether the first or last interval can be one, given the one beside it; where that runs back, nobody knows."""
-    return usual_ns < 0 or 0 <= gap_ns <= _ODD_GAP * usual_ns + _ODD_GAP_NS
+    return None if fits else "its time does not fit those of the frames beside it"
 
 
 def _agree(one: FrameHead, other: FrameHead) -> bool:
+    """True where two frames have the same settings."""
     return all(
         abs(a - b) <= _DRIFT * abs(b) if isinstance(a, float) and isinstance(b, float) else a == b
         for a, b in zip(one.settings, other.settings, strict=True)
     )
-
-
-def _is_between(earlier: FrameHead, judged: FrameHead, later: FrameHead, period_ns: int | None) -> bool:
-    """Whether time runs on; where it runs back over both steps, the clock was set and nothing can be said."""
-    before, after = _elapsed(earlier, judged, period_ns), _elapsed(judged, later, period_ns)
-    total = _elapsed(earlier, later, period_ns)
-    return total < 0 or (before >= 0 and after >= 0 and before + after == total)
 
 
 def _elapsed(one: FrameHead, other: FrameHead, period_ns: int | None) -> int:
@@ -361,39 +296,29 @@ def _elapsed(one: FrameHead, other: FrameHead, period_ns: int | None) -> int:
     return difference if period_ns is None else difference % period_ns
 
 
-TOPIC = "/sonar/image"
-_BLOCK_BYTES_sonar_conversion = 1 << 22
-_MOST_MISSING = 100_000
-"""More numbers than this are not missing: counting began anew."""
-Progress = Callable[[int, int], None]
-"""Called with the bytes done and the bytes in all."""
-Block = list[tuple[FrameHead, int]]
-"""Frames with the same settings, and their stamps in nanoseconds."""
-
-
 @dataclass
 class SonarConversion:
-    """What became of a sonar's recording."""
+    """Result of the conversion of a sonar's recording."""
 
     frames: int = 0
     first_ns: int = 0
     last_ns: int = 0
     lost: list[Lost] = field(default_factory=list)
-    """What could not be read."""
+    """Bytes that could not be read."""
     missing: int = 0
-    """Numbers that no frame has: those lost, and those that were never recorded."""
+    """Frame numbers without a frame, either lost or never recorded."""
     promised: int = 0
-    """Number of frames by the file's header; 0: it does not say."""
+    """Number of frames by the file's header; 0: not stated."""
     readings: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Lowest and highest value of what other sensors said in the frames' headers."""
+    """Lowest and highest reading of other sensors in the frames' headers."""
 
     @property
     def duration_s(self) -> float:
-        """From the first frame to the last."""
+        """Time from the first frame to the last."""
         return (self.last_ns - self.first_ns) * 1e-9
 
     def shortcomings(self, most: int | None = None) -> list[str]:
-        """What is lost or missing, in lines; of many losses only the first ``most``."""
+        """Lines about lost and missing frames; at most ``most`` of the losses."""
         lines = [f"lost: {loss}" for loss in self.lost[:most]]
         if len(self.lost) > len(lines):
             lines.append(f"lost: and {len(self.lost) - len(lines)} stretches more; all are in the log's notes")
@@ -409,7 +334,7 @@ class SonarConversion:
 def convert_sonar_file(
     source: ByteSource, kind: SonarFormat, output: Path, progress: Progress | None = None
 ) -> SonarConversion:
-    """Write all frames that are whole to an MCAP log; memory holds a few of them at a time.
+    """Write all whole frames to an MCAP log; memory holds a few of them at a time.
 
     Raises
     ------
@@ -421,22 +346,35 @@ def convert_sonar_file(
     conversion = SonarConversion(promised=kind.frames_promised)
     record = {"name": source.path.stem, "calibration": kind.calibration.model_dump_json()}
     with recording(output, {METADATA: record | {"notes": json.dumps(dict(kind.notes))}}) as out:
-        for block in _blocks(_stamped(frames_and_losses(source, kind), kind.clock_period_ns, conversion)):
-            _write(out, source, kind, block)
+        for block in _blocks(frames_and_losses(source, kind), kind.clock_period_ns, conversion):
+            heads, stamps_ns = zip(*block, strict=True)
+            geometry = kind.geometry(heads[0].settings)
+            images = np.stack([kind.samples(source.read(head.at, head.size), head.settings) for head in heads])
+            frames = SonarFrames(np.array(stamps_ns), images, geometry.ranges_m, geometry.azimuths_rad)
+            frequency_hz, sound_speed_m_s = geometry.frequency_hz, geometry.sound_speed_m_s
+            out.write([sonar_image_messages(TOPIC, frames, frequency_hz=frequency_hz, sound_speed_m_s=sound_speed_m_s)])
             if progress:
-                progress(block[-1][0].end, source.size)
+                progress(heads[-1].end, source.size)
         if not conversion.frames:
             first = f": {conversion.lost[0]}" if conversion.lost else ""
             raise DatasetError(f"{source.path}: holds no whole frame{first}; is it a recording of this sonar?")
-        notes = dict(kind.notes) | _notes(conversion)
+        spans = conversion.readings.items()
+        notes = dict(kind.notes) | {f"sonar.{n}": f"{low:g} to {high:g}" for n, (low, high) in spans if low or high}
+        shortcomings = conversion.shortcomings()
+        if shortcomings:
+            notes["sonar.shortcomings"] = "; ".join(shortcomings)
         out.add_metadata(METADATA, record | {"notes": json.dumps(notes)})  # the later of two records counts
     return conversion
 
 
-def _stamped(
-    found: Iterator[FrameHead | Lost], period_ns: int | None, conversion: SonarConversion
-) -> Iterator[tuple[FrameHead, int]]:
-    """Frames with their stamps, a clock that wraps around being continued; the rest goes to the conversion."""
+def _blocks(
+    found: Iterable[FrameHead | Lost], period_ns: int | None, conversion: SonarConversion
+) -> Iterator[list[tuple[FrameHead, int]]]:
+    """Frames and their stamps in blocks of the same settings, with time running on, and of a size that fits memory.
+
+    A clock that wraps around is continued. The account of frames and losses goes to ``conversion``.
+    """
+    block: list[tuple[FrameHead, int]] = []
     earlier: FrameHead | None = None
     stamp_ns = 0
     for head in found:
@@ -450,47 +388,17 @@ def _stamped(
         conversion.first_ns = conversion.first_ns if conversion.frames else stamp_ns
         conversion.last_ns = stamp_ns
         conversion.frames += 1
-        _add_readings(conversion.readings, head.readings)
+        for name, value in head.readings.items():
+            if np.isfinite(value):
+                low, high = conversion.readings.get(name, (value, value))
+                conversion.readings[name] = min(low, value), max(high, value)
         earlier = head
-        yield head, stamp_ns
-
-
-def _add_readings(extremes: dict[str, tuple[float, float]], readings: Mapping[str, float]) -> None:
-    for name, value in readings.items():
-        if np.isfinite(value):
-            low, high = extremes.get(name, (value, value))
-            extremes[name] = min(low, value), max(high, value)
-
-
-def _blocks(frames: Iterator[tuple[FrameHead, int]]) -> Iterator[Block]:
-    """Runs of frames with the same settings and time running on, of a size that is handled at once."""
-    block: Block = []
-    for head, stamp_ns in frames:
         if block:
             last, last_ns = block[-1]
-            full = (len(block) + 1) * head.size > _BLOCK_BYTES_sonar_conversion
+            full = (len(block) + 1) * head.size > _IMAGE_BYTES
             if full or last.settings != head.settings or last.size != head.size or stamp_ns < last_ns:
                 yield block
                 block = []
         block.append((head, stamp_ns))
     if block:
         yield block
-
-
-def _write(out: RecordingWriter, source: ByteSource, kind: SonarFormat, block: Block) -> None:
-    heads, stamps_ns = zip(*block, strict=True)
-    geometry = kind.geometry(heads[0].settings)
-    images = np.stack([kind.samples(source.read(head.at, head.size), head.settings) for head in heads])
-    frames = SonarFrames(np.array(stamps_ns), images, geometry.ranges_m, geometry.azimuths_rad)
-    message = sonar_image_messages(
-        TOPIC, frames, frequency_hz=geometry.frequency_hz, sound_speed_m_s=geometry.sound_speed_m_s
-    )
-    out.write([message])
-
-
-def _notes(conversion: SonarConversion) -> dict[str, str]:
-    notes = {
-        f"sonar.{name}": f"{low:g} to {high:g}" for name, (low, high) in conversion.readings.items() if low or high
-    }
-    shortcomings = conversion.shortcomings()
-    return notes | ({"sonar.shortcomings": "; ".join(shortcomings)} if shortcomings else {})

@@ -1,7 +1,8 @@
-"""Text files of numbers, read with errors that name the file and the line."""
+"""Text files of numbers, and folders of numbered runs, read with errors that name file and line."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -16,7 +17,7 @@ from sonar_graph.sequence import NS_PER_S
 
 @dataclass(frozen=True, eq=False)
 class NumberTable:
-    """Rows of a text file."""
+    """Rows of numbers in a text file."""
 
     path: Path
     first: list[str]
@@ -53,13 +54,13 @@ def read_table(
     Parameters
     ----------
     path
-        Text file; blank lines and lines that begin with ``#`` are passed over.
+        Text file; blank lines and lines that begin with ``#`` are skipped.
     columns
         Names of the columns, for the error and for their number.
     delimiter
         None: white space.
     header_lines
-        Lines at the top that are no data.
+        Number of lines at the top without data.
 
     Raises
     ------
@@ -100,7 +101,7 @@ def read_lines(
 
 
 def numbers(path: Path, number: int, fields: list[str], columns: tuple[str, ...]) -> list[float]:
-    """The fields of one line as finite numbers.
+    """Fields of one line as finite numbers.
 
     Raises
     ------
@@ -119,13 +120,31 @@ def numbers(path: Path, number: int, fields: list[str], columns: tuple[str, ...]
     return values
 
 
-def require_folder(folder: Path, expected: str) -> None:
-    """Refuse a data set's folder that is none.
+def numbered_run(folder: Path, entry: str, number: int, kind: str, expected: str) -> Path:
+    """Path of a run in a data set's folder, where the runs are numbered.
+
+    Parameters
+    ----------
+    folder
+        Folder of the data set.
+    entry
+        Name of a run's file or folder, with ``N`` for the number.
+    number
+        The wanted run.
+    kind, expected
+        Names of a run and of the content of the folder, for the errors.
 
     Raises
     ------
     DatasetError
-        Saying what the folder should hold.
+        When the folder or the run does not exist.
     """
     if not folder.is_dir():
         raise DatasetError(f"{folder}: is not a folder; give the folder that holds {expected}")
+    pattern = re.escape(entry).replace("N", r"(\d+)")
+    found = sorted(int(match[1]) for path in folder.iterdir() if (match := re.fullmatch(pattern, path.name)))
+    if not found:
+        raise DatasetError(f"{folder}: holds no {entry}; give the folder that holds {expected}")
+    if number not in found:
+        raise DatasetError(f"{folder}: has no {kind} {number}; it has {', '.join(map(str, found))}")
+    return folder / entry.replace("N", str(number))

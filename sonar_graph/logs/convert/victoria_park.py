@@ -1,18 +1,17 @@
 """Victoria Park: a truck among trees in Sydney, as the edge list that GTSAM ships.
 
 Guivant, Nebot, "Optimization of the simultaneous localization and map-building algorithm for real-time
-implementation", IEEE T-RA 17(3), 2001. The recognition of trees in laser scans and the odometry are those of the file.
+implementation", IEEE T-RA 17(3), 2001. Trees recognised in laser scans, and odometry, are those of the file.
 
 ``ODOMETRY i j dx dy dθ  c_xx c_xy c_xθ c_yy c_yθ c_θθ``   pose j in the frame of pose i (x forward, y left)
 ``LANDMARK i l x y  c_xx c_xy c_yy``                       landmark l in the frame of pose i
 
 Poses and landmarks share one numbering: a number is a pose where an ``ODOMETRY`` line ends and a landmark where a
-``LANDMARK`` line does, never both. Landmarks keep their numbers. The file has no times.
+``LANDMARK`` line does. Landmarks keep their numbers. The file has no times.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import gtsam
@@ -38,12 +37,12 @@ EXPECTED = "lines 'ODOMETRY i j dx dy dtheta + 6 covariances' and 'LANDMARK i la
 
 
 def read_victoria_park(path: Path | None = None) -> Sequence:
-    """The run, one odometry edge a second.
+    """Sequence of the run, one odometry edge a second.
 
     Parameters
     ----------
     path
-        File in the format above; None: the one in the installed gtsam.
+        File in the format above; None: the file in the installed gtsam.
 
     Returns
     -------
@@ -55,20 +54,38 @@ def read_victoria_park(path: Path | None = None) -> Sequence:
     DatasetError
         When the file is missing or malformed, or its odometry is no single chain.
     """
-    edges = _read(path or Path(gtsam.findExampleDataFile("victoria_park.txt")))  # type: ignore[no-untyped-call]
-    steps, covs = np.array(edges.steps), symmetric(np.array(edges.step_covs), STEP_COV_PLACES)
-    imu, dvl = stepped_odometry(steps, covs, STEP_S)
-    stamps_ns = step_stamps_ns(len(steps), STEP_S)
+    path = path or Path(gtsam.findExampleDataFile("victoria_park.txt"))  # type: ignore[no-untyped-call]
+    steps: list[list[float]] = []
+    landmarks: list[list[float]] = []
+    poses: list[int] = []  # number of steps before each landmark
+    newest = 0
+    for number, (kind, *rest) in read_lines(path, EXPECTED):
+        if kind not in ("ODOMETRY", "LANDMARK"):
+            raise DatasetError(f"{path}, line {number}: begins with {kind!r}; expected {EXPECTED}")
+        values = numbers(path, number, rest, ODOMETRY_COLUMNS if kind == "ODOMETRY" else LANDMARK_COLUMNS)
+        if values[0] != newest:
+            raise DatasetError(
+                f"{path}, line {number}: starts at pose {rest[0]}, but the newest pose is {newest};"
+                " expected one chain of poses from 0, with landmarks seen from the newest"
+            )
+        if kind == "ODOMETRY":
+            newest = int(values[1])
+            steps.append(values[2:])
+        else:
+            landmarks.append(values[1:])
+            poses.append(len(steps))
+    if not steps:
+        raise DatasetError(f"{path}: holds no ODOMETRY line; expected {EXPECTED}")
+    rows = np.array(steps)
+    covs = symmetric(rows[:, 3:], STEP_COV_PLACES)
+    imu, dvl = stepped_odometry(rows[:, :3], covs, STEP_S)
     detections = None
-    if edges.points:
-        ids = np.array(edges.landmarks, dtype=np.int64)[:, None]
-        detections = point_detections(
-            stamps_ns[edges.poses],
-            np.array(edges.points),
-            symmetric(np.array(edges.point_covs), POINT_COV_PLACES),
-            ids,
-            np.ones(ids.shape),
-        )
+    if landmarks:
+        seen = np.array(landmarks)
+        ids = seen[:, :1].astype(np.int64)
+        stamps_ns = step_stamps_ns(len(rows), STEP_S)[poses]
+        point_covs = symmetric(seen[:, 3:], POINT_COV_PLACES)
+        detections = point_detections(stamps_ns, seen[:, 1:3], point_covs, ids, np.ones(ids.shape))
     return Sequence(
         name="victoria_park",
         calibration=stepped_calibration(dvl, covs, STEP_S),
@@ -83,45 +100,3 @@ def read_victoria_park(path: Path | None = None) -> Sequence:
             "noise": "the file's covariances",
         },
     )
-
-
-@dataclass
-class _Edges:
-    """What the file's lines say, in their order."""
-
-    last_vertex: int = 0
-    steps: list[list[float]] = field(default_factory=list)
-    step_covs: list[list[float]] = field(default_factory=list)
-    poses: list[int] = field(default_factory=list)
-    landmarks: list[int] = field(default_factory=list)
-    points: list[list[float]] = field(default_factory=list)
-    point_covs: list[list[float]] = field(default_factory=list)
-
-    def add_step(self, values: list[float]) -> None:
-        self.last_vertex = int(values[1])
-        self.steps.append(values[2:5])
-        self.step_covs.append(values[5:])
-
-    def add_point(self, values: list[float]) -> None:
-        self.poses.append(len(self.steps))
-        self.landmarks.append(int(values[1]))
-        self.points.append(values[2:4])
-        self.point_covs.append(values[4:])
-
-
-def _read(path: Path) -> _Edges:
-    edges = _Edges()
-    for number, (kind, *rest) in read_lines(path, EXPECTED):
-        if kind not in ("ODOMETRY", "LANDMARK"):
-            raise DatasetError(f"{path}, line {number}: begins with {kind!r}; expected {EXPECTED}")
-        odometry = kind == "ODOMETRY"
-        values = numbers(path, number, rest, ODOMETRY_COLUMNS if odometry else LANDMARK_COLUMNS)
-        if values[0] != edges.last_vertex:
-            raise DatasetError(
-                f"{path}, line {number}: starts at pose {rest[0]}, but the newest pose is {edges.last_vertex};"
-                " expected one chain of poses from 0, with landmarks seen from the newest"
-            )
-        (edges.add_step if odometry else edges.add_point)(values)
-    if not edges.steps:
-        raise DatasetError(f"{path}: holds no ODOMETRY line; expected {EXPECTED}")
-    return edges

@@ -1,9 +1,8 @@
-"""Mcap."""
+"""MCAP containers: messages read by topic, also from damaged files, and written with CRCs."""
 
 # fmt: off
-from sonar_graph.logs.mcap.file_pass import ChunkPart, Passage, Progress
 from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow, parse
-from sonar_graph.logs.mcap.reader import Recording, scan, stream
+from sonar_graph.logs.mcap.reader import ChunkPart, Passage, Progress, Recording, scan, stream
 from sonar_graph.logs.mcap.records import START_BYTES, LogFile, seal, why_no_bag
 from sonar_graph.logs.mcap.topic import STAMP_BYTES, Keep, Topic
 from sonar_graph.logs.mcap.writer import (

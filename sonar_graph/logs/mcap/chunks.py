@@ -1,4 +1,8 @@
-"""What a chunk holds: its bytes, unpacked and checked, and the messages in them."""
+"""Chunks of an MCAP file: records decompressed and checked against the CRC, and the messages among them.
+
+The messages are found by the chunk's message index where it agrees with every record, or else by a walk through the
+records.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,7 @@ from sonar_graph.logs.mcap.records import HEAD, LOOSE, ChunkRecord
 from sonar_graph.measurements import Ints
 
 LARGEST_BYTES = 1 << 32
-"""A chunk is not unpacked beyond this; a damaged size would ask for all memory."""
+"""Limit for decompressing a chunk; a damaged size could ask for all memory."""
 _PIECE = 1 << 13
 _ZSTD, _LZ4 = b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"
 _MESSAGE = np.dtype(
@@ -30,64 +34,77 @@ Index = Mapping[int, NDArray[np.uint64]]
 
 
 class ChunkError(LogError):
-    """A chunk is not whole."""
+    """A chunk that cannot be read whole."""
 
 
 class Found(NamedTuple):
-    """Messages of one channel in a stretch of bytes, in their order."""
+    """Places of the messages of one channel in some bytes, in their order."""
 
     offsets: Ints
-    """Of the payloads, shape (n,)."""
+    """Offsets of the payloads, shape (n,)."""
     sizes: Ints
-    """Of the payloads."""
+    """Bytes of each payload."""
     log_times_ns: Ints
 
     def of(self, rows: slice | Ints | NDArray[np.bool_]) -> Found:
-        """Some of them."""
+        """Some of the messages."""
         return Found(self.offsets[rows], self.sizes[rows], self.log_times_ns[rows])
 
 
 @dataclass
 class Content:
-    """The records in a stretch of uncompressed bytes."""
+    """Records in some uncompressed bytes."""
 
     data: bytes | memoryview
     channels: dict[int, Found]
-    """Its messages."""
+    """Messages by channel."""
     described: list[tuple[int, bytes]]
-    """Opcode and content of its schemas and channels, in their order."""
+    """Opcode and content of schemas and channels, in their order."""
     end: int
-    """Where the last whole record ends."""
+    """End of the last whole record."""
 
     def __len__(self) -> int:
         return sum(len(found.sizes) for found in self.channels.values())
 
     def times_ns(self) -> tuple[int, int]:
-        """The earliest and the latest log time; there must be a message."""
+        """Earliest and latest log time; there must be a message."""
         times_ns = [found.log_times_ns for found in self.channels.values()]
         return min(int(t.min()) for t in times_ns), max(int(t.max()) for t in times_ns)
 
     def trusted(self) -> Content:
-        """Without the last message, where what follows it is no record: it may reach into what is damaged."""
+        """Content without its last message where no record follows it: that message may reach into damaged bytes."""
         rest = self.data[self.end : self.end + 1]
         if not len(rest) or rest[0] in LOOSE or not self.channels:
             return self
         last = max(self.channels, key=lambda channel: int(self.channels[channel].offsets[-1]))
-        rest_of_last = self.channels[last].of(slice(0, -1))
-        channels = {**self.channels, last: rest_of_last}
+        channels = {**self.channels, last: self.channels[last].of(slice(0, -1))}
         return Content(self.data, {c: f for c, f in channels.items() if len(f.sizes)}, self.described, self.end)
 
 
+_DECOMPRESSOR = zstandard.ZstdDecompressor()
+
+
 def unpack(chunk: ChunkRecord, packed: bytes) -> bytes:
-    """The records of a chunk, checked against its CRC.
+    """Records of a chunk, checked against its CRC.
 
     Raises
     ------
     ChunkError
-        When they cannot be had, or are not what was written.
+        When they cannot be decompressed, or are not the bytes that were written.
     """
+    data = packed
     try:
-        data = _decompress(chunk, packed)
+        if chunk.compression == "zstd" or (chunk.compression not in ("", "lz4") and packed.startswith(_ZSTD)):
+            size = zstandard.get_frame_parameters(packed).content_size
+            unknown = size in (zstandard.CONTENTSIZE_UNKNOWN, zstandard.CONTENTSIZE_ERROR)
+            size = chunk.uncompressed_size if unknown else size
+            if size > LARGEST_BYTES:
+                raise ChunkError(f"it claims to have {size} bytes")
+            data = _DECOMPRESSOR.decompress(packed, max_output_size=size)
+        elif chunk.compression == "lz4" or (chunk.compression and packed.startswith(_LZ4)):
+            data = lz4.frame.decompress(packed)
+        elif chunk.compression:
+            raise ChunkError(f"its compression {chunk.compression!r} is not known")
     except (zstandard.ZstdError, RuntimeError, MemoryError, ValueError) as error:
         raise ChunkError(f"it cannot be decompressed: {error}") from error
     if chunk.crc and zlib.crc32(data) != chunk.crc:
@@ -97,27 +114,8 @@ def unpack(chunk: ChunkRecord, packed: bytes) -> bytes:
     return data
 
 
-_DECOMPRESSOR = zstandard.ZstdDecompressor()
-
-
-def _decompress(chunk: ChunkRecord, packed: bytes) -> bytes:
-    if chunk.compression == "zstd" or (chunk.compression not in ("", "lz4") and packed.startswith(_ZSTD)):
-        size = zstandard.get_frame_parameters(packed).content_size
-        unknown = size in (zstandard.CONTENTSIZE_UNKNOWN, zstandard.CONTENTSIZE_ERROR)
-        size = chunk.uncompressed_size if unknown else size
-        if size > LARGEST_BYTES:
-            raise ChunkError(f"it claims to have {size} bytes")
-        return _DECOMPRESSOR.decompress(packed, max_output_size=size)
-    if chunk.compression == "lz4" or (chunk.compression and packed.startswith(_LZ4)):
-        data: bytes = lz4.frame.decompress(packed)
-        return data
-    if chunk.compression:
-        raise ChunkError(f"its compression {chunk.compression!r} is not known")
-    return packed
-
-
 def unpack_beginning(chunk: ChunkRecord, packed: bytes) -> bytes:
-    """As much as can be had of a chunk of which only the beginning is there; no CRC covers it."""
+    """Records at the beginning of a chunk that is cut off; no CRC covers them."""
     if not chunk.compression:
         return packed
     reader: Any = (
@@ -135,10 +133,10 @@ def unpack_beginning(chunk: ChunkRecord, packed: bytes) -> bytes:
 
 
 def find_by_index(data: bytes | memoryview, index: Index) -> Content | None:
-    """The messages of a chunk as its index says; None where index and chunk disagree in anything.
+    """Messages of a chunk by its index; None where index and chunk disagree in anything.
 
-    Every record that the index names must be a message of that channel and time, and between them may lie only
-    schemas and channels: an index that leaves out a message, or points into one, is found out.
+    Every record that the index names must be a message of that channel and time, and only schemas and channels may lie
+    between them. So an index that leaves out a message, or points into one, is detected.
     """
     counts = [len(rows) for rows in index.values()]
     rows = np.concatenate([*index.values(), np.empty((0, 2), np.uint64)])
@@ -151,49 +149,37 @@ def find_by_index(data: bytes | memoryview, index: Index) -> Content | None:
     agree = (heads["opcode"] == Opcode.MESSAGE) & (heads["channel"] == channels) & (heads["log"] == times_ns)
     if not (agree & (lengths >= _MESSAGE_FIELDS) & (lengths <= len(data))).all():
         return None
-    described = _between(data, starts, starts + HEAD.size + lengths)
-    if described is None:
-        return None
-    every = Found(starts + _MESSAGE.itemsize, lengths - _MESSAGE_FIELDS, times_ns.astype(np.int64))
-    ends = np.cumsum(counts).tolist()
-    found = {
-        channel: every.of(slice(end - count, end)) for channel, count, end in zip(index, counts, ends, strict=True)
-    }
-    return Content(data, {channel: _in_order(part) for channel, part in found.items()}, described, len(data))
-
-
-def _heads(data: bytes | memoryview) -> NDArray[Any]:
-    """What a message's head would be at each offset."""
-    return np.ndarray((max(len(data) - _MESSAGE.itemsize + 1, 0),), _MESSAGE, data, strides=(1,))
-
-
-def _in_order(found: Found) -> Found:
-    is_sorted = (found.offsets[1:] > found.offsets[:-1]).all()
-    return found if is_sorted else found.of(np.argsort(found.offsets))
-
-
-def _between(data: bytes | memoryview, starts: Ints, ends: Ints) -> list[tuple[int, bytes]] | None:
-    """The schemas and channels between messages; None where there is anything else, or messages overlap."""
     order = np.argsort(starts, kind="stable")
-    before = np.concatenate([[0], ends[order]])
-    after = np.concatenate([starts[order], [len(data)]])
-    if (after < before).any():
+    ends = np.concatenate([[0], (starts + HEAD.size + lengths)[order]])
+    following = np.concatenate([starts[order], [len(data)]])
+    if (following < ends).any():  # messages overlap
         return None
     described = []
-    for gap in np.flatnonzero(after > before).tolist():
-        at = last = int(before[gap])
-        for opcode, start, stop in _records(data[at : int(after[gap])]):
+    for gap in np.flatnonzero(following > ends).tolist():
+        at = last = int(ends[gap])
+        for opcode, start, stop in _records(data[at : int(following[gap])]):
             if opcode == Opcode.MESSAGE:
                 return None
             described.append((opcode, bytes(data[at + start : at + stop])))
             last = at + stop
-        if last != after[gap]:
+        if last != following[gap]:
             return None
-    return described
+    every = Found(starts + _MESSAGE.itemsize, lengths - _MESSAGE_FIELDS, times_ns.astype(np.int64))
+    found: dict[int, Found] = {}
+    for channel, count, end in zip(index, counts, np.cumsum(counts).tolist(), strict=True):
+        part = every.of(slice(end - count, end))
+        is_sorted = (part.offsets[1:] > part.offsets[:-1]).all()
+        found[channel] = part if is_sorted else part.of(np.argsort(part.offsets))
+    return Content(data, found, described, len(data))
+
+
+def _heads(data: bytes | memoryview) -> NDArray[Any]:
+    """View of the bytes as the head of a message at every offset."""
+    return np.ndarray((max(len(data) - _MESSAGE.itemsize + 1, 0),), _MESSAGE, data, strides=(1,))
 
 
 def find_by_walk(data: bytes | memoryview) -> Content:
-    """The messages of a stretch, record by record until the first that is not whole."""
+    """Messages in some bytes, record by record until the first that is not whole."""
     messages, described, end = [], [], 0
     for opcode, start, stop in _records(data):
         if opcode == Opcode.MESSAGE:
@@ -212,7 +198,7 @@ def find_by_walk(data: bytes | memoryview) -> Content:
 
 
 def _records(data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
-    """Opcode, and where the content begins and ends, of each whole record."""
+    """Opcode, begin and end of the content of each whole record."""
     at, end = 0, len(data)
     while at + HEAD.size <= end:
         opcode, length = HEAD.unpack_from(data, at)

@@ -1,14 +1,10 @@
-"""Records of an MCAP file: where each begins and ends, also in a file that is damaged.
+"""Records of an MCAP file (https://mcap.dev/spec), also of one that is damaged.
 
-The walk goes from record to record in file order and believes a length only where something speaks for it: a chunk
-says its length twice, an index says how long it is, the next record must begin like one. Where nothing fits, the walk
-searches for the next place that does, and what lies between becomes a `Hole`.
+`RecordWalk` goes from record to record in the order of the file. It trusts a length only where a second source agrees:
+a chunk states its length twice, a message index states its number of entries, and the next record must begin like one.
+Where nothing agrees, the walk searches for the next place that does and reports the bytes between as a `Hole`.
 
-Format: https://mcap.dev/spec
-
-Files that are given as a log and are none: what they seem to be, and what to do.
-
-Metadata records that carry their own checksum, because the container gives them none.
+MCAP has no CRC over a metadata record; `seal` adds one to the record's entries.
 """
 
 from __future__ import annotations
@@ -24,68 +20,53 @@ from typing import Self
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.writer import MCAP0_MAGIC
 
 from sonar_graph.errors import LogError
 
+MAGIC = b"\x89MCAP0\r\n"
 BAG_MAGIC = (b"#ROSBAG", b"SQLite format 3")
-"""How ROS 1 bags and the files of ROS 2 bags begin."""
+"""First bytes of ROS 1 bags and of the files of ROS 2 bags."""
 START_BYTES = 64
-"""How much of a file's beginning tells."""
+"""Bytes from which the kind of a file is told."""
 
 
 def kind_and_advice(path: Path, start: bytes) -> str:
-    """What completes "is not an MCAP file but ...".
-
-    Parameters
-    ----------
-    path
-        Of the file.
-    start
-        Its first bytes; fewer than `START_BYTES` only where the file ends.
-    """
+    """The end of "`path` is not an MCAP file but ...", from the first `START_BYTES` bytes of the file."""
     convert = f"`sonar-graph convert rosbag {path} -o {path.with_suffix('.mcap').name}` makes one"
     if start.startswith(b"#ROSBAG"):
         return f"a ROS 1 bag; {convert}"
     if start.startswith(b"SQLite format 3"):
         return f"a ROS 2 bag of the sqlite3 kind; {convert}"
-    return _neither(start, "logs are .mcap files, and ROS bags become one by `sonar-graph convert rosbag`")
+    return _unknown_kind(start, "logs are .mcap files, and ROS bags become one by `sonar-graph convert rosbag`")
 
 
 def why_no_bag(path: Path, start: bytes) -> str | None:
-    """What completes "`path` is ..." where a file is no bag by its first bytes; None where it may be one."""
+    """The end of "`path` is ..." where the first bytes are not those of a bag; None where they are."""
     if start.startswith(BAG_MAGIC):
         return None
-    if start.startswith(MCAP0_MAGIC):
+    if start.startswith(MAGIC):
         return f"already an MCAP file: read it directly, `sonar-graph inspect {path}`"
-    return f"no bag but {_neither(start, 'give a ROS 1 .bag, or the folder of a ROS 2 bag')}"
+    return f"no bag but {_unknown_kind(start, 'give a ROS 1 .bag, or the folder of a ROS 2 bag')}"
 
 
-def _neither(start: bytes, advice: str) -> str:
+def _unknown_kind(start: bytes, advice: str) -> str:
     if not start.strip(b"\0"):
         kind = "zeros" if start else "empty"
         return f"{kind}: copy it again, or see whether the recorder wrote anything"
-    if _is_text(start):
+    text = start.decode("utf-8", "replace").rstrip("\ufffd")  # the last character may be cut
+    if text and all(character.isprintable() or character.isspace() for character in text):
         first_line = start.decode("utf-8", "replace").strip().partition("\n")[0]
         return f"a text that begins with {first_line[:40]!r}; {advice}"
     return f"something else; {advice}"
 
 
-def _is_text(start: bytes) -> bool:
-    """Whether these are printable characters, the last of which may be cut."""
-    text = start.decode("utf-8", "replace").rstrip("\ufffd")
-    return bool(text) and all(character.isprintable() or character.isspace() for character in text)
-
-
-MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")
 LOOSE = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
-"""Kinds that lie in chunks, or outside where a writer makes none."""
+"""Kinds of records within chunks; outside where the writer makes no chunks."""
 _TIMES_SIZE_CRC = struct.Struct("<QQQII")
 _LONGEST_COMPRESSION = 16
 _CHUNK_HEAD = HEAD.size + _TIMES_SIZE_CRC.size + _LONGEST_COMPRESSION + 8
 _CHUNK_FIXED = _TIMES_SIZE_CRC.size + 8
-_NEVER = 1 << 64
 _SMALLEST: dict[int, int] = {
     Opcode.SCHEMA: 14,
     Opcode.CHANNEL: 16,
@@ -94,7 +75,7 @@ _SMALLEST: dict[int, int] = {
     Opcode.METADATA: 8,
 }
 PRIVATE = 0x80
-"""Kinds from here on are a writer's own and mean nothing to others."""
+"""Kinds of records from here on are private to a writer."""
 _BLOCK = 1 << 22
 _STRETCH = 1 << 20
 _CHAIN = 3
@@ -102,34 +83,34 @@ _CHAIN = 3
 
 @dataclass(frozen=True)
 class Record:
-    """Where a record lies."""
+    """Place of a record in the file."""
 
     opcode: int
     at: int
-    """Offset of its first byte."""
+    """Offset of the first byte."""
     size: int
-    """Of its content, after opcode and length."""
+    """Bytes of content, after opcode and length."""
 
     @property
     def content_at(self) -> int:
-        """Offset of its content."""
+        """Offset of the content."""
         return self.at + HEAD.size
 
     @property
     def end(self) -> int:
-        """Offset after its last byte."""
+        """Offset after the last byte."""
         return self.content_at + self.size
 
 
 @dataclass(frozen=True)
 class ChunkRecord(Record):
-    """A chunk and what its head says."""
+    """A chunk with the fields of its head."""
 
     start_ns: int
     end_ns: int
     uncompressed_size: int
     crc: int
-    """Of the uncompressed records; 0: none."""
+    """CRC of the uncompressed records; 0: none."""
     compression: str
     data_at: int
     data_size: int
@@ -137,7 +118,7 @@ class ChunkRecord(Record):
 
 @dataclass(frozen=True)
 class ByteRange:
-    """Bytes that are whole records without a chunk around them: schemas, channels and messages."""
+    """Bytes of whole schemas, channels and messages outside chunks."""
 
     at: int
     end: int
@@ -145,7 +126,7 @@ class ByteRange:
 
 @dataclass(frozen=True)
 class Hole:
-    """Bytes that are no records."""
+    """Bytes that are not records."""
 
     at: int
     end: int
@@ -157,7 +138,7 @@ class LogFile:
     Raises
     ------
     LogError
-        When there is no such file or it is not MCAP.
+        When the file does not exist or is not MCAP.
     """
 
     def __init__(self, path: Path) -> None:
@@ -188,37 +169,33 @@ class LogFile:
         return self._stream.read(min(count, self.size - at))
 
     def content(self, record: Record) -> bytes:
-        """What a record holds."""
+        """Content of a record."""
         return self.read(record.content_at, record.size)
 
     def record(self, at: int) -> Record | None:
-        """What would be the record at an offset; a chunk also where its opcode or its outer length is damaged."""
+        """Record at an offset, not checked. A chunk is found also where its opcode or its outer length is damaged."""
         start = self.read(at, _CHUNK_HEAD)
         if len(start) < HEAD.size:
             return None
         opcode, size = HEAD.unpack_from(start)
         chunk = None if opcode == Opcode.MESSAGE else _chunk(start, at)
-        if chunk is not None and (chunk.size == size or (opcode == Opcode.CHUNK and self._begins(chunk.end))):
-            return chunk
-        return Record(opcode, at, size)
+        if chunk is not None and chunk.size != size:
+            following = self.read(chunk.end, HEAD.size)
+            next_opcode, next_size = HEAD.unpack(following) if len(following) == HEAD.size else (0, 0)
+            is_followed = 0 < next_opcode <= Opcode.DATA_END and next_size <= self.size - chunk.end - HEAD.size
+            if opcode != Opcode.CHUNK or not (is_followed or chunk.end == self.size):
+                chunk = None
+        return chunk or Record(opcode, at, size)
 
     def is_like_chunk(self, at: int) -> bool:
-        """Whether a chunk begins at an offset, be its lengths as they may."""
+        """True where the head of a chunk is at an offset, whatever its lengths."""
         start = self.read(at, _CHUNK_HEAD)
         chunk = _chunk(start, at)
         return chunk is not None and start[0] == Opcode.CHUNK and chunk.compression in ("", "lz4", "zstd")
 
-    def _begins(self, at: int) -> bool:
-        """Whether something that begins like a record, or nothing, is at an offset."""
-        head = self.read(at, HEAD.size)
-        if len(head) < HEAD.size:
-            return at == self.size
-        opcode, size = HEAD.unpack(head)
-        return 0 < opcode <= Opcode.DATA_END and size <= self.size - at - HEAD.size
-
 
 def _chunk(start: bytes, at: int) -> ChunkRecord | None:
-    """The chunk whose head these bytes are, by the lengths within it."""
+    """Chunk with these bytes as its head, by the lengths in the head."""
     if len(start) < HEAD.size + _CHUNK_FIXED:
         return None
     start_ns, end_ns, uncompressed, crc, letters = _TIMES_SIZE_CRC.unpack_from(start, HEAD.size)
@@ -233,69 +210,69 @@ def _chunk(start: bytes, at: int) -> ChunkRecord | None:
 
 
 class RecordWalk:
-    """Goes through the data section of a file.
+    """Walk through the data section of a file.
 
     Parameters
     ----------
     file
         The file.
     data_end_at
-        Where the data section ends, if something trustworthy says so.
+        End of the data section, if the summary states it and can be trusted.
     """
 
     def __init__(self, file: LogFile, data_end_at: int | None) -> None:
         self._file = file
         self._at = len(MAGIC)
         self._stop_at = file.size if data_end_at is None else data_end_at
-        self._data_end_at = data_end_at
         self._has_chunks = False
         self._is_loose = False
         self.reached_end = data_end_at is not None
-        """Whether the data section's end is known or was found."""
+        """True when the end of the data section is known or was found."""
 
     def __iter__(self) -> Iterator[Record | ByteRange | Hole]:
         while self._at < self._stop_at:
             record = self._file.record(self._at)
-            if record is not None and self._is_data_end(record):
+            if record is not None and record.opcode == Opcode.DATA_END and record.size == 4 and not self.reached_end:
                 self.reached_end = True
                 return
-            if record is None or not self._is_whole(record):
+            if record is None or record.end > self._stop_at or not self._is_likely(record):
                 yield self.search(self._at)
-            elif record.opcode in LOOSE:
-                self._is_loose = True
-                stretch = ByteRange(self._at, max(record.end, self._last_loose(self._at)))
-                self._at = stretch.end
-                yield stretch
-            else:
+            elif record.opcode not in LOOSE:
                 self._has_chunks |= isinstance(record, ChunkRecord)
                 self._at = record.end
                 yield record
+            else:
+                # only the record after it confirms the length of a record outside chunks
+                following = self._file.record(record.end) if record.end < self._stop_at else None
+                if following is not None and not self._is_likely(following):
+                    yield self.search(self._at)
+                    continue
+                self._is_loose = True
+                stretch = ByteRange(self._at, max(record.end, self._confirmed_end(self._at)))
+                self._at = stretch.end
+                yield stretch
 
     def search(self, at: int) -> Hole:
-        """Give up what begins at an offset and go on with the next trustworthy record after it."""
+        """Give up the record at an offset and go on with the next trustworthy one after it.
+
+        That is a chunk or metadata, or in a file without chunks three records in a row. In a file with chunks, bytes
+        that look like a message are not trusted: they may lie within a damaged chunk.
+        """
         self._has_chunks |= self._file.is_like_chunk(at)
-        found = self._next_record(at + 1)
+        found = None
+        if not self._is_loose or self._has_chunks:
+            found = self._next_of(at + 1, (Opcode.CHUNK, Opcode.METADATA))
+        if found is None and not self._has_chunks:
+            found = self._next_of(at + 1, (Opcode.METADATA, *LOOSE))
         self._at = self._stop_at if found is None else found
         return Hole(at, self._at)
 
     def jump(self, at: int) -> None:
-        """Go on at an offset, where something trustworthy says that a record begins."""
+        """Go on at an offset where a record begins according to a trusted index."""
         self._at = at
 
-    def _is_data_end(self, record: Record) -> bool:
-        known = self._data_end_at is not None
-        return record.opcode == Opcode.DATA_END and record.size == 4 and not known
-
-    def _is_whole(self, record: Record) -> bool:
-        if record.end > self._stop_at or not self._is_likely(record):
-            return False
-        if record.opcode not in LOOSE or record.end == self._stop_at:
-            return True
-        following = self._file.record(record.end)  # the only witness to the length of a record without chunk
-        return following is None or self._is_likely(following)
-
     def _is_likely(self, record: Record) -> bool:
-        """Whether a record of this kind can have this length, in the data section."""
+        """True where the data section can have a record of this kind and length."""
         if record.opcode in (Opcode.CHUNK, Opcode.HEADER):
             return isinstance(record, ChunkRecord) or record.at == len(MAGIC)
         if record.opcode == Opcode.MESSAGE_INDEX:
@@ -303,12 +280,14 @@ class RecordWalk:
             return record.size >= 6 and len(count) == 4 and int.from_bytes(count, "little") == record.size - 6
         if record.opcode == Opcode.DATA_END:
             return record.size == 4
-        return record.opcode >= PRIVATE or record.size >= _SMALLEST.get(record.opcode, _NEVER)
+        if record.opcode in _SMALLEST:
+            return record.size >= _SMALLEST[record.opcode]
+        return record.opcode >= PRIVATE
 
-    def _last_loose(self, at: int) -> int:
-        """Where the last of the records without chunk begins that lie in a block; those before it are whole."""
+    def _confirmed_end(self, at: int) -> int:
+        """End of the records outside chunks that lie in the next block and are followed by another of them."""
         block = self._file.read(at, min(_STRETCH, self._stop_at - at))
-        place = 0
+        place = last = 0
         while place + HEAD.size <= len(block):
             opcode, size = HEAD.unpack_from(block, place)
             if opcode not in LOOSE or size < _SMALLEST[opcode] or place + HEAD.size + size > len(block):
@@ -316,27 +295,24 @@ class RecordWalk:
             last, place = place, place + HEAD.size + size
         return at + (place if at + place == self._stop_at else last)
 
-    def _next_record(self, start: int) -> int | None:
-        """Where the next trustworthy record begins: a chunk or metadata; in a file without chunks three in a row.
-
-        What looks like a message is not taken for one in a file with chunks: it may lie within a damaged chunk.
-        """
-        found = None
-        if not self._is_loose or self._has_chunks:
-            found = self._next_of(start, (Opcode.CHUNK, Opcode.METADATA))
-        if found is None and not self._has_chunks:
-            found = self._next_of(start, (Opcode.METADATA, *LOOSE))
-        return found
-
     def _next_of(self, start: int, kinds: Sequence[Opcode]) -> int | None:
+        """Offset of the next trustworthy record of some kinds."""
+        wanted = np.zeros(256, bool)
+        wanted[[int(kind) for kind in kinds]] = True
         for block_at in range(start, self._stop_at, _BLOCK):
             block = self._file.read(block_at, _BLOCK + HEAD.size)
-            for offset in _places_of(block, kinds, self._stop_at):
+            if len(block) < HEAD.size:
+                continue
+            octets = np.frombuffer(block, np.uint8)
+            places = np.flatnonzero(wanted[octets[: len(octets) - HEAD.size + 1]])
+            lengths = np.ndarray((len(octets) - 7,), "<u8", block, strides=(1,))[places + 1]
+            for offset in places[lengths <= self._stop_at].tolist():
                 if offset < _BLOCK and self._is_trustworthy(block_at + offset):
                     return block_at + offset
         return None
 
     def _is_trustworthy(self, at: int) -> bool:
+        """True for a chunk whose two lengths agree, and for the first of three likely records in a row."""
         record = self._file.record(at)
         if isinstance(record, ChunkRecord):
             return record.size == HEAD.unpack(self._file.read(at, HEAD.size))[1]
@@ -349,28 +325,16 @@ class RecordWalk:
         return True
 
 
-def _places_of(block: bytes, kinds: Sequence[Opcode], limit: int) -> list[int]:
-    """Offsets at which a byte is one of the kinds and the eight after it are a length below the limit."""
-    octets = np.frombuffer(block, np.uint8)
-    if len(octets) < HEAD.size:
-        return []
-    wanted = np.zeros(256, bool)
-    wanted[[int(kind) for kind in kinds]] = True
-    places = np.flatnonzero(wanted[octets[: len(octets) - HEAD.size + 1]])
-    lengths = np.ndarray((len(octets) - 7,), "<u8", block, strides=(1,))[places + 1]
-    return [int(place) for place in places[lengths <= limit]]
-
-
 _SEAL = "crc32"
 
 
 def seal(metadata: Mapping[str, str]) -> dict[str, str]:
-    """The metadata with a CRC-32 over its keys and values, under the key ``crc32``."""
+    """Metadata with a CRC-32 over its keys and values, under the key ``crc32``."""
     return {**metadata, _SEAL: _checksum(metadata)}
 
 
 def open_seal(metadata: Mapping[str, str]) -> tuple[dict[str, str], bool]:
-    """The metadata without the checksum, and whether it had one.
+    """Metadata without the checksum, and True where it had one.
 
     Raises
     ------

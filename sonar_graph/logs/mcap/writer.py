@@ -1,11 +1,11 @@
-"""Writing MCAP: columns of payloads from several topics, merged by time.
+"""Writing of MCAP files of profile ``ros2``: encoded messages of several topics, merged by time.
 
-A file has profile ``ros2``, chunks with CRCs, and all indexes. What lies outside chunks is covered too: by a CRC over
-all data, and metadata by a checksum of their own, which also holds in a file that was cut off. Each chunk is on its way
-to the disk as soon as it is full, so that a writer that is killed loses only the one that it was filling.
+Chunks carry CRCs, and the file has all indexes. A CRC over all data covers what lies outside chunks, and metadata
+have a checksum of their own, which holds also in a file that was cut off. Each chunk is written to the disk as soon as
+it is full, so that a writer that is killed loses only its open chunk.
 
-Topics that a viewer must also get when it joins late carry the quality of service "transient local" in the form of
-rosbag2, so that ``ros2 bag play`` offers it: without it RViz would never receive ``/tf_static``.
+Topics for viewers that join late carry the quality of service "transient local" in the form of rosbag2, so that
+``ros2 bag play`` offers it: without it RViz would never receive ``/tf_static``.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from mcap.writer import MCAP0_MAGIC, Writer
+from mcap.writer import Writer
 
 from sonar_graph.files import written_whole
 from sonar_graph.logs.cdr import Bytes, definition
-from sonar_graph.logs.mcap.records import seal
+from sonar_graph.logs.mcap.records import MAGIC, seal
 from sonar_graph.measurements import Ints
 
 _CHUNK_BYTES = 1 << 20
@@ -32,13 +32,13 @@ TRANSIENT_LOCAL = (
     f"- {{history: 1, depth: 10, reliability: 1, durability: 1, deadline: {_FOREVER}, lifespan: {_FOREVER}, "
     f"liveliness: 1, liveliness_lease_duration: {_FOREVER}, avoid_ros_namespace_conventions: false}}"
 )
-"""Keep last, reliable, transient local: the numbers of rmw's enumerations, as rosbag2 has them up to version 8."""
+"""Keep last, reliable, transient local, by the numbers of rmw's enumerations as rosbag2 has them up to version 8."""
 LIBRARY = "sonar-graph"
-"""What the head of a log says that this package wrote."""
+"""Library in the header of a log that this package wrote."""
 _HEAD_AT = 17  # after the magic bytes, an opcode and a length
 _LONGEST_PROFILE = 64
 ROSBAG2_METADATA = {"serialized_metadata": ""}
-"""Makes newer versions of rosbag2, which write words, read numbers in what a channel offers."""
+"""Record that makes newer versions of rosbag2, which write words, read numbers in the offer of a channel."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,11 @@ class Outgoing:
     type_name: str
     """Such as ``sensor_msgs/msg/Imu``."""
     log_times_ns: Ints
-    """When each message counts as recorded, shape (n,)."""
+    """Time of recording of each message, shape (n,)."""
     payloads: Bytes
     """Shape (n, size)."""
     is_latched: bool = False
-    """Viewers that join late get it too; the first entry of a topic decides."""
+    """True for viewers that join late; the first entry of a topic decides."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def write_recording(
 ) -> None:
     """Write an MCAP file of profile ``ros2``; an existing file is replaced only when the new one is complete.
 
-    Messages appear in the order of their log times; those at one instant in the order of the list.
+    Messages appear in the order of their log times; those of one instant in the order of the list.
 
     Raises
     ------
@@ -92,16 +92,16 @@ def write_recording(
 
 @contextmanager
 def recording(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> Iterator[RecordingWriter]:
-    """A recording that is written piece by piece, for what does not fit into memory.
+    """Recording that is written piece by piece, for messages that do not fit into memory.
 
-    An existing file is replaced when the context ends without an error; until then, pieces go to a file beside it.
+    An existing file is replaced when the context ends without an error; until then, the pieces go to a file beside it.
 
     Parameters
     ----------
     path
         The MCAP file.
     metadata
-        Records by name, written first.
+        Metadata records by name, written first.
 
     Raises
     ------
@@ -117,9 +117,9 @@ def recording(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> Iterator
 
 
 def is_own_log(path: Path) -> bool:
-    """Whether the head of a file says that it is a log which this package wrote, of whatever profile."""
+    """True for a log that this package wrote, of whatever profile, by the header of the file."""
     with path.open("rb") as stream:
-        if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+        if stream.read(len(MAGIC)) != MAGIC:
             return False
         stream.seek(_HEAD_AT)
         profile_size = int.from_bytes(stream.read(4), "little")
@@ -131,7 +131,7 @@ def is_own_log(path: Path) -> bool:
 
 
 class RecordingWriter:
-    """Writes to an open file; memory holds one chunk and what the index needs."""
+    """Writer to an open file; memory holds one chunk and the index."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -142,22 +142,32 @@ class RecordingWriter:
         self._offers_latched = False
 
     def add_metadata(self, name: str, record: Mapping[str, str]) -> None:
-        """A metadata record with its checksum."""
+        """Add a metadata record with its checksum."""
         self._writer.add_metadata(name, seal(record))
 
     def attach(self, file: Attachment, time_ns: int) -> None:
-        """A file within the recording."""
+        """Add a file within the recording."""
         self._writer.add_attachment(0, time_ns, file.name, file.media_type, file.content)
 
     def offer_latched(self) -> None:
-        """Say in the form of rosbag2 that there are latched topics; once is enough."""
+        """State once in the form of rosbag2 that there are latched topics."""
         if not self._offers_latched:
             self._writer.add_metadata("rosbag2", ROSBAG2_METADATA)
             self._offers_latched = True
 
     def write(self, messages: Sequence[Outgoing]) -> None:
-        """Messages in the order of their log times; those at one instant in the order of the list."""
-        channels = [self._channel(entry) for entry in messages]
+        """Write messages in the order of their log times; those of one instant in the order of the list."""
+        for entry in messages:
+            if entry.type_name not in self._schemas:
+                text = definition(entry.type_name).encode()
+                self._schemas[entry.type_name] = self._writer.register_schema(entry.type_name, "ros2msg", text)
+            if entry.topic not in self._channels:
+                if entry.is_latched:
+                    self.offer_latched()
+                offers = {"offered_qos_profiles": TRANSIENT_LOCAL} if entry.is_latched else {}
+                schema = self._schemas[entry.type_name]
+                self._channels[entry.topic] = self._writer.register_channel(entry.topic, "cdr", schema, offers)
+        channels = [self._channels[entry.topic] for entry in messages]
         times_ns = np.concatenate([np.maximum(m.log_times_ns, 0) for m in messages] or [np.empty(0, np.int64)])
         source = np.repeat(np.arange(len(messages)), [len(m.log_times_ns) for m in messages])
         row = np.concatenate([np.arange(len(m.log_times_ns)) for m in messages] or [np.empty(0, np.int64)])
@@ -172,15 +182,3 @@ class RecordingWriter:
     def finish(self) -> None:
         """Write the summary."""
         self._writer.finish()  # type: ignore[no-untyped-call]  # of the mcap package
-
-    def _channel(self, entry: Outgoing) -> int:
-        if entry.type_name not in self._schemas:
-            text = definition(entry.type_name).encode()
-            self._schemas[entry.type_name] = self._writer.register_schema(entry.type_name, "ros2msg", text)
-        if entry.topic not in self._channels:
-            if entry.is_latched:
-                self.offer_latched()
-            offers = {"offered_qos_profiles": TRANSIENT_LOCAL} if entry.is_latched else {}
-            schema = self._schemas[entry.type_name]
-            self._channels[entry.topic] = self._writer.register_channel(entry.topic, "cdr", schema, offers)
-        return self._channels[entry.topic]

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.logs.convert.aris import convert_aris
-from sonar_graph.logs.convert.didson import convert_didson
+from sonar_graph.logs.convert.didson_aris import convert_aris, convert_didson
 from sonar_graph.logs.convert.oculus import convert_oculus
 from sonar_graph.logs.convert.sonar_file import SonarConversion
 from sonar_graph.logs.mcap.reader import Recording, scan

@@ -90,7 +90,7 @@ def test_start_is_the_reference_when_the_dvl_begins(folder):
 
 def test_trajectories_that_exist_are_named(folder, tmp_path, refusal):
     refusal(lambda: read_akit(folder, 5), "no trajectory 5", "it has 2")
-    refusal(lambda: read_akit(folder / "Trajectory2", 2), "no folder TrajectoryN")
+    refusal(lambda: read_akit(folder / "Trajectory2", 2), "holds no TrajectoryN")
     refusal(lambda: read_akit(tmp_path / "absent", 1), "not a folder")
 
 

@@ -8,7 +8,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from sonar_graph.logs.convert.aris import convert_aris
+from sonar_graph.logs.convert.didson_aris import convert_aris
 from sonar_graph.logs.sonar_frames import read_sonar_frames
 
 from .sonar_logs import converted, degrees

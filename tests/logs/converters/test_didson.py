@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sonar_graph.logs.convert.didson import convert_didson
+from sonar_graph.logs.convert.didson_aris import convert_didson
 
 from .sonar_logs import converted, degrees
 from .sonar_recordings import START_NS, STEP_NS, Ddf, images, put

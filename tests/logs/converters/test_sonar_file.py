@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from sonar_graph.errors import DatasetError
-from sonar_graph.logs.convert.sonar_file import ByteSource, Lost, may_be_numbered_header
+from sonar_graph.logs.convert.didson_aris import ArisFormat
+from sonar_graph.logs.convert.sonar_file import ByteSource, FrameHead, Lost
 
 MIB = 1 << 20
 
@@ -52,7 +53,8 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
     ],
 )
 def test_the_beginning_of_a_header_is_told_from_other_bytes(content: bytes, may_be: bool) -> None:
-    assert may_be_numbered_header(content, b"DDF\x05", 12, 0x105) is may_be
+    kind = object.__new__(ArisFormat)
+    assert kind.may_follow(content, FrameHead(0, 1, 0x104, 0, ())) is may_be
 
 
 def test_a_loss_names_its_first_and_last_byte() -> None:

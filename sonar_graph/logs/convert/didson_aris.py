@@ -1,0 +1,325 @@
+"""DIDSON (``.ddf``) and ARIS (``.aris``) recordings of Sound Metrics' lens sonars: DDF versions 3, 4 and 5.
+
+A file is a header and frames: a header each, then one byte a sample, all beams of the first range first. An ARIS states
+delay and sample period of a frame; its bins begin ``delay c / 2`` away and are ``period c / 2`` long. A DIDSON states
+codes of the window of ranges: it begins at a multiple of 0.42 m ("extended") or 0.375 m ("classic"), twice that at low
+frequency, and its length is in a table. These metres hold for the nominal speed of sound, see
+``docs/theory/sonar_files.md``.
+
+Sources: SoundMetrics/aris-file-sdk (MIT) for ARIS; for facts on DIDSON oncvideo (MIT), ARISreader, pyDIDSON and
+Echoview's description of the format. No file of a real DIDSON was at hand.
+"""
+
+from __future__ import annotations
+
+import struct
+from abc import abstractmethod
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
+from sonar_graph.devices import aris_azimuths, didson_azimuths, even_azimuths
+from sonar_graph.errors import DatasetError
+from sonar_graph.logs.convert.sonar_file import (
+    ByteSource,
+    DamagedFrameError,
+    FrameGeometry,
+    FrameHead,
+    Settings,
+    SonarConversion,
+    SonarFormat,
+    convert_sonar_file,
+)
+from sonar_graph.logs.mcap import Progress
+
+MAGIC = b"DDF"
+
+
+def convert_didson(
+    path: Path, output: Path, progress: Progress | None = None, *, sound_speed_m_s: float | None = None
+) -> SonarConversion:
+    """Write an MCAP log with all whole frames of a ``.ddf`` file.
+
+    Parameters
+    ----------
+    path, output
+        The recording and the log.
+    progress
+        Called with the bytes done and the bytes in all.
+    sound_speed_m_s
+        Speed of sound in the water, by which ranges are scaled; None: the nominal 1465 m/s of the window codes.
+
+    Raises
+    ------
+    DatasetError
+        When it is no such file, its header is damaged, or it has no whole frame.
+    LogError
+        When the log cannot be written.
+    """
+    with ByteSource(Path(path)) as source:
+        return convert_sonar_file(source, DidsonFormat(source, sound_speed_m_s), Path(output), progress)
+
+
+def convert_aris(path: Path, output: Path, progress: Progress | None = None) -> SonarConversion:
+    """Write an MCAP log with all whole frames of an ``.aris`` file.
+
+    Raises
+    ------
+    DatasetError
+        When it is no such file, or has no whole frame.
+    LogError
+        When the log cannot be written.
+    """
+    with ByteSource(Path(path)) as source:
+        return convert_sonar_file(source, ArisFormat(source), Path(output), progress)
+
+
+class LensSonarFormat(SonarFormat):
+    """Frames with a number in the first four bytes of their header, and a signature at byte 12."""
+
+    signature_at = 12
+    readings_at: Mapping[str, int]
+    """Offsets in the header of the readings of other sensors."""
+
+    def head(self, content: bytes, at: int) -> FrameHead:
+        """Header of a frame."""
+        if len(content) < self.head_bytes:
+            raise DamagedFrameError(f"a frame cut off, {len(content)} bytes of its header are there")
+        if content[self.signature_at : self.signature_at + 4] != self.signature:
+            raise DamagedFrameError("no frame begins here")
+        (number,) = struct.unpack_from("<I", content, 0)
+        clock_ns, samples, settings = self.fields(content, number)
+        readings = {
+            name: float(struct.unpack_from("<f", content, where)[0]) for name, where in self.readings_at.items()
+        }
+        size = self.head_bytes + self.beams(settings) * samples
+        return FrameHead(at, size, number, clock_ns, settings, readings)
+
+    @abstractmethod
+    def fields(self, content: bytes, number: int) -> tuple[int, int, Settings]:
+        """Time by the sonar's clock in nanoseconds, samples a beam, and settings of a frame."""
+
+    @abstractmethod
+    def beams(self, settings: Settings) -> int:
+        """Number of beams of frames with some settings."""
+
+    def may_follow(self, content: bytes, earlier: FrameHead) -> bool:
+        """True where some bytes can begin the frame after, by its number and signature."""
+        signed = content[self.signature_at :]
+        is_next = (earlier.number + 1).to_bytes(4, "little").startswith(content[:4])
+        return is_next and self.signature.startswith(signed[: len(self.signature)])
+
+    def samples(self, frame: bytes, settings: Settings) -> NDArray[np.generic]:
+        """Image of a frame, shape (beams, bins)."""
+        return np.frombuffer(frame, np.uint8, offset=self.head_bytes).reshape(-1, self.beams(settings)).T
+
+
+HEADER_BYTES = {3: (512, 256), 4: (1024, 1024)}
+"""Bytes of the file's and of a frame's header, by version."""
+BEAMS = (48, 96)
+MOST_SAMPLES = 4096
+DIDSON_DECIBEL_SPAN = 90.0
+"""By Echoview's description of the format."""
+LAST_YEAR = 2037
+"""Last year whose stamps ROS 2 can hold."""
+NOMINAL_SOUND_SPEED_M_S = 1465.0
+HIGH_FREQUENCY_HZ, LOW_FREQUENCY_HZ = 1.8e6, 1.1e6
+CLASSIC, LONG_RANGE = 1, 2
+"""Bits of a frame's configuration flags."""
+START_STEP_M = {0: 0.42, CLASSIC: 0.375, LONG_RANGE: 0.42, CLASSIC | LONG_RANGE: 0.375}
+LENGTHS_M = {
+    0: (1.25, 2.5, 5.0, 10.0, 20.0, 40.0),
+    CLASSIC: (1.125, 2.25, 4.5, 9.0, 18.0, 36.0),
+    LONG_RANGE: (2.5, 5.0, 10.0, 20.0, 40.0, 80.0),
+    CLASSIC | LONG_RANGE: (2.25, 4.5, 9.0, 18.0, 36.0, 72.0),
+}
+"""Lengths of the window by flags; low frequency begins with the third."""
+LOW_FREQUENCY_SHIFT = 2
+FIRST_EXTENDED_SERIAL, LONG_RANGE_SERIAL = 19, 15
+"""Sonars of earlier serial numbers are classic whatever the flags say, and one of them has a long range."""
+_TIME_AT, _WINDOW_AT, _FLAGS_AT = 20, 52, 192
+
+
+class DidsonFormat(LensSonarFormat):
+    """Headers, samples and geometry of a ``.ddf`` file."""
+
+    readings_at: Mapping[str, int] = {
+        "depth": 128,
+        "altitude": 132,
+        "pitch": 136,
+        "roll": 144,
+        "heading": 152,
+        "pan": 160,
+        "tilt": 164,
+        "sonar roll": 168,
+    }
+
+    def __init__(self, source: ByteSource, sound_speed_m_s: float | None = None) -> None:
+        start = source.read(0, len(MAGIC) + 1)
+        if start[: len(MAGIC)] != MAGIC:
+            raise DatasetError(f"{source.path}: begins with {start!r}; a DIDSON recording begins with {MAGIC!r}")
+        self._version = start[-1] if len(start) > len(MAGIC) else 0
+        if self._version not in HEADER_BYTES:
+            advice = "use `convert aris`" if self._version == 5 else "versions 3 and 4 are read"
+            raise DatasetError(f"{source.path}: is of DDF version {self._version}; {advice}")
+        self.first_at, self.head_bytes = HEADER_BYTES[self._version]
+        header = source.read(0, self.first_at)
+        if len(header) < self.first_at:
+            raise DatasetError(f"{source.path}: ends within its header of {self.first_at} bytes")
+        self.frames_promised, _, resolution, self._beams, _, self._samples = struct.unpack_from("<4ifi", header, 4)
+        self._reverse, self._serial = struct.unpack_from("<2i", header, 40)
+        if self._beams not in BEAMS or resolution not in (0, 1) or not 0 < self._samples <= MOST_SAMPLES:
+            said = f"{self._beams} beams, {self._samples} samples, resolution {resolution}"
+            expected = f"48 or 96 beams, at most {MOST_SAMPLES} samples, resolution 0 or 1"
+            raise DatasetError(f"{source.path}: its header is damaged: it says {said}; expected {expected}")
+        self._is_high = resolution == 1
+        self._sound_speed_m_s = sound_speed_m_s or NOMINAL_SOUND_SPEED_M_S
+        # frames usually repeat the file's version in their headers, and otherwise all have the same bytes there
+        usual = MAGIC + bytes([self._version])
+        first_frames = source.read(len(usual), self.first_at + 2 * (self.head_bytes + self._beams * self._samples))
+        is_usual = usual in first_frames
+        self.signature = usual if is_usual else source.read(self.first_at + self.signature_at, len(usual))
+        image = SonarImage(scale="decibel", decibel_span=DIDSON_DECIBEL_SPAN)
+        self.calibration = Calibration(sonar=SonarCalibration(image=image))
+        self.notes = {
+            "source": f"DIDSON recording {source.path.name}, DDF version {self._version}",
+            "sonar.time": "the sonar's own calendar time, to hundredths of a second, taken as UTC",
+            "sonar.beams": "the manufacturer's polynomial for the lens",
+            "sonar.ranges": f"from window codes, for a sound speed of {self._sound_speed_m_s:g} m/s",
+            "sonar.scale": f"counts 0 to 255 are 0 to {DIDSON_DECIBEL_SPAN:g} dB "
+            "(Echoview's description of the format)",
+        }
+
+    def fields(self, content: bytes, number: int) -> tuple[int, int, Settings]:
+        """Time, samples a beam and settings: window codes, flags, beams, samples."""
+        start, length = struct.unpack_from("<2i", content, _WINDOW_AT)
+        (flags,) = struct.unpack_from("<I", content, _FLAGS_AT)
+        if self._serial < FIRST_EXTENDED_SERIAL:
+            flags = CLASSIC | (LONG_RANGE if self._serial == LONG_RANGE_SERIAL else 0)
+        else:
+            flags = flags & (CLASSIC | LONG_RANGE) if self._version == 3 else 0
+        shift = 0 if self._is_high else LOW_FREQUENCY_SHIFT
+        if not 0 <= start <= 31 or not 0 <= length < len(LENGTHS_M[flags]) - shift:
+            raise DamagedFrameError(f"frame {number} with window codes {start} and {length}")
+        year, month, day, hour, minute, second, hundredths = struct.unpack_from("<7i", content, _TIME_AT)
+        if not 1990 <= year <= LAST_YEAR or not 0 <= hundredths < 100:
+            raise DamagedFrameError(f"frame {number} of the year {year}, with {hundredths} hundredths of a second")
+        try:
+            moment = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
+        except (ValueError, OverflowError) as error:
+            raise DamagedFrameError(f"frame {number} with a time that does not exist: {error}") from error
+        clock_ns = round(moment.timestamp()) * 10**9 + hundredths * 10**7
+        return clock_ns, self._samples, (start, length, flags, self._beams, self._samples)
+
+    def beams(self, settings: Settings) -> int:
+        """Number of beams, the same in all frames."""
+        return int(settings[3])
+
+    def geometry(self, settings: Settings) -> FrameGeometry:
+        """Bins that divide the window evenly."""
+        start, length, flags, beams, samples = map(int, settings)
+        scale = self._sound_speed_m_s / NOMINAL_SOUND_SPEED_M_S
+        begin_m = start * START_STEP_M[flags] * (1 if self._is_high else 2) * scale
+        length_m = LENGTHS_M[flags][length + (0 if self._is_high else LOW_FREQUENCY_SHIFT)] * scale
+        ranges_m = begin_m + (np.arange(samples, dtype=float) + 0.5) * (length_m / samples)
+        azimuths_rad = didson_azimuths(beams)
+        if self._reverse:
+            azimuths_rad = azimuths_rad[::-1]
+        frequency_hz = HIGH_FREQUENCY_HZ if self._is_high else LOW_FREQUENCY_HZ
+        return FrameGeometry(ranges_m, azimuths_rad, frequency_hz, self._sound_speed_m_s)
+
+
+BEAMS_OF_PING_MODE = {1: 48, 2: 48, 3: 96, 4: 96, 5: 96, 6: 64, 7: 64, 8: 64, 9: 128, 10: 128, 11: 128, 12: 128}
+HALF_ANGLE_DEG, TELEPHOTO_HALF_ANGLE_DEG = 14.0, 7.0
+"""Field of view for combinations of beams and lens without a table."""
+FREQUENCIES_HZ = {0: (1.1e6, 1.8e6), 1: (1.8e6, 3.0e6), 2: (0.7e6, 1.2e6)}
+"""Low and high frequency by system type: ARIS 1800, 3000, 1200."""
+SOUND_SPEEDS_M_S = (1350.0, 1650.0)
+"""Limits of the speed of sound in an undamaged header."""
+ARIS_DECIBEL_SPAN = 80.0
+_US = 1e-6
+LAST_US = 2**31 * 10**6 - 1
+"""Last time that stamps of ROS 2 can hold, with 31 bits for seconds since 1970."""
+
+
+class ArisFormat(LensSonarFormat):
+    """Headers, samples and geometry of an ``.aris`` file; all of them are in the headers of the frames."""
+
+    first_at = head_bytes = 1024
+    signature = b"DDF\x05"
+    readings_at: Mapping[str, int] = {
+        "depth": 128,
+        "altitude": 132,
+        "pitch": 136,
+        "roll": 144,
+        "heading": 152,
+        "compass heading": 160,
+        "compass pitch": 164,
+        "compass roll": 168,
+        "water temperature": 224,
+        "pan": 244,
+        "tilt": 248,
+    }
+
+    def __init__(self, source: ByteSource) -> None:
+        start = source.read(0, len(self.signature))
+        in_first_frame = source.read(self.first_at + self.signature_at, len(self.signature))
+        if self.signature not in (start, in_first_frame):
+            raise DatasetError(
+                f"{source.path}: begins with {start!r}; an ARIS recording begins with {self.signature!r}"
+            )
+        (self.frames_promised,) = struct.unpack("<I", source.read(4, 4).ljust(4, b"\0"))
+        image = SonarImage(scale="decibel", decibel_span=ARIS_DECIBEL_SPAN)
+        self.calibration = Calibration(sonar=SonarCalibration(image=image))
+        self.notes = {
+            "source": f"ARIS recording {source.path.name}",
+            "sonar.time": "the sonar's own clock, microseconds since 1970",
+            "sonar.beams": "the manufacturer's table for lens and number of beams, evenly spaced where there is none",
+            "sonar.scale": f"counts 0 to 255 are 0 to {ARIS_DECIBEL_SPAN:g} dB",
+        }
+
+    def fields(self, content: bytes, number: int) -> tuple[int, int, Settings]:
+        """Time, samples a beam and settings.
+
+        These are ping mode, high frequency, sample period (µs), sound speed, samples, start delay (µs), lens, system.
+        """
+        (clock_us,) = struct.unpack_from("<Q", content, 20)
+        mode, high, _, _, period_us, _, _, sound_speed, samples = struct.unpack_from("<7IfI", content, 436)
+        delay_us, lens, system = struct.unpack_from("<3I", content, 476)
+        (in_order,) = struct.unpack_from("<I", content, 516)
+        faults = {
+            f"ping mode {mode}": mode not in BEAMS_OF_PING_MODE,
+            f"frequency {high}": high not in (0, 1),
+            f"system type {system}": system not in FREQUENCIES_HZ,
+            f"lens {lens}": lens not in (0, 1),
+            f"{samples} samples a beam": not 0 < samples <= 1 << 16,
+            f"a sample period of {period_us} us": not 0 < period_us <= 1000,
+            f"a start delay of {delay_us} us": delay_us > 1 << 20,
+            f"a sound speed of {sound_speed:g} m/s": not SOUND_SPEEDS_M_S[0] <= sound_speed <= SOUND_SPEEDS_M_S[1],
+            "samples that are not in order": in_order == 0,
+        }
+        if any(faults.values()):
+            raise DamagedFrameError(f"a header with {', '.join(text for text, wrong in faults.items() if wrong)}")
+        if clock_us > LAST_US:
+            raise DamagedFrameError(f"frame {number} with a time of {clock_us} us")
+        settings = mode, high, period_us, float(sound_speed), samples, delay_us, lens, system
+        return clock_us * 1000, samples, settings
+
+    def beams(self, settings: Settings) -> int:
+        """Number of beams by the ping mode."""
+        return BEAMS_OF_PING_MODE[int(settings[0])]
+
+    def geometry(self, settings: Settings) -> FrameGeometry:
+        """Bins by start delay, sample period and speed of sound."""
+        _, high, period_us, sound_speed, samples, delay_us, lens, system = map(float, settings)
+        beams, telephoto = self.beams(settings), bool(lens)
+        azimuths = aris_azimuths(beams, telephoto=telephoto)
+        if azimuths is None:
+            azimuths = even_azimuths(beams, TELEPHOTO_HALF_ANGLE_DEG if telephoto else HALF_ANGLE_DEG)
+        middles_us = delay_us + (np.arange(int(samples), dtype=float) + 0.5) * period_us
+        frequency_hz = FREQUENCIES_HZ[int(system)][int(high)]
+        return FrameGeometry(middles_us * _US * sound_speed / 2, azimuths, frequency_hz, sound_speed)
