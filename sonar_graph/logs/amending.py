@@ -1,6 +1,6 @@
 """A log written anew with more messages in it: everything that was there, byte by byte, and what was added.
 
-The log is read as every log is (`sonar_graph.logs.mcap.file_pass`), so that of one that is cut off what is whole is
+The log is read as every log is (`sonar_graph.logs.mcap.reader`), so that of one that is cut off what is whole is
 copied.
 """
 
