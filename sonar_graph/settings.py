@@ -3,18 +3,105 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from copy import deepcopy
 from difflib import SequenceMatcher
 from functools import partial
 from types import UnionType
-from typing import Any, Union, get_args, get_origin
+from typing import Any, NamedTuple, Union, get_args, get_origin
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 Place = tuple[int | str, ...]
 _SHOWN_CHARACTERS = 60
 _LEAST_SIMILARITY = 0.7
 _MISFIT = "misfit"
+
+
+def tagged(tag: str, default: str) -> tuple[FieldInfo, BeforeValidator]:
+    """Metadata of a union of sections that one of their fields tells apart; it has a default.
+
+    Parameters
+    ----------
+    tag
+        That field, with a literal text in each section.
+    default
+        Its value where it is not given.
+    """
+
+    def with_tag(value: Any) -> Any:
+        if isinstance(value, str):
+            raise ValueError(f'expected a section with {tag} = "{value}"')
+        return {tag: default, **value} if isinstance(value, dict) else value
+
+    return Field(discriminator=tag), BeforeValidator(with_tag)
+
+
+def nested(values: dict[str, Any], start: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Settings in sections, from values by dotted names such as ``image.noise_db``, added to those of a start."""
+    tree = deepcopy(start or {})
+    for name, value in values.items():
+        *sections, last = name.split(".")
+        place = tree
+        for section in sections:
+            if not isinstance(place.get(section), dict):
+                place[section] = {}
+            place = place[section]
+        place[last] = value
+    return tree
+
+
+def flattened(tree: dict[str, Any], section: str = "") -> dict[str, Any]:
+    """Values by dotted names, the inverse of `nested`."""
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        flat |= flattened(value, f"{section}{name}.") if isinstance(value, dict) else {f"{section}{name}": value}
+    return flat
+
+
+class Setting(NamedTuple):
+    """One setting of a model, for a listing."""
+
+    name: str
+    """With the sections that it is in, dotted."""
+    default: Any
+    meaning: str
+
+
+def settings_of(model: type[BaseModel], default: BaseModel | None = None, section: str = "") -> list[Setting]:
+    """All settings of a model, section after section.
+
+    Of a tagged union first its tag, with what each value means, then the settings of all its sections.
+    """
+    found: dict[str, Setting] = {}
+    for name, field in model.model_fields.items():
+        value = getattr(default, name) if default else field.get_default(call_default_factory=True)
+        path, options, tag = f"{section}{name}", list(_sections(field.annotation)), field.discriminator
+        if isinstance(tag, str):
+            meanings = (f"{' or '.join(_tags(option, tag))}: {_first_paragraph(option)}" for option in options)
+            found[f"{path}.{tag}"] = Setting(f"{path}.{tag}", getattr(value, tag), " ".join(meanings))
+            for option in options:
+                others = [other for other in options if other is not option]
+                for setting in settings_of(option, value if isinstance(value, option) else None, f"{path}."):
+                    top = setting.name[len(path) + 1 :].split(".")[0]
+                    with_it = [option, *(other for other in others if top in other.model_fields)]
+                    limit = "" if len(with_it) == len(options) else _only_with(tag, with_it)
+                    found.setdefault(setting.name, setting._replace(meaning=setting.meaning + limit))
+        elif isinstance(value, BaseModel):
+            found |= {setting.name: setting for setting in settings_of(type(value), value, f"{path}.")}
+        else:
+            found[path] = Setting(path, value, " ".join((field.description or "").split()))
+    return list(found.values())
+
+
+def _only_with(tag: str, options: list[type[BaseModel]]) -> str:
+    names = (f'"{name}"' for option in options for name in _tags(option, tag))
+    return f" Only with {tag} = {' or '.join(names)}."
+
+
+def _first_paragraph(section: type[BaseModel]) -> str:
+    return " ".join((section.__doc__ or "").split("\n\n")[0].split())
 
 
 def faults_in(error: ValidationError, model: type[BaseModel]) -> str:
@@ -54,6 +141,11 @@ def _describe(error: ErrorDetails, model: type[BaseModel]) -> str:
         return error["msg"]
     if error["type"] == "extra_forbidden":
         return unknown_field(place, model)
+    if error["type"] == "union_tag_invalid":
+        at, given = _walk(model, place), error["ctx"]["tag"]
+        known = [name for option in at.options for name in _tags(option, at.tag)]
+        return f"{_path((*at.names, at.tag))}: there is no {given!r}{choice(given, known)}"
+    place = field_place(model, place)
     if error["type"] == "missing":
         return f"{_path(place)}: is missing"
     if error["type"] in ("list_type", "tuple_type") and isinstance(error["input"], dict):
@@ -65,10 +157,16 @@ def _describe(error: ErrorDetails, model: type[BaseModel]) -> str:
 
 
 def unknown_field(place: Place, model: type[BaseModel]) -> str:
-    """Message that a field does not exist, with the most similar one and those that exist."""
-    section = section_at(model, place[:-1])
-    names = list(section.model_fields) if section else []
-    return f"{_path(place)}: there is no such field{choice(str(place[-1]), names, _path(place[:-1]) or 'it')}"
+    """Message that a field does not exist, with the policy that has it, or the most similar one and all there are."""
+    name, owner = str(place[-1]), _walk(model, place[:-1])
+    fault, whose = f"{_path((*owner.names, name))}: there is no such field", _path(owner.names) or "it"
+    if owner.value:
+        others = [f'"{tag}"' for o in owner.options if name in o.model_fields for tag in _tags(o, owner.tag)]
+        if others:
+            having = f"{_path((*owner.names, owner.tag))} = {' or '.join(others)}"
+            return f'{fault} with {owner.tag} = "{owner.value}"; {having} has it'
+        whose = f'{whose} with {owner.tag} = "{owner.value}"'
+    return fault + choice(name, list(owner.section.model_fields) if owner.section else [], whose)
 
 
 def choice(name: str, known: Iterable[str], owner: str = "") -> str:
@@ -111,13 +209,45 @@ def _path(place: Place) -> str:
 
 def section_at(model: type[BaseModel], place: Place) -> type[BaseModel] | None:
     """Section at a place within a model, or None."""
-    section: type[BaseModel] | None = model
+    return _walk(model, place).section
+
+
+def field_place(model: type[BaseModel], place: Place) -> Place:
+    """Place of an error as the user wrote it, without the tags that pydantic adds for tagged unions."""
+    return _walk(model, place).names
+
+
+class _Spot(NamedTuple):
+    """A place in a model."""
+
+    names: Place
+    """Without the tags of unions."""
+    section: type[BaseModel] | None
+    tag: str
+    """Name of the field that tells the options apart; empty where it is no union."""
+    value: str
+    options: list[type[BaseModel]]
+
+
+def _walk(model: type[BaseModel], place: Place) -> _Spot:
+    spot = _Spot((), model, "", "", [model])
     for name in place:
-        if section is None:
-            return None
-        if isinstance(name, str) and name in section.model_fields:
-            section = next(_sections(section.model_fields[name].annotation), None)
-    return section
+        picked = [option for option in spot.options if name in _tags(option, spot.tag)] if not spot.value else []
+        if picked:
+            spot = spot._replace(section=picked[0], value=str(name))
+            continue
+        section = spot.section
+        spot = spot._replace(names=(*spot.names, name))
+        if section is not None and isinstance(name, str) and name in section.model_fields:
+            field = section.model_fields[name]
+            options = list(_sections(field.annotation))
+            tag = field.discriminator if isinstance(field.discriminator, str) else ""
+            spot = _Spot(spot.names, options[0] if options else None, tag, "", options)
+    return spot
+
+
+def _tags(section: type[BaseModel], tag: str) -> tuple[str, ...]:
+    return get_args(section.model_fields[tag].annotation) if tag else ()
 
 
 def _sections(annotation: Any) -> Iterator[type[BaseModel]]:

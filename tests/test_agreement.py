@@ -13,19 +13,23 @@ from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration,
 from sonar_graph.estimator import Estimator
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.sequence import NS_PER_S, Sequence
-from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam import GaussianKernel, Isam2, Isam2Params, KeyframeParams, SmootherParams
 from sonar_graph.states import Estimate
 
 from .slam.rail import STEP_S, T0_NS, rail
 
 NODES = 21
-EVERY_NODE = {"max_keyframe_interval_s": 0.1, "waiting_gain": 0.0}
+EVERY_NODE = KeyframeParams(max_interval_s=0.1)
 SMOOTHERS = {
     "everything kept": Isam2Params(
-        kernel="none", gate_probability=1, lag_s=1e6, relinearize_threshold=1e-6, **EVERY_NODE
+        kernel=GaussianKernel(),
+        smoother=SmootherParams(lag_s=1e6, relinearize_threshold=1e-6, waiting_gain=0.0),
+        keyframes=EVERY_NODE,
     ),
     "three seconds kept": Isam2Params(
-        kernel="none", gate_probability=1, lag_s=3.1, relinearize_threshold=1e-6, **EVERY_NODE
+        kernel=GaussianKernel(),
+        smoother=SmootherParams(lag_s=3.1, relinearize_threshold=1e-6, waiting_gain=0.0),
+        keyframes=EVERY_NODE,
     ),
 }
 smoothers = pytest.mark.parametrize("params", SMOOTHERS.values(), ids=SMOOTHERS)

@@ -208,9 +208,10 @@ def test_page_on_doubtful_identities_has_commands_and_programs_that_show_what_it
         "Warning: isam2 puts landmark 4 far outside its covariance (NEES up to " in printed["run basin.mcap -o robust"]
     )
     assert "none of 220 detections has an identity that isam2 can use" in printed["run blind.mcap -o ignored"]
-    associated = printed["run blind.mcap -o found --set isam2.unknown_landmarks=associate"]
+    associated = printed["run blind.mcap -o found --set isam2.identity.unknown.policy=associate"]
     assert (
-        "isam2 found 4 landmarks without a name (unknown_landmarks); scored by place, as 1, 2, 3 and 4." in associated
+        "isam2 found 4 landmarks without a name (identity.unknown.policy); scored by place, as 1, 2, 3 and 4."
+        in associated
     )
     compared, asked = (
         subprocess.run(

@@ -39,7 +39,7 @@ from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Block, Depth, Dvl, Imu, LandmarkDetections, Measurements
 from sonar_graph.sequence import NS_PER_S, Sequence
 from sonar_graph.simulation import MissionOptions, simulate_mission
-from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam import BoundedHistory, Isam2, Isam2Params, WholeHistory
 from sonar_graph.states import Estimate
 
 TARGETS = {"decile_ratio": 1.3, "max_update_ms": 100.0, "memory_growth_ratio": 1.1}
@@ -236,7 +236,8 @@ def main() -> None:
     parser.add_argument("--trace", action="store_true", help="say which lines hold more memory at the end")
     arguments = parser.parse_args()
     hours = arguments.hours or (0.25 if arguments.quick else 8.0)
-    params = Isam2Params(history=arguments.history, remembered_s=arguments.remembered or None)
+    bounded = BoundedHistory(remembered_s=arguments.remembered or None)
+    params = Isam2Params(history=bounded if arguments.history == "bounded" else WholeHistory())
     with tempfile.TemporaryDirectory() as first, tempfile.TemporaryDirectory() as second:
         note("warming up: compiled functions load at their first use")
         run(simulated(MissionOptions(duration_s=60.0), Path(first)), params)

@@ -1,4 +1,4 @@
-"""What a bounded history costs in accuracy: iSAM2 with ``history = "bounded"`` beside the whole one, on the same logs.
+"""What a bounded history costs in accuracy: iSAM2 with a bounded history beside the whole one, on the same logs.
 
 Missions of `sonar_graph.simulation.mission`, and basins with their three laps, one of each a seed. At 1 Hz, without
 alignment: horizontal rms of causal and smoothed positions, NEES of the smoothed position by its 3 degrees of freedom
@@ -23,7 +23,7 @@ from common import in_parallel, make_parser, print_figures, print_table
 from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, MissionOptions, simulate_basin, simulate_mission
-from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam import Isam2, Isam2Params
 from sonar_graph.states import LandmarkMap, Trajectory
 
 RATE_HZ = 1.0
@@ -31,9 +31,9 @@ SETTLING_S = 10.0
 """Before it errors are the start's."""
 SETTINGS: dict[str, dict[str, Any]] = {
     "whole": {},
-    "bounded, 5 s": {"history": "bounded", "lag_s": 5.0},
-    "bounded, 15 s": {"history": "bounded"},
-    "bounded, 60 s": {"history": "bounded", "lag_s": 60.0},
+    "bounded, 5 s": {"history": {"policy": "bounded"}, "smoother": {"lag_s": 5.0}},
+    "bounded, 15 s": {"history": {"policy": "bounded"}},
+    "bounded, 60 s": {"history": {"policy": "bounded"}, "smoother": {"lag_s": 60.0}},
 }
 QUANTITIES = ("causal_m", "smoothed_m", "nees", "landmarks_m", "landmarks_nees")
 Figures = dict[str, float]

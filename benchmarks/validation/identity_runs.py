@@ -19,11 +19,11 @@ ESTIMATORS: dict[str, tuple[str, dict[str, Any]]] = {
     "dead reckoning": ("dead-reckoning", {}),
     "EKF-SLAM": ("ekf-slam", {}),
     "invariant EKF": ("invariant-ekf", {}),
-    "iSAM2, gate": ("isam2", {"identity_policy": "gate", "kernel": "none", "deferred_identity": False}),
-    "iSAM2, robust": ("isam2", {"deferred_identity": False}),
+    "iSAM2, gate": ("isam2", {"identity": {"policy": "gate", "longest_wait_s": 0}, "kernel": {"shape": "none"}}),
+    "iSAM2, robust": ("isam2", {"identity": {"longest_wait_s": 0}}),
     "iSAM2, deferred": ("isam2", {}),
-    "iSAM2, max-mixture": ("isam2", {"identity_policy": "max-mixture"}),
-    "iSAM2, gnc": ("isam2", {"identity_policy": "gnc"}),
+    "iSAM2, max-mixture": ("isam2", {"identity": {"policy": "max-mixture"}}),
+    "iSAM2, gnc": ("isam2", {"identity": {"policy": "gnc"}}),
 }
 """By the name in the table: entry point and settings."""
 LOST_M = 1.0

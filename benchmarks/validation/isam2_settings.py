@@ -31,7 +31,7 @@ from sonar_graph.evaluation import compare
 from sonar_graph.logs.convert import read_mrclam
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, MissionOptions, simulate_basin, simulate_mission
-from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam import Isam2, Isam2Params
 from sonar_graph.slam.smoother import Smoother, solve
 
 RATE_HZ, LONG_S, SHORT_S = 2.0, 600.0, 300.0
@@ -41,14 +41,14 @@ THRESHOLDS = (0.01, 0.001, 0.0001)
 GAINS = (0.0, 2.0, 5.0, 20.0)
 EFFORTS: dict[str, dict[str, Any]] = {
     "default": {},
-    "share 0": {"motion_noise_share": 0.0},
-    "gain 0": {"waiting_gain": 0.0},
+    "share 0": {"keyframes": {"motion_noise_share": 0.0}},
+    "gain 0": {"smoother": {"waiting_gain": 0.0}},
 }
 KERNELS: dict[str, dict[str, Any]] = {
-    "huber 2.0, gate 0.999": {"identity_policy": "gate", "kernel": "huber", "kernel_width": 2.0},
+    "huber 2.0, gate 0.999": {"identity": {"policy": "gate"}, "kernel": {"shape": "huber", "width": 2.0}},
     "cauchy 1.5, no gate": {},
-    "cauchy 1.0, no gate": {"kernel_width": 1.0},
-    "no kernel, no gate": {"kernel": "none"},
+    "cauchy 1.0, no gate": {"kernel": {"width": 1.0}},
+    "no kernel, no gate": {"kernel": {"shape": "none"}},
 }
 Scores = dict[str, dict[str, float]]
 """By kernel and figure."""
@@ -119,7 +119,7 @@ def waiting(seconds: float, seed: int) -> list[float]:
     """Causal aligned error by gain, m."""
     sequence, found = mission(seconds, seed), []
     for gain in GAINS:
-        compared = compare(sequence, ["isam2"], {"isam2": {"waiting_gain": gain}}, rate_hz=RATE_HZ)
+        compared = compare(sequence, ["isam2"], {"isam2": {"smoother": {"waiting_gain": gain}}}, rate_hz=RATE_HZ)
         found.append(compared.scores["isam2"]["causal.ate_yaw_m"].value)
     return found
 
@@ -127,7 +127,7 @@ def waiting(seconds: float, seed: int) -> list[float]:
 def relinearised(seconds: float, case: tuple[str, float]) -> tuple[float, float, float]:
     """Of iSAM2 by itself."""
     world, threshold = case
-    return from_least_cost(run(WORLDS[world](seconds), {**ALONE, "relinearize_threshold": threshold})[0])
+    return from_least_cost(run(WORLDS[world](seconds), {"smoother": {**ALONE, "relinearize_threshold": threshold}})[0])
 
 
 def marginalised(seconds: float, world: str) -> tuple[float, float, float]:

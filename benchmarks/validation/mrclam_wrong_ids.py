@@ -29,8 +29,8 @@ ROBOTS = (1, 2, 3, 4, 5)
 SHARE, SEED, RATE_HZ, LOST_M = 0.1, 6, 2.0, 1.0
 POLICIES = ("gate", "robust", "max-mixture", "gnc")
 ESTIMATORS: dict[str, tuple[str, dict[str, Any]]] = {
-    **{f"isam2 {policy}": ("isam2", {"identity_policy": policy}) for policy in POLICIES},
-    "isam2 gate alone": ("isam2", {"identity_policy": "gate", "kernel": "none"}),
+    **{f"isam2 {policy}": ("isam2", {"identity": {"policy": policy}}) for policy in POLICIES},
+    "isam2 gate alone": ("isam2", {"identity": {"policy": "gate"}, "kernel": {"shape": "none"}}),
     "ekf-slam": ("ekf-slam", {}),
     "invariant-ekf": ("invariant-ekf", {}),
 }

@@ -1,6 +1,6 @@
 """Landmarks without identities: what geometry alone finds, beside known identities and beside dead reckoning.
 
-The same runs, once with the identities and once without any (`Isam2Params.unknown_landmarks`): the basin of default
+The same runs, once with the identities and once without any (``identity.unknown.policy``): the basin of default
 length, in which nothing but the identities differs, and the robots of UTIAS MRCLAM data set 6.
 
 A landmark of the map stands for the true one to which most of its detections belong. Where several stand for one, all
@@ -36,8 +36,8 @@ SURE = 0.9
 """Least posterior of a detection that was of a landmark, before identities were taken away."""
 USED = (Outcome.USED, Outcome.NEW, Outcome.PLACED_LATER, Outcome.USED_LATER, Outcome.MOVED)
 PLACES: dict[str, dict[str, Any]] = {
-    "basin": {"unknown_density_m2": 0.05},
-    "mrclam": {"unknown_density_m2": 0.15},
+    "basin": {"density_m2": 0.05},
+    "mrclam": {"density_m2": 0.15},
 }
 """Landmarks a square metre, roughly: 4 on the 49 m² that the basin's square encloses; 15 on 100 m²."""
 MOST_ERROR = 1.05
@@ -57,7 +57,7 @@ def without_identities(sequence: Sequence) -> Sequence:
 def run(sequence: Sequence, rate_hz: float, error: str, settings: dict[str, Any]) -> dict[str, Figures]:
     """Figures with identities, without, and of dead reckoning."""
     instants = sequence.instants(rate_hz)
-    unknown = {"unknown_landmarks": "associate", **settings}
+    unknown = {"identity": {"unknown": {"policy": "associate", **settings}}}
     runs = {
         "known": run_estimator(sequence, "isam2", instants_ns=instants, interim_maps=False),
         "unknown": run_estimator(

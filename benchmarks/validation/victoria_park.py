@@ -39,13 +39,11 @@ from sonar_graph.evaluation.metrics import align_yaw
 from sonar_graph.logs.convert import read_victoria_park
 from sonar_graph.states import Outcome
 
-LIKE_FOR_LIKE = {
-    "kernel": "none",
-    "gate_probability": 1.0,
-    "identity_probability": 0.0,
-    "motion_noise_share": 0.0,
-    "max_keyframe_interval_s": 0.5,
-    "waiting_gain": 0.0,
+LIKE_FOR_LIKE: dict[str, Any] = {
+    "kernel": {"shape": "none"},
+    "identity": {"minimum_probability": 0.0},
+    "keyframes": {"motion_noise_share": 0.0, "max_interval_s": 0.5},
+    "smoother": {"waiting_gain": 0.0},
 }
 KERNEL_WIDTH = 1.5
 """Of the default kernel (Cauchy), in standard deviations."""

@@ -13,7 +13,7 @@ from sonar_graph.logs import read_log, write_log
 from sonar_graph.navigation import Odometry
 from sonar_graph.navigation.preintegration import Preintegrator
 from sonar_graph.simulation import BasinOptions, simulate_basin
-from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam import Isam2, Isam2Params, KeyframeParams
 from sonar_graph.slam.models import factors
 
 # 1. A log: blocks of columns, stamps in integer nanoseconds. `help(sonar_graph)` states frames and units.
@@ -78,7 +78,7 @@ print(f"its 1 sigma: {np.sqrt(np.diag(marginals.marginalCovariance(L(1)))).round
 
 # 4. The smoother, fed as a vehicle would feed it: whatever came since the last call, and the instant for which an
 # estimate is wanted. `replay` cuts a log that way; a live program passes blocks of one row.
-smoother = Isam2(calibration, Isam2Params(max_keyframe_interval_s=3.0))
+smoother = Isam2(calibration, Isam2Params(keyframes=KeyframeParams(max_interval_s=3.0)))
 for measurements in sequence.replay(sequence.instants(rate_hz=1.0)):
     estimate = smoother.process(measurements)
 

@@ -28,7 +28,7 @@ from sonar_graph.batch.suite import EstimatorEntry, LogEntry, Place, SuiteFile
 from sonar_graph.calibration import Section
 from sonar_graph.errors import BatchError, EstimatorError, SonarGraphError, UnknownEstimatorError
 from sonar_graph.estimator import installed_estimators, load_estimator
-from sonar_graph.settings import faults_in
+from sonar_graph.settings import faults_in, field_place, flattened, nested
 from sonar_graph.simulation import LandmarkOptions
 
 DIGITS = 16
@@ -223,7 +223,7 @@ def _contestants(file: SuiteFile, number: int, entry: EstimatorEntry) -> Iterato
     except EstimatorError:  # its runs fail with the reason, and the others go on
         params = None
     for chosen in _combinations(file, place, entry.grid, entry.params, "params"):
-        given = values = entry.params | chosen
+        given = values = nested(chosen, entry.params)
         if params is not None:
             values = _checked(file, place, chosen, params, given, "params").model_dump(mode="json")
         yield _Contestant(place, entry.name, _label(entry.variant, chosen) or DEFAULT_VARIANT, given, values)
@@ -233,14 +233,15 @@ def _combinations(
     file: SuiteFile, place: Place, grid: dict[str, list[Any]], fixed: dict[str, Any], table: str
 ) -> Iterator[dict[str, Any]]:
     for name, values in grid.items():
-        if name in fixed:
-            file.refuse((*place, "grid", name), f"is also in {table}; give it in one of them")
+        at = (*place, "grid", *name.split("."))
+        if name in flattened(fixed):
+            file.refuse(at, f"is also in {table}; give it in one of them")
         if not values:
-            file.refuse((*place, "grid", name), "has no values; give at least one")
+            file.refuse(at, "has no values; give at least one")
         texts = [json.dumps(value, default=str) for value in values]
         if len(set(texts)) < len(texts):
             twice = next(text for text in texts if texts.count(text) > 1)
-            file.refuse((*place, "grid", name), f"has {twice} more than once; leave one out")
+            file.refuse(at, f"has {twice} more than once; leave one out")
     for chosen in itertools.product(*grid.values()):
         yield dict(zip(grid, chosen, strict=True))
 
@@ -249,8 +250,9 @@ def _checked(
     file: SuiteFile, place: Place, chosen: dict[str, Any], model: type[Section], values: Any, table: str = "options"
 ) -> Section:
     """Values as their model has them; a fault is told where the suite gives the value."""
+    in_grid = {name.split(".")[0] for name in chosen}
     return _validated(
-        file, place, model, values, lambda name: "grid" if name in chosen else "log" if name == "log" else table
+        file, place, model, values, lambda name: "grid" if name in in_grid else "log" if name == "log" else table
     )
 
 
@@ -260,7 +262,7 @@ def _validated(
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        at = error.errors()[0]["loc"]
+        at = field_place(model, error.errors()[0]["loc"])
         table_name = (table(str(at[0])),) if table and at else ()
         file.refuse((*place, *table_name, *at), faults_in(error, model))
 

@@ -14,7 +14,7 @@
 
     [[estimators]]
     name = "isam2"
-    grid = { lag_s = [5, 15] }
+    grid = { smoother.lag_s = [5, 15] }
 
     [[estimators]]
     name = "dead-reckoning"
@@ -31,13 +31,13 @@ import re
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, field_validator, model_validator
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import BatchError
-from sonar_graph.settings import choice, faults_in
+from sonar_graph.settings import choice, faults_in, flattened
 
 Place = tuple[int | str, ...]
 _NAME = r"""(?:[A-Za-z0-9_-]+|"[^"]*"|'[^']*')"""
@@ -134,6 +134,12 @@ LARGEST_SEED = 2**63 - 1
 """That a column of the results can hold."""
 
 
+Grid = Annotated[
+    dict[str, list[Any]], BeforeValidator(lambda given: flattened(given) if isinstance(given, dict) else given)
+]
+"""Values by name; of nested settings by dotted names."""
+
+
 class LogEntry(Section):
     """One log, data set or generator; with a grid, several of them."""
 
@@ -146,7 +152,7 @@ class LogEntry(Section):
     generator: str | None = None
     """Name of a simulator."""
     options: dict[str, Any] = Field(default_factory=dict)
-    grid: dict[str, list[Any]] = Field(default_factory=dict)
+    grid: Grid = Field(default_factory=dict)
     """Options that take each of several values, in every combination."""
     seeds: int | list[int] | None = None
     """Of a generator, or of ``landmarks``: so many from 0 on, or these."""
@@ -197,7 +203,7 @@ class EstimatorEntry(Section):
     """Name of these settings, for tables."""
     params: dict[str, Any] = Field(default_factory=dict)
     """Settings that differ from its defaults."""
-    grid: dict[str, list[Any]] = Field(default_factory=dict)
+    grid: Grid = Field(default_factory=dict)
     """Settings that take each of several values, in every combination."""
 
 

@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 
 from sonar_graph.errors import CalibrationError, EstimatorError, EvaluationError, LogError
+from sonar_graph.settings import nested
 
 if TYPE_CHECKING:
     from sonar_graph.logs import PartialCalibration
@@ -145,10 +146,7 @@ def nested_settings(texts: list[str]) -> dict[str, Any]:
     EstimatorError
         When there is no name or no ``=``, or one comes again with another value.
     """
-    settings: dict[str, Any] = {}
-    for path, value in _each_once(texts).items():
-        _put(settings, path.split("."), value)
-    return settings
+    return nested(_each_once(texts))
 
 
 def _plain_value(text: str) -> Any:
@@ -161,22 +159,21 @@ def _plain_value(text: str) -> Any:
 
 
 def estimator_settings(texts: list[str], names: list[str]) -> dict[str, dict[str, Any]]:
-    """Settings by estimator, from texts such as ``isam2.lag_s=20``; deeper dots go into nested settings.
+    """Settings by estimator, from texts such as ``isam2.smoother.lag_s=20``; dots go into nested settings.
 
     Raises
     ------
     EstimatorError
         When a text does not begin with one of the estimators that run, or one setting comes again with another value.
     """
-    settings: dict[str, dict[str, Any]] = {}
-    for path, value in _each_once(texts).items():
+    given = _each_once(texts)
+    for path in given:
         estimator, dot, setting = path.partition(".")
         if dot and estimator not in names:
             raise EstimatorError(f"--set {path}: {estimator} is not among the estimators that run: {', '.join(names)}")
         if not dot or not all(setting.split(".")):
             raise EstimatorError(f"--set {path}: expected ESTIMATOR.setting=value with one of {', '.join(names)}")
-        _put(settings.setdefault(estimator, {}), setting.split("."), value)
-    return settings
+    return nested(given)
 
 
 def _each_once(texts: list[str]) -> dict[str, Any]:
@@ -188,14 +185,6 @@ def _each_once(texts: list[str]) -> dict[str, Any]:
             raise EstimatorError(f"--set {text}: {path} is also set to {settings[path]}; give it once")
         settings[path] = value
     return settings
-
-
-def _put(tree: dict[str, Any], path: list[str], value: Any) -> None:
-    for name in path[:-1]:
-        if not isinstance(tree.get(name), dict):
-            tree[name] = {}
-        tree = tree[name]
-    tree[path[-1]] = value
 
 
 def topic_choices(texts: list[str]) -> dict[str, str]:

@@ -45,7 +45,6 @@ from sonar_graph.cli.simulate import write_basin
 from sonar_graph.errors import EstimatorError, LogError, UnknownEstimatorError
 
 if TYPE_CHECKING:
-    from sonar_graph.calibration import Section
     from sonar_graph.evaluation import Comparison
     from sonar_graph.recognition import Recognition
     from sonar_graph.sequence import Sequence
@@ -311,6 +310,7 @@ def estimators() -> None:
     """List the installed estimators with their settings, defaults and meaning."""
     from sonar_graph.errors import EstimatorError
     from sonar_graph.estimator import installed_estimators, load_estimator
+    from sonar_graph.settings import settings_of
 
     console = answers()
     failed = False
@@ -322,15 +322,10 @@ def estimators() -> None:
             failed = True
             continue
         console.print(f"[bold]{escape(name)}[/] ({escape(point.value)})", soft_wrap=True)
-        console.print(_settings_table(settings) if settings.model_fields else "  no settings")
+        table = Table("setting", "default", "meaning", box=None, pad_edge=True)
+        for setting in settings_of(settings):
+            table.add_row(escape(setting.name), escape(str(setting.default)), escape(setting.meaning))
+        console.print(table if settings.model_fields else "  no settings")
         console.print()
     if failed:
         raise typer.Exit(1)
-
-
-def _settings_table(settings: type[Section]) -> Table:
-    table = Table("setting", "default", "meaning", box=None, pad_edge=True)
-    for name, field in settings.model_fields.items():
-        default = field.get_default(call_default_factory=True)
-        table.add_row(escape(name), escape(str(default)), escape(" ".join((field.description or "").split())))
-    return table

@@ -27,6 +27,7 @@ from sonar_graph.evaluation import (
     landmark_errors,
     normalised_squares,
 )
+from sonar_graph.settings import flattened
 from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap, Outcome
 
 QUANTILE = 1 - 1e-9
@@ -40,7 +41,7 @@ NAMELESS = {Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNF
 """Outcomes of detections of which an estimator does not know what they are of."""
 UNHEARD = {Outcome.UNSOUND, Outcome.LATE, Outcome.UNLOCATED, Outcome.TRACK_REPEATED}
 """Outcomes of detections that were refused before what they are of mattered."""
-POLICY, UNKNOWN = "identity_policy", "unknown_landmarks"
+POLICY, UNKNOWN = "identity.policy", "identity.unknown.policy"
 
 
 def doubt_of_identities(comparison: Comparison) -> list[str]:
@@ -74,7 +75,7 @@ def _nothing_named(comparison: Comparison) -> list[str]:
     blind = [(run, outcomes) for run, outcomes in heard if outcomes and set(outcomes) <= NAMELESS]
     if not blind:
         return []
-    hint = "" if any(run.params.get(UNKNOWN) == "associate" for run, _ in blind) else _associate()
+    hint = "" if any(flattened(run.params).get(UNKNOWN) == "associate" for run, _ in blind) else _associate()
     names = ", ".join(run.estimator for run, _ in blind)
     count = max(len(outcomes) for _, outcomes in blind)
     return [f"Warning: none of {count} detections has an identity that {names} can use: no landmark is mapped{hint}"]
@@ -130,7 +131,7 @@ def _contradicting(run: RunResult) -> dict[int, float]:
 
 
 def _look_at(run: RunResult) -> str:
-    policy = run.params.get(POLICY)
+    policy = flattened(run.params).get(POLICY)
     if policy is None:
         return "look at identities, then at noise and start"
     return f'look at identities ({POLICY} is "{policy}"), then at noise and start'

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 from sonar_graph.evaluation import ABSENT, GATED_SHARE, Comparison, RunResult, Score, format_value
+from sonar_graph.settings import flattened
 from sonar_graph.states import Outcome
 
 TOO_CLOSE = 0.05
@@ -93,7 +94,7 @@ def lost_runs(comparison: Comparison) -> list[str]:
 
 
 def _advice(run: RunResult) -> str:
-    return ' (try identity_policy = "max-mixture")' if run.params.get("identity_policy") == "gate" else ""
+    return ' (try identity.policy = "max-mixture")' if flattened(run.params).get("identity.policy") == "gate" else ""
 
 
 def score_of(comparison: Comparison, name: str, key: str) -> Score | None:

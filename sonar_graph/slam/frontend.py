@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -16,53 +16,28 @@ from sonar_graph.slam.estimates import Solution
 from sonar_graph.slam.keyframes import Keyframes, without_unsound
 from sonar_graph.slam.landmarks import (
     AnonymousLandmarks,
-    AnonymousPolicy,
+    AssociatedUnknown,
     DeferredIdentities,
     DoubtfulIdentities,
     Identities,
+    IdentityParams,
     IdentityPosterior,
-    Kernel,
     LandmarkSightings,
     LateGate,
     Mixture,
+    MixtureIdentity,
     Sighting,
     SightingFactors,
     decide,
-    gate_threshold,
     identify,
     of_no_landmark,
     once_a_track,
     refuse_taken_ids,
     unnamed,
 )
-from sonar_graph.slam.models import FLOOR_GATE, PredictedView, Robust, locate
+from sonar_graph.slam.models import FLOOR_GATE, KernelParams, PredictedView, locate
 from sonar_graph.slam.smoother import Sightline, Smoother
 from sonar_graph.states import DetectionJournal, DetectionLog, Outcome
-
-
-@dataclass(frozen=True)
-class SightingPolicy:
-    """Which detections become factors, and how much an outlier may pull."""
-
-    identity_probability: float
-    gate_probability: float
-    kernel: Literal["none", "huber", "cauchy"]
-    kernel_width: float
-    deferred_identity: bool = True
-    """Whether detections of tracks are used once their identity is known, and moved when it turns out to be another."""
-    longest_wait_s: float = 60.0
-    """How long they wait for it."""
-    mixture: Mixture | None = None
-    """What detections may be of, chosen by where they are; None: the recogniser is believed, or not."""
-    is_graduated: bool = False
-    """Whether that is also sought by graduated non-convexity in the whole history."""
-    anonymous: AnonymousPolicy | None = None
-    """What is believed of landmarks without identities; None: their detections are refused."""
-
-    def robust(self) -> Robust:
-        """What wraps a noise model in the kernel."""
-        kernel = Kernel(self.kernel, self.kernel_width).estimator()
-        return lambda noise: gtsam.noiseModel.Robust.Create(kernel, noise) if kernel else noise
 
 
 class SightingVerdict(NamedTuple):
@@ -84,28 +59,31 @@ class Sightings:
     """Adds the factors of detected landmarks to a smoother and records what became of each detection."""
 
     calibration: Calibration
-    policy: SightingPolicy
+    identity: IdentityParams
+    kernel: KernelParams
     smoother: Smoother
     keyframes: Keyframes
     journal: DetectionJournal = field(default_factory=DetectionJournal)
 
     def __post_init__(self) -> None:
-        sonar = self.calibration.sonar
+        sonar, identity = self.calibration.sonar, self.identity
         self._body_T_sonar = sonar.mounting.pose()
         self._default_cov = np.diag([sonar.range_sigma_m**2, sonar.azimuth_sigma_rad**2])
-        probability = self.policy.gate_probability
-        self._gate = gate_threshold(probability, 2) if probability < 1 else np.inf
-        self._factors = SightingFactors(sonar, self.policy.robust())
+        self._factors = SightingFactors(sonar, self.kernel.robust)
         landmarks = self._landmarks = LandmarkSightings(self.smoother, self._factors)
         self.smoother.when_withheld = lambda withheld: self._landmarks.withhold(withheld, self.journal)
+        self._doubtful: DoubtfulIdentities | None = None
+        self._anonymous: AnonymousLandmarks | None = None
+        self._minimum_probability, self._gate, self._is_deferred = 0.0, np.inf, True
+        if isinstance(identity, MixtureIdentity):
+            self._doubtful = DoubtfulIdentities(landmarks, self.journal, identity, Mixture(identity, self.kernel))
+        else:
+            self._minimum_probability, self._gate = identity.minimum_probability, identity.gate
+            self._is_deferred = identity.longest_wait_s > 0
+            if isinstance(identity.unknown, AssociatedUnknown):
+                self._anonymous = AnonymousLandmarks(landmarks, self.journal, identity.unknown)
         gate = LateGate(self.smoother, self._gate)
-        wait_s, mixture, anonymous = self.policy.longest_wait_s, self.policy.mixture, self.policy.anonymous
-        graduated = self.policy.is_graduated
-        self._deferred = DeferredIdentities(landmarks, self.journal, gate, wait_s)
-        self._doubtful = (
-            DoubtfulIdentities(landmarks, self.journal, mixture, wait_s, is_graduated=graduated) if mixture else None
-        )
-        self._anonymous = AnonymousLandmarks(landmarks, self.journal, anonymous) if anonymous else None
+        self._deferred = DeferredIdentities(landmarks, self.journal, gate, identity.longest_wait_s)
 
     @property
     def ids(self) -> set[int]:
@@ -133,19 +111,19 @@ class Sightings:
             for landmark_id in frame.most_probable()[0].tolist():
                 self.journal.record(stamp_ns, landmark_id, late)
             return
-        if self.policy.deferred_identity or self._doubtful is not None:
+        if self._is_deferred:
             known = of_no_landmark if self._doubtful is not None else self._deferred.identity_of
             frame = once_a_track(frame, known, self.journal)
-        identities = identify(frame, self.policy.identity_probability)
-        is_unnamed = unnamed(frame) & (self._anonymous is not None)
         if self._doubtful is not None:
             self._doubt(self._doubtful, stamp_ns, frame)
             return
-        is_tracked = (frame.track != NO_TRACK) & self.policy.deferred_identity & ~is_unnamed
+        identities = identify(frame, self._minimum_probability)
+        is_unnamed = unnamed(frame) & (self._anonymous is not None)
+        is_tracked = (frame.track != NO_TRACK) & self._is_deferred & ~is_unnamed
         if is_tracked.any():
             self.keyframes.update_if_due()
             tracked = frame.rows(is_tracked)
-            self._deferred.hear(tracked, decide(tracked, self.policy.identity_probability), self.keyframes.newest_s)
+            self._deferred.hear(tracked, decide(tracked, self._minimum_probability), self.keyframes.newest_s)
         verdicts = self._judge(stamp_ns, frame, identities, is_tracked.tolist())
         if is_unnamed.any():
             seen = self._seen(frame, identities, is_unnamed.tolist(), np.flatnonzero(is_unnamed).tolist())

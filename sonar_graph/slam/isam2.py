@@ -9,20 +9,18 @@ Flow of one call of `Isam2.process`::
 
 A frame is tied to its keyframe through the odometry between them: the sonar's pose in the keyframe's body frame at the
 time of the frame. Keyframes can then be sparser than frames at no loss but the (included) noise of that short motion.
-
-Settings of the smoother that exclude each other, or do nothing beside another: all reasons, in one place.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L
-from pydantic import Field, model_validator
+from pydantic import BaseModel, model_validator
 
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import CalibrationError, EstimatorError
@@ -30,118 +28,74 @@ from sonar_graph.measurements import Floats, Ints, Measurements
 from sonar_graph.sequence import NS_PER_S
 from sonar_graph.settings import misfits
 from sonar_graph.slam.estimates import AnchoredPose, Over, PoseHistory, joint_covariance
-from sonar_graph.slam.frontend import SightingPolicy, Sightings
-from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
-from sonar_graph.slam.landmarks import AnonymousPolicy, Kernel, Mixture, RecogniserErrors
-from sonar_graph.slam.smoother import JointCovariance, Smoother
+from sonar_graph.slam.frontend import Sightings
+from sonar_graph.slam.keyframes import KeyframeParams, Keyframes
+from sonar_graph.slam.landmarks import IdentityParams, MixtureIdentity, RobustIdentity
+from sonar_graph.slam.models import KernelParams, RobustKernel
+from sonar_graph.slam.smoother import HistoryParams, JointCovariance, Smoother, SmootherParams, WholeHistory
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, RefusedRow, Trajectory
+
+OLD_NAMES = {
+    "lag_s": "smoother.lag_s",
+    "relinearize_threshold": "smoother.relinearize_threshold",
+    "stale_shift_m": "smoother.stale_shift_m",
+    "waiting_gain": "smoother.waiting_gain",
+    "history": "history.policy",
+    "remembered_s": "history.remembered_s",
+    "max_keyframe_interval_s": "keyframes.max_interval_s",
+    "motion_noise_share": "keyframes.motion_noise_share",
+    "bias_interval_s": "keyframes.bias_interval_s",
+    "kernel": "kernel.shape",
+    "kernel_width": "kernel.width",
+    "identity_policy": "identity.policy",
+    "identity_probability": "identity.minimum_probability",
+    "gate_probability": "identity.gate_probability",
+    "deferred_identity": "identity.longest_wait_s, where 0 turns it off",
+    "longest_wait_s": "identity.longest_wait_s",
+    "wrong_id_probability": "identity.wrong_id_probability",
+    "view_range_m": "identity.view_range_m",
+    "view_azimuth_rad": "identity.view_azimuth_rad",
+    "unknown_landmarks": "identity.unknown.policy",
+    "unknown_gate_probability": "identity.unknown.gate_probability",
+    "unknown_density_m2": "identity.unknown.density_m2",
+    "unknown_sightings": "identity.unknown.sightings",
+    "unknown_wait_s": "identity.unknown.longest_wait_s",
+}
+"""Settings that had a name of one word before they were in sections."""
 
 
 class Isam2Params(Section):
     """Settings of the smoothing estimator."""
 
-    lag_s: float = Field(15.0, gt=0)
-    """Poses older than this are marginalised out of the incremental solution; a large value keeps the whole history."""
-    history: Literal["whole", "bounded"] = "whole"
-    """What is kept of poses older than the lag. "whole": everything, for the batch solution in `Isam2.trajectory`.
-    "bounded": nothing but what they say of landmarks and bias, so that time and memory do not grow with the run;
-    `Isam2.trajectory` is then what the lag allowed (docs/theory/bounded_memory.md)."""
-    remembered_s: float | None = Field(None, gt=0)
-    """With a bounded history: `Isam2.trajectory` and `Isam2.detections` forget what is older than this (and up to a
-    quarter more); None: nothing."""
-    max_keyframe_interval_s: float = Field(5.0, gt=0)
-    """A keyframe is set at the latest after this time."""
-    motion_noise_share: float = Field(0.1, ge=0)
-    """While landmarks are seen, a keyframe is set sooner: once the variance of the motion since the last one exceeds
-    this share of the sonar's variance. 0: every frame with a landmark."""
-    waiting_gain: float = Field(5.0, ge=0)
-    """Sightings wait for the next keyframe until what they would add, the sum of expected over measured variance,
-    exceeds this. 0: none waits."""
-    bias_interval_s: float = Field(60.0, gt=0)
-    """The gyro bias is constant over stretches of this length."""
-    relinearize_threshold: float = Field(0.001, gt=0)
-    """A variable is relinearised when a component of its change exceeds this (rad or m)."""
-    stale_shift_m: float = Field(0.1, gt=0)
-    """The window is linearised anew, from a solution of the whole graph, when a landmark has moved farther."""
-    kernel: Literal["none", "huber", "cauchy"] = "cauchy"
-    """Robust kernel on range and on azimuth. It may let an outlier at a landmark's first sighting be outvoted later,
-    which a gate cannot, unless it lies too far off; where noise is Gaussian it costs next to nothing (measured in
-    docs/theory/isam2.md)."""
-    kernel_width: float = Field(1.5, gt=0)
-    """Width of the kernel, in standard deviations."""
-    identity_probability: float = Field(0.7, ge=0, le=1)
-    """A detection is used when its most probable identity has at least this posterior."""
-    gate_probability: float = Field(0.999, gt=0, le=1)
-    """With `identity_policy` "gate": a detection whose squared Mahalanobis innovation exceeds this chi-square quantile
-    (2 dof) is refused; 1: none."""
+    keyframes: KeyframeParams = KeyframeParams()
+    """Where keyframes are set."""
+    smoother: SmootherParams = SmootherParams()
+    """The incremental solution."""
+    history: HistoryParams = WholeHistory()
+    """What is kept of poses older than the lag."""
+    kernel: KernelParams = RobustKernel()
+    """Shape of the noise of range and of azimuth, under every identity policy."""
+    identity: IdentityParams = RobustIdentity()
+    """What is made of identities that may be wrong (docs/theory/doubtful_identities.md)."""
 
-    identity_policy: Literal["gate", "robust", "max-mixture", "gnc"] = "robust"
-    """What is made of identities that may be wrong (docs/theory/doubtful_identities.md).
-
-    "gate": what is probable enough is believed, if it lies where that landmark is expected (`gate_probability`).
-    Assumes that the estimate and its covariance are right when a detection comes; nothing is taken back.
-    "robust": what is probable enough is believed. Assumes that most sightings of every landmark are right, and that
-    wrong ones disagree with each other: the kernel then lets the majority win, unless a landmark's first sighting is
-    so far off that the others hardly pull.
-    "max-mixture": a detection, or a track, is of the landmark that its place and its posterior together make most
-    probable, or of none; chosen anew in the window as the estimate moves, in the whole history for smoothed results.
-    Assumes `wrong_id_probability`, errors that are independent, and an estimate that is near when it chooses.
-    "gnc": the same, and smoothed results also try what graduated non-convexity finds in the whole history, which needs
-    no near estimate; assumes that most of what the recogniser says is right.
-    The last two want a whole history and take no ``unknown_landmarks = "associate"``.
-
-    `kernel` is the shape of the noise under all of them."""
-    wrong_id_probability: float = Field(0.05, gt=0, lt=1)
-    """Probability that what the recogniser says has nothing to do with what was seen, beside what its posterior admits.
-    The mixture's other landmarks share one half of it, no landmark has the other."""
-    view_range_m: float = Field(10.0, gt=0)
-    """Detections of no landmark are spread evenly over so much range."""
-    view_azimuth_rad: float = Field(2.0, gt=0)
-    """The same of azimuth."""
-
-    deferred_identity: bool = True
-    """Detections of one track wait until its identity is known, and are moved when it turns out to be another. Has no
-    effect where detections belong to no track."""
-    longest_wait_s: float = Field(60.0, gt=0)
-    """A detection waits at most so long for its identity. A track not seen for so long keeps the one it has."""
-
-    unknown_landmarks: Literal["ignore", "associate"] = "ignore"
-    """What becomes of detections that name no landmark: ``ignore`` refuses them; ``associate`` pairs them with
-    landmarks by geometry, and begins landmarks with identities from 3000000000 on; docs/theory/unknown_landmarks.md
-    says on what conditions."""
-    unknown_gate_probability: float = Field(0.9999, gt=0, lt=1)
-    """A true pairing of a frame's detections with landmarks is jointly compatible with this probability."""
-    unknown_density_m2: float = Field(0.05, gt=0)
-    """Landmarks a square metre that may be there and are not in the map: the rival of every pairing."""
-    unknown_sightings: int = Field(5, ge=1)
-    """So many sightings of what is paired with no landmark begin one."""
-    unknown_wait_s: float = Field(10.0, gt=0)
-    """So long, and no longer than ``lag_s``, a sighting waits for them."""
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_old_names(cls, given: Any) -> Any:
+        fields = given if isinstance(given, dict) else {}
+        old = [name for name in OLD_NAMES if name in fields and not isinstance(fields[name], dict | BaseModel)]
+        if old:
+            raise misfits(cls, {name: f"{name} is now {OLD_NAMES[name]}" for name in old})
+        return given
 
     @model_validator(mode="after")
-    def _check_conflicts(self) -> Self:
-        found = conflicts(self)
-        if found:
-            raise misfits(type(self), {conflict.setting: conflict.reason for conflict in found})
+    def _check_history(self) -> Self:
+        if self.history.policy == "bounded" and isinstance(self.identity, MixtureIdentity):
+            reason = (
+                f'history.policy = "bounded" cannot be with identity.policy = "{self.identity.policy}", which chooses'
+                ' anew in the whole history; give history.policy = "whole", or identity.policy = "robust"'
+            )
+            raise misfits(type(self), {"history": reason})
         return self
-
-    def mixture(self) -> Mixture | None:
-        """What detections may be of; None: the recogniser is believed, or not."""
-        if self.identity_policy in ("gate", "robust"):
-            return None
-        errors = RecogniserErrors(self.wrong_id_probability, self.view_range_m, self.view_azimuth_rad)
-        return Mixture(errors, Kernel(self.kernel, self.kernel_width))
-
-    def anonymous(self) -> AnonymousPolicy | None:
-        """What is believed of landmarks without identities; None: their detections are refused."""
-        if self.unknown_landmarks == "ignore":
-            return None
-        return AnonymousPolicy(
-            self.unknown_gate_probability,
-            self.unknown_density_m2,
-            self.unknown_sightings,
-            min(self.unknown_wait_s, self.lag_s),
-        )
 
 
 class Isam2:
@@ -162,24 +116,10 @@ class Isam2:
         self._calibration = calibration
         self._params = _settings(params)
         p = self._params
-        self._smoother = Smoother(
-            p.lag_s, p.relinearize_threshold, p.stale_shift_m, p.waiting_gain, is_bounded=p.history == "bounded"
-        )
+        self._smoother = Smoother(p.smoother, is_bounded=p.history.policy == "bounded")
         self._smoother.when_leaving = self._leave
-        policy = KeyframePolicy(p.max_keyframe_interval_s, p.motion_noise_share, p.bias_interval_s)
-        self._keyframes = Keyframes(calibration, policy, self._smoother)
-        sightings = SightingPolicy(
-            p.identity_probability,
-            p.gate_probability if p.identity_policy == "gate" else 1.0,
-            p.kernel,
-            p.kernel_width,
-            p.deferred_identity,
-            p.longest_wait_s,
-            p.mixture(),
-            p.identity_policy == "gnc",
-            p.anonymous(),
-        )
-        self._sightings = Sightings(calibration, sightings, self._smoother, self._keyframes)
+        self._keyframes = Keyframes(calibration, p.keyframes, self._smoother)
+        self._sightings = Sightings(calibration, p.identity, p.kernel, self._smoother, self._keyframes)
         self._asked = PoseHistory()
         self._forgot_s = -math.inf
 
@@ -232,7 +172,8 @@ class Isam2:
 
     def _forget(self, now_s: float) -> None:
         """Drop what need not be remembered, a good deal at a time."""
-        remembered_s = self._params.remembered_s
+        history = self._params.history
+        remembered_s = history.remembered_s if history.policy == "bounded" else None
         if remembered_s is not None and now_s - self._forgot_s > remembered_s / 4:
             self._forgot_s, oldest_ns = now_s, round((now_s - remembered_s) * NS_PER_S)
             self._asked.forget_before(oldest_ns)
@@ -373,69 +314,3 @@ def _check_noise(calibration: Calibration) -> None:
         raise CalibrationError(
             f"isam2: {', '.join(zero)} must be above zero; give a small value for what is known well"
         )
-
-
-_OF_MIXTURES = ("wrong_id_probability", "view_range_m", "view_azimuth_rad")
-_OF_UNKNOWN = ("unknown_gate_probability", "unknown_density_m2", "unknown_sightings", "unknown_wait_s")
-
-
-class Conflict(NamedTuple):
-    """A setting that cannot stand beside the others."""
-
-    setting: str
-    reason: str
-    """With what it collides, and what to do: one line that names the setting."""
-
-
-def conflicts(params: Isam2Params) -> list[Conflict]:
-    """What excludes each other, then what was set on purpose and does nothing."""
-    return [*_excluding(params), *_idle(params)]
-
-
-def _excluding(params: Isam2Params) -> list[Conflict]:
-    """A mixture is of landmarks that have names, in a history that is kept."""
-    if params.mixture() is None:
-        return []
-    policy, found = f'identity_policy = "{params.identity_policy}"', []
-    if params.history == "bounded":
-        reason = (
-            f"{policy} chooses anew in the whole history; give it"
-            ' history = "whole", or history = "bounded" with identity_policy = "robust"'
-        )
-        found.append(Conflict("history", reason))
-    if params.unknown_landmarks == "associate":
-        reason = (
-            f"{policy} pairs detections by place itself, and begins no landmark"
-            ' without a name; give it unknown_landmarks = "ignore", or "associate" with identity_policy = "robust"'
-        )
-        found.append(Conflict("unknown_landmarks", reason))
-    return found
-
-
-def _idle(params: Isam2Params) -> list[Conflict]:
-    """Settings that were given and that nothing asks for; what says the same as the others is let through."""
-    given = params.model_fields_set
-    idle = {name: why for name, why in _without_effect(params).items() if name in given}
-    return [Conflict(name, f"{name} is of no effect with {why}") for name, why in idle.items()]
-
-
-def _without_effect(params: Isam2Params) -> dict[str, str]:
-    """Beside which setting each of them does nothing, and what to set for it to do something."""
-    policy, idle = f'"{params.identity_policy}"', {}
-    if params.identity_policy != "gate" and params.gate_probability < 1:
-        idle["gate_probability"] = f'{policy}: set identity_policy = "gate"'
-    if params.mixture() is None:
-        idle |= dict.fromkeys(_OF_MIXTURES, f'{policy}: set identity_policy = "max-mixture" or "gnc"')
-        if not params.deferred_identity:
-            idle["longest_wait_s"] = "deferred_identity = false: leave one of them out"
-    else:
-        idle["identity_probability"] = f"{policy}, which weighs every posterior: leave it out"
-        if not params.deferred_identity:
-            idle["deferred_identity"] = f"{policy}, which always decides on whole tracks: leave it out"
-    if params.unknown_landmarks == "ignore":
-        idle |= dict.fromkeys(_OF_UNKNOWN, 'unknown_landmarks = "ignore": set unknown_landmarks = "associate"')
-    if params.kernel == "none":
-        idle["kernel_width"] = 'kernel = "none": set kernel = "cauchy" or "huber"'
-    if params.history == "whole" and params.remembered_s is not None:
-        idle["remembered_s"] = 'history = "whole": set history = "bounded"'
-    return idle

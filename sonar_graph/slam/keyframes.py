@@ -20,8 +20,9 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, X
 from numpy.typing import NDArray
+from pydantic import Field
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import Calibration, Section
 from sonar_graph.devices import in_numbers
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections, possible_ranges
 from sonar_graph.navigation import Odometry, RunningMotion, motion_between_nodes, weights_at_end
@@ -95,14 +96,16 @@ Rows = TypeVar("Rows", Dvl, Depth)
 EARLIEST_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 
-@dataclass(frozen=True)
-class KeyframePolicy:
-    """When a keyframe is set."""
+class KeyframeParams(Section):
+    """Settings of the keyframes."""
 
-    max_interval_s: float
-    motion_noise_share: float
-    """Variance of the motion since the last keyframe over the sonar's, above which a frame gets a keyframe."""
-    bias_interval_s: float
+    max_interval_s: float = Field(5.0, gt=0)
+    """A keyframe is set at the latest after this time."""
+    motion_noise_share: float = Field(0.1, ge=0)
+    """While landmarks are seen, a keyframe is set sooner: once the variance of the motion since the last one exceeds
+    this share of the sonar's variance. 0: every frame with a landmark."""
+    bias_interval_s: float = Field(60.0, gt=0)
+    """The gyro bias is constant over stretches of this length."""
 
 
 class Carried(NamedTuple):
@@ -118,7 +121,7 @@ class Keyframes:
     """Sets keyframes along the odometry and adds their factors to a smoother."""
 
     calibration: Calibration
-    policy: KeyframePolicy
+    params: KeyframeParams
     smoother: Smoother
     stamps_ns: list[int] = field(default_factory=list)
     """Of each keyframe; its key is ``X(index)``."""
@@ -197,7 +200,7 @@ class Keyframes:
             if start_ns is None:
                 return
             self._start(start_ns)
-        interval_ns = round(self.policy.max_interval_s / S_PER_NS)
+        interval_ns = round(self.params.max_interval_s / S_PER_NS)
         for node_ns in self.odometry.nodes(self.stamps_ns[-1], until_ns).tolist():
             if node_ns - self.stamps_ns[-1] >= interval_ns:
                 self._set(node_ns)
@@ -238,7 +241,7 @@ class Keyframes:
         sonar, bias_sigma = self.calibration.sonar, self.calibration.imu.gyro_bias_sigma
         turn, shift = largest_variances(motion.covariance, motion.D_bias, bias_sigma)
         share = max(turn / sonar.azimuth_sigma_rad**2, shift / sonar.range_sigma_m**2)
-        return share > self.policy.motion_noise_share
+        return share > self.params.motion_noise_share
 
     def motion_since_newest(self, until_ns: int) -> PreintegratedMotion:
         """Provisional motion from the newest keyframe to an instant not before that of any earlier call."""
@@ -366,7 +369,7 @@ class Keyframes:
     def _next_bias_key(self, i: int, node_ns: int) -> int:
         elapsed_s = (node_ns - self._bias_since_ns) * S_PER_NS
         walk = self.calibration.imu.gyro_bias_walk_density
-        if not self._estimates_bias or walk == 0 or elapsed_s < self.policy.bias_interval_s:
+        if not self._estimates_bias or walk == 0 or elapsed_s < self.params.bias_interval_s:
             return self.bias_keys[i]
         old = self.bias_keys[i]
         new = B(gtsam.Symbol(old).index() + 1)

@@ -33,14 +33,14 @@ def test_every_combination_is_planned_once_in_order(write_suite: WriteSuite) -> 
         BASIN,
         "grid = { wrong_id_rate = [0.0, 0.1], frame_rate_hz = [1, 2] }\nseeds = 2\n",
         DEAD_RECKONING,
-        ISAM2 + 'variant = "short"\ngrid = { lag_s = [5, 15] }\n',
+        ISAM2 + 'variant = "short"\ngrid = { smoother.lag_s = [5, 15] }\n',
     )
     assert len({run.key for run in runs}) == len(runs) == 4 * 2 * 3
-    assert [run.variant for run in runs[:3]] == ["default", "short, lag_s=5", "short, lag_s=15"]
+    assert [run.variant for run in runs[:3]] == ["default", "short, smoother.lag_s=5", "short, smoother.lag_s=15"]
     assert [run.seed for run in runs[:6]] == [0, 0, 0, 1, 1, 1]
     assert runs[-1].log == "basin, wrong_id_rate=0.1, frame_rate_hz=2"
     assert runs[-1].options["wrong_id_rate"] == 0.1
-    assert runs[-1].params["lag_s"] == 15
+    assert runs[-1].params["smoother"]["lag_s"] == 15
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_every_combination_is_planned_once_in_order(write_suite: WriteSuite) -> 
     [
         (HEADER_OF_ISAM2, BASIN.replace("120", "121"), ISAM2),
         (HEADER_OF_ISAM2, BASIN, "seeds = [1]\n", ISAM2),
-        (HEADER_OF_ISAM2, BASIN, ISAM2, "params = { lag_s = 14 }\n"),
+        (HEADER_OF_ISAM2, BASIN, ISAM2, "params = { smoother.lag_s = 14 }\n"),
         (HEADER_OF_ISAM2, "rate_hz = 1\n", BASIN, ISAM2),
         (HEADER, BASIN, DEAD_RECKONING),
     ],
@@ -79,7 +79,7 @@ def test_key_does_not_change_with_names_or_with_defaults_written_out(write_suite
         BASIN.replace('"basin"\ngen', '"pool"\ngen').replace("laps = 1", "laps = 1, wrong_id_rate = 0.0"),
         "seeds = [0]\n",
         ISAM2,
-        "params = { lag_s = 15.0 }\n",
+        "params = { smoother.lag_s = 15.0 }\n",
     )
     assert same == key(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2)
 
@@ -136,21 +136,26 @@ def test_estimator_that_cannot_be_loaded_is_planned(write_suite: WriteSuite, mis
 
 
 def test_settings_that_exclude_each_other_are_told_with_line_and_key(write_suite: WriteSuite) -> None:
-    text = 'params = { identity_policy = "gnc" }\ngrid = { history = ["whole", "bounded"] }\n'
-    with pytest.raises(BatchError, match=r'line 11: estimators\.0\.grid\.history: .*"gnc" chooses anew'):
+    text = 'params = { identity.policy = "gnc" }\ngrid = { history.policy = ["whole", "bounded"] }\n'
+    with pytest.raises(BatchError, match=r'line 11: estimators\.0\.grid\.history: .*"gnc", which chooses anew'):
         planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2, text)
 
 
 def test_what_was_asked_for_is_what_the_suite_states(write_suite: WriteSuite) -> None:
     (run,) = planned(
-        write_suite, HEADER_OF_ISAM2, BASIN, "grid = { wrong_id_rate = [0.1] }\n", ISAM2, "params = { lag_s = 14 }\n"
+        write_suite,
+        HEADER_OF_ISAM2,
+        BASIN,
+        "grid = { wrong_id_rate = [0.1] }\n",
+        ISAM2,
+        "params = { smoother.lag_s = 14 }\n",
     )
     assert run.asked == {
         "generator": "basin",
         "options": {"duration_s": 120, "laps": 1, "wrong_id_rate": 0.1},
         "files": {},
         "landmarks": None,
-        "settings": {"lag_s": 14},
+        "settings": {"smoother": {"lag_s": 14}},
         "rate_hz": 2.0,
     }
 

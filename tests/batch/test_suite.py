@@ -43,9 +43,13 @@ def second(entry: str) -> str:
         (HEADER + BASIN + "grid = { wrong_id_rate = [] }\n" + DEAD_RECKONING, "grid", "has no values"),
         (HEADER + BASIN + "grid = { laps = [1, 2] }\n" + DEAD_RECKONING, "grid", "grid.laps: is also in options"),
         (
-            HEADER + BASIN + DEAD_RECKONING + ISAM2 + "params = { lag_s = 3 }\ngrid = { lag_s = [4] }\n",
+            HEADER
+            + BASIN
+            + DEAD_RECKONING
+            + ISAM2
+            + "params = { smoother.lag_s = 3 }\ngrid = { smoother.lag_s = [4] }\n",
             "grid",
-            "grid.lag_s: is also in params",
+            "grid.smoother.lag_s: is also in params",
         ),
         (HEADER + BASIN + "seeds = 0\n" + DEAD_RECKONING, "seeds", "has no seeds"),
         (HEADER + BASIN + "seeds = []\n" + DEAD_RECKONING, "seeds", "has no seeds"),
@@ -55,8 +59,12 @@ def second(entry: str) -> str:
             "deaf",
             "estimators.0.name: no estimator is called",
         ),
-        (HEADER + BASIN + DEAD_RECKONING + ISAM2 + "params = { lag = 1 }\n", "lag = 1", "did you mean lag_s?"),
-        (HEADER + BASIN + DEAD_RECKONING + ISAM2 + "[estimators.grid]\n\nlag_s = [1, -1]\n", "lag_s", "grid.lag_s"),
+        (HEADER + BASIN + DEAD_RECKONING + ISAM2 + "params = { smoother.lag = 1 }\n", "lag = 1", "did you mean lag_s?"),
+        (
+            HEADER + BASIN + DEAD_RECKONING + ISAM2 + "[estimators.grid]\n\nsmoother.lag_s = [1, -1]\n",
+            "lag_s",
+            "grid.smoother.lag_s",
+        ),
         (HEADER + BASIN + ISAM2, "reference", "'dead-reckoning' does not run here; what does: isam2"),
         (HEADER + 'metrics = ["ate"]\n' + BASIN + DEAD_RECKONING, "metrics", "there is no score 'ate'"),
         (HEADER + BASIN + second(BASIN) + DEAD_RECKONING, "# second", "logs.1: two logs are called 'basin'"),

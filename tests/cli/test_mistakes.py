@@ -45,8 +45,8 @@ MISTAKES = {
     "setting without name": (["run", "LOG", "-o", "OUT", "--set", "isam2.=1"], "expected ESTIMATOR.setting=value"),
     "unknown setting": (["run", "LOG", "-o", "OUT", "--set", "isam2.nonsense=1"], "nonsense"),
     "setting twice": (
-        ["run", "LOG", "-o", "OUT", "--set", "isam2.lag_s=5", "--set", "isam2.lag_s=6"],
-        "isam2.lag_s is also set to 5; give it once",
+        ["run", "LOG", "-o", "OUT", "--set", "isam2.smoother.lag_s=5", "--set", "isam2.smoother.lag_s=6"],
+        "isam2.smoother.lag_s is also set to 5; give it once",
     ),
     "simulation option twice": (
         ["simulate", "basin", "-o", "new.mcap", "--set", "tracks=true", "--set", "tracks=false"],
@@ -57,12 +57,12 @@ MISTAKES = {
         "wrong_id_share = 0.3 is a share of a track; set tracks = true",
     ),
     "settings that exclude each other": (
-        ["run", "TEXT", "-o", "OUT", "--set", "isam2.identity_policy=gnc", "--set", "isam2.history=bounded"],
-        'settings of isam2: identity_policy = "gnc" chooses anew in the whole history',
+        ["run", "TEXT", "-o", "OUT", "--set", "isam2.identity.policy=gnc", "--set", "isam2.history.policy=bounded"],
+        'settings of isam2: history.policy = "bounded" cannot be with identity.policy = "gnc"',
     ),
     "setting that does nothing": (
-        ["run", "TEXT", "-o", "OUT", "--set", "isam2.remembered_s=10"],
-        'remembered_s is of no effect with history = "whole"',
+        ["run", "TEXT", "-o", "OUT", "--set", "isam2.history.remembered_s=10"],
+        'there is no such field with policy = "whole"; history.policy = "bounded" has it',
     ),
     "topic without role": (["run", "LOG", "-o", "OUT", "--topic", "/imu/data"], "expected ROLE=TOPIC"),
     "topic of no such role": (["run", "LOG", "-o", "OUT", "--topic", "smell=/imu/data"], "smell"),

@@ -27,7 +27,7 @@ def with_map(
     comparison = only(basin_comparison(60), "isam2")
     positions = LANDMARKS + np.column_stack([offsets_m, np.zeros(4), np.zeros(4)])
     found = LandmarkMap(ids, positions, np.tile(SIGMA_M**2 * np.eye(3), (4, 1, 1)))
-    run = replace(comparison.runs[0], landmarks=found, params={"identity_policy": policy}, **changes)
+    run = replace(comparison.runs[0], landmarks=found, params={"identity": {"policy": policy}}, **changes)
     sequence = comparison.sequence if has_truth else replace(comparison.sequence, true_landmarks=None)
     return replace(with_run(comparison, run), sequence=sequence)
 
@@ -47,7 +47,7 @@ def test_a_landmark_that_its_covariance_rules_out_is_named_with_the_policy() -> 
     comparison = with_map(IDS, [0.0, 0.05, 5.0, 0.01])
     line = (
         "Warning: isam2 puts landmark 3 far outside its covariance (NEES up to 31250); "
-        'look at identities (identity_policy is "robust"), then at noise and start'
+        'look at identities (identity.policy is "robust"), then at noise and start'
     )
     assert doubt_of_identities(comparison) == [line]
     assert line in printed(comparison, 200)
@@ -110,7 +110,7 @@ def test_a_log_without_any_identity_is_told_with_what_to_do(outcome: Outcome) ->
     blind = with_map(IDS, [0.0] * 4, detections=log)
     line = (
         "Warning: none of 6 detections has an identity that isam2 can use: no landmark is mapped; "
-        'isam2 maps them by place with unknown_landmarks = "associate"'
+        'isam2 maps them by place with identity.unknown.policy = "associate"'
     )
     assert doubt_of_identities(blind) == [line]
     assert line in printed(blind, 200)
@@ -135,20 +135,22 @@ def test_runs_that_know_no_identity_are_named_together_with_the_most_that_any_wa
     (line,) = doubt_of_identities(comparison)
     assert line.startswith("Warning: none of 6 detections has an identity that isam2, ekf-slam can use")
     assert "associate" in line
-    comparison = with_run(comparison, replace(comparison.runs[0], params={"unknown_landmarks": "associate"}))
+    comparison = with_run(
+        comparison, replace(comparison.runs[0], params={"identity": {"unknown": {"policy": "associate"}}})
+    )
     assert not any("associate" in line for line in doubt_of_identities(comparison))
 
 
 def test_what_is_asked_for_already_is_not_advised() -> None:
     blind = with_map(IDS, [0.0] * 4, detections=log_of([Outcome.WAITING] * 6, [np.nan] * 6))
-    run: RunResult = replace(blind.runs[0], params={"unknown_landmarks": "associate"})
+    run: RunResult = replace(blind.runs[0], params={"identity": {"unknown": {"policy": "associate"}}})
     (line,) = doubt_of_identities(with_run(blind, run))
     assert line.endswith("no landmark is mapped")
 
 
 def test_landmarks_without_a_name_are_counted_and_scored_by_place() -> None:
     nameless = with_map(np.arange(4) + FIRST_ANONYMOUS_ID, [0.01, 0.02, 3.0, 0.01])
-    sentence = "isam2 found 4 landmarks without a name (unknown_landmarks); scored by place, as 1, 2 and 4."
+    sentence = "isam2 found 4 landmarks without a name (identity.unknown.policy); scored by place, as 1, 2 and 4."
     assert nameless_landmarks(nameless) == [sentence]
     assert sentence in printed(nameless, 200)
     assert sentence in render_report(nameless)
@@ -176,5 +178,5 @@ def test_an_identity_that_is_merely_wrong_is_not_named_by_place() -> None:
 def test_without_truth_they_are_only_counted() -> None:
     nameless = with_map(np.array([1, 2, 3, FIRST_ANONYMOUS_ID]), [0.0] * 4, has_truth=False)
     assert nameless_landmarks(nameless) == [
-        "isam2 found 1 landmark without a name (unknown_landmarks); identities from 3000000000 on are made up."
+        "isam2 found 1 landmark without a name (identity.unknown.policy); identities from 3000000000 on are made up."
     ]

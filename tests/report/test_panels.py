@@ -27,7 +27,7 @@ def test_names_stand_at_the_left_of_every_row_only() -> None:
     assert set(shown[1] + shown[2] + shown[4]) == {""}
 
 
-@pytest.mark.parametrize("name", ["isam2/identity_policy=max-mixture", "a, b=1, c=2", "plain", "/=,", "x" * 40])
+@pytest.mark.parametrize("name", ["isam2/identity.policy=max-mixture", "a, b=1, c=2", "plain", "/=,", "x" * 40])
 def test_folding_loses_no_letter(name: str) -> None:
     lines = folded(name, 18).split("\n")
     assert "".join(lines).replace(" ", "") == name.replace(" ", "")

@@ -165,10 +165,10 @@ def test_a_gate_that_refuses_much_may_have_three_causes():
     run = comparison.runs[0]
     gated = replace(run.detections, outcomes=[Outcome.GATED] * 30 + [Outcome.USED] * 30)
     for policy, advice in (
-        ("gate", 'identities are wrong (try identity_policy = "max-mixture"), or'),
+        ("gate", 'identities are wrong (try identity.policy = "max-mixture"), or'),
         (None, "wrong, or"),
     ):
-        params = {} if policy is None else {"identity_policy": policy}
+        params = {} if policy is None else {"identity": {"policy": policy}}
         (sentence,) = lost_runs(with_run(comparison, replace(run, detections=gated, params=params)))
         assert "refused 30 of 60 detections as outside its gate: it has lost its way, identities are wrong" in sentence
         assert advice in sentence

@@ -6,16 +6,21 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration, FloorPrior, ImuCalibration, Mounting, SonarCalibration, Start
 from sonar_graph.measurements import Dvl, Floats, Imu, LandmarkDetections
-from sonar_graph.slam.frontend import SightingPolicy, Sightings
-from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
+from sonar_graph.slam import GatedIdentity, GaussianKernel, KeyframeParams, MixtureIdentity, RobustKernel
+from sonar_graph.slam.frontend import Sightings
+from sonar_graph.slam.keyframes import Keyframes
+from sonar_graph.slam.landmarks.tracked import TrackedIdentity
 from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import Outcome
+
+from .made import smoother_with
 
 NS = 1_000_000_000
 T0_NS = 1_500_000_000 * NS
 START_NS = T0_NS - 1
-POLICY = KeyframePolicy(max_interval_s=5.0, motion_noise_share=1e9, bias_interval_s=60.0)
-TRUSTING = SightingPolicy(identity_probability=0.7, gate_probability=0.99, kernel="none", kernel_width=2.0)
+POLICY = KeyframeParams(max_interval_s=5.0, motion_noise_share=1e9, bias_interval_s=60.0)
+TRUSTING = GatedIdentity(gate_probability=0.99)
+UNGATED = GatedIdentity(gate_probability=1.0)
 SONAR = SonarCalibration(
     mounting=Mounting(translation_m=(0.3, 0.1, -0.1), rpy_rad=(0.0, 0.4, 0.2)),
     range_sigma_m=0.02,
@@ -36,13 +41,14 @@ class Dive:
     def __init__(
         self,
         calibration: Calibration = CALIBRATION,
-        policy: SightingPolicy = TRUSTING,
+        identity: TrackedIdentity | MixtureIdentity = TRUSTING,
+        kernel: GaussianKernel | RobustKernel = GaussianKernel(),  # noqa: B008
         lag_s: float = 1e9,
         smoother: Smoother | None = None,
     ) -> None:
-        self.smoother = smoother or Smoother(lag_s, 1e-6, 1e9)
+        self.smoother = smoother or smoother_with(lag_s, 1e-6, 1e9)
         self.keyframes = Keyframes(calibration, POLICY, self.smoother)
-        self.sightings = Sightings(calibration, policy, self.smoother, self.keyframes)
+        self.sightings = Sightings(calibration, identity, kernel, self.smoother, self.keyframes)
         stamps = T0_NS + np.arange(-1, 101) * NS // 10
         doppler = np.r_[START_NS, stamps[1:]]  # the second row confirms the first
         n = len(stamps)

@@ -12,9 +12,9 @@ from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother import batch_solution as sightlines_module
 from sonar_graph.slam.smoother.batch_solution import solve
-from sonar_graph.slam.smoother.incremental import Smoother
 
 from .graphs import information
+from .made import smoother_with
 from .rail import RANGE_SIGMA_M, STEP_S, VELOCITY_SIGMA_M_S, calibration, rail
 
 FOREVER_S = 1e9
@@ -30,7 +30,7 @@ class Fed:
     """A smoother, and on the side every factor that it was given."""
 
     def __init__(self, lag_s: float, stale_shift_m: float = NEVER_M, *, is_bounded: bool = False) -> None:
-        self.smoother = Smoother(lag_s, 1e-6, stale_shift_m, is_bounded=is_bounded)
+        self.smoother = smoother_with(lag_s, 1e-6, stale_shift_m, is_bounded=is_bounded)
         self.given: list[gtsam.NonlinearFactor] = []
         self.handles: list[int] = []
 

@@ -9,10 +9,11 @@ import numpy as np
 
 from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.sequence import Sequence
-from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam import Isam2
 from sonar_graph.states import Outcome
 
 from .dive import NS, T0_NS, Dive, spherical
+from .made import isam2_params
 from .rail import rail
 
 FLAT = [0.2, 0.2, 0.2, 0.2]
@@ -46,7 +47,7 @@ def from_the_start(sequence: Sequence) -> Sequence:
 
 
 def run(sequence: Sequence, rate_hz: float = 2.0, **params) -> Isam2:
-    estimator = Isam2(sequence.calibration, Isam2Params(**params))
+    estimator = Isam2(sequence.calibration, isam2_params(**params))
     for step in sequence.replay(sequence.instants(rate_hz)):
         estimator.process(step)
     return estimator

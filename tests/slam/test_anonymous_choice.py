@@ -11,11 +11,13 @@ from scipy.stats import multivariate_normal
 from sonar_graph.calibration import SonarCalibration
 from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors
 from sonar_graph.slam.landmarks.tracked import STILL
-from sonar_graph.slam.landmarks.unknown import ODDS, AnonymousLandmarks, AnonymousPolicy, PairedDetection
+from sonar_graph.slam.landmarks.unknown import ODDS, AnonymousLandmarks, AssociatedUnknown, PairedDetection
 from sonar_graph.slam.models.prediction import PredictedView
 from sonar_graph.slam.smoother.batch_solution import Sightline
 from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import DetectionJournal, Outcome
+
+from .made import smoother_with
 
 NOISE = np.diag([4e-4, 1e-4])
 
@@ -24,7 +26,7 @@ def anonymous(
     range_m: float, density_m2: float, least_sightings: int = 1, aperture_rad: float = 0.3
 ) -> tuple[AnonymousLandmarks, Smoother]:
     """A known pose, and a landmark straight ahead."""
-    smoother = Smoother(1e9, 0.1, 1e9)
+    smoother = smoother_with(1e9, 0.1, 1e9)
     maker = SightingFactors(SonarCalibration(elevation_aperture_rad=aperture_rad), lambda noise: noise)
     landmarks = LandmarkSightings(smoother, maker)
     smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
@@ -32,7 +34,9 @@ def anonymous(
     smoother.update(0.0)
     sighting = Sighting(0, 0, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.0])), NOISE, None)
     landmarks.exchange([], [(sighting, 7)], 0.0)
-    policy = AnonymousPolicy(0.99, density_m2, least_sightings, 60.0)
+    policy = AssociatedUnknown(
+        gate_probability=0.99, density_m2=density_m2, sightings=least_sightings, longest_wait_s=60.0
+    )
     return AnonymousLandmarks(landmarks, DetectionJournal(), policy), smoother
 
 

@@ -18,7 +18,7 @@ from .late_identities import assert_outcomes_account, run
 
 TWO_LAPS = {"duration_s": 260.0, "laps": 2, "speed_m_s": 0.4, "seed": 3, "gyro_bias_scale": 0.0}
 CLEAN = {"tracks": True, "detection_probability": 1.0, "false_detections_per_frame": 0.0}
-ASSOCIATED = {"unknown_landmarks": "associate", "unknown_gate_probability": 1 - 1e-9}
+ASSOCIATED = {"identity__unknown__policy": "associate", "identity__unknown__gate_probability": 1 - 1e-9}
 USED = {Outcome.USED, Outcome.NEW, Outcome.PLACED_LATER, Outcome.USED_LATER, Outcome.MOVED}
 
 
@@ -81,7 +81,7 @@ def test_a_landmark_begins_with_as_many_sightings_as_asked():
     sequence = simulate_basin(BasinOptions(**TWO_LAPS, **CLEAN))
     blind = anonymous_where(sequence, everywhere(sequence))
     for least in (1, 3, 8):
-        outcomes = Counter(run(blind, **ASSOCIATED, unknown_sightings=least).detections().outcomes)
+        outcomes = Counter(run(blind, **ASSOCIATED, identity__unknown__sightings=least).detections().outcomes)
         assert outcomes[Outcome.PLACED_LATER] == 4 * (least - 1)
         assert outcomes[Outcome.USED_LATER] == 0
         assert outcomes[Outcome.NEW] == 4
@@ -105,12 +105,12 @@ def test_scattered_detections_of_nothing_begin_no_landmark():
     """As many in a place as would begin one do not come within the time that they may wait."""
     sequence = simulate_basin(BasinOptions(**TWO_LAPS, false_detections_per_frame=0.05, detection_probability=0.0))
     blind = anonymous_where(sequence, everywhere(sequence))
-    estimator = run(blind, unknown_landmarks="associate")
+    estimator = run(blind, identity__unknown__policy="associate")
     assert len(estimator.landmarks()) == 0
     outcomes = assert_outcomes_account(estimator, blind)
     assert outcomes[Outcome.FORGOTTEN] > 30
     assert outcomes.keys() <= {Outcome.FORGOTTEN, Outcome.WAITING}
-    assert len(run(blind, unknown_landmarks="associate", unknown_sightings=1).landmarks()) > 4
+    assert len(run(blind, identity__unknown__policy="associate", identity__unknown__sightings=1).landmarks()) > 4
 
 
 # Merging ------------------------------------------------------------------------------------------------------------
@@ -128,7 +128,7 @@ def named_late(share: float) -> tuple[Sequence, Sequence]:
 def test_a_landmark_that_is_named_later_gives_the_graph_of_one_known_from_the_start(lag_s: float):
     """Factor by factor, and so are the marginals."""
     sequence, late = named_late(0.4)
-    estimator, known = run(late, **ASSOCIATED, lag_s=lag_s), run(sequence, lag_s=lag_s)
+    estimator, known = run(late, **ASSOCIATED, smoother__lag_s=lag_s), run(sequence, smoother__lag_s=lag_s)
     assert estimator.landmarks().ids.tolist() == [1, 2, 3, 4]
     assert Counter(estimator.detections().outcomes)[Outcome.MOVED] > 20
     assert largest_difference(estimator, known) < 1e-6
@@ -145,9 +145,9 @@ def test_without_merging_they_stay_two(monkeypatch: pytest.MonkeyPatch):
 def test_with_a_bounded_history_none_is_merged_that_has_left_the_window():
     """Factors in a marginal cannot be moved; pairing works all the same."""
     sequence, late = named_late(0.4)
-    merged, kept = (run(late, **ASSOCIATED, history=history).landmarks() for history in ("whole", "bounded"))
+    merged, kept = (run(late, **ASSOCIATED, history__policy=history).landmarks() for history in ("whole", "bounded"))
     assert len(kept) > len(merged) == 4
-    blind = run(anonymous_where(sequence, everywhere(sequence)), **ASSOCIATED, history="bounded")
+    blind = run(anonymous_where(sequence, everywhere(sequence)), **ASSOCIATED, history__policy="bounded")
     assert len(blind.landmarks()) == 4
     assert set(blind.detections().outcomes) <= USED
 
@@ -199,7 +199,7 @@ def test_half_named_ends_in_names_only():
     options = BasinOptions(**TWO_LAPS, anonymous_share=0.5)
     sequence = simulate_basin(options)
     assert 0.4 < np.mean((detections_of(sequence).candidate_ids < 0).all(axis=1)) < 0.6
-    estimator = run(sequence, unknown_landmarks="associate")
+    estimator = run(sequence, identity__unknown__policy="associate")
     assert estimator.landmarks().ids.tolist() == [1, 2, 3, 4]
     ignoring = Counter(run(sequence).detections().outcomes)
     outcomes = assert_outcomes_account(estimator, sequence)
@@ -208,6 +208,6 @@ def test_half_named_ends_in_names_only():
 
 def test_the_outcome_does_not_depend_on_how_often_one_asks():
     sequence = anonymous_where(simulate_basin(BasinOptions(**TWO_LAPS)), slice(None))
-    maps = [run(sequence, rate, unknown_landmarks="associate").landmarks() for rate in (0.3, 5.0)]
+    maps = [run(sequence, rate, identity__unknown__policy="associate").landmarks() for rate in (0.3, 5.0)]
     assert maps[0].ids.tolist() == maps[1].ids.tolist()
     assert maps[0].positions == pytest.approx(maps[1].positions, abs=1e-4)

@@ -2,16 +2,19 @@
 
 from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L
 
-from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam import Isam2
 from sonar_graph.states import Outcome
 from sonar_graph.testing import laws
 from sonar_graph.testing.drives import misnamed_world, small_world
 from sonar_graph.testing.laws import run, unlike
+
+from .made import isam2_params
 
 LAG_S = 3.0
 """Much less than the worlds last: what is wrong leaves the window before it is known to be."""
@@ -26,8 +29,13 @@ BELIEVING = product(("gate", "robust"), ("whole", "bounded"), ("ignore", "associ
 DOUBTING = product(("max-mixture", "gnc"), ("whole",), ("ignore",))
 
 
-def settings(policy: str, history: str, unknown_landmarks: str) -> Isam2Params:
-    return Isam2Params(identity_policy=policy, history=history, unknown_landmarks=unknown_landmarks, lag_s=LAG_S)
+def settings(policy: str, history: str, unknown_landmarks: str) -> Any:
+    return isam2_params(
+        identity__policy=policy,
+        history__policy=history,
+        identity__unknown__policy=unknown_landmarks,
+        smoother__lag_s=LAG_S,
+    )
 
 
 @pytest.mark.parametrize(
@@ -59,7 +67,7 @@ def test_landmarks_list_and_covariances_are_of_one_choice() -> None:
 
 
 def test_answers_that_differ_in_one_bit_are_unlike() -> None:
-    one, other = (run(partial(Isam2, params=Isam2Params()), small_world()) for _ in range(2))
+    one, other = (run(partial(Isam2, params=isam2_params()), small_world()) for _ in range(2))
     assert unlike(one, other) == []
     other.trajectory.positions[3, 1] += 1e-15
     other.landmarks.covariances[0, 0, 0] *= 1 + 1e-15

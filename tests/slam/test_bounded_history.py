@@ -11,12 +11,13 @@ from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
-from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam import Isam2
 from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import DetectionJournal, Estimate, Outcome
 from sonar_graph.testing.laws import check_estimator
 
 from .late_identities import on_the_rail
+from .made import isam2_params
 from .rail import STEP_S, rail
 
 LAG_S = 5.0
@@ -28,14 +29,18 @@ def mission(duration_s: float = 120.0) -> Sequence:
 
 
 def run(sequence: Sequence, history: str, rate_hz: float = 2.0, **params) -> tuple[Isam2, list[Estimate]]:
-    estimator = Isam2(sequence.calibration, Isam2Params(history=history, **{"lag_s": LAG_S, **params}))
+    estimator = Isam2(
+        sequence.calibration, isam2_params(history__policy=history, **{"smoother__lag_s": LAG_S, **params})
+    )
     estimates = [estimator.process(step) for step in sequence.replay(sequence.instants(rate_hz))]
     return estimator, [estimate for estimate in estimates if estimate is not None]
 
 
 def test_causal_estimates_are_those_of_the_whole_history_to_the_bit():
     """The window is the same; what is kept beside it is not asked."""
-    (_, whole), (_, bounded) = (run(mission(), history, stale_shift_m=1e9) for history in ("whole", "bounded"))
+    (_, whole), (_, bounded) = (
+        run(mission(), history, smoother__stale_shift_m=1e9) for history in ("whole", "bounded")
+    )
     assert len(whole) == len(bounded) > 200
     for one, other in zip(whole, bounded, strict=True):
         assert np.array_equal(one.world_T_body.matrix(), other.world_T_body.matrix())
@@ -46,8 +51,13 @@ def test_poses_that_left_are_those_of_least_squares_as_far_as_the_lag_reached():
     """On the rail, with a keyframe a node: each pose is that of all that was measured until it left."""
     nodes, (sequence, numbers) = 31, rail(31)
     lag_s = 3.25 * STEP_S
-    settings = {"lag_s": lag_s, "kernel": "none", "waiting_gain": 0.0, "motion_noise_share": 0.0}
-    estimator, _ = run(sequence, "bounded", 1 / STEP_S, **settings, max_keyframe_interval_s=STEP_S)
+    settings = {
+        "smoother__lag_s": lag_s,
+        "kernel__shape": "none",
+        "smoother__waiting_gain": 0.0,
+        "keyframes__motion_noise_share": 0.0,
+    }
+    estimator, _ = run(sequence, "bounded", 1 / STEP_S, **settings, keyframes__max_interval_s=STEP_S)
     found = estimator.trajectory()
     assert len(found) == nodes - 1
     for k, (position, cov) in enumerate(zip(found.positions, found.covariances, strict=True), start=1):
@@ -98,7 +108,7 @@ def test_nothing_grows_with_the_run(tracks):
     """What is held after a minute and after four differs by less than a window; of a whole history it does not."""
     sequence = simulate_mission(MissionOptions(duration_s=240.0, tracks=tracks, id_delay_s=2.0 if tracks else 0.0))
     sizes, counts = [], []
-    estimator = Isam2(sequence.calibration, Isam2Params(history="bounded", lag_s=LAG_S))
+    estimator = Isam2(sequence.calibration, isam2_params(history__policy="bounded", smoother__lag_s=LAG_S))
     for step in sequence.replay(sequence.instants(2.0)):
         estimator.process(step)
         if round((step.end_ns - sequence.start_ns) * 1e-9, 3) in (60.0, 120.0, 180.0, 239.0):
@@ -116,7 +126,9 @@ def test_nothing_grows_with_the_run(tracks):
 
 
 def test_it_keeps_the_contract():
-    check_estimator(lambda calibration: Isam2(calibration, Isam2Params(history="bounded", lag_s=2.0)))
+    check_estimator(
+        lambda calibration: Isam2(calibration, isam2_params(history__policy="bounded", smoother__lag_s=2.0))
+    )
 
 
 # Identities ---------------------------------------------------------------------------------------------------------
@@ -128,7 +140,12 @@ SURE_4, SURE_7 = [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
 def test_a_wrong_identity_is_taken_back_as_far_as_the_window_reaches(frames, is_corrected):
     """Landmark 7 is taken for 6 in its first frames. Corrected within the lag the run is the right one; else not."""
     wrong = [0.0, 0.0, 1.0, 0.0]
-    settings = {"lag_s": 4.0, "kernel": "none", "waiting_gain": 0.0, "motion_noise_share": 0.0}
+    settings = {
+        "smoother__lag_s": 4.0,
+        "kernel__shape": "none",
+        "smoother__waiting_gain": 0.0,
+        "keyframes__motion_noise_share": 0.0,
+    }
     late, _ = run(on_the_rail([wrong] * frames + [SURE_7], SURE_4), "bounded", **settings)
     right, _ = run(on_the_rail([SURE_7], SURE_4), "bounded", **settings)
     maps = [dict(zip(e.landmarks().ids.tolist(), e.landmarks().positions[:, 0], strict=True)) for e in (late, right)]
@@ -145,7 +162,14 @@ def test_a_wrong_identity_is_taken_back_as_far_as_the_window_reaches(frames, is_
 
 def test_a_landmark_whose_sightings_have_left_stays_when_its_last_one_is_taken_back():
     sequence = on_the_rail([[0.0, 0.0, 1.0, 0.0]] * 12 + [SURE_7], SURE_4)
-    estimator, _ = run(sequence, "bounded", lag_s=2.0, kernel="none", waiting_gain=0.0, motion_noise_share=0.0)
+    estimator, _ = run(
+        sequence,
+        "bounded",
+        smoother__lag_s=2.0,
+        kernel__shape="none",
+        smoother__waiting_gain=0.0,
+        keyframes__motion_noise_share=0.0,
+    )
     assert 6 in estimator.landmarks().ids.tolist()
     assert estimator.values.exists(L(6))
 
@@ -153,7 +177,12 @@ def test_a_landmark_whose_sightings_have_left_stays_when_its_last_one_is_taken_b
 def test_sightings_that_left_while_nobody_knew_them_are_not_used_later():
     """Landmark 7 is first taken for none; nothing holds the window open for it, and the first ones leave."""
     sequence = on_the_rail([[0.0] * 4] * 10 + [SURE_7], SURE_4)
-    settings = {"lag_s": 2.0, "kernel": "none", "waiting_gain": 0.0, "motion_noise_share": 0.0}
+    settings = {
+        "smoother__lag_s": 2.0,
+        "kernel__shape": "none",
+        "smoother__waiting_gain": 0.0,
+        "keyframes__motion_noise_share": 0.0,
+    }
     whole, bounded = (run(sequence, history, **settings)[0].detections().outcomes for history in ("whole", "bounded"))
     assert whole.count(Outcome.USED_LATER) == 10
     assert 0 < bounded.count(Outcome.USED_LATER) < 8
@@ -167,9 +196,9 @@ def test_sightings_that_left_while_nobody_knew_them_are_not_used_later():
 def test_a_window_that_begins_anew_says_the_same():
     """On the rail all is linear: QR and a restart change nothing."""
     sequence, _ = rail(31)
-    settings = {"lag_s": 2.0, "kernel": "none", "waiting_gain": 0.0}
+    settings = {"smoother__lag_s": 2.0, "kernel__shape": "none", "smoother__waiting_gain": 0.0}
     plain, expected = run(sequence, "bounded", **settings)
-    estimator = Isam2(sequence.calibration, Isam2Params(history="bounded", **settings))
+    estimator = Isam2(sequence.calibration, isam2_params(history__policy="bounded", **settings))
     for k, step in enumerate(sequence.replay(sequence.instants(2.0))):
         estimate = estimator.process(step)
         assert estimate is not None
@@ -185,16 +214,16 @@ def test_landmarks_that_have_moved_are_linearised_anew_once_a_lag(monkeypatch):
     restarts = []
     restart = Smoother._restart
     monkeypatch.setattr(Smoother, "_restart", lambda self, time_s: restarts.append(time_s) or restart(self, time_s))
-    run(mission(), "bounded", stale_shift_m=1e-6)
+    run(mission(), "bounded", smoother__stale_shift_m=1e-6)
     assert len(restarts) > 5
     assert np.diff(restarts).min() >= LAG_S
     many = len(restarts)
-    run(mission(), "bounded", stale_shift_m=1e9)
+    run(mission(), "bounded", smoother__stale_shift_m=1e9)
     assert len(restarts) == many
 
 
 def test_detections_have_the_outcomes_of_a_whole_history():
-    whole, bounded = (run(mission(), h, stale_shift_m=1e9)[0].detections() for h in ("whole", "bounded"))
+    whole, bounded = (run(mission(), h, smoother__stale_shift_m=1e9)[0].detections() for h in ("whole", "bounded"))
     assert whole.outcomes == bounded.outcomes
     assert np.array_equal(whole.innovations, bounded.innovations, equal_nan=True)
 
@@ -204,7 +233,10 @@ def test_without_bias_and_landmarks_it_is_dead_reckoning():
     imu = still.calibration.imu.model_copy(update={"gyro_bias_sigma": 0.0, "gyro_bias_walk_density": 0.0})
     calibration = still.calibration.model_copy(update={"imu": imu})
     alone = replace(still, detections=None, calibration=calibration)
-    (whole, causal), (bounded, same) = run(alone, "whole", lag_s=2.0), run(alone, "bounded", lag_s=2.0)
+    (whole, causal), (bounded, same) = (
+        run(alone, "whole", smoother__lag_s=2.0),
+        run(alone, "bounded", smoother__lag_s=2.0),
+    )
     assert np.array_equal(causal[-1].covariance, same[-1].covariance)
     assert len(bounded.trajectory()) == len(whole.trajectory()) == len(causal)
     assert not bounded.values.exists(X(0))
@@ -213,7 +245,7 @@ def test_without_bias_and_landmarks_it_is_dead_reckoning():
 
 def test_what_need_not_be_remembered_is_forgotten_and_nothing_else_changes():
     """Poses and outcomes of the last half minute, and up to a quarter more, are left."""
-    (everything, causal), (recent, same) = (run(mission(), "bounded", remembered_s=s) for s in (None, 30.0))
+    (everything, causal), (recent, same) = (run(mission(), "bounded", history__remembered_s=s) for s in (None, 30.0))
     assert all(np.array_equal(a.covariance, b.covariance) for a, b in zip(causal, same, strict=True))
     whole, part = everything.trajectory(), recent.trajectory()
     assert 30 <= (part.stamps_ns[-1] - part.stamps_ns[0]) * 1e-9 < 30 * 1.25 + LAG_S + 2

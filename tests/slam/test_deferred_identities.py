@@ -1,7 +1,6 @@
 """Identities that come late, change, or never come: the graph is that of the last beliefs, whatever came before."""
 
 from collections import Counter
-from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -13,10 +12,10 @@ from hypothesis import strategies as st
 from sonar_graph.calibration import FloorPrior
 from sonar_graph.sequence import NS_PER_S
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam import Isam2, RobustKernel
 from sonar_graph.states import Outcome
 
-from .dive import CALIBRATION, TRUSTING, Dive
+from .dive import CALIBRATION, UNGATED, Dive
 from .graph_comparison import assert_marginals_agree, largest_difference, rows_of
 from .late_identities import (
     BASIN,
@@ -33,6 +32,7 @@ from .late_identities import (
     run,
     see,
 )
+from .made import isam2_params
 from .rail import STEP_S, rail
 
 NEARLY_4 = [0.9, 0.0, 0.0, 0.0]
@@ -56,8 +56,16 @@ def test_on_the_rail_the_end_is_least_squares_with_the_right_identities(history:
     nodes = len(numbers.displacements_m) + 1
     mean, variance = numbers.solution(nodes)
     sequence = on_the_rail(HISTORIES[history], NEARLY_4)
-    estimator = run(sequence, 1 / STEP_S, kernel="none", motion_noise_share=0.0, lag_s=lag_s)
-    known = run(from_the_start(sequence), 1 / STEP_S, kernel="none", motion_noise_share=0.0, lag_s=lag_s)
+    estimator = run(
+        sequence, 1 / STEP_S, kernel__shape="none", keyframes__motion_noise_share=0.0, smoother__lag_s=lag_s
+    )
+    known = run(
+        from_the_start(sequence),
+        1 / STEP_S,
+        kernel__shape="none",
+        keyframes__motion_noise_share=0.0,
+        smoother__lag_s=lag_s,
+    )
     smoothed, landmarks = estimator.trajectory(), estimator.landmarks()
     assert smoothed.positions[:, 0] == pytest.approx([mean[f"x{k}"] for k in range(1, nodes)], abs=2e-4)
     assert smoothed.positions[:, 0] == pytest.approx(known.trajectory().positions[:, 0], abs=1e-8)
@@ -74,10 +82,10 @@ def test_without_deferring_the_rail_does_not_end_there():
     _, numbers = rail()
     mean, _ = numbers.solution(len(numbers.displacements_m) + 1)
     wrong = on_the_rail(HISTORIES["wrong to the frame before the last"], NEARLY_4)
-    estimator = run(wrong, 1 / STEP_S, kernel="none", deferred_identity=False)
+    estimator = run(wrong, 1 / STEP_S, kernel__shape="none", identity__longest_wait_s=0)
     assert estimator.landmarks().ids.tolist() == [4, 6, 7]
     late = on_the_rail(HISTORIES["late"], NEARLY_4)
-    estimator = run(late, 1 / STEP_S, kernel="none", deferred_identity=False)
+    estimator = run(late, 1 / STEP_S, kernel__shape="none", identity__longest_wait_s=0)
     assert Counter(estimator.detections().outcomes)[Outcome.NO_IDENTITY] == 6
     assert abs(estimator.landmarks().positions[1, 0] - mean["l7"]) > 2e-4
 
@@ -87,7 +95,7 @@ def test_without_deferring_the_rail_does_not_end_there():
 def test_what_is_known_late_gives_the_graph_of_what_was_known_from_the_start(trouble: str, lag_s: float):
     """Without a gyro bias no factor depends on an estimate: equal one by one, and so are the marginals."""
     sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES[trouble], gyro_bias_scale=0.0))
-    estimator, known = run(sequence, lag_s=lag_s), run(from_the_start(sequence), lag_s=lag_s)
+    estimator, known = run(sequence, smoother__lag_s=lag_s), run(from_the_start(sequence), smoother__lag_s=lag_s)
     assert largest_difference(estimator, known) < 1e-6
     assert_marginals_agree(estimator, known, 1e-6)
     assert assert_outcomes_account(estimator, sequence).keys() & LATE
@@ -108,7 +116,7 @@ def test_with_a_gyro_bias_the_graphs_differ_by_where_odometry_was_linearised(tro
 
 def test_a_wrong_identity_that_is_not_taken_back_leaves_another_graph():
     sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["wrong"], gyro_bias_scale=0.0))
-    estimator, known = run(sequence, deferred_identity=False), run(from_the_start(sequence))
+    estimator, known = run(sequence, identity__longest_wait_s=0), run(from_the_start(sequence))
     names = [rows_of(each.graph, each.values).keys() for each in (estimator, known)]
     assert names[0] != names[1]
     assert Counter(estimator.detections().outcomes).keys().isdisjoint(LATE)
@@ -123,7 +131,7 @@ FRAMES = 6
 def test_whatever_was_believed_before_the_graph_is_that_of_the_last_beliefs(histories: list[list[list[float]]]):
     """Also where tracks change places, all at once, or claim one landmark together."""
     last = [SURE[4], SURE[5], SURE[7]]
-    believed, known = (Watch(policy=replace(TRUSTING, gate_probability=1.0, kernel="cauchy")) for _ in range(2))
+    believed, known = (Watch(identity=UNGATED, kernel=RobustKernel(width=2.0)) for _ in range(2))
     for number in range(FRAMES):
         believed.watch(number, histories[number] if number < FRAMES - 1 else last)
         known.watch(number, last)
@@ -154,8 +162,8 @@ def test_whether_it_stands_on_the_floor_is_judged_where_it_was_seen():
 
 
 def test_a_displaced_sighting_is_used_when_its_place_becomes_free_though_its_track_is_gone():
-    dive = Watch(policy=replace(TRUSTING, gate_probability=1.0))
-    known = Watch(policy=replace(TRUSTING, gate_probability=1.0))
+    dive = Watch(identity=UNGATED)
+    known = Watch(identity=UNGATED)
     for each, first in ((dive, SURE[5]), (known, SURE[4])):
         each.watch(0, [FLAT, SURE[5], FLAT])
         each.watch(1, [first, [0.0, 0.9, 0.0, 0.0], FLAT])
@@ -187,7 +195,7 @@ def test_the_causal_estimate_after_a_flip_does_not_wait_for_the_end():
     sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["wrong"]))
     ends = [{}, {}]
     for end, each in zip(ends, (sequence, from_the_start(sequence)), strict=True):
-        estimator = Isam2(each.calibration, Isam2Params(waiting_gain=0.0, lag_s=1e6))
+        estimator = Isam2(each.calibration, isam2_params(smoother__waiting_gain=0.0, smoother__lag_s=1e6))
         for step in each.replay(each.instants(2.0)):
             estimate = estimator.process(step)
             if estimate is not None:

@@ -1,7 +1,5 @@
 """What is said of detections that wait: used later, moved, taken back, refused or forgotten."""
 
-from dataclasses import replace
-
 import gtsam
 from gtsam.symbol_shorthand import L
 
@@ -9,18 +7,19 @@ from sonar_graph.slam.smoother import incremental as smoother_module
 from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import Outcome
 
-from .dive import NS, T0_NS, TRUSTING, Dive
+from .dive import NS, T0_NS, TRUSTING, UNGATED, Dive
 from .late_identities import FLAT, SURE, Watch, see
+from .made import smoother_with
 
 
 def test_what_waits_too_long_is_dropped_and_said():
-    dive = Dive(policy=replace(TRUSTING, longest_wait_s=2.0))
+    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 2.0}))
     for after_s in (0.0, 1.0, 2.5):
         see(dive, after_s, FLAT)
     assert dive.outcomes == [Outcome.FORGOTTEN, Outcome.WAITING, Outcome.WAITING]
     see(dive, 3.0, SURE[5])
     assert dive.outcomes == [Outcome.FORGOTTEN, Outcome.USED_LATER, Outcome.USED_LATER, Outcome.USED]
-    dive = Dive(policy=replace(TRUSTING, longest_wait_s=2.0))
+    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 2.0}))
     see(dive, 0.0, FLAT)
     dive.keyframes.advance(T0_NS + 5 * NS)
     dive.sightings.forget()
@@ -29,7 +28,7 @@ def test_what_waits_too_long_is_dropped_and_said():
 
 
 def test_what_is_of_no_landmark_to_the_end_is_said_to_have_no_identity():
-    dive = Dive(policy=replace(TRUSTING, longest_wait_s=2.0))
+    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 2.0}))
     see(dive, 0.0, FLAT)
     see(dive, 1.0, [0.05] * 4)
     assert dive.outcomes == [Outcome.WAITING, Outcome.WAITING]
@@ -39,7 +38,7 @@ def test_what_is_of_no_landmark_to_the_end_is_said_to_have_no_identity():
 
 
 def test_what_was_taken_back_is_given_to_no_other_landmark_after_too_long():
-    dive = Dive(policy=replace(TRUSTING, longest_wait_s=2.0))
+    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 2.0}))
     see(dive, 0.0, SURE[5])
     see(dive, 1.0, FLAT)
     see(dive, 1.5, [0.0] * 4)
@@ -48,7 +47,7 @@ def test_what_was_taken_back_is_given_to_no_other_landmark_after_too_long():
 
 
 def test_a_track_that_is_over_keeps_its_identity():
-    dive = Dive(policy=replace(TRUSTING, longest_wait_s=1.0))
+    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 1.0}))
     see(dive, 0.0, SURE[5])
     see(dive, 2.0, SURE[6])
     assert dive.outcomes == [Outcome.NEW, Outcome.NEW]
@@ -90,7 +89,7 @@ def test_what_was_refused_for_one_landmark_is_not_refused_for_good():
 
 
 def test_of_tracks_that_claim_a_landmark_at_once_the_more_probable_gets_the_earlier_frames():
-    dive = Watch(policy=replace(TRUSTING, gate_probability=1.0))
+    dive = Watch(identity=UNGATED)
     dive.watch(0, [FLAT, FLAT, FLAT])
     dive.watch(1, [[0.0, 0.8, 0.0, 0.0], SURE[5], FLAT])
     repeated, later = Outcome.REPEATED, Outcome.USED_LATER
@@ -99,7 +98,7 @@ def test_of_tracks_that_claim_a_landmark_at_once_the_more_probable_gets_the_earl
 
 def test_a_landmark_may_begin_late_while_what_waits_makes_the_window_restart(monkeypatch):
     monkeypatch.setattr(smoother_module, "FIRST_RESTART", 5)
-    dive = Dive(smoother=Smoother(1e9, 1e-6, 1e-9, greatest_waiting_gain=1e9))
+    dive = Dive(smoother=smoother_with(1e9, 1e-6, 1e-9, waiting_gain=1e9))
     restarts = []
     restart = Smoother._restart
     monkeypatch.setattr(Smoother, "_restart", lambda self, time_s: restarts.append(time_s) or restart(self, time_s))

@@ -1,7 +1,5 @@
 """Which watches the window chooses anew, when, and from what; worlds in which one of the rules decides."""
 
-from dataclasses import replace
-
 import gtsam
 import numpy as np
 import pytest
@@ -9,17 +7,18 @@ from gtsam.symbol_shorthand import X
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.measurements import Floats
+from sonar_graph.slam import KeyframeParams, MixtureIdentity
 from sonar_graph.slam.landmarks.association import IdentityPosterior
 from sonar_graph.slam.landmarks.mixture import TrackedObject
 from sonar_graph.slam.landmarks.mixture_policy import DoubtfulIdentities
 from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors
 from sonar_graph.slam.smoother.batch_solution import Sightline
-from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import DetectionJournal, Outcome
 
 from . import dive as dive_module
 from .dive import CALIBRATION, FLOOR, Dive, spherical
-from .test_doubtful_identities import MIXTURE, PLACES, dive, doubting, show
+from .made import smoother_with
+from .test_doubtful_identities import MIXTURE, PLACES, dive, show
 
 LAG_S = 1.0
 AFAR = np.array([0.06, 0.0])
@@ -33,13 +32,13 @@ def at(after_s: float, landmark_id: int, off: Floats | None = None) -> Floats:
 
 def short_lived(monkeypatch: pytest.MonkeyPatch) -> Dive:
     """A keyframe each frame, a second in the window."""
-    monkeypatch.setattr(dive_module, "POLICY", replace(dive_module.POLICY, max_interval_s=1.0, motion_noise_share=0.0))
-    return Dive(CALIBRATION.model_copy(update={"floor": FLOOR}), doubting(), lag_s=LAG_S)
+    monkeypatch.setattr(dive_module, "POLICY", KeyframeParams(max_interval_s=1.0, motion_noise_share=0.0))
+    return Dive(CALIBRATION.model_copy(update={"floor": FLOOR}), MixtureIdentity(), lag_s=LAG_S)
 
 
 def test_all_of_the_window_is_chosen_anew_and_not_only_the_newest() -> None:
     """Two that were perhaps of landmark 4, of which nothing was known; then one surely is."""
-    world = dive(doubting())
+    world = dive("max-mixture")
     for k in (1, 2):
         show(world, 0.3 * k, at(0.3 * k, 4), [4], [-1], surely=0.3)
     assert world.outcomes == [Outcome.UNFIT] * 2
@@ -49,7 +48,7 @@ def test_all_of_the_window_is_chosen_anew_and_not_only_the_newest() -> None:
 
 def test_choices_that_follow_from_choices_are_made_at_once() -> None:
     """A track, alone with its name, is given another; a single one that was perhaps of that one follows it."""
-    world = dive(doubting())
+    world = dive("max-mixture")
     show(world, 0.3, at(0.3, 9, AFAR), [9], [-1], surely=0.3)
     for k in (2, 3, 4):
         show(world, 0.3 * k, at(0.3 * k, 9), [4], [2])
@@ -94,7 +93,7 @@ def test_keyframes_of_what_waits_are_held_and_of_what_is_known_are_not(
 def test_what_waited_in_a_frame_that_shows_the_landmark_already_is_not_of_it(monkeypatch) -> None:
     """Before anything is chosen anew: what was surer in that frame has it."""
     monkeypatch.setattr(DoubtfulIdentities, "reconsider", lambda *_: None)
-    world = dive(doubting())
+    world = dive("max-mixture")
     for k in (1, 2):
         show(world, 0.3 * k, np.vstack([at(0.3 * k, 7), at(0.3 * k, 7, AFAR / 3)]), [7, -1], [-1, 2])
     show(world, 0.9, at(0.9, 4), [-1], [2])
@@ -110,7 +109,7 @@ def test_what_waited_in_a_frame_that_shows_the_landmark_already_is_not_of_it(mon
 @pytest.mark.parametrize(("sigma_m", "stays"), [(0.01, False), (0.5, True)])
 def test_a_misfit_is_one_of_the_identity_only_where_the_estimate_is_sure(sigma_m: float, stays: bool) -> None:
     """Seen 0.3 m off from a second pose: as it stands, it is of nothing; expected with the pose's error, it may be."""
-    smoother = Smoother(1e9, 0.1, 1e9)
+    smoother = smoother_with(1e9, 0.1, 1e9)
     landmarks = LandmarkSightings(smoother, SightingFactors(SonarCalibration(), lambda noise: noise))
     for k, sigma in enumerate((0.001, sigma_m)):
         smoother.add_pose(X(k), gtsam.Pose3(), float(k))
@@ -125,7 +124,7 @@ def test_a_misfit_is_one_of_the_identity_only_where_the_estimate_is_sure(sigma_m
     landmarks.enter(off, 7, ())
     seen, journal = TrackedObject(IdentityPosterior({7: 0.9}), [off]), DetectionJournal()
     off.row = journal.record(off.stamp_ns, 7, Outcome.USED)
-    doubtful = DoubtfulIdentities(landmarks, journal, MIXTURE, 60.0)
+    doubtful = DoubtfulIdentities(landmarks, journal, MixtureIdentity(), MIXTURE)
     doubtful.watches.append(seen)
     assert MIXTURE.best([seen], smoother.values, [7], landmarks.sizes()) == [None]
     doubtful.reconsider(1.0)

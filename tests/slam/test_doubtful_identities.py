@@ -4,16 +4,15 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
-from pydantic import ValidationError
 
 from sonar_graph.measurements import LandmarkDetections
-from sonar_graph.slam.frontend import SightingPolicy
-from sonar_graph.slam.isam2 import Isam2Params
+from sonar_graph.slam import GaussianKernel, MixtureIdentity, RobustIdentity, RobustKernel
 from sonar_graph.slam.landmarks import mixture
 from sonar_graph.slam.landmarks import mixture_policy as doubtful_identities
 from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
-from sonar_graph.slam.landmarks.mixture import Kernel, Mixture, TrackedObject
+from sonar_graph.slam.landmarks.mixture import Mixture, TrackedObject
 from sonar_graph.slam.landmarks.sighting import Sighting
+from sonar_graph.slam.models import Kernel
 from sonar_graph.slam.smoother.batch_solution import Sightline
 from sonar_graph.states import Outcome
 
@@ -21,17 +20,14 @@ from .dive import CALIBRATION, FLOOR, T0_NS, Dive, spherical
 
 PLACES = {7: np.array([2.6, 0.5, -1.0]), 4: np.array([2.9, 1.4, -1.0]), 9: np.array([3.2, 0.1, -1.0])}
 """Of landmarks, in the world of `Dive`: on the floor, within its sonar's fan."""
-ERRORS = RecogniserErrors(0.05, 10.0, 2.0)
-MIXTURE = Mixture(ERRORS, Kernel("none", 1.0))
-BELIEVING = SightingPolicy(0.7, 1.0, "none", 2.0)
+ERRORS = RecogniserErrors()
+GAUSSIAN = GaussianKernel()
+MIXTURE = Mixture(ERRORS, GAUSSIAN)
 
 
-def doubting(kernel: str = "none", **settings) -> SightingPolicy:
-    return SightingPolicy(0.7, 1.0, kernel, 1.5, mixture=Mixture(ERRORS, Kernel(kernel, 1.5)), **settings)
-
-
-def dive(policy: SightingPolicy) -> Dive:
-    return Dive(CALIBRATION.model_copy(update={"floor": FLOOR}), policy)
+def dive(policy: str, kernel: Kernel = GAUSSIAN) -> Dive:
+    identity = RobustIdentity() if policy == "robust" else MixtureIdentity(policy=policy)
+    return Dive(CALIBRATION.model_copy(update={"floor": FLOOR}), identity, kernel)
 
 
 def watch(
@@ -52,9 +48,9 @@ def show(world: Dive, after_s: float, z, named: list[int], tracks: list[int], su
     world.sightings.add(rows)
 
 
-def misnamed(policy: SightingPolicy, share: float = 0.25) -> tuple[Dive, list[int]]:
+def misnamed(policy: str, kernel: Kernel = GAUSSIAN, share: float = 0.25) -> tuple[Dive, list[int]]:
     """Thirty frames in which a share of the names, not of the first two frames, is wrong; the true ones in order."""
-    world, rng, truth = dive(policy), np.random.default_rng(5), []
+    world, rng, truth = dive(policy, kernel), np.random.default_rng(5), []
     for k in range(30):
         named = {i: i for i in PLACES}
         if k > 1 and rng.random() < 3 * share:
@@ -126,7 +122,7 @@ def largest(named: int, components: dict[int, list], sighting) -> gtsam.CustomFa
 
 
 def test_the_end_is_a_fixed_point_of_the_max_mixture_that_another_solver_finds() -> None:
-    world, truth = misnamed(doubting())
+    world, truth = misnamed("max-mixture")
     values = world.sightings.history().values
     scattered = values.retract(scatter(values))
     params = gtsam.LevenbergMarquardtParams()
@@ -153,15 +149,15 @@ def gtsam_vector(key: int, change) -> gtsam.VectorValues:
     return one
 
 
-@pytest.mark.parametrize("kernel", ["none", "cauchy"])
-def test_wrong_names_cost_nothing_and_believing_them_does(kernel: str) -> None:
-    right_m = worst_landmark_m(misnamed(BELIEVING, 0.0)[0])
-    assert worst_landmark_m(misnamed(doubting(kernel))[0]) < right_m + 0.02
-    assert worst_landmark_m(misnamed(BELIEVING)[0]) > right_m + 0.1
+@pytest.mark.parametrize("kernel", [GaussianKernel(), RobustKernel()])
+def test_wrong_names_cost_nothing_and_believing_them_does(kernel: Kernel) -> None:
+    right_m = worst_landmark_m(misnamed("robust", share=0.0)[0])
+    assert worst_landmark_m(misnamed("max-mixture", kernel)[0]) < right_m + 0.02
+    assert worst_landmark_m(misnamed("robust")[0]) > right_m + 0.1
 
 
 def test_right_names_give_the_graph_of_one_that_believes_them() -> None:
-    doubted, believed = misnamed(doubting(), 0.0)[0], misnamed(BELIEVING, 0.0)[0]
+    doubted, believed = misnamed("max-mixture", share=0.0)[0], misnamed("robust", share=0.0)[0]
     assert doubted.outcomes == believed.outcomes
     for i in PLACES:
         places = [world.sightings.history().values.atPoint3(L(i)) for world in (doubted, believed)]
@@ -172,7 +168,7 @@ def test_right_names_give_the_graph_of_one_that_believes_them() -> None:
 def test_a_landmark_that_begins_in_a_wrong_place_is_moved_by_those_who_name_it(can_move: bool, monkeypatch) -> None:
     if not can_move:
         monkeypatch.setattr(doubtful_identities, "supporters_elsewhere", lambda *_: None)
-    world, rng = dive(doubting()), np.random.default_rng(2)
+    world, rng = dive("max-mixture"), np.random.default_rng(2)
     watch(world, 0.3, {4: 7}, rng)
     for k in range(2, 8):
         watch(world, 0.3 * k, {7: 7}, rng)
@@ -198,14 +194,14 @@ def test_many_sightings_of_another_object_do_not_prove_it_to_be_a_landmark(
 
 
 def test_a_late_name_brings_all_sightings_of_its_track() -> None:
-    world, rng = dive(doubting()), np.random.default_rng(2)
+    world, rng = dive("max-mixture"), np.random.default_rng(2)
     for k, name in enumerate([-1, -1, -1, 7, 7], start=1):
         watch(world, 0.3 * k, {7: name}, rng, track=2)
     assert world.outcomes == [Outcome.USED_LATER] * 3 + [Outcome.NEW, Outcome.USED]
 
 
 def test_one_name_that_changes_moves_all_sightings_of_its_track() -> None:
-    world, rng = dive(doubting()), np.random.default_rng(2)
+    world, rng = dive("max-mixture"), np.random.default_rng(2)
     for k in range(1, 5):
         watch(world, 0.3 * k, {4: 4, 9: 9}, rng)
     for k, name in enumerate([9, 9, 7, 7, 7], start=5):
@@ -216,7 +212,7 @@ def test_one_name_that_changes_moves_all_sightings_of_its_track() -> None:
 
 def test_a_landmark_that_alone_was_named_wrongly_gets_its_name_with_all_sightings() -> None:
     """A landmark 4 that nothing else was seen of becomes 9 when its track is named so."""
-    world, rng = dive(doubting()), np.random.default_rng(2)
+    world, rng = dive("max-mixture"), np.random.default_rng(2)
     for k in range(1, 4):
         watch(world, 0.3 * k, {7: 7}, rng)
     for k, name in enumerate([4, 4, 4, 9, 9], start=4):
@@ -230,7 +226,7 @@ def test_a_landmark_that_alone_was_named_wrongly_gets_its_name_with_all_sighting
 @pytest.mark.parametrize(("surely", "where"), [(0.3, 7), (0.9, 4)], ids=["not named", "named"])
 def test_what_names_no_landmark_has_no_vote_on_its_place(surely: float, where: int) -> None:
     """Landmark 7 is seen three times; then another thing thirty times, which is more or less surely said to be 7."""
-    world, rng = dive(doubting()), np.random.default_rng(2)
+    world, rng = dive("max-mixture"), np.random.default_rng(2)
     for k in range(1, 4):
         watch(world, 0.3 * k, {7: 7}, rng)
     for k in range(4, 34):
@@ -248,9 +244,3 @@ def test_a_landmark_begins_with_one_of_those_that_name_it() -> None:
     assert MIXTURE.best([single, longest], values, [None, None], {}) == [None, 7]
     values.insert(L(7), np.array([3.0, 0.0, 0.0]))
     assert MIXTURE.best([single, longest], values, [None, 7], {7: 3}) == [None, 7]
-
-
-def test_a_gate_that_would_do_nothing_is_refused() -> None:
-    with pytest.raises(ValidationError, match='set identity_policy = "gate"'):
-        Isam2Params(gate_probability=0.99)
-    assert Isam2Params(gate_probability=0.99, identity_policy="gate").gate_probability == 0.99

@@ -13,12 +13,14 @@ from sonar_graph.errors import EstimatorError, MeasurementError
 from sonar_graph.measurements import Measurements
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
-from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam import Isam2
 from sonar_graph.slam.landmarks.sighting import SightingFactors
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother.factor_store import GraphEdit
 from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import Estimate, Outcome, Refusal
+
+from .made import isam2_params, smoother_with
 
 ROW = 40
 SOUND_2, SOUND_3 = np.diag([1e-4, 1e-4]), np.diag([1e-4, 1e-4, 1e-4])
@@ -31,7 +33,9 @@ def mission() -> Sequence:
 
 
 def run(sequence: Sequence, history: str = "whole") -> tuple[Isam2, list[Estimate]]:
-    estimator = Isam2(sequence.calibration, Isam2Params(history=history, lag_s=8.0, waiting_gain=0.0))
+    estimator = Isam2(
+        sequence.calibration, isam2_params(history__policy=history, smoother__lag_s=8.0, smoother__waiting_gain=0.0)
+    )
     estimates = [estimator.process(step) for step in sequence.replay(mission().instants(1.0))]
     return estimator, [estimate for estimate in estimates if estimate is not None]
 
@@ -183,7 +187,7 @@ def range_factor(pose: int, landmark: int, range_m: float) -> gtsam.NonlinearFac
 
 def begun(*, is_bounded: bool = False, by_qr: bool = False) -> Smoother:
     """Two keyframes and a landmark."""
-    smoother = Smoother(3.5, 1e-3, 1e9, is_bounded=is_bounded)
+    smoother = smoother_with(3.5, 1e-3, 1e9, is_bounded=is_bounded)
     if by_qr:
         smoother._window.is_by_qr = True
         smoother._window.isam = smoother._window._empty()

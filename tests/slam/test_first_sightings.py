@@ -11,7 +11,9 @@ import pytest
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam import Isam2
+
+from .made import isam2_params
 
 LANDMARK, BEFORE = 2, 1
 
@@ -48,7 +50,7 @@ def ranged_wrongly(by_m: float) -> LandmarkDetections:
 def error_and_sigma_m(detections: LandmarkDetections, **settings: str) -> tuple[float, float]:
     """Of the landmark at the end: how far it is from where it lies, horizontally, and what is said of that."""
     sequence = replace(basin(), detections=detections)
-    estimator = Isam2(sequence.calibration, Isam2Params(**settings))
+    estimator = Isam2(sequence.calibration, isam2_params(**settings))
     for step in sequence.replay(sequence.instants(1.0)):
         estimator.process(step)
     found, true = estimator.landmarks(), sequence.true_landmarks
@@ -59,8 +61,8 @@ def error_and_sigma_m(detections: LandmarkDetections, **settings: str) -> tuple[
 
 
 def test_a_whole_history_takes_a_wrong_first_identity_back_and_a_bounded_one_keeps_it_and_is_sure():
-    whole_m, _ = error_and_sigma_m(named_wrongly(), history="whole")
-    bounded_m, sigma_m = error_and_sigma_m(named_wrongly(), history="bounded")
+    whole_m, _ = error_and_sigma_m(named_wrongly(), history__policy="whole")
+    bounded_m, sigma_m = error_and_sigma_m(named_wrongly(), history__policy="bounded")
     assert whole_m < 0.05
     assert bounded_m == pytest.approx(5.4, abs=0.2)
     assert sigma_m < 0.06

@@ -23,13 +23,13 @@ def statement(ids: list[int], probability: list[float]) -> IdentityPosterior:
 @given(CHANCES, st.floats(0.001, 0.999), st.integers(LEAST_LANDMARKS, 60))
 def test_weights_are_a_distribution_with_none_impossible(chances: list[float], q: float, count: int) -> None:
     ids = list(range(count))
-    weights = np.exp(statement(ids[: len(chances)], chances).log_weights(ids, RecogniserErrors(q, 10.0, 2.0)))
+    weights = np.exp(statement(ids[: len(chances)], chances).log_weights(ids, RecogniserErrors(wrong_id_probability=q)))
     assert weights.sum() == pytest.approx(1.0)
     assert weights.min() >= min(0.5 * q / count, 0.5 * q) * (1 - 1e-9)
 
 
 def test_the_order_of_weights_is_that_of_the_posterior() -> None:
-    weights = statement([5, 3, -1], [0.2, 0.7, 0.1]).log_weights([3, 4, 5], RecogniserErrors(0.1, 10.0, 2.0))
+    weights = statement([5, 3, -1], [0.2, 0.7, 0.1]).log_weights([3, 4, 5], RecogniserErrors(wrong_id_probability=0.1))
     assert np.exp(weights) == pytest.approx([0.63 + 0.0025, 0.0025, 0.18 + 0.0025, 0.9 * 0.1 + 0.05])
 
 

@@ -13,9 +13,11 @@ from sonar_graph.logs.convert.mrclam import read_mrclam
 from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections, Measurements
 from sonar_graph.sequence import NS_PER_S, Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam import Isam2
 from sonar_graph.states import Estimate, Outcome
 from sonar_graph.testing.drives import small_world, still_world
+
+from .made import isam2_params
 
 BASIN_S = 130.0
 
@@ -126,7 +128,9 @@ def poses_in(values: gtsam.Values) -> list[int]:
 def test_incremental_equals_batch_in_the_basin(kernel, bias):
     """iSAM2's own estimate, when it keeps all poses and relinearises what moved by a tenth of a milliradian."""
     sequence = simulate_basin(BasinOptions(duration_s=BASIN_S, laps=1, seed=3, gyro_bias_scale=bias))
-    settings = Isam2Params(lag_s=1e6, kernel=kernel, relinearize_threshold=1e-4, waiting_gain=0.0)
+    settings = isam2_params(
+        smoother__lag_s=1e6, kernel__shape=kernel, smoother__relinearize_threshold=1e-4, smoother__waiting_gain=0.0
+    )
     estimator = Isam2(sequence.calibration, settings)
     run(estimator, sequence)
     assert len(poses_in(estimator.values)) > 20
@@ -151,7 +155,10 @@ def test_incremental_equals_batch_on_mrclam(unpacked):
     folder = next(unpacked("mrclam_ds6.tar.xz").rglob("Barcodes.dat")).parent
     whole = read_mrclam(folder, 1)
     sequence = until(whole, whole.start_ns + 300 * NS_PER_S)
-    estimator = Isam2(sequence.calibration, Isam2Params(lag_s=1e6, relinearize_threshold=1e-3, waiting_gain=0.0))
+    estimator = Isam2(
+        sequence.calibration,
+        isam2_params(smoother__lag_s=1e6, smoother__relinearize_threshold=1e-3, smoother__waiting_gain=0.0),
+    )
     run(estimator, sequence)
     assert len(poses_in(estimator.values)) > 100
     assert_is_batch(estimator.graph, estimator.values)
@@ -214,7 +221,7 @@ def test_every_detection_has_one_row_in_the_order_of_frames(basin):
 def test_used_detections_are_two_factors_each_a_landmark_one_more_and_refused_none():
     """Against the same log without detections, keyframes at the same stamps."""
     sequence = with_calibration(small_world(), imu=ImuCalibration(gyro_bias_sigma=0.0))
-    params = Isam2Params(motion_noise_share=1e9, max_keyframe_interval_s=1.0)
+    params = isam2_params(keyframes__motion_noise_share=1e9, keyframes__max_interval_s=1.0)
     sighted, blind = (Isam2(s.calibration, params) for s in (sequence, sequence))
     run(sighted, sequence)
     run(blind, replace(sequence, detections=None))
@@ -253,7 +260,7 @@ def test_a_detection_far_off_is_gated_and_changes_nothing():
         range_m=last.range_m + 2.0,
         id_probability=last.id_probability * 0 + 1,
     )
-    gated = Isam2Params(identity_policy="gate", gate_probability=0.999)
+    gated = isam2_params(identity__policy="gate", identity__gate_probability=0.999)
     haunted, plain = Isam2(sequence.calibration, gated), Isam2(sequence.calibration, gated)
     ends = run(haunted, replace(sequence, detections=LandmarkDetections.concatenate([sequence.detections, ghost])))
     expected = run(plain, sequence)

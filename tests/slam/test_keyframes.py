@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import gtsam
 import numpy as np
 import pytest
@@ -19,16 +17,17 @@ from sonar_graph.calibration import (
 from sonar_graph.measurements import Depth, Dvl, Imu
 from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
 from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
-from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes, largest_variances
+from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, largest_variances
 from sonar_graph.slam.models import factors
-from sonar_graph.slam.smoother.incremental import Smoother
+
+from .made import smoother_with
 
 NS = 1_000_000_000
 T0_NS = 1_500_000_000 * NS
 G = 9.80665
 NO_BIAS = ImuCalibration(gyro_bias_sigma=0.0)
 EXACT_DVL = DvlCalibration(velocity_sigma_m_s=(1e-7, 1e-7, 1e-7))
-POLICY = KeyframePolicy(max_interval_s=2.0, motion_noise_share=1e9, bias_interval_s=10.0)
+POLICY = KeyframeParams(max_interval_s=2.0, motion_noise_share=1e9, bias_interval_s=10.0)
 
 
 def seconds(keyframes: Keyframes) -> list[float]:
@@ -49,8 +48,8 @@ def steady_dvl(until_s: float, velocity=(0.5, 0.0, 0.0), hz: float = 5) -> Dvl:
     return Dvl(stamps, np.tile(velocity, (len(stamps), 1)), np.full((len(stamps), 3, 3), np.nan))
 
 
-def keyframes_of(calibration: Calibration, policy: KeyframePolicy = POLICY) -> Keyframes:
-    return Keyframes(calibration, policy, Smoother(1e9, 0.01, 1e9))
+def keyframes_of(calibration: Calibration, policy: KeyframeParams = POLICY) -> Keyframes:
+    return Keyframes(calibration, policy, smoother_with(1e9, 0.01, 1e9))
 
 
 def driven(calibration: Calibration, until_s: float, depth: Depth | None = None, **motion) -> Keyframes:
@@ -78,7 +77,7 @@ def test_one_is_set_at_the_first_node_after_the_longest_interval():
 
 
 def test_nodes_off_the_interval_are_waited_for():
-    keyframes = keyframes_of(Calibration(imu=NO_BIAS), replace(POLICY, max_interval_s=1.9))
+    keyframes = keyframes_of(Calibration(imu=NO_BIAS), POLICY.model_copy(update={"max_interval_s": 1.9}))
     keyframes.add(level_imu(4.5), steady_dvl(4.5, hz=3), None)
     keyframes.advance(int(at(4.5)[0]))
     assert seconds(keyframes) == pytest.approx([0.0, 2.0, 4.0], abs=1e-8)
@@ -112,7 +111,8 @@ def noisy_keyframes(share: float, **calibration) -> Keyframes:
     dvl = DvlCalibration(velocity_sigma_m_s=(0.3, 0.3, 0.3))
     exact_gyro = ImuCalibration(gyro_noise_density=1e-12, gyro_bias_sigma=0.0)
     keyframes = keyframes_of(
-        Calibration(**({"imu": exact_gyro, "dvl": dvl} | calibration)), replace(POLICY, motion_noise_share=share)
+        Calibration(**({"imu": exact_gyro, "dvl": dvl} | calibration)),
+        POLICY.model_copy(update={"motion_noise_share": share}),
     )
     keyframes.add(level_imu(1.99), steady_dvl(1.99), None)
     return keyframes
@@ -171,7 +171,7 @@ def test_largest_variances_are_those_of_noise_and_bias_together():
 
 def test_the_smoother_waits_with_sightings_and_not_with_keyframes():
     keyframes = keyframes_of(Calibration(imu=NO_BIAS))
-    keyframes.smoother = Smoother(1e9, 0.01, 1e9, 1.0)
+    keyframes.smoother = smoother_with(1e9, 0.01, 1e9, 1.0)
     keyframes.add(level_imu(4.0), steady_dvl(4.0), None)
     keyframes.advance(int(at(1.0)[0]))
     keyframes.update_if_due()

@@ -8,8 +8,9 @@ import pytest
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
-from sonar_graph.slam.keyframes import KeyframePolicy, Keyframes
-from sonar_graph.slam.smoother.incremental import Smoother
+from sonar_graph.slam.keyframes import KeyframeParams, Keyframes
+
+from .made import smoother_with
 
 NS = 1_000_000_000
 G = 9.80665
@@ -28,7 +29,11 @@ def keyframes_over_gaps() -> Keyframes:
     t, s = np.arange(241) / 20, np.arange(61) / 5
     for lost_s, found_s in GAPS_S:
         s = s[(s <= lost_s) | (s >= found_s)]
-    keyframes = Keyframes(calibration, KeyframePolicy(1e3, 1e9, 10.0), Smoother(1e9, 0.01, 1e9))
+    keyframes = Keyframes(
+        calibration,
+        KeyframeParams(max_interval_s=1e3, motion_noise_share=1e9, bias_interval_s=10.0),
+        smoother_with(1e9, 0.01, 1e9),
+    )
     keyframes.add(
         Imu(stamps(t), np.zeros((len(t), 3)), np.tile([0.0, 0.0, G], (len(t), 1))),
         Dvl(stamps(s), np.tile([0.5, 0.0, 0.0], (len(s), 1)), np.full((len(s), 3, 3), np.nan)),

@@ -12,7 +12,8 @@ from sonar_graph.calibration import SonarCalibration
 from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors
 from sonar_graph.slam.landmarks.unknown import LandmarkMerging
 from sonar_graph.slam.smoother.batch_solution import JointCovariance, Sightline
-from sonar_graph.slam.smoother.incremental import Smoother
+
+from .made import smoother_with
 
 PROBABILITY = 0.99
 NOISE_M = 0.02
@@ -28,7 +29,7 @@ def nearest(
     range_m: float = 2.0,
 ) -> tuple[int, int] | None:
     """Of landmarks at points with a joint covariance, each seen in some frames."""
-    smoother = Smoother(1e9, 0.1, 1e9)
+    smoother = smoother_with(1e9, 0.1, 1e9)
     landmarks = LandmarkSightings(smoother, SightingFactors(SonarCalibration(), lambda noise: noise))
     values = gtsam.Values()
     for i, point in points.items():

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors
 from sonar_graph.slam.smoother.batch_solution import Sightline
-from sonar_graph.slam.smoother.incremental import Smoother
+
+from .made import smoother_with
 
 POSES = 5
 PLACES = {7: np.array([3.0, 0.5, -0.8]), 9: np.array([3.0, -0.4, -0.8])}
@@ -21,7 +22,7 @@ FLOOR = FloorPrior(z_m=-0.8, sigma_m=0.05)
 
 def begun() -> LandmarkSightings:
     """Keyframes whose poses are known, and no landmark yet."""
-    smoother = Smoother(1e9, 0.1, 1e9)
+    smoother = smoother_with(1e9, 0.1, 1e9)
     for k in range(POSES):
         pose = gtsam.Pose3(gtsam.Rot3.Ypr(0.1 * k, 0.2, 0.0), np.array([0.2 * k, 0.1 * k, 0.0]))
         smoother.add_pose(X(k), pose, float(k))

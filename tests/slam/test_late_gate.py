@@ -11,6 +11,8 @@ from sonar_graph.slam.landmarks.tracked import LateGate
 from sonar_graph.slam.smoother.batch_solution import Sightline
 from sonar_graph.slam.smoother.incremental import Smoother
 
+from .made import smoother_with
+
 THRESHOLD = 9.21
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.3, 0.1), np.array([0.3, 0.0, -0.1]))
 POINT = np.array([3.0, 0.6, -0.8])
@@ -20,7 +22,7 @@ NOISES = {"as uncertain as the graph": 1.0, "much more": 30.0, "much less": 1e-3
 
 def smoother() -> Smoother:
     """A pose and a landmark that are each known to some centimetres, and together by a sighting."""
-    found = Smoother(1e9, 1e-6, 1e9)
+    found = smoother_with(1e9, 1e-6, 1e9)
     found.add_pose(X(0), gtsam.Pose3(), 0.0)
     found.add_landmark(L(7), POINT)
     sigmas = np.array([0.01, 0.01, 0.02, 0.05, 0.04, 0.03])

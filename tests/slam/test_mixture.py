@@ -10,25 +10,25 @@ from scipy.integrate import trapezoid
 from scipy.stats import multivariate_normal
 
 from sonar_graph.measurements import Floats
+from sonar_graph.slam import GaussianKernel, RobustKernel
 from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
 from sonar_graph.slam.landmarks.mixture import (
     LEAST_TRUNCATION,
     REPEATED_LOSS,
     Choices,
     Errors,
-    Kernel,
     Mixture,
     TrackedObject,
 )
 from sonar_graph.slam.landmarks.sighting import Sighting
-from sonar_graph.slam.models import factors
+from sonar_graph.slam.models import Kernel, factors
 from sonar_graph.slam.smoother.batch_solution import Sightline
 
-ERRORS = RecogniserErrors(0.05, 10.0, 2.0)
+ERRORS = RecogniserErrors()
 LOG_U = -np.log(20.0)
-MIXTURE = Mixture(ERRORS, Kernel("none", 1.0))
-KERNELS = [Kernel("none", 1.0), Kernel("huber", 1.3), Kernel("cauchy", 1.5)]
-NAMES = [kernel.name for kernel in KERNELS]
+MIXTURE = Mixture(ERRORS, GaussianKernel())
+KERNELS = [GaussianKernel(), RobustKernel(shape="huber", width=1.3), RobustKernel()]
+NAMES = [kernel.shape for kernel in KERNELS]
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.4, 0.2), np.array([0.3, 0.1, -0.1]))
 R = np.array([[4e-4, 1.2e-4], [1.2e-4, 1e-4]])
 PLACES = {7: np.array([3.0, 0.5, -1.0]), 4: np.array([3.2, 1.4, -1.1]), 9: np.array([2.6, -0.6, -0.9])}

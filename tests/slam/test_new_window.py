@@ -11,6 +11,8 @@ from sonar_graph.slam.smoother.factor_store import GraphEdit
 from sonar_graph.slam.smoother.fixed_lag import SmootherWindow, joined, marginal, picked, without
 from sonar_graph.slam.smoother.incremental import Smoother
 
+from .made import smoother_with
+
 PRIOR_M, TIGHT_M, WEAK_M = 3.0, 2e-8, 1e3
 
 
@@ -72,7 +74,7 @@ def test_nothing_says_nothing_and_what_touches_nothing_inside_neither(is_by_qr: 
 
 def begun_anew(tight_m: float) -> Smoother:
     """Three keyframes like the chain; a factor on the first, which has left, is exchanged for its like."""
-    smoother = Smoother(lag_s=0.5, relinearize_threshold=1e-6, stale_shift_m=1e9)
+    smoother = smoother_with(lag_s=0.5, relinearize_threshold=1e-6, stale_shift_m=1e9)
     handles = []
     for k, sigma in enumerate([PRIOR_M, tight_m, WEAK_M]):
         smoother.add_pose(X(k), gtsam.Pose3(), float(k))

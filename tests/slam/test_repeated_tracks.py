@@ -19,12 +19,12 @@ from .rail import STEP_S, rail
 
 POLICIES = {
     "robust": {},
-    "gate": {"identity_policy": "gate", "gate_probability": 0.99},
-    "bounded": {"history": "bounded", "lag_s": 3.0},
-    "short": {"lag_s": 1.6},
-    "associate": {"unknown_landmarks": "associate"},
-    "max-mixture": {"identity_policy": "max-mixture"},
-    "gnc": {"identity_policy": "gnc"},
+    "gate": {"identity__policy": "gate", "identity__gate_probability": 0.99},
+    "bounded": {"history__policy": "bounded", "smoother__lag_s": 3.0},
+    "short": {"smoother__lag_s": 1.6},
+    "associate": {"identity__unknown__policy": "associate"},
+    "max-mixture": {"identity__policy": "max-mixture"},
+    "gnc": {"identity__policy": "gnc"},
 }
 NODES = 10
 ROWS = len(rail(NODES)[1].ranges)
@@ -54,11 +54,11 @@ def test_a_run_is_that_without_second_rows_of_tracks(policy: str, data: st.DataO
     sequence = said(tracks, beliefs)
     with pytest.MonkeyPatch.context() as monkeypatch:
         heard = Heard(monkeypatch)
-        estimator = run(sequence, 1 / STEP_S, motion_noise_share=0.0, **POLICIES[policy])
+        estimator = run(sequence, 1 / STEP_S, keyframes__motion_noise_share=0.0, **POLICIES[policy])
     outcomes = assert_outcomes_account(estimator, sequence)
     assert outcomes[Outcome.TRACK_REPEATED] == ROWS - len(once(sequence))
     without = replace(sequence, detections=LandmarkDetections.concatenate(heard.rows))
-    alone = run(without, 1 / STEP_S, motion_noise_share=0.0, **POLICIES[policy])
+    alone = run(without, 1 / STEP_S, keyframes__motion_noise_share=0.0, **POLICIES[policy])
     for with_others, known in zip(result(estimator), result(alone), strict=True):
         assert np.array_equal(with_others, known)
 
@@ -123,7 +123,7 @@ def test_the_posterior_of_no_identity_speaks_for_no_row(counts_as: int):
 
 def test_where_tracks_are_not_used_all_rows_are():
     sequence = said([0] * ROWS, [SURE[4] if i == 0 else SURE[7] for i in first_of_frame()])
-    outcomes = assert_outcomes_account(run(sequence, 1 / STEP_S, deferred_identity=False), sequence)
+    outcomes = assert_outcomes_account(run(sequence, 1 / STEP_S, identity__longest_wait_s=0), sequence)
     assert outcomes[Outcome.TRACK_REPEATED] == 0
     assert outcomes[Outcome.USED] + outcomes[Outcome.NEW] == ROWS
 

@@ -52,8 +52,8 @@ def test_names_of_landmarks_without_names_are_refused_where_these_begin():
     assert sequence.detections is not None
     ids = np.where(sequence.detections.candidate_ids == 4, FIRST_ANONYMOUS_ID, 7)
     named = replace(sequence, detections=replace(sequence.detections, candidate_ids=ids))
-    with pytest.raises(EstimatorError, match=rf"has identity {FIRST_ANONYMOUS_ID}; with unknown_landmarks = "):
-        run(named, 1 / STEP_S, unknown_landmarks="associate")
+    with pytest.raises(EstimatorError, match=rf"has identity {FIRST_ANONYMOUS_ID}; with identity.unknown.policy = "):
+        run(named, 1 / STEP_S, identity__unknown__policy="associate")
     assert FIRST_ANONYMOUS_ID in run(named, 1 / STEP_S).landmarks().ids
 
 
@@ -65,9 +65,9 @@ def test_a_range_beyond_any_sonar_is_refused_by_name_and_the_run_is_that_without
     assert seen is not None
     far = seen.range_m.copy()
     far[3] = range_m
-    estimator = run(replace(sequence, detections=replace(seen, range_m=far)), 1 / STEP_S, identity_policy=policy)
+    estimator = run(replace(sequence, detections=replace(seen, range_m=far)), 1 / STEP_S, identity__policy=policy)
     assert assert_outcomes_account(estimator, sequence)[Outcome.UNSOUND] == 1
     without = replace(sequence, detections=seen.rows(np.arange(len(seen)) != 3))
-    known = run(without, 1 / STEP_S, identity_policy=policy)
+    known = run(without, 1 / STEP_S, identity__policy=policy)
     assert np.array_equal(estimator.landmarks().positions, known.landmarks().positions)
     assert np.array_equal(estimator.trajectory().positions, known.trajectory().positions)

@@ -1,6 +1,5 @@
 """Another solution of the history: what it costs, and when it is taken."""
 
-from dataclasses import replace
 from itertools import product
 
 import gtsam
@@ -10,6 +9,7 @@ from gtsam.symbol_shorthand import L, X
 from scipy.stats import multivariate_normal
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
+from sonar_graph.slam import KeyframeParams, MixtureIdentity
 from sonar_graph.slam.landmarks import mixture_history as rival_history
 from sonar_graph.slam.landmarks.mixture import Choices, TrackedObject
 from sonar_graph.slam.landmarks.mixture_history import RivalHistory
@@ -18,7 +18,7 @@ from sonar_graph.slam.landmarks.sighting import SightingFactors
 from . import dive as dive_module
 from . import test_mixture as small
 from .dive import CALIBRATION, FLOOR, Dive, spherical
-from .test_doubtful_identities import PLACES, dive, doubting, misnamed, show, watch
+from .test_doubtful_identities import PLACES, dive, misnamed, show, watch
 
 
 def rival_of(world: Dive) -> RivalHistory:
@@ -32,7 +32,7 @@ def rival_of(world: Dive) -> RivalHistory:
 @pytest.mark.parametrize("move_m", [[0.05, 0.0, 0.0], [0.0, -0.05, 0.0], [0.0, 0.0, 0.05]])
 def test_the_cost_rises_as_the_error_of_the_graph_does(move_m: list[float]) -> None:
     """As long as choices stay; a landmark that leaves its floor pays for that too."""
-    world, _ = misnamed(doubting())
+    world, _ = misnamed("max-mixture")
     rival, chosen = rival_of(world), world.sightings._doubtful.history()
     graph, moved = rival._chosen_graph(chosen.choices), gtsam.Values(chosen.values)
     moved.update(L(7), chosen.values.atPoint3(L(7)) + move_m)
@@ -44,7 +44,7 @@ def test_the_cost_rises_as_the_error_of_the_graph_does(move_m: list[float]) -> N
 
 def test_the_cheaper_of_both_solutions_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     """The one that stands has taken all sightings of landmark 9 for no landmark; the other knows better, or worse."""
-    world, rng = dive(doubting()), np.random.default_rng(3)
+    world, rng = dive("max-mixture"), np.random.default_rng(3)
     for k in range(1, 9):
         watch(world, 0.3 * k, {i: i for i in PLACES}, rng)
     rival, chosen = rival_of(world), world.sightings._doubtful.history()
@@ -136,7 +136,10 @@ def test_a_landmark_that_began_with_another_thing_is_moved_beside_the_run_too() 
 def drifted(side_m: float, *, is_graduated: bool) -> tuple[Dive, list[int]]:
     """Three landmarks, and again after the vehicle has drifted aside; in two frames first only the middle one."""
     dvl = CALIBRATION.dvl.model_copy(update={"velocity_sigma_m_s": (0.2, 0.2, 0.2)})
-    world = Dive(CALIBRATION.model_copy(update={"floor": FLOOR, "dvl": dvl}), doubting(is_graduated=is_graduated))
+    world = Dive(
+        CALIBRATION.model_copy(update={"floor": FLOOR, "dvl": dvl}),
+        MixtureIdentity(policy="gnc" if is_graduated else "max-mixture"),
+    )
     rng, truth = np.random.default_rng(3), []
     for k in range(10):
         after_s, moved_m = (0.1 * (k + 1), 0.0) if k < 4 else (1.6 + 0.1 * k, side_m)
@@ -149,7 +152,7 @@ def drifted(side_m: float, *, is_graduated: bool) -> tuple[Dive, list[int]]:
 
 def test_graduated_non_convexity_finds_what_the_windows_choices_have_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     """The drift is of four standard deviations: a few wrong identities explain it as well until more is seen."""
-    monkeypatch.setattr(dive_module, "POLICY", replace(dive_module.POLICY, max_interval_s=1.0, motion_noise_share=0.0))
+    monkeypatch.setattr(dive_module, "POLICY", KeyframeParams(max_interval_s=1.0, motion_noise_share=0.0))
     costs, sides, side_m = [], [], 0.6
     for is_graduated in (False, True):
         world, truth = drifted(side_m, is_graduated=is_graduated)

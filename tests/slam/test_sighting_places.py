@@ -1,7 +1,5 @@
 """Where a landmark is put when it is first seen: on the beam, or on a floor, from where the vehicle was."""
 
-from dataclasses import replace
-
 import gtsam
 import numpy as np
 import pytest
@@ -90,7 +88,7 @@ def test_elevation_is_said_once_for_a_landmark():
 
 def test_a_frame_that_brings_a_keyframe_hangs_on_it():
     dive = Dive()
-    dive.keyframes.policy = replace(POLICY, motion_noise_share=0.0)
+    dive.keyframes.params = POLICY.model_copy(update={"motion_noise_share": 0.0})
     dive.see(1.05, (5, 3.0, 0.0))
     assert dive.keyframes.stamps_ns == [START_NS, T0_NS + NS]
     graph = dive.smoother.graph

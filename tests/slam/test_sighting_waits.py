@@ -5,17 +5,17 @@ import pytest
 from gtsam.symbol_shorthand import L
 
 from sonar_graph.calibration import Start
-from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import Outcome
 
 from .dive import CALIBRATION, NS, T0_NS, Dive
+from .made import smoother_with
 
 
 def waiting(greatest_gain: float) -> Dive:
     """A landmark that has been seen once by a vehicle that is sure of where it is."""
     sure = Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)
     dive = Dive(CALIBRATION.model_copy(update={"start": sure}))
-    dive.smoother = dive.keyframes.smoother = dive.sightings.smoother = Smoother(1e9, 1e-6, 1e9, greatest_gain)
+    dive.smoother = dive.keyframes.smoother = dive.sightings.smoother = smoother_with(1e9, 1e-6, 1e9, greatest_gain)
     dive.see(0.0, (5, 3.0, 0.0))
     return dive
 

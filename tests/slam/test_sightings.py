@@ -10,11 +10,10 @@ from scipy.stats import chi2
 
 from sonar_graph.calibration import DvlCalibration, Mounting, SonarCalibration, Start
 from sonar_graph.measurements import Floats
-from sonar_graph.slam.frontend import SightingPolicy
-from sonar_graph.slam.keyframes import KeyframePolicy
+from sonar_graph.slam import GaussianKernel, KeyframeParams, RobustKernel
 from sonar_graph.states import Outcome
 
-from .dive import CALIBRATION, NS, POLICY, SONAR, T0_NS, Dive, frame, spherical
+from .dive import CALIBRATION, NS, POLICY, SONAR, T0_NS, UNGATED, Dive, frame, spherical
 
 
 def test_innovation_and_its_covariance_are_those_of_the_joint_prediction():
@@ -51,7 +50,7 @@ def test_noise_of_the_motion_since_the_keyframe_is_added():
         }
     )
     dive = Dive(ahead)
-    dive.keyframes.policy = KeyframePolicy(100.0, 1e9, 60.0)
+    dive.keyframes.params = KeyframeParams(max_interval_s=100.0, motion_noise_share=1e9)
     dive.see(0.0, (5, 4.0, 0.0))
     dive.see(0.0, (5, 4.0, 0.0))
     dive.see(2.0, (5, 3.0, 0.0))
@@ -78,7 +77,7 @@ def test_the_gate_is_the_chi_square_quantile(beyond):
 
 
 def test_without_a_gate_nothing_is_refused():
-    dive = Dive(policy=SightingPolicy(0.7, 1.0, "none", 2.0))
+    dive = Dive(identity=UNGATED)
     dive.see(0.0, (5, 3.0, 0.0))
     dive.see(0.0, (5, 30.0, 1.0))
     assert dive.outcomes == [Outcome.NEW, Outcome.USED]
@@ -106,7 +105,7 @@ def test_a_frame_before_the_start_is_unlocated():
 def test_a_frame_older_than_what_was_processed_is_late(share):
     """Whether a keyframe was set since then or not: motion to it is no longer kept."""
     dive = Dive()
-    dive.keyframes.policy = replace(POLICY, motion_noise_share=share)
+    dive.keyframes.params = POLICY.model_copy(update={"motion_noise_share": share})
     dive.see(3.0, (5, 3.0, 0.0))
     before = dive.smoother.graph.size()
     dive.see(2.99, (5, 3.0, 0.0), (6, 2.0, 0.0))
@@ -142,8 +141,8 @@ def test_a_covariance_in_the_log_goes_before_that_of_the_calibration(told):
 @pytest.mark.parametrize("kernel", ["huber", "cauchy"])
 def test_a_kernel_keeps_an_outlier_from_pulling(kernel):
     pulls = []
-    for name in ("none", kernel):
-        dive = Dive(policy=SightingPolicy(0.7, 1.0, name, 2.0))
+    for noise in (GaussianKernel(), RobustKernel(shape=kernel, width=2.0)):
+        dive = Dive(identity=UNGATED, kernel=noise)
         for _ in range(5):
             dive.see(0.0, (5, 3.0, 0.0))
         before = dive.smoother.values.atPoint3(L(5))

@@ -7,7 +7,8 @@ from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother.batch_solution import Sightline, Sightlines, solve
-from sonar_graph.slam.smoother.incremental import Smoother
+
+from .made import smoother_with
 
 BODY_T_SONAR = gtsam.Pose3(gtsam.Rot3.Ypr(0.3, 0.4, 0.0), np.array([0.8, 0.1, -0.2]))
 POSE = gtsam.Pose3(gtsam.Rot3.Ypr(2.0, 0.05, -0.03), np.array([3.0, -4.0, -1.0]))
@@ -81,7 +82,7 @@ def test_a_landmark_is_placed_where_most_of_its_sightings_say():
 
 
 def test_a_landmark_stuck_behind_comes_round_in_the_solution_of_the_history():
-    smoother = Smoother(lag_s=10.0, relinearize_threshold=1e-3, stale_shift_m=0.1)
+    smoother = smoother_with(lag_s=10.0, relinearize_threshold=1e-3, stale_shift_m=0.1)
     smoother.add_pose(X(0), POSE, 0.0)
     smoother.add([gtsam.PriorFactorPose3(X(0), POSE, gtsam.noiseModel.Isotropic.Sigma(6, 1e-3))])
     smoother.add_landmark(L(1), world_point(1.9, Z[1] + 0.9 * np.pi))
@@ -97,7 +98,7 @@ def test_a_landmark_stuck_behind_comes_round_in_the_solution_of_the_history():
 
 def test_a_new_start_that_ends_higher_is_not_taken():
     """One sharp sighting ahead against two dull ones behind: most lie behind, yet the landmark is where it is best."""
-    smoother = Smoother(lag_s=10.0, relinearize_threshold=1e-3, stale_shift_m=0.1)
+    smoother = smoother_with(lag_s=10.0, relinearize_threshold=1e-3, stale_shift_m=0.1)
     smoother.add_pose(X(0), POSE, 0.0)
     smoother.add([gtsam.PriorFactorPose3(X(0), POSE, gtsam.noiseModel.Isotropic.Sigma(6, 1e-3))])
     smoother.add_landmark(L(1), world_point(*Z))

@@ -8,10 +8,10 @@ from gtsam.symbol_shorthand import B, L, X
 from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother.batch_solution import solve
-from sonar_graph.slam.smoother.incremental import Smoother
 
 from .fed import FOREVER_S, NEVER_M, dense_covariance, in_the_basin, joint, on_the_rail, settled
 from .graphs import graph_of
+from .made import smoother_with
 from .rail import rail
 
 
@@ -102,7 +102,7 @@ def test_factors_wait_until_they_are_worth_an_update():
 
 
 def test_a_new_variable_does_not_wait():
-    smoother = Smoother(6.0, 1e-6, NEVER_M, greatest_waiting_gain=1e9)
+    smoother = smoother_with(6.0, 1e-6, NEVER_M, waiting_gain=1e9)
     smoother.waiting_gain = 1e8
     assert not smoother.is_due
     smoother.add_landmark(L(1), np.zeros(3))
@@ -112,7 +112,7 @@ def test_a_new_variable_does_not_wait():
 @pytest.mark.parametrize("lag_s", [FOREVER_S, 3.0])
 def test_biases_in_a_row_are_least_squares(lag_s):
     """Old ones leave the window; the newest is that of all: scalars by hand, prior, walk, and a reading of each."""
-    smoother, sigma, walk, reading = Smoother(lag_s, 1e-6, NEVER_M), 1.0, 0.5, 0.3
+    smoother, sigma, walk, reading = smoother_with(lag_s, 1e-6, NEVER_M), 1.0, 0.5, 0.3
     A, b = [np.eye(8)[0] / sigma], [0.0]
     for k in range(8):
         smoother.add_pose(X(k), gtsam.Pose3(), float(k))

@@ -8,10 +8,10 @@ from gtsam.symbol_shorthand import L, X
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother.batch_solution import solve
 from sonar_graph.slam.smoother.factor_store import GraphEdit
-from sonar_graph.slam.smoother.incremental import Smoother
 
 from .fed import FOREVER_S, SONAR, Fed, counted_solves, in_the_basin, joint, on_the_rail, plain
 from .graphs import graph_of
+from .made import smoother_with
 from .rail import RANGE_SIGMA_M, STEP_S, Rail, rail
 
 
@@ -196,7 +196,7 @@ def test_a_hold_that_is_over_ends_at_an_exchange_only_where_what_left_can_be_tak
 @pytest.mark.parametrize("start_s", [0.001, 3.137, 30.7, 1.7e9])
 def test_a_held_keyframe_stays_however_its_time_is_rounded(start_s: float, is_bounded: bool) -> None:
     """Its age is exactly the lag then; differences of times near 0 are rounded up as often as down."""
-    smoother, sigmas = Smoother(2.0, 1e-3, 1e9, is_bounded=is_bounded), gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
+    smoother, sigmas = smoother_with(2.0, 1e-3, 1e9, is_bounded=is_bounded), gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
     smoother.add_pose(X(0), gtsam.Pose3(), start_s)
     smoother.add([gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), sigmas)])
     smoother.hold({X(0): np.inf})

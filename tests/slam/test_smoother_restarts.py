@@ -11,7 +11,7 @@ from sonar_graph.calibration import Calibration, Start
 from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother.batch_solution import solve
-from sonar_graph.slam.smoother.incremental import FIRST_RESTART, Smoother
+from sonar_graph.slam.smoother.incremental import FIRST_RESTART
 
 from .fed import (
     FOREVER_S,
@@ -27,6 +27,7 @@ from .fed import (
     settled,
 )
 from .graphs import graph_of
+from .made import smoother_with
 from .rail import rail
 
 
@@ -82,7 +83,7 @@ def test_drift_beyond_what_cholesky_takes_is_survived():
     """A pose uncertain by 20 m with millimetre steps: the plain solver gives up, the smoother agrees with algebra."""
     plain = gtsam.ISAM2()
     sigmas = np.array([20.0, 0.002])
-    smoother = Smoother(FOREVER_S, 1e-3, NEVER_M)
+    smoother = smoother_with(FOREVER_S, 1e-3, NEVER_M)
     wide, narrow = (gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-3] * 3 + [s] * 3)) for s in sigmas)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k in range(3):
@@ -107,7 +108,7 @@ def test_drift_beyond_what_cholesky_takes_is_survived():
 @pytest.mark.parametrize(("shift_m", "is_due"), [(0.09, False), (0.11, True)])
 def test_the_window_restarts_once_a_landmark_has_moved_by_the_stale_shift(monkeypatch, shift_m, is_due):
     sizes = counted_solves(monkeypatch)
-    smoother = Smoother(1e9, 1.0, 0.1)
+    smoother = smoother_with(1e9, 1.0, 0.1)
     tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
     smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
     smoother.add([gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), tight)] * FIRST_RESTART)

@@ -9,15 +9,22 @@ from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.errors import EstimatorError
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
-from sonar_graph.slam.isam2 import Isam2, Isam2Params
+from sonar_graph.slam import Isam2
 
 from .graphs import information
+from .made import isam2_params
 
 
 @cache
 def ran(lag_s: float, history: str = "whole", kernel: str = "none") -> Isam2:
     sequence = simulate_mission(MissionOptions(duration_s=40.0, imu="mti1", landmarks=6))
-    params = Isam2Params(lag_s=lag_s, history=history, kernel=kernel, waiting_gain=0.0, bias_interval_s=15.0)
+    params = isam2_params(
+        smoother__lag_s=lag_s,
+        history__policy=history,
+        kernel__shape=kernel,
+        smoother__waiting_gain=0.0,
+        keyframes__bias_interval_s=15.0,
+    )
     estimator = Isam2(sequence.calibration, params)
     for step in sequence.replay(sequence.instants(2.0)):
         estimator.process(step)

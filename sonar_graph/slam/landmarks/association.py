@@ -20,8 +20,10 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from pydantic import Field
 from scipy.stats import chi2
 
+from sonar_graph.calibration import Section
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections
 from sonar_graph.states import Outcome
 
@@ -78,15 +80,16 @@ LEAST_LANDMARKS = 20
 """K at least: while a graph has few landmarks, a mistake is more probably of one that it has not yet got."""
 
 
-@dataclass(frozen=True)
-class RecogniserErrors:
+class RecogniserErrors(Section):
     """How often a recogniser is wrong, and where something that is no landmark may be seen."""
 
-    wrong_id_probability: float
-    """q: probability that a statement has nothing to do with what was seen."""
-    view_range_m: float
-    view_azimuth_rad: float
-    """Extent of range and azimuth over which detections of no landmark are spread."""
+    wrong_id_probability: float = Field(0.05, gt=0, lt=1)
+    """Probability q that what the recogniser says has nothing to do with what was seen, beside what its posterior
+    admits. The mixture's other landmarks share one half of it, no landmark has the other."""
+    view_range_m: float = Field(10.0, gt=0)
+    """Detections of no landmark are spread evenly over so much range."""
+    view_azimuth_rad: float = Field(2.0, gt=0)
+    """The same of azimuth."""
 
     @property
     def log_density(self) -> float:

@@ -23,56 +23,23 @@ at the point where it is, and where each sighting that does not fit has it. The 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
-from typing import Literal
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L
-from scipy.integrate import quad
 
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
 from sonar_graph.slam.landmarks.sighting import Sighting
+from sonar_graph.slam.models.factors import Kernel
 
 LEAST_TRUNCATION = 1.0
 """Of the squared error, where even a perfect fit is less probable than none."""
 REPEATED_LOSS = 3.0
 """Mean loss, twice or thrice what noise alone gives, to which sightings of one thing that stands still agree."""
-KernelName = Literal["none", "huber", "cauchy"]
-
-
-@dataclass(frozen=True)
-class Kernel:
-    """The shape of the noise of range and of azimuth."""
-
-    name: KernelName
-    width: float
-    """In standard deviations."""
-
-    def estimator(self) -> gtsam.noiseModel.mEstimator.Base | None:
-        """As GTSAM has it; None for Gaussian noise."""
-        if self.name == "huber":
-            return gtsam.noiseModel.mEstimator.Huber.Create(self.width)
-        return gtsam.noiseModel.mEstimator.Cauchy.Create(self.width) if self.name == "cauchy" else None
-
-    def loss(self, e: Floats) -> Floats:
-        """The loss rho of errors in standard deviations."""
-        k, size = self.width, np.abs(e)
-        if self.name == "huber":
-            return np.where(size <= k, 0.5 * size**2, k * (size - 0.5 * k))
-        if self.name == "cauchy":
-            return np.asarray(0.5 * k**2 * np.log1p((size / k) ** 2))
-        return np.asarray(0.5 * size**2)
-
-    @property
-    def log_normaliser(self) -> float:
-        """Logarithm of n, of a density ``n / sigma exp(-rho(e / sigma))``. A Cauchy kernel needs a width above 1."""
-        area, _ = quad(lambda e: math.exp(-float(self.loss(np.array(e)))), -math.inf, math.inf)
-        return -math.log(area)
 
 
 @dataclass(eq=False)

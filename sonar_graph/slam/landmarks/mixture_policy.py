@@ -14,17 +14,20 @@ For smoothed results the choices of the whole history are made anew, beside the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L
+from pydantic import Field
 
 from sonar_graph.measurements import NO_TRACK, Floats
-from sonar_graph.slam.landmarks.association import IdentityPosterior
+from sonar_graph.settings import tagged
+from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
 from sonar_graph.slam.landmarks.mixture import Choices, Mixture, TrackedObject, each_once, supporters_elsewhere
 from sonar_graph.slam.landmarks.mixture_history import RivalHistory
 from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting
-from sonar_graph.slam.landmarks.tracked import NS_PER_S, STILL
+from sonar_graph.slam.landmarks.tracked import NS_PER_S, STILL, GatedIdentity, RobustIdentity
 from sonar_graph.slam.models import PredictedView
 from sonar_graph.states import DetectionJournal, DetectionLog, Outcome
 
@@ -32,6 +35,23 @@ MOST_ROUNDS = 3
 """Times that choices are made anew after one update."""
 MOST_OPEN = 200
 """Newest watches that are chosen anew."""
+
+
+class MixtureIdentity(RecogniserErrors):
+    """Take a detection, or a track, as of the landmark that place and posterior make most probable, or of none.
+
+    "max-mixture": chosen anew in the window as the estimate moves, in the whole history for smoothed results. Assumes
+    `wrong_id_probability`, errors that are independent, and an estimate that is near when it chooses. "gnc": smoothed
+    results also try what graduated non-convexity finds in the whole history, which needs no near estimate; assumes that
+    most of what the recogniser says is right.
+    """
+
+    policy: Literal["max-mixture", "gnc"] = "max-mixture"
+    longest_wait_s: float = Field(60.0, gt=0)
+    """Detections of a track wait at most so long in the window. A track not seen for so long is over."""
+
+
+IdentityParams = Annotated[RobustIdentity | GatedIdentity | MixtureIdentity, *tagged("policy", "robust")]
 
 
 class DoubtfulIdentities:
@@ -43,29 +63,25 @@ class DoubtfulIdentities:
         Of the graph.
     journal
         Its rows are amended when choices change.
+    params
+        Its settings.
     mixture
         What watches may be of, and how probable that is.
-    longest_wait_s
-        A track's sightings wait at most so long in the window; a track that was not seen for so long is over.
-    is_graduated
-        Whether the choices of the history are also sought by graduated non-convexity.
     """
 
     def __init__(
         self,
         landmarks: LandmarkSightings,
         journal: DetectionJournal,
+        params: MixtureIdentity,
         mixture: Mixture,
-        longest_wait_s: float,
-        *,
-        is_graduated: bool = False,
     ) -> None:
         self._landmarks = landmarks
         self._smoother, self._maker = landmarks.smoother, landmarks.maker
         self._journal = journal
         self._mixture = mixture
-        self._longest_wait_ns = round(longest_wait_s * NS_PER_S)
-        self._is_graduated = is_graduated
+        self._longest_wait_ns = round(params.longest_wait_s * NS_PER_S)
+        self._is_graduated = params.policy == "gnc"
         self._tracks: dict[int, TrackedObject] = {}
         self._disputed: set[int] = set()
         self._chosen: ChosenHistory | None = None

@@ -24,21 +24,71 @@ While a track counts as none it is the row with the highest posterior of any; of
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Literal
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L
 from numpy.typing import NDArray
+from pydantic import Field
 
+from sonar_graph.calibration import Section
 from sonar_graph.measurements import NO_TRACK, LandmarkDetections
 from sonar_graph.navigation.preintegration import PreintegratedMotion
+from sonar_graph.slam.landmarks.association import gate_threshold
 from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting
+from sonar_graph.slam.landmarks.unknown import IgnoredUnknown, UnknownParams
 from sonar_graph.slam.models import PredictedView
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.states import DetectionJournal, Outcome
+
+
+class TrackedIdentity(Section):
+    """Settings of identities that are believed track by track."""
+
+    minimum_probability: float = Field(0.7, ge=0, le=1)
+    """A detection is used when its most probable identity has at least this posterior."""
+    longest_wait_s: float = Field(60.0, ge=0)
+    """Detections of one track wait at most so long until its identity is known, and are moved when it turns out to be
+    another. A track not seen for so long keeps the one it has. 0: every detection is judged by itself."""
+    unknown: UnknownParams = IgnoredUnknown()
+    """Detections that name no landmark."""
+
+    @property
+    def gate(self) -> float:
+        """Largest squared Mahalanobis innovation of range and azimuth; infinite: none is refused."""
+        return math.inf
+
+
+class RobustIdentity(TrackedIdentity):
+    """Believe what is probable enough.
+
+    Assumes that most sightings of every landmark are right, and that wrong ones disagree with each other: the kernel
+    then lets the majority win, unless a landmark's first sighting is so far off that the others hardly pull.
+    """
+
+    policy: Literal["robust"] = "robust"
+
+
+class GatedIdentity(TrackedIdentity):
+    """Believe what is probable enough and lies where that landmark is expected.
+
+    Assumes that the estimate and its covariance are right when a detection comes; nothing is taken back.
+    """
+
+    policy: Literal["gate"] = "gate"
+    gate_probability: float = Field(0.999, gt=0, le=1)
+    """A detection whose squared Mahalanobis innovation exceeds this chi-square quantile (2 dof) is refused; 1: none."""
+
+    @property
+    def gate(self) -> float:
+        """Largest squared Mahalanobis innovation of range and azimuth; infinite: none is refused."""
+        return gate_threshold(self.gate_probability, 2) if self.gate_probability < 1 else math.inf
+
 
 UNDECIDED, NO_LANDMARK = -2, -1
 """What a row may decide besides a landmark's identity."""

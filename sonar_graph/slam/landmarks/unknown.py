@@ -28,15 +28,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L
 from numpy.typing import NDArray
+from pydantic import Field
 
+from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.settings import tagged
 from sonar_graph.slam.landmarks.association import gate_threshold
 from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, believed, pair_jointly
 from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, place, source
@@ -119,23 +122,35 @@ LARGEST_SIGMA_SHARE = 0.1
 range: a point that far off still looks linear."""
 
 
-@dataclass(frozen=True)
-class AnonymousPolicy:
-    """What is believed of landmarks without identities."""
+class IgnoredUnknown(Section):
+    """Refuse detections that name no landmark."""
 
-    gate_probability: float
-    """A true pairing is jointly compatible with this probability."""
-    density_m2: float
-    """Landmarks a square metre of floor that may be there and are not in the map."""
-    least_sightings: int
-    """So many of a candidate make a landmark."""
-    longest_wait_s: float
-    """A sighting waits for them until its keyframe is so much older than the newest one."""
+    policy: Literal["ignore"] = "ignore"
+
+
+class AssociatedUnknown(Section):
+    """Pair detections that name no landmark with landmarks by geometry.
+
+    Begins landmarks with identities from 3000000000 on; docs/theory/unknown_landmarks.md says on what conditions.
+    """
+
+    policy: Literal["associate"] = "associate"
+    gate_probability: float = Field(0.9999, gt=0, lt=1)
+    """A true pairing of a frame's detections with landmarks is jointly compatible with this probability."""
+    density_m2: float = Field(0.05, gt=0)
+    """Landmarks a square metre that may be there and are not in the map: the rival of every pairing."""
+    sightings: int = Field(5, ge=1)
+    """So many sightings of what is paired with no landmark begin one."""
+    longest_wait_s: float = Field(10.0, gt=0)
+    """So long, and no longer than ``smoother.lag_s``, a sighting waits for them."""
 
     @property
     def log_rival(self) -> float:
         """Logarithm of the density, 1/m², that a pairing has to exceed."""
         return math.log(ODDS * self.density_m2)
+
+
+UnknownParams = Annotated[IgnoredUnknown | AssociatedUnknown, *tagged("policy", "ignore")]
 
 
 def unnamed(frame: LandmarkDetections) -> NDArray[np.bool_]:
@@ -154,9 +169,9 @@ def refuse_taken_ids(frame: LandmarkDetections) -> None:
     largest = int(frame.candidate_ids.max())
     if largest >= FIRST_ANONYMOUS_ID:
         raise EstimatorError(
-            f"isam2: a detection at {frame.stamps_ns[0]} ns has identity {largest}; with unknown_landmarks ="
+            f"isam2: a detection at {frame.stamps_ns[0]} ns has identity {largest}; with identity.unknown.policy ="
             f' "associate" those from {FIRST_ANONYMOUS_ID} on are of landmarks without names: number the landmarks'
-            ' below that, or give it unknown_landmarks = "ignore"'
+            ' below that, or give it identity.unknown.policy = "ignore"'
         )
 
 
@@ -193,19 +208,16 @@ class AnonymousLandmarks:
         What is believed.
     """
 
-    def __init__(self, landmarks: LandmarkSightings, journal: DetectionJournal, policy: AnonymousPolicy) -> None:
+    def __init__(self, landmarks: LandmarkSightings, journal: DetectionJournal, policy: AssociatedUnknown) -> None:
         self._landmarks = landmarks
         self._smoother, self._maker = landmarks.smoother, landmarks.maker
         self._journal = journal
         self._policy = policy
+        self.longest_wait_s = min(policy.longest_wait_s, landmarks.smoother.params.lag_s)
+        """Age, against the newest keyframe, of the oldest keyframes on which sightings may wait."""
         self._merging = LandmarkMerging(landmarks, policy.gate_probability, policy.log_rival)
         self._candidates: list[Candidate] = []
         self._next_id = FIRST_ANONYMOUS_ID
-
-    @property
-    def longest_wait_s(self) -> float:
-        """Age, against the newest keyframe, of the oldest keyframes on which sightings may wait."""
-        return self._policy.longest_wait_s
 
     @property
     def has_landmarks(self) -> bool:
@@ -265,7 +277,7 @@ class AnonymousLandmarks:
                 self._begin(candidate, time_s)
 
     def _is_placed(self, candidate: Candidate) -> bool:
-        if len(candidate.sightings) < self._policy.least_sightings:
+        if len(candidate.sightings) < self._policy.sightings:
             return False
         _, cov = place(candidate.sightings, self._smoother.values, self._maker)
         range_m = candidate.sightings[-1].line.z[0]
@@ -316,7 +328,7 @@ class AnonymousLandmarks:
 
 
 def _choose(
-    z: Floats, noise: Floats, expected: Floats, cov: Floats, policy: AnonymousPolicy
+    z: Floats, noise: Floats, expected: Floats, cov: Floats, policy: AssociatedUnknown
 ) -> list[tuple[int, Floats | None, Floats | None]]:
     """For each detection the index of what it is paired with, the innovation and its covariance."""
     if not len(z) or not len(expected):

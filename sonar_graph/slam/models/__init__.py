@@ -1,7 +1,7 @@
 """Models."""
 
 # fmt: off
-from sonar_graph.slam.models.factors import Robust
+from sonar_graph.slam.models.factors import GaussianKernel, Kernel, KernelParams, Robust, RobustKernel
 from sonar_graph.slam.models.prediction import PredictedView, Source
 from sonar_graph.slam.models.sonar_model import (
     FLOOR_GATE, elevation_on_floor, floor_elevation, locate, locate_jacobians, project, range_azimuth_jacobians,
@@ -9,6 +9,7 @@ from sonar_graph.slam.models.sonar_model import (
 )
 
 __all__ = [
-    "FLOOR_GATE", "PredictedView", "Robust", "Source", "elevation_on_floor", "floor_elevation", "locate",
-    "locate_jacobians", "project", "range_azimuth_jacobians", "sonar_point", "sonar_point_jacobian", "wrap_angle",
+    "FLOOR_GATE", "GaussianKernel", "Kernel", "KernelParams", "PredictedView", "Robust", "RobustKernel", "Source",
+    "elevation_on_floor", "floor_elevation", "locate", "locate_jacobians", "project", "range_azimuth_jacobians",
+    "sonar_point", "sonar_point_jacobian", "wrap_angle",
 ]

@@ -24,13 +24,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import gtsam
 import numpy as np
+from pydantic import Field
 
+from sonar_graph.calibration import Section
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
+from sonar_graph.settings import tagged
 from sonar_graph.slam.smoother.batch_solution import (
     JointCovariance,
     KeptCovariance,
@@ -52,35 +55,60 @@ ROUNDING_S = 1e-6
 """Longer than differences of times are wrong by: what is exactly as old as the lag stays."""
 
 
+class SmootherParams(Section):
+    """Settings of the incremental solution."""
+
+    lag_s: float = Field(15.0, gt=0)
+    """Poses older than this are marginalised out of the incremental solution; a large value keeps the whole history."""
+    relinearize_threshold: float = Field(0.001, gt=0)
+    """A variable is relinearised when a component of its change exceeds this (rad or m)."""
+    stale_shift_m: float = Field(0.1, gt=0)
+    """The window is linearised anew, from a solution of the whole graph, when a landmark has moved farther."""
+    waiting_gain: float = Field(5.0, ge=0)
+    """Sightings wait for the next keyframe until what they would add, the sum of expected over measured variance,
+    exceeds this. 0: none waits."""
+
+
+class WholeHistory(Section):
+    """Every factor is kept, for the batch solution in `Isam2.trajectory`."""
+
+    policy: Literal["whole"] = "whole"
+
+
+class BoundedHistory(Section):
+    """Poses older than the lag are given up, so that time and memory do not grow with the run.
+
+    Kept is what they say about landmarks and bias; `Isam2.trajectory` is fixed-lag smoothed
+    (docs/theory/bounded_memory.md).
+    """
+
+    policy: Literal["bounded"] = "bounded"
+    remembered_s: float | None = Field(None, gt=0)
+    """`Isam2.trajectory` and `Isam2.detections` forget what is older than this (and up to a quarter more); None:
+    nothing."""
+
+
+HistoryParams = Annotated[WholeHistory | BoundedHistory, *tagged("policy", "whole")]
+
+
 class Smoother:
     """A growing graph with a bounded incremental solution.
 
     Parameters
     ----------
-    lag_s
-        Poses older than this leave the window; infinite: plain iSAM2 over the whole history.
-    relinearize_threshold
-        A variable is relinearised when any component of its change exceeds this (rad or m).
-    stale_shift_m
-        The window restarts when a landmark has moved by more than this from where it was linearised.
-    greatest_waiting_gain
-        An update is due when `waiting_gain` exceeds this.
+    params
+        With an infinite lag: plain iSAM2 over the whole history.
     is_bounded
         What leaves the window is given up: its factors become marginals for good, its variables are forgotten.
     """
 
     def __init__(
         self,
-        lag_s: float,
-        relinearize_threshold: float,
-        stale_shift_m: float,
-        greatest_waiting_gain: float = 0.0,
+        params: SmootherParams,
         *,
         is_bounded: bool = False,
     ) -> None:
-        self._lag_s = lag_s
-        self._stale_shift_m = stale_shift_m
-        self._greatest_waiting_gain = greatest_waiting_gain
+        self.params = params
         self._restart_size = FIRST_RESTART
         self.is_bounded = is_bounded
         """Whether what leaves the window is given up."""
@@ -103,7 +131,7 @@ class Smoother:
         self._held: dict[int, float] = {}
         self._landmarks: list[int] = []
         self._bias: list[int] = []
-        self._window = SmootherWindow(relinearize_threshold, lag_s)
+        self._window = SmootherWindow(params.relinearize_threshold, params.lag_s)
         self._kept_covariance = KeptCovariance()
         self._solved: tuple[gtsam.Values, gtsam.Marginals | gtsam.ISAM2] | None = None
         self._solved_changes = 0
@@ -243,7 +271,7 @@ class Smoother:
     @property
     def is_due(self) -> bool:
         """Whether an update is: variables wait for it, or factors that would change the estimate."""
-        return self._pending.values.size() > 0 or self.waiting_gain > self._greatest_waiting_gain
+        return self._pending.values.size() > 0 or self.waiting_gain > self.params.waiting_gain
 
     def update(self, time_s: float) -> None:
         """Bring the window's estimate up to date with what was added; what is older than the lag leaves it."""
@@ -266,7 +294,7 @@ class Smoother:
             estimate = self._window.isam.calculateEstimate()
         self._clear_pending()
         self._take(estimate)
-        if self._may_restart(time_s) and self._window.largest_shift(self._landmarks) > self._stale_shift_m:
+        if self._may_restart(time_s) and self._window.largest_shift(self._landmarks) > self.params.stale_shift_m:
             self._restart(time_s)
 
     def _times(self, poses_s: dict[int, float], time_s: float) -> dict[Any, float]:
@@ -327,7 +355,7 @@ class Smoother:
 
     def _may_restart(self, time_s: float) -> bool:
         if self.is_bounded:
-            return time_s >= self._restarted_s + self._lag_s
+            return time_s >= self._restarted_s + self.params.lag_s
         return self.graph.size() >= self._restart_size
 
     def _give_up_cholesky(self, time_s: float) -> None:
@@ -345,7 +373,7 @@ class Smoother:
     def _lag_at(self, time_s: float) -> float:
         """Age (s) from which on poses leave the window."""
         held = (time_s - self._expiring[key] + ROUNDING_S for key, until_s in self._held.items() if time_s <= until_s)
-        return max([self._lag_s, *held])
+        return max([self.params.lag_s, *held])
 
     def _clear_pending(self) -> None:
         self._pending = Pending()
