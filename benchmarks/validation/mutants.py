@@ -5,8 +5,9 @@ the broken module or its package are run until the first failure. A fault is one
 sign or an operator exchanged, a number changed, ``and`` and ``or`` exchanged, a condition negated, a returned value
 dropped, a call left out. Messages, docstrings, annotations and defaults of tests are not touched.
 
-``--root`` judges another checkout, such as an older commit, in the same way. ``--keep`` holds results, so that a run
-that was interrupted goes on.
+``--root`` judges another checkout in the same way. ``--against`` names an older checkout: each fault that survives is
+made there too, in the same statement wherever it stands, and judged by the older tests; one that they find is a guard
+that was lost. ``--keep`` holds results, so that a run that was interrupted goes on.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -48,6 +50,7 @@ class Mutant(NamedTuple):
     line: int
     before: str
     after: str
+    statement: str
     source: str
 
     @property
@@ -59,6 +62,8 @@ def sites(tree: ast.Module) -> Iterator[tuple[ast.AST, str, int]]:
     """Nodes that can be broken, with the kind of fault and a number where a node has several."""
     untouched: set[int] = set()
     for node in ast.walk(tree):
+        for child in ast.iter_child_nodes(node):
+            child._parent = node  # type: ignore[attr-defined]  # for `_statement_of`
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             annotations = [a.annotation for a in ast.walk(node.args) if isinstance(a, ast.arg)] + [node.returns]
             untouched |= {id(n) for a in (*annotations, *node.decorator_list) if a for n in ast.walk(a)}
@@ -143,7 +148,8 @@ def _mutant(root: Path, path: Path, k: int) -> Mutant:
     text = path.read_text("utf-8")
     tree = ast.parse(text)
     node, kind, number = list(sites(tree))[k]
-    statement = _statement_of(tree, node)
+    statement = _statement_of(node)
+    text_before = ast.unparse(statement)
     before = ast.get_source_segment(text, statement) or ""
     first, last = statement.lineno, statement.end_lineno or statement.lineno
     node._site = k  # type: ignore[attr-defined]  # a mark for the transformer
@@ -154,13 +160,45 @@ def _mutant(root: Path, path: Path, k: int) -> Mutant:
     lines[first - 1 : last] = [indent + row for row in changed.split("\n")]
     old, new = before.split("\n"), changed.split("\n")
     shown = next(((a, b) for a, b in zip(old, new, strict=False) if a.split() != b.split()), (old[0], new[0]))
-    return Mutant(str(path.relative_to(root)), line, shown[0].strip(), f"{kind}: {shown[1].strip()}", "\n".join(lines))
+    return Mutant(
+        str(path.relative_to(root)),
+        line,
+        shown[0].strip(),
+        f"{kind}: {shown[1].strip()}",
+        text_before,
+        "\n".join(lines),
+    )
 
 
-def _statement_of(tree: ast.Module, node: ast.AST) -> ast.stmt:
-    """The innermost simple statement, or compound one by its head, that holds a node."""
-    holders = [s for s in ast.walk(tree) if isinstance(s, ast.stmt) and any(n is node for n in ast.walk(s))]
-    return min(holders, key=lambda s: sum(1 for _ in ast.walk(s)))
+@cache
+def faults_by_statement(root: Path) -> dict[str, list[tuple[Path, int]]]:
+    """All places where a fault can be made, by the text of their statement."""
+    places: dict[str, list[tuple[Path, int]]] = {}
+    for package in PACKAGES:
+        for path in sorted((root / package).rglob("*.py")):
+            tree = ast.parse(path.read_text("utf-8"))
+            texts: dict[int, str] = {}
+            for k, (node, _, _) in enumerate(sites(tree)):
+                statement = _statement_of(node)
+                text = texts.setdefault(id(statement), ast.unparse(statement))
+                places.setdefault(text, []).append((path, k))
+    return places
+
+
+def same_fault(mutant: Mutant, old_root: Path) -> Mutant | None:
+    """The fault in an older checkout: in a statement with the same text there; None where there is none."""
+    for path, k in faults_by_statement(old_root).get(mutant.statement, []):
+        found = _mutant(old_root, path, k)
+        if "".join(found.after.split()) == "".join(mutant.after.split()):
+            return found
+    return None
+
+
+def _statement_of(node: ast.AST) -> ast.stmt:
+    """The innermost statement that holds a node."""
+    while not isinstance(node, ast.stmt):
+        node = node._parent  # type: ignore[attr-defined]  # set by `sites`
+    return node
 
 
 def tests_of(root: Path, path: str) -> list[str]:
@@ -216,25 +254,34 @@ def main() -> None:
     parser.add_argument("--mutants", type=int, default=60)
     parser.add_argument("--seed", type=int, default=16)
     parser.add_argument("--keep", type=Path, help="JSON file with the results so far")
+    parser.add_argument("--against", type=Path, help="an older checkout that judges the survivors")
     parser.add_argument("--quick", action="store_true", help="three mutants, to see that it runs")
     arguments = parser.parse_args()
     root = arguments.root.resolve()
     mutants = choose(root, 3 if arguments.quick else arguments.mutants, arguments.seed)
     kept = json.loads(arguments.keep.read_text()) if arguments.keep and arguments.keep.exists() else {}
-    for number, mutant in enumerate(mutants, start=1):
-        key = f"{mutant.name} {mutant.after}"
+
+    def remember(key: str, root: Path, mutant: Mutant) -> str:
         if key not in kept:
             began = time.perf_counter()
             kept[key] = judge(root, mutant, tests_of(root, mutant.path))
-            note(f"{number}/{len(mutants)} {kept[key]:8s} {time.perf_counter() - began:4.0f} s  {key}")
+            note(f"{kept[key]:8s} {time.perf_counter() - began:4.0f} s  {key}")
             if arguments.keep:
                 arguments.keep.write_text(json.dumps(kept, indent=1))
-    outcomes = [kept[f"{m.name} {m.after}"] for m in mutants]
+        return str(kept[key])
+
+    outcomes = [remember(f"{m.name} {m.after}", root, m) for m in mutants]
     survivors = [m for m, outcome in zip(mutants, outcomes, strict=True) if outcome == "survived"]
-    print_table(["survivor", "before", "fault"], [[m.name, m.before[:60], m.after[:80]] for m in survivors])
-    survival = len(survivors) / len(mutants)
-    figures = {"mutants": len(mutants), "survived": len(survivors), "survival": round(survival, 3), "passed": True}
-    conclude(figures, is_quick=arguments.quick)
+    figures = {"mutants": len(mutants), "survived": len(survivors), "survival": round(len(survivors) / len(mutants), 3)}
+    said = ["not judged"] * len(survivors)
+    if arguments.against:
+        old_root = arguments.against.resolve()
+        older = [same_fault(m, old_root) for m in survivors]
+        said = [remember(f"older {o.name} {o.after}", old_root, o) if o else "not there" for o in older]
+        figures |= {"found_by_older_tests": sum(s not in ("survived", "not there") for s in said)}
+    rows = [[m.name, m.before[:60], m.after[:70], s] for m, s in zip(survivors, said, strict=True)]
+    print_table(["survivor", "before", "fault", "older tests"], rows)
+    conclude(figures | {"passed": figures.get("found_by_older_tests", 0) == 0}, is_quick=arguments.quick)
 
 
 if __name__ == "__main__":
