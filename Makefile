@@ -1,5 +1,6 @@
 # make demo    install, run the main job on a simulated basin, say where the report is
 # make test    install, run the fast tests
+# make test-slow, make test-thorough   the slow tests; every property with many examples
 # make check   lint, format, types, import contracts
 # PYTHON=python3.13 chooses the interpreter, VENV=folder the environment.
 
@@ -9,16 +10,24 @@ DEMO ?= demo
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test test-slow check format wheel check-wheel install clean
+.PHONY: demo test test-slow test-thorough check format wheel check-wheel install clean
 
 demo: $(VENV)/.installed
 	$(BIN)/sonar-graph demo -o $(DEMO)
 
+# Loops are compiled before the workers start; each of them would compile them for itself.
 test: $(VENV)/.installed-tests
+	$(BIN)/python tests/compile_kernels.py
 	$(BIN)/python -m pytest -n auto
 
 test-slow: $(VENV)/.installed-tests
+	$(BIN)/python tests/compile_kernels.py
 	$(BIN)/python -m pytest -n auto -m slow
+
+# All properties with a hundred examples each instead of twenty.
+test-thorough: $(VENV)/.installed-tests
+	$(BIN)/python tests/compile_kernels.py
+	$(BIN)/python -m pytest -n auto --hypothesis-profile=thorough
 
 check: $(VENV)/.installed-lint
 	$(BIN)/ruff check .

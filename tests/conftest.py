@@ -1,4 +1,4 @@
-"""What all tests share: the recordings, a plotting backend without a screen, hypothesis without deadlines.
+"""Fixtures and settings of all tests: recordings, a plotting backend without a screen, hypothesis without deadlines.
 
 Linear algebra runs in one thread: matrices here are small, and the threads of several workers wait for each other.
 """
@@ -23,8 +23,9 @@ os.environ["MPLBACKEND"] = "Agg"
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):  # before numpy is loaded, here and in the workers
     os.environ.setdefault(name, "1")
 
-settings.register_profile("sonar_graph", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("sonar_graph")
+settings.register_profile("thorough", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("fast", settings.get_profile("thorough"), max_examples=20)
+settings.load_profile("fast")  # --hypothesis-profile=thorough: a hundred examples for each property
 
 
 @pytest.fixture(scope="session")
