@@ -1,6 +1,6 @@
-"""A suite from its file to its table: planned, resumed, done, collected.
+"""A suite from its file to its table of results: planned, resumed, done, collected. Start with `run_suite`.
 
-Ctrl-C that comes at a bad moment and is not lost, and SIGTERM that counts like it.
+Decisions: docs/design/0011-batch.md.
 """
 
 from __future__ import annotations
@@ -13,21 +13,234 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 
-from sonar_graph.batch.cluster import Where, run_batch
 from sonar_graph.batch.plan import plan_runs
+from sonar_graph.batch.recorded import RecordedBatch, read_batch
 from sonar_graph.batch.result_table import write_results
-from sonar_graph.batch.store import SUITE, Limits, PlannedRun, Row, RunOutcome, Store, only_batch_in
-from sonar_graph.batch.suite import SuiteFile
+from sonar_graph.batch.store import (
+    SUITE,
+    Limits,
+    PlannedRun,
+    Progress,
+    Row,
+    RunOutcome,
+    Store,
+    Where,
+    only_batch_in,
+)
+from sonar_graph.batch.suite import SuiteFile, read_suite
 from sonar_graph.errors import BatchError
 from sonar_graph.files import replacing
+
+NEEDED_PACKAGES = ("distributed", "filelock", "pyarrow")
+INSTALL = "pip install 'sonar-graph[bench]'"
+
+
+def run_suite(
+    path: Path | str,
+    folder: Path | str,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    timeout_s: float | None = None,
+    retry_failed: bool = False,
+    progress: Callable[[int, int, int], None] | None = None,
+) -> RecordedBatch:
+    """Run a suite: logs or simulations, seeds, estimators and variants. Runs that are done already are kept.
+
+    Needs the extra ``bench``. A script calls it under ``if __name__ == "__main__":``, because worker processes import
+    the script. The same call resumes a batch that was interrupted, also with more seeds or estimators in the suite.
+
+    Parameters
+    ----------
+    path
+        The suite, a TOML file; its format is in `sonar_graph.batch.suite`.
+    folder
+        Folder for the batch. One suite has one folder.
+    workers
+        Number of processes on this machine; None: one for each core.
+    scheduler
+        Address of a Dask scheduler, such as ``tcp://10.0.0.5:8786``, to be used instead.
+    timeout_s
+        Time limit of a run, in seconds; None: the suite's.
+    retry_failed
+        Do runs again that failed, timed out or were killed.
+    progress
+        Called at the start and after each run with the number of runs that are done, planned and failed.
+
+    Returns
+    -------
+    RecordedBatch
+        All runs with their scores. The folder has them as ``results.parquet``, and in ``runs/KEY`` what `compare`
+        writes.
+
+    Raises
+    ------
+    BatchError
+        When the suite has a mistake (with file, line and key), another batch runs in the folder, it holds the batch of
+        another suite, no worker can be had, or a package of the extra is missing. Runs that are done are kept.
+    KeyboardInterrupt
+        On Ctrl-C or SIGTERM, with a message that tells how many runs are done.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from sonar_graph.batch import plan_runs, read_suite, run_suite
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> suite = folder / "lap.toml"
+    >>> _ = suite.write_text('''
+    ... name = "lap"
+    ... reference = "dead-reckoning"
+    ...
+    ... [[logs]]
+    ... name = "basin"
+    ... generator = "basin"
+    ... options = { duration_s = 120, laps = 1 }
+    ... seeds = 2
+    ...
+    ... [[estimators]]
+    ... name = "dead-reckoning"
+    ... ''')
+    >>> [(run.log, run.seed, run.estimator) for run in plan_runs(read_suite(suite))]
+    [('basin', 0, 'dead-reckoning'), ('basin', 1, 'dead-reckoning')]
+    >>> batch = run_suite(suite, folder / "lap", workers=1)  # doctest: +SKIP
+    >>> batch.values("basin", "dead-reckoning", "causal.ate_se2_m").shape  # doctest: +SKIP
+    (2,)
+    """
+    if workers is not None and scheduler is not None:
+        raise BatchError("workers are processes on this machine, a scheduler is that of a cluster; give one of them")
+    if lacking := [name for name in NEEDED_PACKAGES if find_spec(name) is None]:
+        raise BatchError(f"bench needs {lacking[0]}, which is not installed: {INSTALL}")
+    file, folder = read_suite(Path(path)), Path(folder)
+    with Batch.opened(file, folder) as batch:
+        if retry_failed:
+            batch.discard_failed()
+        statuses = Counter(str(row["status"]) for row in batch.rows().values())
+
+        def report() -> None:
+            if progress is not None:
+                progress(statuses.total(), len(batch.runs), statuses.total() - statuses["ok"])
+
+        def count(_run: PlannedRun, outcome: RunOutcome) -> None:
+            statuses[str(outcome.row["status"])] += 1
+            report()
+
+        report()
+        try:
+            with terminations_as_interrupts():
+                batch.run(Where(workers, scheduler), limits_of(file, timeout_s), count)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(batch.resuming()) from None
+    return read_batch(folder)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """A suite and the folder of its runs."""
+
+    file: SuiteFile
+    runs: list[PlannedRun]
+    store: Store
+
+    @classmethod
+    @contextlib.contextmanager
+    def opened(cls, file: SuiteFile, folder: Path) -> Iterator[Batch]:
+        """Plan a suite, find its finished runs, and keep other batches out of the folder while the block runs.
+
+        Raises
+        ------
+        BatchError
+            When the suite has a mistake, another batch runs in the folder, or it holds the batch of another suite; no
+            file in it is touched then, and no folder is made for a suite with a mistake.
+        """
+        runs = plan_runs(file)
+        store = Store(folder)
+        with only_batch_in(folder):
+            with contextlib.suppress(OSError, ValueError):  # no suite here, or none that can be resumed
+                name = tomllib.loads((folder / SUITE).read_text(encoding="utf-8")).get("name")
+                if name != file.suite.name:  # a suite that was edited but has its name still goes on here
+                    raise BatchError(
+                        f"{folder}: holds the batch of suite {name!r}, and {file.path} is suite {file.suite.name!r}; "
+                        "choose another folder with -o, or, where it only has a new name, give it that name in "
+                        f"{folder / SUITE} too"
+                    )
+            store.remove_partial()
+            yield cls(file, runs, store)
+
+    def rows(self) -> dict[str, Row]:
+        """Rows of the runs that are done, by key."""
+        return {run.key: row for run in self.runs if (row := self.store.row(run.key)) is not None}
+
+    def discard_failed(self) -> None:
+        """Remove runs that did not succeed, so that they are done again."""
+        for key, row in self.rows().items():
+            if row["status"] != "ok":
+                self.store.discard(key)
+
+    def run(self, where: Where, limits: Limits, progress: Progress) -> None:
+        """Do the runs that are not done, and write the table, also if the batch ends early.
+
+        Suite and table in the folder are replaced as soon as the first run of this plan is done, and not before. The
+        table then names all runs, so a batch that is killed can be read without the code that planned it.
+
+        Raises
+        ------
+        BatchError
+            When the batch cannot go on; finished runs are kept.
+        """
+        from sonar_graph.batch import cluster  # Dask is of the extra `bench`
+
+        done = self.rows()
+        missing = [run for run in self.runs if run.key not in done]
+        has_table = self._write_table_if_possible()
+
+        def kept(run: PlannedRun, outcome: RunOutcome) -> None:
+            nonlocal has_table
+            has_table = has_table or self._write_table_if_possible()
+            progress(run, outcome)
+
+        try:
+            cluster.run_batch(missing, self.store, limits, where, kept)
+        except (BatchError, KeyboardInterrupt) as error:
+            self._write_table_if_possible()  # an error here would hide the one that ends the batch
+            if isinstance(error, BatchError):
+                raise BatchError(f"{error}; {self.resuming()}") from error
+            raise
+        self._write_table()
+
+    def resuming(self) -> str:
+        """Sentence with the number of finished runs and how to resume."""
+        return f"{len(self.rows())} of {len(self.runs)} runs are done and kept; the same command goes on from there"
+
+    def _write_table(self) -> None:
+        with deferred_interrupt():
+            with replacing(self.store.folder / SUITE) as partial:
+                partial.write_text(self.file.text, encoding="utf-8")
+            write_results(self.store, self.file.suite, self.runs)
+
+    def _write_table_if_possible(self) -> bool:
+        """Write the table if any run is done and there is space; tell whether it was written."""
+        if not any(self.store.row(run.key) for run in self.runs):
+            return False
+        with contextlib.suppress(OSError):
+            self._write_table()
+            return True
+        return False
+
+
+def limits_of(file: SuiteFile, timeout_s: float | None) -> Limits:
+    """Limits of a suite's runs; a given timeout replaces the suite's."""
+    limits = Limits(file.suite.timeout_s, file.suite.memory_mb)
+    return limits if timeout_s is None else replace(limits, timeout_s=timeout_s)
 
 
 @contextmanager
 def terminations_as_interrupts() -> Iterator[None]:
-    """Let SIGTERM, by which SLURM, Kubernetes and ``timeout`` end a job, do in the block what Ctrl-C does."""
+    """Treat SIGTERM, by which SLURM, Kubernetes and ``timeout`` end a job, like Ctrl-C inside the block."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         handler = signal.getsignal(signal.SIGINT)
@@ -45,14 +258,14 @@ def terminations_as_interrupts() -> Iterator[None]:
 
 @contextmanager
 def deferred_interrupt() -> Iterator[None]:
-    """Let a Ctrl-C that comes during the block count at its end.
+    """Defer a Ctrl-C that comes during the block to its end.
 
-    Compiled code without a way to raise (pyarrow has some) swallows the exception, and the batch would go on.
+    Compiled code that cannot raise (some of pyarrow) swallows the exception, and the batch would go on.
 
     Raises
     ------
     KeyboardInterrupt
-        At the end of the block, when the signal came meanwhile; an error of the block is its context.
+        At the end of the block, when the signal came in between; an error of the block is its context.
     """
     handler = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(handler):
@@ -64,119 +277,5 @@ def deferred_interrupt() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, handler)
-        if came:  # also where the block fails: whoever passes over its error would pass over the interrupt
+        if came:  # also when the block fails: a caller that passes over its error must not pass over the interrupt
             handler(*came[0])
-
-
-@dataclass(frozen=True)
-class Batch:
-    """A suite and the folder of its runs."""
-
-    file: SuiteFile
-    runs: list[PlannedRun]
-    store: Store
-
-    @classmethod
-    @contextlib.contextmanager
-    def opened(cls, file: SuiteFile, folder: Path, runs: list[PlannedRun] | None = None) -> Iterator[Batch]:
-        """Plan a suite, find out what of it is done, and keep other batches out of the folder while the block runs.
-
-        Parameters
-        ----------
-        runs
-            The suite's plan, where it was made already.
-
-        Raises
-        ------
-        BatchError
-            When the suite has a mistake, another batch runs in the folder, or it holds the batch of another suite; no
-            file in it is touched then.
-        """
-        runs = plan_runs(file) if runs is None else runs
-        store = Store(folder)
-        with only_batch_in(folder):
-            _check_same_suite(file, folder)
-            store.remove_partial()
-            yield cls(file, runs, store)
-
-    def rows(self) -> dict[str, Row]:
-        """The rows of the runs that are done, by key."""
-        return {run.key: row for run in self.runs if (row := self.store.row(run.key)) is not None}
-
-    def discard_failed(self) -> None:
-        """Forget runs that did not succeed, so that they are done anew."""
-        for key, row in self.rows().items():
-            if row["status"] != "ok":
-                self.store.discard(key)
-
-    def run(self, where: Where, limits: Limits, progress: Callable[[PlannedRun, RunOutcome], None]) -> Counter[str]:
-        """Do what is not done, and write the table, also where the batch ends early.
-
-        Suite and table in the folder are replaced as soon as a run of this plan is done, and not before: the table then
-        names all runs, so that what a batch left that is killed can be read without the code that planned it.
-
-        Returns
-        -------
-        How many runs have which status.
-
-        Raises
-        ------
-        BatchError
-            When the batch cannot go on; what is done is kept.
-        """
-        done = self.rows()
-        missing = [run for run in self.runs if run.key not in done]
-        is_begun = self._write_table_if_it_can_be()
-
-        def begun(run: PlannedRun, outcome: RunOutcome) -> None:
-            nonlocal is_begun
-            is_begun = is_begun or self._write_table_if_it_can_be()
-            progress(run, outcome)
-
-        try:
-            run_batch(missing, self.store, limits, where, begun)
-        except (BatchError, KeyboardInterrupt) as error:
-            self._write_table_if_it_can_be()  # why the batch ends is what has to be told
-            if isinstance(error, BatchError):
-                raise BatchError(f"{error}; {self.resuming()}") from error
-            raise
-        self._write_table()
-        return Counter(str(row["status"]) for row in self.rows().values())
-
-    def resuming(self) -> str:
-        """How far it is and how to go on."""
-        return f"{len(self.rows())} of {len(self.runs)} runs are done and kept; the same command goes on from there"
-
-    def _write_table(self) -> None:
-        with deferred_interrupt():
-            with replacing(self.store.folder / SUITE) as partial:
-                partial.write_text(self.file.text, encoding="utf-8")
-            write_results(self.store, self.file.suite, self.runs)
-
-    def _write_table_if_it_can_be(self) -> bool:
-        """Whether there is something to tell and space to tell it."""
-        if not any(self.store.row(run.key) for run in self.runs):
-            return False
-        with contextlib.suppress(OSError):
-            self._write_table()
-            return True
-        return False
-
-
-def _check_same_suite(file: SuiteFile, folder: Path) -> None:
-    """Refuse the folder of another suite; one that was changed, and has its name still, goes on there."""
-    try:
-        name = tomllib.loads((folder / SUITE).read_text(encoding="utf-8")).get("name")
-    except (OSError, ValueError):  # none, or none that could be gone on with
-        return
-    if name != file.suite.name:
-        raise BatchError(
-            f"{folder}: holds the batch of suite {name!r}, and {file.path} is suite {file.suite.name!r}; choose "
-            f"another folder with -o, or, where it only has a new name, give it that name in {folder / SUITE} too"
-        )
-
-
-def limits_of(file: SuiteFile, timeout_s: float | None) -> Limits:
-    """What a run of a suite may take; a timeout that is given goes before the suite's."""
-    limits = Limits(file.suite.timeout_s, file.suite.memory_mb)
-    return limits if timeout_s is None else replace(limits, timeout_s=timeout_s)

@@ -1,9 +1,8 @@
-"""A batch on Dask: a cluster of this machine's processes, or one that exists.
+"""A batch on Dask: a cluster of this machine's processes, or a scheduler that exists.
 
-One task a run. What a run leaves travels back to the batch, which alone writes to the store: workers need no common
-file system, except for logs, and a full disk is met in one place.
-
-Loaded by the Dask workers of this machine: Ctrl-C in a terminal goes to them too, and the batch ends them itself.
+Each run is one task. Its outcome travels back to the batch, which alone writes to the store: workers need no common
+file system, except for logs, and a full disk is noticed in one place. Workers on this machine preload this module
+(`dask_setup`). Decisions: docs/design/0011-batch.md.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ import signal
 import threading
 import uuid
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import dask
@@ -24,7 +22,7 @@ from distributed import Client, Future, LocalCluster, as_completed
 from distributed.client import FutureCancelledError
 from distributed.scheduler import KilledWorker
 
-from sonar_graph.batch.store import Limits, PlannedRun, RunOutcome, Store
+from sonar_graph.batch.store import Limits, PlannedRun, Progress, RunOutcome, Store, Where
 from sonar_graph.batch.supervision import perform_watched
 from sonar_graph.errors import BatchError, SonarGraphError
 
@@ -42,26 +40,8 @@ DASK_SETTINGS = {
     "distributed.admin.system-monitor.interval": "10s",
     "distributed.worker.preload": ["sonar_graph.batch.cluster"],
 }
-"""One retry for the run of a worker that is killed; memory is that of the runs' own processes, watched there; and
-Dask's looking at itself, made for many small tasks, is rare: it takes time from the runs."""
-
-
-@dataclass(frozen=True)
-class Where:
-    """Who does the runs."""
-
-    workers: int | None = None
-    """On this machine; None: one for each of its cores that this process may use."""
-    scheduler: str | None = None
-    """Address of a Dask scheduler that exists, in place of workers here."""
-
-    @property
-    def local_workers(self) -> int:
-        """How many there are on this machine."""
-        return self.workers or CPU_COUNT
-
-
-Progress = Callable[[PlannedRun, RunOutcome], None]
+"""One retry after a worker is killed. Memory is watched by `supervision`, not by Dask. Dask's self-monitoring is made
+for many small tasks and is slowed down here, because it takes time from the runs."""
 
 
 def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: Where, progress: Progress) -> None:
@@ -77,16 +57,21 @@ def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: W
     Raises
     ------
     BatchError
-        When there is no scheduler or no worker, workers cannot do any run, or nothing can be written. What is done by
-        then is kept.
+        When there is no scheduler or no worker, workers cannot do any run, or nothing can be written. Runs that are
+        done by then are kept.
     KeyboardInterrupt
         On Ctrl-C, after a few seconds in which workers are ended.
     """
     planned = list(runs)
     if not planned:
         return
-    with dask.config.set(DASK_SETTINGS), _quiet(), _client(where, len(planned)) as client:
-        this_batch = uuid.uuid4().hex  # tasks of equal keys are one for a scheduler, which other batches use too
+    connected = (
+        _local_client(min(where.workers or CPU_COUNT, len(planned)))
+        if where.scheduler is None
+        else _remote_client(where.scheduler)
+    )
+    with dask.config.set(DASK_SETTINGS), _silent_dask(), connected as client:
+        this_batch = uuid.uuid4().hex  # equal keys are one task for a scheduler, which other batches use too
         submitted = (
             client.submit(perform_watched, run, limits, key=f"run-{run.key}-{this_batch}", pure=False)
             for run in planned
@@ -94,7 +79,7 @@ def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: W
         futures = dict(zip(submitted, planned, strict=True))
         try:
             for future in as_completed(list(futures)):
-                _keep(futures.pop(future), future, store, progress)
+                keep(futures.pop(future), future, store, progress)
                 future.release()
         except FutureCancelledError as error:
             raise BatchError(f"the scheduler was lost: {error}") from error
@@ -102,8 +87,24 @@ def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: W
             _within_seconds(lambda: client.cancel(list(futures)))
 
 
-def _keep(run: PlannedRun, future: Future[Any], store: Store, progress: Progress) -> None:
-    outcome = _outcome(future)
+def keep(run: PlannedRun, future: Future[Any], store: Store, progress: Progress) -> None:
+    """Write the outcome of a finished task to the store; a run whose workers were killed has a row that says so.
+
+    Raises
+    ------
+    BatchError
+        When the worker could not do the run at all, or the store cannot be written.
+    """
+    try:
+        outcome = future.result()
+    except KilledWorker:
+        reason = "the workers that did it were killed, one after the other"
+        outcome = RunOutcome({"status": "killed", "reason": reason}, log=f"{reason}\n")
+    except SonarGraphError as error:
+        raise BatchError(str(error)) from error
+    except (OSError, ImportError) as error:
+        raise BatchError(f"a worker cannot do runs: {error}") from error
+    assert isinstance(outcome, RunOutcome)
     try:
         store.write(run.key, outcome)
     except OSError as error:
@@ -111,87 +112,9 @@ def _keep(run: PlannedRun, future: Future[Any], store: Store, progress: Progress
     progress(run, outcome)
 
 
-def _outcome(future: Future[Any]) -> RunOutcome:
-    """What a run left; workers that were killed under it leave a row that says so."""
-    try:
-        outcome = future.result()
-    except KilledWorker:
-        reason = "the workers that did it were killed, one after the other"
-        return RunOutcome({"status": "killed", "reason": reason}, log=f"{reason}\n")
-    except SonarGraphError as error:
-        raise BatchError(str(error)) from error
-    except (OSError, ImportError) as error:
-        raise BatchError(f"a worker cannot do runs: {error}") from error
-    assert isinstance(outcome, RunOutcome)
-    return outcome
-
-
 @contextlib.contextmanager
-def _client(where: Where, tasks: int) -> Iterator[Client]:
-    """A client of the scheduler there is, or of a cluster that lives as long as the block.
-
-    Raises
-    ------
-    BatchError
-        When the scheduler cannot be reached, or no worker can be started here.
-    """
-    if where.scheduler is not None:
-        client = _connected(where.scheduler)
-        try:
-            yield client
-        finally:
-            _within_seconds(client.close)
-        return
-    cluster = _local_cluster(min(where.local_workers, tasks))
-    client = Client(cluster)
-    try:
-        yield client
-    finally:
-        workers = _worker_processes(cluster)
-        _within_seconds(client.close)
-        _within_seconds(cluster.close)
-        for process in workers:
-            with contextlib.suppress(psutil.Error):
-                process.kill()
-
-
-def _local_cluster(workers: int) -> LocalCluster:
-    try:
-        return LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            processes=True,
-            memory_limit=None,
-            dashboard_address=":0",
-            silence_logs=logging.CRITICAL,
-        )
-    except RuntimeError as error:
-        raise BatchError(
-            f"no worker could be started ({error}); a script that runs a batch does so under "
-            '`if __name__ == "__main__":`, since workers import it'
-        ) from error
-
-
-def _worker_processes(cluster: Any) -> list[psutil.Process]:
-    """The processes of a cluster of this machine; runs' own processes end when these do."""
-    pids = [nanny.pid for nanny in cluster.workers.values() if nanny.pid is not None]
-    return [psutil.Process(pid) for pid in pids if psutil.pid_exists(pid)]
-
-
-def _within_seconds(end: Callable[[], object]) -> None:
-    """End something that may wait for what is gone; after some seconds it is left to itself."""
-
-    def end_quietly() -> None:
-        with contextlib.suppress(Exception):  # the first error is the one to tell
-            end()
-
-    thread = threading.Thread(target=end_quietly, daemon=True)
-    thread.start()
-    thread.join(CLOSE_S)
-
-
-def _connected(address: str) -> Client:
-    """A client of a scheduler that has at least one worker.
+def _remote_client(address: str) -> Iterator[Client]:
+    """Client of a scheduler that exists and has at least one worker.
 
     Raises
     ------
@@ -207,12 +130,63 @@ def _connected(address: str) -> Client:
     except TimeoutError as error:
         client.close()
         raise BatchError(f"the scheduler at {address} has no worker after {CONNECT_S:g} s; start some") from error
-    return client
+    try:
+        yield client
+    finally:
+        _within_seconds(client.close)
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Without Dask's own messages: workers that come and go are told by rows."""
+def _local_client(workers: int) -> Iterator[Client]:
+    """Client of a cluster on this machine that lives as long as the block.
+
+    Raises
+    ------
+    BatchError
+        When no worker can be started.
+    """
+    try:
+        cluster = LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            memory_limit=None,
+            dashboard_address=":0",
+            silence_logs=logging.CRITICAL,
+        )
+    except RuntimeError as error:
+        raise BatchError(
+            f"no worker could be started ({error}); a script that runs a batch does so under "
+            '`if __name__ == "__main__":`, since workers import it'
+        ) from error
+    client = Client(cluster)
+    try:
+        yield client
+    finally:
+        pids = [nanny.pid for nanny in cluster.workers.values() if nanny.pid is not None]
+        workers_here = [psutil.Process(pid) for pid in pids if psutil.pid_exists(pid)]
+        _within_seconds(client.close)
+        _within_seconds(cluster.close)
+        for process in workers_here:  # the processes of runs end when these do
+            with contextlib.suppress(psutil.Error):
+                process.kill()
+
+
+def _within_seconds(end: Callable[[], object]) -> None:
+    """End something that may wait for a lost partner; after `CLOSE_S` it is left alone."""
+
+    def end_quietly() -> None:
+        with contextlib.suppress(Exception):  # the first error is the one to report
+            end()
+
+    thread = threading.Thread(target=end_quietly, daemon=True)
+    thread.start()
+    thread.join(CLOSE_S)
+
+
+@contextlib.contextmanager
+def _silent_dask() -> Iterator[None]:
+    """Suppress Dask's own messages; rows report workers that were lost."""
     names = [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]
     before = {name: logging.getLogger(name).level for name in names}
     for name in names:
@@ -225,5 +199,5 @@ def _quiet() -> Iterator[None]:
 
 
 def dask_setup(_worker: object) -> None:
-    """Leave the signal to the batch; Dask calls this when a worker starts."""
+    """Let a new worker ignore Ctrl-C, which a terminal sends to it too; the batch ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,7 +1,7 @@
-"""What a batch left behind, as its report and its gate read it: ``results.parquet`` and the suite beside it.
+"""Results of a batch, as its report and its gate read them: ``results.parquet`` and the suite beside it.
 
-The table names every run that is planned. One that it has as not done may have been done since, by a batch that was
-killed: its row is then read from where the run is kept.
+The table names every planned run. A run that it lists as not done may have been done since by a batch that was killed;
+its row is then read from the run's own folder.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ DEFAULT_METRICS = (
 )
 GOING_ON = "give the bench command that began it again: it goes on from there"
 ALL_LOGS = "all logs"
-"""Stands for every log of a batch where they are taken together."""
+"""Name for all logs of a batch taken together."""
 NEEDED = ("key", "log", "estimator", "status")
 WORDS = ("key", "suite", "log", "generator", "estimator", "variant", "status", "reason", "log_file", "machine")
 OBJECTS = ("options", "params", "versions")
@@ -54,34 +54,34 @@ class RecordedRun:
     reason: str = ""
     log_file: str = ""
     texts: dict[str, str] = field(default_factory=dict)
-    """All else that is no number: generator, options, params, versions, machine."""
+    """Other columns that are no numbers: generator, options, params, versions, machine."""
     values: dict[str, float] = field(default_factory=dict)
-    """Every number that is known, by column."""
+    """Every finite number, by column."""
     place: int = 0
-    """In the plan: groups are told in its order, whichever of their runs are done."""
+    """Position in the plan, which gives the order of groups."""
 
     @property
     def contestant(self) -> str:
-        """Estimator, with the variant where it is not the default one."""
+        """Estimator, with the variant unless it is the default one."""
         return self.estimator if self.variant in DEFAULT_VARIANT else f"{self.estimator}/{self.variant}"
 
     @property
     def ended(self) -> bool:
-        """Whether it came to an end, so that its numbers count."""
+        """True if the run succeeded, so that its numbers count."""
         return self.status == "ok"
 
     def value(self, key: str) -> float:
-        """A score; infinity where the run did not end or has none."""
+        """A score; infinity if the run did not end or has none."""
         return self.values.get(key, math.inf) if self.ended else math.inf
 
 
 @dataclass(frozen=True)
 class RecordedBatch:
-    """All runs of a batch, and what its suite says about comparing them."""
+    """All runs of a batch, and its suite's choices for comparing them."""
 
     name: str
     runs: list[RecordedRun]
-    """Those that were done, whatever came of them. Statistics are of these alone."""
+    """Runs that were done, whether they succeeded or not. Statistics are of these alone."""
     reference: str
     """Contestant with which the others are compared."""
     metrics: list[str]
@@ -89,7 +89,7 @@ class RecordedBatch:
     suite: str = ""
     """The suite's text."""
     missing: list[RecordedRun] = field(default_factory=list)
-    """Those that are planned and were not done; not failures."""
+    """Runs that are planned and were not done; no failures."""
 
     @cached_property
     def _groups(self) -> dict[tuple[str, str], list[RecordedRun]]:
@@ -99,16 +99,14 @@ class RecordedBatch:
         return groups
 
     @cached_property
-    def _log_scores(self) -> set[tuple[str, str]]:
-        return {(key, run.log) for run in self.runs if run.ended for key in run.values}
-
-    @cached_property
-    def _contestant_scores(self) -> set[tuple[str, str]]:
-        return {(key, run.contestant) for run in self.runs if run.ended for key in run.values}
-
-    @cached_property
-    def _ended_contestants(self) -> set[str]:
-        return {run.contestant for run in self.runs if run.ended}
+    def _known_scores(self) -> tuple[set[tuple[str, str]], set[tuple[str, str]], set[str]]:
+        """Scores by log, scores by contestant, and contestants of which any run ended."""
+        ended = [run for run in self.runs if run.ended]
+        return (
+            {(key, run.log) for run in ended for key in run.values},
+            {(key, run.contestant) for run in ended for key in run.values},
+            {run.contestant for run in ended},
+        )
 
     @cached_property
     def logs(self) -> list[str]:
@@ -117,7 +115,7 @@ class RecordedBatch:
 
     @cached_property
     def contestants(self) -> list[str]:
-        """In the order of the plan."""
+        """Names of contestants, in the order of the plan."""
         return list(dict.fromkeys(run.contestant for run in self._planned))
 
     @property
@@ -125,17 +123,17 @@ class RecordedBatch:
         return sorted([*self.runs, *self.missing], key=lambda run: run.place)
 
     def group(self, log: str, contestant: str) -> list[RecordedRun]:
-        """Runs of one contestant on one log that were done, one a seed."""
+        """Finished runs of one contestant on one log, one for each seed."""
         return self._groups.get((log, contestant), [])
 
     def values(self, log: str, contestant: str, key: str) -> Floats:
-        """A score of one contestant on one log, shape (runs,); infinity where a run has none."""
+        """A score of one contestant on one log, shape (runs,); infinity for a run without one."""
         return np.array([run.value(key) for run in self.group(log, contestant)])
 
     def pairs(self, log: str, contestant: str, key: str) -> tuple[Floats, Floats]:
         """A score of one contestant and of the reference on the same log and seed, each shape (n,).
 
-        With `ALL_LOGS` those of every log. Logs on which either cannot have the score have no pairs.
+        `ALL_LOGS` gives those of every log. Logs on which either cannot have the score have no pairs.
         """
         logs = self.logs if log == ALL_LOGS else [log]
         both = [pair for one in logs for pair in self._pairs_on(one, contestant, key)]
@@ -143,9 +141,9 @@ class RecordedBatch:
         return values[:, 0], values[:, 1]
 
     def cases(self, log: str, contestant: str, key: str) -> list[str | int]:
-        """What each of `pairs` is a case of: its seed, and where there is none its log.
+        """Case of each of `pairs`: its seed, or its log if it has no seed.
 
-        Pairs with one seed on several logs depend on each other: worlds of a grid share what the seed drew.
+        Pairs with one seed on several logs depend on each other: worlds of a grid share the draws of the seed.
         """
         logs = self.logs if log == ALL_LOGS else [log]
         runs = [own for one in logs for own, _ in self._pairs_on(one, contestant, key)]
@@ -158,39 +156,68 @@ class RecordedBatch:
         return [(run, reference[run.seed]) for run in self.group(log, contestant) if run.seed in reference]
 
     def is_asked(self, log: str, contestant: str, key: str) -> bool:
-        """Whether a score can be expected: the log has it for somebody, and the contestant on some log.
+        """True if a score can be expected: some contestant has it on this log, and this contestant on some log.
 
-        A dead reckoning has no map and a log without truth no errors; neither is a failure. Of a contestant that never
-        ended nobody knows what it would have, so everything is expected of it. Where none of its runs was done there is
-        nothing to expect.
+        Dead reckoning has no map, and a log without truth has no errors; neither is a failure. A contestant none of
+        whose runs ended is expected to have every score. Without finished runs on the log nothing is expected.
         """
-        is_known = (key, contestant) in self._contestant_scores or contestant not in self._ended_contestants
-        return (key, log) in self._log_scores and is_known and (log, contestant) in self._groups
+        on_log, of_contestant, ended = self._known_scores
+        is_known = (key, contestant) in of_contestant or contestant not in ended
+        return (key, log) in on_log and is_known and (log, contestant) in self._groups
+
+    @property
+    def missing_count(self) -> str:
+        """Sentence part with the number of runs that were not done."""
+        planned = len(self.runs) + len(self.missing)
+        return f"{len(self.missing)} of {planned} runs {'has' if len(self.missing) == 1 else 'have'} not been done"
 
 
 def is_batch(folder: Path) -> bool:
-    """Whether a batch was begun in a folder."""
+    """True if a batch was begun in a folder."""
     return any((folder / name).is_file() for name in (RESULTS, SUITE, LOCK))
 
 
 def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
-    """The batch in a folder.
+    """Read the batch in a folder.
 
     Parameters
     ----------
     reference
-        Contestant to compare with; None: the suite's, and without a suite that of the first row.
+        Contestant to compare with; None: the suite's, or without a suite that of the first row.
 
     Raises
     ------
     EvaluationError
         When there are no results, no run was done yet, the table lacks a column, or the reference is not planned.
     """
-    planned, about = _read_table(folder / RESULTS)
+    path = folder / RESULTS
+    if not path.is_file() and is_batch(folder):
+        raise EvaluationError(
+            f"{folder}: no {RESULTS} in it: the batch was ended before any of its runs was done; {GOING_ON}"
+        )
+    if not path.is_file():
+        raise EvaluationError(f"{folder}: no {RESULTS} in it; it needs a folder that bench wrote to")
+    try:
+        import pyarrow as pa  # of the extra `bench`
+        import pyarrow.parquet as pq
+    except ModuleNotFoundError as error:
+        raise EvaluationError(f"{path}: reading it needs pyarrow; pip install 'sonar-graph[bench]'") from error
+    try:
+        table = pq.read_table(path)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise EvaluationError(f"{path}: cannot be read as Parquet ({error}); run bench again, it resumes") from error
+    if absent := [name for name in NEEDED if name not in table.column_names]:
+        raise EvaluationError(f"{path}: no column {', '.join(absent)}; expected results that bench wrote")
+    if not table.num_rows:
+        raise EvaluationError(f"{path}: has no rows; run bench again, it resumes")
+    if repeated := [key for key, count in Counter(table["key"].to_pylist()).items() if count > 1]:
+        raise EvaluationError(f"{path}: run {repeated[0]} has more than one row; run bench again, it resumes")
+    planned = [_recorded(row, place, folder) for place, row in enumerate(table.to_pylist())]
     runs = [run for run in planned if run.status != NOT_RUN]
     if not runs:
         raise EvaluationError(f"{folder}: none of its {len(planned)} runs has been done yet; {GOING_ON}")
-    chosen = reference or _plain_name(about.get("reference")) or planned[0].contestant
+    about = json.loads((table.schema.metadata or {}).get(SUITE_METADATA, b"{}"))
+    chosen = reference or str(about.get("reference") or "").removesuffix("/default") or planned[0].contestant
     batch = RecordedBatch(
         name=about.get("name") or runs[0].texts.get("suite") or folder.name,
         runs=runs,
@@ -207,64 +234,22 @@ def read_batch(folder: Path, reference: str | None = None) -> RecordedBatch:
     return batch
 
 
-def _plain_name(reference: str | None) -> str | None:
-    """A reference as contestants are called."""
-    return reference.removesuffix("/default") if reference else None
-
-
-def _read_table(path: Path) -> tuple[list[RecordedRun], dict[str, Any]]:
-    """The runs, and what the suite says about comparing them."""
-    if not path.is_file():
-        raise EvaluationError(_absence_told(path))
-    try:
-        import pyarrow as pa  # only batches need it
-        import pyarrow.parquet as pq
-    except ModuleNotFoundError as error:
-        raise EvaluationError(f"{path}: reading it needs pyarrow; pip install 'sonar-graph[bench]'") from error
-    try:
-        table = pq.read_table(path)
-    except (pa.ArrowInvalid, OSError) as error:
-        raise EvaluationError(f"{path}: cannot be read as Parquet ({error}); run bench again, it resumes") from error
-    missing = [name for name in NEEDED if name not in table.column_names]
-    if missing:
-        raise EvaluationError(f"{path}: no column {', '.join(missing)}; expected results that bench wrote")
-    if not table.num_rows:
-        raise EvaluationError(f"{path}: has no rows; run bench again, it resumes")
-    if repeated := [key for key, count in Counter(table["key"].to_pylist()).items() if count > 1]:
-        raise EvaluationError(f"{path}: run {repeated[0]} has more than one row; run bench again, it resumes")
-    about = json.loads((table.schema.metadata or {}).get(SUITE_METADATA, b"{}"))
-    rows = [_row_now(row, path.parent) for row in table.to_pylist()]
-    return [_run(row, place) for place, row in enumerate(rows)], about
-
-
-def _absence_told(path: Path) -> str:
-    """What a folder without a table is."""
-    if not is_batch(path.parent):
-        return f"{path.parent}: no {path.name} in it; it needs a folder that bench wrote to"
-    return f"{path.parent}: no {path.name} in it: the batch was ended before any of its runs was done; {GOING_ON}"
-
-
-def _row_now(row: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """A row of the table, with what was measured if the run was done after the table was written.
-
-    A run that is not where the table says has no log.
-    """
-    if row["status"] != NOT_RUN:
-        is_here = row.get("log_file") and (folder / row["log_file"]).is_file()
-        return row if is_here else row | {"log_file": None}
-    kept = Path(RUNS) / str(row["key"])
-    with contextlib.suppress(EvaluationError):
-        return row | {"reason": None, "log_file": f"{kept.as_posix()}/{LOG}"} | read_json(folder / kept / ROW)
-    return row
-
-
-def _run(row: dict[str, Any], place: int) -> RecordedRun:
+def _recorded(row: dict[str, Any], place: int, folder: Path) -> RecordedRun:
+    """A run from its row of the table; from its own folder if it was done after the table was written."""
+    if row["status"] == NOT_RUN:
+        kept = Path(RUNS) / str(row["key"])
+        with contextlib.suppress(EvaluationError):
+            row = row | {"reason": None, "log_file": f"{kept.as_posix()}/{LOG}"} | read_json(folder / kept / ROW)
+    elif not (row.get("log_file") and (folder / row["log_file"]).is_file()):  # its folder was moved or removed
+        row = row | {"log_file": None}
     words = {name: str(row.pop(name, None) or "") for name in WORDS}
     seed = row.pop("seed", None)
-    objects = {name: _as_text(row.pop(name)) for name in OBJECTS if row.get(name)}
+    objects = {name: row.pop(name) for name in OBJECTS if row.get(name)}
+    texts = {name: words[name] for name in ("suite", "generator", "machine") if words[name]}
+    for name, value in objects.items():
+        texts[name] = value if isinstance(value, str) else json.dumps(value, sort_keys=True, default=str)
+    texts |= {name: value for name, value in row.items() if isinstance(value, str)}
     numbers = {name: float(value) for name, value in row.items() if isinstance(value, int | float)}
-    others = {name: value for name, value in row.items() if isinstance(value, str)}
-    known = {name: words[name] for name in ("suite", "generator", "machine") if words[name]}
     return RecordedRun(
         key=words["key"],
         log=words["log"],
@@ -274,14 +259,10 @@ def _run(row: dict[str, Any], place: int) -> RecordedRun:
         status=words["status"],
         reason=words["reason"],
         log_file=words["log_file"],
-        texts=known | objects | others,
+        texts=texts,
         values={name: value for name, value in numbers.items() if math.isfinite(value)},
         place=place,
     )
-
-
-def _as_text(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value, sort_keys=True, default=str)
 
 
 def require_complete(batch: RecordedBatch, subject: str | Path, purpose: str) -> None:
@@ -290,7 +271,7 @@ def require_complete(batch: RecordedBatch, subject: str | Path, purpose: str) ->
     Parameters
     ----------
     subject
-        What the message begins with.
+        Beginning of the message.
     purpose
         What the batch cannot do, for the message.
 
@@ -300,9 +281,6 @@ def require_complete(batch: RecordedBatch, subject: str | Path, purpose: str) ->
         When a planned run was not done.
     """
     if batch.missing:
-        raise EvaluationError(f"{subject}: the batch {batch.name!r} cannot {purpose}, {_count_told(batch)}; {GOING_ON}")
-
-
-def _count_told(batch: RecordedBatch) -> str:
-    planned = len(batch.runs) + len(batch.missing)
-    return f"{len(batch.missing)} of {planned} runs {'has' if len(batch.missing) == 1 else 'have'} not been done"
+        raise EvaluationError(
+            f"{subject}: the batch {batch.name!r} cannot {purpose}, {batch.missing_count}; {GOING_ON}"
+        )

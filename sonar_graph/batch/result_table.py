@@ -1,11 +1,9 @@
-"""The table of a batch: one row for each planned run, as Parquet.
+"""Table of a batch, and the scores in it: their names, units and protocols, the same for every run.
 
-Columns in this order: what was run, how it went, on what, how long it took, and then every score by its key, in
-alphabetical order. What was not measured is null. A run that was not done has the status ``not run`` and no numbers.
-The file's metadata say under ``sonar_graph.suite`` what the suite compares: its name, description, reference, metrics
-and rate, as JSON.
-
-Scores that a batch compares: their names, units and protocols, the same for every run.
+``results.parquet`` has one row for each planned run. Its columns are in this order: the run, its ending, versions,
+times, and then every score by its key, in alphabetical order. A value that was not measured is null. A run that was not
+done has the status ``not run`` and no numbers. The file's metadata have under ``sonar_graph.suite``, as JSON, the
+suite's name, description, reference, metrics and rate.
 """
 
 from __future__ import annotations
@@ -14,11 +12,8 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-
+from sonar_graph.batch.recorded import RESULTS, SUITE_METADATA
 from sonar_graph.batch.store import NOT_RUN, PlannedRun, Row, Store
 from sonar_graph.batch.suite import Suite
 from sonar_graph.evaluation import ESTIMATES, LABELS
@@ -49,7 +44,7 @@ TIMINGS = (
     *("wall_s", "read_s", "estimate_s", "cpu_s", "peak_memory_mb"),
     *("update_p50_ms", "update_p99_ms", "finish_s"),
 )
-"""Columns of the results that every run has, of time and memory."""
+"""Columns of time and memory that every run has."""
 
 
 @dataclass(frozen=True)
@@ -59,31 +54,31 @@ class Metric:
     name: str
     """Key without its prefix, such as ``ate_se2_m``."""
     keys: dict[str, str]
-    """Column of the results by what it is of: ``Causal``, ``Smoothed``; empty where there is no such distinction."""
+    """Column of the results by estimate, ``Causal`` or ``Smoothed``; the key is empty for a score of neither."""
 
     @property
     def label(self) -> str:
-        """For people."""
+        """Name for readers."""
         return LABELS.get(self.name, self.name)
 
     @property
     def unit(self) -> str:
-        """Of the stored value."""
+        """Unit of the stored value."""
         return UNITS.get(self.name.rpartition("_")[2], "")
 
     @property
     def shown_unit(self) -> str:
-        """Of the value on the page: degrees for radians."""
+        """Unit on the page: degrees for radians."""
         return "°" if self.unit == "rad" else self.unit
 
     @property
     def factor(self) -> float:
-        """From the stored to the shown value."""
+        """Factor from the stored to the shown value."""
         return math.degrees(1) if self.unit == "rad" else 1.0
 
     @property
     def direction(self) -> str:
-        """Which values are better."""
+        """Words for the better values."""
         if self.name in INSIDE:
             return "1 is consistent"
         if self.name in NO_BETTER:
@@ -92,15 +87,15 @@ class Metric:
 
     @property
     def is_error(self) -> bool:
-        """Whether smaller is better and the same run always gives it, so that differences can be tested.
+        """True if smaller is better and a repeated run gives the same value, so that differences can be tested.
 
-        Time and memory depend on the machine and on what else it does: they are shown, and not tested.
+        Time and memory depend on the machine and its load: they are shown, and not tested.
         """
         return self.direction == "lower is better" and not any(map(is_timing, self.keys.values()))
 
     @property
     def protocol(self) -> str:
-        """How it was got, in a sentence."""
+        """Definition in a sentence."""
         said = PROTOCOLS.get(self.name, f"As compare writes it: the run's comparison.json, {self.name}.")
         if set(self.keys) <= {""}:
             return said
@@ -108,12 +103,12 @@ class Metric:
 
 
 def is_timing(column: str) -> bool:
-    """Whether a column may differ between two runs of the same: time and memory."""
+    """True for columns that may differ between two equal runs: time and memory."""
     return column in TIMINGS or column.startswith(("time.", "memory."))
 
 
 def metrics_of(keys: list[str]) -> list[Metric]:
-    """Metrics in the order in which a suite names them; a trajectory score named once is shown causal and smoothed."""
+    """Metrics in the suite's order; a trajectory score that is named once is shown causal and smoothed."""
     found: dict[str, Metric] = {}
     for key in keys:
         prefix, _, name = key.partition(".")
@@ -125,64 +120,60 @@ def metrics_of(keys: list[str]) -> list[Metric]:
 
 
 def estimate_sentences() -> list[str]:
-    """What causal and smoothed mean."""
+    """Sentences that explain causal and smoothed."""
     return [f"{sentence}." for sentence in ESTIMATES.values()]
 
 
-RESULTS = "results.parquet"
-SUITE_METADATA = b"sonar_graph.suite"
 TEXTS = ("key", "suite", "log", "generator", "options", "asked")
 SETTINGS = ("variant", "params", "estimator", "status", "reason", "log_file")
 VERSIONS = ("sonar_graph", "source", "estimator_source", "gtsam", "numpy", "scipy", "numba", "python", "machine")
-COLUMNS: dict[str, pa.DataType] = {
-    **dict.fromkeys(TEXTS, pa.string()),
-    "seed": pa.int64(),
-    **dict.fromkeys(SETTINGS, pa.string()),
-    "rate_hz": pa.float64(),
-    **dict.fromkeys(VERSIONS, pa.string()),
-    **dict.fromkeys(TIMINGS, pa.float64()),
-    "scored_instants": pa.int64(),
+COLUMNS = {
+    **dict.fromkeys(TEXTS, "string"),
+    "seed": "int64",
+    **dict.fromkeys(SETTINGS, "string"),
+    "rate_hz": "float64",
+    **dict.fromkeys(VERSIONS, "string"),
+    **dict.fromkeys(TIMINGS, "float64"),
+    "scored_instants": "int64",
 }
 
 
 def write_results(store: Store, suite: Suite, runs: list[PlannedRun]) -> Path:
     """Write the table of all runs, also of those that are not done, in the order of the plan; whole or not at all."""
-    rows = [_described(run) | _came_of(run, store) for run in runs]
+    import pyarrow as pa  # of the extra `bench`
+    import pyarrow.parquet as pq
+
+    rows: list[Row] = []
+    for run in runs:
+        options = run.options if run.landmarks is None else run.options | {"landmarks": run.landmarks}
+        described: Row = {
+            "key": run.key,
+            "suite": run.suite,
+            "log": run.log,
+            "generator": run.kind,
+            "options": json.dumps(options, sort_keys=True),
+            "asked": json.dumps(run.asked, sort_keys=True),
+            "seed": run.seed,
+            "variant": run.variant,
+            "params": json.dumps(run.params, sort_keys=True),
+            "estimator": run.estimator,
+            "rate_hz": run.rate_hz,
+            **{name: number for name, number in run.versions.items() if name in VERSIONS},
+        }
+        row = store.row(run.key)
+        if row is None:
+            row = {"status": NOT_RUN, "reason": "not done when this table was written"}
+        else:
+            row = {"log_file": store.log_file(run.key), **row}  # versions are those that the run itself found
+        rows.append(described | row)
     scores = sorted({name for row in rows for name in row} - set(COLUMNS))
-    types = COLUMNS | {name: pa.int64() if name.endswith("_dof") else pa.float64() for name in scores}
+    types = COLUMNS | {name: "int64" if name.endswith("_dof") else "float64" for name in scores}
     about = suite.model_dump(mode="json", include={"name", "description", "reference", "metrics", "rate_hz"})
-    schema = pa.schema(types, metadata={SUITE_METADATA: json.dumps(about).encode()})
+    schema = pa.schema(
+        [pa.field(name, pa.type_for_alias(kind)) for name, kind in types.items()],
+        metadata={SUITE_METADATA: json.dumps(about).encode()},
+    )
     path = store.folder / RESULTS
     with replacing(path) as partial:
         pq.write_table(pa.Table.from_pylist(rows, schema=schema), partial)
     return path
-
-
-def _came_of(run: PlannedRun, store: Store) -> Row:
-    """What was measured and where its log is, or that nothing was."""
-    row = store.row(run.key)
-    if row is None:
-        return {"status": NOT_RUN, "reason": "not done when this table was written"}
-    return {"log_file": store.log_file(run.key), **row}
-
-
-def _described(run: PlannedRun) -> Row:
-    """What was run; versions are told again by the run itself, where it came so far."""
-    return {
-        "key": run.key,
-        "suite": run.suite,
-        "log": run.log,
-        "generator": run.kind,
-        "options": _plain(run.options if run.landmarks is None else run.options | {"landmarks": run.landmarks}),
-        "asked": _plain(run.asked),
-        "seed": run.seed,
-        "variant": run.variant,
-        "params": _plain(run.params),
-        "estimator": run.estimator,
-        "rate_hz": run.rate_hz,
-        **{name: number for name, number in run.versions.items() if name in VERSIONS},
-    }
-
-
-def _plain(values: dict[str, Any]) -> str:
-    return json.dumps(values, sort_keys=True)

@@ -1,13 +1,8 @@
-"""What many runs say together: spread, paired differences, failure rates, consistency.
+"""Statistics of many runs: spread, paired differences, the signed-rank test, failure rates, consistency.
 
 A run that did not end, or gave no value, is never left out. It has the value infinity, the worst there is: quantiles
-and rank tests go on with it (Lachin 1999, "Worst-rank score analysis with informatively missing observations in
-clinical trials"), and a mean over such a group does not exist.
+and rank tests work with it (Lachin 1999), and a mean over such a group does not exist.
 Equations: docs/theory/batch_statistics.md.
-
-Wilcoxon's signed-rank test of paired differences: exact where that is cheap, else close to it, and always quick.
-
-Equations and how far off the second way is: docs/theory/batch_statistics.md.
 """
 
 from __future__ import annotations
@@ -23,20 +18,20 @@ from sonar_graph.evaluation import anees_interval
 from sonar_graph.measurements import Floats
 
 Ranks = np.ndarray[tuple[int], np.dtype[np.int64]]
-"""Whole numbers above zero: ranks, doubled where there are ties, without their common divisor."""
+"""Positive integers: ranks, doubled if there are ties, divided by their common divisor."""
 LEAST_PAIRS = 6
-"""Of fewer no two-sided rank test reaches 5 %: 2 / 2⁵ = 0.06."""
+"""With fewer pairs no two-sided rank test reaches 5 %: 2 / 2⁵ = 0.06."""
 MOST_ADDITIONS = 10_000_000
-"""Of an exact test: 341 differences without ties, 271 with ties; some 10 ms."""
+"""Largest cost of an exact test: 341 differences without ties, 271 with ties; some 10 ms."""
 
 
 def signed_rank_p(differences: Floats) -> float:
     """Two-sided p value of Wilcoxon's signed-rank test (zeros as Pratt 1959); infinite differences rank highest.
 
-    The chance that the sum of signed ranks is at least as far from zero as it was found, given the ranks, when every
-    sign that is not of a zero is thrown anew. Ties and zeros are in the ranks and need no correction.
+    The p value is the probability, given the ranks, that the sum of signed ranks is at least as far from zero as the
+    observed one when every sign of a non-zero difference is drawn at random. Ties and zeros need no correction.
 
-    NaN of fewer than 6: their smallest possible value is above 5 %, so there is nothing to be found.
+    NaN for fewer than 6, whose smallest possible p value is above 5 %.
     """
     if len(differences) < LEAST_PAIRS:
         return math.nan
@@ -51,9 +46,9 @@ def signed_rank_p(differences: Floats) -> float:
 
 
 def exact_tail(ranks: Ranks, most: int) -> float:
-    """Chance that the ranks with a positive sign sum up to at most ``most``.
+    """Probability that the ranks with a positive sign sum up to at most ``most``.
 
-    With each rank the distribution of the sum becomes the mean of itself and of itself moved up by the rank.
+    Each rank turns the distribution of the sum into the mean of itself and of itself shifted by the rank.
     """
     chances = np.zeros(most + 1)
     chances[0] = 1.0
@@ -64,11 +59,11 @@ def exact_tail(ranks: Ranks, most: int) -> float:
 
 
 def near_tail(ranks: Ranks, most: int) -> float:
-    """The same, where the sum is taken as normal once it is known how many of the signs are positive.
+    """Approximation of `exact_tail`: the sum is normal, given the number of positive signs, which is binomial.
 
-    That number is binomial. Of ``k`` ranks out of ``m``, drawn without replacement, the sum has mean ``k r`` and
-    variance ``k (m - k) s² / m`` with the ranks' mean ``r`` and sample variance ``s²``. So equal ranks, and ranks that
-    many zeros push up, keep their steps, which a single normal distribution would blur.
+    The sum of ``k`` out of ``m`` ranks, drawn without replacement, has mean ``k r`` and variance ``k (m - k) s² / m``
+    with the ranks' mean ``r`` and sample variance ``s²``. Unlike a single normal distribution this keeps the steps of
+    equal ranks.
     """
     count = len(ranks)
     positive = np.arange(count + 1)
@@ -79,31 +74,31 @@ def near_tail(ranks: Ranks, most: int) -> float:
 
 
 def least_p(pairs: int) -> float:
-    """The smallest p value that the signed-rank test of so many pairs can have: all of one sign."""
+    """Smallest p value of the signed-rank test for a number of pairs, reached if all have one sign."""
     return float(2.0 ** (1 - pairs)) if pairs else 1.0
 
 
 CONFIDENCE = 0.95
 LOW, HIGH = 0.1, 0.9
-"""Quantiles that are shown beside the median."""
+"""Quantiles shown beside the median."""
 
 
 @dataclass(frozen=True)
 class SampleSummary:
-    """Values of one group of runs; infinity for a run without a value."""
+    """Summary of the values of one group of runs."""
 
     runs: int
     without: int
-    """Runs that did not end or gave no value."""
+    """Number of runs that did not end or gave no value."""
     mean: float
-    """NaN where a run has no value."""
+    """NaN if a run has no value."""
     standard_error: float
-    """Of the mean; NaN for one run."""
+    """Standard error of the mean; NaN for one run."""
     median: float
     low: float
     high: float
     median_error: float
-    """Of the median, `quantile_error`; digits beyond it mean nothing."""
+    """`quantile_error` of the median; digits beyond it mean nothing."""
     low_error: float
     high_error: float
 
@@ -119,38 +114,38 @@ class Rate:
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """Differences of one group to the reference on the same cases; negative: smaller than the reference."""
+    """Differences from the reference on the same cases; negative: smaller than the reference."""
 
     pairs: int
-    """Differences: pairs of runs, or seeds where a seed has several pairs."""
+    """Number of differences: pairs of runs, or seeds if a seed has several pairs."""
     each: str
-    """What each difference is of: ``pair``, ``seed``, ``log``; ``case`` where some are of seeds and some of logs."""
+    """Unit of a difference: ``pair``, ``seed``, ``log``; ``case`` for a mixture of seeds and logs."""
     without: int
-    """Differences for which a value is missing."""
+    """Number of differences for which a value is missing."""
     smaller: int
-    """Differences below zero."""
+    """Number of differences below zero."""
     mean: float
-    """NaN where a pair is without a value."""
+    """NaN if a pair lacks a value."""
     rounding_error: float
-    """Of the mean: the standard error of pairs that have a value, for few not below 1 %."""
+    """Standard error of the mean of pairs that have a value; for few pairs at least 1 % of the mean."""
     interval: tuple[float, float]
-    """Of the mean, `mean_interval`; NaN where there are too few pairs or no mean."""
+    """`mean_interval`; NaN if there are too few pairs or no mean."""
     median: float
-    """Infinite where half of the pairs have no value on one side; NaN where nothing can be said."""
+    """Infinite if half of the pairs have no value on one side; NaN if that holds for both sides."""
     median_error: float
-    """Of the median, `quantile_error`."""
+    """`quantile_error` of the median."""
     p_value: float
-    """Of the two-sided signed-rank test, not corrected; NaN of too few pairs."""
+    """Two-sided signed-rank test, not corrected for other tests; NaN for too few pairs."""
 
     @property
     def counted(self) -> str:
-        """How many differences of what, such as ``10 seeds``."""
+        """Number and unit of the differences, such as ``10 seeds``."""
         return f"{self.pairs} {self.each}{'s' * (self.pairs != 1)}"
 
 
 @dataclass(frozen=True)
 class Anees:
-    """Average normalised squared error of independent runs, per degree of freedom, and where it should lie."""
+    """Average normalised squared error of independent runs, per degree of freedom, with its chi-square band."""
 
     runs: int
     mean: float
@@ -158,7 +153,7 @@ class Anees:
 
     @property
     def verdict(self) -> str:
-        """In a word, or empty where nothing is known."""
+        """Verdict in one word; empty if nothing is known."""
         if math.isnan(self.mean) or math.isnan(self.band[0]):
             return ""
         if self.mean > self.band[1]:
@@ -167,10 +162,10 @@ class Anees:
 
 
 def summarise(values: Floats) -> SampleSummary:
-    """Mean with standard error, median and quantiles of values, shape (n,); infinity where a run has none.
+    """Mean with standard error, median and quantiles of values, shape (n,); infinity for a run without a value.
 
     Quantiles are values that occur or lie between two that do (linear between order statistics, as numpy's default);
-    they are infinite where they fall among runs without a value.
+    they are infinite if they fall among runs without a value.
     """
     n, without = len(values), int(np.isinf(values).sum())
     has_mean = n > 0 and not without
@@ -190,7 +185,7 @@ def summarise(values: Floats) -> SampleSummary:
 
 
 def quantile(values: Floats, share: float) -> float:
-    """Linear between order statistics, infinite where an infinite value takes part; NaN of nothing and between both."""
+    """Linear between order statistics, infinite if an infinite value takes part; NaN of nothing or between -∞ and ∞."""
     if not len(values):
         return math.nan
     ordered, place = np.sort(values), share * (len(values) - 1)
@@ -203,12 +198,12 @@ def quantile(values: Floats, share: float) -> float:
 
 
 def quantile_error(values: Floats, share: float) -> float:
-    """Standard error of a quantile, without assuming a distribution; NaN of one value or where it is infinite.
+    """Standard error of a quantile, for any distribution; NaN for one value or an infinite quantile.
 
     The number of values below the true quantile is binomial with deviation ``sqrt(n q (1 - q))``; the error is half the
-    distance between the order statistics that many places below and above (David, Nagaraja 2003, section 7.1). Where
-    the upper one is infinite it is the distance to the lower one. Of few values it is at least a hundredth of the
-    quantile, as two may agree by chance.
+    distance between the order statistics that many places below and above (David, Nagaraja 2003, section 7.1). If the
+    upper one is infinite, it is the distance to the lower one. For few values, two of which may agree by chance, it is
+    at least a hundredth of the quantile.
     """
     n, middle = len(values), quantile(values, share)
     if n < 2 or not math.isfinite(middle):
@@ -221,50 +216,54 @@ def quantile_error(values: Floats, share: float) -> float:
 
 
 def standard_error(values: Floats) -> float:
-    """Standard deviation over the root of the number; NaN of fewer than two, or where one is infinite."""
+    """Standard deviation over the root of the number; NaN for fewer than two values or infinite ones."""
     if len(values) < 2 or not np.isfinite(values).all():
         return math.nan
     return float(values.std(ddof=1) / math.sqrt(len(values)))
 
 
-def _rounding_error(values: Floats) -> float:
-    """Standard error; of few values at least a hundredth of their mean, as two may agree by chance."""
-    if not len(values) or len(values) >= LEAST_PAIRS:
-        return standard_error(values)
-    return max(standard_error(values), 0.01 * abs(float(values.mean()))) if len(values) > 1 else math.nan
-
-
 def failure_rate(failed: int, runs: int) -> Rate:
-    """Share of runs that did not end, with its 95 % interval (Wilson 1927)."""
+    """Share of runs that failed, with its 95 % interval (Wilson 1927)."""
     interval = stats.binomtest(failed, runs).proportion_ci(CONFIDENCE, method="wilson")
     return Rate(failed / runs, float(interval.low), float(interval.high))
 
 
 def paired(own: Floats, reference: Floats, cases: Sequence[str | int] | None = None) -> PairedDifference:
-    """Differences own minus reference, each shape (n,), infinity where a run has no value.
+    """Compare paired values, each shape (n,), by their differences; infinity for a run without a value.
 
-    A run without a value is worse than any with one; where both have none they are equal.
+    A run without a value is worse than any run with one; two such runs are equal.
 
     Parameters
     ----------
+    own, reference
+        Values of the same cases, in the same order.
     cases
-        What each pair is a case of. Pairs of one case depend on each other and make one difference, their mean. None:
-        each pair is its own.
+        Case of each pair: a seed, or the name of a log for runs without seeds. Pairs of one case depend on each other
+        and make one difference, their mean (infinite ones to the side that has more of them). None: each pair is a
+        case of its own.
     """
-    differences, lost = _differences(own, reference), np.isinf(own) | np.isinf(reference)
+    lost = np.isinf(own) | np.isinf(reference)
+    both = np.isinf(own) & np.isinf(reference)
+    differences = np.where(both, 0.0, np.where(both, 0.0, own) - np.where(both, 0.0, reference))
+    each = "pair"
     if cases is not None:
         members = [np.array([one == case for one in cases]) for case in dict.fromkeys(cases)]
-        differences = np.array([_difference_of_case(differences[which]) for which in members])
+        differences = np.array([case_difference(differences[which]) for which in members])
         lost = np.array([lost[which].any() for which in members], dtype=bool)
-    without = int(lost.sum())
+        kinds = {"log" if isinstance(case, str) else "seed" for case in cases}
+        each = kinds.pop() if len(kinds) == 1 else "case"
+    without, valued = int(lost.sum()), differences[~lost]
     has_mean = len(differences) > 0 and not without
+    rounding_error = standard_error(valued)
+    if 1 < len(valued) < LEAST_PAIRS:  # two may agree by chance
+        rounding_error = max(rounding_error, 0.01 * abs(float(valued.mean())))
     return PairedDifference(
         pairs=len(differences),
-        each=_kind_of(cases),
+        each=each,
         without=without,
         smaller=int((differences < 0).sum()),
         mean=float(differences.mean()) if has_mean else math.nan,
-        rounding_error=_rounding_error(differences[~lost]),
+        rounding_error=rounding_error,
         interval=mean_interval(differences) if has_mean else (math.nan, math.nan),
         median=quantile(differences, 0.5),
         median_error=quantile_error(differences, 0.5),
@@ -272,21 +271,8 @@ def paired(own: Floats, reference: Floats, cases: Sequence[str | int] | None = N
     )
 
 
-def _kind_of(cases: Sequence[str | int] | None) -> str:
-    """Seeds are numbers, and logs stand for runs that have none."""
-    if cases is None:
-        return "pair"
-    kinds = {"log" if isinstance(case, str) else "seed" for case in cases}
-    return kinds.pop() if len(kinds) == 1 else "case"
-
-
-def _differences(own: Floats, reference: Floats) -> Floats:
-    both = np.isinf(own) & np.isinf(reference)
-    return np.where(both, 0.0, np.where(both, 0.0, own) - np.where(both, 0.0, reference))
-
-
-def _difference_of_case(differences: Floats) -> float:
-    """Mean; with infinite ones infinite to the side that has more of them, and if none has, the mean of the others."""
+def case_difference(differences: Floats) -> float:
+    """Mean of one case's differences; infinite to the side that has more infinite ones, without them if none has."""
     infinite = np.isinf(differences)
     side = float(np.sign(differences[infinite]).sum())
     if side:
@@ -295,10 +281,10 @@ def _difference_of_case(differences: Floats) -> float:
 
 
 def mean_interval(values: Floats) -> tuple[float, float]:
-    """95 % interval of the mean of values that may be skewed (Hall 1992); NaN of too few.
+    """95 % interval of the mean of values that may be skewed (Hall 1992); NaN for fewer than `LEAST_PAIRS`.
 
-    Student's ``t`` supposes symmetry. With the sample's skewness ``g`` and ``W = (mean - true mean) / s``,
-    ``W + g W² / 3 + g² W³ / 27 + g / (6 n)`` has none to first order; times ``√n`` it is held against Student's
+    Student's ``t`` assumes symmetry. With the sample's skewness ``g`` and ``W = (mean - true mean) / s``,
+    ``W + g W² / 3 + g² W³ / 27 + g / (6 n)`` is symmetric to first order; times ``√n`` it is compared with Student's
     quantiles. Its roots are the bounds.
     """
     n = len(values)
@@ -313,17 +299,17 @@ def mean_interval(values: Floats) -> tuple[float, float]:
 
 
 def _unskewed(bound: float, skewness: float, n: int) -> float:
-    """``W`` at which the cubic that takes away skewness reaches a bound."""
+    """``W`` at which the cubic of `mean_interval` reaches a bound."""
     if abs(skewness) < 1e-6:
         return bound
     return 3 * (math.cbrt(1 + skewness * (bound - skewness / (6 * n))) - 1) / skewness
 
 
 def holm(p_values: Floats) -> Floats:
-    """P values of a family of tests, corrected so that 5 % bounds the chance of any false finding (Holm 1979).
+    """P values of a family of tests, corrected so that 5 % bounds the probability of any false finding (Holm 1979).
 
-    Sorted upwards, the i-th of m (from 0) is multiplied by m - i; none may be below one before it, none above 1. NaN
-    stays NaN and does not count.
+    In ascending order, the i-th of m (from 0) is multiplied by m - i; none may be below the one before it or above 1.
+    NaN stays NaN and does not count.
     """
     corrected = np.full(len(p_values), np.nan)
     known = np.flatnonzero(~np.isnan(p_values))
@@ -339,9 +325,9 @@ def anees(nees: Floats, dof: float) -> Anees:
     Parameters
     ----------
     nees
-        Normalised squared error of each run at one instant, divided by ``dof``, shape (n,); infinity for a run without.
+        Normalised squared error of each run at one instant, divided by ``dof``, shape (n,); infinity: none.
     dof
-        Degrees of freedom; NaN: not known, and no band.
+        Degrees of freedom; NaN: unknown, which gives no band.
     """
     if not len(nees) or np.isinf(nees).any():
         return Anees(len(nees), math.nan, (math.nan, math.nan))

@@ -1,20 +1,16 @@
-"""What is done, under which limits, and what comes of it: the words that batch, workers and processes share.
-
-Runs on disk: each written once, whole or not at all, under its key.
+"""Runs on disk, and the records that the batch, its workers and the processes of runs exchange.
 
 ::
 
     DIR/.lock                   held by the batch that runs
-    DIR/suite.toml              the suite, as it was given, once a run of it is done
+    DIR/suite.toml              the suite as it was given, written when its first run is done
     DIR/results.parquet         one row for each planned run
     DIR/runs/KEY/row.json       the row of a run
-    DIR/runs/KEY/log.txt        what its process printed, tracebacks with it
-    DIR/runs/KEY/...            what `sonar-graph compare` writes, where the run came so far
+    DIR/runs/KEY/log.txt        output of its process, with tracebacks
+    DIR/runs/KEY/...            files of `sonar-graph compare`, if the run came that far
 
-A run's folder is filled under another name and then renamed, and has another name again before it is removed. So a
-folder that has its name is complete.
-
-One batch at a time in a folder: two would remove each other's half-written runs, and write one table.
+A run's folder is filled under a temporary name and then renamed, and is renamed again before it is removed. A folder
+with its final name is therefore complete. Decisions: docs/design/0011-batch.md.
 """
 
 from __future__ import annotations
@@ -22,34 +18,32 @@ from __future__ import annotations
 import contextlib
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
-
-from filelock import FileLock, Timeout
 
 from sonar_graph.errors import BatchError, EvaluationError
 from sonar_graph.files import read_json, write_json
 
 Status = Literal["ok", "failed", "timeout", "memory", "killed"]
 NOT_RUN = "not run"
-"""In place of the status of a run that is planned and was not done: the table has a row for it too."""
+"""Status in the table of a run that is planned and not done yet."""
 Row = dict[str, str | int | float | None]
-"""Of the table of results, by column."""
+"""A row of the results by column."""
 
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One run: all that a process needs to do it, and nothing that it would have to ask for."""
+    """One run with everything that a process needs to do it."""
 
     key: str
-    """Of everything that decides its outcome: content of the log or options of the simulator, seed, estimator,
-    settings, rate, versions, source. Equal keys, equal numbers."""
+    """Hash of everything that decides the outcome: content of the log or options of the simulator, seed, estimator,
+    settings, rate, versions, source. Equal keys give equal numbers."""
     suite: str
     log: str
-    """Name with the values of its grid."""
+    """Name, with the values of its grid."""
     kind: str
     """Generator, data set, or ``mcap``."""
     options: dict[str, Any]
@@ -60,41 +54,53 @@ class PlannedRun:
     estimator: str
     variant: str
     overrides: dict[str, Any]
-    """Settings that were given; an estimator may tell them from equal defaults."""
+    """Settings as the suite gives them; an estimator may distinguish them from equal defaults."""
     params: dict[str, Any]
-    """All settings; of an estimator that cannot be loaded those that were given."""
+    """All settings; for an estimator that cannot be loaded, those that were given."""
     rate_hz: float
     versions: dict[str, str]
     asked: dict[str, Any]
-    """What the suite states of it, of files their content, without what it leaves to defaults: two runs of one name are
-    comparable where these are equal, though a default or the code was changed between them."""
+    """What the suite states of this run, files by their content, without defaults. Two runs of one name are comparable
+    when these are equal, even if a default or the code changed in between."""
 
 
 @dataclass(frozen=True)
 class Preparation:
-    """What a process is asked before the first run of an estimator, and before the clock of that run starts."""
+    """Request for a warm-up, sent before the first run of an estimator and outside its measured time."""
 
     run: PlannedRun
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a run may take."""
+    """Limits of time and memory for one run."""
 
     timeout_s: float
     memory_mb: float | None = None
-    """Resident memory of its process and of those that it starts, 10⁶ bytes; None: no limit but the machine's."""
+    """Resident memory of the run's process and its children, 10⁶ bytes; None: no limit but the machine's."""
 
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """What a run left: a row of what was measured, files by their path within its folder, and its log."""
+    """Result of a run: its row, its files by path within its folder, and its log."""
 
     row: Row
     files: dict[str, bytes] = field(default_factory=dict)
     log: str = ""
 
 
+@dataclass(frozen=True)
+class Where:
+    """Place where the runs are done: workers on this machine, or a Dask scheduler that exists."""
+
+    workers: int | None = None
+    """Number of workers on this machine; None: one for each core that this process may use."""
+    scheduler: str | None = None
+    """Address of a scheduler, used in place of local workers."""
+
+
+Progress = Callable[[PlannedRun, RunOutcome], None]
+"""Called after a run is kept."""
 RUNS, ROW, LOG = "runs", "row.json", "log.txt"
 KEY = "key"
 SUITE, LOCK = "suite.toml", ".lock"
@@ -102,19 +108,28 @@ _PARTIAL = ".partial-"
 
 
 class Store:
-    """The runs in a folder."""
+    """The runs in a folder, each written once, whole or not at all, under its key.
+
+    Raises
+    ------
+    BatchError
+        When the folder cannot be made.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        (folder / RUNS).mkdir(parents=True, exist_ok=True)
+        try:
+            (folder / RUNS).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise BatchError(f"{folder}: cannot be written: {error.strerror}; choose another folder with -o") from error
 
     def remove_partial(self) -> None:
-        """Remove what a batch that was killed left half written or half removed; nothing else may be writing."""
+        """Remove what a killed batch left half written or half removed; nothing else may be writing."""
         for path in (self.folder / RUNS).glob(f"{_PARTIAL}*"):
             shutil.rmtree(path)
 
     def row(self, key: str) -> Row | None:
-        """What was measured in a run; None where it is not done, or its row was lost or is that of another run."""
+        """Row of a run; None if it is not done, or its row is lost or belongs to another run."""
         try:
             row = dict(read_json(self.run_folder(key) / ROW))
         except EvaluationError:
@@ -142,22 +157,21 @@ class Store:
             shutil.rmtree(partial, ignore_errors=True)
 
     def discard(self, key: str) -> None:
-        """Remove a run, so that it is done anew."""
+        """Remove a run, so that it is done again."""
         gone = self._partial_folder(key)
         with contextlib.suppress(FileNotFoundError):
             self.run_folder(key).rename(gone)
         shutil.rmtree(gone, ignore_errors=True)
 
     def run_folder(self, key: str) -> Path:
-        """Where a run is."""
+        """Folder of a run."""
         return self.folder / RUNS / key
 
     def _partial_folder(self, key: str) -> Path:
-        """A name of its own for what is not whole."""
         return self.folder / RUNS / f"{_PARTIAL}{key}-{uuid.uuid4().hex[:8]}"
 
     def log_file(self, key: str) -> str:
-        """Where the log of a run is, from the store's folder on."""
+        """Path of a run's log, relative to the store's folder."""
         return f"{RUNS}/{key}/{LOG}"
 
 
@@ -165,14 +179,16 @@ class Store:
 def only_batch_in(folder: Path) -> Iterator[None]:
     """Keep every other batch out of a folder while the block runs.
 
-    The operating system holds the lock and gives it up with the process, however that ends. The file stays behind and
-    means nothing.
+    Two batches would remove each other's half-written runs and write one table. The operating system holds the lock
+    and releases it when the process ends, also by SIGKILL; the file that stays behind means nothing.
 
     Raises
     ------
     BatchError
         When another batch runs there, or the file system has no locks.
     """
+    from filelock import FileLock, Timeout  # of the extra `bench`
+
     lock = FileLock(folder / LOCK, timeout=0, fallback_to_soft=False)
     try:
         lock.acquire()

@@ -1,4 +1,4 @@
-"""A suite: which logs or simulations, seeds, estimators and variants are run, and what is asked of them.
+"""A suite: the logs or simulations, seeds, estimators and variants to run, and how they are compared.
 
 ::
 
@@ -19,9 +19,8 @@
     [[estimators]]
     name = "dead-reckoning"
 
-Every mistake is found here, before anything runs, and told with file, line and key.
-
-On which line of a TOML file a key stands: `tomllib` gives values without places.
+Mistakes are found before anything runs and reported with file, line and key. `tomllib` gives values without line
+numbers, so `line_of` finds the line of a key again.
 """
 
 from __future__ import annotations
@@ -40,74 +39,9 @@ from sonar_graph.errors import BatchError
 from sonar_graph.settings import choice, faults_in, flattened
 
 Place = tuple[int | str, ...]
-_NAME = r"""(?:[A-Za-z0-9_-]+|"[^"]*"|'[^']*')"""
-_DOTTED = rf"{_NAME}(?:\s*\.\s*{_NAME})*"
-_HEADER = re.compile(rf"\s*(?P<array>\[)?\[\s*(?P<path>{_DOTTED})\s*\]")
-_KEY = re.compile(rf"\s*(?P<path>{_DOTTED})\s*=")
-_TEXT_MARKS = ('"""', "'''")
-
-
-def line_of(text: str, place: Place) -> int:
-    """The line, counted from 1, of a key, or of the nearest thing around it that has a line of its own.
-
-    Parameters
-    ----------
-    text
-        A valid TOML document.
-    place
-        Names of tables and keys, and numbers, from 0, of the entries of arrays.
-    """
-    lines = _lines_of_keys(text)
-    return next(lines[place[:length]] for length in range(len(place), -1, -1) if place[:length] in lines)
-
-
-def _lines_of_keys(text: str) -> dict[Place, int]:
-    lines: dict[Place, int] = {(): 1}
-    entries: dict[Place, int] = {}
-    table: Place = ()
-    for number, line in _lines_outside_texts(text):
-        if header := _HEADER.match(line):
-            table = _table(_names(header["path"]), header["array"] is not None, entries)
-            lines.setdefault(table, number)
-            if header["array"]:
-                lines.setdefault(table[:-1], number)
-        elif key := _KEY.match(line):
-            names = _names(key["path"])
-            for length in range(1, len(names) + 1):
-                lines.setdefault((*table, *names[:length]), number)
-    return lines
-
-
-def _table(names: list[str], is_array: bool, entries: dict[Place, int]) -> Place:
-    """The place of a header's table; names of arrays are followed by the number of their last entry."""
-    place: Place = ()
-    for depth, name in enumerate(names, start=1):
-        place = (*place, name)
-        if is_array and depth == len(names):
-            entries[place] = entries.get(place, -1) + 1
-        if place in entries:
-            place = (*place, entries[place])
-    return place
-
-
-def _lines_outside_texts(text: str) -> list[tuple[int, str]]:
-    """Numbered lines, without those inside of texts of several lines."""
-    outside, open_mark = [], ""
-    for number, line in enumerate(text.splitlines(), start=1):
-        if not open_mark:
-            outside.append((number, line))
-        for mark in _TEXT_MARKS:
-            if open_mark in ("", mark) and line.count(mark) % 2:
-                open_mark = "" if open_mark else mark
-    return outside
-
-
-def _names(path: str) -> list[str]:
-    return [name.strip("\"'") for name in re.findall(_NAME, path)]
-
-
+"""Names of tables and keys, and indices of the entries of arrays, from the top of the file."""
 DATA_VARIABLE = "SONAR_GRAPH_DATA"
-"""Environment variable with the folder in which data sets are looked for that do not lie beside the suite."""
+"""Environment variable: folder of data sets that do not lie beside the suite."""
 DEFAULT_METRICS = (
     "causal.ate_se2_m",
     "causal.ate_raw_m",
@@ -131,33 +65,33 @@ METRICS = (
 """Every key that a score can have."""
 MOST_SEEDS = 1_000_000
 LARGEST_SEED = 2**63 - 1
-"""That a column of the results can hold."""
+"""Largest integer that a column of the results can hold."""
 
 
 Grid = Annotated[
     dict[str, list[Any]], BeforeValidator(lambda given: flattened(given) if isinstance(given, dict) else given)
 ]
-"""Values by name; of nested settings by dotted names."""
+"""Values by name; names of nested settings are dotted."""
 
 
 class LogEntry(Section):
     """One log, data set or generator; with a grid, several of them."""
 
     name: str = Field(min_length=1)
-    """For tables."""
+    """Label in tables."""
     log: str | None = None
-    """An MCAP file, from the suite's folder on, read with `sonar_graph.batch.sources.LogOptions` as its ``options``."""
+    """MCAP file, relative to the suite's folder; its ``options``: `sonar_graph.batch.sources.LogOptions`."""
     dataset: str | None = None
-    """Name of a converter of a public data set."""
+    """Name of a public data set."""
     generator: str | None = None
     """Name of a simulator."""
     options: dict[str, Any] = Field(default_factory=dict)
     grid: Grid = Field(default_factory=dict)
     """Options that take each of several values, in every combination."""
     seeds: int | list[int] | None = None
-    """Of a generator, or of ``landmarks``: so many from 0 on, or these."""
+    """Seeds of a generator or of ``landmarks``: their number, from 0 on, or a list."""
     landmarks: dict[str, Any] | None = None
-    """Options of landmarks that are simulated on a recorded log."""
+    """Options of landmarks to be simulated on a recorded log."""
 
     @field_validator("seeds", mode="before")
     @classmethod
@@ -184,11 +118,11 @@ class LogEntry(Section):
 
     @property
     def kind(self) -> str:
-        """Name of the source, as `sonar_graph.batch.sources.KINDS` has it."""
+        """Name of the source in `sonar_graph.batch.sources.KINDS`."""
         return self.generator or self.dataset or "mcap"
 
     def seed_list(self) -> list[int | None]:
-        """Seeds to run; one None where nothing is random."""
+        """Seeds to run; one None if nothing is random."""
         if self.generator is None and self.landmarks is None:
             return [None]
         return list(range(self.seeds)) if isinstance(self.seeds, int) else [0] if self.seeds is None else [*self.seeds]
@@ -198,11 +132,11 @@ class EstimatorEntry(Section):
     """One estimator; with a grid, several variants of it."""
 
     name: str
-    """Under which it is installed."""
+    """Name of the installed estimator."""
     variant: str = ""
-    """Name of these settings, for tables."""
+    """Label of these settings in tables."""
     params: dict[str, Any] = Field(default_factory=dict)
-    """Settings that differ from its defaults."""
+    """Settings that differ from the defaults."""
     grid: Grid = Field(default_factory=dict)
     """Settings that take each of several values, in every combination."""
 
@@ -213,7 +147,7 @@ class Suite(Section):
     name: str = Field(min_length=1)
     description: str = ""
     rate_hz: float = Field(2.0, gt=0, le=1000)
-    """How often every estimator is asked for its estimate."""
+    """Rate at which every estimator is asked for its estimate."""
     reference: str
     """Estimator with which the others are compared: its name, or ``name/variant``."""
     metrics: tuple[str, ...] = Field(DEFAULT_METRICS, min_length=1)
@@ -242,10 +176,10 @@ class SuiteFile:
         BatchError
             With file, line and key.
         """
-        refuse(self.path, self.text, place, f"{'.'.join(map(str, place))}: {fault}")
+        raise BatchError(f"{self.path}, line {line_of(self.text, place)}: {'.'.join(map(str, place))}: {fault}")
 
     def find(self, place: Place, name: str) -> str:
-        """Where a file or folder is: from the suite's folder on, else in the folder of data sets.
+        """Absolute path of a file or folder, relative to the suite's folder or else to the folder of data sets.
 
         Raises
         ------
@@ -262,7 +196,7 @@ class SuiteFile:
 
 
 def read_suite(path: Path) -> SuiteFile:
-    """A suite from its file, its values checked one by one; `sonar_graph.batch.plan` checks what they name.
+    """Read a suite and check its values one by one; `plan_runs` checks what they refer to.
 
     Raises
     ------
@@ -279,7 +213,8 @@ def read_suite(path: Path) -> SuiteFile:
     try:
         suite = Suite.model_validate(values)
     except ValidationError as error:
-        refuse(path, text, error.errors()[0]["loc"], faults_in(error, Suite))
+        line = line_of(text, error.errors()[0]["loc"])
+        raise BatchError(f"{path}, line {line}: {faults_in(error, Suite)}") from error
     found = SuiteFile(path, text, suite)
     for number, metric in enumerate(suite.metrics):
         if metric not in METRICS:
@@ -287,12 +222,39 @@ def read_suite(path: Path) -> SuiteFile:
     return found
 
 
-def refuse(path: Path, text: str, place: Place, fault: str) -> NoReturn:
-    """Raise for a mistake, with the line of its place.
+_NAME = r"""(?:[A-Za-z0-9_-]+|"[^"]*"|'[^']*')"""
+_DOTTED = rf"{_NAME}(?:\s*\.\s*{_NAME})*"
+_HEADER = re.compile(rf"\s*(?P<array>\[)?\[\s*(?P<path>{_DOTTED})\s*\]")
+_KEY = re.compile(rf"\s*(?P<path>{_DOTTED})\s*=")
+_TEXT_MARKS = ('"""', "'''")
 
-    Raises
-    ------
-    BatchError
-        Always.
-    """
-    raise BatchError(f"{path}, line {line_of(text, place)}: {fault}")
+
+def line_of(text: str, place: Place) -> int:
+    """Line, counted from 1, of a key in a valid TOML document, or of the nearest table or array around it."""
+    lines: dict[Place, int] = {(): 1}
+    entries: dict[Place, int] = {}
+    table: Place = ()
+    open_mark = ""  # of a text of several lines, in which nothing is a key
+    for number, line in enumerate(text.splitlines(), start=1):
+        if not open_mark and (header := _HEADER.match(line)):
+            names, table = _names(header["path"]), ()
+            for depth, name in enumerate(names, start=1):
+                table = (*table, name)
+                if header["array"] and depth == len(names):
+                    lines.setdefault(table, number)
+                    entries[table] = entries.get(table, -1) + 1
+                if table in entries:
+                    table = (*table, entries[table])
+            lines.setdefault(table, number)
+        elif not open_mark and (key := _KEY.match(line)):
+            names = _names(key["path"])
+            for length in range(1, len(names) + 1):
+                lines.setdefault((*table, *names[:length]), number)
+        for mark in _TEXT_MARKS:
+            if open_mark in ("", mark) and line.count(mark) % 2:
+                open_mark = "" if open_mark else mark
+    return next(lines[place[:length]] for length in range(len(place), -1, -1) if place[:length] in lines)
+
+
+def _names(path: str) -> list[str]:
+    return [name.strip("\"'") for name in re.findall(_NAME, path)]

@@ -1,7 +1,7 @@
-"""Runs watched from outside: ended when they take too long or too much memory, repeated once when they are killed.
+"""Runs watched from outside: ended when they exceed their time or memory, repeated once when they are killed.
 
-A run is done in a process of its own kind (`sonar_graph.batch.one_run`), because native code cannot be stopped from
-within, and because a crash must not take the Dask worker with it. The process is kept for the next run.
+A run is done in a process of its own (`sonar_graph.batch.one_run`), because native code cannot be stopped from within
+and a crash must not end the Dask worker. The process is kept for the next run.
 """
 
 from __future__ import annotations
@@ -32,51 +32,60 @@ ONE_THREAD = (
     *("VECLIB_MAXIMUM_THREADS", "TBB_NUM_THREADS"),
 )
 ONE_ORDER = {"PYTHONHASHSEED": "0"}
-"""An estimator may sum over a set of texts: its order, and so the last digits, would be another one in each process."""
+"""Fixes the order of sets of texts, and with it the last digits of sums over them."""
 LOOK_EVERY_S = 0.2
 START_S = 300.0
-"""A process that is not ready by then is broken."""
+"""Longest start of a process."""
 WARM_UP_S = 3600.0
-"""The first process on a machine compiles kernels, beside others that do the same."""
+"""Longest warm-up: the first processes on a machine all compile kernels."""
 OWN = "sonar-graph"
 """Name among the versions of a run whose estimator this package brings. Others are not warmed up: they may take any
-time, and that is their runs'."""
+time, which then counts for their runs."""
 JOIN_S = 5.0
-"""For the thread that listens to a process that was ended; what left the process's session may keep it listening."""
+"""Longest wait for the thread that listens to an ended process, whose detached children may keep the pipe open."""
 ATTEMPTS = 2
 LOG_CHARACTERS = 100_000
-"""Of a run's log its end is kept."""
+"""Length of the kept end of a run's log."""
 
 
 class KilledError(Exception):
-    """The process of a run ended by itself, or was ended by somebody else."""
+    """The process of a run ended by itself or was killed."""
 
 
 def perform_watched(run: PlannedRun, limits: Limits) -> RunOutcome:
-    """Do a run in one of this process's runners; one that is killed is done once more.
+    """Do a run in one of this process's runners; a run that is killed is done once more.
 
     Returns
     -------
-    Its outcome; that of a run which is killed again, takes too long or needs too much memory is a row that says so.
+    Its outcome. For a run that is killed again, takes too long or needs too much memory, the row says so.
 
     Raises
     ------
     BatchError, OSError
-        When no run could be done here: other versions, no process, no space.
+        When no run can be done here: other versions, no process, no space.
     """
     reason, log = "", ""
     for _ in range(ATTEMPTS):
-        with _a_runner() as runner:
-            try:
-                outcome = runner.perform(run, limits)
-                return replace(outcome, row=_here() | outcome.row)
-            except KilledError as error:
-                reason, log = str(error), runner.log()
+        with _idle_lock:
+            runner = _idle.pop() if _idle else None
+        if runner is None or not runner.is_fit():
+            runner = Runner()
+        try:
+            outcome = runner.perform(run, limits)
+            return replace(outcome, row=_here() | outcome.row)
+        except KilledError as error:
+            reason, log = str(error), runner.log()
+        finally:
+            if runner.is_fit():
+                with _idle_lock:
+                    _idle.append(runner)
+            else:
+                runner.end()
     return RunOutcome({**_here(), "status": "killed", "reason": f"{reason}, {ATTEMPTS} times"}, log=log)
 
 
 def _here() -> Row:
-    """Where a run is done, also for those that cannot tell any more."""
+    """Versions of this machine, also for runs that ended without a row."""
     environment = describe_environment()
     return {"python": environment["python"], "machine": environment["machine"]}
 
@@ -85,25 +94,14 @@ _idle: list[Runner] = []
 _idle_lock = threading.Lock()
 
 
-@contextlib.contextmanager
-def _a_runner() -> Any:
-    """A process of one's own for the block; kept afterwards for the next run if it is fit for it."""
-    with _idle_lock:
-        runner = _idle.pop() if _idle else None
-    if runner is None or not runner.is_fit():
-        runner = Runner()
-    try:
-        yield runner
-    finally:
-        if runner.is_fit():
-            with _idle_lock:
-                _idle.append(runner)
-        else:
-            runner.end()
-
-
 class Runner:
-    """A process that does one run after the other."""
+    """A process that does one run after the other.
+
+    Raises
+    ------
+    BatchError
+        When the process does not become ready in time.
+    """
 
     def __init__(self) -> None:
         self._log = tempfile.TemporaryFile(mode="a+b")  # noqa: SIM115  it is open as long as the process runs
@@ -121,16 +119,10 @@ class Runner:
         self._answers: SimpleQueue[Any] = SimpleQueue()
         self._is_busy = True
         self._warm: set[str] = set()
-        collector_arguments = (self._process.stdout, self._answers)
-        self._collector = threading.Thread(target=_collect, args=collector_arguments, daemon=True)
+        self._collector = threading.Thread(target=self._collect, args=(self._process.stdout,), daemon=True)
         self._collector.start()
-        self._await_readiness()
-
-    def _await_readiness(self) -> None:
-        """Return when the process has loaded everything; one that does not come so far is ended."""
         try:
-            answer = self._wait(Limits(START_S))
-            reason = "" if answer == READY else f"it was not ready after {START_S:g} s"
+            reason = "" if self._wait(Limits(START_S)) == READY else f"it was not ready after {START_S:g} s"
         except KilledError as error:
             reason = str(error)
         if reason:
@@ -138,17 +130,24 @@ class Runner:
             self.end()
             raise BatchError(f"no process for runs on {platform.node()}: {reason}; {said}")
 
+    def _collect(self, source: BinaryIO) -> None:
+        """Put the answers of the process into the queue; None at their end."""
+        with source, contextlib.suppress(EOFError, OSError, pickle.UnpicklingError):
+            while True:
+                self._answers.put(pickle.load(source))
+        self._answers.put(None)
+
     @property
     def pid(self) -> int:
-        """Of the process."""
+        """Number of the process."""
         return self._process.pid
 
     def is_fit(self) -> bool:
-        """Whether it can take a run."""
+        """Tell whether it can take a run."""
         return not self._is_busy and self._process.poll() is None
 
     def perform(self, run: PlannedRun, limits: Limits) -> RunOutcome:
-        """Do one run, after a warm-up where it is the first of its estimator here.
+        """Do one run, after a warm-up if it is the first of its estimator here.
 
         Raises
         ------
@@ -170,7 +169,7 @@ class Runner:
 
     def _ask(self, request: PlannedRun | Preparation, limits: Limits) -> Any:
         self._is_busy = True
-        with contextlib.suppress(OSError):  # a process that is gone is told by its missing answer
+        with contextlib.suppress(OSError):  # a process that is gone is noticed by its missing answer
             pickle.dump(request, self._requests)
             self._requests.flush()
         answer = self._wait(limits)
@@ -179,12 +178,12 @@ class Runner:
         return answer
 
     def log(self) -> str:
-        """What the process printed since the run began."""
+        """Output of the process since the run began."""
         self._log.seek(0)
         return self._log.read().decode("utf-8", "replace")[-LOG_CHARACTERS:]
 
     def end(self) -> None:
-        """End the process now, and all that it started: they hold its pipe open."""
+        """Kill the process and its children, which hold its pipe open."""
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGKILL)
         self._process.wait()
@@ -194,7 +193,7 @@ class Runner:
         self._log.close()
 
     def _wait(self, limits: Limits) -> Any:
-        """The answer to what was asked; for a run that exceeds its limits an outcome, and the process stays busy."""
+        """Answer to the last request; for a run that exceeds its limits an outcome, and the process stays busy."""
         deadline = time.monotonic() + limits.timeout_s
         while True:
             is_gone = self._process.poll() is not None
@@ -204,19 +203,13 @@ class Runner:
                     raise KilledError(self._ending())
                 self._is_busy = False
                 return answer
-            if is_gone:  # what it started may live on and keep the end of its answers from being seen
+            if is_gone:  # its children may live on and keep the pipe open
                 raise KilledError(self._ending())
-            excess = self._excess(limits, deadline)
-            if excess is not None:
-                return RunOutcome(excess)
-
-    def _excess(self, limits: Limits, deadline: float) -> Row | None:
-        """The row of a run that exceeds its limits."""
-        if time.monotonic() > deadline:
-            return {"status": "timeout", "reason": f"took longer than {limits.timeout_s:g} s"}
-        if limits.memory_mb is not None and _resident_mb(self.pid) > limits.memory_mb:
-            return {"status": "memory", "reason": f"its processes needed more than {limits.memory_mb:g} MB"}
-        return None
+            if time.monotonic() > deadline:
+                return RunOutcome({"status": "timeout", "reason": f"took longer than {limits.timeout_s:g} s"})
+            if limits.memory_mb is not None and resident_mb(self.pid) > limits.memory_mb:
+                reason = f"its processes needed more than {limits.memory_mb:g} MB"
+                return RunOutcome({"status": "memory", "reason": reason})
 
     def _ending(self) -> str:
         code = self._process.wait()
@@ -225,8 +218,8 @@ class Runner:
         return f"its process was ended by {signal.Signals(-code).name}"
 
 
-def _resident_mb(pid: int) -> float:
-    """Of a process and of all that it started; of these without what they may share with it."""
+def resident_mb(pid: int) -> float:
+    """Resident memory, 10⁶ bytes, of a process with its children; of these without pages shared with it."""
     total_bytes = 0
     with contextlib.suppress(psutil.Error):
         process = psutil.Process(pid)
@@ -235,11 +228,3 @@ def _resident_mb(pid: int) -> float:
             with contextlib.suppress(psutil.Error):
                 total_bytes += child.memory_full_info().uss
     return float(total_bytes / 1e6)
-
-
-def _collect(source: BinaryIO, answers: SimpleQueue[Any]) -> None:
-    """Put what a process answers into a queue; None at its end."""
-    with source, contextlib.suppress(EOFError, OSError, pickle.UnpicklingError):
-        while True:
-            answers.put(pickle.load(source))
-    answers.put(None)

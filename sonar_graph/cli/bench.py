@@ -12,17 +12,16 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer.core import TyperGroup
 
 from sonar_graph.cli.arguments import OutputFolder, examples
-from sonar_graph.cli.outputs import working, writable_folder, writable_json
-from sonar_graph.errors import BatchError
+from sonar_graph.cli.outputs import working, writable_json
 
 if TYPE_CHECKING:
-    from sonar_graph.batch import Batch, GateVerdict, Limits, Where
+    from sonar_graph.batch import GateVerdict
 
 
 INTERRUPTED = 130
@@ -34,7 +33,6 @@ BatchFolder = Annotated[
 Strict = Annotated[
     bool, typer.Option("--strict", help="Fail the gate by lines that say 'look at' too: these are no tests.")
 ]
-INSTALL = "pip install 'sonar-graph[bench]'"
 
 
 def bench(
@@ -72,17 +70,29 @@ def bench(
     Writes report.html, its tables, results.parquet with one row a run, and runs/KEY/ with what compare writes and the
     log of the run.
     """
-    if workers is not None and scheduler is not None:
-        raise typer.BadParameter("--workers is for this machine, --scheduler for a cluster; give one of them")
     if is_strict and reference is None:
         raise typer.BadParameter("--strict is about the gate; give it with --gate")
-    with _opened(suite, output, timeout_s) as (batch, limits):
-        if retry_failed:
-            batch.discard_failed()
-        counts = _run(batch, _where(workers, scheduler), limits)
-        typer.echo(f"Runs: {_told(counts)}")
-        typer.echo(f"Results: {output / 'results.parquet'}")
-        typer.echo(f"Report: {write_report_of(output)}")
+    from sonar_graph.batch import run_suite
+
+    try:
+        with run_bar() as progress:
+            batch = run_suite(
+                suite,
+                output,
+                workers=workers,
+                scheduler=scheduler,
+                timeout_s=timeout_s,
+                retry_failed=retry_failed,
+                progress=progress,
+            )
+    except KeyboardInterrupt as error:
+        print(f"sonar-graph: interrupted; {error}".rstrip("; "), file=sys.stderr, flush=True)
+        os._exit(INTERRUPTED)  # the ordinary way waits for threads, also for those of workers that are gone
+    counts = Counter(run.status for run in batch.runs)
+    told = sorted(counts.items(), key=lambda count: (count[0] != "ok", count[0]))
+    typer.echo(f"Runs: {', '.join(f'{number} {status}' for status, number in told)}")
+    typer.echo(f"Results: {output / 'results.parquet'}")
+    typer.echo(f"Report: {write_report_of(output)}")
     if reference is not None:
         exit_by_gate(output, reference, is_strict=is_strict)
     elif set(counts) - {"ok"}:
@@ -143,65 +153,22 @@ def write_report_of(folder: Path) -> Path:
 
 
 @contextmanager
-def _opened(suite: Path, output: Path, timeout_s: float | None) -> Iterator[tuple[Batch, Limits]]:
-    try:
-        from sonar_graph.batch import Batch, limits_of, plan_runs, read_suite
-    except ModuleNotFoundError as error:
-        raise BatchError(f"bench needs {error.name}, which is not installed: {INSTALL}") from error
-    file = read_suite(suite)
-    runs = plan_runs(file)  # before the folder is made, which a suite with a mistake does not need
-    with Batch.opened(file, writable_folder(output), runs) as batch:
-        yield batch, limits_of(file, timeout_s)
-
-
-def _where(workers: int | None, scheduler: str | None) -> Where:
-    from sonar_graph.batch import Where
-
-    return Where(workers, scheduler)
-
-
-def _run(batch: Batch, where: Where, limits: Limits) -> Counter[str]:
-    """All runs; on Ctrl-C, and where a scheduler of jobs ends it, it says how to go on."""
-    from sonar_graph.batch import terminations_as_interrupts
-
-    try:
-        with terminations_as_interrupts(), _shown(batch) as progress:
-            return batch.run(where, limits, progress)
-    except KeyboardInterrupt:
-        print(f"sonar-graph: interrupted; {batch.resuming()}", file=sys.stderr, flush=True)
-        os._exit(INTERRUPTED)  # the ordinary way waits for threads, and those for workers that are gone
-
-
-@contextmanager
-def _shown(batch: Batch) -> Iterator[Callable[[Any, Any], None]]:
-    """Runs done, failed, and the time that is left, for people only: silent where stderr is no terminal."""
+def run_bar() -> Iterator[Callable[[int, int, int], None]]:
+    """Progress bar of runs with the number of failures and the time left; silent unless stderr is a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
     columns = (TextColumn("runs"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[failed]}"))
-    statuses = Counter(str(row["status"]) for row in batch.rows().values())
     with Progress(
         *columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal, transient=True
     ) as bar:
-        task = bar.add_task("runs", total=len(batch.runs), completed=statuses.total(), failed=_failures(statuses))
+        task = bar.add_task("runs", failed="")
 
-        def show(_run: Any, outcome: Any) -> None:
-            statuses[str(outcome.row["status"])] += 1
-            bar.update(task, completed=statuses.total(), failed=_failures(statuses))
+        def show(done: int, planned: int, failed: int) -> None:
+            bar.update(task, completed=done, total=planned, failed=f"{failed} failed" if failed else "")
 
         yield show
-
-
-def _failures(statuses: Counter[str]) -> str:
-    failed = statuses.total() - statuses["ok"]
-    return f"{failed} failed" if failed else ""
-
-
-def _told(counts: Counter[str]) -> str:
-    return ", ".join(
-        f"{count} {status}" for status, count in sorted(counts.items(), key=lambda c: (c[0] != "ok", c[0]))
-    )
 
 
 DEFAULT_COMMAND = "run"

@@ -11,6 +11,7 @@ What a log written by this package says about itself: name, calibration and note
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -130,6 +131,27 @@ class PartialCalibration:
             if any(not _is_missing_field(fault["type"], fault["loc"]) for fault in error.errors()):
                 raise CalibrationError(f"{source}: {faults_in(error, Calibration)}") from error
         return cls(values, source)
+
+    @classmethod
+    def read(cls, path: Path) -> PartialCalibration:
+        """Read a TOML or JSON file (by its suffix) whose fields go before the log's own.
+
+        Raises
+        ------
+        CalibrationError
+            When the file is neither TOML nor JSON, or a field does not fit.
+        """
+        kind = "JSON" if path.suffix == ".json" else "TOML"
+        try:
+            text = path.read_text(encoding="utf-8")
+            values = json.loads(text) if kind == "JSON" else tomllib.loads(text)
+        except (json.JSONDecodeError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise CalibrationError(f"{path}: not {kind}: {error}") from error
+        if not isinstance(values, dict):
+            raise CalibrationError(
+                f"{path}: expected an object with sections such as imu, not {json.dumps(values):.40}"
+            )
+        return cls.parse(values, str(path))
 
     def fields(self) -> list[str]:
         """Paths of all that is said, such as ``dvl.mounting.translation_m``."""

@@ -25,7 +25,6 @@ from sonar_graph.batch import (
     quantile_error,
     summarise,
 )
-from sonar_graph.batch.recorded import _count_told
 from sonar_graph.report.batch_tables import SIGNIFICANT, Tests, p_text
 from sonar_graph.report.tables import Cell, Column, Table, absent, number, words
 from sonar_graph.report.wording import quantile_text
@@ -288,7 +287,7 @@ def missing_told(batch: RecordedBatch) -> list[str]:
     logs = [log for log in batch.logs if log in lacking]
     more = f" and {len(logs) - NAMED} more" if len(logs) > NAMED else ""
     return [
-        f"This batch is not complete: {_count_told(batch)} ({whose}), on {'; '.join(logs[:NAMED])}{more}. All numbers "
+        f"This batch is not complete: {batch.missing_count} ({whose}), on {'; '.join(logs[:NAMED])}{more}. All numbers "
         f"are of the other runs, and may change. To complete it, {GOING_ON}."
     ]
 
@@ -308,4 +307,4 @@ def marked(batch: RecordedBatch, table: Table) -> Table:
     """A table, with a caption that says so where runs are missing: tables are taken out of the page."""
     if not batch.missing:
         return table
-    return replace(table, caption=f"{table.caption} Not complete: {_count_told(batch)}.".lstrip())
+    return replace(table, caption=f"{table.caption} Not complete: {batch.missing_count}.".lstrip())

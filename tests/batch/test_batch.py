@@ -3,6 +3,7 @@ from __future__ import annotations
 import errno
 import os
 import tempfile
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from sonar_graph.batch import batch as batch_module
+from sonar_graph.batch import cluster
 from sonar_graph.batch.batch import Batch, limits_of
-from sonar_graph.batch.cluster import Progress, Where
 from sonar_graph.batch.one_run import perform
 from sonar_graph.batch.recorded import is_batch, read_batch
 from sonar_graph.batch.result_table import RESULTS, is_timing
-from sonar_graph.batch.store import Limits, PlannedRun, RunOutcome, Store
+from sonar_graph.batch.store import Limits, PlannedRun, Progress, RunOutcome, Store, Where
 from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import BatchError, EvaluationError
 
@@ -55,12 +56,18 @@ def suite(write_suite: WriteSuite) -> Path:
 
 @pytest.fixture
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch_module, "run_batch", do_here)
+    monkeypatch.setattr(cluster, "run_batch", do_here)
+
+
+def statuses_after(batch: Batch) -> Counter[str]:
+    """Number of runs by status, after all of them were done."""
+    batch.run(HERE, LIMITS, nobody)
+    return Counter(str(row["status"]) for row in batch.rows().values())
 
 
 def finished(suite: Path, folder: Path) -> list[dict[str, Any]]:
     with Batch.opened(read_suite(suite), folder) as batch:
-        assert batch.run(HERE, LIMITS, nobody) == {"ok": 4}
+        assert statuses_after(batch) == {"ok": 4}
     return table(folder)
 
 
@@ -77,13 +84,13 @@ def test_resumed_batch_has_the_table_of_an_undisturbed_one(
         raise Interrupted
 
     for count in (1, 2, 3):
-        monkeypatch.setattr(batch_module, "run_batch", interrupted)
+        monkeypatch.setattr(cluster, "run_batch", interrupted)
         with Batch.opened(read_suite(suite), tmp_path / "b") as batch, pytest.raises(Interrupted):
             batch.run(HERE, LIMITS, nobody)
         statuses = [row["status"] for row in table(tmp_path / "b")]
         assert statuses == ["ok"] * count + ["not run"] * (4 - count)
         assert batch.resuming().startswith(f"{count} of 4 runs are done and kept")
-    monkeypatch.setattr(batch_module, "run_batch", do_here)
+    monkeypatch.setattr(cluster, "run_batch", do_here)
     assert finished(suite, tmp_path / "b") == undisturbed
     assert len(set(done)) == 3
 
@@ -91,8 +98,6 @@ def test_resumed_batch_has_the_table_of_an_undisturbed_one(
 def test_full_disk_is_told_and_loses_no_run_that_is_done(
     suite: Path, tmp_path: Path, in_this_process: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sonar_graph.batch import cluster as execution
-
     class Full(Store):
         def write(self, key: str, outcome: RunOutcome) -> None:
             if len(list((self.folder / "runs").iterdir())) == 2:
@@ -108,19 +113,19 @@ def test_full_disk_is_told_and_loses_no_run_that_is_done(
 
     def kept(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
         for run in runs:
-            execution._keep(run, Done(run), store, nobody)  # type: ignore[arg-type]
+            cluster.keep(run, Done(run), store, nobody)  # type: ignore[arg-type]
 
     def no_space(*_arguments: Any) -> Path:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(batch_module, "run_batch", kept)
+    monkeypatch.setattr(cluster, "run_batch", kept)
     folder = tmp_path / "out"
     with Batch.opened(read_suite(suite), folder) as batch, monkeypatch.context() as patch:
         patch.setattr(batch_module, "write_results", no_space)
         with pytest.raises(BatchError, match=r"No space left.*2 of 4 runs are done and kept; the same command"):
             Batch(batch.file, batch.runs, Full(folder)).run(HERE, LIMITS, nobody)
     stamps = {path: path.stat().st_mtime_ns for path in folder.glob("runs/*/row.json")}
-    monkeypatch.setattr(batch_module, "run_batch", do_here)
+    monkeypatch.setattr(cluster, "run_batch", do_here)
     finished(suite, folder)
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
 
@@ -135,10 +140,10 @@ def test_mistake_in_a_suite_leaves_the_folder_alone(write_suite: WriteSuite, tmp
 def test_failed_runs_are_kept_until_they_are_discarded(suite: Path, tmp_path: Path, in_this_process: None) -> None:
     with Batch.opened(read_suite(suite), tmp_path) as batch:
         batch.store.write(batch.runs[0].key, RunOutcome({"status": "timeout", "reason": "took longer than 1 s"}))
-        assert batch.run(HERE, LIMITS, nobody) == {"ok": 3, "timeout": 1}
-        assert batch.run(HERE, LIMITS, nobody) == {"ok": 3, "timeout": 1}
+        assert statuses_after(batch) == {"ok": 3, "timeout": 1}
+        assert statuses_after(batch) == {"ok": 3, "timeout": 1}
         batch.discard_failed()
-        assert batch.run(HERE, LIMITS, nobody) == {"ok": 4}
+        assert statuses_after(batch) == {"ok": 4}
 
 
 def test_second_batch_in_a_folder_is_refused_and_touches_nothing(suite: Path, tmp_path: Path) -> None:
@@ -168,7 +173,7 @@ def killed_after(count: int) -> Callable[..., None]:
 
 
 def kill(suite: Path, folder: Path, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch_module, "run_batch", killed_after(count))
+    monkeypatch.setattr(cluster, "run_batch", killed_after(count))
     with Batch.opened(read_suite(suite), folder) as batch, pytest.raises(Killed):
         batch.run(HERE, LIMITS, nobody)
 
@@ -181,7 +186,7 @@ def test_what_a_killed_batch_did_is_read_with_what_it_did_not_do(
     batch = read_batch(folder)
     assert [(run.seed, run.status) for run in batch.runs] == [(0, "ok"), (1, "ok"), (2, "ok")]
     assert [(run.seed, run.status) for run in batch.missing] == [(3, "not run")]
-    monkeypatch.setattr(batch_module, "run_batch", do_here)
+    monkeypatch.setattr(cluster, "run_batch", do_here)
     finished(suite, folder)
     whole = read_batch(folder)
     assert not whole.missing

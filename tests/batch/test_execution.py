@@ -24,8 +24,8 @@ import pytest
 from distributed import LocalCluster
 
 from sonar_graph.batch import cluster as execution
-from sonar_graph.batch.cluster import Where, run_batch
-from sonar_graph.batch.store import Limits, PlannedRun, RunOutcome, Store
+from sonar_graph.batch.cluster import run_batch
+from sonar_graph.batch.store import Limits, PlannedRun, RunOutcome, Store, Where
 from sonar_graph.errors import BatchError
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
@@ -194,7 +194,7 @@ def test_a_script_that_workers_cannot_import_is_told_what_to_write(write_suite: 
     script.write_text(f"""
 from pathlib import Path
 from sonar_graph.batch.batch import Batch, limits_of
-from sonar_graph.batch.execution import Where
+from sonar_graph.batch.store import Where
 from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import BatchError
 

@@ -17,7 +17,7 @@ from sonar_graph.errors import BatchError
 HOLDER = """
 import subprocess, sys, time
 from pathlib import Path
-from sonar_graph.batch.lock import only_batch_in
+from sonar_graph.batch.store import only_batch_in
 
 with only_batch_in(Path(sys.argv[1])):
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], stdout=subprocess.DEVNULL)

@@ -190,7 +190,7 @@ def test_estimator_is_loaded_between_two_looks_at_its_source(
 ) -> None:
     run, order = planned(), []
     monkeypatch.delitem(sys.modules, "baselines.dead_reckoning")
-    for name in ("_check_versions", "load_estimator", "run_estimator", "_check_source_now"):
+    for name in ("versions_of", "load_estimator", "run_estimator", "sources_now"):
         real = getattr(one_run, name)
 
         def noted(*given: Any, name: str = name, real: Any = real, **named: Any) -> Any:
@@ -199,7 +199,7 @@ def test_estimator_is_loaded_between_two_looks_at_its_source(
 
         monkeypatch.setattr(one_run, name, noted)
     perform(run, tmp_path / "run")
-    assert order == ["_check_versions", "load_estimator", "run_estimator", "_check_source_now"]
+    assert order == ["versions_of", "load_estimator", "run_estimator", "sources_now"]
 
 
 def test_folder_that_cannot_be_written_is_no_result(planned: Planned, tmp_path: Path) -> None:

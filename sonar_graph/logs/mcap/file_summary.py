@@ -181,6 +181,18 @@ class TimeWindow:
     start: Instant | None = None
     end: Instant | None = None
 
+    @classmethod
+    def parse(cls, start: str | None, end: str | None) -> TimeWindow:
+        """Window between two times in text, as `Instant.parse` takes them; None: no limit.
+
+        Raises
+        ------
+        LogError
+            When a text is no time.
+        """
+        first, last = (None if text is None else Instant.parse(text) for text in (start, end))
+        return cls(first, last)
+
     @property
     def is_all(self) -> bool:
         """True when the window has no limits."""
