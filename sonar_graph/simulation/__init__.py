@@ -1,4 +1,4 @@
-"""Truth and sensor readings; shares no code with the models that it judges."""
+"""Simulated truth and sensor readings, sharing no code with the models that they judge."""
 
 # fmt: off
 from sonar_graph.simulation.basin import (

@@ -1,13 +1,8 @@
-"""The basin experiment of the seed paper, with landmark detections or with sonar images.
+"""Basin experiment of the 2014 paper, with landmark detections or with sonar images.
 
 Four landmarks lie on the floor of a basin of 20 m × 14 m × 1.7 m, at (5, 0), (7, -5), (2, -7) and (0, -2). A vehicle
-with an imaging sonar tilted 30° down is driven around them three times in 2039 s at about 0.15 m/s.
-
-The published landmarks lie on the sides of a square of 7 m, each 5 m along its side when it is driven clockwise from
-the origin along x. That square is taken for the "rectangle path" of the paper; on each side the vehicle stops where it
-sees the landmark from 1.8 m (horizontally), watches it, drives on over it to the corner, and turns right by 90°.
-Three laps (84 m) at 0.15 m/s take 728 s with stops and turns; watching fills the rest. 2039 s at 0.15 m/s would be
-306 m, more than ten laps of that square: the published mean speed cannot be meant over the whole run.
+with an imaging sonar tilted 30° down drives around them three times in 2039 s at about 0.15 m/s. The route, the square
+of 7 m through the landmarks with a stop before each, is this project's: docs/theory/simulation.md says why.
 
 Source: "Experimental Results of Real-time Sonar-based Underwater Localization Using Landmarks", 2014.
 """
@@ -22,10 +17,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
-from sonar_graph.calibration import Calibration, Mounting, SonarImage
+from sonar_graph.calibration import Mounting, SonarImage
 from sonar_graph.devices import DEFAULT_DESIGNS, OWN_DESIGNS, LandmarkDesign, load_designs
 from sonar_graph.errors import SimulationError
-from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.detections import FieldOfView, World, world_on_floor
 from sonar_graph.simulation.options import SimulationOptions
@@ -58,23 +52,20 @@ WATCHING_M = 1.8
 """Horizontal distance from sonar to landmark while hovering: a slant range of 2.04 m."""
 OBJECTS_ALONG_SIDE_M = (2.2, 3.5, 6.5)
 OBJECTS_ASIDE_M = 0.3
-"""Stones and patches that are no landmarks lie about there along each side, up to so far to either side of it."""
+"""Stones and patches lie at about these distances along each side, up to `OBJECTS_ASIDE_M` beside it."""
 RAMP_S = 3.0
 TURN_S = 8.0
 FASTEST_M_S = 0.45
 KNOT_S = 0.5
 PAPER_DURATION_S, PAPER_LAPS, PAPER_SPEED_M_S = 2039.0, 3, 0.15
-NOTES = {
-    "truth": "exact: a quintic spline",
-    "earth rotation": "neither simulated nor to be removed",
-}
+NOTES = {"truth": "exact: a quintic spline", "earth rotation": "neither simulated nor to be removed"}
 
 
 class BasinOptions(SimulationOptions):
-    """What can be chosen about the basin experiment."""
+    """Options of the basin experiment."""
 
     duration_s: float = Field(PAPER_DURATION_S, gt=0)
-    """Of the whole run. What driving and turning leave is spent watching landmarks."""
+    """Of the whole run. The time that driving and turning leave is spent watching landmarks."""
     laps: int = Field(PAPER_LAPS, ge=1)
     """Rounds of the square."""
     speed_m_s: float = Field(PAPER_SPEED_M_S, gt=0, le=FASTEST_M_S)
@@ -84,72 +75,108 @@ class BasinOptions(SimulationOptions):
 
 
 def simulate_basin(options: BasinOptions | None = None) -> Sequence:
-    """The basin experiment with exact truth.
+    """Simulate the basin experiment: measurements of all sensors, calibration and exact truth.
 
     Parameters
     ----------
     options
-        None: the published run with the better sensors. With ``image`` there are no detections: the frames come from
-        `simulate_basin_frames`.
+        None: the published run of 2039 s with the better sensors. With ``image`` there are no detections: the frames
+        come from `simulate_basin_frames`.
+
+    Returns
+    -------
+    Sequence
+        IMU, Doppler log, depth and landmark detections; the calibration that holds for them; true trajectory in the
+        ``world`` frame at 50 Hz and true landmarks (m).
 
     Raises
     ------
     SimulationError
-        When the duration is too short for the laps.
+        When the duration is too short for the laps, or a file of landmark designs has fewer than four.
+    CalibrationError
+        When ``image.designs`` is no file of landmark designs.
+
+    Examples
+    --------
+    >>> from sonar_graph.simulation import BasinOptions, simulate_basin
+    >>> sequence = simulate_basin(BasinOptions(seed=1, duration_s=120, laps=1))
+    >>> sequence.true_landmarks.positions[:, :2].tolist()
+    [[5.0, 0.0], [7.0, -5.0], [2.0, -7.0], [0.0, -2.0]]
+    >>> len(sequence.imu), len(sequence.dvl), len(sequence.depth)
+    (12001, 841, 1201)
+    >>> sequence.notes["speed_m_s"]
+    '0.438'
     """
     options = options or BasinOptions()
     streams = Streams.of(options.seed)
-    world = _world(options, streams.world)
-    path = _path(options, streams.path)
-    sequence = record("basin", options, YSHARK, path, world, streams, _notes(options))
+    world, path = _world_and_path(options, streams)
+    sequence = record("basin", options, YSHARK, path, world, streams, provenance(options))
     if options.image is None:
         return sequence
-    return replace(sequence, detections=None, calibration=_imaging(sequence.calibration, options.image))
-
-
-def _imaging(calibration: Calibration, image: ImageOptions) -> Calibration:
-    """The calibration with what the counts of the images mean."""
-    scale = SonarImage(scale="decibel", decibel_span=SONARS[image.sonar].decibel_span, full_scale=255)
-    return calibration.model_copy(update={"sonar": calibration.sonar.model_copy(update={"image": scale})})
+    scale = SonarImage(scale="decibel", decibel_span=SONARS[options.image.sonar].decibel_span, full_scale=255)
+    sonar = sequence.calibration.sonar.model_copy(update={"image": scale})
+    return replace(sequence, detections=None, calibration=sequence.calibration.model_copy(update={"sonar": sonar}))
 
 
 def simulate_basin_frames(options: BasinOptions, frames_per_block: int = 32) -> Iterator[ImagedFrames]:
-    """The images of the very run that `simulate_basin` gives for the same options, a block at a time.
+    """Simulate the sonar images of the run that `simulate_basin` gives for the same options, a block at a time.
 
     Parameters
     ----------
     options
         Without ``image`` its defaults hold.
     frames_per_block
-        How many frames are held at once.
+        Number of frames in one block; memory grows with it.
+
+    Yields
+    ------
+    ImagedFrames
+        Frames, and the truth about each.
 
     Raises
     ------
     SimulationError
         When the duration is too short for the laps.
+
+    Examples
+    --------
+    >>> from sonar_graph.simulation import BasinOptions, simulate_basin_frames
+    >>> block = next(simulate_basin_frames(BasinOptions(duration_s=120, laps=1), frames_per_block=1))
+    >>> block.frames.intensity.shape  # frames, beams, range bins
+    (1, 96, 512)
     """
     streams = Streams.of(options.seed)
-    world = _world(options, streams.world)
-    path = _path(options, streams.path)
+    world, path = _world_and_path(options, streams)
     image = options.image or ImageOptions()
-    simulator = FrameSimulator(image, _seabed(world, image, streams.seabed), FLOOR_Z_M, options.seed)
+    simulator = FrameSimulator(image, objects_on_floor(world, image, streams.seabed), FLOOR_Z_M, options.seed)
     stamps_ns = frame_stamps(options.frame_rate_hz, path.duration_s)
     yield from image_along(path, YSHARK.sonar, stamps_ns, simulator, frames_per_block)
 
 
-def _world(options: BasinOptions, rng: np.random.Generator) -> World:
-    """The landmarks on the floor, with the identities of their designs."""
-    world = world_on_floor(LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, rng)
-    return replace(world, landmark_ids=np.array([design.id for design in designs_laid(options.image)]))
+def _world_and_path(options: BasinOptions, streams: Streams) -> tuple[World, VehiclePath]:
+    """Landmarks with the identities of their designs, and the route with the wobble of a vehicle under a joystick.
+
+    The wobble is slow wandering of a decimetre and quicker swaying of centimetres and degrees.
+    """
+    world = world_on_floor(LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, streams.world)
+    world = replace(world, landmark_ids=np.array([design.id for design in designs_laid(options.image)]))
+    rng, seconds = streams.path, np.linspace(0, options.duration_s, math.ceil(options.duration_s / KNOT_S) + 1)
+    x, y, yaw = follow((0.0, 0.0, 0.0), route(options, rng), seconds).T
+    level = np.zeros_like(seconds)
+    intended = np.column_stack([x, y, level + BODY_Z_M, level, level, yaw])
+    slow = smooth_noise(seconds, np.array([0.12, 0.12, 0.03]), 40.0, 3, rng)
+    quick = smooth_noise(seconds, np.array([0.03, 0.03, 0.02]), 5.0, 3, rng)
+    swaying = smooth_noise(seconds, np.radians([1.8, 1.8, 3.0]), 4.0, 3, rng)
+    return world, VehiclePath.through(seconds, intended + np.column_stack([slow + quick, swaying]))
 
 
 def designs_laid(image: ImageOptions | None) -> list[LandmarkDesign]:
-    """The four that lie at `LANDMARKS_XY_M`, in this order: those of the lowest identities, by identity.
+    """Designs of the landmarks at `LANDMARKS_XY_M`, in this order: the four lowest identities.
 
     Raises
     ------
     CalibrationError
-        When the file of one's own designs is none.
+        When ``image.designs`` is no file of landmark designs.
     SimulationError
         When there are fewer than four.
     """
@@ -163,17 +190,11 @@ def designs_laid(image: ImageOptions | None) -> list[LandmarkDesign]:
     return sorted(designs, key=lambda design: design.id)[: len(LANDMARKS_XY_M)]
 
 
-def _seabed(world: World, image: ImageOptions, rng: np.random.Generator) -> list[SeabedObject]:
-    """Landmarks, turned at random, and what is no landmark."""
+def objects_on_floor(world: World, image: ImageOptions, rng: np.random.Generator) -> list[SeabedObject]:
+    """Landmarks, turned at random, then stones and patches at random spots on the route."""
     yaw_rad = rng.uniform(-np.pi, np.pi, len(world.landmark_ids))
     placed = zip(designs_laid(image), world.landmark_positions, yaw_rad.tolist(), strict=True)
     landmarks = [place_landmark(design, position, yaw, FLOOR_Z_M) for design, position, yaw in placed]
-    spots = rng.permutation(_spots(rng))[: image.stones + image.decoys]
-    return landmarks + scattered_objects(spots, image.stones, rng)
-
-
-def _spots(rng: np.random.Generator) -> Floats:
-    """Places on the route where something may lie that is no landmark, shape (12, 3)."""
     spots, corner = [], np.zeros(2)
     for heading_rad in -math.pi / 2 * np.arange(SIDES):
         ahead = np.array([math.cos(heading_rad), math.sin(heading_rad)])
@@ -182,11 +203,12 @@ def _spots(rng: np.random.Generator) -> Floats:
             aside_m = rng.uniform(-OBJECTS_ASIDE_M, OBJECTS_ASIDE_M)
             spots.append([*(corner + (along_m + rng.uniform(-0.2, 0.2)) * ahead + aside_m * left), FLOOR_Z_M])
         corner = corner + SIDE_M * ahead
-    return np.array(spots)
+    chosen = rng.permutation(np.array(spots))[: image.stones + image.decoys]
+    return landmarks + scattered_objects(chosen, image.stones, rng)
 
 
-def _notes(options: BasinOptions) -> dict[str, str]:
-    """Provenance: what is the paper's, which of duration, laps and speed only where they are as published."""
+def provenance(options: BasinOptions) -> dict[str, str]:
+    """Notes on what is the paper's and what is ours; duration, laps and speed are the paper's only as published."""
     speed_m_s = cruise_speed(options)
     chosen = {
         f"{options.duration_s:g} s in all": options.duration_s == PAPER_DURATION_S,
@@ -197,24 +219,15 @@ def _notes(options: BasinOptions) -> dict[str, str]:
     ours = ["route", "hovering", "sensor models and mountings", "rates", "noise", "wobble"]
     ours += ["error rates of the recogniser"] if options.image is None else ["landmark designs", "image model"]
     ours += [*(text for text, same in chosen.items() if not same)]
-    return {
-        "from the paper": ", ".join(published),
-        "ours": ", ".join(ours),
-        **NOTES,
-        **_own_designs(options.image),
-        "speed_m_s": f"{speed_m_s:.3f}",
-    }
-
-
-def _own_designs(image: ImageOptions | None) -> dict[str, str]:
-    if image is None or image.designs is None:
-        return {}
-    laid = ", ".join(f"{design.id}: {design.name}" for design in designs_laid(image))
-    return {OWN_DESIGNS: f"{laid}, of {Path(image.designs).name}"}
+    notes = {"from the paper": ", ".join(published), "ours": ", ".join(ours), **NOTES}
+    if options.image and options.image.designs is not None:
+        laid = ", ".join(f"{design.id}: {design.name}" for design in designs_laid(options.image))
+        notes[OWN_DESIGNS] = f"{laid}, of {Path(options.image.designs).name}"
+    return {**notes, "speed_m_s": f"{speed_m_s:.3f}"}
 
 
 def cruise_speed(options: BasinOptions) -> float:
-    """Speed on the straights: the one asked for, or what the duration needs.
+    """Speed on the straights, m/s: that of the options, or a higher one where the duration needs it.
 
     Raises
     ------
@@ -232,46 +245,21 @@ def cruise_speed(options: BasinOptions) -> float:
     return max(options.speed_m_s, sides * SIDE_M / (options.duration_s - overhead_s))
 
 
-def _path(options: BasinOptions, rng: np.random.Generator) -> VehiclePath:
-    """The route with the wobble of a vehicle under a joystick."""
-    seconds = np.linspace(0, options.duration_s, math.ceil(options.duration_s / KNOT_S) + 1)
-    start, pieces = (0.0, 0.0, 0.0), _route(options, rng)
-    x, y, yaw = follow(start, pieces, seconds).T
-    level = np.zeros_like(seconds)
-    intended = np.column_stack([x, y, level + BODY_Z_M, level, level, yaw])
-    return VehiclePath.through(seconds, intended + _wobble(seconds, rng))
+def route(options: BasinOptions, rng: np.random.Generator) -> list[RouteLeg]:
+    """Legs along the square: drive into sight of a landmark, watch it, drive over it to the corner, turn right.
 
-
-def _route(options: BasinOptions, rng: np.random.Generator) -> list[RouteLeg]:
-    """Sides of the square: drive into sight of the landmark, watch, drive over it to the corner, turn right."""
-    speed = cruise_speed(options)
+    Driving and turning leave some time, which is spent watching, unequally.
+    """
+    speed, sides = cruise_speed(options), SIDES * options.laps
+    spare_s = max(0.0, options.duration_s - sides * (SIDE_M / speed + 2 * RAMP_S + TURN_S))
+    share = rng.uniform(0.8, 1.2, sides)
     stop_m = LANDMARK_ALONG_SIDE_M - WATCHING_M - YSHARK.sonar.translation_m[0]
     pose: PlanarPose = (0.0, 0.0, 0.0)
-    pieces: list[RouteLeg] = []
-    for watch_s in _watching_s(options, speed, rng).tolist():
-        pieces.append(drive(pose, stop_m, speed, RAMP_S))
-        pieces.append(hover(pieces[-1].goal, watch_s))
-        pieces.append(drive(pieces[-1].goal, SIDE_M - stop_m, speed, RAMP_S))
-        pieces.append(turn(pieces[-1].goal, -math.pi / 2, TURN_S))
-        pose = pieces[-1].goal
-    return pieces
-
-
-def _watching_s(options: BasinOptions, speed_m_s: float, rng: np.random.Generator) -> Floats:
-    """How long each landmark is watched, shape (sides,): unequal, in all what driving and turning leave."""
-    sides = SIDES * options.laps
-    spare_s = max(0.0, options.duration_s - sides * (SIDE_M / speed_m_s + 2 * RAMP_S + TURN_S))
-    share = rng.uniform(0.8, 1.2, sides)
-    return np.asarray(spare_s * share / share.sum())
-
-
-def _wobble(seconds: Floats, rng: np.random.Generator) -> Floats:
-    """What the water and the operator add to (x, y, z, roll, pitch, yaw), shape (n, 6).
-
-    Slow wandering of a decimetre and quicker swaying of centimetres and degrees.
-    """
-    roll_pitch_yaw = np.radians([1.8, 1.8, 3.0])
-    slow = smooth_noise(seconds, np.array([0.12, 0.12, 0.03]), 40.0, 3, rng)
-    quick = smooth_noise(seconds, np.array([0.03, 0.03, 0.02]), 5.0, 3, rng)
-    swaying = smooth_noise(seconds, roll_pitch_yaw, 4.0, 3, rng)
-    return np.column_stack([slow + quick, swaying])
+    legs: list[RouteLeg] = []
+    for watch_s in (spare_s * share / share.sum()).tolist():
+        legs.append(drive(pose, stop_m, speed, RAMP_S))
+        legs.append(hover(legs[-1].goal, watch_s))
+        legs.append(drive(legs[-1].goal, SIDE_M - stop_m, speed, RAMP_S))
+        legs.append(turn(legs[-1].goal, -math.pi / 2, TURN_S))
+        pose = legs[-1].goal
+    return legs

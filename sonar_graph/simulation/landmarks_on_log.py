@@ -1,10 +1,8 @@
-"""Landmarks along a recorded run, and what a sonar on that vehicle would have reported of them.
+"""Simulated landmarks along a recorded run, and the detections of a sonar on that vehicle.
 
-The vehicle, its IMU and its Doppler log are real; landmarks and detections are drawn. The log's reference trajectory is
-taken for the truth, through which a quintic spline is laid, so that detections between its poses have a place. What is
-wrong in the reference (its time, its noise) is therefore in the geometry of the detections too.
-
-Landmarks lie on either side of the track, at distances and heights drawn anew for each; the same stretch driven twice
+Vehicle, IMU and Doppler log are real; landmarks and detections are drawn. The log's reference trajectory is taken for
+the truth, with a quintic spline through it. Errors of the reference (time, noise) are therefore in the geometry of the
+detections too. Landmarks lie on either side of the track at random distances and heights; the same stretch driven twice
 sees the same ones.
 """
 
@@ -18,19 +16,18 @@ from pydantic import Field
 
 from sonar_graph.calibration import Mounting, Section, SonarCalibration
 from sonar_graph.errors import SimulationError
-from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.sequence import NS_PER_S, Sequence
 from sonar_graph.simulation.detections import FieldOfView, SimulatedRecogniser, World, simulate_detections
 from sonar_graph.simulation.sensors import EPOCH_NS, regular_stamps
 from sonar_graph.simulation.vehicle import VehiclePath, rpy_from_rotation
 
 LEAST_POSES = 6
-"""A quintic spline needs as many."""
+"""Number that a quintic spline needs."""
 KNOT_S = 0.5
 
 
 class LandmarkOptions(Section):
-    """What can be chosen about landmarks and sonar."""
+    """Options of landmarks and sonar on a recorded run."""
 
     seed: int = Field(0, ge=0)
     """Of everything random; equal options give equal bits."""
@@ -67,12 +64,12 @@ class LandmarkOptions(Section):
 
 
 def add_landmarks(recorded: Sequence, options: LandmarkOptions | None = None) -> Sequence:
-    """The run with landmarks, detections and the sonar's calibration; all else as recorded.
+    """Add landmarks, detections and the sonar's calibration to a recorded run; all else stays as recorded.
 
     Parameters
     ----------
     recorded
-        With a reference trajectory; detections and landmarks that it has are replaced.
+        Run with a reference trajectory; its detections and landmarks are replaced.
     options
         None: a landmark every 25 m, seen from up to 40 m.
 
@@ -82,28 +79,37 @@ def add_landmarks(recorded: Sequence, options: LandmarkOptions | None = None) ->
         When the log has no reference trajectory, too short a one, or ranges are the wrong way round.
     """
     options = options or LandmarkOptions()
-    _check(options)
-    first_ns, path = _path(recorded)
+    for low, high in (("range_min_m", "range_max_m"), ("side_min_m", "side_max_m")):
+        least, most = getattr(options, low), getattr(options, high)
+        if least >= most:
+            raise SimulationError(f"simulate landmarks: {low} = {least:g} must be less than {high} = {most:g}")
+    first_ns, path = reference_path(recorded)
     world_rng, sonar_rng = (np.random.default_rng(child) for child in np.random.SeedSequence(options.seed).spawn(2))
-    world = _world(path, options, world_rng)
-    calibration = recorded.calibration.model_copy(update={"sonar": _sonar(options), "floor": None})
-    detections = simulate_detections(
-        path,
-        regular_stamps(options.frame_rate_hz, path.duration_s),
-        calibration.sonar,
-        _fan(options),
-        _recogniser(options),
-        world,
-        sonar_rng,
+    world = landmarks_beside(path, options, world_rng)
+    sonar = SonarCalibration(
+        mounting=Mounting(),
+        range_sigma_m=options.range_sigma_m,
+        azimuth_sigma_rad=options.azimuth_sigma_rad,
+        elevation_aperture_rad=options.elevation_aperture_rad,
     )
+    azimuth_half_rad, elevation_half_rad = options.azimuth_aperture_rad / 2, options.elevation_aperture_rad / 2
+    fan = FieldOfView(options.range_min_m, options.range_max_m, azimuth_half_rad, elevation_half_rad)
+    recogniser = SimulatedRecogniser(
+        detection_probability=options.detection_probability,
+        wrong_id_rate=options.wrong_id_rate,
+        false_detections_per_frame=options.false_detections_per_frame,
+        confident_false_fraction=options.confident_false_fraction,
+    )
+    frames_ns = regular_stamps(options.frame_rate_hz, path.duration_s)
+    detections = simulate_detections(path, frames_ns, sonar, fan, recogniser, world, sonar_rng)
     if detections is None:
         raise SimulationError(
             f"{recorded.name}: not one landmark is seen; lower spacing_m = {options.spacing_m:g} or raise range_max_m"
         )
     return replace(
         recorded,
-        calibration=calibration,
-        detections=_restamped(detections, first_ns),
+        calibration=recorded.calibration.model_copy(update={"sonar": sonar, "floor": None}),
+        detections=replace(detections, stamps_ns=detections.stamps_ns - EPOCH_NS + first_ns),  # on the log's clock
         true_landmarks=world.landmark_map(),
         notes=recorded.notes
         | {
@@ -113,15 +119,11 @@ def add_landmarks(recorded: Sequence, options: LandmarkOptions | None = None) ->
     )
 
 
-def _check(options: LandmarkOptions) -> None:
-    for low, high in (("range_min_m", "range_max_m"), ("side_min_m", "side_max_m")):
-        least, most = getattr(options, low), getattr(options, high)
-        if least >= most:
-            raise SimulationError(f"simulate landmarks: {low} = {least:g} must be less than {high} = {most:g}")
+def reference_path(recorded: Sequence) -> tuple[int, VehiclePath]:
+    """Stamp of the path's beginning (ns), and the spline through the reference while IMU and DVL run.
 
-
-def _path(recorded: Sequence) -> tuple[int, VehiclePath]:
-    """The stamp at which the path begins, and the spline through the reference while IMU and DVL run."""
+    Its poses are thinned to one in `KNOT_S`: the noise of a quick reference is no motion.
+    """
     if recorded.truth is None or not len(recorded.truth):
         raise SimulationError(
             f"{recorded.name}: no reference trajectory, along which landmarks could lie; "
@@ -135,22 +137,17 @@ def _path(recorded: Sequence) -> tuple[int, VehiclePath]:
             f"expected {LEAST_POSES} or more"
         )
     stamps_ns = stamps_ns[inside]
-    seconds = _knots((stamps_ns - stamps_ns[0]) * 1e-9)
+    seconds, knots = (stamps_ns - stamps_ns[0]) * 1e-9, [0.0]
+    for instant in seconds[1:].tolist():
+        if instant - knots[-1] >= KNOT_S - 1e-6:
+            knots.append(instant)
+    seconds = np.array(knots) if len(knots) >= LEAST_POSES else seconds
     poses = recorded.truth.at(stamps_ns[0] + np.rint(seconds * NS_PER_S).astype(np.int64))
     angles = np.unwrap(rpy_from_rotation(poses.rotations()), axis=0)
     return int(stamps_ns[0]), VehiclePath.through(seconds, np.column_stack([poses.positions, angles]))
 
 
-def _knots(seconds: Floats) -> Floats:
-    """Times of the reference's poses, thinned where it is quick: its noise is no motion."""
-    knots = [0.0]
-    for instant in seconds[1:].tolist():
-        if instant - knots[-1] >= KNOT_S - 1e-6:
-            knots.append(instant)
-    return np.array(knots) if len(knots) >= LEAST_POSES else seconds
-
-
-def _world(path: VehiclePath, options: LandmarkOptions, rng: np.random.Generator) -> World:
+def landmarks_beside(path: VehiclePath, options: LandmarkOptions, rng: np.random.Generator) -> World:
     """Landmarks beside the track."""
     seconds = np.arange(0.0, path.duration_s, 0.1)
     motion = path.at(seconds)
@@ -163,35 +160,3 @@ def _world(path: VehiclePath, options: LandmarkOptions, rng: np.random.Generator
     height = motion.position[row, 2] + options.height_sigma_m * rng.standard_normal(len(row))
     positions = np.column_stack([motion.position[row, :2] + offset, height])
     return World(np.arange(1, len(row) + 1), positions, float(height.min()))
-
-
-def _sonar(options: LandmarkOptions) -> SonarCalibration:
-    return SonarCalibration(
-        mounting=Mounting(),
-        range_sigma_m=options.range_sigma_m,
-        azimuth_sigma_rad=options.azimuth_sigma_rad,
-        elevation_aperture_rad=options.elevation_aperture_rad,
-    )
-
-
-def _fan(options: LandmarkOptions) -> FieldOfView:
-    return FieldOfView(
-        options.range_min_m,
-        options.range_max_m,
-        options.azimuth_aperture_rad / 2,
-        options.elevation_aperture_rad / 2,
-    )
-
-
-def _recogniser(options: LandmarkOptions) -> SimulatedRecogniser:
-    return SimulatedRecogniser(
-        detection_probability=options.detection_probability,
-        wrong_id_rate=options.wrong_id_rate,
-        false_detections_per_frame=options.false_detections_per_frame,
-        confident_false_fraction=options.confident_false_fraction,
-    )
-
-
-def _restamped(detections: LandmarkDetections, first_ns: int) -> LandmarkDetections:
-    """On the log's clock instead of the simulator's."""
-    return replace(detections, stamps_ns=detections.stamps_ns - EPOCH_NS + first_ns)

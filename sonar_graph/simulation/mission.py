@@ -1,4 +1,4 @@
-"""A long mission with wide sonar views of the same landmarks: work for estimators, rather than an experiment.
+"""Long mission with wide sonar views of the same landmarks: work for estimators, rather than an experiment.
 
 The vehicle goes round a closed, three-lobed loop again and again at a constant speed, 2 m over a flat floor; its
 forward-looking sonar sees up to ten landmarks at a time.
@@ -31,14 +31,14 @@ NOTES = {"ours": "everything: a synthetic mission", "truth": "exact: a quintic s
 
 
 class MissionOptions(SimulationOptions):
-    """What can be chosen about the mission."""
+    """Options of the mission."""
 
     duration_s: float = Field(2040.0, gt=5)
     """Of the whole run."""
     speed_m_s: float = Field(0.5, gt=0, le=1.0)
     """Along the loop of about 40 m."""
     landmarks: int = Field(12, ge=1, le=500)
-    """How many lie on the floor, spread evenly over a disc of 22 m."""
+    """Number on the floor, spread evenly over a disc of 22 m."""
     frame_rate_hz: float = Field(2.0, gt=0, le=30)
     """Sonar frames a second."""
     azimuth_aperture_rad: float = Field(math.radians(130), gt=0, lt=math.pi)
@@ -50,51 +50,44 @@ class MissionOptions(SimulationOptions):
 
 
 def simulate_mission(options: MissionOptions | None = None) -> Sequence:
-    """The mission with exact truth.
+    """Simulate the mission: measurements of all sensors, calibration and exact truth.
 
     Parameters
     ----------
     options
         None: 34 minutes with 12 landmarks.
+
+    Examples
+    --------
+    >>> from sonar_graph.simulation import MissionOptions, simulate_mission
+    >>> sequence = simulate_mission(MissionOptions(duration_s=20, landmarks=5))
+    >>> len(sequence.true_landmarks), sequence.calibration.floor.z_m
+    (5, -5.0)
     """
     options = options or MissionOptions()
     streams = Streams.of(options.seed)
-    world = world_on_floor(_landmarks_xy(options.landmarks), FLOOR_Z_M, options.floor_sigma_m, streams.world)
-    path = _path(options, streams.path)
-    return record("mission", options, _vehicle(options), path, world, streams, NOTES)
-
-
-def _vehicle(options: MissionOptions) -> Vehicle:
-    """A survey vehicle with a wide sonar tilted 10° down."""
-    return Vehicle(
+    index = np.arange(options.landmarks)  # the sunflower's spiral: evenly over a disc, without rows
+    radius, angle = FIELD_RADIUS_M * np.sqrt((index + 0.5) / options.landmarks), GOLDEN_ANGLE_RAD * index
+    landmarks_xy = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+    world = world_on_floor(landmarks_xy, FLOOR_Z_M, options.floor_sigma_m, streams.world)
+    vehicle = Vehicle(
         sonar=Mounting(translation_m=(0.40, 0.0, -0.05), rpy_rad=(0.0, math.radians(10), 0.0)),
         fan=FieldOfView(0.5, options.range_max_m, options.azimuth_aperture_rad / 2, options.elevation_aperture_rad / 2),
         dvl=Mounting(translation_m=(-0.20, 0.0, -0.15)),
         depth_port_m=(0.10, 0.05, 0.10),
     )
-
-
-def _landmarks_xy(count: int) -> Floats:
-    """Evenly over a disc, without rows: the sunflower's spiral, shape (count, 2)."""
-    index = np.arange(count)
-    radius = FIELD_RADIUS_M * np.sqrt((index + 0.5) / count)
-    angle = GOLDEN_ANGLE_RAD * index
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
-
-
-def _path(options: MissionOptions, rng: np.random.Generator) -> VehiclePath:
-    """Round the loop, heading along it, with a little wobble."""
     seconds = np.linspace(0, options.duration_s, math.ceil(options.duration_s / KNOT_S) + 1)
-    xy, heading = _loop(options.speed_m_s * seconds)
+    xy, heading = loop(options.speed_m_s * seconds)
     level = np.zeros_like(seconds)
     intended = np.column_stack([xy, level + BODY_Z_M, level, level, heading])
-    position = smooth_noise(seconds, np.array([0.05, 0.05, 0.04]), 8.0, 3, rng)
-    attitude = smooth_noise(seconds, np.radians([1.8, 1.8, 2.0]), 4.0, 3, rng)
-    return VehiclePath.through(seconds, intended + np.column_stack([position, attitude]))
+    position = smooth_noise(seconds, np.array([0.05, 0.05, 0.04]), 8.0, 3, streams.path)
+    attitude = smooth_noise(seconds, np.radians([1.8, 1.8, 2.0]), 4.0, 3, streams.path)
+    path = VehiclePath.through(seconds, intended + np.column_stack([position, attitude]))
+    return record("mission", options, vehicle, path, world, streams, NOTES)
 
 
-def _loop(travelled_m: Floats) -> tuple[Floats, Floats]:
-    """Position (n, 2) and unwrapped heading (n,) after some distance on the loop r = 6 m + 1.2 m cos(3 angle)."""
+def loop(travelled_m: Floats) -> tuple[Floats, Floats]:
+    """Position (n, 2) and unwrapped heading (n,) after a distance on the loop r = 6 m + 1.2 m cos(3 angle)."""
     fine = np.linspace(0, 2 * math.pi, 20_001)
     along_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(_loop_xy(fine), axis=0).T))])
     laps, rest_m = np.divmod(travelled_m, along_m[-1])

@@ -1,8 +1,6 @@
-"""What can be chosen about any simulated run.
+"""Options of every simulated run, and presets of its sensors from data sheets.
 
-Sensors by name: data-sheet figures, and what is assumed where a sheet says nothing.
-
-The vehicle's own sensors are not published. These are what similar vehicles carry.
+The sensors of the paper's vehicle are not published; similar vehicles carry these.
 
 ==========  ==============  =====================  ==============  ====================  ==========
 IMU         gyro bias       gyro white noise       accel bias      accel white noise     rate

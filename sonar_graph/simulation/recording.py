@@ -1,4 +1,4 @@
-"""Everything that sensors record along a true path, as a `Sequence`.
+"""Recording of all sensors along a true path, as a `Sequence`.
 
 Each sensor draws from a random stream of its own, so that changing one (the sonar's frame rate, say) leaves the noise
 of all others as it was.
@@ -17,7 +17,6 @@ from sonar_graph.calibration import (
     DepthCalibration,
     DvlCalibration,
     FloorPrior,
-    ImuCalibration,
     Mounting,
     SonarCalibration,
     Start,
@@ -45,7 +44,7 @@ SONAR_OFFSET_S = 0.0371
 
 @dataclass(frozen=True)
 class Vehicle:
-    """Where the sensors sit, and what the sonar sees."""
+    """Mountings of the sensors, and the sonar's field of view."""
 
     sonar: Mounting
     fan: FieldOfView
@@ -68,7 +67,7 @@ class Streams:
 
     @classmethod
     def of(cls, seed: int) -> Streams:
-        """The streams of a seed."""
+        """Spawn the streams of a seed."""
         return cls(*(np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(8)))
 
 
@@ -81,12 +80,12 @@ def record(
     streams: Streams,
     notes: dict[str, str],
 ) -> Sequence:
-    """All measurements along a path, with the truth and the calibration that describes them truly.
+    """Simulate all measurements along a path, with the truth and the calibration that holds for them.
 
     Parameters
     ----------
     name
-        Of the sequence.
+        Name of the sequence.
     options
         Sensors and faults.
     vehicle
@@ -101,30 +100,8 @@ def record(
     Raises
     ------
     SimulationError
-        When identities are to come late without tracks, of which late is the age.
+        When options of tracks are set without ``tracks``.
     """
-    _require_tracks(name, options)
-    calibration = _calibration(options, vehicle, path, world, streams.start)
-    rates_hz = IMU_RATE_HZ, DVL_PRESETS[options.dvl].rate_hz, DEPTH_RATE_HZ, TRUTH_RATE_HZ
-    imu_ns, dvl_ns, depth_ns, truth_ns = (regular_stamps(rate, path.duration_s) for rate in rates_hz)
-    frames_ns = frame_stamps(options.frame_rate_hz, path.duration_s)
-    truth = path.at(seconds_since_start(truth_ns))
-    return Sequence(
-        name=name,
-        calibration=calibration,
-        imu=simulate_imu(path, imu_ns, calibration.imu, calibration.gravity_m_s2, streams.imu),
-        dvl=simulate_dvl(path, dvl_ns, calibration.dvl, _dvl_faults(options), streams.dvl),
-        depth=simulate_depth(path, depth_ns, calibration.depth, streams.depth),
-        detections=simulate_detections(
-            path, frames_ns, calibration.sonar, vehicle.fan, _recogniser(options), world, streams.sonar
-        ),
-        truth=Trajectory.without_covariances(truth_ns, truth.position, truth.world_R_body.as_quat()),
-        true_landmarks=world.landmark_map(),
-        notes={"generator": f"sonar_graph {__version__}, {name}", "options": options.model_dump_json(), **notes},
-    )
-
-
-def _require_tracks(name: str, options: SimulationOptions) -> None:
     if options.id_delay_s > 0 and not options.tracks:
         raise SimulationError(
             f"simulate {name}: id_delay_s = {options.id_delay_s:g} is the age of a track; set tracks = true with it"
@@ -134,21 +111,7 @@ def _require_tracks(name: str, options: SimulationOptions) -> None:
         raise SimulationError(
             f"simulate {name}: wrong_id_share = {options.wrong_id_share:g} is a share of a track; set tracks = true"
         )
-
-
-def frame_stamps(rate_hz: float, duration_s: float) -> Ints:
-    """When the sonar sends its pings."""
-    return regular_stamps(rate_hz, duration_s, SONAR_OFFSET_S)
-
-
-def _dvl_faults(options: SimulationOptions) -> DvlFaults:
-    """What goes wrong with the Doppler log."""
-    return DvlFaults(options.dvl_scale_error, options.dvl_dropouts_per_hour, options.dvl_dropout_s)
-
-
-def _recogniser(options: SimulationOptions) -> SimulatedRecogniser:
-    """How often detections are right."""
-    return SimulatedRecogniser(
+    recogniser = SimulatedRecogniser(
         detection_probability=options.detection_probability,
         wrong_id_rate=options.wrong_id_rate,
         false_detections_per_frame=options.false_detections_per_frame,
@@ -156,15 +119,49 @@ def _recogniser(options: SimulationOptions) -> SimulatedRecogniser:
         anonymous_share=options.anonymous_share,
         tracking=Tracking(options.id_delay_s, options.wrong_id_share) if options.tracks else None,
     )
+    dvl_faults = DvlFaults(options.dvl_scale_error, options.dvl_dropouts_per_hour, options.dvl_dropout_s)
+    calibration = true_calibration(options, vehicle, path, world, streams.start)
+    rates_hz = IMU_RATE_HZ, DVL_PRESETS[options.dvl].rate_hz, DEPTH_RATE_HZ, TRUTH_RATE_HZ
+    imu_ns, dvl_ns, depth_ns, truth_ns = (regular_stamps(rate, path.duration_s) for rate in rates_hz)
+    frames_ns = frame_stamps(options.frame_rate_hz, path.duration_s)
+    truth = path.at(seconds_since_start(truth_ns))
+    return Sequence(
+        name=name,
+        calibration=calibration,
+        imu=simulate_imu(path, imu_ns, calibration.imu, calibration.gravity_m_s2, streams.imu),
+        dvl=simulate_dvl(path, dvl_ns, calibration.dvl, dvl_faults, streams.dvl),
+        depth=simulate_depth(path, depth_ns, calibration.depth, streams.depth),
+        detections=simulate_detections(
+            path, frames_ns, calibration.sonar, vehicle.fan, recogniser, world, streams.sonar
+        ),
+        truth=Trajectory.without_covariances(truth_ns, truth.position, truth.world_R_body.as_quat()),
+        true_landmarks=world.landmark_map(),
+        notes={"generator": f"sonar_graph {__version__}, {name}", "options": options.model_dump_json(), **notes},
+    )
 
 
-def _calibration(
+def frame_stamps(rate_hz: float, duration_s: float) -> Ints:
+    """Stamps of the sonar's pings, shape (n,), ns."""
+    return regular_stamps(rate_hz, duration_s, SONAR_OFFSET_S)
+
+
+def true_calibration(
     options: SimulationOptions, vehicle: Vehicle, path: VehiclePath, world: World, rng: np.random.Generator
 ) -> Calibration:
-    """What estimators are told: the very noise that is simulated, and a start drawn about the true one."""
-    sigma_m_s = DVL_PRESETS[options.dvl].velocity_sigma_m_s
+    """The noise that is simulated, and a start drawn about the true one, so that its error is as large as it says."""
+    preset, sigma_m_s = IMU_PRESETS[options.imu], DVL_PRESETS[options.dvl].velocity_sigma_m_s
+    imu = preset.model_copy(
+        update={
+            "gyro_bias_sigma": preset.gyro_bias_sigma * options.gyro_bias_scale,
+            "gyro_bias_walk_density": preset.gyro_bias_walk_density * options.gyro_bias_scale,
+            "accel_bias_sigma": preset.accel_bias_sigma * options.accel_bias_scale,
+        }
+    )
+    true = path.at(np.zeros(1))
+    position = true.position[0] + options.start_position_sigma_m * rng.standard_normal(3)
+    turn = Rotation.from_rotvec(options.start_rotation_sigma_rad * rng.standard_normal(3))
     return Calibration(
-        imu=_scaled_imu(options),
+        imu=imu,
         dvl=DvlCalibration(velocity_sigma_m_s=(sigma_m_s,) * 3, mounting=vehicle.dvl),
         depth=DepthCalibration(sigma_m=0.01, port_m=vehicle.depth_port_m),
         sonar=SonarCalibration(
@@ -173,35 +170,13 @@ def _calibration(
             azimuth_sigma_rad=options.azimuth_sigma_rad,
             elevation_aperture_rad=2 * vehicle.fan.elevation_half_rad,
         ),
-        start=_drawn_start(path, options.start_position_sigma_m, options.start_rotation_sigma_rad, rng),
+        start=Start(
+            position_m=_vector(position),
+            rpy_rad=_vector(rpy_from_rotation(true.world_R_body[0] * turn)),
+            position_sigma_m=(options.start_position_sigma_m,) * 3,
+            rpy_sigma_rad=(options.start_rotation_sigma_rad,) * 3,
+        ),
         floor=FloorPrior(z_m=world.floor_z_m, sigma_m=options.floor_sigma_m),
-    )
-
-
-def _scaled_imu(options: SimulationOptions) -> ImuCalibration:
-    """The IMU preset with its biases scaled."""
-    preset = IMU_PRESETS[options.imu]
-    return preset.model_copy(
-        update={
-            "gyro_bias_sigma": preset.gyro_bias_sigma * options.gyro_bias_scale,
-            "gyro_bias_walk_density": preset.gyro_bias_walk_density * options.gyro_bias_scale,
-            "accel_bias_sigma": preset.accel_bias_sigma * options.accel_bias_scale,
-        }
-    )
-
-
-def _drawn_start(
-    path: VehiclePath, position_sigma_m: float, rotation_sigma_rad: float, rng: np.random.Generator
-) -> Start:
-    """A prior whose mean is drawn about the truth: its error is as large as it says."""
-    true = path.at(np.zeros(1))
-    position = true.position[0] + position_sigma_m * rng.standard_normal(3)
-    rotation = true.world_R_body[0] * Rotation.from_rotvec(rotation_sigma_rad * rng.standard_normal(3))
-    return Start(
-        position_m=_vector(position),
-        rpy_rad=_vector(rpy_from_rotation(rotation)),
-        position_sigma_m=(position_sigma_m,) * 3,
-        rpy_sigma_rad=(rotation_sigma_rad,) * 3,
     )
 
 

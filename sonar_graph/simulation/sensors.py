@@ -1,7 +1,7 @@
-"""What an IMU, a Doppler log and a pressure sensor report about a true motion.
+"""Readings of an IMU, a Doppler log and a pressure sensor along a true motion, with noise and faults.
 
-The Earth's rotation is left out, of the truth as of the estimators that read it (a calibration without
-``earth_rate_latitude_rad``). Samples are instantaneous values at their stamps.
+Samples are instantaneous values at their stamps. The Earth's rotation is left out, and the calibration does not ask
+estimators to remove it. docs/theory/simulation.md
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ EPOCH_NS = 1_400_000_000 * NS_PER_S
 
 @dataclass(frozen=True)
 class DvlFaults:
-    """What is wrong with a Doppler log beyond white noise; estimators are not told."""
+    """Faults of a Doppler log beyond white noise, unknown to estimators."""
 
     scale_error: float = 0.0
     """Relative: 0.007 reads 0.7 % too fast."""
     dropouts_per_hour: float = 0.0
     """Losses of bottom lock, at random times."""
     dropout_s: float = 3.0
-    """How long each lasts."""
+    """Duration of each."""
 
 
 def regular_stamps(rate_hz: float, duration_s: float, offset_s: float = 0.0) -> Ints:
@@ -87,9 +87,10 @@ def simulate_imu(
     """
     omega, force = imu_readings(path.at(seconds_since_start(stamps_ns)), calibration.mounting, gravity_m_s2)
     dt_s = float(np.diff(stamps_ns).mean()) / NS_PER_S
-    gyro_bias = calibration.gyro_bias_sigma * rng.standard_normal(3) + _walk(
-        len(stamps_ns), calibration.gyro_bias_walk_density * np.sqrt(dt_s), rng
-    )
+    first_bias = calibration.gyro_bias_sigma * rng.standard_normal(3)
+    steps = calibration.gyro_bias_walk_density * np.sqrt(dt_s) * rng.standard_normal((len(stamps_ns), 3))
+    steps[0] = 0
+    gyro_bias = first_bias + np.cumsum(steps, axis=0)
     accel_bias = calibration.accel_bias_sigma * rng.standard_normal(3)
     gyro_noise = calibration.gyro_noise_density / np.sqrt(dt_s) * rng.standard_normal(omega.shape)
     accel_noise = calibration.accel_noise_density / np.sqrt(dt_s) * rng.standard_normal(force.shape)
@@ -109,14 +110,18 @@ def simulate_dvl(
 ) -> Dvl:
     """DVL samples with white noise, a scale error, and gaps where bottom lock is lost.
 
-    The first and the last row are never lost, so that faults do not change the time that the run covers.
+    Losses begin as a Poisson process. The first and the last row are never lost, so that faults do not change the time
+    that the run covers.
     """
     seconds = seconds_since_start(stamps_ns)
     sigmas = np.array(calibration.velocity_sigma_m_s)
     exact = dvl_readings(path.at(seconds), calibration.mounting) * (1 + faults.scale_error)
     velocity = exact + sigmas * rng.standard_normal(exact.shape)
     covariance = np.broadcast_to(np.diag(sigmas**2), (len(stamps_ns), 3, 3))
-    locked = ~_in_dropout(seconds, faults, rng)
+    duration_s = float(seconds[-1])
+    begins = np.sort(rng.uniform(0, duration_s, rng.poisson(faults.dropouts_per_hour * duration_s / 3600)))
+    latest = np.concatenate([[-np.inf], begins])[np.searchsorted(begins, seconds, side="right")]
+    locked = seconds - latest >= faults.dropout_s
     locked[[0, -1]] = True
     return Dvl(stamps_ns, velocity, covariance).rows(locked)
 
@@ -129,22 +134,3 @@ def simulate_depth(
     port = motion.position + motion.world_R_body.apply(np.array(calibration.port_m))
     z_m = port[:, 2] + calibration.sigma_m * rng.standard_normal(len(stamps_ns))
     return Depth(stamps_ns, z_m, np.full(len(stamps_ns), calibration.sigma_m**2))
-
-
-def _walk(count: int, step_sigma: float, rng: np.random.Generator) -> Floats:
-    """Random walk of three axes from zero, shape (count, 3)."""
-    steps = step_sigma * rng.standard_normal((count, 3))
-    steps[0] = 0
-    return np.cumsum(steps, axis=0)
-
-
-def _in_dropout(
-    seconds: Floats, faults: DvlFaults, rng: np.random.Generator
-) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which instants fall into a loss of bottom lock; losses begin as a Poisson process."""
-    duration_s = float(seconds[-1])
-    count = rng.poisson(faults.dropouts_per_hour * duration_s / 3600)
-    begins = np.sort(rng.uniform(0, duration_s, count))
-    begun = np.searchsorted(begins, seconds, side="right")
-    latest = np.concatenate([[-np.inf], begins])[begun]
-    return np.asarray(seconds - latest < faults.dropout_s)

@@ -1,20 +1,17 @@
-"""True motion: one smooth curve through pose samples, with exact derivatives at any time.
+"""True motion of the vehicle: one quintic spline through pose samples, and the route that an operator intends.
 
-Position and attitude (x, y, z, roll, pitch, yaw) are a quintic spline of time. All that a sensor feels follows from
-its derivatives in closed form, so that the noise-free measurements of a run are exact, not integrated.
-With ``world_R_body = Rz(yaw) Ry(pitch) Rx(roll)`` the body's angular velocity is linear in the angle rates::
+All readings follow from derivatives of (x, y, z, roll, pitch, yaw) in closed form, so that noise-free measurements are
+exact, not integrated. With ``world_R_body = Rz(yaw) Ry(pitch) Rx(roll)`` the body's angular velocity is ::
 
     omega = ( roll' - yaw' sin(pitch),
               pitch' cos(roll) + yaw' sin(roll) cos(pitch),
              -pitch' sin(roll) + yaw' cos(roll) cos(pitch) )
 
-and its angular acceleration is the time derivative of that (Diebel, "Representing Attitude", 2006, section 5.6).
+and its angular acceleration the time derivative of that (Diebel, "Representing Attitude", 2006, section 5.6).
 
-What the operator intends: straight drives, turns on the spot and hovers, each from rest to rest.
-
-Speed rises over ``ramp_s`` by a cubic smoothstep, stays, and falls again, so that position is twice continuously
-differentiable. With ``A(t)`` the distance covered since a start at unit final speed, progress along a piece of
-duration T is ``(A(t) - A(t - (T - ramp))) / (T - ramp)``; the greatest acceleration is 1.5 times speed / ramp.
+A route is a list of straight drives, turns on the spot and hovers, each from rest to rest. Speed rises over ``ramp_s``
+by a cubic smoothstep, stays, and falls again. With ``A(t)`` the distance since a start at unit final speed, progress
+along a leg of duration T is ``(A(t) - A(t - (T - ramp))) / (T - ramp)``. docs/theory/simulation.md
 """
 
 from __future__ import annotations
@@ -65,7 +62,7 @@ class VehiclePath:
     def at(self, seconds: Floats) -> Kinematics:
         """Motion at any instants from 0 to ``duration_s``, shape (n,), seconds since the start."""
         pose, rate, change = (self.spline(seconds, nu=order) for order in range(3))
-        angular_velocity, angular_acceleration = _angular_motion(pose[:, 3:], rate[:, 3:], change[:, 3:])
+        angular_velocity, angular_acceleration = angular_motion(pose[:, 3:], rate[:, 3:], change[:, 3:])
         return Kinematics(
             position=pose[:, :3],
             velocity=rate[:, :3],
@@ -116,7 +113,7 @@ def smooth_noise(
     return wandering
 
 
-def _angular_motion(rpy: Floats, rate: Floats, change: Floats) -> tuple[Floats, Floats]:
+def angular_motion(rpy: Floats, rate: Floats, change: Floats) -> tuple[Floats, Floats]:
     """Angular velocity and acceleration in the body frame from angles and their two time derivatives."""
     (sin_r, sin_p, _), (cos_r, cos_p, _) = np.sin(rpy).T, np.cos(rpy).T
     (roll, pitch, yaw), (roll2, pitch2, yaw2) = rate.T, change.T
@@ -144,7 +141,7 @@ PlanarPose = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class RouteLeg:
-    """One rest-to-rest motion to a goal."""
+    """Motion to a goal, from rest to rest."""
 
     duration_s: float
     ramp_s: float
@@ -153,17 +150,17 @@ class RouteLeg:
     """x, y (m) and unwrapped yaw (rad) at its end."""
 
 
-def follow(start: PlanarPose, pieces: list[RouteLeg], seconds: Floats) -> Floats:
+def follow(start: PlanarPose, legs: list[RouteLeg], seconds: Floats) -> Floats:
     """The intended pose at some instants.
 
     Parameters
     ----------
     start
-        Where the first piece begins.
-    pieces
+        Pose before the first leg.
+    legs
         Motions one after the other.
     seconds
-        Instants since the start, shape (n,); after the last piece its goal holds.
+        Instants since the start, shape (n,); after the last leg its goal holds.
 
     Returns
     -------
@@ -172,39 +169,34 @@ def follow(start: PlanarPose, pieces: list[RouteLeg], seconds: Floats) -> Floats
     """
     pose = np.tile(np.array(start), (len(seconds), 1))
     begin_s = 0.0
-    for (from_, to), piece in zip(pairwise([start, *(p.goal for p in pieces)]), pieces, strict=True):
+    for (from_, to), leg in zip(pairwise([start, *(leg.goal for leg in legs)]), legs, strict=True):
         first = np.searchsorted(seconds, begin_s)
-        progress = _progress(seconds[first:] - begin_s, piece)
+        elapsed_s, full_speed_s = seconds[first:] - begin_s, leg.duration_s - leg.ramp_s
+        progress = np.ones_like(elapsed_s)
+        if full_speed_s > 0:
+            covered = _distance(elapsed_s, leg.ramp_s) - _distance(elapsed_s - full_speed_s, leg.ramp_s)
+            progress = covered / full_speed_s
         pose[first:] += progress[:, None] * np.subtract(to, from_)
-        begin_s += piece.duration_s
+        begin_s += leg.duration_s
     return pose
 
 
 def drive(start: PlanarPose, length_m: float, speed_m_s: float, ramp_s: float) -> RouteLeg:
-    """Straight ahead over a length."""
+    """Leg straight ahead over a length."""
     x, y, yaw = start
     goal = (x + length_m * float(np.cos(yaw)), y + length_m * float(np.sin(yaw)), yaw)
     return RouteLeg(length_m / speed_m_s + ramp_s, ramp_s, goal)
 
 
 def turn(start: PlanarPose, angle_rad: float, duration_s: float) -> RouteLeg:
-    """On the spot, positive to the left."""
+    """Turn on the spot, positive to the left."""
     x, y, yaw = start
     return RouteLeg(duration_s, duration_s / 2, (x, y, yaw + angle_rad))
 
 
 def hover(start: PlanarPose, duration_s: float) -> RouteLeg:
-    """Stay where it is."""
+    """Stay at a pose."""
     return RouteLeg(duration_s, duration_s / 2, start)
-
-
-def _progress(seconds: Floats, piece: RouteLeg) -> Floats:
-    """Share of a piece that is done after some seconds of it, from 0 to 1."""
-    full_speed_s = piece.duration_s - piece.ramp_s
-    if full_speed_s <= 0:
-        return np.ones_like(seconds)
-    covered = _distance(seconds, piece.ramp_s) - _distance(seconds - full_speed_s, piece.ramp_s)
-    return covered / full_speed_s
 
 
 def _distance(seconds: Floats, ramp_s: float) -> Floats:

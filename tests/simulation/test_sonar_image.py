@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import SonarImage
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.simulation.sonar_image.frames import SONARS, FrameSimulator, drawn_gain_error_db
-from sonar_graph.simulation.sonar_image.imaging_sonar import ImageOptions, ImagingSonar
+from sonar_graph.simulation.sonar_image.frames import FrameSimulator, drawn_gain_error_db
+from sonar_graph.simulation.sonar_image.imaging_sonar import SONARS, ImageOptions, ImagingSonar
 from sonar_graph.simulation.sonar_image.scene import SeabedObject, block, place, place_landmark
 
 HEIGHT_M = 0.95

@@ -1,12 +1,12 @@
-"""The coherent sum of all echoes from the floor and what lies on it.
+"""Coherent sum of all echoes from the floor and the objects on it.
 
 A scatterer with complex amplitude a, at distance r in direction (azimuth, elevation e), seen under the angle i from its
 facet's normal N = (-dz/dx, -dz/dy, 1), adds to the column of its azimuth at range bin b::
 
     a gain (u · N) / sqrt(|N|) pattern(e) pulse(r_b - r) exp(4 pi j r / wavelength)
 
-with u the unit vector to the sonar: the intensity of Lambert's rule, cos² i times the facet's area |N|. What depends
-on range alone, and the beams' pattern in azimuth, is applied to the sum.
+with u the unit vector to the sonar: the intensity of Lambert's rule, cos² i times the facet's area |N|. The module
+`frames` applies the beams' pattern in azimuth and the factors of range alone to the sum. docs/theory/sonar_image.md
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import compiled
@@ -30,12 +29,12 @@ STEEP = 0.25
 
 
 class Tables(NamedTuple):
-    """What does not change from frame to frame."""
+    """Constants of a sonar, and functions as tables."""
 
     cell_m: float
     """Of the scatterers' grid."""
     columns_per_rad: float
-    """Columns of azimuth; see `columns`."""
+    """Resolution of the columns of azimuth."""
     columns: int
     """Centred on azimuth 0."""
     range_start_m: float
@@ -54,7 +53,7 @@ class Tables(NamedTuple):
 
 
 class SonarPlacement(NamedTuple):
-    """Where the sonar is and which cells it can see."""
+    """Pose of the sonar, and the cells that it can see."""
 
     position_m: Floats
     """In the world, shape (3,)."""
@@ -71,7 +70,7 @@ class SonarPlacement(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """What lies in view, cell by cell; arrays without a row where there is only floor."""
+    """Objects in view, cell by cell; arrays without a row where there is only floor."""
 
     first_column: int
     amplitude: Floats32
@@ -80,7 +79,7 @@ class Surface(NamedTuple):
 
 
 class Horizon(NamedTuple):
-    """Highest line of sight that something blocks, over bearing and horizontal distance."""
+    """Highest blocked line of sight over bearing and horizontal distance."""
 
     tangent: Floats32
     """Rise over run of the highest blocked ray, shape (bearings, distances); without a row: no shadows."""
@@ -92,7 +91,7 @@ class Horizon(NamedTuple):
 
 @compiled
 def block_rays(view: SonarPlacement, surface: Surface, horizon: Horizon, raised_m: float, cell_m: float) -> None:
-    """Fill the horizon: what lies behind something raised is blocked below the ray over its top."""
+    """Fill the horizon: everything behind a raised cell is blocked below the ray over its top."""
     bearings, distances = horizon.tangent.shape
     for row in range(surface.relief_m.shape[0]):
         y = (view.first_row + row + 0.5) * cell_m - view.position_m[1]
@@ -137,7 +136,7 @@ def add_echo(
 
 @compiled
 def is_blocked(view: SonarPlacement, horizon: Horizon, x: float, y: float, z: float) -> bool:
-    """Whether something nearer hides a point from the sonar."""
+    """True where something nearer hides a point from the sonar."""
     bearings, distances = horizon.tangent.shape
     ahead = view.heading[0] * x + view.heading[1] * y
     aside = view.heading[0] * y - view.heading[1] * x
@@ -151,7 +150,7 @@ def is_blocked(view: SonarPlacement, horizon: Horizon, x: float, y: float, z: fl
 
 @compiled
 def slopes(relief_m: Floats32, row: int, column: int, cell_m: float) -> tuple[float, float]:
-    """Rise per metre along x and y; 0 at the border of what is in view."""
+    """Rise per metre along x and y; 0 at the border of the view."""
     rows, columns = relief_m.shape
     if not (0 < row < rows - 1 and 0 < column < columns - 1):
         return 0.0, 0.0
@@ -255,24 +254,11 @@ def through_beams(beam_matrix: Floats32, bands: Ints, echoes: Floats32, seen: Fl
 
 
 def no_surface() -> Surface:
-    """Nothing but floor."""
+    """Surface without objects."""
     none = np.empty((0, 0), np.float32)
     return Surface(0, none, none)
 
 
 def no_horizon() -> Horizon:
-    """Nothing that hides anything."""
+    """Horizon without shadows."""
     return Horizon(np.empty((0, 0), np.float32), 1.0, 1.0)
-
-
-def phasors() -> Floats32:
-    """One turn in PHASE_STEPS steps."""
-    angle = 2 * np.pi * (np.arange(PHASE_STEPS) + 0.5) / PHASE_STEPS
-    return np.column_stack([np.cos(angle), np.sin(angle)]).astype(np.float32)
-
-
-def pulses(sigma_bins: float) -> Floats32:
-    """A Gaussian pulse at TAPS bins around each position within a bin."""
-    within = (np.arange(PULSE_STEPS) + 0.5) / PULSE_STEPS
-    offset: NDArray[np.float64] = np.arange(TAPS) + 1 - 0.5 * TAPS - within[:, None]
-    return np.exp(-((offset / sigma_bins) ** 2) / 2).astype(np.float32)

@@ -1,23 +1,20 @@
-"""Frames of an imaging sonar over a floor with objects on it.
+"""Frames of an imaging sonar over a floor with objects, and the truth about each along a path.
 
 One frame is the coherent sum of echoes from scatterers that stay in the world, seen through the beams' pattern, with
 receiver noise, time-varied gain and a logarithmic 8-bit scale::
 
-    Y[b, r]  = sum over scatterers (echoes.py), through the two-way pattern of beam b and cross-talk, times
+    Y[b, r]  = sum over scatterers (`echoes`), through the two-way pattern of beam b and cross-talk, times
                (2 m / r)² 10^(-2 alpha (r - 2 m) / 20)
-    dB[b, r] = 10 log10 |Y + noise|² + 30 log10 (r / 2 m) + 2 alpha (r - 2 m) + what the gain gets wrong
+    dB[b, r] = 10 log10 |Y + noise|² + 30 log10 (r / 2 m) + 2 alpha (r - 2 m) + error of the gain
     sample   = round(255 dB / 80), from 0 to 255
 
-Documentation: docs/theory/sonar_image.md.
-
-Images along a true path, with what is where in each of them.
+docs/theory/sonar_image.md
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,15 +26,17 @@ from sonar_graph.sequence import NS_PER_S
 from sonar_graph.simulation.detections import FieldOfView, inside, range_azimuth_elevation
 from sonar_graph.simulation.sensors import body_R_sensor, seconds_since_start
 from sonar_graph.simulation.sonar_image import echoes
-from sonar_graph.simulation.sonar_image.echoes import ELEVATION_STEPS, TAPS, Horizon, SonarPlacement, Surface, Tables
-from sonar_graph.simulation.sonar_image.imaging_sonar import (
-    ARIS_3000,
-    DIDSON,
-    OCULUS_M1200D,
-    ImageOptions,
-    ImagingSonar,
-    SonarName,
+from sonar_graph.simulation.sonar_image.echoes import (
+    ELEVATION_STEPS,
+    PHASE_STEPS,
+    PULSE_STEPS,
+    TAPS,
+    Horizon,
+    SonarPlacement,
+    Surface,
+    Tables,
 )
+from sonar_graph.simulation.sonar_image.imaging_sonar import SONARS, ImageOptions, ImagingSonar
 from sonar_graph.simulation.sonar_image.scene import (
     CELL_M,
     CELLS,
@@ -51,7 +50,6 @@ from sonar_graph.simulation.sonar_image.scene import (
 )
 from sonar_graph.simulation.vehicle import VehiclePath
 
-SONARS: dict[SonarName, ImagingSonar] = {"didson": DIDSON, "aris3000": ARIS_3000, "oculus1200": OCULUS_M1200D}
 REFERENCE_M = 2.0
 REFERENCE_GRAZING = 0.475
 """Sine of the grazing angle at 2 m from 0.95 m above the floor, where `ImageOptions.floor_db` holds."""
@@ -59,27 +57,27 @@ GAIN_SLOPE_DB = 30.0
 """Decibels of gain for ten times the range, beside absorption."""
 COLUMNS_PER_BEAM = 5
 HALF_LIFT_RAD = np.radians(15)
-"""Elevations beyond are left out: two-way, they are 50 dB down."""
+"""Larger elevations are left out: two-way, they are 50 dB down."""
 LEAST_AMPLITUDE = 3e-4
-"""Where a beam's pattern stays below, 70 dB down, it is taken for zero."""
+"""A beam's pattern below this, 70 dB down, is taken for zero."""
 RAISED_M = 0.003
-"""What stands higher casts a shadow."""
+"""Higher cells cast a shadow."""
 BEARINGS, DISTANCE_STEP_M = 256, 0.006
 
 
 class FrameSimulator:
-    """Makes frames of one basin floor; each depends only on where the sonar is and on the frame's number.
+    """Simulator of frames over one floor; each depends only on the sonar's pose and on the frame's number.
 
     Parameters
     ----------
     options
         Effects and their values.
     objects
-        What lies on the floor.
+        Objects on the floor.
     floor_z_m
-        Its height.
+        Height of the floor in the world.
     seed
-        Of the floor, gain error, noise and drop-outs.
+        Seed of the floor, gain error, noise and drop-outs.
     sonar
         None: the one that the options name.
     """
@@ -97,32 +95,57 @@ class FrameSimulator:
         self.objects = list(objects)
         self._floor_z_m = floor_z_m
         self._seed = seed
-        floor_rng = np.random.default_rng([seed, 0])
-        self._floor = scatterers(options.texture_shape, options.joints, floor_rng)
+        sonar = self.sonar
+        self._floor = scatterers(options.texture_shape, options.joints, np.random.default_rng([seed, 0]))
+        pulse_sigma_m = sonar.range_resolution_m / (2 * np.sqrt(np.log(2)))  # the Gaussian's square is as wide at half
+        self._column_rad = column_rad = sonar.beam_width_rad / COLUMNS_PER_BEAM
+        self._tables = tables_of(sonar, column_rad, pulse_sigma_m)
+
+        ranges_m = sonar.ranges_m()
+        absorbed_db = 2 * options.absorption_db_m * (ranges_m - REFERENCE_M)
+        gain_db = GAIN_SLOPE_DB * np.log10(ranges_m / REFERENCE_M) + absorbed_db
+        gain_db = gain_db + drawn_gain_error_db(options.tvg_error_db, len(ranges_m), seed)
+        self._gain_db: Floats32 = gain_db.astype(np.float32)
+        # mean square of the sum over a floor of unit strength at the reference: cells in a resolution cell
+        across_m = REFERENCE_M * (2 / 3) * sonar.wavelength_m / sonar.aperture_m
+        along_m = pulse_sigma_m * np.sqrt(np.pi) / np.sqrt(1 - REFERENCE_GRAZING**2)
+        reference_intensity = float(across_m * along_m / CELL_M**2 * REFERENCE_GRAZING**2)
+        strength = 10 ** (options.floor_db / 20) / np.sqrt(reference_intensity)
+        spreading = strength * (REFERENCE_M / ranges_m) ** 2 * 10 ** (-absorbed_db / 20)
+        self._spreading: Floats32 = spreading.astype(np.float32)
+
+        columns = self._tables.columns
+        middles = (np.arange(columns) + 0.5 - 0.5 * columns) * column_rad
+        offset = middles[None, :] - sonar.azimuths_rad()[:, None]
+        pattern = sonar.two_way_pattern(offset, options.side_lobes)
+        matters = pattern > LEAST_AMPLITUDE
+        first, last = matters.argmax(axis=1), columns - matters[:, ::-1].argmax(axis=1)
+        self._bands = np.column_stack([first // 4 * 4, -(-last // 4) * 4])
+        self._beam_matrix: Floats32 = pattern.astype(np.float32)
 
     def azimuths_rad(self) -> Floats:
-        """What a log says about the beams: where they point, or equally spaced."""
+        """Azimuths of the beams as a log states them: true ones, or equally spaced, shape (beams,)."""
         return self.sonar.azimuths_rad() if self.options.measured_lens else self.sonar.linear_azimuths_rad()
 
     def ranges_m(self) -> Floats:
-        """What a log says about the middles of the bins: true ones scaled by the error of the sound speed."""
+        """Middles of the bins as a log states them: true ones scaled by the error of the sound speed, shape (bins,)."""
         return self.sonar.ranges_m() * (1 + self.options.sound_speed_error)
 
     def is_dropped(self, number: int) -> bool:
-        """Whether a frame is never recorded."""
+        """True for a frame that is never recorded."""
         return bool(self._rng(number, 1).random() < self.options.drop_probability)
 
     def frame(
         self, position_m: Floats, world_R_sonar: Rotation, number: int, surface_z_m: float | None = None
     ) -> NDArray[np.uint8]:
-        """The recorded image, shape (beams, bins).
+        """Recorded image, shape (beams, bins).
 
         Parameters
         ----------
         position_m, world_R_sonar
             The sonar in the world: x along its axis, y to its left.
         number
-            Of the frame: draws its noise.
+            Number of the frame, the seed of its noise.
         surface_z_m
             Height of the water's surface; None: too far away to matter.
         """
@@ -133,9 +156,18 @@ class FrameSimulator:
         self, position_m: Floats, world_R_sonar: Rotation, number: int, surface_z_m: float | None = None
     ) -> Floats32:
         """Level of each sample before it is rounded and clipped, shape (beams, bins)."""
-        signal = self._through_beams(self._echoes(np.asarray(position_m, float), world_R_sonar, number))
+        position_m = np.asarray(position_m, float)
+        total = self.scattered(position_m, world_R_sonar, number)
+        columns, bins, _ = total.shape
+        seen = np.zeros((self.sonar.beams, bins * 2), np.float32)
+        by_column = np.ascontiguousarray(total).reshape(columns, -1)
+        echoes.through_beams(self._beam_matrix, self._bands, by_column, seen)
+        if self.options.cross_talk_db is not None:
+            seen = with_cross_talk(seen, self.sonar, self.options.cross_talk_db)
+        signal = seen.reshape(-1, bins, 2) * self._spreading[:, None]
         if self.options.multipath and surface_z_m is not None:
-            signal = self._with_surface_path(signal, position_m[2] - self._floor_z_m, surface_z_m - position_m[2])
+            heights_m = position_m[2] - self._floor_z_m, surface_z_m - position_m[2]
+            signal = with_surface_path(signal, self.sonar, *heights_m, self.options.surface_path_db)
         if self.options.noise_db is not None:
             sigma = np.float32(10 ** (self.options.noise_db / 20) * np.sqrt(0.5))
             signal = signal + sigma * self._rng(number, 0).standard_normal(signal.shape, np.float32)
@@ -143,9 +175,10 @@ class FrameSimulator:
         return 10 * np.log10(np.maximum(intensity, np.float32(1e-12))) + self._gain_db
 
     def _rng(self, number: int, purpose: int) -> np.random.Generator:
+        """Random generator of a frame for one purpose."""
         return np.random.default_rng([self._seed, 2, number, purpose])
 
-    def _echoes(self, position_m: Floats, world_R_sonar: Rotation, number: int) -> Floats32:
+    def scattered(self, position_m: Floats, world_R_sonar: Rotation, number: int) -> Floats32:
         """Sum of the scatterers by column of azimuth, shape (columns, bins, 2)."""
         tables = self._tables
         total = np.zeros((tables.columns, tables.bins + 2 * TAPS, 2), np.float32)
@@ -154,7 +187,8 @@ class FrameSimulator:
         half_azimuth_rad = 0.5 * tables.columns * self._column_rad
         sector = lit_sector(world_R_sonar, height_m, window, half_azimuth_rad, HALF_LIFT_RAD)
         if sector is not None:
-            cells = cells_of(sector, position_m)
+            cells, is_fixed = cells_of(sector, position_m), self.options.speckle == "world"
+            shift = np.zeros(2, np.int64) if is_fixed else self._rng(number, 2).integers(0, CELLS, 2)
             view = SonarPlacement(
                 position_m,
                 np.ascontiguousarray(world_R_sonar.inv().as_matrix()),
@@ -162,149 +196,89 @@ class FrameSimulator:
                 self._floor_z_m,
                 cells.first_row,
                 cells.spans,
-                self._shift(number),
+                shift,
             )
-            surface, horizon = self._surroundings(view, cells, sector.half_bearing_rad, sector.farthest_m)
+            surface, horizon = echoes.no_surface(), echoes.no_horizon()
+            near = within(self.objects, position_m, sector.farthest_m / np.cos(sector.half_bearing_rad / 2))
+            laid = laid_out(near, cells)
+            if laid.relief_m.any() or not np.isnan(laid.amplitude).all():
+                surface = laid
+                if self.options.shadows:
+                    steps = int(np.ceil(sector.farthest_m * 1.1 / DISTANCE_STEP_M)) + 1
+                    blocked = np.full((BEARINGS, steps), -np.inf, np.float32)
+                    horizon = Horizon(blocked, float(np.tan(sector.half_bearing_rad + 0.02)), DISTANCE_STEP_M)
+                    echoes.block_rays(view, surface, horizon, RAISED_M, CELL_M)
             reflection = self.options.floor_reflection if self.options.multipath else 0.0
             floor = self._floor
             echoes.sum_echoes(view, floor.points, floor.texture, surface, horizon, tables, reflection, total)
         return total[:, TAPS:-TAPS]
 
-    def _shift(self, number: int) -> NDArray[np.int64]:
-        if self.options.speckle == "world":
-            return np.zeros(2, np.int64)
-        return self._rng(number, 2).integers(0, CELLS, 2)
 
-    def _surroundings(
-        self, view: SonarPlacement, cells: Cells, half_bearing_rad: float, farthest_m: float
-    ) -> tuple[Surface, Horizon]:
-        """Objects near the sonar as cells, and what they hide."""
-        near = within(self.objects, view.position_m, farthest_m / np.cos(half_bearing_rad / 2))
-        if not near:
-            return echoes.no_surface(), echoes.no_horizon()
-        surface = _laid_out(near, cells)
-        if not surface.relief_m.any() and np.isnan(surface.amplitude).all():
-            return echoes.no_surface(), echoes.no_horizon()
-        if not self.options.shadows:
-            return surface, echoes.no_horizon()
-        steps = int(np.ceil(farthest_m * 1.1 / DISTANCE_STEP_M)) + 1
-        blocked = np.full((BEARINGS, steps), -np.inf, np.float32)
-        horizon = Horizon(blocked, float(np.tan(half_bearing_rad + 0.02)), DISTANCE_STEP_M)
-        echoes.block_rays(view, surface, horizon, RAISED_M, CELL_M)
-        return surface, horizon
+def with_cross_talk(seen: Floats32, sonar: ImagingSonar, level_db: float) -> Floats32:
+    """Add to each beam a share of all others that are fired together with it."""
+    groups = sonar.firing_groups
+    others = sonar.beams // groups - 1
+    if groups == 1 or others < 1:
+        return seen
+    leak = float(10 ** (level_db / 20) / np.sqrt(others))
+    number = np.arange(sonar.beams) % groups
+    together = np.stack([seen[number == group].sum(axis=0) for group in range(groups)])
+    return ((1 - leak) * seen + leak * together[number]).astype(np.float32, copy=False)
 
-    def _through_beams(self, total: Floats32) -> Floats32:
-        """Beams' patterns and what depends on range alone, shape (beams, bins, 2)."""
-        columns, bins, _ = total.shape
-        seen = np.zeros((self.sonar.beams, bins * 2), np.float32)
-        matrix, bands = self._beam_matrix
-        echoes.through_beams(matrix, bands, np.ascontiguousarray(total).reshape(columns, -1), seen)
-        return self._with_cross_talk(seen).reshape(-1, bins, 2) * self._spreading[:, None]
 
-    def _with_cross_talk(self, seen: Floats32) -> Floats32:
-        """Adds to each beam a share of all others that are fired together with it."""
-        groups = self.sonar.firing_groups
-        others = self.sonar.beams // groups - 1
-        if self.options.cross_talk_db is None or groups == 1 or others < 1:
-            return seen
-        leak = float(10 ** (self.options.cross_talk_db / 20) / np.sqrt(others))
-        number = np.arange(self.sonar.beams) % groups
-        together = np.stack([seen[number == group].sum(axis=0) for group in range(groups)])
-        return ((1 - leak) * seen + leak * together[number]).astype(np.float32, copy=False)
+def with_surface_path(
+    signal: Floats32, sonar: ImagingSonar, height_m: float, depth_m: float, level_db: float
+) -> Floats32:
+    """Add echoes that went one way by the surface and arrive later than the direct ones."""
+    ranges_m = sonar.ranges_m()
+    run2 = np.maximum(ranges_m**2 - height_m**2, 0.0)
+    late_m = 0.5 * (ranges_m + np.sqrt(run2 + (height_m + 2 * depth_m) ** 2))
+    source = np.rint(np.interp(ranges_m, late_m, np.arange(len(ranges_m)), left=-1)).astype(int)
+    arrives = source >= 0
+    of = source[arrives]
+    turn = 2 * np.pi * (2 / sonar.wavelength_m) * (late_m - ranges_m)[of]
+    level = 10 ** (level_db / 20) * (ranges_m / late_m)[of] ** 2
+    cos, sin = (level * np.cos(turn)).astype(np.float32), (level * np.sin(turn)).astype(np.float32)
+    real, imaginary = signal[:, of, 0], signal[:, of, 1]
+    result = signal.copy()
+    result[:, arrives, 0] += real * cos - imaginary * sin
+    result[:, arrives, 1] += real * sin + imaginary * cos
+    return result
 
-    def _with_surface_path(self, signal: Floats32, height_m: float, depth_m: float) -> Floats32:
-        """Adds what went one way by the surface: echoes of the floor that arrive later than their own."""
-        ranges_m = self.sonar.ranges_m()
-        run2 = np.maximum(ranges_m**2 - height_m**2, 0.0)
-        late_m = 0.5 * (ranges_m + np.sqrt(run2 + (height_m + 2 * depth_m) ** 2))
-        source = np.rint(np.interp(ranges_m, late_m, np.arange(len(ranges_m)), left=-1)).astype(int)
-        arrives = source >= 0
-        of = source[arrives]
-        turn = 2 * np.pi * self._tables.waves_per_m * (late_m - ranges_m)[of]
-        level = 10 ** (self.options.surface_path_db / 20) * (ranges_m / late_m)[of] ** 2
-        cos, sin = (level * np.cos(turn)).astype(np.float32), (level * np.sin(turn)).astype(np.float32)
-        real, imaginary = signal[:, of, 0], signal[:, of, 1]
-        result = signal.copy()
-        result[:, arrives, 0] += real * cos - imaginary * sin
-        result[:, arrives, 1] += real * sin + imaginary * cos
-        return result
 
-    @cached_property
-    def _gain_db(self) -> Floats32:
-        ranges_m = self.sonar.ranges_m()
-        exact = GAIN_SLOPE_DB * np.log10(ranges_m / REFERENCE_M)
-        absorbed = 2 * self.options.absorption_db_m * (ranges_m - REFERENCE_M)
-        return (exact + absorbed + drawn_gain_error_db(self.options.tvg_error_db, len(ranges_m), self._seed)).astype(
-            np.float32
-        )
-
-    @cached_property
-    def _spreading(self) -> Floats32:
-        """Amplitude over range, with the floor's strength: shape (bins,)."""
-        ranges_m = self.sonar.ranges_m()
-        absorbed_db = 2 * self.options.absorption_db_m * (ranges_m - REFERENCE_M)
-        strength = 10 ** (self.options.floor_db / 20) / np.sqrt(self._reference_intensity())
-        return (strength * (REFERENCE_M / ranges_m) ** 2 * 10 ** (-absorbed_db / 20)).astype(np.float32)
-
-    def _reference_intensity(self) -> float:
-        """Mean square of the sum over a floor of unit strength at the reference: cells in a resolution cell."""
-        across_m = REFERENCE_M * (2 / 3) * self.sonar.wavelength_m / self.sonar.aperture_m
-        along_m = self._pulse_sigma_m * np.sqrt(np.pi) / np.sqrt(1 - REFERENCE_GRAZING**2)
-        return float(across_m * along_m / CELL_M**2 * REFERENCE_GRAZING**2)
-
-    @property
-    def _pulse_sigma_m(self) -> float:
-        """Of the Gaussian amplitude whose square has the resolution as its width at half."""
-        return self.sonar.range_resolution_m / (2 * np.sqrt(np.log(2)))
-
-    @property
-    def _column_rad(self) -> float:
-        return self.sonar.beam_width_rad / COLUMNS_PER_BEAM
-
-    @cached_property
-    def _tables(self) -> Tables:
-        sonar = self.sonar
-        bin_m = sonar.range_length_m / sonar.bins
-        half_rad = np.abs(sonar.azimuths_rad()).max() + 4 * sonar.beam_width_rad
-        column_rad = self._column_rad
-        lift = (np.arange(ELEVATION_STEPS) + 0.5) / ELEVATION_STEPS - 0.5
-        return Tables(
-            cell_m=CELL_M,
-            columns_per_rad=1 / column_rad,
-            columns=4 * int(np.ceil(half_rad / column_rad / 2)),
-            range_start_m=sonar.range_start_m,
-            bin_m=bin_m,
-            bins_per_m=1 / bin_m,
-            bins=sonar.bins,
-            waves_per_m=2 / sonar.wavelength_m,
-            phasor=echoes.phasors(),
-            pulse=echoes.pulses(self._pulse_sigma_m / bin_m),
-            elevation=sonar.elevation_pattern(np.arcsin(lift)).astype(np.float32),
-        )
-
-    @cached_property
-    def _beam_matrix(self) -> tuple[Floats32, NDArray[np.int64]]:
-        """Amplitude of each column in each beam, shape (beams, columns), and the columns that matter to it."""
-        columns = self._tables.columns
-        middles = (np.arange(columns) + 0.5 - 0.5 * columns) * self._column_rad
-        offset = middles[None, :] - self.sonar.azimuths_rad()[:, None]
-        pattern = self.sonar.two_way_pattern(offset, self.options.side_lobes)
-        matters = pattern > LEAST_AMPLITUDE
-        first, last = matters.argmax(axis=1), columns - matters[:, ::-1].argmax(axis=1)
-        bands = np.column_stack([first // 4 * 4, -(-last // 4) * 4])
-        return pattern.astype(np.float32), bands
+def tables_of(sonar: ImagingSonar, column_rad: float, pulse_sigma_m: float) -> Tables:
+    """Tables of a sonar for columns of some width and a Gaussian pulse."""
+    bin_m = sonar.range_length_m / sonar.bins
+    half_rad = np.abs(sonar.azimuths_rad()).max() + 4 * sonar.beam_width_rad
+    angle = 2 * np.pi * (np.arange(PHASE_STEPS) + 0.5) / PHASE_STEPS
+    place = (np.arange(PULSE_STEPS) + 0.5) / PULSE_STEPS
+    offset = np.arange(TAPS) + 1 - 0.5 * TAPS - place[:, None]
+    lift = (np.arange(ELEVATION_STEPS) + 0.5) / ELEVATION_STEPS - 0.5
+    return Tables(
+        cell_m=CELL_M,
+        columns_per_rad=1 / column_rad,
+        columns=4 * int(np.ceil(half_rad / column_rad / 2)),
+        range_start_m=sonar.range_start_m,
+        bin_m=bin_m,
+        bins_per_m=1 / bin_m,
+        bins=sonar.bins,
+        waves_per_m=2 / sonar.wavelength_m,
+        phasor=np.column_stack([np.cos(angle), np.sin(angle)]).astype(np.float32),
+        pulse=np.exp(-((offset / (pulse_sigma_m / bin_m)) ** 2) / 2).astype(np.float32),
+        elevation=sonar.elevation_pattern(np.arcsin(lift)).astype(np.float32),
+    )
 
 
 def drawn_gain_error_db(sigma_db: float, bins: int, seed: int) -> Floats:
-    """What time-varied gain leaves: a tilt over the window and a slow wave of a third of it, shape (bins,)."""
+    """Error of the time-varied gain: a tilt over the window and a slow wave of a third of it, shape (bins,)."""
     rng = np.random.default_rng([seed, 1])
     along = np.linspace(-0.5, 0.5, bins)
     tilt, wave, phase = rng.standard_normal(), rng.standard_normal(), rng.uniform(0, 2 * np.pi)
     return sigma_db * (tilt * along + wave / 3 * np.sin(3 * np.pi * along + phase))
 
 
-def _laid_out(objects: Sequence[SeabedObject], cells: Cells) -> Surface:
-    """Objects on the cells in view; where two overlap, the later covers the earlier."""
+def laid_out(objects: Sequence[SeabedObject], cells: Cells) -> Surface:
+    """Objects on the cells in view; the later of two covers the earlier."""
     first_column, end_column = int(cells.spans[:, 0].min()), int(cells.spans[:, 1].max())
     shape = len(cells.spans), end_column - first_column
     amplitude, relief_m = np.full(shape, np.nan, np.float32), np.zeros(shape, np.float32)
@@ -318,7 +292,7 @@ def _laid_out(objects: Sequence[SeabedObject], cells: Cells) -> Surface:
 
 
 def _overlap(first: int, length: int, size: int) -> tuple[slice, slice]:
-    """Where a patch of a length from ``first`` on lies on an axis of a size, and which part of it."""
+    """Slice of an axis of a size that a patch of a length from ``first`` on covers, and the slice of the patch."""
     begin, end = min(max(first, 0), size), max(min(first + length, size), 0)
     end = max(begin, end)
     return slice(begin, end), slice(begin - first, end - first)
@@ -334,18 +308,18 @@ SURFACE_Z_M = 0.0
 
 @dataclass(frozen=True, eq=False)
 class FrameTruth:
-    """What is where in n frames; m objects on the floor."""
+    """Positions of the sonar and of m objects in n frames."""
 
     positions: Floats
     """True position of the sonar in the world, shape (n, 3)."""
     quaternions_xyzw: Floats
     """world_R_sonar, shape (n, 4)."""
     ids: Ints
-    """Landmarks by identity; what is no landmark is negative. Shape (m,)."""
+    """Identities of landmarks, negative for other objects, shape (m,)."""
     points_m: Floats
     """Centre of each object in the sonar's frame, shape (n, m, 3)."""
     share_in_view: Floats
-    """How much of each object's disc the fan between half powers and the window hold, shape (n, m)."""
+    """Share of each object's disc inside the fan between half powers and the window, shape (n, m)."""
 
     def range_m(self) -> Floats:
         """Slant range of each object, shape (n, m)."""
@@ -358,7 +332,7 @@ class FrameTruth:
 
 @dataclass(frozen=True, eq=False)
 class ImagedFrames:
-    """Some frames and the truth about them."""
+    """Frames and the truth about them."""
 
     frames: SonarFrames
     truth: FrameTruth
@@ -372,49 +346,33 @@ def image_along(
     Parameters
     ----------
     path
-        The truth.
+        The true path.
     mounting
-        Of the sonar.
+        Mounting of the sonar.
     pings_ns
-        When it sends, shape (n,). Frames are stamped later by the options' time offset.
+        Stamps of the pings, shape (n,). Frames are stamped later by the options' time offset.
     simulator
-        Makes the frames.
+        Simulator of the frames.
     frames_per_block
-        How many are held at once.
+        Number of frames in one block.
     """
     numbers = np.array([n for n in range(len(pings_ns)) if not simulator.is_dropped(n)], dtype=np.int64)
     for first in range(0, len(numbers), frames_per_block):
         block = numbers[first : first + frames_per_block]
-        yield _block(path, mounting, pings_ns[block], block, simulator)
-
-
-def _block(
-    path: VehiclePath, mounting: Mounting, pings_ns: Ints, numbers: Ints, simulator: FrameSimulator
-) -> ImagedFrames:
-    motion = path.at(seconds_since_start(pings_ns))
-    positions = motion.position + motion.world_R_body.apply(np.array(mounting.translation_m))
-    world_R_sonar = motion.world_R_body * body_R_sensor(mounting)
-    images = [
-        simulator.frame(position, rotation, number, SURFACE_Z_M)
-        for position, rotation, number in zip(positions, world_R_sonar, numbers.tolist(), strict=True)
-    ]
-    offset_ns = round(simulator.options.time_offset_s * NS_PER_S)
-    frames = SonarFrames(pings_ns + offset_ns, np.stack(images), simulator.ranges_m(), simulator.azimuths_rad())
-    return ImagedFrames(frames, frame_truth(positions, world_R_sonar, simulator))
+        motion = path.at(seconds_since_start(pings_ns[block]))
+        positions = motion.position + motion.world_R_body.apply(np.array(mounting.translation_m))
+        world_R_sonar = motion.world_R_body * body_R_sensor(mounting)
+        images = [
+            simulator.frame(position, rotation, number, SURFACE_Z_M)
+            for position, rotation, number in zip(positions, world_R_sonar, block.tolist(), strict=True)
+        ]
+        stamps_ns = pings_ns[block] + round(simulator.options.time_offset_s * NS_PER_S)
+        frames = SonarFrames(stamps_ns, np.stack(images), simulator.ranges_m(), simulator.azimuths_rad())
+        yield ImagedFrames(frames, frame_truth(positions, world_R_sonar, simulator))
 
 
 def frame_truth(positions: Floats, world_R_sonar: Rotation, simulator: FrameSimulator) -> FrameTruth:
-    """Where every object lies as the sonar sees it.
-
-    Parameters
-    ----------
-    positions
-        Of the sonar, shape (n, 3).
-    world_R_sonar
-        n rotations.
-    simulator
-        Knows the objects and the sonar.
-    """
+    """Position of every object in the sonar's frame, for positions (n, 3) and n rotations of the sonar."""
     sonar, objects = simulator.sonar, simulator.objects
     far_m = sonar.range_start_m + sonar.range_length_m
     half_azimuth_rad = float(np.abs(sonar.azimuths_rad()).max())

@@ -1,12 +1,8 @@
-"""Imaging sonars by their parameters: beams, lens, window and scale.
+"""Imaging sonars (beams, lens, window, scale) and the options of simulated images.
 
 The two-way pattern of a focused lens of width D is ``w(t) = sinc²(D sin(t) / wavelength)``, with D from the one-way
-width of a beam at half power, ``D = 0.886 wavelength / width``: its first side lobe lies at -26 dB.
-
-What can be chosen about simulated images: every effect has a switch and a documented value.
-
-No value is published for the 2014 experiment beyond the sonar's window and tilt; all are ours. Where they come from is
-in docs/theory/sonar_image.md.
+width of a beam at half power, ``D = 0.886 wavelength / width``: its first side lobe lies at -26 dB. Sources of all
+values: docs/theory/sonar_image.md.
 """
 
 from __future__ import annotations
@@ -25,7 +21,7 @@ _FINE_DEG = np.linspace(-20, 20, 8001)
 
 
 class ImagingSonar(Section):
-    """What a multibeam imaging sonar is, apart from its surroundings."""
+    """Parameters of a multibeam imaging sonar."""
 
     frequency_hz: float = Field(gt=0)
     beams: int = Field(gt=1)
@@ -50,7 +46,7 @@ class ImagingSonar(Section):
 
     @property
     def wavelength_m(self) -> float:
-        """In water."""
+        """Wavelength in water."""
         return SOUND_SPEED_M_S / self.frequency_hz
 
     @property
@@ -67,7 +63,7 @@ class ImagingSonar(Section):
         return ((np.arange(self.beams) + 0.5) / self.beams - 0.5) * self.azimuth_span_rad
 
     def azimuths_rad(self) -> Floats:
-        """Where the beams truly point, positive to the left, rightmost first, shape (beams,)."""
+        """True azimuth of each beam, positive to the left, rightmost first, shape (beams,)."""
         if self.lens_cubic is None:
             return self.linear_azimuths_rad()
         numbers = np.polyval(self.lens_cubic, _FINE_DEG)
@@ -125,13 +121,14 @@ OCULUS_M1200D = ImagingSonar(
 )
 """Oculus M1200d, high frequency; an electronic array, which forms all beams from one ping."""
 SonarName = Literal["didson", "aris3000", "oculus1200"]
+SONARS: dict[SonarName, ImagingSonar] = {"didson": DIDSON, "aris3000": ARIS_3000, "oculus1200": OCULUS_M1200D}
 
 
 class ImageOptions(Section):
     """Surroundings and faults of an imaging sonar."""
 
     sonar: SonarName = "didson"
-    """Which sonar; the window is the same for all."""
+    """Sonar model; the window is the same for all."""
     designs: str | None = None
     """TOML file, or folder of such files, with the landmarks that lie in the basin. It needs four; of more, those with
     the four lowest identities lie there, in the order of their identities at (5, 0), (7, -5), (2, -7) and (0, -2).
@@ -140,11 +137,11 @@ class ImageOptions(Section):
     """world: scatterers stay where they are, so that speckle changes only as the vehicle moves; frame: drawn anew for
     each frame, as many simulators do."""
     side_lobes: bool = True
-    """Of the beams' pattern in azimuth; off: Gaussian beams of the same width."""
+    """Side lobes of the beams in azimuth; off: Gaussian beams of the same width."""
     cross_talk_db: float | None = -25.0
     """Power from all beams fired together with one, against its own; None: none."""
     measured_lens: bool = True
-    """Whether the log says where the beams truly point; off: it says that they are equally spaced."""
+    """The log has the true azimuths of the beams; off: it says that they are equally spaced."""
     floor_db: float = 40.0
     """Level of the floor at 2 m in the middle of the fan, over the lowest sample."""
     absorption_db_m: float = Field(0.8, ge=0)
@@ -156,7 +153,7 @@ class ImageOptions(Section):
     joints: bool = True
     """Bright joints between the plates of the floor, every 0.5 m."""
     shadows: bool = True
-    """Behind what stands above the floor."""
+    """Shadows behind objects that stand above the floor."""
     multipath: bool = True
     """Echoes by way of the surface, and by way of the floor in front of steep faces."""
     surface_path_db: float = -15.0
@@ -168,7 +165,7 @@ class ImageOptions(Section):
     drop_probability: float = Field(0.01, ge=0, lt=1)
     """Share of the frames that are never recorded."""
     time_offset_s: float = 0.0
-    """By how much stamps are late; estimators are not told. Real drivers: 0.02 to 0.1."""
+    """Delay of the stamps; estimators are not told. Real drivers: 0.02 to 0.1."""
     sound_speed_error: float = Field(0.0, gt=-0.1, lt=0.1)
     """Relative error of the sound speed with which times become ranges; estimators are not told."""
     stones: int = Field(4, ge=0, le=6)

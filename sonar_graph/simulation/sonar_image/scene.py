@@ -1,17 +1,12 @@
-"""What lies on the floor: landmarks, stones, and flat patches that are no landmarks.
+"""Floor as scatterers that stay in the world, the objects on it, and the cells that a sonar sees.
 
-Each is turned once into a patch of the scatterers' grid, which says how strongly each cell scatters and how high it is.
-
-Scatterers that stay where they are: what makes speckle belong to the world.
-
-The floor is a square grid with one scatterer a cell, at a random place in it, with a complex amplitude drawn from
-CN(0, 1). Both repeat every 4 m, beyond what a sonar sees at once, so that a basin of any size needs the same memory.
-Many such echoes in one resolution cell give an exponentially distributed intensity; a floor of varying strength
-multiplies it, and Gamma(shape) strength makes it K-distributed.
+The floor is a square grid with one scatterer a cell, at a random place in it, with a complex amplitude from CN(0, 1).
+Both repeat every 4 m, beyond what a sonar sees at once, so that memory does not grow with the basin. Many such echoes
+in one resolution cell give an exponentially distributed intensity; Gamma(shape) strength of the floor makes it
+K-distributed. An object is a patch of the grid: how strongly each cell scatters and how high it is.
 
 Source: Abraham and Lyons, "Novel physical interpretations of K-distributed reverberation", IEEE JOE 27(4), 2002.
-
-Which cells of the floor a sonar can see.
+docs/theory/sonar_image.md
 """
 
 from __future__ import annotations
@@ -47,56 +42,43 @@ class Scatterers:
 
 
 def scatterers(texture_shape: float | None, joints: bool, rng: np.random.Generator) -> Scatterers:
-    """Draw a floor.
+    """Draw a floor; its joints are bright lines every half metre.
 
-    Parameters
-    ----------
-    texture_shape
-        Shape of the Gamma distribution of its strength; None: even.
-    joints
-        Whether there are bright lines every half metre.
-    rng
-        Source of everything random.
+    ``texture_shape`` is the shape of the Gamma distribution of its strength (mean 1, smooth over `TEXTURE_M` and
+    periodic); None: even.
     """
     points_rng, texture_rng = rng.spawn(2)
     points = np.empty((CELLS, CELLS, 4), np.float32)
     points[..., :2] = points_rng.standard_normal((CELLS, CELLS, 2), np.float32) * np.float32(np.sqrt(0.5))
     points[..., 2:] = points_rng.random((CELLS, CELLS, 2), np.float32)
-    strength = np.ones((CELLS, CELLS)) if texture_shape is None else _gamma_field(texture_shape, texture_rng)
+    strength = np.ones((CELLS, CELLS))
+    if texture_shape is not None:
+        frequency = np.fft.fftfreq(CELLS, CELL_M), np.fft.rfftfreq(CELLS, CELL_M)
+        smoothing = np.exp(-((np.pi * TEXTURE_M) ** 2) * np.add.outer(frequency[0] ** 2, frequency[1] ** 2) / 2)
+        field = np.fft.irfft2(smoothing * np.fft.rfft2(texture_rng.standard_normal((CELLS, CELLS))), (CELLS, CELLS))
+        quantiles = np.linspace(-6, 6, 2001)
+        levels = stats.gamma.ppf(stats.norm.cdf(quantiles), texture_shape, scale=1 / texture_shape)
+        strength = np.interp(field / field.std(), quantiles, levels)
     if joints:
-        strength = np.where(_on_joint(), strength * 10 ** (JOINT_DB / 10), strength)
+        middle_m = (np.arange(CELLS) + 0.5) * CELL_M
+        on_line = (middle_m + JOINT_WIDTH_M / 2) % JOINT_SPACING_M < JOINT_WIDTH_M
+        on_joint = on_line[:, None] | on_line[None, :]
+        strength = np.where(on_joint, strength * 10 ** (JOINT_DB / 10), strength)
     return Scatterers(points, np.sqrt(strength).astype(np.float32))
-
-
-def _gamma_field(shape: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Strength with mean 1, Gamma-distributed at each point, smooth over `TEXTURE_M` and periodic."""
-    frequency = np.fft.fftfreq(CELLS, CELL_M), np.fft.rfftfreq(CELLS, CELL_M)
-    smoothing = np.exp(-((np.pi * TEXTURE_M) ** 2) * np.add.outer(frequency[0] ** 2, frequency[1] ** 2) / 2)
-    field = np.fft.irfft2(smoothing * np.fft.rfft2(rng.standard_normal((CELLS, CELLS))), (CELLS, CELLS))
-    quantiles = np.linspace(-6, 6, 2001)
-    levels = stats.gamma.ppf(stats.norm.cdf(quantiles), shape, scale=1 / shape)
-    return np.interp(field / field.std(), quantiles, levels)
-
-
-def _on_joint() -> NDArray[np.bool_]:
-    """Cells on the grid of joints."""
-    middle_m = (np.arange(CELLS) + 0.5) * CELL_M
-    on_line = (middle_m + JOINT_WIDTH_M / 2) % JOINT_SPACING_M < JOINT_WIDTH_M
-    return np.asarray(on_line[:, None] | on_line[None, :])
 
 
 Shape = Callable[[Floats, Floats], tuple[Floats, Floats]]
 """Level over the floor in dB (NaN: floor) and height over it in metres, at points of the object's own frame."""
 SLOPE_M = 0.4
-"""Over which the floor rises or falls to the bottom of a landmark."""
+"""Distance over which the floor rises or falls to the bottom of a landmark."""
 
 
 @dataclass(frozen=True, eq=False)
 class SeabedObject:
-    """Something on the floor."""
+    """Landmark, stone or patch on the floor, as a patch of the scatterers' grid."""
 
     id: int
-    """Of a landmark its identity, otherwise negative."""
+    """Identity of a landmark; negative for other objects."""
     kind: str
     position_m: Floats
     """World position of the centre of its face, or of its foot, shape (3,)."""
@@ -104,9 +86,9 @@ class SeabedObject:
     extent_m: float
     """Radius of the disc that its material covers."""
     radius_m: float
-    """Of a circle around its patch, in which the floor may slope."""
+    """Radius of a circle around its patch, in which the floor may slope."""
     first_row: int
-    """Where its patch begins on the grid of scatterers."""
+    """First row of its patch on the grid."""
     first_column: int
     amplitude: Floats32
     """Over the even floor, shape (rows, columns); NaN: floor."""
@@ -117,22 +99,14 @@ class SeabedObject:
 def place(
     id_: int, kind: str, shape: Shape, extent_m: float, position_m: Floats, yaw_rad: float, margin_m: float = 0.0
 ) -> SeabedObject:
-    """Put a shape on the grid.
+    """Put a shape on the grid, at a world position and turned by a yaw (positive to the left).
 
     Parameters
     ----------
-    id_, kind
-        What it is.
-    shape
-        Its level and height.
     extent_m
-        Radius that holds its material.
-    position_m
-        World position of its origin.
-    yaw_rad
-        Turns it, positive to the left.
+        Radius of its material.
     margin_m
-        How far the floor around it slopes.
+        Width of the slope of the floor around it.
     """
     radius_m = extent_m + margin_m
     first = np.floor((position_m[:2] - radius_m) / CELL_M).astype(int) - 1
@@ -150,12 +124,15 @@ def place(
 
 
 def place_landmark(design: LandmarkDesign, position_m: Floats, yaw_rad: float, floor_z_m: float) -> SeabedObject:
-    """A landmark whose face lies at its true position.
+    """Put a landmark on the floor, with its face at its true position (m, world) and a yaw in rad.
 
-    It stands on the floor, which rises or falls around it by a smooth cosine as far as that needs.
+    The floor rises or falls around it by a smooth cosine as far as that needs.
     """
     bottom_m = float(position_m[2]) - design.height_m - floor_z_m
-    plate_m = _material_radius_m(design)
+    pixels = len(design.mask)
+    middle_m = ((np.arange(pixels) + 0.5) / pixels - 0.5) * design.size_m
+    away_m = np.hypot(middle_m[:, None], middle_m[None, :]) + design.size_m / pixels
+    plate_m = float(away_m[~np.isnan(design.mask)].max(initial=0.0))  # radius of all of its material
 
     def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         level_db = design.level_db(x_m, y_m)
@@ -164,14 +141,6 @@ def place_landmark(design: LandmarkDesign, position_m: Floats, yaw_rad: float, f
         return level_db, ground_m + np.where(np.isnan(level_db), 0.0, design.height_m)
 
     return place(design.id, design.name, shape, plate_m, position_m, yaw_rad, SLOPE_M)
-
-
-def _material_radius_m(design: LandmarkDesign) -> float:
-    """Of the circle about its centre that holds all of its material."""
-    pixels = len(design.mask)
-    middle_m = ((np.arange(pixels) + 0.5) / pixels - 0.5) * design.size_m
-    away_m = np.hypot(middle_m[:, None], middle_m[None, :]) + design.size_m / pixels
-    return float(away_m[~np.isnan(design.mask)].max(initial=0.0))
 
 
 def stone(radius_m: float, height_m: float, level_db: float) -> Shape:
@@ -210,17 +179,7 @@ def ragged_patch(radius_m: float, level_db: float, rng: np.random.Generator) -> 
 
 
 def scattered_objects(spots_m: Floats, stones: int, rng: np.random.Generator) -> list[SeabedObject]:
-    """Stones at the first spots, ragged patches at the others, with identities -1, -2, ...
-
-    Parameters
-    ----------
-    spots_m
-        World positions on the floor, shape (n, 3).
-    stones
-        How many of them.
-    rng
-        Source of sizes, levels and outlines.
-    """
+    """Stones at the first of some spots (n, 3), ragged patches at the others, with identities -1, -2, ..."""
     objects = []
     for number, spot in enumerate(spots_m):
         if number < stones:
@@ -235,12 +194,12 @@ def scattered_objects(spots_m: Floats, stones: int, rng: np.random.Generator) ->
 
 
 def within(objects: Sequence[SeabedObject], centre_m: Floats, reach_m: float) -> list[SeabedObject]:
-    """Those that a circle on the floor touches."""
+    """Objects that a circle on the floor touches."""
     return [o for o in objects if np.hypot(*(o.position_m[:2] - centre_m[:2])) < reach_m + o.radius_m]
 
 
 class Sector(NamedTuple):
-    """Part of the floor as the sonar's foot sees it."""
+    """Sector of the floor around the point below the sonar."""
 
     heading: Floats
     """Horizontal unit vector of the sonar's axis, shape (2,)."""
@@ -251,7 +210,7 @@ class Sector(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """Cells row by row."""
+    """Columns of the grid that are in view, row by row."""
 
     first_row: int
     spans: Ints
@@ -265,7 +224,7 @@ def lit_sector(
     half_azimuth_rad: float,
     half_lift_rad: float,
 ) -> Sector | None:
-    """Floor within the ranges and within the angles either side of the axis; None where there is none."""
+    """Floor within the ranges and the angles either side of the axis; None without any."""
     axis = world_R_sonar.apply([1.0, 0.0, 0.0])
     azimuth, lift = np.meshgrid(
         np.linspace(-half_azimuth_rad, half_azimuth_rad, 5), np.linspace(-half_lift_rad, half_lift_rad, 5)
@@ -287,7 +246,7 @@ def lit_sector(
 
 
 def cells_of(sector: Sector, foot_m: Floats) -> Cells:
-    """Cells of a four-cornered part of the floor that holds the sector; ``foot_m`` is what lies below the sonar."""
+    """Cells of a quadrilateral that contains the sector; ``foot_m`` is the point below the sonar."""
     bearing = sector.half_bearing_rad * np.array([1, 1, 0, -1, -1])
     far_m = sector.farthest_m / np.cos(sector.half_bearing_rad / 2)
     reach_m = np.array([sector.nearest_m, far_m, far_m, far_m, sector.nearest_m])
