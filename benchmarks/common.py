@@ -1,4 +1,4 @@
-"""What the benchmark scripts share: arguments, recordings, workers, tables, and the last line of figures."""
+"""Helpers of the benchmark scripts: arguments, recordings, workers, tables, and the last line of figures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What EKF-SLAM costs, beside the same filter written with filterpy.
+"""Time of EKF-SLAM, beside the same filter written with filterpy.
 
     python benchmarks/performance/ekf_step.py [--quick]
 
@@ -71,12 +71,12 @@ def main() -> int:
 
 
 def is_same(figures: dict[str, float]) -> bool:
-    """Whether all filters end in one state."""
+    """Check that all filters end in one state."""
     return figures["difference"] < SAME
 
 
 def meets_targets(figures: dict[str, float]) -> bool:
-    """Whether the comparison is valid and both targets are met."""
+    """Check that the comparison is valid and both targets are met."""
     fast = figures["log_s"] <= MOST_LOG_S and figures["filterpy_ratio"] >= LEAST_FILTERPY_RATIO
     return bool(fast and is_same(figures))
 

@@ -34,7 +34,7 @@ NO_BIAS = np.zeros(3)
 
 @dataclass
 class FilterpyRun:
-    """What came out, and what it cost."""
+    """Result and time of one filter."""
 
     node_ns: int
     x: Floats

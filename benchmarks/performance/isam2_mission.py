@@ -61,7 +61,7 @@ class Stopwatch:
 
 
 class PlainIsam2:
-    """What a reader of GTSAM's examples writes: a pose a frame, one update a frame, the newest pose asked.
+    """Plain use as in GTSAM's examples: a pose and an update a frame, and the newest pose asked.
 
     The gyro bias is not estimated: a native BetweenFactorPose3 has no place for it.
     """
@@ -165,7 +165,7 @@ def frame_instants(sequence: Sequence) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Race:
-    """What came of running all over one mission."""
+    """Results of all contestants over one mission."""
 
     clocks: dict[str, Stopwatch]
     """Of every frame, by runner."""
@@ -211,7 +211,7 @@ def batched(steps: Iterator[Measurements], size: int) -> Iterator[list[Measureme
 
 
 def pose_of(estimate: Estimate | None) -> gtsam.Pose3 | None:
-    """Of the body, where there is an estimate."""
+    """Positions of the body, where there is an estimate."""
     return estimate.world_T_body if estimate else None
 
 

@@ -1,4 +1,4 @@
-"""How fast a long log is read, beside the limit of the machine and two other libraries.
+"""Time of reading a long log, beside the limit of the machine and two other libraries.
 
     python benchmarks/performance/log_reading.py [--quick]
 
@@ -140,7 +140,7 @@ def exhaust(messages: Callable[[Path], Iterator[tuple[str, Any]]], path: Path) -
 
 
 def agrees(columns: Columns, path: Path) -> bool:
-    """Whether our arrays hold what rosbags decodes, bit for bit."""
+    """Check that our arrays equal those of rosbags, bit for bit."""
     rows: dict[str, int] = defaultdict(int)
     for topic, message in rosbags(path):
         row, rows[topic] = rows[topic], rows[topic] + 1
@@ -168,7 +168,7 @@ WHAT = {"add-up": add_up, "arrays": load, "sequence": read_with_sequence}
 
 
 def peak_rss_mb(path: Path, what: str) -> float:
-    """Of a process of its own."""
+    """Peak memory of a separate process."""
     command = [sys.executable, __file__, "--measure", what, str(path)]
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 

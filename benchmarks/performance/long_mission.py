@@ -56,7 +56,7 @@ class StoredMission:
 
     @property
     def calibration(self) -> Calibration:
-        """Of the vehicle."""
+        """Poses of the vehicle."""
         return Calibration.model_validate_json((self.folder / "calibration.json").read_text())
 
     @property
@@ -67,7 +67,7 @@ class StoredMission:
         return stamps[stamps < min(ends)]
 
     def measurements(self) -> Iterator[Measurements]:
-        """What came between one frame and the next, from pieces of a minute."""
+        """Measurements between successive frames, from pieces of a minute."""
         frames_ns = self.frames_ns
         piece_ns = round(PIECE_S * NS_PER_S)
         after_ns = int(np.iinfo(np.int64).min)
@@ -112,7 +112,7 @@ def store(options: MissionOptions, folder: Path) -> None:
 
 
 class Record:
-    """What was measured at each call, in memory that is there from the start."""
+    """Measurements at each call, in arrays allocated at the start."""
 
     def __init__(self, calls: int) -> None:
         self.calls = 0
@@ -131,13 +131,13 @@ class Record:
 
 
 def resident_mb() -> float:
-    """Of this process, 10⁶ bytes."""
+    """Resident memory of this process, 10⁶ bytes."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def interrupted() -> int:
-    """How often the system took the core from this thread."""
+    """Number of involuntary context switches of this thread."""
     return resource.getrusage(resource.RUSAGE_THREAD).ru_nivcsw
 
 

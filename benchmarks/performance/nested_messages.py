@@ -1,4 +1,4 @@
-"""What messages cost that hardly share a layout, beside decoding them one at a time.
+"""Time of decoding messages of many layouts, beside decoding them one at a time.
 
     python benchmarks/performance/nested_messages.py [--quick]
 

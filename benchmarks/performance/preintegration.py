@@ -1,4 +1,4 @@
-"""What joint preintegration costs an IMU sample, beside GTSAM's inertial preintegration.
+"""Time of joint preintegration for an IMU sample, beside GTSAM's inertial preintegration.
 
     python benchmarks/performance/preintegration.py [--quick]
 

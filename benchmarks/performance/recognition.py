@@ -1,4 +1,4 @@
-"""What recognition costs a sonar frame, beside AcTag's detector on the same frames.
+"""Time of recognition for a sonar frame, beside AcTag's detector on the same frames.
 
     python benchmarks/performance/recognition.py [--quick]
 
@@ -181,7 +181,7 @@ def race(path: Path, sequence: Sequence, clocks: Clocks) -> int:
 
 
 def peak_rss_mb(path: Path) -> float:
-    """Of a process of its own that runs `recognise`."""
+    """Peak memory of a separate process that runs `recognise`."""
     command = [sys.executable, __file__, "--measure", str(path)]
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
@@ -220,7 +220,7 @@ def report(clocks: Clocks) -> dict[str, Any]:
 
 
 def meets_targets(figures: dict[str, Any]) -> bool:
-    """Whether all targets are met; without AcTag they are not."""
+    """Check that all targets are met; without AcTag they are not."""
     ratio = figures["actag_ratio"]
     return all(figures[name] <= limit for name, limit in MOST.items()) and (ratio or 0.0) >= LEAST_ACTAG_RATIO
 

@@ -1,4 +1,4 @@
-"""How well AcTag's detector reads AcTags in simulated DIDSON frames.
+"""Reading of AcTags in simulated DIDSON frames by AcTag's detector.
 
 A lap of the simulated basin with four AcTags on its floor instead of landmarks, stones and rough patches beside them.
 Frames go through `sonar_graph.sonar.actag`, with the true motion between frames.

@@ -49,7 +49,7 @@ Figures = dict[str, Any]
 
 
 def imu_place(folder: Path, number: int) -> PlaceFit:
-    """What one trajectory says about the IMU's place."""
+    """Estimate of the IMU's place from one trajectory."""
     recorded = read_akit(folder, number)
     offset = match_dvl_to_imu(recorded.imu, recorded.dvl, recorded.calibration).offset.value
     return fit_place(replace(recorded, dvl=shifted(recorded.dvl, offset)))
@@ -138,7 +138,7 @@ def final_error(sequence: Sequence, estimate: Trajectory) -> dict[str, float]:
 
 
 def start_heading(recorded: Sequence, aligned: Sequence) -> float:
-    """How wrong the start heading as converted is: its gyro-carried heading less that of the aligned reference."""
+    """Error of the converted start heading: gyro-carried heading minus that of the aligned reference."""
     assert aligned.truth is not None
     estimate = reckoned(recorded)
     inside = estimate.stamps_ns <= aligned.truth.stamps_ns[-1]
@@ -202,7 +202,7 @@ def main() -> None:
 
 
 def print_places(fits: list[PlaceFit]) -> None:
-    """Where each trajectory has the IMU on the body, with standard deviations, and the noise of the Doppler log."""
+    """IMU's place on the body by trajectory, with standard deviations, and the noise of the Doppler log."""
     print_table(
         ("IMU's place", *(f"{axis} m" for axis in "xyz"), "±", "±", "±", "accel bias x mm/s²", "y", "DVL noise m/s"),
         [

@@ -1,4 +1,4 @@
-"""Where the IMU is in A-KIT's vehicle, from the accelerations that it shares with the Doppler log.
+"""Lever arm from the IMU to the Doppler log of A-KIT's vehicle, from accelerations of both.
 
 Part of `akit`. The lever arm in the files' calibration is that from the point whose velocity the reference gives to the
 Doppler log; where the IMU is, nothing says. In a turn at rate w, a place that is wrong by d makes the velocity at the
@@ -61,7 +61,7 @@ def fit_place(sequence: Sequence) -> PlaceFit:
 
 
 def _least_squares(A: Floats, x: Floats) -> tuple[Floats, Floats, float]:
-    """Of differences, whose neighbours are anticorrelated: parameters, covariance, and a sample's variance."""
+    """Least squares on differences with anticorrelated neighbours: parameters, covariance, variance of a sample."""
     n = len(x) - 1
     root = np.linalg.cholesky(2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
     both = np.concatenate([np.diff(A, axis=0), np.diff(x, axis=0)[:, :, None]], axis=2)

@@ -51,7 +51,7 @@ Scores = dict[str, dict[str, float]]
 
 @dataclass(frozen=True)
 class Placing:
-    """How landmarks lie and are seen, and the Doppler log's noise; None: as the sensor has it."""
+    """Placing and visibility of landmarks, and noise of the Doppler log (None: the sensor's)."""
 
     options: LandmarkOptions
     sigma_m_s: tuple[float, float, float] | None
@@ -94,7 +94,7 @@ def _scores(aligned: Sequence, placing: Placing, start: Any) -> Scores:
 
 
 def sightings(aligned: Sequence) -> dict[str, tuple[float, float]]:
-    """Of each placing: how often a landmark is detected, and seconds from first to last; medians over landmarks."""
+    """Median number of detections of a landmark, and seconds from first to last, for each placing."""
     return {name: _sightings(add_landmarks(aligned, placing.options)) for name, placing in PLACINGS.items()}
 
 
@@ -108,7 +108,7 @@ def _sightings(placed: Sequence) -> tuple[float, float]:
 
 
 def reference_wander(folder: Path, number: int, positions: Floats) -> tuple[float, float]:
-    """How far the reference's positions are from the sum of its own velocities: rms over one second, and the most ever.
+    """Difference of the reference's positions from the sum of its velocities: rms over one second, and maximum.
 
     Horizontal, metres. Velocities are integrated along cubic splines, row by row.
     """

@@ -58,7 +58,7 @@ def print_trajectories(numbers: tuple[int, ...], runs: list[Figures]) -> None:
 
 
 def print_gap_widths(runs: list[Figures]) -> None:
-    """What is lost in gaps and what is said of it, with and without a bias of the accelerometers."""
+    """Errors in gaps and their claimed sigmas, with and without a bias of the accelerometers."""
     print_table(
         ("IMU by others", "lost rms m", "sigma rms m", "least", "largest", "NEES"),
         [("as calibrated", *gap_width(runs, "gaps")), ("no accel bias", *gap_width(runs, "gaps_unbiased"))],
@@ -77,7 +77,7 @@ def alignment_figures(runs: list[Figures]) -> Figures:
 
 
 def gap_figures(runs: list[Figures]) -> Figures:
-    """What is lost in gaps, and the share of them that the ellipse holds."""
+    """Errors in gaps, and the share inside the ellipse."""
     calibrated, unbiased = gap_width(runs, "gaps"), gap_width(runs, "gaps_unbiased")
     return {
         "gap_lost_m": lost_m(runs, "gaps"),
@@ -97,7 +97,7 @@ def gap_figures(runs: list[Figures]) -> Figures:
 
 
 def slam_figures(numbers: tuple[int, ...], runs: list[Figures]) -> Figures:
-    """What landmarks give, and the least of it against dead reckoning where the start is sure."""
+    """Gain by landmarks, and its least value against dead reckoning where the start is known."""
     sure = [r for n, r in zip(numbers, runs, strict=True) if n not in UNSURE_START]
     return {
         "reference_wander_m": [r["reference_wander_m"] for r in runs],
@@ -117,18 +117,18 @@ def lost_m(runs: list[Figures], gaps: str) -> list[list[float]]:
 
 
 def share_inside(runs: list[Figures], gaps: str, name: str) -> float:
-    """Of all gaps in the 99 % ellipse."""
+    """Share of all gaps inside the 99 % ellipse."""
     return float(np.mean(inside_ellipse(runs, gaps, name)))
 
 
 def inside_ellipse(runs: list[Figures], gaps: str, name: str) -> list[list[bool]]:
-    """Whether each gap's square lies in the 99 % ellipse."""
+    """Mask of gaps whose squared error lies in the 99 % ellipse."""
     limit = float(chi2.ppf(0.99, 3))
     return [[gap[name] <= limit for gap in r[gaps]] for r in runs]
 
 
 def gap_width(runs: list[Figures], gaps: str) -> tuple[float, float, float, float, float]:
-    """What is lost and its sigma, root mean square, the least and largest sigma, m, and the NEES per dimension."""
+    """RMS of error and sigma, least and largest sigma, m, and the NEES per dimension."""
     lost, sigma, squares = (
         np.array([gap[of] for r in runs for gap in r[gaps]]) for of in ("lost_m", "sigma_m", "square")
     )

@@ -140,7 +140,7 @@ class FullDisk(Store):
     left = 3
 
     def write(self, key: str, outcome: RunOutcome) -> None:
-        """As on a full disk: a part is written, then an error comes."""
+        """Writing as on a full disk: a part, then an error."""
         self.left -= 1
         if self.left < 0:
             (self.folder / "runs" / f".partial-{key}-full").mkdir()
@@ -149,7 +149,7 @@ class FullDisk(Store):
 
 
 def full_disk(suite: Path, folder: Path) -> int:
-    """How many runs are lost when the disk is full for a while; the batch must say so."""
+    """Number of runs lost when the disk is full for a while; the batch must say so."""
     with Batch.opened(read_suite(suite), folder) as batch:
         full = Batch(batch.file, batch.runs, FullDisk(folder))
         try:

@@ -1,4 +1,4 @@
-"""How often does the gate of batches fail where nothing got worse, and what does it find? Drawn log ratios.
+"""False alarms and power of the gate of batches, on drawn log ratios.
 
 Drawn log ratios of new to old errors, for 1, 3, 5 and 20 seeds, 1, 3 and 9 logs (seeds of a grid), 2, 4 and 8
 contestants and 9 columns. An error is ``exp(0.1 z)`` times its size, where z is shared in part by the logs of a seed
@@ -40,7 +40,7 @@ POWER_PART = 8
 
 @dataclass(frozen=True)
 class Design:
-    """What a batch has, and how its errors are distributed."""
+    """Size of a batch and distribution of its errors."""
 
     seeds: int
     logs: int
@@ -88,13 +88,13 @@ def _case(design: Design, log: int, seed: int) -> Case:
 
 
 def fails(design: Design, worse: float, rng: np.random.Generator, columns: int = COLUMNS) -> bool:
-    """Whether the gate fails a batch."""
+    """Verdict of the gate on one batch."""
     ratios = with_all_logs(draw(design, worse, rng, columns))
     return bool(worse_groups(ratios, families(movable(ratios))))
 
 
 def told(design: Design, rng: np.random.Generator) -> float:
-    """What the gate says that it would have found."""
+    """Worsening that the gate says it would have found."""
     tested = families(movable(with_all_logs(draw(design, 0.0, rng))))
     found = detectable(tested, [f"column {k}" for k in range(COLUMNS)], math.log1p(TOLERANCE))
     return float(np.median(list(found.values()))) if found else math.inf

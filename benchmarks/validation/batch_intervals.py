@@ -1,4 +1,4 @@
-"""How often 95 % intervals of a mean difference hold it, with few pairs and with skewed differences.
+"""Coverage of 95 % intervals of a mean difference, with few pairs and with skewed differences.
 
 Differences are normal, or log-normal with a deviation of 0.5 or 1 of their logarithm: few pairs of such hang on single
 runs. Or one in ten is 100 off, as where an estimator now and then loses its way: where no such run is among the pairs,
@@ -59,7 +59,7 @@ def studentised(values: Floats, rng: np.random.Generator) -> Interval:
 
 
 def reported(values: Floats, _rng: np.random.Generator) -> Interval:
-    """What reports of batches show."""
+    """Interval as reports of batches show it."""
     return mean_interval(values)
 
 

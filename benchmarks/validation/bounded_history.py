@@ -1,4 +1,4 @@
-"""What a bounded history costs in accuracy: iSAM2 with a bounded history beside the whole one, on the same logs.
+"""Accuracy of iSAM2 with a bounded history beside the whole one, on the same logs.
 
 Missions of `sonar_graph.simulation.mission`, and basins with their three laps, one of each a seed. At 1 Hz, without
 alignment: horizontal rms of causal and smoothed positions, NEES of the smoothed position by its 3 degrees of freedom
@@ -71,7 +71,7 @@ def run(sequence: Sequence, settings: dict[str, Any]) -> Figures:
 
 
 def rms(off: Floats) -> float:
-    """Of the lengths of rows."""
+    """Root mean square of the lengths of rows."""
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 

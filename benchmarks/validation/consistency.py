@@ -38,7 +38,7 @@ Nees = dict[tuple[str, str], np.ndarray]
 
 @dataclass(frozen=True)
 class Basin:
-    """What is varied from the nominal run."""
+    """Variation of the nominal run."""
 
     duration_s: float
     laps: int
@@ -63,7 +63,7 @@ def run_seed(basin: Basin, seed: int) -> tuple[np.ndarray, Nees]:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is said about one quantity of one estimator."""
+    """Consistency of one quantity of one estimator."""
 
     final: float
     band: tuple[float, float]

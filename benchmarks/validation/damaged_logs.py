@@ -1,4 +1,4 @@
-"""What is got from 1,000 damaged logs, and whether any wrong number comes out without a word.
+"""Recovery from 1,000 damaged logs, and numbers that come out wrong without a warning.
 
     python benchmarks/validation/damaged_logs.py [--quick]
 

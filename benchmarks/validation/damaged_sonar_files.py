@@ -1,4 +1,4 @@
-"""What is got from 1,000 damaged recordings of sonars, and whether any wrong frame comes out without a word.
+"""Recovery from 1,000 damaged recordings of sonars, and frames that come out wrong without a warning.
 
     python benchmarks/validation/damaged_sonar_files.py [--quick] [--data FOLDER]
 
@@ -196,7 +196,7 @@ def intact_frames(file: Damaged) -> list[int]:
 
 
 def compare(file: Damaged, frames: list[Frame]) -> Counter[str]:
-    """How many frames differ from what was recorded, by what can be known of it."""
+    """Number of frames that differ from the recording, by kind."""
     verdict: Counter[str] = Counter()
     origin_ns = origin(file, frames)
     for image, stamp_ns, geometry in frames:
@@ -215,7 +215,7 @@ def compare(file: Damaged, frames: list[Frame]) -> Counter[str]:
 
 
 def origin(file: Damaged, frames: list[Frame]) -> int:
-    """What the older Oculus clock, which says only how long after the first frame, is ahead; 0 for the others."""
+    """Lead of the older Oculus clock, which counts from the first frame; 0 for others."""
     if not file.source.is_relative:
         return 0
     ahead: Counter[int] = Counter()
@@ -227,7 +227,7 @@ def origin(file: Damaged, frames: list[Frame]) -> int:
 
 
 def recorded_frame(source: Source, image: bytes, stamp_ns: int) -> int | None:
-    """Which frame an image is, but for samples that were zeroed or of which one bit was flipped; None: of no frame."""
+    """Number of the frame that an image is, up to zeroed samples or one flipped bit; None without one."""
     found = []
     values = np.frombuffer(image, np.uint8)
     for number, (recorded, recorded_ns, _) in enumerate(source.frames):
@@ -240,7 +240,7 @@ def recorded_frame(source: Source, image: bytes, stamp_ns: int) -> int | None:
 
 
 def between_neighbours_ns(source: Source, number: int) -> int:
-    """How far a time may be off while it is between those beside it; at the ends, while it is not far from them."""
+    """Tolerance of a stamp: between its neighbours, at the ends near them."""
     stamps_ns = [stamp_ns for _, stamp_ns, _ in source.frames]
     usual_ns = max(np.diff(stamps_ns).tolist())
     is_inner = 0 < number < len(stamps_ns) - 1

@@ -58,7 +58,7 @@ RATE_HZ = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Told:
-    """What one estimator's run says."""
+    """Errors and covariances of one estimator's run."""
 
     nees: dict[str, np.ndarray]
     """By quantity, over the instants."""

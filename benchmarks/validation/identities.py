@@ -1,4 +1,4 @@
-"""What late, wrong and doubtful identities cost: dead reckoning, two filters, and iSAM2 under each of its policies.
+"""Cost of late, wrong and doubtful identities to dead reckoning, two filters, and iSAM2 under each policy.
 
 Basins with a gyro biased as its calibration says, or five times as much (and said so). A share of the tracks is taken
 for another landmark: until half of the track's time is over, so that about half as large a share of the detections is

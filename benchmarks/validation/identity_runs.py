@@ -37,7 +37,7 @@ SETTLING_S = 60.0
 
 @dataclass(frozen=True)
 class Case:
-    """What is wrong with the identities, and with the gyro."""
+    """Faults of the identities and of the gyro."""
 
     wrong_id_rate: float
     id_delay_s: float = 0.0
@@ -47,13 +47,13 @@ class Case:
 
     @property
     def name(self) -> str:
-        """How tables call it."""
+        """Name in tables."""
         kind = "corrected halfway" if self.wrong_id_share < 1 else "never corrected"
         kind = kind if self.tracks else "frame by frame"
         return f"delay {self.id_delay_s:g} s, bias {self.gyro_bias_scale:g}, {kind}"
 
     def options(self, seed: int, *, is_quick: bool) -> BasinOptions:
-        """Of the simulated basin: its laps with less hovering and fewer frames, to afford thousands of runs."""
+        """Options of the simulated basin: less hovering and fewer frames, to afford thousands of runs."""
         route: dict[str, Any] = {"duration_s": 240.0, "laps": 1} if is_quick else {"duration_s": DURATION_S}
         return BasinOptions(seed=seed, frame_rate_hz=FRAME_RATE_HZ, **route, **asdict(self))
 
@@ -78,7 +78,7 @@ class Judged:
 
     @property
     def is_lost(self) -> bool:
-        """Whether the run failed: no result, or one that is of no use."""
+        """Failure of the run: no result, or a useless one."""
         return self.smoothed_m is None or self.smoothed_m > LOST_M
 
 
@@ -96,7 +96,7 @@ class Job:
         return f"{self.case.wrong_id_rate:.0%} wrong, {self.case.name}, seed {self.seed}"
 
     def file(self, estimator: str) -> Path | None:
-        """Where one estimator's figures are kept; another version of the code has other files."""
+        """File of one estimator's figures; another version of the code has other files."""
         if self.folder is None:
             return None
         name, params = ESTIMATORS[estimator]

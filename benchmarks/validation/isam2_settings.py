@@ -1,4 +1,4 @@
-"""What iSAM2's settings do: keyframes, waiting, relinearisation, marginalising, kernel and gate.
+"""Effect of iSAM2's settings: keyframes, waiting, relinearisation, marginalising, kernel and gate.
 
 * Effort: keyframes, updates of the window and CPU time in a basin of 600 s, by default, with a keyframe at every frame
   (``motion_noise_share`` 0), and with no sighting waiting (``waiting_gain`` 0).
@@ -125,7 +125,7 @@ def waiting(seconds: float, seed: int) -> list[float]:
 
 
 def relinearised(seconds: float, case: tuple[str, float]) -> tuple[float, float, float]:
-    """Of iSAM2 by itself."""
+    """Scores of iSAM2 alone."""
     world, threshold = case
     return from_least_cost(run(WORLDS[world](seconds), {"smoother": {**ALONE, "relinearize_threshold": threshold}})[0])
 

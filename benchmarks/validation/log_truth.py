@@ -1,4 +1,4 @@
-"""What an undamaged log holds, as mcap's own reader sees it."""
+"""Content of an undamaged log, by mcap's own reader."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Truth:
         return damaged[start:end] == self.content[start:end] or self.content[start:end] in damaged
 
     def _is_described(self, damaged: bytes) -> bool:
-        """Whether the first chunk, or the summary, with all channels in it is there."""
+        """Check that the first chunk, or the summary, with all channels is there."""
         first = next((record for record in self.records if record[1] in self.chunks), None)
         if first is not None and self._is_in(damaged, *first[1:]):
             return True

@@ -87,7 +87,7 @@ def collect(runs: list[Scores]) -> dict[str, Any]:
 
 
 def targets(figures: dict[str, Any]) -> list[Target]:
-    """What must be true."""
+    """Targets, and whether they are met."""
     return [
         Target("iSAM2 smoothed ATE, worst robot", max(figures["isam2_smoothed_ate_m"]), 0.17),
         Target("iSAM2 smoothed ATE, mean", figures["isam2_smoothed_ate_mean_m"], 0.125),

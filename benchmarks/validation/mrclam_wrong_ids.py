@@ -1,4 +1,4 @@
-"""What wrong identities cost on real data: MRCLAM data set 6 with 10 % of its landmark identities falsified.
+"""Cost of wrong identities on real data: MRCLAM data set 6 with 10 % of its landmark identities falsified.
 
 Each detection's identity is replaced, with the probability `SHARE` and independently, by one drawn evenly from the
 other landmarks that the robot sees; ``numpy.random.default_rng([SEED, robot])``. Posteriors stay 1: the recogniser is
@@ -90,7 +90,7 @@ def collect(cases: list[tuple[int, float, str]], runs: list[Errors]) -> dict[str
 
 
 def is_met(figures: dict[str, Any]) -> bool:
-    """Whether the best policies stand wrong identities, and no policy costs accuracy where all are right."""
+    """Check that the best policies stand wrong identities, and no policy costs accuracy where all are right."""
     keys = {policy: f"isam2_{policy.replace('-', '_')}" for policy in POLICIES}
     growths = [figures[f"{keys[policy]}_growth"] for policy in BEST]
     right = [figures[f"{key}_smoothed_right"] for key in keys.values()]

@@ -1,4 +1,4 @@
-"""What the accelerometers add to odometry: twelve rows, six with them between Doppler samples, or six without them.
+"""Gain by accelerometers in odometry: twelve rows, six with them between Doppler samples, or six without.
 
 * Keyframes: error of one displacement by the rules "linear" (what every estimator here takes for odometry) and
   "inertial", and as the estimators have it where ``dvl.gap_s`` is below the Doppler log's interval, so that each
@@ -65,7 +65,7 @@ ERRORS = ("error_m", "tilt_rad")
 
 
 class Rows(NamedTuple):
-    """What a motion says in the graph."""
+    """Factor of a motion in the graph."""
 
     rule: DopplerRule
     is_inertial: bool
@@ -87,7 +87,7 @@ VARIANTS = {UNPLACED: "12", NO_EARTH: "12", "12": "12", "6": "6", "6 linear": "6
 
 @dataclass(frozen=True)
 class Told:
-    """What one chain says."""
+    """Errors and covariances of one chain."""
 
     chi_square: float
     dof: int

@@ -81,7 +81,7 @@ class Case:
 
     @property
     def seed(self) -> tuple[int, ...]:
-        """Of its own for each case, so that luck is not shared."""
+        """Random generator of each case."""
         numbers = (
             self.keyframe_s,
             1e6 * self.gyro_density,

@@ -19,7 +19,7 @@ TIME_LIMIT_S = 20.0
 
 @dataclass
 class Reading:
-    """What came out of a file."""
+    """Content read from a file."""
 
     messages: dict[str, list[Payload]] = field(default_factory=dict)
     types: dict[str, tuple[str, str]] = field(default_factory=dict)

@@ -194,7 +194,7 @@ def regions_of(mask: Image, frame: Frame, settings: DetectionParams) -> tuple[La
 
 @dataclass(frozen=True)
 class Score:
-    """What one detector did on one frame."""
+    """Result of one detector on one frame."""
 
     candidates: int
     found: tuple[bool, ...]
@@ -219,7 +219,7 @@ def cartesian_box(frame: Frame, labels: Labels, label: int) -> tuple[tuple[float
 
 
 def is_hit(centroid: tuple[float, float], region: Box, box: Box) -> bool:
-    """Whether a region finds a box."""
+    """Overlap test of a region with a box."""
     (x, y, w, h), (u, v, p, q) = box, region
     across, along = min(x + w, u + p) - max(x, u), min(y + h, v + q) - max(y, v)
     shared = max(across, 0.0) * max(along, 0.0)
@@ -333,7 +333,7 @@ def draw(points: Sequence[Point], path: Path) -> None:
 
 
 def is_ahead(best: dict[str, list[float]]) -> list[bool]:
-    """Whether we find more than every other detector, at each number of candidates: the better way of each counts."""
+    """Check that we find more than every other detector at each number of candidates, by the better way of each."""
     ways = {name: np.maximum(best[name], best[f"{name}-strongest"]) for name in best if not name.endswith("-strongest")}
     return [all(ways["ours"][i] > row[i] for name, row in ways.items() if name != "ours") for i in range(len(BUDGETS))]
 

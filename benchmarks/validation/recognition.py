@@ -68,7 +68,7 @@ TARGETS = {
 
 @dataclass(frozen=True)
 class Case:
-    """What is simulated, apart from the seed."""
+    """Options of the simulation, apart from the seed."""
 
     duration_s: float
     laps: int
@@ -90,7 +90,7 @@ class Case:
 
 @cache
 def digest() -> str:
-    """Of the code and the model that make a run what it is: other code does not go on from kept runs."""
+    """Hash of the code and the model; other code does not go on from kept runs."""
     root = Path(sonar_graph.__file__).parent
     here = [Path(__file__).with_name(name) for name in ("recognition_runs.py", "brighter_landmarks.toml")]
     files = [*sorted(root.glob("*.*")), *here]
@@ -153,7 +153,7 @@ def summarise(runs: list[Run], rule: str) -> Summary:
 
 
 class Watched(NamedTuple):
-    """What came of the passes of one run."""
+    """Results of the passes of one run."""
 
     recognised: np.ndarray
     """Of each landmark's pass, whether it was."""
@@ -201,14 +201,14 @@ def _normalised(found: Detections, rows: Any) -> np.ndarray:
 
 
 def _normalised_mean(found: Detections, rows: np.ndarray) -> float:
-    """Of the mean weighted by information, per degree of freedom, as if errors were independent."""
+    """NEES of the information-weighted mean per degree of freedom, as if errors were independent."""
     information = np.linalg.inv(found.covariance[rows])
     total = np.einsum("nij,nj->i", information, found.error[rows])
     return float(total @ np.linalg.solve(information.sum(axis=0), total) / 2)
 
 
 def _reliability(found: list[Detections], rows: list[np.ndarray]) -> Reliability:
-    """Of the most probable class, where the truth can be told."""
+    """Accuracy of the most probable class, where the truth is known."""
     confidence = np.concatenate([d.confidence[r] for d, r in zip(found, rows, strict=True)])
     label = np.concatenate([d.label[r] for d, r in zip(found, rows, strict=True)])
     said = np.concatenate([np.where(d.is_named, d.named, NONE)[r] for d, r in zip(found, rows, strict=True)])

@@ -60,7 +60,7 @@ class Passes:
     frames: np.ndarray
 
     def during(self, row: int, stamp_s: np.ndarray) -> np.ndarray:
-        """Which instants are of a pass."""
+        """Mask of the instants of a pass."""
         return (stamp_s >= self.begin_s[row] - MARGIN_S) & (stamp_s <= self.end_s[row] + MARGIN_S)
 
 

@@ -82,7 +82,7 @@ KINDS = (("causal", "causal_m"), ("smoothed", "smoothed_m"))
 
 
 def of_landmarks(sequence: Sequence, result: RunResult) -> Figures:
-    """How many landmarks are found, how well, and how many detections go to the wrong one."""
+    """Number of landmarks found, their errors, and the number of detections given to a wrong one."""
     true, estimated, log = sequence.true_landmarks, result.landmarks, result.detections
     assert true is not None
     assert estimated is not None
@@ -110,7 +110,7 @@ def most_frequent(identities: Ints) -> int:
 
 
 def true_identities(sequence: Sequence, log: DetectionLog) -> Ints:
-    """Of each detection of a log; -2: of nothing."""
+    """True landmark of each detection; -2: none."""
     assert sequence.detections is not None
     ids, probability = sequence.detections.rows(np.isin(sequence.detections.stamps_ns, log.stamps_ns)).most_probable()
     return np.where(probability >= SURE, ids, -2)

@@ -65,7 +65,7 @@ Sighter = Callable[[int, int, np.ndarray, np.ndarray], list[gtsam.NonlinearFacto
 
 @dataclass(frozen=True)
 class Step:
-    """What the file says at one pose: the edge that leads to it, and what is seen from it."""
+    """Row of the file: the edge that leads to a pose, and the sightings from it."""
 
     edge: tuple[gtsam.Pose2, np.ndarray] | None
     """The motion from the pose before with its covariance (3, 3); None at the first pose."""
@@ -73,7 +73,7 @@ class Step:
     """Landmark, point in the body frame (2,), covariance (2, 2)."""
 
     def factors(self, index: int, reading: Reading, sighter: Sighter) -> gtsam.NonlinearFactorGraph:
-        """Of this pose, the ``index``-th."""
+        """Key of the ``index``-th pose."""
         graph = gtsam.NonlinearFactorGraph()
         if self.edge is None:
             graph.push_back(
@@ -349,7 +349,7 @@ def refused(run: RunResult) -> int:
 
 
 def passed(same: dict[str, float]) -> bool:
-    """Whether maps are equal, and nothing started from ours goes elsewhere."""
+    """Check that maps are equal, and that solutions started from ours stay there."""
     return (
         maps_agree(same)
         and abs(same["cost_ratio"] - 1) <= COST_AGREEMENT
@@ -358,7 +358,7 @@ def passed(same: dict[str, float]) -> bool:
 
 
 def maps_agree(differences: dict[str, float]) -> bool:
-    """Whether landmarks are where the batch solution has them."""
+    """Check that landmarks are where the batch solution has them."""
     return (
         differences["rms_difference_m"] <= RMS_AGREEMENT_M and differences["max_difference_sigmas"] <= SIGMAS_AGREEMENT
     )
