@@ -3,10 +3,9 @@
 # fmt: off
 from sonar_graph.logs.amending import Amended, write_amended
 from sonar_graph.logs.inspection import LogSummary, TopicSummary, inspect_log
-from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.reading import read_log, read_sonar_frames
 from sonar_graph.logs.result_log import write_result
 from sonar_graph.logs.roles import DETECTIONS
-from sonar_graph.logs.sonar_frames import read_sonar_frames
 from sonar_graph.logs.trajectory_files import write_landmarks_csv, write_tum
 from sonar_graph.logs.vehicle_setup import METADATA, PartialCalibration, with_notes
 from sonar_graph.logs.viewer_messages import PICTURES, Picture

@@ -1,99 +1,35 @@
-"""What is in a log: topics, their times and gaps, which part each would play, and what is damaged.
+"""Inspection of logs: topics with their times, the role that each would play, damage, warnings, and a configuration.
 
-The log configuration to start from: what would be used, and what might be for roles that nothing plays.
+`inspect_log` reads what a run would read, so that rows left out and doubtful numbers are known before. The log
+configuration that it begins makes, read back unchanged, the same choices (docs/tutorials/04_your_own_log.md).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sonar_graph.errors import CalibrationError, LogError, SonarGraphError
-from sonar_graph.logs.adapters import LogConfig, comment, leaf_fields, plain_lines, shipped_like, table_text
+from sonar_graph.logs.adapters import LogConfig, leaf_fields, plain_lines, shipped_like, table_text
 from sonar_graph.logs.cdr import Struct, decode, definition, parse_definition, short_name
 from sonar_graph.logs.checks import stamp_faults
 from sonar_graph.logs.mcap import STAMP_BYTES, Keep, Recording, TimeWindow, Topic, scan
-from sonar_graph.logs.message_table import NS_PER_S
-from sonar_graph.logs.reading import Assembly
+from sonar_graph.logs.reading import Assembly, describe_frames, read_sonar_frames
 from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, TF, Choice, choose_topic, refusal, wanted_types
-from sonar_graph.logs.sonar_frames import describe_frames, read_sonar_frames
 from sonar_graph.logs.vehicle_setup import read_calibration, read_notes, recorded_name, static_frames
 from sonar_graph.measurements import Ints
+from sonar_graph.sequence import NS_PER_S
 
 _MOST_FIELDS = 24
-_UNKNOWN_TOPIC = ['topic = "/..."', 'type = "package/msg/Type"']
+_MOST_FRAMES = 6
 _EXAMPLES = {
     "imu": 'angular_velocity = ["...", "...", "..."]\nlinear_acceleration = ["...", "...", "..."]',
     "dvl": 'velocity = ["...", "...", "..."]',
 }
-
-
-def starting_config(recording: Recording, choices: Sequence[Choice], config: LogConfig) -> str:
-    """TOML that, read back unchanged, makes the same choices; comments say what else might be chosen."""
-    used = {choice.topic for choice in choices}
-    unknown = [topic for topic in recording.topics.values() if topic.name not in used and _is_unknown(topic)]
-    parts = [f"# What the topics of {recording.path.name} are. Every key of a table that comes along may be left out."]
-    parts += [_table(recording, choice, config.table(choice.role.name)) for choice in choices]
-    if any(choice.topic is None and choice.role.is_required for choice in choices):
-        parts += [comment(_described(topic)) for topic in unknown]
-    return "\n\n".join(parts) + "\n"
-
-
-def _table(recording: Recording, choice: Choice, said: Mapping[str, Any]) -> str:
-    role = choice.role.name
-    if choice.topic is not None and choice.adapter is not None:
-        topic = recording.topics[choice.topic]
-        base = shipped_like(role, topic.type_name, topic.definition())
-        return table_text(role, choice.topic, choice.adapter, base)
-    if said:  # it stays as it is, also where nothing in this log answers to it
-        return "\n".join([comment(choice.reason), f"[{role}]", *plain_lines(said)])
-    named = choice.candidates or choice.could_be
-    if named:
-        return comment("\n".join([f"[{role}]  # one of", *(f'topic = "{name}"' for name in named)]))
-    if choice.role.is_required:
-        return comment("\n".join(_template(recording, role)))
-    return comment(f"[{role}]  # nothing found")
-
-
-def _template(recording: Recording, role: str) -> list[str]:
-    """A table to fill in for a type that does not come along; a topic whose name says the role is proposed."""
-    likely = [t for t in recording.topics.values() if role in t.name.lower() and t.is_ros2]
-    lines = [f"[{role}]  # nothing of a type that comes along; the fields of other topics are listed below"]
-    lines += [f'topic = "{likely[0].name}"', f'type = "{likely[0].type_name}"'] if likely else _UNKNOWN_TOPIC
-    if likely and "header.stamp.sec" not in _leaves(likely[0]):
-        lines.append('stamp = "log"  # messages without a header: when they were recorded')
-    return [*lines, _EXAMPLES[role]]
-
-
-def _is_unknown(topic: Topic) -> bool:
-    return topic.is_ros2 and short_name(topic.type_name) != short_name(TF)
-
-
-def _described(topic: Topic) -> str:
-    return "\n".join(_fields(topic))
-
-
-def _fields(topic: Topic) -> Iterator[str]:
-    paths = _leaves(topic)
-    yield f"{topic.name} is a {topic.type_name} with the fields"
-    yield from (f"  {path}{size}" for path, size in list(paths.items())[:_MOST_FIELDS])
-    if len(paths) > _MOST_FIELDS:
-        yield f"  and {len(paths) - _MOST_FIELDS} more"
-
-
-def _leaves(topic: Topic) -> dict[str, str]:
-    """Paths of a type's fields, with ``[n]`` or ``[]`` for arrays and sequences; none where it cannot be read."""
-    try:
-        return dict(leaf_fields(topic.definition()))
-    except LogError:
-        return {}
-
-
-_FRAMES_NAMED = 6
+"""Keys of a table to fill in, for the roles that are needed."""
 
 
 @dataclass(frozen=True)
@@ -116,20 +52,20 @@ class TopicSummary:
     jitter_s: float = 0.0
     """Scatter of the times between successive stamps: half of the central 68 %."""
     lag_s: float | None = None
-    """Median time of recording less stamp; None where messages have no stamps."""
+    """Median of time of recording less stamp; None where messages have no stamps."""
     stamp_faults: tuple[str, ...] = ()
-    """What is wrong with the stamps."""
+    """Faults of the stamps (`stamp_faults`)."""
     refusal: str | None = None
-    """Why its messages cannot be decoded, which completes "/imu ..."; None: they can."""
+    """Reason why its messages cannot be decoded, which completes "/imu ..."; None: they can."""
 
 
 @dataclass(frozen=True)
 class RoleSummary:
-    """Which topic plays a part."""
+    """The topic that plays a role."""
 
     role: str
     topic: str | None
-    """None: none does, or several could."""
+    """None: no topic plays it, or several could."""
     reason: str
     candidates: tuple[str, ...] = ()
     """The topics that fit, where they are several."""
@@ -137,22 +73,22 @@ class RoleSummary:
 
 @dataclass(frozen=True)
 class LogSummary:
-    """What a log holds."""
+    """Content of a log, and its faults."""
 
     path: Path
     name: str | None
-    """As the log calls itself."""
+    """Name in the log's record."""
     topics: tuple[TopicSummary, ...]
     roles: tuple[RoleSummary, ...]
     calibration: str
-    """Where a calibration would come from, or why the one in the log cannot be used."""
+    """Source of the calibration, or the reason why the one in the log cannot be used."""
     notes: dict[str, str]
     damage: tuple[str, ...]
-    """What is lost or cannot be read; empty for a sound file."""
+    """Lost or unreadable parts; empty for a sound file."""
     left_out: tuple[str, ...] = ()
     """Rows that are not fit for use, by role and reason."""
     warnings: tuple[str, ...] = ()
-    """What can be read but looks wrong."""
+    """Sentences about what can be read but looks wrong, each after its role."""
     sonar: str | None = None
     """Size, sector and range of the sonar's first frames."""
     toml: str = ""
@@ -160,10 +96,7 @@ class LogSummary:
 
     @property
     def obstacles(self) -> tuple[str, ...]:
-        """What keeps estimators from running on the log as it is: needed parts that no topic plays, or several could.
-
-        Such as ``no IMU``.
-        """
+        """Needed roles that no topic plays, or several could, so that no estimator can run; such as ``no IMU``."""
         needed = [role for role in self.roles if ROLES[role.role].is_required and role.topic is None]
         return tuple(
             f"{len(role.candidates)} topics for {role.role} (choose: --topic {role.role}={role.candidates[0]})"
@@ -174,7 +107,7 @@ class LogSummary:
 
     @property
     def duration_s(self) -> float:
-        """Seconds between the first and the last stamp of the topics that play a part, or of all where none does."""
+        """Seconds between the first and the last stamp of the topics that play a role, or of all where none does."""
         used = {role.topic for role in self.roles}
         by_header = [topic for topic in self.topics if topic.stamps_from == "header"]  # not the recorder's clock
         topics = [topic for topic in self.topics if topic.name in used] or by_header or self.topics
@@ -189,30 +122,77 @@ def inspect_log(
     topics: Mapping[str, str] | None = None,
     window: TimeWindow | None = None,
 ) -> LogSummary:
-    """Summarise an MCAP file; what is wrong in it becomes part of the summary.
+    """Summarise an MCAP file; faults of the log become part of the summary.
 
     Parameters
     ----------
     path
         The log.
     config, topics
-        What the user says about topics, as of `read_log`.
+        What the user says about topics, as for `read_log`.
     window
-        Only what was recorded then.
+        Part of the recording to inspect.
+
+    Returns
+    -------
+    LogSummary
+        Topics, roles, calibration, damage, rows left out, warnings, and the log configuration to start from.
 
     Raises
     ------
     LogError
-        When there is no such file or it is not MCAP.
+        When there is no such file, it is not MCAP, or `config` names fields that the messages do not have.
+
+    See Also
+    --------
+    read_log : Reads the log as a `Sequence`.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> from sonar_graph.calibration import Calibration
+    >>> from sonar_graph.logs import inspect_log, write_log
+    >>> from sonar_graph.measurements import Dvl, Imu
+    >>> from sonar_graph.sequence import Sequence
+    >>> stamps_ns = np.arange(50) * 10**8
+    >>> imu = Imu(stamps_ns, np.zeros((50, 3)), np.tile([0.0, 9.81, 0.0], (50, 1)))
+    >>> dvl = Dvl(stamps_ns, np.tile([0.5, 0.0, 0.0], (50, 1)), np.tile(1e-4 * np.eye(3), (50, 1, 1)))
+    >>> with TemporaryDirectory() as folder:
+    ...     write_log(Path(folder) / "dive.mcap", Sequence("straight", Calibration(), imu, dvl))
+    ...     summary = inspect_log(Path(folder) / "dive.mcap")
+    >>> sorted((topic.name, topic.messages, topic.rate_hz) for topic in summary.topics if topic.messages > 1)
+    [('/dvl/data', 50, 10.0), ('/imu/data', 50, 10.0)]
+    >>> summary.warnings[0].split(":")[1]
+    " gravity is felt along +y (9.81 m/s2) instead of the body's +z"
     """
     config = config or LogConfig()
     types = wanted_types(config)
     recording = scan(Path(path), lambda kind: Keep.ALL if short_name(kind) in types else Keep.STAMP, window)
     damage = [*recording.corrupt, *([recording.ending] if recording.ending else []), *recording.damage.remarks]
     choices = {name: choose_topic(role, recording, config, (topics or {}).get(name)) for name, role in ROLES.items()}
-    calibration, notes = _calibration(recording), _notes(recording, damage)
+    calibration = _calibration_source(recording)
+    try:
+        notes = read_notes(recording)
+    except SonarGraphError as error:
+        notes = {}
+        damage.append(str(error))
     summaries = tuple(_summarise(topic) for topic in recording.topics.values())
-    left_out, warnings = _trial(recording, {name: choices[name] for name in SEQUENCE_ROLES}, damage)
+    left_out, warnings = list[str](), list[str]()
+    try:
+        left_out, warnings = Assembly(recording, {name: choices[name] for name in SEQUENCE_ROLES}).survey()
+    except CalibrationError:
+        pass  # `calibration` says so
+    except SonarGraphError as error:
+        damage.append(str(error))
+    sonar = None
+    if (sonar_topic := choices[SONAR].topic) is not None:
+        try:
+            frames = next(read_sonar_frames(recording.path, sonar_topic, config), None)
+            sonar = describe_frames(frames) if frames else None
+        except SonarGraphError as error:
+            sonar = f"cannot be read: {error}"
     return LogSummary(
         path=recording.path,
         name=recorded_name(recording),
@@ -223,37 +203,18 @@ def inspect_log(
         damage=tuple(damage),
         left_out=tuple(left_out),
         warnings=tuple(warnings),
-        sonar=_sonar(recording.path, choices[SONAR], config),
+        sonar=sonar,
         toml=starting_config(recording, list(choices.values()), config),
     )
 
 
-def _trial(recording: Recording, choices: Mapping[str, Choice], damage: list[str]) -> tuple[list[str], list[str]]:
-    """Read what was chosen, as a run would, for what is left out and what looks wrong."""
-    try:
-        return Assembly(recording, choices).survey()
-    except CalibrationError:
-        return [], []  # told where the calibration comes from
-    except SonarGraphError as error:
-        damage.append(str(error))
-        return [], []
-
-
-def _sonar(path: Path, choice: Choice, config: LogConfig) -> str | None:
-    """What the first frames of the sonar are like."""
-    if choice.topic is None:
-        return None
-    try:
-        frames = next(read_sonar_frames(path, choice.topic, config), None)
-    except SonarGraphError as error:
-        return f"cannot be read: {error}"
-    return describe_frames(frames) if frames else None
-
-
 def _summarise(topic: Topic) -> TopicSummary:
-    recorded = _stamps_from_headers(topic)
-    log_times_ns = topic.log_times_ns
-    stamps_ns = np.sort(log_times_ns if recorded is None else np.where(recorded == 0, log_times_ns, recorded))
+    header_ns, log_times_ns = _header_stamps(topic), topic.log_times_ns
+    stamps_ns, lag_s = np.sort(log_times_ns), None
+    if header_ns is not None:
+        stamps_ns = np.sort(np.where(header_ns == 0, log_times_ns, header_ns))
+        stamped = (header_ns != 0) | (log_times_ns == 0)
+        lag_s = float(np.median((log_times_ns - header_ns)[stamped])) * 1e-9 if stamped.any() else None
     span_s = float(stamps_ns[-1] - stamps_ns[0]) * 1e-9
     steps_s = np.diff(stamps_ns) * 1e-9
     low, high = np.quantile(steps_s, [0.16, 0.84]) if len(steps_s) else (0.0, 0.0)
@@ -266,54 +227,44 @@ def _summarise(topic: Topic) -> TopicSummary:
         last_stamp_ns=int(stamps_ns[-1]),
         rate_hz=(len(topic) - 1) / span_s if span_s > 0 else 0.0,
         largest_gap_s=float(steps_s.max(initial=0)),
-        stamps_from="log" if recorded is None else "header",
+        stamps_from="log" if header_ns is None else "header",
         jitter_s=float(high - low) / 2,
-        lag_s=None if recorded is None else _lag_s(recorded, log_times_ns),
-        stamp_faults=() if recorded is None else tuple(stamp_faults(recorded, log_times_ns)),
+        lag_s=lag_s,
+        stamp_faults=() if header_ns is None else tuple(stamp_faults(header_ns, log_times_ns)),
         refusal=refusal(topic),
     )
 
 
-def _lag_s(stamps_ns: Ints, log_times_ns: Ints) -> float | None:
-    """Of messages with a stamp."""
-    stamped = (stamps_ns != 0) | (log_times_ns == 0)
-    return float(np.median((log_times_ns - stamps_ns)[stamped])) * 1e-9 if stamped.any() else None
-
-
-def _stamps_from_headers(topic: Topic) -> Ints | None:
-    """Stamps as they stand at the beginning of each message, or None where not every message has one there."""
+def _header_stamps(topic: Topic) -> Ints | None:
+    """Stamps at the beginning of each message, shape (n,); None where not every message begins with a header."""
     try:
         first = topic.definition().fields[:1] if topic.is_ros2 else ()
-        if not first or not isinstance(first[0].kind, Struct) or first[0].is_array:
-            return None
-        if first[0].kind.name != "std_msgs/Header" or min(topic.stacks, default=0) < STAMP_BYTES:
-            return None
-        return _decode_stamps(topic)
     except SonarGraphError:
         return None
-
-
-def _decode_stamps(topic: Topic) -> Ints | None:
+    if not first or not isinstance(first[0].kind, Struct) or first[0].is_array:
+        return None
+    if first[0].kind.name != "std_msgs/Header" or min(topic.stacks, default=0) < STAMP_BYTES:
+        return None
     time = parse_definition("builtin_interfaces/msg/Time", definition("builtin_interfaces/msg/Time"))
-    stamps_ns = np.empty(len(topic), np.int64)
     parts = [(rows, payloads[:, :STAMP_BYTES]) for stack in topic.stacks.values() for rows, payloads in stack]
     decoded = decode(time, parts)
     if decoded.unsound:
         return None
+    stamps_ns = np.empty(len(topic), np.int64)
     for group in decoded.groups:
         stamps_ns[group.rows] = group["sec"].astype(np.int64) * NS_PER_S + group["nanosec"]
     return stamps_ns
 
 
-def _calibration(recording: Recording) -> str:
+def _calibration_source(recording: Recording) -> str:
     try:
         if read_calibration(recording) is not None:
             return "in the log"
-        frames = static_frames(recording)
+        frames = list(static_frames(recording))
     except SonarGraphError as error:
         return f"unusable: {error}"
     if frames:
-        names = ", ".join(list(frames)[:_FRAMES_NAMED]) + (", ..." if len(frames) > _FRAMES_NAMED else "")
+        names = ", ".join(frames[:_MOST_FRAMES]) + (", ..." if len(frames) > _MOST_FRAMES else "")
         return f"none in the log; defaults with the mountings of /tf_static ({names})"
     return (
         "none in the log and no /tf_static; defaults, with every sensor at base_link: sonar_graph/calibration.py lists "
@@ -321,9 +272,49 @@ def _calibration(recording: Recording) -> str:
     )
 
 
-def _notes(recording: Recording, damage: list[str]) -> dict[str, str]:
+def starting_config(recording: Recording, choices: list[Choice], config: LogConfig) -> str:
+    """TOML that makes the same choices when it is read back unchanged; comments name other possible topics."""
+    parts = [f"# Topics of {recording.path.name}. Every key in a table of a known type may be left out."]
+    for choice in choices:
+        role, table = choice.role.name, config.table(choice.role.name)
+        named = choice.candidates or choice.could_be
+        if choice.topic is not None and choice.adapter is not None:
+            topic = recording.topics[choice.topic]
+            base = shipped_like(role, topic.type_name, topic.definition())
+            parts.append(table_text(role, choice.topic, choice.adapter, base))
+        elif table:  # kept as it is, also where nothing in this log fits it
+            parts.append("\n".join([_comment(choice.reason), f"[{role}]", *plain_lines(table)]))
+        elif named:
+            parts.append(_comment("\n".join([f"[{role}]  # one of", *(f'topic = "{name}"' for name in named)])))
+        elif choice.role.is_required:  # a table to fill in, for a topic whose name contains the role
+            lines = [f"[{role}]  # no topic of a known type; the fields of other topics are listed below"]
+            likely = [topic for topic in recording.topics.values() if role in topic.name.lower() and topic.is_ros2]
+            name, kind = (likely[0].name, likely[0].type_name) if likely else ("/...", "package/msg/Type")
+            lines += [f'topic = "{name}"', f'type = "{kind}"']
+            if likely and "header.stamp.sec" not in _leaves(likely[0]):
+                lines.append('stamp = "log"  # messages without a header: when they were recorded')
+            parts.append(_comment("\n".join([*lines, _EXAMPLES[role]])))
+        else:
+            parts.append(_comment(f"[{role}]  # nothing found"))
+    if any(choice.topic is None and choice.role.is_required for choice in choices):
+        used = {choice.topic for choice in choices}
+        for topic in recording.topics.values():
+            if topic.name in used or not topic.is_ros2 or short_name(topic.type_name) == short_name(TF):
+                continue
+            fields = [f"  {path}{size}" for path, size in _leaves(topic).items()]
+            more = [f"  and {len(fields) - _MOST_FIELDS} more"] if len(fields) > _MOST_FIELDS else []
+            head = f"{topic.name} is a {topic.type_name} with the fields"
+            parts.append(_comment("\n".join([head, *fields[:_MOST_FIELDS], *more])))
+    return "\n\n".join(parts) + "\n"
+
+
+def _comment(text: str) -> str:
+    return "\n".join(f"# {line}".rstrip() for line in text.splitlines())
+
+
+def _leaves(topic: Topic) -> dict[str, str]:
+    """Paths of a type's fields, with ``[n]`` or ``[]`` for arrays and sequences; none where it cannot be read."""
     try:
-        return read_notes(recording)
-    except SonarGraphError as error:
-        damage.append(str(error))
+        return dict(leaf_fields(topic.definition()))
+    except LogError:
         return {}

@@ -1,34 +1,35 @@
-"""From an MCAP log to a `Sequence`.
+"""Reading of logs: a `Sequence` from the topics of an MCAP file, and frames from its sonar images.
 
-Whether what was read of a log is enough for an estimator, and where the calibration must stand in for it.
-
-Chosen topics put together into a sequence, with an account of what was assumed, left out, and looks wrong.
+The topics are chosen by role (`sonar_graph.logs.roles`), their messages read by adapters (`sonar_graph.logs.adapters`),
+and the calibration is gathered (`sonar_graph.logs.vehicle_setup`). The notes of the sequence, under ``log.*``, say what
+was chosen, assumed and left out, and what looks wrong (docs/design/0004-logs.md).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
-from sonar_graph.calibration import Calibration, Mounting
+from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import (
-    Adapter,
     DepthAdapter,
     DetectionArrayAdapter,
+    DetectionListsAdapter,
+    Dropped,
     DvlAdapter,
     ImuAdapter,
+    LandmarkMapAdapter,
     LogConfig,
+    MessageTable,
+    Refused,
+    SonarAdapter,
     TruthAdapter,
     changes_text,
     detection_warnings,
-    read_detections,
-    read_landmark_map,
     shipped_like,
 )
 from sonar_graph.logs.cdr import short_name
@@ -41,9 +42,8 @@ from sonar_graph.logs.checks import (
     stamp_faults,
     stuck_warning,
 )
-from sonar_graph.logs.mcap import Keep, Progress, Recording, TimeWindow, Topic, scan
-from sonar_graph.logs.message_table import Dropped, MessageTable
-from sonar_graph.logs.roles import ROLES, Choice, choose_topics, wanted_types
+from sonar_graph.logs.mcap import Keep, Progress, Recording, TimeWindow, scan, stream
+from sonar_graph.logs.roles import ROLES, SEQUENCE_ROLES, SONAR, Choice, choose_topics, wanted_types
 from sonar_graph.logs.vehicle_setup import (
     PartialCalibration,
     gathered,
@@ -54,306 +54,11 @@ from sonar_graph.logs.vehicle_setup import (
     recorded_name,
     static_frames,
 )
-from sonar_graph.measurements import Block, Depth, Dvl, Floats, Imu, LandmarkDetections
+from sonar_graph.measurements import Block, Depth, Dvl, Floats, Imu, LandmarkDetections, SonarFrames
 from sonar_graph.sequence import Sequence
-from sonar_graph.states import Trajectory
 
-
-def require_use(file: str, imu: Imu, dvl: Dvl) -> None:
-    """Refuse measurements with which no estimator could begin.
-
-    Raises
-    ------
-    LogError
-        When IMU and Doppler log have no time in common, or too few beams make a velocity in every row.
-    """
-    if max(imu.stamps_ns[0], dvl.stamps_ns[0]) > min(imu.stamps_ns[-1], dvl.stamps_ns[-1]):
-        raise LogError(
-            f"{file}: IMU {_span(imu)}, DVL {_span(dvl)}: no common time; of another clock or unit? "
-            f"See stamp, stamp_unit_s and stamp_offset_s of the log configuration"
-        )
-    if is_partial(dvl).all():
-        raise LogError(
-            f"{file}: DVL: too few valid beams in all {len(dvl)} rows; at least one row needs three, for a velocity in "
-            f"all directions"
-        )
-
-
-def unsaid_noise(dvl: Dvl, depth: Depth | None, detections: LandmarkDetections | None) -> Iterator[str]:
-    """Whose noise is the calibration's, because rows do not say it or say zero, less or no number."""
-    yield from _unsaid("dvl", dvl, dvl.velocity_cov, "dvl.velocity_sigma_m_s")
-    if depth is not None:
-        yield from _unsaid("depth", depth, depth.variance_m2, "depth.sigma_m")
-    if detections is not None:
-        fields = "sonar.range_sigma_m and azimuth_sigma_rad"
-        yield from _unsaid("detections", detections, detections.range_azimuth_cov, fields)
-
-
-def _unsaid(role: str, rows: Block, covariances: Floats, fields: str) -> Iterator[str]:
-    count = np.count_nonzero(np.isnan(covariances.reshape(len(rows), -1)).any(axis=1))
-    if count:
-        yield f"{role}: {count} of {len(rows)} rows say no covariance, {fields} of the calibration count"
-
-
-def _span(rows: Block) -> str:
-    first_s, last_s = rows.stamps_ns[0] * 1e-9, rows.stamps_ns[-1] * 1e-9
-    return f"from {first_s:.3f} to {last_s:.3f} s"
-
-
-_TABLES = frozenset({"imu", "dvl", "depth", "truth"})
-"""Roles whose messages are read as one table."""
 FOUND_ANEW = frozenset({"log.warnings", "log.gaps", "log.noise"})
-"""Notes that say how a log's own rows are; those of an earlier reading may no longer hold."""
-T = TypeVar("T")
-A = TypeVar("A", bound=Adapter)
-
-
-class Assembly:
-    """Reads the topics that were chosen.
-
-    Parameters
-    ----------
-    recording
-        The log.
-    choices
-        By role.
-    calibration
-        Instead of the one in the log; or what goes before that, field by field.
-
-    Raises
-    ------
-    LogError
-        When messages of a chosen topic are not what they should be.
-    CalibrationError
-        When the calibration in the log, or what it becomes by the user's changes, is not one.
-    """
-
-    def __init__(
-        self,
-        recording: Recording,
-        choices: Mapping[str, Choice],
-        calibration: Calibration | PartialCalibration | None = None,
-    ) -> None:
-        self._recording = recording
-        self._topics = {role: recording.topics[c.topic] for role, c in choices.items() if c.topic is not None}
-        self._adapters = {role: c.adapter for role, c in choices.items() if c.adapter is not None}
-        self._dropped: dict[str, Dropped] = {}
-        tables = {role: self._table(role, topic) for role, topic in self._topics.items() if role in _TABLES}
-        self._tables = {role: table for role, table in tables.items() if table is not None}
-        self._is_mounting_known = True
-        self._notes = {key: note for key, note in read_notes(recording).items() if key not in FOUND_ANEW}
-        self._notes["log.topics"] = "; ".join(f"{role}: {topic.name}" for role, topic in self._topics.items())
-        changes = list(self._changes())
-        if changes:
-            self._notes["log.adapters"] = "; ".join(changes)
-        if "truth" in choices and choices["truth"].topic is None:
-            self._notes["log.truth"] = choices["truth"].reason
-        self._notes |= recording.notes()
-        self.calibration = self._calibration(calibration)
-
-    def sequence(self, name: str | None = None) -> Sequence:
-        """All that was chosen as one sequence, called ``name``, or as the log calls itself, or like the file.
-
-        Raises
-        ------
-        LogError
-            When no row of IMU or DVL is fit for use, both have no time in common, no velocity is whole, or a message
-            breaks its own rules.
-        """
-        imu, dvl = self._needed("imu", self.imu()), self._needed("dvl", self.dvl())
-        require_use(str(self._recording.path), imu, dvl)
-        sequence = Sequence(
-            name=name or recorded_name(self._recording) or self._recording.path.stem,
-            calibration=self.calibration,
-            imu=imu,
-            dvl=dvl,
-            depth=self.depth(),
-            detections=self.detections(),
-            truth=self.truth(),
-            true_landmarks=self._kept("true_landmarks", (read_landmark_map(self._topics["true_landmarks"]), {}))
-            if "true_landmarks" in self._topics
-            else None,
-            notes=self._notes,
-        )
-        if self._dropped:
-            self._notes["log.dropped"] = "; ".join(self.left_out())
-        stamps = list(self._stamp_faults())
-        if stamps:
-            self._notes["log.stamps"] = "; ".join(stamps)
-        found = {
-            "log.warnings": list(self.warnings()),
-            "log.gaps": list(gap_warnings(imu, dvl, self.calibration)),
-            "log.noise": list(unsaid_noise(dvl, sequence.depth, sequence.detections)),
-        }
-        self._notes |= {subject: "; ".join(texts) for subject, texts in found.items() if texts}
-        return sequence
-
-    def imu(self) -> Imu | None:
-        """The inertial measurements; None where no topic or no row is fit."""
-        return self._kept("imu", self._adapter("imu", ImuAdapter).read(self._tables["imu"]))
-
-    def dvl(self) -> Dvl | None:
-        """The Doppler velocities; None where no topic or no row is fit."""
-        return self._kept("dvl", self._adapter("dvl", DvlAdapter).read(self._tables["dvl"]))
-
-    def depth(self) -> Depth | None:
-        """The heights; None where no topic or no row is fit."""
-        if "depth" not in self._tables:
-            return None
-        adapter = self._adapter("depth", DepthAdapter)
-        assumption = adapter.assumption(self.calibration.gravity_m_s2)
-        if assumption:
-            self._notes["log.depth"] = assumption
-        return self._kept("depth", adapter.read(self._tables["depth"], self.calibration.gravity_m_s2))
-
-    def detections(self) -> LandmarkDetections | None:
-        """The landmark detections; None where no topic or no row is fit."""
-        return self._detections
-
-    @cached_property
-    def _detections(self) -> LandmarkDetections | None:
-        if "detections" not in self._topics:
-            return None
-        adapter, topic = self._adapters["detections"], self._topics["detections"]
-        outcome = adapter.read(topic) if isinstance(adapter, DetectionArrayAdapter) else read_detections(topic)
-        return self._kept("detections", outcome)
-
-    def truth(self) -> Trajectory | None:
-        """The reference poses; None where no topic or no row is fit."""
-        if "truth" not in self._tables:
-            return None
-        return self._kept("truth", self._adapter("truth", TruthAdapter).read(self._tables["truth"]))
-
-    def left_out(self) -> list[str]:
-        """Rows that were left out of what was read so far, by role and reason."""
-        return [f"{role}: {_list(dropped)}" for role, dropped in self._dropped.items()]
-
-    def warnings(self) -> Iterator[str]:
-        """What can be read but looks wrong."""
-        for role, table in self._tables.items():
-            yield from (f"{role}: {text}" for text in self._adapters[role].warnings(table))
-        if "imu" in self._tables and (imu := self.imu()) is not None:
-            yield from (f"imu: {text}" for text in self._inertial_warnings(imu))
-        is_linear = self.calibration.odometry_interpolation == "linear"  # wheels may turn evenly
-        if is_linear and "dvl" in self._tables and (dvl := self.dvl()) is not None:
-            text = stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")
-            yield from [f"dvl: {text}"] if text else []
-        if "dvl" in self._tables and not self._is_mounting_known:
-            text = axes_warning(self._adapters["dvl"])
-            yield from [f"dvl: {text}"] if text else []
-
-        yield from (f"detections: {text}" for text in self._detection_warnings())
-
-    def _detection_warnings(self) -> Iterator[str]:
-        odometry = [self._tables[role].stamps_ns for role in ("imu", "dvl") if role in self._tables]
-        if (seen := self.detections()) is not None and len(odometry) == 2:
-            first_ns, last_ns = max(stamps.min() for stamps in odometry), min(stamps.max() for stamps in odometry)
-            yield from detection_warnings(seen, int(first_ns), int(last_ns))
-
-    def _inertial_warnings(self, imu: Imu) -> Iterator[str]:
-        text = gravity_warning(imu.specific_force, self.calibration.imu.mounting, self.calibration.gravity_m_s2)
-        yield from [text] if text else []
-        if self.calibration.odometry_interpolation == "linear":  # held rates may jump
-            text = spike_warning(imu)
-            yield from [text] if text else []
-            text = stuck_warning(imu.stamps_ns, imu.angular_velocity, "angular rate")
-            yield from [text] if text else []
-
-    def _gaps(self) -> Iterator[str]:
-        imu = self.imu() if "imu" in self._tables else None
-        dvl = self.dvl() if "dvl" in self._tables else None
-        if imu is not None and dvl is not None:
-            yield from gap_warnings(imu, dvl, self.calibration)
-
-    def _stamp_faults(self) -> Iterator[str]:
-        for role, table in self._tables.items():
-            yield from (f"{role}: {text}" for text in stamp_faults(table.stamps_ns, table.topic.log_times_ns))
-
-    def survey(self) -> tuple[list[str], list[str]]:
-        """What is left out and what looks wrong in all that was chosen, be it enough for a sequence or not."""
-        gaps = list(self._gaps())
-        self.depth(), self.detections(), self.truth()
-        return self.left_out(), [*self.warnings(), *gaps]
-
-    def _changes(self) -> Iterator[str]:
-        """What was said about topics beyond the adapters that come along."""
-        for role, adapter in self._adapters.items():
-            topic = self._topics[role]
-            text = changes_text(adapter, shipped_like(role, topic.type_name, topic.definition()))
-            yield from [f"{role}: {text}"] if text else []
-
-    def _adapter(self, role: str, kind: type[A]) -> A:
-        adapter = self._adapters[role]
-        assert isinstance(adapter, kind)  # each role has adapters of one kind
-        return adapter
-
-    def _table(self, role: str, topic: Topic) -> MessageTable | None:
-        """None for a role that is not needed, where no message of its topic is sound."""
-        try:
-            return self._adapters[role].table(topic)
-        except LogError:
-            if len(topic) or ROLES[role].is_required:
-                raise
-            self._dropped[role] = topic.unsound
-            return None
-
-    def _kept(self, role: str, outcome: tuple[T, Dropped]) -> T:
-        dropped = self._topics[role].unsound | outcome[1]
-        if dropped:
-            self._dropped[role] = dropped
-        return outcome[0]
-
-    def _needed(self, role: str, block: T | None) -> T:
-        if block is None:
-            topic = self._topics[role]
-            faults = _list(self._dropped.get(role, {}))
-            raise LogError(f"{topic.file}: topic {topic.name}: none of its {len(topic)} messages can be used: {faults}")
-        return block
-
-    def _calibration(self, given: Calibration | PartialCalibration | None) -> Calibration:
-        if isinstance(given, Calibration):
-            self._notes["log.calibration"] = "given by the caller"
-            return given
-        recorded = read_calibration(self._recording)
-        said = mounted_by(given.values if given else {}) | mounted_by(
-            recorded.model_dump(exclude_unset=True) if recorded else {}
-        )
-        sensors = self._frames()
-        known = self._mountings(sensors)
-        self._is_mounting_known = "dvl" in known.keys() | said
-        of_log = "from the log" if recorded else _source_of_mountings(sensors, known, said)
-        self._notes["log.calibration"] = (
-            f"from {given.source}: {', '.join(given.fields()) or 'nothing'}; else {of_log}" if given else of_log
-        )
-        return gathered(given, recorded, known)
-
-    def _frames(self) -> dict[str, str]:
-        """The frame of each sensor, by the calibration's name for it."""
-        frames = {
-            role: self._adapters[role].frame_in(table.groups) for role, table in self._tables.items() if role != "truth"
-        }
-        if not frames.get("depth", "depth"):
-            del frames["depth"]  # a pose in the world: there is no port to mount
-        if "detections" in self._topics and (messages := self._topics["detections"].messages()):
-            frames["sonar"] = self._adapters["detections"].frame_in(messages)
-        return frames
-
-    def _mountings(self, sensors: Mapping[str, str]) -> dict[str, Mounting]:
-        tree = static_frames(self._recording)
-        found = {name: mounting_of(frame, tree) for name, frame in sensors.items()}
-        return {name: mounting for name, mounting in found.items() if mounting is not None}
-
-
-def _source_of_mountings(sensors: Mapping[str, str], known: Mapping[str, Mounting], said: set[str]) -> str:
-    """Where the places of sensors come from in a log without a calibration, in words."""
-    missing = [f"{name} ({frame or 'unnamed'})" for name, frame in sensors.items() if name not in known.keys() | said]
-    return f"defaults; mountings from /tf_static: {', '.join(known) or 'none'}" + (
-        f"; not in the tree, taken as base_link: {', '.join(missing)}" if missing else ""
-    )
-
-
-def _list(dropped: Dropped) -> str:
-    return ", ".join(f"{count} {fault}" for fault, count in dropped.items())
+"""Notes about the rows of a log; those of an earlier reading may no longer hold."""
 
 
 def read_log(
@@ -367,31 +72,36 @@ def read_log(
     salvage: bool = False,
     progress: Progress | None = None,
 ) -> Sequence:
-    """Read a log of ROS 2 messages.
+    """Read a log of ROS 2 messages as a `Sequence`.
 
-    Stamps are those of the sensors' headers. What was left out, which topic was used for what and where the
-    calibration comes from is in the sequence's notes, under ``log.*``.
+    Stamps are those of the sensors' headers. The notes of the sequence, under ``log.*``, say which topic was used for
+    what, where the calibration comes from, what was left out and what looks wrong.
 
     Parameters
     ----------
     path
         An MCAP file.
     calibration
-        A `Calibration` replaces all that the file says. A `PartialCalibration` goes before it, field by field.
-        Without either: the file's record; where it has none, defaults with the mountings of ``/tf_static``.
+        A `Calibration` replaces everything that the file says. A `PartialCalibration` goes before it, field by field.
+        Without either the file's record holds; without a record, defaults with the mountings of ``/tf_static``.
     name
-        Instead of the one in the file; without either, the file's name.
+        Name of the sequence, instead of the one in the file; without either, the file's name.
     topics
         Topics by role (``imu``, ``dvl``, ``depth``, ``detections``, ``truth``, ``true_landmarks``), where several
-        fit or none is found by type and name; before those of `config`.
+        fit or none is found by type and name; they go before those of `config`.
     config
-        What the topics of a foreign log are; `read_log_config` reads one from a TOML file.
+        Description of the topics of a foreign log; `read_log_config` reads one from a TOML file.
     window
-        Only what was recorded then, with ``/tf_static`` and other latched topics whenever recorded.
+        Part of the recording to read; ``/tf_static`` and other latched topics are read whenever recorded.
     salvage
-        Read what is whole of a file that is damaged in its middle; what is lost is in the notes, under ``log.damage``.
+        Read what is whole of a file that is damaged in its middle; the note ``log.damage`` says what is lost.
     progress
-        Called with the bytes done and the bytes in all.
+        Called with the bytes read so far and the bytes in all.
+
+    Returns
+    -------
+    Sequence
+        Measurements, calibration, notes, and truth where the log has it.
 
     Raises
     ------
@@ -401,7 +111,32 @@ def read_log(
         When the file is not MCAP, is damaged in its middle without `salvage`, has nothing in the window, or a message
         breaks its own rules.
     CalibrationError
-        When the calibration in the file, or what `calibration` makes of it, is not one.
+        When the calibration in the file is invalid, or becomes so by `calibration`.
+
+    See Also
+    --------
+    write_log : The inverse.
+    inspect_log : A summary of a log that may lack what reading needs.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> from sonar_graph.calibration import Calibration
+    >>> from sonar_graph.logs import read_log, write_log
+    >>> from sonar_graph.measurements import Dvl, Imu
+    >>> from sonar_graph.sequence import Sequence
+    >>> stamps_ns = np.arange(50) * 10**8
+    >>> imu = Imu(stamps_ns, np.zeros((50, 3)), np.tile([0.0, 0.0, 9.81], (50, 1)))
+    >>> dvl = Dvl(stamps_ns, np.tile([0.5, 0.0, 0.0], (50, 1)), np.tile(1e-4 * np.eye(3), (50, 1, 1)))
+    >>> with TemporaryDirectory() as folder:
+    ...     write_log(Path(folder) / "dive.mcap", Sequence("straight", Calibration(), imu, dvl))
+    ...     sequence = read_log(Path(folder) / "dive.mcap")
+    >>> sequence.name, len(sequence.imu), sequence.duration_s
+    ('straight', 50, 4.9)
+    >>> sequence.notes["log.topics"]
+    'imu: /imu/data; dvl: /dvl/data'
     """
     path = Path(path)
     config = config or LogConfig()
@@ -410,22 +145,282 @@ def read_log(
     if not salvage:
         recording.require_sound()
     sequence = Assembly(recording, choose_topics(recording, topics or {}, config), calibration).sequence(name)
-    said = _start_elsewhere(recording, calibration, window)
-    return replace(sequence, notes=sequence.notes | {"log.start": said}) if said else sequence
+    if window is not None and window.start is not None and recording.beginning_ns is not None:
+        late_ns = window.start.resolve(recording.beginning_ns) - recording.beginning_ns
+        given = calibration.values if isinstance(calibration, PartialCalibration) else {}
+        recorded = None if isinstance(calibration, Calibration) else read_calibration(recording)
+        if late_ns > 0 and "start" not in given and recorded is not None and "start" in recorded.model_fields_set:
+            sequence.notes["log.start"] = (
+                f"the start pose that it states is of its beginning, {late_ns * 1e-9:.3f} s before the part that was "
+                "read; give the pose there as [start] position_m and rpy_rad in a file for --calibration"
+            )
+    return sequence
 
 
-def _start_elsewhere(
-    recording: Recording, given: Calibration | PartialCalibration | None, window: TimeWindow | None
-) -> str | None:
-    """That the start pose in the log is of another instant than the first one read; None where that is not so."""
-    if window is None or window.start is None or recording.beginning_ns is None or isinstance(given, Calibration):
-        return None
-    recorded = read_calibration(recording)
-    is_given = given is not None and "start" in given.values
-    late_ns = window.start.resolve(recording.beginning_ns) - recording.beginning_ns
-    if is_given or late_ns <= 0 or recorded is None or "start" not in recorded.model_fields_set:
-        return None
+class Assembly:
+    """Blocks of measurements from the chosen topics of a log, with an account of rows left out and warnings.
+
+    Parameters
+    ----------
+    recording
+        The log.
+    choices
+        The choice for each role.
+    calibration
+        As for `read_log`.
+
+    Raises
+    ------
+    LogError
+        When no message of a needed topic is what its definition says.
+    CalibrationError
+        When the calibration in the log is invalid, or becomes so by the user's changes.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        choices: Mapping[str, Choice],
+        calibration: Calibration | PartialCalibration | None = None,
+    ) -> None:
+        self._recording = recording
+        self._topics = {role: recording.topics[c.topic] for role, c in choices.items() if c.topic is not None}
+        self._adapters = {role: c.adapter for role, c in choices.items() if c.adapter is not None}
+        self._blocks: dict[str, Any] = {}
+        self._dropped: dict[str, Dropped] = {}
+        self._tables: dict[str, MessageTable] = {}
+        for role, topic in self._topics.items():
+            if isinstance(self._adapters[role], ImuAdapter | DvlAdapter | DepthAdapter | TruthAdapter):
+                try:
+                    self._tables[role] = self._adapters[role].table(topic)
+                except LogError:
+                    if len(topic) or ROLES[role].is_required:
+                        raise
+                    self._dropped[role] = topic.unsound
+        self._notes = {key: note for key, note in read_notes(recording).items() if key not in FOUND_ANEW}
+        self._notes["log.topics"] = "; ".join(f"{role}: {topic.name}" for role, topic in self._topics.items())
+        changes = []
+        for role, topic in self._topics.items():
+            adapter = self._adapters[role]
+            if text := changes_text(adapter, shipped_like(role, topic.type_name, topic.definition())):
+                changes.append(f"{role}: {text}")
+        if changes:
+            self._notes["log.adapters"] = "; ".join(changes)
+        if "truth" in choices and choices["truth"].topic is None:
+            self._notes["log.truth"] = choices["truth"].reason
+        self._notes |= recording.notes()
+        self._is_mounting_known = True
+        self.calibration = calibration if isinstance(calibration, Calibration) else self._gathered(calibration)
+        if isinstance(calibration, Calibration):
+            self._notes["log.calibration"] = "given by the caller"
+
+    def _gathered(self, given: PartialCalibration | None) -> Calibration:
+        """The calibration of user, record, ``/tf_static`` and defaults, with its sources in the notes."""
+        recorded = read_calibration(self._recording)
+        stated = mounted_by(recorded.model_dump(exclude_unset=True)) if recorded else set()
+        stated |= mounted_by(given.values) if given else set()
+        frames = {
+            role: self._adapters[role].frame_in(table.groups) for role, table in self._tables.items() if role != "truth"
+        }
+        if not frames.get("depth", "depth"):
+            del frames["depth"]  # a pose in the world: there is no port to mount
+        if "detections" in self._topics and (messages := self._topics["detections"].messages()):
+            frames["sonar"] = self._adapters["detections"].frame_in(messages)
+        tree = static_frames(self._recording)
+        mountings = {name: found for name, frame in frames.items() if (found := mounting_of(frame, tree)) is not None}
+        mounted = mountings.keys() | stated
+        self._is_mounting_known = "dvl" in mounted
+        source = "from the log"
+        if recorded is None:
+            source = f"defaults; mountings from /tf_static: {', '.join(mountings) or 'none'}"
+            missing = [f"{name} ({frame or 'unnamed'})" for name, frame in frames.items() if name not in mounted]
+            source += f"; not in the tree, taken as base_link: {', '.join(missing)}" if missing else ""
+        if given:
+            source = f"from {given.source}: {', '.join(given.fields()) or 'nothing'}; else {source}"
+        self._notes["log.calibration"] = source
+        return gathered(given, recorded, mountings)
+
+    def block(self, role: str) -> Any:
+        """The measurements of a role; None where it has no topic, or none of its rows is fit."""
+        if role in self._blocks or role not in self._topics:
+            return self._blocks.get(role)
+        topic, table = self._topics[role], self._tables.get(role)
+        outcome: tuple[Any, Dropped] = None, {}
+        match self._adapters[role]:
+            case ImuAdapter() | DvlAdapter() | TruthAdapter() as adapter if table is not None:
+                outcome = adapter.read(table)
+            case DepthAdapter() as adapter if table is not None:
+                gravity_m_s2 = self.calibration.gravity_m_s2
+                if assumption := adapter.assumption(gravity_m_s2):
+                    self._notes["log.depth"] = assumption
+                outcome = adapter.read(table, gravity_m_s2)
+            case DetectionListsAdapter() | DetectionArrayAdapter() | LandmarkMapAdapter() as adapter:
+                outcome = adapter.read(topic)
+        self._blocks[role], dropped = outcome
+        if dropped := topic.unsound | dropped:
+            self._dropped[role] = dropped
+        return self._blocks[role]
+
+    def sequence(self, name: str | None = None) -> Sequence:
+        """Everything that was chosen as one sequence, called ``name``, or as the log calls itself, or like the file.
+
+        Raises
+        ------
+        LogError
+            When no row of IMU or DVL is fit for use, both have no time in common, no velocity is whole, or a message
+            breaks its own rules.
+        """
+        for role in ("imu", "dvl"):
+            if self.block(role) is None:
+                topic, faults = self._topics[role], _counts(self._dropped.get(role, {}))
+                raise LogError(
+                    f"{topic.file}: topic {topic.name}: none of its {len(topic)} messages can be used: {faults}"
+                )
+        require_use(str(self._recording.path), self.block("imu"), self.block("dvl"))
+        blocks = {role: self.block(role) for role in SEQUENCE_ROLES}
+        stamps = [
+            f"{role}: {text}"
+            for role, table in self._tables.items()
+            for text in stamp_faults(table.stamps_ns, table.topic.log_times_ns)
+        ]
+        findings = {
+            "log.dropped": self.left_out(),
+            "log.stamps": stamps,
+            "log.warnings": list(self.warnings()),
+            "log.gaps": list(gap_warnings(blocks["imu"], blocks["dvl"], self.calibration)),
+            "log.noise": list(unsaid_noise(blocks["dvl"], blocks["depth"], blocks["detections"])),
+        }
+        self._notes |= {subject: "; ".join(texts) for subject, texts in findings.items() if texts}
+        name = name or recorded_name(self._recording) or self._recording.path.stem
+        return Sequence(name=name, calibration=self.calibration, notes=self._notes, **blocks)
+
+    def survey(self) -> tuple[list[str], list[str]]:
+        """Rows left out and warnings of everything that was chosen, whether or not it is enough for a sequence."""
+        imu, dvl, *_ = (self.block(role) for role in SEQUENCE_ROLES)
+        gaps = gap_warnings(imu, dvl, self.calibration) if imu is not None and dvl is not None else ()
+        return self.left_out(), [*self.warnings(), *gaps]
+
+    def left_out(self) -> list[str]:
+        """Numbers of rows that were left out of the blocks read so far, by role and reason."""
+        return [f"{role}: {_counts(dropped)}" for role, dropped in self._dropped.items()]
+
+    def warnings(self) -> Iterator[str]:
+        """Sentences about messages that can be read but look wrong, each after its role."""
+        for role, table in self._tables.items():
+            yield from (f"{role}: {text}" for text in self._adapters[role].warnings(table))
+        imu, dvl, detections = self.block("imu"), self.block("dvl"), self.block("detections")
+        mounting, gravity_m_s2 = self.calibration.imu.mounting, self.calibration.gravity_m_s2
+        is_linear = self.calibration.odometry_interpolation == "linear"  # otherwise rates jump, and wheels turn evenly
+        found: list[tuple[str, str | None]] = []
+        if imu is not None:
+            found.append(("imu", gravity_warning(imu.specific_force, mounting, gravity_m_s2)))
+        if imu is not None and is_linear:
+            found.append(("imu", spike_warning(imu)))
+            found.append(("imu", stuck_warning(imu.stamps_ns, imu.angular_velocity, "angular rate")))
+        if dvl is not None and is_linear:
+            found.append(("dvl", stuck_warning(dvl.stamps_ns, dvl.velocity, "velocity")))
+        if "dvl" in self._tables and not self._is_mounting_known:
+            found.append(("dvl", axes_warning(self._adapters["dvl"])))
+        yield from (f"{role}: {text}" for role, text in found if text)
+        stamps = [self._tables[role].stamps_ns for role in ("imu", "dvl") if role in self._tables]
+        if detections is not None and len(stamps) == 2:
+            first_ns, last_ns = max(ns.min() for ns in stamps), min(ns.max() for ns in stamps)
+            texts = detection_warnings(detections, int(first_ns), int(last_ns))
+            yield from (f"detections: {text}" for text in texts)
+
+
+def _counts(dropped: Dropped) -> str:
+    return ", ".join(f"{count} {fault}" for fault, count in dropped.items())
+
+
+def require_use(file: str, imu: Imu, dvl: Dvl) -> None:
+    """Refuse measurements with which no estimator could begin.
+
+    Raises
+    ------
+    LogError
+        When IMU and Doppler log have no time in common, or no row of the Doppler log has a velocity in all directions.
+    """
+    if max(imu.stamps_ns[0], dvl.stamps_ns[0]) > min(imu.stamps_ns[-1], dvl.stamps_ns[-1]):
+        raise LogError(
+            f"{file}: IMU {_span(imu)}, DVL {_span(dvl)}: no common time; of another clock or unit? "
+            f"See stamp, stamp_unit_s and stamp_offset_s of the log configuration"
+        )
+    if is_partial(dvl).all():
+        raise LogError(
+            f"{file}: DVL: too few valid beams in all {len(dvl)} rows; at least one row needs three, for a velocity in "
+            f"all directions"
+        )
+
+
+def _span(rows: Block) -> str:
+    return f"from {rows.stamps_ns[0] * 1e-9:.3f} to {rows.stamps_ns[-1] * 1e-9:.3f} s"
+
+
+def unsaid_noise(dvl: Dvl, depth: Depth | None, detections: LandmarkDetections | None) -> Iterator[str]:
+    """Sensors with rows of unknown covariance, for which the noise of the calibration counts."""
+    columns: list[tuple[str, Floats, str]] = [("dvl", dvl.velocity_cov, "dvl.velocity_sigma_m_s")]
+    if depth is not None:
+        columns.append(("depth", depth.variance_m2, "depth.sigma_m"))
+    if detections is not None:
+        fields = "sonar.range_sigma_m and azimuth_sigma_rad"
+        columns.append(("detections", detections.range_azimuth_cov, fields))
+    for role, covariances, fields in columns:
+        count = np.count_nonzero(np.isnan(covariances.reshape(len(covariances), -1)).any(axis=1))
+        if count:
+            yield f"{role}: {count} of {len(covariances)} rows say no covariance, {fields} of the calibration count"
+
+
+def read_sonar_frames(
+    path: Path,
+    topic: str | None = None,
+    config: LogConfig | None = None,
+    *,
+    window: TimeWindow | None = None,
+    salvage: bool = False,
+    refused: Refused | None = None,
+) -> Iterator[SonarFrames]:
+    """Read the frames of one sonar in blocks that share beams and bins, holding one chunk of the file at a time.
+
+    Blocks and the frames in them are in the order of the log; a block ends before a frame with an earlier stamp.
+
+    Parameters
+    ----------
+    path
+        An MCAP file.
+    topic
+        Topic of the images, where several fit.
+    config
+        Description of the topics of a foreign log; its table is ``[sonar]``.
+    window, salvage
+        As for `read_log`.
+    refused
+        Called with stamp and reason of each message that is no image; None: the first is an error.
+
+    Raises
+    ------
+    MissingTopicError
+        When the topic that was asked for is not there, or is none that can be read.
+    LogError
+        When several topics fit, the file is damaged in its middle (without ``salvage``, after the last frame), or an
+        image is not what its message says (without ``refused``). A log without sonar images gives no block.
+    """
+    config, path = config or LogConfig(), Path(path)
+    recording = scan(path, lambda _: Keep.NONE)
+    choice = choose_topics(recording, {SONAR: topic} if topic else {}, config, (SONAR,))[SONAR]
+    if choice.topic is None or not isinstance(choice.adapter, SonarAdapter):
+        return
+    kind = recording.topics[choice.topic].type_name
+    for piece in stream(path, lambda name: Keep.ALL if name == kind else Keep.NONE, window, salvage=salvage):
+        if piece.name == choice.topic:
+            yield from choice.adapter.read(piece, refused)
+
+
+def describe_frames(frames: SonarFrames) -> str:
+    """Size, sector and range of a block, in words."""
+    _, beams, bins = frames.intensity.shape
+    left, right = np.degrees([frames.azimuths_rad.max(), frames.azimuths_rad.min()])
     return (
-        f"the start pose that it states is of its beginning, {late_ns * 1e-9:.3f} s before the part that was read; "
-        "give the pose there as [start] position_m and rpy_rad in a file for --calibration"
+        f"{beams} beams x {bins} bins of {frames.intensity.dtype}, azimuth {right:.1f}° to {left:.1f}°, "
+        f"{frames.ranges_m.min():.2f} m to {frames.ranges_m.max():.2f} m"
     )

@@ -1,6 +1,7 @@
-"""Which topic of a log plays which part: as the user said, or found by type, and by name where that says too little.
+"""Roles and the topics that play them, chosen by the user or found by message type and, where that is general, name.
 
-Why the messages of a topic cannot be decoded.
+A role is a part of a `Sequence` (IMU, Doppler log, depth, detections, truth) or the sonar images. Every choice comes
+with its reason, for notes, error messages and `inspect_log` (docs/design/0004-logs.md).
 """
 
 from __future__ import annotations
@@ -12,27 +13,6 @@ from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.adapters import SHIPPED, Adapter, LogConfig, Shipped
 from sonar_graph.logs.cdr import parse_definition, short_name
 from sonar_graph.logs.mcap import Recording, Topic
-
-_ADVICE = {
-    "ros2idl": "record it again where the type's .msg file is installed, or publish a type that is defined by one",
-}
-
-
-def refusal(topic: Topic) -> str | None:
-    """What is in the way, which completes "/imu ..."; None where nothing is."""
-    if topic.encoding != "cdr":
-        return f"has messages in {topic.encoding or 'no named encoding'}; only ROS 2 CDR is read"
-    if not topic.schema_encoding:
-        return "has no definition of its messages"
-    if topic.schema_encoding != "ros2msg":
-        advice = _ADVICE.get(topic.schema_encoding)
-        return f"has a definition in {topic.schema_encoding}; only ros2msg is read" + (f": {advice}" if advice else "")
-    try:
-        parse_definition(topic.type_name, topic.schema_text)
-    except LogError as error:
-        return f"has a definition that cannot be read: {error}"
-    return None
-
 
 IMU = "sensor_msgs/msg/Imu"
 DVL = "marine_acoustic_msgs/msg/Dvl"
@@ -53,42 +33,55 @@ class Role:
 
     name: str
     shipped: tuple[Shipped, ...]
-    """The adapters that come along for it."""
     is_required: bool = False
 
     def describe(self) -> str:
-        """What is looked for."""
-        by_words: dict[tuple[str, ...], list[str]] = {}
+        """Message types that can play the role, with the words that a topic's name needs."""
+        by_words: dict[tuple[str, ...], dict[str, None]] = {}
         for offer in self.shipped:
-            names = by_words.setdefault(offer.words, [])
-            if short_name(offer.adapter.type) not in names:
-                names.append(short_name(offer.adapter.type))
+            by_words.setdefault(offer.words, {})[short_name(offer.adapter.type)] = None
         return ", or ".join(
             ", ".join(names) + (f" on a topic with {' or '.join(map(repr, words))} in its name" if words else "")
             for words, names in by_words.items()
         )
 
+    def fits(self, topic: Topic, *, general: bool) -> bool:
+        """Tell whether a topic fits one of the shipped adapters, of those that are general or of the others."""
+        return any(
+            short_name(offer.adapter.type) == short_name(topic.type_name)
+            and (not offer.words or any(word in topic.name.lower() for word in offer.words))
+            for offer in self.shipped
+            if offer.is_general == general
+        )
+
 
 ROLES = {name: Role(name, shipped, is_required=name in ("imu", "dvl")) for name, shipped in SHIPPED.items()}
 SEQUENCE_ROLES = tuple(name for name in ROLES if name != SONAR)
-"""Those that make a `Sequence`; sonar images are read by themselves."""
+"""Roles that make a `Sequence`, called like its fields; sonar images are read by themselves."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The topic that plays a part, or why none does."""
+    """The topic that plays a role, or the reason why none does."""
 
     role: Role
     topic: str | None
     reason: str
     adapter: Adapter | None = None
-    """How its messages are read."""
+    """Adapter for its messages."""
     candidates: tuple[str, ...] = field(default=())
-    """The topics that fit, where they are several."""
+    """Topics that fit, where they are several."""
     could_be: tuple[str, ...] = field(default=())
-    """Topics that could be read for it, but whose names do not say that they play it."""
+    """Topics of a fitting type whose names do not say that they play the role."""
     is_off: bool = False
     """The user wants nothing to play it."""
+
+    def advice(self) -> str:
+        """Advice to choose one of several topics, on the command line, in Python and in a log configuration."""
+        role, topic = self.role.name, self.candidates[0]
+        return (
+            f"--topic {role}={topic} (topics={{{role!r}: {topic!r}}} in Python, [{role}] topic in a log configuration)"
+        )
 
 
 def wanted_types(config: LogConfig = _DEFAULTS, roles: Iterable[str] = SEQUENCE_ROLES) -> frozenset[str]:
@@ -97,15 +90,52 @@ def wanted_types(config: LogConfig = _DEFAULTS, roles: Iterable[str] = SEQUENCE_
     return config.types() | shipped | {short_name(TF)}
 
 
+def refusal(topic: Topic) -> str | None:
+    """Reason why the messages of a topic cannot be decoded, which completes "/imu ..."; None: they can."""
+    if topic.encoding != "cdr":
+        return f"has messages in {topic.encoding or 'no named encoding'}; only ROS 2 CDR is read"
+    if not topic.schema_encoding:
+        return "has no definition of its messages"
+    if topic.schema_encoding == "ros2idl":
+        return (
+            "has a definition in ros2idl; only ros2msg is read: record it again where the type's .msg file is "
+            "installed, or publish a type that is defined by one"
+        )
+    if topic.schema_encoding != "ros2msg":
+        return f"has a definition in {topic.schema_encoding}; only ros2msg is read"
+    try:
+        parse_definition(topic.type_name, topic.schema_text)
+    except LogError as error:
+        return f"has a definition that cannot be read: {error}"
+    return None
+
+
+def adapter_for(role: Role, topic: Topic, config: LogConfig) -> Adapter | str:
+    """Adapter for a topic in a role, or the reason why there is none."""
+    if (reason := refusal(topic)) is not None:
+        return reason
+    table = config.table(role.name)
+    if "type" in table and short_name(table["type"]) != short_name(topic.type_name):
+        return f"is a {topic.type_name}, and {config.source} asks for a {table['type']}"
+    lacking: list[str] = []
+    for adapter in config.adapters(role.name, topic.type_name):
+        lacking = adapter.missing_in(topic.definition())
+        if not lacking:
+            return adapter
+    if lacking:
+        return f"has no field {', '.join(lacking)}"
+    return f"is a {topic.type_name}, for which no adapter is shipped: name type and fields in --log-config"
+
+
 def choose_topic(role: Role, recording: Recording, config: LogConfig = _DEFAULTS, wanted: str | None = None) -> Choice:
-    """The topic for a part, and how to read it; a reason instead of an error where there is none.
+    """Choose the topic for a role and its adapter; where there is none, the choice has a reason instead of an error.
 
     Parameters
     ----------
     role, recording
-        The part and the log.
+        The role and the log.
     config
-        What the user said about topics; its topic goes before a search by type.
+        The user's log configuration; its topic goes before a search by type.
     wanted
         The topic that the user chose, before that of the configuration.
 
@@ -114,99 +144,49 @@ def choose_topic(role: Role, recording: Recording, config: LogConfig = _DEFAULTS
     LogError
         When the configuration names fields that the messages which it is about do not have.
     """
-    choice = _choose(role, recording, config, wanted)
-    for topic in _topics_meant(choice, recording, config, wanted):
-        config.require_fields(role.name, topic.type_name, topic.definition())
+    table, topics = config.table(role.name), recording.topics
+    if table.get("use") is False and wanted is None:
+        return Choice(role, None, f"switched off in {config.source}", is_off=True)
+    named, asked = wanted or table.get("topic"), table.get("type")
+    if named:
+        meant = [topics[named]] if named in topics else []
+        adapter = adapter_for(role, meant[0], config) if meant else "is not in the log"
+        if isinstance(adapter, str):
+            choice = Choice(role, None, f"{named} was chosen but {adapter}")
+        else:
+            choice = Choice(role, named, f"chosen {'by name' if wanted else f'in {config.source}'}", adapter)
+    elif asked:
+        meant = [topic for topic in topics.values() if short_name(topic.type_name) == short_name(asked)]
+        choice = _only(role, recording, config, meant) or Choice(
+            role, None, f"no {asked}, which {config.source} asks for"
+        )
+    else:
+        telling, general = ([t for t in topics.values() if role.fits(t, general=of)] for of in (False, True))
+        meant = telling + general
+        found = _only(role, recording, config, telling) or _only(role, recording, config, general)
+        if found is None:
+            others = tuple(t.name for t in topics.values() if not isinstance(adapter_for(role, t, config), str))
+            hint = f"; {', '.join(others)} only if chosen: --topic {role.name}={others[0]}" if others else ""
+            found = Choice(role, None, f"no {role.describe()}{hint}", could_be=others)
+        choice = found
+    if table and not choice.candidates:
+        for topic in [topics[choice.topic]] if choice.topic else meant:
+            if refusal(topic) is None:
+                config.require_fields(role.name, topic.type_name, topic.definition())
     return choice
 
 
-def _topics_meant(choice: Choice, recording: Recording, config: LogConfig, wanted: str | None) -> list[Topic]:
-    """The topics that a table of the configuration is about; none where there is no table."""
-    table, topics = config.table(choice.role.name), recording.topics
-    if not table or choice.is_off or choice.candidates:
-        return []
-    named = choice.topic or wanted or table.get("topic")
-    if named:
-        meant = [topics[named]] if named in topics else []
-    elif "type" in table:
-        meant = [t for t in topics.values() if short_name(t.type_name) == short_name(table["type"])]
-    else:
-        meant = [t for t in topics.values() if any(_fits(choice.role, t, general=general) for general in (False, True))]
-    return [t for t in meant if refusal(t) is None]
-
-
-def _choose(role: Role, recording: Recording, config: LogConfig, wanted: str | None) -> Choice:
-    table = config.table(role.name)
-    if table.get("use") is False and wanted is None:
-        return Choice(role, None, f"switched off in {config.source}", is_off=True)
-    named = wanted or table.get("topic") or None
-    if named is not None:
-        return _named(role, recording, config, named, "by name" if wanted else f"in {config.source}")
-    if "type" in table:
-        fitting = [t for t in recording.topics.values() if short_name(t.type_name) == short_name(table["type"])]
-        return _only(role, recording, config, fitting) or Choice(
-            role, None, f"no {table['type']}, which {config.source} asks for"
-        )
-    return _by_type(role, recording, config)
-
-
-def _named(role: Role, recording: Recording, config: LogConfig, name: str, how: str) -> Choice:
-    topic = recording.topics.get(name)
-    if topic is None:
-        return Choice(role, None, f"{name} was chosen but is not in the log")
-    adapter = adapter_for(role, topic, config)
-    if isinstance(adapter, str):
-        return Choice(role, None, f"{name} was chosen but {adapter}")
-    return Choice(role, name, f"chosen {how}", adapter)
-
-
-def _by_type(role: Role, recording: Recording, config: LogConfig) -> Choice:
-    for general in (False, True):
-        fitting = [t for t in recording.topics.values() if _fits(role, t, general=general)]
-        if (choice := _only(role, recording, config, fitting)) is not None:
-            return choice
-    others = tuple(t.name for t in recording.topics.values() if not isinstance(adapter_for(role, t, config), str))
-    passed_over = f"; {', '.join(others)} only if chosen: --topic {role.name}={others[0]}" if others else ""
-    return Choice(role, None, f"no {role.describe()}{passed_over}", could_be=others)
-
-
-def _fits(role: Role, topic: Topic, *, general: bool) -> bool:
-    return any(
-        short_name(offer.adapter.type) == short_name(topic.type_name)
-        and (not offer.words or any(word in topic.name.lower() for word in offer.words))
-        for offer in role.shipped
-        if offer.is_general == general
-    )
-
-
 def _only(role: Role, recording: Recording, config: LogConfig, fitting: list[Topic]) -> Choice | None:
-    """The only one of the topics that fit; None where none does."""
+    """Choose the only usable topic of those that fit; None where none fits."""
     adapters = {topic.name: adapter_for(role, topic, config) for topic in fitting}
     usable = {name: adapter for name, adapter in adapters.items() if not isinstance(adapter, str)}
     if len(usable) > 1:
         return Choice(role, None, f"{len(usable)} topics fit: {', '.join(usable)}", candidates=tuple(usable))
     for name, adapter in usable.items():
-        as_said = f", read as {config.source} says" if config.table(role.name) else ""
-        return Choice(role, name, f"the only {recording.topics[name].type_name} that fits{as_said}", adapter)
+        as_told = f", read as {config.source} says" if config.table(role.name) else ""
+        return Choice(role, name, f"the only {recording.topics[name].type_name} that fits{as_told}", adapter)
     reasons = [f"{name} {reason}" for name, reason in adapters.items()]
     return Choice(role, None, "; ".join(reasons)) if reasons else None
-
-
-def adapter_for(role: Role, topic: Topic, config: LogConfig) -> Adapter | str:
-    """How a topic would be read in a part, or why it cannot be."""
-    if (reason := refusal(topic)) is not None:
-        return reason
-    table = config.table(role.name)
-    if "type" in table and short_name(table["type"]) != short_name(topic.type_name):
-        return f"is a {topic.type_name}, and {config.source} asks for a {table['type']}"
-    adapters = config.adapters(role.name, topic.type_name)
-    if not adapters:
-        return f"is a {topic.type_name}, for which no adapter comes along: name type and fields in --log-config"
-    missing = [adapter.missing_in(topic.definition()) for adapter in adapters]
-    for adapter, paths in zip(adapters, missing, strict=True):
-        if not paths:
-            return adapter
-    return f"has no field {', '.join(missing[-1])}"
 
 
 def choose_topics(
@@ -215,50 +195,37 @@ def choose_topics(
     config: LogConfig = _DEFAULTS,
     roles: Iterable[str] = SEQUENCE_ROLES,
 ) -> dict[str, Choice]:
-    """The choice for each part.
+    """Choose the topic for each role.
 
     Raises
     ------
     MissingTopicError
-        When a needed part has no topic, or one that the user named is not there; listing the topics that are.
+        When a needed role has no topic, or one that the user named is not there; listing the topics that are.
     LogError
-        When several topics fit one part, or ``wanted`` names a part that does not exist.
+        When several topics fit one role, or ``wanted`` names a role that does not exist.
     """
-    unknown = wanted.keys() - ROLES.keys()
+    path, unknown = recording.path, wanted.keys() - ROLES.keys()
     if unknown:
         raise LogError(f"there is no role {', '.join(sorted(unknown))}; topics are chosen for {', '.join(ROLES)}")
     choices = {name: choose_topic(ROLES[name], recording, config, wanted.get(name)) for name in roles}
-    for choice in choices.values():
-        _require(choice, recording, wanted, config)
+    for name, choice in choices.items():
+        is_required = choice.role.is_required
+        if choice.candidates:
+            raise LogError(f"{path}: for {name}, {choice.reason}; choose one: {choice.advice()}")
+        if is_required and not recording.topics:
+            raise MissingTopicError(
+                f"{path}: has no messages: {recording.ending or 'see whether the recorder wrote any'}"
+            )
+        is_asked_for = name in wanted or {"topic", "type"} & config.table(name).keys()
+        if choice.topic is None and (is_required or (is_asked_for and not choice.is_off)):
+            listed = [
+                f"{t.name} ({t.type_name or 'no type'}{f', {reason}' if (reason := refusal(t)) else ''})"
+                for t in recording.topics.values()
+            ]
+            needed = " (IMU and Doppler log must both be in the log, for recognising in sonar images too)"
+            raise MissingTopicError(
+                f"{path}: nothing for {name}: {choice.reason}{needed if is_required else ''}; the log has "
+                f"{', '.join(listed) or 'no messages at all'}; describe topics of other types in a log configuration, "
+                f"which `sonar-graph inspect {path} --toml` begins"
+            )
     return choices
-
-
-def advice(choice: Choice) -> str:
-    """How to choose one of several topics, in the words of the command line, of Python, and of a configuration."""
-    role, topic = choice.role.name, choice.candidates[0]
-    return f"--topic {role}={topic} (topics={{{role!r}: {topic!r}}} in Python, [{role}] topic in a log configuration)"
-
-
-def _require(choice: Choice, recording: Recording, wanted: Mapping[str, str], config: LogConfig) -> None:
-    role, path = choice.role, recording.path
-    if choice.candidates:
-        raise LogError(f"{path}: for {role.name}, {choice.reason}; choose one: {advice(choice)}")
-    is_asked_for = role.name in wanted or {"topic", "type"} & config.table(role.name).keys()
-    if role.is_required and not recording.topics:
-        raise MissingTopicError(f"{path}: has no messages: {recording.ending or 'see whether the recorder wrote any'}")
-    if choice.topic is None and (role.is_required or (is_asked_for and not choice.is_off)):
-        needed = " (IMU and Doppler log must both be in the log, for recognising in sonar images too)"
-        raise MissingTopicError(
-            f"{path}: nothing for {role.name}: {choice.reason}{needed if role.is_required else ''}; the log has "
-            f"{topic_list(recording)}; what other types are is said in a log configuration, which "
-            f"`sonar-graph inspect {path} --toml` begins"
-        )
-
-
-def topic_list(recording: Recording) -> str:
-    """The topics of a log with their types, for a message."""
-    entries = [
-        f"{t.name} ({t.type_name or 'no type'}{'' if (reason := refusal(t)) is None else f', {reason}'})"
-        for t in recording.topics.values()
-    ]
-    return ", ".join(entries) or "no messages at all"

@@ -13,18 +13,18 @@ from pathlib import Path
 import numpy as np
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.message_table import NS_PER_S
+from sonar_graph.sequence import NS_PER_S
 from sonar_graph.states import LandmarkMap, Trajectory
 
 LANDMARK_COLUMNS = ("id", "x_m", "y_m", "z_m", "cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
 _UPPER = np.triu_indices(3)
 _VALUES = 8
 _LINE = "%s" + " %.17g" * (_VALUES - 1) + "\n"
-"""17 digits: no bit of a double is lost, and they take less than half the time of the fewest digits that keep it."""
+"""17 digits keep every bit of a double, in less than half the time that the shortest form takes."""
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write poses; stamps with nine decimals made from integers, so that no nanosecond is lost.
+    """Write poses, with stamps of nine decimals made from integers, so that no nanosecond is lost.
 
     Raises
     ------
@@ -32,19 +32,16 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
         When the file cannot be written.
     """
     poses = np.hstack([trajectory.positions, trajectory.quaternions_xyzw]).tolist()
-    stamps_ns = trajectory.stamps_ns.tolist()
-    lines = [_LINE % (_seconds(stamp_ns), *pose) for stamp_ns, pose in zip(stamps_ns, poses, strict=True)]
+    lines = []
+    for stamp_ns, pose in zip(trajectory.stamps_ns.tolist(), poses, strict=True):
+        seconds, nanoseconds = divmod(abs(stamp_ns), NS_PER_S)
+        stamp = f"{'-' if stamp_ns < 0 else ''}{seconds}.{nanoseconds:09d}"
+        lines.append(_LINE % (stamp, *pose))
     _write(path, "".join(lines))
 
 
-def _seconds(stamp_ns: int) -> str:
-    sign = "-" if stamp_ns < 0 else ""
-    seconds, nanoseconds = divmod(abs(stamp_ns), NS_PER_S)
-    return f"{sign}{seconds}.{nanoseconds:09d}"
-
-
 def read_tum(path: Path) -> Trajectory:
-    """Read poses; blank lines and those that begin with ``#`` are passed over. Covariances are unknown.
+    """Read poses without covariances; blank lines and lines that begin with ``#`` are skipped.
 
     Raises
     ------
@@ -55,25 +52,24 @@ def read_tum(path: Path) -> Trajectory:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise LogError(f"{path} cannot be read as a text file: {error}") from error
-    rows = [
-        _pose(path, number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")
-    ]
-    stamps_ns = np.array([stamp for stamp, _ in rows], np.int64)
-    values = np.array([pose for _, pose in rows]).reshape(-1, _VALUES - 1)
+    stamps, poses = [], []
+    for number, line in enumerate(lines, 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        stamp, *pose = line.split()
+        if len(pose) != _VALUES - 1:
+            raise LogError(f"{path}, line {number}: {len(pose) + 1} values; a pose has {_VALUES}: t x y z qx qy qz qw")
+        try:
+            stamps.append(int((Decimal(stamp) * NS_PER_S).to_integral_value()))
+            poses.append([float(value) for value in pose])
+        except (InvalidOperation, ValueError, OverflowError) as error:
+            raise LogError(f"{path}, line {number}: {line!r} has something that is no number") from error
+    stamps_ns = np.array(stamps, np.int64)
+    values = np.array(poses).reshape(-1, _VALUES - 1)
     backwards = np.flatnonzero(np.diff(stamps_ns) <= 0)
     if backwards.size:
         raise LogError(f"{path}: pose {backwards[0] + 2} is not later than the one before; sort the lines by time")
     return Trajectory.without_covariances(stamps_ns, values[:, :3], values[:, 3:])
-
-
-def _pose(path: Path, number: int, line: str) -> tuple[int, list[float]]:
-    try:
-        stamp, *pose = line.split()
-        if len(pose) == _VALUES - 1:
-            return int((Decimal(stamp) * NS_PER_S).to_integral_value()), [float(value) for value in pose]
-    except (InvalidOperation, ValueError, OverflowError) as error:
-        raise LogError(f"{path}, line {number}: {line!r} has something that is no number") from error
-    raise LogError(f"{path}, line {number}: {len(pose) + 1} values; a pose has {_VALUES}: t x y z qx qy qz qw")
 
 
 def write_landmarks_csv(path: Path, landmarks: LandmarkMap) -> None:

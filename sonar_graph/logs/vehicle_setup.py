@@ -1,11 +1,7 @@
-"""Where sensors sit: ``/tf_static`` to mountings and back.
+"""Setup of the vehicle that a log states: mountings in ``/tf_static``, and calibration, name and notes in its record.
 
-What the calibration of a run comes from, field by field.
-
-What a user's file says goes before what the log's own record says, that before the mountings of ``/tf_static``, and
-those before defaults.
-
-What a log written by this package says about itself: name, calibration and notes, in a metadata record.
+A calibration is gathered field by field. A user's file goes before the metadata record of the log, the record before
+the mountings of ``/tf_static``, and these before defaults (docs/design/0004-logs.md).
 """
 
 from __future__ import annotations
@@ -29,13 +25,18 @@ from sonar_graph.logs.mcap import Keep, Recording, scan
 from sonar_graph.logs.roles import TF
 from sonar_graph.settings import faults_in
 
+METADATA = "sonar_graph"
+"""Name of the metadata record with name, calibration and notes."""
 BODY_FRAME = "base_link"
 FrameTree = dict[str, tuple[str, gtsam.Pose3]]
-"""Each frame's parent and ``parent_T_frame``."""
+"""Parent and ``parent_T_frame`` of each frame."""
+Values = Mapping[str, Any]
+MOUNTING_FIELDS = {"imu": "mounting", "dvl": "mounting", "depth": "port_m", "sonar": "mounting"}
+"""Field of each sensor's section that says where the sensor is."""
 
 
 def static_frames(recording: Recording) -> FrameTree:
-    """The frames of ``/tf_static``; of several transforms to one frame the last holds."""
+    """Frames of ``/tf_static``; of several transforms to one frame the last holds."""
     frames: FrameTree = {}
     for topic in recording.topics.values():
         if not topic.name.endswith("tf_static") or short_name(topic.type_name) != short_name(TF) or not topic.is_ros2:
@@ -49,20 +50,19 @@ def static_frames(recording: Recording) -> FrameTree:
             for message, (children, parents) in enumerate(names):
                 for i, (child, parent) in enumerate(zip(children, parents, strict=True)):
                     rotation = gtsam.Rot3.Quaternion(*rotations[message, i])
-                    frames[_plain(child)] = _plain(parent), gtsam.Pose3(rotation, translations[message, i])
+                    parent_T_child = gtsam.Pose3(rotation, translations[message, i])
+                    frames[child.lstrip("/")] = parent.lstrip("/"), parent_T_child
     return frames
 
 
-def _plain(frame: str) -> str:
-    return frame.lstrip("/")
-
-
 def mounting_of(frame: str, frames: FrameTree) -> Mounting | None:
-    """``body_T_frame`` through all frames in between; None where the tree does not reach from the body to the frame."""
-    body_T_sensor, name = gtsam.Pose3(), _plain(frame)
+    """``body_T_frame`` through all frames in between; None where the frame does not hang on the body."""
+    body_T_sensor, name = gtsam.Pose3(), frame.lstrip("/")
     for _ in range(len(frames) + 1):
         if name == BODY_FRAME:
-            return _mounting(body_T_sensor)
+            x_m, y_m, z_m = body_T_sensor.translation().tolist()
+            roll, pitch, yaw = body_T_sensor.rotation().rpy().tolist()
+            return Mounting(translation_m=(x_m, y_m, z_m), rpy_rad=(roll, pitch, yaw))
         if name not in frames:
             break
         name, parent_T_frame = frames[name]
@@ -70,25 +70,8 @@ def mounting_of(frame: str, frames: FrameTree) -> Mounting | None:
     return None
 
 
-def _mounting(body_T_sensor: gtsam.Pose3) -> Mounting:
-    x_m, y_m, z_m = body_T_sensor.translation().tolist()
-    roll, pitch, yaw = body_T_sensor.rotation().rpy().tolist()
-    return Mounting(translation_m=(x_m, y_m, z_m), rpy_rad=(roll, pitch, yaw))
-
-
-def with_mountings(calibration: Calibration, mountings: dict[str, Mounting]) -> Calibration:
-    """A calibration with other mountings of ``imu``, ``dvl``, ``sonar``, or the port of ``depth``."""
-    sections = {
-        name: getattr(calibration, name).model_copy(
-            update={"port_m": mounting.translation_m} if name == "depth" else {"mounting": mounting}
-        )
-        for name, mounting in mountings.items()
-    }
-    return calibration.model_copy(update=sections)
-
-
 def encode_mountings(calibration: Calibration) -> Bytes:
-    """One ``tf2_msgs/TFMessage`` with the mountings of a calibration, shape (1, size); stamped zero."""
+    """Encode the mountings of a calibration as one ``tf2_msgs/TFMessage``, shape (1, size), stamped zero."""
     mountings = {
         "imu": calibration.imu.mounting,
         "dvl": calibration.dvl.mounting,
@@ -103,22 +86,17 @@ def encode_mountings(calibration: Calibration) -> Bytes:
     return encode(parse_definition(TF, definition(TF)), 1, values, {"transforms": len(mountings)})
 
 
-Values = Mapping[str, Any]
-MOUNTING_FIELDS = {"imu": "mounting", "dvl": "mounting", "depth": "port_m", "sonar": "mounting"}
-"""Where each sensor's place is in its section."""
-
-
 @dataclass(frozen=True)
 class PartialCalibration:
-    """What a user says; all else is left to the log. ``false`` takes away what may be absent, such as ``floor``."""
+    """Fields that a user gives; the others are left to the log. ``false`` takes away an optional one (``floor``)."""
 
     values: Values
     source: str
-    """Names the file in errors and notes."""
+    """Name of the file in errors and notes."""
 
     @classmethod
     def parse(cls, values: Values, source: str) -> PartialCalibration:
-        """Check plain values as TOML and JSON give them; what is not said may be needed, but not yet.
+        """Check values as TOML and JSON give them; needed fields may still come from the log.
 
         Raises
         ------
@@ -128,7 +106,8 @@ class PartialCalibration:
         try:
             Calibration.model_validate(_over(Calibration().model_dump(), values))
         except ValidationError as error:
-            if any(not _is_missing_field(fault["type"], fault["loc"]) for fault in error.errors()):
+            absent = [fault["type"] == "missing" and isinstance(fault["loc"][-1], str) for fault in error.errors()]
+            if not all(absent):
                 raise CalibrationError(f"{source}: {faults_in(error, Calibration)}") from error
         return cls(values, source)
 
@@ -154,30 +133,33 @@ class PartialCalibration:
         return cls.parse(values, str(path))
 
     def fields(self) -> list[str]:
-        """Paths of all that is said, such as ``dvl.mounting.translation_m``."""
+        """Paths of the fields that are given, such as ``dvl.mounting.translation_m``."""
         return list(_paths(self.values))
 
 
 def gathered(
     given: PartialCalibration | None, recorded: Calibration | None, mountings: Mapping[str, Mounting]
 ) -> Calibration:
-    """The calibration from what there is, by precedence.
+    """Gather a calibration from all sources, field by field.
 
     Parameters
     ----------
     given
-        What the user says.
+        Fields of the user, before all others.
     recorded
-        What the log's record says; fields that it leaves out count as not said.
+        Calibration of the log's record; fields that were not set there do not count.
     mountings
-        Those of ``/tf_static``, by sensor.
+        Mountings of ``/tf_static`` by sensor, before defaults; of ``depth`` only the translation counts.
 
     Raises
     ------
     CalibrationError
-        When all together is none; naming the user's source.
+        When the fields together are no calibration; naming the user's source.
     """
-    values = with_mountings(Calibration(), dict(mountings)).model_dump()
+    values = Calibration().model_dump()
+    for sensor, mounting in mountings.items():
+        is_port = MOUNTING_FIELDS[sensor] == "port_m"
+        values[sensor][MOUNTING_FIELDS[sensor]] = mounting.translation_m if is_port else mounting.model_dump()
     if recorded is not None:
         values = _over(values, recorded.model_dump(exclude_unset=True))
     if given is None:
@@ -186,7 +168,7 @@ def gathered(
 
 
 def mounted_by(values: Values) -> set[str]:
-    """Sensors whose place is said."""
+    """Sensors of which the values state the mounting."""
     return {
         sensor
         for sensor, field in MOUNTING_FIELDS.items()
@@ -195,6 +177,7 @@ def mounted_by(values: Values) -> set[str]:
 
 
 def _over(values: Values, changes: Values) -> dict[str, Any]:
+    """Values with changes, section by section; ``false`` for what is no flag takes it away."""
     merged = dict(values)
     for name, change in changes.items():
         old = merged.get(name)
@@ -215,22 +198,13 @@ def _paths(values: Values, prefix: str = "") -> Iterator[str]:
             yield prefix + name
 
 
-def _is_missing_field(kind: str, place: tuple[int | str, ...]) -> bool:
-    """Whether a field is missing, and not an element of a list."""
-    return kind == "missing" and isinstance(place[-1], str)
-
-
-METADATA = "sonar_graph"
-"""The metadata record that carries name, calibration and notes."""
-
-
 def recorded_name(recording: Recording) -> str | None:
-    """The name that a log gives itself, or None."""
+    """Name in the log's record, or None."""
     return recording.metadata.get(METADATA, {}).get("name")
 
 
 def read_calibration(recording: Recording) -> Calibration | None:
-    """The calibration that a log carries, or None.
+    """Calibration in the log's record, or None.
 
     Raises
     ------
@@ -244,7 +218,7 @@ def read_calibration(recording: Recording) -> Calibration | None:
 
 
 def read_notes(recording: Recording) -> dict[str, str]:
-    """The notes that a log carries.
+    """Notes in the log's record.
 
     Raises
     ------
@@ -258,14 +232,14 @@ def read_notes(recording: Recording) -> dict[str, str]:
 
 
 def with_notes(path: Path, notes: Mapping[str, str]) -> dict[str, str]:
-    """A log's record as it is, with further notes.
+    """Record of a log with further notes.
 
     Parameters
     ----------
     path
-        The log; one without a record is given one that holds only notes.
+        The log; without a record the new one holds only notes.
     notes
-        By subject; they go before those of the log.
+        Notes by subject, before those of the log.
 
     Raises
     ------

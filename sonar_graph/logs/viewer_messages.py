@@ -1,29 +1,18 @@
-"""Landmarks and positions as ``visualization_msgs/MarkerArray``: 95 % ellipsoids, and landmarks' identities.
+"""Messages and layouts for viewers: ellipsoids and landmarks, clouds, pictures, and the first look of a result.
 
 Viewers differ in how large they draw the covariance of a pose (RViz: one sigma; Lichtblick: half a sigma, without
-correlations); an ellipsoid marker looks the same in all of them.
+correlations); an ellipsoid marker looks the same in all of them. A viewer can switch markers by their namespace:
+``ellipsoid_95_percent``, ``covariance_unknown`` (a sphere whose size means nothing), ``identity``.
 
-A marker's namespace says what it is: ``ellipsoid_95_percent``, ``covariance_unknown`` (a sphere whose size means
-nothing), ``identity``. A viewer switches each on and off.
-
-Landmarks as ``sensor_msgs/PointCloud2``: positions, identities and covariances that a program can read.
-
-A point has ``x y z`` as float32, because RViz reads nothing else, and as float64 ``id`` (exact up to 2^53) and the
-upper triangle of the covariance, ``cov_xx cov_xy cov_xz cov_yy cov_yz cov_zz`` (m²; NaN where unknown).
-
-Pictures as ``sensor_msgs/CompressedImage``.
-
-Layouts with which viewers show a result at once: one for Foxglove and Lichtblick, one for RViz 2.
-
-Without a layout these viewers open with every topic switched off. A layout names the topics that the result has, in
-their colours, with a camera, a grid and lines that fit its size. ``templates/`` has what is the same for all results;
-a new kind of topic needs an entry in `_drawing_settings` and in ``templates/rviz.jinja``.
+Without a layout, viewers open with every topic switched off. `write_layouts` writes one for Foxglove and Lichtblick
+and one for RViz 2, with a camera, a grid and lines that fit the result. A new kind of topic needs an entry in
+`foxglove_layout` and in ``templates/rviz.jinja`` (docs/tutorials/03_viewers.md).
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -36,19 +25,19 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs import writing as encoding
 from sonar_graph.logs.adapters import body_to_ros
 from sonar_graph.logs.cdr import Value
 from sonar_graph.logs.mcap import Outgoing
 from sonar_graph.logs.roles import ODOMETRY, POSE_WITH_COVARIANCE
 from sonar_graph.logs.trajectory_files import LANDMARK_COLUMNS
+from sonar_graph.logs.writing import WORLD_FRAME, fields, header, outgoing
 from sonar_graph.measurements import Floats
 from sonar_graph.states import LandmarkMap, Trajectory
 
 MARKER_ARRAY = "visualization_msgs/msg/MarkerArray"
 SPHERE, TEXT_VIEW_FACING = 2, 9
 UNKNOWN_DIAMETER_M = 0.2
-"""Drawn where a covariance is unknown."""
+"""Diameter of the sphere that is drawn for an unknown covariance."""
 _SMALLEST_DIAMETER_M = 1e-3
 ELLIPSOID, UNKNOWN, IDENTITY = "ellipsoid_95_percent", "covariance_unknown", "identity"
 _FAINT = 0.35
@@ -62,17 +51,17 @@ GREY: Colour = (0.5, 0.5, 0.5, 0.9)
 
 
 def ellipsoids(covariances: Floats) -> tuple[Floats, Floats]:
-    """The 95 % ellipsoids of Gaussian points in space, ``x' C^-1 x = chi2_3(0.95)``.
+    """95 % ellipsoids of Gaussian points in space, ``x' C^-1 x = chi2_3(0.95)``.
 
     Parameters
     ----------
     covariances
-        Shape (m, 3, 3), m²; NaN where unknown: a small sphere then.
+        Shape (m, 3, 3), m²; NaN where unknown, which gives a small sphere.
 
     Returns
     -------
     diameters
-        Along the principal axes, shape (m, 3), metres.
+        Along the principal axes, shape (m, 3), m.
     quaternions_xyzw
         From the principal axes to the world, shape (m, 4).
     """
@@ -91,17 +80,17 @@ def _unknown(covariances: Floats) -> NDArray[np.bool_]:
 def landmark_markers(
     topic: str, landmarks: LandmarkMap, stamp_ns: int, colour: Colour, text_height_m: float
 ) -> Outgoing:
-    """One message: for each landmark an ellipsoid, and its identity as text above it."""
+    """``visualization_msgs/MarkerArray``: for each landmark an ellipsoid, with its identity as text above it."""
     count = len(landmarks)
     diameters, quaternions = ellipsoids(landmarks.covariances)
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
     above = landmarks.positions + np.array([0, 0, text_height_m])
     stamps_ns = np.full(2 * count, stamp_ns)
-    values = encoding.header(stamps_ns, encoding.WORLD_FRAME, "markers.header")
-    values |= encoding.fields("markers.pose.position", "xyz", np.vstack([landmarks.positions, above]))
-    values |= encoding.fields("markers.pose.orientation", "xyzw", np.vstack([quaternions, upright]))
-    values |= encoding.fields("markers.scale", "xyz", np.vstack([diameters, np.full((count, 3), text_height_m)]))
-    values |= encoding.fields("markers.color", "rgba", np.tile(colour, (2 * count, 1)))
+    values = header(stamps_ns, WORLD_FRAME, "markers.header")
+    values |= fields("markers.pose.position", "xyz", np.vstack([landmarks.positions, above]))
+    values |= fields("markers.pose.orientation", "xyzw", np.vstack([quaternions, upright]))
+    values |= fields("markers.scale", "xyz", np.vstack([diameters, np.full((count, 3), text_height_m)]))
+    values |= fields("markers.color", "rgba", np.tile(colour, (2 * count, 1)))
     values |= {
         "markers.ns": [UNKNOWN if unknown else ELLIPSOID for unknown in _unknown(landmarks.covariances)]
         + [IDENTITY] * count,
@@ -109,87 +98,81 @@ def landmark_markers(
         "markers.type": np.repeat([SPHERE, TEXT_VIEW_FACING], count),
         "markers.text": [""] * count + [str(identity) for identity in landmarks.ids.tolist()],
     }
-    return encoding.outgoing(topic, MARKER_ARRAY, np.array([stamp_ns]), values, {"markers": 2 * count}, is_latched=True)
+    return outgoing(topic, MARKER_ARRAY, np.array([stamp_ns]), values, {"markers": 2 * count}, is_latched=True)
 
 
 def position_ellipsoids(topic: str, trajectory: Trajectory, colour: Colour) -> Outgoing:
-    """For each pose whose covariance is known one message: where the position is, as an ellipsoid."""
+    """``visualization_msgs/MarkerArray`` for each pose with a known covariance: the ellipsoid of its position."""
     known = trajectory.rows(np.flatnonzero(~_unknown(trajectory.covariances[:, 3:, 3:])))
     world_axes = body_to_ros(known.covariances, known.matrices) if len(known) else known.covariances
     diameters, quaternions = ellipsoids(world_axes[:, :3, :3])
-    columns = encoding.header(known.stamps_ns, encoding.WORLD_FRAME, "markers.header")
-    columns |= encoding.fields("markers.pose.position", "xyz", known.positions)
-    columns |= encoding.fields("markers.pose.orientation", "xyzw", quaternions)
-    columns |= encoding.fields("markers.scale", "xyz", diameters)
-    columns |= encoding.fields("markers.color", "rgba", np.tile((*colour[:3], _FAINT), (len(known), 1)))
+    columns = header(known.stamps_ns, WORLD_FRAME, "markers.header")
+    columns |= fields("markers.pose.position", "xyz", known.positions)
+    columns |= fields("markers.pose.orientation", "xyzw", quaternions)
+    columns |= fields("markers.scale", "xyz", diameters)
+    columns |= fields("markers.color", "rgba", np.tile((*colour[:3], _FAINT), (len(known), 1)))
     values: dict[str, Value] = {
         path: value[:, None] if isinstance(value, np.ndarray) else value for path, value in columns.items()
     }
     values |= {"markers.ns": ELLIPSOID, "markers.type": SPHERE}
-    return encoding.outgoing(topic, MARKER_ARRAY, known.stamps_ns, values, {"markers": 1})
+    return outgoing(topic, MARKER_ARRAY, known.stamps_ns, values, {"markers": 1})
 
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-_DATATYPES = {np.dtype(np.float32): 7, np.dtype(np.float64): 8}
-"""Those of ``sensor_msgs/PointField``."""
-_COVARIANCES = LANDMARK_COLUMNS[4:]
-POINT = np.dtype(
-    {
-        "names": ["x", "y", "z", "id", *_COVARIANCES],
-        "formats": ["<f4"] * 3 + ["<f8"] * (1 + len(_COVARIANCES)),
-        "offsets": [0, 4, 8, *range(16, 16 + 8 * (1 + len(_COVARIANCES)), 8)],
-    }
-)
-"""One landmark in the cloud's data."""
+_FLOAT32, _FLOAT64 = 7, 8
+"""Types of a ``sensor_msgs/PointField``."""
+_NUMBERS = ("id", *LANDMARK_COLUMNS[4:])
+POINT = np.dtype([("xyz", "<f4", 3), ("", "<f4"), ("numbers", "<f8", len(_NUMBERS))])
+"""One point of `landmark_cloud`; the float64 numbers are aligned."""
 
 
 def landmark_cloud(topic: str, landmarks: LandmarkMap, stamp_ns: int) -> Outgoing:
-    """One message with all landmarks."""
+    """``sensor_msgs/PointCloud2``: positions, identities and covariances that a program can read.
+
+    A point has ``x y z`` as float32, because RViz reads nothing else, and as float64 ``id`` (exact up to 2^53) and the
+    upper triangle of the covariance, ``cov_xx cov_xy cov_xz cov_yy cov_yz cov_zz`` (m²; NaN where unknown).
+    """
     points = np.zeros(len(landmarks), POINT)
-    points["id"] = landmarks.ids
-    for axis, name in enumerate("xyz"):
-        points[name] = landmarks.positions[:, axis]
-    for name, row, column in zip(_COVARIANCES, *np.triu_indices(3), strict=True):
-        points[name] = landmarks.covariances[:, row, column]
-    layout = [POINT.fields[name] for name in POINT.names or ()] if POINT.fields else []
-    values = encoding.header(np.array([stamp_ns]), encoding.WORLD_FRAME) | {
+    points["xyz"] = landmarks.positions
+    points["numbers"][:, 0] = landmarks.ids
+    points["numbers"][:, 1:] = landmarks.covariances[:, *np.triu_indices(3)]
+    stamps_ns = np.array([stamp_ns])
+    values = header(stamps_ns, WORLD_FRAME) | {
         "height": 1,
         "width": len(points),
-        "fields.name": list(POINT.names or ()),
-        "fields.offset": np.array([[entry[1] for entry in layout]]),
-        "fields.datatype": np.array([[_DATATYPES[entry[0]] for entry in layout]]),
-        "fields.count": np.ones((1, len(layout))),
+        "fields.name": ["x", "y", "z", *_NUMBERS],
+        "fields.offset": np.array([[0, 4, 8, *range(16, POINT.itemsize, 8)]]),
+        "fields.datatype": np.array([[_FLOAT32] * 3 + [_FLOAT64] * len(_NUMBERS)]),
+        "fields.count": np.ones((1, 3 + len(_NUMBERS))),
         "point_step": POINT.itemsize,
         "row_step": len(points) * POINT.itemsize,
         "data": np.frombuffer(points.tobytes(), np.uint8)[None, :],
         "is_dense": 1,
     }
-    stamps_ns = np.array([stamp_ns])
-    return encoding.outgoing(topic, POINT_CLOUD, stamps_ns, values, {"fields": len(layout)}, is_latched=True)
+    return outgoing(topic, POINT_CLOUD, stamps_ns, values, {"fields": 3 + len(_NUMBERS)}, is_latched=True)
 
 
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 PICTURES = "/sonar/recognised"
-"""The topic of sonar images with what was recognised drawn into them."""
+"""Topic of sonar images into which recognised landmarks are drawn."""
 
 
 class Picture(NamedTuple):
-    """One picture."""
+    """A picture in JPEG format."""
 
     stamp_ns: int
     jpeg: bytes
 
 
 def picture_messages(topic: str, pictures: Sequence[Picture]) -> list[Outgoing]:
-    """One message a picture."""
-    return [_message(topic, picture) for picture in pictures]
-
-
-def _message(topic: str, picture: Picture) -> Outgoing:
-    stamps_ns = np.array([picture.stamp_ns])
-    content = np.frombuffer(picture.jpeg, np.uint8)[None, :]
-    values = encoding.header(stamps_ns, "sonar") | {"format": "jpeg", "data": content}
-    return encoding.outgoing(topic, COMPRESSED_IMAGE, stamps_ns, values, {"data": content.shape[1]})
+    """``sensor_msgs/CompressedImage``, one for each picture."""
+    messages = []
+    for picture in pictures:
+        stamps_ns = np.array([picture.stamp_ns])
+        content = np.frombuffer(picture.jpeg, np.uint8)[None, :]
+        values = header(stamps_ns, "sonar") | {"format": "jpeg", "data": content}
+        messages.append(outgoing(topic, COMPRESSED_IMAGE, stamps_ns, values, {"data": content.shape[1]}))
+    return messages
 
 
 PATH = "nav_msgs/msg/Path"
@@ -198,20 +181,20 @@ _PLOTS = {
     "Plot!height": ("pose.pose.position.z", ("/pose", "/ground_truth/odometry")),
     "Plot!variance": ("pose.covariance[0]", ("/pose",)),
 }
-"""For each plot a field, and how the topics end of which it is shown."""
+"""Field of each plot, and endings of the topics of which it is shown."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """How large what is drawn is, and where."""
+    """Size and centre of everything that is drawn."""
 
     centre_m: tuple[float, float, float]
     size_m: float
-    """The longest side of the box around everything."""
+    """Longest side of the box around everything."""
 
     @classmethod
     def around(cls, positions: Iterable[Floats]) -> Scene:
-        """The scene that holds all positions, each of shape (n, 3); what is not finite does not count."""
+        """The scene around all positions, each of shape (n, 3), without those that are not finite."""
         points = np.concatenate([np.zeros((0, 3)), *positions])
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
@@ -262,16 +245,16 @@ class Layer:
 
     @property
     def is_shown(self) -> bool:
-        """Whether it is on from the start: not what another layer shows already."""
+        """Tell whether it is on from the start; what another layer shows already is off."""
         return not self.topic.endswith(("/odometry", "/smoothed"))
 
     @property
     def rgb(self) -> str:
-        """The colour as RViz writes it."""
+        """Colour in RViz's notation."""
         return "; ".join(str(round(255 * part)) for part in self.colour[:3])
 
     def css(self, opacity: float) -> str:
-        """The colour as Foxglove writes it."""
+        """Colour in Foxglove's notation."""
         return "#" + "".join(f"{round(255 * part):02x}" for part in (*self.colour[:3], opacity))
 
 
@@ -293,17 +276,22 @@ def write_layouts(result: Path, layers: Sequence[Layer], scene: Scene) -> None:
 
 
 def foxglove_layout(layers: Sequence[Layer], scene: Scene) -> dict[str, Any]:
-    """What Foxglove and Lichtblick import: a 3D view, and plots over time beside it."""
+    """Layout that Foxglove and Lichtblick import: a 3D view, with plots over time and pictures beside it."""
     template = files("sonar_graph.logs").joinpath("templates", "foxglove.json")
     layout: dict[str, Any] = json.loads(template.read_text(encoding="utf-8"))
     panels = layout["configById"]
     view = panels["3D!result"]
-    settings = _drawing_settings(scene)
-    view["topics"] = {
-        layer.topic: {"visible": layer.is_shown} | settings[layer.type_name](layer)
-        for layer in layers
-        if layer.type_name in settings
-    }
+    view["topics"] = {}
+    for layer in layers:  # the 3D panel does not draw Odometry
+        colour = layer.css(1)
+        settings: dict[str, dict[str, Any]] = {
+            PATH: {"type": "line", "lineWidth": scene.line_m, "gradient": [colour, colour]},
+            MARKER_ARRAY: {},
+            POSE_WITH_COVARIANCE: {"type": "axis", "axisScale": scene.axis_m, "showCovariance": False},
+            POINT_CLOUD: {"pointSize": 6, "colorMode": "flat", "flatColor": colour},
+        }
+        if layer.type_name in settings:
+            view["topics"][layer.topic] = {"visible": layer.is_shown} | settings[layer.type_name]
     view["cameraState"] |= {"distance": scene.camera_m, "targetOffset": scene.centre_m}
     view["cameraState"] |= {"near": round(scene.size_m / 1000, 4), "far": 100 * scene.size_m}
     view["scene"]["transforms"] |= {"axisScale": scene.axis_m, "labelSize": round(scene.text_height_m / 2, 3)}
@@ -311,46 +299,29 @@ def foxglove_layout(layers: Sequence[Layer], scene: Scene) -> dict[str, Any]:
     grid = {"size": scene.cells * scene.cell_m, "divisions": scene.cells, "position": [x_m, y_m, 0]}
     view["layers"]["grid"] |= grid
     for panel, (field, endings) in _PLOTS.items():
-        panels[panel]["paths"] = [_plotted(layer, field) for layer in layers if layer.topic.endswith(endings)]
-    _show_pictures(layout, [layer.topic for layer in layers if layer.type_name == COMPRESSED_IMAGE])
+        panels[panel]["paths"] = [
+            {
+                "value": f"{layer.topic}.{field}",
+                "enabled": True,
+                "timestampMethod": "headerStamp",
+                "label": layer.topic.split("/")[1],
+                "color": layer.css(1),
+                "showLine": True,
+                "lineSize": 1,
+            }
+            for layer in layers
+            if layer.topic.endswith(endings)
+        ]
+    if pictures := [layer.topic for layer in layers if layer.type_name == COMPRESSED_IMAGE]:
+        panel, beside = "Image!pictures", layout["layout"]
+        panels[panel] = {"imageMode": {"imageTopic": pictures[0]}}
+        plots = beside["second"]
+        beside["second"] = {"direction": "column", "splitPercentage": 40, "first": panel, "second": plots}
     return layout
 
 
-def _show_pictures(layout: dict[str, Any], topics: list[str]) -> None:
-    """A panel for the first topic with pictures, over the plots; nothing where there is none."""
-    if not topics:
-        return
-    panel = "Image!pictures"
-    layout["configById"][panel] = {"imageMode": {"imageTopic": topics[0]}}
-    beside = layout["layout"]
-    plots = beside["second"]
-    beside["second"] = {"direction": "column", "splitPercentage": 40, "first": panel, "second": plots}
-
-
-def _drawing_settings(scene: Scene) -> dict[str, Callable[[Layer], dict[str, Any]]]:
-    """Settings of Foxglove's 3D panel for the types that it draws; Odometry is not among them."""
-    return {
-        PATH: lambda layer: {"type": "line", "lineWidth": scene.line_m, "gradient": [layer.css(1), layer.css(1)]},
-        MARKER_ARRAY: lambda _: {},
-        POSE_WITH_COVARIANCE: lambda _: {"type": "axis", "axisScale": scene.axis_m, "showCovariance": False},
-        POINT_CLOUD: lambda layer: {"pointSize": 6, "colorMode": "flat", "flatColor": layer.css(1)},
-    }
-
-
-def _plotted(layer: Layer, field: str) -> dict[str, Any]:
-    return {
-        "value": f"{layer.topic}.{field}",
-        "enabled": True,
-        "timestampMethod": "headerStamp",
-        "label": layer.topic.split("/")[1],
-        "color": layer.css(1),
-        "showLine": True,
-        "lineSize": 1,
-    }
-
-
 def rviz_config(layers: Sequence[Layer], scene: Scene) -> str:
-    """What ``rviz2 -d`` opens: a display for each topic."""
+    """Configuration that ``rviz2 -d`` opens, with a display for each topic."""
     environment = Environment(
         loader=PackageLoader("sonar_graph.logs", "templates"),
         undefined=StrictUndefined,

@@ -1,14 +1,13 @@
-"""From a `Sequence` to an MCAP log.
+"""Writing of logs: a `Sequence` and sonar images as ROS 2 messages in an MCAP file.
 
-Measurements and poses as messages: the reverse of decoding, and what viewers draw.
-
-Sonar images as ``marine_acoustic_msgs/ProjectedSonarImage``, read back by `read_sonar_frames`.
+The functions ``*_messages`` are the reverse of the adapters; result logs for viewers use them too. What is written is
+read back to the bit (docs/design/0004-logs.md).
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,60 +18,87 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters import SAMPLE_TYPES, body_to_ros
 from sonar_graph.logs.cdr import Bytes, Struct, Value, definition, encode, parse_definition
 from sonar_graph.logs.mcap import Outgoing, recording
-from sonar_graph.logs.message_table import NS_PER_S
 from sonar_graph.logs.roles import DETECTIONS, DVL, IMU, LANDMARK_MAP, ODOMETRY, POSE_WITH_COVARIANCE, SONAR_IMAGE, TF
-from sonar_graph.logs.vehicle_setup import METADATA, encode_mountings
+from sonar_graph.logs.vehicle_setup import BODY_FRAME, METADATA, encode_mountings
 from sonar_graph.measurements import NO_TRACK, Depth, Dvl, Floats, Imu, Ints, LandmarkDetections, SonarFrames
-from sonar_graph.sequence import Sequence
+from sonar_graph.sequence import NS_PER_S, Sequence
 from sonar_graph.states import LandmarkMap, Trajectory
 
 WORLD_FRAME = "map"
-BODY_FRAME = "base_link"
 _Z_VARIANCE = 14
+"""Place of the variance of z in the 6 x 6 covariance of a pose."""
 _SECONDS = np.iinfo(np.int32)
 
 
-@lru_cache
-def own_definition(type_name: str) -> Struct:
-    """The tree of one of the types that this package writes."""
-    return parse_definition(type_name, definition(type_name))
+def write_log(path: Path, sequence: Sequence, more: Iterable[Outgoing] = ()) -> None:
+    """Write a log of ROS 2 messages from which `read_log` gives the same sequence.
 
-
-def header(stamps_ns: Ints, frame_id: str, prefix: str = "header") -> dict[str, Value]:
-    """Columns of a header.
+    Parameters
+    ----------
+    path
+        The MCAP file; one that exists is replaced.
+    sequence
+        Its calibration, name and notes go into the metadata record ``sonar_graph``, the mountings into ``/tf_static``.
+    more
+        Messages that do not fit into memory at once, such as images: entries in the order of time, each taken when the
+        one before is written.
 
     Raises
     ------
     LogError
-        When a stamp lies outside what ROS 2 can express (years 1901 to 2038).
+        When the file cannot be written, or a stamp does not fit into a ROS 2 message.
+
+    See Also
+    --------
+    read_log : The inverse.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> from sonar_graph.calibration import Calibration
+    >>> from sonar_graph.logs import read_log, write_log
+    >>> from sonar_graph.measurements import Dvl, Imu
+    >>> from sonar_graph.sequence import Sequence
+    >>> stamps_ns = np.arange(50) * 10**8
+    >>> imu = Imu(stamps_ns, np.zeros((50, 3)), np.tile([0.0, 0.0, 9.81], (50, 1)))
+    >>> dvl = Dvl(stamps_ns, np.tile([0.5, 0.0, 0.0], (50, 1)), np.tile(1e-4 * np.eye(3), (50, 1, 1)))
+    >>> with TemporaryDirectory() as folder:
+    ...     write_log(Path(folder) / "dive.mcap", Sequence("straight", Calibration(), imu, dvl))
+    ...     copy = read_log(Path(folder) / "dive.mcap")
+    >>> bool((copy.dvl.velocity == dvl.velocity).all())
+    True
     """
-    seconds, nanoseconds = np.divmod(stamps_ns, NS_PER_S)
-    if len(seconds) and not (_SECONDS.min <= seconds.min() and seconds.max() <= _SECONDS.max):
-        raise LogError(f"stamp {stamps_ns.max()} ns: ROS 2 stamps have 32-bit seconds; give stamps of another epoch")
-    return {
-        f"{prefix}.stamp.sec": seconds,
-        f"{prefix}.stamp.nanosec": nanoseconds,
-        f"{prefix}.frame_id": frame_id,
+    first_ns = int(min(sequence.imu.stamps_ns[0], sequence.dvl.stamps_ns[0]))
+    messages = [static_message("/tf_static", TF, first_ns, encode_mountings(sequence.calibration))]
+    if sequence.true_landmarks is not None:
+        messages.append(landmark_map_message("/ground_truth/landmarks", sequence.true_landmarks, first_ns))
+    messages.append(imu_messages("/imu/data", sequence.imu))
+    messages.append(dvl_messages("/dvl/data", sequence.dvl))
+    if sequence.depth is not None:
+        messages.append(depth_messages("/depth/pose", sequence.depth))
+    if sequence.detections is not None:
+        messages += detection_messages("/sonar/landmarks", sequence.detections)
+    if sequence.truth is not None:
+        messages.append(odometry_messages("/ground_truth/odometry", sequence.truth))
+    record = {
+        "name": sequence.name,
+        "calibration": sequence.calibration.model_dump_json(),
+        "notes": json.dumps(sequence.notes),
     }
+    with recording(Path(path), {METADATA: record}) as out:
+        begins = [0] * len(messages)
+        for entry in more:  # with each, what comes up to its end
+            until_ns = int(entry.log_times_ns[-1])
+            ends = [int(np.searchsorted(m.log_times_ns, until_ns, side="right")) for m in messages]
+            out.write([*map(_rows, messages, begins, ends), entry])
+            begins = ends
+        out.write(list(map(_rows, messages, begins, [len(m.log_times_ns) for m in messages])))
 
 
-def fields(prefix: str, names: str, columns: Floats) -> dict[str, Value]:
-    """Columns side by side as fields: ``fields("velocity", "xyz", v)``."""
-    return {f"{prefix}.{name}": columns[..., i] for i, name in enumerate(names)}
-
-
-def outgoing(
-    topic: str,
-    type_name: str,
-    stamps_ns: Ints,
-    values: Mapping[str, Value],
-    lengths: Mapping[str, int] | None = None,
-    *,
-    is_latched: bool = False,
-) -> Outgoing:
-    """Messages recorded at the stamps given; values and lengths as in `encode`."""
-    payloads = encode(own_definition(type_name), len(stamps_ns), values, lengths)
-    return Outgoing(topic, type_name, stamps_ns, payloads, is_latched)
+def _rows(entry: Outgoing, first: int, end: int) -> Outgoing:
+    return replace(entry, log_times_ns=entry.log_times_ns[first:end], payloads=entry.payloads[first:end])
 
 
 def imu_messages(topic: str, imu: Imu) -> Outgoing:
@@ -98,7 +124,7 @@ def dvl_messages(topic: str, dvl: Dvl) -> Outgoing:
 
 
 def depth_messages(topic: str, depth: Depth) -> Outgoing:
-    """``PoseWithCovarianceStamped`` of which only z counts: it keeps the height to the bit, which pressure does not."""
+    """``PoseWithCovarianceStamped`` of which only z counts; it keeps every bit of a height, a pressure does not."""
     covariances = np.zeros((len(depth), 36))
     covariances[:, _Z_VARIANCE] = np.where(np.isnan(depth.variance_m2), 0.0, depth.variance_m2)
     values = header(depth.stamps_ns, WORLD_FRAME)
@@ -130,7 +156,7 @@ def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgo
 
 
 def pose_columns(trajectory: Trajectory) -> dict[str, Value]:
-    """Columns of a ``PoseWithCovariance`` called ``pose``; a covariance of zeros: unknown."""
+    """Columns of a ``PoseWithCovariance`` called ``pose``, with zeros for an unknown covariance."""
     covariances = body_to_ros(trajectory.covariances, trajectory.matrices)
     values = fields("pose.pose.position", "xyz", trajectory.positions)
     values |= fields("pose.pose.orientation", "xyzw", trajectory.quaternions_xyzw)
@@ -161,73 +187,14 @@ def landmark_map_message(topic: str, landmarks: LandmarkMap, stamp_ns: int) -> O
 
 
 def static_message(topic: str, type_name: str, stamp_ns: int, payload: Bytes) -> Outgoing:
-    """One message that was encoded already and holds from then on."""
+    """One latched message that is encoded already."""
     return Outgoing(topic, type_name, np.array([stamp_ns]), payload, is_latched=True)
-
-
-def write_log(path: Path, sequence: Sequence, more: Iterable[Outgoing] = ()) -> None:
-    """Write a log of ROS 2 messages from which `read_log` gives the same sequence.
-
-    Parameters
-    ----------
-    path
-        The MCAP file; one that exists is replaced.
-    sequence
-        Its calibration, name and notes go into the metadata record ``sonar_graph``; the mountings into ``/tf_static``.
-    more
-        What does not fit into memory at once, such as images: entries in the order of time, each taken when the one
-        before is written.
-
-    Raises
-    ------
-    LogError
-        When the file cannot be written, or a stamp does not fit into a ROS 2 message.
-    """
-    record = {
-        "name": sequence.name,
-        "calibration": sequence.calibration.model_dump_json(),
-        "notes": json.dumps(sequence.notes),
-    }
-    with recording(Path(path), {METADATA: record}) as out:
-        for piece in _pieces(_messages(sequence), more):
-            out.write(piece)
-
-
-def _pieces(messages: list[Outgoing], more: Iterable[Outgoing]) -> Iterator[list[Outgoing]]:
-    """The messages cut in time: what comes up to the end of each further entry, with that entry, and then the rest."""
-    begins = [0] * len(messages)
-    for entry in more:
-        until_ns = int(entry.log_times_ns[-1])
-        ends = [int(np.searchsorted(m.log_times_ns, until_ns, side="right")) for m in messages]
-        yield [*map(_rows, messages, begins, ends), entry]
-        begins = ends
-    yield list(map(_rows, messages, begins, [len(m.log_times_ns) for m in messages]))
-
-
-def _rows(entry: Outgoing, first: int, end: int) -> Outgoing:
-    return replace(entry, log_times_ns=entry.log_times_ns[first:end], payloads=entry.payloads[first:end])
-
-
-def _messages(sequence: Sequence) -> list[Outgoing]:
-    first_ns = int(min(sequence.imu.stamps_ns[0], sequence.dvl.stamps_ns[0]))
-    messages = [static_message("/tf_static", TF, first_ns, encode_mountings(sequence.calibration))]
-    if sequence.true_landmarks is not None:
-        messages.append(landmark_map_message("/ground_truth/landmarks", sequence.true_landmarks, first_ns))
-    messages.append(imu_messages("/imu/data", sequence.imu))
-    messages.append(dvl_messages("/dvl/data", sequence.dvl))
-    if sequence.depth is not None:
-        messages.append(depth_messages("/depth/pose", sequence.depth))
-    if sequence.detections is not None:
-        messages += detection_messages("/sonar/landmarks", sequence.detections)
-    if sequence.truth is not None:
-        messages.append(odometry_messages("/ground_truth/odometry", sequence.truth))
-    return messages
 
 
 def sonar_image_messages(
     topic: str, frames: SonarFrames, *, frequency_hz: float = 0.0, sound_speed_m_s: float = 0.0
 ) -> Outgoing:
-    """One message a frame, recorded at the frame's stamp.
+    """``marine_acoustic_msgs/ProjectedSonarImage``, one a frame, which `read_sonar_frames` reads back.
 
     A beam points to ``(x, y, z) = (0, -sin azimuth, cos azimuth)``: z forward, x up, y to the right. Samples keep their
     type, little-endian, all beams of the first range first. Ranges are float32 in this message.
@@ -235,11 +202,11 @@ def sonar_image_messages(
     Parameters
     ----------
     topic
-        Such as ``/sonar/image``.
+        Name of the topic, such as ``/sonar/image``.
     frames
         A block of frames.
     frequency_hz, sound_speed_m_s
-        What the sonar says; 0: unknown.
+        Frequency of the sonar, and the speed of sound that it took; 0: unknown.
 
     Raises
     ------
@@ -262,3 +229,46 @@ def sonar_image_messages(
         "image.data": samples.reshape(count, -1).view(np.uint8),
     }
     return outgoing(topic, SONAR_IMAGE, frames.stamps_ns, values, {"beam_directions": beams})
+
+
+@lru_cache
+def own_definition(type_name: str) -> Struct:
+    """Definition of one of the types that this package writes."""
+    return parse_definition(type_name, definition(type_name))
+
+
+def header(stamps_ns: Ints, frame_id: str, prefix: str = "header") -> dict[str, Value]:
+    """Columns of a message's header.
+
+    Raises
+    ------
+    LogError
+        When a stamp lies outside what ROS 2 can express (years 1901 to 2038).
+    """
+    seconds, nanoseconds = np.divmod(stamps_ns, NS_PER_S)
+    if len(seconds) and not (_SECONDS.min <= seconds.min() and seconds.max() <= _SECONDS.max):
+        raise LogError(f"stamp {stamps_ns.max()} ns: ROS 2 stamps have 32-bit seconds; give stamps of another epoch")
+    return {
+        f"{prefix}.stamp.sec": seconds,
+        f"{prefix}.stamp.nanosec": nanoseconds,
+        f"{prefix}.frame_id": frame_id,
+    }
+
+
+def fields(prefix: str, names: str, columns: Floats) -> dict[str, Value]:
+    """Fields from columns side by side: ``fields("velocity", "xyz", v)``."""
+    return {f"{prefix}.{name}": columns[..., i] for i, name in enumerate(names)}
+
+
+def outgoing(
+    topic: str,
+    type_name: str,
+    stamps_ns: Ints,
+    values: Mapping[str, Value],
+    lengths: Mapping[str, int] | None = None,
+    *,
+    is_latched: bool = False,
+) -> Outgoing:
+    """Messages recorded at their stamps; values and lengths as for `encode`."""
+    payloads = encode(own_definition(type_name), len(stamps_ns), values, lengths)
+    return Outgoing(topic, type_name, stamps_ns, payloads, is_latched)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.logs.adapters.adapter import body_to_ros, ros_to_body
+from sonar_graph.logs.adapters.vehicle_messages import body_to_ros, ros_to_body
 
 
 def random_covariances(seed: int, n: int = 3) -> tuple[np.ndarray, np.ndarray]:

@@ -9,7 +9,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.mcap.writer import recording
-from sonar_graph.logs.sonar_frames import read_sonar_frames
+from sonar_graph.logs.reading import read_sonar_frames
 from sonar_graph.logs.writing import sonar_image_messages
 from sonar_graph.measurements import SonarFrames
 

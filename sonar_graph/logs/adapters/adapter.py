@@ -1,20 +1,14 @@
-"""What every adapter says: topic, type, where the stamp is, and along which axes a driver measures.
+"""Adapters: the fields of a message type that hold the values of one role, with their units, axes and covariances.
 
-Axes of drivers turned into those of this package: body x forward, y left, z up; world x east, y north, z up.
-
-What drivers mean by a covariance: variances or standard deviations, and which numbers say that it is not known.
-
-Pose covariances in this package's order and in ROS's.
-
-Here the perturbation is ``[theta, rho]`` in the body frame; in ``geometry_msgs/PoseWithCovariance`` it is translation
-and then rotation about the fixed axes of the header's frame. With ``R = world_R_body`` the first becomes the second by
-
-    [rho_world; theta_world] = [[0, R], [R, 0]] [theta; rho]
+A role is a part that a topic plays: IMU, Doppler log, depth, detections, truth, sonar. Each has one subclass of
+`Adapter` (`vehicle_messages`, `dvl_messages`, `landmark_messages`, `sonar_messages`), whose attributes are field paths
+and conventions. A message type is added without code, as an instance of that subclass: for everybody in
+`drivers.SHIPPED`, for one log in a table of a TOML file (`log_config`, docs/tutorials/04_your_own_log.md).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Literal
 
 import numpy as np
@@ -23,17 +17,14 @@ from pydantic import AfterValidator, Field
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 from sonar_graph.calibration import Section
+from sonar_graph.logs.adapters.message_table import MessageTable, field_of
 from sonar_graph.logs.cdr import Messages, Struct
 from sonar_graph.logs.mcap import Topic
-from sonar_graph.logs.message_table import MessageTable, field_of
 from sonar_graph.measurements import Floats
 
 Rotation = Annotated[Literal["flu", "frd"] | tuple[float, float, float], Field()]
-"""``flu`` (x forward, y left, z up: nothing to turn), ``frd`` (y right, z down), or roll, pitch, yaw in degrees of
-``ours_R_driver = Rz(yaw) Ry(pitch) Rx(roll)``."""
-World = Literal["enu", "ned"]
-_FLU_R_FRD = np.diag([1.0, -1.0, -1.0])
-_ENU_R_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""Axes of a driver: ``flu`` (x forward, y left, z up, as here), ``frd`` (y right, z down), or roll, pitch, yaw in
+degrees of ``ours_R_driver = Rz(yaw) Ry(pitch) Rx(roll)``."""
 
 
 def axes_matrix(rotation: Rotation) -> Floats:
@@ -41,22 +32,17 @@ def axes_matrix(rotation: Rotation) -> Floats:
     if rotation == "flu":
         return np.eye(3)
     if rotation == "frd":
-        return _FLU_R_FRD
+        return np.diag([1.0, -1.0, -1.0])
     return np.asarray(SpatialRotation.from_euler("xyz", rotation, degrees=True).as_matrix())
 
 
-def world_matrix(world: World) -> Floats:
-    """``enu_R_world``, shape (3, 3)."""
-    return _ENU_R_NED if world == "ned" else np.eye(3)
-
-
 def turn(rotation: Rotation, vectors: Floats) -> Floats:
-    """Vectors along our axes, shape (n, 3); those that need no turning stay as they are to the bit."""
+    """Vectors along the axes of this package, shape (n, 3); those that need no rotation keep every bit."""
     return vectors if rotation == "flu" else vectors @ axes_matrix(rotation).T
 
 
 def turn_covariances(rotation: Rotation, covariances: Floats) -> Floats:
-    """Covariances along our axes, shape (n, 3, 3)."""
+    """Covariances along the axes of this package, shape (n, 3, 3)."""
     if rotation == "flu":
         return covariances
     R = axes_matrix(rotation)
@@ -70,57 +56,67 @@ def _not_zero(scale: float) -> float:
 
 
 Scale = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_not_zero)]
-"""What numbers of a driver are multiplied by."""
+"""Factor for the numbers of a driver."""
 
 
 class Adapter(Section):
-    """Where the values of one role are in messages of one type; fields are named by their paths, such as ``a.b[2]``."""
+    """Fields of one message type for one role, named by their paths such as ``a.b[2]``.
+
+    A subclass adds the attributes of its role, names the paths that a message must have in `fields`, and gives the
+    measurements, with the number of rows left out by reason, in ``read``.
+    """
 
     type: str
     """Message type, such as sensor_msgs/msg/Imu."""
     topic: str | None = None
-    """Found by type where it is not given."""
+    """Topic; without it the topic is found by type."""
     use: bool = True
     """false: nothing plays this role, whatever the log has."""
     stamp: str = "header.stamp"
     """Field with the time of validity (a Time or a number), or "log": when the message was recorded."""
     stamp_unit_s: float = Field(1.0, gt=0, allow_inf_nan=False)
-    """What one unit of the stamp is, where it is a number; 1e-6 for microseconds."""
+    """Unit of a stamp that is a number; 1e-6 for microseconds."""
     stamp_offset_s: float = Field(0.0, allow_inf_nan=False)
     """Added to every stamp: minus the delay of a driver that stamps when a message arrives."""
     frame_id_field: str | None = "header.frame_id"
     """Field with the name of the sensor's frame in /tf_static."""
     frame_id: str | None = None
-    """That name itself, where the message has none or a wrong one."""
+    """Name of the sensor's frame, where the message has none or a wrong one."""
     rotation: Rotation = "flu"
     """Axes of the driver: "flu", "frd", or [roll, pitch, yaw] in degrees of ours_R_driver."""
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have, except for the stamp's."""
-        yield from ()
+        return field_paths()
 
     def missing_in(self, definition: Struct) -> list[str]:
-        """Which of `fields` a message type does not have."""
+        """Paths of `fields` that a message type does not have."""
         known = dict(leaf_fields(definition))
         return [path for path in self.fields() if field_of(path)[0] not in known]
 
     def table(self, topic: Topic) -> MessageTable:
-        """The messages of a topic, with their stamps."""
+        """Messages of a topic with their stamps."""
         return MessageTable(topic, self.stamp, self.stamp_unit_s, self.stamp_offset_s)
 
     def frame_in(self, messages: Sequence[Messages]) -> str:
-        """The sensor's frame; empty where the messages do not name one."""
+        """Frame of the sensor; empty where the messages do not name one."""
         if self.frame_id is not None or self.frame_id_field is None:
             return self.frame_id or ""
         return messages[0].first_string(self.frame_id_field)
 
-    def warnings(self, table: MessageTable) -> Iterator[str]:  # noqa: ARG002  # adapters with something to check use it
-        """What in the messages contradicts itself or is unlikely, although it can be read."""
+    def warnings(self, table: MessageTable) -> Iterator[str]:  # noqa: ARG002  # for subclasses
+        """Contradictions and unlikely values in messages that can be read."""
         yield from ()
 
 
+def field_paths(*values: str | Iterable[str] | None) -> Iterator[str]:
+    """Paths in attributes of an adapter, each one path, several, or none."""
+    for value in values:
+        yield from (value,) if isinstance(value, str) else value or ()
+
+
 def leaf_fields(definition: Struct, prefix: str = "", size: str = "") -> Iterator[tuple[str, str]]:
-    """Paths of all fields that hold values, through nested messages, each with ``[n]`` or ``[]`` for its arrays."""
+    """Paths of all fields that hold values, through nested messages, with ``[n]`` or ``[]`` for arrays."""
     for entry in definition.fields:
         own = size + (f"[{entry.length or ''}]" if entry.is_array else "")
         if isinstance(entry.kind, Struct):
@@ -131,24 +127,24 @@ def leaf_fields(definition: Struct, prefix: str = "", size: str = "") -> Iterato
 
 Reading = Literal["unknown", "invalid"]
 ROUNDING = 1e-6
-"""Of the largest eigenvalue: single precision may leave the smallest this far below zero."""
+"""Part of the largest eigenvalue by which single precision may leave the smallest below zero."""
 
 
 class CovarianceFields(Section):
-    """Where a covariance is, and how to read it."""
+    """Fields of a covariance, and the meaning of their numbers."""
 
     fields: tuple[str, ...] = Field(min_length=1, max_length=3)
     """One field: a row-major matrix (3x3, or 6x6 of which the first three rows count), or one number for all axes.
     Three fields: one an axis, each a number or a row."""
     meaning: Literal["variance", "standard deviation"] = "variance"
-    """Where drivers put standard deviations, only the diagonal is used, squared."""
+    """Of standard deviations only the diagonal is used, squared."""
     negative: Reading = "unknown"
-    """What a negative first element says: the covariance is unknown, or the whole message is invalid."""
+    """Meaning of a negative first element: the covariance is unknown, or the whole message is invalid."""
     zero: Reading = "unknown"
-    """What zeros say."""
+    """Meaning of a covariance of zeros."""
 
     def read(self, table: MessageTable) -> tuple[Floats, NDArray[np.bool_]]:
-        """Covariances, shape (n, 3, 3) with NaN: unknown, and which rows they say are invalid, shape (n,)."""
+        """Covariances, shape (n, 3, 3), NaN: unknown, and a mask of rows that they call invalid, shape (n,)."""
         matrices = self._matrices(table)
         negative = matrices[:, 0, 0] < 0
         zero = ~matrices.any(axis=(1, 2))
@@ -159,7 +155,7 @@ class CovarianceFields(Section):
         return np.where(unknown[:, None, None], np.nan, matrices), invalid
 
     def warnings(self, table: MessageTable) -> Iterator[str]:
-        """How many messages have what no errors can have."""
+        """Number of messages whose matrix is no covariance."""
         if self.meaning == "standard deviation":
             return
         matrices = self._matrices(table)
@@ -172,7 +168,7 @@ class CovarianceFields(Section):
             )
 
     def read_variance(self, table: MessageTable) -> Floats:
-        """One variance a row from one field, shape (n,); NaN: unknown (zero, negative, not finite)."""
+        """Variances from one field, shape (n,); NaN: unknown (zero, negative, not finite)."""
         value = table.column(self.fields[0]).astype(float)
         known = np.isfinite(value) & (value > 0)
         return np.where(known, value**2 if self.meaning == "standard deviation" else value, np.nan)
@@ -203,36 +199,3 @@ def _is_indefinite(matrices: Floats) -> NDArray[np.bool_]:
 
 def _diagonal(values: Floats) -> Floats:
     return values[:, :, None] * np.eye(3)
-
-
-def body_to_ros(covariances: Floats, rotations: Floats) -> Floats:
-    """Covariances for ROS messages.
-
-    Parameters
-    ----------
-    covariances
-        Of ``[theta, rho]`` in the body frame, shape (n, 6, 6); NaN: unknown.
-    rotations
-        ``world_R_body``, shape (n, 3, 3).
-
-    Returns
-    -------
-    ndarray
-        Of ``[rho, theta]`` along the world's axes, shape (n, 6, 6); zeros: unknown.
-    """
-    swap = _swap(rotations)
-    return np.nan_to_num(swap @ covariances @ swap.transpose(0, 2, 1), nan=0.0)
-
-
-def ros_to_body(covariances: Floats, rotations: Floats) -> Floats:
-    """The inverse of `body_to_ros`; all zeros, or a negative variance, mean unknown and become NaN."""
-    swap = _swap(rotations).transpose(0, 2, 1)
-    known = np.any(covariances != 0, axis=(1, 2)) & (np.diagonal(covariances, axis1=1, axis2=2) >= 0).all(axis=1)
-    return np.where(known[:, None, None], swap @ covariances @ swap.transpose(0, 2, 1), np.nan)
-
-
-def _swap(rotations: Floats) -> Floats:
-    swap = np.zeros((len(rotations), 6, 6))
-    swap[:, :3, 3:] = rotations
-    swap[:, 3:, :3] = rotations
-    return swap

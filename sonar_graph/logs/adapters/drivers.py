@@ -1,4 +1,8 @@
-"""The adapters that come along: types of common drivers, with what is known of how those fill them."""
+"""Shipped adapters: message types of common drivers, with the conventions by which these fill them.
+
+A message type is added here for everybody: make an adapter of its role, whose attributes are field paths and
+conventions (`Adapter` and its subclasses), and put it into `SHIPPED` (docs/design/0004-logs.md).
+"""
 
 from __future__ import annotations
 
@@ -14,25 +18,19 @@ TRUTH_WORDS = ("truth",)
 _DVL_WORDS = ("dvl", "doppler")
 _DEPTH_WORDS = ("depth",)
 _LANDMARK_WORDS = ("landmark", "sonar")
-_UUV_DVL_TYPES = (
-    "uuv_sensor_ros_plugins_msgs/msg/DVL",
-    "stonefish_ros2/msg/DVL",
-    "cola2_msgs/msg/DVL",
-    "smarc_msgs/msg/DVL",
-)
 Z_DOWN_TYPES = frozenset({"marine_acoustic_msgs/msg/Dvl"})
-"""Types whose definition says that z points downwards, which not all drivers follow."""
+"""Types whose definition has z downwards, which not all drivers follow."""
 
 
 @dataclass(frozen=True)
 class Shipped:
-    """An adapter and when it is taken without being asked for."""
+    """An adapter, and the topics for which it is taken without being asked for."""
 
     adapter: Adapter
     words: tuple[str, ...] = ()
-    """A topic's name must hold one of these; none: any name fits."""
+    """Words of which the topic's name must contain one; none: any name fits."""
     is_general: bool = False
-    """Its type says little about the sensor: counts only where no topic of a more telling type fits."""
+    """The type says little about the sensor: the adapter counts only where no topic of a more telling type fits."""
 
 
 def _xyz(prefix: str) -> tuple[str, str, str]:
@@ -55,11 +53,6 @@ def _water_linked(*covariance: str, meaning: str = "variance") -> DvlAdapter:
     )
 
 
-def _uuv(type_name: str) -> DvlAdapter:
-    covariance = CovarianceFields(fields=("velocity_covariance",), negative="invalid", zero="unknown")
-    return DvlAdapter(type=type_name, velocity=_xyz("velocity"), covariance=covariance)
-
-
 IMU = ImuAdapter(
     type="sensor_msgs/msg/Imu",
     angular_velocity=_xyz("angular_velocity"),
@@ -78,6 +71,14 @@ MARINE_DVL = DvlAdapter(
     beam_ranges_valid="beam_ranges_valid",
     sound_speed="sound_speed",
 )
+UUV_SIMULATOR_DVLS = [
+    DvlAdapter(
+        type=f"{package}/msg/DVL",
+        velocity=_xyz("velocity"),
+        covariance=CovarianceFields(fields=("velocity_covariance",), negative="invalid", zero="unknown"),
+    )
+    for package in ("uuv_sensor_ros_plugins_msgs", "stonefish_ros2", "cola2_msgs", "smarc_msgs")
+]
 TWIST = DvlAdapter(
     type="geometry_msgs/msg/TwistWithCovarianceStamped",
     velocity=_xyz("twist.twist.linear"),
@@ -122,7 +123,7 @@ SHIPPED: dict[str, tuple[Shipped, ...]] = {
         Shipped(_water_linked("cov.x", "cov.y", "cov.z")),
         Shipped(_water_linked("covariance")),
         Shipped(_water_linked("fom", meaning="standard deviation")),
-        *(Shipped(_uuv(name)) for name in _UUV_DVL_TYPES),
+        *map(Shipped, UUV_SIMULATOR_DVLS),
         Shipped(TWIST, _DVL_WORDS, is_general=True),
         Shipped(ODOMETRY_TWIST, _DVL_WORDS, is_general=True),
     ),
@@ -143,4 +144,4 @@ SHIPPED: dict[str, tuple[Shipped, ...]] = {
     "true_landmarks": (Shipped(LandmarkMapAdapter(type="sonar_graph_msgs/msg/LandmarkMap"), TRUTH_WORDS),),
     "sonar": (Shipped(PROJECTED_SONAR_IMAGE), Shipped(OCULUS_PING)),
 }
-"""By role; of several for one type the first whose fields a message has is taken."""
+"""Adapters by role; of several for one type the first is taken whose fields the messages have."""

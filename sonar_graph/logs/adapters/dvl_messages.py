@@ -1,13 +1,11 @@
-"""Doppler velocity logs, and other messages whose velocity stands for one.
+"""Adapters for Doppler velocity logs, and for other messages whose velocity stands for one.
 
-The geometry of a Doppler log's beams: from velocities along them to a velocity, and what drivers get wrong in it.
-
-A beam that leaves the instrument at a tilt t from its vertical and an azimuth a (from x towards y) has the direction
+A beam that leaves the instrument at a tilt t from its vertical and an azimuth a (from x towards y) has the direction::
 
     d = [sin t cos a, sin t sin a, cos t]    with z along the instrument's vertical, down
 
-and sees the velocity d . v. Three beams or more give v by least squares; fewer give what they measured of it
-(`sonar_graph.devices.dvl_beams`).
+and measures the velocity d . v. Three beams or more give v by least squares, fewer the part of it that they measured
+(`sonar_graph.devices.dvl_beams`, docs/theory/beams.md).
 """
 
 from __future__ import annotations
@@ -20,20 +18,20 @@ from pydantic import Field, model_validator
 
 from sonar_graph.calibration import Section
 from sonar_graph.devices import velocity_of_beams
-from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields, Scale, turn, turn_covariances
-from sonar_graph.logs.message_table import NOT_FINITE, Dropped, MessageTable, fit_rows, not_finite
+from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields, Scale, field_paths, turn, turn_covariances
+from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, MessageTable, fit_rows, not_finite
 from sonar_graph.measurements import Dvl, Floats
 
 LARGEST_TILT_DEG = 45.0
-"""No Doppler log in use points its beams further outwards; 20 to 30 degrees are usual."""
+"""Largest tilt of beams in use; 20 to 30 degrees are usual."""
 TOLERANCE_DEG = 3.0
-"""By which published and configured directions may differ."""
+"""Difference allowed between published and configured directions."""
 FEWEST_BEAMS = 3
-"""That make a velocity."""
+"""Beams needed for a velocity."""
 
 
 class BeamGeometry(Section):
-    """Where the beams point, and their fields where the velocity is to be computed from them."""
+    """Directions of the beams, and their fields where the velocity is to be computed from them."""
 
     tilt_deg: float = Field(gt=0, lt=90)
     """Angle between beams and the instrument's vertical: 30 (RDI), 25 (Nortek), 22.5 (Water Linked)."""
@@ -57,17 +55,23 @@ class BeamGeometry(Section):
         )
 
     def velocities(self, table: MessageTable, scale: float) -> tuple[Floats, Floats, NDArray[np.int64]]:
-        """What the valid beams of each row say, along the driver's axes.
+        """Velocities from the valid beams of each row, along the driver's axes.
 
         Parameters
         ----------
+        table
+            The messages.
         scale
             Turns the velocity field into m/s.
 
         Returns
         -------
-        Velocity, shape (n, 3), NaN with too few beams; covariance, shape (n, 3, 3), NaN without `sigma_m_s`; number of
-        valid beams, shape (n,).
+        velocity
+            Shape (n, 3), NaN with too few beams.
+        covariance
+            Shape (n, 3, 3), NaN without `sigma_m_s`.
+        count
+            Number of valid beams, shape (n,).
         """
         along = table.column(str(self.velocity)).astype(float)
         if along.shape[1:] != (len(self.azimuth_deg),):
@@ -85,55 +89,48 @@ class BeamGeometry(Section):
 
     @property
     def fewest(self) -> int:
-        """Beams that are needed."""
+        """Number of beams that a row needs."""
         return 1 if self.sigma_m_s else FEWEST_BEAMS
 
 
-def unit_vector_warning(vectors: Floats, geometry: BeamGeometry | None) -> str | None:
-    """What is wrong with published beam directions, shape (beams, 3), or None.
+def beam_direction_fault(vectors: Floats, geometry: BeamGeometry | None) -> str | None:
+    """Fault of published beam directions, shape (beams, 3); None: there is none, or nothing was published.
 
-    One driver, and one that copies it, publish z = sin(22.5°) where a beam tilted by 22.5° has cos(22.5°). Whatever is
-    wrong, published directions are not used; where velocities come from beams, the configured ones are.
+    One driver, and one that copies it, publish z = sin(22.5°) where a beam tilted by 22.5° has cos(22.5°). Published
+    directions are never used; where velocities come from beams, the configured directions are.
     """
     if not np.isfinite(vectors).all() or not vectors.any():
         return None
     across, down = np.hypot(vectors[:, 0], vectors[:, 1]), np.abs(vectors[:, 2])
     if np.allclose(across, down, atol=1e-3) and across.max() < np.sin(np.radians(LARGEST_TILT_DEG)) - 1e-2:
         tilt_deg = float(np.degrees(np.arcsin(down)).mean())
-        return _not_used(
+        return (
             f"have z = {down.mean():.3f}, the sine of the tilt of {tilt_deg:.1f}°, where its cosine "
             f"{np.cos(np.radians(tilt_deg)):.3f} should be"
         )
     lengths = np.linalg.norm(vectors, axis=1)
     if np.any(np.abs(lengths - 1) > 1e-2):
-        return _not_used(f"are no unit vectors (length {lengths.min():.3f} to {lengths.max():.3f})")
-    found = float(np.degrees(np.arccos(np.clip(down, 0, 1))).max())
-    if found > LARGEST_TILT_DEG:
-        return _not_used(
-            f"are tilted by {found:.1f}°, which no Doppler log is: the driver seems to publish the sine of "
-            f"{90 - found:.1f}° as z, where its cosine should be"
+        return f"are no unit vectors (length {lengths.min():.3f} to {lengths.max():.3f})"
+    tilt_deg = float(np.degrees(np.arccos(np.clip(down, 0, 1))).max())
+    if tilt_deg > LARGEST_TILT_DEG:
+        return (
+            f"are tilted by {tilt_deg:.1f}°, which no Doppler log is: the driver seems to publish the sine of "
+            f"{90 - tilt_deg:.1f}° as z, where its cosine should be"
         )
-    return None if geometry is None else _disagreement(vectors, found, geometry)
-
-
-def _disagreement(vectors: Floats, tilt_deg: float, geometry: BeamGeometry) -> str | None:
-    """Between published unit vectors and the configuration; z may point up or down."""
+    if geometry is None:
+        return None
     if abs(tilt_deg - geometry.tilt_deg) > TOLERANCE_DEG:
-        return _not_used(f"are tilted by {tilt_deg:.1f}°, the configured beams by {geometry.tilt_deg:g}°")
+        return f"are tilted by {tilt_deg:.1f}°, the configured beams by {geometry.tilt_deg:g}°"
     if geometry.velocity is None:
         return None
     if len(vectors) != len(geometry.azimuth_deg):
-        return _not_used(f"are {len(vectors)}, the configured beams {len(geometry.azimuth_deg)}")
-    configured = geometry.directions() * np.sign(vectors[:, 2:]) ** np.array([0, 0, 1])
-    off = np.degrees(np.arccos(np.clip((configured * vectors).sum(axis=1), -1, 1)))
-    beam = int(off.argmax())
-    if off[beam] <= TOLERANCE_DEG:
+        return f"are {len(vectors)}, the configured beams {len(geometry.azimuth_deg)}"
+    configured = geometry.directions() * np.sign(vectors[:, 2:]) ** np.array([0, 0, 1])  # z may point up or down
+    off_deg = np.degrees(np.arccos(np.clip((configured * vectors).sum(axis=1), -1, 1)))
+    beam = int(off_deg.argmax())
+    if off_deg[beam] <= TOLERANCE_DEG:
         return None
-    return _not_used(f"and the configured ones differ by up to {off[beam]:.0f}° (beam {beam}); check azimuth_deg")
-
-
-def _not_used(fault: str) -> str:
-    return f"beam directions {fault}; they are not used"
+    return f"and the configured ones differ by up to {off_deg[beam]:.0f}° (beam {beam}); check azimuth_deg"
 
 
 Number = bool | int | float
@@ -150,11 +147,11 @@ class DvlAdapter(Adapter):
     covariance: CovarianceFields | None = None
     """Of the velocity, before `scale`; without it the calibration's noise holds."""
     valid_where: Mapping[str, Number] = {}
-    """Fields and the value that each has in messages to be used: {velocity_mode = 1}."""
+    """Fields, each with its value in messages to be used: {velocity_mode = 1}."""
     good_beams: str | None = None
     """Field that counts good beams; messages with none are left out, where the driver counts at all."""
     beams: BeamGeometry | None = None
-    """Where the beams point."""
+    """Directions of the beams."""
     beam_unit_vectors: tuple[str, str, str] | None = None
     """Array fields with x, y, z of each beam's direction: only checked, because drivers get them wrong. Velocities come
     from the directions of `beams`."""
@@ -173,40 +170,50 @@ class DvlAdapter(Adapter):
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have."""
-        yield from self.velocity or ()
-        yield from self.covariance.fields if self.covariance else ()
-        yield from self.valid_where
-        yield from filter(None, (self.good_beams, self.beam_ranges, self.beam_ranges_valid, self.sound_speed))
-        yield from self.beam_unit_vectors or ()
-        if self.beams:
-            yield from filter(None, (self.beams.velocity, self.beams.valid))
+        checked = (self.beam_ranges, self.beam_ranges_valid, self.sound_speed, self.beam_unit_vectors)
+        beams = (self.beams.velocity, self.beams.valid) if self.beams else ()
+        covariance = self.covariance.fields if self.covariance else None
+        return field_paths(self.velocity, covariance, self.valid_where, self.good_beams, *checked, *beams)
 
     def read(self, table: MessageTable) -> tuple[Dvl | None, Dropped]:
         """The rows with a valid velocity, or with part of one from beams; a covariance that is not known is NaN."""
-        velocity, covariance, faults = self._by_beams(table) if self._is_by_beams else self._by_velocity(table)
-        faults |= {
-            f"with {path} not {_toml(value)}": table.column(path) != value for path, value in self.valid_where.items()
-        }
+        faults: dict[str, NDArray[np.bool_]] = {}
+        if self.beams is not None and self.beams.velocity is not None:
+            velocity, covariance, count = self.beams.velocities(table, self.scale)
+            fewest = self.beams.fewest
+            faults["without a valid beam" if fewest == 1 else f"with fewer than {fewest} valid beams"] = count < fewest
+        else:
+            assert self.velocity is not None  # by the validator
+            velocity = table.beside(self.velocity)
+            velocity = velocity if self.scale == 1 else velocity * self.scale
+            covariance = np.full((len(table), 3, 3), np.nan)
+        if self.covariance is not None and not self._is_noise_of_beams:
+            covariance, faults[SAID_INVALID] = self.covariance.read(table)
+            covariance = covariance if self.scale == 1 else covariance * self.scale**2
+        for path, value in self.valid_where.items():
+            faults[f"with {path} not {str(value).lower()}"] = table.column(path) != value
         if self.good_beams is not None:
             beams = table.column(self.good_beams)
             faults["without a good beam"] = (beams == 0) & beams.any()
         faults[NOT_FINITE] = not_finite(velocity)
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
-        velocity, covariance = (
-            turn(self.rotation, velocity[rows]),
-            turn_covariances(self.rotation, covariance[rows]),
-        )
+        velocity, covariance = turn(self.rotation, velocity[rows]), turn_covariances(self.rotation, covariance[rows])
         return (Dvl(table.stamps_ns[rows], velocity, covariance) if rows.size else None), dropped
 
+    @property
+    def _is_noise_of_beams(self) -> bool:
+        """Tell whether the covariance follows from the beams, not from a field of the message."""
+        return self.beams is not None and self.beams.velocity is not None and self.beams.sigma_m_s is not None
+
     def warnings(self, table: MessageTable) -> Iterator[str]:
-        """What in the messages contradicts itself, although it can be read."""
-        if self.covariance is not None and not (self._is_by_beams and self.beams and self.beams.sigma_m_s):
+        """Warnings about covariances, beam directions, ranges and the speed of sound that a driver gets wrong."""
+        if self.covariance is not None and not self._is_noise_of_beams:
             yield from self.covariance.warnings(table)
         if self.beam_unit_vectors is not None:
             vectors = np.stack([table.column(path)[0] for path in self.beam_unit_vectors], axis=-1)
-            fault = unit_vector_warning(vectors, self.beams)
-            if fault:
-                yield f"topic {table.topic.name}: {self.beam_unit_vectors[0].rpartition('.')[0]}: {fault}"
+            if fault := beam_direction_fault(vectors, self.beams):
+                field = self.beam_unit_vectors[0].rpartition(".")[0]
+                yield f"topic {table.topic.name}: {field}: beam directions {fault}; they are not used"
         if self.sound_speed is not None and not table.column(self.sound_speed).any():
             yield f"{self.sound_speed} is 0 in every message: the driver does not fill it"
         if self.beam_ranges is not None and self.beam_ranges_valid is not None:
@@ -214,34 +221,3 @@ class DvlAdapter(Adapter):
             wrong = said & ~(np.isfinite(ranges) & (ranges > 0)).all(axis=1)
             if wrong.any():
                 yield f"{self.beam_ranges_valid} is true in {wrong.sum()} messages that have a range of 0 or less"
-
-    @property
-    def _is_by_beams(self) -> bool:
-        return self.beams is not None and self.beams.velocity is not None
-
-    def _by_velocity(self, table: MessageTable) -> tuple[Floats, Floats, dict[str, NDArray[np.bool_]]]:
-        """The driver's own velocity and covariance, and rows with a fault."""
-        assert self.velocity is not None  # by the validator
-        velocity = table.beside(self.velocity)
-        covariance, invalid = self._covariances(table)
-        return velocity if self.scale == 1 else velocity * self.scale, covariance, {SAID_INVALID: invalid}
-
-    def _by_beams(self, table: MessageTable) -> tuple[Floats, Floats, dict[str, NDArray[np.bool_]]]:
-        """The same from single beams; what a driver says of their sum holds where nothing is said of them."""
-        assert self.beams is not None
-        velocity, covariance, count = self.beams.velocities(table, self.scale)
-        fewest = self.beams.fewest
-        faults = {"without a valid beam" if fewest == 1 else f"with fewer than {fewest} valid beams": count < fewest}
-        if self.beams.sigma_m_s is None:
-            covariance, faults[SAID_INVALID] = self._covariances(table)
-        return velocity, covariance, faults
-
-    def _covariances(self, table: MessageTable) -> tuple[Floats, NDArray[np.bool_]]:
-        if self.covariance is None:
-            return np.full((len(table), 3, 3), np.nan), np.zeros(len(table), bool)
-        covariance, invalid = self.covariance.read(table)
-        return covariance if self.scale == 1 else covariance * self.scale**2, invalid
-
-
-def _toml(value: Number) -> str:
-    return str(value).lower()

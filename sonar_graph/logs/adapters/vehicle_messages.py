@@ -1,8 +1,11 @@
-"""Inertial measurements.
+"""Adapters for inertial measurements, depth, and reference poses of the vehicle.
 
-Depth: from pressure, or from anything that gives a height or a depth in metres.
+Height from a pressure p is ``z = -(p - atmosphere) / (density g)``.
 
-Reference poses of the body.
+A pose covariance is of ``[theta, rho]`` in the body frame in this package, and in ``geometry_msgs/PoseWithCovariance``
+of translation, then rotation, along the fixed axes of the header's frame. With ``R = world_R_body``:
+
+    [rho_world; theta_world] = [[0, R], [R, 0]] [theta; rho]
 """
 
 from __future__ import annotations
@@ -14,21 +17,13 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from sonar_graph.logs.adapters.adapter import (
-    Adapter,
-    CovarianceFields,
-    Scale,
-    World,
-    axes_matrix,
-    ros_to_body,
-    turn,
-    world_matrix,
-)
-from sonar_graph.logs.message_table import NOT_FINITE, Dropped, MessageTable, fit_rows, not_finite
+from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields, Scale, axes_matrix, field_paths, turn
+from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, MessageTable, fit_rows, not_finite
 from sonar_graph.measurements import Depth, Floats, Imu
 from sonar_graph.states import Trajectory
 
 Paths = tuple[str, str, str]
+_ENU_R_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 class ImuAdapter(Adapter):
@@ -41,7 +36,7 @@ class ImuAdapter(Adapter):
     angular_velocity_status: str | None = None
     """Field that is -1 where the rate was not measured."""
     linear_acceleration: Paths
-    """Fields of the specific force along x, y, z: what accelerometers feel, +9.81 upwards at rest."""
+    """Fields of the specific force along x, y, z, which accelerometers measure: +9.81 upwards at rest."""
     linear_acceleration_scale: Scale = 1.0
     """Turns them into m/s²; 9.80665 from g, -1 where the driver gives gravity's own direction."""
     linear_acceleration_status: str | None = None
@@ -49,8 +44,8 @@ class ImuAdapter(Adapter):
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have."""
-        yield from (*self.angular_velocity, *self.linear_acceleration)
-        yield from filter(None, (self.angular_velocity_status, self.linear_acceleration_status))
+        status = (self.angular_velocity_status, self.linear_acceleration_status)
+        return field_paths(self.angular_velocity, self.linear_acceleration, *status)
 
     def read(self, table: MessageTable) -> tuple[Imu | None, Dropped]:
         """The rows with an angular rate; specific force is NaN where it was not measured."""
@@ -67,15 +62,15 @@ class ImuAdapter(Adapter):
         return (Imu(table.stamps_ns[rows], rate, force) if rows.size else None), dropped
 
     def warnings(self, table: MessageTable) -> Iterator[str]:
-        """That a driver leaves the specific force as it was made."""
+        """Warning about a specific force that the driver does not fill."""
         if self._is_force_unfilled(table):
             names = ", ".join(self.linear_acceleration)
             yield f"{names} are 0 in every message, which no accelerometer measures: taken as not measured"
 
     def _is_force_unfilled(self, table: MessageTable) -> bool:
-        """Whether it is zero throughout: not even free fall is that."""
-        said = table.beside(self.linear_acceleration)[~_is_marked(table, self.linear_acceleration_status)]
-        return bool(len(said)) and not said.any()
+        """Tell whether the force is zero in all messages, which not even free fall gives."""
+        measured = table.beside(self.linear_acceleration)[~_is_marked(table, self.linear_acceleration_status)]
+        return bool(len(measured)) and not measured.any()
 
 
 def _scaled(values: np.ndarray, scale: float) -> np.ndarray:
@@ -87,7 +82,7 @@ def _is_marked(table: MessageTable, path: str | None) -> np.ndarray:
 
 
 class DepthAdapter(Adapter):
-    """Height of the pressure port: ``z = -(p - atmosphere) / (density g)``, or a field's own metres."""
+    """Height of the pressure port, from a pressure or from a field in metres."""
 
     pressure: str | None = None
     """Field with a pressure."""
@@ -110,8 +105,7 @@ class DepthAdapter(Adapter):
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have."""
-        yield from filter(None, (self.pressure, self.height))
-        yield from self.variance.fields if self.variance else ()
+        return field_paths(self.pressure, self.height, self.variance.fields if self.variance else None)
 
     def read(self, table: MessageTable, gravity_m_s2: float) -> tuple[Depth | None, Dropped]:
         """Heights with variances; NaN: unknown."""
@@ -128,7 +122,7 @@ class DepthAdapter(Adapter):
         return (Depth(table.stamps_ns[rows], z_m[rows], variance_m2[rows]) if rows.size else None), dropped
 
     def assumption(self, gravity_m_s2: float) -> str | None:
-        """How heights were got from pressure, for the notes; None where they were not."""
+        """Formula from pressure to height for the notes; None where the message gives a height."""
         if self.pressure is None:
             return None
         water = f"{self.water_density_kg_m3:g} kg/m3 x {gravity_m_s2:g} m/s2"
@@ -136,7 +130,7 @@ class DepthAdapter(Adapter):
         return f"z = -(p - {self.atmosphere_pa:g} Pa) / ({water}){fresh}"
 
     def warnings(self, table: MessageTable) -> Iterator[str]:
-        """What makes a pressure an unlikely one."""
+        """Warning about a pressure below the atmosphere's."""
         if self.pressure is None:
             return
         typical_pa = float(np.nanmedian(table.column(self.pressure))) * self.scale
@@ -150,11 +144,11 @@ class DepthAdapter(Adapter):
 class TruthAdapter(Adapter):
     """Poses of the body; a twist is not used.
 
-    From the driver's world and body (axes ``w`` and ``b``) to ours: ``R = enu_R_w w_R_b ours_R_b^T``.
+    From world and body axes of the driver (``w``, ``b``) to those of this package: ``R = enu_R_w w_R_b ours_R_b^T``.
     """
 
     frame_id_field: str | None = None
-    position: tuple[str, str, str]
+    position: Paths
     """Fields of x, y, z in the world."""
     orientation: tuple[str, str, str, str]
     """Fields of the quaternion's x, y, z, w."""
@@ -162,13 +156,12 @@ class TruthAdapter(Adapter):
     """Array field of 36: position, then rotation, along the world's axes, as ROS has it."""
     covariance_meaning: Literal["variance", "standard deviation"] = "variance"
     """"variance", or "standard deviation" where the driver puts those on the diagonal."""
-    world: World = "enu"
+    world: Literal["enu", "ned"] = "enu"
     """"enu" (any world with z up), or "ned"."""
 
     def fields(self) -> Iterator[str]:
         """Paths that a message must have."""
-        yield from (*self.position, *self.orientation)
-        yield from filter(None, (self.covariance,))
+        return field_paths(self.position, self.orientation, self.covariance)
 
     def read(self, table: MessageTable) -> tuple[Trajectory | None, Dropped]:
         """Poses with covariances; NaN: unknown."""
@@ -178,30 +171,57 @@ class TruthAdapter(Adapter):
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
         if not rows.size:
             return None, dropped
-        scale = np.where(np.abs(lengths - 1) > 1e-6, lengths, 1.0)  # what is of unit length stays as it is to the bit
-        quaternions = (quaternions / scale[:, None])[rows]
-        truth = Trajectory.without_covariances(table.stamps_ns[rows], *self._in_our_axes(positions[rows], quaternions))
-        covariances = self._covariances(table)[rows]
-        covariances = ros_to_body(covariances, truth.matrices)
-        return Trajectory(truth.stamps_ns, truth.positions, truth.quaternions_xyzw, covariances), dropped
-
-    def _in_our_axes(self, positions: Floats, quaternions: Floats) -> tuple[Floats, Floats]:
-        if self.world == "enu" and self.rotation == "flu":
-            return positions, quaternions
-        W, B = world_matrix(self.world), axes_matrix(self.rotation)
-        turned = SpatialRotation.from_matrix(W @ SpatialRotation.from_quat(quaternions).as_matrix() @ B.T)
-        return positions @ W.T, turned.as_quat()
-
-    def _covariances(self, table: MessageTable) -> Floats:
+        scale = np.where(np.abs(lengths - 1) > 1e-6, lengths, 1.0)  # unit quaternions keep every bit
+        positions, quaternions = positions[rows], (quaternions / scale[:, None])[rows]
+        enu_R_world = _ENU_R_NED if self.world == "ned" else np.eye(3)
+        if self.world != "enu" or self.rotation != "flu":
+            matrices = SpatialRotation.from_quat(quaternions).as_matrix()
+            turned = SpatialRotation.from_matrix(enu_R_world @ matrices @ axes_matrix(self.rotation).T)
+            positions, quaternions = positions @ enu_R_world.T, turned.as_quat()
+        truth = Trajectory.without_covariances(table.stamps_ns[rows], positions, quaternions)
         if self.covariance is None:
-            return np.full((len(table), 6, 6), np.nan)
+            return truth, dropped
         covariances = table.column(self.covariance)
         if covariances.shape[1:] != (36,):
             table.refuse(self.covariance, "is no array of 36 numbers")
-        covariances = covariances.reshape(-1, 6, 6)
+        covariances = covariances.reshape(-1, 6, 6)[rows]
         if self.covariance_meaning == "standard deviation":
             covariances = np.where(covariances < 0, covariances, covariances**2) * np.eye(6)
         if self.world != "enu":
-            W = np.kron(np.eye(2), world_matrix(self.world))
+            W = np.kron(np.eye(2), enu_R_world)
             covariances = W @ covariances @ W.T
-        return covariances
+        covariances = ros_to_body(covariances, truth.matrices)
+        return Trajectory(truth.stamps_ns, truth.positions, truth.quaternions_xyzw, covariances), dropped
+
+
+def body_to_ros(covariances: Floats, rotations: Floats) -> Floats:
+    """Covariances for ROS messages.
+
+    Parameters
+    ----------
+    covariances
+        Of ``[theta, rho]`` in the body frame, shape (n, 6, 6); NaN: unknown.
+    rotations
+        ``world_R_body``, shape (n, 3, 3).
+
+    Returns
+    -------
+    ndarray
+        Of ``[rho, theta]`` along the world's axes, shape (n, 6, 6); zeros: unknown.
+    """
+    swap = _swap(rotations)
+    return np.nan_to_num(swap @ covariances @ swap.transpose(0, 2, 1), nan=0.0)
+
+
+def ros_to_body(covariances: Floats, rotations: Floats) -> Floats:
+    """Inverse of `body_to_ros`; all zeros, or a negative variance, mean unknown and become NaN."""
+    swap = _swap(rotations).transpose(0, 2, 1)
+    known = np.any(covariances != 0, axis=(1, 2)) & (np.diagonal(covariances, axis1=1, axis2=2) >= 0).all(axis=1)
+    return np.where(known[:, None, None], swap @ covariances @ swap.transpose(0, 2, 1), np.nan)
+
+
+def _swap(rotations: Floats) -> Floats:
+    swap = np.zeros((len(rotations), 6, 6))
+    swap[:, :3, 3:] = rotations
+    swap[:, 3:, :3] = rotations
+    return swap

@@ -22,7 +22,7 @@ MISTAKES = {
     ),
     "a type of which too little is said": (
         '[imu]\ntype = "my_msgs/msg/Gyro"',
-        r"\[imu\] angular_velocity: is missing; .*no adapter comes along for my_msgs/msg/Gyro",
+        r"\[imu\] angular_velocity: is missing; .*no adapter is shipped for my_msgs/msg/Gyro",
     ),
     "a key in an inner table": (
         "[dvl]\ncovariance = {kind = 1}",
@@ -96,7 +96,7 @@ def test_a_topic_of_the_command_line_goes_before_that_of_the_file(foreign: Any, 
     ("toml", "message"),
     [
         ('[dvl]\ntopic = "/missing"', "nothing for dvl: /missing was chosen but is not in the log"),
-        ('[dvl]\ntopic = "/imu"', "/imu was chosen but is a sensor_msgs/msg/Imu, for which no adapter comes along"),
+        ('[dvl]\ntopic = "/imu"', "/imu was chosen but is a sensor_msgs/msg/Imu, for which no adapter is shipped"),
         ('[dvl]\ntype = "dvl_msgs/msg/DVL"', "nothing for dvl: no dvl_msgs/msg/DVL, which .* asks for"),
         ('[depth]\ntopic = "/missing"', "nothing for depth: /missing was chosen"),
         (

@@ -9,7 +9,7 @@ import pytest
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters.log_config import read_log_config
 from sonar_graph.logs.inspection import inspect_log
-from sonar_graph.logs.sonar_frames import describe_frames, read_sonar_frames
+from sonar_graph.logs.reading import describe_frames, read_sonar_frames
 from sonar_graph.measurements import SonarFrames
 
 IMAGE, PING = "marine_acoustic_msgs/msg/ProjectedSonarImage", "oculus_interfaces/msg/Ping"

@@ -15,7 +15,7 @@ from sonar_graph.logs.convert.oculus import convert_oculus
 from sonar_graph.logs.convert.sonar_file import SonarConversion
 from sonar_graph.logs.mcap.reader import Recording, scan
 from sonar_graph.logs.mcap.topic import Keep
-from sonar_graph.logs.sonar_frames import read_sonar_frames
+from sonar_graph.logs.reading import read_sonar_frames
 from sonar_graph.logs.vehicle_setup import read_calibration, read_notes
 from sonar_graph.measurements import SonarFrames
 

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from sonar_graph.logs.convert.didson_aris import convert_aris
-from sonar_graph.logs.sonar_frames import read_sonar_frames
+from sonar_graph.logs.reading import read_sonar_frames
 
 from .sonar_logs import converted, degrees
 from .sonar_recordings import START_NS, STEP_NS, Aris, images, put

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.logs.convert.oculus import convert_oculus
-from sonar_graph.logs.sonar_frames import read_sonar_frames
+from sonar_graph.logs.reading import read_sonar_frames
 
 from .sonar_logs import converted, degrees
 from .sonar_recordings import STEP_NS, Oculus, images, oculus_note, put

@@ -9,7 +9,7 @@ import pytest
 from sonar_graph.cli.main import main
 from sonar_graph.errors import DatasetError, LogError
 from sonar_graph.logs.convert.didson_aris import convert_didson
-from sonar_graph.logs.sonar_frames import read_sonar_frames
+from sonar_graph.logs.reading import read_sonar_frames
 
 from .sonar_logs import converted
 from .sonar_recordings import START_NS, STEP_NS, Aris, Ddf, Oculus, images

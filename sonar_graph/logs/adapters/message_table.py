@@ -1,4 +1,4 @@
-"""The messages of a topic as one table: columns over all rows, stamps, and which rows are fit for use."""
+"""Messages of a topic as one table: columns over all rows, stamps, and the rows that are fit for use."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from sonar_graph.errors import LogError
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
 from sonar_graph.measurements import Ints
+from sonar_graph.sequence import NS_PER_S
 
-NS_PER_S = 1_000_000_000
 Dropped = dict[str, int]
-"""How many rows were left out, by reason."""
+"""Number of rows left out, by reason."""
 NOT_FINITE = "with values that are not finite"
 LOG_TIME = "log"
-"""In the place of a stamp's field: the time of recording."""
+"""Value of `Adapter.stamp` that stands for the time of recording."""
 
 
 def header_stamps_ns(group: Messages, log_times_ns: Ints, prefix: str = "header.stamp.") -> Ints:
@@ -29,9 +29,9 @@ def header_stamps_ns(group: Messages, log_times_ns: Ints, prefix: str = "header.
     group
         n messages.
     log_times_ns
-        Of all messages of the topic.
+        Times of recording of all messages of the topic.
     prefix
-        Of the stamp's two fields.
+        Path before the two fields of the stamp.
     """
     stamps_ns = group[f"{prefix}sec"].astype(np.int64) * NS_PER_S + group[f"{prefix}nanosec"]
     return np.where(stamps_ns == 0, log_times_ns[group.rows], stamps_ns)
@@ -45,9 +45,9 @@ class MessageTable:
     topic
         With its payloads.
     stamp
-        The field with the time of validity: a Time, or a number; ``log`` takes the time of recording.
+        Field with the time of validity: a Time or a number; ``log`` takes the time of recording.
     stamp_unit_s
-        Of the stamp, where it is a number.
+        Unit of a stamp that is a number.
     stamp_offset_s
         Added to every stamp.
 
@@ -69,7 +69,7 @@ class MessageTable:
         if stamp == LOG_TIME:
             self.stamps_ns = log_times_ns
         elif self.has(stamp):
-            self.stamps_ns = _nanoseconds(self.column(stamp), stamp_unit_s)
+            self.stamps_ns = nanoseconds(self.column(stamp), stamp_unit_s)
         else:
             self._require(f"{stamp}.sec")
             self.stamps_ns = np.empty(len(topic), np.int64)
@@ -82,7 +82,7 @@ class MessageTable:
         return len(self.stamps_ns)
 
     def has(self, path: str) -> bool:
-        """Whether every message has a field with values."""
+        """Tell whether every message has a field with values."""
         return all(field_of(path)[0] in group.layout.columns for group in self.groups)
 
     def column(self, path: str) -> NDArray[Any]:
@@ -101,12 +101,8 @@ class MessageTable:
             self.refuse(path, f"has {values.shape[1] if values.ndim > 1 else 'no'} elements")
         return values[:, index]
 
-    def columns(self, prefix: str, names: str) -> NDArray[Any]:
-        """Fields side by side, shape (n, m): ``columns("velocity", "xyz")``."""
-        return self.beside([f"{prefix}.{name}" for name in names])
-
     def beside(self, paths: Sequence[str]) -> NDArray[Any]:
-        """Fields of one number a message side by side, shape (n, m)."""
+        """Fields with one number a message side by side, shape (n, m)."""
         found = [self.column(path) for path in paths]
         for path, column in zip(paths, found, strict=True):
             if column.ndim > 1:
@@ -134,8 +130,8 @@ def field_of(path: str) -> tuple[str, int | None]:
     return name, int(rest.rstrip("]")) if bracket else None
 
 
-def _nanoseconds(values: NDArray[Any], unit_s: float) -> Ints:
-    """Exact where the unit is a whole number of nanoseconds; what is not finite counts as 0."""
+def nanoseconds(values: NDArray[Any], unit_s: float) -> Ints:
+    """Stamps of any unit in nanoseconds; exact for units of whole nanoseconds, 0 for values that are not finite."""
     unit_ns = unit_s * NS_PER_S
     finite = np.where(np.isfinite(values), values, 0)
     if unit_ns < 1 or abs(unit_ns - round(unit_ns)) > 1e-9 * unit_ns:
@@ -145,21 +141,21 @@ def _nanoseconds(values: NDArray[Any], unit_s: float) -> Ints:
 
 
 def not_finite(*columns: NDArray[Any]) -> NDArray[np.bool_]:
-    """Rows in which some column has a value that is not finite, shape (n,)."""
+    """Mask of rows in which some column has a value that is not finite, shape (n,)."""
     return ~np.all([np.isfinite(c).reshape(len(c), -1).all(axis=1) for c in columns], axis=0)
 
 
-def fit_rows(stamps_ns: Ints, faults: Mapping[str, NDArray[np.bool_]], *, unique: bool) -> tuple[Ints, dict[str, int]]:
-    """The rows fit for use in the order of their stamps, and how many are not, by fault.
+def fit_rows(stamps_ns: Ints, faults: Mapping[str, NDArray[np.bool_]], *, unique: bool) -> tuple[Ints, Dropped]:
+    """Rows fit for use in the order of their stamps, and the number of the others by fault.
 
     Parameters
     ----------
     stamps_ns
         Shape (n,).
     faults
-        Which rows have it, shape (n,), by the fault's name; a row counts for the first only.
+        Masks, shape (n,), by the fault's name; a row counts for its first fault only.
     unique
-        Refuse all but the first of rows with the same stamp.
+        Leave out all but the first of rows with the same stamp.
     """
     fit = np.ones(len(stamps_ns), bool)
     counts = {}
