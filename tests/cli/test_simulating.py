@@ -9,8 +9,7 @@ from mcap.stream_reader import StreamReader
 from typer.testing import CliRunner
 
 from sonar_graph.cli.main import app
-from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.reading import read_sonar_frames
+from sonar_graph.logs.reading import read_log, read_sonar_frames
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin, simulate_basin_frames
 
 SHORT = {"duration_s": 120, "laps": 1, "frame_rate_hz": 0.5, "image": {"multipath": False}}
