@@ -1,4 +1,4 @@
-"""Running estimators, judging them, and reporting: knows them only through their contract."""
+"""Running estimators on a sequence and scoring them; estimators are known only through their contract."""
 
 # fmt: off
 from sonar_graph.evaluation.comparison import LIBRARIES, compare, describe_environment, judge
@@ -6,55 +6,25 @@ from sonar_graph.evaluation.consistency import (
     GATED_SHARE, NONE, UNJUDGED, Reliability, anees_interval, confidences, nis, normalised_squares, reliability_of,
     true_identities,
 )
+from sonar_graph.evaluation.digits import ABSENT, between, fixed, format_value, quantile_text, supported, with_error
 from sonar_graph.evaluation.metrics import anonymous_named, landmark_errors, rmse, yaw_rad
 from sonar_graph.evaluation.results import (
-    ABSENT, LABELS, MOST_ROWS_NAMED, Comparison, ErrorSeries, MapSoFar, RefusedRows, RunResult, Score, format_value,
-    gathered,
+    MOST_ROWS_NAMED, TOLERATED_FACTOR, Comparison, ErrorSeries, MapSoFar, RefusedRows, RunResult, Score, gathered,
 )
 from sonar_graph.evaluation.run import one_line, run_estimator
+from sonar_graph.evaluation.score_table import LABELS, run_columns, score_keys, score_table
 from sonar_graph.evaluation.scored_instants import DURATION_S, MAP_TIMES_S, RETURN_M, published_maps, repeats_published
 from sonar_graph.evaluation.scores import ESTIMATES
 from sonar_graph.evaluation.storage import read_comparison, write_comparison, write_viewer_files
+from sonar_graph.evaluation.tables import Cell, Column, Table, absent, as_html, count, number, text_table, words
 
 __all__ = [
-    "ABSENT",
-    "DURATION_S",
-    "ESTIMATES",
-    "GATED_SHARE",
-    "LABELS",
-    "LIBRARIES",
-    "MAP_TIMES_S",
-    "MOST_ROWS_NAMED",
-    "NONE",
-    "RETURN_M",
-    "UNJUDGED",
-    "Comparison",
-    "ErrorSeries",
-    "MapSoFar",
-    "RefusedRows",
-    "Reliability",
-    "RunResult",
-    "Score",
-    "anees_interval",
-    "anonymous_named",
-    "compare",
-    "confidences",
-    "describe_environment",
-    "format_value",
-    "gathered",
-    "judge",
-    "landmark_errors",
-    "nis",
-    "normalised_squares",
-    "one_line",
-    "published_maps",
-    "read_comparison",
-    "reliability_of",
-    "repeats_published",
-    "rmse",
-    "run_estimator",
-    "true_identities",
-    "write_comparison",
-    "write_viewer_files",
-    "yaw_rad",
+    "ABSENT", "Cell", "Column", "Comparison", "DURATION_S", "ESTIMATES", "ErrorSeries", "GATED_SHARE", "LABELS",
+    "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "MapSoFar", "NONE", "RETURN_M", "RefusedRows", "Reliability",
+    "RunResult", "Score", "TOLERATED_FACTOR", "Table", "UNJUDGED", "absent", "anees_interval", "anonymous_named",
+    "as_html", "between", "compare", "confidences", "count", "describe_environment", "fixed", "format_value",
+    "gathered", "judge", "landmark_errors", "nis", "normalised_squares", "number", "one_line", "published_maps",
+    "quantile_text", "read_comparison", "reliability_of", "repeats_published", "rmse", "run_columns", "run_estimator",
+    "score_keys", "score_table", "supported", "text_table", "true_identities", "with_error", "words",
+    "write_comparison", "write_viewer_files", "yaw_rad",
 ]

@@ -1,17 +1,12 @@
-"""Does the reported covariance fit the errors? NEES, NIS, and the bounds between which they should lie.
+"""Consistency: NEES and NIS with their chi-square bounds, and the reliability of identity posteriors.
 
-Equations: docs/theory/metrics.md. Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to
-Tracking and Navigation, Wiley 2001, section 5.4.
+NEES and NIS: docs/theory/metrics.md (Bar-Shalom, Li, Kirubarajan 2001, section 5.4).
 
-Are identity posteriors as sure as they are right? Judged against the true landmarks.
-
-A detection is of the true landmark that lies nearest to it, if that is within 15 cm, and of none if all are farther
-than 40 cm; those in between are left out. Its confidence is the posterior of its most probable class, "none of them"
-included. With n_b of n detections in bin b of confidence,
+Reliability: a detection belongs to the nearest true landmark within `SAME_M`, and to none if all are farther than
+`APART_M`; those in between are left out. Its confidence is the posterior of its most probable class, "none of them"
+included. With n_b of n detections in bin b of confidence, the expected calibration error is (Naeini et al., AAAI 2015)
 
     ECE = sum_b n_b / n | mean confidence of b - share of right ones in b |
-
-(Naeini et al., AAAI 2015). Detections of one pass depend on each other: the number tells little about few passes.
 """
 
 from __future__ import annotations
@@ -28,8 +23,12 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, Outcome, Trajectory
 
 GATED_SHARE = 0.2
-"""Above this share of detections outside its gate an estimator has lost its way, or its noise is far too small; the
-innovations that the gate let through then say nothing of its covariances."""
+"""Above this share of detections outside its gate an estimator is lost, or its noise is far too small; the innovations
+inside the gate then say nothing about its covariances."""
+BINS = 10
+SAME_M, APART_M = 0.15, 0.40
+NONE, UNJUDGED = -1, -2
+"""True class of a detection that is of no landmark, and of one that is left out."""
 
 
 def error_series(estimate: Trajectory, truth: Trajectory, position_dof: int) -> ErrorSeries:
@@ -46,12 +45,16 @@ def error_series(estimate: Trajectory, truth: Trajectory, position_dof: int) -> 
     position_error = estimate.positions - truth.positions
     position_cov, yaw_var = world_position_covs(estimate), yaw_variances(estimate)
     axes = slice(0, position_dof)
+
+    def sigma(variances: Floats) -> Floats:
+        return np.asarray(np.sqrt(np.maximum(variances, 0.0)))  # rounding below zero counts as zero
+
     return ErrorSeries(
         stamps_ns=estimate.stamps_ns,
         position_m=position_error,
-        position_sigma_m=_root(np.diagonal(position_cov, axis1=1, axis2=2)),
+        position_sigma_m=sigma(np.diagonal(position_cov, axis1=1, axis2=2)),
         yaw_rad=yaw_error,
-        yaw_sigma_rad=_root(yaw_var),
+        yaw_sigma_rad=sigma(yaw_var),
         nees_position=normalised_squares(position_error[:, axes], position_cov[:, axes, axes]),
         nees_yaw=normalised_squares(yaw_error[:, None], yaw_var[:, None, None]),
         position_dof=position_dof,
@@ -102,7 +105,7 @@ def normalised_squares(errors: Floats, covs: Floats) -> Floats:
 def nis(log: DetectionLog) -> Floats:
     """Normalised innovation squared of each detection that was used, shape (k,); 2 degrees of freedom.
 
-    The first sight of a landmark has no prediction and does not appear; what the gate refused does not either.
+    The first sight of a landmark has no prediction and is left out, as is what the gate refused.
     """
     used = np.array([outcome is Outcome.USED for outcome in log.outcomes], dtype=bool)
     squares = normalised_squares(log.innovations[used], log.innovation_covs[used])
@@ -110,9 +113,9 @@ def nis(log: DetectionLog) -> Floats:
 
 
 def mean_normalised(squares: Floats, dof: int) -> float:
-    """Mean over what is known, divided by the degrees of freedom: 1 is consistent, above it over-confident.
+    """Mean of the known values divided by the degrees of freedom: 1 is consistent, above is over-confident.
 
-    NaN when nothing is known.
+    NaN when none is known.
     """
     known = squares[np.isfinite(squares)]
     return float(known.mean() / dof) if known.size else float("nan")
@@ -144,16 +147,6 @@ def anees_interval(runs: int, dof: int, probability: float = 0.95) -> tuple[floa
     return float(chi2.ppf(tail, total) / total), float(chi2.ppf(1 - tail, total) / total)
 
 
-def _root(variances: Floats) -> Floats:
-    """Standard deviations; rounding below zero counts as zero."""
-    return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
-
-
-BINS = 10
-SAME_M, APART_M = 0.15, 0.40
-NONE, UNJUDGED = -1, -2
-
-
 @dataclass(frozen=True, eq=False)
 class Reliability:
     """Confidence and truth by bins of equal width from 0 to 1."""
@@ -181,7 +174,7 @@ def reliability(confidence: Floats, right: Floats) -> Reliability:
 
 
 def reliability_of(sequence: Sequence) -> Reliability | None:
-    """Of a sequence's detections; None without them, truth, or any that can be judged."""
+    """Reliability of a sequence's detections; None without them, without truth, or if none can be judged."""
     if sequence.detections is None or sequence.truth is None or sequence.true_landmarks is None:
         return None
     labels = true_identities(sequence, sequence.detections)
@@ -193,14 +186,14 @@ def reliability_of(sequence: Sequence) -> Reliability | None:
 
 
 def confidences(detections: LandmarkDetections) -> tuple[Floats, Ints]:
-    """Posterior of the most probable class and that class, -1 for none of them, shapes (n,)."""
+    """Posterior of the most probable class, and that class (`NONE` for none of them), shapes (n,)."""
     ids, probability = detections.most_probable()
     none = 1.0 - detections.id_probability.sum(axis=1)
     return np.maximum(probability, none), np.where(none > probability, NONE, ids)
 
 
 def true_identities(sequence: Sequence, detections: LandmarkDetections) -> Ints:
-    """The true class of each detection; -1: none, -2: cannot be told. Shape (n,)."""
+    """The true class of each detection, shape (n,): an identity, `NONE` or `UNJUDGED`."""
     assert sequence.truth is not None
     assert sequence.true_landmarks is not None
     truth, landmarks = sequence.truth, sequence.true_landmarks

@@ -1,13 +1,10 @@
-"""Errors of trajectories and maps against the truth. Equations: docs/theory/metrics.md.
+"""Errors of trajectories and maps against the truth: ATE, RPE, heading, return, landmarks.
 
-Every function of two trajectories takes them at the same instants; `Trajectory.at` brings a truth there.
+    ATE = sqrt( 1/n sum_i |T(p_i) - p_true,i|^2 )        T: identity, or the best rigid alignment (Umeyama 1991)
 
-Rigid alignment of an estimate with the truth: what is left of an error without the choice of world frame.
-
-Landmarks that an estimator has named itself, matched to the true ones by their place.
-
-An estimator that is not told identities gives its landmarks some of its own, from `FIRST_ANONYMOUS_ID` on. Maps are
-compared by identity, so that no landmark is ever mistaken for a known one; to score these, they are named first.
+All equations: docs/theory/metrics.md. Functions of two trajectories take them at the same instants; `Trajectory.at`
+interpolates a truth there. Maps are compared by identity. Landmarks of unknown identity (from `FIRST_ANONYMOUS_ID` on)
+are first matched to the true ones by their place.
 """
 
 from __future__ import annotations
@@ -21,6 +18,11 @@ from sonar_graph.errors import EvaluationError
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import NS_PER_S
 from sonar_graph.states import FIRST_ANONYMOUS_ID, LandmarkMap, Trajectory
+
+PAIRING_TOLERANCE = 0.01
+"""A pair for the relative error may be this fraction of the delta longer or shorter than it."""
+FARTHEST_M = 1.0
+"""Largest horizontal distance at which a landmark of unknown identity is matched to a true one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,18 +81,13 @@ def align_se3(points: Floats, targets: Floats) -> Alignment:
 
 
 def align_yaw(points: Floats, targets: Floats) -> Alignment:
-    """The best rotation about the vertical and translation: the four directions that sonar, IMU and Doppler cannot see.
+    """The best rotation about the vertical and translation, from points of shape (n, 3).
 
-    Height and heading do not meet in the sum of squares, so its horizontal part is also the best SE(2) alignment.
-    Points have shape (n, 3).
+    Height and heading are separate in the sum of squares, so its horizontal part is also the best SE(2) alignment.
     """
     rotation, translation = np.eye(3), (targets - points).mean(axis=0)
     rotation[:2, :2], translation[:2] = umeyama(points[:, :2], targets[:, :2])
     return Alignment(rotation, translation)
-
-
-PAIRING_TOLERANCE = 0.01
-"""A pair for the relative error may be this fraction of the delta longer or shorter than it."""
 
 
 def rmse(errors: Floats) -> float:
@@ -161,12 +158,17 @@ class RelativeErrors:
 def relative_errors(estimate: Trajectory, truth: Trajectory, delta_s: float) -> RelativeErrors:
     """Errors of the motion over ``delta_s`` from every instant that has a partner that much later.
 
-    The motion's translation is the displacement seen from the body at the pair's first instant, so that an error of
-    heading which is already there does not count again.
+    The translation of a motion is the displacement in the body frame at the pair's first instant: an error of heading
+    that is already there does not count again.
     """
     check_paired(estimate, truth)
     first, second = pairs_apart(estimate.stamps_ns, delta_s)
-    error_m = _body_displacement(estimate, first, second) - _body_displacement(truth, first, second)
+
+    def body_displacement(trajectory: Trajectory) -> Floats:
+        step = trajectory.positions[second] - trajectory.positions[first]
+        return np.asarray(np.einsum("kji,kj->ki", trajectory.matrices[first], step))
+
+    error_m = body_displacement(estimate) - body_displacement(truth)
     yaw_error = yaw_errors_rad(estimate, truth)
     return RelativeErrors(np.linalg.norm(error_m, axis=1), wrapped(yaw_error[second] - yaw_error[first]))
 
@@ -214,13 +216,7 @@ def horizontal_aligned_rmse(points: Floats, targets: Floats) -> float:
 
 
 def check_paired(estimate: Trajectory, truth: Trajectory) -> None:
-    """Refuse trajectories that are not at the same instants, or empty.
-
-    Raises
-    ------
-    EvaluationError
-        Saying which.
-    """
+    """Raise `EvaluationError` for trajectories that are not at the same instants, or empty."""
     if not len(estimate) or not np.array_equal(estimate.stamps_ns, truth.stamps_ns):
         raise EvaluationError(
             f"an error needs estimate and truth at the same instants, at least one; got {len(estimate)} and "
@@ -228,32 +224,17 @@ def check_paired(estimate: Trajectory, truth: Trajectory) -> None:
         )
 
 
-def _body_displacement(trajectory: Trajectory, first: Ints, second: Ints) -> Floats:
-    """Position at ``second`` in the body frame at ``first``, shape (k, 3)."""
-    step = trajectory.positions[second] - trajectory.positions[first]
-    return np.asarray(np.einsum("kji,kj->ki", trajectory.matrices[first], step))
-
-
-FARTHEST_M = 1.0
-"""Farther from a true landmark than this, horizontally, one without a name is not taken for it when it is scored."""
-
-
 def anonymous_named(estimated: LandmarkMap, true: LandmarkMap | None) -> LandmarkMap:
-    """The map as it is scored: landmarks without a name get that of the true one within `FARTHEST_M`."""
+    """The map as it is scored: landmarks of unknown identity get that of the true one within `FARTHEST_M`."""
     return estimated if true is None else named_by_place(estimated, true, FARTHEST_M)
 
 
 def named_by_place(estimated: LandmarkMap, true: LandmarkMap, farthest_m: float) -> LandmarkMap:
     """The estimated map, in which landmarks of unknown identity get that of the true landmark at their place.
 
-    Of all matchings one to one between landmarks of unknown identity and true ones that no identity of the map names,
-    the one with the most pairs within ``farthest_m``, horizontally, and of these the one with the least sum of squared
-    distances (Kuhn, Naval Research Logistics 2, 1955). What is matched with none keeps its identity.
-
-    Parameters
-    ----------
-    farthest_m
-        Farther apart than this nothing is matched. Neither map is aligned.
+    The assignment is one to one, between landmarks of unknown identity and true ones that the map does not name. It has
+    the most pairs within ``farthest_m`` (horizontal distance, not aligned), and among such assignments the least sum of
+    squared distances (Kuhn, Naval Research Logistics 2, 1955). Landmarks without a partner keep their identity.
     """
     unknown = np.flatnonzero((estimated.ids >= FIRST_ANONYMOUS_ID) & ~np.isin(estimated.ids, true.ids))
     free = np.flatnonzero(~np.isin(true.ids, estimated.ids))

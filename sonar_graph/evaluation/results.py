@@ -1,21 +1,29 @@
-"""What a run left behind, and what was made of several: the data that metrics fill and reports show."""
+"""Results as data: a run, its scores and errors, and a comparison of several runs."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from html import escape
 from itertools import groupby
 from typing import Any, Literal
 
 import numpy as np
 
+from sonar_graph.evaluation.digits import format_value
+from sonar_graph.evaluation.score_table import score_table
+from sonar_graph.evaluation.tables import as_html
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.recognition import Recognition
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, LandmarkMap, Refusal, RefusedRow, Trajectory
 
 Kind = Literal["causal", "smoothed"]
+TOLERATED_FACTOR = 2.0
+"""Distance from 1, as a factor, from which a normalised squared error without an interval is called inconsistent."""
+MOST_ROWS_NAMED = 5
+"""Refused rows of one sensor and reason that are named one by one, and messages of one run that are shown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,15 +45,15 @@ class RunResult:
     reason: str = ""
     """Why it failed, in one line; empty when it did not."""
     causal: Trajectory | None = None
-    """What `process` returned at each instant."""
+    """Estimates that `process` returned at each instant."""
     smoothed: Trajectory | None = None
-    """What `trajectory` returned at the end: the same instants. A filter's is its causal one."""
+    """The `trajectory` at the end, at the same instants. A filter's is its causal one."""
     landmarks: LandmarkMap | None = None
     detections: DetectionLog | None = None
     refused: list[RefusedRow] = field(default_factory=list)
     """Rows of IMU and Doppler log that it names as not used."""
     withheld: list[str] = field(default_factory=list)
-    """What it says that it could not use for want of something else, a line each."""
+    """Measurements that it could not use because something else is missing, in its own words, a line each."""
     maps: list[MapSoFar] = field(default_factory=list)
     """The map at `map_instants`, in order; the last one is `landmarks`."""
     update_s: Floats = field(default_factory=lambda: np.empty(0))
@@ -63,10 +71,43 @@ class Score:
     value: float
     unit: str
     protocol: str
-    """How it was got, in one sentence: which estimate, aligned how, over which instants, against which truth."""
+    """The measuring rule in one sentence: which estimate, aligned how, over which instants, against which truth."""
     interval: tuple[float, float] | None = None
-    """Where the value should lie if the estimator is consistent; None where no such interval exists."""
+    """Interval in which the value of a consistent estimator lies; None where none is known."""
     better: Literal["lower", "higher", "inside", "none"] = "lower"
+
+    @property
+    def shown_unit(self) -> str:
+        """The unit in which people see the score: degrees for radians, none for "1"."""
+        return {"rad": "°", "1": "", "-": ""}.get(self.unit, self.unit)
+
+    def text(self, value: float | None = None) -> str:
+        """The score's value, or another value in its unit, as people see it in `shown_unit`."""
+        number = self.value if value is None else value
+        return format_value(math.degrees(number) if self.unit == "rad" else number)
+
+    @property
+    def with_unit(self) -> str:
+        """The value as people see it, with its unit."""
+        unit = self.shown_unit
+        return self.text() + ("" if unit in ("", "°") else "\N{NO-BREAK SPACE}") + unit
+
+    @property
+    def verdict(self) -> str:
+        """The verdict of a normalised squared error on the reported covariances; empty for other scores.
+
+        Above the score's interval, or where it has none above `TOLERATED_FACTOR`, the estimator is over-confident;
+        below the interval, or the factor's inverse, over-cautious. Inside the interval it is consistent. Inside the
+        factor nothing is said: one run proves little.
+        """
+        if self.better != "inside" or math.isnan(self.value):
+            return ""
+        lowest, highest = self.interval or (1 / TOLERATED_FACTOR, TOLERATED_FACTOR)
+        if self.value > highest:
+            return "over-confident"
+        if self.value < lowest:
+            return "over-cautious"
+        return "consistent" if self.interval else ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,31 +146,22 @@ class Comparison:
     environment: dict[str, str]
     """Versions, machine, date, and the command that made it."""
     recognition: Recognition | None = None
-    """How the detections came from sonar images; None where the log had detections or no images."""
+    """The recognition of landmarks in sonar images; None where the log had detections or no images."""
 
+    def score_of(self, name: str, key: str) -> Score | None:
+        """The score of a run; None where it is missing or not a number."""
+        score = self.scores.get(name, {}).get(key)
+        return None if score is None or math.isnan(score.value) else score
 
-ABSENT = "\N{EN DASH}"
+    @property
+    def failed_runs(self) -> list[RunResult]:
+        """Runs that did not come to an end."""
+        return [run for run in self.runs if run.status == "failed"]
 
-
-def format_value(value: float) -> str:
-    """A number with three significant digits; whole numbers and thousands in full; a dash where there is none."""
-    if math.isnan(value):
-        return ABSENT
-    if math.isinf(value):
-        return "∞" if value > 0 else "\N{MINUS SIGN}∞"
-    if float(value).is_integer() or abs(value) >= 1000:
-        text = f"{value:.0f}"
-    elif abs(value) < 1e-3:
-        mantissa, exponent = f"{value:.2e}".split("e")
-        text = f"{mantissa}e{int(exponent)}"
-    else:
-        rounded = float(f"{value:.3g}")
-        text = f"{rounded:.{max(0, 2 - math.floor(math.log10(abs(rounded))))}f}"
-    return text.replace("-", "\N{MINUS SIGN}")
-
-
-MOST_ROWS_NAMED = 5
-"""Rows of one sensor and reason that are named one by one, more are gathered; of what was withheld the first ones."""
+    def _repr_html_(self) -> str:
+        """The scores as a table, for a notebook; below them, why runs failed."""
+        failed = (f"<p>{escape(run.estimator)} failed: {escape(run.reason)}</p>" for run in self.failed_runs)
+        return f"<p><strong>{escape(self.sequence.name)}</strong></p>\n{as_html(score_table(self))}\n{''.join(failed)}"
 
 
 @dataclass(frozen=True)
@@ -146,23 +178,23 @@ class RefusedRows:
 
     @classmethod
     def of(cls, rows: list[RefusedRow]) -> RefusedRows:
-        """From rows with the same sensor and reason."""
+        """One summary of rows with the same sensor and reason."""
         stamps_ns = [row.stamp_ns for row in rows]
         distances = [row.distance for row in rows if not math.isnan(row.distance)]
         ends = (min(distances), max(distances)) if distances else None
         return cls(rows[0].sensor, rows[0].reason, len(rows), min(stamps_ns), max(stamps_ns), ends)
 
     def times(self, start_ns: int) -> str:
-        """In seconds after the start, from the first to the last."""
+        """First and last stamp in seconds after the start."""
         return " to ".join(f"{(stamp_ns - start_ns) * 1e-9:.3f}" for stamp_ns in sorted({self.first_ns, self.last_ns}))
 
     def distances(self) -> str:
-        """From the least to the largest; empty where the reason has none."""
+        """Least and largest squared distance; empty where the reason has none."""
         return " to ".join(format_value(distance) for distance in sorted(set(self.least_and_largest_distance or ())))
 
 
 def gathered(rows: Iterable[RefusedRow]) -> list[RefusedRows]:
-    """Each row where a sensor has few for a reason, else all in one; in order of sensors, reasons and stamps."""
+    """Refused rows by sensor and reason, in this order: up to `MOST_ROWS_NAMED` one by one, more in one summary."""
     ordered = sorted(rows, key=lambda row: (row.sensor, row.reason, row.stamp_ns))
     found: list[RefusedRows] = []
     for _, alike in groupby(ordered, key=lambda row: (row.sensor, row.reason)):
@@ -171,33 +203,3 @@ def gathered(rows: Iterable[RefusedRow]) -> list[RefusedRows]:
             [RefusedRows.of(several)] if len(several) > MOST_ROWS_NAMED else [RefusedRows.of([row]) for row in several]
         )
     return found
-
-
-LABELS = {
-    "ate_raw_m": "Position error, not aligned (ATE, RMS)",
-    "ate_yaw_m": "Position error, yaw and translation aligned (ATE, RMS)",
-    "ate_se2_m": "Horizontal position error, SE(2) aligned (ATE, RMS)",
-    "ate_se3_m": "Position error, SE(3) aligned (ATE, RMS)",
-    "rpe_1s_m": "Drift over 1 s (RPE, RMS)",
-    "rpe_10s_m": "Drift over 10 s (RPE, RMS)",
-    "rpe_1s_rad": "Yaw drift over 1 s (RPE, RMS)",
-    "rpe_10s_rad": "Yaw drift over 10 s (RPE, RMS)",
-    "yaw_rmse_rad": "Yaw error (RMS)",
-    "return_error_m": "Return error: last position",
-    "nees_position": "Position NEES per degree of freedom",
-    "nees_yaw": "Yaw NEES",
-    "raw_m": "Horizontal landmark error, not aligned (RMS)",
-    "se2_m": "Horizontal landmark error, SE(2) aligned (RMS)",
-    "count": "Landmarks mapped",
-    "nees": "Landmark NEES per degree of freedom",
-    "used": "Detections used",
-    "refused": "Detections refused",
-    "unnamed": "Detections of no landmark that is probable enough",
-    "nis": "NIS per degree of freedom",
-    "update_median_ms": "Per update, median",
-    "update_p99_ms": "Per update, 99th percentile",
-    "update_max_ms": "Per update, longest",
-    "total_s": "Whole run",
-    "real_time_factor": "Real-time factor: log duration over run time",
-    "peak_mb": "Peak memory added by the run",
-}

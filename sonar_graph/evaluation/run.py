@@ -1,8 +1,6 @@
-"""One estimator over one sequence: replayed, timed, checked. Its failure is a result with a reason.
+"""A run of one estimator over one sequence: replayed, timed, checked. A failure is a result with a reason.
 
-The process's resident memory, where the operating system tells it.
-
-What an estimator handed back, checked before anyone judges it.
+Only calls of the estimator are timed. Results are checked before they are scored. See docs/design/0007.
 """
 
 from __future__ import annotations
@@ -28,17 +26,28 @@ from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measureme
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Estimate, LandmarkMap, Trajectory
 
+Flags = NDArray[np.bool_]
+LOG = logging.getLogger(__name__)
 STATUS = Path("/proc/self/status")
 CLEAR_REFS = Path("/proc/self/clear_refs")
 RESET_PEAK = "5"
-"""What Linux takes for "start the high-water mark anew"."""
+"""Written to `CLEAR_REFS` it resets Linux's high-water mark of resident memory."""
+NEGATIVE_TOLERANCE = 1e-9
+"""An eigenvalue may be this far below zero, as a fraction of the largest: rounding."""
+REASON_WIDTH = 400
+"""Largest number of characters of a reason: one line that a table can hold."""
+WARM_UP_STEPS = 20
+MAX_WARM_UP_STEPS = 200
+"""Steps given to the instance that warms up: without and with detections to wait for."""
+WARM_UP_FRAMES = 4
+"""Steps with a landmark that can be named: it is begun, waited for, and seen again."""
 
 
 class PeakMemory:
     """Highest resident memory of this process from now on, above what is resident now.
 
-    Known on Linux only. It is the whole process's: memory that an earlier run left free for reuse is not counted
-    again, and caches that fill meanwhile are. It shows orders of magnitude, not kilobytes.
+    Known on Linux only, for the whole process: memory that an earlier run left free for reuse is not counted again, and
+    caches that fill meanwhile are. It shows orders of magnitude, not kilobytes.
     """
 
     def __init__(self) -> None:
@@ -62,25 +71,8 @@ def _status_mb(field: str) -> float:
     return float("nan")
 
 
-Flags = NDArray[np.bool_]
-NEGATIVE_TOLERANCE = 1e-9
-"""An eigenvalue may be this far below zero, as a fraction of the largest: rounding."""
-
-
-def check_estimate(estimate: Estimate | None, end_ns: int) -> None:
-    """Refuse an estimate for another instant than the one asked for.
-
-    Raises
-    ------
-    EvaluationError
-        Naming both stamps.
-    """
-    if estimate is not None and estimate.stamp_ns != end_ns:
-        raise EvaluationError(f"process returned an estimate for {estimate.stamp_ns} ns when asked for {end_ns} ns")
-
-
 def check_outcome(causal: Trajectory, smoothed: Trajectory, landmarks: LandmarkMap) -> None:
-    """Refuse what cannot be scored.
+    """Refuse results that cannot be scored.
 
     Raises
     ------
@@ -114,7 +106,7 @@ def _not_finite(rows: Floats) -> Flags:
 
 
 def _impossible(covs: Floats) -> Flags:
-    """Which of the covariances, shape (n, d, d), are partly NaN, infinite, asymmetric or not positive semidefinite."""
+    """Flags of covariances, shape (n, d, d), that are partly NaN, infinite, asymmetric or not positive semidefinite."""
     n = len(covs)
     rows = covs.reshape(n, covs.shape[1] * covs.shape[2])
     unknown, finite = np.all(np.isnan(rows), axis=1), ~_not_finite(rows)
@@ -124,16 +116,6 @@ def _impossible(covs: Floats) -> Flags:
     smallest = np.linalg.eigvalsh(filled)[:, 0] if n else np.zeros(0)
     sound = finite & (asymmetry <= 1e-6 * size) & (smallest >= -NEGATIVE_TOLERANCE * size)
     return np.asarray(~(unknown | sound))
-
-
-LOG = logging.getLogger(__name__)
-REASON_WIDTH = 400
-"""Characters of a reason at most: one line that a table can hold."""
-WARM_UP_STEPS = 20
-MAX_WARM_UP_STEPS = 200
-"""Steps given to the instance that warms up: without and with detections to wait for."""
-WARM_UP_FRAMES = 4
-"""Steps with a landmark that can be named: it is begun, waited for, and seen again."""
 
 
 def run_estimator(
@@ -146,32 +128,30 @@ def run_estimator(
     interim_maps: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> RunResult:
-    """Replay a sequence into an estimator and keep what it said, with the duration of each call.
+    """Replay a sequence into an estimator and keep its estimates, with the duration of each call.
 
     The log is cut into steps before the clock starts, and a second instance of the estimator takes the first of them,
-    so that compiling at a first call is not counted. Only calls of the estimator are timed, with everything that these
-    cause. The map is kept at `map_instants`; asking for it before the end is not timed, and changes nothing in an
-    estimator that keeps its contract.
-
-    An estimator gets a copy of the measurements, since one that corrects them in place would alter those of the next.
+    so that compiling at a first call is not counted. Only calls of the estimator are timed. The map is kept at
+    `map_instants`; asking for it before the end is not timed. The estimator gets a copy of the measurements, so that
+    one that changes them does not change those of the next.
 
     Parameters
     ----------
     name
-        Under which the estimator is installed.
+        Name under which the estimator is installed.
     overrides
         Settings that differ from the estimator's defaults.
     instants_ns
-        When estimates are asked for, increasing; None: ``sequence.instants(rate_hz)``.
+        Stamps at which estimates are asked for, increasing; None: ``sequence.instants(rate_hz)``.
     interim_maps
-        Whether the map is asked for before the end too. For a smoother each costs a solution of the whole history.
+        True to ask for the map before the end too. For a smoother each costs a solution of the whole history.
     progress
         Called after each step with the number of steps done and their total.
 
     Returns
     -------
-    A run whose status is ``failed`` when the estimator cannot be loaded, raises anything, or hands back what cannot be
-    scored (see `check_outcome`).
+    A run whose status is ``failed`` when the estimator cannot be loaded, raises anything, or returns results that
+    cannot be scored (see `check_outcome`).
 
     Raises
     ------
@@ -179,6 +159,14 @@ def run_estimator(
         When no estimator has that name.
     EstimatorError
         When a setting does not exist or does not fit.
+
+    Examples
+    --------
+    >>> from sonar_graph.evaluation import run_estimator
+    >>> from sonar_graph.simulation import MissionOptions, simulate_mission
+    >>> run = run_estimator(simulate_mission(MissionOptions(duration_s=10.0)), "dead-reckoning")
+    >>> run.status, len(run.causal), run.causal.positions.shape
+    ('ok', 20, (20, 3))
     """
     instants = sequence.instants(rate_hz) if instants_ns is None else instants_ns
     try:
@@ -194,7 +182,7 @@ def run_estimator(
 
 
 def check_request(name: str, overrides: dict[str, Any] | None = None) -> None:
-    """Raise for a name or setting that does not exist, as `run_estimator` would, without running anything."""
+    """Raise for a name or setting that does not exist, as `run_estimator` does, without running anything."""
     try:
         kind = load_estimator(name)
     except UnknownEstimatorError:
@@ -205,7 +193,7 @@ def check_request(name: str, overrides: dict[str, Any] | None = None) -> None:
 
 
 class _Replay:
-    """A run in progress: what has been said and how long it took."""
+    """A run in progress: estimates and maps until now, and the duration of each call."""
 
     def __init__(
         self, sequence: Sequence, steps: list[Measurements], name: str, params: Section, *, interim_maps: bool
@@ -232,12 +220,22 @@ class _Replay:
             return self._finish(estimator, memory)
         except Exception as error:  # a third party's estimator may fail in any way, and the others still run
             LOG.info("%s failed %s", self._name, self._stage, exc_info=True)
-            reason, told = f"{self._stage}: {one_line(error)}", _told_so_far(estimator)
+            told: dict[str, Any] = {}  # rows refused before are often why it failed
+            if estimator is not None:
+                with contextlib.suppress(Exception):
+                    told["refused"] = refused_rows_of(estimator)
+                with contextlib.suppress(Exception):
+                    told["withheld"] = withheld_of(estimator)
+            reason = f"{self._stage}: {one_line(error)}"
             return self._result("failed", reason, **told, peak_memory_mb=memory.rise_mb())
 
     def _warm_up(self, kind: type[Estimator]) -> None:
-        """Let an estimator that is thrown away compile what it needs, until landmarks were seen again."""
-        named = [i for i, step in enumerate(self._steps) if step.detections is not None and _names(step.detections)]
+        """Let an estimator that is thrown away compile its code, until landmarks were seen again."""
+
+        def is_named(detections: LandmarkDetections | None) -> bool:  # others are refused, and nothing is compiled
+            return bool(detections is not None and len(detections) and detections.most_probable()[1].max() > 0.5)
+
+        named = [i for i, step in enumerate(self._steps) if is_named(step.detections)]
         last = named[min(len(named), WARM_UP_FRAMES) - 1] if named else WARM_UP_STEPS
         with contextlib.suppress(Exception):  # what fails here fails again below, where it is reported
             estimator = kind(self._sequence.calibration, self._params)
@@ -246,15 +244,19 @@ class _Replay:
 
     def _process(self, estimator: Estimator, progress: Callable[[int, int], None] | None) -> None:
         for done, step in enumerate(self._steps, start=1):
-            self._stage = f"{(step.end_ns - self._sequence.start_ns) * 1e-9:.3f} s after the start ({step.end_ns} ns)"
+            end_ns = step.end_ns
+            self._stage = f"{(end_ns - self._sequence.start_ns) * 1e-9:.3f} s after the start ({end_ns} ns)"
             before = time.perf_counter()
             estimate = estimator.process(step)
             self._update_s.append(time.perf_counter() - before)
-            check_estimate(estimate, step.end_ns)
+            if estimate is not None and estimate.stamp_ns != end_ns:
+                raise EvaluationError(
+                    f"process returned an estimate for {estimate.stamp_ns} ns when asked for {end_ns} ns"
+                )
             if estimate is not None:
                 self._estimates.append(estimate)
-                if step.end_ns in self._map_at_ns:
-                    self._maps.append(MapSoFar(step.end_ns, estimator.landmarks()))
+                if end_ns in self._map_at_ns:
+                    self._maps.append(MapSoFar(end_ns, estimator.landmarks()))
             if progress:
                 progress(done, len(self._steps))
 
@@ -284,22 +286,6 @@ class _Replay:
     def _result(self, status: Any, reason: str = "", **outcome: Any) -> RunResult:
         params = self._params.model_dump(mode="json")
         return RunResult(self._name, params, status, reason, update_s=np.array(self._update_s), **outcome)
-
-
-def _told_so_far(estimator: Estimator | None) -> dict[str, Any]:
-    """What a run that failed had not used before, often why it failed; nothing where it cannot even say that."""
-    told: dict[str, Any] = {}
-    if estimator is not None:
-        with contextlib.suppress(Exception):
-            told["refused"] = refused_rows_of(estimator)
-        with contextlib.suppress(Exception):
-            told["withheld"] = withheld_of(estimator)
-    return told
-
-
-def _names(detections: LandmarkDetections) -> bool:
-    """Whether any identity is more probable than all else: others are refused, and nothing is compiled for them."""
-    return bool(len(detections) and detections.most_probable()[1].max() > 0.5)
 
 
 def one_line(error: Exception) -> str:

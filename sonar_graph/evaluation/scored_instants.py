@@ -1,13 +1,10 @@
-"""At which instants estimators are scored: the same for all, and nothing dropped without being counted.
+"""Instants at which estimators are scored and maps are kept, and the published numbers of the 2014 paper.
 
-And at which their maps are kept: those of the 2014 paper's Fig. 4, or the same fractions of another run.
+Scored instants are the same for all estimators; those left out are counted with the reason (docs/design/0007).
 
-The numbers that the 2014 paper publishes of its basin experiment, to stand beside what is estimated here.
-
-Landmark positions are those of its Table I, times those of its Fig. 4. Errors of its map are computed from the table,
-which gives centimetres; the paper itself states none. Its vehicle had no reference for its own path.
-
-Source: "Experimental Results of Real-time Sonar-based Underwater Localization Using Landmarks", 2014.
+The paper: "Experimental Results of Real-time Sonar-based Underwater Localization Using Landmarks", 2014. Landmark
+positions from its Table I (in centimetres), times of maps from its Fig. 4. It states no errors; those of its map are
+computed from the table. Its vehicle had no reference for its own path.
 """
 
 from __future__ import annotations
@@ -17,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sonar_graph.devices import OWN_DESIGNS
-from sonar_graph.evaluation.metrics import LandmarkErrors, landmark_errors
 from sonar_graph.evaluation.results import RunResult
 from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence
@@ -30,9 +26,13 @@ RETURN_M = (-0.3013, -0.1758)
 """Last minus first estimated position, x and y: error of the estimate and of steering back by hand together."""
 DURATION_S = 2039.0
 MAP_TIMES_S = (833.1, 1369.4, 2039.0)
-"""When Fig. 4 shows path and map."""
-SAME_M = 1e-3
+"""Times of path and map in Fig. 4."""
+SAME_PLACE_M = 1e-3
 """A true landmark this near to the published one in x and in y is that landmark."""
+TRUTH_GAP_S = 0.5
+"""Between truth samples farther apart than this the truth is not interpolated (an occluded tracking system)."""
+GAP_TO_SPACING = 1.5
+"""The gap is at least this many times the truth's median spacing: a truth may be sparse throughout."""
 
 
 def published_maps() -> tuple[LandmarkMap, LandmarkMap]:
@@ -43,31 +43,20 @@ def published_maps() -> tuple[LandmarkMap, LandmarkMap]:
     return estimated, true
 
 
-def published_errors() -> LandmarkErrors:
-    """The errors of the published map, raw and after SE(2) alignment."""
-    return landmark_errors(*published_maps())
-
-
 def repeats_published(sequence: Sequence) -> bool:
-    """Whether a sequence's true landmarks are those of the paper, by identity and horizontal position.
+    """True where a sequence has the paper's true landmarks, by identity and horizontal position.
 
-    Landmarks of one's own design in their places are another experiment.
+    Landmarks of other designs in the same places are another experiment.
     """
     true = sequence.true_landmarks
     if true is None or OWN_DESIGNS in sequence.notes or not np.array_equal(true.ids, IDS):
         return False
-    return bool(np.abs(true.positions[:, :2] - TRUE_XY_M).max() < SAME_M)
-
-
-TRUTH_GAP_S = 0.5
-"""Between truth samples further apart than this the truth is not interpolated (an occluded tracking system)."""
-GAP_TO_SPACING = 1.5
-"""... unless the truth is that sparse throughout: a gap is also this many times its median spacing."""
+    return bool(np.abs(true.positions[:, :2] - TRUE_XY_M).max() < SAME_PLACE_M)
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredInstants:
-    """The instants that count, and how many of those asked for do not."""
+    """The instants that count, and the numbers of those left out."""
 
     stamps_ns: Ints
     """Shape (n,)."""
@@ -76,7 +65,7 @@ class ScoredInstants:
     """Before the truth's first or after its last sample."""
     in_truth_gap: int
     gap_s: float
-    """What counts as a gap, seconds."""
+    """Length from which a gap of the truth counts, seconds."""
     not_estimated: int
     """Of the rest, those at which some run that did not fail returned no estimate."""
 
@@ -95,10 +84,13 @@ class ScoredInstants:
 
 
 def scored_instants(asked_ns: Ints, truth: Trajectory, runs: list[RunResult]) -> ScoredInstants:
-    """Of the instants asked for, those with truth nearby and an estimate from each run that did not fail."""
+    """The instants with truth nearby and an estimate from each run that did not fail."""
     inside = (asked_ns >= truth.stamps_ns[0]) & (asked_ns <= truth.stamps_ns[-1])
     gap_s = gap_limit_s(truth)
-    covered = inside & ~_in_gap(asked_ns, truth, gap_s)
+    after = np.clip(np.searchsorted(truth.stamps_ns, asked_ns, side="left"), 0, len(truth) - 1)
+    before = np.clip(np.searchsorted(truth.stamps_ns, asked_ns, side="right") - 1, 0, len(truth) - 1)
+    in_gap = (truth.stamps_ns[after] - truth.stamps_ns[before]) * 1e-9 > gap_s
+    covered = inside & ~in_gap
     estimated = np.ones(len(asked_ns), dtype=bool)
     for run in runs:
         if run.causal is not None:
@@ -114,7 +106,7 @@ def scored_instants(asked_ns: Ints, truth: Trajectory, runs: list[RunResult]) ->
 
 
 def map_instants(asked_ns: Ints, start_ns: int) -> Ints:
-    """Of the instants asked for, those nearest to the published times scaled to the run's length; the last included."""
+    """The instants nearest to the published times, scaled to the run's length; the last one included."""
     if not len(asked_ns):
         return asked_ns
     wanted_ns = start_ns + (asked_ns[-1] - start_ns) * np.array(MAP_TIMES_S) / DURATION_S
@@ -130,10 +122,3 @@ def gap_limit_s(truth: Trajectory) -> float:
 def rows_at(trajectory: Trajectory, stamps_ns: Ints) -> Trajectory:
     """The rows of a trajectory that has all of these stamps."""
     return trajectory.rows(np.searchsorted(trajectory.stamps_ns, stamps_ns))
-
-
-def _in_gap(stamps_ns: Ints, truth: Trajectory, gap_s: float) -> np.ndarray:
-    """Which stamps lie strictly between two truth samples that are more than the gap apart."""
-    after = np.clip(np.searchsorted(truth.stamps_ns, stamps_ns, side="left"), 0, len(truth) - 1)
-    before = np.clip(np.searchsorted(truth.stamps_ns, stamps_ns, side="right") - 1, 0, len(truth) - 1)
-    return np.asarray((truth.stamps_ns[after] - truth.stamps_ns[before]) * 1e-9 > gap_s)

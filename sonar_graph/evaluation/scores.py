@@ -1,4 +1,4 @@
-"""Scores of one run: each a value with its unit and the sentence that says how it was got."""
+"""Scores of one run: each a value with its unit and the sentence of its measuring rule (docs/theory/metrics.md)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sonar_graph.evaluation.results import ErrorSeries, Kind, RunResult, Score
 from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Trajectory
 
 RELATIVE_DELTAS_S = (1, 10)
-"""Time differences of the relative error."""
+"""Time differences of the relative error, seconds."""
 ESTIMATES: dict[str, str] = {
     "causal": "Causal estimate (what could be known at each instant)",
     "smoothed": "Smoothed estimate (what is known at the end about each instant)",
@@ -48,21 +48,13 @@ def trajectory_scores(
     estimate, truth
         At the scored instants.
     errors
-        Of the same two.
+        Errors of the same two.
     instants
-        Which instants these are, for the protocols.
+        The scored instants in words, for the protocols.
     """
-    over = f"over {instants}, to which the truth is interpolated"
-    scores = _absolute(estimate, truth, ESTIMATES[kind], over)
-    scores |= _relative(estimate, truth, ESTIMATES[kind], over)
-    scores |= _consistency(errors, ESTIMATES[kind], over)
-    return {f"{kind}.{key}": score for key, score in scores.items()}
-
-
-def _absolute(estimate: Trajectory, truth: Trajectory, which: str, over: str) -> dict[str, Score]:
-    yaw_rmse = rmse(yaw_errors_rad(estimate, truth))
+    which, over = ESTIMATES[kind], f"over {instants}, to which the truth is interpolated"
     fitted = "without scale (Umeyama 1991), fitted to these instants"
-    return {
+    scores = {
         "ate_raw_m": Score(ate_raw_m(estimate, truth), "m", f"{which}, not aligned: rms of 3-D position error {over}."),
         "ate_yaw_m": Score(
             ate_yaw_m(estimate, truth),
@@ -79,18 +71,17 @@ def _absolute(estimate: Trajectory, truth: Trajectory, which: str, over: str) ->
             "m",
             f"{which}, aligned by SE(3) {fitted}: rms of 3-D position error {over}.",
         ),
-        "yaw_rmse_rad": Score(yaw_rmse, "rad", f"{which}, not aligned: rms of wrapped heading error {over}."),
+        "yaw_rmse_rad": Score(
+            rmse(yaw_errors_rad(estimate, truth)),
+            "rad",
+            f"{which}, not aligned: rms of wrapped heading error {over}.",
+        ),
         "return_error_m": Score(
             return_error_m(estimate, truth),
             "m",
             f"{which}, not aligned: norm of estimated minus true displacement from the first to the last, {over}.",
         ),
     }
-
-
-def _relative(estimate: Trajectory, truth: Trajectory, which: str, over: str) -> dict[str, Score]:
-    """Relative errors for each time difference at which there are pairs."""
-    scores: dict[str, Score] = {}
     for delta_s in RELATIVE_DELTAS_S:
         relative = relative_errors(estimate, truth, delta_s)
         if not len(relative):
@@ -102,25 +93,21 @@ def _relative(estimate: Trajectory, truth: Trajectory, which: str, over: str) ->
         scores[f"rpe_{delta_s}s_rad"] = Score(
             rmse(relative.yaw_rad), "rad", f"{which}: rms of the error of heading change {pairs}."
         )
-    return scores
-
-
-def _consistency(errors: ErrorSeries, which: str, over: str) -> dict[str, Score]:
-    """Average NEES per degree of freedom, where covariances were reported."""
     axes = "x and y" if errors.position_dof == 2 else "x, y and z"
     parts = (
         ("nees_position", errors.nees_position, errors.position_dof, f"position ({axes})"),
         ("nees_yaw", errors.nees_yaw, 1, "heading"),
     )
-    scores = {}
     for key, nees, dof, what in parts:
-        known = int(np.isfinite(nees).sum())
+        known, mean = int(np.isfinite(nees).sum()), mean_normalised(nees, dof)
+        if not math.isfinite(mean):
+            continue
         protocol = (
             f"{which}, not aligned: mean normalised squared error of {what} divided by {dof}, {over}, {known} of which "
             f"have a covariance; 1 is consistent, above is over-confident; {IN_TIME}."
         )
-        scores[key] = Score(mean_normalised(nees, dof), "1", protocol, better="inside")
-    return _finite(scores)
+        scores[key] = Score(mean, "1", protocol, better="inside")
+    return {f"{kind}.{key}": score for key, score in scores.items()}
 
 
 def landmark_scores(estimated: LandmarkMap, true: LandmarkMap | None) -> dict[str, Score]:
@@ -156,7 +143,7 @@ def landmark_scores(estimated: LandmarkMap, true: LandmarkMap | None) -> dict[st
 
 
 def detection_scores(log: DetectionLog) -> dict[str, Score]:
-    """What became of the detections, and whether innovations fit their covariances."""
+    """Counts of detections by outcome, and the NIS of those used."""
     counts = Counter(log.outcomes)
     new, ignored = counts[Outcome.NEW], counts[Outcome.IGNORED]
     used = sum(counts[outcome] for outcome in USED)

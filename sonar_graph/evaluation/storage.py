@@ -1,26 +1,20 @@
-"""A comparison as a folder, and back.
+"""Storage: a comparison as a folder, and back.
 
 ::
 
     DIR/comparison.json         scores with units and protocol, states of the runs, settings, environment
     DIR/sequence.npz            truth, true landmarks, detections and instants
     DIR/recognition.json, recognised/STAMP.jpg
-                                how detections came from sonar images, and the pictures that the report shows
+                                recognition of landmarks in sonar images, and the pictures that the report shows
     DIR/runs/NAME/trajectory.tum, causal.tum, landmarks.csv
-                                what the estimator said, for other tools; absent when the run failed
+                                the estimates, for other tools; absent when the run failed
     DIR/runs/NAME/result.json   settings, versions, timings, status and reason
     DIR/runs/NAME/series.npz    everything as arrays, with covariances
+    DIR/result.mcap             all of it for viewers, with layouts for Foxglove and RViz beside it
 
-Each file appears whole or not at all. ``comparison.json`` goes first and comes last: a folder that has one is complete.
-
-The arrays behind a report, in npz files, so that it can be drawn again without running anything.
-
-Fields of one object share a prefix: ``causal.stamps_ns``, ``causal.positions``, ... An object that is absent has none.
-
-A comparison for viewers: ``result.mcap`` and the layouts beside it, in the folder that has the comparison.
-
-What stands in the folder as JSON travels in the file too: settings and versions as metadata, ``comparison.json`` and
-each ``runs/NAME/result.json`` as attachments, so that the file alone says how it came about.
+Each file appears whole or not at all. ``comparison.json`` is removed first and written last: a folder that has one is
+complete. In npz files the fields of one object share a prefix: ``causal.stamps_ns``, ``causal.positions``, ...; an
+absent object has no fields.
 """
 
 from __future__ import annotations
@@ -28,7 +22,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from dataclasses import MISSING, asdict, fields
+from dataclasses import MISSING, asdict, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -49,12 +43,200 @@ from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Refusal, Refu
 Arrays = dict[str, np.ndarray]
 T = TypeVar("T")
 KINDS: tuple[Kind, Kind] = ("causal", "smoothed")
+FORMAT = "sonar_graph comparison 1"
+INDEX, SEQUENCE, RUNS = "comparison.json", "sequence.npz", "runs"
+RESULT, SERIES, RESULT_LOG = "result.json", "series.npz", "result.mcap"
+ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv")
+
+
+def write_comparison(comparison: Comparison, folder: Path) -> None:
+    """Write a comparison into a folder, made where it does not exist.
+
+    Files of the same names are replaced. Files of an earlier comparison's other runs, and of a run that now failed, are
+    removed. Files of other kinds stay.
+
+    Raises
+    ------
+    EvaluationError
+        When an estimator's name cannot be the name of a folder.
+    """
+    names = [run.estimator for run in comparison.runs]
+    for name in names:
+        if name in ("", ".", "..") or any(character in name for character in '/\\:*?"<>|'):
+            raise EvaluationError(f"estimator name {name!r} cannot name a folder; install it under another name")
+    (folder / RUNS).mkdir(parents=True, exist_ok=True)
+    (folder / INDEX).unlink(missing_ok=True)
+    for result in (folder / RUNS).glob(f"*/{RESULT}"):
+        if result.parent.name not in names:
+            for name in (*ESTIMATES, SERIES, RESULT):
+                (result.parent / name).unlink(missing_ok=True)
+            if not any(result.parent.iterdir()):
+                result.parent.rmdir()
+    write_arrays(folder / SEQUENCE, sequence_arrays(comparison.sequence) | {"instants_ns": comparison.instants_ns})
+    entries = {}
+    for run in comparison.runs:
+        _write_run(run, comparison, folder / RUNS / run.estimator)
+        scores = comparison.scores.get(run.estimator, {})
+        entry = _state(run) | {"scores": {key: asdict(score) for key, score in scores.items()}}
+        if run.estimator in comparison.errors:
+            errors = comparison.errors[run.estimator]
+            entry["errors"] = {kind: _error_summary(series) for kind, series in errors.items()}
+        entries[run.estimator] = entry
+    write_recognition(comparison.recognition, folder)
+    sequence, instants = comparison.sequence, comparison.instants_ns
+    index = {
+        "format": FORMAT,
+        "sequence": {
+            "name": sequence.name,
+            "duration_s": sequence.duration_s,
+            "notes": sequence.notes,
+            "calibration": sequence.calibration.model_dump(mode="json"),
+        },
+        "instants": {"count": len(instants), "first_ns": int(instants[0]), "last_ns": int(instants[-1])},
+        "environment": comparison.environment,
+        "runs": entries,
+    }
+    write_json(folder / INDEX, index)
+
+
+def _write_run(run: RunResult, comparison: Comparison, folder: Path) -> None:
+    """The files of one run: trajectories and map, all arrays, and ``result.json``."""
+    folder.mkdir(exist_ok=True)
+    for name in ESTIMATES:
+        (folder / name).unlink(missing_ok=True)
+    if run.smoothed is not None and run.causal is not None and run.landmarks is not None:
+        with replacing(folder / "trajectory.tum") as path:
+            write_tum(path, run.smoothed)
+        with replacing(folder / "causal.tum") as path:
+            write_tum(path, run.causal)
+        with replacing(folder / "landmarks.csv") as path:
+            write_landmarks_csv(path, run.landmarks)
+    write_arrays(folder / SERIES, run_arrays(run, comparison.errors.get(run.estimator, {})))
+    scores = comparison.scores.get(run.estimator, {})
+    timings = {key.removeprefix("time."): score.value for key, score in scores.items() if key.startswith("time.")}
+    result = {
+        "estimator": run.estimator,
+        "sequence": comparison.sequence.name,
+        **_state(run),
+        "timings": timings | {"calls": len(run.update_s)},
+        "environment": comparison.environment,
+    }
+    write_json(folder / RESULT, result)
+
+
+def _state(run: RunResult) -> dict[str, Any]:
+    """Status, settings and refusals of a run, as ``comparison.json`` and ``result.json`` have them."""
+    return {
+        "status": run.status,
+        "reason": run.reason,
+        "params": run.params,
+        "finish_s": run.finish_s,
+        "peak_memory_mb": run.peak_memory_mb,
+        "refused": [asdict(rows) for rows in gathered(run.refused)],
+        "withheld": run.withheld,
+    }
+
+
+def _error_summary(series: ErrorSeries) -> dict[str, Any]:
+    """Raw errors by axis in a few numbers; the series itself is in the run's arrays."""
+    return {
+        "instants": len(series.stamps_ns),
+        "rms_xyz_m": [rmse(series.position_m[:, axis]) for axis in range(3)],
+        "max_position_m": float(np.linalg.norm(series.position_m, axis=1).max()),
+        "rms_yaw_rad": rmse(series.yaw_rad),
+        "max_yaw_rad": float(np.abs(series.yaw_rad).max()),
+    }
+
+
+def write_viewer_files(comparison: Comparison, folder: Path) -> None:
+    """Write ``result.mcap``, ``result.foxglove.json`` and ``result.rviz`` beside the files of `write_comparison`.
+
+    The JSON files of the folder are in ``result.mcap`` as attachments, settings and versions as metadata, so that it
+    can be understood alone.
+
+    Raises
+    ------
+    LogError
+        When a file cannot be written, or a stamp does not fit into a ROS 2 message.
+    """
+    estimates = {
+        run.estimator: (run.causal, run.smoothed, run.landmarks)
+        for run in comparison.runs
+        if run.causal is not None and run.smoothed is not None and run.landmarks is not None
+    }
+    settings = {
+        f"settings of {run.estimator}": json.dumps(run.params, default=str, ensure_ascii=False)
+        for run in comparison.runs
+    }
+    names = [INDEX, *(f"{RUNS}/{run.estimator}/{RESULT}" for run in comparison.runs)]
+    attachments = [Attachment(name, "application/json", (folder / name).read_bytes()) for name in names]
+    drawn = comparison.recognition.pictures if comparison.recognition else []
+    pictures = [Picture(picture.stamp_ns, picture.jpeg) for picture in drawn]
+    about = comparison.environment | settings
+    write_result(folder / RESULT_LOG, comparison.sequence, estimates, about, attachments, pictures)
+
+
+def read_comparison(folder: Path) -> Comparison:
+    """The comparison in a folder. Its sequence has start, end, truth and notes, but not the measurements.
+
+    Raises
+    ------
+    EvaluationError
+        When the folder holds no complete comparison, naming the file at fault.
+    """
+    if not (folder / INDEX).is_file():
+        raise EvaluationError(f"{folder}: no {INDEX} in it; it needs a folder that a comparison was written to")
+    index = read_json(folder / INDEX)
+    if index.get("format") != FORMAT:
+        raise EvaluationError(f"{folder / INDEX}: format is {index.get('format')!r}, expected {FORMAT!r}; compare anew")
+    try:
+        return _restore(index, folder)
+    except (KeyError, TypeError, ValueError) as error:
+        raise EvaluationError(f"{folder}: incomplete, {error} is missing or not as written; compare anew") from error
+
+
+def _restore(index: dict[str, Any], folder: Path) -> Comparison:
+    """The comparison that ``comparison.json`` and the arrays describe."""
+    runs: list[RunResult] = []
+    scores: dict[str, dict[str, Score]] = {}
+    errors: dict[str, dict[Kind, ErrorSeries]] = {}
+    for name, entry in index["runs"].items():
+        arrays = read_arrays(folder / RUNS / name / SERIES)
+        memory = entry["peak_memory_mb"]
+        told = RunResult(
+            name,
+            entry["params"],
+            entry["status"],
+            entry["reason"],
+            withheld=entry.get("withheld", []),
+            finish_s=entry["finish_s"],
+            peak_memory_mb=float("nan") if memory is None else memory,
+        )
+        runs.append(restore_run(told, arrays))
+        scores[name] = {
+            key: Score(**(score | {"interval": tuple(score["interval"]) if score["interval"] else None}))
+            for key, score in entry["scores"].items()
+        }
+        if "errors" in entry:
+            series = {kind: _unpack(f"errors.{kind}", ErrorSeries, arrays) for kind in KINDS}
+            errors[name] = {kind: known for kind, known in series.items() if known is not None}
+    arrays, entry = read_arrays(folder / SEQUENCE), index["sequence"]
+    calibration = Calibration.parse(entry["calibration"], str(folder / INDEX))
+    return Comparison(
+        sequence=restore_sequence(entry["name"], calibration, entry["notes"], arrays),
+        instants_ns=arrays["instants_ns"],
+        runs=runs,
+        scores=scores,
+        errors=errors,
+        environment=index["environment"],
+        recognition=read_recognition(folder),
+    )
 
 
 def write_arrays(path: Path, arrays: Arrays) -> None:
     """Write named arrays, whole or not at all; not compressed, since noise in every digit hardly gets smaller.
 
-    In memory first: an archive goes back to the head of each entry, and there are many small ones.
+    The archive is built in memory: writing it goes back to the head of each of many small entries.
     """
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
@@ -81,10 +263,12 @@ def read_arrays(path: Path) -> Arrays:
 
 
 def sequence_arrays(sequence: Sequence) -> Arrays:
-    """Truth and detections, and of IMU and Doppler log the first and last row: what they measured is in the log."""
+    """Truth and detections, and the first and last row of IMU and Doppler log; their measurements are in the log."""
     ends = np.array([0, -1])
     arrays = _pack("imu", sequence.imu.rows(ends)) | _pack("dvl", sequence.dvl.rows(ends))
-    arrays |= _pack_truth(sequence.truth) | _pack("true_landmarks", sequence.true_landmarks)
+    arrays |= _pack("truth", sequence.truth) | _pack("true_landmarks", sequence.true_landmarks)
+    if sequence.truth is not None and np.isnan(sequence.truth.covariances).all():
+        del arrays["truth.covariances"]  # they would be most of the file
     return arrays | _pack("detections", sequence.detections)
 
 
@@ -93,28 +277,18 @@ def restore_sequence(name: str, calibration: Calibration, notes: dict[str, str],
     imu, dvl = _unpack("imu", Imu, arrays), _unpack("dvl", Dvl, arrays)
     if imu is None or dvl is None:
         raise EvaluationError("sequence.npz: the first and last rows of imu and dvl are missing")
-    truth = _unpack_truth(arrays)
-    true_landmarks = _unpack("true_landmarks", LandmarkMap, arrays)
-    detections = _unpack("detections", LandmarkDetections, arrays)
+    if "truth.stamps_ns" in arrays and "truth.covariances" not in arrays:
+        arrays = arrays | {"truth.covariances": np.full((len(arrays["truth.stamps_ns"]), 6, 6), np.nan)}
     return Sequence(
-        name, calibration, imu, dvl, detections=detections, truth=truth, true_landmarks=true_landmarks, notes=notes
+        name,
+        calibration,
+        imu,
+        dvl,
+        detections=_unpack("detections", LandmarkDetections, arrays),
+        truth=_unpack("truth", Trajectory, arrays),
+        true_landmarks=_unpack("true_landmarks", LandmarkMap, arrays),
+        notes=notes,
     )
-
-
-def _pack_truth(truth: Trajectory | None) -> Arrays:
-    """Without covariances where none is known: they would be most of the file."""
-    arrays = _pack("truth", truth)
-    if truth is not None and np.isnan(truth.covariances).all():
-        del arrays["truth.covariances"]
-    return arrays
-
-
-def _unpack_truth(arrays: Arrays) -> Trajectory | None:
-    stamps_ns = arrays.get("truth.stamps_ns")
-    if stamps_ns is None or "truth.covariances" in arrays:
-        return _unpack("truth", Trajectory, arrays)
-    unknown = np.full((len(stamps_ns), 6, 6), np.nan)
-    return _unpack("truth", Trajectory, arrays | {"truth.covariances": unknown})
 
 
 def run_arrays(run: RunResult, errors: dict[Kind, ErrorSeries]) -> Arrays:
@@ -130,42 +304,20 @@ def run_arrays(run: RunResult, errors: dict[Kind, ErrorSeries]) -> Arrays:
 
 def restore_run(run: RunResult, arrays: Arrays) -> RunResult:
     """A run with its arrays put back."""
-    return RunResult(
-        run.estimator,
-        run.params,
-        run.status,
-        run.reason,
+    maps: list[MapSoFar] = []
+    while (landmarks := _unpack(f"maps.{len(maps)}", LandmarkMap, arrays)) is not None:
+        maps.append(MapSoFar(int(arrays[f"maps.{len(maps)}.stamp_ns"]), landmarks))
+    refused = zip(*(arrays[f"refused.{name}"].tolist() for name in RefusedRow._fields), strict=True)
+    return replace(
+        run,
         causal=_unpack("causal", Trajectory, arrays),
         smoothed=_unpack("smoothed", Trajectory, arrays),
         landmarks=_unpack("landmarks", LandmarkMap, arrays),
         detections=_unpack("detections", DetectionLog, arrays),
-        refused=_restore_refused(arrays),
-        withheld=run.withheld,
-        maps=_restore_maps(arrays),
+        refused=[RefusedRow(sensor, at_ns, Refusal(reason), distance) for sensor, at_ns, reason, distance in refused],
+        maps=maps,
         update_s=arrays["update_s"],
-        finish_s=run.finish_s,
-        peak_memory_mb=run.peak_memory_mb,
     )
-
-
-def _restore_maps(arrays: Arrays) -> list[MapSoFar]:
-    """The maps of a run in order."""
-    maps: list[MapSoFar] = []
-    while (landmarks := _unpack(f"maps.{len(maps)}", LandmarkMap, arrays)) is not None:
-        maps.append(MapSoFar(int(arrays[f"maps.{len(maps)}.stamp_ns"]), landmarks))
-    return maps
-
-
-def _restore_refused(arrays: Arrays) -> list[RefusedRow]:
-    columns = [arrays[f"refused.{name}"].tolist() for name in RefusedRow._fields]
-    rows = zip(*columns, strict=True)
-    return [RefusedRow(sensor, stamp_ns, Refusal(reason), distance) for sensor, stamp_ns, reason, distance in rows]
-
-
-def restore_errors(arrays: Arrays) -> dict[Kind, ErrorSeries]:
-    """The errors of one run."""
-    found = {kind: _unpack(f"errors.{kind}", ErrorSeries, arrays) for kind in KINDS}
-    return {kind: series for kind, series in found.items() if series is not None}
 
 
 def _pack(prefix: str, record: Any) -> Arrays:
@@ -176,7 +328,7 @@ def _pack(prefix: str, record: Any) -> Arrays:
 
 
 def _unpack(prefix: str, kind: type[T], arrays: Arrays) -> T | None:
-    """The dataclass that `_pack` took apart; None where it was absent.
+    """The dataclass whose fields `_pack` stored; None where it was absent.
 
     Raises
     ------
@@ -184,229 +336,13 @@ def _unpack(prefix: str, kind: type[T], arrays: Arrays) -> T | None:
         Naming the field that is missing.
     """
     columns = fields(kind)  # type: ignore[arg-type]  # every kind here is a dataclass
-    stored = [column.name for column in columns if f"{prefix}.{column.name}" in arrays]
+    stored = {column.name: arrays[key] for column in columns if (key := f"{prefix}.{column.name}") in arrays}
     if not stored:
         return None
     missing = [c.name for c in columns if c.name not in stored and c.default_factory is MISSING]
     if missing:
         raise EvaluationError(f"stored {prefix} lacks {', '.join(missing)}; write the comparison anew")
-    return kind(**{name: _plain(name, arrays[f"{prefix}.{name}"]) for name in stored})
-
-
-def _plain(name: str, array: np.ndarray) -> Any:
-    """What a field held before it became an array."""
-    if name == "outcomes":
-        return [Outcome(text) for text in array.tolist()]
-    return array.item() if array.ndim == 0 else array
-
-
-FORMAT = "sonar_graph comparison 1"
-INDEX, SEQUENCE, RUNS = "comparison.json", "sequence.npz", "runs"
-RESULT, SERIES = "result.json", "series.npz"
-ESTIMATES = ("trajectory.tum", "causal.tum", "landmarks.csv")
-
-
-def write_comparison(comparison: Comparison, folder: Path) -> None:
-    """Write a comparison into a folder, made where it does not exist.
-
-    Files of the same names are replaced. The files of an earlier comparison's other runs, and of a run that now
-    failed, are removed, so that nothing in the folder is of another comparison; files that are not ours stay.
-
-    Raises
-    ------
-    EvaluationError
-        When an estimator's name cannot be a folder's.
-    """
-    for run in comparison.runs:
-        _check_folder_name(run.estimator)
-    (folder / RUNS).mkdir(parents=True, exist_ok=True)
-    (folder / INDEX).unlink(missing_ok=True)
-    _remove_other_runs(folder / RUNS, {run.estimator for run in comparison.runs})
-    write_arrays(folder / SEQUENCE, sequence_arrays(comparison.sequence) | {"instants_ns": comparison.instants_ns})
-    for run in comparison.runs:
-        _write_run(run, comparison, folder / RUNS / run.estimator)
-    write_recognition(comparison.recognition, folder)
-    write_json(folder / INDEX, _index(comparison))
-
-
-def read_comparison(folder: Path) -> Comparison:
-    """The comparison in a folder. Its sequence has start, end, truth and notes, but not the measurements.
-
-    Raises
-    ------
-    EvaluationError
-        When the folder holds no complete comparison, naming the file at fault.
-    """
-    if not (folder / INDEX).is_file():
-        raise EvaluationError(f"{folder}: no {INDEX} in it; it needs a folder that a comparison was written to")
-    index = read_json(folder / INDEX)
-    if index.get("format") != FORMAT:
-        raise EvaluationError(f"{folder / INDEX}: format is {index.get('format')!r}, expected {FORMAT!r}; compare anew")
-    try:
-        return _restore(index, folder)
-    except (KeyError, TypeError, ValueError) as error:
-        raise EvaluationError(f"{folder}: incomplete, {error} is missing or not as written; compare anew") from error
-
-
-def _restore(index: dict[str, Any], folder: Path) -> Comparison:
-    arrays = {name: read_arrays(folder / RUNS / name / SERIES) for name in index["runs"]}
-    runs = {name: restore_run(_plain_run(name, entry), arrays[name]) for name, entry in index["runs"].items()}
-    stored = read_arrays(folder / SEQUENCE)
-    errors = {name: restore_errors(arrays[name]) for name in runs if "errors" in index["runs"][name]}
-    return Comparison(
-        sequence=_restore_sequence(index["sequence"], stored, folder),
-        instants_ns=stored["instants_ns"],
-        runs=list(runs.values()),
-        scores={name: _restore_scores(entry["scores"]) for name, entry in index["runs"].items()},
-        errors=errors,
-        environment=index["environment"],
-        recognition=read_recognition(folder),
-    )
-
-
-def _restore_sequence(entry: dict[str, Any], arrays: dict[str, np.ndarray], folder: Path) -> Sequence:
-    calibration = Calibration.parse(entry["calibration"], str(folder / INDEX))
-    return restore_sequence(entry["name"], calibration, entry["notes"], arrays)
-
-
-def _restore_scores(entries: dict[str, dict[str, Any]]) -> dict[str, Score]:
-    return {
-        key: Score(**(entry | {"interval": tuple(entry["interval"]) if entry["interval"] else None}))
-        for key, entry in entries.items()
-    }
-
-
-def _plain_run(name: str, entry: dict[str, Any]) -> RunResult:
-    """A run as far as the index tells: without its arrays."""
-    memory = entry["peak_memory_mb"]
-    return RunResult(
-        name,
-        entry["params"],
-        entry["status"],
-        entry["reason"],
-        withheld=entry.get("withheld", []),
-        finish_s=entry["finish_s"],
-        peak_memory_mb=float("nan") if memory is None else memory,
-    )
-
-
-def _index(comparison: Comparison) -> dict[str, Any]:
-    """What comparison.json says."""
-    sequence, instants = comparison.sequence, comparison.instants_ns
-    return {
-        "format": FORMAT,
-        "sequence": {
-            "name": sequence.name,
-            "duration_s": sequence.duration_s,
-            "notes": sequence.notes,
-            "calibration": sequence.calibration.model_dump(mode="json"),
-        },
-        "instants": {"count": len(instants), "first_ns": int(instants[0]), "last_ns": int(instants[-1])},
-        "environment": comparison.environment,
-        "runs": {run.estimator: _run_entry(run, comparison) for run in comparison.runs},
-    }
-
-
-def _run_entry(run: RunResult, comparison: Comparison) -> dict[str, Any]:
-    scores = comparison.scores.get(run.estimator, {})
-    entry = _state(run) | {"scores": {key: asdict(score) for key, score in scores.items()}}
-    if run.estimator in comparison.errors:
-        errors = comparison.errors[run.estimator]
-        entry["errors"] = {kind: _summary(series) for kind, series in errors.items()}
-    return entry
-
-
-def _state(run: RunResult) -> dict[str, Any]:
-    return {
-        "status": run.status,
-        "reason": run.reason,
-        "params": run.params,
-        "finish_s": run.finish_s,
-        "peak_memory_mb": run.peak_memory_mb,
-        "refused": [asdict(rows) for rows in gathered(run.refused)],
-        "withheld": run.withheld,
-    }
-
-
-def _summary(series: ErrorSeries) -> dict[str, Any]:
-    """Raw errors by axis in a few numbers; the series itself is in the run's arrays."""
-    rms_xyz = [rmse(series.position_m[:, axis]) for axis in range(3)]
-    return {
-        "instants": len(series.stamps_ns),
-        "rms_xyz_m": rms_xyz,
-        "max_position_m": float(np.linalg.norm(series.position_m, axis=1).max()),
-        "rms_yaw_rad": rmse(series.yaw_rad),
-        "max_yaw_rad": float(np.abs(series.yaw_rad).max()),
-    }
-
-
-def _write_run(run: RunResult, comparison: Comparison, folder: Path) -> None:
-    folder.mkdir(exist_ok=True)
-    for name in ESTIMATES:
-        (folder / name).unlink(missing_ok=True)
-    if run.smoothed is not None and run.causal is not None and run.landmarks is not None:
-        with replacing(folder / "trajectory.tum") as path:
-            write_tum(path, run.smoothed)
-        with replacing(folder / "causal.tum") as path:
-            write_tum(path, run.causal)
-        with replacing(folder / "landmarks.csv") as path:
-            write_landmarks_csv(path, run.landmarks)
-    errors: dict[Kind, ErrorSeries] = comparison.errors.get(run.estimator, {})
-    write_arrays(folder / SERIES, run_arrays(run, errors))
-    write_json(folder / RESULT, _result(run, comparison))
-
-
-def _result(run: RunResult, comparison: Comparison) -> dict[str, Any]:
-    """What result.json says: how this run went."""
-    scores = comparison.scores.get(run.estimator, {})
-    timings = {key.removeprefix("time."): score.value for key, score in scores.items() if key.startswith("time.")}
-    return {
-        "estimator": run.estimator,
-        "sequence": comparison.sequence.name,
-        **_state(run),
-        "timings": timings | {"calls": len(run.update_s)},
-        "environment": comparison.environment,
-    }
-
-
-def _remove_other_runs(folder: Path, names: set[str]) -> None:
-    """Remove what earlier comparisons left under other names; a folder goes only when nothing else is in it."""
-    for result in folder.glob(f"*/{RESULT}"):
-        if result.parent.name not in names:
-            for name in (*ESTIMATES, SERIES, RESULT):
-                (result.parent / name).unlink(missing_ok=True)
-            if not any(result.parent.iterdir()):
-                result.parent.rmdir()
-
-
-def _check_folder_name(name: str) -> None:
-    if name in ("", ".", "..") or any(character in name for character in '/\\:*?"<>|'):
-        raise EvaluationError(f"estimator name {name!r} cannot name a folder; install it under another name")
-
-
-RESULT_LOG = "result.mcap"
-
-
-def write_viewer_files(comparison: Comparison, folder: Path) -> None:
-    """Write ``result.mcap``, ``result.foxglove.json`` and ``result.rviz`` beside what `write_comparison` wrote.
-
-    Raises
-    ------
-    LogError
-        When a file cannot be written, or a stamp does not fit into a ROS 2 message.
-    """
-    estimates = {
-        run.estimator: (run.causal, run.smoothed, run.landmarks)
-        for run in comparison.runs
-        if run.causal is not None and run.smoothed is not None and run.landmarks is not None
-    }
-    settings = {
-        f"settings of {run.estimator}": json.dumps(run.params, default=str, ensure_ascii=False)
-        for run in comparison.runs
-    }
-    names = [INDEX, *(f"{RUNS}/{run.estimator}/{RESULT}" for run in comparison.runs)]
-    attachments = [Attachment(name, "application/json", (folder / name).read_bytes()) for name in names]
-    drawn = comparison.recognition.pictures if comparison.recognition else []
-    pictures = [Picture(picture.stamp_ns, picture.jpeg) for picture in drawn]
-    about = comparison.environment | settings
-    write_result(folder / RESULT_LOG, comparison.sequence, estimates, about, attachments, pictures)
+    values: dict[str, Any] = {name: array.item() if array.ndim == 0 else array for name, array in stored.items()}
+    if "outcomes" in values:
+        values["outcomes"] = [Outcome(text) for text in values["outcomes"].tolist()]
+    return kind(**values)

@@ -1,10 +1,10 @@
-"""Report."""
+"""Reports: pages, tables and terminal texts about comparisons and batches."""
 
 # fmt: off
 from sonar_graph.report.batch_page import write_batch_report
 from sonar_graph.report.batch_summary import lost_told, missing_told
+from sonar_graph.report.comparison_page import write_page, write_report
 from sonar_graph.report.console import published_counterpart, summary
-from sonar_graph.report.page import write_page, write_report
 
 __all__ = [
     "lost_told", "missing_told", "published_counterpart", "summary", "write_batch_report", "write_page",

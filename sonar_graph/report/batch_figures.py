@@ -1,15 +1,12 @@
-"""Figures of a batch: each a pure function to a drawing with its own data, None where there is nothing to draw.
+"""Figures of a batch: each a pure function to an illustration with its data, None where there is nothing to draw.
 
-A contestant keeps its colour and its place in every figure. Each log has a panel with a scale of its own.
-
-Panels of a batch's figures: one a log, a line for each contestant; many logs stand beside each other.
+Each log has a panel with its own scale and a line for each contestant, which keeps its colour and place everywhere.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,33 +15,40 @@ from matplotlib.ticker import LogLocator
 
 from sonar_graph.batch import KINDS, Metric, RecordedBatch, failure_rate, quantile
 from sonar_graph.measurements import Floats
-from sonar_graph.report.batch_tables import SAME_EVIDENCE, Tests, anees_of, is_evidence
+from sonar_graph.report.batch_tables import SAME_EVIDENCE, Tests, anees_of, is_evidence, unit_of
 from sonar_graph.report.figure_style import (
     INK,
     LABEL_SIZE,
     MUTED,
     TICK_SIZE,
     TRUTH,
+    Illustration,
     blank_panels,
     colour,
     head_panel,
     inline_svg,
     logarithmic,
 )
-from sonar_graph.report.tables import csv_text
+from sonar_graph.report.table_files import csv_text
 
 ROW_IN, PANEL_IN, WIDTH_IN = 0.36, 0.95, 7.4
 STACKED = 2
-"""So many logs stand below each other; more make small multiples."""
-COLUMNS = 3
+"""Largest number of logs below each other; more make small multiples."""
+MOST_COLUMNS = 3
 NAME_LETTERS, HEADING_LETTERS = 18, 20
 """Width of names beside and headings above small panels."""
+KIND_SHIFT = {"": 0.0, "Causal": -0.17, "Smoothed": 0.17}
+FILLED = {"": True, "Causal": True, "Smoothed": False}
+SMALL = 9.0
+LEAST_SPAN = 4.0
+"""Consistency is drawn from a quarter to four times its expected value, or farther: small deviations look small."""
+Rows = list[list[str]]
 
 
 def log_panels(batch: RecordedBatch, logs: list[str], x_label: str) -> tuple[Figure, list[Axes]]:
     """A panel a log with a scale of its own; in each a line for each contestant, the first on top."""
     names = batch.contestants
-    columns = 1 if len(logs) <= STACKED else min(COLUMNS, len(logs) - 1)
+    columns = 1 if len(logs) <= STACKED else min(MOST_COLUMNS, len(logs) - 1)
     rows = -(-len(logs) // columns)
     height_in = rows * (PANEL_IN + ROW_IN * len(names))
     figure, axes = blank_panels(rows, columns, (WIDTH_IN, height_in))
@@ -52,23 +56,21 @@ def log_panels(batch: RecordedBatch, logs: list[str], x_label: str) -> tuple[Fig
     for panel in panels[len(logs) :]:
         panel.remove()
     for index, log in enumerate(logs):
-        _name_lines(panels[index], names if index % columns == 0 else [""] * len(names), narrow=columns > 1)
-        head_panel(panels[index], folded(log, HEADING_LETTERS) if columns > 1 else log)
+        panel, narrow = panels[index], columns > 1
+        shown = names if index % columns == 0 else [""] * len(names)
+        labels = [folded(name, NAME_LETTERS) if narrow else name for name in shown]
+        panel.set(ylim=(len(names) - 0.5, -0.5), yticks=range(len(names)), yticklabels=labels)
+        panel.grid(False, axis="y")
+        for place, label in enumerate(panel.get_yticklabels()):
+            label.set_color(colour(place))
+            label.set_linespacing(0.95)
+        head_panel(panel, folded(log, HEADING_LETTERS) if narrow else log)
     figure.supxlabel(x_label, color=INK, fontsize=LABEL_SIZE)
     return figure, panels[: len(logs)]
 
 
-def _name_lines(panel: Axes, names: list[str], *, narrow: bool) -> None:
-    labels = [folded(name, NAME_LETTERS) if narrow else name for name in names]
-    panel.set(ylim=(len(names) - 0.5, -0.5), yticks=range(len(names)), yticklabels=labels)
-    panel.grid(False, axis="y")
-    for place, label in enumerate(panel.get_yticklabels()):
-        label.set_color(colour(place))
-        label.set_linespacing(0.95)
-
-
 def folded(name: str, letters: int) -> str:
-    r"""A name in lines of at most so many letters where it can be: they end after a slash, an equals sign or a comma.
+    r"""A name in lines of at most so many letters, where it has a slash, an equals sign or a comma to break after.
 
     Examples
     --------
@@ -91,32 +93,12 @@ def spread_out(panel: Axes) -> None:
     panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
 
 
-KIND_SHIFT = {"": 0.0, "Causal": -0.17, "Smoothed": 0.17}
-FILLED = {"": True, "Causal": True, "Smoothed": False}
-SMALL = 9.0
-LEAST_SPAN = 4.0
-"""Consistency is drawn from a quarter to four times what it should be, or farther: no small deviation fills a panel."""
-Rows = list[list[str]]
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """One figure as the page shows it."""
-
-    name: str
-    title: str
-    caption: str
-    svg: str
-    data: str
-    """What is drawn, as CSV, in the units of the results."""
-
-
-def spread_drawing(batch: RecordedBatch, metric: Metric) -> Drawing | None:
+def spread_drawing(batch: RecordedBatch, metric: Metric) -> Illustration | None:
     """Every run's value as a dot, with the median and the middle 80 %."""
     logs = [log for log in batch.logs if any(_finite(batch, log, name, metric).size for name in batch.contestants)]
     if not logs:
         return None
-    figure, panels = log_panels(batch, logs, f"{metric.label}{_unit(metric)}")
+    figure, panels = log_panels(batch, logs, f"{metric.label}{unit_of(metric)}")
     for panel, log in zip(panels, logs, strict=True):
         values = np.concatenate([_finite(batch, log, name, metric) for name in batch.contestants])
         if values.min() > 0 and values.max() > SMALL * values.min():
@@ -128,17 +110,20 @@ def spread_drawing(batch: RecordedBatch, metric: Metric) -> Drawing | None:
         f"{metric.protocol} A dot is a run, the stroke their median, the bar the middle 80 %. {_kinds_told(metric)}"
         "Runs without a value have no dot; their number stands at the right."
     )
-    rows = [["log", "contestant", "seed", "key", "column", "value"], *_value_rows(batch, metric)]
+    rows = [["log", "contestant", "seed", "key", "column", "value"]]
+    for run in batch.runs:
+        seed = "" if run.seed is None else str(run.seed)
+        rows += [[run.log, run.contestant, seed, run.key, key, _text(run.value(key))] for key in metric.keys.values()]
     return _drawn(figure, f"spread-{metric.name}", metric.label, caption, rows)
 
 
-def difference_drawing(batch: RecordedBatch, metric: Metric, tests: Tests) -> Drawing | None:
+def difference_drawing(batch: RecordedBatch, metric: Metric, tests: Tests) -> Illustration | None:
     """Mean differences to the reference with their intervals."""
     found = {place: test for place, (test, _) in tests.items() if place[0] in metric.keys.values()}
     logs = [log for log in batch.logs if any(place[1] == log and math.isfinite(t.mean) for place, t in found.items())]
     if not logs:
         return None
-    figure, panels = log_panels(batch, logs, f"difference to {batch.reference}{_unit(metric)}")
+    figure, panels = log_panels(batch, logs, f"difference to {batch.reference}{unit_of(metric)}")
     for panel, log in zip(panels, logs, strict=True):
         panel.axvline(0, color=TRUTH, linewidth=1.6)
         for place, contestant in enumerate(batch.contestants):
@@ -160,7 +145,7 @@ def difference_drawing(batch: RecordedBatch, metric: Metric, tests: Tests) -> Dr
     return _drawn(figure, f"difference-{metric.name}", f"{metric.label}: against {batch.reference}", caption, rows)
 
 
-def consistency_drawing(batch: RecordedBatch, what: str) -> Drawing | None:
+def consistency_drawing(batch: RecordedBatch, what: str) -> Illustration | None:
     """ANEES over independent runs against its chi-square band."""
     rows: Rows = [["log", "contestant", "estimate", "runs", "anees", "low", "high"]]
     known: dict[tuple[str, str], list[tuple[str, float]]] = {}
@@ -199,7 +184,7 @@ def consistency_drawing(batch: RecordedBatch, what: str) -> Drawing | None:
     return _drawn(figure, f"anees-{what}", f"Consistency of {what}", caption, rows)
 
 
-def failure_drawing(batch: RecordedBatch) -> Drawing | None:
+def failure_drawing(batch: RecordedBatch) -> Illustration | None:
     """Failure rates with their intervals; None where every run ended."""
     if all(run.ended for run in batch.runs):
         return None
@@ -219,7 +204,7 @@ def failure_drawing(batch: RecordedBatch) -> Drawing | None:
     return _drawn(figure, "failures", "Runs that did not end", caption, rows)
 
 
-def cost_drawing(batch: RecordedBatch) -> Drawing | None:
+def cost_drawing(batch: RecordedBatch) -> Illustration | None:
     """Median and 99th percentile of the time of an update, over all runs of a group."""
     keys = ("update_p50_ms", "update_p99_ms")
     if not any(keys[0] in run.values for run in batch.runs):
@@ -253,12 +238,8 @@ def _draw_spread(panel: Axes, values: Floats, place: int, over: str) -> None:
     if math.isfinite(middle):
         panel.plot(middle, row, "|", color=INK, markersize=12, markeredgewidth=1.6)
     if len(known) < len(values):
-        _note(panel, f"{len(values) - len(known)} without", row)
-
-
-def _note(panel: Axes, text: str, row: float) -> None:
-    across = panel.get_yaxis_transform()
-    panel.text(1.01, row, text, transform=across, ha="left", va="center", color=MUTED, fontsize=TICK_SIZE - 1)
+        across, note = panel.get_yaxis_transform(), f"{len(values) - len(known)} without"
+        panel.text(1.01, row, note, transform=across, ha="left", va="center", color=MUTED, fontsize=TICK_SIZE - 1)
 
 
 def _draw_interval(panel: Axes, ends: Floats, place: int, over: str) -> None:
@@ -282,27 +263,15 @@ def _finite(batch: RecordedBatch, log: str, contestant: str, metric: Metric) -> 
     return np.asarray(values[np.isfinite(values)])
 
 
-def _value_rows(batch: RecordedBatch, metric: Metric) -> Rows:
-    return [
-        [run.log, run.contestant, "" if run.seed is None else str(run.seed), run.key, key, _text(run.value(key))]
-        for run in batch.runs
-        for key in metric.keys.values()
-    ]
-
-
 def _kinds_told(metric: Metric) -> str:
     return "" if "" in metric.keys else "Full dots, above: causal; hollow, below: smoothed. "
-
-
-def _unit(metric: Metric) -> str:
-    return f" ({metric.shown_unit})" if metric.shown_unit else ""
 
 
 def _text(value: float) -> str:
     return repr(float(value)) if math.isfinite(value) else ""
 
 
-def _drawn(figure: Figure, name: str, title: str, caption: str, rows: Rows) -> Drawing:
+def _drawn(figure: Figure, name: str, title: str, caption: str, rows: Rows) -> Illustration:
     plain_name = name.replace("_", "-").replace(".", "-")
     svg = inline_svg(figure, plain_name, f"{title}. {caption}")
-    return Drawing(plain_name, title, caption, svg, csv_text(rows))
+    return Illustration(plain_name, title, caption, svg, data=csv_text(rows))

@@ -1,8 +1,6 @@
-"""What a batch found, in sentences made from its numbers: failures first, then errors against the reference.
+"""Findings of a batch in sentences made from its numbers, and the overview at the head of its page.
 
-The head of a report: for one score, who is told apart from the reference on how many logs, and every median.
-
-Batches of which not every planned run was done, or is there any more: what is said of them, what they cannot be.
+Failures and missing runs come first, then warnings, then errors against the reference.
 """
 
 from __future__ import annotations
@@ -25,13 +23,14 @@ from sonar_graph.batch import (
     quantile_error,
     summarise,
 )
-from sonar_graph.report.batch_tables import SIGNIFICANT, Tests, p_text
-from sonar_graph.report.tables import Cell, Column, Table, absent, number, words
-from sonar_graph.report.wording import quantile_text
+from sonar_graph.evaluation import Cell, Column, Table, absent, number, quantile_text, words
+from sonar_graph.report.batch_tables import GROUP_COLUMNS, SIGNIFICANT, Tests, p_text, unit_of
 
 SCORED = "scored_instants"
 NAMED = 3
-"""Logs that a warning names; of more it tells the number."""
+"""Largest number of logs that a warning names; others are counted."""
+LOWER, HIGHER, DIFFERENT = "\N{DOWNWARDS ARROW}", "\N{UPWARDS ARROW}", "\N{NOT EQUAL TO}"
+SIDES = {LOWER: "lower", HIGHER: "higher", DIFFERENT: "different"}
 
 
 def failures_told(batch: RecordedBatch) -> list[str]:
@@ -47,7 +46,7 @@ def failures_told(batch: RecordedBatch) -> list[str]:
 
 
 def reference_told(batch: RecordedBatch) -> list[str]:
-    """A warning where the reference never ended: then differences tell of its failure and of nothing else."""
+    """A warning where the reference never ended: differences then show its failure and nothing else."""
     groups = {log: batch.group(log, batch.reference) for log in batch.logs}
     lost = [log for log, group in groups.items() if group and not any(run.ended for run in group)]
     if not lost:
@@ -59,59 +58,48 @@ def reference_told(batch: RecordedBatch) -> list[str]:
 
 
 def errors_told(batch: RecordedBatch, metrics: list[Metric], tests: Tests) -> list[str]:
-    """For each log the first metric that it has: medians, then differences to the reference that are no chance."""
+    """A sentence for each log on the first error that it has: medians, then significant differences."""
+    columns = [(metric, over, key) for metric in metrics if metric.is_error for over, key in metric.keys.items()]
     sentences = []
     for log in batch.logs:
-        found = next(
-            (
-                (metric, key)
-                for metric in metrics
-                if metric.is_error
-                for key in metric.keys.values()
-                if any(batch.is_asked(log, name, key) for name in batch.contestants)
-            ),
-            None,
+        known = (one for one in columns if any(batch.is_asked(log, name, one[2]) for name in batch.contestants))
+        found = next(known, None)
+        if found is None:
+            sentences.append(f"{log}: no run has an error to compare.")
+            continue
+        metric, over, key = found
+        values = {name: batch.values(log, name, key) for name in batch.contestants}
+        medians = sorted(
+            (quantile(own, 0.5), name, quantile_error(own, 0.5) * metric.factor)
+            for name, own in values.items()
+            if len(own)
         )
-        sentences.append(
-            f"{log}: no run has an error to compare." if found is None else _log_told(batch, log, *found, tests)
+        listed = ", ".join(
+            f"{name} {quantile_text(value * metric.factor, error)}"
+            for value, name, error in medians
+            if value < math.inf
         )
+        unit = f" in {metric.shown_unit}" if metric.shown_unit else ""
+        which = f"{over.lower()} " if over else ""
+        told, alike = [f"{log}, median {which}error{unit} ({metric.label}): {listed}."], []
+        for contestant in batch.contestants:
+            if (key, log, contestant) not in tests:
+                continue
+            test, p_value = tests[key, log, contestant]
+            if p_value < SIGNIFICANT:
+                p = p_text(p_value)
+                sign = "" if p.startswith("<") else "= "
+                told.append(f"{contestant} {_side_told(batch, metric, test)} (p {sign}{p}).")
+            else:
+                alike.append(contestant)
+        if alike:
+            told.append(f"Not told apart from {batch.reference}: {', '.join(alike)}.")
+        sentences.append(" ".join(told))
     return sentences
 
 
-def _log_told(batch: RecordedBatch, log: str, metric: Metric, key: str, tests: Tests) -> str:
-    medians = [
-        (quantile(values, 0.5), name, quantile_error(values, 0.5) * metric.factor)
-        for name in batch.contestants
-        if len(values := batch.values(log, name, key))
-    ]
-    listed = ", ".join(
-        f"{name} {quantile_text(value * metric.factor, error)}"
-        for value, name, error in sorted(medians)
-        if value < math.inf
-    )
-    which = next(over for over, own in metric.keys.items() if own == key).lower()
-    unit = f" in {metric.shown_unit}" if metric.shown_unit else ""
-    opening = f"{log}, median {f'{which} ' if which else ''}error{unit} ({metric.label}): {listed}."
-    return " ".join([opening, *_differences_told(batch, log, metric, key, tests)])
-
-
-def _differences_told(batch: RecordedBatch, log: str, metric: Metric, key: str, tests: Tests) -> list[str]:
-    told, alike = [], []
-    for contestant in batch.contestants:
-        if (key, log, contestant) not in tests:
-            continue
-        test, p_value = tests[key, log, contestant]
-        if not p_value < SIGNIFICANT:
-            alike.append(contestant)
-        else:
-            told.append(f"{contestant} {_side_told(batch, metric, test)} (p {_p(p_value)}).")
-    if alike:
-        told.append(f"Not told apart from {batch.reference}: {', '.join(alike)}.")
-    return told
-
-
 def _side_told(batch: RecordedBatch, metric: Metric, test: PairedDifference) -> str:
-    """What the rank test is about: the side of most differences, not of their mean, which one run can turn."""
+    """The side of most differences, which the rank test is about; their mean can be turned by one run."""
     counted = f"smaller in {test.smaller} of {test.counted}"
     if math.isnan(test.median) or test.median == 0:
         return f"differs from {batch.reference}, {counted}"
@@ -144,7 +132,8 @@ def power_told(tests: Tests) -> list[str]:
         families.setdefault(key.rpartition(".")[2], {})[log, id(test)] = test
     blind: dict[str, str] = {}
     for family in families.values():
-        best = holm(np.array([_best_p(test.pairs) for test in family.values()]))
+        pairs = [test.pairs for test in family.values()]
+        best = holm(np.array([least_p(count) if count >= LEAST_PAIRS else math.nan for count in pairs]))
         found = zip(family.items(), best.tolist(), strict=True)
         blind |= {log: test.counted for ((log, _), test), p_value in found if not p_value < SIGNIFICANT}
     if not blind:
@@ -153,73 +142,54 @@ def power_told(tests: Tests) -> list[str]:
     return [f"Too few pairs for any corrected p value to fall below {SIGNIFICANT:g}: {listed}. Add seeds."]
 
 
-def _best_p(pairs: int) -> float:
-    return least_p(pairs) if pairs >= LEAST_PAIRS else math.nan
-
-
-def _few(names: list[str]) -> str:
-    """The first names, and how many more there are."""
-    more = len(names) - NAMED
-    return ", ".join(names) if more < 1 else f"{', '.join(names[:NAMED])} and {more} more"
-
-
-def _p(p_value: float) -> str:
-    text = p_text(p_value)
-    return text if text.startswith("<") else f"= {text}"
-
-
-LOWER, HIGHER, DIFFERENT = "\N{DOWNWARDS ARROW}", "\N{UPWARDS ARROW}", "\N{NOT EQUAL TO}"
-SIDES = {LOWER: "lower", HIGHER: "higher", DIFFERENT: "different"}
+def _few(names: list[str], joint: str = ", ") -> str:
+    """The first names, and the number of the others."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return joint.join(names[:NAMED]) + more
 
 
 def head_metric(batch: RecordedBatch, metrics: list[Metric]) -> Metric | None:
     """The error that most logs have, of those the one that the suite names first; None where no run has an error."""
-    known = {metric.name: len(_scored_logs(batch, metric)) for metric in metrics if metric.is_error}
-    if not any(known.values()):
+
+    def has(log: str, metric: Metric) -> bool:
+        return any(batch.is_asked(log, name, key) for key in metric.keys.values() for name in batch.contestants)
+
+    logs = {metric.name: sum(has(log, metric) for log in batch.logs) for metric in metrics if metric.is_error}
+    if not any(logs.values()):
         return None
-    return max((metric for metric in metrics if metric.is_error), key=lambda metric: known[metric.name])
-
-
-def _scored_logs(batch: RecordedBatch, metric: Metric) -> list[str]:
-    return [log for log in batch.logs if any(_asked(batch, log, key) for key in metric.keys.values())]
-
-
-def _asked(batch: RecordedBatch, log: str, key: str) -> bool:
-    return any(batch.is_asked(log, contestant, key) for contestant in batch.contestants)
+    return max((metric for metric in metrics if metric.is_error), key=lambda metric: logs[metric.name])
 
 
 def headlines(batch: RecordedBatch, metric: Metric, tests: Tests) -> list[str]:
-    """For each estimate who is told apart from the reference, to which side, and on how many logs."""
+    """For each estimate the contestants that differ from the reference, the side, and the number of logs."""
     own = {place: test for place, test in tests.items() if place[0] in metric.keys.values() and place[1] in batch.logs}
+    several = len(batch.logs) > 1
     if own and not any(map(mark_of, own.values())):
-        place = " on any one log" if len(batch.logs) > 1 else ""
+        place = " on any one log" if several else ""
         return [f"{metric.label}: no estimator is told apart from {batch.reference}{place}."]
-    sentences = [_headline(batch, metric, own, over, key) for over, key in metric.keys.items()]
-    return [sentence for sentence in sentences if sentence]
-
-
-def _headline(batch: RecordedBatch, metric: Metric, tests: Tests, over: str, key: str) -> str:
-    asked = [name for name in _shown(batch, metric, over) if any((key, log, name) in tests for log in batch.logs)]
-    if not asked:
-        return ""
-    marks = {name: [mark_of(tests.get((key, log, name))) for log in batch.logs] for name in asked}
-    told = [f"{word} with {names}" for mark, word in SIDES.items() if (names := _marked(marks, mark))]
-    alike = ", ".join(name for name, own in marks.items() if not any(own))
-    if alike:
-        told.append(f"{'never' if len(batch.logs) > 1 else 'not'} told apart: {alike}")
-    place = f" (on how many of {len(batch.logs)} logs)" if len(batch.logs) > 1 and len(told) > bool(alike) else ""
-    return f"{f'{over} error' if over else 'Error'} beside that of {batch.reference}{place}: {'; '.join(told)}."
-
-
-def _marked(marks: dict[str, list[str]], mark: str) -> str:
-    """Contestants that have a mark, with the number of logs where there are several."""
-    return ", ".join(
-        f"{name} ({own.count(mark)})" if len(own) > 1 else name for name, own in marks.items() if mark in own
-    )
+    sentences = []
+    for over, key in metric.keys.items():
+        names = [name for name in _shown(batch, metric, over) if any((key, log, name) in own for log in batch.logs)]
+        if not names:
+            continue
+        marks = {name: [mark_of(own.get((key, log, name))) for log in batch.logs] for name in names}
+        told = []
+        for mark, word in SIDES.items():
+            counts = {name: found.count(mark) for name, found in marks.items() if mark in found}
+            if counts:
+                listed = ", ".join(f"{name} ({count})" if several else name for name, count in counts.items())
+                told.append(f"{word} with {listed}")
+        alike = ", ".join(name for name, found in marks.items() if not any(found))
+        place = f" (on how many of {len(batch.logs)} logs)" if several and told else ""
+        if alike:
+            told.append(f"{'never' if several else 'not'} told apart: {alike}")
+        subject = f"{over} error" if over else "Error"
+        sentences.append(f"{subject} beside that of {batch.reference}{place}: {'; '.join(told)}.")
+    return sentences
 
 
 def mark_of(found: tuple[PairedDifference, float] | None) -> str:
-    """An arrow to the side on which most differences to the reference are, where they are no chance; else nothing."""
+    """An arrow to the side of most differences to the reference where these are significant; else nothing."""
     if found is None or not found[1] < SIGNIFICANT:
         return ""
     median = found[0].median
@@ -227,56 +197,47 @@ def mark_of(found: tuple[PairedDifference, float] | None) -> str:
 
 
 def overview_table(batch: RecordedBatch, metric: Metric, tests: Tests) -> Table:
-    """Log by contestant: medians, and a mark where a contestant is told apart from the reference."""
+    """Logs down, contestants across: medians, with a mark where a contestant differs from the reference."""
     shown = [(over, key, name) for over, key in metric.keys.items() for name in _shown(batch, metric, over)]
-    columns = [Column("log", "Log", is_number=False)]
-    columns += [
-        Column(f"{key} {name}", _heading(batch, name), over, ("", "p_holm"), contestant=name)
-        for over, key, name in shown
-    ]
-    rows = [
-        [words(log), *(_median_cell(batch, metric, tests, (key, log, name)) for _, key, name in shown)]
-        for log in batch.logs
-    ]
-    unit = f" ({metric.shown_unit})" if metric.shown_unit else ""
+    columns = [GROUP_COLUMNS[0]]
+    for over, key, name in shown:
+        heading = f"{name} (reference)" if name == batch.reference else name
+        run = batch.contestants.index(name)
+        columns.append(Column(f"{key} {name}", heading, over, ("", "p_holm"), run=run))
+    rows: list[list[Cell]] = []
+    for log in batch.logs:
+        rows.append([words(log)])
+        for _, key, name in shown:
+            if not batch.is_asked(log, name, key):
+                rows[-1].append(absent(2))
+                continue
+            told, found = summarise(batch.values(log, name, key)), tests.get((key, log, name))
+            text = quantile_text(told.median * metric.factor, told.median_error * metric.factor)
+            note = f"{told.without} of {told.runs} without a value" if told.without else ""
+            p_value = found[1] if found else math.nan
+            rows[-1].append(number(told.median, f"{text} {mark_of(found)}".rstrip(), p_value, note=note))
     caption = (
         f"{LOWER} lower, {HIGHER} higher than {batch.reference} on the same seeds, beyond chance "
         f"(p below {SIGNIFICANT:g}, Holm); no arrow: not told apart."
     )
-    return Table("overview", f"{metric.label}{unit}, median over runs", caption, columns, rows)
-
-
-def _heading(batch: RecordedBatch, contestant: str) -> str:
-    return f"{contestant} (reference)" if contestant == batch.reference else contestant
+    return Table("overview", f"{metric.label}{unit_of(metric)}, median over runs", caption, columns, rows)
 
 
 def _shown(batch: RecordedBatch, metric: Metric, over: str) -> list[str]:
     """Contestants that have the estimate; the smoothed one only where it is not the causal one everywhere."""
-    key = metric.keys[over]
+    key, first = metric.keys[over], next(iter(metric.keys.values()))
     asked = [name for name in batch.contestants if any(batch.is_asked(log, name, key) for log in batch.logs)]
-    first = next(iter(metric.keys.values()))
-    return asked if key == first else [name for name in asked if not _are_equal(batch, name, key, first)]
-
-
-def _are_equal(batch: RecordedBatch, contestant: str, key: str, other: str) -> bool:
-    return all(
-        np.array_equal(batch.values(log, contestant, key), batch.values(log, contestant, other)) for log in batch.logs
-    )
-
-
-def _median_cell(batch: RecordedBatch, metric: Metric, tests: Tests, place: tuple[str, str, str]) -> Cell:
-    key, log, contestant = place
-    if not batch.is_asked(log, contestant, key):
-        return absent(2)
-    told = summarise(batch.values(log, contestant, key))
-    found = tests.get(place)
-    text = quantile_text(told.median * metric.factor, told.median_error * metric.factor)
-    note = f"{told.without} of {told.runs} without a value" if told.without else ""
-    return number(told.median, f"{text} {mark_of(found)}".rstrip(), found[1] if found else math.nan, note=note)
+    if key == first:
+        return asked
+    return [
+        name
+        for name in asked
+        if not all(np.array_equal(batch.values(log, name, key), batch.values(log, name, first)) for log in batch.logs)
+    ]
 
 
 def missing_told(batch: RecordedBatch) -> list[str]:
-    """How many runs are missing, whose, on which logs, and how to go on; nothing of a complete batch."""
+    """The missing runs by contestant and log, and the way to complete the batch; nothing where it is complete."""
     if not batch.missing:
         return []
     by_contestant = Counter(run.contestant for run in batch.missing)
@@ -284,16 +245,15 @@ def missing_told(batch: RecordedBatch) -> list[str]:
     names = [name for name in batch.contestants if by_contestant[name]]
     whose = ", ".join(f"{name} {by_contestant[name]} of {planned[name]}" for name in names)
     lacking = {run.log for run in batch.missing}
-    logs = [log for log in batch.logs if log in lacking]
-    more = f" and {len(logs) - NAMED} more" if len(logs) > NAMED else ""
+    logs = _few([log for log in batch.logs if log in lacking], "; ")
     return [
-        f"This batch is not complete: {batch.missing_count} ({whose}), on {'; '.join(logs[:NAMED])}{more}. All numbers "
+        f"This batch is not complete: {batch.missing_count} ({whose}), on {logs}. All numbers "
         f"are of the other runs, and may change. To complete it, {GOING_ON}."
     ]
 
 
 def lost_told(batch: RecordedBatch) -> list[str]:
-    """How many runs have left their row and nothing else."""
+    """The number of runs that are rows of the table but whose folders are gone."""
     lost = [run.key for run in batch.runs if not run.log_file]
     if not lost:
         return []
@@ -304,7 +264,7 @@ def lost_told(batch: RecordedBatch) -> list[str]:
 
 
 def marked(batch: RecordedBatch, table: Table) -> Table:
-    """A table, with a caption that says so where runs are missing: tables are taken out of the page."""
+    """The table, with a caption that says where runs are missing: tables are also used outside the page."""
     if not batch.missing:
         return table
     return replace(table, caption=f"{table.caption} Not complete: {batch.missing_count}.".lstrip())

@@ -1,4 +1,4 @@
-"""The comparison in the terminal: the few numbers that are read first, and the counterpart of a published table."""
+"""The comparison in the terminal: the few numbers that are read first, and the counterpart of the published table."""
 
 from __future__ import annotations
 
@@ -7,27 +7,18 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from sonar_graph.evaluation import ABSENT, LABELS, Comparison, RunResult, repeats_published
-from sonar_graph.report.landmark_table import PAPER, LandmarkTable, landmark_table
-from sonar_graph.report.warnings import (
+from sonar_graph.evaluation import ABSENT, LABELS, TOLERATED_FACTOR, Comparison, repeats_published, score_keys
+from sonar_graph.report.findings import (
     doubt_lines,
     doubt_of_identities,
+    headline_metric,
+    lost_runs,
     nameless_landmarks,
+    no_detections,
     refusal_lines,
     withheld_lines,
 )
-from sonar_graph.report.wording import (
-    TOLERATED_FACTOR,
-    consistency,
-    display_unit,
-    display_value,
-    failed_runs,
-    has_detections,
-    headline_metric,
-    lost_runs,
-    no_detections,
-    score_of,
-)
+from sonar_graph.report.landmark_table import PAPER, landmark_table
 
 COLUMNS = {
     "causal.yaw_rmse_rad": "yaw",
@@ -59,54 +50,78 @@ ASK_INSPECT = (
 def summary(comparison: Comparison) -> Group:
     """The runs in rows with position error (causal and smoothed), yaw error, NEES and time; below, why runs failed.
 
-    What is below may be as wide as the terminal. The same numbers as in the report. NEES is 1 for a consistent
-    estimator, and marked where `consistency` says more.
+    The numbers are those of the report. NEES is 1 for a consistent estimator and marked by `Score.verdict`. The lines
+    below the table may be as wide as the terminal.
     """
-    columns = _columns(comparison)
-    title = Text(comparison.sequence.name, style="bold")
-    table = Table(title=title, title_justify="left")
+    metric = headline_metric(comparison)
+    errors = {f"causal.{metric}": "causal", f"smoothed.{metric}": "smoothed"} if metric else {}
+    present = score_keys(comparison)
+    columns = {key: heading for key, heading in {**errors, **COLUMNS}.items() if key in present}
+    table = Table(title=Text(comparison.sequence.name, style="bold"), title_justify="left")
     table.box, table.padding = SIMPLE_HEAD, (0, 1, 0, 0)
     table.add_column("estimator", no_wrap=True)
     for key, heading in columns.items():
-        table.add_column(Text(_heading(comparison, key, heading)), justify="right", no_wrap=True)
-    for run in comparison.runs:
-        table.add_row(Text(run.estimator), *(_cell(comparison, run, key) for key in columns))
-    return Group(table, _notes(comparison))
+        unit = next(scores[key].shown_unit for scores in comparison.scores.values() if key in scores)
+        table.add_column(Text(f"{heading}\n({unit})" if unit else heading), justify="right", no_wrap=True)
+    for name in (run.estimator for run in comparison.runs):
+        cells = []
+        for key in columns:
+            score = comparison.score_of(name, key)
+            mark = {"over-confident": " ▲", "over-cautious": " ▼"}.get(score.verdict, "") if score else ""
+            cells.append(Text(score.text() + mark if score else ABSENT))
+        table.add_row(Text(name), *cells)
+    return Group(table, Text("\n".join(_lines_below(comparison, metric))))
+
+
+def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
+    """Failures, warnings, and the meaning of the columns."""
+    lines = [f"{run.estimator} failed: {run.reason}" for run in comparison.failed_runs]
+    lines += lost_runs(comparison)
+    lines += refusal_lines(comparison)
+    lines += withheld_lines(comparison)
+    lines += doubt_of_identities(comparison)
+    lines += nameless_landmarks(comparison)
+    lines += doubt_lines(comparison.sequence.notes)
+    if comparison.recognition is not None:
+        found = comparison.recognition
+        warned = [f"{n} x {reason}" for reason, n in found.warned().items()]
+        lines += [f"Sonar images: {line}" for line in [*found.naming(comparison.sequence.true_landmarks), *warned]]
+    elif "detections.model" in comparison.sequence.notes:
+        lines.append(RECOGNISED_BEFORE)
+    has_detections = bool(comparison.sequence.detections)
+    if not has_detections:
+        lines.append(no_detections(comparison))
+    if metric is None:
+        return [*lines, "No position errors: the report says why."]
+    lines += [f"causal, smoothed: {LABELS[metric]}", NEES_LEGEND]
+    for name in (run.estimator for run in comparison.runs):
+        score = comparison.score_of(name, "causal.nees_position")
+        is_odometry = name == "dead-reckoning" or not has_detections
+        if is_odometry and score is not None and score.value > FAR_FROM_FITTING:
+            return [*lines, ASK_INSPECT]  # odometry alone contradicts the reference: no estimator is to blame
+    return lines
 
 
 def published_counterpart(comparison: Comparison) -> Group | None:
     """Table I of the 2014 paper and its counterpart; None where the run does not repeat that experiment.
 
-    The same numbers as in the report.
+    Landmarks stand across, as in the paper. The numbers are those of the report.
     """
     found = landmark_table(comparison) if repeats_published(comparison.sequence) else None
     if found is None:
         return None
-    return Group(_positions(found), _totals(found), Text(PUBLISHED_LEGEND))
-
-
-def _positions(found: LandmarkTable) -> Table:
-    """As in the paper: landmarks across; x and y of the truth and of each column down."""
-    table = _plain_table(
-        "Landmarks: position in metres (estimate minus truth)",
-        ["", *(row.label.removesuffix(", x") for row in found.positions[::2])],
-    )
-    for axis in (0, 1):
-        table.add_row(f"true {'xy'[axis]}", *(row.true for row in found.positions[axis::2]))
-    for column, name in enumerate(found.columns):
-        if found.has_map(column):
+    texts = [[cell.text for cell in row] for row in found.rows]
+    (split,) = found.sections
+    positions, totals = texts[:split], texts[split:]
+    landmarks = [row[0].removesuffix(", x") for row in positions[::2]]
+    across = _plain_table("Landmarks: position in metres (estimate minus truth)", ["", *landmarks])
+    below = _plain_table("", ["", "RMS", "RMS after\nSE(2)", "last minus\nfirst x", "last minus\nfirst y"])
+    for place, column in enumerate(found.columns[1:], start=1):
+        below.add_row(column.heading, *(row[place] for row in totals))
+        if any(row[place] != ABSENT for row in positions):
             for axis in (0, 1):
-                table.add_row(f"{name} {'xy'[axis]}", *(row.cells[column] for row in found.positions[axis::2]))
-    return table
-
-
-def _totals(found: LandmarkTable) -> Table:
-    """What they come to: a column a quantity."""
-    table = _plain_table("", ["", "RMS", "RMS after\nSE(2)", "last minus\nfirst x", "last minus\nfirst y"])
-    table.add_row("true", *(row.true for row in found.totals))
-    for column, name in enumerate(found.columns):
-        table.add_row(name, *(row.cells[column] for row in found.totals))
-    return table
+                across.add_row(f"{column.heading} {'xy'[axis]}", *(row[place] for row in positions[axis::2]))
+    return Group(across, below, Text(PUBLISHED_LEGEND))
 
 
 def _plain_table(title: str, headings: list[str]) -> Table:
@@ -115,64 +130,3 @@ def _plain_table(title: str, headings: list[str]) -> Table:
     for number, heading in enumerate(headings):
         table.add_column(heading, no_wrap=True, justify="right" if number else "left")
     return table
-
-
-def _columns(comparison: Comparison) -> dict[str, str]:
-    metric = headline_metric(comparison)
-    errors = {f"causal.{metric}": "causal", f"smoothed.{metric}": "smoothed"} if metric else {}
-    present = {key for scores in comparison.scores.values() for key in scores}
-    return {key: heading for key, heading in {**errors, **COLUMNS}.items() if key in present}
-
-
-def _heading(comparison: Comparison, key: str, heading: str) -> str:
-    units = {display_unit(scores[key]) for scores in comparison.scores.values() if key in scores}
-    unit = next(iter(units), "")
-    return f"{heading}\n({unit})" if unit else heading
-
-
-def _notes(comparison: Comparison) -> Text:
-    lines = [f"{run.estimator} failed: {run.reason}" for run in failed_runs(comparison)]
-    lines += lost_runs(comparison)
-    lines += refusal_lines(comparison)
-    lines += withheld_lines(comparison)
-    lines += doubt_of_identities(comparison)
-    lines += nameless_landmarks(comparison)
-    lines += doubt_lines(comparison.sequence.notes)
-    lines += _recognition(comparison)
-    if not has_detections(comparison):
-        lines.append(no_detections(comparison))
-    metric = headline_metric(comparison)
-    if metric is None:
-        lines.append("No position errors: the report says why.")
-    else:
-        lines.append(f"causal, smoothed: {LABELS[metric]}")
-        lines.append(NEES_LEGEND)
-        lines += _reference_doubt(comparison)
-    return Text("\n".join(lines))
-
-
-def _reference_doubt(comparison: Comparison) -> list[str]:
-    """Where odometry alone contradicts the reference, no estimator is to blame."""
-    for run in comparison.runs:
-        score = score_of(comparison, run.estimator, "causal.nees_position")
-        is_odometry = run.estimator == "dead-reckoning" or not has_detections(comparison)
-        if is_odometry and score is not None and score.value > FAR_FROM_FITTING:
-            return [ASK_INSPECT]
-    return []
-
-
-def _recognition(comparison: Comparison) -> list[str]:
-    """What was recognised in the log's images, or how to see it where that was done before."""
-    found = comparison.recognition
-    if found is None:
-        return [RECOGNISED_BEFORE] if "detections.model" in comparison.sequence.notes else []
-    warned = [f"{n} x {reason}" for reason, n in found.warned().items()]
-    return [f"Sonar images: {line}" for line in [*found.naming(comparison.sequence.true_landmarks), *warned]]
-
-
-def _cell(comparison: Comparison, run: RunResult, key: str) -> Text:
-    score = score_of(comparison, run.estimator, key)
-    if score is None:
-        return Text(ABSENT)
-    mark = {"over-confident": " ▲", "over-cautious": " ▼"}.get(consistency(score), "")
-    return Text(display_value(score) + mark)

@@ -1,13 +1,11 @@
-"""The looks that all figures share: colours, panels, and how long series are thinned.
-
-A matplotlib figure as an inline SVG that takes its colours from the page around it.
-"""
+"""The style of all figures: colours, panels, thinning of long series, and inline SVG in the colours of the page."""
 
 from __future__ import annotations
 
 import html
 import io
 import re
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -31,6 +29,27 @@ LINE_STYLES: tuple[Any, ...] = ("-", (0, (5, 1.6)), (0, (4, 1.4, 1, 1.4)), (0, (
 LABEL_SIZE, TICK_SIZE = 9.5, 9.0
 SERIES_POINTS = 700
 """Points that a drawn series keeps: more cannot be seen at the width of a page."""
+PAGE_COLOURS = {INK: "--ink", MUTED: "--muted", RULE: "--rule", TRUTH: "--truth"} | {
+    own: f"--run-{index}" for index, own in enumerate(ESTIMATOR_COLOURS)
+}
+"""Custom property of the page that replaces each colour, so that figures follow dark and light."""
+POINTS_PER_INCH = 72
+
+
+@dataclass(frozen=True)
+class Illustration:
+    """One figure as a page shows it."""
+
+    name: str
+    """Letters, digits and hyphens, unique on the page."""
+    title: str
+    caption: str
+    svg: str
+    """Empty where there is nothing to draw."""
+    instead: str = ""
+    """Sentence in place of the caption where there is nothing to draw."""
+    data: str = ""
+    """The drawn values as CSV, in the units of the results."""
 
 
 def colour(index: int) -> str:
@@ -48,18 +67,14 @@ def blank_panels(rows: int, columns: int, size_in: tuple[float, float], **sharin
     figure = Figure(figsize=size_in, layout="constrained", facecolor="none")
     axes = figure.subplots(rows, columns, squeeze=False, **sharing)
     for panel in axes.flat:
-        _style(panel)
+        panel.set_facecolor("none")
+        panel.grid(True, color=RULE, linewidth=0.6)
+        panel.set_axisbelow(True)
+        panel.tick_params(which="both", color=RULE, labelcolor=MUTED, labelsize=TICK_SIZE)
+        for side, spine in panel.spines.items():
+            spine.set_visible(side in ("left", "bottom"))
+            spine.set_color(RULE)
     return figure, axes
-
-
-def _style(panel: Axes) -> None:
-    panel.set_facecolor("none")
-    panel.grid(True, color=RULE, linewidth=0.6)
-    panel.set_axisbelow(True)
-    panel.tick_params(which="both", color=RULE, labelcolor=MUTED, labelsize=TICK_SIZE)
-    for side, spine in panel.spines.items():
-        spine.set_visible(side in ("left", "bottom"))
-        spine.set_color(RULE)
 
 
 def name_axes(panel: Axes, x: str = "", y: str = "") -> None:
@@ -104,7 +119,7 @@ def seconds_since_start(comparison: Comparison, stamps_ns: Ints) -> Floats:
 def thinned(values: Floats, points: int = SERIES_POINTS) -> Ints:
     """Rows that draw like the whole series: first, last, and the extremes of each of ``points / 2`` equal stretches.
 
-    Extremes stay, so that thinning never hides a jump; a stretch with a gap (NaN) keeps the gap.
+    Thinning never hides a jump; a stretch with a gap (NaN) keeps the gap.
     """
     n = len(values)
     if n <= points:
@@ -121,54 +136,32 @@ def evenly(n: int, points: int = SERIES_POINTS) -> Ints:
     return np.unique(np.linspace(0, n - 1, min(n, points)).round().astype(np.int64)) if n else np.empty(0, np.int64)
 
 
-PAGE_COLOURS = {INK: "--ink", MUTED: "--muted", RULE: "--rule", TRUTH: "--truth"} | {
-    own: f"--run-{index}" for index, own in enumerate(ESTIMATOR_COLOURS)
-}
-"""Custom property of the page that takes the place of each colour, so that figures follow dark and light."""
-POINTS_PER_INCH = 72
-
-
 def inline_svg(figure: Figure, name: str, description: str) -> str:
     """The figure as an ``<svg>`` element for an HTML page.
 
-    Text stays text, colours become the page's custom properties, nothing refers outside, and identifiers start with
-    ``name`` so that several figures can share a page.
+    Text stays text, colours become the page's custom properties, and nothing refers outside. Identifiers begin with
+    ``name`` (letters, digits and hyphens, unique on the page), so that several figures can share a page.
 
     Parameters
     ----------
-    name
-        Letters and hyphens, unique on the page.
     description
-        What the figure shows, for those who cannot see it.
+        Content of the figure in words, for those who cannot see it.
     """
     buffer = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "path.simplify_threshold": 0.25, "svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", metadata={"Date": None})
-    drawing = _without_wrapping(buffer.getvalue())
-    drawing = _with_own_identifiers(drawing, name)
+    svg = buffer.getvalue()
+    svg = svg[svg.index(">", svg.index("<svg")) + 1 :]
+    # metadata and comments are of no use; a style rule would reach the whole page
+    svg = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", svg, flags=re.DOTALL)
+    svg = re.sub(r"\s*\n\s*", "\n", svg)
+    svg = re.sub(r'(\s)id="([^"]+)"', rf'\1id="{name}-\2"', svg)
+    svg = re.sub(r'(?:xlink:)?href="#([^"]+)"', rf'href="#{name}-\1"', svg)
+    svg = re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", svg)
     for own, variable in PAGE_COLOURS.items():
-        drawing = drawing.replace(own, f"var({variable})")
-    return _opening_tag(figure, description) + drawing
-
-
-def _without_wrapping(svg: str) -> str:
-    """What follows the opening tag, without metadata, and without the style rule, which would reach the whole page."""
-    body = svg[svg.index(">", svg.index("<svg")) + 1 :]
-    body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
-    body = re.sub(r"<style.*?</style>", "", body, flags=re.DOTALL)
-    body = re.sub(r"<!--.*?-->", "", body, flags=re.DOTALL)
-    return re.sub(r"\s*\n\s*", "\n", body)
-
-
-def _with_own_identifiers(body: str, name: str) -> str:
-    body = re.sub(r'(\s)id="([^"]+)"', rf'\1id="{name}-\2"', body)
-    body = re.sub(r'(?:xlink:)?href="#([^"]+)"', rf'href="#{name}-\1"', body)
-    return re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", body)
-
-
-def _opening_tag(figure: Figure, description: str) -> str:
+        svg = svg.replace(own, f"var({variable})")
     width, height = (float(side) * POINTS_PER_INCH for side in figure.get_size_inches())
     return (
         f'<svg role="img" aria-label="{html.escape(description)}" viewBox="0 0 {width:g} {height:g}"'
-        f' style="--natural-width: {width * 96 / POINTS_PER_INCH:.0f}px">'
+        f' style="--natural-width: {width * 96 / POINTS_PER_INCH:.0f}px">{svg}'
     )

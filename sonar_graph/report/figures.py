@@ -1,17 +1,10 @@
-"""Figures of a comparison over time and as distributions: each a pure function, None where there is nothing to draw.
+"""Figures of a comparison: each a pure function to a matplotlib figure, None where there is nothing to draw.
 
-Estimators keep their colour in all figures. Angles are drawn in degrees. Where runs stand side by side each panel has
-its own scale, because a dead reckoning's drift would flatten everyone else's error.
-
-What the report says about how detections came from sonar images.
+Estimators keep their colour in all figures. Angles are drawn in degrees. Panels side by side have scales of their own,
+because the drift of a dead reckoning would flatten the errors of the others. Maps: `sonar_graph.report.maps`.
 """
 
 from __future__ import annotations
-
-import base64
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,24 +12,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from sonar_graph.errors import EvaluationError
-from sonar_graph.evaluation import (
-    ABSENT,
-    NONE,
-    UNJUDGED,
-    Comparison,
-    ErrorSeries,
-    Reliability,
-    RunResult,
-    confidences,
-    nis,
-    reliability_of,
-    true_identities,
-    yaw_rad,
-)
-from sonar_graph.logs import PICTURES
-from sonar_graph.measurements import Floats, Ints
-from sonar_graph.recognition import SURE, DrawnFrame
+from sonar_graph.evaluation import Comparison, Reliability, RunResult, nis, yaw_rad
+from sonar_graph.measurements import Floats
 from sonar_graph.report.figure_style import (
     INK,
     MUTED,
@@ -47,7 +24,6 @@ from sonar_graph.report.figure_style import (
     colour,
     evenly,
     head_panel,
-    inline_svg,
     legend_above,
     line_style,
     logarithmic,
@@ -55,8 +31,6 @@ from sonar_graph.report.figure_style import (
     seconds_since_start,
     thinned,
 )
-from sonar_graph.report.maps import map_figure
-from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, Outcome, Trajectory
 
 TIME_LABEL = "time since start (s)"
@@ -68,23 +42,39 @@ NEES_MEANS = 40
 """Stretches of the run over which NEES is averaged for the line among the dots."""
 COLUMN_IN = 3.1
 """Width of a panel where runs stand side by side."""
-Quantity = tuple[str, Callable[[ErrorSeries], tuple[Floats, Floats]]]
+SINGLE_IN = (7.4, 3.1)
+"""Size of a figure with one panel."""
+LARGEST_DOT, SMALLEST_DOT = 90.0, 9.0
+"""Areas in points²."""
+SMALL = 7.5
 
 
 def error_figure(comparison: Comparison) -> Figure | None:
-    """Causal error in x, y, (z) and yaw over time with the reported ±3σ: a row a quantity, a column a run."""
+    """Causal error in x, y, (z) and yaw over time with the reported ±3σ: a row for each quantity, a column a run."""
     runs = _runs_with_errors(comparison)
     if not runs:
         return None
     series = [comparison.errors[run.estimator]["causal"] for _, run in runs]
-    quantities = _quantities(max(errors.position_dof for errors in series))
-    figure, axes = blank_panels(len(quantities), len(runs), _size(len(quantities), len(runs)), sharex=True)
-    for column, (index, run) in enumerate(runs):
+    axes_count = max(errors.position_dof for errors in series)
+    labels = [*(f"error in {'xyz'[axis]} (m)" for axis in range(axes_count)), "yaw error (°)"]
+    figure, axes = blank_panels(len(labels), len(runs), _size(len(labels), len(runs)), sharex=True)
+    for column, ((index, run), errors) in enumerate(zip(runs, series, strict=True)):
         head_panel(axes[0, column], run.estimator, colour(index))
-        name_axes(axes[-1, column], TIME_LABEL)
-        for row, (label, values) in enumerate(quantities):
-            _draw_error(axes[row, column], comparison, series[column], values, colour(index))
-            name_axes(axes[row, column], TIME_LABEL if row == len(quantities) - 1 else "", "" if column else label)
+        seconds = seconds_since_start(comparison, errors.stamps_ns)
+        for row, label in enumerate(labels):
+            panel: Axes = axes[row, column]
+            if row < axes_count:
+                error, sigma = errors.position_m[:, row], errors.position_sigma_m[:, row]
+            else:
+                error, sigma = np.degrees(errors.yaw_rad), np.degrees(errors.yaw_sigma_rad)
+            if np.isfinite(sigma).any():
+                band = np.union1d(evenly(len(sigma), SERIES_POINTS // 2), thinned(sigma, SERIES_POINTS // 2))
+                low, high = -3 * sigma[band], 3 * sigma[band]
+                panel.fill_between(seconds[band], low, high, color=colour(index), alpha=0.2, linewidth=0)
+            rows = thinned(error)
+            panel.axhline(0.0, color=MUTED, linewidth=0.7)
+            panel.plot(seconds[rows], error[rows], color=colour(index), linewidth=1.1)
+            name_axes(panel, TIME_LABEL if row == axes_count else "", "" if column else label)
     return figure
 
 
@@ -93,7 +83,7 @@ def yaw_figure(comparison: Comparison) -> Figure | None:
     runs = [(i, run.causal) for i, run in enumerate(comparison.runs) if run.causal is not None and len(run.causal)]
     if not runs:
         return None
-    figure, axes = blank_panels(1, 1, (7.4, 3.1))
+    figure, axes = blank_panels(1, 1, SINGLE_IN)
     panel: Axes = axes[0, 0]
     truth = comparison.sequence.truth
     if truth is not None and len(truth):
@@ -111,7 +101,11 @@ def yaw_figure(comparison: Comparison) -> Figure | None:
 
 def nees_figure(comparison: Comparison) -> Figure | None:
     """Causal NEES of position and yaw over time per degree of freedom, with the two-sided 95 % chi-square band."""
-    runs = [(index, run) for index, run in _runs_with_errors(comparison) if _has_nees(comparison, run)]
+    runs = []
+    for index, run in _runs_with_errors(comparison):
+        errors = comparison.errors[run.estimator]["causal"]
+        if np.isfinite(errors.nees_position).any() or np.isfinite(errors.nees_yaw).any():
+            runs.append((index, run))
     if not runs:
         return None
     figure, axes = blank_panels(2, len(runs), _size(2, len(runs)), sharex=True, sharey=True)
@@ -129,16 +123,32 @@ def nees_figure(comparison: Comparison) -> Figure | None:
 
 def innovation_figure(comparison: Comparison) -> Figure | None:
     """Range and azimuth innovations over time: used detections as dots, those refused by the gate as crosses."""
-    runs = [(i, run) for i, run in enumerate(comparison.runs) if run.detections and _predicted(run.detections).any()]
+
+    def is_predicted(log: DetectionLog) -> NDArray[np.bool_]:
+        return np.asarray(np.isfinite(log.innovations).all(axis=1), dtype=np.bool_)
+
+    logs = [(i, run.estimator, run.detections) for i, run in enumerate(comparison.runs) if run.detections]
+    runs = [(index, name, log) for index, name, log in logs if is_predicted(log).any()]
     if not runs:
         return None
     figure, axes = blank_panels(2, len(runs), _size(2, len(runs)), sharex=True)
-    for column, (index, run) in enumerate(runs):
-        head_panel(axes[0, column], run.estimator, colour(index))
+    for column, (index, name, log) in enumerate(runs):
+        head_panel(axes[0, column], name, colour(index))
+        gated = np.array([outcome is Outcome.GATED for outcome in log.outcomes], dtype=bool)
+        predicted = is_predicted(log)
+        seconds = seconds_since_start(comparison, log.stamps_ns)
         for row, (label, factor) in enumerate((("range (m)", 1.0), ("azimuth (°)", np.degrees(1.0)))):
-            if run.detections is not None:
-                _draw_innovations(axes[row, column], comparison, run.detections, row, factor, colour(index))
-            name_axes(axes[row, column], TIME_LABEL if row else "", "" if column else label)
+            panel: Axes = axes[row, column]
+            for chosen, marker, shade, outcome in (
+                (predicted & ~gated, ".", colour(index), "used"),
+                (predicted & gated, "x", INK, "refused by the gate"),
+            ):
+                values = factor * log.innovations[chosen, row]
+                rows = np.union1d(evenly(len(values), SERIES_POINTS // 2), thinned(values, SERIES_POINTS // 20))
+                x, y = seconds[chosen][rows], values[rows]
+                panel.plot(x, y, marker, color=shade, markersize=3.5, linestyle="none", label=outcome)
+            panel.axhline(0.0, color=MUTED, linewidth=0.7)
+            name_axes(panel, TIME_LABEL if row else "", "" if column else label)
     legend_above(figure, axes[0, 0])
     return figure
 
@@ -149,7 +159,7 @@ def nis_figure(comparison: Comparison) -> Figure | None:
     runs = [(index, run, values) for index, run, values in known if values.size]
     if not runs:
         return None
-    figure, axes = blank_panels(1, 1, (7.4, 3.1))
+    figure, axes = blank_panels(1, 1, SINGLE_IN)
     panel: Axes = axes[0, 0]
     grid = np.geomspace(1e-2, max(30.0, *(float(values.max()) for _, _, values in runs)), 200)
     panel.plot(grid, 100 * chi2.cdf(grid, NIS_DOF), color=TRUTH, linewidth=3.2, alpha=0.6, label="χ², 2 dof: expected")
@@ -167,7 +177,7 @@ def timing_figure(comparison: Comparison) -> Figure | None:
     runs = [(index, run) for index, run in enumerate(comparison.runs) if len(run.update_s)]
     if not runs:
         return None
-    figure, axes = blank_panels(1, 1, (7.4, 3.1))
+    figure, axes = blank_panels(1, 1, SINGLE_IN)
     panel: Axes = axes[0, 0]
     for index, run in runs:
         update_ms = 1e3 * run.update_s
@@ -177,194 +187,6 @@ def timing_figure(comparison: Comparison) -> Figure | None:
     name_axes(panel, "duration of an update (ms)", "updates at most as long (%)")
     legend_above(figure, panel)
     return figure
-
-
-def write_map_png(comparison: Comparison, path: Path, dpi: int = 150) -> None:
-    """Write the map on white paper as a PNG picture, as a README shows it.
-
-    Raises
-    ------
-    EvaluationError
-        When no run has a path and there is no truth.
-    """
-    figure = map_figure(comparison)
-    if figure is None:
-        raise EvaluationError(f"{path.name}: {comparison.sequence.name} has neither a path nor a truth to draw")
-    figure.savefig(path, dpi=dpi, facecolor="white")
-
-
-def _runs_with_errors(comparison: Comparison) -> list[tuple[int, RunResult]]:
-    return [
-        (index, run)
-        for index, run in enumerate(comparison.runs)
-        if "causal" in (series := comparison.errors.get(run.estimator, {})) and len(series["causal"].stamps_ns)
-    ]
-
-
-def _size(rows: int, columns: int) -> tuple[float, float]:
-    return max(7.4, COLUMN_IN * columns), 1.75 * rows + 0.6
-
-
-def _quantities(position_dof: int) -> list[Quantity]:
-    def position(axis: int) -> Callable[[ErrorSeries], tuple[Floats, Floats]]:
-        return lambda errors: (errors.position_m[:, axis], errors.position_sigma_m[:, axis])
-
-    def yaw(errors: ErrorSeries) -> tuple[Floats, Floats]:
-        return np.degrees(errors.yaw_rad), np.degrees(errors.yaw_sigma_rad)
-
-    return [*((f"error in {'xyz'[axis]} (m)", position(axis)) for axis in range(position_dof)), ("yaw error (°)", yaw)]
-
-
-def _draw_error(
-    panel: Axes,
-    comparison: Comparison,
-    errors: ErrorSeries,
-    values: Callable[[ErrorSeries], tuple[Floats, Floats]],
-    own_colour: str,
-) -> None:
-    error, sigma = values(errors)
-    seconds = seconds_since_start(comparison, errors.stamps_ns)
-    if np.isfinite(sigma).any():
-        band = np.union1d(evenly(len(sigma), SERIES_POINTS // 2), thinned(sigma, SERIES_POINTS // 2))
-        panel.fill_between(seconds[band], -3 * sigma[band], 3 * sigma[band], color=own_colour, alpha=0.2, linewidth=0)
-    rows = thinned(error)
-    panel.axhline(0.0, color=MUTED, linewidth=0.7)
-    panel.plot(seconds[rows], error[rows], color=own_colour, linewidth=1.1)
-
-
-def _headings(comparison: Comparison, path: Trajectory) -> tuple[Floats, Floats]:
-    """Seconds and degrees, with a gap wherever the heading passes ±180°."""
-    degrees = np.degrees(yaw_rad(path.matrices))
-    rows = np.union1d(evenly(len(degrees), 2 * SERIES_POINTS), thinned(degrees))
-    seconds, degrees = seconds_since_start(comparison, path.stamps_ns)[rows], degrees[rows]
-    jumps = np.flatnonzero(np.abs(np.diff(degrees)) > 180) + 1
-    return np.insert(seconds, jumps, np.nan), np.insert(degrees, jumps, np.nan)
-
-
-def _has_nees(comparison: Comparison, run: RunResult) -> bool:
-    errors = comparison.errors[run.estimator]["causal"]
-    return bool(np.isfinite(errors.nees_position).any() or np.isfinite(errors.nees_yaw).any())
-
-
-def _draw_nees(panel: Axes, seconds: Floats, nees: Floats, dof: int, own_colour: str) -> None:
-    low, high = (float(chi2.ppf((1 + side * BAND_PROBABILITY) / 2, dof)) / dof for side in (-1, 1))
-    per_dof = nees / dof
-    known = per_dof[np.isfinite(per_dof)]
-    top = max(panel.get_ylim()[1], 10.0, 2 * float(known.max(initial=0.0)))
-    panel.set_ylim(NEES_FLOOR, top)
-    panel.axhspan(low, high, color=TRUTH, alpha=0.25, linewidth=0)
-    panel.axhline(1.0, color=MUTED, linewidth=0.7)
-    rows = evenly(len(per_dof), SERIES_POINTS // 2)
-    panel.plot(seconds[rows], np.maximum(per_dof[rows], NEES_FLOOR), ".", color=own_colour, markersize=2, alpha=0.5)
-    mean_seconds, means = _means(seconds, per_dof)
-    panel.plot(mean_seconds, means, color=own_colour, linewidth=1.6)
-    if known.size:
-        inside = 100 * float(np.mean((known >= low) & (known <= high)))
-        panel.text(0.02, 0.04, f"{inside:.0f} % in the band", transform=panel.transAxes, color=INK, fontsize=TICK_SIZE)
-
-
-def _means(seconds: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Mean time and mean value of each of `NEES_MEANS` stretches of the run in which a value is known."""
-    known = np.isfinite(values)
-    stretches = [rows for rows in np.array_split(np.flatnonzero(known), NEES_MEANS) if rows.size]
-    return np.array([seconds[rows].mean() for rows in stretches]), np.array([values[rows].mean() for rows in stretches])
-
-
-def _predicted(log: DetectionLog) -> NDArray[np.bool_]:
-    return np.asarray(np.isfinite(log.innovations).all(axis=1), dtype=np.bool_)
-
-
-def _draw_innovations(
-    panel: Axes, comparison: Comparison, log: DetectionLog, component: int, factor: float, own_colour: str
-) -> None:
-    gated = np.array([outcome is Outcome.GATED for outcome in log.outcomes], dtype=bool)
-    predicted = _predicted(log)
-    seconds = seconds_since_start(comparison, log.stamps_ns)
-    for chosen, marker, shade, label in (
-        (predicted & ~gated, ".", own_colour, "used"),
-        (predicted & gated, "x", INK, "refused by the gate"),
-    ):
-        values = factor * log.innovations[chosen, component]
-        rows = np.union1d(evenly(len(values), SERIES_POINTS // 2), thinned(values, SERIES_POINTS // 20))
-        x, y = seconds[chosen][rows], values[rows]
-        panel.plot(x, y, marker, color=shade, markersize=3.5, linestyle="none", label=label)
-    panel.axhline(0.0, color=MUTED, linewidth=0.7)
-
-
-def _draw_distribution(panel: Axes, values: Floats, index: int, label: str) -> None:
-    ordered = np.sort(values)
-    rows = evenly(len(ordered), SERIES_POINTS // 2)
-    share = 100 * (rows + 1) / len(ordered)
-    style = line_style(index)
-    panel.plot(ordered[rows], share, color=colour(index), linestyle=style, linewidth=1.5, label=label)
-
-
-LARGEST_DOT, SMALLEST_DOT = 90.0, 9.0
-"""Areas in points²."""
-SMALL = 7.5
-
-
-def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
-    """Pictures, outcomes, warnings and the reliability of posteriors; None where nothing was recognised here."""
-    found = comparison.recognition
-    if found is None:
-        return None
-    start_ns = comparison.sequence.start_ns
-    judged = reliability_of(comparison.sequence)
-    return {
-        "frames": found.frames,
-        "detections": 0 if comparison.sequence.detections is None else len(comparison.sequence.detections),
-        "named": _named(comparison.sequence),
-        "sure": SURE,
-        "topic": PICTURES,
-        "pictures": [_picture(picture, start_ns) for picture in found.shown()],
-        "outcomes": dict(found.outcomes.most_common()),
-        "warnings": [(f"{(stamp_ns - start_ns) * 1e-9:.2f}", reason) for stamp_ns, reason in found.warnings],
-        "expected_error": None if judged is None else f"{judged.expected_error:.3f}",
-        "reliability": "" if judged is None else _drawn(judged),
-    }
-
-
-def _named(sequence: Sequence) -> dict[str, list[str]]:
-    """By what a detection truly is: how many were named rightly, named wrongly, and taken for no landmark."""
-    if sequence.detections is None or sequence.truth is None or sequence.true_landmarks is None:
-        return {}
-    labels = true_identities(sequence, sequence.detections)
-    _, named = confidences(sequence.detections)
-    rows = {}
-    for identity in sequence.true_landmarks.ids.tolist():
-        seen = labels == identity
-        right = int((seen & (named == identity)).sum())
-        rows[f"landmark {identity}"] = [str(right), *_others(seen & (named != identity), named)]
-    rows["no landmark"] = [ABSENT, *_others(labels == NONE, named)]
-    if np.any(labels == UNJUDGED):
-        rows["cannot be told"] = [ABSENT, *_others(labels == UNJUDGED, named)]
-    return rows
-
-
-def _others(chosen: NDArray[np.bool_], named: Ints) -> list[str]:
-    """Of chosen detections how many are named at all, and how many are not."""
-    return [str(int((chosen & (named != NONE)).sum())), str(int((chosen & (named == NONE)).sum()))]
-
-
-def _picture(picture: DrawnFrame, start_ns: int) -> dict[str, str]:
-    """A picture as the page shows it: within the page itself."""
-    named = ", ".join(
-        f"ID {landmark} ({probability:.2f})"
-        for landmark, probability in zip(picture.landmark_ids, picture.probabilities, strict=True)
-    )
-    return {
-        "address": "data:image/jpeg;base64," + base64.b64encode(picture.jpeg).decode("ascii"),
-        "caption": f"T = {(picture.stamp_ns - start_ns) * 1e-9:.1f} s: {named}",
-    }
-
-
-def _drawn(judged: Reliability) -> str:
-    description = (
-        f"Reliability of identity posteriors: expected calibration error {judged.expected_error:.3f} over "
-        f"{judged.count.sum()} detections."
-    )
-    return inline_svg(reliability_figure(judged), "reliability", description)
 
 
 def reliability_figure(judged: Reliability) -> Figure:
@@ -386,3 +208,50 @@ def reliability_figure(judged: Reliability) -> Figure:
     counts.set_ylim(0, 1.25 * max(int(judged.count.max()), 1))
     name_axes(counts, "posterior of the most probable class", "detections")
     return figure
+
+
+def _runs_with_errors(comparison: Comparison) -> list[tuple[int, RunResult]]:
+    return [
+        (index, run)
+        for index, run in enumerate(comparison.runs)
+        if "causal" in (series := comparison.errors.get(run.estimator, {})) and len(series["causal"].stamps_ns)
+    ]
+
+
+def _size(rows: int, columns: int) -> tuple[float, float]:
+    return max(7.4, COLUMN_IN * columns), 1.75 * rows + 0.6
+
+
+def _headings(comparison: Comparison, path: Trajectory) -> tuple[Floats, Floats]:
+    """Seconds and degrees, with a gap wherever the heading passes ±180°."""
+    degrees = np.degrees(yaw_rad(path.matrices))
+    rows = np.union1d(evenly(len(degrees), 2 * SERIES_POINTS), thinned(degrees))
+    seconds, degrees = seconds_since_start(comparison, path.stamps_ns)[rows], degrees[rows]
+    jumps = np.flatnonzero(np.abs(np.diff(degrees)) > 180) + 1
+    return np.insert(seconds, jumps, np.nan), np.insert(degrees, jumps, np.nan)
+
+
+def _draw_nees(panel: Axes, seconds: Floats, nees: Floats, dof: int, own_colour: str) -> None:
+    low, high = (float(chi2.ppf((1 + side * BAND_PROBABILITY) / 2, dof)) / dof for side in (-1, 1))
+    per_dof = nees / dof
+    known = per_dof[np.isfinite(per_dof)]
+    top = max(panel.get_ylim()[1], 10.0, 2 * float(known.max(initial=0.0)))
+    panel.set_ylim(NEES_FLOOR, top)
+    panel.axhspan(low, high, color=TRUTH, alpha=0.25, linewidth=0)
+    panel.axhline(1.0, color=MUTED, linewidth=0.7)
+    rows = evenly(len(per_dof), SERIES_POINTS // 2)
+    panel.plot(seconds[rows], np.maximum(per_dof[rows], NEES_FLOOR), ".", color=own_colour, markersize=2, alpha=0.5)
+    stretches = [rows for rows in np.array_split(np.flatnonzero(np.isfinite(per_dof)), NEES_MEANS) if rows.size]
+    middles, means = ([values[rows].mean() for rows in stretches] for values in (seconds, per_dof))
+    panel.plot(middles, means, color=own_colour, linewidth=1.6)
+    if known.size:
+        inside = 100 * float(np.mean((known >= low) & (known <= high)))
+        panel.text(0.02, 0.04, f"{inside:.0f} % in the band", transform=panel.transAxes, color=INK, fontsize=TICK_SIZE)
+
+
+def _draw_distribution(panel: Axes, values: Floats, index: int, label: str) -> None:
+    ordered = np.sort(values)
+    rows = evenly(len(ordered), SERIES_POINTS // 2)
+    share = 100 * (rows + 1) / len(ordered)
+    style = line_style(index)
+    panel.plot(ordered[rows], share, color=colour(index), linestyle=style, linewidth=1.5, label=label)

@@ -1,7 +1,7 @@
 """Landmarks in rows, as in Table I of the 2014 paper: true and estimated x and y, the difference in brackets.
 
-Where a run repeats the published experiment the paper's own table stands beside it, and two rows tell how far from its
-first position the last one is.
+Where a run repeats the published experiment, the paper's own table stands beside it, and two rows give the displacement
+from the first to the last position.
 """
 
 from __future__ import annotations
@@ -13,153 +13,129 @@ import numpy as np
 from sonar_graph.evaluation import (
     ABSENT,
     RETURN_M,
+    Column,
     Comparison,
+    Table,
     anonymous_named,
+    fixed,
     landmark_errors,
     published_maps,
     repeats_published,
     rmse,
+    words,
 )
 from sonar_graph.measurements import Floats
 from sonar_graph.states import LandmarkMap, Trajectory
 
 PAPER = "2014 paper"
 MOST_LANDMARKS = 30
-"""Rows of more landmarks than a page should hold are left to ``landmarks.csv``."""
+"""Largest number of landmarks in rows; others are left to ``landmarks.csv``."""
 DECIMALS, PAPER_DECIMALS, PAPER_RETURN_DECIMALS = 3, 2, 4
 
 
 @dataclass(frozen=True)
-class LandmarkRow:
-    """One quantity in metres: of the truth and of each column."""
-
-    label: str
-    true: str
-    cells: list[str]
-
-
-@dataclass(frozen=True)
-class LandmarkTable:
-    """Landmarks, and below them what they come to."""
-
-    columns: list[str]
-    """Runs that have a map; at the end the paper, where its experiment is repeated."""
-    has_truth: bool
-    positions: list[LandmarkRow]
-    totals: list[LandmarkRow]
-    left_out: int
-    """Landmarks for which there is no row."""
-
-    def has_map(self, column: int) -> bool:
-        """Whether a column holds any position."""
-        return any(row.cells[column] != ABSENT for row in self.positions)
-
-
-@dataclass(frozen=True)
-class _Column:
-    """What one column is made from."""
+class MapColumn:
+    """The source of one column of the table: a run, or the paper."""
 
     landmarks: LandmarkMap | None
-    path: Trajectory | None
+    path: Trajectory | None = None
     """None for the paper, whose path is not published."""
-    decimals: int
+    decimals: int = DECIMALS
+
+    def coordinate(self, identity: int, axis: int) -> float | None:
+        """The estimated x or y of a landmark; None where it is not in the map."""
+        return None if self.landmarks is None else coordinate(self.landmarks, identity, axis)
 
 
-def landmark_table(comparison: Comparison) -> LandmarkTable | None:
-    """The final maps of the runs against the true one, not aligned; None where no run has mapped a landmark."""
-    columns = _columns(comparison)
-    known = [column.landmarks for column in columns.values() if column.landmarks is not None]
-    if not known:
-        return None
-    true, shown = comparison.sequence.true_landmarks, list(columns.values())
-    ids = np.unique(np.concatenate([landmarks.ids for landmarks in ([true] if true is not None else known)])).tolist()
-    return LandmarkTable(
-        columns=list(columns),
-        has_truth=true is not None,
-        positions=[_position_row(id_, axis, true, shown) for id_ in ids[:MOST_LANDMARKS] for axis in (0, 1)],
-        totals=_totals(comparison, true, shown),
-        left_out=max(0, len(ids) - MOST_LANDMARKS),
-    )
+def coordinate(landmarks: LandmarkMap, identity: int, axis: int) -> float | None:
+    """The x or y of a landmark; None where it is not in the map."""
+    rows = np.flatnonzero(landmarks.ids == identity)
+    return float(landmarks.positions[rows[0], axis]) if rows.size else None
 
 
-def _columns(comparison: Comparison) -> dict[str, _Column]:
-    """Runs with a map; where the published experiment is repeated all that have a path, and the paper."""
+def landmark_table(comparison: Comparison) -> Table | None:
+    """The final maps of the runs against the true one, not aligned; None where no run has mapped a landmark.
+
+    Columns: quantity, true value (where the true landmarks are known), each run with a map, and the paper where its
+    experiment is repeated (then also runs with a path only). Rows: x and y of each landmark; below a section heading
+    the RMS errors and the displacement.
+    """
     runs, true = comparison.runs, comparison.sequence.true_landmarks
+    repeats = repeats_published(comparison.sequence)
     mapped = {
         run.estimator: anonymous_named(run.landmarks, true)
         for run in runs
         if run.landmarks is not None and len(run.landmarks)
     }
-    if not repeats_published(comparison.sequence):
-        return {name: _Column(landmarks, None, DECIMALS) for name, landmarks in mapped.items()}
-    walked = {run.estimator: run.causal for run in runs if run.causal is not None and len(run.causal)}
-    columns = {name: _Column(mapped.get(name), path, DECIMALS) for name, path in walked.items()}
-    return columns | {PAPER: _Column(published_maps()[0], None, PAPER_DECIMALS)}
-
-
-def _position_row(identity: int, axis: int, true: LandmarkMap | None, columns: list[_Column]) -> LandmarkRow:
-    at = None if true is None else _coordinate(true, identity, axis)
-    cells = [_with_difference(_coordinate(column.landmarks, identity, axis), at, column.decimals) for column in columns]
-    return LandmarkRow(f"ID {identity}, {'xy'[axis]}", ABSENT if at is None else _metres(at, DECIMALS), cells)
-
-
-def _coordinate(landmarks: LandmarkMap | None, identity: int, axis: int) -> float | None:
-    if landmarks is None:
+    columns = {name: MapColumn(landmarks) for name, landmarks in mapped.items()}
+    if repeats:
+        walked = {run.estimator: run.causal for run in runs if run.causal is not None and len(run.causal)}
+        columns = {name: MapColumn(mapped.get(name), path) for name, path in walked.items()}
+        columns[PAPER] = MapColumn(published_maps()[0], decimals=PAPER_DECIMALS)
+    known = [column.landmarks for column in columns.values() if column.landmarks is not None]
+    if not known:
         return None
-    rows = np.flatnonzero(landmarks.ids == identity)
-    return float(landmarks.positions[rows[0], axis]) if rows.size else None
-
-
-def _totals(comparison: Comparison, true: LandmarkMap | None, columns: list[_Column]) -> list[LandmarkRow]:
+    rows: list[list[str]] = []
+    for id_ in mapped_ids(comparison, known)[:MOST_LANDMARKS]:
+        for axis in (0, 1):
+            at = None if true is None else coordinate(true, id_, axis)
+            cells = [_with_difference(column.coordinate(id_, axis), at, column.decimals) for column in columns.values()]
+            rows.append([f"ID {id_}, {'xy'[axis]}", _with_difference(at, None, DECIMALS), *cells])
+    sections = {}
+    if true is not None:
+        sections[len(rows)] = "In all"
+        errors = [None if one.landmarks is None else landmark_errors(one.landmarks, true) for one in columns.values()]
+        raw = [fixed(rmse(e.horizontal_m), DECIMALS) if e else ABSENT for e in errors]
+        aligned = [ABSENT if not e or np.isnan(e.aligned_rmse_m) else fixed(e.aligned_rmse_m, DECIMALS) for e in errors]
+        rows += [["RMS, not aligned", "", *raw], ["RMS after SE(2) alignment", "", *aligned]]
+        if repeats:
+            rows += _return_rows(comparison.sequence.truth, [column.path for column in columns.values()])
+    heads = [Column("quantity", "Quantity", is_number=False), Column("true", "true")]
+    heads += [Column(name, name) for name in columns]
     if true is None:
-        return []
-    errors = [None if column.landmarks is None else landmark_errors(column.landmarks, true) for column in columns]
-    raw = [_rms(rmse(e.horizontal_m)) if e else ABSENT for e in errors]
-    aligned = [_rms(e.aligned_rmse_m) if e else ABSENT for e in errors]
-    rows = [LandmarkRow("RMS, not aligned", "", raw), LandmarkRow("RMS after SE(2) alignment", "", aligned)]
-    return [*rows, *_return_rows(comparison, columns)] if repeats_published(comparison.sequence) else rows
+        heads, rows = [heads[0], *heads[2:]], [[row[0], *row[2:]] for row in rows]
+    caption = "Positions in the map at the end, metres" + ("" if true is None else "; in brackets estimate minus truth")
+    return Table("landmarks", caption, "", heads, [[words(text) for text in row] for row in rows], sections)
 
 
-def _return_rows(comparison: Comparison, columns: list[_Column]) -> list[LandmarkRow]:
-    """Last minus first position of the causal estimates, and of the truth at the same instants."""
-    truth = comparison.sequence.truth
-    paths = [column.path for column in columns]
-    ways = [None if path is None else _way(path) for path in paths]
-    true_ways = [None if truth is None or path is None else _way(_ends_along(truth, path)) for path in paths]
+def mapped_ids(comparison: Comparison, maps: list[LandmarkMap]) -> list[int]:
+    """Identities of the true landmarks; where these are not known, of the maps."""
+    true = comparison.sequence.true_landmarks
+    return np.unique(np.concatenate([landmarks.ids for landmarks in ([true] if true is not None else maps)])).tolist()
+
+
+def landmarks_left_out(comparison: Comparison) -> int:
+    """Number of landmarks for which the table has no row."""
+    maps = [run.landmarks for run in comparison.runs if run.landmarks is not None]
+    return max(0, len(mapped_ids(comparison, maps)) - MOST_LANDMARKS) if maps else 0
+
+
+def _return_rows(truth: Trajectory | None, paths: list[Trajectory | None]) -> list[list[str]]:
+    """Last minus first position of the causal estimates, and of the truth at the same instants or nearest to them."""
+
+    def displacement(path: Trajectory) -> Floats:
+        return np.asarray(path.positions[-1] - path.positions[0])
+
     rows = []
     for axis in (0, 1):
-        at = [None if way is None else float(way[axis]) for way in true_ways]
-        cells = [
-            _metres(RETURN_M[axis], PAPER_RETURN_DECIMALS)
-            if way is None
-            else _with_difference(float(way[axis]), true, DECIMALS)
-            for way, true in zip(ways, at, strict=True)
-        ]
-        label = f"last minus first position, {'xy'[axis]}"
-        rows.append(LandmarkRow(label, ABSENT if at[0] is None else _metres(at[0], DECIMALS), cells))
+        first, cells = ABSENT, []
+        for place, path in enumerate(paths):
+            if path is None:
+                cells.append(fixed(RETURN_M[axis], PAPER_RETURN_DECIMALS))
+                continue
+            at = None
+            if truth is not None:
+                ends_ns = np.clip(path.stamps_ns[[0, -1]], truth.stamps_ns[0], truth.stamps_ns[-1])
+                at = float(displacement(truth.at(ends_ns))[axis])
+            cells.append(_with_difference(float(displacement(path)[axis]), at, DECIMALS))
+            first = _with_difference(at, None, DECIMALS) if place == 0 else first
+        rows.append([f"last minus first position, {'xy'[axis]}", first, *cells])
     return rows
 
 
-def _ends_along(truth: Trajectory, path: Trajectory) -> Trajectory:
-    """The truth at a path's first and last instant, or as near to them as it reaches."""
-    return truth.at(np.clip(path.stamps_ns[[0, -1]], truth.stamps_ns[0], truth.stamps_ns[-1]))
-
-
-def _way(path: Trajectory) -> Floats:
-    return np.asarray(path.positions[-1] - path.positions[0])
-
-
 def _with_difference(value: float | None, true: float | None, decimals: int) -> str:
+    """A coordinate in metres, and in brackets its difference to the true one."""
     if value is None:
         return ABSENT
-    shown = _metres(value, decimals)
-    return shown if true is None else f"{shown} ({_metres(value - true, decimals)})"
-
-
-def _rms(value: float) -> str:
-    return ABSENT if np.isnan(value) else _metres(value, DECIMALS)
-
-
-def _metres(value: float, decimals: int) -> str:
-    text = f"{value:.{decimals}f}"
-    return (text[1:] if float(text) == 0 and text.startswith("-") else text).replace("-", "\N{MINUS SIGN}")
+    shown = fixed(value, decimals)
+    return shown if true is None else f"{shown} ({fixed(value - true, decimals)})"

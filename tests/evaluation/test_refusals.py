@@ -20,9 +20,9 @@ from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.storage import read_comparison, write_comparison
 from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import Dvl, Measurements
+from sonar_graph.report.comparison_page import render_report
 from sonar_graph.report.console import summary
-from sonar_graph.report.page import render_report
-from sonar_graph.report.warnings import refusal_lines
+from sonar_graph.report.findings import refusal_lines
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Estimate, Refusal, RefusedRow
 from tests.synthetic import basin_comparison, with_run

@@ -17,8 +17,8 @@ from sonar_graph.evaluation.results import MOST_ROWS_NAMED, Comparison
 from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.storage import read_comparison, write_comparison
 from sonar_graph.measurements import Measurements
-from sonar_graph.report.page import render_report
-from sonar_graph.report.warnings import withheld_lines
+from sonar_graph.report.comparison_page import render_report
+from sonar_graph.report.findings import withheld_lines
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam.landmarks.sighting import SightingFactors

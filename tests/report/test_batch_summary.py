@@ -11,10 +11,11 @@ import pytest
 from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
 from sonar_graph.batch.result_table import metrics_of
 from sonar_graph.batch.statistics import paired, quantile_error
+from sonar_graph.evaluation.digits import quantile_text
+from sonar_graph.evaluation.tables import Cell, Table
 from sonar_graph.report.batch_summary import DIFFERENT, HIGHER, LOWER, head_metric, headlines, mark_of, overview_table
 from sonar_graph.report.batch_tables import accuracy_table, all_tests
-from sonar_graph.report.tables import Cell, Table, as_csv, as_latex
-from sonar_graph.report.wording import quantile_text
+from sonar_graph.report.table_files import as_csv, as_latex
 from tests.recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, with_failures
 
 ATE = metrics_of(["causal.ate_se2_m"])[0]
@@ -25,7 +26,9 @@ def overview_of(batch: RecordedBatch) -> Table:
 
 
 def cell_of(table: Table, log: str, over: str, contestant: str) -> Cell:
-    place = next(i for i, c in enumerate(table.columns) if (c.over, c.contestant) == (over, contestant))
+    place = next(
+        i for i, c in enumerate(table.columns) if (c.over, c.heading.removesuffix(" (reference)")) == (over, contestant)
+    )
     return next(row[place] for row in table.rows if row[0].text == log)
 
 
@@ -73,7 +76,7 @@ def test_the_mark_is_of_the_median_and_only_below_five_percent(median, mark):
 
 def test_a_filter_has_no_smoothed_column_and_the_reference_is_named():
     table = overview_of(without_smoothing(drawn_batch(), "ekf-slam"))
-    smoothed = [column.contestant for column in table.columns if column.over == "Smoothed"]
+    smoothed = [column.heading.removesuffix(" (reference)") for column in table.columns if column.over == "Smoothed"]
     assert smoothed == ["dead-reckoning", "isam2"]
     assert next(column.heading for column in table.columns if column.over == "Causal") == "dead-reckoning (reference)"
 

@@ -11,6 +11,8 @@ import pytest
 from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch
 from sonar_graph.batch.result_table import KINDS, Metric, metrics_of
 from sonar_graph.batch.statistics import paired, quantile_error
+from sonar_graph.evaluation.digits import quantile_text
+from sonar_graph.evaluation.tables import Cell, Column, Table
 from sonar_graph.report.batch_figures import consistency_drawing, difference_drawing
 from sonar_graph.report.batch_summary import (
     errors_told,
@@ -31,8 +33,7 @@ from sonar_graph.report.batch_tables import (
     p_text,
     run_lists,
 )
-from sonar_graph.report.tables import Cell, Column, Table, as_csv, as_latex, latex_text, write_tables
-from sonar_graph.report.wording import quantile_text
+from sonar_graph.report.table_files import as_csv, as_latex, latex_text, write_tables
 from tests.recorded_batches import LOGS, METRICS, changed, drawn_batch, with_failures
 
 ATE = metrics_of(["causal.ate_se2_m"])[0]

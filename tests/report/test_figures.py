@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -13,7 +12,6 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.results import Comparison, RunResult
 from sonar_graph.report.figure_style import colour, evenly, inline_svg, thinned
 from sonar_graph.report.figures import (
@@ -22,7 +20,6 @@ from sonar_graph.report.figures import (
     nees_figure,
     nis_figure,
     timing_figure,
-    write_map_png,
     yaw_figure,
 )
 from sonar_graph.report.maps import map_figure, paths_cut_off
@@ -170,17 +167,6 @@ def test_without_truth_only_the_figures_of_errors_are_missing():
 def test_nothing_to_draw_is_no_figure(comparison, draw):
     empty = replace(only(comparison), sequence=replace(comparison.sequence, truth=None, true_landmarks=None))
     assert draw(empty) is None
-
-
-def test_the_map_is_written_as_a_picture(comparison, tmp_path: Path):
-    write_map_png(comparison, tmp_path / "map.png", dpi=40)
-    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_map_of_nothing_is_refused_by_name(comparison, tmp_path: Path):
-    empty = replace(only(comparison), sequence=replace(comparison.sequence, truth=None))
-    with pytest.raises(EvaluationError, match=r"map\.png: basin-three-laps has neither"):
-        write_map_png(empty, tmp_path / "map.png")
 
 
 @pytest.mark.parametrize("draw", FIGURES)

@@ -9,8 +9,8 @@ from scipy.stats import chi2
 
 from sonar_graph.evaluation.results import Comparison, MapSoFar
 from sonar_graph.evaluation.scored_instants import map_instants, published_maps
-from sonar_graph.report.maps import LARGEST_ELLIPSE, enlargement, growth_figure, growth_instants, seen_from_above
-from sonar_graph.report.page import illustrations
+from sonar_graph.report.comparison_page import illustrations
+from sonar_graph.report.maps import LARGEST_ELLIPSE, enlargement, growth_figure, map_view
 from sonar_graph.states import LandmarkMap
 from tests.synthetic import basin_comparison, with_failure
 
@@ -39,7 +39,7 @@ def test_each_panel_shows_what_was_known_then():
     figure = growth_figure(comparison)
     assert figure is not None
     panels = np.array(figure.axes).reshape(2, 3)
-    stamps = growth_instants(comparison)
+    stamps = sorted({known.stamp_ns for run in comparison.runs for known in run.maps})
     for row, run in enumerate(comparison.runs[:2]):
         for column, (panel, stamp_ns) in enumerate(zip(panels[row], stamps, strict=True)):
             lines = {line.get_label(): line for line in panel.get_lines()}
@@ -64,7 +64,7 @@ def test_ellipses_are_as_large_as_the_caption_says():
 @pytest.mark.parametrize("sigma_m", [1e-4, 0.01, 0.1, 3.0])
 def test_ellipses_are_enlarged_only_as_far_as_there_is_room(sigma_m: float):
     comparison = grown(60, sigma_m)
-    view, factor = seen_from_above(comparison), enlargement(comparison)
+    view, factor = map_view(comparison), enlargement(comparison)
     assert view is not None
     half_m = factor * sigma_m * np.sqrt(chi2.ppf(0.95, 2))
     assert factor == 1 or half_m <= LARGEST_ELLIPSE * float((view[1] - view[0]).max())

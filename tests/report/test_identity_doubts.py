@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation.results import ABSENT, Comparison, RunResult
+from sonar_graph.evaluation.digits import ABSENT
+from sonar_graph.evaluation.results import Comparison, RunResult
 from sonar_graph.evaluation.scores import landmark_scores
+from sonar_graph.report.comparison_page import render_report
+from sonar_graph.report.findings import ABSURD, doubt_of_identities, nameless_landmarks
 from sonar_graph.report.landmark_table import landmark_table
-from sonar_graph.report.page import render_report
-from sonar_graph.report.warnings import ABSURD, doubt_of_identities, nameless_landmarks
 from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionLog, LandmarkMap, Outcome
 from tests.synthetic import IDS, LANDMARKS, basin_comparison, only, with_run
 
@@ -156,7 +157,7 @@ def test_landmarks_without_a_name_are_counted_and_scored_by_place() -> None:
     assert sentence in render_report(nameless)
     table = landmark_table(nameless)
     assert table is not None
-    assert [row.cells[0] != ABSENT for row in table.positions[::2]] == [True, True, False, True]
+    assert [row[2].text != ABSENT for row in table.rows[:8:2]] == [True, True, False, True]
     scores = landmark_scores(nameless.runs[0].landmarks, nameless.sequence.true_landmarks)
     assert scores["landmarks.raw_m"].value == pytest.approx(np.sqrt((0.01**2 + 0.02**2 + 0.01**2) / 3))
     assert "3 landmarks matched by identity, 3 of them by place within 1 m" in scores["landmarks.raw_m"].protocol

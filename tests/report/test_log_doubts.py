@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from sonar_graph.report.warnings import SAID_NOTES, doubt_lines, warning_lines
+from sonar_graph.report.findings import SAID_NOTES, doubt_lines, warning_lines
 
 
 def test_every_doubt_is_a_line_and_nothing_else_is() -> None:

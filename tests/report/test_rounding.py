@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.report.wording import between, decimals_of, fixed, quantile_text, supported, with_error
+from sonar_graph.evaluation.digits import between, decimals_of, fixed, quantile_text, supported, with_error
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.evaluation.results import Score, format_value
+from sonar_graph.evaluation.digits import format_value
+from sonar_graph.evaluation.results import Score
 from sonar_graph.evaluation.scores import detection_scores
-from sonar_graph.report.wording import NO_DETECTIONS, consistency, display_value, finding, lost_runs, with_unit
+from sonar_graph.report.findings import NO_DETECTIONS, finding, lost_runs
 from sonar_graph.states import DetectionLog, Outcome
 from tests.synthetic import basin_comparison, only, with_failure, with_run, with_score
 
@@ -60,8 +61,8 @@ def test_a_shown_number_is_within_half_a_percent(value):
 
 def test_radians_are_shown_as_degrees():
     score = Score(math.pi / 2, "rad", "By hand.")
-    assert display_value(score) == "90"
-    assert with_unit(score) == "90°"
+    assert score.text() == "90"
+    assert score.with_unit == "90°"
 
 
 def test_finding_names_the_smaller_error_and_by_how_much():
@@ -100,19 +101,19 @@ def test_finding_says_why_there_is_none():
 
 
 def test_consistency_follows_the_interval_and_without_one_a_factor_of_two():
-    assert [consistency(Score(v, "1", "", better="inside")) for v in (0.49, 0.51, 1.99, 2.01)] == [
+    assert [Score(v, "1", "", better="inside").verdict for v in (0.49, 0.51, 1.99, 2.01)] == [
         "over-cautious",
         "",
         "",
         "over-confident",
     ]
     bounds = (0.9, 1.1)
-    assert [consistency(Score(v, "1", "", bounds, "inside")) for v in (0.8, 1.0, 1.2)] == [
+    assert [Score(v, "1", "", bounds, "inside").verdict for v in (0.8, 1.0, 1.2)] == [
         "over-cautious",
         "consistent",
         "over-confident",
     ]
-    assert consistency(Score(40.0, "m", "")) == ""
+    assert Score(40.0, "m", "").verdict == ""
 
 
 def test_finding_tells_the_nees_furthest_from_one():
@@ -150,7 +151,7 @@ def test_an_estimator_that_refuses_a_fifth_of_the_detections_is_called_lost(gate
     sentences = finding(replace(comparison, runs=runs))
     told = [sentence for sentence in sentences if sentence.startswith(f"ekf-slam refused {gated} of 100")]
     assert bool(told) == is_told
-    assert consistency(detection_scores(log)["detections.nis"]) == ("" if is_told else "over-cautious")
+    assert detection_scores(log)["detections.nis"].verdict == ("" if is_told else "over-cautious")
 
 
 def test_without_truth_innovations_tell_whether_covariances_hold():

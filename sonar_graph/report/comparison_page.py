@@ -1,0 +1,400 @@
+"""The report of a comparison: one HTML page that needs nothing but itself, beside the files it links to.
+
+Layout and explanations: ``templates/comparison.html``. Design: docs/design/0008.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sonar_graph.evaluation import (
+    ABSENT,
+    DURATION_S,
+    MAP_TIMES_S,
+    NONE,
+    TOLERATED_FACTOR,
+    UNJUDGED,
+    Column,
+    Comparison,
+    Table,
+    confidences,
+    format_value,
+    reliability_of,
+    repeats_published,
+    run_columns,
+    score_keys,
+    score_table,
+    text_table,
+    true_identities,
+    words,
+    write_comparison,
+    write_viewer_files,
+)
+from sonar_graph.files import replacing
+from sonar_graph.logs import PICTURES
+from sonar_graph.recognition import SURE
+from sonar_graph.report.figure_style import Illustration, inline_svg
+from sonar_graph.report.figures import (
+    error_figure,
+    innovation_figure,
+    nees_figure,
+    nis_figure,
+    reliability_figure,
+    timing_figure,
+    yaw_figure,
+)
+from sonar_graph.report.findings import (
+    doubt_of_identities,
+    finding,
+    nameless_landmarks,
+    refused_by,
+    warning_lines,
+    withheld_lines,
+)
+from sonar_graph.report.html_page import data_address, render
+from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
+from sonar_graph.report.maps import enlargement, growth_figure, map_figure, paths_cut_off
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import Outcome
+
+PAGE, TEMPLATE = "report.html", "comparison.html"
+RUN_FILES = {
+    "trajectory.tum": "smoothed",
+    "causal.tum": "causal",
+    "landmarks.csv": "landmarks",
+    "result.json": "params",
+}
+"""Files of a run, and the field of `RunResult` without which a file is absent."""
+
+
+def write_report(comparison: Comparison, folder: str | Path) -> Path:
+    """Write a comparison into a folder: all the files that ``sonar-graph compare`` writes.
+
+    The folder is made where it does not exist. It gets ``report.html``, ``comparison.json``, ``sequence.npz``,
+    ``runs/NAME/`` for each estimator, the pictures of recognised landmarks, and ``result.mcap`` with its layouts for
+    Foxglove and RViz. An earlier comparison in the folder is replaced; other files stay.
+
+    Parameters
+    ----------
+    comparison
+        Result of `sonar_graph.evaluation.compare`.
+    folder
+        Path of the folder.
+
+    Returns
+    -------
+    Path of ``report.html``.
+
+    Raises
+    ------
+    EvaluationError
+        When the name of an estimator cannot be the name of a folder.
+    LogError
+        When ``result.mcap`` cannot be written, or a stamp does not fit into a ROS 2 message.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from sonar_graph.evaluation import compare
+    >>> from sonar_graph.report import write_report
+    >>> from sonar_graph.simulation import MissionOptions, simulate_mission
+    >>> comparison = compare(simulate_mission(MissionOptions(duration_s=10.0)), ["dead-reckoning"])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_report(comparison, folder).name
+    'report.html'
+    """
+    folder = Path(folder)
+    write_comparison(comparison, folder)
+    write_viewer_files(comparison, folder)
+    return write_page(comparison, folder)
+
+
+def write_page(comparison: Comparison, folder: Path) -> Path:
+    """Write only ``report.html``, beside the other files of a comparison, and return its path.
+
+    The page needs nothing but itself: figures are inline SVG in the page's colours, style is inline, there is no
+    script. Links lead to the files beside it (``comparison.json``, ``result.mcap``, ``runs/NAME/``).
+    """
+    with replacing(folder / PAGE) as partial:
+        partial.write_text(render_report(comparison), encoding="utf-8")
+    return folder / PAGE
+
+
+def render_report(comparison: Comparison) -> str:
+    """The page as text."""
+    sequence, runs = comparison.sequence, comparison.runs
+    is_repeated, failed = repeats_published(sequence), comparison.failed_runs
+    detections = len(sequence.detections) if sequence.detections else 0
+    content = {
+        "name": sequence.name,
+        "names": [run.estimator for run in runs],
+        "summary": (
+            f"{format_value(round(sequence.duration_s, 1))} s of "
+            f"{'planar' if sequence.calibration.planar else 'three-dimensional'} motion "
+            f"{'without' if sequence.truth is None else 'with'} ground truth, "
+            f"{_counted(detections, 'landmark detection')}, {len(comparison.instants_ns)} instants, "
+            f"{_counted(len(runs), 'estimator')}."
+        ),
+        "finding": finding(comparison),
+        "doubts": [*doubt_of_identities(comparison), *withheld_lines(comparison), *warning_lines(sequence.notes)],
+        "failed": text_table(
+            "failed",
+            "Runs that did not come to an end",
+            ["Estimator", "Reason"],
+            [[run.estimator, run.reason] for run in failed],
+            numbers=False,
+        ),
+        "scores": score_table(comparison),
+        "protocols": protocols(comparison),
+        "nees_limits": [f"{1 / TOLERATED_FACTOR:g}", f"{TOLERATED_FACTOR:g}"],
+        "figures": illustrations(comparison),
+        "landmarks": landmark_table(comparison),
+        "left_out": landmarks_left_out(comparison),
+        "has_true_landmarks": sequence.true_landmarks is not None,
+        "nameless": nameless_landmarks(comparison),
+        "paper": PAPER if is_repeated else "",
+        "outcomes": outcome_table(comparison),
+        "refused": refused_table(comparison),
+        "recognition": recognition_content(comparison),
+        "files": {
+            run.estimator: {
+                name: f"runs/{quote(run.estimator)}/{name}"
+                for name, field in RUN_FILES.items()
+                if getattr(run, field) is not None
+            }
+            for run in runs
+        },
+        "settings": {run.estimator: _as_json(run.params) for run in runs},
+        "calibration": _as_json(sequence.calibration.model_dump(mode="json")),
+        "notes": sequence.notes,
+        "environment": comparison.environment,
+    }
+    return render(TEMPLATE, content)
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def _as_json(values: Any) -> str:
+    return json.dumps(values, indent=2, default=str, ensure_ascii=False)
+
+
+def protocols(comparison: Comparison) -> dict[str, list[tuple[str, str, list[tuple[str, str]]]]]:
+    """The measuring rules by block of the score table: label, key, and each rule with the runs that it is of.
+
+    The runs are left out where one rule is of all.
+    """
+    table = score_table(comparison)
+    found: dict[str, list[tuple[str, str, list[tuple[str, str]]]]] = {}
+    for place, (key, row) in enumerate(zip(score_keys(comparison), table.rows, strict=True)):
+        if place in table.sections:
+            told = found.setdefault(table.sections[place], [])
+        rules: dict[str, list[str]] = {}
+        for name in (run.estimator for run in comparison.runs):
+            if key in (scores := comparison.scores.get(name, {})):
+                rules.setdefault(scores[key].protocol, []).append(name)
+        told.append(
+            (row[0].text, key, [("" if len(rules) == 1 else ", ".join(names), rule) for rule, names in rules.items()])
+        )
+    return found
+
+
+def outcome_table(comparison: Comparison) -> Table:
+    """Outcomes of detections, with count and share by run; a total in the last row."""
+    counts = [Counter(run.detections.outcomes) if run.detections else None for run in comparison.runs]
+    rows = []
+    for outcome in Outcome:
+        if any(count and count[outcome] for count in counts):
+            shares = [
+                ABSENT if count is None else f"{count[outcome]} ({100 * count[outcome] / max(count.total(), 1):.1f} %)"
+                for count in counts
+            ]
+            rows.append([outcome.value.capitalize(), *shares])
+    if rows:
+        rows.append(["All detections", *(ABSENT if count is None else str(count.total()) for count in counts)])
+    columns = [Column("outcome", "Outcome", is_number=False), *run_columns(comparison)]
+    cells = [[words(text) for text in row] for row in rows]
+    return Table("outcomes", "What became of each detection", "", columns, cells)
+
+
+def refused_table(comparison: Comparison) -> Table:
+    """Rows of IMU and Doppler log that were not used."""
+    start_ns = comparison.sequence.start_ns
+    columns = [
+        Column("sensor", "Sensor", is_number=False),
+        Column("rows", "Rows"),
+        Column("time", "Time (s)"),
+        Column("reason", "Reason", is_number=False),
+        Column("distance", "Squared distance"),
+        Column("estimators", "Estimators", is_number=False),
+    ]
+    rows = [
+        [row.sensor, str(row.count), row.times(start_ns), row.reason, row.distances() or ABSENT, ", ".join(names)]
+        for row, names in refused_by(comparison).items()
+    ]
+    cells = [[words(text) for text in row] for row in rows]
+    return Table("refused", "Which rows were not used, and why", "", columns, cells)
+
+
+def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
+    """Pictures, outcomes, warnings and the reliability of posteriors; None where nothing was recognised here."""
+    found, sequence = comparison.recognition, comparison.sequence
+    if found is None:
+        return None
+    start_ns, judged = sequence.start_ns, reliability_of(sequence)
+    pictures = []
+    for picture in found.shown():
+        pairs = zip(picture.landmark_ids, picture.probabilities, strict=True)
+        named = ", ".join(f"ID {landmark} ({probability:.2f})" for landmark, probability in pairs)
+        caption = f"T = {(picture.stamp_ns - start_ns) * 1e-9:.1f} s: {named}"
+        pictures.append({"address": data_address(picture.jpeg, "image/jpeg"), "caption": caption})
+    reliability = ""
+    if judged is not None:
+        description = (
+            f"Reliability of identity posteriors: expected calibration error {judged.expected_error:.3f} over "
+            f"{judged.count.sum()} detections."
+        )
+        reliability = inline_svg(reliability_figure(judged), "reliability", description)
+    return {
+        "frames": found.frames,
+        "detections": 0 if sequence.detections is None else len(sequence.detections),
+        "named": naming_table(sequence),
+        "sure": SURE,
+        "topic": PICTURES,
+        "pictures": pictures,
+        "outcomes": text_table(
+            "recognition",
+            "What became of candidates, tracks and frames",
+            ["Outcome", "Count"],
+            [[outcome, str(count)] for outcome, count in found.outcomes.most_common()],
+        ),
+        "warnings": text_table(
+            "frames",
+            "Frames that were not used, and changes of the sonar's window",
+            ["Time (s)", "Reason"],
+            [[f"{(stamp_ns - start_ns) * 1e-9:.2f}", reason] for stamp_ns, reason in found.warnings],
+            numbers=False,
+        ),
+        "expected_error": None if judged is None else f"{judged.expected_error:.3f}",
+        "reliability": reliability,
+    }
+
+
+def naming_table(sequence: Sequence) -> Table | None:
+    """Detections by their true class: named rightly, named wrongly, taken for no landmark; None without truth."""
+    if sequence.detections is None or sequence.truth is None or sequence.true_landmarks is None:
+        return None
+    labels = true_identities(sequence, sequence.detections)
+    _, named = confidences(sequence.detections)
+
+    def counted(chosen: NDArray[np.bool_]) -> list[str]:
+        return [str(int((chosen & (named != NONE)).sum())), str(int((chosen & (named == NONE)).sum()))]
+
+    rows = []
+    for identity in sequence.true_landmarks.ids.tolist():
+        seen = labels == identity
+        right = int((seen & (named == identity)).sum())
+        rows.append([f"landmark {identity}", str(right), *counted(seen & (named != identity))])
+    rows.append(["no landmark", ABSENT, *counted(labels == NONE)])
+    if np.any(labels == UNJUDGED):
+        rows.append(["cannot be told", ABSENT, *counted(labels == UNJUDGED)])
+    title = "What detections truly are, and what was most probable for the recogniser"
+    return text_table("naming", title, ["Truly", "named rightly", "named wrongly", "taken for no landmark"], rows)
+
+
+def illustrations(comparison: Comparison) -> dict[str, Illustration]:
+    """All figures of the page by name, in reading order: headings, captions, and descriptions that can be read out."""
+    is_repeated = repeats_published(comparison.sequence)
+    counterpart = " The counterpart of {} of the 2014 paper." if is_repeated else ""
+    no_errors = "No run has errors against the ground truth."
+    if comparison.sequence.truth is None:
+        no_errors = "The log has no ground truth, so there are no errors to draw."
+    no_path = "No run has a path to draw."
+    gone = paths_cut_off(comparison)
+    factor = enlargement(comparison)
+    growth = (
+        "Causal paths until the time T since start, and the landmarks as each estimator knew them then, not aligned. "
+        f"Ellipses hold 95 %{'' if factor == 1 else f', drawn {factor} times as large'}."
+        f"{counterpart.format('Fig. 4')}"
+    )
+    if is_repeated:
+        *others, last = (f"{time_s:.1f}" for time_s in MAP_TIMES_S)
+        if abs(comparison.sequence.duration_s - DURATION_S) < 1:
+            growth += f" T are the instants nearest to its {', '.join(others)} and {last} s."
+        else:
+            growth += (
+                f" T are the same fractions of this run as its {', '.join(others)} and {last} s of {DURATION_S:.1f} s."
+            )
+    shown = (
+        (
+            *("map", "Map", map_figure),
+            "Paths and landmarks in the world of the start pose, not aligned. Ellipses hold 95 % of where each "
+            "estimator believes a landmark to be; numbers are landmark IDs. Smoothed paths are drawn where they differ."
+            + (f" Leaves the picture: {', '.join(gone)}." if gone else ""),
+            no_path,
+            (),
+        ),
+        ("growth", "Map as it grew", growth_figure, growth, "No run kept its map on the way.", ()),
+        (
+            *("errors", "Error over time", error_figure),
+            "Estimate minus truth of the causal estimates, not aligned. The shaded band is three reported standard "
+            "deviations either side: a consistent estimator leaves it almost never. Each panel has its own scale.",
+            no_errors,
+            ("causal.ate_raw_m", "causal.yaw_rmse_rad"),
+        ),
+        (
+            *("yaw", "Yaw over time", yaw_figure),
+            f"Heading of the body's x axis, wrapped to ±180°, causal.{counterpart.format('Fig. 5')}",
+            no_path,
+            ("causal.yaw_rmse_rad",),
+        ),
+        (
+            *("nees", "Consistency over time", nees_figure),
+            "Normalised estimation error squared (NEES) of the causal estimates, divided by its degrees of freedom. "
+            "Dots are instants, the line is the mean over a fortieth of the run; 1 is consistent. The band holds 95 % "
+            "of a consistent estimator's values. Instants of one run depend on each other, so a share near 95 % is a "
+            "hint and not a test.",
+            f"{no_errors} NEES needs them.",
+            ("causal.nees_position", "causal.nees_yaw"),
+        ),
+        (
+            *("innovations", "Innovations over time", innovation_figure),
+            "Measured minus predicted range and azimuth of detections that had a prediction; in long runs an even "
+            "choice of them, with the extremes.",
+            "No run reports innovations.",
+            (),
+        ),
+        (
+            *("nis", "Distribution of NIS", nis_figure),
+            "Normalised innovation squared (NIS) of used detections. Right of the grey curve: innovations larger than "
+            "predicted; left: smaller.",
+            "No run reports innovations with their covariances.",
+            ("detections.nis",),
+        ),
+        (
+            *("timing", "Time per update", timing_figure),
+            "Share of updates that took at most the given time; dots mark the median and the 99th percentile.",
+            "No run reports durations.",
+            ("time.update_median_ms", "time.update_p99_ms"),
+        ),
+    )
+    found = {}
+    for name, title, draw, caption, instead, keys in shown:
+        told = []  # the figure's numbers, run by run, for a reader who does not see it
+        for run in comparison.runs:
+            scores = [score for key in keys if (score := comparison.score_of(run.estimator, key))]
+            if scores:
+                told.append(f"{run.estimator}: {' and '.join(score.with_unit for score in scores)}")
+        numbers = " ".join(finding(comparison)) if name == "map" else f"{'; '.join(told)}." if told else ""
+        figure = draw(comparison)
+        svg = "" if figure is None else inline_svg(figure, name, f"{title}. {caption} {numbers}".strip())
+        found[name] = Illustration(name, title, caption, svg, instead)
+    return found

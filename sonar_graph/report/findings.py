@@ -1,0 +1,278 @@
+"""Findings of a comparison in words: errors, consistency, and the warnings that a reader must see first.
+
+No sentence claims more than its numbers support. A landmark is called wrong when its squared error, or too many of its
+squared innovations, exceed `ABSURD`; where covariances hold, that has a probability of 1e-9. Where sigmas are f times
+too small it has 1e-9 to the power of 1/f².
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from scipy.stats import chi2
+
+from sonar_graph.evaluation import (
+    GATED_SHARE,
+    MOST_ROWS_NAMED,
+    Comparison,
+    RefusedRows,
+    anonymous_named,
+    gathered,
+    landmark_errors,
+    normalised_squares,
+)
+from sonar_graph.settings import flattened
+from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
+
+TOO_CLOSE = 0.05
+"""Relative difference below which one run says nothing about which of two errors is the smaller one."""
+CONSISTENCY_KEYS = {"position": "causal.nees_position", "yaw": "causal.nees_yaw"}
+NO_DETECTIONS = "The log has no landmark detections; without them nothing corrects the drift."
+HEADLINES = {
+    "ate_se2_m": "RMS after SE(2) alignment",
+    "ate_se3_m": "RMS after SE(3) alignment",
+    "ate_yaw_m": "RMS after alignment of yaw and translation",
+    "ate_raw_m": "RMS, not aligned",
+}
+"""Position errors that can stand in the headline, best suited first, with their names there."""
+ABSURD = float(chi2.ppf(1 - 1e-9, 2))
+"""41.4: the chi-square quantile of two degrees of freedom at 1 - 1e-9."""
+CONTRADICTING_SHARE = 0.2
+"""Above this share of innovations above `ABSURD` the sightings of a landmark contradict each other; below it they are
+outliers, which a robust estimator outvotes."""
+MOST_NAMED = 5
+NAMELESS = {Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNFIT}
+"""Outcomes of detections whose landmark an estimator does not know."""
+UNHEARD = {Outcome.UNSOUND, Outcome.LATE, Outcome.UNLOCATED, Outcome.TRACK_REPEATED}
+"""Outcomes of detections that were refused before their landmark mattered."""
+POLICY, UNKNOWN = "identity.policy", "identity.unknown.policy"
+WARNING = "Warning"
+SAID_NOTES = {
+    "log.ending": "Log",
+    "log.damage": "Log",
+    "log.start": "Log",
+    "log.stamps": "Log",
+    "log.dropped": "Log, left out",
+    "log.warnings": WARNING,
+    "log.gaps": WARNING,
+}
+"""Notes that the terminal shows, and the word before each; the report has all notes."""
+
+
+def finding(comparison: Comparison) -> list[str]:
+    """The findings of the comparison, a sentence each: failures first, then errors, then consistency.
+
+    A log without detections, and runs that lost their way, are mentioned after the failures.
+    """
+    runs = comparison.runs
+    sentences = [f"{run.estimator} failed: {run.reason.rstrip('.')}." for run in comparison.failed_runs]
+    if not comparison.sequence.detections:
+        sentences.append(no_detections(comparison))
+    sentences += lost_runs(comparison)
+    metric = headline_metric(comparison)
+    if metric is None:
+        if len(comparison.failed_runs) == len(runs):
+            sentences.append("No estimator came to an end, so there is nothing to compare.")
+        elif comparison.sequence.truth is None:
+            sentences.append(
+                "The log has no ground truth, so paths, maps and times can be compared, but no errors given."
+            )
+        else:
+            sentences.append("No position error could be computed against the log's ground truth.")
+        nis = {run.estimator: comparison.score_of(run.estimator, "detections.nis") for run in runs}
+        told = [f"{name} {score.text()} ({score.verdict})" for name, score in nis.items() if score and score.verdict]
+        return [*sentences, *([f"NIS, 1 where innovations fit their covariances: {', '.join(told)}."] if told else [])]
+    sentences.append(_causal_sentence(comparison, metric))
+    improved, judged = [], []
+    for name in (run.estimator for run in runs):
+        causal, smoothed = (comparison.score_of(name, f"{kind}.{metric}") for kind in ("causal", "smoothed"))
+        if causal and smoothed and not math.isclose(causal.value, smoothed.value, rel_tol=1e-3):
+            improved.append(f"{name} {smoothed.with_unit}")
+        scores = {what: score for what, key in CONSISTENCY_KEYS.items() if (score := comparison.score_of(name, key))}
+        if scores:
+            what = max(scores, key=lambda what: abs(math.log(max(scores[what].value, math.ulp(0.0)))))
+            said = ", ".join(filter(None, [what, scores[what].verdict]))
+            judged.append(f"{name} {scores[what].text()} ({said})")
+    if improved:
+        sentences.append(f"Looking back from the end of the run (smoothed): {', '.join(improved)}.")
+    if judged:
+        sentences.append(
+            f"NEES, of position or yaw whichever is further from the 1 of a fitting uncertainty: {', '.join(judged)}."
+        )
+    return sentences
+
+
+def no_detections(comparison: Comparison) -> str:
+    """The sentence that nothing corrects the drift, in the log or in the chosen part of it."""
+    part = comparison.sequence.notes.get("log.part")
+    if not part:
+        return NO_DETECTIONS
+    return f"The part of the log that was chosen ({part}) has no landmark detections; nothing corrects the drift in it."
+
+
+def headline_metric(comparison: Comparison) -> str | None:
+    """The position error that most runs have, without its ``causal.`` or ``smoothed.``; None where no run has one."""
+    counts = {
+        metric: sum(comparison.score_of(run.estimator, f"causal.{metric}") is not None for run in comparison.runs)
+        for metric in HEADLINES
+    }
+    best = max(counts, key=lambda metric: counts[metric])
+    return best if counts[best] else None
+
+
+def _causal_sentence(comparison: Comparison, metric: str) -> str:
+    """Causal errors in order of size, and the distance of the smallest from the others."""
+    errors = {run.estimator: comparison.score_of(run.estimator, f"causal.{metric}") for run in comparison.runs}
+    scored = sorted(((name, score) for name, score in errors.items() if score), key=lambda item: item[1].value)
+    listed = ", ".join(f"{name} {score.with_unit}" for name, score in scored)
+    opening = f"Causal position error ({HEADLINES[metric]}): {listed}"
+    if len(scored) == 1:
+        return opening + "."
+    (first, least), *others = scored
+    below = {name: 1 - least.value / score.value if score.value > 0 else 0.0 for name, score in others}
+    far = [f"{100 * share:.0f} % below {name}" for name, share in below.items() if share >= TOO_CLOSE]
+    close = [name for name, share in below.items() if share < TOO_CLOSE]
+    said = [f"{first} is {' and '.join(far)}"] if far else []
+    if close:
+        said.append(
+            f"{first} and {' and '.join(close)} differ by less than 5 %, too little for one run to tell them apart"
+        )
+    return f"{opening}; {'; '.join(said)}."
+
+
+def lost_runs(comparison: Comparison) -> list[str]:
+    """A sentence on each run whose gate refused more than `GATED_SHARE` of the detections."""
+    said = []
+    for run in comparison.runs:
+        outcomes = run.detections.outcomes if run.detections else []
+        gated = outcomes.count(Outcome.GATED)
+        if gated > GATED_SHARE * max(len(outcomes), 1):
+            advice = ' (try identity.policy = "max-mixture")' if flattened(run.params).get(POLICY) == "gate" else ""
+            said.append(
+                f"{run.estimator} refused {gated} of {len(outcomes)} detections as outside its gate: it has lost its "
+                f"way, identities are wrong{advice}, or noise is set far too small; its NIS only tells of what "
+                "the gate let through."
+            )
+    return said
+
+
+def doubt_of_identities(comparison: Comparison) -> list[str]:
+    """Warnings, a line each: runs for which no detection has an identity, then runs whose map is wrong.
+
+    With true landmarks a map is wrong where they are not; without, where the sightings contradict it.
+    """
+    lines = []
+    blind = {}
+    for run in comparison.runs:
+        outcomes = [outcome for outcome in run.detections.outcomes if outcome not in UNHEARD] if run.detections else []
+        if outcomes and set(outcomes) <= NAMELESS:
+            blind[run.estimator] = len(outcomes)
+    if blind:
+        runs = [run for run in comparison.runs if run.estimator in blind]
+        asked = any(flattened(run.params).get(UNKNOWN) == "associate" for run in runs)
+        hint = "" if asked else f'; isam2 maps them by place with {UNKNOWN} = "associate"'
+        lines.append(
+            f"{WARNING}: none of {max(blind.values())} detections has an identity that {', '.join(blind)} can use: "
+            f"no landmark is mapped{hint}"
+        )
+    true = comparison.sequence.true_landmarks
+    for run in comparison.runs:
+        wrong: dict[int, float] = {}
+        if run.landmarks is not None and true is not None:
+            errors = landmark_errors(anonymous_named(run.landmarks, true), true)
+            squares = normalised_squares(errors.horizontal_m, errors.horizontal_covs).tolist()
+            wrong = {
+                id_: square / 2 for id_, square in zip(errors.ids.tolist(), squares, strict=True) if square > ABSURD
+            }
+            said = f" puts {_landmarks(wrong)} far outside its covariance (NEES up to"
+        elif run.landmarks is not None and (log := run.detections) is not None:
+            innovations = normalised_squares(log.innovations, log.innovation_covs)
+            used = np.array([outcome is Outcome.USED for outcome in log.outcomes], dtype=bool)
+            used &= np.isfinite(innovations)
+            for id_ in run.landmarks.ids.tolist():
+                own = innovations[used & (log.landmark_ids == id_)]
+                if own.size and np.mean(own > ABSURD) > CONTRADICTING_SHARE:
+                    wrong[id_] = float(own.mean() / 2)
+            said = f": sightings of {_landmarks(wrong)} contradict its map (mean NIS up to"
+        if wrong:
+            policy = flattened(run.params).get(POLICY)
+            named = "" if policy is None else f' ({POLICY} is "{policy}")'
+            advice = f"look at identities{named}, then at noise and start"
+            lines.append(f"{WARNING}: {run.estimator}{said} {max(wrong.values()):.0f}); {advice}")
+    return lines
+
+
+def nameless_landmarks(comparison: Comparison) -> list[str]:
+    """A sentence for each run with landmarks of unknown identity: their number, and their identities by place."""
+    said = []
+    true = comparison.sequence.true_landmarks
+    for run in comparison.runs:
+        count = 0 if run.landmarks is None else int((run.landmarks.ids >= FIRST_ANONYMOUS_ID).sum())
+        if run.landmarks is None or not count:
+            continue
+        if true is None:
+            which = f"identities from {FIRST_ANONYMOUS_ID} on are made up"
+        else:
+            found = np.setdiff1d(anonymous_named(run.landmarks, true).ids, run.landmarks.ids).tolist()
+            which = f"scored by place, as {_listed(found)}" if found else "none is at the place of a true one"
+        counted = "1 landmark" if count == 1 else f"{count} landmarks"
+        said.append(f"{run.estimator} found {counted} without a name ({UNKNOWN}); {which}.")
+    return said
+
+
+def _landmarks(ids: Iterable[int]) -> str:
+    """The word and the identities; empty where there are none."""
+    ids = list(ids)
+    return f"landmark{'s' if len(ids) > 1 else ''} {_listed(ids)}" if ids else ""
+
+
+def _listed(ids: list[int]) -> str:
+    """The first identities, and the number of the others."""
+    if len(ids) > MOST_NAMED:
+        return f"{', '.join(map(str, ids[:MOST_NAMED]))} and {len(ids) - MOST_NAMED} more"
+    *first, last = map(str, ids)
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def doubt_lines(notes: Mapping[str, str]) -> list[str]:
+    """A line for each of `SAID_NOTES` that a log has: damage, rows left out, gaps, unlikely numbers."""
+    return [f"{word}: {notes[subject]}" for subject, word in SAID_NOTES.items() if subject in notes]
+
+
+def warning_lines(notes: Mapping[str, str]) -> list[str]:
+    """The lines of `doubt_lines` that put results in doubt."""
+    return [line for line in doubt_lines(notes) if line.startswith(f"{WARNING}:")]
+
+
+def refused_by(comparison: Comparison) -> dict[RefusedRows, list[str]]:
+    """Refused rows of IMU and Doppler log, with the names of the runs that refused them."""
+    names: dict[RefusedRows, list[str]] = {}
+    for run in comparison.runs:
+        for refused in gathered(run.refused):
+            names.setdefault(refused, []).append(run.estimator)
+    return names
+
+
+def refusal_lines(comparison: Comparison) -> list[str]:
+    """A line for each refused row, or for many at once: sensor, time, reason, distance, and the runs."""
+    start_ns = comparison.sequence.start_ns
+    lines = []
+    for refused, names in refused_by(comparison).items():
+        count = "" if refused.count == 1 else f"{refused.count} rows, "
+        distance = f" (squared distance {refused.distances()})" if refused.distances() else ""
+        at = f"{count}{refused.times(start_ns)} s"
+        lines.append(f"{WARNING}: {refused.sensor}, {at}: {refused.reason}{distance}; {', '.join(names)}")
+    return lines
+
+
+def withheld_lines(comparison: Comparison) -> list[str]:
+    """Measurements that runs could not use, in their own words: the first ones, and the number of the others."""
+    lines = []
+    for run in comparison.runs:
+        lines += [f"{WARNING}: {run.estimator}: {message}" for message in run.withheld[:MOST_ROWS_NAMED]]
+        more = len(run.withheld) - MOST_ROWS_NAMED
+        if more > 0:
+            lines.append(f"{WARNING}: {run.estimator} withheld {more} more: runs/{run.estimator}/result.json has all")
+    return lines

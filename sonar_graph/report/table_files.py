@@ -1,0 +1,108 @@
+"""Tables as files: CSV for machines, LaTeX with booktabs for papers."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from pathlib import Path
+
+from sonar_graph.evaluation import Table
+from sonar_graph.files import replacing
+
+FOLDER = "tables"
+LATEX_SPECIAL = {
+    "\\": r"\textbackslash{}",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "±": r"$\pm$",
+    "°": r"\textdegree{}",
+    "<": r"$<$",
+    ">": r"$>$",
+    "\N{MINUS SIGN}": "$-$",
+    "\N{EN DASH}": "--",
+    "\N{NO-BREAK SPACE}": "~",
+    "²": r"$^2$",
+    "\N{DOWNWARDS ARROW}": r"$\downarrow$",
+    "\N{UPWARDS ARROW}": r"$\uparrow$",
+    "\N{NOT EQUAL TO}": r"$\neq$",
+    "χ": r"$\chi$",
+}
+
+
+def write_tables(tables: list[Table], folder: Path) -> list[Path]:
+    """Write each table as ``tables/NAME.csv`` and ``tables/NAME.tex`` in a folder; earlier ones are replaced."""
+    written = []
+    (folder / FOLDER).mkdir(parents=True, exist_ok=True)
+    for table in tables:
+        for suffix, text in (("csv", as_csv(table)), ("tex", as_latex(table))):
+            path = folder / FOLDER / f"{table.name}.{suffix}"
+            with replacing(path) as partial:
+                partial.write_text(text, "utf-8")
+            written.append(path)
+    return written
+
+
+def as_csv(table: Table) -> str:
+    """Numbers in full and in the units of the results; empty where there is none."""
+    rows = [[f"{column.key}_{part}" if part else column.key for column in table.columns for part in column.parts]]
+    for row in table.rows:
+        texts: list[str] = []
+        for column, cell in zip(table.columns, row, strict=True):
+            for value in [*cell.numbers, *[math.nan] * (len(column.parts) - len(cell.numbers))]:
+                if isinstance(value, float):
+                    texts.append("" if math.isnan(value) else repr(float(value)))
+                else:
+                    texts.append(str(value))
+        rows.append(texts)
+    return csv_text(rows)
+
+
+def csv_text(rows: list[list[str]]) -> str:
+    """Rows of texts as CSV (RFC 4180, with line feeds alone)."""
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows(rows)
+    return buffer.getvalue()
+
+
+def as_latex(table: Table) -> str:
+    """A ``table`` with the digits that people are shown; it needs the packages booktabs and textcomp."""
+    above: list[str] = []
+    if any(heading for heading, _ in table.groups):
+        cells, rules, first = [], [], 1
+        for heading, width in table.groups:
+            cells.append(rf"\multicolumn{{{width}}}{{c}}{{{latex_text(heading)}}}")
+            if heading:
+                rules.append(rf"\cmidrule(lr){{{first}-{first + width - 1}}}")
+            first += width
+        above = [" & ".join(cells) + r" \\", "".join(rules)]
+    rows = [[f"{cell.text} ({cell.note})" if cell.note else cell.text for cell in row] for row in table.rows]
+    lines = [
+        r"% \usepackage{booktabs,textcomp}",
+        r"\begin{table}",
+        r"\centering",
+        rf"\caption{{{latex_text(table.title)}. {latex_text(table.caption)}}}",
+        rf"\label{{tab:{table.name}}}",
+        rf"\begin{{tabular}}{{{''.join('r' if column.is_number else 'l' for column in table.columns)}}}",
+        r"\toprule",
+        *above,
+        " & ".join(latex_text(column.heading) for column in table.columns) + r" \\",
+        r"\midrule",
+        *(" & ".join(map(latex_text, row)) + r" \\" for row in rows),
+        r"\bottomrule",
+        r"\end{tabular}",
+        r"\end{table}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def latex_text(text: str) -> str:
+    """Text with everything escaped that LaTeX would take for a command."""
+    return "".join(LATEX_SPECIAL.get(character, character) for character in text)
