@@ -10,7 +10,9 @@ from pathlib import Path
 from sonar_graph.numerics.jit import NOTICE, nothing_is_cached
 
 KERNELS = """
-from sonar_graph.kernels import compiled
+from sonar_graph.numerics import compiled, jit
+
+jit._sources.clear()  # of a fresh clone: those of the package are compiled here
 
 @compiled
 def twice(x):

@@ -37,7 +37,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 from common import make_parser, print_figures, print_table
 
 from sonar_graph.measurements import Dvl, Floats, Imu
-from sonar_graph.navigation.preintegration.joint_preintegration import JointPreintegrator
+from sonar_graph.navigation import JointPreintegrator
 from sonar_graph.slam.models.factors import odometry_with_bias
 from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry
 

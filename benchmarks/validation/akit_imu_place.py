@@ -50,10 +50,14 @@ def fit_place(sequence: Sequence) -> PlaceFit:
     body_p_dvl = np.array(calibration.dvl.mounting.translation_m)
     body_p_imu = np.array(calibration.imu.mounting.translation_m)
     C = path.rotations_at(seconds)
-    turning = C @ cross_matrices(path.rate_at(seconds))
-    x = np.einsum("nij,nj->ni", C, velocity) - turning @ (body_p_dvl - body_p_imu) - path.impulse_at(seconds)
+    turning = C @ cross_matrices(path.linear_at(seconds, path.rate))
+    x = (
+        np.einsum("nij,nj->ni", C, velocity)
+        - turning @ (body_p_dvl - body_p_imu)
+        - path.linear_at(seconds, path.impulse)
+    )
     slow = seconds[:, None, None] * np.eye(3)
-    columns = [turning, -path.turned_time_at(seconds), slow, seconds[:, None, None] * slow]
+    columns = [turning, -path.linear_at(seconds, path.turned_time), slow, seconds[:, None, None] * slow]
     found, covariance, variance = _least_squares(np.concatenate(columns, axis=2), x)
     place = body_p_imu - found[SHOWN]
     information = np.asarray(np.linalg.inv(covariance[SHOWN, SHOWN]), np.float64)

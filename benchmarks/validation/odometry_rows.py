@@ -47,9 +47,13 @@ from sonar_graph.navigation.alignment import (
     match_reference_to_imu,
     velocity_at_imu,
 )
-from sonar_graph.navigation.preintegration import DISPLACEMENT, JointMotion, Preintegrator
-from sonar_graph.navigation.preintegration.joint_preintegration import JointPreintegrator
-from sonar_graph.navigation.preintegration.joint_recursion import DopplerRule
+from sonar_graph.navigation.preintegration import (
+    DISPLACEMENT,
+    DopplerRule,
+    JointMotion,
+    JointPreintegrator,
+    Preintegrator,
+)
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.slam.models import factors

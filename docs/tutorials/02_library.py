@@ -10,8 +10,7 @@ import numpy as np
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.logs import read_log, write_log
-from sonar_graph.navigation import Odometry
-from sonar_graph.navigation.preintegration import Preintegrator
+from sonar_graph.navigation import Odometry, Preintegrator
 from sonar_graph.simulation import BasinOptions, simulate_basin
 from sonar_graph.slam import Isam2, Isam2Params, KeyframeParams
 from sonar_graph.slam.models import factors

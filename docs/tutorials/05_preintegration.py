@@ -9,7 +9,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.preintegration.joint_preintegration import JointPreintegrator
+from sonar_graph.navigation import JointPreintegrator
 from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry
 
 NS = 1_000_000_000

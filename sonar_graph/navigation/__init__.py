@@ -1,15 +1,18 @@
-"""From inertial and Doppler samples to motion and its covariance; no landmarks here.
+"""Motion and its covariance from inertial and Doppler samples, roll, pitch and biases at the start; no landmarks.
 
-Of use in any GTSAM program (docs/tutorials/05_preintegration.py); factors: `sonar_graph.slam.inertial_factors`.
+For use in any GTSAM program: docs/tutorials/05_preintegration.py; factors: `sonar_graph.slam.models.inertial_factors`.
 """
 
 # fmt: off
+from sonar_graph.navigation.alignment import InitialTilt, align_at_rest, align_in_motion
 from sonar_graph.navigation.odometry import (
     Odometry, RunningMotion, motion_between, motion_between_nodes, motion_since_node,
 )
+from sonar_graph.navigation.preintegration import JointMotion, JointPreintegrator, PreintegratedMotion, Preintegrator
 from sonar_graph.navigation.samples import finite_vector, rows_until, value_at, weights_at_end
 
 __all__ = [
-    "Odometry", "RunningMotion", "finite_vector", "motion_between", "motion_between_nodes", "motion_since_node",
-    "rows_until", "value_at", "weights_at_end",
+    "InitialTilt", "JointMotion", "JointPreintegrator", "Odometry", "PreintegratedMotion", "Preintegrator",
+    "RunningMotion", "align_at_rest", "align_in_motion", "finite_vector", "motion_between", "motion_between_nodes",
+    "motion_since_node", "rows_until", "value_at", "weights_at_end",
 ]

@@ -1,30 +1,19 @@
-"""Motion by gyros and Doppler log, asked for by stamps.
+"""Motion by gyros and Doppler log between two instants.
 
 Nodes. The stamps of the DVL rows are *nodes*: between two nodes the velocity is known on both sides and the motion is
 final. A node counts as reached at time t when its own row and an IMU row at or after it are stamped at or before t.
-Whatever happens between nodes (a detection, a depth sample, an estimate being asked for) is related to the newest
-reached node by a provisional motion that uses nothing stamped later. Results therefore depend on stamps alone, not on
-how a log is cut into blocks, and nothing peeks ahead. One thing does where rows are added long before they are asked
-for: the first velocities, and those after a long gap, are nodes once later ones have confirmed them
-(`sonar_graph.navigation.dvl_screening.dvl_gate`).
+What happens between nodes (a detection, a depth sample, an estimate) is related to the newest reached node by a
+provisional motion that uses nothing stamped later. Results therefore depend on stamps alone, not on how a log is cut
+into blocks. One exception: where rows are added long before they are used, the first velocities, and those after a long
+gap, are nodes once later ones have confirmed them (`sonar_graph.navigation.dvl_screening.dvl_gate`).
 
-Rows: `sonar_graph.navigation.dvl_screening.row_intake`. Motion between them:
-`sonar_graph.navigation.preintegration.recursion`.
-
-Motion from a node of the odometry, over whatever lies behind it: Doppler samples, and gaps without them.
-
-Motion since a node, asked for at one instant after another, without integrating twice what is final.
-
-Motion between any two instants, from what is stamped no later than the second.
-
-Nodes are the stamps of the Doppler log (`sonar_graph.navigation.odometry`). Without a gap of the log the motion runs
-over the steps between the instants. A gap that has ended between two nodes is bridged with both its ends known. In one
-that has not, both instants are reached from the node at which bottom lock was lost, and the motion between them is::
+Gaps. Without a gap of the log the motion runs over the steps between the instants. A gap between two nodes is bridged
+with both its ends known. In a gap that lasts, both instants are reached from the node at which bottom lock was lost::
 
     M = M_1^-1 M_2,    P = P_2 - Ad(M^-1) P_1 Ad(M^-1)^T
 
-P is what the error grew by, so that motions which follow each other, taken as independent, add up to that since the
-node. What they share makes a single one surer than P says.
+P is the growth of the error, so that successive motions, taken as independent, add up to that since the node.
+docs/theory/preintegration.md, docs/theory/gaps.md.
 """
 
 from __future__ import annotations
@@ -60,12 +49,32 @@ from sonar_graph.states import RefusedRow
 
 
 class Odometry:
-    """Keeps the rows that are still needed and turns them into steps.
+    """Rows of both sensors that are still needed, and the steps between two instants.
 
     Parameters
     ----------
     calibration
-        Mountings, DVL noise where the log has none, and the meaning of a sample.
+        Mountings, DVL noise where the log has none, and the interpolation between samples.
+
+    Examples
+    --------
+    Half a metre per second ahead, for one second:
+
+    >>> import numpy as np
+    >>> from sonar_graph.calibration import Calibration
+    >>> from sonar_graph.measurements import Dvl, Imu
+    >>> from sonar_graph.navigation import Odometry, Preintegrator, motion_between_nodes
+    >>> imu_ns, dvl_ns = np.arange(201) * 10_000_000, np.arange(11) * 200_000_000
+    >>> odometry = Odometry(Calibration())
+    >>> odometry.add(
+    ...     Imu(imu_ns, np.zeros((201, 3)), np.tile([0.0, 0.0, 9.81], (201, 1))),
+    ...     Dvl(dvl_ns, np.tile([0.5, 0.0, 0.0], (11, 1)), np.full((11, 3, 3), np.nan)),
+    ... )
+    False
+    >>> sensors = Preintegrator.from_calibration(Calibration())
+    >>> motion = motion_between_nodes(odometry, sensors, 0, 1_000_000_000, np.zeros(3), None)
+    >>> round(float(motion.i_T_j.x()), 6), motion.covariance.shape
+    (0.5, (6, 6))
     """
 
     def __init__(self, calibration: Calibration) -> None:
@@ -77,19 +86,19 @@ class Odometry:
 
     @property
     def refused(self) -> list[RefusedRow]:
-        """Rows that are not used, and why; of too few beams also those that may still be completed."""
+        """Rows that are not used, and why; includes rows that may still be completed or confirmed."""
         return self._intake.refused
 
     def add(self, imu: Imu | None, dvl: Dvl | None) -> bool:
         """Take in rows and place them by their stamps.
 
         Of rows with equal stamps the first counts. A row that comes after motion up to its stamp was settled is late,
-        and a velocity may be an outlier (`sonar_graph.navigation.dvl_screening.dvl_gate`): these become rows of
-        `refused`.
+        and a velocity may be an outlier (`sonar_graph.navigation.dvl_screening.dvl_gate`): both go to `refused`.
 
         Returns
         -------
-        Whether rows were placed before others that are there already: provisional motion has to be had anew.
+        bool
+            True where rows were placed before others that were there already: provisional motion is out of date.
 
         Raises
         ------
@@ -103,11 +112,11 @@ class Odometry:
         return placed_imu or placed_dvl
 
     def settle(self, node_ns: int) -> None:
-        """Motion up to a node is used and stays as it is: rows up to there come too late from now on."""
+        """Fix the motion up to a node: rows stamped at or before it are late from now on."""
         self._intake.settled_ns = max(self._intake.settled_ns, node_ns)
 
     def forget_before(self, node_ns: int) -> None:
-        """Drop rows that no motion from this node on can need, gaps after it included."""
+        """Settle, and drop rows that no motion from this node on can need, gaps after it included."""
         self.settle(node_ns)
         needed_ns = node_ns if self._hold_past else node_ns - WINDOW_NS
         self._imu.forget_before(needed_ns, ROWS_BEFORE)
@@ -115,14 +124,8 @@ class Odometry:
 
     def columns(self) -> Columns:
         """All rows, for compiled loops over many instants."""
-        return (
-            self._imu.stamps_ns,
-            *self._imu.values,
-            self._dvl.stamps_ns,
-            *self._dvl.values,
-            self._hold_past,
-            self._turns,
-        )
+        imu, dvl = self._imu, self._dvl
+        return imu.stamps_ns, *imu.values, dvl.stamps_ns, *dvl.values, self._hold_past, self._turns
 
     def start_ns(self) -> int | None:
         """First node that IMU rows cover from both sides; None before there is one."""
@@ -134,12 +137,12 @@ class Odometry:
         return int(self._dvl.stamps_ns[first])
 
     def start_reached_ns(self, start_ns: int) -> int:
-        """When the first node was reached: an IMU row was at or after it, and its velocity was confirmed."""
+        """Instant at which the first node was reached: an IMU row covers it, and its velocity is confirmed."""
         covered_ns = int(self._imu.stamps_ns[np.searchsorted(self._imu.stamps_ns, start_ns)])
         return max(covered_ns, self._intake.start_known_ns)
 
     def start_by(self, until_ns: int) -> int | None:
-        """First node, when it is reached at an instant; None before."""
+        """First node, if it is reached at an instant; else None."""
         start_ns = self.start_ns()
         if start_ns is None or self.start_reached_ns(start_ns) > until_ns:
             return None
@@ -152,11 +155,11 @@ class Odometry:
 
     def newest_node(self, after_ns: int, until_ns: int) -> int | None:
         """Last of `nodes`; None where there is none."""
-        first, last = node_range(self._imu.stamps_ns, self._dvl.stamps_ns, after_ns, until_ns)
-        return int(self._dvl.stamps_ns[last - 1]) if last > first else None
+        nodes = self.nodes(after_ns, until_ns)
+        return int(nodes[-1]) if len(nodes) else None
 
     def steps_between_nodes(self, start_ns: int, end_ns: int) -> Steps:
-        """Final motion from one node to a later, reached one.
+        """Steps of the final motion from one node to a later, reached one.
 
         Raises
         ------
@@ -168,7 +171,7 @@ class Odometry:
         return self._final_steps(start_ns, end_ns)
 
     def steps_to_node(self, since_ns: int, node_ns: int) -> Steps:
-        """Final motion to a reached node from any instant between the rows before it, such as one in a gap.
+        """Steps of the final motion to a reached node from any instant among the rows, such as one in a gap.
 
         Raises
         ------
@@ -183,7 +186,7 @@ class Odometry:
         return self._final_steps(since_ns, node_ns)
 
     def steps_since_node(self, node_ns: int, until_ns: int) -> Steps:
-        """Provisional motion from a reached node to any later instant, from rows stamped no later than that.
+        """Steps of the provisional motion from a reached node to a later instant, from rows stamped no later.
 
         Raises
         ------
@@ -197,7 +200,7 @@ class Odometry:
         return self._steps(node_ns, until_ns, imu_rows, dvl_rows)
 
     def is_gap(self, start_ns: int, end_ns: int) -> bool:
-        """Whether the velocity is not taken as linear, or held, over a time without samples."""
+        """True for a time without samples that is too long for a linear velocity."""
         return end_ns - start_ns > self._longest_ns
 
     def gaps(self, start_ns: int, end_ns: int) -> list[tuple[int, int]]:
@@ -215,15 +218,14 @@ class Odometry:
         return Steps(*merge_rows(self.columns(), imu_rows, dvl_rows, start_ns, end_ns))
 
     def _no_nodes(self, start_ns: int, end_ns: int, nodes: dict[str, int]) -> MeasurementError:
-        """What is wrong with an interval of which these ends have to be nodes."""
+        """The error for an interval whose named ends have to be nodes."""
         if end_ns < start_ns:
             return MeasurementError(f"interval: ends at {end_ns} ns, before its start {start_ns}; the earlier first")
         for name, instant_ns in nodes.items():
             if instant_ns not in self._dvl.stamps_ns:
                 return no_doppler_stamp(name, instant_ns, self._dvl.stamps_ns)
-        covered = (
-            f"from {self._imu.stamps_ns[0]} to {self._imu.stamps_ns[-1]} ns" if len(self._imu.stamps_ns) else "none"
-        )
+        imu_ns = self._imu.stamps_ns
+        covered = f"from {imu_ns[0]} to {imu_ns[-1]} ns" if len(imu_ns) else "none"
         return MeasurementError(
             f"{', '.join(nodes)}: IMU rows ({covered}) do not cover {', '.join(map(str, nodes.values()))}; take nodes"
             " from start_ns() on, of nodes()"
@@ -280,32 +282,31 @@ def motion_since_node(
     bias: Floats,
     earth_rate: Floats | None,
 ) -> PreintegratedMotion:
-    """Provisional motion from the newest node reached to an instant, from rows stamped no later than that."""
+    """Provisional motion from the newest reached node to an instant, from rows stamped no later than that."""
     if preintegrator.gap and odometry.is_gap(node_ns, until_ns):
         return preintegrator.bridge(odometry.columns(), node_ns, until_ns, False, bias, earth_rate)
     return preintegrator.integrate(odometry.steps_since_node(node_ns, until_ns), bias, earth_rate)
 
 
 def _then(before: PreintegratedMotion | None, motion: PreintegratedMotion) -> PreintegratedMotion:
+    """A motion after another, if there is one before."""
     return motion if before is None else before.then(motion)
 
 
 def _turned(earth_rate: Floats | None, motion: PreintegratedMotion | None) -> Floats | None:
-    """Earth's rotation after a motion."""
+    """Earth's rotation in the frame at the end of a motion."""
     if earth_rate is None or motion is None:
         return earth_rate
     return motion.i_T_j.rotation().unrotate(earth_rate)
 
 
 class RunningMotion:
-    """Motion from one node to later and later instants.
-
-    Motion between nodes is final and is kept; only what follows the newest reached node is integrated at each call.
+    """Motion from one node to later and later instants; final motion between nodes is kept, not integrated again.
 
     Parameters
     ----------
     start_ns
-        The node.
+        Stamp of the node.
     bias
         Gyro bias to remove, shape (3,), rad/s.
     earth_rate
@@ -313,38 +314,25 @@ class RunningMotion:
     """
 
     def __init__(
-        self,
-        odometry: Odometry,
-        preintegrator: Preintegrator,
-        start_ns: int,
-        bias: Floats,
-        earth_rate: Floats | None,
+        self, odometry: Odometry, preintegrator: Preintegrator, start_ns: int, bias: Floats, earth_rate: Floats | None
     ) -> None:
-        self._odometry = odometry
-        self._preintegrator = preintegrator
-        self._bias = bias
-        self._earth_rate = earth_rate
+        self._odometry, self._preintegrator = odometry, preintegrator
+        self._bias, self._earth_rate = bias, earth_rate
         self._reached_ns = start_ns
         self._reached: PreintegratedMotion | None = None
 
     def until(self, instant_ns: int) -> PreintegratedMotion:
         """Provisional motion to an instant not before that of any earlier call."""
+        sensors = self._odometry, self._preintegrator
         newest_ns = self._odometry.newest_node(self._reached_ns, instant_ns)
         if newest_ns is not None:
-            motion = motion_between_nodes(*self._from_reached(newest_ns))
-            self._reached = motion if self._reached is None else self._reached.then(motion)
-            self._reached_ns = newest_ns
+            earth = _turned(self._earth_rate, self._reached)
+            motion = motion_between_nodes(*sensors, self._reached_ns, newest_ns, self._bias, earth)
+            self._reached, self._reached_ns = _then(self._reached, motion), newest_ns
         if instant_ns == self._reached_ns and self._reached is not None:
             return self._reached
-        motion = motion_since_node(*self._from_reached(instant_ns))
-        return motion if self._reached is None else self._reached.then(motion)
-
-    def _from_reached(self, until_ns: int) -> tuple[Odometry, Preintegrator, int, int, Floats, Floats | None]:
-        """What a motion from the newest node reached needs."""
-        earth_rate = self._earth_rate
-        if earth_rate is not None and self._reached is not None:
-            earth_rate = self._reached.i_T_j.rotation().unrotate(earth_rate)
-        return self._odometry, self._preintegrator, self._reached_ns, until_ns, self._bias, earth_rate
+        earth = _turned(self._earth_rate, self._reached)
+        return _then(self._reached, motion_since_node(*sensors, self._reached_ns, instant_ns, self._bias, earth))
 
 
 def motion_between(
@@ -359,7 +347,13 @@ def motion_between(
     """
     newest_ns = odometry.newest_node(start_ns, end_ns)
     if newest_ns is None:
-        return _without_a_node(odometry, preintegrator, start_ns, end_ns, bias)
+        lost_ns = odometry.newest_node(EARLIEST_NS, end_ns)
+        if lost_ns is None or start_ns == end_ns or not odometry.is_gap(lost_ns, end_ns):
+            return _over_steps(odometry, preintegrator, start_ns, end_ns, end_ns, bias)
+        whole = motion_since_node(odometry, preintegrator, lost_ns, end_ns, bias, None)
+        if lost_ns == start_ns:
+            return whole
+        return remaining_motion(motion_since_node(odometry, preintegrator, lost_ns, start_ns, bias, None), whole)
     first_ns = int(odometry.nodes(start_ns - 1, end_ns)[0])
     if not (odometry.gaps(first_ns, newest_ns) or odometry.is_gap(newest_ns, end_ns)):
         return _over_steps(odometry, preintegrator, start_ns, end_ns, end_ns, bias)
@@ -371,21 +365,8 @@ def motion_between(
     return motion
 
 
-def _without_a_node(
-    odometry: Odometry, preintegrator: Preintegrator, start_ns: int, end_ns: int, bias: Floats
-) -> PreintegratedMotion:
-    """No node after the first instant is reached at the second."""
-    node_ns = odometry.newest_node(EARLIEST_NS, end_ns)
-    if node_ns is None or start_ns == end_ns or not odometry.is_gap(node_ns, end_ns):
-        return _over_steps(odometry, preintegrator, start_ns, end_ns, end_ns, bias)
-    whole = motion_since_node(odometry, preintegrator, node_ns, end_ns, bias, None)
-    if node_ns == start_ns:
-        return whole
-    return _rest(motion_since_node(odometry, preintegrator, node_ns, start_ns, bias, None), whole)
-
-
-def _rest(before: PreintegratedMotion, whole: PreintegratedMotion) -> PreintegratedMotion:
-    """What is left of a motion after another that begins where it begins."""
+def remaining_motion(before: PreintegratedMotion, whole: PreintegratedMotion) -> PreintegratedMotion:
+    """The rest of a whole motion after a first part of it; P of the module's equation."""
     motion = before.i_T_j.between(whole.i_T_j)
     adjoint = motion.inverse().AdjointMap()
     grown = whole.covariance - adjoint @ before.covariance @ adjoint.T
@@ -405,7 +386,7 @@ def _rest(before: PreintegratedMotion, whole: PreintegratedMotion) -> Preintegra
 def _over_steps(
     odometry: Odometry, preintegrator: Preintegrator, start_ns: int, end_ns: int, known_ns: int, bias: Floats
 ) -> PreintegratedMotion:
-    """Over linear or held velocities, by rows stamped until an instant not before the end."""
+    """Motion over linear or held velocities, from rows stamped up to an instant not before the end."""
     columns = odometry.columns()
     rows = rows_until(columns[0], known_ns), rows_until(columns[3], known_ns)
     return preintegrator.integrate(Steps(*merge_rows(columns, *rows, start_ns, end_ns)), bias)

@@ -1,21 +1,13 @@
-"""Rows of a sensor as they are kept: in the order of their stamps, whatever the order in which they came.
-
-Values of a sensor between its rows.
+"""Rows of a sensor by their stamps: storage, values in between, checks of what a caller gives, and weights of depths.
 
 ``linear``: rate and velocity are piecewise linear through the samples; the mean over a step is the value at its middle.
 ``hold-past``: a sample is the mean over the interval that ends at its stamp.
 
-What is wrong with instants, vectors and noise that a caller hands to preintegration, in one line.
-
-What depth samples over an interval say about its end.
-
-Each sample is carried to the end by the vehicle's own odometry. Its noise is white, r, but the error of carrying it
-grows as a random walk of q m²/s, and is shared by all samples that are older. The best weights are those of a Kalman
-filter for a random walk, started from nothing::
+Depth samples are carried to the end of an interval by the vehicle's own odometry, whose error is a random walk of
+q m²/s that all older samples share; a sample's own noise is white, r. The best weights are those of a Kalman filter for
+a random walk, started from nothing::
 
     P <- P + q dt,    K = P / (P + r_k),    w <- (1 - K) w,  w_k = K,    P <- (1 - K) P
-
-so that samples count for as long as q lets them: about sqrt(r dt / q). For q = 0 the weights are the inverse variances.
 """
 
 from __future__ import annotations
@@ -32,35 +24,27 @@ from sonar_graph.numerics import Vector, compiled, inlined, minus, plus, scaled,
 
 EARLIEST_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 WINDOW_NS = 5_000_000_000
-"""Rows kept before a node, where gravity is found should bottom lock be lost there: enough for 1 mm/s² with samples of
-5 mm/s at 7 Hz, short enough for an accelerometer's bias not to have turned."""
+"""Window before a node in which gravity is measured should bottom lock be lost there: long enough for 1 mm/s² with
+samples of 5 mm/s at 7 Hz, short enough for an accelerometer's bias not to have turned."""
 
 
 class StampedRows:
-    """Each stamp once, with two values.
+    """Rows of one sensor in the order of their stamps, each stamp once, with two values per row.
 
     Parameters
     ----------
-    shapes
-        Of either value's rows.
+    one, other
+        Shapes of either value's rows.
     """
 
-    def __init__(self, *shapes: tuple[int, ...]) -> None:
+    def __init__(self, one: tuple[int, ...], other: tuple[int, ...]) -> None:
         self.stamps_ns: Ints = np.empty(0, np.int64)
-        one, other = shapes
         self.values: tuple[Floats, Floats] = np.empty((0, *one)), np.empty((0, *other))
 
     def insert(self, stamps_ns: Ints, one: Floats, other: Floats) -> bool:
-        """Place rows by their stamps; of equal stamps the first counts.
+        """Place rows by their increasing stamps; of equal stamps the first counts.
 
-        Parameters
-        ----------
-        stamps_ns
-            At least one, increasing.
-
-        Returns
-        -------
-        Whether the first comes before a row that was there already, or is one.
+        Returns True where the first row comes before a row that was there already, or repeats its stamp.
         """
         comes_after = not len(self.stamps_ns) or bool(stamps_ns[0] > self.stamps_ns[-1])
         self.stamps_ns = np.concatenate([self.stamps_ns, stamps_ns])
@@ -70,7 +54,7 @@ class StampedRows:
         return not comes_after
 
     def forget_before(self, stamp_ns: int, more: int = 0) -> None:
-        """Drop rows that are needed for no value from a stamp on, but for some more before it."""
+        """Drop rows that no value from a stamp on needs, but keep ``more`` of them."""
         self._keep(slice(max(int(np.searchsorted(self.stamps_ns, stamp_ns)) - 1 - more, 0), None))
 
     def _keep(self, rows: slice | Ints) -> None:
@@ -80,7 +64,7 @@ class StampedRows:
 
 @compiled
 def node_range(imu_ns: Ints, dvl_ns: Ints, after_ns: int, until_ns: int) -> tuple[int, int]:
-    """Rows of the DVL that are nodes after one instant and reached at another: first, and one past the last."""
+    """Rows of the DVL that are nodes after one instant and reached at another: the first, and one past the last."""
     seen = np.searchsorted(imu_ns, until_ns, side="right")
     if seen == 0:
         return 0, 0
@@ -91,14 +75,14 @@ def node_range(imu_ns: Ints, dvl_ns: Ints, after_ns: int, until_ns: int) -> tupl
 
 @compiled
 def rows_before_gaps(stamps: Ints, start_ns: int, end_ns: int, longest_ns: int) -> Ints:
-    """Rows from one stamp to another whose next one comes more than so long after."""
+    """Rows between two stamps whose next row comes more than ``longest_ns`` later."""
     first, last = np.searchsorted(stamps, start_ns), np.searchsorted(stamps, end_ns)
     return np.flatnonzero(np.diff(stamps[first : last + 1]) > longest_ns) + first
 
 
 @inlined
 def rows_until(stamps: Ints, instant_ns: int) -> int:
-    """Number of rows stamped at or before an instant; numpy's search takes its side as text, slow to compile."""
+    """Number of rows stamped at or before an instant (numpy's search with a side is slow to compile)."""
     low, high = 0, len(stamps)
     while low < high:
         middle = (low + high) // 2
@@ -113,7 +97,7 @@ def rows_until(stamps: Ints, instant_ns: int) -> int:
 def bracket(stamps: Ints, n: int, i: int, t: int, hold_past: bool) -> tuple[int, int, float]:
     """Rows before and after t and the share of the later, where ``stamps[i - 1] < t <= stamps[i]``.
 
-    Outside the first n rows the nearest end's value holds.
+    Outside the first n rows the nearest row holds.
     """
     if i >= n:
         return n - 1, n - 1, 0.0
@@ -124,19 +108,19 @@ def bracket(stamps: Ints, n: int, i: int, t: int, hold_past: bool) -> tuple[int,
 
 @inlined
 def value_at(stamps: Ints, values: Floats, i: int, t: int, hold_past: bool) -> Vector:
-    """Value at t, where ``stamps[i - 1] < t <= stamps[i]``; the nearest end's value outside the rows."""
+    """Value at t, where ``stamps[i - 1] < t <= stamps[i]``; that of the nearest row outside the rows."""
     return value_among(stamps, values, len(stamps), i, t, hold_past)
 
 
 @inlined
 def value_among(stamps: Ints, values: Floats, rows: int, i: int, t: int, hold_past: bool) -> Vector:
-    """The same, of the first rows only."""
+    """Value at t from the first ``rows`` rows only."""
     return between(values, *bracket(stamps, rows, i, t, hold_past))
 
 
 @inlined
 def between(values: Floats, before: int, after: int, share: float) -> Vector:
-    """Between two rows."""
+    """Linear interpolation between two rows."""
     a, b = vector(values[before]), vector(values[after])
     return plus(a, scaled(share, minus(b, a)))
 
@@ -149,7 +133,7 @@ _CLOSEST_SAMPLES_NS = 1_000_000
 
 
 def finite_vector(name: str, values: ArrayLike, size: int, kind: type[SonarGraphError] = MeasurementError) -> Floats:
-    """The values as an array; an error of this kind where they are not so many finite numbers."""
+    """The values as an array of shape (size,); raises ``kind`` where they are not finite numbers of that shape."""
     found = np.asarray(values, np.float64)
     if found.shape != (size,):
         raise kind(f"{name}: expected shape ({size},), not {found.shape}")
@@ -159,13 +143,7 @@ def finite_vector(name: str, values: ArrayLike, size: int, kind: type[SonarGraph
 
 
 def require_noise(name: str, numbers: ArrayLike, size: int) -> None:
-    """Refuse what is no standard deviation.
-
-    Raises
-    ------
-    CalibrationError
-        When the numbers are not so many, or one is negative or not finite.
-    """
+    """Raise CalibrationError where the numbers are not ``size`` finite standard deviations."""
     found = np.asarray(numbers)
     if found.dtype.kind not in "iuf" or found.shape != ((size,) if size > 1 else ()):
         raise CalibrationError(f"{name}: expected {size} number{'s' * (size > 1)}, not {numbers!r}")
@@ -174,7 +152,7 @@ def require_noise(name: str, numbers: ArrayLike, size: int) -> None:
 
 
 def require_order(start_ns: int, end_ns: int) -> None:
-    """Refuse an interval whose ends are not integers, the earlier first."""
+    """Raise MeasurementError where the ends of an interval are not integers, the earlier first."""
     for name, instant in (("start_ns", start_ns), ("end_ns", end_ns)):
         if not isinstance(instant, int | np.integer):
             raise MeasurementError(f"{name}: expected integer nanoseconds, not {instant!r}; take the stamp of a row")
@@ -183,39 +161,35 @@ def require_order(start_ns: int, end_ns: int) -> None:
 
 
 def no_doppler_stamp(name: str, instant_ns: int, stamps_ns: Ints) -> MeasurementError:
-    """That an end of an interval is not the stamp of a Doppler row, which there are, and which unit may be meant."""
+    """Error for an end of an interval that is not the stamp of a Doppler row; names the nearest and a likely unit."""
     if not len(stamps_ns):
         return MeasurementError(f"{name}: {instant_ns} is no Doppler stamp: there are no Doppler rows; add them first")
     first, last = int(stamps_ns[0]), int(stamps_ns[-1])
     nearest = int(stamps_ns[np.argmin(np.abs(stamps_ns - instant_ns))])
+    units = [unit for unit, factor in UNITS_NS.items() if instant_ns and first <= int(instant_ns) * factor <= last]
+    hint = f"; it seems to be in {units[0]}: times {UNITS_NS[units[0]]} it lies among them" if units else ""
+    if len(stamps_ns) > 1 and last - first < _CLOSEST_SAMPLES_NS * (len(stamps_ns) - 1):
+        hint = "; the stamps are so close that they seem to be in a larger unit than nanoseconds"
     return MeasurementError(
         f"{name}: {instant_ns} is none of the {len(stamps_ns)} Doppler stamps from {first} to {last} ns; take one of"
-        f" them, the nearest is {nearest}{_other_unit(int(instant_ns), stamps_ns)}"
+        f" them, the nearest is {nearest}{hint}"
     )
 
 
-def _other_unit(instant: int, stamps_ns: Ints) -> str:
-    first, last = int(stamps_ns[0]), int(stamps_ns[-1])
-    if len(stamps_ns) > 1 and last - first < _CLOSEST_SAMPLES_NS * (len(stamps_ns) - 1):
-        return "; the stamps are so close that they seem to be in a larger unit than nanoseconds"
-    for require_nanoseconds, factor in UNITS_NS.items():
-        if instant and first <= instant * factor <= last:
-            return f"; it seems to be in {require_nanoseconds}: times {factor} it lies among them"
-    return ""
-
-
 def require_distinct_stamps(name: str, stamps_ns: Ints, first: int, last: int) -> None:
-    """Refuse repeated stamps from one row to another and next to these."""
-    repeated = _repeated_row(stamps_ns, max(first - 1, 0), min(last + 2, len(stamps_ns)))
-    if repeated >= 0:
+    """Raise MeasurementError where stamps repeat between two rows or next to them."""
+    begin = max(first - 1, 0)
+    repeated = np.flatnonzero(np.diff(stamps_ns[begin : last + 2]) == 0)
+    if len(repeated):
+        row = begin + int(repeated[0])
         raise MeasurementError(
-            f"{name}.stamps_ns: rows {repeated} and {repeated + 1} are both stamped {stamps_ns[repeated]} ns; leave one"
+            f"{name}.stamps_ns: rows {row} and {row + 1} are both stamped {stamps_ns[row]} ns; leave one"
             " out: rows(numpy.unique(stamps_ns, return_index=True)[1]) keeps the first of each"
         )
 
 
 def require_nanoseconds(name: str, stamps_ns: Ints) -> None:
-    """Refuse rows so close that their stamps must be in another unit."""
+    """Raise MeasurementError where rows are so close that their stamps must be in another unit."""
     mean_ns = float(stamps_ns[-1] - stamps_ns[0]) / max(len(stamps_ns) - 1, 1)
     if len(stamps_ns) > 2 and mean_ns < _CLOSEST_ROWS_NS:
         raise MeasurementError(
@@ -225,8 +199,8 @@ def require_nanoseconds(name: str, stamps_ns: Ints) -> None:
 
 
 def require_covariances(name: str, cov: Floats, stamps_ns: Ints) -> None:
-    """Refuse what no errors can have: not symmetric, or negative in a direction; shape (n, 3, 3)."""
-    row = _impossible_row(cov)
+    """Raise MeasurementError where one of (n, 3, 3) matrices is not symmetric, or negative in a direction."""
+    row = first_impossible_covariance(cov)
     if row >= 0:
         raise MeasurementError(
             f"{name}: the row at {stamps_ns[row]} ns is no covariance: expected a symmetric matrix without negative"
@@ -235,16 +209,8 @@ def require_covariances(name: str, cov: Floats, stamps_ns: Ints) -> None:
 
 
 @compiled
-def _repeated_row(stamps_ns: Ints, first: int, end: int) -> int:
-    for row in range(first, end - 1):
-        if stamps_ns[row + 1] == stamps_ns[row]:
-            return row
-    return -1
-
-
-@compiled
-def _impossible_row(cov: Floats) -> int:
-    """By all principal minors, each relative to the size that its variances give it."""
+def first_impossible_covariance(cov: Floats) -> int:
+    """First row that is no covariance, by all principal minors relative to its variances; -1 where there is none."""
     for k in range(len(cov)):
         P = cov[k]
         determinant, scale = 0.0, P[0, 0] * P[1, 1] * P[2, 2]
@@ -263,7 +229,7 @@ def _impossible_row(cov: Floats) -> int:
 
 @compiled
 def weights_at_end(variance_m2: Floats, before_end_s: Floats, wander_m2_s: float) -> tuple[Floats, float]:
-    """Weights of the samples in the height at the end, and that height's variance.
+    """Weights of depth samples in the height at the end of an interval, and that height's variance.
 
     Parameters
     ----------
@@ -290,5 +256,5 @@ def weights_at_end(variance_m2: Floats, before_end_s: Floats, wander_m2_s: float
 
 
 def longest_interval_ns(calibration: Calibration) -> int:
-    """Between velocity samples that is no gap; held samples leave none."""
+    """Longest interval between velocity samples that is no gap; held samples leave no gap."""
     return LATEST_NS if calibration.odometry_interpolation == "hold-past" else round(calibration.dvl.gap_s * 1e9)

@@ -1,4 +1,4 @@
-"""Numerics."""
+"""Compiled functions, and vectors and matrices of three rows inside them."""
 
 # fmt: off
 from sonar_graph.numerics.jit import compiled, inlined

@@ -1,4 +1,4 @@
-"""Machine code for loops over samples and pixels."""
+"""Compilation of loops over samples and pixels to machine code, with a cache that follows changed callees."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def compiled(function: Compiled) -> Compiled:
 
 
 def inlined(function: Compiled) -> Compiled:
-    """As `compiled`, and always a part of its callers: for the steps of a loop over samples.
+    """Compile as `compiled`, and inline into every caller: for the steps of a loop over samples.
 
-    There a call that hands over tuples costs as much as the arithmetic of a step, and tuples stay in registers only
-    within one function. Elsewhere it gains nothing and costs compile time: the code of the callee is compiled in every
-    caller, and that of a function which Python calls twice, once for the call from Python.
+    In such a loop a call that passes tuples costs as much as the arithmetic of a step, and tuples stay in registers
+    only within one function. Elsewhere inlining gains nothing and costs compile time, since the code is compiled in
+    every caller.
     """
     return _compiled(function, forceinline=True)
 
@@ -49,12 +49,12 @@ def _compiled(function: Compiled, *, forceinline: bool) -> Compiled:
 
 
 def nothing_is_cached(folders: Iterable[Path]) -> bool:
-    """Whether none of the folders of sources has compiled code of any function."""
+    """True where no folder of sources has compiled code of any function."""
     return not any(any((folder / "__pycache__").glob("*.nbi")) for folder in folders)
 
 
 class _Notice(event.Listener):
-    """Says before the first compilation of a process that it takes long, where nothing is cached yet."""
+    """Logs once, before the first compilation of a process, that it takes long, where nothing is cached yet."""
 
     def __init__(self) -> None:
         self._is_first = True
@@ -67,7 +67,7 @@ class _Notice(event.Listener):
                 LOG.warning(NOTICE)
 
     def on_end(self, event: Any) -> None:
-        """Nothing is to be said then."""
+        """Required by numba; nothing to log."""
 
 
 event.register("numba:compile", _Notice())  # type: ignore[no-untyped-call]  # numba has no types

@@ -1,19 +1,10 @@
-"""Vectors of three numbers and 3 × 3 matrices as tuples, for compiled code.
+"""Vectors of three numbers and 3 × 3 matrices as tuples, and rotations, for compiled code.
 
 In machine code a tuple lives in registers. An array of nine numbers is an allocation, which costs as much as a product
-of two such matrices, and every store to it keeps the compiler from reordering what follows.
-
-Rotation arithmetic for compiled loops over samples.
-
-Poses that leave a loop are `gtsam.Pose3`; inside one, a call into another library for every IMU sample would cost more
-than the arithmetic. Equations: Forster et al., "On-Manifold Preintegration", IEEE TRO 33(1), 2017, (3), (8), (9).
-
-Attitude as roll, pitch and yaw (phi, theta, psi), and their rates.
-
-::
+of two such matrices. Rotations follow Forster et al., "On-Manifold Preintegration", IEEE TRO 33(1), 2017, (3), (8),
+(9). Euler angles are roll, pitch and yaw (phi, theta, psi)::
 
     world_R_body = Rz(psi) Ry(theta) Rx(phi)
-
     w = W (phi', theta', psi')^T        body rates from Euler rates, W = rates_from_euler
     (phi', theta', psi')^T = E w        E = W^-1; infinite at theta = +-90 degrees
 
@@ -31,7 +22,7 @@ from sonar_graph.measurements import Floats
 from sonar_graph.numerics.jit import compiled, inlined
 
 SMALL_ANGLE_RAD = 1e-4
-"""Below it the series are exact to 1e-18 relative."""
+"""Angle below which the series are exact to 1e-18 relative."""
 
 
 @compiled
@@ -80,13 +71,13 @@ IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @inlined
 def vector(a: Floats) -> Vector:
-    """From an array, shape (3,)."""
+    """A vector from an array, shape (3,)."""
     return a[0], a[1], a[2]
 
 
 @inlined
 def matrix(A: Floats) -> Matrix:
-    """From an array, shape (3, 3)."""
+    """A matrix from an array, shape (3, 3)."""
     return vector(A[0]), vector(A[1]), vector(A[2])
 
 
@@ -200,7 +191,7 @@ def symmetric(A: Matrix) -> Matrix:
 
 @inlined
 def place(A: Matrix, out: Floats, row: int, column: int) -> None:
-    """Write into a larger array."""
+    """Write A into a larger array, with its first element at (row, column)."""
     for r in range(3):
         out[row + r, column], out[row + r, column + 1], out[row + r, column + 2] = A[r]
 

@@ -140,7 +140,7 @@ def test_a_hole_of_the_imu_asks_for_nothing(hole_s: float, monkeypatch: pytest.M
     assert [finding.text() for finding in found.values() if finding.acts] == []
     assert found["DVL scale"].estimate.is_known
     assert found["reference against IMU: time offset"].estimate.is_known
-    monkeypatch.setattr("sonar_graph.navigation.alignment.dvl_imu._parts", np.zeros_like)
+    monkeypatch.setattr("sonar_graph.navigation.alignment.dvl_imu.holes_before", np.zeros_like)
     blind = by_name(check_sensors(run))
     assert blind["DVL scale"].acts == blind["reference against IMU: time offset"].acts == (hole_s > 2.0)
 

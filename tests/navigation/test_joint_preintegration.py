@@ -1,3 +1,7 @@
+"""Joint preintegration: laws of every rule, against dead reckoning in dense matrices, GTSAM and formulas."""
+
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -10,18 +14,29 @@ from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.preintegration.joint_preintegration import DISPLACEMENT, JointMotion, JointPreintegrator
+from sonar_graph.navigation.preintegration.joint_preintegration import (
+    DISPLACEMENT,
+    JointMotion,
+    JointPreintegrator,
+    with_rate_noise,
+)
 from sonar_graph.navigation.preintegration.joint_recursion import RULES
 from sonar_graph.navigation.preintegration.motion import Preintegrator
 
-from .joint_rows import ACCEL, GYRO, random_rows, step_by_step
 from .rows import NS, T0_NS, derivative, dvl, imu, stamps, waves
+from .step_by_step import ACCEL, GYRO, StepByStep, random_rows, step_by_step
+from .test_motion_laws import at
+from .vehicle import DVL, QUIET, Vehicle
 
 BIAS = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.05])
 ARM = np.array([0.3, -0.1, 0.2])
+EARTH = np.array([0.04, -0.07, 0.05])
+"""A thousand times as fast, for its sign and axes to be seen."""
+SIGMAS = (0.01, 0.02, 0.04)
 seeds = st.integers(0, 2**32 - 9)
 ours = pytest.mark.parametrize("rule", ["inertial", "linear"])
 every_rule = pytest.mark.parametrize("rule", sorted(RULES))
+others = pytest.mark.parametrize("rule", sorted(set(RULES) - {"inertial"}))
 
 
 def made(rows: tuple[Imu, Dvl], rule: str, bias=BIAS, **options) -> JointMotion:
@@ -41,17 +56,78 @@ def relative(actual: np.ndarray, expected: np.ndarray) -> float:
     return float(np.abs((actual - expected) / np.outer(sigmas, sigmas)).max())
 
 
-@every_rule
-@given(seeds)
-@settings(max_examples=5, deadline=None)
-def test_preintegration_equals_dead_reckoning(rule, seed):
-    rows = random_rows(seed)
-    motion, truth = made(rows, rule), step_by_step(*rows, rule, BIAS)
+def ends(rows: tuple[Imu, Dvl]) -> tuple[int, int]:
+    return int(rows[1].stamps_ns[0]), int(rows[1].stamps_ns[-1])
+
+
+def with_doppler(rows: tuple[Imu, Dvl], velocity: np.ndarray, cov: np.ndarray) -> tuple[Imu, Dvl]:
+    return rows[0], Dvl(rows[1].stamps_ns, velocity, np.broadcast_to(cov, (len(rows[1]), 3, 3)))
+
+
+def assert_equals(motion: JointMotion, truth: StepByStep) -> None:
+    expected = truth.covariance()
+    sigmas = np.sqrt(np.diag(expected))
     assert np.allclose(motion.i_R_j.matrix(), truth.R, atol=1e-12)
     assert np.allclose(motion.velocity, truth.v, atol=1e-11)
     assert np.allclose(motion.position, truth.p, atol=1e-11)
     assert np.allclose(motion.displacement, truth.s, atol=1e-11)
-    assert relative(motion.covariance, truth.covariance()) < 1e-9
+    assert np.allclose(motion.covariance / np.outer(sigmas, sigmas), expected / np.outer(sigmas, sigmas), atol=1e-9)
+
+
+def plain(rule: str, seed: int, earth=None, gyro=GYRO, accel=ACCEL, **rows_of) -> tuple[JointMotion, StepByStep]:
+    rows = random_rows(seed, **rows_of)
+    motion = JointPreintegrator(gyro, accel, rule=rule, longest_s=2.0).integrate(*rows, *ends(rows), BIAS, earth)
+    truth = step_by_step(*rows, rule, BIAS, np.zeros(3) if earth is None else earth, accel_density=accel)
+    return motion, truth
+
+
+def gyros_alone(rule: str) -> tuple[JointMotion, StepByStep]:
+    """No other noise hides theirs."""
+    rows = random_rows(13)
+    rows = with_doppler(rows, rows[1].velocity, np.eye(3) * 1e-20)
+    motion = JointPreintegrator(GYRO, 0.0, rule=rule).integrate(*rows, *ends(rows), BIAS)
+    return motion, step_by_step(*rows, rule, BIAS, accel_density=0.0)
+
+
+def mounted(rule: str) -> tuple[JointMotion, StepByStep]:
+    """Readings along a sensor's own axes, covariances of the calibration or the log in turn; no long interval."""
+    rows = random_rows(109)
+    body_R_imu, body_R_dvl = gtsam.Rot3.RzRyRx(0.2, -0.4, 2.0), gtsam.Rot3.RzRyRx(3.0, 0.3, 0.8)
+    A, B, cov = body_R_imu.matrix(), body_R_dvl.matrix(), np.diag(np.square(SIGMAS))
+    own = Imu(rows[0].stamps_ns, rows[0].angular_velocity @ A, rows[0].specific_force @ A)
+    said = np.where(np.arange(len(rows[1]))[:, None, None] % 2, cov, np.nan)
+    log = with_doppler(rows, rows[1].velocity @ B, said)[1]
+    known = Calibration(
+        imu=ImuCalibration(
+            gyro_noise_density=GYRO,
+            accel_noise_density=ACCEL,
+            mounting=Mounting(translation_m=(0.3, -0.1, 0.2), rpy_rad=(0.2, -0.4, 2.0)),
+        ),
+        dvl=DvlCalibration(
+            velocity_sigma_m_s=SIGMAS, mounting=Mounting(translation_m=(-0.2, 0.1, 0.4), rpy_rad=(3.0, 0.3, 0.8))
+        ),
+    )
+    motion = JointPreintegrator.from_calibration(known, rule).integrate(own, log, *ends(rows), BIAS, EARTH)
+    assert motion.body_p_imu == pytest.approx((0.3, -0.1, 0.2))
+    assert motion.body_p_dvl == pytest.approx((-0.2, 0.1, 0.4))
+    return motion, step_by_step(*with_doppler(rows, rows[1].velocity, B @ cov @ B.T), rule, BIAS, EARTH)
+
+
+CASES = {
+    "slow": lambda rule: plain(rule, 4),
+    "slow, other rows": lambda rule: plain(rule, 2**31),
+    "eastward Earth": lambda rule: plain(rule, 11, EARTH),
+    "westward Earth": lambda rule: plain(rule, 11, -EARTH),
+    "steps of up to 0.4 rad": lambda rule: plain(rule, 12, turn_rad_s=20.0),
+    "gyros alone": gyros_alone,
+    "sensors at an angle": mounted,
+}
+
+
+@every_rule
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_joint_motion_is_dead_reckoning_in_dense_matrices(rule, case):
+    assert_equals(*case(rule))
 
 
 @every_rule
@@ -224,20 +300,53 @@ def steady(unit_ns: int = 1) -> tuple[Imu, Dvl]:
 
 
 @pytest.mark.parametrize(
-    ("unit_ns", "ends", "message"),
+    ("mistake", "message"),
     [
-        (1, (0.0, 1.0), "start_ns: expected integer nanoseconds, not 0.0"),
-        (1, (0, 1), "it seems to be in seconds: times 1000000000"),
-        (1, (0, 1500), "it seems to be in milliseconds: times 1000000 "),
-        (1, (0, 2_100_000), "it seems to be in microseconds: times 1000 "),
-        (1000, (0, NS), "they seem to be in a larger unit than nanoseconds"),
-        (1000, (0, NS // 1000), r"Imu.stamps_ns: 2003 rows are 5e\+03 ns apart"),
-        (NS // 1000, (0, 1000), r"Imu.stamps_ns: 2003 rows are 5 ns apart"),
+        ({"ends": (0.0, 1.0)}, "start_ns: expected integer nanoseconds, not 0.0"),
+        ({"ends": (0, 1)}, "it seems to be in seconds: times 1000000000"),
+        ({"ends": (0, 1500)}, "it seems to be in milliseconds: times 1000000 "),
+        ({"ends": (0, 2_100_000)}, "it seems to be in microseconds: times 1000 "),
+        ({"unit_ns": 1000}, "they seem to be in a larger unit than nanoseconds"),
+        ({"unit_ns": 1000, "ends": (0, NS // 1000)}, r"Imu.stamps_ns: 2003 rows are 5e\+03 ns apart"),
+        ({"unit_ns": NS // 1000, "ends": (0, 1000)}, r"Imu.stamps_ns: 2003 rows are 5 ns apart"),
+        ({"bias": np.zeros(3)}, r"bias: expected shape \(6,\), not \(3,\)"),
+        ({"bias": [0, 0, np.nan, 0, 0, 0]}, "bias: expected finite"),
+        ({"earth_rate": np.zeros(2)}, r"earth_rate: expected shape \(3,\)"),
+        ({"swapped": True}, "expected Imu and Dvl, not Dvl and Imu"),
+        ({"rate": 1e200}, "the motion is not finite"),
+        ({"velocity": 1e308}, "the motion is not finite"),
+        ({"cov": -np.eye(3)}, r"Dvl\.velocity_cov: the row at 0 ns is no covariance"),
+        ({"cov": [[1, 5, 0], [0, 1, 0], [0, 0, 1]]}, r"Dvl\.velocity_cov: the row at 0 ns is no covariance"),
     ],
 )
-def test_another_unit_of_time_is_named(unit_ns, ends, message):
+def test_mistakes_in_a_motion_are_named(mistake, message):
+    mistake = dict(mistake)
+    ends = mistake.pop("ends", (0, NS))
+    inertial, doppler = steady(mistake.pop("unit_ns", 1))
+    inertial = imu(inertial.stamps_ns, mistake.pop("rate", [0, 0, 0.1]))
+    doppler = dvl(doppler.stamps_ns, mistake.pop("velocity", [0.5, 0, 0]), mistake.pop("cov", np.nan))
+    blocks = (doppler, inertial) if mistake.pop("swapped", False) else (inertial, doppler)
     with pytest.raises(MeasurementError, match=message):
-        JointPreintegrator(GYRO, ACCEL).integrate(*steady(unit_ns), *ends)
+        JointPreintegrator(GYRO, ACCEL).integrate(*blocks, *ends, **mistake)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"gyro_noise_density": -1e-4}, "gyro_noise_density: expected finite numbers of zero or more"),
+        ({"gyro_noise_density": np.nan}, "gyro_noise_density: expected finite"),
+        ({"gyro_noise_density": "1e-4"}, "gyro_noise_density: expected 1 number, not '1e-4'"),
+        ({"accel_noise_density": np.inf}, "accel_noise_density: expected finite"),
+        ({"velocity_sigma_m_s": (0.01, -0.01, 0.01)}, "velocity_sigma_m_s: expected finite"),
+        ({"velocity_sigma_m_s": 0.01}, "velocity_sigma_m_s: expected 3 numbers, not 0.01"),
+        ({"rule": "zoh"}, "rule: there is no 'zoh'; there are inertial, linear"),
+        ({"body_T_dvl": np.eye(4)}, "body_T_dvl: expected a gtsam.Pose3, not ndarray"),
+        ({"body_T_imu": (0.1, 0.0, 0.0)}, "body_T_imu: expected a gtsam.Pose3, not tuple"),
+    ],
+)
+def test_impossible_sensors_are_refused(options, message):
+    with pytest.raises(CalibrationError, match=message):
+        JointPreintegrator(**{"gyro_noise_density": GYRO, "accel_noise_density": ACCEL} | options)
 
 
 @pytest.mark.parametrize("row", [0, 3, 5])
@@ -263,43 +372,6 @@ def test_repeated_inertial_stamps_are_refused_at_the_ends_too(row):
     preintegrator.integrate(twice, doppler, 2 * NS, 3 * NS)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"gyro_noise_density": -1e-4}, "gyro_noise_density: expected finite numbers of zero or more"),
-        ({"gyro_noise_density": np.nan}, "gyro_noise_density: expected finite"),
-        ({"gyro_noise_density": "1e-4"}, "gyro_noise_density: expected 1 number, not '1e-4'"),
-        ({"accel_noise_density": np.inf}, "accel_noise_density: expected finite"),
-        ({"velocity_sigma_m_s": (0.01, -0.01, 0.01)}, "velocity_sigma_m_s: expected finite"),
-        ({"velocity_sigma_m_s": 0.01}, "velocity_sigma_m_s: expected 3 numbers, not 0.01"),
-        ({"rule": "zoh"}, "rule: there is no 'zoh'; there are inertial, linear"),
-        ({"body_T_dvl": np.eye(4)}, "body_T_dvl: expected a gtsam.Pose3, not ndarray"),
-        ({"body_T_imu": (0.1, 0.0, 0.0)}, "body_T_imu: expected a gtsam.Pose3, not tuple"),
-    ],
-)
-def test_impossible_sensors_are_refused(options, message):
-    with pytest.raises(CalibrationError, match=message):
-        JointPreintegrator(**{"gyro_noise_density": GYRO, "accel_noise_density": ACCEL} | options)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"bias": np.zeros(3)}, r"bias: expected shape \(6,\), not \(3,\)"),
-        ({"bias": [0, 0, np.nan, 0, 0, 0]}, "bias: expected finite"),
-        ({"earth_rate": np.zeros(2)}, r"earth_rate: expected shape \(3,\)"),
-    ],
-)
-def test_vectors_of_another_shape_are_refused(options, message):
-    with pytest.raises(MeasurementError, match=message):
-        JointPreintegrator(GYRO, ACCEL).integrate(*steady(), 0, NS, **options)
-
-
-def test_swapped_blocks_are_refused():
-    with pytest.raises(MeasurementError, match="expected Imu and Dvl, not Dvl and Imu"):
-        JointPreintegrator(GYRO, ACCEL).integrate(*steady()[::-1], 0, NS)
-
-
 @given(arrays.arrays(np.float64, (3, 3), elements=st.floats(-1, 1)), st.integers(1, 3))
 @settings(max_examples=60)
 def test_covariances_are_refused_exactly_where_an_eigenvalue_is_negative(A, rank):
@@ -322,13 +394,6 @@ def test_covariances_are_refused_exactly_where_an_eigenvalue_is_negative(A, rank
             JointPreintegrator(GYRO, ACCEL).integrate(*rows, 0, NS)
 
 
-@pytest.mark.parametrize("cov", [-np.eye(3), [[1, 5, 0], [0, 1, 0], [0, 0, 1]], [[1, 0, 0], [0, 1, 2], [0, 2, 1]]])
-def test_what_is_no_covariance_is_refused(cov):
-    inertial, doppler = steady()
-    with pytest.raises(MeasurementError, match=r"Dvl\.velocity_cov: the row at 0 ns is no covariance"):
-        JointPreintegrator(GYRO, ACCEL).integrate(inertial, dvl(doppler.stamps_ns, 0.0, cov), 0, NS)
-
-
 def test_a_chain_takes_only_the_motion_that_ends_where_the_next_begins():
     rows, preintegrator = steady(), JointPreintegrator(GYRO, ACCEL)
     first, second, third = (preintegrator.integrate(*rows, k * NS, (k + 1) * NS) for k in range(3))
@@ -336,26 +401,6 @@ def test_a_chain_takes_only_the_motion_that_ends_where_the_next_begins():
         with pytest.raises(MeasurementError, match=rf"ends at {before.end_ns} ns, this motion begins at"):
             later.after(before)
     assert np.array_equal(second.after(first).after(first).covariance, second.after(first).covariance)
-
-
-def test_motion_beyond_all_bounds_is_refused():
-    inertial, doppler = steady()
-    for rows in (
-        (imu(inertial.stamps_ns, 1e200), doppler),
-        (inertial, dvl(doppler.stamps_ns, 1e308)),
-    ):
-        with pytest.raises(MeasurementError, match="the motion is not finite"):
-            JointPreintegrator(GYRO, ACCEL).integrate(*rows, 0, NS)
-
-
-def test_longer_blocks_change_nothing():
-    rows = random_rows(7)
-    at = rows[1].stamps_ns
-    preintegrator = JointPreintegrator(GYRO, ACCEL)
-    part = rows[0].between(int(at[2]) - NS // 20, int(at[5]) + NS // 20), rows[1].rows(slice(2, 6))
-    a, b = (preintegrator.integrate(*r, int(at[2]), int(at[5]), BIAS) for r in (rows, part))
-    assert np.array_equal(a.displacement, b.displacement)
-    assert np.array_equal(a.covariance, b.covariance)
 
 
 @pytest.mark.parametrize("unmeasured", [UNMEASURED_M_S**2, np.inf])
@@ -372,3 +417,126 @@ def test_rows_of_few_beams_are_refused_within_the_motion_only(unmeasured):
     preintegrator.integrate(inertial, partial, int(at[0]), int(at[2]))
     left_out = partial.rows(np.delete(np.arange(len(at)), 3))
     preintegrator.integrate(inertial, left_out, int(at[0]), int(at[5]))
+
+
+QUICK_HZ, LONG_SIGMA = 100.0, 0.003
+BODY_T_IMU, BODY_T_DVL = QUIET.mounting.pose(), DVL.mounting.pose()
+SENSORS = JointPreintegrator(2e-4, 1e-4, (LONG_SIGMA,) * 3, BODY_T_IMU, BODY_T_DVL)
+
+
+def apart(*doppler_s: float) -> tuple[Imu, Dvl]:
+    vehicle = Vehicle()
+    dvl_ns = T0_NS + np.round(np.array(doppler_s) * NS).astype(np.int64)
+    return vehicle.imu(stamps(QUICK_HZ, doppler_s[-1] + 0.1)), vehicle.dvl(dvl_ns)
+
+
+def whole(
+    samples: tuple[Imu, Dvl], sensors: JointPreintegrator = SENSORS, bias: np.ndarray | None = None
+) -> JointMotion:
+    return sensors.integrate(*samples, *ends(samples), bias)
+
+
+@pytest.mark.parametrize("doppler_s", [(6.0, 11.0), (6.0, 36.0), (5.8, 6.0, 16.0, 16.2, 36.0), (6.0, 16.0, 26.0, 26.5)])
+def test_a_vehicle_that_turns_is_where_it_is_however_far_the_samples_are_apart(doppler_s):
+    """The log swings about the IMU; as if it did not, the way is wrong by a centimetre to a metre."""
+    motion = whole(apart(*doppler_s))
+    truth = Vehicle().displacement(doppler_s[0], doppler_s[-1])
+    assert motion.relative_pose().i_T_j.translation() == pytest.approx(truth, abs=1e-3)
+    at_one_point = JointPreintegrator(0.0, 0.0, body_T_dvl=gtsam.Pose3(BODY_T_DVL.rotation(), np.zeros(3)))
+    swung = BODY_T_DVL.translation() - motion.i_R_j.matrix() @ BODY_T_DVL.translation()
+    wrong = whole(apart(*doppler_s), at_one_point).displacement + swung - truth
+    assert np.linalg.norm(wrong) > 0.01
+
+
+@pytest.mark.parametrize("doppler_s", [(6.0, 16.0), (6.0, 7.0, 8.0, 9.0, 10.0)])
+def test_covariance_over_long_intervals_is_that_of_many_noisy_runs(doppler_s):
+    """With gyros as poor as those of a phone, and a long arm: their noise at the ends counts as the samples' does."""
+    inertial, doppler = apart(*doppler_s)
+    far = gtsam.Pose3(BODY_T_IMU.rotation(), BODY_T_IMU.translation() + np.array([0.0, 0.7, 0.0]))
+    sensors = JointPreintegrator(1e-3, 1e-4, (LONG_SIGMA,) * 3, far, BODY_T_DVL)
+    exact, rng, squares = whole((inertial, doppler), sensors), np.random.default_rng(3), []
+    P = exact.covariance[DISPLACEMENT, DISPLACEMENT]
+    for _ in range(400):
+        noise = rng.standard_normal((2, len(inertial), 3)) * np.sqrt(QUICK_HZ)
+        rate, force = inertial.angular_velocity + 1e-3 * noise[0], inertial.specific_force + 1e-4 * noise[1]
+        velocity = doppler.velocity + LONG_SIGMA * rng.standard_normal(doppler.velocity.shape)
+        noisy = Imu(inertial.stamps_ns, rate, force), Dvl(doppler.stamps_ns, velocity, doppler.velocity_cov)
+        error = whole(noisy, sensors).displacement - exact.displacement
+        squares.append(error @ np.linalg.solve(P, error))
+    assert 0.87 < np.mean(squares) / 3 < 1.13
+
+
+def test_noise_of_the_rate_is_across_the_arm_at_the_ends_of_long_intervals_alone():
+    dvl_ns, arm = apart(0.0, 0.2, 0.4, 2.0, 2.2)[1].stamps_ns, np.array([2.0, 0.0, 0.0])
+    cov = with_rate_noise(np.zeros((5, 3, 3)), dvl_ns, stamps(QUICK_HZ, 3.0), 1e-3, arm)
+    expected = (2e-3) ** 2 * QUICK_HZ * np.diag([0.0, 1.0, 1.0])
+    assert np.allclose(cov, [0 * expected, 0 * expected, expected, expected, 0 * expected], atol=1e-18)
+
+
+def test_a_chain_over_long_intervals_has_the_displacement_of_the_whole():
+    samples = apart(6.0, 7.0, 9.0, 9.2, 12.0)
+    first, second = (SENSORS.integrate(*samples, at(a), at(b)) for a, b in ((6.0, 9.0), (9.0, 12.0)))
+    chained = first.displacement + first.i_R_j.matrix() @ second.displacement
+    assert chained == pytest.approx(whole(samples).displacement, abs=1e-9)
+
+
+def test_an_unknown_accelerometer_bias_counts_in_the_relative_pose():
+    """As much as integrating with another bias on each axis moves it; over short intervals it hardly does."""
+    sigma, exact = 5e-3, whole(apart(6.0, 16.0))
+    plain, counted = exact.relative_pose(), exact.relative_pose(accel_bias_sigma=sigma)
+    moved = [
+        whole(apart(6.0, 16.0), bias=np.r_[0, 0, 0, sigma * axis]).relative_pose().i_T_j.translation()
+        for axis in np.eye(3)
+    ]
+    offsets = np.column_stack([exact.i_R_j.unrotate(m - plain.i_T_j.translation()) for m in moved])
+    expected = np.zeros((6, 6))
+    expected[3:, 3:] = offsets @ offsets.T
+    assert np.allclose(counted.covariance - plain.covariance, expected, rtol=1e-3, atol=1e-9)
+    assert np.sqrt(np.trace(expected)) > 0.05
+    short = whole(apart(*np.arange(6.0, 16.1, 0.2)))
+    added = np.trace(short.relative_pose(sigma).covariance - short.relative_pose().covariance)
+    assert added < 1e-4 * np.trace(short.relative_pose().covariance[3:, 3:])
+
+
+@others
+def test_rules_that_know_nothing_of_a_gap_refuse_it(rule):
+    samples = apart(6.0, 6.2, 8.0, 8.2)
+    sensors = JointPreintegrator(2e-4, 1e-4, rule=rule)
+    with pytest.raises(MeasurementError, match=rf"no row for 1.8 s after {at(6.2)} ns.*longest_s \(1.5 s\).*inertial"):
+        whole(samples, sensors)
+    sensors.integrate(*samples, at(6.0), at(6.2))
+    whole(samples, replace(sensors, longest_s=1.9))
+    whole(samples)
+
+
+def turning(rate: np.ndarray, arm: tuple[float, float, float]) -> tuple[Imu, Dvl, JointPreintegrator]:
+    """Nothing but rates, 20 Hz, and Doppler samples of zero at 0, 4 and 7 s."""
+    inertial_ns, doppler_ns = stamps(20.0, 7.0), T0_NS + np.array([0, 4, 7]) * NS
+    log = Dvl(doppler_ns, np.zeros((3, 3)), np.zeros((3, 3, 3)))
+    sensors = JointPreintegrator(1e-3, 0.0, body_T_dvl=gtsam.Pose3(gtsam.Rot3(), np.array(arm)))
+    return Imu(inertial_ns, rate * np.ones((len(inertial_ns), 3)), np.zeros((len(inertial_ns), 3))), log, sensors
+
+
+def test_gyro_noise_spreads_the_swing_about_the_imu_as_noise_of_every_row_does():
+    """Row by row by differences; to a tenth, since what a rate and the attitude share at an end is not counted."""
+    inertial, log, sensors = turning(np.array([0.1, -0.2, 0.8]), (1.0, 0.2, -0.3))
+    exact, expected = whole((inertial, log), sensors), np.zeros((3, 3))
+    for row in range(len(inertial)):
+        for axis in range(3):
+            rate = inertial.angular_velocity.copy()
+            rate[row, axis] += 1e-6
+            moved = whole((Imu(inertial.stamps_ns, rate, inertial.specific_force), log), sensors)
+            J = (moved.displacement - exact.displacement) / 1e-6
+            expected += np.outer(J, J) * sensors.gyro_noise_density**2 * 20.0
+    sigmas = np.sqrt(np.diag(expected))
+    off = (exact.covariance[DISPLACEMENT, DISPLACEMENT] - expected) / np.outer(sigmas, sigmas)
+    assert np.abs(off).max() < 0.1
+
+
+def test_earths_rotation_swings_no_doppler_log():
+    """At rest on the Earth gyros read its rate, and the log stays where it is."""
+    earth = np.array([0.04, -0.07, 0.05])
+    inertial, log, sensors = turning(earth, (1.0, 0.2, -0.3))
+    ends = int(log.stamps_ns[0]), int(log.stamps_ns[-1])
+    still = sensors.integrate(inertial, log, *ends, earth_rate=earth)
+    assert np.abs(still.displacement).max() < 1e-12

@@ -1,22 +1,35 @@
+"""Odometry: nodes and steps by stamps alone, running motion, motion between any two instants."""
+
 from itertools import pairwise
 
+import gtsam
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.calibration import ROWS_BEFORE, Calibration, DvlCalibration
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.preintegration.motion import Preintegrator
+from sonar_graph.navigation.odometry import (
+    Odometry,
+    RunningMotion,
+    motion_between,
+    motion_between_nodes,
+    motion_since_node,
+)
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion, Preintegrator
 from sonar_graph.navigation.preintegration.recursion import Steps
-from sonar_graph.states import Refusal
+from sonar_graph.navigation.samples import longest_interval_ns
 
-from .rows import NS, T0_NS, dvl, imu, stamps, waves
+from . import test_motion_laws as tumbling
+from . import vehicle
+from .rows import NS, T0_NS, dvl, imu, part, random_steps, stamps, waves
+from .test_motion_laws import at
+from .vehicle import DVL, FOUND_S, LOST_S, NOISY, QUIET, Vehicle
 
-SECONDS = 3.0
+SECONDS, ZERO = 3.0, np.zeros(3)
+HELD = Calibration(odometry_interpolation="hold-past")
 
 
 def recorded(
@@ -76,45 +89,6 @@ def test_later_rows_change_nothing(offset_ns):
     )
 
 
-def test_provisional_motion_holds_the_newest_rows_until_the_instant():
-    imu_ns, dvl_ns = T0_NS + np.array([0, 10, 20]) * NS // 10, T0_NS + np.array([5, 15, 25]) * NS // 10
-    odometry = odometry_of(
-        imu(imu_ns, [[0, 0, 1], [0, 0, 2], [0, 0, 9]]), dvl(dvl_ns, [[0.1, 0, 0], [0.3, 0, 0], [0.9, 0, 0]])
-    )
-    steps = odometry.steps_since_node(int(dvl_ns[0]), int(imu_ns[1]) + NS * 4 // 10)
-    assert steps.duration_s == pytest.approx([0.5, 0.4])
-    assert steps.rate[:, 2] == pytest.approx([1.75, 2.0])
-    assert steps.velocity[:, 0] == pytest.approx([0.1, 0.1])
-
-
-@pytest.mark.parametrize("imu_offset_s", [0.0, 0.004, 0.0095])
-def test_interpolation_is_exact_for_piecewise_linear_truth(imu_offset_s):
-    """Rate and velocity are a t and v t: the angle is a t^2 / 2, and straight on, the way v t^2 / 2."""
-    imu_ns, dvl_ns = stamps(100, 2.2, imu_offset_s - 0.1), stamps(5, 2.0)
-    t_imu, t_dvl = (imu_ns - T0_NS) * 1e-9, (dvl_ns - T0_NS) * 1e-9
-    odometry = odometry_of(
-        imu(imu_ns, np.outer(t_imu, [0.0, 0.0, 0.4])), dvl(dvl_ns, np.outer(t_dvl, [0.3, -0.2, 0.1]))
-    )
-    until = T0_NS + 2 * NS
-    steps = odometry.steps_between_nodes(T0_NS, until)
-    assert steps.duration_s.sum() == pytest.approx(2.0)
-    assert (steps.duration_s[:, None] * steps.rate).sum(0) == pytest.approx([0, 0, 0.8])
-    assert (steps.duration_s[:, None] * steps.velocity).sum(0) == pytest.approx([0.6, -0.4, 0.2])
-
-
-def test_a_held_sample_is_the_mean_over_the_interval_that_ends_at_its_stamp():
-    calibration = Calibration(odometry_interpolation="hold-past")
-    at = T0_NS + np.array([0, 2, 3, 7]) * NS
-    odometry = odometry_of(
-        imu(at, np.outer([9, 1, 2, 3], [0, 0, 1.0])), dvl(at, np.outer([9, 4, 5, 6], [1.0, 0, 0])), calibration
-    )
-    steps = odometry.steps_between_nodes(T0_NS, T0_NS + 7 * NS)
-    assert steps.duration_s == pytest.approx([2, 1, 4])
-    assert steps.rate[:, 2] == pytest.approx([1, 2, 3])
-    assert steps.velocity[:, 0] == pytest.approx([4, 5, 6])
-    assert odometry.velocity_at_node(T0_NS + 3 * NS)[2] == pytest.approx([0, 0, 2])
-
-
 def test_velocity_at_a_node_is_its_row_and_the_rate_in_between():
     imu_rows, dvl_rows = recorded()
     odometry, k = odometry_of(imu_rows, dvl_rows), 5
@@ -143,18 +117,6 @@ def test_there_is_no_start_before_imu_rows_cover_a_node():
     assert odometry_of(imu(stamps(10, 1, 5.0), 0.0), dvl(stamps(10, 1), 0.0)).start_ns() is None
     assert odometry_of(imu(stamps(10, 1), 0.0), dvl(stamps(10, 1, -0.33), 0.0)).start_ns() == T0_NS + 70_000_000
     assert odometry_of(imu(stamps(10, 1), 0.0), dvl(stamps(10, 1, 1.0), 0.0)).start_ns() == T0_NS + NS
-
-
-def test_rows_are_late_once_their_motion_is_settled():
-    imu_rows, dvl_rows = recorded()
-    odometry = odometry_of(imu_rows, dvl_rows)
-    odometry.settle(int(dvl_rows.stamps_ns[-1]))
-    first, last = (int(odometry.nodes(0, T0_NS + 10 * NS)[k]) for k in (0, -1))
-    before = odometry.steps_between_nodes(first, last)
-    odometry.add(imu(imu_rows.stamps_ns[3:9] + 7, 99.0), dvl(dvl_rows.stamps_ns[:4] + 7, 99.0))
-    assert same_steps(odometry.steps_between_nodes(first, last), before)
-    assert [row.sensor for row in odometry.refused] == ["imu"] * 6 + ["dvl"] * 4
-    assert {row.reason for row in odometry.refused} == {Refusal.LATE}
 
 
 @given(st.permutations(range(12)))
@@ -187,42 +149,6 @@ def test_forgetting_changes_nothing_afterwards(calibration):
     assert len(forgetful.columns()[0]) < len(full.columns()[0]) / 1.5
 
 
-def test_unmeasured_forces_pass_through():
-    imu_rows, dvl_rows = recorded()
-    force = imu_rows.specific_force.copy()
-    force[70:80] = np.nan
-    odometry = odometry_of(Imu(imu_rows.stamps_ns, imu_rows.angular_velocity, force), dvl_rows)
-    nodes = odometry.nodes(0, T0_NS + 10 * NS)
-    steps = odometry.steps_between_nodes(int(nodes[0]), int(nodes[-1]))
-    unmeasured = np.isnan(steps.specific_force).all(axis=1)
-    assert 0 < unmeasured.sum() < len(steps) / 4
-    assert np.isfinite(steps.rate).all()
-    assert np.isfinite(steps.velocity).all()
-
-
-def test_rows_are_turned_into_the_body_by_the_mountings():
-    imu_rpy, dvl_rpy = (0.3, -0.2, 1.0), (0.1, 0.4, -0.8)
-    calibration = Calibration(
-        imu=ImuCalibration(mounting=Mounting(rpy_rad=imu_rpy)),
-        dvl=DvlCalibration(mounting=Mounting(rpy_rad=dvl_rpy), velocity_sigma_m_s=(0.01, 0.02, 0.03)),
-    )
-    body_R_imu, body_R_dvl = (Rotation.from_euler("xyz", rpy).as_matrix() for rpy in (imu_rpy, dvl_rpy))
-    at, rate, force, velocity = stamps(10, 0.2), np.array([1.0, 2, 3]), np.array([4.0, 5, 6]), np.array([0.7, 0.8, 0.9])
-    steps = odometry_of(imu(at, rate, force), dvl(at, velocity), calibration).steps_between_nodes(at[0], at[-1])
-    assert np.allclose(steps.rate, body_R_imu @ rate)
-    assert np.allclose(steps.specific_force, body_R_imu @ force)
-    assert np.allclose(steps.velocity, body_R_dvl @ velocity)
-    assert np.allclose(steps.velocity_psd, 0.1 * body_R_dvl @ np.diag([1e-4, 4e-4, 9e-4]) @ body_R_dvl.T)
-
-
-def test_a_covariance_in_the_log_goes_before_that_of_the_calibration():
-    at = stamps(10, 0.2)
-    cov = np.stack([np.full((3, 3), np.nan), np.eye(3) * 4e-4, np.eye(3) * 4e-4])
-    calibration = Calibration(dvl=DvlCalibration(velocity_sigma_m_s=(0.1, 0.1, 0.1)))
-    steps = odometry_of(imu(at, 0.0), dvl(at, 0.0, cov), calibration).steps_between_nodes(at[0], at[-1])
-    assert steps.velocity_psd[:, 0, 0] == pytest.approx([0.1 * (1e-2 + 4e-4) / 2, 0.1 * 4e-4])
-
-
 def displacement_variance(odometry: Odometry, nodes: list[int]) -> float:
     """Along x, over a chain of intervals, each preintegrated on its own."""
     still_gyro = Preintegrator(0.0, np.zeros(3))
@@ -245,14 +171,6 @@ def test_a_chain_has_the_variance_of_its_doppler_samples(intervals_s, seed):
     assert displacement_variance(odometry, at.tolist()) == pytest.approx(true + excess, rel=1e-6)
 
 
-def test_a_long_regular_chain_has_the_variance_of_its_doppler_samples():
-    """No more than half a sample too much: weight^2 times variance for all but the ends."""
-    at, sigma, interval_s = stamps(10, 20.0), 0.02, 0.1
-    odometry = odometry_of(imu(at, 0.0), dvl(at, 0.0, sigma**2 * np.eye(3)))
-    true = (len(at) - 1.5) * (interval_s * sigma) ** 2
-    assert true < displacement_variance(odometry, at.tolist()) < 1.003 * true
-
-
 def test_the_weight_of_a_doppler_sample_is_half_its_two_intervals():
     at = T0_NS + np.array([0, 100, 350, 400, 700]) * 1_000_000
     weights = []
@@ -271,81 +189,340 @@ def test_velocity_noise_does_not_depend_on_where_the_imu_cuts():
     assert displacement_variance(fine, at.tolist()) == pytest.approx(displacement_variance(coarse, at.tolist()))
 
 
-@pytest.mark.parametrize("sensor", ["imu", "dvl"])
-def test_a_repeated_stamp_counts_once(sensor):
-    """Drivers do repeat rows; the first of equal stamps holds."""
-    imu_rows, dvl_rows = recorded()
-    rows = {"imu": imu_rows, "dvl": dvl_rows}
-    rows[sensor] = rows[sensor].rows(
-        np.repeat(np.arange(len(rows[sensor])), np.where(np.arange(len(rows[sensor])) == 8, 2, 1))
-    )
-    repeated = odometry_of(rows["imu"], rows["dvl"])
-    plain = odometry_of(imu_rows, dvl_rows)
-    nodes = plain.nodes(0, T0_NS + 10 * NS)
-    assert np.array_equal(repeated.nodes(0, T0_NS + 10 * NS), nodes)
-    first, last = int(nodes[0]), int(nodes[-1])
-    assert same_steps(repeated.steps_between_nodes(first, last), plain.steps_between_nodes(first, last))
-
-
 @pytest.mark.parametrize(
-    ("start", "end", "message"),
+    ("steps", "start_s", "end_s", "message"),
     [
-        (0.0, 900.0, r"end_ns: \d+ is none of the 21 Doppler stamps from \d+ to \d+ ns"),
-        (0.05, 1.0, r"start_ns: \d+ is none of the 21"),
-        (0.5, 1.02, rf"end_ns: \d+ is none of the 21 .* nearest is {T0_NS + NS}$"),
-        (1.0, 0.2, "before its start"),
-        (0.0, 2.0, r"IMU rows \(from .*\) do not cover"),
-        (0.0, 0.3, None),
-        (0.1, 0.1, None),
+        ("steps_between_nodes", 0.2, 900.0, r"end_ns: \d+ is none of the 21 Doppler stamps from \d+ to \d+ ns"),
+        ("steps_between_nodes", 0.25, 1.0, r"start_ns: \d+ is none of the 21"),
+        ("steps_between_nodes", 0.25, 0.25, r"start_ns: \d+ is none of the 21"),
+        ("steps_between_nodes", 0.5, 1.02, rf"end_ns: \d+ is none of the 21 .* nearest is {T0_NS + NS}$"),
+        ("steps_between_nodes", 1.0, 0.2, "before its start"),
+        ("steps_between_nodes", 0.2, 2.0, r"IMU rows \(from .*\) do not cover"),
+        ("steps_between_nodes", 0.2, 0.3, None),
+        ("steps_between_nodes", 0.2, 0.2, None),
+        ("steps_since_node", 0.25, 0.4, r"node_ns: \d+ is none of the 21"),
+        ("steps_since_node", 0.1, 0.4, r"IMU rows \(from .*\) do not cover"),
+        ("steps_since_node", 1.7, 1.8, r"IMU rows \(from .*\) do not cover"),
+        ("steps_since_node", 0.5, 0.4, "before its start"),
+        ("steps_since_node", 0.2, 0.25, None),
+        ("steps_since_node", 0.2, 0.2, None),
+        ("steps_to_node", 0.42, 1.0, None),
+        ("steps_to_node", 0.15, 0.2, None),
+        ("steps_to_node", 1.0, 1.0, None),
+        ("steps_to_node", 0.02, 1.0, "lies before the rows"),
+        ("steps_to_node", 1.000001, 1.0, "before its start"),
+        ("steps_to_node", 0.42, 1.02, "node_ns: .* is none of the 21"),
     ],
 )
-def test_only_covered_nodes_bound_final_motion(start, end, message):
+def test_only_covered_nodes_bound_motion(steps, start_s, end_s, message):
     """Far outside the rows a motion was of millions of metres."""
-    odometry = odometry_of(imu(stamps(50, 1.5), 0.0), dvl(stamps(10, 2.0), [0.5, 0, 0]))
-    ends = [T0_NS + round(t * NS) for t in (start, end)]
+    odometry = odometry_of(imu(stamps(50, 1.35, 0.15), 0.0), dvl(stamps(10, 2.0), [0.5, 0, 0]))
+    between = getattr(odometry, steps)
     if message is None:
-        assert odometry.steps_between_nodes(*ends).duration_s.sum() == pytest.approx(end - start)
+        assert between(at(start_s), at(end_s)).duration_s.sum() == pytest.approx(end_s - start_s)
     else:
         with pytest.raises(MeasurementError, match=message):
-            odometry.steps_between_nodes(*ends)
+            between(at(start_s), at(end_s))
 
 
-def test_provisional_motion_begins_at_a_covered_node():
-    odometry = odometry_of(imu(stamps(50, 1.5, 0.15), 0.0), dvl(stamps(10, 3.0), [0.5, 0, 0]))
-    for node, until, message in (
-        (0.25, 0.4, r"node_ns: \d+ is none of the 31"),
-        (0.1, 0.4, r"IMU rows \(from .*\) do not cover"),
-        (1.7, 1.8, r"IMU rows \(from .*\) do not cover"),
-        (0.5, 0.4, "before its start"),
+def test_rows_that_are_missing_or_of_another_kind_are_named():
+    imu_rows, dvl_rows = recorded()
+    for blocks, message in (
+        ((dvl_rows, imu_rows), "expected Imu and Dvl, not Dvl and Imu"),
+        ((None, imu_rows), "expected Imu and Dvl, not NoneType and Imu"),
+        ((None, "rows"), "expected Imu and Dvl, not NoneType and str"),
     ):
         with pytest.raises(MeasurementError, match=message):
-            odometry.steps_since_node(T0_NS + round(node * NS), T0_NS + round(until * NS))
-    assert odometry.steps_since_node(T0_NS + NS // 5, T0_NS + NS // 4).duration_s.sum() == pytest.approx(0.05)
-    with pytest.raises(MeasurementError, match="is none of the 31"):
-        odometry.velocity_at_node(T0_NS + 1)
-
-
-def test_motion_to_a_node_begins_at_any_instant_among_the_rows():
-    odometry = odometry_of(imu(stamps(50, 3.0), 0.0), dvl(stamps(10, 2.0, 0.05), [0.5, 0, 0]))
-    since, node = (T0_NS + round(t * NS) for t in (0.42, 1.05))
-    assert odometry.steps_to_node(since, node).duration_s.sum() == pytest.approx(0.63)
-    for ends, message in (
-        ((T0_NS + NS // 50, node), "lies before the rows"),
-        ((node + 1, node), "before its start"),
-        ((since, node + 1), "node_ns: .* is none of the 21"),
-    ):
-        with pytest.raises(MeasurementError, match=message):
-            odometry.steps_to_node(*ends)
-
-
-def test_without_rows_there_is_no_motion():
+            Odometry(Calibration()).add(*blocks)
     with pytest.raises(MeasurementError, match="there are no Doppler rows; add them first"):
         Odometry(Calibration()).steps_between_nodes(1, 2)
     with pytest.raises(MeasurementError, match=r"IMU rows \(none\) do not cover"):
         odometry_of(None, dvl(stamps(10, 1.0), 0.0)).steps_between_nodes(T0_NS, T0_NS + NS)
+    for instant_s in (0.25, 4.2, -0.5):
+        with pytest.raises(MeasurementError, match=rf"node_ns: {at(instant_s)} is none of the 9 Doppler stamps"):
+            steady().velocity_at_node(at(instant_s))
 
 
-def test_swapped_blocks_are_refused():
-    imu_rows, dvl_rows = recorded()
-    with pytest.raises(MeasurementError, match="expected Imu and Dvl, not Dvl and Imu"):
-        Odometry(Calibration()).add(dvl_rows, imu_rows)
+def steady(seconds: float = 4.0, calibration: Calibration | None = None) -> Odometry:
+    """Ten IMU rows a second and two of the Doppler log: tenths of a second in rad/s, and their hundredth in m/s."""
+    quick, slow = stamps(10, seconds), stamps(2, seconds)
+    odometry = Odometry(calibration or Calibration())
+    rate, velocity = (np.outer((t - T0_NS) / (NS / 10), [0, 0, 1.0]) for t in (quick, slow))
+    odometry.add(imu(quick, rate), dvl(slow, 0.01 * velocity))
+    return odometry
+
+
+@pytest.mark.parametrize(("calibration", "kept_s"), [(HELD, 0.0), (Calibration(), 5.0)], ids=["held", "linear"])
+def test_forgetting_drops_rows_of_both_sensors_that_no_motion_needs(calibration, kept_s):
+    """A gap that opens later is bridged by a line through the five seconds before it; held velocities need one row.
+
+    What counts as a hole of the IMU is told from some rows more.
+    """
+    odometry = steady(20.0, calibration)
+    odometry.forget_before(at(15.0))
+    columns = odometry.columns()
+    assert columns[6] == (calibration is HELD)
+    more_s = ROWS_BEFORE / 10
+    for stamps_ns, earliest_s in ((columns[0], 15.0 - more_s), (columns[3], 14.5)):
+        assert at(earliest_s - kept_s - 0.1) <= stamps_ns[0] <= at(15.0 - kept_s)
+        assert stamps_ns[-1] == at(20.0)
+
+
+def test_a_row_at_the_very_instant_is_used_and_none_after_it():
+    """Rates are linear from 10 on and held after the newest row; so are velocities from 0.1 on."""
+    odometry = steady()
+    for until_s, turn, way in ((1.2, 2.2, 0.02), (1.25, 2.2 + 0.6, 0.025), (1.5, 6.25, 0.0625)):
+        steps = odometry.steps_since_node(at(1.0), at(until_s))
+        assert steps.duration_s @ steps.rate[:, 2] == pytest.approx(turn)
+        assert steps.duration_s @ steps.velocity[:, 2] == pytest.approx(way)
+
+
+def test_final_motion_uses_the_row_that_covers_its_end():
+    """With the node between two IMU rows."""
+    odometry = Odometry(Calibration())
+    quick = stamps(10, 2.0)
+    odometry.add(imu(quick, np.outer((quick - T0_NS) / (NS / 10), [0, 0, 1.0])), dvl(stamps(2, 1.5, 0.05), 0.0))
+    steps = odometry.steps_between_nodes(at(0.55), at(1.05))
+    assert steps.duration_s @ steps.rate[:, 2] == pytest.approx(0.5 * 8.0)
+
+
+def test_the_newest_node_is_the_last_that_is_reached():
+    odometry = steady()
+    assert odometry.newest_node(at(0.5), at(2.2)) == at(2.0)
+    assert odometry.newest_node(at(2.0), at(2.2)) is None
+    assert odometry.nodes(at(0.5), at(2.2)).tolist() == [at(1.0), at(1.5), at(2.0)]
+
+
+def test_a_gap_is_longer_than_the_calibration_says():
+    """Between nodes that follow each other; held samples leave none."""
+    calibration = Calibration(dvl=DvlCalibration(gap_s=0.5))
+    assert longest_interval_ns(calibration) == NS // 2
+    odometry, held = (
+        Odometry(known) for known in (calibration, HELD.model_copy(update={"dvl": DvlCalibration(gap_s=0.5)}))
+    )
+    slow = T0_NS + np.array([0, 500, 1001, 1501, 4000]) * 1_000_000
+    for one in (odometry, held):
+        one.add(imu(stamps(10, 5.0), 0.0), dvl(slow, 0.0))
+    assert not odometry.is_gap(at(0.0), at(0.5))
+    assert odometry.is_gap(at(0.0), at(0.5) + 1)
+    assert odometry.gaps(at(0.0), at(4.0)) == [(at(0.5), at(1.001)), (at(1.501), at(4.0))]
+    assert odometry.gaps(at(0.5), at(1.501)) == [(at(0.5), at(1.001))]
+    assert not held.gaps(at(0.0), at(4.0))
+    assert not held.is_gap(at(0.0), at(1e6))
+
+
+@pytest.mark.parametrize("speed_m_s", [0.0, 3.0])
+def test_the_start_is_reached_at_the_same_time_however_the_log_is_cut(speed_m_s):
+    """When its velocity is confirmed: at 3 m/s by two rows more than at rest."""
+    imu_rows = imu(stamps(100, 3), 0.0)
+    dvl_rows = dvl(stamps(5, 3), (speed_m_s, 0, 0), 1e-4 * np.eye(3))
+    at_once, by_and_by = Odometry(Calibration()), Odometry(Calibration())
+    at_once.add(imu_rows, dvl_rows)
+    reached = []
+    for until_ns in imu_rows.stamps_ns.tolist():
+        by_and_by.add(
+            imu_rows.between(until_ns - NS // 100, until_ns), dvl_rows.between(until_ns - NS // 100, until_ns)
+        )
+        assert by_and_by.start_by(until_ns) == at_once.start_by(until_ns)
+        reached.append(at_once.start_by(until_ns) is not None)
+    assert at_once.start_ns() == T0_NS
+    assert reached.index(True) == (20 if speed_m_s == 0 else 60)
+
+
+LEVER = np.array([-0.2, 0.1, -0.15])
+BIAS = np.array([0.01, -0.02, 0.03])
+EARTH = {"no Earth": None, "Earth": np.array([0.02, -0.03, 0.05])}
+PREINTEGRATOR = Preintegrator(3e-3, LEVER)
+
+
+instants = st.lists(st.integers(0, round((SECONDS - 0.3) * NS)), min_size=1, max_size=12)
+
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@pytest.fixture(scope="module", params=["linear", "hold-past"])
+def swaying(request) -> Odometry:
+    imu_ns, dvl_ns = stamps(50, SECONDS, -0.005), stamps(7, SECONDS - 0.2)
+    rng = np.random.default_rng(0)
+    cov = 1e-4 * (1 + rng.random((len(dvl_ns), 1, 1))) * np.eye(3)
+    made = Odometry(Calibration(odometry_interpolation=request.param))
+    made.add(imu(imu_ns, waves(imu_ns, 1, 0.5), waves(imu_ns, 3, 1.0)), dvl(dvl_ns, waves(dvl_ns, 2, 0.3), cov))
+    return made
+
+
+def assert_same(one: PreintegratedMotion, other: PreintegratedMotion) -> None:
+    assert np.abs(gtsam.Pose3.Logmap(one.i_T_j.between(other.i_T_j))).max() < 1e-12
+    scale = np.sqrt(np.outer(np.diag(other.covariance), np.diag(other.covariance)))
+    assert np.abs(one.covariance - other.covariance).max() <= 1e-9 * scale.max()
+    assert np.allclose(one.D_bias, other.D_bias, rtol=0, atol=1e-12)
+    assert one.duration_s == pytest.approx(other.duration_s, abs=1e-12)
+    assert np.allclose(one.mean_specific_force, other.mean_specific_force, equal_nan=True, atol=1e-12)
+    assert np.array_equal(one.bias, other.bias)
+
+
+def directly(odometry: Odometry, earth: np.ndarray | None, until_ns: int) -> PreintegratedMotion:
+    return PREINTEGRATOR.integrate(odometry.steps_since_node(T0_NS, until_ns), BIAS, earth)
+
+
+@pytest.mark.parametrize("earth", EARTH.values(), ids=EARTH)
+@given(offsets=instants)
+@settings(max_examples=40)
+def test_running_motion_equals_direct_integration_from_the_node(swaying, earth, offsets):
+    """For instants in order, between nodes, on them, and the same one twice."""
+    running = RunningMotion(swaying, PREINTEGRATOR, T0_NS, BIAS, earth)
+    for offset in sorted(offsets):
+        assert_same(running.until(T0_NS + offset), directly(swaying, earth, T0_NS + offset))
+
+
+def test_at_a_reached_node_the_motion_is_the_final_one():
+    """Of sensors that share their stamps; asked for twice, it is the same object."""
+    odometry, at = Odometry(Calibration()), stamps(10, SECONDS)
+    odometry.add(imu(at, waves(at, 1, 0.5)), dvl(at[::2], waves(at[::2], 2, 0.3), 1e-4 * np.eye(3)))
+    running = RunningMotion(odometry, PREINTEGRATOR, T0_NS, BIAS, None)
+    for node_ns in odometry.nodes(T0_NS, T0_NS + 10 * NS).tolist():
+        motion = running.until(node_ns)
+        assert_same(motion, PREINTEGRATOR.integrate(odometry.steps_between_nodes(T0_NS, node_ns), BIAS))
+        assert running.until(node_ns) is motion
+
+
+def test_what_is_final_is_not_integrated_again(swaying):
+    """Of twenty instants a second for two seconds, each takes in the rows of one Doppler interval and a bit."""
+    counted: list[int] = []
+
+    class Counting(Preintegrator):
+        def integrate(self, steps, bias, earth_rate=None):
+            counted.append(len(steps))
+            return super().integrate(steps, bias, earth_rate)
+
+    running = RunningMotion(swaying, Counting(3e-3, LEVER), T0_NS, BIAS, None)
+    for offset in range(0, 2 * NS, NS // 20):
+        running.until(T0_NS + offset)
+    rows = len(swaying.steps_since_node(T0_NS, T0_NS + 2 * NS))
+    assert max(counted) < 0.15 * rows
+
+
+def test_the_earth_turns_in_the_frame_of_the_node(swaying):
+    """Negative control: its rate taken as that of the newest node's frame would be felt."""
+    until_ns, earth = T0_NS + 2 * NS, EARTH["Earth"]
+    middle = int(swaying.newest_node(T0_NS, T0_NS + NS))
+    first = PREINTEGRATOR.integrate(swaying.steps_between_nodes(T0_NS, middle), BIAS, earth)
+    unturned = first.then(PREINTEGRATOR.integrate(swaying.steps_since_node(middle, until_ns), BIAS, earth))
+    off = gtsam.Pose3.Logmap(unturned.i_T_j.between(directly(swaying, earth, until_ns).i_T_j))
+    assert np.abs(off).max() > 1e-4
+
+
+@given(seeds, st.integers(1, 59))
+@settings(max_examples=30)
+def test_then_is_integration_of_both(seed, cut):
+    """Mean, covariance, bias derivative, mean force and duration."""
+    steps = random_steps(seed)
+    first, second = (PREINTEGRATOR.integrate(part(steps, a, b), BIAS) for a, b in ((0, cut), (cut, 60)))
+    assert_same(first.then(second), PREINTEGRATOR.integrate(steps, BIAS))
+    turned_round = second.then(first)
+    assert np.abs(gtsam.Pose3.Logmap(first.then(second).i_T_j.between(turned_round.i_T_j))).max() > 1e-6
+
+
+def ready(until_s=20.0, imu=QUIET):
+    """What was measured until an instant, and what it means."""
+    calibration = Calibration(imu=imu, dvl=DVL)
+    odometry = Odometry(calibration)
+    imu_rows, dvl_rows = vehicle.rows()
+    odometry.add(imu_rows.between(0, at(until_s)), dvl_rows.between(0, at(until_s)))
+    return odometry, Preintegrator.from_calibration(calibration)
+
+
+def moved(start_s, end_s, until_s=20.0, imu=QUIET):
+    return motion_between(*ready(until_s, imu), at(start_s), at(end_s), ZERO)
+
+
+@pytest.mark.parametrize(
+    ("start_s", "end_s"),
+    [
+        *((1.03, 1.17), (5.9, 6.0), (5.93, 8.31), (6.0, 12.0), (6.0, 16.0), (6.0, 17.3), (8.07, 8.36), (13.0, 15.9)),
+        *((5.03, 16.53), (16.0, 16.1)),
+    ],
+)
+def test_motion_is_that_of_the_vehicle_before_in_over_and_after_a_gap(start_s, end_s):
+    truth, found = Vehicle().displacement(start_s, end_s), moved(start_s, end_s)
+    assert found.i_T_j.translation() == pytest.approx(truth, abs=0.02)
+    turn = Vehicle().attitude([end_s - start_s]).as_matrix()[0]
+    assert found.i_T_j.rotation().equals(gtsam.Rot3(turn), 1e-6)
+    assert found.duration_s == pytest.approx(end_s - start_s)
+
+
+def in_between(start_s, end_s, bias=(0.0, 0.0, 0.0), gap_s=1.5):
+    """Of a vehicle that rolls, pitches and turns, whose Doppler stamps fall between those of the IMU."""
+    known = tumbling.calibration({"gyro_noise_density": 1e-3}, velocity_sigma_m_s=(0.01,) * 3, gap_s=gap_s)
+    imu_rows, dvl_rows = tumbling.rows()
+    biased = Imu(imu_rows.stamps_ns, imu_rows.angular_velocity + bias, imu_rows.specific_force)
+    odometry = Odometry(known)
+    odometry.add(biased, Dvl(dvl_rows.stamps_ns + 30_000_000, dvl_rows.velocity, dvl_rows.velocity_cov))
+    return motion_between(odometry, Preintegrator.from_calibration(known), at(start_s), at(end_s), np.array(bias))
+
+
+INTERVALS = pytest.mark.parametrize(
+    ("start_s", "end_s"), [(1.11, 1.72), (8.0, 9.0), (6.03, 9.0), (5.58, 8.31), (5.58, 11.7), (4.6, 15.78)]
+)
+
+
+@INTERVALS
+def test_the_turn_is_that_of_the_gyros_whatever_the_doppler_log_does(start_s, end_s):
+    """As if a straight line led over its gaps, to the last digits; the displacement is another one there."""
+    found, straight = in_between(start_s, end_s), in_between(start_s, end_s, gap_s=100.0)
+    assert found.i_T_j.rotation().equals(straight.i_T_j.rotation(), 1e-12)
+    assert found.i_T_j.equals(straight.i_T_j, 1e-3) == (start_s < 2.0)
+
+
+def test_without_a_gap_motion_is_that_over_the_steps_to_the_bit():
+    odometry, preintegrator = ready()
+    found = motion_between(odometry, preintegrator, at(1.0), at(3.2), ZERO)
+    steps = odometry.steps_between_nodes(at(1.0), at(3.2))
+    expected = preintegrator.integrate(steps, ZERO)
+    assert np.array_equal(found.i_T_j.matrix(), expected.i_T_j.matrix())
+    assert np.array_equal(found.covariance, expected.covariance)
+
+
+def test_motions_that_follow_each_other_in_a_gap_add_up_to_that_since_the_node():
+    odometry, preintegrator = ready(15.0, NOISY)
+    total = motion_between(odometry, preintegrator, at(LOST_S), at(7.3), ZERO)
+    for start_s, end_s in pairwise([7.3, 7.6, 9.0, 9.2, 12.0, 14.7]):
+        total = total.then(motion_between(odometry, preintegrator, at(start_s), at(end_s), ZERO))
+    whole = motion_since_node(odometry, preintegrator, at(LOST_S), at(14.7), ZERO, None)
+    assert total.i_T_j.equals(whole.i_T_j, 1e-9)
+    assert total.covariance == pytest.approx(whole.covariance, rel=1e-3, abs=1e-9)
+    assert total.D_bias == pytest.approx(whole.D_bias, rel=1e-6, abs=1e-9)
+    assert total.mean_specific_force == pytest.approx(whole.mean_specific_force, abs=1e-9)
+    assert total.duration_s == pytest.approx(whole.duration_s)
+
+
+def test_a_gap_that_has_ended_is_bridged_with_both_its_ends():
+    odometry, preintegrator = ready(imu=NOISY)
+    found = motion_between(odometry, preintegrator, at(5.0), at(17.0), ZERO)
+    nodes = motion_between_nodes(odometry, preintegrator, at(5.0), at(17.0), ZERO, None)
+    assert found.i_T_j.equals(nodes.i_T_j, 1e-12)
+    assert found.covariance == pytest.approx(nodes.covariance)
+    longer = motion_between(odometry, preintegrator, at(4.91), at(17.09), ZERO)
+    assert np.trace(longer.covariance) > np.trace(nodes.covariance)
+
+
+@pytest.mark.parametrize(
+    ("start_s", "end_s"), [(1.03, 1.17), (5.0, 9.0), (8.0, 9.0), (15.0, FOUND_S + 0.2), (15.0, 16.3)]
+)
+def test_nothing_stamped_after_the_second_instant_is_used(start_s, end_s):
+    here, there = (moved(start_s, end_s, until_s, NOISY) for until_s in (20.0, end_s))
+    assert np.array_equal(here.i_T_j.matrix(), there.i_T_j.matrix())
+    assert np.array_equal(here.covariance, there.covariance)
+
+
+@pytest.mark.parametrize("instant_s", [1.1, 3.0, 9.0])
+def test_from_an_instant_to_itself_nothing_moves(instant_s):
+    found = moved(instant_s, instant_s)
+    assert found.i_T_j.equals(gtsam.Pose3(), 0.0)
+    assert not found.covariance.any()
+
+
+def test_covariances_have_no_negative_variance():
+    for start_s in np.arange(6.0, 15.0, 0.37):
+        cov = moved(start_s, start_s + 0.05, 15.9, NOISY).covariance
+        assert np.linalg.eigvalsh(cov)[0] >= -1e-18

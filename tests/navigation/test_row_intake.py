@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.devices.dvl_beams import UNMEASURED_M_S, in_numbers, is_partial
 from sonar_graph.measurements import Dvl
 from sonar_graph.navigation.dvl_screening.partial_beams import LONGEST_STRETCH_NS
 from sonar_graph.navigation.dvl_screening.row_intake import RowIntake
@@ -180,18 +181,36 @@ def test_an_infinite_variance_is_completed_like_one_of_a_direction_not_measured(
     assert len(found[0][3]) == len(rows)
 
 
-def test_late_rows_ask_for_no_motion_anew():
-    odometry = Odometry(Calibration())
-    rows = driven([], [])
-    odometry.add(imu(stamps(50, SECONDS), 0.0), rows)
-    odometry.settle(T0_NS + 3 * NS)
-    assert not odometry.add(imu(stamps(50, 1.0) + 1, 0.0), dvl(stamps(5, 1.0) + 1, [0.8, 0.0, 0.0]))
-    assert len(odometry.refused) == 51 + 6
-
-
 def test_rows_are_late_at_the_settled_stamp_and_not_after_it():
     odometry = Odometry(Calibration())
     odometry.settle(T0_NS)
     odometry.add(None, dvl(T0_NS + np.array([-1, 0, 1, 2]), [0.8, 0.0, 0.0]))
     assert [row.stamp_ns - T0_NS for row in odometry.refused] == [-1, 0]
     assert (odometry.columns()[3] - T0_NS).tolist() == [1, 2]
+
+
+def test_an_infinite_variance_is_that_of_a_direction_not_measured_and_nan_is_not_said():
+    whole = np.array([[2.0, 0.5, 0.1], [0.5, 3.0, 0.2], [0.1, 0.2, 4.0]])
+    cov = np.array([whole, whole, np.full((3, 3), np.nan)])
+    cov[1, 1], cov[1, :, 1] = np.inf, np.inf
+    cov[0, 2, 1] = np.nan
+    unsaid = np.arange(9.0).reshape(3, 3)
+    whole[2, 1] = 7.0
+    found = in_numbers(cov, unsaid)
+    np.testing.assert_array_equal(found[0], whole)
+    np.testing.assert_array_equal(found[1], [[2.0, 0.0, 0.1], [0.0, UNMEASURED_M_S**2, 0.0], [0.1, 0.0, 4.0]])
+    np.testing.assert_array_equal(found[2], unsaid)
+    np.testing.assert_array_equal(is_partial(cov), [False, True, False])
+
+
+def test_a_row_is_partial_by_the_directions_that_it_leaves_whatever_its_axes():
+    turn = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
+    for variances, partial in (
+        ((1e-4, 1e-4, UNMEASURED_M_S**2), True),
+        ((UNMEASURED_M_S**2, 1e-4, 1e-4), True),
+        ((1e-4, UNMEASURED_M_S**2, 1e-4), True),
+        ((0.2 * UNMEASURED_M_S**2,) * 3, True),
+        ((0.16 * UNMEASURED_M_S**2,) * 3, False),
+        ((np.nan,) * 3, False),
+    ):
+        assert is_partial((turn * np.array(variances) @ turn.T)[None])[0] == partial

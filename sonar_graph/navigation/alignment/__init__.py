@@ -1,4 +1,4 @@
-"""Alignment."""
+"""Roll, pitch and gyro bias at the start, time offsets, mountings and noise, from sensors of one run."""
 
 # fmt: off
 from sonar_graph.navigation.alignment.allan import longest_rest, noise_densities

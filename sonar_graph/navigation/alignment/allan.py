@@ -16,8 +16,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sonar_graph.measurements import Floats, Imu
+from sonar_graph.measurements import Floats, Imu, Ints
 from sonar_graph.navigation.alignment.time_offset import Estimate1D
 
 TAU_S = 1.0
@@ -25,18 +26,18 @@ LEAST_STILL_S = 30.0
 WINDOW_S = 1.0
 GYRO_MOTION_RAD_S = 0.005
 ACCEL_MOTION_M_S2 = 0.05
-"""A second whose mean differs from the last by more than this and five times what noise does is no rest."""
+"""Change of the mean from one second to the next that is no rest, on top of five times that of noise."""
 QUIET_SHARE = 0.1
 LARGEST_SPREAD = 1.5
-"""Times the spread within the quietest tenth of all seconds."""
+"""Largest spread within a second at rest, in units of that of the quietest tenth of all seconds."""
 
 
 @dataclass(frozen=True)
 class NoiseDensities:
-    """Of the noisiest axis of each kind."""
+    """Noise densities of the noisiest gyro and accelerometer axis."""
 
     still_s: float
-    """Length of the longest rest; the densities are from there."""
+    """Length of the longest rest, which the densities are from."""
     gyro: Estimate1D
     """rad/s/√Hz."""
     accel: Estimate1D
@@ -44,7 +45,7 @@ class NoiseDensities:
 
 
 def allan_deviation(samples: Floats, together: int) -> Floats:
-    """Overlapping Allan deviation over so many samples of each column, shape (columns,).
+    """Overlapping Allan deviation of each column over means of ``together`` samples, shape (columns,).
 
     Parameters
     ----------
@@ -58,7 +59,7 @@ def allan_deviation(samples: Floats, together: int) -> Floats:
 
 
 def degrees_of_freedom(count: int, together: int) -> float:
-    """Of an overlapping estimate over so many samples together, of white noise."""
+    """Equivalent degrees of freedom of the overlapping deviation of white noise, over ``together`` samples."""
     n, m = count + 1, together
     return (3 * (n - 1) / (2 * m) - 2 * (n - 2) / n) * 4 * m**2 / (4 * m**2 + 5)
 
@@ -69,7 +70,7 @@ def density(samples: Floats, rate_hz: float) -> Estimate1D:
     Parameters
     ----------
     samples
-        Of a still sensor, shape (n, columns), over at least some seconds.
+        Readings of a still sensor over at least some seconds, shape (n, columns).
     """
     together = max(1, round(TAU_S * rate_hz))
     tau_s = together / rate_hz
@@ -78,7 +79,7 @@ def density(samples: Floats, rate_hz: float) -> Estimate1D:
 
 
 def noise_densities(imu: Imu) -> NoiseDensities:
-    """Densities from the longest rest in a log, if it is long enough."""
+    """Noise densities from the longest rest in a log, if it is long enough."""
     rest = longest_rest(imu)
     seconds = (imu.stamps_ns[rest] - imu.stamps_ns[0]) * 1e-9
     still_s = float(seconds[-1] - seconds[0]) if len(seconds) > 1 else 0.0
@@ -109,10 +110,8 @@ def longest_rest(imu: Imu) -> slice:
     return slice(int(first[begins[longest]]), int(first[last] + count[last]))
 
 
-def _steady(
-    values: Floats, first: np.ndarray, count: np.ndarray, least: float
-) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Seconds that vary no more than the quietest do, and whose mean is near that of the second before."""
+def _steady(values: Floats, first: Ints, count: Ints, least: float) -> NDArray[np.bool_]:
+    """True for seconds that vary no more than the quietest, and whose mean is near that of the second before."""
     means = np.add.reduceat(values, first, axis=0) / count[:, None]
     spread = np.sqrt(np.maximum(np.add.reduceat(values**2, first, axis=0) / count[:, None] - means**2, 0.0))
     quiet = np.quantile(spread, QUIET_SHARE, axis=0)

@@ -1,19 +1,15 @@
 """Roll, pitch and gyro bias from a rest.
 
-At rest accelerometers feel gravity's reaction and gyros the Earth. With means over the length T of the rest, in body
-axes, u the world's up there, b_a and b_g the biases, a and N the noise densities, K the walk of the gyro bias::
+At rest accelerometers measure gravity's reaction and gyros the Earth's rotation. With means over the length T of the
+rest, u the world's up in body axes, b_a and b_g the biases, a and N the noise densities, K the walk of the gyro bias::
 
     mean f = g u + b_a + e_a,               cov(e_a) = a^2 / T
     mean w = b_g + Omega sin(phi) u + Omega cos(phi) n + e_g,    cov(e_g) = N^2 / T + K^2 T / 3
 
-Hence ``u = mean f / |mean f|``, with the variance ``(sigma_a^2 + a^2 / T) / g^2`` across u, and at the end of the rest
-``b_g = mean w - Omega sin(phi) u``. It takes over the tilt's error, -Omega sin(phi) times it, and the level part of
-the Earth's rate, whose direction n needs a heading (`sonar_graph.navigation.alignment.gravity`). Without a latitude,
-the
-bias holds the Earth's rotation as the body lies; it is not in the covariance.
-
-Coarse levelling: P. D. Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd ed.,
-Artech House 2013, chapter 5.6.
+Hence ``u = mean f / |mean f|`` with the variance ``(sigma_a^2 + a^2 / T) / g^2`` across u, and at the end of the rest
+``b_g = mean w - Omega sin(phi) u``. Without a latitude the bias includes the Earth's rotation, which is not in the
+covariance. docs/theory/alignment.md; coarse levelling: P. D. Groves, Principles of GNSS, Inertial, and Multisensor
+Integrated Navigation Systems, 2nd ed., 2013, chapter 5.6.
 """
 
 from __future__ import annotations
@@ -33,16 +29,16 @@ from sonar_graph.navigation.alignment.gravity import (
 )
 
 BLOCK_S = 0.5
-"""Vibration above some hertz is not motion: means over so long are compared."""
+"""Means over this time are compared, so that vibration is not taken for motion."""
 FEWEST_BLOCKS = 4
 LARGEST_NOISE_RATIO = 1.5
-"""Of the means' standard deviation to what the densities say, beyond chance."""
+"""Largest ratio of the means' standard deviation to that of the noise densities, beyond chance."""
 FALSE_ALARM = 1e-6
 LARGEST_RATE_RAD_S = 0.02
-"""No bias is as large: the vehicle turns steadily."""
+"""A larger mean rate is no bias: the vehicle turns steadily."""
 LARGEST_SPEED_M_S = 0.02
 LARGEST_GRAVITY_ERROR = 0.05
-"""Share of gravity; beyond it units are others, or gravity was taken out."""
+"""Share of gravity; beyond it the unit is another one, or gravity was removed."""
 
 
 def align_at_rest(imu: Imu, calibration: Calibration, dvl: Dvl | None = None) -> InitialTilt:
@@ -51,40 +47,46 @@ def align_at_rest(imu: Imu, calibration: Calibration, dvl: Dvl | None = None) ->
     Parameters
     ----------
     imu
-        Of the rest, at least two seconds, and nothing else.
+        Rows of the rest alone, at least two seconds.
     calibration
         Noise densities, accelerometer bias, mountings, gravity, and the latitude if the Earth's rotation is to be
-        taken out of the bias. `gyro_bias_sigma` is not used: what is said of the bias is from the rest alone.
+        removed from the bias. `gyro_bias_sigma` is not used: the bias is from the rest alone.
     dvl
         Velocities of the same time, as a further check that the vehicle rested.
 
     Returns
     -------
-    At the last row's stamp.
+    InitialTilt
+        At the last row's stamp.
 
     Raises
     ------
     AlignmentError
         Where the vehicle moved, the rest is too short or has a hole, or there is no accelerometer.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.calibration import Calibration
+    >>> from sonar_graph.measurements import Imu
+    >>> from sonar_graph.navigation import align_at_rest
+    >>> force = np.tile([0.0, 9.80665 * np.sin(0.1), 9.80665 * np.cos(0.1)], (500, 1))
+    >>> tilt = align_at_rest(Imu(np.arange(500) * 10_000_000, np.zeros((500, 3)), force), Calibration())
+    >>> round(tilt.roll_rad, 6)
+    0.1
     """
     imu = in_body_axes(imu, calibration)
-    _check_rest(imu, calibration)
-    if dvl is not None:
-        _check_speed(dvl, imu, calibration)
+    refuse_motion(imu, calibration, dvl)
     force, rate = imu.specific_force.mean(axis=0), imu.angular_velocity.mean(axis=0)
     up = force / np.linalg.norm(force)
     upward, _ = earth_up_and_level(calibration)
-    return InitialTilt(
-        int(imu.stamps_ns[-1]),
-        *roll_and_pitch(up),
-        rate - upward * up,
-        covariance_at_rest(up, _length_s(imu), calibration),
-        np.ones(3, dtype=np.bool_),
-    )
+    length_s = float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 * len(imu) / (len(imu) - 1)  # n samples, n intervals
+    cov = covariance_at_rest(up, length_s, calibration)
+    return InitialTilt(int(imu.stamps_ns[-1]), *roll_and_pitch(up), rate - upward * up, cov, np.ones(3, dtype=np.bool_))
 
 
 def covariance_at_rest(up: Floats, rest_s: float, calibration: Calibration) -> Floats:
-    """Of [roll, pitch, gyro bias] after a rest of such a length, shape (5, 5).
+    """Covariance of [roll, pitch, gyro bias] after a rest of ``rest_s`` seconds, shape (5, 5).
 
     Parameters
     ----------
@@ -101,21 +103,28 @@ def covariance_at_rest(up: Floats, rest_s: float, calibration: Calibration) -> F
     return np.asarray(covariance)
 
 
-def _length_s(imu: Imu) -> float:
-    """A mean of n samples is one over n intervals."""
-    return float(imu.stamps_ns[-1] - imu.stamps_ns[0]) * 1e-9 * len(imu) / (len(imu) - 1)
-
-
-def _check_rest(imu: Imu, calibration: Calibration) -> None:
+def refuse_motion(imu: Imu, calibration: Calibration, dvl: Dvl | None) -> None:
+    """Raise AlignmentError where the rows, in body axes, are no rest: too short, with a hole, moving or turning."""
     seconds = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9
     if seconds[-1] < FEWEST_BLOCKS * BLOCK_S:
         raise AlignmentError(f"alignment: {seconds[-1]:.1f} s of IMU is too short; give {FEWEST_BLOCKS * BLOCK_S:g} s")
     if np.diff(seconds).max() > 0.5 * BLOCK_S:
         raise AlignmentError(f"Imu: {np.diff(seconds).max():.2f} s without a row; give a stretch without holes")
     block = (seconds / BLOCK_S).astype(np.int64)
-    sensors = calibration.imu
-    _check_steady("Imu.specific_force", imu.specific_force, block, sensors.accel_noise_density, "accel_noise_density")
-    _check_steady("Imu.angular_velocity", imu.angular_velocity, block, sensors.gyro_noise_density, "gyro_noise_density")
+    _, first, count = np.unique(block, return_index=True, return_counts=True)
+    for name, values, field in (
+        ("specific_force", imu.specific_force, "accel_noise_density"),
+        ("angular_velocity", imu.angular_velocity, "gyro_noise_density"),
+    ):
+        density = getattr(calibration.imu, field)
+        means = (np.add.reduceat(values, first, axis=0) / count[:, None])[:-1]
+        freedom = means.size - means.shape[1]
+        ratio = np.sqrt(np.sum((means - means.mean(axis=0)) ** 2) * BLOCK_S / freedom)
+        if ratio > LARGEST_NOISE_RATIO * np.sqrt(chi2.isf(FALSE_ALARM, freedom) / freedom) * density:
+            raise AlignmentError(
+                f"Imu.{name}: varies as a density of {ratio:.2g}, not imu.{field} = {density:.2g}; "
+                "the vehicle moved (give another stretch, or align in motion), or the density is too small"
+            )
     rate = float(np.linalg.norm(imu.angular_velocity.mean(axis=0)))
     if rate > LARGEST_RATE_RAD_S:
         raise AlignmentError(
@@ -127,29 +136,11 @@ def _check_rest(imu: Imu, calibration: Calibration) -> None:
             f"Imu.specific_force: {force:.2f} m/s² on average, not {gravity:.2f}; "
             "check its unit, and that gravity is in it"
         )
-
-
-def _check_steady(name: str, values: Floats, block: np.ndarray, density: float, field: str) -> None:
-    """Means over blocks vary as white noise of the density does."""
-    _, first, count = np.unique(block, return_index=True, return_counts=True)
-    means = (np.add.reduceat(values, first, axis=0) / count[:, None])[:-1]
-    freedom = means.size - means.shape[1]
-    ratio = np.sqrt(np.sum((means - means.mean(axis=0)) ** 2) * BLOCK_S / freedom)
-    allowed = LARGEST_NOISE_RATIO * np.sqrt(chi2.isf(FALSE_ALARM, freedom) / freedom) * density
-    if ratio > allowed:
-        raise AlignmentError(
-            f"{name}: varies as a density of {ratio:.2g}, not imu.{field} = {density:.2g}; "
-            "the vehicle moved (give another stretch, or align in motion), or the density is too small"
-        )
-
-
-def _check_speed(dvl: Dvl, imu: Imu, calibration: Calibration) -> None:
-    during = dvl.between(int(imu.stamps_ns[0]) - 1, int(imu.stamps_ns[-1]))
-    if during is None:
-        return
-    speed = float(np.linalg.norm(during.velocity.mean(axis=0)))
-    sigma = float(np.linalg.norm(calibration.dvl.velocity_sigma_m_s)) / np.sqrt(len(during))
-    if speed > LARGEST_SPEED_M_S + 5.0 * sigma:
-        raise AlignmentError(
-            f"Dvl.velocity: {speed:.3f} m/s on average; no rest, give another stretch or align in motion"
-        )
+    during = None if dvl is None else dvl.between(int(imu.stamps_ns[0]) - 1, int(imu.stamps_ns[-1]))
+    if during is not None:
+        speed = float(np.linalg.norm(during.velocity.mean(axis=0)))
+        sigma = float(np.linalg.norm(calibration.dvl.velocity_sigma_m_s)) / np.sqrt(len(during))
+        if speed > LARGEST_SPEED_M_S + 5.0 * sigma:
+            raise AlignmentError(
+                f"Dvl.velocity: {speed:.3f} m/s on average; no rest, give another stretch or align in motion"
+            )

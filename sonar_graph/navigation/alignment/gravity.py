@@ -1,44 +1,21 @@
-"""The direction of gravity from accelerometers, with the vehicle's own acceleration taken out by the Doppler log.
+"""Direction of gravity from accelerometers, the Earth's rotation, and roll and pitch of an up vector.
 
 Over an interval of duration T from node i to node j the specific force f, turned into frame i and averaged, is the
-change of velocity plus gravity's reaction. With the velocity v of the IMU's point in body axes at both ends and the
-rotation dR = i_R_j::
+change of velocity plus gravity's reaction. With the velocity v of the IMU's point, dR = i_R_j and
+``up = body_R_world e_z``::
 
-    mean(i_R(t) f(t)) = (dR v_j - v_i) / T + g up_i
-
-    up_j    = dR^T up_i,    a measurement of body_R_world e_z at node j, which has roll and pitch but no yaw
+    mean(i_R(t) f(t)) = (dR v_j - v_i) / T + g up_i,    up_j = dR^T up_i
     sigma^2 = (accel_noise^2 / T + 2 sigma_v^2 / T^2) / g^2 + N^2 T / 3 + sigma_b^2 T^2 / 4 + beta^2 max(1, tau / T)
 
-Taking the change of velocity out is what lets a moving vehicle measure its tilt. The gyros, of noise density N and bias
-sigma_b, turn the frame meanwhile: what counts is how far the tilt at the end is from its mean over the interval,
-``var(W(T) - mean W) = N^2 T / 3`` and ``b T - b T / 2``. Over a second that is a hundredth of the accelerometer's bias;
-over a gap of the Doppler log, which is then the interval, it is the larger part.
+The bias of the accelerometers, ``beta = accel_bias / g``, does not average out over successive directions:
+``tau = (beta / N)^2`` keeps a filtered tilt from claiming less. It does not make it consistent (its true variance is
+1.5 times the claimed one, that of a smoothed tilt 2.5 times, by the scalar model): only the bias as a state would. Roll
+r and pitch p follow from ``up = (-sin p, sin r cos p, cos r cos p)``. A gyro also measures the Earth's rotation; in a
+world with x east and y north, at latitude phi, with n the north in body axes::
 
-The gyro and Doppler samples are also in the odometry between the two nodes. Their errors are taken as independent of
-those here: the direction's sigma is mostly the accelerometers'.
+    body_R_world Omega = Omega sin(phi) up + Omega cos(phi) n
 
-The bias does not average out: successive directions share its tilt ``beta = accel_bias / g``. Taken as fresh noise each
-time it would let the estimate believe itself better than the bias allows. A tilt that walks with the gyro noise density
-N and is measured every T with sigma s settles at the variance ``N s sqrt(T)`` (the scalar Riccati equation for
-s^2 >> N^2 T). With ``s = beta sqrt(tau / T)`` and ``tau = (beta / N)^2``, the time in which the gyro drifts as far as
-the bias misleads, that is ``beta^2``: the bias's own. This keeps the filtered tilt from claiming less than the bias; it
-does not make it consistent, since the bias stays in it undiminished beside the random part: its true variance is 1.5
-times the claimed one, that of a smoothed tilt 2.5 times (scalar model). Only the bias as a state would mend that.
-
-The Earth's rotation, which gyros feel.
-
-Roll, pitch and gyro bias at an instant, with how they depend on each other.
-
-Which way is up in the body, ``u = body_R_world e_z``, has roll r and pitch p and no yaw::
-
-    u = (-sin p, sin r cos p, cos r cos p),    r = atan2(u_y, u_z),    p = atan2(-u_x, hypot(u_y, u_z))
-
-A gyro also feels the Earth. In a world with x east and y north, at latitude phi, with n the north in body axes::
-
-    body_R_world Omega = Omega sin(phi) u + Omega cos(phi) n
-
-The first part is known as soon as u is. n is horizontal and of no known direction without a heading: taken as uniform
-in direction, the second part has mean zero and covariance ``(Omega cos(phi))^2 / 2 (I - u u^T)``.
+Derivation: docs/theory/alignment.md.
 """
 
 from __future__ import annotations
@@ -56,7 +33,7 @@ from sonar_graph.navigation.preintegration import PreintegratedMotion
 from sonar_graph.numerics import compiled
 
 LEAST_GYRO_NOISE_DENSITY = 1e-7
-"""rad/s/√Hz, ten times below the best fibre gyros: keeps the time above finite for a gyro without noise."""
+"""rad/s/√Hz, ten times below the best fibre gyros: keeps tau finite for a gyro without noise."""
 
 
 def velocity_at_imu(velocity: Floats, rate: Floats, body_p_dvl: Floats, body_p_imu: Floats) -> Floats:
@@ -72,7 +49,7 @@ def gravity_direction(
     imu: ImuCalibration,
     gravity_m_s2: float,
 ) -> tuple[Floats, float] | None:
-    """The world's up in frame j.
+    """Measure the world's up in frame j.
 
     Parameters
     ----------
@@ -107,7 +84,7 @@ def gravity_direction(
 def up_direction(
     mean_force: Floats, i_R_j: Floats, velocity_i: Floats, velocity_j: Floats, duration_s: float
 ) -> Floats:
-    """Unit vector of the module's equation, shape (3,); NaN where the force is."""
+    """up_j of the module's equation, shape (3,); NaN where the force is not measured."""
     up_i = np.empty(3)
     for r in range(3):
         turned = i_R_j[r, 0] * velocity_j[0] + i_R_j[r, 1] * velocity_j[1] + i_R_j[r, 2] * velocity_j[2]
@@ -142,7 +119,7 @@ EARTH_RATE_RAD_S = 7.292115e-5
 
 
 def earth_rate_in_world(calibration: Calibration) -> Floats | None:
-    """Earth's angular rate in a world with x east, y north, z up, shape (3,), rad/s; None where it is not removed."""
+    """Earth's angular rate in a world with x east, y north, z up, shape (3,), rad/s; None without a latitude."""
     latitude = calibration.earth_rate_latitude_rad
     if latitude is None:
         return None
@@ -150,12 +127,12 @@ def earth_rate_in_world(calibration: Calibration) -> Floats | None:
 
 
 LEAST_COSINE = 1e-3
-"""Of pitch; roll has no meaning with the nose straight up or down."""
+"""Least cosine of pitch; roll has no meaning with the nose straight up or down."""
 
 
 @dataclass(frozen=True, eq=False)
 class InitialTilt:
-    """Attitude but for yaw, and gyro bias."""
+    """Roll, pitch and gyro bias at one instant, with their joint covariance."""
 
     stamp_ns: int
     """When it holds."""
@@ -166,11 +143,11 @@ class InitialTilt:
     covariance: Floats
     """Of [roll, pitch, gyro bias], shape (5, 5)."""
     bias_is_observed: NDArray[np.bool_]
-    """Axes of whose bias the stretch told more than was known before, shape (3,)."""
+    """True for the axes whose bias the data tell better than the prior, shape (3,)."""
 
 
 def roll_and_pitch(up: Floats) -> tuple[float, float]:
-    """Of the world's up in body axes, any length, shape (3,); rad."""
+    """Roll and pitch (rad) from the world's up in body axes, of any length, shape (3,)."""
     return float(np.arctan2(up[1], up[2])), float(np.arctan2(-up[0], np.hypot(up[1], up[2])))
 
 
@@ -192,13 +169,13 @@ def angles_by_up(up: Floats) -> Floats:
 
 
 def earth_up_and_level(calibration: Calibration) -> tuple[float, float]:
-    """Earth's rate along up and along north, rad/s; zero where it is not removed."""
+    """Earth's rate along up and along north, rad/s; zero without a latitude."""
     earth = earth_rate_in_world(calibration)
     return (0.0, 0.0) if earth is None else (float(earth[2]), float(earth[1]))
 
 
 def in_body_axes(imu: Imu, calibration: Calibration) -> Imu:
-    """The same readings along the body's axes.
+    """Turn readings into body axes.
 
     Raises
     ------

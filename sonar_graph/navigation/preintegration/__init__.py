@@ -1,8 +1,11 @@
-"""Preintegration."""
+"""Preintegration of gyros, accelerometers and Doppler log between two instants, and over gaps of the log."""
 
 # fmt: off
 from sonar_graph.navigation.preintegration.dvl_gaps import NO_GAPS, GapMotion, GapValues, bridge, gap_values
-from sonar_graph.navigation.preintegration.joint_preintegration import DISPLACEMENT, ROTATION, JointMotion
+from sonar_graph.navigation.preintegration.joint_preintegration import (
+    DISPLACEMENT, ROTATION, JointMotion, JointPreintegrator,
+)
+from sonar_graph.navigation.preintegration.joint_recursion import DopplerRule
 from sonar_graph.navigation.preintegration.motion import PreintegratedMotion, Preintegrator
 from sonar_graph.navigation.preintegration.recursion import (
     NO_MOTION, Columns, Cursor, Integral, Steps, are_nodes, cursor_at, exp_and_chord, extended, extended_by_bias,
@@ -10,8 +13,8 @@ from sonar_graph.navigation.preintegration.recursion import (
 )
 
 __all__ = [
-    "Columns", "Cursor", "DISPLACEMENT", "GapMotion", "GapValues", "Integral", "JointMotion", "NO_GAPS",
-    "NO_MOTION", "PreintegratedMotion", "Preintegrator", "ROTATION", "Steps", "are_nodes", "bridge", "cursor_at",
-    "exp_and_chord", "extended", "extended_by_bias", "gap_values", "increment", "merge_rows", "mirrored",
-    "next_step", "rate_of_turn",
+    "Columns", "Cursor", "DISPLACEMENT", "DopplerRule", "GapMotion", "GapValues", "Integral", "JointMotion",
+    "JointPreintegrator", "NO_GAPS", "NO_MOTION", "PreintegratedMotion", "Preintegrator", "ROTATION", "Steps",
+    "are_nodes", "bridge", "cursor_at", "exp_and_chord", "extended", "extended_by_bias", "gap_values", "increment",
+    "merge_rows", "mirrored", "next_step", "rate_of_turn",
 ]

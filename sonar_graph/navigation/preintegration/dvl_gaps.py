@@ -2,42 +2,24 @@
 
 From node i on, with everything in frame i: R the rotation by the gyros, F and P the velocity and position that the
 accelerometers gain from rest (`sonar_graph.navigation.preintegration.joint_steps`), g gravity. The velocity of the
-IMU's point less F
-is then a straight line whose slope is gravity, and a Doppler sample z at time t measures a point of it::
+IMU's point less F is then a straight line whose slope is gravity, and a Doppler sample z at time t measures a point of
+it::
 
     y(t) = R z - F = v + g t
 
 Closed: the sample j that ends the gap is there. The line joins both ends, ``displacement = P + T (y_i + y_j)/2``.
-Tilt, initial velocity and a constant accelerometer bias cancel; what is left is how the gyros' noise and bias tilt the
-frame, how a bias turns with the vehicle, and white noise.
 
-Open: nothing stamped later is there. The line is fitted to the samples of the last `WINDOW_NS` before the node, and
-extrapolated. Its slope is gravity with the accelerometers' bias as it was then, so that neither attitude nor bias need
-be known. Errors grow with the time since then squared.
+Open: nothing stamped later is there. The line is fitted by least squares to the samples of the last `WINDOW_NS` before
+the node, and extrapolated: ``s = T (mean + slope (T / 2 - mean t)) = sum_k w_k y_k``. With W the length of the window,
+``r = T (T / 2 + W / 2) / W`` and s from 0 to 1 over it, gyros (density n) and accelerometers (a) in the window add::
 
-Where a specific force was not measured, also in holes (`sonar_graph.navigation.imu_gaps`), or nothing
-precedes the node to fit a line to, the velocity is a random walk of root density q (m/s/√s) between its ends, whose
-displacement has the variance ``q^2 T^3 / 12`` beside the samples' (closed), or from its last value on, ``q^2 T^3 / 3``
-(open).
+    K(s) = int w dt = T s - 6 r s (1 - s),    a^2 W int K^2 ds + (g n)^2 W^3 int (int K ds)^2 ds
 
-The covariance holds, beside the noise of the samples: gyro and accelerometer noise, and the bias of the accelerometers,
-constant over the gap. That of the gyros is the derivative's affair. Derivation: docs/theory/gaps.md.
+Walk: where a specific force was not measured, or too little precedes the node, the velocity is a random walk of root
+density q (m/s/√s) between its ends, ``q^2 T^3 / 12`` (closed), or from its last value on, ``q^2 T^3 / 3`` (open).
 
-The straight line on which the velocity less the accelerometers' gain lay before bottom lock was lost.
-
-Backwards from node i, in frame i, every Doppler sample z_k of the last seconds gives ``y_k = R_k z_k - F_k``, which is
-``v + g t_k`` but for noise (`sonar_graph.navigation.preintegration.dvl_gaps`). The line is fitted by least squares;
-over the next T
-seconds it moves the vehicle by::
-
-    s = T (mean + slope (T / 2 - mean t)) = sum_k w_k y_k
-
-Its covariance: the samples' noise by their weights, and what gyros and accelerometers did in the W seconds before the
-node. With ``w(t)`` the weights a second, s from 0 to 1 over the window and ``r = T (T / 2 + W / 2) / W``::
-
-    K(s) = int w dt = T s - 6 r s (1 - s)          weight of an acceleration in the displacement
-    a^2 W int K^2 ds                               white force noise of density a
-    (g n)^2 W^3 int (int K ds)^2 ds                tilt that walks with density n, backwards from the node
+The covariance includes the noise of the samples, gyros and accelerometers, and the accelerometers' bias, constant over
+the gap; the gyros' bias has a derivative. docs/theory/gaps.md.
 """
 
 from __future__ import annotations
@@ -48,7 +30,7 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Ints
-from sonar_graph.navigation.imu_gaps import felt
+from sonar_graph.navigation.imu_gaps import force_outside_holes
 from sonar_graph.navigation.preintegration.joint_steps import (
     AT_REST,
     NO_SLOPES,
@@ -87,7 +69,6 @@ from sonar_graph.numerics import (
     cross,
     difference_of,
     gram,
-    inlined,
     matrix,
     minus,
     multiple_of,
@@ -103,11 +84,11 @@ from sonar_graph.numerics import (
 )
 
 FEWEST, SHORTEST_S = 4, 1.0
-"""Samples, and the time that they span."""
+"""Fewest samples of a line, and the shortest time that they span."""
 
 
 class Sums(NamedTuple):
-    """Over samples: of 1, t and t², and of a column of numbers times 1 and times t."""
+    """Sums over samples of 1, t and t², and of y and its derivatives by both biases, times 1 and times t."""
 
     n: float
     t: float
@@ -124,12 +105,13 @@ NOTHING = Sums(0.0, 0.0, 0.0, ZERO, ZERO, ZEROS, ZEROS, ZEROS, ZEROS)
 
 
 class Line(NamedTuple):
-    """Fitted, with what its integral over the time to come needs."""
+    """Fitted line of y(t)."""
 
     sums: Sums
     Q: Matrix
     """Sum of the samples' covariances, frame i."""
     is_known: bool
+    """False where samples are too few or a force was not measured."""
 
 
 @compiled
@@ -151,7 +133,7 @@ def line_before(columns: Columns, body_p_imu: Vector, body_p_dvl: Vector, k: int
             middle = until + (t - until) // 2
             w = minus(value_among(imu_ns, rate, len(imu_ns), row, middle, hold_past), bias)
             f = value_among(imu_ns, force, len(imu_ns), row, middle, hold_past)
-            f = felt(f, turns, imu_ns, len(imu_ns), row, t)
+            f = force_outside_holes(f, turns, imu_ns, len(imu_ns), row, t)
             by = push(path.R, (until - t) * 1e-9, minus(w, times(transposed(path.R), earth)), f)
             slopes = pushed_slopes(slopes, by)
             path = pushed_path(path, by)
@@ -161,7 +143,18 @@ def line_before(columns: Columns, body_p_imu: Vector, body_p_dvl: Vector, k: int
         turned = times(path.R, plus(vector(velocity[k]), cross(at_dvl, lever)))
         y_g = difference_of(skew_times(turned, slopes.M), slopes.v_g)
         y_g = sum_of(y_g, times_skew(path.R, lever))
-        sums = _with(sums, path.elapsed_s, minus(turned, path.v), y_g, slopes.M)
+        point, at_s = minus(turned, path.v), path.elapsed_s
+        sums = Sums(
+            sums.n + 1.0,
+            sums.t + at_s,
+            sums.tt + at_s * at_s,
+            plus(sums.y, point),
+            plus(sums.ty, scaled(at_s, point)),
+            sum_of(sums.y_g, y_g),
+            sum_of(sums.ty_g, multiple_of(at_s, y_g)),
+            sum_of(sums.y_a, slopes.M),
+            sum_of(sums.ty_a, multiple_of(at_s, slopes.M)),
+        )
         Q = sum_of(Q, sandwich(path.R, matrix(cov[k]), path.R))
         k -= 1
     y = sums.y[0] + sums.y[1] + sums.y[2]
@@ -169,25 +162,10 @@ def line_before(columns: Columns, body_p_imu: Vector, body_p_dvl: Vector, k: int
 
 
 @compiled
-def _with(sums: Sums, t: float, y: Vector, y_g: Matrix, y_a: Matrix) -> Sums:
-    return Sums(
-        sums.n + 1.0,
-        sums.t + t,
-        sums.tt + t * t,
-        plus(sums.y, y),
-        plus(sums.ty, scaled(t, y)),
-        sum_of(sums.y_g, y_g),
-        sum_of(sums.ty_g, multiple_of(t, y_g)),
-        sum_of(sums.y_a, y_a),
-        sum_of(sums.ty_a, multiple_of(t, y_a)),
-    )
-
-
-@compiled
 def integral(
     line: Line, elapsed_s: float, gyro_density: float, accel_density: float
 ) -> tuple[Vector, Matrix, Matrix, Matrix]:
-    """Displacement over the time after the node, its derivatives by gyro and accelerometer bias, its covariance.
+    """Displacement over a time after the node, its derivatives by gyro and accelerometer bias, and its covariance.
 
     ``w_k = T (1/n + (T/2 - mean t) (t_k - mean t) / S) = a + b t_k``.
     """
@@ -198,7 +176,12 @@ def integral(
     b = reach / S
     a = elapsed_s / sums.n - b * mean_t
     doppler = multiple_of((elapsed_s**2 / sums.n + reach * b) / sums.n, line.Q)
-    by_gyro, by_force = _weights_in_window(elapsed_s, -2.0 * mean_t, reach)
+    window_s = -2.0 * mean_t
+    r = reach / window_s
+    A, B = elapsed_s / 2.0 - 3.0 * r, 2.0 * r
+    C, D = elapsed_s - 6.0 * r, 6.0 * r
+    by_gyro = window_s**3 * (A * A / 5.0 + A * B / 3.0 + B * B / 7.0)
+    by_force = window_s * (C * C / 3.0 + C * D / 2.0 + D * D / 5.0)
     turning = skew_times(scaled(1.0 / S, minus(sums.ty, scaled(mean_t, sums.y))), IDENTITY)
     inertial = sum_of(
         multiple_of(by_gyro * gyro_density**2, gram(turning)), multiple_of(by_force * accel_density**2, IDENTITY)
@@ -211,21 +194,11 @@ def integral(
     )
 
 
-@inlined
-def _weights_in_window(elapsed_s: float, window_s: float, reach: float) -> tuple[float, float]:
-    """``W^3 int (int K)^2`` and ``W int K^2`` of the module's docstring."""
-    r = reach / window_s
-    A, B = elapsed_s / 2.0 - 3.0 * r, 2.0 * r
-    C, D = elapsed_s - 6.0 * r, 6.0 * r
-    by_gyro = window_s**3 * (A * A / 5.0 + A * B / 3.0 + B * B / 7.0)
-    return by_gyro, window_s * (C * C / 3.0 + C * D / 2.0 + D * D / 5.0)
-
-
 class GapModel(NamedTuple):
-    """What is known of sensors and vehicle."""
+    """Numbers of sensors and vehicle."""
 
     longest_ns: int
-    """Between samples, for the velocity to be linear."""
+    """Longest interval between samples over which the velocity is linear."""
     gyro_noise_density: float
     accel_noise_density: float
     accel_bias_sigma: float
@@ -238,7 +211,7 @@ GapValues = tuple[int, float, float, float, float, Vector, Vector]
 
 
 def gap_values(calibration: Calibration) -> GapValues:
-    """Fields of the model that a calibration describes; plain tuples enter compiled code faster."""
+    """Fields of `GapModel` from a calibration, as a plain tuple, which enters compiled code faster."""
     imu, dvl = calibration.imu, calibration.dvl
     return (
         longest_interval_ns(calibration),
@@ -252,7 +225,7 @@ def gap_values(calibration: Calibration) -> GapValues:
 
 
 NO_GAPS: GapValues = (int(np.iinfo(np.int64).max), 0.0, 0.0, 0.0, 0.0, ZERO, ZERO)
-"""However long it lasts, the velocity is linear or held."""
+"""Values with which no interval is a gap: the velocity is linear or held."""
 
 
 class GapMotion(NamedTuple):
@@ -278,11 +251,11 @@ def bridge(
     Parameters
     ----------
     columns
-        Of `sonar_graph.navigation.odometry.Odometry`.
+        Rows of `sonar_graph.navigation.odometry.Odometry`.
     values
         Fields of a `GapModel`.
     start_ns, end_ns
-        From a node to the next (closed), or to an instant before it, from rows stamped no later (open).
+        A node and the next one (closed), or a node and an instant before the next, from rows stamped no later (open).
     bias
         Gyro bias to remove, body axes, rad/s.
     earth
@@ -290,17 +263,17 @@ def bridge(
     """
     model = GapModel(*values)
     if is_closed or not _is_sampled(columns, model, start_ns, end_ns):
-        motion, is_known = _by_accelerometers(columns, model, start_ns, end_ns, is_closed, bias, earth)
+        motion, is_known = bridge_by_accelerometers(columns, model, start_ns, end_ns, is_closed, bias, earth)
         if is_known:
             return motion
-    return _by_walk(columns, model, start_ns, end_ns, is_closed, bias, earth)
+    return bridge_by_walk(columns, model, start_ns, end_ns, is_closed, bias, earth)
 
 
 @compiled
-def _by_accelerometers(
+def bridge_by_accelerometers(
     columns: Columns, model: GapModel, start_ns: int, end_ns: int, is_closed: bool, bias: Vector, earth: Vector
 ) -> tuple[GapMotion, bool]:
-    """The motion, and whether there is what it takes."""
+    """The motion, and False where a force was not measured or no line is known."""
     dvl_ns = columns[3]
     elapsed_s = (end_ns - start_ns) * 1e-9
     k, gyro_psd = rows_until(dvl_ns, start_ns) - 1, model.gyro_noise_density**2
@@ -316,9 +289,13 @@ def _by_accelerometers(
         s, s_g, s_a, doppler = integral(line, elapsed_s, model.gyro_noise_density, model.accel_noise_density)
         path = Path(0.0, IDENTITY, path.v, path.p, s)
         slopes = Slopes(slopes.M, slopes.N, slopes.v_g, slopes.p_g, s_g, s_a, slopes.s_scale, slopes.s_mounting)
-    path, spread, slopes = _carried(columns, model, path, spread, slopes, (start_ns, end_ns), is_closed, bias, earth)
+    span_ns = start_ns, end_ns
+    path, spread, slopes = carry_through(columns, model, path, spread, slopes, span_ns, is_closed, bias, earth)
     if is_closed:
-        doppler = _at_both_ends(columns, model, k, elapsed_s, path.R)
+        first_s, last_s = _neighbours_s(dvl_ns, k, model.longest_ns)
+        first, last = matrix(columns[5][k]), sandwich(path.R, matrix(columns[5][k + 1]), path.R)
+        by_first = multiple_of(elapsed_s * (elapsed_s + 2.0 * first_s) / 4.0, first)
+        doppler = sum_of(by_first, multiple_of(elapsed_s * (elapsed_s + 2.0 * last_s) / 4.0, last))
         z = _velocity_at_imu(columns, model, k + 1, bias)
         path, spread, slopes = with_sample(path, spread, slopes, z, elapsed_s / 2, gyro_psd)
     path, spread, slopes = with_inertial_position(path, spread, slopes)
@@ -328,12 +305,12 @@ def _by_accelerometers(
     if is_closed:
         both = sum_of(IDENTITY, path.R)
         s_g = sum_of(s_g, multiple_of(elapsed_s / 2, times_skew(both, minus(model.body_p_imu, model.body_p_dvl))))
-    motion = _of_body(path, spread.ms, slopes.M, s_g, ss, gyro_psd, model.body_p_imu)
+    motion = motion_of_origin(path, spread.ms, slopes.M, s_g, ss, gyro_psd, model.body_p_imu)
     return motion, is_known and np.isfinite(path.s[0] + path.s[1] + path.s[2])
 
 
 @compiled
-def _carried(
+def carry_through(
     columns: Columns,
     model: GapModel,
     path: Path,
@@ -344,7 +321,7 @@ def _carried(
     bias: Vector,
     earth: Vector,
 ) -> tuple[Path, Spread, Slopes]:
-    """Over all inertial rows of a gap."""
+    """Take path, covariances and derivatives over all inertial rows of a gap."""
     imu_ns, rate, force, hold_past, turns = columns[0], columns[1], columns[2], columns[6], columns[7]
     t, end_ns = span_ns
     rows = rows_until(imu_ns, end_ns - 1) + 1 if is_closed else rows_until(imu_ns, end_ns)
@@ -354,7 +331,8 @@ def _carried(
         until = min(end_ns, imu_ns[row]) if row < rows else end_ns
         middle = t + (until - t) // 2
         w = minus(value_among(imu_ns, rate, rows, row, middle, hold_past), bias)
-        f = felt(value_among(imu_ns, force, rows, row, middle, hold_past), turns, imu_ns, rows, row, until)
+        f = value_among(imu_ns, force, rows, row, middle, hold_past)
+        f = force_outside_holes(f, turns, imu_ns, rows, row, until)
         by = push(path.R, (until - t) * 1e-9, minus(w, times(transposed(path.R), earth)), f)
         spread = pushed_spread(spread, by, gyro_psd * (path.elapsed_s + 0.5 * by.dt), accel_psd)
         slopes = pushed_slopes(slopes, by)
@@ -366,19 +344,10 @@ def _carried(
 
 @compiled
 def _velocity_at_imu(columns: Columns, model: GapModel, k: int, bias: Vector) -> Vector:
-    """Of the IMU's point at a Doppler row, body axes."""
+    """Velocity of the IMU's point at a Doppler row, body axes."""
     imu_ns, rate, t = columns[0], columns[1], columns[3][k]
     w = minus(value_among(imu_ns, rate, len(imu_ns), rows_until(imu_ns, t - 1), t, columns[6]), bias)
     return plus(vector(columns[4][k]), cross(w, minus(model.body_p_imu, model.body_p_dvl)))
-
-
-@compiled
-def _at_both_ends(columns: Columns, model: GapModel, k: int, elapsed_s: float, R: Matrix) -> Matrix:
-    """Displacement covariance by the samples k and k + 1, half the gap's length each, with what neighbours share."""
-    first_s, last_s = _neighbours_s(columns[3], k, model.longest_ns)
-    first, last = matrix(columns[5][k]), sandwich(R, matrix(columns[5][k + 1]), R)
-    by_first = multiple_of(elapsed_s * (elapsed_s + 2.0 * first_s) / 4.0, first)
-    return sum_of(by_first, multiple_of(elapsed_s * (elapsed_s + 2.0 * last_s) / 4.0, last))
 
 
 @compiled
@@ -386,16 +355,18 @@ def _neighbours_s(dvl_ns: Ints, k: int, longest_ns: int) -> tuple[float, float]:
     """Lengths of the intervals beside the gap after row k whose errors add to its own.
 
     Each end also ends or begins a neighbouring interval, of length d, and errors add up:
-    ``((T + d) / 2)^2 = (T / 2)^2 (1 + 2 d / T) + (d / 2)^2``, of which the last is the neighbour's own. What lies after
-    the end is not known yet: as long as what lay before the gap. Of two gaps that follow each other the later one
-    counts what they share.
+    ``((T + d) / 2)^2 = (T / 2)^2 (1 + 2 d / T) + (d / 2)^2``, of which the last is the neighbour's own. The interval
+    after the gap is not known yet and taken as long as the one before. Of two successive gaps the later one counts what
+    they share.
     """
     before_ns = dvl_ns[k] - dvl_ns[k - 1] if k > 0 else 0
     return before_ns * 1e-9, (before_ns if before_ns <= longest_ns else 0) * 1e-9
 
 
 @compiled
-def _of_body(path: Path, ms: Vector, M: Matrix, s_g: Matrix, ss: Matrix, gyro_psd: float, lever: Vector) -> GapMotion:
+def motion_of_origin(
+    path: Path, ms: Vector, M: Matrix, s_g: Matrix, ss: Matrix, gyro_psd: float, lever: Vector
+) -> GapMotion:
     """From the IMU's point to the body's origin: ``dp = s - (R - I) l``, ``eps = ds + [R l]x theta``.
 
     ``cov(ds, theta) = -[ms]x``, M the integral of R, s_g the derivative of s by the gyro bias, ss its covariance.
@@ -413,7 +384,7 @@ def _of_body(path: Path, ms: Vector, M: Matrix, s_g: Matrix, ss: Matrix, gyro_ps
 
 @compiled
 def _is_sampled(columns: Columns, model: GapModel, start_ns: int, end_ns: int) -> bool:
-    """Whether velocities go on after a node, and it is inertial rows that are missing.
+    """True where velocities go on after a node and inertial rows are missing instead.
 
     A sample that ends a gap of the velocity, but is no node yet, does not count.
     """
@@ -423,10 +394,10 @@ def _is_sampled(columns: Columns, model: GapModel, start_ns: int, end_ns: int) -
 
 
 @compiled
-def _by_walk(
+def bridge_by_walk(
     columns: Columns, model: GapModel, start_ns: int, end_ns: int, is_closed: bool, bias: Vector, earth: Vector
 ) -> GapMotion:
-    """Velocity linear between the ends or held since the last sample, and a random walk about that.
+    """Motion with the velocity linear between the ends or held since the last sample, and a random walk about that.
 
     An open gap may hold samples, where motion could not be settled for want of inertial rows.
     """

@@ -1,28 +1,16 @@
 """Joint preintegration of gyro, accelerometer and Doppler log between two keyframes.
 
-From body frame i to body frame j, t seconds later, with world gravity g and every point of the body known by its place
-in it (a: the IMU, d: the Doppler log)::
+From body frame i to body frame j, t seconds later, with world gravity g, a the IMU's point and d the Doppler log's::
 
-    R = i_R_j                              rotation
-    v = i_R_world (v_a,j - v_a,i - g t)           velocity that the accelerometer gained
+    R = i_R_j                                           rotation
+    v = i_R_world (v_a,j - v_a,i - g t)                 velocity that the accelerometer gained
     p = i_R_world (a_j - a_i - v_a,i t - g t^2 / 2)     position that it gained
-    s = i_R_world (d_j - d_i)                     displacement by the Doppler log
+    s = i_R_world (d_j - d_i)                           displacement by the Doppler log
 
-with one covariance of all twelve errors, since the gyros turn all of them and, with the rule "inertial", the
-accelerometer draws s between the Doppler samples. Each measurement enters once. Lever arms need no rates but over long
-intervals (`sonar_graph.navigation.preintegration.joint_preintegration`): v and p are those of the IMU's point, s that
-of the Doppler log's.
-Derivation: docs/theory/preintegration.md. After Forster et al., TRO 2017, section VI.
-
-What long times between rows ask of joint preintegration.
-
-Rule "inertial". What is straight in time is the velocity of the IMU's point less what the accelerometers gained; the
-log's own swings about it. Over long intervals the log's samples are therefore taken to the IMU's point by the gyros,
-``z - w x l``, and the log's way about that point, ``(R_j - R_i) l``, is added (`joint_recursion`). The gyros' noise at
-the two ends is then one with that of the samples.
-
-All other rules know nothing of the velocity between two samples: they refuse long intervals. No rule knows how the
-vehicle turned in a hole of the inertial rows (`sonar_graph.navigation.imu_gaps`).
+with one covariance of all twelve errors; each measurement enters once. With the rule "inertial" the accelerometer
+shapes s between the Doppler samples, also over long intervals, where samples are taken to the IMU's point by the gyros,
+``z - w x l``, and the log's way about it, ``(R_j - R_i) l``, is added. All other rules refuse long intervals, and all
+refuse holes of the IMU. After Forster et al., TRO 2017, section VI. docs/theory/preintegration.md.
 """
 
 from __future__ import annotations
@@ -39,7 +27,7 @@ from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.imu_gaps import row_after_hole
 from sonar_graph.navigation.preintegration.joint_recursion import LONG_S, RULES, DopplerRule, Inertial, preintegrate
-from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion, float_triple
 from sonar_graph.navigation.samples import (
     finite_vector,
     no_doppler_stamp,
@@ -52,13 +40,7 @@ from sonar_graph.navigation.samples import (
 
 
 def refuse_beyond(longest_s: float, dvl_ns: Ints) -> None:
-    """Raise where Doppler samples are too far apart for a velocity that they alone shape.
-
-    Raises
-    ------
-    MeasurementError
-        Names the interval.
-    """
+    """Raise MeasurementError where Doppler samples are too far apart for a velocity that they alone shape."""
     between_ns = np.diff(dvl_ns)
     k = int(between_ns.argmax())
     if between_ns[k] > longest_s * 1e9:
@@ -69,13 +51,7 @@ def refuse_beyond(longest_s: float, dvl_ns: Ints) -> None:
 
 
 def refuse_holes(longest_s: float, imu_ns: Ints, first: int, last: int) -> None:
-    """Raise where inertial rows, from one to another, are too far apart to tell how the vehicle turned.
-
-    Raises
-    ------
-    MeasurementError
-        Names the hole.
-    """
+    """Raise MeasurementError where inertial rows, from one row to another, have a hole."""
     row = row_after_hole(imu_ns, first, last, round(longest_s * 1e9))
     if row >= 0:
         raise MeasurementError(
@@ -91,11 +67,9 @@ def with_rate_noise(cov: Floats, dvl_ns: Ints, imu_ns: Ints, gyro_density: float
     Parameters
     ----------
     cov
-        Of the samples z, body axes, shape (n, 3, 3), m²/s².
-    dvl_ns, imu_ns
-        Stamps.
+        Covariances of the samples z, body axes, shape (n, 3, 3), m²/s².
     gyro_density
-        rad/s/√Hz.
+        Noise density of the gyros, rad/s/√Hz.
     arm
         l, from the IMU to the Doppler log, body axes, shape (3,), m.
 
@@ -120,10 +94,24 @@ GYRO, ACCEL, SCALE, MOUNTING = slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 1
 
 @dataclass(frozen=True, eq=False)
 class JointMotion:
-    """Motion from body frame i to body frame j, a Doppler sample at either end.
+    """Motion from body frame i to body frame j, with a Doppler sample at either end; made by `JointPreintegrator`.
 
     Errors are ``[theta, dv, dp, ds]``: theta in frame j (``R Exp(theta)``), the others added in frame i. Where the
-    specific force was not measured, velocity and position and all that belongs to them are NaN.
+    specific force was not measured, velocity, position, and their covariances and derivatives are NaN.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.measurements import Dvl, Imu
+    >>> from sonar_graph.navigation import JointPreintegrator
+    >>> imu_ns, dvl_ns = np.arange(401) * 5_000_000, np.arange(11) * 200_000_000
+    >>> imu = Imu(imu_ns, np.zeros((401, 3)), np.tile([0.0, 0.0, 9.81], (401, 1)))
+    >>> dvl = Dvl(dvl_ns, np.tile([0.5, 0.0, 0.0], (11, 1)), np.full((11, 3, 3), np.nan))
+    >>> sensors = JointPreintegrator(gyro_noise_density=1e-4, accel_noise_density=1e-3)
+    >>> first = sensors.integrate(imu, dvl, 0, 1_000_000_000)
+    >>> second = sensors.integrate(imu, dvl, 1_000_000_000, 2_000_000_000).after(first)
+    >>> second.relative_pose().i_T_j.translation().round(6).tolist()
+    [0.5, 0.0, 0.0]
     """
 
     i_R_j: gtsam.Rot3
@@ -140,9 +128,9 @@ class JointMotion:
     end_weights: tuple[Floats, Floats]
     """Derivative of s by the velocity (body axes) of the first and of the last Doppler sample, shape (3, 3), s."""
     end_covariances: tuple[Floats, Floats]
-    """Of these two samples, shape (3, 3), m²/s²."""
+    """Covariances of these two samples, shape (3, 3), m²/s²."""
     shared_covariance: Floats
-    """What sharing the first sample with the motion before adds to s, shape (3, 3), m²; zero before `after`."""
+    """Added to that of s where the first sample is shared with the motion before, shape (3, 3), m²; see `after`."""
     bias: Floats
     """Gyro and accelerometer bias that were removed, body axes, shape (6,), rad/s and m/s²."""
     start_ns: int
@@ -156,12 +144,12 @@ class JointMotion:
 
     @property
     def duration_s(self) -> float:
-        """From the first to the last Doppler sample."""
+        """Time from the first to the last Doppler sample."""
         return (self.end_ns - self.start_ns) * 1e-9
 
     @property
     def covariance(self) -> Floats:
-        """Of the errors, shape (12, 12)."""
+        """Covariance of the errors, shape (12, 12)."""
         P = self.inner_covariance.copy()
         for W, Q in zip(self.end_weights, self.end_covariances, strict=True):
             P[DISPLACEMENT, DISPLACEMENT] += W @ Q @ W.T
@@ -169,11 +157,11 @@ class JointMotion:
         return P
 
     def after(self, before: JointMotion) -> JointMotion:
-        """The same motion in a chain, next to the one before.
+        """The same motion in a chain, after the one before.
 
-        The Doppler sample between them moves both, so that their errors are correlated. Charging all of it to the later
+        Both hold the Doppler sample between them, so that their errors are correlated. Adding all of that to the later
         one, ``C + C^T`` with ``C = R^T W_last Q W_first^T``, lets a graph take them as independent: the covariance of
-        the chain's displacement is then that of the samples with their weights, however it is cut.
+        the chain's displacement is then that of the samples with their weights, wherever it is cut.
 
         Raises
         ------
@@ -189,12 +177,12 @@ class JointMotion:
         return replace(self, shared_covariance=C + C.T)
 
     def corrected(self, change: Floats) -> JointMotion:
-        """For other parameters, to first order.
+        """The motion for other parameters, to first order.
 
         Parameters
         ----------
         change
-            Of gyro bias, accelerometer bias, scale and mounting, shape (10,).
+            Change of gyro bias, accelerometer bias, scale and mounting, shape (10,).
         """
         error = self.D_parameters @ finite_vector("change", change, 10)
         return replace(
@@ -207,15 +195,13 @@ class JointMotion:
         )
 
     def relative_pose(self, accel_bias_sigma: float = 0.0) -> PreintegratedMotion:
-        """Rotation and Doppler displacement alone, as the body's relative pose.
-
-        The body's origin moves by ``s - (R - I) d``.
+        """Rotation and Doppler displacement alone, as the body's relative pose: the origin moves by ``s - (R - I) d``.
 
         Parameters
         ----------
         accel_bias_sigma
-            What is not known of the accelerometers' bias, on each axis, m/s²: counted in the covariance. With the rule
-            "inertial" it moves s by the cube of the time between Doppler samples; with the others not at all.
+            Sigma of the accelerometers' bias on each axis, m/s², counted in the covariance. With the rule "inertial"
+            the bias moves s by the cube of the time between Doppler samples; with the others not at all.
         """
         R, arm = self.i_R_j.matrix(), self.body_p_dvl
         translation = self.displacement - R @ arm + arm
@@ -232,12 +218,25 @@ class JointMotion:
 
 @dataclass(frozen=True, eq=False)
 class JointPreintegrator:
-    """What joint preintegration needs to know of the sensors.
+    """Joint preintegration of IMU and Doppler log, for one set of sensors.
 
     Raises
     ------
     CalibrationError
         When a number is negative or not finite, or a mounting or the rule is of another kind.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.measurements import Dvl, Imu
+    >>> from sonar_graph.navigation import JointPreintegrator
+    >>> imu_ns, dvl_ns = np.arange(201) * 5_000_000, np.arange(6) * 200_000_000
+    >>> imu = Imu(imu_ns, np.zeros((201, 3)), np.tile([0.0, 0.0, 9.81], (201, 1)))
+    >>> dvl = Dvl(dvl_ns, np.tile([0.5, 0.0, 0.0], (6, 1)), np.full((6, 3, 3), np.nan))
+    >>> sensors = JointPreintegrator(gyro_noise_density=1e-4, accel_noise_density=1e-3)
+    >>> motion = sensors.integrate(imu, dvl, 0, 1_000_000_000)
+    >>> motion.displacement.round(6).tolist(), motion.covariance.shape
+    ([0.5, 0.0, 0.0], (12, 12))
     """
 
     gyro_noise_density: float
@@ -245,24 +244,22 @@ class JointPreintegrator:
     accel_noise_density: float
     """m/s²/√Hz."""
     velocity_sigma_m_s: tuple[float, float, float] = (0.01, 0.01, 0.01)
-    """Of a Doppler sample along the log's axes, where its covariance is NaN."""
+    """Noise of a Doppler sample along the log's axes, where its covariance is NaN."""
     body_T_imu: gtsam.Pose3 = field(default_factory=gtsam.Pose3)
     body_T_dvl: gtsam.Pose3 = field(default_factory=gtsam.Pose3)
     rule: DopplerRule = "inertial"
-    """How a velocity is had between samples: `sonar_graph.navigation.preintegration.joint_recursion`."""
+    """Velocity between samples: see `sonar_graph.navigation.preintegration.joint_recursion`."""
     longest_s: float = 1.5
-    """Between Doppler samples for all rules but "inertial", which know nothing of the velocity there."""
+    """Longest interval between Doppler samples, for all rules but "inertial"."""
     longest_hole_s: float = SHORTEST_HOLE_S
-    """Between inertial rows where that is more than five typical intervals: nothing tells the turn in there."""
+    """Longest interval between inertial rows where that is more than five typical ones: the turn in it is not
+    measured."""
 
     def __post_init__(self) -> None:
         if self.rule not in RULES:
             raise CalibrationError(f"rule: there is no {self.rule!r}; there are {', '.join(RULES)}")
-        require_noise("gyro_noise_density", self.gyro_noise_density, 1)
-        require_noise("accel_noise_density", self.accel_noise_density, 1)
-        require_noise("velocity_sigma_m_s", self.velocity_sigma_m_s, 3)
-        require_noise("longest_s", self.longest_s, 1)
-        require_noise("longest_hole_s", self.longest_hole_s, 1)
+        for name in ("gyro_noise_density", "accel_noise_density", "velocity_sigma_m_s", "longest_s", "longest_hole_s"):
+            require_noise(name, getattr(self, name), 3 if name == "velocity_sigma_m_s" else 1)
         for name, mounting in (("body_T_imu", self.body_T_imu), ("body_T_dvl", self.body_T_dvl)):
             if not isinstance(mounting, gtsam.Pose3):
                 raise CalibrationError(f"{name}: expected a gtsam.Pose3, not {type(mounting).__name__}")
@@ -320,9 +317,14 @@ class JointPreintegrator:
         if not (isinstance(imu, Imu) and isinstance(dvl, Dvl)):
             raise MeasurementError(f"imu, dvl: expected Imu and Dvl, not {type(imu).__name__} and {type(dvl).__name__}")
         require_order(start_ns, end_ns)
-        samples = _doppler_rows(dvl, start_ns, end_ns)
-        inertial = _inertial_rows(imu, start_ns, end_ns, self.longest_hole_s)
-        velocity, cov = self._in_body(samples)
+        samples = doppler_rows_between(dvl, start_ns, end_ns)
+        inertial = imu_rows_around(imu, start_ns, end_ns, self.longest_hole_s)
+        body_R_imu, body_R_dvl = self.body_T_imu.rotation().matrix(), self.body_T_dvl.rotation().matrix()
+        cov, unsaid = samples.velocity_cov, np.isnan(samples.velocity_cov)
+        if unsaid.any():
+            cov = np.where(unsaid, np.diag(np.square(self.velocity_sigma_m_s)), cov)
+        require_covariances("Dvl.velocity_cov", cov, samples.stamps_ns)
+        velocity, cov = samples.velocity @ body_R_dvl.T, body_R_dvl @ cov @ body_R_dvl.T
         arms = self.body_T_imu.translation(), self.body_T_dvl.translation()
         arm = arms[1] - arms[0]
         if self.rule == "inertial":
@@ -331,50 +333,32 @@ class JointPreintegrator:
             refuse_beyond(self.longest_s, samples.stamps_ns)
         bias = np.zeros(6) if bias is None else finite_vector("bias", bias, 6)
         earth = np.zeros(3) if earth_rate is None else finite_vector("earth_rate", earth_rate, 3)
-        rows = self._inertial(inertial, bias, earth, arm)
-        R, (v, p, s), P, D, first, last = preintegrate(rows, samples.stamps_ns, velocity, cov, RULES[self.rule])
-        _refuse_infinite(s, P, start_ns, end_ns)
-        ends, span = (cov[0], cov[-1]), (int(start_ns), int(end_ns))
-        return JointMotion(gtsam.Rot3(R), v, p, s, P, D, (first, last), ends, np.zeros((3, 3)), bias, *span, *arms)
-
-    def _inertial(self, imu: Imu, bias: Floats, earth: Floats, arm: Floats) -> Inertial:
-        """Rows in body axes, with what is to be removed from them."""
-        body_R_imu = self.body_T_imu.rotation().matrix()
-        force = imu.specific_force @ body_R_imu.T
+        force = inertial.specific_force @ body_R_imu.T
         if self.rule == "inertial" and not np.isfinite(force).all():
             raise MeasurementError('Imu.specific_force: not measured in every row; use the rule "linear"')
-        return Inertial(
-            imu.stamps_ns,
-            imu.angular_velocity @ body_R_imu.T,
+        rows = Inertial(
+            inertial.stamps_ns,
+            inertial.angular_velocity @ body_R_imu.T,
             force,
-            _vector(bias[:3]),
-            _vector(bias[3:]),
-            _vector(earth),
-            _vector(arm),
+            float_triple(bias[:3]),
+            float_triple(bias[3:]),
+            float_triple(earth),
+            float_triple(arm),
             self.gyro_noise_density**2,
             self.accel_noise_density**2,
         )
-
-    def _in_body(self, samples: Dvl) -> tuple[Floats, Floats]:
-        """Velocities in body axes and a covariance for each."""
-        body_R_dvl, cov = self.body_T_dvl.rotation().matrix(), samples.velocity_cov
-        unsaid = np.isnan(cov)
-        if unsaid.any():
-            cov = np.where(unsaid, np.diag(np.square(self.velocity_sigma_m_s)), cov)
-        require_covariances("Dvl.velocity_cov", cov, samples.stamps_ns)
-        return samples.velocity @ body_R_dvl.T, body_R_dvl @ cov @ body_R_dvl.T
-
-
-def _refuse_infinite(s: Floats, P: Floats, start_ns: int, end_ns: int) -> None:
-    if not isfinite(sum(s.tolist()) + P.item(9, 9) + P.item(10, 10) + P.item(11, 11)):
-        raise MeasurementError(
-            f"from {start_ns} to {end_ns} ns: the motion is not finite; expected angular velocities in rad/s and"
-            " velocities in m/s that are not beyond all bounds"
-        )
+        R, (v, p, s), P, D, first, last = preintegrate(rows, samples.stamps_ns, velocity, cov, RULES[self.rule])
+        if not isfinite(sum(s.tolist()) + P.item(9, 9) + P.item(10, 10) + P.item(11, 11)):
+            raise MeasurementError(
+                f"from {start_ns} to {end_ns} ns: the motion is not finite; expected angular velocities in rad/s and"
+                " velocities in m/s that are not beyond all bounds"
+            )
+        ends, span = (cov[0], cov[-1]), (int(start_ns), int(end_ns))
+        return JointMotion(gtsam.Rot3(R), v, p, s, P, D, (first, last), ends, np.zeros((3, 3)), bias, *span, *arms)
 
 
-def _doppler_rows(dvl: Dvl, start_ns: int, end_ns: int) -> Dvl:
-    """Rows from one end to the other."""
+def doppler_rows_between(dvl: Dvl, start_ns: int, end_ns: int) -> Dvl:
+    """Doppler rows from one stamp to another; raises MeasurementError where they cannot be used."""
     first, last = (int(row) for row in np.searchsorted(dvl.stamps_ns, [start_ns, end_ns]))
     if last == len(dvl) or dvl.stamps_ns[last] != end_ns:
         raise no_doppler_stamp("end_ns", end_ns, dvl.stamps_ns)
@@ -391,8 +375,8 @@ def _doppler_rows(dvl: Dvl, start_ns: int, end_ns: int) -> Dvl:
     return samples
 
 
-def _inertial_rows(imu: Imu, start_ns: int, end_ns: int, longest_hole_s: float) -> Imu:
-    """Rows from the last at or before the start to the first at or after the end."""
+def imu_rows_around(imu: Imu, start_ns: int, end_ns: int, longest_hole_s: float) -> Imu:
+    """IMU rows from the last at or before the start to the first at or after the end; raises MeasurementError."""
     require_nanoseconds("Imu", imu.stamps_ns)
     first = int(np.searchsorted(imu.stamps_ns, start_ns, side="right")) - 1
     last = int(np.searchsorted(imu.stamps_ns, end_ns))
@@ -404,7 +388,3 @@ def _inertial_rows(imu: Imu, start_ns: int, end_ns: int, longest_hole_s: float) 
     require_distinct_stamps("Imu", imu.stamps_ns, first, last)
     refuse_holes(longest_hole_s, imu.stamps_ns, first, last)
     return imu.rows(slice(first, last + 1))
-
-
-def _vector(a: Floats) -> tuple[float, float, float]:
-    return float(a[0]), float(a[1]), float(a[2])

@@ -1,24 +1,19 @@
-"""How a velocity is had between two Doppler samples: our two rules, and those of others.
+"""Loop of joint preintegration as machine code, with the rule for the velocity between two Doppler samples.
 
 =============== ====================================== ================================ ==============================
-rule            velocity between samples a and b       rotation that turns it           whose
+rule            velocity between samples a and b       rotation that turns it           used by
 =============== ====================================== ================================ ==============================
-inertial        through both samples, in between the   at every IMU sample              ours, with an accelerometer
-                shape that the accelerometer felt
-linear          linear from a to b, in the body        at every IMU sample              ours, gyro and Doppler alone
+inertial        through both samples, in between the   at every IMU sample              this package, with an
+                shape that the accelerometer measured                                   accelerometer
+linear          linear from a to b, in the body        at every IMU sample              this package, gyro and Doppler
 hold-previous   that of a                              at every IMU sample              AQUA-SLAM
 zoh-previous    that of a                              in the middle of the interval    coug_fgo, tight integrator
 zoh-current     that of b                              at the end of the interval       TURTLMap
 trapezoid       mean of a and b                        in the middle of the interval    sonar-SLAM's dead reckoning
 =============== ====================================== ================================ ==============================
 
-The last four are here to be compared with. A hold is late or early by half an interval, which costs half of it times
-the change of velocity over the motion.
-
-The loop of joint preintegration as machine code: inertial steps between Doppler samples, then the next sample.
-
-Equations: `sonar_graph.navigation.preintegration.joint_steps` (steps) and
-`sonar_graph.navigation.preintegration.joint_steps` (samples).
+The last four are for comparison: a hold is late or early by half an interval. Equations of a step and of a sample:
+`sonar_graph.navigation.preintegration.joint_steps`.
 """
 
 from __future__ import annotations
@@ -75,7 +70,7 @@ DopplerRule = Literal["inertial", "linear", "hold-previous", "zoh-previous", "zo
 
 
 class Turning(IntEnum):
-    """Which rotation turns a velocity into frame i."""
+    """Instant of the rotation that turns a velocity into frame i."""
 
     EVERY_SAMPLE = 0
     MIDDLE = 1
@@ -86,12 +81,13 @@ class Rule(NamedTuple):
     """A row of the table, for compiled code."""
 
     inertial: bool
-    """Whether the accelerometer shapes the velocity between samples."""
+    """True where the accelerometer shapes the velocity between samples."""
     interpolated: bool
-    """Whether the later sample's share grows from 0 to 1 over the interval."""
+    """True where the later sample's share grows from 0 to 1 over the interval."""
     share: float
     """The later sample's share where it is constant."""
     turning: int
+    """A value of `Turning`."""
 
 
 RULES: dict[DopplerRule, Rule] = {
@@ -103,11 +99,11 @@ RULES: dict[DopplerRule, Rule] = {
     "trapezoid": Rule(False, False, 0.5, Turning.MIDDLE.value),
 }
 EVERY_SAMPLE, MIDDLE = 0, 1
-"""Of `sonar_graph.navigation.preintegration.joint_recursion.Turning`."""
+"""Values of `Turning` for compiled code."""
 
 
 class Inertial(NamedTuple):
-    """Inertial rows in body axes, and what is taken out of them."""
+    """Inertial rows in body axes, and the biases and Earth rate to remove from them."""
 
     stamps: Ints
     rate: Floats
@@ -147,14 +143,15 @@ class Motion(NamedTuple):
     spread: Spread
     slopes: Slopes
     weights: Weights
-    """Of the interval at hand."""
+    """Weights of the current interval."""
     row: int
     """First inertial row after the instant."""
 
 
 NO_WEIGHTS = Weights(ZEROS, ZEROS)
 LONG_S = 0.4
-"""Between Doppler samples: from here on the rule "inertial" draws the log's way about the IMU's point by the gyros."""
+"""Interval of Doppler samples above which the rule "inertial" takes the log's way about the IMU's point from the
+gyros."""
 
 
 @compiled
@@ -184,35 +181,38 @@ def preintegrate(
             motion = _at_sample(motion, imu, dvl_ns[k], vector(velocity[k]), past_s, next_s)
         interval = Interval(dvl_ns[k], dvl_ns[k + 1], vector(velocity[k]), vector(velocity[k + 1]))
         here = multiple_of(0.5 * next_s, motion.path.R)
-        motion = _over(motion, imu, interval, rule)
+        motion = over_interval(motion, imu, interval, rule)
         weights = Weights(here, multiple_of(0.5 * next_s, motion.path.R)) if rule.inertial else motion.weights
         if k == 0:
             first = weights.before
         else:
             weight = sum_of(last, weights.before)
-            motion = _with_noise(motion, sandwich(weight, matrix(cov[k]), weight))
+            mv, mp, ms, vv, vp, pp, sv, sp, ss = motion.spread
+            spread = Spread(mv, mp, ms, vv, vp, pp, sv, sp, sum_of(ss, sandwich(weight, matrix(cov[k]), weight)))
+            motion = Motion(motion.path, spread, motion.slopes, motion.weights, motion.row)
         last, past_s = weights.after, next_s
     if rule.inertial:
         motion = _at_sample(motion, imu, dvl_ns[-1], vector(velocity[len(dvl_ns) - 1]), past_s, 0.0)
         path, spread, slopes = with_inertial_position(motion.path, motion.spread, motion.slopes)
         motion = Motion(path, spread, slopes, NO_WEIGHTS, motion.row)
-    return _arrays(motion, first, last, imu.gyro_psd)
+    return to_arrays(motion, first, last, imu.gyro_psd)
 
 
 @inlined
 def _at_sample(motion: Motion, imu: Inertial, at_ns: int, z: Vector, past_s: float, next_s: float) -> Motion:
-    """With a Doppler sample between two intervals; the log's way about the IMU counts in long ones."""
+    """Add a Doppler sample between two intervals; in long ones with the log's way about the IMU."""
     weight_s = 0.5 * (past_s + next_s)
     path, spread, slopes = with_sample(motion.path, motion.spread, motion.slopes, z, weight_s, imu.gyro_psd)
     motion = Motion(path, spread, slopes, motion.weights, motion.row)
     if past_s > LONG_S or next_s > LONG_S:
-        motion = _levered(motion, imu, at_ns, past_s if past_s > LONG_S else 0.0, next_s if next_s > LONG_S else 0.0)
+        past_s, next_s = past_s if past_s > LONG_S else 0.0, next_s if next_s > LONG_S else 0.0
+        motion = with_lever_arm(motion, imu, at_ns, past_s, next_s)
     return motion
 
 
 @inlined
-def _levered(motion: Motion, imu: Inertial, at_ns: int, past_s: float, next_s: float) -> Motion:
-    """One end of long intervals: ``(R_b - R_a) l`` in place of the trapezoid of ``R (w x l)``; 0: not long."""
+def with_lever_arm(motion: Motion, imu: Inertial, at_ns: int, past_s: float, next_s: float) -> Motion:
+    """One end of long intervals (0: not long): ``(R_b - R_a) l`` in place of the trapezoid of ``R (w x l)``."""
     R, weight_s = motion.path.R, 0.5 * (past_s + next_s)
     rate = minus(value_at(imu.stamps, imu.rate, motion.row, at_ns, False), imu.gyro_bias)
     rate = minus(rate, times(transposed(R), imu.earth))
@@ -231,8 +231,11 @@ def _levered(motion: Motion, imu: Inertial, at_ns: int, past_s: float, next_s: f
 
 
 @inlined
-def _over(motion: Motion, imu: Inertial, interval: Interval, rule: Rule) -> Motion:
-    """All inertial steps between two Doppler samples; a fixed rotation acts at its own instant."""
+def over_interval(motion: Motion, imu: Inertial, interval: Interval, rule: Rule) -> Motion:
+    """Take the motion over all inertial steps between two Doppler samples.
+
+    A rule with a fixed rotation adds the whole interval's displacement at the instant of that rotation.
+    """
     motion = Motion(motion.path, motion.spread, motion.slopes, NO_WEIGHTS, motion.row)
     start_ns, end_ns, z, z_next = interval
     if rule.turning == EVERY_SAMPLE:
@@ -241,23 +244,36 @@ def _over(motion: Motion, imu: Inertial, interval: Interval, rule: Rule) -> Moti
         at_ns = start_ns + (end_ns - start_ns) // 2 if rule.turning == MIDDLE else end_ns
         motion = _stepped(motion, imu, interval, start_ns, at_ns, rule)
         turned = multiple_of((end_ns - start_ns) * 1e-9, motion.path.R)
-        motion = _displaced(motion, turned, interval, rule.share, imu.gyro_psd)
+        by = Push(0.0, IDENTITY, ZEROS, ZEROS, ZERO, ZERO, times(turned, _mixed(interval, rule.share)))
+        motion = Motion(
+            pushed_path(motion.path, by),
+            pushed_spread(motion.spread, by, imu.gyro_psd * motion.path.elapsed_s, 0.0),
+            pushed_slopes(motion.slopes, by),
+            Weights(multiple_of(1.0 - rule.share, turned), multiple_of(rule.share, turned)),
+            motion.row,
+        )
         motion = _stepped(motion, imu, interval, at_ns, end_ns, rule)
     if rule.inertial:
         return motion
-    slopes = _with_calibration(motion.slopes, motion.weights, z, z_next)
-    return Motion(motion.path, motion.spread, slopes, motion.weights, motion.row)
+    weights, (M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting) = motion.weights, motion.slopes
+    s_scale = plus(s_scale, plus(times(weights.before, z), times(weights.after, z_next)))
+    s_mounting = difference_of(s_mounting, times_skew(weights.before, z))
+    s_mounting = difference_of(s_mounting, times_skew(weights.after, z_next))
+    slopes = Slopes(M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting)
+    return Motion(motion.path, motion.spread, slopes, weights, motion.row)
 
 
 @inlined
 def _stepped(motion: Motion, imu: Inertial, interval: Interval, t: int, end_ns: int, rule: Rule) -> Motion:
-    """Inertial steps, cut at every row; with the Doppler displacement where it turns with every row."""
+    """Inertial steps, cut at every row; with the Doppler displacement where its rotation changes at every row."""
     path, spread, slopes, (A, B), row = motion
     moving = not rule.inertial and rule.turning == EVERY_SAMPLE
     while t < end_ns:
         until = min(end_ns, imu.stamps[row]) if row < len(imu.stamps) else end_ns
         middle = t + (until - t) // 2
-        by = _push_at(path.R, imu, row, t, until)
+        rate = minus(value_at(imu.stamps, imu.rate, row, middle, False), imu.gyro_bias)
+        force = minus(value_at(imu.stamps, imu.force, row, middle, False), imu.accel_bias)
+        by = push(path.R, (until - t) * 1e-9, minus(rate, times(transposed(path.R), imu.earth)), force)
         if moving:
             span_ns = interval.end_ns - interval.start_ns
             later = (middle - interval.start_ns) / span_ns if rule.interpolated else rule.share
@@ -272,56 +288,16 @@ def _stepped(motion: Motion, imu: Inertial, interval: Interval, t: int, end_ns: 
 
 
 @inlined
-def _push_at(R: Matrix, imu: Inertial, row: int, t: int, until: int) -> Push:
-    """The step between two instants of which no row lies in between."""
-    middle = t + (until - t) // 2
-    rate = minus(value_at(imu.stamps, imu.rate, row, middle, False), imu.gyro_bias)
-    force = minus(value_at(imu.stamps, imu.force, row, middle, False), imu.accel_bias)
-    return push(R, (until - t) * 1e-9, minus(rate, times(transposed(R), imu.earth)), force)
-
-
-@inlined
-def _displaced(motion: Motion, turned: Matrix, interval: Interval, later: float, gyro_psd: float) -> Motion:
-    """A whole interval's displacement at once, by a rotation times the interval's length."""
-    by = Push(0.0, IDENTITY, ZEROS, ZEROS, ZERO, ZERO, times(turned, _mixed(interval, later)))
-    return Motion(
-        pushed_path(motion.path, by),
-        pushed_spread(motion.spread, by, gyro_psd * motion.path.elapsed_s, 0.0),
-        pushed_slopes(motion.slopes, by),
-        Weights(multiple_of(1.0 - later, turned), multiple_of(later, turned)),
-        motion.row,
-    )
-
-
-@inlined
 def _mixed(interval: Interval, later: float) -> Vector:
-    """Between the two samples, by the later one's share."""
+    """Velocity between the two samples, by the later one's share."""
     return plus(interval.z, scaled(later, minus(interval.z_next, interval.z)))
 
 
 @inlined
-def _with_calibration(slopes: Slopes, weights: Weights, z: Vector, z_next: Vector) -> Slopes:
-    """``s_scale`` and ``s_mounting`` after an interval."""
-    scale = plus(slopes.s_scale, plus(times(weights.before, z), times(weights.after, z_next)))
-    mounting = difference_of(slopes.s_mounting, times_skew(weights.before, z))
-    mounting = difference_of(mounting, times_skew(weights.after, z_next))
-    M, N, v_g, p_g, s_g, s_a, _, _ = slopes
-    return Slopes(M, N, v_g, p_g, s_g, s_a, scale, mounting)
-
-
-@inlined
-def _with_noise(motion: Motion, noise: Matrix) -> Motion:
-    """The motion with a Doppler sample's part of the covariance of s."""
-    mv, mp, ms, vv, vp, pp, sv, sp, ss = motion.spread
-    spread = Spread(mv, mp, ms, vv, vp, pp, sv, sp, sum_of(ss, noise))
-    return Motion(motion.path, spread, motion.slopes, motion.weights, motion.row)
-
-
-@inlined
-def _arrays(
+def to_arrays(
     motion: Motion, first: Matrix, last: Matrix, gyro_psd: float
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Arrays of `preintegrate`; theta turned from frame i into frame j."""
+    """Results of `preintegrate` as arrays, theta turned from frame i into frame j."""
     path, spread, slopes = motion.path, motion.spread, motion.slopes
     R, vectors, weights = np.empty((3, 3)), np.empty((3, 3)), np.empty((2, 3, 3))
     P, D = np.zeros((12, 12)), np.zeros((12, 10))

@@ -1,36 +1,22 @@
-"""One inertial step: rotation, velocity, position and Doppler displacement, their covariance and derivatives.
+"""One inertial step and one Doppler sample of joint preintegration: mean, covariance and derivatives.
 
 All errors are in frame i: ``R_true = Exp(theta) R``, ``v + dv``, ``p + dp``, ``s + ds``. Over a step of duration dt
-with constant rate and specific force f, and with ``G`` the integral and ``H`` the double integral of the rotation::
+with constant rate and specific force f, ``G`` the integral and ``H`` the double integral of the rotation, and u the
+velocity of the DVL in body axes::
 
-    a = G f,  b = H f,  c = G u         u velocity of the DVL in body axes
-    v <- v + a,    p <- p + v dt + b,    s <- s + c
+    a = G f,  b = H f,  c = G u,    v <- v + a,    p <- p + v dt + b,    s <- s + c
     dv <- dv - [a]x theta,    dp <- dp + dv dt - [b]x theta,    ds <- ds - [c]x theta
 
-Isotropic gyro noise stays isotropic however the body turns: ``cov(theta) = n_g^2 t I``. A covariance with theta is then
-a vector m, ``cov(dx, theta) = -[m]x``, and one of two integrals x and y with increments a_x, a_y changes by::
+Isotropic gyro noise stays isotropic: ``cov(theta) = n_g^2 t I``. A covariance with theta is a vector m,
+``cov(dx, theta) = -[m]x``; that of two integrals x and y with increments a_x, a_y changes, with q the variance of theta
+in the middle of the step, by::
 
     cov(dx, dy) <- cov(dx, dy) - (h_y a_x^T + a_y h_x^T) + (a_x . h_y + a_y . h_x) I,     h = m + q a / 2
 
-where q is the variance of theta in the middle of the step. That is why a step costs little more than its mean.
-
-What a Doppler sample does to the joint integral.
-
-Rule "inertial". With the velocity v(t) that the accelerometer gives from rest and the velocity z of the IMU's point,
-``y_k = R_k z_k - v_k`` would be the same at every sample k but for gravity, which makes it linear in time. Its
-trapezoid is therefore exact, and ::
-
-    s = p + sum_k w_k y_k,     w_k half of the two intervals at sample k
-
-is a displacement in which the accelerometer draws the velocity between samples and the samples its level and slope:
-gravity, the initial velocity and an accelerometer bias that is constant in frame i all cancel, however long the gap.
-A Doppler log at another place swings about the IMU's point: over short intervals that is left to the trapezoid, over
-long ones it is drawn by the gyros (`sonar_graph.navigation.preintegration.joint_preintegration`).
-
-All other rules. ``s = sum_k W_k z_k``, W_k from the rotations around sample k.
-
-Either way sample k enters by one weight matrix W_k, ``cov(ds) += W_k Q_k W_k^T``. Those of the first and last sample
-are kept apart: the neighbouring motion has the same sample.
+A Doppler sample enters s by one weight matrix, ``cov(ds) += W_k Q_k W_k^T``. Rule "inertial", with z the velocity of
+the IMU's point and w_k half of the two intervals at sample k: ``s = p + sum_k w_k (R_k z_k - v_k)``, in which gravity,
+initial velocity and a constant accelerometer bias cancel. Other rules: ``s = sum_k W_k z_k``.
+docs/theory/preintegration.md.
 """
 
 from __future__ import annotations
@@ -100,7 +86,7 @@ class Slopes(NamedTuple):
 
 
 class Push(NamedTuple):
-    """What a step adds, in frame i."""
+    """The contribution of one step, in frame i."""
 
     dt: float
     turn: Matrix
@@ -221,10 +207,7 @@ def pushed_slopes(slopes: Slopes, by: Push) -> Slopes:
 def with_sample(
     path: Path, spread: Spread, slopes: Slopes, z: Vector, weight_s: float, gyro_psd: float
 ) -> tuple[Path, Spread, Slopes]:
-    """After ``w_k y_k`` is added; the sample's own noise is not in the spread.
-
-    With ``e = -w ([R z]x theta + dv)`` the error that is added.
-    """
+    """Add ``w_k y_k`` with the error ``e = -w ([R z]x theta + dv)``; the sample's own noise is added elsewhere."""
     w, turned = weight_s, times(path.R, z)
     variance = gyro_psd * path.elapsed_s
     by_v = _skew_product(turned, spread.mv)
@@ -276,7 +259,7 @@ def _skew_product(a: Vector, b: Vector) -> Matrix:
 
 @inlined
 def with_inertial_position(path: Path, spread: Spread, slopes: Slopes) -> tuple[Path, Spread, Slopes]:
-    """At the end, ``s <- p + s``."""
+    """Add the inertial position at the end, ``s <- p + s``."""
     sp = sum_of(spread.pp, spread.sp)
     return (
         Path(path.elapsed_s, path.R, path.v, path.p, plus(path.p, path.s)),

@@ -13,11 +13,8 @@ error ``n``::
     theta <- Exp(-phi)  theta + J_r(phi) dt d
     eps   <- eps - dR [J_l u dt]x theta + dR (D dt + J_l [l]x) dt d + dR J_l dt n,     D = d(J_l u) / d phi
 
-White noise gives the covariance, a constant ``d = -db`` the bias Jacobian, both by the same recursion, so that
-rotation and displacement are correlated as they should be and no sample is counted twice. A gyro error also reaches
-the velocity through the lever arm. Following Forster et al., TRO 2017, section VI, with the DVL in place of the
-accelerometer; compare
-Thoms et al., IEEE JOE 2023.
+White noise gives the covariance, a constant ``d = -db`` the bias Jacobian. After Forster et al., TRO 2017, section VI,
+with the DVL in place of the accelerometer; compare Thoms et al., IEEE JOE 2023. docs/theory/preintegration.md.
 """
 
 from __future__ import annotations
@@ -38,12 +35,27 @@ from sonar_graph.numerics import compiled
 
 @dataclass(frozen=True, eq=False)
 class PreintegratedMotion:
-    """Motion from body frame i to body frame j."""
+    """Motion from body frame i to body frame j, with its covariance and its derivative by the gyro bias.
+
+    Examples
+    --------
+    Ten steps of 0.1 s at 0.5 m/s, and the same again, as one motion:
+
+    >>> import numpy as np
+    >>> from sonar_graph.navigation import Preintegrator
+    >>> from sonar_graph.navigation.preintegration import Steps
+    >>> zeros, ahead = np.zeros((10, 3)), np.tile([0.5, 0.0, 0.0], (10, 1))
+    >>> steps = Steps(np.full(10, 0.1), zeros, ahead, np.zeros((10, 3, 3)), zeros, zeros)
+    >>> motion = Preintegrator(1e-4, np.zeros(3)).integrate(steps, np.zeros(3))
+    >>> twice = motion.then(motion)
+    >>> round(float(twice.i_T_j.x()), 6), round(twice.duration_s, 6)
+    (1.0, 2.0)
+    """
 
     i_T_j: gtsam.Pose3
     """Mean, for the gyro bias `bias`."""
     covariance: Floats
-    """Of the perturbation [rotation, translation] in frame j, shape (6, 6)."""
+    """Covariance of the perturbation [rotation, translation] in frame j, shape (6, 6)."""
     D_bias: Floats
     """Derivative of the same perturbation by the gyro bias, shape (6, 3), per rad/s."""
     bias: Floats
@@ -53,12 +65,12 @@ class PreintegratedMotion:
     """Mean over time of the specific force, turned into frame i, shape (3,), m/s²; NaN where not measured."""
 
     def then(self, next_motion: PreintegratedMotion) -> PreintegratedMotion:
-        """Followed by the next motion, from the last instant on, for the same gyro bias.
+        """The motion followed by the next one, for the same gyro bias.
 
         ``i_T_k = i_T_j j_T_k``; a perturbation of the first reaches frame k through ``Ad(j_T_k^-1)``.
         """
         i_R_j = self.i_T_j.rotation().matrix()
-        cov, D, force = _chained(
+        cov, D, force = chain_covariances(
             next_motion.i_T_j.inverse().AdjointMap(),
             self.covariance,
             self.D_bias,
@@ -78,12 +90,23 @@ class PreintegratedMotion:
 
 @dataclass(frozen=True, eq=False)
 class Preintegrator:
-    """What preintegration needs to know of the sensors.
+    """Preintegration of gyro and Doppler steps, for one set of sensors.
 
     Raises
     ------
     CalibrationError
         When the density is negative, or a number is not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sonar_graph.navigation import Preintegrator
+    >>> from sonar_graph.navigation.preintegration import Steps
+    >>> zeros, ahead = np.zeros((10, 3)), np.tile([0.5, 0.0, 0.0], (10, 1))
+    >>> steps = Steps(np.full(10, 0.1), zeros, ahead, np.zeros((10, 3, 3)), zeros, zeros)
+    >>> motion = Preintegrator(1e-4, np.zeros(3)).integrate(steps, np.zeros(3))
+    >>> motion.i_T_j.translation().round(6).tolist()
+    [0.5, 0.0, 0.0]
     """
 
     gyro_noise_density: float
@@ -109,7 +132,7 @@ class Preintegrator:
         Parameters
         ----------
         steps
-            From `sonar_graph.navigation.odometry.Odometry`.
+            Steps of `sonar_graph.navigation.odometry.Odometry`.
         bias
             Gyro bias in the body frame to remove, shape (3,), rad/s.
         earth_rate
@@ -152,16 +175,16 @@ class Preintegrator:
         Parameters
         ----------
         columns
-            Of `sonar_graph.navigation.odometry.Odometry`.
+            Rows of `sonar_graph.navigation.odometry.Odometry`.
         start_ns, end_ns
-            From a node to the next, or (not closed) to an instant before it.
+            A node and the next one, or (not closed) a node and an instant before the next.
         bias, earth_rate
-            As those of `integrate`.
+            See `integrate`.
         """
         if self.gap is None:
             raise CalibrationError("gap: a Preintegrator without it bridges no gaps; make it with from_calibration")
-        earth = (0.0, 0.0, 0.0) if earth_rate is None else _vector(earth_rate)
-        motion = bridge(columns, self.gap, start_ns, end_ns, is_closed, _vector(bias), earth)
+        earth = (0.0, 0.0, 0.0) if earth_rate is None else float_triple(earth_rate)
+        motion = bridge(columns, self.gap, start_ns, end_ns, is_closed, float_triple(bias), earth)
         rotation, displacement, cov, D, impulse = in_last_frame(*motion)
         duration_s = (end_ns - start_ns) * 1e-9
         pose = gtsam.Pose3(gtsam.Rot3(rotation), displacement)
@@ -173,7 +196,7 @@ class Preintegrator:
         Parameters
         ----------
         point
-            In the body frame, shape (3,), m.
+            Position in the body frame, shape (3,), m.
         offsets_s
             Times after the start of the steps, not decreasing, shape (n,).
 
@@ -186,11 +209,13 @@ class Preintegrator:
 
 
 @compiled
-def _chained(
+def chain_covariances(
     A: Floats, cov: Floats, D: Floats, next_cov: Floats, next_D: Floats, impulse: Floats, next_impulse: Floats
 ) -> tuple[Floats, Floats, Floats]:
+    """Covariance, bias derivative and impulse of two successive motions, A the adjoint of the second's inverse."""
     return A @ cov @ A.T + next_cov, A @ D + next_D, impulse + next_impulse
 
 
-def _vector(a: Floats) -> tuple[float, float, float]:
+def float_triple(a: Floats) -> tuple[float, float, float]:
+    """Three numbers of an array as a tuple, for compiled code."""
     return float(a[0]), float(a[1]), float(a[2])

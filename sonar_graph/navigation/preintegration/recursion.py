@@ -1,20 +1,14 @@
-"""The recursion of preintegration as machine code: about 0.1 µs for a step, where matrix expressions take 5 µs.
+"""Steps of gyro and Doppler rows, and the recursion of preintegration over them, as machine code.
 
-The equations are those of `sonar_graph.navigation.preintegration.motion`, with the rotation's perturbation kept in
-frame i
-until the end (``theta_i = dR theta``), where it needs no transport::
+Rows of both sensors are merged into steps of constant rate and velocity, on which every estimator moves. The equations
+are those of `sonar_graph.navigation.preintegration.motion`, with the rotation's perturbation kept in frame i until the
+end (``theta_i = dR theta``), where it needs no transport::
 
     theta_i <- theta_i + dR J_l dt d
     eps     <- eps - [s]x theta_i + (dR D dt + dR J_l [l]x) dt d + dR J_l dt n,     s = dR J_l u dt
 
-Gyro and Doppler rows, merged into steps of constant rate and velocity.
-
-Every estimator moves on these steps, so that no comparison hinges on how two sensors were interpolated
-(`sonar_graph.navigation.samples`).
-
-Noise. Doppler samples are white: each perturbs the displacement by its weight (half the two intervals that it ends and
-begins) times its error. The same total over any chain follows from a velocity noise that is white in time with
-spectral density ``velocity_cov * interval``; half of a sample's variance falls on either side of its node.
+Doppler noise is white in time with the spectral density ``velocity_cov * interval``; half of a sample's variance falls
+on either side of its node. docs/theory/preintegration.md.
 """
 
 from __future__ import annotations
@@ -25,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.navigation.imu_gaps import TurnValues, felt, turn_psd
+from sonar_graph.navigation.imu_gaps import TurnValues, force_outside_holes, turn_psd
 from sonar_graph.navigation.samples import between, bracket, rows_until
 from sonar_graph.numerics import (
     IDENTITY,
@@ -62,7 +56,7 @@ SERIES_ANGLE2 = 2.5e-3
 
 
 class Step(NamedTuple):
-    """One row of `sonar_graph.navigation.preintegration.recursion.Steps`."""
+    """One row of `Steps`."""
 
     duration_s: float
     rate: Vector
@@ -80,15 +74,15 @@ class Integral(NamedTuple):
     impulse: Vector
     """Integral of the specific force in frame i, m/s."""
     cov_tt: Matrix
-    """Of theta_i; the perturbation [theta_i, eps] is that of the module's equations."""
+    """Covariance of theta_i; the perturbation [theta_i, eps] is that of the module's equations."""
     cov_rt: Matrix
-    """Between eps and theta_i."""
+    """Covariance of eps with theta_i."""
     cov_rr: Matrix
-    """Of eps; only the upper half is exact in its last bits, see `mirrored`."""
+    """Covariance of eps; only the upper half is exact in its last bits, see `mirrored`."""
 
 
 class Increment(NamedTuple):
-    """What a step adds to an integral."""
+    """The contribution of one step to an integral."""
 
     turn: Matrix
     """``Exp(phi)``."""
@@ -105,19 +99,19 @@ NO_MOTION = Integral(IDENTITY, ZERO, ZERO, ZEROS, ZEROS, ZEROS)
 
 @inlined
 def increment(dR: Matrix, duration_s: float, rate: Vector, velocity: Vector, lever: Vector) -> Increment:
-    """What a step adds after a rotation.
+    """The contribution of a step after the rotation dR.
 
     Parameters
     ----------
     rate
-        Without bias and Earth rate.
+        Angular rate without bias and Earth rate, rad/s.
     lever
-        The DVL in the body frame, m.
+        Lever arm of the DVL, body frame, m.
     """
     phi, u = scaled(duration_s, rate), minus(velocity, cross(rate, lever))
     turn, chord = exp_and_chord(phi)
     turned = product(dR, chord)
-    by_rate = sum_of(product(dR, _chord_derivative(phi, u, duration_s)), times_skew(turned, lever))
+    by_rate = sum_of(product(dR, chord_derivative(phi, u, duration_s)), times_skew(turned, lever))
     return Increment(turn, scaled(duration_s, times(turned, u)), turned, by_rate)
 
 
@@ -179,7 +173,7 @@ def extended_by_bias(D_t: Matrix, D_r: Matrix, step: Step, added: Increment) -> 
 
 @inlined
 def mirrored(A: Matrix) -> Matrix:
-    """The upper half in both places."""
+    """Symmetric matrix from the upper half."""
     return A[0], (A[0][1], A[1][1], A[1][2]), (A[0][2], A[1][2], A[2][2])
 
 
@@ -201,13 +195,13 @@ def integrate_steps(
     Parameters
     ----------
     duration, rate, velocity, velocity_psd, force, turn_psd
-        The columns of `sonar_graph.navigation.preintegration.recursion.Steps`.
+        The columns of `Steps`.
     bias
         Gyro bias to remove, body frame, shape (3,), rad/s.
     earth
         Earth's rotation in frame i, shape (3,), rad/s.
     lever
-        The DVL in the body frame, shape (3,), m.
+        Lever arm of the DVL, body frame, shape (3,), m.
     gyro_density
         White noise of the gyros, rad/s/√Hz.
 
@@ -233,12 +227,12 @@ def integrate_steps(
 def trace_point(
     duration: Floats, rate: Floats, velocity: Floats, bias: Floats, lever: Floats, point: Floats, offsets: Floats
 ) -> Floats:
-    """Where a point of the body is at times after the first instant, in frame i, shape (n, 3); the mean motion only.
+    """Positions of a point of the body at times after the first instant, in frame i, shape (n, 3), m.
 
     Parameters
     ----------
     point
-        In the body frame, shape (3,), m.
+        Position in the body frame, shape (3,), m.
     offsets
         Seconds after the start of the steps, not decreasing, shape (n,). Motion within a step is taken as straight.
     """
@@ -265,7 +259,7 @@ def trace_point(
 
 @inlined
 def exp_and_chord(phi: Vector) -> tuple[Matrix, Matrix]:
-    """Exp(phi) and J_l(phi) at once: they share sine and cosine, and a sample's turn needs neither."""
+    """Exp(phi) and J_l(phi), which share sine and cosine; small turns need neither."""
     angle2 = dot(phi, phi)
     s1, s2, s3 = sine_series(angle2)
     return rotation_series(phi, angle2, s1, s2), rotation_series(phi, angle2, s2, s3)
@@ -298,7 +292,7 @@ def rotation_series(phi: Vector, angle2: float, a: float, b: float) -> Matrix:
 
 
 @inlined
-def _chord_derivative(phi: Vector, u: Vector, scale: float) -> Matrix:
+def chord_derivative(phi: Vector, u: Vector, scale: float) -> Matrix:
     """Derivative of ``J_l(phi) u`` by phi, times scale; to second order in phi (a step turns by far less than 1 rad).
 
     ``-[u]x / 2 - ([phi]x [u]x + [phi x u]x) / 6``, with ``[phi]x [u]x = u phi^T - (phi . u) I``.
@@ -334,8 +328,8 @@ def in_last_frame(motion: Integral, D_t: Matrix, D_r: Matrix) -> tuple[Floats, F
 
 
 Columns = tuple[Ints, Floats, Floats, Ints, Floats, Floats, bool, TurnValues]
-"""IMU: stamps, rate, specific force. DVL: stamps, velocity, covariance. Whether a sample holds for what lies before.
-How the vehicle turns where no gyro tells."""
+"""IMU: stamps, rate, specific force. DVL: stamps, velocity, covariance. True where a sample holds for the interval
+before it. Turn values for holes of the IMU."""
 
 
 class Cursor(NamedTuple):
@@ -343,9 +337,9 @@ class Cursor(NamedTuple):
 
     stamp_ns: int
     imu_row: int
-    """First row after it."""
+    """First IMU row after it."""
     dvl_row: int
-    """First row after it."""
+    """First DVL row after it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,19 +357,10 @@ class Steps:
     specific_force: Floats
     """Mean specific force at the IMU, body axes, shape (n, 3), m/s²; NaN where not measured."""
     turn_psd: Floats
-    """Spectral density of rates that were not measured, body axes, shape (n, 3), rad²/s; zero where they were."""
+    """Spectral density of the rates' error in holes of the IMU, body axes, shape (n, 3), rad²/s; zero elsewhere."""
 
     def __len__(self) -> int:
         return len(self.duration_s)
-
-
-@inlined
-def _velocity_psd(dvl_ns: Ints, cov: Floats, n: int, k: int, hold_past: bool) -> Matrix:
-    """Spectral density of the velocity noise between rows k - 1 and k; past row n - 1, that of the last interval."""
-    last = min(k, n - 1)
-    interval_s = (dvl_ns[last] - dvl_ns[last - 1]) * 1e-9 if last > 0 else 0.0
-    other = last if hold_past or k >= n or last == 0 else last - 1
-    return multiple_of(interval_s, multiple_of(0.5, sum_of(matrix(cov[last]), matrix(cov[other]))))
 
 
 @inlined
@@ -388,10 +373,8 @@ def cursor_at(columns: Columns, instant_ns: int) -> Cursor:
 def next_step(columns: Columns, imu_rows: int, dvl_rows: int, cursor: Cursor, end_ns: int) -> tuple[Cursor, Step]:
     """The step from a cursor to the next stamp of either sensor, or to the end: each sensor's mean over it.
 
-    Parameters
-    ----------
-    columns
-        Of `Odometry.columns`, of which only the first ``imu_rows`` and ``dvl_rows`` rows are used.
+    Only the first ``imu_rows`` and ``dvl_rows`` rows are used. The velocity noise after the last DVL row is that of the
+    last interval.
     """
     imu_ns, rate, force, dvl_ns, velocity, cov, hold_past, turns = columns
     t, i, k = cursor
@@ -402,12 +385,15 @@ def next_step(columns: Columns, imu_rows: int, dvl_rows: int, cursor: Cursor, en
         until = min(until, dvl_ns[k])
     middle = t + (until - t) // 2
     before, after, share = bracket(imu_ns, imu_rows, i, middle, hold_past)
+    last = min(k, dvl_rows - 1)
+    interval_s = (dvl_ns[last] - dvl_ns[last - 1]) * 1e-9 if last > 0 else 0.0
+    other = last if hold_past or k >= dvl_rows or last == 0 else last - 1
     step = Step(
         (until - t) * 1e-9,
         between(rate, before, after, share),
         between(velocity, *bracket(dvl_ns, dvl_rows, k, middle, hold_past)),
-        _velocity_psd(dvl_ns, cov, dvl_rows, k, hold_past),
-        felt(between(force, before, after, share), turns, imu_ns, imu_rows, i, until),
+        multiple_of(interval_s, multiple_of(0.5, sum_of(matrix(cov[last]), matrix(cov[other])))),
+        force_outside_holes(between(force, before, after, share), turns, imu_ns, imu_rows, i, until),
         turn_psd(turns, imu_ns, imu_rows, i, t, until),
     )
     past_imu = i < imu_rows and imu_ns[i] <= until
@@ -417,7 +403,7 @@ def next_step(columns: Columns, imu_rows: int, dvl_rows: int, cursor: Cursor, en
 
 @compiled
 def are_nodes(imu_ns: Ints, dvl_ns: Ints, start_ns: int, end_ns: int) -> bool:
-    """Whether an interval, the earlier end first, begins and ends at Doppler rows that IMU rows cover."""
+    """True where an interval, the earlier end first, begins and ends at Doppler rows that IMU rows cover."""
     if end_ns < start_ns or not len(imu_ns) or start_ns < imu_ns[0] or end_ns > imu_ns[-1]:
         return False
     first, last = np.searchsorted(dvl_ns, start_ns), np.searchsorted(dvl_ns, end_ns)
@@ -428,7 +414,7 @@ def are_nodes(imu_ns: Ints, dvl_ns: Ints, start_ns: int, end_ns: int) -> bool:
 def merge_rows(
     columns: Columns, imu_rows: int, dvl_rows: int, start_ns: int, end_ns: int
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Cut (start, end] at every stamp of either sensor and take each sensor's mean over each piece."""
+    """Columns of `Steps`: (start, end] cut at every stamp of either sensor, with each sensor's mean over each piece."""
     cursor = cursor_at(columns, start_ns)
     most = max(imu_rows - cursor.imu_row, 0) + max(dvl_rows - cursor.dvl_row, 0) + 1
     duration, rates, velocities = np.empty(most), np.empty((most, 3)), np.empty((most, 3))

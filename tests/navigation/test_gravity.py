@@ -1,3 +1,5 @@
+"""Direction of gravity in a moving vehicle, the Earth's rotation, and roll and pitch of an up vector."""
+
 import gtsam
 import numpy as np
 import pytest
@@ -6,11 +8,22 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from sonar_graph.calibration import ImuCalibration
-from sonar_graph.measurements import Floats
-from sonar_graph.navigation.alignment.gravity import gravity_direction, velocity_at_imu
+from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
+from sonar_graph.errors import AlignmentError
+from sonar_graph.measurements import Floats, Imu
+from sonar_graph.navigation.alignment.gravity import (
+    angles_by_up,
+    earth_rate_in_world,
+    earth_up_and_level,
+    gravity_direction,
+    in_body_axes,
+    roll_and_pitch,
+    velocity_at_imu,
+)
 from sonar_graph.navigation.preintegration.motion import PreintegratedMotion, Preintegrator
 from sonar_graph.navigation.preintegration.recursion import Steps
+
+from .rows import derivative
 
 G = 9.81
 GRAVITY = np.array([0.0, 0.0, G])
@@ -50,6 +63,10 @@ def accelerated() -> tuple[PreintegratedMotion, Floats, Floats]:
     return motion, attitude(0).inv().apply(world_velocity(0)), attitude(T).inv().apply(world_velocity(T))
 
 
+def at_rest(duration_s: float, force: Floats = GRAVITY) -> PreintegratedMotion:
+    return PreintegratedMotion(gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), duration_s, force)
+
+
 def test_up_is_found_in_a_moving_vehicle():
     """And would be off by degrees, were the vehicle's own acceleration left in."""
     motion, v_i, v_j = accelerated()
@@ -86,10 +103,7 @@ def test_stated_sigma_is_that_of_many_noisy_intervals():
 @settings(max_examples=30)
 def test_each_source_of_tilt_noise_falls_with_time_as_it_should(duration_s, velocity_sigma):
     """White force as 1 / sqrt(T), velocities as 1 / T, the bias not at all; the gyros' rises."""
-    motion = PreintegratedMotion(
-        gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), duration_s, np.array([0, 0, G])
-    )
-    _, sigma = gravity_direction(motion, np.zeros(3), np.zeros(3), velocity_sigma, IMU, G)
+    _, sigma = gravity_direction(at_rest(duration_s), np.zeros(3), np.zeros(3), velocity_sigma, IMU, G)
     parts = [2e-3 / np.sqrt(duration_s), np.sqrt(2) * velocity_sigma / duration_s, 5e-3]
     by_gyros = IMU.gyro_noise_density * np.sqrt(duration_s / 3), IMU.gyro_bias_sigma * duration_s / 2
     assert sigma == pytest.approx(np.linalg.norm([np.linalg.norm(parts) / G, *by_gyros]))
@@ -100,10 +114,7 @@ def test_each_source_of_tilt_noise_falls_with_time_as_it_should(duration_s, velo
 def test_tilt_settles_at_what_the_accelerometer_bias_allows(duration_s, gyro_density):
     """A scalar Kalman filter fed with many directions; as fresh noise the bias would be claimed several times less."""
     imu = ImuCalibration(accel_noise_density=1e-5, accel_bias_sigma=1e-2, gyro_noise_density=gyro_density)
-    motion = PreintegratedMotion(
-        gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), duration_s, np.array([0, 0, G])
-    )
-    _, sigma = gravity_direction(motion, np.zeros(3), np.zeros(3), 1e-6, imu, G)
+    _, sigma = gravity_direction(at_rest(duration_s), np.zeros(3), np.zeros(3), 1e-6, imu, G)
     settled, naive = (settled_tilt_sigma(s, gyro_density, duration_s) for s in (sigma, 1e-2 / G))
     assert settled == pytest.approx(1e-2 / G, rel=0.03)
     assert naive < 0.6 * settled
@@ -120,10 +131,7 @@ def test_what_the_gyros_do_meanwhile_is_in_the_tilt(duration_s):
     imu = ImuCalibration(
         accel_noise_density=1e-9, accel_bias_sigma=0.0, gyro_noise_density=density, gyro_bias_sigma=bias
     )
-    motion = PreintegratedMotion(
-        gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), duration_s, np.array([0, 0, G])
-    )
-    _, sigma = gravity_direction(motion, np.zeros(3), np.zeros(3), 0.0, imu, G)
+    _, sigma = gravity_direction(at_rest(duration_s), np.zeros(3), np.zeros(3), 0.0, imu, G)
     assert sigma == pytest.approx((tilt[:, -1] - tilt.mean(axis=1)).std(), rel=0.03)
 
 
@@ -136,8 +144,7 @@ def settled_tilt_sigma(sigma, gyro_density, duration_s):
 
 
 def test_without_forces_there_is_no_direction():
-    motion = PreintegratedMotion(gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), 1.0, np.full(3, np.nan))
-    assert gravity_direction(motion, np.zeros(3), np.zeros(3), 0.01, IMU, G) is None
+    assert gravity_direction(at_rest(1.0, np.full(3, np.nan)), np.zeros(3), np.zeros(3), 0.01, IMU, G) is None
 
 
 def test_velocity_at_the_imu_is_that_of_a_point_of_a_rigid_body():
@@ -152,3 +159,65 @@ def test_velocity_at_the_imu_is_that_of_a_point_of_a_rigid_body():
     moved = gtsam.Pose3.Expmap(1e-6 * twist_at_dvl).transformFrom(body_p_imu - body_p_dvl)
     expected = (moved - (body_p_imu - body_p_dvl)) / 1e-6
     assert velocity_at_imu(v_dvl, w, body_p_dvl, body_p_imu) == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize(("latitude_deg", "rate"), [(0, [0, 15.041, 0]), (90, [0, 0, 15.041]), (-90, [0, 0, -15.041])])
+def test_the_earth_turns_north_at_the_equator_and_up_at_the_north_pole(latitude_deg, rate):
+    """Degrees an hour; once a sidereal day."""
+    known = Calibration(earth_rate_latitude_rad=np.radians(latitude_deg))
+    found = np.degrees(earth_rate_in_world(known)) * 3600
+    assert found == pytest.approx(rate, abs=1e-3)
+    assert earth_up_and_level(known) == pytest.approx(earth_rate_in_world(known)[[2, 1]])
+    assert 360 / np.linalg.norm(found) == pytest.approx(23.9345, abs=1e-4)
+    assert earth_rate_in_world(Calibration()) is None
+    assert earth_up_and_level(Calibration()) == (0.0, 0.0)
+
+
+ATTITUDES = [(0.3, -0.4), (-2.8, 1.2), (0.0, 0.0), (1.5, -1.5)]
+
+
+def up_of(roll: float, pitch: float, yaw: float = 0.7) -> np.ndarray:
+    return Rotation.from_euler("ZYX", [yaw, pitch, roll]).inv().apply([0, 0, 1.0])
+
+
+@pytest.mark.parametrize(("roll", "pitch"), ATTITUDES)
+@pytest.mark.parametrize("length", [1.0, 9.8])
+def test_up_in_the_body_has_the_roll_and_pitch_of_the_attitude(roll, pitch, length):
+    assert roll_and_pitch(length * up_of(roll, pitch)) == pytest.approx((roll, pitch))
+
+
+@pytest.mark.parametrize(("roll", "pitch"), ATTITUDES)
+def test_the_derivative_is_that_of_turning_up_a_little(roll, pitch):
+    """Along the sphere; a change of length is none of either angle."""
+    up = up_of(roll, pitch)
+
+    def angles(phi: np.ndarray) -> tuple[float, float]:
+        return roll_and_pitch(Rotation.from_rotvec(phi).apply(up))
+
+    by_turn = derivative(lambda phi: Rotation.from_rotvec(phi).apply(up), 3)
+    assert angles_by_up(up) @ by_turn == pytest.approx(derivative(angles, 3), abs=1e-6)
+    assert angles_by_up(up) @ up == pytest.approx([0.0, 0.0], abs=1e-12)
+
+
+@pytest.mark.parametrize("pitch", [np.pi / 2 - 0.9e-3, -np.pi / 2 + 0.9e-3])
+def test_a_nose_within_a_milliradian_of_the_vertical_has_no_roll(pitch):
+    with pytest.raises(AlignmentError, match="nose points straight"):
+        angles_by_up(up_of(0.3, pitch))
+    angles_by_up(up_of(0.3, pitch - np.copysign(0.2e-3, pitch)))
+
+
+def test_readings_are_turned_by_the_mounting():
+    rpy, rng = (0.3, -0.5, 1.1), np.random.default_rng(0)
+    rate, force = rng.standard_normal((2, 5, 3))
+    known = Calibration(imu=ImuCalibration(mounting=Mounting(rpy_rad=rpy)))
+    imu, turn = Imu(np.arange(5), rate, force), Rotation.from_euler("xyz", rpy)
+    found = in_body_axes(imu, known)
+    assert found.angular_velocity == pytest.approx(turn.apply(rate))
+    assert found.specific_force == pytest.approx(turn.apply(force))
+
+
+def test_a_single_force_that_was_not_measured_is_refused():
+    force = np.ones((5, 3))
+    force[3, 1] = np.nan
+    with pytest.raises(AlignmentError, match="not finite in every row"):
+        in_body_axes(Imu(np.arange(5), np.zeros((5, 3)), force), Calibration())

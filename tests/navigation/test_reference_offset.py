@@ -1,3 +1,5 @@
+"""Reference against gyros, with poses of a simulated mission stamped early by known amounts."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -76,7 +78,7 @@ def test_nothing_is_compared_over_a_hole_of_the_gyros(monkeypatch):
     assert abs(offset.value - 0.2) < 3 * offset.sigma < 0.01
     assert heading.value == pytest.approx(0.07, abs=4 * heading.sigma)
     assert heading.sigma < 0.005
-    monkeypatch.setattr("sonar_graph.navigation.alignment.dvl_imu._parts", np.zeros_like)
+    monkeypatch.setattr("sonar_graph.navigation.alignment.dvl_imu.holes_before", np.zeros_like)
     assert match_reference_to_imu(holed, right, RUN.calibration).offset.sigma > 1.5 * offset.sigma
     assert match_reference_to_imu(holed, wrong, RUN.calibration).start_heading.sigma > 0.005
 

@@ -1,4 +1,4 @@
-"""Truth from the simulator, whose exact kinematics share no code with navigation."""
+"""Doppler log against accelerometers; truth from the simulator, whose kinematics share no code with navigation."""
 
 from __future__ import annotations
 
@@ -14,14 +14,61 @@ from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.alignment.dvl_imu import (
     DvlMatch,
     InertialPath,
-    _line_up,
-    _without_shared_noise,
     match_dvl_to_imu,
     stretches_of,
+    velocity_changes,
 )
 from sonar_graph.navigation.alignment.time_offset import OffsetFit, SampleSeries, fit, rate_noise_power
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+
+T_S = np.arange(0, 20, 0.02)
+STAMPS_NS = np.round(T_S * 1e9).astype(np.int64)
+RATE = np.column_stack([0.2 * np.sin(T_S), 0.1 * np.cos(0.7 * T_S), 0.3 + 0.2 * np.sin(0.4 * T_S)])
+FORCE = np.column_stack([np.sin(0.5 * T_S), 0.3 * np.cos(T_S), 9.8 + 0.1 * T_S])
+
+
+def path_with(gyro_bias: np.ndarray, accel_bias: np.ndarray) -> InertialPath:
+    return InertialPath.of(Imu(STAMPS_NS, RATE + gyro_bias, FORCE + accel_bias))
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_impulse_changes_with_biases_as_its_derivatives_say(axis):
+    bias, none = 1e-5 * np.eye(3)[axis], np.zeros(3)
+    path = path_with(none, none)
+    by_accel = path_with(none, bias).impulse - path.impulse
+    by_gyro = 0.5 * (path_with(bias, none).impulse - path_with(-bias, none).impulse)
+    assert by_accel == pytest.approx(path.turned_time @ bias, abs=1e-12)
+    assert by_gyro == pytest.approx(-path.tilted_impulse @ bias, abs=5e-4 * np.abs(by_gyro).max())
+    assert np.abs(by_gyro[-1]).max() > 3e-4
+
+
+def test_a_hole_ends_a_part_and_what_is_about_it_is_not_covered():
+    """Between 5 s and 7 s there is no sample; 80 ms are no hole."""
+    kept = ((T_S <= 5.001) | (T_S >= 6.999)) & ((T_S <= 12.001) | (T_S >= 12.079))
+    path = InertialPath.of(Imu(STAMPS_NS[kept], RATE[kept], FORCE[kept]))
+    assert np.flatnonzero(np.diff(path.parts)).tolist() == [250]
+    assert path.parts_at(np.array([0.0, 5.0, 6.9, 7.0, 19.9])).tolist() == [0, 0, 0, 1, 1]
+    asked = np.array([-0.1, 0.0, 5.0, 5.01, 6.99, 7.0, 12.04, 19.98, 20.0])
+    assert path.covers(asked).tolist() == [False, True, True, False, False, True, True, True, False]
+    assert path.covers(np.array([0.9, 3.99, 4.01, 7.99, 8.01, 18.99]), 1.0).tolist() == [
+        False,
+        True,
+        False,
+        False,
+        True,
+        False,
+    ]
+
+
+def test_integrals_at_samples_are_those_of_the_samples():
+    path = path_with(np.zeros(3), np.zeros(3))
+    rows = np.array([3, 500, 700])
+    assert path.rotations_at(T_S[rows]) == pytest.approx(path.rotations[rows])
+    assert path.linear_at(T_S[rows], path.tilted_impulse) == pytest.approx(path.tilted_impulse[rows])
+    between = 0.5 * (path.rotations[3] + path.rotations[4])
+    assert path.rotations_at(T_S[3:4] + 0.01)[0] == pytest.approx(between, abs=1e-4)
+
 
 OFFSET_S, YAW_RAD, SCALE = 0.13, np.radians(3), 1.01
 
@@ -43,11 +90,6 @@ def test_offset_yaw_and_scale_are_found():
     assert abs(found.offset.value - OFFSET_S) < 4 * found.offset.sigma < 0.4
     assert abs(found.yaw.value - YAW_RAD) < 4 * found.yaw.sigma < 0.03
     assert abs(found.scale.value - SCALE) < 4 * found.scale.sigma < 0.02
-
-
-def test_shifting_the_stamps_shifts_the_offset():
-    here, there = matched(spoilt(2, offset_s=-0.4)), matched(spoilt(2, offset_s=0.3))
-    assert there.offset.value - here.offset.value == pytest.approx(0.7, abs=0.02)
 
 
 def test_straight_and_steady_driving_tells_nothing():
@@ -120,7 +162,7 @@ def test_a_hole_of_the_imu_ends_a_stretch(hole_s: float, monkeypatch: pytest.Mon
     assert np.abs(errors_over_sigma(holed)).max() < 2.5
     assert holed.scale.sigma < 1.5 * whole.scale.sigma
     assert abs(holed.scale.value - whole.scale.value) < 2 * whole.scale.sigma
-    monkeypatch.setattr("sonar_graph.navigation.alignment.dvl_imu._parts", np.zeros_like)
+    monkeypatch.setattr("sonar_graph.navigation.alignment.dvl_imu.holes_before", np.zeros_like)
     blind = matched(without_rows(run, hole_s))
     assert blind.scale.sigma > 1.25 * whole.scale.sigma
     assert hole_s < 5.0 or abs(blind.scale.value - 1.0) > 2.5 * blind.scale.sigma
@@ -194,12 +236,12 @@ def test_the_gyro_bias_is_found_in_body_axes():
 
 
 def test_what_the_shared_noise_adds_is_taken_off_every_parameter_and_the_offset():
-    """The column of the scale holds it: see the same law, with noise, of `differenced_fit`."""
+    """The column of the scale holds it: see the same law, with noise, of `test_time_offset`."""
     rng, m = np.random.default_rng(3), 30
     B = np.tile(np.eye(3), (m, 1, 1))
     stretch = SampleSeries(rng.standard_normal((m, 3)), rng.standard_normal((m, 3, 14)), B, np.ones(m))
     found = fit([stretch], np.full(14, 10.0), np.array([0.5, 0.1]))
-    corrected = _without_shared_noise(OffsetFit(found, 0.3, ""), [stretch])
+    corrected = OffsetFit(found, 0.3, "").without_shared_noise([stretch], 1)
     added = found.covariance[:, 1] * rate_noise_power([stretch], found.ratios)
     assert corrected.fit.parameters == pytest.approx(found.parameters - added, rel=1e-9)
     assert corrected.offset_s == pytest.approx(0.3 - added[0], rel=1e-9)
@@ -213,7 +255,7 @@ def test_the_third_axis_of_a_stretch_is_the_vertical_and_does_not_walk():
     turned = [lying.apply(columns) for columns in (imu.angular_velocity, imu.specific_force, dvl.velocity)]
     path = InertialPath.of(Imu(imu.stamps_ns, turned[0], turned[1]))
     seconds = path.since_origin(dvl.stamps_ns)[:-50]
-    stretches = _line_up(
+    stretches = velocity_changes(
         path, seconds, turned[2][:-50], list(stretches_of(seconds, path.parts_at(seconds))), np.zeros(3), 0.0
     )
     assert len(stretches) > 3
@@ -235,7 +277,7 @@ def test_derivatives_are_those_of_what_is_lined_up(kind: str, axis: int):
         imu, dvl = on_a_plane(arm)
         path = InertialPath.of(Imu(imu.stamps_ns, imu.angular_velocity + rate, imu.specific_force + force))
         seconds = path.since_origin(dvl.stamps_ns)[:150]
-        return _line_up(path, seconds, dvl.velocity[:150], [slice(0, 150)], np.zeros(3), 0.0)[0]
+        return velocity_changes(path, seconds, dvl.velocity[:150], [slice(0, 150)], np.zeros(3), 0.0)[0]
 
     nothing = np.zeros(3)
     before = first(nothing, nothing, nothing)

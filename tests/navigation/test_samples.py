@@ -1,0 +1,290 @@
+"""Rows of a sensor: storage, values in between against numpy's, limits of what is refused, weights of depths."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonar_graph.errors import CalibrationError, MeasurementError
+from sonar_graph.navigation.samples import (
+    StampedRows,
+    finite_vector,
+    no_doppler_stamp,
+    node_range,
+    require_covariances,
+    require_distinct_stamps,
+    require_nanoseconds,
+    require_noise,
+    require_order,
+    rows_before_gaps,
+    rows_until,
+    value_among,
+    value_at,
+    weights_at_end,
+)
+
+
+def kept(*blocks: list[int]) -> StampedRows:
+    """Values are the number of the block, so that it is seen which of equal stamps is there."""
+    rows = StampedRows((3,), (3, 3))
+    for number, block in enumerate(blocks):
+        n = len(block)
+        rows.insert(np.array(block), np.full((n, 3), float(number)), np.full((n, 3, 3), float(-number)))
+    return rows
+
+
+@given(st.lists(st.lists(st.integers(0, 40), min_size=1, unique=True).map(sorted), min_size=1, max_size=5))
+def test_rows_are_those_of_all_blocks_in_order_and_the_first_of_equal_stamps(blocks):
+    rows, first = kept(*blocks), {}
+    for number, block in enumerate(blocks):
+        for stamp in block:
+            first.setdefault(stamp, number)
+    assert rows.stamps_ns.tolist() == sorted(first)
+    assert rows.values[0][:, 1].tolist() == [first[stamp] for stamp in sorted(first)]
+    assert rows.values[1][:, 2, 0].tolist() == [-first[stamp] for stamp in sorted(first)]
+
+
+def test_inserting_says_whether_rows_were_there_at_or_after_the_first():
+    rows = kept([10, 20])
+    for stamp, is_before in ((21, False), (20, True), (15, True), (22, False), (22, True)):
+        assert rows.insert(np.array([stamp]), np.zeros((1, 3)), np.zeros((1, 3, 3))) == is_before
+
+
+def test_the_row_at_or_before_a_stamp_is_kept_and_those_after():
+    for stamp, left in ((9, 10), (10, 10), (11, 10), (20, 10), (21, 20), (31, 30), (99, 30)):
+        rows = kept([10, 20, 30])
+        rows.forget_before(stamp)
+        assert rows.stamps_ns[0] == left
+        assert len(rows.values[0]) == len(rows.values[1]) == len(rows.stamps_ns)
+
+
+def test_nodes_are_after_one_instant_and_covered_by_the_other_sensor_until_another():
+    imu_ns, dvl_ns = np.array([0, 10, 20]), np.array([-5, 0, 7, 10, 15, 20, 25])
+    assert node_range(imu_ns, dvl_ns, -5, 9) == (1, 2)
+    assert node_range(imu_ns, dvl_ns, -6, 10) == (0, 4)
+    assert node_range(imu_ns, dvl_ns, 7, 19) == (3, 4)
+    assert node_range(imu_ns, dvl_ns, 7, 99) == (3, 6)
+    assert node_range(imu_ns, dvl_ns, 15, 10) == (5, 5)
+    assert node_range(imu_ns, dvl_ns, -6, -1) == (0, 0)
+
+
+@given(
+    st.lists(st.integers(0, 60), min_size=1, unique=True).map(sorted),
+    st.tuples(st.integers(0, 12), st.integers(0, 12)).map(sorted),
+    st.integers(1, 20),
+)
+def test_gaps_are_between_successive_rows_from_one_to_another_that_are_too_far_apart(stamps, ends, longest):
+    start, end = (min(row, len(stamps) - 1) for row in ends)
+    expected = [row for row in range(start, end) if stamps[row + 1] - stamps[row] > longest]
+    assert rows_before_gaps(np.array(stamps), stamps[start], stamps[end], longest).tolist() == expected
+
+
+STAMPS = np.array([0, 10, 14, 30, 31], dtype=np.int64)
+VALUES = np.random.default_rng(0).standard_normal((5, 3))
+
+
+instants = st.integers(-5, 40)
+
+
+def first_at_or_after(t: int) -> int:
+    return rows_until(STAMPS, t - 1)
+
+
+@given(instants)
+def test_rows_until_an_instant_are_those_stamped_at_or_before_it(t):
+    assert rows_until(STAMPS, t) == np.count_nonzero(t >= STAMPS)
+    assert rows_until(STAMPS[:0], t) == 0
+
+
+@given(instants)
+def test_values_are_linear_between_rows_and_constant_beyond_them(t):
+    expected = [np.interp(t, STAMPS, VALUES[:, axis]) for axis in range(3)]
+    assert value_at(STAMPS, VALUES, first_at_or_after(t), t, False) == pytest.approx(expected)
+
+
+@given(instants)
+def test_held_values_are_those_of_the_interval_that_ends_next(t):
+    row = min(int(np.searchsorted(STAMPS, t)), 4)
+    assert value_at(STAMPS, VALUES, first_at_or_after(t), t, True) == pytest.approx(VALUES[row])
+
+
+@given(instants, st.integers(1, 5), st.booleans())
+def test_rows_that_are_not_to_be_used_do_not_matter(t, known, hold_past):
+    """As if there were only the first."""
+    among = value_among(STAMPS, VALUES, known, first_at_or_after(t), t, hold_past)
+    i = rows_until(STAMPS[:known], t - 1)
+    alone = value_at(STAMPS[:known], VALUES[:known], i, t, hold_past)
+    if first_at_or_after(t) >= known:
+        alone = VALUES[known - 1]
+    assert among == pytest.approx(alone)
+
+
+AT = np.array([10, 20, 30, 40, 50]) * 1_000_000_000
+"""Five stamps, ten seconds apart."""
+NUMBER, NUMBERS = "sigma: expected 1 number, not", "sigma: expected 3 numbers, not"
+NEGATIVE = "sigma: expected finite numbers of zero or more"
+
+
+@pytest.mark.parametrize(
+    ("check", "arguments", "message"),
+    [
+        *((finite_vector, ("bias", v, 3), r"bias: expected shape \(3,\)") for v in ([1, 2], [[1], [2], [3]], 1.0)),
+        (finite_vector, ("bias", [0, np.inf, 0], 3), r"bias: expected finite numbers, not \[0.0, inf, 0.0\]"),
+        (finite_vector, ("bias", [0, np.nan, 0], 3, CalibrationError), "bias: expected finite numbers"),
+        *((require_noise, ("sigma", v, 1), NUMBER) for v in (True, [1.0], "1")),
+        *((require_noise, ("sigma", v, 3), NUMBERS) for v in (1.0, [1.0, 2.0], [True] * 3)),
+        *((require_noise, ("sigma", v, 1), NEGATIVE) for v in (-1e-9, np.inf, np.nan)),
+        *((require_noise, ("sigma", v, 3), NEGATIVE) for v in ([1.0, 1.0, -1.0], [-1.0, 1.0, 1.0])),
+        (require_order, (1.0, 2), "^start_ns: expected integer nanoseconds"),
+        (require_order, (1, np.float64(2)), "^end_ns: expected integer nanoseconds"),
+        (require_order, (5, 5), "end_ns: 5 is not after start_ns 5"),
+        (require_order, (5, 4), "end_ns: 4 is not after start_ns 5"),
+        (require_nanoseconds, ("Imu", 7 + np.arange(3) * 49_900), r"Imu.stamps_ns: 3 rows are 4.99e\+04 ns apart"),
+        (require_distinct_stamps, ("Imu", np.array([0, 0, 100]), 0, 2), "rows 0 and 1 are both stamped 0 ns"),
+        (require_distinct_stamps, ("Imu", np.array([0, 100, 100]), 0, 2), "rows 1 and 2 are both stamped 100 ns"),
+    ],
+)
+def test_mistakes_are_refused_by_name(check, arguments, message):
+    with pytest.raises((MeasurementError, CalibrationError), match=message):
+        check(*arguments)
+
+
+def test_what_is_right_is_let_through():
+    """Of two rows nothing can be said about their unit; one of them may be late."""
+    assert finite_vector("bias", [1, 2, 3], 3).tolist() == [1.0, 2.0, 3.0]
+    for numbers, size in ((0.0, 1), (2, 1), ([0.0, 1.0, 2.0], 3), (np.ones(3, np.int64), 3)):
+        require_noise("sigma", numbers, size)
+    require_order(np.int64(1), np.int32(2))
+    require_nanoseconds("Imu", 7 + np.arange(3) * 50_100)
+    require_nanoseconds("Imu", np.array([7, 17]))
+    for first, last in ((0, 8), (0, 0), (8, 8)):
+        require_distinct_stamps("Imu", np.arange(9) * 100, first, last)
+
+
+@pytest.mark.parametrize(
+    ("instant", "ending"),
+    [
+        *((t * 10**9, f"the nearest is {n * 10**9}") for t, n in ((1, 10), (24, 20), (26, 30), (99, 50))),
+        *((t, f"in seconds: times {10**9} it lies among them") for t in (10, 50)),
+        *((t, f"the nearest is {n * 10**9}") for t, n in ((51, 10), (9, 10))),
+        (10_000, "in milliseconds: times 1000000 it lies among them"),
+        (50_000_000, "in microseconds: times 1000 it lies among them"),
+    ],
+)
+def test_the_nearest_stamp_and_another_unit_are_named(instant, ending):
+    assert str(no_doppler_stamp("end_ns", instant, AT)).endswith(ending)
+    assert "seems" not in str(no_doppler_stamp("start_ns", 0, AT - 30 * 10**9 - 1))
+
+
+@pytest.mark.parametrize(("spacing_ns", "is_close"), [(999_000, True), (1_001_000, False)])
+def test_doppler_stamps_closer_than_a_millisecond_are_in_a_larger_unit(spacing_ns, is_close):
+    """In the mean over all; a single one tells nothing."""
+    text = str(no_doppler_stamp("end_ns", -5, np.arange(5) * spacing_ns))
+    assert ("the stamps are so close" in text) == is_close
+    assert "the stamps are so close" not in str(no_doppler_stamp("end_ns", 5, np.array([9])))
+
+
+@pytest.mark.parametrize("row", range(8))
+def test_stamps_repeated_from_the_row_before_to_the_row_after_are_refused(row):
+    """Of rows 2 to 4, from which motion may reach one row further at either end."""
+    twice = np.arange(9) * 100
+    twice[row + 1] = twice[row]
+    if 1 <= row <= 4:
+        with pytest.raises(MeasurementError, match=f"rows {row} and {row + 1} are both .* {row}00 ns"):
+            require_distinct_stamps("Imu", twice, 2, 4)
+    else:
+        require_distinct_stamps("Imu", twice, 2, 4)
+
+
+def correlated(xy: float, yz: float, zx: float, sigmas: tuple[float, float, float] = (0.01, 0.02, 0.05)) -> np.ndarray:
+    return np.array([[1, xy, zx], [xy, 1, yz], [zx, yz, 1]]) * np.outer(sigmas, sigmas)
+
+
+def is_covariance(cov: np.ndarray) -> bool:
+    try:
+        require_covariances("cov", cov[None], AT)
+    except MeasurementError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("row", [0, 1, 2])
+def test_an_impossible_covariance_is_found_in_every_row(row):
+    assert is_covariance(np.eye(3))
+    every = np.tile(np.eye(3), (3, 1, 1))
+    every[row] = -np.eye(3)
+    with pytest.raises(MeasurementError, match=f"cov: the row at {AT[row]} ns is no covariance"):
+        require_covariances("cov", every, AT)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3, 1e3])
+def test_correlations_are_possible_up_to_one_in_every_plane(scale):
+    """Within the rounding of seven digits; whatever the unit."""
+    sigmas = (0.01 * scale, 0.02 * scale, 0.05 * scale)
+    for sign in (1.0, -1.0):
+        for plane in np.eye(3):
+            assert is_covariance(correlated(*(sign * plane), sigmas))
+            assert is_covariance(correlated(*(sign * (1 + 1e-7) * plane), sigmas))
+            assert not is_covariance(correlated(*(sign * 1.01 * plane), sigmas))
+
+
+@pytest.mark.parametrize(
+    ("correlations", "is_possible"),
+    [
+        ((0.9, 0.9, 0.9), True),
+        ((0.9, -0.9, -0.9), True),
+        ((0.9, 0.9, -0.9), False),
+        ((-0.9, -0.9, -0.9), False),
+        ((0.8, 0.6, 0.0), True),  # singular
+        ((0.8, 0.0, 0.6), True),
+        ((0.0, 0.8, 0.6), True),
+        ((0.8, 0.61, 0.0), False),
+        ((0.8, 0.0, 0.61), False),
+        ((0.0, 0.8, 0.61), False),
+    ],
+)
+def test_three_correlations_must_agree(correlations, is_possible):
+    """``1 + 2 abc - a^2 - b^2 - c^2 >= 0``, by hand."""
+    assert is_covariance(correlated(*correlations)) == is_possible
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_no_variance_is_negative_or_unknown_and_zero_is_possible(axis):
+    for variance, is_possible in ((0.0, True), (-1e-6, False), (np.nan, False)):
+        diagonal = np.array([1e-4, 4e-4, 9e-4])
+        diagonal[axis] = variance
+        assert is_covariance(np.diag(diagonal)) == is_possible
+    assert is_covariance(np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize("place", [(0, 1), (1, 0), (1, 2), (2, 1), (0, 2), (2, 0)])
+def test_a_covariance_is_symmetric_to_six_digits(place):
+    for change, is_possible in ((5e-7, True), (-5e-7, True), (2e-6, False), (-2e-6, False)):
+        cov = correlated(0.5, 0.5, 0.5)
+        cov[place] += change * np.sqrt(cov[place[0], place[0]] * cov[place[1], place[1]])
+        assert is_covariance(cov) == is_possible
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.01, 2.0), st.floats(1e-5, 1e-2)), min_size=1, max_size=12),
+    st.floats(1e-8, 1e-2),
+    st.floats(0.0, 1.0),
+)
+def test_weights_are_those_of_least_squares_with_a_shared_random_walk(samples, wander, last_s):
+    """Two samples share the error of the way that both are carried: C_kl = q min(t_k, t_l) + r_k for k = l."""
+    steps, variance = np.array(samples).T
+    before_end = last_s + np.append(np.cumsum(steps[:0:-1])[::-1], 0.0)
+    C = wander * np.minimum.outer(before_end, before_end) + np.diag(variance)
+    ones = np.ones(len(variance))
+    expected = np.linalg.solve(C, ones) / (ones @ np.linalg.solve(C, ones))
+    weights, mean_variance = weights_at_end(variance, before_end, wander)
+    assert weights == pytest.approx(expected, rel=1e-6, abs=1e-9)
+    assert mean_variance == pytest.approx(1 / (ones @ np.linalg.solve(C, ones)), rel=1e-6)
+
+
+def test_without_wander_weights_are_inverse_variances():
+    weights, mean_variance = weights_at_end(np.array([1.0, 3.0]), np.array([4.0, 1.0]), 0.0)
+    assert weights == pytest.approx([0.75, 0.25])
+    assert mean_variance == pytest.approx(0.75)
