@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, settings
 if TYPE_CHECKING:
     from sonar_graph.recognition.recognition_record import Recognition
 
-    from .imaged_lane import Lane
+    from .recognition.imaged_lane import Lane
 
 os.environ["MPLBACKEND"] = "Agg"
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):  # before numpy is loaded, here and in the workers
@@ -60,7 +60,7 @@ def unpacked(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Call
 @pytest.fixture(scope="session")
 def lane() -> Lane:
     """A short run along all four landmarks, a stone and a rough patch, with images; simulated once a session."""
-    from .imaged_lane import lane_run
+    from .recognition.imaged_lane import lane_run
 
     return lane_run(1)
 

@@ -58,7 +58,7 @@ from sonar_graph.simulation import BasinOptions, simulate_basin, simulate_basin_
 from sonar_graph.simulation.sonar_image import ImageOptions
 from sonar_graph.sonar import Recogniser, recogniser
 from sonar_graph.sonar.appearance import CandidateFit
-from sonar_graph.sonar.beliefs import Beliefs
+from sonar_graph.sonar.bayes import Beliefs
 from sonar_graph.sonar.tracker import Tracker
 
 TOPIC = "/sonar/image"

@@ -14,7 +14,7 @@ from sonar_graph.recognition.session import RecognitionSession, one_by_one
 from sonar_graph.simulation import BasinOptions, simulate_basin, simulate_basin_frames
 from sonar_graph.simulation.sonar_image.frames import FrameTruth
 from sonar_graph.sonar import RecogniserParams
-from sonar_graph.sonar.beliefs import IdentityParams
+from sonar_graph.sonar.bayes import IdentityParams
 
 WHOLE = 0.9
 """Share of an object that must be in view for it to be in view."""

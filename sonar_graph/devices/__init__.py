@@ -1,4 +1,4 @@
-"""Devices."""
+"""Device data: beams of Doppler logs, lenses of sonars, designs of artificial landmarks."""
 
 # fmt: off
 from sonar_graph.devices.dvl_beams import UNMEASURED_M_S, in_numbers, is_partial, velocity_of_beams

@@ -1,14 +1,12 @@
-"""What one ping of a Doppler log's beams says about the velocity, be there four valid beams or one.
+"""Velocity and covariance from the beams of a Doppler log, with all beams valid or some.
 
-A beam of unit direction b measures ``z = b . v + n``, n ~ N(0, sigma²). Valid beams together have the information
+A beam of unit direction b measures ``z = b . v + n``, n ~ N(0, sigma²). Valid beams together have the information::
 
     Lambda = sum b b^T / sigma^2,      Lambda v = sum b z / sigma^2
 
-With three beams or more, not in one plane, that is a velocity with the covariance ``Lambda^-1``. With fewer, directions
-remain of which nothing was measured: there the velocity is given as 0 with a sigma of `UNMEASURED_M_S`, which says
-nothing to whoever weighs by covariances. `sonar_graph.navigation.dvl_screening.partial_beams` completes such rows.
-
-Covariances of Doppler velocities: what holds where they are not said, and which say that a part was measured.
+With fewer than three beams, or three in one plane, some directions are not measured. The velocity is 0 along them, with
+a sigma of `UNMEASURED_M_S`; `sonar_graph.navigation.dvl_screening.partial_beams` completes such rows. Derivation:
+docs/theory/beams.md.
 """
 
 from __future__ import annotations
@@ -20,9 +18,9 @@ from sonar_graph.measurements import Floats
 from sonar_graph.numerics import compiled
 
 UNMEASURED_M_S = 100.0
-"""Sigma along a direction that no beam measured."""
+"""Standard deviation along a direction that no beam measured."""
 _LEAST_SHARE = 1e-6
-"""Of the largest information, below which a direction counts as not measured."""
+"""Share of the largest information below which a direction counts as not measured."""
 
 
 def velocity_of_beams(
@@ -49,29 +47,24 @@ def velocity_of_beams(
     covariance = np.empty((len(valid), 3, 3))
     for pattern in np.unique(valid, axis=0):
         rows = (valid == pattern).all(axis=1)
-        inverse, covariance[rows] = _solution(directions[pattern], sigma_m_s)
-        velocity[rows] = along_m_s[rows][:, pattern] @ inverse.T
+        beams = directions[pattern]
+        geometry, axes = np.linalg.eigh(beams.T @ beams)
+        is_measured = geometry > max(_LEAST_SHARE * geometry[-1], np.finfo(float).tiny)
+        per_geometry = 1.0 / np.where(is_measured, geometry, 1.0)
+        inverse = (axes * (per_geometry * is_measured)) @ axes.T @ beams.T
+        variances = np.where(is_measured, sigma_m_s**2 * per_geometry, UNMEASURED_M_S**2)
+        velocity[rows], covariance[rows] = along_m_s[rows][:, pattern] @ inverse.T, (axes * variances) @ axes.T
     return velocity, covariance
-
-
-def _solution(directions: Floats, sigma_m_s: float) -> tuple[Floats, Floats]:
-    """Of some beams: what turns their velocities into one, shape (3, beams), and its covariance."""
-    geometry, axes = np.linalg.eigh(directions.T @ directions)
-    is_measured = geometry > max(_LEAST_SHARE * geometry[-1], np.finfo(float).tiny)
-    per_geometry = 1.0 / np.where(is_measured, geometry, 1.0)
-    inverse = (axes * (per_geometry * is_measured)) @ axes.T @ directions.T
-    variances = np.where(is_measured, sigma_m_s**2 * per_geometry, UNMEASURED_M_S**2)
-    return inverse, (axes * variances) @ axes.T
 
 
 @compiled
 def in_numbers(velocity_cov: Floats, unsaid: Floats) -> Floats:
-    """Covariances of shape (n, 3, 3) to compute with.
+    """Covariances of shape (n, 3, 3) without NaN and infinity.
 
     Parameters
     ----------
     unsaid
-        What holds where a number is NaN, shape (3, 3).
+        Value in place of NaN, shape (3, 3).
 
     Returns
     -------
@@ -91,7 +84,7 @@ def in_numbers(velocity_cov: Floats, unsaid: Floats) -> Floats:
 
 @compiled
 def is_partial(velocity_cov: Floats) -> NDArray[np.bool_]:
-    """Rows with a direction of which nothing was measured, shape (n,), from covariances of shape (n, 3, 3)."""
+    """True for covariances of shape (n, 3, 3) with an unmeasured direction, shape (n,)."""
     partial = np.empty(len(velocity_cov), np.bool_)
     for k in range(len(partial)):
         cov = velocity_cov[k]

@@ -1,4 +1,4 @@
-"""Where the beams of lens sonars point, as their makers measured it.
+"""Azimuths of the beams of lens sonars, as measured by their makers.
 
 An acoustic lens does not space beams evenly: 0.37° a beam in the middle and 0.22° at the edge for a DIDSON. Even
 spacing instead errs by up to 1.2°, which is 4 cm at 2 m.

@@ -1,4 +1,4 @@
-"""Diagnosis."""
+"""Diagnosis of a log: its sensors compared with each other and with the calibration."""
 
 # fmt: off
 from sonar_graph.diagnosis.findings import Finding

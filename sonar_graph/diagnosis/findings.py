@@ -1,16 +1,13 @@
-"""One thing that a log's sensors tell, how sure it is, and what to do about it.
+"""Findings of the sensor check: an estimate, how certain it is, and the line of the calibration to change.
 
-The lever arm from IMU to Doppler log and the gyro bias of a log, against what the calibration says of them.
-
-Roll, pitch and heading at the start of a log, against the start that its calibration gives.
-
-Roll and pitch come with the gyro bias from a rest at the start or, where the vehicle moves there, from its first minute
-(docs/theory/alignment.md). A heading comes from a reference alone.
+Here: lever arm from IMU to DVL, gyro bias, and roll, pitch and heading at the start of a log. Roll and pitch come from
+a rest at the start or, if the vehicle moves there, from its first minute (docs/theory/alignment.md); the heading needs
+a reference. Derivation: docs/theory/sensor_check.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,38 +30,38 @@ from sonar_graph.sequence import NS_PER_S, Sequence
 from sonar_graph.states import Trajectory
 
 INTERVAL_SIGMAS = 1.96
-"""Intervals are printed as plus or minus 95 %."""
+"""Half width of printed intervals, 95 %."""
 NO_NEED = "no need to act"
 ALSO = "put right by the line above"
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One quantity, how sure it is, and what to do."""
+    """One quantity with its uncertainty, and the advice that follows."""
 
     quantity: str
     estimate: Estimate1D
     unit: str
     advice: str
-    """A sentence; says that nothing need be done where nothing need."""
+    """A sentence, also where nothing need be done."""
     acts: bool = False
-    """Whether something should be done."""
+    """True where something should be done."""
 
     def text(self) -> str:
-        """Value with its 95 % interval, and the advice; or why it cannot be told, or what is wrong before that."""
+        """Value with its 95 % interval and the advice; or the reason why it is not known."""
         if not self.estimate.is_known:
             return self.advice if self.acts else f"cannot be told: {self.estimate.reason}"
         return f"{with_interval(self.estimate, self.unit)}: {self.advice}"
 
     def plain(self) -> dict[str, Any]:
-        """For JSON."""
+        """Content for JSON."""
         known, e = self.estimate.is_known, self.estimate
         numbers = {"value": e.value if known else None, "sigma": e.sigma if known else None, "unit": self.unit}
         return {"quantity": self.quantity, **numbers, "reason": e.reason, "act": bool(self.acts), "advice": self.advice}
 
 
 def with_interval(estimate: Estimate1D, unit: str) -> str:
-    """Digits as far as the interval supports them."""
+    """Value and 95 % interval, with the digits that the interval supports."""
     half = INTERVAL_SIGMAS * estimate.sigma
     digits = int(np.clip(1 - np.floor(np.log10(half)), 0, 8)) if half > 0 else 3
     if unit.startswith(("rad/s", "m/s")):
@@ -74,17 +71,17 @@ def with_interval(estimate: Estimate1D, unit: str) -> str:
 
 
 def in_degrees(angle: Estimate1D) -> Estimate1D:
-    """An angle, or a difference of angles, from radians."""
+    """An angle converted from radians."""
     return replace(angle, value=float(np.degrees(angle.value)), sigma=float(np.degrees(angle.sigma)))
 
 
 def matters(estimate: Estimate1D, least: float) -> bool:
-    """Larger than what is worth the trouble, and its interval leaves zero out."""
+    """True for an estimate above a threshold whose interval excludes zero."""
     return bool(estimate.is_known and abs(estimate.value) > max(least, INTERVAL_SIGMAS * estimate.sigma))
 
 
 def said_once(findings: Iterable[Finding]) -> list[Finding]:
-    """Findings that one line puts right together: it stands in the first that acts, the others refer to it."""
+    """Findings that share one line of advice: it stands in the first that acts, the others refer to it."""
     acting = [number for number, finding in enumerate(findings) if finding.acts]
     return [replace(f, advice=ALSO) if number in acting[1:] else f for number, f in enumerate(findings)]
 
@@ -98,9 +95,9 @@ ARM, BIAS = "lever arm from IMU to DVL", "gyro bias"
 
 
 def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
-    """A row an axis; the arm is the difference of two places, and nothing here says which of them is wrong.
+    """One row for each axis; a single row where no axis is known.
 
-    One row in all where no axis can be told.
+    The arm is a difference of two places, and nothing tells which of them is wrong.
     """
     if not any(estimate.is_known for estimate in found.lever):
         return [Finding(ARM, found.lever[0], "m", "")]
@@ -121,7 +118,7 @@ def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
 
 
 def with_fitted(found: DvlMatch, calibration: Calibration) -> Calibration:
-    """The calibration with the IMU's place and the bias' sigma changed as the findings advise."""
+    """Calibration with the changes that the findings advise: place of the IMU, sigma of the gyro bias."""
     imu = calibration.imu
     place = np.subtract(imu.mounting.translation_m, _wrong_by(found, _given_arm(calibration)))
     moved = imu.mounting.model_copy(update={"translation_m": tuple(place.tolist())})
@@ -131,22 +128,18 @@ def with_fitted(found: DvlMatch, calibration: Calibration) -> Calibration:
 
 
 def bias_findings(bias: Estimates3D, sources: tuple[str, str, str], imu: ImuCalibration) -> list[Finding]:
-    """A row an axis, against what the calibration lets a bias be; one in all where no axis can be told.
+    """One row for each axis, compared with the sigma of the calibration; a single row where no axis is known.
 
     Parameters
     ----------
     bias
         Body axes, rad/s.
     sources
-        From what each was told, such as "from 12 s of rest".
+        Source of each, such as "from 12 s of rest".
     """
     if not any(estimate.is_known for estimate in bias):
         return [Finding(BIAS, bias[0], "rad/s", "")]
-    return said_once(list(_bias_rows(bias, sources, imu)))
-
-
-def _bias_rows(bias: Estimates3D, sources: tuple[str, str, str], imu: ImuCalibration) -> Iterator[Finding]:
-    allowed = imu.gyro_bias_sigma
+    rows, allowed = [], imu.gyro_bias_sigma
     for axis, estimate, source in zip(AXES, bias, sources, strict=True):
         acts = _is_beyond(estimate, imu)
         advice = f"{source}; the calibration's sigma of {allowed:.2g} allows it, {NO_NEED}"
@@ -155,7 +148,8 @@ def _bias_rows(bias: Estimates3D, sources: tuple[str, str, str], imu: ImuCalibra
                 f"{source}, beyond the calibration's sigma of {allowed:.2g}: "
                 f"`imu.gyro_bias_sigma = {_largest(bias):.2g}` in the calibration, for estimators that find the bias"
             )
-        yield Finding(f"{BIAS}, {axis}", estimate, "rad/s", advice, acts)
+        rows.append(Finding(f"{BIAS}, {axis}", estimate, "rad/s", advice, acts))
+    return said_once(rows)
 
 
 def _is_beyond(bias: Estimate1D, imu: ImuCalibration) -> bool:
@@ -171,7 +165,7 @@ def _given_arm(calibration: Calibration) -> Floats:
 
 
 def _wrong_by(found: DvlMatch, given: Floats) -> Floats:
-    """By how much the arm is longer than given, shape (3,), m; 0 along an axis on which nothing need be done."""
+    """Error of the given arm, shape (3,), m; 0 along an axis on which nothing need be done."""
     errors = [replace(e, value=e.value - g) for e, g in zip(found.lever, given.tolist(), strict=True)]
     return np.array([error.value if matters(error, LEAST_LEVER_M) else 0.0 for error in errors])
 
@@ -181,21 +175,21 @@ def _numbers(place: Floats) -> str:
 
 
 RESTS_S = (10, 20, 40, 80, 160)
-"""A rest at the start is taken as the longest of these that holds; a shorter one tells less than a minute's motion."""
+"""Tried lengths of a rest at the start; the longest that holds counts."""
 LEAST_TILT_RAD = np.radians(0.25)
 LEAST_HEADING_RAD = np.radians(1.0)
-"""What is smaller changes nothing that other errors would not hide."""
+"""Smaller errors are hidden by others."""
 TURN_OVER_NS = NS_PER_S
 LEAST_SPREAD_RAD = np.radians(0.1)
 
 
 @dataclass(frozen=True)
 class StartTilt:
-    """An alignment at the start of a log, or why there is none."""
+    """Alignment at the start of a log, or the reason why there is none."""
 
     tilt: InitialTilt | None
     said: str
-    """From what it is, such as "from 20 s of rest"; why there is none."""
+    """Source, such as "from 20 s of rest", or the reason why there is none."""
     is_rest: bool = False
 
     def angle(self, axis: int) -> Estimate1D:
@@ -206,7 +200,7 @@ class StartTilt:
         return Estimate1D(value, float(np.sqrt(self.tilt.covariance[axis, axis])))
 
     def gyro_bias(self) -> Estimates3D | None:
-        """From a rest; in motion the whole drive tells more than its first minute."""
+        """Bias from a rest; None in motion, where the whole drive tells more than its first minute."""
         if self.tilt is None or not self.is_rest:
             return None
         sigmas = np.sqrt(np.diag(self.tilt.covariance)[2:]).tolist()
@@ -215,14 +209,25 @@ class StartTilt:
 
 
 def find_start_tilt(sequence: Sequence) -> StartTilt:
-    """At rest if the vehicle rests at the start, else in motion.
+    """Alignment at rest if the vehicle rests at the start, else in motion.
 
     Parameters
     ----------
     sequence
-        With stamps, mountings and scale put right as far as they are known to be wrong.
+        With stamps, mountings and scale corrected as far as they are known to be wrong.
     """
-    found = _at_rest(sequence)
+    found = StartTilt(None, "no rows")
+    for rest_s in RESTS_S:
+        imu, dvl = _beginning(sequence, rest_s)
+        if imu is None:
+            break
+        try:
+            tilt = align_at_rest(imu, sequence.calibration, dvl)
+        except AlignmentError as error:
+            found = found if found.tilt is not None else StartTilt(None, _without_advice(error))
+            break
+        lasted_s = (imu.stamps_ns[-1] - imu.stamps_ns[0]) / NS_PER_S
+        found = StartTilt(tilt, f"from {lasted_s:.0f} s of rest", is_rest=True)
     if found.tilt is not None:
         return found
     imu, dvl = _beginning(sequence, LONGEST_S)
@@ -239,7 +244,7 @@ def find_start_tilt(sequence: Sequence) -> StartTilt:
 
 
 def tilt_findings(found: StartTilt, start: Start, yaw_rad: float) -> list[Finding]:
-    """Roll and pitch in a row each, and the line for the calibration with this heading; one row if there are none."""
+    """One row each for roll and pitch, and a line for the calibration with this heading; a single row without them."""
     if found.tilt is None:
         return [Finding("start roll and pitch", found.angle(0), "°", "")]
     given, sigmas = start.rpy_rad, [float(found.angle(axis).sigma) for axis in (0, 1)]
@@ -249,23 +254,19 @@ def tilt_findings(found: StartTilt, start: Start, yaw_rad: float) -> list[Findin
     )
     rows = []
     for axis, name in enumerate(("roll", "pitch")):
-        of_calibration, acts = f"the calibration's {np.degrees(given[axis]):+.2f}°", _contradicts(found, start, axis)
+        told, of_calibration = found.angle(axis), f"the calibration's {np.degrees(given[axis]):+.2f}°"
+        sigma = float(np.hypot(told.sigma, start.rpy_sigma_rad[axis]))
+        acts = matters(replace(told, value=_wrapped(told.value - given[axis]), sigma=sigma), LEAST_TILT_RAD)
         advice = (
             f"{found.said}, not {of_calibration}: {line}" if acts else f"{found.said}; {of_calibration} fits, {NO_NEED}"
         )
-        rows.append(Finding(f"start {name}", in_degrees(found.angle(axis)), "°", advice, acts))
+        rows.append(Finding(f"start {name}", in_degrees(told), "°", advice, acts))
     return said_once(rows)
-
-
-def _contradicts(found: StartTilt, start: Start, axis: int) -> bool:
-    told = found.angle(axis)
-    sigma = float(np.hypot(told.sigma, start.rpy_sigma_rad[axis]))
-    return matters(replace(told, value=_wrapped(told.value - start.rpy_rad[axis]), sigma=sigma), LEAST_TILT_RAD)
 
 
 @dataclass(frozen=True, eq=False)
 class StartHeading:
-    """The reference's pose at the start, and by how much the calibration's heading is off."""
+    """Pose of the reference at the start, and error of the calibration's heading."""
 
     rpy_rad: tuple[float, float, float]
     position_m: tuple[float, float, float]
@@ -274,11 +275,11 @@ class StartHeading:
 
     @property
     def acts(self) -> bool:
-        """Whether the calibration's heading should be changed."""
+        """True where the calibration's heading should be changed."""
         return matters(self.error, LEAST_HEADING_RAD)
 
     def finding(self, tilt: StartTilt) -> Finding:
-        """A row, with roll and pitch of the alignment, so that no row contradicts another; else the reference's."""
+        """The row, with roll and pitch of the alignment if known, so that rows agree; else those of the reference."""
         advice = NO_NEED
         if self.acts:
             rpy = (tilt.angle(0).value, tilt.angle(1).value, self.rpy_rad[2]) if tilt.tilt else self.rpy_rad
@@ -293,14 +294,14 @@ class StartHeading:
 
 
 def find_start_heading(sequence: Sequence, reference: Trajectory, offset: Estimate1D) -> StartHeading:
-    """The calibration's start against the reference at that instant.
+    """Compare the calibration's start with the reference at that instant.
 
     Parameters
     ----------
     sequence
         As for `find_start_tilt`.
     offset
-        To be added to the reference's stamps, s.
+        Correction of the reference's stamps, s.
     """
     first_ns, last_ns = reference.stamps_ns[[0, -1]].tolist()
     at_ns = min(max(sequence.start_ns - round(offset.value * NS_PER_S), first_ns), last_ns)
@@ -308,18 +309,13 @@ def find_start_heading(sequence: Sequence, reference: Trajectory, offset: Estima
     yaw, pitch, roll = pose.rotations().as_euler("ZYX")[0].tolist()
     x, y, z = pose.positions[0].tolist()
     error = _wrapped(sequence.calibration.start.rpy_rad[2] - yaw)
-    spread = float(np.hypot(LEAST_SPREAD_RAD, _turn_rate(reference, at_ns) * offset.sigma))
-    return StartHeading((roll, pitch, yaw), (x, y, z), Estimate1D(error, spread))
-
-
-def _turn_rate(reference: Trajectory, at_ns: int) -> float:
-    """About an instant, or as near to it as the reference lasts, rad/s."""
-    first_ns, last_ns = reference.stamps_ns[[0, -1]].tolist()
     begin_ns, end_ns = max(at_ns - TURN_OVER_NS // 2, first_ns), min(at_ns + TURN_OVER_NS // 2, last_ns)
-    if end_ns <= begin_ns:
-        return 0.0
-    begin, end = reference.at(np.array([begin_ns, end_ns])).rotations()
-    return float((begin.inv() * end).magnitude()) * NS_PER_S / (end_ns - begin_ns)
+    turn_rate = 0.0
+    if end_ns > begin_ns:
+        begin, end = reference.at(np.array([begin_ns, end_ns])).rotations()
+        turn_rate = float((begin.inv() * end).magnitude()) * NS_PER_S / (end_ns - begin_ns)
+    spread = float(np.hypot(LEAST_SPREAD_RAD, turn_rate * offset.sigma))
+    return StartHeading((roll, pitch, yaw), (x, y, z), Estimate1D(error, spread))
 
 
 def _wrapped(angle_rad: float) -> float:
@@ -332,22 +328,6 @@ def _beginning(sequence: Sequence, seconds: float) -> tuple[Imu | None, Dvl | No
     return sequence.imu.between(before_ns, until_ns), sequence.dvl.between(before_ns, until_ns)
 
 
-def _at_rest(sequence: Sequence) -> StartTilt:
-    """The longest rest, or what speaks against the shortest."""
-    found = StartTilt(None, "no rows")
-    for rest_s in RESTS_S:
-        imu, dvl = _beginning(sequence, rest_s)
-        if imu is None:
-            break
-        try:
-            tilt = align_at_rest(imu, sequence.calibration, dvl)
-        except AlignmentError as error:
-            return found if found.tilt is not None else StartTilt(None, _without_advice(error))
-        lasted_s = (imu.stamps_ns[-1] - imu.stamps_ns[0]) / NS_PER_S
-        found = StartTilt(tilt, f"from {lasted_s:.0f} s of rest", is_rest=True)
-    return found
-
-
 def _without_advice(error: AlignmentError) -> str:
-    """What was found; what to do about it is said in other rows."""
+    """The finding of an error; other rows have the advice."""
     return str(error).partition(";")[0]

@@ -1,12 +1,10 @@
-"""What a log's sensors say about each other: offsets, mounting, scale and noise, and whether to act on it.
+"""Check of a log's sensors against each other: units, offsets, mountings, scale and noise.
 
-The estimators are in `sonar_graph.navigation`, derived in docs/theory/sensor_check.md. Here each number meets what the
-run would use (calibration and log configuration) and becomes a line to put into one of the two.
+The estimators are in `sonar_graph.navigation.alignment`; here each number is compared with the calibration and the log
+configuration of a run, and becomes a line for one of the two. Derivation: docs/theory/sensor_check.md.
 
-Units that a log's numbers can hardly be in: read as said, no vehicle moves like that.
-
-Where a factor between common units makes them plausible, it is named with the line that says so to the reader of the
-log. A slow vehicle's rates in degrees can pass for a lively one's in radians: nothing found is no proof.
+Units are recognised where the values, read as configured, are implausible for a vehicle and a common factor makes them
+plausible. A slow vehicle's rates in degrees can pass for rates in radians: no finding is no proof.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, DvlCalibration, Start
+from sonar_graph.calibration import DvlCalibration, Start
 from sonar_graph.diagnosis.findings import (
     NO_NEED,
     Finding,
@@ -46,152 +44,143 @@ from sonar_graph.navigation.alignment import (
 from sonar_graph.sequence import NS_PER_S, Sequence
 
 FASTEST_M_S = 20.0
-"""No vehicle with a Doppler log over the bottom keeps such a speed for a twentieth of a log."""
+"""Implausible over the bottom for a twentieth of a log."""
 FASTEST_TURN_RAD_S = 2.0
-"""Nor such a rate, 115 degrees a second."""
+"""Implausible likewise, 115 degrees a second."""
 SPEEDS = {"cm/s": 1e-2, "mm/s": 1e-3}
 """Factor to m/s."""
 FORCES = {"g": 9.80665, "mg": 9.80665e-3, "cm/s²": 1e-2, "mm/s²": 1e-3}
 """Factor to m/s²; mg and cm/s² differ by a fiftieth, so that the nearest counts."""
 SHARE_OF_GRAVITY = 0.2
-"""By which a typical specific force may differ from gravity."""
+"""Relative difference allowed between a typical specific force and gravity."""
 USUAL_SPEED_M_S = 3.0
 HIGH_PERCENTILE = 95.0
 
 
 class WrongUnit(NamedTuple):
-    """What looks wrong, and what to write where."""
+    """A quantity in an implausible unit, and the line that corrects it."""
 
     quantity: str
     advice: str
 
 
 def wrong_units(sequence: Sequence, config: LogConfig) -> list[WrongUnit]:
-    """Velocities, rates and specific forces in another unit than they are read in.
+    """Velocities, rates and specific forces that look like another unit than the configured one.
 
     Parameters
     ----------
     sequence
         As a run would read it.
     config
-        With which it was read: its scales are taken over into the advice.
+        Log configuration of the reading; its scales enter the advice.
     """
-    found = [
-        _of_speed(sequence.dvl, config),
-        _of_rate(sequence.imu, config),
-        _of_force(sequence.imu, sequence.calibration, config),
-    ]
-    return [fault for fault in found if fault is not None]
-
-
-def _of_speed(dvl: Dvl, config: LogConfig) -> WrongUnit | None:
-    high = _high(dvl.velocity)
-    if high <= FASTEST_M_S:
-        return None
-    unit = next((unit for unit, factor in SPEEDS.items() if high * factor <= USUAL_SPEED_M_S), "mm/s")
-    scale = float(config.table("dvl").get("scale", 1.0)) * SPEEDS[unit]
-    return WrongUnit(
-        "DVL: unit",
-        f"velocities look {1 / SPEEDS[unit]:.0f} times too large (up to {high:.3g} m/s): {unit}? "
-        f"`scale = {scale:.4g}` under [dvl] in the log configuration",
-    )
-
-
-def _of_rate(imu: Imu, config: LogConfig) -> WrongUnit | None:
-    high = _high(imu.angular_velocity)
-    if high <= FASTEST_TURN_RAD_S:
-        return None
-    scale = float(config.table("imu").get("angular_velocity_scale", 1.0)) * np.radians(1.0)
-    return WrongUnit(
-        "gyro: unit",
-        f"rates look 57 times too large (up to {high:.3g} rad/s): degrees a second? "
-        f"`angular_velocity_scale = {scale:.5g}` under [imu] in the log configuration",
-    )
-
-
-def _of_force(imu: Imu, calibration: Calibration, config: LogConfig) -> WrongUnit | None:
-    lengths = _lengths(imu.specific_force)
-    if not len(lengths):
-        return None
-    typical, gravity = float(np.median(lengths)), calibration.gravity_m_s2
+    found: list[WrongUnit] = []
+    speed_m_s = _exceeded_by_few(sequence.dvl.velocity)
+    if speed_m_s > FASTEST_M_S:
+        unit = next((unit for unit, factor in SPEEDS.items() if speed_m_s * factor <= USUAL_SPEED_M_S), "mm/s")
+        scale = float(config.table("dvl").get("scale", 1.0)) * SPEEDS[unit]
+        advice = (
+            f"velocities look {1 / SPEEDS[unit]:.0f} times too large (up to {speed_m_s:.3g} m/s): {unit}? "
+            f"`scale = {scale:.4g}` under [dvl] in the log configuration"
+        )
+        found.append(WrongUnit("DVL: unit", advice))
+    rate_rad_s = _exceeded_by_few(sequence.imu.angular_velocity)
+    if rate_rad_s > FASTEST_TURN_RAD_S:
+        scale = float(config.table("imu").get("angular_velocity_scale", 1.0)) * np.radians(1.0)
+        advice = (
+            f"rates look 57 times too large (up to {rate_rad_s:.3g} rad/s): degrees a second? "
+            f"`angular_velocity_scale = {scale:.5g}` under [imu] in the log configuration"
+        )
+        found.append(WrongUnit("gyro: unit", advice))
+    forces, gravity = _lengths(sequence.imu.specific_force), sequence.calibration.gravity_m_s2
+    typical = float(np.median(forces)) if len(forces) else 0.0
     unit = min(FORCES, key=lambda unit: abs(typical * FORCES[unit] - gravity))
-    if abs(typical * FORCES[unit] / gravity - 1) > SHARE_OF_GRAVITY:
-        return None
-    scale = float(config.table("imu").get("linear_acceleration_scale", 1.0)) * FORCES[unit]
-    return WrongUnit(
-        "accelerometer: unit",
-        f"specific forces are typically {typical:.4g} instead of {gravity:.4g} m/s²: {unit}? "
-        f"`linear_acceleration_scale = {scale:.6g}` under [imu] in the log configuration",
-    )
+    if len(forces) and not abs(typical * FORCES[unit] / gravity - 1) > SHARE_OF_GRAVITY:
+        scale = float(config.table("imu").get("linear_acceleration_scale", 1.0)) * FORCES[unit]
+        advice = (
+            f"specific forces are typically {typical:.4g} instead of {gravity:.4g} m/s²: {unit}? "
+            f"`linear_acceleration_scale = {scale:.6g}` under [imu] in the log configuration"
+        )
+        found.append(WrongUnit("accelerometer: unit", advice))
+    return found
 
 
-def _high(vectors: Floats) -> float:
-    """What is exceeded by a twentieth of them only: spikes do not count."""
+def _exceeded_by_few(vectors: Floats) -> float:
+    """Length that one in twenty vectors exceeds, so that spikes do not count."""
     lengths = _lengths(vectors)
     return float(np.percentile(lengths, HIGH_PERCENTILE)) if len(lengths) else 0.0
 
 
 def _lengths(vectors: Floats) -> Floats:
-    """Of the rows that were measured."""
+    """Lengths of the finite rows."""
     return np.asarray(np.linalg.norm(vectors[np.isfinite(vectors).all(axis=1)], axis=1))
 
 
 LONGEST_S = 600.0
-"""Compared over at most so long, in the middle of the log, which bounds the time: 240 s take about 1 s."""
+"""Longest part compared, in the middle of the log; 240 s take about 1 s."""
 LEAST_OFFSET_S = 0.01
 LEAST_YAW_RAD = np.radians(0.25)
 LEAST_SCALE = 0.002
 LEAST_HEADING_RAD = np.radians(1.0)
-"""What is smaller changes nothing that other errors would not hide."""
+"""Smaller errors are hidden by others."""
 LARGEST_DENSITY_RATIO = 1.5
-"""Densities further from the calibration's than this, either way, are worth a line."""
+"""Ratio to the calibration's density, either way, from which on a line is advised."""
 LARGEST_RESTING_M_S = 0.1
 FROM_DRIVE = "from the turns of the drive"
 
 
 def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[Finding]:
-    """Everything that can be told, in the order in which to act; wrong units alone, since they spoil the rest.
+    """Findings in the order in which to act; wrong units alone, since they spoil the rest.
 
     Parameters
     ----------
     sequence
         As a run would read it.
     config
-        With which it was read: corrections are added to what it says already.
+        Log configuration of the reading; corrections are added to it.
     """
     config = config or LogConfig()
     faults = wrong_units(sequence, config)
     if faults:
         unknown = Estimate1D(np.nan, np.inf, "wrong unit")
         return [Finding(quantity, unknown, "", advice, acts=True) for quantity, advice in faults]
-    match = match_dvl_to_imu(*_middle(sequence.imu, sequence.dvl), sequence.calibration)
-    of_dvl = list(_of_dvl(match, sequence, config))
+    imu, dvl = sequence.imu, sequence.dvl
+    first_ns, last_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0]), min(imu.stamps_ns[-1], dvl.stamps_ns[-1])
+    spare_ns = (int(last_ns - first_ns) - round(LONGEST_S * NS_PER_S)) // 2
+    if spare_ns > 0:
+        ends = int(first_ns) + spare_ns, int(last_ns) - spare_ns
+        inner_imu, inner_dvl = imu.between(*ends), dvl.between(*ends)
+        if inner_imu is not None and inner_dvl is not None:
+            imu, dvl = inner_imu, inner_dvl
+    match = match_dvl_to_imu(imu, dvl, sequence.calibration)
+    of_dvl = dvl_findings(match, sequence, config)
     lever = lever_findings(match, sequence.calibration)
-    right = _put_right(sequence, match, of_dvl)
+    right = corrected_sequence(sequence, match, of_dvl)
     tilt = find_start_tilt(right)
-    bias = bias_findings(*_surest_bias(match, tilt), sequence.calibration.imu)
-    return [*of_dvl, *lever, *bias, *_of_reference(right, config, tilt), *_of_noise(sequence)]
+    bias = bias_findings(*surest_bias(match, tilt), sequence.calibration.imu)
+    return [*of_dvl, *lever, *bias, *reference_findings(right, config, tilt), *noise_findings(sequence)]
 
 
-def _of_dvl(found: DvlMatch, sequence: Sequence, config: LogConfig) -> Iterator[Finding]:
-    yield _offset("DVL against IMU", _as_sure_as_samples(found.offset, sequence.imu), "dvl", config)
-    yaw_deg = in_degrees(found.yaw)
-    if matters(found.yaw, LEAST_YAW_RAD):
+def dvl_findings(found: DvlMatch, sequence: Sequence, config: LogConfig) -> list[Finding]:
+    """Time offset, mounting yaw and scale of the DVL."""
+    turns = matters(found.yaw, LEAST_YAW_RAD)
+    scales = matters(replace(found.scale, value=found.scale.value - 1), LEAST_SCALE)
+    yaw_advice = scale_advice = NO_NEED
+    if turns:
         rpy = ", ".join(f"{angle:.4f}" for angle in _turned(sequence.calibration.dvl, found.yaw.value))
-        advice = f"turn the DVL's mounting: `dvl.mounting.rpy_rad = [{rpy}]` in the calibration"
-        yield Finding("DVL mounting yaw", yaw_deg, "°", advice, acts=True)
-    else:
-        yield Finding("DVL mounting yaw", yaw_deg, "°", NO_NEED)
-    if matters(replace(found.scale, value=found.scale.value - 1), LEAST_SCALE):
+        yaw_advice = f"turn the DVL's mounting: `dvl.mounting.rpy_rad = [{rpy}]` in the calibration"
+    if scales:
         scale = float(config.table("dvl").get("scale", 1.0)) * found.scale.value
-        advice = f"scale the DVL's velocities: `scale = {scale:.4f}` under [dvl] in the log configuration"
-        yield Finding("DVL scale", found.scale, "", advice, acts=True)
-    else:
-        yield Finding("DVL scale", found.scale, "", NO_NEED)
+        scale_advice = f"scale the DVL's velocities: `scale = {scale:.4f}` under [dvl] in the log configuration"
+    return [
+        _offset("DVL against IMU", found.offset, sequence.imu, "dvl", config)[0],
+        Finding("DVL mounting yaw", in_degrees(found.yaw), "°", yaw_advice, turns),
+        Finding("DVL scale", found.scale, "", scale_advice, scales),
+    ]
 
 
-def _put_right(sequence: Sequence, match: DvlMatch, of_dvl: list[Finding]) -> Sequence:
-    """With what the rows before would change: the Doppler log's stamps, yaw and scale, lever arm, sigma of the bias."""
+def corrected_sequence(sequence: Sequence, match: DvlMatch, of_dvl: list[Finding]) -> Sequence:
+    """Sequence with the advised changes: stamps, yaw and scale of the DVL, lever arm, sigma of the gyro bias."""
     late, turned, scaled = (finding.acts for finding in of_dvl)
     dvl, calibration = sequence.dvl, with_fitted(match, sequence.calibration)
     shift_ns = round(match.offset.value * NS_PER_S) if late else 0
@@ -205,8 +194,8 @@ def _put_right(sequence: Sequence, match: DvlMatch, of_dvl: list[Finding]) -> Se
     return replace(sequence, dvl=moved, calibration=calibration)
 
 
-def _surest_bias(match: DvlMatch, tilt: StartTilt) -> tuple[Estimates3D, tuple[str, str, str]]:
-    """Of the whole drive's and a rest's the surer one, axis by axis, and from which it is."""
+def surest_bias(match: DvlMatch, tilt: StartTilt) -> tuple[Estimates3D, tuple[str, str, str]]:
+    """Gyro bias of the whole drive or of a rest, whichever is more certain on each axis, and its source."""
     still = tilt.gyro_bias() or match.gyro_bias
     pairs = [
         (a, tilt.said) if tilt.is_rest and (not b.is_known or a.sigma < b.sigma) else (b, FROM_DRIVE)
@@ -216,15 +205,15 @@ def _surest_bias(match: DvlMatch, tilt: StartTilt) -> tuple[Estimates3D, tuple[s
     return (x, y, z), (of_x, of_y, of_z)
 
 
-def _of_reference(right: Sequence, config: LogConfig, tilt: StartTilt) -> Iterator[Finding]:
-    """With the start's roll and pitch, whose line has the heading that the reference puts right."""
+def reference_findings(right: Sequence, config: LogConfig, tilt: StartTilt) -> Iterator[Finding]:
+    """Time offset and first headings of the reference, and the start; its line has the heading of the reference."""
     start = right.calibration.start
     if right.truth is None:
         yield from tilt_findings(tilt, start, start.rpy_rad[2])
         return
     found = match_reference_to_imu(right.imu, right.truth, right.calibration)
-    offset = _as_sure_as_samples(found.offset, right.imu)
-    yield _offset("reference against IMU", offset, "truth", config)
+    row, offset = _offset("reference against IMU", found.offset, right.imu, "truth", config)
+    yield row
     jump = in_degrees(found.start_heading)
     acts = matters(found.start_heading, LEAST_HEADING_RAD)
     advice = "the reference begins with a wrong heading: leave its beginning out with `--start`" if acts else NO_NEED
@@ -236,20 +225,20 @@ def _of_reference(right: Sequence, config: LogConfig, tilt: StartTilt) -> Iterat
         yield heading.finding(tilt)
 
 
-def _of_noise(sequence: Sequence) -> Iterator[Finding]:
-    found, imu, speed = noise_densities(sequence.imu), sequence.calibration.imu, _speed_in_rest(sequence)
+def noise_findings(sequence: Sequence) -> Iterator[Finding]:
+    """Noise densities of gyro and accelerometer, where the DVL confirms the rest: a steady drive can be as quiet."""
+    found, imu = noise_densities(sequence.imu), sequence.calibration.imu
+    stamps_ns = sequence.imu.stamps_ns[longest_rest(sequence.imu)]
+    during = sequence.dvl.between(int(stamps_ns[0]), int(stamps_ns[-1])) if len(stamps_ns) else None
+    speed = 0.0 if during is None else float(np.median(np.linalg.norm(during.velocity, axis=1)))
     rest = f"from {found.still_s:.0f} s of rest"
     known = {
         "gyro noise density": ("gyro_noise_density", found.gyro, imu.gyro_noise_density, "rad/s/√Hz"),
         "accelerometer noise density": ("accel_noise_density", found.accel, imu.accel_noise_density, "m/s²/√Hz"),
     }
-    for quantity, (field, measured, given, unit) in known.items():
-        driving = measured.is_known and speed > LARGEST_RESTING_M_S
-        estimate = (
-            replace(measured, reason=f"{found.still_s:.0f} s are steady, but at {speed:.1f} m/s")
-            if driving
-            else measured
-        )
+    for quantity, (field, estimate, given, unit) in known.items():
+        if estimate.is_known and speed > LARGEST_RESTING_M_S:
+            estimate = replace(estimate, reason=f"{found.still_s:.0f} s are steady, but at {speed:.1f} m/s")
         ratio = max(estimate.value / given, given / estimate.value) if estimate.value > 0 and given > 0 else np.inf
         acts = matters(replace(estimate, value=estimate.value - given), 0.0) and ratio > LARGEST_DENSITY_RATIO
         advice = f"{rest}; the calibration's {given:.2g} fits, no need to act"
@@ -260,41 +249,18 @@ def _of_noise(sequence: Sequence) -> Iterator[Finding]:
         yield Finding(quantity, estimate, unit, advice, acts)
 
 
-def _speed_in_rest(sequence: Sequence) -> float:
-    """Of the Doppler log, m/s: a steady drive can be as quiet as a rest."""
-    stamps_ns = sequence.imu.stamps_ns[longest_rest(sequence.imu)]
-    during = sequence.dvl.between(int(stamps_ns[0]), int(stamps_ns[-1])) if len(stamps_ns) else None
-    return 0.0 if during is None else float(np.median(np.linalg.norm(during.velocity, axis=1)))
-
-
-def _offset(quantity: str, estimate: Estimate1D, role: str, config: LogConfig) -> Finding:
-    if not matters(estimate, LEAST_OFFSET_S):
-        return Finding(f"{quantity}: time offset", estimate, "s", NO_NEED)
-    total_s = float(config.table(role).get("stamp_offset_s", 0.0)) + estimate.value
-    advice = f"shift its stamps: `stamp_offset_s = {total_s:.3f}` under [{role}] in the log configuration"
-    return Finding(f"{quantity}: time offset", estimate, "s", advice, acts=True)
-
-
-def _as_sure_as_samples(offset: Estimate1D, imu: Imu) -> Estimate1D:
-    """No surer than it is known what instant of its interval a sample of the IMU stands for (uniform)."""
+def _offset(quantity: str, offset: Estimate1D, imu: Imu, role: str, config: LogConfig) -> tuple[Finding, Estimate1D]:
+    """Row for a time offset, and the offset with the uncertainty of the instant that an IMU sample stands for."""
     interval_s = float(np.median(np.diff(imu.stamps_ns))) / NS_PER_S if len(imu) > 1 else 0.0
-    return replace(offset, sigma=float(np.hypot(offset.sigma, interval_s / np.sqrt(12))))
+    offset = replace(offset, sigma=float(np.hypot(offset.sigma, interval_s / np.sqrt(12))))
+    total_s = float(config.table(role).get("stamp_offset_s", 0.0)) + offset.value
+    acts = matters(offset, LEAST_OFFSET_S)
+    advice = f"shift its stamps: `stamp_offset_s = {total_s:.3f}` under [{role}] in the log configuration"
+    return Finding(f"{quantity}: time offset", offset, "s", advice if acts else NO_NEED, acts), offset
 
 
 def _turned(dvl: DvlCalibration, yaw_rad: float) -> tuple[float, float, float]:
-    """Roll, pitch, yaw of the mounting after a turn about the body's z axis."""
+    """Roll, pitch and yaw of the mounting after a turn about the body's z axis."""
     before = Rotation.from_euler("ZYX", dvl.mounting.rpy_rad[::-1])
     yaw, pitch, roll = (Rotation.from_euler("z", yaw_rad) * before).as_euler("ZYX").tolist()
     return roll, pitch, yaw
-
-
-def _middle(imu: Imu, dvl: Dvl) -> tuple[Imu, Dvl]:
-    """The middle of a long log."""
-    first_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0])
-    last_ns = min(imu.stamps_ns[-1], dvl.stamps_ns[-1])
-    spare_ns = (int(last_ns - first_ns) - round(LONGEST_S * NS_PER_S)) // 2
-    if spare_ns <= 0:
-        return imu, dvl
-    ends = int(first_ns) + spare_ns, int(last_ns) - spare_ns
-    inner_imu, inner_dvl = imu.between(*ends), dvl.between(*ends)
-    return (imu, dvl) if inner_imu is None or inner_dvl is None else (inner_imu, inner_dvl)

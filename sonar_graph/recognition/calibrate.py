@@ -1,16 +1,19 @@
-"""Measures how often landmarks look like which, on logs whose truth is known: `sonar-graph calibrate`.
+"""Measuring the model of recognition on logs with known truth: `sonar-graph calibrate`.
 
-Every sighting of a track is labelled by the true landmarks: one that lies within 8 cm of a landmark is of it, one that
-has none within 40 cm is of none; what lies between, such as a piece of a landmark, is left out.
+Sightings are labelled by the true landmarks: within 8 cm of one it is that landmark, more than 40 cm from all it is
+none, in between (such as a piece of a landmark) it is left out. `estimate_confusion` then fits sharpness and threshold
+of the soft scores, the confusion matrix and the accuracy of range and azimuth. Derivation: docs/theory/recognition.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import brentq, minimize, minimize_scalar
+from scipy.special import expit
 
 from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.errors import CalibrationError, LogError
@@ -19,16 +22,29 @@ from sonar_graph.logs.adapters import LogConfig
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.recognition.session import RecognitionSession, no_images
 from sonar_graph.sequence import Sequence as Run
-from sonar_graph.sonar import Confusion, LabelledFits, ObjectSighting, Recogniser, RecogniserParams, estimate_confusion
+from sonar_graph.sonar import (
+    Confusion,
+    ObjectSighting,
+    Recogniser,
+    RecogniserParams,
+    bounded_rows,
+    mark_of,
+    soft_scores,
+    virtual_evidence,
+)
 
 SAME_M, APART_M = 0.08, 0.40
 NO_LABEL = -2
 NONE = -1
+LEAST_FRAMES = 20
+"""Labelled frames that every class needs."""
+ONE_STANDARD_ERROR_NATS = 0.5
+"""Rise of the total loss at one sigma of a Gaussian likelihood."""
 
 
 @dataclass(eq=False)
 class LabelledSightings:
-    """Gathers sightings with their true classes."""
+    """Columns of sightings with their true classes."""
 
     ids: tuple[int, ...]
     """Of the designs, in order."""
@@ -41,7 +57,7 @@ class LabelledSightings:
     def add(
         self, sighting: ObjectSighting, track: tuple[int, int], ids: Ints, range_m: Floats, azimuth_rad: Floats
     ) -> None:
-        """One sighting, the log and the track that it is of, and where every landmark truly is, shapes (m,)."""
+        """Add a sighting of a track (log, number), given the true range and azimuth of every landmark, shapes (m,)."""
         if sighting.fit is None:
             return
         label, at = label_of(sighting, ids, range_m, azimuth_rad)
@@ -78,7 +94,7 @@ def label_of(sighting: ObjectSighting, ids: Ints, range_m: Floats, azimuth_rad: 
 
 
 def true_ranges_azimuths(run: Run, stamp_ns: int) -> tuple[Floats, Floats]:
-    """Of every true landmark in the sonar's frame at an instant, shapes (m,)."""
+    """True range and azimuth of every landmark at an instant, shapes (m,)."""
     assert run.truth is not None
     assert run.true_landmarks is not None
     pose = run.truth.at(np.array([stamp_ns]))
@@ -98,7 +114,7 @@ def calibrate(
     params: RecogniserParams | None = None,
     salvage: bool = False,
 ) -> Confusion:
-    """Measure the model on logs with images, true trajectory and true landmarks.
+    """Measure the model of recognition on logs with images, true trajectory and true landmarks.
 
     Parameters
     ----------
@@ -125,12 +141,22 @@ def calibrate(
     for log, (path, run) in enumerate(logs):
         if run.truth is None or run.true_landmarks is None:
             raise CalibrationError(f"{path}: without true trajectory and true landmarks nothing in it can be labelled")
-        _require_common(path, run.true_landmarks.ids, gathered.ids)
+        in_log = run.true_landmarks.ids.tolist()
+        if not set(gathered.ids) & set(in_log):
+            true, known = (", ".join(map(str, sorted(ids))) for ids in (in_log, gathered.ids))
+            raise CalibrationError(
+                f"{path}: its true landmarks are {true}, the designs are {known}: none can be measured; "
+                "give the designs of the log's landmarks with --designs (designs in Python)"
+            )
         recogniser = Recogniser(run.calibration, designs, params)
         session = RecognitionSession(run, recogniser=recogniser, pictures=False)
         for stamp_ns in session.run(read_sonar_frames(path, topic, config, salvage=salvage)):
-            if recogniser.stamp_ns == stamp_ns:
-                _gather(gathered, log, recogniser, run, stamp_ns)
+            if recogniser.stamp_ns != stamp_ns or not run.truth.stamps_ns[0] <= stamp_ns <= run.truth.stamps_ns[-1]:
+                continue
+            range_m, azimuth_rad = true_ranges_azimuths(run, stamp_ns)
+            for track, sighting in zip(recogniser.track_ids.tolist(), recogniser.sightings, strict=True):
+                if sighting is not None:
+                    gathered.add(sighting, (log, track), run.true_landmarks.ids, range_m, azimuth_rad)
         if not session.result.frames:
             raise LogError(no_images(path))
     names = ", ".join(path.name for path, _ in logs)
@@ -138,23 +164,108 @@ def calibrate(
     return estimate_confusion(gathered.fits(), gathered.ids, {"logs": names, "what they are": kinds}, designs)
 
 
-def _require_common(path: Path, in_log: Ints, known: tuple[int, ...]) -> None:
-    if not set(known) & set(in_log.tolist()):
+@dataclass(frozen=True, eq=False)
+class LabelledFits:
+    """Fits of designs to patches whose class is known."""
+
+    correlation: Floats
+    """Of each design with the patch, shape (n, ids)."""
+    visible: Floats
+    """Share of the template in view, shape (n,)."""
+    label: Ints
+    """Index of the true class; the number of ids for "none of them", shape (n,)."""
+    track: Ints
+    """Track of each patch, shape (n,); frames of one track are not independent."""
+    range_azimuth_error: Floats
+    """Measured minus true (m, rad), shape (n, 2); NaN where there is no landmark."""
+
+
+def estimate_confusion(
+    fits: LabelledFits, ids: tuple[int, ...], provenance: dict[str, str], designs: Sequence[LandmarkDesign] = ()
+) -> Confusion:
+    """Fit the model to labelled frames, all classes weighing the same.
+
+    Parameters
+    ----------
+    fits
+        Labelled frames.
+    ids
+        Of the designs, in their order.
+    provenance
+        Source of the frames.
+    designs
+        The designs as measured; without them no recogniser accepts the model.
+
+    Raises
+    ------
+    CalibrationError
+        When a class has too few frames, naming it.
+    """
+    counts = np.bincount(fits.label, minlength=len(ids) + 1)
+    names = [*(f"landmark {i}" for i in ids), "no landmark"]
+    poor = [f"{name}: {count}" for name, count in zip(names, counts.tolist(), strict=True) if count < LEAST_FRAMES]
+    if poor:
         raise CalibrationError(
-            f"{path}: its true landmarks are {_listed(in_log.tolist())}, the designs are {_listed(known)}: none can "
-            "be measured; give the designs of the log's landmarks with --designs (designs in Python)"
+            f"too few labelled frames ({'; '.join(poor)}; needed {LEAST_FRAMES} of each): give longer or more logs"
         )
+    tracks = np.array([len(np.unique(fits.track[fits.label == k])) for k in range(len(counts))])
+    # (n + 1) / (n + 2) for the own class after n tracks (Platt 1999, section 2.2): classes that were never confused are
+    # not certain. All landmarks share the two fitted numbers, so that n counts the tracks of all of them.
+    n = np.append(np.full(len(tracks) - 1, tracks[:-1].sum()), tracks[-1])
+    targets = np.tile(1.0 / ((n + 2.0) * (len(n) - 1))[:, None], (1, len(n)))
+    np.fill_diagonal(targets, (n + 1.0) / (n + 2.0))
+    targets = targets[fits.label] / (counts[fits.label] * len(counts))[:, None]
+    sharpness, threshold = fit_scores(fits, targets, int(tracks.sum()))
+    matrix = mean_scores(soft_scores(fits.correlation, fits.visible, sharpness, threshold), fits.label)
+    sigmas = np.sqrt(np.nanmean((fits.range_azimuth_error * fits.visible[:, None] ** 2) ** 2, axis=0))
+    return Confusion(
+        ids=ids,
+        designs=tuple(map(mark_of, designs)),
+        matrix=tuple(map(tuple, matrix.tolist())),
+        sharpness=sharpness,
+        threshold=threshold,
+        range_sigma_m=float(sigmas[0]),
+        azimuth_sigma_rad=float(sigmas[1]),
+        provenance=provenance
+        | {f"frames of {n}": str(c) for n, c in zip(names, counts.tolist(), strict=True)}
+        | {f"tracks of {n}": str(c) for n, c in zip(names, tracks.tolist(), strict=True)},
+    )
 
 
-def _listed(ids: Iterable[int]) -> str:
-    return ", ".join(map(str, sorted(ids)))
+def mean_scores(scores: Floats, label: Ints) -> Floats:
+    """Confusion matrix from soft scores, no entry below the least, rows with sum 1."""
+    return bounded_rows(np.array([scores[label == k].mean(axis=0) for k in range(scores.shape[1])]))
 
 
-def _gather(gathered: LabelledSightings, log: int, recogniser: Recogniser, run: Run, stamp_ns: int) -> None:
-    truth, landmarks = run.truth, run.true_landmarks
-    if truth is None or landmarks is None or not truth.stamps_ns[0] <= stamp_ns <= truth.stamps_ns[-1]:
-        return
-    range_m, azimuth_rad = true_ranges_azimuths(run, stamp_ns)
-    for track, sighting in zip(recogniser.track_ids.tolist(), recogniser.sightings, strict=True):
-        if sighting is not None:
-            gathered.add(sighting, (log, track), landmarks.ids, range_m, azimuth_rad)
+def fit_scores(fits: LabelledFits, targets: Floats, tracks: int) -> tuple[float, float]:
+    """Sharpness and threshold for which the posterior of one frame fits weighted targets, shape (n, classes).
+
+    The posterior counts, after the confusion matrix and from equal priors: doubt in the scores would count twice.
+    Where nothing was ever confused, any large sharpness fits. So the least sharpness is taken whose loss is within one
+    standard error of the best, each track counting as one observation (Breiman et al. 1984, section 3.4.3).
+    """
+    classes = targets.shape[1]
+    equal, news = np.full((len(targets), classes), 1.0 / classes), np.ones(len(targets))
+
+    def loss(log_sharpness: float, logit: float) -> float:
+        scores = soft_scores(fits.correlation, fits.visible, float(np.exp(log_sharpness)), float(expit(logit)))
+        matrix = mean_scores(scores, fits.label)
+        posterior = virtual_evidence(equal, scores, matrix, matrix.mean(axis=0), news)
+        return float(-np.sum(targets * np.log(np.maximum(posterior, 1e-12))))
+
+    def loss_of_both(unbounded: Floats) -> float:
+        return loss(float(unbounded[0]), float(unbounded[1]))
+
+    best = minimize(loss_of_both, np.array([np.log(10.0), 1.0]), method="Nelder-Mead")
+    allowed = best.fun + ONE_STANDARD_ERROR_NATS / tracks
+
+    def least(log_sharpness: float) -> tuple[float, float]:
+        """Loss and logit of the best threshold for a sharpness."""
+        found = minimize_scalar(lambda x: loss(log_sharpness, x), bounds=(-2.0, 5.0), method="bounded")
+        return float(found.fun), float(found.x)
+
+    blunt = float(best.x[0]) - 1.0
+    while least(blunt)[0] <= allowed:
+        blunt -= 1.0
+    chosen = float(brentq(lambda x: least(x)[0] - allowed, blunt, float(best.x[0]), xtol=1e-3))
+    return float(np.exp(chosen)), float(expit(least(chosen)[1]))

@@ -1,9 +1,7 @@
-"""What was made of the sonar images of a log: data that recognising fills and that reports and viewers show.
+"""Record of the recognition in a log, with pictures of its frames, for reports and viewers.
 
-A sonar frame as a picture of its fan, with the recognised identities drawn where they were seen.
-
-The counterpart of Fig. 6 of the 2014 paper. Pixels are looked up in the polar image (nearest beam and bin), for
-display only: nothing is measured in such a picture.
+Pictures show the fan of a frame with the recognised identities, as Fig. 6 of the 2014 paper. Their pixels are those of
+the nearest beam and bin, for display only.
 """
 
 from __future__ import annotations
@@ -26,12 +24,12 @@ RECOGNITION, PICTURES = "recognition.json", "recognised"
 MOST_SHOWN = 6
 NONE = -1
 LEAST_NAMED = 0.5
-"""Posterior above which a detection names a landmark."""
+"""Posterior above which a detection counts as naming a landmark."""
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnFrame:
-    """A frame with what was recognised drawn into it."""
+    """Picture of a frame with its detections."""
 
     stamp_ns: int
     jpeg: bytes
@@ -43,32 +41,31 @@ class DrawnFrame:
 
 @dataclass(eq=False)
 class Recognition:
-    """What was made of the images of a log."""
+    """Detections in the images of a log, and what became of every candidate, track and frame."""
 
     frames: int = 0
     detections: LandmarkDetections | None = None
     outcomes: Counter[str] = field(default_factory=Counter)
-    """How often each thing became of a candidate, track or frame."""
+    """Count of each outcome of candidates, tracks and frames."""
     warnings: list[tuple[int, str]] = field(default_factory=list)
-    """Stamp and reason: frames that were not used, and changes of the sonar's window; the first of each reason, and of
-    all others the earliest."""
+    """Stamp and reason of unused frames and of changes of the window: the first of each reason, and the earliest."""
     pictures: list[DrawnFrame] = field(default_factory=list)
-    """Evenly over the run."""
+    """Spread evenly over the run."""
     notes: dict[str, str] = field(default_factory=dict)
-    """Which model and settings."""
+    """Model and settings."""
 
     def warned(self) -> dict[str, int]:
-        """How often frames were warned about, by reason; most frequent first."""
+        """Count of warnings by reason, most frequent first."""
         reasons = {reason for _, reason in self.warnings}
         return {outcome: count for outcome, count in self.outcomes.most_common() if outcome in reasons}
 
     def naming(self, true_landmarks: LandmarkMap | None = None) -> list[str]:
-        """Lines on how often each landmark was the most probable class, and a warning where none ever was.
+        """Lines on how often each landmark was the most probable class, with warnings.
 
         Parameters
         ----------
         true_landmarks
-            Those that the log says to be there, if it does.
+            Of the log, if it has any: landmarks without a design are named.
         """
         named: Counter[int] = Counter()
         if self.detections is not None:
@@ -88,12 +85,12 @@ class Recognition:
         return lines
 
     def entry(self) -> dict[str, Any]:
-        """All but detections and pictures, as it stands in JSON."""
+        """Content for JSON, without detections and pictures."""
         outcomes = dict(self.outcomes.most_common())
         return {"frames": self.frames, "outcomes": outcomes, "warnings": self.warnings, "notes": self.notes}
 
     def shown(self) -> list[DrawnFrame]:
-        """The surest picture of each landmark, at most six, in order of identity."""
+        """Picture with the highest posterior of each landmark, at most six, in order of identity."""
         surest: dict[int, tuple[float, DrawnFrame]] = {}
         for picture in self.pictures:
             for landmark, probability in zip(picture.landmark_ids, picture.probabilities, strict=True):
@@ -118,7 +115,7 @@ def write_recognition(recognition: Recognition | None, folder: Path) -> None:
 
 
 def read_recognition(folder: Path) -> Recognition | None:
-    """What `write_recognition` left, without detections; None where it left nothing."""
+    """Read the files of `write_recognition`, without detections; None where there are none."""
     if not (folder / RECOGNITION).is_file():
         return None
     entry: dict[str, Any] = read_json(folder / RECOGNITION)
@@ -133,12 +130,12 @@ def read_recognition(folder: Path) -> Recognition | None:
 Picture = NDArray[np.uint8]
 MARGIN = 6
 SURE = 0.9
-"""Posterior from which on an identity is drawn as recognised."""
+"""Posterior from which on an identity is drawn as certain."""
 RECOGNISED, DOUBTFUL = (60, 220, 255), (190, 190, 190)
 """Blue, green, red."""
 JPEG_QUALITY = 85
 TEXT_SIZE = 0.85
-"""Of letters that can still be read where a page shows four pictures in a row."""
+"""Legible where a page shows four pictures in a row."""
 
 
 def draw_fan(image_db: NDArray[np.floating], fan: Fan, detections: LandmarkDetections | None) -> Picture:
@@ -151,23 +148,18 @@ def draw_fan(image_db: NDArray[np.floating], fan: Fan, detections: LandmarkDetec
         ids, probabilities = detections.most_probable()
         for i, (landmark, probability) in enumerate(zip(ids.tolist(), probabilities.tolist(), strict=True)):
             place = fan.pixel(float(detections.range_m[i]), float(detections.azimuth_rad[i]))
-            _draw_detection(picture, place, landmark, probability, round(0.23 * fan.pixels_per_m))
+            radius, is_sure = round(0.23 * fan.pixels_per_m), probability >= SURE
+            colour = RECOGNISED if is_sure else DOUBTFUL
+            text = f"ID {landmark}" if is_sure else f"ID {landmark}?  {probability:.2f}"
+            cv2.circle(picture, place, radius, colour, 2 if is_sure else 1, cv2.LINE_AA)
+            cv2.drawMarker(picture, place, colour, cv2.MARKER_CROSS, 9, 1)
+            (width, height), descent = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, 2)
+            left = int(np.clip(place[0] - width // 2, MARGIN, picture.shape[1] - width - MARGIN))
+            foot = max(place[1] - radius - 2 * MARGIN, height + MARGIN)
+            corners = (left - MARGIN, foot - height - MARGIN), (left + width + MARGIN, foot + descent)
+            cv2.rectangle(picture, *corners, (0, 0, 0), -1)
+            cv2.putText(picture, text, (left, foot), cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, colour, 2, cv2.LINE_AA)
     return picture
-
-
-def _draw_detection(picture: Picture, place: tuple[int, int], landmark: int, probability: float, radius: int) -> None:
-    is_sure = probability >= SURE
-    colour = RECOGNISED if is_sure else DOUBTFUL
-    text = f"ID {landmark}" if is_sure else f"ID {landmark}?  {probability:.2f}"
-    cv2.circle(picture, place, radius, colour, 2 if is_sure else 1, cv2.LINE_AA)
-    cv2.drawMarker(picture, place, colour, cv2.MARKER_CROSS, 9, 1)
-    (width, height), descent = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, 2)
-    left = int(np.clip(place[0] - width // 2, MARGIN, picture.shape[1] - width - MARGIN))
-    foot = max(place[1] - radius - 2 * MARGIN, height + MARGIN)
-    cv2.rectangle(
-        picture, (left - MARGIN, foot - height - MARGIN), (left + width + MARGIN, foot + descent), (0, 0, 0), -1
-    )
-    cv2.putText(picture, text, (left, foot), cv2.FONT_HERSHEY_SIMPLEX, TEXT_SIZE, colour, 2, cv2.LINE_AA)
 
 
 def as_jpeg(picture: Picture) -> bytes:

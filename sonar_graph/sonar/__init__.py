@@ -3,12 +3,14 @@
 # fmt: off
 from sonar_graph.sonar.actag import AcTagRecogniser, AcTagSettings
 from sonar_graph.sonar.appearance import ObjectSighting
-from sonar_graph.sonar.confusion import Confusion, LabelledFits, estimate_confusion, read_confusion
+from sonar_graph.sonar.bayes import virtual_evidence
+from sonar_graph.sonar.confusion import Confusion, bounded_rows, mark_of, read_confusion, soft_scores
 from sonar_graph.sonar.geometry import Fan, FloorView, with_lens
 from sonar_graph.sonar.recogniser import Fate, Recogniser, RecogniserParams
 from sonar_graph.sonar.track_filter import SonarStep
 
 __all__ = [
-    "AcTagRecogniser", "AcTagSettings", "Confusion", "Fan", "Fate", "FloorView", "LabelledFits", "ObjectSighting",
-    "Recogniser", "RecogniserParams", "SonarStep", "estimate_confusion", "read_confusion", "with_lens",
+    "AcTagRecogniser", "AcTagSettings", "Confusion", "Fan", "Fate", "FloorView", "ObjectSighting", "Recogniser",
+    "RecogniserParams", "SonarStep", "bounded_rows", "mark_of", "read_confusion", "soft_scores", "virtual_evidence",
+    "with_lens",
 ]

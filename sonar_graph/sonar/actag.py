@@ -1,19 +1,16 @@
-"""AcTag fiducials in sonar images, decoded by AcTag's own detector (the extra ``actag``).
+"""AcTag fiducials in sonar images, decoded by AcTag's own detector (the extra ``actag``), and as designs to simulate.
 
-AcTag wants rows and columns that are equally spaced in range and azimuth, the farthest range and the leftmost azimuth
-first, and its filters have a size in pixels. Frames are therefore sampled anew: by the log's own table of beams, and
-with as many pixels a bit of the tag as `AcTagSettings.pixels_per_bit` says. AcTag looks at each frame for itself and
-decodes clutter now and then; a tag is reported from the second frame on that has it in the same place.
+AcTag wants rows and columns equally spaced in range and azimuth, the farthest range and the leftmost azimuth first, and
+its filters have a size in pixels. Frames are therefore resampled by the log's table of beams, with
+`AcTagSettings.pixels_per_bit` pixels for a bit. AcTag decodes clutter now and then; a tag is reported from the second
+frame on that has it in the same place.
 
 Source: K. Norman, D. Butterfield, J. Mangelson, "AcTag: Opti-Acoustic Fiducial Markers for Underwater Localization and
 Mapping", IROS 2023; PyPI ``actag`` (BSD-2-Clause).
-
-AcTags as landmark designs, for simulating them: drawn from the bits of AcTag's own families.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -42,20 +39,20 @@ SEED = 1
 
 
 class AcTagSettings(Section):
-    """Which tags there are, and how AcTag is used."""
+    """Family of tags, and settings of AcTag."""
 
     family: str = "AcTag24h10"
-    """AcTag24h4, 24h6, 24h8 or 24h10: bits, and the least number of bits in which two tags differ."""
+    """AcTag24h4, 24h6, 24h8 or 24h10: number of bits, and least number in which two tags differ."""
     tag_size_m: float = Field(0.1306, gt=0)
     """Side of the inner square; the whole tag is 7/3 of it."""
     bit_corrections: int = Field(3, ge=0)
-    """Wrong bits that are put right: fewer than half of those in which two tags differ."""
+    """Wrong bits that are corrected: fewer than half of those in which two tags differ."""
     pixels_per_bit: float = Field(8.0, ge=4)
     """Size of a bit in the image that AcTag gets."""
     least_frames: int = Field(2, ge=1)
     """Frames in which a tag must have been decoded in one place before it is reported."""
     same_place_m: float = Field(0.5, gt=0)
-    """How far apart one place may seem: the elevation of a tag is not known."""
+    """Largest distance of one place between frames; the elevation of a tag is not known."""
     probability: float = Field(0.99, gt=0, lt=1)
     """Posterior of a decoded identity."""
     range_sigma_m: float = Field(0.003, gt=0)
@@ -65,7 +62,7 @@ class AcTagSettings(Section):
 
 
 class Tag(NamedTuple):
-    """A decoded tag, and where its centre is."""
+    """A decoded tag and the place of its centre."""
 
     id: int
     range_m: float
@@ -73,12 +70,12 @@ class Tag(NamedTuple):
 
 
 class AcTagRecogniser:
-    """Recognises AcTags, one frame after another, as `sonar_graph.sonar.recogniser.Recogniser` does its landmarks.
+    """Recogniser of AcTags, with the interface of `sonar_graph.sonar.Recogniser`.
 
     Parameters
     ----------
     calibration
-        Of the sonar: the scale of its samples.
+        Scale of the samples of the sonar.
     settings
         None: the defaults.
 
@@ -92,7 +89,7 @@ class AcTagRecogniser:
         self.settings = settings or AcTagSettings()
         self._image = calibration.sonar.image
         self._check = FrameCheck(calibration.sonar.image)
-        self._make = _actag()
+        self._make = _import_actag("actag", "recognising").AcTag
         try:
             self._detector(np.array([1.0, 2.0]), np.array([-0.25, 0.25]))
         except (ValueError, FileNotFoundError) as error:
@@ -100,12 +97,12 @@ class AcTagRecogniser:
         self._start_T_sonar = gtsam.Pose3()
         self._seen: dict[int, tuple[Floats, int]] = {}
         self.fates: list[Fate] = []
-        """What became of everything in the frame last processed."""
+        """Outcome of every tag and fault in the last frame."""
 
     def process(
         self, frame: SonarFrames, motion: SonarStep | None = None, view: FloorView | None = None
     ) -> LandmarkDetections | None:
-        """The tags in a block of one frame; motion as for `Recogniser`, the floor is of no use to AcTag.
+        """Tags in a block of one frame; motion as for `Recogniser`, the floor is not used.
 
         Raises
         ------
@@ -114,52 +111,59 @@ class AcTagRecogniser:
         """
         del view
         check_block(frame)
-        stamp_ns = int(frame.stamps_ns[0])
+        stamp_ns, settings = int(frame.stamps_ns[0]), self.settings
         if motion is not None:
             self._start_T_sonar = self._start_T_sonar.compose(motion.previous_T_sonar)
         if (fault := self._check.fault(frame)) is not None:
             self.fates = [Fate(stamp_ns, -1, np.nan, np.nan, f"frame not used: {fault}")]
             return None
-        tags = self._decoded(frame)
-        outcomes = [self._outcome(tag, [other.id for other in tags[:n]]) for n, tag in enumerate(tags)]
-        self.fates = [
-            Fate(stamp_ns, -1, tag.range_m, tag.azimuth_rad, outcome)
-            for tag, outcome in zip(tags, outcomes, strict=True)
-        ]
+        bit_m = settings.tag_size_m / BITS_OF_INNER_SQUARE
+        image_db = self._image.decibels(frame.intensity[0])
+        picture_db, rows_m, columns_rad = evenly_sampled(
+            image_db, frame.ranges_m, frame.azimuths_rad, bit_m / settings.pixels_per_bit
+        )
+        counts = np.clip(np.rint(picture_db * COUNTS_A_DECIBEL), 0, 255).astype(np.int64)
+        decoded = self._detector(rows_m, columns_rad).run_detection(counts)
+        tags = [Tag(int(id_), *np.mean(range_azimuth, axis=0).tolist()) for id_, _, range_azimuth in decoded]
+        self.fates, reported = [], []
+        for n, tag in enumerate(tags):
+            outcome = REPORTED
+            if tag.id in [other.id for other in tags[:n]]:
+                outcome = "not reported: decoded already in this frame"
+            elif self._frames_in_place(tag) < settings.least_frames:
+                outcome = f"not reported: decoded in fewer than {settings.least_frames} frames in one place"
+            else:
+                reported.append(tag)
+            self.fates.append(Fate(stamp_ns, -1, tag.range_m, tag.azimuth_rad, outcome))
         if self._check.change is not None:
             self.fates.append(Fate(stamp_ns, -1, np.nan, np.nan, self._check.change))
-        reported = [tag for tag, outcome in zip(tags, outcomes, strict=True) if outcome == REPORTED]
-        return self._detections(stamp_ns, reported) if reported else None
+        if not reported:
+            return None
+        covariance = np.diag([settings.range_sigma_m**2, settings.azimuth_sigma_rad**2])
+        return LandmarkDetections(
+            stamps_ns=np.full(len(reported), stamp_ns),
+            range_m=np.array([tag.range_m for tag in reported]),
+            azimuth_rad=np.array([tag.azimuth_rad for tag in reported]),
+            range_azimuth_cov=np.tile(covariance, (len(reported), 1, 1)),
+            candidate_ids=np.array([[tag.id] for tag in reported]),
+            id_probability=np.full((len(reported), 1), settings.probability),
+        )
 
-    def _outcome(self, tag: Tag, earlier_ids: list[int]) -> str:
-        """What becomes of a tag; remembers where it was decoded."""
-        if tag.id in earlier_ids:
-            return "not reported: decoded already in this frame"
+    def _frames_in_place(self, tag: Tag) -> int:
+        """Frames in a row that have a tag in one place; remembers the place."""
         q = points(np.array([tag.range_m]), np.array([tag.azimuth_rad]))[0]
         place = np.asarray(self._start_T_sonar.transformFrom(q))
         before, frames = self._seen.get(tag.id, (place, 0))
         frames = frames + 1 if np.linalg.norm(place - before) <= self.settings.same_place_m else 1
         self._seen[tag.id] = place, frames
-        if frames < self.settings.least_frames:
-            return f"not reported: decoded in fewer than {self.settings.least_frames} frames in one place"
-        return REPORTED
+        return frames
 
     def notes(self) -> dict[str, str]:
-        """How detections come about, for a log's notes."""
+        """Rule and designs, for the notes of a log."""
         return {
             "detections.rule": f"AcTag, decoded in {self.settings.least_frames} frames in one place",
             "detections.designs": f"{self.settings.family}, inner square {self.settings.tag_size_m:g} m",
         }
-
-    def _decoded(self, frame: SonarFrames) -> list[Tag]:
-        bit_m = self.settings.tag_size_m / BITS_OF_INNER_SQUARE
-        image_db = self._image.decibels(frame.intensity[0])
-        picture_db, rows_m, columns_rad = evenly_sampled(
-            image_db, frame.ranges_m, frame.azimuths_rad, bit_m / self.settings.pixels_per_bit
-        )
-        counts = np.clip(np.rint(picture_db * COUNTS_A_DECIBEL), 0, 255).astype(np.int64)
-        found = self._detector(rows_m, columns_rad).run_detection(counts)
-        return [Tag(int(id_), *np.mean(range_azimuth, axis=0).tolist()) for id_, _, range_azimuth in found]
 
     def _detector(self, rows_m: Floats, columns_rad: Floats) -> Any:
         return self._make(
@@ -172,23 +176,11 @@ class AcTagRecogniser:
             quads_random_seed=SEED,
         )
 
-    def _detections(self, stamp_ns: int, tags: list[Tag]) -> LandmarkDetections:
-        settings, n = self.settings, len(tags)
-        covariance = np.diag([settings.range_sigma_m**2, settings.azimuth_sigma_rad**2])
-        return LandmarkDetections(
-            stamps_ns=np.full(n, stamp_ns),
-            range_m=np.array([tag.range_m for tag in tags]),
-            azimuth_rad=np.array([tag.azimuth_rad for tag in tags]),
-            range_azimuth_cov=np.tile(covariance, (n, 1, 1)),
-            candidate_ids=np.array([[tag.id] for tag in tags]),
-            id_probability=np.full((n, 1), settings.probability),
-        )
-
 
 def evenly_sampled(
     image_db: NDArray[np.float32], ranges_m: Floats, azimuths_rad: Floats, pixel_m: float
 ) -> tuple[NDArray[np.float32], Floats, Floats]:
-    """A polar image on equally spaced ranges and azimuths, as long and (in the middle of the window) as wide.
+    """Resample a polar image on equally spaced ranges and azimuths, with square pixels in the middle of the window.
 
     Levels are averaged over as many bins as a pixel covers, and interpolated between beams.
 
@@ -224,12 +216,12 @@ def evenly_sampled(
     return np.asarray(picture, np.float32), rows_m, columns_rad
 
 
-def _actag() -> Callable[..., Any]:
-    """AcTag's class."""
+def _import_actag(module: str, activity: str) -> Any:
+    """A module of AcTag, needed for an activity."""
     try:
-        return import_module("actag").AcTag
+        return import_module(module)
     except ImportError as error:
-        raise CalibrationError(f"recognising AcTags needs the package actag: {INSTALL} ({error})") from error
+        raise CalibrationError(f"{activity} AcTags needs the package actag: {INSTALL} ({error})") from error
 
 
 BITS_ACROSS, PIXELS_A_BIT = 7, 20
@@ -261,10 +253,7 @@ def tag_design(family: str, tag: int, tag_size_m: float) -> LandmarkDesign:
     CalibrationError
         When AcTag is not installed.
     """
-    try:
-        parameters = import_module("actag.tag_parameters")
-    except ImportError as error:
-        raise CalibrationError(f"drawing AcTags needs the package actag: {INSTALL} ({error})") from error
+    parameters = _import_actag("actag.tag_parameters", "drawing")
     levels = np.full((BITS_ACROSS, BITS_ACROSS), PLATE_DB)
     for bit, place in zip(parameters.AcTagParams(family, tag_size_m).tags_in_family[tag], RING, strict=True):
         levels[place] = FOAM_DB if bit else PLATE_DB

@@ -1,18 +1,15 @@
-"""What a candidate looks like: soft scores against the landmark designs, whatever its heading.
+"""Appearance of candidates: correlation of the image around them with every design, at all headings and small shifts.
 
-The image around a candidate is sampled on a square grid of the floor, so that foreshortening and the fan's shape drop
-out; each sample is a mean of decibels over a stretch of range as long as a cell. Every design is a template on the same
-grid (`sonar_graph.sonar.templates`). Patch and template are compared by their correlation c over the cells in view,
-which neither gain nor the floor's level changes, at all small shifts.
-
-A closer look at the candidates that tracks took: which design fits, and where its centre is.
+The image is sampled on a square grid of the floor, where foreshortening and the shape of the fan drop out. Designs are
+templates on the same grid (`sonar_graph.sonar.templates`). The correlation c over the cells in view does not depend on
+gain or on the level of the floor. Derivation: docs/theory/recognition.md.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
@@ -31,25 +28,25 @@ MOST_MULTIPLICATIONS = 250_000
 
 
 class AppearanceParams(Section):
-    """How candidates are compared with designs."""
+    """Settings of the comparison with designs."""
 
     cell_m: float = Field(0.015, gt=0)
     """Distance of the samples on the floor."""
     margin_m: float = Field(0.03, ge=0)
-    """Width of the ring of floor around the largest design that is compared too."""
+    """Width of the compared ring of floor around the largest design."""
     blur_m: float = Field(0.01, gt=0)
     """Standard deviation of the sonar's resolution on the floor."""
     search_m: float = Field(0.045, ge=0)
-    """How far a landmark's centre is sought from the candidate's, along each axis."""
+    """Largest distance of a landmark's centre from the candidate's centroid, along each axis."""
     least_visible: float = Field(0.65, gt=0, le=1)
-    """Share of the cells that must lie in the image where the best of all fits."""
+    """Share of the cells that must lie in the image at the best fit."""
     least_searched: float = Field(0.5, gt=0, le=1)
-    """The same while the best is sought: less, or the rim of the image would push the best fit aside."""
+    """The same during the search: less, or the rim of the image would push the best fit aside."""
 
 
 @dataclass(frozen=True, eq=False)
 class DesignFit:
-    """How well each design fits a patch."""
+    """Fit of each design to a patch."""
 
     correlation: Floats
     """Best over headings and shifts, shape (designs,); -1 where too little is visible."""
@@ -58,18 +55,18 @@ class DesignFit:
     best: int
     """Design with the highest correlation."""
     heading_rad: float
-    """Of that design's x axis against the floor's."""
+    """Heading of that design's x axis against the floor's."""
     centre_m: Floats
     """(x, y) of that design's centre on the floor, between the grid's points, shape (2,)."""
 
 
 class Appearance:
-    """Compares patches with designs.
+    """Comparison of patches with designs.
 
     Parameters
     ----------
     designs
-        What is known.
+        The known landmarks.
     params
         None: the defaults.
     """
@@ -90,11 +87,15 @@ class Appearance:
         self._first_of_design = np.searchsorted(self.templates.design, np.arange(self.designs))
 
     def fit(self, patch: Patch) -> DesignFit:
-        """The designs at their best headings and shifts."""
-        visible = _visible(patch.seen.ravel(), self._cells, self._offsets)
-        at = self._correlations(patch, visible)
+        """Fit of the designs at their best headings and shifts."""
+        seen = windows(patch.seen.ravel(), self._cells, self._offsets)
+        visible = seen.sum(axis=1) / np.float32(len(self._cells))
+        at = self._correlations(patch, seen, visible)
         best_shift, best_template = divmod(int(np.argmax(at)), at.shape[1])
-        offset = self._between_points(at[:, best_template], best_shift)
+        side = 2 * self._steps + 1
+        surface = at[:, best_template].reshape(side, side)
+        x, y = divmod(best_shift, side)
+        offset = np.array([parabola_top(surface[:, y], x), parabola_top(surface[x, :], y)])
         by_design = np.maximum.reduceat(at.max(axis=0), self._first_of_design)
         share = float(visible[best_shift])
         return DesignFit(
@@ -105,68 +106,41 @@ class Appearance:
             patch.centre_m + self.params.cell_m * (self._shifts[best_shift] - self._steps + offset),
         )
 
-    def _correlations(self, patch: Patch, visible: Floats32) -> Floats32:
+    def _correlations(self, patch: Patch, seen: Floats32, visible: Floats32) -> Floats32:
         """Correlation of each shift with each template, shape (shifts, templates); -1 where too little is visible."""
         correlation = np.full((len(visible), self._pictures.shape[1]), -1.0, np.float32)
         shifts = np.flatnonzero(visible >= self.params.least_searched)
         if not len(shifts):
             return correlation
         n = (visible[shifts] * len(self._cells))[:, None]
-        level = _windows(_centred(patch).ravel(), self._cells, self._offsets[shifts])
-        total, square = self._template_sums(patch, visible, shifts)
+        # levels over their mean, 0 where nothing is seen: sums of small numbers are exact enough in 32 bits
+        centred = (patch.level_db - patch.level_db.sum() / max(patch.seen.sum(), 1.0)) * patch.seen
+        level = windows(centred.ravel(), self._cells, self._offsets[shifts])
+        total, square = (np.tile(whole, (len(shifts), 1)) for whole in self._sums)
+        cut = np.flatnonzero(visible[shifts] < 1)
+        if len(cut):
+            in_view = seen[shifts[cut]]
+            total[cut], square[cut] = matmul(in_view, self._pictures), matmul(in_view, self._squares)
         level_sum, level_square = level.sum(axis=1)[:, None], np.einsum("sc,sc->s", level, level)[:, None]
-        covariance = _product(level, self._pictures) - level_sum * total / n
+        covariance = matmul(level, self._pictures) - level_sum * total / n
         scale2 = np.maximum(square - total**2 / n, 0.0) * np.maximum(level_square - level_sum**2 / n, 0.0)
         known = scale2 > 0
         correlation[shifts] = np.where(known, covariance / np.sqrt(np.where(known, scale2, 1.0)), -1.0)
         return correlation
 
-    def _template_sums(self, patch: Patch, visible: Floats32, shifts: Ints) -> tuple[Floats32, Floats32]:
-        """Of the templates and of their squares over the cells that are seen, shape (shifts, templates)."""
-        total, square = (np.tile(whole, (len(shifts), 1)) for whole in self._sums)
-        cut = np.flatnonzero(visible[shifts] < 1)
-        if len(cut):
-            seen = _windows(patch.seen.ravel(), self._cells, self._offsets[shifts[cut]])
-            total[cut], square[cut] = _product(seen, self._pictures), _product(seen, self._squares)
-        return total, square
-
-    def _between_points(self, correlation: Floats32, best: int) -> Floats:
-        """Where a parabola through the neighbours of the best shift has its top, in points, shape (2,)."""
-        side = 2 * self._steps + 1
-        surface = correlation.reshape(side, side)
-        x, y = divmod(best, side)
-        return np.array([_top(surface[:, y], x), _top(surface[x, :], y)])
-
-
-def _centred(patch: Patch) -> Floats32:
-    """Levels over their mean, 0 where nothing is seen: sums of small numbers are exact enough."""
-    return (patch.level_db - patch.level_db.sum() / max(patch.seen.sum(), 1.0)) * patch.seen
-
 
 @compiled
-def _visible(seen: Floats32, cells: Ints, offsets: Ints) -> Floats32:
-    """Share of the cells that a patch holds at each offset, shape (offsets,)."""
-    share = np.empty(len(offsets), np.float32)
-    for n in range(len(offsets)):
-        count = 0
-        for c in range(len(cells)):
-            count += int(seen[cells[c] + offsets[n]])
-        share[n] = count / len(cells)
-    return share
-
-
-@compiled
-def _windows(values: Floats32, cells: Ints, offsets: Ints) -> Floats32:
+def windows(values: Floats32, cells: Ints, offsets: Ints) -> Floats32:
     """Values of a patch in the cells at each offset, shape (offsets, cells)."""
-    windows = np.empty((len(offsets), len(cells)), np.float32)
+    found = np.empty((len(offsets), len(cells)), np.float32)
     for n in range(len(offsets)):
         for c in range(len(cells)):
-            windows[n, c] = values[cells[c] + offsets[n]]
-    return windows
+            found[n, c] = values[cells[c] + offsets[n]]
+    return found
 
 
-def _product(rows: Floats32, columns: Floats32) -> Floats32:
-    """The matrix product, in pieces that BLAS takes on one core: for so little, threads that wait cost far more."""
+def matmul(rows: Floats32, columns: Floats32) -> Floats32:
+    """Matrix product in pieces that BLAS takes on one core: threads that wait cost more than so small a product."""
     step = max(1, MOST_MULTIPLICATIONS // columns.size)
     product = np.empty((len(rows), columns.shape[1]), np.float32)
     for first in range(0, len(rows), step):
@@ -174,8 +148,8 @@ def _product(rows: Floats32, columns: Floats32) -> Floats32:
     return product
 
 
-def _top(values: Floats32, at: int) -> float:
-    """Offset of the top of the parabola through three values around the highest; 0 at an end."""
+def parabola_top(values: Floats32, at: int) -> float:
+    """Offset of the top of the parabola through the highest value and its neighbours; 0 at an end."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = (float(v) for v in values[at - 1 : at + 2])
@@ -184,27 +158,27 @@ def _top(values: Floats32, at: int) -> float:
 
 
 CENTROID_SIGMA_M = 0.04
-"""Of a candidate's own centroid, along and across, where no design fits: a landmark's middle may be elsewhere."""
+"""Standard deviation of a candidate's centroid from the landmark's centre, along and across; used without a fit."""
 SLANT_PLANE = FloorView(np.eye(3), 1e-3)
-"""Where no floor is known, patches lie in the plane of the image."""
+"""Plane of the image, which holds the patches where no floor is known."""
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectSighting:
-    """A track's candidate in one frame, and how the designs fit it."""
+    """Candidate of a track in one frame, and how the designs fit it."""
 
     fit: DesignFit | None
     """None where too little of it is in the image."""
     range_m: float
     azimuth_rad: float
     covariance: Floats
-    """Of both, shape (2, 2)."""
+    """Of range and azimuth, shape (2, 2)."""
     is_fitted: bool = False
-    """Whether range and azimuth are those of a design's centre, not of the candidate's centroid."""
+    """Range and azimuth are those of a design's centre, not of the candidate's centroid."""
 
 
 class CandidateFit:
-    """Compares candidates with the designs.
+    """Comparison of candidates with the designs.
 
     Parameters
     ----------
@@ -220,7 +194,7 @@ class CandidateFit:
         self._appearance, self._confusion = appearance, confusion
         self._aperture_rad = elevation_aperture_rad
         self._grid: PolarGrid | None = None
-        self._shape: tuple[Floats, Floats] | None = None
+        self._shape: tuple[Floats, Floats] = np.empty(0), np.empty(0)
 
     def at(
         self,
@@ -230,45 +204,38 @@ class CandidateFit:
         candidates: Candidates,
         rows: Ints,
     ) -> list[ObjectSighting | None]:
-        """What each track took; None for a row of -1."""
-        grid, floor = self._grid_of(frame), view or SLANT_PLANE
-        return [None if row < 0 else self._one(image_db, grid, floor, candidates, row) for row in rows.tolist()]
+        """Sightings of the candidates in these rows; None for a row of -1."""
+        shape = (frame.ranges_m, frame.azimuths_rad)
+        is_same = (one is other or np.array_equal(one, other) for one, other in zip(self._shape, shape, strict=True))
+        if self._grid is None or not all(is_same):
+            self._grid, self._shape = PolarGrid(*shape, self._aperture_rad), shape
+        view, appearance = view or SLANT_PLANE, self._appearance
+        sightings: list[ObjectSighting | None] = []
+        for row in rows.tolist():
+            if row < 0:
+                sightings.append(None)
+                continue
+            range_m, azimuth_rad = float(candidates.range_m[row]), float(candidates.azimuth_rad[row])
+            centroid_cov = np.diag(np.square([CENTROID_SIGMA_M, CENTROID_SIGMA_M / range_m]))
+            sighting = ObjectSighting(None, range_m, azimuth_rad, centroid_cov)
+            centre = view.floor_point(range_m, azimuth_rad)
+            if centre is not None:
+                side, cell_m = appearance.patch_side, appearance.params.cell_m
+                fit = appearance.fit(self._grid.patch(image_db, view, centre, side, cell_m))
+                best = fit.correlation.max()
+                if best >= self._confusion.threshold:
+                    covariance = self._confusion.range_azimuth_cov(fit.visible)
+                    sighting = ObjectSighting(fit, *view.range_azimuth(fit.centre_m), covariance, is_fitted=True)
+                elif best >= 0:
+                    sighting = replace(sighting, fit=fit)
+            sightings.append(sighting)
+        return sightings
 
     def scores(self, sightings: Sequence[ObjectSighting | None]) -> Floats:
         """Soft scores of the features, shape (M, designs + 1); rows of 0 where nothing was compared."""
-        scores = np.zeros((len(sightings), self._appearance.designs + 1))
+        scores, model = np.zeros((len(sightings), self._appearance.designs + 1)), self._confusion
         for row, sighting in enumerate(sightings):
             if sighting is not None and (fit := sighting.fit) is not None:
-                model = self._confusion
                 found = soft_scores(fit.correlation[None], np.array([fit.visible]), model.sharpness, model.threshold)
                 scores[row] = found[0]
         return scores
-
-    def _grid_of(self, frame: SonarFrames) -> PolarGrid:
-        """The lookup of the frame's beams and bins, made once for all frames that share them."""
-        shape = (frame.ranges_m, frame.azimuths_rad)
-        if self._grid is None or self._shape is None or not all(map(_is_same, self._shape, shape)):
-            self._grid, self._shape = PolarGrid(*shape, self._aperture_rad), shape
-        return self._grid
-
-    def _one(
-        self, image_db: Floats32, grid: PolarGrid, view: FloorView, candidates: Candidates, row: int
-    ) -> ObjectSighting:
-        range_m, azimuth_rad = float(candidates.range_m[row]), float(candidates.azimuth_rad[row])
-        loose = np.square([CENTROID_SIGMA_M, CENTROID_SIGMA_M / range_m])
-        unfitted = ObjectSighting(None, range_m, azimuth_rad, np.diag(loose))
-        centre = view.floor_point(range_m, azimuth_rad)
-        if centre is None:
-            return unfitted
-        appearance = self._appearance
-        fit = appearance.fit(grid.patch(image_db, view, centre, appearance.patch_side, appearance.params.cell_m))
-        if fit.correlation.max() < 0:
-            return unfitted
-        if fit.correlation.max() < self._confusion.threshold:
-            return ObjectSighting(fit, range_m, azimuth_rad, unfitted.covariance)
-        covariance = self._confusion.range_azimuth_cov(fit.visible)
-        return ObjectSighting(fit, *view.range_azimuth(fit.centre_m), covariance, is_fitted=True)
-
-
-def _is_same(one: Floats, other: Floats) -> bool:
-    return one is other or np.array_equal(one, other)

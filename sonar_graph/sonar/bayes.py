@@ -1,43 +1,41 @@
-"""Which landmark a track is: beliefs over identities, carried from frame to frame.
+"""Recursive Bayesian estimate of landmark identities, one belief per track.
 
-K classes: the known landmarks in the order of their designs, and last "none of them". J features, what one frame can
-look like: the same landmarks, and last "none of the above". The confusion matrix ``C[k, j] = p(z = j | x = k)`` has
-rows that sum to 1. A frame gives soft scores ``s`` over the features, which sum to 1.
-
-Equation numbers are those of "Experimental Results of Real-time Sonar-based Underwater Localization Using Landmarks",
-2014, section II-B::
+K classes: the known landmarks in the order of their designs, last "none of them". J features that one frame can show:
+the same landmarks, last "none of the above". Confusion matrix ``C[k, j] = p(z = j | x = k)``, soft scores s over the
+features, association A of the tracks now with those before. Equation numbers of the 2014 paper, section II-B::
 
     (1)   b'[m] = ( sum_j A[m, j] b[j]  +  A[m, new] birth ) T        T = (1 - e) I + e 1 birth^T
     (2)   p[m, k | j] = C[k, j] b'[m, k] / sum_i C[i, j] b'[m, i]
     (3)   b[m, k] = sum_j p[m, k | j] s[m, j]
 
-(2) and (3) together are Jeffrey's rule: `jeffrey`. `virtual_evidence` is ours, Pearl's rule with a temper::
+(2) and (3) are Jeffrey's rule: `jeffrey`. Ours is tempered virtual evidence (Pearl's rule): `virtual_evidence`,
 
     b[m, k]  ~  b'[m, k] ( sum_j C[k, j] s[m, j] / base[j] )^weight[m]
 
-where ``base`` is the share of each feature in the scorer's own prior and 0 <= weight <= 1 says how much of the frame is
-news (`news_of_motion`). Both agree for one-hot scores, and on a first frame from a uniform prior under a uniform base.
-How they differ is in docs/theory/recognition.md.
-
-Sources: R. Jeffrey, "The Logic of Decision", 1965; H. Chan and A. Darwiche, "On the revision of probabilistic beliefs
-using uncertain evidence", Artificial Intelligence 163, 2005.
+with base the share of each feature in the prior of the scores, and 0 <= weight <= 1 the independent share of the frame
+(`news_of_motion`). Comparison of both rules, and sources: docs/theory/recognition.md.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
+from sonar_graph.calibration import Section
 from sonar_graph.measurements import Floats
+from sonar_graph.sonar.confusion import Confusion
+from sonar_graph.sonar.track_filter import Association
 
 Rule = Literal["virtual-evidence", "jeffrey"]
 LEAST_PROBABILITY = 1e-12
-"""Beliefs never reach 0, from which no evidence leads back."""
+"""Floor of beliefs: from 0 no evidence leads back."""
 
 
 def predict(beliefs: Floats, association: Floats, birth: Floats, forgetting: Floats | float = 1e-3) -> Floats:
-    """Equation (1): beliefs of the tracks now, before the frame is looked at.
+    """Predict beliefs by equation (1).
 
     Parameters
     ----------
@@ -62,10 +60,10 @@ def predict(beliefs: Floats, association: Floats, birth: Floats, forgetting: Flo
 
 
 def jeffrey(predicted: Floats, scores: Floats, confusion: Floats) -> Floats:
-    """Equations (2) and (3), as printed.
+    """Update beliefs by equations (2) and (3), as printed.
 
-    Where a feature is impossible under the prediction, ``sum_k C[k, j] b'[k] = 0``, it says nothing: its part of the
-    prediction is kept. A row of scores that are all 0 is a missing measurement: the prediction is kept.
+    A feature that is impossible under the prediction, ``sum_k C[k, j] b'[k] = 0``, keeps its part of the prediction.
+    A row of zero scores is a missing measurement and keeps the prediction.
 
     Parameters
     ----------
@@ -90,18 +88,18 @@ def jeffrey(predicted: Floats, scores: Floats, confusion: Floats) -> Floats:
 
 
 def virtual_evidence(predicted: Floats, scores: Floats, confusion: Floats, base: Floats, weights: Floats) -> Floats:
-    """Tempered virtual evidence: each frame multiplies the odds, by as much as it is news.
+    """Update beliefs by tempered virtual evidence: each frame multiplies the odds.
 
-    A row of scores that are all 0 is a missing measurement, as is a weight of 0: the prediction is kept.
+    A row of zero scores, or a weight of 0, is a missing measurement and keeps the prediction.
 
     Parameters
     ----------
     predicted, scores, confusion
         As in `jeffrey`.
     base
-        Share of each feature in the scores' own prior, shape (J,).
+        Share of each feature in the prior of the scores, shape (J,).
     weights
-        How much of each frame is news, from 0 to 1, shape (M,).
+        Independent share of each frame, from 0 to 1, shape (M,).
 
     Returns
     -------
@@ -116,18 +114,11 @@ def virtual_evidence(predicted: Floats, scores: Floats, confusion: Floats, base:
     return np.where(measured, odds / odds.sum(axis=1, keepdims=True), predicted)
 
 
-def update(rule: Rule, predicted: Floats, scores: Floats, confusion: Floats, base: Floats, weights: Floats) -> Floats:
-    """Beliefs after a frame by the rule of that name; the paper's knows neither base nor weights."""
-    if rule == "jeffrey":
-        return jeffrey(predicted, scores, confusion)
-    return virtual_evidence(predicted, scores, confusion, base, weights)
-
-
 def news_of_motion(moved_m: Floats, aperture_m: float) -> Floats:
-    """Share of a frame that is news after the sonar moved across its line of sight, shape as given.
+    """Independent share of a frame after motion across the line of sight, shape as given.
 
-    It is ``1 - rho^2``, what is left of the intensity of speckle after its correlation with the frame before. A lens of
-    aperture D that both sends and receives has the autocorrelation of a triangle::
+    ``1 - rho^2`` with rho the correlation of speckle with the frame before. A lens of aperture D that both sends and
+    receives has the autocorrelation of a triangle::
 
         rho = 1 - 1.5 u^2 + 0.75 u^3    u <= 1
               0.25 (2 - u)^3            1 < u <= 2          u = 2 moved / D
@@ -144,3 +135,103 @@ def news_of_motion(moved_m: Floats, aperture_m: float) -> Floats:
     u = np.minimum(2.0 * np.abs(moved_m) / aperture_m, 2.0)
     rho = np.where(u <= 1, 1 - 1.5 * u**2 + 0.75 * u**3, 0.25 * (2 - u) ** 3)
     return np.asarray(1.0 - rho**2)
+
+
+class IdentityParams(Section):
+    """Settings of the identity estimate."""
+
+    rule: Rule = "virtual-evidence"
+    """virtual-evidence: ours; jeffrey: the 2014 paper's equations as printed, every frame counting in full."""
+    unknown_prior: float = Field(0.5, gt=0, lt=1)
+    """Belief in "none of them" about a new track."""
+    forgetting: float = Field(1e-4, ge=0, lt=1)
+    """Share of a belief that returns to that of a new track, per independent frame."""
+    temper: float = Field(1.0, gt=0, le=1)
+    """Weight of an independent frame; below 1 where the appearance is less certain than was measured."""
+    least_news: float = Field(0.1, ge=0, lt=1)
+    """Frames with a smaller independent share are left out; motion adds up until the next one counts."""
+    aperture_m: float = Field(0.14, gt=0)
+    """Aperture of the sonar's lens; it sets how soon speckle changes."""
+    ahead_ratio: float = Field(2.0, ge=1)
+    """Motion ahead or up that changes speckle as much as a unit of motion to the side. Chosen on simulated basins of
+    seeds 1001 to 1003, not derived."""
+    most_looks: int = Field(64, ge=1)
+    """Sonar positions remembered for each track."""
+
+
+class Beliefs:
+    """Beliefs over the landmarks and "none of them", by track.
+
+    A frame counts only as far as the sonar moved since it last looked at the track from there: speckle belongs to the
+    floor and comes back when the sonar comes back.
+
+    Parameters
+    ----------
+    confusion
+        The measured model.
+    params
+        None: the defaults.
+    """
+
+    def __init__(self, confusion: Confusion, params: IdentityParams | None = None) -> None:
+        self.params = params or IdentityParams()
+        self._matrix, self._base = confusion.array(), confusion.base()
+        known = len(confusion.ids)
+        self._birth = np.append(np.full(known, (1 - self.params.unknown_prior) / known), self.params.unknown_prior)
+        self._order: list[int] = []
+        self._beliefs: Floats = np.empty((0, known + 1))
+        self._looks: dict[int, list[Floats]] = {}
+
+    def step(
+        self, association: Association, scores: Floats, places: Sequence[Floats | None], sideways: Floats
+    ) -> Floats:
+        """Predict and update for one frame, equations (1) to (3).
+
+        Parameters
+        ----------
+        association
+            Of the tracks before and after it.
+        scores
+            Of each track after it, shape (M, features); rows of 0 where there is no measurement.
+        places
+            The sonar's position in a fixed frame for each track that was looked at, shape (3,); None: not looked at.
+        sideways
+            Horizontal unit vector across each track's line of sight in the same frame, shape (M, 3).
+
+        Returns
+        -------
+        Floats
+            Beliefs after the frame, shape (M, classes).
+        """
+        rows = [self._order.index(track) for track in association.previous_ids.tolist()]
+        self._order = association.track_ids.tolist()
+        weights = np.array([self._weight(*look) for look in zip(self._order, places, sideways, strict=True)])
+        forgetting = self.params.forgetting * weights[:, None]
+        predicted = predict(self._beliefs[rows], association.matrix, self._birth, forgetting)
+        scores = np.where(weights[:, None] > 0, scores, 0.0)
+        if self.params.rule == "jeffrey":
+            self._beliefs = jeffrey(predicted, scores, self._matrix)
+        else:
+            self._beliefs = virtual_evidence(predicted, scores, self._matrix, self._base, weights)
+        self._looks = {track: looks for track, looks in self._looks.items() if track in self._order}
+        return self._beliefs
+
+    def _weight(self, track: int, place: Floats | None, sideways: Floats) -> float:
+        """Independent share of a look, times the temper; 0: left out. Remembers the place of one that counts."""
+        if place is None:
+            return 0.0
+        if self.params.rule == "jeffrey":
+            return 1.0
+        looks = self._looks.setdefault(track, [])
+        news = 1.0
+        if looks:
+            moved = place - np.array(looks)
+            aside = moved @ sideways
+            ahead = np.sqrt(np.maximum(np.sum(moved**2, axis=1) - aside**2, 0.0))
+            nearest = np.hypot(aside, ahead / self.params.ahead_ratio).min()
+            news = float(news_of_motion(nearest, self.params.aperture_m))
+        if news < self.params.least_news:
+            return 0.0
+        looks.append(place)
+        del looks[: -self.params.most_looks]
+        return self.params.temper * news

@@ -1,8 +1,8 @@
-"""Frames that must not be used: found before anything is made of them, each with its reason.
+"""Check of sonar frames before they are used; a refused frame has a reason.
 
-A sonar's window (number of beams and bins, where they lie) may change while it works: an operator turns a knob, or a
-sonar alternates between two modes. A damaged header looks the same, once. So the first frame of a window that was never
-there before is not used, and every later one is.
+The window of a sonar (number and place of beams and bins) may change while it works: an operator sets another range, or
+the sonar alternates between two modes. A damaged header looks the same, once. So the first frame of a new window is not
+used, and every later one is.
 """
 
 from __future__ import annotations
@@ -17,31 +17,46 @@ from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Floats, SonarFrames
 
 SATURATED_SHARE = 0.5
-"""Of the samples that are the largest in a frame, from which on it shows nothing."""
+"""Share of samples at the largest value from which on a frame is saturated."""
 SAME_PLACE = 0.5
-"""Windows are one when no bin and no beam lies farther off than this share of the distance between two."""
+"""Largest offset of bins and beams of one window, as a share of the distance between two."""
 LEAST_BEAMS, LEAST_BINS = 8, 32
 """Smaller images show no landmark."""
 MOST_WINDOWS = 64
-"""So many are remembered."""
+"""Windows remembered."""
 
 
 class RangeWindow(NamedTuple):
-    """Where the samples of a frame lie."""
+    """Ranges and azimuths of the samples of a frame."""
 
     ranges_m: Floats
     azimuths_rad: Floats
 
     def shares_arrays(self, other: RangeWindow | None) -> bool:
-        """Whether both are of one block of frames."""
+        """True for windows of one block of frames."""
         return other is not None and all(own is others for own, others in zip(self, other, strict=True))
 
     def is_like(self, other: RangeWindow) -> bool:
-        """Whether bins and beams are the same, but for what a driver computes anew for every ping."""
+        """True for the same bins and beams, up to what a driver computes anew for every ping."""
         return self.shares_arrays(other) or all(
-            len(own) == len(others) and bool(np.abs(own - others).max() <= SAME_PLACE * _step(own))
+            len(own) == len(others)
+            and bool(np.abs(own - others).max() <= SAME_PLACE * (abs(float(own[-1] - own[0])) / (len(own) - 1)))
             for own, others in zip(self, other, strict=True)
         )
+
+    def fault(self) -> str | None:
+        """Reason not to use frames with these ranges and azimuths."""
+        ranges_m, azimuths_rad = self
+        if len(azimuths_rad) < LEAST_BEAMS or len(ranges_m) < LEAST_BINS:
+            size = f"{len(azimuths_rad)} x {len(ranges_m)}"
+            return f"wrong size: {size}, expected at least {LEAST_BEAMS} beams and {LEAST_BINS} bins"
+        if not (np.isfinite(ranges_m).all() and np.isfinite(azimuths_rad).all()):
+            return "ranges or azimuths that are not finite"
+        steps_m, steps_rad = np.diff(ranges_m), np.diff(azimuths_rad)
+        is_even = np.abs(steps_m - steps_m.mean()).max() <= SAME_PLACE * abs(steps_m.mean())
+        if ranges_m[0] < 0 or not steps_m.mean() > 0 or not is_even:
+            return "ranges that do not increase evenly from the sonar on"
+        return None if (steps_rad > 0).all() or (steps_rad < 0).all() else "azimuths that do not go one way"
 
     def __str__(self) -> str:
         size = f"{len(self.azimuths_rad)} x {len(self.ranges_m)}"
@@ -62,12 +77,12 @@ def check_block(frame: SonarFrames) -> None:
 
 
 class FrameCheck:
-    """Compares each frame with the good one before it.
+    """Comparison of each frame with the good one before it.
 
     Parameters
     ----------
     image
-        What samples mean; those that it does not allow are faults. None: decibels in bytes.
+        Scale of the samples; None: decibels in bytes.
     """
 
     def __init__(self, image: SonarImage | None = None) -> None:
@@ -77,40 +92,30 @@ class FrameCheck:
         self._window: RangeWindow | None = None
         self._seen: list[RangeWindow] = []
         self.change: str | None = None
-        """How the window of the frame last found good differs from that of the one before."""
+        """Change of window at the last good frame."""
 
     def fault(self, frame: SonarFrames) -> str | None:
-        """Why a frame (a block of one) must not be used; None for a good one, with which later ones are compared."""
+        """Reason not to use a frame (a block of one); None for a good one, with which later ones are compared."""
         stamp_ns, image = int(frame.stamps_ns[0]), frame.intensity[0]
         window = RangeWindow(frame.ranges_m, frame.azimuths_rad)
-        reason = (
-            self._fault_of_stamp(stamp_ns)
-            or (None if window.shares_arrays(self._window) else _fault_of_places(window))
-            or self._fault_of_samples(image)
-            or self._fault_of_window(window)
-        )
         self.change = None
-        if reason is None:
-            if self._window is not None and not window.is_like(self._window):
-                self.change = f"window changed: {window}; tracks that lie in it go on"
-            self._stamp_ns, self._image, self._window = stamp_ns, image, window
-        return reason
-
-    def _fault_of_stamp(self, stamp_ns: int) -> str | None:
-        if self._stamp_ns is None or stamp_ns > self._stamp_ns:
-            return None
-        return "duplicated: same stamp as the frame before" if stamp_ns == self._stamp_ns else "out of order"
-
-    def _fault_of_window(self, window: RangeWindow) -> str | None:
-        """A window counts from its second frame on; the first of all is taken as it is."""
-        if self._window is not None and window.is_like(self._window):
-            return None
-        if any(window.is_like(seen) for seen in self._seen):
-            return None
-        self._seen = [*self._seen[-MOST_WINDOWS + 1 :], window]
-        return None if len(self._seen) == 1 else f"wrong size or window: {window}; used if it comes again"
+        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
+            return "duplicated: same stamp as the frame before" if stamp_ns == self._stamp_ns else "out of order"
+        reason = (None if window.shares_arrays(self._window) else window.fault()) or self._fault_of_samples(image)
+        if reason is not None:
+            return reason
+        is_change = self._window is not None and not window.is_like(self._window)
+        if (self._window is None or is_change) and not any(window.is_like(seen) for seen in self._seen):
+            self._seen = [*self._seen[-MOST_WINDOWS + 1 :], window]
+            if len(self._seen) > 1:  # a window counts from its second frame on; the first of all is taken as it is
+                return f"wrong size or window: {window}; used if it comes again"
+        if is_change:
+            self.change = f"window changed: {window}; tracks that lie in it go on"
+        self._stamp_ns, self._image, self._window = stamp_ns, image, window
+        return None
 
     def _fault_of_samples(self, image: NDArray[np.generic]) -> str | None:
+        """Reason not to use these samples."""
         low, high = image.min(), image.max()
         if np.issubdtype(image.dtype, np.floating) and not max(abs(low), abs(high)) < np.finfo(np.float32).max:
             return "samples that are not finite"
@@ -126,22 +131,3 @@ class FrameCheck:
         if self._image is not None and np.array_equal(image, self._image):
             return "duplicated: same samples as the frame before"
         return None
-
-
-def _fault_of_places(window: RangeWindow) -> str | None:
-    """What is wrong with ranges and azimuths themselves."""
-    ranges_m, azimuths_rad = window
-    if len(azimuths_rad) < LEAST_BEAMS or len(ranges_m) < LEAST_BINS:
-        size = f"{len(azimuths_rad)} x {len(ranges_m)}"
-        return f"wrong size: {size}, expected at least {LEAST_BEAMS} beams and {LEAST_BINS} bins"
-    if not (np.isfinite(ranges_m).all() and np.isfinite(azimuths_rad).all()):
-        return "ranges or azimuths that are not finite"
-    steps_m, steps_rad = np.diff(ranges_m), np.diff(azimuths_rad)
-    is_even = np.abs(steps_m - steps_m.mean()).max() <= SAME_PLACE * abs(steps_m.mean())
-    if ranges_m[0] < 0 or not steps_m.mean() > 0 or not is_even:
-        return "ranges that do not increase evenly from the sonar on"
-    return None if (steps_rad > 0).all() or (steps_rad < 0).all() else "azimuths that do not go one way"
-
-
-def _step(places: Floats) -> float:
-    return abs(float(places[-1] - places[0])) / (len(places) - 1)

@@ -1,16 +1,12 @@
-"""Ranges and azimuths as points, on a floor or with an unknown elevation.
+"""Geometry of an imaging sonar: range and azimuth to points, on a level floor or with unknown elevation.
 
 A point q of the sonar frame (x along the centre beam, y left, z up) has
 
     range r = |q|,    azimuth a = atan2(q_y, q_x),    elevation e = asin(q_z / r),
     q = r (cos e cos a, cos e sin a, sin e).
 
-The image gives r and a; e is only known to lie in the aperture. On a level floor, height h below the sonar, it follows:
-with (u1, u2, u3) the upward direction in the sonar frame, u . q = -h, that is
-
-    (u1 cos a + u2 sin a) cos e + u3 sin e = -h / r,
-
-of whose two solutions the one nearer to the centre beam counts. A beam is a plane of constant azimuth here.
+The image gives r and a; e is only known to lie in the aperture. On a level floor at height h below the sonar, with u
+the upward direction in the sonar frame, ``u . q = -h`` gives e; of two solutions the one nearer to the centre beam.
 """
 
 from __future__ import annotations
@@ -59,29 +55,29 @@ class FloorView:
 
     @classmethod
     def from_angles(cls, height_m: float, roll_rad: float, pitch_rad: float) -> FloorView:
-        """From the sonar's own roll and pitch; a positive pitch turns the centre beam down."""
+        """View of a sonar with this roll and pitch; a positive pitch turns the centre beam down."""
         return cls(gtsam.Rot3.RzRyRx(roll_rad, pitch_rad, 0.0).matrix(), height_m)
 
     @classmethod
     def from_pose(cls, world_T_sonar: gtsam.Pose3, floor_z_m: float) -> FloorView:
-        """From the sonar's pose in a world with z up; the heading drops out."""
+        """View of a sonar at this pose in a world with z up; the heading drops out."""
         rotation = world_T_sonar.rotation()
         forward = rotation.matrix()[:, 0]
         heading = gtsam.Rot3.Rz(math.atan2(forward[1], forward[0]))
         return cls((heading.inverse() * rotation).matrix(), float(world_T_sonar.translation()[2]) - floor_z_m)
 
     def floor_points(self, ranges_m: Floats, azimuths_rad: Floats) -> Floats:
-        """Sonar-frame points where rays meet the floor, shape (n, 3); NaN where they do not."""
+        """Points in the sonar frame where rays meet the floor, shape (n, 3); NaN where they do not."""
         elevations = floor_elevations(ranges_m, azimuths_rad, self.level_R_sonar[2], self.height_m)
         return points(ranges_m, azimuths_rad, elevations)
 
     def floor_point(self, range_m: float, azimuth_rad: float) -> Floats | None:
-        """Level (x, y) of what is seen there, shape (2,); None where the ray does not reach the floor."""
+        """Level (x, y) of the floor point at a range and azimuth, shape (2,); None where the ray does not reach it."""
         q = self.floor_points(np.array([range_m]), np.array([azimuth_rad]))[0]
         return None if np.isnan(q[0]) else np.asarray(self.level_R_sonar @ q)[:2]
 
     def range_azimuth(self, xy_m: Floats) -> tuple[float, float]:
-        """Where a floor point, level (x, y) of shape (2,), is seen."""
+        """Range and azimuth of a floor point, level (x, y) of shape (2,)."""
         q = self.level_R_sonar.T @ np.array([xy_m[0], xy_m[1], -self.height_m])
         return float(np.linalg.norm(q)), math.atan2(q[1], q[0])
 
@@ -102,10 +98,7 @@ class FloorView:
 
 @dataclass(frozen=True, eq=False)
 class Fan:
-    """Where each pixel of a picture lies in a polar image: range up, azimuth positive to the left.
-
-    For display only: nearest beam and bin, nothing is measured in such a picture.
-    """
+    """Nearest beam and bin of each pixel of a picture, range up, azimuth to the left; for display only."""
 
     beam: NDArray[np.int32]
     """Shape (height, width); -1 outside of the fan."""
@@ -141,7 +134,7 @@ class Fan:
 
 
 def with_lens(frames: SonarFrames, lens: str) -> SonarFrames:
-    """The frames with beams that point where the lens of that name makes them point, as-logged: as they are.
+    """Frames with the azimuths of a lens table; as-logged: unchanged.
 
     Raises
     ------
@@ -156,7 +149,7 @@ def with_lens(frames: SonarFrames, lens: str) -> SonarFrames:
 
 @lru_cache(maxsize=8)
 def lens_azimuths(lens: str, beams: int, is_rightmost_first: bool = True) -> Floats:
-    """Azimuths of a lens' beams, positive to the left, shape (beams,).
+    """Azimuths of the beams of a lens, shape (beams,).
 
     Raises
     ------
@@ -182,7 +175,7 @@ def points(ranges_m: Floats, azimuths_rad: Floats, elevations_rad: Floats | floa
 
 
 def ranges_azimuths_elevations(points_m: Floats) -> tuple[Floats, Floats, Floats]:
-    """Of points in the sonar frame, shape (n, 3); each of shape (n,)."""
+    """Range, azimuth and elevation, each of shape (n,), of points in the sonar frame, shape (n, 3)."""
     x, y, z = np.moveaxis(np.asarray(points_m, dtype=np.float64), -1, 0)
     level = np.hypot(x, y)
     return np.hypot(level, z), np.arctan2(y, x), np.arctan2(z, level)

@@ -1,10 +1,9 @@
-"""From sonar frames to recognised landmarks: candidates, tracks, appearance, beliefs, one frame after another.
+"""Recogniser of landmarks in sonar frames.
 
-    frame -> decibels -> candidates -> tracks -> how well each design fits -> beliefs -> detections
+    frame -> decibels -> candidates (cfar) -> tracks (tracker) -> fits of designs (appearance) -> beliefs (bayes)
 
-The steps are those of the 2014 paper: candidate selection (`sonar_graph.sonar.cfar`), elimination of noisy data
-(`sonar_graph.sonar.tracker`), Bayesian feature estimation (`sonar_graph.sonar.bayes`). Nothing that is seen
-disappears without a row that says why.
+The steps are those of the 2014 paper: candidate selection, elimination of noisy data, Bayesian feature estimation.
+Every candidate, track and unused frame has a row in `Recogniser.fates` that says why.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from sonar_graph.calibration import Calibration, Section
 from sonar_graph.devices import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, SonarFrames
 from sonar_graph.sonar.appearance import Appearance, AppearanceParams, CandidateFit, ObjectSighting
-from sonar_graph.sonar.beliefs import Beliefs, IdentityParams
+from sonar_graph.sonar.bayes import Beliefs, IdentityParams
 from sonar_graph.sonar.cfar import DetectionParams, check_candidates, select_candidates
 from sonar_graph.sonar.confusion import Confusion, confusion_for
 from sonar_graph.sonar.frame_check import FrameCheck, check_block
@@ -32,14 +31,14 @@ from sonar_graph.sonar.tracker import Tracker, TrackingParams
 
 
 class RecogniserParams(Section):
-    """All settings of the recogniser."""
+    """Settings of the recogniser."""
 
     detection: DetectionParams = DetectionParams()
     tracking: TrackingParams = TrackingParams()
     appearance: AppearanceParams = AppearanceParams()
     identity: IdentityParams = IdentityParams()
     confusion: Confusion | None = None
-    """The measured model; None: the one that ships, for the designs that ship, and an assumed one for others."""
+    """Measured model; None: the one that ships for the designs that ship, and an assumed one for others."""
     least_existence: float = Field(0.5, ge=0, le=1)
     """Tracks that exist less probably are not reported."""
     least_frames: int = Field(3, ge=1)
@@ -47,16 +46,16 @@ class RecogniserParams(Section):
 
 
 class Fate(NamedTuple):
-    """What became of one candidate, one track, or a whole frame."""
+    """Outcome of one candidate, one track, or a whole frame."""
 
     stamp_ns: int
     track: int
-    """-1: of no track."""
+    """-1: no track."""
     range_m: float
     azimuth_rad: float
     """NaN for a frame."""
     outcome: str
-    """In words; `REPORTED` for a detection."""
+    """Words; `REPORTED` for a detection."""
 
 
 REPORTED = "reported"
@@ -64,12 +63,12 @@ REJECTED = {int(v): f"candidate rejected: {v.name.lower().replace('_', ' ')}" fo
 
 
 class Recogniser:
-    """Recognises landmarks in the frames of one sonar, taken one after another.
+    """Recogniser of landmarks in the frames of one sonar, in order.
 
     Parameters
     ----------
     calibration
-        Of the sonar: its mounting, aperture and scale of samples.
+        Aperture and scale of samples of the sonar.
     designs
         The landmarks that may be there; None: those that ship.
     params
@@ -78,7 +77,7 @@ class Recogniser:
     Raises
     ------
     CalibrationError
-        When the measured model is of other landmarks, or a design can never be found.
+        When the model was measured on other designs, or a design can never be found.
     """
 
     def __init__(
@@ -104,33 +103,33 @@ class Recogniser:
         self._check = FrameCheck(calibration.sonar.image)
         self._start_T_sonar = gtsam.Pose3()
         self.fates: list[Fate] = []
-        """What became of everything in the frame last processed."""
+        """Outcome of every candidate, track and fault in the last frame."""
         self.stamp_ns: int | None = None
-        """Of the frame last processed."""
+        """Stamp of the last frame."""
         self.sightings: list[ObjectSighting | None] = []
-        """How the designs fitted each track of that frame; None where it had no candidate."""
+        """Fit of the designs to each track of the last frame; None for a track without a candidate."""
         self.track_ids: Ints = np.empty(0, dtype=np.int64)
-        """Numbers of those tracks."""
+        """Numbers of these tracks."""
 
     def process(
         self, frame: SonarFrames, motion: SonarStep | None = None, view: FloorView | None = None
     ) -> LandmarkDetections | None:
-        """Take in one frame; what is recognised in it.
+        """Detections in one frame: cfar, tracker, appearance, bayes.
 
         Parameters
         ----------
         frame
             A block of one frame.
         motion
-            Of the sonar since the frame before; None for the first.
+            Motion of the sonar since the frame before; None for the first.
         view
-            Where the sonar is over the floor; None: not known, and patches are compared in the image's plane.
+            Tilt and height over the floor; None: not known, and patches are compared in the image's plane.
 
         Returns
         -------
         LandmarkDetections | None
-            One row a track that is seen now and trusted, with the posterior over all landmarks. None where there is
-            none, and for a frame that must not be used; `fates` says why.
+            One row for each track that is seen now and trusted, with the posterior over all landmarks. None without
+            such a track and for a frame that must not be used; `fates` says why.
 
         Raises
         ------
@@ -152,44 +151,41 @@ class Recogniser:
         self.track_ids = association.track_ids
         self.sightings = self._look.at(image_db, frame, view, candidates, association.candidate)
         scores = self._look.scores(self.sightings)
-        beliefs = self._beliefs.step(association, scores, self._places(), self._sideways(association))
-        found = self._report(stamp_ns, candidates, association, beliefs)
+        place = self._start_T_sonar.translation()
+        places = [None if sighting is None or sighting.fit is None else place for sighting in self.sightings]
+        azimuth = np.arctan2(association.position_m[:, 1], association.position_m[:, 0])
+        across = np.column_stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)])
+        sideways = np.asarray(across @ self._start_T_sonar.rotation().matrix().T)
+        beliefs = self._beliefs.step(association, scores, places, sideways)
+        found = self._report(candidates, association, beliefs)
         if self._check.change is not None:
             self.fates.append(Fate(stamp_ns, -1, np.nan, np.nan, self._check.change))
         return found
 
-    def notes(self) -> dict[str, str]:
-        """How detections come about, for a log's notes."""
-        return {
-            "detections.rule": self.params.identity.rule,
-            "detections.designs": ", ".join(f"{design.id}: {design.name}" for design in self.designs),
-            "detections.model": "; ".join(f"{k}: {v}" for k, v in self.confusion.provenance.items()) or "not said",
-        }
-
-    def _places(self) -> list[Floats | None]:
-        """Where the sonar is, for each track that could be compared with the designs."""
-        place = self._start_T_sonar.translation()
-        return [None if sighting is None or sighting.fit is None else place for sighting in self.sightings]
-
-    def _sideways(self, association: Association) -> Floats:
-        """Horizontal axis across each track's line of sight, in the frame of the places, shape (M, 3)."""
-        azimuth = np.arctan2(association.position_m[:, 1], association.position_m[:, 0])
-        across = np.column_stack([-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)])
-        return np.asarray(across @ self._start_T_sonar.rotation().matrix().T)
-
-    def _report(
-        self, stamp_ns: int, candidates: Candidates, association: Association, beliefs: Floats
-    ) -> LandmarkDetections | None:
-        """The rows of the frame, and what became of all the rest."""
-        self.fates = _fates_of_candidates(stamp_ns, candidates)
+    def _report(self, candidates: Candidates, association: Association, beliefs: Floats) -> LandmarkDetections | None:
+        """Rows for the tracks that are seen and trusted; fates of all candidates and tracks."""
+        stamp_ns, params = association.stamp_ns, self.params
+        columns = candidates.verdicts.tolist(), candidates.range_m.tolist(), candidates.azimuth_rad.tolist()
+        self.fates = [
+            Fate(stamp_ns, -1, range_m, azimuth_rad, REJECTED[verdict])
+            for verdict, range_m, azimuth_rad in zip(*columns, strict=True)
+            if verdict != CandidateVerdict.ACCEPTED
+        ]
         reported = []
         for row, sighting in enumerate(self.sightings):
-            if sighting is not None:
-                outcome = self._outcome(association, row, sighting)
-                track = int(association.track_ids[row])
-                self.fates.append(Fate(stamp_ns, track, sighting.range_m, sighting.azimuth_rad, outcome))
-                if outcome == REPORTED:
-                    reported.append((row, sighting))
+            if sighting is None:
+                continue
+            outcome = REPORTED
+            if sighting.fit is None:
+                outcome = "not reported: too little of it is in view"
+            elif association.frames_seen[row] < params.least_frames:
+                outcome = f"not reported: seen in fewer than {params.least_frames} frames"
+            elif association.existence[row] < params.least_existence:
+                outcome = f"not reported: exists with less than {params.least_existence:g}"
+            else:
+                reported.append((row, sighting))
+            track = int(association.track_ids[row])
+            self.fates.append(Fate(stamp_ns, track, sighting.range_m, sighting.azimuth_rad, outcome))
         self.fates += [
             Fate(stamp_ns, track, np.nan, np.nan, f"track ended: {reason}")
             for track, reason in zip(association.ended_ids.tolist(), association.ended_reasons, strict=True)
@@ -207,14 +203,13 @@ class Recogniser:
             track=association.track_ids[rows],
         )
 
-    def _outcome(self, association: Association, row: int, sighting: ObjectSighting) -> str:
-        if sighting.fit is None:
-            return "not reported: too little of it is in view"
-        if association.frames_seen[row] < self.params.least_frames:
-            return f"not reported: seen in fewer than {self.params.least_frames} frames"
-        if association.existence[row] < self.params.least_existence:
-            return f"not reported: exists with less than {self.params.least_existence:g}"
-        return REPORTED
+    def notes(self) -> dict[str, str]:
+        """Rule, designs and model, for the notes of a log."""
+        return {
+            "detections.rule": self.params.identity.rule,
+            "detections.designs": ", ".join(f"{design.id}: {design.name}" for design in self.designs),
+            "detections.model": "; ".join(f"{k}: {v}" for k, v in self.confusion.provenance.items()) or "not said",
+        }
 
 
 def each_once(beliefs: Floats) -> Floats:
@@ -236,13 +231,3 @@ def each_once(beliefs: Floats) -> Floats:
             result[track, known] += result[track, landmark]
             result[track, landmark] = 0.0
     return result
-
-
-def _fates_of_candidates(stamp_ns: int, candidates: Candidates) -> list[Fate]:
-    """Those that were rejected before they came to a track."""
-    columns = candidates.verdicts.tolist(), candidates.range_m.tolist(), candidates.azimuth_rad.tolist()
-    return [
-        Fate(stamp_ns, -1, range_m, azimuth_rad, REJECTED[verdict])
-        for verdict, range_m, azimuth_rad in zip(*columns, strict=True)
-        if verdict != CandidateVerdict.ACCEPTED
-    ]

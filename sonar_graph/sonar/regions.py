@@ -1,21 +1,12 @@
-"""What a frame would look like without objects: its local level and the spread of speckle and texture around it.
+"""Background of a polar frame, and regions of it in metres.
 
-Both are medians, so that objects that fill less than half of a neighbourhood do not matter:
+Background B and spread sigma are medians, which objects in less than half of a neighbourhood do not change::
 
-    B = median over the neighbourhood of the smoothed levels,    sigma = 1.4826 median |level - B|
+    B = median of the smoothed levels,    sigma = 1.4826 median |level - B|
 
-first along the beams for every range (time-varying gain, the edges of the vertical beam), then in two dimensions on a
-grid of about one independent level a node. The factor makes sigma the standard deviation of a normal distribution.
-
-Where labelled regions of a polar image lie and how large they are, in metres.
-
-A pixel of ``dr`` by ``da`` covers, in the slant plane, ``r dr da``. On the floor its points are at the horizontal
-distance ``g = sqrt(r^2 - h^2)``, so that ``dg = (r / g) dr``, and a step da moves them along a circle by
-``|dq/da + dq/de de/da| da`` with ``de/da = -(u . dq/da) / (u . dq/de)``, u the upward direction in the sonar frame. The
-two derivatives are perpendicular, of lengths ``r cos e`` and r.
-Centroids and second moments are taken over these areas.
-
-What stands out of one sonar frame, and why each of it is or is not followed up.
+first along the beams at every range (time-varying gain, edges of the vertical beam), then in two dimensions on a grid
+of about one independent level a node. Regions have centroids and second moments over the area of their pixels: on the
+floor where it is known, else in the slant plane. Derivation: docs/theory/candidates.md.
 """
 
 from __future__ import annotations
@@ -35,22 +26,22 @@ from sonar_graph.sonar.geometry import FloorView, floor_lift, ranges_azimuths_el
 Floats32 = NDArray[np.float32]
 MEDIAN_TO_SIGMA = 1.4826
 LEAST_SPREAD_DB = 0.2
-"""Below it a level is not told from its quantisation."""
+"""Below it a level cannot be told from its quantisation."""
 STEPS_PER_DB = 8.0
 DEVIATION_STEPS_PER_DB = 40.0
 LARGEST_WINDOW = 127
 TREND_NODES = 5
-"""The median along the beams is itself averaged over so many nodes in range."""
+"""Nodes in range over which the median along the beams is averaged."""
 
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """On a grid of nodes over the image, about one independent level each, shape (nodes, nodes)."""
+    """Background on a grid of nodes, about one independent level each, shape (nodes, nodes)."""
 
     level_db: Floats32
-    """B."""
+    """B, median level."""
     spread_db: Floats32
-    """sigma."""
+    """sigma, spread around it."""
 
 
 def background_of(smooth_db: Floats32, smoothing: tuple[int, int], neighbourhood: tuple[int, int]) -> Background:
@@ -78,8 +69,7 @@ def background_of(smooth_db: Floats32, smoothing: tuple[int, int], neighbourhood
 def _median(values: Floats32, window: int, steps_per_db: float, zero: float) -> Floats32:
     """Median over a square window, to half a step.
 
-    Mirrored at the edges: opencv would repeat the edge, whose few nodes then had most of the votes. In bytes, because
-    its median over large windows takes nothing else.
+    Mirrored at the edges, where opencv would repeat the last node; in bytes, the only type of its large medians.
     """
     half = window // 2
     counts = cv2.convertScaleAbs(np.maximum(values, -zero / steps_per_db), alpha=steps_per_db, beta=zero)
@@ -94,7 +84,7 @@ AREA, LEVEL, X, Y, XX, XY, YY, PIXELS = range(8)
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """One row a region."""
+    """Measured regions, one row each."""
 
     points_m: Floats
     """Centroid in the sonar frame, shape (n, 3)."""
@@ -119,7 +109,7 @@ def measure_regions(
 ) -> Regions:
     """Measure regions 1 to ``count`` of a label image, on the floor or (None) in the slant plane."""
     level_R_sonar, height_m = (np.eye(3), 0.0) if view is None else (view.level_R_sonar, view.height_m)
-    sums = _sums(contrast_db, labels, count, ranges_m, azimuths_rad, np.ascontiguousarray(level_R_sonar), height_m)
+    sums = pixel_sums(contrast_db, labels, count, ranges_m, azimuths_rad, np.ascontiguousarray(level_R_sonar), height_m)
     weight = np.maximum(sums[:, AREA], 1e-12)
     x, y = sums[:, X] / weight, sums[:, Y] / weight
     xx, xy, yy = sums[:, XX] / weight - x * x, sums[:, XY] / weight - x * y, sums[:, YY] / weight - y * y
@@ -131,7 +121,30 @@ def measure_regions(
 
 
 @compiled
-def _sums(
+def floor_cell(
+    r: float, cos_a: float, sin_a: float, level_R_sonar: Floats, height_m: float
+) -> tuple[float, float, float]:
+    """Level x and y of a floor point, and area per unit of range and azimuth there; area 0 off the floor.
+
+    Steps in range and in azimuth, at constant height below the sonar, are perpendicular:
+    ``dg = (r / sqrt(r^2 - h^2)) dr`` and ``|dq/da + dq/de de/da| da`` with ``de/da = -(u . dq/da) / (u . dq/de)``.
+    """
+    up = level_R_sonar[2]
+    cos_e, sin_e = floor_lift(r, cos_a, sin_a, up, height_m)
+    g2 = r * r - height_m * height_m
+    if not g2 > 0 or not math.isfinite(cos_e):
+        return 0.0, 0.0, 0.0
+    qx, qy, qz = r * cos_e * cos_a, r * cos_e * sin_a, r * sin_e
+    by_elevation = r * (up[2] * cos_e - sin_e * (up[0] * cos_a + up[1] * sin_a))
+    ratio = (up[1] * qx - up[0] * qy) / by_elevation
+    step = r * math.sqrt(cos_e * cos_e + ratio * ratio)
+    x = level_R_sonar[0, 0] * qx + level_R_sonar[0, 1] * qy + level_R_sonar[0, 2] * qz
+    y = level_R_sonar[1, 0] * qx + level_R_sonar[1, 1] * qy + level_R_sonar[1, 2] * qz
+    return x, y, step * r / math.sqrt(g2)
+
+
+@compiled
+def pixel_sums(
     contrast_db: Floats32,
     labels: NDArray[np.int32],
     count: int,
@@ -153,7 +166,7 @@ def _sums(
                 continue
             r = ranges_m[bin_]
             if height_m > 0:
-                x, y, area = _floor_cell(r, cos_a, sin_a, level_R_sonar, height_m)
+                x, y, area = floor_cell(r, cos_a, sin_a, level_R_sonar, height_m)
                 area *= dr * da
             else:
                 x, y, area = r * cos_a, r * sin_a, r * dr * da
@@ -169,33 +182,14 @@ def _sums(
     return sums
 
 
-@compiled
-def _floor_cell(
-    r: float, cos_a: float, sin_a: float, level_R_sonar: Floats, height_m: float
-) -> tuple[float, float, float]:
-    """Level x and y of a floor point, and area there per unit of range and azimuth; area 0 off the floor."""
-    up = level_R_sonar[2]
-    cos_e, sin_e = floor_lift(r, cos_a, sin_a, up, height_m)
-    g2 = r * r - height_m * height_m
-    if not g2 > 0 or not math.isfinite(cos_e):
-        return 0.0, 0.0, 0.0
-    qx, qy, qz = r * cos_e * cos_a, r * cos_e * sin_a, r * sin_e
-    by_elevation = r * (up[2] * cos_e - sin_e * (up[0] * cos_a + up[1] * sin_a))
-    ratio = (up[1] * qx - up[0] * qy) / by_elevation
-    step = r * math.sqrt(cos_e * cos_e + ratio * ratio)
-    x = level_R_sonar[0, 0] * qx + level_R_sonar[0, 1] * qy + level_R_sonar[0, 2] * qz
-    y = level_R_sonar[1, 0] * qx + level_R_sonar[1, 1] * qy + level_R_sonar[1, 2] * qz
-    return x, y, step * r / math.sqrt(g2)
-
-
 class CandidateVerdict(IntEnum):
-    """What became of a region that stood out; the first that applies."""
+    """Verdict on a region over the threshold; the first that applies."""
 
     ACCEPTED = 0
     OFF_FLOOR = 1
-    """No ray from there meets the floor."""
+    """Its rays do not meet the floor."""
     AT_EDGE = 2
-    """It touches the first or last beam or bin: its extent is unknown."""
+    """It touches the first or last beam or bin."""
     TOO_SMALL = 3
     """Its area is below the gate."""
     TOO_LARGE = 4
@@ -208,7 +202,7 @@ class CandidateVerdict(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Regions of a frame that stand out of the background: one row each, rejected ones included.
+    """Regions of a frame over the threshold, one row each, rejected ones included.
 
     Lengths and areas are on the floor where it is known, otherwise in the slant plane of the image.
     """
@@ -218,21 +212,21 @@ class Candidates:
     range_m: Floats
     """Slant range of the centroid, shape (n,)."""
     azimuth_rad: Floats
-    """Of the centroid, positive to the left, shape (n,)."""
+    """Azimuth of the centroid, shape (n,)."""
     elevation_rad: Floats
-    """On the floor where it is known, otherwise 0, shape (n,)."""
+    """Elevation on the floor where it is known, otherwise 0, shape (n,)."""
     elevation_sigma_rad: Floats
-    """Standard deviation of it, shape (n,)."""
+    """Its standard deviation, shape (n,)."""
     area_m2: Floats
     """Shape (n,)."""
     extent_m: Floats
-    """Length of the longer side of the region's rectangle, from its second moments, shape (n,)."""
+    """Longer side of the region, from its second moments, shape (n,)."""
     level_db: Floats
     """Mean level over the local background, shape (n,)."""
     boxes: Ints
     """First beam, first bin, number of beams, number of bins, shape (n, 4)."""
     window: Floats
-    """What the image covers: smallest and largest range (m), smallest and largest azimuth (rad), shape (2, 2)."""
+    """Smallest and largest range (m), smallest and largest azimuth (rad) of the image, shape (2, 2)."""
     labels: NDArray[np.int32]
     """Shape (beams, bins): i + 1 in the pixels of candidate i, 0 elsewhere."""
 
@@ -243,9 +237,3 @@ class Candidates:
     def accepted(self) -> Ints:
         """Rows of the accepted candidates, in order."""
         return np.flatnonzero(self.verdicts == CandidateVerdict.ACCEPTED)
-
-    def region(self, row: int) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
-        """Where a candidate lies in the image, (beams, bins), and which of those pixels are its own."""
-        beam, bin_, beams, bins = self.boxes[row].tolist()
-        where = slice(beam, beam + beams), slice(bin_, bin_ + bins)
-        return where, self.labels[where] == row + 1

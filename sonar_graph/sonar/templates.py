@@ -1,9 +1,7 @@
-"""Landmark designs as pictures on a grid of the floor, at all headings.
+"""Templates of the landmark designs at all headings, and patches of the image, on the same grid of the floor.
 
-The image around a point of the floor, on a square metric grid.
-
-Level axes are those of `sonar_graph.sonar.geometry.FloorView`. A floor point p is the sonar point
-``q = level_R_sonar^T p``, seen at range |q| and azimuth atan2(q_y, q_x): each point of the grid is looked up there.
+Axes are the level ones of `sonar_graph.sonar.geometry.FloorView`. A floor point p is the sonar point
+``q = level_R_sonar^T p``, looked up at range |q| and azimuth atan2(q_y, q_x).
 """
 
 from __future__ import annotations
@@ -24,9 +22,9 @@ from sonar_graph.sonar.geometry import FloorView
 Floats32 = NDArray[np.float32]
 HEADINGS = 48
 FINE = 5
-"""Points a cell, along each axis, over which a mask is averaged."""
+"""Points of a cell, along each axis, over which a mask is averaged."""
 SAME_SHARE = 0.05
-"""Headings are one template when their squared difference is below this share of their variance."""
+"""Largest squared difference of headings that share a template, as a share of their variance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,29 +46,38 @@ class Templates:
 
     @classmethod
     def of(cls, designs: Sequence[LandmarkDesign], cell_m: float, margin_m: float, blur_m: float) -> Templates:
-        """Pictures of all designs.
+        """Templates of all designs at all headings.
 
         Parameters
         ----------
         cell_m
             Distance of the grid's points.
         margin_m
-            Width of the ring of floor around the largest design, but for what lies behind it as the sonar sees it: the
+            Width of the ring of floor around the largest design, without the part behind it, which it may shade: the
             grid's x axis points away from the sonar.
         blur_m
-            Standard deviation of the resolution with which the sonar sees it.
+            Standard deviation of the resolution of the sonar.
         """
         material_m = max(map(material_radius_m, designs))
         half = math.ceil((material_m + margin_m) / cell_m)
+        side = 2 * half + 1
         places_m = cell_m * np.arange(-half, half + 1)
         x_m, y_m = np.meshgrid(places_m, places_m, indexing="ij")
-        cells = np.flatnonzero(_compared(x_m, y_m, material_m, margin_m))
+        # a plate of 13 mm throws a shadow of 2 cm, which would pull the best fit away from the sonar
+        away_m = np.hypot(x_m, y_m)
+        is_behind = (away_m > material_m) & (x_m > 0.5 * away_m)
+        cells = np.flatnonzero((away_m <= material_m + margin_m) & ~is_behind)
+        fine_m = cell_m / FINE * (np.arange(side * FINE) - side * FINE / 2 + 0.5)
+        fine_x_m, fine_y_m = np.meshgrid(fine_m, fine_m, indexing="ij")
         pictures: list[Floats32] = []
         of: list[int] = []
         headings: list[float] = []
         for index, design in enumerate(designs):
             for heading in 2 * np.pi * np.arange(HEADINGS) / HEADINGS:
-                picture = _picture(design, heading, half, cell_m, blur_m).ravel()[cells]
+                cos, sin = math.cos(heading), math.sin(heading)
+                level = design.level_db(cos * fine_x_m + sin * fine_y_m, -sin * fine_x_m + cos * fine_y_m)
+                blurred = cv2.GaussianBlur(np.nan_to_num(level).astype(np.float32), (0, 0), blur_m / cell_m * FINE)
+                picture = blurred.reshape(side, FINE, side, FINE).mean(axis=(1, 3)).ravel()[cells]
                 same = (
                     np.mean((picture - known) ** 2) < SAME_SHARE * known.var()
                     for known, i in zip(pictures, of, strict=True)
@@ -80,17 +87,7 @@ class Templates:
                     pictures.append(picture)
                     of.append(index)
                     headings.append(heading)
-        return cls(cell_m, 2 * half + 1, cells, np.array(pictures, np.float32), np.array(of), np.array(headings))
-
-
-def _compared(x_m: Floats, y_m: Floats, material_m: float, margin_m: float) -> NDArray[np.bool_]:
-    """Which points are compared: a disc, but for the floor behind, which the landmark may hide from the sonar.
-
-    A plate of 13 mm throws a shadow of 2 cm. Taken for a part of it, it pulls the best fit away from the sonar.
-    """
-    away_m = np.hypot(x_m, y_m)
-    is_behind = (away_m > material_m) & (x_m > 0.5 * away_m)
-    return np.asarray((away_m <= material_m + margin_m) & ~is_behind)
+        return cls(cell_m, side, cells, np.array(pictures, np.float32), np.array(of), np.array(headings))
 
 
 def material_radius_m(design: LandmarkDesign) -> float:
@@ -100,17 +97,6 @@ def material_radius_m(design: LandmarkDesign) -> float:
     y_m, x_m = np.meshgrid(-middles_m, middles_m, indexing="ij")
     there = np.isfinite(design.mask)
     return float(np.hypot(x_m, y_m)[there].max(initial=design.size_m / 4))
-
-
-def _picture(design: LandmarkDesign, heading: float, half: int, cell_m: float, blur_m: float) -> Floats32:
-    """The mask at a heading, averaged over cells and blurred, shape (side, side), first axis x, second y."""
-    fine = cell_m / FINE * (np.arange((2 * half + 1) * FINE) - (2 * half + 1) * FINE / 2 + 0.5)
-    x_m, y_m = np.meshgrid(fine, fine, indexing="ij")
-    cos, sin = math.cos(heading), math.sin(heading)
-    level = np.nan_to_num(design.level_db(cos * x_m + sin * y_m, -sin * x_m + cos * y_m)).astype(np.float32)
-    blurred = cv2.GaussianBlur(level, (0, 0), blur_m / cell_m * FINE)
-    side = 2 * half + 1
-    return blurred.reshape(side, FINE, side, FINE).mean(axis=(1, 3))
 
 
 _STEPS_A_BEAM = 4

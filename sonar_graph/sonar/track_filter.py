@@ -1,12 +1,10 @@
-"""Points at rest, seen from a moving sonar: their prediction, and their correction by range and azimuth.
+"""Kalman filter of points at rest, seen from a moving sonar by range and azimuth.
 
-With previous_T_sonar = (R, t) and its covariance Sigma (tangent, rotation first), a point q of the frame before is
+With previous_T_sonar = (R, t), its covariance Sigma (tangent, rotation first) and a point q of the frame before::
 
-    q <- R^T (q - t),    P <- R^T P R + J Sigma J^T + drift^2 I,    J = [[q]x | -I].
+    q <- R^T (q - t),    P <- R^T P R + J Sigma J^T + drift^2 I,    J = [[q]x | -I]
 
-A frame has few tracks: compiled loops over them take a seventh of the time of an array operation each.
-
-How the tracks of two frames belong together: the process model p(m, j) of equation (1) of the 2014 paper.
+Loops over the few tracks of a frame are compiled: a seventh of the time of array operations.
 """
 
 from __future__ import annotations
@@ -23,20 +21,20 @@ from sonar_graph.numerics import compiled
 
 @dataclass(frozen=True, eq=False)
 class SonarStep:
-    """How the sonar moved between two frames."""
+    """Motion of the sonar between two frames."""
 
     previous_T_sonar: gtsam.Pose3
-    """The sonar now, in the sonar frame of the frame before."""
+    """Pose of the sonar now in the sonar frame of the frame before."""
     covariance: Floats
-    """Of its tangent (rotation first, in the frame of now), shape (6, 6)."""
+    """Of its tangent (rotation first, in the sonar frame now), shape (6, 6)."""
 
     @classmethod
     def none(cls) -> SonarStep:
-        """It stood still, with certainty."""
+        """No motion, with certainty."""
         return cls(gtsam.Pose3(), np.zeros((6, 6)))
 
     def then(self, later: SonarStep) -> SonarStep:
-        """Both steps, one after the other; their errors are independent."""
+        """Both steps, one after the other, with independent errors."""
         adjoint = later.previous_T_sonar.inverse().AdjointMap()
         covariance = adjoint @ self.covariance @ adjoint.T + later.covariance
         return SonarStep(self.previous_T_sonar.compose(later.previous_T_sonar), covariance)
@@ -44,18 +42,18 @@ class SonarStep:
 
 @dataclass(frozen=True, eq=False)
 class TrackStates:
-    """One row a track, M of them."""
+    """States of M tracks, one row each."""
 
     ids: Ints
-    """Numbers, never used twice."""
+    """Track numbers, never used twice."""
     position_m: Floats
     """In the sonar frame, shape (M, 3)."""
     position_cov: Floats
     """Shape (M, 3, 3)."""
     existence: Floats
-    """Probability that something persistent is behind it, shape (M,)."""
+    """Probability that the track is of something persistent, shape (M,)."""
     frames_seen: Ints
-    """Frames in which it took a candidate, shape (M,)."""
+    """Frames in which the track took a candidate, shape (M,)."""
 
     @classmethod
     def none(cls) -> TrackStates:
@@ -67,25 +65,25 @@ class TrackStates:
         return len(self.ids)
 
     def rows(self, selection: Ints) -> TrackStates:
-        """Some of them, in this order."""
+        """The selected rows, in this order."""
         return TrackStates(*(column[selection] for column in vars(self).values()))
 
     def and_(self, other: TrackStates) -> TrackStates:
-        """These, then the others."""
+        """These tracks, then the others."""
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return TrackStates(*(np.concatenate(pair) for pair in pairs))
 
     def moved(self, step: SonarStep, drift_m: float) -> TrackStates:
-        """In the sonar frame after a step."""
+        """Prediction: the tracks in the sonar frame after a step."""
         previous_R_sonar = np.ascontiguousarray(step.previous_T_sonar.rotation().matrix())
         translation, step_cov = step.previous_T_sonar.translation(), np.ascontiguousarray(step.covariance)
-        q, P = _moved(self.position_m, self.position_cov, previous_R_sonar, translation, step_cov, drift_m**2)
+        q, P = predicted_points(self.position_m, self.position_cov, previous_R_sonar, translation, step_cov, drift_m**2)
         return replace(self, position_m=q, position_cov=P)
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """Range and azimuth of tracks, before they are measured."""
+    """Expected measurements of range and azimuth, one row a track."""
 
     z: Floats
     """Shape (M, 2)."""
@@ -96,25 +94,25 @@ class Expected:
 
     @classmethod
     def of(cls, tracks: TrackStates, noise: Floats) -> Expected:
-        """With the measurement's noise, shape (2, 2)."""
-        return cls(*_expected(tracks.position_m, tracks.position_cov, noise))
+        """Expectation under measurement noise of shape (2, 2)."""
+        return cls(*expected_ranges_azimuths(tracks.position_m, tracks.position_cov, noise))
 
     def densities(self, z: Floats, gate: float) -> Floats:
         """N(z; h(q), S) of n measurements; 0 where the squared Mahalanobis distance exceeds the gate. Shape (n, M)."""
-        return _densities(self.z, self.S, z, gate)
+        return innovation_densities(self.z, self.S, z, gate)
 
 
 def corrected(tracks: TrackStates, expected: Expected, z: Floats, took: Ints, noise: Floats) -> TrackStates:
-    """Positions after the measurement that each track took (-1: none), by the Kalman filter in Joseph's form."""
-    q, P = _corrected(tracks.position_m, tracks.position_cov, expected.z, expected.H, expected.S, z, took, noise)
+    """Update by the measurement that each track took (-1: none), with the covariance in Joseph's form."""
+    q, P = corrected_points(tracks.position_m, tracks.position_cov, expected.z, expected.H, expected.S, z, took, noise)
     return replace(tracks, position_m=q, position_cov=P)
 
 
 @compiled
-def _moved(
+def predicted_points(
     position_m: Floats, position_cov: Floats, R: Floats, t: Floats, step_cov: Floats, drift2: float
 ) -> tuple[Floats, Floats]:
-    """Positions and covariances after a step."""
+    """Positions and covariances in the sonar frame after a step."""
     q, P = np.empty_like(position_m), np.empty_like(position_cov)
     J = np.zeros((3, 6))
     J[:, 3:] = -np.eye(3)
@@ -128,8 +126,8 @@ def _moved(
 
 
 @compiled
-def _expected(position_m: Floats, position_cov: Floats, noise: Floats) -> tuple[Floats, Floats, Floats]:
-    """What `Expected` has."""
+def expected_ranges_azimuths(position_m: Floats, position_cov: Floats, noise: Floats) -> tuple[Floats, Floats, Floats]:
+    """Expected measurements, their derivatives and innovation covariances: the columns of `Expected`."""
     n = len(position_m)
     z, H, S = np.empty((n, 2)), np.zeros((n, 2, 3)), np.empty((n, 2, 2))
     for m in range(n):
@@ -144,15 +142,15 @@ def _expected(position_m: Floats, position_cov: Floats, noise: Floats) -> tuple[
 
 @compiled
 def _innovation(z: Floats, expected: Floats) -> Floats:
-    """Of one measurement from one track, the azimuth wrapped, shape (2,)."""
+    """Innovation of one measurement, the azimuth wrapped, shape (2,)."""
     difference = z - expected
     difference[1] -= 2 * math.pi * round(difference[1] / (2 * math.pi))
     return difference
 
 
 @compiled
-def _densities(expected: Floats, S: Floats, z: Floats, gate: float) -> Floats:
-    """Shape (n, M)."""
+def innovation_densities(expected: Floats, S: Floats, z: Floats, gate: float) -> Floats:
+    """Gaussian density of each measurement for each track, 0 outside the gate, shape (n, M)."""
     densities = np.zeros((len(z), len(expected)))
     for m in range(len(expected)):
         information = np.linalg.inv(S[m])
@@ -166,7 +164,7 @@ def _densities(expected: Floats, S: Floats, z: Floats, gate: float) -> Floats:
 
 
 @compiled
-def _corrected(
+def corrected_points(
     position_m: Floats,
     position_cov: Floats,
     expected: Floats,
@@ -189,7 +187,7 @@ def _corrected(
 
 @dataclass(frozen=True, eq=False)
 class Association:
-    """The tracks after a frame, M of them, and where each came from among the M' tracks before it."""
+    """The M tracks after a frame and their association with the M' tracks before it, p(m, j) of equation (1)."""
 
     stamp_ns: int
     """Of the frame."""
@@ -201,9 +199,9 @@ class Association:
     """Probability that track m now was track j before, shape (M, M' + 1); the last column is "new track". Rows sum
     to 1. A track without a candidate in this frame is itself, with certainty; only a track that starts can be new."""
     candidate: Ints
-    """Row in `Candidates` that each track took, shape (M,); -1: it was not seen in this frame."""
+    """Row in `Candidates` that each track took, shape (M,); -1: none."""
     existence: Floats
-    """Probability that something persistent is behind the track, shape (M,)."""
+    """Probability that the track is of something persistent, shape (M,)."""
     position_m: Floats
     """In the sonar frame at ``stamp_ns``, shape (M, 3)."""
     position_cov: Floats
@@ -211,6 +209,6 @@ class Association:
     frames_seen: Ints
     """Frames in which the track had a candidate, shape (M,)."""
     ended_ids: Ints
-    """Tracks that were given up in this frame, shape (k,)."""
+    """Tracks ended in this frame, shape (k,)."""
     ended_reasons: tuple[str, ...]
-    """Why, one for each of ``ended_ids``."""
+    """Reason for each of ``ended_ids``."""

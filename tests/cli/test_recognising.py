@@ -21,7 +21,7 @@ from sonar_graph.sonar import confusion
 from sonar_graph.sonar.confusion import read_confusion
 
 if TYPE_CHECKING:
-    from tests.imaged_lane import Lane
+    from tests.recognition.imaged_lane import Lane
 
 Run = Callable[..., int]
 QUICK = ("--estimators", "dead-reckoning")

@@ -20,7 +20,7 @@ from sonar_graph.recognition.recognition_record import Recognition
 from sonar_graph.recognition.session import LEAPT, NO_FLOOR, recognise_images
 
 if TYPE_CHECKING:
-    from tests.imaged_lane import Lane
+    from tests.recognition.imaged_lane import Lane
 
 
 TOPIC = "/sonar/image"

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sonar_graph.sonar.beliefs import Beliefs, IdentityParams
+from sonar_graph.sonar.bayes import Beliefs, IdentityParams
 from sonar_graph.sonar.confusion import Confusion
 from sonar_graph.sonar.track_filter import Association
 

@@ -8,7 +8,7 @@ from scipy.ndimage import uniform_filter
 
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.errors import CalibrationError
-from sonar_graph.sonar.cfar import DetectionParams, _bright_parts, check_candidates, select_candidates
+from sonar_graph.sonar.cfar import DetectionParams, bright_parts, check_candidates, select_candidates
 from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.recogniser import Recogniser, RecogniserParams
 
@@ -73,7 +73,7 @@ def test_what_the_selection_never_finds_in_the_middle_is_refused_by_name(design:
 
 def test_parts_that_the_selection_joins_are_one():
     joined = design_of((-0.06, 0.0, 0.05, 0.08), (0.06, 0.0, 0.05, 0.08))
-    assert len(_bright_parts(joined, PARAMS)[0]) == 1
+    assert len(bright_parts(joined, PARAMS)[0]) == 1
     check_candidates([joined], PARAMS, SEARCH_M)
     with pytest.raises(CalibrationError, match="closing_m"):
         check_candidates([TWO_APART], PARAMS, SEARCH_M)
@@ -81,7 +81,7 @@ def test_parts_that_the_selection_joins_are_one():
 
 
 def test_parts_have_the_area_length_and_place_of_their_drawing():
-    areas_m2, extents_m, offsets_m = _bright_parts(design_of((0.1, 0.05, 0.1, 0.05)), PARAMS)
+    areas_m2, extents_m, offsets_m = bright_parts(design_of((0.1, 0.05, 0.1, 0.05)), PARAMS)
     assert areas_m2 == pytest.approx([0.02], rel=0.25)
     assert extents_m == pytest.approx([0.2], rel=0.1)
     assert offsets_m == pytest.approx([np.hypot(0.1, 0.05)], abs=0.003)
@@ -134,15 +134,15 @@ def test_what_is_refused_is_named_in_square_metres_and_centimetres():
 
 def test_a_part_much_narrower_than_the_smoothing_is_dimmed_away():
     """A mean over 10 cm of 12 dB on 4 cm is 1.9 dB; closing does not average."""
-    assert len(_bright_parts(TINY, set_to(smoothing_m=0.1))[0]) == 0
-    assert len(_bright_parts(TINY, set_to(closing_m=0.1))[0]) == 1
+    assert len(bright_parts(TINY, set_to(smoothing_m=0.1))[0]) == 0
+    assert len(bright_parts(TINY, set_to(closing_m=0.1))[0]) == 1
     with pytest.raises(CalibrationError, match="its bright parts are all smoothed away; one must have"):
         check_candidates([TINY], set_to(smoothing_m=0.1), SEARCH_M)
 
 
 def test_a_part_is_where_the_mean_over_the_smoothing_is_over_the_floor():
     """Against scipy, in cells of 2 mm; 3 dB of 12 are reached beyond the edge."""
-    areas_m2, extents_m, _ = _bright_parts(design_of((0.0, 0.0, 0.2, 0.1)), set_to(smoothing_m=0.1))
+    areas_m2, extents_m, _ = bright_parts(design_of((0.0, 0.0, 0.2, 0.1)), set_to(smoothing_m=0.1))
     at_m = 0.002 * np.arange(-200, 201)
     x_m, y_m = np.meshgrid(at_m, at_m)
     mean_db = uniform_filter(np.where((np.abs(x_m) <= 0.2) & (np.abs(y_m) <= 0.1), 12.0, 0.0), 50)
@@ -156,24 +156,24 @@ def test_a_part_is_where_the_mean_over_the_smoothing_is_over_the_floor():
 def test_the_edge_of_the_square_is_none_of_a_part(settings):
     """The same box, in a square that it fills and in a larger one."""
     box = (0.0, 0.0, 0.1, 0.1)
-    filled, larger = (_bright_parts(design_of(box, size_m=size_m), set_to(**settings)) for size_m in (0.2, 0.5))
+    filled, larger = (bright_parts(design_of(box, size_m=size_m), set_to(**settings)) for size_m in (0.2, 0.5))
     for one, other in zip(filled, larger, strict=True):
         assert one == pytest.approx(other, rel=0.06, abs=0.003)
 
 
 def test_dark_parts_are_none():
     dark = design_of((0.0, 0.0, 0.1, 0.1), level_db=-12.0)
-    assert len(_bright_parts(dark, PARAMS)[0]) == 0
+    assert len(bright_parts(dark, PARAMS)[0]) == 0
     assert is_refused(dark)
 
 
 def test_parts_that_touch_at_a_corner_are_one():
     touching = design_of((-0.0525, -0.0525, 0.05, 0.05), (0.05, 0.045, 0.05, 0.05))
-    areas_m2, _, _ = _bright_parts(touching, set_to(smoothing_m=0.005, closing_m=0.0))
+    areas_m2, _, _ = bright_parts(touching, set_to(smoothing_m=0.005, closing_m=0.0))
     assert areas_m2 == pytest.approx([0.02], rel=0.1)
 
 
 def test_parts_come_largest_first():
-    areas_m2, _, offsets_m = _bright_parts(design_of((-0.15, 0.0, 0.03, 0.03), (0.1, 0.0, 0.1, 0.1)), PARAMS)
+    areas_m2, _, offsets_m = bright_parts(design_of((-0.15, 0.0, 0.03, 0.03), (0.1, 0.0, 0.1, 0.1)), PARAMS)
     assert areas_m2[0] > 4 * areas_m2[1]
     assert offsets_m == pytest.approx([0.1, 0.15], abs=0.005)

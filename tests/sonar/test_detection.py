@@ -7,10 +7,9 @@ from scipy import stats
 from sonar_graph.errors import MeasurementError
 from sonar_graph.sonar.cfar import (
     DetectionParams,
-    _cell_m,
-    _odd,
     false_alarm_offset_db,
     false_alarm_offsets_db,
+    odd_counts,
     select_candidates,
 )
 from sonar_graph.sonar.geometry import FloorView
@@ -74,12 +73,10 @@ def test_false_alarms_keep_their_rate_at_the_rim():
 
 
 def test_lengths_in_metres_become_beams_and_bins_at_mid_range():
-    """Of 0.3 degrees at 1.885 m, and of 1.25 m in 512."""
-    across_m, along_m = _cell_m(RANGES_M, AZIMUTHS_RAD)
-    assert across_m == pytest.approx(1.885 * np.radians(0.3), rel=1e-3)
-    assert along_m == pytest.approx(1.25 / 512)
-    assert _odd(0.03, (across_m, along_m)) == (3, 13)
-    assert _odd(0.0, (across_m, along_m)) == (1, 1)
+    """Beams of 0.3 degrees at 1.885 m, bins of 1.25 m in 512."""
+    across_m, along_m = 1.885 * np.radians(0.3), 1.25 / 512
+    assert odd_counts(0.03, (across_m, along_m)) == (3, 13)
+    assert odd_counts(0.0, (across_m, along_m)) == (1, 1)
 
 
 @pytest.mark.parametrize(("closing_m", "count"), [(0.12, 1), (0.0, 2)])
@@ -221,16 +218,6 @@ def test_what_lies_nearer_than_the_floor_is_off_it():
     found = select(image.astype(np.float32), view=view)
     near = np.flatnonzero(found.boxes[:, 3] * found.boxes[:, 2] > 200)
     assert found.verdicts[near].tolist() == [CandidateVerdict.OFF_FLOOR]
-
-
-def test_a_region_covers_the_pixels_of_its_label():
-    found = select(frame_with_plate())
-    (row,) = found.accepted
-    where, own = found.region(row)
-    assert own.sum() == np.sum(found.labels == row + 1)
-    assert own.any(axis=0).all()
-    assert own.any(axis=1).all()
-    assert found.labels[where].shape == own.shape
 
 
 def test_frames_that_break_the_rules_are_refused():

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonar_graph.sonar.bayes import Rule, jeffrey, news_of_motion, predict, update, virtual_evidence
+from sonar_graph.sonar.bayes import Rule, jeffrey, news_of_motion, predict, virtual_evidence
 
 RULES: list[Rule] = ["jeffrey", "virtual-evidence"]
 
@@ -15,8 +15,10 @@ def _rows(rng: np.random.Generator, *shape: int) -> np.ndarray:
 
 
 def _updated(rule: Rule, predicted: np.ndarray, scores: np.ndarray, confusion: np.ndarray) -> np.ndarray:
+    if rule == "jeffrey":
+        return jeffrey(predicted, scores, confusion)
     features = confusion.shape[1]
-    return update(rule, predicted, scores, confusion, np.full(features, 1 / features), np.ones(len(predicted)))
+    return virtual_evidence(predicted, scores, confusion, np.full(features, 1 / features), np.ones(len(predicted)))
 
 
 def _literal(predicted: np.ndarray, scores: np.ndarray, confusion: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import SonarFrames
-from sonar_graph.sonar.beliefs import IdentityParams
+from sonar_graph.sonar.bayes import IdentityParams
 from sonar_graph.sonar.cfar import DetectionParams
 from sonar_graph.sonar.confusion import confusion_for
 from sonar_graph.sonar.geometry import FloorView
@@ -220,21 +220,19 @@ def test_turning_on_the_spot_is_no_news_and_moving_across_is():
     assert 1 - across < 0.1 * (1 - once)
 
 
-def test_what_is_across_turns_with_the_sonar():
+def test_what_is_across_turns_with_the_sonar(monkeypatch: pytest.MonkeyPatch):
     """After a quarter turn, motion along the old centre beam is motion to the side."""
-    recogniser = Recogniser(DECIBELS)
+    recogniser, looks = Recogniser(DECIBELS), []
+    step = recogniser._beliefs.step
+    monkeypatch.setattr(recogniser._beliefs, "step", lambda *args: looks.append(args[2:]) or step(*args))
     quarter = SonarStep(gtsam.Pose3(gtsam.Rot3.Rz(np.pi / 2), np.zeros(3)), COVARIANCE)
-    recogniser.process(frame(0, picture(SQUARE, 1.7, 0.0, 0.4, 0)), None, VIEW)
-    recogniser.process(frame(1, picture(SQUARE, 1.7, 0.0, 0.4, 1)), quarter, VIEW)
-
-    class OneTrack:
-        position_m = np.array([[2.0, 0.0, 0.0]])
-
-    np.testing.assert_allclose(recogniser._sideways(OneTrack()), [[-1.0, 0.0, 0.0]], atol=1e-12)
     ahead = SonarStep(gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 0.0])), COVARIANCE)
-    recogniser.process(frame(2, picture(SQUARE, 1.7, 0.0, 0.4, 2)), ahead, VIEW)
-    (place,) = [place for place in recogniser._places() if place is not None]
+    for k, motion in enumerate([None, quarter, ahead]):
+        recogniser.process(frame(k, picture(SQUARE, 1.7, 0.0, 0.4, k)), motion, VIEW)
+    (place,) = [place for place in looks[-1][0] if place is not None]
     np.testing.assert_allclose(place, [0.0, 0.1, 0.0], atol=1e-12)  # in the axes of the first frame
+    np.testing.assert_allclose(looks[0][1], [[0.0, 1.0, 0.0]], atol=0.02)
+    np.testing.assert_allclose(looks[1][1], [[-1.0, 0.0, 0.0]], atol=0.02)
 
 
 def test_linear_samples_give_what_decibels_give():

@@ -18,13 +18,13 @@ from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, SonarFrames
 from sonar_graph.recognition.recognition_record import Recognition
 from sonar_graph.recognition.session import RecognitionSession, one_by_one, recognise, recognise_images, with_detections
-from sonar_graph.sonar.beliefs import IdentityParams
+from sonar_graph.sonar.bayes import IdentityParams
 from sonar_graph.sonar.confusion import confusion_for
 from sonar_graph.sonar.recogniser import REPORTED, RecogniserParams
-from tests.imaged_lane import TOPIC
+from tests.recognition.imaged_lane import TOPIC
 
 if TYPE_CHECKING:
-    from tests.imaged_lane import Lane
+    from tests.recognition.imaged_lane import Lane
 
 SURE = 0.9
 

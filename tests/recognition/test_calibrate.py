@@ -19,7 +19,6 @@ from sonar_graph.recognition.calibrate import (
     label_of,
     true_ranges_azimuths,
 )
-from sonar_graph.sonar import confusion
 from sonar_graph.sonar.appearance import DesignFit, ObjectSighting
 from sonar_graph.sonar.confusion import Confusion
 from sonar_graph.sonar.recogniser import Recogniser, RecogniserParams
@@ -98,7 +97,7 @@ def test_true_ranges_and_azimuths_are_those_of_the_simulator(lane, second: int):
 def few_frames_are_enough():
     """A lane is shorter than what one would calibrate on."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(confusion, "LEAST_FRAMES", 8)
+        patch.setattr("sonar_graph.recognition.calibrate.LEAST_FRAMES", 8)
         yield
 
 

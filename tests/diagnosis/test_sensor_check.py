@@ -11,7 +11,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.diagnosis.findings import Finding, StartTilt, find_start_tilt, with_interval
-from sonar_graph.diagnosis.sensor_check import _of_dvl, _of_noise, _put_right, _surest_bias, check_sensors, wrong_units
+from sonar_graph.diagnosis.sensor_check import (
+    check_sensors,
+    corrected_sequence,
+    dvl_findings,
+    noise_findings,
+    surest_bias,
+    wrong_units,
+)
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.alignment.dvl_imu import DvlMatch
@@ -217,7 +224,7 @@ def test_a_density_matters_by_half_as_much_again_either_way(factor: float, acts:
     at_rest = [0, 0, 9.80665] + given.accel_noise_density * force
     imu = Imu(np.arange(n) * 10_000_000, given.gyro_noise_density * rate, at_rest)
     dvl = Dvl(np.arange(500) * 200_000_000, np.zeros((500, 3)), np.full((500, 3, 3), np.nan))
-    for finding in _of_noise(replace(RIGHT, imu=imu, dvl=dvl)):
+    for finding in noise_findings(replace(RIGHT, imu=imu, dvl=dvl)):
         assert finding.acts == acts, finding.text()
 
 
@@ -227,15 +234,15 @@ def told(*values: float, sigma: float = 1e-3) -> tuple[Estimate1D, Estimate1D, E
 
 
 @pytest.mark.parametrize("acts", [True, False])
-def test_what_is_put_right_before_the_start_is_what_the_rows_advise(acts: bool):
+def test_what_iscorrected_sequence_before_the_start_is_what_the_rows_advise(acts: bool):
     offset, yaw, scale = (0.4, 0.05, 1.04) if acts else (0.008, 0.002, 1.001)
     numbers = (Estimate1D(value, 1e-5) for value in (offset, yaw, scale))
     match = DvlMatch(*numbers, lever=told(-0.2, 0.0, -0.15), gyro_bias=told(0.0, 0.0, 0.0, sigma=1e-6))
     turned = with_mounting(RIGHT, "dvl", rpy_rad=(0.3, 0.1, 0.2))
-    rows = list(_of_dvl(match, turned, LogConfig()))
+    rows = list(dvl_findings(match, turned, LogConfig()))
     assert [row.acts for row in rows] == [acts] * 3
     assert rows[0].estimate.sigma == pytest.approx(0.01 / np.sqrt(12), rel=1e-3), "that of a sample's instant"
-    right = _put_right(turned, match, rows)
+    right = corrected_sequence(turned, match, rows)
     assert right.dvl.stamps_ns - RIGHT.dvl.stamps_ns == pytest.approx(400_000_000 if acts else 0)
     assert right.dvl.velocity == pytest.approx(RIGHT.dvl.velocity * (1.04 if acts else 1.0))
     assert right.calibration.dvl.mounting.rpy_rad == pytest.approx((0.3, 0.1, 0.25 if acts else 0.2))
@@ -248,9 +255,9 @@ def test_of_two_biases_the_surer_is_told_axis_by_axis_with_where_it_is_from():
     drive = DvlMatch(unknown, unknown, unknown, nothing, (x, replace(y, sigma=1e-2), unknown))
     sigmas = np.array([1.0, 1.0, 1e-3, 1e-3, 1e-3])
     rest = InitialTilt(0, 0.0, 0.0, np.array([10.0, 20.0, 30.0]), np.diag(sigmas**2), np.ones(3, dtype=np.bool_))
-    bias, sources = _surest_bias(drive, StartTilt(rest, "from 20 s of rest", is_rest=True))
+    bias, sources = surest_bias(drive, StartTilt(rest, "from 20 s of rest", is_rest=True))
     assert [one.value for one in bias] == [1.0, 20.0, 30.0]
     assert sources == ("from the turns of the drive", "from 20 s of rest", "from 20 s of rest")
-    moving, sources = _surest_bias(drive, StartTilt(rest, "from 60 s in motion"))
+    moving, sources = surest_bias(drive, StartTilt(rest, "from 60 s in motion"))
     assert moving == drive.gyro_bias
     assert set(sources) == {"from the turns of the drive"}
