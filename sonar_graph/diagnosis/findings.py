@@ -101,12 +101,11 @@ def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
     """
     if not any(estimate.is_known for estimate in found.lever):
         return [Finding(ARM, found.lever[0], "m", "")]
-    given = _given_arm(calibration)
-    wrong = _wrong_by(found, given)
+    given, wrong = _arm_and_error(found, calibration)
     imu, dvl = calibration.imu.mounting.translation_m, calibration.dvl.mounting.translation_m
     line = (
-        f"`imu.mounting.translation_m = {_numbers(np.subtract(imu, wrong))}` in the calibration or, if that place is "
-        f"sure, `dvl.mounting.translation_m = {_numbers(np.add(dvl, wrong))}`"
+        f"`imu.mounting.translation_m = {numbers(np.subtract(imu, wrong), 3)}` in the calibration or, if that place is "
+        f"sure, `dvl.mounting.translation_m = {numbers(np.add(dvl, wrong), 3)}`"
     )
     rows = []
     for axis, estimate, of_calibration, error in zip(AXES, found.lever, given, wrong, strict=True):
@@ -120,7 +119,7 @@ def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
 def with_fitted(found: DvlMatch, calibration: Calibration) -> Calibration:
     """Calibration with the changes that the findings advise: place of the IMU, sigma of the gyro bias."""
     imu = calibration.imu
-    place = np.subtract(imu.mounting.translation_m, _wrong_by(found, _given_arm(calibration)))
+    place = np.subtract(imu.mounting.translation_m, _arm_and_error(found, calibration)[1])
     moved = imu.mounting.model_copy(update={"translation_m": tuple(place.tolist())})
     sigma = _largest(found.gyro_bias) if any(_is_beyond(e, imu) for e in found.gyro_bias) else imu.gyro_bias_sigma
     changed = imu.model_copy(update={"mounting": moved, "gyro_bias_sigma": sigma})
@@ -128,15 +127,7 @@ def with_fitted(found: DvlMatch, calibration: Calibration) -> Calibration:
 
 
 def bias_findings(bias: Estimates3D, sources: tuple[str, str, str], imu: ImuCalibration) -> list[Finding]:
-    """One row for each axis, compared with the sigma of the calibration; a single row where no axis is known.
-
-    Parameters
-    ----------
-    bias
-        Body axes, rad/s.
-    sources
-        Source of each, such as "from 12 s of rest".
-    """
+    """One row for each body axis with its source, such as "from 12 s of rest"; a single row where no axis is known."""
     if not any(estimate.is_known for estimate in bias):
         return [Finding(BIAS, bias[0], "rad/s", "")]
     rows, allowed = [], imu.gyro_bias_sigma
@@ -160,18 +151,16 @@ def _largest(bias: Estimates3D) -> float:
     return max((abs(estimate.value) for estimate in bias if estimate.is_known), default=0.0)
 
 
-def _given_arm(calibration: Calibration) -> Floats:
-    return np.subtract(calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m)
-
-
-def _wrong_by(found: DvlMatch, given: Floats) -> Floats:
-    """Error of the given arm, shape (3,), m; 0 along an axis on which nothing need be done."""
+def _arm_and_error(found: DvlMatch, calibration: Calibration) -> tuple[Floats, Floats]:
+    """The calibration's arm and its error, shapes (3,), m; error 0 along an axis on which nothing need be done."""
+    given = np.subtract(calibration.dvl.mounting.translation_m, calibration.imu.mounting.translation_m)
     errors = [replace(e, value=e.value - g) for e, g in zip(found.lever, given.tolist(), strict=True)]
-    return np.array([error.value if matters(error, LEAST_LEVER_M) else 0.0 for error in errors])
+    return given, np.array([error.value if matters(error, LEAST_LEVER_M) else 0.0 for error in errors])
 
 
-def _numbers(place: Floats) -> str:
-    return f"[{', '.join(f'{metres:.3f}' for metres in place)}]"
+def numbers(values: Iterable[float], digits: int) -> str:
+    """A list of numbers as TOML has it."""
+    return f"[{', '.join(f'{value:.{digits}f}' for value in values)}]"
 
 
 RESTS_S = (10, 20, 40, 80, 160)
@@ -209,13 +198,7 @@ class StartTilt:
 
 
 def find_start_tilt(sequence: Sequence) -> StartTilt:
-    """Alignment at rest if the vehicle rests at the start, else in motion.
-
-    Parameters
-    ----------
-    sequence
-        With stamps, mountings and scale corrected as far as they are known to be wrong.
-    """
+    """Alignment at rest if the vehicle rests at the start, else in motion, of a log with the other faults corrected."""
     found = StartTilt(None, "no rows")
     for rest_s in RESTS_S:
         imu, dvl = _beginning(sequence, rest_s)
@@ -249,7 +232,7 @@ def tilt_findings(found: StartTilt, start: Start, yaw_rad: float) -> list[Findin
         return [Finding("start roll and pitch", found.angle(0), "°", "")]
     given, sigmas = start.rpy_rad, [float(found.angle(axis).sigma) for axis in (0, 1)]
     line = (
-        f"`start.rpy_rad = [{found.angle(0).value:.4f}, {found.angle(1).value:.4f}, {yaw_rad:.4f}]`, "
+        f"`start.rpy_rad = {numbers((found.angle(0).value, found.angle(1).value, yaw_rad), 4)}`, "
         f"`start.rpy_sigma_rad = [{sigmas[0]:.2g}, {sigmas[1]:.2g}, {start.rpy_sigma_rad[2]:.2g}]` in the calibration"
     )
     rows = []
@@ -284,25 +267,16 @@ class StartHeading:
         if self.acts:
             rpy = (tilt.angle(0).value, tilt.angle(1).value, self.rpy_rad[2]) if tilt.tilt else self.rpy_rad
             of_tilt = f", with roll and pitch {tilt.said}" if tilt.tilt else ""
-            turns = ", ".join(f"{angle:.4f}" for angle in rpy)
-            place = ", ".join(f"{metres:.2f}" for metres in self.position_m)
             advice = (
                 f"the start heading is wrong; by the reference, its stamps put right{of_tilt}: "
-                f"`start.rpy_rad = [{turns}]`, `start.position_m = [{place}]` in the calibration"
+                f"`start.rpy_rad = {numbers(rpy, 4)}`, `start.position_m = {numbers(self.position_m, 2)}` in the "
+                "calibration"
             )
         return Finding("start heading of the calibration", in_degrees(self.error), "°", advice, self.acts)
 
 
 def find_start_heading(sequence: Sequence, reference: Trajectory, offset: Estimate1D) -> StartHeading:
-    """Compare the calibration's start with the reference at that instant.
-
-    Parameters
-    ----------
-    sequence
-        As for `find_start_tilt`.
-    offset
-        Correction of the reference's stamps, s.
-    """
+    """Compare the calibration's start with the reference at that instant, its stamps corrected by an offset in s."""
     first_ns, last_ns = reference.stamps_ns[[0, -1]].tolist()
     at_ns = min(max(sequence.start_ns - round(offset.value * NS_PER_S), first_ns), last_ns)
     pose = reference.at(np.array([at_ns]))

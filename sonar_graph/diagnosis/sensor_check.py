@@ -27,6 +27,7 @@ from sonar_graph.diagnosis.findings import (
     in_degrees,
     lever_findings,
     matters,
+    numbers,
     tilt_findings,
     with_fitted,
 )
@@ -65,15 +66,7 @@ class WrongUnit(NamedTuple):
 
 
 def wrong_units(sequence: Sequence, config: LogConfig) -> list[WrongUnit]:
-    """Velocities, rates and specific forces that look like another unit than the configured one.
-
-    Parameters
-    ----------
-    sequence
-        As a run would read it.
-    config
-        Log configuration of the reading; its scales enter the advice.
-    """
+    """Velocities, rates and specific forces in an implausible unit; the configured scales enter the advice."""
     found: list[WrongUnit] = []
     speed_m_s = _exceeded_by_few(sequence.dvl.velocity)
     if speed_m_s > FASTEST_M_S:
@@ -167,8 +160,8 @@ def dvl_findings(found: DvlMatch, sequence: Sequence, config: LogConfig) -> list
     scales = matters(replace(found.scale, value=found.scale.value - 1), LEAST_SCALE)
     yaw_advice = scale_advice = NO_NEED
     if turns:
-        rpy = ", ".join(f"{angle:.4f}" for angle in _turned(sequence.calibration.dvl, found.yaw.value))
-        yaw_advice = f"turn the DVL's mounting: `dvl.mounting.rpy_rad = [{rpy}]` in the calibration"
+        rpy = numbers(_turned(sequence.calibration.dvl, found.yaw.value), 4)
+        yaw_advice = f"turn the DVL's mounting: `dvl.mounting.rpy_rad = {rpy}` in the calibration"
     if scales:
         scale = float(config.table("dvl").get("scale", 1.0)) * found.scale.value
         scale_advice = f"scale the DVL's velocities: `scale = {scale:.4f}` under [dvl] in the log configuration"

@@ -1,7 +1,7 @@
 """Landmark detections from the sonar images of a log, their record, and the measuring of the recognition model."""
 
 # fmt: off
-from sonar_graph.recognition.calibrate import calibrate
+from sonar_graph.recognition.confusion_fit import calibrate
 from sonar_graph.recognition.recognition_record import (
     SURE, DrawnFrame, Recognition, read_recognition, write_recognition,
 )

@@ -155,32 +155,8 @@ def recognise_images(
 ) -> Recognition | None:
     """Recognise landmarks in sonar images, with a record of what became of every candidate and frame.
 
-    Parameters
-    ----------
-    images
-        An MCAP file with sonar images, or blocks of frames in order.
-    sequence
-        The other sensors.
-    topic, config
-        As of `sonar_graph.logs.read_sonar_frames`.
-    designs, params, recogniser
-        As of `recognise`.
-    window, salvage
-        As of `sonar_graph.logs.read_log`, and as the sequence was read.
-    progress
-        Called with the number of frames done.
-
-    Returns
-    -------
-    Recognition | None
-        None where there are no images.
-
-    Raises
-    ------
-    LogError
-        As `sonar_graph.logs.read_sonar_frames`.
-    CalibrationError
-        When designs and measured model do not belong together.
+    Parameters and errors are those of `recognise`, with the topic of the images and the window and salvage of the
+    sequence; ``progress`` is called with the number of frames done. None where there are no images.
     """
     session = RecognitionSession(sequence, designs, params, recogniser=recogniser)
     if isinstance(images, Path | str):
@@ -230,15 +206,7 @@ def without_leaps(frames: Iterable[SonarFrames], refuse: Callable[[int, str], No
 
 
 class RecognitionSession:
-    """Recognition frame by frame; its memory does not grow with the number of images.
-
-    Parameters
-    ----------
-    sequence, designs, params, recogniser
-        As of `recognise_images`.
-    pictures
-        Draw frames for the report.
-    """
+    """Recognition frame by frame; its memory does not grow with the number of images."""
 
     def __init__(
         self,

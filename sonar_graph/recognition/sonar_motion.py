@@ -120,13 +120,7 @@ class _Height:
 
 
 class SonarMotions:
-    """Motion from frame to frame of one sequence.
-
-    Parameters
-    ----------
-    sequence
-        With IMU and Doppler log; the height needs depth and a floor too.
-    """
+    """Motion from frame to frame of a sequence; the height needs depth and a floor."""
 
     def __init__(self, sequence: Sequence) -> None:
         calibration = sequence.calibration

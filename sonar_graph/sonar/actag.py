@@ -182,25 +182,8 @@ def evenly_sampled(
 ) -> tuple[NDArray[np.float32], Floats, Floats]:
     """Resample a polar image on equally spaced ranges and azimuths, with square pixels in the middle of the window.
 
-    Levels are averaged over as many bins as a pixel covers, and interpolated between beams.
-
-    Parameters
-    ----------
-    image_db
-        Shape (beams, bins).
-    ranges_m, azimuths_rad
-        Of bins (equally spaced) and beams (in any order, however spaced).
-    pixel_m
-        Side of a pixel.
-
-    Returns
-    -------
-    picture_db
-        Shape (rows, columns).
-    rows_m
-        Range of each row, farthest first.
-    columns_rad
-        Azimuth of each column, leftmost first, positive to the left and 0 in the middle as AcTag has it.
+    Levels are averaged over the bins of a pixel, and interpolated between beams. Returned are the picture, shape (rows,
+    columns), the range of each row, farthest first, and the azimuth of each column, leftmost first and 0 in the middle.
     """
     first_m, last_m = float(ranges_m[0]), float(ranges_m[-1])
     widest_rad = float(np.abs(azimuths_rad).max())
@@ -237,16 +220,7 @@ RING = (
 
 
 def tag_design(family: str, tag: int, tag_size_m: float) -> LandmarkDesign:
-    """A tag of foam and metal: 24 bits about a dark ring about a square of foam.
-
-    Parameters
-    ----------
-    family
-        Such as AcTag24h10.
-    tag
-        Its number in the family, and the landmark's identity.
-    tag_size_m
-        Side of the inner square.
+    """Design of a tag of foam and metal: 24 bits about a dark ring about a square of foam of this size.
 
     Raises
     ------

@@ -61,15 +61,7 @@ class DesignFit:
 
 
 class Appearance:
-    """Comparison of patches with designs.
-
-    Parameters
-    ----------
-    designs
-        The known landmarks.
-    params
-        None: the defaults.
-    """
+    """Comparison of patches with the templates of designs."""
 
     def __init__(self, designs: Sequence[LandmarkDesign], params: AppearanceParams | None = None) -> None:
         self.params = params or AppearanceParams()
@@ -178,17 +170,7 @@ class ObjectSighting:
 
 
 class CandidateFit:
-    """Comparison of candidates with the designs.
-
-    Parameters
-    ----------
-    appearance
-        The designs.
-    confusion
-        The measured model.
-    elevation_aperture_rad
-        Full vertical opening of the sonar.
-    """
+    """Comparison of candidates with designs, for a sonar of this full vertical opening."""
 
     def __init__(self, appearance: Appearance, confusion: Confusion, elevation_aperture_rad: float) -> None:
         self._appearance, self._confusion = appearance, confusion

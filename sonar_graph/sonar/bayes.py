@@ -1,8 +1,10 @@
 """Recursive Bayesian estimate of landmark identities, one belief per track.
 
 K classes: the known landmarks in the order of their designs, last "none of them". J features that one frame can show:
-the same landmarks, last "none of the above". Confusion matrix ``C[k, j] = p(z = j | x = k)``, soft scores s over the
-features, association A of the tracks now with those before. Equation numbers of the 2014 paper, section II-B::
+the same landmarks, last "none of the above". Beliefs b of M tracks, shape (M, K); soft scores s of the features, shape
+(M, J), a row of 0 where nothing was measured; confusion matrix ``C[k, j] = p(z = j | x = k)``; association A of the
+tracks now with those before, shape (M, M' + 1), the last column for new ones. Rows sum to 1. With the equation numbers
+of the 2014 paper, section II-B::
 
     (1)   b'[m] = ( sum_j A[m, j] b[j]  +  A[m, new] birth ) T        T = (1 - e) I + e 1 birth^T
     (2)   p[m, k | j] = C[k, j] b'[m, k] / sum_i C[i, j] b'[m, i]
@@ -35,25 +37,7 @@ LEAST_PROBABILITY = 1e-12
 
 
 def predict(beliefs: Floats, association: Floats, birth: Floats, forgetting: Floats | float = 1e-3) -> Floats:
-    """Predict beliefs by equation (1).
-
-    Parameters
-    ----------
-    beliefs
-        Of the tracks before, shape (M', K), rows sum to 1.
-    association
-        ``A[m, j]``: probability that track m now is track j before; the last column that it is new. Shape (M, M' + 1),
-        rows sum to 1.
-    birth
-        Belief about a new track, shape (K,).
-    forgetting
-        ``e``: identities do not change, but a belief must be able to. One number, or one a track, shape (M, 1).
-
-    Returns
-    -------
-    Floats
-        Shape (M, K), rows sum to 1.
-    """
+    """Predict beliefs by equation (1), with the belief about a new track, shape (K,), and e for all or each track."""
     carried = association[:, :-1] @ beliefs + association[:, -1:] * birth
     total = carried.sum(axis=1, keepdims=True)
     return np.asarray((1 - forgetting) * carried + forgetting * total * birth)
@@ -63,21 +47,7 @@ def jeffrey(predicted: Floats, scores: Floats, confusion: Floats) -> Floats:
     """Update beliefs by equations (2) and (3), as printed.
 
     A feature that is impossible under the prediction, ``sum_k C[k, j] b'[k] = 0``, keeps its part of the prediction.
-    A row of zero scores is a missing measurement and keeps the prediction.
-
-    Parameters
-    ----------
-    predicted
-        Shape (M, K), rows sum to 1.
-    scores
-        Shape (M, J), rows sum to 1, or to 0 where there is no measurement.
-    confusion
-        Shape (K, J), rows sum to 1.
-
-    Returns
-    -------
-    Floats
-        Shape (M, K), rows sum to 1.
+    A row of zero scores keeps the prediction.
     """
     evidence = predicted @ confusion
     possible = evidence > 0
@@ -90,21 +60,7 @@ def jeffrey(predicted: Floats, scores: Floats, confusion: Floats) -> Floats:
 def virtual_evidence(predicted: Floats, scores: Floats, confusion: Floats, base: Floats, weights: Floats) -> Floats:
     """Update beliefs by tempered virtual evidence: each frame multiplies the odds.
 
-    A row of zero scores, or a weight of 0, is a missing measurement and keeps the prediction.
-
-    Parameters
-    ----------
-    predicted, scores, confusion
-        As in `jeffrey`.
-    base
-        Share of each feature in the prior of the scores, shape (J,).
-    weights
-        Independent share of each frame, from 0 to 1, shape (M,).
-
-    Returns
-    -------
-    Floats
-        Shape (M, K), rows sum to 1.
+    A row of zero scores, or a weight of 0, keeps the prediction. Shapes: base (J,), weights (M,).
     """
     likelihood = (scores / base) @ confusion.T
     measured = likelihood.max(axis=1, keepdims=True, initial=0.0) > 0
@@ -124,13 +80,6 @@ def news_of_motion(moved_m: Floats, aperture_m: float) -> Floats:
               0.25 (2 - u)^3            1 < u <= 2          u = 2 moved / D
 
     which leaves one half at 3.6 cm for the 0.14 m of a DIDSON's high frequency.
-
-    Parameters
-    ----------
-    moved_m
-        Cross-range motion since the frame before, metres.
-    aperture_m
-        D.
     """
     u = np.minimum(2.0 * np.abs(moved_m) / aperture_m, 2.0)
     rho = np.where(u <= 1, 1 - 1.5 * u**2 + 0.75 * u**3, 0.25 * (2 - u) ** 3)
@@ -164,13 +113,6 @@ class Beliefs:
 
     A frame counts only as far as the sonar moved since it last looked at the track from there: speckle belongs to the
     floor and comes back when the sonar comes back.
-
-    Parameters
-    ----------
-    confusion
-        The measured model.
-    params
-        None: the defaults.
     """
 
     def __init__(self, confusion: Confusion, params: IdentityParams | None = None) -> None:
@@ -185,23 +127,16 @@ class Beliefs:
     def step(
         self, association: Association, scores: Floats, places: Sequence[Floats | None], sideways: Floats
     ) -> Floats:
-        """Predict and update for one frame, equations (1) to (3).
+        """Predict and update for one frame, equations (1) to (3); the beliefs after it, shape (M, K).
 
         Parameters
         ----------
-        association
-            Of the tracks before and after it.
-        scores
-            Of each track after it, shape (M, features); rows of 0 where there is no measurement.
+        association, scores
+            Of the tracks after the frame.
         places
-            The sonar's position in a fixed frame for each track that was looked at, shape (3,); None: not looked at.
+            Position of the sonar in a fixed frame for each track that was looked at, shape (3,); None: not looked at.
         sideways
-            Horizontal unit vector across each track's line of sight in the same frame, shape (M, 3).
-
-        Returns
-        -------
-        Floats
-            Beliefs after the frame, shape (M, classes).
+            Horizontal unit vector across each line of sight in the same frame, shape (M, 3).
         """
         rows = [self._order.index(track) for track in association.previous_ids.tolist()]
         self._order = association.track_ids.tolist()

@@ -104,17 +104,14 @@ def select_candidates(
         elevation_sigmas = np.full(len(boxes), elevation_sigma(params.elevation_aperture_rad))
     else:
         elevation_sigmas = view.elevation_sigmas(regions.points_m)
+    window = np.array([[ranges_m.min(), ranges_m.max()], [azimuths_rad.min(), azimuths_rad.max()]])
+    verdicts = judged(regions, boxes, shape, params)
     return Candidates(
-        verdicts=judged(regions, boxes, shape, params),
-        range_m=regions.range_m,
-        azimuth_rad=regions.azimuth_rad,
-        elevation_rad=regions.elevation_rad,
+        **vars(regions),
+        verdicts=verdicts,
         elevation_sigma_rad=elevation_sigmas,
-        area_m2=regions.area_m2,
-        extent_m=regions.extent_m,
-        level_db=regions.level_db,
         boxes=boxes,
-        window=np.array([[ranges_m.min(), ranges_m.max()], [azimuths_rad.min(), azimuths_rad.max()]]),
+        window=window,
         labels=labels,
     )
 
@@ -185,15 +182,6 @@ def check_candidates(designs: Iterable[LandmarkDesign], params: DetectionParams,
     Only candidates are compared with designs, and a candidate is one connected bright region, compared at its centroid
     and up to ``search_m`` beside it. So some bright part of a design must have the right size and lie about the middle
     of its square. Parts are taken as `select_candidates` sees them in a perfect image without speckle.
-
-    Parameters
-    ----------
-    designs
-        All of them.
-    params
-        Of the candidate selection.
-    search_m
-        `AppearanceParams.search_m`.
 
     Raises
     ------

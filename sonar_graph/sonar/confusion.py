@@ -8,7 +8,7 @@ score of feature j over the labelled frames of class k. With c_j the correlation
     s_none  ~  (1 - threshold^2)^(-sharpness visible)
 
 The model that ships, ``default_confusion.json``, was measured on simulated basins with the designs that ship.
-`sonar_graph.recognition.calibrate` measures others.
+`sonar_graph.recognition.confusion_fit` measures others.
 """
 
 from __future__ import annotations
@@ -35,21 +35,9 @@ ASSUMED_RIGHT = 0.9
 
 
 def soft_scores(correlation: Floats, visible: Floats, sharpness: float, threshold: float) -> Floats:
-    """Probabilities of the features: each design, and last "none of the above".
+    """Soft scores of the features: each design, last "none of the above", shape (n, designs + 1), rows sum to 1.
 
-    Parameters
-    ----------
-    correlation
-        Of each design with each patch, shape (n, designs).
-    visible
-        Share of the template in view, shape (n,).
-    sharpness, threshold
-        Exponent, and correlation at which "none" is as probable as a design.
-
-    Returns
-    -------
-    Floats
-        Shape (n, designs + 1), rows sum to 1.
+    From the correlation of each design with n patches, shape (n, designs), and the visible shares, shape (n,).
     """
     known = np.clip(correlation, 0.0, BEST_CORRELATION)
     none = np.full((len(known), 1), threshold)

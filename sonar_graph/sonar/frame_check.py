@@ -77,13 +77,7 @@ def check_block(frame: SonarFrames) -> None:
 
 
 class FrameCheck:
-    """Comparison of each frame with the good one before it.
-
-    Parameters
-    ----------
-    image
-        Scale of the samples; None: decibels in bytes.
-    """
+    """Comparison of each frame with the good one before it; the scale of samples is decibels in bytes by default."""
 
     def __init__(self, image: SonarImage | None = None) -> None:
         self._scale = image or SonarImage()

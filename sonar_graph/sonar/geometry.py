@@ -189,16 +189,7 @@ def elevation_sigma(aperture_rad: float) -> float:
 def point_covariances(points_m: Floats, range_azimuth_cov: Floats, elevation_sigmas_rad: Floats) -> Floats:
     """Covariance of points in the sonar frame, first order, shape (n, 3, 3).
 
-    ``J blockdiag(R, sigma_e^2) J^T`` with J the derivative of q by (r, a, e).
-
-    Parameters
-    ----------
-    points_m
-        Shape (n, 3).
-    range_azimuth_cov
-        R, shape (n, 2, 2) or (2, 2).
-    elevation_sigmas_rad
-        Shape (n,): `elevation_sigma` of the aperture, or `FloorView.elevation_sigmas`.
+    ``J blockdiag(R, sigma_e^2) J^T``, R of shape (n, 2, 2) or (2, 2), J the derivative of q by (r, a, e).
     """
     r, _, _ = ranges_azimuths_elevations(points_m)
     by_azimuth = np.stack([-points_m[:, 1], points_m[:, 0], np.zeros(len(r))], axis=1)

@@ -45,15 +45,7 @@ class Background:
 
 
 def background_of(smooth_db: Floats32, smoothing: tuple[int, int], neighbourhood: tuple[int, int]) -> Background:
-    """Background and spread of smoothed levels.
-
-    Parameters
-    ----------
-    smooth_db
-        Shape (beams, bins).
-    smoothing, neighbourhood
-        Beams and bins over which levels were averaged, and over which medians are taken; odd numbers.
-    """
+    """Background of levels averaged over beams and bins, by medians over a larger neighbourhood of them."""
     beams, bins = smoothing
     nodes = np.ascontiguousarray(smooth_db[beams // 2 :: beams, bins // 2 :: bins])
     ordered, count = np.sort(nodes, axis=0), len(nodes)
@@ -84,19 +76,20 @@ AREA, LEVEL, X, Y, XX, XY, YY, PIXELS = range(8)
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Measured regions, one row each."""
+    """Measured regions, one row each; lengths on the floor where it is known, otherwise in the slant plane."""
 
     points_m: Floats
     """Centroid in the sonar frame, shape (n, 3)."""
     range_m: Floats
     azimuth_rad: Floats
     elevation_rad: Floats
+    """Of the centroid, shape (n,); elevation 0 in the slant plane."""
     area_m2: Floats
     """0 where no pixel meets the floor."""
     extent_m: Floats
     """Longer side of the rectangle with the same second moments: ``sqrt(12)`` times the largest deviation."""
     level_db: Floats
-    """Mean contrast."""
+    """Mean level over the local background."""
 
 
 def measure_regions(
@@ -201,28 +194,13 @@ class CandidateVerdict(IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
-    """Regions of a frame over the threshold, one row each, rejected ones included.
-
-    Lengths and areas are on the floor where it is known, otherwise in the slant plane of the image.
-    """
+class Candidates(Regions):
+    """Regions of a frame over the threshold, one row each, rejected ones included."""
 
     verdicts: Ints
     """`CandidateVerdict` of each, shape (n,)."""
-    range_m: Floats
-    """Slant range of the centroid, shape (n,)."""
-    azimuth_rad: Floats
-    """Azimuth of the centroid, shape (n,)."""
-    elevation_rad: Floats
-    """Elevation on the floor where it is known, otherwise 0, shape (n,)."""
     elevation_sigma_rad: Floats
-    """Its standard deviation, shape (n,)."""
-    area_m2: Floats
-    """Shape (n,)."""
-    extent_m: Floats
-    """Longer side of the region, from its second moments, shape (n,)."""
-    level_db: Floats
-    """Mean level over the local background, shape (n,)."""
+    """Standard deviation of the elevation, shape (n,)."""
     boxes: Ints
     """First beam, first bin, number of beams, number of bins, shape (n, 4)."""
     window: Floats

@@ -46,17 +46,10 @@ class Templates:
 
     @classmethod
     def of(cls, designs: Sequence[LandmarkDesign], cell_m: float, margin_m: float, blur_m: float) -> Templates:
-        """Templates of all designs at all headings.
+        """Templates of all designs at all headings, blurred by the resolution of the sonar.
 
-        Parameters
-        ----------
-        cell_m
-            Distance of the grid's points.
-        margin_m
-            Width of the ring of floor around the largest design, without the part behind it, which it may shade: the
-            grid's x axis points away from the sonar.
-        blur_m
-            Standard deviation of the resolution of the sonar.
+        Around the largest design lies a ring of floor, without the part behind it, which the design may shade: the x
+        axis of the grid points away from the sonar.
         """
         material_m = max(map(material_radius_m, designs))
         half = math.ceil((material_m + margin_m) / cell_m)

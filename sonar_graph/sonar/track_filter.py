@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -81,8 +82,7 @@ class TrackStates:
         return replace(self, position_m=q, position_cov=P)
 
 
-@dataclass(frozen=True, eq=False)
-class Expected:
+class Expected(NamedTuple):
     """Expected measurements of range and azimuth, one row a track."""
 
     z: Floats

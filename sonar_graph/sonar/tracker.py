@@ -60,13 +60,7 @@ class TrackingParams(Section):
 
 
 class Tracker:
-    """Tracker of the candidates of one frame after another.
-
-    Parameters
-    ----------
-    params
-        Settings; None for the defaults.
-    """
+    """Tracker of the candidates of one frame after another."""
 
     def __init__(self, params: TrackingParams | None = None) -> None:
         self.params = params or TrackingParams()
@@ -85,16 +79,7 @@ class Tracker:
         return motion if self._skipped is None else self._skipped.then(motion)
 
     def step(self, candidates: Candidates, motion: SonarStep | None, stamp_ns: int) -> Association:
-        """Take in the accepted candidates of one frame.
-
-        Parameters
-        ----------
-        candidates
-            Of the frame, rejected ones included.
-        motion
-            Of the sonar since the frame before or the last `skip`; None: it stood still.
-        stamp_ns
-            Of the frame, later than that of the frame before.
+        """Predict the tracks by the motion since the frame before or the last `skip` (None: none), and update them.
 
         Raises
         ------
@@ -132,12 +117,10 @@ class Tracker:
         existence = before.existence * likelihood / (1.0 - before.existence + before.existence * likelihood)
         after = corrected(before, expected, z, took, self._noise)
         after = replace(after, existence=existence, frames_seen=before.frames_seen + (took >= 0))
-        reasons = [
-            f"exists with less than {params.least_existence:g}"
-            if probability < params.least_existence
-            else ("left the image" if least < -params.leaving_sigmas else "")
-            for probability, least in zip(existence, inside.min(axis=(1, 2), initial=0.0), strict=True)
-        ]
+        least_inside = inside.min(axis=(1, 2), initial=0.0)
+        reasons = ["left the image" if least < -params.leaving_sigmas else "" for least in least_inside]
+        for row in np.flatnonzero(existence < params.least_existence):
+            reasons[row] = f"exists with less than {params.least_existence:g}"
         return self._keep(stamp_ns, candidates, after, matrix, took, reasons)
 
     def _keep(

@@ -19,6 +19,7 @@ def candidates_at(range_m: list[float], azimuth_rad: list[float], rejected: tupl
     verdicts[list(rejected)] = CandidateVerdict.TOO_SMALL
     zero = np.zeros(n)
     return Candidates(
+        points_m=np.zeros((n, 3)),
         verdicts=verdicts,
         range_m=np.array(range_m, dtype=float),
         azimuth_rad=np.array(azimuth_rad, dtype=float),

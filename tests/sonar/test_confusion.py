@@ -10,7 +10,7 @@ import pytest
 from sonar_graph.devices import landmark_designs
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign, load_designs
 from sonar_graph.errors import CalibrationError
-from sonar_graph.recognition.calibrate import LabelledFits, estimate_confusion
+from sonar_graph.recognition.confusion_fit import LabelledFits, estimate_confusion
 from sonar_graph.sonar.bayes import virtual_evidence
 from sonar_graph.sonar.confusion import Confusion, confusion_for, read_confusion, soft_scores
 

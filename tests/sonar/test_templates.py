@@ -1,3 +1,5 @@
+"""Laws of templates, and of patches of the floor."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -5,7 +7,10 @@ import pytest
 from scipy.special import erf
 
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
-from sonar_graph.sonar.templates import Templates, material_radius_m
+from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar.templates import PolarGrid, Templates, material_radius_m
+
+from .polar_images import AZIMUTHS_RAD, HEIGHT_M, RANGES_M, floor_points, level_R_sonar
 
 
 def half_plane(level_db: float = 10.0) -> LandmarkDesign:
@@ -49,6 +54,9 @@ def test_cells_are_those_of_a_disc_with_a_margin_around_the_largest_design_but_f
     assert radius_m - 0.01 < away_m.max() <= radius_m
     area_m2 = np.pi * (material_m**2 + 2 / 3 * (radius_m**2 - material_m**2))  # a third of the ring is behind
     assert len(away_m) == pytest.approx(area_m2 / 0.01**2, rel=0.03)
+    x, _ = places_m(templates).T
+    assert away_m[x > 0.51 * away_m].max() <= material_m
+    assert margin_m == 0 or away_m[x < 0.49 * away_m].max() > material_m + 0.03
 
 
 def test_material_ends_where_the_mask_ends():
@@ -57,16 +65,49 @@ def test_material_ends_where_the_mask_ends():
     assert material_radius_m(LandmarkDesign(1, "dot", 1.0, mask)) == pytest.approx(np.hypot(0.305, 0.005), abs=1e-9)
 
 
-def test_designs_that_look_alike_have_templates_each():
-    disc = DEFAULT_DESIGNS[0]
+def test_headings_that_look_alike_are_one_template_and_designs_that_do_are_not():
+    disc, square = DEFAULT_DESIGNS[:2]
     twin = LandmarkDesign(9, "twin", disc.size_m, disc.mask)
-    assert np.bincount(Templates.of([disc, twin], 0.02, 0.0, 0.01).design).tolist() == [1, 1]
+    assert np.bincount(Templates.of([disc, twin, square], 0.015, 0.03, 0.01).design).tolist() == [1, 1, 12]
 
 
-def test_floor_behind_a_landmark_is_not_compared():
-    templates = Templates.of(DEFAULT_DESIGNS, 0.01, 0.05, 0.01)
-    x, y = places_m(templates).T
-    away_m = np.hypot(x, y)
-    material_m = max(map(material_radius_m, DEFAULT_DESIGNS))
-    assert away_m[x > 0.51 * away_m].max() <= material_m
-    assert away_m[x < 0.49 * away_m].max() > material_m + 0.03
+def test_patch_shows_what_a_search_along_rays_finds():
+    rotation = level_R_sonar(np.radians(29), np.radians(3))
+    xy, lit = floor_points(rotation)
+    grid, view = PolarGrid(RANGES_M, AZIMUTHS_RAD), FloorView(rotation, HEIGHT_M)
+    for axis in range(2):
+        image = np.where(lit, 100 * xy[..., axis], 0).astype(np.float32)
+        patch = grid.patch(image, view, np.array([1.75, 0.02]), 21, 0.015)
+        assert (patch.seen == 1).all()
+        expected = np.array([1.75, 0.02])[axis] + 0.015 * (np.arange(21) - 10)
+        shown = patch.level_db / 100
+        np.testing.assert_allclose(
+            shown, np.broadcast_to(expected[:, None] if axis == 0 else expected, shown.shape), atol=2e-3
+        )
+
+
+def test_order_of_beams_does_not_matter():
+    rotation, rng = level_R_sonar(), np.random.default_rng(0)
+    image = rng.normal(size=(96, 512)).astype(np.float32)
+    view, centre = FloorView(rotation, HEIGHT_M), np.array([1.7, 0.0])
+    left = PolarGrid(RANGES_M, AZIMUTHS_RAD).patch(image, view, centre, 21, 0.015)
+    right = PolarGrid(RANGES_M, AZIMUTHS_RAD[::-1]).patch(image[::-1].copy(), view, centre, 21, 0.015)
+    np.testing.assert_allclose(left.level_db, right.level_db, atol=1e-4)
+
+
+def test_a_point_is_seen_when_all_bins_of_its_cell_are_in_the_image():
+    """A fine grid over the far end, and one over the near end."""
+    view, cell_m = FloorView(level_R_sonar(), HEIGHT_M), 0.004
+    bin_m = RANGES_M[1] - RANGES_M[0]
+    grid, image = PolarGrid(RANGES_M, AZIMUTHS_RAD), np.ones((96, 512), np.float32)
+    for end_m in (RANGES_M[0], RANGES_M[-1]):
+        centre = np.array([np.sqrt(end_m**2 - HEIGHT_M**2), 0.0])
+        patch = grid.patch(image, view, centre, 41, cell_m)
+        x = centre[0] + cell_m * (np.arange(41) - 20)
+        y = cell_m * (np.arange(41) - 20)
+        r = np.sqrt(x[:, None] ** 2 + y**2 + HEIGHT_M**2)
+        bins = RANGES_M[0] + bin_m * np.arange(-60, 572)
+        covered = np.abs(bins - r[..., None]) < cell_m / 2
+        outside = covered[..., [*range(60), *range(572, 632)]].any(axis=2)
+        np.testing.assert_array_equal(patch.seen, ~outside)
+        np.testing.assert_allclose(patch.level_db, patch.seen, atol=1e-6)

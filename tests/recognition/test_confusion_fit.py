@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS
 from sonar_graph.errors import CalibrationError
 from sonar_graph.logs.reading import read_log
-from sonar_graph.recognition.calibrate import (
+from sonar_graph.recognition.confusion_fit import (
     NO_LABEL,
     NONE,
     LabelledSightings,
@@ -97,7 +97,7 @@ def test_true_ranges_and_azimuths_are_those_of_the_simulator(lane, second: int):
 def few_frames_are_enough():
     """A lane is shorter than what one would calibrate on."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sonar_graph.recognition.calibrate.LEAST_FRAMES", 8)
+        patch.setattr("sonar_graph.recognition.confusion_fit.LEAST_FRAMES", 8)
         yield
 
 

@@ -1,3 +1,5 @@
+"""Laws of tracks: existence, association, and the filter of points at rest."""
+
 from __future__ import annotations
 
 import gtsam
@@ -19,7 +21,6 @@ AREA = float(np.prod(WINDOW[:, 1] - WINDOW[:, 0]))
 _mixing = np.random.default_rng(11).normal(size=(6, 6)) * 0.02
 CORRELATED = _mixing @ _mixing.T
 """Covariance of a step whose rotation and translation are wrong together."""
-ahead = st.lists(st.tuples(st.floats(1.3, 2.5), st.floats(-0.24, 0.24)), max_size=6)
 
 
 def moved_by(x=0.0, y=0.0, yaw=0.0):
@@ -35,39 +36,31 @@ def run(tracker, frames, step=STILL):
     ]
 
 
-@given(st.lists(ahead, min_size=1, max_size=5))
-def test_rows_of_the_association_are_probabilities(frames):
-    for found in run(Tracker(), frames):
+def track_at(q, P) -> TrackStates:
+    return TrackStates(np.array([0]), np.array([q]), np.array([P]), np.array([0.5]), np.array([1]))
+
+
+@given(st.lists(st.integers(0, 6), min_size=1, max_size=5), st.integers(0, 2**32 - 1), st.booleans())
+def test_the_association_is_a_distribution_and_forgets_the_order_of_candidates(counts, seed, is_crowded):
+    """Places are drawn and not chosen: between two candidates equally far from a track there is no better one."""
+    rng, (r, a) = np.random.default_rng(seed), (((1.8, 2.0), 0.06) if is_crowded else ((1.3, 2.5), 0.24))
+    frames = [list(zip(rng.uniform(*r, n), rng.uniform(-a, a, n), strict=True)) for n in counts]
+    shuffled = [[seen[i] for i in rng.permutation(len(seen))] for seen in frames]
+    pairs = list(zip(run(Tracker(), frames), run(Tracker(), shuffled), strict=True))
+    for found, _ in pairs:
         assert found.matrix.shape == (len(found.track_ids), len(found.previous_ids) + 1)
         assert (found.matrix >= 0).all()
         assert np.allclose(found.matrix.sum(axis=1), 1.0)
         assert ((found.existence >= 0) & (found.existence <= 1)).all()
-
-
-@given(st.lists(st.integers(0, 6), min_size=2, max_size=5), st.integers(0, 2**32 - 1))
-def test_only_a_track_that_starts_can_be_new(counts, seed):
-    """Candidates crowd in a few decimetres, so that they may be of several tracks."""
-    rng = np.random.default_rng(seed)
-    frames = [list(zip(rng.uniform(1.8, 2.0, n), rng.uniform(-0.06, 0.06, n), strict=True)) for n in counts]
-    for found in run(Tracker(), frames):
         goes_on = np.isin(found.track_ids, found.previous_ids)
-        assert (found.matrix[goes_on, -1] == 0).all()
+        assert (found.matrix[goes_on, -1] == 0).all()  # only a track that starts can be new
         assert (found.matrix[~goes_on, -1] > 0).all()
-
-
-@given(st.lists(st.integers(0, 6), min_size=1, max_size=4), st.integers(0, 2**32 - 1))
-def test_the_order_of_candidates_does_not_matter(counts, seed):
-    """Places are drawn and not chosen: between two candidates equally far from a track there is no better one."""
-    rng = np.random.default_rng(seed)
-    frames = [list(zip(rng.uniform(1.3, 2.5, n), rng.uniform(-0.24, 0.24, n), strict=True)) for n in counts]
-    shuffled = [[seen[i] for i in rng.permutation(len(seen))] for seen in frames]
-
-    def by_place(found):
-        order = np.argsort(found.position_m[:, 1])
-        return found.position_m[order], found.existence[order], found.matrix[order, -1]
-
-    one, other = run(Tracker(), frames)[-1], run(Tracker(), shuffled)[-1]
-    for left, right in zip(by_place(one), by_place(other), strict=True):
+    one, other = (
+        (found.position_m[order], found.existence[order], found.matrix[order, -1])
+        for found in pairs[-1]
+        for order in [np.argsort(found.position_m[:, 1])]
+    )
+    for left, right in zip(one, other, strict=True):
         assert np.allclose(left, right)
 
 
@@ -100,47 +93,26 @@ def test_existence_is_the_ratio_of_densities_by_hand():
     assert found.position_m[0] == pytest.approx([2.01, 0.0, 0.0], abs=1e-9)
 
 
-def test_a_missed_track_loses_existence_as_bayes_says():
-    tracker = Tracker(TrackingParams(lifetime_s=1e12))
-    before = run(tracker, [[(1.9, 0.0)]])[-1].existence[0]
-    found = tracker.step(candidates_at([], []), STILL, 2 * FRAME_NS)
-    assert found.existence[0] == pytest.approx(before * 0.1 / (1 - before + before * 0.1), rel=1e-6)
-    assert found.matrix.tolist() == [[1.0, 0.0]]
-    assert found.candidate.tolist() == [-1]
+@pytest.mark.parametrize(
+    ("range_m", "frames", "lifetime_s", "elapsed_s", "missed"),
+    [(1.9, 1, 1e12, 0.1, 0.1), (1.26, 3, 1e12, 0.1, 0.55), (1.9, 1, 10.0, 10.0, 0.1)],
+    ids=["inside", "on the edge: missed with half the probability", "after a lifetime"],
+)
+def test_a_missed_track_loses_existence_as_bayes_says(range_m, frames, lifetime_s, elapsed_s, missed):
+    tracker = Tracker(TrackingParams(lifetime_s=lifetime_s, least_existence=0.0))
+    before = run(tracker, [[(range_m, 0.0)]] * frames)[-1].existence[0]
+    found = tracker.step(candidates_at([], []), STILL, frames * FRAME_NS + round(elapsed_s * 1e9))
+    faded = before * np.exp(-elapsed_s / lifetime_s)
+    assert found.existence[0] == pytest.approx(faded * missed / (1 - faded + faded * missed), rel=1e-4)
+    assert (found.matrix.tolist(), found.candidate.tolist()) == ([[1.0, 0.0]], [-1])
+    assert found.frames_seen.tolist() == [frames]
 
 
-def test_existence_fades_with_time_and_frames_are_counted_where_it_was_seen():
-    """After a lifetime of 10 s a third is left, before the frame is looked at."""
-    tracker = Tracker(TrackingParams(lifetime_s=10.0, least_existence=0.0))
-    before = run(tracker, [[(1.9, 0.0)]])[-1].existence[0]
-    found = tracker.step(candidates_at([], []), STILL, FRAME_NS + 10 * 10**9)
-    faded = before * np.exp(-1)
-    assert found.existence[0] == pytest.approx(faded * 0.1 / (1 - faded + faded * 0.1), rel=1e-6)
-    assert found.frames_seen.tolist() == [1]
-
-
-def test_a_candidate_beyond_the_gate_is_of_no_track():
-    """18 cm are 4.2 deviations of the innovation; 14 cm are 3.3."""
-    for off_m, is_inside in ((0.18, False), (0.14, True)):
-        tracker = Tracker()
-        run(tracker, [[(2.0, 0.0)]])
-        found = tracker.step(candidates_at([2.0 + off_m], [0.0]), STILL, 2 * FRAME_NS)
-        row = int(np.flatnonzero(found.candidate == 0)[0])
-        assert bool(found.matrix[row, 0] > 0) == is_inside
-
-
-def test_a_new_track_is_as_uncertain_as_its_candidate_and_its_elevation():
-    found = Tracker().step(candidates_at([2.0], [0.0]), None, FRAME_NS)
-    assert np.allclose(found.position_cov[0], np.diag([0.03**2, (2 * 0.015) ** 2, (2 * 0.07) ** 2]))
-
-
-def test_a_covariance_turns_with_the_sonar_and_drift_adds_to_it():
-    P = np.diag([1e-3, 2e-3, 4e-3])
-    tracks = TrackStates(np.array([0]), np.array([[2.0, 0.0, 0.0]]), P[None], np.array([0.5]), np.array([1]))
-    quarter = SonarStep(gtsam.Pose3(gtsam.Rot3.Rz(np.pi / 2), np.zeros(3)), np.zeros((6, 6)))
-    found = tracks.moved(quarter, 0.1)
-    assert np.allclose(found.position_cov[0], np.diag([2e-3, 1e-3, 4e-3]) + 0.01 * np.eye(3))
-    assert np.allclose(found.position_m[0], [0.0, -2.0, 0.0])
+def test_a_track_starts_from_an_accepted_candidate_as_uncertain_as_it_and_its_elevation():
+    found = Tracker().step(candidates_at([2.0, 1.5, 2.0], [0.0, 0.1, 0.0], rejected=(0,)), None, FRAME_NS)
+    assert found.candidate.tolist() == [1, 2]
+    assert found.position_m[0] == pytest.approx(1.5 * np.array([np.cos(0.1), np.sin(0.1), 0.0]))
+    assert np.allclose(found.position_cov[1], np.diag([0.03**2, (2 * 0.015) ** 2, (2 * 0.07) ** 2]))
 
 
 def test_what_persists_becomes_certain_and_what_flickers_ends_with_its_reason():
@@ -205,44 +177,52 @@ def test_steps_join_as_samples_of_them_do():
     assert np.allclose(np.cov(np.array(tangents).T), joined.covariance, atol=0.05 * joined.covariance.max())
 
 
-def test_covariance_of_a_moved_track_is_that_of_samples():
+def test_covariance_of_a_moved_track_is_that_of_samples_and_of_its_drift():
     rng = np.random.default_rng(9)
     step = SonarStep(moved_by(0.3, 0.1, 0.4).previous_T_sonar, CORRELATED)
     q, P = np.array([2.0, 0.3, -0.2]), np.diag([1e-3, 2e-3, 4e-3])
-    tracks = TrackStates(np.array([0]), q[None], P[None], np.array([0.5]), np.array([1]))
-    found = tracks.moved(step, 0.0)
+    tracks = track_at(q, P)
+    found = tracks.moved(step, 0.02)
     points = rng.multivariate_normal(q, P, 8_000)
     noise = rng.multivariate_normal(np.zeros(6), step.covariance, 8_000)
     pairs = zip(noise, points, strict=True)
     sampled = [step.previous_T_sonar.retract(n).transformTo(p) for n, p in pairs]
     assert np.allclose(found.position_m[0], np.mean(sampled, axis=0), atol=1e-2)
-    assert np.allclose(found.position_cov[0], np.cov(np.array(sampled).T), atol=0.06 * found.position_cov.max())
+    expected = np.cov(np.array(sampled).T) + 0.02**2 * np.eye(3)
+    assert np.allclose(found.position_cov[0], expected, atol=0.06 * found.position_cov.max())
+    rested = tracks.moved(STILL, 0.02)
+    assert rested.position_cov[0] == pytest.approx(P + 0.02**2 * np.eye(3))
 
 
-def test_a_track_at_rest_grows_less_certain_by_its_drift():
-    P = np.diag([1e-2, 3e-2, 2e-2])
-    tracks = TrackStates(np.array([0]), np.array([[1.9, 0.2, -0.3]]), P[None], np.array([0.5]), np.array([1]))
-    after = tracks.moved(STILL, 0.02)
-    assert after.position_m == pytest.approx(tracks.position_m)
-    assert after.position_cov[0] == pytest.approx(P + 4e-4 * np.eye(3))
-
-
-def test_a_density_ends_at_the_gate():
-    """Inside it is the normal density, just outside 0."""
-    P = np.ascontiguousarray(CORRELATED[:3, :3])[None]
-    tracks = TrackStates(np.array([0]), np.array([[1.9, 0.2, -0.3]]), P, np.ones(1), np.ones(1, int))
-    expected = Expected.of(tracks, np.diag([9e-4, 2e-4]))
-    along = np.linalg.cholesky(expected.S[0])[:, 0]
-    z = expected.z + np.array([2.99, 3.01])[:, None] * along
+def test_a_density_is_normal_and_ends_at_the_gate():
+    """18 cm are 4.2 deviations of the innovation of a tracker; 14 cm are 3.3."""
+    expected = Expected.of(track_at([1.9, 0.2, -0.3], CORRELATED[:3, :3]), np.diag([9e-4, 2e-4]))
+    z = expected.z + np.array([2.99, 3.01])[:, None] * np.linalg.cholesky(expected.S[0])[:, 0]
     inside, outside = expected.densities(z, 9.0)[:, 0]
     assert inside == pytest.approx(multivariate_normal(expected.z[0], expected.S[0]).pdf(z[0]), rel=1e-9)
     assert outside == 0
+    for off_m, is_inside in ((0.18, False), (0.14, True)):
+        tracker = Tracker()
+        run(tracker, [[(2.0, 0.0)]])
+        found = tracker.step(candidates_at([2.0 + off_m], [0.0]), STILL, 2 * FRAME_NS)
+        assert bool(found.matrix[found.candidate == 0][0, 0] > 0) == is_inside
+
+
+def test_innovations_wrap_behind_the_sonar():
+    R, tracks = np.diag([1e-4, 1e-6]), track_at([-2.0, 1e-3, 0.0], 1e-4 * np.eye(3))
+    expected = Expected.of(tracks, R)
+    turned, plain = np.array([[2.0, -np.pi + 5e-4]]), np.array([[2.0, np.pi + 5e-4]])
+    density = expected.densities(turned, 9.0)[0, 0]
+    assert density == pytest.approx(multivariate_normal(expected.z[0], expected.S[0]).pdf(plain[0]), rel=1e-9)
+    one, other = (corrected(tracks, expected, z, np.array([0]), R).position_m for z in (turned, plain))
+    assert one == pytest.approx(other, abs=1e-12)
+    assert one[0, 1] < 0  # on the other side of the axis
 
 
 def test_a_correction_is_that_of_the_information_form():
     """P^-1 grows by H^T R^-1 H; H by differences of range and azimuth."""
     q, P, R = np.array([1.9, 0.2, -0.3]), np.diag([1e-2, 3e-2, 2e-2]), np.diag([9e-4, 2e-4])
-    tracks = TrackStates(np.array([0]), q[None], P[None], np.array([0.5]), np.array([1]))
+    tracks = track_at(q, P)
     expected = Expected.of(tracks, R)
 
     def seen(point):
@@ -257,27 +237,6 @@ def test_a_correction_is_that_of_the_information_form():
     assert after.position_m[0] == pytest.approx(q + gain @ [0.02, -0.01], abs=1e-7)
 
 
-def test_innovations_wrap_behind_the_sonar():
-    R = np.diag([1e-4, 1e-6])
-    tracks = TrackStates(
-        np.array([0]), np.array([[-2.0, 1e-3, 0.0]]), 1e-4 * np.eye(3)[None], np.array([0.5]), np.array([1])
-    )
-    expected = Expected.of(tracks, R)
-    turned, plain = np.array([[2.0, -np.pi + 5e-4]]), np.array([[2.0, np.pi + 5e-4]])
-    density = expected.densities(turned, 9.0)[0, 0]
-    assert density == pytest.approx(multivariate_normal(expected.z[0], expected.S[0]).pdf(plain[0]), rel=1e-9)
-    moved = [corrected(tracks, expected, z, np.array([0]), R).position_m for z in (turned, plain)]
-    assert moved[0] == pytest.approx(moved[1], abs=1e-12)
-    assert moved[0][0, 1] < 0  # on the other side of the axis
-
-
-def test_a_track_on_the_edge_is_missed_with_half_the_probability():
-    tracker = Tracker(TrackingParams(lifetime_s=1e12))
-    before = run(tracker, [[(1.26, 0.0)]] * 3)[-1].existence[0]
-    found = tracker.step(candidates_at([], []), STILL, 4 * FRAME_NS)
-    assert found.existence[0] == pytest.approx(before * 0.55 / (1 - before + before * 0.55), rel=1e-4)
-
-
 def test_what_leaves_the_image_ends_and_is_not_held_against_it():
     tracker = Tracker(TrackingParams(lifetime_s=1e12))
     before = run(tracker, [[(1.4, 0.0)]] * 10)[-1]
@@ -286,12 +245,6 @@ def test_what_leaves_the_image_ends_and_is_not_held_against_it():
     assert out.ended_ids.tolist() == before.track_ids.tolist() or out.existence[0] > 0.99
     gone = tracker.step(candidates_at([], []), moved_by(0.3), 21 * FRAME_NS)
     assert "left the image" in out.ended_reasons + gone.ended_reasons
-
-
-def test_rejected_candidates_start_no_track_and_rows_point_into_all_of_them():
-    found = Tracker().step(candidates_at([2.0, 1.5, 1.7], [0.0, 0.1, 0.2], rejected=(0,)), None, FRAME_NS)
-    assert found.candidate.tolist() == [1, 2]
-    assert found.position_m[0] == pytest.approx(1.5 * np.array([np.cos(0.1), np.sin(0.1), 0.0]))
 
 
 def test_one_candidate_serves_one_track_and_numbers_are_not_used_twice():

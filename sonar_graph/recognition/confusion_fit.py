@@ -8,7 +8,7 @@ of the soft scores, the confusion matrix and the accuracy of range and azimuth. 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -42,44 +42,52 @@ ONE_STANDARD_ERROR_NATS = 0.5
 """Rise of the total loss at one sigma of a Gaussian likelihood."""
 
 
-@dataclass(eq=False)
-class LabelledSightings:
-    """Columns of sightings with their true classes."""
+@dataclass(frozen=True, eq=False)
+class LabelledFits:
+    """Fits of designs to patches whose class is known."""
 
-    ids: tuple[int, ...]
-    """Of the designs, in order."""
-    _correlation: list[Floats] = field(default_factory=list)
-    _visible: list[float] = field(default_factory=list)
-    _label: list[int] = field(default_factory=list)
-    _track: list[tuple[int, int]] = field(default_factory=list)
-    _error: list[tuple[float, float]] = field(default_factory=list)
+    correlation: Floats
+    """Of each design with the patch, shape (n, ids)."""
+    visible: Floats
+    """Share of the template in view, shape (n,)."""
+    label: Ints
+    """Index of the true class; the number of ids for "none of them", shape (n,)."""
+    track: Ints
+    """Track of each patch, shape (n,); frames of one track are not independent."""
+    range_azimuth_error: Floats
+    """Measured minus true (m, rad), shape (n, 2); NaN where there is no landmark."""
+
+
+class LabelledSightings:
+    """Sightings with their true classes, for designs with these identities in order."""
+
+    def __init__(self, ids: tuple[int, ...]) -> None:
+        self.ids = ids
+        self._rows: list[tuple[Floats, float, int, tuple[int, int], tuple[float, float]]] = []
 
     def add(
         self, sighting: ObjectSighting, track: tuple[int, int], ids: Ints, range_m: Floats, azimuth_rad: Floats
     ) -> None:
         """Add a sighting of a track (log, number), given the true range and azimuth of every landmark, shapes (m,)."""
-        if sighting.fit is None:
-            return
         label, at = label_of(sighting, ids, range_m, azimuth_rad)
-        if label == NO_LABEL or (label != NONE and label not in self.ids):
-            return
         known = label != NONE
-        self._track.append(track)
-        self._correlation.append(sighting.fit.correlation)
-        self._visible.append(sighting.fit.visible)
-        self._label.append(self.ids.index(label) if known else len(self.ids))
-        missed = (sighting.range_m - range_m[at], sighting.azimuth_rad - azimuth_rad[at])
-        fits = known and sighting.is_fitted
-        self._error.append(missed if fits else (np.nan, np.nan))
+        if sighting.fit is None or label == NO_LABEL or (known and label not in self.ids):
+            return
+        error = np.nan, np.nan
+        if known and sighting.is_fitted:
+            error = sighting.range_m - range_m[at], sighting.azimuth_rad - azimuth_rad[at]
+        row = self.ids.index(label) if known else len(self.ids)
+        self._rows.append((sighting.fit.correlation, sighting.fit.visible, row, track, error))
 
     def fits(self) -> LabelledFits:
         """All of them as columns."""
+        correlation, visible, label, track, error = zip(*self._rows, strict=True) if self._rows else [()] * 5
         return LabelledFits(
-            np.array(self._correlation, float).reshape(-1, len(self.ids)),
-            np.array(self._visible, float),
-            np.array(self._label, np.int64),
-            np.unique(np.reshape(self._track, (-1, 2)), axis=0, return_inverse=True)[1].ravel(),
-            np.array(self._error, float).reshape(-1, 2),
+            np.array(correlation, float).reshape(-1, len(self.ids)),
+            np.array(visible, float),
+            np.array(label, np.int64),
+            np.unique(np.reshape(track, (-1, 2)), axis=0, return_inverse=True)[1].ravel(),
+            np.array(error, float).reshape(-1, 2),
         )
 
 
@@ -162,22 +170,6 @@ def calibrate(
     names = ", ".join(path.name for path, _ in logs)
     kinds = "; ".join(dict.fromkeys(run.notes.get("ours", "recorded") for _, run in logs))
     return estimate_confusion(gathered.fits(), gathered.ids, {"logs": names, "what they are": kinds}, designs)
-
-
-@dataclass(frozen=True, eq=False)
-class LabelledFits:
-    """Fits of designs to patches whose class is known."""
-
-    correlation: Floats
-    """Of each design with the patch, shape (n, ids)."""
-    visible: Floats
-    """Share of the template in view, shape (n,)."""
-    label: Ints
-    """Index of the true class; the number of ids for "none of them", shape (n,)."""
-    track: Ints
-    """Track of each patch, shape (n,); frames of one track are not independent."""
-    range_azimuth_error: Floats
-    """Measured minus true (m, rad), shape (n, 2); NaN where there is no landmark."""
 
 
 def estimate_confusion(

@@ -1,0 +1,254 @@
+"""Laws of the identity rules, and of beliefs over tracks and places."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonar_graph.sonar.bayes import Beliefs, IdentityParams, Rule, jeffrey, news_of_motion, predict, virtual_evidence
+from sonar_graph.sonar.confusion import Confusion
+from sonar_graph.sonar.track_filter import Association
+
+RULES: list[Rule] = ["jeffrey", "virtual-evidence"]
+LIKE_1, LIKE_2 = np.array([[0.8, 0.1, 0.05, 0.05]]), np.array([[0.1, 0.8, 0.05, 0.05]])
+UNIFORM = np.full((1, 4), 0.25)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def _rows(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    return rng.dirichlet(np.ones(shape[-1]), shape[:-1])
+
+
+def _updated(rule: Rule, predicted: np.ndarray, scores: np.ndarray, confusion: np.ndarray) -> np.ndarray:
+    if rule == "jeffrey":
+        return jeffrey(predicted, scores, confusion)
+    features = confusion.shape[1]
+    return virtual_evidence(predicted, scores, confusion, np.full(features, 1 / features), np.ones(len(predicted)))
+
+
+def confusion_of(accuracy: float, classes: int = 4) -> np.ndarray:
+    wrong = (1 - accuracy) / (classes - 1)
+    return np.full((classes, classes), wrong) + np.eye(classes) * (accuracy - wrong)
+
+
+@given(seeds, st.integers(1, 5), st.integers(0, 4), st.integers(2, 6), st.integers(2, 6))
+def test_beliefs_stay_distributions(seed: int, tracks: int, before: int, classes: int, features: int):
+    rng = np.random.default_rng(seed)
+    beliefs = _rows(rng, before, classes) if before else np.empty((0, classes))
+    predicted = predict(beliefs, _rows(rng, tracks, before + 1), _rows(rng, classes), 0.01)
+    np.testing.assert_allclose(predicted.sum(axis=1), 1)
+    for rule in RULES:
+        after = _updated(rule, predicted, _rows(rng, tracks, features), _rows(rng, classes, features))
+        assert (after >= 0).all()
+        np.testing.assert_allclose(after.sum(axis=1), 1)
+
+
+@given(seeds)
+def test_renaming_identities_renames_beliefs_and_nothing_else(seed: int):
+    rng = np.random.default_rng(seed)
+    predicted, scores, confusion = _rows(rng, 3, 5), _rows(rng, 3, 4), _rows(rng, 5, 4)
+    classes, tracks = rng.permutation(5), rng.permutation(3)
+    for rule in RULES:
+        renamed = _updated(rule, predicted[tracks][:, classes], scores[tracks], confusion[classes])
+        np.testing.assert_allclose(renamed, _updated(rule, predicted, scores, confusion)[tracks][:, classes])
+
+
+@given(seeds)
+def test_rules_are_their_equations_with_an_index_for_everything(seed: int):
+    rng = np.random.default_rng(seed)
+    start, scores, C, base = _rows(rng, 3, 5), _rows(rng, 3, 4), _rows(rng, 5, 4), _rows(rng, 4)
+    weights = rng.uniform(0, 1, 3)
+    printed, ours = np.zeros_like(start), np.zeros_like(start)
+    for m, k in np.ndindex(start.shape):
+        for j in range(4):
+            printed[m, k] += C[k, j] * start[m, k] / sum(C[i, j] * start[m, i] for i in range(5)) * scores[m, j]
+        ours[m, k] = start[m, k] * sum(C[k, j] * scores[m, j] / base[j] for j in range(4)) ** weights[m]
+    np.testing.assert_allclose(jeffrey(start, scores, C), printed)
+    found = virtual_evidence(start, scores, C, base, weights)
+    np.testing.assert_allclose(found, ours / ours.sum(axis=1, keepdims=True))
+
+
+def test_both_rules_are_bayes_for_one_hot_scores():
+    rng = np.random.default_rng(0)
+    predicted, confusion = _rows(rng, 1, 4), _rows(rng, 4, 3)
+    bayes = predicted * confusion[:, 1]
+    for rule in RULES:
+        after = _updated(rule, predicted, np.array([[0.0, 1.0, 0.0]]), confusion)
+        np.testing.assert_allclose(after, bayes / bayes.sum())
+
+
+def test_both_rules_agree_on_the_first_frame_and_only_jeffrey_saturates_where_the_matrix_explains_the_scores():
+    scores, confusion = np.array([[0.55, 0.25, 0.15, 0.05]]), confusion_of(0.9)
+    theirs, ours = (_updated(rule, UNIFORM, scores, confusion) for rule in RULES)
+    np.testing.assert_allclose(theirs, ours)
+    assert theirs[0, 0] == pytest.approx(0.51)
+    for _ in range(500):
+        theirs, ours = (_updated(rule, b, scores, confusion) for rule, b in zip(RULES, (theirs, ours), strict=True))
+    np.testing.assert_allclose(theirs[0] @ confusion, scores[0], atol=1e-9)  # C' b = s
+    assert theirs.max() == pytest.approx(0.596, abs=1e-3)
+    assert ours.max() > 0.999
+
+
+def test_frames_without_information_make_jeffrey_forget():
+    sure, confusion = np.array([[0.97, 0.01, 0.01, 0.01]]), confusion_of(0.9)
+    assert jeffrey(sure, UNIFORM, confusion)[0, 0] == pytest.approx(0.827, abs=2e-3)
+    np.testing.assert_allclose(_updated("virtual-evidence", sure, UNIFORM, confusion), sure)
+
+
+@given(seeds, st.floats(0, 1), st.floats(0, 1))
+def test_order_of_frames_does_not_matter_to_virtual_evidence(seed: int, one: float, other: float):
+    rng = np.random.default_rng(seed)
+    start, confusion, base = _rows(rng, 1, 4), _rows(rng, 4, 3), _rows(rng, 3)
+    frames = [(_rows(rng, 1, 3), np.array([weight])) for weight in (one, other)]
+    ends = []
+    for order in (frames, frames[::-1]):
+        belief = start
+        for scores, weight in order:
+            belief = virtual_evidence(belief, scores, confusion, base, weight)
+        ends.append(belief)
+    np.testing.assert_allclose(*ends, atol=1e-9)
+
+
+def test_order_of_frames_matters_to_jeffrey():
+    C = confusion_of(0.9)
+    forth, back = (jeffrey(jeffrey(UNIFORM, a, C), b, C) for a, b in ((LIKE_1, LIKE_2), (LIKE_2, LIKE_1)))
+    assert abs(forth[0, 0] - back[0, 0]) > 0.2
+
+
+def test_a_missing_measurement_changes_nothing_and_an_impossible_feature_divides_nothing_by_zero():
+    predicted = _rows(np.random.default_rng(2), 2, 4)
+    for rule in RULES:
+        np.testing.assert_array_equal(_updated(rule, predicted, np.zeros((2, 4)), confusion_of(0.9)), predicted)
+    predicted, scores = np.array([[0.5, 0.5, 0.0]]), np.array([[0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(jeffrey(predicted, scores, np.eye(3)), predicted)
+    assert np.isfinite(_updated("virtual-evidence", predicted, scores, np.eye(3))).all()
+
+
+@pytest.mark.parametrize(
+    ("association", "forgetting", "expected"),
+    [
+        ([[0.0, 0.0, 1.0]], 1e-3, [0.1, 0.2, 0.7]),  # new
+        ([[1.0, 0.0, 0.0]], 0.1, [0.91, 0.02, 0.07]),  # a share returns to the belief of a new track
+        ([[0.5, 0.5, 0.0]], 0.0, [0.5, 0.5, 0.0]),  # of either track before
+    ],
+)
+def test_prediction_follows_the_association(association, forgetting, expected):
+    predicted = predict(np.eye(3)[:2], np.array(association), np.array([0.1, 0.2, 0.7]), forgetting)
+    np.testing.assert_allclose(predicted, [expected])
+
+
+def test_news_follow_from_the_autocorrelation_of_a_triangle():
+    """By numerical convolution: a lens that sends and receives weighs its aperture by a triangle."""
+    places = np.linspace(-0.5, 0.5, 2001)
+    triangle = np.maximum(0.07 - np.abs(places), 0.0)
+    autocorrelation = np.convolve(triangle, triangle, mode="same")
+    moved = np.array([0.0, 0.01, 0.03, 0.0357, 0.05, 0.07, 0.09, 0.12, 0.14])
+    expected = 1 - np.interp(moved, places, autocorrelation / autocorrelation.max()) ** 2
+    np.testing.assert_allclose(news_of_motion(moved, 0.14), expected, atol=1e-3)
+    assert news_of_motion(np.array([0.0357, 1.0, -1.0]), 0.14) == pytest.approx([0.5, 1, 1], abs=0.01)
+
+
+CONFUSION = Confusion(
+    ids=(1, 2),
+    matrix=((0.9, 0.05, 0.05), (0.05, 0.9, 0.05), (0.05, 0.05, 0.9)),
+    sharpness=20.0,
+    threshold=0.8,
+    range_sigma_m=0.01,
+    azimuth_sigma_rad=0.003,
+)
+LOOKS_LIKE_1 = np.array([[0.9, 0.05, 0.05]])
+SIDEWAYS = np.array([[0.0, 1.0, 0.0]])
+
+
+def _association(before: list[int], after: list[int]) -> Association:
+    matrix = np.array([[float(track == old) for old in before] + [float(track not in before)] for track in after])
+    n = len(after)
+    return Association(
+        0, np.array(before, int), np.array(after), matrix.reshape(n, len(before) + 1), np.zeros(n, int), np.ones(n),
+        np.tile([2.0, 0, 0], (n, 1)), np.zeros((n, 3, 3)), np.full(n, 5), np.array([], int), (),
+    )  # fmt: skip
+
+
+def _after(places: list[tuple[float, float, float] | None], rule: str = "virtual-evidence", **settings: float) -> list:
+    """Belief in landmark 1 after each frame of one track, looked at from these places; None: not looked at."""
+    params = IdentityParams.model_validate({"rule": rule} | settings)
+    beliefs, before, found = Beliefs(CONFUSION, params), [], []
+    for place in places:
+        looked = None if place is None else np.array(place)
+        found.append(float(beliefs.step(_association(before, [7]), LOOKS_LIKE_1, [looked], SIDEWAYS)[0, 0]))
+        before = [7]
+    return found
+
+
+def test_a_resting_sonar_learns_nothing_and_the_papers_rule_counts_every_frame():
+    first, *rest = _after([(0, 0, 0)] * 20)
+    assert first > 0.3
+    assert max(rest) <= first
+    theirs = _after([(0, 0, 0)] * 200, "jeffrey")
+    assert theirs[1] > theirs[0]
+    assert theirs[-1] == pytest.approx(1.0, abs=0.01)  # C' b = s is solved by b = (1, 0, 0) here
+
+
+def test_looks_from_new_places_add_up_and_old_places_are_no_news():
+    found = _after([(0, 0.07 * k, 0) for k in range(6)])
+    assert (np.diff(found) > 0).all()
+    assert found[-1] > 0.98
+    away_and_back = _after([(0, 0, 0), (0, 0.1, 0), (0, 0, 0), (0, 0.1, 0)])
+    assert away_and_back[3] <= away_and_back[1] > away_and_back[0]
+    back = [(0, 0, 0), (0, 0.14, 0), (0, 0, 0)]
+    assert (np.diff(_after(back, most_looks=1)) > 0).all()  # places beyond the limit are forgotten
+    remembered = _after(back)
+    assert remembered[2] <= remembered[1]
+
+
+def test_motion_ahead_counts_less_than_motion_to_the_side():
+    ahead, aside = (_after([(0, 0, 0), place]) for place in ((0.03, 0, 0), (0, 0.03, 0)))
+    assert ahead[0] < ahead[1] < aside[1]
+
+
+def test_hardly_any_motion_waits_until_it_adds_up():
+    """4 mm each: a hundredth of a frame; after 16 mm a seventh."""
+    found = _after([(0, 0.004 * k, 0) for k in range(6)])
+    assert found[2] <= found[1] <= found[0] < max(found[3:])
+
+
+@pytest.mark.parametrize("is_reversed", [False, True])
+def test_beliefs_follow_their_tracks(is_reversed: bool):
+    """Rows change places after the frame, or before it."""
+    beliefs, scores = Beliefs(CONFUSION), np.array([[0.9, 0.05, 0.05], [0.05, 0.9, 0.05]])
+    place, sideways = np.zeros(3), np.tile(SIDEWAYS, (2, 1))
+    first = beliefs.step(_association([], [3, 4]), scores, [place, place], sideways)
+    change = _association([4, 3], [3, 4]) if is_reversed else _association([3, 4], [4, 3])
+    after = beliefs.step(change, 0 * scores, [None, None], sideways)
+    np.testing.assert_allclose(after, first if is_reversed else first[::-1], atol=1e-3)
+
+
+def test_a_new_track_that_is_not_looked_at_has_the_prior():
+    beliefs = Beliefs(CONFUSION, IdentityParams(unknown_prior=0.6))
+    np.testing.assert_allclose(
+        beliefs.step(_association([], [7]), np.zeros((1, 3)), [None], SIDEWAYS), [[0.2, 0.2, 0.6]]
+    )
+
+
+def test_temper_is_a_share_of_the_log_odds():
+    whole, half = (_after([(0, 0, 0)], temper=temper)[0] for temper in (1.0, 0.5))
+    prior = np.log(0.25 / 0.75)
+    assert prior < np.log(half / (1 - half)) < np.log(whole / (1 - whole))
+
+
+def test_a_belief_fades_by_the_share_that_is_set_and_only_when_looked_at():
+    kept, faded = (_after([(0, 0, 0), None, (0, 1, 0)], forgetting=e) for e in (0.0, 1 - 1e-12))
+    assert kept[1] == faded[1] == pytest.approx(kept[0])
+    assert kept[2] > kept[0]
+    assert faded[2] == pytest.approx(kept[0])  # as if it were the first look
+    theirs = _after([(0, 0, 0), None, None], "jeffrey", forgetting=0.0)
+    assert theirs[1:] == pytest.approx([theirs[0]] * 2)
+
+
+def test_places_of_a_track_end_with_it():
+    beliefs = Beliefs(CONFUSION)
+    beliefs.step(_association([], [7]), LOOKS_LIKE_1, [np.zeros(3)], SIDEWAYS)
+    beliefs.step(_association([7], [8]), LOOKS_LIKE_1, [np.zeros(3)], SIDEWAYS)
+    assert list(beliefs._looks) == [8]
