@@ -76,6 +76,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sonar_graph.batch import run_suite
     from sonar_graph.calibration import Calibration
     from sonar_graph.estimator import Estimator, load_estimator
     from sonar_graph.evaluation import Comparison, RunResult, compare, run_estimator
@@ -110,12 +111,14 @@ __all__ = [
     "read_log",
     "recognise",
     "run_estimator",
+    "run_suite",
     "simulate_basin",
     "write_log",
     "write_report",
 ]
 
 _PLACES = {
+    "batch": ("run_suite",),
     "calibration": ("Calibration",),
     "estimator": ("Estimator", "load_estimator"),
     "evaluation": ("Comparison", "RunResult", "compare", "run_estimator"),
@@ -127,7 +130,7 @@ _PLACES = {
     "simulation": ("simulate_basin",),
     "states": ("DetectionLog", "Estimate", "LandmarkMap", "Trajectory"),
 }
-_ROOMS = {"navigation", "numerics", "slam", "sonar", "devices", "diagnosis", "testing", "errors", "batch"} | set(
+_ROOMS = {"navigation", "numerics", "slam", "sonar", "devices", "diagnosis", "testing", "errors"} | set(
     _PLACES
 )
 

@@ -36,7 +36,16 @@ class MapSoFar:
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """One estimator's run over one sequence. A failed run is a result too, with its reason."""
+    """One estimator's run over one sequence; a failed run is a result too, with its reason.
+
+    Examples
+    --------
+    >>> from sonar_graph import run_estimator
+    >>> from sonar_graph.testing import small_world
+    >>> result = run_estimator(small_world(), "dead-reckoning")
+    >>> result.status, len(result.causal) == len(result.smoothed)
+    ('ok', True)
+    """
 
     estimator: str
     """Entry-point name; also the run's name in tables and folders."""
@@ -134,7 +143,16 @@ class ErrorSeries:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Several runs on one sequence, with scores: the content of comparison.json and of the report."""
+    """Several runs on one sequence, with scores: the content of comparison.json and of the report.
+
+    Examples
+    --------
+    >>> from sonar_graph import compare
+    >>> from sonar_graph.testing import small_world
+    >>> comparison = compare(small_world(), ["dead-reckoning"])
+    >>> comparison.scores["dead-reckoning"]["causal.ate_raw_m"].unit
+    'm'
+    """
 
     sequence: Sequence
     instants_ns: Ints
