@@ -130,9 +130,7 @@ _PLACES = {
     "simulation": ("simulate_basin",),
     "states": ("DetectionLog", "Estimate", "LandmarkMap", "Trajectory"),
 }
-_ROOMS = {"navigation", "numerics", "slam", "sonar", "devices", "diagnosis", "testing", "errors"} | set(
-    _PLACES
-)
+_ROOMS = {"navigation", "numerics", "slam", "sonar", "devices", "diagnosis", "testing", "errors"} | set(_PLACES)
 
 
 def __getattr__(name: str) -> Any:
