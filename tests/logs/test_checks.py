@@ -1,0 +1,277 @@
+"""Checks of a log's numbers: each fault x the sentence about it, and whole logs without a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration
+from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
+from sonar_graph.errors import LogError
+from sonar_graph.logs.checks import gap_warnings, spike_warning, stamp_faults, stuck_warning
+from sonar_graph.logs.reading import require_use, unsaid_noise
+from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections
+from sonar_graph.navigation.imu_gaps import hole_ns
+
+PINGS, SAMPLES = np.arange(1500) * 0.2, np.arange(30000) * 0.01
+NAN = (np.nan,) * 3
+
+
+def stamps(times_s: Floats) -> Any:
+    return np.rint((1000.0 + times_s) * 1e9).astype(np.int64)
+
+
+def imu(times_s: Floats = SAMPLES, force: tuple[float, ...] = (0, 0, 9.8)) -> Imu:
+    return Imu(stamps(times_s), np.zeros((len(times_s), 3)), np.tile(force, (len(times_s), 1)).astype(float))
+
+
+def dvl(times_s: Floats = PINGS, partial: Any = False) -> Dvl:
+    cov = np.tile(1e-4 * np.eye(3), (len(times_s), 1, 1))
+    cov[np.broadcast_to(partial, len(times_s)), 1, 1] = UNMEASURED_M_S**2
+    return Dvl(stamps(times_s), np.ones((len(times_s), 3)), cov)
+
+
+def without(times_s: Floats, *spans_s: tuple[float, float]) -> Floats:
+    for first_s, last_s in spans_s:
+        times_s = times_s[(times_s <= first_s) | (times_s >= last_s)]
+    return times_s
+
+
+# --- gaps -----------------------------------------------------------------------------------------------------------
+
+GUESS = "the turn in between is guessed from the rates before and after"
+STILL = Calibration(imu=ImuCalibration(turn_sigma_rad_s=(0.0, 0.0, 0.0)))
+SHORT = Calibration(dvl=DvlCalibration(gap_s=1.5))
+HELD = Calibration(odometry_interpolation="hold-past")
+HOLED, LATE = imu(without(SAMPLES, (100, 110))), dvl(without(PINGS, (100, 220)))
+SLOWER = np.concatenate([SAMPLES[:10000], 100 + 0.2 * np.arange(250), 150 + SAMPLES[:15000]])
+"""100 Hz, 5 Hz for 50 s, 100 Hz: a hole until more than four of the eight intervals before are slow."""
+GAPS: dict[str, tuple[Imu, Dvl, Calibration, list[str]]] = {
+    "whole": (imu(), dvl(), Calibration(), []),
+    "bridged by force": (
+        imu(), LATE, Calibration(),
+        ["dvl: no velocity 100.000 to 220.000 s after the start: bridged by the IMU, with an error that grows fast"],
+    ),
+    "bridged by a walk": (
+        imu(force=NAN), LATE, Calibration(),
+        ["dvl: no velocity 100.000 to 220.000 s after the start, and no accelerometer: bridged by a random walk"],
+    ),
+    "few beams": (
+        imu(), dvl(PINGS, (PINGS > 100) & (PINGS < 130)), Calibration(),
+        ["dvl: too few beams for a whole velocity 100.000 to 130.000 s after the start: completed by the IMU"],
+    ),
+    "few beams first": (
+        imu(), dvl(PINGS, PINGS < 12), Calibration(),
+        ["dvl: no whole velocity until 12.000 s after the start: too few beams"],
+    ),
+    "hole": (
+        HOLED, dvl(), Calibration(),
+        [f"imu: no sample 100.000 to 110.000 s after the start: {GUESS}, with an error of imu.turn_sigma_rad_s"],
+    ),
+    "hole without turns": (
+        HOLED, dvl(), STILL,
+        [f"imu: no sample 100.000 to 110.000 s after the start: {GUESS}, and counts as measured"],
+    ),
+    "slower": (imu(SLOWER), dvl(), Calibration(), ["imu: no sample in 5 gaps of 1.0 s together, the longest"]),
+    "lost samples": (imu(without(SAMPLES, (100, 100.04))), dvl(), Calibration(), []),
+    "used part of holes": (
+        imu(without(SAMPLES, (5, 7), (9, 11), (290, 291))), dvl(PINGS[50:1449]), Calibration(),
+        ["Doppler log begins 10.0 s after the IMU", "Doppler log ends", "imu: no sample 0.000 to 1.000 s after the"],
+    ),
+    "many": (
+        imu(without(SAMPLES, *((10.0 * k, 10.1 * k) for k in range(1, 7)))), dvl(), Calibration(),
+        ["imu: no sample in 6 gaps of 2.1 s together, the longest 40.000 to 40.400, 50.000 to 50.500, 60.000 to 60.6"],
+    ),
+    "held": (HOLED, LATE, HELD, []),
+    "begins late": (
+        imu(SAMPLES[300:29000]), dvl(PINGS[:1451]), HELD,
+        ["IMU begins 3.0 s after the Doppler log; not estimated until then"],
+    ),
+    "ends early": (
+        imu(SAMPLES[:28001]), dvl(PINGS[:1451]), Calibration(),
+        ["IMU ends 10.0 s before the Doppler log; not estimated from there"],
+    ),
+    "both ends": (
+        imu(SAMPLES[:29001]), dvl(PINGS[20:1401]), Calibration(),
+        ["Doppler log begins 4.0 s after the IMU; not estimated until then",
+         "Doppler log ends 10.0 s before the IMU; not estimated from there"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("inertial", "doppler", "calibration", "expected"), GAPS.values(), ids=GAPS)
+def test_each_gap_is_named_with_its_times_and_the_assumption_in_it(
+    inertial: Imu, doppler: Dvl, calibration: Calibration, expected: list[str]
+) -> None:
+    found = list(gap_warnings(inertial, doppler, calibration))
+    assert len(found) == len(expected)
+    assert all(text.startswith(start) for text, start in zip(found, expected, strict=True))
+
+
+def apart(shift_s: float) -> Iterable[str]:
+    return gap_warnings(imu(SAMPLES[1000:20001]), dvl(10.0 + shift_s + PINGS[:951]), Calibration())
+
+
+def doppler_gap(gap_s: float) -> Iterable[str]:
+    return gap_warnings(imu(), dvl(np.concatenate([PINGS[:500], PINGS[500:] - 0.2 + gap_s])), SHORT)
+
+
+def first_interval(gap_s: float) -> Iterable[str]:
+    return gap_warnings(imu(np.concatenate([[0.0], gap_s + SAMPLES])), dvl(), Calibration())
+
+
+@pytest.mark.parametrize(
+    ("fault", "most", "more"),
+    [(apart, 1.4, 1.6), (apart, -1.4, -1.6), (doppler_gap, 1.4, 1.6), (first_interval, 0.9, 1.1)],
+)  # fmt: skip
+def test_a_gap_begins_at_its_limit(fault: Callable[[float], Iterable[str]], most: float, more: float) -> None:
+    assert (any(fault(most)), any(fault(more))) == (False, True)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_holes_named_are_those_that_estimators_count_with(seed: int) -> None:
+    """Intervals of all sizes, from the very first on; all told by their number and sum."""
+    rng = np.random.default_rng(seed)
+    at_s = np.cumsum(np.round(10.0 ** rng.uniform(-2.3, 0.3, 60), 3))
+    rows, pings = imu(at_s), dvl(np.array([at_s[0], at_s[-1]]))
+    ns = rows.stamps_ns
+    lengths = [hole_ns(ns, len(ns), row, int(ns[row])) for row in range(1, len(ns))]
+    count, sum_s = np.count_nonzero(lengths), sum(lengths) * 1e-9
+    assert count > 3
+    found = [text for text in gap_warnings(rows, pings, Calibration()) if text.startswith("imu")]
+    assert f"in {count} gaps of {sum_s:.1f} s together" in found[0]
+
+
+# --- stamps ---------------------------------------------------------------------------------------------------------
+
+SECOND = 10**9
+EVEN = np.arange(100) * SECOND // 10 + 10**18
+FIRST = np.arange(100)
+
+
+@pytest.mark.parametrize(
+    ("stamps_ns", "log_times_ns", "expected"),
+    [
+        (EVEN, EVEN + SECOND // 20, None),
+        (FIRST * SECOND, FIRST * SECOND, None),  # recorded at 0, a stamp of 0 is right
+        (np.where(FIRST < 3, 0, EVEN), EVEN, "3 messages without a stamp: the time of recording is used"),
+        (np.where(FIRST < 1, 0, EVEN), EVEN, "1 message without a stamp"),
+        (EVEN[np.r_[:50, 52, 50:52, 53:100]], EVEN, "once backwards, by 0.2 s at most"),
+        (EVEN[np.r_[1, 0, 2:50, 51, 50, 52:100]], EVEN, "2 times backwards, by 0.1 s at most"),
+        (np.where(FIRST == 7, EVEN[6], EVEN), EVEN, "1 message with the stamp of another"),
+        (EVEN - 5 * SECOND, EVEN, "stamped 5 s before recording"),
+        (EVEN + 5 * SECOND, EVEN, "stamped 5 s after recording"),
+        (EVEN + np.where(FIRST < 60, 0, SECOND * 9 // 10), EVEN, "stamps and recording drift apart by 0.9 s"),
+    ],
+)
+def test_each_fault_of_stamps_is_told_alone(stamps_ns: Any, log_times_ns: Any, expected: str | None) -> None:
+    found = list(stamp_faults(stamps_ns, log_times_ns))
+    assert len(found) == (expected is not None)
+    assert expected is None or found[0].startswith(expected)
+
+
+# --- spikes and stuck sensors ---------------------------------------------------------------------------------------
+
+
+def turning(*changes: tuple[Any, float]) -> Floats:
+    """A turn that swells and fades, with noise; changes are added at rows and axes."""
+    yaw_rate = 0.6 * np.sin(0.009 * np.arange(3000))
+    rate = np.column_stack([np.zeros((3000, 2)), yaw_rate])
+    rate += 2e-3 * np.random.default_rng(0).standard_normal(rate.shape)
+    for where, change_rad_s in changes:
+        rate[where] += change_rad_s
+    return rate
+
+
+SHAKING = 2.0 * np.random.default_rng(3).standard_normal((3000, 3))
+
+
+@pytest.mark.parametrize(
+    ("rate", "expected"),
+    [
+        (turning(), None),
+        (turning((slice(1000, None), 3.0)), None),  # a turn that begins at once
+        (SHAKING, None),
+        (np.array([[0.0, 0, 0], [0, 0, 90]]), None),
+        (turning(((2000, 2), 30.0)), "1 angular rate stands out from both neighbours, by 30 rad/s at most, 20.000 s"),
+        (turning(((100, 0), 5.0), ((700, 0), -9.0), ((1900, 0), 7.0)), "3 angular rates stand out from both"),
+        *((turning((row, -4.0)), "1 angular rate stands out") for row in (1, 1500, 2998)),
+    ],
+)  # fmt: skip
+def test_only_single_wild_rates_are_spikes(rate: Floats, expected: str | None) -> None:
+    stamps_ns = 1_400_000_000_000_000_000 + np.arange(len(rate)) * 10_000_000
+    found = spike_warning(Imu(stamps_ns, rate, np.full(rate.shape, np.nan)))
+    assert (found or "").startswith(expected or "")
+    assert (found is None) == (expected is None)
+
+
+def moving(*stretches: tuple[slice, Any], rows: int = 300) -> Floats:
+    values = np.random.default_rng(0).standard_normal((rows, 3))
+    for where, value in stretches:
+        values[where] = value
+    return values
+
+
+ZEROS = [(slice(60 + 40 * k, 80 + 41 * k), 0.0) for k in range(5)]
+
+
+@pytest.mark.parametrize(
+    ("values", "rate_hz", "expected"),
+    [
+        (moving(), 10, []),
+        (np.zeros((1, 3)), 10, []),
+        (np.column_stack([np.zeros((300, 2)), moving()[:, 2]]), 10, []),  # a vehicle in the plane
+        (moving((slice(100, 111), 0.0)), 10, []),
+        (moving((slice(100, 104), 0.0)), 1, []),
+        (moving((slice(100, 112), 0.0)), 10, ["velocity exactly zero in 12 rows, "]),
+        (moving((slice(100, 105), 0.0)), 1, ["in 5 rows, 100.000 to 104.000 s"]),
+        (
+            moving((slice(100, 131), (0.4, 0, -0.1))), 10,
+            ["velocity the same to the last bit in 31 rows, 10.000 to 13.000 s after the first: used as measured"],
+        ),
+        (moving((slice(20), 0.0), (slice(270, 300), 0.0)), 10, ["in 50 rows, 0.000 to 1.900, 27.000 to 29.900 s"]),
+        (
+            moving((slice(10, 40), 1.0), *ZEROS), 10,
+            ["exactly zero in 110 rows of 5 stretches, the longest 14.000 to 16.100, 18.000 to 20.200, 22.000 to",
+             "and the same to the last bit in 30 rows, 1.000 to 3.900 s after the first"],
+        ),
+    ],
+)  # fmt: skip
+def test_equal_rows_of_more_than_a_second_and_five_rows_are_named(
+    values: Floats, rate_hz: float, expected: list[str]
+) -> None:
+    stamps_ns = 1_400_000_000_000_000_000 + np.rint(np.arange(len(values)) * 1e9 / rate_hz).astype(np.int64)
+    found = stuck_warning(stamps_ns, values, "velocity")
+    assert (found is not None) == bool(expected)
+    assert all(part in str(found) for part in expected)
+
+
+# --- enough for an estimator ----------------------------------------------------------------------------------------
+
+
+def test_measurements_with_which_no_estimator_could_begin_are_refused() -> None:
+    five = np.arange(5.0)
+    require_use("log.mcap", imu(five), dvl(five + 4))  # one common instant is enough
+    require_use("log.mcap", imu(five), dvl(five, five != 3))
+    spans = r"log\.mcap: IMU from 1000\.000 to 1004\.000 s, DVL from 4600\.000 to 4604\.000 s: no common time"
+    with pytest.raises(LogError, match=spans):
+        require_use("log.mcap", imu(five), dvl(five + 3600))
+    with pytest.raises(LogError, match=r"log\.mcap: DVL: too few valid beams in all 5 rows"):
+        require_use("log.mcap", imu(five), dvl(five, True))
+
+
+def test_rows_that_do_not_say_their_noise_are_counted() -> None:
+    five = np.arange(5.0)
+    doppler, depth = dvl(five), Depth(stamps(five), np.zeros(5), np.full(5, 1e-4))
+    known, ones = np.tile(np.eye(2), (5, 1, 1)), np.ones((5, 1))
+    detections = LandmarkDetections(stamps(five), np.ones(5), np.zeros(5), known, ones.astype(int), ones)
+    assert list(unsaid_noise(doppler, depth, detections)) == []
+    doppler.velocity_cov[1:3, 2, 2] = depth.variance_m2[0] = detections.range_azimuth_cov[:] = np.nan
+    assert list(unsaid_noise(doppler, depth, detections)) == [
+        "dvl: 2 of 5 rows say no covariance, dvl.velocity_sigma_m_s of the calibration count",
+        "depth: 1 of 5 rows say no covariance, depth.sigma_m of the calibration count",
+        "detections: 5 of 5 rows say no covariance, sonar.range_sigma_m and azimuth_sigma_rad of the calibration count",
+    ]

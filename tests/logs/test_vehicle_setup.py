@@ -1,0 +1,222 @@
+"""Where a calibration comes from: mountings of ``/tf_static``, the record of the log, and the user's file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonar_graph.calibration import Calibration, DepthCalibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.errors import CalibrationError, LogError
+from sonar_graph.logs.mcap.reader import scan
+from sonar_graph.logs.mcap.topic import Keep
+from sonar_graph.logs.mcap.writer import write_recording
+from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.roles import TF
+from sonar_graph.logs.vehicle_setup import (
+    METADATA,
+    PartialCalibration,
+    encode_mountings,
+    gathered,
+    mounting_of,
+    static_frames,
+)
+from sonar_graph.logs.writing import dvl_messages, imu_messages, static_message, write_log
+
+TREE_M = (1.0, 2.0, 3.0)
+FLOOR = Calibration.model_validate({"floor": {"z_m": -1, "sigma_m": 0.1}})
+
+
+def said(**values: Any) -> PartialCalibration:
+    return PartialCalibration.parse(values, "vehicle.toml")
+
+
+def written(path: Path, sequence: Any, tree: Calibration | None, record: dict[str, str] | None = None) -> Path:
+    """A log of IMU and DVL with the mountings of a calibration and a metadata record."""
+    messages = [imu_messages("/imu", sequence.imu), dvl_messages("/dvl", sequence.dvl)]
+    if tree is not None:
+        messages.insert(0, static_message("/tf_static", TF, 0, encode_mountings(tree)))
+    write_recording(path, messages, {METADATA: record} if record else {})
+    return path
+
+
+# --- mountings ------------------------------------------------------------------------------------------------------
+
+ANGLES = st.tuples(st.floats(-3, 3), st.floats(-1.5, 1.5), st.floats(-3, 3))
+OFFSETS = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-5, 5))
+
+
+@given(ANGLES, OFFSETS, OFFSETS)
+def test_mountings_survive_tf_static(
+    make_sequence: Any, tmp_path_factory: Any, rpy: tuple[float, ...], lever: tuple[float, ...], port: tuple[float, ...]
+) -> None:
+    mounting = Mounting(translation_m=lever, rpy_rad=rpy)
+    tree = Calibration(dvl=DvlCalibration(mounting=mounting), depth=DepthCalibration(port_m=port))
+    path = written(tmp_path_factory.mktemp("log") / "a.mcap", make_sequence(), tree)
+    found = read_log(path).calibration
+    assert found.dvl.mounting.pose().equals(mounting.pose(), 1e-9)
+    assert found.imu.mounting.pose().equals(gtsam.Pose3(), 1e-9)
+    assert mounting_of("depth", static_frames(scan(path, lambda _: Keep.ALL))).translation_m == port
+
+
+def test_a_frame_that_does_not_hang_on_the_body_has_no_mounting() -> None:
+    step = gtsam.Pose3(gtsam.Rot3(), np.array([1.0, 0, 0]))
+    frames = {"a": ("base_link", step), "b": ("elsewhere", step), "c": ("d", step), "d": ("c", step)}
+    assert mounting_of("a", frames) == mounting_of("/a", frames) == Mounting(translation_m=(1, 0, 0))
+    assert mounting_of("base_link", frames) == Mounting()
+    assert mounting_of("b", frames) is None
+    assert mounting_of("c", frames) is None, "a loop ends"
+
+
+def test_mountings_come_from_tf_static_through_frames_in_between(bench: Any) -> None:
+    first = bench.transform("base_link", "frame", (1, 0, 0), np.pi / 2)
+    second = bench.transform("frame", "imu_link", (0.5, 0, 0), np.pi / 2)
+    tree = ("/tf_static", "tf", [{"transforms": [second]}, {"transforms": [first]}])
+    sequence = read_log(bench.write(*bench.basics(), tree))
+    # half a metre along the frame's x, which points along the body's y
+    np.testing.assert_allclose(sequence.calibration.imu.mounting.translation_m, [1, 0.5, 0], atol=1e-12)
+    np.testing.assert_allclose(np.abs(sequence.calibration.imu.mounting.rpy_rad), [0, 0, np.pi], atol=1e-12)
+    assert sequence.calibration.dvl == Calibration().dvl
+    assert "mountings from /tf_static: imu; not in the tree" in sequence.notes["log.calibration"]
+
+
+# --- precedence -----------------------------------------------------------------------------------------------------
+
+VECTOR = st.tuples(*[st.floats(-1, 1)] * 3)
+FIELDS = {
+    "gravity_m_s2": st.floats(9, 10),
+    "use_gravity": st.booleans(),
+    "imu.gyro_bias_sigma": st.floats(0, 1),
+    "imu.mounting.translation_m": VECTOR,
+    "dvl.mounting.translation_m": VECTOR,
+    "dvl.mounting.rpy_rad": VECTOR,
+    "depth.port_m": VECTOR,
+    "start.position_m": VECTOR,
+}
+SOME = st.fixed_dictionaries({}, optional=FIELDS)
+
+
+def leaves(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    found = {}
+    for name, value in values.items():
+        found |= leaves(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return found
+
+
+def nested(flat: dict[str, Any]) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    for path, value in flat.items():
+        *sections, name = path.split(".")
+        at = tree
+        for section in sections:
+            at = at.setdefault(section, {})
+        at[name] = value
+    return tree
+
+
+@given(SOME, SOME, st.sets(st.sampled_from(["imu", "dvl", "depth", "sonar"])))
+def test_every_field_comes_from_the_first_that_says_it(
+    of_file: dict[str, Any], of_record: dict[str, Any], in_tree: set[str]
+) -> None:
+    recorded = Calibration.model_validate(nested(of_record))
+    tree = {name: Mounting(translation_m=TREE_M, rpy_rad=(0, 0, 1)) for name in in_tree}
+    found = leaves(gathered(said(**nested(of_file)), recorded, tree).model_dump())
+    expected = leaves(Calibration().model_dump())
+    for name in in_tree - {"depth"}:
+        expected |= {f"{name}.mounting.translation_m": TREE_M, f"{name}.mounting.rpy_rad": (0, 0, 1)}
+    expected |= {"depth.port_m": TREE_M} if "depth" in in_tree else {}
+    assert found == expected | of_record | of_file
+
+
+def test_a_file_goes_before_the_record_and_a_whole_calibration_before_everything(
+    make_sequence: Any, tmp_path: Path
+) -> None:
+    sequence = make_sequence()
+    write_log(tmp_path / "a.mcap", sequence)
+    assert read_log(tmp_path / "a.mcap").calibration == sequence.calibration
+    found = read_log(tmp_path / "a.mcap", calibration=said(imu={"gyro_noise_density": 0.5}, gravity_m_s2=9.7))
+    imu = sequence.calibration.imu.model_copy(update={"gyro_noise_density": 0.5})
+    assert imu.mounting != Mounting()
+    assert found.calibration == sequence.calibration.model_copy(update={"imu": imu, "gravity_m_s2": 9.7})
+    assert found.notes["log.calibration"] == (
+        "from vehicle.toml: imu.gyro_noise_density, gravity_m_s2; else from the log"
+    )
+    given = read_log(tmp_path / "a.mcap", calibration=Calibration(), name="mine")
+    assert (given.calibration, given.name) == (Calibration(), "mine")
+    assert given.notes["log.calibration"] == "given by the caller"
+
+
+def test_a_file_goes_before_tf_static(bench: Any) -> None:
+    tree = [bench.transform("base_link", "imu_link", (1, 0, 0)), bench.transform("base_link", "dvl_link", (0, 2, 0), 1)]
+    log = bench.write(*bench.basics(), ("/tf_static", "tf", [{"transforms": tree}]))
+    found = read_log(log, calibration=said(dvl={"mounting": {"translation_m": [0, 3, 0]}}))
+    assert found.calibration.imu.mounting.translation_m == (1, 0, 0)
+    assert found.calibration.dvl.mounting.translation_m == (0, 3, 0)
+    np.testing.assert_allclose(found.calibration.dvl.mounting.rpy_rad, (0, 0, 1), atol=1e-12)
+    assert found.notes["log.calibration"] == (
+        "from vehicle.toml: dvl.mounting.translation_m; else defaults; mountings from /tf_static: imu, dvl"
+    )
+
+
+def test_a_record_that_says_little_leaves_the_rest_to_tf_static(make_sequence: Any, tmp_path: Path) -> None:
+    mounting = Mounting(translation_m=TREE_M)
+    tree = Calibration(imu=ImuCalibration(mounting=mounting), dvl=DvlCalibration(mounting=mounting))
+    record = {"calibration": json.dumps({"imu": {"mounting": {"translation_m": [7, 8, 9]}}})}
+    calibration = read_log(written(tmp_path / "a.mcap", make_sequence(), tree, record)).calibration
+    assert calibration.imu.mounting.translation_m == (7, 8, 9)
+    assert calibration.dvl.mounting.translation_m == TREE_M
+
+
+def test_a_sensor_mounted_by_the_file_is_not_told_to_be_missing(bench: Any) -> None:
+    log = bench.write(*bench.basics())
+    other = said(gravity_m_s2=9.81)  # says nothing of how the instrument sits
+    for calibration, is_said in ((None, False), (said(dvl={"mounting": {"rpy_rad": [0, 0, 1]}}), True), (other, False)):
+        notes = read_log(log, calibration=calibration).notes
+        assert ("dvl (dvl_link)" in notes["log.calibration"]) is not is_said
+        assert ("z downwards" in notes.get("log.warnings", "")) is not is_said
+        assert "imu (imu_link)" in notes["log.calibration"]
+
+
+def test_a_section_is_completed_by_the_log_or_taken_away_by_false() -> None:
+    floor = gathered(said(floor={"z_m": -2}), FLOOR, {}).floor
+    assert floor is not None
+    assert (floor.z_m, floor.sigma_m) == (-2, 0.1)
+    assert gathered(said(floor=False, use_gravity=False), FLOOR, {}) == Calibration(use_gravity=False)
+    with pytest.raises(CalibrationError, match=r"^vehicle\.toml: floor\.sigma_m: is missing$"):
+        gathered(said(floor={"z_m": -2}), None, {})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"imu": {"gyro_sigma": 1}}, r"^vehicle\.toml: imu\.gyro_sigma: there is no such field"),
+        ({"floor": {"z": 1}}, r"^vehicle\.toml: .*floor\.z: there is no such field"),
+        ({"start": {"position_m": [1, 2]}}, r"start\.position_m: expected 3 values, not \[1, 2\]"),
+        ({"depth": {"sigma_m": -1}}, r"depth\.sigma_m: .* greater than 0"),
+        ({"imu": False}, "imu: "),
+    ],
+)
+def test_mistakes_are_found_before_a_log_is_read(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        said(**values)
+
+
+@pytest.mark.parametrize(
+    ("record", "error", "message"),
+    [
+        ({"calibration": "{"}, LogError, "calibration is not JSON"),
+        ({"calibration": '{"imu": {"nonsense": 1}}'}, CalibrationError, "imu.nonsense"),
+        ({"notes": "[]"}, LogError, "notes must be a JSON object"),
+    ],
+)
+def test_a_broken_metadata_record_is_named(
+    make_sequence: Any, tmp_path: Path, record: dict[str, str], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        read_log(written(tmp_path / "a.mcap", make_sequence(), None, record))
