@@ -84,20 +84,28 @@ class Bench:
         stamps = [T0_NS + i * 10**8 for i in range(samples)]
         return [("/imu", "imu", [self.imu(s) for s in stamps]), ("/dvl", "dvl", [self.dvl(s) for s in stamps])]
 
-    def write(
-        self, *entries: Entry, name: str = "log.mcap", schemas: dict[str, str] | None = None, **settings: Any
-    ) -> Path:
-        path = self._folder / name
-        with path.open("wb") as stream:
-            writer = Writer(stream, **settings)
-            for topic, kind, messages in entries:
-                text = (schemas or {}).get(kind, definition(TYPES[kind]))
-                schema = writer.register_msgdef(TYPES[kind], text)
-                for i, message in enumerate(messages):
-                    time_ns = T0_NS + i * 10**8
-                    writer.write_message(topic, schema, message, log_time=time_ns, publish_time=time_ns)
-            writer.finish()
-        return path
+    def write(self, *entries: Entry, name: str = "log.mcap", schemas: dict[str, str] | None = None) -> Path:
+        texts = schemas or {}
+        rows = [
+            (topic, TYPES[kind], messages, texts.get(kind) or definition(TYPES[kind]))
+            for topic, kind, messages in entries
+        ]
+        return write_messages(self._folder / name, rows)
+
+
+def write_messages(
+    path: Path, entries: list[tuple[str, str, list[dict[str, Any]], str]], begin_ns: int = T0_NS
+) -> Path:
+    """A log by mcap-ros2-support of topics, types, messages and definitions; ten messages a second."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        for topic, kind, messages, text in entries:
+            schema = writer.register_msgdef(kind, text)
+            for i, message in enumerate(messages):
+                time_ns = begin_ns + i * 10**8
+                writer.write_message(topic, schema, message, log_time=time_ns, publish_time=time_ns)
+        writer.finish()
+    return path
 
 
 @pytest.fixture

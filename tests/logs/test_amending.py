@@ -160,6 +160,8 @@ def test_a_topic_that_is_there_already_is_refused_unless_it_is_written_anew(tmp_
     write_amended(source, once, [landmarks(5)])
     with pytest.raises(LogError, match=r"/map .* is in the log already"):
         write_amended(once, twice, [landmarks(6)])
+    with pytest.raises(LogError, match=r"/one \(a/msg/B\) is in the log already"):  # of another type
+        write_amended(source, twice, [replace(landmarks(5), topic="/one")], anew={"/one": MAP})
     amended = write_amended(once, twice, [landmarks(6)], anew={"/map": MAP})
     assert amended.replaced == {"/map": 1}
     assert [message[0] for message in content(twice)["/map"][1:]] == [6]
@@ -169,12 +171,6 @@ def test_what_is_written_anew_is_gone_even_where_nothing_comes_in_its_place(tmp_
     write_amended(foreign_log(tmp_path / "a.mcap"), tmp_path / "once.mcap", [landmarks(5)])
     write_amended(tmp_path / "once.mcap", tmp_path / "b.mcap", [], anew={"/map": MAP})
     assert content(tmp_path / "b.mcap") == content(tmp_path / "a.mcap")
-
-
-def test_a_topic_of_another_type_is_never_replaced(tmp_path: Path) -> None:
-    source = foreign_log(tmp_path / "a.mcap")
-    with pytest.raises(LogError, match=r"/one \(a/msg/B\) is in the log already"):
-        write_amended(source, tmp_path / "b.mcap", [replace(landmarks(5), topic="/one")], anew={"/one": MAP})
 
 
 def test_a_log_is_never_written_over_itself(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -8,12 +9,18 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from sonar_graph.cli.main import main
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.logs.convert.victoria_park import read_victoria_park
 from sonar_graph.logs.inspection import LogSummary, inspect_log
+from sonar_graph.logs.mcap.reader import scan
+from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.reading import read_log
+from sonar_graph.logs.roles import ROLES, Choice, choose_topic
 from sonar_graph.logs.writing import write_log
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+
+from .conftest import TYPES
 
 
 def role(summary: LogSummary, name: str) -> tuple[str | None, str]:
@@ -36,14 +43,22 @@ def test_rates_and_gaps_come_from_the_headers(bench: Any) -> None:
 
 def test_roles_are_explained_whether_filled_or_not(bench: Any) -> None:
     imu, dvl = bench.basics()
-    poses = [bench.odometry(bench.t0_ns, 0.0)]
-    summary = inspect_log(bench.write(imu, dvl, ("/second", "imu", imu[2]), ("/odom", "odometry", poses)))
+    odometry = ("/odom", "odometry", [bench.odometry(bench.t0_ns, 0.0)])
+    path = bench.write(imu, dvl, ("/second", "imu", imu[2]), odometry)
+    summary = inspect_log(path)
     assert role(summary, "imu") == (None, "2 topics fit: /imu, /second")
     assert role(summary, "dvl") == ("/dvl", "the only marine_acoustic_msgs/msg/Dvl that fits")
     assert role(summary, "truth")[0] is None
     assert "/odom only if chosen: --topic truth=/odom" in role(summary, "truth")[1]
+    assert summary.obstacles == ("2 topics for imu (choose: --topic imu=/imu)",)
+    assert inspect_log(bench.write(odometry, name="other.mcap")).obstacles == ("no IMU", "no DVL")
     assert summary.calibration.startswith("none in the log and no /tf_static")
     assert "sonar_graph/calibration.py lists them" in summary.calibration
+    assert role(inspect_log(path, topics={"imu": "/second"}), "imu") == ("/second", "chosen by name")
+    config = LogConfig.parse({"imu": {"topic": "/imu"}, "dvl": {"use": False}}, "my.toml")
+    said = inspect_log(path, config)
+    assert role(said, "imu") == ("/imu", "chosen in my.toml")
+    assert role(said, "dvl") == (None, "switched off in my.toml")
 
 
 def test_the_roles_are_those_that_reading_uses(make_sequence: Any, tmp_path: Path) -> None:
@@ -57,14 +72,6 @@ def test_the_roles_are_those_that_reading_uses(make_sequence: Any, tmp_path: Pat
     assert summary.notes == sequence.notes
     assert summary.damage == ()
     assert summary.obstacles == ()
-
-
-def test_what_keeps_a_log_from_being_used_is_named(bench: Any) -> None:
-    imu, dvl = bench.basics()
-    missing = inspect_log(bench.write(("/odom", "odometry", [bench.odometry(bench.t0_ns, 0.0)])))
-    assert missing.obstacles == ("no IMU", "no DVL")
-    twice = inspect_log(bench.write(imu, dvl, ("/second", "imu", imu[2])))
-    assert twice.obstacles == ("2 topics for imu (choose: --topic imu=/imu)",)
 
 
 def test_mountings_in_the_log_are_mentioned(bench: Any) -> None:
@@ -101,6 +108,7 @@ def test_a_third_party_log_is_described(recordings: Path) -> None:
 def test_what_a_run_would_leave_out_and_doubt_is_told_before(bench: Any) -> None:
     imu, _ = bench.basics()
     sideways = [message | {"linear_acceleration": {"x": 0.0, "y": 9.8, "z": 0.0}} for message in imu[2]]
+    sideways[0] |= {"header": bench.imu(0)["header"]}
     dvl = ("/dvl", "dvl", [bench.dvl(bench.t0_ns + i * 10**8, velocity_mode=1 + (i == 2)) for i in range(5)])
     path = bench.write(("/imu", "imu", sideways), dvl)
     summary = inspect_log(path)
@@ -109,25 +117,9 @@ def test_what_a_run_would_leave_out_and_doubt_is_told_before(bench: Any) -> None
     assert "; ".join(summary.left_out) == notes["log.dropped"]
     assert "; ".join(summary.warnings) == notes["log.warnings"]
     assert any("gravity is felt along +y" in warning for warning in summary.warnings)
-
-
-def test_stamps_are_doubted(bench: Any) -> None:
-    imu, dvl = bench.basics()
-    unset = ("/imu", "imu", [bench.imu(0), *imu[2][1:]])
-    summary = inspect_log(bench.write(unset, dvl))
     faults = {topic.name: topic.stamp_faults for topic in summary.topics}
     assert faults["/dvl"] == ()
     assert "1 message without a stamp: the time of recording is used" in faults["/imu"]
-
-
-def test_what_the_user_says_is_what_is_inspected(bench: Any) -> None:
-    imu, dvl = bench.basics()
-    path = bench.write(imu, dvl, ("/second", "imu", imu[2]))
-    assert role(inspect_log(path, topics={"imu": "/second"}), "imu") == ("/second", "chosen by name")
-    config = LogConfig.parse({"imu": {"topic": "/imu"}, "dvl": {"use": False}}, "my.toml")
-    summary = inspect_log(path, config)
-    assert role(summary, "imu") == ("/imu", "chosen in my.toml")
-    assert role(summary, "dvl") == (None, "switched off in my.toml")
 
 
 def test_stuck_sensors_are_named(bench: Any) -> None:
@@ -147,3 +139,89 @@ def test_what_this_package_wrote_gives_no_warning(tmp_path: Path) -> None:
         assert [topic.stamp_faults for topic in summary.topics if topic.stamp_faults] == []
         assert summary.damage == ()
         assert not {"log.stamps", "log.warnings"} & read_log(tmp_path / name).notes.keys()
+
+
+# --- the log configuration to start from ---------------------------------------------------------------------------
+
+
+def choices(path: Path, config: LogConfig) -> dict[str, Choice]:
+    recording = scan(path, lambda _: Keep.STAMP)
+    return {name: choose_topic(role, recording, config) for name, role in ROLES.items()}
+
+
+def test_read_back_unchanged_it_makes_the_same_choices(bench: Any, make_sequence: Any, tmp_path: Path) -> None:
+    imu, dvl = bench.basics()
+    poses = [bench.odometry(bench.t0_ns, 0.0)]
+    pressure = ("/bar30", "pressure", [bench.pressure(bench.t0_ns, 2e5)])
+    logs = [
+        bench.write(imu, dvl, pressure, ("/odom", "odometry", poses), name="plain.mcap"),
+        bench.write(imu, dvl, ("/second", "imu", imu[2]), name="two.mcap"),
+        bench.write(imu, name="half.mcap"),
+        tmp_path / "own.mcap",
+    ]
+    write_log(logs[-1], make_sequence())
+    said = [
+        LogConfig(),
+        LogConfig.parse({"dvl": {"rotation": [1, 2, 3], "covariance": False}, "depth": {"use": False}}, "x"),
+        LogConfig.parse({"truth": {"topic": "/odom"}, "imu": {"frame_id": 'a "frame"', "stamp_offset_s": -0.04}}, "x"),
+    ]
+    for path in logs:
+        for config in said:
+            text = inspect_log(path, config).toml
+            again = LogConfig.parse(tomllib.loads(text), "again")
+            first, second = choices(path, config), choices(path, again)
+            for role in ROLES:
+                assert first[role].topic == second[role].topic
+                assert first[role].candidates == second[role].candidates
+                assert plain(first[role]) == plain(second[role])
+
+
+def plain(choice: Choice) -> object:
+    """The adapter but for its topic, which the text names and a search by type does not."""
+    return choice.adapter and choice.adapter.model_copy(update={"topic": None})
+
+
+def test_what_is_changed_in_it_counts(bench: Any) -> None:
+    path = bench.write(*bench.basics())
+    text = inspect_log(path).toml
+    assert 'rotation = "flu"' in text
+    turned = LogConfig.parse(tomllib.loads(text.replace('rotation = "flu"', 'rotation = "frd"')), "x")
+    plain, frd = read_log(path), read_log(path, config=turned)
+    assert (frd.imu.specific_force == plain.imu.specific_force * [1, -1, -1]).all()
+
+
+def test_several_topics_are_offered_and_those_whose_names_say_nothing(bench: Any) -> None:
+    imu, dvl = bench.basics()
+    poses = [bench.odometry(bench.t0_ns, 0.0)]
+    text = inspect_log(bench.write(imu, dvl, ("/second", "imu", imu[2]), ("/odom", "odometry", poses))).toml
+    assert '# [imu]  # one of\n# topic = "/imu"\n# topic = "/second"' in text
+    assert '# [truth]  # one of\n# topic = "/odom"' in text
+
+
+def test_an_unknown_type_is_proposed_with_its_fields(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = "float64 time\nfloat64[3] speed\nfloat32[] beams\n"
+    monkeypatch.setitem(TYPES, "own", "my_msgs/msg/Velocity")
+    rows = [{"time": 0.0, "speed": [1.0, 2.0, 3.0], "beams": []}] * 3
+    path = bench.write(bench.basics()[0], ("/my_dvl", "own", rows), schemas={"own": own})
+    text = inspect_log(path).toml
+    assert '# topic = "/my_dvl"\n# type = "my_msgs/msg/Velocity"\n# stamp = "log"' in text
+    assert "#   time\n#   speed[3]\n#   beams[]" in text
+    filled = "\n".join(line.removeprefix("# ") for line in text.splitlines() if "my_dvl is" not in line)
+    table = filled[filled.index("[dvl]") : filled.index("[depth]")].replace('"..."', '"speed[{}]"').format(0, 1, 2)
+    sequence = read_log(path, config=LogConfig.parse(tomllib.loads(table), "x"))
+    assert sequence.dvl.velocity.tolist() == [[1, 2, 3]] * 3
+
+
+def test_the_command_prints_what_the_option_takes(
+    bench: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = bench.write(*bench.basics())
+    with pytest.raises(SystemExit) as done:
+        main(["inspect", str(path), "--toml"])
+    assert done.value.code == 0
+    config = tmp_path / "log.toml"
+    config.write_text(capsys.readouterr().out)
+    with pytest.raises(SystemExit) as done:
+        main(["inspect", str(path), "--log-config", str(config)])
+    assert done.value.code == 0
+    assert f"chosen in {config}" in capsys.readouterr().out

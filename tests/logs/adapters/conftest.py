@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap_ros2.writer import Writer
 
 from sonar_graph.logs.cdr.definitions import definition
+from tests.logs.conftest import header, vector, write_messages
 
 T0_NS = 1_700_000_000_000_000_000
 STEP_NS = 10**8
@@ -109,25 +109,6 @@ MSG: geometry_msgs/Point
 MSG: geometry_msgs/Quaternion
 {_XYZ}float64 w
 {_VECTOR}"""
-SONAR_IMAGE = f"""std_msgs/Header header
-PingInfo ping_info
-geometry_msgs/Vector3[] beam_directions
-float32[] ranges
-SonarImageData image
-{_HEADER}{_VECTOR}{_RULE}
-MSG: marine_acoustic_msgs/PingInfo
-float32 frequency
-float32 sound_speed
-float32[] tx_beamwidths
-float32[] rx_beamwidths
-{_RULE}
-MSG: marine_acoustic_msgs/SonarImageData
-uint8 DTYPE_UINT8=0
-bool is_bigendian
-uint32 dtype
-uint32 beam_count
-uint8[] data
-"""
 OCULUS_PING = f"""std_msgs/Header header
 uint32 ping_id
 uint32 ping_firing_date
@@ -154,7 +135,6 @@ DEFINITIONS = {
     "stonefish_ros2/msg/DVL": UUV_DVL,
     "geometry_msgs/msg/TwistWithCovarianceStamped": TWIST,
     "vision_msgs/msg/Detection3DArray": DETECTIONS,
-    "marine_acoustic_msgs/msg/ProjectedSonarImage": SONAR_IMAGE,
     "oculus_interfaces/msg/Ping": OCULUS_PING,
     "provider_dvl/msg/PD0Packet": BARE_PD0,
     "std_msgs/msg/Float64": FLOAT,
@@ -166,17 +146,13 @@ class Foreign:
     """Builds logs of other people's messages."""
 
     t0_ns, step_ns = T0_NS, STEP_NS
-    water_linked = staticmethod(water_linked)
+    water_linked, vector = staticmethod(water_linked), staticmethod(vector)
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def header(self, row: int, frame_id: str = "sensor") -> dict[str, Any]:
-        ns = T0_NS + row * STEP_NS
-        return {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}, "frame_id": frame_id}
-
-    def vector(self, x: float, y: float, z: float) -> dict[str, float]:
-        return {"x": x, "y": y, "z": z}
+        return header(T0_NS + row * STEP_NS, frame_id)
 
     def imu(self, rows: int = 5, force: tuple[float, ...] = (0, 0, 9.8), rate: tuple[float, ...] = (0, 0, 0)) -> Entry:
         messages = [
@@ -195,17 +171,11 @@ class Foreign:
 
     def write(self, *entries: Entry, name: str = "log.mcap") -> Path:
         """Entries are topic, type, messages, and the definition where it is not the usual one."""
-        path = self._folder / name
-        with path.open("wb") as stream:
-            writer = Writer(stream)
-            for topic, kind, messages, *text in entries:
-                known = text[0] if text else DEFINITIONS[kind] if kind in DEFINITIONS else definition(kind)
-                schema = writer.register_msgdef(kind, known)
-                for i, message in enumerate(messages):
-                    time_ns = T0_NS + i * STEP_NS
-                    writer.write_message(topic, schema, message, log_time=time_ns, publish_time=time_ns)
-            writer.finish()
-        return path
+        rows = [
+            (topic, kind, messages, text[0] if text else DEFINITIONS.get(kind) or definition(kind))
+            for topic, kind, messages, *text in entries
+        ]
+        return write_messages(self._folder / name, rows, T0_NS)
 
     def config(self, text: str, name: str = "log.toml") -> Path:
         path = self._folder / name

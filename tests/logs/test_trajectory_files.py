@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -48,25 +49,26 @@ def test_comments_blank_lines_and_exponents_are_read(tmp_path: Path) -> None:
     assert read_tum(tmp_path / "t.tum").stamps_ns.tolist() == [1_500_000_000, 2_000_000_000]
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("1 0 0 0 0 0 0\n", "line 1: 7 values"),
-        ("1 0 0 0 0 0 0 1\n2 0 0 x 0 0 0 1\n", "line 2: .* no number"),
-        ("t 0 0 0 0 0 0 1\n", "line 1: .* no number"),
-        ("nan 0 0 0 0 0 0 1\n", "line 1: .* no number"),
-        ("2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "pose 2 is not later"),
-    ],
-)
-def test_a_line_that_is_no_pose_is_named(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "t.tum").write_text(text)
-    with pytest.raises(LogError, match=message):
-        read_tum(tmp_path / "t.tum")
+MISTAKES: list[tuple[Callable[[Path], object], str | None, str]] = [
+    (read_tum, None, "cannot be read"),
+    (read_tum, "1 0 0 0 0 0 0\n", "line 1: 7 values"),
+    (read_tum, "1 0 0 0 0 0 0 1\n2 0 0 x 0 0 0 1\n", "line 2: .* no number"),
+    (read_tum, "t 0 0 0 0 0 0 1\n", "line 1: .* no number"),
+    (read_tum, "nan 0 0 0 0 0 0 1\n", "line 1: .* no number"),
+    (read_tum, "2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "pose 2 is not later"),
+    (read_landmarks_csv, "id,x\n1,2\n", "is not a landmark table"),
+]
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(LogError, match=r"none\.tum cannot be read"):
-        read_tum(tmp_path / "none.tum")
+@pytest.mark.parametrize(("read", "text", "message"), MISTAKES)
+def test_a_file_that_is_no_table_of_poses_or_landmarks_is_named(
+    tmp_path: Path, read: Callable[[Path], object], text: str | None, message: str
+) -> None:
+    path = tmp_path / "table.txt"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(LogError, match=rf"table\.txt.* {message}"):
+        read(path)
 
 
 def test_landmarks_come_back_from_their_table(tmp_path: Path) -> None:
@@ -89,9 +91,3 @@ def test_an_empty_map_is_a_header(tmp_path: Path) -> None:
     write_landmarks_csv(tmp_path / "l.csv", LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3))))
     assert len((tmp_path / "l.csv").read_text().splitlines()) == 1
     assert len(read_landmarks_csv(tmp_path / "l.csv")) == 0
-
-
-def test_a_table_without_its_columns_is_named(tmp_path: Path) -> None:
-    (tmp_path / "l.csv").write_text("id,x\n1,2\n")
-    with pytest.raises(LogError, match=r"l\.csv is not a landmark table"):
-        read_landmarks_csv(tmp_path / "l.csv")

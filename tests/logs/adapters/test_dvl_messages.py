@@ -68,17 +68,14 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 def test_a_twist_is_a_doppler_log_where_its_name_says_so_or_it_is_chosen(foreign: Any, read: Any) -> None:
-    sequence = read(foreign.imu(), ("/dvl/twist", TWIST, twists(foreign)))
+    entry, wheels = ("/dvl/twist", TWIST, twists(foreign)), ("/wheels", TWIST, twists(foreign))
+    sequence = read(foreign.imu(), entry)
     np.testing.assert_array_equal(sequence.dvl.velocity, [VELOCITY] * 3)
     np.testing.assert_array_equal(sequence.dvl.velocity_cov, [np.diag([1.0, 2, 3])] * 3)
+    assert len(read(foreign.imu(), foreign.dvl(rows=4), entry).dvl) == 4, "a real Doppler log goes before"
     with pytest.raises(MissingTopicError, match="/wheels only if chosen: --topic dvl=/wheels"):
-        read(foreign.imu(), ("/wheels", TWIST, twists(foreign)))
-    assert len(read(foreign.imu(), ("/wheels", TWIST, twists(foreign)), topics={"dvl": "/wheels"}).dvl) == 3
-
-
-def test_a_real_doppler_log_goes_before_a_twist(foreign: Any, read: Any) -> None:
-    sequence = read(foreign.imu(), foreign.dvl(rows=4), ("/dvl/twist", TWIST, twists(foreign)))
-    assert len(sequence.dvl) == 4
+        read(foreign.imu(), wheels)
+    assert len(read(foreign.imu(), wheels, topics={"dvl": "/wheels"}).dvl) == 3
 
 
 def test_the_twist_of_odometry_is_in_the_frame_of_its_child(foreign: Any, read: Any) -> None:
@@ -120,21 +117,25 @@ def test_the_axes_of_a_driver_are_turned_into_ours(
     np.testing.assert_allclose(sequence.dvl.velocity_cov[0], R @ np.reshape(KNOWN, (3, 3)) @ R.T, atol=1e-15)
 
 
-def test_scale_turns_units_and_covariances_with_them(foreign: Any, read: Any) -> None:
-    entry = foreign.dvl(velocity=foreign.vector(1000, 2000, 3000), velocity_covar=(np.array(KNOWN) * 1e6).tolist())
-    sequence = read(foreign.imu(), entry, toml="[dvl]\nscale = 0.001")
+DEVIATIONS = np.diag(np.sqrt(np.diag(np.reshape(KNOWN, (3, 3)))))
+SQUARED = 'covariance = {meaning = "standard deviation"}'
+
+
+@pytest.mark.parametrize(
+    ("unit", "given", "toml", "expected"),
+    [
+        (1000, (np.array(KNOWN) * 1e6).tolist(), "scale = 0.001", np.reshape(KNOWN, (3, 3))),
+        (1, DEVIATIONS.ravel().tolist(), "", DEVIATIONS),
+        (1, DEVIATIONS.ravel().tolist(), SQUARED, DEVIATIONS**2),
+    ],
+)
+def test_units_and_meanings_of_a_velocity_and_its_covariance(
+    foreign: Any, read: Any, unit: float, given: list[float], toml: str, expected: np.ndarray
+) -> None:
+    entry = foreign.dvl(velocity=foreign.vector(*(unit * v for v in VELOCITY)), velocity_covar=given)
+    sequence = read(foreign.imu(), entry, toml=f"[dvl]\n{toml}")
     np.testing.assert_allclose(sequence.dvl.velocity, [VELOCITY] * 5)
-    np.testing.assert_allclose(sequence.dvl.velocity_cov, [np.reshape(KNOWN, (3, 3))] * 5)
-
-
-def test_a_standard_deviation_given_as_a_variance_is_squared(foreign: Any, read: Any) -> None:
-    deviations = np.diag([0.1, 0.2, 0.3]).ravel().tolist()
-    entry = foreign.dvl(velocity_covar=deviations)
-    assert read(foreign.imu(), entry).dvl.velocity_cov[0, 1, 1] == 0.2
-    toml = '[dvl]\ncovariance = {meaning = "standard deviation"}'
-    np.testing.assert_allclose(
-        read(foreign.imu(), entry, toml=toml).dvl.velocity_cov, [np.diag([0.01, 0.04, 0.09])] * 5
-    )
+    np.testing.assert_allclose(sequence.dvl.velocity_cov, [expected] * 5)
 
 
 @pytest.mark.parametrize(
@@ -158,7 +159,7 @@ def test_the_meaning_of_zeros_and_of_minus_one_can_be_said(
 
 
 def packets(velocities: list[list[float]]) -> tuple[str, str, list[dict[str, Any]]]:
-    rows = [{"timestamp": 1.4e15 + 1e5 * i, "range": [1.0] * 4, "velocity": v} for i, v in enumerate(velocities)]
+    rows = [{"timestamp": 0.0, "range": [1.0] * 4, "velocity": v} for v in velocities]
     return "/pd0", "provider_dvl/msg/PD0Packet", rows
 
 
@@ -166,25 +167,23 @@ TABLE = '[dvl]\ntopic = "/pd0"\ntype = "provider_dvl/msg/PD0Packet"\n'
 OF_ARRAY = TABLE + 'velocity = ["velocity[0]", "velocity[1]", "velocity[2]"]\n'
 
 
-def test_a_type_of_which_nothing_is_known_needs_only_its_fields(foreign: Any, read: Any) -> None:
-    entry = packets([[1.0, 2.0, 3.0, 0.01]] * 5)
-    sequence = read(foreign.imu(), entry, toml=OF_ARRAY + 'stamp = "log"')
-    np.testing.assert_array_equal(sequence.dvl.velocity, [VELOCITY] * 5)
-    assert np.isnan(sequence.dvl.velocity_cov).all()
-    assert sequence.dvl.stamps_ns.tolist() == sequence.imu.stamps_ns.tolist()
-
-
-def test_a_stamp_can_be_a_number_of_any_unit_and_be_shifted(foreign: Any, read: Any) -> None:
-    toml = OF_ARRAY + 'stamp = "timestamp"\nstamp_unit_s = 1e-6\nstamp_offset_s = 3e8'
-    stamps_ns = read(foreign.imu(), packets([[1.0, 2.0, 3.0, 0.0]] * 3), toml=toml).dvl.stamps_ns
-    assert (stamps_ns - foreign.t0_ns).tolist() == [0, 10**8, 2 * 10**8]
-
-
-def test_a_stamp_in_seconds_keeps_its_fraction(foreign: Any, read: Any) -> None:
-    topic, kind, rows = packets([[1.0, 2.0, 3.0, 0.0]] * 3)
-    rows = [row | {"timestamp": foreign.t0_ns / 1e9 + 0.25 * i} for i, row in enumerate(rows)]
-    stamps_ns = read(foreign.imu(), (topic, kind, rows), toml=OF_ARRAY + 'stamp = "timestamp"').dvl.stamps_ns
-    assert (stamps_ns - foreign.t0_ns).tolist() == [0, 250_000_000, 500_000_000]
+@pytest.mark.parametrize(
+    ("stamp", "first", "step", "steps_ns"),
+    [
+        ('"log"', 0.0, 0.0, 10**8),
+        ('"timestamp"\nstamp_unit_s = 1e-6\nstamp_offset_s = 3e8', 1.4e15, 1e5, 10**8),
+        ('"timestamp"', 1.7e9, 0.25, 250_000_000),
+    ],
+)
+def test_a_type_of_which_nothing_is_known_needs_only_its_fields_and_a_stamp_of_any_unit(
+    foreign: Any, read: Any, stamp: str, first: float, step: float, steps_ns: int
+) -> None:
+    topic, kind, rows = packets([[1.0, 2.0, 3.0, 0.01]] * 3)
+    rows = [row | {"timestamp": first + step * i} for i, row in enumerate(rows)]
+    dvl = read(foreign.imu(), (topic, kind, rows), toml=f"{OF_ARRAY}stamp = {stamp}").dvl
+    np.testing.assert_array_equal(dvl.velocity, [VELOCITY] * 3)
+    assert np.isnan(dvl.velocity_cov).all()
+    assert (dvl.stamps_ns - foreign.t0_ns).tolist() == [0, steps_ns, 2 * steps_ns]
 
 
 @pytest.mark.parametrize(
@@ -208,23 +207,16 @@ def janus(tilt_deg: float, azimuth_deg: list[float]) -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize("lost", [None, 2])
-def test_a_velocity_is_solved_from_its_beams(foreign: Any, read: Any, lost: int | None) -> None:
-    along = (janus(30, [45, -45, -135, 135]) @ VELOCITY).tolist()
-    if lost is not None:
-        along[lost] = float("nan")
-    geometry = 'beams = {velocity = "velocity", tilt_deg = 30, azimuth_deg = [45, -45, -135, 135]}\nstamp = "log"'
-    found = read(foreign.imu(), packets([along] * 3), toml=TABLE + geometry).dvl.velocity
-    np.testing.assert_allclose(found, [VELOCITY] * 3, atol=1e-12)
-
-
-def test_two_beams_are_no_velocity(foreign: Any, read: Any) -> None:
-    rows = [[1.0, 1.0, float("nan"), float("nan")], [1.0, 1.0, 1.0, 1.0]]
-    geometry = 'beams = {velocity = "velocity", tilt_deg = 30, azimuth_deg = [45, -45, -135, 135]}\nstamp = "log"'
-    assert len(read(foreign.imu(), packets(rows), toml=TABLE + geometry).dvl) == 1
-
-
 GEOMETRY = "tilt_deg = 30, azimuth_deg = [45, -45, -135, 135]"
+OF_BEAMS = TABLE + f'beams = {{velocity = "velocity", {GEOMETRY}}}\nstamp = "log"'
+
+
+def test_a_velocity_is_solved_from_three_beams_or_more(foreign: Any, read: Any) -> None:
+    rows = np.tile(janus(30, [45, -45, -135, 135]) @ VELOCITY, (3, 1))
+    rows[1, 2] = rows[2, 1:3] = np.nan
+    sequence = read(foreign.imu(), packets(rows.tolist()), toml=OF_BEAMS)
+    np.testing.assert_allclose(sequence.dvl.velocity, [VELOCITY] * 2, atol=1e-12)
+    assert sequence.notes["log.dropped"] == "dvl: 1 with fewer than 3 valid beams"
 
 
 def test_beams_of_known_noise_count_even_alone(foreign: Any, read: Any) -> None:

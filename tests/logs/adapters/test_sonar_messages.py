@@ -9,7 +9,7 @@ import pytest
 from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters.log_config import read_log_config
 from sonar_graph.logs.inspection import inspect_log
-from sonar_graph.logs.reading import describe_frames, read_sonar_frames
+from sonar_graph.logs.reading import read_sonar_frames
 from sonar_graph.measurements import SonarFrames
 
 IMAGE, PING = "marine_acoustic_msgs/msg/ProjectedSonarImage", "oculus_interfaces/msg/Ping"
@@ -48,12 +48,10 @@ def test_the_order_that_the_definition_states_can_be_chosen(foreign: Any) -> Non
     assert (frames_in(path)[0].intensity[0] != POLAR).any()
 
 
-@pytest.mark.parametrize(("dtype", "kind"), [(2, "<u2"), (4, "<u4"), (8, "<f4"), (9, "<f8")])
-def test_samples_have_the_type_that_the_message_states(foreign: Any, dtype: int, kind: str) -> None:
-    for order in "<>":
-        data = POLAR.T.astype(order + kind[1:]).tobytes()
-        path = foreign.write(("/sonar", IMAGE, [image(foreign, 0, data, dtype, big=order == ">")]))
-        np.testing.assert_array_equal(frames_in(path)[0].intensity[0], POLAR)
+@pytest.mark.parametrize(("dtype", "kind"), [(2, "u2"), (9, "f8")])
+def test_samples_may_be_big_endian(foreign: Any, dtype: int, kind: str) -> None:
+    path = foreign.write(("/sonar", IMAGE, [image(foreign, 0, POLAR.T.astype(f">{kind}").tobytes(), dtype, big=True)]))
+    np.testing.assert_array_equal(frames_in(path)[0].intensity[0], POLAR)
 
 
 def test_blocks_are_split_where_the_range_changes(foreign: Any) -> None:
@@ -126,11 +124,6 @@ def test_of_two_sonars_one_must_be_chosen(foreign: Any) -> None:
 
 def test_a_log_without_sonar_has_no_frames(foreign: Any) -> None:
     assert frames_in(foreign.write(foreign.imu(), foreign.dvl())) == []
-
-
-def test_frames_are_described_by_size_and_sector(foreign: Any) -> None:
-    (frames,) = frames_in(foreign.write(("/oculus", PING, [ping(foreign, 0, gains=None)])))
-    assert describe_frames(frames) == "3 beams x 4 bins of uint8, azimuth -30.0° to 30.0°, 0.25 m to 1.75 m"
 
 
 def test_inspect_describes_the_sonar_and_says_what_is_wrong_with_it(foreign: Any) -> None:

@@ -1,18 +1,205 @@
+"""Messages and layouts for viewers, as other libraries decode them."""
+
 from __future__ import annotations
 
 import json
 import re
+import struct
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from ruamel.yaml import YAML
+from scipy.spatial.transform import Rotation
 
+from sonar_graph.logs.mcap.writer import write_recording
 from sonar_graph.logs.result_log import write_result
-from sonar_graph.logs.viewer_messages import Layer, Scene, foxglove_layout
+from sonar_graph.logs.viewer_messages import (
+    GREY,
+    PICTURES,
+    UNKNOWN_DIAMETER_M,
+    Layer,
+    Picture,
+    Scene,
+    ellipsoids,
+    foxglove_layout,
+    landmark_cloud,
+    landmark_markers,
+    picture_messages,
+    position_ellipsoids,
+)
 from sonar_graph.states import LandmarkMap, Trajectory
+
+Decode = Callable[[Path], dict[str, list[Any]]]
+
+
+# --- ellipsoids -----------------------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 10_000))
+def test_points_on_the_drawn_ellipsoid_have_the_same_mahalanobis_distance(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(1, 3, 3)) + 2 * np.eye(3)
+    covariances = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3)
+    diameters, quaternions = ellipsoids(covariances)
+    sphere = rng.normal(size=(50, 3))
+    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+    points = Rotation.from_quat(quaternions[0]).apply(sphere * diameters[0] / 2)
+    squared = np.einsum("ni,ij,nj->n", points, np.linalg.inv(covariances[0]), points)
+    np.testing.assert_allclose(squared, 7.814727903251179)  # chi-square table: 3 degrees of freedom, 0.95
+
+
+def test_unknown_covariances_are_small_spheres_and_known_ones_beside_them_stay() -> None:
+    diameters, _ = ellipsoids(np.array([np.full((3, 3), np.nan), np.eye(3)]))
+    np.testing.assert_allclose(diameters[0], UNKNOWN_DIAMETER_M)
+    np.testing.assert_allclose(diameters[1], 2 * np.sqrt(7.814727903251179))
+
+
+def test_a_landmark_known_exactly_can_still_be_seen() -> None:
+    assert (ellipsoids(np.zeros((1, 3, 3)))[0] > 0).all()
+
+
+def test_namespaces_tell_ellipsoids_that_mean_something_from_those_that_do_not(tmp_path: Path, decoded: Decode) -> None:
+    covariances = np.array([np.diag([0.01, 0.04, 0.09]), np.full((3, 3), np.nan)])
+    landmarks = LandmarkMap(np.array([7, 2**40]), np.array([[1.0, 2, 3], [4, 5, 6]]), covariances)
+    write_recording(tmp_path / "a.mcap", [landmark_markers("/landmarks", landmarks, 1, GREY, 0.5)], {})
+    ((array,),) = decoded(tmp_path / "a.mcap").values()
+    assert [(m.ns, m.text) for m in array.markers] == [
+        ("ellipsoid_95_percent", ""),
+        ("covariance_unknown", ""),
+        ("identity", "7"),
+        ("identity", "1099511627776"),
+    ]
+    assert [(m.pose.position.z, m.scale.z) for m in array.markers[2:]] == [(3.5, 0.5), (6.5, 0.5)]
+    assert {(m.header.frame_id, m.action, m.lifetime.sec) for m in array.markers} == {("map", 0, 0)}
+
+
+def test_a_drawn_ellipsoid_lies_as_its_covariance_does(tmp_path: Path, decoded: Decode) -> None:
+    """A stick of 1 m standard deviation along (1, 1, 0), thin across; by hand, its longest axis lies there."""
+    along, across = np.array([1.0, 1, 0]) / np.sqrt(2), np.array([1.0, -1, 0]) / np.sqrt(2)
+    covariance = np.outer(along, along) + 0.04 * np.outer(across, across) + 0.01 * np.diag([0, 0, 1.0])
+    landmarks = LandmarkMap(np.array([1]), np.zeros((1, 3)), covariance[None])
+    write_recording(tmp_path / "a.mcap", [landmark_markers("/landmarks", landmarks, 1, GREY, 0.5)], {})
+    ((array,),) = decoded(tmp_path / "a.mcap").values()
+    marker = array.markers[0]
+    diameters = np.array([marker.scale.x, marker.scale.y, marker.scale.z])
+    q = marker.pose.orientation
+    axes = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+    longest = axes[:, np.argmax(diameters)]
+    np.testing.assert_allclose(np.abs(longest @ along), 1)
+    np.testing.assert_allclose(np.sort(diameters), 2 * 2.7954834829151074 * np.array([0.1, 0.2, 1.0]))
+
+
+def test_the_ellipsoid_of_a_pose_holds_95_percent_of_sampled_positions(tmp_path: Path, decoded: Decode) -> None:
+    """Its covariance is in the body's axes, the ellipsoid is drawn in those of the map."""
+    rng = np.random.default_rng(5)
+    root = rng.normal(size=(3, 6, 6))
+    covariances = root @ root.transpose(0, 2, 1)
+    covariances[1] = np.nan
+    rotations = Rotation.random(3, rng)
+    positions = rng.normal(size=(3, 3))
+    trajectory = Trajectory(np.array([10, 20, 30]), positions, rotations.as_quat(), covariances)
+    write_recording(tmp_path / "a.mcap", [position_ellipsoids("/pose", trajectory, GREY)], {})
+    (arrays,) = decoded(tmp_path / "a.mcap").values()
+    assert [array.markers[0].header.stamp.nanosec for array in arrays] == [10, 30]
+    for array, row in zip(arrays, (0, 2), strict=True):
+        marker, q = array.markers[0], array.markers[0].pose.orientation
+        samples = rng.multivariate_normal(np.zeros(6), covariances[row], 50_000)[:, 3:]
+        sampled = rotations[row].apply(samples) + positions[row]
+        centre = np.array([marker.pose.position.x, marker.pose.position.y, marker.pose.position.z])
+        radii = np.array([marker.scale.x, marker.scale.y, marker.scale.z]) / 2
+        within = Rotation.from_quat([q.x, q.y, q.z, q.w]).inv().apply(sampled - centre) / radii
+        assert abs(np.mean(np.sum(within**2, axis=1) < 1) - 0.95) < 0.005
+
+
+# --- cloud and pictures ----------------------------------------------------------------------------------------------
+
+IDS = [3, 2**40 + 1]
+POSITIONS = np.array([[1.5, -2.25, 0.1], [4000.0, 5.0, -6.0]])
+COVARIANCES = np.array([[[1, 0.1, 0.2], [0.1, 2, 0.3], [0.2, 0.3, 3]], np.full((3, 3), np.nan)])
+FORMATS = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}
+"""By sensor_msgs/PointField."""
+
+
+@pytest.fixture
+def cloud(tmp_path: Path, decoded: Decode) -> Any:
+    landmarks = LandmarkMap(np.array(IDS), POSITIONS, COVARIANCES)
+    write_recording(tmp_path / "cloud.mcap", [landmark_cloud("/cloud", landmarks, 5)], {})
+    (message,) = decoded(tmp_path / "cloud.mcap")["/cloud"]
+    return message
+
+
+def values(cloud: Any, point: int) -> dict[str, float]:
+    """As a reader that follows the fields sees a point."""
+    start = point * cloud.point_step
+    data = bytes(cloud.data)
+    return {
+        field.name: struct.unpack_from("<" + FORMATS[field.datatype], data, start + field.offset)[0]
+        for field in cloud.fields
+    }
+
+
+def test_a_reader_of_the_fields_finds_position_identity_and_covariance(cloud: Any) -> None:
+    first, second = values(cloud, 0), values(cloud, 1)
+    assert [first[name] for name in "xyz"] == [1.5, -2.25, np.float32(0.1)]
+    assert [second[name] for name in "xyz"] == [4000, 5, -6]
+    assert [first["id"], second["id"]] == IDS
+    upper = ("cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz")
+    assert [first[name] for name in upper] == [1, 0.1, 0.2, 2, 0.3, 3]
+    assert all(np.isnan(second[name]) for name in upper)
+    assert set(first) == {"x", "y", "z", "id", *upper}
+
+
+def test_the_cloud_keeps_the_rules_of_its_type(cloud: Any) -> None:
+    assert (cloud.height, cloud.width, cloud.is_bigendian) == (1, 2, False)
+    assert cloud.row_step == cloud.width * cloud.point_step == len(cloud.data)
+    places = [(f.offset, f.offset + struct.calcsize(FORMATS[f.datatype])) for f in cloud.fields]
+    assert all(end <= start for (_, end), (start, _) in pairwise(places))
+    assert places[-1][1] <= cloud.point_step
+    assert {f.count for f in cloud.fields} == {1}
+
+
+def test_coordinates_are_what_rviz_reads(cloud: Any) -> None:
+    float32 = 7
+    assert {f.datatype for f in cloud.fields if f.name in "xyz"} == {float32}
+
+
+def jpeg(width: int, grey: int) -> bytes:
+    return cv2.imencode(".jpg", np.full((20, width), grey, np.uint8))[1].tobytes()
+
+
+def test_another_library_sees_each_picture_whole_with_its_stamp(tmp_path: Path) -> None:
+    """Of different sizes, as JPEG files are."""
+    pictures = [Picture(1_700_000_000_000_000_001 + k * 10**9, jpeg(30 + 40 * k, 90 * k)) for k in range(3)]
+    write_recording(tmp_path / "log.mcap", picture_messages(PICTURES, pictures), {})
+    with (tmp_path / "log.mcap").open("rb") as stream:
+        found = list(make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
+    assert [entry.channel.topic for entry in found] == ["/sonar/recognised"] * 3
+    assert {entry.schema.name for entry in found} == {"sensor_msgs/msg/CompressedImage"}
+    for entry, picture in zip(found, pictures, strict=True):
+        message = entry.decoded_message
+        stamp_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        assert stamp_ns == entry.message.log_time == picture.stamp_ns
+        assert message.header.frame_id == "sonar"
+        assert message.format == "jpeg"
+        assert bytes(message.data) == picture.jpeg
+        decoded = cv2.imdecode(np.frombuffer(bytes(message.data), np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert decoded.shape == cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE).shape
+
+
+def test_no_picture_is_no_message() -> None:
+    assert picture_messages(PICTURES, []) == []
+
+
+# --- layouts ---------------------------------------------------------------------------------------------------------
 
 T0_NS = 1_700_000_000_000_000_000
 DRAWN_BY_RVIZ = {
@@ -43,7 +230,7 @@ def result(make_sequence: Any, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def messages(result: Path, decoded: Callable[[Path], dict[str, list[Any]]]) -> dict[str, list[Any]]:
+def messages(result: Path, decoded: Decode) -> dict[str, list[Any]]:
     return decoded(result)
 
 
@@ -203,9 +390,7 @@ def test_a_scene_without_anything_can_be_drawn() -> None:
     assert json.loads(json.dumps(layout, allow_nan=False))["configById"]["3D!result"]["topics"]["/a/path"]["visible"]
 
 
-def test_without_any_estimate_the_truth_is_left(
-    make_sequence: Any, tmp_path: Path, decoded: Callable[[Path], dict[str, list[Any]]]
-) -> None:
+def test_without_any_estimate_the_truth_is_left(make_sequence: Any, tmp_path: Path, decoded: Decode) -> None:
     write_result(tmp_path / "result.mcap", make_sequence(), {})
     layout = json.loads((tmp_path / "result.foxglove.json").read_text("utf-8"))
     topics = {"/ground_truth/path", "/ground_truth/landmarks", "/ground_truth/landmark_cloud"}
