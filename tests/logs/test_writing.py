@@ -125,7 +125,7 @@ def frames(kind: str = "u1", count: int = 3, first: int = 0, beams: int = 4, bin
     return SonarFrames(stamps_ns, intensity.astype(kind), np.linspace(1.26, 2.51, bins), azimuths_rad)
 
 
-def written(path: Path, *blocks: SonarFrames) -> Path:
+def write_frames(path: Path, *blocks: SonarFrames) -> Path:
     with recording(path, {}) as out:
         for block in blocks:
             out.write([sonar_image_messages("/sonar/image", block, frequency_hz=1.8e6, sound_speed_m_s=1480)])
@@ -135,7 +135,7 @@ def written(path: Path, *blocks: SonarFrames) -> Path:
 @pytest.mark.parametrize("kind", [*KINDS, ">u2", ">f4"])
 def test_frames_are_read_as_they_were_written(tmp_path: Path, kind: str) -> None:
     written = frames(kind)
-    (read,) = read_sonar_frames(written(tmp_path / "log.mcap", written))
+    (read,) = read_sonar_frames(write_frames(tmp_path / "log.mcap", written))
     np.testing.assert_array_equal(read.stamps_ns, written.stamps_ns)
     np.testing.assert_array_equal(read.intensity, written.intensity)
     assert read.intensity.dtype == written.intensity.dtype.newbyteorder("<")
@@ -145,7 +145,7 @@ def test_frames_are_read_as_they_were_written(tmp_path: Path, kind: str) -> None
 
 def test_another_library_sees_what_the_message_defines(tmp_path: Path) -> None:
     written = frames()
-    with written(tmp_path / "log.mcap", written).open("rb") as stream:
+    with write_frames(tmp_path / "log.mcap", written).open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         messages = [message for *_, message in reader.iter_decoded_messages()]
     assert [m.header.stamp.nanosec for m in messages] == [123, 100_000_123, 200_000_123]
@@ -161,16 +161,16 @@ def test_another_library_sees_what_the_message_defines(tmp_path: Path) -> None:
 
 def test_pieces_of_different_size_are_one_recording(tmp_path: Path) -> None:
     blocks = [frames(first=0), frames(first=3, bins=7), frames(first=6, count=1)]
-    read = list(read_sonar_frames(written(tmp_path / "log.mcap", *blocks)))
+    read = list(read_sonar_frames(write_frames(tmp_path / "log.mcap", *blocks)))
     assert [(len(block), block.intensity.shape[2]) for block in read] == [(3, 5), (3, 7), (1, 5)]
     assert (np.diff(np.concatenate([block.stamps_ns for block in read])) > 0).all()
     np.testing.assert_array_equal(read[2].intensity, blocks[2].intensity)
 
 
 def test_an_existing_recording_survives_an_error(tmp_path: Path) -> None:
-    path = written(tmp_path / "log.mcap", frames())
+    path = write_frames(tmp_path / "log.mcap", frames())
     before = path.read_bytes()
     with pytest.raises(LogError, match="/sonar/image: samples of type complex"):
-        written(path, frames(first=3), frames("c16"))
+        write_frames(path, frames(first=3), frames("c16"))
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
