@@ -1,4 +1,10 @@
-"""From detections to factors: identity, prediction, gate, and the landmark's first appearance."""
+"""Detections to factors: identity, prediction, gate, and the first sighting of a landmark.
+
+A frame hangs on the newest keyframe by the odometry between them: the sonar's pose at the frame, in the keyframe's
+body frame. Detections are predicted from there (docs/theory/models.md) and compared with the joint covariance of
+keyframe, gyro bias and landmarks. The identity policy decides which become factors (docs/theory/identities.md,
+doubtful_identities.md, unknown_landmarks.md).
+"""
 
 from __future__ import annotations
 
@@ -23,7 +29,6 @@ from sonar_graph.slam.landmarks import (
     IdentityParams,
     IdentityPosterior,
     LandmarkSightings,
-    LateGate,
     Mixture,
     MixtureIdentity,
     Sighting,
@@ -41,7 +46,7 @@ from sonar_graph.states import DetectionJournal, DetectionLog, Outcome
 
 
 class SightingVerdict(NamedTuple):
-    """What became of a detection when it came."""
+    """Outcome of a detection when it came."""
 
     outcome: Outcome
     innovation: Floats | None = None
@@ -49,9 +54,9 @@ class SightingVerdict(NamedTuple):
     S: Floats | None = None
     """Its covariance, shape (2, 2)."""
     landmark_id: int | None = None
-    """Of which it is, where geometry said so."""
+    """Landmark that geometry paired it with."""
     sighting: Sighting | None = None
-    """None where it did not come so far as to be tied to a keyframe."""
+    """None where it was not tied to a keyframe."""
 
 
 @dataclass
@@ -82,16 +87,15 @@ class Sightings:
             self._is_deferred = identity.longest_wait_s > 0
             if isinstance(identity.unknown, AssociatedUnknown):
                 self._anonymous = AnonymousLandmarks(landmarks, self.journal, identity.unknown)
-        gate = LateGate(self.smoother, self._gate)
-        self._deferred = DeferredIdentities(landmarks, self.journal, gate, identity.longest_wait_s)
+        self._deferred = DeferredIdentities(landmarks, self.journal, self._gate, identity.longest_wait_s)
 
     @property
     def ids(self) -> set[int]:
-        """Landmarks in the graph."""
+        """Identities of the landmarks in the graph."""
         return self._landmarks.ids
 
     def leave(self, pose_keys: set[int]) -> None:
-        """Poses leave a bounded window."""
+        """Forget sightings from poses that leave a bounded window."""
         self._landmarks.leave(pose_keys)
         self._deferred.leave(pose_keys)
 
@@ -100,11 +104,9 @@ class Sightings:
         if self._anonymous is not None:
             refuse_taken_ids(frame)
         sound = without_unsound(frame, self.journal)
-        if sound is not None:
-            self._add(sound)
-
-    def _add(self, frame: LandmarkDetections) -> None:
-        stamp_ns = int(frame.stamps_ns[0])
+        if sound is None:
+            return
+        frame, stamp_ns = sound, int(sound.stamps_ns[0])
         unlocated = self.keyframes.newest_ns is None
         if unlocated or stamp_ns < self.keyframes.advanced_ns:
             late = Outcome.UNLOCATED if unlocated else Outcome.LATE
@@ -125,9 +127,9 @@ class Sightings:
             tracked = frame.rows(is_tracked)
             self._deferred.hear(tracked, decide(tracked, self._minimum_probability), self.keyframes.newest_s)
         verdicts = self._judge(stamp_ns, frame, identities, is_tracked.tolist())
-        if is_unnamed.any():
+        if self._anonymous is not None and is_unnamed.any():
             seen = self._seen(frame, identities, is_unnamed.tolist(), np.flatnonzero(is_unnamed).tolist())
-            verdicts |= self._associate(stamp_ns, seen, verdicts)
+            verdicts |= self._associate(self._anonymous, stamp_ns, seen, verdicts)
         elif self._anonymous is not None and self._anonymous.has_landmarks:
             self._merge(self._anonymous)
         for row, (landmark_id, track) in enumerate(zip(identities.ids.tolist(), frame.track.tolist(), strict=True)):
@@ -141,19 +143,19 @@ class Sightings:
                     self._deferred.remember(track, verdict.sighting)
 
     def history(self) -> Solution:
-        """The whole graph solved; of doubtful identities with those that fit it best."""
+        """Solution of the whole graph, with the doubtful identities that fit it best."""
         if self._doubtful is None:
             return Solution(*self.smoother.solve_history(), sorted(self.ids))
         chosen = self._doubtful.history()
         return Solution(chosen.values, chosen.marginals, sorted(chosen.ids))
 
     def log(self) -> DetectionLog:
-        """What became of each detection, in the same history."""
+        """Outcome of each detection in the same history."""
         self.forget()
         return self.journal.log() if self._doubtful is None else self._doubtful.log()
 
     def _doubt(self, doubtful: DoubtfulIdentities, stamp_ns: int, frame: LandmarkDetections) -> None:
-        """Take in a frame whose identities are weighed against where its detections are."""
+        """Take in a frame whose identities are weighed against the places of its detections."""
         self.keyframes.update_if_due()
         rows = range(len(frame))
         statements, tracks = [IdentityPosterior.of(frame, row) for row in rows], frame.track.tolist()
@@ -161,9 +163,7 @@ class Sightings:
         motion = self.keyframes.motion_since_newest(stamp_ns)
         view = self._view(motion, doubtful.keys)
         chosen = doubtful.chosen_at_first(view, statements, tracks, seen.z, seen.cov)
-        motion = self.keyframes.set_for_frame(stamp_ns, motion)
-        tie = Tie.between(motion, self.keyframes.newest_key, self._body_T_sonar, stamp_ns)
-        sightings = self._sightings(view, tie, seen, np.zeros((len(frame), 3)))
+        sightings = self._sightings(view, self._tie(stamp_ns, motion), seen)
         doubtful.enter(statements, tracks, sightings, chosen, self.keyframes.newest_s)
         for row, sighting in enumerate(sightings):
             of = statements[row].favourite if chosen[row] is None else chosen[row]
@@ -172,7 +172,7 @@ class Sightings:
         doubtful.reconsider(self.keyframes.newest_s)
 
     def forget(self) -> None:
-        """Let go of sightings that have waited too long for their identity."""
+        """Forget sightings that have waited too long for their identity."""
         self._deferred.forget(self.keyframes.advanced_ns)
         if self._anonymous is not None:
             self._anonymous.forget(self.keyframes.oldest_key(self._anonymous.longest_wait_s))
@@ -180,12 +180,28 @@ class Sightings:
     def _judge(
         self, stamp_ns: int, frame: LandmarkDetections, identities: Identities, is_tracked: list[bool]
     ) -> dict[int, SightingVerdict]:
-        """Use what has an identity, keep what belongs to a track, refuse the rest; what became of each row."""
+        """Use what has an identity, keep what belongs to a track, refuse the rest; the verdict on each row."""
         refusals = identities.refusals
         verdicts = {row: SightingVerdict(why) for row, why in enumerate(refusals) if why}
         rows = [row for row, why in enumerate(refusals) if is_tracked[row] or not why]
-        if rows:
-            verdicts |= self._use(stamp_ns, self._seen(frame, identities, is_tracked, rows), refusals)
+        if not rows:
+            return verdicts
+        seen = self._seen(frame, identities, is_tracked, rows)
+        self.keyframes.update_if_due()
+        motion = self.keyframes.motion_since_newest(stamp_ns)
+        named = seen.where([refusals[row] is None for row in rows])
+        is_known = [i in self._landmarks for i in named.ids]
+        known, new = named.where(is_known), named.where([not known for known in is_known])
+        view = self._view(motion, known.keys)
+        tie = self._tie(stamp_ns, motion)
+        verdicts |= self._sight_again(view, tie, known) | self._sight_first(view, tie, new)
+        if len(named.rows) < len(rows):
+            kept = seen.where([refusals[row] is not None for row in rows])
+            for row, sighting in zip(kept.rows, self._sightings(view, tie, kept), strict=True):
+                if refusals[row] is Outcome.REPEATED:  # a more probable row of the frame has the landmark
+                    sighting.outcome = Outcome.REPEATED
+                verdicts[row] = SightingVerdict(sighting.outcome, sighting=sighting)
+        self.keyframes.update_if_due()
         return verdicts
 
     def _seen(self, frame: LandmarkDetections, identities: Identities, is_tracked: list[bool], rows: list[int]) -> Seen:
@@ -196,23 +212,6 @@ class Sightings:
             cov[is_unknown] = self._default_cov
         ids: list[int] = identities.ids[rows].tolist()
         return Seen(rows, ids, [L(max(i, 0)) for i in ids], [is_tracked[row] for row in rows], z, cov)
-
-    def _use(self, stamp_ns: int, seen: Seen, refusals: list[Outcome | None]) -> dict[int, SightingVerdict]:
-        """Add the factors of a frame's landmarks, keep what is refused but tracked; what became of each, by row."""
-        self.keyframes.update_if_due()
-        motion = self.keyframes.motion_since_newest(stamp_ns)
-        named = seen.where([refusals[row] is None for row in seen.rows])
-        is_known = [i in self._landmarks for i in named.ids]
-        known, new = named.where(is_known), named.where([not known for known in is_known])
-        view = self._view(motion, known.keys)
-        motion = self.keyframes.set_for_frame(stamp_ns, motion)
-        tie = Tie.between(motion, self.keyframes.newest_key, self._body_T_sonar, stamp_ns)
-        verdicts = self._sight_again(view, tie, known) | self._sight_first(view, tie, new)
-        if len(named.rows) < len(seen.rows):
-            kept = seen.where([refusals[row] is not None for row in seen.rows])
-            verdicts |= self._keep(view, tie, kept, refusals)
-        self.keyframes.update_if_due()
-        return verdicts
 
     def _view(self, motion: PreintegratedMotion, landmark_keys: list[int]) -> PredictedView:
         key, bias_key = self.keyframes.newest_key, self.keyframes.newest_bias_key
@@ -226,8 +225,13 @@ class Sightings:
             covariance=self.smoother.joint_covariance(keys),
         )
 
+    def _tie(self, stamp_ns: int, motion: PreintegratedMotion) -> Tie:
+        """Tie a frame to the newest keyframe, which is set now if the motion since the last one blurs the frame."""
+        motion = self.keyframes.set_for_frame(stamp_ns, motion)
+        return Tie(stamp_ns, self.keyframes.newest_key, motion, motion.i_T_j.compose(self._body_T_sonar))
+
     def _sight_again(self, view: PredictedView, tie: Tie, seen: Seen) -> dict[int, SightingVerdict]:
-        """Compare landmarks of the graph with what is expected of them; add what is inside the gate."""
+        """Add sightings of landmarks in the graph that are inside the gate."""
         if not seen.ids:
             return {}
         points = np.array([self.smoother.values.atPoint3(key) for key in seen.keys])
@@ -238,14 +242,14 @@ class Sightings:
         for k, sighting in enumerate(self._sightings(view, tie, seen, points)):
             sighting.outcome = Outcome.USED if inside[k] else Outcome.GATED
             if inside[k]:
-                self._enter(sighting, seen.ids[k], is_first=False)
+                self._landmarks.add(sighting, seen.ids[k], is_first=False)
             verdicts[seen.rows[k]] = SightingVerdict(
                 sighting.outcome, found.innovation[k], found.S[k], sighting=sighting
             )
         return verdicts
 
     def _sight_first(self, view: PredictedView, tie: Tie, seen: Seen) -> dict[int, SightingVerdict]:
-        """Add landmarks to the graph: on the floor, where they can stand there, else on the centre beam."""
+        """Add new landmarks: on the known floor where they can stand on it, else on the centre beam."""
         verdicts = {}
         for k, landmark_id in enumerate(seen.ids):
             alone = seen.where([row == k for row in range(len(seen.ids))])
@@ -257,20 +261,8 @@ class Sightings:
             (sighting,) = self._sightings(view, tie, alone, point[None])
             sighting.floor, sighting.outcome = floor, Outcome.NEW
             sighting.elevation_rad = 0.0 if seen.is_tracked[k] else elevation
-            self._enter(sighting, landmark_id, is_first=True)
+            self._landmarks.add(sighting, landmark_id, is_first=True)
             verdicts[seen.rows[k]] = SightingVerdict(Outcome.NEW, sighting=sighting)
-        return verdicts
-
-    def _keep(
-        self, view: PredictedView, tie: Tie, seen: Seen, refusals: list[Outcome | None]
-    ) -> dict[int, SightingVerdict]:
-        """Tie to the keyframe what has no identity yet, or is displaced by a more probable row of the frame."""
-        verdicts = {}
-        sightings = self._sightings(view, tie, seen, np.zeros((len(seen.rows), 3)))
-        for row, sighting in zip(seen.rows, sightings, strict=True):
-            if refusals[row] is Outcome.REPEATED:
-                sighting.outcome = Outcome.REPEATED
-            verdicts[row] = SightingVerdict(sighting.outcome, sighting=sighting)
         return verdicts
 
     def _merge(self, anonymous: AnonymousLandmarks) -> None:
@@ -280,11 +272,10 @@ class Sightings:
             joint = self.smoother.joint_covariance([self.keyframes.newest_key, *anonymous.keys()])
             anonymous.merge(joint, self.keyframes.newest_s)
 
-    def _associate(self, stamp_ns: int, seen: Seen, named: dict[int, SightingVerdict]) -> dict[int, SightingVerdict]:
-        """Pair what has no identity with landmarks by geometry; what became of each, by row."""
-        anonymous = self._anonymous
-        if anonymous is None:
-            return {}
+    def _associate(
+        self, anonymous: AnonymousLandmarks, stamp_ns: int, seen: Seen, named: dict[int, SightingVerdict]
+    ) -> dict[int, SightingVerdict]:
+        """Pair what has no identity with landmarks by geometry; the verdict on each row."""
         self.keyframes.update_if_due()
         anonymous.forget(self.keyframes.oldest_key(anonymous.longest_wait_s))
         motion = self.keyframes.motion_since_newest(stamp_ns)
@@ -292,9 +283,7 @@ class Sightings:
         view = self._view(motion, anonymous.keys())
         taken = {v.sighting.landmark_id for v in named.values() if v.sighting and v.sighting.landmark_id is not None}
         paired = anonymous.pair(view, seen.z, seen.cov, taken)
-        motion = self.keyframes.set_for_frame(stamp_ns, motion)
-        tie = Tie.between(motion, self.keyframes.newest_key, self._body_T_sonar, stamp_ns)
-        sightings = self._sightings(view, tie, seen, np.zeros((len(seen.rows), 3)))
+        sightings = self._sightings(view, self._tie(stamp_ns, motion), seen)
         anonymous.use(sightings, paired, self.keyframes.newest_s)
         self.keyframes.update_if_due()
         return {
@@ -303,7 +292,7 @@ class Sightings:
         }
 
     def _floor_under(self, view: PredictedView, range_m: float, azimuth_rad: float) -> FloorPrior | None:
-        """The known floor, unless it is implausibly far from the point on the centre beam (`FLOOR_GATE`)."""
+        """Known floor, or None where it is too far from the point on the centre beam (`FLOOR_GATE`)."""
         floor = self.calibration.floor
         if floor is None:
             return None
@@ -312,11 +301,12 @@ class Sightings:
         variance = by_elevation**2 + view.height_variance(point) + floor.sigma_m**2
         return floor if (point[2] - floor.z_m) ** 2 <= FLOOR_GATE * variance else None
 
-    def _sightings(self, view: PredictedView, tie: Tie, seen: Seen, points: Floats) -> list[Sighting]:
+    def _sightings(self, view: PredictedView, tie: Tie, seen: Seen, at: Floats | None = None) -> list[Sighting]:
         """Sightings of landmarks at points of the world, shape (m, 3); those of tracks as if at elevation 0."""
         if not seen.rows:
             return []
-        points, floors = points.copy(), [self.calibration.floor] * len(seen.rows)
+        points = np.zeros((len(seen.rows), 3)) if at is None else at.copy()
+        floors = [self.calibration.floor] * len(seen.rows)
         for k, (range_m, azimuth_rad) in enumerate(seen.z.tolist()):
             if seen.is_tracked[k]:
                 points[k] = locate(view.world_T_sonar, range_m, azimuth_rad, 0.0)
@@ -327,29 +317,24 @@ class Sightings:
             for z, R, floor in zip(seen.z, noise, floors, strict=True)
         ]
 
-    def _enter(self, sighting: Sighting, landmark_id: int, *, is_first: bool) -> None:
-        made = self._factors.make(sighting, L(landmark_id), is_first=is_first)
-        self._landmarks.enter(sighting, landmark_id, self.smoother.add(made))
-
 
 @dataclass(frozen=True, eq=False)
 class Seen:
     """Some detections of one frame."""
 
     rows: list[int]
-    """In the frame, length m."""
+    """Numbers of the rows in the frame, length m."""
     ids: list[int]
     keys: list[int]
-    """Of the landmarks in the graph."""
+    """Graph keys of the landmarks."""
     is_tracked: list[bool]
-    """Whether each belongs to a track."""
     z: Floats
     """Range (m) and azimuth (rad), shape (m, 2)."""
     cov: Floats
-    """Their noise, shape (m, 2, 2)."""
+    """Noise covariance, shape (m, 2, 2)."""
 
     def where(self, chosen: list[bool]) -> Seen:
-        """Those that are chosen."""
+        """Subset of the detections."""
         if all(chosen):
             return self
         at = [k for k, is_chosen in enumerate(chosen) if is_chosen]
@@ -359,17 +344,11 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Tie:
-    """How a frame hangs on the keyframe that gets its factors."""
+    """Motion from the keyframe that gets the factors of a frame to that frame."""
 
     stamp_ns: int
-    """Of the frame."""
+    """Stamp of the frame."""
     pose_key: int
     motion: PreintegratedMotion
-    """From that keyframe to the frame; its noise blurs the sightings."""
+    """Motion whose noise is added to that of the sightings."""
     keyframe_T_sonar: gtsam.Pose3
-    """The sonar at the frame, in the keyframe's body frame."""
-
-    @classmethod
-    def between(cls, motion: PreintegratedMotion, pose_key: int, body_T_sonar: gtsam.Pose3, stamp_ns: int) -> Tie:
-        """Tie by a motion and the sonar's mounting."""
-        return cls(stamp_ns, pose_key, motion, motion.i_T_j.compose(body_T_sonar))

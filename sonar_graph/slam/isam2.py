@@ -1,14 +1,11 @@
-"""The smoothing estimator: keyframes, landmarks and gyro bias in one incrementally solved graph.
+"""The smoothing estimator: keyframes, landmarks and gyro bias in one incrementally solved graph (docs/theory/isam2.md).
 
-Flow of one call of `Isam2.process`::
+One call of `Isam2.process`::
 
-    odometry  ── nodes due as keyframes ──► preintegrate ──► factors of that keyframe
+    odometry ── nodes due as keyframes ──► preintegration ──► factors of each keyframe
     frames of detections ──► newest keyframe, or a new one ──► identity ──► gate ──► sighting factors
     one update of the smoother, if there is anything new
     newest keyframe's estimate, carried on by odometry ──► Estimate at end_ns
-
-A frame is tied to its keyframe through the odometry between them: the sonar's pose in the keyframe's body frame at the
-time of the frame. Keyframes can then be sparser than frames at no loss but the (included) noise of that short motion.
 """
 
 from __future__ import annotations
@@ -61,7 +58,7 @@ OLD_NAMES = {
     "unknown_sightings": "identity.unknown.sightings",
     "unknown_wait_s": "identity.unknown.longest_wait_s",
 }
-"""Settings that had a name of one word before they were in sections."""
+"""Flat names that settings had before they were in sections."""
 
 
 class Isam2Params(Section):
@@ -112,10 +109,22 @@ class Isam2:
     Params: ClassVar[type[Section]] = Isam2Params
 
     def __init__(self, calibration: Calibration, params: Any = None) -> None:
-        _check_noise(calibration)
-        self._calibration = calibration
-        self._params = _settings(params)
-        p = self._params
+        if not isinstance(params, Isam2Params | None):
+            raise EstimatorError(
+                f"isam2: params: expected Isam2Params or None, not {type(params).__name__}; of a dict:"
+                " Isam2Params(**params)"
+            )
+        noise = {
+            "imu.gyro_noise_density": calibration.imu.gyro_noise_density,
+            "dvl.velocity_sigma_m_s": min(calibration.dvl.velocity_sigma_m_s),
+            "start.position_sigma_m": min(calibration.start.position_sigma_m),
+            "start.rpy_sigma_rad": min(calibration.start.rpy_sigma_rad),
+        }
+        if zero := [name for name, least in noise.items() if least <= 0]:  # a graph weighs by inverse variances
+            raise CalibrationError(
+                f"isam2: {', '.join(zero)} must be above zero; give a small value for what is known well"
+            )
+        self._params = p = params or Isam2Params()
         self._smoother = Smoother(p.smoother, is_bounded=p.history.policy == "bounded")
         self._smoother.when_leaving = self._leave
         self._keyframes = Keyframes(calibration, p.keyframes, self._smoother)
@@ -142,12 +151,16 @@ class Isam2:
         return len(self._keyframes.stamps_ns)
 
     def process(self, measurements: Measurements) -> Estimate | None:
-        """Take in measurements; the causal estimate at their end.
+        """Take in measurements and return the causal estimate at their end.
 
         None before IMU and DVL have begun, and for an instant before that of an earlier call.
         """
         if self._asked.newest_ns is not None and measurements.end_ns < self._asked.newest_ns:
-            self._refuse(measurements)
+            self._keyframes.add(measurements.imu, measurements.dvl, None)  # rows that are still new count
+            if measurements.detections is not None:
+                stamps_ns, ids = measurements.detections.stamps_ns, measurements.detections.most_probable()[0]
+                for stamp_ns, landmark_id in zip(stamps_ns.tolist(), ids.tolist(), strict=True):
+                    self._sightings.journal.record(stamp_ns, landmark_id, Outcome.LATE)
             return None
         self._keyframes.add(measurements.imu, measurements.dvl, measurements.depth)
         if measurements.detections is not None:
@@ -165,33 +178,18 @@ class Isam2:
         return instant.carried_on(self._smoother.values, self._smoother.joint_covariance(instant.keys()))
 
     def _leave(self, keys: set[int]) -> None:
-        """Variables leave a bounded window."""
+        """Take leave of variables before they leave a bounded window; forget what is old, a good deal at a time."""
         self._asked.leave(keys, self._smoother.values, self._smoother.marginals)
         self._sightings.leave(keys)
-        self._forget(self._keyframes.newest_s)
-
-    def _forget(self, now_s: float) -> None:
-        """Drop what need not be remembered, a good deal at a time."""
-        history = self._params.history
+        history, now_s = self._params.history, self._keyframes.newest_s
         remembered_s = history.remembered_s if history.policy == "bounded" else None
         if remembered_s is not None and now_s - self._forgot_s > remembered_s / 4:
             self._forgot_s, oldest_ns = now_s, round((now_s - remembered_s) * NS_PER_S)
             self._asked.forget_before(oldest_ns)
             self._sightings.journal.forget_before(oldest_ns)
 
-    def _refuse(self, measurements: Measurements) -> None:
-        """Time does not go back: take the rows that are still new, refuse the detections, estimate nothing."""
-        self._keyframes.add(measurements.imu, measurements.dvl, None)
-        if measurements.detections is not None:
-            for stamp_ns, i in zip(
-                measurements.detections.stamps_ns.tolist(),
-                measurements.detections.most_probable()[0].tolist(),
-                strict=True,
-            ):
-                self._sightings.journal.record(stamp_ns, i, Outcome.LATE)
-
     def keyframe_stamps(self) -> Ints:
-        """Stamps of the keyframes, by their numbers, shape (n,), nanoseconds."""
+        """Stamps of the keyframes, shape (n,), nanoseconds."""
         return np.array(self._keyframes.stamps_ns, dtype=np.int64)
 
     def marginal(
@@ -274,43 +272,13 @@ class Isam2:
         )
 
     def detections(self) -> DetectionLog:
-        """What became of each detection; of doubtful identities in the history that `trajectory` is of."""
+        """Outcome of each detection; of doubtful identities in the history of `trajectory`."""
         return self._sightings.log()
 
     def withheld(self) -> list[str]:
-        """What of the newest detections could not be used in the graph, variable by variable, and what was missing."""
+        """Newest factors that could not be used, a line each: the variable, its factors and what was missing."""
         return list(self._smoother.withheld)
 
     def refused_rows(self) -> list[RefusedRow]:
         """Rows of IMU, Doppler log and depth that are not used, and why."""
         return self._keyframes.refused
-
-
-def _settings(params: Any) -> Isam2Params:
-    if params is None:
-        return Isam2Params()
-    if not isinstance(params, Isam2Params):
-        raise EstimatorError(
-            f"isam2: params: expected Isam2Params or None, not {type(params).__name__}; of a dict:"
-            " Isam2Params(**params)"
-        )
-    return params
-
-
-def _check_noise(calibration: Calibration) -> None:
-    """A graph weighs by the inverse of variances: none may be zero."""
-    start = calibration.start
-    zero = [
-        name
-        for name, least in {
-            "imu.gyro_noise_density": calibration.imu.gyro_noise_density,
-            "dvl.velocity_sigma_m_s": min(calibration.dvl.velocity_sigma_m_s),
-            "start.position_sigma_m": min(start.position_sigma_m),
-            "start.rpy_sigma_rad": min(start.rpy_sigma_rad),
-        }.items()
-        if least <= 0
-    ]
-    if zero:
-        raise CalibrationError(
-            f"isam2: {', '.join(zero)} must be above zero; give a small value for what is known well"
-        )

@@ -1,13 +1,11 @@
-"""Keyframes: where they are set, and the factors that odometry, depth and gravity give each of them.
+"""Keyframes, and the factors that odometry, depth and gravity give each of them.
 
 A keyframe sits at a node of the odometry (a DVL stamp). One is due ``max_interval_s`` after the last, and sooner when
-landmarks are seen and the motion since has blurred what the sonar sees: then sightings would lose by hanging on it.
-The gyro bias is constant over stretches of ``bias_interval_s`` and walks between them.
+landmarks are seen and the noise of the motion since then would blur them (docs/theory/isam2.md). The gyro bias is
+constant over stretches of ``bias_interval_s`` and walks between them.
 
-Rows that can be measurements at all: variances above zero, covariances positive definite, ranges that can be.
-
-A block of measurements checks shapes, order and that numbers are finite (`sonar_graph.measurements`). What is checked
-here depends on what a number means. NaN is sound: it says that the log does not know, and the calibration does.
+Rows that cannot be measurements are refused: variances not above zero, covariances not positive definite, impossible
+ranges. NaN is sound: the log does not know the noise, and the calibration does.
 """
 
 from __future__ import annotations
@@ -39,13 +37,13 @@ Flags = NDArray[np.bool_]
 
 
 def sound_detections(frame: LandmarkDetections) -> Flags:
-    """Shape (n,)."""
+    """Rows that a sonar can have measured, shape (n,)."""
     unsaid = np.asarray(np.isnan(frame.range_azimuth_cov).any(axis=(1, 2)))
     return possible_ranges(frame.range_m) & (unsaid | positive_definite(frame.range_azimuth_cov))
 
 
 def without_unsound(frame: LandmarkDetections, journal: DetectionJournal) -> LandmarkDetections | None:
-    """A frame without what no sonar can have measured, which goes to the journal; None: nothing is left."""
+    """Frame without rows that no sonar can have measured, which go to the journal; None: no row is left."""
     is_sound = sound_detections(frame)
     if is_sound.all():
         return frame
@@ -55,19 +53,19 @@ def without_unsound(frame: LandmarkDetections, journal: DetectionJournal) -> Lan
 
 
 def sound_velocities(dvl: Dvl) -> Flags:
-    """Shape (n,). An infinite variance is sound: of an axis that was not measured."""
+    """Rows with a sound covariance, shape (n,). An infinite variance is sound: that axis was not measured."""
     return positive_definite(in_numbers(dvl.velocity_cov, np.eye(3)))
 
 
 def sound_depths(depth: Depth) -> Flags:
-    """Shape (n,)."""
+    """Rows with a sound variance, shape (n,)."""
     variance = np.where(np.isnan(depth.variance_m2), 1.0, depth.variance_m2)
     return (variance > 0) & np.isfinite(variance)
 
 
 @compiled
 def positive_definite(covs: Floats) -> Flags:
-    """Which of some symmetric matrices, shape (n, k, k), are finite and positive definite: Cholesky takes them."""
+    """Flags of symmetric matrices, shape (n, k, k), that are finite and positive definite, by Cholesky."""
     n, k = covs.shape[:2]
     found = np.ones(n, np.bool_)
     for row in range(n):
@@ -91,7 +89,7 @@ def positive_definite(covs: Floats) -> Flags:
 
 S_PER_NS = 1e-9
 CARRIED_IN_GAP_NS = 300_000_000
-"""Over the end of a gap, straight on, a depth sample is carried no longer than this."""
+"""Longest time over which a depth sample is carried straight on over the end of a gap."""
 Rows = TypeVar("Rows", Dvl, Depth)
 EARLIEST_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
@@ -109,7 +107,7 @@ class KeyframeParams(Section):
 
 
 class Carried(NamedTuple):
-    """The way on which depth samples reach a keyframe."""
+    """Motion by which depth samples are carried to a keyframe."""
 
     start_ns: int
     steps: Steps
@@ -124,9 +122,9 @@ class Keyframes:
     params: KeyframeParams
     smoother: Smoother
     stamps_ns: list[int] = field(default_factory=list)
-    """Of each keyframe; its key is ``X(index)``."""
+    """Stamps of the keyframes; the key of each is ``X(index)``."""
     bias_keys: list[int] = field(default_factory=list)
-    """Of each keyframe: the bias that holds from it on."""
+    """Key of the gyro bias that holds from each keyframe on."""
     advanced_ns: int = EARLIEST_NS
     """Latest instant that was advanced to."""
 
@@ -149,7 +147,7 @@ class Keyframes:
 
     @property
     def newest_s(self) -> float:
-        """The same in seconds, as the smoother counts them."""
+        """Stamp of the newest keyframe in seconds, as the smoother counts them."""
         return self.stamps_ns[-1] * S_PER_NS
 
     @property
@@ -164,7 +162,7 @@ class Keyframes:
         return X(bisect_left(self.stamps_ns, self.stamps_ns[-1] - round(age_s / S_PER_NS)))
 
     def add(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None) -> None:
-        """Take in rows; depths not newer than those that wait are passed over, and what cannot be a measurement."""
+        """Take in rows; refuse unsound ones, and depths older than those that wait."""
         if dvl is not None:
             dvl = self._sound("dvl", dvl, sound_velocities(dvl))
         if depth is not None:
@@ -199,7 +197,15 @@ class Keyframes:
             start_ns = self.odometry.start_by(until_ns)
             if start_ns is None:
                 return
-            self._start(start_ns)
+            self.stamps_ns.append(start_ns)
+            self._bias_since_ns = start_ns
+            self.smoother.add_pose(X(0), self.calibration.start.pose(), start_ns * S_PER_NS)
+            self.smoother.add([factors.start_prior(X(0), self.calibration)])
+            self.bias_keys.append(B(0))
+            if self._estimates_bias:
+                self.smoother.add_bias(B(0), np.zeros(3))
+                self.smoother.add([factors.bias_prior(B(0), self.calibration.imu.gyro_bias_sigma)])
+            self._constrain(0)
         interval_ns = round(self.params.max_interval_s / S_PER_NS)
         for node_ns in self.odometry.nodes(self.stamps_ns[-1], until_ns).tolist():
             if node_ns - self.stamps_ns[-1] >= interval_ns:
@@ -219,29 +225,20 @@ class Keyframes:
             From what is then the newest keyframe to the frame.
         """
         node_ns = self.odometry.newest_node(self.stamps_ns[-1], stamp_ns)
-        if node_ns is not None and self._is_noisy(motion):
-            self._set(node_ns)
-            motion = self.motion_since_newest(stamp_ns)
-        return self._told_again(motion, node_ns or self.stamps_ns[-1], stamp_ns)
-
-    def _told_again(self, motion: PreintegratedMotion, node_ns: int, stamp_ns: int) -> PreintegratedMotion:
-        """The motion to the k-th frame that is tied to a keyframe over the same gap of the Doppler log.
-
-        All share its error. Taken as independent, many of them would tell more than one exact one can: with k (k + 1)
-        times the covariance the information of all together stays below that, since ``sum 1 / (k (k + 1)) = 1``.
-        """
-        if not self.odometry.is_gap(node_ns, stamp_ns):
+        if node_ns is not None:
+            sonar, bias_sigma = self.calibration.sonar, self.calibration.imu.gyro_bias_sigma
+            turn, shift = largest_variances(motion.covariance, motion.D_bias, bias_sigma)
+            share = max(turn / sonar.azimuth_sigma_rad**2, shift / sonar.range_sigma_m**2)
+            if share > self.params.motion_noise_share:
+                self._set(node_ns)
+                motion = self.motion_since_newest(stamp_ns)
+        if not self.odometry.is_gap(node_ns or self.stamps_ns[-1], stamp_ns):
             self._told = 0
             return motion
+        # Frames tied to one keyframe over the same gap share its error. With k (k + 1) times the covariance of the k-th
+        # their information stays below that of one exact frame: sum 1 / (k (k + 1)) = 1.
         self._told += 1
         return replace(motion, covariance=motion.covariance * (self._told * (self._told + 1)))
-
-    def _is_noisy(self, motion: PreintegratedMotion) -> bool:
-        """Whether the motion's noise, and what the gyro bias may add to it, would blur what the sonar saw."""
-        sonar, bias_sigma = self.calibration.sonar, self.calibration.imu.gyro_bias_sigma
-        turn, shift = largest_variances(motion.covariance, motion.D_bias, bias_sigma)
-        share = max(turn / sonar.azimuth_sigma_rad**2, shift / sonar.range_sigma_m**2)
-        return share > self.params.motion_noise_share
 
     def motion_since_newest(self, until_ns: int) -> PreintegratedMotion:
         """Provisional motion from the newest keyframe to an instant not before that of any earlier call."""
@@ -280,23 +277,15 @@ class Keyframes:
             return None
         return self.smoother.values.atPose3(self.newest_key).rotation().matrix().T @ self._earth
 
-    def _start(self, node_ns: int) -> None:
-        imu = self.calibration.imu
-        self.stamps_ns.append(node_ns)
-        self._bias_since_ns = node_ns
-        self.smoother.add_pose(X(0), self.calibration.start.pose(), node_ns * S_PER_NS)
-        self.smoother.add([factors.start_prior(X(0), self.calibration)])
-        self.bias_keys.append(B(0))
-        if self._estimates_bias:
-            self.smoother.add_bias(B(0), np.zeros(3))
-            self.smoother.add([factors.bias_prior(B(0), imu.gyro_bias_sigma)])
-        self._constrain(0)
-
     def _set(self, node_ns: int) -> None:
         i, j = len(self.stamps_ns) - 1, len(self.stamps_ns)
         motion, carried = self._motion_to(node_ns)
         self.smoother.add_pose(X(j), self.smoother.values.atPose3(X(i)).compose(motion.i_T_j), node_ns * S_PER_NS)
-        self.smoother.add([self._odometry_factor(i, motion), *self._gravity(j, node_ns, motion)])
+        if self._estimates_bias:
+            between = factors.odometry_with_bias(X(i), X(j), self.bias_keys[i], motion)
+        else:
+            between = factors.odometry(X(i), X(j), motion)
+        self.smoother.add([between, *self._gravity(j, node_ns, motion)])
         self.smoother.add(self._depth(j, node_ns, carried))
         self.bias_keys.append(self._next_bias_key(i, node_ns))
         self.stamps_ns.append(node_ns)
@@ -316,11 +305,6 @@ class Keyframes:
             motion = motion_between_nodes(self.odometry, self._preintegrator, start_ns, node_ns, bias, earth_rate)
         return motion, carried
 
-    def _odometry_factor(self, i: int, motion: PreintegratedMotion) -> gtsam.NonlinearFactor:
-        if self._estimates_bias:
-            return factors.odometry_with_bias(X(i), X(i + 1), self.bias_keys[i], motion)
-        return factors.odometry(X(i), X(i + 1), motion)
-
     def _gravity(self, j: int, node_ns: int, motion: PreintegratedMotion) -> list[gtsam.NonlinearFactor]:
         if not self.calibration.use_gravity:
             return []
@@ -335,32 +319,25 @@ class Keyframes:
     def _depth(self, j: int, node_ns: int, carried: Carried) -> list[gtsam.NonlinearFactor]:
         """One factor for the samples since the last keyframe, carried to this one and averaged there."""
         start_ns, steps, motion = carried
-        samples = self._depths_until(start_ns, node_ns)
+        if not self._depths:
+            return []
+        waiting = Depth.concatenate(self._depths)
+        later = waiting.between(node_ns, LATEST_NS)
+        self._depths = [later] if later else []
+        samples = waiting.between(start_ns, node_ns)
         if samples is None:
             return []
+        up = self.smoother.values.atPose3(self.newest_key).rotation().matrix()[2]
+        mean_psd = np.average(steps.velocity_psd, axis=0, weights=steps.duration_s)
+        wander_m2_s = float(up @ mean_psd @ up)  # spectral density of the vertical velocity noise
         variance = np.where(np.isnan(samples.variance_m2), self.calibration.depth.sigma_m**2, samples.variance_m2)
         offsets_s = np.asarray((samples.stamps_ns - start_ns) * S_PER_NS, dtype=np.float64)
-        weights, mean_variance = weights_at_end(variance, motion.duration_s - offsets_s, self._wander_m2_s(steps))
+        weights, mean_variance = weights_at_end(variance, motion.duration_s - offsets_s, wander_m2_s)
         port = np.array(self.calibration.depth.port_m)
         mean_port = weights @ self._preintegrator.path_of(port, steps, motion.bias, offsets_s)
         return [
             factors.depth(X(j), float(weights @ samples.z_m), motion.i_T_j.transformTo(mean_port), mean_variance**0.5)
         ]
-
-    def _depths_until(self, start_ns: int, node_ns: int) -> Depth | None:
-        """The samples after an instant, all of which are then done with."""
-        if not self._depths:
-            return None
-        waiting = Depth.concatenate(self._depths)
-        later = waiting.between(node_ns, LATEST_NS)
-        self._depths = [later] if later else []
-        return waiting.between(start_ns, node_ns)
-
-    def _wander_m2_s(self, steps: Steps) -> float:
-        """Spectral density of the vertical velocity noise over the steps, for the attitude of the newest keyframe."""
-        up = self.smoother.values.atPose3(self.newest_key).rotation().matrix()[2]
-        mean_psd = np.average(steps.velocity_psd, axis=0, weights=steps.duration_s)
-        return float(up @ mean_psd @ up)
 
     def _constrain(self, j: int) -> None:
         if self.calibration.planar:

@@ -1,16 +1,13 @@
-"""Which landmark a detection belongs to, whether it may be believed, and the record of what became of it.
+"""Identities as a recogniser states them: accepted by posterior, or weighed as components of a mixture.
 
-What a detection may be of, and how probable each is before anyone looks where it was seen.
-
-A recogniser states a posterior p over landmarks; what is missing to 1 is none of them. It may be wrong, and says
-nothing of that. With the probability ``q`` that its statement has nothing to do with what was seen, K landmarks in the
-graph, and half of the errors being of no landmark at all::
+A recogniser states a posterior p over landmarks; what is missing to 1 is no landmark. With the probability q that the
+statement has nothing to do with what was seen, K landmarks in the graph, and half of the errors being no landmark::
 
     w_i    = (1 - q) p_i + q / (2 K)          landmark i
     w_none = (1 - q) (1 - sum p) + q / 2      no landmark
 
-So no weight is zero: no identity is so sure that its place cannot refute it. A detection of no landmark may be anywhere
-that the sonar looks, with the density ``u`` over range and azimuth (1/(m rad)).
+No weight is zero: the place of a detection can refute any identity. A detection of no landmark may be anywhere in view,
+with the density u over range and azimuth, 1/(m rad) (docs/theory/doubtful_identities.md).
 """
 
 from __future__ import annotations
@@ -30,7 +27,7 @@ from sonar_graph.states import Outcome
 
 @dataclass(frozen=True, eq=False)
 class Identities:
-    """The identity of each detection of a block, or the reason why it has none."""
+    """Identity of each detection of a block, or the reason why it has none."""
 
     ids: Ints
     """Most probable identity, shape (n,)."""
@@ -54,20 +51,13 @@ def identify(detections: LandmarkDetections, minimum_probability: float) -> Iden
         None if p >= minimum_probability and landmark_id >= 0 else Outcome.NO_IDENTITY
         for p, landmark_id in zip(probability.tolist(), ids.tolist(), strict=True)
     ]
-    return Identities(ids, _once_a_frame(detections.stamps_ns.tolist(), ids.tolist(), probability.tolist(), refusals))
-
-
-def _once_a_frame(
-    stamps_ns: list[int], ids: list[int], probability: list[float], refusals: list[Outcome | None]
-) -> list[Outcome | None]:
+    places = list(zip(detections.stamps_ns.tolist(), ids.tolist(), strict=True))
     best: dict[tuple[int, int], int] = {}
-    for row, place in enumerate(zip(stamps_ns, ids, strict=True)):
+    for row, place in enumerate(places):
         if refusals[row] is None and (place not in best or probability[row] > probability[best[place]]):
             best[place] = row
-    return [
-        refusal if refusal or best[stamp_ns, landmark_id] == row else Outcome.REPEATED
-        for row, (stamp_ns, landmark_id, refusal) in enumerate(zip(stamps_ns, ids, refusals, strict=True))
-    ]
+    once = [why if why or best[places[row]] == row else Outcome.REPEATED for row, why in enumerate(refusals)]
+    return Identities(ids, once)
 
 
 @cache
@@ -77,11 +67,11 @@ def gate_threshold(probability: float, dof: int) -> float:
 
 
 LEAST_LANDMARKS = 20
-"""K at least: while a graph has few landmarks, a mistake is more probably of one that it has not yet got."""
+"""Least K: while a graph has few landmarks, a mistake is more probably one that it has not got yet."""
 
 
 class RecogniserErrors(Section):
-    """How often a recogniser is wrong, and where something that is no landmark may be seen."""
+    """Error rate of a recogniser, and the view over which detections of no landmark are spread."""
 
     wrong_id_probability: float = Field(0.05, gt=0, lt=1)
     """Probability q that what the recogniser says has nothing to do with what was seen, beside what its posterior
@@ -89,7 +79,7 @@ class RecogniserErrors(Section):
     view_range_m: float = Field(10.0, gt=0)
     """Detections of no landmark are spread evenly over so much range."""
     view_azimuth_rad: float = Field(2.0, gt=0)
-    """The same of azimuth."""
+    """Detections of no landmark are spread evenly over so much azimuth."""
 
     @property
     def log_density(self) -> float:
@@ -99,14 +89,14 @@ class RecogniserErrors(Section):
 
 @dataclass(frozen=True)
 class IdentityPosterior:
-    """What a recogniser said of one detection, or last said of a track."""
+    """Posterior that a recogniser stated for one detection, or last for a track."""
 
     probability: dict[int, float]
-    """Posterior of each landmark that it considered; 0 of all others."""
+    """Posterior of each landmark considered; 0 for all others."""
 
     @classmethod
     def of(cls, frame: LandmarkDetections, row: int) -> IdentityPosterior:
-        """Of a row; probabilities that are no numbers count as 0, and more than 1 in sum as 1."""
+        """Posterior of a row; NaN counts as 0, and a sum above 1 is normalised to 1."""
         stated: dict[int, float] = {}
         for landmark_id, p in zip(frame.candidate_ids[row].tolist(), frame.id_probability[row].tolist(), strict=True):
             if landmark_id >= 0 and p > 0:
@@ -115,11 +105,11 @@ class IdentityPosterior:
 
     @property
     def favourite(self) -> int | None:
-        """The landmark that is more probable than all else together; None where there is none: it names nothing."""
+        """Landmark more probable than all else together, or None."""
         return next((landmark_id for landmark_id, p in self.probability.items() if p > 0.5), None)
 
     def log_weights(self, ids: list[int], errors: RecogniserErrors) -> Floats:
-        """Logarithms of w of some landmarks, and of none, shape (K + 1,); K is their number."""
+        """Logarithms of w for K landmarks and for none, shape (K + 1,)."""
         q, p = errors.wrong_id_probability, self.probability
         none = (1.0 - q) * (1.0 - min(sum(p.values()), 1.0)) + 0.5 * q
         share = 0.5 * q / max(len(ids), LEAST_LANDMARKS)

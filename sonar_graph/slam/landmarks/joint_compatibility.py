@@ -1,14 +1,13 @@
-"""Which detections of a frame are of which landmarks, judged by geometry alone and all together.
+"""Joint compatibility of a frame's detections with landmarks, by geometry alone.
 
-Joint compatibility branch and bound (Neira and Tardós, IEEE T-RA 17(6), 2001). A pairing of k detections with k
-landmarks has the innovation ``e`` of 2 k numbers and its covariance ``C``: what the landmarks are expected to show has
-the joint covariance P, and each detection its own noise R::
+Branch and bound (Neira and Tardós, IEEE T-RA 17(6), 2001). A pairing of k detections with k landmarks has the
+innovation e of 2 k numbers and its covariance C, with P the joint covariance of the expectations and R the noise::
 
     D² = e' C^-1 e,     C = P of the paired landmarks + blockdiag(R),     D² <= chi2(2 k)
 
-P has the error of the vehicle in it, which shifts all innovations of a frame together. A test of each detection by
-itself does not see that; the joint one does. Of all jointly compatible pairings the one with the most pairs is taken,
-of these the one with the smallest D².
+P contains the error of the vehicle, which shifts all innovations of a frame together; a test of each detection alone
+does not see that. The largest jointly compatible pairing is taken, of equally large ones that with the smallest D²
+(docs/theory/unknown_landmarks.md).
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ UNPAIRED = -1
 
 @dataclass(frozen=True)
 class Pairing:
-    """A hypothesis: the landmark of each detection, by index, or `UNPAIRED`."""
+    """Hypothesis: index of the landmark of each detection, or `UNPAIRED`."""
 
     landmarks: tuple[int, ...]
     distance: float
@@ -40,14 +39,14 @@ class Pairing:
 
 @dataclass(frozen=True, eq=False)
 class Innovations:
-    """Every detection of a frame beside every landmark that it might be of."""
+    """Innovations of m detections against n landmarks."""
 
     innovation: Floats
     """Measured minus expected range (m) and azimuth (rad, wrapped), shape (m, n, 2)."""
     expected_cov: Floats
-    """Joint covariance of what is expected of the landmarks, shape (2 n, 2 n)."""
+    """Joint covariance of the expectations, shape (2 n, 2 n)."""
     noise: Floats
-    """Of each detection, shape (m, 2, 2)."""
+    """Noise of each detection, shape (m, 2, 2)."""
 
     def of(self, landmarks: tuple[int, ...]) -> tuple[Floats, Floats]:
         """Innovation of the pairs of a hypothesis and its covariance, shapes (2 k,) and (2 k, 2 k)."""
@@ -77,12 +76,12 @@ def pair_jointly(innovations: Innovations, probability: float) -> Pairing:
 
     Parameters
     ----------
-    innovations
-        Of m detections and n landmarks.
     probability
-        A true pairing of k pairs passes the gate, the chi-square quantile with 2 k degrees of freedom, with this.
+        Chance that a true pairing of k pairs passes the gate, the chi-square quantile with 2 k degrees of freedom.
     """
-    return _Search(innovations, probability).best()
+    search = _Search(innovations, probability)
+    search.branch(0, _Whitened((UNPAIRED,) * len(innovations.innovation), [], np.zeros((0, 0)), np.zeros(0), 0.0))
+    return search.best
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,37 +104,31 @@ class _Search:
 
     def __init__(self, innovations: Innovations, probability: float) -> None:
         self._of = innovations
-        self._count = len(innovations.innovation)
-        self._gates = [0.0] + [gate_threshold(probability, 2 * (k + 1)) for k in range(self._count)]
+        count = len(innovations.innovation)
+        self._gates = [0.0] + [gate_threshold(probability, 2 * (k + 1)) for k in range(count)]
         distances = innovations.distances()
         self._possible = [[j for j in np.argsort(row).tolist() if row[j] <= self._gates[1]] for row in distances]
-        self._order = sorted(range(self._count), key=lambda i: (len(self._possible[i]) == 0, len(self._possible[i])))
-        self._left = [sum(bool(self._possible[i]) for i in self._order[depth:]) for depth in range(self._count + 1)]
-        self._best = Pairing((UNPAIRED,) * self._count, 0.0)
+        self._order = sorted(range(count), key=lambda i: (len(self._possible[i]) == 0, len(self._possible[i])))
+        self._left = [sum(bool(self._possible[i]) for i in self._order[depth:]) for depth in range(count + 1)]
+        self.best = Pairing((UNPAIRED,) * count, 0.0)
         self._best_size = 0
 
-    def best(self) -> Pairing:
-        self._branch(0, _Whitened((UNPAIRED,) * self._count, [], np.zeros((0, 0)), np.zeros(0), 0.0))
-        return self._best
-
-    def _branch(self, depth: int, found: _Whitened) -> None:
-        is_better = (found.size, -found.distance) > (self._best_size, -self._best.distance)
+    def branch(self, depth: int, found: _Whitened) -> None:
+        is_better = (found.size, -found.distance) > (self._best_size, -self.best.distance)
         if is_better and found.distance <= self._gates[found.size]:
-            self._best, self._best_size = Pairing(found.landmarks, found.distance), found.size
+            self.best, self._best_size = Pairing(found.landmarks, found.distance), found.size
         reach = found.size + self._left[depth]
-        if self._left[depth] == 0 or self._is_hopeless(reach, found):
+        # D² only grows with pairs: with so many in the end nothing can be better than the best so far.
+        is_hopeless = reach < self._best_size or (reach == self._best_size and found.distance >= self.best.distance)
+        if self._left[depth] == 0 or is_hopeless:
             return
         i = self._order[depth]
         for j in self._possible[i]:
             if j not in found.landmarks:
                 more = self._with_pair(found, i, j)
                 if more.distance <= self._gates[reach]:
-                    self._branch(depth + 1, more)
-        self._branch(depth + 1, found)
-
-    def _is_hopeless(self, reach: int, found: _Whitened) -> bool:
-        """D² only grows with pairs: with so many in the end nothing can be better than the best so far."""
-        return reach < self._best_size or (reach == self._best_size and found.distance >= self._best.distance)
+                    self.branch(depth + 1, more)
+        self.branch(depth + 1, found)
 
     def _with_pair(self, found: _Whitened, i: int, j: int) -> _Whitened:
         """One more pair, by a block of the Cholesky factor."""
@@ -154,8 +147,8 @@ class _Search:
 def believed(innovations: Innovations, pairing: Pairing, log_rivals: Floats) -> Pairing:
     """The pairing without what geometry says too little about.
 
-    A gate only says that a landmark *may* be the one. Where the expectation is wide the detection may as well be of
-    a landmark that is not in the map. Densities of the measurement under the two beliefs say which::
+    Where the expectation is wide a detection inside the gate may as well be of a landmark that is not in the map. A
+    pairing is believed where the measurement is denser than under that rival::
 
         ln N(e; 0, C)  >  sum of ln_rivals          all pairs together
         ln N(e_i; given the others)  >  ln_rival_i  each pair, given the other pairs
@@ -171,35 +164,25 @@ def believed(innovations: Innovations, pairing: Pairing, log_rivals: Floats) -> 
         Without the pair that fails worst, one after the other, until each one passes; without any if together they
         do not.
     """
-    landmarks = pairing.landmarks
+    landmarks, nothing = pairing.landmarks, Pairing((UNPAIRED,) * len(pairing.landmarks), 0.0)
     while any(landmark != UNPAIRED for landmark in landmarks):
         paired = [i for i, landmark in enumerate(landmarks) if landmark != UNPAIRED]
         e, C = innovations.of(landmarks)
-        excess = _log_given_the_others(e, C) - log_rivals[paired]
+        A = np.linalg.inv(C)  # given the others, e_i is normal about 0 with innovation A_ii^-1 (A e)_i
+        weighed, given = A @ e, []
+        for first in range(0, len(e), 2):
+            at = slice(first, first + 2)
+            S = np.linalg.inv(A[at, at])
+            given.append(_log_density(S @ weighed[at], S))
+        excess = np.array(given) - log_rivals[paired]
         worst = int(np.argmin(excess))
         if excess[worst] > 0:
             is_likely = _log_density(e, C) > float(log_rivals[paired].sum())
-            return Pairing(landmarks, float(e @ np.linalg.solve(C, e))) if is_likely else _without_pairs(pairing)
+            return Pairing(landmarks, float(e @ np.linalg.solve(C, e))) if is_likely else nothing
         landmarks = tuple(UNPAIRED if i == paired[worst] else at for i, at in enumerate(landmarks))
-    return _without_pairs(pairing)
-
-
-def _without_pairs(pairing: Pairing) -> Pairing:
-    return Pairing((UNPAIRED,) * len(pairing.landmarks), 0.0)
+    return nothing
 
 
 def _log_density(e: Floats, C: Floats) -> float:
     log_det = float(np.linalg.slogdet(C)[1])
     return -0.5 * (float(e @ np.linalg.solve(C, e)) + log_det + len(e) * math.log(2 * math.pi))
-
-
-def _log_given_the_others(e: Floats, C: Floats) -> Floats:
-    """Of each pair: with ``A = C^-1``, e_i given the others is normal about 0 with innovation ``A_ii^-1 (A e)_i``."""
-    A = np.linalg.inv(C)
-    weighed = A @ e
-    found = []
-    for first in range(0, len(e), 2):
-        at = slice(first, first + 2)
-        S = np.linalg.inv(A[at, at])
-        found.append(_log_density(S @ weighed[at], S))
-    return np.array(found)

@@ -1,24 +1,17 @@
-"""The max-mixture of what sightings may be of, and the choice that maximises it.
+"""Max-mixture of the landmarks that sightings may be of, and the choice that maximises it.
 
-Olson and Agarwal, "Inference on networks of mixtures for robust robot mapping", IJRR 32(7), 2013: of a mixture only its
-largest component is kept, at every point of the state space. For a watch g (all sightings j of one track, or a single
-sighting), landmarks i and none::
+Olson and Agarwal, "Inference on networks of mixtures for robust robot mapping", IJRR 32(7), 2013: only the largest
+component of a mixture is kept, at every point of the state space. For a watch g (all sightings j of one track, or a
+single sighting), landmarks i and none::
 
     l_i(x)    = log w_i + sum_j [ log n - 1/2 log det R_j - rho(e_range) - rho(e_azimuth) ]        e = e(x, j, L_i)
     l_none(x) = log w_none + log density of the watch if it is of no landmark
-    cost(x)   = sum_g min_k -l_k(x)  +  what all other factors cost
+    cost(x)   = sum_g min_k -l_k(x)  +  cost of all other factors
 
-rho is the kernel's loss (e^2 / 2 for none) and n normalises ``n^2 / sqrt(det R) exp(-rho)`` to one.
-
-Landmarks that began with sightings of something else, and where those that name them agree that they are.
-
-Choosing components is a descent: each watch goes where it fits best now. A landmark that began in a wrong place fits
-none of its own sightings, and nothing moves it. So the sightings that name it vote on its place. With the component l_i
-of the mixture for the landmark at a point p, and that of no landmark::
-
-    vote(p) = sum over watches that name i of max(l_i(p), l_none)
-
-at the point where it is, and where each sighting that does not fit has it. The best wins.
+with the kernel's loss rho, and n normalising ``n^2 / sqrt(det R) exp(-rho)``. Choosing components is a descent: a
+landmark that began in a wrong place fits none of its own sightings, and nothing moves it. So the watches that name it
+vote on its place, ``vote(p) = sum of max(l_i(p), l_none)``, at the point where it is and where each sighting that does
+not fit has it (docs/theory/doubtful_identities.md).
 """
 
 from __future__ import annotations
@@ -44,24 +37,24 @@ REPEATED_LOSS = 3.0
 
 @dataclass(eq=False)
 class TrackedObject:
-    """One object: what the recogniser last said of it, and its sightings, at least one."""
+    """One object (a watch): the last statement of the recogniser on it, and its sightings, at least one."""
 
     statement: IdentityPosterior
     sightings: list[Sighting] = field(default_factory=list)
 
     @property
     def landmark_id(self) -> int | None:
-        """What it counts as; None: no landmark."""
+        """Landmark that it counts as; None: no landmark."""
         return next((s.landmark_id for s in self.sightings if s.landmark_id is not None), None)
 
     @property
     def stamps_ns(self) -> set[int]:
-        """Frames in which it is."""
+        """Stamps of the frames that show it."""
         return {sighting.stamp_ns for sighting in self.sightings}
 
 
 Choices = list[int | None]
-"""What watches count as; None: no landmark."""
+"""Landmark that each watch counts as; None: no landmark."""
 Scores = dict[int | None, float]
 """The component l of each component of a watch; None: no landmark."""
 
@@ -101,22 +94,14 @@ class Errors:
         return np.einsum("nij,nkj->nki", self._whitener, e)
 
     def located(self) -> Floats:
-        """Where each was seen if at elevation 0, in the world, shape (n, 3)."""
+        """Points of the world where each was seen if at elevation 0, shape (n, 3), m."""
         r, a = self._z.T
         on_beam = np.column_stack((r * np.cos(a), r * np.sin(a), np.zeros_like(r)))
         return self._origin + np.einsum("nij,nj->ni", self._axes, on_beam)
 
 
 class Mixture:
-    """The components of watches, and which is largest.
-
-    Parameters
-    ----------
-    errors
-        How often the recogniser is wrong.
-    kernel
-        The shape of a sighting's noise.
-    """
+    """Components of watches, by the errors of the recogniser and the kernel of a sighting's noise."""
 
     def __init__(self, errors: RecogniserErrors, kernel: Kernel) -> None:
         self._errors = errors
@@ -124,7 +109,7 @@ class Mixture:
         self._log_peak = 2.0 * kernel.log_normaliser
 
     def at_first(self, statement: IdentityPosterior, ids: list[int], z: Floats, expected: Floats, S: Floats) -> Scores:
-        """Of a detection that the state is not yet conditioned on, with the covariances of its innovations."""
+        """Components of a detection that the state is not yet conditioned on, with its innovation covariances S."""
         e = z - expected
         e[:, 1] = np.arctan2(np.sin(e[:, 1]), np.cos(e[:, 1]))
         whitener = np.linalg.inv(np.linalg.cholesky(S))
@@ -146,7 +131,7 @@ class Mixture:
         return np.asarray(fits - self._unplaced(watches)[:, None] + (weights[:, 0] - weights[:, 1])[:, None])
 
     def squared_errors(self, watches: list[TrackedObject], ids: list[int], values: gtsam.Values) -> Floats:
-        """Of each watch, all its sightings together, were it of the landmark given, shape (n,)."""
+        """Squared error of each watch, all its sightings together, as of the landmark given, shape (n,)."""
         squares = []
         errors = Errors([s for watch in watches for s in watch.sightings], values)
         keys = sorted(set(ids))
@@ -233,7 +218,7 @@ class Mixture:
 
 
 def _starts(watches: list[TrackedObject]) -> list[int]:
-    """Where the sightings of each begin, when all are in one row."""
+    """First index of each watch's sightings in one row of all."""
     return list(accumulate((len(watch.sightings) for watch in watches[:-1]), initial=0))
 
 

@@ -1,14 +1,9 @@
-"""The history as it would be if watches were of other landmarks, solved beside the one that stands.
+"""Whole history under other choices of landmarks, solved beside the run for smoothed results.
 
-Nothing here is written to: it is what results are chosen from when they are asked for, and asking must not change the
-run. Factors are shared with it; they are never changed.
-
-A history in which watches count more or less: factors are made once, and given other noise for other weights.
-
-Which sightings belong, found without a good start: graduated non-convexity on the truncated cost.
-
-Yang, Antonante, Tzoumas, Carlone, "Graduated non-convexity for robust spatial perception", IEEE RA-L 5(2), 2020. Every
-watch g is of the landmark that it names (r_g^2 its squared error) or of none (a constant c_g^2)::
+Asking must not change the run: nothing here is written to, and factors are shared with it. Besides choosing again,
+graduated non-convexity finds which sightings belong without a good start (Yang, Antonante, Tzoumas, Carlone, "Graduated
+non-convexity for robust spatial perception", IEEE RA-L 5(2), 2020). Every watch g is of the landmark that it names,
+with its squared error r_g^2, or of none, at a constant c_g^2::
 
     min_x  sum_g min(r_g^2, c_g^2) / 2 + |odometry and all else|^2 / 2                                           (1)
 
@@ -17,8 +12,7 @@ The minimum in (1) is graduated by mu, from nearly convex to (1) itself; each mu
 
     w = 0  where r^2 >= (mu + 1) / mu c^2,   1  where r^2 <= mu / (mu + 1) c^2,   else  c / r sqrt(mu (mu + 1)) - mu
 
-Odometry and all other factors are known inliers. GTSAM has this too (`gtsam.GncLMOptimizer`), but weighs each factor
-alone where a watch is to be kept or dropped as a whole, and calls each factor in Python with a copy of all values.
+`gtsam.GncLMOptimizer` weighs each factor alone where a watch is kept or dropped as a whole (doubtful_identities.md).
 """
 
 from __future__ import annotations
@@ -42,18 +36,9 @@ LEAST_WEIGHT = 1e-6
 
 
 class WeighedHistory:
-    """Watches that are each of one landmark, and all other factors.
+    """Watches that are each of one landmark and count more or less, and all other factors.
 
-    What is said once of a landmark, by its earliest sighting, is not weighed: it is not of a watch.
-
-    Parameters
-    ----------
-    rest
-        Those other factors.
-    watches, ids
-        At least one, and of which landmark each is.
-    maker
-        Makes factors; without a kernel.
+    What is said once of a landmark, by its earliest sighting, is not weighed. The maker has no kernel.
     """
 
     def __init__(
@@ -84,7 +69,8 @@ class WeighedHistory:
         weight = max(weight, LEAST_WEIGHT)
         if any(isinstance(factor, gtsam.CustomFactor) for factor in factors):  # of those GTSAM makes no copies
             return self._maker.measured(replace(sighting, noise=sighting.noise / weight), key)
-        return [_with_sigmas(factor, factor.noiseModel().sigmas() / math.sqrt(weight)) for factor in factors]
+        divisor, diagonal = math.sqrt(weight), gtsam.noiseModel.Diagonal.Sigmas
+        return [f.cloneWithNewNoiseModel(diagonal(f.noiseModel().sigmas() / divisor)) for f in factors]
 
 
 def earliest(watches: list[TrackedObject], ids: list[int]) -> dict[int, Sighting]:
@@ -96,10 +82,6 @@ def earliest(watches: list[TrackedObject], ids: list[int]) -> dict[int, Sighting
             if known is None or (sighting.stamp_ns, sighting.row) < (known.stamp_ns, known.row):
                 first[landmark_id] = sighting
     return first
-
-
-def _with_sigmas(factor: gtsam.NoiseModelFactor, sigmas: Floats) -> gtsam.NoiseModelFactor:
-    return factor.cloneWithNewNoiseModel(gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
 
 MU_FACTOR = 1.4
@@ -157,17 +139,7 @@ LEAST_GAIN = 1e-3
 
 
 class RivalHistory:
-    """All watches, and all factors that are not of their sightings.
-
-    Parameters
-    ----------
-    rest
-        Those factors.
-    watches, mixture
-        What is chosen, and by what.
-    maker
-        Makes factors of sightings.
-    """
+    """All watches with the mixture that they are chosen by, and all factors that are not of their sightings."""
 
     def __init__(
         self, rest: gtsam.NonlinearFactorGraph, watches: list[TrackedObject], mixture: Mixture, maker: SightingFactors
@@ -193,11 +165,11 @@ class RivalHistory:
         return values, choices
 
     def marginals(self, values: gtsam.Values, choices: Choices) -> gtsam.Marginals | gtsam.ISAM2:
-        """What gives the covariances of a solution."""
+        """Marginals of a solution."""
         return marginals_of(self._chosen_graph(choices), values)
 
     def cost(self, values: gtsam.Values, choices: Choices) -> float:
-        """Of the max-mixture, with these components; what is said once of a landmark is of all other factors there."""
+        """Cost of the max-mixture with these components; what is said once of a landmark is among the other factors."""
         scores = self._mixture.scores(self._watches, values, choices, self._sizes(choices))
         chosen = [(watch, choice) for watch, choice in zip(self._watches, choices, strict=True) if choice is not None]
         said_once = sum(

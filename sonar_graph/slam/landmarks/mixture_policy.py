@@ -1,14 +1,11 @@
-"""Which landmark each watch shows, chosen and chosen again as the estimate moves: the max-mixture, incrementally.
+"""Max-mixture of identities, incrementally: choices made again as the estimate moves (doubtful_identities.md).
 
 A watch is all sightings of one track, or one sighting of no track. Its chosen component has its factors in the graph,
-the others have none; a Gauss-Newton step of that graph is one of the max-mixture
-(`sonar_graph.slam.landmarks.mixture`). After
-every update the choices of the window are made anew from where the estimate has moved, until none changes.
+the others have none; a Gauss-Newton step of that graph is one of the max-mixture. After every update the choices of the
+window are made anew until none changes. For smoothed results those of the whole history are, beside the run.
 
 When a detection comes, the state is not yet conditioned on it. It is then weighed by its predictive density, with the
-covariance ``S = H P H' + R`` of what was expected: a vehicle that has drifted must not mistake its landmarks for none.
-
-For smoothed results the choices of the whole history are made anew, beside the run (`DoubtfulIdentities.history`).
+innovation covariance ``S = H P H' + R``: a vehicle that has drifted must not mistake its landmarks for none.
 """
 
 from __future__ import annotations
@@ -55,19 +52,7 @@ IdentityParams = Annotated[RobustIdentity | GatedIdentity | MixtureIdentity, *ta
 
 
 class DoubtfulIdentities:
-    """Keeps the graph in line with the best component of every watch.
-
-    Parameters
-    ----------
-    landmarks
-        Of the graph.
-    journal
-        Its rows are amended when choices change.
-    params
-        Its settings.
-    mixture
-        What watches may be of, and how probable that is.
-    """
+    """Keeps the graph in line with the best component of every watch."""
 
     def __init__(
         self,
@@ -87,17 +72,17 @@ class DoubtfulIdentities:
         self._chosen: ChosenHistory | None = None
         self._chosen_from: gtsam.Values | None = None
         self.watches: list[TrackedObject] = []
-        """All so far, in the order in which they began."""
+        """All watches in the order in which they began."""
 
     @property
     def keys(self) -> list[int]:
-        """Of the landmarks that anything may be of."""
+        """Keys of the landmarks in the graph."""
         return [L(i) for i in sorted(self._landmarks.ids)]
 
     def chosen_at_first(
         self, view: PredictedView, statements: list[IdentityPosterior], tracks: list[int], z: Floats, noise: Floats
     ) -> list[int | None]:
-        """Of which landmark each detection of a frame is; a track's is what the track is of, if it is of any.
+        """Choose the landmark of each detection of a frame; that of a known track is the track's.
 
         Parameters
         ----------
@@ -125,10 +110,19 @@ class DoubtfulIdentities:
         chosen: list[int | None],
         time_s: float,
     ) -> None:
-        """Put a frame's sightings into the graph as they were chosen, and what waited in their tracks."""
+        """Put a frame's sightings into the graph as chosen, with what waited in their tracks.
+
+        Tracks that are over are forgotten; keyframes on which sightings of others wait are held in the window.
+        """
         late: list[tuple[Sighting, int]] = []
         for statement, track, sighting, landmark_id in zip(statements, tracks, sightings, chosen, strict=True):
-            watch = self._watch_of(track, statement)
+            known = self._tracks.get(track) if track != NO_TRACK else None
+            watch = known or TrackedObject(statement)
+            watch.statement = statement
+            if known is None:
+                self.watches.append(watch)
+                if track != NO_TRACK:
+                    self._tracks[track] = watch
             waiting = [s for s in watch.sightings if s.outcome is Outcome.UNFIT] if track != NO_TRACK else []
             watch.sightings.append(sighting)
             if landmark_id != statement.favourite and statement.favourite is not None:
@@ -140,8 +134,7 @@ class DoubtfulIdentities:
             sighting.outcome = Outcome.NEW if is_first else _used(statement, landmark_id, Outcome.USED)
             if is_first:
                 self._smoother.add_landmark(L(landmark_id), self._maker.place(sighting, self._smoother.values))
-            made = self._maker.make(sighting, L(landmark_id), is_first=is_first)
-            self._landmarks.enter(sighting, landmark_id, self._smoother.add(made))
+            self._landmarks.add(sighting, landmark_id, is_first=is_first)
             taken_ns = self._landmarks.stamps_ns(landmark_id)
             fresh = [s for s in waiting if s.stamp_ns not in taken_ns]
             for waited in fresh:
@@ -151,11 +144,7 @@ class DoubtfulIdentities:
             self._landmarks.exchange([], late, time_s)
         for sighting, landmark_id in late:
             self._journal.amend(sighting.row, sighting.outcome, landmark_id)
-        self._hold(sightings[0].stamp_ns)
-
-    def _hold(self, now_ns: int) -> None:
-        """Keep keyframes on which sightings of tracks wait in the window, and let go of tracks that are over."""
-        oldest_ns = now_ns - self._longest_wait_ns
+        oldest_ns = sightings[0].stamp_ns - self._longest_wait_ns
         self._tracks = {k: watch for k, watch in self._tracks.items() if watch.sightings[-1].stamp_ns >= oldest_ns}
         self._smoother.hold(
             {
@@ -167,18 +156,8 @@ class DoubtfulIdentities:
             }
         )
 
-    def _watch_of(self, track: int, statement: IdentityPosterior) -> TrackedObject:
-        watch = self._tracks.get(track) if track != NO_TRACK else None
-        if watch is None:
-            watch = TrackedObject(statement)
-            self.watches.append(watch)
-            if track != NO_TRACK:
-                self._tracks[track] = watch
-        watch.statement = statement
-        return watch
-
     def reconsider(self, time_s: float) -> None:
-        """Choose anew in the window until nothing changes."""
+        """Choose anew in the window until nothing changes; move landmarks to where those that name them agree."""
         watches = self._open()
         if self._changes(watches, self._smoother.values):
             self._smoother.flush(time_s)
@@ -192,32 +171,40 @@ class DoubtfulIdentities:
             if not changes:
                 break
             self._change(changes, time_s)
-        self._relocate(time_s)
+        for landmark_id in sorted(self._disputed & self._landmarks.ids):
+            naming = [watch for watch in self.watches if watch.statement.favourite == landmark_id]
+            present = [watch.landmark_id for watch in naming]
+            found = supporters_elsewhere(landmark_id, naming, present, self._smoother.values, self._mixture)
+            if found is not None:
+                self._change([(w, None) for w in self.watches if w.landmark_id == landmark_id], time_s)
+                self._change([(w, landmark_id) for w in found], time_s)
+        self._disputed.clear()
 
     def history(self) -> ChosenHistory:
         """Choose anew in the whole history until nothing changes; the window's choices stay as they are."""
         values, marginals = self._smoother.solve_history()
         heard = sum(len(watch.sightings) for watch in self.watches)
         if self._chosen is None or self._chosen_from is not values or self._chosen.heard != heard:
-            self._chosen_from, self._chosen = values, self._choose(values, marginals, heard)
+            watches = [
+                watch
+                for watch in self.watches
+                if watch.landmark_id is not None or all(s.outcome is not Outcome.WITHHELD for s in watch.sightings)
+            ]
+            present = [watch.landmark_id for watch in watches]
+            handles = {handle for watch in watches for s in watch.sightings for handle in s.handles}
+            rival = RivalHistory(self._smoother.graph_without(handles), watches, self._mixture, self._maker)
+            found, choices = rival.settled(values, present, is_graduated=self._is_graduated)
+            if found is not values:
+                marginals = rival.marginals(found, choices)
+            self._chosen_from, self._chosen = values, ChosenHistory(found, marginals, watches, choices, heard)
         return self._chosen
 
-    def _choose(self, values: gtsam.Values, marginals: gtsam.Marginals | gtsam.ISAM2, heard: int) -> ChosenHistory:
-        watches = [watch for watch in self.watches if not _is_withheld(watch)]
-        present = [watch.landmark_id for watch in watches]
-        handles = {handle for watch in watches for s in watch.sightings for handle in s.handles}
-        rival = RivalHistory(self._smoother.graph_without(handles), watches, self._mixture, self._maker)
-        found, choices = rival.settled(values, present, is_graduated=self._is_graduated)
-        if found is not values:
-            marginals = rival.marginals(found, choices)
-        return ChosenHistory(found, marginals, watches, choices, heard)
-
     def log(self) -> DetectionLog:
-        """What became of each detection in the whole history."""
+        """Outcome of each detection in the whole history."""
         journal, chosen = self._journal.copy(), self.history()
         for watch, new in _differing(chosen.watches, chosen.choices):
             for sighting in watch.sightings:
-                journal.amend(sighting.row, *_what_became(watch.statement, new))
+                journal.amend(sighting.row, *late_outcome(watch.statement, new))
         return journal.log()
 
     def _changes(self, watches: list[TrackedObject], values: gtsam.Values) -> list[tuple[TrackedObject, int | None]]:
@@ -225,8 +212,16 @@ class DoubtfulIdentities:
         return _differing(watches, best)
 
     def _open(self) -> list[TrackedObject]:
-        """Contradicted watches, and those whose sightings are all in the window, unless they alone hold a landmark."""
-        recent, contradicted = self.watches[-MOST_OPEN:], self._contradicted()
+        """Watches to choose anew: tracks that are now named otherwise than what they count as, and those in the window.
+
+        A watch is in the window when all its sightings are; one that alone holds a landmark keeps it.
+        """
+        recent = self.watches[-MOST_OPEN:]
+        contradicted = [
+            watch
+            for watch in self._tracks.values()
+            if watch.landmark_id is not None and watch.statement.favourite not in (None, watch.landmark_id)
+        ]
         inside = set(self._smoother.in_window(sorted({s.line.pose_key for w in recent for s in w.sightings})))
         return contradicted + [
             watch
@@ -237,19 +232,11 @@ class DoubtfulIdentities:
         ]
 
     def _is_alone(self, watch: TrackedObject) -> bool:
-        """Whether its landmark is where it, and no other watch, has put it."""
+        """True when no other watch has sightings of its landmark."""
         return watch.landmark_id is not None and self._landmarks.sizes()[watch.landmark_id] == len(watch.sightings)
 
-    def _contradicted(self) -> list[TrackedObject]:
-        """Watches of tracks that are now named as something else than what they count as."""
-        return [
-            watch
-            for watch in self._tracks.values()
-            if watch.landmark_id is not None and watch.statement.favourite not in (None, watch.landmark_id)
-        ]
-
     def _is_preferred(self, new: int | None, watch: TrackedObject) -> bool:
-        """Whether the predictive density of a watch's newest sighting, too, is for another component than the present.
+        """True when the predictive density of the newest sighting, too, is for another component than the present.
 
         Where the estimate is uncertain, as when a loop closes, a misfit is not yet one of the identity. A robust kernel
         may leave it there for some updates.
@@ -263,16 +250,6 @@ class DoubtfulIdentities:
         scores = self._mixture.at_first(watch.statement, ids, line.z, expected, cov + sighting.noise)
         return scores[new] > scores[watch.landmark_id]
 
-    def _relocate(self, time_s: float) -> None:
-        for landmark_id in sorted(self._disputed & self._landmarks.ids):
-            naming = [watch for watch in self.watches if watch.statement.favourite == landmark_id]
-            present = [watch.landmark_id for watch in naming]
-            found = supporters_elsewhere(landmark_id, naming, present, self._smoother.values, self._mixture)
-            if found is not None:
-                self._change([(w, None) for w in self.watches if w.landmark_id == landmark_id], time_s)
-                self._change([(w, landmark_id) for w in found], time_s)
-        self._disputed.clear()
-
     def _change(self, changes: list[tuple[TrackedObject, int | None]], time_s: float) -> None:
         leaving = [s for watch, _ in changes for s in watch.sightings if s.landmark_id is not None]
         coming = [(s, new) for watch, new in changes if new is not None for s in watch.sightings]
@@ -281,36 +258,31 @@ class DoubtfulIdentities:
             if said is not None and new != said:
                 self._disputed.add(said)
             for sighting in watch.sightings:
-                sighting.outcome, landmark_id = _what_became(watch.statement, new)
+                sighting.outcome, landmark_id = late_outcome(watch.statement, new)
                 self._journal.amend(sighting.row, sighting.outcome, landmark_id)
         self._landmarks.exchange(leaving, coming, time_s)
 
 
 @dataclass(frozen=True, eq=False)
 class ChosenHistory:
-    """The whole history, with what suits it best, and its solution."""
+    """Solution of the whole history with the choices that suit it best."""
 
     values: gtsam.Values
     marginals: gtsam.Marginals | gtsam.ISAM2
     watches: list[TrackedObject]
     choices: Choices
-    """Of the watches."""
+    """Choice of each watch."""
     heard: int
     """Number of sightings from which it was chosen."""
 
     @property
     def ids(self) -> set[int]:
-        """Landmarks that are seen in it."""
+        """Landmarks that are seen in it, by identity."""
         return {choice for choice in self.choices if choice is not None}
 
 
-def _is_withheld(watch: TrackedObject) -> bool:
-    """Whether the smoother cannot use what it would be."""
-    return watch.landmark_id is None and any(s.outcome is Outcome.WITHHELD for s in watch.sightings)
-
-
-def _what_became(statement: IdentityPosterior, new: int | None) -> tuple[Outcome, int | None]:
-    """Of detections whose landmark is chosen after they came, and the landmark for the journal."""
+def late_outcome(statement: IdentityPosterior, new: int | None) -> tuple[Outcome, int | None]:
+    """Outcome of detections whose landmark is chosen late, and the landmark for the journal."""
     if new is None:
         return Outcome.UNFIT, statement.favourite
     return _used(statement, new, Outcome.USED_LATER), new

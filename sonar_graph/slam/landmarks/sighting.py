@@ -1,18 +1,8 @@
-"""One detection, tied to a keyframe, and the factors that it becomes.
+"""Sightings: detections tied to keyframes, the factors that they become, and those that are in the graph by landmark.
 
-A sighting holds only what was measured, not what was believed of the landmark when it was made. Its factors are thus
-the same whenever they are made, and for whichever landmark.
-
-Which sighting is of which landmark, and what of that is in the graph.
-
-The earliest sighting of a landmark carries what is said of it once (`SightingFactors`). Whatever is
-put in and taken out, and in whatever order, the factors depend only on which sightings are of which landmark: they are
-those of a graph that had known from the start.
-
-Where sightings alone put a point, seen from keyframes that are taken as they are.
-
-A sonar measures range and azimuth. One sighting leaves the elevation to the aperture, or to a known floor; sightings
-from other places narrow it.
+A sighting holds only what was measured. Its factors are the same whenever they are made, and for whichever landmark.
+The earliest sighting of a landmark carries what is said of it once (`SightingFactors`): whatever is put in and taken
+out, in whatever order, the graph depends only on which sightings are of which landmark (docs/theory/identities.md).
 """
 
 from __future__ import annotations
@@ -44,36 +34,28 @@ from sonar_graph.states import DetectionJournal, Outcome
 
 @dataclass(eq=False, slots=True)
 class Sighting:
-    """Range and azimuth of something, seen from a keyframe."""
+    """Range and azimuth of an object, seen from a keyframe."""
 
     stamp_ns: int
     row: int
-    """In the journal."""
+    """Row in the journal."""
     line: Sightline
     noise: Floats
     """Covariance of range and azimuth, with that of the motion since the keyframe, shape (2, 2)."""
     floor: FloorPrior | None
-    """On which it may stand, judged from where it was seen."""
+    """Floor on which it may stand, judged from where it was seen."""
     elevation_rad: float = 0.0
-    """Of its direction, when a landmark begins with it."""
+    """Elevation of its direction when a landmark begins with it."""
     landmark_id: int | None = None
-    """Of which it is a sighting; None: not of any."""
+    """Landmark of which it is a sighting, or None."""
     handles: tuple[int, ...] = ()
-    """Of its factors."""
+    """Handles of its factors."""
     outcome: Outcome = Outcome.WAITING
-    """What has become of it so far."""
+    """Present outcome."""
 
 
 class SightingFactors:
-    """Makes the factors of sightings.
-
-    Parameters
-    ----------
-    sonar
-        For its vertical aperture.
-    robust
-        Wraps a noise model in the chosen kernel.
-    """
+    """Makes the factors of sightings, with noise models that a kernel wraps."""
 
     def __init__(self, sonar: SonarCalibration, robust: factors.Robust) -> None:
         self.elevation_sigma_rad = sonar.elevation_aperture_rad / math.sqrt(12.0)
@@ -82,7 +64,7 @@ class SightingFactors:
         self._robust = robust
 
     def without_kernel(self) -> SightingFactors:
-        """One that makes the same factors with Gaussian noise."""
+        """Maker of the same factors with Gaussian noise."""
         plain = copy(self)
         plain._robust = lambda noise: noise
         return plain
@@ -98,7 +80,7 @@ class SightingFactors:
         return self._measured(sighting, key, None)
 
     def beginning(self, sighting: Sighting, key: int) -> list[gtsam.NonlinearFactor]:
-        """What the first sighting of a landmark says beside range and azimuth, with a kernel as they have it."""
+        """Factors of a landmark's first sighting besides range and azimuth, with the same kernel."""
         line = sighting.line
         if sighting.floor:
             return self._placed(sighting, key)
@@ -116,7 +98,7 @@ class SightingFactors:
         )
 
     def _placed(self, sighting: Sighting, key: int) -> list[gtsam.NonlinearFactor]:
-        """Where, and on which floor, a landmark is said to be once."""
+        """Factors on the place and the floor of a landmark, added once."""
         line = sighting.line
         range_m, azimuth_rad = line.z.tolist()
         on_beam = locate(line.body_T_sonar, range_m, azimuth_rad, sighting.elevation_rad)
@@ -126,7 +108,7 @@ class SightingFactors:
         return made
 
     def place(self, sighting: Sighting, values: gtsam.Values) -> Floats:
-        """Where a landmark that begins with this sighting is to start: on its floor, else on the centre beam."""
+        """First estimate of a landmark that begins with this sighting: on its floor, else on the centre beam."""
         line = sighting.line
         range_m, azimuth_rad = line.z.tolist()
         world_T_sonar = values.atPose3(line.pose_key).compose(line.body_T_sonar)
@@ -143,42 +125,31 @@ class SightingFactors:
 
 
 class LandmarkSightings:
-    """The sightings that are in the graph, by landmark.
-
-    Parameters
-    ----------
-    smoother
-        Gets their factors.
-    maker
-        Makes them.
-    """
+    """Sightings that are in the graph, by landmark."""
 
     def __init__(self, smoother: Smoother, maker: SightingFactors) -> None:
-        self.smoother = smoother
-        """Whose graph has their factors."""
-        self.maker = maker
-        """Of their factors."""
+        self.smoother, self.maker = smoother, maker
         self._of: dict[int, dict[Sighting, None]] = defaultdict(dict)
         self._rooted: dict[int, Sighting] = {}
 
     @property
     def ids(self) -> set[int]:
-        """Landmarks in the graph."""
+        """Identities of the landmarks in the graph."""
         return set(self._of)
 
     def __contains__(self, landmark_id: object) -> bool:
         return landmark_id in self._of
 
     def sightings(self, landmark_id: int) -> list[Sighting]:
-        """Those of a landmark."""
+        """Sightings of a landmark."""
         return list(self._of.get(landmark_id, {}))
 
     def any_sighting(self, landmark_id: int) -> Sighting:
-        """One of a landmark of the graph."""
+        """Any sighting of a landmark of the graph."""
         return next(iter(self._of[landmark_id]), None) or self._rooted[landmark_id]
 
     def is_rooted(self, landmark_id: int) -> bool:
-        """Whether sightings of it have left a bounded window, so that it stays."""
+        """True when sightings of it have left a bounded window, so that it stays."""
         return landmark_id in self._rooted
 
     def sizes(self) -> dict[int, int]:
@@ -186,11 +157,16 @@ class LandmarkSightings:
         return {i: len(sightings) + (i in self._rooted) for i, sightings in self._of.items()}
 
     def stamps_ns(self, landmark_id: int) -> set[int]:
-        """Frames that show a landmark."""
+        """Stamps of the frames that show a landmark."""
         return {sighting.stamp_ns for sighting in self._of.get(landmark_id, {})}
 
+    def add(self, sighting: Sighting, landmark_id: int, *, is_first: bool) -> None:
+        """Add a sighting with its factors at the next update."""
+        made = self.maker.make(sighting, L(landmark_id), is_first=is_first)
+        self.enter(sighting, landmark_id, self.smoother.add(made))
+
     def enter(self, sighting: Sighting, landmark_id: int, handles: Iterable[int]) -> None:
-        """A sighting whose factors were given to the smoother already."""
+        """Add a sighting whose factors the smoother has already."""
         sighting.landmark_id, sighting.handles = landmark_id, tuple(handles)
         self._of[landmark_id][sighting] = None
         self.smoother.sightlines.add(L(landmark_id), sighting.line)
@@ -238,9 +214,34 @@ class LandmarkSightings:
             self._take(sighting)
         for sighting, landmark in new:
             self.enter(sighting, landmark, ())
-        again = self._roles_changed(before, {sighting for sighting, _ in new})
+        firsts = {landmark: self._first(landmark) for landmark in before}
+        fresh = {sighting for sighting, _ in new}
+        again = [  # they stay in, but no longer are, or now are, the first of their landmark
+            s
+            for landmark, old in before.items()
+            if firsts[landmark] is not old
+            for s in (old, firsts[landmark])
+            if s is not None and s.landmark_id == landmark and s not in fresh
+        ]
         removed += [handle for sighting in again for handle in sighting.handles]
-        self._make([sighting for sighting, _ in new] + again, removed, before, time_s)
+        begun = {
+            L(landmark): self.maker.place(first, self.smoother.values)
+            for landmark, first in firsts.items()
+            if first is not None and before[landmark] is None
+        }
+        lost = [L(landmark) for landmark, first in firsts.items() if first is None and before[landmark] is not None]
+        sightings = [sighting for sighting, _ in new] + again
+        made = [
+            self.maker.make(s, L(s.landmark_id), is_first=s is firsts[s.landmark_id])
+            for s in sightings
+            if s.landmark_id is not None
+        ]
+
+        def entered(groups: list[list[int]]) -> None:
+            for sighting, handles in zip(sightings, groups, strict=True):
+                sighting.handles = tuple(handles)
+
+        self.smoother.exchange(GraphEdit(removed, made, begun, lost), time_s, entered)
 
     def _first(self, landmark_id: int) -> Sighting | None:
         if landmark_id in self._rooted:
@@ -256,38 +257,6 @@ class LandmarkSightings:
             del self._of[landmark]
         self.smoother.sightlines.remove(L(landmark), sighting.line)
         sighting.landmark_id, sighting.handles = None, ()
-
-    def _roles_changed(self, before: dict[int, Sighting | None], new: set[Sighting]) -> list[Sighting]:
-        """Sightings that stay in, but no longer are, or now are, the first of their landmark."""
-        changed = []
-        for landmark, old in before.items():
-            first = self._first(landmark)
-            if first is not old:
-                changed += [s for s in (old, first) if s is not None and s.landmark_id == landmark and s not in new]
-        return changed
-
-    def _make(
-        self, sightings: list[Sighting], removed: list[int], before: dict[int, Sighting | None], time_s: float
-    ) -> None:
-        """Exchange factors for those of the sightings; landmarks begin and end with their sightings."""
-        firsts = {landmark: self._first(landmark) for landmark in before}
-        begun = {
-            L(landmark): self.maker.place(first, self.smoother.values)
-            for landmark, first in firsts.items()
-            if first is not None and before[landmark] is None
-        }
-        lost = [L(landmark) for landmark, first in firsts.items() if first is None and before[landmark] is not None]
-        made = [
-            self.maker.make(s, L(s.landmark_id), is_first=s is firsts[s.landmark_id])
-            for s in sightings
-            if s.landmark_id is not None
-        ]
-
-        def entered(groups: list[list[int]]) -> None:
-            for sighting, handles in zip(sightings, groups, strict=True):
-                sighting.handles = tuple(handles)
-
-        self.smoother.exchange(GraphEdit(removed, made, begun, lost), time_s, entered)
 
 
 def source(sighting: Sighting, values: gtsam.Values, maker: SightingFactors) -> Source:
@@ -310,9 +279,9 @@ def source(sighting: Sighting, values: gtsam.Values, maker: SightingFactors) -> 
 
 
 def place(sightings: list[Sighting], values: gtsam.Values, maker: SightingFactors) -> tuple[Floats, Floats]:
-    """The point of several sightings, shape (3,), m, and its covariance, shape (3, 3), m².
+    """Point of several sightings, shape (3,), m, and its covariance, shape (3, 3), m².
 
-    That of the first, corrected by one after the other::
+    The first sighting, corrected by the others one after the other::
 
         K = P H' (H P H' + R)^-1,    p <- p + K (z - h(p)),    P <- (I - K H) P
     """

@@ -1,26 +1,19 @@
-"""Landmarks that nothing but their place tells apart.
+"""Unknown landmarks: detections without identities, paired by geometry (docs/theory/unknown_landmarks.md).
 
-Detections without an identity are paired with the landmarks of the graph, named ones too, by joint compatibility
-(`sonar_graph.slam.landmarks.joint_compatibility`). What is left waits, tied to its keyframe, and is paired with what
-waits of
-earlier frames. Once enough sightings of one candidate place it well enough, they become factors, each on the keyframe
-at which it was made, and the candidate a landmark. Landmarks that turn out to be one are merged
-(`sonar_graph.slam.landmarks.unknown`).
+They are paired with the landmarks of the graph, named ones too, by joint compatibility. What is left waits, tied to its
+keyframe, and is paired with what waits of earlier frames. Once enough sightings of one candidate place it well enough,
+they become factors, each on its own keyframe, and the candidate a landmark.
 
-Two landmarks of the graph that are one.
+Two landmarks a, b of the graph are one, and are merged, when
 
-A landmark that was seen again after much drift may be taken for a new one. When other evidence has since corrected
-the poses, its duplicate comes to lie where it lies. Two landmarks a, b are one when all of this holds:
+* at least one of them is anonymous, no frame shows both, and no sighting of the one that goes has left the window;
+* their difference ``d = p_a - p_b`` with ``S = P_aa + P_bb - P_ab - P_ba + sigma² I`` is compatible with zero:
+  ``d' S^-1 d`` is inside the chi-square gate, three degrees of freedom;
+* the density of the horizontal difference ``N(d_xy; 0, S_xy)``, 1/m², exceeds that of neighbours which are not in the
+  map. Where S is wide it does not.
 
-* at least one of them is anonymous;
-* no frame shows both, and with a bounded history none of the one that goes has left the window;
-* their difference ``d = p_a - p_b``, with ``S = P_aa + P_bb - P_ab - P_ba + sigma² I``, is compatible with zero:
-  ``d' S^-1 d`` is within the chi-square gate, three degrees of freedom;
-* that says something: the density of the horizontal difference ``N(d_xy; 0, S_xy)``, 1/m², exceeds the density that
-  neighbours which are not in the map are expected to have. Where S is wide it does not.
-
-Sigma is the noise of one sighting. Of two landmarks in one place each gets the sightings on its side, so that they stay
-apart by about that, and P does not know it. Two that really lie so near each other are told apart by frames with both.
+Sigma is the noise of one sighting: of two landmarks in one place each gets the sightings on its side, so that they stay
+apart by about that, and P does not know it.
 """
 
 from __future__ import annotations
@@ -49,17 +42,7 @@ from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionJournal, Outcome
 
 
 class LandmarkMerging:
-    """Finds landmarks that are one.
-
-    Parameters
-    ----------
-    landmarks
-        Those of the graph, with their frames.
-    gate_probability
-        Two that are one pass the gate with this probability.
-    log_rival
-        Logarithm of the density, 1/m², which the horizontal difference has to exceed.
-    """
+    """Finds two landmarks of the graph that are one, inside a gate and denser than a rival (logarithm of 1/m²)."""
 
     def __init__(self, landmarks: LandmarkSightings, gate_probability: float, log_rival: float) -> None:
         self._landmarks = landmarks
@@ -69,50 +52,37 @@ class LandmarkMerging:
     def nearest(
         self, values: gtsam.Values, covariance: JointCovariance, named: list[int], anonymous: list[int]
     ) -> tuple[int, int] | None:
-        """The pair of landmarks that are most likely one: which stays, and which becomes part of it; None: no pair.
+        """Nearest two landmarks that are one, or None: that which stays and that which becomes part of it.
 
-        A named landmark stays, of two anonymous ones that of the lower identity.
-
-        Parameters
-        ----------
-        covariance
-            Joint, of all these landmarks.
+        A named landmark stays, of two anonymous ones the one with the lower identity.
         """
         pairs = [(a, b) for b in anonymous for a in named] + list(combinations(sorted(anonymous), 2))
         if not pairs:
             return None
-        d, S = _differences(values, covariance, pairs)
-        S = S + np.array([max(map(self._variance, pair)) for pair in pairs])[:, None, None] * np.eye(3)
+        points = {i: values.atPoint3(L(i)) for i in {i for pair in pairs for i in pair}}
+        rows = {i: covariance.rows[L(i)] + np.arange(3) for i in points}
+        a, b = (np.array([rows[pair[side]] for pair in pairs]) for side in (0, 1))
+        P, d = covariance.matrix, np.array([points[i] - points[j] for i, j in pairs])
+        signed = ((1, a, a), (1, b, b), (-1, a, b), (-1, b, a))
+        S = np.asarray(sum(sign * P[i[:, :, None], j[:, None, :]] for sign, i, j in signed))
+        noise = {}
+        for i in points:  # of a sighting, across or along its beam, whichever is larger, m²
+            sighting = self._landmarks.any_sighting(i)
+            noise[i] = float(max(sighting.noise[0, 0], sighting.line.z[0] ** 2 * sighting.noise[1, 1]))
+        S = S + np.array([max(noise[i], noise[j]) for i, j in pairs])[:, None, None] * np.eye(3)
         distance = np.einsum("ki,ki->k", d, np.linalg.solve(S, d[..., None])[..., 0])
         near = [k for k in np.argsort(distance).tolist() if distance[k] <= self._gate]
-        return next((pairs[k] for k in near if self._is_telling(d[k], S[k]) and self._may_be_one(*pairs[k])), None)
-
-    def _variance(self, landmark_id: int) -> float:
-        """Noise of a sighting, across or along its beam, whichever is larger, m²."""
-        sighting = self._landmarks.any_sighting(landmark_id)
-        return float(max(sighting.noise[0, 0], sighting.line.z[0] ** 2 * sighting.noise[1, 1]))
+        for k in near:
+            stays, goes = pairs[k]
+            of_both = self._landmarks.stamps_ns(stays) & self._landmarks.stamps_ns(goes)
+            if self._is_telling(d[k], S[k]) and not of_both and not self._landmarks.is_rooted(goes):
+                return stays, goes
+        return None
 
     def _is_telling(self, d: Floats, S: Floats) -> bool:
         level = S[:2, :2]
         log_det = float(np.linalg.slogdet(level)[1])
         return -0.5 * (float(d[:2] @ np.linalg.solve(level, d[:2])) + log_det) - math.log(2 * math.pi) > self._log_rival
-
-    def _may_be_one(self, stays: int, goes: int) -> bool:
-        """Whether no frame shows both, and all sightings of the one that goes can still be moved."""
-        of_both = self._landmarks.stamps_ns(stays) & self._landmarks.stamps_ns(goes)
-        return not of_both and not self._landmarks.is_rooted(goes)
-
-
-def _differences(
-    values: gtsam.Values, covariance: JointCovariance, pairs: list[tuple[int, int]]
-) -> tuple[Floats, Floats]:
-    """Difference of each pair and its covariance, shapes (k, 3) and (k, 3, 3)."""
-    points = {i: values.atPoint3(L(i)) for i in {i for pair in pairs for i in pair}}
-    rows = {i: covariance.rows[L(i)] + np.arange(3) for i in points}
-    a, b = (np.array([rows[pair[side]] for pair in pairs]) for side in (0, 1))
-    P = covariance.matrix
-    S = sum(sign * P[i[:, :, None], j[:, None, :]] for sign, i, j in ((1, a, a), (1, b, b), (-1, a, b), (-1, b, a)))
-    return np.array([points[i] - points[j] for i, j in pairs]), np.asarray(S)
 
 
 ODDS = 10.0
@@ -154,12 +124,12 @@ UnknownParams = Annotated[IgnoredUnknown | AssociatedUnknown, *tagged("policy", 
 
 
 def unnamed(frame: LandmarkDetections) -> NDArray[np.bool_]:
-    """Which rows name no landmark at all, neither one nor several in doubt, shape (n,)."""
+    """Flags of rows that name no landmark at all, neither one nor several in doubt, shape (n,)."""
     return np.asarray((frame.candidate_ids < 0).all(axis=1))
 
 
 def refuse_taken_ids(frame: LandmarkDetections) -> None:
-    """Refuse names that are those of landmarks without names.
+    """Refuse identities that are reserved for landmarks without names.
 
     Raises
     ------
@@ -177,20 +147,18 @@ def refuse_taken_ids(frame: LandmarkDetections) -> None:
 
 @dataclass(eq=False)
 class Candidate:
-    """Sightings of what may be a landmark, in the order of time."""
+    """Sightings that may be of one landmark, in the order of time."""
 
     sightings: list[Sighting] = field(default_factory=list)
 
 
 class PairedDetection(NamedTuple):
-    """What a detection was paired with."""
+    """Landmark or candidate that a detection was paired with, or neither."""
 
     landmark_id: int | None
-    """A landmark of the graph."""
     candidate: Candidate | None
-    """None beside it: of neither."""
     innovation: Floats | None = None
-    """Against a landmark, shape (2,)."""
+    """Innovation against the landmark, shape (2,)."""
     S: Floats | None = None
     """Its covariance, shape (2, 2)."""
 
@@ -221,16 +189,16 @@ class AnonymousLandmarks:
 
     @property
     def has_landmarks(self) -> bool:
-        """Whether any landmark of the graph is anonymous."""
+        """True when a landmark of the graph is anonymous."""
         return any(i >= FIRST_ANONYMOUS_ID for i in self._landmarks.ids)
 
     def keys(self) -> list[int]:
-        """Variables whose joint covariance pairing needs: all landmarks, and keyframes that saw candidates."""
+        """Keys whose joint covariance pairing needs: all landmarks, and keyframes that saw candidates."""
         seen_from = [candidate.sightings[-1].line.pose_key for candidate in self._candidates]
         return [*(L(i) for i in sorted(self._landmarks.ids)), *sorted(set(seen_from))]
 
     def pair(self, view: PredictedView, z: Floats, noise: Floats, taken: set[int]) -> list[PairedDetection]:
-        """Landmark or candidate of each detection of a frame: landmarks first, candidates for what is left.
+        """Pair each detection of a frame with a landmark, or else with a candidate.
 
         Parameters
         ----------
@@ -261,48 +229,34 @@ class AnonymousLandmarks:
         return paired
 
     def use(self, sightings: list[Sighting], paired: list[PairedDetection], time_s: float) -> None:
-        """Add what was paired with landmarks; the rest waits, until a candidate becomes a landmark."""
+        """Add sightings that were paired with landmarks; the others wait until their candidate becomes a landmark."""
         for sighting, (landmark_id, candidate, _, S) in zip(sightings, paired, strict=True):
             if landmark_id is not None and S is not None:
                 self._smoother.waiting_gain += float((np.diag(S) / np.diag(sighting.noise)).max()) - 1.0
-                made = self._maker.make(sighting, L(landmark_id), is_first=False)
-                self._landmarks.enter(sighting, landmark_id, self._smoother.add(made))
+                self._landmarks.add(sighting, landmark_id, is_first=False)
                 sighting.outcome = Outcome.USED
                 continue
             if candidate is None:
                 candidate = Candidate()
                 self._candidates.append(candidate)
             candidate.sightings.append(sighting)
-            if self._is_placed(candidate):
-                self._begin(candidate, time_s)
-
-    def _is_placed(self, candidate: Candidate) -> bool:
-        if len(candidate.sightings) < self._policy.sightings:
-            return False
-        _, cov = place(candidate.sightings, self._smoother.values, self._maker)
-        range_m = candidate.sightings[-1].line.z[0]
-        return bool(np.linalg.eigvalsh(cov)[-1] <= (LARGEST_SIGMA_SHARE * range_m) ** 2)
-
-    def _begin(self, candidate: Candidate, time_s: float) -> None:
-        """A candidate becomes a landmark. The row of its newest sighting, which has none yet, says so."""
-        landmark_id, self._next_id = self._next_id, self._next_id + 1
-        self._candidates.remove(candidate)
-        *earlier, newest = candidate.sightings
-        for sighting in earlier:
-            sighting.outcome = Outcome.PLACED_LATER
-            self._journal.amend(sighting.row, sighting.outcome, landmark_id)
-        newest.outcome = Outcome.NEW
-        self._landmarks.exchange([], [(sighting, landmark_id) for sighting in candidate.sightings], time_s)
+            if len(candidate.sightings) < self._policy.sightings:
+                continue
+            _, cov = place(candidate.sightings, self._smoother.values, self._maker)
+            if not np.linalg.eigvalsh(cov)[-1] <= (LARGEST_SIGMA_SHARE * sighting.line.z[0]) ** 2:
+                continue
+            landmark_id, self._next_id = self._next_id, self._next_id + 1
+            self._candidates.remove(candidate)
+            for earlier in candidate.sightings[:-1]:
+                earlier.outcome = Outcome.PLACED_LATER
+                self._journal.amend(earlier.row, earlier.outcome, landmark_id)
+            sighting.outcome = Outcome.NEW  # its row comes with the frame
+            self._landmarks.exchange([], [(each, landmark_id) for each in candidate.sightings], time_s)
 
     def merge(self, covariance: JointCovariance, time_s: float) -> None:
-        """Merge the two landmarks that are most likely one, if any are.
+        """Give the sightings of one landmark to another that is the same, if there are two such.
 
-        The sightings of one become those of the other: the graph is then that of a run that had known.
-
-        Parameters
-        ----------
-        covariance
-            Joint, of all landmarks.
+        The graph is then that of a run that had known. The joint covariance is of all landmarks.
         """
         anonymous = [i for i in self._landmarks.ids if i >= FIRST_ANONYMOUS_ID]
         named = [i for i in self._landmarks.ids if i < FIRST_ANONYMOUS_ID]
@@ -317,7 +271,7 @@ class AnonymousLandmarks:
         self._landmarks.exchange(moving, [(sighting, stays) for sighting in moving], time_s)
 
     def forget(self, oldest_pose_key: int) -> None:
-        """Let go of sightings on older keyframes than one."""
+        """Forget sightings on keyframes older than one."""
         for candidate in self._candidates:
             for sighting in candidate.sightings:
                 if sighting.line.pose_key < oldest_pose_key:

@@ -1,4 +1,4 @@
-"""The factors of the graph, each from a measurement and its noise.
+"""Factors of the graph, each from a measurement and its noise (docs/theory/factors.md).
 
 ::
 
@@ -8,17 +8,12 @@
                    └── range, azimuth ── L7 ── floor prior
     depth, gravity direction and the planar constraint: one keyframe each
 
-All but the odometry factor with a gyro bias are GTSAM's own (compiled) factors; each is checked numerically in the
-tests against `sonar_graph.slam.models.sonar_model`. Range and azimuth are two factors, so that elevation stays unknown:
-
-* range: ``RangeFactorWithTransform3D``.
-* azimuth: a camera whose optical axis lies in the sonar's fan plane along the measured azimuth, with the equidistant
-  projection (Kannala and Brandt, IEEE PAMI 28(8), 2006, equation 6 without distortion): a direction at angle ``t`` from
-  the axis has an image point at distance ``t`` from its centre. The horizontal coordinate of a point at elevation 0 is
-  ``azimuth - measured``; at a small elevation ``e`` it is that times ``e / tan(e)`` (0.995 at 7 degrees), zero where
-  the azimuth is as measured, whatever ``e``. The vertical coordinate is ``e`` near the axis. A horizontal and a
-  vertical sigma thus say what is known. A pinhole, with tangents for angles, lets an azimuth that is wrong by tens of
-  degrees pull much harder.
+All but the odometry factor with a gyro bias are GTSAM's own (compiled) factors. Range and azimuth are two factors, so
+that elevation stays unknown: ``RangeFactorWithTransform3D``, and for azimuth a camera whose optical axis lies in the
+sonar's fan plane along the measured azimuth, with the equidistant projection (Kannala and Brandt, IEEE PAMI 28(8),
+2006): a direction at angle t from the axis has an image point at distance t from its centre. Its horizontal coordinate
+is ``azimuth - measured`` at elevation 0, times ``e / tan(e)`` at a small elevation e (0.995 at 7 degrees); the vertical
+coordinate is e near the axis. So a horizontal and a vertical sigma state what is known.
 """
 
 from __future__ import annotations

@@ -140,7 +140,7 @@ def _with_calibration(
 
 
 class _Terms:
-    """What an error needs of the motion, as contiguous arrays."""
+    """Arguments of an error that come from the motion, as contiguous arrays."""
 
     def __init__(self, motion: JointMotion, gravity: Floats) -> None:
         measured = motion.velocity, motion.position, motion.displacement
@@ -228,24 +228,16 @@ def joint_error(
     e[9:] = between + turn @ body_p_dvl - body_p_dvl - measured[2] - correction[9:]
 
     by_parameters = -D
-    _put_rotation_rows(H, by_parameters, e[:3], E, turn, correction[:3], D[:3])
+    by_log = np.linalg.inv(left_jacobian(-e[:3]))  # inverse right Jacobian
+    H[:3, 0:3] = -by_log @ np.ascontiguousarray(turn.T)
+    H[:3, 9:12] = by_log
+    by_parameters[:3] = -by_log @ np.ascontiguousarray(E.T) @ left_jacobian(-correction[:3]) @ D[:3]
     H[3:6, 0:3], H[3:6, 6:9], H[3:6, 15:18] = skew(gained), -world_R_i, world_R_i
     _put_point_rows(H[6:9], between + turn @ body_p_imu - fallen, turn, body_p_imu)
     H[6:9, 6:9] = -world_R_i * t
     _put_point_rows(H[9:], between + turn @ body_p_dvl, turn, body_p_dvl)
     H[:, 18:21], H[:, 21:24], H[:, 24:] = by_parameters[:, 3:6], by_parameters[:, :3], by_parameters[:, 6:]
     return e, H
-
-
-@compiled
-def _put_rotation_rows(
-    H: Floats, by_parameters: Floats, error: Floats, E: Floats, turn: Floats, correction: Floats, D: Floats
-) -> None:
-    """Derivatives of the rotation's error by both poses, and by the parameters that correct it."""
-    by_log = np.linalg.inv(left_jacobian(-error))  # inverse right Jacobian
-    H[:3, 0:3] = -by_log @ np.ascontiguousarray(turn.T)
-    H[:3, 9:12] = by_log
-    by_parameters[:3] = -by_log @ np.ascontiguousarray(E.T) @ left_jacobian(-correction) @ D
 
 
 @compiled

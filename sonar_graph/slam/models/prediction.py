@@ -1,4 +1,10 @@
-"""What the graph expects a sonar frame to show, and how surely."""
+"""Prediction of a sonar frame from the graph: range and azimuth of landmarks, with covariances.
+
+With the motion M from a keyframe X to the frame, its noise covariance Q, its derivative D by the gyro bias b, and the
+sonar mounted at T, the landmark p is expected at ``h(X M T, p)``, h of `sonar_graph.slam.models.sonar_model`. The
+expectation has the covariance ``H P H' + H_M Q H_M'``: P of (X, b, p) together, ``H = [H_X, H_M D, H_p]``, H_M the
+derivative by the body's pose at the frame.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +34,7 @@ class ComparedRow:
     distance: Floats
     """Squared Mahalanobis distance of the innovation, shape (m,)."""
     gain: Floats
-    """The larger of the expected variances relative to the noise, shape (m,): how much a detection has to tell."""
+    """Larger of the expected variances relative to the noise, shape (m,): what a detection has to tell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,33 +43,24 @@ class Source:
 
     pose_key: int
     point: Floats
-    """In the world, shape (3,), m."""
+    """Point in the world, shape (3,), m."""
     by_pose: Floats
     """Its derivative by the keyframe, shape (3, 6)."""
     cov: Floats
-    """Of the point, seen from the keyframe, shape (3, 3), m²."""
+    """Covariance of the point as seen from the keyframe, shape (3, 3), m²."""
 
 
 class PredictedView:
-    """A frame, seen from a keyframe whose estimate and covariance are known.
-
-    With the motion M from that keyframe X to the frame, its noise covariance Q and its derivative D by the gyro bias b,
-    and the sonar mounted at T, the landmark p is expected at ``h(X M T, p)``. What is expected has the covariance
-    ``H P H' + H_M Q H_M'``: P of (X, b, p) together, ``H = [H_X, H_M D, H_p]``, H_M the derivative by the body's pose
-    at the frame.
+    """Prediction of a frame from a keyframe whose estimate and covariance are known.
 
     Parameters
     ----------
-    pose_key, bias_key
-        The keyframe, and the gyro bias since then; None when there is none to estimate.
-    world_T_keyframe
-        The keyframe's estimate.
+    bias_key
+        Gyro bias since the keyframe; None when none is estimated.
     motion
-        From the keyframe to the frame.
-    body_T_sonar
-        The sonar's mounting.
+        Motion from the keyframe to the frame.
     covariance
-        Of the keyframe, the bias and the landmarks that are compared, together.
+        Joint covariance of the keyframe, the bias and the landmarks.
     """
 
     def __init__(
@@ -77,10 +74,9 @@ class PredictedView:
     ) -> None:
         keyframe_T_sonar = motion.i_T_j.compose(body_T_sonar)
         self.world_T_sonar = world_T_keyframe.compose(keyframe_T_sonar)
-        """The sonar at the frame."""
+        """Pose of the sonar at the frame."""
         self._world_T_keyframe = world_T_keyframe
         self.covariance = covariance
-        """Of the keyframe, the bias and the landmarks, together."""
         self._pose_row = covariance.rows[pose_key]
         self._bias_row = ABSENT if bias_key is None else covariance.rows[bias_key]
         self._world_T_sonar = self.world_T_sonar.matrix()
@@ -91,7 +87,7 @@ class PredictedView:
     def height_variance(self, point: Floats) -> float:
         """Variance of the world z of a point fixed to the body at the frame, shape (3,) in the world, m².
 
-        Of keyframe and motion; that of the gyro bias, which turns about the vertical most of all, is left out.
+        By keyframe and motion; the gyro bias, which turns about the vertical most of all, is left out.
         """
         by_keyframe = _height_derivative(self._world_T_keyframe, point)
         by_body = _height_derivative(self._world_T_keyframe.compose(self._motion.i_T_j), point)
@@ -100,14 +96,14 @@ class PredictedView:
         return float(by_keyframe @ P @ by_keyframe + by_body @ self._motion.covariance @ by_body)
 
     def expect(self, keys: list[int], points: Floats) -> tuple[Floats, Floats]:
-        """What landmarks at points of the world, shape (m, 3), are expected to show.
+        """Expected range and azimuth of landmarks at points of the world, shape (m, 3).
 
         Returns
         -------
         Range (m) and azimuth (rad), shape (m, 2), and their covariances, shape (m, 2, 2).
         """
         rows = np.array([self.covariance.rows[key] for key in keys], dtype=np.int64)
-        return _expect(
+        return expected_view(
             points,
             rows,
             self._pose_row,
@@ -121,7 +117,7 @@ class PredictedView:
         )
 
     def expect_jointly(self, keys: list[int], points: Floats, sources: list[Source]) -> tuple[Floats, Floats]:
-        """What landmarks of the graph, shape (m, 3), and points that are not in it are expected to show, all together.
+        """Joint expectation of landmarks of the graph, shape (m, 3), and of points that are not in it.
 
         Returns
         -------
@@ -142,7 +138,12 @@ class PredictedView:
             row, by_point = self.covariance.rows[source.pose_key], by_state[k, :, 9:]
             H[k, :, row : row + 6] += by_point @ source.by_pose
             own[k] = by_point @ source.cov @ by_point.T
-        return predicted, _joint_cov(H, self.covariance.matrix, by_motion, self._motion.covariance, own)
+        n = 2 * len(H)
+        J, G = H.reshape(n, -1), by_motion.reshape(n, 6)
+        joint = J @ self.covariance.matrix @ J.T + G @ self._motion.covariance @ G.T
+        for k, cov in enumerate(own):
+            joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += cov
+        return predicted, np.asarray(0.5 * (joint + joint.T))
 
     def compare(self, keys: list[int], points: Floats, z: Floats, cov: Floats) -> ComparedRow:
         """Detections z, shape (m, 2), with noise (m, 2, 2), of landmarks at points of the world, shape (m, 3)."""
@@ -153,16 +154,7 @@ class PredictedView:
 
         The motion's part is added to each variance; that it correlates range and azimuth a little is left out.
         """
-        return _blurred(cov, points, self._world_T_sonar, self._to_body, motion.covariance)
-
-
-def _joint_cov(H: Floats, P: Floats, by_motion: Floats, motion_cov: Floats, own: Floats) -> Floats:
-    n = 2 * len(H)
-    H, G = H.reshape(n, -1), by_motion.reshape(n, 6)
-    joint = H @ P @ H.T + G @ motion_cov @ G.T
-    for k, cov in enumerate(own):
-        joint[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += cov
-    return np.asarray(0.5 * (joint + joint.T))
+        return blurred_noise(cov, points, self._world_T_sonar, self._to_body, motion.covariance)
 
 
 def _height_derivative(world_T_body: gtsam.Pose3, point: Floats) -> Floats:
@@ -173,7 +165,7 @@ def _height_derivative(world_T_body: gtsam.Pose3, point: Floats) -> Floats:
 
 @compiled
 def weigh(z: Floats, predicted: Floats, prior_cov: Floats, cov: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Compare m detections with what was expected: the fields of `Comparison`."""
+    """Compare m detections with what was expected: the fields of `ComparedRow`."""
     S = prior_cov + cov
     innovation, distance, gain = np.empty(z.shape), np.empty(len(z)), np.empty(len(z))
     for k in range(len(z)):
@@ -195,7 +187,7 @@ def _by_sonar_pose(q: Floats, D_q: Floats) -> Floats:
 
 
 @compiled
-def _expect(
+def expected_view(
     points: Floats,
     rows: Ints,
     pose_row: int,
@@ -207,6 +199,7 @@ def _expect(
     D_bias: Floats,
     motion_cov: Floats,
 ) -> tuple[Floats, Floats]:
+    """Range and azimuth of m points, shape (m, 2), and their covariances, shape (m, 2, 2)."""
     predicted, by_state, by_body = _derivatives(points, world_T_sonar, to_keyframe, to_body, D_bias)
     covs = np.empty((len(points), 2, 2))
     place = np.full(12, ABSENT)
@@ -227,7 +220,7 @@ def _expect(
 def _derivatives(
     points: Floats, world_T_sonar: Floats, to_keyframe: Floats, to_body: Floats, D_bias: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """What points show, (m, 2); its derivatives by keyframe, bias and point, (m, 2, 12), and by motion, (m, 2, 6)."""
+    """Range and azimuth, (m, 2), with derivatives by keyframe, bias and point, (m, 2, 12), and by motion, (m, 2, 6)."""
     sonar_R_world = np.ascontiguousarray(world_T_sonar[:3, :3].T)
     predicted = np.empty((len(points), 2))
     by_state, by_motion = np.empty((len(points), 2, 12)), np.empty((len(points), 2, 6))
@@ -244,7 +237,8 @@ def _derivatives(
 
 
 @compiled
-def _blurred(cov: Floats, points: Floats, world_T_sonar: Floats, to_body: Floats, motion_cov: Floats) -> Floats:
+def blurred_noise(cov: Floats, points: Floats, world_T_sonar: Floats, to_body: Floats, motion_cov: Floats) -> Floats:
+    """Noise of range and azimuth, shape (m, 2, 2), with the variances of a motion's noise."""
     sonar_R_world = np.ascontiguousarray(world_T_sonar[:3, :3].T)
     blurred = cov.copy()
     for k in range(len(points)):

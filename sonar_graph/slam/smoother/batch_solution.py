@@ -1,17 +1,11 @@
-"""Solving a whole graph at once, when some of its factors are Python functions.
+"""Levenberg-Marquardt solution of a whole graph, and joint covariances.
 
-GTSAM's optimisers hand each Python factor a copy of all values, which makes their cost quadratic in the length of a
-run. Linearising from Python does not; so the loop is here, and the linear algebra is GTSAM's.
+GTSAM's optimisers hand each Python factor a copy of all values, at a cost quadratic in the length of a run; linearising
+from Python does not. So the loop is here, and the linear algebra is GTSAM's.
 
-Landmarks that an estimate has put behind the sonar that saw them, and where to start them instead.
-
-The azimuth factor is a camera along the measured azimuth (`sonar_graph.slam.models.factors`). It holds in the half
-space ahead
-of the sonar; for a landmark behind, GTSAM's camera has a constant error and no gradient. A landmark gets there when a
-large correction, such as a loop closed after much drift, turns the poses that saw it, and if all its sightings are of
-that kind nothing pulls it back. Its sightings themselves say where it should be.
-
-The joint covariance of several variables, by their keys.
+The azimuth factor holds in the half space ahead of the sonar. For a landmark behind, GTSAM's camera has a constant
+error and no gradient. A large correction, such as a loop closed after much drift, may put a landmark there; then its
+sightings say where to start it instead (docs/theory/isam2.md).
 """
 
 from __future__ import annotations
@@ -51,9 +45,19 @@ def solve(
     damping = FIRST_DAMPING
     for _ in range(most_iterations):
         linear = graph.linearize(values)
-        candidate, candidate_error, damping = _lower(graph, linear, values, error, damping)
-        if candidate is None:
+        candidate, candidate_error = values, np.inf
+        while damping <= MAX_DAMPING:
+            try:
+                candidate = damped_step(linear, values, damping)
+                candidate_error = graph.error(candidate)
+            except RuntimeError:  # GTSAM: indeterminate for this damping
+                candidate_error = np.inf
+            if candidate_error < error:
+                break
+            damping *= DAMPING_FACTOR
+        else:
             break
+        damping = max(damping / DAMPING_FACTOR, FIRST_DAMPING)
         decrease = error - candidate_error
         values, error = candidate, candidate_error
         if decrease <= RELATIVE_DECREASE * error:
@@ -61,27 +65,15 @@ def solve(
     return values
 
 
-def _lower(
-    graph: gtsam.NonlinearFactorGraph,
-    linear: gtsam.GaussianFactorGraph,
-    values: gtsam.Values,
-    error: float,
-    damping: float,
-) -> tuple[gtsam.Values | None, float, float]:
-    while damping <= MAX_DAMPING:
-        try:
-            candidate = _step(linear, values, damping)
-            candidate_error = graph.error(candidate)
-        except RuntimeError:  # GTSAM: indeterminate for this damping
-            candidate_error = np.inf
-        if candidate_error < error:
-            return candidate, candidate_error, max(damping / DAMPING_FACTOR, FIRST_DAMPING)
-        damping *= DAMPING_FACTOR
-    return None, error, damping
-
-
-def _step(linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float) -> gtsam.Values:
-    damped = _damped(linear, values, damping)
+def damped_step(linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float) -> gtsam.Values:
+    """Values after one step of a linear graph with ``damping`` times the identity in its information."""
+    damped = linear
+    if damping > FIRST_DAMPING:
+        damped = linear.clone()
+        zero = values.zeroVectors()
+        for key in linear.keyVector():
+            n, root = len(zero.at(key)), np.sqrt(damping)
+            damped.push_back(gtsam.JacobianFactor(key, root * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n)))
     try:
         return values.retract(damped.optimize())
     except RuntimeError:  # Cholesky refuses what is determined, but weakly
@@ -104,25 +96,12 @@ def qr_tree(linear: gtsam.GaussianFactorGraph, values: gtsam.Values) -> gtsam.IS
 
 
 def marginals_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Marginals | gtsam.ISAM2:
-    """What gives the covariances of a graph, linearised at the values."""
+    """Marginals of a graph, linearised at the values; by QR where Cholesky refuses."""
     linear = graph.linearize(values)
     try:
         return gtsam.Marginals(linear, values)
     except RuntimeError:
         return qr_tree(linear, values)
-
-
-def _damped(linear: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float) -> gtsam.GaussianFactorGraph:
-    if damping <= FIRST_DAMPING:
-        return linear
-    damped = linear.clone()
-    zero = values.zeroVectors()
-    for key in linear.keyVector():
-        n = len(zero.at(key))
-        damped.push_back(
-            gtsam.JacobianFactor(key, np.sqrt(damping) * np.eye(n), np.zeros(n), gtsam.noiseModel.Unit.Create(n))
-        )
-    return damped
 
 
 MAX_PLACEMENTS = 3
@@ -140,12 +119,12 @@ class Sightline:
     """Range (m) and azimuth (rad), shape (2,)."""
 
     def point(self, values: gtsam.Values) -> Floats:
-        """Where in the world the landmark was measured, at elevation 0, shape (3,), m."""
+        """Point of the world where the landmark was measured, at elevation 0, shape (3,), m."""
         on_beam = self.z[0] * np.array([np.cos(self.z[1]), np.sin(self.z[1]), 0.0])
         return self._world_T_sonar(values).transformFrom(on_beam)
 
     def is_behind(self, values: gtsam.Values, landmark: Floats) -> bool:
-        """Whether a point of the world is more than a right angle off the measured azimuth."""
+        """True when a point of the world is a right angle or more off the measured azimuth."""
         x, y, _ = self._world_T_sonar(values).transformTo(landmark)
         return bool(x * np.cos(self.z[1]) + y * np.sin(self.z[1]) <= 0)
 
@@ -177,7 +156,12 @@ class Sightlines:
 
     def turned_away(self, values: gtsam.Values) -> list[int]:
         """Landmarks that lie behind the sonar in at least half of their sightings."""
-        return [key for key, lines in self._lines.items() if 2 * _behind(lines, values, key) >= len(lines)]
+        found = []
+        for key, lines in self._lines.items():
+            landmark = values.atPoint3(key)
+            if 2 * sum(line.is_behind(values, landmark) for line in lines) >= len(lines):
+                found.append(key)
+        return found
 
     def placed_anew(self, values: gtsam.Values, landmark_keys: list[int]) -> gtsam.Values:
         """The values, with each of the landmarks at the median of where its sightings, from these poses, say it is."""
@@ -185,11 +169,6 @@ class Sightlines:
         for key in landmark_keys:
             placed.update(key, np.median([line.point(values) for line in self._lines[key]], axis=0))
         return placed
-
-
-def _behind(lines: Iterable[Sightline], values: gtsam.Values, landmark_key: int) -> int:
-    landmark = values.atPoint3(landmark_key)
-    return sum(line.is_behind(values, landmark) for line in lines)
 
 
 def solve_in_sight(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, sightlines: Sightlines) -> gtsam.Values:
@@ -245,7 +224,7 @@ class KeptCovariance:
         self._asked_before: set[int] = set()
 
     def of(self, marginals: gtsam.Marginals | gtsam.ISAM2, keys: list[int]) -> JointCovariance:
-        """Of these variables, and possibly of more of them."""
+        """Joint covariance of these variables, and possibly of more."""
         self._asked.update(keys)
         if self._joint is None or not self._joint.rows.keys() >= self._asked:
             self._joint = JointCovariance.of(marginals, sorted(self._asked | self._asked_before))

@@ -1,9 +1,4 @@
-"""A graph that grows, and from which single factors can be taken out again: the whole of it, or the window's part.
-
-What is taken out of a graph, and what comes in its place.
-
-What waits for the next update of a smoother.
-"""
+"""Stores of a growing graph from which single factors can be taken out: the whole history, or the window's part."""
 
 from __future__ import annotations
 
@@ -59,14 +54,11 @@ class History:
             self.changes += 1
 
     def keep(self, window: gtsam.NonlinearFactorGraph, theta: gtsam.Values, left: Iterable[int]) -> None:
-        """Nothing is given up: what leaves the window stays here."""
+        """Keep everything: a factor that leaves the window stays here."""
 
 
 class Recent:
-    """The same for the factors that are in the window: those on variables that have left are in marginals for good.
-
-    A handle ends when a variable of its factor leaves.
-    """
+    """Factors of the window; those on variables that have left are in marginals for good, and their handles end."""
 
     def __init__(self) -> None:
         self.changes = 0
@@ -80,7 +72,7 @@ class Recent:
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Those in the window, marginals among them, and those that wait to be."""
+        """Factors in the window, marginals among them, and those that wait to be."""
         graph = without(self._window, self._theta, self._gone)
         for handle in self._waiting:
             graph.push_back(self._factors[handle])
@@ -90,7 +82,9 @@ class Recent:
         """Put a factor in; its handle."""
         handle, self._next = self._next, self._next + 1
         self._factors[handle] = factor
-        for key in _passing(factor):
+        keys = [(key, gtsam.symbolChr(key)) for key in list(factor.keys())]
+        poses = [key for key, kind in keys if kind == POSE]
+        for key in poses or [key for key, kind in keys if kind != LANDMARK]:  # it leaves with its poses, else biases
             self._handles[key].append(handle)
         self._waiting.append(handle)
         self.changes += 1
@@ -108,17 +102,7 @@ class Recent:
         self.changes += len(gone)
 
     def keep(self, window: gtsam.NonlinearFactorGraph, theta: gtsam.Values, left: Iterable[int]) -> None:
-        """The window has been brought up to date.
-
-        Parameters
-        ----------
-        window
-            All its factors.
-        theta
-            Where its variables are linearised.
-        left
-            Variables that have left it.
-        """
+        """Take over the factors of an updated window, linearised at theta, and drop those of variables that left."""
         self._window, self._theta, self._waiting, self._gone = window, theta, [], []
         for key in left:
             for handle in self._handles.pop(key, ()):
@@ -135,25 +119,18 @@ def rest_of(history: History | Recent, handles: set[int]) -> gtsam.NonlinearFact
     return rest
 
 
-def _passing(factor: gtsam.NonlinearFactor) -> list[int]:
-    """Those of a factor's variables with which it leaves: its poses, else its biases. Landmarks stay."""
-    keys = [(key, gtsam.symbolChr(key)) for key in list(factor.keys())]
-    poses = [key for key, kind in keys if kind == POSE]
-    return poses or [key for key, kind in keys if kind != LANDMARK]
-
-
 @dataclass(frozen=True, eq=False)
 class GraphEdit:
-    """Some factors for others."""
+    """Exchange of factors for others."""
 
     removed: list[int]
-    """Handles of those that go."""
+    """Handles of factors that go."""
     added: list[list[gtsam.NonlinearFactor]]
-    """Those that come, in groups."""
+    """Factors that come, in groups."""
     new_landmarks: dict[int, Floats]
-    """Keys and first estimates of landmarks that the graph has not yet got."""
+    """Keys and first estimates of new landmarks."""
     lost_landmarks: list[int]
-    """Keys of those on which no factor is left."""
+    """Keys of landmarks on which no factor is left."""
 
 
 class Pending:

@@ -1,10 +1,8 @@
-"""GTSAM's fixed-lag smoother, with what it takes to begin it anew.
+"""GTSAM's fixed-lag smoother, begun anew from a graph and the marginal of what lies outside it.
 
 GTSAM's Cholesky elimination gives up ("indeterminate") when a variable's absolute sigma is more than 4096 times its
 sigma given its neighbours, which millimetre odometry reaches after some metres of drift. QR does not, at a higher cost;
-once Cholesky has given up the window stays with QR.
-
-What a new window is made of: a graph cut in two, and the part outside replaced by its marginal.
+once Cholesky has given up the window stays with QR (docs/theory/isam2.md).
 """
 
 from __future__ import annotations
@@ -30,7 +28,7 @@ def split(
 def marginal(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, kept: Container[int], *, is_by_qr: bool = False
 ) -> list[gtsam.NonlinearFactor]:
-    """What a graph says about the kept variables alone, linearised at the values.
+    """Marginal of a graph on the kept variables, linearised at the values.
 
     Raises
     ------
@@ -103,7 +101,7 @@ def joined(values: gtsam.Values, new: gtsam.Values) -> gtsam.Values:
 
 
 def keys_of(values: gtsam.Values) -> list[int]:
-    """Of all variables."""
+    """Keys of all variables."""
     return list(values.keys())
 
 
@@ -218,7 +216,7 @@ class SmootherWindow:
             self.isam.update()
 
     def slots(self, factors: list[gtsam.NonlinearFactor]) -> list[int] | None:
-        """Where factors are; None when one of them is not there."""
+        """Places of factors in the window; None when one of them is not there."""
         if not factors:
             return []
         inside = self.isam.getFactors()
@@ -227,6 +225,6 @@ class SmootherWindow:
         return None if None in found else [slot for slot in found if slot is not None]
 
     def largest_shift(self, keys: Sequence[int]) -> float:
-        """How far the farthest of some variables is from where it was linearised: its largest component, rad or m."""
+        """Largest component by which one of some variables has moved from where it was linearised, rad or m."""
         delta = self.isam.getDelta()
         return max((float(np.abs(delta.at(key)).max()) for key in keys), default=0.0)

@@ -1,23 +1,16 @@
-"""Incremental smoothing whose cost per update stays bounded, and the whole graph's solution when it is asked for.
+"""Incremental smoothing at a bounded cost per update, and the solution of the whole graph on request.
 
-Two solutions share the same factors:
+Two solutions share the same factors (docs/theory/isam2.md):
 
-* the *window*: GTSAM's iSAM2 over the poses of the last ``lag_s`` seconds, all landmarks and all biases. Older poses
-  are marginalised, so that an update does not walk over all sightings that a landmark ever had.
+* the *window*: GTSAM's iSAM2 over the poses of the last ``lag_s`` seconds, all landmarks and all biases; older poses
+  are marginalised.
 * the *history*: every factor of the run, solved by Levenberg-Marquardt when the smoothed result is asked for.
 
 Marginalising freezes the linearisation of the landmarks that it touches. When one has since moved by more than
-``stale_shift_m`` (a loop was closed after much drift), the history is solved at once and the window starts again from
-that solution with fresh linearisations. The graph must have grown by `RESTART_GROWTH` since, so that all restarts
-together cost some times the last one.
-
-Factors can be exchanged for others. While all their variables are in the window, iSAM2 removes them; what has been
-marginalised cannot be taken out of a marginal, and the window starts again from the history.
-
-A *bounded* history is that of the window: its factors, and the marginals of what has left. The window then begins anew
-from those, which leaves older marginals linearised where they were.
-
-New factors that cannot be used are taken out again (`sonar_graph.slam.smoother.observability`).
+``stale_shift_m``, the history is solved and the window starts again from that solution; the graph must have grown by
+`RESTART_GROWTH` since, so that all restarts together cost some times the last one. The window also starts again when a
+factor is taken out that has been marginalised. A *bounded* history consists of the window's factors and the marginals
+of what has left; a new window then begins from those, with the older linearisations.
 """
 
 from __future__ import annotations
@@ -52,7 +45,7 @@ FIRST_RESTART = 100
 MOST_MESSAGES = 1000
 """Kept of what was withheld."""
 ROUNDING_S = 1e-6
-"""Longer than differences of times are wrong by: what is exactly as old as the lag stays."""
+"""Margin for rounded times: a variable exactly as old as the lag stays."""
 
 
 class SmootherParams(Section):
@@ -92,14 +85,9 @@ HistoryParams = Annotated[WholeHistory | BoundedHistory, *tagged("policy", "whol
 
 
 class Smoother:
-    """A growing graph with a bounded incremental solution.
+    """Growing graph with a bounded incremental solution; plain iSAM2 over the whole history where the lag is infinite.
 
-    Parameters
-    ----------
-    params
-        With an infinite lag: plain iSAM2 over the whole history.
-    is_bounded
-        What leaves the window is given up: its factors become marginals for good, its variables are forgotten.
+    When bounded, factors that leave the window become marginals for good, and their variables are forgotten.
     """
 
     def __init__(
@@ -111,7 +99,6 @@ class Smoother:
         self.params = params
         self._restart_size = FIRST_RESTART
         self.is_bounded = is_bounded
-        """Whether what leaves the window is given up."""
         self._history: History | Recent = Recent() if is_bounded else History()
         self._restarted_s = self._newest_s = -np.inf
         self.withheld: deque[str] = deque(maxlen=MOST_MESSAGES)
@@ -206,7 +193,7 @@ class Smoother:
         self._held = until_s
 
     def flush(self, time_s: float) -> None:
-        """Update with what waits, if anything does; a bounded window keeps what it has."""
+        """Update with the factors that wait, if any; a bounded window keeps its variables."""
         self._withhold_unusable()
         if self._pending.handles:
             self._update(time_s, self._exchange_lag_s(time_s))
@@ -246,7 +233,7 @@ class Smoother:
         return max([self._lag_at(time_s), *inside_s])
 
     def in_window(self, keys: list[int]) -> list[int]:
-        """Those of some variables that are in the window, or about to be."""
+        """Keys of variables that are in the window, or about to be."""
         inside = self._window.isam.getLinearizationPoint() if keys else gtsam.Values()
         return [key for key in keys if inside.exists(key) or self._pending.values.exists(key)]
 
@@ -270,7 +257,7 @@ class Smoother:
 
     @property
     def is_due(self) -> bool:
-        """Whether an update is: variables wait for it, or factors that would change the estimate."""
+        """True when variables wait for an update, or factors that would change the estimate."""
         return self._pending.values.size() > 0 or self.waiting_gain > self.params.waiting_gain
 
     def update(self, time_s: float) -> None:
@@ -281,7 +268,10 @@ class Smoother:
     def _update(self, time_s: float, lag_s: float, removed_slots: Sequence[int] = ()) -> None:
         """The same without what is in some places of the window."""
         self._expiring |= dict.fromkeys(self._bias, time_s)
-        self._announce_leaving(time_s - lag_s)
+        if self.is_bounded:
+            old = (key for key, t in self._expiring.items() if t < time_s - lag_s)
+            if leaving := {key for key in old if not self._pending.values.exists(key)}:
+                self.when_leaving(leaving)
         self._window.lag_s = lag_s
         times = self._times(self._pending.times_s, time_s)
         try:
@@ -294,7 +284,9 @@ class Smoother:
             estimate = self._window.isam.calculateEstimate()
         self._clear_pending()
         self._take(estimate)
-        if self._may_restart(time_s) and self._window.largest_shift(self._landmarks) > self.params.stale_shift_m:
+        since_s = self._restarted_s + self.params.lag_s
+        may_restart = time_s >= since_s if self.is_bounded else self.graph.size() >= self._restart_size
+        if may_restart and self._window.largest_shift(self._landmarks) > self.params.stale_shift_m:
             self._restart(time_s)
 
     def _times(self, poses_s: dict[int, float], time_s: float) -> dict[Any, float]:
@@ -330,15 +322,11 @@ class Smoother:
             theta.erase(key)
         before.push_back(self._pending.graph)
         kept_s = {key: self._expiring.get(key, time_s) for key in keys_of(theta)}
-        self._begin_window(before, theta, self._times(kept_s, time_s))
+        try:
+            self._window.begin(before, theta, self._times(kept_s, time_s))
+        except RuntimeError as error:
+            raise EstimatorError(f"isam2: {reasons(before, theta, self._expiring)}") from error
         return True
-
-    def _announce_leaving(self, before_s: float) -> None:
-        if not self.is_bounded:
-            return
-        old = (key for key, t in self._expiring.items() if t < before_s)
-        if leaving := {key for key in old if not self._pending.values.exists(key)}:
-            self.when_leaving(leaving)
 
     def _take(self, estimate: gtsam.Values) -> None:
         """The window's; a bounded one forgets what has left."""
@@ -353,13 +341,8 @@ class Smoother:
         self.sightlines.leave(set(left))
         self._history.keep(self._window.isam.getFactors(), self._window.isam.getLinearizationPoint(), left)
 
-    def _may_restart(self, time_s: float) -> bool:
-        if self.is_bounded:
-            return time_s >= self._restarted_s + self.params.lag_s
-        return self.graph.size() >= self._restart_size
-
     def _give_up_cholesky(self, time_s: float) -> None:
-        """It met a pose far less certain than its step (`sonar_graph.slam.smoother.fixed_lag`): QR has no such limit.
+        """Go on by QR after Cholesky met a pose far less certain than its step (`sonar_graph.slam.smoother.fixed_lag`).
 
         Raises
         ------
@@ -393,23 +376,17 @@ class Smoother:
             raise EstimatorError(f"isam2: {reasons(self.graph, self.values, self._expiring)}") from error
         self._take(self._window.isam.calculateEstimate())
 
-    def _begin_window(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times: dict[Any, float]) -> None:
-        try:
-            self._window.begin(graph, values, times)
-        except RuntimeError as error:
-            raise EstimatorError(f"isam2: {reasons(graph, values, self._expiring)}") from error
-
     def _solve(self) -> gtsam.Values:
         return solve_in_sight(self.graph, self.values, self.sightlines)
 
     @property
     def landmark_ids(self) -> list[int]:
-        """Of the landmarks in the graph, ascending."""
+        """Identities of the landmarks in the graph, ascending."""
         return sorted(gtsam.Symbol(key).index() for key in self._landmarks)
 
     @property
     def marginals(self) -> gtsam.ISAM2:
-        """What gives covariances of variables in the window."""
+        """Source of covariances of variables in the window."""
         return self._window.isam.getISAM2()
 
     def covariance(self, key: int) -> Floats:

@@ -1,13 +1,11 @@
-"""Whether factors determine variables, and in words what they leave open.
+"""Observability: directions that factors leave open, in words, and new factors that a smoother does without.
 
 Linearised factors ``A x = b`` leave every direction v with ``A v = 0`` open. Columns are scaled to unit length; v is
 open where its singular value is below `RANK_LIMIT` of the largest.
 
-Which new factors a smoother has to do without, and why, in words.
-
 A landmark whose new factors leave a direction open cannot be solved for; a factor whose error is no number spoils all
-variables, and marginals for good. Such factors are withheld, with the landmarks and biases that then have none, and the
-rest goes on as if they had never come. A keyframe cannot be withheld, since later ones hang on it.
+variables, and marginals for good. Such factors are withheld, with landmarks and biases that then have none, and the
+rest goes on without them. A keyframe cannot be withheld, since later ones hang on it.
 """
 
 from __future__ import annotations
@@ -52,29 +50,26 @@ KINDS = {
 
 @dataclass(frozen=True, eq=False)
 class Open:
-    """What factors leave open of a variable."""
+    """Directions of a variable that factors leave open."""
 
     key: int
     directions: Floats
-    """Of its tangent space, as rows of unit length, shape (k, n)."""
+    """Directions of its tangent space, as rows of unit length, shape (k, n)."""
 
     def axes(self) -> str:
-        """Each direction by the axis nearest to it, and how near that is where it is not the axis itself."""
-        names = AXES[chr(gtsam.symbolChr(self.key))]
-        return ", ".join(_named(row, names) for row in self.directions)
-
-
-def _named(direction: Floats, names: tuple[str, ...]) -> str:
-    nearest = int(np.argmax(np.abs(direction)))
-    if abs(direction[nearest]) > 0.999:
-        return names[nearest]
-    return f"mostly {names[nearest]} ({', '.join(f'{share:.2f}' for share in direction)})"
+        """Name of the axis nearest to each direction, with its components where it is not the axis itself."""
+        names, found = AXES[chr(gtsam.symbolChr(self.key))], []
+        for direction in self.directions:
+            nearest = int(np.argmax(np.abs(direction)))
+            shares = f"mostly {names[nearest]} ({', '.join(f'{share:.2f}' for share in direction)})"
+            found.append(names[nearest] if abs(direction[nearest]) > 0.999 else shares)
+        return ", ".join(found)
 
 
 def left_open(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keys: Iterable[int], least_said: float = 0.0
 ) -> list[Open]:
-    """Which of some variables the factors leave open, given all others.
+    """Directions of some variables that the factors leave open, given all other variables.
 
     Parameters
     ----------
@@ -105,7 +100,12 @@ def left_open(
     rank = int(np.sum(s > RANK_LIMIT * max(s[0], 1e-300)))
     null = V[rank:] * scale
     null /= np.maximum(np.linalg.norm(null, axis=1, keepdims=True), 1e-300)
-    return [Open(key, found) for key, place in places.items() if len(found := _basis(null[:, place]))]
+    found = []
+    for key, place in places.items() if len(null) else ():
+        _, s, V = np.linalg.svd(null[:, place], full_matrices=False)
+        if (s > OPEN_SHARE).any():
+            found.append(Open(key, np.asarray(V[s > OPEN_SHARE])))
+    return found
 
 
 def _rows(factor: gtsam.NonlinearFactor, values: gtsam.Values, places: dict[int, slice], least_said: float) -> Floats:
@@ -123,14 +123,6 @@ def _rows(factor: gtsam.NonlinearFactor, values: gtsam.Values, places: dict[int,
     return rows[np.linalg.norm(A, axis=1) >= least_said]
 
 
-def _basis(rows: Floats) -> Floats:
-    """Unit vectors that span what is of any length in some rows."""
-    if not len(rows):
-        return rows
-    _, s, V = np.linalg.svd(rows, full_matrices=False)
-    return np.asarray(V[s > OPEN_SHARE])
-
-
 def not_finite(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> list[int]:
     """Places of the factors whose error or derivative is no number."""
     found = []
@@ -142,23 +134,19 @@ def not_finite(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> list[
 
 
 def variable_name(key: int) -> str:
-    """In words."""
+    """Kind and number of a variable, in words."""
     kind = {"x": "keyframe", "l": "landmark", "b": "gyro bias"}.get(chr(gtsam.symbolChr(key)), "variable")
     return f"{kind} {gtsam.Symbol(key).index()}"
 
 
 def factor_names(factors: Iterable[gtsam.NonlinearFactor]) -> str:
-    """How many of which kind, in words."""
-    counts = Counter(_kind(factor) for factor in factors)
+    """Number of factors of each kind, in words."""
+    counts: Counter[str] = Counter()
+    for factor in factors:
+        name, kinds = type(factor).__name__, [chr(gtsam.symbolChr(key)) for key in list(factor.keys())]
+        custom = "odometry" if kinds[:2] == ["x", "x"] else "range and azimuth"
+        counts[custom if name == "CustomFactor" else KINDS.get(name, name)] += 1
     return ", ".join(f"{count} {kind}" for kind, count in counts.items()) or "no factor"
-
-
-def _kind(factor: gtsam.NonlinearFactor) -> str:
-    name = type(factor).__name__
-    if name != "CustomFactor":
-        return KINDS.get(name, name)
-    kinds = [chr(gtsam.symbolChr(key)) for key in list(factor.keys())]
-    return "odometry" if kinds[:2] == ["x", "x"] else "range and azimuth"
 
 
 def _size(key: int) -> int:
@@ -183,32 +171,22 @@ class Withheld:
 
 
 def spoilt(pending: Pending, values: gtsam.Values, times_s: dict[int, float]) -> list[Withheld]:
-    """New factors whose error is no number.
-
-    Parameters
-    ----------
-    values, times_s
-        See `undetermined`.
-    """
+    """New factors whose error is no number."""
     if np.isfinite(pending.graph.error(values)):
         return []
-    return [_no_number(pending.handles[i], pending, times_s) for i in not_finite(pending.graph, values)]
+    found = []
+    for i in not_finite(pending.graph, values):
+        handle, factor = pending.handles[i], pending.graph.at(i)
+        key = max(list(factor.keys()), key=lambda k: gtsam.symbolChr(k) == ord("l"))
+        told = f"{_placed(key, [factor], times_s)}: {factor_names([factor])} gives an error that is no number; withheld"
+        found.append(Withheld({handle}, set(), told))
+    return found
 
 
 def undetermined(
     pending: Pending, values: gtsam.Values, times_s: dict[int, float], least_said: float = 0.0
 ) -> list[Withheld]:
-    """New landmarks and biases that their factors leave open, whatever becomes of the poses.
-
-    Parameters
-    ----------
-    values
-        Of the variables of the new factors.
-    times_s
-        Of the keyframes.
-    least_said
-        See `sonar_graph.slam.smoother.observability.left_open`.
-    """
+    """New landmarks and biases that their factors leave open, whatever becomes of the poses."""
     found = []
     for key in keys_of(pending.values):
         if gtsam.symbolChr(key) != ord("x"):
@@ -221,12 +199,7 @@ def undetermined(
 def culprits(
     window: gtsam.NonlinearFactorGraph, pending: Pending, values: gtsam.Values, times_s: dict[int, float]
 ) -> list[Withheld]:
-    """Why a window with new factors cannot be solved; nothing where it can, if with better arithmetic.
-
-    Parameters
-    ----------
-    window
-        Without what is pending.
+    """New factors because of which a window cannot be solved; none where it can, if with better arithmetic.
 
     Raises
     ------
@@ -245,7 +218,7 @@ def culprits(
 
 
 def reasons(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times_s: dict[int, float]) -> str:
-    """Why a graph has no solution."""
+    """Reason, in words, why a graph has no solution."""
     spoilt = [graph.at(i) for i in not_finite(graph, values)]
     if spoilt:
         where = _placed(list(spoilt[0].keys())[-1], spoilt, times_s)
@@ -255,7 +228,7 @@ def reasons(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times_s: di
 
 
 def explained(open_: Open, factors: list[gtsam.NonlinearFactor], times_s: dict[int, float]) -> str:
-    """The variable, its factors, the open directions, and what would close them."""
+    """Variable, its factors, the open directions, and what would close them, in words."""
     kind = chr(gtsam.symbolChr(open_.key))
     return f"{_placed(open_.key, factors, times_s)}: {factor_names(factors)}; open: {open_.axes()}; {MISSING[kind]}"
 
@@ -275,13 +248,6 @@ def _without(open_: Open, pending: Pending, times_s: dict[int, float]) -> Withhe
     handles = pending.on(open_.key)
     factors = [pending.factor(handle) for handle in handles]
     return Withheld(set(handles), {open_.key}, f"{explained(open_, factors, times_s)}; withheld")
-
-
-def _no_number(handle: int, pending: Pending, times_s: dict[int, float]) -> Withheld:
-    factor = pending.factor(handle)
-    key = max(list(factor.keys()), key=lambda k: gtsam.symbolChr(k) == ord("l"))
-    where = _placed(key, [factor], times_s)
-    return Withheld({handle}, set(), f"{where}: {factor_names([factor])} gives an error that is no number; withheld")
 
 
 def _on(key: int, graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactor]:
