@@ -1,20 +1,16 @@
 """What leaves the window is given up, and nothing but that."""
 
 import gc
-from dataclasses import replace
 from functools import cache
 
-import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import L
 
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
-from sonar_graph.slam.smoother.incremental import Smoother
-from sonar_graph.states import DetectionJournal, Estimate, Outcome
-from sonar_graph.testing.laws import check_estimator
+from sonar_graph.states import Estimate, Outcome
 
 from .late_identities import on_the_rail
 from .made import isam2_params
@@ -98,7 +94,7 @@ def held(estimator: Isam2) -> dict[str, int]:
         "expiring": len(smoother._expiring),
         "sightlines": sum(len(lines) for lines in smoother.sightlines._lines.values()),
         "sightings": sum(len(seen) for seen in sightings._landmarks._of.values()),
-        "tracks": sum(len(t.waiting) + len(t.settled) for t in sightings._deferred._tracks._by_number.values()),
+        "tracks": sum(len(t.waiting) + len(t.settled) for t in sightings._deferred._tracks.values()),
         "asked": len(estimator._asked._open),
     }
 
@@ -123,12 +119,6 @@ def test_nothing_grows_with_the_run(tracks):
     whole, _ = run(sequence, "whole")
     assert whole.graph.size() > 5 * later[-1]["factors"]
     assert whole.values.size() > 3 * later[-1]["values"]
-
-
-def test_it_keeps_the_contract():
-    check_estimator(
-        lambda calibration: Isam2(calibration, isam2_params(history__policy="bounded", smoother__lag_s=2.0))
-    )
 
 
 # Identities ---------------------------------------------------------------------------------------------------------
@@ -210,39 +200,6 @@ def test_a_window_that_begins_anew_says_the_same():
     assert np.allclose(estimator.trajectory().positions, plain.trajectory().positions, rtol=0, atol=1e-7)
 
 
-def test_landmarks_that_have_moved_are_linearised_anew_once_a_lag(monkeypatch):
-    restarts = []
-    restart = Smoother._restart
-    monkeypatch.setattr(Smoother, "_restart", lambda self, time_s: restarts.append(time_s) or restart(self, time_s))
-    run(mission(), "bounded", smoother__stale_shift_m=1e-6)
-    assert len(restarts) > 5
-    assert np.diff(restarts).min() >= LAG_S
-    many = len(restarts)
-    run(mission(), "bounded", smoother__stale_shift_m=1e9)
-    assert len(restarts) == many
-
-
-def test_detections_have_the_outcomes_of_a_whole_history():
-    whole, bounded = (run(mission(), h, smoother__stale_shift_m=1e9)[0].detections() for h in ("whole", "bounded"))
-    assert whole.outcomes == bounded.outcomes
-    assert np.array_equal(whole.innovations, bounded.innovations, equal_nan=True)
-
-
-def test_without_bias_and_landmarks_it_is_dead_reckoning():
-    still = mission(30.0)
-    imu = still.calibration.imu.model_copy(update={"gyro_bias_sigma": 0.0, "gyro_bias_walk_density": 0.0})
-    calibration = still.calibration.model_copy(update={"imu": imu})
-    alone = replace(still, detections=None, calibration=calibration)
-    (whole, causal), (bounded, same) = (
-        run(alone, "whole", smoother__lag_s=2.0),
-        run(alone, "bounded", smoother__lag_s=2.0),
-    )
-    assert np.array_equal(causal[-1].covariance, same[-1].covariance)
-    assert len(bounded.trajectory()) == len(whole.trajectory()) == len(causal)
-    assert not bounded.values.exists(X(0))
-    assert isinstance(bounded.values, gtsam.Values)
-
-
 def test_what_need_not_be_remembered_is_forgotten_and_nothing_else_changes():
     """Poses and outcomes of the last half minute, and up to a quarter more, are left."""
     (everything, causal), (recent, same) = (run(mission(), "bounded", history__remembered_s=s) for s in (None, 30.0))
@@ -256,17 +213,3 @@ def test_what_need_not_be_remembered_is_forgotten_and_nothing_else_changes():
     assert np.array_equal(rest.innovations, log.innovations[-len(rest) :], equal_nan=True)
     assert rest.outcomes == log.outcomes[-len(rest) :]
     assert np.array_equal(recent.landmarks().positions, everything.landmarks().positions)
-
-
-def test_rows_keep_their_numbers_when_older_ones_are_forgotten():
-    journal = DetectionJournal()
-    numbers = [journal.record(stamp_ns, stamp_ns, Outcome.WAITING, np.full(2, 1.0), np.eye(2)) for stamp_ns in range(6)]
-    journal.forget_before(3)
-    journal.amend(numbers[1], Outcome.FORGOTTEN)
-    journal.amend(numbers[4], Outcome.USED_LATER, 70)
-    assert journal.record(6, 6, Outcome.USED) == 6
-    log = journal.log()
-    assert log.stamps_ns.tolist() == [3, 4, 5, 6]
-    assert log.landmark_ids.tolist() == [3, 70, 5, 6]
-    assert log.outcomes == [Outcome.WAITING, Outcome.USED_LATER, Outcome.WAITING, Outcome.USED]
-    assert np.isnan(log.innovations).all(axis=1).tolist() == [False, True, False, True]

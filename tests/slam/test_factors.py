@@ -56,32 +56,6 @@ def small_pose(rng: np.random.Generator, sigma: float) -> gtsam.Pose3:
     return gtsam.Pose3.Expmap(sigma * rng.standard_normal(6))
 
 
-# Odometry ---------------------------------------------------------------------------------------------------------
-
-
-@poses
-@pytest.mark.parametrize("off", [0.0, 1e-7, 0.4], ids=["at the mean", "next to it", "far from it"])
-def test_derivatives_of_odometry_with_bias_are_those_of_differences(pose, off):
-    rng = np.random.default_rng(4)
-    motion = some_motion(1)
-    bias = motion.bias + off * rng.standard_normal(3)
-    X_j = pose.compose(motion.corrected(bias)).compose(small_pose(rng, off))
-    factor = factors.odometry_with_bias(X(0), X(1), B(0), motion)
-    assert_jacobians(factor, values_of(X0=pose, X1=X_j, B0=bias))
-
-
-def test_derivatives_of_odometry_hold_where_a_turn_goes_through_pi():
-    motion = PreintegratedMotion(
-        gtsam.Pose3(gtsam.Rot3.Rz(np.pi - 1e-7), np.array([1.0, 0, 0])), full_covariance(6, 0.05),
-        some_motion().D_bias, np.zeros(3), 1.0, np.zeros(3),
-    )  # fmt: skip
-    X_j = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.01, 0.02, -np.pi + 0.05), np.array([1.1, 0, 0]))
-    factor = factors.odometry_with_bias(X(0), X(1), B(0), motion)
-    values = values_of(X0=gtsam.Pose3(), X1=X_j, B0=np.array([0.01, 0.0, -0.01]))
-    assert np.abs(factor.unwhitenedError(values)).max() < 0.2
-    assert_jacobians(factor, values)
-
-
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1.0))
 @settings(max_examples=25)
 def test_derivatives_of_odometry_hold_everywhere(seed, spread):
@@ -129,12 +103,6 @@ def test_odometry_keeps_the_correlations_of_the_shortest_motion(sigma: float):
     moved = start.pose().compose(gtsam.Pose3(gtsam.Rot3(), start.pose().rotation().unrotate(np.array([2e-5, 0, 0]))))
     prior = factors.start_prior(X(0), Calibration(start=start))
     assert prior.error(values_of(X0=moved)) == pytest.approx(0.5, rel=1e-5)
-
-
-def test_bias_prior_and_walk_weigh_by_their_sigmas():
-    values = values_of(B0=np.array([1e-3, 0, 0]), B1=np.array([1e-3, 3e-3, 0]))
-    assert factors.bias_prior(B(0), 5e-4).error(values) == pytest.approx(0.5 * 2**2)
-    assert factors.bias_walk(B(0), B(1), 1e-3).error(values) == pytest.approx(0.5 * 3**2)
 
 
 # Sightings --------------------------------------------------------------------------------------------------------
@@ -213,28 +181,6 @@ def test_a_correlated_sighting_is_the_model_weighed_by_its_covariance(azimuth, e
     assert sighting.error(values) == pytest.approx(0.5 * off @ np.linalg.solve(cov, off), rel=1e-6)
 
 
-def test_a_correlated_sighting_wraps_its_azimuth():
-    """A sonar that looks back sees the landmark on either side of pi."""
-    values = values_of(X0=gtsam.Pose3(), L0=np.array([-2.0, -0.01, 0.0]))
-    sighting = factors.correlated_sighting(X(0), L(0), gtsam.Pose3(), np.array([2.0, np.pi - 0.01]), np.eye(2), plain)
-    assert sighting.unwhitenedError(values)[1] == pytest.approx(0.015, abs=1e-6)
-
-
-@pytest.mark.parametrize("elevation_sigma_rad", [None, 0.07])
-def test_correlation_changes_how_it_is_said_but_not_what(elevation_sigma_rad):
-    """With a correlation next to nothing, and at elevation 0, both forms carry the same information."""
-    pose, sigma = BODY_POSES["random"], np.array([0.02, 0.009])
-    values = values_of(X0=pose, L0=seen_from(pose, 0.2, 0.0, 2.0))
-    said = []
-    for correlation in (0.0, 2e-6):
-        cov = np.outer(sigma, sigma) * [[1, correlation], [correlation, 1]]
-        sighting = factors.landmark_sighting(
-            X(0), L(0), BODY_T_SONAR, np.array([2.0, 0.2]), cov, plain, elevation_sigma_rad
-        )
-        said.append(information(sighting, values, [X(0), L(0)]))
-    assert np.allclose(said[0], said[1], rtol=1e-4, atol=1e-4 * np.abs(said[0]).max())
-
-
 def test_without_an_elevation_a_sighting_says_next_to_nothing_about_it():
     """Information along the unmeasured direction is under a millionth of that across it; with a sigma, it is said."""
     pose = BODY_POSES["random"]
@@ -283,13 +229,6 @@ def test_depth_is_the_height_of_the_port_and_nothing_else(pose):
     assert eigenvalues[-1] > 1 / sigma**2 > 1e9 * eigenvalues[-2]
 
 
-def test_depth_sees_the_tilt_through_the_lever_arm():
-    """Nose down by 0.1 rad: a port 0.5 m ahead sinks by 5 cm."""
-    nose_down = values_of(X0=gtsam.Pose3(gtsam.Rot3.Pitch(0.1), np.zeros(3)))
-    factor = factors.depth(X(0), 0.0, np.array([0.5, 0, 0]), 0.01)
-    assert factor.unwhitenedError(nose_down)[2] == pytest.approx(-0.5 * np.sin(0.1))
-
-
 @poses
 @given(roll=st.floats(-0.3, 0.3), pitch=st.floats(-0.3, 0.3))
 @settings(max_examples=10)
@@ -323,14 +262,6 @@ def test_a_gravity_direction_that_does_not_fit_still_says_nothing_of_the_yaw(pos
     assert of_yaw == pytest.approx([0.0, squared], rel=0.01, abs=1e-9)
 
 
-def test_gravity_direction_says_sigma_about_each_horizontal_axis():
-    values, sigma = values_of(X0=BODY_POSES["random"]), 0.01
-    up = BODY_POSES["random"].rotation().matrix().T @ [0, 0, 1.0]
-    said = information([factors.gravity_direction(X(0), up, sigma)], values, [X(0)])
-    assert np.linalg.eigvalsh(said)[-2:] == pytest.approx([1e4, 1e4])
-    assert np.abs(said @ np.concatenate([up, np.zeros(3)])).max() < 1e-6
-
-
 def test_the_plane_holds_height_roll_and_pitch_and_leaves_the_rest():
     plane = PlanarMotion(z_m=0.4, z_sigma_m=0.01, tilt_sigma_rad=0.02)
     pose = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([5.0, -3.0, 0.4]))
@@ -359,18 +290,6 @@ def test_only_its_first_direction_holds_a_landmark_behind_every_sonar_that_saw_i
         graph.append(factors.first_direction(X(0), L(0), np.array([12.0, 1.0, 0.0])))
     held = np.linalg.eigvalsh(information(graph, values, [X(0), X(1), L(0)])[12:, 12:])
     assert (held[0] > 1e-3) == is_held
-
-
-def test_the_first_direction_says_next_to_nothing_beside_a_sighting():
-    pose, z = BODY_POSES["random"], np.array([3.0, 0.2])
-    point = seen_from(pose, 0.2, 0.0, 3.0)
-    values = values_of(X0=pose, L0=point)
-    sighting = factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, np.diag([4e-4, 8e-5]), plain, 0.07)
-    first = factors.first_direction(X(0), L(0), pose.transformTo(point))
-    assert first.error(values) == pytest.approx(0.0, abs=1e-12)
-    assert_jacobians(first, values)
-    without, including = (information([*sighting, *more], values, [X(0), L(0)])[6:, 6:] for more in ([], [first]))
-    assert np.linalg.eigvalsh(np.linalg.solve(without, including)).max() < 1.01
 
 
 def test_the_floor_holds_the_height_of_a_landmark_alone():

@@ -8,7 +8,7 @@ from gtsam.symbol_shorthand import B, C, M, V, X
 from sonar_graph.errors import MeasurementError
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.preintegration.joint_preintegration import JointMotion, JointPreintegrator
-from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry, rotation_log
+from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry
 
 NS = 1_000_000_000
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -133,20 +133,6 @@ def test_doppler_rows_agree_with_the_compiled_between_factor():
         values = fitting(motion, seed, 1e-4)
         values.update(B(0), gtsam.imuBias.ConstantBias(motion.bias[3:], motion.bias[:3]))
         assert made(motion, False, False).error(values) == pytest.approx(between.error(values), rel=1e-2)
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-5, 1.0, 3.0, np.pi - 1e-6])
-def test_rotation_log_is_that_of_gtsam(angle):
-    for axis in np.vstack([np.eye(3), -np.eye(3), np.array([[0.6, 0.0, -0.8], [-0.48, 0.6, 0.64]])]):
-        R = gtsam.Rot3.Expmap(angle * axis).matrix()
-        assert rotation_log(R) == pytest.approx(angle * axis, abs=1e-9)
-
-
-@pytest.mark.parametrize("gravity", [9.81, np.array([0.0, 9.81]), np.array([0.0, 0.0, np.nan])])
-def test_gravity_is_a_vector(gravity):
-    """A number alone was added to all three axes."""
-    with pytest.raises(MeasurementError, match="gravity: expected"):
-        inertial_doppler_odometry(X(0), V(0), X(1), V(1), B(0), some_motion(1), gravity)
 
 
 def test_keys_are_integers_and_differ():

@@ -109,21 +109,6 @@ def test_an_error_that_all_share_does_not_mislead_joint_compatibility():
     assert pair_jointly(case, PROBABILITY).landmarks == (0, 1)
 
 
-def test_with_errors_taken_as_independent_it_would():
-    """Negative control: the crossed pairing's innovations differ by two metres, which only the correlation forbids."""
-    case = shifted()
-    crossed = (1, 0)
-    _, joint = distance(case, crossed)
-    alone = Innovations(case.innovation, np.diag(np.diag(case.expected_cov)), case.noise)
-    _, apart = distance(alone, crossed)
-    assert joint > chi2.ppf(PROBABILITY, 4) > apart
-
-
-def test_a_landmark_is_paired_once():
-    case = Innovations(np.zeros((3, 1, 2)), np.eye(2), np.tile(np.eye(2), (3, 1, 1)))
-    assert pair_jointly(case, PROBABILITY).size == 1
-
-
 # What a pairing must be worth ---------------------------------------------------------------------------------------
 
 
@@ -167,3 +152,13 @@ def test_a_pair_that_the_others_speak_against_is_dropped():
     cov = shared @ shared.T + 1e-4 * np.eye(6)
     case = Innovations(z[:, None] - expected[None], cov, np.tile(SIGMA**2 * np.eye(2), (3, 1, 1)))
     assert believed(case, Pairing((0, 1, 2), 0.0), np.log(np.full(3, 0.2))).landmarks == (0, 1, UNPAIRED)
+
+
+def test_with_errors_taken_as_independent_it_would():
+    """Negative control: the crossed pairing's innovations differ by two metres, which only the correlation forbids."""
+    case = shifted()
+    crossed = (1, 0)
+    _, joint = distance(case, crossed)
+    alone = Innovations(case.innovation, np.diag(np.diag(case.expected_cov)), case.noise)
+    _, apart = distance(alone, crossed)
+    assert joint > chi2.ppf(PROBABILITY, 4) > apart

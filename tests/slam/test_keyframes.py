@@ -1,3 +1,7 @@
+"""Keyframes and the factors that they get from odometry, depth and gravity, on drives made by hand."""
+
+from __future__ import annotations
+
 import gtsam
 import numpy as np
 import pytest
@@ -10,14 +14,13 @@ from sonar_graph.calibration import (
     DvlCalibration,
     ImuCalibration,
     Mounting,
-    PlanarMotion,
     SonarCalibration,
     Start,
 )
 from sonar_graph.measurements import Depth, Dvl, Imu
 from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
 from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
-from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, largest_variances
+from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, positive_definite
 from sonar_graph.slam.models import factors
 
 from .made import smoother_with
@@ -74,13 +77,6 @@ def test_one_is_set_at_the_first_node_after_the_longest_interval():
     assert seconds(keyframes) == [0.0, 2.0, 4.0]
     assert keyframes.newest_key == X(2)
     assert keyframes.newest_s == pytest.approx(T0_NS * 1e-9 + 4.0)
-
-
-def test_nodes_off_the_interval_are_waited_for():
-    keyframes = keyframes_of(Calibration(imu=NO_BIAS), POLICY.model_copy(update={"max_interval_s": 1.9}))
-    keyframes.add(level_imu(4.5), steady_dvl(4.5, hz=3), None)
-    keyframes.advance(int(at(4.5)[0]))
-    assert seconds(keyframes) == pytest.approx([0.0, 2.0, 4.0], abs=1e-8)
 
 
 def test_there_is_none_before_imu_covers_a_doppler_stamp():
@@ -162,13 +158,6 @@ def test_with_no_share_every_frame_brings_one_if_a_node_was_reached_since():
     assert seconds(keyframes) == pytest.approx([0.0, 0.2, 0.4, 1.0])
 
 
-def test_largest_variances_are_those_of_noise_and_bias_together():
-    rng = np.random.default_rng(0)
-    root, D_bias, sigma = rng.standard_normal((6, 6)), rng.standard_normal((6, 3)), 0.7
-    total = np.diag(root @ root.T + sigma**2 * D_bias @ D_bias.T)
-    assert largest_variances(root @ root.T, D_bias, sigma) == pytest.approx((total[:3].max(), total[3:].max()))
-
-
 def test_the_smoother_waits_with_sightings_and_not_with_keyframes():
     keyframes = keyframes_of(Calibration(imu=NO_BIAS))
     keyframes.smoother = smoother_with(1e9, 0.01, 1e9, 1.0)
@@ -185,16 +174,6 @@ def test_the_smoother_waits_with_sightings_and_not_with_keyframes():
     assert keyframes.smoother.covariance(X(0))[5, 5] < 0.1 * before[5, 5]
 
 
-def test_first_estimates_follow_the_odometry():
-    """A turn of 0.1 rad/s at 0.5 m/s: an arc of 5 m radius from the start pose."""
-    start = Start(position_m=(1.0, 2.0, -0.5), rpy_rad=(0.0, 0.0, 0.7))
-    keyframes = driven(Calibration(imu=NO_BIAS, start=start), 4.0, rate=(0, 0, 0.1))
-    arc = np.array([5 * np.sin(0.4), 5 * (1 - np.cos(0.4)), 0.0])
-    pose = keyframes.smoother.values.atPose3(X(2))
-    assert pose.translation() == pytest.approx(np.add([1, 2, -0.5], Rotation.from_euler("z", 0.7).apply(arc)), abs=1e-9)
-    assert pose.rotation().yaw() == pytest.approx(1.1)
-
-
 def test_every_keyframe_has_its_odometry_and_gravity():
     calibration = Calibration(imu=NO_BIAS)
     keyframes = driven(calibration, 6.0)
@@ -205,22 +184,6 @@ def test_every_keyframe_has_its_odometry_and_gravity():
     assert [list(graph.at(k).keys()) for k in (1, 3, 5)] == [[X(0), X(1)], [X(1), X(2)], [X(2), X(3)]]
     without = driven(calibration.model_copy(update={"use_gravity": False}), 6.0)
     assert without.smoother.graph.size() == 1 + 3
-
-
-def test_gravity_is_as_sure_as_the_mean_component_of_both_velocities():
-    """Accelerometers and gyros without noise: what is left is ``sqrt(2) sigma_v / T`` in units of gravity."""
-    imu = ImuCalibration(gyro_bias_sigma=0.0, gyro_noise_density=1e-9, accel_noise_density=1e-9, accel_bias_sigma=0.0)
-    keyframes = driven(Calibration(imu=imu, dvl=DvlCalibration(velocity_sigma_m_s=(0.01, 0.02, 0.05))), 2.0)
-    (factor,) = factors_on(keyframes, gtsam.MagPoseFactorPose3, X(1))
-    mean_variance = (0.01**2 + 0.02**2 + 0.05**2) / 3
-    assert factor.noiseModel().sigma() == pytest.approx(np.sqrt(2 * mean_variance) / 2.0 / G, rel=1e-4)
-
-
-def test_unmeasured_forces_bring_no_gravity():
-    keyframes, imu = keyframes_of(Calibration(imu=NO_BIAS)), level_imu(4.0)
-    keyframes.add(Imu(imu.stamps_ns, imu.angular_velocity, imu.specific_force * np.nan), steady_dvl(4.0), None)
-    keyframes.advance(int(at(4.0)[0]))
-    assert keyframes.smoother.graph.size() == 1 + 2
 
 
 def test_gravity_tells_the_tilt_of_a_tilted_vehicle():
@@ -281,20 +244,6 @@ def test_a_depth_carried_far_by_a_noisy_log_is_worth_less():
         assert factor.noiseModel().sigmas()[2] ** 2 == pytest.approx(1e-4 + carried, rel=1e-3)
 
 
-def test_each_depth_is_used_once_at_the_next_keyframe():
-    when = np.arange(1, 60) / 10
-    keyframes = driven(Calibration(imu=NO_BIAS, dvl=EXACT_DVL), 6.0, Depth(at(*when), np.zeros(59), np.full(59, 1e-4)))
-    sigmas = [factors_on(keyframes, gtsam.GPSFactorArm, X(k))[0].noiseModel().sigmas()[2] for k in (1, 2, 3)]
-    assert [1e-4 / sigma**2 for sigma in sigmas] == pytest.approx([20, 20, 19])
-
-
-def test_the_plane_holds_every_keyframe_from_the_first():
-    keyframes = driven(Calibration(imu=NO_BIAS, planar=PlanarMotion(), use_gravity=False), 4.0)
-    for k in range(3):
-        assert len(factors_on(keyframes, gtsam.GPSFactorArm, X(k))) == 1
-        assert len(factors_on(keyframes, gtsam.MagPoseFactorPose3, X(k))) == 1
-
-
 def test_the_bias_walks_between_stretches():
     """A new one after ten seconds, tied to the old by the walk in between; odometry uses that of its start."""
     imu = ImuCalibration(gyro_bias_sigma=1e-3, gyro_bias_walk_density=1e-4)
@@ -308,14 +257,6 @@ def test_the_bias_walks_between_stretches():
     assert odometry == [[X(k), X(k + 1), B(k // 5)] for k in range(12)]
     assert [keyframes.bias_key(k) for k in (0, 4, 5, 12)] == [B(0), B(0), B(1), B(2)]
     assert len(factors_on(keyframes, gtsam.PriorFactorPoint3, B(0))) == 1
-
-
-@pytest.mark.parametrize("imu", [NO_BIAS, ImuCalibration(gyro_bias_walk_density=0.0)], ids=["none", "constant"])
-def test_a_bias_that_does_not_walk_stays_one(imu):
-    keyframes = driven(Calibration(imu=imu, use_gravity=False), 24.0)
-    keys = {keyframes.bias_key(k) for k in range(13)}
-    assert keys == ({None} if imu.gyro_bias_sigma == 0 else {B(0)})
-    assert keyframes.smoother.graph.size() == 1 + 12 + (imu.gyro_bias_sigma > 0)
 
 
 def test_the_known_bias_is_taken_out_of_the_motion():
@@ -384,16 +325,100 @@ def test_rows_that_come_between_two_questions_about_one_instant_count():
     assert not after.i_T_j.equals(before.i_T_j, 1e-3)
 
 
-def test_what_carrying_a_depth_adds_is_the_vertical_noise_of_the_tilted_doppler_log():
-    """World z of the noise of a vehicle that is rolled, pitched and turned, by scipy."""
-    sigmas, rpy = np.array([0.1, 0.02, 0.05]), (0.3, -0.5, 1.1)
+GAPS_S = ((2.0, 6.0), (7.0, 10.0))
+
+
+def stamps(seconds: np.ndarray) -> np.ndarray:
+    return np.round(seconds * NS).astype(np.int64)
+
+
+def keyframes_over_gaps() -> Keyframes:
+    """Straight on at 0.5 m/s for twelve seconds, without bottom lock twice; no keyframe but the first is due."""
     calibration = Calibration(
-        imu=NO_BIAS, dvl=DvlCalibration(velocity_sigma_m_s=tuple(sigmas)), start=Start(rpy_rad=rpy)
+        imu=ImuCalibration(gyro_bias_sigma=0.0), dvl=DvlCalibration(velocity_sigma_m_s=(0.01, 0.01, 0.01), gap_s=0.3)
     )
-    keyframes = driven(calibration, 1.0)
-    steps = keyframes.odometry.steps_between_nodes(keyframes.stamps_ns[0], int(at(0.8)[0]))
-    world_R_body = Rotation.from_euler("xyz", rpy).as_matrix()
-    up, wrong = world_R_body[2], world_R_body[:, 2]
-    mean_psd = np.average(steps.velocity_psd, axis=0, weights=steps.duration_s)
-    assert keyframes._wander_m2_s(steps) == pytest.approx(up @ mean_psd @ up)
-    assert up @ mean_psd @ up != pytest.approx(wrong @ mean_psd @ wrong, rel=0.1)
+    t, s = np.arange(241) / 20, np.arange(61) / 5
+    for lost_s, found_s in GAPS_S:
+        s = s[(s <= lost_s) | (s >= found_s)]
+    keyframes = Keyframes(
+        calibration,
+        KeyframeParams(max_interval_s=1e3, motion_noise_share=1e9, bias_interval_s=10.0),
+        smoother_with(1e9, 0.01, 1e9),
+    )
+    keyframes.add(
+        Imu(stamps(t), np.zeros((len(t), 3)), np.tile([0.0, 0.0, G], (len(t), 1))),
+        Dvl(stamps(s), np.tile([0.5, 0.0, 0.0], (len(s), 1)), np.full((len(s), 3, 3), np.nan)),
+        None,
+    )
+    return keyframes
+
+
+def seen(keyframes: Keyframes, at_s: float) -> tuple[PreintegratedMotion, PreintegratedMotion]:
+    """A frame comes: the motion as it is, and as it is told."""
+    stamp_ns = round(at_s * NS)
+    keyframes.advance(stamp_ns)
+    motion = keyframes.motion_since_newest(stamp_ns)
+    return motion, keyframes.set_for_frame(stamp_ns, motion)
+
+
+def shares(keyframes: Keyframes, at_s: list[float]) -> list[float]:
+    """Of the information of each motion, how much is told."""
+    found = []
+    for motion, told in (seen(keyframes, t) for t in at_s):
+        ratio = np.diag(told.covariance) / np.diag(motion.covariance)
+        assert ratio == pytest.approx(ratio[0])
+        assert told.i_T_j.equals(motion.i_T_j, 0.0)
+        found.append(1.0 / ratio[0])
+    return found
+
+
+def test_frames_over_one_gap_together_tell_ever_nearer_what_one_exact_frame_would_and_never_more():
+    """A telescoping sum by hand: ``1 / (k (k + 1)) = 1 / k - 1 / (k + 1)``, so that n of them tell ``n / (n + 1)``."""
+    told = np.cumsum(shares(keyframes_over_gaps(), (2.5 + 0.1 * np.arange(30)).tolist()))
+    n = np.arange(1, 31)
+    assert told == pytest.approx(n / (n + 1))
+
+
+def test_each_gap_counts_anew_and_frames_between_gaps_tell_all():
+    """With bottom lock, or only so long after it that velocity still counts as linear, frames share no such error."""
+    keyframes = keyframes_over_gaps()
+    told = shares(keyframes, [1.0, 2.2, 3.0, 4.0, 6.3, 6.7, 8.0, 9.0, 9.5, 11.0])
+    assert told == pytest.approx([1, 1, 1 / 2, 1 / 6, 1, 1, 1 / 2, 1 / 6, 1 / 12, 1])
+
+
+def test_a_gap_that_has_ended_before_a_frame_is_not_shared_with_it():
+    """Its end is a node, even where that is no keyframe."""
+    keyframes = keyframes_over_gaps()
+    assert shares(keyframes, [4.0, 6.4]) == pytest.approx([1 / 2, 1])
+    assert len(keyframes.stamps_ns) == 1
+
+
+@pytest.mark.parametrize("k", [2, 3])
+def test_positive_definite_are_those_whose_eigenvalues_are_above_zero(k):
+    rng = np.random.default_rng(k)
+    roots = rng.normal(size=(2000, k, k))
+    matrices = roots @ roots.transpose(0, 2, 1) - rng.uniform(0, 1, 2000)[:, None, None] * np.eye(k)
+    matrices *= 10.0 ** rng.uniform(-8, 8, 2000)[:, None, None]
+    expected = np.linalg.eigvalsh(matrices)[:, 0] > 0
+    assert 200 < expected.sum() < 1800
+    assert np.array_equal(positive_definite(matrices), expected)
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_singular_ones_are_not(scale):
+    rng = np.random.default_rng(0)
+    roots = rng.uniform(0.5, 2.0, size=(500, 3, 1))
+    assert not positive_definite(scale * (roots @ roots.transpose(0, 2, 1))).any()
+    assert not positive_definite(scale * np.diag([1.0, 0.0, 1.0])[None]).any()
+    assert positive_definite(scale * np.eye(3)[None]).all()
+    assert positive_definite(np.diag([1e6, 1e-6, 1.0])[None]).all()
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_what_is_no_number_is_not(wrong):
+    for i in range(3):
+        for j in range(3):
+            matrix = np.eye(3)
+            matrix[i, j] = matrix[j, i] = wrong
+            assert not positive_definite(np.stack([np.eye(3), matrix]))[1]
+            assert positive_definite(np.stack([np.eye(3), matrix]))[0]

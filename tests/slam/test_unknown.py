@@ -1,20 +1,40 @@
-"""Landmarks that nothing but their place tells apart."""
+"""Landmarks without names: paired, begun and merged by geometry."""
 
+from __future__ import annotations
+
+import math
 from collections import Counter
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import L, X
+from scipy.stats import chi2, multivariate_normal
 
+from sonar_graph.calibration import SonarCalibration
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam.landmarks import unknown as module
 from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, Pairing, pair_jointly
-from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
+from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors
+from sonar_graph.slam.landmarks.tracked import STILL
+from sonar_graph.slam.landmarks.unknown import (
+    ODDS,
+    AnonymousLandmarks,
+    AssociatedUnknown,
+    LandmarkMerging,
+    PairedDetection,
+)
+from sonar_graph.slam.models.prediction import PredictedView
+from sonar_graph.slam.smoother.batch_solution import JointCovariance, Sightline
+from sonar_graph.slam.smoother.incremental import Smoother
+from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionJournal, Outcome
 
 from .graph_comparison import assert_marginals_agree, largest_difference
 from .late_identities import assert_outcomes_account, run
+from .made import smoother_with
 
 TWO_LAPS = {"duration_s": 260.0, "laps": 2, "speed_m_s": 0.4, "seed": 3, "gyro_bias_scale": 0.0}
 CLEAN = {"tracks": True, "detection_probability": 1.0, "false_detections_per_frame": 0.0}
@@ -60,13 +80,6 @@ def test_without_names_the_basin_is_that_with_names():
     assert set(log.outcomes) <= USED
     assert [name_of[i] for i in log.landmark_ids.tolist()] == detections_of(sequence).most_probable()[0].tolist()
     assert estimator.trajectory().positions == pytest.approx(known.trajectory().positions, abs=1e-4)
-
-
-def test_by_default_they_are_refused():
-    sequence = simulate_basin(BasinOptions(**TWO_LAPS))
-    estimator = run(anonymous_where(sequence, everywhere(sequence)))
-    assert set(estimator.detections().outcomes) == {Outcome.NO_IDENTITY}
-    assert len(estimator.landmarks()) == 0
 
 
 def test_where_all_are_named_nothing_changes():
@@ -136,12 +149,6 @@ def test_a_landmark_that_is_named_later_gives_the_graph_of_one_known_from_the_st
     assert estimator.detections().landmark_ids.tolist() == known.detections().landmark_ids.tolist()
 
 
-def test_without_merging_they_stay_two(monkeypatch: pytest.MonkeyPatch):
-    _, late = named_late(0.4)
-    monkeypatch.setattr(module.LandmarkMerging, "nearest", lambda *_: None)
-    assert len(run(late, **ASSOCIATED).landmarks()) > 4
-
-
 def test_with_a_bounded_history_none_is_merged_that_has_left_the_window():
     """Factors in a marginal cannot be moved; pairing works all the same."""
     sequence, late = named_late(0.4)
@@ -206,8 +213,124 @@ def test_half_named_ends_in_names_only():
     assert sum(outcomes[used] for used in USED) > 1.7 * sum(ignoring[used] for used in USED)
 
 
-def test_the_outcome_does_not_depend_on_how_often_one_asks():
-    sequence = anonymous_where(simulate_basin(BasinOptions(**TWO_LAPS)), slice(None))
-    maps = [run(sequence, rate, identity__unknown__policy="associate").landmarks() for rate in (0.3, 5.0)]
-    assert maps[0].ids.tolist() == maps[1].ids.tolist()
-    assert maps[0].positions == pytest.approx(maps[1].positions, abs=1e-4)
+NOISE = np.diag([4e-4, 1e-4])
+
+
+def anonymous(
+    range_m: float, density_m2: float, least_sightings: int = 1, aperture_rad: float = 0.3
+) -> tuple[AnonymousLandmarks, Smoother]:
+    """A known pose, and a landmark straight ahead."""
+    smoother = smoother_with(1e9, 0.1, 1e9)
+    maker = SightingFactors(SonarCalibration(elevation_aperture_rad=aperture_rad), lambda noise: noise)
+    landmarks = LandmarkSightings(smoother, maker)
+    smoother.add_pose(X(0), gtsam.Pose3(), 0.0)
+    smoother.add([gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1e-4))])
+    smoother.update(0.0)
+    sighting = Sighting(0, 0, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.0])), NOISE, None)
+    landmarks.exchange([], [(sighting, 7)], 0.0)
+    policy = AssociatedUnknown(
+        gate_probability=0.99, density_m2=density_m2, sightings=least_sightings, longest_wait_s=60.0
+    )
+    return AnonymousLandmarks(landmarks, DetectionJournal(), policy), smoother
+
+
+@pytest.mark.parametrize("range_m", [0.5, 2.0, 8.0])
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_a_landmark_has_to_be_denser_than_what_is_not_in_the_map(range_m: float, share: float) -> None:
+    """So many a square metre are ``range`` times as many a metre of range and radian of azimuth."""
+    z = np.array([range_m + 0.02, 0.01])
+    _, smoother = anonymous(range_m, 1.0)
+    view = PredictedView(X(0), None, gtsam.Pose3(), STILL, gtsam.Pose3(), smoother.joint_covariance([X(0), L(7)]))
+    expected, cov = view.expect([L(7)], smoother.values.atPoint3(L(7))[None])
+    density = multivariate_normal.pdf(z, expected[0], cov[0] + NOISE)
+    policied, _ = anonymous(range_m, share * density / (ODDS * z[0]))
+    (paired,) = policied.pair(view, z[None], NOISE[None], set())
+    assert paired.landmark_id == (7 if share < 1.0 else None)
+
+
+@pytest.mark.parametrize("range_m", [0.5, 2.0, 8.0])
+@pytest.mark.parametrize("share", [0.98, 1.02])
+def test_a_candidate_begins_a_landmark_when_it_is_known_to_a_tenth_of_its_range(range_m: float, share: float) -> None:
+    """One sighting in an aperture whose standard deviation is about 0.1 rad."""
+    made, _ = anonymous(range_m, 1e-3, aperture_rad=share * 0.1 * math.sqrt(12.0))
+    sighting = Sighting(1, 1, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.4])), NOISE, None)
+    made.use([sighting], [PairedDetection(None, None)], 0.0)
+    assert sighting.outcome is (Outcome.NEW if share < 1.0 else Outcome.WAITING)
+
+
+PROBABILITY = 0.99
+NOISE_M = 0.02
+LIKELY = math.log(1.0)
+
+
+def nearest(
+    points: dict[int, list[float]],
+    cov: np.ndarray,
+    named: list[int],
+    frames: dict[int, list[int]],
+    log_rival: float = LIKELY,
+    range_m: float = 2.0,
+) -> tuple[int, int] | None:
+    """Of landmarks at points with a joint covariance, each seen in some frames."""
+    smoother = smoother_with(1e9, 0.1, 1e9)
+    landmarks = LandmarkSightings(smoother, SightingFactors(SonarCalibration(), lambda noise: noise))
+    values = gtsam.Values()
+    for i, point in points.items():
+        values.insert(L(i), np.array(point))
+        for stamp_ns in frames[i]:
+            noise = np.diag([NOISE_M**2, (NOISE_M / 2) ** 2])
+            sighting = Sighting(stamp_ns, 0, Sightline(X(0), gtsam.Pose3(), np.array([range_m, 0.0])), noise, None)
+            landmarks.enter(sighting, i, [])
+    joint = JointCovariance(cov, {L(i): 3 * k for k, i in enumerate(points)})
+    merging = LandmarkMerging(landmarks, PROBABILITY, log_rival)
+    return merging.nearest(values, joint, named, [i for i in points if i not in named])
+
+
+def shared(count: int, common_sigma: float, own_sigma: float) -> np.ndarray:
+    """An error that all share, and one of each."""
+    return common_sigma**2 * np.kron(np.ones((count, count)), np.eye(3)) + own_sigma**2 * np.eye(3 * count)
+
+
+APART = {5: [1], 7: [2], 9: [3]}
+
+
+@pytest.mark.parametrize("is_named", [True, False])
+def test_two_within_the_gate_of_their_difference_are_one(is_named: bool):
+    """``P_aa + P_bb - P_ab - P_ba``: what both share does not count."""
+    cov = shared(2, 3.0, 0.05)
+    reach = math.sqrt(chi2.ppf(PROBABILITY, 3) * (2 * 0.05**2 + NOISE_M**2))
+    named = [5] if is_named else []
+    for factor, merged in ((0.98, (5, 7)), (1.02, None)):
+        points = {5: [1.0, 2.0, 0.0], 7: [1.0 + factor * reach, 2.0, 0.0]}
+        assert nearest(points, cov, named, APART, log_rival=-10.0) == merged
+
+
+def test_two_of_one_frame_stay_two():
+    points, cov = {5: [0.0] * 3, 7: [0.0] * 3}, shared(2, 1.0, 0.05)
+    assert nearest(points, cov, [], {5: [1, 2], 7: [2, 3]}) is None
+    assert nearest(points, cov, [], {5: [1, 2], 7: [3, 4]}) == (5, 7)
+
+
+@pytest.mark.parametrize("own_sigma", [0.1, 1.0])
+def test_a_wide_difference_says_nothing(own_sigma: float):
+    """Compatible with zero, but no denser there, horizontally, than other landmarks are."""
+    density = 1 / (2 * math.pi * (2 * own_sigma**2 + NOISE_M**2))
+    points, cov = {5: [0.0] * 3, 7: [0.0] * 3}, shared(2, 1.0, own_sigma)
+    assert nearest(points, cov, [], APART, math.log(0.99 * density)) == (5, 7)
+    assert nearest(points, cov, [], APART, math.log(1.01 * density)) is None
+
+
+@pytest.mark.parametrize("range_m", [0.5, 2.0, 6.0])
+def test_the_noise_of_a_sighting_is_across_the_beam_where_that_is_larger(range_m: float):
+    """``max(range sigma, range times azimuth sigma)`` beside two landmarks that are known well."""
+    sigma = max(NOISE_M, range_m * NOISE_M / 2)
+    reach = math.sqrt(chi2.ppf(PROBABILITY, 3) * (2 * 0.001**2 + sigma**2))
+    for factor, merged in ((0.98, (5, 7)), (1.02, None)):
+        points = {5: [1.0, 2.0, 0.0], 7: [1.0 + factor * reach, 2.0, 0.0]}
+        assert nearest(points, shared(2, 1.0, 0.001), [], APART, log_rival=-10.0, range_m=range_m) == merged
+
+
+def test_without_merging_they_stay_two(monkeypatch: pytest.MonkeyPatch):
+    _, late = named_late(0.4)
+    monkeypatch.setattr(module.LandmarkMerging, "nearest", lambda *_: None)
+    assert len(run(late, **ASSOCIATED).landmarks()) > 4

@@ -1,3 +1,7 @@
+"""Factors put in and taken out again."""
+
+from __future__ import annotations
+
 import gtsam
 import numpy as np
 import pytest

@@ -1,4 +1,8 @@
-"""Which factors are in the graph depends on which sightings are of which landmark, not on how they came there."""
+"""Sightings in the graph whatever came and went, and the points that they place."""
+
+from __future__ import annotations
+
+import math
 
 import gtsam
 import numpy as np
@@ -6,9 +10,11 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import least_squares
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
-from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors
+from sonar_graph.measurements import Floats
+from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors, place
 from sonar_graph.slam.smoother.batch_solution import Sightline
 
 from .made import smoother_with
@@ -111,3 +117,61 @@ def test_a_landmark_whose_sightings_have_left_counts_as_one_more() -> None:
     landmarks.exchange([third, other], [], float(POSES))
     assert landmarks.sizes() == {7: 1}
     assert landmarks.any_sighting(7) is first
+
+
+APERTURE_RAD = 0.3
+MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.4, 0.0), np.array([0.3, 0.0, -0.1]))
+POINT = np.array([3.0, 0.5, -1.7])
+R = np.diag([0.02**2, 0.01**2])
+MAKER_OF_PLACING = SightingFactors(SonarCalibration(elevation_aperture_rad=APERTURE_RAD), lambda noise: noise)
+
+
+def polar(pose: gtsam.Pose3, point: Floats) -> Floats:
+    """Range, azimuth and elevation."""
+    x, y, z = pose.compose(MOUNTED).transformTo(point)
+    return np.array([math.hypot(x, y, z), math.atan2(y, x), math.asin(z / math.hypot(x, y, z))])
+
+
+def seen(
+    poses: list[gtsam.Pose3], floor: FloorPrior | None, noise: Floats
+) -> tuple[list[Sighting], gtsam.Values, list[Floats]]:
+    values, sightings, measured = gtsam.Values(), [], []
+    for k, pose in enumerate(poses):
+        values.insert(X(k), pose)
+        z = polar(pose, POINT)[:2] + noise[k]
+        measured.append(z)
+        sightings.append(Sighting(k, k, Sightline(X(k), MOUNTED, z), R, floor))
+    return sightings, values, measured
+
+
+def around(count: int) -> list[gtsam.Pose3]:
+    """Poses on an arc, at different heights, that look at the point."""
+    angles = np.linspace(0.0, 0.8, count)
+    return [
+        gtsam.Pose3(gtsam.Rot3.Yaw(a), POINT - [2.2 * math.cos(a), 2.2 * math.sin(a), -1.0 - 0.3 * math.sin(5 * a)])
+        for a in angles.tolist()
+    ]
+
+
+@pytest.mark.parametrize("floor", [None, FloorPrior(z_m=-1.7, sigma_m=0.02)], ids=["no floor", "floor"])
+def test_a_point_is_that_of_least_squares(floor: FloorPrior | None):
+    """With the elevation at the first sighting, or the floor, as a prior; to a tenth of a sigma."""
+    poses = around(6)
+    noise = 0.5 * np.random.default_rng(0).standard_normal((6, 2)) * np.sqrt(np.diag(R))
+    sightings, values, measured = seen(poses, floor, noise)
+    sigma_e = APERTURE_RAD / math.sqrt(12)
+
+    def residuals(p: Floats) -> Floats:
+        rows = [(polar(pose, p)[:2] - z) / np.sqrt(np.diag(R)) for pose, z in zip(poses, measured, strict=True)]
+        first = polar(poses[0], p)[2]
+        middle = MAKER_OF_PLACING.elevation_on(floor, poses[0].compose(MOUNTED), *measured[0].tolist())
+        rows.append(np.array([(first - middle) / sigma_e]))
+        if floor:
+            rows.append(np.array([(p[2] - floor.z_m) / floor.sigma_m]))
+        return np.concatenate(rows)
+
+    best = least_squares(residuals, POINT)
+    point, cov = place(sightings, values, MAKER_OF_PLACING)
+    sigma = np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac)))
+    assert np.abs((point - best.x) / sigma).max() < 0.1
+    assert np.sqrt(np.diag(cov)) == pytest.approx(sigma, rel=0.05)

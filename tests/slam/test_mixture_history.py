@@ -1,4 +1,6 @@
-"""Another solution of the history: what it costs, and when it is taken."""
+"""Whole histories under other choices: least cost by trying all, graduated non-convexity beside GTSAM."""
+
+from __future__ import annotations
 
 from itertools import product
 
@@ -11,14 +13,16 @@ from scipy.stats import multivariate_normal
 from sonar_graph.calibration import FloorPrior, SonarCalibration
 from sonar_graph.slam import KeyframeParams, MixtureIdentity
 from sonar_graph.slam.landmarks import mixture_history as rival_history
+from sonar_graph.slam.landmarks.association import IdentityPosterior
 from sonar_graph.slam.landmarks.mixture import Choices, TrackedObject
-from sonar_graph.slam.landmarks.mixture_history import RivalHistory
-from sonar_graph.slam.landmarks.sighting import SightingFactors
+from sonar_graph.slam.landmarks.mixture_history import LEAST_WEIGHT, RivalHistory, WeighedHistory, graduated_weights
+from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors
+from sonar_graph.slam.smoother.batch_solution import Sightline
 
 from . import dive as dive_module
 from . import test_mixture as small
 from .dive import CALIBRATION, FLOOR, Dive, spherical
-from .test_doubtful_identities import PLACES, dive, misnamed, show, watch
+from .test_mixture_policy import PLACES, dive, show, watch
 
 
 def rival_of(world: Dive) -> RivalHistory:
@@ -27,19 +31,6 @@ def rival_of(world: Dive) -> RivalHistory:
     return RivalHistory(
         world.smoother.graph_without(handles), doubtful.watches, doubtful._mixture, doubtful._landmarks.maker
     )
-
-
-@pytest.mark.parametrize("move_m", [[0.05, 0.0, 0.0], [0.0, -0.05, 0.0], [0.0, 0.0, 0.05]])
-def test_the_cost_rises_as_the_error_of_the_graph_does(move_m: list[float]) -> None:
-    """As long as choices stay; a landmark that leaves its floor pays for that too."""
-    world, _ = misnamed("max-mixture")
-    rival, chosen = rival_of(world), world.sightings._doubtful.history()
-    graph, moved = rival._chosen_graph(chosen.choices), gtsam.Values(chosen.values)
-    moved.update(L(7), chosen.values.atPoint3(L(7)) + move_m)
-    rise = graph.error(moved) - graph.error(chosen.values)
-    assert rise > 10.0
-    found = rival.cost(moved, chosen.choices) - rival.cost(chosen.values, chosen.choices)
-    assert found == pytest.approx(rise, rel=0.05)  # the camera shrinks azimuths at an elevation
 
 
 def test_the_cheaper_of_both_solutions_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,19 +108,6 @@ def test_the_choices_that_settle_are_the_cheapest_of_all(said: list[int]) -> Non
         assert cost_of(rival, rival._solve(start, other), other) > cost_of(rival, values, choices) + 1.0
 
 
-def test_a_landmark_that_began_with_another_thing_is_moved_beside_the_run_too() -> None:
-    """The first that was said to be 7 is of 4, and has put it there; no later one fits."""
-    values = small.world()
-    watches = [named(0, 4, 7, values), *(named(k, 7, 7, values) for k in range(1, 5))]
-    rival, start = small_rival(watches)
-    began = [7, None, None, None, None]
-    start = rival._solve(start, began)
-    assert np.linalg.norm(start.atPoint3(L(7)) - small.PLACES[4]) < 0.1
-    found, choices = rival.settled(start, began, is_graduated=False)
-    assert choices == [None, 7, 7, 7, 7]
-    assert np.linalg.norm(found.atPoint3(L(7)) - small.PLACES[7]) < 0.1
-
-
 # What the window chooses wrongly --------------------------------------------------------------------------------------
 
 
@@ -165,3 +143,122 @@ def test_graduated_non_convexity_finds_what_the_windows_choices_have_lost(monkey
         assert len(world.sightings.log()) == len(truth)
     assert sides == pytest.approx([0.0, side_m], abs=0.05)
     assert costs[0] - costs[1] == pytest.approx(123.0, abs=2.0)
+
+
+MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.4, 0.0), np.array([0.3, 0.0, -0.1]))
+IDS_OF_WEIGHED_HISTORY = [7, 9, 7, 9]
+NOISE = {"independent": np.diag([4e-4, 1e-4]), "correlated": np.array([[4e-4, 1e-4], [1e-4, 1e-4]])}
+FLOORS = {"floor": FloorPrior(z_m=-1.0, sigma_m=0.05), "no floor": None}
+
+
+def history(noise: str, floor: str):
+    """Two landmarks, two watches each of three sightings; the earliest of landmark 7 is in its second watch."""
+    rng = np.random.default_rng(1)
+    values, rest = gtsam.Values(), gtsam.NonlinearFactorGraph()
+    for k in range(3):
+        pose = gtsam.Pose3.Expmap(0.1 * rng.standard_normal(6))
+        values.insert(X(k), pose)
+        rest.push_back(gtsam.PriorFactorPose3(X(k), gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 0.1)))
+    for landmark_id in set(IDS_OF_WEIGHED_HISTORY):
+        values.insert(L(landmark_id), np.array([3.0, 0.2, -1.0]) + 0.1 * rng.standard_normal(3))
+    watches = []
+    for row, _ in enumerate(IDS_OF_WEIGHED_HISTORY):
+        z = np.array([3.0, 0.1]) + 0.02 * rng.standard_normal((3, 2))
+        sightings = [
+            Sighting(100 - 10 * row + k, row, Sightline(X(k), MOUNTED, z[k]), NOISE[noise], FLOORS[floor])
+            for k in range(3)
+        ]
+        watches.append(TrackedObject(IdentityPosterior({}), sightings))
+    return rest, watches, values
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+@pytest.mark.parametrize("noise", NOISE)
+def test_each_watch_counts_by_its_weight_and_the_beginning_of_landmarks_in_full(noise: str, floor: str) -> None:
+    rest, watches, values = history(noise, floor)
+    weighed = WeighedHistory(rest, watches, IDS_OF_WEIGHED_HISTORY, MAKER)
+    first = {7: watches[2].sightings[0], 9: watches[3].sightings[0]}
+    said_once = rest.error(values) + sum(
+        factor.error(values) for i, sighting in first.items() for factor in MAKER.beginning(sighting, L(i))
+    )
+    alone = [
+        sum(factor.error(values) for sighting in each.sightings for factor in MAKER.measured(sighting, L(i)))
+        for each, i in zip(watches, IDS_OF_WEIGHED_HISTORY, strict=True)
+    ]
+    for weights in ([1.0, 1.0, 1.0, 1.0], [0.0, 1.0, 0.3, 0.02], [0.5, 0.25, 0.0, 0.9]):
+        expected = said_once + np.maximum(weights, LEAST_WEIGHT) @ alone
+        assert weighed.graph(np.array(weights)).error(values) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+@pytest.mark.parametrize("noise", NOISE)
+def test_with_all_weights_one_it_is_the_history_as_it_is_made(noise: str, floor: str) -> None:
+    rest, watches, values = history(noise, floor)
+    made = gtsam.NonlinearFactorGraph(rest)
+    for each, i in zip(watches, IDS_OF_WEIGHED_HISTORY, strict=True):
+        for sighting in each.sightings:
+            is_first = sighting in (watches[2].sightings[0], watches[3].sightings[0])
+            for factor in MAKER.make(sighting, L(i), is_first=is_first):
+                made.push_back(factor)
+    weighed = WeighedHistory(rest, watches, IDS_OF_WEIGHED_HISTORY, MAKER).graph(np.ones(4))
+    expected, found = (graph.linearize(values) for graph in (made, weighed))
+    ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(made)
+    for theirs, ours in zip(expected.hessian(ordering), found.hessian(ordering), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-6)
+
+
+C2 = 9.0
+
+
+def problem(seed: int):
+    """A point on a line, measured twelve times with a sigma of 1, four of them far off."""
+    rng = np.random.default_rng(seed)
+    return np.concatenate([rng.standard_normal(8), 8.0 + 30.0 * rng.random(4)])
+
+
+def graph_of(z, weights=None) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph()
+    for value, weight in zip(z, np.ones(len(z)) if weights is None else weights, strict=True):
+        noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0 / np.sqrt(max(weight, 1e-12)))
+        graph.push_back(gtsam.PriorFactorPoint3(0, np.array([value, 0.0, 0.0]), noise))
+    return graph
+
+
+def start() -> gtsam.Values:
+    values = gtsam.Values()
+    values.insert(0, np.array([12.0, 0.0, 0.0]))
+    return values
+
+
+def ours(z):
+    def squared(values):
+        return (values.atPoint3(0)[0] - z) ** 2
+
+    values, weights = graduated_weights(lambda w: graph_of(z, w), squared, np.full(len(z), C2), start())
+    return values.atPoint3(0)[0], weights
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_it_keeps_what_gtsams_keeps(seed: int) -> None:
+    z = problem(seed)
+    params = gtsam.GncLMParams()
+    params.setLossType(gtsam.GncLossType.TLS)
+    theirs = gtsam.GncLMOptimizer(graph_of(z), start(), params)
+    theirs.setInlierCostThresholds(C2 / 2)
+    point = theirs.optimize().atPoint3(0)[0]
+    found, weights = ours(z)
+    assert found == pytest.approx(point, abs=1e-3)
+    np.testing.assert_allclose(weights, theirs.getWeights(), atol=1e-2)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_it_finds_the_least_truncated_cost_of_all_subsets(seed: int) -> None:
+    z = problem(seed)
+    costs = {}
+    for kept in product([False, True], repeat=len(z)):
+        inside = z[list(kept)]
+        if len(inside):
+            costs[kept] = ((inside - inside.mean()) ** 2).sum() + C2 * (len(z) - len(inside))
+    found, weights = ours(z)
+    assert tuple((weights > 0.5).tolist()) == min(costs, key=costs.__getitem__)
+    assert abs(np.mean(z) - found) > 3.0, "without weights the answer would be another one"

@@ -1,6 +1,6 @@
-"""What becomes of each detection of a frame, and with what noise it is believed."""
+"""Detections of a straight dive: gate, first place of a landmark, noise of the motion, waiting."""
 
-from dataclasses import replace
+from __future__ import annotations
 
 import gtsam
 import numpy as np
@@ -8,12 +8,13 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 from scipy.stats import chi2
 
-from sonar_graph.calibration import DvlCalibration, Mounting, SonarCalibration, Start
+from sonar_graph.calibration import DvlCalibration, FloorPrior, SonarCalibration, Start
 from sonar_graph.measurements import Floats
 from sonar_graph.slam import GaussianKernel, KeyframeParams, RobustKernel
 from sonar_graph.states import Outcome
 
-from .dive import CALIBRATION, NS, POLICY, SONAR, T0_NS, UNGATED, Dive, frame, spherical
+from .dive import CALIBRATION, FLOOR, NS, POLICY, SONAR, T0_NS, UNGATED, Dive, frame, spherical
+from .made import smoother_with
 
 
 def test_innovation_and_its_covariance_are_those_of_the_joint_prediction():
@@ -76,24 +77,6 @@ def test_the_gate_is_the_chi_square_quantile(beyond):
     assert dive.sightings.journal.log().innovations[1] == pytest.approx([6.0, 0.0], abs=1e-6)
 
 
-def test_without_a_gate_nothing_is_refused():
-    dive = Dive(identity=UNGATED)
-    dive.see(0.0, (5, 3.0, 0.0))
-    dive.see(0.0, (5, 30.0, 1.0))
-    assert dive.outcomes == [Outcome.NEW, Outcome.USED]
-
-
-@pytest.mark.parametrize("rows", [((5, 3.0, 0.0),), ((-1, 3.0, 0.0), (4, 2.0, 0.1))])
-def test_a_doubtful_identity_changes_nothing(rows):
-    """Neither keyframe nor landmark nor factor."""
-    dive = Dive()
-    dive.see(1.5, *rows, probability=0.69)
-    assert dive.outcomes == [Outcome.NO_IDENTITY] * len(rows)
-    assert dive.smoother.graph.size() == 1
-    assert dive.sightings.ids == set()
-    assert len(dive.keyframes.stamps_ns) == 1
-
-
 def test_a_frame_before_the_start_is_unlocated():
     dive = Dive()
     dive.sightings.add(frame(T0_NS - 1, [(5, 3.0, 0.0), (6, 2.0, 0.0)]))
@@ -153,16 +136,6 @@ def test_a_kernel_keeps_an_outlier_from_pulling(kernel):
     assert pulls[1] < 0.2 * pulls[0]
 
 
-def test_azimuths_either_side_of_pi_are_near_each_other():
-    backwards = SonarCalibration(mounting=Mounting(), range_sigma_m=0.02, azimuth_sigma_rad=0.01)
-    dive = Dive(CALIBRATION.model_copy(update={"sonar": backwards}))
-    dive.see(0.0, (5, 3.0, np.pi - 0.005))
-    dive.see(0.0, (5, 3.0, -np.pi + 0.005))
-    log = dive.sightings.journal.log()
-    assert log.outcomes[-1] is Outcome.USED
-    assert log.innovations[-1] == pytest.approx([0.0, 0.01], abs=1e-6)
-
-
 def factor_of(dive: Dive, kind: type) -> gtsam.NonlinearFactor:
     graph = dive.smoother.graph
     (factor,) = [graph.at(k) for k in range(graph.size()) if isinstance(graph.at(k), kind)]
@@ -184,15 +157,113 @@ def test_factors_of_a_frame_off_its_keyframe_carry_the_noise_of_the_motion():
     assert sigmas[1] > 1.5 * sigmas[0]
 
 
-def test_rows_of_one_frame_keep_their_own_covariance():
-    """The calibration's noise is only for the row whose log does not say."""
-    told = np.diag([0.05**2, 0.03**2])
-    both = frame(T0_NS, ((5, 3.0, 0.0), (6, 2.5, 0.1)))
-    both = replace(both, range_azimuth_cov=np.array([told, np.full((2, 2), np.nan)]))
+def test_a_first_sighting_places_a_landmark_on_the_centre_beam():
+    """Range 3 m straight ahead of a sonar that looks 0.4 rad down and 0.2 rad to the left."""
     dive = Dive()
-    dive.keyframes.advance(T0_NS)
-    dive.sightings.add(both)
-    graph = dive.smoother.graph
-    ranges = [graph.at(k) for k in range(graph.size()) if isinstance(graph.at(k), gtsam.RangeFactorWithTransform3D)]
-    sigmas = {list(factor.keys())[1]: factor.noiseModel().sigma() for factor in ranges}
-    assert sigmas == {L(5): pytest.approx(0.05), L(6): pytest.approx(SONAR.range_sigma_m)}
+    dive.see(0.0, (5, 3.0, 0.0))
+    beam = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
+    assert dive.outcomes == [Outcome.NEW]
+    assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(np.array([0.3, 0.1, -0.1]) + 3.0 * beam)
+
+
+def test_a_known_floor_gives_the_elevation():
+    dive = Dive(CALIBRATION.model_copy(update={"floor": FLOOR}))
+    truth = np.array([2.6, 0.9, FLOOR.z_m])
+    dive.see(0.0, (5, *spherical(0.0, truth)))
+    assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(truth, abs=1e-9)
+    assert dive.smoother.graph.size() == 1 + 4
+    dive.smoother.update(dive.keyframes.newest_s)
+    assert np.sqrt(dive.smoother.covariance(L(5))[2, 2]) == pytest.approx(FLOOR.sigma_m, rel=1e-3)
+
+
+def test_a_floor_out_of_the_aperture_is_believed_all_the_same():
+    """0.2 rad below the centre beam, where half the aperture is 0.12 rad: first put on the beam, then on the floor."""
+    dive = Dive(CALIBRATION.model_copy(update={"floor": FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.6), sigma_m=0.01)}))
+    dive.see(0.0, (5, 3.0, 0.0))
+    for _ in range(5):
+        dive.smoother.update(dive.keyframes.newest_s)
+    assert dive.outcomes == [Outcome.NEW]
+    assert dive.smoother.values.atPoint3(L(5))[2] == pytest.approx(-0.1 - 3.0 * np.sin(0.6), abs=1e-3)
+    assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-3)
+
+
+def test_a_landmark_that_cannot_stand_on_the_floor_does_not_drag_the_vehicle_there():
+    """0.5 rad below the centre beam is seven sigmas of the aperture: no floor is said, but the aperture is."""
+    floor = FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.9), sigma_m=0.01)
+    dive, without = Dive(CALIBRATION.model_copy(update={"floor": floor})), Dive()
+    for each in (dive, without):
+        each.see(0.0, (5, 3.0, 0.0))
+        each.smoother.update(each.keyframes.newest_s)
+    assert dive.smoother.graph.equals(without.smoother.graph, 1e-12)
+    assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-9)
+
+
+def test_a_doubtful_height_of_the_vehicle_lets_the_floor_be_farther():
+    floor = FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.9), sigma_m=0.01)
+    start = Start(position_sigma_m=(0.05, 0.02, 2.0), rpy_sigma_rad=(0.01, 0.01, 0.03))
+    dive = Dive(CALIBRATION.model_copy(update={"floor": floor, "start": start}))
+    dive.see(0.0, (5, 3.0, 0.0))
+    for _ in range(5):
+        dive.smoother.update(dive.keyframes.newest_s)
+    assert dive.smoother.values.atPoint3(L(5))[2] == pytest.approx(floor.z_m, abs=1e-2)
+
+
+def test_elevation_is_said_once_for_a_landmark():
+    """It does not vary as noise would: many sightings from one place leave its height as unknown as the first."""
+    dive = Dive(
+        CALIBRATION.model_copy(update={"start": Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)})
+    )
+    for k in range(9):
+        dive.see(0.01 * k, (5, 3.0, 0.0))
+    dive.smoother.update(dive.keyframes.newest_s)
+    up = np.array([np.cos(0.2) * np.sin(0.4), np.sin(0.2) * np.sin(0.4), np.cos(0.4)])
+    cov = dive.smoother.covariance(L(5))
+    elevation_sigma = SONAR.elevation_aperture_rad / np.sqrt(12)
+    assert np.sqrt(up @ cov @ up) == pytest.approx(3.0 * np.tan(elevation_sigma), rel=0.01)
+    assert dive.outcomes == [Outcome.NEW] + [Outcome.USED] * 8
+
+
+def waiting(greatest_gain: float) -> Dive:
+    """A landmark that has been seen once by a vehicle that is sure of where it is."""
+    sure = Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)
+    dive = Dive(CALIBRATION.model_copy(update={"start": sure}), smoother=smoother_with(waiting_gain=greatest_gain))
+    dive.see(0.0, (5, 3.0, 0.0))
+    return dive
+
+
+def range_variance(dive: Dive) -> float:
+    beam = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
+    return float(beam @ dive.smoother.covariance(L(5)) @ beam)
+
+
+def test_sightings_wait_until_together_they_have_something_to_tell():
+    """After n sightings range and azimuth are known to 1/n of the noise: the next would add 1/n, and so on."""
+    dive, known, waited = waiting(0.45), [], []
+    for _ in range(6):
+        known.append(0.02**2 / range_variance(dive))
+        dive.see(0.0, (5, 3.0, 0.0))
+        waited.append(dive.smoother.waiting_gain)
+    assert known == pytest.approx([1, 2, 3, 3, 5, 5], rel=1e-3)
+    assert waited == pytest.approx([0, 0, 1 / 3, 0, 1 / 5, 2 / 5], rel=1e-3, abs=1e-9)
+    assert dive.outcomes == [Outcome.NEW] + [Outcome.USED] * 6
+
+
+@pytest.mark.parametrize("what", ["keyframe", "landmark"])
+def test_what_waits_is_used_with_the_next_keyframe_or_landmark(what):
+    dive = waiting(1e9)
+    for _ in range(3):
+        dive.see(0.0, (5, 3.0, 0.0))
+    assert range_variance(dive) == pytest.approx(0.02**2, rel=1e-3)
+    if what == "keyframe":
+        dive.keyframes.advance(T0_NS + 5 * NS)
+        dive.keyframes.update_if_due()
+    else:
+        dive.see(0.0, (6, 3.0, 0.3))
+    assert range_variance(dive) == pytest.approx(0.02**2 / 4, rel=0.01)
+
+
+def test_a_refused_detection_does_not_add_to_what_waits():
+    dive = waiting(1e9)
+    dive.see(0.0, (5, 9.0, 0.0))
+    assert dive.outcomes[-1] is Outcome.GATED
+    assert dive.smoother.waiting_gain == 0.0

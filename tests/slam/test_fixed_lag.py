@@ -1,14 +1,15 @@
-"""What lies outside a window is said within it as hand algebra has it, however weakly it is determined."""
+"""Windows begun anew where Cholesky gives up."""
+
+from __future__ import annotations
 
 import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import L, X
 
-from sonar_graph.errors import EstimatorError
 from sonar_graph.slam.smoother import fixed_lag as new_window_module
 from sonar_graph.slam.smoother.factor_store import GraphEdit
-from sonar_graph.slam.smoother.fixed_lag import SmootherWindow, joined, marginal, picked, without
+from sonar_graph.slam.smoother.fixed_lag import SmootherWindow, marginal, picked
 from sonar_graph.slam.smoother.incremental import Smoother
 
 from .made import smoother_with
@@ -44,34 +45,6 @@ def test_cholesky_loses_it():
     assert not found.linearize(values).augmentedInformation()[:3, :3].any()
 
 
-def test_values_are_joined_in_others_of_their_own():
-    values, new = gtsam.Values(), gtsam.Values()
-    values.insert(L(1), np.ones(3))
-    new.insert(L(1), np.full(3, 9.0))
-    new.insert(X(0), gtsam.Pose3())
-    both = joined(values, new)
-    assert both.atPoint3(L(1)) == pytest.approx(np.ones(3))
-    assert set(both.keys()) == {L(1), X(0)}
-    assert (list(values.keys()), new.size()) == ([L(1)], 2)
-
-
-def test_a_graph_without_factors_given_once_lacks_all_of_them_and_has_no_holes():
-    graph, factors = gtsam.NonlinearFactorGraph(), [factor(k, 1.0) for k in range(4)]
-    for each in factors:
-        graph.push_back(each)
-    graph.remove(1)
-    rest = without(graph, gtsam.Values(), (factors[k] for k in (3, 0)))
-    assert [rest.at(i) for i in range(rest.size())] == [factors[2]]
-
-
-@pytest.mark.parametrize("is_by_qr", [False, True])
-def test_nothing_says_nothing_and_what_touches_nothing_inside_neither(is_by_qr: bool):
-    graph, values = chain()
-    assert marginal(gtsam.NonlinearFactorGraph(), values, [L(2)], is_by_qr=is_by_qr) == []
-    graph.resize(1)
-    assert marginal(graph, values, [L(2)], is_by_qr=is_by_qr) == []
-
-
 def begun_anew(tight_m: float) -> Smoother:
     """Three keyframes like the chain; a factor on the first, which has left, is exchanged for its like."""
     smoother = smoother_with(lag_s=0.5, relinearize_threshold=1e-6, stale_shift_m=1e9)
@@ -89,11 +62,6 @@ def factor(k: int, sigma: float) -> gtsam.NonlinearFactor:
     if k == 0:
         return gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), isotropic(6, sigma))
     return gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), isotropic(6, sigma))
-
-
-def test_a_window_begins_anew_after_what_only_qr_eliminates():
-    expected = (PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2) * np.eye(6)
-    assert begun_anew(TIGHT_M).covariance(X(2)) == pytest.approx(expected, rel=1e-6)
 
 
 def begun_after(outside: gtsam.NonlinearFactorGraph, tight_m: float, *, is_by_qr: bool) -> SmootherWindow:
@@ -115,21 +83,6 @@ def test_what_lies_outside_counts_once_where_cholesky_gives_up_on_the_window():
     window = begun_after(outside, 1e-6, is_by_qr=False)
     assert window.is_by_qr
     assert window.isam.marginalCovariance(L(2)) == pytest.approx(0.5 * WEAK_M**2 * np.eye(3), rel=1e-5)
-
-
-def test_a_window_without_an_outside_begins_by_qr_where_cholesky_gives_up():
-    window, (graph, values) = SmootherWindow(1e-6, 1e9), chain()
-    window.begin(graph, values, {L(k): 0.0 for k in range(3)})
-    expected = (PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2) * np.eye(3)
-    assert window.is_by_qr
-    assert window.isam.marginalCovariance(L(2)) == pytest.approx(expected, rel=1e-9)
-
-
-def test_a_window_that_is_not_determined_does_not_begin():
-    window, (graph, values) = SmootherWindow(1e-6, 1e9), chain()
-    graph.remove(0)
-    with pytest.raises(RuntimeError):
-        window.begin(graph, values, {L(k): 0.0 for k in range(3)})
 
 
 @pytest.mark.parametrize("is_by_qr", [False, True])
@@ -171,12 +124,3 @@ def test_where_cholesky_gives_up_on_the_marginal_qr_makes_it(monkeypatch: pytest
     assert ways == [False, True]
     assert smoother.covariance(X(2)) == pytest.approx((PRIOR_M**2 + 0.1**2 + WEAK_M**2) * np.eye(6), rel=1e-6)
     assert not smoother.withheld
-
-
-def test_where_qr_gives_up_too_the_error_is_the_estimators(monkeypatch: pytest.MonkeyPatch):
-    def giving_up(*_, **__):
-        raise RuntimeError("Indeterminate linear system")
-
-    monkeypatch.setattr(new_window_module, "marginal", giving_up)
-    with pytest.raises(EstimatorError, match=r"^isam2: the graph is determined too weakly"):
-        begun_anew(0.1)

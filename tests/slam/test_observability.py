@@ -1,4 +1,6 @@
-"""Rows that cannot be measurements, and factors that cannot be solved: the run goes on as if they had never come."""
+"""Directions left open, rows that are no measurements, and factors that are withheld."""
+
+from __future__ import annotations
 
 import re
 from dataclasses import replace
@@ -18,12 +20,63 @@ from sonar_graph.slam.landmarks.sighting import SightingFactors
 from sonar_graph.slam.models import factors
 from sonar_graph.slam.smoother.factor_store import GraphEdit
 from sonar_graph.slam.smoother.incremental import Smoother
+from sonar_graph.slam.smoother.observability import LEAST_SAID, left_open
 from sonar_graph.states import Estimate, Outcome, Refusal
 
+from .graphs import graph_of
 from .made import isam2_params, smoother_with
 
+
+def values() -> gtsam.Values:
+    found = gtsam.Values()
+    found.insert(X(0), gtsam.Pose3())
+    found.insert(L(1), np.array([2.0, 0.0, 0.0]))
+    return found
+
+
+def along(direction: list[float], sigma: float) -> gtsam.NonlinearFactor:
+    """A landmark is at its estimate, to sigma, along one direction."""
+    J = np.array([direction]) / np.linalg.norm(direction)
+
+    def error(_, found, jacobians):
+        if jacobians is not None:
+            jacobians[0] = J
+        return J @ (found.atPoint3(L(1)) - [2.0, 0.0, 0.0])
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, sigma), [L(1)], error)
+
+
+@pytest.mark.parametrize("tilt", [1e-2, 1e-4, 1e-6])
+def test_nearly_the_same_is_not_the_same(tilt: float) -> None:
+    """Two directions apart by a small angle hold both, however badly; the same direction twice holds one."""
+    made = [along([0.0, 0.0, 1.0], 0.1), along([1.0, 1.0, 0.0], 0.1)]
+    assert left_open(graph_of([*made, along([1.0, 1.0 + tilt, 0.0], 0.1)]), values(), [L(1)]) == []
+    (open_,) = left_open(graph_of([*made, along([1.0, 1.0, 0.0], 0.1)]), values(), [L(1)])
+    np.testing.assert_allclose(open_.directions @ [1.0, 1.0, 0.0], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("sigma", [1e-6, 1.0, 1e6])
+def test_what_is_open_does_not_depend_on_how_surely_the_rest_is_held(sigma: float) -> None:
+    made = [along([0.0, 0.0, 1.0], sigma), along([1.0, 0.0, 0.0], 1.0)]
+    (open_,) = left_open(graph_of(made), values(), [L(1)])
+    np.testing.assert_allclose(np.abs(open_.directions), [[0.0, 1.0, 0.0]], atol=1e-9)
+    assert left_open(graph_of([*made, along([0.0, 1.0, 0.0], 1.0)]), values(), [L(1)]) == []
+
+
+def test_a_range_leaves_open_what_is_across_it() -> None:
+    """Of the landmark when the pose is known; what is said too weakly counts as not said."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, 0.1)
+    distance = gtsam.RangeFactor3D(X(0), L(1), 2.0, noise)
+    (across,) = left_open(graph_of([distance]), values(), [L(1)])
+    assert np.linalg.matrix_rank(across.directions) == 2
+    np.testing.assert_allclose(across.directions[:, 0], 0.0, atol=1e-9)
+    weak = [along([0.0, 1.0, 0.0], 0.9 / LEAST_SAID), along([0.0, 0.0, 1.0], 1.1 / LEAST_SAID)]
+    assert left_open(graph_of([distance, *weak]), values(), [L(1)]) == []
+    (left,) = left_open(graph_of([distance, *weak]), values(), [L(1)], LEAST_SAID)
+    assert left.axes() == "z"
+
+
 ROW = 40
-SOUND_2, SOUND_3 = np.diag([1e-4, 1e-4]), np.diag([1e-4, 1e-4, 1e-4])
 MODES = pytest.mark.parametrize("history", ["whole", "bounded"])
 
 
@@ -92,31 +145,6 @@ def test_a_row_that_is_no_measurement_is_refused_and_changes_nothing(sensor, col
         assert [(row.sensor, row.stamp_ns) for row in refused] == [(sensor, stamp_ns)]
 
 
-@pytest.mark.parametrize(
-    ("sensor", "column", "value"),
-    [
-        ("detections", "range_azimuth_cov", SOUND_2),
-        ("dvl", "velocity_cov", SOUND_3),
-        ("depth", "variance_m2", 1e-4),
-        ("depth", "variance_m2", np.nan),
-    ],
-    ids=["detection", "dvl", "depth", "unsaid"],
-)
-def test_a_row_that_may_be_a_measurement_counts(sensor, column, value):
-    told = run(changed(sensor, column, value))
-    assert not np.array_equal(numbers(told), numbers(run(left_out(sensor))))
-    assert Outcome.UNSOUND not in told[0].detections().outcomes
-    assert not told[0].refused_rows()
-
-
-def test_a_frame_of_nothing_but_faults_is_refused_row_by_row():
-    stamp_ns = mission().detections.stamps_ns[ROW]
-    rows = mission().detections.stamps_ns == stamp_ns
-    ranges = np.where(rows, -1.0, mission().detections.range_m)
-    estimator, _ = run(replace(mission(), detections=replace(mission().detections, range_m=ranges)))
-    assert estimator.detections().outcomes.count(Outcome.UNSOUND) == rows.sum() > 1
-
-
 # Time ---------------------------------------------------------------------------------------------------------------
 
 
@@ -134,14 +162,6 @@ def test_depths_that_run_back_are_refused_by_name_and_change_nothing():
     assert np.array_equal(fine.trajectory().positions, late.trajectory().positions)
     assert not fine.refused_rows()
     assert {(row.sensor, row.reason) for row in late.refused_rows()} == {("depth", Refusal.LATE)}
-
-
-def test_keyframes_that_run_back_are_told_apart_and_nothing_is_added():
-    smoother = begun()
-    with pytest.raises(EstimatorError, match=r"keyframe 2 at 0\.500 s is older than the one before \(1\.000 s\)"):
-        smoother.add_pose(X(2), gtsam.Pose3(), 0.5)
-    assert not smoother.values.exists(X(2))
-    assert_alive(smoother)
 
 
 # Keys and noise -----------------------------------------------------------------------------------------------------
@@ -296,15 +316,6 @@ def test_what_has_no_solution_is_withheld_by_whichever_way_it_comes(fault, is_bo
     assert re.fullmatch(SAID[fault], smoothers[0].withheld[0]), smoothers[0].withheld
     assert not smoothers[1].withheld
     same(*smoothers)
-
-
-def test_handles_are_known_before_one_of_them_is_withheld():
-    smoother, order = begun(), []
-    smoother.when_withheld = lambda withheld: order.append(withheld.handles) or set()
-    step(smoother, 2)
-    smoother.exchange(GraphEdit([], [no_number(smoother)], {}, []), 2.0, lambda groups: order.append(set(groups[0])))
-    assert len(order) == 2
-    assert order[0] == order[1]
 
 
 def test_a_landmark_that_was_withheld_can_come_again():

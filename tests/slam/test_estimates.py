@@ -1,0 +1,245 @@
+"""Covariances against the inverse of the information of all factors, and requests that cannot be met."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import B, L, X
+
+from sonar_graph.errors import EstimatorError
+from sonar_graph.measurements import Floats
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
+from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.slam import Isam2
+from sonar_graph.slam.estimates import AnchoredPose
+from sonar_graph.slam.smoother.batch_solution import JointCovariance
+from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
+
+from .graphs import information
+from .late_identities import assert_outcomes_account, run
+from .made import isam2_params
+from .rail import STEP_S, rail
+
+KEYFRAME = gtsam.Pose3(gtsam.Rot3.Ypr(0.4, -0.1, 0.05), np.array([3.0, -2.0, -1.0]))
+BIAS = np.array([1e-3, -2e-3, 5e-3])
+STEP = 1e-6
+
+
+def covariance(size: int, scale: float, seed: int) -> Floats:
+    A = np.random.default_rng(seed).standard_normal((size, size))
+    return scale * (A @ A.T + 0.1 * np.eye(size))
+
+
+def motion() -> PreintegratedMotion:
+    return PreintegratedMotion(
+        gtsam.Pose3(gtsam.Rot3.Ypr(0.5, 0.1, 0.0), np.array([2.0, 0.3, -0.1])),
+        covariance(6, 1e-5, 1),
+        0.5 * np.random.default_rng(2).standard_normal((6, 3)),
+        np.zeros(3),
+        2.0,
+        np.full(3, np.nan),
+    )
+
+
+def values() -> gtsam.Values:
+    found = gtsam.Values()
+    found.insert(X(3), KEYFRAME)
+    found.insert(B(0), BIAS)
+    return found
+
+
+@pytest.mark.parametrize("bias_key", [None, B(0)], ids=["no bias", "bias"])
+def test_the_pose_and_its_covariance_are_those_of_keyframe_bias_and_motion(bias_key: int | None) -> None:
+    """``J P J'`` with J by differences, P joint of keyframe and bias: what both share counts."""
+    moved, P = motion(), covariance(9, 1e-4, 3)
+    joint = JointCovariance(P, {B(0): 6, X(3): 0})
+    found = AnchoredPose(7, 3, bias_key, moved).carried_on(values(), joint)
+
+    def carried(state: Floats) -> gtsam.Pose3:
+        pose = KEYFRAME.compose(gtsam.Pose3.Expmap(state[:6]))
+        if bias_key is None:
+            return pose.compose(moved.i_T_j)
+        return pose.compose(moved.i_T_j).compose(gtsam.Pose3.Expmap(moved.D_bias @ (BIAS + state[6:])))
+
+    mean = carried(np.zeros(9))
+    assert found.world_T_body.equals(mean, 1e-9)
+    columns = [gtsam.Pose3.Logmap(carried(-STEP * e).between(carried(STEP * e))) / (2 * STEP) for e in np.eye(9)]
+    J = np.column_stack(columns)
+    expected = J @ P @ J.T + moved.covariance
+    np.testing.assert_allclose(found.covariance, expected, rtol=1e-2, atol=1e-2 * np.abs(expected).max())
+    np.testing.assert_array_equal(found.covariance, found.covariance.T)
+    if bias_key is not None:
+        apart = np.kron(np.eye(3), np.ones((3, 3)))
+        apart[:6, :6] = 1.0
+        assert np.abs(J @ (P * (1.0 - apart)) @ J.T).max() > 0.05 * np.abs(expected).max()
+
+
+@cache
+def ran(lag_s: float, history: str = "whole", kernel: str = "none") -> Isam2:
+    sequence = simulate_mission(MissionOptions(duration_s=40.0, imu="mti1", landmarks=6))
+    params = isam2_params(
+        smoother__lag_s=lag_s,
+        history__policy=history,
+        kernel__shape=kernel,
+        smoother__waiting_gain=0.0,
+        keyframes__bias_interval_s=15.0,
+    )
+    estimator = Isam2(sequence.calibration, params)
+    for step in sequence.replay(sequence.instants(2.0)):
+        estimator.process(step)
+    return estimator
+
+
+def dense(estimator: Isam2, values: gtsam.Values, keys: list[int]) -> np.ndarray:
+    """Block of the inverse of the sum of all factors' information."""
+    graph = estimator.graph
+    every = sorted(graph.keyVector())
+    sizes = [len(values.zeroVectors().at(key)) for key in every]
+    starts = dict(zip(every, np.cumsum([0, *sizes]).tolist(), strict=False))
+    wanted = np.concatenate([np.arange(starts[k], starts[k] + sizes[every.index(k)]) for k in keys])
+    total = information([graph.at(i) for i in range(graph.size())], values, every)
+    return np.linalg.inv(total)[np.ix_(wanted, wanted)]
+
+
+def off(found: np.ndarray, expected: np.ndarray) -> float:
+    """Largest deviation, in standard deviations of both components."""
+    sigmas = np.sqrt(np.diag(expected))
+    return float(np.abs((found - expected) / np.outer(sigmas, sigmas)).max())
+
+
+KEYFRAMES, LANDMARKS = [4, 0, 2], [5, 2]
+
+
+def keys() -> list[int]:
+    return [L(2), L(5), X(0), X(2), X(4)]
+
+
+def test_over_the_history_it_is_the_inverse_of_the_whole_information():
+    estimator = ran(5.0)
+    values, _ = estimator._smoother.solve_history()
+    found = estimator.joint_covariance(KEYFRAMES, (), LANDMARKS, over="history")
+    assert off(found.matrix, dense(estimator, values, keys())) < 1e-6
+    for key in keys():
+        assert off(found.at(key, key), dense(estimator, values, [key])) < 1e-6
+    assert np.array_equal(found.at(L(5), X(2)), found.matrix[3:6, 12:18])
+
+
+def test_over_the_window_it_is_the_same_where_variables_are_linearised_if_nothing_was_marginalised():
+    estimator = ran(1e9)
+    found = estimator.joint_covariance(KEYFRAMES, (), LANDMARKS)
+    linearised = estimator._smoother._window.isam.getLinearizationPoint()
+    assert off(found.matrix, dense(estimator, linearised, keys())) < 1e-6
+    assert 1e-4 < off(found.matrix, dense(estimator, estimator.values, keys())) < 0.02
+
+
+def test_of_a_bounded_history_it_is_the_inverse_of_the_windows_information():
+    estimator = ran(5.0, "bounded")
+    newest = len(estimator.keyframe_stamps()) - 1
+    values, _ = estimator._smoother.solve_history()
+    found = estimator.joint_covariance([newest], (), [5, 2], over="history")
+    assert off(found.matrix, dense(estimator, values, [L(2), L(5), X(newest)])) < 1e-6
+    assert off(estimator.joint_covariance([newest], (), [5, 2]).matrix, found.matrix) < 0.05
+
+
+def test_a_keyframe_is_known_by_its_stamp_as_by_its_number():
+    estimator = ran(5.0)
+    stamps = estimator.keyframe_stamps()
+    by_number = estimator.marginal(keyframe=3, over="history")
+    assert np.array_equal(estimator.marginal(stamp_ns=int(stamps[3]), over="history"), by_number)
+    assert not np.allclose(estimator.marginal(stamp_ns=int(stamps[2]), over="history"), by_number)
+    assert by_number.shape == (6, 6)
+    joint = estimator.joint_covariance([3], [int(stamps[3])], [2], over="history")
+    assert joint.matrix.shape == (9, 9)
+    assert np.allclose(joint.at(X(3), X(3)), by_number, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (lambda e: e.marginal(keyframe=999), r"there is no keyframe 999; it has 0 to \d+"),
+        (lambda e: e.marginal(keyframe=-1), r"there is no keyframe -1; it has 0 to \d+"),
+        (lambda e: e.marginal(landmark=77), r"landmark 77 is not in the graph; it holds [\d, ]+$"),
+        (lambda e: e.marginal(landmark=-1), r"landmark -1 is not in the graph"),
+        (lambda e: e.marginal(stamp_ns=5), r"no keyframe at 5 ns; the nearest are at \d+ ns"),
+        (
+            lambda e: e.marginal(stamp_ns=int(e.keyframe_stamps()[1]) + 1),
+            r"no keyframe at \d+ ns; the nearest are at \d+ and \d+ ns",
+        ),
+        (
+            lambda e: e.marginal(keyframe=0),
+            r'keyframe 0 has left the window, which holds \d+ to \d+; ask over="history"',
+        ),
+        (lambda e: e.marginal(), "give one of keyframe, stamp_ns and landmark"),
+        (lambda e: e.marginal(keyframe=1, landmark=2), "give one of keyframe, stamp_ns and landmark"),
+        (lambda e: e.joint_covariance(), "the covariance of nothing was asked for"),
+    ],
+)
+def test_what_is_not_known_is_told_with_what_is(ask, message):
+    with pytest.raises(EstimatorError, match=message):
+        ask(ran(5.0))
+
+
+def test_what_a_bounded_history_has_given_up_is_told():
+    with pytest.raises(EstimatorError, match=r"keyframe 0 has left the window, .*; none is known any more"):
+        ran(5.0, "bounded").marginal(keyframe=0, over="history")
+
+
+@pytest.fixture(scope="module")
+def ran_of_requests() -> Isam2:
+    return run(rail(8)[0], 1 / STEP_S)
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"landmarks": 4}, r"landmarks: expected a list of integers, such as \[1, 2\], not 4"),
+        ({"landmarks": ["4"]}, "landmarks: expected a list of integers"),
+        ({"keyframes": 0.0}, "keyframes: expected a list of integers"),
+        ({"keyframes": [0.5]}, "keyframes: expected a list of integers"),
+        ({"stamps_ns": [1.5]}, "stamps_ns: expected a list of integers"),
+        ({"landmarks": [4], "over": "whole"}, 'over is \'whole\'; expected "window" or "history"'),
+    ],
+)
+def test_a_covariance_of_what_cannot_be_is_refused(ran_of_requests: Isam2, asked: dict, said: str):
+    with pytest.raises(EstimatorError, match=f"^isam2: {said}") as caught:
+        ran_of_requests.joint_covariance(**asked)
+    assert "\n" not in str(caught.value)
+    assert np.array_equal(
+        ran_of_requests.joint_covariance(landmarks=np.array([4])).matrix, ran_of_requests.marginal(landmark=4)
+    )
+
+
+@pytest.mark.parametrize("params", [{"lag_s": 3}, {}, "robust"])
+def test_settings_are_of_their_own_type(params: object):
+    with pytest.raises(EstimatorError, match=r"^isam2: params: expected Isam2Params or None, not (dict|str)"):
+        Isam2(rail()[0].calibration, params)
+
+
+def test_names_of_landmarks_without_names_are_refused_where_these_begin():
+    sequence, _ = rail(8)
+    assert sequence.detections is not None
+    ids = np.where(sequence.detections.candidate_ids == 4, FIRST_ANONYMOUS_ID, 7)
+    named = replace(sequence, detections=replace(sequence.detections, candidate_ids=ids))
+    with pytest.raises(EstimatorError, match=rf"has identity {FIRST_ANONYMOUS_ID}; with identity.unknown.policy = "):
+        run(named, 1 / STEP_S, identity__unknown__policy="associate")
+    assert FIRST_ANONYMOUS_ID in run(named, 1 / STEP_S).landmarks().ids
+
+
+@pytest.mark.parametrize("policy", ["robust", "gate", "max-mixture", "gnc"])
+@pytest.mark.parametrize("range_m", [1.1e5, 1e10, 1e200])
+def test_a_range_beyond_any_sonar_is_refused_by_name_and_the_run_is_that_without_it(policy: str, range_m: float):
+    sequence, _ = rail(8)
+    seen = sequence.detections
+    assert seen is not None
+    far = seen.range_m.copy()
+    far[3] = range_m
+    estimator = run(replace(sequence, detections=replace(seen, range_m=far)), 1 / STEP_S, identity__policy=policy)
+    assert assert_outcomes_account(estimator, sequence)[Outcome.UNSOUND] == 1
+    without = replace(sequence, detections=seen.rows(np.arange(len(seen)) != 3))
+    known = run(without, 1 / STEP_S, identity__policy=policy)
+    assert np.array_equal(estimator.landmarks().positions, known.landmarks().positions)
+    assert np.array_equal(estimator.trajectory().positions, known.trajectory().positions)

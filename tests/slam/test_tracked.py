@@ -1,0 +1,431 @@
+"""Identities that are known late, change or are repeated: the graph is that of a run that had known."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import L
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from sonar_graph.calibration import FloorPrior
+from sonar_graph.measurements import NO_TRACK, LandmarkDetections
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.basin import BasinOptions, simulate_basin
+from sonar_graph.slam import Isam2, RobustKernel
+from sonar_graph.slam import frontend as sightings_module
+from sonar_graph.slam.landmarks.tracked import of_no_landmark, once_a_track
+from sonar_graph.slam.smoother import incremental as smoother_module
+from sonar_graph.slam.smoother.incremental import Smoother
+from sonar_graph.states import DetectionJournal, Outcome
+
+from .dive import CALIBRATION, NS, T0_NS, TRUSTING, UNGATED, Dive
+from .graph_comparison import assert_marginals_agree, largest_difference, rows_of
+from .late_identities import (
+    BASIN,
+    FLAT,
+    GAP_S,
+    IDS,
+    LATE,
+    OBJECTS,
+    SURE,
+    TROUBLES,
+    Watch,
+    assert_outcomes_account,
+    from_the_start,
+    on_the_rail,
+    run,
+    see,
+)
+from .made import smoother_with
+from .rail import STEP_S, rail
+
+NEARLY_4 = [0.9, 0.0, 0.0, 0.0]
+HISTORIES = {
+    "late": [FLAT] * 6 + [SURE[7]],
+    "another that is new": [SURE[5]] * 6 + [SURE[7]],
+    "another that is seen beside it, less surely": [SURE[4]] * 6 + [SURE[7]],
+    "undecided, wrong, wrong, none, right": [FLAT] * 2 + [SURE[5]] * 3 + [SURE[6]] * 3 + [[0.0] * 4] * 2 + [SURE[7]],
+    "wrong to the frame before the last": [SURE[6]] * 14 + [SURE[7]],
+}
+
+
+@pytest.mark.parametrize("lag_s", [1e9, 2.6, 0.6], ids=["all", "five poses", "one pose"])
+@pytest.mark.parametrize("history", HISTORIES)
+def test_on_the_rail_the_end_is_least_squares_with_the_right_identities(history: str, lag_s: float):
+    """Poses, landmarks and their variances as numpy has them but for the little that a first direction weighs.
+
+    As known from the start to 1e-8, and the window's landmarks to 1e-6.
+    """
+    _, numbers = rail()
+    nodes = len(numbers.displacements_m) + 1
+    mean, variance = numbers.solution(nodes)
+    sequence = on_the_rail(HISTORIES[history], NEARLY_4)
+    estimator = run(
+        sequence, 1 / STEP_S, kernel__shape="none", keyframes__motion_noise_share=0.0, smoother__lag_s=lag_s
+    )
+    known = run(
+        from_the_start(sequence),
+        1 / STEP_S,
+        kernel__shape="none",
+        keyframes__motion_noise_share=0.0,
+        smoother__lag_s=lag_s,
+    )
+    smoothed, landmarks = estimator.trajectory(), estimator.landmarks()
+    assert smoothed.positions[:, 0] == pytest.approx([mean[f"x{k}"] for k in range(1, nodes)], abs=2e-4)
+    assert smoothed.positions[:, 0] == pytest.approx(known.trajectory().positions[:, 0], abs=1e-8)
+    assert smoothed.covariances[:, 3, 3] == pytest.approx(known.trajectory().covariances[:, 3, 3], rel=1e-6)
+    assert landmarks.ids.tolist() == [4, 7]
+    assert landmarks.positions[:, 0] == pytest.approx([mean["l4"], mean["l7"]], abs=2e-4)
+    assert landmarks.covariances[:, 0, 0] == pytest.approx([variance["l4"], variance["l7"]], rel=1e-3)
+    assert estimator.values.atPoint3(L(7)) == pytest.approx(known.values.atPoint3(L(7)), abs=1e-6)
+    outcomes = assert_outcomes_account(estimator, sequence)
+    assert sum(outcomes[used] for used in (Outcome.USED, Outcome.NEW, *LATE)) == len(numbers.ranges)
+
+
+@pytest.mark.parametrize("lag_s", [15.0, 2.0])
+@pytest.mark.parametrize("trouble", TROUBLES)
+def test_what_is_known_late_gives_the_graph_of_what_was_known_from_the_start(trouble: str, lag_s: float):
+    """Without a gyro bias no factor depends on an estimate: equal one by one, and so are the marginals."""
+    sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES[trouble], gyro_bias_scale=0.0))
+    estimator, known = run(sequence, smoother__lag_s=lag_s), run(from_the_start(sequence), smoother__lag_s=lag_s)
+    assert largest_difference(estimator, known) < 1e-6
+    assert_marginals_agree(estimator, known, 1e-6)
+    assert assert_outcomes_account(estimator, sequence).keys() & LATE
+    assert not assert_outcomes_account(known, sequence).keys() & LATE
+
+
+BELIEFS = st.sampled_from([SURE[4], SURE[5], SURE[6], [0.9, 0, 0, 0], FLAT, [0.0] * 4])
+FRAMES = 6
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.lists(BELIEFS, min_size=3, max_size=3), min_size=FRAMES - 1, max_size=FRAMES - 1))
+def test_whatever_was_believed_before_the_graph_is_that_of_the_last_beliefs(histories: list[list[list[float]]]):
+    """Also where tracks change places, all at once, or claim one landmark together."""
+    last = [SURE[4], SURE[5], SURE[7]]
+    believed, known = (Watch(identity=UNGATED, kernel=RobustKernel(width=2.0)) for _ in range(2))
+    for number in range(FRAMES):
+        believed.watch(number, histories[number] if number < FRAMES - 1 else last)
+        known.watch(number, last)
+    values = known.smoother.values
+    a, b = rows_of(believed.smoother.graph, values), rows_of(known.smoother.graph, values)
+    assert a.keys() == b.keys()
+    for name, rows in b.items():
+        np.testing.assert_allclose(a[name], rows, atol=1e-7 * max(1.0, np.abs(rows).max()))
+    assert believed.sightings.ids == {4, 5, 7}
+    assert len(believed.outcomes) == 3 * FRAMES
+    assert set(believed.outcomes) <= {Outcome.USED, Outcome.NEW, *LATE}
+    ids = believed.sightings.journal.log().landmark_ids
+    assert ids.tolist() == [4, 5, 7] * FRAMES
+
+
+def test_whether_it_stands_on_the_floor_is_judged_where_it_was_seen():
+    """An object high above the floor and one on it, known late: what is said of heights is as if known at once."""
+    for height_m, factors_on_height in ((OBJECTS[0][2] - 1.2, 0), (OBJECTS[0][2], 1)):
+        floor = FloorPrior(z_m=height_m, sigma_m=0.01)
+        late, known = (Dive(CALIBRATION.model_copy(update={"floor": floor})) for _ in range(2))
+        for dive, first in ((late, FLAT), (known, SURE[5])):
+            see(dive, 0.0, first)
+            see(dive, 0.5, SURE[5])
+        values = known.smoother.values
+        a, b = rows_of(late.smoother.graph, values), rows_of(known.smoother.graph, values)
+        assert {name: len(rows) for name, rows in a.items()} == {name: len(rows) for name, rows in b.items()}
+        assert len(b.get(("PriorFactorPoint3", L(5)), [])) == factors_on_height
+
+
+def test_a_displaced_sighting_is_used_when_its_place_becomes_free_though_its_track_is_gone():
+    dive = Watch(identity=UNGATED)
+    known = Watch(identity=UNGATED)
+    for each, first in ((dive, SURE[5]), (known, SURE[4])):
+        each.watch(0, [FLAT, SURE[5], FLAT])
+        each.watch(1, [first, [0.0, 0.9, 0.0, 0.0], FLAT])
+    assert dive.outcomes[3:5] == [Outcome.USED, Outcome.REPEATED]
+    for each in (dive, known):
+        see(each, 2 * GAP_S, SURE[4], track=0)
+    assert dive.outcomes[3:5] == [Outcome.MOVED, Outcome.USED_LATER]
+    values = known.smoother.values
+    a, b = rows_of(dive.smoother.graph, values), rows_of(known.smoother.graph, values)
+    assert a.keys() == b.keys()
+    for name, rows in b.items():
+        np.testing.assert_allclose(a[name], rows, atol=1e-7 * max(1.0, np.abs(rows).max()))
+
+
+def test_the_end_does_not_depend_on_how_the_log_is_cut():
+    """Estimates at the whole seconds, asked for alone and among others."""
+    sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["late and wrong"]))
+    estimators = [Isam2(sequence.calibration), Isam2(sequence.calibration)]
+    found: list[dict[int, gtsam.Pose3]] = [{}, {}]
+    for estimator, rate_hz, at in zip(estimators, (1.0, 4.0), found, strict=True):
+        for step in sequence.replay(sequence.instants(rate_hz)):
+            estimate = estimator.process(step)
+            if estimate is not None:
+                at[estimate.stamp_ns] = estimate.world_T_body
+    shared = found[0].keys() & found[1].keys()
+    assert len(shared) > 100
+    assert max(np.abs(found[0][ns].matrix() - found[1][ns].matrix()).max() for ns in shared) < 1e-12
+    assert estimators[0].detections().outcomes == estimators[1].detections().outcomes
+
+
+def test_what_waits_too_long_is_dropped_and_said():
+    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 2.0}))
+    for after_s in (0.0, 1.0, 2.5):
+        see(dive, after_s, FLAT)
+    assert dive.outcomes == [Outcome.FORGOTTEN, Outcome.WAITING, Outcome.WAITING]
+    see(dive, 3.0, SURE[5])
+    assert dive.outcomes == [Outcome.FORGOTTEN, Outcome.USED_LATER, Outcome.USED_LATER, Outcome.USED]
+    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 2.0}))
+    see(dive, 0.0, FLAT)
+    dive.keyframes.advance(T0_NS + 5 * NS)
+    dive.sightings.forget()
+    assert dive.outcomes == [Outcome.FORGOTTEN]
+    assert not dive.sightings.ids
+
+
+def test_what_was_taken_back_is_given_to_no_other_landmark_after_too_long():
+    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 2.0}))
+    see(dive, 0.0, SURE[5])
+    see(dive, 1.0, FLAT)
+    see(dive, 1.5, [0.0] * 4)
+    see(dive, 2.6, SURE[5])
+    assert dive.outcomes == [Outcome.TAKEN_BACK, Outcome.USED_LATER, Outcome.USED_LATER, Outcome.USED]
+
+
+def test_a_track_that_is_over_keeps_its_identity():
+    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 1.0}))
+    see(dive, 0.0, SURE[5])
+    see(dive, 2.0, SURE[6])
+    assert dive.outcomes == [Outcome.NEW, Outcome.NEW]
+
+
+def test_a_doubtful_row_of_a_known_track_waits_for_the_next_sure_one():
+    dive = Dive()
+    see(dive, 0.0, SURE[5])
+    see(dive, 0.5, [0.1, 0.6, 0.1, 0.1])
+    assert dive.outcomes == [Outcome.NEW, Outcome.WAITING]
+    see(dive, 1.0, SURE[5])
+    assert dive.outcomes == [Outcome.NEW, Outcome.USED_LATER, Outcome.USED]
+
+
+def test_what_was_refused_for_one_landmark_is_not_refused_for_good():
+    dive = Dive()
+    for after_s in (0.0, 0.2, 0.4):
+        see(dive, after_s, SURE[5])
+    see(dive, 0.6, SURE[5], off_m=0.5)
+    assert dive.outcomes[-1] == Outcome.GATED
+    see(dive, 0.8, [0.0] * 4)
+    assert dive.outcomes == [Outcome.TAKEN_BACK] * 3 + [Outcome.WAITING] * 2
+    see(dive, 1.0, SURE[6])
+    assert dive.outcomes[:5] == [Outcome.MOVED] * 3 + [Outcome.USED_LATER] * 2
+
+
+def test_of_tracks_that_claim_a_landmark_at_once_the_more_probable_gets_the_earlier_frames():
+    dive = Watch(identity=UNGATED)
+    dive.watch(0, [FLAT, FLAT, FLAT])
+    dive.watch(1, [[0.0, 0.8, 0.0, 0.0], SURE[5], FLAT])
+    repeated, later = Outcome.REPEATED, Outcome.USED_LATER
+    assert dive.outcomes == [repeated, later, Outcome.WAITING, repeated, Outcome.USED, Outcome.WAITING]
+
+
+def test_a_landmark_may_begin_late_while_what_waits_makes_the_window_restart(monkeypatch):
+    monkeypatch.setattr(smoother_module, "FIRST_RESTART", 5)
+    dive = Dive(smoother=smoother_with(1e9, 1e-6, 1e-9, waiting_gain=1e9))
+    restarts = []
+    restart = Smoother._restart
+    monkeypatch.setattr(Smoother, "_restart", lambda self, time_s: restarts.append(time_s) or restart(self, time_s))
+    for after_s in (0.0, 0.2, 0.4):
+        see(dive, after_s, SURE[4])
+        see(dive, after_s + 0.1, FLAT, track=5, off_m=0.3)
+    see(dive, 0.6, SURE[6], track=5, off_m=0.3)
+    assert restarts
+    assert dive.outcomes[1::2] == [Outcome.USED_LATER] * 3
+    assert dive.sightings.ids == {4, 6}
+
+
+def test_late_sightings_pass_the_gate_one_by_one():
+    dive = Dive()
+    for after_s in (0.0, 0.2, 0.4):
+        see(dive, after_s, SURE[5])
+    see(dive, 1.0, FLAT, track=4)
+    see(dive, 1.2, FLAT, track=4, off_m=0.5)
+    see(dive, 1.4, SURE[5], track=4)
+    assert dive.outcomes[3:] == [Outcome.USED_LATER, Outcome.GATED, Outcome.USED]
+
+
+def test_while_sightings_wait_the_window_stays_open_for_them(monkeypatch):
+    """Late factors then cost no solution of the history; of a track that is of no landmark they may."""
+    solves = []
+    solve = Smoother._solve
+    monkeypatch.setattr(Smoother, "_solve", lambda self: solves.append(1) or solve(self))
+    for beliefs, expected in (([FLAT] * 9, 0), ([FLAT] * 2 + [[0.0] * 4] * 7, 1)):
+        dive = Dive(lag_s=0.5)
+        solves.clear()
+        for k, belief in enumerate([*beliefs, SURE[5]]):
+            see(dive, float(k), belief)
+        assert len(solves) == expected
+        assert dive.outcomes == [Outcome.USED_LATER] * 9 + [Outcome.USED]
+
+
+def test_late_sightings_pass_the_gate_at_keyframes_that_have_left_the_window():
+    dive = Dive(lag_s=0.5)
+    for after_s in (0.0, 0.2, 0.4):
+        see(dive, after_s, SURE[5])
+    for after_s, off_m in ((6.0, 0.0), (6.2, 3.0)):
+        see(dive, after_s, SURE[6], track=4, off_m=off_m)
+    see(dive, 9.0, SURE[5], track=4)
+    assert dive.outcomes[3:] == [Outcome.MOVED, Outcome.GATED, Outcome.USED]
+
+
+POLICIES = {
+    "robust": {},
+    "gate": {"identity__policy": "gate", "identity__gate_probability": 0.99},
+    "bounded": {"history__policy": "bounded", "smoother__lag_s": 3.0},
+    "short": {"smoother__lag_s": 1.6},
+    "associate": {"identity__unknown__policy": "associate"},
+    "max-mixture": {"identity__policy": "max-mixture"},
+    "gnc": {"identity__policy": "gnc"},
+}
+NODES = 10
+ROWS = len(rail(NODES)[1].ranges)
+BELIEFS_OF_REPEATED_TRACKS = [*SURE.values(), FLAT, [0.0] * 4, [0.0, 0.9, 0.0, 0.05]]
+
+
+def said(tracks: list[int], beliefs: list[list[float]]) -> Sequence:
+    sequence, _ = rail(NODES)
+    seen = sequence.detections
+    assert seen is not None
+    ids = np.tile(IDS, (len(seen), 1))
+    found = replace(seen, track=np.array(tracks), candidate_ids=ids, id_probability=np.array(beliefs, dtype=float))
+    return replace(sequence, detections=found)
+
+
+def result(estimator: Isam2) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    smoothed, landmarks = estimator.trajectory(), estimator.landmarks()
+    return landmarks.ids, landmarks.positions, smoothed.positions
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+@settings(max_examples=4, phases=[Phase.explicit, Phase.generate])
+@given(data=st.data())
+def test_a_run_is_that_without_second_rows_of_tracks(policy: str, data: st.DataObject):
+    tracks = data.draw(st.lists(st.integers(NO_TRACK, 1), min_size=ROWS, max_size=ROWS))
+    beliefs = data.draw(st.lists(st.sampled_from(BELIEFS_OF_REPEATED_TRACKS), min_size=ROWS, max_size=ROWS))
+    sequence = said(tracks, beliefs)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        heard = Heard(monkeypatch)
+        estimator = run(sequence, 1 / STEP_S, keyframes__motion_noise_share=0.0, **POLICIES[policy])
+    outcomes = assert_outcomes_account(estimator, sequence)
+    assert outcomes[Outcome.TRACK_REPEATED] == ROWS - len(once(sequence))
+    without = replace(sequence, detections=LandmarkDetections.concatenate(heard.rows))
+    alone = run(without, 1 / STEP_S, keyframes__motion_noise_share=0.0, **POLICIES[policy])
+    for with_others, known in zip(result(estimator), result(alone), strict=True):
+        assert np.array_equal(with_others, known)
+
+
+def once(sequence: Sequence) -> set[tuple[int, int]]:
+    """What may be used: each track once a frame, and all rows of none."""
+    seen = sequence.detections
+    assert seen is not None
+    pairs = zip(seen.stamps_ns.tolist(), seen.track.tolist(), range(len(seen)), strict=True)
+    return {(stamp_ns, track if track != NO_TRACK else -2 - row) for stamp_ns, track, row in pairs}
+
+
+class Heard:
+    """Keeps what the estimator's sightings are given once second rows are gone."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.rows: list[LandmarkDetections] = []
+        monkeypatch.setattr(sightings_module, "once_a_track", self._once)
+
+    def _once(self, *arguments) -> LandmarkDetections:
+        self.rows.append(once_a_track(*arguments))
+        return self.rows[-1]
+
+
+def frame(track: list[int], beliefs: list[list[float]]) -> LandmarkDetections:
+    n = len(track)
+    stamps, covs = np.zeros(n, dtype=np.int64), np.full((n, 2, 2), np.nan)
+    ids = np.tile(IDS, (n, 1))
+    return LandmarkDetections(stamps, np.ones(n), np.zeros(n), covs, ids, np.array(beliefs, float), np.array(track))
+
+
+def best_of_tracks(rows: LandmarkDetections, identity_of) -> np.ndarray:
+    numbered = replace(rows, range_m=1.0 + np.arange(len(rows)))
+    return np.isin(numbered.range_m, once_a_track(numbered, identity_of, DetectionJournal()).range_m)
+
+
+def test_the_row_stays_that_the_tracks_identity_explains_best():
+    rows = frame([3, 3, NO_TRACK, 8], [[0.9, 0, 0, 0], [0, 0, 0.8, 0], SURE[4], FLAT])
+    assert best_of_tracks(rows, lambda _: 6).tolist() == [False, True, True, True]
+    assert best_of_tracks(rows, lambda _: 4).tolist() == [True, False, True, True]
+
+
+def test_of_a_track_that_counts_as_nothing_the_most_probable_row_stays_and_of_equals_the_first():
+    rows = frame([3, 3, 3, NO_TRACK, NO_TRACK], [FLAT, [0, 0.8, 0, 0], [0, 0, 0.8, 0], FLAT, FLAT])
+    assert best_of_tracks(rows, of_no_landmark).tolist() == [False, True, False, True, True]
+
+
+def test_an_identity_that_a_row_names_twice_has_the_sum_of_both_posteriors():
+    rows = replace(frame([3, 3], [[0, 0.6, 0, 0], [0.4, 0.4, 0, 0]]), candidate_ids=np.zeros((2, 4), int))
+    assert best_of_tracks(rows, lambda _: 0).tolist() == [False, True]
+
+
+def test_where_tracks_are_not_used_all_rows_are():
+    sequence = said([0] * ROWS, [SURE[4] if i == 0 else SURE[7] for i in first_of_frame()])
+    outcomes = assert_outcomes_account(run(sequence, 1 / STEP_S, identity__longest_wait_s=0), sequence)
+    assert outcomes[Outcome.TRACK_REPEATED] == 0
+    assert outcomes[Outcome.USED] + outcomes[Outcome.NEW] == ROWS
+
+
+def first_of_frame() -> list[int]:
+    """Place of each of the rail's rows in its frame."""
+    seen = rail(NODES)[0].detections
+    assert seen is not None
+    return [int(np.count_nonzero(seen.stamps_ns[:row] == seen.stamps_ns[row])) for row in range(len(seen))]
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_two_rows_of_a_known_track_that_name_others_do_not_end_the_run(policy: str):
+    tracks = [40 if i == 0 else 70 for i in first_of_frame()]
+    beliefs = [SURE[4] if i == 0 else SURE[7] for i in first_of_frame()]
+    two = [row for row, i in enumerate(first_of_frame()) if i == 1][1]
+    tracks[two], beliefs[two - 1], beliefs[two] = 40, SURE[5], SURE[6]
+    sequence = said(tracks, beliefs)
+    outcomes = assert_outcomes_account(run(sequence, 1 / STEP_S, **POLICIES[policy]), sequence)
+    assert outcomes[Outcome.TRACK_REPEATED] == 1
+
+
+def test_without_deferring_the_rail_does_not_end_there():
+    _, numbers = rail()
+    mean, _ = numbers.solution(len(numbers.displacements_m) + 1)
+    wrong = on_the_rail(HISTORIES["wrong to the frame before the last"], NEARLY_4)
+    estimator = run(wrong, 1 / STEP_S, kernel__shape="none", identity__longest_wait_s=0)
+    assert estimator.landmarks().ids.tolist() == [4, 6, 7]
+    late = on_the_rail(HISTORIES["late"], NEARLY_4)
+    estimator = run(late, 1 / STEP_S, kernel__shape="none", identity__longest_wait_s=0)
+    assert Counter(estimator.detections().outcomes)[Outcome.NO_IDENTITY] == 6
+    assert abs(estimator.landmarks().positions[1, 0] - mean["l7"]) > 2e-4
+
+
+def test_a_wrong_identity_that_is_not_taken_back_leaves_another_graph():
+    sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["wrong"], gyro_bias_scale=0.0))
+    estimator, known = run(sequence, identity__longest_wait_s=0), run(from_the_start(sequence))
+    names = [rows_of(each.graph, each.values).keys() for each in (estimator, known)]
+    assert names[0] != names[1]
+    assert Counter(estimator.detections().outcomes).keys().isdisjoint(LATE)
+
+
+def test_an_earlier_sighting_becomes_the_one_that_a_landmark_begins_with():
+    """Seen first without a track, then known to have been seen before: what is said once is said there."""
+    dive = Dive()
+    see(dive, 0.0, FLAT, track=4)
+    see(dive, 0.5, SURE[5], track=-1)
+    see(dive, 1.0, SURE[5], track=4)
+    graph = dive.smoother.graph
+    begun = [graph.at(i) for i in range(graph.size()) if isinstance(graph.at(i), gtsam.BearingRangeFactor3D)]
+    assert [gtsam.Symbol(factor.keys()[0]).index() for factor in begun] == [0]
+    assert dive.outcomes == [Outcome.USED_LATER, Outcome.NEW, Outcome.USED]
