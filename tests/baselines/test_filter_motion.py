@@ -5,14 +5,27 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from baselines.filter_motion import inflate_shared_motion, motion_since_node, motion_to_node, no_provisional_motion
-from baselines.filter_window import VehicleModel
+from baselines.filter_motion import (
+    inflate_shared_motion,
+    inflate_shared_motion_with_bias,
+    motion_since_node,
+    motion_since_node_with_bias,
+    motion_to_node,
+    motion_to_node_with_bias,
+    no_provisional_motion,
+    open_interval,
+    up_at_node,
+)
+from baselines.filter_window import NODE, OPENED, GravityInterval, VehicleModel
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation import odometry as node_motion
+from sonar_graph.navigation.imu_gaps import NO_TURNS
 from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.navigation.preintegration.dvl_gaps import gap_values
 from sonar_graph.navigation.preintegration.motion import Preintegrator
+from sonar_graph.navigation.preintegration.recursion import NO_MOTION, in_last_frame
+from sonar_graph.numerics.jit import compiled
 from sonar_graph.sequence import NS_PER_S
 
 from .motions import motion_of
@@ -209,3 +222,94 @@ def test_an_interval_as_long_as_the_longest_is_no_gap(until_s, node_s):
     )
     assert over == gapless
     assert beyond != gapless
+
+
+BIAS = np.array([0.01, -0.02, 0.03])
+
+
+@pytest.mark.parametrize(("node_s", "until_s"), [(LOST_S, FOUND_S), (LOST_S, 2.0), (0.3, 0.4), (0.3, 0.37)])
+def test_motion_with_its_derivative_by_the_bias_is_that_of_every_estimator(node_s, until_s):
+    """To a node and to an instant, between samples and over a gap, with bias, Earth rate and lever arms."""
+    known = calibration_with_gaps()
+    rows, preintegrator = lost(calibration=known), Preintegrator.from_calibration(known)
+    R = np.ascontiguousarray(gtsam.Rot3.RzRyRx(X[3:]).matrix())
+    stamps_ns = [T0_NS + round(s * NS_PER_S) for s in (node_s, until_s)]
+    ours, theirs = motion_since_node_with_bias, node_motion.motion_since_node
+    if until_s in (FOUND_S, 0.4):
+        ours, theirs = motion_to_node_with_bias, node_motion.motion_between_nodes
+    motion = ours(rows.columns(), vehicle_with_gaps(0.0), R, BIAS, *stamps_ns)
+    expected = theirs(rows, preintegrator, *stamps_ns, BIAS, R.T @ EARTH)
+    dR, dp, cov, D, impulse = in_last_frame(*motion)
+    assert_allclose(dR, expected.i_T_j.rotation().matrix(), atol=1e-12)
+    assert_allclose(dp, expected.i_T_j.translation(), atol=1e-12)
+    assert_allclose(cov, expected.covariance, atol=1e-15, rtol=1e-9)
+    assert_allclose(D, expected.D_bias, atol=1e-12)
+    assert_allclose(impulse, expected.mean_specific_force * expected.duration_s, atol=1e-9)
+    again = inflate_shared_motion_with_bias(motion, 3)
+    assert (again.D_t, again.D_r) == (motion.D_t, motion.D_r)
+    assert again.integral == inflate_shared_motion(motion.integral, 3)
+
+
+IMU_LEVER, GRAVITY = (0.3, -0.2, 0.1), 9.8
+RATES = np.array([[0.1, 0.2, 0.3], [-0.4, 0.5, 0.6], [0.7, -0.8, 0.9], [1.0, 1.1, -1.2]])
+VELOCITIES = np.array([[1.0, 0.1, 0.2], [1.5, -0.3, 0.4]])
+VARIANCES = np.array([[1e-4, 4e-4, 25e-4], [9e-4, 1e-4, 2e-4]])
+"""Of the Doppler samples, by axis: means 1e-3 and 4e-4."""
+
+
+def columns_of(imu_ns, dvl_ns, *, rates=RATES, velocities=VELOCITIES, hold_past=False):
+    cov = np.array([np.diag(row) for row in VARIANCES])
+    force = np.tile([0.0, 0.0, GRAVITY], (len(imu_ns), 1))
+    return np.array(imu_ns), rates, force, np.array(dvl_ns), velocities, cov, hold_past, NO_TURNS
+
+
+def an_interval():
+    return GravityInterval(np.empty((3, 3)), np.empty(3), np.empty(4))
+
+
+@pytest.mark.parametrize(
+    ("dvl_ns", "hold_past", "expected_rate"),
+    [
+        (100, False, RATES[1]),
+        (100, True, RATES[1]),
+        (125, False, 0.75 * RATES[1] + 0.25 * RATES[2]),
+        (125, True, RATES[2]),
+    ],
+)
+def test_an_interval_begins_with_the_velocity_of_the_imu_s_point(dvl_ns, hold_past, expected_rate):
+    """``v + w x l``; a held rate belongs to what lies before its stamp, on which the node may be."""
+    imu_ns, dvl_ns = T0_NS + np.array([0, 100, 200, 300]), T0_NS + np.array([dvl_ns, 290])
+    interval, clock = an_interval(), np.array([dvl_ns[0], 0, 0, 0])
+    open_interval(columns_of(imu_ns, dvl_ns, hold_past=hold_past), IMU_LEVER, interval, clock)
+    assert_allclose(interval.velocity[:3], VELOCITIES[0] + np.cross(expected_rate, IMU_LEVER), atol=1e-12)
+    assert interval.velocity[3] == pytest.approx(1e-3)
+    assert clock[1] == dvl_ns[0]
+
+
+@compiled
+def up_measured(columns, vehicle, motion, clock, interval):
+    return up_at_node(columns, vehicle, motion, clock, interval)
+
+
+def test_gravity_has_the_velocity_noise_of_both_ends():
+    """Level and at rest; sigma as the theory page has it. A node before the interval is over measures nothing."""
+    duration_s = 2.0
+    imu_ns = T0_NS + np.arange(4) * NS_PER_S
+    dvl_ns = T0_NS + np.array([0, round(duration_s * NS_PER_S)])
+    columns = columns_of(imu_ns, dvl_ns, rates=np.zeros((4, 3)), velocities=np.zeros((2, 3)))
+    model = VEHICLE._replace(
+        gravity_interval_ns=NS_PER_S, gyro_bias_sigma=2e-3, accel_noise_density=2e-3, dvl_p_imu=IMU_LEVER
+    )
+    clock, interval = np.array([T0_NS, 0, 7, 7, 0]), an_interval()
+    open_interval(columns, IMU_LEVER, interval, clock)
+    assert np.isnan(up_measured(columns, model, NO_MOTION, clock, interval)[1])
+    clock[NODE] = dvl_ns[1]
+    motion = NO_MOTION._replace(impulse=(0.0, 0.0, GRAVITY * duration_s))
+    up, sigma = up_measured(columns, model, motion, clock, interval)
+    velocity_noise = VARIANCES.mean(axis=1).sum()
+    tilt = (model.accel_noise_density**2 / duration_s + velocity_noise / duration_s**2) / GRAVITY**2
+    tilt += model.gyro_noise_density**2 * duration_s / 3 + (model.gyro_bias_sigma * duration_s) ** 2 / 4
+    assert sigma**2 == pytest.approx(tilt, rel=1e-9)
+    assert_allclose(up, [0.0, 0.0, 1.0], atol=1e-12)
+    assert clock[OPENED] == dvl_ns[1]
+    assert interval.velocity[3] == pytest.approx(VARIANCES[1].mean())
