@@ -20,7 +20,7 @@ Entry = tuple[int, bytes]
 def write(path: Path, count: int = 400, *, chunk_size: int = 4096, **settings: Any) -> list[Entry]:
     """Messages of three lengths on /bytes, 1 ns apart, between others in JSON; what was written on /bytes."""
     rng = np.random.default_rng(0)
-    written = []
+    written = [(1000 + i, rng.bytes([20, 50, 80][i % 3])) for i in range(count)]
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=chunk_size, **settings)
         writer.start("ros2", "test")
@@ -30,11 +30,9 @@ def write(path: Path, count: int = 400, *, chunk_size: int = 4096, **settings: A
         silent = writer.register_channel("/json", "json", other)
         writer.register_channel("/never", "cdr", schema)
         writer.add_metadata("sonar_graph", {"name": "x"})
-        for i in range(count):
-            payload = rng.bytes([20, 50, 80][i % 3])
-            written.append((1000 + i, payload))
-            writer.add_message(channel, 1000 + i, payload, 1000 + i)
-            writer.add_message(silent, 1000 + i, b'{"a": 1}', 1000 + i)
+        for time_ns, payload in written:
+            writer.add_message(channel, time_ns, payload, time_ns)
+            writer.add_message(silent, time_ns, b'{"a": 1}', time_ns)
         writer.finish()  # type: ignore[no-untyped-call]
     return written
 
@@ -67,8 +65,9 @@ def scan_all(path: Path) -> Recording:
 
 
 def read(path: Path) -> list[Entry]:
-    """What /bytes holds."""
-    return entries(scan_all(path).topics["/bytes"])
+    """Messages on /bytes."""
+    topics = scan_all(path).topics
+    return entries(topics["/bytes"]) if "/bytes" in topics else []
 
 
 def chunk_indexes(path: Path) -> list[ChunkIndex]:

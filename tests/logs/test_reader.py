@@ -1,0 +1,539 @@
+"""MCAP files of every kind, whole and damaged: every message that is whole is read, and what is lost is told."""
+
+from __future__ import annotations
+
+import re
+import struct
+import tracemalloc
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta, timezone
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.data_stream import ReadDataStream
+from mcap.records import Chunk, ChunkIndex, Message
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import CompressionType, IndexType, Writer
+
+from sonar_graph.errors import LogError, MissingTopicError
+from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
+from sonar_graph.logs.mcap.reader import scan, stream
+from sonar_graph.logs.mcap.records import seal
+from sonar_graph.logs.mcap.topic import Damage, Keep, Loss, Topic, settle
+from sonar_graph.logs.reading import read_log
+
+from .containers import TEXT, Entry, chunk_indexes, entries, flip, read, scan_all, write, write_apart
+
+NONE, LZ4, ZSTD = CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD
+
+
+def chunk_end(chunk: ChunkIndex) -> int:
+    return chunk.chunk_start_offset + chunk.chunk_length
+
+
+def chunk_of(path: Path, number: int, channel: int = 1) -> list[Entry]:
+    """Messages of a chunk as mcap's own reader finds them."""
+    index = chunk_indexes(path)[number]
+    content = path.read_bytes()[index.chunk_start_offset + 9 :][: index.chunk_length - 9]
+    records = breakup_chunk(Chunk.read(ReadDataStream(BytesIO(content))))
+    return [(r.log_time, r.data) for r in records if isinstance(r, Message) and r.channel_id == channel]
+
+
+def cut_out(path: Path, at: int, count: int) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[:at] + content[at + count :])
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "log.mcap"
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"compression": ZSTD},
+        {"compression": LZ4},
+        {"compression": NONE},
+        {"use_chunking": False},
+        {"index_types": IndexType.NONE, "use_statistics": False, "use_summary_offsets": False},
+        {"repeat_channels": False, "repeat_schemas": False},
+    ],
+    ids=["zstd", "lz4", "none", "unchunked", "no-index", "no-summary"],
+)
+def test_every_message_is_found_whatever_the_container(path: Path, options: dict[str, object]) -> None:
+    written = write(path, **options)
+    assert read(path) == written
+    recording = scan(path, lambda _: Keep.STAMP)
+    assert list(recording.topics) == ["/bytes", "/json"]
+    assert recording.metadata == {"sonar_graph": {"name": "x"}}
+    assert (recording.ending, recording.corrupt, recording.damage.remarks) == (None, [], [])
+    assert len(recording.topics["/bytes"]) == len(written)
+    assert list(recording.topics["/bytes"].stacks) == [12]  # only the stamps were wanted
+    pieces: dict[str, list[Entry]] = {}
+    for piece in stream(path, lambda _: Keep.ALL):
+        pieces.setdefault(piece.name, []).extend(entries(piece))
+    assert pieces == {name: entries(topic) for name, topic in scan_all(path).topics.items()}
+
+
+def test_messages_outside_chunks_may_be_larger_than_what_is_read_at_a_time(path: Path) -> None:
+    payloads = [bytes([i]) * (3 << 20) for i in range(3)]
+    with path.open("wb") as stream:
+        writer = Writer(stream, use_chunking=False)
+        writer.start("ros2", "test")
+        channel = writer.register_channel("/a", "cdr", writer.register_schema("a/msg/A", "ros2msg", TEXT))
+        for i, payload in enumerate(payloads):
+            writer.add_message(channel, i, payload, i)
+        writer.finish()  # type: ignore[no-untyped-call]
+    assert entries(scan_all(path).topics["/a"]) == list(enumerate(payloads))
+
+
+# ---- damage
+
+
+def in_chunk(number: int, offset: int, bit: int = 4) -> Callable[[Path], None]:
+    """A bit at an offset from the beginning of a chunk."""
+    return lambda path: flip(path, chunk_indexes(path)[number].chunk_start_offset + offset, bit)
+
+
+def at_text(text: bytes, offset: int = 0, bit: int = 1) -> Callable[[Path], None]:
+    """A bit at an offset from some bytes."""
+    return lambda path: flip(path, path.read_bytes().index(text) + offset, bit)
+
+
+def both_lengths(path: Path) -> None:
+    """Both lengths of the second chunk, so that nothing says where it ends."""
+    at = chunk_indexes(path)[1].chunk_start_offset
+    flip(path, at + 1)
+    flip(path, at + 9 + 32, 1)
+
+
+def missing_in_chunk(number: int, count: int) -> Callable[[Path], None]:
+    return lambda path: cut_out(path, chunk_indexes(path)[number].chunk_start_offset + 200, count)
+
+
+def huge_size(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<Q", content, chunk_indexes(path)[1].chunk_start_offset + 9 + 16, 1 << 62)
+    path.write_bytes(content)
+
+
+def in_index(offset: int) -> Callable[[Path], None]:
+    """A bit of the message index of the third chunk."""
+    return lambda path: flip(path, min(chunk_indexes(path)[2].message_index_offsets.values()) + offset, 1)
+
+
+def shorter_index(path: Path) -> None:
+    """The message index of the third chunk with one entry fewer, its lengths in order."""
+    at = min(chunk_indexes(path)[2].message_index_offsets.values())
+    content = bytearray(path.read_bytes())
+    (length,) = struct.unpack_from("<Q", content, at + 1)
+    private = struct.pack("<BQ", 0x80, 16 - 9) + bytes(16 - 9)
+    content[at + 1 : at + 9] = struct.pack("<Q", length - 16)
+    content[at + 11 : at + 15] = struct.pack("<I", length - 16 - 6)
+    content[at + 9 + length - 16 : at + 9 + length] = private
+    path.write_bytes(content)
+
+
+def message_200(offset: int, bit: int) -> Callable[[Path], None]:
+    """A bit at an offset from the head of a message outside chunks."""
+    payload = np.random.default_rng(0)
+    for i in range(201):
+        text = payload.bytes([20, 50, 80][i % 3])
+    return at_text(text, offset - 31, bit)
+
+
+def tail(content: bytes) -> Callable[[Path], None]:
+    return lambda path: path.write_bytes(path.read_bytes() + content) and None
+
+
+@dataclass
+class Fault:
+    """Damage to a file, and the account that is expected of it."""
+
+    damage: Callable[[Path], object]
+    lost: int | None = None
+    """The chunk whose messages are lost; without chunks, the message."""
+    corrupt: str = ""
+    """What the losses must say; empty: there must be none."""
+    remark: str = ""
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+PLAIN: dict[str, Any] = {"compression": NONE}
+LOOSE: dict[str, Any] = {"use_chunking": False}
+UNREPEATED = LOOSE | {"use_statistics": False, "repeat_channels": False, "repeat_schemas": False}
+SECOND, COUNTED = "chunk 2 is lost: .*; lost: 35 of /bytes, 35 of /json$", "lost: 35 of /bytes, 35 of /json$"
+MOVED, INDEX, ENDING = "bytes are missing or doubled in it", "message index of chunk 3", "does not end as an MCAP file"
+TWICE = r"schema 1 \(test_msgs/msg/Bytes\) is described in two ways; the one under a CRC holds"
+FAULTS = {
+    "a bit in a chunk": Fault(in_chunk(1, 900), 1, SECOND),
+    "a bit in a chunk without compression": Fault(in_chunk(1, 900), 1, SECOND, "", PLAIN),
+    "a chunk's opcode": Fault(in_chunk(1, 0, 0x80)),
+    "a chunk's size beyond all memory": Fault(huge_size),  # the frame within tells its size, and the CRC fits
+    "both lengths of a chunk": Fault(both_lengths, 1, COUNTED, "", PLAIN),
+    "more bytes missing than an index takes": Fault(missing_in_chunk(1, 1500), 1, SECOND, MOVED),
+    "the same without compression": Fault(missing_in_chunk(1, 1500), 1, SECOND, MOVED, PLAIN),
+    "the first chunk, with the descriptions": Fault(in_chunk(0, 100), 0, "chunk 1 is lost"),
+    "bytes missing in the first chunk": Fault(missing_in_chunk(0, 10), 0, "chunk 1 is lost", MOVED),
+    "an index's channel": Fault(in_index(9), None, "", INDEX, PLAIN),
+    "an index's time": Fault(in_index(15), None, "", INDEX, PLAIN),
+    "an index's offset": Fault(in_index(23), None, "", INDEX, PLAIN),
+    "an index without an entry": Fault(shorter_index, None, "", INDEX, PLAIN),
+    "a longer message outside chunks": Fault(message_200(1, 1), 200, "1 of /bytes", "", LOOSE),
+    "a shorter message outside chunks": Fault(message_200(1, 64), 200, "no valid record", "", LOOSE),
+    "a type's name outside chunks": Fault(at_text(b"test_msgs/msg/Bytes"), None, "", TWICE, LOOSE),
+    "a topic's name outside chunks": Fault(at_text(b"/bytes"), None, "", r"channel 1 \(/bytes\) is desc", LOOSE),
+    # of 13 bytes it claims 29, of which 13 are there
+    "a length in a description": Fault(at_text(b"uint8[] d", -4, 16), None, "description of a ch", "", UNREPEATED),
+    "the length of metadata": Fault(at_text(b"sonar_graph", -12, 64), None, "a metadata record is lost"),
+    "zeros after the end": Fault(tail(bytes(5000)), None, "", ENDING),
+    "opcodes after the end": Fault(tail(b"\x05" * 5000), None, "", ENDING),
+    "noise after the end": Fault(tail(bytes(range(256)) * 20), None, "", ENDING),
+} | {f"bit {bit} of byte {at} of a chunk": Fault(in_chunk(1, at, bit)) for at in (1, 2, 5, 8) for bit in (1, 8, 128)}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(path: Path, name: str) -> None:
+    fault = FAULTS[name]
+    written = write(path, **fault.options)
+    chunks = chunk_indexes(path)
+    lost, others = [], []
+    if fault.lost is not None:
+        lost = chunk_of(path, fault.lost) if chunks else [written[fault.lost]]
+        others = chunk_of(path, fault.lost, channel=2) if chunks else []
+    fault.damage(path)
+    recording = scan_all(path)
+    found = read(path)
+    if not chunks:  # without a CRC a message that became shorter is read
+        found = [entry for entry in found if entry in written]
+    assert found == [entry for entry in written if entry not in lost]
+    for told, expected in ((recording.corrupt, fault.corrupt), (recording.damage.remarks, fault.remark)):
+        assert bool(told) == bool(expected)
+        assert any(re.search(expected, text) for text in told or [""])
+    assert recording.ending is None
+    if lost and chunks:
+        (loss,) = recording.damage.losses
+        assert loss.at == chunks[fault.lost or 0].chunk_start_offset
+        assert loss.messages == {"/bytes": len(lost), "/json": len(others)}
+        assert not loss.is_estimate
+        with pytest.raises(LogError, match=r"damaged: bytes \d+ to \d+: .*--salvage"):
+            recording.require_sound()
+    if name.startswith("a bit in a chunk"):
+        (loss,), chunk = recording.damage.losses, chunks[1]
+        assert (loss.end, loss.start_ns, loss.end_ns) == (
+            chunk_end(chunk),
+            chunk.message_start_time,
+            chunk.message_end_time,
+        )
+
+
+RANDOM = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@RANDOM
+@given(st.sampled_from(["flip", "remove", "insert", "zero", "cut"]), st.floats(0, 1), st.integers(1, 3000))
+@pytest.mark.parametrize("compression", [ZSTD, NONE])
+def test_no_damage_makes_up_a_message_or_loses_one_silently(
+    path: Path, compression: CompressionType, how: str, part: float, count: int
+) -> None:
+    written = write(path, 200, compression=compression)
+    content = path.read_bytes()
+    at = 8 + int(part * (len(content) - 9))
+    damaged = {
+        "flip": content[:at] + bytes([content[at] ^ (1 << count % 8)]) + content[at + 1 :],
+        "remove": content[:at] + content[at + count :],
+        "insert": content[:at] + bytes(count) + content[at:],
+        "zero": (content[:at] + bytes(count))[: len(content)] + content[at + count :],
+        "cut": content[:at],
+    }[how]
+    path.write_bytes(damaged)
+    recording = scan_all(path)
+    found = read(path)
+    assert found == [entry for entry in written if entry in set(found)]
+    if found != written:
+        assert recording.corrupt or recording.ending
+
+
+def test_the_crc_over_all_data_tells_a_bit_outside_chunks(path: Path) -> None:
+    written = write(path, use_chunking=False, enable_data_crcs=True)
+    assert scan_all(path).damage == Damage()
+    at_text(written[200][1], 3)(path)
+    (loss,) = scan_all(path).damage.losses
+    assert "the CRC over all data does not fit, and messages lie outside chunks" in loss.reason
+
+
+def test_messages_in_the_only_chunk_are_not_read_as_messages_outside_chunks(path: Path) -> None:
+    """Uncompressed, with both of its lengths wrong: the messages in it have no CRC that could be checked."""
+    write(path, chunk_size=1 << 20, compression=NONE)
+    (chunk,) = chunk_indexes(path)
+    path.write_bytes(path.read_bytes()[: chunk_end(chunk)])
+    flip(path, chunk.chunk_start_offset + 1)
+    flip(path, chunk.chunk_start_offset + 9 + 32, 1)
+    assert scan_all(path).topics == {}
+
+
+def test_without_any_description_messages_are_counted_as_lost(path: Path) -> None:
+    written = write(path)
+    first, second = chunk_indexes(path)[:2]
+    path.write_bytes(path.read_bytes()[: chunk_end(second)])
+    flip(path, first.chunk_start_offset + 100)
+    recording = scan_all(path)
+    assert recording.topics == {}
+    assert sum(sum((loss.messages or {}).values()) for loss in recording.damage.losses) > len(written) / 10
+    assert "whose description is lost" in recording.corrupt[1]
+
+
+def test_what_no_crc_covers_is_named(path: Path) -> None:
+    for options, named in (
+        ({"use_chunking": False}, "messages lie outside chunks, metadata record 'sonar_graph'"),
+        ({"enable_crcs": False}, "12 chunks carry no CRC, metadata record 'sonar_graph'"),
+        ({}, "metadata record 'sonar_graph'"),
+    ):
+        write(path, **options)
+        assert scan_all(path).notes() == {"log.unprotected": named}
+
+
+def test_metadata_under_a_seal_is_whole_or_lost(path: Path) -> None:
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.add_metadata("sonar_graph", seal({"calibration": "0.05", "name": "x"}))
+        writer.finish()  # type: ignore[no-untyped-call]
+    recording = scan_all(path)
+    assert recording.metadata == {"sonar_graph": {"calibration": "0.05", "name": "x"}}
+    assert recording.damage == Damage()
+    at_text(b"0.05", 3)(path)
+    recording = scan_all(path)
+    assert recording.metadata == {}
+    assert "a metadata record is lost: its CRC does not fit" in recording.corrupt[0]
+
+
+def test_losses_are_estimated_from_rates_where_nothing_counts_them() -> None:
+    topic = Topic(Path("x"), "/imu", "", "cdr", "ros2msg", "", Keep.ALL)
+    times_ns = np.delete(np.arange(1000) * 10_000_000, slice(400, 450))
+    topic.gather(bytes(10), np.zeros(950, np.int64), np.full(950, 10), times_ns)
+    loss = Loss(0, 100, "no valid record", int(times_ns[399]), int(times_ns[400]))
+    settle(Damage([loss]), {"/imu": topic}, None)
+    assert loss.messages == {"/imu": 50}
+    assert loss.is_estimate
+    assert loss.describe(0) == "bytes 0 to 100: no valid record; 3.990 s to 4.500 s of the log; lost: about 50 of /imu"
+
+
+def test_fewer_messages_than_the_statistics_count_are_a_loss() -> None:
+    damage = Damage()
+    settle(damage, {}, {"/imu": 3})
+    assert damage.losses[0].messages == {"/imu": 3}
+    settle(sound := Damage(), {}, {})
+    assert sound.losses == []
+
+
+# ---- files that are cut off
+
+
+@pytest.mark.parametrize("kept", [0.3, 0.6, 0.8])
+def test_of_a_file_cut_off_all_before_the_cut_is_read_and_its_duration_told(path: Path, kept: float) -> None:
+    written = write(path)
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * kept)])
+    found = read(path)
+    assert 0 < len(found) < len(written)
+    assert found == written[: len(found)]
+    recording = scan_all(path)
+    assert re.search(r"^the file is cut off: .* spans 0\.000 s$", recording.ending or "")
+    recording.require_sound()
+
+
+def test_a_cut_between_records_or_before_any_message_is_told(path: Path) -> None:
+    write(path)
+    chunks, content = chunk_indexes(path), path.read_bytes()
+    path.write_bytes(content[: chunk_end(chunks[-1])])
+    assert (scan_all(path).ending or "").startswith("the file is cut off: it ends after a whole record")
+    path.write_bytes(content[: chunks[0].chunk_start_offset + 3])
+    assert re.search(r"^the file is cut off: .*; no message is there$", scan_all(path).ending or "")
+    with pytest.raises(MissingTopicError, match=r"log\.mcap: has no messages: the file is cut off: "):
+        read_log(path)
+
+
+def test_zeros_after_a_cut_are_not_taken_for_a_message(path: Path) -> None:
+    """As a file system leaves them after a crash: a message that reaches into them is not whole."""
+    written = write(path, 2000, chunk_size=1 << 20, compression=NONE)
+    content = path.read_bytes()
+    for kept in range(20_000, 20_080):
+        path.write_bytes(content[:kept] + bytes(300))
+        found = read(path)
+        assert found == written[: len(found)]
+        assert len(found) > 100
+
+
+@pytest.mark.parametrize("compression", [ZSTD, LZ4, NONE])
+def test_half_a_chunk_gives_its_whole_messages(path: Path, compression: CompressionType) -> None:
+    written = write(path, 60_000, chunk_size=1 << 20, compression=compression)
+    second = chunk_indexes(path)[1]
+    before = int(np.searchsorted([time for time, _ in written], second.message_start_time))
+    path.write_bytes(path.read_bytes()[: second.chunk_start_offset + second.chunk_length // 2])
+    found = read(path)
+    assert found == written[: len(found)]
+    assert len(found) > before + 0.2 * before
+    ending = scan_all(path).ending or ""
+    assert "which no CRC covers" in ending
+    assert ending.endswith(f"what is there spans {(found[-1][0] - 1000) * 1e-9:.3f} s")
+
+
+# ---- files that are no logs
+
+
+@pytest.mark.parametrize(
+    ("content", "kind"),
+    [
+        (b"#ROSBAG V2.0\n", r"a ROS 1 bag; `sonar-graph convert rosbag .*log\.bag -o log\.mcap`"),
+        (b"SQLite format 3\0", "a ROS 2 bag of the sqlite3 kind; `sonar-graph convert rosbag"),
+        (b"", "empty: copy it again"),
+        (bytes(1000), "zeros: copy it again"),
+        (b'{"a": 1}\nb', r"""a text that begins with '\{"a": 1\}'"""),
+        ("Überschrift\n".encode() * 9, "a text that begins with 'Überschrift'"),
+        (b" \n ", "a text that begins with ''"),
+        (b"\x7fELF\x02\x01\x01", "something else"),
+    ],
+)
+def test_other_files_are_named_for_what_they_are(tmp_path: Path, content: bytes, kind: str) -> None:
+    path = tmp_path / "log.bag"
+    path.write_bytes(content)
+    with pytest.raises(LogError, match=rf"not an MCAP file but {kind}"):
+        scan_all(path)
+    with pytest.raises(LogError, match="is a folder"):
+        scan_all(tmp_path)
+    with pytest.raises(LogError, match="No such file"):
+        scan_all(tmp_path / "none.mcap")
+
+
+# ---- parts of a file
+
+
+def test_pieces_of_a_damaged_file_end_in_an_error(path: Path) -> None:
+    written = write(path)
+    in_chunk(1, 100)(path)
+    found: list[Entry] = []
+
+    def gather() -> Iterator[Topic]:
+        for piece in stream(path, lambda _: Keep.ALL):
+            found.extend(entries(piece) if piece.name == "/bytes" else [])
+        yield piece
+
+    with pytest.raises(LogError, match="damaged: bytes"):
+        list(gather())
+    assert set(found) < set(written)
+
+
+def test_chunks_without_a_wanted_topic_are_not_even_read(path: Path) -> None:
+    write_apart(path)
+    for index in chunk_indexes(path)[1::2]:  # those of /b: damage there goes unnoticed, and the recording says so
+        flip(path, chunk_end(index) - 1)
+    assert len(scan_all(path).corrupt) == 50
+    recording = scan(path, lambda kind: Keep.NONE if kind.endswith("/B") else Keep.ALL)
+    assert len(recording.topics["/a"]) == 50
+    assert recording.corrupt == []
+    assert (recording.chunks, recording.skipped_chunks) == (100, 50)
+    assert recording.notes()["log.skipped"].startswith("50 of 100 chunks")
+
+
+def test_a_window_holds_what_was_recorded_in_it_and_latched_topics(path: Path) -> None:
+    write_apart(path)
+    recording = scan(path, lambda _: Keep.ALL, TimeWindow(Instant.parse("10"), Instant.parse("20")))
+    times_s = sorted(t for name in ("/a", "/b") for t in (recording.topics[name].log_times_ns // 10**9).tolist())
+    assert times_s == list(range(11, 21))
+    assert entries(recording.topics["/tf_static"]) == [(10**9, b"static")]
+    assert recording.skipped_chunks == 89
+    assert recording.notes()["log.part"] == "10.000 s to 20.000 s of the recording"
+    absolute = TimeWindow(Instant.parse("1970-01-01T00:01:31Z"))
+    assert sum(len(t) for t in scan(path, lambda _: Keep.ALL, absolute).topics.values()) == 11
+    with pytest.raises(LogError, match=r"nothing was recorded from 1000\.000 s to the end"):
+        scan(path, lambda _: Keep.ALL, TimeWindow(Instant.parse("1000")))
+
+
+@pytest.mark.parametrize("summary", [True, False])
+def test_a_window_is_the_same_without_summary(path: Path, summary: bool) -> None:
+    written = write(path)
+    if not summary:
+        path.write_bytes(path.read_bytes()[: chunk_indexes(path)[-1].chunk_start_offset])
+        written = read(path)
+    window = TimeWindow(Instant.parse("100e-9"), Instant.parse("150e-9"))
+    recording = scan(path, lambda _: Keep.ALL, window)
+    assert entries(recording.topics["/bytes"]) == [entry for entry in written if 1100 <= entry[0] < 1150]
+    assert (recording.skipped_chunks > 0) == summary
+
+
+def test_a_summary_that_lies_about_chunks_is_not_used_to_skip(path: Path) -> None:
+    """The index of a chunk with /a says that it holds /b only, in a summary without CRC."""
+    write_apart(path)
+    content = bytearray(path.read_bytes())
+    footer_at = len(content) - 8 - 29
+    content[footer_at + 25 : footer_at + 29] = bytes(4)
+    index = chunk_indexes(path)[4]
+    entry = struct.pack("<IHQ", 10, 1, index.message_index_offsets[1])
+    assert content.count(entry) == 1
+    at = content.index(entry)
+    content[at : at + len(entry)] = struct.pack("<IHQ", 10, 2, index.message_index_offsets[1])
+    path.write_bytes(content)
+    recording = scan(path, lambda _: Keep.ALL, TimeWindow(Instant.parse("3"), Instant.parse("7")))
+    assert (recording.topics["/a"].log_times_ns // 10**9).tolist() == [5, 7]
+    assert any("the summary's index does not fit chunk 5" in remark for remark in recording.damage.remarks)
+    assert recording.skipped_chunks == 0
+
+
+def test_progress_ends_at_the_whole(path: Path) -> None:
+    write(path)
+    calls: list[tuple[int, int]] = []
+    scan(path, lambda _: Keep.ALL, progress=lambda done, total: calls.append((done, total)))
+    assert calls == sorted(calls)
+    assert {total for _, total in calls} == {path.stat().st_size}
+    assert len(calls) == len(chunk_indexes(path))
+
+
+BEGINNING_NS = 1_700_000_000_000_000_001
+
+
+@given(st.datetimes(min_value=datetime(1971, 1, 1), max_value=datetime(2200, 1, 1)), st.integers(-12, 14))
+def test_a_date_is_absolute_in_its_zone(when: datetime, hours: int) -> None:
+    zoned = when.replace(tzinfo=timezone(timedelta(hours=hours)))
+    expected_us = (zoned - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1)
+    assert Instant.parse(zoned.isoformat()).resolve(BEGINNING_NS) == expected_us * 1000
+
+
+def test_a_date_without_a_zone_is_in_utc_and_a_number_is_seconds_from_the_beginning() -> None:
+    assert Instant.parse("1970-01-02T00:00:01").resolve(BEGINNING_NS) == 86_401 * 10**9
+    assert Instant.parse("1.5").resolve(BEGINNING_NS) == BEGINNING_NS + 1_500_000_000
+    assert Instant.parse("1700000000").resolve(0) == 1_700_000_000 * 10**9
+
+
+@pytest.mark.parametrize("text", ["-1", "nan", "inf", "x", "", "12:30", "1e30"])
+def test_other_times_and_an_end_before_the_start_are_refused(text: str) -> None:
+    with pytest.raises(LogError, match=r"no time in a log: give seconds from its beginning"):
+        Instant.parse(text)
+    with pytest.raises(LogError, match="ends before it starts"):
+        TimeWindow(Instant.parse("2"), Instant.parse("2")).resolve(BEGINNING_NS)
+
+
+def test_a_long_log_is_read_in_bounded_memory(path: Path) -> None:
+    """60 MB of images between numbers, each image a chunk of its own."""
+    image = np.random.default_rng(0).bytes(1 << 20)
+    with path.open("wb") as stream_:
+        writer = Writer(stream_, compression=NONE)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("test_msgs/msg/Image", "ros2msg", TEXT)
+        images, numbers = (writer.register_channel(name, "cdr", schema) for name in ("/image", "/number"))
+        for i in range(60):
+            writer.add_message(images, i, image, 0)
+            writer.add_message(numbers, i, b"12345678", 0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    tracemalloc.start()
+    total = sum(part.nbytes for t in stream(path, lambda _: Keep.ALL) for s in t.stacks.values() for _, part in s)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert total == 60 * ((1 << 20) + 8)
+    assert peak < 10 << 20
