@@ -1,10 +1,12 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from sonar_graph.calibration import Mounting
-from sonar_graph.logs.convert.akit import enu_R_flu, read_akit
+from sonar_graph.logs.convert.akit import earth_centred, east_north_up, enu_R_earth, enu_R_flu, read_akit
 from sonar_graph.navigation.odometry import Odometry, motion_between_nodes
 from sonar_graph.navigation.preintegration.motion import Preintegrator
 
@@ -39,34 +41,24 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_axes_turn_to_forward_left_up(folder):
-    """The DVL is forward, right, down; the IMU the same but for its y axis, which is to the left already."""
+def test_axes_times_and_start_are_those_of_the_files(folder):
+    """The DVL is forward, right, down; the IMU the same but for its y axis, which is to the left already.
+
+    Radii of curvature by hand at that latitude: 6 354 km along the meridian, 5 366 km along the parallel.
+    """
     sequence = read_akit(folder, 2)
     assert np.allclose(sequence.dvl.velocity[0], [1.0, -0.5, -0.25])
     assert np.allclose(sequence.imu.angular_velocity[0], [0.01, 0.02, -0.03])
     assert np.allclose(sequence.imu.specific_force[0], [0.1, 0.2, 9.8])
-
-
-def test_rows_are_timed_by_their_number(folder):
-    sequence = read_akit(folder, 2)
-    assert np.unique(np.diff(sequence.imu.stamps_ns)).tolist() == [10_000_000]
+    assert np.unique(np.diff(sequence.imu.stamps_ns)).tolist() == [10_000_000]  # rows are timed by their number
     assert sequence.dvl.stamps_ns.tolist() == [10**9, 2 * 10**9, 3 * 10**9]
     assert sequence.truth.stamps_ns.tolist() == [0, 10**9, 2 * 10**9]
     assert sequence.start_ns == 10**9
-
-
-def test_reference_is_metres_east_north_up(folder):
-    """Radii of curvature by hand at that latitude: 6 354 km along the meridian, 5 366 km along the parallel."""
-    sequence = read_akit(folder, 2)
-    steps = np.diff(sequence.truth.positions, axis=0)
-    assert np.allclose(steps, [[5.366, 6.354, -1.0]] * 2, rtol=0, atol=5e-3)
+    assert np.allclose(np.diff(sequence.truth.positions, axis=0), [[5.366, 6.354, -1.0]] * 2, rtol=0, atol=5e-3)
     assert np.allclose(sequence.truth.positions[0], [0, 0, -10], atol=1e-6)
-
-
-def test_heading_east_is_along_x(folder):
-    sequence = read_akit(folder, 2)
-    assert np.allclose(sequence.truth.rotations()[0].as_matrix(), np.eye(3), atol=1e-12)
+    assert np.allclose(sequence.truth.rotations()[0].as_matrix(), np.eye(3), atol=1e-12)  # east is along x
     assert np.allclose(sequence.calibration.start.rpy_rad, 0, atol=1e-9)
+    assert np.allclose(sequence.calibration.start.position_m, sequence.truth.positions[1])
 
 
 @pytest.mark.parametrize(
@@ -83,26 +75,30 @@ def test_attitude_by_hand(roll, pitch, yaw, body, world):
     assert np.allclose(turned, world, atol=1e-12)
 
 
-def test_start_is_the_reference_when_the_dvl_begins(folder):
-    sequence = read_akit(folder, 2)
-    assert np.allclose(sequence.calibration.start.position_m, sequence.truth.positions[1])
+def test_earth_centred_reproduces_known_points():
+    """Equator and pole, by the semi-axes that define WGS-84."""
+    points = earth_centred(np.array([0.0, np.pi / 2]), np.array([0.0, 0.0]), np.array([10.0, 0.0]))
+    assert np.allclose(points, [[6378147.0, 0, 0], [0, 0, 6356752.3142]], rtol=0, atol=1e-4)
 
 
-def test_trajectories_that_exist_are_named(folder, tmp_path, refusal):
-    refusal(lambda: read_akit(folder, 5), "no trajectory 5", "it has 2")
-    refusal(lambda: read_akit(folder / "Trajectory2", 2), "holds no TrajectoryN")
-    refusal(lambda: read_akit(tmp_path / "absent", 1), "not a folder")
+@given(st.floats(-1.3, 1.3), st.floats(-3, 3))
+def test_small_offsets_are_the_radii_of_curvature_times_the_angles(latitude, longitude):
+    e2, a, d = 6.69437999014e-3, 6378137.0, 1e-6
+    meridian = a * (1 - e2) / (1 - e2 * np.sin(latitude) ** 2) ** 1.5
+    vertical = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
+    enu = east_north_up(
+        latitude + np.array([0, d, 0, 0]), longitude + np.array([0, 0, d, 0]), np.array([-5.0, -5.0, -5.0, -2.0])
+    )
+    assert np.allclose(enu[1] - enu[0], [0, (meridian - 5) * d, 0], rtol=0, atol=1e-4)
+    assert np.allclose(enu[2] - enu[0], [(vertical - 5) * np.cos(latitude) * d, 0, 0], rtol=0, atol=1e-4)
+    assert np.allclose(enu[3] - enu[0], [0, 0, 3], rtol=0, atol=1e-4)
+    assert np.allclose(enu[0], [0, 0, -5], rtol=0, atol=1e-6)
 
 
-def test_a_malformed_line_is_named(folder, refusal):
-    path = folder / "Trajectory2" / "DVL_trajectory2.csv"
-    path.write_text(f"{DVL_HEADER}\n0,1,2,3\n1,2,3\n")
-    refusal(lambda: read_akit(folder, 2), path, "line 3", "DVL Z")
-
-
-def test_a_missing_file_is_named(folder, refusal):
-    (folder / "Trajectory2" / "GT_trajectory2.csv").unlink()
-    refusal(lambda: read_akit(folder, 2), "GT_trajectory2.csv", "Longitude")
+def test_local_axes_are_a_right_handed_rotation():
+    R = enu_R_earth(0.57, 0.61)
+    assert np.allclose(R @ R.T, np.eye(3))
+    assert np.linalg.det(R) == pytest.approx(1)
 
 
 @pytest.mark.recording

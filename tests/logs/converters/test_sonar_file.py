@@ -1,17 +1,234 @@
+"""Any sonar's file, whole and damaged: no frame but those recorded, and what is lost is told."""
+
 from __future__ import annotations
 
+import re
+import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
-from sonar_graph.errors import DatasetError
-from sonar_graph.logs.convert.didson_aris import ArisFormat
+from sonar_graph.cli.main import main
+from sonar_graph.errors import DatasetError, LogError
+from sonar_graph.logs.convert.didson_aris import ArisFormat, convert_didson
 from sonar_graph.logs.convert.sonar_file import ByteSource, FrameHead, Lost
+from sonar_graph.logs.reading import read_sonar_frames
 
-MIB = 1 << 20
+from .sonar_logs import CONVERTERS, Converted, converted
+from .sonar_recordings import START_NS, STEP_NS, Aris, Ddf, Oculus, images, put
+
+COUNT, MIB = 7, 1 << 20
+EVERY = list(range(COUNT))
+PICTURES = images(COUNT, 48, 50)
+RECORDINGS = {"ddf": Ddf(PICTURES, high=0), "aris": Aris(PICTURES, mode=1), "raw": Oculus(PICTURES)}
+PIECES = {ending: recording.pieces() for ending, recording in RECORDINGS.items()}
+SETTING_AT = {"ddf": 52, "aris": 476, "raw": 53 + 40 + 4 + 1 + 6}
+"""A byte of something that ranges depend on: window start, delay, size of a bin."""
+CLOCK_AT = {"ddf": 40, "aris": 24, "raw": 53 + 40 + 3}
+"""A byte of a frame's time, worth seconds for a DIDSON, hours for an ARIS, and tenths of one for an Oculus."""
+each_kind = pytest.mark.parametrize("ending", PIECES)
+in_one_folder = settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+Frames = list[bytes]
 
 
-def test_a_pattern_is_found_wherever_it_is(tmp_path: Path) -> None:
+def which(result: Converted) -> list[int]:
+    """Numbers of the frames that were read: each was recorded, to the last byte, and at this time after the first."""
+    known = {picture.tobytes(): i for i, picture in enumerate(PICTURES)}
+    frames = sorted((stamp_ns, known[image.tobytes()]) for stamp_ns, image in result.by_stamp().items())
+    assert sum(len(block) for block in result.blocks) == len(frames) == result.done.frames
+    return [number for _, number in frames]
+
+
+def read(folder: Path, pieces: Frames, ending: str) -> tuple[list[int], str]:
+    """Numbers of the frames that were read, and what is said of the others; together they are all bytes."""
+    content = b"".join(pieces)
+    result = converted(folder, content, ending)
+    lost = sum(loss.end - loss.at for loss in result.done.lost)
+    assert len(PIECES[ending][0]) + len(PIECES[ending][1]) * result.done.frames + lost == len(content)
+    numbers = which(result)
+    origins_ns = {
+        stamp_ns - number * STEP_NS for stamp_ns, number in zip(sorted(result.by_stamp()), numbers, strict=True)
+    }
+    assert len(origins_ns) == 1  # an Oculus counts from anywhere
+    return numbers, "; ".join(result.done.shortcomings())
+
+
+# ---- damage
+
+
+def patched(frames: Frames, which_one: int, at: int, value: bytes) -> Frames:
+    frame = frames[which_one]
+    return [*frames[:which_one], frame[:at] + value + frame[at + len(value) :], *frames[which_one + 1 :]]
+
+
+def flipped(frames: Frames, which_one: int, at: int, bit: int) -> Frames:
+    return patched(frames, which_one, at, bytes([frames[which_one][at] ^ bit]))
+
+
+def setting(which_one: int) -> Callable[[Frames, str], Frames]:
+    return lambda frames, ending: flipped(frames, which_one, SETTING_AT[ending], 4)
+
+
+def settings_side_by_side(frames: Frames, ending: str) -> Frames:
+    for i, bit in ((0, 1), (1, 2), (4, 4), (5, 8)):
+        frames = flipped(frames, i, SETTING_AT[ending], bit)
+    return frames
+
+
+def alternating(frames: Frames, ending: str) -> Frames:
+    """Some sonars switch between two frequencies or windows with every frame."""
+    for i in range(1, COUNT, 2):
+        frames = flipped(frames, i, SETTING_AT[ending], 4)
+    return frames
+
+
+def without(*lost: int) -> list[int]:
+    return [n for n in EVERY if n not in lost]
+
+
+FAULTS: dict[str, tuple[Callable[[Frames, str], Frames], list[int], str]] = {
+    "nothing": (lambda frames, _: frames, EVERY, "^$"),
+    "one frame": (lambda frames, _: frames[:1], [0], ""),
+    "two frames": (lambda frames, _: frames[:2], [0, 1], ""),
+    "a cut frame": (
+        lambda f, _: [*f[:3], f[3][:-10]],
+        [0, 1, 2],
+        r"frame (3|503): cut off, \d+ of \d+ bytes are there",
+    ),
+    "a frame twice": (lambda f, _: [*f[:3], *f[2:]], EVERY, "a repetition of the frame at byte"),
+    "two settings that alternate": (alternating, EVERY, "^$"),
+    "damaged settings side by side": (settings_side_by_side, [2, 3, 6], "^([^;]*settings[^;]*(; )?){4}"),
+}
+FAULTS |= {f"header {i}": (lambda f, _, i=i: patched(f, i, 0, b"\xa5" * 200), without(i), "bytes") for i in (0, 3, 6)}
+FAULTS |= {f"setting {i}": (setting(i), without(i), "settings are those of no frame") for i in (0, 1, 4, 6)}
+FAULTS |= {
+    f"time {i}": (lambda f, e, i=i: flipped(f, i, CLOCK_AT[e], 16), without(i), "its time does not fit") for i in (2, 4)
+}
+FAULTS |= {  # the same number of bytes remains as of a cut header, but they are not how a header begins
+    f"{n} bytes in the last": (
+        lambda f, _, n=n: [*f[:-1], f[-1][:-30] + b"\x5a" * n + f[-1][-30:]],
+        EVERY[:-1],
+        "bytes are missing or too many",
+    )
+    for n in (1, 5, 40)
+}
+ARIS_FAULTS = {
+    f"time {i} far off": (lambda f, _, i=i: flipped(f, i, 24, 1), without(i), "its time does not fit") for i in (0, 6)
+} | {  # 65,000 samples a beam are possible, but then other frames would lie within this one
+    f"length {i}": (lambda f, _, i=i: patched(f, i, 468, (65_000).to_bytes(4, "little")), without(i), "longer than the")
+    for i in (0, 2)
+}
+CASES = [(ending, name) for ending in PIECES for name in FAULTS] + [("aris", name) for name in ARIS_FAULTS]
+
+
+@pytest.mark.parametrize(("ending", "name"), CASES)
+def test_of_a_damaged_file_all_other_frames_are_read_and_the_damage_is_told(
+    tmp_path: Path, ending: str, name: str
+) -> None:
+    damage, expected, told = (FAULTS | ARIS_FAULTS)[name]
+    head, *frames = PIECES[ending]
+    numbers, said = read(tmp_path, [head, *damage(frames, ending)], ending)
+    assert numbers == expected
+    assert re.search(told, said)
+    lost = without(*expected)
+    if name != "two frames" and len(lost) == 1 and "in the last" not in name:
+        begin = len(head) + lost[0] * len(frames[0])
+        assert f"bytes {begin} to {begin + len(frames[0]) - 1}: " in said
+
+
+@each_kind
+@in_one_folder
+@given(part=st.floats(0, 1, exclude_max=True))
+def test_of_a_cut_file_every_complete_frame_is_read(tmp_path: Path, ending: str, part: float) -> None:
+    head, *frames = PIECES[ending]
+    length = len(head) + len(frames[0]) + int(part * (COUNT - 1) * len(frames[0]))
+    whole, rest = divmod(length - len(head), len(frames[0]))
+    numbers, said = read(tmp_path, [b"".join(PIECES[ending])[:length]], ending)
+    assert numbers == list(range(whole))
+    assert bool(rest) == ("cut off" in said)
+    if rest:
+        assert f"bytes {length - rest} to {length - 1}: " in said
+
+
+@each_kind
+@in_one_folder
+@given(st.floats(0, 1, exclude_max=True), st.integers(1, 3000), st.one_of(st.none(), st.integers(0, 255)))
+def test_missing_or_foreign_bytes_cost_the_frames_that_they_touch_and_perhaps_the_one_before(
+    tmp_path: Path, ending: str, part: float, count: int, fill: int | None
+) -> None:
+    """Where the next header is not found in its place, nobody can say that the frame before is whole."""
+    head, *frames = PIECES[ending]
+    size, content = len(frames[0]), b"".join(frames)
+    at = size + int(part * (COUNT - 3) * size)
+    foreign, last = (b"", at + count - 1) if fill is None else (bytes([fill]) * count, at)
+    numbers, said = read(
+        tmp_path, [head, content[:at], foreign, content[at + (count if fill is None else 0) :]], ending
+    )
+    assert set(EVERY) - set(numbers) <= set(range(at // size - 1, last // size + 1))
+    assert "bytes" in said
+
+
+@each_kind
+def test_a_setting_that_stays_changed_is_believed(tmp_path: Path, ending: str) -> None:
+    head, *frames = PIECES[ending]
+    for i in range(3, COUNT):
+        frames = flipped(frames, i, SETTING_AT[ending], 4)
+    result = converted(tmp_path, b"".join([head, *frames]), ending)
+    assert which(result) == EVERY
+    assert len(result.blocks) == 2
+    assert result.blocks[0].ranges_m[-1] != result.blocks[1].ranges_m[-1]
+
+
+def test_a_clock_that_is_set_back_loses_nothing(tmp_path: Path) -> None:
+    head, *frames = PIECES["aris"]
+    for i in range(4, COUNT):
+        frame = bytearray(frames[i])
+        put(frame, 20, "Q", int.from_bytes(frame[20:28], "little") - 3_600_000_000)
+        frames[i] = bytes(frame)
+    assert sorted(which(converted(tmp_path, b"".join([head, *frames]), "aris"))) == EVERY
+
+
+@pytest.mark.parametrize("ending", ["ddf", "aris"])
+def test_a_file_header_that_lost_bytes_costs_no_frame(tmp_path: Path, ending: str) -> None:
+    head, *frames = PIECES[ending]
+    result = converted(tmp_path, b"".join([head[:300], *frames]), ending)
+    assert which(result) == EVERY
+    assert [loss.end for loss in result.done.lost] == [300]
+    assert f"{len(head) - 300} bytes too short" in result.done.shortcomings()[0]
+
+
+@each_kind
+def test_a_file_of_nothing_but_noise_after_its_header_is_refused(tmp_path: Path, ending: str) -> None:
+    noise = np.random.default_rng(1).integers(0, 256, 200_000, dtype=np.uint8).tobytes()
+    path = tmp_path / f"dive.{ending}"
+    path.write_bytes(PIECES[ending][0] + noise)
+    with pytest.raises(DatasetError, match=rf"^{re.escape(str(path))}: "):
+        CONVERTERS[ending](path, tmp_path / "dive.mcap")
+
+
+@pytest.mark.parametrize(
+    ("content", "may_be"),
+    [
+        (b"", True),
+        (b"\x05", True),
+        (b"\x05\x01\0\0", True),
+        (b"\x06", False),
+        (b"\x05\x02", False),
+        (b"\x05\x01\0\0" + b"?" * 8 + b"DD", True),
+        (b"\x05\x01\0\0" + b"?" * 8 + b"DDF\x05" + b"?" * 50, True),
+        (b"\x05\x01\0\0" + b"?" * 8 + b"DX", False),
+        (b"\x04\x01\0\0" + b"?" * 8 + b"DDF\x05", False),
+    ],
+)
+def test_the_beginning_of_a_header_is_told_from_other_bytes(content: bytes, may_be: bool) -> None:
+    assert object.__new__(ArisFormat).may_follow(content, FrameHead(0, 1, 0x104, 0, ())) is may_be
+
+
+def test_a_pattern_is_found_wherever_it_is_and_reading_ends_with_the_file(tmp_path: Path) -> None:
     """Also across the places where one read ends and the next begins, and where it overlaps itself."""
     places = [0, 7, MIB - 3, MIB + 1, 2 * MIB - 1, 2 * MIB + 1, 3 * MIB, 3 * MIB + 2]
     content = bytearray(3 * MIB + 5)
@@ -23,39 +240,97 @@ def test_a_pattern_is_found_wherever_it_is(tmp_path: Path) -> None:
         assert list(source.places(b"aba", 0)) == places
         assert list(source.places(b"aba", 8)) == places[2:]
         assert list(source.places(b"abb", 0)) == []
-
-
-def test_reading_ends_with_the_file(tmp_path: Path) -> None:
-    path = tmp_path / "a.bin"
-    path.write_bytes(b"abcdef")
-    with ByteSource(path) as source:
-        assert (source.size, source.read(1, 3), source.read(4, 9), source.read(20, 1)) == (6, b"bcd", b"ef", b"")
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"a\.bin: cannot be read: No such file"):
-        ByteSource(tmp_path / "a.bin")
-
-
-@pytest.mark.parametrize(
-    ("content", "may_be"),
-    [
-        (b"", True),
-        (b"\x05", True),
-        (b"\x05\x01\0\0", True),
-        (b"\x06", False),
-        (b"\x05\x02", False),
-        (b"\x05\x01\0\0" + b"?" * 8, True),
-        (b"\x05\x01\0\0" + b"?" * 8 + b"DD", True),
-        (b"\x05\x01\0\0" + b"?" * 8 + b"DDF\x05" + b"?" * 50, True),
-        (b"\x05\x01\0\0" + b"?" * 8 + b"DX", False),
-        (b"\x04\x01\0\0" + b"?" * 8 + b"DDF\x05", False),
-    ],
-)
-def test_the_beginning_of_a_header_is_told_from_other_bytes(content: bytes, may_be: bool) -> None:
-    kind = object.__new__(ArisFormat)
-    assert kind.may_follow(content, FrameHead(0, 1, 0x104, 0, ())) is may_be
-
-
-def test_a_loss_names_its_first_and_last_byte() -> None:
+        end = source.size
+        assert (end, source.read(7, 3), source.read(end - 3, 9), source.read(end, 1)) == (
+            len(content),
+            *[b"aba"] * 2,
+            b"",
+        )
     assert str(Lost(10, 20, "because")) == "bytes 10 to 19: because"
+
+
+# ---- conversion to a log
+
+
+def long_recording(path: Path, frames: int) -> Path:
+    """Frames of 96 x 512 that differ in number and time only."""
+    kind = Ddf(np.broadcast_to(np.zeros((1, 96, 512), np.uint8), (frames, 96, 512)))
+    with path.open("wb") as stream:
+        stream.writelines(kind.frame(i) if i >= 0 else kind.file_header() for i in range(-1, frames))
+    return path
+
+
+def test_a_long_recording_is_written_whole_with_progress_in_bounded_memory(tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+    log = tmp_path / "dive.mcap"
+    convert_didson(long_recording(tmp_path / "short.ddf", 200), log)  # imports and caches
+    source = long_recording(tmp_path / "dive.ddf", 800)
+    size = source.stat().st_size
+    tracemalloc.start()
+    convert_didson(source, log, lambda done, total: told.append((done, total)))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 32e6 < size
+    assert len(told) > 2
+    assert told == sorted(told)
+    assert {total for _, total in told} == {size}
+    assert told[-1] == (size, size)
+    stamps_ns = np.concatenate([block.stamps_ns for block in read_sonar_frames(log)])
+    assert np.sort(stamps_ns).tolist() == [START_NS + i * STEP_NS for i in range(800)]
+
+
+def test_a_log_that_exists_survives_a_recording_that_is_missing_or_without_frames(tmp_path: Path) -> None:
+    log, source = tmp_path / "dive.mcap", tmp_path / "dive.ddf"
+    log.write_bytes(b"precious")
+    with pytest.raises(DatasetError, match=r"dive\.ddf: cannot be read: No such file"):
+        convert_didson(source, log)
+    source.write_bytes(Ddf(images(1, 96, 64)).content()[:600])
+    with pytest.raises(DatasetError, match="no whole frame: bytes 512 to 599: a frame cut off"):
+        convert_didson(source, log)
+    assert log.read_bytes() == b"precious"
+    assert sorted(tmp_path.iterdir()) == [source, log]
+    source.write_bytes(PIECES["ddf"][0] + PIECES["ddf"][1])
+    with pytest.raises(LogError, match="cannot be written"):
+        convert_didson(source, log / "dive.mcap")
+
+
+def test_the_log_has_the_name_of_the_recording_and_notes_what_is_lost(tmp_path: Path) -> None:
+    result = converted(tmp_path, b"".join(PIECES["aris"]), "aris")
+    assert result.recording.metadata["sonar_graph"]["name"] == "dive"
+    assert result.notes["source"] == "ARIS recording dive.aris"
+    assert "sonar.shortcomings" not in result.notes
+    assert "cut off" in converted(tmp_path, b"".join(PIECES["aris"])[:-5], "aris").notes["sonar.shortcomings"]
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    with pytest.raises(SystemExit) as stop:
+        main([str(argument) for argument in arguments])
+    assert not stop.value.code
+    printed = capsys.readouterr()
+    return printed.out + printed.err
+
+
+@pytest.mark.parametrize(("kind", "ending"), [("didson", "ddf"), ("aris", "aris"), ("oculus", "raw")])
+def test_the_commands_say_what_was_read_and_lost(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, ending: str
+) -> None:
+    source, log = tmp_path / "dive.bin", tmp_path / "dive.mcap"
+    source.write_bytes(b"".join(PIECES[ending][:5])[:-7])
+    said = run(capsys, "convert", kind, source, "-o", log)
+    for words in ("dive.bin: 3 frames, 0.2 s", "lost: bytes", "cut off"):
+        assert words in said
+    said = run(capsys, "inspect", log)
+    for words in ("48 beams x 50 bins of uint8", "cut off"):
+        assert words in said
+
+
+def test_the_command_takes_the_speed_of_sound_and_shows_some_of_many_losses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    header, *frames = Ddf(images(50, 96, 512)).pieces()
+    source, log = tmp_path / "dive.ddf", tmp_path / "dive.mcap"
+    source.write_bytes(header + b"".join(bytes(len(f)) if i % 2 else f for i, f in enumerate(frames)))
+    said = run(capsys, "convert", "didson", source, "-o", log, "--sound-speed", 1500)
+    assert said.count("lost: bytes") == 10
+    assert "and 15 stretches more" in said
+    assert next(iter(read_sonar_frames(log))).ranges_m[-1] == pytest.approx((1.26 + 1.25) * 1500 / 1465, abs=0.002)

@@ -1,0 +1,356 @@
+"""DIDSON, ARIS and Oculus recordings; no file of a real DIDSON was at hand: they are written from the documents."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from sonar_graph.logs.convert.didson_aris import convert_aris
+from sonar_graph.logs.convert.oculus import convert_oculus
+from sonar_graph.logs.reading import read_sonar_frames
+
+from .sonar_logs import CONVERTERS, Converted, converted, degrees
+from .sonar_recordings import START_NS, STEP_NS, Aris, Ddf, Oculus, images, oculus_note, put
+
+ARIS_BEAMS = {1: 48, 2: 48, 3: 96, 5: 96, 6: 64, 8: 64, 9: 128, 12: 128}
+ENDING = {Ddf: "ddf", Aris: "aris", Oculus: "raw"}
+
+
+def log_of(folder: Path, recording: Any, **settings: Any) -> Converted:
+    return converted(folder, recording.content(), ENDING[type(recording)], **settings)
+
+
+WHOLE = [
+    *(Ddf(images(5, beams, 512), version=v, high=high) for v in (3, 4) for beams, high in ((96, 1), (48, 0))),
+    Ddf(images(3, 48, 64), high=0, frame_version=b"5.26"),
+    *(Aris(images(4, beams, 700), mode=mode) for mode, beams in ARIS_BEAMS.items()),
+    Aris(images(5, 48, 64), mode=1, sound_speeds=[1480.0, 1480.1, 1480.0, 1480.2, 1480.0]),  # it drifts
+    *(
+        Oculus(images(4, beams, 40).astype(kind) * factor, version=version)
+        for version in (0, 2)
+        for kind, factor in (("u1", 1), ("u2", 257), ("u4", 1))
+        for beams in (256, 512)
+    ),
+]
+
+
+@pytest.mark.parametrize("recording", WHOLE, ids=lambda r: f"{type(r).__name__}-{r.frames.dtype}-{r.frames.shape[1]}")
+def test_frames_are_read_as_they_were_recorded(tmp_path: Path, recording: Any) -> None:
+    result = log_of(tmp_path, recording)
+    known = result.by_stamp()
+    first_ns = result.done.first_ns
+    assert isinstance(recording, Oculus) or first_ns == START_NS
+    for i, picture in enumerate(recording.frames):
+        image = known[min(known, key=lambda stamp_ns: abs(stamp_ns - first_ns - i * STEP_NS))]
+        np.testing.assert_array_equal(image, picture)
+        assert image.dtype == picture.dtype
+    assert len(known) == result.done.frames == len(recording.frames)
+    assert result.done.duration_s == pytest.approx((len(known) - 1) * 0.12)
+    assert (result.done.lost, result.done.shortcomings()) == ([], [])
+
+
+@pytest.mark.parametrize(
+    ("file", "begin_m", "length_m"),
+    [
+        ({"start_code": 3, "length_code": 0}, 1.26, 1.25),  # the window of the 2014 paper
+        ({"start_code": 1, "length_code": 3}, 0.42, 10.0),
+        ({"start_code": 3, "length_code": 0, "flags": 1}, 1.125, 1.125),
+        ({"start_code": 2, "length_code": 1, "flags": 2}, 0.84, 5.0),
+        ({"start_code": 2, "length_code": 1, "flags": 3}, 0.75, 4.5),
+        ({"start_code": 2, "length_code": 0, "high": 0}, 1.68, 5.0),
+        ({"start_code": 2, "length_code": 3, "high": 0, "flags": 1}, 1.5, 36.0),
+        ({"start_code": 2, "length_code": 0, "serial": 18}, 0.75, 1.125),
+        ({"start_code": 2, "length_code": 0, "serial": 15}, 0.75, 2.25),
+        ({"start_code": 3, "length_code": 0, "flags": 0xF0}, 1.26, 1.25),
+        ({"start_code": 3, "length_code": 0, "flags": 1, "version": 4}, 1.26, 1.25),
+    ],
+)
+def test_window_codes_of_a_didson_are_metres_at_1465_m_s(
+    tmp_path: Path, file: dict[str, Any], begin_m: float, length_m: float
+) -> None:
+    recording = Ddf(images(2, 96 if file.get("high", 1) else 48, 500), **file)
+    expected = begin_m + length_m / 500 * (np.arange(500) + 0.5)
+    np.testing.assert_allclose(log_of(tmp_path, recording).frames.ranges_m, expected, rtol=1e-6)
+    warm = log_of(tmp_path, recording, sound_speed_m_s=1500.0)
+    np.testing.assert_allclose(warm.frames.ranges_m, expected * 1500 / 1465, rtol=1e-6)
+    assert "1500 m/s" in warm.notes["sonar.ranges"]
+
+
+def test_ranges_of_an_aris_are_half_the_way_of_sound(tmp_path: Path) -> None:
+    """Bin i is sampled from delay + i period to the next, and sound goes there and back."""
+    recording = Aris(images(2, 128, 600), delay_us=1700, period_us=5, sound_speed=1480.0)
+    ranges_m = log_of(tmp_path, recording).frames.ranges_m
+    np.testing.assert_allclose(ranges_m[[0, 599]], [(1700 + 2.5) * 740e-6, (1700 + 599 * 5 + 2.5) * 740e-6], rtol=1e-6)
+
+
+MARKED = np.zeros((1, 96, 512), np.uint8)
+MARKED[0, 0] = 255
+
+
+@pytest.mark.parametrize(
+    ("recording", "first_deg", "last_deg"),
+    [  # the first beam in a file is the right-most, unless the sonar is upside down
+        (Ddf(MARKED), -14.26, 14.25),
+        (Ddf(MARKED, reverse=1), 14.25, -14.26),
+        (Aris(images(2, 128, 64), mode=9, system=1), -14.705, 14.705),
+        (Aris(images(2, 48, 64), mode=1, system=2, telephoto=1), -6.742, 6.742),
+        (Aris(images(2, 128, 64), mode=9, system=1, telephoto=1), -7.0 * 127 / 128, 7.0 * 127 / 128),  # no table
+        (Oculus(images(2, 26, 8)), 65.0, -60.0),
+    ],
+)
+def test_azimuths_are_positive_to_the_left(tmp_path: Path, recording: Any, first_deg: float, last_deg: float) -> None:
+    frames = log_of(tmp_path, recording).frames
+    assert degrees(frames)[[0, -1]] == pytest.approx([first_deg, last_deg], abs=0.01)
+    np.testing.assert_array_equal(frames.intensity, recording.frames)
+    if isinstance(recording, Oculus):
+        assert degrees(frames)[1] == pytest.approx(60.0)
+        np.testing.assert_allclose(frames.ranges_m, 0.003 * (np.arange(8) + 0.5), rtol=1e-6)
+
+
+NAN_DEPTH = bytearray(Aris(images(3, 48, 64), mode=1).content())
+put(NAN_DEPTH, 1024 + 128, "f", float("nan"))
+
+
+@pytest.mark.parametrize(
+    ("ending", "content", "expected"),
+    [
+        (
+            "ddf",
+            Ddf(images(3, 96, 64), readings={128: 2.5, 152: 90.0}).content(),
+            {"depth": "2.5 to 4.5", "time": "UTC"},
+        ),
+        ("ddf", Ddf(images(3, 96, 64), readings={152: 90.0}).content(), {"heading": "90 to 92", "pitch": None}),
+        ("aris", Aris(images(3, 48, 64), mode=1).content(), {"depth": "1.5 to 3.5", "compass heading": "88 to 90"}),
+        ("aris", bytes(NAN_DEPTH), {"depth": "2.5 to 3.5", "time": "since 1970"}),
+        ("raw", Oculus(images(3, 16, 8), version=2).content(), {"heading": "45 to 47", "pitch": "3 to 3"}),
+        ("raw", Oculus(images(3, 16, 8), gamma_code=127).content(), {"scale": "0.498", "time": "switched on"}),
+    ],
+)
+def test_readings_of_other_sensors_and_the_kind_of_time_are_in_the_notes(
+    tmp_path: Path, ending: str, content: bytes, expected: dict[str, str | None]
+) -> None:
+    """A reading that is always zero was not measured; those that are no numbers are left out."""
+    notes = converted(tmp_path, content, ending).notes
+    for name, words in expected.items():
+        assert words is None if f"sonar.{name}" not in notes else words is not None and words in notes[f"sonar.{name}"]
+
+
+@pytest.mark.parametrize(("recording", "span_db"), [(Ddf(images(1, 96, 64)), 90), (Aris(images(1, 128, 64)), 80)])
+def test_the_log_says_that_counts_of_lens_sonars_are_decibels(tmp_path: Path, recording: Any, span_db: float) -> None:
+    image = log_of(tmp_path, recording).calibration.sonar.image
+    np.testing.assert_allclose(image.decibels(np.array([0, 51, 255], np.uint8)), [0, 0.2 * span_db, span_db], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "code", "full_scale", "gamma"),
+    [("u1", 0, 255, 1.0), ("u2", 255, 65_535, 1.0), ("u1", 127, 255, 0.498), ("u1", 51, 255, 0.2)],
+)
+def test_the_log_says_the_scale_and_the_gamma_of_an_oculus(
+    tmp_path: Path, kind: str, code: int, full_scale: float, gamma: float
+) -> None:
+    image = log_of(tmp_path, Oculus(images(1, 16, 8).astype(kind), gamma_code=code)).calibration.sonar.image
+    assert (image.scale, image.full_scale) == ("linear", full_scale)
+    assert image.gamma == pytest.approx(gamma, abs=1e-3)
+
+
+@pytest.mark.parametrize("system", [(1, 1, 3.0e6), (1, 0, 1.8e6), (0, 1, 1.8e6), (2, 0, 0.7e6)])
+def test_frequency_and_speed_of_sound_are_in_the_messages(tmp_path: Path, system: tuple[int, int, float]) -> None:
+    kind, high, frequency_hz = system
+    log_of(tmp_path, Aris(images(1, 128, 64), system=kind, high=high))
+    with (tmp_path / "dive.mcap").open("rb") as stream:
+        ((*_, message),) = make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+    assert message.ping_info.frequency == pytest.approx(frequency_hz)
+    assert message.ping_info.sound_speed == pytest.approx(1482.5)
+
+
+# ---- damage of each kind
+
+
+ONE_DDF, TWO_DDF = Ddf(images(1, 48, 64), high=0), Ddf(images(2, 96, 512))
+ONE_ARIS, THREE_ARIS = Aris(images(1, 48, 64), mode=1), Aris(images(3, 128, 64))
+
+
+@pytest.mark.parametrize(
+    ("recording", "at", "value", "words"),
+    [
+        *((TWO_DDF, *case) for case in [
+            (0, b"MOV", "begins with b'MOV"),
+            (3, b"\x02", "version 2; versions 3 and 4"),
+            (3, b"\x05", "convert aris"),
+            (16, b"\x61", "97 beams"),
+            (12, b"\x07", "resolution 7"),
+            (24, b"\0\0", "0 samples"),
+            (16, b"\x30", "no whole frame"),  # possible, but not the number of beams of the frames
+            (25, b"\x01", "no whole frame"),  # nor that of samples
+        ]),
+        *((ONE_DDF, 512 + at, value.to_bytes(4, "little", signed=True), words) for at, value, words in [
+            (52, 32, "no whole frame: bytes 512 to 3839: frame 0 with window codes 32 and 0"),
+            (52, -1, "window codes -1 and 0"),
+            (56, 4, "window codes 3 and 4"),  # at low frequency there are four lengths
+            (20, 1970, "year 1970"),
+            (20, 2038, "year 2038"),
+            (24, 13, "a time that does not exist"),
+            (44, 100, "100 hundredths"),
+        ]),
+        (ONE_ARIS, 1024 + 20, (2**31 * 10**6).to_bytes(8, "little"), "frame 0 with a time of 2147483648000000 us"),
+        (Aris(images(3, 128, 64), mode=0), 0, b"", "no whole frame: bytes 1024 to 28671: a header with ping mode 0"),
+        (Aris(images(3, 128, 64), system=7), 0, b"", "system type 7"),
+        (Aris(images(3, 128, 64), in_order=0), 0, b"", "not in order"),
+        (Aris(images(3, 128, 64), sound_speed=15.0), 0, b"", "sound speed of 15"),
+        (Aris(images(3, 128, 64), sound_speed=float("nan")), 0, b"", "sound speed of nan"),
+    ],
+)  # fmt: skip
+def test_a_header_that_makes_no_sense_is_named(
+    tmp_path: Path, refusal: Any, recording: Any, at: int, value: bytes, words: str
+) -> None:
+    content = bytearray(recording.content())
+    content[at : at + len(value)] = value
+    path = tmp_path / "dive"
+    path.write_bytes(content)
+    refusal(lambda: CONVERTERS[ENDING[type(recording)]](path, tmp_path / "dive.mcap"), path, words)
+    assert not list(tmp_path.glob("*.mcap*"))
+
+
+@pytest.mark.parametrize(
+    ("ending", "content", "words"),
+    [
+        *(("ddf", ONE_DDF.content()[:length], "") for length in (0, 2, 3, 4, 300)),
+        ("aris", b"SO" * 4000, "DDF"),
+        ("raw", b"DDF\x05" + bytes(4000), "no Oculus ping"),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, refusal: Any, ending: str, content: bytes, words: str) -> None:
+    path = tmp_path / "dive"
+    path.write_bytes(content)
+    refusal(lambda: CONVERTERS[ending](path, tmp_path / "dive.mcap"), path, words)
+
+
+def test_a_damaged_file_header_of_an_aris_costs_no_frame(tmp_path: Path) -> None:
+    content = b"\xff" * 1024 + THREE_ARIS.content()[1024:]
+    np.testing.assert_array_equal(converted(tmp_path, content, "aris").frames.intensity, THREE_ARIS.frames)
+
+
+def test_frames_that_a_didsons_header_promises_are_missed(tmp_path: Path) -> None:
+    done = log_of(tmp_path, Ddf(images(3, 48, 64), high=0, promised=5)).done
+    assert done.shortcomings() == ["missing: 2 of 5 frames that the file's header names"]
+
+
+@pytest.mark.parametrize(
+    ("at", "layout", "value", "words"),
+    [
+        (122 - 8, "I", 100, "an image of 100 bytes"),
+        (122 - 4, "I", 2177, "a message of 2177 bytes"),
+        (122 - 12, "I", 150, "an image from byte 150"),
+        (122 - 12, "I", 2049, "a message of"),
+        (122 + 4, "h", -8000, "bearings that do not increase"),
+        (122, "h", -9100, "bearings that do not increase"),
+        (97, "B", 2, "3 bytes a sample"),
+        (98, "d", 5.0, "bins of 5 m"),
+        (98, "d", float("nan"), "bins of nan m"),
+        (106, "H", 0, "0 ranges"),
+        (108, "H", 2000, "2000 beams"),
+        (85, "d", 15.0, "sound speed of 15"),
+        *((length, "", None, "cut off") for length in (3, 16, 60, 130, 150)),
+    ],
+)
+def test_a_ping_whose_header_makes_no_sense_is_lost(
+    tmp_path: Path, at: int, layout: str, value: Any, words: str
+) -> None:
+    _, *pings = Oculus(images(4, 16, 8)).pieces()
+    broken = bytearray(pings[1])
+    if value is None:
+        pings[3] = pings[3][:at]
+    else:
+        put(broken, at, layout, value)
+    done = converted(tmp_path, b"".join([pings[0], bytes(broken), *pings[2:]]), "raw").done
+    assert done.frames == 3
+    assert words in str(done.lost[0])
+
+
+# ---- messages and clocks of an Oculus
+
+
+@pytest.mark.parametrize("version", [0, 2])
+def test_time_goes_on_where_the_clock_wraps_around(tmp_path: Path, version: int) -> None:
+    """The older clock has 32 bits: it begins anew after 4.3 s, here between the first and the second ping."""
+    stamps_ns = log_of(tmp_path, Oculus(images(60, 16, 8), version=version)).frames.stamps_ns
+    np.testing.assert_allclose(np.diff(stamps_ns), STEP_NS, atol=1)
+    assert stamps_ns[0] == pytest.approx(2**32 - 100_000_000, abs=1)
+
+
+def test_the_newer_clock_does_not_wrap_around(tmp_path: Path) -> None:
+    _, first, *_ = Oculus(images(1, 16, 8), version=2, first_clock=10**12).pieces()
+    _, second, *_ = Oculus(images(1, 16, 8, seed=1), version=2, first_clock=10**12 + 10**10, first_number=501).pieces()
+    stamps_ns = converted(tmp_path, first + second, "raw").frames.stamps_ns
+    assert stamps_ns.tolist() == [10**12, 10**12 + 10**10]
+
+
+@pytest.mark.parametrize("kind", ["u1", "u2"])
+def test_gains_of_the_rows_are_taken_out(tmp_path: Path, kind: str) -> None:
+    pictures = images(3, 16, 4).astype(kind)
+    frames = log_of(tmp_path, Oculus(pictures, gains=np.array([1, 4, 9, 16], np.uint32))).frames
+    np.testing.assert_allclose(frames.intensity, pictures / [1, 2, 3, 4], rtol=1e-6)
+
+
+def test_messages_without_images_are_passed_over_and_damage_after_one_costs_only_itself(tmp_path: Path) -> None:
+    pictures = images(4, 16, 8)
+    _, *pings = Oculus(pictures).pieces()
+    note, huge = oculus_note(b"SO" * 6), bytearray(oculus_note())
+    put(huge, 10, "I", 1 << 20)
+    begin = len(note) + len(pings[0]) + len(note)
+    for between, lost in (
+        (note, []),
+        (bytes(len(note)), [f"bytes {begin} to {begin + len(note) - 1}: no message begins here"]),
+        (bytes(huge), [f"bytes {begin} to {begin + len(huge) - 1}: a message of kind 0x55, version 0"]),
+    ):
+        result = converted(tmp_path, b"".join([note, pings[0], note, between, *pings[1:], note]), "raw")
+        np.testing.assert_array_equal(result.frames.intensity, pictures)
+        assert [str(loss) for loss in result.done.lost] == lost
+
+
+def test_pings_that_were_not_recorded_are_counted_but_not_where_numbers_begin_anew(tmp_path: Path) -> None:
+    _, *pings = Oculus(images(6, 16, 8)).pieces()
+    done = converted(tmp_path, b"".join(pings[:2] + pings[4:]), "raw").done
+    assert (done.frames, done.lost) == (4, [])
+    assert done.shortcomings() == ["missing: the numbers of 2 frames between the first and the last"]
+    anew = Oculus(images(3, 16, 8, seed=1), first_number=7).pieces()
+    assert converted(tmp_path, b"".join(pings[:3] + anew), "raw").done.missing == 0
+
+
+# ---- recordings of real sonars
+
+
+@pytest.mark.recording
+def test_a_real_recording_of_an_aris_is_read_to_the_byte(recordings: Path, tmp_path: Path) -> None:
+    source = recordings / "sonar" / "sample.aris"
+    done = convert_aris(source, tmp_path / "dive.mcap")
+    (frames,) = read_sonar_frames(tmp_path / "dive.mcap")
+    content = np.fromfile(source, np.uint8)[1024:].reshape(6, 1024 + 48 * 2000)[:, 1024:]
+    np.testing.assert_array_equal(frames.intensity, content.reshape(6, 2000, 48).transpose(0, 2, 1))
+    assert done.shortcomings() == []
+    assert frames.stamps_ns[0] == 1_371_198_080_759_456_000  # 2013-06-14, by the sonar
+    assert degrees(frames)[[0, -1]] == pytest.approx([-6.742, 6.742])  # an ARIS 1200 with telephoto lens
+    # the header also states 3.33 m and 20.3 m, for 1450 m/s; the water had 1435.93 m/s
+    assert frames.ranges_m[0] == pytest.approx(3.3299 * 1435.93 / 1450, abs=0.006)
+    assert frames.ranges_m[-1] - frames.ranges_m[0] == pytest.approx(20.3 * 1435.93 / 1450, abs=0.02)
+
+
+@pytest.mark.recording
+@pytest.mark.parametrize(("name", "count"), [("one_ping_8bit.raw", 1), ("three_pings_8bit.raw", 3)])
+def test_real_recordings_of_an_oculus_are_read_to_the_byte(
+    recordings: Path, tmp_path: Path, name: str, count: int
+) -> None:
+    source = recordings / "sonar" / name
+    done = convert_oculus(source, tmp_path / "dive.mcap")
+    (frames,) = read_sonar_frames(tmp_path / "dive.mcap")
+    content = np.fromfile(source, np.uint8).reshape(count, -1)[:, 2048:]
+    np.testing.assert_array_equal(frames.intensity, content.reshape(count, 703, 256).transpose(0, 2, 1))
+    assert done.shortcomings() == []
+    assert degrees(frames)[[0, -1]] == pytest.approx([30.0, -30.0])
+    assert frames.ranges_m[-1] == pytest.approx(2.0, abs=0.005)
+    assert np.diff(frames.stamps_ns) == pytest.approx([62_502_130, 62_502_097][: count - 1])
