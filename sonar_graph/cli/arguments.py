@@ -1,29 +1,30 @@
-"""Arguments and options that several commands share.
-
-Settings given on the command line or in a file: ``--set``, ``--topic``, ``--log-config``, ``--start``.
-
-What commands say in the same way everywhere.
-"""
+"""Arguments and options that several commands share, and settings given as texts."""
 
 from __future__ import annotations
 
-import json
 import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
 from rich.console import Console
 
-from sonar_graph.errors import CalibrationError, EstimatorError, EvaluationError, LogError
-from sonar_graph.settings import nested
+from sonar_graph.errors import EstimatorError, LogError
 
 if TYPE_CHECKING:
+    from sonar_graph.calibration import Section
     from sonar_graph.logs import PartialCalibration
     from sonar_graph.logs.adapters import LogConfig
     from sonar_graph.logs.mcap import TimeWindow
     from sonar_graph.sequence import Sequence
 
+Model = TypeVar("Model", bound="Section")
+FILE_WIDTH = 200
+"""Columns of output that does not go to a terminal, so that lines stay whole."""
 
 LogPath = Annotated[
     Path, typer.Argument(metavar="LOG", exists=True, dir_okay=False, readable=True, help="MCAP log to read.")
@@ -31,16 +32,6 @@ LogPath = Annotated[
 OutputLog = Annotated[Path, typer.Option("--output", "-o", metavar="OUT.mcap", help="MCAP log to write.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a file even where sonar-graph did not write it.")]
 OutputFolder = Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder to write to.")]
-CalibrationPath = Annotated[
-    Path | None,
-    typer.Option(
-        "--calibration",
-        metavar="FILE",
-        exists=True,
-        dir_okay=False,
-        help="TOML or JSON file whose fields go before those of the log's own calibration and mountings.",
-    ),
-]
 RateHz = Annotated[
     float,
     typer.Option(
@@ -54,46 +45,6 @@ EstimatorSettings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME.SETTING=VALUE", help="Change a setting of an estimator; may be repeated."),
 ]
-LogConfigPath = Annotated[
-    Path | None,
-    typer.Option(
-        "--log-config",
-        metavar="FILE.toml",
-        exists=True,
-        dir_okay=False,
-        help="What the topics of a foreign log are: types, fields, units, axes. `inspect LOG --toml` prints one.",
-    ),
-]
-TopicChoices = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--topic",
-        metavar="ROLE=TOPIC",
-        help="Topic for a role, where inspect says that several fit or none; may be repeated. "
-        "Roles: imu, dvl, depth, detections, truth, true_landmarks, sonar.",
-    ),
-]
-StartTime = Annotated[
-    str | None,
-    typer.Option(
-        "--start",
-        metavar="TIME",
-        help="Leave out what was recorded before: seconds from the log's beginning (90.5), or a date and time, "
-        "in UTC unless it says else (2026-05-01T12:30:00Z).",
-    ),
-]
-EndTime = Annotated[
-    str | None,
-    typer.Option("--end", metavar="TIME", help="Leave out what was recorded then and later; written like --start."),
-]
-Salvage = Annotated[
-    bool,
-    typer.Option(
-        "--salvage",
-        help="Read what is whole of a log that is damaged in its middle, "
-        "and say what is lost. One that is cut off is always read as far as it goes.",
-    ),
-]
 DesignsPath = Annotated[
     Path | None,
     typer.Option(
@@ -103,70 +54,200 @@ DesignsPath = Annotated[
         help="Landmark designs: a TOML file, or a folder of such files. Default: those that ship.",
     ),
 ]
-ModelPath = Annotated[
-    Path | None,
-    typer.Option(
-        "--model",
-        metavar="MODEL.json",
-        exists=True,
-        dir_okay=False,
-        help="How often landmarks look like which, as calibrate measured it.",
-    ),
-]
-RuleName = Annotated[
-    str | None,
-    typer.Option(
-        "--rule",
-        help="How beliefs are updated: virtual-evidence (ours, the default) or jeffrey (the 2014 paper's equations).",
-    ),
-]
-_SLACK = 1.01
-"""For a rate that is counted, not stated."""
 
 
-def parse_setting(text: str) -> tuple[str, Any]:
-    """Name and value of ``name=value``; the value is read as TOML, and as plain text where it is none.
+@dataclass(frozen=True)
+class ReadingOptions:
+    """Options for reading a log; `with_options` gives them to a command."""
+
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            "--calibration",
+            metavar="FILE",
+            exists=True,
+            dir_okay=False,
+            help="TOML or JSON file whose fields go before those of the log's own calibration and mountings.",
+        ),
+    ] = None
+    topics: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--topic",
+            metavar="ROLE=TOPIC",
+            help="Topic for a role, where inspect says that several fit or none; may be repeated. "
+            "Roles: imu, dvl, depth, detections, truth, true_landmarks, sonar.",
+        ),
+    ] = None
+    log_config: Annotated[
+        Path | None,
+        typer.Option(
+            "--log-config",
+            metavar="FILE.toml",
+            exists=True,
+            dir_okay=False,
+            help="What the topics of a foreign log are: types, fields, units, axes. `inspect LOG --toml` prints one.",
+        ),
+    ] = None
+    start: Annotated[
+        str | None,
+        typer.Option(
+            "--start",
+            metavar="TIME",
+            help="Leave out what was recorded before: seconds from the log's beginning (90.5), or a date and time, "
+            "in UTC unless it says else (2026-05-01T12:30:00Z).",
+        ),
+    ] = None
+    end: Annotated[
+        str | None,
+        typer.Option("--end", metavar="TIME", help="Leave out what was recorded then and later; written like --start."),
+    ] = None
+    salvage: Annotated[
+        bool,
+        typer.Option(
+            "--salvage",
+            help="Read what is whole of a log that is damaged in its middle, "
+            "and say what is lost. One that is cut off is always read as far as it goes.",
+        ),
+    ] = False
+
+    @property
+    def choices(self) -> dict[str, str]:
+        """Topics by role, from texts such as ``imu=/imu/data``.
+
+        Raises
+        ------
+        LogError
+            When a text has no role, no ``=`` or no topic.
+        """
+        choices = {}
+        for text in self.topics or []:
+            role, _, topic = text.partition("=")
+            if not role or not topic:
+                raise LogError(f"--topic {text}: expected ROLE=TOPIC such as imu=/imu/data")
+            choices[role] = topic
+        return choices
+
+    @property
+    def config(self) -> LogConfig | None:
+        """Description of the log's topics from a TOML file, if one is given."""
+        from sonar_graph.logs.adapters import read_log_config
+
+        return None if self.log_config is None else read_log_config(self.log_config)
+
+    @property
+    def given(self) -> PartialCalibration | None:
+        """Fields of a calibration from a file, if one is given."""
+        from sonar_graph.logs import PartialCalibration
+
+        return None if self.calibration is None else PartialCalibration.read(self.calibration)
+
+    @property
+    def window(self) -> TimeWindow:
+        """Part of the log to read."""
+        from sonar_graph.logs.mcap import TimeWindow
+
+        return TimeWindow.parse(self.start, self.end)
+
+    def read(self, log: Path, *, images: bool = False, progress: Callable[[int, int], None] | None = None) -> Sequence:
+        """Read a log as a sequence.
+
+        Parameters
+        ----------
+        images
+            The chosen topic of the role ``sonar`` is for the images, which are read separately.
+        """
+        from sonar_graph.logs import read_log
+
+        return read_log(
+            log,
+            calibration=self.given,
+            topics={role: topic for role, topic in self.choices.items() if not (images and role == "sonar")},
+            config=self.config,
+            window=self.window,
+            salvage=self.salvage,
+            progress=progress,
+        )
+
+
+def with_options(*left_out: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Replace each dataclass among a command's parameters by its fields, which typer turns into options.
+
+    Parameters
+    ----------
+    left_out
+        Fields that the command does not offer; they have their defaults.
+    """
+
+    def expand(command: Callable[..., None]) -> Callable[..., None]:
+        hints = get_type_hints(command, include_extras=True)
+        groups: dict[str, Any] = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
+        offered = {name: [f for f in fields(kind) if f.name not in left_out] for name, kind in groups.items()}
+
+        @wraps(command)
+        def run(**values: Any) -> None:
+            for name, kind in groups.items():
+                values[name] = kind(**{f.name: values.pop(f.name) for f in offered[name]})
+            command(**values)
+
+        parameters = []
+        for name, parameter in signature(command).parameters.items():
+            if name in groups:
+                kinds = get_type_hints(groups[name], include_extras=True)
+                given = [(f.name, f.default, kinds[f.name]) for f in offered[name]]
+            else:
+                given = [(name, parameter.default, hints[name])]
+            parameters += [Parameter(n, Parameter.KEYWORD_ONLY, default=d, annotation=kind) for n, d, kind in given]
+        run.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        return run
+
+    return expand
+
+
+def parse_settings(texts: list[str]) -> dict[str, Any]:
+    """Values by name from texts such as ``laps=2``, read as TOML, or as plain text if they are no TOML.
 
     Raises
     ------
     EstimatorError
-        When there is no name or no ``=``.
+        When a text has no name or no ``=``, or a name is given again with another value.
     """
-    name, equals, value = text.partition("=")
-    if not equals or not name.strip():
-        raise EstimatorError(f"--set {text}: expected name=value")
-    return name.strip(), _plain_value(value.strip())
+    settings: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not equals or not name:
+            raise EstimatorError(f"--set {text}: expected name=value")
+        parsed: Any = value
+        if "\n" not in value:
+            try:
+                parsed = tomllib.loads(f"value = {value}")["value"]
+            except tomllib.TOMLDecodeError:
+                parsed = value
+        if name in settings and settings[name] != parsed:
+            raise EstimatorError(f"--set {text}: {name} is also set to {settings[name]}; give it once")
+        settings[name] = parsed
+    return settings
 
 
-def nested_settings(texts: list[str]) -> dict[str, Any]:
-    """Settings by name, from texts such as ``laps=2``; dots go into nested settings: ``image.noise_db=20``.
+def nested_settings(texts: list[str] | None) -> dict[str, Any]:
+    """Settings in sections, from texts such as ``laps=2`` or ``image.noise_db=20``; errors as in `parse_settings`."""
+    from sonar_graph.settings import nested
 
-    Raises
-    ------
-    EstimatorError
-        When there is no name or no ``=``, or one comes again with another value.
-    """
-    return nested(_each_once(texts))
+    return nested(parse_settings(texts or []))
 
 
-def _plain_value(text: str) -> Any:
-    if "\n" in text:
-        return text
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
-
-
-def estimator_settings(texts: list[str], names: list[str]) -> dict[str, dict[str, Any]]:
+def estimator_settings(texts: list[str] | None, names: list[str]) -> dict[str, dict[str, Any]]:
     """Settings by estimator, from texts such as ``isam2.smoother.lag_s=20``; dots go into nested settings.
 
     Raises
     ------
     EstimatorError
-        When a text does not begin with one of the estimators that run, or one setting comes again with another value.
+        As `parse_settings`, and when a text does not begin with one of the estimators that run.
     """
-    given = _each_once(texts)
+    from sonar_graph.settings import nested
+
+    given = parse_settings(texts or [])
     for path in given:
         estimator, dot, setting = path.partition(".")
         if dot and estimator not in names:
@@ -176,102 +257,22 @@ def estimator_settings(texts: list[str], names: list[str]) -> dict[str, dict[str
     return nested(given)
 
 
-def _each_once(texts: list[str]) -> dict[str, Any]:
-    """Values by the names before ``=``; one name may come again only with the same value."""
-    settings: dict[str, Any] = {}
-    for text in texts:
-        path, value = parse_setting(text)
-        if path in settings and settings[path] != value:
-            raise EstimatorError(f"--set {text}: {path} is also set to {settings[path]}; give it once")
-        settings[path] = value
-    return settings
-
-
-def topic_choices(texts: list[str]) -> dict[str, str]:
-    """Topics by role, from texts such as ``imu=/imu/data``.
+def validated(kind: type[Model], values: dict[str, Any], whose: str) -> Model:
+    """Settings as their model.
 
     Raises
     ------
-    LogError
-        When there is no role, no ``=`` or no topic.
+    typer.BadParameter
+        Naming each setting that does not exist or does not fit, and those that exist.
     """
-    choices = {}
-    for text in texts:
-        role, _, topic = text.partition("=")
-        if not role or not topic:
-            raise LogError(f"--topic {text}: expected ROLE=TOPIC such as imu=/imu/data")
-        choices[role] = topic
-    return choices
+    from pydantic import ValidationError
 
+    from sonar_graph.settings import faults_in
 
-def check_rate(rate_hz: float, sequence: Sequence, default_hz: float) -> None:
-    """Refuse to ask for estimates more often than the IMU measures; the default rate holds for any log.
-
-    Raises
-    ------
-    EvaluationError
-        Naming the highest rate.
-    """
-    stamps_ns = sequence.imu.stamps_ns
-    imu_hz = len(stamps_ns) / max(float(stamps_ns[-1] - stamps_ns[0]) * 1e-9, 1.0)
-    highest_hz = max(default_hz, imu_hz)
-    if rate_hz > highest_hz * _SLACK:
-        raise EvaluationError(
-            f"--rate-hz {rate_hz:g}: the IMU of {sequence.name} measures {imu_hz:.4g} times a second; "
-            f"give at most {highest_hz:.4g}"
-        )
-
-
-def read_config(path: Path | None) -> LogConfig | None:
-    """What a TOML file says about a log's topics; None where no file is given.
-
-    Raises
-    ------
-    LogError
-        When the file is not TOML, or says something that cannot be.
-    """
-    from sonar_graph.logs.adapters import read_log_config
-
-    return None if path is None else read_log_config(path)
-
-
-def read_calibration(path: Path | None) -> PartialCalibration | None:
-    """What a TOML or JSON file says of the calibration, before the log's own; None where no file is given.
-
-    Raises
-    ------
-    CalibrationError
-        When the file is neither TOML nor JSON, or a field does not fit.
-    """
-    from sonar_graph.logs import PartialCalibration
-
-    if path is None:
-        return None
     try:
-        text = path.read_text(encoding="utf-8")
-        values = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except (json.JSONDecodeError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        kind = "JSON" if path.suffix == ".json" else "TOML"
-        raise CalibrationError(f"{path}: not {kind}: {error}") from error
-    if not isinstance(values, dict):
-        raise CalibrationError(f"{path}: expected an object with sections such as imu, not {json.dumps(values):.40}")
-    return PartialCalibration.parse(values, str(path))
-
-
-def window_of(start: str | None, end: str | None) -> TimeWindow:
-    """The part of a log that ``--start`` and ``--end`` name.
-
-    Raises
-    ------
-    LogError
-        When one is no time.
-    """
-    from sonar_graph.logs.mcap import Instant, TimeWindow
-
-    return TimeWindow(Instant.parse(start) if start else None, Instant.parse(end) if end else None)
-
-
-WIDTH_OF_A_FILE = 200
+        return kind.model_validate(values)
+    except ValidationError as error:
+        raise typer.BadParameter(f"settings of the {whose}: {faults_in(error, kind)}") from error
 
 
 def examples(*commands: str) -> str:
@@ -280,6 +281,6 @@ def examples(*commands: str) -> str:
 
 
 def answers() -> Console:
-    """Where results go: stdout, and where that is no terminal, wide enough for lines to stay whole."""
+    """Console for results on stdout; if that is no terminal, it is `FILE_WIDTH` wide."""
     console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=WIDTH_OF_A_FILE)
+    return console if console.is_terminal else Console(highlight=False, width=FILE_WIDTH)

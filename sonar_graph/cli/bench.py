@@ -1,7 +1,4 @@
-"""``sonar-graph bench``: a suite of runs, done on all cores or on a cluster.
-
-``sonar-graph bench``: the group of its commands; ``bless`` a reference, and ``gate`` a batch by it.
-"""
+"""``sonar-graph bench``: ``run`` a suite on all cores or on a cluster, ``bless`` a reference, ``gate`` a batch."""
 
 from __future__ import annotations
 
@@ -26,7 +23,7 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 SHOWN = 10
-"""Lines about runs that stand out; the report lists every run."""
+"""Most lines about runs that stand out; the report lists every run."""
 BatchFolder = Annotated[
     Path, typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that bench wrote.")
 ]
@@ -100,7 +97,7 @@ def bench(
 
 
 def exit_by_gate(folder: Path, reference: Path, *, is_strict: bool) -> None:
-    """Print what got worse, and exit with 1 where anything did; if strict also where there is something to look at."""
+    """Print the verdict of the gate, and exit with 1 if it fails; if strict, also if there is anything to look at."""
     from sonar_graph.batch import gate as judge
     from sonar_graph.batch import read_batch
 
@@ -116,7 +113,7 @@ def exit_by_gate(folder: Path, reference: Path, *, is_strict: bool) -> None:
 
 
 def verdict_lines(verdict: GateVerdict) -> list[str]:
-    """What got worse, what a person should look at, and what the tests could have seen."""
+    """Lines of the verdict: what got worse, what to look at, and what the tests could have found."""
     lines = [f"Worse: {worsening}" for worsening in verdict.worsenings]
     lines += [f"Look at: {line}" for line in verdict.look_at[:SHOWN]]
     if len(verdict.look_at) > SHOWN:
@@ -129,18 +126,17 @@ def verdict_lines(verdict: GateVerdict) -> list[str]:
     if verdict.unmoved:
         lines.append(f"Hardly different from the reference: {', '.join(verdict.unmoved)}")
     if verdict.detectable:
-        told = ", ".join(_seen(name, share, verdict.cases[name]) for name, share in verdict.detectable.items())
+        sizes = []
+        for name, share in verdict.detectable.items():
+            size = f"about {share:.0%}" if math.isfinite(share) else "more than ten times"
+            sizes.append(f"{size} ({name}, {verdict.cases[name]} cases)")
+        told = ", ".join(sizes)
         lines.append(f"Would have been found in four of five batches: one error larger on all logs by {told}")
     return lines
 
 
-def _seen(contestant: str, share: float, cases: int) -> str:
-    size = f"about {share:.0%}" if math.isfinite(share) else "more than ten times"
-    return f"{size} ({contestant}, {cases} cases)"
-
-
 def write_report_of(folder: Path) -> Path:
-    """Write the page and the tables of a batch from its results, and say where runs are missing in them."""
+    """Write the page and the tables of a batch from its results, and warn of runs that are missing."""
     from sonar_graph.batch import read_batch
     from sonar_graph.report import lost_told, missing_told, write_batch_report
 
@@ -175,10 +171,10 @@ DEFAULT_COMMAND = "run"
 
 
 class SuiteFirst(TyperGroup):
-    """Commands of which `DEFAULT_COMMAND` need not be named: ``bench SUITE.toml`` is ``bench run SUITE.toml``."""
+    """Group of commands with a default one: ``bench SUITE.toml`` is ``bench run SUITE.toml``."""
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
-        """Put the name of the default command where none is given."""
+        """Insert the name of the default command if none is given."""
         is_named = not args or args[0] in self.commands or args[0] in ctx.help_option_names
         return super().parse_args(ctx, args if is_named else [DEFAULT_COMMAND, *args])
 

@@ -1,136 +1,73 @@
-"""``sonar-graph run``, ``compare`` and ``report``: from a log to a side-by-side report.
-
-``sonar-graph demo``: the experiment of the 2014 paper in short, from sonar images to the report.
-
-``sonar-graph estimators``: what is installed, with every setting.
-"""
+"""``sonar-graph run``, ``compare``, ``report``, ``demo`` and ``estimators``: from a log to a side-by-side report."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
 from sonar_graph.cli.arguments import (
-    CalibrationPath,
-    DesignsPath,
-    EndTime,
     EstimatorSettings,
-    LogConfigPath,
     LogPath,
-    ModelPath,
     OutputFolder,
     RateHz,
-    RuleName,
-    Salvage,
-    StartTime,
-    TopicChoices,
+    ReadingOptions,
     answers,
-    check_rate,
     estimator_settings,
-    read_calibration,
-    read_config,
-    topic_choices,
-    window_of,
+    with_options,
 )
 from sonar_graph.cli.bench import write_report_of
-from sonar_graph.cli.outputs import Report, progress_bars, working, writable_folder, writable_log
-from sonar_graph.cli.recognise import our_recogniser, warn_of_other_designs
+from sonar_graph.cli.outputs import progress_bars, working, writable_folder, writable_log
+from sonar_graph.cli.recognise import RecogniserOptions, warn_of_other_designs
 from sonar_graph.cli.simulate import write_basin
-from sonar_graph.errors import EstimatorError, LogError, UnknownEstimatorError
+from sonar_graph.errors import EstimatorError, EvaluationError, LogError
 
 if TYPE_CHECKING:
     from sonar_graph.evaluation import Comparison
-    from sonar_graph.recognition import Recognition
     from sonar_graph.sequence import Sequence
-
 
 DEFAULT_ESTIMATORS = "isam2,ekf-slam,dead-reckoning"
 DEFAULT_RATE_HZ = 2.0
+RATE_SLACK = 1.01
+"""Tolerance for the IMU's rate, which is counted from its stamps."""
+LOG = "basin.mcap"
+DEMO = {"duration_s": 390.0, "laps": 3, "imu": "mti1", "dvl": "explorer", "image": {}}
+"""The three laps of the paper in less time; cheap sensors, so that dead reckoning drifts within minutes."""
 
 
-@dataclass(frozen=True)
-class LogSource:
-    """A log, and what the user said about reading it."""
-
-    path: Path
-    calibration: Path | None = None
-    topics: list[str] | None = None
-    config: Path | None = None
-    start: str | None = None
-    end: str | None = None
-    salvage: bool = False
-    designs: Path | None = None
-    model: Path | None = None
-    rule: str | None = None
-
-    @property
-    def files(self) -> tuple[Path | None, ...]:
-        """What is read, and must not be overwritten."""
-        return self.path, self.calibration, self.config, self.designs, self.model
-
-    @property
-    def is_recognised_anew(self) -> bool:
-        """Whether images are looked at even where the log has detections."""
-        return not (self.designs is None and self.model is None and self.rule is None)
-
-    def read(self, progress: Report) -> Sequence:
-        """The log as a sequence; the errors are those of reading a log, a calibration, or choices of topics."""
-        from sonar_graph.logs import read_log
-
-        topics, config = topic_choices(self.topics or []), read_config(self.config)
-        return read_log(
-            self.path,
-            calibration=read_calibration(self.calibration),
-            topics=topics,
-            config=config,
-            window=window_of(self.start, self.end),
-            salvage=self.salvage,
-            progress=partial(progress, f"reading {self.path.name}"),
-        )
-
-
+@with_options()
 def run(
     log: LogPath,
     output: OutputFolder,
+    reading: ReadingOptions,
     estimator: Annotated[str, typer.Option("--estimator", help="Name of an installed estimator.")] = "isam2",
     rate_hz: RateHz = DEFAULT_RATE_HZ,
     settings: EstimatorSettings = None,
-    calibration: CalibrationPath = None,
-    topics: TopicChoices = None,
-    log_config: LogConfigPath = None,
-    start: StartTime = None,
-    end: EndTime = None,
-    salvage: Salvage = False,
 ) -> None:
     """Run one estimator on a log; write its trajectories, landmarks and scores."""
-    source = LogSource(log, calibration, topics, log_config, start, end, salvage)
-    comparison = _compare_log(source, output, [estimator], rate_hz, settings)
-    _print_summary(comparison)
-    typer.echo(f"Results: {output}")
-    _exit_by(comparison)
+    from sonar_graph.evaluation import write_comparison, write_viewer_files
+
+    comparison = compare_log(log, output, [estimator], reading, RecogniserOptions(), rate_hz, settings)
+    with working("writing results"):
+        write_comparison(comparison, output)
+        write_viewer_files(comparison, output)
+    print_outcome(comparison, f"Results: {output}")
 
 
+@with_options()
 def compare(
     log: LogPath,
     output: OutputFolder,
+    recognition: RecogniserOptions,
+    reading: ReadingOptions,
     estimators: Annotated[str, typer.Option(help="Names of installed estimators, with commas.")] = DEFAULT_ESTIMATORS,
     rate_hz: RateHz = DEFAULT_RATE_HZ,
     settings: EstimatorSettings = None,
-    designs: DesignsPath = None,
-    model: ModelPath = None,
-    rule: RuleName = None,
-    calibration: CalibrationPath = None,
-    topics: TopicChoices = None,
-    log_config: LogConfigPath = None,
-    start: StartTime = None,
-    end: EndTime = None,
-    salvage: Salvage = False,
 ) -> None:
     """Run several estimators on the same measurements and write a report on how they compare.
 
@@ -139,12 +76,22 @@ def compare(
 
     Writes report.html, comparison.json, result.mcap for a viewer, and runs/NAME/ with each estimator's trajectories.
     """
-    source = LogSource(log, calibration, topics, log_config, start, end, salvage, designs, model, rule)
-    comparison = _compare_log(source, output, _estimator_names(estimators), rate_hz, settings)
-    page = _write_report(comparison, output)
-    _print_summary(comparison)
-    typer.echo(f"Report: {page}")
-    _exit_by(comparison)
+    from sonar_graph.report import write_report
+
+    names = [name.strip() for name in estimators.split(",")]
+    if not any(names):
+        raise EstimatorError(f"--estimators {estimators!r}: expected names such as {DEFAULT_ESTIMATORS}")
+    again = next((name for name in names if names.count(name) > 1), None)
+    if not all(names):
+        raise EstimatorError(
+            f"--estimators {estimators!r}: a name is empty; expected names such as {DEFAULT_ESTIMATORS}"
+        )
+    if again is not None:
+        raise EstimatorError(f"--estimators {estimators!r}: {again} is named twice; each runs once")
+    comparison = compare_log(log, output, names, reading, recognition, rate_hz, settings)
+    with working("writing results"):
+        page = write_report(comparison, output)
+    print_outcome(comparison, f"Report: {page}")
 
 
 def report(
@@ -156,139 +103,15 @@ def report(
     """Write report.html, and a batch's tables, anew from what compare, run or bench left in a folder."""
     from sonar_graph.batch import is_batch
     from sonar_graph.evaluation import read_comparison
-
-    if is_batch(folder):
-        typer.echo(f"Report: {write_report_of(writable_folder(folder))}")
-        return
-    comparison = read_comparison(folder)
-    typer.echo(f"Report: {_write_report(comparison, writable_folder(folder))}")
-
-
-def _estimator_names(text: str) -> list[str]:
-    """Names from a list with commas, in order.
-
-    Raises
-    ------
-    EstimatorError
-        When there is none, one is empty, or one comes again.
-    """
-    names = [name.strip() for name in text.split(",")]
-    if not any(names):
-        raise EstimatorError(f"--estimators {text!r}: expected names such as {DEFAULT_ESTIMATORS}")
-    again = next((name for name in names if names.count(name) > 1), None)
-    if not all(names):
-        raise EstimatorError(f"--estimators {text!r}: a name is empty; expected names such as {DEFAULT_ESTIMATORS}")
-    if again is not None:
-        raise EstimatorError(f"--estimators {text!r}: {again} is named twice; each runs once")
-    return names
-
-
-def _compare_log(
-    source: LogSource, output: Path, names: list[str], rate_hz: float, settings: list[str] | None
-) -> Comparison:
-    from sonar_graph.evaluation import compare as compare_runs
-
-    overrides = estimator_settings(settings or [], names)
-    _check_settings(names, overrides)
-    writable_folder(output, source.files)
-    with progress_bars() as progress:
-        sequence = source.read(progress)
-    check_rate(rate_hz, sequence, DEFAULT_RATE_HZ)
-    sequence, recognition = _with_recognised(source, sequence)
-    with progress_bars() as progress:
-        comparison = compare_runs(sequence, names, overrides, rate_hz=rate_hz, progress=progress)
-    comparison = replace(comparison, recognition=recognition)
-    _write_results(comparison, output)
-    return comparison
-
-
-def _with_recognised(source: LogSource, sequence: Sequence) -> tuple[Sequence, Recognition | None]:
-    """The sequence with landmarks recognised in the log's sonar images, where that is asked for or it has none yet.
-
-    Raises
-    ------
-    LogError
-        When it is asked for and there are no images.
-    """
-    from sonar_graph.recognition import no_images, recognise_images, with_detections
-
-    if sequence.detections is not None and not source.is_recognised_anew:
-        return sequence, None
-    topic = topic_choices(source.topics or []).get("sonar")
-    with progress_bars() as progress:
-        found = recognise_images(
-            source.path,
-            sequence,
-            topic=topic,
-            config=read_config(source.config),
-            recogniser=our_recogniser(sequence.calibration, source.designs, source.model, source.rule),
-            window=window_of(source.start, source.end),
-            salvage=source.salvage,
-            progress=lambda done: progress("recognising landmarks (frames)", done, 0),
-        )
-    if found is None:
-        if source.is_recognised_anew:
-            raise LogError(f"{no_images(source.path)}; --designs, --model and --rule are for images")
-        return sequence, None
-    if source.designs is None:
-        warn_of_other_designs(sequence)
-    return with_detections(sequence, found), found
-
-
-def _check_settings(names: list[str], overrides: dict[str, dict[str, Any]]) -> None:
-    """Refuse unknown names and settings before the log is read.
-
-    An estimator that cannot be loaded is no mistake of the user's: its run fails, and the others go on.
-    """
-    from sonar_graph.estimator import load_estimator, make_params
-
-    for name in names:
-        try:
-            estimator = load_estimator(name)
-        except UnknownEstimatorError:
-            raise
-        except EstimatorError:
-            continue
-        make_params(estimator, overrides.get(name, {}), name)
-
-
-def _write_results(comparison: Comparison, folder: Path) -> None:
-    from sonar_graph.evaluation import write_comparison, write_viewer_files
-
-    with working("writing results"):
-        write_comparison(comparison, folder)
-        write_viewer_files(comparison, folder)
-
-
-def _write_report(comparison: Comparison, folder: Path) -> Path:
     from sonar_graph.report import write_page
 
-    with working("drawing"):
-        return write_page(comparison, folder)
-
-
-def _print_summary(comparison: Comparison) -> None:
-    from sonar_graph.report import published_counterpart, summary
-
-    out = answers()
-    out.print(summary(comparison))
-    counterpart = published_counterpart(comparison)
-    if counterpart is not None:
-        out.print(counterpart)
-
-
-def _exit_by(comparison: Comparison) -> None:
-    """Exit with 1 when a run failed, saying why; everything is written by then."""
-    failed = [run for run in comparison.runs if run.status == "failed"]
-    for run in failed:
-        typer.echo(f"sonar-graph: {run.estimator} failed: {run.reason}", err=True)
-    if failed:
-        raise typer.Exit(1)
-
-
-LOG = "basin.mcap"
-DEMO = {"duration_s": 390.0, "laps": 3, "imu": "mti1", "dvl": "explorer", "image": {}}
-"""The three laps of the paper in less time; cheap sensors, so that dead reckoning drifts within minutes."""
+    if is_batch(folder):
+        page = write_report_of(writable_folder(folder))
+    else:
+        comparison = read_comparison(folder)
+        with working("drawing"):
+            page = write_page(comparison, writable_folder(folder))
+    typer.echo(f"Report: {page}")
 
 
 def demo(output: OutputFolder = Path("demo")) -> None:
@@ -303,7 +126,7 @@ def demo(output: OutputFolder = Path("demo")) -> None:
     typer.echo(f"Simulating {options.duration_s:g} s in a basin, {options.laps} laps, with sonar images: {log}")
     write_basin(log, options)
     typer.echo("Recognising landmarks in them, then running the estimators")
-    compare(log, output)
+    compare.__wrapped__(log, output, RecogniserOptions(), ReadingOptions())  # type: ignore[attr-defined]
 
 
 def estimators() -> None:
@@ -327,5 +150,91 @@ def estimators() -> None:
             table.add_row(escape(setting.name), escape(str(setting.default)), escape(setting.meaning))
         console.print(table if settings.model_fields else "  no settings")
         console.print()
+    if failed:
+        raise typer.Exit(1)
+
+
+def compare_log(
+    log: Path,
+    output: Path,
+    names: list[str],
+    reading: ReadingOptions,
+    recognition: RecogniserOptions,
+    rate_hz: float,
+    settings: list[str] | None,
+) -> Comparison:
+    """Read a log, recognise landmarks if it needs that, and compare estimators; mistakes are reported first.
+
+    Raises
+    ------
+    SonarGraphError
+        When an argument does not fit, or the log cannot be read.
+    """
+    from sonar_graph.evaluation import check_request
+    from sonar_graph.evaluation import compare as compare_runs
+    from sonar_graph.recognition import no_images, recognise_images, with_detections
+
+    overrides = estimator_settings(settings, names)
+    for name in names:
+        check_request(name, overrides.get(name))
+    writable_folder(output, (log, reading.calibration, reading.log_config, recognition.designs, recognition.model))
+    with progress_bars() as progress:
+        sequence = reading.read(log, progress=partial(progress, f"reading {log.name}"))
+    check_rate(rate_hz, sequence)
+    found = None
+    if sequence.detections is None or recognition.is_given:
+        with progress_bars() as progress:
+            found = recognise_images(
+                log,
+                sequence,
+                topic=reading.choices.get("sonar"),
+                config=reading.config,
+                recogniser=recognition.recogniser(sequence.calibration),
+                window=reading.window,
+                salvage=reading.salvage,
+                progress=lambda done: progress("recognising landmarks (frames)", done, 0),
+            )
+        if found is None and recognition.is_given:
+            raise LogError(f"{no_images(log)}; --designs, --model and --rule are for images")
+    if found is not None:
+        if recognition.designs is None:
+            warn_of_other_designs(sequence)
+        sequence = with_detections(sequence, found)
+    with progress_bars() as progress:
+        comparison = compare_runs(sequence, names, overrides, rate_hz=rate_hz, progress=progress)
+    return replace(comparison, recognition=found)
+
+
+def check_rate(rate_hz: float, sequence: Sequence) -> None:
+    """Refuse to ask for estimates more often than the IMU measures; the default rate is valid for any log.
+
+    Raises
+    ------
+    EvaluationError
+        Naming the highest rate.
+    """
+    stamps_ns = sequence.imu.stamps_ns
+    imu_hz = len(stamps_ns) / max(float(stamps_ns[-1] - stamps_ns[0]) * 1e-9, 1.0)
+    highest_hz = max(DEFAULT_RATE_HZ, imu_hz)
+    if rate_hz > highest_hz * RATE_SLACK:
+        raise EvaluationError(
+            f"--rate-hz {rate_hz:g}: the IMU of {sequence.name} measures {imu_hz:.4g} times a second; "
+            f"give at most {highest_hz:.4g}"
+        )
+
+
+def print_outcome(comparison: Comparison, place: str) -> None:
+    """Print the table of scores and where the files are; exit with 1 if a run failed, saying why."""
+    from sonar_graph.report import published_counterpart, summary
+
+    out = answers()
+    out.print(summary(comparison))
+    counterpart = published_counterpart(comparison)
+    if counterpart is not None:
+        out.print(counterpart)
+    typer.echo(place)
+    failed = [run for run in comparison.runs if run.status == "failed"]
+    for run in failed:
+        typer.echo(f"sonar-graph: {run.estimator} failed: {run.reason}", err=True)
     if failed:
         raise typer.Exit(1)

@@ -1,15 +1,15 @@
-"""The commands: thin shells around the library, one module a group.
+"""The commands: thin layers over the library, one module for each group.
 
-Exit codes: 0 done; 1 a comparison in which some run failed (everything is written), or a batch that is worse than its
-reference; 2 the user's mistake, told in one line on stderr; 130 interrupted. Only an error that nobody foresaw ends in
-a traceback.
+Exit codes: 0 done; 1 a comparison with a failed run (everything is written), or a batch that is worse than its
+reference; 2 a mistake of the user, reported in one line on stderr; 130 interrupted. Only unforeseen errors end in a
+traceback.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -65,48 +65,34 @@ app.command(epilog=examples("sonar-graph estimators"))(estimators)
 app.command(epilog=examples("sonar-graph demo -o demo"))(demo)
 
 
-def _show_version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"sonar-graph {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def _options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
-    ] = False,
+@app.callback(invoke_without_command=True)
+def show_version(
+    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
 ) -> None:
     """Landmark SLAM for underwater vehicles: estimators compared on the same log."""
+    if version:
+        typer.echo(f"sonar-graph {__version__}")
+        raise typer.Exit
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit with its code; the entry point of ``sonar-graph``."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    sys.exit(_exit_code(given or ["--help"]))
-
-
-def _exit_code(arguments: list[str]) -> int:
     try:
-        code = app(arguments, prog_name="sonar-graph", standalone_mode=False)
+        code = app(given or ["--help"], prog_name="sonar-graph", standalone_mode=False)
     except (SonarGraphError, OSError) as error:
-        return _complain(str(error), MISTAKE)
+        code = _complain(str(error), MISTAKE)
     except KeyboardInterrupt:
-        return _complain("interrupted", INTERRUPTED)
+        code = INTERRUPTED
     except Exception as error:
-        return _complain_of_usage(error)
+        if not hasattr(error, "format_message"):  # not typer's own: nobody foresaw it
+            raise
+        context = getattr(error, "ctx", None)
+        command = context.command_path if context else "sonar-graph"
+        code = _complain(f"{error.format_message().rstrip('.')}; see {command} --help", MISTAKE)
     if code == INTERRUPTED:  # typer turns Ctrl-C into this code without a word
-        return _complain("interrupted", INTERRUPTED)
-    return int(code or 0)
-
-
-def _complain_of_usage(error: Any) -> int:
-    """A wrong option or argument, in one line; what is not typer's own is unforeseen and goes on."""
-    if not hasattr(error, "format_message"):
-        raise error
-    context = getattr(error, "ctx", None)
-    command = context.command_path if context else "sonar-graph"
-    return _complain(f"{error.format_message().rstrip('.')}; see {command} --help", MISTAKE)
+        _complain("interrupted", INTERRUPTED)
+    sys.exit(int(code or 0))
 
 
 def _complain(message: str, code: int) -> int:

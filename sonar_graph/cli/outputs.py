@@ -1,6 +1,6 @@
-"""Places to write to, tried before any long work begins; nothing that the user wrote is overwritten.
+"""Output files, checked before any long work begins, and progress on stderr, silent unless it is a terminal.
 
-Progress on stderr, for people only: silent where stderr is no terminal.
+Files that the user wrote are never overwritten.
 """
 
 from __future__ import annotations
@@ -20,14 +20,12 @@ _WRITTEN_FOR_A_RUN = ("trajectory.tum", "causal.tum", "landmarks.csv", "result.j
 
 
 def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = False) -> Path:
-    """``path``, with its folder made, once it is known that a log can be written there.
+    """Check that a log can be written, make its folder, and return ``path``.
 
     Parameters
     ----------
-    path
-        Of the log.
     source
-        File or folder that it is made from; never overwritten.
+        File or folder that the log is made from; never overwritten.
     overwrite
         Replace a file that this package did not write.
 
@@ -50,19 +48,12 @@ def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = Fa
 
 
 def writable_json(path: Path, sources: Iterable[Path]) -> Path:
-    """``path``, with its folder made, once it is known that a JSON file can be written there.
-
-    Parameters
-    ----------
-    path
-        Of the file.
-    sources
-        Files that it is made from; never overwritten.
+    """Check that a JSON file can be written, make its folder, and return ``path``.
 
     Raises
     ------
     EvaluationError
-        When it is a folder, is not called ``*.json``, is a source, or its folder cannot be written to.
+        When it is a folder, is not called ``*.json``, is one of the sources, or its folder cannot be written to.
     """
     if path.is_dir() or path.suffix != ".json":
         raise EvaluationError(f"{path}: expected the name of a file that ends in .json")
@@ -73,24 +64,19 @@ def writable_json(path: Path, sources: Iterable[Path]) -> Path:
 
 
 def writable_folder(path: Path, sources: Iterable[Path | None] = ()) -> Path:
-    """``path``, made where it did not exist, once it is known that a comparison can be written there.
-
-    Parameters
-    ----------
-    path
-        Of the folder.
-    sources
-        Files that are read; never overwritten.
+    """Check that a comparison can be written to a folder, make it, and return ``path``.
 
     Raises
     ------
     EvaluationError
-        When it is a file, cannot be written to, or holds a source under a name that is written, or a
+        When it is a file, cannot be written to, or holds one of the sources under a name that is written, or a
         ``result.mcap`` that this package did not write.
     """
     if path.exists() and not path.is_dir():
         raise EvaluationError(f"{path}: is a file; give a folder with -o")
-    for written in _written_in(path):
+    names = [path / name for name in _WRITTEN]
+    names += [run / name for run in path.glob("runs/*") for name in _WRITTEN_FOR_A_RUN]
+    for written in filter(Path.exists, names):
         if any(source is not None and written.samefile(source) for source in sources):
             raise EvaluationError(
                 f"{written}: is what is read, and would be overwritten; choose another folder with -o"
@@ -101,29 +87,22 @@ def writable_folder(path: Path, sources: Iterable[Path | None] = ()) -> Path:
     return path
 
 
-def _written_in(folder: Path) -> Iterator[Path]:
-    """What is there under the names of a comparison's files."""
-    names = [folder / name for name in _WRITTEN]
-    names += [run / name for run in folder.glob("runs/*") for name in _WRITTEN_FOR_A_RUN]
-    yield from (path for path in names if path.exists())
-
-
 def _is_part_of(path: Path, source: Path) -> bool:
-    """Whether a file is the source, be it through links, or lies in the folder that is the source."""
+    """True if a file is the source, also through links, or lies in the folder that is the source."""
     if not path.exists():
         return False
     return path.samefile(source) or (source.is_dir() and path.resolve().is_relative_to(source.resolve()))
 
 
 def _is_replaceable(path: Path) -> bool:
-    """Whether a file holds nothing, or what this package can make again."""
+    """True if there is no file, an empty one, or a log that this package wrote."""
     from sonar_graph.logs.mcap import is_own_log
 
     return not path.exists() or path.stat().st_size == 0 or is_own_log(path)
 
 
 def _require_writing_in(folder: Path, path: Path, refusal: type[SonarGraphError]) -> None:
-    """Make a folder and try to write there, on behalf of a path."""
+    """Make a folder and try to write there; an error names the path that was asked for."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=folder):
@@ -133,12 +112,12 @@ def _require_writing_in(folder: Path, path: Path, refusal: type[SonarGraphError]
 
 
 Report = Callable[[str, int, int], None]
-"""Called with what is being done, how many steps are done, and how many there are (0: not known)."""
+"""Called with the name of the work, the number of steps done, and their total (0: not known)."""
 
 
 @contextmanager
 def progress_bars() -> Iterator[Report]:
-    """One bar for each thing that is reported on, while the context is open."""
+    """Progress bars, one for each name of work, while the context is open."""
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(elapsed_when_finished=True))
     bars = Progress(*columns, console=console, disable=not console.is_terminal, transient=True)
@@ -155,7 +134,7 @@ def progress_bars() -> Iterator[Report]:
 
 @contextmanager
 def working(what: str) -> Iterator[None]:
-    """A spinner beside ``what``, for work whose length is not known."""
+    """Spinner beside ``what``, for work of unknown length."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield

@@ -1,7 +1,4 @@
-"""``sonar-graph simulate``: worlds with known truth.
-
-``sonar-graph simulate landmarks``: simulated landmarks on a recorded run.
-"""
+"""``sonar-graph simulate``: a basin with known truth, and landmarks on a recorded run."""
 
 from __future__ import annotations
 
@@ -12,71 +9,48 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sonar_graph.cli.arguments import (
-    CalibrationPath,
-    LogConfigPath,
     OutputLog,
     Overwrite,
-    TopicChoices,
+    ReadingOptions,
     examples,
     nested_settings,
-    read_calibration,
-    read_config,
-    topic_choices,
+    validated,
+    with_options,
 )
-from sonar_graph.cli.outputs import Report, progress_bars, working, writable_log
+from sonar_graph.cli.outputs import progress_bars, working, writable_log
 
 if TYPE_CHECKING:
-    from pydantic_core import ErrorDetails
-
     from sonar_graph.logs.mcap import Outgoing
-    from sonar_graph.simulation import BasinOptions, LandmarkOptions
+    from sonar_graph.simulation import BasinOptions
 
 
+@with_options("start", "end", "salvage")
 def landmarks(
     log: Annotated[
         Path,
         typer.Option("--on", metavar="LOG", exists=True, dir_okay=False, help="MCAP log with a reference trajectory."),
     ],
     output: OutputLog,
+    reading: ReadingOptions,
     seed: Annotated[int | None, typer.Option(min=0, help="Same seed, same log. Default: 0.")] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Any other option of the landmarks; may be repeated."),
     ] = None,
-    calibration: CalibrationPath = None,
-    log_config: LogConfigPath = None,
-    topics: TopicChoices = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Landmarks along a recorded run, and the detections of a sonar; IMU and DVL stay as recorded."""
-    from sonar_graph.logs import read_log, write_log
-    from sonar_graph.simulation import add_landmarks
+    from sonar_graph.logs import write_log
+    from sonar_graph.simulation import LandmarkOptions, add_landmarks
 
-    options = _landmark_options(({} if seed is None else {"seed": seed}) | nested_settings(settings or []))
+    given = ({} if seed is None else {"seed": seed}) | nested_settings(settings)
+    options = validated(LandmarkOptions, given, "landmarks")
     path = writable_log(output, log, overwrite=overwrite)
     with working("simulating"):
-        recorded = read_log(
-            log,
-            calibration=read_calibration(calibration),
-            config=read_config(log_config),
-            topics=topic_choices(topics or []),
-        )
-        sequence = add_landmarks(recorded, options)
+        sequence = add_landmarks(reading.read(log), options)
         write_log(path, sequence)
     detections, placed = sequence.detections, sequence.true_landmarks
     typer.echo(f"{len(placed or ())} landmarks, {len(detections or ())} detections\nLog: {path}")
-
-
-def _landmark_options(values: dict[str, Any]) -> LandmarkOptions:
-    from pydantic import ValidationError
-
-    from sonar_graph.simulation import LandmarkOptions
-
-    try:
-        return LandmarkOptions.model_validate(values)
-    except ValidationError as error:
-        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise typer.BadParameter(f"{faults}. There are: {', '.join(LandmarkOptions.model_fields)}") from error
 
 
 _OTHERS = (
@@ -89,7 +63,7 @@ _OTHERS = (
     "sound_speed_error, stones, decoys. image.designs is a TOML file of at least four landmarks; the four lowest ids "
     "are laid, in their order"
 )
-"""Written out, because help must not wait for the simulator to be imported."""
+"""Written out, so that help need not import the simulator."""
 worlds = typer.Typer(
     name="simulate",
     help="Simulate a run with known truth and write it as an MCAP log.",
@@ -135,76 +109,51 @@ def basin(
     overwrite: Overwrite = False,
 ) -> None:
     """A vehicle drives round four landmarks in a basin, with IMU, DVL, depth and landmark detections or images."""
+    from sonar_graph.simulation import LANDMARKS_XY_M, BasinOptions, designs_laid
+
     flags = {"seed": seed, "duration_s": duration_s, "laps": laps, "imu": imu, "dvl": dvl}
     values: dict[str, Any] = {name: value for name, value in flags.items() if value is not None}
     if no_bias:
         values["gyro_bias_scale"] = 0.0
-    given = nested_settings(settings or [])
+    given = nested_settings(settings)
     if "image" in given and not images:
         raise typer.BadParameter("--set image.NAME=VALUE is for sonar images: give --images too, or leave it out")
     if images:
         values["image"] = {}
-    options = _basin_options(values | given)
+    options = validated(BasinOptions, values | given, "basin")
     path = writable_log(output, overwrite=overwrite)
     write_basin(path, options)
     if options.image is not None:
-        typer.echo(f"Landmarks: {_laid(options)}")
+        placed = zip(designs_laid(options.image), LANDMARKS_XY_M.tolist(), strict=True)
+        laid = ", ".join(f"{design.id} {design.name} at ({x:g}, {y:g})" for design, (x, y) in placed)
+        typer.echo(f"Landmarks: {laid}")
     typer.echo(f"Log: {path}")
 
 
-def _laid(options: BasinOptions) -> str:
-    """Which landmarks lie where."""
-    from sonar_graph.simulation import LANDMARKS_XY_M, designs_laid
-
-    placed = zip(designs_laid(options.image), LANDMARKS_XY_M.tolist(), strict=True)
-    return ", ".join(f"{design.id} {design.name} at ({x:g}, {y:g})" for design, (x, y) in placed)
-
-
 def write_basin(path: Path, options: BasinOptions) -> None:
-    """Write the log of a simulated basin, with images where its options ask for them."""
-    from sonar_graph.logs import write_log
-    from sonar_graph.simulation import simulate_basin
+    """Write the log of a simulated basin, with images if its options ask for them."""
+    from sonar_graph.logs import sonar_image_messages, write_log
+    from sonar_graph.simulation import simulate_basin, simulate_basin_frames
+    from sonar_graph.simulation.sonar_image import SONARS, SOUND_SPEED_M_S
 
-    if options.image is None:
+    image = options.image
+    if image is None:
         with working("simulating"):
             write_log(path, simulate_basin(options))
         return
+    total = round(options.duration_s * options.frame_rate_hz)
+
+    def images() -> Iterator[Outgoing]:
+        done = 0
+        for block in simulate_basin_frames(options):
+            yield sonar_image_messages(
+                "/sonar/image",
+                block.frames,
+                frequency_hz=SONARS[image.sonar].frequency_hz,
+                sound_speed_m_s=SOUND_SPEED_M_S * (1 + image.sound_speed_error),
+            )
+            done += len(block.frames)
+            report("simulating images", done, total)
+
     with progress_bars() as report:
-        write_log(path, simulate_basin(options), _image_messages(options, report))
-
-
-def _image_messages(options: BasinOptions, report: Report) -> Iterator[Outgoing]:
-    """Images of the basin, a block at a time."""
-    from sonar_graph.logs import sonar_image_messages
-    from sonar_graph.simulation import simulate_basin_frames
-    from sonar_graph.simulation.sonar_image import SONARS, SOUND_SPEED_M_S
-
-    assert options.image is not None
-    frequency_hz = SONARS[options.image.sonar].frequency_hz
-    told_m_s = SOUND_SPEED_M_S * (1 + options.image.sound_speed_error)
-    total, done = round(options.duration_s * options.frame_rate_hz), 0
-    for block in simulate_basin_frames(options):
-        yield sonar_image_messages("/sonar/image", block.frames, frequency_hz=frequency_hz, sound_speed_m_s=told_m_s)
-        done += len(block.frames)
-        report("simulating images", done, total)
-
-
-def _basin_options(values: dict[str, Any]) -> BasinOptions:
-    from pydantic import ValidationError
-
-    from sonar_graph.simulation import BasinOptions
-    from sonar_graph.simulation.sonar_image import ImageOptions
-
-    try:
-        return BasinOptions.model_validate(values)
-    except ValidationError as error:
-        faults = "; ".join(map(_fault, error.errors()))
-        names = [*BasinOptions.model_fields, *(f"image.{name}" for name in ImageOptions.model_fields)]
-        raise typer.BadParameter(f"{faults}. The basin has: {', '.join(names)}") from error
-
-
-def _fault(error: ErrorDetails) -> str:
-    name = ".".join(map(str, error["loc"]))
-    if error["type"] == "extra_forbidden":
-        return f"there is no option {name}"
-    return f"{name}: {error['msg']}, not {error['input']!r}"
+        write_log(path, simulate_basin(options), images())

@@ -11,7 +11,7 @@ from sonar_graph.evaluation.metrics import anonymous_named, landmark_errors, rms
 from sonar_graph.evaluation.results import (
     MOST_ROWS_NAMED, TOLERATED_FACTOR, Comparison, ErrorSeries, MapSoFar, RefusedRows, RunResult, Score, gathered,
 )
-from sonar_graph.evaluation.run import one_line, run_estimator
+from sonar_graph.evaluation.run import check_request, one_line, run_estimator
 from sonar_graph.evaluation.score_table import LABELS, run_columns, score_keys, score_table
 from sonar_graph.evaluation.scored_instants import DURATION_S, MAP_TIMES_S, RETURN_M, published_maps, repeats_published
 from sonar_graph.evaluation.scores import ESTIMATES
@@ -22,9 +22,9 @@ __all__ = [
     "ABSENT", "Cell", "Column", "Comparison", "DURATION_S", "ESTIMATES", "ErrorSeries", "GATED_SHARE", "LABELS",
     "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "MapSoFar", "NONE", "RETURN_M", "RefusedRows", "Reliability",
     "RunResult", "Score", "TOLERATED_FACTOR", "Table", "UNJUDGED", "absent", "anees_interval", "anonymous_named",
-    "as_html", "between", "compare", "confidences", "count", "describe_environment", "fixed", "format_value",
-    "gathered", "judge", "landmark_errors", "nis", "normalised_squares", "number", "one_line", "published_maps",
-    "quantile_text", "read_comparison", "reliability_of", "repeats_published", "rmse", "run_columns", "run_estimator",
-    "score_keys", "score_table", "supported", "text_table", "true_identities", "with_error", "words",
+    "as_html", "between", "check_request", "compare", "confidences", "count", "describe_environment", "fixed",
+    "format_value", "gathered", "judge", "landmark_errors", "nis", "normalised_squares", "number", "one_line",
+    "published_maps", "quantile_text", "read_comparison", "reliability_of", "repeats_published", "rmse", "run_columns",
+    "run_estimator", "score_keys", "score_table", "supported", "text_table", "true_identities", "with_error", "words",
     "write_comparison", "write_viewer_files", "yaw_rad",
 ]

@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.cli.arguments import check_rate, estimator_settings, parse_setting, read_calibration, topic_choices
+from sonar_graph.cli.arguments import ReadingOptions, estimator_settings, parse_settings
+from sonar_graph.cli.compare import check_rate
 from sonar_graph.errors import CalibrationError, EstimatorError, EvaluationError
 from sonar_graph.logs.vehicle_setup import PartialCalibration
 from sonar_graph.measurements import Dvl, Imu
