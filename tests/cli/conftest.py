@@ -11,6 +11,8 @@ from sonar_graph.cli.main import main
 from sonar_graph.logs.writing import write_log
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
+Run = Callable[..., int]
+
 
 def run_command(*arguments: object) -> int:
     with pytest.raises(SystemExit) as stop:
@@ -19,7 +21,7 @@ def run_command(*arguments: object) -> int:
 
 
 @pytest.fixture(scope="session")
-def run() -> Callable[..., int]:
+def run() -> Run:
     """Gives the exit code of ``sonar-graph`` with these arguments."""
     return run_command
 

@@ -1,122 +1,165 @@
-"""A user's mistake is told in one line, with nothing written; other errors are not hidden."""
+"""A user's mistake ends with code 2 and one line that names it, and no file is written; other errors are not hidden."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from sonar_graph.cli.main import main
+from sonar_graph.logs.mcap.writer import write_recording
+from sonar_graph.logs.writing import sonar_image_messages, write_log
 
-Run = Callable[..., int]
+if TYPE_CHECKING:
+    from tests.recognition.imaged_lane import Lane
+
+    from .conftest import Run
+
+DESIGN = '[[landmark]]\nid = {id}\nname = "plate"\nsize_m = {size_m}\nshapes = [{{ level_db = 12.0, {shape} }}]\n'
+CIRCLE, BAR = "circle_m = [0.0, 0.0, 0.15]", "polygon_m = [[-0.3, -0.02], [0.3, -0.02], [0.3, 0.02], [-0.3, 0.02]]"
+
+
+@pytest.fixture(scope="module")
+def files(lane: Lane, lane_log: Path, basin_content: bytes, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with logs, and with everything that a user may give in place of another file."""
+    folder = tmp_path_factory.mktemp("files")
+    (folder / "basin.mcap").write_bytes(basin_content)
+    (folder / "lane.mcap").write_bytes(lane_log.read_bytes())
+    write_log(folder / "bare.mcap", lane.sequence)
+    blind = replace(lane, sequence=replace(lane.sequence, truth=None))
+    blind.write(folder / "blind.mcap", [lane.one(k) for k in range(3)])
+    images = [sonar_image_messages("/sonar", lane.one(0), frequency_hz=1.8e6, sound_speed_m_s=1480)]
+    write_recording(folder / "images.mcap", images, {})
+    texts = {"notes.txt": "these are = = words", "words.json": "{ no", "list.json": "[1]"}
+    texts |= {"strange.toml": DESIGN.format(id=9, size_m=0.6, shape=BAR)}
+    texts |= {"broken.toml": DESIGN.format(id=1, size_m=-1, shape=CIRCLE)}
+    texts |= {"large.toml": DESIGN.format(id=4, size_m=2.0, shape=CIRCLE.replace("0.15", "1.0"))}
+    for name, text in texts.items():
+        (folder / name).write_text(text)
+    (folder / "empty").mkdir()
+    return folder
+
 
 MISTAKES = {
-    "unknown command": (["dance"], "dance"),
-    "unknown option": (["compare", "LOG", "-o", "OUT", "--speed", "9"], "--speed"),
-    "no log": (["compare", "missing.mcap", "-o", "OUT"], "missing.mcap"),
-    "folder as log": (["inspect", "FOLDER"], "is a directory"),
-    "text as log": (["inspect", "TEXT"], "notes.txt"),
-    "text as log to compare": (["compare", "TEXT", "-o", "OUT"], "notes.txt"),
-    "file as output folder": (["compare", "LOG", "-o", "TEXT"], "is a file; give a folder"),
-    "output below a file": (["compare", "LOG", "-o", "TEXT/deeper"], "cannot be written"),
-    "folder as output log": (["simulate", "basin", "-o", "FOLDER"], "is a folder; give the name of a file"),
-    "output log with another ending": (["simulate", "basin", "-o", "basin.bag"], "ends in .mcap"),
-    "unknown estimator": (["compare", "LOG", "-o", "OUT", "--estimators", "isam3"], "no estimator is called 'isam3'"),
-    "no estimator": (["compare", "LOG", "-o", "OUT", "--estimators", ","], "expected names such as"),
-    "estimator without name": (["compare", "LOG", "-o", "OUT", "--estimators", "isam2,,mine"], "a name is empty"),
-    "estimator twice": (["compare", "LOG", "-o", "OUT", "--estimators", "isam2,isam2"], "isam2 is named twice"),
-    "rate of zero": (["compare", "LOG", "-o", "OUT", "--rate-hz", "0"], "--rate-hz"),
-    "rate without end": (["compare", "LOG", "-o", "OUT", "--rate-hz", "inf"], "--rate-hz"),
-    "rate of no number": (["compare", "LOG", "-o", "OUT", "--rate-hz", "nan"], "--rate-hz"),
-    "rate too high": (["compare", "LOG", "-o", "OUT", "--rate-hz", "2000"], "--rate-hz"),
-    "rate above the IMU's": (
-        ["compare", "LOG", "-o", "OUT", "--rate-hz", "200"],
-        "measures 100 times a second; give at most 100",
+    "dance": "dance",
+    "compare basin.mcap -o out --speed 9": "--speed",
+    "compare missing.mcap -o out": r"missing\.mcap",
+    "inspect empty": "is a directory",
+    "inspect notes.txt": r"notes\.txt",
+    "compare notes.txt -o out": r"notes\.txt",
+    "compare basin.mcap -o notes.txt": "is a file; give a folder",
+    "compare basin.mcap -o notes.txt/deeper": "cannot be written",
+    "simulate basin -o empty": "is a folder; give the name of a file",
+    "simulate basin -o basin.bag": r"ends in \.mcap",
+    "compare basin.mcap -o out --estimators isam3": "no estimator is called 'isam3'",
+    "compare basin.mcap -o out --estimators ,": "expected names such as",
+    "compare basin.mcap -o out --estimators isam2,,mine": "a name is empty",
+    "compare basin.mcap -o out --estimators isam2,isam2": "isam2 is named twice",
+    "compare basin.mcap -o out --rate-hz 0": "--rate-hz",
+    "compare basin.mcap -o out --rate-hz inf": "--rate-hz",
+    "compare basin.mcap -o out --rate-hz nan": "--rate-hz",
+    "compare basin.mcap -o out --rate-hz 2000": "--rate-hz",
+    "compare basin.mcap -o out --rate-hz 200": "measures 100 times a second; give at most 100",
+    "run basin.mcap -o out --estimator dead-reckoning --rate-hz 0.001": "too short",
+    "run basin.mcap -o out --set isam2.lag_s": "expected name=value",
+    "run basin.mcap -o out --set ekf-slam.x=1": "ekf-slam is not among the estimators that run: isam2",
+    "run basin.mcap -o out --set isam2.=1": r"expected ESTIMATOR\.setting=value",
+    "run basin.mcap -o out --set isam2.nonsense=1": "nonsense",
+    "run basin.mcap -o out --set isam2.smoother.lag_s=5 --set isam2.smoother.lag_s=6": "also set to 5; give it once",
+    "simulate basin -o new.mcap --set tracks=true --set tracks=false": "tracks is also set to True; give it once",
+    "simulate basin -o new.mcap --set wrong_id_share=0.3": "wrong_id_share = 0.3 is a share of a track; set tracks",
+    "run notes.txt -o out --set isam2.identity.policy=gnc --set isam2.history.policy=bounded": (
+        'history.policy = "bounded" cannot be with identity.policy = "gnc"'
     ),
-    "rate too low": (["run", "LOG", "-o", "OUT", "--estimator", "dead-reckoning", "--rate-hz", "0.001"], "too short"),
-    "setting without value": (["run", "LOG", "-o", "OUT", "--set", "isam2.lag_s"], "expected name=value"),
-    "setting of another": (
-        ["run", "LOG", "-o", "OUT", "--set", "ekf-slam.x=1"],
-        "ekf-slam is not among the estimators",
+    "run notes.txt -o out --set isam2.history.remembered_s=10": (
+        'there is no such field with policy = "whole"; history.policy = "bounded" has it'
     ),
-    "setting without name": (["run", "LOG", "-o", "OUT", "--set", "isam2.=1"], "expected ESTIMATOR.setting=value"),
-    "unknown setting": (["run", "LOG", "-o", "OUT", "--set", "isam2.nonsense=1"], "nonsense"),
-    "setting twice": (
-        ["run", "LOG", "-o", "OUT", "--set", "isam2.smoother.lag_s=5", "--set", "isam2.smoother.lag_s=6"],
-        "isam2.smoother.lag_s is also set to 5; give it once",
-    ),
-    "simulation option twice": (
-        ["simulate", "basin", "-o", "new.mcap", "--set", "tracks=true", "--set", "tracks=false"],
-        "tracks is also set to True; give it once",
-    ),
-    "share of tracks without tracks": (
-        ["simulate", "basin", "-o", "new.mcap", "--set", "wrong_id_share=0.3"],
-        "wrong_id_share = 0.3 is a share of a track; set tracks = true",
-    ),
-    "settings that exclude each other": (
-        ["run", "TEXT", "-o", "OUT", "--set", "isam2.identity.policy=gnc", "--set", "isam2.history.policy=bounded"],
-        'settings of isam2: history.policy = "bounded" cannot be with identity.policy = "gnc"',
-    ),
-    "setting that does nothing": (
-        ["run", "TEXT", "-o", "OUT", "--set", "isam2.history.remembered_s=10"],
-        'there is no such field with policy = "whole"; history.policy = "bounded" has it',
-    ),
-    "topic without role": (["run", "LOG", "-o", "OUT", "--topic", "/imu/data"], "expected ROLE=TOPIC"),
-    "topic of no such role": (["run", "LOG", "-o", "OUT", "--topic", "smell=/imu/data"], "smell"),
-    "topic that is not there": (["run", "LOG", "-o", "OUT", "--topic", "imu=/imu/raw"], "/imu/raw"),
-    "broken calibration": (["run", "LOG", "-o", "OUT", "--calibration", "TEXT"], "not TOML"),
-    "list as calibration": (["run", "LOG", "-o", "OUT", "--calibration", "LIST"], "expected an object with sections"),
-    "unknown simulation option": (["simulate", "basin", "-o", "new.mcap", "--set", "wind=3"], "wind"),
-    "unknown preset": (["simulate", "basin", "-o", "new.mcap", "--imu", "sundial"], "sundial"),
-    "too short for the laps": (["simulate", "basin", "-o", "new.mcap", "--duration-s", "1"], "laps"),
-    "laps that are no number": (["simulate", "basin", "-o", "new.mcap", "--laps", "many"], "--laps"),
-    "empty dataset": (["convert", "mrclam", "FOLDER", "--robot", "1", "-o", "new.mcap"], "FOLDER"),
-    "report of nothing": (["report", "FOLDER"], "FOLDER"),
+    "run basin.mcap -o out --start 1e6": r"nothing was recorded from 1000000\.000 s to the end",
+    "run basin.mcap -o out --topic /imu/data": "expected ROLE=TOPIC",
+    "run basin.mcap -o out --topic smell=/imu/data": "smell",
+    "run basin.mcap -o out --topic imu=/imu/raw": "/imu/raw",
+    "run basin.mcap -o out --calibration notes.txt": "not TOML",
+    "run basin.mcap -o out --calibration list.json": "expected an object with sections",
+    "simulate basin -o new.mcap --set wind=3": "wind",
+    "simulate basin -o new.mcap --images --set image.nois=1": r"image\.nois: there is no such field.*noise_db",
+    "simulate basin -o new.mcap --set image.designs=mine.toml": "give --images too",
+    "simulate basin -o new.mcap --imu sundial": "sundial",
+    "simulate basin -o new.mcap --duration-s 1": "laps",
+    "simulate basin -o new.mcap --laps many": "--laps",
+    "simulate landmarks --on basin.mcap -o new.mcap --set spacing=4": "did you mean spacing_m",
+    "simulate landmarks --on basin.mcap -o basin.mcap --overwrite": "is what is read",
+    "convert mrclam empty --robot 1 -o new.mcap": "empty",
+    "report empty": "empty",
+    "bench bless empty new.json": r"no results\.parquet in it",
+    "recognise bare.mcap -o new.mcap": r"bare\.mcap: has no sonar images; `sonar-graph inspect .*` lists what it has",
+    "recognise lane.mcap -o new.mcap --rule bayes": "rule.*virtual-evidence.*jeffrey",
+    "recognise lane.mcap -o new.mcap --model words.json": r"words\.json is not JSON",
+    "recognise lane.mcap -o new.mcap --model list.json": r"list\.json: .*calibrate",
+    "recognise lane.mcap -o new.mcap --designs broken.toml": r"broken\.toml.*size_m",
+    "recognise lane.mcap -o new.mcap --designs large.toml": r"plate \(id 4\) would never be found",
+    "recognise lane.mcap -o new.mcap --designs empty": "empty: no landmark designs",
+    "recognise lane.mcap -o lane.mcap --overwrite": "is what is read",
+    "recognise lane.mcap -o new.mcap --topic sonar=/none": "/none was chosen but is not in the log",
+    "recognise lane.mcap -o new.mcap --rule jeffrey --set identity.rule=jeffrey": "--rule jeffrey and --set .*one of",
+    "recognise lane.mcap -o new.mcap --set least_frames=many": "least_frames",
+    "recognise lane.mcap -o new.mcap --recogniser actag --rule jeffrey": "not for actag.*use --set",
+    "recognise lane.mcap -o new.mcap --recogniser bogus": "actag",
+    "recognise images.mcap -o new.mcap": r"images\.mcap: nothing for imu.*IMU and Doppler log must both be in the log",
+    "compare lane.mcap -o out --topic sonar=/none": "/none was chosen but is not in the log",
+    "compare bare.mcap -o out --rule jeffrey": r"bare\.mcap: has no sonar images.*--rule",
+    "compare lane.mcap -o out --rule bayes": r"settings of the recogniser: identity\.rule: .*virtual-evidence.*jeffrey",
+    "compare lane.mcap -o out --designs broken.toml": r"broken\.toml.*size_m",
+    "calibrate bare.mcap -o new.mcap": r"ends in \.json",
+    "calibrate blind.mcap -o new.json": r"blind\.mcap: without true trajectory and true landmarks",
+    "calibrate bare.mcap -o new.json": r"bare\.mcap: has no sonar images",
+    "calibrate lane.mcap lane.mcap -o new.json": r"lane\.mcap: is named twice.*name each log once",
+    "calibrate lane.mcap -o new.json --designs strange.toml": "true landmarks are 1, 2, 3, 4, the designs are 9: ",
+    "calibrate lane.mcap -o new.json --set identity.tempre=1": r"the recogniser: identity\.tempre: .*temper",
 }
 
 
-@pytest.mark.parametrize(("arguments", "expected"), MISTAKES.values(), ids=MISTAKES)
-def test_mistake_is_told_in_one_line(
+@pytest.mark.parametrize(("command", "expected"), MISTAKES.items())
+def test_a_mistake_is_named_in_one_line_and_no_file_is_written(
     run: Run,
-    arguments: list[str],
+    command: str,
     expected: str,
-    basin: Path,
-    tmp_path: Path,
+    files: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("FOLDER").mkdir()
-    Path("notes.txt").write_text("these are = = words")
-    Path("list.json").write_text("[1]")
-    places = {"LOG": str(basin), "LIST": "list.json", "TEXT": "notes.txt", "TEXT/deeper": "notes.txt/deeper"}
-    assert run(*(places.get(word, word) for word in arguments)) == 2
-    told = capsys.readouterr().err
-    assert re.fullmatch(r"sonar-graph: .+\n", told)
-    assert expected in told
-    assert not Path("new.mcap").exists()
-    assert not Path("OUT/comparison.json").exists()
+    def content() -> dict[Path, bytes]:
+        return {path: path.read_bytes() for path in files.rglob("*") if path.is_file()}
+
+    before = content()
+    monkeypatch.chdir(files)
+    assert run(*command.split()) == 2
+    said = capsys.readouterr().err
+    assert re.fullmatch(r"sonar-graph: .+\n", said)
+    assert re.search(expected, said), said
+    assert content() == before
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, PermissionError(13, "Permission denied", "x.mcap")])
 def test_interruption_and_refused_access_end_in_one_line(
     run: Run, stop: Any, basin: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def stopped(*_: object) -> None:
-        raise stop
-
-    monkeypatch.setattr("sonar_graph.logs.inspection.inspect_log", stopped)
+    monkeypatch.setattr("sonar_graph.logs.inspect_log", raising(stop))
     assert run("inspect", basin) == (130 if stop is KeyboardInterrupt else 2)
     assert re.fullmatch(r"sonar-graph: .+\n", capsys.readouterr().err)
 
 
 def test_unforeseen_error_is_not_hidden(basin: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> None:
-        raise ZeroDivisionError
-
-    monkeypatch.setattr("sonar_graph.logs.inspection.inspect_log", broken)
+    monkeypatch.setattr("sonar_graph.logs.inspect_log", raising(ZeroDivisionError()))
     with pytest.raises(ZeroDivisionError):
         main(["inspect", str(basin)])
+
+
+def raising(error: Any) -> Callable[..., None]:
+    def stopped(*_: object) -> None:
+        raise error
+
+    return stopped

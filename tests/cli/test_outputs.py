@@ -1,17 +1,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+import typer.main
 from mcap.writer import Writer
 
+from sonar_graph.cli.main import app
 from sonar_graph.cli.outputs import writable_folder
 from sonar_graph.errors import EvaluationError
 
-Run = Callable[..., int]
 QUICK = ("--estimators", "dead-reckoning")
 
 
@@ -34,14 +35,7 @@ def links(target: Path, folder: Path) -> list[Path]:
 
 @pytest.mark.parametrize("flags", [(), ("--overwrite",)])
 @pytest.mark.parametrize("command", [("rosbag",), ("didson",), ("aris",), ("oculus",), ("victoria-park", "--file")])
-def test_a_conversion_never_overwrites_what_it_reads(
-    command: tuple[str, ...],
-    flags: tuple[str, ...],
-    basin: Path,
-    run: Run,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_conversion_never_overwrites_what_it_reads(command, flags, basin, run, tmp_path, capsys):
     before = basin.read_bytes()
     for output in (basin, tmp_path / "." / basin.name, *links(basin, tmp_path)):
         assert run("convert", *command, basin, "-o", output, *flags) == 2
@@ -49,9 +43,7 @@ def test_a_conversion_never_overwrites_what_it_reads(
     assert basin.read_bytes() == before
 
 
-def test_a_conversion_never_overwrites_a_part_of_the_bag_that_it_reads(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_conversion_never_overwrites_a_part_of_the_bag_that_it_reads(run, tmp_path, capsys):
     bag = tmp_path / "bag"
     bag.mkdir()
     before = foreign_log(bag / "bag_0.mcap")
@@ -61,9 +53,7 @@ def test_a_conversion_never_overwrites_a_part_of_the_bag_that_it_reads(
 
 
 @pytest.mark.parametrize("name", ["result.mcap", "comparison.json", "report.html", "runs/isam2/trajectory.tum"])
-def test_results_never_overwrite_the_log(
-    name: str, basin: Path, run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_results_never_overwrite_the_log(name, basin, run, tmp_path, capsys):
     log = tmp_path / "results" / name
     log.parent.mkdir(parents=True)
     before = basin.read_bytes()
@@ -76,13 +66,13 @@ def test_results_never_overwrite_the_log(
 
 
 @pytest.mark.parametrize("option", ["--calibration", "--log-config"])
-def test_results_never_overwrite_settings(option: str, basin: Path, run: Run, tmp_path: Path) -> None:
+def test_results_never_overwrite_settings(option, basin, run, tmp_path):
     (tmp_path / "comparison.json").write_text("{}")
     assert run("compare", basin, "-o", tmp_path, option, tmp_path / "comparison.json", *QUICK) == 2
     assert (tmp_path / "comparison.json").read_text() == "{}"
 
 
-def test_every_file_of_a_comparison_is_kept_from_being_read_and_written(basin: Path, run: Run, tmp_path: Path) -> None:
+def test_every_file_of_a_comparison_is_kept_from_being_read_and_written(basin, run, tmp_path):
     folder = tmp_path / "results"
     assert run("compare", basin, "-o", folder, *QUICK) == 0
     written = [path for path in folder.rglob("*") if path.is_file()]
@@ -92,14 +82,14 @@ def test_every_file_of_a_comparison_is_kept_from_being_read_and_written(basin: P
             writable_folder(folder, [path])
 
 
-def test_a_log_beside_results_is_read_and_a_comparison_can_be_repeated(basin: Path, run: Run, tmp_path: Path) -> None:
+def test_a_log_beside_results_is_read_and_a_comparison_can_be_repeated(basin, run, tmp_path):
     before = basin.read_bytes()
     for _ in range(2):
         assert run("compare", basin, "-o", tmp_path, *QUICK) == 0
     assert basin.read_bytes() == before
 
 
-def test_results_never_replace_a_log_of_another_program(basin: Path, run: Run, tmp_path: Path) -> None:
+def test_results_never_replace_a_log_of_another_program(basin, run, tmp_path):
     folder = tmp_path / "results"
     folder.mkdir()
     before = foreign_log(folder / "result.mcap")
@@ -108,9 +98,7 @@ def test_results_never_replace_a_log_of_another_program(basin: Path, run: Run, t
 
 
 @pytest.mark.parametrize("content", ["another program's", "a text", "cut off"])
-def test_what_another_program_wrote_is_replaced_only_when_asked_for(
-    content: str, run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_another_program_wrote_is_replaced_only_when_asked_for(content, run, tmp_path, capsys):
     log = tmp_path / "log.mcap"
     before = foreign_log(log) if content == "another program's" else b"words" if content == "a text" else b"\x89MCAP0"
     log.write_bytes(before)
@@ -122,7 +110,7 @@ def test_what_another_program_wrote_is_replaced_only_when_asked_for(
     assert log.read_bytes() != before
 
 
-def test_commands_can_be_repeated_over_what_they_wrote(run: Run, tmp_path: Path) -> None:
+def test_commands_can_be_repeated_over_what_they_wrote(run, tmp_path):
     log = tmp_path / "log.mcap"
     log.touch()  # an empty file holds nothing to lose
     for _ in range(2):
@@ -130,31 +118,27 @@ def test_commands_can_be_repeated_over_what_they_wrote(run: Run, tmp_path: Path)
         assert run("simulate", "basin", "--duration-s", "120", "--laps", "1", "-o", log) == 0
 
 
-def test_demo_never_replaces_a_log_of_another_program(run: Run, tmp_path: Path) -> None:
+def test_demo_never_replaces_a_log_of_another_program(run, tmp_path):
     before = foreign_log(tmp_path / "basin.mcap")
     assert run("demo", "-o", tmp_path) == 2
     assert (tmp_path / "basin.mcap").read_bytes() == before
 
 
-def test_a_link_to_nowhere_is_no_obstacle(run: Run, tmp_path: Path) -> None:
+def test_a_link_to_nowhere_is_no_obstacle(run, tmp_path):
     (tmp_path / "log.mcap").symlink_to(tmp_path / "missing.mcap")
     assert run("convert", "victoria-park", "-o", tmp_path / "log.mcap") == 0
     assert (tmp_path / "log.mcap").stat().st_size > 0
 
 
 @pytest.mark.parametrize("command", [("recognise",), ("simulate", "landmarks", "--on")], ids=" ".join)
-def test_a_log_made_from_a_log_never_replaces_it(
-    command: tuple[str, ...], basin: Path, run: Run, tmp_path: Path
-) -> None:
+def test_a_log_made_from_a_log_never_replaces_it(command, basin, run, tmp_path):
     before = basin.read_bytes()
     for output in (basin, *links(basin, tmp_path)):
         assert run(*command, basin, "-o", output, "--overwrite") == 2
         assert basin.read_bytes() == before
 
 
-def test_a_model_never_replaces_a_log(
-    basin: Path, run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_model_never_replaces_a_log(basin, run, tmp_path, capsys):
     before = basin.read_bytes()
     assert run("calibrate", basin, "-o", basin) == 2
     assert "ends in .json" in capsys.readouterr().err
@@ -165,11 +149,8 @@ def test_a_model_never_replaces_a_log(
     assert basin.read_bytes() == before
 
 
-def test_every_command_that_writes_a_log_from_a_file_is_tried_here() -> None:
+def test_every_command_that_writes_from_a_file_is_tried_here():
     """A command that joins later must not be forgotten."""
-    import typer.main
-
-    from sonar_graph.cli.main import app
 
     def commands(group: Any) -> Iterator[Any]:
         for command in group.commands.values():
@@ -177,16 +158,5 @@ def test_every_command_that_writes_a_log_from_a_file_is_tried_here() -> None:
 
     writing = {c.name for c in commands(typer.main.get_command(app)) if any(p.name == "output" for p in c.params)}
     of_folders, of_nothing = {"mrclam", "dlr", "akit"}, {"basin", "demo"}
-    tried = {
-        "rosbag",
-        "didson",
-        "aris",
-        "oculus",
-        "victoria-park",
-        "compare",
-        "run",
-        "recognise",
-        "landmarks",
-        "calibrate",
-    }
-    assert writing == tried | of_folders | of_nothing
+    tried = {"rosbag", "didson", "aris", "oculus", "victoria-park", "compare", "recognise", "landmarks", "calibrate"}
+    assert writing == tried | of_folders | of_nothing | {"run"}

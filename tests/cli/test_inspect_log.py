@@ -1,4 +1,4 @@
-"""``inspect`` compares sensors, skips that with a reason, and what it advises can be given to it again."""
+"""``inspect`` names what a log has, compares its sensors, and gives advice that can be followed."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sonar_graph.cli.main import app
+from sonar_graph.logs.inspection import LogSummary
 from sonar_graph.logs.writing import write_log
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 
@@ -70,3 +71,27 @@ def test_json_has_lever_arm_bias_and_start_as_numbers(log: Path):
     assert sensor(said, "lever arm from IMU to DVL, z")["unit"] == "m"
     assert abs(sensor(said, "gyro bias, x")["value"]) < 1e-3
     assert 0 < sensor(said, "start pitch")["sigma"] < 0.2
+
+
+def test_inspect_names_the_topics(run, basin, capsys):
+    assert run("inspect", basin) == 0
+    shown = capsys.readouterr().out
+    for name in ("sensor_msgs/Imu", "marine_acoustic_msgs/Dvl", "sonar_graph_msgs/LandmarkDetections"):
+        assert name in shown
+
+
+def test_inspect_ends_in_what_compare_would_lack(run, basin, monkeypatch, capsys):
+    assert run("inspect", basin) == 0
+    assert "not usable" not in capsys.readouterr().out
+    monkeypatch.setattr(LogSummary, "obstacles", ("no IMU (a/msg/B)", "no DVL (c/msg/D)"))
+    assert run("inspect", basin) == 0
+    *_, lack, advice = capsys.readouterr().out.splitlines()
+    assert lack == "not usable for compare: no IMU (a/msg/B), no DVL (c/msg/D)"
+    assert "--toml > log.toml" in advice
+
+
+def test_converted_data_set_can_be_inspected(run, tmp_path, capsys):
+    log = tmp_path / "victoria_park.mcap"
+    assert run("convert", "victoria-park", "-o", log) == 0
+    assert "3640 landmark detections" in capsys.readouterr().out
+    assert run("inspect", log) == 0

@@ -1,12 +1,91 @@
+"""``bench``: suites are run, blessed and judged from the command line."""
+
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+
+from sonar_graph.batch.gate import GateVerdict
+from sonar_graph.cli.bench import verdict_lines
+
+ESTIMATOR = """
+from dataclasses import replace
+import numpy as np
+from baselines.dead_reckoning import DeadReckoning
+from sonar_graph.calibration import Section
+
+
+class Params(Section):
+    velocity_noise_m_s: float = {default}
+    lag_s: float = 1.0
+
+
+class Noisy(DeadReckoning):
+    Params = Params
+
+    def __init__(self, calibration, params=None):
+        super().__init__(calibration)
+        self._sigma, self._rng = (params or Params()).velocity_noise_m_s, np.random.default_rng(0)
+
+    def process(self, measurements):
+        if (dvl := measurements.dvl) is not None:
+            dvl = replace(dvl, velocity=dvl.velocity + self._rng.normal(0, self._sigma, dvl.velocity.shape))
+        return super().process(replace(measurements, dvl=dvl))
+"""
+SUITE = """
+name = "short"
+reference = "dead-reckoning"
+[[logs]]
+name = "basin"
+generator = "basin"
+options = { duration_s = 120, laps = 1 }
+seeds = 3
+[[estimators]]
+name = "noisy"
+[[estimators]]
+name = "dead-reckoning"
+"""
+
+
+def test_mistake_in_a_suite_is_one_line_and_exit_code_2(run, tmp_path, capsys):
+    suite = tmp_path / "suite.toml"
+    for text, told in (
+        ('name = "x"\nreference = "isam2"\nlogs = 3\n', "line 3: logs"),
+        (
+            'name = "x"\nreference = "b"\n[[logs]]\nname = "a"\nlog = "a.mcap"\n[[estimators]]\nname = "b"\n',
+            "line 7: est",
+        ),
+    ):
+        suite.write_text(text)
+        assert run("bench", suite, "-o", tmp_path / "out") == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"{suite}, {told}" in line
+        assert not (tmp_path / "out").exists()
+
+
+def test_missing_packages_are_named_with_how_to_get_them(run, tmp_path, capsys, monkeypatch):
+    suite = tmp_path / "suite.toml"
+    suite.touch()
+    for name in [name for name in sys.modules if name.startswith("sonar_graph.batch")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert run("bench", suite, "-o", tmp_path / "out") == 2
+    assert "pip install 'sonar-graph[bench]'" in capsys.readouterr().err
+
+
+def test_workers_and_scheduler_exclude_each_other(run, tmp_path, capsys):
+    suite = tmp_path / "suite.toml"
+    suite.touch()
+    assert run("bench", suite, "-o", tmp_path, "--workers", 2, "--scheduler", "tcp://127.0.0.1:1") == 2
+    assert "give one of them" in capsys.readouterr().err
 
 
 @pytest.fixture
@@ -89,9 +168,6 @@ def test_only_a_strict_gate_fails_by_a_difference_that_no_test_can_judge(run, tm
 
 
 def test_no_more_than_ten_runs_that_stand_out_are_printed():
-    from sonar_graph.batch.gate import GateVerdict
-    from sonar_graph.cli.bench import verdict_lines
-
     lines = verdict_lines(GateVerdict([], [f"run {n}" for n in range(12)], 24, {"isam2": 2}, {}, []))
     assert len([line for line in lines if line.startswith("Look at: run")]) == 10
     assert "Look at: 2 more such lines are not shown" in lines
@@ -124,14 +200,55 @@ def test_report_of_a_batch_that_was_killed_at_once_says_what_to_do(run, tmp_path
     assert "before any of its runs was done; give the bench command that began it again" in capsys.readouterr().err
 
 
-def test_a_folder_without_results_is_the_users_mistake(run, tmp_path, capsys):
-    assert run("bench", "bless", tmp_path, tmp_path / "reference.json") == 2
-    assert "no results.parquet in it" in capsys.readouterr().err
-    assert not (tmp_path / "reference.json").exists()
-
-
 def test_a_reference_is_json_that_every_reader_takes(run, folder, tmp_path):
     run("bench", "bless", folder, tmp_path / "reference.json")
     content = json.loads((tmp_path / "reference.json").read_text("utf-8"))
     assert content["format"] == "sonar_graph batch reference 2"
     assert len(content["runs"]) == 16
+
+
+def install(site: Path, default: float) -> None:
+    info = site / "noisy-1.0.dist-info"
+    info.mkdir(parents=True, exist_ok=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: noisy\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[sonar_graph.estimators]\nnoisy = noisy_estimator:Noisy\n")
+    (site / "noisy_estimator.py").write_text(ESTIMATOR.format(default=default))
+
+
+def command(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    path = os.pathsep.join([str(folder / "site"), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    program = "from sonar_graph.cli.main import main; main()"
+    return subprocess.run(
+        [sys.executable, "-c", program, "bench", *arguments],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+@pytest.mark.slow
+def test_a_default_that_got_worse_fails_the_gate_and_the_same_code_passes(tmp_path: Path) -> None:
+    pytest.importorskip("dask", reason="needs sonar-graph[bench]")
+    install(tmp_path / "site", 0.0)
+    (tmp_path / "suite.toml").write_text(SUITE)
+    first = command(tmp_path, "suite.toml", "-o", "first", "--workers", "1")
+    assert first.returncode == 0, first.stderr
+    assert command(tmp_path, "bless", "first", "reference.json").returncode == 0
+
+    same = command(tmp_path, "suite.toml", "-o", "same", "--workers", "1", "--gate", "reference.json")
+    assert same.returncode == 0, same.stdout + same.stderr
+    assert "Gate: passed, 6 runs" in same.stdout
+    assert "Worse" not in same.stdout
+
+    install(tmp_path / "site", 1.0)
+    worse = command(tmp_path, "suite.toml", "-o", "worse", "--workers", "1", "--gate", "reference.json")
+    assert worse.returncode == 1, worse.stdout + worse.stderr
+    assert "Worse: basin, noisy, causal.ate_se2_m, smoothed.ate_se2_m: +" in worse.stdout
+    assert "dead-reckoning, causal" not in worse.stdout
+
+    (tmp_path / "suite.toml").write_text(SUITE.replace('"noisy"\n', '"noisy"\nparams = { lag_s = 2.0 }\n'))
+    other = command(tmp_path, "suite.toml", "-o", "other", "--workers", "1", "--gate", "reference.json")
+    assert other.returncode == 2
+    assert "noisy, seed 0: settings.lag_s is 2.0, in the reference not given" in other.stderr

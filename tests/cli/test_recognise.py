@@ -1,29 +1,23 @@
-"""``recognise``, ``calibrate`` and ``compare`` on a log with images, and what they say to a user's mistakes."""
+"""``recognise`` and ``calibrate`` on a log with images, and ``compare`` on one without detections."""
 
 from __future__ import annotations
 
 import json
 import re
+import sys
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import ModuleType
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from sonar_graph.logs.mcap.writer import write_recording
 from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.writing import sonar_image_messages, write_log
 from sonar_graph.sonar import confusion
 from sonar_graph.sonar.confusion import read_confusion
 
-if TYPE_CHECKING:
-    from tests.recognition.imaged_lane import Lane
-
-Run = Callable[..., int]
 QUICK = ("--estimators", "dead-reckoning")
 DESIGNS = """
 [[landmark]]
@@ -35,7 +29,7 @@ shapes = [{ level_db = 12.0, circle_m = [0.0, 0.0, 0.15] }]
 
 
 @pytest.fixture(scope="module")
-def recognised(lane_log: Path, run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recognised(lane_log, run, tmp_path_factory):
     """The log with what was recognised in it."""
     out = tmp_path_factory.mktemp("recognised") / "out.mcap"
     assert run("recognise", lane_log, "-o", out) == 0
@@ -93,16 +87,6 @@ def test_where_nothing_is_recognised_one_line_says_so_and_what_was_looked_for(
         assert run(command, lane_log, "-o", tmp_path / out, "--designs", strange_designs, *more) == 0
         said = capsys.readouterr().out
         assert "Warning: no landmark was recognised; looked for 9: plate; --designs gives others" in said
-
-
-def test_a_design_that_is_never_a_candidate_is_refused_before_a_frame_is_read(lane_log, run, tmp_path, capsys):
-    path = tmp_path / "large.toml"
-    path.write_text(DESIGNS.replace("size_m = 0.3", "size_m = 2.0").replace("0.15]", "1.0]"))
-    assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--designs", path) == 2
-    said = capsys.readouterr().err
-    assert "plate (id 4) would never be found" in said
-    assert "Traceback" not in said
-    assert not (tmp_path / "out.mcap").exists()
 
 
 def test_a_log_made_with_other_designs_says_so(lane, run, tmp_path, capsys):
@@ -168,78 +152,46 @@ def test_designs_of_ones_own_need_no_code(lane_log, run, tmp_path, capsys):
     assert np.unique(found.candidate_ids).tolist() == [4]
 
 
-def images_alone(lane: Lane, path: Path) -> Path:
-    """A log as one of a sonar's own file is."""
-    write_recording(path, [sonar_image_messages("/sonar", lane.one(0), frequency_hz=1.8e6, sound_speed_m_s=1480)], {})
-    return path
+class Decoder:
+    """In place of AcTag: sees tag 5 in every frame."""
+
+    def __init__(self, **settings: object) -> None:
+        self.settings = settings
+
+    def run_detection(self, image: np.ndarray) -> list:
+        corners = np.array([[1.9, 0.1], [2.0, 0.1], [2.0, 0.0], [1.9, 0.0]])
+        return [[5, corners, corners]] if image.any() else []
 
 
 @pytest.fixture
-def files(lane: Lane, lane_log: Path, strange_designs: Path, tmp_path: Path) -> dict[str, object]:
-    """What a user may give by mistake."""
-    bare, blind = tmp_path / "bare.mcap", tmp_path / "blind.mcap"
-    write_log(bare, lane.sequence)
-    short = replace(lane, sequence=replace(lane.sequence, truth=None))
-    short.write(blind, [lane.one(k) for k in range(3)])
-    (tmp_path / "words.json").write_text("{ no")
-    (tmp_path / "list.json").write_text("[]")
-    (tmp_path / "designs.toml").write_text(DESIGNS)
-    (tmp_path / "broken.toml").write_text('[[landmark]]\nid = 1\nname = "x"\nsize_m = -1\n')
-    (tmp_path / "empty").mkdir()
-    names = ("words.json", "list.json", "designs.toml", "broken.toml", "empty")
-    return {
-        "lane": lane_log,
-        "bare": bare,
-        "blind": blind,
-        "images": images_alone(lane, tmp_path / "images.mcap"),
-        "strange": strange_designs,
-        "new": tmp_path / "new.mcap",
-        "model": tmp_path / "m.json",
-    } | {name: tmp_path / name for name in names}
+def actag(monkeypatch):
+    module = ModuleType("actag")
+    module.AcTag = Decoder
+    monkeypatch.setitem(sys.modules, "actag", module)
 
 
-MISTAKES = {
-    "recognise bare -o new": r"bare\.mcap: has no sonar images; `sonar-graph inspect .*` lists what it has",
-    "recognise lane -o new --rule bayes": r"rule.*virtual-evidence.*jeffrey",
-    "recognise lane -o new --model words.json": r"words\.json is not JSON",
-    "recognise lane -o new --model list.json": r"list\.json: .*calibrate",
-    "recognise lane -o new --designs broken.toml": r"broken\.toml.*size_m",
-    "recognise lane -o new --designs empty": r"empty: no landmark designs",
-    "recognise lane -o lane --overwrite": r"is what is read",
-    "recognise lane -o new --topic sonar=/none": r"/none was chosen but is not in the log",
-    "compare lane -o new --topic sonar=/none": r"/none was chosen but is not in the log",
-    "recognise words.json -o new": r"words\.json",
-    "recognise missing.mcap -o new": r"missing\.mcap",
-    "calibrate bare -o new": r"ends in \.json",
-    "calibrate blind -o model": r"blind\.mcap: without true trajectory and true landmarks",
-    "calibrate bare -o model": r"bare\.mcap: has no sonar images",
-    "calibrate lane lane -o model": r"lane\.mcap: is named twice.*name each log once",
-    "calibrate lane -o model --designs strange": r"true landmarks are 1, 2, 3, 4, the designs are 9: .*--designs",
-    "calibrate lane -o model --set identity.tempre=1": r"settings of the recogniser: identity\.tempre: .*temper",
-    "calibrate lane -o model --calibration words.json": r"words\.json: not JSON",
-    "compare bare -o new --rule jeffrey": r"bare\.mcap: has no sonar images.*--rule",
-    "compare lane -o new --rule bayes": r"settings of the recogniser: identity\.rule: .*virtual-evidence.*jeffrey",
-    "compare lane -o new --model list.json": r"list\.json: .*calibrate",
-    "compare lane -o new --designs broken.toml": r"broken\.toml.*size_m",
-    "recognise lane -o new --rule jeffrey --set identity.rule=jeffrey": r"--rule jeffrey and --set .*give one of them",
-    "recognise images -o new": r"images\.mcap: nothing for imu.*IMU and Doppler log must both be in the log",
-    "calibrate lane -o model --designs broken.toml": r"broken\.toml.*size_m",
-    "compare words.json -o new": r"words\.json",
-}
+def test_tags_are_written_as_landmarks(lane_log, actag, run, tmp_path):
+    written = tmp_path / "tags.mcap"
+    assert run("recognise", lane_log, "-o", written, "--recogniser", "actag", "--set", "tag_size_m=0.15") == 0
+    sequence = read_log(written)
+    found = sequence.detections
+    assert found is not None
+    assert len(found) > 50
+    assert set(found.candidate_ids.ravel().tolist()) == {5}
+    np.testing.assert_allclose(found.range_m, 1.95)
+    np.testing.assert_allclose(found.azimuth_rad, 0.05)
+    assert "AcTag" in sequence.notes["detections.rule"]
+    assert "0.15 m" in sequence.notes["detections.designs"]
 
 
-@pytest.mark.parametrize("command", MISTAKES)
-def test_a_mistake_is_answered_in_a_line(command: str, files, run, capsys):
-    arguments = [files.get(word, word) for word in command.split()]
-    before = {path: path.read_bytes() for path in files.values() if path.is_file()}
-    assert run(*arguments) == 2
-    said = capsys.readouterr().err
-    assert "Traceback" not in said
-    assert re.search(MISTAKES[command], " ".join(re.sub(r"[│╭╮╰╯─]", " ", said).split())), said
-    if said.startswith("sonar-graph: "):
-        assert said.count("\n") == 1
-    else:
-        assert said.startswith("Usage: ")
-    assert {path: path.read_bytes() for path in before} == before
-    assert not files["new"].is_file()
-    assert not files["model"].exists()
+def test_without_actag_one_line_names_the_extra(lane_log, monkeypatch, run, tmp_path, capsys):
+    monkeypatch.setitem(sys.modules, "actag", None)
+    assert run("recognise", lane_log, "-o", tmp_path / "tags.mcap", "--recogniser", "actag") == 2
+    assert "sonar-graph[actag]" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "tags.mcap").exists()
+
+
+def test_settings_reach_the_recogniser(lane_log, run, tmp_path):
+    written = tmp_path / "none.mcap"
+    assert run("recognise", lane_log, "-o", written, "--set", "least_frames=10000") == 0
+    assert read_log(written).detections is None

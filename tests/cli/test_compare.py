@@ -1,0 +1,171 @@
+"""``run``, ``compare``, ``report``, ``demo`` and ``estimators``: from a log to reports and results."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sonar_graph.calibration import Calibration
+from sonar_graph.cli.compare import DEMO, check_rate
+from sonar_graph.errors import EvaluationError
+from sonar_graph.estimator import load_estimator
+from sonar_graph.evaluation.storage import read_comparison
+from sonar_graph.logs.reading import read_log
+from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.basin import FASTEST_M_S, PAPER_LAPS, BasinOptions, cruise_speed
+
+
+@pytest.fixture(scope="module")
+def compared(run, basin_content, tmp_path_factory):
+    """What ``compare`` writes for a log."""
+    folder = tmp_path_factory.mktemp("compared")
+    log = folder / "basin.mcap"
+    log.write_bytes(basin_content)
+    assert run("compare", log, "-o", folder / "out", "--rate-hz", "1") == 0
+    return folder / "out"
+
+
+def test_compare_writes_report_numbers_results_and_runs(compared):
+    for name in ("report.html", "comparison.json", "result.mcap", "result.foxglove.json", "result.rviz"):
+        assert (compared / name).stat().st_size > 1000
+    for estimator in ("isam2", "ekf-slam", "dead-reckoning"):
+        there = {path.name for path in (compared / "runs" / estimator).iterdir()}
+        assert {"trajectory.tum", "causal.tum", "landmarks.csv", "result.json"} <= there
+        assert json.loads((compared / "runs" / estimator / "result.json").read_text())["status"] == "ok"
+
+
+def test_compare_says_where_the_report_is_and_nothing_on_stderr(run, basin, tmp_path, capsys):
+    assert run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning") == 0
+    told = capsys.readouterr()
+    assert f"Report: {tmp_path / 'report.html'}" in told.out.splitlines()
+    assert "dead-reckoning" in told.out
+    assert told.err == ""
+
+
+def test_report_draws_the_same_page_again(run, compared):
+    page = compared / "report.html"
+    before = page.read_text()
+    page.unlink()
+    assert run("report", compared) == 0
+    assert len(page.read_text()) == pytest.approx(len(before), rel=0.01)
+
+
+def test_failed_run_is_written_and_reported_by_exit_code(run, basin, tmp_path, monkeypatch, capsys):
+    from baselines.dead_reckoning import DeadReckoning
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("the filter is tired")
+
+    monkeypatch.setattr(DeadReckoning, "process", fail)
+    assert run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning,ekf-slam") == 1
+    assert "the filter is tired" in capsys.readouterr().err
+    assert "the filter is tired" in (tmp_path / "report.html").read_text()
+    assert json.loads((tmp_path / "runs" / "dead-reckoning" / "result.json").read_text())["status"] == "failed"
+    assert json.loads((tmp_path / "runs" / "ekf-slam" / "result.json").read_text())["status"] == "ok"
+
+
+def test_run_writes_one_estimator(run, basin, tmp_path):
+    assert run("run", basin, "--estimator", "dead-reckoning", "-o", tmp_path) == 0
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["dead-reckoning"]
+
+
+def test_calibration_file_goes_before_that_of_the_log_field_by_field(run, basin, tmp_path):
+    moved = tmp_path / "moved.toml"
+    moved.write_text("[start]\nposition_m = [100.0, 0.0, -1.0]\n")
+    arguments = ("run", basin, "--estimator", "dead-reckoning", "-o", tmp_path / "out")
+    calibrations = []
+    for more in ((), ("--calibration", moved)):
+        assert run(*arguments, *more) == 0
+        said = json.loads((tmp_path / "out" / "comparison.json").read_text())["sequence"]
+        calibrations.append(said["calibration"])
+    first = (tmp_path / "out" / "runs" / "dead-reckoning" / "causal.tum").read_text().splitlines()[1].split()
+    assert float(first[1]) == pytest.approx(100, abs=3)
+    of_log, changed = calibrations
+    assert changed["start"].pop("position_m") != of_log["start"].pop("position_m")
+    assert changed == of_log
+    assert said["notes"]["log.calibration"] == f"from {moved}: start.position_m; else from the log"
+
+
+def test_estimators_lists_every_setting(run, capsys):
+
+    assert run("estimators") == 0
+    shown = capsys.readouterr().out
+    for name in ("isam2", "invariant-ekf", "ekf-slam", "dead-reckoning"):
+        assert name in shown
+        for setting in load_estimator(name).Params.model_fields:
+            assert setting in shown
+
+
+def test_start_and_end_cut_the_log(run, basin, tmp_path, capsys):
+    options = ("--estimator", "dead-reckoning", "--start", "30", "--end", "60")
+    assert run("run", basin, "-o", tmp_path / "out", *options) == 0
+    notes = json.loads((tmp_path / "out" / "comparison.json").read_text())["sequence"]["notes"]
+    assert notes["log.part"] == "30.000 s to 60.000 s of the recording"
+    capsys.readouterr()
+    assert run("inspect", basin, "--start", "30", "--end", "60") == 0
+    assert ", 30.0 s" in capsys.readouterr().out
+
+
+def test_a_damaged_log_is_refused_with_the_option_that_reads_it(run, basin, tmp_path, capsys):
+    log = tmp_path / "damaged.mcap"
+    content = bytearray(basin.read_bytes())
+    content[len(content) // 3] ^= 1
+    log.write_bytes(content)
+    options = ("-o", tmp_path / "out", "--estimator", "dead-reckoning")
+    assert run("run", log, *options) == 2
+    assert re.search(r"is damaged: bytes .* is lost: .*--salvage", capsys.readouterr().err)
+    assert run("run", log, *options, "--salvage") == 0
+    notes = json.loads((tmp_path / "out" / "comparison.json").read_text())["sequence"]["notes"]
+    assert "is lost" in notes["log.damage"]
+
+
+@pytest.mark.slow
+def test_demo_goes_from_images_to_the_papers_table(run, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sonar_graph.cli.compare.DEMO", DEMO | {"duration_s": 130.0, "laps": 1})
+    assert run("demo", "-o", tmp_path) == 0
+    told = capsys.readouterr().out
+    assert f"Report: {tmp_path / 'report.html'}" in told
+    assert "2014 paper x" in told
+    sequence = read_log(tmp_path / "basin.mcap")
+    assert sequence.detections is None, "the log holds images, not what is in them"
+    comparison = read_comparison(tmp_path)
+    assert comparison.recognition is not None
+    assert comparison.recognition.frames > 600
+    assert {run.estimator for run in comparison.runs if run.landmarks is not None and len(run.landmarks) == 4} == {
+        "isam2",
+        "ekf-slam",
+    }
+
+
+def test_demo_drives_the_three_laps_of_the_paper_with_images():
+    options = BasinOptions.model_validate(DEMO)
+    assert options.laps == PAPER_LAPS
+    assert options.image is not None
+    assert cruise_speed(options) < FASTEST_M_S
+
+
+def measured_at(stamps_s: list[float]) -> Sequence:
+    stamps_ns = np.round(np.array(stamps_s) * 1e9).astype(np.int64)
+    vectors = np.zeros((len(stamps_ns), 3))
+    dvl = Dvl(stamps_ns, vectors, np.full((len(stamps_ns), 3, 3), np.nan))
+    return Sequence("dive", Calibration(), Imu(stamps_ns, vectors, vectors), dvl)
+
+
+def test_estimates_are_asked_for_at_most_as_often_as_the_imu_measures():
+    dive = measured_at(np.arange(0, 10.01, 0.05).tolist())
+    check_rate(20.0, dive)
+    with pytest.raises(EvaluationError, match=r"--rate-hz 21: the IMU of dive .* at most 20\.1"):
+        check_rate(21.0, dive)
+
+
+def test_the_default_rate_is_never_refused():
+    slow = measured_at([0.0, 1.0, 2.0])
+    check_rate(2.0, slow)
+    with pytest.raises(EvaluationError, match=r"give at most 2$"):
+        check_rate(3.0, slow)
+    check_rate(2.0, replace(slow, imu=slow.imu.between(0, 10**9)))  # one row

@@ -1,0 +1,109 @@
+"""``simulate``: the commands are the library's functions between reading and writing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from typer.testing import CliRunner
+
+from sonar_graph.cli.main import app
+from sonar_graph.logs.reading import read_log, read_sonar_frames
+from sonar_graph.logs.writing import write_log
+from sonar_graph.simulation.basin import BasinOptions, simulate_basin, simulate_basin_frames
+from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmarks
+from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+
+SHORT = {"duration_s": 120, "laps": 1, "frame_rate_hz": 0.5, "image": {"multipath": False}}
+
+
+def simulate(path: Path, *more: str, said: str = "Log: ") -> None:
+    words = ["simulate", "basin", "-o", str(path), "--images", "--duration-s", "120", "--laps", "1"]
+    result = CliRunner().invoke(app, [*words, "--set", "frame_rate_hz=0.5", "--set", "image.multipath=false", *more])
+    assert result.exit_code == 0, result.output
+    assert said in result.output
+
+
+def test_images_and_other_sensors_are_those_of_the_library(tmp_path: Path):
+    simulate(
+        tmp_path / "a.mcap", said="Landmarks: 1 disc at (5, 0), 2 square at (7, -5), 3 triangle at (2, -7), 4 cross"
+    )
+    options = BasinOptions.model_validate(SHORT)
+    read, made = list(read_sonar_frames(tmp_path / "a.mcap")), list(simulate_basin_frames(options))
+    order = np.argsort([block.stamps_ns[0] for block in read])
+    images = np.concatenate([read[k].intensity for k in order])
+    np.testing.assert_array_equal(images, np.concatenate([block.frames.intensity for block in made]))
+    np.testing.assert_allclose(read[0].azimuths_rad, made[0].frames.azimuths_rad, atol=1e-12)
+    sequence, expected = read_log(tmp_path / "a.mcap"), simulate_basin(options)
+    assert sequence.detections is None
+    np.testing.assert_array_equal(sequence.imu.angular_velocity, expected.imu.angular_velocity)
+    assert sequence.true_landmarks is not None
+
+
+@pytest.mark.slow
+def test_same_seed_gives_the_same_bytes(tmp_path: Path):
+    for name, seed in (("a", "3"), ("b", "3"), ("c", "4")):
+        simulate(tmp_path / f"{name}.mcap", "--seed", seed)
+    contents = [(tmp_path / f"{name}.mcap").read_bytes() for name in "abc"]
+    assert contents[0] == contents[1]
+    assert contents[0] != contents[2]
+
+
+def test_images_lie_among_the_other_messages_in_the_order_of_time(tmp_path: Path):
+    simulate(tmp_path / "a.mcap")
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        times_ns = [record.log_time for record in StreamReader(stream).records if isinstance(record, Message)]
+    assert len(times_ns) > 60
+    assert times_ns == sorted(times_ns)
+
+
+def test_simulation_flags_and_settings_reach_the_simulator(run, tmp_path, monkeypatch, capsys):
+    given_options = []
+    monkeypatch.setattr("sonar_graph.simulation.simulate_basin", given_options.append)
+    monkeypatch.setattr("sonar_graph.logs.write_log", lambda path, _: path.touch())
+    flags = ("--seed", 7, "--laps", 2, "--imu", "mti1", "--no-bias", "--set", "wrong_id_rate=0.05")
+    assert run("simulate", "basin", "-o", tmp_path / "new" / "basin.mcap", *flags) == 0
+    options = given_options[0]
+    assert (options.seed, options.laps, options.imu) == (7, 2, "mti1")
+    assert (options.gyro_bias_scale, options.wrong_id_rate) == (0.0, 0.05)
+    assert capsys.readouterr().out == f"Log: {tmp_path / 'new' / 'basin.mcap'}\n"
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("landmarks") / "recorded.mcap"
+    run = simulate_mission(MissionOptions(seed=5, duration_s=60))
+    write_log(path, replace(run, detections=None, true_landmarks=None))
+    return path
+
+
+def place(*words: str | Path) -> tuple[int, str]:
+    result = CliRunner().invoke(app, ["simulate", "landmarks", *map(str, words)])
+    return result.exit_code, " ".join(result.output.split())
+
+
+def test_the_log_gets_what_the_library_places_and_keeps_its_sensors(log: Path, tmp_path: Path):
+    code, said = place("--on", log, "-o", tmp_path / "new.mcap", "--seed", "3", "--set", "spacing_m=4")
+    assert code == 0, said
+    read, recorded = read_log(tmp_path / "new.mcap"), read_log(log)
+    expected = add_landmarks(recorded, LandmarkOptions(seed=3, spacing_m=4.0))
+    assert read.detections is not None
+    assert expected.detections is not None
+    np.testing.assert_allclose(read.detections.range_m, expected.detections.range_m, atol=1e-6)
+    np.testing.assert_array_equal(read.imu.angular_velocity, recorded.imu.angular_velocity)
+    np.testing.assert_array_equal(read.dvl.velocity, recorded.dvl.velocity)
+    assert f"{len(read.true_landmarks or ())} landmarks, {len(read.detections)} detections" in said
+
+
+def test_another_seed_is_another_map(log: Path, tmp_path: Path):
+    maps = []
+    for seed in "12":
+        assert place("--on", log, "-o", tmp_path / f"{seed}.mcap", "--seed", seed)[0] == 0
+        maps.append(read_log(tmp_path / f"{seed}.mcap").true_landmarks)
+    assert maps[0] is not None
+    assert maps[1] is not None
+    assert not np.array_equal(maps[0].positions, maps[1].positions)
