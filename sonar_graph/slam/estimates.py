@@ -162,14 +162,8 @@ def joint_covariance(
 ) -> JointCovariance:
     """See `sonar_graph.slam.isam2.Isam2.joint_covariance`.
 
-    Parameters
-    ----------
-    history
-        Solves the whole graph.
-    stamps_ns
-        Of all keyframes of the run.
-    at_ns
-        Stamps of those that are asked for beside ``keyframes``.
+    ``history`` solves the whole graph; ``stamps_ns`` are those of all keyframes, ``at_ns`` those asked for beside
+    ``keyframes``.
     """
     if over not in get_args(Over):
         raise EstimatorError(f'isam2: over is {over!r}; expected "window" or "history"')

@@ -212,18 +212,7 @@ class Keyframes:
                 self._set(node_ns)
 
     def set_for_frame(self, stamp_ns: int, motion: PreintegratedMotion) -> PreintegratedMotion:
-        """Set a keyframe if a frame deserves a newer one than the newest.
-
-        Parameters
-        ----------
-        motion
-            From the newest keyframe to the frame.
-
-        Returns
-        -------
-        PreintegratedMotion
-            From what is then the newest keyframe to the frame.
-        """
+        """Set a keyframe if a frame needs a newer one; the motion from the then newest keyframe to the frame."""
         node_ns = self.odometry.newest_node(self.stamps_ns[-1], stamp_ns)
         if node_ns is not None:
             sonar, bias_sigma = self.calibration.sonar, self.calibration.imu.gyro_bias_sigma

@@ -24,9 +24,6 @@ def smoother_with(
 ) -> Smoother:
     """One that keeps all poses, never restarts and lets nothing wait, unless told so."""
     params = SmootherParams(
-        lag_s=lag_s,
-        relinearize_threshold=relinearize_threshold,
-        stale_shift_m=stale_shift_m,
-        waiting_gain=waiting_gain,
+        lag_s=lag_s, relinearize_threshold=relinearize_threshold, stale_shift_m=stale_shift_m, waiting_gain=waiting_gain
     )
     return Smoother(params, is_bounded=is_bounded)

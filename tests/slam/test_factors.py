@@ -78,18 +78,6 @@ def test_odometry_error_is_what_the_pose_is_off_the_corrected_motion():
     assert not np.allclose(factor.unwhitenedError(values_of(X0=pose, X1=X_j, B0=motion.bias)), 0, atol=1e-3)
 
 
-def test_odometry_with_the_bias_it_was_integrated_with_is_gtsams_between_factor():
-    motion, pose = some_motion(3), BODY_POSES["random"]
-    X_j = pose.compose(motion.i_T_j).compose(small_pose(np.random.default_rng(0), 0.1))
-    with_bias = factors.odometry_with_bias(X(0), X(1), B(0), motion)
-    without = factors.odometry(X(0), X(1), motion)
-    values = values_of(X0=pose, X1=X_j, B0=motion.bias)
-    assert np.allclose(with_bias.unwhitenedError(values), without.unwhitenedError(values))
-    assert with_bias.error(values) == pytest.approx(without.error(values))
-    error = without.unwhitenedError(values)
-    assert without.error(values) == pytest.approx(0.5 * error @ np.linalg.solve(motion.covariance, error))
-
-
 @pytest.mark.parametrize("sigma", [0.05, 1e-5, 1e-7])
 def test_odometry_keeps_the_correlations_of_the_shortest_motion(sigma: float):
     """GTSAM's own choice drops them where all are below 1e-9."""
@@ -156,17 +144,6 @@ def test_derivatives_of_sightings_are_those_of_differences(pose, azimuth, elevat
     cov[0, 1] = cov[1, 0] = 1e-4
     for factor in factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain, 0.07):
         assert_jacobians(factor, values)
-
-
-@given(azimuth=st.floats(-1.13, 1.13), elevation=st.floats(-0.12, 0.12))
-@settings(max_examples=20)
-def test_elevation_is_the_vertical_image_coordinate(azimuth, elevation):
-    pose, sigma = BODY_POSES["random"], 0.07
-    values = values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, 2.0))
-    camera = factors.landmark_sighting(
-        X(0), L(0), BODY_T_SONAR, np.array([2.0, azimuth]), np.diag([4e-4, 8e-5]), plain, sigma
-    )[0]
-    assert camera.whitenedError(values)[1] == pytest.approx(elevation / sigma, abs=1e-9)
 
 
 @given(st.floats(-1.13, 1.13), st.floats(-0.12, 0.12), st.floats(-0.9, 0.9))

@@ -13,7 +13,6 @@ import pytest
 from gtsam.symbol_shorthand import L
 from scipy.stats import chi2
 
-from sonar_graph.calibration import Calibration, ImuCalibration, Start
 from sonar_graph.errors import CalibrationError
 from sonar_graph.evaluation.consistency import normalised_squares
 from sonar_graph.logs.convert.mrclam import read_mrclam
@@ -58,10 +57,6 @@ def until(sequence: Sequence, end_ns: int) -> Sequence:
         depth=sequence.depth.between(0, end_ns) if sequence.depth else None,
         detections=sequence.detections.between(0, end_ns) if sequence.detections else None,
     )
-
-
-def with_calibration(sequence: Sequence, **changes) -> Sequence:
-    return replace(sequence, calibration=sequence.calibration.model_copy(update=changes))
 
 
 # At rest ------------------------------------------------------------------------------------------------------------
@@ -206,20 +201,6 @@ def test_every_detection_has_one_row_in_the_order_of_frames(basin):
     assert counts.get(Outcome.NO_IDENTITY, 0) == int(np.sum(seen.most_probable()[1] < 0.7))
 
 
-def test_used_detections_are_two_factors_each_a_landmark_one_more_and_refused_none():
-    """Against the same log without detections, keyframes at the same stamps."""
-    sequence = with_calibration(small_world(), imu=ImuCalibration(gyro_bias_sigma=0.0))
-    params = isam2_params(keyframes__motion_noise_share=1e9, keyframes__max_interval_s=1.0)
-    sighted, blind = (Isam2(s.calibration, params) for s in (sequence, sequence))
-    run(sighted, sequence)
-    run(blind, replace(sequence, detections=None))
-    outcomes = sighted.detections().outcomes
-    told = sum(outcome in (Outcome.USED, Outcome.NEW) for outcome in outcomes)
-    assert 0 < outcomes.count(Outcome.NO_IDENTITY) < len(outcomes)
-    landmarks = outcomes.count(Outcome.NEW)
-    assert sighted.graph.size() == blind.graph.size() + 2 * told + landmarks
-
-
 def test_refused_detections_leave_everything_as_it_is():
     sequence = small_world()
     rows = sequence.detections
@@ -255,64 +236,6 @@ def test_a_detection_far_off_is_gated_and_changes_nothing():
     assert haunted.detections().outcomes[-1] is Outcome.GATED
     assert np.abs(gtsam.Pose3.Logmap(ends[-1].world_T_body.between(expected[-1].world_T_body))).max() < 1e-3
     assert len(haunted.detections()) == len(plain.detections()) + 1
-
-
-def test_detections_before_the_start_are_unlocated():
-    sequence = small_world(dvl_delay_s=5.0)
-    estimator = Isam2(sequence.calibration)
-    for step in sequence.replay(sequence.start_ns + np.arange(-8, 20) * NS_PER_S // 2):
-        estimator.process(step)
-    log = estimator.detections()
-    early = log.stamps_ns < sequence.start_ns
-    assert early.any()
-    assert [o is Outcome.UNLOCATED for o in log.outcomes] == early.tolist()
-
-
-# Kinds of vehicles --------------------------------------------------------------------------------------------------
-
-
-def test_a_landmarks_height_is_wide_until_it_is_seen_from_several_heights():
-    """No floor: from one height the aperture is all that is known; a dive of 2 m tells it by the ranges."""
-    spread = {}
-    for dive_m in (0.0, 2.0):
-        sequence = dipping(dive_m)
-        estimator = Isam2(sequence.calibration)
-        run(estimator, sequence)
-        found = estimator.landmarks()
-        spread[dive_m] = np.sqrt(found.covariances[0, 2, 2])
-        assert abs(found.positions[0, 2] - DIP_LANDMARK[2]) < 3 * spread[dive_m]
-    aperture_m = 3.0 * Calibration().sonar.elevation_aperture_rad / np.sqrt(12)
-    assert spread[0.0] == pytest.approx(aperture_m, rel=0.1)
-    assert spread[2.0] < 0.2 * spread[0.0]
-
-
-DIP_LANDMARK = np.array([3.0, 0.0, 0.1])
-
-
-def dipping(dive_m: float) -> Sequence:
-    """20 s on the spot, or down and up again, watching one landmark; measurements are exact."""
-    hz, seconds = 10, 20
-    stamps = 10**18 + np.arange(seconds * hz + 1) * NS_PER_S // hz
-    t = (stamps - stamps[0]) * 1e-9
-    z = -dive_m / 2 * (1 - np.cos(2 * np.pi * t / seconds))
-    sink = -dive_m / 2 * 2 * np.pi / seconds * np.sin(2 * np.pi * t / seconds)
-    n, seen = len(stamps), slice(1, None, 5)
-    points = DIP_LANDMARK - np.column_stack([0 * z, 0 * z, z])
-    return Sequence(
-        "dip",
-        Calibration(imu=ImuCalibration(gyro_bias_sigma=0.0), start=Start(rpy_sigma_rad=(1e-4,) * 3)),
-        Imu(stamps, np.zeros((n, 3)), np.full((n, 3), np.nan)),
-        Dvl(stamps, np.outer(sink, [0, 0, 1.0]), np.full((n, 3, 3), np.nan)),
-        Depth(stamps, z, np.full(n, 1e-6)),
-        LandmarkDetections(
-            stamps[seen],
-            np.linalg.norm(points, axis=1)[seen],
-            np.zeros(n)[seen],
-            np.full((n, 2, 2), np.nan)[seen],
-            np.full((n, 1), 2)[seen],
-            np.ones((n, 1))[seen],
-        ),
-    )
 
 
 # Consistency --------------------------------------------------------------------------------------------------------

@@ -35,10 +35,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a policy for its section": ({"identity": "gnc"}, 'identity: expected a section with policy = "gnc"'),
     "no such section": ({"smother.lag_s": 3}, "smother: there is no such field; did you mean smoother?"),
     "no such setting": ({"smoother.lag": 3}, "smoother.lag: there is no such field; did you mean lag_s? smoother has"),
-    "out of range": (
-        {"identity.policy": "gate", "identity.gate_probability": 2},
-        "identity.gate_probability: Input",
-    ),
+    "out of range": ({"identity.policy": "gate", "identity.gate_probability": 2}, "identity.gate_probability: Input"),
 }
 
 

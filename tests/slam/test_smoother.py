@@ -101,38 +101,6 @@ def test_biases_in_a_row_are_least_squares(lag_s):
     assert np.diag(smoother.covariance(B(7))) == pytest.approx([cov[7, 7]] * 3, abs=1e-9)
 
 
-def test_an_older_bias_leaves_the_window_once_the_lag_is_over():
-    """The next one takes its place; the old stays in what the history gives."""
-    fed = in_the_basin(5, 3.0)
-    fed.smoother.add_bias(B(1), np.zeros(3))
-    fed.add([factors.bias_walk(B(0), B(1), 1e-3)])
-    D_bias = np.vstack([-np.eye(3), np.zeros((3, 3))])
-    motion = PreintegratedMotion(gtsam.Pose3(), 1e-4 * np.eye(6), D_bias, np.zeros(3), 1.0, np.zeros(3))
-    for k in range(5, 12):
-        fed.smoother.add_pose(X(k), fed.smoother.values.atPose3(X(k - 1)), float(k))
-        fed.add([factors.odometry_with_bias(X(k - 1), X(k), B(1), motion)])
-        fed.smoother.update(float(k))
-    assert fed.smoother.covariance(B(1)).shape == (3, 3)
-    with pytest.raises(IndexError, match="not in the BayesTree"):
-        fed.smoother.covariance(B(0))
-    values, marginals = fed.smoother.solve_history()
-    assert np.allclose(marginals.marginalCovariance(B(0)), dense_covariance(fed, values, [B(0)]), rtol=1e-6)
-
-
-def test_one_computation_of_covariances_serves_until_the_next_update():
-    """Asked for more than before, it is made for all; what it says does not depend on who asked first."""
-    fed = in_the_basin(12, FOREVER_S)
-    alone = fed.smoother.joint_covariance([X(11), L(3)])
-    pose = alone.at(X(11), X(11)).copy()
-    both = fed.smoother.joint_covariance([X(11), L(3), L(5)])
-    assert np.allclose(both.at(X(11), X(11)), pose, rtol=1e-9)
-    assert np.allclose(both.at(L(5), L(5)), fed.smoother.covariance(L(5)), rtol=1e-6)
-    assert fed.smoother.joint_covariance([L(5)]) is both
-    fed.add([gtsam.PriorFactorPoint3(L(5), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 1e-3))])
-    fed.smoother.update(11.0)
-    assert fed.smoother.joint_covariance([L(5)]).at(L(5), L(5))[0, 0] < 1e-5
-
-
 def test_covariances_are_those_of_where_the_window_has_settled():
     """A landmark that is pulled away by decimetres lies at other angles to all that see it."""
     fed, keys = in_the_basin(12, FOREVER_S), [X(11), L(3)]

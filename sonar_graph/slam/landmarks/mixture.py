@@ -60,15 +60,7 @@ Scores = dict[int | None, float]
 
 
 class Errors:
-    """Errors of sightings against landmarks, whitened, for poses as they are estimated.
-
-    Parameters
-    ----------
-    sightings
-        n of them.
-    values
-        With the poses that they hang on.
-    """
+    """Whitened errors of n sightings against landmarks, for poses as they are estimated."""
 
     def __init__(self, sightings: Sequence[Sighting], values: gtsam.Values) -> None:
         n = len(sightings)
@@ -247,15 +239,7 @@ LEAST_MARGIN = 3.0
 def supporters_elsewhere(
     landmark_id: int, watches: list[TrackedObject], choices: Choices, values: gtsam.Values, mixture: Mixture
 ) -> list[TrackedObject] | None:
-    """Watches that put a landmark in a better place than where it is; None where there is no better one.
-
-    Parameters
-    ----------
-    watches
-        Those that name the landmark.
-    choices
-        What each counts as now.
-    """
+    """Watches that put the landmark they name in a better place than where it is; None where none is better."""
     voters = watches[-MOST_VOTERS:]
     proposals = [w for w, choice in zip(watches, choices, strict=True) if choice != landmark_id][-MOST_PROPOSALS:]
     if len(proposals) < 2:

@@ -112,15 +112,7 @@ def graduated_weights(
     c2: Floats,
     values: gtsam.Values,
 ) -> tuple[gtsam.Values, Floats]:
-    """The solution of (1), and which watches it keeps, shape (n,): weights of 0 or 1, or nearly.
-
-    Parameters
-    ----------
-    weighted
-        The graph in which the watches have these weights.
-    squared_errors
-        r2 of the watches.
-    """
+    """Solution of (1), and the weight of each watch, shape (n,): 0 or 1, or nearly."""
     mu = first_mu(squared_errors(values), c2)
     weights = np.ones(len(c2))
     for _ in range(MOST_GRADES if np.isfinite(mu) else 0):
@@ -150,13 +142,7 @@ class RivalHistory:
         self._maker = maker
 
     def settled(self, values: gtsam.Values, choices: Choices, *, is_graduated: bool) -> tuple[gtsam.Values, Choices]:
-        """The nearest fixed point of the max-mixture from a solution with these choices.
-
-        Parameters
-        ----------
-        is_graduated
-            Whether to take what graduated non-convexity finds, if that costs less.
-        """
+        """Nearest fixed point of the max-mixture from these choices, or what graduated non-convexity finds."""
         values, choices = self._fixed_point(values, choices)
         if is_graduated and self._known(values):
             found, others = self.graduated(values)

@@ -55,11 +55,7 @@ class DoubtfulIdentities:
     """Keeps the graph in line with the best component of every watch."""
 
     def __init__(
-        self,
-        landmarks: LandmarkSightings,
-        journal: DetectionJournal,
-        params: MixtureIdentity,
-        mixture: Mixture,
+        self, landmarks: LandmarkSightings, journal: DetectionJournal, params: MixtureIdentity, mixture: Mixture
     ) -> None:
         self._landmarks = landmarks
         self._smoother, self._maker = landmarks.smoother, landmarks.maker

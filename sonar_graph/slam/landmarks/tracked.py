@@ -134,16 +134,8 @@ def inside_gate(smoother: Smoother, threshold: float, sightings: list[Sighting],
 class DeferredIdentities:
     """Keeps the graph in line with the identities of tracks.
 
-    Parameters
-    ----------
-    landmarks
-        Sightings in the graph, by landmark.
-    journal
-        Rows to amend when sightings are used, moved, taken back or forgotten.
-    gate
-        Largest squared Mahalanobis distance of sightings that come late to a landmark of the graph.
-    longest_wait_s
-        Longest wait of a sighting. A track that was not seen for so long is over, and keeps its identity.
+    Late sightings pass a gate, the largest squared Mahalanobis distance. A sighting waits at most ``longest_wait_s``; a
+    track that was not seen for so long is over, and keeps its identity.
     """
 
     def __init__(
@@ -162,19 +154,10 @@ class DeferredIdentities:
         return track
 
     def hear(self, frame: LandmarkDetections, decisions: list[int], time_s: float) -> None:
-        """Bring earlier sightings in line with what a frame's rows decide, before its own are made.
+        """Bring earlier sightings in line with what a frame's rows decide (`decide`), before its own are made.
 
-        Where tracks come to claim one landmark in one earlier frame, that of the more probable row gets it, but what
-        is used already stays.
-
-        Parameters
-        ----------
-        frame
-            One row of each track (`once_a_track`).
-        decisions
-            Decision of each row (`decide`).
-        time_s
-            Time of the newest keyframe.
+        Where tracks come to claim one landmark in one earlier frame, that of the more probable row gets it, but what is
+        used already stays. The frame has one row of each track (`once_a_track`); time is that of the newest keyframe.
         """
         stamp_ns = int(frame.stamps_ns[0])
         self.forget(stamp_ns)

@@ -129,13 +129,7 @@ def unnamed(frame: LandmarkDetections) -> NDArray[np.bool_]:
 
 
 def refuse_taken_ids(frame: LandmarkDetections) -> None:
-    """Refuse identities that are reserved for landmarks without names.
-
-    Raises
-    ------
-    EstimatorError
-        Naming the identity.
-    """
+    """Refuse identities that are reserved for landmarks without names, with an `EstimatorError`."""
     largest = int(frame.candidate_ids.max())
     if largest >= FIRST_ANONYMOUS_ID:
         raise EstimatorError(
@@ -164,17 +158,7 @@ class PairedDetection(NamedTuple):
 
 
 class AnonymousLandmarks:
-    """Pairs detections without identities, and begins and merges landmarks.
-
-    Parameters
-    ----------
-    landmarks
-        Of the graph.
-    journal
-        Its rows are amended when sightings are used later, or forgotten, and when landmarks are merged.
-    policy
-        What is believed.
-    """
+    """Pairs detections without identities, and begins and merges landmarks."""
 
     def __init__(self, landmarks: LandmarkSightings, journal: DetectionJournal, policy: AssociatedUnknown) -> None:
         self._landmarks = landmarks

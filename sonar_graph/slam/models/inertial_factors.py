@@ -101,12 +101,7 @@ def inertial_doppler_odometry(
 
 
 def doppler_odometry(
-    pose_i: int,
-    pose_j: int,
-    bias: int,
-    motion: JointMotion,
-    scale: int | None = None,
-    mounting: int | None = None,
+    pose_i: int, pose_j: int, bias: int, motion: JointMotion, scale: int | None = None, mounting: int | None = None
 ) -> gtsam.NonlinearFactor:
     """Six rows from gyro and Doppler log; see `inertial_doppler_odometry`."""
     keys, columns = _with_calibration([pose_i, pose_j, bias], [POSE_I, POSE_J, BIAS], scale, mounting)

@@ -111,11 +111,7 @@ def locate(world_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, eleva
 
 
 def locate_jacobians(
-    world_T_body: gtsam.Pose3,
-    body_T_sonar: gtsam.Pose3,
-    range_m: float,
-    azimuth_rad: float,
-    elevation_rad: float,
+    world_T_body: gtsam.Pose3, body_T_sonar: gtsam.Pose3, range_m: float, azimuth_rad: float, elevation_rad: float
 ) -> tuple[Floats, Floats, Floats]:
     """A located point with derivatives.
 

@@ -30,10 +30,7 @@ def marginal(
 ) -> list[gtsam.NonlinearFactor]:
     """Marginal of a graph on the kept variables, linearised at the values.
 
-    Raises
-    ------
-    RuntimeError
-        When elimination gives up: QR on what is not determined, Cholesky also on what is determined weakly.
+    A RuntimeError where elimination gives up: QR on what is not determined, Cholesky also on what is determined weakly.
     """
     linear = graph.linearize(values)
     separator = [key for key in linear.keyVector() if key in kept]
@@ -77,13 +74,7 @@ def anchored(factor: gtsam.NonlinearFactor, theta: gtsam.Values) -> gtsam.Nonlin
 def without(
     graph: gtsam.NonlinearFactorGraph, theta: gtsam.Values, left_out: Iterable[gtsam.NonlinearFactor] = ()
 ) -> gtsam.NonlinearFactorGraph:
-    """A window's graph, its holes closed and its marginals anchored, less some factors.
-
-    Parameters
-    ----------
-    theta
-        Where the window's variables are linearised.
-    """
+    """Graph of a window linearised at theta, its holes closed and its marginals anchored, less some factors."""
     gone, kept = list(left_out), gtsam.NonlinearFactorGraph()
     for i in range(graph.size()):
         if graph.exists(i) and graph.at(i) not in gone:
@@ -118,17 +109,7 @@ MOST_SETTLING_UPDATES = 10
 
 
 class SmootherWindow:
-    """iSAM2 over the variables that were seen in the last seconds.
-
-    It eliminates by Cholesky, and by QR once that has given up.
-
-    Parameters
-    ----------
-    relinearize_threshold
-        A variable is relinearised when any component of its change exceeds this (rad or m).
-    lag_s
-        Age from which on variables leave, to begin with.
-    """
+    """iSAM2 over the variables of the last ``lag_s`` seconds, by Cholesky, and by QR once that has given up."""
 
     def __init__(self, relinearize_threshold: float, lag_s: float) -> None:
         self._threshold = relinearize_threshold
@@ -146,13 +127,7 @@ class SmootherWindow:
         return gtsam.IncrementalFixedLagSmoother(self.lag_s, params)
 
     def begin(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times_s: Mapping[Any, float]) -> None:
-        """Anew, with nothing but these factors and variables; by QR where it is needed.
-
-        Raises
-        ------
-        RuntimeError
-            When even that finds no solution.
-        """
+        """Begin anew with nothing but these factors and variables; by QR where it is needed, else a RuntimeError."""
         try:
             self._begin_once(graph, values, times_s)
         except RuntimeError:
@@ -175,17 +150,9 @@ class SmootherWindow:
         values: gtsam.Values,
         times_s: Mapping[Any, float],
     ) -> None:
-        """Anew, with the marginal of what lies outside: by Cholesky while that is able to, then by QR.
+        """Begin anew with the marginal of what lies outside, linearised at the solved values: by Cholesky, else by QR.
 
-        Parameters
-        ----------
-        solved
-            Values of all variables, at which the marginal is linearised.
-
-        Raises
-        ------
-        RuntimeError
-            When even QR finds no solution.
+        A RuntimeError where even QR finds no solution.
         """
         if not self.is_by_qr:
             try:

@@ -90,12 +90,7 @@ class Smoother:
     When bounded, factors that leave the window become marginals for good, and their variables are forgotten.
     """
 
-    def __init__(
-        self,
-        params: SmootherParams,
-        *,
-        is_bounded: bool = False,
-    ) -> None:
+    def __init__(self, params: SmootherParams, *, is_bounded: bool = False) -> None:
         self.params = params
         self._restart_size = FIRST_RESTART
         self.is_bounded = is_bounded
@@ -129,13 +124,7 @@ class Smoother:
         return self._history.graph
 
     def add_pose(self, key: int, pose: gtsam.Pose3, time_s: float) -> None:
-        """A new keyframe, with its first estimate, not older than the one before.
-
-        Raises
-        ------
-        EstimatorError
-            When the key is taken, or time runs back; nothing is added.
-        """
+        """Add a keyframe with its first estimate; an `EstimatorError` where the key is taken or time runs back."""
         self._check_new(key)
         if time_s < self._newest_s:
             raise EstimatorError(
@@ -148,25 +137,13 @@ class Smoother:
         self._expiring[key] = time_s
 
     def add_landmark(self, key: int, point: Floats) -> None:
-        """A new landmark, which never leaves the window, with its first estimate.
-
-        Raises
-        ------
-        EstimatorError
-            When the key is taken; nothing is added.
-        """
+        """Add a landmark, which never leaves the window, with its first estimate."""
         self._check_new(key)
         self._insert(key, point)
         self._landmarks.append(key)
 
     def add_bias(self, key: int, bias: Floats) -> None:
-        """A new gyro bias, with its first estimate. It stays in the window until the lag after the next one.
-
-        Raises
-        ------
-        EstimatorError
-            When the key is taken; nothing is added.
-        """
+        """Add a gyro bias with its first estimate. It stays in the window until the lag after the next one."""
         self._check_new(key)
         self._insert(key, bias)
         self._bias = [key]
@@ -201,12 +178,9 @@ class Smoother:
     def exchange(
         self, what: GraphEdit, time_s: float, entered: Callable[[list[list[int]]], None] = lambda _: None
     ) -> list[list[int]]:
-        """Take factors out, put others in, and bring the window up to date; the handles of each group put in.
+        """Take factors out, put others in, and update the window; the handles of each group put in.
 
-        Parameters
-        ----------
-        entered
-            Is told these handles before anything is solved: `when_withheld` may be about one of them.
+        ``entered`` gets these handles before anything is solved: `when_withheld` may be about one of them.
         """
         self.flush(time_s)
         slots = self._window.slots([self._history.factor(handle) for handle in what.removed])
@@ -342,13 +316,7 @@ class Smoother:
         self._history.keep(self._window.isam.getFactors(), self._window.isam.getLinearizationPoint(), left)
 
     def _give_up_cholesky(self, time_s: float) -> None:
-        """Go on by QR after Cholesky met a pose far less certain than its step (`sonar_graph.slam.smoother.fixed_lag`).
-
-        Raises
-        ------
-        EstimatorError
-            When QR has one here too: which variables are open, and what is missing.
-        """
+        """Go on by QR after Cholesky met a pose far less certain than its step; `EstimatorError` where QR fails too."""
         self._window.is_by_qr = True
         self._clear_pending()
         self._restart(time_s)

@@ -201,10 +201,7 @@ def culprits(
 ) -> list[Withheld]:
     """New factors because of which a window cannot be solved; none where it can, if with better arithmetic.
 
-    Raises
-    ------
-    EstimatorError
-        When a keyframe, or what was in the window before, is left open.
+    An `EstimatorError` where a keyframe, or what was in the window before, is left open.
     """
     graph = gtsam.NonlinearFactorGraph(window)
     graph.push_back(pending.graph)
