@@ -138,12 +138,6 @@ def test_other_objects_in_other_places_for_another_seed():
     assert not np.allclose(first.truth.points_m[0, 4:], second.truth.points_m[0, 4:], atol=0.05)
 
 
-def test_oculus_frames_have_its_size():
-    imaged = next(simulate_basin_frames(BasinOptions.model_validate(SLOW | {"image": {"sonar": "oculus1200"}}), 1))
-    assert imaged.frames.intensity.shape == (1, 512, 512)
-    assert imaged.frames.azimuths_rad[0] < -0.5
-
-
 def squares(path: Path, ids: list[int]) -> Path:
     """Bright squares with these identities, on plates of unequal sizes."""
     corners = "[[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]"

@@ -1,5 +1,7 @@
 """The truth is one curve: rates, accelerations and attitude must belong to the same motion."""
 
+import math
+
 import gtsam
 import numpy as np
 import pytest
@@ -7,7 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import cumulative_simpson
 
-from sonar_graph.simulation.vehicle import VehiclePath, rotation_from_rpy, rpy_from_rotation, smooth_noise
+from sonar_graph.simulation.vehicle import (
+    VehiclePath,
+    drive,
+    follow,
+    hover,
+    rpy_from_rotation,
+    smooth_noise,
+    turn,
+)
 
 SECONDS = np.linspace(0, 10, 41)
 
@@ -53,21 +63,45 @@ def test_angular_acceleration_is_the_derivative_of_angular_velocity():
     np.testing.assert_allclose(path.at(middle).angular_acceleration, slope, atol=1e-5)
 
 
-@given(st.tuples(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1)))
-def test_roll_pitch_yaw_means_the_same_as_in_the_calibration(rpy: tuple[float, float, float]):
-    rotation = rotation_from_rpy(np.array(rpy))
-    np.testing.assert_allclose(rotation.as_matrix(), gtsam.Rot3.RzRyRx(*rpy).matrix(), atol=1e-12)
-    np.testing.assert_allclose(rpy_from_rotation(rotation), rpy, atol=1e-6)
-
-
-def test_positive_pitch_lowers_the_nose():
-    nose = rotation_from_rpy(np.array([0.0, 0.5, 0.0])).apply([1.0, 0.0, 0.0])
-    assert nose[2] < 0
-
-
 def test_smooth_noise_is_as_large_as_it_says_and_smooth():
     seconds = np.linspace(0, 20_000, 200_001)
     curves = smooth_noise(seconds, np.array([1.0, 3.0]), 5.0, 2, np.random.default_rng(1))
     np.testing.assert_allclose(curves.std(axis=0), [0.66, 1.98], rtol=0.08)
     second = np.diff(curves, 2, axis=0) / 0.1**2
     assert np.abs(np.diff(second, axis=0)).max() < 0.1 * np.abs(second).max()
+
+
+START = (1.0, -2.0, 0.5)
+
+
+@given(st.floats(0.1, 20), st.floats(0.05, 1), st.floats(0.5, 5))
+def test_drive_ends_its_length_ahead(length_m: float, speed_m_s: float, ramp_s: float):
+    piece = drive(START, length_m, speed_m_s, ramp_s)
+    end = follow(START, [piece], np.array([0.0, piece.duration_s, piece.duration_s + 5]))
+    ahead = np.array([math.cos(0.5), math.sin(0.5)]) * length_m
+    np.testing.assert_allclose(end[0], START, atol=1e-12)
+    np.testing.assert_allclose(end[1:, :2], np.tile(START[:2] + ahead, (2, 1)), atol=1e-9)
+    np.testing.assert_allclose(end[:, 2], 0.5, atol=1e-12)
+
+
+def test_drive_cruises_at_its_speed_and_accelerates_no_more_than_stated():
+    piece = drive((0.0, 0.0, 0.0), 3.0, 0.15, 3.0)
+    seconds = np.linspace(0, piece.duration_s, 23_001)
+    x = follow((0.0, 0.0, 0.0), [piece], seconds)[:, 0]
+    step = seconds[1]
+    speed, acceleration = np.diff(x) / step, np.diff(x, 2) / step**2
+    np.testing.assert_allclose(speed[5000:15000], 0.15, rtol=1e-6)
+    assert speed.min() > -1e-9
+    assert np.abs(acceleration).max() == pytest.approx(1.5 * 0.15 / 3.0, rel=1e-3)
+
+
+def test_legs_follow_each_other_and_a_hover_stays():
+    first = drive((0.0, 0.0, 0.0), 2.0, 0.5, 1.0)
+    second = turn(first.goal, -math.pi / 2, 4.0)
+    third = hover(second.goal, 30.0)
+    fourth = drive(third.goal, 1.0, 0.5, 1.0)
+    pieces = [first, second, third, fourth]
+    until = np.cumsum([p.duration_s for p in pieces])
+    poses = follow((0.0, 0.0, 0.0), pieces, until)
+    expected = [[2, 0, 0], [2, 0, -math.pi / 2], [2, 0, -math.pi / 2], [2, -1, -math.pi / 2]]
+    np.testing.assert_allclose(poses, expected, atol=1e-12)
