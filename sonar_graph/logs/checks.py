@@ -42,15 +42,7 @@ _ROTATIONS = {
 
 
 def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
-    """Faults of a topic's stamps: missing, backwards, repeated, far from the time of recording, or drifting from it.
-
-    Parameters
-    ----------
-    stamps_ns
-        Stamps of the headers in the order of the file, shape (n,).
-    log_times_ns
-        Times of recording, shape (n,).
-    """
+    """Faults of header stamps, shape (n,): missing, backwards, repeated, far from times of recording, or drifting."""
     unset = (stamps_ns == 0) & (log_times_ns != 0)  # data sets begin at 0: recorded at 0, a stamp of 0 is right
     if unset.any():
         yield f"{_count(int(unset.sum()), 'message')} without a stamp: the time of recording is used"

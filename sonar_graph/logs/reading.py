@@ -160,21 +160,8 @@ def read_log(
 class Assembly:
     """Blocks of measurements from the chosen topics of a log, with an account of rows left out and warnings.
 
-    Parameters
-    ----------
-    recording
-        The log.
-    choices
-        The choice for each role.
-    calibration
-        As for `read_log`.
-
-    Raises
-    ------
-    LogError
-        When no message of a needed topic is what its definition says.
-    CalibrationError
-        When the calibration in the log is invalid, or becomes so by the user's changes.
+    Raises LogError when no message of a needed topic is what its definition says, and CalibrationError when the
+    calibration in the log is invalid, or becomes so by the user's changes.
     """
 
     def __init__(
@@ -264,11 +251,7 @@ class Assembly:
     def sequence(self, name: str | None = None) -> Sequence:
         """Everything that was chosen as one sequence, called ``name``, or as the log calls itself, or like the file.
 
-        Raises
-        ------
-        LogError
-            When no row of IMU or DVL is fit for use, both have no time in common, no velocity is whole, or a message
-            breaks its own rules.
+        Raises LogError when IMU and DVL are not enough for any estimator, or a message breaks its own rules.
         """
         for role in ("imu", "dvl"):
             if self.block(role) is None:
@@ -334,13 +317,7 @@ def _counts(dropped: Dropped) -> str:
 
 
 def require_use(file: str, imu: Imu, dvl: Dvl) -> None:
-    """Refuse measurements with which no estimator could begin.
-
-    Raises
-    ------
-    LogError
-        When IMU and Doppler log have no time in common, or no row of the Doppler log has a velocity in all directions.
-    """
+    """Refuse an IMU and a Doppler log without common time, or without a row of velocity in all directions."""
     if max(imu.stamps_ns[0], dvl.stamps_ns[0]) > min(imu.stamps_ns[-1], dvl.stamps_ns[-1]):
         raise LogError(
             f"{file}: IMU {_span(imu)}, DVL {_span(dvl)}: no common time; of another clock or unit? "

@@ -130,19 +130,8 @@ def adapter_for(role: Role, topic: Topic, config: LogConfig) -> Adapter | str:
 def choose_topic(role: Role, recording: Recording, config: LogConfig = _DEFAULTS, wanted: str | None = None) -> Choice:
     """Choose the topic for a role and its adapter; where there is none, the choice has a reason instead of an error.
 
-    Parameters
-    ----------
-    role, recording
-        The role and the log.
-    config
-        The user's log configuration; its topic goes before a search by type.
-    wanted
-        The topic that the user chose, before that of the configuration.
-
-    Raises
-    ------
-    LogError
-        When the configuration names fields that the messages which it is about do not have.
+    A topic that the user ``wanted`` goes before that of the configuration, and this before a search by type. A
+    configuration that names fields which the messages do not have is refused.
     """
     table, topics = config.table(role.name), recording.topics
     if table.get("use") is False and wanted is None:

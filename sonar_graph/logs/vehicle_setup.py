@@ -204,13 +204,7 @@ def recorded_name(recording: Recording) -> str | None:
 
 
 def read_calibration(recording: Recording) -> Calibration | None:
-    """Calibration in the log's record, or None.
-
-    Raises
-    ------
-    CalibrationError
-        When it is not one.
-    """
+    """Calibration in the log's record, or None; an invalid one is a `CalibrationError`."""
     text = recording.metadata.get(METADATA, {}).get("calibration")
     if text is None:
         return None
@@ -218,13 +212,7 @@ def read_calibration(recording: Recording) -> Calibration | None:
 
 
 def read_notes(recording: Recording) -> dict[str, str]:
-    """Notes in the log's record.
-
-    Raises
-    ------
-    LogError
-        When they are not a JSON object.
-    """
+    """Notes in the log's record, which must be a JSON object."""
     notes = _json(recording, "notes", recording.metadata.get(METADATA, {}).get("notes", "{}"))
     if not isinstance(notes, dict):
         raise LogError(f"{recording.path}: metadata record {METADATA!r}: notes must be a JSON object")

@@ -272,6 +272,15 @@ def test_detections_that_estimators_do_not_use_are_told_and_impossible_ones_left
     assert all(text in notes for text in told)
 
 
+def test_odometry_lasts_while_there_are_both_sensors(bench: Bench) -> None:
+    imu, (topic, kind, messages) = bench.basics(9)
+    frames = [bench.detections(T0_NS + k * STEP_NS, [2.0], [5]) for k in (0, 4, 8)]
+    path = bench.write(imu, (topic, kind, messages[2:7]), ("/landmarks", "detections", frames))
+    said = read_log(path).notes["log.warnings"]
+    assert "detections: 1 of 3 rows have a stamp before the first odometry" in said
+    assert "detections: 1 of 3 rows have a stamp after the last odometry" in said
+
+
 @pytest.mark.parametrize("cross", [0.0, 0.9, -1.1, np.inf, np.nan])
 @pytest.mark.parametrize(
     "variances", [(1.0, 1.0), (-1.0, -1.0), (0.0, 1.0), (np.inf, 1.0), (1.0, np.inf), (np.nan, 1.0)]

@@ -92,13 +92,7 @@ class DetectionListsAdapter(Adapter):
     """``sonar_graph_msgs/LandmarkDetections``: range, azimuth, covariance and posterior, in flat lists."""
 
     def read(self, topic: Topic) -> tuple[LandmarkDetections | None, Dropped]:
-        """One row a detection; where messages differ in the number of candidates, -1 with probability 0 fills.
-
-        Raises
-        ------
-        LogError
-            When the lists of a message do not belong together, or an identity is too large.
-        """
+        """One row a detection; where messages differ in the number of candidates, -1 with probability 0 fills."""
         groups = [group for group in topic.messages() if group["range_m"].shape[1]]
         log_times_ns = topic.log_times_ns  # of sound messages, which are known now
         if not groups:
@@ -162,13 +156,7 @@ class DetectionArrayAdapter(Adapter):
         return field_paths(f"{_CENTRE}.x", _SCORE, _CLASS, f"{_RESULT}.pose.position.x", f"{_RESULT}.covariance")
 
     def read(self, topic: Topic) -> tuple[LandmarkDetections | None, Dropped]:
-        """One row a detection that has a result; the scores are the posterior, in the order of the results.
-
-        Raises
-        ------
-        LogError
-            For a class that stands for no integer, and scores that are no posterior.
-        """
+        """One row a detection that has a result; the scores are the posterior, in the order of the results."""
         groups = [group for group in topic.messages() if group.lengths("detections.results")]
         if not groups:
             return None, {}
@@ -249,13 +237,7 @@ class LandmarkMapAdapter(Adapter):
     """``sonar_graph_msgs/LandmarkMap``: true positions of landmarks."""
 
     def read(self, topic: Topic) -> tuple[LandmarkMap | None, Dropped]:
-        """The last sound map of a topic; None where none is.
-
-        Raises
-        ------
-        LogError
-            When its lists do not belong together or an identity comes twice.
-        """
+        """The last sound map of a topic; None where none is."""
         groups = topic.messages()
         if not groups:
             return None, {}
@@ -273,14 +255,9 @@ class LandmarkMapAdapter(Adapter):
 
 
 def detection_warnings(detections: LandmarkDetections, first_ns: int, last_ns: int) -> Iterator[str]:
-    """Rows that estimators do not use: impossible ranges and covariances, no odometry at their time, repeated tracks.
+    """Rows that estimators do not use: impossible ranges and covariances, repeated tracks, and rows without odometry.
 
-    Parameters
-    ----------
-    detections
-        All that were read.
-    first_ns, last_ns
-        Beginning and end of the odometry.
+    The odometry lasts from ``first_ns`` to ``last_ns``.
     """
     covs = detections.range_azimuth_cov
     a, b, c = covs[:, 0, 0], covs[:, 1, 0], covs[:, 1, 1]

@@ -96,13 +96,7 @@ class LogConfig:
         return frozenset(short_name(table["type"]) for table in self.tables.values() if "type" in table)
 
     def adapters(self, role: str, type_name: str) -> list[Adapter]:
-        """Adapters for one type: the shipped ones, changed as the table says, or the table's own.
-
-        Raises
-        ------
-        LogError
-            As `parse`.
-        """
+        """Adapters for one type: the shipped ones, changed as the table says, or the table's own."""
         table = self.table(role)
         bases = shipped_for(role, type_name)
         if not bases and "type" in table:
@@ -127,13 +121,7 @@ class LogConfig:
         return found
 
     def require_fields(self, role: str, type_name: str, definition: Struct) -> None:
-        """Refuse a table that names fields which the messages do not have.
-
-        Raises
-        ------
-        LogError
-            Naming source, table, key and field, and the fields that there are.
-        """
+        """Refuse a table that names fields which the messages do not have; naming those that they have."""
         known = dict(leaf_fields(definition))
         faults: list[str] = []
         for adapter in self.adapters(role, type_name):
@@ -199,14 +187,9 @@ _WIDTH = 120
 
 
 def table_text(role: str, topic: str, adapter: Adapter, shipped: Adapter | None) -> str:
-    """TOML table that gives this adapter again when it is read, each key with its meaning.
+    """TOML table that gives an adapter again when it is read, each key with its meaning.
 
-    Parameters
-    ----------
-    role, topic, adapter
-        What was chosen.
-    shipped
-        Shipped adapter for the type, whose settings hold where the table has none.
+    A setting that is None is written only where the shipped adapter for the type has one.
     """
     lines = [f"[{role}]", _line("topic", topic, None), _line("type", adapter.type, None)]
     for name, info in type(adapter).model_fields.items():
@@ -241,13 +224,7 @@ def _line(name: str, value: Any, description: str | None) -> str:
 
 
 def toml_value(value: Any) -> str:
-    """A value as TOML, on one line.
-
-    Raises
-    ------
-    TypeError
-        For what TOML cannot express.
-    """
+    """A value as TOML, on one line."""
     if isinstance(value, BaseModel):
         return toml_value(value.model_dump(exclude_none=True))
     if isinstance(value, str):

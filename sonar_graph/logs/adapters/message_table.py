@@ -22,17 +22,7 @@ LOG_TIME = "log"
 
 
 def header_stamps_ns(group: Messages, log_times_ns: Ints, prefix: str = "header.stamp.") -> Ints:
-    """Stamps of messages from their headers, shape (n,); the log's time where a header's stamp is zero.
-
-    Parameters
-    ----------
-    group
-        n messages.
-    log_times_ns
-        Times of recording of all messages of the topic.
-    prefix
-        Path before the two fields of the stamp.
-    """
+    """Stamps of messages from their headers, shape (n,); the topic's times of recording where these are zero."""
     stamps_ns = group[f"{prefix}sec"].astype(np.int64) * NS_PER_S + group[f"{prefix}nanosec"]
     return np.where(stamps_ns == 0, log_times_ns[group.rows], stamps_ns)
 

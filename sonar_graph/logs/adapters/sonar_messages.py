@@ -84,19 +84,8 @@ class SonarAdapter(Adapter):
     def read(self, topic: Topic, refused: Refused | None = None) -> Iterator[SonarFrames]:
         """Blocks of frames that share beams, bins and kind of sample, in the order of the log.
 
-        A block ends where the next frame differs in these, or has an earlier stamp.
-
-        Parameters
-        ----------
-        topic
-            With its payloads.
-        refused
-            Called with stamp and reason of each message that is no image; None: the first is an error.
-
-        Raises
-        ------
-        LogError
-            When an image is not as long as beams and bins say, without ``refused``.
+        A block ends where the next frame differs in these, or has an earlier stamp. A message that is no image is given
+        to ``refused`` with its stamp and the reason, or else is an error.
         """
         recorded_ns = topic.log_times_ns
         is_any_sound = bool(topic.messages())  # from here on the topic knows its sound messages
