@@ -46,14 +46,8 @@ def turn_values(imu: ImuCalibration) -> TurnValues:
 def hole_ns(stamps: Ints, rows: int, row: int, until_ns: int) -> int:
     """Length of the hole before a row; 0 where there is none.
 
-    Parameters
-    ----------
-    rows
-        Number of stamps that are known.
-    row
-        First row after an instant; ``rows``: none is known, and a hole is open.
-    until_ns
-        End of an open hole so far.
+    Only the first ``rows`` stamps are known; ``row = rows`` means a hole that is open, and lasts until ``until_ns`` so
+    far.
     """
     if row <= 0:
         return 0

@@ -161,10 +161,7 @@ class Odometry:
     def steps_between_nodes(self, start_ns: int, end_ns: int) -> Steps:
         """Steps of the final motion from one node to a later, reached one.
 
-        Raises
-        ------
-        MeasurementError
-            When an end is no node or is not covered by IMU rows, or the ends are in the wrong order.
+        Raises MeasurementError where an end is no node or not covered by IMU rows, or the ends are in the wrong order.
         """
         if not are_nodes(self._imu.stamps_ns, self._dvl.stamps_ns, start_ns, end_ns):
             raise self._no_nodes(start_ns, end_ns, {"start_ns": start_ns, "end_ns": end_ns})
@@ -173,10 +170,7 @@ class Odometry:
     def steps_to_node(self, since_ns: int, node_ns: int) -> Steps:
         """Steps of the final motion to a reached node from any instant among the rows, such as one in a gap.
 
-        Raises
-        ------
-        MeasurementError
-            When the node is none or is not covered by IMU rows, or the instant lies before all rows or after the node.
+        Raises MeasurementError where the node is none or not covered, or the instant is before all rows or after it.
         """
         if not are_nodes(self._imu.stamps_ns, self._dvl.stamps_ns, node_ns, node_ns) or since_ns > node_ns:
             raise self._no_nodes(since_ns, node_ns, {"node_ns": node_ns})
@@ -188,10 +182,7 @@ class Odometry:
     def steps_since_node(self, node_ns: int, until_ns: int) -> Steps:
         """Steps of the provisional motion from a reached node to a later instant, from rows stamped no later.
 
-        Raises
-        ------
-        MeasurementError
-            When the node is none or is not reached, or the instant lies before it.
+        Raises MeasurementError where the node is none or not reached, or the instant lies before it.
         """
         if until_ns < node_ns or not are_nodes(self._imu.stamps_ns, self._dvl.stamps_ns, node_ns, node_ns):
             raise self._no_nodes(node_ns, until_ns, {"node_ns": node_ns})

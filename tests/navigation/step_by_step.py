@@ -16,11 +16,7 @@ from .rows import NS, T0_NS, dvl, imu, stamps, waves
 GYRO, ACCEL, SIGMA = 2e-3, 3e-3, 0.01
 NO_RATE = np.zeros(3)
 
-HELD: dict[str, tuple[float, float]] = {
-    "zoh-previous": (0.0, 0.5),
-    "zoh-current": (1.0, 1.0),
-    "trapezoid": (0.5, 0.5),
-}
+HELD: dict[str, tuple[float, float]] = {"zoh-previous": (0.0, 0.5), "zoh-current": (1.0, 1.0), "trapezoid": (0.5, 0.5)}
 """Rules that turn one velocity by one rotation: the later sample's share, and when the rotation is, in intervals."""
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -194,21 +192,6 @@ def test_a_quarter_of_a_second_without_a_row_is_no_hole_and_more_is():
         align_at_rest(imu.rows((seconds < 5.01) | (seconds > 5.27)), KNOWN)
 
 
-def density_of(imu: Imu) -> float:
-    """As the refusal by much too small a density says it."""
-    sharp = Calibration(imu=SENSORS.model_copy(update={"accel_noise_density": 1e-9}))
-    with pytest.raises(AlignmentError, match=r"Imu.specific_force: varies") as refused:
-        align_at_rest(imu, sharp)
-    return float(re.search(r"a density of (\S+),", str(refused.value))[1])
-
-
-@pytest.mark.parametrize(("rest_s", "runs"), [(2.2, 400), (20.0, 60)])
-def test_the_density_that_is_said_is_that_of_the_noise(rest_s, runs):
-    """Mean of many squares, whatever the number of blocks, and however few rows are left over at the end."""
-    squares = [density_of(noisy(seed, rest_s)) ** 2 for seed in range(runs)]
-    assert np.mean(squares) == pytest.approx(SENSORS.accel_noise_density**2, rel=0.1)
-
-
 def test_half_more_noise_than_known_is_let_pass_even_where_chance_adds_to_it():
     """20 s are 39 blocks: 114 squares sum to 1.76 times their number once in a million, and 1.5 sqrt(1.76) is 1.99."""
     assert all(is_rest(noisy(seed, times=1.7)) for seed in range(20))
@@ -231,17 +214,20 @@ def test_a_push_of_half_a_second_is_noticed_in_the_first_block_too(block):
         align_at_rest(Imu(imu.stamps_ns, imu.angular_velocity, pushed), KNOWN)
 
 
-@pytest.mark.parametrize(("rate", "rests"), [(0.019, True), (0.021, False), (-0.021, False)])
-def test_a_rate_may_be_a_bias_up_to_a_fiftieth_of_a_radian(rate, rests):
+@pytest.mark.parametrize(
+    ("rate", "share", "rests"),
+    [
+        *((rate, 1.0, rests) for rate, rests in ((0.019, True), (0.021, False), (-0.021, False))),
+        *(
+            (0.0, share, rests)
+            for share, rests in ((0.96, True), (1.04, True), (0.94, False), (1.06, False), (9.8, False))
+        ),
+    ],
+)
+def test_a_rest_turns_by_a_bias_at_most_and_feels_gravity_but_for_a_twentieth(rate, share, rests):
     imu = rest(NOISELESS, noise=0.0)
     turned = np.tile([0.0, rate, 0.0], (len(imu), 1))
-    assert is_rest(Imu(imu.stamps_ns, turned, imu.specific_force)) == rests
-
-
-@pytest.mark.parametrize(("share", "rests"), [(0.96, True), (1.04, True), (0.94, False), (1.06, False), (9.8, False)])
-def test_force_is_gravity_but_for_a_twentieth(share, rests):
-    imu = rest(NOISELESS, noise=0.0)
-    assert is_rest(Imu(imu.stamps_ns, imu.angular_velocity, share * imu.specific_force)) == rests
+    assert is_rest(Imu(imu.stamps_ns, turned, share * imu.specific_force)) == rests
 
 
 def doppler(seconds: list[float], velocity: object) -> Dvl:

@@ -142,13 +142,6 @@ def test_gaps_that_follow_each_other_spread_together_as_noise_of_every_sample_do
     assert error_of_spread("velocity", SIGMA_M_S, imu, few, known, pings_s[0], pings_s[-1]) < tolerance
 
 
-def test_the_first_gap_of_a_log_has_no_neighbour():
-    known = calibration(velocity_sigma_m_s=(0.01,) * 3, gap_s=0.9)
-    imu, dvl = rows()
-    alone = motion(imu, dvl.rows(np.isin(dvl.stamps_ns, [at(5.0), at(LOST_S)])), known, 5.0, LOST_S)
-    assert np.diag(alone.covariance)[3:] == pytest.approx([0.01**2 * 2 / 4] * 3, rel=1e-6)
-
-
 def test_a_gap_that_ends_between_inertial_rows_uses_the_row_after_its_end_and_no_later_one():
     imu, dvl = rows()
     late = Dvl(dvl.stamps_ns + NS // 20 * (dvl.stamps_ns >= at(FOUND_S)), dvl.velocity, dvl.velocity_cov)
@@ -302,13 +295,6 @@ def test_the_line_is_fitted_to_the_samples_of_the_last_five_seconds_that_inertia
 )
 def test_a_line_takes_four_samples_and_a_second(dvl_hz, count, is_known):
     assert fitted(dvl_hz, count=count).is_known == is_known
-
-
-def test_no_line_where_a_force_was_not_measured():
-    still = imu(stamps(RATE_HZ, NODE_S + 1.0), ZERO)
-    force = still.specific_force.copy()
-    force[-40] = np.nan
-    assert not fitted(4.0, imu_rows=Imu(still.stamps_ns, still.angular_velocity, force)).is_known
 
 
 def test_the_displacement_is_that_of_the_fitted_line():

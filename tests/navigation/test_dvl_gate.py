@@ -104,13 +104,6 @@ def test_rows_are_compared_with_the_last_one_believed():
     assert d[3] == pytest.approx(0.1**2 / variances[1])
 
 
-def test_a_row_that_measured_a_part_is_compared_but_nothing_with_it():
-    velocity = [[0.5, 0.0, 0.0], [0.55, 0.0, 0.0], [0.6, 0.0, 0.0]]
-    d = found([0, NS // 10, 2 * NS // 10], velocity, partial=(1,))
-    assert d[1] == pytest.approx(0.05**2 / (5e-4 + WALK**2 * 0.1 + (0.03 * 0.5) ** 2))
-    assert d[2] == pytest.approx(0.1**2 / (2e-4 + WALK**2 * 0.2 + (0.06 * 0.5) ** 2))
-
-
 def test_a_distance_at_the_gate_is_believed():
     """Just inside it becomes the one that others are compared with, just outside it does not."""
     spread = np.sqrt(1e-4 + 4e-4 + WALK**2 * 0.1)
@@ -313,13 +306,6 @@ def test_rows_of_few_beams_wait_with_the_first_whole_ones():
     odometry = told(Dvl(rows.stamps_ns, rows.velocity, cov))
     assert np.array_equal(odometry.columns()[3], rows.stamps_ns[1:])
     assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [(rows.stamps_ns[0], Refusal.INCOMPLETE)]
-
-
-def test_held_velocities_are_never_in_doubt():
-    rows = start({0: WRONG})
-    odometry = told(rows, calibration=Calibration(odometry_interpolation="hold-past"))
-    assert np.array_equal(odometry.columns()[4], rows.velocity)
-    assert not odometry.refused
 
 
 def test_after_a_shorter_gap_one_row_is_enough():

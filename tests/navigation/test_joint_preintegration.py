@@ -5,9 +5,8 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as arrays
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
@@ -18,7 +17,6 @@ from sonar_graph.navigation.preintegration.joint_preintegration import (
     DISPLACEMENT,
     JointMotion,
     JointPreintegrator,
-    with_rate_noise,
 )
 from sonar_graph.navigation.preintegration.joint_recursion import RULES
 from sonar_graph.navigation.preintegration.motion import Preintegrator
@@ -212,14 +210,6 @@ def test_linear_rule_is_the_motion_of_the_gyro_and_doppler_preintegrator():
     assert relative(actual.covariance, expected.covariance) < 1e-3
 
 
-def test_doppler_noise_of_the_linear_rule_is_half_a_sample_less_than_spread_over_time():
-    """Ten intervals: weights of one, and a half at either end, have 9.5 squares where the other has 10."""
-    at = stamps(5, 2.0)
-    rows = random_rows(8)[0], dvl(at, np.array([0.5, 0.1, 0.0]) + waves(at, 9, 0.3))
-    actual, expected = both_ways(rows, 1e-12, 0.01)
-    assert relative(actual.covariance[3:, 3:], 0.95 * expected.covariance[3:, 3:]) < 0.01
-
-
 def test_inertial_part_is_that_of_gtsam():
     """Its tangent preintegration turns a step by the attitude at its start: first order in small steps."""
     quick = stamps(1000, 2.0)
@@ -239,15 +229,6 @@ def test_inertial_part_is_that_of_gtsam():
     order = np.r_[0:3, 6:9, 3:6]
     sigmas = np.sqrt(np.diag(motion.covariance)[order])
     assert np.sqrt(np.diag(theirs.preintMeasCov())) == pytest.approx(sigmas, rel=0.03)
-
-
-def test_a_vehicle_at_rest_stays_there():
-    """Whatever its tilt: the Doppler samples level the accelerometer."""
-    at, slow = stamps(100, 60.0), stamps(5, 60.0)
-    up = gtsam.Rot3.RzRyRx(0.4, -0.3, 1.0).unrotate(np.array([0, 0, 9.81]))
-    motion = made((imu(at, np.zeros(3), up), dvl(slow, np.zeros(3))), "inertial", np.zeros(6))
-    assert np.abs(motion.displacement).max() < 1e-9
-    assert motion.velocity == pytest.approx(60 * up)
 
 
 def test_the_accelerometer_draws_what_lies_between_two_samples():
@@ -372,28 +353,6 @@ def test_repeated_inertial_stamps_are_refused_at_the_ends_too(row):
     preintegrator.integrate(twice, doppler, 2 * NS, 3 * NS)
 
 
-@given(arrays.arrays(np.float64, (3, 3), elements=st.floats(-1, 1)), st.integers(1, 3))
-@settings(max_examples=60)
-def test_covariances_are_refused_exactly_where_an_eigenvalue_is_negative(A, rank):
-    """Of what is far enough from zero to be told; singular ones are possible."""
-    inertial, doppler = steady()
-    indefinite = A + A.T
-    lowest, size = np.linalg.eigvalsh(indefinite)[0], np.abs(indefinite).max()
-    assume(size > 1e-3)
-    cases = [(A[:, :rank] @ A[:, :rank].T, False)]
-    if lowest < -1e-3 * size or lowest > 0:
-        cases.append((indefinite, bool(lowest < 0)))
-    for cov, is_refused in cases:
-        every = np.tile(np.eye(3) * 1e-4, (51, 1, 1))
-        every[2] = cov
-        rows = inertial, Dvl(doppler.stamps_ns, doppler.velocity, every)
-        if is_refused:
-            with pytest.raises(MeasurementError, match=f"row at {2 * NS // 5} ns is no covariance"):
-                JointPreintegrator(GYRO, ACCEL).integrate(*rows, 0, NS)
-        else:
-            JointPreintegrator(GYRO, ACCEL).integrate(*rows, 0, NS)
-
-
 def test_a_chain_takes_only_the_motion_that_ends_where_the_next_begins():
     rows, preintegrator = steady(), JointPreintegrator(GYRO, ACCEL)
     first, second, third = (preintegrator.integrate(*rows, k * NS, (k + 1) * NS) for k in range(3))
@@ -466,13 +425,6 @@ def test_covariance_over_long_intervals_is_that_of_many_noisy_runs(doppler_s):
     assert 0.87 < np.mean(squares) / 3 < 1.13
 
 
-def test_noise_of_the_rate_is_across_the_arm_at_the_ends_of_long_intervals_alone():
-    dvl_ns, arm = apart(0.0, 0.2, 0.4, 2.0, 2.2)[1].stamps_ns, np.array([2.0, 0.0, 0.0])
-    cov = with_rate_noise(np.zeros((5, 3, 3)), dvl_ns, stamps(QUICK_HZ, 3.0), 1e-3, arm)
-    expected = (2e-3) ** 2 * QUICK_HZ * np.diag([0.0, 1.0, 1.0])
-    assert np.allclose(cov, [0 * expected, 0 * expected, expected, expected, 0 * expected], atol=1e-18)
-
-
 def test_a_chain_over_long_intervals_has_the_displacement_of_the_whole():
     samples = apart(6.0, 7.0, 9.0, 9.2, 12.0)
     first, second = (SENSORS.integrate(*samples, at(a), at(b)) for a, b in ((6.0, 9.0), (9.0, 12.0)))
@@ -531,12 +483,3 @@ def test_gyro_noise_spreads_the_swing_about_the_imu_as_noise_of_every_row_does()
     sigmas = np.sqrt(np.diag(expected))
     off = (exact.covariance[DISPLACEMENT, DISPLACEMENT] - expected) / np.outer(sigmas, sigmas)
     assert np.abs(off).max() < 0.1
-
-
-def test_earths_rotation_swings_no_doppler_log():
-    """At rest on the Earth gyros read its rate, and the log stays where it is."""
-    earth = np.array([0.04, -0.07, 0.05])
-    inertial, log, sensors = turning(earth, (1.0, 0.2, -0.3))
-    ends = int(log.stamps_ns[0]), int(log.stamps_ns[-1])
-    still = sensors.integrate(inertial, log, *ends, earth_rate=earth)
-    assert np.abs(still.displacement).max() < 1e-12

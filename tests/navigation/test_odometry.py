@@ -22,7 +22,6 @@ from sonar_graph.navigation.preintegration.motion import PreintegratedMotion, Pr
 from sonar_graph.navigation.preintegration.recursion import Steps
 from sonar_graph.navigation.samples import longest_interval_ns
 
-from . import test_motion_laws as tumbling
 from . import vehicle
 from .rows import NS, T0_NS, dvl, imu, part, random_steps, stamps, waves
 from .test_motion_laws import at
@@ -171,17 +170,6 @@ def test_a_chain_has_the_variance_of_its_doppler_samples(intervals_s, seed):
     assert displacement_variance(odometry, at.tolist()) == pytest.approx(true + excess, rel=1e-6)
 
 
-def test_the_weight_of_a_doppler_sample_is_half_its_two_intervals():
-    at = T0_NS + np.array([0, 100, 350, 400, 700]) * 1_000_000
-    weights = []
-    for k in range(len(at)):
-        velocity = np.zeros((len(at), 3))
-        velocity[k, 0] = 0.01
-        steps = odometry_of(imu(at, 0.0), dvl(at, velocity)).steps_between_nodes(int(at[0]), int(at[-1]))
-        weights.append(100 * float(steps.duration_s @ steps.velocity[:, 0]))
-    assert weights == pytest.approx([0.05, 0.175, 0.15, 0.175, 0.15])
-
-
 def test_velocity_noise_does_not_depend_on_where_the_imu_cuts():
     """Many gyro samples in a Doppler interval, or none: the same variance in all."""
     at, cov = stamps(5, 2.0), 1e-4 * np.eye(3)
@@ -277,22 +265,6 @@ def test_a_row_at_the_very_instant_is_used_and_none_after_it():
         assert steps.duration_s @ steps.velocity[:, 2] == pytest.approx(way)
 
 
-def test_final_motion_uses_the_row_that_covers_its_end():
-    """With the node between two IMU rows."""
-    odometry = Odometry(Calibration())
-    quick = stamps(10, 2.0)
-    odometry.add(imu(quick, np.outer((quick - T0_NS) / (NS / 10), [0, 0, 1.0])), dvl(stamps(2, 1.5, 0.05), 0.0))
-    steps = odometry.steps_between_nodes(at(0.55), at(1.05))
-    assert steps.duration_s @ steps.rate[:, 2] == pytest.approx(0.5 * 8.0)
-
-
-def test_the_newest_node_is_the_last_that_is_reached():
-    odometry = steady()
-    assert odometry.newest_node(at(0.5), at(2.2)) == at(2.0)
-    assert odometry.newest_node(at(2.0), at(2.2)) is None
-    assert odometry.nodes(at(0.5), at(2.2)).tolist() == [at(1.0), at(1.5), at(2.0)]
-
-
 def test_a_gap_is_longer_than_the_calibration_says():
     """Between nodes that follow each other; held samples leave none."""
     calibration = Calibration(dvl=DvlCalibration(gap_s=0.5))
@@ -375,17 +347,6 @@ def test_running_motion_equals_direct_integration_from_the_node(swaying, earth, 
         assert_same(running.until(T0_NS + offset), directly(swaying, earth, T0_NS + offset))
 
 
-def test_at_a_reached_node_the_motion_is_the_final_one():
-    """Of sensors that share their stamps; asked for twice, it is the same object."""
-    odometry, at = Odometry(Calibration()), stamps(10, SECONDS)
-    odometry.add(imu(at, waves(at, 1, 0.5)), dvl(at[::2], waves(at[::2], 2, 0.3), 1e-4 * np.eye(3)))
-    running = RunningMotion(odometry, PREINTEGRATOR, T0_NS, BIAS, None)
-    for node_ns in odometry.nodes(T0_NS, T0_NS + 10 * NS).tolist():
-        motion = running.until(node_ns)
-        assert_same(motion, PREINTEGRATOR.integrate(odometry.steps_between_nodes(T0_NS, node_ns), BIAS))
-        assert running.until(node_ns) is motion
-
-
 def test_what_is_final_is_not_integrated_again(swaying):
     """Of twenty instants a second for two seconds, each takes in the rows of one Doppler interval and a bit."""
     counted: list[int] = []
@@ -449,29 +410,6 @@ def test_motion_is_that_of_the_vehicle_before_in_over_and_after_a_gap(start_s, e
     turn = Vehicle().attitude([end_s - start_s]).as_matrix()[0]
     assert found.i_T_j.rotation().equals(gtsam.Rot3(turn), 1e-6)
     assert found.duration_s == pytest.approx(end_s - start_s)
-
-
-def in_between(start_s, end_s, bias=(0.0, 0.0, 0.0), gap_s=1.5):
-    """Of a vehicle that rolls, pitches and turns, whose Doppler stamps fall between those of the IMU."""
-    known = tumbling.calibration({"gyro_noise_density": 1e-3}, velocity_sigma_m_s=(0.01,) * 3, gap_s=gap_s)
-    imu_rows, dvl_rows = tumbling.rows()
-    biased = Imu(imu_rows.stamps_ns, imu_rows.angular_velocity + bias, imu_rows.specific_force)
-    odometry = Odometry(known)
-    odometry.add(biased, Dvl(dvl_rows.stamps_ns + 30_000_000, dvl_rows.velocity, dvl_rows.velocity_cov))
-    return motion_between(odometry, Preintegrator.from_calibration(known), at(start_s), at(end_s), np.array(bias))
-
-
-INTERVALS = pytest.mark.parametrize(
-    ("start_s", "end_s"), [(1.11, 1.72), (8.0, 9.0), (6.03, 9.0), (5.58, 8.31), (5.58, 11.7), (4.6, 15.78)]
-)
-
-
-@INTERVALS
-def test_the_turn_is_that_of_the_gyros_whatever_the_doppler_log_does(start_s, end_s):
-    """As if a straight line led over its gaps, to the last digits; the displacement is another one there."""
-    found, straight = in_between(start_s, end_s), in_between(start_s, end_s, gap_s=100.0)
-    assert found.i_T_j.rotation().equals(straight.i_T_j.rotation(), 1e-12)
-    assert found.i_T_j.equals(straight.i_T_j, 1e-3) == (start_s < 2.0)
 
 
 def test_without_a_gap_motion_is_that_over_the_steps_to_the_bit():

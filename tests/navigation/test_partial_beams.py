@@ -172,16 +172,6 @@ def test_a_row_before_the_first_whole_one_after_the_last_or_in_an_endless_stretc
     assert kept.tolist() == [1, 2, 3, 4 + LONGEST_STRETCH_NS]
 
 
-def test_more_beams_are_never_less_certain():
-    rng = np.random.default_rng(4)
-    truth = walk(7, rng)
-    traces = []
-    for count in range(5):
-        velocity, cov = pings(valid_beams(4, *[count] * 5, 4), rng, truth)
-        traces.append(np.trace(completed(stamps(7), velocity, cov)[2].sum(axis=0)))
-    assert np.all(np.diff(traces) < 0)
-
-
 def test_accelerometers_and_gyros_complete_what_the_beam_did_not_see_exactly():
     """A vehicle that turns and speeds up in a world with gravity, levers to both sensors, no noise."""
     w, a, g = np.array([0.1, -0.2, 0.4]), np.array([0.3, -0.2, 0.1]), np.array([0.0, 0.0, -9.8])
@@ -293,20 +283,20 @@ def test_over_a_hole_nothing_is_carried_wherever_it_begins(begin_s):
     assert carry(without_rows(5.0, 5.9), stamps_ns, MOUNTED).is_inertial
 
 
-def test_a_force_that_is_missing_elsewhere_does_not_matter():
-    rows = steady()
-    force = rows.specific_force.copy()
-    force[[49, 151]] = np.nan
-    assert carry(InertialRows(*rows[:2], force), ats(1.0, 3.0), MOUNTED).is_inertial
-
-
 G = Calibration().gravity_m_s2
 
 
-def test_the_walk_of_accelerometer_noise_is_its_density():
-    T, earth = 4.0, (G * EARTH_RATE_RAD_S) ** 2
-    noisy = density(QUIET.model_copy(update={"accel_noise_density": 3e-3}), ats(1.0, 1.0 + T))
-    assert noisy**2 == pytest.approx(9e-6 + earth * T**3 / 16.0)
+@pytest.mark.parametrize(
+    ("sensor", "value", "walk"),
+    [
+        ("accel_noise_density", 3e-3, 3e-3**2),
+        ("gyro_bias_sigma", 1e-3, 4 / 6 * (G * 1e-3 * 6**2 / 8) ** 2),  # the peak of its parabola in mid-stretch
+        ("accel_bias_sigma", 0.05, (0.05 * np.linalg.norm(RATE) * 6) ** 2 * 6 / 16),  # of what turns
+    ],
+)
+def test_the_walk_over_six_seconds_is_of_each_noise_beside_the_earth(sensor, value, walk):
+    earth = (G * EARTH_RATE_RAD_S) ** 2 * 6**3 / 16.0
+    assert density(QUIET.model_copy(update={sensor: value}), ats(1.0, 7.0)) ** 2 == pytest.approx(walk + earth)
 
 
 def test_the_walk_of_gyro_noise_is_the_variance_in_mid_stretch_over_a_quarter_of_its_length():
@@ -321,22 +311,6 @@ def test_the_walk_of_gyro_noise_is_the_variance_in_mid_stretch_over_a_quarter_of
     earth = (G * EARTH_RATE_RAD_S) ** 2 * T**3 / 16.0
     assert found**2 == pytest.approx((G * n * T) ** 2 / 12.0 + earth)
     assert found**2 * T / 4.0 == pytest.approx(off_line.var(), rel=0.1)
-
-
-def test_the_walk_of_a_gyro_bias_has_the_peak_of_its_parabola_in_mid_stretch():
-    b, T = 1e-3, 6.0
-    found = density(QUIET.model_copy(update={"gyro_bias_sigma": b}), ats(1.0, 1.0 + T))
-    peak = G * np.hypot(b, EARTH_RATE_RAD_S) * T**2 / 8.0
-    assert found**2 * T / 4.0 == pytest.approx(peak**2)
-
-
-def test_the_walk_of_an_accelerometer_bias_is_of_what_turns():
-    b, T = 0.05, 6.0
-    biased, turned = QUIET.model_copy(update={"accel_bias_sigma": b}), np.linalg.norm(RATE) * T
-    earth = (G * EARTH_RATE_RAD_S) ** 2 * T**3 / 16.0
-    assert density(biased, ats(1.0, 1.0 + T)) ** 2 == pytest.approx((b * turned) ** 2 * T / 16.0 + earth)
-    still = InertialRows(steady().stamps_ns, np.zeros((501, 3)), steady().specific_force)
-    assert density(biased, ats(1.0, 1.0 + T), still) ** 2 == pytest.approx(earth)
 
 
 IMU_HZ, SECONDS, LOST_S = 100, 40.0, (10.0, 30.0)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.navigation.samples import (
@@ -198,10 +199,6 @@ def test_stamps_repeated_from_the_row_before_to_the_row_after_are_refused(row):
         require_distinct_stamps("Imu", twice, 2, 4)
 
 
-def correlated(xy: float, yz: float, zx: float, sigmas: tuple[float, float, float] = (0.01, 0.02, 0.05)) -> np.ndarray:
-    return np.array([[1, xy, zx], [xy, 1, yz], [zx, yz, 1]]) * np.outer(sigmas, sigmas)
-
-
 def is_covariance(cov: np.ndarray) -> bool:
     try:
         require_covariances("cov", cov[None], AT)
@@ -217,54 +214,6 @@ def test_an_impossible_covariance_is_found_in_every_row(row):
     every[row] = -np.eye(3)
     with pytest.raises(MeasurementError, match=f"cov: the row at {AT[row]} ns is no covariance"):
         require_covariances("cov", every, AT)
-
-
-@pytest.mark.parametrize("scale", [1.0, 1e-3, 1e3])
-def test_correlations_are_possible_up_to_one_in_every_plane(scale):
-    """Within the rounding of seven digits; whatever the unit."""
-    sigmas = (0.01 * scale, 0.02 * scale, 0.05 * scale)
-    for sign in (1.0, -1.0):
-        for plane in np.eye(3):
-            assert is_covariance(correlated(*(sign * plane), sigmas))
-            assert is_covariance(correlated(*(sign * (1 + 1e-7) * plane), sigmas))
-            assert not is_covariance(correlated(*(sign * 1.01 * plane), sigmas))
-
-
-@pytest.mark.parametrize(
-    ("correlations", "is_possible"),
-    [
-        ((0.9, 0.9, 0.9), True),
-        ((0.9, -0.9, -0.9), True),
-        ((0.9, 0.9, -0.9), False),
-        ((-0.9, -0.9, -0.9), False),
-        ((0.8, 0.6, 0.0), True),  # singular
-        ((0.8, 0.0, 0.6), True),
-        ((0.0, 0.8, 0.6), True),
-        ((0.8, 0.61, 0.0), False),
-        ((0.8, 0.0, 0.61), False),
-        ((0.0, 0.8, 0.61), False),
-    ],
-)
-def test_three_correlations_must_agree(correlations, is_possible):
-    """``1 + 2 abc - a^2 - b^2 - c^2 >= 0``, by hand."""
-    assert is_covariance(correlated(*correlations)) == is_possible
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_no_variance_is_negative_or_unknown_and_zero_is_possible(axis):
-    for variance, is_possible in ((0.0, True), (-1e-6, False), (np.nan, False)):
-        diagonal = np.array([1e-4, 4e-4, 9e-4])
-        diagonal[axis] = variance
-        assert is_covariance(np.diag(diagonal)) == is_possible
-    assert is_covariance(np.zeros((3, 3)))
-
-
-@pytest.mark.parametrize("place", [(0, 1), (1, 0), (1, 2), (2, 1), (0, 2), (2, 0)])
-def test_a_covariance_is_symmetric_to_six_digits(place):
-    for change, is_possible in ((5e-7, True), (-5e-7, True), (2e-6, False), (-2e-6, False)):
-        cov = correlated(0.5, 0.5, 0.5)
-        cov[place] += change * np.sqrt(cov[place[0], place[0]] * cov[place[1], place[1]])
-        assert is_covariance(cov) == is_possible
 
 
 @given(
@@ -284,7 +233,29 @@ def test_weights_are_those_of_least_squares_with_a_shared_random_walk(samples, w
     assert mean_variance == pytest.approx(1 / (ones @ np.linalg.solve(C, ones)), rel=1e-6)
 
 
-def test_without_wander_weights_are_inverse_variances():
-    weights, mean_variance = weights_at_end(np.array([1.0, 3.0]), np.array([4.0, 1.0]), 0.0)
-    assert weights == pytest.approx([0.75, 0.25])
-    assert mean_variance == pytest.approx(0.75)
+@given(
+    arrays.arrays(np.float64, (3, 3), elements=st.floats(-1, 1)), st.integers(0, 3), st.sampled_from([1e-3, 1.0, 1e3])
+)
+def test_covariances_are_possible_exactly_where_no_eigenvalue_is_negative(A, rank, scale):
+    """Of what is far enough from zero to be told, whatever the unit; singular ones and zero are possible."""
+    indefinite = scale * (A + A.T)
+    lowest, size = np.linalg.eigvalsh(indefinite)[0], np.abs(indefinite).max()
+    assert is_covariance(scale * A[:, :rank] @ A[:, :rank].T)
+    assume(size > 1e-3 * scale and abs(lowest) > 1e-3 * size)
+    assert is_covariance(indefinite) == (lowest > 0)
+
+
+@pytest.mark.parametrize("place", [(0, 0), (1, 1), (2, 2), (0, 1), (1, 0), (1, 2), (2, 1), (0, 2), (2, 0)])
+def test_a_covariance_has_no_negative_or_unknown_variance_and_is_symmetric_to_six_digits(place):
+    sigmas = np.array([0.01, 0.02, 0.05])
+    cov = (0.5 * np.eye(3) + 0.5) * np.outer(sigmas, sigmas)
+    size = sigmas[place[0]] * sigmas[place[1]]
+    cases = (
+        ((5e-7, True), (-5e-7, True), (2e-6, False), (-2e-6, False))
+        if place[0] != place[1]
+        else ((-1.01, False), (np.nan, False))
+    )
+    for change, is_possible in cases:
+        changed = cov.copy()
+        changed[place] += change * size
+        assert is_covariance(changed) == is_possible

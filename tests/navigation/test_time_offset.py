@@ -156,10 +156,9 @@ def test_the_ratios_have_the_highest_restricted_likelihood_of_all_about_them():
         assert restricted_likelihood(stretches, found * step) > top
 
 
-@pytest.mark.parametrize("duration_s", [0.5, 1.0])
-def test_ratios_are_those_of_the_noise_that_was_simulated(duration_s: float):
+def test_ratios_are_those_of_the_noise_that_was_simulated():
     rng = np.random.default_rng(4)
-    found = fit([noisy_stretch(rng, (0.8, 0.3), duration_s) for _ in range(300)], WIDE)
+    found = fit([noisy_stretch(rng, (0.8, 0.3), 0.5) for _ in range(300)], WIDE)
     assert found.ratios == pytest.approx([0.8, 0.3], rel=0.35)
     assert found.variance == pytest.approx(0.01, rel=0.1)
 
@@ -221,10 +220,6 @@ def test_sigma_is_the_textbooks_wherever_the_offset_lies_between_grid_points(off
     assert found.is_known
     assert found.sigma == pytest.approx(textbook_sigma(offset_s), rel=0.15)
     assert abs(found.value - offset_s) < 4 * found.sigma
-
-
-def test_a_motion_that_repeats_cannot_tell():
-    assert "fit as well" in searched(turning_every_second, 0.3).reason
 
 
 @pytest.mark.parametrize("offset_s", [-1.93, 1.94])

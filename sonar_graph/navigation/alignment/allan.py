@@ -45,13 +45,7 @@ class NoiseDensities:
 
 
 def allan_deviation(samples: Floats, together: int) -> Floats:
-    """Overlapping Allan deviation of each column over means of ``together`` samples, shape (columns,).
-
-    Parameters
-    ----------
-    samples
-        Shape (n, columns), n at least twice ``together``.
-    """
+    """Overlapping Allan deviation of each of (n, columns) over means of ``together`` samples, shape (columns,)."""
     sums = np.cumsum(np.concatenate([np.zeros((1, samples.shape[1])), samples]), axis=0)
     means = (sums[together:] - sums[:-together]) / together
     steps = means[together:] - means[:-together]
@@ -65,13 +59,7 @@ def degrees_of_freedom(count: int, together: int) -> float:
 
 
 def density(samples: Floats, rate_hz: float) -> Estimate1D:
-    """Root spectral density of the noisiest column at one second.
-
-    Parameters
-    ----------
-    samples
-        Readings of a still sensor over at least some seconds, shape (n, columns).
-    """
+    """Root spectral density at one second of the noisiest of (n, columns) readings of a still sensor."""
     together = max(1, round(TAU_S * rate_hz))
     tau_s = together / rate_hz
     value = float(allan_deviation(samples, together).max()) * np.sqrt(tau_s)

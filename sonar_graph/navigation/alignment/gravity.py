@@ -152,13 +152,7 @@ def roll_and_pitch(up: Floats) -> tuple[float, float]:
 
 
 def angles_by_up(up: Floats) -> Floats:
-    """Derivative of roll and pitch by a unit vector, shape (2, 3).
-
-    Raises
-    ------
-    AlignmentError
-        Where the nose points straight up or down.
-    """
+    """Derivative of roll and pitch by up, shape (2, 3); raises AlignmentError for a nose straight up or down."""
     x, y, z = up.tolist()
     cosine = np.hypot(y, z)
     if cosine < LEAST_COSINE:
@@ -175,13 +169,7 @@ def earth_up_and_level(calibration: Calibration) -> tuple[float, float]:
 
 
 def in_body_axes(imu: Imu, calibration: Calibration) -> Imu:
-    """Turn readings into body axes.
-
-    Raises
-    ------
-    AlignmentError
-        Where a specific force was not measured.
-    """
+    """Turn readings into body axes; raises AlignmentError where a specific force was not measured."""
     if not np.isfinite(imu.specific_force).all():
         raise AlignmentError(
             "Imu.specific_force: is not finite in every row; alignment needs accelerometers throughout"

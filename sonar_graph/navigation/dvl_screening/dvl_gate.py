@@ -81,16 +81,10 @@ def gate_velocities(
     walk: float,
     gate: float,
 ) -> GateResult:
-    """Compare each row with the last whole one accepted.
+    """Compare each row with the last whole one accepted, beginning with the known row before the first.
 
-    Parameters
-    ----------
-    known_ns, known_velocity, known_cov
-        Rows that were accepted already; the comparison begins with the one before the first row.
-    walk
-        Root spectral density of the velocity's random walk, m/s/√s.
-    gate
-        Squared distance beyond which a row is an outlier.
+    ``walk`` is the root spectral density of the velocity's random walk, m/s/√s; ``gate`` the squared distance beyond
+    which a row is an outlier.
     """
     n = len(stamps)
     distance, partial, outlier, is_plain = np.zeros(n), is_partial(cov), np.zeros(n, np.bool_), True

@@ -150,14 +150,7 @@ class PartialVelocities:
     ) -> Rows:
         """The rows that can be used now, all with a whole velocity; they may be older than those given.
 
-        Parameters
-        ----------
-        stamps_ns, velocity, covs
-            Rows in order, without NaN.
-        partial
-            True for rows that leave a direction unmeasured, shape (n,).
-        imu
-            All rows known; those after a stamp are not used for it.
+        Rows come in order and without NaN; ``partial`` is True for those that leave a direction unmeasured, shape (n,).
         """
         usable: list[_Row] = []
         for stamp_ns, v, cov, is_part in zip(stamps_ns.tolist(), velocity, covs, partial.tolist(), strict=True):

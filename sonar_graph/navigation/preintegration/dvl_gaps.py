@@ -116,13 +116,7 @@ class Line(NamedTuple):
 
 @compiled
 def line_before(columns: Columns, body_p_imu: Vector, body_p_dvl: Vector, k: int, bias: Vector, earth: Vector) -> Line:
-    """Fit to the samples before and at Doppler row k; the velocity is that of the IMU's point.
-
-    Parameters
-    ----------
-    earth
-        Earth's rotation in frame i, rad/s.
-    """
+    """Fit to the samples before and at Doppler row k; the velocity is that of the IMU's point, earth is in frame i."""
     imu_ns, rate, force, dvl_ns, velocity, cov, hold_past, turns = columns
     lever, node_ns, t = minus(body_p_imu, body_p_dvl), dvl_ns[k], dvl_ns[k]
     row = rows_until(imu_ns, t - 1)
@@ -238,28 +232,13 @@ class GapMotion(NamedTuple):
 
 @compiled
 def bridge(
-    columns: Columns,
-    values: GapValues,
-    start_ns: int,
-    end_ns: int,
-    is_closed: bool,
-    bias: Vector,
-    earth: Vector,
+    columns: Columns, values: GapValues, start_ns: int, end_ns: int, is_closed: bool, bias: Vector, earth: Vector
 ) -> GapMotion:
     """Motion over a gap.
 
-    Parameters
-    ----------
-    columns
-        Rows of `sonar_graph.navigation.odometry.Odometry`.
-    values
-        Fields of a `GapModel`.
-    start_ns, end_ns
-        A node and the next one (closed), or a node and an instant before the next, from rows stamped no later (open).
-    bias
-        Gyro bias to remove, body axes, rad/s.
-    earth
-        Earth's rotation in frame i, rad/s.
+    It begins at a node and ends at the next one (closed), or at an instant before it, from rows stamped no later
+    (open). Removed are the gyro bias (body axes) and the Earth's rotation (frame i), rad/s; ``values`` are those of
+    `gap_values`.
     """
     model = GapModel(*values)
     if is_closed or not _is_sampled(columns, model, start_ns, end_ns):

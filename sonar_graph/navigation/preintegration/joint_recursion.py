@@ -158,20 +158,11 @@ gyros."""
 def preintegrate(
     imu: Inertial, dvl_ns: Ints, velocity: Floats, cov: Floats, rule: Rule
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Motion from the first to the last Doppler row.
+    """Motion from the first to the last Doppler row (body axes), which the inertial rows cover.
 
-    Parameters
-    ----------
-    imu
-        Rows that reach from before the first Doppler row to after the last.
-    dvl_ns, velocity, cov
-        Doppler rows in body axes.
-
-    Returns
-    -------
-    R (3, 3); v, p, s as rows (3, 3); covariance (12, 12) of [theta in frame j, v, p, s] without the noise of the first
-    and the last Doppler row; derivatives (12, 10) by gyro bias, accelerometer bias, scale, mounting; weights (3, 3) of
-    the first and of the last row in s.
+    Returns R (3, 3); v, p, s as rows (3, 3); covariance (12, 12) of [theta in frame j, v, p, s] without the noise of
+    the first and the last Doppler row; derivatives (12, 10) by gyro bias, accelerometer bias, scale, mounting; weights
+    (3, 3) of the first and of the last row in s.
     """
     motion = Motion(AT_REST, NO_SPREAD, NO_SLOPES, NO_WEIGHTS, rows_until(imu.stamps, dvl_ns[0]))
     first, last, past_s = ZEROS, ZEROS, 0.0
@@ -218,16 +209,19 @@ def with_lever_arm(motion: Motion, imu: Inertial, at_ns: int, past_s: float, nex
     rate = minus(rate, times(transposed(R), imu.earth))
     ends = (1.0 if past_s > 0.0 else 0.0) - (1.0 if next_s > 0.0 else 0.0)
     c = times(R, minus(scaled(ends, imu.arm), scaled(weight_s, cross(rate, imu.arm))))
-    by = Push(0.0, IDENTITY, ZEROS, ZEROS, ZERO, ZERO, c)
-    M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting = pushed_slopes(motion.slopes, by)
+    motion = _displaced(motion, c, imu.gyro_psd, motion.weights)
+    M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting = motion.slopes
     s_g = difference_of(s_g, multiple_of(weight_s, times_skew(R, imu.arm)))
-    return Motion(
-        pushed_path(motion.path, by),
-        pushed_spread(motion.spread, by, imu.gyro_psd * motion.path.elapsed_s, 0.0),
-        Slopes(M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting),
-        motion.weights,
-        motion.row,
-    )
+    slopes = Slopes(M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting)
+    return Motion(motion.path, motion.spread, slopes, motion.weights, motion.row)
+
+
+@inlined
+def _displaced(motion: Motion, c: Vector, gyro_psd: float, weights: Weights) -> Motion:
+    """Displaced by c at one instant."""
+    by = Push(0.0, IDENTITY, ZEROS, ZEROS, ZERO, ZERO, c)
+    spread = pushed_spread(motion.spread, by, gyro_psd * motion.path.elapsed_s, 0.0)
+    return Motion(pushed_path(motion.path, by), spread, pushed_slopes(motion.slopes, by), weights, motion.row)
 
 
 @inlined
@@ -244,18 +238,13 @@ def over_interval(motion: Motion, imu: Inertial, interval: Interval, rule: Rule)
         at_ns = start_ns + (end_ns - start_ns) // 2 if rule.turning == MIDDLE else end_ns
         motion = _stepped(motion, imu, interval, start_ns, at_ns, rule)
         turned = multiple_of((end_ns - start_ns) * 1e-9, motion.path.R)
-        by = Push(0.0, IDENTITY, ZEROS, ZEROS, ZERO, ZERO, times(turned, _mixed(interval, rule.share)))
-        motion = Motion(
-            pushed_path(motion.path, by),
-            pushed_spread(motion.spread, by, imu.gyro_psd * motion.path.elapsed_s, 0.0),
-            pushed_slopes(motion.slopes, by),
-            Weights(multiple_of(1.0 - rule.share, turned), multiple_of(rule.share, turned)),
-            motion.row,
-        )
+        weights = Weights(multiple_of(1.0 - rule.share, turned), multiple_of(rule.share, turned))
+        motion = _displaced(motion, times(turned, _mixed(interval, rule.share)), imu.gyro_psd, weights)
         motion = _stepped(motion, imu, interval, at_ns, end_ns, rule)
     if rule.inertial:
         return motion
-    weights, (M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting) = motion.weights, motion.slopes
+    weights = motion.weights
+    M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting = motion.slopes
     s_scale = plus(s_scale, plus(times(weights.before, z), times(weights.after, z_next)))
     s_mounting = difference_of(s_mounting, times_skew(weights.before, z))
     s_mounting = difference_of(s_mounting, times_skew(weights.after, z_next))

@@ -128,26 +128,14 @@ def pushed_path(path: Path, by: Push) -> Path:
 
 @inlined
 def pushed_spread(spread: Spread, by: Push, theta_variance: float, accel_psd: float) -> Spread:
-    """The covariance after a step.
-
-    Parameters
-    ----------
-    theta_variance
-        In the middle of the step, rad².
-    accel_psd
-        Spectral density of the accelerometers' noise, (m/s²)²/Hz.
-    """
+    """The covariance after a step; the variance of theta is that in the middle of the step, rad²."""
     dt, half = by.dt, 0.5 * theta_variance
     mp = plus(spread.mp, scaled(dt, spread.mv))
     pp = sum_of(spread.pp, multiple_of(dt, sum_of(spread.vp, transposed(spread.vp))))
     pp = sum_of(pp, multiple_of(dt * dt, spread.vv))
     vp = sum_of(spread.vp, multiple_of(dt, spread.vv))
     sp = sum_of(spread.sp, multiple_of(dt, spread.sv))
-    hv, hp, hs = (
-        plus(spread.mv, scaled(half, by.a)),
-        plus(mp, scaled(half, by.b)),
-        plus(spread.ms, scaled(half, by.c)),
-    )
+    hv, hp, hs = plus(spread.mv, scaled(half, by.a)), plus(mp, scaled(half, by.b)), plus(spread.ms, scaled(half, by.c))
     noise = accel_psd * dt
     return Spread(
         plus(spread.mv, scaled(theta_variance, by.a)),
@@ -188,19 +176,12 @@ def _coupled(P: Matrix, ax: Vector, hx: Vector, ay: Vector, hy: Vector, noise: f
 @inlined
 def pushed_slopes(slopes: Slopes, by: Push) -> Slopes:
     """The derivatives after a step; the rotation's own change within it counts by its mean."""
-    half = sum_of(slopes.M, multiple_of(0.5, by.G))
-    third = sum_of(slopes.M, multiple_of(1.0 / 3.0, by.G))
-    p_g = sum_of(slopes.p_g, multiple_of(by.dt, slopes.v_g))
-    return Slopes(
-        sum_of(slopes.M, by.G),
-        sum_of(sum_of(slopes.N, multiple_of(by.dt, slopes.M)), by.H),
-        sum_of(slopes.v_g, skew_times(by.a, half)),
-        sum_of(p_g, skew_times(by.b, third)),
-        sum_of(slopes.s_g, skew_times(by.c, half)),
-        slopes.s_a,
-        slopes.s_scale,
-        slopes.s_mounting,
-    )
+    M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting = slopes
+    half, third = sum_of(M, multiple_of(0.5, by.G)), sum_of(M, multiple_of(1.0 / 3.0, by.G))
+    N = sum_of(sum_of(N, multiple_of(by.dt, M)), by.H)
+    p_g = sum_of(sum_of(p_g, multiple_of(by.dt, v_g)), skew_times(by.b, third))
+    v_g, s_g = sum_of(v_g, skew_times(by.a, half)), sum_of(s_g, skew_times(by.c, half))
+    return Slopes(sum_of(M, by.G), N, v_g, p_g, s_g, s_a, s_scale, s_mounting)
 
 
 @inlined
@@ -210,39 +191,23 @@ def with_sample(
     """Add ``w_k y_k`` with the error ``e = -w ([R z]x theta + dv)``; the sample's own noise is added elsewhere."""
     w, turned = weight_s, times(path.R, z)
     variance = gyro_psd * path.elapsed_s
-    by_v = _skew_product(turned, spread.mv)
-    e_v = multiple_of(-w, sum_of(by_v, spread.vv))
-    e_p = multiple_of(-w, sum_of(_skew_product(turned, spread.mp), spread.vp))
-    e_s = multiple_of(-w, sum_of(_skew_product(turned, spread.ms), transposed(spread.sv)))
+    mv, mp, ms, vv, vp, pp, sv, sp, ss = spread
+    by_v = _skew_product(turned, mv)
+    e_v = multiple_of(-w, sum_of(by_v, vv))
+    e_p = multiple_of(-w, sum_of(_skew_product(turned, mp), vp))
+    e_s = multiple_of(-w, sum_of(_skew_product(turned, ms), transposed(sv)))
     e_e = difference_of(sum_of(by_v, transposed(by_v)), multiple_of(variance, _skew_product(turned, turned)))
-    e_e = multiple_of(w * w, sum_of(e_e, spread.vv))
-    y = minus(turned, path.v)
-    after = Path(path.elapsed_s, path.R, path.v, path.p, plus(path.s, scaled(w, y)))
-    e_m = scaled(w, minus(scaled(variance, turned), spread.mv))
-    ss = sum_of(sum_of(spread.ss, e_e), sum_of(e_s, transposed(e_s)))
+    e_e = multiple_of(w * w, sum_of(e_e, vv))
+    e_m = scaled(w, minus(scaled(variance, turned), mv))
+    ss = sum_of(sum_of(ss, e_e), sum_of(e_s, transposed(e_s)))
+    M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting = slopes
+    s_g = sum_of(s_g, multiple_of(w, difference_of(skew_times(turned, M), v_g)))
+    s_a, s_scale = sum_of(s_a, multiple_of(w, M)), plus(s_scale, scaled(w, turned))
+    s_mounting = difference_of(s_mounting, multiple_of(w, times_skew(path.R, z)))
     return (
-        after,
-        Spread(
-            spread.mv,
-            spread.mp,
-            plus(spread.ms, e_m),
-            spread.vv,
-            spread.vp,
-            spread.pp,
-            sum_of(spread.sv, e_v),
-            sum_of(spread.sp, e_p),
-            ss,
-        ),
-        Slopes(
-            slopes.M,
-            slopes.N,
-            slopes.v_g,
-            slopes.p_g,
-            sum_of(slopes.s_g, multiple_of(w, difference_of(skew_times(turned, slopes.M), slopes.v_g))),
-            sum_of(slopes.s_a, multiple_of(w, slopes.M)),
-            plus(slopes.s_scale, scaled(w, turned)),
-            difference_of(slopes.s_mounting, multiple_of(w, times_skew(path.R, z))),
-        ),
+        Path(path.elapsed_s, path.R, path.v, path.p, plus(path.s, scaled(w, minus(turned, path.v)))),
+        Spread(mv, mp, plus(ms, e_m), vv, vp, pp, sum_of(sv, e_v), sum_of(sp, e_p), ss),
+        Slopes(M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting),
     )
 
 
@@ -260,28 +225,12 @@ def _skew_product(a: Vector, b: Vector) -> Matrix:
 @inlined
 def with_inertial_position(path: Path, spread: Spread, slopes: Slopes) -> tuple[Path, Spread, Slopes]:
     """Add the inertial position at the end, ``s <- p + s``."""
-    sp = sum_of(spread.pp, spread.sp)
+    mv, mp, ms, vv, vp, pp, sv, sp, ss = spread
+    M, N, v_g, p_g, s_g, s_a, s_scale, s_mounting = slopes
+    sp_end = sum_of(pp, sp)
+    ss_end = sum_of(sum_of(ss, transposed(sp)), sp_end)
     return (
         Path(path.elapsed_s, path.R, path.v, path.p, plus(path.p, path.s)),
-        Spread(
-            spread.mv,
-            spread.mp,
-            plus(spread.mp, spread.ms),
-            spread.vv,
-            spread.vp,
-            spread.pp,
-            sum_of(transposed(spread.vp), spread.sv),
-            sp,
-            sum_of(sum_of(spread.ss, transposed(spread.sp)), sp),
-        ),
-        Slopes(
-            slopes.M,
-            slopes.N,
-            slopes.v_g,
-            slopes.p_g,
-            sum_of(slopes.p_g, slopes.s_g),
-            difference_of(slopes.s_a, slopes.N),
-            slopes.s_scale,
-            slopes.s_mounting,
-        ),
+        Spread(mv, mp, plus(mp, ms), vv, vp, pp, sum_of(transposed(vp), sv), sp_end, ss_end),
+        Slopes(M, N, v_g, p_g, sum_of(p_g, s_g), difference_of(s_a, N), s_scale, s_mounting),
     )

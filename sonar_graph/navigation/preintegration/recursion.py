@@ -99,15 +99,7 @@ NO_MOTION = Integral(IDENTITY, ZERO, ZERO, ZEROS, ZEROS, ZEROS)
 
 @inlined
 def increment(dR: Matrix, duration_s: float, rate: Vector, velocity: Vector, lever: Vector) -> Increment:
-    """The contribution of a step after the rotation dR.
-
-    Parameters
-    ----------
-    rate
-        Angular rate without bias and Earth rate, rad/s.
-    lever
-        Lever arm of the DVL, body frame, m.
-    """
+    """The contribution of a step after the rotation dR, from the rate without bias and Earth rate."""
     phi, u = scaled(duration_s, rate), minus(velocity, cross(rate, lever))
     turn, chord = exp_and_chord(phi)
     turned = product(dR, chord)
@@ -190,25 +182,11 @@ def integrate_steps(
     lever: Floats,
     gyro_density: float,
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Motion over all steps, from frame i to frame j.
+    """Motion over all steps (the columns of `Steps`), from frame i to frame j.
 
-    Parameters
-    ----------
-    duration, rate, velocity, velocity_psd, force, turn_psd
-        The columns of `Steps`.
-    bias
-        Gyro bias to remove, body frame, shape (3,), rad/s.
-    earth
-        Earth's rotation in frame i, shape (3,), rad/s.
-    lever
-        Lever arm of the DVL, body frame, shape (3,), m.
-    gyro_density
-        White noise of the gyros, rad/s/√Hz.
-
-    Returns
-    -------
-    dR (3, 3), dp (3,), covariance (6, 6) and bias Jacobian (6, 3) of the perturbation in frame j, and the integral of
-    the specific force in frame i (3,), m/s.
+    Removed are the gyro bias (body frame) and the Earth's rotation (frame i), rad/s. Returns dR (3, 3), dp (3,),
+    covariance (6, 6) and bias Jacobian (6, 3) of the perturbation in frame j, and the integral of the specific force in
+    frame i (3,), m/s.
     """
     motion, D_t, D_r = NO_MOTION, ZEROS, ZEROS
     body_bias, earth_i, arm = vector(bias), vector(earth), vector(lever)
@@ -227,14 +205,9 @@ def integrate_steps(
 def trace_point(
     duration: Floats, rate: Floats, velocity: Floats, bias: Floats, lever: Floats, point: Floats, offsets: Floats
 ) -> Floats:
-    """Positions of a point of the body at times after the first instant, in frame i, shape (n, 3), m.
+    """Positions of a point of the body at increasing times (s) after the first instant, in frame i, shape (n, 3), m.
 
-    Parameters
-    ----------
-    point
-        Position in the body frame, shape (3,), m.
-    offsets
-        Seconds after the start of the steps, not decreasing, shape (n,). Motion within a step is taken as straight.
+    Motion within a step is taken as straight.
     """
     positions = np.empty((len(offsets), 3))
     dR, dp = IDENTITY, ZERO
@@ -298,11 +271,7 @@ def chord_derivative(phi: Vector, u: Vector, scale: float) -> Matrix:
     ``-[u]x / 2 - ([phi]x [u]x + [phi x u]x) / 6``, with ``[phi]x [u]x = u phi^T - (phi . u) I``.
     """
     v, d = cross(phi, u), scale * dot(phi, u) / 6.0
-    x, y, z = (
-        scale * (0.5 * u[0] + v[0] / 6.0),
-        scale * (0.5 * u[1] + v[1] / 6.0),
-        scale * (0.5 * u[2] + v[2] / 6.0),
-    )
+    x, y, z = (scale * (0.5 * u[0] + v[0] / 6.0), scale * (0.5 * u[1] + v[1] / 6.0), scale * (0.5 * u[2] + v[2] / 6.0))
     a, b, c = scaled(-scale, u)
     return (
         (a * phi[0] / 6.0 + d, a * phi[1] / 6.0 + z, a * phi[2] / 6.0 - y),
