@@ -344,6 +344,10 @@ BROKEN: dict[str, tuple[bytes, str]] = {
     "with a sequence beyond the end": (poked(20, 0xF0, 0xFF, 0xFF, 0x7F), "with a length of values beyond their end"),
     "with a boolean of 2": (poked(17, 2), "with a boolean flags that is neither 0 nor 1"),
     "with a boolean of 255": (poked(16, 255), "with a boolean flags that is neither 0 nor 1"),
+    "with two faults": (
+        poked(9, 0xFF)[:16] + b"\2" + poked(9, 0xFF)[17:],
+        "with a boolean flags that is neither 0 nor 1",
+    ),
     "with bytes that are no UTF-8": (poked(9, 0xFF), "with a string s that is not UTF-8 closed by a NUL"),
     "with a string that goes on": (poked(11, 0x41), "with a string s that is not UTF-8 closed by a NUL"),
     "in XCDR2": (poked(1, 7), "encoded as XCDR2 instead of plain CDR"),
@@ -412,9 +416,9 @@ def test_21_000_messages_that_are_broken_or_hardly_share_a_layout_take_no_longer
 ) -> None:
     payloads = [make(i) for i in range(300)] * 70
     stacks = stacked(payloads)
-    start = time.perf_counter()
+    start = time.process_time()
     decode(DEFINITION, stacks)
-    assert time.perf_counter() - start < 3.0
+    assert time.process_time() - start < 3.0
 
 
 def test_12_000_messages_of_one_length_with_a_layout_each_take_no_longer_than_seconds() -> None:
@@ -424,9 +428,9 @@ def test_12_000_messages_of_one_length_with_a_layout_each_take_no_longer_than_se
     stacks = stacked(payloads)
     assert len(stacks) == 1
     definition = parsed("string[4] names")
-    start = time.perf_counter()
+    start = time.process_time()
     decoded = decode(definition, stacks)
-    assert time.perf_counter() - start < 3.0
+    assert time.process_time() - start < 3.0
     assert len(decoded.groups) == 12_000
 
 

@@ -218,6 +218,12 @@ def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(path: 
         assert bool(told) == bool(expected)
         assert any(re.search(expected, text) for text in told or [""])
     assert recording.ending is None
+    assert recording.topics["/bytes"].type_name == ("test_msgs/msg/Bytes" if fault.options != UNREPEATED else "")
+    if lost and not chunks:
+        (loss,) = recording.damage.losses
+        assert loss.start_ns is not None
+        assert loss.end_ns is not None
+        assert loss.start_ns <= lost[0][0] <= loss.end_ns
     if lost and chunks:
         (loss,) = recording.damage.losses
         assert loss.at == chunks[fault.lost or 0].chunk_start_offset
@@ -320,7 +326,9 @@ def test_losses_are_estimated_from_rates_where_nothing_counts_them() -> None:
     times_ns = np.delete(np.arange(1000) * 10_000_000, slice(400, 450))
     topic.gather(bytes(10), np.zeros(950, np.int64), np.full(950, 10), times_ns)
     loss = Loss(0, 100, "no valid record", int(times_ns[399]), int(times_ns[400]))
-    settle(Damage([loss]), {"/imu": topic}, None)
+    over = Topic(Path("x"), "/over", "", "cdr", "ros2msg", "", Keep.ALL)
+    over.gather(bytes(10), np.zeros(400, np.int64), np.full(400, 10), times_ns[:400])  # nothing after the loss
+    settle(Damage([loss]), {"/imu": topic, "/over": over}, None)
     assert loss.messages == {"/imu": 50}
     assert loss.is_estimate
     assert loss.describe(0) == "bytes 0 to 100: no valid record; 3.990 s to 4.500 s of the log; lost: about 50 of /imu"
@@ -350,10 +358,12 @@ def test_of_a_file_cut_off_all_before_the_cut_is_read_and_its_duration_told(path
 
 
 def test_a_cut_between_records_or_before_any_message_is_told(path: Path) -> None:
-    write(path)
+    written = write(path)
     chunks, content = chunk_indexes(path), path.read_bytes()
     path.write_bytes(content[: chunk_end(chunks[-1])])
     assert (scan_all(path).ending or "").startswith("the file is cut off: it ends after a whole record")
+    flip(path, chunks[-1].chunk_start_offset + 1)  # the outer length of the last chunk
+    assert read(path) == written
     path.write_bytes(content[: chunks[0].chunk_start_offset + 3])
     assert re.search(r"^the file is cut off: .*; no message is there$", scan_all(path).ending or "")
     with pytest.raises(MissingTopicError, match=r"log\.mcap: has no messages: the file is cut off: "):

@@ -62,6 +62,15 @@ def test_profile_index_counts_metadata_and_attachments_are_those_of_a_ros_2_reco
     assert (file.name, file.media_type, file.data) == ("notes/a.json", "application/json", b'{"a": 1}')
 
 
+def test_messages_lie_in_the_order_of_their_times_and_those_of_one_instant_in_that_of_the_list(tmp_path: Path) -> None:
+    times_ns = np.repeat([20, 10], 50)
+    first, second = (Outgoing(n, "std_msgs/msg/Header", times_ns, np.zeros((100, 9), np.uint8)) for n in ("/a", "/b"))
+    write_recording(tmp_path / "a.mcap", [first, second], {})
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        found = [(m.log_time, c.topic) for _, c, m in make_reader(stream).iter_messages(log_time_order=False)]
+    assert found == [(time, topic) for time in (10, 20) for topic in ("/a", "/b") for _ in range(50)]
+
+
 def test_crcs_cover_each_chunk_and_all_data(recording: Path, tmp_path: Path) -> None:
     with LogFile(recording) as file:
         summary, fault = read_summary(file)

@@ -128,7 +128,8 @@ class Decoder:
                 found = stack[first : last + 1] if last - first + 1 == len(members) else stack[members]
                 is_sound = np.ones(len(members), bool)
                 for fault, has_it in unsound_contents(layout, found):
-                    self._unsound[fault].append(rows[members[has_it & is_sound]])
+                    if (has_it & is_sound).any():
+                        self._unsound[fault].append(rows[members[has_it & is_sound]])
                     is_sound &= ~has_it
                 if is_sound.all():
                     groups.append(Messages(rows[members], found, layout))

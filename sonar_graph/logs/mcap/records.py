@@ -277,7 +277,7 @@ class RecordWalk:
             return isinstance(record, ChunkRecord) or record.at == len(MAGIC)
         if record.opcode == Opcode.MESSAGE_INDEX:
             count = self._file.read(record.content_at + 2, 4)
-            return record.size >= 6 and len(count) == 4 and int.from_bytes(count, "little") == record.size - 6
+            return len(count) == 4 and int.from_bytes(count, "little") == record.size - 6
         if record.opcode == Opcode.DATA_END:
             return record.size == 4
         if record.opcode in _SMALLEST:
