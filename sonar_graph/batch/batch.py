@@ -20,17 +20,7 @@ from types import FrameType
 from sonar_graph.batch.plan import plan_runs
 from sonar_graph.batch.recorded import RecordedBatch, read_batch
 from sonar_graph.batch.result_table import write_results
-from sonar_graph.batch.store import (
-    SUITE,
-    Limits,
-    PlannedRun,
-    Progress,
-    Row,
-    RunOutcome,
-    Store,
-    Where,
-    only_batch_in,
-)
+from sonar_graph.batch.store import SUITE, Limits, PlannedRun, Progress, Row, RunOutcome, Store, Where, only_batch_in
 from sonar_graph.batch.suite import SuiteFile, read_suite
 from sonar_graph.errors import BatchError
 from sonar_graph.files import replacing

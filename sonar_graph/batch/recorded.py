@@ -25,13 +25,7 @@ from sonar_graph.measurements import Floats
 RESULTS = "results.parquet"
 SUITE_METADATA = b"sonar_graph.suite"
 DEFAULT_VARIANT = ("", "default")
-DEFAULT_METRICS = (
-    "causal.ate_se2_m",
-    "causal.ate_raw_m",
-    "causal.rpe_10s_m",
-    "causal.yaw_rmse_rad",
-    "landmarks.se2_m",
-)
+DEFAULT_METRICS = ("causal.ate_se2_m", "causal.ate_raw_m", "causal.rpe_10s_m", "causal.yaw_rmse_rad", "landmarks.se2_m")
 GOING_ON = "give the bench command that began it again: it goes on from there"
 ALL_LOGS = "all logs"
 """Name for all logs of a batch taken together."""

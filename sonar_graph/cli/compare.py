@@ -96,8 +96,7 @@ def compare(
 
 def report(
     folder: Annotated[
-        Path,
-        typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that compare or bench wrote."),
+        Path, typer.Argument(metavar="DIR", exists=True, file_okay=False, help="Folder that compare or bench wrote.")
     ],
 ) -> None:
     """Write report.html, and a batch's tables, anew from what compare, run or bench left in a folder."""

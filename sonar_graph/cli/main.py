@@ -29,9 +29,7 @@ app = typer.Typer(
     name="sonar-graph",
     help="Landmark SLAM for underwater vehicles: estimators compared on the same log.",
     epilog=examples(
-        "sonar-graph demo -o demo",
-        "sonar-graph inspect dive.mcap",
-        "sonar-graph compare dive.mcap -o comparison",
+        "sonar-graph demo -o demo", "sonar-graph inspect dive.mcap", "sonar-graph compare dive.mcap -o comparison"
     ),
     pretty_exceptions_enable=False,
     add_completion=False,

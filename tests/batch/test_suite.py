@@ -1,3 +1,5 @@
+"""A suite is understood, and a mistake in it is reported with file, line and key."""
+
 from __future__ import annotations
 
 import tomllib
@@ -6,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sonar_graph.batch.plan import plan_runs
-from sonar_graph.batch.suite import METRICS, read_suite
+from sonar_graph.batch.suite import METRICS, Place, line_of, read_suite
 from sonar_graph.errors import BatchError
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
@@ -19,6 +21,26 @@ def line(text: str, word: str) -> int:
     return next(number for number, content in enumerate(text.splitlines(), 1) if word in content)
 
 
+def head(text: str) -> str:
+    return HEADER + text + BASIN + DEAD_RECKONING
+
+
+def basin(old: str, new: str) -> str:
+    return HEADER + BASIN.replace(old, new) + DEAD_RECKONING
+
+
+def log(text: str) -> str:
+    return HEADER + BASIN + text + DEAD_RECKONING
+
+
+def end(text: str) -> str:
+    return HEADER + BASIN + DEAD_RECKONING + text
+
+
+def other(text: str) -> str:
+    return HEADER + '[[logs]]\nname = "a"\n' + text + DEAD_RECKONING
+
+
 def second(entry: str) -> str:
     return entry.replace("]]", "]]  # second", 1)
 
@@ -26,22 +48,18 @@ def second(entry: str) -> str:
 @pytest.mark.parametrize(
     ("text", "at", "words"),
     [
-        (HEADER + "nmae = 1\n" + BASIN + DEAD_RECKONING, "nmae", "nmae: there is no such field; did you mean name?"),
+        (head("nmae = 1\n"), "nmae", "nmae: there is no such field; did you mean name?"),
         (HEADER.replace('"short"', "3") + BASIN + DEAD_RECKONING, "name", "name: Input should be a valid string"),
-        (HEADER + BASIN + DEAD_RECKONING + "grdi = {}\n", "grdi", "did you mean grid?"),
-        (HEADER + BASIN + "seeds = -1.5\n" + DEAD_RECKONING, "seeds", "seeds"),
-        (HEADER + BASIN + 'log = "x.mcap"\n' + DEAD_RECKONING, "[[logs]]", "exactly one of log, dataset and generator"),
-        (
-            HEADER + BASIN.replace('"basin"\nopt', '"pool"\nopt') + DEAD_RECKONING,
-            "generator",
-            "there are: basin, mission",
-        ),
-        (HEADER + BASIN.replace("laps = 1", "lapse = 1") + DEAD_RECKONING, "lapse", "options.lapse"),
-        (HEADER + BASIN.replace("120", "20") + DEAD_RECKONING, "options", "too short for laps"),
-        (HEADER + BASIN.replace("laps = 1", "seed = 1") + DEAD_RECKONING, "seed =", "seeds = [...]"),
-        (HEADER + BASIN + "grid = { wrong_id_rate = [2.0] }\n" + DEAD_RECKONING, "grid", "grid.wrong_id_rate"),
-        (HEADER + BASIN + "grid = { wrong_id_rate = [] }\n" + DEAD_RECKONING, "grid", "has no values"),
-        (HEADER + BASIN + "grid = { laps = [1, 2] }\n" + DEAD_RECKONING, "grid", "grid.laps: is also in options"),
+        (end("grdi = {}\n"), "grdi", "did you mean grid?"),
+        (log("seeds = -1.5\n"), "seeds", "seeds"),
+        (log('log = "x.mcap"\n'), "[[logs]]", "exactly one of log, dataset and generator"),
+        (basin('"basin"\nopt', '"pool"\nopt'), "generator", "there are: basin, mission"),
+        (basin("laps = 1", "lapse = 1"), "lapse", "options.lapse"),
+        (basin("120", "20"), "options", "too short for laps"),
+        (basin("laps = 1", "seed = 1"), "seed =", "seeds = [...]"),
+        (log("grid = { wrong_id_rate = [2.0] }\n"), "grid", "grid.wrong_id_rate"),
+        (log("grid = { wrong_id_rate = [] }\n"), "grid", "has no values"),
+        (log("grid = { laps = [1, 2] }\n"), "grid", "grid.laps: is also in options"),
         (
             HEADER
             + BASIN
@@ -51,73 +69,49 @@ def second(entry: str) -> str:
             "grid",
             "grid.smoother.lag_s: is also in params",
         ),
-        (HEADER + BASIN + "seeds = 0\n" + DEAD_RECKONING, "seeds", "has no seeds"),
-        (HEADER + BASIN + "seeds = []\n" + DEAD_RECKONING, "seeds", "has no seeds"),
-        (HEADER + BASIN + "landmarks = {}\n" + DEAD_RECKONING, "[[logs]]", "a generator has its own"),
+        (log("seeds = 0\n"), "seeds", "has no seeds"),
+        (log("seeds = []\n"), "seeds", "has no seeds"),
+        (log("landmarks = {}\n"), "[[logs]]", "a generator has its own"),
         (
             HEADER + BASIN + DEAD_RECKONING.replace("dead-", "deaf-"),
             "deaf",
             "estimators.0.name: no estimator is called",
         ),
-        (HEADER + BASIN + DEAD_RECKONING + ISAM2 + "params = { smoother.lag = 1 }\n", "lag = 1", "did you mean lag_s?"),
-        (
-            HEADER + BASIN + DEAD_RECKONING + ISAM2 + "[estimators.grid]\n\nsmoother.lag_s = [1, -1]\n",
-            "lag_s",
-            "grid.smoother.lag_s",
-        ),
+        (end(ISAM2 + "params = { smoother.lag = 1 }\n"), "lag = 1", "did you mean lag_s?"),
+        (end(ISAM2 + "[estimators.grid]\n\nsmoother.lag_s = [1, -1]\n"), "lag_s", "grid.smoother.lag_s"),
         (HEADER + BASIN + ISAM2, "reference", "'dead-reckoning' does not run here; what does: isam2"),
-        (HEADER + 'metrics = ["ate"]\n' + BASIN + DEAD_RECKONING, "metrics", "there is no score 'ate'"),
-        (HEADER + BASIN + second(BASIN) + DEAD_RECKONING, "# second", "logs.1: two logs are called 'basin'"),
+        (head('metrics = ["ate"]\n'), "metrics", "there is no score 'ate'"),
+        (log(second(BASIN)), "# second", "logs.1: two logs are called 'basin'"),
         (
-            HEADER + BASIN + second(BASIN.replace('"basin"\ngen', '"pool"\ngen')) + DEAD_RECKONING,
+            log(second(BASIN.replace('"basin"\ngen', '"pool"\ngen'))),
             "# second",
             "logs.1: 'pool' and 'basin' are the same with seed 0",
         ),
+        (end(second(DEAD_RECKONING)), "# second", "estimators.1: dead-reckoning/default is there twice"),
         (
-            HEADER + BASIN + DEAD_RECKONING + second(DEAD_RECKONING),
-            "# second",
-            "estimators.1: dead-reckoning/default is there twice",
-        ),
-        (
-            HEADER + BASIN + DEAD_RECKONING + ISAM2 + second(ISAM2) + 'variant = "again"\n',
+            end(ISAM2 + second(ISAM2) + 'variant = "again"\n'),
             "# second",
             "estimators.2: isam2/again and isam2/default have the same settings",
         ),
-        (HEADER + BASIN + "seeds = [1, 1]\n" + DEAD_RECKONING, "seeds", "list of different whole numbers"),
-        (HEADER + BASIN + "seeds = [-1]\n" + DEAD_RECKONING, "seeds", "logs.0.seeds: expected the number of seeds"),
-        (HEADER + BASIN + "seeds = [9223372036854775808]\n" + DEAD_RECKONING, "seeds", "to 9223372036854775807"),
-        (HEADER + BASIN + "seeds = 1000001\n" + DEAD_RECKONING, "seeds", "up to 1000000"),
-        (HEADER + BASIN + "seeds = true\n" + DEAD_RECKONING, "seeds", "not True"),
-        (HEADER + BASIN + 'seeds = "2"\n' + DEAD_RECKONING, "seeds", "not '2'"),
-        (HEADER + BASIN.replace("120", "inf") + DEAD_RECKONING, "options", "options.duration_s"),
-        (HEADER + BASIN + "grid = { wrong_id_rate = [0.1, 0.1] }\n" + DEAD_RECKONING, "grid", "has 0.1 more than once"),
+        (log("seeds = [1, 1]\n"), "seeds", "list of different whole numbers"),
+        (log("seeds = [-1]\n"), "seeds", "logs.0.seeds: expected the number of seeds"),
+        (log("seeds = [9223372036854775808]\n"), "seeds", "to 9223372036854775807"),
+        (log("seeds = 1000001\n"), "seeds", "up to 1000000"),
+        (log("seeds = true\n"), "seeds", "not True"),
+        (log('seeds = "2"\n'), "seeds", "not '2'"),
+        (basin("120", "inf"), "options", "options.duration_s"),
+        (log("grid = { wrong_id_rate = [0.1, 0.1] }\n"), "grid", "has 0.1 more than once"),
+        (basin("[[logs]]", "[logs]"), "[logs]", "expected a list of tables, [[logs]]"),
+        (basin('"basin"\ngen', '"all logs"\ngen'), "all logs", "stands for all logs"),
+        (end("params = { lag = 3 }\n"), "lag = 3", "it has: none"),
+        (head("metrics = []\n"), "metrics", "metrics"),
+        (head('metrics = ["causal.ate_se3"]\n'), "metrics", "did you mean causal.ate_se3_m?"),
+        (other('log = "no.mcap"\n'), "no.mcap", "no.mcap is not in"),
+        (other('log = "suite.toml"\n'), "suite.toml", "not an MCAP file but a text"),
+        (other('log = "."\n'), "log =", "is a folder; give the .mcap file in it"),
+        (other('dataset = "mrclam"\n'), "[[logs]]", "robot: is missing"),
         (
-            HEADER + BASIN.replace("[[logs]]", "[logs]") + DEAD_RECKONING,
-            "[logs]",
-            "expected a list of tables, [[logs]]",
-        ),
-        (HEADER + BASIN.replace('"basin"\ngen', '"all logs"\ngen') + DEAD_RECKONING, "all logs", "stands for all logs"),
-        (HEADER + BASIN + DEAD_RECKONING + "params = { lag = 3 }\n", "lag = 3", "it has: none"),
-        (HEADER + "metrics = []\n" + BASIN + DEAD_RECKONING, "metrics", "metrics"),
-        (
-            HEADER + 'metrics = ["causal.ate_se3"]\n' + BASIN + DEAD_RECKONING,
-            "metrics",
-            "did you mean causal.ate_se3_m?",
-        ),
-        (HEADER + '[[logs]]\nname = "a"\nlog = "no.mcap"\n' + DEAD_RECKONING, "no.mcap", "no.mcap is not in"),
-        (
-            HEADER + '[[logs]]\nname = "a"\nlog = "suite.toml"\n' + DEAD_RECKONING,
-            "suite.toml",
-            "not an MCAP file but a text",
-        ),
-        (
-            HEADER + '[[logs]]\nname = "a"\nlog = "."\n' + DEAD_RECKONING,
-            "log =",
-            "is a folder; give the .mcap file in it",
-        ),
-        (HEADER + '[[logs]]\nname = "a"\ndataset = "mrclam"\n' + DEAD_RECKONING, "[[logs]]", "robot: is missing"),
-        (
-            HEADER + '[[logs]]\nname = "a"\ndataset = "victoria-park"\nlandmarks = { seed = 1 }\n' + DEAD_RECKONING,
+            other('dataset = "victoria-park"\nlandmarks = { seed = 1 }\n'),
             "landmarks",
             "logs.0.landmarks.seed: cannot be set",
         ),
@@ -168,3 +162,47 @@ def test_example_in_the_documentation_of_the_module_is_a_suite(write_suite: Writ
     example = "\n".join(row[4:] for row in (suite.__doc__ or "").splitlines() if row.startswith("    "))
     assert tomllib.loads(example)["name"] == "smoke"
     assert len(plan_runs(read_suite(write_suite(example)))) == 2 * 3 * 3
+
+
+TEXT = '''name = "a"
+note = """
+name = "not a key"
+[[logs]]
+"""
+
+[[logs]]
+name = "one"
+[logs.options]
+seed = 3
+
+[[logs]]
+options = { "odd key" = 1 }
+grid.lag_s = [
+  1,
+]
+[top.'inner part']
+x.y = 1
+'''
+
+
+@pytest.mark.parametrize(
+    ("place", "line"),
+    [
+        (("name",), 1),
+        (("note",), 2),
+        (("logs",), 7),
+        (("logs", 0), 7),
+        (("logs", 0, "name"), 8),
+        (("logs", 0, "options"), 9),
+        (("logs", 0, "options", "seed"), 10),
+        (("logs", 1), 12),
+        (("logs", 1, "options", "odd key"), 13),
+        (("logs", 1, "grid", "lag_s", 0), 14),
+        (("logs", 1, "missing"), 12),
+        (("top", "inner part", "x", "y"), 18),
+        (("nothing",), 1),
+        ((), 1),
+    ],
+)
+def test_line_is_that_of_the_key_or_of_what_holds_it(place: Place, line: int) -> None:
+    assert line_of(TEXT, place) == line

@@ -1,3 +1,5 @@
+"""The table of a batch has a row for each planned run."""
+
 from __future__ import annotations
 
 import json
