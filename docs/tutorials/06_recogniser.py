@@ -1,7 +1,8 @@
 """Landmarks in sonar frames, in your own program: arrays and poses go in, range, azimuth and identities come out.
 
-Nothing here reads a log or runs an estimator. Where the frames and poses come from is up to you: here from the
-simulator, a sonar that moves past landmark 3 for six seconds.
+Nothing here reads a log or runs an estimator. Frames and poses come from your own source: here from the simulator, a
+sonar that moves past landmark 3 for six seconds. For a whole log, or frames with the other sensors of a vehicle, see
+`sonar_graph.recognition.recognise`.
 Run it in any folder: ``python 06_recogniser.py``. It takes a few seconds, half a minute the first time.
 """
 

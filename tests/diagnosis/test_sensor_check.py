@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.diagnosis.findings import Finding, StartTilt, find_start_tilt, with_interval
+from sonar_graph.calibration import Calibration
+from sonar_graph.diagnosis.findings import Finding, StartTilt, find_start_tilt
 from sonar_graph.diagnosis.sensor_check import (
+    WrongUnit,
     check_sensors,
     corrected_sequence,
     dvl_findings,
@@ -20,7 +22,7 @@ from sonar_graph.diagnosis.sensor_check import (
     wrong_units,
 )
 from sonar_graph.logs.adapters.log_config import LogConfig
-from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation.alignment.dvl_imu import DvlMatch
 from sonar_graph.navigation.alignment.gravity import InitialTilt
 from sonar_graph.navigation.alignment.time_offset import Estimate1D
@@ -94,14 +96,16 @@ def test_the_start_is_aligned_with_what_was_found_before(found_in_spoilt: dict[s
     assert find_start_tilt(spoilt()).tilt is None
 
 
-def test_corrections_are_added_to_what_the_configuration_says():
+def test_corrections_are_added_to_what_the_configuration_says_and_a_wrong_unit_is_named_alone():
     config = LogConfig.parse({"dvl": {"stamp_offset_s": -0.1, "scale": 2.0}}, "x")
     found = by_name(check_sensors(spoilt(), config))
-    offset, scale = (
-        tomllib.loads(found[name].advice.split("`")[1]) for name in ("DVL against IMU: time offset", "DVL scale")
-    )
+    offset, scale = (line_of(found[name]) for name in ("DVL against IMU: time offset", "DVL scale"))
     assert offset["stamp_offset_s"] == pytest.approx(OFFSET_S - 0.1, abs=0.15)
     assert scale["scale"] == pytest.approx(2 * SCALE, abs=0.05)
+    dvl = RIGHT.dvl
+    in_mm = replace(RIGHT, dvl=Dvl(dvl.stamps_ns, dvl.velocity * 1000.0, dvl.velocity_cov))
+    (finding,) = check_sensors(in_mm, config)
+    assert (finding.quantity, finding.acts, line_of(finding)) == ("DVL: unit", True, {"scale": 0.002})
 
 
 def test_a_start_taken_from_a_late_reference_is_named_with_the_right_one():
@@ -150,57 +154,6 @@ def test_a_hole_of_the_imu_asks_for_nothing(hole_s: float, monkeypatch: pytest.M
     monkeypatch.setattr("sonar_graph.navigation.alignment.dvl_imu.holes_before", np.zeros_like)
     blind = by_name(check_sensors(run))
     assert blind["DVL scale"].acts == blind["reference against IMU: time offset"].acts == (hole_s > 2.0)
-
-
-def test_digits_are_those_that_the_interval_supports():
-    assert with_interval(Estimate1D(1.0312345, 0.0102), "s") == "+1.031 ± 0.020 s"
-    assert with_interval(Estimate1D(1.00213, 0.0011), "") == "1.0021 ± 0.0022"
-
-
-UNITS = {  # per unit of the package, what the driver counts, and the name and the line that are to be found
-    "mm/s": ("dvl", 1000.0, "DVL: unit", {"scale": 0.001}),
-    "cm/s": ("dvl", 100.0, "DVL: unit", {"scale": 0.01}),
-    "degrees a second": ("rate", np.degrees(1), "gyro: unit", {"angular_velocity_scale": np.radians(1)}),
-    "g": ("force", 1 / 9.80665, "accelerometer: unit", {"linear_acceleration_scale": 9.80665}),
-    "mm/s²": ("force", 1000.0, "accelerometer: unit", {"linear_acceleration_scale": 0.001}),
-}
-
-
-def in_other_units(sensor: str, factor: float) -> Sequence:
-    imu, dvl = RIGHT.imu, RIGHT.dvl
-    rate = imu.angular_velocity * (factor if sensor == "rate" else 1.0)
-    force = imu.specific_force * (factor if sensor == "force" else 1.0)
-    velocity = dvl.velocity * (factor if sensor == "dvl" else 1.0)
-    return replace(RIGHT, imu=Imu(imu.stamps_ns, rate, force), dvl=Dvl(dvl.stamps_ns, velocity, dvl.velocity_cov))
-
-
-@pytest.mark.parametrize("unit", UNITS)
-def test_a_wrong_unit_is_named_alone_with_the_line_that_puts_it_right(unit: str):
-    sensor, factor, quantity, line = UNITS[unit]
-    (finding,) = check_sensors(in_other_units(sensor, factor))
-    assert finding.quantity == quantity
-    assert finding.acts
-    assert f": {unit}?" in finding.text()
-    assert tomllib.loads(finding.advice.split("`")[1]) == pytest.approx(line, rel=1e-3)
-
-
-def test_a_wrong_unit_adds_to_what_the_configuration_scales():
-    config = LogConfig.parse({"dvl": {"scale": -2.0}}, "x")
-    (finding,) = check_sensors(in_other_units("dvl", 1000.0), config)
-    assert tomllib.loads(finding.advice.split("`")[1]) == {"scale": -0.002}
-
-
-def test_right_units_are_not_doubted_even_with_spikes_and_rows_that_were_not_measured():
-    rate, force, velocity = (
-        RIGHT.imu.angular_velocity.copy(),
-        RIGHT.imu.specific_force.copy(),
-        RIGHT.dvl.velocity.copy(),
-    )
-    rate[::50], force[::50], velocity[::50] = 1e3, np.nan, 1e3
-    imu = Imu(RIGHT.imu.stamps_ns, rate, force)
-    assert not wrong_units(
-        replace(RIGHT, imu=imu, dvl=Dvl(RIGHT.dvl.stamps_ns, velocity, RIGHT.dvl.velocity_cov)), LogConfig()
-    )
 
 
 @pytest.mark.parametrize(("speed_m_s", "is_told"), [(0.0, True), (0.05, True), (0.8, False)])
@@ -261,3 +214,116 @@ def test_of_two_biases_the_surer_is_told_axis_by_axis_with_where_it_is_from():
     moving, sources = surest_bias(drive, StartTilt(rest, "from 60 s in motion"))
     assert moving == drive.gyro_bias
     assert set(sources) == {"from the turns of the drive"}
+
+
+N = 100
+ALONG = np.array([2.0, -1.0, 2.0]) / 3.0
+
+
+def line(fault: WrongUnit) -> dict[str, float]:
+    return tomllib.loads(fault.advice.split("`")[1])
+
+
+def vectors(length: float | Floats) -> Floats:
+    """All in one direction, along none of the axes."""
+    return np.broadcast_to(length, N)[:, None] * ALONG
+
+
+def units(
+    speed: float | Floats = 1.0,
+    turn: float | Floats = 0.1,
+    force: float | Floats = 9.8,
+    gravity: float = 9.80665,
+    **scales: dict[str, float],
+) -> list[WrongUnit]:
+    stamps_ns = np.arange(N) * 10_000_000
+    sequence = Sequence(
+        "hand",
+        Calibration(gravity_m_s2=gravity),
+        Imu(stamps_ns, vectors(turn), vectors(force)),
+        Dvl(stamps_ns, vectors(speed), np.full((N, 3, 3), np.nan)),
+    )
+    return wrong_units(sequence, LogConfig.parse(scales, "x"))
+
+
+@pytest.mark.parametrize(
+    ("speed", "unit", "times", "scale"),
+    [
+        (20.1, "cm/s", 100, 0.01),
+        (299.0, "cm/s", 100, 0.01),
+        (301.0, "mm/s", 1000, 0.001),
+        (2900.0, "mm/s", 1000, 0.001),
+        (9e5, "mm/s", 1000, 0.001),  # no unit makes it slow: the smallest
+    ],
+)
+def test_a_speed_over_twenty_is_in_the_largest_unit_in_which_it_is_no_more_than_three(speed, unit, times, scale):
+    (fault,) = units(speed=speed)
+    assert fault.quantity == "DVL: unit"
+    assert fault.advice.startswith(f"velocities look {times} times too large (up to {speed:.3g} m/s): {unit}? ")
+    assert line(fault) == pytest.approx({"scale": scale})
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "shares"),
+    [
+        ("g", 9.80665, (0.81, 1.0, 1.19)),
+        ("mg", 9.80665e-3, (0.992, 1.0, 1.19)),
+        ("cm/s²", 0.01, (0.81, 1.0, 1.008)),
+        ("mm/s²", 0.001, (0.81, 1.0, 1.19)),
+    ],
+)
+def test_a_force_is_in_the_unit_that_brings_it_nearest_to_gravity(unit, factor, shares):
+    """Between mg and cm/s², which differ by a fiftieth, an accelerometer within a hundredth decides."""
+    for share in shares:
+        (fault,) = units(force=share * 9.80665 / factor)
+        assert fault.quantity == "accelerometer: unit"
+        assert f"instead of 9.807 m/s²: {unit}?" in fault.advice
+        assert line(fault) == pytest.approx({"linear_acceleration_scale": factor}, rel=1e-5)
+
+
+@pytest.mark.parametrize("force", [0.78, 1.22, 0.0, 1.5, 3.7, 300.0, 1e6])
+def test_a_force_that_is_gravity_in_no_unit_has_no_wrong_one(force):
+    assert not units(force=force)
+
+
+def test_what_is_usual_is_not_doubted_and_gravity_is_that_of_the_calibration():
+    """0.78 g are within a fifth of 9.1 m/s². Shocks move a mean, not a median."""
+    assert not units(speed=19.9, turn=1.99, force=9.0)
+    assert not units(force=0.78)
+    (fault,) = units(force=0.78, gravity=9.1)
+    assert "instead of 9.1 m/s²: g?" in fault.advice
+    (fault,) = units(force=np.where(np.arange(N) < 40, 20.0, 1.0))
+    assert "typically 1 instead" in fault.advice
+    (fault,) = units(turn=2.1)
+    assert fault.advice.startswith("rates look 57 times too large (up to 2.1 rad/s): degrees a second? ")
+
+
+def test_what_the_configuration_scales_is_taken_over():
+    faults = units(
+        speed=200.0,
+        turn=20.0,
+        force=1.0,
+        dvl={"scale": 3.0},
+        imu={"angular_velocity_scale": -1.0, "linear_acceleration_scale": 2.0},
+    )
+    assert [fault.quantity for fault in faults] == ["DVL: unit", "gyro: unit", "accelerometer: unit"]
+    speed, turn, force = map(line, faults)
+    assert speed == pytest.approx({"scale": 0.03})
+    assert turn == pytest.approx({"angular_velocity_scale": -np.pi / 180}, rel=1e-4)
+    assert force == pytest.approx({"linear_acceleration_scale": 19.6133})
+
+
+def test_a_twentieth_of_spikes_counts_for_nothing_and_more_does():
+    few, many = (np.where(np.arange(N) < k, 1e4, 0.1) for k in (4, 7))
+    assert not units(speed=few, turn=few)
+    assert [fault.quantity for fault in units(speed=many, turn=many)] == ["DVL: unit", "gyro: unit"]
+
+
+def test_rows_that_were_not_measured_in_full_do_not_count():
+    """A vector without one component looks shorter than it is; without any row there is nothing to say."""
+    force = vectors(9.8).copy()
+    force[: N - 10] = [np.nan, 0.0, 1.0]
+    stamps_ns = np.arange(N) * 10_000_000
+    imu, dvl = Imu(stamps_ns, vectors(0.1), force), Dvl(stamps_ns, vectors(1.0), np.full((N, 3, 3), np.nan))
+    assert not wrong_units(Sequence("hand", Calibration(), imu, dvl), LogConfig())
+    assert not units(force=np.nan)

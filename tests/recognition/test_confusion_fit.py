@@ -1,3 +1,5 @@
+"""Laws of the fitted model, and the model measured on a lane whose truth is known."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -14,13 +16,16 @@ from sonar_graph.logs.reading import read_log
 from sonar_graph.recognition.confusion_fit import (
     NO_LABEL,
     NONE,
+    LabelledFits,
     LabelledSightings,
     calibrate,
+    estimate_confusion,
     label_of,
     true_ranges_azimuths,
 )
 from sonar_graph.sonar.appearance import DesignFit, ObjectSighting
-from sonar_graph.sonar.confusion import Confusion
+from sonar_graph.sonar.bayes import virtual_evidence
+from sonar_graph.sonar.confusion import Confusion, soft_scores
 from sonar_graph.sonar.recogniser import Recogniser, RecogniserParams
 
 IDS = np.array([5, 3])
@@ -47,11 +52,8 @@ def sighting(range_m: float, azimuth_rad: float, *, is_fitted: bool = True, is_c
 )
 def test_a_sighting_is_of_what_truly_lies_there(range_m: float, azimuth_rad: float, label: int):
     assert label_of(sighting(range_m, azimuth_rad), IDS, RANGE_M, AZIMUTH_RAD)[0] == label
-
-
-def test_a_landmark_behind_the_sonar_is_not_what_is_seen_in_front():
     behind = np.array([0.1 + np.pi, -0.2 - np.pi])
-    assert label_of(sighting(2.0, 0.1), IDS, RANGE_M, behind)[0] == NONE
+    assert label_of(sighting(range_m, azimuth_rad), IDS, RANGE_M, behind)[0] == NONE
 
 
 def test_sightings_become_columns_with_their_errors():
@@ -70,13 +72,9 @@ def test_sightings_become_columns_with_their_errors():
     np.testing.assert_allclose(fits.visible, 0.95)
     np.testing.assert_allclose(fits.range_azimuth_error[0], [0.01, 0.002])
     assert np.isnan(fits.range_azimuth_error[1:]).all()  # a centroid's error is not that of a fitted centre
-
-
-def test_landmarks_that_no_design_is_of_are_left_out():
-    gathered = LabelledSightings((3, 9))
-    gathered.add(sighting(2.0, 0.1), (0, 1), IDS, RANGE_M, AZIMUTH_RAD)
-    assert len(gathered.fits().label) == 0
-    assert gathered.fits().correlation.shape == (0, 2)
+    stranger = LabelledSightings((3, 9))  # no design is of landmark 5
+    stranger.add(sighting(2.0, 0.1), (0, 1), IDS, RANGE_M, AZIMUTH_RAD)
+    assert stranger.fits().correlation.shape == (0, 2)
 
 
 @given(st.integers(0, 27))
@@ -118,12 +116,7 @@ def test_a_model_measured_on_a_log_is_of_its_landmarks_and_says_where_it_comes_f
     assert int(said["frames of no landmark"]) >= 8
     assert measured.range_sigma_m < 0.02
     assert np.degrees(measured.azimuth_sigma_rad) < 0.5
-
-
-def test_a_measured_model_is_one_that_the_recogniser_takes(lane, measured):
-    again = Confusion.model_validate_json(measured.model_dump_json())
-    assert again == measured
-    assert Recogniser(lane.sequence.calibration, params=RecogniserParams(confusion=again)).confusion is again
+    assert Recogniser(lane.sequence.calibration, params=RecogniserParams(confusion=measured)).confusion is measured
 
 
 def test_logs_count_together(lane_log, measured):
@@ -173,3 +166,94 @@ def test_frames_outside_the_truth_are_not_labelled(lane_log, measured):
     cut = replace(run, truth=run.truth.rows(run.truth.stamps_ns >= middle_ns))
     with pytest.raises(CalibrationError, match="landmark 1: "):
         calibrate([(lane_log, cut)])
+
+
+def _fits(per_class: int, noise: float, seed: int = 0) -> LabelledFits:
+    """Correlations of 0.9 with the true design and 0.7 with others; of 0.6 with all where there is none."""
+    rng = np.random.default_rng(seed)
+    label = np.repeat(np.arange(3), per_class)
+    means = np.array([[0.9, 0.7], [0.7, 0.9], [0.6, 0.6]])[label]
+    error = np.where((label < 2)[:, None], rng.normal(0, [0.01, 0.002], (len(label), 2)), np.nan)
+    return LabelledFits(
+        means + rng.normal(0, noise, means.shape), np.ones(len(label)), label, np.arange(len(label)), error
+    )
+
+
+def test_scores_that_are_fitted_are_calibrated():
+    fitted, unseen = estimate_confusion(_fits(400, 0.08), (1, 2), {}), _fits(400, 0.08, seed=1)
+    scores = soft_scores(unseen.correlation, unseen.visible, fitted.sharpness, fitted.threshold)
+    confidence, right = scores.max(axis=1), scores.argmax(axis=1) == unseen.label
+    assert abs(confidence.mean() - right.mean()) < 0.04
+    assert 0.6 < fitted.threshold < 0.9
+
+
+def test_matrix_is_the_mean_score_of_each_class():
+    fits = _fits(100, 0.1)
+    model = estimate_confusion(fits, (1, 2), {"origin": "made up"})
+    scores = soft_scores(fits.correlation, fits.visible, model.sharpness, model.threshold)
+    for k in range(3):
+        np.testing.assert_allclose(np.array(model.matrix)[k], scores[fits.label == k].mean(axis=0), atol=5e-3)
+    assert model.provenance["origin"] == "made up"
+    assert model.provenance["frames of landmark 1"] == "100"
+    sigmas = model.range_sigma_m, model.azimuth_sigma_rad
+    assert sigmas == pytest.approx((0.01, 0.002), rel=0.2)
+
+
+@pytest.mark.parametrize("tracks", [5, 100])
+def test_frames_that_never_were_confused_are_as_sure_as_their_tracks_allow_within_a_standard_error(tracks: int):
+    """With n tracks of a class (n + 1) / (n + 2) is certainty. The loss is the entropy of that, half a nat
+    over all tracks, and a little for what two numbers cannot fit."""
+    fits = _fits(200, 0.01)
+    model = estimate_confusion(replace(fits, track=np.arange(600) % tracks + 1000 * fits.label), (1, 2), {})
+    scores = soft_scores(fits.correlation, fits.visible, model.sharpness, model.threshold)
+    posterior = virtual_evidence(np.full((600, 3), 1 / 3), scores, model.array(), model.base(), np.ones(600))
+    n = np.array([2 * tracks, 2 * tracks, tracks])[fits.label]
+    sure, unsure = (n + 1) / (n + 2), 1 / (n + 2) / 2
+    own = np.eye(3, dtype=bool)[fits.label]
+    entropy = -(sure * np.log(sure) + 2 * unsure * np.log(unsure)).mean()
+    loss = -np.where(own, sure[:, None], unsure[:, None]) * np.log(posterior)
+    assert 0.5 <= (loss.sum(axis=1).mean() - entropy) * 3 * tracks <= 1.0
+    assert posterior[own].mean() < sure.mean() + 0.001
+    assert model.provenance["tracks of landmark 2"] == str(tracks)
+    assert model.sharpness < 100
+
+
+def test_a_class_with_too_few_frames_is_named():
+    fits = _fits(100, 0.1)
+    few = LabelledFits(
+        *(getattr(fits, n)[:205] for n in ("correlation", "visible", "label", "track", "range_azimuth_error"))
+    )
+    with pytest.raises(CalibrationError, match="no landmark: 5"):
+        estimate_confusion(few, (1, 2), {})
+
+
+def test_errors_that_are_always_the_same_count_as_errors():
+    """A landmark that is always seen 3 cm too far: root mean square, not the spread about the mean."""
+    fits = _fits(300, 0.1)
+    off = replace(fits, range_azimuth_error=fits.range_azimuth_error + np.array([0.03, -0.005]))
+    model = estimate_confusion(off, (1, 2), {})
+    assert model.range_sigma_m == pytest.approx(np.hypot(0.03, 0.01), rel=0.05)
+    assert model.azimuth_sigma_rad == pytest.approx(np.hypot(0.005, 0.002), rel=0.05)
+
+
+def test_sigmas_are_those_of_a_landmark_that_is_wholly_in_view():
+    fits = _fits(300, 0.1)
+    cut = replace(fits, visible=np.full(900, 0.7), range_azimuth_error=fits.range_azimuth_error / 0.7**2)
+    model = estimate_confusion(cut, (1, 2), {})
+    assert model.range_sigma_m == pytest.approx(0.01, rel=0.15)
+    np.testing.assert_allclose(
+        np.diag(model.range_azimuth_cov(0.7)), np.nanmean(cut.range_azimuth_error**2, axis=0), rtol=1e-9
+    )
+
+
+def test_a_class_that_was_seen_more_often_counts_no_more():
+    """Every frame of the first class five times over, on the same tracks."""
+    fits = _fits(60, 0.1)
+    rows = np.concatenate([np.repeat(np.arange(60), 5), np.arange(60, 180)])
+    more = LabelledFits(*(column[rows] for column in vars(fits).values()))
+    one, other = (estimate_confusion(f, (1, 2), {}) for f in (fits, more))
+    assert (other.sharpness, other.threshold) == (
+        pytest.approx(one.sharpness, rel=0.01),
+        pytest.approx(one.threshold, abs=0.002),
+    )
+    np.testing.assert_allclose(other.matrix, one.matrix, atol=2e-3)

@@ -1,3 +1,5 @@
+"""Laws of the whole recogniser, on small images of designs."""
+
 from __future__ import annotations
 
 from collections import Counter
@@ -70,47 +72,72 @@ def test_a_landmark_passed_by_is_named_and_lies_where_geometry_says(design: int)
     assert last.stamps_ns.tolist() == [8 * FRAME_NS]
 
 
-def test_bare_floor_is_no_landmark():
-    assert pass_by(Recogniser(DECIBELS), None) == [None] * 9
+def standing(recogniser: Recogniser, frames: range, design: int | None = SQUARE, y_m: float = 0.0, view=VIEW) -> list:
+    """Detections of frames from one place, and the outcomes of their tracks."""
+    results = []
+    for k in frames:
+        motion = None if k == 0 else aside(0.0)
+        found = recogniser.process(frame(k, picture(design, 1.7, y_m, 0.4, k)), motion, view)
+        results.append((found, [fate.outcome for fate in recogniser.fates if fate.track >= 0]))
+    return results
 
 
-def test_nothing_is_reported_before_enough_frames_and_the_reason_is_said():
-    recogniser = Recogniser(DECIBELS, params=RecogniserParams(least_frames=4))
-    outcomes = []
-    for k in range(5):
-        found = recogniser.process(frame(k, picture(SQUARE, 1.7, 0.0, 0.4, k)), None if k == 0 else aside(0.0), VIEW)
-        outcomes.append([fate.outcome for fate in recogniser.fates if fate.track >= 0])
-        assert (found is None) is (k < 3)
-    assert outcomes == [["not reported: seen in fewer than 4 frames"]] * 3 + [[REPORTED]] * 2
+@pytest.mark.parametrize(
+    ("settings", "y_m", "reasons"),
+    [
+        ({"least_frames": 4}, 0.0, ["seen in fewer than 4 frames"] * 3),
+        ({"least_frames": 1, "least_existence": 0.5}, 0.0, ["exists with less than 0.5"]),
+        ({"least_frames": 1, "least_existence": 0.0}, 0.45, ["too little of it is in view"] * 5),
+    ],
+)
+def test_a_track_is_reported_from_the_frame_that_is_enough_and_the_reason_is_said(settings, y_m, reasons):
+    params = RecogniserParams(detection=DetectionParams(keep_at_edge=y_m > 0), **settings)
+    results = standing(Recogniser(DECIBELS, params=params), range(5), y_m=y_m)
+    for (found, outcomes), reason in zip(results, reasons, strict=False):
+        assert found is None
+        assert set(outcomes) == {f"not reported: {reason}"}
+    assert all(found is not None and REPORTED in outcomes for found, outcomes in results[len(reasons) :])
 
 
-def test_detections_say_which_track_they_are_of():
+def test_a_track_ends_with_a_row_and_the_next_has_another_number():
     recogniser = Recogniser(DECIBELS)
-    pass_by(recogniser, DISC, 4, 0.0)
-    for k in range(4, 30):
-        recogniser.process(frame(k, picture(None, 1.7, 0.0, 0.4, k)), aside(0.0), VIEW)
-    tracks = []
-    for k in range(30, 36):
-        found = recogniser.process(frame(k, picture(SQUARE, 1.7, 0.0, 0.4, k)), aside(0.0), VIEW)
-        if found is not None:
-            tracks += found.track.tolist()
-            assert found.track.tolist() == [f.track for f in recogniser.fates if f.outcome == REPORTED]
-    assert len(set(tracks)) == 1
-    assert tracks[0] > 0
+    standing(recogniser, range(4), DISC)
+    assert recogniser.track_ids.tolist() == [0]
+    blank = standing(recogniser, range(4, 30), None)
+    assert all(found is None for found, _ in blank)
+    assert "track ended: exists with less than 0.01" in [outcome for _, outcomes in blank for outcome in outcomes]
+    tracks = [found.track.tolist() for found, _ in standing(recogniser, range(30, 36)) if found is not None]
+    assert len(set(map(tuple, tracks))) == 1
+    assert tracks[0] == [fate.track for fate in recogniser.fates if fate.outcome == REPORTED]
+    assert tracks[0][0] > 0
 
 
-def test_a_track_that_hardly_exists_is_not_reported():
-    recogniser = Recogniser(DECIBELS, params=RecogniserParams(least_frames=1, least_existence=0.5))
-    assert recogniser.process(frame(0, picture(SQUARE, 1.7, 0.0, 0.4, 0)), None, VIEW) is None
-    assert [f.outcome for f in recogniser.fates if f.track >= 0] == ["not reported: exists with less than 0.5"]
-    assert recogniser.process(frame(1, picture(SQUARE, 1.7, 0.0, 0.4, 1)), aside(0.0), VIEW) is not None
+@pytest.mark.parametrize("case", ["linear samples", "no floor"])
+def test_linear_samples_and_the_plane_of_the_image_give_nearly_the_same(case: str):
+    """Patches are compared in that plane where no floor is known."""
+    linear = Calibration(sonar=SonarCalibration(image=SonarImage(scale="linear", full_scale=1e8)))
+    one, other = Recogniser(DECIBELS), Recogniser(linear if case == "linear samples" else DECIBELS)
+    for k in range(4):
+        image = np.maximum(picture(DISC, 1.7, 0.0, 0.4, k), 0.0)
+        changed = (1e3 * 10 ** (image / 20)).astype(np.float32) if case == "linear samples" else image
+        motion = None if k == 0 else aside(0.0)
+        a = one.process(frame(k, image), motion, VIEW)
+        b = other.process(frame(k, changed), motion, None if case == "no floor" else VIEW)
+    atol = 1e-4 if case == "linear samples" else 0.04
+    np.testing.assert_allclose((a.range_m, a.azimuth_rad), (b.range_m, b.azimuth_rad), atol=atol)
+    if case == "linear samples":
+        np.testing.assert_allclose(a.id_probability, b.id_probability, atol=0.01)
 
 
-def test_what_is_hardly_in_view_is_not_reported_and_the_reason_is_said():
-    params = RecogniserParams(detection=DetectionParams(keep_at_edge=True), least_frames=1, least_existence=0.0)
-    recogniser = Recogniser(DECIBELS, params=params)
-    assert recogniser.process(frame(0, picture(SQUARE, 1.7, 0.45, 0.0, 0)), None, VIEW) is None
-    assert {f.outcome for f in recogniser.fates if f.track >= 0} == {"not reported: too little of it is in view"}
+def test_other_designs_and_blocks_of_more_frames_are_refused():
+    model = confusion_for(DEFAULT_DESIGNS[:2])
+    with pytest.raises(CalibrationError, match=r"\(1, 2\), the designs are \(1, 2, 3, 4\).*calibrate"):
+        Recogniser(DECIBELS, params=RecogniserParams(confusion=model))
+    assert Recogniser(DECIBELS, DEFAULT_DESIGNS[:2], RecogniserParams(confusion=model)).ids.tolist() == [1, 2]
+    recogniser, both = Recogniser(DECIBELS), np.stack([picture(DISC, 1.7, 0.0, 0.0, k) for k in (1, 2)])
+    with pytest.raises(MeasurementError, match=r"a block of 2 frames; give blocks of one"):
+        recogniser.process(SonarFrames(np.array([0, FRAME_NS]), both, RANGES_M, AZIMUTHS_RAD), None, VIEW)
+    assert recogniser.stamp_ns is None
 
 
 def test_nothing_that_stands_out_disappears_without_a_row(monkeypatch: pytest.MonkeyPatch):
@@ -128,16 +155,6 @@ def test_nothing_that_stands_out_disappears_without_a_row(monkeypatch: pytest.Mo
         assert {f.stamp_ns for f in recogniser.fates} == {k * FRAME_NS}
         words = Counter(f.outcome for f in fates if f.track < 0)
         assert words["candidate rejected: too small"] == np.sum(seen[-1].verdicts == 3)
-
-
-def test_the_end_of_a_track_has_a_row():
-    recogniser = Recogniser(DECIBELS)
-    pass_by(recogniser, DISC, 4, 0.0)
-    ended = []
-    for k in range(4, 20):
-        recogniser.process(frame(k, picture(None, 1.7, 0.0, 0.4, k)), aside(0.0), VIEW)
-        ended += [f for f in recogniser.fates if f.outcome.startswith("track ended")]
-    assert next((f.track, f.outcome) for f in ended) == (0, "track ended: exists with less than 0.01")
 
 
 BAD = {
@@ -174,20 +191,6 @@ def test_a_bad_frame_is_named_and_the_others_are_as_without_it(reason: str):
     assert [f.track for f in bad.fates if f.track >= 0] == [f.track for f in good.fates if f.track >= 0]
 
 
-def test_more_frames_from_one_place_make_no_landmark_surer_and_the_papers_rule_counts_them():
-    ours, papers = (
-        [float(found.id_probability[0, SQUARE]) for found in _resting(rule) if found is not None]
-        for rule in ("virtual-evidence", "jeffrey")
-    )
-    np.testing.assert_allclose(ours, ours[0], rtol=1e-9)
-    assert 1 - papers[-1] < 0.1 * (1 - ours[-1])
-
-
-def _resting(rule: str) -> list:
-    params = RecogniserParams(identity=IdentityParams.model_validate({"rule": rule}))
-    return pass_by(Recogniser(DECIBELS, params=params), SQUARE, 8, 0.0)
-
-
 def test_a_sonar_that_comes_to_rest_believes_for_500_frames_what_it_believed():
     """The same picture from the same place, an unseen bit brighter every other time: no copy of the frame before."""
     recogniser = Recogniser(DECIBELS)
@@ -197,6 +200,16 @@ def test_a_sonar_that_comes_to_rest_believes_for_500_frames_what_it_believed():
         found = recogniser.process(frame(9 + k, image + np.float32(1e-3 * (k % 2))), aside(0.0), VIEW)
     assert before.id_probability[0, SQUARE] > 0.9
     np.testing.assert_allclose(found.id_probability, before.id_probability, rtol=1e-9)
+
+
+def test_more_frames_from_one_place_make_no_landmark_surer_and_the_papers_rule_counts_them():
+    ours, papers = (
+        [float(found.id_probability[0, SQUARE]) for found in pass_by(recogniser, SQUARE, 8, 0.0) if found is not None]
+        for rule in ("virtual-evidence", "jeffrey")
+        for recogniser in [Recogniser(DECIBELS, params=RecogniserParams(identity=IdentityParams(rule=rule)))]
+    )
+    np.testing.assert_allclose(ours, ours[0], rtol=1e-9)
+    assert 1 - papers[-1] < 0.1 * (1 - ours[-1])
 
 
 def _belief_after(steps: list[SonarStep], xy_m: list[tuple[float, float]]) -> float:
@@ -235,40 +248,6 @@ def test_what_is_across_turns_with_the_sonar(monkeypatch: pytest.MonkeyPatch):
     np.testing.assert_allclose(looks[1][1], [[-1.0, 0.0, 0.0]], atol=0.02)
 
 
-def test_linear_samples_give_what_decibels_give():
-    linear = Calibration(sonar=SonarCalibration(image=SonarImage(scale="linear", full_scale=1e8)))
-    one, other = Recogniser(DECIBELS), Recogniser(linear)
-    for k in range(4):
-        image = np.maximum(picture(TRIANGLE, 1.7, 0.0, 0.4, k), 0.0)
-        amplitude = (1e3 * 10 ** (image / 20)).astype(np.float32)
-        motion = None if k == 0 else aside(0.0)
-        a, b = one.process(frame(k, image), motion, VIEW), other.process(frame(k, amplitude), motion, VIEW)
-    np.testing.assert_allclose(a.range_m, b.range_m, atol=1e-4)
-    np.testing.assert_allclose(a.id_probability, b.id_probability, atol=0.01)
-
-
-def test_without_a_floor_patches_are_compared_in_the_plane_of_the_image():
-    recogniser = Recogniser(DECIBELS)
-    for k in range(4):
-        found = recogniser.process(frame(k, picture(DISC, 1.7, 0.0, 0.4, k)), None if k == 0 else aside(0.0), None)
-    r, a = VIEW.range_azimuth(np.array([1.7, 0.0]))
-    assert (found.range_m[0], found.azimuth_rad[0]) == pytest.approx((r, a), abs=0.04)
-
-
-def test_a_model_of_other_landmarks_is_refused():
-    model = confusion_for(DEFAULT_DESIGNS[:2])
-    with pytest.raises(CalibrationError, match=r"\(1, 2\), the designs are \(1, 2, 3, 4\).*calibrate"):
-        Recogniser(DECIBELS, params=RecogniserParams(confusion=model))
-    assert Recogniser(DECIBELS, DEFAULT_DESIGNS[:2], RecogniserParams(confusion=model)).ids.tolist() == [1, 2]
-
-
-def test_the_surer_of_two_tracks_keeps_the_landmark_and_the_other_is_none():
-    beliefs = np.array([[0.7, 0.1, 0.2], [0.9, 0.05, 0.05]])
-    found = each_once(beliefs)
-    np.testing.assert_allclose(found, [[0.0, 0.1, 0.9], [0.9, 0.05, 0.05]])
-    np.testing.assert_allclose(each_once(beliefs[::-1]), found[::-1])
-
-
 def test_two_discs_at_once_are_not_both_the_disc():
     """Two discs in one image: one is the landmark, the other is believed to be none."""
     recogniser = Recogniser(DECIBELS)
@@ -287,6 +266,8 @@ def test_two_discs_at_once_are_not_both_the_disc():
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(1, 4))
 def test_no_landmark_is_the_most_probable_identity_of_two_tracks(seed: int, tracks: int, known: int):
+    surer = np.array([[0.7, 0.1, 0.2], [0.9, 0.05, 0.05]])
+    np.testing.assert_allclose(each_once(surer), [[0.0, 0.1, 0.9], [0.9, 0.05, 0.05]])
     rng = np.random.default_rng(seed)
     beliefs = rng.dirichlet(np.full(known + 1, 0.4), tracks)
     found = each_once(beliefs)
@@ -298,12 +279,3 @@ def test_no_landmark_is_the_most_probable_identity_of_two_tracks(seed: int, trac
     free = before[before < known]
     if len(set(free.tolist())) == len(free):
         np.testing.assert_array_equal(found, beliefs)
-
-
-def test_a_block_of_two_frames_is_refused_and_changes_nothing():
-    recogniser = Recogniser(DECIBELS)
-    both = np.stack([picture(DISC, 1.7, 0.0, 0.0, 1), picture(DISC, 1.7, 0.0, 0.0, 2)])
-    block = SonarFrames(np.array([0, FRAME_NS]), both, RANGES_M, AZIMUTHS_RAD)
-    with pytest.raises(MeasurementError, match=r"a block of 2 frames; give blocks of one"):
-        recogniser.process(block, None, VIEW)
-    assert recogniser.stamp_ns is None

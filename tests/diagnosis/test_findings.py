@@ -1,4 +1,4 @@
-"""Truth by hand: a vehicle that lies tilted and then drives off, and the simulator's moving one."""
+"""Truth by hand: places, arms, biases and a vehicle that lies tilted; and the simulator's moving one."""
 
 from __future__ import annotations
 
@@ -9,13 +9,103 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import STANDARD_GRAVITY, Calibration, Start
-from sonar_graph.diagnosis.findings import StartHeading, StartTilt, find_start_heading, find_start_tilt, tilt_findings
+from sonar_graph.calibration import STANDARD_GRAVITY, Calibration, ImuCalibration, Start
+from sonar_graph.diagnosis.findings import (
+    StartHeading,
+    StartTilt,
+    bias_findings,
+    find_start_heading,
+    find_start_tilt,
+    lever_findings,
+    tilt_findings,
+    with_fitted,
+    with_interval,
+)
 from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.navigation.alignment.dvl_imu import DvlMatch
 from sonar_graph.navigation.alignment.time_offset import Estimate1D
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.states import Trajectory
+
+UNKNOWN = Estimate1D(np.nan, np.inf, "too little turning")
+GIVEN = Calibration.parse(
+    {
+        "imu": {"mounting": {"translation_m": [0.5, 0.1, 0.0]}, "gyro_bias_sigma": 1e-4},
+        "dvl": {"mounting": {"translation_m": [-1.0, 0.2, 0.3]}},
+    },
+    "by hand",
+)
+"""An arm of (-1.5, 0.1, 0.3) m."""
+
+
+def match(lever: tuple[Estimate1D, ...], bias: tuple[Estimate1D, ...] = (UNKNOWN,) * 3) -> DvlMatch:
+    return DvlMatch(UNKNOWN, UNKNOWN, UNKNOWN, lever, bias)  # type: ignore[arg-type]
+
+
+def arm(*values: float, sigma: float = 0.01) -> tuple[Estimate1D, ...]:
+    return tuple(Estimate1D(value, sigma) for value in values)
+
+
+def test_either_line_makes_the_arm_of_the_calibration_the_one_found():
+    rows = lever_findings(match(arm(-0.2, 0.11, 0.9)), GIVEN)
+    assert [row.acts for row in rows] == [True, False, True]
+    texts = [row.text() for row in rows]
+    assert "not the calibration's -1.50 m" in texts[0]
+    assert texts[1] == "+0.110 ± 0.020 m: the calibration's +0.10 m fits, no need to act"
+    assert texts[2] == "+0.900 ± 0.020 m: put right by the line above"
+    _, imu_line, _, dvl_line, _ = rows[0].advice.split("`")
+    imu, dvl = (tomllib.loads(line) for line in (imu_line, dvl_line))
+    places = [imu["imu"]["mounting"]["translation_m"], dvl["dvl"]["mounting"]["translation_m"]]
+    assert np.subtract((-1.0, 0.2, 0.3), places[0]) == pytest.approx([-0.2, 0.1, 0.9])
+    assert np.subtract(places[1], (0.5, 0.1, 0.0)) == pytest.approx([-0.2, 0.1, 0.9])
+    assert with_fitted(match(arm(-0.2, 0.11, 0.9)), GIVEN).imu.mounting.translation_m == pytest.approx(places[0])
+
+
+def test_an_axis_that_cannot_be_told_keeps_the_place_of_the_calibration():
+    rows = lever_findings(match((UNKNOWN, *arm(0.6, 0.3))), GIVEN)
+    assert rows[0].text() == "cannot be told: too little turning"
+    assert [row.acts for row in rows] == [False, True, False]
+    assert "`imu.mounting.translation_m = [0.500, -0.400, 0.000]`" in rows[1].advice
+
+
+@pytest.mark.parametrize(("error_m", "sigma_m", "acts"), [(0.04, 0.01, False), (0.06, 0.01, True), (0.5, 0.3, False)])
+def test_an_arm_matters_by_centimetres_and_only_beyond_its_interval(error_m: float, sigma_m: float, acts: bool):
+    (row, *_) = lever_findings(match(arm(-1.5 + error_m, 0.1, 0.3, sigma=sigma_m)), GIVEN)
+    assert row.acts == acts
+
+
+def biases(*values: float, sigma: float = 1e-5) -> tuple[Estimate1D, Estimate1D, Estimate1D]:
+    x, y, z = (Estimate1D(value, sigma) for value in values)
+    return x, y, z
+
+
+def test_a_bias_beyond_its_sigma_asks_for_one_that_holds_the_largest():
+    sources = ("from 20 s of rest", "from turns", "from turns")
+    rows = bias_findings(biases(1e-3, 1.5e-4, -4e-3), sources, GIVEN.imu)
+    assert [row.acts for row in rows] == [True, False, True]
+    assert "from 20 s of rest" in rows[0].text()
+    assert tomllib.loads(rows[0].advice.split("`")[1]) == {"imu": {"gyro_bias_sigma": 0.004}}
+    assert rows[2].advice == "put right by the line above"
+    changed = with_fitted(match(arm(-1.5, 0.1, 0.3), biases(1e-3, 1.5e-4, -4e-3)), GIVEN).imu
+    assert changed.gyro_bias_sigma == 0.004
+    assert not any(row.acts for row in bias_findings(biases(1e-3, 1.5e-4, -4e-3), sources, changed))
+    fibre = ImuCalibration(gyro_bias_sigma=3e-6)  # the rotation of the Earth is no fault of a gyro
+    assert not any(row.acts for row in bias_findings(biases(7.3e-5, 0.0, -7.3e-5), sources, fibre))
+    assert bias_findings(biases(1.2e-4, 0.0, 0.0), sources, fibre)[0].acts
+
+
+def test_where_no_axis_can_be_told_one_row_says_why():
+    rows = [*lever_findings(match((UNKNOWN,) * 3), GIVEN), *bias_findings((UNKNOWN,) * 3, ("",) * 3, GIVEN.imu)]
+    assert [row.quantity for row in rows] == ["lever arm from IMU to DVL", "gyro bias"]
+    assert [row.text() for row in rows] == ["cannot be told: too little turning"] * 2
+    assert with_fitted(match((UNKNOWN,) * 3), GIVEN) == GIVEN
+
+
+def test_digits_are_those_that_the_interval_supports():
+    assert with_interval(Estimate1D(1.0312345, 0.0102), "s") == "+1.031 ± 0.020 s"
+    assert with_interval(Estimate1D(1.00213, 0.0011), "") == "1.0021 ± 0.0022"
+
 
 ROLL, PITCH, BIAS = 0.12, -0.07, np.array([3e-4, -2e-4, 1e-4])
 NS = 1_000_000_000
@@ -48,28 +138,18 @@ def test_a_rest_at_the_start_is_used_as_long_as_it_lasts(rest_s: float, used: in
         assert abs(one.value - true) < 4 * one.sigma < 4 * 1.2e-4
 
 
-def test_a_rest_before_the_doppler_log_begins_is_not_the_start():
-    found = find_start_tilt(resting(15.0, lay_s=14.0))
-    assert not found.is_rest
-    assert "in motion" in found.said
-
-
-def test_a_short_rest_is_taken_together_with_the_motion_after_it():
-    found = find_start_tilt(resting(4.0))
-    assert found.said == "from 60 s in motion"
-    assert found.gyro_bias() is None
-    for axis, true in enumerate((ROLL, PITCH)):
-        assert abs(found.angle(axis).value - true) < 4 * found.angle(axis).sigma < 0.01
-
-
-def test_a_moving_start_has_the_tilt_of_the_simulator():
+def test_without_a_rest_that_the_doppler_log_confirms_the_first_minute_in_motion_counts():
+    late = find_start_tilt(resting(15.0, lay_s=14.0))
+    assert not late.is_rest
+    assert "in motion" in late.said
     run = simulate_mission(MissionOptions(seed=8, duration_s=70, landmarks=1))
-    assert run.truth is not None
     _, pitch, roll = run.truth.at(np.array([run.start_ns])).rotations().as_euler("ZYX")[0].tolist()
-    found = find_start_tilt(run)
-    assert not found.is_rest
-    for axis, true in enumerate((roll, pitch)):
-        assert abs(found.angle(axis).value - true) < 4 * found.angle(axis).sigma < 0.01
+    for sequence, rpy in ((resting(4.0), (ROLL, PITCH)), (run, (roll, pitch))):
+        found = find_start_tilt(sequence)
+        assert found.said.endswith("s in motion")
+        assert found.gyro_bias() is None
+        for axis, true in enumerate(rpy):
+            assert abs(found.angle(axis).value - true) < 4 * found.angle(axis).sigma < 0.01
 
 
 def test_a_start_that_contradicts_is_named_with_the_line_that_puts_it_right():
@@ -83,12 +163,8 @@ def test_a_start_that_contradicts_is_named_with_the_line_that_puts_it_right():
     assert rpy["rpy_rad"] == pytest.approx([ROLL, PITCH, 0.9], abs=5e-3)
     assert sigma["rpy_sigma_rad"] == pytest.approx([found.angle(0).sigma, found.angle(1).sigma, 1e-3], rel=0.05)
     right = Start(rpy_rad=tuple(rpy["rpy_rad"]), rpy_sigma_rad=tuple(sigma["rpy_sigma_rad"]))
-    assert not any(row.acts for row in tilt_findings(found, right, 0.9))
-
-
-def test_what_the_calibration_is_unsure_of_is_not_contradicted():
-    found = find_start_tilt(resting(50.0))
-    assert not any(row.acts for row in tilt_findings(found, Start(rpy_sigma_rad=(0.1, 0.1, 0.1)), 0.0))
+    for fits in (right, Start(rpy_sigma_rad=(0.1, 0.1, 0.1))):
+        assert not any(row.acts for row in tilt_findings(found, fits, 0.9))
 
 
 def test_without_accelerometers_one_row_says_why_there_is_no_tilt():
@@ -112,13 +188,8 @@ def test_what_speaks_against_both_ways_is_said():
     assert "at rest: Imu.specific_force: varies" in found.said
     assert "in motion: alignment: velocities and accelerations differ" in found.said
     assert "inspect" not in found.said
-
-
-def test_a_calibration_without_any_noise_is_a_reason_too():
-    run = resting(4.0)
     silent = {"imu": {"gyro_noise_density": 0.0, "accel_noise_density": 0.0}, "dvl": {"velocity_sigma_m_s": [0.0] * 3}}
     found = find_start_tilt(replace(run, calibration=Calibration.parse(silent, "by hand")))
-    assert found.tilt is None
     assert found.said.endswith("in motion: the calibration's noise is zero")
 
 
