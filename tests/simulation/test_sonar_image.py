@@ -217,6 +217,15 @@ def test_one_way_beam_is_down_by_half_power_at_half_its_width():
     assert 20 * np.log10(EVEN.elevation_pattern(np.radians([7.0]))) == pytest.approx(-6.02, abs=0.2)
 
 
+@pytest.mark.parametrize("side_lobes", [True, False])
+def test_columns_left_out_of_a_beam_are_seventy_decibels_down(side_lobes: bool):
+    made = simulator(side_lobes=side_lobes)
+    column = np.arange(made._beam_matrix.shape[1])
+    is_left_out = (column < made._bands[:, :1]) | (column >= made._bands[:, 1:])
+    assert 0.5 < is_left_out.mean() < 1
+    assert 20 * np.log10(made._beam_matrix[is_left_out].max()) < -70
+
+
 def test_cross_talk_shows_every_eighth_beam_at_its_level():
     quiet, loud = point_response(side_lobes=False), point_response(side_lobes=False, cross_talk_db=-25.0)
     strongest = int(np.argmax(loud))
