@@ -12,8 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sonar_graph.evaluation.digits import format_value
-from sonar_graph.evaluation.score_table import score_table
-from sonar_graph.evaluation.tables import as_html
+from sonar_graph.evaluation.tables import as_html, score_table
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.recognition import Recognition
 from sonar_graph.sequence import Sequence

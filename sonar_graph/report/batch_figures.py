@@ -29,7 +29,7 @@ from sonar_graph.report.figure_style import (
     inline_svg,
     logarithmic,
 )
-from sonar_graph.report.table_files import csv_text
+from sonar_graph.report.rendering import csv_text
 
 ROW_IN, PANEL_IN, WIDTH_IN = 0.36, 0.95, 7.4
 STACKED = 2

@@ -41,8 +41,7 @@ from sonar_graph.report.batch_tables import (
     run_lists,
 )
 from sonar_graph.report.figure_style import Illustration
-from sonar_graph.report.html_page import render
-from sonar_graph.report.table_files import write_tables
+from sonar_graph.report.rendering import render, write_tables
 
 FOLDED_ROWS = 24
 """Tables with more rows are folded on the screen: figures above them show the same."""

@@ -29,7 +29,7 @@ OTHER_KEYS = {
 }
 
 
-def test_scores_of_a_constant_offset_by_hand(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
+def test_scores_of_a_constant_offset_by_hand(install, make_sequence, offset_estimator):
     install(offset=offset_estimator)
     scores = compare(make_sequence(), ["offset"], {"offset": {"offset_m": 0.4, "sigma_m": 0.1}}).scores["offset"]
     value = {key: score.value for key, score in scores.items()}
@@ -47,9 +47,7 @@ def test_scores_of_a_constant_offset_by_hand(install: Install, make_sequence: Ma
     assert value["detections.nis"] == pytest.approx((4.0 + 1.0) / 2 / 2)
 
 
-def test_every_score_is_there_with_unit_and_protocol(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
+def test_every_score_is_there_with_unit_and_protocol(install, make_sequence, offset_estimator):
     install(offset=offset_estimator)
     scores = compare(make_sequence(), ["offset"]).scores["offset"]
     expected = {f"{kind}.{key}" for kind in ("causal", "smoothed") for key in TRAJECTORY_KEYS} | OTHER_KEYS
@@ -65,7 +63,7 @@ def test_every_score_is_there_with_unit_and_protocol(
     assert scores["smoothed.ate_raw_m"].protocol.startswith("Smoothed")
 
 
-def test_ignored_detections_are_neither_used_nor_refused() -> None:
+def test_ignored_detections_are_neither_used_nor_refused():
     n = 3
     unpredicted = (np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan))
     log = DetectionLog(np.arange(n), np.ones(n, int), *unpredicted, [Outcome.IGNORED] * 2 + [Outcome.NO_IDENTITY])
@@ -76,7 +74,7 @@ def test_ignored_detections_are_neither_used_nor_refused() -> None:
     assert "detections.nis" not in scores
 
 
-def test_only_independent_samples_get_a_band(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
+def test_only_independent_samples_get_a_band(install, make_sequence, offset_estimator):
     install(offset=offset_estimator)
     scores = compare(make_sequence(), ["offset"]).scores["offset"]
     assert scores["causal.nees_position"].interval is None
@@ -84,16 +82,14 @@ def test_only_independent_samples_get_a_band(install: Install, make_sequence: Ma
     assert scores["detections.nis"].interval == pytest.approx(tuple(chi2.ppf([0.025, 0.975], 4) / 4))
 
 
-def test_spatial_runs_score_height_too(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
+def test_spatial_runs_score_height_too(install, make_sequence, offset_estimator):
     install(offset=offset_estimator)
     comparison = compare(make_sequence(planar=False), ["offset"], {"offset": {"offset_m": 0.3, "sigma_m": 0.3}})
     assert comparison.errors["offset"]["causal"].position_dof == 3
     assert comparison.scores["offset"]["causal.nees_position"].value == pytest.approx(1 / 3)
 
 
-def test_all_are_scored_at_the_instants_that_all_have(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
+def test_all_are_scored_at_the_instants_that_all_have(install, make_sequence, offset_estimator):
     class Late(offset_estimator):
         def process(self, measurements: Measurements) -> Estimate | None:
             return None if measurements.end_ns < 4_000_000_000 else super().process(measurements)
@@ -106,9 +102,7 @@ def test_all_are_scored_at_the_instants_that_all_have(
     assert len(comparison.runs[0].causal or ()) == 40
 
 
-def test_a_failed_run_is_a_row_and_does_not_disturb_the_others(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
+def test_a_failed_run_is_a_row_and_does_not_disturb_the_others(install, make_sequence, offset_estimator):
     class Broken(offset_estimator):
         def process(self, _measurements: Measurements) -> Estimate | None:
             raise RuntimeError("diverged")
@@ -121,9 +115,7 @@ def test_a_failed_run_is_a_row_and_does_not_disturb_the_others(
     assert together.scores["offset"]["causal.ate_raw_m"] == alone.scores["offset"]["causal.ate_raw_m"]
 
 
-def test_without_truth_the_rest_is_scored_and_it_is_said(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
+def test_without_truth_the_rest_is_scored_and_it_is_said(install, make_sequence, offset_estimator):
     install(offset=offset_estimator)
     comparison = compare(make_sequence(truth=False), ["offset"])
     keys = set(comparison.scores["offset"])
@@ -134,9 +126,7 @@ def test_without_truth_the_rest_is_scored_and_it_is_said(
     assert "no truth" in comparison.environment["scored instants"]
 
 
-def test_a_truth_that_covers_one_instant_is_too_little(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
+def test_a_truth_that_covers_one_instant_is_too_little(install, make_sequence, offset_estimator):
     install(offset=offset_estimator)
     sequence = make_sequence()
     assert sequence.truth is not None
@@ -145,9 +135,7 @@ def test_a_truth_that_covers_one_instant_is_too_little(
     assert comparison.environment["scored instants"].startswith("1 of 40 instants")
 
 
-def test_an_estimator_without_covariances_has_errors_but_no_nees(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
+def test_an_estimator_without_covariances_has_errors_but_no_nees(install, make_sequence, offset_estimator):
     class Modest(offset_estimator):
         def beside(self, stamp_ns: int, offset_m: float) -> Estimate:
             return replace(super().beside(stamp_ns, offset_m), covariance=np.full((6, 6), np.nan))
@@ -158,7 +146,7 @@ def test_an_estimator_without_covariances_has_errors_but_no_nees(
     assert "causal.nees_position" not in scores
 
 
-def test_mistakes_of_the_user_are_raised(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
+def test_mistakes_of_the_user_are_raised(install, make_sequence, offset_estimator):
     install(offset=offset_estimator)
     sequence = make_sequence()
     with pytest.raises(EvaluationError, match="no estimator"):
@@ -173,9 +161,7 @@ def test_mistakes_of_the_user_are_raised(install: Install, make_sequence: Make, 
         compare(sequence, ["offset"], {"offset": {"colour": 1}})
 
 
-def test_a_wrong_name_is_found_before_anything_runs(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
+def test_a_wrong_name_is_found_before_anything_runs(install, make_sequence, offset_estimator):
     install(offset=offset_estimator)
     calls: list[Any] = []
     with pytest.raises(UnknownEstimatorError):
@@ -183,7 +169,7 @@ def test_a_wrong_name_is_found_before_anything_runs(
     assert calls == []
 
 
-def test_times_by_hand() -> None:
+def test_times_by_hand():
     run = RunResult("by hand", {}, "ok", update_s=np.array([0.001, 0.002, 0.003, 0.010]), finish_s=0.984)
     value = {key: score.value for key, score in resource_scores(run, log_s=50.0).items()}
     assert value["time.update_median_ms"] == pytest.approx(2.5)
@@ -194,16 +180,14 @@ def test_times_by_hand() -> None:
     assert "memory.peak_mb" not in value
 
 
-def test_progress_names_the_estimator(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
+def test_progress_names_the_estimator(install, make_sequence, offset_estimator):
     install(one=offset_estimator, two=offset_estimator)
     calls: list[tuple[str, int, int]] = []
     compare(make_sequence(2.0), ["one", "two"], rate_hz=1.0, progress=lambda *call: calls.append(call))
     assert calls == [("one", 1, 2), ("one", 2, 2), ("two", 1, 2), ("two", 2, 2)]
 
 
-def test_environment_names_versions_machine_date_and_command(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
+def test_environment_names_versions_machine_date_and_command(install, make_sequence, offset_estimator):
     install(offset=offset_estimator)
     environment = compare(make_sequence(), ["offset"]).environment
     assert {"sonar_graph", "python", "numpy", "gtsam", "machine", "date", "command"} <= set(environment)

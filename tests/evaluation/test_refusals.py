@@ -1,4 +1,4 @@
-"""Rows that estimators refuse are named to the user: terminal, page and files, for one estimator and for several."""
+"""Rows that estimators refuse, and what they withhold, are named to the user, from the log to the files."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ import math
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import L
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -20,10 +22,9 @@ from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.storage import read_comparison, write_comparison
 from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import Dvl, Measurements
-from sonar_graph.report.comparison_page import render_report
-from sonar_graph.report.console import summary
-from sonar_graph.report.findings import refusal_lines
 from sonar_graph.sequence import Sequence
+from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.slam.landmarks.sighting import SightingFactors
 from sonar_graph.states import Estimate, Refusal, RefusedRow
 from tests.synthetic import basin_comparison, with_run
 
@@ -76,43 +77,10 @@ def test_rows_of_other_sensors_and_reasons_are_counted_apart():
     assert found == {("dvl", Refusal.OUTLIER): 9, ("imu", Refusal.LATE): 9, ("dvl", Refusal.LATE): 1}
 
 
-def test_a_line_names_sensor_stamp_reason_distance_and_runs():
-    start_ns = basin_comparison(60).sequence.start_ns
-    comparison = refusing([outlier(start_ns + 1_234_000_000, 512.6), late(start_ns)], "isam2", "ekf-slam")
-    assert refusal_lines(comparison) == [
-        f"Warning: dvl, 1.234 s: {Refusal.OUTLIER} (squared distance 513); isam2, ekf-slam",
-        f"Warning: imu, 0.000 s: {Refusal.LATE}; isam2, ekf-slam",
-    ]
-    many = refusing([outlier(start_ns + k * NS, 60.0 + k) for k in range(20)], "isam2")
-    assert refusal_lines(many) == [
-        f"Warning: dvl, 20 rows, 0.000 to 19.000 s: {Refusal.OUTLIER} (squared distance 60 to 79); isam2"
-    ]
-
-
-def test_runs_that_refused_differently_have_lines_of_their_own():
-    comparison = refusing([outlier(0)], "isam2")
-    other = refusing([outlier(0, 70.0)], "ekf-slam")
-    both = with_run(comparison, next(run for run in other.runs if run.estimator == "ekf-slam"))
-    assert [line.rsplit("; ")[-1] for line in refusal_lines(both)] == ["isam2", "ekf-slam"]
-
-
-def test_terminal_and_page_say_the_same_and_nothing_where_nothing_was_refused():
-    start_ns = basin_comparison(60).sequence.start_ns
-    comparison = refusing([outlier(start_ns + NS, 512.6), late(start_ns)], "isam2")
-    below = str(summary(comparison).renderables[1])
-    assert all(line in below for line in refusal_lines(comparison))
-    page = render_report(comparison)
-    section = page[page.index('<h2 id="refused">') : page.index('<h2 id="time">')]
-    for word in ("dvl", "1.000", Refusal.OUTLIER, "513", "imu", "0.000", Refusal.LATE, "isam2"):
-        assert word in section
-    assert "ekf-slam" not in section
-    assert 'id="refused"' not in render_report(basin_comparison(60))
-    assert "Warning" not in str(summary(basin_comparison(60)).renderables[1])
-
-
 def test_files_have_counts_for_people_and_every_row_for_the_report(tmp_path: Path):
     rows = [outlier(k * NS, 50.0 + k) for k in range(8)] + [late(3)]
     comparison = refusing(rows, "isam2", "ekf-slam")
+    comparison = with_run(comparison, replace(comparison.runs[0], withheld=["landmark 3; open: z"]))
     write_comparison(comparison, tmp_path)
     for path, entry in (
         (tmp_path / "comparison.json", lambda content: content["runs"]["isam2"]),
@@ -129,25 +97,10 @@ def test_files_have_counts_for_people_and_every_row_for_the_report(tmp_path: Pat
         }
         assert told[1]["least_and_largest_distance"] is None
     restored = read_comparison(tmp_path)
-    assert refusal_lines(restored) == refusal_lines(comparison)
+    assert [run.withheld for run in restored.runs] == [["landmark 3; open: z"], [], []]
     for run, again in zip(comparison.runs, restored.runs, strict=True):
         assert [row[:3] for row in again.refused] == [row[:3] for row in run.refused]
         np.testing.assert_array_equal([row.distance for row in again.refused], [row.distance for row in run.refused])
-
-
-def test_an_estimator_that_does_not_tell_has_no_rows(install, make_sequence, offset_estimator):
-    install(silent=offset_estimator)
-    result = run_estimator(make_sequence(), "silent")
-    assert (result.status, result.refused) == ("ok", [])
-
-
-def test_an_estimator_of_others_that_tells_is_heard(install, make_sequence, offset_estimator):
-    class Telling(offset_estimator):
-        def refused_rows(self) -> list[RefusedRow]:
-            return [outlier(7)]
-
-    install(telling=Telling)
-    assert run_estimator(make_sequence(), "telling").refused == [outlier(7)]
 
 
 @pytest.fixture(scope="module")
@@ -261,3 +214,17 @@ def test_run_and_compare_name_what_was_refused_in_a_log(spoilt_log, tmp_path, ca
         index = json.loads((out / "comparison.json").read_text())
         for entry in index["runs"].values():
             assert [(rows["sensor"], rows["count"]) for rows in entry["refused"]] == [("dvl", 1), ("dvl", 1)]
+
+
+def test_a_landmark_that_isam2_could_not_place_reaches_the_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
+    sequence = simulate_mission(MissionOptions(duration_s=20.0, imu="mti1"))
+    placed = SightingFactors._placed
+    first = {int(sequence.detections.most_probable()[0][0])}
+
+    def without(self: SightingFactors, sighting: Any, key: int) -> Any:
+        return [] if {key} == {L(id_) for id_ in first} else placed(self, sighting, key)
+
+    monkeypatch.setattr(SightingFactors, "_placed", without)
+    (line, *_) = run_estimator(sequence, "isam2").withheld
+    assert line.startswith("landmark ")
+    assert line.endswith("; withheld")

@@ -1,91 +1,132 @@
+"""One estimator over one sequence: fed in order, timed, checked; whatever it does wrong is a result with a reason."""
+
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ClassVar
 
 import gtsam
 import numpy as np
 import pytest
 
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
+from sonar_graph.estimator import load_estimator, withheld_of
 from sonar_graph.evaluation import run as run_module
-from sonar_graph.evaluation.run import run_estimator
+from sonar_graph.evaluation.results import RunResult
+from sonar_graph.evaluation.run import PeakMemory, run_estimator
 from sonar_graph.evaluation.scored_instants import map_instants
-from sonar_graph.measurements import LandmarkDetections, Measurements
-from sonar_graph.sequence import Sequence
+from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.states import Estimate, LandmarkMap, Refusal, RefusedRow, Trajectory
 
-Make = Callable[..., Sequence]
-Install = Callable[..., None]
+from .conftest import Offset, straight_sequence
+
+MEGABYTES = 80
 
 
-def test_every_row_reaches_the_estimator_once_and_in_order(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
-    instances: list[list[Measurements]] = []
+@pytest.fixture
+def ran(install) -> Callable[..., RunResult]:
+    """Run an estimator that is `Offset` but for some methods; ``ran.made`` has its instances, the first warmed up."""
 
-    class Recorder(offset_estimator):
-        def __init__(self, *arguments: Any) -> None:
-            super().__init__(*arguments)
-            self.seen: list[Measurements] = []
-            instances.append(self.seen)
+    def run(sequence=None, settings=None, *, options=None, **methods) -> RunResult:
+        def init(self, *arguments):
+            Offset.__init__(self, *arguments)
+            self.seen = []
+            run.made.append(self)
 
-        def process(self, measurements: Measurements) -> Estimate | None:
+        def process(self, measurements):
             self.seen.append(measurements)
-            return super().process(measurements)
+            return methods.get("process", Offset.process)(self, measurements)
 
-    install(recorder=Recorder)
-    sequence = make_sequence()
-    result = run_estimator(sequence, "recorder", rate_hz=2.0)
-    assert result.status == "ok"
-    seen = instances[-1]
-    stamps = np.concatenate([step.imu.stamps_ns for step in seen if step.imu])
-    np.testing.assert_array_equal(stamps, sequence.imu.stamps_ns)
+        install(own=type("Own", (Offset,), methods | {"__init__": init, "process": process}))
+        return run_estimator(sequence or straight_sequence(), "own", settings, **(options or {}))
+
+    run.made = []
+    return run
+
+
+def changing(**change):
+    """A method that alters every estimate but the first."""
+
+    def process(self, measurements):
+        estimate = Offset.process(self, measurements)
+        return estimate if len(self.estimates) == 1 else replace(estimate, **change)
+
+    return process
+
+
+def with_covariance(covariance):
+    return lambda self, stamp_ns, offset_m: replace(Offset.beside(self, stamp_ns, offset_m), covariance=covariance)
+
+
+def failing_after(steps: int, error: BaseException):
+    def process(self, measurements):
+        if len(self.estimates) == steps:
+            raise error
+        return Offset.process(self, measurements)
+
+    return process
+
+
+def slow(method, seconds: float):
+    def slowed(self, *arguments):
+        time.sleep(seconds)
+        return method(self, *arguments)
+
+    return slowed
+
+
+def map_of(positions: list[list[float]]) -> LandmarkMap:
+    n = len(positions)
+    return LandmarkMap(np.arange(7, 7 + n), np.reshape(positions, (n, 3)), np.full((n, 3, 3), np.nan))
+
+
+def test_every_row_reaches_the_estimator_once_and_in_order(ran):
+    sequence = straight_sequence()
+    assert ran(sequence).status == "ok"
+    seen = ran.made[-1].seen
+    np.testing.assert_array_equal(np.concatenate([s.imu.stamps_ns for s in seen if s.imu]), sequence.imu.stamps_ns)
     np.testing.assert_array_equal([step.end_ns for step in seen], sequence.instants(2.0))
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_nothing_of_the_instance_that_warms_up_reaches_the_result(
-    install: Install, make_sequence: Make, offset_estimator: Any, fails: bool
-) -> None:
-    instances: list[Any] = []
+def test_nothing_of_the_instance_that_warms_up_reaches_the_result(ran, fails: bool):
     calls: list[tuple[int, int]] = []
 
-    class FirstIsOther(offset_estimator):
-        def __init__(self, *arguments: Any) -> None:
-            super().__init__(*arguments)
-            instances.append(self)
+    def process(self, measurements):
+        if self is not ran.made[0]:
+            return Offset.process(self, measurements)
+        if fails:
+            raise ZeroDivisionError
+        time.sleep(0.05)
+        return self.beside(measurements.end_ns, 99.0)
 
-        def process(self, measurements: Measurements) -> Estimate | None:
-            if self is not instances[0]:
-                return super().process(measurements)
-            if fails:
-                raise ZeroDivisionError
-            time.sleep(0.05)
-            return self.beside(measurements.end_ns, 99.0)
-
-    install(first=FirstIsOther, offset=offset_estimator)
-    result = run_estimator(make_sequence(5.0), "first", progress=lambda *call: calls.append(call))
-    plain = run_estimator(make_sequence(5.0), "offset")
-    assert len(instances) == 2
+    result = ran(straight_sequence(5.0), options={"progress": lambda *call: calls.append(call)}, process=process)
+    assert len(ran.made) == 2
     assert (result.status, result.reason) == ("ok", "")
-    assert result.causal is not None
-    assert plain.causal is not None
-    np.testing.assert_array_equal(result.causal.positions, plain.causal.positions)
+    np.testing.assert_array_equal(result.causal.positions, ran(straight_sequence(5.0)).causal.positions)
     assert len(result.update_s) == 10
     assert result.update_s.min() < 0.05
     assert calls == [(i, 10) for i in range(1, 11)]
 
 
-def test_causal_and_smoothed_are_what_the_estimator_said(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
-    install(offset=offset_estimator)
-    result = run_estimator(make_sequence(), "offset", {"offset_m": 0.4})
-    assert result.causal is not None
-    assert result.smoothed is not None
+def test_the_instance_that_warms_up_waits_for_landmarks_that_can_be_named(ran):
+    """Ten frames name nothing, then five name a landmark: it is still warming up when that is seen again."""
+    sequence = straight_sequence()
+    stamps_ns = sequence.imu.stamps_ns[5:155:10]
+    n = len(stamps_ns)
+    probable = np.where(np.arange(n) < 10, 0.2, 0.9)[:, None]
+    unsure = LandmarkDetections(
+        stamps_ns, np.ones(n), np.zeros(n), np.full((n, 2, 2), np.nan), np.full((n, 1), 7), probable
+    )
+    assert ran(replace(sequence, detections=unsure)).status == "ok"
+    warmed_up, judged = (one.seen for one in ran.made)
+    assert warmed_up[-1].end_ns >= stamps_ns[11]
+    assert len(warmed_up) < len(judged)
+
+
+def test_causal_and_smoothed_are_what_the_estimator_said(ran):
+    result = ran(settings={"offset_m": 0.4})
     np.testing.assert_allclose(result.causal.positions[:, 1], 0.4)
     np.testing.assert_allclose(result.smoothed.positions[:, 1], 0.2)
     assert result.params == {"offset_m": 0.4, "sigma_m": 0.3}
@@ -93,44 +134,26 @@ def test_causal_and_smoothed_are_what_the_estimator_said(
     assert result.detections is not None
 
 
-def test_only_calls_of_the_estimator_are_timed(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
-    class Slow(offset_estimator):
-        def process(self, measurements: Measurements) -> Estimate | None:
-            time.sleep(0.01)
-            return super().process(measurements)
-
-        def trajectory(self) -> Trajectory:
-            time.sleep(0.03)
-            return super().trajectory()
-
-    install(slow=Slow)
+def test_only_calls_of_the_estimator_are_timed(ran):
     before = time.perf_counter()
-    result = run_estimator(make_sequence(5.0), "slow", progress=lambda *_: time.sleep(0.02))
+    result = ran(
+        straight_sequence(5.0),
+        options={"progress": lambda *_: time.sleep(0.02)},
+        process=slow(Offset.process, 0.01),
+        trajectory=slow(Offset.trajectory, 0.03),
+    )
     whole_s = time.perf_counter() - before
     assert len(result.update_s) == 10
     assert np.all(result.update_s >= 0.01)
     assert result.finish_s >= 0.03
     assert result.update_s.sum() + result.finish_s < whole_s - 10 * 0.02
+    told = ran(landmarks=slow(Offset.landmarks, 0.2))
+    assert len(told.maps) == 3
+    assert told.update_s.max() < 0.15, "asking for the map on the way is not timed"
 
 
-def test_progress_counts_to_the_total(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
-    install(offset=offset_estimator)
-    calls: list[tuple[int, int]] = []
-    run_estimator(make_sequence(5.0), "offset", progress=lambda done, total: calls.append((done, total)))
-    assert calls == [(i, 10) for i in range(1, 11)]
-
-
-def test_an_exception_becomes_a_reason_of_one_line_with_type_and_time(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
-    class Singular(offset_estimator):
-        def process(self, measurements: Measurements) -> Estimate | None:
-            if len(self.estimates) == 6:
-                raise ZeroDivisionError("the matrix\n  is singular")
-            return super().process(measurements)
-
-    install(singular=Singular)
-    result = run_estimator(make_sequence(), "singular")
+def test_an_exception_becomes_a_reason_of_one_line_with_type_and_time(ran):
+    result = ran(process=failing_after(6, ZeroDivisionError("the matrix\n  is singular")))
     assert result.status == "failed"
     assert result.reason == "3.500 s after the start (4500000000 ns): ZeroDivisionError: the matrix is singular"
     assert result.causal is None
@@ -138,275 +161,149 @@ def test_an_exception_becomes_a_reason_of_one_line_with_type_and_time(
 
 
 @pytest.mark.parametrize("can_tell", [True, False])
-def test_a_failed_run_names_the_rows_that_were_refused_before_it_failed(
-    install: Install, make_sequence: Make, offset_estimator: Any, can_tell: bool
-) -> None:
-    row = RefusedRow("dvl", 2_000_000_000, Refusal.OUTLIER, 100.0)
+def test_a_failed_run_names_what_was_refused_and_withheld_before(ran, can_tell: bool):
+    told = {"refused": [RefusedRow("dvl", 2_000_000_000, Refusal.OUTLIER, 100.0)], "withheld": ["landmark 3; open: z"]}
 
-    class Refuses(offset_estimator):
-        def process(self, measurements: Measurements) -> Estimate | None:
-            if len(self.estimates) == 6:
-                raise ZeroDivisionError("singular")
-            return super().process(measurements)
+    def telling(what: str):
+        return lambda _: told[what] if can_tell else 1 / 0
 
-        def refused_rows(self) -> list[RefusedRow]:
-            if not can_tell:
-                raise ValueError("not even that")
-            return [row]
-
-    install(refuses=Refuses)
-    result = run_estimator(make_sequence(), "refuses")
-    assert result.status == "failed"
-    assert "ZeroDivisionError: singular" in result.reason
-    assert result.refused == ([row] if can_tell else [])
+    result = ran(
+        process=failing_after(6, ValueError("singular")),
+        refused_rows=telling("refused"),
+        withheld=telling("withheld"),
+    )
+    assert "ValueError: singular" in result.reason
+    for what, known in told.items():
+        assert getattr(result, what) == (known if can_tell else [])
 
 
-def estimate_with(estimate: Estimate, **change: Any) -> Estimate:
-    return replace(estimate, **change)
+def test_telling_is_optional_and_heard_in_runs_that_end(ran):
+    assert (ran().refused, ran().withheld) == ([], [])
+    assert ran(withheld=lambda _: ["a", "b"]).withheld == ["a", "b"]
+    assert withheld_of(load_estimator("dead-reckoning")(straight_sequence().calibration)) == []
 
 
 NAN_POSE = gtsam.Pose3(gtsam.Rot3(), np.array([np.nan, 0.0, 0.0]))
-NEGATIVE = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1e-3])
-ASYMMETRIC = np.eye(6) + 0.5 * np.eye(6, k=1)
 
 
 @pytest.mark.parametrize(
-    ("change", "reason"),
+    ("methods", "reason"),
     [
-        ({"world_T_body": NAN_POSE}, "causal pose is not finite in 39 of 40 rows, first at ns 2000000000"),
-        ({"covariance": NEGATIVE}, "causal covariance is impossible in 39 of 40 rows"),
-        ({"covariance": ASYMMETRIC}, "causal covariance is impossible"),
-        ({"covariance": np.where(np.eye(6) > 0, np.nan, 0.0)}, "causal covariance is impossible"),
-        ({"stamp_ns": 17}, "returned an estimate for 17 ns when asked for 2000000000 ns"),
+        (
+            {"process": changing(world_T_body=NAN_POSE)},
+            "causal pose is not finite in 39 of 40 rows, first at ns 2000000000",
+        ),
+        (
+            {"process": changing(covariance=np.diag([1.0] * 5 + [-1e-3]))},
+            "causal covariance is impossible in 39 of 40 rows",
+        ),
+        ({"process": changing(covariance=np.eye(6) + 0.5 * np.eye(6, k=1))}, "causal covariance is impossible"),
+        (
+            {"process": changing(covariance=np.where(np.eye(6) > 0, np.nan, 0.0))},
+            "causal covariance is impossible",
+        ),
+        ({"process": changing(stamp_ns=17)}, "returned an estimate for 17 ns when asked for 2000000000 ns"),
+        ({"process": lambda *_: None}, "never returned an estimate"),
+        (
+            {"trajectory": lambda self: Offset.trajectory(self).rows(slice(1, None))},
+            "trajectory() has 39 instants, not the 40",
+        ),
+        (
+            {"landmarks": lambda _: map_of([[np.inf, 0.0, 0.0]])},
+            "position is not finite in 1 of 1 rows, first at landmark 7",
+        ),
+        ({"beside": with_covariance(np.full((6, 6), np.nan))}, ""),  # unknown covariances are allowed,
+        ({"beside": with_covariance(np.diag([1.0] * 5 + [-1e-12]))}, ""),  # rounding below zero,
+        ({"landmarks": lambda _: map_of([])}, ""),  # and an empty map
     ],
 )
-def test_an_impossible_estimate_fails_the_run(
-    install: Install, make_sequence: Make, offset_estimator: Any, change: dict[str, Any], reason: str
-) -> None:
-    class Wrong(offset_estimator):
-        def process(self, measurements: Measurements) -> Estimate | None:
-            estimate = super().process(measurements)
-            return estimate if len(self.estimates) == 1 else estimate_with(estimate, **change)
-
-    install(wrong=Wrong)
-    result = run_estimator(make_sequence(), "wrong")
-    assert result.status == "failed"
+def test_results_that_cannot_be_scored_fail_the_run(ran, methods, reason: str):
+    result = ran(**methods)
+    assert result.status == ("failed" if reason else "ok")
     assert reason in result.reason
+    assert bool(result.reason) == bool(reason)
 
 
-def test_unknown_covariances_are_allowed(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
-    class Modest(offset_estimator):
-        def beside(self, stamp_ns: int, offset_m: float) -> Estimate:
-            return estimate_with(super().beside(stamp_ns, offset_m), covariance=np.full((6, 6), np.nan))
-
-    install(modest=Modest)
-    assert run_estimator(make_sequence(), "modest").status == "ok"
-
-
-def test_rounding_below_zero_is_no_impossible_covariance(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
-    class Rounded(offset_estimator):
-        def beside(self, stamp_ns: int, offset_m: float) -> Estimate:
-            return estimate_with(super().beside(stamp_ns, offset_m), covariance=np.diag([1.0] * 5 + [-1e-12]))
-
-    install(rounded=Rounded)
-    assert run_estimator(make_sequence(), "rounded").status == "ok"
-
-
-def test_a_trajectory_at_other_instants_fails_the_run(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
-    class Short(offset_estimator):
-        def trajectory(self) -> Trajectory:
-            return super().trajectory().rows(slice(1, None))
-
-    install(short=Short)
-    result = run_estimator(make_sequence(), "short")
-    assert result.status == "failed"
-    assert "trajectory() has 39 instants, not the 40" in result.reason
-
-
-def test_a_map_that_is_not_finite_fails_the_run(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
-    class Lost(offset_estimator):
-        def landmarks(self) -> LandmarkMap:
-            return LandmarkMap(np.array([7]), np.array([[np.inf, 0.0, 0.0]]), np.full((1, 3, 3), np.nan))
-
-    install(lost=Lost)
-    result = run_estimator(make_sequence(), "lost")
-    assert "position is not finite in 1 of 1 rows, first at landmark 7" in result.reason
-
-
-def test_an_estimator_that_never_speaks_fails(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
-    class Mute(offset_estimator):
-        def process(self, _measurements: Measurements) -> Estimate | None:
-            return None
-
-    install(mute=Mute)
-    assert "never returned an estimate" in run_estimator(make_sequence(), "mute").reason
-
-
-def test_an_empty_map_is_fine(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
-    class Blind(offset_estimator):
-        def landmarks(self) -> LandmarkMap:
-            return LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
-
-    install(blind=Blind)
-    assert run_estimator(make_sequence(), "blind").status == "ok"
-
-
-def test_mistakes_of_the_user_are_raised(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
-    install(offset=offset_estimator)
-    with pytest.raises(UnknownEstimatorError):
-        run_estimator(make_sequence(), "ofset")
+def test_mistakes_of_the_user_are_raised_and_a_broken_installation_is_a_failed_run(ran, monkeypatch):
     with pytest.raises(EstimatorError, match="offset_cm"):
-        run_estimator(make_sequence(), "offset", {"offset_cm": 3})
+        ran(settings={"offset_cm": 3})
+    with pytest.raises(UnknownEstimatorError):
+        run_estimator(straight_sequence(), "ofset")
 
-
-def test_an_estimator_that_cannot_be_loaded_is_a_failed_run(
-    monkeypatch: pytest.MonkeyPatch, make_sequence: Make
-) -> None:
-    def load(name: str) -> Any:
+    def load(name: str):
         raise EstimatorError(f"{name} cannot be loaded: No module named 'torch'")
 
     monkeypatch.setattr(run_module, "load_estimator", load)
-    result = run_estimator(make_sequence(), "neural")
+    result = run_estimator(straight_sequence(), "neural")
     assert result.status == "failed"
     assert "No module named 'torch'" in result.reason
 
 
-def test_interruption_is_not_swallowed(install: Install, make_sequence: Make, offset_estimator: Any) -> None:
-    class Interrupted(offset_estimator):
-        def process(self, _measurements: Measurements) -> Estimate | None:
-            raise KeyboardInterrupt
-
-    install(interrupted=Interrupted)
+def test_interruption_is_not_swallowed(ran):
     with pytest.raises(KeyboardInterrupt):
-        run_estimator(make_sequence(), "interrupted")
+        ran(process=failing_after(0, KeyboardInterrupt()))
 
 
-def test_the_map_is_kept_on_the_way_as_it_was_known_then(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
-    class Counting(offset_estimator):
-        """Has as many landmarks as it took steps."""
-
-        def landmarks(self) -> LandmarkMap:
-            n = len(self.estimates)
-            return LandmarkMap(np.arange(n), np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)))
-
-    install(counting=Counting)
-    sequence = make_sequence()
-    result = run_estimator(sequence, "counting", rate_hz=2.0)
+def test_the_map_is_kept_on_the_way_as_it_was_known_then(ran):
+    """The estimator has as many landmarks as it took steps."""
+    sequence = straight_sequence()
+    result = ran(sequence, landmarks=lambda self: map_of([[0.0] * 3] * len(self.estimates)))
     instants = sequence.instants(2.0)
     expected = map_instants(instants, sequence.start_ns)
     assert [known.stamp_ns for known in result.maps] == expected.tolist()
     assert [len(known.landmarks) for known in result.maps] == (np.searchsorted(instants, expected) + 1).tolist()
     assert result.landmarks is result.maps[-1].landmarks
+    only_last = ran(sequence, options={"interim_maps": False})
+    assert [known.stamp_ns for known in only_last.maps] == [only_last.causal.stamps_ns[-1]]
 
 
-def test_without_interim_maps_only_the_last_is_asked_for(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
-    asked = []
+def test_no_map_is_asked_for_before_the_first_estimate(ran):
+    def process(self, measurements) -> Estimate | None:
+        estimate = Offset.process(self, measurements)
+        return None if len(self.estimates) < 30 else estimate
 
-    class Counting(offset_estimator):
-        def landmarks(self) -> LandmarkMap:
-            asked.append(len(self.estimates))
-            return super().landmarks()
+    def landmarks(self) -> LandmarkMap:
+        assert len(self.estimates) >= 30, "nothing is known yet"
+        return Offset.landmarks(self)
 
-    install(counting=Counting)
-    result = run_estimator(make_sequence(), "counting", rate_hz=2.0, interim_maps=False)
-    assert asked == [len(result.causal)]
-    assert [known.stamp_ns for known in result.maps] == [result.causal.stamps_ns[-1]]
-
-
-def test_asking_for_the_map_on_the_way_is_not_timed(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
-    class SlowToTell(offset_estimator):
-        def landmarks(self) -> LandmarkMap:
-            time.sleep(0.2)
-            return super().landmarks()
-
-    install(slow=SlowToTell)
-    result = run_estimator(make_sequence(), "slow", rate_hz=2.0)
-    assert len(result.maps) == 3
-    assert result.update_s.max() < 0.15
-
-
-def test_no_map_is_asked_for_before_the_first_estimate(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
-    class Late(offset_estimator):
-        def process(self, measurements: Measurements) -> Estimate | None:
-            estimate = super().process(measurements)
-            if len(self.estimates) < 30:
-                return None
-            return estimate
-
-        def trajectory(self) -> Trajectory:
-            return Trajectory.from_estimates(self.estimates[29:])
-
-        def landmarks(self) -> LandmarkMap:
-            if len(self.estimates) < 30:
-                raise RuntimeError("nothing is known yet")
-            return super().landmarks()
-
-    install(late=Late)
-    result = run_estimator(make_sequence(), "late", rate_hz=2.0)
-    assert (result.status, result.reason) == ("ok", "")
-    assert len(result.maps) == 1
-
-
-def test_the_instance_that_warms_up_waits_for_landmarks_that_can_be_named(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
-    """Ten frames name nothing, then five name a landmark: it is still warming up when that is seen again."""
-    instances: list[list[int]] = []
-
-    class Recorder(offset_estimator):
-        def __init__(self, *arguments: Any) -> None:
-            super().__init__(*arguments)
-            self.ends_ns: list[int] = []
-            instances.append(self.ends_ns)
-
-        def process(self, measurements: Measurements) -> Estimate | None:
-            self.ends_ns.append(measurements.end_ns)
-            return super().process(measurements)
-
-    install(recorder=Recorder)
-    sequence = make_sequence()
-    stamps_ns = sequence.imu.stamps_ns[5:155:10]
-    n = len(stamps_ns)
-    probable = np.where(np.arange(n) < 10, 0.2, 0.9)[:, None]
-    unsure = LandmarkDetections(
-        stamps_ns, np.ones(n), np.zeros(n), np.full((n, 2, 2), np.nan), np.full((n, 1), 7), probable
+    result = ran(
+        process=process, landmarks=landmarks, trajectory=lambda self: Trajectory.from_estimates(self.estimates[29:])
     )
-    assert run_estimator(replace(sequence, detections=unsure), "recorder", rate_hz=2.0).status == "ok"
-    warmed_up, judged = instances
-    assert warmed_up[-1] >= stamps_ns[11]
-    assert len(warmed_up) < len(judged)
+    assert (result.status, result.reason, len(result.maps)) == ("ok", "", 1)
 
 
-def test_what_an_estimator_does_to_its_measurements_no_other_sees(
-    install: Install, make_sequence: Make, offset_estimator: Any
-) -> None:
-    class Correcting(offset_estimator):
-        given: ClassVar[list[float]] = []
+def test_what_an_estimator_does_to_its_measurements_no_other_sees(ran):
+    given: list[float] = []
 
-        def process(self, measurements: Measurements) -> Estimate | None:
-            self.given.append(float(np.abs(measurements.imu.specific_force).sum()))
-            measurements.imu.specific_force[:] *= 2
-            return super().process(measurements)
+    def process(self, measurements):
+        given.append(float(np.abs(measurements.imu.specific_force).sum()))
+        measurements.imu.specific_force[:] *= 2
+        return Offset.process(self, measurements)
 
-    install(correcting=Correcting)
-    sequence = make_sequence()
+    sequence = straight_sequence()
     before = sequence.imu.specific_force.copy()
-    run_estimator(sequence, "correcting")
+    ran(sequence, process=process)
     np.testing.assert_array_equal(sequence.imu.specific_force, before)
     steps = len(sequence.instants(2.0))
-    assert len(Correcting.given) > steps
-    assert (
-        Correcting.given[: len(Correcting.given) - steps] == Correcting.given[-steps:][: len(Correcting.given) - steps]
-    )
+    warmed_up = len(given) - steps
+    assert warmed_up > 0
+    assert given[:warmed_up] == given[-steps:][:warmed_up]
+
+
+def touch() -> float:
+    return float(np.ones(MEGABYTES * 125_000).sum())
+
+
+@pytest.mark.skipif(np.isnan(PeakMemory().rise_mb()), reason="this system does not tell a process's peak memory")
+def test_peak_memory_sees_what_was_freed_again_and_forgets_what_was_before():
+    touch()
+    quiet = PeakMemory()
+    assert quiet.rise_mb() < MEGABYTES / 2
+    loud = PeakMemory()
+    touch()
+    assert loud.rise_mb() > 0.8 * MEGABYTES
+
+
+def test_peak_memory_is_unknown_where_the_system_does_not_tell(monkeypatch, tmp_path):
+    monkeypatch.setattr(run_module, "CLEAR_REFS", tmp_path / "absent" / "clear_refs")
+    assert np.isnan(PeakMemory().rise_mb())

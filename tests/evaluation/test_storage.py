@@ -24,7 +24,7 @@ Make = Callable[..., Sequence]
 
 
 @pytest.fixture
-def comparison(install: Callable[..., None], make_sequence: Make, offset_estimator: Any) -> Comparison:
+def comparison(install, make_sequence, offset_estimator) -> Comparison:
     """One run that went well, one that failed."""
 
     class Broken(offset_estimator):
@@ -54,7 +54,7 @@ def assert_same(left: Any, right: Any, where: str = "") -> None:
         assert left == right, where
 
 
-def test_reading_returns_what_was_written(comparison: Comparison, tmp_path: Path) -> None:
+def test_reading_returns_what_was_written(comparison, tmp_path):
     write_comparison(comparison, tmp_path)
     restored = read_comparison(tmp_path)
     for name in ("runs", "scores", "errors", "environment", "instants_ns"):
@@ -65,9 +65,7 @@ def test_reading_returns_what_was_written(comparison: Comparison, tmp_path: Path
     assert isinstance(restored.sequence.calibration, Calibration)
 
 
-def test_a_comparison_without_truth_survives(
-    install: Callable[..., None], make_sequence: Make, offset_estimator: Any, tmp_path: Path
-) -> None:
+def test_a_comparison_without_truth_survives(install, make_sequence, offset_estimator, tmp_path):
     install(offset=offset_estimator)
     written = compare(make_sequence(truth=False), ["offset"])
     write_comparison(written, tmp_path)
@@ -78,9 +76,9 @@ def test_a_comparison_without_truth_survives(
 
 
 @pytest.mark.parametrize("are_known", [False, True])
-def test_truth_keeps_its_covariances_and_unknown_ones_take_no_space(
-    install: Callable[..., None], make_sequence: Make, offset_estimator: Any, tmp_path: Path, are_known: bool
-) -> None:
+def test_truth_keeps_its_covariances_and_unknown_take_no_space(
+    install, make_sequence, offset_estimator, tmp_path, are_known: bool
+):
     install(offset=offset_estimator)
     sequence = make_sequence()
     assert sequence.truth is not None
@@ -97,7 +95,7 @@ def test_truth_keeps_its_covariances_and_unknown_ones_take_no_space(
         assert ("truth.covariances" in archive.files) == are_known
 
 
-def test_json_is_strict_and_tells_units_and_protocol(comparison: Comparison, tmp_path: Path) -> None:
+def test_json_is_strict_and_tells_units_and_protocol(comparison, tmp_path):
     write_comparison(comparison, tmp_path)
 
     def refuse(constant: str) -> None:
@@ -114,14 +112,14 @@ def test_json_is_strict_and_tells_units_and_protocol(comparison: Comparison, tmp
     assert "diverged" in index["runs"]["broken"]["reason"]
 
 
-def test_what_is_not_a_number_is_null(comparison: Comparison, tmp_path: Path) -> None:
+def test_what_is_not_a_number_is_null(comparison, tmp_path):
     object.__setattr__(comparison.runs[0], "peak_memory_mb", float("nan"))
     write_comparison(comparison, tmp_path)
     assert json.loads((tmp_path / "comparison.json").read_text("utf-8"))["runs"]["offset"]["peak_memory_mb"] is None
     assert np.isnan(read_comparison(tmp_path).runs[0].peak_memory_mb)
 
 
-def test_folder_holds_what_other_tools_read(comparison: Comparison, tmp_path: Path) -> None:
+def test_folder_holds_what_other_tools_read(comparison, tmp_path):
     write_comparison(comparison, tmp_path)
     folder = tmp_path / "runs" / "offset"
     assert sorted(path.name for path in folder.iterdir()) == [
@@ -139,14 +137,14 @@ def test_folder_holds_what_other_tools_read(comparison: Comparison, tmp_path: Pa
     assert result["timings"]["update_median_ms"] > 0
 
 
-def test_a_failed_run_leaves_only_its_reason(comparison: Comparison, tmp_path: Path) -> None:
+def test_a_failed_run_leaves_only_its_reason(comparison, tmp_path):
     write_comparison(comparison, tmp_path)
     folder = tmp_path / "runs" / "broken"
     assert sorted(path.name for path in folder.iterdir()) == ["result.json", "series.npz"]
     assert "diverged" in json.loads((folder / "result.json").read_text("utf-8"))["reason"]
 
 
-def test_nothing_of_an_earlier_comparison_remains(comparison: Comparison, make_sequence: Make, tmp_path: Path) -> None:
+def test_nothing_of_an_earlier_comparison_remains(comparison: Comparison, make_sequence, tmp_path):
     write_comparison(compare(make_sequence(), ["other", "offset"]), tmp_path)
     (tmp_path / "runs" / "other" / "my notes.txt").write_text("kept")
     (tmp_path / "runs" / "broken").mkdir()
@@ -157,9 +155,7 @@ def test_nothing_of_an_earlier_comparison_remains(comparison: Comparison, make_s
     assert [run.estimator for run in read_comparison(tmp_path).runs] == ["offset", "broken"]
 
 
-def test_an_interrupted_writing_is_not_taken_for_a_comparison(
-    comparison: Comparison, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_an_interrupted_writing_is_not_taken_for_a_comparison(comparison: Comparison, monkeypatch, tmp_path):
     write_comparison(comparison, tmp_path)
 
     def fail(path: Path, _: Any) -> None:
@@ -174,7 +170,7 @@ def test_an_interrupted_writing_is_not_taken_for_a_comparison(
         read_comparison(tmp_path)
 
 
-def test_a_name_that_leaves_the_folder_is_refused(comparison: Comparison, tmp_path: Path) -> None:
+def test_a_name_that_leaves_the_folder_is_refused(comparison, tmp_path):
     object.__setattr__(comparison.runs[0], "estimator", "../elsewhere")
     with pytest.raises(EvaluationError, match="cannot name a folder"):
         write_comparison(comparison, tmp_path)
@@ -215,14 +211,14 @@ def remove_column(folder: Path) -> None:
         (remove_column, "truth lacks positions"),
     ],
 )
-def test_damage_is_named(comparison: Comparison, tmp_path: Path, damage: Callable[[Path], None], named: str) -> None:
+def test_damage_is_named(comparison, tmp_path, damage: Callable[[Path], None], named: str):
     write_comparison(comparison, tmp_path)
     damage(tmp_path)
     with pytest.raises(EvaluationError, match=named):
         read_comparison(tmp_path)
 
 
-def test_arrays_hold_no_code(comparison: Comparison, tmp_path: Path) -> None:
+def test_arrays_hold_no_code(comparison, tmp_path):
     write_comparison(comparison, tmp_path)
     for path in tmp_path.rglob("*.npz"):
         with zipfile.ZipFile(path) as archive:

@@ -1,9 +1,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from mcap.reader import make_reader
@@ -11,14 +9,11 @@ from mcap.reader import make_reader
 from sonar_graph.evaluation.comparison import compare
 from sonar_graph.evaluation.storage import write_comparison, write_viewer_files
 from sonar_graph.measurements import Measurements
-from sonar_graph.sequence import Sequence
 from sonar_graph.states import Estimate
 
 
 @pytest.fixture
-def folder(
-    install: Callable[..., None], make_sequence: Callable[..., Sequence], offset_estimator: Any, tmp_path: Path
-) -> Path:
+def folder(install, make_sequence, offset_estimator, tmp_path) -> Path:
     class Broken(offset_estimator):
         def process(self, _measurements: Measurements) -> Estimate | None:
             raise RuntimeError("diverged")
@@ -31,7 +26,7 @@ def folder(
     return tmp_path
 
 
-def test_the_result_carries_the_json_files_beside_it(folder: Path) -> None:
+def test_the_result_carries_the_json_files_beside_it(folder: Path):
     with (folder / "result.mcap").open("rb") as stream:
         attached = {a.name: a.data for a in make_reader(stream, validate_crcs=True).iter_attachments()}
     assert set(attached) == {"comparison.json", "runs/offset/result.json", "runs/broken/result.json"}
@@ -39,7 +34,7 @@ def test_the_result_carries_the_json_files_beside_it(folder: Path) -> None:
         assert content == (folder / name).read_bytes()
 
 
-def test_the_record_says_settings_versions_and_what_the_topics_are_of(folder: Path) -> None:
+def test_the_record_says_settings_versions_and_what_the_topics_are_of(folder: Path):
     with (folder / "result.mcap").open("rb") as stream:
         record = {m.name: m.metadata for m in make_reader(stream).iter_metadata()}["sonar_graph_result"]
     environment = json.loads((folder / "comparison.json").read_text("utf-8"))["environment"]
@@ -49,7 +44,7 @@ def test_the_record_says_settings_versions_and_what_the_topics_are_of(folder: Pa
     assert (record["estimators"], record["topics"]) == ("offset", "offset")
 
 
-def test_layouts_name_what_ran_and_not_what_failed(folder: Path) -> None:
+def test_layouts_name_what_ran_and_not_what_failed(folder: Path):
     layout = json.loads((folder / "result.foxglove.json").read_text("utf-8"))
     names = {topic.split("/")[1] for topic in layout["configById"]["3D!result"]["topics"]}
     assert names == {"offset", "ground_truth"}

@@ -23,22 +23,6 @@ def html(batch):
     return render_batch(batch)
 
 
-def test_the_page_fetches_nothing(html):
-    addresses = re.findall(r'(?:src|href)="([^"]*)"', html)
-    outside = [address for address in addresses if re.match(r"(?!data:)[a-z]+:|//|/", address)]
-    assert len(addresses) > 50
-    assert outside == []
-    assert "@import" not in html
-    assert re.findall(r"url\((?!#)", html) == []
-    assert "<script src" not in html
-
-
-def test_links_within_the_page_lead_somewhere_and_ids_are_unique(html):
-    ids = re.findall(r'\sid="([^"]+)"', html)
-    assert len(ids) == len(set(ids))
-    assert set(re.findall(r'href="#([^"]+)"', html)) <= set(ids)
-
-
 def test_every_figure_has_its_data(html, batch):
     figures = re.findall(r'<figure id="figure-([^"]+)"', html)
     addresses = dict(re.findall(r'href="(data:text/csv[^"]+)" download="([^"]+)\.csv"', html))
@@ -69,18 +53,6 @@ def test_the_page_says_what_its_counts_are_of(html):
     assert "it is no second evidence" in text
     assert "60 runs of 3 estimators on 2 logs, up to 10 seeds each, compared with dead-reckoning." in text
     assert ">8 of 10 seeds<" in text or ">10 of 10 seeds<" in text
-
-
-def test_what_a_suite_or_an_estimator_says_is_escaped(batch):
-    hostile = '"><script>alert(1)</script>'
-    runs = [failed(replace(run, log=hostile), reason=hostile) for run in batch.runs[:3]]
-    html = render_batch(replace(batch, name=hostile, description=hostile, suite=hostile, runs=[*runs, *batch.runs]))
-    assert html.count("<script>") == 1
-    assert "alert(1)" in html
-
-
-def test_the_same_results_make_the_same_page(batch, html):
-    assert render_batch(batch) == html
 
 
 @pytest.mark.parametrize("count", [1, 3])

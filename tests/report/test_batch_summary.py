@@ -15,7 +15,7 @@ from sonar_graph.evaluation.digits import quantile_text
 from sonar_graph.evaluation.tables import Cell, Table
 from sonar_graph.report.batch_summary import DIFFERENT, HIGHER, LOWER, head_metric, headlines, mark_of, overview_table
 from sonar_graph.report.batch_tables import accuracy_table, all_tests
-from sonar_graph.report.table_files import as_csv, as_latex
+from sonar_graph.report.rendering import as_csv, as_latex
 from tests.recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, with_failures
 
 ATE = metrics_of(["causal.ate_se2_m"])[0]

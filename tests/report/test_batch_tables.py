@@ -33,7 +33,7 @@ from sonar_graph.report.batch_tables import (
     p_text,
     run_lists,
 )
-from sonar_graph.report.table_files import as_csv, as_latex, latex_text, write_tables
+from sonar_graph.report.rendering import as_csv, as_latex, latex_text, write_tables
 from tests.recorded_batches import LOGS, METRICS, changed, drawn_batch, with_failures
 
 ATE = metrics_of(["causal.ate_se2_m"])[0]

@@ -1,13 +1,21 @@
-"""Tables as files: CSV for machines, LaTeX with booktabs for papers."""
+"""Rendering: HTML pages from templates, and tables as CSV (for machines) and LaTeX (booktabs, for papers).
+
+Everything that comes from a suite, a log or an estimator is escaped.
+"""
 
 from __future__ import annotations
 
+import base64
 import csv
 import io
 import math
 from pathlib import Path
+from typing import Any
 
-from sonar_graph.evaluation import Table
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup
+
+from sonar_graph.evaluation import Table, as_html
 from sonar_graph.files import replacing
 
 FOLDER = "tables"
@@ -35,6 +43,26 @@ LATEX_SPECIAL = {
     "\N{NOT EQUAL TO}": r"$\neq$",
     "χ": r"$\chi$",
 }
+
+
+def render(template: str, content: dict[str, Any]) -> str:
+    """The page as text: a template in ``templates/``, filled with content by the names that it uses."""
+    environment = Environment(
+        loader=PackageLoader("sonar_graph.report", "templates"),
+        autoescape=select_autoescape(["html"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"svg": Markup, "csv": as_csv, "latex": as_latex, "address": data_address}
+    environment.filters["html"] = lambda table, is_sortable: Markup(as_html(table, is_sortable=is_sortable))
+    return environment.get_template(template).render(**content)
+
+
+def data_address(text: str | bytes, kind: str) -> str:
+    """Content as an address within the page itself: ``data:KIND;base64,...``."""
+    content = text if isinstance(text, bytes) else text.encode()
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def write_tables(tables: list[Table], folder: Path) -> list[Path]:

@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sonar_graph.evaluation.digits import (
+    between,
+    decimals_of,
+    fixed,
+    format_value,
+    quantile_text,
+    supported,
+    with_error,
+)
+
+
+@pytest.mark.parametrize(
+    ("error", "decimals"),
+    [
+        (0.034, 2),
+        (0.012, 3),
+        (340.0, -2),
+        (1.0, 1),
+        (0.2, 1),
+        (9.9e-5, 5),
+        (1.99, 1),
+        (2.0, 0),
+        (0.3, 1),
+        (1e-3, 4),
+        (2e-3, 3),
+        (1.999996, 1),
+        (1.9999996, 0),
+        (5e-324, 324),
+        (3e-320, 320),
+    ],
+)
+def test_digits_end_where_the_standard_error_begins(error, decimals):
+    assert decimals_of(error) == decimals
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e3))
+def test_rounding_changes_a_value_by_less_than_half_its_standard_error(value, error):
+    shown = float(supported(value, error).replace("\N{MINUS SIGN}", "-"))
+    assert abs(shown - value) <= 0.5 * error + 1e-9 * abs(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        (with_error(0.123456, 0.0034), "0.123 ± 0.003"),  # value and error have the same digits
+        (with_error(1234.5, 86.0), "1230 ± 90"),
+        (with_error(-2.0, 0.15), "-2.00 ± 0.15"),
+        (supported(0.123456, math.nan), "0.123"),  # without an error three digits
+        (with_error(0.123456, math.nan), "0.123"),
+        *((form(0.123456, 0.0), "0.123") for form in (supported, quantile_text, with_error)),  # zero is no error
+        (quantile_text(0.123456, 40.0), "0.12"),  # a quantile has two digits however large its error
+        (quantile_text(-0.00098765, 40.0), "-0.00099"),
+        (quantile_text(0.0, 40.0), "0"),
+        (with_error(3.21e-20, 4e-22), "3.21e-20 ± 4.00e-22"),  # nothing at twelve decimals: a power of ten
+        (with_error(0.25, 5e-324), "0.250000000000 ± 4.94e-324"),
+        (quantile_text(5e-324, 1.0), "4.94e-324"),
+        (quantile_text(0.25, 5e-324), "0.250000000000"),
+        (supported(0.0, 5e-324), "0"),
+        (fixed(3e-12, 12), "0.000000000003"),
+        (fixed(3e-13, 12), "0.000000000000"),
+        (supported(-0.001, 0.3), "0.0"),  # zero has no sign
+        (supported(math.inf, 0.1), "no value"),
+        (between(0.1, math.inf), "0.100 to no value"),
+        (between(0.123456, 0.987654, 0.03), "0.12 to 0.99"),
+        *((between(*bounds), "\N{EN DASH}") for bounds in ((math.nan, math.nan), (0.1, math.nan), (math.nan, 0.1))),
+    ],
+)
+def test_digits_by_hand(text, shown):
+    assert text.replace("\N{MINUS SIGN}", "-") == shown
+
+
+@given(st.floats(0.1, 1e6), st.floats(1e-6, 1e-2))
+def test_a_quantile_with_a_small_error_is_rounded_by_it(value, error):
+    assert quantile_text(value, error) == supported(value, error)
+
+
+@given(st.floats(-1e300, 1e300), st.floats(0.0, 1e300))
+def test_every_number_can_be_written(value, error):
+    for text in (supported(value, error), quantile_text(value, error), with_error(value, error)):
+        assert text
+        assert "nan" not in text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.12345, "0.123"),
+        (0.0688888, "0.0689"),
+        (1.0, "1"),
+        (9.999, "10.0"),
+        (0.9996, "1.00"),
+        (38.04, "38.0"),
+        (1234.5, "1234"),
+        (2_039_000.0, "2039000"),
+        (0.00012, "1.20e\N{MINUS SIGN}4"),
+        (0.0, "0"),
+        (-0.5, "\N{MINUS SIGN}0.500"),
+        (float("nan"), "\N{EN DASH}"),
+        (float("inf"), "∞"),
+        (float("-inf"), "\N{MINUS SIGN}∞"),
+    ],
+)
+def test_numbers_have_as_many_digits_as_mean_something(value, text):
+    assert format_value(value) == text
+
+
+@given(st.floats(1e-9, 1e9))
+def test_a_shown_number_is_within_half_a_percent(value):
+    assert float(format_value(value).replace("\N{MINUS SIGN}", "-")) == pytest.approx(value, rel=5.1e-3)

@@ -1,0 +1,239 @@
+"""The page of a comparison says everything that the comparison holds, and what is missing."""
+
+from __future__ import annotations
+
+import base64
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sonar_graph.evaluation.consistency import reliability, reliability_of
+from sonar_graph.evaluation.results import Comparison, Score
+from sonar_graph.evaluation.scored_instants import published_maps
+from sonar_graph.evaluation.tables import Table, score_keys, score_table
+from sonar_graph.recognition.session import with_detections
+from sonar_graph.report.comparison_page import recognition_content, render_report, write_page
+from sonar_graph.report.figures import reliability_figure
+from sonar_graph.states import Outcome
+from tests.synthetic import REFUSALS, basin_comparison, only, with_failure, with_run, with_score
+
+from .test_pages import Page
+
+REASON = "gave up at 12.5 s <script>alert(1)</script> & more"
+
+
+@pytest.fixture(scope="module")
+def comparison() -> Comparison:
+    return basin_comparison(120)
+
+
+@pytest.fixture(scope="module")
+def page(comparison) -> Page:
+    return Page(render_report(comparison))
+
+
+def test_files_beside_the_page_are_linked(page):
+    addresses = {attrs["href"] for attrs in page.named("a")}
+    assert {"comparison.json", "result.mcap", "runs/isam2/causal.tum", "runs/ekf-slam/result.json"} <= addresses
+    assert "runs/dead-reckoning/landmarks.csv" not in addresses
+
+
+def test_every_run_score_and_protocol_appears(comparison, page):
+    cells = {cell.text for row in score_table(comparison).rows for cell in row}
+    for name, scores in comparison.scores.items():
+        assert name in page.text
+        for key, score in scores.items():
+            assert key in page.text
+            assert " ".join(score.protocol.split()) in page.text
+    assert len(cells) > 20
+    assert all(cell in page.text for cell in cells)
+
+
+def test_scores_nobody_foresaw_are_shown_too(comparison):
+    odd = with_score(comparison, "isam2", "energy.used_j", Score(12.5, "J", "Read from the meter."))
+    text = Page(render_report(odd)).text
+    assert "energy.used_j" in text
+    assert "12.5" in text
+    assert "Read from the meter." in text
+
+
+def test_a_failed_run_is_named_first_with_its_reason_escaped(comparison):
+    html = render_report(with_failure(comparison, "ekf-slam", REASON))
+    page = Page(html)
+    assert "<script" not in html
+    assert page.text.count(REASON) == 2, "in the finding and in the table of failures"
+    assert page.text.index("ekf-slam failed") < page.text.index("Causal position error")
+    assert {"runs/ekf-slam/result.json"} == {
+        attrs["href"] for attrs in page.named("a") if "ekf-slam" in (attrs["href"] or "")
+    }
+
+
+def test_what_puts_a_log_in_doubt_stands_at_the_top(comparison):
+    notes = {"log.gaps": "imu: no sample 3.000 to 9.000 s after the start", "log.noise": "dvl: 5 of 5 rows"}
+    page = render_report(replace(comparison, sequence=replace(comparison.sequence, notes=notes)))
+    top = page[: page.index('class="summary"')]
+    assert "Warning: imu: no sample 3.000 to 9.000 s after the start" in top
+    assert "5 of 5 rows" not in top
+    assert "Warning:" not in render_report(replace(comparison, sequence=replace(comparison.sequence, notes={})))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: only(c, "isam2"),
+        lambda c: with_failure(only(c, "isam2"), "isam2", "no odometry"),
+        lambda c: with_run(c, replace(c.runs[0], update_s=np.empty(0), detections=None, landmarks=None)),
+        lambda c: with_score(
+            with_score(c, "isam2", "memory.peak_mb", Score(float("nan"), "MB", "Not measured.")),
+            "isam2",
+            "causal.ate_se2_m",
+            Score(float("inf"), "m", "Diverged."),
+        ),
+        lambda c: replace(c, scores={run.estimator: {} for run in c.runs}, errors={}),
+    ],
+    ids=["one run", "all failed", "empty blocks", "nan and infinite scores", "no scores"],
+)
+def test_page_is_whole_whatever_is_missing(comparison, change):
+    page = Page(render_report(change(comparison)))
+    assert "basin-three-laps" in page.text
+    assert re.findall(r"\b(nan|NaN|inf|None)\b", page.text) == []
+
+
+@pytest.mark.parametrize("planar", [True, False], ids=["planar", "3-D"])
+def test_without_truth_the_page_says_so_and_shows_the_rest(planar):
+    page = Page(render_report(basin_comparison(60, planar=planar, truth=False)))
+    assert "The log has no ground truth" in page.text
+    assert "Per update, median" in page.text
+    assert "Position error" not in page.text
+    assert len(page.named("svg")) == 5
+
+
+def test_every_reason_of_refusal_is_counted(comparison, page):
+    log = comparison.runs[0].detections
+    assert log is not None
+    for outcome in [Outcome.USED, Outcome.NEW, *REFUSALS]:
+        count = log.outcomes.count(outcome)
+        assert re.search(rf"{re.escape(outcome.value.capitalize())} {count} \(", page.text)
+    assert f"All detections {len(log)}" in page.text
+
+
+def test_nees_is_shown_with_what_is_expected(comparison):
+    far = with_score(comparison, "isam2", "causal.nees_position", Score(3.0, "1", "Mean.", (0.9, 1.1), "inside"))
+    rows = dict(zip(score_keys(far), score_table(far).rows, strict=True))
+    assert rows["causal.nees_yaw"][-1].text == "1 is consistent"
+    assert rows["causal.nees_position"][2].note == "over-confident; expected 0.900 to 1.10"
+
+
+@pytest.mark.slow
+def test_a_long_mission_still_makes_a_small_page(tmp_path):
+    write_page(basin_comparison(4078), tmp_path)
+    assert (tmp_path / "report.html").stat().st_size < 3_000_000
+
+
+def test_only_the_repeated_experiment_stands_beside_the_paper(comparison):
+    same = replace(comparison, sequence=replace(comparison.sequence, true_landmarks=published_maps()[1]))
+    for shown, is_repeated in ((comparison, False), (same, True)):
+        text = Page(render_report(shown)).text
+        assert ("2014 paper" in text) == is_repeated
+        assert ("4.81 (\N{MINUS SIGN}0.19)" in text) == is_repeated
+        assert "Positions in the map at the end, metres; in brackets estimate minus truth" in text
+
+
+def texts(table: Table) -> dict[str, list[str]]:
+    """The texts of each row by its first cell."""
+    return {row[0].text: [cell.text for cell in row[1:]] for row in table.rows}
+
+
+@pytest.fixture(scope="module")
+def recognised(lane, lane_recognition) -> Comparison:
+    """Some runs, with the sequence and the recognition of a lane."""
+    sequence = with_detections(lane.sequence, lane_recognition)
+    return replace(basin_comparison(), sequence=sequence, recognition=lane_recognition)
+
+
+def test_a_comparison_without_images_has_no_such_section() -> None:
+    assert recognition_content(basin_comparison()) is None
+
+
+def test_the_section_shows_pictures_counts_and_reliability(recognised, lane_recognition) -> None:
+    content = recognition_content(recognised)
+    assert content is not None
+    assert content["frames"] == lane_recognition.frames
+    assert texts(content["outcomes"]) == {outcome: [str(n)] for outcome, n in lane_recognition.outcomes.items()}
+    assert len(content["pictures"]) == len(lane_recognition.shown()) == 4
+    first, shown = content["pictures"][0], lane_recognition.shown()[0]
+    address = first["address"].removeprefix("data:image/jpeg;base64,")
+    assert base64.b64decode(address) == shown.jpeg
+    seconds = (shown.stamp_ns - recognised.sequence.start_ns) * 1e-9
+    assert first["caption"].startswith(f"T = {seconds:.1f} s: ")
+    for landmark, probability in zip(shown.landmark_ids, shown.probabilities, strict=True):
+        assert f"ID {landmark} ({probability:.2f})" in first["caption"]
+    judged = reliability_of(recognised.sequence)
+    assert judged is not None
+    assert content["expected_error"] == f"{judged.expected_error:.3f}"
+    assert "<svg" in content["reliability"]
+
+
+def test_the_report_holds_pictures_and_warnings_with_their_time(recognised) -> None:
+    start_ns = recognised.sequence.start_ns
+    warned = replace(
+        recognised, recognition=replace(recognised.recognition, warnings=[(start_ns + 1_250_000_000, "<b> & so on")])
+    )
+    content = recognition_content(warned)
+    assert content is not None
+    assert texts(content["warnings"]) == {"1.25": ["<b> & so on"]}
+    page = render_report(warned).split('id="recognition"')[1].split("</section>")[0]
+    assert "1.25" in page
+    assert "&lt;b&gt; &amp; so on" in page
+    assert "<b> & so on" not in page
+    assert page.count("data:image/jpeg;base64,") == 4
+    assert content["expected_error"] in page
+
+
+def test_without_truth_nothing_is_judged(recognised) -> None:
+    blind = replace(recognised, sequence=replace(recognised.sequence, truth=None))
+    content = recognition_content(blind)
+    assert content is not None
+    assert content["expected_error"] is None
+    assert content["reliability"] == ""
+
+
+def test_the_figure_shows_shares_over_confidence_and_counts() -> None:
+    judged = reliability(np.array([0.95, 0.95, 0.55]), np.array([1.0, 0.0, 1.0]))
+    shares, counts = reliability_figure(judged).axes
+    (dots,) = shares.collections
+    x, y = np.ma.filled(dots.get_offsets(), np.nan).T
+    known = np.isfinite(y)
+    assert x[known].tolist() == pytest.approx([0.55, 0.95])
+    assert y[known].tolist() == [1.0, 0.5]
+    assert [bar.get_height() for bar in counts.patches] == judged.count.tolist()
+    assert counts.patches[9].get_x() + counts.patches[9].get_width() / 2 == pytest.approx(0.95)
+
+
+def test_detections_are_counted_by_what_they_truly_are(recognised, lane_recognition) -> None:
+    """Right, wrong and taken for no landmark: in all as many as there are detections."""
+    content = recognition_content(recognised)
+    assert content is not None
+    assert content["detections"] == len(lane_recognition.detections)
+    named = texts(content["named"])
+    assert list(named)[:5] == [*(f"landmark {k}" for k in (1, 2, 3, 4)), "no landmark"]
+    counts = np.array([[int(n) if n.isdigit() else 0 for n in row] for row in named.values()])
+    assert counts.sum() == content["detections"]
+    assert (counts[:4, 0] > 10).all()
+    assert (counts[:4, 1] == 0).all()
+    assert counts[4].tolist()[:2] == [0, 0]
+    assert counts[4, 2] > 20
+
+
+def test_a_landmark_that_is_named_as_another_is_named_wrongly(recognised) -> None:
+    detections = recognised.sequence.detections
+    swapped = replace(detections, candidate_ids=detections.candidate_ids % 4 + 1)
+    before = recognition_content(recognised)
+    after = recognition_content(replace(recognised, sequence=replace(recognised.sequence, detections=swapped)))
+    assert before is not None
+    assert after is not None
+    for what in (f"landmark {k}" for k in (1, 2, 3, 4)):
+        right, wrong, none = texts(before["named"])[what]
+        assert texts(after["named"])[what] == [wrong, right, none]

@@ -1,0 +1,391 @@
+"""Findings in words follow the numbers: the smaller error, consistency, failures, and warnings that come first."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sonar_graph.evaluation.digits import ABSENT
+from sonar_graph.evaluation.results import MOST_ROWS_NAMED, Comparison, Score
+from sonar_graph.evaluation.scores import detection_scores, landmark_scores
+from sonar_graph.report.comparison_page import render_report
+from sonar_graph.report.findings import (
+    ABSURD,
+    NO_DETECTIONS,
+    SAID_NOTES,
+    doubt_lines,
+    doubt_of_identities,
+    finding,
+    lost_runs,
+    nameless_landmarks,
+    refusal_lines,
+    warning_lines,
+    withheld_lines,
+)
+from sonar_graph.report.landmark_table import landmark_table
+from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionLog, LandmarkMap, Outcome, Refusal, RefusedRow
+from tests.synthetic import IDS, LANDMARKS, basin_comparison, only, with_failure, with_run, with_score
+
+from .test_console import printed
+
+KEY = "causal.ate_se2_m"
+SIGMA_M = 0.02
+NS = 10**9
+WITHHELD = "landmark 3, from keyframe 1 at 1.000 s: 1 range; open: z; an elevation is missing; withheld"
+
+
+def scored(**values: float) -> Comparison:
+    """Runs whose causal errors have these values, without runs that have none."""
+    comparison = only(basin_comparison(60), *(name.replace("_", "-") for name in values))
+    for name, value in values.items():
+        comparison = with_score(comparison, name.replace("_", "-"), KEY, Score(value, "m", "By hand."))
+    return comparison
+
+
+def nees(value: float, interval: tuple[float, float] | None = None) -> Score:
+    return Score(value, "1", "By hand.", interval, "inside")
+
+
+@pytest.mark.parametrize(
+    ("errors", "said"),
+    [
+        ({"isam2": 0.1, "ekf_slam": 0.25, "dead_reckoning": 2.0}, "isam2 is 60 % below ekf-slam and 95 % below dead-r"),
+        ({"isam2": 0.25, "ekf_slam": 0.1, "dead_reckoning": 2.0}, "ekf-slam is 60 % below isam2 and 95 % below dead-r"),
+        ({"isam2": 0.100, "ekf_slam": 0.103}, "isam2 and ekf-slam differ by less than 5 %"),
+        ({"isam2": 0.0, "ekf_slam": 0.0}, "isam2 and ekf-slam differ by less than 5 %"),
+        ({"isam2": 0.1, "ekf_slam": 0.103, "dead_reckoning": 2.0}, "isam2 is 95 % below dead-reckoning; isam2 and ekf"),
+    ],
+)
+def test_the_smaller_error_is_named_only_where_the_difference_is_large(errors, said):
+    sentence = next(one for one in finding(scored(**errors)) if one.startswith("Causal position error"))
+    assert said in sentence
+    assert ("below" in sentence) == ("below" in said)
+
+
+def test_radians_are_shown_as_degrees():
+    score = Score(math.pi / 2, "rad", "By hand.")
+    assert (score.text(), score.with_unit, Score(2.0, "m", "").with_unit) == ("90", "90°", "2\N{NO-BREAK SPACE}m")
+
+
+@pytest.mark.parametrize("truth", [True, False])
+def test_the_smoothed_error_is_told_only_where_it_is_another_one(truth: bool):
+    sentences = [one for one in finding(basin_comparison(60, truth=truth)) if "(smoothed)" in one]
+    assert len(sentences) == truth
+    assert all("isam2" in one and "ekf-slam" not in one for one in sentences)
+
+
+def test_failures_come_first_and_the_lack_of_a_finding_has_its_reason():
+    sentences = finding(with_failure(basin_comparison(60), "ekf-slam", "no odometry."))
+    assert sentences[0] == "ekf-slam failed: no odometry."
+    assert "ekf-slam" not in " ".join(sentences[1:])
+    assert "no ground truth" in " ".join(finding(basin_comparison(60, truth=False)))
+    assert "nothing to compare" in finding(with_failure(scored(isam2=0.1), "isam2", "no odometry"))[-1]
+    unscored = replace(basin_comparison(60), scores={})
+    assert finding(unscored) == ["No position error could be computed against the log's ground truth."]
+
+
+@pytest.mark.parametrize(
+    ("score", "verdict"),
+    [
+        *((nees(value), said) for value, said in ((0.49, "over-cautious"), (0.51, ""), (1.99, ""))),
+        (nees(2.01), "over-confident"),
+        *((nees(value, (0.9, 1.1)), said) for value, said in ((0.8, "over-cautious"), (1.0, "consistent"))),
+        (nees(1.2, (0.9, 1.1)), "over-confident"),
+        (nees(math.nan), ""),
+        (Score(40.0, "m", ""), ""),
+    ],
+)
+def test_consistency_follows_the_interval_and_without_one_a_factor_of_two(score: Score, verdict: str):
+    assert score.verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("position", "yaw", "told"),
+    [
+        (1.5, 6.0, "isam2 6 (yaw, over-confident)"),
+        (0.1, 6.0, "isam2 0.100 (position, over-cautious)"),
+        (1.5, 1.2, "isam2 1.50 (position)"),
+        (0.0, 6.0, "isam2 0 (position, over-cautious)"),
+    ],
+)
+def test_the_nees_furthest_from_one_is_told(position: float, yaw: float, told: str):
+    judged = with_score(scored(isam2=0.1), "isam2", "causal.nees_position", nees(position))
+    assert finding(with_score(judged, "isam2", "causal.nees_yaw", nees(yaw)))[-1].endswith(f": {told}.")
+
+
+@pytest.mark.parametrize("truth", [True, False])
+def test_finding_says_that_there_were_no_detections(truth):
+    comparison = basin_comparison(60, truth=truth)
+    assert NO_DETECTIONS not in finding(comparison)
+    none = replace(comparison.sequence, detections=None)
+    assert finding(replace(comparison, sequence=none))[0] == NO_DETECTIONS
+    part = replace(none, notes={"log.part": "the beginning to 10.000 s"})
+    said = "The part of the log that was chosen (the beginning to 10.000 s) has no landmark detections"
+    assert finding(replace(comparison, sequence=part))[0].startswith(said)
+
+
+@pytest.mark.parametrize(("gated", "is_told"), [(19, False), (21, True)])
+def test_an_estimator_that_refuses_a_fifth_of_the_detections_is_called_lost(gated, is_told):
+    outcomes = [Outcome.GATED] * gated + [Outcome.USED] * (100 - gated)
+    log = DetectionLog(
+        np.arange(100), np.ones(100, np.int64), np.full((100, 2), 0.1), np.tile(np.eye(2), (100, 1, 1)), outcomes
+    )
+    comparison = basin_comparison(60)
+    runs = [replace(run, detections=log) if run.estimator == "ekf-slam" else run for run in comparison.runs]
+    sentences = finding(replace(comparison, runs=runs))
+    told = [sentence for sentence in sentences if sentence.startswith(f"ekf-slam refused {gated} of 100")]
+    assert bool(told) == is_told
+    assert detection_scores(log)["detections.nis"].verdict == ("" if is_told else "over-cautious")
+
+
+def test_without_truth_innovations_tell_whether_covariances_hold():
+    comparison = with_score(
+        basin_comparison(60, truth=False), "isam2", "detections.nis", Score(6.9, "1", "By hand.", (0.9, 1.1), "inside")
+    )
+    assert "isam2 6.90 (over-confident)" in finding(comparison)[-1]
+
+
+def test_a_gate_that_refuses_much_may_have_three_causes():
+    comparison = only(basin_comparison(60), "isam2")
+    run = comparison.runs[0]
+    gated = replace(run.detections, outcomes=[Outcome.GATED] * 30 + [Outcome.USED] * 30)
+    for policy, advice in (
+        ("gate", 'identities are wrong (try identity.policy = "max-mixture"), or'),
+        (None, "wrong, or"),
+    ):
+        params = {} if policy is None else {"identity": {"policy": policy}}
+        (sentence,) = lost_runs(with_run(comparison, replace(run, detections=gated, params=params)))
+        assert "refused 30 of 60 detections as outside its gate: it has lost its way, identities are wrong" in sentence
+        assert advice in sentence
+        assert "or noise is set far too small" in sentence
+
+
+def with_map(
+    ids: np.ndarray, offsets_m: list[float], policy: str = "robust", *, has_truth: bool = True, **changes: object
+) -> Comparison:
+    """One run whose landmarks are so far from the true ones along x, with a sigma of 2 cm."""
+    comparison = only(basin_comparison(60), "isam2")
+    positions = LANDMARKS + np.column_stack([offsets_m, np.zeros(4), np.zeros(4)])
+    found = LandmarkMap(ids, positions, np.tile(SIGMA_M**2 * np.eye(3), (4, 1, 1)))
+    run = replace(comparison.runs[0], landmarks=found, params={"identity": {"policy": policy}}, **changes)
+    sequence = comparison.sequence if has_truth else replace(comparison.sequence, true_landmarks=None)
+    return replace(with_run(comparison, run), sequence=sequence)
+
+
+def log_of(outcomes: list[Outcome], innovations_m: list[float], landmark_id: int = 2) -> DetectionLog:
+    n = len(outcomes)
+    innovations = np.column_stack([innovations_m, np.zeros(n)])
+    covs = np.tile(SIGMA_M**2 * np.eye(2), (n, 1, 1))
+    return DetectionLog(np.arange(n), np.full(n, landmark_id), innovations, covs, outcomes)
+
+
+def test_the_threshold_is_the_quantile_that_chance_exceeds_once_in_a_billion():
+    assert np.exp(-ABSURD / 2) == pytest.approx(1e-9, rel=1e-6)  # of two degrees of freedom, in closed form
+
+
+def test_a_landmark_that_its_covariance_rules_out_is_named_with_the_policy():
+    comparison = with_map(IDS, [0.0, 0.05, 5.0, 0.01])
+    line = (
+        "Warning: isam2 puts landmark 3 far outside its covariance (NEES up to 31250); "
+        'look at identities (identity.policy is "robust"), then at noise and start'
+    )
+    assert doubt_of_identities(comparison) == [line]
+    assert line in printed(comparison, 200)
+    page = render_report(comparison)
+    assert page.index("puts landmark 3 far outside") < page.index("<nav")
+
+
+def test_just_inside_the_quantile_nothing_is_said_and_just_outside_it_is():
+    limit_m = SIGMA_M * np.sqrt(ABSURD)
+    assert doubt_of_identities(with_map(IDS, [0.999 * limit_m] * 4)) == []
+    (line,) = doubt_of_identities(with_map(IDS, [1.001 * limit_m] * 4))
+    assert "landmarks 1, 2, 3 and 4 far outside" in line
+
+
+def test_consistent_maps_are_never_called_wrong():
+    rng = np.random.default_rng(1)
+    assert not any(doubt_of_identities(with_map(IDS, list(rng.normal(0, SIGMA_M, 4)))) for _ in range(50))
+
+
+def test_without_true_landmarks_the_innovations_tell():
+    used = [Outcome.USED] * 10
+    for far, is_told in ((2, False), (3, True), (10, True)):
+        log = log_of(used, [1.0] * far + [0.01] * (10 - far))
+        lines = doubt_of_identities(with_map(IDS, [0.0] * 4, has_truth=False, detections=log))
+        assert bool(lines) == is_told, far
+        if far == 3:
+            assert "(mean NIS up to 375)" in lines[0]  # (3 * 50² + 7 * 0.5²) / 10 / 2
+        assert not doubt_of_identities(with_map(IDS, [0.0] * 4, detections=log))  # the truth says that all is well
+    assert lines[0].startswith("Warning: isam2: sightings of landmark 2 contradict its map (mean NIS up to 1250); look")
+
+
+def test_sightings_contradict_a_map_where_sigmas_are_four_times_too_small_but_not_where_three():
+    n, rng = 2000, np.random.default_rng(2)
+    unit = replace(log_of([Outcome.USED] * n, [0.0] * n), innovations=SIGMA_M * rng.standard_normal((n, 2)))
+    for factor, is_told in ((3.0, False), (4.0, True)):
+        log = replace(unit, innovations=factor * unit.innovations)
+        assert bool(doubt_of_identities(with_map(IDS, [0.0] * 4, has_truth=False, detections=log))) == is_told
+
+
+@pytest.mark.parametrize(
+    ("count", "listed"), [(2, "1 and 2"), (5, "1, 2, 3, 4 and 5"), (6, "1, 2, 3, 4, 5 and 1 more")]
+)
+def test_five_landmarks_are_named_and_more_are_counted(count: int, listed: str):
+    ids, blank = np.arange(1, count + 1), with_map(IDS, [0.0] * 4, has_truth=False)
+    log = replace(log_of([Outcome.USED] * count, [1.0] * count), landmark_ids=ids)
+    landmarks = LandmarkMap(ids, np.zeros((count, 3)), np.zeros((count, 3, 3)))
+    (line,) = doubt_of_identities(with_run(blank, replace(blank.runs[0], landmarks=landmarks, detections=log)))
+    assert f"sightings of landmarks {listed} contradict its map" in line
+
+
+@pytest.mark.parametrize("outcome", [Outcome.GATED, Outcome.WITHHELD, Outcome.REPEATED])
+def test_innovations_that_were_refused_say_nothing_of_the_map(outcome: Outcome):
+    log = log_of([outcome] * 10, [1.0] * 10)
+    assert doubt_of_identities(with_map(IDS, [0.0] * 4, has_truth=False, detections=log)) == []
+
+
+@pytest.mark.parametrize("outcome", [Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNFIT])
+def test_a_log_without_any_identity_is_told_with_what_to_do(outcome: Outcome):
+    log = log_of([outcome] * 6, [np.nan] * 6)
+    blind = with_map(IDS, [0.0] * 4, detections=log)
+    line = (
+        "Warning: none of 6 detections has an identity that isam2 can use: no landmark is mapped; "
+        'isam2 maps them by place with identity.unknown.policy = "associate"'
+    )
+    assert doubt_of_identities(blind) == [line]
+    assert line in printed(blind, 200)
+    assert "none of 6 detections has an identity" in render_report(blind)
+    one_used = log_of([outcome] * 5 + [Outcome.NEW], [np.nan] * 6)
+    assert doubt_of_identities(with_map(IDS, [0.0] * 4, detections=one_used)) == []
+
+
+def test_detections_that_were_refused_before_their_identity_mattered_do_not_hide_that_none_has_one():
+    before = [Outcome.UNSOUND, Outcome.LATE, Outcome.UNLOCATED, Outcome.TRACK_REPEATED]
+    mixed = log_of([*before, Outcome.WAITING, Outcome.NO_IDENTITY, Outcome.WAITING], [np.nan] * 7)
+    (line,) = doubt_of_identities(with_map(IDS, [0.0] * 4, detections=mixed))
+    assert line.startswith("Warning: none of 3 detections has an identity that isam2 can use")
+    assert doubt_of_identities(with_map(IDS, [0.0] * 4, detections=log_of(before, [np.nan] * 4))) == []
+
+
+def test_runs_that_know_no_identity_are_named_together_with_the_most_that_any_was_given():
+    comparison = only(basin_comparison(60), "isam2", "ekf-slam")
+    for run, n in zip(comparison.runs, (4, 6), strict=True):
+        blind = replace(run, detections=log_of([Outcome.NO_IDENTITY] * n, [np.nan] * n))
+        comparison = with_run(comparison, blind)
+    (line,) = doubt_of_identities(comparison)
+    assert line.startswith("Warning: none of 6 detections has an identity that isam2, ekf-slam can use")
+    assert "associate" in line
+    comparison = with_run(
+        comparison, replace(comparison.runs[0], params={"identity": {"unknown": {"policy": "associate"}}})
+    )
+    assert not any("associate" in line for line in doubt_of_identities(comparison))
+
+
+def test_landmarks_without_a_name_are_counted_and_scored_by_place():
+    nameless = with_map(np.arange(4) + FIRST_ANONYMOUS_ID, [0.01, 0.02, 3.0, 0.01])
+    sentence = "isam2 found 4 landmarks without a name (identity.unknown.policy); scored by place, as 1, 2 and 4."
+    assert nameless_landmarks(nameless) == [sentence]
+    assert sentence in printed(nameless, 200)
+    assert sentence in render_report(nameless)
+    table = landmark_table(nameless)
+    assert table is not None
+    assert [row[2].text != ABSENT for row in table.rows[:8:2]] == [True, True, False, True]
+    scores = landmark_scores(nameless.runs[0].landmarks, nameless.sequence.true_landmarks)
+    assert scores["landmarks.raw_m"].value == pytest.approx(np.sqrt((0.01**2 + 0.02**2 + 0.01**2) / 3))
+    assert "3 landmarks matched by identity, 3 of them by place within 1 m" in scores["landmarks.raw_m"].protocol
+
+
+def test_a_landmark_without_a_name_is_wrong_where_its_place_names_it_but_its_covariance_rules_it_out():
+    nameless = with_map(np.arange(4) + FIRST_ANONYMOUS_ID, [0.01, 0.5, 3.0, 0.01])  # the third is nobody's
+    (line,) = doubt_of_identities(nameless)
+    assert "puts landmark 2 far outside its covariance" in line
+
+
+def test_an_identity_that_is_merely_wrong_is_not_named_by_place():
+    wrong = with_map(np.array([1, 2, 3, 9]), [0.0] * 4)
+    assert nameless_landmarks(wrong) == []
+    scores = landmark_scores(wrong.runs[0].landmarks, wrong.sequence.true_landmarks)
+    assert "3 landmarks matched by identity (4 true" in scores["landmarks.raw_m"].protocol
+
+
+def test_without_truth_they_are_only_counted():
+    nameless = with_map(np.array([1, 2, 3, FIRST_ANONYMOUS_ID]), [0.0] * 4, has_truth=False)
+    assert nameless_landmarks(nameless) == [
+        "isam2 found 1 landmark without a name (identity.unknown.policy); identities from 3000000000 on are made up."
+    ]
+
+
+def test_of_a_logs_notes_the_doubts_are_said_and_gaps_and_unlikely_numbers_are_warnings():
+    notes = {subject: f"<{subject}>" for subject in SAID_NOTES} | {"log.topics": "imu: /imu", "log.noise": "dvl"}
+    assert [line.partition(": ")[2] for line in doubt_lines(notes)] == [f"<{subject}>" for subject in SAID_NOTES]
+    assert warning_lines(notes) == ["Warning: <log.warnings>", "Warning: <log.gaps>"]
+
+
+def outlier(stamp_ns: int, distance: float = 100.0) -> RefusedRow:
+    return RefusedRow("dvl", stamp_ns, Refusal.OUTLIER, distance)
+
+
+def late(stamp_ns: int) -> RefusedRow:
+    return RefusedRow("imu", stamp_ns, Refusal.LATE, math.nan)
+
+
+def refusing(refused: list[RefusedRow], *names: str) -> Comparison:
+    comparison = basin_comparison(60)
+    for run in comparison.runs:
+        if run.estimator in names:
+            comparison = with_run(comparison, replace(run, refused=refused))
+    return comparison
+
+
+def test_a_line_names_sensor_stamp_reason_distance_and_runs():
+    start_ns = basin_comparison(60).sequence.start_ns
+    comparison = refusing([outlier(start_ns + 1_234_000_000, 512.6), late(start_ns)], "isam2", "ekf-slam")
+    assert refusal_lines(comparison) == [
+        f"Warning: dvl, 1.234 s: {Refusal.OUTLIER} (squared distance 513); isam2, ekf-slam",
+        f"Warning: imu, 0.000 s: {Refusal.LATE}; isam2, ekf-slam",
+    ]
+    many = refusing([outlier(start_ns + k * NS, 60.0 + k) for k in range(20)], "isam2")
+    assert refusal_lines(many) == [
+        f"Warning: dvl, 20 rows, 0.000 to 19.000 s: {Refusal.OUTLIER} (squared distance 60 to 79); isam2"
+    ]
+
+
+def test_runs_that_refused_differently_have_lines_of_their_own():
+    comparison = refusing([outlier(0)], "isam2")
+    other = refusing([outlier(0, 70.0)], "ekf-slam")
+    both = with_run(comparison, next(run for run in other.runs if run.estimator == "ekf-slam"))
+    assert [line.rsplit("; ")[-1] for line in refusal_lines(both)] == ["isam2", "ekf-slam"]
+
+
+def test_terminal_and_page_say_the_same_and_nothing_where_nothing_was_refused():
+    start_ns = basin_comparison(60).sequence.start_ns
+    comparison = refusing([outlier(start_ns + NS, 512.6), late(start_ns)], "isam2")
+    below = printed(comparison, 200)
+    assert all(line in below for line in refusal_lines(comparison))
+    page = render_report(comparison)
+    section = page[page.index('<h2 id="refused">') : page.index('<h2 id="time">')]
+    for word in ("dvl", "1.000", Refusal.OUTLIER, "513", "imu", "0.000", Refusal.LATE, "isam2"):
+        assert word in section
+    assert "ekf-slam" not in section
+    assert 'id="refused"' not in render_report(basin_comparison(60))
+    assert "Warning" not in printed(basin_comparison(60), 200)
+
+
+def withholding(messages: list[str]) -> Comparison:
+    comparison = basin_comparison(60)
+    return with_run(comparison, replace(comparison.runs[0], withheld=messages))
+
+
+def test_terminal_and_page_say_what_was_withheld_the_first_lines_in_full():
+    comparison, line = withholding([WITHHELD]), f"Warning: isam2: {WITHHELD}"
+    assert withheld_lines(comparison) == [line]
+    assert line in printed(comparison, 200)
+    page = render_report(comparison)
+    assert page.index(line) < page.index("<nav")
+    lines = withheld_lines(withholding([f"{WITHHELD} {k}" for k in range(MOST_ROWS_NAMED + 2)]))
+    assert len(lines) == MOST_ROWS_NAMED + 1
+    assert lines[-1] == "Warning: isam2 withheld 2 more: runs/isam2/result.json has all"
+    assert withheld_lines(basin_comparison(60)) == []

@@ -1,0 +1,198 @@
+"""Laws of both pages, of a comparison and of a batch: whole, self-contained, escaped, readable; and the front door."""
+
+from __future__ import annotations
+
+import doctest
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from sonar_graph.evaluation import Comparison, Score, comparison, digits, read_comparison, run, score_table, tables
+from sonar_graph.report import batch_figures, comparison_page
+from sonar_graph.report.batch_page import render_batch
+from sonar_graph.report.comparison_page import render_report
+from sonar_graph.report.figure_style import ESTIMATOR_COLOURS
+from tests.recorded_batches import LOGS, drawn_batch, failed, with_failures
+from tests.synthetic import basin_comparison
+
+VOID = {"meta", "br", "wbr", "link", "img", "input", "hr"}
+HOSTILE = '"><script>alert(1)</script>'
+
+
+class Page(HTMLParser):
+    """What a page consists of; refuses tags that are not closed in order."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if not {"style", "text"} & set(self.open):
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join("".join(self.words).split())
+
+    def named(self, *names: str) -> list[dict[str, str | None]]:
+        return [attrs for tag, attrs in self.tags if tag in names]
+
+
+def hostile_comparison() -> Comparison:
+    """Everything that a log or an estimator can say would run a script."""
+    compared = basin_comparison(60)
+    sequence = replace(compared.sequence, name=HOSTILE, notes={HOSTILE: HOSTILE})
+    told = replace(compared.runs[0], estimator=HOSTILE, params={HOSTILE: HOSTILE})
+    scores = {**compared.scores, HOSTILE: {HOSTILE: Score(1.0, HOSTILE, HOSTILE)}}
+    runs = [told, *compared.runs[1:]]
+    return replace(compared, sequence=sequence, runs=runs, scores=scores, environment={"x": HOSTILE})
+
+
+def hostile_batch() -> str:
+    batch = drawn_batch()
+    runs = [failed(replace(run, log=HOSTILE), reason=HOSTILE) for run in batch.runs[:3]]
+    named = replace(batch, name=HOSTILE, description=HOSTILE, suite=HOSTILE, runs=[*runs, *batch.runs])
+    return render_batch(named)
+
+
+PAGES = {
+    "comparison": lambda: render_report(basin_comparison(120)),
+    "batch": lambda: render_batch(with_failures(drawn_batch(), "ekf-slam", LOGS[1], 2)),
+}
+
+
+@pytest.fixture(scope="module", params=list(PAGES))
+def kind(request) -> str:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def html(kind) -> str:
+    return PAGES[kind]()
+
+
+@pytest.fixture(scope="module")
+def page(html) -> Page:
+    return Page(html)
+
+
+def test_the_check_of_tags_notices_an_unclosed_one():
+    with pytest.raises(AssertionError):
+        Page("<div><p>text</div>")
+
+
+def test_a_page_fetches_nothing_and_only_that_of_a_batch_has_a_script(page, html, kind):
+    addresses = [attrs[key] or "" for _, attrs in page.tags for key in ("src", "href", "xlink:href") if key in attrs]
+    assert len(addresses) > 20
+    assert [address for address in addresses if re.match(r"(?!data:)[a-z]+:|//|/", address)] == []
+    assert "@import" not in html
+    assert re.findall(r"url\((?!#)", html) == []
+    assert page.named("script") == ([{}] if kind == "batch" else [])
+    assert page.named("iframe", "img") == []
+
+
+def test_links_within_the_page_lead_somewhere_and_ids_are_unique(page):
+    ids = [attrs["id"] for _, attrs in page.tags if attrs.get("id")]
+    assert len(ids) == len(set(ids))
+    targets = {attrs["href"] for attrs in page.named("a", "use") if (attrs["href"] or "").startswith("#")}
+    assert targets <= {f"#{identity}" for identity in ids}
+
+
+def test_a_page_can_be_read_without_seeing_it(page, kind):
+    assert page.named("html")[0]["lang"] == "en"
+    levels = [int(tag[1]) for tag, _ in page.tags if re.fullmatch(r"h[1-6]", tag)]
+    assert levels.count(1) == 1
+    assert levels[0] == 1
+    assert all(deeper - level <= 1 for level, deeper in pairwise(levels))
+    assert all(attrs.get("scope") for attrs in page.named("th"))
+    assert all(len(attrs["aria-label"] or "") > 40 for attrs in page.named("svg"))
+    assert len(page.named("svg")) == {"comparison": 7, "batch": 9}[kind]
+    scrolling = [attrs for attrs in page.named("div") if attrs.get("class") == "scroll"]
+    assert all(attrs.get("aria-label") and attrs.get("tabindex") == "0" for attrs in scrolling)
+
+
+def test_the_same_results_make_the_same_page(kind, html):
+    assert kind == "comparison" or PAGES[kind]() == html
+
+
+@pytest.mark.parametrize(
+    ("shown", "scripts"),
+    [
+        (lambda: render_report(hostile_comparison()), 0),
+        (hostile_batch, 1),
+        (lambda: hostile_comparison()._repr_html_(), 0),
+    ],
+    ids=["comparison", "batch", "notebook"],
+)
+def test_what_a_log_or_an_estimator_says_is_escaped_everywhere(shown, scripts: int):
+    text = shown()
+    Page(text)
+    assert text.count("<script") == scripts
+    assert "alert(1)" in text
+
+
+def contrast(first: str, second: str) -> float:
+    """WCAG 2.1 contrast ratio."""
+
+    def luminance(colour: str) -> float:
+        parts = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+        linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+        return float(linear @ [0.2126, 0.7152, 0.0722])
+
+    lighter, darker = sorted([luminance(first), luminance(second)], reverse=True)
+    return (lighter + 0.05) / (darker + 0.05)
+
+
+@pytest.mark.parametrize("scheme", [0, 1], ids=["light", "dark"])
+def test_text_and_lines_stand_out_from_the_paper(html, scheme):
+    assert contrast("#000000", "#ffffff") == pytest.approx(21)
+    block = re.findall(r":root \{(.*?)\}", html, flags=re.DOTALL)[scheme]
+    colours = dict(re.findall(r"(--[\w-]+): (#[0-9a-f]{6})", block))
+    for name, least in {"--ink": 7, "--muted": 4.5, "--link": 4.5, "--warning": 4.5}.items():
+        assert contrast(colours[name], colours["--paper"]) >= least, name
+    runs = [name for name in colours if name.startswith("--run-")]
+    assert len(runs) == len(ESTIMATOR_COLOURS) == tables.RUN_COLOURS
+    assert all(contrast(colours[name], colours["--paper"]) >= 3 for name in runs)
+
+
+def test_a_notebook_shows_every_score_under_its_run():
+    compared = basin_comparison(60)
+    text = Page(compared._repr_html_()).text
+    table = score_table(compared)
+    assert all(cell.text in text for row in table.rows for cell in row)
+    assert [column.heading for column in table.columns[2:-1]] == [run.estimator for run in compared.runs]
+
+
+def test_examples_of_the_front_door_run(tmp_path):
+    for module in (comparison, run, digits, comparison_page, batch_figures):
+        done = doctest.testmod(module)
+        assert done.attempted > 0
+        assert done.failed == 0, module.__name__
+    compared = basin_comparison(60)
+    assert comparison_page.write_report(compared, str(tmp_path / "new")) == tmp_path / "new" / "report.html"
+    assert {path.name for path in (tmp_path / "new").iterdir()} == {
+        *("report.html", "comparison.json", "sequence.npz", "runs"),
+        *("result.mcap", "result.foxglove.json", "result.rviz"),
+    }
+    assert list(read_comparison(tmp_path / "new").scores) == list(compared.scores)
