@@ -92,7 +92,16 @@ def test_a_row_of_few_beams_that_is_overtaken_is_named():
     rows = driven(partial=[3], outliers=[])
     odometry.add(None, rows.rows(np.array([2, 4])))
     odometry.add(None, rows.rows(np.array([3])))
+    odometry.add(None, rows.rows(np.array([5])))
     assert told(odometry) == [(3, Refusal.INCOMPLETE)]
+    np.testing.assert_array_equal(odometry.columns()[3], rows.stamps_ns[[2, 4, 5]])
+
+
+def test_a_row_of_few_beams_after_a_long_gap_waits_to_be_completed_and_for_no_other():
+    odometry = Odometry(Calibration())
+    odometry.add(imu(stamps(50, SECONDS), 0.0), None)
+    odometry.add(None, driven(partial=[25], outliers=[]).rows(np.array([0, 1, 25])))
+    assert told(odometry) == [(25, Refusal.INCOMPLETE)]
 
 
 def test_rows_are_late_from_the_settled_stamp_on_and_those_known_already_are_no_news():
