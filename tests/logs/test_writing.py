@@ -174,3 +174,17 @@ def test_an_existing_recording_survives_an_error(tmp_path: Path) -> None:
         write_frames(path, frames(first=3), frames("c16"))
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_images_that_are_made_one_by_one_lie_among_the_others_once_and_in_order(
+    make_sequence: Any, tmp_path: Path
+) -> None:
+    sequence = make_sequence()
+    blocks = [replace(frames(count=1), stamps_ns=sequence.imu.stamps_ns[row : row + 1]) for row in (4, 12)]
+    write_log(tmp_path / "a.mcap", sequence)
+    write_log(tmp_path / "b.mcap", sequence, (sonar_image_messages("/sonar/image", block) for block in blocks))
+    times: list[list[int]] = []
+    for name in ("a.mcap", "b.mcap"):
+        with (tmp_path / name).open("rb") as stream:
+            times.append([r.log_time for r in StreamReader(stream).records if isinstance(r, Message)])
+    assert times[1] == sorted([*times[0], *(int(block.stamps_ns[0]) for block in blocks)])
