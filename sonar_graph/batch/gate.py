@@ -220,7 +220,7 @@ def told(name: Name) -> str:
 
 
 def asked_of(run: RecordedRun) -> dict[str, Any]:
-    """What the suite states of a run.
+    """Options that the suite states for a run.
 
     Raises
     ------

@@ -219,6 +219,11 @@ def test_differences_say_what_they_are_of(cases, counted):
     assert paired(np.ones(3), np.zeros(3), [1, 2, "a"]).counted == "3 cases"
 
 
+def test_the_rounding_of_a_mean_difference_is_that_of_pairs_that_have_a_value():
+    own = np.array([1.0, 2.0, 4.0, 5.0, 7.0, 8.0, INF])
+    assert paired(own, np.zeros(7)).rounding_error == pytest.approx(stats.sem(own[:-1]))
+
+
 def test_two_failures_on_one_seed_are_equal():
     told = paired(np.array([INF, 1.0]), np.array([INF, 2.0]))
     assert (told.smaller, told.without, told.median) == (1, 1, -0.5)
