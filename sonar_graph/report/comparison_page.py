@@ -50,7 +50,7 @@ from sonar_graph.report.figures import (
     timing_figure,
     yaw_figure,
 )
-from sonar_graph.report.findings import (
+from sonar_graph.report.sentences import (
     doubt_of_identities,
     finding,
     nameless_landmarks,

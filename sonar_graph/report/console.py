@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sonar_graph.evaluation import ABSENT, LABELS, TOLERATED_FACTOR, Comparison, repeats_published, score_keys
-from sonar_graph.report.findings import (
+from sonar_graph.report.sentences import (
     doubt_lines,
     doubt_of_identities,
     headline_metric,

@@ -1,4 +1,4 @@
-"""Findings of a comparison in words: errors, consistency, and the warnings that a reader must see first.
+"""Sentences about a comparison: errors, consistency, and the warnings that a reader must see first.
 
 No sentence claims more than its numbers support. A landmark is called wrong when its squared error, or too many of its
 squared innovations, exceed `ABSURD`; where covariances hold, that has a probability of 1e-9. Where sigmas are f times

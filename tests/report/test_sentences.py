@@ -12,7 +12,7 @@ from sonar_graph.evaluation.digits import ABSENT
 from sonar_graph.evaluation.results import MOST_ROWS_NAMED, Comparison, Score
 from sonar_graph.evaluation.scores import detection_scores, landmark_scores
 from sonar_graph.report.comparison_page import render_report
-from sonar_graph.report.findings import (
+from sonar_graph.report.sentences import (
     ABSURD,
     NO_DETECTIONS,
     SAID_NOTES,
