@@ -50,6 +50,9 @@ from sonar_graph.report.figures import (
     timing_figure,
     yaw_figure,
 )
+from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
+from sonar_graph.report.maps import enlargement, growth_figure, map_figure, paths_cut_off
+from sonar_graph.report.rendering import data_address, render
 from sonar_graph.report.sentences import (
     doubt_of_identities,
     finding,
@@ -58,9 +61,6 @@ from sonar_graph.report.sentences import (
     warning_lines,
     withheld_lines,
 )
-from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
-from sonar_graph.report.maps import enlargement, growth_figure, map_figure, paths_cut_off
-from sonar_graph.report.rendering import data_address, render
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Outcome
 

@@ -8,6 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sonar_graph.evaluation import ABSENT, LABELS, TOLERATED_FACTOR, Comparison, repeats_published, score_keys
+from sonar_graph.report.landmark_table import PAPER, landmark_table
 from sonar_graph.report.sentences import (
     doubt_lines,
     doubt_of_identities,
@@ -18,7 +19,6 @@ from sonar_graph.report.sentences import (
     refusal_lines,
     withheld_lines,
 )
-from sonar_graph.report.landmark_table import PAPER, landmark_table
 
 COLUMNS = {
     "causal.yaw_rmse_rad": "yaw",

@@ -12,6 +12,7 @@ from sonar_graph.evaluation.digits import ABSENT
 from sonar_graph.evaluation.results import MOST_ROWS_NAMED, Comparison, Score
 from sonar_graph.evaluation.scores import detection_scores, landmark_scores
 from sonar_graph.report.comparison_page import render_report
+from sonar_graph.report.landmark_table import landmark_table
 from sonar_graph.report.sentences import (
     ABSURD,
     NO_DETECTIONS,
@@ -25,7 +26,6 @@ from sonar_graph.report.sentences import (
     warning_lines,
     withheld_lines,
 )
-from sonar_graph.report.landmark_table import landmark_table
 from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionLog, LandmarkMap, Outcome, Refusal, RefusedRow
 from tests.synthetic import IDS, LANDMARKS, basin_comparison, only, with_failure, with_run, with_score
 
