@@ -73,6 +73,7 @@ def test_run_begins_with_a_row_without_motion():
     imu, dvl = stepped_odometry(np.array([[1.0, 0.0, 0.1]]), np.zeros((1, 3, 3)), 1)
     assert imu.stamps_ns.tolist() == dvl.stamps_ns.tolist() == [0, 1_000_000_000]
     assert not dvl.velocity[0].any()
+    assert dvl.velocity_cov[:, 2, 2] == pytest.approx([1e-6, 1e-6])  # a millimetre a second
     assert not imu.angular_velocity[0].any()
     assert np.isnan(imu.specific_force).all()
 
