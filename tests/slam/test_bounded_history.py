@@ -10,6 +10,7 @@ from gtsam.symbol_shorthand import L
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
+from sonar_graph.slam.smoother import Smoother
 from sonar_graph.states import Estimate, Outcome
 
 from .late_identities import on_the_rail
@@ -213,3 +214,15 @@ def test_what_need_not_be_remembered_is_forgotten_and_nothing_else_changes():
     assert np.array_equal(rest.innovations, log.innovations[-len(rest) :], equal_nan=True)
     assert rest.outcomes == log.outcomes[-len(rest) :]
     assert np.array_equal(recent.landmarks().positions, everything.landmarks().positions)
+
+
+def test_landmarks_that_have_moved_are_linearised_anew_once_a_lag(monkeypatch):
+    restarts = []
+    restart = Smoother._restart
+    monkeypatch.setattr(Smoother, "_restart", lambda self, time_s: restarts.append(time_s) or restart(self, time_s))
+    run(mission(), "bounded", smoother__stale_shift_m=1e-6)
+    assert len(restarts) > 5
+    assert np.diff(restarts).min() >= LAG_S
+    many = len(restarts)
+    run(mission(), "bounded", smoother__stale_shift_m=1e9)
+    assert len(restarts) == many
