@@ -252,10 +252,8 @@ def deferred_interrupt() -> Iterator[None]:
 
     Compiled code that cannot raise (some of pyarrow) swallows the exception, and the batch would go on.
 
-    Raises
-    ------
-    KeyboardInterrupt
-        At the end of the block, when the signal came in between; an error of the block is its context.
+    Raises `KeyboardInterrupt` at the end of the block, when the signal came in between; an error of the block is its
+    context.
     """
     handler = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(handler):

@@ -45,14 +45,7 @@ for many small tasks and is slowed down here, because it takes time from the run
 
 
 def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: Where, progress: Progress) -> None:
-    """Do runs and keep each as soon as it is done.
-
-    Parameters
-    ----------
-    runs
-        Those that are not done yet.
-    progress
-        Called after a run is kept.
+    """Do runs and keep each as soon as it is done; ``progress`` is called after that.
 
     Raises
     ------
@@ -90,10 +83,7 @@ def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: W
 def keep(run: PlannedRun, future: Future[Any], store: Store, progress: Progress) -> None:
     """Write the outcome of a finished task to the store; a run whose workers were killed has a row that says so.
 
-    Raises
-    ------
-    BatchError
-        When the worker could not do the run at all, or the store cannot be written.
+    Raises `BatchError` when the worker could not do the run at all, or the store cannot be written.
     """
     try:
         outcome = future.result()
@@ -116,10 +106,7 @@ def keep(run: PlannedRun, future: Future[Any], store: Store, progress: Progress)
 def _remote_client(address: str) -> Iterator[Client]:
     """Client of a scheduler that exists and has at least one worker.
 
-    Raises
-    ------
-    BatchError
-        When there is none.
+    Raises `BatchError` when there is none.
     """
     try:
         client = Client(address, timeout=CONNECT_S)
@@ -140,10 +127,7 @@ def _remote_client(address: str) -> Iterator[Client]:
 def _local_client(workers: int) -> Iterator[Client]:
     """Client of a cluster on this machine that lives as long as the block.
 
-    Raises
-    ------
-    BatchError
-        When no worker can be started.
+    Raises `BatchError` when no worker can be started.
     """
     try:
         cluster = LocalCluster(

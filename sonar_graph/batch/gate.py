@@ -222,10 +222,7 @@ def told(name: Name) -> str:
 def asked_of(run: RecordedRun) -> dict[str, Any]:
     """Options that the suite states for a run.
 
-    Raises
-    ------
-    EvaluationError
-        When the results are of a version that did not record it.
+    Raises `EvaluationError` when the results are of a version that did not record it.
     """
     if "asked" not in run.texts:
         raise EvaluationError(
@@ -238,10 +235,7 @@ def asked_of(run: RecordedRun) -> dict[str, Any]:
 def check_comparable(entry: dict[str, Any], run: RecordedRun, path: Path) -> None:
     """Refuse a run for which the suite states something else than for the reference's run of its name.
 
-    Raises
-    ------
-    EvaluationError
-        With run, field and both values.
+    Raises `EvaluationError` with run, field and both values.
     """
     before, now = _flat(entry["asked"]), _flat(asked_of(run))
     for field in sorted(before | now):

@@ -140,10 +140,7 @@ def warm_up(run: PlannedRun) -> None:
 def _sequence(kind: str, options: str, content: str, seed: int | None, landmarks: str) -> Sequence:
     """Sequence of a source; arguments are JSON texts. Equal arguments give the same object, which nobody changes.
 
-    Raises
-    ------
-    BatchError
-        When files are not, before or after they were read, what they were when the run was planned.
+    Raises `BatchError` when files are not, before or after they were read, what they were when the run was planned.
     """
     values = json.loads(options)
     _check_content(kind, values, content)

@@ -114,10 +114,7 @@ def plan_runs(file: SuiteFile) -> list[PlannedRun]:
 def contestants_of(file: SuiteFile) -> list[_Contestant]:
     """Estimators with their settings, grids multiplied out; no two of one name or with equal settings.
 
-    Raises
-    ------
-    BatchError
-        With file, line and key.
+    Raises `BatchError` with file, line and key.
     """
     found: list[_Contestant] = []
     for number, entry in enumerate(file.suite.estimators):
@@ -154,10 +151,7 @@ def contestants_of(file: SuiteFile) -> list[_Contestant]:
 def sources_of(file: SuiteFile) -> list[_Source]:
     """Logs and simulations, grids multiplied out; no two of one name or with equal content for one seed.
 
-    Raises
-    ------
-    BatchError
-        With file, line and key.
+    Raises `BatchError` with file, line and key.
     """
     found: list[_Source] = []
     for number, entry in enumerate(file.suite.logs):
@@ -212,10 +206,7 @@ def _combinations(
 ) -> Iterator[dict[str, Any]]:
     """Every combination of a grid's values.
 
-    Raises
-    ------
-    BatchError
-        When a name is also fixed, or its values are none or not distinct.
+    Raises `BatchError` when a name is also fixed, or its values are none or not distinct.
     """
     for name, values in grid.items():
         at = (*place, "grid", *name.split("."))
@@ -258,10 +249,7 @@ def _label(name: str, chosen: dict[str, Any]) -> str:
 def versions_of(estimator: str) -> dict[str, str]:
     """Versions that decide the numbers, with that of the package that brings the estimator, and hashes of both sources.
 
-    Raises
-    ------
-    BatchError
-        When this machine does not have the estimator.
+    Raises `BatchError` when this machine does not have the estimator.
     """
     point = installed_estimators().get(estimator)
     if point is None:

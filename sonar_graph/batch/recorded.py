@@ -260,20 +260,7 @@ def _recorded(row: dict[str, Any], place: int, folder: Path) -> RecordedRun:
 
 
 def require_complete(batch: RecordedBatch, subject: str | Path, purpose: str) -> None:
-    """Refuse a batch with missing runs.
-
-    Parameters
-    ----------
-    subject
-        Beginning of the message.
-    purpose
-        What the batch cannot do, for the message.
-
-    Raises
-    ------
-    EvaluationError
-        When a planned run was not done.
-    """
+    """Raise `EvaluationError` if a planned run was not done; the message has the subject, and what cannot be done."""
     if batch.missing:
         raise EvaluationError(
             f"{subject}: the batch {batch.name!r} cannot {purpose}, {batch.missing_count}; {GOING_ON}"

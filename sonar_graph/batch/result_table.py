@@ -16,7 +16,7 @@ from pathlib import Path
 from sonar_graph.batch.recorded import RESULTS, SUITE_METADATA
 from sonar_graph.batch.store import NOT_RUN, PlannedRun, Row, Store
 from sonar_graph.batch.suite import Suite
-from sonar_graph.evaluation import ESTIMATES, LABELS
+from sonar_graph.evaluation import LABELS
 from sonar_graph.files import replacing
 
 KINDS = ("causal", "smoothed")
@@ -117,11 +117,6 @@ def metrics_of(keys: list[str]) -> list[Metric]:
         else:
             found[key] = Metric(name, {"": key})
     return list(found.values())
-
-
-def estimate_sentences() -> list[str]:
-    """Sentences that explain causal and smoothed."""
-    return [f"{sentence}." for sentence in ESTIMATES.values()]
 
 
 TEXTS = ("key", "suite", "log", "generator", "options", "asked")

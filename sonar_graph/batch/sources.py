@@ -117,10 +117,7 @@ FILE = "file"
 def read_source(kind: str, options: dict[str, Any], seed: int | None) -> Sequence:
     """Read or simulate the sequence of a source; a generator takes the seed.
 
-    Raises
-    ------
-    SonarGraphError
-        From the reader or simulator.
+    Raises `SonarGraphError` from the reader or simulator.
     """
     source = KINDS[kind]
     values = options | {"seed": seed} if kind in GENERATORS else options

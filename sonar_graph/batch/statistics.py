@@ -322,12 +322,8 @@ def holm(p_values: Floats) -> Floats:
 def anees(nees: Floats, dof: float) -> Anees:
     """Average over independent runs, with the chi-square band of a consistent estimator.
 
-    Parameters
-    ----------
-    nees
-        Normalised squared error of each run at one instant, divided by ``dof``, shape (n,); infinity: none.
-    dof
-        Degrees of freedom; NaN: unknown, which gives no band.
+    ``nees`` is the normalised squared error of each run at one instant, divided by ``dof``, shape (n,); infinity: none.
+    Unknown degrees of freedom (NaN) give no band.
     """
     if not len(nees) or np.isinf(nees).any():
         return Anees(len(nees), math.nan, (math.nan, math.nan))

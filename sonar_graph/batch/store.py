@@ -110,10 +110,7 @@ _PARTIAL = ".partial-"
 class Store:
     """The runs in a folder, each written once, whole or not at all, under its key.
 
-    Raises
-    ------
-    BatchError
-        When the folder cannot be made.
+    Raises `BatchError` when the folder cannot be made.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -139,10 +136,7 @@ class Store:
     def write(self, key: str, outcome: RunOutcome) -> None:
         """Keep a run.
 
-        Raises
-        ------
-        OSError
-            When there is no space; nothing of the run is left then, and no other run is touched.
+        Raises `OSError` when there is no space; nothing of the run is left then, and no other run is touched.
         """
         partial = self._partial_folder(key)
         try:
@@ -182,10 +176,7 @@ def only_batch_in(folder: Path) -> Iterator[None]:
     Two batches would remove each other's half-written runs and write one table. The operating system holds the lock
     and releases it when the process ends, also by SIGKILL; the file that stays behind means nothing.
 
-    Raises
-    ------
-    BatchError
-        When another batch runs there, or the file system has no locks.
+    Raises `BatchError` when another batch runs there, or the file system has no locks.
     """
     from filelock import FileLock, Timeout  # of the extra `bench`
 

@@ -36,6 +36,7 @@ from pydantic import BeforeValidator, Field, ValidationError, field_validator, m
 
 from sonar_graph.calibration import Section
 from sonar_graph.errors import BatchError
+from sonar_graph.evaluation import SCORES
 from sonar_graph.settings import choice, faults_in, flattened
 
 Place = tuple[int | str, ...]
@@ -51,17 +52,7 @@ DEFAULT_METRICS = (
     "smoothed.ate_raw_m",
     "landmarks.se2_m",
 )
-_TRAJECTORY_METRICS = (
-    *("ate_raw_m", "ate_yaw_m", "ate_se2_m", "ate_se3_m", "yaw_rmse_rad", "return_error_m"),
-    *("rpe_1s_m", "rpe_1s_rad", "rpe_10s_m", "rpe_10s_rad", "nees_position", "nees_yaw"),
-)
-METRICS = (
-    *(f"{kind}.{key}" for kind in ("causal", "smoothed") for key in _TRAJECTORY_METRICS),
-    *(f"landmarks.{key}" for key in ("raw_m", "se2_m", "count", "nees")),
-    *(f"detections.{key}" for key in ("used", "refused", "unnamed", "nis")),
-    *(f"time.{key}" for key in ("update_median_ms", "update_p99_ms", "update_max_ms", "total_s", "real_time_factor")),
-    "memory.peak_mb",
-)
+METRICS = tuple(f"{block}.{name}" for block, labels in SCORES.items() for name in labels)
 """Every key that a score can have."""
 MOST_SEEDS = 1_000_000
 LARGEST_SEED = 2**63 - 1
@@ -171,20 +162,14 @@ class SuiteFile:
     def refuse(self, place: Place, fault: str) -> NoReturn:
         """Raise for a mistake at a place of the file.
 
-        Raises
-        ------
-        BatchError
-            With file, line and key.
+        Raises `BatchError` with file, line and key.
         """
         raise BatchError(f"{self.path}, line {line_of(self.text, place)}: {'.'.join(map(str, place))}: {fault}")
 
     def find(self, place: Place, name: str) -> str:
         """Absolute path of a file or folder, relative to the suite's folder or else to the folder of data sets.
 
-        Raises
-        ------
-        BatchError
-            When it is in neither.
+        Raises `BatchError` when it is in neither.
         """
         roots = [self.path.parent, *([Path(os.environ[DATA_VARIABLE])] if os.environ.get(DATA_VARIABLE) else [])]
         found = [root / name for root in roots if (root / name).exists()]

@@ -97,10 +97,7 @@ _idle_lock = threading.Lock()
 class Runner:
     """A process that does one run after the other.
 
-    Raises
-    ------
-    BatchError
-        When the process does not become ready in time.
+    Raises `BatchError` when the process does not become ready in time.
     """
 
     def __init__(self) -> None:

@@ -115,10 +115,7 @@ class ReadingOptions:
     def choices(self) -> dict[str, str]:
         """Topics by role, from texts such as ``imu=/imu/data``.
 
-        Raises
-        ------
-        LogError
-            When a text has no role, no ``=`` or no topic.
+        Raises `LogError` when a text has no role, no ``=`` or no topic.
         """
         choices = {}
         for text in self.topics or []:
@@ -150,13 +147,7 @@ class ReadingOptions:
         return TimeWindow.parse(self.start, self.end)
 
     def read(self, log: Path, *, images: bool = False, progress: Callable[[int, int], None] | None = None) -> Sequence:
-        """Read a log as a sequence.
-
-        Parameters
-        ----------
-        images
-            The chosen topic of the role ``sonar`` is for the images, which are read separately.
-        """
+        """Read a log as a sequence; with images the topic of the role ``sonar`` is for these, which are read apart."""
         from sonar_graph.logs import read_log
 
         return read_log(
@@ -173,10 +164,7 @@ class ReadingOptions:
 def with_options(*left_out: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Replace each dataclass among a command's parameters by its fields, which typer turns into options.
 
-    Parameters
-    ----------
-    left_out
-        Fields that the command does not offer; they have their defaults.
+    The command does not offer the fields that are left out; they have their defaults.
     """
 
     def expand(command: Callable[..., None]) -> Callable[..., None]:
@@ -208,10 +196,7 @@ def with_options(*left_out: str) -> Callable[[Callable[..., None]], Callable[...
 def parse_settings(texts: list[str]) -> dict[str, Any]:
     """Values by name from texts such as ``laps=2``, read as TOML, or as plain text if they are no TOML.
 
-    Raises
-    ------
-    EstimatorError
-        When a text has no name or no ``=``, or a name is given again with another value.
+    Raises `EstimatorError` when a text has no name or no ``=``, or a name is given again with another value.
     """
     settings: dict[str, Any] = {}
     for text in texts:
@@ -240,10 +225,7 @@ def nested_settings(texts: list[str] | None) -> dict[str, Any]:
 def estimator_settings(texts: list[str] | None, names: list[str]) -> dict[str, dict[str, Any]]:
     """Settings by estimator, from texts such as ``isam2.smoother.lag_s=20``; dots go into nested settings.
 
-    Raises
-    ------
-    EstimatorError
-        As `parse_settings`, and when a text does not begin with one of the estimators that run.
+    Raises `EstimatorError` as `parse_settings`, and when a text does not begin with one of the estimators that run.
     """
     from sonar_graph.settings import nested
 
@@ -260,10 +242,7 @@ def estimator_settings(texts: list[str] | None, names: list[str]) -> dict[str, d
 def validated(kind: type[Model], values: dict[str, Any], whose: str) -> Model:
     """Settings as their model.
 
-    Raises
-    ------
-    typer.BadParameter
-        Naming each setting that does not exist or does not fit, and those that exist.
+    Raises `typer.BadParameter` naming each setting that does not exist or does not fit, and those that exist.
     """
     from pydantic import ValidationError
 

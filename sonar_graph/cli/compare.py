@@ -164,10 +164,7 @@ def compare_log(
 ) -> Comparison:
     """Read a log, recognise landmarks if it needs that, and compare estimators; mistakes are reported first.
 
-    Raises
-    ------
-    SonarGraphError
-        When an argument does not fit, or the log cannot be read.
+    Raises `SonarGraphError` when an argument does not fit, or the log cannot be read.
     """
     from sonar_graph.evaluation import check_request
     from sonar_graph.evaluation import compare as compare_runs
@@ -207,10 +204,7 @@ def compare_log(
 def check_rate(rate_hz: float, sequence: Sequence) -> None:
     """Refuse to ask for estimates more often than the IMU measures; the default rate is valid for any log.
 
-    Raises
-    ------
-    EvaluationError
-        Naming the highest rate.
+    Raises `EvaluationError` naming the highest rate.
     """
     stamps_ns = sequence.imu.stamps_ns
     imu_hz = len(stamps_ns) / max(float(stamps_ns[-1] - stamps_ns[0]) * 1e-9, 1.0)

@@ -50,10 +50,8 @@ def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = Fa
 def writable_json(path: Path, sources: Iterable[Path]) -> Path:
     """Check that a JSON file can be written, make its folder, and return ``path``.
 
-    Raises
-    ------
-    EvaluationError
-        When it is a folder, is not called ``*.json``, is one of the sources, or its folder cannot be written to.
+    Raises `EvaluationError` when it is a folder, is not called ``*.json``, is one of the sources, or its folder cannot
+    be written to.
     """
     if path.is_dir() or path.suffix != ".json":
         raise EvaluationError(f"{path}: expected the name of a file that ends in .json")
@@ -66,11 +64,8 @@ def writable_json(path: Path, sources: Iterable[Path]) -> Path:
 def writable_folder(path: Path, sources: Iterable[Path | None] = ()) -> Path:
     """Check that a comparison can be written to a folder, make it, and return ``path``.
 
-    Raises
-    ------
-    EvaluationError
-        When it is a file, cannot be written to, or holds one of the sources under a name that is written, or a
-        ``result.mcap`` that this package did not write.
+    Raises `EvaluationError` when it is a file, cannot be written to, or holds one of the sources under a name that is
+    written, or a ``result.mcap`` that this package did not write.
     """
     if path.exists() and not path.is_dir():
         raise EvaluationError(f"{path}: is a file; give a folder with -o")

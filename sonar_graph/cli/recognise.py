@@ -88,10 +88,7 @@ class RecogniserOptions:
     def read_designs(self) -> tuple[LandmarkDesign, ...] | None:
         """Designs of the user, if given.
 
-        Raises
-        ------
-        CalibrationError
-            When a file is not what it should be.
+        Raises `CalibrationError` when a file is not what it should be.
         """
         from sonar_graph.devices import load_designs
 
@@ -100,10 +97,7 @@ class RecogniserOptions:
     def params(self, settings: list[str] | None = None) -> RecogniserParams:
         """Settings of the recogniser.
 
-        Raises
-        ------
-        CalibrationError
-            When the model's file is none.
+        Raises `CalibrationError` when the model's file is none.
         """
         from sonar_graph.sonar import RecogniserParams, read_confusion
 
@@ -123,11 +117,8 @@ class RecogniserOptions:
     ) -> LandmarkRecogniser:
         """The recogniser of that name.
 
-        Raises
-        ------
-        CalibrationError
-            When a file is not what it should be, designs and model are of different landmarks, or AcTag is not
-            installed.
+        Raises `CalibrationError` when a file is not what it should be, designs and model are of different landmarks, or
+        AcTag is not installed.
         """
         from sonar_graph.sonar import AcTagRecogniser, AcTagSettings, Recogniser
 

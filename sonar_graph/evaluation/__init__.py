@@ -14,16 +14,16 @@ from sonar_graph.evaluation.scored_instants import DURATION_S, MAP_TIMES_S, RETU
 from sonar_graph.evaluation.scores import ESTIMATES
 from sonar_graph.evaluation.storage import read_comparison, write_comparison, write_viewer_files
 from sonar_graph.evaluation.tables import (
-    LABELS, Cell, Column, Table, absent, as_html, count, number, run_columns, score_keys, score_table, text_table,
-    words)
+    LABELS, SCORES, Cell, Column, Table, absent, as_html, count, number, run_columns, score_keys, score_table,
+    text_table, words)
 
 __all__ = [
     "ABSENT", "Cell", "Column", "Comparison", "DURATION_S", "ESTIMATES", "ErrorSeries", "GATED_SHARE", "LABELS",
     "LIBRARIES", "MAP_TIMES_S", "MOST_ROWS_NAMED", "NONE", "RETURN_M", "RefusedRows", "Reliability", "RunResult",
-    "Score", "TOLERATED_FACTOR", "Table", "UNJUDGED", "absent", "anees_interval", "anonymous_named", "as_html",
-    "between", "check_request", "compare", "confidences", "count", "describe_environment", "fixed", "format_value",
-    "gathered", "judge", "landmark_errors", "nis", "normalised_squares", "number", "one_line", "published_maps",
-    "quantile_text", "read_comparison", "reliability_of", "repeats_published", "rmse", "run_columns", "run_estimator",
-    "score_keys", "score_table", "supported", "text_table", "true_identities", "with_error", "words",
-    "write_comparison", "write_viewer_files", "yaw_rad",
+    "SCORES", "Score", "TOLERATED_FACTOR", "Table", "UNJUDGED", "absent", "anees_interval", "anonymous_named",
+    "as_html", "between", "check_request", "compare", "confidences", "count", "describe_environment", "fixed",
+    "format_value", "gathered", "judge", "landmark_errors", "nis", "normalised_squares", "number", "one_line",
+    "published_maps", "quantile_text", "read_comparison", "reliability_of", "repeats_published", "rmse",
+    "run_columns", "run_estimator", "score_keys", "score_table", "supported", "text_table", "true_identities",
+    "with_error", "words", "write_comparison", "write_viewer_files", "yaw_rad",
 ]

@@ -111,13 +111,7 @@ def compare(
 
 
 def judge(sequence: Sequence, instants_ns: Ints, runs: list[RunResult]) -> Comparison:
-    """Score runs that were asked for estimates at the same instants.
-
-    Parameters
-    ----------
-    instants_ns
-        Instants at which all runs were asked, shape (n,).
-    """
+    """Score runs that were all asked for estimates at these instants, shape (n,)."""
     environment = describe_environment()
     errors: dict[str, dict[Kind, ErrorSeries]] = {}
     scores: dict[str, dict[str, Score]] = {run.estimator: {} for run in runs}

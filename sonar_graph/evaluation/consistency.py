@@ -32,14 +32,9 @@ NONE, UNJUDGED = -1, -2
 
 
 def error_series(estimate: Trajectory, truth: Trajectory, position_dof: int) -> ErrorSeries:
-    """Errors, their reported standard deviations and their NEES at instants common to both.
+    """Errors, their reported standard deviations and their NEES; estimate and truth have the same instants.
 
-    Parameters
-    ----------
-    estimate, truth
-        At the same instants.
-    position_dof
-        2: the NEES of position takes x and y (planar motion); 3: also z.
+    The NEES of position takes x and y (``position_dof`` 2, planar motion), or also z (3).
     """
     yaw_error = yaw_errors_rad(estimate, truth)
     position_error = estimate.positions - truth.positions
@@ -84,15 +79,7 @@ def yaw_variances(trajectory: Trajectory) -> Floats:
 
 
 def normalised_squares(errors: Floats, covs: Floats) -> Floats:
-    """``e^T P^-1 e`` of every row; NaN where the covariance is unknown or not positive definite.
-
-    Parameters
-    ----------
-    errors
-        Shape (n, d).
-    covs
-        Shape (n, d, d).
-    """
+    """``e^T P^-1 e`` of every row of (n, d) and (n, d, d); NaN where P is unknown or not positive definite."""
     squares = np.full(len(errors), np.nan)
     known = np.isfinite(covs).all(axis=(1, 2)) & np.isfinite(errors).all(axis=1)
     variances, axes = np.linalg.eigh(covs[known])
@@ -122,16 +109,9 @@ def mean_normalised(squares: Floats, dof: int) -> float:
 
 
 def anees_over_runs(nees: Floats, dof: int) -> Floats:
-    """Average over independent runs at each instant, divided by the degrees of freedom.
+    """Average of shape (runs, n) over independent runs, divided by the degrees of freedom, shape (n,).
 
-    Parameters
-    ----------
-    nees
-        Shape (runs, n).
-
-    Returns
-    -------
-    Shape (n,); with consistent estimators each value lies in `anees_interval` with the probability given there.
+    With consistent estimators each value lies in `anees_interval` with the probability given there.
     """
     return np.asarray(nees.mean(axis=0) / dof)
 

@@ -74,11 +74,8 @@ def _status_mb(field: str) -> float:
 def check_outcome(causal: Trajectory, smoothed: Trajectory, landmarks: LandmarkMap) -> None:
     """Refuse results that cannot be scored.
 
-    Raises
-    ------
-    EvaluationError
-        When there is no estimate; the smoothed trajectory is not at the causal one's instants; a pose or landmark is
-        not finite; a covariance is neither unknown (all NaN) nor symmetric and positive semidefinite.
+    Raises `EvaluationError` when there is no estimate; the smoothed trajectory is not at the causal one's instants; a
+    pose or landmark is not finite; a covariance is neither unknown (all NaN) nor symmetric and positive semidefinite.
     """
     if not len(causal):
         raise EvaluationError("process never returned an estimate")

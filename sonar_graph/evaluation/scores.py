@@ -43,38 +43,23 @@ def trajectory_scores(
 ) -> dict[str, Score]:
     """Accuracy and consistency of one trajectory, under keys that begin with its kind.
 
-    Parameters
-    ----------
-    estimate, truth
-        At the scored instants.
-    errors
-        Errors of the same two.
-    instants
-        The scored instants in words, for the protocols.
+    Estimate, truth and errors are at the scored instants; ``instants`` has these in words, for the protocols.
     """
     which, over = ESTIMATES[kind], f"over {instants}, to which the truth is interpolated"
     fitted = "without scale (Umeyama 1991), fitted to these instants"
     scores = {
         "ate_raw_m": Score(ate_raw_m(estimate, truth), "m", f"{which}, not aligned: rms of 3-D position error {over}."),
-        "ate_yaw_m": Score(
-            ate_yaw_m(estimate, truth),
-            "m",
-            f"{which}, aligned by yaw and translation {fitted}: rms of 3-D position error {over}.",
-        ),
-        "ate_se2_m": Score(
-            ate_se2_m(estimate, truth),
-            "m",
-            f"{which}, aligned by SE(2) {fitted}: rms of horizontal position error {over}.",
-        ),
-        "ate_se3_m": Score(
-            ate_se3_m(estimate, truth),
-            "m",
-            f"{which}, aligned by SE(3) {fitted}: rms of 3-D position error {over}.",
-        ),
+    }
+    for key, error_m, freedom, what in (
+        ("ate_yaw_m", ate_yaw_m, "yaw and translation", "3-D"),
+        ("ate_se2_m", ate_se2_m, "SE(2)", "horizontal"),
+        ("ate_se3_m", ate_se3_m, "SE(3)", "3-D"),
+    ):
+        protocol = f"{which}, aligned by {freedom} {fitted}: rms of {what} position error {over}."
+        scores[key] = Score(error_m(estimate, truth), "m", protocol)
+    scores |= {
         "yaw_rmse_rad": Score(
-            rmse(yaw_errors_rad(estimate, truth)),
-            "rad",
-            f"{which}, not aligned: rms of wrapped heading error {over}.",
+            rmse(yaw_errors_rad(estimate, truth)), "rad", f"{which}, not aligned: rms of wrapped heading error {over}."
         ),
         "return_error_m": Score(
             return_error_m(estimate, truth),

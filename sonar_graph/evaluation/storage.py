@@ -250,10 +250,7 @@ def write_arrays(path: Path, arrays: Arrays) -> None:
 def read_arrays(path: Path) -> Arrays:
     """The arrays of a file by name.
 
-    Raises
-    ------
-    EvaluationError
-        When the file is missing or damaged.
+    Raises `EvaluationError` when the file is missing or damaged.
     """
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
@@ -330,10 +327,7 @@ def _pack(prefix: str, record: Any) -> Arrays:
 def _unpack(prefix: str, kind: type[T], arrays: Arrays) -> T | None:
     """The dataclass whose fields `_pack` stored; None where it was absent.
 
-    Raises
-    ------
-    EvaluationError
-        Naming the field that is missing.
+    Raises `EvaluationError` naming the field that is missing.
     """
     columns = fields(kind)  # type: ignore[arg-type]  # every kind here is a dataclass
     stored = {column.name: arrays[key] for column in columns if (key := f"{prefix}.{column.name}") in arrays}

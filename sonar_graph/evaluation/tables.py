@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 RUN_COLOURS = 6
 """Colours that a page has for runs; the next run begins anew."""
-LABELS = {
+TRAJECTORY_LABELS = {
     "ate_raw_m": "Position error, not aligned (ATE, RMS)",
     "ate_yaw_m": "Position error, yaw and translation aligned (ATE, RMS)",
     "ate_se2_m": "Horizontal position error, SE(2) aligned (ATE, RMS)",
@@ -31,21 +31,33 @@ LABELS = {
     "return_error_m": "Return error: last position",
     "nees_position": "Position NEES per degree of freedom",
     "nees_yaw": "Yaw NEES",
-    "raw_m": "Horizontal landmark error, not aligned (RMS)",
-    "se2_m": "Horizontal landmark error, SE(2) aligned (RMS)",
-    "count": "Landmarks mapped",
-    "nees": "Landmark NEES per degree of freedom",
-    "used": "Detections used",
-    "refused": "Detections refused",
-    "unnamed": "Detections of no landmark that is probable enough",
-    "nis": "NIS per degree of freedom",
-    "update_median_ms": "Per update, median",
-    "update_p99_ms": "Per update, 99th percentile",
-    "update_max_ms": "Per update, longest",
-    "total_s": "Whole run",
-    "real_time_factor": "Real-time factor: log duration over run time",
-    "peak_mb": "Peak memory added by the run",
 }
+SCORES = {
+    "causal": TRAJECTORY_LABELS,
+    "smoothed": TRAJECTORY_LABELS,
+    "landmarks": {
+        "raw_m": "Horizontal landmark error, not aligned (RMS)",
+        "se2_m": "Horizontal landmark error, SE(2) aligned (RMS)",
+        "count": "Landmarks mapped",
+        "nees": "Landmark NEES per degree of freedom",
+    },
+    "detections": {
+        "used": "Detections used",
+        "refused": "Detections refused",
+        "unnamed": "Detections of no landmark that is probable enough",
+        "nis": "NIS per degree of freedom",
+    },
+    "time": {
+        "update_median_ms": "Per update, median",
+        "update_p99_ms": "Per update, 99th percentile",
+        "update_max_ms": "Per update, longest",
+        "total_s": "Whole run",
+        "real_time_factor": "Real-time factor: log duration over run time",
+    },
+    "memory": {"peak_mb": "Peak memory added by the run"},
+}
+"""Label of every score, by the parts of its key before and after the point."""
+LABELS = {name: label for block in SCORES.values() for name, label in block.items()}
 BLOCKS = {
     "causal": "Causal: what was known at each instant",
     "smoothed": "Smoothed: what is known at the end about each instant",
@@ -147,10 +159,7 @@ def text_table(name: str, title: str, headings: list[str], rows: list[list[str]]
 def as_html(table: Table, *, is_sortable: bool = False) -> str:
     """The table as a ``<table>`` element, all texts escaped.
 
-    Parameters
-    ----------
-    is_sortable
-        Whether headings are buttons and cells say their ``sorting``, for the script of a page.
+    In a sortable one headings are buttons and cells say their ``sorting``, for the script of a page.
     """
 
     def named(text: str, run: int | None) -> str:

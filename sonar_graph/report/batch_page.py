@@ -8,8 +8,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from sonar_graph.batch import LEAST_PAIRS, RESULTS, Metric, RecordedBatch, estimate_sentences, metrics_of
-from sonar_graph.evaluation import Table
+from sonar_graph.batch import LEAST_PAIRS, RESULTS, Metric, RecordedBatch, metrics_of
+from sonar_graph.evaluation import ESTIMATES, Table
 from sonar_graph.files import replacing
 from sonar_graph.report.batch_figures import (
     consistency_drawing,
@@ -128,7 +128,7 @@ def _content(batch: RecordedBatch) -> dict[str, Any]:
         "few_logs": len(batch.logs) <= FEW_LOGS,
         "folded_rows": FOLDED_ROWS,
         "reference": batch.reference,
-        "estimates": estimate_sentences(),
+        "estimates": [f"{sentence}." for sentence in ESTIMATES.values()],
         "failures": failures,
         "failure_drawing": failure_drawing(batch),
         "chapters": chapters,
