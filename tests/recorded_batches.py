@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -61,6 +62,26 @@ def changed(batch: RecordedBatch, contestant: str, column: str, factors: np.ndar
             factor = next(own)
             run = replace(run, values=run.values | {column: run.values[column] * factor})
         runs.append(run)
+    return replace(batch, runs=runs)
+
+
+def updated(
+    batch: RecordedBatch, values: Callable[[RecordedRun], dict[str, float]], contestants: tuple[str, ...] = ()
+) -> RecordedBatch:
+    """The batch, had every run, or those of some contestants, these values too."""
+    some = contestants or batch.contestants
+    runs = [replace(run, values=run.values | values(run)) if run.contestant in some else run for run in batch.runs]
+    return replace(batch, runs=runs)
+
+
+def without(batch: RecordedBatch, column: str, log: str | None = None) -> RecordedBatch:
+    """The batch, had its runs, or those on one log, no column whose name has this part."""
+    runs = [
+        replace(run, values={key: value for key, value in run.values.items() if column not in key})
+        if log in (None, run.log)
+        else run
+        for run in batch.runs
+    ]
     return replace(batch, runs=runs)
 
 

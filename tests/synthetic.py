@@ -13,7 +13,7 @@ from sonar_graph.evaluation.comparison import judge
 from sonar_graph.evaluation.results import Comparison, RunResult, Score
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints, LandmarkDetections
 from sonar_graph.sequence import Sequence
-from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Trajectory
+from sonar_graph.states import DetectionLog, LandmarkMap, Outcome, Refusal, RefusedRow, Trajectory
 
 STEP_NS = 500_000_000
 CORNERS = np.array([[0.0, 0.0], [6.5, 0.0], [6.5, -6.5], [0.0, -6.5], [0.0, 0.0]])
@@ -65,6 +65,23 @@ def with_score(comparison: Comparison, name: str, key: str, score: Score) -> Com
 def with_run(comparison: Comparison, run: RunResult) -> Comparison:
     """The same comparison with the run of that name replaced."""
     return replace(comparison, runs=[run if own.estimator == run.estimator else own for own in comparison.runs])
+
+
+def outlier(stamp_ns: int, distance: float = 100.0) -> RefusedRow:
+    """A refused velocity."""
+    return RefusedRow("dvl", stamp_ns, Refusal.OUTLIER, distance)
+
+
+def late(stamp_ns: int) -> RefusedRow:
+    """A row of the IMU that came too late."""
+    return RefusedRow("imu", stamp_ns, Refusal.LATE, np.nan)
+
+
+def refusing(refused: list[RefusedRow], *names: str) -> Comparison:
+    """A comparison, had some runs refused these rows."""
+    comparison = basin_comparison(60)
+    runs = [replace(run, refused=refused) if run.estimator in names else run for run in comparison.runs]
+    return replace(comparison, runs=runs)
 
 
 def _sequence(stamps: Ints, truth: Trajectory | None, planar: bool) -> Sequence:

@@ -15,31 +15,29 @@ lengths = st.floats(-5, 5)
 
 
 @given(st.tuples(lengths, lengths, lengths), st.tuples(angles, angles, angles))
-def test_mounting_turns_about_z_after_y_after_x(
-    translation_m: tuple[float, float, float], rpy_rad: tuple[float, float, float]
-) -> None:
+def test_mounting_turns_about_z_after_y_after_x(translation_m, rpy_rad):
     body_T_sensor = Mounting(translation_m=translation_m, rpy_rad=rpy_rad).pose()
     expected = Rotation.from_euler("xyz", rpy_rad).as_matrix()  # fixed axes x, y, z: Rz Ry Rx
     np.testing.assert_allclose(body_T_sensor.rotation().matrix(), expected, atol=1e-12)
     np.testing.assert_array_equal(body_T_sensor.translation(), translation_m)
 
 
-def test_start_heading_is_positive_to_the_left() -> None:
+def test_start_heading_is_positive_to_the_left():
     ahead_of_body = Start(position_m=(1.0, 2.0, 0.0), rpy_rad=(0.0, 0.0, np.pi / 2)).pose()
     np.testing.assert_allclose(ahead_of_body.transformFrom(np.array([1.0, 0, 0])), [1, 3, 0], atol=1e-12)
 
 
-def test_sonar_pitched_down_looks_at_the_floor() -> None:
+def test_sonar_pitched_down_looks_at_the_floor():
     body_T_sonar = Mounting(rpy_rad=(0.0, np.radians(30), 0.0)).pose()
     assert body_T_sonar.transformFrom(np.array([1.0, 0, 0]))[2] == pytest.approx(-0.5)
 
 
-def test_calibration_survives_json() -> None:
+def test_calibration_survives_json():
     calibration = Calibration.parse({"imu": {"gyro_noise_density": 1 / 3}, "floor": {"z_m": -1.7, "sigma_m": 0.1}}, "x")
     assert Calibration.model_validate_json(calibration.model_dump_json()) == calibration
 
 
-def test_empty_calibration_is_usable() -> None:
+def test_empty_calibration_is_usable():
     assert Calibration.parse({}, "x") == Calibration()
 
 
@@ -54,7 +52,7 @@ def test_empty_calibration_is_usable() -> None:
         ({"gravity_m_s2": 0}, "gravity_m_s2"),
     ],
 )
-def test_wrong_field_is_refused_by_source_and_name(values: dict[str, object], field: str) -> None:
+def test_wrong_field_is_refused_by_source_and_name(values, field):
     with pytest.raises(CalibrationError) as refusal:
         Calibration.parse(values, "vehicle.toml")
     message = str(refusal.value)
@@ -83,35 +81,35 @@ def test_wrong_field_is_refused_by_source_and_name(values: dict[str, object], fi
         ({"gravity_m_s2": 9810}, "gravity_m_s2: expected m/s² between 9 and 10.5"),
     ],
 )
-def test_a_number_that_nothing_can_have_is_refused(values: dict[str, object], message: str) -> None:
+def test_a_number_that_nothing_can_have_is_refused(values, message):
     with pytest.raises(CalibrationError) as refusal:
         Calibration.parse(values, "vehicle.toml")
     assert message in str(refusal.value)
 
 
-def test_numbers_at_the_edge_of_what_can_be_are_taken() -> None:
+def test_numbers_at_the_edge_of_what_can_be_are_taken():
     exact = {"start": {"rpy_sigma_rad": [0, 0, 0], "rpy_rad": [0, 0, -2 * np.pi]}, "imu": {"gyro_noise_density": 0}}
     at_pole = {"earth_rate_latitude_rad": -np.pi / 2, "gravity_m_s2": 9.832}
     assert Calibration.parse(exact | at_pole, "x").gravity_m_s2 == 9.832
 
 
-def test_every_wrong_field_is_named_at_once() -> None:
+def test_every_wrong_field_is_named_at_once():
     with pytest.raises(CalibrationError, match=r"gravity_m_s2.*nonsense"):
         Calibration.parse({"gravity_m_s2": -1, "nonsense": 1}, "x")
 
 
-def test_calibration_cannot_be_changed() -> None:
+def test_calibration_cannot_be_changed():
     with pytest.raises(ValidationError, match="frozen"):
         Calibration().gravity_m_s2 = 1.0  # type: ignore[misc]
 
 
-def test_every_field_says_what_it_means() -> None:
+def test_every_field_says_what_it_means():
     without = [name for name, field in Calibration().imu.__class__.model_fields.items() if not field.description]
     assert without == ["mounting"]  # its type says it
 
 
 @given(st.floats(20.0, 120.0))
-def test_logarithmic_counts_are_decibels_by_their_span(span: float) -> None:
+def test_logarithmic_counts_are_decibels_by_their_span(span):
     level_db = np.linspace(0, span, 50)
     counts = np.rint(level_db * 255 / span).astype(np.uint8)
     found = SonarImage(decibel_span=span).decibels(counts)
@@ -119,7 +117,7 @@ def test_logarithmic_counts_are_decibels_by_their_span(span: float) -> None:
 
 
 @given(st.floats(0.2, 1.0))
-def test_linear_counts_are_decibels_of_the_amplitude_whatever_the_gamma(gamma: float) -> None:
+def test_linear_counts_are_decibels_of_the_amplitude_whatever_the_gamma(gamma):
     level_db = np.linspace(0, 40, 50)
     counts = (10 ** (level_db / 20)) ** gamma
     found = SonarImage(scale="linear", gamma=gamma, full_scale=1e4).decibels(counts)

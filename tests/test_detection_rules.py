@@ -18,7 +18,7 @@ def test_posteriors_that_were_rounded_to_single_precision_still_are():
 
 
 @pytest.mark.parametrize("row", [[0.5, 0.500002], [-1e-9, 0.5], [0.5, np.nan], [np.inf, 0.0], [2.0, -1.5]])
-def test_what_is_no_posterior_is_told_from_one_beside_it(row: list[float]):
+def test_what_is_no_posterior_is_told_from_one_beside_it(row):
     assert no_posterior(np.array([row, [0.0, 0.0], [1.0, 0.0], [0.5, 0.5]])).tolist() == [True, False, False, False]
 
 

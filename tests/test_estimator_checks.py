@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import count
 from typing import Any
 
@@ -230,33 +229,33 @@ ALL_CHECKS = (*CHECKS, *FILTER_CHECKS)
 
 
 @pytest.mark.parametrize("check", ALL_CHECKS, ids=lambda check: check.__name__)
-def test_estimator_that_keeps_the_contract_passes(check: Check) -> None:
+def test_estimator_that_keeps_the_contract_passes(check):
     check(PlainDeadReckoning)
 
 
 @pytest.mark.parametrize(("broken", "check"), BROKEN, ids=lambda part: part.__name__)
-def test_broken_estimator_fails_the_check_meant_for_it(broken: type[PlainDeadReckoning], check: Check) -> None:
+def test_broken_estimator_fails_the_check_meant_for_it(broken, check):
     with pytest.raises(ContractError):
         check(broken)
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("name", ["dead-reckoning", "ekf-slam", "invariant-ekf", "isam2"])
-def test_estimators_that_come_along_keep_the_contract(name: str, check: Check) -> None:
+def test_estimators_that_come_along_keep_the_contract(name, check):
     check(load_estimator(name))
 
 
 @pytest.mark.parametrize("check", FILTER_CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("name", ["dead-reckoning", "ekf-slam", "invariant-ekf"])
-def test_filters_that_come_along_do_not_care_how_rows_are_cut(name: str, check: Check) -> None:
+def test_filters_that_come_along_do_not_care_how_rows_are_cut(name, check):
     check(load_estimator(name))
 
 
-def test_every_check_has_an_estimator_that_fails_it() -> None:
+def test_every_check_has_an_estimator_that_fails_it():
     assert {check for _, check in BROKEN} == set(ALL_CHECKS)
 
 
-def test_first_violation_is_named() -> None:
+def test_first_violation_is_named():
     check_estimator(PlainDeadReckoning)
     with pytest.raises(ContractError, match="still_vehicle_stays_still: a still vehicle drifts by"):
         check_estimator(CreepsForward)
@@ -271,7 +270,7 @@ def test_first_violation_is_named() -> None:
         (lambda p: -p, "negative eigenvalue"),
     ],
 )
-def test_what_is_no_covariance_is_refused(spoil: Callable[[np.ndarray], np.ndarray], complaint: str) -> None:
+def test_what_is_no_covariance_is_refused(spoil, complaint):
     require_covariance(np.eye(6), 6, "P")
     require_covariance(np.zeros((6, 6)), 6, "P")
     with pytest.raises(ContractError, match=complaint):

@@ -17,14 +17,14 @@ BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
 
 @pytest.fixture
-def table(monkeypatch: pytest.MonkeyPatch) -> Any:
+def table(monkeypatch) -> Any:
     for folder in (BENCHMARKS, BENCHMARKS / "validation"):
         monkeypatch.syspath_prepend(str(folder))
     return importlib.import_module("identities")
 
 
 @pytest.fixture
-def kept(table: Any) -> Any:
+def kept(table) -> Any:
     return importlib.import_module("identity_runs")
 
 
@@ -40,7 +40,7 @@ def runs(kept: Any, *errors_m: float | None) -> list[dict[str, Any]]:
     return [{"dead reckoning": judged(kept, 0.3), "iSAM2, robust": judged(kept, error)} for error in errors_m]
 
 
-def test_a_mean_over_survivors_is_not_given(table: Any, kept: Any) -> None:
+def test_a_mean_over_survivors_is_not_given(table, kept):
     clean = runs(kept, 0.1, 0.1, 0.1, 0.1)
     found = table.summarise(runs(kept, 0.1, None, 0.1, 2.0), clean, "iSAM2, robust")
     assert (found["failed"], found["lost"]) == (0.25, 0.5)
@@ -51,7 +51,7 @@ def test_a_mean_over_survivors_is_not_given(table: Any, kept: Any) -> None:
     assert whole["smoothed_m"] == pytest.approx(0.625)
 
 
-def test_differences_are_paired_by_seed(table: Any, kept: Any) -> None:
+def test_differences_are_paired_by_seed(table, kept):
     clean, wrong = runs(kept, 0.1, 0.2, 0.3), runs(kept, 0.15, 0.25, 0.35)
     found = table.summarise(wrong, clean, "iSAM2, robust")
     assert found["above_clean_m"] == pytest.approx(0.05)
@@ -60,7 +60,7 @@ def test_differences_are_paired_by_seed(table: Any, kept: Any) -> None:
     assert found["loss"] == pytest.approx(0.25)
 
 
-def test_the_best_policy_is_the_one_whose_worst_case_is_best(table: Any, kept: Any, monkeypatch: Any) -> None:
+def test_the_best_policy_is_the_one_whose_worst_case_is_best(table, kept, monkeypatch):
     monkeypatch.setattr(table, "ESTIMATORS", dict.fromkeys(("EKF-SLAM", "iSAM2, a", "iSAM2, b")))
 
     def told(ekf: float, a: float, b: float, b_map: float = 0.0) -> dict[str, dict[str, float]]:
@@ -79,7 +79,7 @@ def test_the_best_policy_is_the_one_whose_worst_case_is_best(table: Any, kept: A
     assert table.best_policy(figures)[1] == np.inf
 
 
-def test_landmarks_that_are_not_found_are_no_gain(table: Any, kept: Any) -> None:
+def test_landmarks_that_are_not_found_are_no_gain(table, kept):
     """One of four landmarks, the best: a small error of the map, and three missing."""
     clean, wrong = runs(kept, 0.1, 0.2), runs(kept, 0.1, 0.05)
     wrong[1]["iSAM2, robust"] = replace(wrong[1]["iSAM2, robust"], landmarks=1)
@@ -88,9 +88,7 @@ def test_landmarks_that_are_not_found_are_no_gain(table: Any, kept: Any) -> None
     assert found["landmark_loss"] < 0
 
 
-def test_what_is_kept_belongs_to_one_run_of_one_version(
-    table: Any, kept: Any, tmp_path: Path, monkeypatch: Any
-) -> None:
+def test_what_is_kept_belongs_to_one_run_of_one_version(table, kept, tmp_path, monkeypatch):
     job = kept.Job(kept.Case(0.1), 3, True, tmp_path)
     name = "iSAM2, robust"
     others = [replace(job, seed=4), replace(job, is_quick=False), replace(job, case=kept.Case(0.1, 5.0))]
@@ -101,7 +99,7 @@ def test_what_is_kept_belongs_to_one_run_of_one_version(
 
 
 @pytest.mark.slow
-def test_a_command_that_is_given_again_gives_the_same_table_from_what_is_kept(tmp_path: Path) -> None:
+def test_a_command_that_is_given_again_gives_the_same_table_from_what_is_kept(tmp_path):
     script = BENCHMARKS / "validation" / "identities.py"
     asked = [sys.executable, str(script), "--quick", "--seeds", "2", "--kinds", "0", "--workers", "2"]
     asked += ["--keep", str(tmp_path)]

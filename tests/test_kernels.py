@@ -37,19 +37,19 @@ def told(folder: Path, program: str = CALLS) -> str:
     return done.stderr
 
 
-def test_the_first_compilation_is_told_once_and_later_ones_are_not(tmp_path: Path) -> None:
+def test_the_first_compilation_is_told_once_and_later_ones_are_not(tmp_path):
     (tmp_path / "loops.py").write_text(KERNELS)
     assert told(tmp_path) == f"{NOTICE}\n"
     assert told(tmp_path) == ""
     assert told(tmp_path, "import loops; assert loops.thrice(1.5) == 4.5") == ""  # compiled, but not the first time
 
 
-def test_other_functions_of_numba_are_none_of_ours(tmp_path: Path) -> None:
+def test_other_functions_of_numba_are_none_of_ours(tmp_path):
     program = "import numba, sonar_graph.numerics.jit; assert numba.njit(lambda x: 2 * x)(2) == 4"
     assert told(tmp_path, program) == ""
 
 
-def test_code_of_any_function_counts_as_cached(tmp_path: Path) -> None:
+def test_code_of_any_function_counts_as_cached(tmp_path):
     (tmp_path / "__pycache__").mkdir()
     assert nothing_is_cached([tmp_path])
     (tmp_path / "__pycache__" / "loops.twice-3.py311.nbi").touch()

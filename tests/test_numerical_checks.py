@@ -26,7 +26,7 @@ def bearing_range_like(wrong: float) -> tuple[gtsam.CustomFactor, gtsam.Values]:
     return gtsam.CustomFactor(NOISE, [7], error), values
 
 
-def test_right_derivatives_pass_and_a_wrong_one_is_named() -> None:
+def test_right_derivatives_pass_and_a_wrong_one_is_named():
     check_jacobians(*bearing_range_like(1.0))
     with pytest.raises(
         AssertionError, match=r"error 1 by direction 0 of 7: the factor says -0\.325\d+, differences say"
@@ -34,12 +34,12 @@ def test_right_derivatives_pass_and_a_wrong_one_is_named() -> None:
         check_jacobians(*bearing_range_like(1.001))
 
 
-def test_a_nan_in_a_jacobian_does_not_pass() -> None:
+def test_a_nan_in_a_jacobian_does_not_pass():
     with pytest.raises(AssertionError, match="nan"):
         check_jacobians(*bearing_range_like(np.nan))
 
 
-def test_columns_belong_to_their_variables() -> None:
+def test_columns_belong_to_their_variables():
     values = gtsam.Values()
     values.insert(3, gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.7, 3.1), np.array([1.0, 2.0, 3.0])))
     values.insert(1, np.array([2.0, -1.0, 0.5]))
@@ -47,7 +47,7 @@ def test_columns_belong_to_their_variables() -> None:
     check_jacobians(factor, values)
 
 
-def test_a_robust_kernel_is_refused_with_advice() -> None:
+def test_a_robust_kernel_is_refused_with_advice():
     robust = gtsam.noiseModel.Robust.Create(
         gtsam.noiseModel.mEstimator.Huber.Create(1.0), gtsam.noiseModel.Unit.Create(3)
     )
@@ -58,7 +58,7 @@ def test_a_robust_kernel_is_refused_with_advice() -> None:
 
 
 @pytest.mark.parametrize(("scale", "said"), [(1.0, None), (0.7, "too large"), (1.4, "too small")])
-def test_covariances_are_judged_on_both_sides(scale: float, said: str | None) -> None:
+def test_covariances_are_judged_on_both_sides(scale, said):
     nees = scale * (np.random.default_rng(3).standard_normal((200, 3)) ** 2).sum(axis=1)
     if said is None:
         check_consistent(nees, dof=3)
@@ -67,7 +67,7 @@ def test_covariances_are_judged_on_both_sides(scale: float, said: str | None) ->
             check_consistent(nees, dof=3)
 
 
-def test_consistent_errors_fail_as_often_as_stated() -> None:
+def test_consistent_errors_fail_as_often_as_stated():
     rng = np.random.default_rng(5)
     failed = 0
     for _ in range(1000):
@@ -79,6 +79,6 @@ def test_consistent_errors_fail_as_often_as_stated() -> None:
 
 
 @pytest.mark.parametrize("nees", [[], [1.0, np.nan]])
-def test_nothing_and_nan_are_no_evidence(nees: list[float]) -> None:
+def test_nothing_and_nan_are_no_evidence(nees):
     with pytest.raises(AssertionError, match="expected finite NEES"):
         check_consistent(nees, dof=1)

@@ -31,7 +31,7 @@ def recording(imu_s: tuple[float, float] = (0.0, 10.0), dvl_s: tuple[float, floa
     )
 
 
-def test_start_and_end_have_both_imu_and_dvl() -> None:
+def test_start_and_end_have_both_imu_and_dvl():
     sequence = recording(imu_s=(0.5, 9.0), dvl_s=(1.0, 8.0))
     assert sequence.start_ns == sequence.dvl.stamps_ns[0]
     assert sequence.end_ns == sequence.dvl.stamps_ns[-1]
@@ -40,7 +40,7 @@ def test_start_and_end_have_both_imu_and_dvl() -> None:
 
 
 @given(st.floats(0.3, 40))
-def test_instants_are_equally_spaced_inside_the_sequence(rate_hz: float) -> None:
+def test_instants_are_equally_spaced_inside_the_sequence(rate_hz):
     sequence = recording()
     instants = sequence.instants(rate_hz)
     step_ns = round(NS_PER_S / rate_hz)
@@ -49,13 +49,13 @@ def test_instants_are_equally_spaced_inside_the_sequence(rate_hz: float) -> None
     assert set(np.diff(instants).tolist()) <= {step_ns}
 
 
-def test_sequence_shorter_than_a_step_is_refused() -> None:
+def test_sequence_shorter_than_a_step_is_refused():
     with pytest.raises(MeasurementError, match=r"too short for 0\.05 Hz"):
         recording().instants(0.05)
 
 
 @given(st.floats(0.3, 40))
-def test_replay_hands_out_every_row_once_and_in_time(rate_hz: float) -> None:
+def test_replay_hands_out_every_row_once_and_in_time(rate_hz):
     sequence = recording()
     steps = list(sequence.replay(sequence.instants(rate_hz)))
     last_ns = steps[-1].end_ns
@@ -69,19 +69,19 @@ def test_replay_hands_out_every_row_once_and_in_time(rate_hz: float) -> None:
             assert step.imu.stamps_ns[-1] <= step.end_ns
 
 
-def test_first_step_of_a_replay_holds_what_came_before_the_start() -> None:
+def test_first_step_of_a_replay_holds_what_came_before_the_start():
     sequence = recording(imu_s=(1.0, 9.0))
     first = next(sequence.replay(sequence.instants(2.0)))
     assert first.depth is not None
     assert first.depth.stamps_ns[0] < sequence.start_ns
 
 
-def test_sensor_that_is_missing_stays_missing() -> None:
+def test_sensor_that_is_missing_stays_missing():
     step = next(recording().replay(recording().instants(1.0)))
     assert step.detections is None
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("inf"), float("nan"), 3e9])
-def test_a_rate_that_is_none_is_refused(rate_hz: float) -> None:
+def test_a_rate_that_is_none_is_refused(rate_hz):
     with pytest.raises(MeasurementError, match="Hz is no rate"):
         recording().instants(rate_hz)

@@ -23,7 +23,7 @@ def turning(n: int = 11, step_rad: float = 0.3) -> Trajectory:
 
 
 @given(angles, st.floats(-1.5, 1.5), angles)
-def test_trajectory_through_estimates_keeps_their_poses(roll: float, pitch: float, yaw: float) -> None:
+def test_trajectory_through_estimates_keeps_their_poses(roll, pitch, yaw):
     pose = gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array([1.0, -2.0, 3.0]))
     covariance = np.diag(np.arange(1.0, 7.0))
     path = Trajectory.from_estimates([Estimate(5, pose, covariance)])
@@ -32,13 +32,13 @@ def test_trajectory_through_estimates_keeps_their_poses(roll: float, pitch: floa
     np.testing.assert_array_equal(path.covariances[0], covariance)
 
 
-def test_trajectory_through_no_estimate_is_empty() -> None:
+def test_trajectory_through_no_estimate_is_empty():
     path = Trajectory.from_estimates([])
     assert len(path) == 0
     assert path.covariances.shape == (0, 6, 6)
 
 
-def test_poses_at_the_own_instants_are_the_own_poses() -> None:
+def test_poses_at_the_own_instants_are_the_own_poses():
     path = turning()
     again = path.at(path.stamps_ns)
     np.testing.assert_allclose(again.positions, path.positions, atol=1e-12)
@@ -46,7 +46,7 @@ def test_poses_at_the_own_instants_are_the_own_poses() -> None:
 
 
 @given(st.floats(0, 1), st.floats(-3, 3))
-def test_interpolation_of_a_steady_turn_is_exact(fraction: float, step_rad: float) -> None:
+def test_interpolation_of_a_steady_turn_is_exact(fraction, step_rad):
     path = turning(3, step_rad)
     stamp_ns = round((1 + fraction) * 1e9)
     there = path.at(np.array([stamp_ns]))
@@ -57,7 +57,7 @@ def test_interpolation_of_a_steady_turn_is_exact(fraction: float, step_rad: floa
     assert abs(dot) == pytest.approx(1, abs=1e-12)
 
 
-def test_interpolation_is_that_of_scipy() -> None:
+def test_interpolation_is_that_of_scipy():
     rng, n = np.random.default_rng(3), 50
     stamps_ns = np.cumsum(rng.integers(1, 10**9, n))
     positions, rotations = rng.normal(size=(n, 3)), Rotation.random(n, rng=rng)
@@ -70,17 +70,17 @@ def test_interpolation_is_that_of_scipy() -> None:
     np.testing.assert_allclose(there.positions, line(asked_ns.astype(float)), atol=1e-12)
 
 
-def test_one_row_is_there_at_its_own_instant_and_no_instants_give_no_rows() -> None:
+def test_one_row_is_there_at_its_own_instant_and_no_instants_give_no_rows():
     one = turning().rows(slice(1))
     np.testing.assert_array_equal(one.at(one.stamps_ns).positions, one.positions)
     assert len(turning().at(np.empty(0, np.int64))) == 0
 
 
-def test_interpolated_poses_claim_no_covariance() -> None:
+def test_interpolated_poses_claim_no_covariance():
     assert np.isnan(turning().at(np.array([5 * 10**8])).covariances).all()
 
 
-def test_interpolation_keeps_nanoseconds_of_an_epoch() -> None:
+def test_interpolation_keeps_nanoseconds_of_an_epoch():
     path = turning(2)
     epoch_ns = 1_700_000_000 * 10**9
     late = Trajectory.without_covariances(path.stamps_ns + epoch_ns, path.positions, path.quaternions_xyzw)
@@ -89,17 +89,17 @@ def test_interpolation_keeps_nanoseconds_of_an_epoch() -> None:
 
 
 @pytest.mark.parametrize("outside_ns", [-1, 10 * 10**9 + 1])
-def test_instants_outside_are_refused(outside_ns: int) -> None:
+def test_instants_outside_are_refused(outside_ns):
     with pytest.raises(MeasurementError, match="outside"):
         turning().at(np.array([outside_ns]))
 
 
-def test_stamps_must_increase_strictly() -> None:
+def test_stamps_must_increase_strictly():
     with pytest.raises(MeasurementError, match="increase"):
         Trajectory.without_covariances(np.array([1, 1]), np.zeros((2, 3)), np.tile([0.0, 0, 0, 1], (2, 1)))
 
 
-def test_rows_select_every_column_alike() -> None:
+def test_rows_select_every_column_alike():
     path = turning()
     part = path.rows(np.array([2, 5]))
     assert part.stamps_ns.tolist() == [2 * 10**9, 5 * 10**9]

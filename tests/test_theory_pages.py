@@ -12,7 +12,7 @@ import cv2
 THEORY = Path(__file__).parents[1] / "docs" / "theory"
 
 
-def test_recognition_quotes_what_its_script_prints_and_draws(tmp_path: Path) -> None:
+def test_recognition_quotes_what_its_script_prints_and_draws(tmp_path):
     picture = tmp_path / "recognition.png"
     command = [sys.executable, "-W", "error", THEORY / "recognition.py", picture]
     done = subprocess.run(command, capture_output=True, text=True, encoding="utf-8", timeout=120)

@@ -15,12 +15,28 @@ TUTORIALS = Path(__file__).parents[1] / "docs" / "tutorials"
 TRUE_LANDMARKS = {1: (5.0, 0.0), 2: (7.0, -5.0), 3: (2.0, -7.0), 4: (0.0, -2.0)}
 
 
-def run(name: str, folder: Path) -> str:
+def output(folder: Path, *command: object, **environment: str) -> str:
+    """Output of a command that ends well; the first word is an installed script."""
+    script, *words = map(str, command)
     done = subprocess.run(
-        [sys.executable, "-W", "error", TUTORIALS / name], cwd=folder, capture_output=True, text=True, timeout=300
+        [Path(sys.executable).parent / script, *words],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        env=os.environ | environment,
     )
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
     return done.stdout
+
+
+def run(name: str, folder: Path) -> str:
+    return output(folder, "python", "-W", "error", TUTORIALS / name)
+
+
+def blocks(page: str, language: str) -> list[str]:
+    """Blocks of a language on a page."""
+    return re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)
 
 
 def number_after(text: str, pattern: str) -> float:
@@ -30,7 +46,7 @@ def number_after(text: str, pattern: str) -> float:
 
 
 @pytest.mark.slow
-def test_first_comparison_finds_the_landmarks_and_writes_a_page_about_every_estimator(tmp_path: Path) -> None:
+def test_first_comparison_finds_the_landmarks_and_writes_a_page_about_every_estimator(tmp_path):
     printed = run("01_first_comparison.py", tmp_path)
     for landmark, true in TRUE_LANDMARKS.items():
         row = re.search(rf"^ +{landmark} +(-?[\d.]+) +(-?[\d.]+) +([\d.]+)$", printed, re.MULTILINE)
@@ -44,7 +60,7 @@ def test_first_comparison_finds_the_landmarks_and_writes_a_page_about_every_esti
         assert (tmp_path / "comparison" / "runs" / name / "trajectory.tum").is_file()
 
 
-def test_library_page_prints_what_it_says(tmp_path: Path) -> None:
+def test_library_page_prints_what_it_says(tmp_path):
     printed = run("02_library.py", tmp_path)
     assert number_after(printed, r"in 10\.00 s:") == pytest.approx(0.39 * 10, abs=1.5)
     assert abs(number_after(printed, "turns it by")) == pytest.approx(1e-4 * 10, rel=0.01)
@@ -54,7 +70,7 @@ def test_library_page_prints_what_it_says(tmp_path: Path) -> None:
     assert 0 < abs(correlation) < 1
 
 
-def test_preintegration_page_finds_the_bias_and_the_way(tmp_path: Path) -> None:
+def test_preintegration_page_finds_the_bias_and_the_way(tmp_path):
     printed = run("05_preintegration.py", tmp_path)
     bias, sigma = number_after(printed, "about z:"), number_after(printed, "±")
     assert abs(bias - 0.01) < 3.5 * sigma < 1e-3
@@ -64,7 +80,7 @@ def test_preintegration_page_finds_the_bias_and_the_way(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_recogniser_page_finds_the_landmark_where_it_is(tmp_path: Path) -> None:
+def test_recogniser_page_finds_the_landmark_where_it_is(tmp_path):
     printed = run("06_recogniser.py", tmp_path)
     last = printed[printed.index("frame 29:") :]
     identity, certainty, range_m = re.search(r"landmark (\d) \(([\d.]+)\) at ([\d.]+)", last).groups()
@@ -76,46 +92,42 @@ def test_recogniser_page_finds_the_landmark_where_it_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_page_on_viewers_has_commands_and_a_program_that_work(tmp_path: Path) -> None:
+def test_page_on_viewers_has_commands_and_a_program_that_work(tmp_path):
     page = (TUTORIALS / "03_viewers.md").read_text(encoding="utf-8")
-    here = Path(sys.executable).parent
-    environment = {**os.environ, "HOME": str(tmp_path), "MPLBACKEND": "Agg"}
-    short = ["basin", "-o", "basin.mcap", "--duration-s", "120", "--laps", "1"]
-    compared = ["basin.mcap", "-o", "comparison", "--estimators", "isam2"]
-    for command in (["simulate", *short], ["compare", *compared]):
-        subprocess.run([here / "sonar-graph", *command], cwd=tmp_path, check=True, capture_output=True)
+    simulated = "simulate basin -o basin.mcap --duration-s 120 --laps 1"
+    for words in (simulated, "compare basin.mcap -o comparison --estimators isam2"):
+        output(tmp_path, "sonar-graph", *words.split())
     lines = re.findall(r"^    (evo_\w+ .*)$|`(evo_\w+ [^`]*)`", page, re.MULTILINE)
     assert len(lines) == 4
-    for name, *words in ((indented or inline).split() for indented, inline in lines):
-        command = [here / name, *words]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=environment, timeout=120)
-        assert done.returncode == 0, f"{name} {words}\n{done.stdout}{done.stderr}"
-        assert "rmse" in done.stdout or "poses" in done.stdout
-    (program,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    seen = re.findall(r"landmark (\d) at (-?[\d.]+), (-?[\d.]+)", done.stdout)
+    for indented, inline in lines:
+        printed = output(tmp_path, *(indented or inline).split(), HOME=str(tmp_path), MPLBACKEND="Agg")
+        assert "rmse" in printed or "poses" in printed
+    (program,) = blocks(page, "python")
+    assert_landmarks_are_true(output(tmp_path, "python", "-c", program), 0.3)
+
+
+def assert_landmarks_are_true(printed: str, off_m: float) -> int:
+    """The number of landmarks that are printed, each near the true one."""
+    seen = re.findall(r"landmark (\d) at (-?[\d.]+), (-?[\d.]+)", printed)
     assert seen
     for landmark, x_m, y_m in seen:
-        assert (float(x_m), float(y_m)) == pytest.approx(TRUE_LANDMARKS[int(landmark)], abs=0.3)
+        assert (float(x_m), float(y_m)) == pytest.approx(TRUE_LANDMARKS[int(landmark)], abs=off_m)
+    return len(seen)
 
 
 @pytest.mark.slow
-def test_page_on_own_logs_has_programs_a_configuration_and_commands_that_work(tmp_path: Path) -> None:
+def test_page_on_own_logs_has_programs_a_configuration_and_commands_that_work(tmp_path):
     page = (TUTORIALS / "04_your_own_log.md").read_text(encoding="utf-8")
-    making, *others = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    (configuration,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    making, *others = blocks(page, "python")
+    (configuration,) = blocks(page, "toml")
     write_ros1_bag(tmp_path / "old.bag")
-    subprocess.run([sys.executable, "-W", "error", "-c", making], cwd=tmp_path, check=True)
+    output(tmp_path, "python", "-W", "error", "-c", making)
     printed = {}
     for line in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE):
         words, _, target = line.partition(" > ")
-        command = [Path(sys.executable).parent / "sonar-graph", *words.split()]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stderr
-        printed[words] = done.stdout
+        printed[words] = output(tmp_path, "sonar-graph", *words.split())
         if target:  # what is printed is a starting point; the page's own text is where the reader ends
-            assert '# topic = "/nav/dvl"\n# type = "my_msgs/msg/Speed"' in done.stdout
+            assert '# topic = "/nav/dvl"\n# type = "my_msgs/msg/Speed"' in printed[words]
             (tmp_path / target).write_text(configuration, encoding="utf-8")
     first, second = printed["inspect dive.mcap"], printed["inspect dive.mcap --log-config dive.toml"]
     assert "not usable for compare: no DVL" in first
@@ -123,7 +135,7 @@ def test_page_on_own_logs_has_programs_a_configuration_and_commands_that_work(tm
     assert "less than the atmosphere's" in first
     assert not {"warning", "not usable", "left out"} & set(re.findall("warning|not usable|left out", second))
     for program in others:
-        subprocess.run([sys.executable, "-W", "error", "-c", program], cwd=tmp_path, check=True)
+        output(tmp_path, "python", "-W", "error", "-c", program)
     assert_is_simulated(tmp_path)
 
 
@@ -156,33 +168,23 @@ def assert_is_simulated(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_page_on_batches_has_a_suite_a_command_and_a_program_that_work(tmp_path: Path) -> None:
+def test_page_on_batches_has_a_suite_a_command_and_a_program_that_work(tmp_path):
     page = (TUTORIALS / "07_batches.md").read_text(encoding="utf-8")
-    (suite,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
-    (program,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (suite,), (program,) = blocks(page, "toml"), blocks(page, "python")
     commands = re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE)
     assert [command.split()[1] for command in commands] == ["lap.toml", "bless", "lap.toml"]
     (tmp_path / "lap.toml").write_text(suite, encoding="utf-8")
     for command in commands:
-        done = subprocess.run(
-            [sys.executable, "-c", "from sonar_graph.cli.main import main; main()", *command.split()],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=600,
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-    assert "Gate: passed, without any test of errors, 8 runs" in done.stdout
-    printed = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, check=True, capture_output=True, text=True
-    ).stdout
+        said = output(tmp_path, "python", "-m", "sonar_graph", *command.split())
+    assert "Gate: passed, without any test of errors, 8 runs" in said
+    printed = output(tmp_path, "python", "-c", program)
     assert len(printed.splitlines()) == 2 * 2 * 2
     assert printed.count("no kernel ok") == 4
-    for cluster in re.findall(r"```python cluster\n(.*?)```", page, re.DOTALL):
+    for cluster in blocks(page, "python cluster"):
         compile(cluster, "cluster.py", "exec")
 
 
-def test_every_tutorial_is_listed_and_run() -> None:
+def test_every_tutorial_is_listed_and_run():
     listed = (TUTORIALS / "README.md").read_text(encoding="utf-8")
     run_here = Path(__file__).read_text(encoding="utf-8")
     for script in TUTORIALS.glob("0*"):
@@ -191,39 +193,26 @@ def test_every_tutorial_is_listed_and_run() -> None:
 
 
 @pytest.mark.slow
-def test_page_on_doubtful_identities_has_commands_and_programs_that_show_what_it_says(tmp_path: Path) -> None:
+def test_page_on_doubtful_identities_has_commands_and_programs_that_show_what_it_says(tmp_path):
     pytest.importorskip("dask", reason="needs sonar-graph[bench]")
     page = (TUTORIALS / "08_doubtful_identities.md").read_text(encoding="utf-8")
-    (suite,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (suite,) = blocks(page, "toml")
     (tmp_path / "policies.toml").write_text(suite, encoding="utf-8")
-    printed = {}
-    for words in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE):
-        command = [Path(sys.executable).parent / "sonar-graph", *words.split()]
-        done = subprocess.run(
-            command, cwd=tmp_path, capture_output=True, text=True, timeout=300, env={**os.environ, "COLUMNS": "300"}
-        )
-        assert done.returncode == 0, done.stderr
-        printed[words] = done.stdout
-    assert (
-        "Warning: isam2 puts landmark 4 far outside its covariance (NEES up to " in printed["run basin.mcap -o robust"]
-    )
-    assert "none of 220 detections has an identity that isam2 can use" in printed["run blind.mcap -o ignored"]
-    associated = printed["run blind.mcap -o found --set isam2.identity.unknown.policy=associate"]
-    assert (
-        "isam2 found 4 landmarks without a name (identity.unknown.policy); scored by place, as 1, 2, 3 and 4."
-        in associated
-    )
-    compared, asked = (
-        subprocess.run(
-            [sys.executable, "-W", "error", "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True
-        ).stdout
-        for program in re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    )
+    printed = {
+        words: output(tmp_path, "sonar-graph", *words.split(), COLUMNS="300")
+        for words in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE)
+    }
+    for words, said in {
+        "run basin.mcap -o robust": "Warning: isam2 puts landmark 4 far outside its covariance (NEES up to ",
+        "run blind.mcap -o ignored": "none of 220 detections has an identity that isam2 can use",
+        "run blind.mcap -o found --set isam2.identity.unknown.policy=associate": (
+            "isam2 found 4 landmarks without a name (identity.unknown.policy); scored by place, as 1, 2, 3 and 4."
+        ),
+    }.items():
+        assert said in printed[words]
+    compared, asked = (output(tmp_path, "python", "-W", "error", "-c", program) for program in blocks(page, "python"))
     off_m = [number_after(compared, rf"{name} [\d.]+") for name in ("default", "gate", "max-mixture", "gnc")]
     assert min(off_m[:2]) > 2
     assert max(off_m[2:]) < 0.1
-    seen = re.findall(r"landmark (\d) at (-?[\d.]+), (-?[\d.]+)", asked)
-    assert len(seen) == 4
-    for landmark, x_m, y_m in seen:
-        assert (float(x_m), float(y_m)) == pytest.approx(TRUE_LANDMARKS[int(landmark)], abs=0.2)
+    assert assert_landmarks_are_true(asked, 0.2) == 4
     assert "withheld: []" in asked

@@ -25,18 +25,16 @@ def told(text: str) -> str:
         ("floor = {z_m = 1, sigma_m = 1, z = 1}", "floor.z", "z_m", "floor has: z_m, sigma_m"),
     ],
 )
-def test_an_unknown_field_is_answered_with_what_is_meant_and_known(
-    text: str, place: str, meant: str, known: str
-) -> None:
+def test_an_unknown_field_is_answered_with_what_is_meant_and_known(text, place, meant, known):
     assert told(text).startswith(f"{place}: there is no such field; did you mean {meant}? {known}")
 
 
-def test_nothing_is_suggested_for_what_resembles_nothing() -> None:
+def test_nothing_is_suggested_for_what_resembles_nothing():
     assert told("wind = 3").startswith("wind: there is no such field; it has: imu, dvl")
 
 
 @pytest.mark.parametrize("values", ["[1.0]", "[1.0, 2.0]", "[1.0, 2.0, 3.0, 4.0]"])
-def test_a_list_of_another_length_is_told_once_with_the_length_expected(values: str) -> None:
+def test_a_list_of_another_length_is_told_once_with_the_length_expected(values):
     fault = f"expected 3 values, not {values}"
     assert told(f"dvl.mounting.translation_m = {values}\nstart.rpy_rad = {values}").split("; ") == [
         f"dvl.mounting.translation_m: {fault}",
@@ -44,14 +42,14 @@ def test_a_list_of_another_length_is_told_once_with_the_length_expected(values: 
     ]
 
 
-def test_other_faults_name_field_expectation_and_value() -> None:
+def test_other_faults_name_field_expectation_and_value():
     assert told("depth.sigma_m = -1.0") == "depth.sigma_m: Input should be greater than 0, not -1.0"
     assert told("floor.z_m = 1") == "floor.sigma_m: is missing"
     assert "not 'aaaa" in told(f"gravity_m_s2 = '{'a' * 500}'")
     assert len(told(f"gravity_m_s2 = '{'a' * 500}'")) < 200
 
 
-def test_sections_are_found_through_optional_fields() -> None:
+def test_sections_are_found_through_optional_fields():
     class Inner(BaseModel):
         model_config = ConfigDict(extra="forbid")
         gain: float = 1

@@ -13,7 +13,7 @@ NOTHING = dict.fromkeys(("smoothed", "causal", "landmarks", "time_s"), float("na
 
 
 @pytest.fixture
-def table(monkeypatch: pytest.MonkeyPatch) -> Any:
+def table(monkeypatch) -> Any:
     monkeypatch.syspath_prepend(str(BENCHMARKS / "validation"))
     return importlib.import_module("mrclam_wrong_ids")
 
@@ -28,7 +28,7 @@ def collected(table: Any, failing: dict[tuple[str, float], int]) -> dict[str, An
     return table.collect(cases, runs)
 
 
-def test_a_mean_is_over_all_robots_or_not_given(table: Any) -> None:
+def test_a_mean_is_over_all_robots_or_not_given(table):
     figures = collected(table, {("isam2 robust", table.SHARE): 1})
     assert figures["isam2_robust_smoothed_wrong"] is None
     assert figures["isam2_robust_growth"] is None
@@ -36,7 +36,7 @@ def test_a_mean_is_over_all_robots_or_not_given(table: Any) -> None:
     assert figures["isam2_gate_smoothed_wrong"] == pytest.approx(0.1)
 
 
-def test_it_passes_only_where_no_run_that_counts_is_lost(table: Any) -> None:
+def test_it_passes_only_where_no_run_that_counts_is_lost(table):
     share = table.SHARE
     assert table.is_met(collected(table, {}))
     assert table.is_met(collected(table, {("isam2 robust", share): 2, ("ekf-slam", 0.0): 5}))

@@ -107,7 +107,7 @@ broken = not_there:Broken
 
 
 @pytest.fixture
-def write_suite(tmp_path: Path) -> WriteSuite:
+def write_suite(tmp_path) -> WriteSuite:
     """Writes a suite from its parts and gives its path."""
 
     def write(*parts: str) -> Path:
@@ -119,7 +119,7 @@ def write_suite(tmp_path: Path) -> WriteSuite:
 
 
 @pytest.fixture
-def misbehaving(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def misbehaving(tmp_path, monkeypatch):
     """Estimators that fail in ways that cannot be caught, found here and in other processes."""
     folder = tmp_path / "site"
     (folder / "misbehaving-1.0.dist-info").mkdir(parents=True)
@@ -139,7 +139,7 @@ def misbehaving(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def planned(write_suite: WriteSuite) -> Callable[..., PlannedRun]:
+def planned(write_suite) -> Callable[..., PlannedRun]:
     """The one run of a suite with a named estimator."""
 
     def plan(estimator: str = "dead-reckoning") -> PlannedRun:

@@ -9,7 +9,7 @@ import signal
 import tempfile
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from sonar_graph.batch.store import Limits, PlannedRun, Progress, RunOutcome, St
 from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import BatchError, EvaluationError
 
-from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
+from .conftest import BASIN, DEAD_RECKONING, HEADER
 
 LIMITS = Limits(600.0)
 HERE = Where(1)
@@ -55,12 +55,12 @@ def do_here(runs: list[PlannedRun], store: Store, *_others: Any) -> None:
 
 
 @pytest.fixture
-def suite(write_suite: WriteSuite) -> Path:
+def suite(write_suite) -> Path:
     return write_suite(HEADER, BASIN, "seeds = 4\n", DEAD_RECKONING)
 
 
 @pytest.fixture
-def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+def in_this_process(monkeypatch):
     monkeypatch.setattr(cluster, "run_batch", do_here)
 
 
@@ -76,9 +76,7 @@ def finished(suite: Path, folder: Path) -> list[dict[str, Any]]:
     return table(folder)
 
 
-def test_resumed_batch_has_the_table_of_an_undisturbed_one(
-    suite: Path, tmp_path: Path, in_this_process: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_resumed_batch_has_the_table_of_an_undisturbed_one(suite, tmp_path, in_this_process, monkeypatch):
     undisturbed = finished(suite, tmp_path / "a")
     assert len({row["causal.ate_raw_m"] for row in undisturbed}) == 4
     done: list[str] = []
@@ -100,9 +98,7 @@ def test_resumed_batch_has_the_table_of_an_undisturbed_one(
     assert len(set(done)) == 3
 
 
-def test_full_disk_is_told_and_loses_no_run_that_is_done(
-    suite: Path, tmp_path: Path, in_this_process: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk_is_told_and_loses_no_run_that_is_done(suite, tmp_path, in_this_process, monkeypatch):
     class Full(Store):
         def write(self, key: str, outcome: RunOutcome) -> None:
             if len(list((self.folder / "runs").iterdir())) == 2:
@@ -135,14 +131,14 @@ def test_full_disk_is_told_and_loses_no_run_that_is_done(
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
 
 
-def test_mistake_in_a_suite_leaves_the_folder_alone(write_suite: WriteSuite, tmp_path: Path) -> None:
+def test_mistake_in_a_suite_leaves_the_folder_alone(write_suite, tmp_path):
     suite = write_suite(HEADER, BASIN, '[[estimators]]\nname = "no such"\n')
     with pytest.raises(BatchError), Batch.opened(read_suite(suite), tmp_path / "out"):
         pass
     assert not (tmp_path / "out").exists()
 
 
-def test_failed_runs_are_kept_until_they_are_discarded(suite: Path, tmp_path: Path, in_this_process: None) -> None:
+def test_failed_runs_are_kept_until_they_are_discarded(suite, tmp_path, in_this_process):
     with Batch.opened(read_suite(suite), tmp_path) as batch:
         batch.store.write(batch.runs[0].key, RunOutcome({"status": "timeout", "reason": "took longer than 1 s"}))
         assert statuses_after(batch) == {"ok": 3, "timeout": 1}
@@ -151,7 +147,7 @@ def test_failed_runs_are_kept_until_they_are_discarded(suite: Path, tmp_path: Pa
         assert statuses_after(batch) == {"ok": 4}
 
 
-def test_second_batch_in_a_folder_is_refused_and_touches_nothing(suite: Path, tmp_path: Path) -> None:
+def test_second_batch_in_a_folder_is_refused_and_touches_nothing(suite, tmp_path):
     folder = tmp_path / "out"
     with Batch.opened(read_suite(suite), folder) as batch:
         half_written = folder / "runs" / f".partial-{batch.runs[0].key}-1"
@@ -183,9 +179,7 @@ def kill(suite: Path, folder: Path, count: int, monkeypatch: pytest.MonkeyPatch)
         batch.run(HERE, LIMITS, nobody)
 
 
-def test_what_a_killed_batch_did_is_read_with_what_it_did_not_do(
-    suite: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_killed_batch_did_is_read_with_what_it_did_not_do(suite, tmp_path, monkeypatch):
     folder = tmp_path / "out"
     kill(suite, folder, 3, monkeypatch)
     batch = read_batch(folder)
@@ -198,18 +192,14 @@ def test_what_a_killed_batch_did_is_read_with_what_it_did_not_do(
     assert whole.runs[:3] == batch.runs
 
 
-def test_batch_killed_before_any_run_is_done_says_what_to_do(
-    suite: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_batch_killed_before_any_run_is_done_says_what_to_do(suite, tmp_path, monkeypatch):
     kill(suite, tmp_path / "out", 0, monkeypatch)
     assert is_batch(tmp_path / "out")
     with pytest.raises(EvaluationError, match=r"before any of its runs was done; give the bench command .* again"):
         read_batch(tmp_path / "out")
 
 
-def test_suite_with_more_seeds_goes_on_in_the_folder_and_another_suite_is_refused(
-    suite: Path, tmp_path: Path, in_this_process: None
-) -> None:
+def test_suite_with_more_seeds_goes_on_in_the_folder_and_another_suite_is_refused(suite, tmp_path, in_this_process):
     folder = tmp_path / "out"
     before = finished(suite, folder)
     suite.write_text(suite.read_text().replace("seeds = 4", "seeds = 5"))
@@ -226,9 +216,7 @@ def test_suite_with_more_seeds_goes_on_in_the_folder_and_another_suite_is_refuse
     assert contents(folder) == kept
 
 
-def test_nothing_in_the_folder_is_replaced_before_a_run_is_done(
-    suite: Path, tmp_path: Path, in_this_process: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_in_the_folder_is_replaced_before_a_run_is_done(suite, tmp_path, in_this_process, monkeypatch):
     folder = tmp_path / "out"
     finished(suite, folder)
     kept = contents(folder)
@@ -244,82 +232,58 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix in (".toml", ".parquet")}
 
 
-def test_timeout_that_is_given_goes_before_the_one_of_the_suite(write_suite: WriteSuite) -> None:
+def test_timeout_that_is_given_goes_before_the_one_of_the_suite(write_suite):
     file = read_suite(write_suite(HEADER, "timeout_s = 7\nmemory_mb = 900\n", BASIN, DEAD_RECKONING))
     assert limits_of(file, None) == Limits(7.0, 900.0)
     assert limits_of(file, 3.0) == Limits(3.0, 900.0)
 
 
-def interrupt() -> None:
-    os.kill(os.getpid(), signal.SIGINT)
+@pytest.fixture
+def handler(request) -> Iterator[Any]:
+    """The handler of interrupts, Python's own or another one; tests must leave it, and that of terminations, as is."""
+    before, terminated = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    given = getattr(request, "param", signal.default_int_handler)
+    signal.signal(signal.SIGINT, given)
+    yield given
+    left = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    signal.signal(signal.SIGINT, before)
+    assert left == (given, terminated)
 
 
-def interrupted_block(steps: list[str]) -> None:
-    with deferred_interrupt():
-        try:
-            interrupt()
-        except KeyboardInterrupt:
-            pytest.fail("swallowed here, and lost")
-        steps.append("went on")
-
-
-def test_interrupt_within_the_block_is_told_at_its_end() -> None:
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    steps: list[str] = []
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            interrupted_block(steps)
-        assert steps == ["went on"]
-        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-def failing_block() -> None:
-    with contextlib.suppress(OSError), deferred_interrupt():
-        interrupt()
-        raise OSError("disk full")
-
-
-def test_interrupt_of_a_block_that_fails_outlives_its_error() -> None:
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            failing_block()
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.parametrize("handler", [signal.default_int_handler, signal.SIG_IGN])
-def test_termination_counts_like_an_interrupt_also_where_shells_let_it_be_ignored(handler: Any) -> None:
-    before = signal.signal(signal.SIGINT, handler), signal.getsignal(signal.SIGTERM)
-    try:
-        with pytest.raises(KeyboardInterrupt), terminations_as_interrupts():
-            os.kill(os.getpid(), signal.SIGTERM)
-        assert signal.getsignal(signal.SIGTERM) is before[1]
-    finally:
-        signal.signal(signal.SIGINT, before[0])
-
-
-def test_termination_is_deferred_like_an_interrupt() -> None:
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupt_or_termination_within_the_block_is_told_at_its_end(handler, number):
     steps: list[str] = []
 
-    def terminated_block() -> None:
+    def interrupted_block() -> None:
         with terminations_as_interrupts(), deferred_interrupt():
-            os.kill(os.getpid(), signal.SIGTERM)
+            try:
+                os.kill(os.getpid(), number)
+            except KeyboardInterrupt:
+                pytest.fail("swallowed here, and lost")
             steps.append("went on")
 
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            terminated_block()
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with pytest.raises(KeyboardInterrupt):
+        interrupted_block()
     assert steps == ["went on"]
 
 
-def test_block_without_interrupt_and_in_another_thread_is_as_without() -> None:
-    handler = signal.getsignal(signal.SIGINT)
+def test_interrupt_of_a_block_that_fails_outlives_its_error(handler):
+    def failing_block() -> None:
+        with contextlib.suppress(OSError), deferred_interrupt():
+            os.kill(os.getpid(), signal.SIGINT)
+            raise OSError("disk full")
+
+    with pytest.raises(KeyboardInterrupt):
+        failing_block()
+
+
+@pytest.mark.parametrize("handler", [signal.default_int_handler, signal.SIG_IGN], indirect=True)
+def test_termination_counts_like_an_interrupt_also_where_shells_let_it_be_ignored(handler):
+    with pytest.raises(KeyboardInterrupt), terminations_as_interrupts():
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def test_block_without_interrupt_and_in_another_thread_is_as_without(handler):
     done = []
 
     def block() -> None:
@@ -332,21 +296,14 @@ def test_block_without_interrupt_and_in_another_thread_is_as_without() -> None:
     with deferred_interrupt():
         done.append(True)
     assert done == [True, True]
-    assert signal.getsignal(signal.SIGINT) is handler
 
 
-def test_error_within_the_block_gives_the_handler_back() -> None:
-    handler = signal.getsignal(signal.SIGINT)
+def test_error_within_the_block_is_not_hidden(handler):
     with pytest.raises(OSError, match="full"), deferred_interrupt():
         raise OSError("full")
-    assert signal.getsignal(signal.SIGINT) is handler
 
 
-def test_interrupt_that_is_ignored_stays_so() -> None:
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with deferred_interrupt():
-            interrupt()
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGINT, before)
+@pytest.mark.parametrize("handler", [signal.SIG_IGN], indirect=True)
+def test_interrupt_that_is_ignored_stays_so(handler):
+    with deferred_interrupt():
+        os.kill(os.getpid(), signal.SIGINT)

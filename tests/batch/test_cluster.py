@@ -13,7 +13,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from sonar_graph.batch.cluster import run_batch
 from sonar_graph.batch.store import Limits, PlannedRun, RunOutcome, Store, Where
 from sonar_graph.errors import BatchError
 
-from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
+from .conftest import BASIN, DEAD_RECKONING, HEADER
 
 ROOT = Path(__file__).parents[2]
 MAIN = """
@@ -46,7 +45,7 @@ def bench(suite: Path, folder: Path, *options: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
-def test_faults_lose_no_run_and_change_no_number() -> None:
+def test_faults_lose_no_run_and_change_no_number():
     done = subprocess.run(
         [sys.executable, str(ROOT / "benchmarks" / "validation" / "batch_faults.py"), "--quick"],
         capture_output=True,
@@ -60,7 +59,7 @@ def test_faults_lose_no_run_and_change_no_number() -> None:
     assert figures["all_ok"] is True
 
 
-def test_rows_that_differ_are_told_apart_and_times_are_not_compared(tmp_path: Path) -> None:
+def test_rows_that_differ_are_told_apart_and_times_are_not_compared(tmp_path):
     faults = load_faults()
     tables = []
     for number, changed in enumerate(({}, {"wall_s": 2.0}, {"causal.ate_raw_m": math.nextafter(0.1, 1)})):
@@ -83,8 +82,8 @@ def load_faults() -> Any:
 
 @pytest.mark.parametrize("ended_by", [signal.SIGINT, signal.SIGTERM])
 def test_interrupt_ends_in_seconds_says_how_to_go_on_and_leaves_no_process(
-    write_suite: WriteSuite, misbehaving: None, tmp_path: Path, ended_by: signal.Signals
-) -> None:
+    write_suite, misbehaving, tmp_path, ended_by
+):
     sleeps = '[[estimators]]\nname = "sleeps"\n'
     suite = write_suite(HEADER, BASIN, "seeds = 2\n", DEAD_RECKONING, sleeps)
     with bench(suite, tmp_path / "out", "--workers", "1") as process:
@@ -107,9 +106,7 @@ def test_interrupt_ends_in_seconds_says_how_to_go_on_and_leaves_no_process(
     assert statuses == ["ok", "not run", "not run", "not run"]
 
 
-def test_failures_are_rows_and_the_exit_code_says_so(
-    write_suite: WriteSuite, misbehaving: None, tmp_path: Path
-) -> None:
+def test_failures_are_rows_and_the_exit_code_says_so(write_suite, misbehaving, tmp_path):
     failing = "".join(f'[[estimators]]\nname = "{name}"\n' for name in ("sleeps", "broken", "dies"))
     suite = write_suite(HEADER, BASIN, DEAD_RECKONING, failing)
     with bench(suite, tmp_path / "out", "--workers", "1", "--timeout", "20") as process:
@@ -123,9 +120,7 @@ def test_failures_are_rows_and_the_exit_code_says_so(
     assert all((tmp_path / "out" / row["log_file"]).is_file() for row in rows)
 
 
-def test_scheduler_that_is_lost_is_told_and_what_is_done_is_kept(
-    write_suite: WriteSuite, misbehaving: None, tmp_path: Path
-) -> None:
+def test_scheduler_that_is_lost_is_told_and_what_is_done_is_kept(write_suite, misbehaving, tmp_path):
     suite = write_suite(HEADER, BASIN, DEAD_RECKONING, '[[estimators]]\nname = "sleeps"\n')
     told = ["--scheduler-file", str(tmp_path / "scheduler.json"), "--no-dashboard"]
     quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
@@ -149,9 +144,7 @@ def test_scheduler_that_is_lost_is_told_and_what_is_done_is_kept(
     assert line.endswith("1 of 2 runs are done and kept; the same command goes on from there")
 
 
-def test_end_of_a_batch_leaves_the_equal_runs_of_another_on_the_scheduler(
-    planned: Callable[..., PlannedRun], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_end_of_a_batch_leaves_the_equal_runs_of_another_on_the_scheduler(planned, tmp_path, monkeypatch):
     """The first batch is waiting while the second one, of the same run, fails and cancels what it asked for."""
     done: list[str] = []
     run = planned()
@@ -180,7 +173,7 @@ def wait_a_second(_run: PlannedRun, limits: Limits) -> RunOutcome:
     return RunOutcome({"status": "ok"})
 
 
-def test_missing_scheduler_is_one_line(write_suite: WriteSuite, tmp_path: Path) -> None:
+def test_missing_scheduler_is_one_line(write_suite, tmp_path):
     with bench(write_suite(), tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9") as process:
         _, said = process.communicate(timeout=120)
     assert process.returncode == 2
@@ -188,7 +181,7 @@ def test_missing_scheduler_is_one_line(write_suite: WriteSuite, tmp_path: Path) 
     assert "no Dask scheduler at tcp://127.0.0.1:9" in said
 
 
-def test_a_script_that_workers_cannot_import_is_told_what_to_write(write_suite: WriteSuite, tmp_path: Path) -> None:
+def test_a_script_that_workers_cannot_import_is_told_what_to_write(write_suite, tmp_path):
     """Without a guard of its main part each worker would begin the batch again."""
     script = tmp_path / "script.py"
     script.write_text(f"""

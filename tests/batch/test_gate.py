@@ -3,17 +3,19 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from sonar_graph.batch.gate import bless, gate, log_ratios, worse_groups
+from sonar_graph.batch.gate import GateVerdict, bless, gate, log_ratios, worse_groups
 from sonar_graph.batch.recorded import RecordedBatch
 from sonar_graph.errors import EvaluationError
-from tests.recorded_batches import ASKED, LOGS, changed, drawn_batch, failed, with_failures
+from tests.recorded_batches import ASKED, LOGS, changed, drawn_batch, failed, updated, with_failures, without
 
 ATE = "causal.ate_se2_m"
+YAW = "causal.yaw_rmse_rad"
 
 
 @pytest.fixture
@@ -26,6 +28,22 @@ def reference(batch, tmp_path):
     path = tmp_path / "reference.json"
     bless(batch, path)
     return path
+
+
+def judged(before: RecordedBatch, after: RecordedBatch, folder: Path) -> GateVerdict:
+    """A batch, held against an earlier one."""
+    bless(before, folder / "before.json")
+    return gate(after, folder / "before.json")
+
+
+def level(batch: RecordedBatch, column: str, value: float) -> RecordedBatch:
+    """The batch, had a column the same value in every run."""
+    return updated(batch, lambda _: {column: value})
+
+
+def factor_of(row: int, factor: float, others: float = 1.0) -> np.ndarray:
+    """Factors of the 24 runs of a contestant, of which one stands out."""
+    return np.where(np.arange(24) == row, factor, others)
 
 
 def noise(seed: int, mean: float, runs: int = 24) -> np.ndarray:
@@ -76,21 +94,18 @@ def test_a_run_that_fails_now_does_not_pass_and_says_why(batch, reference):
 
 def test_a_run_that_failed_before_may_fail_or_end(batch, tmp_path):
     before = with_failures(batch, "isam2", LOGS[0], 1)
-    bless(before, tmp_path / "reference.json")
-    assert gate(before, tmp_path / "reference.json").passed
-    assert gate(batch, tmp_path / "reference.json").passed
+    assert judged(before, before, tmp_path).passed
+    assert judged(before, batch, tmp_path).passed
 
 
 def test_a_lost_score_does_not_pass(batch, reference):
-    runs = [replace(run, values={k: v for k, v in run.values.items() if k != ATE}) for run in batch.runs[:1]]
-    (worsening,) = gate(replace(batch, runs=[*runs, *batch.runs[1:]]), reference).worsenings
+    lost = without(batch, ATE).runs[0]
+    (worsening,) = gate(replace(batch, runs=[lost, *batch.runs[1:]]), reference).worsenings
     assert worsening.column == ATE
 
 
 def test_one_run_that_lost_its_way_is_told_by_its_seed_and_fails_nothing(batch, reference):
-    factors = np.full(24, 0.9)
-    factors[7] = 100.0
-    verdict = gate(changed(batch, "isam2", ATE, factors), reference)
+    verdict = gate(changed(batch, "isam2", ATE, factor_of(7, 100.0, 0.9)), reference)
     assert verdict.passed
     (line,) = verdict.look_at
     assert line.startswith(f"{LOGS[0]}, isam2, seed 7: {ATE} is ")
@@ -98,39 +113,28 @@ def test_one_run_that_lost_its_way_is_told_by_its_seed_and_fails_nothing(batch, 
 
 def test_single_runs_have_no_test_and_are_told_from_a_quarter_on(tmp_path):
     batch = drawn_batch(2, logs=LOGS)
-    bless(batch, tmp_path / "reference.json")
-    assert not gate(changed(batch, "isam2", ATE, 1.24), tmp_path / "reference.json").look_at
-    verdict = gate(changed(batch, "isam2", ATE, 1.26), tmp_path / "reference.json")
+    assert not judged(batch, changed(batch, "isam2", ATE, 1.24), tmp_path).look_at
+    verdict = judged(batch, changed(batch, "isam2", ATE, 1.26), tmp_path)
     assert verdict.passed
     assert verdict.look_at == [f"{log}, isam2: {ATE} is 26% worse; 2 cases here, which no test judges" for log in LOGS]
     assert verdict.untested == ["dead-reckoning", "isam2", "ekf-slam"]
 
 
-def on_recorded_logs(logs: int) -> RecordedBatch:
-    """One run of each contestant on each log, without seeds."""
-    batch = drawn_batch(1, logs=tuple(f"dive {n}" for n in range(logs)))
-    return replace(batch, runs=[replace(run, seed=None) for run in batch.runs])
-
-
 @pytest.mark.parametrize(("logs", "passes"), [(2, True), (3, False), (9, False)])
 def test_recorded_logs_are_cases_of_one_test(tmp_path, logs, passes):
-    batch = on_recorded_logs(logs)
-    bless(batch, tmp_path / "reference.json")
-    verdict = gate(changed(batch, "isam2", ATE, noise(1, 1.5, logs)), tmp_path / "reference.json")
+    batch = drawn_batch(1, logs=tuple(f"dive {n}" for n in range(logs)))
+    batch = replace(batch, runs=[replace(run, seed=None) for run in batch.runs])
+    verdict = judged(batch, changed(batch, "isam2", ATE, noise(1, 1.5, logs)), tmp_path)
     assert verdict.passed is passes
-    assert {(one.log, one.contestant, one.column) for one in verdict.worsenings} == (
-        set() if passes else {("all logs", "isam2", ATE)}
-    )
+    found = {(one.log, one.contestant, one.column) for one in verdict.worsenings}
+    assert found == (set() if passes else {("all logs", "isam2", ATE)})
 
 
-def test_equal_numbers_of_both_estimates_are_one_worsening(batch, reference, tmp_path):
-    smoothed = "smoothed.ate_se2_m"
-    runs = [replace(run, values=run.values | {smoothed: run.values[ATE]}) for run in batch.runs]
-    filters = replace(batch, runs=runs)
-    bless(filters, tmp_path / "filters.json")
-    factors = noise(0, 1.5)
+def test_equal_numbers_of_both_estimates_are_one_worsening(batch, tmp_path):
+    smoothed, factors = "smoothed.ate_se2_m", noise(0, 1.5)
+    filters = updated(batch, lambda run: {smoothed: run.values[ATE]})
     worse = changed(changed(filters, "ekf-slam", ATE, factors), "ekf-slam", smoothed, factors)
-    found = [(one.log, one.column) for one in gate(worse, tmp_path / "filters.json").worsenings]
+    found = [(one.log, one.column) for one in judged(filters, worse, tmp_path).worsenings]
     assert {column for _, column in found} == {f"{ATE}, {smoothed}"}
     assert len(found) == len(set(found)) == 3
 
@@ -175,8 +179,8 @@ def test_a_batch_of_which_no_run_ended_is_no_reference(batch, tmp_path):
 
 def slower(batch: RecordedBatch, factor: float) -> RecordedBatch:
     """The batch, on a machine that takes so many times as long."""
-    runs = [replace(run, values=run.values | {"time.total_s": factor * (3 + 0.1 * run.seed)}) for run in batch.runs]
-    return replace(batch, runs=runs, metrics=[ATE, "time.total_s"])
+    timed = updated(batch, lambda run: {"time.total_s": factor * (3 + 0.1 * run.seed)})
+    return replace(timed, metrics=[ATE, "time.total_s"])
 
 
 def test_a_slower_machine_passes_also_by_a_reference_that_has_times(batch, tmp_path):
@@ -194,26 +198,20 @@ def test_a_slower_machine_passes_also_by_a_reference_that_has_times(batch, tmp_p
 @pytest.mark.parametrize(("factor", "passes"), [(1.09, True), (1.11, False)])
 def test_consistency_may_move_by_a_tenth(batch, tmp_path, factor, passes):
     even = level(batch, "causal.nees_position", 1.5)
-    bless(even, tmp_path / "level.json")
-    assert gate(changed(even, "isam2", "causal.nees_position", factor), tmp_path / "level.json").passed is passes
+    assert judged(even, changed(even, "isam2", "causal.nees_position", factor), tmp_path).passed is passes
 
 
 @pytest.mark.parametrize(("factor", "is_told"), [(1.95, False), (2.05, True)])
 def test_a_run_twice_as_bad_as_the_worst_stands_out(batch, tmp_path, factor, is_told):
     even = level(batch, ATE, 0.5)
-    bless(even, tmp_path / "level.json")
-    factors = np.full(24, 0.8)
-    factors[7] = factor
-    assert bool(gate(changed(even, "isam2", ATE, factors), tmp_path / "level.json").look_at) is is_told
+    assert bool(judged(even, changed(even, "isam2", ATE, factor_of(7, factor, 0.8)), tmp_path).look_at) is is_told
 
 
 def test_missing_runs_are_refused_and_new_ones_named(batch, reference, tmp_path):
-    with pytest.raises(
-        EvaluationError, match="1 of its runs are not in the batch, first basin, dead-reckoning, seed 0"
-    ):
-        gate(replace(batch, runs=batch.runs[1:]), reference)
-    bless(replace(batch, runs=batch.runs[1:]), tmp_path / "fewer.json")
-    assert gate(batch, tmp_path / "fewer.json").new == ["basin, dead-reckoning, seed 0"]
+    fewer = replace(batch, runs=batch.runs[1:])
+    with pytest.raises(EvaluationError, match="1 of its runs are not in the batch, first basin, dead-reckoning, seed"):
+        gate(fewer, reference)
+    assert judged(fewer, batch, tmp_path).new == ["basin, dead-reckoning, seed 0"]
 
 
 def test_what_is_no_reference_is_refused(batch, tmp_path):
@@ -230,18 +228,11 @@ def test_a_batch_in_which_all_failed_does_not_pass(batch, reference):
     assert len(verdict.worsenings) == len(batch.runs)
 
 
-def level(batch: RecordedBatch, column: str, value: float) -> RecordedBatch:
-    """The batch, had a column the same value in every run."""
-    return replace(batch, runs=[replace(run, values=run.values | {column: value}) for run in batch.runs])
-
-
 @pytest.mark.parametrize(("seeds", "told"), [(1, "1 case here"), (2, "2 cases here"), (4, "4 cases here")])
 def test_a_log_with_few_seeds_beside_one_with_many_is_told(tmp_path, seeds, told):
     many = drawn_batch(10)
     batch = replace(many, runs=[run for run in many.runs if run.log == LOGS[0] or run.seed < seeds])
-    bless(batch, tmp_path / "reference.json")
-    factors = [1.0] * 10 + [1.9] * seeds
-    verdict = gate(changed(batch, "isam2", ATE, factors), tmp_path / "reference.json")
+    verdict = judged(batch, changed(batch, "isam2", ATE, [1.0] * 10 + [1.9] * seeds), tmp_path)
     assert verdict.passed
     assert not verdict.untested
     assert verdict.look_at == [f"{LOGS[1]}, isam2: {ATE} is 90% worse; {told}, which no test judges"]
@@ -264,18 +255,14 @@ def test_an_error_of_nothing_has_a_ratio():
 @pytest.mark.parametrize(("seeds", "has_test"), [(2, False), (3, True)])
 def test_three_cases_have_a_test_and_two_are_neither_tested_nor_unmoved(tmp_path, seeds, has_test):
     batch = drawn_batch(seeds)
-    bless(batch, tmp_path / "reference.json")
-    verdict = gate(batch, tmp_path / "reference.json")
+    verdict = judged(batch, batch, tmp_path)
     assert verdict.untested == ([] if has_test else batch.contestants)
     assert verdict.has_test is has_test
     assert verdict.unmoved == (batch.contestants if has_test else [])
 
 
 def test_a_score_that_the_reference_lacks_is_not_judged(batch, tmp_path):
-    runs = [replace(run, values={k: v for k, v in run.values.items() if k != ATE}) for run in batch.runs]
-    lacking = replace(batch, runs=runs)
-    bless(lacking, tmp_path / "reference.json")
-    verdict = gate(batch, tmp_path / "reference.json")
+    verdict = judged(without(batch, ATE), batch, tmp_path)
     assert verdict.passed
     assert not verdict.look_at
 
@@ -290,37 +277,28 @@ def test_a_run_that_did_not_end_leaves_no_score_in_a_reference(batch, tmp_path):
 
 def test_a_run_is_held_against_the_worst_of_its_group_and_not_against_itself(batch, tmp_path):
     even = level(batch, ATE, 0.5)
-    hard = changed(even, "isam2", ATE, np.where(np.arange(24) == 3, 4.0, 1.0))
-    bless(hard, tmp_path / "reference.json")
-    other = changed(even, "isam2", ATE, np.where(np.arange(24) == 7, 6.0, 1.0))
-    assert not gate(other, tmp_path / "reference.json").look_at
-    bless(even, tmp_path / "even.json")
-    assert len(gate(other, tmp_path / "even.json").look_at) == 1
+    hard = changed(even, "isam2", ATE, factor_of(3, 4.0))
+    other = changed(even, "isam2", ATE, factor_of(7, 6.0))
+    assert not judged(hard, other, tmp_path).look_at
+    assert len(judged(even, other, tmp_path).look_at) == 1
 
 
 def test_the_farthest_run_is_told_first_and_by_its_farthest_column(batch, tmp_path):
-    yaw = "causal.yaw_rmse_rad"
-    even = level(level(batch, ATE, 0.5), yaw, 0.01)
-    bless(even, tmp_path / "reference.json")
-    factors = np.where(np.arange(24) == 2, 3.0, np.where(np.arange(24) == 9, 8.0, 1.0))
-    far = changed(changed(even, "isam2", ATE, factors), "isam2", yaw, factors**2)
-    assert [line.split(" is ")[0] for line in gate(far, tmp_path / "reference.json").look_at] == [
-        f"{LOGS[0]}, isam2, seed 9: {yaw}",
-        f"{LOGS[0]}, isam2, seed 2: {yaw}",
-    ]
+    even = level(level(batch, ATE, 0.5), YAW, 0.01)
+    factors = factor_of(2, 3.0) * factor_of(9, 8.0)
+    far = changed(changed(even, "isam2", ATE, factors), "isam2", YAW, factors**2)
+    told = [line.split(" is ")[0] for line in judged(even, far, tmp_path).look_at]
+    assert told == [f"{LOGS[0]}, isam2, seed {seed}: {YAW}" for seed in (9, 2)]
 
 
 def test_a_covariance_that_is_far_off_is_no_error_that_stands_out(batch, reference):
-    factors = np.where(np.arange(24) == 7, 50.0, 1.0)
-    assert not gate(changed(batch, "isam2", "causal.nees_position", factors), reference).look_at
+    assert not gate(changed(batch, "isam2", "causal.nees_position", factor_of(7, 50.0)), reference).look_at
 
 
 def test_without_a_test_a_log_is_told_once_by_what_is_up_most(tmp_path):
-    yaw = "causal.yaw_rmse_rad"
     batch = drawn_batch(2, logs=LOGS[:1])
-    bless(batch, tmp_path / "reference.json")
     for first, second in ((1.3, 1.5), (1.5, 1.3)):
-        up = changed(changed(batch, "isam2", ATE, first), "isam2", yaw, second)
-        (line,) = gate(up, tmp_path / "reference.json").look_at
-        assert line.startswith(f"{LOGS[0]}, isam2: {ATE if first > second else yaw} is 50% worse")
-    assert len(gate(changed(batch, "isam2", ATE, [1.0, 9.0]), tmp_path / "reference.json").look_at) == 1
+        up = changed(changed(batch, "isam2", ATE, first), "isam2", YAW, second)
+        (line,) = judged(batch, up, tmp_path).look_at
+        assert line.startswith(f"{LOGS[0]}, isam2: {ATE if first > second else YAW} is 50% worse")
+    assert len(judged(batch, changed(batch, "isam2", ATE, [1.0, 9.0]), tmp_path).look_at) == 1

@@ -26,7 +26,7 @@ from sonar_graph.simulation.landmarks_on_log import LandmarkOptions, add_landmar
 Planned = Callable[..., PlannedRun]
 
 
-def test_scores_are_those_of_compare_bit_for_bit(planned: Planned, tmp_path: Path) -> None:
+def test_scores_are_those_of_compare_bit_for_bit(planned, tmp_path):
     row = perform(planned("isam2"), tmp_path / "run")
     comparison = compare(simulate_basin(BasinOptions(duration_s=120, laps=1)), ["isam2"])
     scores = {key: score.value for key, score in comparison.scores["isam2"].items()}
@@ -36,7 +36,7 @@ def test_scores_are_those_of_compare_bit_for_bit(planned: Planned, tmp_path: Pat
     assert set(row) - set(METRICS) - set(COLUMNS) == {name for name in row if name.endswith(("_dof", "_end"))}
 
 
-def test_all_libraries_that_are_in_the_key_are_in_the_row(planned: Planned, tmp_path: Path) -> None:
+def test_all_libraries_that_are_in_the_key_are_in_the_row(planned, tmp_path):
     run = planned()
     row = perform(run, tmp_path / "run")
     libraries = {"gtsam", "numpy", "scipy", "numba"}
@@ -44,7 +44,7 @@ def test_all_libraries_that_are_in_the_key_are_in_the_row(planned: Planned, tmp_
     assert libraries <= set(COLUMNS)
 
 
-def test_nees_at_the_end_is_that_of_the_last_error(planned: Planned, tmp_path: Path) -> None:
+def test_nees_at_the_end_is_that_of_the_last_error(planned, tmp_path):
     row = perform(planned(), tmp_path / "run")
     (errors,) = read_comparison(tmp_path / "run").errors.values()
     causal = errors["causal"]
@@ -57,14 +57,14 @@ def test_nees_at_the_end_is_that_of_the_last_error(planned: Planned, tmp_path: P
     assert row["scored_instants"] == len(causal.stamps_ns)
 
 
-def test_same_run_gives_the_same_bits(planned: Planned, tmp_path: Path) -> None:
+def test_same_run_gives_the_same_bits(planned, tmp_path):
     first, second = (perform(planned(), tmp_path / name) for name in ("a", "b"))
     assert {k: v for k, v in first.items() if not is_timing(k)} == {k: v for k, v in second.items() if not is_timing(k)}
     other = perform(replace(planned(), seed=1), tmp_path / "c")
     assert other["causal.ate_raw_m"] != first["causal.ate_raw_m"]
 
 
-def test_log_that_cannot_be_read_is_a_row_with_a_reason(planned: Planned, tmp_path: Path) -> None:
+def test_log_that_cannot_be_read_is_a_row_with_a_reason(planned, tmp_path):
     log = tmp_path / "dive.mcap"
     log.write_bytes(b"not a log")
     row = perform(of_log(planned(), log), tmp_path / "run")
@@ -78,9 +78,7 @@ def of_log(run: PlannedRun, log: Path) -> PlannedRun:
     return replace(run, kind="mcap", options=options, content=fingerprint("mcap", options), seed=None)
 
 
-def test_run_of_a_changed_log_uses_the_new_content(
-    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_run_of_a_changed_log_uses_the_new_content(planned, tmp_path, monkeypatch):
     """A process that has the old sequence in hand gets a run that was planned with the new file."""
     log = log_with_duration(tmp_path, monkeypatch, 120)
     short = perform(of_log(planned(), log), tmp_path / "short")
@@ -89,9 +87,7 @@ def test_run_of_a_changed_log_uses_the_new_content(
     assert long["scored_instants"] > short["scored_instants"] > 0
 
 
-def test_log_that_changed_since_it_was_planned_gives_no_result(
-    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_log_that_changed_since_it_was_planned_gives_no_result(planned, tmp_path, monkeypatch):
     log = log_with_duration(tmp_path, monkeypatch, 120)
     run = of_log(planned(), log)
     log.write_text("150")
@@ -99,9 +95,7 @@ def test_log_that_changed_since_it_was_planned_gives_no_result(
         perform(run, tmp_path / "run")
 
 
-def test_log_that_changes_while_it_is_read_gives_no_result(
-    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_log_that_changes_while_it_is_read_gives_no_result(planned, tmp_path, monkeypatch):
     log = log_with_duration(tmp_path, monkeypatch, 120)
     run, read = of_log(planned(), log), one_run.read_source
 
@@ -128,9 +122,7 @@ def log_with_duration(folder: Path, monkeypatch: pytest.MonkeyPatch, duration_s:
     return log
 
 
-def test_landmarks_on_a_log_are_those_of_the_seed(
-    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_landmarks_on_a_log_are_those_of_the_seed(planned, tmp_path, monkeypatch):
     log = log_with_duration(tmp_path, monkeypatch, 120)
     run = replace(of_log(planned(), log), landmarks={}, seed=1)
     used: list[Sequence] = []
@@ -152,14 +144,14 @@ def map_of(sequence: Sequence) -> list[list[float]]:
     return positions
 
 
-def test_estimator_that_fails_is_a_row_with_a_reason(planned: Planned, misbehaving: None, tmp_path: Path) -> None:
+def test_estimator_that_fails_is_a_row_with_a_reason(planned, misbehaving, tmp_path):
     row = perform(planned("prints"), tmp_path / "run")
     assert row["status"] == "failed"
     assert str(row["reason"]).endswith("RuntimeError: diverged")
     assert not [name for name in row if name.startswith("causal.")]
 
 
-def test_other_versions_than_planned_are_no_result(planned: Planned, tmp_path: Path) -> None:
+def test_other_versions_than_planned_are_no_result(planned, tmp_path):
     run = planned()
     with pytest.raises(BatchError, match=r"a worker has gtsam 4\.3\S*, planned with gtsam 4\.2; install the same"):
         perform(replace(run, versions=run.versions | {"gtsam": "4.2"}), tmp_path / "run")
@@ -167,9 +159,7 @@ def test_other_versions_than_planned_are_no_result(planned: Planned, tmp_path: P
         perform(replace(run, versions=run.versions | {"source": "changed"}), tmp_path / "run")
 
 
-def test_estimator_that_changes_during_a_run_gives_no_result(
-    planned: Planned, misbehaving: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_estimator_that_changes_during_a_run_gives_no_result(planned, misbehaving, tmp_path, monkeypatch):
     """It is changed after the first look at its source, and before it runs: it may import more of it only then."""
     module = tmp_path / "site" / "misbehaving.py"
     run = planned("prints")
@@ -185,9 +175,7 @@ def test_estimator_that_changes_during_a_run_gives_no_result(
         perform(run, tmp_path / "after")
 
 
-def test_estimator_is_loaded_between_two_looks_at_its_source(
-    planned: Planned, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_estimator_is_loaded_between_two_looks_at_its_source(planned, tmp_path, monkeypatch):
     run, order = planned(), []
     monkeypatch.delitem(sys.modules, "baselines.dead_reckoning")
     for name in ("versions_of", "load_estimator", "run_estimator", "sources_now"):
@@ -202,7 +190,7 @@ def test_estimator_is_loaded_between_two_looks_at_its_source(
     assert order == ["versions_of", "load_estimator", "run_estimator", "sources_now"]
 
 
-def test_folder_that_cannot_be_written_is_no_result(planned: Planned, tmp_path: Path) -> None:
+def test_folder_that_cannot_be_written_is_no_result(planned, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match="file"):
         perform(planned(), tmp_path / "file")

@@ -33,7 +33,7 @@ def key(write_suite: WriteSuite, *parts: str) -> str:
     return run.key
 
 
-def test_every_combination_is_planned_once_in_order(write_suite: WriteSuite) -> None:
+def test_every_combination_is_planned_once_in_order(write_suite):
     runs = planned(
         write_suite,
         HEADER,
@@ -60,17 +60,17 @@ def test_every_combination_is_planned_once_in_order(write_suite: WriteSuite) -> 
         (HEADER, BASIN, DEAD_RECKONING),
     ],
 )
-def test_key_changes_with_all_that_decides_the_numbers(write_suite: WriteSuite, parts: tuple[str, ...]) -> None:
+def test_key_changes_with_all_that_decides_the_numbers(write_suite, parts):
     assert key(write_suite, *parts) != key(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2)
 
 
-def test_key_changes_with_the_version(write_suite: WriteSuite, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_key_changes_with_the_version(write_suite, monkeypatch):
     before = key(write_suite)
     monkeypatch.setattr(plan, "versions_of", lambda _name: {"sonar_graph": "another"})
     assert key(write_suite) != before
 
 
-def test_key_changes_with_landmarks_on_a_log(write_suite: WriteSuite) -> None:
+def test_key_changes_with_landmarks_on_a_log(write_suite):
     log = '[[logs]]\nname = "park"\ndataset = "victoria-park"\n'
     placed = [
         key(write_suite, HEADER, log, f"landmarks = {{ {text} }}\n", DEAD_RECKONING)
@@ -79,7 +79,7 @@ def test_key_changes_with_landmarks_on_a_log(write_suite: WriteSuite) -> None:
     assert len({key(write_suite, HEADER, log, DEAD_RECKONING), *placed}) == 3
 
 
-def test_key_does_not_change_with_names_or_with_defaults_written_out(write_suite: WriteSuite) -> None:
+def test_key_does_not_change_with_names_or_with_defaults_written_out(write_suite):
     same = key(
         write_suite,
         HEADER_OF_ISAM2.replace("short", "another") + "timeout_s = 9\n",
@@ -91,7 +91,7 @@ def test_key_does_not_change_with_names_or_with_defaults_written_out(write_suite
     assert same == key(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2)
 
 
-def test_of_a_log_the_content_counts_and_not_the_place(tmp_path: Path) -> None:
+def test_of_a_log_the_content_counts_and_not_the_place(tmp_path):
     (tmp_path / "other").mkdir()
     paths = [tmp_path / "a.mcap", tmp_path / "other" / "b.mcap", tmp_path / "c.mcap"]
     for path, content in zip(paths, (b"log", b"log", b"lob"), strict=True):
@@ -103,7 +103,7 @@ def test_of_a_log_the_content_counts_and_not_the_place(tmp_path: Path) -> None:
     assert fingerprint(LOG, {"log": str(paths[0])}) == changed
 
 
-def test_folders_whose_files_end_elsewhere_have_another_content(tmp_path: Path) -> None:
+def test_folders_whose_files_end_elsewhere_have_another_content(tmp_path):
     """Names and contents of both are the same characters one after the other."""
     for name, files in (("one", {"a": "b", "c": ""}), ("two", {"a": "", "bc": ""}), ("three", {"abc": ""})):
         (tmp_path / name).mkdir()
@@ -113,7 +113,7 @@ def test_folders_whose_files_end_elsewhere_have_another_content(tmp_path: Path) 
     assert len(set(folders)) == 3
 
 
-def test_key_changes_with_the_class_behind_the_name(write_suite: WriteSuite, misbehaving: None, tmp_path: Path) -> None:
+def test_key_changes_with_the_class_behind_the_name(write_suite, misbehaving, tmp_path):
     suite = (HEADER.replace("dead-reckoning", "dies"), BASIN, '[[estimators]]\nname = "dies"\n')
     before = key(write_suite, *suite)
     points = tmp_path / "site" / "misbehaving-1.0.dist-info" / "entry_points.txt"
@@ -123,7 +123,7 @@ def test_key_changes_with_the_class_behind_the_name(write_suite: WriteSuite, mis
     versions_of.cache_clear()
 
 
-def test_key_changes_with_the_version_of_python(write_suite: WriteSuite, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_key_changes_with_the_version_of_python(write_suite, monkeypatch):
     before = key(write_suite)
     versions_of.cache_clear()
     with monkeypatch.context() as patch:
@@ -132,23 +132,23 @@ def test_key_changes_with_the_version_of_python(write_suite: WriteSuite, monkeyp
     versions_of.cache_clear()
 
 
-def test_run_has_the_content_that_its_key_is_made_of(write_suite: WriteSuite) -> None:
+def test_run_has_the_content_that_its_key_is_made_of(write_suite):
     (run,) = planned(write_suite)
     assert run.content == fingerprint(run.kind, run.options)
 
 
-def test_estimator_that_cannot_be_loaded_is_planned(write_suite: WriteSuite, misbehaving: None) -> None:
+def test_estimator_that_cannot_be_loaded_is_planned(write_suite, misbehaving):
     runs = planned(write_suite, HEADER, BASIN, DEAD_RECKONING, '[[estimators]]\nname = "broken"\nparams = { a = 1 }\n')
     assert runs[1].params == {"a": 1}
 
 
-def test_settings_that_exclude_each_other_are_told_with_line_and_key(write_suite: WriteSuite) -> None:
+def test_settings_that_exclude_each_other_are_told_with_line_and_key(write_suite):
     text = 'params = { identity.policy = "gnc" }\ngrid = { history.policy = ["whole", "bounded"] }\n'
     with pytest.raises(BatchError, match=r'line 11: estimators\.0\.grid\.history: .*"gnc", which chooses anew'):
         planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2, text)
 
 
-def test_what_was_asked_for_is_what_the_suite_states(write_suite: WriteSuite) -> None:
+def test_what_was_asked_for_is_what_the_suite_states(write_suite):
     (run,) = planned(
         write_suite,
         HEADER_OF_ISAM2,
@@ -167,9 +167,7 @@ def test_what_was_asked_for_is_what_the_suite_states(write_suite: WriteSuite) ->
     }
 
 
-def test_files_are_asked_for_by_content_and_landmarks_as_they_are_stated(
-    write_suite: WriteSuite, tmp_path: Path
-) -> None:
+def test_files_are_asked_for_by_content_and_landmarks_as_they_are_stated(write_suite, tmp_path):
     park = '[[logs]]\nname = "park"\ndataset = "victoria-park"\nlandmarks = { frame_rate_hz = 3 }\n'
     (run,) = planned(write_suite, HEADER, park, DEAD_RECKONING)
     assert run.asked["files"] == {"file": fingerprint("victoria-park", {})["file"]}
@@ -182,7 +180,7 @@ def test_files_are_asked_for_by_content_and_landmarks_as_they_are_stated(
     assert len(run.asked["files"]["folder"]) == 64
 
 
-def test_content_of_a_folder_has_what_lies_behind_links(tmp_path: Path) -> None:
+def test_content_of_a_folder_has_what_lies_behind_links(tmp_path):
     for name in ("data", "elsewhere"):
         (tmp_path / name).mkdir()
     (tmp_path / "elsewhere" / "a.csv").write_text("1")
@@ -196,7 +194,7 @@ Hashed = Callable[[], str]
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def package(tmp_path, monkeypatch) -> Path:
     folder = tmp_path / "first" / "hashed_package"
     (folder / "inner").mkdir(parents=True)
     (folder / "__init__.py").write_text("raise RuntimeError('imported')\n")
@@ -215,7 +213,7 @@ def hashed() -> Iterator[Hashed]:
     source_hash.cache_clear()
 
 
-def test_hash_changes_with_code_data_and_names(package: Path, hashed: Hashed) -> None:
+def test_hash_changes_with_code_data_and_names(package, hashed):
     hashes = [hashed()]
     (package / "__init__.py").write_text("raise RuntimeError('Imported')\n")
     hashes.append(hashed())
@@ -229,9 +227,7 @@ def test_hash_changes_with_code_data_and_names(package: Path, hashed: Hashed) ->
     assert "" not in hashes
 
 
-def test_hash_is_of_neither_bytecode_nor_hidden_files_nor_place(
-    package: Path, hashed: Hashed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hash_is_of_neither_bytecode_nor_hidden_files_nor_place(package, hashed, tmp_path, monkeypatch):
     before = hashed()
     (package / "__pycache__").mkdir()
     (package / "__pycache__" / "kernel.nbi").write_text("compiled")
@@ -244,7 +240,7 @@ def test_hash_is_of_neither_bytecode_nor_hidden_files_nor_place(
     assert hashed() == before
 
 
-def test_hash_of_a_module_is_of_its_file(tmp_path: Path, hashed: Hashed, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hash_of_a_module_is_of_its_file(tmp_path, hashed, monkeypatch):
     assert hashed() == ""
     (tmp_path / "hashed_package.py").write_text("a = 1\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -253,14 +249,14 @@ def test_hash_of_a_module_is_of_its_file(tmp_path: Path, hashed: Hashed, monkeyp
     assert len({"", first, hashed()}) == 3
 
 
-def test_hash_is_taken_once_in_a_process(package: Path, hashed: Hashed) -> None:
+def test_hash_is_taken_once_in_a_process(package, hashed):
     before = hashed()
     (package / "__init__.py").write_text("")
     assert source_hash("hashed_package") == before
     assert source_hash_now("hashed_package") == hashed() != before
 
 
-def test_look_at_the_disk_sees_a_change_of_equal_size_and_time(package: Path, hashed: Hashed) -> None:
+def test_look_at_the_disk_sees_a_change_of_equal_size_and_time(package, hashed):
     before, code = hashed(), package / "__init__.py"
     state = code.stat()
     code.write_text("raise RuntimeError('Imported')\n")
@@ -269,7 +265,7 @@ def test_look_at_the_disk_sees_a_change_of_equal_size_and_time(package: Path, ha
     assert source_hash_now("hashed_package") != before
 
 
-def test_files_that_differ_in_where_name_and_content_end_have_another_hash(package: Path, hashed: Hashed) -> None:
+def test_files_that_differ_in_where_name_and_content_end_have_another_hash(package, hashed):
     """Without lengths, the names and contents of both packages are the same characters one after the other."""
     (package / "__init__.py").write_text("")
     (package / "inner" / "data.json").unlink()
@@ -281,7 +277,7 @@ def test_files_that_differ_in_where_name_and_content_end_have_another_hash(packa
 
 
 @pytest.mark.slow
-def test_key_changes_with_a_changed_checkout(write_suite: WriteSuite, tmp_path: Path) -> None:
+def test_key_changes_with_a_changed_checkout(write_suite, tmp_path):
     """Another process has a copy of the package in which one comment was added, under the same version."""
     import baselines
     import sonar_graph
@@ -313,13 +309,13 @@ def keys_by(code: Path, suite: Path) -> list[str]:
     return subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout.split()
 
 
-def test_estimator_of_another_package_has_the_hash_of_that(misbehaving: None) -> None:
+def test_estimator_of_another_package_has_the_hash_of_that(misbehaving):
     assert versions_of("dies")["estimator_source"] == source_hash("misbehaving") != ""
     assert versions_of("broken")["estimator_source"] == ""
     assert versions_of("isam2")["estimator_source"] == versions_of("dies")["source"] == source_hash("sonar_graph")
 
 
-def test_code_behind_a_link_counts_and_links_in_a_circle_end(package: Path, hashed: Hashed, tmp_path: Path) -> None:
+def test_code_behind_a_link_counts_and_links_in_a_circle_end(package, hashed, tmp_path):
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "linked.py").write_text("a = 1\n")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -13,10 +12,10 @@ from sonar_graph.batch.result_table import COLUMNS, SUITE_METADATA, is_timing, w
 from sonar_graph.batch.store import RunOutcome, Store
 from sonar_graph.batch.suite import read_suite
 
-from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
+from .conftest import BASIN, DEAD_RECKONING, HEADER
 
 
-def test_table_has_a_row_for_each_planned_run_in_the_order_of_the_plan(write_suite: WriteSuite, tmp_path: Path) -> None:
+def test_table_has_a_row_for_each_planned_run_in_the_order_of_the_plan(write_suite, tmp_path):
     file = read_suite(write_suite(HEADER, BASIN, "seeds = 4\n", DEAD_RECKONING))
     runs, store = plan_runs(file), Store(tmp_path / "out")
     for run, error_m in ((runs[2], 0.3), (runs[0], 0.1)):
@@ -37,14 +36,14 @@ def test_table_has_a_row_for_each_planned_run_in_the_order_of_the_plan(write_sui
     assert about["reference"] == "dead-reckoning"
 
 
-def test_table_of_a_batch_without_any_run_has_the_columns(write_suite: WriteSuite, tmp_path: Path) -> None:
+def test_table_of_a_batch_without_any_run_has_the_columns(write_suite, tmp_path):
     file = read_suite(write_suite())
     table = pq.read_table(write_results(Store(tmp_path), file.suite, plan_runs(file)))
     assert table.column_names == [*COLUMNS]
     assert table["status"].to_pylist() == ["not run"]
 
 
-def test_times_and_memory_alone_may_differ_between_equal_runs() -> None:
+def test_times_and_memory_alone_may_differ_between_equal_runs():
     timings = {"wall_s", "cpu_s", "peak_memory_mb", "update_p99_ms", "time.total_s", "memory.peak_mb"}
     assert all(map(is_timing, timings))
     assert not any(map(is_timing, ("key", "causal.ate_raw_m", "scored_instants", "machine", "status")))

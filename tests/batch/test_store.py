@@ -26,7 +26,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
 
 
-def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
+def test_what_is_written_is_what_is_read(tmp_path):
     store = Store(tmp_path)
     assert store.row("k") is None
     store.write("k", OUTCOME)
@@ -36,9 +36,7 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("last", range(4))
-def test_full_disk_leaves_nothing_of_the_run_and_all_of_the_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, last: int
-) -> None:
+def test_full_disk_leaves_nothing_of_the_run_and_all_of_the_others(tmp_path, monkeypatch, last):
     store = Store(tmp_path)
     store.write("done", OUTCOME)
     before = names(tmp_path)
@@ -61,7 +59,7 @@ def test_full_disk_leaves_nothing_of_the_run_and_all_of_the_others(
     assert not list((tmp_path / "runs").glob(".*"))
 
 
-def test_process_that_dies_before_the_rename_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_process_that_dies_before_the_rename_leaves_no_run(tmp_path, monkeypatch):
     store = Store(tmp_path)
 
     class Died(BaseException):
@@ -82,9 +80,7 @@ def test_process_that_dies_before_the_rename_leaves_no_run(tmp_path: Path, monke
 
 
 @pytest.mark.parametrize("act", ["discard", "write"])
-def test_process_that_dies_while_it_removes_a_run_leaves_it_whole_or_not_at_all(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, act: str
-) -> None:
+def test_process_that_dies_while_it_removes_a_run_leaves_it_whole_or_not_at_all(tmp_path, monkeypatch, act):
     store = Store(tmp_path)
     store.write("k", OUTCOME)
     whole = names(store.run_folder("k"))
@@ -107,7 +103,7 @@ def test_process_that_dies_while_it_removes_a_run_leaves_it_whole_or_not_at_all(
     assert names(tmp_path) == [f"runs/k/{name}" for name in whole]
 
 
-def test_row_that_the_machine_lost_counts_as_not_done(tmp_path: Path) -> None:
+def test_row_that_the_machine_lost_counts_as_not_done(tmp_path):
     store = Store(tmp_path)
     store.write("k", OUTCOME)
     (store.run_folder("k") / "row.json").write_bytes(b"")
@@ -116,7 +112,7 @@ def test_row_that_the_machine_lost_counts_as_not_done(tmp_path: Path) -> None:
     assert store.row("k") == OUTCOME.row
 
 
-def test_row_of_another_run_counts_as_not_done(tmp_path: Path) -> None:
+def test_row_of_another_run_counts_as_not_done(tmp_path):
     store = Store(tmp_path)
     for key, error_m in (("a", 1.0), ("b", 2.0)):
         store.write(key, RunOutcome({"status": "ok", "error_m": error_m}))
@@ -152,14 +148,14 @@ def another_process_in(folder: Path) -> Iterator[tuple[subprocess.Popen[str], in
             os.kill(child, 9)
 
 
-def test_second_process_is_refused_in_one_line_that_says_what_to_do(tmp_path: Path) -> None:
+def test_second_process_is_refused_in_one_line_that_says_what_to_do(tmp_path):
     with another_process_in(tmp_path), pytest.raises(BatchError) as refused, only_batch_in(tmp_path):
         pass
     assert str(refused.value).startswith(f"{tmp_path}: another batch is running in this folder; ")
     assert "\n" not in str(refused.value)
 
 
-def test_killed_batch_leaves_no_lock_although_its_children_live(tmp_path: Path) -> None:
+def test_killed_batch_leaves_no_lock_although_its_children_live(tmp_path):
     with another_process_in(tmp_path) as (process, child):
         process.kill()
         process.wait()
@@ -168,14 +164,14 @@ def test_killed_batch_leaves_no_lock_although_its_children_live(tmp_path: Path) 
             assert (tmp_path / ".lock").exists()
 
 
-def test_lock_ends_with_the_block_also_by_an_error(tmp_path: Path) -> None:
+def test_lock_ends_with_the_block_also_by_an_error(tmp_path):
     with pytest.raises(KeyboardInterrupt), only_batch_in(tmp_path):
         raise KeyboardInterrupt
     with only_batch_in(tmp_path):
         pass
 
 
-def test_other_folders_are_free(tmp_path: Path) -> None:
+def test_other_folders_are_free(tmp_path):
     (tmp_path / "other").mkdir()
     with only_batch_in(tmp_path), only_batch_in(tmp_path / "other"):
         pass
@@ -183,7 +179,7 @@ def test_other_folders_are_free(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="other locks")
 @pytest.mark.parametrize("number", [errno.ENOSYS, errno.ENOLCK])
-def test_file_system_without_locks_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+def test_file_system_without_locks_is_refused(tmp_path, monkeypatch, number):
     import fcntl
 
     def no_lock(*_arguments: object) -> None:

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from sonar_graph.batch.plan import plan_runs
-from sonar_graph.batch.suite import METRICS, Place, line_of, read_suite
+from sonar_graph.batch.suite import METRICS, line_of, read_suite
 from sonar_graph.errors import BatchError
 
-from .conftest import BASIN, DEAD_RECKONING, HEADER, WriteSuite
+from .conftest import BASIN, DEAD_RECKONING, HEADER
 
 SUITES = sorted((Path(__file__).parents[2] / "benchmarks" / "suites").glob("*.toml"))
 ISAM2 = '\n[[estimators]]\nname = "isam2"\n'
@@ -118,7 +118,7 @@ def second(entry: str) -> str:
         (HEADER + "[[logs]\n", "[[logs]", "not TOML"),
     ],
 )
-def test_mistake_is_told_with_file_line_and_key(write_suite: WriteSuite, text: str, at: str, words: str) -> None:
+def test_mistake_is_told_with_file_line_and_key(write_suite, text, at, words):
     path = write_suite(text)
     with pytest.raises(BatchError) as caught:
         plan_runs(read_suite(path))
@@ -129,13 +129,11 @@ def test_mistake_is_told_with_file_line_and_key(write_suite: WriteSuite, text: s
     assert "\n" not in message
 
 
-def test_the_same_suites_without_mistakes_are_planned(write_suite: WriteSuite) -> None:
+def test_the_same_suites_without_mistakes_are_planned(write_suite):
     assert len(plan_runs(read_suite(write_suite(HEADER, BASIN, "seeds = [4, 2]\n", DEAD_RECKONING, ISAM2)))) == 4
 
 
-def test_data_beside_the_suite_goes_before_the_folder_of_data_sets(
-    write_suite: WriteSuite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_data_beside_the_suite_goes_before_the_folder_of_data_sets(write_suite, tmp_path, monkeypatch):
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "dive.mcap").touch()
@@ -147,7 +145,7 @@ def test_data_beside_the_suite_goes_before_the_folder_of_data_sets(
 
 
 @pytest.mark.parametrize("path", SUITES, ids=lambda path: path.stem)
-def test_suites_that_ship_are_sound(path: Path) -> None:
+def test_suites_that_ship_are_sound(path):
     file = read_suite(path)
     assert file.suite.name == path.stem
     assert file.suite.description
@@ -156,7 +154,7 @@ def test_suites_that_ship_are_sound(path: Path) -> None:
         assert plan_runs(file)
 
 
-def test_example_in_the_documentation_of_the_module_is_a_suite(write_suite: WriteSuite) -> None:
+def test_example_in_the_documentation_of_the_module_is_a_suite(write_suite):
     from sonar_graph.batch import suite
 
     example = "\n".join(row[4:] for row in (suite.__doc__ or "").splitlines() if row.startswith("    "))
@@ -204,5 +202,5 @@ x.y = 1
         ((), 1),
     ],
 )
-def test_line_is_that_of_the_key_or_of_what_holds_it(place: Place, line: int) -> None:
+def test_line_is_that_of_the_key_or_of_what_holds_it(place, line):
     assert line_of(TEXT, place) == line

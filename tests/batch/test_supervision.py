@@ -34,7 +34,7 @@ def runners() -> list[psutil.Process]:
     return [p for p in psutil.Process().children() if "sonar_graph.batch.one_run" in p.cmdline()]
 
 
-def test_run_that_takes_too_long_is_ended_and_the_next_one_is_done(planned: Planned, misbehaving: None) -> None:
+def test_run_that_takes_too_long_is_ended_and_the_next_one_is_done(planned, misbehaving):
     perform_watched(planned(), AMPLE)  # compiled from here on
     began = time.monotonic()
     outcome = perform_watched(planned("sleeps"), Limits(2.0))
@@ -45,7 +45,7 @@ def test_run_that_takes_too_long_is_ended_and_the_next_one_is_done(planned: Plan
     assert perform_watched(planned(), AMPLE).row["status"] == "ok"
 
 
-def test_run_that_needs_too_much_memory_is_ended(planned: Planned, misbehaving: None) -> None:
+def test_run_that_needs_too_much_memory_is_ended(planned, misbehaving):
     outcome = perform_watched(planned("hungry"), Limits(120.0, memory_mb=700.0))
     assert outcome.row["status"] == "memory"
     assert outcome.row["reason"] == "its processes needed more than 700 MB"
@@ -59,9 +59,7 @@ def test_run_that_needs_too_much_memory_is_ended(planned: Planned, misbehaving: 
         ("hungry-child", Limits(120.0, memory_mb=700.0), "memory"),
     ],
 )
-def test_processes_that_a_run_starts_count_and_end_with_it(
-    planned: Planned, misbehaving: None, estimator: str, limits: Limits, status: str
-) -> None:
+def test_processes_that_a_run_starts_count_and_end_with_it(planned, misbehaving, estimator, limits, status):
     outcome = perform_watched(planned(estimator), limits)
     assert outcome.row["status"] == status
     assert not [p for p in psutil.process_iter() if is_runner_of_this_test(p)]
@@ -75,20 +73,18 @@ def is_runner_of_this_test(process: psutil.Process) -> bool:
     return False
 
 
-def test_run_whose_process_is_killed_once_costs_a_retry_and_nothing_else(planned: Planned, misbehaving: None) -> None:
+def test_run_whose_process_is_killed_once_costs_a_retry_and_nothing_else(planned, misbehaving):
     outcome = perform_watched(planned("dies-once"), AMPLE)
     assert outcome.row["status"] == "ok"
 
 
-def test_run_whose_process_is_killed_twice_is_a_row(planned: Planned, misbehaving: None) -> None:
+def test_run_whose_process_is_killed_twice_is_a_row(planned, misbehaving):
     outcome = perform_watched(planned("dies"), AMPLE)
     assert outcome.row["status"] == "killed"
     assert outcome.row["reason"] == "its process was ended by SIGKILL, 2 times"
 
 
-def test_log_has_the_traceback_and_what_native_code_wrote_of_this_run_alone(
-    planned: Planned, misbehaving: None
-) -> None:
+def test_log_has_the_traceback_and_what_native_code_wrote_of_this_run_alone(planned, misbehaving):
     outcome = perform_watched(planned("prints"), AMPLE)
     assert outcome.row["status"] == "failed"
     assert "written by native code" in outcome.log
@@ -100,9 +96,7 @@ def test_log_has_the_traceback_and_what_native_code_wrote_of_this_run_alone(
     assert runners() == [runner]
 
 
-def test_order_of_sets_does_not_hang_on_who_started_the_process(
-    planned: Planned, misbehaving: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_order_of_sets_does_not_hang_on_who_started_the_process(planned, misbehaving, monkeypatch):
     reasons = set()
     for seed in ("1", "2"):
         monkeypatch.setenv("PYTHONHASHSEED", seed)
@@ -113,9 +107,7 @@ def test_order_of_sets_does_not_hang_on_who_started_the_process(
     assert "mine 7" in str(reason)
 
 
-def test_first_run_of_an_estimator_is_warmed_up_before_its_clock_starts(
-    planned: Planned, misbehaving: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_first_run_of_an_estimator_is_warmed_up_before_its_clock_starts(planned, misbehaving, monkeypatch):
     asked: list[str] = []
     ask = Runner._ask
 
@@ -129,7 +121,7 @@ def test_first_run_of_an_estimator_is_warmed_up_before_its_clock_starts(
     assert rows[0]["causal.ate_raw_m"] == rows[1]["causal.ate_raw_m"]
 
 
-def test_warm_up_that_does_not_end_is_told(planned: Planned, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_warm_up_that_does_not_end_is_told(planned, monkeypatch):
     run = planned()
     monkeypatch.setattr(supervision, "WARM_UP_S", 0.0)
     row = perform_watched(run, AMPLE).row
@@ -137,14 +129,14 @@ def test_warm_up_that_does_not_end_is_told(planned: Planned, monkeypatch: pytest
     assert not runners()
 
 
-def test_process_that_is_not_ready_in_time_is_ended_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_process_that_is_not_ready_in_time_is_ended_and_told(monkeypatch):
     monkeypatch.setattr(supervision, "START_S", 0.0)
     with pytest.raises(BatchError, match=r"no process for runs on .*: it was not ready after 0 s"):
         Runner()
     assert not runners()
 
 
-def test_process_of_runs_does_not_outlive_who_started_it() -> None:
+def test_process_of_runs_does_not_outlive_who_started_it():
     code = (
         "from sonar_graph.batch.supervision import Runner; import time;"
         "print(Runner().pid, flush=True); time.sleep(1000)"

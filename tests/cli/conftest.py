@@ -27,14 +27,14 @@ def run() -> Run:
 
 
 @pytest.fixture(scope="session")
-def basin_content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def basin_content(tmp_path_factory) -> bytes:
     log = tmp_path_factory.mktemp("log") / "basin.mcap"
     write_log(log, simulate_basin(BasinOptions(seed=3, duration_s=120.0, laps=1)))
     return log.read_bytes()
 
 
 @pytest.fixture
-def basin(basin_content: bytes, tmp_path: Path) -> Path:
+def basin(basin_content, tmp_path) -> Path:
     """A log of a short run in the basin."""
     log = tmp_path / "basin.mcap"
     log.write_bytes(basin_content)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import pytest
@@ -17,7 +16,7 @@ from sonar_graph.logs.vehicle_setup import PartialCalibration
 
 
 @given(st.one_of(st.integers(-(2**62), 2**62), st.booleans(), st.floats(allow_nan=False, allow_infinity=False)))
-def test_setting_keeps_type_and_value(value: float) -> None:
+def test_setting_keeps_type_and_value(value):
     text = str(value).lower() if isinstance(value, bool) else repr(value)
     ((name, parsed),) = parse_settings([f"gain = {text}"]).items()
     assert (name, parsed, type(parsed)) == ("gain", value, type(value))
@@ -34,11 +33,11 @@ def test_setting_keeps_type_and_value(value: float) -> None:
         ("a=1\nb=2", "1\nb=2"),
     ],
 )
-def test_setting_that_is_no_toml_is_text(text: str, value: object) -> None:
+def test_setting_that_is_no_toml_is_text(text, value):
     assert parse_settings([text]) == {"a": value}
 
 
-def test_settings_go_to_their_estimator_at_any_depth() -> None:
+def test_settings_go_to_their_estimator_at_any_depth():
     texts = ["one.gain=1", "two.gate.sigma=3", "two.gate.kind=hard", "one.gain=1.0"]
     assert estimator_settings(texts, ["one", "two"]) == {
         "one": {"gain": 1.0},
@@ -46,27 +45,27 @@ def test_settings_go_to_their_estimator_at_any_depth() -> None:
     }
 
 
-def test_topics_go_to_their_roles() -> None:
+def test_topics_go_to_their_roles():
     assert ReadingOptions(topics=["imu=/imu/data", "dvl=/a=b"]).choices == {"imu": "/imu/data", "dvl": "/a=b"}
 
 
 @pytest.mark.parametrize(
     ("name", "text"), [("a.toml", "[imu]\ngyro_bias_sigma = 0.5\n"), ("a.json", '{"imu": {"gyro_bias_sigma": 0.5}}')]
 )
-def test_calibration_is_read_from_toml_and_json(name: str, text: str, tmp_path: Path) -> None:
+def test_calibration_is_read_from_toml_and_json(name, text, tmp_path):
     path = tmp_path / name
     path.write_text(text)
     assert ReadingOptions(calibration=path).given == PartialCalibration({"imu": {"gyro_bias_sigma": 0.5}}, str(path))
 
 
-def test_calibration_with_an_unknown_field_names_file_and_field(tmp_path: Path) -> None:
+def test_calibration_with_an_unknown_field_names_file_and_field(tmp_path):
     path = tmp_path / "vehicle.toml"
     path.write_text("[imu]\ngyro_sigma = 1\n")
     with pytest.raises(CalibrationError, match=r"vehicle\.toml: imu\.gyro_sigma"):
         _ = ReadingOptions(calibration=path).given
 
 
-def test_fields_of_a_group_are_options_and_those_left_out_have_their_defaults() -> None:
+def test_fields_of_a_group_are_options_and_those_left_out_have_their_defaults():
     given: list[object] = []
 
     @with_options("end", "salvage")

@@ -19,7 +19,7 @@ FOLDER = os.environ.get("SONAR_GRAPH_DATA")
 @pytest.mark.slow
 @pytest.mark.recording
 @pytest.mark.skipif(not FOLDER, reason="SONAR_GRAPH_DATA is not set")
-def test_the_documented_commands_convert_inspect_and_reckon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_documented_commands_convert_inspect_and_reckon(tmp_path, monkeypatch):
     section = PAGE.read_text(encoding="utf-8").split("## SONIA")[1]
     (toml,) = re.findall(r"```toml\n(.*?)```", section, re.DOTALL)
     (tmp_path / "sonia.toml").write_text(toml, encoding="utf-8")

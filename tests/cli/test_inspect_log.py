@@ -15,7 +15,7 @@ from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("inspect") / "mission.mcap"
     write_log(path, simulate_mission(MissionOptions(seed=6, duration_s=150, landmarks=2)))
     return path
@@ -32,7 +32,7 @@ def sensor(said: dict, quantity: str) -> dict:
 
 
 @pytest.mark.slow
-def test_a_stamp_offset_in_the_configuration_moves_the_offset_found(log: Path, tmp_path: Path):
+def test_a_stamp_offset_in_the_configuration_moves_the_offset_found(log, tmp_path):
     (tmp_path / "late.toml").write_text("[dvl]\nstamp_offset_s = 0.5\n")
     here = sensor(answer(log), "DVL against IMU: time offset")
     there = sensor(answer(log, "--log-config", tmp_path / "late.toml"), "DVL against IMU: time offset")
@@ -41,21 +41,21 @@ def test_a_stamp_offset_in_the_configuration_moves_the_offset_found(log: Path, t
     assert there["act"]
 
 
-def test_a_mounting_in_the_calibration_moves_the_yaw_found(log: Path, tmp_path: Path):
+def test_a_mounting_in_the_calibration_moves_the_yaw_found(log, tmp_path):
     (tmp_path / "turned.toml").write_text("[dvl]\nmounting.rpy_rad = [0, 0, 0.1]\n")
     yaw = sensor(answer(log, "--calibration", tmp_path / "turned.toml"), "DVL mounting yaw")
     assert yaw["value"] == pytest.approx(-5.73, abs=1.0)
     assert "dvl.mounting.rpy_rad" in yaw["advice"]
 
 
-def test_quick_says_that_nothing_was_compared(log: Path):
+def test_quick_says_that_nothing_was_compared(log):
     said = answer(log, "--quick")
     assert said["sensors"] == []
     assert "--quick" in said["sensors_skipped"]
     assert {topic["name"] for topic in said["topics"]} >= {"/imu/data"}
 
 
-def test_sentences_say_whether_to_act(log: Path):
+def test_sentences_say_whether_to_act(log):
     result = CliRunner().invoke(app, ["inspect", str(log)])
     assert result.exit_code == 0, result.output
     assert "sensors against each other (± 95 %)" in result.stdout
@@ -65,7 +65,7 @@ def test_sentences_say_whether_to_act(log: Path):
         assert f"\n{row} " in result.stdout
 
 
-def test_json_has_lever_arm_bias_and_start_as_numbers(log: Path):
+def test_json_has_lever_arm_bias_and_start_as_numbers(log):
     said = answer(log)
     assert sensor(said, "lever arm from IMU to DVL, x")["value"] == pytest.approx(-0.2, abs=0.1)
     assert sensor(said, "lever arm from IMU to DVL, z")["unit"] == "m"

@@ -32,36 +32,32 @@ def examples_of(command: Any) -> list[list[str]]:
     return [line.split() for line in command.epilog.splitlines() if line.startswith("sonar-graph ")]
 
 
-def test_no_argument_shows_the_commands(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_argument_shows_the_commands(run, capsys):
     assert run() == 0
     shown = capsys.readouterr().out
     for path in commands():
         assert path[0] in shown
 
 
-def test_help_does_not_wait_for_heavy_imports(run: Run) -> None:
+def test_help_does_not_wait_for_heavy_imports(run):
     heavy = "{'gtsam', 'matplotlib', 'numba', 'numpy', 'scipy'}"
     code = f"import sys, sonar_graph.cli.main; print(sorted({heavy} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
-def test_version_is_that_of_the_package(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_version_is_that_of_the_package(run, capsys):
     assert run("--version") == 0
     assert capsys.readouterr().out == f"sonar-graph {sonar_graph.__version__}\n"
 
 
 @pytest.mark.parametrize("path", commands(), ids=" ".join)
-def test_every_command_has_help_that_ends_in_examples(
-    run: Run, path: tuple[str, ...], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_command_has_help_that_ends_in_examples(run, path, capsys):
     assert run(*path, "--help") == 0
     assert f"sonar-graph {' '.join(path)}" in capsys.readouterr().out.partition("Examples:")[2]
 
 
 @pytest.mark.parametrize("path", commands(), ids=" ".join)
-def test_examples_in_help_are_understood(
-    path: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_examples_in_help_are_understood(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in (
         "dive.mcap",
@@ -86,12 +82,12 @@ def test_examples_in_help_are_understood(
 
 
 @pytest.mark.parametrize("group", ["simulate", "convert", "bench"])
-def test_help_of_a_group_ends_in_examples(run: Run, group: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_of_a_group_ends_in_examples(run, group, capsys):
     assert run(group, "--help") == 0
     assert f"sonar-graph {group} " in capsys.readouterr().out.partition("Examples:")[2]
 
 
-def test_help_names_defaults_presets_and_roles_as_they_are() -> None:
+def test_help_names_defaults_presets_and_roles_as_they_are():
     from sonar_graph.logs.roles import ROLES
     from sonar_graph.simulation.basin import BasinOptions
     from sonar_graph.simulation.options import DVL_PRESETS, IMU_PRESETS

@@ -15,16 +15,14 @@ from sonar_graph.logs.mcap.writer import write_recording
 from sonar_graph.logs.writing import sonar_image_messages, write_log
 
 if TYPE_CHECKING:
-    from tests.recognition.imaged_lane import Lane
-
-    from .conftest import Run
+    pass
 
 DESIGN = '[[landmark]]\nid = {id}\nname = "plate"\nsize_m = {size_m}\nshapes = [{{ level_db = 12.0, {shape} }}]\n'
 CIRCLE, BAR = "circle_m = [0.0, 0.0, 0.15]", "polygon_m = [[-0.3, -0.02], [0.3, -0.02], [0.3, 0.02], [-0.3, 0.02]]"
 
 
 @pytest.fixture(scope="module")
-def files(lane: Lane, lane_log: Path, basin_content: bytes, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def files(lane, lane_log, basin_content, tmp_path_factory) -> Path:
     """Folder with logs, and with everything that a user may give in place of another file."""
     folder = tmp_path_factory.mktemp("files")
     (folder / "basin.mcap").write_bytes(basin_content)
@@ -123,14 +121,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize(("command", "expected"), MISTAKES.items())
-def test_a_mistake_is_named_in_one_line_and_no_file_is_written(
-    run: Run,
-    command: str,
-    expected: str,
-    files: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_mistake_is_named_in_one_line_and_no_file_is_written(run, command, expected, files, monkeypatch, capsys):
     def content() -> dict[Path, bytes]:
         return {path: path.read_bytes() for path in files.rglob("*") if path.is_file()}
 
@@ -144,15 +135,13 @@ def test_a_mistake_is_named_in_one_line_and_no_file_is_written(
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, PermissionError(13, "Permission denied", "x.mcap")])
-def test_interruption_and_refused_access_end_in_one_line(
-    run: Run, stop: Any, basin: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_interruption_and_refused_access_end_in_one_line(run, stop, basin, monkeypatch, capsys):
     monkeypatch.setattr("sonar_graph.logs.inspect_log", raising(stop))
     assert run("inspect", basin) == (130 if stop is KeyboardInterrupt else 2)
     assert re.fullmatch(r"sonar-graph: .+\n", capsys.readouterr().err)
 
 
-def test_unforeseen_error_is_not_hidden(basin: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unforeseen_error_is_not_hidden(basin, monkeypatch):
     monkeypatch.setattr("sonar_graph.logs.inspect_log", raising(ZeroDivisionError()))
     with pytest.raises(ZeroDivisionError):
         main(["inspect", str(basin)])

@@ -37,7 +37,7 @@ def recognised(lane_log, run, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def strange_designs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def strange_designs(tmp_path_factory) -> Path:
     """Of a landmark that is not in the log."""
     path = tmp_path_factory.mktemp("strange") / "mine.toml"
     bar = "polygon_m = [[-0.3, -0.02], [0.3, -0.02], [0.3, 0.02], [-0.3, 0.02]]"

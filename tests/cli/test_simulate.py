@@ -28,7 +28,7 @@ def simulate(path: Path, *more: str, said: str = "Log: ") -> None:
     assert said in result.output
 
 
-def test_images_and_other_sensors_are_those_of_the_library(tmp_path: Path):
+def test_images_and_other_sensors_are_those_of_the_library(tmp_path):
     simulate(
         tmp_path / "a.mcap", said="Landmarks: 1 disc at (5, 0), 2 square at (7, -5), 3 triangle at (2, -7), 4 cross"
     )
@@ -45,7 +45,7 @@ def test_images_and_other_sensors_are_those_of_the_library(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_same_seed_gives_the_same_bytes(tmp_path: Path):
+def test_same_seed_gives_the_same_bytes(tmp_path):
     for name, seed in (("a", "3"), ("b", "3"), ("c", "4")):
         simulate(tmp_path / f"{name}.mcap", "--seed", seed)
     contents = [(tmp_path / f"{name}.mcap").read_bytes() for name in "abc"]
@@ -53,7 +53,7 @@ def test_same_seed_gives_the_same_bytes(tmp_path: Path):
     assert contents[0] != contents[2]
 
 
-def test_images_lie_among_the_other_messages_in_the_order_of_time(tmp_path: Path):
+def test_images_lie_among_the_other_messages_in_the_order_of_time(tmp_path):
     simulate(tmp_path / "a.mcap")
     with (tmp_path / "a.mcap").open("rb") as stream:
         times_ns = [record.log_time for record in StreamReader(stream).records if isinstance(record, Message)]
@@ -74,7 +74,7 @@ def test_simulation_flags_and_settings_reach_the_simulator(run, tmp_path, monkey
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("landmarks") / "recorded.mcap"
     run = simulate_mission(MissionOptions(seed=5, duration_s=60))
     write_log(path, replace(run, detections=None, true_landmarks=None))
@@ -86,7 +86,7 @@ def place(*words: str | Path) -> tuple[int, str]:
     return result.exit_code, " ".join(result.output.split())
 
 
-def test_the_log_gets_what_the_library_places_and_keeps_its_sensors(log: Path, tmp_path: Path):
+def test_the_log_gets_what_the_library_places_and_keeps_its_sensors(log, tmp_path):
     code, said = place("--on", log, "-o", tmp_path / "new.mcap", "--seed", "3", "--set", "spacing_m=4")
     assert code == 0, said
     read, recorded = read_log(tmp_path / "new.mcap"), read_log(log)
@@ -99,7 +99,7 @@ def test_the_log_gets_what_the_library_places_and_keeps_its_sensors(log: Path, t
     assert f"{len(read.true_landmarks or ())} landmarks, {len(read.detections)} detections" in said
 
 
-def test_another_seed_is_another_map(log: Path, tmp_path: Path):
+def test_another_seed_is_another_map(log, tmp_path):
     maps = []
     for seed in "12":
         assert place("--on", log, "-o", tmp_path / f"{seed}.mcap", "--seed", seed)[0] == 0

@@ -88,9 +88,9 @@ class Offset:
 
 
 @pytest.fixture
-def install(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Make classes known as estimators: ``install(name=Class)``."""
-    installed: dict[str, Any] = {}
+def install(monkeypatch) -> Callable[..., None]:
+    """Make classes known as estimators, beside ``offset``: ``install(name=Class)``."""
+    installed: dict[str, Any] = {"offset": Offset}
 
     def load(name: str) -> Any:
         if name not in installed:
@@ -99,13 +99,3 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
     monkeypatch.setattr(run_module, "load_estimator", load)
     return installed.update
-
-
-@pytest.fixture
-def make_sequence() -> Callable[..., Sequence]:
-    return straight_sequence
-
-
-@pytest.fixture
-def offset_estimator() -> type[Offset]:
-    return Offset

@@ -17,17 +17,18 @@ def cloud(seed: int, n: int = 30) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=(n, 3)) * [5.0, 3.0, 1.0]
 
 
-@given(seeds)
-def test_se3_alignment_undoes_any_rigid_motion(seed: int) -> None:
-    points = cloud(seed)
-    turn, shift = Rotation.random(rng=seed).as_matrix(), np.array([10.0, -3.0, 2.0])
-    alignment = align_se3(points, points @ turn.T + shift)
-    np.testing.assert_allclose(alignment.rotation, turn, atol=1e-10)
-    np.testing.assert_allclose(alignment.translation, shift, atol=1e-9)
+@given(seeds, st.floats(-np.pi, np.pi))
+def test_alignment_undoes_a_motion_that_it_allows(seed, angle):
+    points, shift = cloud(seed), np.array([10.0, -3.0, 2.0])
+    turns = Rotation.random(rng=seed).as_matrix(), Rotation.from_euler("z", angle).as_matrix()
+    for align, turn in zip((align_se3, align_yaw), turns, strict=True):
+        alignment = align(points, points @ turn.T + shift)
+        np.testing.assert_allclose(alignment.rotation, turn, atol=1e-10)
+        np.testing.assert_allclose(alignment.translation, shift, atol=1e-9)
 
 
 @given(seeds, st.sampled_from([2, 3]))
-def test_umeyama_agrees_with_evo(seed: int, dimension: int) -> None:
+def test_umeyama_agrees_with_evo(seed, dimension):
     points, targets = cloud(seed)[:, :dimension], cloud(seed + 1)[:, :dimension]
     R, t = umeyama(points, targets)
     expected_R, expected_t, _ = umeyama_alignment(points.T, targets.T)
@@ -35,24 +36,7 @@ def test_umeyama_agrees_with_evo(seed: int, dimension: int) -> None:
     np.testing.assert_allclose(t, expected_t, atol=1e-9)
 
 
-@given(seeds)
-def test_alignment_never_mirrors(seed: int) -> None:
-    points = cloud(seed)
-    mirrored = points * [1.0, 1.0, -1.0]
-    R, _ = umeyama(points, mirrored)
-    assert np.linalg.det(R) == pytest.approx(1.0)
-
-
-@given(seeds, st.floats(-np.pi, np.pi))
-def test_yaw_alignment_undoes_a_turn_about_the_vertical(seed: int, angle: float) -> None:
-    points = cloud(seed)
-    turn = Rotation.from_euler("z", angle).as_matrix()
-    alignment = align_yaw(points, points @ turn.T + [1.0, 2.0, 3.0])
-    np.testing.assert_allclose(alignment.rotation, turn, atol=1e-10)
-    np.testing.assert_allclose(alignment.translation, [1.0, 2.0, 3.0], atol=1e-9)
-
-
-def test_yaw_alignment_leaves_a_tilt_where_se3_removes_it() -> None:
+def test_yaw_alignment_leaves_a_tilt_where_se3_removes_it():
     points = cloud(0)
     tilted = points @ Rotation.from_euler("x", 0.2).as_matrix().T
     assert rmse(align_se3(points, tilted).apply(points) - tilted) < 1e-10
@@ -60,7 +44,7 @@ def test_yaw_alignment_leaves_a_tilt_where_se3_removes_it() -> None:
 
 
 @given(seeds)
-def test_more_freedom_never_fits_worse(seed: int) -> None:
+def test_more_freedom_never_fits_worse(seed):
     points, targets = cloud(seed), cloud(seed) + np.random.default_rng(seed + 1).normal(size=(30, 3))
     raw = rmse(points - targets)
     yaw = rmse(align_yaw(points, targets).apply(points) - targets)
@@ -70,20 +54,20 @@ def test_more_freedom_never_fits_worse(seed: int) -> None:
 
 
 @given(seeds, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
-def test_horizontal_part_of_yaw_alignment_is_the_best_se2(seed: int, turn: float, x: float, y: float) -> None:
+def test_horizontal_part_of_yaw_alignment_is_the_best_se2(seed, turn, x, y):
     points, targets = cloud(seed), cloud(seed) + np.random.default_rng(seed + 1).normal(size=(30, 3))
     aligned = align_yaw(points, targets).apply(points)
     other = aligned @ Rotation.from_euler("z", turn).as_matrix().T + [x, y, 0.0]
     assert rmse((aligned - targets)[:, :2]) <= rmse((other - targets)[:, :2]) + 1e-12
 
 
-def test_a_vehicle_that_did_not_move_is_aligned_by_translation() -> None:
+def test_a_vehicle_that_did_not_move_is_aligned_by_translation():
     points = np.ones((5, 3))
     alignment = align_se3(points, points + 2.0)
     np.testing.assert_allclose(alignment.apply(points), points + 2.0)
 
 
 @pytest.mark.parametrize("shapes", [((0, 3), (0, 3)), ((4, 3), (5, 3))])
-def test_unpaired_points_are_refused(shapes: tuple[tuple[int, int], tuple[int, int]]) -> None:
+def test_unpaired_points_are_refused(shapes):
     with pytest.raises(EvaluationError, match="paired points"):
         umeyama(np.zeros(shapes[0]), np.zeros(shapes[1]))

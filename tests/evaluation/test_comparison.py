@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -13,11 +12,10 @@ from sonar_graph.evaluation.comparison import compare
 from sonar_graph.evaluation.results import RunResult
 from sonar_graph.evaluation.scores import detection_scores, resource_scores
 from sonar_graph.measurements import Measurements
-from sonar_graph.sequence import Sequence
 from sonar_graph.states import DetectionLog, Estimate, Outcome
 
-Make = Callable[..., Sequence]
-Install = Callable[..., None]
+from .conftest import Offset, straight_sequence
+
 TRAJECTORY_KEYS = {
     *("ate_raw_m", "ate_yaw_m", "ate_se2_m", "ate_se3_m", "rpe_1s_m", "rpe_1s_rad", "rpe_10s_m", "rpe_10s_rad"),
     *("yaw_rmse_rad", "return_error_m", "nees_position", "nees_yaw"),
@@ -29,9 +27,8 @@ OTHER_KEYS = {
 }
 
 
-def test_scores_of_a_constant_offset_by_hand(install, make_sequence, offset_estimator):
-    install(offset=offset_estimator)
-    scores = compare(make_sequence(), ["offset"], {"offset": {"offset_m": 0.4, "sigma_m": 0.1}}).scores["offset"]
+def test_scores_of_a_constant_offset_by_hand(install):
+    scores = compare(straight_sequence(), ["offset"], {"offset": {"offset_m": 0.4, "sigma_m": 0.1}}).scores["offset"]
     value = {key: score.value for key, score in scores.items()}
     assert value["causal.ate_raw_m"] == pytest.approx(0.4)
     assert value["smoothed.ate_raw_m"] == pytest.approx(0.2)
@@ -47,9 +44,8 @@ def test_scores_of_a_constant_offset_by_hand(install, make_sequence, offset_esti
     assert value["detections.nis"] == pytest.approx((4.0 + 1.0) / 2 / 2)
 
 
-def test_every_score_is_there_with_unit_and_protocol(install, make_sequence, offset_estimator):
-    install(offset=offset_estimator)
-    scores = compare(make_sequence(), ["offset"]).scores["offset"]
+def test_every_score_is_there_with_unit_and_protocol(install):
+    scores = compare(straight_sequence(), ["offset"]).scores["offset"]
     expected = {f"{kind}.{key}" for kind in ("causal", "smoothed") for key in TRAJECTORY_KEYS} | OTHER_KEYS
     assert set(scores) - {"memory.peak_mb"} == expected
     for key, score in scores.items():
@@ -74,50 +70,47 @@ def test_ignored_detections_are_neither_used_nor_refused():
     assert "detections.nis" not in scores
 
 
-def test_only_independent_samples_get_a_band(install, make_sequence, offset_estimator):
-    install(offset=offset_estimator)
-    scores = compare(make_sequence(), ["offset"]).scores["offset"]
+def test_only_independent_samples_get_a_band(install):
+    scores = compare(straight_sequence(), ["offset"]).scores["offset"]
     assert scores["causal.nees_position"].interval is None
     assert "correlated" in scores["causal.nees_position"].protocol
     assert scores["detections.nis"].interval == pytest.approx(tuple(chi2.ppf([0.025, 0.975], 4) / 4))
 
 
-def test_spatial_runs_score_height_too(install, make_sequence, offset_estimator):
-    install(offset=offset_estimator)
-    comparison = compare(make_sequence(planar=False), ["offset"], {"offset": {"offset_m": 0.3, "sigma_m": 0.3}})
+def test_spatial_runs_score_height_too(install):
+    comparison = compare(straight_sequence(planar=False), ["offset"], {"offset": {"offset_m": 0.3, "sigma_m": 0.3}})
     assert comparison.errors["offset"]["causal"].position_dof == 3
     assert comparison.scores["offset"]["causal.nees_position"].value == pytest.approx(1 / 3)
 
 
-def test_all_are_scored_at_the_instants_that_all_have(install, make_sequence, offset_estimator):
-    class Late(offset_estimator):
+def test_all_are_scored_at_the_instants_that_all_have(install):
+    class Late(Offset):
         def process(self, measurements: Measurements) -> Estimate | None:
             return None if measurements.end_ns < 4_000_000_000 else super().process(measurements)
 
-    install(offset=offset_estimator, late=Late)
-    comparison = compare(make_sequence(), ["offset", "late"])
+    install(late=Late)
+    comparison = compare(straight_sequence(), ["offset", "late"])
     for name in ("offset", "late"):
         assert comparison.errors[name]["causal"].stamps_ns[0] == 4_000_000_000
         assert "5 without an estimate" in comparison.scores[name]["causal.ate_raw_m"].protocol
     assert len(comparison.runs[0].causal or ()) == 40
 
 
-def test_a_failed_run_is_a_row_and_does_not_disturb_the_others(install, make_sequence, offset_estimator):
-    class Broken(offset_estimator):
+def test_a_failed_run_is_a_row_and_does_not_disturb_the_others(install):
+    class Broken(Offset):
         def process(self, _measurements: Measurements) -> Estimate | None:
             raise RuntimeError("diverged")
 
-    install(offset=offset_estimator, broken=Broken)
-    together, alone = compare(make_sequence(), ["broken", "offset"]), compare(make_sequence(), ["offset"])
+    install(broken=Broken)
+    together, alone = compare(straight_sequence(), ["broken", "offset"]), compare(straight_sequence(), ["offset"])
     assert [(run.estimator, run.status) for run in together.runs] == [("broken", "failed"), ("offset", "ok")]
     assert together.scores["broken"] == {}
     assert together.errors["broken"] == {}
     assert together.scores["offset"]["causal.ate_raw_m"] == alone.scores["offset"]["causal.ate_raw_m"]
 
 
-def test_without_truth_the_rest_is_scored_and_it_is_said(install, make_sequence, offset_estimator):
-    install(offset=offset_estimator)
-    comparison = compare(make_sequence(truth=False), ["offset"])
+def test_without_truth_the_rest_is_scored_and_it_is_said(install):
+    comparison = compare(straight_sequence(truth=False), ["offset"])
     keys = set(comparison.scores["offset"])
     assert not any(key.startswith(("causal.", "smoothed.")) for key in keys)
     assert {"landmarks.count", "detections.used", "time.total_s"} <= keys
@@ -126,29 +119,27 @@ def test_without_truth_the_rest_is_scored_and_it_is_said(install, make_sequence,
     assert "no truth" in comparison.environment["scored instants"]
 
 
-def test_a_truth_that_covers_one_instant_is_too_little(install, make_sequence, offset_estimator):
-    install(offset=offset_estimator)
-    sequence = make_sequence()
+def test_a_truth_that_covers_one_instant_is_too_little(install):
+    sequence = straight_sequence()
     assert sequence.truth is not None
     comparison = compare(replace(sequence, truth=sequence.truth.rows(slice(0, 7))), ["offset"])
     assert comparison.errors == {}
     assert comparison.environment["scored instants"].startswith("1 of 40 instants")
 
 
-def test_an_estimator_without_covariances_has_errors_but_no_nees(install, make_sequence, offset_estimator):
-    class Modest(offset_estimator):
+def test_an_estimator_without_covariances_has_errors_but_no_nees(install):
+    class Modest(Offset):
         def beside(self, stamp_ns: int, offset_m: float) -> Estimate:
             return replace(super().beside(stamp_ns, offset_m), covariance=np.full((6, 6), np.nan))
 
     install(modest=Modest)
-    scores = compare(make_sequence(), ["modest"]).scores["modest"]
+    scores = compare(straight_sequence(), ["modest"]).scores["modest"]
     assert "causal.ate_raw_m" in scores
     assert "causal.nees_position" not in scores
 
 
-def test_mistakes_of_the_user_are_raised(install, make_sequence, offset_estimator):
-    install(offset=offset_estimator)
-    sequence = make_sequence()
+def test_mistakes_of_the_user_are_raised(install):
+    sequence = straight_sequence()
     with pytest.raises(EvaluationError, match="no estimator"):
         compare(sequence, [])
     with pytest.raises(EvaluationError, match="more than once: offset"):
@@ -161,11 +152,10 @@ def test_mistakes_of_the_user_are_raised(install, make_sequence, offset_estimato
         compare(sequence, ["offset"], {"offset": {"colour": 1}})
 
 
-def test_a_wrong_name_is_found_before_anything_runs(install, make_sequence, offset_estimator):
-    install(offset=offset_estimator)
+def test_a_wrong_name_is_found_before_anything_runs(install):
     calls: list[Any] = []
     with pytest.raises(UnknownEstimatorError):
-        compare(make_sequence(), ["offset", "nobody"], progress=lambda *call: calls.append(call))
+        compare(straight_sequence(), ["offset", "nobody"], progress=lambda *call: calls.append(call))
     assert calls == []
 
 
@@ -180,15 +170,14 @@ def test_times_by_hand():
     assert "memory.peak_mb" not in value
 
 
-def test_progress_names_the_estimator(install, make_sequence, offset_estimator):
-    install(one=offset_estimator, two=offset_estimator)
+def test_progress_names_the_estimator(install):
+    install(one=Offset, two=Offset)
     calls: list[tuple[str, int, int]] = []
-    compare(make_sequence(2.0), ["one", "two"], rate_hz=1.0, progress=lambda *call: calls.append(call))
+    compare(straight_sequence(2.0), ["one", "two"], rate_hz=1.0, progress=lambda *call: calls.append(call))
     assert calls == [("one", 1, 2), ("one", 2, 2), ("two", 1, 2), ("two", 2, 2)]
 
 
-def test_environment_names_versions_machine_date_and_command(install, make_sequence, offset_estimator):
-    install(offset=offset_estimator)
-    environment = compare(make_sequence(), ["offset"]).environment
+def test_environment_names_versions_machine_date_and_command(install):
+    environment = compare(straight_sequence(), ["offset"]).environment
     assert {"sonar_graph", "python", "numpy", "gtsam", "machine", "date", "command"} <= set(environment)
     assert environment["numpy"] == np.__version__

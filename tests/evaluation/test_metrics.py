@@ -51,7 +51,7 @@ def evo_rmse(metric: APE | RPE, truth: PoseTrajectory3D, estimate: PoseTrajector
 
 @settings(max_examples=20)
 @given(seeds)
-def test_ate_agrees_with_evo(seed: int) -> None:
+def test_ate_agrees_with_evo(seed):
     truth = random_walk(seed)
     estimate = moved(disturbed(truth, seed + 1), Rotation.from_euler("z", 0.4), (1.0, 2.0, 3.0))
     raw = evo_rmse(APE(PoseRelation.translation_part), as_evo(truth), as_evo(estimate))
@@ -70,7 +70,7 @@ def flat(trajectory: Trajectory) -> Trajectory:
 
 @settings(max_examples=20)
 @given(seeds)
-def test_errors_on_a_plane_agree_with_evo(seed: int) -> None:
+def test_errors_on_a_plane_agree_with_evo(seed):
     truth = flat(random_walk(seed))
     estimate = moved(flat(disturbed(truth, seed + 1)), Rotation.from_euler("z", 0.4), (1.0, 2.0, 0.0))
     aligned = as_evo(estimate)
@@ -85,7 +85,7 @@ def test_errors_on_a_plane_agree_with_evo(seed: int) -> None:
 
 @settings(max_examples=20)
 @given(seeds, st.sampled_from([1, 10]))
-def test_relative_error_agrees_with_evo(seed: int, delta_s: int) -> None:
+def test_relative_error_agrees_with_evo(seed, delta_s):
     truth = random_walk(seed)
     estimate = disturbed(truth, seed + 1)
     frames = delta_s * 1_000_000_000 // STEP_NS
@@ -98,7 +98,7 @@ def test_relative_error_agrees_with_evo(seed: int, delta_s: int) -> None:
 
 @settings(max_examples=20)
 @given(seeds, st.floats(-3, 3))
-def test_aligned_and_relative_errors_do_not_depend_on_the_world(seed: int, angle: float) -> None:
+def test_aligned_and_relative_errors_do_not_depend_on_the_world(seed, angle):
     truth = random_walk(seed)
     estimate = disturbed(truth, seed + 1)
     elsewhere = moved(estimate, Rotation.from_euler("z", angle), (10.0, -5.0, 1.0))
@@ -114,7 +114,7 @@ def line(yaws: list[float], positions: list[list[float]]) -> Trajectory:
     return Trajectory.without_covariances(np.arange(len(yaws)) * STEP_NS, np.array(positions, dtype=float), quaternions)
 
 
-def test_planar_errors_by_hand() -> None:
+def test_planar_errors_by_hand():
     truth = line([0.0] * 4, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     estimate = line([0.0] * 4, [[0, 0, 1], [1, 0, 1], [1, 1, -1], [0, 1, -1]])
     assert metrics.ate_raw_m(estimate, truth) == pytest.approx(1.0)
@@ -122,39 +122,39 @@ def test_planar_errors_by_hand() -> None:
     assert metrics.ate_se2_m(estimate, truth) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_return_error_is_the_error_of_the_displacement() -> None:
+def test_return_error_is_the_error_of_the_displacement():
     truth = line([0.0] * 3, [[0, 0, 0], [5, 0, 0], [0, 0, 0]])
     estimate = line([0.0] * 3, [[1, 1, 0], [9, 9, 9], [1.3, 1.4, 0]])
     assert metrics.return_error_m(estimate, truth) == pytest.approx(0.5)
 
 
-def test_yaw_error_wraps() -> None:
+def test_yaw_error_wraps():
     truth = line([np.pi - 0.01], [[0, 0, 0]])
     estimate = line([-np.pi + 0.02], [[0, 0, 0]])
     np.testing.assert_allclose(metrics.yaw_errors_rad(estimate, truth), [0.03], atol=1e-12)
 
 
-def test_a_constant_heading_error_is_in_yaw_but_not_in_relative_yaw() -> None:
+def test_a_constant_heading_error_is_in_yaw_but_not_in_relative_yaw():
     truth = random_walk(3)
     estimate = moved(truth, Rotation.from_euler("z", 0.2), (0.0, 0.0, 0.0))
     assert metrics.rmse(metrics.yaw_errors_rad(estimate, truth)) == pytest.approx(0.2)
     assert metrics.rmse(metrics.relative_errors(estimate, truth, 1.0).yaw_rad) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_pairs_skip_instants_without_a_partner() -> None:
+def test_pairs_skip_instants_without_a_partner():
     stamps = np.array([0.0, 0.5, 1.0, 1.5, 4.0, 5.0]) * 1e9
     first, second = metrics.pairs_apart(stamps.astype(np.int64), 1.0)
     assert list(zip(first.tolist(), second.tolist(), strict=True)) == [(0, 2), (1, 3), (4, 5)]
 
 
-def test_pairs_forgive_the_rounding_of_a_third_of_a_second() -> None:
+def test_pairs_forgive_the_rounding_of_a_third_of_a_second():
     stamps = np.arange(10, dtype=np.int64) * 333_333_333
     first, second = metrics.pairs_apart(stamps, 1.0)
     np.testing.assert_array_equal(second - first, 3)
     assert len(first) == 7
 
 
-def test_no_pairs_in_a_single_instant() -> None:
+def test_no_pairs_in_a_single_instant():
     assert not len(metrics.pairs_apart(np.array([5]), 1.0)[0])
 
 
@@ -162,7 +162,7 @@ def landmark_map(ids: list[int], positions: list[list[float]]) -> LandmarkMap:
     return LandmarkMap(np.array(ids), np.array(positions, dtype=float), np.full((len(ids), 3, 3), np.nan))
 
 
-def test_landmarks_of_the_seed_experiment_by_hand() -> None:
+def test_landmarks_of_the_seed_experiment_by_hand():
     true = landmark_map([1, 2, 3, 4], [[5, 0, 0], [7, -5, 0], [2, -7, 0], [0, -2, 0]])
     estimated = landmark_map(
         [1, 2, 3, 4, 8], [[4.81, -0.07, 9], [6.74, -5.01, 9], [1.85, -6.85, 9], [-0.14, -1.82, 9], [0, 0, 0]]
@@ -173,7 +173,7 @@ def test_landmarks_of_the_seed_experiment_by_hand() -> None:
     assert errors.aligned_rmse_m == pytest.approx(0.093, abs=5e-4)
 
 
-def test_landmarks_are_matched_by_identity_not_by_row() -> None:
+def test_landmarks_are_matched_by_identity_not_by_row():
     true = landmark_map([6, 8, 20], [[0, 0, 0], [1, 0, 0], [0, 5, 0]])
     estimated = landmark_map([8, 20, 30], [[1, 0.5, 0], [0, 5, 0], [7, 7, 7]])
     errors = metrics.landmark_errors(estimated, true)
@@ -181,12 +181,12 @@ def test_landmarks_are_matched_by_identity_not_by_row() -> None:
     np.testing.assert_allclose(errors.horizontal_m, [[0, 0.5], [0, 0]])
 
 
-def test_one_landmark_cannot_be_aligned() -> None:
+def test_one_landmark_cannot_be_aligned():
     one = landmark_map([1], [[0, 0, 0]])
     assert np.isnan(metrics.landmark_errors(one, one).aligned_rmse_m)
 
 
-def test_trajectories_at_different_instants_are_refused() -> None:
+def test_trajectories_at_different_instants_are_refused():
     truth = random_walk(0)
     with pytest.raises(EvaluationError, match=r"Trajectory\.at"):
         metrics.ate_raw_m(truth.rows(slice(1, None)), truth)

@@ -21,7 +21,7 @@ def landmark_map(ids: list[int], xy: np.ndarray) -> LandmarkMap:
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**31), n=st.integers(1, 4), m=st.integers(1, 4))
-def test_it_is_the_best_of_all_matchings(seed: int, n: int, m: int) -> None:
+def test_it_is_the_best_of_all_matchings(seed, n, m):
     rng = np.random.default_rng(seed)
     estimated = landmark_map([UNKNOWN + k for k in range(n)], 1.2 * rng.standard_normal((n, 2)))
     true = landmark_map(list(range(m)), 1.2 * rng.standard_normal((m, 2)))
@@ -38,7 +38,7 @@ def test_it_is_the_best_of_all_matchings(seed: int, n: int, m: int) -> None:
     assert np.sum(matched.horizontal_m**2) == pytest.approx(-best[1])
 
 
-def test_known_identities_stay_wherever_they_are() -> None:
+def test_known_identities_stay_wherever_they_are():
     true = landmark_map([1, 2], np.array([[0.0, 0.0], [5.0, 0.0]]))
     estimated = landmark_map([1, UNKNOWN, UNKNOWN + 1], np.array([[5.0, 0.0], [0.0, 0.0], [5.1, 0.0]]))
     named = named_by_place(estimated, true, FARTHEST_M)
@@ -46,12 +46,12 @@ def test_known_identities_stay_wherever_they_are() -> None:
     assert named.positions[:, 0].tolist() == [5.0, 5.1, 0.0]
 
 
-def test_unnamed_landmarks_are_never_taken_for_known_ones() -> None:
+def test_unnamed_landmarks_are_never_taken_for_known_ones():
     true = landmark_map([1], np.zeros((1, 2)))
     assert len(landmark_errors(landmark_map([UNKNOWN], np.zeros((1, 2))), true)) == 0
 
 
-def test_nothing_is_matched_with_nothing() -> None:
+def test_nothing_is_matched_with_nothing():
     empty, true = landmark_map([], np.empty((0, 2))), landmark_map([1], np.zeros((1, 2)))
     assert len(named_by_place(empty, true, FARTHEST_M)) == 0
     assert named_by_place(true, empty, FARTHEST_M).ids.tolist() == [1]

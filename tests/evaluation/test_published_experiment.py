@@ -60,7 +60,7 @@ def test_the_simulated_basin_repeats_the_published_experiment():
 
 
 @pytest.mark.parametrize("change", ["moved", "renamed", "one more", "unknown"])
-def test_another_arrangement_does_not_repeat_it(change: str):
+def test_another_arrangement_does_not_repeat_it(change):
     true = published_maps()[1]
     assert repeats_published(sequence(true))
     changed = {

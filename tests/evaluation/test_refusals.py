@@ -17,7 +17,7 @@ from mcap.writer import Writer
 
 from sonar_graph.cli.main import main
 from sonar_graph.estimator import installed_estimators, load_estimator, refused_rows_of
-from sonar_graph.evaluation.results import MOST_ROWS_NAMED, Comparison, gathered
+from sonar_graph.evaluation.results import MOST_ROWS_NAMED, gathered
 from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.storage import read_comparison, write_comparison
 from sonar_graph.logs.writing import write_log
@@ -26,29 +26,13 @@ from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam.landmarks.sighting import SightingFactors
 from sonar_graph.states import Estimate, Refusal, RefusedRow
-from tests.synthetic import basin_comparison, with_run
+from tests.synthetic import late, outlier, refusing, with_run
 
 from .conftest import straight_sequence
 
 HELD_NS = 3 * 10**9, 3 * 10**9 + 500_000_000
 ESTIMATORS = list(installed_estimators())
 NS = 10**9
-
-
-def outlier(stamp_ns: int, distance: float = 100.0) -> RefusedRow:
-    return RefusedRow("dvl", stamp_ns, Refusal.OUTLIER, distance)
-
-
-def late(stamp_ns: int) -> RefusedRow:
-    return RefusedRow("imu", stamp_ns, Refusal.LATE, math.nan)
-
-
-def refusing(refused: list[RefusedRow], *names: str) -> Comparison:
-    comparison = basin_comparison(60)
-    for run in comparison.runs:
-        if run.estimator in names:
-            comparison = with_run(comparison, replace(run, refused=refused))
-    return comparison
 
 
 def without_rows(sequence: Sequence, rows: list[int]) -> Sequence:
@@ -77,7 +61,7 @@ def test_rows_of_other_sensors_and_reasons_are_counted_apart():
     assert found == {("dvl", Refusal.OUTLIER): 9, ("imu", Refusal.LATE): 9, ("dvl", Refusal.LATE): 1}
 
 
-def test_files_have_counts_for_people_and_every_row_for_the_report(tmp_path: Path):
+def test_files_have_counts_for_people_and_every_row_for_the_report(tmp_path):
     rows = [outlier(k * NS, 50.0 + k) for k in range(8)] + [late(3)]
     comparison = refusing(rows, "isam2", "ekf-slam")
     comparison = with_run(comparison, replace(comparison.runs[0], withheld=["landmark 3; open: z"]))
@@ -151,6 +135,14 @@ def test_late_rows_are_named_and_not_used(straight, name):
     assert estimate.world_T_body.equals(other.world_T_body, 1e-9)
 
 
+def told_by(capsys: Any, *command: object) -> str:
+    """Output of a command that ends well, without its line breaks."""
+    with pytest.raises(SystemExit) as stop:
+        main([str(word) for word in command])
+    assert not stop.value.code
+    return " ".join(capsys.readouterr().out.split())
+
+
 def recorded_late(path: Path, out: Path, delays_ns: dict[str, int]) -> None:
     """The same messages, but every tenth of some topics is recorded later than it was."""
     counts: Counter[str] = Counter()
@@ -184,10 +176,7 @@ def test_rows_recorded_late_are_placed_by_their_stamps_and_said(straight, tmp_pa
     assert len(delays_ns) == 2
     recorded_late(tmp_path / "log.mcap", tmp_path / "late.mcap", delays_ns)
     for name in ("log", "late"):
-        with pytest.raises(SystemExit) as stop:
-            main(["run", str(tmp_path / f"{name}.mcap"), "-o", str(tmp_path / name), "--estimator", "dead-reckoning"])
-        assert not stop.value.code
-        said = " ".join(capsys.readouterr().out.split())
+        said = told_by(capsys, "run", tmp_path / f"{name}.mcap", "-o", tmp_path / name, "--estimator", "dead-reckoning")
         assert said.count("backwards, by 0.3 s at most: rows are sorted") == (2 if name == "late" else 0)
         assert "refused" not in said
     one, other = (read_comparison(tmp_path / name).runs[0] for name in ("log", "late"))
@@ -205,10 +194,7 @@ def spoilt_log(straight, tmp_path_factory) -> Path:
 def test_run_and_compare_name_what_was_refused_in_a_log(spoilt_log, tmp_path, capsys):
     for arguments in (["run", "--estimator", "dead-reckoning"], ["compare", "--estimators", "dead-reckoning,ekf-slam"]):
         out = tmp_path / arguments[0]
-        with pytest.raises(SystemExit) as stop:
-            main([arguments[0], str(spoilt_log), "-o", str(out), *arguments[1:]])
-        assert not stop.value.code
-        said = " ".join(capsys.readouterr().out.split())
+        said = told_by(capsys, arguments[0], spoilt_log, "-o", out, *arguments[1:])
         for seconds in ("2.000", "6.000"):
             assert f"Warning: dvl, {seconds} s: {Refusal.OUTLIER} (squared distance" in said
         index = json.loads((out / "comparison.json").read_text())
@@ -216,7 +202,7 @@ def test_run_and_compare_name_what_was_refused_in_a_log(spoilt_log, tmp_path, ca
             assert [(rows["sensor"], rows["count"]) for rows in entry["refused"]] == [("dvl", 1), ("dvl", 1)]
 
 
-def test_a_landmark_that_isam2_could_not_place_reaches_the_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_landmark_that_isam2_could_not_place_reaches_the_comparison(monkeypatch):
     sequence = simulate_mission(MissionOptions(duration_s=20.0, imu="mti1"))
     placed = SightingFactors._placed
     first = {int(sequence.detections.most_probable()[0][0])}

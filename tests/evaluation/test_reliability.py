@@ -27,7 +27,7 @@ def test_expected_error_of_five_detections_by_hand():
 
 
 @given(st.integers(1, 200), st.integers(0, 2**32 - 1))
-def test_bins_are_those_of_another_implementation(n: int, seed: int):
+def test_bins_are_those_of_another_implementation(n, seed):
     rng = np.random.default_rng(seed)
     confidence, right = rng.uniform(0, 1, n), rng.integers(0, 2, n).astype(float)
     found = reliability(confidence, right)
@@ -146,7 +146,7 @@ def test_a_sequence_is_judged_by_what_is_true():
 
 
 @pytest.mark.parametrize("missing", ["detections", "truth", "true_landmarks"])
-def test_nothing_is_judged_without_truth(missing: str):
+def test_nothing_is_judged_without_truth(missing):
     r, a = seen_at(0, LANDMARKS_M[0])
     run = run_with([(0, r, a)], [11], [0.9])
     assert reliability_of(run) is not None

@@ -90,7 +90,7 @@ def test_every_row_reaches_the_estimator_once_and_in_order(ran):
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_nothing_of_the_instance_that_warms_up_reaches_the_result(ran, fails: bool):
+def test_nothing_of_the_instance_that_warms_up_reaches_the_result(ran, fails):
     calls: list[tuple[int, int]] = []
 
     def process(self, measurements):
@@ -161,7 +161,7 @@ def test_an_exception_becomes_a_reason_of_one_line_with_type_and_time(ran):
 
 
 @pytest.mark.parametrize("can_tell", [True, False])
-def test_a_failed_run_names_what_was_refused_and_withheld_before(ran, can_tell: bool):
+def test_a_failed_run_names_what_was_refused_and_withheld_before(ran, can_tell):
     told = {"refused": [RefusedRow("dvl", 2_000_000_000, Refusal.OUTLIER, 100.0)], "withheld": ["landmark 3; open: z"]}
 
     def telling(what: str):
@@ -217,7 +217,7 @@ NAN_POSE = gtsam.Pose3(gtsam.Rot3(), np.array([np.nan, 0.0, 0.0]))
         ({"landmarks": lambda _: map_of([])}, ""),  # and an empty map
     ],
 )
-def test_results_that_cannot_be_scored_fail_the_run(ran, methods, reason: str):
+def test_results_that_cannot_be_scored_fail_the_run(ran, methods, reason):
     result = ran(**methods)
     assert result.status == ("failed" if reason else "ok")
     assert reason in result.reason

@@ -22,14 +22,14 @@ def seconds(*values: float) -> np.ndarray:
 DENSE = np.arange(0, 3.01, 0.1).tolist()
 
 
-def test_instants_outside_the_truth_are_left_out_and_counted() -> None:
+def test_instants_outside_the_truth_are_left_out_and_counted():
     scored = scored_instants(seconds(-0.5, 0, 1, 3, 3.5), trajectory(DENSE), [])
     np.testing.assert_array_equal(scored.stamps_ns, seconds(0, 1, 3))
     assert (scored.asked, scored.outside_truth, scored.in_truth_gap) == (5, 2, 0)
     assert str(scored) == "3 of 5 instants (left out: 2 outside the truth's time span)"
 
 
-def test_instants_in_a_gap_of_the_truth_are_left_out_but_not_its_edges() -> None:
+def test_instants_in_a_gap_of_the_truth_are_left_out_but_not_its_edges():
     occluded = [t for t in DENSE if not 1.0 < t < 1.95]
     scored = scored_instants(seconds(0.5, 1.0, 1.5, 2.0), trajectory(occluded), [])
     np.testing.assert_array_equal(scored.stamps_ns, seconds(0.5, 1.0, 2.0))
@@ -37,19 +37,19 @@ def test_instants_in_a_gap_of_the_truth_are_left_out_but_not_its_edges() -> None
     assert "1 in gaps of the truth longer than 0.5 s" in str(scored)
 
 
-def test_a_short_gap_is_interpolated() -> None:
+def test_a_short_gap_is_interpolated():
     occluded = [t for t in DENSE if not 1.05 < t < 1.45]
     assert len(scored_instants(seconds(1.25), trajectory(occluded), [])) == 1
 
 
-def test_a_sparse_truth_is_no_gap_throughout() -> None:
+def test_a_sparse_truth_is_no_gap_throughout():
     reference = trajectory([0.0, 1.0, 2.0, 3.0, 6.0, 7.0])
     assert gap_limit_s(reference) == pytest.approx(1.5)
     scored = scored_instants(seconds(0.5, 1.5, 4.0, 6.5), reference, [])
     np.testing.assert_array_equal(scored.stamps_ns, seconds(0.5, 1.5, 6.5))
 
 
-def test_an_instant_that_one_run_lacks_is_left_out_for_all() -> None:
+def test_an_instant_that_one_run_lacks_is_left_out_for_all():
     runs = [
         RunResult("a", {}, "ok", causal=trajectory([0.5, 1.0, 1.5])),
         RunResult("b", {}, "ok", causal=trajectory([1.0, 1.5])),
@@ -60,7 +60,7 @@ def test_an_instant_that_one_run_lacks_is_left_out_for_all() -> None:
     assert scored.not_estimated == 1
 
 
-def test_every_instant_asked_for_is_scored_or_left_out_for_one_reason() -> None:
+def test_every_instant_asked_for_is_scored_or_left_out_for_one_reason():
     """The run lacks an instant before the truth, one in its gap and one that it covers: only the last is its fault."""
     occluded = [t for t in DENSE if not 1.0 < t < 1.95]
     runs = [RunResult("a", {}, "ok", causal=trajectory([2.5, 3.0, 3.5]))]
@@ -70,13 +70,13 @@ def test_every_instant_asked_for_is_scored_or_left_out_for_one_reason() -> None:
     assert len(scored) + scored.outside_truth + scored.in_truth_gap + scored.not_estimated == scored.asked
 
 
-def test_rows_are_found_by_stamp() -> None:
+def test_rows_are_found_by_stamp():
     rows = rows_at(trajectory(DENSE), seconds(0.5, 2.0))
     np.testing.assert_allclose(rows.positions[:, 0], [0.5, 2.0])
 
 
 @pytest.mark.parametrize("duration_s", [2039.0, 203.9])
-def test_maps_are_kept_at_the_published_times_or_the_same_fractions(duration_s: float) -> None:
+def test_maps_are_kept_at_the_published_times_or_the_same_fractions(duration_s):
     scale = duration_s / 2039.0
     asked = seconds(*(7.0 + np.linspace(0, duration_s, 4079)[1:]))
     kept = map_instants(asked, int(seconds(7.0)[0]))
@@ -87,6 +87,6 @@ def test_maps_are_kept_at_the_published_times_or_the_same_fractions(duration_s: 
     assert kept[-1] == asked[-1]
 
 
-def test_few_instants_are_each_kept_once() -> None:
+def test_few_instants_are_each_kept_once():
     np.testing.assert_array_equal(map_instants(seconds(1.0), 0), seconds(1.0))
     assert len(map_instants(seconds(), 0)) == 0

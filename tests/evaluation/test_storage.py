@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,22 +16,21 @@ from sonar_graph.evaluation.comparison import compare
 from sonar_graph.evaluation.results import Comparison
 from sonar_graph.evaluation.storage import read_comparison, write_comparison
 from sonar_graph.measurements import Measurements
-from sonar_graph.sequence import Sequence
 from sonar_graph.states import Estimate
 
-Make = Callable[..., Sequence]
+from .conftest import Offset, straight_sequence
 
 
 @pytest.fixture
-def comparison(install, make_sequence, offset_estimator) -> Comparison:
+def comparison(install) -> Comparison:
     """One run that went well, one that failed."""
 
-    class Broken(offset_estimator):
+    class Broken(Offset):
         def process(self, _measurements: Measurements) -> Estimate | None:
             raise RuntimeError("diverged")
 
-    install(offset=offset_estimator, broken=Broken, other=offset_estimator)
-    return compare(make_sequence(), ["offset", "broken"], {"offset": {"offset_m": 0.4}})
+    install(broken=Broken, other=Offset)
+    return compare(straight_sequence(), ["offset", "broken"], {"offset": {"offset_m": 0.4}})
 
 
 def assert_same(left: Any, right: Any, where: str = "") -> None:
@@ -65,9 +63,8 @@ def test_reading_returns_what_was_written(comparison, tmp_path):
     assert isinstance(restored.sequence.calibration, Calibration)
 
 
-def test_a_comparison_without_truth_survives(install, make_sequence, offset_estimator, tmp_path):
-    install(offset=offset_estimator)
-    written = compare(make_sequence(truth=False), ["offset"])
+def test_a_comparison_without_truth_survives(install, tmp_path):
+    written = compare(straight_sequence(truth=False), ["offset"])
     write_comparison(written, tmp_path)
     restored = read_comparison(tmp_path)
     assert restored.sequence.truth is None
@@ -76,11 +73,8 @@ def test_a_comparison_without_truth_survives(install, make_sequence, offset_esti
 
 
 @pytest.mark.parametrize("are_known", [False, True])
-def test_truth_keeps_its_covariances_and_unknown_take_no_space(
-    install, make_sequence, offset_estimator, tmp_path, are_known: bool
-):
-    install(offset=offset_estimator)
-    sequence = make_sequence()
+def test_truth_keeps_its_covariances_and_unknown_take_no_space(install, tmp_path, are_known):
+    sequence = straight_sequence()
     assert sequence.truth is not None
     assert np.isnan(sequence.truth.covariances).all()
     covariances = sequence.truth.covariances.copy()
@@ -144,8 +138,8 @@ def test_a_failed_run_leaves_only_its_reason(comparison, tmp_path):
     assert "diverged" in json.loads((folder / "result.json").read_text("utf-8"))["reason"]
 
 
-def test_nothing_of_an_earlier_comparison_remains(comparison: Comparison, make_sequence, tmp_path):
-    write_comparison(compare(make_sequence(), ["other", "offset"]), tmp_path)
+def test_nothing_of_an_earlier_comparison_remains(comparison, tmp_path):
+    write_comparison(compare(straight_sequence(), ["other", "offset"]), tmp_path)
     (tmp_path / "runs" / "other" / "my notes.txt").write_text("kept")
     (tmp_path / "runs" / "broken").mkdir()
     (tmp_path / "runs" / "broken" / "trajectory.tum").write_text("of a run that went well")
@@ -155,7 +149,7 @@ def test_nothing_of_an_earlier_comparison_remains(comparison: Comparison, make_s
     assert [run.estimator for run in read_comparison(tmp_path).runs] == ["offset", "broken"]
 
 
-def test_an_interrupted_writing_is_not_taken_for_a_comparison(comparison: Comparison, monkeypatch, tmp_path):
+def test_an_interrupted_writing_is_not_taken_for_a_comparison(comparison, monkeypatch, tmp_path):
     write_comparison(comparison, tmp_path)
 
     def fail(path: Path, _: Any) -> None:
@@ -211,7 +205,7 @@ def remove_column(folder: Path) -> None:
         (remove_column, "truth lacks positions"),
     ],
 )
-def test_damage_is_named(comparison, tmp_path, damage: Callable[[Path], None], named: str):
+def test_damage_is_named(comparison, tmp_path, damage, named):
     write_comparison(comparison, tmp_path)
     damage(tmp_path)
     with pytest.raises(EvaluationError, match=named):

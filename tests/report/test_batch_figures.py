@@ -8,7 +8,7 @@ from tests.recorded_batches import drawn_batch
 
 
 @pytest.mark.parametrize(("logs", "shape"), [(1, (1, 1)), (2, (2, 1)), (3, (2, 2)), (4, (2, 3)), (9, (3, 3))])
-def test_many_logs_stand_beside_each_other(logs: int, shape: tuple[int, int]) -> None:
+def test_many_logs_stand_beside_each_other(logs, shape):
     names = tuple(f"log {index}" for index in range(logs))
     figure, panels = log_panels(drawn_batch(1, logs=names), list(names), "error (m)")
     assert [panel.get_title(loc="left") for panel in panels] == list(names)
@@ -18,7 +18,7 @@ def test_many_logs_stand_beside_each_other(logs: int, shape: tuple[int, int]) ->
     assert figure.get_figwidth() == WIDTH_IN
 
 
-def test_names_stand_at_the_left_of_every_row_only() -> None:
+def test_names_stand_at_the_left_of_every_row_only():
     names = tuple(f"log {index}" for index in range(5))
     batch = drawn_batch(1, logs=names)
     _, panels = log_panels(batch, list(names), "")
@@ -28,13 +28,13 @@ def test_names_stand_at_the_left_of_every_row_only() -> None:
 
 
 @pytest.mark.parametrize("name", ["isam2/identity.policy=max-mixture", "a, b=1, c=2", "plain", "/=,", "x" * 40])
-def test_folding_loses_no_letter(name: str) -> None:
+def test_folding_loses_no_letter(name):
     lines = folded(name, 18).split("\n")
     assert "".join(lines).replace(" ", "") == name.replace(" ", "")
     assert all(len(line) <= 18 or not any(sign in line[:-1] for sign in "/=,") for line in lines)
 
 
-def test_the_first_contestant_is_on_top_and_each_has_its_colour() -> None:
+def test_the_first_contestant_is_on_top_and_each_has_its_colour():
     batch = drawn_batch(1)
     _, panels = log_panels(batch, batch.logs, "")
     bottom, top = panels[0].get_ylim()
@@ -44,7 +44,7 @@ def test_the_first_contestant_is_on_top_and_each_has_its_colour() -> None:
     assert len(set(colours)) == len(colours)
 
 
-def test_headings_are_folded_over_small_panels_alone() -> None:
+def test_headings_are_folded_over_small_panels_alone():
     names = tuple(f"tracks, wrong_id_rate=0.0{index}" for index in range(3))
     batch = drawn_batch(1, logs=names)
     for logs in (names[:2], names):
@@ -52,7 +52,7 @@ def test_headings_are_folded_over_small_panels_alone() -> None:
         assert ["\n" in panel.get_title(loc="left") for panel in panels] == [len(logs) > 2] * len(logs)
 
 
-def test_a_spread_out_scale_has_numbers_at_one_two_and_five() -> None:
+def test_a_spread_out_scale_has_numbers_at_one_two_and_five():
     _, (panel, *_) = log_panels(drawn_batch(1), ["basin"], "")
     spread_out(panel)
     panel.set_xlim(0.9, 11)

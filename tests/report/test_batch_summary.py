@@ -16,7 +16,7 @@ from sonar_graph.evaluation.tables import Cell, Table
 from sonar_graph.report.batch_summary import DIFFERENT, HIGHER, LOWER, head_metric, headlines, mark_of, overview_table
 from sonar_graph.report.batch_tables import accuracy_table, all_tests
 from sonar_graph.report.rendering import as_csv, as_latex
-from tests.recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, with_failures
+from tests.recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, updated, with_failures, without
 
 ATE = metrics_of(["causal.ate_se2_m"])[0]
 
@@ -30,18 +30,6 @@ def cell_of(table: Table, log: str, over: str, contestant: str) -> Cell:
         i for i, c in enumerate(table.columns) if (c.over, c.heading.removesuffix(" (reference)")) == (over, contestant)
     )
     return next(row[place] for row in table.rows if row[0].text == log)
-
-
-def without_smoothing(batch: RecordedBatch, contestant: str) -> RecordedBatch:
-    """The batch, were the smoothed estimate of a contestant its causal one."""
-    same = {"smoothed.ate_se2_m": "causal.ate_se2_m"}
-    runs = [
-        replace(run, values=run.values | {own: run.values[other] for own, other in same.items()})
-        if run.contestant == contestant
-        else run
-        for run in batch.runs
-    ]
-    return replace(batch, runs=runs)
 
 
 def test_overview_has_the_median_of_every_log_and_contestant():
@@ -75,7 +63,8 @@ def test_the_mark_is_of_the_median_and_only_below_five_percent(median, mark):
 
 
 def test_a_filter_has_no_smoothed_column_and_the_reference_is_named():
-    table = overview_of(without_smoothing(drawn_batch(), "ekf-slam"))
+    same = updated(drawn_batch(), lambda run: {"smoothed.ate_se2_m": run.values["causal.ate_se2_m"]}, ("ekf-slam",))
+    table = overview_of(same)
     smoothed = [column.heading.removesuffix(" (reference)") for column in table.columns if column.over == "Smoothed"]
     assert smoothed == ["dead-reckoning", "isam2"]
     assert next(column.heading for column in table.columns if column.over == "Causal") == "dead-reckoning (reference)"
@@ -104,19 +93,12 @@ def test_who_never_ended_is_higher_than_the_reference_and_not_left_out():
 
 def test_the_sentence_counts_logs():
     batch = drawn_batch(logs=("one", "two", "three"))
-    worse = [
-        replace(run, values=run.values | {"causal.ate_se2_m": 9.0 + 0.01 * run.seed})
-        if (run.contestant, run.log) == ("isam2", "two")
-        else run
-        for run in batch.runs
-    ]
     causal, smoothed = headlines(batch, ATE, all_tests(batch, [ATE]))
-    assert (
-        causal
-        == "Causal error beside that of dead-reckoning (on how many of 3 logs): lower with isam2 (3), ekf-slam (3)."
-    )
-    assert smoothed.startswith("Smoothed error beside that of dead-reckoning")
-    mixed = replace(batch, runs=worse)
+    beside = "error beside that of dead-reckoning"
+    assert causal == f"Causal {beside} (on how many of 3 logs): lower with isam2 (3), ekf-slam (3)."
+    assert smoothed.startswith(f"Smoothed {beside}")
+    worse = {"causal.ate_se2_m": 9.0}
+    mixed = updated(batch, lambda run: worse if run.log == "two" else {}, ("isam2",))
     told = headlines(mixed, ATE, all_tests(mixed, [ATE]))[0]
     assert "lower with isam2 (2), ekf-slam (3); higher with isam2 (1)" in told
 
@@ -145,23 +127,13 @@ def test_what_only_all_logs_together_tell_is_no_count_of_logs():
 def test_the_head_shows_the_first_error_that_most_logs_have():
     batch, metrics = drawn_batch(), metrics_of(METRICS)
     assert head_metric(batch, metrics) == metrics[0]
-    partly = replace(
-        batch,
-        runs=[
-            replace(run, values={key: value for key, value in run.values.items() if "ate" not in key})
-            if run.log == LOGS[0]
-            else run
-            for run in batch.runs
-        ],
-    )
-    assert head_metric(partly, metrics) == metrics[1]
+    assert head_metric(without(batch, "ate", LOGS[0]), metrics) == metrics[1]
     assert head_metric(replace(batch, runs=[failed(run) for run in batch.runs]), metrics) is None
 
 
-@pytest.mark.parametrize("arrow", [r"$\downarrow$"])
-def test_latex_has_arrows_as_commands(arrow):
+def test_latex_has_arrows_as_commands():
     text = as_latex(overview_of(drawn_batch()))
-    assert arrow in text
+    assert r"$\downarrow$" in text
     assert LOWER not in text
 
 
@@ -171,9 +143,8 @@ def test_what_is_no_error_is_no_head():
 
 
 def test_logs_are_counted_only_where_somebody_is_told_apart():
-    batch, rng = drawn_batch(), np.random.default_rng(16)
-    runs = [replace(run, values=run.values | {"smoothed.ate_se2_m": rng.lognormal()}) for run in batch.runs]
-    batch = replace(batch, runs=runs)
+    rng = np.random.default_rng(16)
+    batch = updated(drawn_batch(), lambda _: {"smoothed.ate_se2_m": rng.lognormal()})
     causal, smoothed = headlines(batch, ATE, all_tests(batch, [ATE]))
     assert causal.startswith("Causal error beside that of dead-reckoning (on how many of 2 logs): lower with")
     assert smoothed == "Smoothed error beside that of dead-reckoning: never told apart: isam2, ekf-slam."

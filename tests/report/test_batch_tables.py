@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import re
 from dataclasses import replace
 
@@ -34,7 +35,7 @@ from sonar_graph.report.batch_tables import (
     run_lists,
 )
 from sonar_graph.report.rendering import as_csv, as_latex, latex_text, write_tables
-from tests.recorded_batches import LOGS, METRICS, changed, drawn_batch, with_failures
+from tests.recorded_batches import LOGS, METRICS, changed, drawn_batch, updated, with_failures, without
 
 ATE = metrics_of(["causal.ate_se2_m"])[0]
 
@@ -158,14 +159,8 @@ def test_consistency_is_judged_over_runs_by_the_chi_square_band():
 def with_one_end(batch: RecordedBatch, contestants: tuple[str, ...], factor: float = 1.0) -> RecordedBatch:
     """The batch, were the smoothed error at the end of contestants the causal one times a factor."""
     ends = [f"nees_{what}_end" for what in ("position", "yaw")]
-    return replace(
-        batch,
-        runs=[
-            replace(run, values=run.values | {f"smoothed.{e}": factor * run.values[f"causal.{e}"] for e in ends})
-            if run.contestant in contestants
-            else run
-            for run in batch.runs
-        ],
+    return updated(
+        batch, lambda run: {f"smoothed.{end}": factor * run.values[f"causal.{end}"] for end in ends}, contestants
     )
 
 
@@ -187,12 +182,7 @@ def test_a_smoothed_error_at_the_end_is_no_second_evidence(factor, shown):
 
 
 def test_who_has_but_a_smoothed_covariance_is_judged_by_it():
-    batch = drawn_batch(logs=LOGS[:1])
-    only = [
-        replace(run, values={key: value for key, value in run.values.items() if not key.startswith("causal.nees")})
-        for run in batch.runs
-    ]
-    rows = rows_of(consistency_table(replace(batch, runs=only)))
+    rows = rows_of(consistency_table(without(drawn_batch(logs=LOGS[:1]), "causal.nees")))
     assert all(row["smoothed_verdict"] for row in rows)
     assert "causal_anees" not in rows[0]
 
@@ -324,17 +314,12 @@ def test_what_has_too_few_pairs_for_a_test_costs_others_nothing():
     ]
 
 
-def uneven_batch(most: int, fewest: int) -> RecordedBatch:
-    """Two logs, of which the second has fewer seeds."""
-    batch = drawn_batch(most)
-    return replace(batch, runs=[run for run in batch.runs if run.log == LOGS[0] or run.seed < fewest])
-
-
 @pytest.mark.parametrize(("fewest", "blind"), [(8, False), (7, True), (5, True)])
 def test_seeds_are_called_too_few_only_where_the_best_differences_find_nothing(fewest, blind):
-    batch = changed(uneven_batch(20, fewest), "isam2", "causal.ate_se2_m", 1e-3)
-    for name, column in (("isam2", "smoothed.ate_se2_m"), *(("ekf-slam", f"{k}.ate_se2_m") for k in KINDS)):
-        batch = changed(batch, name, column, 1e-3)
+    batch = drawn_batch(20)
+    batch = replace(batch, runs=[run for run in batch.runs if run.log == LOGS[0] or run.seed < fewest])
+    for name, kind in itertools.product(("isam2", "ekf-slam"), KINDS):
+        batch = changed(batch, name, f"{kind}.ate_se2_m", 1e-3)
     tests = all_tests(batch, [ATE])
     assert len(tests) == 12
     assert (tests["causal.ate_se2_m", LOGS[1], "isam2"][1] < 0.05) is not blind
@@ -345,19 +330,14 @@ def test_seeds_are_called_too_few_only_where_the_best_differences_find_nothing(f
 
 def test_a_filters_two_estimates_do_not_ask_for_more_seeds():
     batch = drawn_batch(7, logs=LOGS[:1])
-    same = [
-        replace(run, values=run.values | {"smoothed.ate_se2_m": run.values["causal.ate_se2_m"]}) for run in batch.runs
-    ]
+    same = updated(batch, lambda run: {"smoothed.ate_se2_m": run.values["causal.ate_se2_m"]})
     assert "7 pairs" in power_told(all_tests(batch, [ATE]))[0], "four tests: 4 / 2**6 is above 5 %"
-    assert power_told(all_tests(replace(batch, runs=same), [ATE])) == [], "two tests"
+    assert power_told(all_tests(same, [ATE])) == [], "two tests"
 
 
 @pytest.mark.parametrize("key", ["time.total_s", "memory.peak_mb", "wall_s", "peak_memory_mb"])
 def test_time_and_memory_are_shown_and_not_tested(key):
-    batch = drawn_batch(12, logs=LOGS[:1])
-    batch = replace(
-        batch, runs=[replace(r, values=r.values | {key: len(r.estimator) + 0.01 * r.seed}) for r in batch.runs]
-    )
+    batch = updated(drawn_batch(12, logs=LOGS[:1]), lambda run: {key: len(run.estimator) + 0.01 * run.seed})
     (metric,) = metrics_of([key])
     assert all_tests(batch, [metric]) == {}
     assert accuracy_table(batch, metric).rows
@@ -383,8 +363,7 @@ def test_a_warning_names_few_logs():
 
 
 def test_runs_that_were_scored_at_other_instants_are_warned_of():
-    batch = drawn_batch(2)
-    even = replace(batch, runs=[replace(run, values=run.values | {"scored_instants": 50.0}) for run in batch.runs])
+    even = updated(drawn_batch(2), lambda _: {"scored_instants": 50.0})
     fewer = replace(even.runs[0], values=even.runs[0].values | {"scored_instants": 40.0})
     assert instants_told(even) == []
     assert LOGS[0] in instants_told(replace(even, runs=[fewer, *even.runs[1:]]))[0]

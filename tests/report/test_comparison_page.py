@@ -153,11 +153,11 @@ def recognised(lane, lane_recognition) -> Comparison:
     return replace(basin_comparison(), sequence=sequence, recognition=lane_recognition)
 
 
-def test_a_comparison_without_images_has_no_such_section() -> None:
+def test_a_comparison_without_images_has_no_such_section():
     assert recognition_content(basin_comparison()) is None
 
 
-def test_the_section_shows_pictures_counts_and_reliability(recognised, lane_recognition) -> None:
+def test_the_section_shows_pictures_counts_and_reliability(recognised, lane_recognition):
     content = recognition_content(recognised)
     assert content is not None
     assert content["frames"] == lane_recognition.frames
@@ -176,7 +176,7 @@ def test_the_section_shows_pictures_counts_and_reliability(recognised, lane_reco
     assert "<svg" in content["reliability"]
 
 
-def test_the_report_holds_pictures_and_warnings_with_their_time(recognised) -> None:
+def test_the_report_holds_pictures_and_warnings_with_their_time(recognised):
     start_ns = recognised.sequence.start_ns
     warned = replace(
         recognised, recognition=replace(recognised.recognition, warnings=[(start_ns + 1_250_000_000, "<b> & so on")])
@@ -192,7 +192,7 @@ def test_the_report_holds_pictures_and_warnings_with_their_time(recognised) -> N
     assert content["expected_error"] in page
 
 
-def test_without_truth_nothing_is_judged(recognised) -> None:
+def test_without_truth_nothing_is_judged(recognised):
     blind = replace(recognised, sequence=replace(recognised.sequence, truth=None))
     content = recognition_content(blind)
     assert content is not None
@@ -200,7 +200,7 @@ def test_without_truth_nothing_is_judged(recognised) -> None:
     assert content["reliability"] == ""
 
 
-def test_the_figure_shows_shares_over_confidence_and_counts() -> None:
+def test_the_figure_shows_shares_over_confidence_and_counts():
     judged = reliability(np.array([0.95, 0.95, 0.55]), np.array([1.0, 0.0, 1.0]))
     shares, counts = reliability_figure(judged).axes
     (dots,) = shares.collections
@@ -212,7 +212,7 @@ def test_the_figure_shows_shares_over_confidence_and_counts() -> None:
     assert counts.patches[9].get_x() + counts.patches[9].get_width() / 2 == pytest.approx(0.95)
 
 
-def test_detections_are_counted_by_what_they_truly_are(recognised, lane_recognition) -> None:
+def test_detections_are_counted_by_what_they_truly_are(recognised, lane_recognition):
     """Right, wrong and taken for no landmark: in all as many as there are detections."""
     content = recognition_content(recognised)
     assert content is not None
@@ -227,7 +227,7 @@ def test_detections_are_counted_by_what_they_truly_are(recognised, lane_recognit
     assert counts[4, 2] > 20
 
 
-def test_a_landmark_that_is_named_as_another_is_named_wrongly(recognised) -> None:
+def test_a_landmark_that_is_named_as_another_is_named_wrongly(recognised):
     detections = recognised.sequence.detections
     swapped = replace(detections, candidate_ids=detections.candidate_ids % 4 + 1)
     before = recognition_content(recognised)

@@ -3,7 +3,6 @@ from __future__ import annotations
 import csv
 import io
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ def rows(batch: RecordedBatch) -> dict[tuple[str, str], dict[str, object]]:
     return {(str(row["log"]), str(row["contestant"])): row for row in cells}
 
 
-def test_missing_runs_are_counted_and_are_no_failures(incomplete: RecordedBatch) -> None:
+def test_missing_runs_are_counted_and_are_no_failures(incomplete):
     counted = rows(incomplete)
     assert len(counted) == 6
     some, none = counted[LOGS[0], "isam2"], counted[LOGS[0], "ekf-slam"]
@@ -45,7 +44,7 @@ def test_missing_runs_are_counted_and_are_no_failures(incomplete: RecordedBatch)
     assert "not_run" not in rows(drawn_batch(2))[LOGS[0], "isam2"]
 
 
-def test_missing_runs_make_no_pairs_and_no_values(incomplete: RecordedBatch) -> None:
+def test_missing_runs_make_no_pairs_and_no_values(incomplete):
     assert len(incomplete.values(LOGS[0], "isam2", ATE)) == 6
     assert len(incomplete.pairs(LOGS[0], "isam2", ATE)[0]) == 6
     assert not incomplete.is_asked(LOGS[0], "ekf-slam", ATE)
@@ -55,19 +54,19 @@ def test_missing_runs_make_no_pairs_and_no_values(incomplete: RecordedBatch) -> 
     assert str(all_tests(incomplete, metrics)) == str(all_tests(dropped, metrics)) != str(all_tests(complete, metrics))
 
 
-def test_contestants_and_logs_keep_the_order_of_the_plan(incomplete: RecordedBatch, tmp_path) -> None:
+def test_contestants_and_logs_keep_the_order_of_the_plan(incomplete, tmp_path):
     lacks_first = with_missing(incomplete, "dead-reckoning", LOGS[0], 10)
     assert lacks_first.contestants == drawn_batch(1).contestants
     assert read_batch(write_batch(lacks_first, tmp_path)).contestants == list(ESTIMATORS)
 
 
-def test_a_table_with_missing_runs_is_read_as_one(incomplete: RecordedBatch, tmp_path) -> None:
+def test_a_table_with_missing_runs_is_read_as_one(incomplete, tmp_path):
     back = read_batch(write_batch(incomplete, tmp_path))
     assert [run.key for run in back.runs] == [run.key for run in incomplete.runs]
     assert {run.key for run in back.missing} == {run.key for run in incomplete.missing}
 
 
-def test_a_batch_of_which_nothing_is_done_is_refused(tmp_path) -> None:
+def test_a_batch_of_which_nothing_is_done_is_refused(tmp_path):
     batch = drawn_batch(1, logs=LOGS[:1])
     for name in ESTIMATORS:
         batch = with_missing(batch, name, LOGS[0], 1)
@@ -76,7 +75,7 @@ def test_a_batch_of_which_nothing_is_done_is_refused(tmp_path) -> None:
         read_batch(tmp_path)
 
 
-def test_the_warning_says_how_many_whose_where_and_how_to_go_on(incomplete: RecordedBatch) -> None:
+def test_the_warning_says_how_many_whose_where_and_how_to_go_on(incomplete):
     (told,) = missing_told(incomplete)
     assert told.startswith("This batch is not complete: 14 of 60 runs have not been done (isam2 4 of 20, ekf-slam")
     assert "on basin. All numbers are of the other runs" in told
@@ -84,7 +83,7 @@ def test_the_warning_says_how_many_whose_where_and_how_to_go_on(incomplete: Reco
     assert missing_told(drawn_batch(2)) == []
 
 
-def test_page_and_tables_say_that_runs_are_missing(incomplete: RecordedBatch, tmp_path) -> None:
+def test_page_and_tables_say_that_runs_are_missing(incomplete, tmp_path):
     write_batch_report(incomplete, tmp_path)
     html = (tmp_path / "report.html").read_text("utf-8")
     first = html.index('<p class="warning">')
@@ -97,7 +96,7 @@ def test_page_and_tables_say_that_runs_are_missing(incomplete: RecordedBatch, tm
     assert sum(int(row["not_run"]) for row in counted) == 14
 
 
-def test_a_complete_page_says_nothing_of_it() -> None:
+def test_a_complete_page_says_nothing_of_it():
     html = render_batch(drawn_batch(2))
     assert "not complete" not in html.lower()
     assert "Every run ended well." in html
@@ -106,7 +105,7 @@ def test_a_complete_page_says_nothing_of_it() -> None:
 
 
 @pytest.mark.parametrize("gone", ["dead-reckoning", "isam2"])
-def test_a_contestant_without_any_run_leaves_a_page_of_the_others(gone: str) -> None:
+def test_a_contestant_without_any_run_leaves_a_page_of_the_others(gone):
     batch = drawn_batch(3)
     for log in LOGS:
         batch = with_missing(batch, gone, log, 3)
@@ -115,7 +114,7 @@ def test_a_contestant_without_any_run_leaves_a_page_of_the_others(gone: str) -> 
     assert f"({gone} 6 of 6)" in html
 
 
-def test_an_incomplete_batch_is_no_reference_and_passes_no_gate(incomplete: RecordedBatch, tmp_path) -> None:
+def test_an_incomplete_batch_is_no_reference_and_passes_no_gate(incomplete, tmp_path):
     reference = tmp_path / "reference.json"
     with pytest.raises(EvaluationError, match=r"the batch 'drawn' cannot become a reference, 14 of 60 runs"):
         bless(incomplete, reference)
@@ -127,7 +126,7 @@ def test_an_incomplete_batch_is_no_reference_and_passes_no_gate(incomplete: Reco
 
 
 @pytest.mark.parametrize(("count", "named"), [(3, "log 0; log 1; log 2."), (5, "log 0; log 1; log 2 and 2 more.")])
-def test_the_warning_names_three_logs_and_counts_the_others(count: int, named: str) -> None:
+def test_the_warning_names_three_logs_and_counts_the_others(count, named):
     logs = tuple(f"log {place}" for place in range(count))
     batch = drawn_batch(2, logs=logs)
     for log in logs:
@@ -136,7 +135,7 @@ def test_the_warning_names_three_logs_and_counts_the_others(count: int, named: s
     assert f", on {named} All numbers" in told
 
 
-def test_rows_whose_runs_are_not_here_are_told_and_lead_nowhere(tmp_path: Path) -> None:
+def test_rows_whose_runs_are_not_here_are_told_and_lead_nowhere(tmp_path):
     batch = drawn_batch(2)
     write_batch(batch, tmp_path)
     for run in batch.runs[1:]:

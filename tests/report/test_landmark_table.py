@@ -103,7 +103,7 @@ def test_only_the_repeated_experiment_has_the_papers_column():
 
 
 @pytest.mark.parametrize("begins_later", [0, 3])
-def test_the_return_is_told_against_the_truth_at_the_runs_own_ends(begins_later: int):
+def test_the_return_is_told_against_the_truth_at_the_runs_own_ends(begins_later):
     """A path that keeps a distance from the truth returns as the truth does; one that drifts by 0.3 m does not."""
     comparison = repeated()
     truth = comparison.sequence.truth

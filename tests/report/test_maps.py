@@ -62,7 +62,7 @@ def test_ellipses_are_as_large_as_the_caption_says():
 
 
 @pytest.mark.parametrize("sigma_m", [1e-4, 0.01, 0.1, 3.0])
-def test_ellipses_are_enlarged_only_as_far_as_there_is_room(sigma_m: float):
+def test_ellipses_are_enlarged_only_as_far_as_there_is_room(sigma_m):
     comparison = grown(60, sigma_m)
     view, factor = map_view(comparison), enlargement(comparison)
     assert view is not None

@@ -145,7 +145,7 @@ def test_the_same_results_make_the_same_page(kind, html):
     ],
     ids=["comparison", "batch", "notebook"],
 )
-def test_what_a_log_or_an_estimator_says_is_escaped_everywhere(shown, scripts: int):
+def test_what_a_log_or_an_estimator_says_is_escaped_everywhere(shown, scripts):
     text = shown()
     Page(text)
     assert text.count("<script") == scripts

@@ -26,8 +26,19 @@ from sonar_graph.report.sentences import (
     warning_lines,
     withheld_lines,
 )
-from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionLog, LandmarkMap, Outcome, Refusal, RefusedRow
-from tests.synthetic import IDS, LANDMARKS, basin_comparison, only, with_failure, with_run, with_score
+from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionLog, LandmarkMap, Outcome, Refusal
+from tests.synthetic import (
+    IDS,
+    LANDMARKS,
+    basin_comparison,
+    late,
+    only,
+    outlier,
+    refusing,
+    with_failure,
+    with_run,
+    with_score,
+)
 
 from .test_console import printed
 
@@ -71,7 +82,7 @@ def test_radians_are_shown_as_degrees():
 
 
 @pytest.mark.parametrize("truth", [True, False])
-def test_the_smoothed_error_is_told_only_where_it_is_another_one(truth: bool):
+def test_the_smoothed_error_is_told_only_where_it_is_another_one(truth):
     sentences = [one for one in finding(basin_comparison(60, truth=truth)) if "(smoothed)" in one]
     assert len(sentences) == truth
     assert all("isam2" in one and "ekf-slam" not in one for one in sentences)
@@ -98,7 +109,7 @@ def test_failures_come_first_and_the_lack_of_a_finding_has_its_reason():
         (Score(40.0, "m", ""), ""),
     ],
 )
-def test_consistency_follows_the_interval_and_without_one_a_factor_of_two(score: Score, verdict: str):
+def test_consistency_follows_the_interval_and_without_one_a_factor_of_two(score, verdict):
     assert score.verdict == verdict
 
 
@@ -111,7 +122,7 @@ def test_consistency_follows_the_interval_and_without_one_a_factor_of_two(score:
         (0.0, 6.0, "isam2 0 (position, over-cautious)"),
     ],
 )
-def test_the_nees_furthest_from_one_is_told(position: float, yaw: float, told: str):
+def test_the_nees_furthest_from_one_is_told(position, yaw, told):
     judged = with_score(scored(isam2=0.1), "isam2", "causal.nees_position", nees(position))
     assert finding(with_score(judged, "isam2", "causal.nees_yaw", nees(yaw)))[-1].endswith(f": {told}.")
 
@@ -233,7 +244,7 @@ def test_sightings_contradict_a_map_where_sigmas_are_four_times_too_small_but_no
 @pytest.mark.parametrize(
     ("count", "listed"), [(2, "1 and 2"), (5, "1, 2, 3, 4 and 5"), (6, "1, 2, 3, 4, 5 and 1 more")]
 )
-def test_five_landmarks_are_named_and_more_are_counted(count: int, listed: str):
+def test_five_landmarks_are_named_and_more_are_counted(count, listed):
     ids, blank = np.arange(1, count + 1), with_map(IDS, [0.0] * 4, has_truth=False)
     log = replace(log_of([Outcome.USED] * count, [1.0] * count), landmark_ids=ids)
     landmarks = LandmarkMap(ids, np.zeros((count, 3)), np.zeros((count, 3, 3)))
@@ -242,13 +253,13 @@ def test_five_landmarks_are_named_and_more_are_counted(count: int, listed: str):
 
 
 @pytest.mark.parametrize("outcome", [Outcome.GATED, Outcome.WITHHELD, Outcome.REPEATED])
-def test_innovations_that_were_refused_say_nothing_of_the_map(outcome: Outcome):
+def test_innovations_that_were_refused_say_nothing_of_the_map(outcome):
     log = log_of([outcome] * 10, [1.0] * 10)
     assert doubt_of_identities(with_map(IDS, [0.0] * 4, has_truth=False, detections=log)) == []
 
 
 @pytest.mark.parametrize("outcome", [Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNFIT])
-def test_a_log_without_any_identity_is_told_with_what_to_do(outcome: Outcome):
+def test_a_log_without_any_identity_is_told_with_what_to_do(outcome):
     log = log_of([outcome] * 6, [np.nan] * 6)
     blind = with_map(IDS, [0.0] * 4, detections=log)
     line = (
@@ -322,22 +333,6 @@ def test_of_a_logs_notes_the_doubts_are_said_and_gaps_and_unlikely_numbers_are_w
     notes = {subject: f"<{subject}>" for subject in SAID_NOTES} | {"log.topics": "imu: /imu", "log.noise": "dvl"}
     assert [line.partition(": ")[2] for line in doubt_lines(notes)] == [f"<{subject}>" for subject in SAID_NOTES]
     assert warning_lines(notes) == ["Warning: <log.warnings>", "Warning: <log.gaps>"]
-
-
-def outlier(stamp_ns: int, distance: float = 100.0) -> RefusedRow:
-    return RefusedRow("dvl", stamp_ns, Refusal.OUTLIER, distance)
-
-
-def late(stamp_ns: int) -> RefusedRow:
-    return RefusedRow("imu", stamp_ns, Refusal.LATE, math.nan)
-
-
-def refusing(refused: list[RefusedRow], *names: str) -> Comparison:
-    comparison = basin_comparison(60)
-    for run in comparison.runs:
-        if run.estimator in names:
-            comparison = with_run(comparison, replace(run, refused=refused))
-    return comparison
 
 
 def test_a_line_names_sensor_stamp_reason_distance_and_runs():
