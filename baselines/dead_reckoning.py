@@ -104,7 +104,7 @@ class DeadReckoning:
     def _motion_inputs(
         self, node_ns: int, until_ns: int
     ) -> tuple[Odometry, Preintegrator, int, int, Floats, Floats | None]:
-        """Arguments of a motion from the newest node."""
+        """Arguments of a motion from the newest epoch."""
         earth_rate = None if self._earth_rate is None else self._pose.rotation().matrix().T @ self._earth_rate
         return self._odometry, self._preintegrator, node_ns, until_ns, ZERO_BIAS, earth_rate
 

@@ -55,7 +55,7 @@ from sonar_graph.numerics import compiled, euler_from_rates, euler_from_rotation
 
 @compiled
 def process_window(x: Floats, P: Floats, n: int, values: WindowValues) -> tuple[int, DetectionOutcomes, PoseArrays]:
-    """Carry the state to the newest node reached at the window's end, with all measurements on the way.
+    """Carry the state to the newest epoch reached at the window's end, with all measurements on the way.
 
     Returns the length of the state, the outcomes of the detections, and the pose at the window's end. x and P (changed)
     have room for all landmarks of the window; ``values`` are the fields of a `MeasurementWindow`.
@@ -138,12 +138,12 @@ class EkfSlam(FilterShell):
         self._P[3:POSE, 3:POSE] = E @ np.diag(np.square(start.rpy_sigma_rad)) @ E.T
 
     def state(self) -> tuple[int, Floats, Floats]:
-        """Stamp (ns), x of equation (4) and P of (5) at the newest node; copies."""
+        """Stamp (ns), x of equation (4) and P of (5) at the newest epoch; copies."""
         n = self._n
         return self.node_ns, self._x[:n].copy(), self._P[:n, :n].copy()
 
     def update(self, window: MeasurementWindow) -> tuple[DetectionOutcomes, PoseArrays]:
-        """Carry the state to the newest node reached at the window's end.
+        """Carry the state to the newest epoch reached at the window's end.
 
         Raises
         ------

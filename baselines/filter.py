@@ -60,7 +60,7 @@ class DetectionIntake:
         """Slot of each landmark, by identity."""
 
     def identify(self, detections: LandmarkDetections | None, reached_ns: int, done_ns: int) -> IdentifiedDetections:
-        """The most probable identity of each row; rows before the first node, or older than those done, are refused."""
+        """Most probable identity of each row; rows before the first epoch, or older than those done, are refused."""
         if detections is None:
             return IdentifiedDetections(None, [], [])
         identities = identify(detections, self._minimum_id_probability)
@@ -134,12 +134,12 @@ class FilterShell(ABC):
     """Estimator around the mathematics of a filter, which a subclass adds.
 
     It cuts the rows into windows; `update` gets each window with its rows in order and the clock. Detections before the
-    first node or older than those done are refused here, those outside the gate by `update`.
+    first epoch or older than those done are refused here, those outside the gate by `update`.
     """
 
     @abstractmethod
     def update(self, window: MeasurementWindow) -> tuple[DetectionOutcomes, PoseArrays]:
-        """Carry the state to the newest node reached at the window's end.
+        """Carry the state to the newest epoch reached at the window's end.
 
         Returns
         -------
@@ -168,7 +168,7 @@ class FilterShell(ABC):
 
     @property
     def node_ns(self) -> int:
-        """Stamp of the newest node, that of the state."""
+        """Stamp of the newest epoch, that of the state."""
         return int(self._clock[NODE])
 
     def process(self, measurements: Measurements) -> Estimate | None:
@@ -239,7 +239,7 @@ class FilterShell(ABC):
         return self._odometry.refused
 
     def _start(self, start_ns: int) -> None:
-        """Set the clock to the first node, which IMU rows cover from both sides."""
+        """Set the clock to the first epoch, which IMU rows cover from both sides."""
         lever_m = VehicleModel(*self._vehicle_values).dvl_p_imu
         self._reached_ns = self._odometry.start_reached_ns(start_ns)
         self._clock[NODE] = start_ns

@@ -1,12 +1,12 @@
 """Motion of the body and direction of gravity, from the IMU and the Doppler log; for both filters.
 
-A motion (dR, dp) begins at the node of the state. Its covariance is that of the perturbation [theta_i, eps] in that
-node's frame: ``Exp(theta_i) dR`` and ``dp + eps``. A gyro bias larger by db adds ``theta_i = D_t db`` and
+A motion (dR, dp) begins at the epoch of the state. Its covariance is that of the perturbation [theta_i, eps] in that
+epoch's frame: ``Exp(theta_i) dR`` and ``dp + eps``. A gyro bias larger by db adds ``theta_i = D_t db`` and
 ``eps = D_r db``; only the invariant filter has a bias in its state. Steps and gaps are those of every estimator
 (`sonar_graph.navigation.preintegration`, docs/theory/preintegration.md, docs/theory/gaps.md).
 
-Between two nodes EKF-SLAM integrates the steps up to the newest IMU row once and extends them to each depth sample and
-frame: the sums are the same to the last bit as those from the node on.
+Between two epochs EKF-SLAM integrates the steps up to the newest IMU row once and extends them to each depth sample and
+frame: the sums are the same to the last bit as those from the epoch on.
 
 Over about a second the mean specific force less the change of the Doppler velocity is that of gravity, which gives the
 direction of the world's up in the body (`sonar_graph.navigation.alignment`, docs/theory/ekf_slam.md).
@@ -65,20 +65,20 @@ UP: Vector = (0.0, 0.0, 1.0)
 
 
 class ProvisionalMotion(NamedTuple):
-    """Motion since a node over the steps that later instants share, and the conditions under which it holds."""
+    """Motion since an epoch over the steps that later instants share, and the conditions under which it holds."""
 
     node_ns: int
     dvl_rows: int
     """Doppler rows used: one more changes the velocity that was held."""
     earth: Vector
-    """Earth's rotation in the node's frame, rad/s; a correction of the attitude changes it."""
+    """Earth's rotation in the epoch's frame, rad/s; a correction of the attitude changes it."""
     cursor: Cursor
     motion: Integral
 
 
 @compiled
 def motion_to_node(columns: Columns, vehicle: VehicleModel, x: Floats, start_ns: int, node_ns: int) -> Integral:
-    """Final motion to the next node, with the first IMU row at or after it."""
+    """Final motion to the next epoch, with the first IMU row at or after it."""
     if node_ns - start_ns > vehicle.gap[0]:
         return _bridged(columns, vehicle, x, start_ns, node_ns, True)
     imu_ns, dvl_ns = columns[0], columns[3]
@@ -182,7 +182,7 @@ def _finished(motion: Integral) -> Integral:
 def motion_to_node_with_bias(
     columns: Columns, vehicle: VehicleModel, R: Floats, bias: Floats, start_ns: int, node_ns: int
 ) -> GapMotion:
-    """Final motion to the next node, with the first IMU row at or after it."""
+    """Final motion to the next epoch, with the first IMU row at or after it."""
     earth = _earth_in_body(vehicle, matrix(R))
     if node_ns - start_ns > vehicle.gap[0]:
         return bridge(columns, vehicle.gap, start_ns, node_ns, True, vector(bias), earth)
@@ -227,7 +227,7 @@ def _integrate_with_bias(
 
 @compiled
 def open_interval(columns: Columns, dvl_p_imu: Vector, interval: GravityInterval, clock: Ints) -> None:
-    """Begin a gravity interval at the node."""
+    """Begin a gravity interval at the epoch."""
     velocity = _imu_velocity(columns, clock[NODE], dvl_p_imu)
     place(IDENTITY, interval.i_R_node, 0, 0)
     for r in range(3):
@@ -239,7 +239,7 @@ def open_interval(columns: Columns, dvl_p_imu: Vector, interval: GravityInterval
 
 @inlined
 def _imu_velocity(columns: Columns, node_ns: int, dvl_p_imu: Vector) -> Floats:
-    """Velocity of the IMU at a node in body axes, m/s, and the variance of one component, shape (4,)."""
+    """Velocity of the IMU at an epoch in body axes, m/s, and the variance of one component, shape (4,)."""
     imu_ns, rate, _, dvl_ns, velocity, cov, hold_past, _ = columns
     k = rows_until(dvl_ns, node_ns - 1)
     w = value_at(imu_ns, rate, rows_until(imu_ns, node_ns - 1), node_ns, hold_past)
@@ -253,7 +253,7 @@ def _imu_velocity(columns: Columns, node_ns: int, dvl_p_imu: Vector) -> Floats:
 def up_at_node(
     columns: Columns, vehicle: VehicleModel, motion: Integral, clock: Ints, interval: GravityInterval
 ) -> tuple[Vector, float]:
-    """Direction of the world's up in the body at the node that a motion has led to, and the sigma of its tilt (rad).
+    """Direction of the world's up in the body at the epoch that a motion has led to, and the sigma of its tilt (rad).
 
     The sigma is NaN while the interval goes on, and where the specific force was not measured all along.
     """

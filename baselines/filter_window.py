@@ -1,7 +1,7 @@
 """Window of measurements as compiled code sees it: vehicle model, rows, clock, and the order of events.
 
-Events happen in the order of their stamps: first all nodes reached by then, then the depth sample or the detections of
-a sonar frame, a provisional motion after the newest node. At equal stamps depth comes first. Nodes are the stamps of
+Events happen in the order of their stamps: first all epochs reached by then, then the depth sample or the detections of
+a sonar frame, a provisional motion after the newest epoch. At equal stamps depth comes first. Epochs are the stamps of
 the Doppler log (`sonar_graph.navigation.Odometry`).
 
 Depth samples and detections that are related to the state over the same gap of the Doppler log are counted
@@ -28,11 +28,11 @@ class FilterParams(Section):
     """Settings of both filters; the paper gives none of them."""
 
     gate_probability: float = Field(0.999, gt=0, le=1)
-    """Share of true innovations that the gate lets pass; 1: no gate."""
+    """Probability with which a right detection passes the gate (chi-square); 1: no gate."""
     minimum_id_probability: float = Field(0.5, ge=0, le=1)
-    """Posterior below which an identity is not believed."""
+    """Least posterior of the most probable identity with which a detection is used."""
     gravity_interval_s: float = Field(1.0, gt=0)
-    """The specific force is averaged over this time for one correction of roll and pitch."""
+    """Time over which the specific force is averaged for one correction of roll and pitch."""
 
 
 class VehicleModel(NamedTuple):
@@ -94,7 +94,7 @@ def vehicle_model(calibration: Calibration, gravity_interval_s: float) -> Vehicl
 
 
 NODE, OPENED, DEPTHS, SIGHTINGS, LOST = 0, 1, 2, 3, 4
-"""Indices of the clock, integers that compiled code changes: stamp of the node, stamp at which the gravity interval
+"""Indices of the clock, integers that compiled code changes: stamp of the epoch, stamp at which the gravity interval
 began, number of depth samples and of detections in the present gap of the Doppler log, and 1 once it has had a gap."""
 CLOCK = 5
 """Length of the clock."""
@@ -164,7 +164,7 @@ class Stamps(NamedTuple):
 
 
 class Event(NamedTuple):
-    """A node, a depth sample, the detections of a frame, or the end of the window."""
+    """An epoch, a depth sample, the detections of a frame, or the end of the window."""
 
     kind: int
     stamp_ns: int

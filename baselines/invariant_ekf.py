@@ -62,7 +62,7 @@ StateValues = tuple[Floats, Floats, Floats, Floats]
 def process_window(
     state_values: StateValues, walk_density: float, values: WindowValues
 ) -> tuple[StateValues, DetectionOutcomes, PoseArrays]:
-    """Carry the state to the newest node reached at the window's end, with all measurements on the way.
+    """Carry the state to the newest epoch reached at the window's end, with all measurements on the way.
 
     Returns the state, the outcomes of the detections, and the pose at the window's end. ``state_values`` (changed) and
     ``values`` are the fields of an `InvariantState` and a `MeasurementWindow`; the bias walks by ``walk_density``,
@@ -131,11 +131,11 @@ class InvariantEkf(FilterShell):
         self._state = start_state(calibration)
 
     def state(self) -> tuple[int, InvariantState]:
-        """Stamp (ns) and a copy of the state at the newest node."""
+        """Stamp (ns) and a copy of the state at the newest epoch."""
         return self.node_ns, InvariantState(*(part.copy() for part in self._state))
 
     def update(self, window: MeasurementWindow) -> tuple[DetectionOutcomes, PoseArrays]:
-        """Carry the state to the newest node reached at the window's end.
+        """Carry the state to the newest epoch reached at the window's end.
 
         Raises
         ------

@@ -23,7 +23,7 @@ calibration = sequence.calibration
 print(f"IMU: angular velocity {sequence.imu.angular_velocity.shape} rad/s, from {sequence.imu.stamps_ns[0]} ns")
 
 # 2. Preintegration between two instants. Gyro and Doppler rows are merged into steps, the steps into one motion with
-# one joint covariance. Nodes, the stamps of the Doppler log, are where a motion can begin and end.
+# one joint covariance. Epochs, the stamps of the Doppler log, are where a motion can begin and end.
 odometry = Odometry(calibration)
 odometry.add(sequence.imu, sequence.dvl)
 preintegrator = Preintegrator.from_calibration(calibration)

@@ -1,18 +1,19 @@
 """Motion by gyros and Doppler log between two instants.
 
-Nodes. The stamps of the DVL rows are *nodes*: between two nodes the velocity is known on both sides and the motion is
-final. A node counts as reached at time t when its own row and an IMU row at or after it are stamped at or before t.
-What happens between nodes (a detection, a depth sample, an estimate) is related to the newest reached node by a
-provisional motion that uses nothing stamped later. Results therefore depend on stamps alone, not on how a log is cut
-into blocks. One exception: where rows are added long before they are used, the first velocities, and those after a long
-gap, are nodes once later ones have confirmed them (`sonar_graph.navigation.dvl_screening.dvl_gate`).
+Epochs. The stamps of the DVL rows are *epochs* (`nodes` in code): between two epochs the velocity is known on both
+sides and the motion is final. An epoch counts as reached at time t when its own row and an IMU row at or after it are
+stamped at or before t. What happens between epochs (a detection, a depth sample, an estimate) is related to the newest
+reached epoch by a provisional motion that uses nothing stamped later. Results therefore depend on stamps alone, not on
+how a log is cut into blocks. One exception: where rows are added long before they are used, the first velocities, and
+those after a long gap, are epochs once later ones have confirmed them
+(`sonar_graph.navigation.dvl_screening.dvl_gate`).
 
-Gaps. Without a gap of the log the motion runs over the steps between the instants. A gap between two nodes is bridged
-with both its ends known. In a gap that lasts, both instants are reached from the node at which bottom lock was lost::
+Gaps. Without a gap of the log the motion runs over the steps between the instants. A gap between two epochs is bridged
+with both its ends known. In a gap that lasts, both instants are reached from the epoch at which bottom lock was lost::
 
     M = M_1^-1 M_2,    P = P_2 - Ad(M^-1) P_1 Ad(M^-1)^T
 
-P is the growth of the error, so that successive motions, taken as independent, add up to that since the node.
+P is the growth of the error, so that successive motions, taken as independent, add up to that since the epoch.
 docs/theory/preintegration.md, docs/theory/gaps.md.
 """
 
@@ -112,11 +113,11 @@ class Odometry:
         return placed_imu or placed_dvl
 
     def settle(self, node_ns: int) -> None:
-        """Fix the motion up to a node: rows stamped at or before it are late from now on."""
+        """Fix the motion up to an epoch: rows stamped at or before it are late from now on."""
         self._intake.settled_ns = max(self._intake.settled_ns, node_ns)
 
     def forget_before(self, node_ns: int) -> None:
-        """Settle, and drop rows that no motion from this node on can need, gaps after it included."""
+        """Settle, and drop rows that no motion from this epoch on can need, gaps after it included."""
         self.settle(node_ns)
         needed_ns = node_ns if self._hold_past else node_ns - WINDOW_NS
         self._imu.forget_before(needed_ns, ROWS_BEFORE)
@@ -128,7 +129,7 @@ class Odometry:
         return imu.stamps_ns, *imu.values, dvl.stamps_ns, *dvl.values, self._hold_past, self._turns
 
     def start_ns(self) -> int | None:
-        """First node that IMU rows cover from both sides; None before there is one."""
+        """First epoch that IMU rows cover from both sides; None before there is one."""
         if not len(self._imu.stamps_ns) or not len(self._dvl.stamps_ns):
             return None
         first = np.searchsorted(self._dvl.stamps_ns, self._imu.stamps_ns[0])
@@ -137,19 +138,19 @@ class Odometry:
         return int(self._dvl.stamps_ns[first])
 
     def start_reached_ns(self, start_ns: int) -> int:
-        """Instant at which the first node was reached: an IMU row covers it, and its velocity is confirmed."""
+        """Instant at which the first epoch was reached: an IMU row covers it, and its velocity is confirmed."""
         covered_ns = int(self._imu.stamps_ns[np.searchsorted(self._imu.stamps_ns, start_ns)])
         return max(covered_ns, self._intake.start_known_ns)
 
     def start_by(self, until_ns: int) -> int | None:
-        """First node, if it is reached at an instant; else None."""
+        """First epoch, if it is reached at an instant; else None."""
         start_ns = self.start_ns()
         if start_ns is None or self.start_reached_ns(start_ns) > until_ns:
             return None
         return start_ns
 
     def nodes(self, after_ns: int, until_ns: int) -> Ints:
-        """Nodes after one instant that are reached at another, in order."""
+        """Epochs after one instant that are reached at another, in order."""
         first, last = node_range(self._imu.stamps_ns, self._dvl.stamps_ns, after_ns, until_ns)
         return self._dvl.stamps_ns[first:last]
 
@@ -159,18 +160,18 @@ class Odometry:
         return int(nodes[-1]) if len(nodes) else None
 
     def steps_between_nodes(self, start_ns: int, end_ns: int) -> Steps:
-        """Steps of the final motion from one node to a later, reached one.
+        """Steps of the final motion from one epoch to a later, reached one.
 
-        Raises MeasurementError where an end is no node or not covered by IMU rows, or the ends are in the wrong order.
+        Raises MeasurementError where an end is no epoch or not covered by IMU rows, or the ends are in the wrong order.
         """
         if not are_nodes(self._imu.stamps_ns, self._dvl.stamps_ns, start_ns, end_ns):
             raise self._no_nodes(start_ns, end_ns, {"start_ns": start_ns, "end_ns": end_ns})
         return self._final_steps(start_ns, end_ns)
 
     def steps_to_node(self, since_ns: int, node_ns: int) -> Steps:
-        """Steps of the final motion to a reached node from any instant among the rows, such as one in a gap.
+        """Steps of the final motion to a reached epoch from any instant among the rows, such as one in a gap.
 
-        Raises MeasurementError where the node is none or not covered, or the instant is before all rows or after it.
+        Raises MeasurementError where the epoch is none or not covered, or the instant is before all rows or after it.
         """
         if not are_nodes(self._imu.stamps_ns, self._dvl.stamps_ns, node_ns, node_ns) or since_ns > node_ns:
             raise self._no_nodes(since_ns, node_ns, {"node_ns": node_ns})
@@ -180,9 +181,9 @@ class Odometry:
         return self._final_steps(since_ns, node_ns)
 
     def steps_since_node(self, node_ns: int, until_ns: int) -> Steps:
-        """Steps of the provisional motion from a reached node to a later instant, from rows stamped no later.
+        """Steps of the provisional motion from a reached epoch to a later instant, from rows stamped no later.
 
-        Raises MeasurementError where the node is none or not reached, or the instant lies before it.
+        Raises MeasurementError where the epoch is none or not reached, or the instant lies before it.
         """
         if until_ns < node_ns or not are_nodes(self._imu.stamps_ns, self._dvl.stamps_ns, node_ns, node_ns):
             raise self._no_nodes(node_ns, until_ns, {"node_ns": node_ns})
@@ -195,7 +196,7 @@ class Odometry:
         return end_ns - start_ns > self._longest_ns
 
     def gaps(self, start_ns: int, end_ns: int) -> list[tuple[int, int]]:
-        """Stamps of successive nodes with a gap in between, from one node to another."""
+        """Stamps of successive epochs with a gap in between, from one epoch to another."""
         stamps_ns = self._dvl.stamps_ns
         rows = rows_before_gaps(stamps_ns, start_ns, end_ns, self._longest_ns)
         return [(int(stamps_ns[row]), int(stamps_ns[row + 1])) for row in rows]
@@ -209,7 +210,7 @@ class Odometry:
         return Steps(*merge_rows(self.columns(), imu_rows, dvl_rows, start_ns, end_ns))
 
     def _no_nodes(self, start_ns: int, end_ns: int, nodes: dict[str, int]) -> MeasurementError:
-        """The error for an interval whose named ends have to be nodes."""
+        """The error for an interval whose named ends have to be epochs."""
         if end_ns < start_ns:
             return MeasurementError(f"interval: ends at {end_ns} ns, before its start {start_ns}; the earlier first")
         for name, instant_ns in nodes.items():
@@ -223,7 +224,7 @@ class Odometry:
         )
 
     def velocity_at_node(self, node_ns: int) -> tuple[Floats, Floats, Floats]:
-        """DVL velocity (body axes), its covariance, and the angular rate at a node; shapes (3,), (3, 3), (3,)."""
+        """DVL velocity (body axes), its covariance, and the angular rate at an epoch; shapes (3,), (3, 3), (3,)."""
         k = int(np.searchsorted(self._dvl.stamps_ns, node_ns))
         if k == len(self._dvl.stamps_ns) or self._dvl.stamps_ns[k] != node_ns:
             raise no_doppler_stamp("node_ns", node_ns, self._dvl.stamps_ns)
@@ -240,14 +241,14 @@ def motion_between_nodes(
     bias: Floats,
     earth_rate: Floats | None,
 ) -> PreintegratedMotion:
-    """Final motion from one node to a later, reached one; each gap in between is bridged with both its ends known.
+    """Final motion from one epoch to a later, reached one; each gap in between is bridged with both its ends known.
 
     Parameters
     ----------
     bias
         Gyro bias in the body frame to remove, shape (3,), rad/s.
     earth_rate
-        Earth's rotation in the body frame at the first node, shape (3,), rad/s; None: not removed.
+        Earth's rotation in the body frame at the first epoch, shape (3,), rad/s; None: not removed.
     """
     gaps = odometry.gaps(start_ns, end_ns) if preintegrator.gap else []
     if not gaps:
@@ -273,7 +274,7 @@ def motion_since_node(
     bias: Floats,
     earth_rate: Floats | None,
 ) -> PreintegratedMotion:
-    """Provisional motion from the newest reached node to an instant, from rows stamped no later than that."""
+    """Provisional motion from the newest reached epoch to an instant, from rows stamped no later than that."""
     if preintegrator.gap and odometry.is_gap(node_ns, until_ns):
         return preintegrator.bridge(odometry.columns(), node_ns, until_ns, False, bias, earth_rate)
     return preintegrator.integrate(odometry.steps_since_node(node_ns, until_ns), bias, earth_rate)
@@ -292,16 +293,16 @@ def _turned(earth_rate: Floats | None, motion: PreintegratedMotion | None) -> Fl
 
 
 class RunningMotion:
-    """Motion from one node to later and later instants; final motion between nodes is kept, not integrated again.
+    """Motion from one epoch to later and later instants; final motion between epochs is kept, not integrated again.
 
     Parameters
     ----------
     start_ns
-        Stamp of the node.
+        Stamp of the epoch.
     bias
         Gyro bias to remove, shape (3,), rad/s.
     earth_rate
-        Earth's rotation in the body frame at the node, shape (3,), rad/s; None: not removed.
+        Earth's rotation in the body frame at the epoch, shape (3,), rad/s; None: not removed.
     """
 
     def __init__(
@@ -329,7 +330,7 @@ class RunningMotion:
 def motion_between(
     odometry: Odometry, preintegrator: Preintegrator, start_ns: int, end_ns: int, bias: Floats
 ) -> PreintegratedMotion:
-    """Provisional motion from one instant to a later one, the first not before the first node.
+    """Provisional motion from one instant to a later one, the first not before the first epoch.
 
     Parameters
     ----------

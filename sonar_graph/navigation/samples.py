@@ -24,7 +24,7 @@ from sonar_graph.numerics import Vector, compiled, inlined, minus, plus, scaled,
 
 EARLIEST_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 WINDOW_NS = 5_000_000_000
-"""Window before a node in which gravity is measured should bottom lock be lost there: long enough for 1 mm/s² with
+"""Window before an epoch in which gravity is measured should bottom lock be lost there: long enough for 1 mm/s² with
 samples of 5 mm/s at 7 Hz, short enough for an accelerometer's bias not to have turned."""
 
 
@@ -64,7 +64,7 @@ class StampedRows:
 
 @compiled
 def node_range(imu_ns: Ints, dvl_ns: Ints, after_ns: int, until_ns: int) -> tuple[int, int]:
-    """Rows of the DVL that are nodes after one instant and reached at another: the first, and one past the last."""
+    """Rows of the DVL that are epochs after one instant and reached at another: the first, and one past the last."""
     seen = np.searchsorted(imu_ns, until_ns, side="right")
     if seen == 0:
         return 0, 0

@@ -82,7 +82,7 @@ class _Tilt:
         return motion.i_T_j.rotation().matrix().T @ self.up, self.variance + noise + drift**2
 
     def _gravity(self, motion: PreintegratedMotion, node_ns: int) -> tuple[Floats, float] | None:
-        """Measured direction of up at a node, and its standard deviation."""
+        """Measured direction of up at an epoch, and its standard deviation."""
         ends = [self._odometry.velocity_at_node(at_ns) for at_ns in (self.node_ns, node_ns)]
         imu, dvl = (np.array(m.translation_m) for m in (self._calibration.imu.mounting, self._calibration.dvl.mounting))
         before, after = (velocity_at_imu(velocity, rate, dvl, imu) for velocity, _, rate in ends)

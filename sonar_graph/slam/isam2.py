@@ -2,7 +2,7 @@
 
 One call of `Isam2.process`::
 
-    odometry ── nodes due as keyframes ──► preintegration ──► factors of each keyframe
+    odometry ── epochs due as keyframes ──► preintegration ──► factors of each keyframe
     frames of detections ──► newest keyframe, or a new one ──► identity ──► gate ──► sighting factors
     one update of the smoother, if there is anything new
     newest keyframe's estimate, carried on by odometry ──► Estimate at end_ns

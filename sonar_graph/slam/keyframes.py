@@ -1,6 +1,6 @@
 """Keyframes, and the factors that odometry, depth and gravity give each of them.
 
-A keyframe sits at a node of the odometry (a DVL stamp). One is due ``max_interval_s`` after the last, and sooner when
+A keyframe sits at an epoch of the odometry (a DVL stamp). One is due ``max_interval_s`` after the last, and sooner when
 landmarks are seen and the noise of the motion since then would blur them (docs/theory/isam2.md). The gyro bias is
 constant over stretches of ``bias_interval_s`` and walks between them.
 
@@ -98,12 +98,12 @@ class KeyframeParams(Section):
     """Settings of the keyframes."""
 
     max_interval_s: float = Field(5.0, gt=0)
-    """A keyframe is set at the latest after this time."""
+    """Time since the last keyframe after which the next is due in any case."""
     motion_noise_share: float = Field(0.1, ge=0)
-    """While landmarks are seen, a keyframe is set sooner: once the variance of the motion since the last one exceeds
-    this share of the sonar's variance. 0: every frame with a landmark."""
+    """While landmarks are seen, a keyframe is set as soon as the variance of the motion since the last one exceeds this
+    share of the sonar's variance. 0: at every frame with a landmark."""
     bias_interval_s: float = Field(60.0, gt=0)
-    """The gyro bias is constant over stretches of this length."""
+    """Time between two gyro bias variables in the graph; the bias is constant from one to the next."""
 
 
 class Carried(NamedTuple):
@@ -191,7 +191,7 @@ class Keyframes:
         return self.odometry.refused + self._refused
 
     def advance(self, until_ns: int) -> None:
-        """Set the keyframes that are due from nodes reached at an instant; the first starts the graph."""
+        """Set the keyframes that are due from epochs reached at an instant; the first starts the graph."""
         self.advanced_ns = max(self.advanced_ns, until_ns)
         if not self.stamps_ns:
             start_ns = self.odometry.start_by(until_ns)
@@ -283,7 +283,7 @@ class Keyframes:
         self.odometry.forget_before(node_ns)
 
     def _motion_to(self, node_ns: int) -> tuple[PreintegratedMotion, Carried]:
-        """From the newest keyframe to a node, and how depth samples reach it: not over a gap of the Doppler log."""
+        """From the newest keyframe to an epoch, and how depth samples reach it: not over a gap of the Doppler log."""
         start_ns, bias, earth_rate = self.stamps_ns[-1], self.bias(len(self.stamps_ns) - 1), self._earth_rate()
         gaps = self.odometry.gaps(start_ns, node_ns)
         since_ns = gaps[-1][1] - CARRIED_IN_GAP_NS if gaps else start_ns

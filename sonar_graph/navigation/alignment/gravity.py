@@ -1,6 +1,6 @@
 """Direction of gravity from accelerometers, the Earth's rotation, and roll and pitch of an up vector.
 
-Over an interval of duration T from node i to node j the specific force f, turned into frame i and averaged, is the
+Over an interval of duration T from epoch i to epoch j the specific force f, turned into frame i and averaged, is the
 change of velocity plus gravity's reaction. With the velocity v of the IMU's point, dR = i_R_j and
 ``up = body_R_world e_z``::
 
@@ -54,15 +54,15 @@ def gravity_direction(
     Parameters
     ----------
     motion
-        From node i to node j, with the mean specific force.
+        From epoch i to epoch j, with the mean specific force.
     velocity_i, velocity_j
-        Velocity of the IMU's point in body axes at the two nodes (see `velocity_at_imu`), shape (3,), m/s.
+        Velocity of the IMU's point in body axes at the two epochs (see `velocity_at_imu`), shape (3,), m/s.
     velocity_sigma_m_s
         Standard deviation of one component of either velocity.
 
     Returns
     -------
-    The unit vector ``body_R_world e_z`` at node j, shape (3,), and the standard deviation of a small tilt of it, rad.
+    The unit vector ``body_R_world e_z`` at epoch j, shape (3,), and the standard deviation of a small tilt of it, rad.
     None where the specific force was not measured.
     """
     i_R_j = np.ascontiguousarray(motion.i_T_j.rotation().matrix())

@@ -15,9 +15,9 @@ stretch and, for a speed v of its last row, at least::
     2 + floor((v / s)^2) rows, at most `MOST`,     s = `USUAL_SPEED_M_S`
 
 The other rows up to its end are outliers. This assumes that of the waiting rows more are right than agree in being
-wrong. The first row stays the first node even where its velocity was wrong: it then has that of the first accepted row,
-with the variance of what may have changed since. Of a chain that ends a gap the last row alone is used. Waiting rows
-are no nodes. Stamps decide, not how a log is cut. docs/theory/gaps.md.
+wrong. The first row stays the first epoch even where its velocity was wrong: it then has that of the first accepted
+row, with the variance of what may have changed since. Of a chain that ends a gap the last row alone is used. Waiting
+rows are no epochs. Stamps decide, not how a log is cut. docs/theory/gaps.md.
 """
 
 from __future__ import annotations

@@ -1,21 +1,27 @@
 """Motion while the Doppler log has no bottom lock, carried by the accelerometers.
 
-From node i on, with everything in frame i: R the rotation by the gyros, F and P the velocity and position that the
-accelerometers gain from rest (`sonar_graph.navigation.preintegration.joint_steps`), g gravity. The velocity of the
-IMU's point less F is then a straight line whose slope is gravity, and a Doppler sample z at time t measures a point of
-it::
+An interval between successive DVL rows is a gap where it is longer than the calibration's ``dvl.gap_s``
+(`sonar_graph.navigation.samples.longest_interval_ns`; with ``hold-past`` there is none). The motion over a gap comes
+from `bridge`; `Preintegrator.bridge` calls it for `sonar_graph.navigation.odometry` (iSAM2, dead reckoning), and
+``baselines/filter_motion.py`` for the two filters.
+
+From epoch i (the stamp of the DVL row before the gap) on, with everything in frame i: R the rotation by the gyros, F
+and P the velocity and position that the accelerometers gain from rest
+(`sonar_graph.navigation.preintegration.joint_steps`), g gravity. The velocity of the IMU's point less F is then a
+straight line whose slope is gravity, and a Doppler sample z at time t measures a point of it::
 
     y(t) = R z - F = v + g t
 
 Closed: the sample j that ends the gap is there. The line joins both ends, ``displacement = P + T (y_i + y_j)/2``.
 
 Open: nothing stamped later is there. The line is fitted by least squares to the samples of the last `WINDOW_NS` before
-the node, and extrapolated: ``s = T (mean + slope (T / 2 - mean t)) = sum_k w_k y_k``. With W the length of the window,
-``r = T (T / 2 + W / 2) / W`` and s from 0 to 1 over it, gyros (density n) and accelerometers (a) in the window add::
+the epoch, and extrapolated: ``s = T (mean + slope (T / 2 - mean t)) = sum_k w_k y_k``. Noise
+of gyros (density n) and accelerometers (a) in a window of length W enters through K(u), the sum of the weights w_k of
+the samples with t_k <= (u - 1) W, u from 0 to 1. For many samples, evenly spaced, with ``r = T (T / 2 + W / 2) / W``::
 
-    K(s) = int w dt = T s - 6 r s (1 - s),    a^2 W int K^2 ds + (g n)^2 W^3 int (int K ds)^2 ds
+    K(u) = T u - 6 r u (1 - u),    variance  a^2 W int K^2 du + (g n)^2 W^3 int (int K du)^2 du
 
-Walk: where a specific force was not measured, or too little precedes the node, the velocity is a random walk of root
+Walk: where a specific force was not measured, or too little precedes the epoch, the velocity is a random walk of root
 density q (m/s/√s) between its ends, ``q^2 T^3 / 12`` (closed), or from its last value on, ``q^2 T^3 / 3`` (open).
 
 The covariance includes the noise of the samples, gyros and accelerometers, and the accelerometers' bias, constant over
@@ -159,7 +165,7 @@ def line_before(columns: Columns, body_p_imu: Vector, body_p_dvl: Vector, k: int
 def integral(
     line: Line, elapsed_s: float, gyro_density: float, accel_density: float
 ) -> tuple[Vector, Matrix, Matrix, Matrix]:
-    """Displacement over a time after the node, its derivatives by gyro and accelerometer bias, and its covariance.
+    """Displacement over a time after the epoch, its derivatives by gyro and accelerometer bias, and its covariance.
 
     ``w_k = T (1/n + (T/2 - mean t) (t_k - mean t) / S) = a + b t_k``.
     """
@@ -236,7 +242,7 @@ def bridge(
 ) -> GapMotion:
     """Motion over a gap.
 
-    It begins at a node and ends at the next one (closed), or at an instant before it, from rows stamped no later
+    It begins at an epoch and ends at the next one (closed), or at an instant before it, from rows stamped no later
     (open). Removed are the gyro bias (body axes) and the Earth's rotation (frame i), rad/s; ``values`` are those of
     `gap_values`.
     """
@@ -363,9 +369,9 @@ def motion_of_origin(
 
 @compiled
 def _is_sampled(columns: Columns, model: GapModel, start_ns: int, end_ns: int) -> bool:
-    """True where velocities go on after a node and inertial rows are missing instead.
+    """True where velocities go on after an epoch and inertial rows are missing instead.
 
-    A sample that ends a gap of the velocity, but is no node yet, does not count.
+    A sample that ends a gap of the velocity, but is no epoch yet, does not count.
     """
     dvl_ns = columns[3]
     row = rows_until(dvl_ns, start_ns)

@@ -177,7 +177,7 @@ class Preintegrator:
         columns
             Rows of `sonar_graph.navigation.odometry.Odometry`.
         start_ns, end_ns
-            A node and the next one, or (not closed) a node and an instant before the next.
+            An epoch and the next one, or (not closed) an epoch and an instant before the next.
         bias, earth_rate
             See `integrate`.
         """

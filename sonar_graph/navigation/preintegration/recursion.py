@@ -8,7 +8,7 @@ end (``theta_i = dR theta``), where it needs no transport::
     eps     <- eps - [s]x theta_i + (dR D dt + dR J_l [l]x) dt d + dR J_l dt n,     s = dR J_l u dt
 
 Doppler noise is white in time with the spectral density ``velocity_cov * interval``; half of a sample's variance falls
-on either side of its node. docs/theory/preintegration.md.
+on either side of its epoch. docs/theory/preintegration.md.
 """
 
 from __future__ import annotations

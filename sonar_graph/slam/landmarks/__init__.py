@@ -1,4 +1,12 @@
-"""Landmarks."""
+"""Identities of detections: what is believed, gated, taken back or chosen anew (docs/theory/doubtful_identities.md).
+
+association.py       the recogniser's posterior, accepted above a least probability or weighed for the mixture
+tracked.py           "robust" (default), "gate" (prompt detections: slam/frontend.py); tracks taken back or moved
+mixture_policy.py    policies "max-mixture" and "gnc" in the window; mixture_history.py: in the whole history
+mixture.py           log densities of the mixture, and the choice that maximises it
+unknown.py           detections that name no landmark, paired by joint_compatibility.py
+sighting.py          a detection tied to a keyframe, and its factors; the kernel (models/factors.py) enters here
+"""
 
 # fmt: off
 from sonar_graph.slam.landmarks.association import (

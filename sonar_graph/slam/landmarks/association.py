@@ -1,4 +1,4 @@
-"""Identities as a recogniser states them: accepted by posterior, or weighed as components of a mixture.
+"""Identities as a recogniser states them: accepted by posterior, or weighed as hypotheses of a mixture.
 
 A recogniser states a posterior p over landmarks; what is missing to 1 is no landmark. With the probability q that the
 statement has nothing to do with what was seen, K landmarks in the graph, and half of the errors being no landmark::
@@ -67,19 +67,19 @@ def gate_threshold(probability: float, dof: int) -> float:
 
 
 LEAST_LANDMARKS = 20
-"""Least K: while a graph has few landmarks, a mistake is more probably one that it has not got yet."""
+"""Least K: while the graph has few landmarks, a mistaken name is more probably of one that is not in it yet."""
 
 
 class RecogniserErrors(Section):
     """Error rate of a recogniser, and the view over which detections of no landmark are spread."""
 
     wrong_id_probability: float = Field(0.05, gt=0, lt=1)
-    """Probability q that what the recogniser says has nothing to do with what was seen, beside what its posterior
-    admits. The mixture's other landmarks share one half of it, no landmark has the other."""
+    """Probability q that the recogniser's statement has nothing to do with the object seen; errors that its posterior
+    admits come on top. One half of q is shared by the landmarks of the graph, the other half means: no landmark."""
     view_range_m: float = Field(10.0, gt=0)
-    """Detections of no landmark are spread evenly over so much range."""
+    """Width of the interval of range over which detections of no landmark are taken as evenly distributed."""
     view_azimuth_rad: float = Field(2.0, gt=0)
-    """Detections of no landmark are spread evenly over so much azimuth."""
+    """Width of the interval of azimuth over which detections of no landmark are taken as evenly distributed."""
 
     @property
     def log_density(self) -> float:

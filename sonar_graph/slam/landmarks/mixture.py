@@ -1,15 +1,15 @@
 """Max-mixture of the landmarks that sightings may be of, and the choice that maximises it.
 
-Olson and Agarwal, "Inference on networks of mixtures for robust robot mapping", IJRR 32(7), 2013: only the largest
-component of a mixture is kept, at every point of the state space. For a watch g (all sightings j of one track, or a
-single sighting), landmarks i and none::
+A *tracked object* g is all sightings j of one track, or one sighting of no track. It is one of the landmarks i, or
+none; each of these hypotheses is a *component* of its mixture, with the log density l. Olson and Agarwal, "Inference on
+networks of mixtures for robust robot mapping", IJRR 32(7), 2013: at every point x only the largest component counts::
 
     l_i(x)    = log w_i + sum_j [ log n - 1/2 log det R_j - rho(e_range) - rho(e_azimuth) ]        e = e(x, j, L_i)
-    l_none(x) = log w_none + log density of the watch if it is of no landmark
+    l_none(x) = log w_none + log density of the sightings if the object is no landmark
     cost(x)   = sum_g min_k -l_k(x)  +  cost of all other factors
 
 with the kernel's loss rho, and n normalising ``n^2 / sqrt(det R) exp(-rho)``. Choosing components is a descent: a
-landmark that began in a wrong place fits none of its own sightings, and nothing moves it. So the watches that name it
+landmark that began in a wrong place fits none of its own sightings, and nothing moves it. So the objects that name it
 vote on its place, ``vote(p) = sum of max(l_i(p), l_none)``, at the point where it is and where each sighting that does
 not fit has it (docs/theory/doubtful_identities.md).
 """
@@ -37,7 +37,7 @@ REPEATED_LOSS = 3.0
 
 @dataclass(eq=False)
 class TrackedObject:
-    """One object (a watch): the last statement of the recogniser on it, and its sightings, at least one."""
+    """One object (`watch` in code): the last statement of the recogniser on it, and its sightings, at least one."""
 
     statement: IdentityPosterior
     sightings: list[Sighting] = field(default_factory=list)
@@ -54,9 +54,9 @@ class TrackedObject:
 
 
 Choices = list[int | None]
-"""Landmark that each watch counts as; None: no landmark."""
+"""Landmark that each tracked object counts as; None: no landmark."""
 Scores = dict[int | None, float]
-"""The component l of each component of a watch; None: no landmark."""
+"""Log density l of each component of a tracked object; None: no landmark."""
 
 
 class Errors:
@@ -93,7 +93,7 @@ class Errors:
 
 
 class Mixture:
-    """Components of watches, by the errors of the recogniser and the kernel of a sighting's noise."""
+    """Log densities of tracked objects, from the recogniser's error rate and the kernel of a sighting's noise."""
 
     def __init__(self, errors: RecogniserErrors, kernel: Kernel) -> None:
         self._errors = errors
@@ -117,13 +117,13 @@ class Mixture:
         return dict(zip([*ids, *new, None], totals.tolist(), strict=True))
 
     def gains(self, landmark_id: int, watches: list[TrackedObject], points: Floats, values: gtsam.Values) -> Floats:
-        """Component of a landmark at each of k points, minus that of no landmark, for n watches, shape (n, k)."""
+        """Log density l_i of a landmark at each of k points minus l_none, for n tracked objects, shape (n, k)."""
         fits = self._fits(watches, points, values)
         weights = np.array([watch.statement.log_weights([landmark_id], self._errors) for watch in watches])
         return np.asarray(fits - self._unplaced(watches)[:, None] + (weights[:, 0] - weights[:, 1])[:, None])
 
     def squared_errors(self, watches: list[TrackedObject], ids: list[int], values: gtsam.Values) -> Floats:
-        """Squared error of each watch, all its sightings together, as of the landmark given, shape (n,)."""
+        """Squared error of each tracked object, summed over its sightings, as of the given landmark, shape (n,)."""
         squares = []
         errors = Errors([s for watch in watches for s in watch.sightings], values)
         keys = sorted(set(ids))
@@ -133,7 +133,7 @@ class Mixture:
         return np.asarray(np.add.reduceat(squares, _starts(watches)))
 
     def truncations(self, watches: list[TrackedObject]) -> Floats:
-        """Squared error at which each watch is as probably of no landmark as of the one it names, shape (n,)."""
+        """Squared error at which each object is as probably no landmark as the one that it names, shape (n,)."""
         weights = [w.statement.log_weights([w.statement.favourite or 0], self._errors) for w in watches]
         gains = np.array(
             [self._peaks(w).sum() + named - none for w, (named, none) in zip(watches, weights, strict=True)]
@@ -146,17 +146,17 @@ class Mixture:
         return np.asarray(self._log_peak - 0.5 * np.linalg.slogdet(noise)[1])
 
     def _unplaced(self, watches: list[TrackedObject]) -> Floats:
-        """Log densities of watches of something whose place is not known, shape (n,).
+        """Log densities of the sightings of objects whose place is not known, shape (n,).
 
-        The first sighting may be anywhere. It tells where the others are: not better than a landmark would, which they
-        fit to `REPEATED_LOSS`. Taken as anywhere themselves, many sightings of an unknown object would prove it to be
-        the landmark that is least far.
+        The first sighting may be anywhere. The others are near it, with the mean loss `REPEATED_LOSS` of sightings of a
+        thing that stands still. If each could be anywhere, many sightings of an unknown object would prove it to be the
+        nearest landmark.
         """
         u = self._errors.log_density
         return np.array([u + np.maximum(self._peaks(w)[1:] - REPEATED_LOSS, u).sum() for w in watches])
 
     def _fits(self, watches: list[TrackedObject], points: Floats, values: gtsam.Values) -> Floats:
-        """Log densities of watches, for landmarks at points of the world, shape (n, k)."""
+        """Log densities of tracked objects, for landmarks at points of the world, shape (n, k)."""
         errors = Errors([s for watch in watches for s in watch.sightings], values)
         single = self._log_peak - errors.half_log_det[:, None] - self._kernel.loss(errors.of(points)).sum(axis=2)
         return np.asarray(np.add.reduceat(single, _starts(watches), axis=0))
@@ -164,10 +164,10 @@ class Mixture:
     def scores(
         self, watches: list[TrackedObject], values: gtsam.Values, choices: Choices, sizes: dict[int, int]
     ) -> list[Scores]:
-        """Components of watches where the estimate is.
+        """Log density of each component of each tracked object, at the estimate.
 
-        A landmark that has no sightings but those of one watch is where they have put it. To that watch it is a
-        landmark of unknown place, as one is that it may be and that is not in the graph.
+        A landmark that is seen by one object alone lies where that object's sightings put it and would always fit them.
+        For this object it counts as a landmark of unknown place, like a landmark that is not in the graph.
 
         Parameters
         ----------
@@ -191,10 +191,10 @@ class Mixture:
     def best(
         self, watches: list[TrackedObject], values: gtsam.Values, choices: Choices, sizes: dict[int, int]
     ) -> Choices:
-        """Largest component of each watch where the estimate is; no landmark twice in a frame.
+        """Largest component of each tracked object at the estimate; no landmark twice in a frame.
 
-        A landmark that is not in the graph begins with one watch, that with most sightings. Others keep what they have:
-        only then is known where it is.
+        A landmark that is not in the graph begins with one object, the one with most sightings. Others that chose it
+        keep their present choice for now: its place is known only once it is in the graph.
         """
         if not watches:
             return []
@@ -210,12 +210,12 @@ class Mixture:
 
 
 def _starts(watches: list[TrackedObject]) -> list[int]:
-    """First index of each watch's sightings in one row of all."""
+    """First index of each object's sightings when those of all objects are joined."""
     return list(accumulate((len(watch.sightings) for watch in watches[:-1]), initial=0))
 
 
 def each_once(scores: list[Scores], stamps_ns: list[set[int]]) -> list[int | None]:
-    """The best of each, those that are surest first; a landmark is once in a frame."""
+    """Best component of each object, those with the highest density first; a landmark is once in a frame."""
     chosen: list[int | None] = [None] * len(scores)
     taken: dict[int, set[int]] = {}
     for row in sorted(range(len(scores)), key=lambda row: -max(scores[row].values())):
@@ -230,7 +230,7 @@ def each_once(scores: list[Scores], stamps_ns: list[set[int]]) -> list[int | Non
 
 
 MOST_PROPOSALS = 20
-"""Newest sightings whose places are put to the vote."""
+"""Newest objects whose first sightings propose a place."""
 MOST_VOTERS = 400
 LEAST_MARGIN = 3.0
 """A new place has to be e to this power times as probable."""
@@ -239,7 +239,7 @@ LEAST_MARGIN = 3.0
 def supporters_elsewhere(
     landmark_id: int, watches: list[TrackedObject], choices: Choices, values: gtsam.Values, mixture: Mixture
 ) -> list[TrackedObject] | None:
-    """Watches that put the landmark they name in a better place than where it is; None where none is better."""
+    """Tracked objects that agree on a better place for the landmark that they name; None: no better place."""
     voters = watches[-MOST_VOTERS:]
     proposals = [w for w, choice in zip(watches, choices, strict=True) if choice != landmark_id][-MOST_PROPOSALS:]
     if len(proposals) < 2:

@@ -1,18 +1,18 @@
 """Whole history under other choices of landmarks, solved beside the run for smoothed results.
 
-Asking must not change the run: nothing here is written to, and factors are shared with it. Besides choosing again,
-graduated non-convexity finds which sightings belong without a good start (Yang, Antonante, Tzoumas, Carlone, "Graduated
-non-convexity for robust spatial perception", IEEE RA-L 5(2), 2020). Every watch g is of the landmark that it names,
-with its squared error r_g^2, or of none, at a constant c_g^2::
+A question for results must not change the run: this module reads its factors and changes nothing. Besides choosing
+again, graduated non-convexity finds the right sightings without a good start (Yang, Antonante, Tzoumas, Carlone,
+"Graduated non-convexity for robust spatial perception", IEEE RA-L 5(2), 2020). Every tracked object g is the landmark
+that it names, with its squared error r_g^2, or none, at a constant c_g^2::
 
     min_x  sum_g min(r_g^2, c_g^2) / 2 + |odometry and all else|^2 / 2                                           (1)
 
 which is the max-mixture of these two components: ``c_g^2 / 2`` is how much more probable a perfect fit is than none.
-The minimum in (1) is graduated by mu, from nearly convex to (1) itself; each mu weighs watches by the paper's (14)::
+The minimum in (1) is graduated by mu, from nearly convex to (1) itself; each mu weighs objects by the paper's (14)::
 
     w = 0  where r^2 >= (mu + 1) / mu c^2,   1  where r^2 <= mu / (mu + 1) c^2,   else  c / r sqrt(mu (mu + 1)) - mu
 
-`gtsam.GncLMOptimizer` weighs each factor alone where a watch is kept or dropped as a whole (doubtful_identities.md).
+`gtsam.GncLMOptimizer` weighs each factor alone; here an object is kept or dropped whole (doubtful_identities.md).
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from sonar_graph.slam.landmarks.sighting import Sighting, SightingFactors
 from sonar_graph.slam.smoother import Sightlines, marginals_of, solve, solve_in_sight
 
 LEAST_WEIGHT = 1e-6
-"""Of a watch in a graph: what nothing else holds stays determinate."""
+"""Least weight of an object: variables that only its sightings hold stay determinate."""
 
 
 class WeighedHistory:
-    """Watches that are each of one landmark and count more or less, and all other factors.
+    """Graph of the whole history in which each tracked object, of one landmark, has a weight.
 
-    What is said once of a landmark, by its earliest sighting, is not weighed. The maker has no kernel.
+    The factors that come once for a landmark, with its earliest sighting, are not weighed. The maker has no kernel.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class WeighedHistory:
 
 
 def earliest(watches: list[TrackedObject], ids: list[int]) -> dict[int, Sighting]:
-    """The first sighting of each landmark, for watches that are each of one."""
+    """Earliest sighting of each landmark, from tracked objects and the landmark of each."""
     first: dict[int, Sighting] = {}
     for watch, landmark_id in zip(watches, ids, strict=True):
         for sighting in watch.sightings:
@@ -112,7 +112,7 @@ def graduated_weights(
     c2: Floats,
     values: gtsam.Values,
 ) -> tuple[gtsam.Values, Floats]:
-    """Solution of (1), and the weight of each watch, shape (n,): 0 or 1, or nearly."""
+    """Solution of (1), and the weight of each object, shape (n,): 0 or 1, or nearly."""
     mu = first_mu(squared_errors(values), c2)
     weights = np.ones(len(c2))
     for _ in range(MOST_GRADES if np.isfinite(mu) else 0):
@@ -131,7 +131,7 @@ LEAST_GAIN = 1e-3
 
 
 class RivalHistory:
-    """All watches with the mixture that they are chosen by, and all factors that are not of their sightings."""
+    """Other choices for all tracked objects: their mixture, and all factors that are not of their sightings."""
 
     def __init__(
         self, rest: gtsam.NonlinearFactorGraph, watches: list[TrackedObject], mixture: Mixture, maker: SightingFactors
@@ -182,7 +182,7 @@ class RivalHistory:
         return self._fixed_point(self._solve(values, choices), choices)
 
     def _known(self, values: gtsam.Values) -> list[tuple[TrackedObject, int]]:
-        """Watches that name a landmark of the graph, and that."""
+        """Tracked objects that name a landmark of the graph, each with that landmark."""
         favourites = [(watch, watch.statement.favourite) for watch in self._watches]
         return [(watch, i) for watch, i in favourites if i is not None and values.exists(L(i))]
 
@@ -228,7 +228,7 @@ class RivalHistory:
         return solve_in_sight(self._chosen_graph(choices), start, lines)
 
     def _chosen_graph(self, choices: Choices) -> gtsam.NonlinearFactorGraph:
-        """The history with the watches of these landmarks."""
+        """Graph of the history in which each tracked object is the landmark chosen for it."""
         graph = gtsam.NonlinearFactorGraph(self._rest)
         of: dict[int, list[Sighting]] = defaultdict(list)
         for watch, landmark_id in zip(self._watches, choices, strict=True):

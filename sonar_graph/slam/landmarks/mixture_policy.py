@@ -1,8 +1,9 @@
 """Max-mixture of identities, incrementally: choices made again as the estimate moves (doubtful_identities.md).
 
-A watch is all sightings of one track, or one sighting of no track. Its chosen component has its factors in the graph,
-the others have none; a Gauss-Newton step of that graph is one of the max-mixture. After every update the choices of the
-window are made anew until none changes. For smoothed results those of the whole history are, beside the run.
+A tracked object is all sightings of one track, or one sighting of no track. Its components are the landmarks that it
+may be, and none. The chosen component has its factors in the graph, the others have none; a Gauss-Newton step of that
+graph is one of the max-mixture. After every update the choices of the window are made anew until none changes. For
+smoothed results the choices of the whole history are made anew too, beside the run.
 
 When a detection comes, the state is not yet conditioned on it. It is then weighed by its predictive density, with the
 innovation covariance ``S = H P H' + R``: a vehicle that has drifted must not mistake its landmarks for none.
@@ -31,28 +32,28 @@ from sonar_graph.states import DetectionJournal, DetectionLog, Outcome
 MOST_ROUNDS = 3
 """Times that choices are made anew after one update."""
 MOST_OPEN = 200
-"""Newest watches that are chosen anew."""
+"""Number of newest tracked objects that are chosen anew."""
 
 
 class MixtureIdentity(RecogniserErrors):
-    """Take a detection, or a track, as of the landmark that place and posterior make most probable, or of none.
+    """Choose for each track, or single detection, the landmark, or none, that posterior and place make most probable.
 
-    "max-mixture": chosen anew in the window as the estimate moves, in the whole history for smoothed results. Assumes
-    `wrong_id_probability`, errors that are independent, and an estimate that is near when it chooses. "gnc": smoothed
-    results also try what graduated non-convexity finds in the whole history, which needs no near estimate; assumes that
-    most of what the recogniser says is right.
+    "max-mixture": the choice is made anew in the window as the estimate moves, and in the whole history for smoothed
+    results. Assumes independent errors at the rate `wrong_id_probability`, and an estimate near the truth when it
+    chooses. "gnc": smoothed results also try the solution of graduated non-convexity over the whole history, which
+    needs no good estimate to begin with; assumes that most identities stated by the recogniser are right.
     """
 
     policy: Literal["max-mixture", "gnc"] = "max-mixture"
     longest_wait_s: float = Field(60.0, gt=0)
-    """Detections of a track wait at most so long in the window. A track not seen for so long is over."""
+    """Longest time for which detections of a track wait in the window. A track that is not seen for this time ends."""
 
 
 IdentityParams = Annotated[RobustIdentity | GatedIdentity | MixtureIdentity, *tagged("policy", "robust")]
 
 
 class DoubtfulIdentities:
-    """Keeps the graph in line with the best component of every watch."""
+    """Keeps the graph in line with the best component of every tracked object."""
 
     def __init__(
         self, landmarks: LandmarkSightings, journal: DetectionJournal, params: MixtureIdentity, mixture: Mixture
@@ -68,7 +69,7 @@ class DoubtfulIdentities:
         self._chosen: ChosenHistory | None = None
         self._chosen_from: gtsam.Values | None = None
         self.watches: list[TrackedObject] = []
-        """All watches in the order in which they began."""
+        """All tracked objects in the order in which they began."""
 
     @property
     def keys(self) -> list[int]:
@@ -208,9 +209,9 @@ class DoubtfulIdentities:
         return _differing(watches, best)
 
     def _open(self) -> list[TrackedObject]:
-        """Watches to choose anew: tracks that are now named otherwise than what they count as, and those in the window.
+        """Objects to choose anew: tracks whose statement contradicts their present choice, and objects in the window.
 
-        A watch is in the window when all its sightings are; one that alone holds a landmark keeps it.
+        An object is in the window when all its sightings are. One that alone holds a landmark keeps it.
         """
         recent = self.watches[-MOST_OPEN:]
         contradicted = [
@@ -228,14 +229,14 @@ class DoubtfulIdentities:
         ]
 
     def _is_alone(self, watch: TrackedObject) -> bool:
-        """True when no other watch has sightings of its landmark."""
+        """True when no other object has sightings of its landmark."""
         return watch.landmark_id is not None and self._landmarks.sizes()[watch.landmark_id] == len(watch.sightings)
 
     def _is_preferred(self, new: int | None, watch: TrackedObject) -> bool:
-        """True when the predictive density of the newest sighting, too, is for another component than the present.
+        """True when the predictive density of the newest sighting also prefers the new component to the present one.
 
-        Where the estimate is uncertain, as when a loop closes, a misfit is not yet one of the identity. A robust kernel
-        may leave it there for some updates.
+        While the estimate is uncertain, as when a loop closes, a large residual does not yet mean a wrong identity.
+        With a robust kernel it may stay large for some updates.
         """
         sighting, values = watch.sightings[-1], self._smoother.values
         ids = [i for i in (watch.landmark_id, new) if i is not None and i in self._landmarks]
@@ -267,7 +268,7 @@ class ChosenHistory:
     marginals: gtsam.Marginals | gtsam.ISAM2
     watches: list[TrackedObject]
     choices: Choices
-    """Choice of each watch."""
+    """Choice for each tracked object."""
     heard: int
     """Number of sightings from which it was chosen."""
 

@@ -4,8 +4,9 @@ Sightings of a track wait, each on the keyframe at which it was made, until the 
 all become factors there. When the track turns out to be of another landmark, or of none, its factors are taken out of
 the graph; those of the other landmark are put in once the estimate no longer rests on the wrong ones.
 
-A track is one object in one place: of several rows in a frame the one is kept that best supports the landmark that the
-track counts as, while it counts as none the row with the highest posterior; of equals the first.
+A track is one object in one place, so each frame keeps one row of it. If the track counts as a landmark, that is the
+row with the highest posterior for this landmark; otherwise the row with the highest posterior for any landmark. If
+several rows are equal, the first is kept.
 """
 
 from __future__ import annotations
@@ -36,10 +37,11 @@ class TrackedIdentity(Section):
     """Settings of identities that are believed track by track."""
 
     minimum_probability: float = Field(0.7, ge=0, le=1)
-    """A detection is used when its most probable identity has at least this posterior."""
+    """Least posterior of the most probable identity with which a detection is used."""
     longest_wait_s: float = Field(60.0, ge=0)
-    """Detections of one track wait at most so long until its identity is known, and are moved when it turns out to be
-    another. A track not seen for so long keeps the one it has. 0: every detection is judged by itself."""
+    """Longest time for which a detection waits for the identity of its track. When the identity changes, all detections
+    of the track move to the new landmark. A track that is not seen for this time keeps its identity. 0: no detection
+    waits, each is judged alone."""
     unknown: UnknownParams = IgnoredUnknown()
     """Detections that name no landmark."""
 
@@ -50,7 +52,7 @@ class TrackedIdentity(Section):
 
 
 class RobustIdentity(TrackedIdentity):
-    """Believe what is probable enough.
+    """Use every detection whose identity is probable enough; the kernel limits the pull of wrong ones.
 
     Assumes that most sightings of every landmark are right, and that wrong ones disagree with each other: the kernel
     then lets the majority win, unless a landmark's first sighting is so far off that the others hardly pull.
@@ -60,14 +62,16 @@ class RobustIdentity(TrackedIdentity):
 
 
 class GatedIdentity(TrackedIdentity):
-    """Believe what is probable enough and lies where that landmark is expected.
+    """Use a detection whose identity is probable enough if it lies inside the gate of that landmark.
 
-    Assumes that the estimate and its covariance are right when a detection comes; nothing is taken back.
+    Assumes that the estimate and its covariance are right when a detection comes: a detection outside the gate is
+    refused, and not tried again unless its track changes its identity. Tracks change theirs as with "robust".
     """
 
     policy: Literal["gate"] = "gate"
     gate_probability: float = Field(0.999, gt=0, le=1)
-    """A detection whose squared Mahalanobis innovation exceeds this chi-square quantile (2 dof) is refused; 1: none."""
+    """Probability with which a right detection passes the gate: detections are refused whose squared Mahalanobis
+    innovation exceeds this chi-square quantile (2 dof). 1: no gate."""
 
     @property
     def gate(self) -> float:
@@ -94,7 +98,7 @@ def decide(frame: LandmarkDetections, least_probability: float) -> list[int]:
 
 @dataclass(eq=False)
 class Track:
-    """One object that is watched over several frames."""
+    """Object that the recogniser follows over several frames, with its present identity."""
 
     identity: int = UNDECIDED
     """Last decision: a landmark, `NO_LANDMARK`, or `UNDECIDED`."""

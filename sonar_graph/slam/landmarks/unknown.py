@@ -106,13 +106,13 @@ class AssociatedUnknown(Section):
 
     policy: Literal["associate"] = "associate"
     gate_probability: float = Field(0.9999, gt=0, lt=1)
-    """A true pairing of a frame's detections with landmarks is jointly compatible with this probability."""
+    """Probability with which a frame's right pairing of detections with landmarks passes the joint chi-square gate."""
     density_m2: float = Field(0.05, gt=0)
-    """Landmarks a square metre that may be there and are not in the map: the rival of every pairing."""
+    """Density of landmarks that are not in the map, 1/m². A pairing has to be more probable than one of these."""
     sightings: int = Field(5, ge=1)
-    """So many sightings of what is paired with no landmark begin one."""
+    """Number of sightings of one unpaired object from which a new landmark begins."""
     longest_wait_s: float = Field(10.0, gt=0)
-    """So long, and no longer than ``smoother.lag_s``, a sighting waits for them."""
+    """Longest time for which an unpaired sighting waits for the others, at most ``smoother.lag_s``."""
 
     @property
     def log_rival(self) -> float:

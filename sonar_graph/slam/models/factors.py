@@ -86,7 +86,7 @@ class RobustKernel(Kernel):
 
     shape: Literal["huber", "cauchy"] = "cauchy"
     width: float = Field(1.5, gt=0)
-    """Width of the kernel, in standard deviations."""
+    """Width of the kernel, in standard deviations: larger errors pull less than with Gaussian noise."""
 
     def loss(self, e: Floats) -> Floats:
         """The loss of errors in standard deviations."""

@@ -7,14 +7,16 @@ With the landmark p in the world and the sonar at ``world_T_sonar = world_T_body
     azimuth = atan2(q_y, q_x)
 
     D_q     = [ q^T / |q|                             ]     D_q: derivative of (range, azimuth) by q, shape (2, 3)
-              [ -q_y / rho^2,  q_x / rho^2,  0        ]     rho^2 = q_x^2 + q_y^2
+              [ -q_y / h^2,    q_x / h^2,    0        ]     h^2 = q_x^2 + q_y^2
 
     by the body pose    D_q [ [q]x | -I ] Ad(sonar_T_body)      right perturbation [theta, rho], shape (2, 6)
     by the landmark     D_q sonar_R_world                       shape (2, 3)
 
+Sonar axes: x along the centre of the aperture, y to the left, z up; h is the distance from the z axis.
+
 The inverse model needs the elevation, which a sonar does not measure: ``elevation = asin(q_z / |q|)``. On a floor of
-known height it follows from range and azimuth. Azimuth has no derivative on the sonar's vertical axis (rho = 0); a
-landmark there is outside every aperture.
+known height it follows from range and azimuth. Azimuth has no derivative on the z axis (h = 0); a landmark there is
+outside every aperture.
 """
 
 from __future__ import annotations
@@ -28,9 +30,10 @@ from sonar_graph.measurements import Floats
 from sonar_graph.numerics import compiled, skew
 
 FLOOR_GATE = 10.83
-"""0.999 of the chi-square distribution with one degree of freedom. A landmark whose height on the centre of the
-aperture is farther from the floor than this, squared and in variances of elevation, pose and floor, does not stand on
-it."""
+"""Gate for "the landmark stands on the floor": the 0.999 quantile of chi-square with one degree of freedom.
+
+The landmark is placed at elevation 0 and its height compared with the floor's. It is not on the floor if the squared
+difference, divided by its variance from elevation, pose and floor, exceeds the gate."""
 
 
 @compiled

@@ -54,12 +54,12 @@ class SmootherParams(Section):
     lag_s: float = Field(15.0, gt=0)
     """Poses older than this are marginalised out of the incremental solution; a large value keeps the whole history."""
     relinearize_threshold: float = Field(0.001, gt=0)
-    """A variable is relinearised when a component of its change exceeds this (rad or m)."""
+    """Change of a component of a variable (rad or m) above which the variable is relinearised."""
     stale_shift_m: float = Field(0.1, gt=0)
-    """The window is linearised anew, from a solution of the whole graph, when a landmark has moved farther."""
+    """Distance that a landmark may move before the window starts again from a solution of the whole graph."""
     waiting_gain: float = Field(5.0, ge=0)
-    """Sightings wait for the next keyframe until what they would add, the sum of expected over measured variance,
-    exceeds this. 0: none waits."""
+    """New sightings enter the estimate at the next keyframe, or as soon as their expected gain, the sum of predicted
+    variance over noise variance, exceeds this. 0: always at once."""
 
 
 class WholeHistory(Section):
@@ -77,8 +77,8 @@ class BoundedHistory(Section):
 
     policy: Literal["bounded"] = "bounded"
     remembered_s: float | None = Field(None, gt=0)
-    """`Isam2.trajectory` and `Isam2.detections` forget what is older than this (and up to a quarter more); None:
-    nothing."""
+    """Age from which `Isam2.trajectory` and `Isam2.detections` may drop entries; those older than 1.25 times this are
+    dropped. None: all are kept."""
 
 
 HistoryParams = Annotated[WholeHistory | BoundedHistory, *tagged("policy", "whole")]
@@ -105,7 +105,7 @@ class Smoother:
         self.sightlines = Sightlines()
         """Where each landmark was seen from."""
         self.waiting_gain = 0.0
-        """What the factors added since the last update would add: a sum of expected over measured variances."""
+        """Expected gain of the factors added since the last update: sum of predicted variances over noise variances."""
         self.when_withheld: Callable[[Withheld], set[int]] = lambda _: set()
         """Called when new factors cannot be used; returns the handles of others that are nothing without them."""
         self._pending = Pending()
