@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 from sonar_graph.measurements import Measurements
-from sonar_graph.settings import faults_in
+from sonar_graph.settings import faults_in, nested
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, RefusedRow, Trajectory
 
 ENTRY_POINT_GROUP = "sonar_graph.estimators"
@@ -136,13 +136,19 @@ def load_estimator(name: str) -> type[Estimator]:
 def make_params(estimator: type[Estimator], overrides: dict[str, Any], name: str) -> Section:
     """An estimator's settings with some replaced.
 
+    Parameters
+    ----------
+    overrides
+        Values by name; of a setting in a section by its dotted name, ``{"identity.policy": "gate"}``, or nested,
+        ``{"identity": {"policy": "gate"}}``.
+
     Raises
     ------
     EstimatorError
         Naming the setting that does not exist or does not fit, and those that exist.
     """
     try:
-        return estimator.Params.model_validate(overrides)
+        return estimator.Params.model_validate(nested(overrides))
     except ValidationError as error:
         raise EstimatorError(f"settings of {name}: {faults_in(error, estimator.Params)}") from error
 

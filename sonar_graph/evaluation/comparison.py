@@ -63,7 +63,7 @@ def compare(
     names
         Estimators by the names under which they are installed, each once.
     overrides
-        Settings that differ from the defaults, by estimator.
+        Settings that differ from the defaults, by estimator: ``{"isam2": {"identity.policy": "gate"}}``.
     rate_hz
         Rate at which estimates are asked for, from the start on, Hz.
     progress

@@ -137,7 +137,7 @@ def run_estimator(
     name
         Name under which the estimator is installed.
     overrides
-        Settings that differ from the estimator's defaults.
+        Settings that differ from the estimator's defaults, by dotted name: ``{"identity.policy": "gate"}``.
     instants_ns
         Stamps at which estimates are asked for, increasing; None: ``sequence.instants(rate_hz)``.
     interim_maps

@@ -70,3 +70,9 @@ def test_the_listing_has_every_setting_once_with_its_policy() -> None:
     assert listed["identity.policy"].default == "robust"
     assert listed["identity.gate_probability"].meaning.endswith('Only with policy = "gate".')
     assert listed["identity.minimum_probability"].meaning.endswith('Only with policy = "robust" or "gate".')
+
+
+def test_settings_are_given_by_dotted_names_or_nested() -> None:
+    given: list[dict[str, object]] = [{"identity.policy": "gate"}, {"identity": {"policy": "gate"}}]
+    first, second = (make_params(Isam2, values, "isam2") for values in given)
+    assert first == second != Isam2.Params()
