@@ -1,4 +1,4 @@
-"""Cli."""
+"""Commands of ``sonar-graph``, a module each; `main` starts them."""
 
 # fmt: off
 from sonar_graph.cli.main import main

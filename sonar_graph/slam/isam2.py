@@ -104,6 +104,19 @@ class Isam2:
         What is known before the run.
     params
         Settings; None for the defaults.
+
+    Examples
+    --------
+    >>> from sonar_graph.slam import Isam2, Isam2Params
+    >>> from sonar_graph.testing import small_world
+    >>> world = small_world()
+    >>> isam2 = Isam2(world.calibration, Isam2Params())
+    >>> for step in world.replay(world.instants(rate_hz=2.0)):
+    ...     estimate = isam2.process(step)
+    >>> isam2.landmarks().ids
+    array([ 4,  9, 11])
+    >>> isam2.trajectory().positions.shape
+    (40, 3)
     """
 
     Params: ClassVar[type[Section]] = Isam2Params

@@ -78,6 +78,19 @@ class Recogniser:
     ------
     CalibrationError
         When the model was measured on other designs, or a design can never be found.
+
+    Examples
+    --------
+    An empty frame:
+
+    >>> import numpy as np
+    >>> from sonar_graph import Calibration, SonarFrames
+    >>> from sonar_graph.sonar import Recogniser
+    >>> noise = np.random.default_rng(1).normal(100.0, 10.0, (1, 96, 512)).astype(np.uint8)
+    >>> ranges_m, azimuths_rad = np.linspace(1.26, 2.51, 512), np.linspace(0.25, -0.25, 96)
+    >>> recogniser = Recogniser(Calibration())
+    >>> recogniser.process(SonarFrames(np.array([0]), noise, ranges_m, azimuths_rad)) is None
+    True
     """
 
     def __init__(

@@ -27,7 +27,7 @@ from gtsam.symbol_shorthand import L
 from sonar_graph.measurements import Floats
 from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
 from sonar_graph.slam.landmarks.sighting import Sighting
-from sonar_graph.slam.models.factors import Kernel
+from sonar_graph.slam.models import Kernel
 
 LEAST_TRUNCATION = 1.0
 """Of the squared error, where even a perfect fit is less probable than none."""

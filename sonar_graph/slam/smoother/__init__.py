@@ -1,4 +1,8 @@
-"""Smoother."""
+"""Solvers of the graph.
+
+Incremental in a window (`incremental`), whole at the end (`batch_solution`), and without factors that leave variables
+undetermined (`observability`).
+"""
 
 # fmt: off
 from sonar_graph.slam.smoother.batch_solution import (
