@@ -1,4 +1,4 @@
-"""Sonar model and Jacobians (`sonar_model`), factors (`factors`, `inertial_factors`), predicted views (`prediction`)."""
+"""Sonar model and Jacobians (`sonar_model`), factors (`factors`, `inertial_factors`), views (`prediction`)."""
 
 # fmt: off
 from sonar_graph.slam.models.factors import GaussianKernel, Kernel, KernelParams, Robust, RobustKernel
