@@ -9,7 +9,7 @@ of at least one half. It is right when that landmark truly lies within 15 cm.
 * `accepted_right`: share of accepted detections that are right;
 * `false_accepts`: share of the passes of other objects in which one of them was accepted as a landmark;
 * `ece`: expected calibration error of the most probable class, over all detections; `ece_of_passes` of one a pass, the
-  middle one, so that a long watch counts as much as a short one;
+  middle one, so that a long pass counts as much as a short one;
 * `range_rms_m`, `azimuth_rms_deg`: of accepted detections that are right;
 * `nis`: normalised error over both, per degree of freedom, of the middle one of each pass, with its two-sided 95 % band
   `nis_band`, and `nis_of_seeds`, the interval that the spread of the basins' own means gives;

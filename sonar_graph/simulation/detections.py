@@ -4,7 +4,7 @@ World z points up with z = 0 at the water's surface. A landmark is seen when it 
 three-dimensional geometry. Of those seen a share is missed, of those detected a share gets another's identity, and some
 detections are false, independently from frame to frame.
 
-A recogniser that tracks has one opinion about a track, an uninterrupted watch of one landmark, which ends when the
+A recogniser that tracks has one opinion about a track, uninterrupted detections of one landmark, which ends when the
 landmark was not detected for `LONGEST_GAP_S`. Until a track is ``id_delay_s`` old it has no identity. Some tracks then
 have a wrong one for a share of the rest of the track, and the right one after that. docs/theory/simulation.md
 """

@@ -52,7 +52,7 @@ class SmootherParams(Section):
     """Settings of the incremental solution."""
 
     lag_s: float = Field(15.0, gt=0)
-    """Poses older than this are marginalised out of the incremental solution; a large value keeps the whole history."""
+    """Age from which poses are marginalised out of the incremental solution; a large value keeps all of them."""
     relinearize_threshold: float = Field(0.001, gt=0)
     """Change of a component of a variable (rad or m) above which the variable is relinearised."""
     stale_shift_m: float = Field(0.1, gt=0)
@@ -69,9 +69,9 @@ class WholeHistory(Section):
 
 
 class BoundedHistory(Section):
-    """Poses older than the lag are given up, so that time and memory do not grow with the run.
+    """Poses older than the lag are marginalised for good, so that time and memory do not grow with the run.
 
-    Kept is what they say about landmarks and bias; `Isam2.trajectory` is fixed-lag smoothed
+    Their information on landmarks and bias is kept; `Isam2.trajectory` is fixed-lag smoothed
     (docs/theory/bounded_memory.md).
     """
 
