@@ -22,18 +22,10 @@ _WRITTEN_FOR_A_RUN = ("trajectory.tum", "causal.tum", "landmarks.csv", "result.j
 def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = False) -> Path:
     """Check that a log can be written, make its folder, and return ``path``.
 
-    Parameters
-    ----------
-    source
-        File or folder that the log is made from; never overwritten.
-    overwrite
-        Replace a file that this package did not write.
+    The source, a file or folder, is never overwritten; a file that this package did not write, only if asked for.
 
-    Raises
-    ------
-    LogError
-        When it is a folder, is not called ``*.mcap``, is the source or a part of it, is a file that this package did
-        not write, or its folder cannot be written to.
+    Raises `LogError` when it is a folder, is not called ``*.mcap``, is the source or a part of it, is a file that this
+    package did not write, or its folder cannot be written to.
     """
     if path.is_dir():
         raise LogError(f"{path}: is a folder; give the name of a file such as {path / 'log.mcap'}")
