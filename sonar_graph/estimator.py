@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from sonar_graph.calibration import Calibration, Section
 from sonar_graph.errors import EstimatorError, UnknownEstimatorError
 from sonar_graph.measurements import Measurements
-from sonar_graph.settings import faults_in, nested
+from sonar_graph.settings import faults_in, nested, suggestion
 from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, RefusedRow, Trajectory
 
 ENTRY_POINT_GROUP = "sonar_graph.estimators"
@@ -122,7 +122,7 @@ def load_estimator(name: str) -> type[Estimator]:
     installed = installed_estimators()
     if name not in installed:
         known = ", ".join(installed) or "none; reinstall the package"
-        raise UnknownEstimatorError(f"no estimator is called {name!r}; installed: {known}")
+        raise UnknownEstimatorError(f"no estimator is called {name!r}{suggestion(name, installed)} installed: {known}")
     try:
         loaded: Any = installed[name].load()
     except Exception as error:  # a third party's import may fail in any way

@@ -12,6 +12,13 @@ from typing import Any, BinaryIO
 from sonar_graph.errors import EvaluationError, LogError
 
 
+def as_path(value: object, call: str) -> Path:
+    """An argument as a path; a TypeError that names the expected ``call`` where it is none."""
+    if not isinstance(value, str | Path):
+        raise TypeError(f"{call}: expected a path, a str or Path, not {type(value).__name__}")
+    return Path(value)
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Temporary path with the suffix of ``path``, which replaces ``path`` when the block ends without an error."""

@@ -94,3 +94,9 @@ class Sequence:
                 self.detections.between(after_ns, end_ns) if self.detections else None,
             )
             after_ns = end_ns
+
+
+def require_sequence(value: object, call: str) -> None:
+    """Raise a TypeError that names the expected ``call`` where an argument is no `Sequence`."""
+    if not isinstance(value, Sequence):
+        raise TypeError(f"{call}: expected a Sequence, not {type(value).__name__}; read_log gives one")

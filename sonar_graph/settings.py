@@ -172,10 +172,13 @@ def unknown_field(place: Place, model: type[BaseModel]) -> str:
 def choice(name: str, known: Iterable[str], owner: str = "") -> str:
     """Message after an unknown name: the most similar known name, and all that exist."""
     names = list(known)
-    similar = max(names, key=partial(_similarity, name), default="")
-    is_meant = _similarity(name, similar) >= _LEAST_SIMILARITY
-    suggestion = f"; did you mean {similar}?" if is_meant else ";"
-    return f"{suggestion} {f'{owner} has' if owner else 'there are'}: {', '.join(names) or 'none'}"
+    return f"{suggestion(name, names)} {f'{owner} has' if owner else 'there are'}: {', '.join(names) or 'none'}"
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """Question after an unknown name whether the most similar known name is meant; a semicolon where none is."""
+    similar = max(known, key=partial(_similarity, name), default="")
+    return f"; did you mean {similar}?" if _similarity(name, similar) >= _LEAST_SIMILARITY else ";"
 
 
 def _similarity(name: str, known: str) -> float:

@@ -227,13 +227,19 @@ def estimator_settings(texts: list[str] | None, names: list[str]) -> dict[str, d
 
     Raises `EstimatorError` as `parse_settings`, and when a text does not begin with one of the estimators that run.
     """
-    from sonar_graph.settings import nested
+    from sonar_graph.estimator import installed_estimators
+    from sonar_graph.settings import nested, suggestion
 
     given = parse_settings(texts or [])
     for path in given:
         estimator, dot, setting = path.partition(".")
         if dot and estimator not in names:
-            raise EstimatorError(f"--set {path}: {estimator} is not among the estimators that run: {', '.join(names)}")
+            hint = suggestion(estimator, names)
+            if hint == ";" and estimator not in installed_estimators():
+                hint = f"; the estimator's name comes first, such as {names[0]}.{path}"
+            raise EstimatorError(
+                f"--set {path}: {estimator} is not among the estimators that run: {', '.join(names)}{hint.rstrip(';')}"
+            )
         if not dot or not all(setting.split(".")):
             raise EstimatorError(f"--set {path}: expected ESTIMATOR.setting=value with one of {', '.join(names)}")
     return nested(given)

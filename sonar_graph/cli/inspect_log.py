@@ -84,7 +84,7 @@ def print_summary(summary: LogSummary, findings: list[Finding], skipped: str) ->
         topics.add_column(heading, justify="right")
     origin_ns = min((topic.first_stamp_ns for topic in summary.topics), default=0)
     for topic in summary.topics:
-        kind = topic.type_name.replace("/msg/", "/") + (f" ({topic.encoding})" if topic.encoding != "cdr" else "")
+        kind = topic.type_name + (f" ({topic.encoding})" if topic.encoding != "cdr" else "")
         first_s, last_s = ((stamp_ns - origin_ns) * 1e-9 for stamp_ns in (topic.first_stamp_ns, topic.last_stamp_ns))
         cells = [topic.name, kind, str(topic.messages), f"{topic.rate_hz:.2f}", f"{first_s:.1f} to {last_s:.1f}"]
         cells += [f"{topic.largest_gap_s:.2f}", f"{1e3 * topic.jitter_s:.2g}"]

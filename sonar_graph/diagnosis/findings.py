@@ -33,6 +33,8 @@ INTERVAL_SIGMAS = 1.96
 """Half width of printed intervals, 95 %."""
 NO_NEED = "no need to act"
 ALSO = "put right by the line above"
+IN_CALIBRATION = "in the calibration (--calibration FILE)"
+IN_LOG_CONFIG = "in the log configuration (--log-config FILE)"
 
 
 @dataclass(frozen=True)
@@ -104,8 +106,8 @@ def lever_findings(found: DvlMatch, calibration: Calibration) -> list[Finding]:
     given, wrong = _arm_and_error(found, calibration)
     imu, dvl = calibration.imu.mounting.translation_m, calibration.dvl.mounting.translation_m
     line = (
-        f"`imu.mounting.translation_m = {numbers(np.subtract(imu, wrong), 3)}` in the calibration or, if that place is "
-        f"sure, `dvl.mounting.translation_m = {numbers(np.add(dvl, wrong), 3)}`"
+        f"`imu.mounting.translation_m = {numbers(np.subtract(imu, wrong), 3)}` {IN_CALIBRATION} or, if that place "
+        f"is sure, `dvl.mounting.translation_m = {numbers(np.add(dvl, wrong), 3)}`"
     )
     rows = []
     for axis, estimate, of_calibration, error in zip(AXES, found.lever, given, wrong, strict=True):
@@ -137,7 +139,7 @@ def bias_findings(bias: Estimates3D, sources: tuple[str, str, str], imu: ImuCali
         if acts:
             advice = (
                 f"{source}, beyond the calibration's sigma of {allowed:.2g}: "
-                f"`imu.gyro_bias_sigma = {_largest(bias):.2g}` in the calibration, for estimators that find the bias"
+                f"`imu.gyro_bias_sigma = {_largest(bias):.2g}` {IN_CALIBRATION}, for estimators that find the bias"
             )
         rows.append(Finding(f"{BIAS}, {axis}", estimate, "rad/s", advice, acts))
     return said_once(rows)
@@ -233,7 +235,7 @@ def tilt_findings(found: StartTilt, start: Start, yaw_rad: float) -> list[Findin
     given, sigmas = start.rpy_rad, [float(found.angle(axis).sigma) for axis in (0, 1)]
     line = (
         f"`start.rpy_rad = {numbers((found.angle(0).value, found.angle(1).value, yaw_rad), 4)}`, "
-        f"`start.rpy_sigma_rad = [{sigmas[0]:.2g}, {sigmas[1]:.2g}, {start.rpy_sigma_rad[2]:.2g}]` in the calibration"
+        f"`start.rpy_sigma_rad = [{sigmas[0]:.2g}, {sigmas[1]:.2g}, {start.rpy_sigma_rad[2]:.2g}]` {IN_CALIBRATION}"
     )
     rows = []
     for axis, name in enumerate(("roll", "pitch")):
@@ -243,7 +245,7 @@ def tilt_findings(found: StartTilt, start: Start, yaw_rad: float) -> list[Findin
         advice = (
             f"{found.said}, not {of_calibration}: {line}" if acts else f"{found.said}; {of_calibration} fits, {NO_NEED}"
         )
-        rows.append(Finding(f"start {name}", in_degrees(told), "°", advice, acts))
+        rows.append(Finding(f"start {name}: value", in_degrees(told), "°", advice, acts))
     return said_once(rows)
 
 
@@ -268,11 +270,11 @@ class StartHeading:
             rpy = (tilt.angle(0).value, tilt.angle(1).value, self.rpy_rad[2]) if tilt.tilt else self.rpy_rad
             of_tilt = f", with roll and pitch {tilt.said}" if tilt.tilt else ""
             advice = (
-                f"the start heading is wrong; by the reference, its stamps put right{of_tilt}: "
-                f"`start.rpy_rad = {numbers(rpy, 4)}`, `start.position_m = {numbers(self.position_m, 2)}` in the "
-                "calibration"
+                f"the calibration's start heading is wrong; by the reference, its stamps put right{of_tilt}: "
+                f"`start.rpy_rad = {numbers(rpy, 4)}`, `start.position_m = {numbers(self.position_m, 2)}` "
+                f"{IN_CALIBRATION}; the position too is the reference's, so that both are of one pose"
             )
-        return Finding("start heading of the calibration", in_degrees(self.error), "°", advice, self.acts)
+        return Finding("start heading: error", in_degrees(self.error), "°", advice, self.acts)
 
 
 def find_start_heading(sequence: Sequence, reference: Trajectory, offset: Estimate1D) -> StartHeading:

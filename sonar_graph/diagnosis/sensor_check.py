@@ -18,6 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import DvlCalibration, Start
 from sonar_graph.diagnosis.findings import (
+    IN_CALIBRATION,
+    IN_LOG_CONFIG,
     NO_NEED,
     Finding,
     StartTilt,
@@ -74,7 +76,7 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[WrongUnit]:
         scale = float(config.table("dvl").get("scale", 1.0)) * SPEEDS[unit]
         advice = (
             f"velocities look {1 / SPEEDS[unit]:.0f} times too large (up to {speed_m_s:.3g} m/s): {unit}? "
-            f"`scale = {scale:.4g}` under [dvl] in the log configuration"
+            f"`scale = {scale:.4g}` under [dvl] {IN_LOG_CONFIG}"
         )
         found.append(WrongUnit("DVL: unit", advice))
     rate_rad_s = _exceeded_by_few(sequence.imu.angular_velocity)
@@ -82,7 +84,7 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[WrongUnit]:
         scale = float(config.table("imu").get("angular_velocity_scale", 1.0)) * np.radians(1.0)
         advice = (
             f"rates look 57 times too large (up to {rate_rad_s:.3g} rad/s): degrees a second? "
-            f"`angular_velocity_scale = {scale:.5g}` under [imu] in the log configuration"
+            f"`angular_velocity_scale = {scale:.5g}` under [imu] {IN_LOG_CONFIG}"
         )
         found.append(WrongUnit("gyro: unit", advice))
     forces, gravity = _lengths(sequence.imu.specific_force), sequence.calibration.gravity_m_s2
@@ -92,7 +94,7 @@ def wrong_units(sequence: Sequence, config: LogConfig) -> list[WrongUnit]:
         scale = float(config.table("imu").get("linear_acceleration_scale", 1.0)) * FORCES[unit]
         advice = (
             f"specific forces are typically {typical:.4g} instead of {gravity:.4g} m/s²: {unit}? "
-            f"`linear_acceleration_scale = {scale:.6g}` under [imu] in the log configuration"
+            f"`linear_acceleration_scale = {scale:.6g}` under [imu] {IN_LOG_CONFIG}"
         )
         found.append(WrongUnit("accelerometer: unit", advice))
     return found
@@ -161,10 +163,10 @@ def dvl_findings(found: DvlMatch, sequence: Sequence, config: LogConfig) -> list
     yaw_advice = scale_advice = NO_NEED
     if turns:
         rpy = numbers(_turned(sequence.calibration.dvl, found.yaw.value), 4)
-        yaw_advice = f"turn the DVL's mounting: `dvl.mounting.rpy_rad = {rpy}` in the calibration"
+        yaw_advice = f"turn the DVL's mounting: `dvl.mounting.rpy_rad = {rpy}` {IN_CALIBRATION}"
     if scales:
         scale = float(config.table("dvl").get("scale", 1.0)) * found.scale.value
-        scale_advice = f"scale the DVL's velocities: `scale = {scale:.4f}` under [dvl] in the log configuration"
+        scale_advice = f"scale the DVL's velocities: `scale = {scale:.4f}` under [dvl] {IN_LOG_CONFIG}"
     return [
         _offset("DVL against IMU", found.offset, sequence.imu, "dvl", config)[0],
         Finding("DVL mounting yaw", in_degrees(found.yaw), "°", yaw_advice, turns),
@@ -210,7 +212,7 @@ def reference_findings(right: Sequence, config: LogConfig, tilt: StartTilt) -> I
     jump = in_degrees(found.start_heading)
     acts = matters(found.start_heading, LEAST_HEADING_RAD)
     advice = "the reference begins with a wrong heading: leave its beginning out with `--start`" if acts else NO_NEED
-    yield Finding("first headings of the reference", jump, "°", advice, acts)
+    yield Finding("first headings of the reference: error", jump, "°", advice, acts)
     is_compared = offset.is_known and start != Start()
     heading = find_start_heading(right, right.truth, offset) if is_compared else None
     yield from tilt_findings(tilt, start, heading.rpy_rad[2] if heading and heading.acts else start.rpy_rad[2])
@@ -236,9 +238,7 @@ def noise_findings(sequence: Sequence) -> Iterator[Finding]:
         acts = matters(replace(estimate, value=estimate.value - given), 0.0) and ratio > LARGEST_DENSITY_RATIO
         advice = f"{rest}; the calibration's {given:.2g} fits, no need to act"
         if acts:
-            advice = (
-                f"{rest}, not the calibration's {given:.2g}: `imu.{field} = {estimate.value:.2g}` in the calibration"
-            )
+            advice = f"{rest}, not the calibration's {given:.2g}: `imu.{field} = {estimate.value:.2g}` {IN_CALIBRATION}"
         yield Finding(quantity, estimate, unit, advice, acts)
 
 
@@ -248,7 +248,7 @@ def _offset(quantity: str, offset: Estimate1D, imu: Imu, role: str, config: LogC
     offset = replace(offset, sigma=float(np.hypot(offset.sigma, interval_s / np.sqrt(12))))
     total_s = float(config.table(role).get("stamp_offset_s", 0.0)) + offset.value
     acts = matters(offset, LEAST_OFFSET_S)
-    advice = f"shift its stamps: `stamp_offset_s = {total_s:.3f}` under [{role}] in the log configuration"
+    advice = f"shift its stamps: `stamp_offset_s = {total_s:.3f}` under [{role}] {IN_LOG_CONFIG}"
     return Finding(f"{quantity}: time offset", offset, "s", advice if acts else NO_NEED, acts), offset
 
 

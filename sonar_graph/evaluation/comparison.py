@@ -21,7 +21,7 @@ from sonar_graph.evaluation.run import check_request, run_estimator
 from sonar_graph.evaluation.scored_instants import rows_at, scored_instants
 from sonar_graph.evaluation.scores import detection_scores, landmark_scores, resource_scores, trajectory_scores
 from sonar_graph.measurements import Ints
-from sonar_graph.sequence import Sequence
+from sonar_graph.sequence import Sequence, require_sequence
 from sonar_graph.states import Trajectory
 
 LIBRARIES = ("gtsam", "numpy", "scipy", "numba")
@@ -79,6 +79,8 @@ def compare(
         When no estimator is named, one is named twice, or settings are for one that is not named.
     UnknownEstimatorError, EstimatorError
         As in `run_estimator`, before anything runs: mistakes in names and settings. A failed run is a result instead.
+    TypeError
+        When `sequence` is no `Sequence`, or `names` is a single text.
 
     Examples
     --------
@@ -91,6 +93,10 @@ def compare(
     >>> comparison.scores["ekf-slam"]["causal.ate_se2_m"].value < 0.1
     True
     """
+    require_sequence(sequence, "compare(sequence, names)")
+    asked: object = names
+    if isinstance(asked, str):
+        raise TypeError(f"compare(sequence, names): names is a list: give [{asked!r}]")
     settings = overrides or {}
     if not names:
         raise EvaluationError("no estimator to compare; name at least one")

@@ -23,7 +23,7 @@ from sonar_graph.estimator import Estimator, load_estimator, make_params, refuse
 from sonar_graph.evaluation.results import MapSoFar, RunResult
 from sonar_graph.evaluation.scored_instants import map_instants
 from sonar_graph.measurements import Floats, Ints, LandmarkDetections, Measurements
-from sonar_graph.sequence import Sequence
+from sonar_graph.sequence import Sequence, require_sequence
 from sonar_graph.states import Estimate, LandmarkMap, Trajectory
 
 Flags = NDArray[np.bool_]
@@ -156,6 +156,8 @@ def run_estimator(
         When no estimator has that name.
     EstimatorError
         When a setting does not exist or does not fit.
+    TypeError
+        When `sequence` is no `Sequence`, such as the path of a log.
 
     Examples
     --------
@@ -165,6 +167,7 @@ def run_estimator(
     >>> run.status, len(run.causal), run.causal.positions.shape
     ('ok', 20, (20, 3))
     """
+    require_sequence(sequence, "run_estimator(sequence, name)")
     instants = sequence.instants(rate_hz) if instants_ns is None else instants_ns
     try:
         kind = load_estimator(name)

@@ -181,7 +181,8 @@ def gravity_warning(specific_force: Floats, mounting: Mounting, gravity_m_s2: fl
     if abs(length - gravity_m_s2) > MOST_OFF_GRAVITY * gravity_m_s2:
         return (
             f"the typical specific force is {length:.3g} m/s2 instead of {gravity_m_s2:.3g}: give its scale (9.80665 "
-            f"where it is in g), or turn off use_gravity in the calibration where gravity was taken out"
+            f"where it is in g), or turn off use_gravity in the calibration (--calibration FILE) "
+            "where gravity was taken out"
         )
     if typical[2] >= LEAST_PART_UPWARDS * length:
         return None

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from sonar_graph.errors import CalibrationError, LogError, SonarGraphError
+from sonar_graph.files import as_path
 from sonar_graph.logs.adapters import LogConfig, leaf_fields, plain_lines, shipped_like, table_text
 from sonar_graph.logs.cdr import Struct, decode, definition, parse_definition, short_name
 from sonar_graph.logs.checks import stamp_faults
@@ -117,7 +118,7 @@ class LogSummary:
 
 
 def inspect_log(
-    path: Path,
+    path: str | Path,
     config: LogConfig | None = None,
     topics: Mapping[str, str] | None = None,
     window: TimeWindow | None = None,
@@ -169,7 +170,9 @@ def inspect_log(
     """
     config = config or LogConfig()
     types = wanted_types(config)
-    recording = scan(Path(path), lambda kind: Keep.ALL if short_name(kind) in types else Keep.STAMP, window)
+    recording = scan(
+        as_path(path, "inspect_log(path)"), lambda kind: Keep.ALL if short_name(kind) in types else Keep.STAMP, window
+    )
     damage = [*recording.corrupt, *([recording.ending] if recording.ending else []), *recording.damage.remarks]
     choices = {name: choose_topic(role, recording, config, (topics or {}).get(name)) for name, role in ROLES.items()}
     calibration = _calibration_source(recording)

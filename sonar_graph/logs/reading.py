@@ -15,6 +15,7 @@ import numpy as np
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import LogError
+from sonar_graph.files import as_path
 from sonar_graph.logs.adapters import (
     DepthAdapter,
     DetectionArrayAdapter,
@@ -62,9 +63,9 @@ FOUND_ANEW = frozenset({"log.warnings", "log.gaps", "log.noise"})
 
 
 def read_log(
-    path: Path,
+    path: str | Path,
     *,
-    calibration: Calibration | PartialCalibration | None = None,
+    calibration: Calibration | PartialCalibration | str | Path | None = None,
     name: str | None = None,
     topics: Mapping[str, str] | None = None,
     config: LogConfig | None = None,
@@ -82,7 +83,8 @@ def read_log(
     path
         An MCAP file.
     calibration
-        A `Calibration` replaces everything that the file says. A `PartialCalibration` goes before it, field by field.
+        A `Calibration` replaces everything that the file says. A `PartialCalibration`, or the path of a TOML or JSON
+        file of one, goes before it, field by field.
         Without either the file's record holds; without a record, defaults with the mountings of ``/tf_static``.
     name
         Name of the sequence, instead of the one in the file; without either, the file's name.
@@ -111,7 +113,9 @@ def read_log(
         When the file is not MCAP, is damaged in its middle without `salvage`, has nothing in the window, or a message
         breaks its own rules.
     CalibrationError
-        When the calibration in the file is invalid, or becomes so by `calibration`.
+        When the calibration in the file is invalid, or becomes so by `calibration`, or that file cannot be read.
+    TypeError
+        When `path` or `calibration` is something else.
 
     See Also
     --------
@@ -138,7 +142,9 @@ def read_log(
     >>> sequence.notes["log.topics"]
     'imu: /imu/data; dvl: /dvl/data'
     """
-    path = Path(path)
+    path = as_path(path, "read_log(path)")
+    if not isinstance(calibration, Calibration | PartialCalibration | None):
+        calibration = PartialCalibration.read(as_path(calibration, "read_log(path, calibration=FILE or Calibration)"))
     config = config or LogConfig()
     types = wanted_types(config)
     recording = scan(path, lambda kind: Keep.ALL if short_name(kind) in types else Keep.NONE, window, progress)

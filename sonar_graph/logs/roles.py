@@ -39,7 +39,7 @@ class Role:
         """Message types that can play the role, with the words that a topic's name needs."""
         by_words: dict[tuple[str, ...], dict[str, None]] = {}
         for offer in self.shipped:
-            by_words.setdefault(offer.words, {})[short_name(offer.adapter.type)] = None
+            by_words.setdefault(offer.words, {})[offer.adapter.type] = None
         return ", or ".join(
             ", ".join(names) + (f" on a topic with {' or '.join(map(repr, words))} in its name" if words else "")
             for words, names in by_words.items()
@@ -124,6 +124,14 @@ def adapter_for(role: Role, topic: Topic, config: LogConfig) -> Adapter | str:
             return adapter
     if lacking:
         return f"has no field {', '.join(lacking)}"
+    others = [
+        other.name
+        for other in ROLES.values()
+        if any(short_name(offer.adapter.type) == short_name(topic.type_name) for offer in other.shipped)
+    ]
+    if others:
+        roles = " or ".join(others)
+        return f"is a {topic.type_name}; no adapter of role {role.name} reads it, it is a type of role {roles}"
     return f"is a {topic.type_name}, for which no adapter is shipped: name type and fields in --log-config"
 
 
@@ -213,7 +221,7 @@ def choose_topics(
             ]
             needed = " (IMU and Doppler log must both be in the log, for recognising in sonar images too)"
             raise MissingTopicError(
-                f"{path}: nothing for {name}: {choice.reason}{needed if is_required else ''}; the log has "
+                f"{path}: nothing for {name}: {choice.reason}{'' if is_asked_for else needed}; the log has "
                 f"{', '.join(listed) or 'no messages at all'}; describe topics of other types in a log configuration, "
                 f"which `sonar-graph inspect {path} --toml` begins"
             )

@@ -118,12 +118,14 @@ class PartialCalibration:
         Raises
         ------
         CalibrationError
-            When the file is neither TOML nor JSON, or a field does not fit.
+            When the file cannot be read, is neither TOML nor JSON, or a field does not fit.
         """
         kind = "JSON" if path.suffix == ".json" else "TOML"
         try:
             text = path.read_text(encoding="utf-8")
             values = json.loads(text) if kind == "JSON" else tomllib.loads(text)
+        except OSError as error:
+            raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
         except (json.JSONDecodeError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise CalibrationError(f"{path}: not {kind}: {error}") from error
         if not isinstance(values, dict):

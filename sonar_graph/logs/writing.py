@@ -15,13 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from sonar_graph.errors import LogError
+from sonar_graph.files import as_path
 from sonar_graph.logs.adapters import SAMPLE_TYPES, body_to_ros
 from sonar_graph.logs.cdr import Bytes, Struct, Value, definition, encode, parse_definition
 from sonar_graph.logs.mcap import Outgoing, recording
 from sonar_graph.logs.roles import DETECTIONS, DVL, IMU, LANDMARK_MAP, ODOMETRY, POSE_WITH_COVARIANCE, SONAR_IMAGE, TF
 from sonar_graph.logs.vehicle_setup import BODY_FRAME, METADATA, encode_mountings
 from sonar_graph.measurements import NO_TRACK, Depth, Dvl, Floats, Imu, Ints, LandmarkDetections, SonarFrames
-from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.sequence import NS_PER_S, Sequence, require_sequence
 from sonar_graph.states import LandmarkMap, Trajectory
 
 WORLD_FRAME = "map"
@@ -30,7 +31,7 @@ _Z_VARIANCE = 14
 _SECONDS = np.iinfo(np.int32)
 
 
-def write_log(path: Path, sequence: Sequence, more: Iterable[Outgoing] = ()) -> None:
+def write_log(path: str | Path, sequence: Sequence, more: Iterable[Outgoing] = ()) -> None:
     """Write a log of ROS 2 messages from which `read_log` gives the same sequence.
 
     Parameters
@@ -47,6 +48,8 @@ def write_log(path: Path, sequence: Sequence, more: Iterable[Outgoing] = ()) -> 
     ------
     LogError
         When the file cannot be written, or a stamp does not fit into a ROS 2 message.
+    TypeError
+        When the arguments are swapped.
 
     See Also
     --------
@@ -70,6 +73,8 @@ def write_log(path: Path, sequence: Sequence, more: Iterable[Outgoing] = ()) -> 
     >>> bool((copy.dvl.velocity == dvl.velocity).all())
     True
     """
+    path = as_path(path, "write_log(path, sequence)")
+    require_sequence(sequence, "write_log(path, sequence)")
     first_ns = int(min(sequence.imu.stamps_ns[0], sequence.dvl.stamps_ns[0]))
     messages = [static_message("/tf_static", TF, first_ns, encode_mountings(sequence.calibration))]
     if sequence.true_landmarks is not None:
@@ -87,7 +92,7 @@ def write_log(path: Path, sequence: Sequence, more: Iterable[Outgoing] = ()) -> 
         "calibration": sequence.calibration.model_dump_json(),
         "notes": json.dumps(sequence.notes),
     }
-    with recording(Path(path), {METADATA: record}) as out:
+    with recording(path, {METADATA: record}) as out:
         begins = [0] * len(messages)
         for entry in more:  # with each, what comes up to its end
             until_ns = int(entry.log_times_ns[-1])

@@ -62,7 +62,7 @@ def recognise(
     designs: Sequence[LandmarkDesign] | None = None,
     params: RecogniserParams | None = None,
     recogniser: LandmarkRecogniser | None = None,
-    calibration: Calibration | PartialCalibration | None = None,
+    calibration: Calibration | PartialCalibration | str | Path | None = None,
     topics: Mapping[str, str] | None = None,
     config: LogConfig | None = None,
     window: TimeWindow | None = None,
@@ -174,7 +174,10 @@ def with_detections(sequence: Run, recognition: Recognition) -> Run:
 
 def no_images(log: Path | str) -> str:
     """Message for a log without sonar images."""
-    return f"{log}: has no sonar images; `sonar-graph inspect {log}` lists what it has"
+    return (
+        f"{log}: has no sonar images; `sonar-graph inspect {log}` lists what it has "
+        "(`sonar-graph compare` and read_log need none)"
+    )
 
 
 def one_by_one(block: SonarFrames) -> Iterator[SonarFrames]:

@@ -14,6 +14,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
+from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation import (
     ABSENT,
     DURATION_S,
@@ -95,7 +96,7 @@ def write_report(comparison: Comparison, folder: str | Path) -> Path:
     Raises
     ------
     EvaluationError
-        When the name of an estimator cannot be the name of a folder.
+        When the folder cannot be written to, or the name of an estimator cannot be the name of a folder.
     LogError
         When ``result.mcap`` cannot be written, or a stamp does not fit into a ROS 2 message.
 
@@ -111,9 +112,12 @@ def write_report(comparison: Comparison, folder: str | Path) -> Path:
     'report.html'
     """
     folder = Path(folder)
-    write_comparison(comparison, folder)
-    write_viewer_files(comparison, folder)
-    return write_page(comparison, folder)
+    try:
+        write_comparison(comparison, folder)
+        write_viewer_files(comparison, folder)
+        return write_page(comparison, folder)
+    except OSError as error:
+        raise EvaluationError(f"{folder}: cannot be written: {error.strerror}; choose another folder") from error
 
 
 def write_page(comparison: Comparison, folder: Path) -> Path:

@@ -61,7 +61,7 @@ def test_sentences_say_whether_to_act(log):
     assert "sensors against each other (± 95 %)" in result.stdout
     assert "no need to act" in result.stdout
     assert "cannot be told: never still for 30 s" in result.stdout
-    for row in ("lever arm from IMU to DVL, x", "gyro bias, x", "start roll", "start pitch"):
+    for row in ("lever arm from IMU to DVL, x", "gyro bias, x", "start roll: value", "start pitch: value"):
         assert f"\n{row} " in result.stdout
 
 
@@ -70,13 +70,13 @@ def test_json_has_lever_arm_bias_and_start_as_numbers(log):
     assert sensor(said, "lever arm from IMU to DVL, x")["value"] == pytest.approx(-0.2, abs=0.1)
     assert sensor(said, "lever arm from IMU to DVL, z")["unit"] == "m"
     assert abs(sensor(said, "gyro bias, x")["value"]) < 1e-3
-    assert 0 < sensor(said, "start pitch")["sigma"] < 0.2
+    assert 0 < sensor(said, "start pitch: value")["sigma"] < 0.2
 
 
 def test_inspect_names_the_topics(run, basin, capsys):
     assert run("inspect", basin) == 0
     shown = capsys.readouterr().out
-    for name in ("sensor_msgs/Imu", "marine_acoustic_msgs/Dvl", "sonar_graph_msgs/LandmarkDetections"):
+    for name in ("sensor_msgs/msg/Imu", "marine_acoustic_msgs/msg/Dvl", "sonar_graph_msgs/msg/LandmarkDetections"):
         assert name in shown
 
 

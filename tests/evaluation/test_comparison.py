@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from sonar_graph.errors import EstimatorError, EvaluationError, UnknownEstimatorError
 from sonar_graph.evaluation.comparison import compare
 from sonar_graph.evaluation.results import RunResult
+from sonar_graph.evaluation.run import run_estimator
 from sonar_graph.evaluation.scores import detection_scores, resource_scores
 from sonar_graph.measurements import Measurements
 from sonar_graph.states import DetectionLog, Estimate, Outcome
@@ -150,6 +151,11 @@ def test_mistakes_of_the_user_are_raised(install):
         compare(sequence, ["offset", "nobody"])
     with pytest.raises(EstimatorError, match="colour"):
         compare(sequence, ["offset"], {"offset": {"colour": 1}})
+    with pytest.raises(TypeError, match=r"names is a list: give \['offset'\]"):
+        compare(sequence, "offset")
+    for call in (lambda log: compare(log, ["offset"]), lambda log: run_estimator(log, "offset")):
+        with pytest.raises(TypeError, match="expected a Sequence, not str; read_log gives one"):
+            call("dive.mcap")
 
 
 def test_a_wrong_name_is_found_before_anything_runs(install):

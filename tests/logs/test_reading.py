@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.errors import LogError, MissingTopicError
+from sonar_graph.errors import CalibrationError, LogError, MissingTopicError
 from sonar_graph.logs.adapters.landmark_messages import LandmarkMapAdapter, detection_warnings
 from sonar_graph.logs.cdr.definitions import definition
 from sonar_graph.logs.inspection import inspect_log
@@ -37,7 +37,7 @@ UNKNOWN = [-1.0] + [0.0] * 8
 def test_a_log_without_imu_or_dvl_names_what_is_there(bench: Bench) -> None:
     imu, dvl = bench.basics()
     for entry, message in (
-        (imu, r"nothing for dvl: no marine_acoustic_msgs/Dvl, dvl_msgs/DVL.*/imu \(sensor_msgs"),
+        (imu, r"nothing for dvl: no marine_acoustic_msgs/msg/Dvl, dvl_msgs/msg/DVL.*/imu \(sensor_msgs"),
         (dvl, r"nothing for imu.*IMU and Doppler log must both be in the log.*/dvl \(marine"),
     ):
         with pytest.raises(MissingTopicError, match=message):
@@ -59,7 +59,8 @@ def test_two_topics_for_one_role_must_be_chosen_from(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("topics", "error", "message"),
     [
-        ({"imu": "/nowhere"}, MissingTopicError, r"/nowhere was chosen but is not in the log.*/imu"),
+        ({"imu": "/nowhere"}, MissingTopicError, r"/nowhere was chosen but is not in the log; the log has .*/imu"),
+        ({"imu": "/dvl"}, MissingTopicError, "Dvl; no adapter of role imu reads it, it is a type of role dvl; the log"),
         ({"depth": "/dvl"}, MissingTopicError, "/dvl was chosen but is a marine_acoustic_msgs/msg/Dvl"),
         ({"gyro": "/imu"}, LogError, "no role gyro; topics are chosen for imu, dvl"),
     ],
@@ -69,6 +70,28 @@ def test_choices_that_cannot_be_are_refused(
 ) -> None:
     with pytest.raises(error, match=message):
         read_log(bench.write(*bench.basics()), topics=topics)
+
+
+def test_arguments_of_a_wrong_type_are_named_and_paths_may_be_texts(bench: Bench, tmp_path: Path) -> None:
+    path = bench.write(*bench.basics())
+    setup = tmp_path / "setup.toml"
+    setup.write_text("[imu]\ngyro_bias_sigma = 0.25")
+    sequence = read_log(str(path), calibration=str(setup))
+    assert sequence.calibration.imu.gyro_bias_sigma == 0.25
+    write_log(str(tmp_path / "copy.mcap"), sequence)
+    assert inspect_log(str(tmp_path / "copy.mcap")).name == sequence.name
+    with pytest.raises(CalibrationError, match=r"absent\.toml: cannot be read: No such file"):
+        read_log(path, calibration=tmp_path / "absent.toml")
+    wrong, text = (sequence, str(path))  # type: Any, Any
+    for call, message in (
+        (lambda: read_log(wrong), r"read_log\(path\): expected a path, a str or Path, not Sequence"),
+        (lambda: inspect_log(wrong), r"inspect_log\(path\): expected a path"),
+        (lambda: read_log(path, calibration=wrong), "calibration=FILE or Calibration.: expected a path"),
+        (lambda: write_log(wrong, wrong), r"write_log\(path, sequence\): expected a path.*not Sequence"),
+        (lambda: write_log(path, text), r"write_log\(path, sequence\): expected a Sequence, not str"),
+    ):
+        with pytest.raises(TypeError, match=message):
+            call()
 
 
 def test_truth_needs_a_name_that_says_so(bench: Bench) -> None:

@@ -9,12 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.consistency import reliability, reliability_of
 from sonar_graph.evaluation.results import Comparison, Score
 from sonar_graph.evaluation.scored_instants import published_maps
 from sonar_graph.evaluation.tables import Table, score_keys, score_table
 from sonar_graph.recognition.session import with_detections
-from sonar_graph.report.comparison_page import recognition_content, render_report, write_page
+from sonar_graph.report.comparison_page import recognition_content, render_report, write_page, write_report
 from sonar_graph.report.figures import reliability_figure
 from sonar_graph.states import Outcome
 from tests.synthetic import REFUSALS, basin_comparison, only, with_failure, with_run, with_score
@@ -237,3 +238,9 @@ def test_a_landmark_that_is_named_as_another_is_named_wrongly(recognised):
     for what in (f"landmark {k}" for k in (1, 2, 3, 4)):
         right, wrong, none = texts(before["named"])[what]
         assert texts(after["named"])[what] == [wrong, right, none]
+
+
+def test_a_folder_that_cannot_be_written_is_named_in_one_line(tmp_path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(EvaluationError, match=r"file/deeper: cannot be written: Not a directory; choose another"):
+        write_report(basin_comparison(60), str(tmp_path / "file" / "deeper"))

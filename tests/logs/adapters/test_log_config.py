@@ -93,7 +93,10 @@ def test_a_topic_of_the_command_line_goes_before_that_of_the_file(foreign: Any, 
     ("toml", "message"),
     [
         ('[dvl]\ntopic = "/missing"', "nothing for dvl: /missing was chosen but is not in the log"),
-        ('[dvl]\ntopic = "/imu"', "/imu was chosen but is a sensor_msgs/msg/Imu, for which no adapter is shipped"),
+        (
+            '[dvl]\ntopic = "/imu"',
+            "/imu was chosen but is a sensor_msgs/msg/Imu; no adapter of role dvl reads it, it is a type of role imu",
+        ),
         ('[dvl]\ntype = "dvl_msgs/msg/DVL"', "nothing for dvl: no dvl_msgs/msg/DVL, which .* asks for"),
         ('[depth]\ntopic = "/missing"', "nothing for depth: /missing was chosen"),
         (
