@@ -78,7 +78,36 @@ def test_consistent_errors_fail_as_often_as_stated():
     assert 70 <= failed <= 130
 
 
-@pytest.mark.parametrize("nees", [[], [1.0, np.nan]])
+@pytest.mark.parametrize("nees", [[], [1.0, np.nan], [-1.0, 2.0]])
 def test_nothing_and_nan_are_no_evidence(nees):
-    with pytest.raises(AssertionError, match="expected finite NEES"):
+    with pytest.raises(AssertionError, match="expected finite NEES of at least 0"):
         check_consistent(nees, dof=1)
+
+
+@pytest.mark.parametrize(("nees", "dof"), [(np.ones((5, 3)), 3), (np.ones(5), 0)])
+def test_another_shape_is_refused(nees: np.ndarray, dof: int) -> None:
+    with pytest.raises(ValueError, match="expected NEES of shape"):
+        check_consistent(nees, dof)
+
+
+def test_a_row_is_judged_by_its_own_size() -> None:
+    """A wrong small row beside a large one does not pass."""
+
+    def error(factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[np.ndarray] | None) -> np.ndarray:
+        x = values.atVector(factor.keys()[0])
+        if jacobians is not None:
+            jacobians[0] = np.array([[1e6, 0.0], [0.0, 0.0]])
+        return np.array([1e6 * x[0], 5.0 * x[1]])
+
+    values = gtsam.Values()
+    values.insert(0, np.zeros(2))
+    with pytest.raises(AssertionError, match="error 1 by direction 1"):
+        check_jacobians(gtsam.CustomFactor(NOISE, [0], error), values)
+
+
+def test_a_constrained_noise_model_is_refused() -> None:
+    values = gtsam.Values()
+    values.insert(0, np.zeros(3))
+    constrained = gtsam.noiseModel.Constrained.All(3)
+    with pytest.raises(TypeError, match="not Constrained"):
+        check_jacobians(gtsam.PriorFactorPoint3(0, np.ones(3), constrained), values)

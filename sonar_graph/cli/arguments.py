@@ -211,6 +211,10 @@ def parse_settings(texts: list[str]) -> dict[str, Any]:
                 parsed = value
         if name in settings and settings[name] != parsed:
             raise EstimatorError(f"--set {text}: {name} is also set to {settings[name]}; give it once")
+        if within := [
+            other for other in settings if f"{other}.".startswith(f"{name}.") != f"{name}.".startswith(f"{other}.")
+        ]:
+            raise EstimatorError(f"--set {text}: {within[0]} is set too, and one is inside the other; give one of them")
         settings[name] = parsed
     return settings
 

@@ -63,14 +63,20 @@ app.command(epilog=examples("sonar-graph estimators"))(estimators)
 app.command(epilog=examples("sonar-graph demo -o demo"))(demo)
 
 
-@app.callback(invoke_without_command=True)
-def show_version(
-    version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
-) -> None:
-    """Landmark SLAM for underwater vehicles: estimators compared on the same log."""
-    if version:
+def show_version(wanted: bool) -> None:
+    """Print the version and end, before anything else is looked at."""
+    if wanted:
         typer.echo(f"sonar-graph {__version__}")
         raise typer.Exit
+
+
+@app.callback()
+def of_all_commands(
+    version: Annotated[
+        bool, typer.Option("--version", callback=show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Landmark SLAM for underwater vehicles: estimators compared on the same log."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

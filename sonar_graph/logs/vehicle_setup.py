@@ -170,7 +170,7 @@ def gathered(
 
 
 def mounted_by(values: Values) -> set[str]:
-    """Sensors of which the values state the mounting."""
+    """Sensors whose mounting is given."""
     return {
         sensor
         for sensor, field in MOUNTING_FIELDS.items()

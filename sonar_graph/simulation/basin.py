@@ -208,7 +208,7 @@ def objects_on_floor(world: World, image: ImageOptions, rng: np.random.Generator
 
 
 def provenance(options: BasinOptions) -> dict[str, str]:
-    """Notes on what is the paper's and what is ours; duration, laps and speed are the paper's only as published."""
+    """Notes on which values are the paper's; duration, laps and speed are only where they are as published."""
     speed_m_s = cruise_speed(options)
     chosen = {
         f"{options.duration_s:g} s in all": options.duration_s == PAPER_DURATION_S,

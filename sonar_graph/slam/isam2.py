@@ -73,7 +73,7 @@ class Isam2Params(Section):
     kernel: KernelParams = RobustKernel()
     """Shape of the noise of range and of azimuth, under every identity policy."""
     identity: IdentityParams = RobustIdentity()
-    """What is made of identities that may be wrong (docs/theory/doubtful_identities.md)."""
+    """Policy for identities that may be wrong (docs/theory/doubtful_identities.md)."""
 
     @model_validator(mode="before")
     @classmethod
@@ -191,7 +191,7 @@ class Isam2:
         return instant.carried_on(self._smoother.values, self._smoother.joint_covariance(instant.keys()))
 
     def _leave(self, keys: set[int]) -> None:
-        """Take leave of variables before they leave a bounded window; forget what is old, a good deal at a time."""
+        """Store estimates of variables that leave a bounded window; drop old ones in batches."""
         self._asked.leave(keys, self._smoother.values, self._smoother.marginals)
         self._sightings.leave(keys)
         history, now_s = self._params.history, self._keyframes.newest_s

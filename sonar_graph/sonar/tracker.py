@@ -56,7 +56,7 @@ class TrackingParams(Section):
     least_existence: float = Field(0.01, ge=0, lt=1)
     """A track ends below it."""
     leaving_sigmas: float = Field(3.0, gt=0)
-    """A track ends so many standard deviations outside the image."""
+    """Standard deviations outside the image at which a track ends."""
 
 
 class Tracker:

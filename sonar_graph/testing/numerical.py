@@ -23,16 +23,19 @@ def check_jacobians(
     factor
         Any factor with a Gaussian noise model, native or `gtsam.CustomFactor`; wrapped in no robust kernel.
     values
-        Point of linearisation; has all variables of the factor. Check random, near-identity and wrap-around states.
+        Point of linearisation; has all variables of the factor. Check random and near-identity states, and states
+        near a wrap-around of the error, farther from its jump than ``step``.
     step
         Length of the differences, in the tangent space (rad, m).
     tolerance
-        Largest difference allowed, relative to the largest entry of both Jacobians, and at least absolute.
+        Largest difference allowed in a row, relative to the largest entry of the row; absolute below 1.
 
     Raises
     ------
+    ValueError
+        When the factor names a variable twice.
     TypeError
-        When the noise model is robust: a kernel weights Jacobian and error.
+        When the noise model is missing, robust (a kernel weights Jacobian and error) or constrained.
     AssertionError
         Naming the variable, row and column of the largest difference, with both numbers.
 
@@ -48,10 +51,11 @@ def check_jacobians(
     >>> check_jacobians(factor, values)
     """
     noise = factor.noiseModel()
-    if not isinstance(noise, gtsam.noiseModel.Gaussian):
-        raise TypeError(
-            f"expected a factor with a Gaussian noise model, not {type(noise).__name__}; leave out its kernel"
-        )
+    if not isinstance(noise, gtsam.noiseModel.Gaussian) or isinstance(noise, gtsam.noiseModel.Constrained):
+        advice = "; leave out its kernel" if isinstance(noise, gtsam.noiseModel.Robust) else ""
+        raise TypeError(f"expected a factor with a Gaussian noise model, not {type(noise).__name__}{advice}")
+    if len(set(factor.keys())) < len(factor.keys()):
+        raise ValueError("expected a factor of different variables; one is named twice")
     whitened = np.asarray(factor.linearize(values).jacobian()[0])
     jacobians = np.linalg.solve(np.asarray(noise.R()), whitened)  # linearize gives R J, R^T R the information
     zero, column = values.zeroVectors(), 0
@@ -65,9 +69,9 @@ def check_jacobians(
             behind.insert(key, -step * direction)
             change = factor.unwhitenedError(values.retract(ahead)) - factor.unwhitenedError(values.retract(behind))
             numeric[:, k] = change / (2 * step)
-        scale = max(1.0, float(np.abs(analytic).max(initial=0.0)), float(np.abs(numeric).max(initial=0.0)))
-        off = np.abs(analytic - numeric)
-        if not off.max(initial=0.0) <= tolerance * scale:
+        largest = np.fmax(np.abs(analytic), np.abs(numeric)).max(axis=1, keepdims=True)
+        off = np.abs(analytic - numeric) / np.fmax(1.0, largest)
+        if not off.max() <= tolerance:
             row, k = divmod(int(np.argmax(np.where(np.isnan(off), np.inf, off))), size)
             raise AssertionError(
                 f"derivative of error {row} by direction {k} of {gtsam.DefaultKeyFormatter(key)}: the factor says"
@@ -95,7 +99,10 @@ def check_consistent(nees: ArrayLike, dof: int, *, confidence: float = 0.99) -> 
     Raises
     ------
     AssertionError
-        With the mean per degree of freedom and the interval; also where there is no finite NEES.
+        With the mean per degree of freedom and the interval; also where there is no NEES, or one is not finite or
+        negative, as of an indefinite covariance.
+    ValueError
+        When ``nees`` has another shape, or ``dof`` is below 1.
 
     Examples
     --------
@@ -108,15 +115,18 @@ def check_consistent(nees: ArrayLike, dof: int, *, confidence: float = 0.99) -> 
         ...
     AssertionError: NEES per degree of freedom is 0.451, below 0.858 to 1.155 (99%): covariances are too large
     """
-    squares: Floats = np.asarray(nees, np.float64).ravel()
-    if not len(squares) or not np.isfinite(squares).all():
-        raise AssertionError(f"expected finite NEES, not {squares[~np.isfinite(squares)].tolist() or 'none'}")
+    squares: Floats = np.asarray(nees, np.float64)
+    if squares.ndim != 1 or dof < 1:
+        raise ValueError(f"expected NEES of shape (n,) and dof >= 1, not {squares.shape} and {dof}")
+    impossible = squares[~(np.isfinite(squares) & (squares >= 0))]
+    if not len(squares) or len(impossible):
+        raise AssertionError(f"expected finite NEES of at least 0, not {impossible.tolist() or 'none'}")
     total_dof = len(squares) * dof
     lowest, highest = (float(bound) / total_dof for bound in chi2.interval(confidence, total_dof))
     mean = float(squares.mean() / dof)
     if not lowest <= mean <= highest:
         side, sizes = ("below", "large") if mean < lowest else ("above", "small")
         raise AssertionError(
-            f"NEES per degree of freedom is {mean:.3f}, {side} {lowest:.3f} to {highest:.3f} ({confidence:.0%}):"
+            f"NEES per degree of freedom is {mean:.3f}, {side} {lowest:.3f} to {highest:.3f} ({100 * confidence:g}%):"
             f" covariances are too {sizes}"
         )

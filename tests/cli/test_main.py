@@ -48,6 +48,7 @@ def test_help_does_not_wait_for_heavy_imports(run):
 def test_version_is_that_of_the_package(run, capsys):
     assert run("--version") == 0
     assert capsys.readouterr().out == f"sonar-graph {sonar_graph.__version__}\n"
+    assert run("--version", "nonsense") == 0
 
 
 @pytest.mark.parametrize("path", commands(), ids=" ".join)

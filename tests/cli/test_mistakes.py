@@ -70,6 +70,8 @@ MISTAKES = {
     "run basin.mcap -o out --set isam2.=1": r"expected ESTIMATOR\.setting=value",
     "run basin.mcap -o out --set isam2.nonsense=1": "nonsense",
     "run basin.mcap -o out --set isam2.smoother.lag_s=5 --set isam2.smoother.lag_s=6": "also set to 5; give it once",
+    "run basin.mcap -o out --set isam2.smoother.lag_s=5 --set isam2.smoother={}": "and one is inside the other",
+    "--": "sonar-graph --help",
     "simulate basin -o new.mcap --set tracks=true --set tracks=false": "tracks is also set to True; give it once",
     "simulate basin -o new.mcap --set wrong_id_share=0.3": "wrong_id_share = 0.3 is a share of a track; set tracks",
     "run notes.txt -o out --set isam2.identity.policy=gnc --set isam2.history.policy=bounded": (

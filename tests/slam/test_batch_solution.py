@@ -142,6 +142,29 @@ def test_the_camera_of_the_azimuth_factor_goes_blind_exactly_there():
         assert bool(seen(Z).turned_away(values)) == is_blind
 
 
+def test_a_sighting_that_is_taken_away_no_longer_counts():
+    values = one_pose(world_point(5.0, Z[1]))
+    opposite = np.array([2.0, Z[1] + np.pi])
+    lines = seen(Z, opposite)
+    extra = Sightline(X(0), BODY_T_SONAR, opposite)
+    lines.add(L(1), extra)
+    assert lines.turned_away(values) == [L(1)]
+    lines.remove(L(1), extra)
+    lines.add(L(1), Sightline(X(0), BODY_T_SONAR, Z))
+    assert lines.turned_away(values) == []
+    alone = Sightline(X(0), BODY_T_SONAR, opposite)
+    lines.add(L(2), alone)
+    lines.remove(L(2), alone)
+    assert lines.turned_away(values) == []
+
+
+def test_a_landmark_is_placed_where_most_of_its_sightings_say():
+    lines = seen(Z, Z, np.array([9.0, -1.0]))
+    placed = lines.placed_anew(one_pose(np.zeros(3)), [L(1)])
+    assert placed.atPoint3(L(1)) == pytest.approx(world_point(*Z))
+    assert placed.atPose3(X(0)).equals(POSE, 1e-12)
+
+
 def test_a_landmark_stuck_behind_comes_round_in_the_solution_of_the_history():
     smoother = smoother_with(lag_s=10.0, relinearize_threshold=1e-3, stale_shift_m=0.1)
     smoother.add_pose(X(0), POSE, 0.0)

@@ -27,7 +27,7 @@ MAGIC = b"\x89MCAP0\r\n"
 BAG_MAGIC = (b"#ROSBAG", b"SQLite format 3")
 """First bytes of ROS 1 bags and of the files of ROS 2 bags."""
 START_BYTES = 64
-"""Bytes from which the kind of a file is told."""
+"""Leading bytes that identify the type of a file."""
 
 
 def kind_and_advice(path: Path, start: bytes) -> str:

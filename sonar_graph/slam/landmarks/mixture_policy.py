@@ -154,7 +154,7 @@ class DoubtfulIdentities:
         )
 
     def reconsider(self, time_s: float) -> None:
-        """Choose anew in the window until nothing changes; move landmarks to where those that name them agree."""
+        """Choose anew in the window until nothing changes; move landmarks to where their sightings agree."""
         watches = self._open()
         if self._changes(watches, self._smoother.values):
             self._smoother.flush(time_s)
