@@ -9,6 +9,7 @@ import os
 import sys
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
+from pathlib import Path
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ[variable] = "1"
@@ -39,7 +40,8 @@ def smoother() -> str:
 
 def images() -> str:
     """Simulated sonar images and the recogniser."""
-    from imaged_lane import lane_run
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from tests.recognition.imaged_lane import lane_run
 
     from sonar_graph import recognise
 
