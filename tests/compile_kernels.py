@@ -41,12 +41,11 @@ def smoother() -> str:
 def images() -> str:
     """Simulated sonar images and the recogniser."""
     sys.path.insert(0, str(Path(__file__).parents[1]))
+    from sonar_graph import recognise
     from tests.recognition.imaged_lane import lane_run
 
-    from sonar_graph import recognise
-
     lane = lane_run(1)
-    recognise(lane.frames, lane.sequence)
+    recognise([lane.frames], lane.sequence)
     return "images and recognition"
 
 
