@@ -72,7 +72,10 @@ window          part of the graph that is still optimised
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -117,33 +120,30 @@ __all__ = [
     "write_report",
 ]
 
-_PLACES = {
-    "batch": ("run_suite",),
-    "calibration": ("Calibration",),
-    "estimator": ("Estimator", "load_estimator"),
-    "evaluation": ("Comparison", "RunResult", "compare", "run_estimator"),
-    "logs": ("inspect_log", "read_log", "write_log"),
-    "measurements": ("Depth", "Dvl", "Imu", "LandmarkDetections", "Measurements", "SonarFrames"),
-    "recognition": ("recognise",),
-    "report": ("write_report",),
-    "sequence": ("Sequence",),
-    "simulation": ("simulate_basin",),
-    "states": ("DetectionLog", "Estimate", "LandmarkMap", "Trajectory"),
-}
-_ROOMS = {"navigation", "numerics", "slam", "sonar", "devices", "diagnosis", "testing", "errors"} | set(_PLACES)
+
+def at_first_use(package: str) -> Callable[[str], Any]:
+    """``__getattr__`` of a package whose names are imported when they are first used, not with the package.
+
+    Its ``__init__`` lists them once, as imports under ``if TYPE_CHECKING``.
+    """
+
+    def find(name: str) -> Any:
+        import ast
+        from pathlib import Path
+
+        module = sys.modules[package]
+        tree = ast.parse(Path(str(module.__file__)).read_text("utf-8"))
+        listed = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+        places = {alias.name: str(node.module) for node in listed for alias in node.names}
+        if places.get(name, "").startswith(f"{package}."):
+            setattr(module, name, getattr(import_module(places[name]), name))
+            return getattr(module, name)
+        if find_spec(f"{package}.{name}"):
+            return import_module(f"{package}.{name}")
+        raise AttributeError(f"{package} has no {name!r}; it has: {', '.join(module.__all__)}")
+
+    return find
 
 
-def __getattr__(name: str) -> Any:
-    """Import a public name, or a room, at its first use: ``import sonar_graph`` alone loads nothing."""
-    for module, names in _PLACES.items():
-        if name in names:
-            found = getattr(import_module(f"sonar_graph.{module}"), name)
-            globals()[name] = found
-            return found
-    if name in _ROOMS:
-        return import_module(f"sonar_graph.{name}")
-    raise AttributeError(f"sonar_graph has no {name!r}; it has: {', '.join(__all__)}")
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__, *_ROOMS])
+if not TYPE_CHECKING:
+    __getattr__ = at_first_use(__name__)

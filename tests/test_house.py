@@ -96,14 +96,20 @@ def test_the_front_door_loads_nothing_heavy() -> None:
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
-def test_names_for_type_checkers_are_those_of_the_front_door() -> None:
-    assert sonar_graph.__file__
-    tree = ast.parse(Path(sonar_graph.__file__).read_text("utf-8"))
+@pytest.mark.parametrize("package", ["sonar_graph", "sonar_graph.devices", "sonar_graph.logs"])
+def test_names_that_are_imported_at_first_use_are_those_that_are_listed(package: str) -> None:
+    module = import_module(package)
+    tree = ast.parse(Path(str(module.__file__)).read_text("utf-8"))
     block = next(node for node in tree.body if isinstance(node, ast.If))
-    typed = {a.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for a in node.names}
-    lazy = {name: f"sonar_graph.{place}" for place, names in sonar_graph._PLACES.items() for name in names}
-    assert typed == lazy
-    assert set(sonar_graph.__all__) == set(lazy)
+    listed = {a.name for node in block.body if isinstance(node, ast.ImportFrom) for a in node.names}
+    assert listed == set(module.__all__)
+    assert [name for name in module.__all__ if not hasattr(module, name)] == []
+
+
+def test_reading_a_log_loads_no_compiler_and_no_plots() -> None:
+    heavy = ("numba", "matplotlib", "cv2", "jinja2")
+    code = f"import sys; from sonar_graph import read_log, inspect_log; print([m for m in {heavy} if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
 def test_an_unknown_name_is_answered_with_those_that_exist() -> None:

@@ -1,14 +1,21 @@
 """Device data: beams of Doppler logs, lenses of sonars, designs of artificial landmarks."""
 
 # fmt: off
-from sonar_graph.devices.dvl_beams import UNMEASURED_M_S, in_numbers, is_partial, velocity_of_beams
-from sonar_graph.devices.landmark_designs import (
-    DEFAULT_DESIGNS, LEAST_BRIGHT_DB, OWN_DESIGNS, LandmarkDesign, load_designs,
-)
-from sonar_graph.devices.sonar_lenses import DIDSON_BEAMS, aris_azimuths, didson_azimuths, even_azimuths
+from typing import TYPE_CHECKING
+
+from sonar_graph import at_first_use
+
+if TYPE_CHECKING:
+    from sonar_graph.devices.dvl_beams import UNMEASURED_M_S, velocity_of_beams
+    from sonar_graph.devices.landmark_designs import (
+        DEFAULT_DESIGNS, LEAST_BRIGHT_DB, OWN_DESIGNS, LandmarkDesign, load_designs,
+    )
+    from sonar_graph.devices.sonar_lenses import DIDSON_BEAMS, aris_azimuths, didson_azimuths, even_azimuths
+else:
+    __getattr__ = at_first_use(__name__)
 
 __all__ = [
     "DEFAULT_DESIGNS", "DIDSON_BEAMS", "LEAST_BRIGHT_DB", "LandmarkDesign", "OWN_DESIGNS", "UNMEASURED_M_S",
-    "aris_azimuths", "didson_azimuths", "even_azimuths", "in_numbers", "is_partial", "load_designs",
+    "aris_azimuths", "didson_azimuths", "even_azimuths", "load_designs",
     "velocity_of_beams",
 ]

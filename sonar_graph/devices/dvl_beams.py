@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sonar_graph.measurements import Floats
-from sonar_graph.numerics import compiled
 
 UNMEASURED_M_S = 100.0
 """Standard deviation along a direction that no beam measured."""
@@ -55,38 +54,3 @@ def velocity_of_beams(
         variances = np.where(is_measured, sigma_m_s**2 * per_geometry, UNMEASURED_M_S**2)
         velocity[rows], covariance[rows] = along_m_s[rows][:, pattern] @ inverse.T, (axes * variances) @ axes.T
     return velocity, covariance
-
-
-@compiled
-def in_numbers(velocity_cov: Floats, unsaid: Floats) -> Floats:
-    """Covariances of shape (n, 3, 3) without NaN and infinity.
-
-    Parameters
-    ----------
-    unsaid
-        Value in place of NaN, shape (3, 3).
-
-    Returns
-    -------
-    The same, with `UNMEASURED_M_S` and no correlation along axes whose variance is infinite.
-    """
-    numbers = np.empty(velocity_cov.shape)
-    for k in range(len(numbers)):
-        said = velocity_cov[k]
-        for i in range(3):
-            for j in range(3):
-                if np.isinf(said[i, i]) or np.isinf(said[j, j]):
-                    numbers[k, i, j] = UNMEASURED_M_S**2 if i == j else 0.0
-                else:
-                    numbers[k, i, j] = unsaid[i, j] if np.isnan(said[i, j]) else said[i, j]
-    return numbers
-
-
-@compiled
-def is_partial(velocity_cov: Floats) -> NDArray[np.bool_]:
-    """True for covariances of shape (n, 3, 3) with an unmeasured direction, shape (n,)."""
-    partial = np.empty(len(velocity_cov), np.bool_)
-    for k in range(len(partial)):
-        cov = velocity_cov[k]
-        partial[k] = cov[0, 0] + cov[1, 1] + cov[2, 2] > 0.5 * UNMEASURED_M_S**2
-    return partial

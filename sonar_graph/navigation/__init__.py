@@ -9,10 +9,10 @@ from sonar_graph.navigation.odometry import (
     Odometry, RunningMotion, motion_between, motion_between_nodes, motion_since_node,
 )
 from sonar_graph.navigation.preintegration import JointMotion, JointPreintegrator, PreintegratedMotion, Preintegrator
-from sonar_graph.navigation.samples import finite_vector, rows_until, value_at, weights_at_end
+from sonar_graph.navigation.samples import finite_vector, in_numbers, rows_until, value_at, weights_at_end
 
 __all__ = [
     "InitialTilt", "JointMotion", "JointPreintegrator", "Odometry", "PreintegratedMotion", "Preintegrator",
-    "RunningMotion", "align_at_rest", "align_in_motion", "finite_vector", "motion_between", "motion_between_nodes",
-    "motion_since_node", "rows_until", "value_at", "weights_at_end",
+    "RunningMotion", "align_at_rest", "align_in_motion", "finite_vector", "in_numbers", "motion_between",
+    "motion_between_nodes", "motion_since_node", "rows_until", "value_at", "weights_at_end",
 ]

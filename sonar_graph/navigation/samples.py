@@ -15,9 +15,10 @@ from __future__ import annotations
 from math import isfinite
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sonar_graph.calibration import Calibration
+from sonar_graph.devices import UNMEASURED_M_S
 from sonar_graph.errors import CalibrationError, MeasurementError, SonarGraphError
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.numerics import Vector, compiled, inlined, minus, plus, scaled, vector
@@ -258,3 +259,38 @@ def weights_at_end(variance_m2: Floats, before_end_s: Floats, wander_m2_s: float
 def longest_interval_ns(calibration: Calibration) -> int:
     """Longest interval between velocity samples that is no gap; held samples leave no gap."""
     return LATEST_NS if calibration.odometry_interpolation == "hold-past" else round(calibration.dvl.gap_s * 1e9)
+
+
+@compiled
+def in_numbers(velocity_cov: Floats, unsaid: Floats) -> Floats:
+    """Covariances of shape (n, 3, 3) without NaN and infinity.
+
+    Parameters
+    ----------
+    unsaid
+        Value in place of NaN, shape (3, 3).
+
+    Returns
+    -------
+    The same, with `UNMEASURED_M_S` and no correlation along axes whose variance is infinite.
+    """
+    numbers = np.empty(velocity_cov.shape)
+    for k in range(len(numbers)):
+        said = velocity_cov[k]
+        for i in range(3):
+            for j in range(3):
+                if np.isinf(said[i, i]) or np.isinf(said[j, j]):
+                    numbers[k, i, j] = UNMEASURED_M_S**2 if i == j else 0.0
+                else:
+                    numbers[k, i, j] = unsaid[i, j] if np.isnan(said[i, j]) else said[i, j]
+    return numbers
+
+
+@compiled
+def is_partial(velocity_cov: Floats) -> NDArray[np.bool_]:
+    """True for covariances of shape (n, 3, 3) with an unmeasured direction, shape (n,)."""
+    partial = np.empty(len(velocity_cov), np.bool_)
+    for k in range(len(partial)):
+        cov = velocity_cov[k]
+        partial[k] = cov[0, 0] + cov[1, 1] + cov[2, 2] > 0.5 * UNMEASURED_M_S**2
+    return partial

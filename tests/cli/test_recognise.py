@@ -15,7 +15,7 @@ import pytest
 from mcap.reader import make_reader
 
 from sonar_graph.logs.reading import read_log
-from sonar_graph.sonar import confusion
+from sonar_graph.recognition import confusion_fit
 from sonar_graph.sonar.confusion import read_confusion
 
 QUICK = ("--estimators", "dead-reckoning")
@@ -127,10 +127,10 @@ def test_compare_recognises_by_itself_and_gives_what_recognise_gives(lane_log, r
 
 
 def test_a_model_that_calibrate_wrote_is_used(lane_log, run, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(confusion, "LEAST_FRAMES", 10**6)
+    monkeypatch.setattr(confusion_fit, "LEAST_FRAMES", 10**6)
     assert run("calibrate", lane_log, "-o", tmp_path / "model.json") == 2
     assert re.fullmatch(r"sonar-graph: too few labelled frames .*give longer or more logs\n", capsys.readouterr().err)
-    monkeypatch.setattr(confusion, "LEAST_FRAMES", 8)
+    monkeypatch.setattr(confusion_fit, "LEAST_FRAMES", 8)
     assert run("calibrate", lane_log, "-o", tmp_path / "model.json") == 0
     said = capsys.readouterr().out
     assert re.search(r"^  landmark 1: \d+ frames, 1 tracks?$", said, re.MULTILINE)

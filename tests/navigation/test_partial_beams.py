@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
-from sonar_graph.devices.dvl_beams import is_partial, velocity_of_beams
+from sonar_graph.devices.dvl_beams import velocity_of_beams
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.dvl_screening.partial_beams import (
     EARTH_RATE_RAD_S,
@@ -20,6 +20,7 @@ from sonar_graph.navigation.dvl_screening.partial_beams import (
 )
 from sonar_graph.navigation.odometry import Odometry, motion_between_nodes
 from sonar_graph.navigation.preintegration.motion import Preintegrator
+from sonar_graph.navigation.samples import is_partial
 
 from .test_motion_laws import at
 

@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
-from sonar_graph.devices.dvl_beams import UNMEASURED_M_S, in_numbers, is_partial
+from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.measurements import Dvl
 from sonar_graph.navigation.dvl_screening.partial_beams import LONGEST_STRETCH_NS
 from sonar_graph.navigation.dvl_screening.row_intake import RowIntake
 from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.navigation.samples import in_numbers, is_partial
 from sonar_graph.states import Refusal
 
 from .rows import NS, T0_NS, dvl, imu, stamps

@@ -27,7 +27,6 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.stats import chi2
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.devices import in_numbers, is_partial
 from sonar_graph.errors import AlignmentError
 from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.navigation.alignment.dvl_imu import InertialPath, cross_matrices
@@ -39,6 +38,7 @@ from sonar_graph.navigation.alignment.gravity import (
     roll_and_pitch,
 )
 from sonar_graph.navigation.imu_gaps import UNFELT_NS, row_after_hole
+from sonar_graph.navigation.samples import in_numbers, is_partial
 
 FEWEST, SHORTEST_S, LONGEST_S = 10, 2.0, 60.0
 """Fewest samples of the Doppler log, the least time that they span, and the longest that is used."""

@@ -27,10 +27,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.devices import is_partial
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.navigation.dvl_screening.partial_beams import Rows
-from sonar_graph.navigation.samples import EARLIEST_NS, LATEST_NS, rows_until
+from sonar_graph.navigation.samples import EARLIEST_NS, LATEST_NS, is_partial, rows_until
 from sonar_graph.numerics import (
     IDENTITY,
     ZERO,

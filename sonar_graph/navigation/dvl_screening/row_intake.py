@@ -13,11 +13,10 @@ from typing import TypeVar
 import numpy as np
 
 from sonar_graph.calibration import Calibration, Mounting
-from sonar_graph.devices import in_numbers
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.dvl_screening.dvl_gate import GATE, GateResult, VelocityConfirmation, gate_velocities
 from sonar_graph.navigation.dvl_screening.partial_beams import InertialRows, PartialVelocities, Rows
-from sonar_graph.navigation.samples import EARLIEST_NS, LATEST_NS, StampedRows
+from sonar_graph.navigation.samples import EARLIEST_NS, LATEST_NS, StampedRows, in_numbers
 from sonar_graph.states import Refusal, RefusedRow
 
 _Rows = TypeVar("_Rows", Imu, Dvl)

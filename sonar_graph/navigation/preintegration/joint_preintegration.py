@@ -22,7 +22,6 @@ import gtsam
 import numpy as np
 
 from sonar_graph.calibration import SHORTEST_HOLE_S, Calibration
-from sonar_graph.devices import is_partial
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
 from sonar_graph.navigation.imu_gaps import row_after_hole
@@ -30,6 +29,7 @@ from sonar_graph.navigation.preintegration.joint_recursion import LONG_S, RULES,
 from sonar_graph.navigation.preintegration.motion import PreintegratedMotion, float_triple
 from sonar_graph.navigation.samples import (
     finite_vector,
+    is_partial,
     no_doppler_stamp,
     require_covariances,
     require_distinct_stamps,
