@@ -78,6 +78,8 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+from sonar_graph.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from sonar_graph.batch import run_suite
     from sonar_graph.calibration import Calibration
@@ -91,7 +93,6 @@ if TYPE_CHECKING:
     from sonar_graph.simulation import simulate_basin
     from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Trajectory
 
-__version__ = "0.1.0"
 __all__ = [
     "Calibration",
     "Comparison",

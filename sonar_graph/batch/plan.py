@@ -21,7 +21,6 @@ from typing import Any
 
 from pydantic import ValidationError
 
-import sonar_graph
 from sonar_graph.batch.recorded import ALL_LOGS
 from sonar_graph.batch.sources import FILE, FILES, GENERATORS, KINDS, LOG, Stamp, files_below, fingerprint, stamp_of
 from sonar_graph.batch.store import PlannedRun
@@ -31,6 +30,7 @@ from sonar_graph.errors import BatchError, EstimatorError, SonarGraphError, Unkn
 from sonar_graph.estimator import installed_estimators, load_estimator
 from sonar_graph.settings import faults_in, field_place, flattened, nested
 from sonar_graph.simulation import LandmarkOptions
+from sonar_graph.version import __version__
 
 DIGITS = 16
 KEY_DIGITS = 20
@@ -256,7 +256,7 @@ def versions_of(estimator: str) -> dict[str, str]:
         raise BatchError(f"{platform.node()}: no estimator is called {estimator!r}; install what brings it")
     brings = {} if point.dist is None else {point.dist.name: point.dist.version}
     return brings | {
-        "sonar_graph": sonar_graph.__version__,
+        "sonar_graph": __version__,
         "gtsam": version("gtsam"),
         "numpy": version("numpy"),
         "scipy": version("scipy"),

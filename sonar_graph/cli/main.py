@@ -13,7 +13,6 @@ from typing import Annotated
 
 import typer
 
-from sonar_graph import __version__
 from sonar_graph.cli.arguments import examples
 from sonar_graph.cli.bench import benches
 from sonar_graph.cli.compare import compare, demo, estimators, report, run
@@ -22,6 +21,7 @@ from sonar_graph.cli.inspect_log import inspect
 from sonar_graph.cli.recognise import calibrate, recognise
 from sonar_graph.cli.simulate import worlds
 from sonar_graph.errors import SonarGraphError
+from sonar_graph.version import __version__
 
 INTERRUPTED = 130
 MISTAKE = 2

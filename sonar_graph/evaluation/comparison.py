@@ -13,7 +13,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import sonar_graph
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.consistency import error_series
 from sonar_graph.evaluation.results import Comparison, ErrorSeries, Kind, RunResult, Score
@@ -23,6 +22,7 @@ from sonar_graph.evaluation.scores import detection_scores, landmark_scores, res
 from sonar_graph.measurements import Ints
 from sonar_graph.sequence import Sequence, require_sequence
 from sonar_graph.states import Trajectory
+from sonar_graph.version import __version__
 
 LIBRARIES = ("gtsam", "numpy", "scipy", "numba")
 LEAST_INSTANTS = 2
@@ -39,7 +39,7 @@ def describe_environment() -> dict[str, str]:
     """Versions, machine, date (UTC) and command, each as text."""
     command = [Path(sys.argv[0]).name, *sys.argv[1:]]
     return {
-        "sonar_graph": sonar_graph.__version__,
+        "sonar_graph": __version__,
         "python": platform.python_version(),
         **library_versions(),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} processors",

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sonar_graph import __version__
 from sonar_graph.calibration import (
     Calibration,
     DepthCalibration,
@@ -36,6 +35,7 @@ from sonar_graph.simulation.sensors import (
 )
 from sonar_graph.simulation.vehicle import VehiclePath, rpy_from_rotation
 from sonar_graph.states import Trajectory
+from sonar_graph.version import __version__
 
 TRUTH_RATE_HZ = 50.0
 SONAR_OFFSET_S = 0.0371
