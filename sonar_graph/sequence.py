@@ -15,7 +15,7 @@ from sonar_graph.states import LandmarkMap, Trajectory
 NS_PER_S = 1_000_000_000
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Sequence:
     """Calibration, measurements in order of time, and truth where it is known.
 
@@ -28,8 +28,8 @@ class Sequence:
     >>> imu = Imu(stamps_ns, np.zeros((n, 3)), np.tile([0.0, 0.0, 9.81], (n, 1)))
     >>> dvl = Dvl(stamps_ns, np.tile([0.15, 0.0, 0.0], (n, 1)), np.full((n, 3, 3), np.nan))
     >>> straight = Sequence("straight", Calibration(), imu, dvl)
-    >>> straight.duration_s
-    2.0
+    >>> straight
+    Sequence('straight': 2.0 s, 21 imu, 21 dvl)
     >>> [step.end_ns for step in straight.replay(straight.instants(rate_hz=1.0))]
     [1000000000, 2000000000]
     """
@@ -46,6 +46,13 @@ class Sequence:
     true_landmarks: LandmarkMap | None = None
     notes: dict[str, str] = field(default_factory=dict)
     """Provenance by subject: data set, licence, options of a simulation, seed."""
+
+    def __repr__(self) -> str:
+        blocks = {
+            name: getattr(self, name) for name in ("imu", "dvl", "depth", "detections", "truth", "true_landmarks")
+        }
+        rows = (f"{len(block)} {name}" for name, block in blocks.items() if block is not None)
+        return f"Sequence({self.name!r}: {self.duration_s:.1f} s, {', '.join(rows)})"
 
     @property
     def start_ns(self) -> int:

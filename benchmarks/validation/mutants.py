@@ -4,7 +4,7 @@ Lines are chosen at random by a seed, each is broken alone in a copy of the chec
 the broken module or its package are run until the first failure. A fault is one of: a comparison turned or shifted, a
 sign or an operator exchanged, a number changed, ``and`` and ``or`` exchanged, a condition negated, a returned value
 dropped, a call left out. Only the bodies of functions are touched, without messages and annotations; constants and
-defaults of settings are not. The tests of a fault that was found are also run without it, and must pass.
+defaults of settings are not. A test that finds a fault is also run without it, and must pass.
 
 ``--root`` judges another checkout in the same way. ``--against`` names an older checkout: each fault that survives is
 made there too, in the same statement wherever it stands, and judged by the older tests; one that they find is a guard
@@ -18,6 +18,7 @@ import ast
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -25,8 +26,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import NamedTuple
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -226,37 +229,40 @@ def tests_of(root: Path, path: str) -> list[str]:
 
 
 def judge(root: Path, mutant: Mutant, tests: list[str]) -> str:
-    """``killed``, ``survived`` or ``timeout``, which counts as killed; in a copy of the checkout, compiled code too."""
+    """``killed``, ``survived`` or ``timeout``, which counts as killed; in a copy of the checkout, compiled code too.
+
+    What fails must pass on sound code, or it would kill every mutant.
+    """
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder, "checkout")
         shutil.copytree(root, copy, ignore=shutil.ignore_patterns(".git", ".venv", "build", "demo", "node_modules"))
         (copy / mutant.path).write_text(mutant.source, "utf-8")
-        return run_tests(copy, tests)
+        outcome, failed = run_tests(copy, tests)
+    if outcome == "killed" and run_tests(root, failed)[0] != "survived":
+        raise RuntimeError(f"{root}: fails without a fault: {' '.join(failed)}")
+    return outcome
 
 
-@cache
-def require_sound(root: Path, tests: tuple[str, ...]) -> None:
-    """Refuse tests that fail on sound code: they would kill every mutant."""
-    if run_tests(root, list(tests)) != "survived":
-        raise RuntimeError(f"{root}: tests fail without a fault: {' '.join(tests[:3])} ...")
-
-
-def run_tests(copy: Path, tests: list[str]) -> str:
-    """Outcome of the tests, until the first that fails."""
+def run_tests(copy: Path, tests: list[str]) -> tuple[str, list[str]]:
+    """Outcome of the tests, and the first that fails; a module that cannot be imported fails with its test file."""
     environment = os.environ | {"PYTHONPATH": str(copy)}
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-rfE", "--tb=no", "-p", "no:cacheprovider", *tests]
     process = subprocess.Popen(
-        command, cwd=copy, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    )
+        command, cwd=copy, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True,
+        text=True, encoding="utf-8", errors="replace",
+    )  # fmt: skip
     try:
-        code = process.wait(TIMEOUT_S)
-        if code not in (0, 1):
-            raise RuntimeError(f"pytest ended with {code} and has judged nothing: {' '.join(tests[:3])} ...")
-        return "survived" if code == 0 else "killed"
+        said, _ = process.communicate(timeout=TIMEOUT_S)
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        return "timeout"
+        process.communicate()
+        return "timeout", []
+    if process.returncode == 0:
+        return "survived", []
+    failed = re.findall(r"^(?:FAILED|ERROR) (tests/\S+\.py(?:::.*?)?)(?: - |$)", said, re.MULTILINE)
+    if not failed:
+        raise RuntimeError(f"pytest ended with {process.returncode} and has judged nothing: {' '.join(tests[:3])} ...")
+    return "killed", failed[:1]
 
 
 def main() -> None:
@@ -267,32 +273,40 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=16)
     parser.add_argument("--keep", type=Path, help="JSON file with the results so far")
     parser.add_argument("--against", type=Path, help="an older checkout that judges the survivors")
+    parser.add_argument("--workers", type=int, default=1, help="faults judged side by side; one a core")
     parser.add_argument("--quick", action="store_true", help="three mutants, to see that it runs")
     arguments = parser.parse_args()
     root = arguments.root.resolve()
     mutants = choose(root, 3 if arguments.quick else arguments.mutants, arguments.seed)
-    kept = json.loads(arguments.keep.read_text()) if arguments.keep and arguments.keep.exists() else {}
+    kept: dict[str, str] = json.loads(arguments.keep.read_text()) if arguments.keep and arguments.keep.exists() else {}
+    writing = Lock()
 
     def remember(key: str, root: Path, mutant: Mutant) -> str:
         if key not in kept:
             began = time.perf_counter()
             tests = tests_of(root, mutant.path)
-            kept[key] = judge(root, mutant, tests)
-            if kept[key] == "killed":
-                require_sound(root, tuple(tests))
-            note(f"{kept[key]:8s} {time.perf_counter() - began:4.0f} s  {key}")
-            if arguments.keep:
-                arguments.keep.write_text(json.dumps(kept, indent=1))
-        return str(kept[key])
+            outcome = judge(root, mutant, tests)
+            note(f"{outcome:8s} {time.perf_counter() - began:4.0f} s  {key}")
+            with writing:
+                kept[key] = outcome
+                if arguments.keep:
+                    arguments.keep.write_text(json.dumps(kept, indent=1))
+        return kept[key]
 
-    outcomes = [remember(f"{m.name} {m.after}", root, m) for m in mutants]
+    def judged(keys: list[str], root: Path, mutants: list[Mutant]) -> list[str]:
+        with ThreadPoolExecutor(arguments.workers) as pool:
+            return list(pool.map(remember, keys, [root] * len(keys), mutants))
+
+    outcomes = judged([f"{m.name} {m.after}" for m in mutants], root, mutants)
     survivors = [m for m, outcome in zip(mutants, outcomes, strict=True) if outcome == "survived"]
     figures = {"mutants": len(mutants), "survived": len(survivors), "survival": round(len(survivors) / len(mutants), 3)}
     said = ["not judged"] * len(survivors)
     if arguments.against:
         old_root = arguments.against.resolve()
         older = [same_fault(m, old_root) for m in survivors]
-        said = [remember(f"older {o.name} {o.after}", old_root, o) if o else "not there" for o in older]
+        there = [o for o in older if o]
+        answers = iter(judged([f"older {o.name} {o.after}" for o in there], old_root, there))
+        said = [next(answers) if o else "not there" for o in older]
         figures |= {"found_by_older_tests": sum(s not in ("survived", "not there") for s in said)}
     rows = [[m.name, m.before[:60], m.after[:70], s] for m, s in zip(survivors, said, strict=True)]
     print_table(["survivor", "before", "fault", "older tests"], rows)
