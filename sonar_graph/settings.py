@@ -210,11 +210,6 @@ def _path(place: Place) -> str:
     return ".".join(str(part) for part in place if isinstance(part, int) or part.isidentifier())
 
 
-def section_at(model: type[BaseModel], place: Place) -> type[BaseModel] | None:
-    """Section at a place within a model, or None."""
-    return _walk(model, place).section
-
-
 def field_place(model: type[BaseModel], place: Place) -> Place:
     """Place of an error as the user wrote it, without the tags that pydantic adds for tagged unions."""
     return _walk(model, place).names

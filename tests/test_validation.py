@@ -3,10 +3,10 @@ from __future__ import annotations
 import tomllib
 
 import pytest
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import ValidationError
 
 from sonar_graph.calibration import Calibration
-from sonar_graph.settings import faults_in, section_at
+from sonar_graph.settings import faults_in
 
 
 def told(text: str) -> str:
@@ -47,16 +47,3 @@ def test_other_faults_name_field_expectation_and_value():
     assert told("floor.z_m = 1") == "floor.sigma_m: is missing"
     assert "not 'aaaa" in told(f"gravity_m_s2 = '{'a' * 500}'")
     assert len(told(f"gravity_m_s2 = '{'a' * 500}'")) < 200
-
-
-def test_sections_are_found_through_optional_fields():
-    class Inner(BaseModel):
-        model_config = ConfigDict(extra="forbid")
-        gain: float = 1
-
-    class Outer(BaseModel):
-        inner: list[float] | Inner | None = None
-
-    assert section_at(Outer, ("inner",)) is Inner
-    assert section_at(Outer, ()) is Outer
-    assert section_at(Outer, ("inner", "gain")) is None

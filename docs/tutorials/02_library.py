@@ -75,8 +75,8 @@ marginals = gtsam.Marginals(graph, solution)
 print(f"\nby hand: {graph.size()} factors, landmark at {solution.atPoint3(L(1)).round(3)}")
 print(f"its 1 sigma: {np.sqrt(np.diag(marginals.marginalCovariance(L(1)))).round(4)} m")
 
-# 4. The smoother, fed as a vehicle would feed it: whatever came since the last call, and the instant for which an
-# estimate is wanted. `replay` cuts a log that way; a live program passes blocks of one row.
+# 4. The smoother, as on a vehicle: each call passes the measurements since the last one, and the instant of the
+# estimate. `replay` cuts a log that way; a live program passes blocks of one row.
 smoother = Isam2(calibration, Isam2Params(keyframes=KeyframeParams(max_interval_s=3.0)))
 for measurements in sequence.replay(sequence.instants(rate_hz=1.0)):
     estimate = smoother.process(measurements)
@@ -94,6 +94,6 @@ first, second = (L(i) for i in landmarks.ids[:2])
 scale = np.sqrt(joint.at(first, first)[0, 0] * joint.at(second, second)[0, 0])
 print(f"correlation of x of landmarks {landmarks.ids[:2].tolist()}: {joint.at(first, second)[0, 0] / scale:.3f}")
 
-# What became of each detection is on record:
+# The outcome of each detection:
 journal = smoother.detections()
 print(f"detections: {len(journal)}, of which used {sum(outcome.value == 'used' for outcome in journal.outcomes)}")
