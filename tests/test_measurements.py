@@ -3,6 +3,7 @@ from __future__ import annotations
 import itertools
 import re
 
+import gtsam
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,7 +11,17 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from sonar_graph.errors import MeasurementError
-from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections, Measurements
+from sonar_graph.measurements import (
+    FIRST_TOO_LARGE_ID,
+    Depth,
+    Dvl,
+    Imu,
+    LandmarkDetections,
+    Measurements,
+    no_posterior,
+    possible_ranges,
+    too_large,
+)
 
 
 def depth(stamps_ns: list[int]) -> Depth:
@@ -44,18 +55,15 @@ def test_concatenation_undoes_a_split(stamps_ns, at):
     np.testing.assert_array_equal(joined.z_m, block.z_m)
 
 
-@pytest.mark.parametrize(("stamps_ns", "said"), [([], "at least one row"), ([1, 5, 5, 4], "backwards after row 2")])
+@pytest.mark.parametrize(
+    ("stamps_ns", "said"),
+    [([], "at least one row"), ([1, 5, 5, 4], "backwards after row 2"), ([2**62, -(2**62)], "backwards after row 0")],
+)
 def test_no_rows_and_stamps_that_run_backwards_are_refused(stamps_ns, said):
+    """Also where they lie farther apart than an integer holds."""
     with pytest.raises(MeasurementError, match=said):
         depth(stamps_ns)
-
-
-@pytest.mark.parametrize("column", ["angular_velocity", "specific_force"])
-def test_column_of_another_length_is_refused_by_name(column):
-    columns = {"angular_velocity": np.zeros((3, 3)), "specific_force": np.zeros((3, 3))}
-    columns[column] = np.zeros((2, 3))
-    with pytest.raises(MeasurementError, match=rf"Imu\.{column}"):
-        Imu(np.arange(3), **columns)
+    assert depth([-(2**62), 2**62]).stamps_ns.tolist() == [-(2**62), 2**62]
 
 
 def test_whole_number_columns_become_floats_and_identities_stay_whole():
@@ -93,14 +101,11 @@ def test_numbers_without_a_meaning_for_not_measured_must_be_finite(bad):
     ],
 )
 def test_stamps_that_are_no_row_of_integers_are_refused(stamps, expected):
-    """Also whole numbers in floating point: near an epoch they are off by up to 128 ns."""
+    """Also whole numbers in floating point: near an epoch they are off by up to 128 ns. Any integers are stamps."""
+    for kind in (np.int32, np.uint64):
+        assert depth(np.array([1, 2], kind)).stamps_ns.dtype == np.int64
     with pytest.raises(MeasurementError, match=rf"Imu\.stamps_ns: {expected}"):
         Imu(stamps, np.zeros((3, 3)), np.zeros((3, 3)))
-
-
-@pytest.mark.parametrize("kind", [np.int32, np.uint64])
-def test_any_integers_are_stamps(kind):
-    assert depth(np.array([1, 2], kind)).stamps_ns.dtype == np.int64
 
 
 @pytest.mark.parametrize(
@@ -108,6 +113,8 @@ def test_any_integers_are_stamps(kind):
     [
         (lambda n: Imu(n, np.zeros((5, 2)), np.zeros((5, 3))), r"Imu.angular_velocity: expected shape (5, 3)"),
         (lambda n: Imu(n, np.zeros((5, 3)), np.zeros(5)), r"Imu.specific_force: expected shape (5, 3), not (5,)"),
+        (lambda n: Imu(n, np.zeros((4, 3)), np.zeros((5, 3))), r"Imu.angular_velocity: "),
+        (lambda n: Imu(n, np.zeros((5, 3)), np.zeros((4, 3))), r"Imu.specific_force: "),
         (lambda n: Imu(n, np.zeros((3, 5)), np.zeros((3, 5))), r"one row for each of 5 stamps; transpose it"),
         (lambda n: Dvl(n, np.zeros(5), np.zeros((5, 3, 3))), r"Dvl.velocity: expected shape (5, 3), not (5,)"),
         (lambda n: Dvl(n, np.zeros((5, 3)), np.zeros((5, 3))), r"Dvl.velocity_cov: expected shape (5, 3, 3)"),
@@ -131,13 +138,6 @@ def test_detections_belong_to_no_track_unless_said():
     assert LandmarkDetections.concatenate([alone, tracked]).rows(slice(2, 5)).track.tolist() == [-1, 5, 6]
     with pytest.raises(MeasurementError, match=r"LandmarkDetections\.track"):
         LandmarkDetections(*columns, np.array([5, 6]))
-
-
-def test_stamps_that_lie_farther_apart_than_an_integer_holds_are_in_order():
-    far = 2**62
-    assert depth(np.array([-far, far])).stamps_ns.tolist() == [-far, far]
-    with pytest.raises(MeasurementError, match="run backwards after row 0"):
-        depth(np.array([far, -far]))
 
 
 def seen(**columns) -> LandmarkDetections:
@@ -188,3 +188,27 @@ def test_an_end_is_an_integer(end):
     with pytest.raises(MeasurementError, match=r"^Measurements\.end_ns: expected an integer, nanoseconds"):
         Measurements(end)  # type: ignore[arg-type]
     assert Measurements(np.int64(3)).end_ns == 3  # type: ignore[arg-type]
+
+
+def test_a_range_is_above_zero_and_at_most_100_km():
+    assert possible_ranges(np.array([1e-9, 1.0, 100_000.0])).all()
+    assert not possible_ranges(np.array([0.0, -1.0, np.nextafter(100_000.0, np.inf), np.inf, np.nan])).any()
+
+
+def test_posteriors_that_were_rounded_to_single_precision_still_are():
+    exact = np.random.default_rng(1).dirichlet(np.ones(20), 1000)
+    assert not no_posterior(exact.astype(np.float32).astype(np.float64)).any()
+
+
+@pytest.mark.parametrize("row", [[0.5, 0.500002], [-1e-9, 0.5], [0.5, np.nan], [np.inf, 0.0], [2.0, -1.5]])
+def test_what_is_no_posterior_is_told_from_one_beside_it(row):
+    assert no_posterior(np.array([row, [0.0, 0.0], [1.0, 0.0], [0.5, 0.5]])).tolist() == [True, False, False, False]
+
+
+def test_the_largest_identity_is_the_last_that_a_key_gives_back():
+    largest = FIRST_TOO_LARGE_ID - 1
+    assert gtsam.Symbol(gtsam.symbol("l", largest)).index() == largest
+    with pytest.raises((ValueError, RuntimeError)):
+        gtsam.symbol("l", FIRST_TOO_LARGE_ID)
+    ids = np.array([[-1, largest], [FIRST_TOO_LARGE_ID, -1], [3, 2**63 - 1]])
+    assert too_large(ids).tolist() == [False, True, True]
