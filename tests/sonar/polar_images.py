@@ -1,4 +1,4 @@
-"""Small polar images of designs on a flat floor: a stand-in for a sonar, of exponential speckle without memory."""
+"""Small polar images of designs on a flat floor, of exponential speckle without memory, and candidates made by hand."""
 
 from __future__ import annotations
 
@@ -7,26 +7,38 @@ from functools import cache
 import numpy as np
 
 from sonar_graph.devices.landmark_designs import LandmarkDesign
+from sonar_graph.measurements import Floats
+from sonar_graph.sonar.geometry import FloorView
+from sonar_graph.sonar.regions import Candidates, CandidateVerdict
 
 RANGES_M = 1.26 + 1.25 / 512 * (np.arange(512) + 0.5)
 AZIMUTHS_RAD = np.radians(np.linspace(-14.25, 14.25, 96))
+WINDOW = np.array([[1.26, 2.51], [-0.25, 0.25]])
 HEIGHT_M = 0.95
 FLOOR_DB = 35.0
 
 
-def level_R_sonar(pitch_rad: float = np.radians(30), roll_rad: float = 0.0) -> np.ndarray:
+def level_R_sonar(pitch_rad: float = np.radians(30), roll_rad: float = 0.0) -> Floats:
     """Down by the pitch, then rolled; written out."""
     cp, sp, cr, sr = np.cos(pitch_rad), np.sin(pitch_rad), np.cos(roll_rad), np.sin(roll_rad)
     return np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]) @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
 
 
-def floor_points(rotation: np.ndarray, height_m: float = HEIGHT_M) -> tuple[np.ndarray, np.ndarray]:
-    """Level floor point (beams, bins, 2) of every pixel, by a search over elevation, and where there is one."""
-    return _searched(tuple(rotation.ravel().tolist()), height_m)
+ROTATION = level_R_sonar()
+VIEW = FloorView(ROTATION, HEIGHT_M)
+
+
+def candidates_at(range_m: list[float], azimuth_rad: list[float], rejected: tuple[int, ...] = ()) -> Candidates:
+    """Candidates with these positions and an elevation known to 0.07 rad."""
+    zero, verdicts = np.zeros(len(range_m)), np.zeros(len(range_m), dtype=np.int64)
+    verdicts[list(rejected)] = CandidateVerdict.TOO_SMALL
+    positions = np.zeros((len(zero), 3)), np.array(range_m, dtype=float), np.array(azimuth_rad, dtype=float)
+    boxes, labels = np.zeros((len(zero), 4), dtype=np.int64), np.zeros((2, 2), dtype=np.int32)
+    return Candidates(*positions, *[zero] * 4, verdicts, zero + 0.07, boxes, WINDOW, labels)
 
 
 @cache
-def _searched(numbers: tuple[float, ...], height_m: float) -> tuple[np.ndarray, np.ndarray]:
+def _floor_points(numbers: tuple[float, ...]) -> Floats:
     rotation = np.reshape(numbers, (3, 3))
     elevation = np.radians(np.linspace(-9, 9, 721))
     xy = np.full((96, 512, 2), np.nan)
@@ -35,12 +47,18 @@ def _searched(numbers: tuple[float, ...], height_m: float) -> tuple[np.ndarray, 
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
         )
         level = rays @ rotation.T
-        distance = np.where(level[:, 2] < -1e-6, -height_m / np.minimum(level[:, 2], -1e-6), np.inf)
+        distance = np.where(level[:, 2] < -1e-6, -HEIGHT_M / np.minimum(level[:, 2], -1e-6), np.inf)
         order = np.argsort(distance)
         for axis in range(2):
             xy[beam, :, axis] = np.interp(
                 RANGES_M, distance[order], (distance[:, None] * level[:, :2])[order, axis], np.nan, np.nan
             )
+    return xy
+
+
+def floor_points(rotation: Floats) -> tuple[Floats, Floats]:
+    """Level floor point (beams, bins, 2) of every pixel, by a search over elevation, and where there is one."""
+    xy = _floor_points(tuple(rotation.ravel().tolist()))
     return xy, np.isfinite(xy[..., 0])
 
 
@@ -48,19 +66,17 @@ def image_db(
     design: LandmarkDesign | None,
     xy_m: tuple[float, float],
     heading_rad: float,
-    rotation: np.ndarray,
-    rng: np.random.Generator | None,
-) -> np.ndarray:
+    rotation: Floats = ROTATION,
+    rng: np.random.Generator | None = None,
+) -> Floats:
     """Decibels, shape (96, 512); without a generator the mean level itself."""
     xy, lit = floor_points(rotation)
     level = np.where(lit, FLOOR_DB, 0.0)
     if design is not None:
         u, v = xy[..., 0] - xy_m[0], xy[..., 1] - xy_m[1]
         cos, sin = np.cos(heading_rad), np.sin(heading_rad)
-        on_floor = np.nan_to_num(
-            design.level_db(np.nan_to_num(cos * u + sin * v, nan=9.0), np.nan_to_num(cos * v - sin * u, nan=9.0))
-        )
-        level = level + np.where(lit, on_floor, 0.0)
+        on_floor = design.level_db(np.nan_to_num(cos * u + sin * v, nan=9.0), np.nan_to_num(cos * v - sin * u, nan=9.0))
+        level = level + np.where(lit, np.nan_to_num(on_floor), 0.0)
     if rng is not None:
         level = level + 10 * np.log10(rng.exponential(size=level.shape))
     return level.astype(np.float32)

@@ -1,22 +1,30 @@
-"""Laws of the fit of designs to patches, and of the sightings that follow from it."""
+"""Laws of templates, of patches of the floor, of the fit of designs to them, and of the sightings that follow."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import erf
 
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
-from sonar_graph.measurements import SonarFrames
+from sonar_graph.measurements import Floats, SonarFrames
 from sonar_graph.sonar.appearance import CENTROID_SIGMA_M, Appearance, CandidateFit, DesignFit, ObjectSighting
 from sonar_graph.sonar.confusion import Confusion, confusion_for, soft_scores
 from sonar_graph.sonar.geometry import FloorView
-from sonar_graph.sonar.templates import Patch, PolarGrid
+from sonar_graph.sonar.templates import Patch, PolarGrid, Templates, material_radius_m
 
-from .candidate_rows import candidates_at
-from .polar_images import AZIMUTHS_RAD, HEIGHT_M, RANGES_M, image_db, level_R_sonar
+from .polar_images import (
+    AZIMUTHS_RAD,
+    HEIGHT_M,
+    RANGES_M,
+    ROTATION,
+    VIEW,
+    candidates_at,
+    floor_points,
+    image_db,
+    level_R_sonar,
+)
 
-ROTATION = level_R_sonar()
-VIEW = FloorView(ROTATION, HEIGHT_M)
 GRID = PolarGrid(RANGES_M, AZIMUTHS_RAD)
 
 
@@ -25,19 +33,95 @@ def appearance() -> Appearance:
     return Appearance(DEFAULT_DESIGNS)
 
 
-def _fit(appearance: Appearance, image: np.ndarray, rotation: np.ndarray, near_m: tuple[float, float]) -> DesignFit:
-    view = FloorView(rotation, HEIGHT_M)
-    patch = GRID.patch(image, view, np.array(near_m), appearance.patch_side, appearance.params.cell_m)
-    return appearance.fit(patch)
+def _fit(appearance: Appearance, image: Floats, near_m: tuple[float, float], view: FloorView = VIEW) -> DesignFit:
+    return appearance.fit(GRID.patch(image, view, np.array(near_m), appearance.patch_side, appearance.params.cell_m))
+
+
+def half_plane() -> LandmarkDesign:
+    """10 dB of material on the side of positive x."""
+    mask = np.full((200, 200), np.nan)
+    mask[:, 100:] = 10.0
+    return LandmarkDesign(1, "half", 1.0, mask)
+
+
+def places_m(templates: Templates) -> Floats:
+    """(x, y) of the cells, shape (2, cells)."""
+    return templates.cell_m * (np.stack(np.divmod(templates.cells, templates.side)) - templates.side // 2)
+
+
+def test_an_edge_is_as_blurred_as_the_sonar_sees_it():
+    templates = Templates.of([half_plane()], 0.01, 0.0, 0.03)
+    first = templates.pictures[templates.heading_rad == 0][0]
+    x, y = places_m(templates)
+    near = (np.abs(x) < 0.1) & (np.abs(y) < 0.2)
+    np.testing.assert_allclose(first[near], 5 * (1 + erf(x[near] / (0.03 * np.sqrt(2)))), atol=0.2)
+
+
+def test_a_heading_turns_from_x_to_y():
+    templates = Templates.of([half_plane()], 0.02, 0.0, 0.01)
+    x, y = places_m(templates)
+    for heading_rad in (0.0, np.pi / 2, np.pi, 5 * np.pi / 4):
+        (picture,) = templates.pictures[np.isclose(templates.heading_rad, heading_rad)]
+        ahead = x * np.cos(heading_rad) + y * np.sin(heading_rad)
+        inside = np.hypot(x, y) < 0.4
+        assert (picture[inside & (ahead > 0.05)] > 9.9).all()
+        assert (picture[inside & (ahead < -0.05)] < 0.1).all()
+
+
+@pytest.mark.parametrize("margin_m", [0.0, 0.05])
+def test_cells_are_those_of_a_disc_with_a_margin_around_the_largest_design_but_for_its_shadow(margin_m: float):
+    templates = Templates.of(DEFAULT_DESIGNS, 0.01, margin_m, 0.01)
+    material_m = max(map(material_radius_m, DEFAULT_DESIGNS))
+    radius_m = material_m + margin_m
+    x, y = places_m(templates)
+    away_m = np.hypot(x, y)
+    assert radius_m - 0.01 < away_m.max() <= radius_m
+    area_m2 = np.pi * (material_m**2 + 2 / 3 * (radius_m**2 - material_m**2))  # a third of the ring is behind
+    assert len(away_m) == pytest.approx(area_m2 / 0.01**2, rel=0.03)
+    assert away_m[x > 0.51 * away_m].max() <= material_m
+    assert margin_m == 0 or away_m[x < 0.49 * away_m].max() > material_m + 0.03
+
+
+def test_material_ends_where_the_mask_ends_and_headings_that_look_alike_are_one_template_of_each_design():
+    mask = np.full((100, 100), np.nan)
+    mask[50, 80] = 3.0
+    assert material_radius_m(LandmarkDesign(1, "dot", 1.0, mask)) == pytest.approx(np.hypot(0.305, 0.005), abs=1e-9)
+    disc, square = DEFAULT_DESIGNS[:2]
+    twin = LandmarkDesign(9, "twin", disc.size_m, disc.mask)
+    assert np.bincount(Templates.of([disc, twin, square], 0.015, 0.03, 0.01).design).tolist() == [1, 1, 12]
+
+
+def test_a_patch_shows_what_a_search_along_rays_finds_whatever_the_order_of_beams():
+    rotation, centre = level_R_sonar(np.radians(29), np.radians(3)), np.array([1.75, 0.02])
+    xy, lit = floor_points(rotation)
+    view, cells_m = FloorView(rotation, HEIGHT_M), 0.015 * (np.arange(21) - 10)
+    for axis, expected in enumerate(np.meshgrid(centre[0] + cells_m, centre[1] + cells_m, indexing="ij")):
+        image = np.where(lit, 100 * xy[..., axis], 0).astype(np.float32)
+        turned = PolarGrid(RANGES_M, AZIMUTHS_RAD[::-1])
+        for patch in (GRID.patch(image, view, centre, 21, 0.015), turned.patch(image[::-1], view, centre, 21, 0.015)):
+            assert (patch.seen == 1).all()
+            np.testing.assert_allclose(patch.level_db / 100, expected, atol=2e-3)
+
+
+def test_a_point_is_seen_when_all_bins_of_its_cell_are_in_the_image():
+    """A fine grid over the far end, and one over the near end."""
+    cell_m, bin_m, image = 0.004, RANGES_M[1] - RANGES_M[0], np.ones((96, 512), np.float32)
+    for end_m in (RANGES_M[0], RANGES_M[-1]):
+        centre, cells_m = np.array([np.sqrt(end_m**2 - HEIGHT_M**2), 0.0]), cell_m * (np.arange(41) - 20)
+        patch = GRID.patch(image, VIEW, centre, 41, cell_m)
+        r = np.sqrt((centre[0] + cells_m[:, None]) ** 2 + cells_m**2 + HEIGHT_M**2)
+        covered = np.abs(RANGES_M[0] + bin_m * np.arange(-60, 572) - r[..., None]) < cell_m / 2
+        outside = covered[..., [*range(60), *range(572, 632)]].any(axis=2)
+        np.testing.assert_array_equal(patch.seen, ~outside)
+        np.testing.assert_allclose(patch.level_db, patch.seen, atol=1e-6)
 
 
 @pytest.mark.parametrize("index", range(len(DEFAULT_DESIGNS)))
 @pytest.mark.parametrize("heading_rad", [0.3, 2.0, -2.6])
 def test_every_design_is_known_at_every_heading_in_speckle(appearance, index, heading_rad):
-    rng = np.random.default_rng(index)
     rotation = level_R_sonar(np.radians(31), np.radians(-2))
-    image = image_db(DEFAULT_DESIGNS[index], (1.7, 0.05), heading_rad, rotation, rng)
-    fit = _fit(appearance, image, rotation, (1.72, 0.03))
+    image = image_db(DEFAULT_DESIGNS[index], (1.7, 0.05), heading_rad, rotation, np.random.default_rng(index))
+    fit = _fit(appearance, image, (1.72, 0.03), FloorView(rotation, HEIGHT_M))
     assert fit.best == index
     assert fit.correlation[index] > 0.75
     assert fit.correlation[index] - np.delete(fit.correlation, index).max() > 0.02
@@ -71,46 +155,44 @@ def test_the_best_fit_is_that_of_numpy_over_the_cells_in_view(appearance, rim: i
 def test_gain_and_floor_level_cost_nothing_and_a_wrong_height_does(appearance):
     """The heading of a triangle is found up to its symmetry."""
     image = image_db(DEFAULT_DESIGNS[2], (1.7, 0.0), 0.4, ROTATION, np.random.default_rng(0))
-    plain, other = (_fit(appearance, picture, ROTATION, (1.7, 0.0)) for picture in (image, 0.5 * image + 20))
+    plain, other = (_fit(appearance, picture, (1.7, 0.0)) for picture in (image, 0.5 * image + 20))
     np.testing.assert_allclose(other.correlation, plain.correlation, atol=1e-3)
     off = (plain.heading_rad - 0.4) % (2 * np.pi / 3)
     assert min(off, 2 * np.pi / 3 - off) < np.radians(5)
-    patch = GRID.patch(image, FloorView(ROTATION, 0.5), np.array([1.9, 0.0]), appearance.patch_side, 0.015)
-    assert appearance.fit(patch).correlation[2] < plain.correlation[2] - 0.05
+    low = _fit(appearance, image, (1.9, 0.0), FloorView(ROTATION, 0.5))
+    assert low.correlation[2] < plain.correlation[2] - 0.05
 
 
 def test_bare_floor_and_a_bar_fit_no_design_well(appearance):
-    rotation, rng = level_R_sonar(), np.random.default_rng(3)
-    bar = np.full((60, 60), np.nan)
+    rng, bar = np.random.default_rng(3), np.full((60, 60), np.nan)
     bar[24:36] = 12.0
     for design in (None, LandmarkDesign(9, "bar", 0.42, bar)):
-        fit = _fit(appearance, image_db(design, (1.7, 0.0), 0.2, rotation, rng), rotation, (1.7, 0.0))
+        fit = _fit(appearance, image_db(design, (1.7, 0.0), 0.2, ROTATION, rng), (1.7, 0.0))
         assert fit.correlation.max() < 0.7
 
 
 @pytest.mark.parametrize("design", DEFAULT_DESIGNS, ids=lambda design: design.name)
-@pytest.mark.parametrize("y_m", np.linspace(0.34, 0.46, 7))
-def test_the_rim_of_the_image_does_not_push_a_landmark_aside(appearance, design, y_m: float):
-    rotation = ROTATION
-    image = image_db(design, (1.7, y_m), 0.6, rotation, None)
-    fit = _fit(appearance, image, rotation, (1.7, y_m - 0.02))
-    if fit.correlation.max() > 0:
-        np.testing.assert_allclose(fit.centre_m, (1.7, y_m), atol=0.003)
+def test_the_rim_of_the_image_does_not_push_a_landmark_aside(appearance, design):
+    for y_m in np.linspace(0.34, 0.46, 7):
+        fit = _fit(appearance, image_db(design, (1.7, y_m), 0.6), (1.7, y_m - 0.02))
+        if fit.correlation.max() > 0:
+            np.testing.assert_allclose(fit.centre_m, (1.7, y_m), atol=0.003)
 
 
 APERTURE_RAD = 0.244
-SHIPPED = confusion_for(DEFAULT_DESIGNS)
-MODEL = SHIPPED.model_copy(update={"threshold": 0.7, "range_sigma_m": 0.01, "azimuth_sigma_rad": 0.004})
+MODEL = confusion_for(DEFAULT_DESIGNS).model_copy(
+    update={"threshold": 0.7, "range_sigma_m": 0.01, "azimuth_sigma_rad": 0.004}
+)
 TRIANGLE = 2
 
 
-def frame(image: np.ndarray, ranges_m: np.ndarray = RANGES_M, azimuths_rad: np.ndarray = AZIMUTHS_RAD) -> SonarFrames:
+def frame(image: Floats, ranges_m: Floats = RANGES_M, azimuths_rad: Floats = AZIMUTHS_RAD) -> SonarFrames:
     return SonarFrames(np.array([1]), image[None], ranges_m, azimuths_rad)
 
 
 def look_at(
     appearance: Appearance,
-    image: np.ndarray,
+    image: Floats,
     near_m: tuple[float, float],
     model: Confusion = MODEL,
     view: FloorView | None = VIEW,
@@ -119,9 +201,7 @@ def look_at(
     """A look at a candidate near a point of the floor."""
     r, a = VIEW.range_azimuth(np.array(near_m))
     look = CandidateFit(appearance, model, aperture_rad)
-    (sighting,) = look.at(image, frame(image), view, candidates_at([r], [a]), np.array([0]))
-    assert sighting is not None
-    return sighting
+    return look.at(image, frame(image), view, candidates_at([r], [a]), np.array([0]))[0]
 
 
 @pytest.fixture(scope="module")
@@ -131,30 +211,23 @@ def triangle() -> np.ndarray:
 
 def test_range_and_azimuth_are_those_of_the_designs_centre_and_not_of_the_candidate(appearance, triangle):
     found = look_at(appearance, triangle, (1.725, 0.03))
-    assert found.is_fitted
-    assert found.fit is not None
-    assert found.fit.best == TRIANGLE
     r, a = VIEW.range_azimuth(np.array([1.7, 0.05]))
+    assert (found.is_fitted, found.fit.best) == (True, TRIANGLE)
     assert (found.range_m, found.azimuth_rad) == (pytest.approx(r, abs=0.006), pytest.approx(a, abs=0.004))
     np.testing.assert_allclose(found.covariance, np.diag([0.01**2, 0.004**2]) / found.fit.visible**4)
 
 
 def test_what_is_partly_in_view_is_less_certain(appearance):
-    image = image_db(DEFAULT_DESIGNS[0], (1.7, 0.34), 0.0, ROTATION, None)
-    found = look_at(appearance, image, (1.7, 0.33))
+    found = look_at(appearance, image_db(DEFAULT_DESIGNS[0], (1.7, 0.34), 0.0), (1.7, 0.33))
     assert found.is_fitted
-    assert found.fit is not None
     assert 0.8 <= found.fit.visible < 0.97
     np.testing.assert_allclose(found.covariance, np.diag([0.01**2, 0.004**2]) / found.fit.visible**4)
 
 
 def test_what_no_design_fits_stays_where_its_centroid_is(appearance, triangle):
-    strict = MODEL.model_copy(update={"threshold": 0.999})
-    found = look_at(appearance, triangle, (1.725, 0.03), strict)
-    assert not found.is_fitted
-    assert found.fit is not None
+    found = look_at(appearance, triangle, (1.725, 0.03), MODEL.model_copy(update={"threshold": 0.999}))
     r, a = VIEW.range_azimuth(np.array([1.725, 0.03]))
-    assert (found.range_m, found.azimuth_rad) == (r, a)
+    assert (found.is_fitted, found.fit.best, found.range_m, found.azimuth_rad) == (False, TRIANGLE, r, a)
     np.testing.assert_allclose(found.covariance, np.diag([CENTROID_SIGMA_M**2, (CENTROID_SIGMA_M / r) ** 2]))
 
 
@@ -180,8 +253,7 @@ def test_rows_say_which_candidate_and_scores_are_those_of_the_model(appearance, 
     assert none is None
     assert seen.is_fitted
     assert beside.azimuth_rad == pytest.approx(-0.1, abs=0.05)
-    scores = look.scores([none, seen, beside])
-    fit = seen.fit
+    scores, fit = look.scores([none, seen, beside]), seen.fit
     expected = soft_scores(fit.correlation[None], np.array([fit.visible]), MODEL.sharpness, MODEL.threshold)[0]
     np.testing.assert_allclose(scores[:2], [np.zeros(5), expected])
     assert scores[1].argmax() == TRIANGLE
@@ -190,35 +262,31 @@ def test_rows_say_which_candidate_and_scores_are_those_of_the_model(appearance, 
 def test_other_beams_and_bins_are_looked_up_anew(appearance, triangle):
     """A log may change its window on the way: beams the other way round, fewer bins, farther bins."""
     look, (r, a) = CandidateFit(appearance, MODEL, APERTURE_RAD), VIEW.range_azimuth(np.array([1.7, 0.05]))
-
-    def correlation(image: np.ndarray, ranges_m: np.ndarray = RANGES_M, azimuths_rad: np.ndarray = AZIMUTHS_RAD):
-        image = np.ascontiguousarray(image)
-        taken = frame(image, ranges_m, azimuths_rad)
-        return look.at(image, taken, VIEW, candidates_at([r], [a]), np.array([0]))[0].fit.correlation
-
-    first = correlation(triangle)
-    np.testing.assert_allclose(correlation(triangle[::-1], azimuths_rad=AZIMUTHS_RAD[::-1].copy()), first, atol=1e-3)
-    np.testing.assert_allclose(correlation(triangle[:, :400], RANGES_M[:400]), first, atol=1e-3)
-    assert abs(correlation(triangle, RANGES_M + 0.1) - first).max() > 0.05
+    first, turned, fewer, farther = (
+        look.at(image, frame(image, *window), VIEW, candidates_at([r], [a]), np.array([0]))[0].fit.correlation
+        for image, *window in (
+            (triangle, RANGES_M, AZIMUTHS_RAD),
+            (np.ascontiguousarray(triangle[::-1]), RANGES_M, AZIMUTHS_RAD[::-1].copy()),
+            (np.ascontiguousarray(triangle[:, :400]), RANGES_M[:400], AZIMUTHS_RAD),
+            (triangle, RANGES_M + 0.1, AZIMUTHS_RAD),
+        )
+    )
+    np.testing.assert_allclose([turned, fewer], [first, first], atol=1e-3)
+    assert abs(farther - first).max() > 0.05
 
 
 def test_without_a_floor_the_patch_lies_in_the_plane_of_the_image(appearance):
     """A design drawn in that plane is found; on the floor's grid it would be foreshortened."""
     r, a = np.meshgrid(RANGES_M, AZIMUTHS_RAD)
-    design = DEFAULT_DESIGNS[1]
-    level = np.nan_to_num(design.level_db(r * np.cos(a) - 1.9, r * np.sin(a) - 0.1)) + 35.0
+    level = np.nan_to_num(DEFAULT_DESIGNS[1].level_db(r * np.cos(a) - 1.9, r * np.sin(a) - 0.1)) + 35.0
     image = (level + 10 * np.log10(np.random.default_rng(3).exponential(size=level.shape))).astype(np.float32)
-    candidates = candidates_at([float(np.hypot(1.9, 0.1))], [float(np.arctan2(0.1, 1.9))])
+    r, a = np.hypot(1.9, 0.1), np.arctan2(0.1, 1.9)
     flat, tilted = (
-        CandidateFit(appearance, MODEL, APERTURE_RAD).at(image, frame(image), view, candidates, np.array([0]))[0]
+        CandidateFit(appearance, MODEL, APERTURE_RAD).at(
+            image, frame(image), view, candidates_at([r], [a]), np.array([0])
+        )[0]
         for view in (None, VIEW)
     )
-    assert flat is not None
-    assert flat.fit is not None
     assert flat.fit.best == 1
-    assert (flat.range_m, flat.azimuth_rad) == (
-        pytest.approx(np.hypot(1.9, 0.1), abs=0.006),
-        pytest.approx(np.arctan2(0.1, 1.9), abs=0.003),
-    )
-    assert tilted is not None
+    assert (flat.range_m, flat.azimuth_rad) == (pytest.approx(r, abs=0.006), pytest.approx(a, abs=0.003))
     assert tilted.fit is None or tilted.fit.correlation[1] < flat.fit.correlation[1] - 0.02

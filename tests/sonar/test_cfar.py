@@ -12,6 +12,7 @@ from scipy.ndimage import uniform_filter
 
 from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
 from sonar_graph.errors import CalibrationError, MeasurementError
+from sonar_graph.measurements import Floats
 from sonar_graph.sonar.appearance import AppearanceParams
 from sonar_graph.sonar.cfar import (
     DetectionParams,
@@ -26,35 +27,45 @@ from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.regions import MEDIAN_TO_SIGMA, CandidateVerdict, background_of, measure_regions
 
 from . import polar_images
-from .candidate_rows import AZIMUTHS_RAD, RANGES_M, speckle_db
+from .polar_images import HEIGHT_M, RANGES_M, image_db
 
-VIEW = FloorView.from_angles(0.95, 0.0, np.radians(30))
+AZIMUTHS_RAD = polar_images.AZIMUTHS_RAD[::-1].copy()
+VIEW = FloorView.from_angles(HEIGHT_M, 0.0, np.radians(30))
 PLATE_DB = 12.0
 
 
-def floor_xy(view=VIEW):
+def speckle_db(seed: int, level_db: float | Floats = 30.0) -> Floats:
+    """One-look speckle: 10 log10 of an exponential variable, shape (96, 512)."""
+    return level_db + 10 * np.log10(np.random.default_rng(seed).exponential(size=(96, 512)))
+
+
+def floor_xy(view=VIEW, azimuths_rad=AZIMUTHS_RAD):
     """Level (x, y) of every pixel, shape (2, beams, bins)."""
-    q = view.floor_points(np.tile(RANGES_M, 96), np.repeat(AZIMUTHS_RAD, 512)) @ view.level_R_sonar.T
-    return q.T[:2].reshape(2, 96, 512)
+    pixels = np.tile(RANGES_M, len(azimuths_rad)), np.repeat(azimuths_rad, 512)
+    return (view.floor_points(*pixels) @ view.level_R_sonar.T).T[:2].reshape(2, -1, 512)
 
 
-def frame_with_plate(x=1.65, y=0.05, side=0.3, seed=1, view=VIEW, level=30.0, plate_db=PLATE_DB):
-    at = floor_xy(view)
+def frame_with_plate(x=1.65, y=0.05, side=0.3, plate_db=PLATE_DB):
+    at = floor_xy()
     inside = (np.abs(at[0] - x) < side / 2) & (np.abs(at[1] - y) < side / 2)
-    return (speckle_db(seed, level) + plate_db * inside).astype(np.float32)
+    return (speckle_db(1) + plate_db * inside).astype(np.float32)
 
 
 def select(image, view=VIEW, **settings):
     return select_candidates(image, RANGES_M, AZIMUTHS_RAD, view, DetectionParams(**settings))
 
 
+def shares_over(frames, **settings):
+    """Pixels over the threshold in each frame, shape (frames, beams, bins)."""
+    return np.array([select(f.astype(np.float32), closing_m=0, **settings).labels > 0 for f in frames])
+
+
 @pytest.mark.parametrize(("closing_m", "count"), [(0.12, 1), (0.0, 2)])
 def test_gaps_up_to_a_width_are_bridged(closing_m, count):
     """Two halves of a plate, 8 cm apart."""
-    at = floor_xy()
-    halves = (np.abs(at[0] - 1.65) < 0.15) & (np.abs(np.abs(at[1]) - 0.1) < 0.06)
-    image = (speckle_db(1) + 15 * halves).astype(np.float32)
-    assert len(select(image, closing_m=closing_m).accepted) == count
+    x, y = floor_xy()
+    halves = (np.abs(x - 1.65) < 0.15) & (np.abs(np.abs(y) - 0.1) < 0.06)
+    assert len(select((speckle_db(1) + 15 * halves).astype(np.float32), closing_m=closing_m).accepted) == count
 
 
 @pytest.mark.parametrize("looks", [1, 4, 20])
@@ -73,8 +84,7 @@ def test_offsets_are_those_of_an_exponential_for_one_look_and_interpolated_for_i
 
 
 def test_lengths_become_odd_numbers_of_beams_and_bins():
-    cell_m = 1.885 * np.radians(0.3), 1.25 / 512
-    assert [odd_counts(length_m, cell_m) for length_m in (0.03, 0.0)] == [(3, 13), (1, 1)]
+    assert [odd_counts(length_m, (1.885 * np.radians(0.3), 1.25 / 512)) for length_m in (0.03, 0)] == [(3, 13), (1, 1)]
 
 
 ACROSS = np.linspace(-1.0, 1.0, 96)[:, None]
@@ -82,8 +92,7 @@ ACROSS = np.linspace(-1.0, 1.0, 96)[:, None]
 
 @pytest.mark.parametrize("level", [20.0, 50.0, 30.0 - 12.0 * (RANGES_M - 1.26) / 1.25, 30.0 + 3.0 * ACROSS])
 def test_false_alarms_keep_their_rate_whatever_the_level_and_at_the_rim(level):
-    frames = [speckle_db(seed, level).astype(np.float32) for seed in range(30)]
-    masks = np.array([select(frame, false_alarm=1e-2, closing_m=0).labels > 0 for frame in frames])
+    masks = shares_over([speckle_db(seed, level) for seed in range(30)], false_alarm=1e-2)
     assert 0.7e-2 < masks.mean() < 1.7e-2
     if np.ndim(level) == 0:
         for rim in (masks[:, 0], masks[:, -1], masks[..., 0], masks[..., -1]):
@@ -92,24 +101,19 @@ def test_false_alarms_keep_their_rate_whatever_the_level_and_at_the_rim(level):
 
 def test_a_background_that_hardly_varies_makes_no_candidates():
     """Constant, or varying by its quantisation only."""
-    for value in (0.0, 80.0):
-        assert len(select(np.full((96, 512), value, dtype=np.float32))) == 0
-    steps = np.round(np.random.default_rng(2).uniform(0, 0.6, (96, 512)))
-    assert (select((30.0 + 0.05 * steps).astype(np.float32), closing_m=0).labels == 0).all()
+    steps = 30.0 + 0.05 * np.round(np.random.default_rng(2).uniform(0, 0.6, (96, 512)))
+    assert not shares_over([np.full((96, 512), 0.0), np.full((96, 512), 80.0), steps]).any()
 
 
 def test_texture_raises_the_threshold_by_itself():
     """Gamma texture of shape 1 in patches as large as the smoothing: a fixed threshold would stand out everywhere."""
     rng = np.random.default_rng(5)
-    shares, fixed = [], []
-    for seed in range(8):
-        texture = np.kron(rng.gamma(1.0, size=(32, 32)), np.ones((3, 16)))
-        image = (speckle_db(seed) + 10 * np.log10(texture)).astype(np.float32)
-        shares.append(np.mean(select(image, false_alarm=1e-2, closing_m=0).labels > 0))
-        smooth = np.mean(image.reshape(32, 3, 32, 16), axis=(1, 3))
-        fixed.append(np.mean(smooth > np.median(smooth) + false_alarm_offset_db(5.57 / np.sqrt(48), 1e-2)))
-    assert np.mean(shares) < 2e-2
-    assert np.mean(fixed) > 0.2
+    textures = [np.kron(rng.gamma(1.0, size=(32, 32)), np.ones((3, 16))) for _ in range(8)]
+    images = [speckle_db(seed) + 10 * np.log10(texture) for seed, texture in enumerate(textures)]
+    smooth = np.mean(np.reshape(images, (8, 32, 3, 32, 16)), axis=(2, 4))
+    fixed = np.median(smooth, axis=(1, 2), keepdims=True) + false_alarm_offset_db(5.57 / np.sqrt(48), 1e-2)
+    assert shares_over(images, false_alarm=1e-2).mean() < 2e-2
+    assert np.mean(smooth > fixed) > 0.2
 
 
 @pytest.mark.parametrize(("x", "y"), [(1.65, 0.05), (1.5, -0.15), (1.9, 0.2)])
@@ -124,7 +128,7 @@ def test_a_plate_is_one_candidate_where_geometry_says(x, y):
     assert found.extent_m[row] == pytest.approx(0.3, abs=0.03)
     assert found.level_db[row] == pytest.approx(PLATE_DB, abs=2.5)
     assert np.sin(found.elevation_rad[row]) == pytest.approx(q[2] / r, abs=1e-9)
-    assert found.area_m2[row] / blind.area_m2[flat] == pytest.approx(r / np.sqrt(r**2 - 0.95**2), rel=0.03)
+    assert found.area_m2[row] / blind.area_m2[flat] == pytest.approx(r / np.sqrt(r**2 - HEIGHT_M**2), rel=0.03)
     assert (blind.elevation_rad == 0).all()
     assert blind.elevation_sigma_rad[flat] == pytest.approx(0.244 / np.sqrt(12))
 
@@ -132,27 +136,24 @@ def test_a_plate_is_one_candidate_where_geometry_says(x, y):
 @pytest.mark.parametrize(("roll", "pitch", "half_rad"), [(0.0, 0.0, 0.25), (0.3, 0.5, 0.9)])
 def test_the_area_of_all_of_an_image_is_that_of_its_outline_on_the_floor(roll, pitch, half_rad):
     """By the shoelace formula."""
-    view, azimuths = FloorView.from_angles(0.95, roll, pitch), np.linspace(half_rad, -half_rad, 192)
+    view, azimuths = FloorView.from_angles(HEIGHT_M, roll, pitch), np.linspace(half_rad, -half_rad, 192)
     labels, contrast = np.ones((192, 512), dtype=np.int32), np.zeros((192, 512), dtype=np.float32)
     area = measure_regions(contrast, labels, 1, RANGES_M, azimuths, view).area_m2[0]
-    q = view.floor_points(np.tile(RANGES_M, 192), np.repeat(azimuths, 512)) @ view.level_R_sonar.T
-    xy = q.T[:2].reshape(2, 192, 512)
+    xy = floor_xy(view, azimuths)
     x, y = np.concatenate([xy[:, 0], xy[:, :, -1], xy[:, -1, ::-1], xy[:, ::-1, 0]], axis=1)
     shoelace = abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
     assert area == pytest.approx(shoelace * 192 / 191 * 512 / 511, rel=2e-3)
 
 
-def test_the_extent_of_a_bar_does_not_depend_on_how_it_lies():
+@pytest.mark.parametrize("turned_rad", [0.0, np.pi / 4, np.pi / 2, -np.pi / 4])
+def test_the_extent_of_a_bar_does_not_depend_on_how_it_lies(turned_rad):
     """Labelled by hand, 0.4 m by 0.05 m, in the slant plane at 2 m."""
     r, a = np.meshgrid(RANGES_M, AZIMUTHS_RAD)
-    x, y = r * np.cos(a) - 1.9, r * np.sin(a)
-    for turned_rad in (0.0, np.pi / 4, np.pi / 2, -np.pi / 4):
-        along = x * np.cos(turned_rad) + y * np.sin(turned_rad)
-        aside = y * np.cos(turned_rad) - x * np.sin(turned_rad)
-        labels = ((np.abs(along) < 0.2) & (np.abs(aside) < 0.025)).astype(np.int32)
-        found = measure_regions(np.zeros((96, 512), np.float32), labels, 1, RANGES_M, AZIMUTHS_RAD, None)
-        assert found.extent_m[0] == pytest.approx(0.4, abs=0.015)
-        assert found.area_m2[0] == pytest.approx(0.02, rel=0.05)
+    x, y, cos, sin = r * np.cos(a) - 1.9, r * np.sin(a), np.cos(turned_rad), np.sin(turned_rad)
+    labels = ((np.abs(x * cos + y * sin) < 0.2) & (np.abs(y * cos - x * sin) < 0.025)).astype(np.int32)
+    found = measure_regions(np.zeros((96, 512), np.float32), labels, 1, RANGES_M, AZIMUTHS_RAD, None)
+    assert found.extent_m[0] == pytest.approx(0.4, abs=0.015)
+    assert found.area_m2[0] == pytest.approx(0.02, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -165,36 +166,31 @@ def test_the_extent_of_a_bar_does_not_depend_on_how_it_lies():
 )
 def test_each_gate_is_the_reason_that_it_gives(settings, verdict):
     kept, gated = select(frame_with_plate()), select(frame_with_plate(), **settings)
-    (row,) = kept.accepted
-    assert gated.verdicts[row] == verdict
+    assert gated.verdicts[kept.accepted].tolist() == [verdict]
     assert len(gated.accepted) == 0
 
 
 @pytest.mark.parametrize(("x", "y"), [(1.65, 0.4), (1.65, -0.4), (2.25, 0.0), (0.85, 0.0)])
 def test_a_plate_cut_by_the_edge_is_rejected_unless_wanted(x, y):
-    image = frame_with_plate(x, y)
-    cut = select(image)
+    cut = select(frame_with_plate(x, y))
     assert CandidateVerdict.AT_EDGE in cut.verdicts[cut.area_m2 > 0.01]
     assert len(cut.accepted) == 0
-    assert len(select(image, keep_at_edge=True).accepted) == 1
+    assert len(select(frame_with_plate(x, y), keep_at_edge=True).accepted) == 1
 
 
 def test_beyond_the_limit_the_strongest_are_kept():
     image = np.maximum(frame_with_plate(y=0.25, side=0.22), frame_with_plate(y=-0.2, side=0.15, plate_db=40.0))
-    (row,) = select(image, max_candidates=1).accepted
-    both = select(image)
-    assert len(both.accepted) == 2
-    by_azimuth = both.accepted[np.argsort(both.azimuth_rad[both.accepted])]
-    assert np.diff(both.area_m2[by_azimuth])[0] > 0  # the weaker one is larger
-    assert both.azimuth_rad[row] < 0
-    assert np.sum(select(image, max_candidates=1).verdicts == CandidateVerdict.BEYOND_LIMIT) == 1
+    both, one = select(image), select(image, max_candidates=1)
+    right, left = both.accepted[np.argsort(both.azimuth_rad[both.accepted])]
+    assert both.area_m2[left] > both.area_m2[right]  # the weaker one is larger
+    assert one.accepted.tolist() == [right]
+    assert one.verdicts[left] == CandidateVerdict.BEYOND_LIMIT
 
 
 def test_what_lies_nearer_than_the_floor_is_off_it():
-    view = FloorView.from_angles(1.6, 0.0, np.radians(45))
     image = speckle_db(6)
     image[40:56, 20:60] += 15
-    found = select(image.astype(np.float32), view=view)
+    found = select(image.astype(np.float32), view=FloorView.from_angles(1.6, 0.0, np.radians(45)))
     near = np.flatnonzero(found.boxes[:, 3] * found.boxes[:, 2] > 200)
     assert found.verdicts[near].tolist() == [CandidateVerdict.OFF_FLOOR]
 
@@ -208,12 +204,11 @@ def test_frames_that_break_the_rules_are_refused():
         select(image)
 
 
-BEAMS, BINS = 3, 5
-SPAN = 9
+BEAMS, BINS, SPAN = 3, 5, 9
 HALF_STEP_DB, HALF_DEVIATION_STEP_DB = 1 / 16, 1 / 80
 
 
-def medians(values: np.ndarray) -> np.ndarray:
+def medians(values: Floats) -> Floats:
     """Over a square window, mirrored at the edges."""
     mirrored = np.pad(values, SPAN // 2, mode="reflect")
     return np.median(sliding_window_view(mirrored, (SPAN, SPAN)), axis=(2, 3))
@@ -223,27 +218,22 @@ def medians(values: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("shaded", [0.0, 0.4])
 def test_the_background_is_a_median_and_the_spread_the_median_of_what_is_left(nodes: int, shaded: float):
     """A shadow 40 dB deep over less than half of the beams is below what bytes reach, -16 dB."""
-    rng = np.random.default_rng(nodes)
-    level = rng.normal(40, 2, (nodes, 30)) + 0.3 * np.arange(30)
+    level = np.random.default_rng(nodes).normal(40, 2, (nodes, 30)) + 0.3 * np.arange(30)
     level[: int(shaded * nodes)] -= 40
     level = level.astype(np.float32)
-    found = background_of(
-        np.kron(level, np.ones((BEAMS, BINS), np.float32)), (BEAMS, BINS), (SPAN * BEAMS, SPAN * BINS)
-    )
-    along = np.pad(np.median(level, axis=0), 2, mode="reflect")
-    trend = sliding_window_view(along, 5).mean(axis=1)
+    pixels = np.kron(level, np.ones((BEAMS, BINS), np.float32))
+    found = background_of(pixels, (BEAMS, BINS), (SPAN * BEAMS, SPAN * BINS))
+    trend = sliding_window_view(np.pad(np.median(level, axis=0), 2, mode="reflect"), 5).mean(axis=1)
     residual = level - trend
     local = medians(np.clip(residual, -16, 127 / 8))
     assert found.level_db == pytest.approx(local + trend, abs=1.01 * HALF_STEP_DB)
     spread = MEDIAN_TO_SIGMA * medians(np.minimum(np.abs(residual - (found.level_db - trend)), 255 / 40))
-    assert found.spread_db == pytest.approx(
-        np.maximum(spread, 0.2), abs=MEDIAN_TO_SIGMA * 1.01 * HALF_DEVIATION_STEP_DB
-    )
+    tolerance = MEDIAN_TO_SIGMA * 1.01 * HALF_DEVIATION_STEP_DB
+    assert found.spread_db == pytest.approx(np.maximum(spread, 0.2), abs=tolerance)
 
 
 PARAMS = DetectionParams()
 SEARCH_M = AppearanceParams().search_m
-LOW_VIEW = FloorView(polar_images.level_R_sonar(), polar_images.HEIGHT_M)
 PIXELS = 200
 
 
@@ -259,19 +249,16 @@ def design_of(*boxes_m: tuple[float, float, float, float], level_db: float = 12.
 
 def accepted_near_middle(design: LandmarkDesign) -> int:
     """Candidates of the selection itself, in an image without speckle but for a little, close enough to be compared."""
-    image = polar_images.image_db(design, (1.7, 0.0), 0.0, polar_images.level_R_sonar(), None)
+    image = image_db(design, (1.7, 0.0), 0.0)
     image = image + np.random.default_rng(0).normal(0, 0.5, image.shape).astype(np.float32)
-    found = select_candidates(image, polar_images.RANGES_M, polar_images.AZIMUTHS_RAD, LOW_VIEW, PARAMS)
-    at = found.accepted
-    away = np.hypot(
-        found.range_m[at] * np.sin(found.azimuth_rad[at]),
-        np.sqrt(found.range_m[at] ** 2 - polar_images.HEIGHT_M**2) * np.cos(found.azimuth_rad[at]) - 1.7,
-    )
+    found = select_candidates(image, RANGES_M, polar_images.AZIMUTHS_RAD, polar_images.VIEW, PARAMS)
+    r, a = found.range_m[found.accepted], found.azimuth_rad[found.accepted]
+    away = np.hypot(r * np.sin(a), np.sqrt(r**2 - HEIGHT_M**2) * np.cos(a) - 1.7)
     return int((away <= SEARCH_M + PARAMS.smoothing_m).sum())
 
 
-SPECK, CORNER = (0.0, 0.0, 0.02, 0.02), (0.17, 0.17, 0.06, 0.06)
-ONE = design_of((0.0, 0.0, 0.1, 0.1))
+SPECK, CORNER, MIDDLE = (0.0, 0.0, 0.02, 0.02), (0.17, 0.17, 0.06, 0.06), (0.0, 0.0, 0.1, 0.1)
+ONE = design_of(MIDDLE)
 TWO_APART = design_of((-0.17, 0.0, 0.07, 0.07), (0.17, 0.0, 0.07, 0.07))
 AT_A_CORNER = design_of((0.15, 0.15, 0.08, 0.08))
 TINY = design_of(SPECK)
@@ -295,7 +282,7 @@ def is_refused(design: LandmarkDesign, search_m: float = SEARCH_M, **settings: f
     ("design", "count"),
     [
         (ONE, 1),
-        (design_of((0.0, 0.0, 0.1, 0.1), (0.2, 0.0, 0.02, 0.02)), 1),  # with a nose
+        (design_of(MIDDLE, (0.2, 0.0, 0.02, 0.02)), 1),  # with a nose
         (TWO_APART, 0),
         (AT_A_CORNER, 0),
         (TINY, 0),
@@ -307,25 +294,21 @@ def test_a_design_is_let_through_where_the_selection_finds_it_in_the_middle(desi
     assert is_refused(design) == (count == 0)
 
 
-@pytest.mark.parametrize(
-    ("design", "settings", "expected"),
-    [
-        (design_of((-0.06, 0.0, 0.05, 0.08), (0.06, 0.0, 0.05, 0.08)), {}, False),  # joined
-        (TWO_APART, {"closing_m": 0.25}, False),
-        (DARK_APART, {}, False),
-        (design_of((0.0, 0.0, 0.1, 0.1), level_db=-12.0), {}, True),  # dark
-        (BAR, {"max_extent_m": 0.55}, False),
-        (BAR, {"max_extent_m": 0.4}, True),
-        (BESIDE, {"smoothing_m": 0.03, "search_m": 0.045}, False),  # 6 cm off the middle
-        (BESIDE, {"smoothing_m": 0.03, "search_m": 0.02}, True),
-        (BESIDE, {"smoothing_m": 0.005, "search_m": 0.045}, True),
-        (design_of(SPECK, CORNER), {}, True),  # size and place of two parts
-        (design_of((0.0, 0.0, 0.06, 0.06), CORNER), {}, False),
-        *((design, {}, False) for design in DEFAULT_DESIGNS),
-    ],
-)
-def test_one_part_must_have_the_size_and_the_place(design: LandmarkDesign, settings: dict, expected: bool):
-    assert is_refused(design, **settings) == expected
+def test_one_part_must_have_the_size_and_the_place():
+    joined, dark = design_of((-0.06, 0.0, 0.05, 0.08), (0.06, 0.0, 0.05, 0.08)), design_of(MIDDLE, level_db=-12.0)
+    not_together = design_of(SPECK, CORNER)  # one part has the place, the other one the size
+    refused = [
+        dark, not_together, (BAR, {"max_extent_m": 0.4}), (BESIDE, {"smoothing_m": 0.03, "search_m": 0.02}),
+        (BESIDE, {"smoothing_m": 0.005, "search_m": 0.045}),
+    ]  # fmt: skip
+    taken = [
+        *DEFAULT_DESIGNS, joined, DARK_APART, design_of((0.0, 0.0, 0.06, 0.06), CORNER),
+        (TWO_APART, {"closing_m": 0.25}), (BAR, {"max_extent_m": 0.55}),
+        (BESIDE, {"smoothing_m": 0.03, "search_m": 0.045}),  # 6 cm off the middle
+    ]  # fmt: skip
+    for case, expected in [*((case, True) for case in refused), *((case, False) for case in taken)]:
+        design, settings = case if isinstance(case, tuple) else (case, {})
+        assert is_refused(design, **settings) == expected, (design.name, settings)
 
 
 def test_a_refusal_names_areas_distances_limits_and_settings():
@@ -344,15 +327,16 @@ def test_parts_have_the_area_length_and_place_of_their_drawing_largest_first():
     assert areas_m2[0] > 4 * areas_m2[1]
     assert offsets_m == pytest.approx([0.1, 0.15], abs=0.005)
     assert len(bright_parts(TINY, set_to(closing_m=0.1))[0]) == 1  # closing does not average
+    touching = design_of((-0.0525, -0.0525, 0.05, 0.05), (0.05, 0.045, 0.05, 0.05))  # at a corner: one part
+    areas_m2, _, _ = bright_parts(touching, set_to(smoothing_m=0.005, closing_m=0.0))
+    assert areas_m2 == pytest.approx([0.02], rel=0.1)
 
 
 def test_a_part_is_where_the_mean_over_the_smoothing_is_over_the_floor():
     """Against scipy, in cells of 2 mm; 3 dB of 12 are reached beyond the edge."""
     areas_m2, extents_m, _ = bright_parts(design_of((0.0, 0.0, 0.2, 0.1)), set_to(smoothing_m=0.1))
-    at_m = 0.002 * np.arange(-200, 201)
-    x_m, y_m = np.meshgrid(at_m, at_m)
-    mean_db = uniform_filter(np.where((np.abs(x_m) <= 0.2) & (np.abs(y_m) <= 0.1), 12.0, 0.0), 50)
-    is_part = mean_db >= 3.0
+    x_m, y_m = np.meshgrid(*2 * [0.002 * np.arange(-200, 201)])
+    is_part = uniform_filter(np.where((np.abs(x_m) <= 0.2) & (np.abs(y_m) <= 0.1), 12.0, 0.0), 50) >= 3.0
     assert areas_m2 == pytest.approx([is_part.sum() * 0.002**2], rel=0.05)
     assert extents_m == pytest.approx([np.sqrt(12 * x_m[is_part].var())], rel=0.02)
     assert extents_m[0] > 0.41
@@ -361,13 +345,6 @@ def test_a_part_is_where_the_mean_over_the_smoothing_is_over_the_floor():
 @pytest.mark.parametrize("settings", [{}, {"smoothing_m": 0.1}, {"closing_m": 0.1}])
 def test_the_edge_of_the_square_is_none_of_a_part(settings):
     """The same box, in a square that it fills and in a larger one."""
-    box = (0.0, 0.0, 0.1, 0.1)
-    filled, larger = (bright_parts(design_of(box, size_m=size_m), set_to(**settings)) for size_m in (0.2, 0.5))
+    filled, larger = (bright_parts(design_of(MIDDLE, size_m=size_m), set_to(**settings)) for size_m in (0.2, 0.5))
     for one, other in zip(filled, larger, strict=True):
         assert one == pytest.approx(other, rel=0.06, abs=0.003)
-
-
-def test_parts_that_touch_at_a_corner_are_one():
-    touching = design_of((-0.0525, -0.0525, 0.05, 0.05), (0.05, 0.045, 0.05, 0.05))
-    areas_m2, _, _ = bright_parts(touching, set_to(smoothing_m=0.005, closing_m=0.0))
-    assert areas_m2 == pytest.approx([0.02], rel=0.1)

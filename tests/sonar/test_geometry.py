@@ -7,7 +7,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sonar_graph.errors import CalibrationError
-from sonar_graph.measurements import SonarFrames
+from sonar_graph.measurements import Floats, SonarFrames
 from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
 from sonar_graph.sonar.geometry import (
     Fan,
@@ -26,16 +26,15 @@ def view_of(height: float, roll: float, pitch: float) -> FloorView:
     return FloorView.from_angles(height, roll, pitch)
 
 
+def point(r: float, a: float, e: float = 0.0) -> Floats:
+    return points(np.array([r]), np.array([a]), np.array([e]))
+
+
 @given(st.floats(0.1, 50), st.floats(-3.1, 3.1), st.floats(-1.5, 1.5))
 def test_range_azimuth_and_elevation_are_undone_by_their_point(r, a, e):
-    found = ranges_azimuths_elevations(points(np.array([r]), np.array([a]), np.array([e])))
+    found = ranges_azimuths_elevations(point(r, a, e))
     assert np.allclose(np.ravel(found), [r, a, e], atol=1e-9 * max(r, 1))
-
-
-def test_left_is_positive_and_so_is_up():
-    q = points(np.array([2.0]), np.array([0.1]), np.array([0.2]))[0]
-    assert q[1] > 0
-    assert q[2] > 0
+    assert (point(2.0, 0.1, 0.2)[0] > 0).all()  # left is positive, and so is up
 
 
 @given(st.floats(0.5, 1.2), angles, st.floats(0.2, 0.9), st.floats(1.3, 2.5), angles)
@@ -54,11 +53,12 @@ def test_floor_points_lie_on_the_floor_at_their_range_and_azimuth(height, roll, 
 def test_a_centre_beam_tilted_down_meets_the_floor_where_the_triangle_says():
     """Tilt 30 degrees, height 1 m: the centre beam is 2 m long and 1.732 m out; 1.5 m is seen below it."""
     view = view_of(1.0, 0.0, np.radians(30))
-    assert view.floor_points(np.array([2.0]), np.array([0.0]))[0] == pytest.approx([2.0, 0.0, 0.0], abs=1e-12)
+    ahead, below, none = view.floor_points(np.array([2.0, 1.5, 0.9]), np.zeros(3))
+    assert ahead == pytest.approx([2.0, 0.0, 0.0], abs=1e-12)
+    assert ranges_azimuths_elevations(below)[2] == pytest.approx(np.radians(30) - np.arcsin(1 / 1.5))
+    assert np.isnan(none).all()
     assert view.floor_point(2.0, 0.0) == pytest.approx([np.sqrt(3), 0.0])
-    q = view.floor_points(np.array([1.5]), np.array([0.0]))
-    _, _, e = ranges_azimuths_elevations(q)
-    assert e[0] == pytest.approx(np.radians(30) - np.arcsin(1 / 1.5))
+    assert view.floor_point(0.9, 0.0) is None
 
 
 @given(st.floats(0.5, 1.2), angles, st.floats(0.2, 0.9), st.floats(1.3, 2.5), angles)
@@ -69,11 +69,6 @@ def test_a_sonar_hung_upside_down_sees_the_same_floor_mirrored(height, roll, pit
     np.testing.assert_allclose(inverted.floor_points(np.array([r]), np.array([-a]))[0], q * [1, -1, -1], atol=1e-9)
 
 
-def test_what_is_nearer_than_the_floor_has_no_floor_point():
-    assert view_of(1.0, 0.0, 0.5).floor_point(0.9, 0.0) is None
-    assert np.isnan(view_of(1.0, 0.0, 0.5).floor_points(np.array([0.9]), np.array([0.1]))).all()
-
-
 @given(st.floats(-3, 3), angles, st.floats(0.2, 0.9))
 def test_heading_drops_out_of_a_view_from_a_pose(yaw, roll, pitch):
     pose = gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, yaw), np.array([3.0, -2.0, -0.7]))
@@ -82,25 +77,20 @@ def test_heading_drops_out_of_a_view_from_a_pose(yaw, roll, pitch):
     assert np.allclose(view.level_R_sonar, expected.level_R_sonar, atol=1e-9)
 
 
-@pytest.mark.parametrize("height", [0.0, -1.0, np.nan])
-def test_a_sonar_must_be_above_the_floor(height):
-    with pytest.raises(CalibrationError, match="height_m"):
-        view_of(height, 0.0, 0.5)
-
-
-def test_a_vertical_centre_beam_is_refused():
-    with pytest.raises(CalibrationError, match="vertical"):
-        view_of(1.0, 0.0, np.pi / 2)
+@pytest.mark.parametrize(
+    ("height", "pitch", "words"),
+    [(0.0, 0.5, "height_m"), (-1.0, 0.5, "height_m"), (np.nan, 0.5, "height_m"), (1.0, np.pi / 2, "vertical")],
+)
+def test_a_sonar_must_be_above_the_floor_and_not_look_straight_down(height, pitch, words):
+    with pytest.raises(CalibrationError, match=words):
+        view_of(height, 0.0, pitch)
 
 
 def test_covariance_of_a_point_is_that_of_many_samples():
-    rng = np.random.default_rng(1)
-    R = np.array([[4e-4, 2e-5], [2e-5, 1e-4]])
-    ra = rng.multivariate_normal([2.0, 0.2], R, 200_000)
-    e = rng.uniform(-0.06, 0.06, 200_000)
+    rng, R = np.random.default_rng(1), np.array([[4e-4, 2e-5], [2e-5, 1e-4]])
+    ra, e = rng.multivariate_normal([2.0, 0.2], R, 200_000), rng.uniform(-0.06, 0.06, 200_000)
     sampled = np.cov(points(ra[:, 0], ra[:, 1], e).T)
-    centre = points(np.array([2.0]), np.array([0.2]))
-    found = point_covariances(centre, R, np.array([elevation_sigma(0.12)]))[0]
+    found = point_covariances(point(2.0, 0.2), R, np.array([elevation_sigma(0.12)]))[0]
     assert np.allclose(found, sampled, atol=0.02 * np.abs(sampled).max())
 
 
@@ -129,23 +119,16 @@ def test_a_log_with_equally_spaced_beams_is_put_right_by_the_lens():
 
 
 def test_a_lens_keeps_the_order_of_the_beams():
-    leftmost_first = with_lens(frames_of(DIDSON.linear_azimuths_rad()[::-1]), "didson")
-    assert np.allclose(leftmost_first.azimuths_rad, DIDSON.azimuths_rad()[::-1], atol=1e-5)
+    told = frames_of(DIDSON.linear_azimuths_rad()[::-1])
+    assert with_lens(told, "as-logged") is told
+    assert np.allclose(with_lens(told, "didson").azimuths_rad, DIDSON.azimuths_rad()[::-1], atol=1e-5)
     assert len(with_lens(frames_of(np.linspace(-0.25, 0.25, 48)), "didson").azimuths_rad) == 48
     aris = with_lens(frames_of(np.linspace(-0.25, 0.25, 128)), "aris").azimuths_rad
     assert (np.diff(aris) > 0).all()
     assert np.degrees(aris[-1]) == pytest.approx(14.7, abs=0.1)
-
-
-def test_without_a_lens_frames_are_as_logged():
-    told = frames_of(DIDSON.linear_azimuths_rad())
-    assert with_lens(told, "as-logged") is told
-
-
-@pytest.mark.parametrize("lens", ["didson", "aris"])
-def test_a_number_of_beams_that_no_table_has_is_refused(lens):
-    with pytest.raises(CalibrationError, match=f"no table of {lens} has 50 beams"):
-        with_lens(frames_of(np.linspace(-0.2, 0.2, 50)), lens)
+    for lens in ("didson", "aris"):
+        with pytest.raises(CalibrationError, match=f"no table of {lens} has 50 beams"):
+            with_lens(frames_of(np.linspace(-0.2, 0.2, 50)), lens)
 
 
 @pytest.mark.parametrize("turned", [1, -1])

@@ -13,7 +13,7 @@ from sonar_graph.errors import MeasurementError
 from sonar_graph.sonar.track_filter import Expected, SonarStep, TrackStates, corrected
 from sonar_graph.sonar.tracker import Tracker, TrackingParams
 
-from .candidate_rows import WINDOW, candidates_at
+from .polar_images import WINDOW, candidates_at
 
 FRAME_NS = 100_000_000
 STILL = SonarStep.none()
@@ -36,6 +36,10 @@ def run(tracker, frames, step=STILL):
     ]
 
 
+def polar(point) -> tuple[float, float]:
+    return float(np.linalg.norm(point)), float(np.arctan2(point[1], point[0]))
+
+
 def track_at(q, P) -> TrackStates:
     return TrackStates(np.array([0]), np.array([q]), np.array([P]), np.array([0.5]), np.array([1]))
 
@@ -46,7 +50,7 @@ def test_the_association_is_a_distribution_and_forgets_the_order_of_candidates(c
     rng, (r, a) = np.random.default_rng(seed), (((1.8, 2.0), 0.06) if is_crowded else ((1.3, 2.5), 0.24))
     frames = [list(zip(rng.uniform(*r, n), rng.uniform(-a, a, n), strict=True)) for n in counts]
     shuffled = [[seen[i] for i in rng.permutation(len(seen))] for seen in frames]
-    pairs = list(zip(run(Tracker(), frames), run(Tracker(), shuffled), strict=True))
+    pairs, numbers = list(zip(run(Tracker(), frames), run(Tracker(), shuffled), strict=True)), []
     for found, _ in pairs:
         assert found.matrix.shape == (len(found.track_ids), len(found.previous_ids) + 1)
         assert (found.matrix >= 0).all()
@@ -55,6 +59,10 @@ def test_the_association_is_a_distribution_and_forgets_the_order_of_candidates(c
         goes_on = np.isin(found.track_ids, found.previous_ids)
         assert (found.matrix[goes_on, -1] == 0).all()  # only a track that starts can be new
         assert (found.matrix[~goes_on, -1] > 0).all()
+        numbers += found.track_ids[~goes_on].tolist()
+        assert len(set(numbers)) == len(numbers)  # numbers are not used twice
+        taken = found.candidate[found.candidate >= 0]
+        assert len(np.unique(taken)) == len(taken)  # one candidate serves one track
     one, other = (
         (found.position_m[order], found.existence[order], found.matrix[order, -1])
         for found in pairs[-1]
@@ -67,9 +75,7 @@ def test_the_association_is_a_distribution_and_forgets_the_order_of_candidates(c
 def test_association_is_the_ratio_of_densities_by_hand():
     """Two tracks side by side, each seen again where it was; what may be of something new leaves a track itself."""
     params = TrackingParams(drift_m=0.0, lifetime_s=1e12)
-    tracker = Tracker(params)
-    run(tracker, [[(2.0, 0.0), (2.0, 0.03)]])
-    found = tracker.step(candidates_at([2.0, 2.0], [0.0, 0.03]), STILL, 2 * FRAME_NS)
+    found = run(Tracker(params), [[(2.0, 0.0), (2.0, 0.03)]] * 2)[-1]
     var_r, var_a = 2 * params.range_sigma_m**2, 2 * params.azimuth_sigma_rad**2
     own = 0.1 / 0.6 * 0.9 / (2 * np.pi * np.sqrt(var_r * var_a))
     other, none = own * np.exp(-0.5 * 0.03**2 / var_a), 0.6 / AREA
@@ -80,17 +86,13 @@ def test_association_is_the_ratio_of_densities_by_hand():
 def test_existence_is_the_ratio_of_densities_by_hand():
     """One track, one candidate 2 cm behind it."""
     params = TrackingParams(drift_m=0.0, lifetime_s=1e12)
-    tracker = Tracker(params)
-    run(tracker, [[(2.0, 0.0)]])
-    found = tracker.step(candidates_at([2.02], [0.0]), STILL, 2 * FRAME_NS)
+    found = run(Tracker(params), [[(2.0, 0.0)], [(2.02, 0.0)]])[-1]
     # The track starts with the noise of one candidate, and the next one adds its own: twice the variance.
     var_r, var_a = 2 * params.range_sigma_m**2, 2 * params.azimuth_sigma_rad**2
     density = np.exp(-0.5 * 0.02**2 / var_r) / (2 * np.pi * np.sqrt(var_r * var_a))
-    birth = 0.1 / 0.6
-    likelihood = 0.1 + 0.9 * density * AREA / 0.5
+    birth, likelihood = 0.1 / 0.6, 0.1 + 0.9 * density * AREA / 0.5
     assert found.existence[0] == pytest.approx(birth * likelihood / (1 - birth + birth * likelihood), rel=1e-6)
-    # Halfway between two equally certain places.
-    assert found.position_m[0] == pytest.approx([2.01, 0.0, 0.0], abs=1e-9)
+    assert found.position_m[0] == pytest.approx([2.01, 0.0, 0.0], abs=1e-9)  # between two equally certain places
 
 
 @pytest.mark.parametrize(
@@ -135,8 +137,8 @@ def test_motion_is_what_makes_a_track_persist(is_compensated):
     step, point = moved_by(0.05, 0.03, 0.05), np.array([2.3, 0.5, 0.0])
     tracker, ids = Tracker(), []
     for k in range(6):
-        candidates = candidates_at([float(np.linalg.norm(point))], [float(np.arctan2(point[1], point[0]))])
-        found = tracker.step(candidates, step if is_compensated else STILL, (k + 1) * FRAME_NS)
+        r, a = polar(point)
+        found = tracker.step(candidates_at([r], [a]), step if is_compensated else STILL, (k + 1) * FRAME_NS)
         ids.append(int(found.track_ids[found.candidate >= 0][0]))
         point = step.previous_T_sonar.transformTo(point)
     assert (len(set(ids)) == 1) is is_compensated
@@ -146,51 +148,37 @@ def test_motion_is_what_makes_a_track_persist(is_compensated):
 
 @pytest.mark.parametrize("skipped", [1, 3])
 def test_skipped_frames_move_the_tracks_too(skipped: int):
-    step, point = moved_by(0.1, 0.0, 0.04), np.array([2.2, 0.1, 0.0])
-    tracker = Tracker()
-    run(tracker, [[(float(np.linalg.norm(point)), float(np.arctan2(point[1], point[0])))]])
-    moved = step.previous_T_sonar.transformTo(point)
+    step, point, tracker = moved_by(0.1, 0.0, 0.04), np.array([2.2, 0.1, 0.0]), Tracker()
+    run(tracker, [[polar(point)]])
     for _ in range(skipped):
         tracker.skip(step)
-        moved = step.previous_T_sonar.transformTo(moved)
-    candidates = candidates_at([float(np.linalg.norm(moved))], [float(np.arctan2(moved[1], moved[0]))])
-    found = tracker.step(candidates, step, 3 * FRAME_NS)
-    assert found.track_ids.tolist() == [0]
-    assert found.position_m[0] == pytest.approx(moved, abs=1e-6)
-    # The skipped motion counts once.
-    later = tracker.step(candidates, STILL, 4 * FRAME_NS)
-    assert later.position_m[0] == pytest.approx(moved, abs=1e-6)
+        point = step.previous_T_sonar.transformTo(point)
+    point = step.previous_T_sonar.transformTo(point)
+    r, a = polar(point)
+    for number, motion in ((3, step), (4, STILL)):  # the skipped motion counts once
+        found = tracker.step(candidates_at([r], [a]), motion, number * FRAME_NS)
+        assert found.track_ids.tolist() == [0]
+        assert found.position_m[0] == pytest.approx(point, abs=1e-6)
 
 
 def test_steps_join_as_samples_of_them_do():
-    rng = np.random.default_rng(8)
-    one, two = moved_by(0.3, 0.1, 0.4), moved_by(-0.1, 0.2, -0.9)
-    one, two = (SonarStep(step.previous_T_sonar, CORRELATED) for step in (one, two))
-    joined = one.then(two)
-    noise = rng.multivariate_normal(np.zeros(12), np.kron(np.eye(2), one.covariance), 8_000)
-    tangents = [
-        joined.previous_T_sonar.localCoordinates(
-            one.previous_T_sonar.retract(n[:6]).compose(two.previous_T_sonar.retract(n[6:]))
-        )
-        for n in noise
-    ]
-    assert np.allclose(np.cov(np.array(tangents).T), joined.covariance, atol=0.05 * joined.covariance.max())
+    one, two = (SonarStep(moved_by(*by).previous_T_sonar, CORRELATED) for by in ((0.3, 0.1, 0.4), (-0.1, 0.2, -0.9)))
+    first, second, joined = one.previous_T_sonar, two.previous_T_sonar, one.then(two)
+    noise = np.random.default_rng(8).multivariate_normal(np.zeros(12), np.kron(np.eye(2), CORRELATED), 8_000)
+    sampled = [first.retract(n[:6]).compose(second.retract(n[6:])) for n in noise]
+    tangents = np.array([joined.previous_T_sonar.localCoordinates(pose) for pose in sampled])
+    assert np.allclose(np.cov(tangents.T), joined.covariance, atol=0.05 * joined.covariance.max())
 
 
 def test_covariance_of_a_moved_track_is_that_of_samples_and_of_its_drift():
-    rng = np.random.default_rng(9)
-    step = SonarStep(moved_by(0.3, 0.1, 0.4).previous_T_sonar, CORRELATED)
+    rng, step = np.random.default_rng(9), SonarStep(moved_by(0.3, 0.1, 0.4).previous_T_sonar, CORRELATED)
     q, P = np.array([2.0, 0.3, -0.2]), np.diag([1e-3, 2e-3, 4e-3])
-    tracks = track_at(q, P)
-    found = tracks.moved(step, 0.02)
-    points = rng.multivariate_normal(q, P, 8_000)
-    noise = rng.multivariate_normal(np.zeros(6), step.covariance, 8_000)
-    pairs = zip(noise, points, strict=True)
-    sampled = [step.previous_T_sonar.retract(n).transformTo(p) for n, p in pairs]
+    found, rested = (track_at(q, P).moved(motion, 0.02) for motion in (step, STILL))
+    points, noise = rng.multivariate_normal(q, P, 8_000), rng.multivariate_normal(np.zeros(6), step.covariance, 8_000)
+    sampled = [step.previous_T_sonar.retract(n).transformTo(p) for n, p in zip(noise, points, strict=True)]
     assert np.allclose(found.position_m[0], np.mean(sampled, axis=0), atol=1e-2)
     expected = np.cov(np.array(sampled).T) + 0.02**2 * np.eye(3)
     assert np.allclose(found.position_cov[0], expected, atol=0.06 * found.position_cov.max())
-    rested = tracks.moved(STILL, 0.02)
     assert rested.position_cov[0] == pytest.approx(P + 0.02**2 * np.eye(3))
 
 
@@ -247,20 +235,9 @@ def test_what_leaves_the_image_ends_and_is_not_held_against_it():
     assert "left the image" in out.ended_reasons + gone.ended_reasons
 
 
-def test_one_candidate_serves_one_track_and_numbers_are_not_used_twice():
-    tracker = Tracker()
-    frames = [[(2.0, 0.0), (2.05, 0.0)], [(2.02, 0.0)], [(2.0, 0.0), (2.05, 0.0)], [(1.4, 0.2)]]
-    numbers = []
-    for found in run(tracker, frames):
-        taken = found.candidate[found.candidate >= 0]
-        assert len(set(taken.tolist())) == len(taken)
-        numbers += [number for number in found.track_ids.tolist() if number not in found.previous_ids]
-    assert len(set(numbers)) == len(numbers)
-
-
 @pytest.mark.parametrize("later_ns", [0, -1])
 def test_frames_that_are_not_later_are_refused(later_ns):
     tracker = Tracker()
-    tracker.step(candidates_at([2.0], [0.0]), None, FRAME_NS)
+    run(tracker, [[(2.0, 0.0)]])
     with pytest.raises(MeasurementError, match="not later"):
         tracker.step(candidates_at([2.0], [0.0]), STILL, FRAME_NS + later_ns)

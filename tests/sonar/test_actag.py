@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import sys
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any, ClassVar
 
 import gtsam
@@ -57,6 +57,11 @@ def noise(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 200, (96, 512)).astype(np.uint8)
 
 
+def at_once(settings: AcTagSettings | None = None) -> AcTagRecogniser:
+    """Reports a tag from the first frame on."""
+    return AcTagRecogniser(Calibration(), settings or AcTagSettings(least_frames=1))
+
+
 def test_a_bright_spot_stays_where_it_is_though_beams_are_not_equally_spaced():
     spot_m, spot_rad = 1.9, np.radians(7.0)
     beams, bins = np.meshgrid(AZIMUTHS_RAD, RANGES_M, indexing="ij")
@@ -69,24 +74,16 @@ def test_a_bright_spot_stays_where_it_is_though_beams_are_not_equally_spaced():
     assert abs(as_if_even - spot_rad) > np.radians(0.8)
 
 
-def test_the_farthest_range_and_the_leftmost_beam_come_first_and_pixels_are_square():
-    _, rows_m, columns_rad = evenly_sampled(noise().astype(np.float32), RANGES_M, AZIMUTHS_RAD, 0.005)
-    assert rows_m[0] == RANGES_M[-1]
-    assert rows_m[-1] == RANGES_M[0]
+def test_the_farthest_range_and_the_leftmost_beam_come_first_and_pixels_are_square_means_over_their_bins():
+    image = noise().astype(np.float32)
+    forth, rows_m, columns_rad = evenly_sampled(image, RANGES_M, AZIMUTHS_RAD, 0.005)
+    back, *_ = evenly_sampled(image[::-1].copy(), RANGES_M, AZIMUTHS_RAD[::-1], 0.005)
+    np.testing.assert_allclose(forth, back, atol=1e-3)
+    assert (rows_m[0], rows_m[-1]) == (RANGES_M[-1], RANGES_M[0])
     assert columns_rad[0] == pytest.approx(-columns_rad[-1])
     assert columns_rad[0] == np.abs(AZIMUTHS_RAD).max()
     assert -np.diff(rows_m)[0] == pytest.approx(0.005, rel=0.02)
     assert -np.diff(columns_rad)[0] * RANGES_M.mean() == pytest.approx(0.005, rel=0.02)
-
-
-def test_beams_in_reverse_order_give_the_same_picture():
-    image = noise().astype(np.float32)
-    forth, *_ = evenly_sampled(image, RANGES_M, AZIMUTHS_RAD, 0.005)
-    back, *_ = evenly_sampled(image[::-1].copy(), RANGES_M, AZIMUTHS_RAD[::-1], 0.005)
-    np.testing.assert_allclose(forth, back, atol=1e-3)
-
-
-def test_bins_are_averaged_over_a_pixel():
     speckle = np.random.default_rng(0).normal(0, 5.6, (96, 512)).astype(np.float32)
     fine, coarse = (evenly_sampled(speckle, RANGES_M, AZIMUTHS_RAD, pixel_m)[0].std() for pixel_m in (0.0024, 0.0098))
     assert coarse < 0.6 * fine
@@ -95,76 +92,59 @@ def test_bins_are_averaged_over_a_pixel():
 def test_a_decoded_tag_becomes_a_detection_of_its_centre(decoder):
     corners = np.array([[1.9, 0.10], [2.0, 0.11], [2.02, 0.02], [1.92, 0.01]])
     decoder.found = [[3, corners * 0, corners]]
-    recogniser = AcTagRecogniser(Calibration(), AcTagSettings(probability=0.97, range_sigma_m=0.02, least_frames=1))
+    recogniser = at_once(AcTagSettings(probability=0.97, range_sigma_m=0.02, least_frames=1))
     found = recogniser.process(frame_of(noise()))
-    assert found is not None
-    assert found.range_m == pytest.approx([1.96])
-    assert found.azimuth_rad == pytest.approx([0.06])
-    assert found.candidate_ids.tolist() == [[3]]
-    assert found.id_probability.tolist() == [[0.97]]
+    assert (found.range_m, found.azimuth_rad) == (pytest.approx([1.96]), pytest.approx([0.06]))
+    assert (found.candidate_ids.tolist(), found.id_probability.tolist()) == ([[3]], [[0.97]])
     assert found.range_azimuth_cov[0] == pytest.approx(np.diag([0.02**2, 0.001**2]))
     assert found.stamps_ns.tolist() == [5]
     assert [fate.outcome for fate in recogniser.fates] == [REPORTED]
-    assert decoder.settings["min_range"] == pytest.approx(RANGES_M[0])
-    assert decoder.settings["max_range"] == pytest.approx(RANGES_M[-1])
-    assert decoder.settings["horizontal_aperture"] == pytest.approx(2 * np.abs(AZIMUTHS_RAD).max())
+    given = [decoder.settings[name] for name in ("min_range", "max_range", "horizontal_aperture")]
+    assert given == pytest.approx([RANGES_M[0], RANGES_M[-1], 2 * np.abs(AZIMUTHS_RAD).max()])
     assert decoder.image.shape == pytest.approx([1.25 / 0.00544, 0.497 * 1.885 / 0.00544], rel=0.01)
 
 
 def test_a_tag_is_reported_once_a_frame(decoder):
-    corners = np.full((4, 2), [2.0, 0.0])
+    corners, recogniser = np.full((4, 2), [2.0, 0.0]), at_once()
     decoder.found = [[3, corners, corners], [3, corners, corners + 0.1], [4, corners, corners]]
-    recogniser = AcTagRecogniser(Calibration(), AcTagSettings(least_frames=1))
-    found = recogniser.process(frame_of(noise()))
-    assert found is not None
-    assert found.candidate_ids.ravel().tolist() == [3, 4]
+    assert recogniser.process(frame_of(noise())).candidate_ids.ravel().tolist() == [3, 4]
     assert [fate.outcome for fate in recogniser.fates].count(REPORTED) == 2
     assert any("already" in fate.outcome for fate in recogniser.fates)
 
 
-def reported(decoder: type[Decoder], ranges_m: list[float], ahead_m: list[float]) -> list[bool]:
-    """Whether tag 3 is reported in each frame, decoded at these ranges after these motions ahead."""
-    recogniser, found = AcTagRecogniser(Calibration()), []
+@pytest.mark.parametrize(
+    ("ranges_m", "ahead_m", "expected"),
+    [
+        ([2.3, 1.5, 2.3], [0.0, 0.8, -0.8], [False, True, True]),
+        ([2.3, 1.5, 1.5], [0.0, 0.0, 0.0], [False, False, True]),
+        ([2.0, 2.0, 2.0], [0.0, 1.0, 1.0], [False, False, False]),
+    ],
+)
+def test_a_tag_is_reported_when_it_was_decoded_twice_in_one_place(decoder, ranges_m, ahead_m, expected):
+    """Decoded at these ranges after these motions ahead."""
+    recogniser, is_reported = AcTagRecogniser(Calibration()), []
     for n, (range_m, moved_m) in enumerate(zip(ranges_m, ahead_m, strict=True)):
         decoder.found = [[3, np.zeros((4, 2)), np.tile([range_m, 0.0], (4, 1))]]
         step = SonarStep(gtsam.Pose3(gtsam.Rot3(), np.array([moved_m, 0.0, 0.0])), np.zeros((6, 6)))
-        found.append(recogniser.process(frame_of(noise(n), n), step) is not None)
-    return found
+        is_reported.append(recogniser.process(frame_of(noise(n), n), step) is not None)
+    assert is_reported == expected
 
 
-def test_a_tag_is_reported_when_it_was_decoded_twice_in_one_place(decoder):
-    assert reported(decoder, [2.3, 1.5, 2.3], [0.0, 0.8, -0.8]) == [False, True, True]
-
-
-def test_a_tag_that_does_not_stay_where_it_was_is_not_reported(decoder):
-    assert reported(decoder, [2.3, 1.5, 1.5], [0.0, 0.0, 0.0]) == [False, False, True]
-    assert reported(decoder, [2.0, 2.0, 2.0], [0.0, 1.0, 1.0]) == [False, False, False]
-
-
-def test_a_frame_without_tags_gives_nothing(decoder):
-    assert AcTagRecogniser(Calibration()).process(frame_of(noise())) is None
-
-
-def test_a_frame_that_must_not_be_used_is_not_shown_to_actag(decoder):
+def test_frames_that_must_not_be_used_are_not_shown_to_actag_and_one_without_tags_gives_nothing(decoder):
     recogniser = AcTagRecogniser(Calibration())
-    assert recogniser.process(frame_of(np.zeros((96, 512), np.uint8))) is None
-    assert decoder.image is None
-    assert "zero" in recogniser.fates[0].outcome
-
-
-def test_a_block_of_two_frames_is_refused_and_not_shown_to_actag(decoder):
     block = SonarFrames(np.array([5, 6]), np.stack([noise(1), noise(2)]), RANGES_M, AZIMUTHS_RAD)
     with pytest.raises(MeasurementError, match=r"a block of 2 frames; give blocks of one"):
-        AcTagRecogniser(Calibration()).process(block)
+        recogniser.process(block)
+    assert recogniser.process(frame_of(np.zeros((96, 512), np.uint8))) is None
+    assert "zero" in recogniser.fates[0].outcome
     assert decoder.image is None
+    assert recogniser.process(frame_of(noise())) is None
+    assert decoder.image is not None
 
 
-def test_an_unknown_family_is_refused_by_name(decoder):
+def test_an_unknown_family_and_a_missing_package_are_named(decoder, monkeypatch):
     with pytest.raises(CalibrationError, match="AcTag99h1"):
         AcTagRecogniser(Calibration(), AcTagSettings(family="AcTag99h1"))
-
-
-def test_without_the_package_the_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "actag", None)
     with pytest.raises(CalibrationError, match=r"sonar-graph\[actag\]"):
         AcTagRecogniser(Calibration())
@@ -174,24 +154,23 @@ def test_without_the_package_the_error_names_the_extra(monkeypatch):
 def test_actag_itself_reads_tags_in_simulated_frames(tag):
     pytest.importorskip("actag", reason="AcTag has wheels for Linux with Python 3.10 and 3.11 only: extra actag")
     right = 0
-    for frame, truth in (simulated(tag, number) for number in range(3)):
-        found = AcTagRecogniser(Calibration(), AcTagSettings(least_frames=1)).process(frame)
+    for frame, range_m, azimuth_rad in (simulated(tag, number) for number in range(3)):
+        found = at_once().process(frame)
         if found is not None:
             assert found.candidate_ids.ravel().tolist() == [tag]
-            assert found.range_m[0] == pytest.approx(truth.range_m, abs=0.015)
-            assert found.azimuth_rad[0] == pytest.approx(truth.azimuth_rad, abs=0.004)
+            assert found.range_m[0] == pytest.approx(range_m, abs=0.015)
+            assert found.azimuth_rad[0] == pytest.approx(azimuth_rad, abs=0.004)
             right += 1
     assert right >= 2
 
 
-def simulated(tag: int, number: int) -> tuple[SonarFrames, SimpleNamespace]:
-    """A tag on the floor of a basin, seen from a height of 0.95 m, and where it is."""
+def simulated(tag: int, number: int) -> tuple[SonarFrames, float, float]:
+    """A tag on the floor of a basin, seen from a height of 0.95 m, and its range and azimuth."""
     rng = np.random.default_rng([tag, number])
     floor_m, centre_m = -1.7, np.array([11.7, 7.0 + rng.uniform(-0.1, 0.1), -1.687])
     design = place_landmark(tag_design(FAMILY, tag, 0.1306), centre_m, rng.uniform(-np.pi, np.pi), floor_m)
     simulator = FrameSimulator(ImageOptions(), [design], floor_m, seed=tag)
     sonar_m = np.array([10.0 + 0.1 * (number - 1), 7.0, floor_m + 0.95])
     world_R_sonar = Rotation.from_euler("ZYX", [0, np.radians(30), 0])
-    image = simulator.frame(sonar_m, world_R_sonar, number, 0.0)
-    q = world_R_sonar.inv().apply(centre_m - sonar_m)
-    return frame_of(image), SimpleNamespace(range_m=np.linalg.norm(q), azimuth_rad=np.arctan2(q[1], q[0]))
+    x, y, z = world_R_sonar.inv().apply(centre_m - sonar_m)
+    return frame_of(simulator.frame(sonar_m, world_R_sonar, number, 0.0)), np.hypot(np.hypot(x, y), z), np.arctan2(y, x)
