@@ -3,12 +3,11 @@
 # fmt: off
 from sonar_graph.logs.convert.akit import read_akit
 from sonar_graph.logs.convert.didson_aris import convert_aris, convert_didson
-from sonar_graph.logs.convert.dlr import read_dlr
 from sonar_graph.logs.convert.mrclam import read_mrclam
 from sonar_graph.logs.convert.oculus import convert_oculus
 from sonar_graph.logs.convert.rosbag import convert_rosbag
 from sonar_graph.logs.convert.sonar_file import SonarConversion
-from sonar_graph.logs.convert.victoria_park import read_victoria_park
+from sonar_graph.logs.convert.step_files import read_dlr, read_victoria_park
 
 __all__ = [
     "SonarConversion", "convert_aris", "convert_didson", "convert_oculus", "convert_rosbag",

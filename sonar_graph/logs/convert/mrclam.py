@@ -20,27 +20,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import (
-    Calibration,
-    DvlCalibration,
-    FloorPrior,
-    ImuCalibration,
-    PlanarMotion,
-    SonarCalibration,
-    Start,
-)
-from sonar_graph.logs.convert.planar import (
-    FLOOR_SIGMA_M,
-    VERTICAL_VELOCITY_SIGMA_M_S,
-    planar_dvl,
-    planar_imu,
-    planar_trajectory,
-)
+from sonar_graph.calibration import SonarCalibration, Start
+from sonar_graph.logs.convert.planar import VERTICAL_VELOCITY_SIGMA_M_S, planar_calibration, planar_dvl, planar_imu
 from sonar_graph.logs.convert.text_tables import NumberTable, numbered_run, read_table
 from sonar_graph.measurements import Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
-from sonar_graph.states import LandmarkMap
+from sonar_graph.states import LandmarkMap, Trajectory
 
 ROBOT_SUBJECTS = frozenset(range(1, 6))
 # The same for every robot; estimated from robots 1 to 5 of set 6 against motion capture (docs/theory/datasets.md).
@@ -48,9 +35,8 @@ FORWARD_NOISE_M_SQRT_S = 0.02
 """Wheel slip along the heading: the sigma of the distance over T is this times sqrt(T)."""
 SIDEWAYS_NOISE_M_SQRT_S = 0.005
 """Wheel slip across the heading."""
-GYRO_NOISE_DENSITY = 0.04
-GYRO_BIAS_SIGMA_RAD_S = 0.003
-GYRO_BIAS_WALK_DENSITY = 1e-5
+GYRO = (0.04, 0.003, 1e-5)
+"""Noise density, bias sigma in rad/s, bias walk density."""
 RANGE_SIGMA_M = 0.18
 AZIMUTH_SIGMA_RAD = 0.0125
 TYPICAL_INTERVAL_S = 0.0145
@@ -89,7 +75,9 @@ def read_mrclam(dataset_dir: Path, robot: int) -> Sequence:
     if Path(f"{prefix}_Groundtruth.dat").exists():
         table = read_table(Path(f"{prefix}_Groundtruth.dat"), ("time", "x", "y", "orientation"))
         stamps_ns, rows = np.unique(table.stamps_ns(), return_index=True)
-        truth = planar_trajectory(stamps_ns, table.values[rows, 1:])
+        x_m, y_m, heading_rad = table.values[rows, 1:].T
+        quaternions = Rotation.from_euler("z", heading_rad[:, None]).as_quat()
+        truth = Trajectory.without_covariances(stamps_ns, np.column_stack([x_m, y_m, np.zeros(len(rows))]), quaternions)
         start_ns = int(imu.stamps_ns[0])
         if truth.stamps_ns[0] <= start_ns <= truth.stamps_ns[-1]:
             pose = truth.at(np.array([start_ns]))
@@ -107,19 +95,11 @@ def read_mrclam(dataset_dir: Path, robot: int) -> Sequence:
     sideways_sigma_m_s = float(SIDEWAYS_NOISE_M_SQRT_S / per_sample)
     return Sequence(
         name=f"{dataset_dir.resolve().name}_robot{robot}",
-        calibration=Calibration(
-            imu=ImuCalibration(
-                gyro_noise_density=GYRO_NOISE_DENSITY,
-                gyro_bias_sigma=GYRO_BIAS_SIGMA_RAD_S,
-                gyro_bias_walk_density=GYRO_BIAS_WALK_DENSITY,
-            ),
-            dvl=DvlCalibration(velocity_sigma_m_s=(forward_sigma_m_s, sideways_sigma_m_s, VERTICAL_VELOCITY_SIGMA_M_S)),
-            sonar=SonarCalibration(range_sigma_m=RANGE_SIGMA_M, azimuth_sigma_rad=AZIMUTH_SIGMA_RAD),
-            start=start or Start(),
-            floor=FloorPrior(z_m=0.0, sigma_m=FLOOR_SIGMA_M),
-            planar=PlanarMotion(),
-            use_gravity=False,
-            odometry_interpolation="hold-past",
+        calibration=planar_calibration(
+            GYRO,
+            (forward_sigma_m_s, sideways_sigma_m_s, VERTICAL_VELOCITY_SIGMA_M_S),
+            SonarCalibration(range_sigma_m=RANGE_SIGMA_M, azimuth_sigma_rad=AZIMUTH_SIGMA_RAD),
+            start,
         ),
         imu=imu,
         dvl=dvl,

@@ -1,7 +1,7 @@
 """Planar robots as vehicles whose Doppler log measures (v_x, v_y, 0) and whose gyro measures (0, 0, ω).
 
-A step of odometry ``(dx, dy, dθ)`` becomes the constant twist that makes it in the step's duration T, the logarithm of
-SE(2). With ``p = V(dθ) v T`` and ``V`` the left Jacobian of SO(2)::
+A file of steps has no times: each step ``(dx, dy, dθ)`` takes T = 1 s here, and becomes the constant twist that makes
+it, the logarithm of SE(2). With ``p = V(dθ) v T`` and ``V`` the left Jacobian of SO(2)::
 
     ω = dθ / T
     v = V(dθ)^-1 (dx, dy) / T,    V(θ)^-1 = [[h, θ/2], [-θ/2, h]],    h = (θ/2) / tan(θ/2)
@@ -11,13 +11,21 @@ Held over the step, it composes to the step exactly. See ``docs/theory/datasets.
 
 from __future__ import annotations
 
-import numpy as np
-from scipy.spatial.transform import Rotation
+from collections.abc import Mapping
 
-from sonar_graph.calibration import Calibration, DvlCalibration, FloorPrior, ImuCalibration, PlanarMotion
+import numpy as np
+
+from sonar_graph.calibration import (
+    Calibration,
+    DvlCalibration,
+    FloorPrior,
+    ImuCalibration,
+    PlanarMotion,
+    SonarCalibration,
+    Start,
+)
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints, LandmarkDetections
-from sonar_graph.sequence import NS_PER_S
-from sonar_graph.states import Trajectory
+from sonar_graph.sequence import NS_PER_S, Sequence
 
 FLOOR_SIGMA_M = 1e-3
 """Sigma of a landmark's height over the plane in which it was measured."""
@@ -27,54 +35,32 @@ VERTICAL_VELOCITY_SIGMA_M_S = 1e-3
 """Sigma of the vertical velocity, which is zero by construction; the planar prior does the rest."""
 
 
-def inverse_left_jacobian(angle_rad: Floats) -> Floats:
-    """V(θ)^-1 for angles within (-2π, 2π), shape (n, 2, 2)."""
-    half = 0.5 * angle_rad
-    small = np.abs(angle_rad) < SMALL_ANGLE_RAD
-    h = np.where(small, 1.0 - angle_rad**2 / 12.0, half / np.tan(np.where(small, 1.0, half)))
-    return np.stack([np.stack([h, half], -1), np.stack([-half, h], -1)], -2)
+def twists_of_steps(steps: Floats, covs: Floats) -> tuple[Floats, Floats, Floats]:
+    """Velocity, its covariance, and rate that make the steps in a second.
 
-
-def twists_of_steps(steps: Floats, duration_s: float) -> tuple[Floats, Floats]:
-    """Velocity (n, 2), m/s, and rate (n,), rad/s, that held for ``duration_s`` make the steps (dx, dy, dθ), (n, 3)."""
-    V_inverse = inverse_left_jacobian(steps[:, 2])
-    return np.einsum("nij,nj->ni", V_inverse, steps[:, :2]) / duration_s, steps[:, 2] / duration_s
-
-
-def velocity_cov_of_steps(steps: Floats, covs: Floats, duration_s: float) -> Floats:
-    """Covariance of the steps' velocity given their turn, shape (n, 2, 2), m²/s².
-
-    ``V^-1 S V^-T / T²`` with S the covariance of (dx, dy). The correlation with the turn is left out, since the two
-    sensors are independent.
-    """
-    V_inverse = inverse_left_jacobian(steps[:, 2]) / duration_s
-    return V_inverse @ covs[:, :2, :2] @ np.swapaxes(V_inverse, -1, -2)
-
-
-def step_stamps_ns(steps: int, step_s: int) -> Ints:
-    """Stamps 0, step, 2 step, ... of the poses before, between and after the steps, shape (steps + 1,)."""
-    return np.arange(steps + 1, dtype=np.int64) * (step_s * NS_PER_S)
-
-
-def stepped_odometry(steps: Floats, covs: Floats, step_s: int) -> tuple[Imu, Dvl]:
-    """Sensor rows at the end of each step, after a row without motion at 0.
+    The covariance is that of the velocity given the turn, ``V^-1 S V^-T / T²`` with S the covariance of (dx, dy). The
+    correlation with the turn is left out, since the two sensors are independent.
 
     Parameters
     ----------
     steps
-        (dx, dy, dθ) in the frame before the step (x forward, y left), shape (n, 3), metres and radians.
+        (dx, dy, dθ) in the frame before the step (x forward, y left), shape (n, 3), metres and radians; turns within
+        (-2π, 2π).
     covs
         Covariances of the steps, shape (n, 3, 3).
-    step_s
-        Duration of a step.
+
+    Returns
+    -------
+    tuple
+        (v_x, v_y), shape (n, 2), m/s; its covariance, shape (n, 2, 2), m²/s²; ω, shape (n,), rad/s.
     """
-    velocity, rate = twists_of_steps(steps, float(step_s))
-    velocity_cov = velocity_cov_of_steps(steps, covs, float(step_s))
-    stamps_ns = step_stamps_ns(len(steps), step_s)
-    return (
-        planar_imu(stamps_ns, np.concatenate([[0.0], rate])),
-        planar_dvl(stamps_ns, np.vstack([np.zeros(2), velocity]), np.concatenate([velocity_cov[:1], velocity_cov])),
-    )
+    angle_rad = steps[:, 2]
+    half = 0.5 * angle_rad
+    small = np.abs(angle_rad) < SMALL_ANGLE_RAD
+    h = np.where(small, 1.0 - angle_rad**2 / 12.0, half / np.tan(np.where(small, 1.0, half)))
+    V_inverse = np.stack([np.stack([h, half], -1), np.stack([-half, h], -1)], -2)
+    velocity = np.einsum("nij,nj->ni", V_inverse, steps[:, :2])
+    return velocity, V_inverse @ covs[:, :2, :2] @ np.swapaxes(V_inverse, -1, -2), angle_rad
 
 
 def planar_imu(stamps_ns: Ints, rate_rad_s: Floats) -> Imu:
@@ -93,10 +79,24 @@ def planar_dvl(stamps_ns: Ints, velocity: Floats, velocity_cov: Floats) -> Dvl:
     return Dvl(stamps_ns, np.column_stack([velocity, np.zeros(n)]), cov)
 
 
-def planar_trajectory(stamps_ns: Ints, poses: Floats) -> Trajectory:
-    """Poses (x, y, θ), shape (n, 3), in the plane z = 0."""
-    positions = np.column_stack([poses[:, :2], np.zeros(len(poses))])
-    return Trajectory.without_covariances(stamps_ns, positions, Rotation.from_euler("z", poses[:, 2:]).as_quat())
+def planar_calibration(
+    gyro: tuple[float, float, float],
+    velocity_sigma_m_s: tuple[float, float, float],
+    sonar: SonarCalibration | None = None,
+    start: Start | None = None,
+) -> Calibration:
+    """Calibration of a planar robot from its gyro's noise density, bias sigma and bias walk density, and its DVL's."""
+    density, bias_sigma, walk_density = gyro
+    return Calibration(
+        imu=ImuCalibration(gyro_noise_density=density, gyro_bias_sigma=bias_sigma, gyro_bias_walk_density=walk_density),
+        dvl=DvlCalibration(velocity_sigma_m_s=velocity_sigma_m_s),
+        sonar=sonar or SonarCalibration(),
+        start=start or Start(),
+        floor=FloorPrior(z_m=0.0, sigma_m=FLOOR_SIGMA_M),
+        planar=PlanarMotion(),
+        use_gravity=False,
+        odometry_interpolation="hold-past",
+    )
 
 
 def range_azimuth(points: Floats, covs: Floats) -> tuple[Floats, Floats, Floats]:
@@ -110,36 +110,56 @@ def range_azimuth(points: Floats, covs: Floats) -> tuple[Floats, Floats, Floats]
     return r, np.arctan2(y, x), J @ covs @ np.swapaxes(J, -1, -2)
 
 
-def point_detections(
-    stamps_ns: Ints, points: Floats, covs: Floats, candidate_ids: Ints, id_probability: Floats
-) -> LandmarkDetections:
-    """Detections from points (n, 2) in the body frame (x forward, y left) and their covariances (n, 2, 2)."""
-    ranges, azimuths, polar_covs = range_azimuth(points, covs)
-    return LandmarkDetections(stamps_ns, ranges, azimuths, polar_covs, candidate_ids, id_probability)
+def stepped_sequence(
+    name: str,
+    steps: Floats,
+    step_covs: Floats,
+    poses: list[int],
+    points: Floats,
+    point_covs: Floats,
+    ids: list[list[int]],
+    notes: Mapping[str, str],
+) -> Sequence:
+    """Sequence of a file of steps and of landmarks seen between them; rows at the end of each step, and at rest at 0.
 
+    The turn's noise is one density whose integral over a step has the mean variance of dθ, ``sqrt(mean(c_θθ) / T)``;
+    that of the velocity is in the rows, and in the calibration their root mean square. The gyro has no bias.
 
-def stepped_calibration(dvl: Dvl, step_covs: Floats, step_s: int) -> Calibration:
-    """Calibration of a planar vehicle from the covariances of its steps, without gyro bias.
-
-    The turn's noise is one density whose integral over a step has the mean variance of dθ,
-    ``sqrt(mean(c_θθ) / T)``; that of the velocity is in the rows, and here their root mean square.
+    Parameters
+    ----------
+    steps, step_covs
+        As for `twists_of_steps`.
+    poses
+        Number of steps before each landmark, length m.
+    points, point_covs
+        Landmarks in the body frame (x forward, y left), shape (m, 2), and their covariances, shape (m, 2, 2).
+    ids
+        Equally probable identities of each landmark, length m; negative ones are left out.
     """
+    velocity, velocity_cov, rate_rad_s = twists_of_steps(steps, step_covs)
+    stamps_ns = np.arange(len(steps) + 1, dtype=np.int64) * NS_PER_S
+    dvl = planar_dvl(stamps_ns, np.vstack([np.zeros(2), velocity]), np.concatenate([velocity_cov[:1], velocity_cov]))
     x, y, z = np.sqrt(np.mean(np.diagonal(dvl.velocity_cov, axis1=1, axis2=2), axis=0)).tolist()
-    return Calibration(
-        imu=ImuCalibration(
-            gyro_noise_density=float(np.sqrt(np.mean(step_covs[:, 2, 2]) / step_s)),
-            gyro_bias_sigma=0.0,
-            gyro_bias_walk_density=0.0,
-        ),
-        dvl=DvlCalibration(velocity_sigma_m_s=(x, y, z)),
-        floor=FloorPrior(z_m=0.0, sigma_m=FLOOR_SIGMA_M),
-        planar=PlanarMotion(),
-        use_gravity=False,
-        odometry_interpolation="hold-past",
+    detections = None
+    if ids:
+        candidate_ids = np.full((len(ids), max(map(len, ids))), -1, dtype=np.int64)
+        for row, found in enumerate(ids):
+            known = [identity for identity in found if identity >= 0]
+            candidate_ids[row, : len(known)] = known
+        is_known = candidate_ids >= 0
+        id_probability = is_known / np.maximum(is_known.sum(axis=1, keepdims=True), 1)
+        polar = range_azimuth(points, point_covs)
+        detections = LandmarkDetections(stamps_ns[poses], *polar, candidate_ids, id_probability)
+    return Sequence(
+        name=name,
+        calibration=planar_calibration((float(np.sqrt(np.mean(step_covs[:, 2, 2]))), 0.0, 0.0), (x, y, z)),
+        imu=planar_imu(stamps_ns, np.concatenate([[0.0], rate_rad_s])),
+        dvl=dvl,
+        detections=detections,
+        notes={
+            "time": "the file has none: the pose after n steps is at n seconds, so rates and speeds are per step",
+            "truth": "none",
+            "odometry": "each step as the constant twist that makes it in one second",
+        }
+        | dict(notes),
     )
-
-
-def symmetric(entries: Floats, places: list[list[int]]) -> Floats:
-    """Matrices (n, size, size) whose element (i, j) is the column ``places[i][j]`` of ``entries``."""
-    matrices: Floats = entries[:, places]
-    return matrices

@@ -3,6 +3,8 @@ import pytest
 
 from sonar_graph.logs.convert.mrclam import read_mrclam
 
+from .builders import chain, hold_past_motions
+
 T0 = 1248444187
 NS = 10**9
 
@@ -21,12 +23,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def rewrite(folder, name, text):
-    (folder / name).write_text(text)
-    return folder
-
-
-def test_a_command_holds_from_its_stamp_to_the_next(folder, chain, hold_past_motions):
+def test_a_command_holds_from_its_stamp_to_the_next(folder):
     """0.1 m/s for 0.2 s, then 0.2 m/s for 0.1 s while turning 0.05 rad; the last command governs nothing."""
     sequence = read_mrclam(folder, 1)
     end = chain(hold_past_motions(sequence))[-1]
@@ -37,34 +34,23 @@ def test_a_command_holds_from_its_stamp_to_the_next(folder, chain, hold_past_mot
     assert sequence.calibration.odometry_interpolation == "hold-past"
 
 
-def test_times_stay_the_data_sets_own_to_the_nanosecond(folder):
-    sequence = read_mrclam(folder, 1)
-    stamps = [T0 * NS + 100_000_000, T0 * NS + 300_000_000, T0 * NS + 400_000_000]
-    assert sequence.imu.stamps_ns.tolist() == sequence.dvl.stamps_ns.tolist() == stamps
-    assert sequence.detections.stamps_ns.tolist() == [T0 * NS + 120_000_000, T0 * NS + 250_000_000]
-
-
 def test_of_commands_with_one_stamp_the_last_holds(folder):
-    rows = f"{T0}.1 0.1 0\n{T0}.2 0.9 0.9\n{T0}.2 0.3 0.4\n{T0}.3 0 0\n"
-    sequence = read_mrclam(rewrite(folder, "Robot1_Odometry.dat", rows), 1)
-    assert len(sequence.imu) == 3
+    (folder / "Robot1_Odometry.dat").write_text(f"{T0}.1 0.1 0\n{T0}.2 0.9 0.9\n{T0}.2 0.3 0.4\n{T0}.3 0 0\n")
+    sequence = read_mrclam(folder, 1)
     assert sequence.dvl.velocity[:, 0].tolist() == [0.1, 0.1, 0.3]
     assert sequence.imu.angular_velocity[:, 2].tolist() == [0.0, 0.0, 0.4]
 
 
-def test_landmarks_keep_their_subjects_and_robots_are_left_out(folder):
+def test_times_subjects_and_coordinates_stay_the_data_sets_own_and_robots_are_left_out(folder):
     sequence = read_mrclam(folder, 1)
-    d = sequence.detections
-    assert d.candidate_ids.tolist() == [[6], [20]]
-    assert d.id_probability.tolist() == [[1], [1]]
-    assert np.allclose(d.range_m, [1.0, 2.0])
-    assert np.allclose(d.azimuth_rad, [-0.2, 0.1])
+    stamps = [T0 * NS + 100_000_000, T0 * NS + 300_000_000, T0 * NS + 400_000_000]
+    assert sequence.imu.stamps_ns.tolist() == sequence.dvl.stamps_ns.tolist() == stamps
+    d, landmarks = sequence.detections, sequence.true_landmarks
+    assert d.stamps_ns.tolist() == [T0 * NS + 120_000_000, T0 * NS + 250_000_000]
+    assert (d.candidate_ids.tolist(), d.id_probability.tolist()) == ([[6], [20]], [[1], [1]])
+    assert (d.range_m.tolist(), d.azimuth_rad.tolist()) == ([1.0, 2.0], [-0.2, 0.1])
     assert np.isnan(d.range_azimuth_cov).all()
     assert "1 of other robots, 1 with unknown" in sequence.notes["detections"]
-
-
-def test_true_landmarks_are_in_order_on_the_plane(folder):
-    landmarks = read_mrclam(folder, 1).true_landmarks
     assert landmarks.ids.tolist() == [6, 20]
     assert landmarks.positions.tolist() == [[3.0, 4.0, 0.0], [1.5, -2.5, 0.0]]
     assert np.allclose(landmarks.covariances[0], np.diag([9e-6, 16e-6, 0]))
@@ -78,8 +64,10 @@ def test_start_is_the_truth_at_the_first_command_across_the_wrap(folder):
 
 
 def test_without_robot_truth_at_the_first_command_the_start_is_the_origin(folder):
-    late = read_mrclam(rewrite(folder, "Robot1_Groundtruth.dat", f"{T0}.2 3 2 1\n{T0}.3 3 2 1\n"), 1)
-    assert len(late.truth) == 2
+    (folder / "Robot1_Groundtruth.dat").write_text(f"{T0}.2 3 2 1\n{T0}.3 3 2 1\n")
+    (folder / "Robot1_Measurement.dat").write_text(f"{T0}.2 14 1 0\n")  # of another robot
+    late = read_mrclam(folder, 1)
+    assert (len(late.truth), late.detections) == (2, None)
     assert "origin" in late.notes["start"]
     (folder / "Robot1_Groundtruth.dat").unlink()
     never = read_mrclam(folder, 1)
@@ -97,26 +85,19 @@ def test_slip_grows_with_time_and_not_with_the_number_of_samples(folder):
     assert variance == pytest.approx(0.02**2 * dt.sum())
 
 
-def test_a_run_without_landmarks_has_no_detections(folder):
-    sequence = read_mrclam(rewrite(folder, "Robot1_Measurement.dat", f"{T0}.2 14 1 0\n"), 1)
-    assert sequence.detections is None
-
-
 @pytest.mark.recording
 class TestSet6:
     """Against motion capture; bounds from docs/theory/datasets.md, with room."""
 
-    @pytest.fixture(params=[1, 2, 3, 4, 5])
+    @pytest.fixture(scope="class", params=[1, 2, 3, 4, 5])
     def sequence(self, request, unpacked):
         folder = next(unpacked("mrclam_ds6.tar.xz").rglob("Barcodes.dat")).parent
         return read_mrclam(folder, request.param)
 
-    def test_subjects_are_the_landmarks_own(self, sequence):
+    def test_detections_point_at_the_true_landmarks(self, sequence):
         assert set(sequence.detections.candidate_ids[:, 0].tolist()) <= set(range(6, 21))
         assert sequence.true_landmarks.ids.tolist() == list(range(6, 21))
         assert T0 - 20 < sequence.start_ns / NS < T0 + 20
-
-    def test_detections_point_at_the_true_landmarks(self, sequence):
         d, truth = sequence.detections, sequence.truth
         d = d.rows((d.stamps_ns >= truth.stamps_ns[0]) & (d.stamps_ns <= truth.stamps_ns[-1]))
         stamps, frame = np.unique(d.stamps_ns, return_inverse=True)

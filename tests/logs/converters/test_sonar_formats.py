@@ -14,6 +14,7 @@ from sonar_graph.logs.convert.didson_aris import convert_aris
 from sonar_graph.logs.convert.oculus import convert_oculus
 from sonar_graph.logs.reading import read_sonar_frames
 
+from .builders import assert_refused
 from .sonar_logs import CONVERTERS, Converted, converted, degrees
 from .sonar_recordings import START_NS, STEP_NS, Aris, Ddf, Oculus, images, oculus_note, put
 
@@ -206,13 +207,13 @@ ONE_ARIS, THREE_ARIS = Aris(images(1, 48, 64), mode=1), Aris(images(3, 128, 64))
     ],
 )  # fmt: skip
 def test_a_header_that_makes_no_sense_is_named(
-    tmp_path: Path, refusal: Any, recording: Any, at: int, value: bytes, words: str
+    tmp_path: Path, recording: Any, at: int, value: bytes, words: str
 ) -> None:
     content = bytearray(recording.content())
     content[at : at + len(value)] = value
     path = tmp_path / "dive"
     path.write_bytes(content)
-    refusal(lambda: CONVERTERS[ENDING[type(recording)]](path, tmp_path / "dive.mcap"), path, words)
+    assert_refused(lambda: CONVERTERS[ENDING[type(recording)]](path, tmp_path / "dive.mcap"), path, words)
     assert not list(tmp_path.glob("*.mcap*"))
 
 
@@ -224,10 +225,10 @@ def test_a_header_that_makes_no_sense_is_named(
         ("raw", b"DDF\x05" + bytes(4000), "no Oculus ping"),
     ],
 )
-def test_other_files_are_refused(tmp_path: Path, refusal: Any, ending: str, content: bytes, words: str) -> None:
+def test_other_files_are_refused(tmp_path: Path, ending: str, content: bytes, words: str) -> None:
     path = tmp_path / "dive"
     path.write_bytes(content)
-    refusal(lambda: CONVERTERS[ending](path, tmp_path / "dive.mcap"), path, words)
+    assert_refused(lambda: CONVERTERS[ending](path, tmp_path / "dive.mcap"), path, words)
 
 
 def test_a_damaged_file_header_of_an_aris_costs_no_frame(tmp_path: Path) -> None:

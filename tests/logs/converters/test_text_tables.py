@@ -6,34 +6,27 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.logs.convert.akit import read_akit
-from sonar_graph.logs.convert.dlr import read_dlr
 from sonar_graph.logs.convert.mrclam import read_mrclam
+from sonar_graph.logs.convert.step_files import read_dlr, read_victoria_park
 from sonar_graph.logs.convert.text_tables import decimal_ns, read_table
-from sonar_graph.logs.convert.victoria_park import read_victoria_park
+
+from .builders import assert_refused
 
 
 @given(st.integers(-(2**62), 2**62))
-def test_decimal_text_gives_its_nanoseconds_exactly(ns):
-    text = f"{'-' if ns < 0 else ''}{abs(ns) // 10**9}.{abs(ns) % 10**9:09d}"
-    assert decimal_ns(text) == ns
-
-
-def test_a_double_would_have_lost_what_the_text_keeps():
-    text = "1248444175.103"
-    assert decimal_ns(text) == 1248444175103000000
-    assert int(float(text) * 1e9) != decimal_ns(text)
+def test_decimal_text_gives_its_nanoseconds_exactly_whatever_the_precision_of_the_caller(ns):
+    with decimal.localcontext() as context:
+        context.prec = 28
+        text = f"{'-' if ns < 0 else ''}{abs(ns) // 10**9}.{abs(ns) % 10**9:09d}"
+        assert decimal_ns(text) == ns
+        assert decimal_ns("1.00250626566416034242424242") == 1002506266
+    assert int(float("1248444175.103") * 1e9) != 1248444175103000000  # what a double would have lost
 
 
 @pytest.mark.parametrize("text", ["nan", "inf", "-Infinity", "soon", ""])
 def test_what_is_no_time_is_refused(text):
     with pytest.raises(ValueError, match="no finite decimal"):
         decimal_ns(text)
-
-
-def test_precision_of_the_caller_does_not_matter():
-    with decimal.localcontext() as context:
-        context.prec = 28
-        assert decimal_ns("1.00250626566416034242424242") == 1002506266
 
 
 def test_comments_and_blank_lines_are_passed_over(tmp_path):
@@ -48,23 +41,20 @@ def test_comments_and_blank_lines_are_passed_over(tmp_path):
 @pytest.mark.parametrize(
     ("content", "fragments"),
     [
-        ("", ("holds no data", "time, value")),
-        ("# only a comment\n", ("holds no data",)),
-        ("1 2\n\n1\n", ("line 3", "1 fields", "2 numbers: time, value")),
-        ("1 2\n1 two\n", ("line 2", "two")),
-        ("1 nan\n", ("line 1", "not finite")),
+        (None, ("No such file", "rows of time, value")),
+        (b"\xff\xfe\x00\x81", ("cannot be read as text",)),
+        (b"", ("holds no data", "time, value")),
+        (b"# only a comment\n", ("holds no data",)),
+        (b"1 2\n\n1\n", ("line 3", "1 fields", "2 numbers: time, value")),
+        (b"1 2\n1 two\n", ("line 2", "two")),
+        (b"1 nan\n", ("line 1", "not finite")),
     ],
 )
-def test_a_bad_table_is_refused_by_file_and_line(tmp_path, refusal, content, fragments):
+def test_a_bad_table_is_refused_by_file_and_line(tmp_path, content, fragments):
     path = tmp_path / "bad.dat"
-    path.write_text(content)
-    refusal(lambda: read_table(path, ("time", "value")), path, *fragments)
-
-
-def test_a_missing_or_binary_file_is_refused(tmp_path, refusal):
-    refusal(lambda: read_table(tmp_path / "absent.dat", ("time",)), "absent.dat", "rows of time")
-    (tmp_path / "binary.dat").write_bytes(b"\xff\xfe\x00\x81")
-    refusal(lambda: read_table(tmp_path / "binary.dat", ("time",)), "binary.dat", "text")
+    if content is not None:
+        path.write_bytes(content)
+    assert_refused(lambda: read_table(path, ("time", "value")), path, *fragments)
 
 
 COV = "1e-5 2e-6 2e-5 3e-6 4e-6 1e-4"
@@ -128,10 +118,10 @@ def test_the_data_sets_that_are_made_faulty_below_are_whole(tmp_path, name):
         ("mrclam absent", {}, ("absent", "not a folder")),
     ],
 )
-def test_a_bad_data_set_is_refused_by_file_and_line(tmp_path, refusal, reader, changed, fragments):
+def test_a_bad_data_set_is_refused_by_file_and_line(tmp_path, reader, changed, fragments):
     read, files = READERS[reader]
     write(tmp_path, files | changed)
-    refusal(lambda: read(tmp_path), *fragments)
+    assert_refused(lambda: read(tmp_path), *fragments)
 
 
 def write(folder, files):

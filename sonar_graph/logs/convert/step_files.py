@@ -1,0 +1,166 @@
+"""Files of odometry steps and landmarks seen between them: DLR Spatial Cognition and Victoria Park; neither has times.
+
+DLR: a wheeled robot in an office building, white discs on the floor as landmarks (Kurlbaum, Frese, "A benchmark data
+set for data association", Universität Bremen, SFB/TR 8 report, 2009). Its file ``map.circles`` holds
+
+``STEP image dx dy dφ  c_xx c_xy c_yy c_xφ c_yφ c_φφ``        the pose after the step in the frame before it
+``LANDMARK_C px py quality  c_xx c_xy c_yy  id [id ...]``     a disc in the frame of the newest pose
+
+with −y forward and x to the right. Body axes (x forward, y left) are therefore ``(x, y)_body = (−y, −x)_file``, a
+reflection, so that angles change their sign: ``θ = −φ``.
+
+Victoria Park: a truck among trees in Sydney, recognised in laser scans, as the edge list that GTSAM ships (Guivant,
+Nebot, "Optimization of the simultaneous localization and map-building algorithm for real-time implementation", IEEE
+T-RA 17(3), 2001).
+
+``ODOMETRY i j dx dy dθ  c_xx c_xy c_xθ c_yy c_yθ c_θθ``   pose j in the frame of pose i (x forward, y left)
+``LANDMARK i l x y  c_xx c_xy c_yy``                       landmark l in the frame of pose i
+
+Poses and landmarks share one numbering: a number is a pose where an ``ODOMETRY`` line ends and a landmark where a
+``LANDMARK`` line does. Landmarks keep their numbers.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from sonar_graph.errors import DatasetError
+from sonar_graph.logs.convert.planar import stepped_sequence
+from sonar_graph.logs.convert.text_tables import numbers, read_lines
+from sonar_graph.sequence import Sequence
+
+POINT_COV_PLACES = [[0, 1], [1, 2]]
+"""Columns of the elements of a landmark's covariance, in both files."""
+DLR_FILE = "map.circles"
+DLR_STEP = ("dX", "dY", "dPhi", "cXX", "cXY", "cYY", "cXPhi", "cYPhi", "cPhiPhi")
+DLR_STEP_COV_PLACES = [[0, 1, 3], [1, 2, 4], [3, 4, 5]]
+DLR_POINT = ("pX", "pY", "quality", "cXX", "cXY", "cYY")
+DLR_LINES = "lines 'STEP image dX dY dPhi + 6 covariances' and 'LANDMARK_C pX pY quality + 3 covariances + IDs'"
+BODY_OF_FILE = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""(x, y, θ) in body axes from (x, y, φ) in DLR's file."""
+PARK_STEP = ("i", "j", "dx", "dy", "dtheta", "c_xx", "c_xy", "c_xt", "c_yy", "c_yt", "c_tt")
+PARK_STEP_COV_PLACES = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
+PARK_POINT = ("i", "landmark", "x", "y", "c_xx", "c_xy", "c_yy")
+PARK_LINES = "lines 'ODOMETRY i j dx dy dtheta + 6 covariances' and 'LANDMARK i landmark x y + 3 covariances'"
+
+
+def read_dlr(path: Path) -> Sequence:
+    """Sequence of the run, one odometry step a second.
+
+    Parameters
+    ----------
+    path
+        ``map.circles``, or the folder that holds it.
+
+    Returns
+    -------
+    Sequence
+        Without truth; the pose after n steps is at n seconds. A detection with several IDs has them as equally
+        probable candidates; one with ID −1 (no known disc) has none.
+
+    Raises
+    ------
+    DatasetError
+        When the file is missing or malformed, or a landmark comes before the first step.
+    """
+    if path.is_dir() and not (path / DLR_FILE).exists():
+        raise DatasetError(f"{path}: holds no {DLR_FILE} ({DLR_LINES}); give the folder that does, or the file itself")
+    path = path / DLR_FILE if path.is_dir() else path
+    steps: list[list[float]] = []
+    points: list[list[float]] = []
+    ids: list[list[int]] = []
+    poses: list[int] = []
+    for number, (kind, *rest) in read_lines(path, DLR_LINES):
+        if kind == "STEP":
+            steps.append(numbers(path, number, rest[1:], DLR_STEP))
+            continue
+        if kind not in ("LANDMARK", "LANDMARK_C"):
+            raise DatasetError(f"{path}, line {number}: begins with {kind!r}; expected {DLR_LINES}")
+        if not steps:
+            raise DatasetError(f"{path}, line {number}: a landmark before the first STEP; expected {DLR_LINES}")
+        points.append(numbers(path, number, rest[: len(DLR_POINT)], DLR_POINT))
+        try:
+            ids.append([int(text) for text in rest[len(DLR_POINT) :]])
+        except ValueError as error:
+            raise DatasetError(f"{path}, line {number}: {error}; expected whole numbers as landmark IDs") from error
+        if not ids[-1]:
+            raise DatasetError(f"{path}, line {number}: no landmark ID after the covariances; expected {DLR_LINES}")
+        poses.append(len(steps))
+    if not steps:
+        raise DatasetError(f"{path}: holds no STEP line; expected {DLR_LINES}")
+    rows, seen = np.array(steps), np.array(points).reshape(-1, len(DLR_POINT))
+    plane = BODY_OF_FILE[:2, :2]
+    return stepped_sequence(
+        "dlr_spatial_cognition",
+        rows[:, :3] @ BODY_OF_FILE.T,
+        BODY_OF_FILE @ rows[:, 3:][:, DLR_STEP_COV_PLACES] @ BODY_OF_FILE.T,
+        poses,
+        seen[:, :2] @ plane.T,
+        plane @ seen[:, 3:][:, POINT_COV_PLACES] @ plane.T,
+        ids,
+        {
+            "data set": "DLR Spatial Cognition; Kurlbaum, Frese, SFB/TR 8 report, 2009",
+            "licence": "none stated",
+            "noise": "the file's covariances; of the turn their mean, and not their correlation with the displacement",
+            "detections": f"{sum(found == [-1] for found in ids)} of {len(ids)} have no identity (-1)",
+        },
+    )
+
+
+def read_victoria_park(path: Path | None = None) -> Sequence:
+    """Sequence of the run, one odometry edge a second.
+
+    Parameters
+    ----------
+    path
+        File in the format above; None: the file in the installed gtsam.
+
+    Returns
+    -------
+    Sequence
+        Without truth. The pose after n edges is at n seconds.
+
+    Raises
+    ------
+    DatasetError
+        When the file is missing or malformed, or its odometry is no single chain.
+    """
+    path = path or Path(gtsam.findExampleDataFile("victoria_park.txt"))  # type: ignore[no-untyped-call]
+    steps: list[list[float]] = []
+    points: list[list[float]] = []
+    poses: list[int] = []
+    newest = 0
+    for number, (kind, *rest) in read_lines(path, PARK_LINES):
+        if kind not in ("ODOMETRY", "LANDMARK"):
+            raise DatasetError(f"{path}, line {number}: begins with {kind!r}; expected {PARK_LINES}")
+        values = numbers(path, number, rest, PARK_STEP if kind == "ODOMETRY" else PARK_POINT)
+        if values[0] != newest:
+            raise DatasetError(
+                f"{path}, line {number}: starts at pose {rest[0]}, but the newest pose is {newest};"
+                " expected one chain of poses from 0, with landmarks seen from the newest"
+            )
+        if kind == "ODOMETRY":
+            newest = int(values[1])
+            steps.append(values[2:])
+        else:
+            points.append(values[1:])
+            poses.append(len(steps))
+    if not steps:
+        raise DatasetError(f"{path}: holds no ODOMETRY line; expected {PARK_LINES}")
+    rows, seen = np.array(steps), np.array(points).reshape(-1, len(PARK_POINT) - 1)
+    return stepped_sequence(
+        "victoria_park",
+        rows[:, :3],
+        rows[:, 3:][:, PARK_STEP_COV_PLACES],
+        poses,
+        seen[:, 1:3],
+        seen[:, 3:][:, POINT_COV_PLACES],
+        seen[:, :1].astype(np.int64).tolist(),
+        {
+            "data set": "Victoria Park; Guivant, Nebot, IEEE T-RA 17(3), 2001; edge list of GTSAM's examples",
+            "noise": "the file's covariances",
+        },
+    )
