@@ -64,7 +64,7 @@ def landmarks(time_ns: int, topic: str = "/map") -> Outgoing:
     return landmark_map_message(topic, known, time_ns)
 
 
-def test_everything_is_there_byte_by_byte_and_what_was_added(tmp_path: Path) -> None:
+def test_everything_is_there_byte_by_byte_and_what_was_added(tmp_path):
     source = foreign_log(tmp_path / "a.mcap")
     amended = write_amended(source, tmp_path / "b.mcap", [landmarks(2005)], metadata={"more": {"key": "value"}})
     before, after = content(source), content(tmp_path / "b.mcap")
@@ -76,7 +76,7 @@ def test_everything_is_there_byte_by_byte_and_what_was_added(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("profile", ["ros2", "", "x" * 40])
-def test_what_was_written_is_known_as_ours_whatever_the_profile_of_the_log(tmp_path: Path, profile: str) -> None:
+def test_what_was_written_is_known_as_ours_whatever_the_profile_of_the_log(tmp_path, profile):
     source = foreign_log(tmp_path / "a.mcap", 3, profile)
     write_amended(source, tmp_path / "b.mcap", [landmarks(2005)])
     with (tmp_path / "b.mcap").open("rb") as stream:
@@ -85,7 +85,7 @@ def test_what_was_written_is_known_as_ours_whatever_the_profile_of_the_log(tmp_p
     assert not is_own_log(source)
 
 
-def test_messages_lie_in_the_order_of_their_times(tmp_path: Path) -> None:
+def test_messages_lie_in_the_order_of_their_times(tmp_path):
     write_amended(foreign_log(tmp_path / "a.mcap"), tmp_path / "b.mcap", [landmarks(2005)])
     with (tmp_path / "b.mcap").open("rb") as stream:
         times_ns = [m.log_time for _, _, m in make_reader(stream).iter_messages(log_time_order=False)]
@@ -93,7 +93,7 @@ def test_messages_lie_in_the_order_of_their_times(tmp_path: Path) -> None:
     assert 2005 in times_ns
 
 
-def test_messages_of_one_chunk_come_in_the_order_of_their_times_and_equal_ones_as_they_were(tmp_path: Path) -> None:
+def test_messages_of_one_chunk_come_in_the_order_of_their_times_and_equal_ones_as_they_were(tmp_path):
     """Two topics in one chunk, whose times go to and fro."""
     times_ns = [70, 10, 40, 40, 90, 10, 40]
     with (tmp_path / "a.mcap").open("wb") as stream:
@@ -109,7 +109,7 @@ def test_messages_of_one_chunk_come_in_the_order_of_their_times_and_equal_ones_a
     assert messages == [(10, 1), (10, 5), (40, 2), (40, 3), (40, 6), (50, 0), (70, 0), (90, 4)]
 
 
-def test_what_is_there_of_a_log_that_is_cut_off_is_counted_from_its_first_message(tmp_path: Path) -> None:
+def test_what_is_there_of_a_log_that_is_cut_off_is_counted_from_its_first_message(tmp_path):
     whole = foreign_log(tmp_path / "a.mcap", tick_ns=100_000_000).read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: int(0.7 * len(whole))])
     amended = write_amended(tmp_path / "cut.mcap", tmp_path / "b.mcap", [])
@@ -122,7 +122,7 @@ def test_what_is_there_of_a_log_that_is_cut_off_is_counted_from_its_first_messag
 
 
 @pytest.mark.parametrize("share", [0.3, 0.77])
-def test_of_a_log_that_is_cut_off_what_is_whole_is_copied_and_the_end_is_named(tmp_path: Path, share: float) -> None:
+def test_of_a_log_that_is_cut_off_what_is_whole_is_copied_and_the_end_is_named(tmp_path, share):
     whole = foreign_log(tmp_path / "a.mcap").read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole[: int(share * len(whole))])
@@ -139,7 +139,7 @@ def test_of_a_log_that_is_cut_off_what_is_whole_is_copied_and_the_end_is_named(t
     assert scan(tmp_path / "b.mcap", lambda _: Keep.NONE).ending is None
 
 
-def test_a_hole_is_refused_and_with_salvage_what_is_whole_is_copied(tmp_path: Path) -> None:
+def test_a_hole_is_refused_and_with_salvage_what_is_whole_is_copied(tmp_path):
     source = foreign_log(tmp_path / "a.mcap")
     data = bytearray(source.read_bytes())
     data[len(data) // 4] ^= 0xFF  # within a chunk
@@ -154,7 +154,7 @@ def test_a_hole_is_refused_and_with_salvage_what_is_whole_is_copied(tmp_path: Pa
     assert all(message in before["/one"] for message in after["/one"])
 
 
-def test_a_topic_that_is_there_already_is_refused_unless_it_is_written_anew(tmp_path: Path) -> None:
+def test_a_topic_that_is_there_already_is_refused_unless_it_is_written_anew(tmp_path):
     source = foreign_log(tmp_path / "a.mcap")
     once, twice = tmp_path / "once.mcap", tmp_path / "twice.mcap"
     write_amended(source, once, [landmarks(5)])
@@ -167,19 +167,19 @@ def test_a_topic_that_is_there_already_is_refused_unless_it_is_written_anew(tmp_
     assert [message[0] for message in content(twice)["/map"][1:]] == [6]
 
 
-def test_what_is_written_anew_is_gone_even_where_nothing_comes_in_its_place(tmp_path: Path) -> None:
+def test_what_is_written_anew_is_gone_even_where_nothing_comes_in_its_place(tmp_path):
     write_amended(foreign_log(tmp_path / "a.mcap"), tmp_path / "once.mcap", [landmarks(5)])
     write_amended(tmp_path / "once.mcap", tmp_path / "b.mcap", [], anew={"/map": MAP})
     assert content(tmp_path / "b.mcap") == content(tmp_path / "a.mcap")
 
 
-def test_a_log_is_never_written_over_itself(tmp_path: Path) -> None:
+def test_a_log_is_never_written_over_itself(tmp_path):
     source = foreign_log(tmp_path / "a.mcap")
     with pytest.raises(LogError, match="is the log itself"):
         write_amended(source, source, [])
 
 
-def test_a_damaged_attachment_is_left_out_and_named(tmp_path: Path) -> None:
+def test_a_damaged_attachment_is_left_out_and_named(tmp_path):
     source = foreign_log(tmp_path / "a.mcap")
     (tmp_path / "bad.mcap").write_bytes(source.read_bytes().replace(b"of the dive", b"of the dove"))
     amended = write_amended(tmp_path / "bad.mcap", tmp_path / "b.mcap", [], salvage=True)

@@ -52,14 +52,14 @@ def messages(result: Path, decoded: Any) -> dict[str, list[Any]]:
     return decoded(result)
 
 
-def test_every_estimator_and_the_truth_are_there(messages: dict[str, list[Any]]) -> None:
+def test_every_estimator_and_the_truth_are_there(messages):
     each = ("odometry", "pose", "pose_ellipsoid", "smoothed", "path", "landmarks", "landmark_cloud")
     expected = {f"/{name}/{kind}" for name in ("ekf_slam", "isam2") for kind in each}
     expected |= {f"/ground_truth/{kind}" for kind in ("odometry", "path", "landmarks", "landmark_cloud")}
     assert set(messages) == expected | {"/tf", "/tf_static"}
 
 
-def test_odometry_is_causal_and_the_last_path_smoothed(messages: dict[str, list[Any]]) -> None:
+def test_odometry_is_causal_and_the_last_path_smoothed(messages):
     assert [m.pose.pose.position.x for m in messages["/isam2/odometry"]] == list(np.arange(100) + 10.0)
     *so_far, last = messages["/isam2/path"]
     assert [len(path.poses) for path in so_far] == [31, 61, 91]
@@ -68,14 +68,14 @@ def test_odometry_is_causal_and_the_last_path_smoothed(messages: dict[str, list[
     assert [p.header.stamp.sec for p in last.poses] == list(range(1_700_000_000, 1_700_000_100))
 
 
-def test_covariances_are_in_the_order_and_axes_of_ros(messages: dict[str, list[Any]]) -> None:
+def test_covariances_are_in_the_order_and_axes_of_ros(messages):
     pose = messages["/isam2/pose"][0]
     # body axes turned by 90 degrees: what lies along the body's x lies along the world's y
     assert np.diag(np.reshape(pose.pose.covariance, (6, 6))) == pytest.approx([5, 4, 6, 2, 1, 3])
     assert (pose.header.frame_id, messages["/isam2/odometry"][0].child_frame_id) == ("map", "isam2/base_link")
 
 
-def test_landmarks_are_ellipsoids_with_their_identities(messages: dict[str, list[Any]]) -> None:
+def test_landmarks_are_ellipsoids_with_their_identities(messages):
     (array,) = messages["/isam2/landmarks"]
     spheres = [m for m in array.markers if m.type == 2]
     texts = [m for m in array.markers if m.type == 9]
@@ -86,9 +86,7 @@ def test_landmarks_are_ellipsoids_with_their_identities(messages: dict[str, list
     assert len({(m.ns, m.id) for m in array.markers}) == 4
 
 
-def test_tf_is_a_tree_below_the_map_in_which_the_sensors_follow_the_first_estimator(
-    messages: dict[str, list[Any]],
-) -> None:
+def test_tf_is_a_tree_below_the_map_in_which_the_sensors_follow_the_first_estimator(messages):
     parents: dict[str, set[str]] = {}
     for transform in [t for m in messages["/tf"] + messages["/tf_static"] for t in m.transforms]:
         parents.setdefault(transform.child_frame_id, set()).add(transform.header.frame_id)
@@ -98,7 +96,7 @@ def test_tf_is_a_tree_below_the_map_in_which_the_sensors_follow_the_first_estima
     assert {m.child_frame_id for m in messages["/isam2/odometry"]} <= parents.keys()
 
 
-def test_transforms_of_one_instant_share_a_message(messages: dict[str, list[Any]]) -> None:
+def test_transforms_of_one_instant_share_a_message(messages):
     instants = [{(t.header.stamp.sec, t.header.stamp.nanosec) for t in m.transforms} for m in messages["/tf"]]
     assert {len(stamps) for stamps in instants} == {1}
     assert len(set.union(*instants)) == len(instants)
@@ -109,14 +107,14 @@ def test_transforms_of_one_instant_share_a_message(messages: dict[str, list[Any]
     assert xs["isam2/base_link"] == list(np.arange(100.0) + 10)
 
 
-def test_rosbags_re_encodes_all_that_is_written_to_the_same_bytes(result: Path) -> None:
+def test_rosbags_re_encodes_all_that_is_written_to_the_same_bytes(result):
     with AnyReader([result]) as reader:
         for connection, _, raw in reader.messages():
             message = reader.typestore.deserialize_cdr(raw, connection.msgtype)
             assert bytes(reader.typestore.serialize_cdr(message, connection.msgtype)) == raw
 
 
-def test_paths_stay_small_on_long_runs(make_sequence: Any, tmp_path: Path) -> None:
+def test_paths_stay_small_on_long_runs(make_sequence, tmp_path):
     sequence: Sequence = make_sequence()
     long = straight(0, 20_000)
     write_result(tmp_path / "r.mcap", sequence, {"isam2": (long, long, NO_LANDMARKS)})
@@ -151,7 +149,7 @@ def written(folder: Path, sequence: Sequence, decoded: Any, **estimates: Any) ->
     return decoded(folder / "r.mcap")
 
 
-def test_poses_survive_to_the_bit(make_sequence: Any, tmp_path: Path, decoded: Any) -> None:
+def test_poses_survive_to_the_bit(make_sequence, tmp_path, decoded):
     sequence, causal, smoothed = make_sequence(), turning(1), turning(2)
     messages = written(tmp_path, sequence, decoded, a=(causal, smoothed, NO_LANDMARKS))
     topics = {"/a/odometry": causal, "/a/pose": causal, "/a/smoothed": smoothed}
@@ -163,7 +161,7 @@ def test_poses_survive_to_the_bit(make_sequence: Any, tmp_path: Path, decoded: A
     np.testing.assert_array_equal([(c.x, c.y, c.z) for c in centres], causal.positions)
 
 
-def test_an_estimator_without_covariances_has_no_ellipsoids(make_sequence: Any, tmp_path: Path, decoded: Any) -> None:
+def test_an_estimator_without_covariances_has_no_ellipsoids(make_sequence, tmp_path, decoded):
     path = straight(0)
     unsure = Trajectory.without_covariances(path.stamps_ns, path.positions, path.quaternions_xyzw)
     messages = written(tmp_path, make_sequence(), decoded, a=(unsure, unsure, NO_LANDMARKS))
@@ -174,14 +172,14 @@ def test_an_estimator_without_covariances_has_no_ellipsoids(make_sequence: Any, 
 
 
 @given(st.lists(st.text(max_size=6), max_size=6))
-def test_source_names_are_ros_names_and_each_its_own(estimators: list[str]) -> None:
+def test_source_names_are_ros_names_and_each_its_own(estimators):
     names = source_names(estimators)
     assert len(names) == len(set(names)) == len(estimators)
     assert not {"ground_truth", "tf", "tf_static"} & set(names)
     assert all(re.fullmatch(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*", name) for name in names)
 
 
-def test_source_names_stay_close_to_the_estimators() -> None:
+def test_source_names_stay_close_to_the_estimators():
     assert source_names(["ekf-slam", "ekf_slam", "isam2", "2d", "ground-truth"]) == [
         "ekf_slam",
         "ekf_slam_2",
@@ -191,7 +189,7 @@ def test_source_names_stay_close_to_the_estimators() -> None:
     ]
 
 
-def test_the_command_of_evo_reads_every_trajectory(result: Path, tmp_path: Path) -> None:
+def test_the_command_of_evo_reads_every_trajectory(result, tmp_path):
     kinds = ("odometry", "pose", "smoothed")
     topics = [f"/{name}/{kind}" for name in ("ekf_slam", "isam2") for kind in kinds]
     command = [Path(sys.executable).with_name("evo_traj"), "mcap", result.name, *topics]

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ STAMPS = st.lists(st.integers(-(2**62), 2**62), min_size=1, max_size=20, unique=
 
 
 @given(STAMPS, st.integers(0, 99))
-def test_not_a_nanosecond_nor_a_bit_is_lost(tmp_path_factory: Any, stamps: list[int], seed: int) -> None:
+def test_not_a_nanosecond_nor_a_bit_is_lost(tmp_path_factory, stamps, seed):
     rng = np.random.default_rng(seed)
     n = len(stamps)
     written = Trajectory.without_covariances(np.array(stamps), rng.normal(size=(n, 3)), rng.normal(size=(n, 4)))
@@ -30,13 +29,13 @@ def test_not_a_nanosecond_nor_a_bit_is_lost(tmp_path_factory: Any, stamps: list[
     np.testing.assert_array_equal(found.quaternions_xyzw, written.quaternions_xyzw)
 
 
-def test_the_line_is_the_one_that_tum_describes(tmp_path: Path) -> None:
+def test_the_line_is_the_one_that_tum_describes(tmp_path):
     pose = Trajectory.without_covariances(np.array([1_700_000_000_000_000_001]), np.array([[1, 2, 3.5]]), np.eye(4)[3:])
     write_tum(tmp_path / "t.tum", pose)
     assert (tmp_path / "t.tum").read_text() == "1700000000.000000001 1 2 3.5 0 0 0 1\n"
 
 
-def test_evo_reads_the_same_poses(make_sequence: Any, tmp_path: Path) -> None:
+def test_evo_reads_the_same_poses(make_sequence, tmp_path):
     truth = make_sequence().truth
     write_tum(tmp_path / "t.tum", truth)
     theirs = file_interface.read_tum_trajectory_file(tmp_path / "t.tum")
@@ -44,7 +43,7 @@ def test_evo_reads_the_same_poses(make_sequence: Any, tmp_path: Path) -> None:
     np.testing.assert_array_equal(theirs.orientations_quat_wxyz, truth.quaternions_xyzw[:, [3, 0, 1, 2]])
 
 
-def test_comments_blank_lines_and_exponents_are_read(tmp_path: Path) -> None:
+def test_comments_blank_lines_and_exponents_are_read(tmp_path):
     (tmp_path / "t.tum").write_text("# t x y z\n\n1.5e0 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
     assert read_tum(tmp_path / "t.tum").stamps_ns.tolist() == [1_500_000_000, 2_000_000_000]
 
@@ -61,9 +60,7 @@ MISTAKES: list[tuple[Callable[[Path], object], str | None, str]] = [
 
 
 @pytest.mark.parametrize(("read", "text", "message"), MISTAKES)
-def test_a_file_that_is_no_table_of_poses_or_landmarks_is_named(
-    tmp_path: Path, read: Callable[[Path], object], text: str | None, message: str
-) -> None:
+def test_a_file_that_is_no_table_of_poses_or_landmarks_is_named(tmp_path, read, text, message):
     path = tmp_path / "table.txt"
     if text is not None:
         path.write_text(text)
@@ -71,7 +68,7 @@ def test_a_file_that_is_no_table_of_poses_or_landmarks_is_named(
         read(path)
 
 
-def test_landmarks_come_back_from_their_table(tmp_path: Path) -> None:
+def test_landmarks_come_back_from_their_table(tmp_path):
     rng = np.random.default_rng(0)
     root = rng.normal(size=(3, 3, 3))
     covariances = root + root.transpose(0, 2, 1)
@@ -87,7 +84,7 @@ def test_landmarks_come_back_from_their_table(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.covariances, landmarks.covariances)
 
 
-def test_an_empty_map_is_a_header(tmp_path: Path) -> None:
+def test_an_empty_map_is_a_header(tmp_path):
     write_landmarks_csv(tmp_path / "l.csv", LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3))))
     assert len((tmp_path / "l.csv").read_text().splitlines()) == 1
     assert len(read_landmarks_csv(tmp_path / "l.csv")) == 0

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,9 +29,7 @@ BLOCKS = ("imu", "dvl", "depth", "detections", "truth", "true_landmarks")
     candidates=st.integers(1, 4),
     left_out=st.sets(st.sampled_from(BLOCKS[2:])),
 )
-def test_reading_what_was_written_is_the_identity(
-    make_sequence: Any, tmp_path_factory: Any, seed: int, samples: int, candidates: int, left_out: set[str]
-) -> None:
+def test_reading_what_was_written_is_the_identity(make_sequence, tmp_path_factory, seed, samples, candidates, left_out):
     sequence = replace(make_sequence(seed, samples, candidates), **dict.fromkeys(left_out))
     path = tmp_path_factory.mktemp("log") / "log.mcap"
     write_log(path, sequence)
@@ -48,7 +45,7 @@ def test_reading_what_was_written_is_the_identity(
     assert found.notes.items() >= sequence.notes.items()
 
 
-def test_known_covariances_of_the_truth_survive(make_sequence: Any, tmp_path: Path) -> None:
+def test_known_covariances_of_the_truth_survive(make_sequence, tmp_path):
     sequence = make_sequence()
     root = np.random.default_rng(0).normal(size=(len(sequence.truth), 6, 6))
     truth = replace(sequence.truth, covariances=root @ root.transpose(0, 2, 1))
@@ -58,7 +55,7 @@ def test_known_covariances_of_the_truth_survive(make_sequence: Any, tmp_path: Pa
     np.testing.assert_allclose(found.covariances, truth.covariances, atol=1e-12)
 
 
-def test_mcap_ros2_support_decodes_what_is_written(make_sequence: Any, tmp_path: Path, decoded: Any) -> None:
+def test_mcap_ros2_support_decodes_what_is_written(make_sequence, tmp_path, decoded):
     sequence = make_sequence()
     write_log(tmp_path / "a.mcap", sequence)
     messages = decoded(tmp_path / "a.mcap")
@@ -80,7 +77,7 @@ def test_mcap_ros2_support_decodes_what_is_written(make_sequence: Any, tmp_path:
     assert tree.transforms[0].transform.translation.y == 0.2
 
 
-def test_rosbags_re_encodes_all_that_is_written_to_the_same_bytes(make_sequence: Any, tmp_path: Path) -> None:
+def test_rosbags_re_encodes_all_that_is_written_to_the_same_bytes(make_sequence, tmp_path):
     write_log(tmp_path / "a.mcap", make_sequence())
     count = 0
     with AnyReader([tmp_path / "a.mcap"]) as reader:
@@ -91,7 +88,7 @@ def test_rosbags_re_encodes_all_that_is_written_to_the_same_bytes(make_sequence:
     assert count > 80
 
 
-def test_messages_lie_in_the_order_of_their_times(make_sequence: Any, tmp_path: Path) -> None:
+def test_messages_lie_in_the_order_of_their_times(make_sequence, tmp_path):
     write_log(tmp_path / "a.mcap", make_sequence())
     with (tmp_path / "a.mcap").open("rb") as stream:
         times = [r.log_time for r in StreamReader(stream).records if isinstance(r, Message)]
@@ -100,14 +97,14 @@ def test_messages_lie_in_the_order_of_their_times(make_sequence: Any, tmp_path: 
 
 
 @pytest.mark.parametrize("stamp_ns", [2**31 * 10**9, -(2**31) * 10**9 - 1])
-def test_stamps_that_ros_cannot_express_are_refused(make_sequence: Any, tmp_path: Path, stamp_ns: int) -> None:
+def test_stamps_that_ros_cannot_express_are_refused(make_sequence, tmp_path, stamp_ns):
     sequence = replace(make_sequence(), imu=Imu(np.array([stamp_ns]), np.zeros((1, 3)), np.zeros((1, 3))))
     with pytest.raises(LogError, match="32-bit seconds"):
         write_log(tmp_path / "a.mcap", sequence)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_that_cannot_be_written_is_named(make_sequence: Any, tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_written_is_named(make_sequence, tmp_path):
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(LogError, match=r"file/a\.mcap cannot be written"):
         write_log(tmp_path / "file" / "a.mcap", make_sequence())
@@ -133,7 +130,7 @@ def write_frames(path: Path, *blocks: SonarFrames) -> Path:
 
 
 @pytest.mark.parametrize("kind", [*KINDS, ">u2", ">f4"])
-def test_frames_are_read_as_they_were_written(tmp_path: Path, kind: str) -> None:
+def test_frames_are_read_as_they_were_written(tmp_path, kind):
     written = frames(kind)
     (read,) = read_sonar_frames(write_frames(tmp_path / "log.mcap", written))
     np.testing.assert_array_equal(read.stamps_ns, written.stamps_ns)
@@ -143,7 +140,7 @@ def test_frames_are_read_as_they_were_written(tmp_path: Path, kind: str) -> None
     np.testing.assert_allclose(read.azimuths_rad, written.azimuths_rad, atol=1e-15)
 
 
-def test_another_library_sees_what_the_message_defines(tmp_path: Path) -> None:
+def test_another_library_sees_what_the_message_defines(tmp_path):
     written = frames()
     with write_frames(tmp_path / "log.mcap", written).open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -159,7 +156,7 @@ def test_another_library_sees_what_the_message_defines(tmp_path: Path) -> None:
     np.testing.assert_allclose([left.z, right.z], np.cos(np.radians([14, 15])))
 
 
-def test_pieces_of_different_size_are_one_recording(tmp_path: Path) -> None:
+def test_pieces_of_different_size_are_one_recording(tmp_path):
     blocks = [frames(first=0), frames(first=3, bins=7), frames(first=6, count=1)]
     read = list(read_sonar_frames(write_frames(tmp_path / "log.mcap", *blocks)))
     assert [(len(block), block.intensity.shape[2]) for block in read] == [(3, 5), (3, 7), (1, 5)]
@@ -167,7 +164,7 @@ def test_pieces_of_different_size_are_one_recording(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read[2].intensity, blocks[2].intensity)
 
 
-def test_an_existing_recording_survives_an_error(tmp_path: Path) -> None:
+def test_an_existing_recording_survives_an_error(tmp_path):
     path = write_frames(tmp_path / "log.mcap", frames())
     before = path.read_bytes()
     with pytest.raises(LogError, match="/sonar/image: samples of type complex"):
@@ -176,9 +173,7 @@ def test_an_existing_recording_survives_an_error(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_images_that_are_made_one_by_one_lie_among_the_others_once_and_in_order(
-    make_sequence: Any, tmp_path: Path
-) -> None:
+def test_images_that_are_made_one_by_one_lie_among_the_others_once_and_in_order(make_sequence, tmp_path):
     sequence = make_sequence()
     blocks = [replace(frames(count=1), stamps_ns=sequence.imu.stamps_ns[row : row + 1]) for row in (4, 12)]
     write_log(tmp_path / "a.mcap", sequence)

@@ -91,13 +91,14 @@ def test_small_offsets_are_the_radii_of_curvature_times_the_angles(latitude, lon
     assert np.allclose(enu[0], [0, 0, -5], rtol=0, atol=1e-6)
 
 
+@pytest.fixture(scope="module", params=[1, 3, 7])
+def sequence(request, unpacked):
+    return read_akit(next(unpacked("akit_1-7.tar.xz").rglob("Trajectory1")).parent, request.param)
+
+
 @pytest.mark.recording
 class TestRecording:
     """Against the reference, which lags the IMU by a time that differs between trajectories."""
-
-    @pytest.fixture(scope="class", params=[1, 3, 7])
-    def sequence(self, request, unpacked):
-        return read_akit(next(unpacked("akit_1-7.tar.xz").rglob("Trajectory1")).parent, request.param)
 
     @pytest.mark.slow
     def test_gyros_follow_the_reference_once_the_earths_rotation_is_removed(self, sequence):

@@ -85,14 +85,15 @@ def test_slip_grows_with_time_and_not_with_the_number_of_samples(folder):
     assert variance == pytest.approx(0.02**2 * dt.sum())
 
 
+@pytest.fixture(scope="module", params=[1, 2, 3, 4, 5])
+def sequence(request, unpacked):
+    folder = next(unpacked("mrclam_ds6.tar.xz").rglob("Barcodes.dat")).parent
+    return read_mrclam(folder, request.param)
+
+
 @pytest.mark.recording
 class TestSet6:
     """Against motion capture; bounds from docs/theory/datasets.md, with room."""
-
-    @pytest.fixture(scope="class", params=[1, 2, 3, 4, 5])
-    def sequence(self, request, unpacked):
-        folder = next(unpacked("mrclam_ds6.tar.xz").rglob("Barcodes.dat")).parent
-        return read_mrclam(folder, request.param)
 
     def test_detections_point_at_the_true_landmarks(self, sequence):
         assert set(sequence.detections.candidate_ids[:, 0].tolist()) <= set(range(6, 21))

@@ -75,7 +75,7 @@ def ros1_bag(tmp_path: Path) -> Path:
     return path
 
 
-def test_stamps_values_and_times_are_those_of_the_bag(ros1_bag: Path, tmp_path: Path, decoded: Decode) -> None:
+def test_stamps_values_and_times_are_those_of_the_bag(ros1_bag, tmp_path, decoded):
     done = convert_rosbag(ros1_bag, tmp_path / "new.mcap")
     assert (done.topics, done.messages, done.left_out) == (3, 7, {})
     found = decoded(tmp_path / "new.mcap")
@@ -87,7 +87,7 @@ def test_stamps_values_and_times_are_those_of_the_bag(ros1_bag: Path, tmp_path: 
     assert times == stamps
 
 
-def test_definitions_are_those_of_ros_2(ros1_bag: Path, tmp_path: Path, decoded: Decode) -> None:
+def test_definitions_are_those_of_ros_2(ros1_bag, tmp_path, decoded):
     convert_rosbag(ros1_bag, tmp_path / "new.mcap")
     with (tmp_path / "new.mcap").open("rb") as stream:
         reader = make_reader(stream)
@@ -104,7 +104,7 @@ def test_definitions_are_those_of_ros_2(ros1_bag: Path, tmp_path: Path, decoded:
     assert offers["/imu"] == {}
 
 
-def test_sqlite3_bags_keep_their_payloads(tmp_path: Path, decoded: Decode) -> None:
+def test_sqlite3_bags_keep_their_payloads(tmp_path, decoded):
     store = get_typestore(Stores.ROS2_HUMBLE)
     folder = tmp_path / "ros2"
     with Ros2Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
@@ -122,7 +122,7 @@ def test_sqlite3_bags_keep_their_payloads(tmp_path: Path, decoded: Decode) -> No
         assert found["/tf_static"][0].transforms[0].transform.translation.y == 2
 
 
-def test_a_type_of_the_users_own_keeps_its_definition(tmp_path: Path, decoded: Decode) -> None:
+def test_a_type_of_the_users_own_keeps_its_definition(tmp_path, decoded):
     store = ros1_store()
     store.register(get_types_from_msg("Header header\nfloat64[4] velocity\n", "provider_dvl/msg/Packet"))
     with Ros1Writer(tmp_path / "own.bag") as writer:
@@ -137,16 +137,14 @@ def test_a_type_of_the_users_own_keeps_its_definition(tmp_path: Path, decoded: D
     assert found.header.stamp.nanosec == (T0_NS + 3 * STEP_NS) % 10**9
 
 
-def test_progress_counts_messages(ros1_bag: Path, tmp_path: Path) -> None:
+def test_progress_counts_messages(ros1_bag, tmp_path):
     told: list[tuple[int, int]] = []
     convert_rosbag(ros1_bag, tmp_path / "new.mcap", lambda done, total: told.append((done, total)))
     assert told
     assert all(total == 7 and done <= total for done, total in told)
 
 
-def test_without_the_library_the_command_that_installs_it_is_named(
-    ros1_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_the_library_the_command_that_installs_it_is_named(ros1_bag, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(LogError, match=r"not installed: pip install 'sonar-graph\[rosbag\]'"):
         convert_rosbag(ros1_bag, tmp_path / "new.mcap")
@@ -168,7 +166,7 @@ def test_without_the_library_the_command_that_installs_it_is_named(
         ("a.bag", b"\x89MCAP0\r\n", r"a\.bag is already an MCAP file: read it directly"),
     ],
 )
-def test_what_is_no_bag_is_refused_and_leaves_nothing(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+def test_what_is_no_bag_is_refused_and_leaves_nothing(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(LogError, match=message):
         convert_rosbag(tmp_path / name, tmp_path / "new.mcap")
@@ -177,9 +175,7 @@ def test_what_is_no_bag_is_refused_and_leaves_nothing(tmp_path: Path, name: str,
 
 @pytest.mark.recording
 @pytest.mark.parametrize("name", ["sonia_imu_dvl", "husky"])
-def test_real_bags_decode_to_what_the_library_reads(
-    recordings: Path, tmp_path: Path, decoded: Decode, name: str
-) -> None:
+def test_real_bags_decode_to_what_the_library_reads(recordings, tmp_path, decoded, name):
     source = recordings / "bags" / f"{name}.bag"
     convert_rosbag(source, tmp_path / "new.mcap")
     found = decoded(tmp_path / "new.mcap")
@@ -198,9 +194,7 @@ def test_real_bags_decode_to_what_the_library_reads(
 
 
 @pytest.mark.recording
-def test_the_pool_run_of_sonia_is_a_sequence_with_a_few_lines_of_configuration(
-    recordings: Path, tmp_path: Path
-) -> None:
+def test_the_pool_run_of_sonia_is_a_sequence_with_a_few_lines_of_configuration(recordings, tmp_path):
     convert_rosbag(recordings / "bags" / "sonia_imu_dvl.bag", tmp_path / "new.mcap")
     table = {"topic": "/provider_dvl_PD0Packet", "type": "provider_dvl/msg/PD0Packet", "stamp": "log"}
     table["velocity"] = [f"velocity[{i}]" for i in range(3)]  # type: ignore[assignment]
@@ -213,7 +207,7 @@ def test_the_pool_run_of_sonia_is_a_sequence_with_a_few_lines_of_configuration(
 
 
 @pytest.mark.recording
-def test_gravity_of_husky_is_on_the_side_and_a_rotation_puts_it_up(recordings: Path, tmp_path: Path) -> None:
+def test_gravity_of_husky_is_on_the_side_and_a_rotation_puts_it_up(recordings, tmp_path):
     convert_rosbag(recordings / "bags" / "husky.bag", tmp_path / "new.mcap")
     topics = {"dvl": "/husky_velocity_controller/odom"}
     plain = read_log(tmp_path / "new.mcap", topics=topics)

@@ -126,9 +126,7 @@ CASES = [(ending, name) for ending in PIECES for name in FAULTS] + [("aris", nam
 
 
 @pytest.mark.parametrize(("ending", "name"), CASES)
-def test_of_a_damaged_file_all_other_frames_are_read_and_the_damage_is_told(
-    tmp_path: Path, ending: str, name: str
-) -> None:
+def test_of_a_damaged_file_all_other_frames_are_read_and_the_damage_is_told(tmp_path, ending, name):
     damage, expected, told = (FAULTS | ARIS_FAULTS)[name]
     head, *frames = PIECES[ending]
     numbers, said = read(tmp_path, [head, *damage(frames, ending)], ending)
@@ -143,7 +141,7 @@ def test_of_a_damaged_file_all_other_frames_are_read_and_the_damage_is_told(
 @each_kind
 @in_one_folder
 @given(part=st.floats(0, 1, exclude_max=True))
-def test_of_a_cut_file_every_complete_frame_is_read(tmp_path: Path, ending: str, part: float) -> None:
+def test_of_a_cut_file_every_complete_frame_is_read(tmp_path, ending, part):
     head, *frames = PIECES[ending]
     length = len(head) + len(frames[0]) + int(part * (COUNT - 1) * len(frames[0]))
     whole, rest = divmod(length - len(head), len(frames[0]))
@@ -158,8 +156,8 @@ def test_of_a_cut_file_every_complete_frame_is_read(tmp_path: Path, ending: str,
 @in_one_folder
 @given(st.floats(0, 1, exclude_max=True), st.integers(1, 3000), st.one_of(st.none(), st.integers(0, 255)))
 def test_missing_or_foreign_bytes_cost_the_frames_that_they_touch_and_perhaps_the_one_before(
-    tmp_path: Path, ending: str, part: float, count: int, fill: int | None
-) -> None:
+    tmp_path, ending, part, count, fill
+):
     """Where the next header is not found in its place, nobody can say that the frame before is whole."""
     head, *frames = PIECES[ending]
     size, content = len(frames[0]), b"".join(frames)
@@ -173,7 +171,7 @@ def test_missing_or_foreign_bytes_cost_the_frames_that_they_touch_and_perhaps_th
 
 
 @each_kind
-def test_a_setting_that_stays_changed_is_believed(tmp_path: Path, ending: str) -> None:
+def test_a_setting_that_stays_changed_is_believed(tmp_path, ending):
     head, *frames = PIECES[ending]
     for i in range(3, COUNT):
         frames = flipped(frames, i, SETTING_AT[ending], 4)
@@ -183,7 +181,7 @@ def test_a_setting_that_stays_changed_is_believed(tmp_path: Path, ending: str) -
     assert result.blocks[0].ranges_m[-1] != result.blocks[1].ranges_m[-1]
 
 
-def test_a_clock_that_is_set_back_loses_nothing(tmp_path: Path) -> None:
+def test_a_clock_that_is_set_back_loses_nothing(tmp_path):
     head, *frames = PIECES["aris"]
     for i in range(4, COUNT):
         frame = bytearray(frames[i])
@@ -193,7 +191,7 @@ def test_a_clock_that_is_set_back_loses_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", ["ddf", "aris"])
-def test_a_file_header_that_lost_bytes_costs_no_frame(tmp_path: Path, ending: str) -> None:
+def test_a_file_header_that_lost_bytes_costs_no_frame(tmp_path, ending):
     head, *frames = PIECES[ending]
     result = converted(tmp_path, b"".join([head[:300], *frames]), ending)
     assert which(result) == EVERY
@@ -202,7 +200,7 @@ def test_a_file_header_that_lost_bytes_costs_no_frame(tmp_path: Path, ending: st
 
 
 @each_kind
-def test_a_file_of_nothing_but_noise_after_its_header_is_refused(tmp_path: Path, ending: str) -> None:
+def test_a_file_of_nothing_but_noise_after_its_header_is_refused(tmp_path, ending):
     noise = np.random.default_rng(1).integers(0, 256, 200_000, dtype=np.uint8).tobytes()
     path = tmp_path / f"dive.{ending}"
     path.write_bytes(PIECES[ending][0] + noise)
@@ -224,11 +222,11 @@ def test_a_file_of_nothing_but_noise_after_its_header_is_refused(tmp_path: Path,
         (b"\x04\x01\0\0" + b"?" * 8 + b"DDF\x05", False),
     ],
 )
-def test_the_beginning_of_a_header_is_told_from_other_bytes(content: bytes, may_be: bool) -> None:
+def test_the_beginning_of_a_header_is_told_from_other_bytes(content, may_be):
     assert object.__new__(ArisFormat).may_follow(content, FrameHead(0, 1, 0x104, 0, ())) is may_be
 
 
-def test_a_pattern_is_found_wherever_it_is_and_reading_ends_with_the_file(tmp_path: Path) -> None:
+def test_a_pattern_is_found_wherever_it_is_and_reading_ends_with_the_file(tmp_path):
     """Also across the places where one read ends and the next begins, and where it overlaps itself."""
     places = [0, 7, MIB - 3, MIB + 1, 2 * MIB - 1, 2 * MIB + 1, 3 * MIB, 3 * MIB + 2]
     content = bytearray(3 * MIB + 5)
@@ -260,7 +258,7 @@ def long_recording(path: Path, frames: int) -> Path:
     return path
 
 
-def test_a_long_recording_is_written_whole_with_progress_in_bounded_memory(tmp_path: Path) -> None:
+def test_a_long_recording_is_written_whole_with_progress_in_bounded_memory(tmp_path):
     told: list[tuple[int, int]] = []
     log = tmp_path / "dive.mcap"
     convert_didson(long_recording(tmp_path / "short.ddf", 200), log)  # imports and caches
@@ -279,7 +277,7 @@ def test_a_long_recording_is_written_whole_with_progress_in_bounded_memory(tmp_p
     assert np.sort(stamps_ns).tolist() == [START_NS + i * STEP_NS for i in range(800)]
 
 
-def test_a_log_that_exists_survives_a_recording_that_is_missing_or_without_frames(tmp_path: Path) -> None:
+def test_a_log_that_exists_survives_a_recording_that_is_missing_or_without_frames(tmp_path):
     log, source = tmp_path / "dive.mcap", tmp_path / "dive.ddf"
     log.write_bytes(b"precious")
     with pytest.raises(DatasetError, match=r"dive\.ddf: cannot be read: No such file"):
@@ -294,7 +292,7 @@ def test_a_log_that_exists_survives_a_recording_that_is_missing_or_without_frame
         convert_didson(source, log / "dive.mcap")
 
 
-def test_the_log_has_the_name_of_the_recording_and_notes_what_is_lost(tmp_path: Path) -> None:
+def test_the_log_has_the_name_of_the_recording_and_notes_what_is_lost(tmp_path):
     result = converted(tmp_path, b"".join(PIECES["aris"]), "aris")
     assert result.recording.metadata["sonar_graph"]["name"] == "dive"
     assert result.notes["source"] == "ARIS recording dive.aris"
@@ -311,9 +309,7 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 
 @pytest.mark.parametrize(("kind", "ending"), [("didson", "ddf"), ("aris", "aris"), ("oculus", "raw")])
-def test_the_commands_say_what_was_read_and_lost(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, ending: str
-) -> None:
+def test_the_commands_say_what_was_read_and_lost(tmp_path, capsys, kind, ending):
     source, log = tmp_path / "dive.bin", tmp_path / "dive.mcap"
     source.write_bytes(b"".join(PIECES[ending][:5])[:-7])
     said = run(capsys, "convert", kind, source, "-o", log)
@@ -324,9 +320,7 @@ def test_the_commands_say_what_was_read_and_lost(
         assert words in said
 
 
-def test_the_command_takes_the_speed_of_sound_and_shows_some_of_many_losses(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_takes_the_speed_of_sound_and_shows_some_of_many_losses(tmp_path, capsys):
     header, *frames = Ddf(images(50, 96, 512)).pieces()
     source, log = tmp_path / "dive.ddf", tmp_path / "dive.mcap"
     source.write_bytes(header + b"".join(bytes(len(f)) if i % 2 else f for i, f in enumerate(frames)))

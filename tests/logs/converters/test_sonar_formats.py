@@ -41,7 +41,7 @@ WHOLE = [
 
 
 @pytest.mark.parametrize("recording", WHOLE, ids=lambda r: f"{type(r).__name__}-{r.frames.dtype}-{r.frames.shape[1]}")
-def test_frames_are_read_as_they_were_recorded(tmp_path: Path, recording: Any) -> None:
+def test_frames_are_read_as_they_were_recorded(tmp_path, recording):
     result = log_of(tmp_path, recording)
     known = result.by_stamp()
     first_ns = result.done.first_ns
@@ -71,9 +71,7 @@ def test_frames_are_read_as_they_were_recorded(tmp_path: Path, recording: Any) -
         ({"start_code": 3, "length_code": 0, "flags": 1, "version": 4}, 1.26, 1.25),
     ],
 )
-def test_window_codes_of_a_didson_are_metres_at_1465_m_s(
-    tmp_path: Path, file: dict[str, Any], begin_m: float, length_m: float
-) -> None:
+def test_window_codes_of_a_didson_are_metres_at_1465_m_s(tmp_path, file, begin_m, length_m):
     recording = Ddf(images(2, 96 if file.get("high", 1) else 48, 500), **file)
     expected = begin_m + length_m / 500 * (np.arange(500) + 0.5)
     np.testing.assert_allclose(log_of(tmp_path, recording).frames.ranges_m, expected, rtol=1e-6)
@@ -82,7 +80,7 @@ def test_window_codes_of_a_didson_are_metres_at_1465_m_s(
     assert "1500 m/s" in warm.notes["sonar.ranges"]
 
 
-def test_ranges_of_an_aris_are_half_the_way_of_sound(tmp_path: Path) -> None:
+def test_ranges_of_an_aris_are_half_the_way_of_sound(tmp_path):
     """Bin i is sampled from delay + i period to the next, and sound goes there and back."""
     recording = Aris(images(2, 128, 600), delay_us=1700, period_us=5, sound_speed=1480.0)
     ranges_m = log_of(tmp_path, recording).frames.ranges_m
@@ -104,7 +102,7 @@ MARKED[0, 0] = 255
         (Oculus(images(2, 26, 8)), 65.0, -60.0),
     ],
 )
-def test_azimuths_are_positive_to_the_left(tmp_path: Path, recording: Any, first_deg: float, last_deg: float) -> None:
+def test_azimuths_are_positive_to_the_left(tmp_path, recording, first_deg, last_deg):
     frames = log_of(tmp_path, recording).frames
     assert degrees(frames)[[0, -1]] == pytest.approx([first_deg, last_deg], abs=0.01)
     np.testing.assert_array_equal(frames.intensity, recording.frames)
@@ -132,9 +130,7 @@ put(NAN_DEPTH, 1024 + 128, "f", float("nan"))
         ("raw", Oculus(images(3, 16, 8), gamma_code=127).content(), {"scale": "0.498", "time": "switched on"}),
     ],
 )
-def test_readings_of_other_sensors_and_the_kind_of_time_are_in_the_notes(
-    tmp_path: Path, ending: str, content: bytes, expected: dict[str, str | None]
-) -> None:
+def test_readings_of_other_sensors_and_the_kind_of_time_are_in_the_notes(tmp_path, ending, content, expected):
     """A reading that is always zero was not measured; those that are no numbers are left out."""
     notes = converted(tmp_path, content, ending).notes
     for name, words in expected.items():
@@ -142,7 +138,7 @@ def test_readings_of_other_sensors_and_the_kind_of_time_are_in_the_notes(
 
 
 @pytest.mark.parametrize(("recording", "span_db"), [(Ddf(images(1, 96, 64)), 90), (Aris(images(1, 128, 64)), 80)])
-def test_the_log_says_that_counts_of_lens_sonars_are_decibels(tmp_path: Path, recording: Any, span_db: float) -> None:
+def test_the_log_says_that_counts_of_lens_sonars_are_decibels(tmp_path, recording, span_db):
     image = log_of(tmp_path, recording).calibration.sonar.image
     np.testing.assert_allclose(image.decibels(np.array([0, 51, 255], np.uint8)), [0, 0.2 * span_db, span_db], rtol=1e-6)
 
@@ -151,16 +147,14 @@ def test_the_log_says_that_counts_of_lens_sonars_are_decibels(tmp_path: Path, re
     ("kind", "code", "full_scale", "gamma"),
     [("u1", 0, 255, 1.0), ("u2", 255, 65_535, 1.0), ("u1", 127, 255, 0.498), ("u1", 51, 255, 0.2)],
 )
-def test_the_log_says_the_scale_and_the_gamma_of_an_oculus(
-    tmp_path: Path, kind: str, code: int, full_scale: float, gamma: float
-) -> None:
+def test_the_log_says_the_scale_and_the_gamma_of_an_oculus(tmp_path, kind, code, full_scale, gamma):
     image = log_of(tmp_path, Oculus(images(1, 16, 8).astype(kind), gamma_code=code)).calibration.sonar.image
     assert (image.scale, image.full_scale) == ("linear", full_scale)
     assert image.gamma == pytest.approx(gamma, abs=1e-3)
 
 
 @pytest.mark.parametrize("system", [(1, 1, 3.0e6), (1, 0, 1.8e6), (0, 1, 1.8e6), (2, 0, 0.7e6)])
-def test_frequency_and_speed_of_sound_are_in_the_messages(tmp_path: Path, system: tuple[int, int, float]) -> None:
+def test_frequency_and_speed_of_sound_are_in_the_messages(tmp_path, system):
     kind, high, frequency_hz = system
     log_of(tmp_path, Aris(images(1, 128, 64), system=kind, high=high))
     with (tmp_path / "dive.mcap").open("rb") as stream:
@@ -206,9 +200,7 @@ ONE_ARIS, THREE_ARIS = Aris(images(1, 48, 64), mode=1), Aris(images(3, 128, 64))
         (Aris(images(3, 128, 64), sound_speed=float("nan")), 0, b"", "sound speed of nan"),
     ],
 )  # fmt: skip
-def test_a_header_that_makes_no_sense_is_named(
-    tmp_path: Path, recording: Any, at: int, value: bytes, words: str
-) -> None:
+def test_a_header_that_makes_no_sense_is_named(tmp_path, recording, at, value, words):
     content = bytearray(recording.content())
     content[at : at + len(value)] = value
     path = tmp_path / "dive"
@@ -225,18 +217,18 @@ def test_a_header_that_makes_no_sense_is_named(
         ("raw", b"DDF\x05" + bytes(4000), "no Oculus ping"),
     ],
 )
-def test_other_files_are_refused(tmp_path: Path, ending: str, content: bytes, words: str) -> None:
+def test_other_files_are_refused(tmp_path, ending, content, words):
     path = tmp_path / "dive"
     path.write_bytes(content)
     assert_refused(lambda: CONVERTERS[ending](path, tmp_path / "dive.mcap"), path, words)
 
 
-def test_a_damaged_file_header_of_an_aris_costs_no_frame(tmp_path: Path) -> None:
+def test_a_damaged_file_header_of_an_aris_costs_no_frame(tmp_path):
     content = b"\xff" * 1024 + THREE_ARIS.content()[1024:]
     np.testing.assert_array_equal(converted(tmp_path, content, "aris").frames.intensity, THREE_ARIS.frames)
 
 
-def test_frames_that_a_didsons_header_promises_are_missed(tmp_path: Path) -> None:
+def test_frames_that_a_didsons_header_promises_are_missed(tmp_path):
     done = log_of(tmp_path, Ddf(images(3, 48, 64), high=0, promised=5)).done
     assert done.shortcomings() == ["missing: 2 of 5 frames that the file's header names"]
 
@@ -259,9 +251,7 @@ def test_frames_that_a_didsons_header_promises_are_missed(tmp_path: Path) -> Non
         *((length, "", None, "cut off") for length in (3, 16, 60, 130, 150)),
     ],
 )
-def test_a_ping_whose_header_makes_no_sense_is_lost(
-    tmp_path: Path, at: int, layout: str, value: Any, words: str
-) -> None:
+def test_a_ping_whose_header_makes_no_sense_is_lost(tmp_path, at, layout, value, words):
     _, *pings = Oculus(images(4, 16, 8)).pieces()
     broken = bytearray(pings[1])
     if value is None:
@@ -277,14 +267,14 @@ def test_a_ping_whose_header_makes_no_sense_is_lost(
 
 
 @pytest.mark.parametrize("version", [0, 2])
-def test_time_goes_on_where_the_clock_wraps_around(tmp_path: Path, version: int) -> None:
+def test_time_goes_on_where_the_clock_wraps_around(tmp_path, version):
     """The older clock has 32 bits: it begins anew after 4.3 s, here between the first and the second ping."""
     stamps_ns = log_of(tmp_path, Oculus(images(60, 16, 8), version=version)).frames.stamps_ns
     np.testing.assert_allclose(np.diff(stamps_ns), STEP_NS, atol=1)
     assert stamps_ns[0] == pytest.approx(2**32 - 100_000_000, abs=1)
 
 
-def test_the_newer_clock_does_not_wrap_around(tmp_path: Path) -> None:
+def test_the_newer_clock_does_not_wrap_around(tmp_path):
     _, first, *_ = Oculus(images(1, 16, 8), version=2, first_clock=10**12).pieces()
     _, second, *_ = Oculus(images(1, 16, 8, seed=1), version=2, first_clock=10**12 + 10**10, first_number=501).pieces()
     stamps_ns = converted(tmp_path, first + second, "raw").frames.stamps_ns
@@ -292,13 +282,13 @@ def test_the_newer_clock_does_not_wrap_around(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["u1", "u2"])
-def test_gains_of_the_rows_are_taken_out(tmp_path: Path, kind: str) -> None:
+def test_gains_of_the_rows_are_taken_out(tmp_path, kind):
     pictures = images(3, 16, 4).astype(kind)
     frames = log_of(tmp_path, Oculus(pictures, gains=np.array([1, 4, 9, 16], np.uint32))).frames
     np.testing.assert_allclose(frames.intensity, pictures / [1, 2, 3, 4], rtol=1e-6)
 
 
-def test_messages_without_images_are_passed_over_and_damage_after_one_costs_only_itself(tmp_path: Path) -> None:
+def test_messages_without_images_are_passed_over_and_damage_after_one_costs_only_itself(tmp_path):
     pictures = images(4, 16, 8)
     _, *pings = Oculus(pictures).pieces()
     note, huge = oculus_note(b"SO" * 6), bytearray(oculus_note())
@@ -314,7 +304,7 @@ def test_messages_without_images_are_passed_over_and_damage_after_one_costs_only
         assert [str(loss) for loss in result.done.lost] == lost
 
 
-def test_pings_that_were_not_recorded_are_counted_but_not_where_numbers_begin_anew(tmp_path: Path) -> None:
+def test_pings_that_were_not_recorded_are_counted_but_not_where_numbers_begin_anew(tmp_path):
     _, *pings = Oculus(images(6, 16, 8)).pieces()
     done = converted(tmp_path, b"".join(pings[:2] + pings[4:]), "raw").done
     assert (done.frames, done.lost) == (4, [])
@@ -327,7 +317,7 @@ def test_pings_that_were_not_recorded_are_counted_but_not_where_numbers_begin_an
 
 
 @pytest.mark.recording
-def test_a_real_recording_of_an_aris_is_read_to_the_byte(recordings: Path, tmp_path: Path) -> None:
+def test_a_real_recording_of_an_aris_is_read_to_the_byte(recordings, tmp_path):
     source = recordings / "sonar" / "sample.aris"
     done = convert_aris(source, tmp_path / "dive.mcap")
     (frames,) = read_sonar_frames(tmp_path / "dive.mcap")
@@ -343,9 +333,7 @@ def test_a_real_recording_of_an_aris_is_read_to_the_byte(recordings: Path, tmp_p
 
 @pytest.mark.recording
 @pytest.mark.parametrize(("name", "count"), [("one_ping_8bit.raw", 1), ("three_pings_8bit.raw", 3)])
-def test_real_recordings_of_an_oculus_are_read_to_the_byte(
-    recordings: Path, tmp_path: Path, name: str, count: int
-) -> None:
+def test_real_recordings_of_an_oculus_are_read_to_the_byte(recordings, tmp_path, name, count):
     source = recordings / "sonar" / name
     done = convert_oculus(source, tmp_path / "dive.mcap")
     (frames,) = read_sonar_frames(tmp_path / "dive.mcap")
