@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 
 from sonar_graph.calibration import Calibration, FloorPrior, ImuCalibration, Mounting, SonarCalibration, Start
-from sonar_graph.measurements import Dvl, Floats, Imu, LandmarkDetections
+from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.slam import GatedIdentity, GaussianKernel, KeyframeParams, MixtureIdentity, RobustKernel
 from sonar_graph.slam.frontend import Sightings
 from sonar_graph.slam.keyframes import Keyframes
@@ -13,7 +14,7 @@ from sonar_graph.slam.landmarks.tracked import TrackedIdentity
 from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import Outcome
 
-from .made import smoother_with
+from .made import detected, polar, smoother_with
 
 NS = 1_000_000_000
 T0_NS = 1_500_000_000 * NS
@@ -63,32 +64,18 @@ class Dive:
         self, after_s: float, *rows: tuple[int, float, float], probability: float = 0.9, cov: Floats | None = None
     ) -> None:
         stamp = T0_NS + round(after_s * NS)
-        self.keyframes.advance(stamp)
-        self.sightings.add(frame(stamp, rows, probability, cov))
+        self.show(stamp, [row[1:] for row in rows], [[row[0]] for row in rows], [probability], cov=cov)
+
+    def show(self, stamp_ns: int, *rows, **more) -> None:
+        """A frame as of `detected`."""
+        self.keyframes.advance(stamp_ns)
+        self.sightings.add(detected(stamp_ns, *rows, **more))
 
     @property
     def outcomes(self) -> list[Outcome]:
         return self.sightings.journal.log().outcomes
 
 
-def frame(stamp: int, rows, probability: float = 0.9, cov: Floats | None = None) -> LandmarkDetections:
-    n = len(rows)
-    ids, ranges, azimuths = zip(*rows, strict=True)
-    return LandmarkDetections(
-        np.full(n, stamp),
-        np.array(ranges),
-        np.array(azimuths),
-        np.tile(np.full((2, 2), np.nan) if cov is None else cov, (n, 1, 1)),
-        np.array(ids)[:, None],
-        np.full((n, 1), probability),
-    )
-
-
-def spherical(x: float, p: Floats) -> tuple[float, float]:
-    """Range and azimuth of a point from the mounted sonar of a level vehicle at (x, 0, 0), by scipy-free algebra."""
-    (roll, pitch, yaw), t = SONAR.mounting.rpy_rad, np.array(SONAR.mounting.translation_m)
-    assert roll == 0
-    Ry = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
-    Rz = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    q = (Rz @ Ry).T @ (p - [x, 0, 0] - t)
-    return float(np.linalg.norm(q)), float(np.arctan2(q[1], q[0]))
+def spherical(x: float, p: Floats) -> Floats:
+    """Range and azimuth of a point from the mounted sonar of a level vehicle at (x, 0, 0)."""
+    return polar(gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0])).compose(SONAR.mounting.pose()), p)

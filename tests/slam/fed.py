@@ -1,4 +1,4 @@
-"""Smoothers that were fed a run, with every factor that they were given, and what these say by numpy."""
+"""Smoothers that were fed a run, with every factor that they were given."""
 
 from __future__ import annotations
 
@@ -8,22 +8,17 @@ import pytest
 from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
 from sonar_graph.slam.models import factors
-from sonar_graph.slam.smoother import batch_solution as sightlines_module
+from sonar_graph.slam.smoother import batch_solution
 from sonar_graph.slam.smoother.batch_solution import solve
 
-from .graphs import information
-from .made import smoother_with
-from .rail import RANGE_SIGMA_M, STEP_S, VELOCITY_SIGMA_M_S, calibration, rail
+from .graphs import block_of, dense_covariance
+from .made import motion_of, plain, polar, smoother_with
+from .rail import RANGE_SIGMA_M, STEP_S, VELOCITY_SIGMA_M_S, Rail, calibration, rail
 
 FOREVER_S = 1e9
 NEVER_M = 1e9
 SONAR = gtsam.Pose3(gtsam.Rot3.Ry(0.4), np.array([0.3, 0.0, -0.1]))
-
-
-def plain(noise):
-    return noise
 
 
 class Fed:
@@ -41,6 +36,13 @@ class Fed:
     def handles_on(self, *keys: int) -> list[int]:
         """Of the factors on just these variables."""
         return [h for h, factor in zip(self.handles, self.given, strict=True) if set(factor.keys()) == set(keys)]
+
+    def joint(self, *keys: int) -> Floats:
+        return block_of(self.smoother.joint_covariance(list(keys)), list(keys))
+
+    def dense(self, values: gtsam.Values, *keys: int) -> Floats:
+        """The same from all factors that were given, by numpy."""
+        return dense_covariance(self.given, values, list(keys))
 
 
 def on_the_rail(
@@ -62,16 +64,31 @@ def on_the_rail(
         fed.smoother.add_pose(X(k), pose, k * STEP_S)
         if held and X(k) in held:
             fed.smoother.hold(held)
-        motion = PreintegratedMotion(moved, cov, np.zeros((6, 3)), np.zeros(3), STEP_S, np.zeros(3))
-        fed.add([factors.odometry(X(k - 1), X(k), motion)])
+        fed.add([factors.odometry(X(k - 1), X(k), motion_of(moved, cov))])
         for _, i, distance in (r for r in numbers.ranges if r[0] == k):
             if i not in seen:
                 fed.smoother.add_landmark(L(i), pose.translation() + distance * np.eye(3)[0])
-            z, R = np.array([distance, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e6])
-            fed.add(factors.landmark_sighting(X(k), L(i), gtsam.Pose3(), z, R, plain, None if i in seen else 3e-4))
+            fed.add(ranged(k, i, distance, None if i in seen else 3e-4))
             seen.add(i)
         fed.smoother.update(k * STEP_S)
     return fed
+
+
+def ranged(k: int, i: int, distance: float, elevation_sigma: float | None = None) -> list[gtsam.NonlinearFactor]:
+    """Factors of a range on the rail."""
+    z, R = np.array([distance, 0.0]), np.diag([RANGE_SIGMA_M**2, 1e6])
+    return factors.landmark_sighting(X(k), L(i), gtsam.Pose3(), z, R, plain, elevation_sigma)
+
+
+def assert_is_least_squares(fed: Fed, numbers: Rail, nodes: int, landmarks: tuple[int, ...] = (4, 7)) -> None:
+    """The window's newest pose and its landmarks along x, with their variances, are those of numpy."""
+    mean, variance = numbers.solution(nodes)
+    newest = X(nodes - 1)
+    assert fed.smoother.values.atPose3(newest).translation()[0] == pytest.approx(mean[f"x{nodes - 1}"], abs=1e-8)
+    assert fed.joint(newest)[3, 3] == pytest.approx(variance[f"x{nodes - 1}"], abs=1e-8)
+    for i in landmarks:
+        assert fed.smoother.values.atPoint3(L(i))[0] == pytest.approx(mean[f"l{i}"], abs=1e-8)
+        assert fed.smoother.covariance(L(i))[0, 0] == pytest.approx(variance[f"l{i}"], abs=1e-8)
 
 
 def in_the_basin(
@@ -90,8 +107,7 @@ def in_the_basin(
     for k in range(1, steps):
         truth = truth.compose(turn)
         moved = turn.compose(gtsam.Pose3.Expmap(np.sqrt(np.diag(cov)) * rng.standard_normal(6)))
-        D_bias = np.vstack([-np.eye(3), np.zeros((3, 3))])
-        motion = PreintegratedMotion(moved, cov, D_bias, np.zeros(3), 1.0, np.zeros(3))
+        motion = motion_of(moved, cov, -np.eye(6)[:, :3])
         fed.smoother.add_pose(X(k), fed.smoother.values.atPose3(X(k - 1)).compose(moved), float(k))
         fed.add([factors.odometry_with_bias(X(k - 1), X(k), B((k - 1) // bias_steps), motion)])
         if k % bias_steps == 0:
@@ -99,8 +115,7 @@ def in_the_basin(
             fed.smoother.add_bias(B(new), fed.smoother.values.atPoint3(B(new - 1)))
             fed.add([factors.bias_walk(B(new - 1), B(new), 0.003)])
         for i, p in landmarks.items():
-            q = truth.compose(SONAR).transformTo(p)
-            z = np.array([np.linalg.norm(q), np.arctan2(q[1], q[0])]) + [0.02, 0.009] * rng.standard_normal(2)
+            z = polar(truth.compose(SONAR), p) + [0.02, 0.009] * rng.standard_normal(2)
             if i not in seen:
                 fed.smoother.add_landmark(L(i), p + 0.3 * rng.standard_normal(3))
             new = factors.landmark_sighting(
@@ -112,27 +127,6 @@ def in_the_basin(
     return fed
 
 
-def dense_covariance(fed: Fed, values: gtsam.Values, keys: list[int]) -> Floats:
-    """Block of the inverse of the information of all factors that were given, by numpy."""
-    every = sorted({key for factor in fed.given for key in list(factor.keys())})
-    sizes = [len(values.zeroVectors().at(key)) for key in every]
-    ends = dict(zip(every, np.cumsum(sizes).tolist(), strict=True))
-    wanted = np.concatenate([np.arange(ends[k] - sizes[every.index(k)], ends[k]) for k in keys])
-    return np.linalg.inv(information(fed.given, values, every))[np.ix_(wanted, wanted)]
-
-
-def settled(fed: Fed, time_s: float) -> Fed:
-    """Updated until nothing is relinearised any more."""
-    for _ in range(8):
-        fed.smoother.update(time_s)
-    return fed
-
-
-def joint(fed: Fed, keys: list[int]) -> Floats:
-    found = fed.smoother.joint_covariance(keys)
-    return np.block([[found.at(a, b) for b in keys] for a in keys])
-
-
 def counted_solves(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Sizes of the graphs that the smoother solves from now on."""
     sizes: list[int] = []
@@ -141,5 +135,5 @@ def counted_solves(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         sizes.append(graph.size())
         return solve(graph, values)
 
-    monkeypatch.setattr(sightlines_module, "solve", counting)
+    monkeypatch.setattr(batch_solution, "solve", counting)
     return sizes

@@ -1,4 +1,4 @@
-"""Derivatives of factors by differences, and what a graph of factors says in sum."""
+"""Sums of what the factors of a graph say, and differences between two graphs."""
 
 from __future__ import annotations
 
@@ -8,54 +8,67 @@ import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Floats
+from sonar_graph.slam import Isam2
+from sonar_graph.slam.smoother import JointCovariance
 
-STEP = 1e-6
-
-
-def perturbed(values: gtsam.Values, key: int, change: Floats) -> gtsam.Values:
-    """One variable moved along its tangent space."""
-    delta = gtsam.VectorValues()
-    delta.insert(key, change)
-    return values.retract(delta)
+from .made import graph_of
 
 
-def numerical_jacobian(factor: gtsam.NonlinearFactor, values: gtsam.Values, key: int) -> Floats:
-    """Derivative of the unwhitened error by a variable, central differences."""
-    n = len(values.zeroVectors().at(key))
-    columns = []
-    for axis in np.eye(n):
-        plus, minus = (factor.unwhitenedError(perturbed(values, key, sign * STEP * axis)) for sign in (1, -1))
-        columns.append((plus - minus) / (2 * STEP))
-    return np.column_stack(columns)
-
-
-def analytic_jacobians(factor: gtsam.NonlinearFactor, values: gtsam.Values) -> Floats:
-    """Whitened derivative that a factor hands to the solver, columns in the order of its keys."""
-    A, _ = factor.linearize(values).jacobian()
-    return A
-
-
-def assert_jacobians(factor: gtsam.NonlinearFactor, values: gtsam.Values, tolerance: float = 1e-5) -> None:
-    """Every derivative of a factor equals the differences of its error, relative to the largest."""
-    numerical = np.hstack([numerical_jacobian(factor, values, key) for key in list(factor.keys())])
-    whitened = factor.noiseModel().R() @ numerical
-    assert np.abs(analytic_jacobians(factor, values) - whitened).max() < tolerance * max(np.abs(whitened).max(), 1.0)
-
-
-def graph_of(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
-    graph = gtsam.NonlinearFactorGraph()
-    for factor in factors:
-        graph.push_back(factor)
-    return graph
-
-
-def information(factors: Iterable[gtsam.NonlinearFactor], values: gtsam.Values, keys: list[int]) -> Floats:
+def information(factors: Iterable[gtsam.NonlinearFactor], values: gtsam.Values, keys: Iterable[int]) -> Floats:
     """Sum of the factors' information about some variables, in the order of the keys."""
-    dims = {key: len(values.zeroVectors().at(key)) for key in keys}
-    at = dict(zip(keys, np.cumsum([0, *dims.values()])[:-1].tolist(), strict=True))
-    total = np.zeros((sum(dims.values()),) * 2)
-    for factor in factors:
-        A = analytic_jacobians(factor, values)
-        columns = np.concatenate([np.arange(at[k], at[k] + dims[k]) for k in list(factor.keys())])
-        total[np.ix_(columns, columns)] += A.T @ A
-    return total
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return graph_of(factors).linearize(values).hessian(ordering)[0]
+
+
+def factors_of(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactor]:
+    return [graph.at(i) for i in range(graph.size())]
+
+
+def dense_covariance(factors: list[gtsam.NonlinearFactor], values: gtsam.Values, keys: list[int]) -> Floats:
+    """Block of the inverse of the information of all factors, by numpy."""
+    every = sorted({key for factor in factors for key in list(factor.keys())})
+    sizes = [len(values.zeroVectors().at(key)) for key in every]
+    ends = dict(zip(every, np.cumsum(sizes).tolist(), strict=True))
+    wanted = np.concatenate([np.arange(ends[k] - sizes[every.index(k)], ends[k]) for k in keys])
+    return np.linalg.inv(information(factors, values, every))[np.ix_(wanted, wanted)]
+
+
+def block_of(joint: JointCovariance, keys: list[int]) -> Floats:
+    return np.block([[joint.at(a, b) for b in keys] for a in keys])
+
+
+def off_sigmas(found: Floats, expected: Floats) -> float:
+    """Largest deviation of a covariance, in standard deviations of both components."""
+    sigmas = np.sqrt(np.diag(expected))
+    return float(np.abs((found - expected) / np.outer(sigmas, sigmas)).max())
+
+
+def rows_of(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> dict[tuple, list[Floats]]:
+    """Each factor by its kind and variables: whitened error and derivatives at some values."""
+    found: dict[tuple, list[Floats]] = {}
+    for factor in factors_of(graph):
+        A, b = factor.linearize(values).jacobian()
+        found.setdefault((type(factor).__name__, *factor.keys()), []).append(np.column_stack([A, b]))
+    return {name: sorted(rows, key=lambda row: tuple(row.ravel())) for name, rows in found.items()}
+
+
+def assert_same_factors(
+    one: gtsam.NonlinearFactorGraph, other: gtsam.NonlinearFactorGraph, values: gtsam.Values, tolerance: float = 1e-7
+) -> None:
+    """One by one, in standard deviations of what they measure."""
+    a, b = rows_of(one, values), rows_of(other, values)
+    assert {name: len(rows) for name, rows in a.items()} == {name: len(rows) for name, rows in b.items()}
+    for name, rows in b.items():
+        for x, y in zip(a[name], rows, strict=True):
+            np.testing.assert_allclose(x, y, rtol=0, atol=tolerance * max(1.0, np.abs(y).max()), err_msg=str(name))
+
+
+def assert_same_graph(one: Isam2, other: Isam2, tolerance: float = 1e-6) -> None:
+    """Factors, and marginals of every variable in the units of its standard deviations, at the values of the other."""
+    values, _ = other._smoother.solve_history()
+    assert_same_factors(one.graph, other.graph, values, tolerance)
+    a, b = (gtsam.Marginals(each.graph, values) for each in (one, other))
+    for key in values.keys():  # noqa: SIM118  # gtsam.Values is no mapping
+        assert off_sigmas(a.marginalCovariance(key), b.marginalCovariance(key)) < tolerance

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
 from sonar_graph.slam import Isam2
 from sonar_graph.states import Outcome
 
 from .dive import NS, T0_NS, Dive, spherical
-from .made import isam2_params
+from .made import ran
 from .rail import rail
 
 FLAT = [0.2, 0.2, 0.2, 0.2]
@@ -47,10 +47,7 @@ def from_the_start(sequence: Sequence) -> Sequence:
 
 
 def run(sequence: Sequence, rate_hz: float = 2.0, **params) -> Isam2:
-    estimator = Isam2(sequence.calibration, isam2_params(**params))
-    for step in sequence.replay(sequence.instants(rate_hz)):
-        estimator.process(step)
-    return estimator
+    return ran(sequence, rate_hz, **params)[0]
 
 
 def assert_outcomes_account(estimator: Isam2, sequence: Sequence) -> Counter:
@@ -78,23 +75,11 @@ class Watch(Dive):
     """Three objects, each watched in every frame."""
 
     def watch(self, number: int, beliefs: list[list[float]]) -> None:
-        stamp = T0_NS + round(number * GAP_S * NS)
-        z = np.array([spherical(0.5 * number * GAP_S, p) for p in OBJECTS])
-        self.keyframes.advance(stamp)
-        self.sightings.add(detected(stamp, z, beliefs, np.arange(3)))
+        z = [spherical(0.5 * number * GAP_S, p) for p in OBJECTS]
+        self.show(T0_NS + round(number * GAP_S * NS), z, IDS, beliefs, np.arange(3))
         self.keyframes.update_if_due()
 
 
-def detected(stamp: int, z: Floats, beliefs: list[list[float]], track) -> LandmarkDetections:
-    n = len(z)
-    ids = np.tile(IDS, (n, 1))
-    return LandmarkDetections(
-        np.full(n, stamp), z[:, 0], z[:, 1], np.full((n, 2, 2), np.nan), ids, np.array(beliefs, float), np.array(track)
-    )
-
-
 def see(dive: Dive, after_s: float, belief: list[float], track: int = 3, off_m: float = 0.0) -> None:
-    stamp = T0_NS + round(after_s * NS)
-    range_m, azimuth_rad = spherical(0.5 * after_s, OBJECTS[0])
-    dive.keyframes.advance(stamp)
-    dive.sightings.add(detected(stamp, np.array([[range_m + off_m, azimuth_rad]]), [belief], [track]))
+    z = spherical(0.5 * after_s, OBJECTS[0]) + np.array([off_m, 0.0])
+    dive.show(T0_NS + round(after_s * NS), [z], IDS, [belief], [track])

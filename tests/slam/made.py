@@ -1,17 +1,39 @@
-"""Settings and smoothers in few words."""
+"""Settings, estimators, smoothers, values, graphs and detections in few words."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from collections.abc import Sequence as Row
 from typing import Any
 
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, L, X
+from numpy.typing import ArrayLike
+
+from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
+from sonar_graph.sequence import Sequence
 from sonar_graph.settings import nested
-from sonar_graph.slam import Isam2Params
+from sonar_graph.slam import Isam2, Isam2Params
 from sonar_graph.slam.smoother import Smoother, SmootherParams
+from sonar_graph.states import Estimate
 
 
 def isam2_params(**given: Any) -> Isam2Params:
     """By dotted names, with two underscores for a dot: ``smoother__lag_s``."""
     return Isam2Params(**nested({name.replace("__", "."): value for name, value in given.items()}))
+
+
+def ran(sequence: Sequence, rate_hz: float = 2.0, **params: Any) -> tuple[Isam2, list[Estimate]]:
+    """The estimator after a run, and its causal estimates."""
+    estimator = Isam2(sequence.calibration, isam2_params(**params))
+    return estimator, estimates_of(estimator, sequence, rate_hz)
+
+
+def estimates_of(estimator: Isam2, sequence: Sequence, rate_hz: float = 2.0) -> list[Estimate]:
+    answers = [estimator.process(step) for step in sequence.replay(sequence.instants(rate_hz))]
+    return [answer for answer in answers if answer is not None]
 
 
 def smoother_with(
@@ -27,3 +49,83 @@ def smoother_with(
         lag_s=lag_s, relinearize_threshold=relinearize_threshold, stale_shift_m=stale_shift_m, waiting_gain=waiting_gain
     )
     return Smoother(params, is_bounded=is_bounded)
+
+
+def values_of(**named: Any) -> gtsam.Values:
+    """Values by name: X0, L3, B1."""
+    values, symbols = gtsam.Values(), {"X": X, "L": L, "B": B}
+    for name, value in named.items():
+        values.insert(symbols[name[0]](int(name[1:])), value)
+    return values
+
+
+def graph_of(factors: Iterable[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        graph.push_back(factor)
+    return graph
+
+
+def plain(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
+    """No kernel."""
+    return noise
+
+
+def isotropic(size: int, sigma: float) -> gtsam.noiseModel.Base:
+    return gtsam.noiseModel.Isotropic.Sigma(size, sigma)
+
+
+def pose_prior(key: int, pose: gtsam.Pose3, sigma: float) -> gtsam.NonlinearFactor:
+    return gtsam.PriorFactorPose3(key, pose, isotropic(6, sigma))
+
+
+def point_prior(key: int, point: ArrayLike, sigma: float = 0.1) -> gtsam.NonlinearFactor:
+    return gtsam.PriorFactorPoint3(key, np.asarray(point, float), isotropic(3, sigma))
+
+
+def polar(world_T_sonar: gtsam.Pose3, point: Floats) -> Floats:
+    """Range and azimuth of a point, by plain trigonometry."""
+    x, y, z = world_T_sonar.transformTo(point)
+    return np.array([np.sqrt(x * x + y * y + z * z), np.arctan2(y, x)])
+
+
+def random_covariance(n: int, sigma: float, seed: int = 0) -> Floats:
+    root = np.random.default_rng(seed).standard_normal((n, n))
+    return sigma**2 * (root @ root.T / n + 0.1 * np.eye(n))
+
+
+def motion_of(
+    i_T_j: gtsam.Pose3, cov: Floats, D_bias: Floats | None = None, bias: Floats | None = None
+) -> PreintegratedMotion:
+    """Motion of one second."""
+    D_bias, bias = (np.zeros((6, 3)) if D_bias is None else D_bias), (np.zeros(3) if bias is None else bias)
+    return PreintegratedMotion(i_T_j, cov, D_bias, bias, 1.0, np.zeros(3))
+
+
+def some_motion(seed: int = 0, sigma: float = 0.01) -> PreintegratedMotion:
+    rng = np.random.default_rng(seed)
+    i_T_j = gtsam.Pose3.Expmap(np.concatenate([0.3 * rng.standard_normal(3), 0.5 * rng.standard_normal(3)]))
+    D_bias, bias = rng.standard_normal((6, 3)), 0.01 * rng.standard_normal(3)
+    return motion_of(i_T_j, random_covariance(6, sigma, seed + 1), D_bias, bias)
+
+
+def detected(
+    stamps_ns: ArrayLike,
+    z: ArrayLike,
+    ids: Row[Any],
+    probabilities: ArrayLike,
+    tracks: ArrayLike | None = None,
+    cov: Floats | None = None,
+) -> LandmarkDetections:
+    """Rows z (range, azimuth), shape (n, 2); stamps and candidates are one for all rows or one for each."""
+    z, probabilities = np.asarray(z, float), np.asarray(probabilities, float)
+    n, width = len(z), probabilities.shape[-1]
+    return LandmarkDetections(
+        np.broadcast_to(np.asarray(stamps_ns, np.int64), n).copy(),
+        z[:, 0],
+        z[:, 1],
+        np.tile(np.full((2, 2), np.nan) if cov is None else cov, (n, 1, 1)),
+        np.broadcast_to(np.asarray(ids, np.int64), (n, width)).copy(),
+        np.broadcast_to(probabilities, (n, width)).copy(),
+        *([] if tracks is None else [np.asarray(tracks)]),
+    )

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, SonarCalibration, Start
-from sonar_graph.measurements import Dvl, Floats, Imu, LandmarkDetections
+from sonar_graph.measurements import Dvl, Floats, Imu
 from sonar_graph.sequence import NS_PER_S, Sequence
+
+from .made import detected
 
 T0_NS = 1_600_000_000 * NS_PER_S
 STEP_S = 0.5
@@ -70,19 +72,13 @@ def rail(nodes: int = 21, seed: int = 0) -> tuple[Sequence, Rail]:
     ]
     at = T0_NS + np.arange(nodes) * round(STEP_S * NS_PER_S)
     imu_ns = T0_NS + np.arange(5 * (nodes - 1) + 1) * NS_PER_S // 10
-    n = len(ranges)
     sequence = Sequence(
         name="rail",
         calibration=calibration(),
         imu=Imu(imu_ns, np.zeros((len(imu_ns), 3)), np.tile([0, 0, 9.80665], (len(imu_ns), 1))),
         dvl=Dvl(at, np.outer(velocity, [1.0, 0, 0]), np.full((nodes, 3, 3), np.nan)),
-        detections=LandmarkDetections(
-            at[[k for k, _, _ in ranges]],
-            np.array([distance for _, _, distance in ranges]),
-            np.zeros(n),
-            np.full((n, 2, 2), np.nan),
-            np.array([[i] for _, i, _ in ranges]),
-            np.ones((n, 1)),
+        detections=detected(
+            at[[k for k, _, _ in ranges]], [(r, 0.0) for _, _, r in ranges], [[i] for _, i, _ in ranges], [1.0]
         ),
     )
     return sequence, Rail(displacements, ranges)

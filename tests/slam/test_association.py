@@ -1,39 +1,44 @@
-"""Identities that are accepted, decided and weighed."""
+"""Identities that are accepted, decided and weighed, and pairings that trying all of them finds."""
 
 from __future__ import annotations
 
-import gtsam
+from itertools import product
+
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import X
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from numpy.testing import assert_array_equal
+from scipy.stats import chi2, multivariate_normal
 
-from sonar_graph.measurements import LandmarkDetections
+from sonar_graph.measurements import Floats, LandmarkDetections
 from sonar_graph.slam.landmarks.association import LEAST_LANDMARKS, IdentityPosterior, RecogniserErrors, identify
-from sonar_graph.slam.landmarks.sighting import Sighting
+from sonar_graph.slam.landmarks.joint_compatibility import UNPAIRED, Innovations, Pairing, believed, pair_jointly
 from sonar_graph.slam.landmarks.tracked import NO_LANDMARK, UNDECIDED, decide
-from sonar_graph.slam.smoother.batch_solution import Sightline
 from sonar_graph.states import DetectionJournal, Outcome
 
-
-def detections(ids, probabilities):
-    n = len(ids)
-    return LandmarkDetections(
-        np.arange(n), np.ones(n), np.zeros(n), np.full((n, 2, 2), np.nan), np.array(ids), np.array(probabilities)
-    )
+from .made import detected
 
 
-def test_the_most_probable_identity_is_accepted_from_the_threshold_on():
-    found = identify(detections([[3, 7], [3, 7], [3, 7]], [[0.2, 0.8], [0.5, 0.1], [0.49, 0.48]]), 0.5)
-    assert_array_equal(found.ids, [7, 3, 3])
-    assert found.refusals == [None, None, Outcome.NO_IDENTITY]
+def stated(stamps_ns: list[int], ids: list, probabilities: list[list[float]]) -> LandmarkDetections:
+    return detected(stamps_ns, np.ones((len(stamps_ns), 2)), ids, probabilities)
 
 
-def test_no_identity_is_refused_however_low_the_threshold():
-    found = identify(detections([[-1, 2], [4, -1]], [[0.9, 0.1], [0.0, 0.0]]), 0.0)
-    assert found.refusals == [Outcome.NO_IDENTITY, None]
+REPEATED, NO_IDENTITY = Outcome.REPEATED, Outcome.NO_IDENTITY
+
+
+@pytest.mark.parametrize(
+    ("rows", "least", "ids", "refusals"),
+    [
+        (([0, 1, 2], [3, 7], [[0.2, 0.8], [0.5, 0.1], [0.49, 0.48]]), 0.5, [7, 3, 3], [None, None, NO_IDENTITY]),
+        (([0, 1], [[-1, 2], [4, -1]], [[0.9, 0.1], [0.0, 0.0]]), 0.0, [-1, 4], [NO_IDENTITY, None]),
+        (([0, 0, 0, 1], [7], [[0.8], [0.9], [0.9], [0.8]]), 0.5, [7] * 4, [REPEATED, None, REPEATED, None]),
+    ],
+    ids=["from the threshold on", "however low the threshold", "once a frame, of equals the first"],
+)
+def test_the_most_probable_identity_is_accepted(rows: tuple, least: float, ids: list[int], refusals: list) -> None:
+    found = identify(stated(*rows), least)
+    assert found.ids.tolist() == ids
+    assert found.refusals == refusals
 
 
 def test_a_row_is_amended_in_its_place_and_loses_its_innovation():
@@ -50,23 +55,11 @@ def test_a_row_is_amended_in_its_place_and_loses_its_innovation():
     assert np.isnan(log.innovation_covs).all()
 
 
-def test_of_one_identity_in_one_frame_the_most_probable_row_is_taken():
-    """Of equals the first; the same identity in another frame is another matter."""
-    rows = detections([[7], [7], [7], [7]], [[0.8], [0.9], [0.9], [0.8]])
-    rows = LandmarkDetections(np.array([0, 0, 0, 1]), *list(vars(rows).values())[1:])
-    assert identify(rows, 0.5).refusals == [Outcome.REPEATED, None, Outcome.REPEATED, None]
-
-
 CHANCES = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=4).map(lambda p: [x / max(sum(p), 1.0) for x in p])
 
 
 def statement(ids: list[int], probability: list[float]) -> IdentityPosterior:
-    n = len(ids)
-    rows = LandmarkDetections(
-        np.zeros(1, dtype=int), np.ones(1), np.ones(1), np.ones((1, 2, 2)), np.array([ids]), np.array([probability])
-    )
-    assert n == len(probability)
-    return IdentityPosterior.of(rows, 0)
+    return IdentityPosterior.of(stated([0], ids, [probability]), 0)
 
 
 @given(CHANCES, st.floats(0.001, 0.999), st.integers(LEAST_LANDMARKS, 60))
@@ -82,35 +75,14 @@ def test_what_is_no_landmark_is_not_stated() -> None:
     assert statement([-1], [1.0]).favourite is None
 
 
-@pytest.mark.parametrize(
-    ("probability", "named"),
-    [
-        ([0.97, 0.01], 5),
-        ([0.2, 0.2], None),
-        ([0.4, 0.1], None),
-        ([0.5, 0.5], None),
-        ([0.1, 0.6], 3),
-        ([0.0, 0.0], None),
-    ],
-)
+NAMED = [
+    ([0.97, 0.01], 5), ([0.2, 0.2], None), ([0.4, 0.1], None), ([0.5, 0.5], None), ([0.1, 0.6], 3), ([0.0, 0.0], None),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("probability", "named"), NAMED)
 def test_only_what_is_more_probable_than_all_else_is_named(probability: list[float], named: int | None) -> None:
     assert statement([5, 3][: len(probability)], probability).favourite == named
-
-
-LEAST = 0.75
-
-
-def frame(*beliefs: list[float]) -> LandmarkDetections:
-    """Of landmarks 4 and 7."""
-    n = len(beliefs)
-    return LandmarkDetections(
-        np.zeros(n, dtype=int),
-        np.ones(n),
-        np.zeros(n),
-        np.full((n, 2, 2), np.nan),
-        np.tile([4, 7], (n, 1)),
-        np.array(beliefs),
-    )
 
 
 @pytest.mark.parametrize(
@@ -126,8 +98,142 @@ def frame(*beliefs: list[float]) -> LandmarkDetections:
     ],
 )
 def test_what_reaches_the_least_probability_is_decided(belief: list[float], decided: int) -> None:
-    assert decide(frame(belief, [1.0, 0.0]), LEAST) == [decided, 4]
+    assert decide(stated([0, 0], [4, 7], [belief, [1.0, 0.0]]), 0.75) == [decided, 4]
 
 
-def sighting(stamp_ns: int) -> Sighting:
-    return Sighting(stamp_ns, 0, Sightline(X(0), gtsam.Pose3(), np.array([2.0, 0.0])), np.eye(2), None)
+# Pairings -----------------------------------------------------------------------------------------------------------
+
+PROBABILITY = 0.95
+
+
+def random_case(seed: int, m: int, n: int, spread: float) -> Innovations:
+    """Landmarks seen by one vehicle whose error they share, some so near that many pairings are possible."""
+    rng = np.random.default_rng(seed)
+    expected = spread * rng.standard_normal((n, 2))
+    shared = rng.standard_normal((2 * n, 3))
+    own = 0.2 * rng.standard_normal((2 * n, 2 * n))
+    cov = shared @ shared.T + own @ own.T
+    noise = np.array([0.1 * (root := rng.standard_normal((2, 2))) @ root.T + 0.05 * np.eye(2) for _ in range(m)])
+    error = rng.multivariate_normal(np.zeros(2 * n), cov).reshape(n, 2)
+    seen = rng.permutation(np.concatenate([expected + error, spread * rng.standard_normal((m, 2))]))[:m]
+    return Innovations(seen[:, None] - expected[None], cov, noise)
+
+
+def distance(case: Innovations, landmarks: tuple[int, ...]) -> tuple[int, float]:
+    """Number of pairs and D², of the whole covariance at once."""
+    pairs = [(i, j) for i, j in enumerate(landmarks) if j != UNPAIRED]
+    if not pairs:
+        return 0, 0.0
+    e = np.concatenate([case.innovation[i, j] for i, j in pairs])
+    C = np.zeros((2 * len(pairs), 2 * len(pairs)))
+    for a, (i, j) in enumerate(pairs):
+        for b, (_, k) in enumerate(pairs):
+            block = case.expected_cov[2 * j : 2 * j + 2, 2 * k : 2 * k + 2]
+            C[2 * a : 2 * a + 2, 2 * b : 2 * b + 2] = block + (case.noise[i] if a == b else 0.0)
+    return len(pairs), float(e @ np.linalg.inv(C) @ e)
+
+
+def all_pairings(m: int, n: int) -> list[tuple[int, ...]]:
+    """Every pairing in which no landmark occurs twice."""
+    every = product(range(UNPAIRED, n), repeat=m)
+    return [p for p in every if len({j for j in p if j != UNPAIRED}) == sum(j != UNPAIRED for j in p)]
+
+
+def brute_force(case: Innovations) -> tuple[int, float, tuple[int, ...]]:
+    """The largest compatible pairing of pairs that are compatible alone, the nearest of equals."""
+    m, n = case.innovation.shape[:2]
+
+    def is_compatible(landmarks: tuple[int, ...]) -> bool:
+        size, squared = distance(case, landmarks)
+        return size == 0 or squared <= chi2.ppf(PROBABILITY, 2 * size)
+
+    found = []
+    for landmarks in all_pairings(m, n):
+        alone = [tuple(j if i == k else UNPAIRED for i in range(m)) for k, j in enumerate(landmarks)]
+        if all(map(is_compatible, alone)) and is_compatible(landmarks):
+            size, squared = distance(case, landmarks)
+            found.append((size, -squared, landmarks))
+    size, squared, landmarks = max(found)
+    return size, -squared, landmarks
+
+
+@example(seed=928, m=3, n=3, spread=1.5)  # two pairs beyond their gate, and the third finds its landmark taken
+@example(seed=15, m=3, n=3, spread=1.5)  # two pairs beyond their gate, three inside
+@settings(max_examples=150, deadline=None)
+@given(seed=st.integers(0, 2**31), m=st.integers(1, 4), n=st.integers(1, 4), spread=st.sampled_from([0.5, 1.5, 4.0]))
+def test_the_pairing_is_that_of_trying_all(seed: int, m: int, n: int, spread: float):
+    case = random_case(seed, m, n, spread)
+    found = pair_jointly(case, PROBABILITY)
+    size, squared, landmarks = brute_force(case)
+    assert distance(case, found.landmarks)[0] == found.size
+    assert found.distance == pytest.approx(distance(case, found.landmarks)[1], rel=1e-6, abs=1e-9)
+    assert found.size == size
+    assert found.distance == pytest.approx(squared, rel=1e-6, abs=1e-9)
+    assert found.landmarks == landmarks
+
+
+SPACING = 1.0
+SHIFT = 0.8
+VEHICLE_SIGMA, SIGMA = 1.0, 0.1
+
+
+def shifted() -> Innovations:
+    """Two landmarks a metre apart, both seen, by a vehicle that is off by nearly that metre."""
+    expected = np.array([[0.0, 0.0], [SPACING, 0.0]])
+    z = expected + np.array([SHIFT, 0.0])
+    shared = np.tile(np.eye(2), (2, 1))
+    cov = VEHICLE_SIGMA**2 * shared @ shared.T + 1e-4 * np.eye(4)
+    return Innovations(z[:, None] - expected[None], cov, np.tile(SIGMA**2 * np.eye(2), (2, 1, 1)))
+
+
+def test_an_error_that_all_share_does_not_mislead_joint_compatibility():
+    """Each detection by itself would be paired with the second landmark, within the same gate.
+
+    Negative control: with errors taken as independent the crossed pairing, whose innovations differ by two metres,
+    would be compatible.
+    """
+    case = shifted()
+    assert np.argmin(case.distances(), axis=1).tolist() == [1, 1]
+    assert (case.distances()[:, 1] <= chi2.ppf(PROBABILITY, 2)).all()
+    assert pair_jointly(case, PROBABILITY).landmarks == (0, 1)
+    independent = Innovations(case.innovation, np.diag(np.diag(case.expected_cov)), case.noise)
+    (_, joint), (_, apart) = distance(case, (1, 0)), distance(independent, (1, 0))
+    assert joint > chi2.ppf(PROBABILITY, 4) > apart
+
+
+# What a pairing must be worth ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sigma", [0.1, 0.5, 2.0])
+def test_a_pair_is_believed_when_it_is_denser_than_its_rival(sigma: float):
+    case = Innovations(np.array([[[0.1, 0.0]]]), sigma**2 * np.eye(2), 1e-6 * np.eye(2)[None])
+    density = multivariate_normal.logpdf([0.1, 0.0], cov=(sigma**2 + 1e-6) * np.eye(2))
+    for rival, size in ((density - 1e-6, 1), (density + 1e-6, 0)):
+        assert believed(case, Pairing((0,), 0.0), np.array([rival])).size == size
+
+
+def test_two_that_share_a_wide_error_support_each_other():
+    """One alone says nothing beside a rival of 0.2 a unit; two at the right distance from each other do."""
+    rival, case = np.log(np.full(2, 0.2)), shifted()
+    assert believed(case, Pairing((0, 1), 0.0), rival).landmarks == (0, 1)
+    assert believed(case, Pairing((0, UNPAIRED), 0.0), rival).size == 0
+
+
+def test_two_that_fit_each_other_but_may_be_anywhere_say_nothing():
+    """Each given the other is denser than a rival of 3 a unit; where both are together is not."""
+    case, both = shifted(), Pairing((0, 1), 0.0)
+    e, C = case.of(both.landmarks)
+    together = multivariate_normal.logpdf(e, cov=C)
+    given_the_other = together - multivariate_normal.logpdf(e[2:], cov=C[2:, 2:])
+    assert given_the_other > np.log(3.0) > together / 2
+    assert believed(case, both, np.log(np.full(2, 3.0))).size == 0
+
+
+def test_a_pair_that_the_others_speak_against_is_dropped():
+    """The third lies where the common error of the first two does not let it be."""
+    expected = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    z: Floats = expected + np.array([[0.8, 0.0], [0.8, 0.0], [-0.3, 0.6]])
+    shared = np.tile(np.eye(2), (3, 1))
+    cov = shared @ shared.T + 1e-4 * np.eye(6)
+    case = Innovations(z[:, None] - expected[None], cov, np.tile(SIGMA**2 * np.eye(2), (3, 1, 1)))
+    assert believed(case, Pairing((0, 1, 2), 0.0), np.log(np.full(3, 0.2))).landmarks == (0, 1, UNPAIRED)

@@ -7,19 +7,15 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, L, X
 
-from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
 from sonar_graph.slam.models import factors
+from sonar_graph.slam.smoother import Smoother
 from sonar_graph.slam.smoother.batch_solution import Sightline, Sightlines, solve
 
-from .made import smoother_with
+from .made import graph_of, motion_of, plain, polar, pose_prior, smoother_with, values_of
 
 TURN = gtsam.Pose3(gtsam.Rot3.Rz(0.3), np.array([0.5, 0.0, 0.02]))
 SONAR = gtsam.Pose3(gtsam.Rot3.Ry(0.4), np.array([0.3, 0.0, -0.1]))
 LANDMARKS = {3: np.array([3.0, 1.0, -1.0]), 5: np.array([2.0, 3.0, -0.8]), 8: np.array([-0.5, 2.5, -1.2])}
-
-
-def plain(noise):
-    return noise
 
 
 def huber(noise):
@@ -39,18 +35,14 @@ def round_trip(seed: int, poses: int = 12, with_bias: bool = False, kernel=plain
     for k in range(poses):
         values.insert(X(k), truth.compose(gtsam.Pose3.Expmap(0.2 * rng.standard_normal(6))))
         for i, p in LANDMARKS.items():
-            q = truth.compose(SONAR).transformTo(p)
-            z = [np.linalg.norm(q), np.arctan2(q[1], q[0])] + [0.02, 0.009] * rng.standard_normal(2)
+            z = polar(truth.compose(SONAR), p) + [0.02, 0.009] * rng.standard_normal(2)
             for factor in factors.landmark_sighting(X(k), L(i), SONAR, z, np.diag([4e-4, 8e-5]), kernel, 0.3):
                 graph.push_back(factor)
         noisy = TURN.compose(gtsam.Pose3.Expmap(np.sqrt(np.diag(cov)) * rng.standard_normal(6)))
-        motion = PreintegratedMotion(noisy, cov, -np.eye(6)[:, :3], np.zeros(3), 1.0, np.zeros(3))
+        motion, ends = motion_of(noisy, cov, -np.eye(6)[:, :3]), (X(k), X(k + 1))
         if k + 1 < poses:
-            graph.push_back(
-                factors.odometry_with_bias(X(k), X(k + 1), B(0), motion)
-                if with_bias
-                else factors.odometry(X(k), X(k + 1), motion)
-            )
+            with_B = factors.odometry_with_bias(*ends, B(0), motion)
+            graph.push_back(with_B if with_bias else factors.odometry(*ends, motion))
         truth = truth.compose(TURN)
     for i, p in LANDMARKS.items():
         values.insert(L(i), p + 0.3 * rng.standard_normal(3))
@@ -95,9 +87,8 @@ def test_where_nothing_lowers_the_error_the_initial_values_are_returned():
             jacobians[0] = -np.eye(3)
         return values.atPoint3(L(0))
 
-    graph, initial = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.push_back(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3), [L(0)], unwise))
-    initial.insert(L(0), np.ones(3))
+    initial = values_of(L0=np.ones(3))
+    graph = graph_of([gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3), [L(0)], unwise)])
     assert solve(graph, initial).equals(initial, 0.0)
 
 
@@ -113,10 +104,18 @@ def world_point(range_m: float, azimuth_rad: float) -> np.ndarray:
 
 
 def one_pose(landmark: np.ndarray) -> gtsam.Values:
-    values = gtsam.Values()
-    values.insert(X(0), POSE)
-    values.insert(L(1), landmark)
-    return values
+    return values_of(X0=POSE, L1=landmark)
+
+
+def smoother_at(landmark: np.ndarray, *sightings: tuple[np.ndarray, float]) -> Smoother:
+    """A known pose, and sightings of a landmark with their sigmas."""
+    smoother = smoother_with(lag_s=10.0, relinearize_threshold=1e-3, stale_shift_m=0.1)
+    smoother.add_pose(X(0), POSE, 0.0)
+    smoother.add([pose_prior(X(0), POSE, 1e-3)])
+    smoother.add_landmark(L(1), landmark)
+    for z, sigma in sightings:
+        smoother.add(factors.landmark_sighting(X(0), L(1), BODY_T_SONAR, z, np.eye(2) * sigma**2, plain, 0.07))
+    return smoother
 
 
 def seen(*sightings: np.ndarray) -> Sightlines:
@@ -135,7 +134,7 @@ def test_behind_begins_at_a_right_angle_to_what_was_measured(off_rad, is_behind)
 
 
 def test_the_camera_of_the_azimuth_factor_goes_blind_exactly_there():
-    camera = factors.landmark_sighting(X(0), L(1), BODY_T_SONAR, Z, np.diag([1e-4, 1e-4]), lambda noise: noise)[0]
+    camera = factors.landmark_sighting(X(0), L(1), BODY_T_SONAR, Z, np.diag([1e-4, 1e-4]), plain)[0]
     for off_rad in np.linspace(-3, 3, 25):
         values = one_pose(world_point(5.0, Z[1] + off_rad))
         is_blind = not np.any(camera.linearize(values).jacobian()[0])
@@ -152,9 +151,8 @@ def test_a_sighting_that_is_taken_away_no_longer_counts():
     lines.remove(L(1), extra)
     lines.add(L(1), Sightline(X(0), BODY_T_SONAR, Z))
     assert lines.turned_away(values) == []
-    alone = Sightline(X(0), BODY_T_SONAR, opposite)
-    lines.add(L(2), alone)
-    lines.remove(L(2), alone)
+    lines.add(L(2), extra)
+    lines.remove(L(2), extra)
     assert lines.turned_away(values) == []
 
 
@@ -166,15 +164,10 @@ def test_a_landmark_is_placed_where_most_of_its_sightings_say():
 
 
 def test_a_landmark_stuck_behind_comes_round_in_the_solution_of_the_history():
-    smoother = smoother_with(lag_s=10.0, relinearize_threshold=1e-3, stale_shift_m=0.1)
-    smoother.add_pose(X(0), POSE, 0.0)
-    smoother.add([gtsam.PriorFactorPose3(X(0), POSE, gtsam.noiseModel.Isotropic.Sigma(6, 1e-3))])
-    smoother.add_landmark(L(1), world_point(1.9, Z[1] + 0.9 * np.pi))
-    cov = np.diag([1e-4, 1e-4])
-    smoother.add(factors.landmark_sighting(X(0), L(1), BODY_T_SONAR, Z, cov, lambda noise: noise, 0.07))
+    smoother = smoother_at(world_point(1.9, Z[1] + 0.9 * np.pi), (Z, 0.01))
     stuck = solve(smoother.graph, smoother.values)
     assert np.linalg.norm(stuck.atPoint3(L(1)) - world_point(*Z)) > 3.0
-    smoother.sightlines.add(L(1), Sightline(X(0), BODY_T_SONAR, Z))
+    smoother.sightlines = seen(Z)
     values, _ = smoother.solve_history()
     assert values.atPoint3(L(1)) == pytest.approx(world_point(*Z), abs=1e-6)
     assert smoother.graph.error(values) == pytest.approx(0.0, abs=1e-9)
@@ -182,14 +175,9 @@ def test_a_landmark_stuck_behind_comes_round_in_the_solution_of_the_history():
 
 def test_a_new_start_that_ends_higher_is_not_taken():
     """One sharp sighting ahead against two dull ones behind: most lie behind, yet the landmark is where it is best."""
-    smoother = smoother_with(lag_s=10.0, relinearize_threshold=1e-3, stale_shift_m=0.1)
-    smoother.add_pose(X(0), POSE, 0.0)
-    smoother.add([gtsam.PriorFactorPose3(X(0), POSE, gtsam.noiseModel.Isotropic.Sigma(6, 1e-3))])
-    smoother.add_landmark(L(1), world_point(*Z))
     opposite = np.array([2.0, Z[1] + 0.95 * np.pi])
-    for z, sigma in ((Z, 1e-3), (opposite, 0.3), (opposite, 0.3)):
-        smoother.add(factors.landmark_sighting(X(0), L(1), BODY_T_SONAR, z, np.eye(2) * sigma**2, lambda n: n, 0.07))
-        smoother.sightlines.add(L(1), Sightline(X(0), BODY_T_SONAR, z))
+    smoother = smoother_at(world_point(*Z), (Z, 1e-3), (opposite, 0.3), (opposite, 0.3))
+    smoother.sightlines = seen(Z, opposite, opposite)
     assert smoother.sightlines.turned_away(smoother.values) == [L(1)]
     elsewhere = solve(smoother.graph, smoother.sightlines.placed_anew(smoother.values, [L(1)]))
     values, _ = smoother.solve_history()

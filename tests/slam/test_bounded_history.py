@@ -13,11 +13,13 @@ from sonar_graph.slam import Isam2
 from sonar_graph.slam.smoother import Smoother
 from sonar_graph.states import Estimate, Outcome
 
-from .late_identities import on_the_rail
-from .made import isam2_params
+from .late_identities import SURE, on_the_rail
+from .made import isam2_params, ran
 from .rail import STEP_S, rail
 
 LAG_S = 5.0
+LINEAR = {"kernel__shape": "none", "smoother__waiting_gain": 0.0}
+EXACT = LINEAR | {"keyframes__motion_noise_share": 0.0}
 
 
 @cache
@@ -26,11 +28,7 @@ def mission(duration_s: float = 120.0) -> Sequence:
 
 
 def run(sequence: Sequence, history: str, rate_hz: float = 2.0, **params) -> tuple[Isam2, list[Estimate]]:
-    estimator = Isam2(
-        sequence.calibration, isam2_params(history__policy=history, **{"smoother__lag_s": LAG_S, **params})
-    )
-    estimates = [estimator.process(step) for step in sequence.replay(sequence.instants(rate_hz))]
-    return estimator, [estimate for estimate in estimates if estimate is not None]
+    return ran(sequence, rate_hz, history__policy=history, **{"smoother__lag_s": LAG_S, **params})
 
 
 def test_causal_estimates_are_those_of_the_whole_history_to_the_bit():
@@ -47,14 +45,8 @@ def test_causal_estimates_are_those_of_the_whole_history_to_the_bit():
 def test_poses_that_left_are_those_of_least_squares_as_far_as_the_lag_reached():
     """On the rail, with a keyframe a node: each pose is that of all that was measured until it left."""
     nodes, (sequence, numbers) = 31, rail(31)
-    lag_s = 3.25 * STEP_S
-    settings = {
-        "smoother__lag_s": lag_s,
-        "kernel__shape": "none",
-        "smoother__waiting_gain": 0.0,
-        "keyframes__motion_noise_share": 0.0,
-    }
-    estimator, _ = run(sequence, "bounded", 1 / STEP_S, **settings, keyframes__max_interval_s=STEP_S)
+    settings = EXACT | {"smoother__lag_s": 3.25 * STEP_S, "keyframes__max_interval_s": STEP_S}
+    estimator, _ = run(sequence, "bounded", 1 / STEP_S, **settings)
     found = estimator.trajectory()
     assert len(found) == nodes - 1
     for k, (position, cov) in enumerate(zip(found.positions, found.covariances, strict=True), start=1):
@@ -63,8 +55,7 @@ def test_poses_that_left_are_those_of_least_squares_as_far_as_the_lag_reached():
         assert cov[3, 3] == pytest.approx(variance[f"x{k}"], rel=1e-5)
     all_mean, _ = numbers.solution(nodes)
     assert abs(found.positions[5, 0] - all_mean["x6"]) > 1e-4
-    for i in (4, 7):
-        assert estimator.landmarks().positions[[4, 7].index(i), 0] == pytest.approx(all_mean[f"l{i}"], abs=1e-7)
+    assert estimator.landmarks().positions[:, 0] == pytest.approx([all_mean["l4"], all_mean["l7"]], abs=1e-7)
 
 
 def test_smoothed_poses_are_better_than_causal_ones_and_worse_than_those_of_the_whole():
@@ -124,21 +115,17 @@ def test_nothing_grows_with_the_run(tracks):
 
 # Identities ---------------------------------------------------------------------------------------------------------
 
-SURE_4, SURE_7 = [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
+
+def seven_after(belief: list[float], frames: int) -> Sequence:
+    """Landmark 7 is known after some frames in which something else is believed of it; 4 from the start."""
+    return on_the_rail([belief] * frames + [SURE[7]], SURE[4])
 
 
 @pytest.mark.parametrize(("frames", "is_corrected"), [(3, True), (12, False)])
 def test_a_wrong_identity_is_taken_back_as_far_as_the_window_reaches(frames, is_corrected):
     """Landmark 7 is taken for 6 in its first frames. Corrected within the lag the run is the right one; else not."""
-    wrong = [0.0, 0.0, 1.0, 0.0]
-    settings = {
-        "smoother__lag_s": 4.0,
-        "kernel__shape": "none",
-        "smoother__waiting_gain": 0.0,
-        "keyframes__motion_noise_share": 0.0,
-    }
-    late, _ = run(on_the_rail([wrong] * frames + [SURE_7], SURE_4), "bounded", **settings)
-    right, _ = run(on_the_rail([SURE_7], SURE_4), "bounded", **settings)
+    late, _ = run(seven_after([0.0, 0.0, 1.0, 0.0], frames), "bounded", **EXACT, smoother__lag_s=4.0)
+    right, _ = run(seven_after([], 0), "bounded", **EXACT, smoother__lag_s=4.0)
     maps = [dict(zip(e.landmarks().ids.tolist(), e.landmarks().positions[:, 0], strict=True)) for e in (late, right)]
     assert (maps[0].keys() == maps[1].keys()) == is_corrected
     assert set(maps[0]) - set(maps[1]) == (set() if is_corrected else {6})
@@ -152,29 +139,15 @@ def test_a_wrong_identity_is_taken_back_as_far_as_the_window_reaches(frames, is_
 
 
 def test_a_landmark_whose_sightings_have_left_stays_when_its_last_one_is_taken_back():
-    sequence = on_the_rail([[0.0, 0.0, 1.0, 0.0]] * 12 + [SURE_7], SURE_4)
-    estimator, _ = run(
-        sequence,
-        "bounded",
-        smoother__lag_s=2.0,
-        kernel__shape="none",
-        smoother__waiting_gain=0.0,
-        keyframes__motion_noise_share=0.0,
-    )
+    estimator, _ = run(seven_after([0.0, 0.0, 1.0, 0.0], 12), "bounded", **EXACT, smoother__lag_s=2.0)
     assert 6 in estimator.landmarks().ids.tolist()
     assert estimator.values.exists(L(6))
 
 
 def test_sightings_that_left_while_nobody_knew_them_are_not_used_later():
     """Landmark 7 is first taken for none; nothing holds the window open for it, and the first ones leave."""
-    sequence = on_the_rail([[0.0] * 4] * 10 + [SURE_7], SURE_4)
-    settings = {
-        "smoother__lag_s": 2.0,
-        "kernel__shape": "none",
-        "smoother__waiting_gain": 0.0,
-        "keyframes__motion_noise_share": 0.0,
-    }
-    whole, bounded = (run(sequence, history, **settings)[0].detections().outcomes for history in ("whole", "bounded"))
+    both = (run(seven_after([0.0] * 4, 10), of, **EXACT, smoother__lag_s=2.0)[0] for of in ("whole", "bounded"))
+    whole, bounded = (estimator.detections().outcomes for estimator in both)
     assert whole.count(Outcome.USED_LATER) == 10
     assert 0 < bounded.count(Outcome.USED_LATER) < 8
     assert bounded.count(Outcome.USED_LATER) + bounded.count(Outcome.NO_IDENTITY) == 10
@@ -187,9 +160,8 @@ def test_sightings_that_left_while_nobody_knew_them_are_not_used_later():
 def test_a_window_that_begins_anew_says_the_same():
     """On the rail all is linear: QR and a restart change nothing."""
     sequence, _ = rail(31)
-    settings = {"smoother__lag_s": 2.0, "kernel__shape": "none", "smoother__waiting_gain": 0.0}
-    plain, expected = run(sequence, "bounded", **settings)
-    estimator = Isam2(sequence.calibration, isam2_params(history__policy="bounded", **settings))
+    plain, expected = run(sequence, "bounded", **LINEAR, smoother__lag_s=2.0)
+    estimator = Isam2(sequence.calibration, isam2_params(history__policy="bounded", **LINEAR, smoother__lag_s=2.0))
     for k, step in enumerate(sequence.replay(sequence.instants(2.0))):
         estimate = estimator.process(step)
         assert estimate is not None

@@ -12,16 +12,15 @@ from gtsam.symbol_shorthand import B, L, X
 
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
-from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam import Isam2
 from sonar_graph.slam.estimates import AnchoredPose
 from sonar_graph.slam.smoother.batch_solution import JointCovariance
 from sonar_graph.states import FIRST_ANONYMOUS_ID, Outcome
 
-from .graphs import information
+from .graphs import dense_covariance, factors_of, off_sigmas
 from .late_identities import assert_outcomes_account, run
-from .made import isam2_params
+from .made import random_covariance, some_motion, values_of
 from .rail import STEP_S, rail
 
 KEYFRAME = gtsam.Pose3(gtsam.Rot3.Ypr(0.4, -0.1, 0.05), np.array([3.0, -2.0, -1.0]))
@@ -29,41 +28,18 @@ BIAS = np.array([1e-3, -2e-3, 5e-3])
 STEP = 1e-6
 
 
-def covariance(size: int, scale: float, seed: int) -> Floats:
-    A = np.random.default_rng(seed).standard_normal((size, size))
-    return scale * (A @ A.T + 0.1 * np.eye(size))
-
-
-def motion() -> PreintegratedMotion:
-    return PreintegratedMotion(
-        gtsam.Pose3(gtsam.Rot3.Ypr(0.5, 0.1, 0.0), np.array([2.0, 0.3, -0.1])),
-        covariance(6, 1e-5, 1),
-        0.5 * np.random.default_rng(2).standard_normal((6, 3)),
-        np.zeros(3),
-        2.0,
-        np.full(3, np.nan),
-    )
-
-
-def values() -> gtsam.Values:
-    found = gtsam.Values()
-    found.insert(X(3), KEYFRAME)
-    found.insert(B(0), BIAS)
-    return found
-
-
 @pytest.mark.parametrize("bias_key", [None, B(0)], ids=["no bias", "bias"])
 def test_the_pose_and_its_covariance_are_those_of_keyframe_bias_and_motion(bias_key: int | None) -> None:
     """``J P J'`` with J by differences, P joint of keyframe and bias: what both share counts."""
-    moved, P = motion(), covariance(9, 1e-4, 3)
+    moved, P = some_motion(1, 5e-3), random_covariance(9, 0.01, 3)
     joint = JointCovariance(P, {B(0): 6, X(3): 0})
-    found = AnchoredPose(7, 3, bias_key, moved).carried_on(values(), joint)
+    found = AnchoredPose(7, 3, bias_key, moved).carried_on(values_of(X3=KEYFRAME, B0=BIAS), joint)
 
     def carried(state: Floats) -> gtsam.Pose3:
         pose = KEYFRAME.compose(gtsam.Pose3.Expmap(state[:6]))
         if bias_key is None:
             return pose.compose(moved.i_T_j)
-        return pose.compose(moved.i_T_j).compose(gtsam.Pose3.Expmap(moved.D_bias @ (BIAS + state[6:])))
+        return pose.compose(moved.i_T_j).compose(gtsam.Pose3.Expmap(moved.D_bias @ (BIAS - moved.bias + state[6:])))
 
     mean = carried(np.zeros(9))
     assert found.world_T_body.equals(mean, 1e-9)
@@ -80,51 +56,32 @@ def test_the_pose_and_its_covariance_are_those_of_keyframe_bias_and_motion(bias_
 
 @cache
 def ran(lag_s: float, history: str = "whole", kernel: str = "none") -> Isam2:
-    sequence = simulate_mission(MissionOptions(duration_s=40.0, imu="mti1", landmarks=6))
-    params = isam2_params(
+    return run(
+        simulate_mission(MissionOptions(duration_s=40.0, imu="mti1", landmarks=6)),
         smoother__lag_s=lag_s,
         history__policy=history,
         kernel__shape=kernel,
         smoother__waiting_gain=0.0,
         keyframes__bias_interval_s=15.0,
     )
-    estimator = Isam2(sequence.calibration, params)
-    for step in sequence.replay(sequence.instants(2.0)):
-        estimator.process(step)
-    return estimator
 
 
-def dense(estimator: Isam2, values: gtsam.Values, keys: list[int]) -> np.ndarray:
-    """Block of the inverse of the sum of all factors' information."""
-    graph = estimator.graph
-    every = sorted(graph.keyVector())
-    sizes = [len(values.zeroVectors().at(key)) for key in every]
-    starts = dict(zip(every, np.cumsum([0, *sizes]).tolist(), strict=False))
-    wanted = np.concatenate([np.arange(starts[k], starts[k] + sizes[every.index(k)]) for k in keys])
-    total = information([graph.at(i) for i in range(graph.size())], values, every)
-    return np.linalg.inv(total)[np.ix_(wanted, wanted)]
-
-
-def off(found: np.ndarray, expected: np.ndarray) -> float:
-    """Largest deviation, in standard deviations of both components."""
-    sigmas = np.sqrt(np.diag(expected))
-    return float(np.abs((found - expected) / np.outer(sigmas, sigmas)).max())
+def dense(estimator: Isam2, values: gtsam.Values, keys: list[int]) -> Floats:
+    return dense_covariance(factors_of(estimator.graph), values, keys)
 
 
 KEYFRAMES, LANDMARKS = [4, 0, 2], [5, 2]
-
-
-def keys() -> list[int]:
-    return [L(2), L(5), X(0), X(2), X(4)]
+KEYS = [L(2), L(5), X(0), X(2), X(4)]
 
 
 def test_over_the_history_it_is_the_inverse_of_the_whole_information():
     estimator = ran(5.0)
     values, _ = estimator._smoother.solve_history()
     found = estimator.joint_covariance(KEYFRAMES, (), LANDMARKS, over="history")
-    assert off(found.matrix, dense(estimator, values, keys())) < 1e-6
-    for key in keys():
-        assert off(found.at(key, key), dense(estimator, values, [key])) < 1e-6
+    assert off_sigmas(found.matrix, dense(estimator, values, KEYS)) < 1e-6
+    assert np.array_equal(estimator.joint_covariance(landmarks=np.array([5])).matrix, estimator.marginal(landmark=5))
+    for key in KEYS:
+        assert off_sigmas(found.at(key, key), dense(estimator, values, [key])) < 1e-6
     assert np.array_equal(found.at(L(5), X(2)), found.matrix[3:6, 12:18])
 
 
@@ -132,8 +89,8 @@ def test_over_the_window_it_is_the_same_where_variables_are_linearised_if_nothin
     estimator = ran(1e9)
     found = estimator.joint_covariance(KEYFRAMES, (), LANDMARKS)
     linearised = estimator._smoother._window.isam.getLinearizationPoint()
-    assert off(found.matrix, dense(estimator, linearised, keys())) < 1e-6
-    assert 1e-4 < off(found.matrix, dense(estimator, estimator.values, keys())) < 0.02
+    assert off_sigmas(found.matrix, dense(estimator, linearised, KEYS)) < 1e-6
+    assert 1e-4 < off_sigmas(found.matrix, dense(estimator, estimator.values, KEYS)) < 0.02
 
 
 def test_of_a_bounded_history_it_is_the_inverse_of_the_windows_information():
@@ -141,8 +98,8 @@ def test_of_a_bounded_history_it_is_the_inverse_of_the_windows_information():
     newest = len(estimator.keyframe_stamps()) - 1
     values, _ = estimator._smoother.solve_history()
     found = estimator.joint_covariance([newest], (), [5, 2], over="history")
-    assert off(found.matrix, dense(estimator, values, [L(2), L(5), X(newest)])) < 1e-6
-    assert off(estimator.joint_covariance([newest], (), [5, 2]).matrix, found.matrix) < 0.05
+    assert off_sigmas(found.matrix, dense(estimator, values, [L(2), L(5), X(newest)])) < 1e-6
+    assert off_sigmas(estimator.joint_covariance([newest], (), [5, 2]).matrix, found.matrix) < 0.05
 
 
 def test_a_keyframe_is_known_by_its_stamp_as_by_its_number():
@@ -188,11 +145,6 @@ def test_what_a_bounded_history_has_given_up_is_told():
         ran(5.0, "bounded").marginal(keyframe=0, over="history")
 
 
-@pytest.fixture(scope="module")
-def ran_of_requests() -> Isam2:
-    return run(rail(8)[0], 1 / STEP_S)
-
-
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
@@ -204,13 +156,10 @@ def ran_of_requests() -> Isam2:
         ({"landmarks": [4], "over": "whole"}, 'over is \'whole\'; expected "window" or "history"'),
     ],
 )
-def test_a_covariance_of_what_cannot_be_is_refused(ran_of_requests: Isam2, asked: dict, said: str):
+def test_a_covariance_of_what_cannot_be_is_refused(asked: dict, said: str):
     with pytest.raises(EstimatorError, match=f"^isam2: {said}") as caught:
-        ran_of_requests.joint_covariance(**asked)
+        ran(5.0).joint_covariance(**asked)
     assert "\n" not in str(caught.value)
-    assert np.array_equal(
-        ran_of_requests.joint_covariance(landmarks=np.array([4])).matrix, ran_of_requests.marginal(landmark=4)
-    )
 
 
 @pytest.mark.parametrize("params", [{"lag_s": 3}, {}, "robust"])

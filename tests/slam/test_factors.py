@@ -1,19 +1,27 @@
+"""Factors: errors in closed form, derivatives by differences, information by directions."""
+
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import B, L, X
+from gtsam.symbol_shorthand import B, C, L, M, V, X
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, PlanarMotion, Start
-from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
+from sonar_graph.errors import MeasurementError
+from sonar_graph.measurements import Dvl, Imu
+from sonar_graph.navigation.preintegration.joint_preintegration import JointMotion, JointPreintegrator
 from sonar_graph.slam.models import factors
+from sonar_graph.slam.models.inertial_factors import doppler_odometry, inertial_doppler_odometry
 from sonar_graph.slam.models.sonar_model import range_azimuth
+from sonar_graph.testing import check_jacobians
 
-from .graphs import assert_jacobians, graph_of, information
+from .graphs import information
+from .made import graph_of, plain, random_covariance, some_motion, values_of
 
 BODY_T_SONAR = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.5, -0.2), np.array([0.4, 0.05, -0.1]))
 BODY_POSES = {
@@ -23,52 +31,77 @@ BODY_POSES = {
     "yaw beyond -pi": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.0, -np.pi + 1e-8), np.array([-1.0, 5.0, 0.3])),
 }
 poses = pytest.mark.parametrize("pose", BODY_POSES.values(), ids=BODY_POSES)
+SIGMA = np.array([0.02, 0.009])
+"""Noise of range and azimuth."""
+PLANE = PlanarMotion(z_m=0.4, z_sigma_m=0.01, tilt_sigma_rad=0.02)
+Made = Iterator[tuple[gtsam.NoiseModelFactor, gtsam.Values]]
 
 
-def plain(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
-    return noise
+def correlated(correlation: float) -> np.ndarray:
+    return np.outer(SIGMA, SIGMA) * [[1, correlation], [correlation, 1]]
 
 
-def values_of(**named) -> gtsam.Values:
-    """Values by name: X0, L3, B1."""
-    symbols = {"X": X, "L": L, "B": B}
-    values = gtsam.Values()
-    for name, value in named.items():
-        values.insert(symbols[name[0]](int(name[1:])), value)
-    return values
+def seen_from(pose: gtsam.Pose3, azimuth_rad: float, elevation_rad: float, range_m: float) -> np.ndarray:
+    """The point at these spherical coordinates of the mounted sonar, by scipy."""
+    beam = Rotation.from_euler("ZY", [azimuth_rad, -elevation_rad]).apply([range_m, 0, 0])
+    return pose.transformFrom(BODY_T_SONAR.transformFrom(beam))
 
 
-def full_covariance(n: int, sigma: float, seed: int = 0) -> np.ndarray:
-    root = np.random.default_rng(seed).standard_normal((n, n))
-    return sigma**2 * (root @ root.T + np.eye(n))
+# Derivatives ------------------------------------------------------------------------------------------------------
 
 
-def some_motion(seed: int = 0, turn_rad: float = 0.3) -> PreintegratedMotion:
-    rng = np.random.default_rng(seed)
-    i_T_j = gtsam.Pose3.Expmap(np.concatenate([turn_rad * rng.standard_normal(3), rng.standard_normal(3)]))
-    D_bias = rng.standard_normal((6, 3))
-    return PreintegratedMotion(
-        i_T_j, full_covariance(6, 0.05, seed), D_bias, 0.01 * rng.standard_normal(3), 1.0, np.zeros(3)
-    )
+def odometries(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
+    for spread in (0.0, 1.0):
+        motion, bias = some_motion(int(rng.integers(99)), 0.05), spread * 0.1 * rng.standard_normal(3)
+        X_j = pose.compose(motion.corrected(bias)).compose(gtsam.Pose3.Expmap(0.3 * spread * rng.standard_normal(6)))
+        yield factors.odometry_with_bias(X(0), X(1), B(0), motion), values_of(X0=pose, X1=X_j, B0=bias)
 
 
-def small_pose(rng: np.random.Generator, sigma: float) -> gtsam.Pose3:
-    return gtsam.Pose3.Expmap(sigma * rng.standard_normal(6))
+def sightings(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
+    azimuth, elevation = rng.uniform([-1.13, -0.12], [1.13, 0.12])
+    z, values = np.array([2.0, azimuth + 0.02]), values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, 2.1))
+    for cov in (correlated(0.0), correlated(0.5)):
+        for factor in factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain, 0.07):
+            yield factor, values
 
 
-@given(st.integers(0, 2**32 - 1), st.floats(0, 1.0))
-@settings(max_examples=25)
-def test_derivatives_of_odometry_hold_everywhere(seed, spread):
-    rng = np.random.default_rng(seed)
-    motion, pose = some_motion(seed), small_pose(rng, 2.0)
-    bias = spread * 0.1 * rng.standard_normal(3)
-    X_j = pose.compose(motion.corrected(bias)).compose(small_pose(rng, 0.3 * spread))
-    assert_jacobians(factors.odometry_with_bias(X(0), X(1), B(0), motion), values_of(X0=pose, X1=X_j, B0=bias))
+def attitudes_and_heights(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
+    values, up_in_body = values_of(X0=pose), pose.rotation().matrix().T @ [0, 0, 1.0]
+    tilt = gtsam.Rot3.RzRyRx(*rng.uniform(-0.3, 0.3, 2), 0)
+    yield factors.depth(X(0), 1.3, np.array([0.3, -0.2, 0.1]), 0.02), values
+    yield from ((factor, values) for factor in factors.planar(X(0), PLANE))
+    tilted = values_of(X0=pose.compose(gtsam.Pose3(tilt, np.zeros(3))))
+    yield factors.gravity_direction(X(0), 9.8 * up_in_body, 0.01), tilted
+
+
+def joint_odometries(pose: gtsam.Pose3, rng: np.random.Generator) -> Made:
+    """On random states, near zero error, and near half a turn of error."""
+    motion, seed = joint_motion(int(rng.integers(3))), int(rng.integers(99))
+    for off, turned in ((0.3, False), (1e-9, False), (0.05, True)):
+        values = fitting(motion, seed, off, turned, pose)
+        for full in (True, False):
+            for calibrated in (True, False):
+                yield made(motion, full, calibrated), values
+
+
+@pytest.mark.parametrize("made_at", [odometries, sightings, attitudes_and_heights, joint_odometries])
+@poses
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=5)
+def test_derivatives_are_those_of_differences(
+    made_at: Callable[[gtsam.Pose3, np.random.Generator], Made], pose: gtsam.Pose3, seed: int
+):
+    for factor, values in made_at(pose, np.random.default_rng(seed)):
+        check_jacobians(factor, values)
+        assert np.allclose(factor.linearize(values).jacobian()[1], -factor.whitenedError(values), rtol=1e-9)
+
+
+# Odometry ---------------------------------------------------------------------------------------------------------
 
 
 def test_odometry_error_is_what_the_pose_is_off_the_corrected_motion():
     """Zero where the second pose is the first moved by the corrected motion; else the perturbation from there."""
-    motion, pose, bias = some_motion(2), BODY_POSES["random"], np.array([0.02, 0.0, -0.03])
+    motion, pose, bias = some_motion(2, 0.05), BODY_POSES["random"], np.array([0.02, 0.0, -0.03])
     perturbation = np.array([0.01, -0.02, 0.03, 0.1, 0.2, -0.3])
     X_j = pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(motion.D_bias @ (bias - motion.bias)))
     factor = factors.odometry_with_bias(X(0), X(1), B(0), motion)
@@ -81,7 +114,7 @@ def test_odometry_error_is_what_the_pose_is_off_the_corrected_motion():
 @pytest.mark.parametrize("sigma", [0.05, 1e-5, 1e-7])
 def test_odometry_keeps_the_correlations_of_the_shortest_motion(sigma: float):
     """GTSAM's own choice drops them where all are below 1e-9."""
-    motion, pose = replace(some_motion(3), covariance=full_covariance(6, sigma)), BODY_POSES["random"]
+    motion, pose = replace(some_motion(3), covariance=random_covariance(6, sigma)), BODY_POSES["random"]
     off = sigma * np.array([0.3, -0.2, 0.1, 1.0, 2.0, -1.0])
     values = values_of(X0=pose, X1=pose.compose(motion.i_T_j).compose(gtsam.Pose3.Expmap(off)), B0=motion.bias)
     expected = 0.5 * off @ np.linalg.solve(motion.covariance, off)
@@ -96,26 +129,20 @@ def test_odometry_keeps_the_correlations_of_the_shortest_motion(sigma: float):
 # Sightings --------------------------------------------------------------------------------------------------------
 
 
-def seen_from(pose: gtsam.Pose3, azimuth_rad: float, elevation_rad: float, range_m: float) -> np.ndarray:
-    """The point at these spherical coordinates of the mounted sonar, by scipy."""
-    beam = Rotation.from_euler("ZY", [azimuth_rad, -elevation_rad]).apply([range_m, 0, 0])
-    return pose.transformFrom(BODY_T_SONAR.transformFrom(beam))
-
-
 @poses
 @given(azimuth=st.floats(-1.13, 1.13), elevation=st.floats(-0.12, 0.12), range_m=st.floats(0.5, 15))
 @settings(max_examples=15)
 def test_a_sighting_is_range_and_azimuth_whatever_the_elevation(pose, azimuth, elevation, range_m):
     """Errors in sigmas are (predicted - measured) / sigma; azimuth's by half a per cent less at the fan's edge."""
-    sigma, off = np.array([0.02, 0.009]), np.array([0.03, np.radians(1.0)])
+    off = np.array([0.03, np.radians(1.0)])
     shrunk = elevation / np.tan(elevation) if elevation else 1.0
     z = np.array([range_m, azimuth]) - off
     values = values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, range_m))
-    camera, distance = factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, np.diag(sigma**2), plain)
+    camera, distance = factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, np.diag(SIGMA**2), plain)
     across, up = camera.whitenedError(values)
-    assert across == pytest.approx(off[1] / sigma[1] * shrunk, rel=1.1e-4)
+    assert across == pytest.approx(off[1] / SIGMA[1] * shrunk, rel=1.1e-4)
     assert shrunk > 0.995
-    assert distance.whitenedError(values) == pytest.approx(off[:1] / sigma[0], rel=1e-6)
+    assert distance.whitenedError(values) == pytest.approx(off[:1] / SIGMA[0], rel=1e-6)
     assert abs(up) < 1e-3
     predicted = range_azimuth(pose.compose(BODY_T_SONAR), values.atPoint3(L(0)))
     assert predicted == pytest.approx([range_m, azimuth], abs=1e-6)
@@ -133,24 +160,10 @@ def test_an_azimuth_is_an_angle_however_wrong_it_is(azimuth, off):
     assert camera.unwhitenedError(values)[0] == pytest.approx(model.unwhitenedError(values)[1], abs=1e-7)
 
 
-@poses
-@given(azimuth=st.floats(-1.13, 1.13), elevation=st.floats(-0.12, 0.12))
-@settings(max_examples=10)
-def test_derivatives_of_sightings_are_those_of_differences(pose, azimuth, elevation):
-    z, cov = np.array([2.0, azimuth + 0.02]), np.array([[4e-4, 0], [0, 8e-5]])
-    values = values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, 2.1))
-    for factor in factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain, 0.07):
-        assert_jacobians(factor, values)
-    cov[0, 1] = cov[1, 0] = 1e-4
-    for factor in factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain, 0.07):
-        assert_jacobians(factor, values)
-
-
 @given(st.floats(-1.13, 1.13), st.floats(-0.12, 0.12), st.floats(-0.9, 0.9))
 @settings(max_examples=20)
 def test_a_correlated_sighting_is_the_model_weighed_by_its_covariance(azimuth, elevation, correlation):
-    pose, sigma, off = BODY_POSES["random"], np.array([0.02, 0.009]), np.array([0.03, -0.01])
-    cov = np.outer(sigma, sigma) * [[1, correlation], [correlation, 1]]
+    pose, off, cov = BODY_POSES["random"], np.array([0.03, -0.01]), correlated(correlation)
     z = np.array([2.0, azimuth]) - off
     values = values_of(X0=pose, L0=seen_from(pose, azimuth, elevation, 2.0))
     sighting = factors.correlated_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain)
@@ -164,7 +177,7 @@ def test_without_an_elevation_a_sighting_says_next_to_nothing_about_it():
     point = seen_from(pose, 0.2, 0.05, 2.0)
     upwards = seen_from(pose, 0.2, 0.05 + 1e-6, 2.0) - point
     upwards /= np.linalg.norm(upwards)
-    values, z, cov = values_of(X0=pose, L0=point), np.array([2.0, 0.2]), np.diag([0.02**2, 0.009**2])
+    values, z, cov = values_of(X0=pose, L0=point), np.array([2.0, 0.2]), np.diag(SIGMA**2)
     silent, told = (
         information(factors.landmark_sighting(X(0), L(0), BODY_T_SONAR, z, cov, plain, s), values, [L(0), X(0)])[:3, :3]
         for s in (None, 0.07)
@@ -179,10 +192,8 @@ def test_the_robust_kernel_weighs_every_part_of_a_sighting(correlation):
     def huber(noise):
         return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(2.0), noise)
 
-    sigma = np.array([0.02, 0.009])
-    cov = np.outer(sigma, sigma) * [[1, correlation], [correlation, 1]]
+    z, cov = np.array([2.0, 0.0]), correlated(correlation)
     values = values_of(X0=gtsam.Pose3(), L0=np.array([3.0, 0.3, 0.0]))
-    z = np.array([2.0, 0.0])
     robust, quadratic = (
         graph_of(factors.landmark_sighting(X(0), L(0), gtsam.Pose3(), z, cov, kernel)).error(values)
         for kernel in (huber, plain)
@@ -201,7 +212,6 @@ def test_depth_is_the_height_of_the_port_and_nothing_else(pose):
     values = values_of(X0=pose)
     assert factor.whitenedError(values)[2] == pytest.approx(0.05 / sigma)
     assert np.abs(factor.whitenedError(values)[:2]).max() < 1e-3
-    assert_jacobians(factor, values)
     eigenvalues = np.linalg.eigvalsh(information([factor], values, [X(0)]))
     assert eigenvalues[-1] > 1 / sigma**2 > 1e9 * eigenvalues[-2]
 
@@ -219,7 +229,6 @@ def test_gravity_direction_weighs_the_tilt_and_leaves_the_yaw(pose, roll, pitch)
     tilted = values_of(X0=pose.compose(gtsam.Pose3(gtsam.Rot3.RzRyRx(roll, pitch, 0), np.zeros(3))))
     angle = np.arccos(np.clip(tilted.atPose3(X(0)).rotation().matrix().T[:, 2] @ up_in_body, -1, 1))
     assert np.linalg.norm(truth.whitenedError(tilted)) == pytest.approx(2 * np.sin(angle / 2) / sigma, abs=1e-5)
-    assert_jacobians(truth, tilted)
 
 
 @poses
@@ -240,16 +249,13 @@ def test_a_gravity_direction_that_does_not_fit_still_says_nothing_of_the_yaw(pos
 
 
 def test_the_plane_holds_height_roll_and_pitch_and_leaves_the_rest():
-    plane = PlanarMotion(z_m=0.4, z_sigma_m=0.01, tilt_sigma_rad=0.02)
     pose = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([5.0, -3.0, 0.4]))
-    said = information(factors.planar(X(0), plane), values_of(X0=pose), [X(0)])
+    said = information(factors.planar(X(0), PLANE), values_of(X0=pose), [X(0)])
     assert np.diag(said) == pytest.approx([2500, 2500, 0, 0, 0, 1e4], abs=1e-6)
-    graph = graph_of(factors.planar(X(0), plane))
+    graph = graph_of(factors.planar(X(0), PLANE))
     assert graph.error(values_of(X0=pose)) < 1e-6
     off = gtsam.Pose3(gtsam.Rot3.Rz(2.0), np.array([5.0, -3.0, 0.43]))
     assert graph.error(values_of(X0=off)) == pytest.approx(4.5, rel=1e-6)
-    for factor in factors.planar(X(0), plane):
-        assert_jacobians(factor, values_of(X0=BODY_POSES["random"]))
 
 
 BLIND_POSES = (gtsam.Pose3(), gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 20.0, 0.0])))
@@ -285,13 +291,113 @@ def test_start_sigmas_of_position_are_along_the_worlds_axes():
     factor, pose = factors.start_prior(X(0), Calibration(start=start)), start.pose()
     rng, n = np.random.default_rng(0), 2000
     squares = []
-    for position, rotation in zip(
-        sigmas * rng.standard_normal((n, 3)), turns * rng.standard_normal((n, 3)), strict=True
-    ):
-        drawn = gtsam.Pose3(pose.rotation().compose(gtsam.Rot3.Expmap(rotation)), pose.translation() + position)
-        squares.append(2 * factor.error(values_of(X0=drawn)))
+    for drawn in rng.standard_normal((n, 6)):
+        turned = pose.rotation().compose(gtsam.Rot3.Expmap(turns * drawn[3:]))
+        squares.append(2 * factor.error(values_of(X0=gtsam.Pose3(turned, pose.translation() + sigmas * drawn[:3]))))
     assert 5.7 < np.mean(squares) < 6.3
-    assert (
-        np.linalg.norm(np.diag(np.linalg.inv(information([factor], values_of(X0=pose), [X(0)]))[:3, :3]) - turns**2)
-        < 1e-9
-    )
+    cov = np.linalg.inv(information([factor], values_of(X0=pose), [X(0)]))
+    assert np.linalg.norm(np.diag(cov[:3, :3]) - turns**2) < 1e-9
+
+
+# Rows of Doppler log and IMU together -----------------------------------------------------------------------------
+
+GRAVITY = np.array([0.0, 0.0, -9.81])
+BODY_T_IMU = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, -0.2, 0.4), np.array([0.2, 0.1, -0.3]))
+BODY_T_DVL = gtsam.Pose3(gtsam.Rot3.RzRyRx(3.0, 0.1, 0.8), np.array([-0.4, 0.2, -0.1]))
+
+
+def joint_motion(seed: int, rule: str = "inertial") -> JointMotion:
+    rng = np.random.default_rng(seed)
+    quick, slow = np.arange(-5, 206) * 5_000_000, np.arange(6) * 200_000_000
+    rate, force = 0.3 * rng.standard_normal((211, 3)), np.array([0, 0, 9.8]) + rng.standard_normal((211, 3))
+    dvl = Dvl(slow, 0.5 * rng.standard_normal((6, 3)), np.full((6, 3, 3), np.nan))
+    bias = 0.01 * rng.standard_normal(6)
+    sensors = JointPreintegrator(1e-3, 2e-3, (0.01,) * 3, BODY_T_IMU, BODY_T_DVL, rule)
+    return sensors.integrate(Imu(quick, rate, force), dvl, 0, 1_000_000_000, bias)
+
+
+def fitting(
+    motion: JointMotion, seed: int, off: float, turned: bool = False, X_i: gtsam.Pose3 = BODY_POSES["random"]
+) -> gtsam.Values:
+    """States that obey the motion up to random errors of this size; turned: an attitude off by nearly half a turn."""
+    rng = np.random.default_rng(seed)
+    R, R_i, t = motion.i_R_j.matrix(), X_i.rotation().matrix(), motion.duration_s
+    v_i = rng.standard_normal(3)
+    place = motion.displacement - R @ motion.body_p_dvl + motion.body_p_dvl
+    X_j = X_i.compose(gtsam.Pose3(motion.i_R_j, place)).retract(off * rng.standard_normal(6))
+    if turned:
+        X_j = X_j.compose(gtsam.Pose3(gtsam.Rot3.Expmap(np.array([0.6, 0.0, 0.8]) * (np.pi - 0.01)), np.zeros(3)))
+    values = values_of(X0=X_i, X1=X_j)
+    values.insert(V(0), v_i)
+    values.insert(V(1), v_i + GRAVITY * t + R_i @ motion.velocity + off * rng.standard_normal(3))
+    b = motion.bias + 0.01 * off * rng.standard_normal(6)
+    values.insert(B(0), gtsam.imuBias.ConstantBias(b[3:], b[:3]))
+    values.insert(C(0), 0.01 * off)
+    values.insert(M(0), 0.1 * off * rng.standard_normal(3))
+    return values
+
+
+def made(motion: JointMotion, full: bool, calibrated: bool) -> gtsam.CustomFactor:
+    extra = (C(0), M(0)) if calibrated else ()
+    if full:
+        return inertial_doppler_odometry(X(0), V(0), X(1), V(1), B(0), motion, GRAVITY, *extra)
+    return doppler_odometry(X(0), X(1), B(0), motion, *extra)
+
+
+def test_states_that_obey_the_motion_have_no_error():
+    motion = joint_motion(1)
+    values = fitting(motion, 2, 0.0)
+    assert np.allclose(made(motion, True, True).noiseModel().covariance(), motion.covariance, rtol=1e-6)
+    error = made(motion, True, True).unwhitenedError(values)
+    assert np.allclose(error[[0, 1, 2, 3, 4, 5, 9, 10, 11]], 0, atol=1e-9)
+    assert np.allclose(made(motion, False, True).unwhitenedError(values), 0, atol=1e-9)
+    # The random samples' inertial position is another than their Doppler displacement.
+    X_i, X_j = values.atPose3(X(0)), values.atPose3(X(1))
+    imu_i, imu_j = (pose.transformFrom(motion.body_p_imu) for pose in (X_i, X_j))
+    gained = X_i.rotation().unrotate(imu_j - imu_i - values.atPoint3(V(0)) - GRAVITY / 2) - motion.position
+    assert np.allclose(error[6:9], gained, atol=1e-9)
+    assert np.abs(gained).max() > 0.1
+
+
+def test_another_bias_is_taken_in_as_by_the_motion_itself():
+    motion = joint_motion(3)
+    change = np.r_[1e-3, -2e-3, 1e-3, 0.02, 0.01, -0.03, 0.01, 2e-3, -1e-3, 3e-3]
+    values = fitting(motion.corrected(change), 4, 0.0)
+    b = motion.bias + change[:6]
+    values.update(B(0), gtsam.imuBias.ConstantBias(b[3:], b[:3]))
+    values.update(C(0), change[6])
+    values.update(M(0), change[7:])
+    assert np.allclose(made(motion, False, True).unwhitenedError(values), 0, atol=1e-9)
+    values.update(C(0), -change[6])
+    assert np.abs(made(motion, False, True).unwhitenedError(values)).max() > 1e-3
+
+
+def test_doppler_rows_agree_with_the_compiled_between_factor():
+    """Same cost near the minimum, through the relative pose and its covariance."""
+    motion = joint_motion(5)
+    pose = motion.relative_pose()
+    between = gtsam.BetweenFactorPose3(X(0), X(1), pose.i_T_j, gtsam.noiseModel.Gaussian.Covariance(pose.covariance))
+    for seed in range(3):
+        values = fitting(motion, seed, 1e-4)
+        values.update(B(0), gtsam.imuBias.ConstantBias(motion.bias[3:], motion.bias[:3]))
+        assert made(motion, False, False).error(values) == pytest.approx(between.error(values), rel=1e-2)
+
+
+def test_keys_are_integers_and_differ():
+    motion = joint_motion(1)
+    with pytest.raises(MeasurementError, match="keys: x0 is given twice"):
+        doppler_odometry(X(0), X(0), B(0), motion)
+    with pytest.raises(MeasurementError, match="keys: b0 is given twice"):
+        inertial_doppler_odometry(X(0), V(0), X(1), V(1), B(0), motion, GRAVITY, mounting=B(0))
+    with pytest.raises(MeasurementError, match=r"keys: expected integers, .* not 'x0'"):
+        doppler_odometry("x0", "x1", "b0", motion)
+
+
+def test_twelve_rows_need_a_measured_specific_force():
+    """Rows of NaN otherwise; the six rows of the Doppler log do without."""
+    motion = joint_motion(1, "linear")
+    unfelt = replace(motion, velocity=np.full(3, np.nan), position=np.full(3, np.nan))
+    with pytest.raises(MeasurementError, match="was not measured in every row; use doppler_odometry"):
+        made(unfelt, True, False)
+    assert np.isfinite(made(unfelt, False, False).unwhitenedError(fitting(motion, 1, 0.1))).all()
+    made(motion, True, False)

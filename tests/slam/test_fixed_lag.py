@@ -1,48 +1,44 @@
-"""Windows begun anew where Cholesky gives up."""
+"""Windows begun anew where Cholesky gives up, and factors put in and taken out again."""
 
 from __future__ import annotations
 
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import L, X
+from gtsam.symbol_shorthand import B, L, X
+from hypothesis import given
+from hypothesis import strategies as st
 
-from sonar_graph.slam.smoother import fixed_lag as new_window_module
-from sonar_graph.slam.smoother.factor_store import GraphEdit
+from sonar_graph.slam.smoother import fixed_lag
+from sonar_graph.slam.smoother.factor_store import GraphEdit, History, Recent
 from sonar_graph.slam.smoother.fixed_lag import SmootherWindow, marginal, picked
 from sonar_graph.slam.smoother.incremental import Smoother
 
-from .made import smoother_with
+from .graphs import factors_of
+from .made import graph_of, isotropic, point_prior, pose_prior, smoother_with, values_of
 
 PRIOR_M, TIGHT_M, WEAK_M = 3.0, 2e-8, 1e3
 
 
-def isotropic(size: int, sigma: float) -> gtsam.noiseModel.Base:
-    return gtsam.noiseModel.Isotropic.Sigma(size, sigma)
+ORIGIN = np.zeros(3)
+
+
+def near(i: int, j: int, sigma_m: float) -> gtsam.NonlinearFactor:
+    return gtsam.BetweenFactorPoint3(L(i), L(j), ORIGIN, isotropic(3, sigma_m))
 
 
 def chain() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """Three points: the first known to a metre, the second nearly the first, the third somewhere near."""
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.push_back(gtsam.PriorFactorPoint3(L(0), np.zeros(3), isotropic(3, PRIOR_M)))
-    graph.push_back(gtsam.BetweenFactorPoint3(L(0), L(1), np.zeros(3), isotropic(3, TIGHT_M)))
-    graph.push_back(gtsam.BetweenFactorPoint3(L(1), L(2), np.zeros(3), isotropic(3, WEAK_M)))
-    for k in range(3):
-        values.insert(L(k), np.zeros(3))
-    return graph, values
+    graph = graph_of([point_prior(L(0), ORIGIN, PRIOR_M), near(0, 1, TIGHT_M), near(1, 2, WEAK_M)])
+    return graph, values_of(L0=ORIGIN, L1=ORIGIN, L2=ORIGIN)
 
 
-def test_by_qr_a_marginal_has_the_sum_of_a_weak_chains_variances():
+def test_by_qr_a_marginal_has_the_sum_of_a_weak_chains_variances_which_cholesky_loses():
     graph, values = chain()
-    (found,) = marginal(graph, values, [L(2)], is_by_qr=True)
-    information = found.linearize(values).augmentedInformation()[:3, :3]
+    ((by_qr,), (by_cholesky,)) = (marginal(graph, values, [L(2)], is_by_qr=by) for by in (True, False))
+    information, lost = (found.linearize(values).augmentedInformation()[:3, :3] for found in (by_qr, by_cholesky))
     assert np.linalg.inv(information) == pytest.approx((PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2) * np.eye(3), rel=1e-9)
-
-
-def test_cholesky_loses_it():
-    graph, values = chain()
-    (found,) = marginal(graph, values, [L(2)])
-    assert not found.linearize(values).augmentedInformation()[:3, :3].any()
+    assert not lost.any()
 
 
 def begun_anew(tight_m: float) -> Smoother:
@@ -60,17 +56,15 @@ def begun_anew(tight_m: float) -> Smoother:
 
 def factor(k: int, sigma: float) -> gtsam.NonlinearFactor:
     if k == 0:
-        return gtsam.PriorFactorPose3(X(0), gtsam.Pose3(), isotropic(6, sigma))
+        return pose_prior(X(0), gtsam.Pose3(), sigma)
     return gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), isotropic(6, sigma))
 
 
 def begun_after(outside: gtsam.NonlinearFactorGraph, tight_m: float, *, is_by_qr: bool) -> SmootherWindow:
     """A third and a fourth point, near each other; inside, the third is known to a kilometre."""
     _, solved = chain()
-    solved.insert(L(3), np.zeros(3))
-    inside = gtsam.NonlinearFactorGraph()
-    inside.push_back(gtsam.PriorFactorPoint3(L(2), np.zeros(3), isotropic(3, WEAK_M)))
-    inside.push_back(gtsam.BetweenFactorPoint3(L(2), L(3), np.zeros(3), isotropic(3, tight_m)))
+    solved.insert(L(3), ORIGIN)
+    inside = graph_of([point_prior(L(2), ORIGIN, WEAK_M), near(2, 3, tight_m)])
     window = SmootherWindow(1e-6, 1e9)
     window.is_by_qr = is_by_qr
     window.begin_after(outside, solved, inside, picked(solved, [L(2), L(3)]), {L(2): 0.0, L(3): 0.0})
@@ -78,9 +72,7 @@ def begun_after(outside: gtsam.NonlinearFactorGraph, tight_m: float, *, is_by_qr
 
 
 def test_what_lies_outside_counts_once_where_cholesky_gives_up_on_the_window():
-    outside = gtsam.NonlinearFactorGraph()
-    outside.push_back(gtsam.PriorFactorPoint3(L(2), np.zeros(3), isotropic(3, WEAK_M)))
-    window = begun_after(outside, 1e-6, is_by_qr=False)
+    window = begun_after(graph_of([point_prior(L(2), ORIGIN, WEAK_M)]), 1e-6, is_by_qr=False)
     assert window.is_by_qr
     assert window.isam.marginalCovariance(L(2)) == pytest.approx(0.5 * WEAK_M**2 * np.eye(3), rel=1e-5)
 
@@ -88,10 +80,8 @@ def test_what_lies_outside_counts_once_where_cholesky_gives_up_on_the_window():
 @pytest.mark.parametrize("is_by_qr", [False, True])
 def test_a_marginal_holds_where_it_was_made_though_the_window_is_linearised_elsewhere(is_by_qr: bool):
     """One says 0 m and one 3 m, equally surely."""
-    outside, values, inside = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.NonlinearFactorGraph()
-    outside.push_back(gtsam.PriorFactorPoint3(L(2), np.zeros(3), isotropic(3, 1.0)))
-    inside.push_back(gtsam.PriorFactorPoint3(L(2), np.full(3, 3.0), isotropic(3, 1.0)))
-    values.insert(L(2), np.zeros(3))
+    outside, inside = (graph_of([point_prior(L(2), np.full(3, at_m), 1.0)]) for at_m in (0.0, 3.0))
+    values = values_of(L2=ORIGIN)
     window = SmootherWindow(1e-6, 1e9)
     window.is_by_qr = is_by_qr
     window.begin_after(outside, values, inside, values, {L(2): 0.0})
@@ -101,7 +91,7 @@ def test_a_marginal_holds_where_it_was_made_though_the_window_is_linearised_else
 
 
 @pytest.mark.parametrize("is_by_qr", [False, True])
-def test_a_window_that_cholesky_cholesky_cannot_begin_has_what_its_marginal_had_lost(is_by_qr: bool):
+def test_a_window_that_cholesky_cannot_begin_has_what_its_marginal_had_lost(is_by_qr: bool):
     """Two sources say where the third point is: the chain outside, and a prior inside."""
     outside, _ = chain()
     window = begun_after(outside, 0.1, is_by_qr=is_by_qr)
@@ -119,8 +109,51 @@ def test_where_cholesky_gives_up_on_the_marginal_qr_makes_it(monkeypatch: pytest
             raise RuntimeError("Indeterminate linear system")
         return marginal(*arguments, is_by_qr=True)
 
-    monkeypatch.setattr(new_window_module, "marginal", giving_up)
+    monkeypatch.setattr(fixed_lag, "marginal", giving_up)
     smoother = begun_anew(0.1)
     assert ways == [False, True]
     assert smoother.covariance(X(2)) == pytest.approx((PRIOR_M**2 + 0.1**2 + WEAK_M**2) * np.eye(6), rel=1e-6)
     assert not smoother.withheld
+
+
+# Factors -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [History, Recent])
+@given(choices=st.lists(st.integers(0, 30), max_size=60))
+def test_what_was_put_in_and_not_taken_out_is_in(kind: type[History] | type[Recent], choices: list[int]):
+    """Each number adds a factor or, where it names one of those that are in, takes that one out."""
+    history, inside = kind(), {}
+    for number, choice in enumerate(choices):
+        if choice in inside:
+            history.remove([inside.pop(choice)])
+        else:
+            inside[choice] = history.add(point_prior(L(choice), ORIGIN))
+        assert sorted(f.keys()[0] for f in factors_of(history.graph)) == sorted(map(L, inside))
+        assert history.changes == number + 1
+        for named, handle in inside.items():
+            assert history.factor(handle).keys()[0] == L(named)
+
+
+def test_what_has_left_is_in_marginals_and_what_waits_beside_them():
+    """A handle ends with the first pose or bias of its factor that leaves; those on landmarks alone stay."""
+    recent = Recent()
+    lone, old = recent.add(point_prior(L(3), ORIGIN)), recent.add(factor(1, 1.0))
+    walk = recent.add(gtsam.BetweenFactorPoint3(B(0), B(1), ORIGIN, isotropic(3, 1.0)))
+    new = recent.add(factor(2, 1.0))
+    window = graph_of(recent.factor(handle) for handle in (lone, walk, new))
+    recent.keep(window, gtsam.Values(), [X(0)])
+    changes = recent.changes
+    assert recent.graph.size() == 3
+    with pytest.raises(KeyError):
+        recent.factor(old)
+    assert recent.factor(new).equals(window.at(2), 0)
+    waiting = recent.add(point_prior(L(4), ORIGIN))
+    assert recent.graph.size() == 4
+    recent.remove([new, waiting])
+    assert recent.graph.size() == 2
+    assert recent.changes == changes + 3
+    recent.keep(window, gtsam.Values(), [B(0)])
+    with pytest.raises(KeyError):
+        recent.factor(walk)
+    assert recent.factor(lone).equals(window.at(0), 0)

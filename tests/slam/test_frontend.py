@@ -11,10 +11,27 @@ from scipy.stats import chi2
 from sonar_graph.calibration import DvlCalibration, FloorPrior, SonarCalibration, Start
 from sonar_graph.measurements import Floats
 from sonar_graph.slam import GaussianKernel, KeyframeParams, RobustKernel
+from sonar_graph.slam.smoother import Smoother
 from sonar_graph.states import Outcome
 
-from .dive import CALIBRATION, FLOOR, NS, POLICY, SONAR, T0_NS, UNGATED, Dive, frame, spherical
-from .made import smoother_with
+from .dive import CALIBRATION, FLOOR, NS, POLICY, SONAR, T0_NS, UNGATED, Dive, spherical
+from .graphs import block_of, factors_of
+from .made import detected, polar, smoother_with
+
+BEAM = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
+"""Centre beam of a sonar that looks 0.4 rad down and 0.2 rad to the left."""
+CERTAIN = Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)
+LOW = FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.9), sigma_m=0.01)
+"""0.5 rad below the centre beam at 3 m, which is seven sigmas of the aperture."""
+
+
+def dive_with(smoother: Smoother | None = None, **changes) -> Dive:
+    return Dive(CALIBRATION.model_copy(update=changes), smoother=smoother)
+
+
+def settle(dive: Dive, updates: int = 1) -> None:
+    for _ in range(updates):
+        dive.smoother.update(dive.keyframes.newest_s)
 
 
 def test_innovation_and_its_covariance_are_those_of_the_joint_prediction():
@@ -22,16 +39,14 @@ def test_innovation_and_its_covariance_are_those_of_the_joint_prediction():
     dive = Dive()
     truth = np.array([3.0, 0.8, -1.4])
     dive.see(0.0, (5, *spherical(0.0, truth)))
-    dive.smoother.update(dive.keyframes.newest_s)
+    settle(dive)
     landmark = dive.smoother.values.atPoint3(L(5))
-    joint = dive.smoother.joint_covariance([X(0), L(5)])
-    P = np.block([[joint.at(a, b) for b in (X(0), L(5))] for a in (X(0), L(5))])
+    P = block_of(dive.smoother.joint_covariance([X(0), L(5)]), [X(0), L(5)])
     world_T_body = dive.smoother.values.atPose3(X(0))
 
     def expected(change: Floats) -> Floats:
         pose = world_T_body.compose(gtsam.Pose3.Expmap(change[:6])).compose(SONAR.mounting.pose())
-        q = pose.transformTo(landmark + change[6:])
-        return np.array([np.linalg.norm(q), np.arctan2(q[1], q[0])])
+        return polar(pose, landmark + change[6:])
 
     H = np.column_stack([(expected(1e-6 * a) - expected(-1e-6 * a)) / 2e-6 for a in np.eye(9)])
     z = expected(np.zeros(9)) + np.array([0.03, -0.02])
@@ -44,13 +59,8 @@ def test_innovation_and_its_covariance_are_those_of_the_joint_prediction():
 
 def test_noise_of_the_motion_since_the_keyframe_is_added():
     """Dead ahead, 2 s after the keyframe, with a log of 0.2 m/s at 10 Hz: range has 0.2^2 x 0.1 s x 2 s more of it."""
-    ahead = CALIBRATION.model_copy(
-        update={
-            "dvl": DvlCalibration(velocity_sigma_m_s=(0.2, 1e-6, 1e-6)),
-            "sonar": SonarCalibration(range_sigma_m=0.02, azimuth_sigma_rad=0.01),
-        }
-    )
-    dive = Dive(ahead)
+    log = DvlCalibration(velocity_sigma_m_s=(0.2, 1e-6, 1e-6))
+    dive = dive_with(dvl=log, sonar=SonarCalibration(range_sigma_m=0.02, azimuth_sigma_rad=0.01))
     dive.keyframes.params = KeyframeParams(max_interval_s=100.0, motion_noise_share=1e9)
     dive.see(0.0, (5, 4.0, 0.0))
     dive.see(0.0, (5, 4.0, 0.0))
@@ -79,7 +89,7 @@ def test_the_gate_is_the_chi_square_quantile(beyond):
 
 def test_a_frame_before_the_start_is_unlocated():
     dive = Dive()
-    dive.sightings.add(frame(T0_NS - 1, [(5, 3.0, 0.0), (6, 2.0, 0.0)]))
+    dive.sightings.add(detected(T0_NS - 1, [(3.0, 0.0), (2.0, 0.0)], [[5], [6]], [0.9]))
     assert dive.outcomes == [Outcome.UNLOCATED] * 2
     assert dive.smoother.graph.size() == 0
 
@@ -112,8 +122,7 @@ def test_one_identity_twice_in_a_frame_counts_once():
 
 @pytest.mark.parametrize("told", [None, np.diag([0.1**2, 0.05**2])])
 def test_a_covariance_in_the_log_goes_before_that_of_the_calibration(told):
-    tight = CALIBRATION.model_copy(update={"start": Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)})
-    dive = Dive(tight)
+    dive = dive_with(start=CERTAIN)
     dive.see(0.0, (5, 3.0, 0.0), cov=told)
     dive.see(0.0, (5, 3.0, 0.0), cov=told)
     sigma = [0.02, 0.01] if told is None else [0.1, 0.05]
@@ -130,27 +139,19 @@ def test_a_kernel_keeps_an_outlier_from_pulling(kernel):
             dive.see(0.0, (5, 3.0, 0.0))
         before = dive.smoother.values.atPoint3(L(5))
         dive.see(0.0, (5, 4.0, 0.0))
-        for _ in range(5):
-            dive.smoother.update(dive.keyframes.newest_s)
+        settle(dive, 5)
         pulls.append(np.linalg.norm(dive.smoother.values.atPoint3(L(5)) - before))
     assert pulls[1] < 0.2 * pulls[0]
 
 
-def factor_of(dive: Dive, kind: type) -> gtsam.NonlinearFactor:
-    graph = dive.smoother.graph
-    (factor,) = [graph.at(k) for k in range(graph.size()) if isinstance(graph.at(k), kind)]
-    return factor
-
-
 def test_factors_of_a_frame_off_its_keyframe_carry_the_noise_of_the_motion():
     """0.35 s of a Doppler log of 0.2 m/s: the range factor is as doubtful as what `View.blurred` says."""
-    noisy = CALIBRATION.model_copy(update={"dvl": DvlCalibration(velocity_sigma_m_s=(0.2, 0.2, 0.2))})
-    at_the_keyframe, off_it = Dive(noisy), Dive(noisy)
-    at_the_keyframe.see(0.0, (5, 3.0, 0.0))
-    off_it.see(0.35, (5, 3.0, 0.0))
-    sigmas = [
-        factor_of(dive, gtsam.RangeFactorWithTransform3D).noiseModel().sigma() for dive in (at_the_keyframe, off_it)
-    ]
+    sigmas = []
+    for after_s in (0.0, 0.35):
+        off_it = dive_with(dvl=DvlCalibration(velocity_sigma_m_s=(0.2, 0.2, 0.2)))
+        off_it.see(after_s, (5, 3.0, 0.0))
+        ranges = [f for f in factors_of(off_it.smoother.graph) if isinstance(f, gtsam.RangeFactorWithTransform3D)]
+        sigmas += [factor.noiseModel().sigma() for factor in ranges]
     motion = off_it.keyframes.motion_since_newest(T0_NS + round(0.35 * NS))
     assert sigmas[0] == pytest.approx(SONAR.range_sigma_m)
     assert sigmas[1] == pytest.approx(np.sqrt(SONAR.range_sigma_m**2 + motion.covariance[3, 3]), rel=1e-2)
@@ -158,64 +159,56 @@ def test_factors_of_a_frame_off_its_keyframe_carry_the_noise_of_the_motion():
 
 
 def test_a_first_sighting_places_a_landmark_on_the_centre_beam():
-    """Range 3 m straight ahead of a sonar that looks 0.4 rad down and 0.2 rad to the left."""
     dive = Dive()
     dive.see(0.0, (5, 3.0, 0.0))
-    beam = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
     assert dive.outcomes == [Outcome.NEW]
-    assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(np.array([0.3, 0.1, -0.1]) + 3.0 * beam)
+    assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(np.array([0.3, 0.1, -0.1]) + 3.0 * BEAM)
 
 
 def test_a_known_floor_gives_the_elevation():
-    dive = Dive(CALIBRATION.model_copy(update={"floor": FLOOR}))
+    dive = dive_with(floor=FLOOR)
     truth = np.array([2.6, 0.9, FLOOR.z_m])
     dive.see(0.0, (5, *spherical(0.0, truth)))
     assert dive.smoother.values.atPoint3(L(5)) == pytest.approx(truth, abs=1e-9)
     assert dive.smoother.graph.size() == 1 + 4
-    dive.smoother.update(dive.keyframes.newest_s)
+    settle(dive)
     assert np.sqrt(dive.smoother.covariance(L(5))[2, 2]) == pytest.approx(FLOOR.sigma_m, rel=1e-3)
 
 
 def test_a_floor_out_of_the_aperture_is_believed_all_the_same():
     """0.2 rad below the centre beam, where half the aperture is 0.12 rad: first put on the beam, then on the floor."""
-    dive = Dive(CALIBRATION.model_copy(update={"floor": FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.6), sigma_m=0.01)}))
+    dive = dive_with(floor=FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.6), sigma_m=0.01))
     dive.see(0.0, (5, 3.0, 0.0))
-    for _ in range(5):
-        dive.smoother.update(dive.keyframes.newest_s)
+    settle(dive, 5)
     assert dive.outcomes == [Outcome.NEW]
     assert dive.smoother.values.atPoint3(L(5))[2] == pytest.approx(-0.1 - 3.0 * np.sin(0.6), abs=1e-3)
     assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-3)
 
 
 def test_a_landmark_that_cannot_stand_on_the_floor_does_not_drag_the_vehicle_there():
-    """0.5 rad below the centre beam is seven sigmas of the aperture: no floor is said, but the aperture is."""
-    floor = FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.9), sigma_m=0.01)
-    dive, without = Dive(CALIBRATION.model_copy(update={"floor": floor})), Dive()
+    """No floor is said, but the aperture is."""
+    dive, without = dive_with(floor=LOW), Dive()
     for each in (dive, without):
         each.see(0.0, (5, 3.0, 0.0))
-        each.smoother.update(each.keyframes.newest_s)
+        settle(each)
     assert dive.smoother.graph.equals(without.smoother.graph, 1e-12)
     assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-9)
 
 
 def test_a_doubtful_height_of_the_vehicle_lets_the_floor_be_farther():
-    floor = FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.9), sigma_m=0.01)
     start = Start(position_sigma_m=(0.05, 0.02, 2.0), rpy_sigma_rad=(0.01, 0.01, 0.03))
-    dive = Dive(CALIBRATION.model_copy(update={"floor": floor, "start": start}))
+    dive = dive_with(floor=LOW, start=start)
     dive.see(0.0, (5, 3.0, 0.0))
-    for _ in range(5):
-        dive.smoother.update(dive.keyframes.newest_s)
-    assert dive.smoother.values.atPoint3(L(5))[2] == pytest.approx(floor.z_m, abs=1e-2)
+    settle(dive, 5)
+    assert dive.smoother.values.atPoint3(L(5))[2] == pytest.approx(LOW.z_m, abs=1e-2)
 
 
 def test_elevation_is_said_once_for_a_landmark():
     """It does not vary as noise would: many sightings from one place leave its height as unknown as the first."""
-    dive = Dive(
-        CALIBRATION.model_copy(update={"start": Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)})
-    )
+    dive = dive_with(start=CERTAIN)
     for k in range(9):
         dive.see(0.01 * k, (5, 3.0, 0.0))
-    dive.smoother.update(dive.keyframes.newest_s)
+    settle(dive)
     up = np.array([np.cos(0.2) * np.sin(0.4), np.sin(0.2) * np.sin(0.4), np.cos(0.4)])
     cov = dive.smoother.covariance(L(5))
     elevation_sigma = SONAR.elevation_aperture_rad / np.sqrt(12)
@@ -225,15 +218,13 @@ def test_elevation_is_said_once_for_a_landmark():
 
 def waiting(greatest_gain: float) -> Dive:
     """A landmark that has been seen once by a vehicle that is sure of where it is."""
-    sure = Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)
-    dive = Dive(CALIBRATION.model_copy(update={"start": sure}), smoother=smoother_with(waiting_gain=greatest_gain))
+    dive = dive_with(smoother_with(waiting_gain=greatest_gain), start=CERTAIN)
     dive.see(0.0, (5, 3.0, 0.0))
     return dive
 
 
 def range_variance(dive: Dive) -> float:
-    beam = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
-    return float(beam @ dive.smoother.covariance(L(5)) @ beam)
+    return float(BEAM @ dive.smoother.covariance(L(5)) @ BEAM)
 
 
 def test_sightings_wait_until_together_they_have_something_to_tell():

@@ -13,19 +13,14 @@ from scipy.stats import multivariate_normal
 
 from sonar_graph.measurements import Floats
 from sonar_graph.slam import GaussianKernel, RobustKernel
+from sonar_graph.slam.landmarks import mixture
 from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
-from sonar_graph.slam.landmarks.mixture import (
-    LEAST_MARGIN,
-    REPEATED_LOSS,
-    Choices,
-    Errors,
-    Mixture,
-    TrackedObject,
-    supporters_elsewhere,
-)
+from sonar_graph.slam.landmarks.mixture import REPEATED_LOSS, Choices, Errors, Mixture, TrackedObject
 from sonar_graph.slam.landmarks.sighting import Sighting
 from sonar_graph.slam.models import Kernel, factors
 from sonar_graph.slam.smoother.batch_solution import Sightline
+
+from .made import plain, polar, values_of
 
 ERRORS = RecogniserErrors()
 LOG_U = -np.log(20.0)
@@ -38,18 +33,14 @@ PLACES = {7: np.array([3.0, 0.5, -1.0]), 4: np.array([3.2, 1.4, -1.1]), 9: np.ar
 
 
 def world() -> gtsam.Values:
-    values = gtsam.Values()
-    for k in range(6):
-        values.insert(X(k), gtsam.Pose3(gtsam.Rot3.Ypr(3.0 + 0.1 * k, 0.05, -0.03), np.array([6.0, 1.0, -0.2 * k])))
-    for i, place in PLACES.items():
-        values.insert(L(i), place)
-    return values
+    poses = [gtsam.Pose3(gtsam.Rot3.Ypr(3 + 0.1 * k, 0.05, -0.03), np.array([6, 1, -0.2 * k])) for k in range(6)]
+    named = {f"X{k}": pose for k, pose in enumerate(poses)} | {f"L{i}": place for i, place in PLACES.items()}
+    return values_of(**named)
 
 
 def shown(values: gtsam.Values, k: int, point: Floats) -> Floats:
     """Range and azimuth of a point from pose k."""
-    x, y, z = values.atPose3(X(k)).compose(MOUNTED).transformTo(point)
-    return np.array([np.sqrt(x * x + y * y + z * z), np.arctan2(y, x)])
+    return polar(values.atPose3(X(k)).compose(MOUNTED), point)
 
 
 def wrapped(e: Floats) -> Floats:
@@ -114,13 +105,11 @@ def test_a_kernels_loss_is_that_of_gtsam(kernel: Kernel) -> None:
 
 def losses(kernel: Kernel, noise: Floats) -> Floats:
     """That of the graph's factors and that of the mixture, shape (n, 2), of points at elevation 0 all about one."""
-    estimator, values, found = kernel.estimator(), gtsam.Values(), []
-    values.insert(X(0), gtsam.Pose3())
+    estimator, values, found = kernel.estimator(), values_of(X0=gtsam.Pose3(), L7=np.zeros(3)), []
     z = np.array([3.0, 0.2])
-    robust = (lambda model: gtsam.noiseModel.Robust.Create(estimator, model)) if estimator else (lambda model: model)
+    robust = (lambda model: gtsam.noiseModel.Robust.Create(estimator, model)) if estimator else plain
     made = factors.landmark_sighting(X(0), L(7), gtsam.Pose3(), z, noise, robust)
     errors = Errors([Sighting(0, 0, Sightline(X(0), gtsam.Pose3(), z), noise, None)], values)
-    values.insert(L(7), np.zeros(3))
     for size, angle in product([0.3, 1.0, 3.0, 12.0], np.linspace(0.0, 2 * np.pi, 13)):
         r, a = z + np.linalg.cholesky(noise) @ (size * np.array([np.cos(angle), np.sin(angle)]))
         point = np.array([r * np.cos(a), r * np.sin(a), 0.0])
@@ -245,23 +234,6 @@ SAID = {7: 0.9}
 HERE, THERE = PLACES[7], PLACES[7] + np.array([0.0, 0.4, 0.0])
 
 
-def named(points: list[Floats], seed: int = 3) -> list[TrackedObject]:
-    values, rng = world(), np.random.default_rng(seed)
-    return [watch(values, p, [0], 0.3 * rng.standard_normal((1, 2)), SAID) for p in points]
-
-
-def found_for(watches: list[TrackedObject], here: int) -> list[TrackedObject] | None:
-    """Landmark 7 is where the first of them have it."""
-    values = world()
-    values.update(L(7), HERE)
-    return supporters_elsewhere(7, watches, [7] * here + [None] * (len(watches) - here), values, MIXTURE)
-
-
-def on_plane(values, seen: TrackedObject) -> Floats:
-    """Where a watch of one sighting has the landmark, at elevation 0: the same for all of one pose."""
-    return seen.sightings[0].line.point(values)
-
-
 def vote(watches: list[TrackedObject], point: Floats) -> float:
     values, (weight, none) = world(), log_weights(SAID, 7)
     gains = (weight + log_density(values, w, point) - none - of_nothing(w) for w in watches)
@@ -274,11 +246,13 @@ def test_the_place_with_most_votes_wins_whatever_lies_far_off(here: int, there: 
     """What fits nowhere has no voice, however far off it is; summed errors would be drawn to it."""
     values = world()
     far = [HERE + np.array([0.0, 1.2 + 0.5 * k, 0.0]) for k in range(strays)]
-    watches = named([HERE] * here + [THERE] * there + far)
-    elsewhere = [on_plane(values, w) for w in watches[here:]]
+    rng, points = np.random.default_rng(3), [HERE] * here + [THERE] * there + far
+    watches = [watch(values, point, [0], 0.3 * rng.standard_normal((1, 2)), SAID) for point in points]
+    elsewhere = [seen.sightings[0].line.point(values) for seen in watches[here:]]
     best = max(elsewhere, key=lambda p: vote(watches, p))
-    is_moved = bool(vote(watches, best) >= vote(watches, HERE) + LEAST_MARGIN)
-    supporters = found_for(watches, here)
+    is_moved = bool(vote(watches, best) >= vote(watches, HERE) + mixture.LEAST_MARGIN)
+    choices = [7] * here + [None] * (len(watches) - here)
+    supporters = mixture.supporters_elsewhere(7, watches, choices, values, MIXTURE)
     assert (supporters is not None) is is_moved is (there > here)
     if supporters is not None:
         assert supporters == watches[here : here + there]

@@ -22,6 +22,7 @@ from sonar_graph.slam.smoother.batch_solution import Sightline
 from . import dive as dive_module
 from . import test_mixture as small
 from .dive import CALIBRATION, FLOOR, Dive, spherical
+from .made import graph_of, plain, point_prior, pose_prior, values_of
 from .test_mixture_policy import PLACES, dive, show, watch
 
 
@@ -54,7 +55,7 @@ def test_the_cheaper_of_both_solutions_is_taken(monkeypatch: pytest.MonkeyPatch)
 # A small world, in which all choices can be tried --------------------------------------------------------------------
 
 IDS = (7, 4, None)
-MAKER = SightingFactors(SonarCalibration(elevation_aperture_rad=0.3), lambda noise: noise)
+MAKER = SightingFactors(SonarCalibration(elevation_aperture_rad=0.3), plain)
 
 
 def named(k: int, place: int, said: int, values: gtsam.Values) -> TrackedObject:
@@ -66,11 +67,9 @@ def named(k: int, place: int, said: int, values: gtsam.Values) -> TrackedObject:
 
 def small_rival(watches: list[TrackedObject]) -> tuple[RivalHistory, gtsam.Values]:
     """Poses that are known to a centimetre, and no landmark yet."""
-    rest, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for k in range(6):
-        pose = small.world().atPose3(X(k))
-        values.insert(X(k), pose)
-        rest.push_back(gtsam.PriorFactorPose3(X(k), pose, gtsam.noiseModel.Isotropic.Sigma(6, 0.01)))
+    poses = [small.world().atPose3(X(k)) for k in range(6)]
+    rest = graph_of(pose_prior(X(k), pose, 0.01) for k, pose in enumerate(poses))
+    values = values_of(**{f"X{k}": pose for k, pose in enumerate(poses)})
     return RivalHistory(rest, watches, small.MIXTURE, MAKER), values
 
 
@@ -146,7 +145,7 @@ def test_graduated_non_convexity_finds_what_the_windows_choices_have_lost(monkey
 
 
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.4, 0.0), np.array([0.3, 0.0, -0.1]))
-IDS_OF_WEIGHED_HISTORY = [7, 9, 7, 9]
+WEIGHED = [7, 9, 7, 9]
 NOISE = {"independent": np.diag([4e-4, 1e-4]), "correlated": np.array([[4e-4, 1e-4], [1e-4, 1e-4]])}
 FLOORS = {"floor": FloorPrior(z_m=-1.0, sigma_m=0.05), "no floor": None}
 
@@ -156,13 +155,12 @@ def history(noise: str, floor: str):
     rng = np.random.default_rng(1)
     values, rest = gtsam.Values(), gtsam.NonlinearFactorGraph()
     for k in range(3):
-        pose = gtsam.Pose3.Expmap(0.1 * rng.standard_normal(6))
-        values.insert(X(k), pose)
-        rest.push_back(gtsam.PriorFactorPose3(X(k), gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 0.1)))
-    for landmark_id in set(IDS_OF_WEIGHED_HISTORY):
+        values.insert(X(k), gtsam.Pose3.Expmap(0.1 * rng.standard_normal(6)))
+        rest.push_back(pose_prior(X(k), gtsam.Pose3(), 0.1))
+    for landmark_id in set(WEIGHED):
         values.insert(L(landmark_id), np.array([3.0, 0.2, -1.0]) + 0.1 * rng.standard_normal(3))
     watches = []
-    for row, _ in enumerate(IDS_OF_WEIGHED_HISTORY):
+    for row, _ in enumerate(WEIGHED):
         z = np.array([3.0, 0.1]) + 0.02 * rng.standard_normal((3, 2))
         sightings = [
             Sighting(100 - 10 * row + k, row, Sightline(X(k), MOUNTED, z[k]), NOISE[noise], FLOORS[floor])
@@ -175,90 +173,59 @@ def history(noise: str, floor: str):
 @pytest.mark.parametrize("floor", FLOORS)
 @pytest.mark.parametrize("noise", NOISE)
 def test_each_watch_counts_by_its_weight_and_the_beginning_of_landmarks_in_full(noise: str, floor: str) -> None:
+    """With all weights one it is the history as it is made."""
     rest, watches, values = history(noise, floor)
-    weighed = WeighedHistory(rest, watches, IDS_OF_WEIGHED_HISTORY, MAKER)
+    weighed = WeighedHistory(rest, watches, WEIGHED, MAKER)
     first = {7: watches[2].sightings[0], 9: watches[3].sightings[0]}
     said_once = rest.error(values) + sum(
         factor.error(values) for i, sighting in first.items() for factor in MAKER.beginning(sighting, L(i))
     )
     alone = [
         sum(factor.error(values) for sighting in each.sightings for factor in MAKER.measured(sighting, L(i)))
-        for each, i in zip(watches, IDS_OF_WEIGHED_HISTORY, strict=True)
+        for each, i in zip(watches, WEIGHED, strict=True)
     ]
     for weights in ([1.0, 1.0, 1.0, 1.0], [0.0, 1.0, 0.3, 0.02], [0.5, 0.25, 0.0, 0.9]):
         expected = said_once + np.maximum(weights, LEAST_WEIGHT) @ alone
         assert weighed.graph(np.array(weights)).error(values) == pytest.approx(expected, rel=1e-9)
-
-
-@pytest.mark.parametrize("floor", FLOORS)
-@pytest.mark.parametrize("noise", NOISE)
-def test_with_all_weights_one_it_is_the_history_as_it_is_made(noise: str, floor: str) -> None:
-    rest, watches, values = history(noise, floor)
     made = gtsam.NonlinearFactorGraph(rest)
-    for each, i in zip(watches, IDS_OF_WEIGHED_HISTORY, strict=True):
+    for each, i in zip(watches, WEIGHED, strict=True):
         for sighting in each.sightings:
             is_first = sighting in (watches[2].sightings[0], watches[3].sightings[0])
             for factor in MAKER.make(sighting, L(i), is_first=is_first):
                 made.push_back(factor)
-    weighed = WeighedHistory(rest, watches, IDS_OF_WEIGHED_HISTORY, MAKER).graph(np.ones(4))
-    expected, found = (graph.linearize(values) for graph in (made, weighed))
     ordering = gtsam.Ordering.ColamdNonlinearFactorGraph(made)
-    for theirs, ours in zip(expected.hessian(ordering), found.hessian(ordering), strict=True):
+    as_made, with_ones = (g.linearize(values).hessian(ordering) for g in (made, weighed.graph(np.ones(4))))
+    for theirs, ours in zip(as_made, with_ones, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-6)
 
 
 C2 = 9.0
 
 
-def problem(seed: int):
-    """A point on a line, measured twelve times with a sigma of 1, four of them far off."""
-    rng = np.random.default_rng(seed)
-    return np.concatenate([rng.standard_normal(8), 8.0 + 30.0 * rng.random(4)])
-
-
-def graph_of(z, weights=None) -> gtsam.NonlinearFactorGraph:
-    graph = gtsam.NonlinearFactorGraph()
-    for value, weight in zip(z, np.ones(len(z)) if weights is None else weights, strict=True):
-        noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0 / np.sqrt(max(weight, 1e-12)))
-        graph.push_back(gtsam.PriorFactorPoint3(0, np.array([value, 0.0, 0.0]), noise))
-    return graph
-
-
-def start() -> gtsam.Values:
-    values = gtsam.Values()
-    values.insert(0, np.array([12.0, 0.0, 0.0]))
-    return values
-
-
-def ours(z):
-    def squared(values):
-        return (values.atPoint3(0)[0] - z) ** 2
-
-    values, weights = graduated_weights(lambda w: graph_of(z, w), squared, np.full(len(z), C2), start())
-    return values.atPoint3(0)[0], weights
-
-
 @pytest.mark.parametrize("seed", range(5))
-def test_it_keeps_what_gtsams_keeps(seed: int) -> None:
-    z = problem(seed)
+def test_graduated_weights_are_gtsams_and_those_of_the_least_truncated_cost_of_all_subsets(seed: int) -> None:
+    """A point on a line, measured twelve times with a sigma of 1, four of them far off."""
+    rng, start, costs = np.random.default_rng(seed), values_of(L0=np.array([12.0, 0.0, 0.0])), {}
+    z = np.concatenate([rng.standard_normal(8), 8.0 + 30.0 * rng.random(4)])
+
+    def graph(weights) -> gtsam.NonlinearFactorGraph:
+        sigmas = 1.0 / np.sqrt(np.maximum(weights, 1e-12))
+        return graph_of(point_prior(L(0), [at, 0.0, 0.0], sigma) for at, sigma in zip(z, sigmas, strict=True))
+
+    def squared(values: gtsam.Values):
+        return (values.atPoint3(L(0))[0] - z) ** 2
+
+    values, weights = graduated_weights(graph, squared, np.full(len(z), C2), start)
+    found = values.atPoint3(L(0))[0]
     params = gtsam.GncLMParams()
     params.setLossType(gtsam.GncLossType.TLS)
-    theirs = gtsam.GncLMOptimizer(graph_of(z), start(), params)
+    theirs = gtsam.GncLMOptimizer(graph(np.ones(len(z))), start, params)
     theirs.setInlierCostThresholds(C2 / 2)
-    point = theirs.optimize().atPoint3(0)[0]
-    found, weights = ours(z)
-    assert found == pytest.approx(point, abs=1e-3)
+    assert found == pytest.approx(theirs.optimize().atPoint3(L(0))[0], abs=1e-3)
     np.testing.assert_allclose(weights, theirs.getWeights(), atol=1e-2)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_it_finds_the_least_truncated_cost_of_all_subsets(seed: int) -> None:
-    z = problem(seed)
-    costs = {}
     for kept in product([False, True], repeat=len(z)):
         inside = z[list(kept)]
         if len(inside):
             costs[kept] = ((inside - inside.mean()) ** 2).sum() + C2 * (len(z) - len(inside))
-    found, weights = ours(z)
     assert tuple((weights > 0.5).tolist()) == min(costs, key=costs.__getitem__)
     assert abs(np.mean(z) - found) > 3.0, "without weights the answer would be another one"

@@ -8,7 +8,7 @@ import pytest
 from gtsam.symbol_shorthand import L, X
 
 from sonar_graph.calibration import FloorPrior, SonarCalibration
-from sonar_graph.measurements import Floats, LandmarkDetections
+from sonar_graph.measurements import Floats
 from sonar_graph.slam import GaussianKernel, KeyframeParams, MixtureIdentity, RobustIdentity, RobustKernel
 from sonar_graph.slam.landmarks import mixture
 from sonar_graph.slam.landmarks import mixture_policy as doubtful_identities
@@ -22,7 +22,7 @@ from sonar_graph.states import DetectionJournal, Outcome
 
 from . import dive as dive_module
 from .dive import CALIBRATION, FLOOR, T0_NS, Dive, spherical
-from .made import smoother_with
+from .made import plain, smoother_with, values_of
 
 PLACES = {7: np.array([2.6, 0.5, -1.0]), 4: np.array([2.9, 1.4, -1.0]), 9: np.array([3.2, 0.1, -1.0])}
 """Of landmarks, in the world of `Dive`: on the floor, within its sonar's fan."""
@@ -41,17 +41,11 @@ def watch(
 ) -> None:
     """A frame with the landmarks that are the keys, each named as the value says."""
     z = [spherical(0.5 * after_s, PLACES[i]) + [0.02, 0.01] * rng.standard_normal(2) for i in said]
-    show(world, after_s, np.array(z), list(said.values()), [track] * len(z), surely)
+    show(world, after_s, z, list(said.values()), [track] * len(z), surely)
 
 
 def show(world: Dive, after_s: float, z, named: list[int], tracks: list[int], surely: float = 1.0) -> None:
-    stamp, n = T0_NS + round(after_s * 1e9), len(z)
-    world.keyframes.advance(stamp)
-    candidates, unknown = np.array(named)[:, None], np.full((n, 2, 2), np.nan)
-    rows = LandmarkDetections(
-        np.full(n, stamp), z[:, 0], z[:, 1], unknown, candidates, np.full((n, 1), surely), np.array(tracks)
-    )
-    world.sightings.add(rows)
+    world.show(T0_NS + round(after_s * 1e9), z, np.array(named)[:, None], [surely], tracks)
 
 
 def misnamed(policy: str, kernel: Kernel = GAUSSIAN, share: float = 0.25) -> tuple[Dive, list[int]]:
@@ -61,9 +55,8 @@ def misnamed(policy: str, kernel: Kernel = GAUSSIAN, share: float = 0.25) -> tup
         named = {i: i for i in PLACES}
         if k > 1 and rng.random() < 3 * share:
             wrong = int(rng.choice(list(PLACES)))
-            named = {wrong: int(rng.choice([i for i in PLACES if i != wrong]))} | {
-                i: i for i in PLACES if i not in (wrong,)
-            }
+            others = [i for i in PLACES if i != wrong]
+            named = {wrong: int(rng.choice(others))} | {i: i for i in others}
         watch(world, 0.1 * (k + 1), named, rng)
         truth += list(named)
     return world, truth
@@ -130,7 +123,12 @@ def largest(named: int, components: dict[int, list], sighting) -> gtsam.CustomFa
 def test_the_end_is_a_fixed_point_of_the_max_mixture_that_another_solver_finds() -> None:
     world, truth = misnamed("max-mixture")
     values = world.sightings.history().values
-    scattered = values.retract(scatter(values))
+    rng, off = np.random.default_rng(1), values.zeroVectors()
+    for key in list(values.keys()):
+        moved = gtsam.VectorValues()
+        moved.insert(key, 3e-3 * rng.standard_normal(len(off.at(key))))
+        off.update(moved)
+    scattered = values.retract(off)
     params = gtsam.LevenbergMarquardtParams()
     params.setRelativeErrorTol(1e-12)
     found = gtsam.LevenbergMarquardtOptimizer(max_mixture(world), scattered, params).optimize()
@@ -140,19 +138,6 @@ def test_the_end_is_a_fixed_point_of_the_max_mixture_that_another_solver_finds()
     log = world.sightings.log()
     assert log.landmark_ids.tolist() == truth
     assert set(log.outcomes) == {Outcome.NEW, Outcome.USED, Outcome.REASSIGNED}
-
-
-def scatter(values: gtsam.Values) -> gtsam.VectorValues:
-    rng, delta = np.random.default_rng(1), values.zeroVectors()
-    for key in list(values.keys()):
-        delta.update(gtsam_vector(key, 3e-3 * rng.standard_normal(len(delta.at(key)))))
-    return delta
-
-
-def gtsam_vector(key: int, change) -> gtsam.VectorValues:
-    one = gtsam.VectorValues()
-    one.insert(key, change)
-    return one
 
 
 @pytest.mark.parametrize("kernel", [GaussianKernel(), RobustKernel()])
@@ -184,16 +169,17 @@ def test_a_landmark_that_begins_in_a_wrong_place_is_moved_by_those_who_name_it(c
     assert world.outcomes.count(Outcome.UNFIT) == (1 if can_move else 6)
 
 
+def sighting(k: int, z: list[float], pose: int = 0, floor: FloorPrior | None = None) -> Sighting:
+    return Sighting(k, k, Sightline(X(pose), gtsam.Pose3(), np.array(z)), np.diag([4e-4, 1e-4]), floor)
+
+
 @pytest.mark.parametrize(("off_sigma", "is_of_7"), [(0.0, True), (1.5, True), (3.0, False)])
 def test_many_sightings_of_another_object_do_not_prove_it_to_be_a_landmark(
     off_sigma: float, is_of_7: bool, monkeypatch
 ) -> None:
     """Something unnamed, seen again and again a little beside a landmark whose place is known."""
-    values, noise = gtsam.Values(), np.diag([4e-4, 1e-4])
-    values.insert(X(0), gtsam.Pose3())
-    values.insert(L(7), np.array([3.0, 0.0, 0.0]))
-    line = Sightline(X(0), gtsam.Pose3(), np.array([3.0, 0.01 * off_sigma]))
-    seen = TrackedObject(IdentityPosterior({}), [Sighting(k, k, line, noise, None) for k in range(20)])
+    values = values_of(X0=gtsam.Pose3(), L7=np.array([3.0, 0.0, 0.0]))
+    seen = TrackedObject(IdentityPosterior({}), [sighting(k, [3.0, 0.01 * off_sigma]) for k in range(20)])
     assert MIXTURE.best([seen], values, [None], {7: 50}) == [7 if is_of_7 else None]
     monkeypatch.setattr(mixture, "REPEATED_LOSS", 1e3)
     assert MIXTURE.best([seen], values, [None], {7: 50}) == [7], "as if each sighting were anywhere"
@@ -232,11 +218,9 @@ def test_what_names_no_landmark_has_no_vote_on_its_place(surely: float, where: i
 
 def test_a_landmark_begins_with_one_of_those_that_name_it() -> None:
     """The longest; where the others are is only known then, and one far from it is of no landmark."""
-    values, noise = gtsam.Values(), np.diag([4e-4, 1e-4])
-    values.insert(X(0), gtsam.Pose3())
-    near, far = (Sightline(X(0), gtsam.Pose3(), np.array(z)) for z in ([3.0, 0.0], [3.0, 0.4]))
-    single = TrackedObject(IdentityPosterior({7: 0.9}), [Sighting(0, 0, far, noise, None)])
-    longest = TrackedObject(IdentityPosterior({7: 0.9}), [Sighting(k, k, near, noise, None) for k in range(1, 4)])
+    values = values_of(X0=gtsam.Pose3())
+    single = TrackedObject(IdentityPosterior({7: 0.9}), [sighting(0, [3.0, 0.4])])
+    longest = TrackedObject(IdentityPosterior({7: 0.9}), [sighting(k, [3.0, 0.0]) for k in range(1, 4)])
     assert MIXTURE.best([single, longest], values, [None, None], {}) == [None, 7]
     values.insert(L(7), np.array([3.0, 0.0, 0.0]))
     assert MIXTURE.best([single, longest], values, [None, 7], {7: 3}) == [None, 7]
@@ -247,9 +231,9 @@ AFAR = np.array([0.06, 0.0])
 """Three standard deviations in range: too far to be of a landmark that is not named, near enough for one that is."""
 
 
-def at(after_s: float, landmark_id: int, off: Floats | None = None) -> Floats:
+def at(after_s: float, landmark_id: int, off: Floats = np.zeros(2)) -> Floats:  # noqa: B008
     """What is seen, without noise."""
-    return np.array([spherical(0.5 * after_s, PLACES[landmark_id])]) + (0.0 if off is None else off)
+    return np.array([spherical(0.5 * after_s, PLACES[landmark_id]) + off])
 
 
 def short_lived(monkeypatch: pytest.MonkeyPatch) -> Dive:
@@ -319,17 +303,16 @@ def test_what_waited_in_a_frame_that_shows_the_landmark_already_is_not_of_it(mon
 def test_a_misfit_is_one_of_the_identity_only_where_the_estimate_is_sure(sigma_m: float, stays: bool) -> None:
     """Seen 0.3 m off from a second pose: as it stands, it is of nothing; expected with the pose's error, it may be."""
     smoother = smoother_with(1e9, 0.1, 1e9)
-    landmarks = LandmarkSightings(smoother, SightingFactors(SonarCalibration(), lambda noise: noise))
+    landmarks = LandmarkSightings(smoother, SightingFactors(SonarCalibration(), plain))
     for k, sigma in enumerate((0.001, sigma_m)):
         smoother.add_pose(X(k), gtsam.Pose3(), float(k))
         sigmas = np.array([1e-3] * 3 + [sigma] * 3)
         smoother.add([gtsam.PriorFactorPose3(X(k), gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(sigmas))])
     smoother.update(1.0)
-    floor, noise = FloorPrior(z_m=0.0, sigma_m=0.01), np.diag([4e-4, 1e-4])
+    floor = FloorPrior(z_m=0.0, sigma_m=0.01)
     for k in range(2):
-        first = Sighting(k, k, Sightline(X(0), gtsam.Pose3(), np.array([3.0, 0.1])), noise, floor)
-        landmarks.exchange([], [(first, 7)], 1.0)
-    off = Sighting(2, 2, Sightline(X(1), gtsam.Pose3(), np.array([3.3, 0.1])), noise, floor)
+        landmarks.exchange([], [(sighting(k, [3.0, 0.1], floor=floor), 7)], 1.0)
+    off = sighting(2, [3.3, 0.1], 1, floor)
     landmarks.enter(off, 7, ())
     seen, journal = TrackedObject(IdentityPosterior({7: 0.9}), [off]), DetectionJournal()
     off.row = journal.record(off.stamp_ns, 7, Outcome.USED)

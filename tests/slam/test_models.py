@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -26,6 +27,9 @@ from sonar_graph.slam.models.sonar_model import (
     wrap_angle,
 )
 from sonar_graph.slam.smoother.batch_solution import JointCovariance
+
+from .graphs import block_of
+from .made import polar, random_covariance, some_motion
 
 STEP = 1e-6
 TOLERANCE = 1e-7
@@ -52,46 +56,39 @@ def numerical(function, size):
 
 
 @given(any_pose, any_pose, views)
-def test_jacobian_by_the_body_pose_is_the_numerical_one(world_T_body, body_T_sonar, view):
-    p = locate(world_T_body.compose(body_T_sonar), *view)
+def test_jacobians_of_the_model_and_of_its_inverse_are_the_numerical_ones(world_T_body, body_T_sonar, view):
+    world_T_sonar = world_T_body.compose(body_T_sonar)
+    p = locate(world_T_sonar, *view)
+    point, G_pose, G_view = locate_jacobians(world_T_body, body_T_sonar, *view)
+    _, H_pose, H_landmark = range_azimuth_jacobians(world_T_body, body_T_sonar, p)
+
+    def sonar(xi):
+        return world_T_body.compose(gtsam.Pose3.Expmap(xi)).compose(body_T_sonar)
+
+    assert_allclose(point, p)
+    # differences of points up to 40 m away carry their rounding, over a level distance rho
+    assert_allclose(H_pose, numerical(lambda xi: range_azimuth(sonar(xi), p), 6), atol=1e-5, rtol=1e-5)
+    assert_allclose(H_landmark, numerical(lambda d: range_azimuth(world_T_sonar, p + d), 3), atol=1e-6, rtol=1e-6)
+    assert_allclose(G_pose, numerical(lambda xi: locate(sonar(xi), *view), 6), atol=1e-6, rtol=1e-6)
+    assert_allclose(G_view, numerical(lambda d: locate(world_T_sonar, *(np.array(view) + d)), 3), atol=1e-6)
+
+
+def test_the_numerical_check_finds_a_missing_inverse_square_and_a_missing_adjoint():
+    body_T_sonar = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.5, 0.0), np.array([0.4, 0.1, -0.2]))
+    world_T_body = gtsam.Pose3.Expmap(np.array([0.1, -0.2, 0.7, 1.0, 2.0, 3.0]))
+    q = sonar_point(3.0, 0.4, 0.1)
+    _, D_q = project(q)
+    p = world_T_body.compose(body_T_sonar).transformFrom(q)
+    _, H_pose, _ = range_azimuth_jacobians(world_T_body, body_T_sonar, p)
 
     def moved(xi):
         return range_azimuth(world_T_body.compose(gtsam.Pose3.Expmap(xi)).compose(body_T_sonar), p)
 
-    _, H_pose, _ = range_azimuth_jacobians(world_T_body, body_T_sonar, p)
-    # differences of points up to 40 m away carry their rounding, over a level distance rho
-    assert_allclose(H_pose, numerical(moved, 6), atol=1e-5, rtol=1e-5)
-
-
-@given(any_pose, any_pose, views)
-def test_jacobian_by_the_landmark_is_the_numerical_one(world_T_body, body_T_sonar, view):
-    world_T_sonar = world_T_body.compose(body_T_sonar)
-    p = locate(world_T_sonar, *view)
-    _, _, H_landmark = range_azimuth_jacobians(world_T_body, body_T_sonar, p)
-    assert_allclose(H_landmark, numerical(lambda d: range_azimuth(world_T_sonar, p + d), 3), atol=1e-6, rtol=1e-6)
-
-
-def test_the_numerical_check_finds_a_bearing_row_without_its_inverse_square():
-    q = sonar_point(3.0, 0.4, 0.1)
-    _, D_q = project(q)
-    faulty = D_q.copy()
-    faulty[1] *= q[0] ** 2 + q[1] ** 2
-    true = numerical(lambda d: range_azimuth(gtsam.Pose3(), q + d), 3)
-    assert_allclose(D_q, true, atol=TOLERANCE)
-    assert np.abs(faulty - true).max() > 0.1
-
-
-@given(any_pose, any_pose, views)
-def test_jacobians_of_the_inverse_model_are_the_numerical_ones(world_T_body, body_T_sonar, view):
-    point, G_pose, G_view = locate_jacobians(world_T_body, body_T_sonar, *view)
-    assert_allclose(point, locate(world_T_body.compose(body_T_sonar), *view))
-
-    def moved(xi):
-        return locate(world_T_body.compose(gtsam.Pose3.Expmap(xi)).compose(body_T_sonar), *view)
-
-    world_T_sonar = world_T_body.compose(body_T_sonar)
-    assert_allclose(G_pose, numerical(moved, 6), atol=1e-6, rtol=1e-6)
-    assert_allclose(G_view, numerical(lambda d: locate(world_T_sonar, *(np.array(view) + d)), 3), atol=1e-6)
+    by_point, by_pose = numerical(lambda d: range_azimuth(gtsam.Pose3(), q + d), 3), numerical(moved, 6)
+    assert_allclose(D_q, by_point, atol=TOLERANCE)
+    assert_allclose(H_pose, by_pose, atol=TOLERANCE)
+    assert np.abs(D_q[1] * (q[0] ** 2 + q[1] ** 2) - by_point[1]).max() > 0.1
+    assert np.abs(H_pose @ body_T_sonar.AdjointMap() - by_pose).max() > 0.1
 
 
 @given(any_pose, views)
@@ -150,21 +147,8 @@ def joint_of(cov: Floats, sizes: dict[int, int]) -> JointCovariance:
     return JointCovariance(cov, dict(zip(sizes, starts, strict=True)))
 
 
-def covariance(n: int, sigma: float, seed: int = 0) -> Floats:
-    root = np.random.default_rng(seed).standard_normal((n, n))
-    return sigma**2 * (root @ root.T / n + 0.1 * np.eye(n))
-
-
-def some_motion(seed: int = 0, sigma: float = 0.01) -> PreintegratedMotion:
-    rng = np.random.default_rng(seed)
-    mean = gtsam.Pose3.Expmap(np.concatenate([0.3 * rng.standard_normal(3), 0.5 * rng.standard_normal(3)]))
-    D_bias = rng.standard_normal((6, 3))
-    return PreintegratedMotion(mean, covariance(6, sigma, seed + 1), D_bias, np.zeros(3), 1.0, np.zeros(3))
-
-
 def observed(world_T_body: gtsam.Pose3, point: Floats) -> Floats:
-    q = world_T_body.compose(BODY_T_SONAR).transformTo(point)
-    return np.array([np.linalg.norm(q), np.arctan2(q[1], q[0])])
+    return polar(world_T_body.compose(BODY_T_SONAR), point)
 
 
 def ahead(keyframe: gtsam.Pose3, motion: PreintegratedMotion, azimuth_rad: float = 0.3) -> Floats:
@@ -185,7 +169,7 @@ def some_view(keyframe: gtsam.Pose3, bias: bool, seed: int = 0, sigma: float = 0
     motion = some_motion(seed, sigma / 2)
     landmarks = {5: ahead(keyframe, motion), 6: ahead(keyframe, motion, -0.6)}
     sizes = {X(2): 6, L(5): 3, L(6): 3} | ({B(0): 3} if bias else {})
-    joint = joint_of(covariance(sum(sizes.values()), sigma, seed + 2), sizes)
+    joint = joint_of(random_covariance(sum(sizes.values()), sigma, seed + 2), sizes)
     return made(keyframe, motion, joint, bias), motion, landmarks, joint
 
 
@@ -201,7 +185,7 @@ def numerical_of_view(keyframe: gtsam.Pose3, motion: PreintegratedMotion, point:
     def at(change: Floats) -> Floats:
         return observed(moved(keyframe, motion, change[:6], change[9:12], change[12:]), point + change[6:9])
 
-    return np.column_stack([(at(1e-6 * axis) - at(-1e-6 * axis)) / 2e-6 for axis in np.eye(18)])
+    return numerical(at, 18)
 
 
 @keyframes
@@ -212,7 +196,7 @@ def test_the_expected_covariance_is_that_of_the_whole_model(keyframe, bias, seed
     view, motion, landmarks, joint = some_view(keyframe, bias, seed)
     for landmark_id, point in landmarks.items():
         keys = [X(2), L(landmark_id), *([B(0)] if bias else [])]
-        P = np.block([[joint.at(a, b) for b in keys] for a in keys])
+        P = block_of(joint, keys)
         H = numerical_of_view(keyframe, motion, point)
         state = H[:, : len(P)]
         expected = state @ P @ state.T + H[:, 12:] @ motion.covariance @ H[:, 12:].T
@@ -226,15 +210,10 @@ def test_the_expected_covariance_is_that_of_many_draws():
     keyframe, n = KEYFRAMES["random"], 20_000
     view, motion, landmarks, joint = some_view(keyframe, True, sigma=0.005)
     keys, rng = [X(2), L(5), B(0)], np.random.default_rng(3)
-    P = np.block([[joint.at(a, b) for b in keys] for a in keys])
-    states = rng.multivariate_normal(np.zeros(12), P, n)
+    states = rng.multivariate_normal(np.zeros(12), block_of(joint, keys), n)
     noises = rng.multivariate_normal(np.zeros(6), motion.covariance, n)
-    seen = np.array(
-        [
-            observed(moved(keyframe, motion, s[:6], s[9:], e), landmarks[5] + s[6:9])
-            for s, e in zip(states, noises, strict=True)
-        ]
-    )
+    pairs = zip(states, noises, strict=True)
+    seen = np.array([observed(moved(keyframe, motion, s[:6], s[9:], e), landmarks[5] + s[6:9]) for s, e in pairs])
     S = expected_of(view, landmarks, 5)[1][0]
     whitened = np.linalg.solve(np.linalg.cholesky(S), (seen - seen.mean(0)).T)
     assert np.cov(whitened) == pytest.approx(np.eye(2), abs=0.05)
@@ -250,7 +229,7 @@ def test_the_variance_of_a_height_is_that_of_keyframe_and_motion(keyframe):
     def z(change: Floats) -> float:
         return moved(keyframe, motion, change[:6], np.zeros(3), change[6:]).transformFrom(q)[2]
 
-    J = np.array([(z(1e-6 * axis) - z(-1e-6 * axis)) / 2e-6 for axis in np.eye(12)])
+    J = numerical(z, 12)
     expected = J[:6] @ joint.at(X(2), X(2)) @ J[:6] + J[6:] @ motion.covariance @ J[6:]
     assert view.height_variance(body.transformFrom(q)) == pytest.approx(expected, rel=1e-6)
 
@@ -309,10 +288,10 @@ def test_the_joint_covariance_is_that_of_many_draws(seen_from: int):
     keyframe, motion = KEYFRAMES["random"], some_motion(3, SMALL)
     earlier = keyframe.compose(gtsam.Pose3(gtsam.Rot3.Yaw(0.2), np.array([-0.4, 0.2, 0.0])))
     landmark, located = ahead(keyframe, motion), ahead(keyframe, motion, -0.4)
-    joint = joint_of(covariance(18, SMALL, 5), {X(1): 6, X(2): 6, B(0): 3, L(5): 3})
+    joint = joint_of(random_covariance(18, SMALL, 5), {X(1): 6, X(2): 6, B(0): 3, L(5): 3})
     anchor = {X(1): earlier, X(2): keyframe}[seen_from]
-    body_p, own = anchor.transformTo(located), covariance(3, SMALL, 7)
-    by_pose = np.column_stack([_shifted(anchor, axis, body_p) - located for axis in np.eye(6)]) / 1e-6
+    body_p, own = anchor.transformTo(located), random_covariance(3, SMALL, 7)
+    by_pose = numerical(lambda xi: anchor.compose(gtsam.Pose3.Expmap(xi)).transformFrom(body_p), 6)
     source = Source(seen_from, located, by_pose, own)
     predicted, cov = made(keyframe, motion, joint).expect_jointly([L(5)], landmark[None], [source])
     rng = np.random.default_rng(1)
@@ -331,36 +310,16 @@ def test_the_joint_covariance_is_that_of_many_draws(seen_from: int):
     assert np.abs(cov[:2, 2:] / np.outer(sigma[:2], sigma[2:])).max() > 0.2
 
 
-def _shifted(pose: gtsam.Pose3, axis: np.ndarray, body_p: np.ndarray) -> np.ndarray:
-    return np.asarray(pose.compose(gtsam.Pose3.Expmap(1e-6 * axis)).transformFrom(body_p))
-
-
-def test_the_numerical_check_finds_a_missing_adjoint():
-    world_T_body = gtsam.Pose3.Expmap(np.array([0.1, -0.2, 0.7, 1.0, 2.0, 3.0]))
-    body_T_sonar = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.5, 0.0), np.array([0.4, 0.1, -0.2]))
-    p = locate(world_T_body.compose(body_T_sonar), 2.0, 0.3, -0.05)
-
-    def moved(xi):
-        return range_azimuth(world_T_body.compose(gtsam.Pose3.Expmap(xi)).compose(body_T_sonar), p)
-
-    _, H_pose, _ = range_azimuth_jacobians(world_T_body, body_T_sonar, p)
-    by_sonar_pose, true = H_pose @ body_T_sonar.AdjointMap(), numerical(moved, 6)
-    assert_allclose(H_pose, true, atol=TOLERANCE)
-    assert np.abs(by_sonar_pose - true).max() > 0.1
-
-
 @pytest.mark.parametrize("left_out", ["pose with landmark", "pose with bias", "bias with landmark", "motion"])
 def test_no_part_of_the_covariance_is_idle(left_out):
     """Negative control: each cross-covariance, and the motion's noise, changes what is expected."""
     view, motion, landmarks, joint = some_view(KEYFRAMES["random"], True)
     S = expected_of(view, landmarks, 5)[1][0]
-    a, b = {"pose with landmark": (X(2), L(5)), "pose with bias": (X(2), B(0)), "bias with landmark": (B(0), L(5))}.get(
-        left_out, (None, None)
-    )
-    if a is None:
-        motion = PreintegratedMotion(motion.i_T_j, np.zeros((6, 6)), motion.D_bias, motion.bias, 1.0, np.zeros(3))
+    pairs = {"pose with landmark": (X(2), L(5)), "pose with bias": (X(2), B(0)), "bias with landmark": (B(0), L(5))}
+    if left_out == "motion":
+        motion = replace(motion, covariance=np.zeros((6, 6)))
     else:
-        joint.at(a, b)[:] = 0.0
-        joint.at(b, a)[:] = 0.0
+        a, b = pairs[left_out]
+        joint.at(a, b)[:] = joint.at(b, a)[:] = 0.0
     without = expected_of(made(KEYFRAMES["random"], motion, joint), landmarks, 5)[1][0]
     assert np.abs(S - without).max() > 0.02 * np.abs(S).max()

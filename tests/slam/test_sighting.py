@@ -17,12 +17,13 @@ from sonar_graph.measurements import Floats
 from sonar_graph.slam.landmarks.sighting import LandmarkSightings, Sighting, SightingFactors, place
 from sonar_graph.slam.smoother.batch_solution import Sightline
 
-from .made import smoother_with
+from .made import graph_of, plain, polar, pose_prior, smoother_with, values_of
 
 POSES = 5
 PLACES = {7: np.array([3.0, 0.5, -0.8]), 9: np.array([3.0, -0.4, -0.8])}
-MAKER = SightingFactors(SonarCalibration(elevation_aperture_rad=0.3), lambda noise: noise)
-NOISE = np.diag([4e-4, 1e-4])
+APERTURE_RAD = 0.3
+MAKER = SightingFactors(SonarCalibration(elevation_aperture_rad=APERTURE_RAD), plain)
+NOISE = np.diag([0.02**2, 0.01**2])
 FLOOR = FloorPrior(z_m=-0.8, sigma_m=0.05)
 
 
@@ -32,15 +33,14 @@ def begun() -> LandmarkSightings:
     for k in range(POSES):
         pose = gtsam.Pose3(gtsam.Rot3.Ypr(0.1 * k, 0.2, 0.0), np.array([0.2 * k, 0.1 * k, 0.0]))
         smoother.add_pose(X(k), pose, float(k))
-        smoother.add([gtsam.PriorFactorPose3(X(k), pose, gtsam.noiseModel.Isotropic.Sigma(6, 0.01))])
+        smoother.add([pose_prior(X(k), pose, 0.01)])
     smoother.update(float(POSES))
     return LandmarkSightings(smoother, MAKER)
 
 
 def sighting_of(landmark_id: int, k: int, floor: FloorPrior | None, landmarks: LandmarkSightings) -> Sighting:
-    x, y, z = landmarks.smoother.values.atPose3(X(k)).transformTo(PLACES[landmark_id])
-    seen = np.array([np.sqrt(x * x + y * y + z * z), np.arctan2(y, x)])
-    return Sighting(k, k, Sightline(X(k), gtsam.Pose3(), seen), NOISE, floor)
+    z = polar(landmarks.smoother.values.atPose3(X(k)), PLACES[landmark_id])
+    return Sighting(k, k, Sightline(X(k), gtsam.Pose3(), z), NOISE, floor)
 
 
 def errors(graph: gtsam.NonlinearFactorGraph, ids: list[int], landmarks: LandmarkSightings) -> list[float]:
@@ -60,9 +60,7 @@ def errors(graph: gtsam.NonlinearFactorGraph, ids: list[int], landmarks: Landmar
 
 
 def known_from_the_start(of: dict[Sighting, int], landmarks: LandmarkSightings) -> gtsam.NonlinearFactorGraph:
-    graph = gtsam.NonlinearFactorGraph()
-    for k in range(POSES):
-        graph.push_back(landmarks.smoother.graph.at(k))
+    graph = graph_of(landmarks.smoother.graph.at(k) for k in range(POSES))
     for i in set(of.values()):
         mine = sorted((s for s, landmark in of.items() if landmark == i), key=lambda s: s.stamp_ns)
         for s in mine:
@@ -119,59 +117,36 @@ def test_a_landmark_whose_sightings_have_left_counts_as_one_more() -> None:
     assert landmarks.any_sighting(7) is first
 
 
-APERTURE_RAD = 0.3
 MOUNTED = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.0, 0.4, 0.0), np.array([0.3, 0.0, -0.1]))
 POINT = np.array([3.0, 0.5, -1.7])
-R = np.diag([0.02**2, 0.01**2])
-MAKER_OF_PLACING = SightingFactors(SonarCalibration(elevation_aperture_rad=APERTURE_RAD), lambda noise: noise)
-
-
-def polar(pose: gtsam.Pose3, point: Floats) -> Floats:
-    """Range, azimuth and elevation."""
-    x, y, z = pose.compose(MOUNTED).transformTo(point)
-    return np.array([math.hypot(x, y, z), math.atan2(y, x), math.asin(z / math.hypot(x, y, z))])
-
-
-def seen(
-    poses: list[gtsam.Pose3], floor: FloorPrior | None, noise: Floats
-) -> tuple[list[Sighting], gtsam.Values, list[Floats]]:
-    values, sightings, measured = gtsam.Values(), [], []
-    for k, pose in enumerate(poses):
-        values.insert(X(k), pose)
-        z = polar(pose, POINT)[:2] + noise[k]
-        measured.append(z)
-        sightings.append(Sighting(k, k, Sightline(X(k), MOUNTED, z), R, floor))
-    return sightings, values, measured
-
-
-def around(count: int) -> list[gtsam.Pose3]:
-    """Poses on an arc, at different heights, that look at the point."""
-    angles = np.linspace(0.0, 0.8, count)
-    return [
-        gtsam.Pose3(gtsam.Rot3.Yaw(a), POINT - [2.2 * math.cos(a), 2.2 * math.sin(a), -1.0 - 0.3 * math.sin(5 * a)])
-        for a in angles.tolist()
-    ]
 
 
 @pytest.mark.parametrize("floor", [None, FloorPrior(z_m=-1.7, sigma_m=0.02)], ids=["no floor", "floor"])
 def test_a_point_is_that_of_least_squares(floor: FloorPrior | None):
-    """With the elevation at the first sighting, or the floor, as a prior; to a tenth of a sigma."""
-    poses = around(6)
-    noise = 0.5 * np.random.default_rng(0).standard_normal((6, 2)) * np.sqrt(np.diag(R))
-    sightings, values, measured = seen(poses, floor, noise)
-    sigma_e = APERTURE_RAD / math.sqrt(12)
+    """With the elevation at the first sighting, or the floor, as a prior; to a tenth of a sigma.
+
+    Poses are on an arc, at different heights, and look at the point.
+    """
+    sigmas, poses = np.sqrt(np.diag(NOISE)), []
+    for a in np.linspace(0.0, 0.8, 6).tolist():
+        off = [2.2 * math.cos(a), 2.2 * math.sin(a), -1.0 - 0.3 * math.sin(5 * a)]
+        poses.append(gtsam.Pose3(gtsam.Rot3.Yaw(a), POINT - off).compose(MOUNTED))
+    noise = 0.5 * np.random.default_rng(0).standard_normal((6, 2)) * sigmas
+    measured = [polar(pose, POINT) + e for pose, e in zip(poses, noise, strict=True)]
+    sightings = [Sighting(k, k, Sightline(X(k), MOUNTED, z), NOISE, floor) for k, z in enumerate(measured)]
+    values = values_of(**{f"X{k}": pose.compose(MOUNTED.inverse()) for k, pose in enumerate(poses)})
 
     def residuals(p: Floats) -> Floats:
-        rows = [(polar(pose, p)[:2] - z) / np.sqrt(np.diag(R)) for pose, z in zip(poses, measured, strict=True)]
-        first = polar(poses[0], p)[2]
-        middle = MAKER_OF_PLACING.elevation_on(floor, poses[0].compose(MOUNTED), *measured[0].tolist())
-        rows.append(np.array([(first - middle) / sigma_e]))
+        rows = [(polar(pose, p) - z) / sigmas for pose, z in zip(poses, measured, strict=True)]
+        elevation = math.asin(poses[0].transformTo(p)[2] / polar(poses[0], p)[0])
+        middle = MAKER.elevation_on(floor, poses[0], *measured[0].tolist())
+        rows.append(np.array([(elevation - middle) / (APERTURE_RAD / math.sqrt(12))]))
         if floor:
             rows.append(np.array([(p[2] - floor.z_m) / floor.sigma_m]))
         return np.concatenate(rows)
 
     best = least_squares(residuals, POINT)
-    point, cov = place(sightings, values, MAKER_OF_PLACING)
+    point, cov = place(sightings, values, MAKER)
     sigma = np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac)))
     assert np.abs((point - best.x) / sigma).max() < 0.1
     assert np.sqrt(np.diag(cov)) == pytest.approx(sigma, rel=0.05)

@@ -16,15 +16,14 @@ from sonar_graph.calibration import FloorPrior
 from sonar_graph.measurements import NO_TRACK, LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.slam import Isam2, RobustKernel
-from sonar_graph.slam import frontend as sightings_module
+from sonar_graph.slam import RobustKernel, frontend
 from sonar_graph.slam.landmarks.tracked import of_no_landmark, once_a_track
 from sonar_graph.slam.smoother import incremental as smoother_module
 from sonar_graph.slam.smoother.incremental import Smoother
 from sonar_graph.states import DetectionJournal, Outcome
 
 from .dive import CALIBRATION, NS, T0_NS, TRUSTING, UNGATED, Dive
-from .graph_comparison import assert_marginals_agree, largest_difference, rows_of
+from .graphs import assert_same_factors, assert_same_graph, factors_of, rows_of
 from .late_identities import (
     BASIN,
     FLAT,
@@ -41,7 +40,7 @@ from .late_identities import (
     run,
     see,
 )
-from .made import smoother_with
+from .made import detected, ran, smoother_with
 from .rail import STEP_S, rail
 
 NEARLY_4 = [0.9, 0.0, 0.0, 0.0]
@@ -65,16 +64,8 @@ def test_on_the_rail_the_end_is_least_squares_with_the_right_identities(history:
     nodes = len(numbers.displacements_m) + 1
     mean, variance = numbers.solution(nodes)
     sequence = on_the_rail(HISTORIES[history], NEARLY_4)
-    estimator = run(
-        sequence, 1 / STEP_S, kernel__shape="none", keyframes__motion_noise_share=0.0, smoother__lag_s=lag_s
-    )
-    known = run(
-        from_the_start(sequence),
-        1 / STEP_S,
-        kernel__shape="none",
-        keyframes__motion_noise_share=0.0,
-        smoother__lag_s=lag_s,
-    )
+    settings = {"kernel__shape": "none", "keyframes__motion_noise_share": 0.0, "smoother__lag_s": lag_s}
+    estimator, known = (run(given, 1 / STEP_S, **settings) for given in (sequence, from_the_start(sequence)))
     smoothed, landmarks = estimator.trajectory(), estimator.landmarks()
     assert smoothed.positions[:, 0] == pytest.approx([mean[f"x{k}"] for k in range(1, nodes)], abs=2e-4)
     assert smoothed.positions[:, 0] == pytest.approx(known.trajectory().positions[:, 0], abs=1e-8)
@@ -93,8 +84,7 @@ def test_what_is_known_late_gives_the_graph_of_what_was_known_from_the_start(tro
     """Without a gyro bias no factor depends on an estimate: equal one by one, and so are the marginals."""
     sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES[trouble], gyro_bias_scale=0.0))
     estimator, known = run(sequence, smoother__lag_s=lag_s), run(from_the_start(sequence), smoother__lag_s=lag_s)
-    assert largest_difference(estimator, known) < 1e-6
-    assert_marginals_agree(estimator, known, 1e-6)
+    assert_same_graph(estimator, known)
     assert assert_outcomes_account(estimator, sequence).keys() & LATE
     assert not assert_outcomes_account(known, sequence).keys() & LATE
 
@@ -112,11 +102,7 @@ def test_whatever_was_believed_before_the_graph_is_that_of_the_last_beliefs(hist
     for number in range(FRAMES):
         believed.watch(number, histories[number] if number < FRAMES - 1 else last)
         known.watch(number, last)
-    values = known.smoother.values
-    a, b = rows_of(believed.smoother.graph, values), rows_of(known.smoother.graph, values)
-    assert a.keys() == b.keys()
-    for name, rows in b.items():
-        np.testing.assert_allclose(a[name], rows, atol=1e-7 * max(1.0, np.abs(rows).max()))
+    assert_same_factors(believed.smoother.graph, known.smoother.graph, known.smoother.values)
     assert believed.sightings.ids == {4, 5, 7}
     assert len(believed.outcomes) == 3 * FRAMES
     assert set(believed.outcomes) <= {Outcome.USED, Outcome.NEW, *LATE}
@@ -132,15 +118,16 @@ def test_whether_it_stands_on_the_floor_is_judged_where_it_was_seen():
         for dive, first in ((late, FLAT), (known, SURE[5])):
             see(dive, 0.0, first)
             see(dive, 0.5, SURE[5])
-        values = known.smoother.values
-        a, b = rows_of(late.smoother.graph, values), rows_of(known.smoother.graph, values)
-        assert {name: len(rows) for name, rows in a.items()} == {name: len(rows) for name, rows in b.items()}
-        assert len(b.get(("PriorFactorPoint3", L(5)), [])) == factors_on_height
+        names, expected = (
+            sorted((type(factor).__name__, *factor.keys()) for factor in factors_of(each.smoother.graph))
+            for each in (late, known)
+        )
+        assert names == expected
+        assert names.count(("PriorFactorPoint3", L(5))) == factors_on_height
 
 
 def test_a_displaced_sighting_is_used_when_its_place_becomes_free_though_its_track_is_gone():
-    dive = Watch(identity=UNGATED)
-    known = Watch(identity=UNGATED)
+    dive, known = Watch(identity=UNGATED), Watch(identity=UNGATED)
     for each, first in ((dive, SURE[5]), (known, SURE[4])):
         each.watch(0, [FLAT, SURE[5], FLAT])
         each.watch(1, [first, [0.0, 0.9, 0.0, 0.0], FLAT])
@@ -148,67 +135,50 @@ def test_a_displaced_sighting_is_used_when_its_place_becomes_free_though_its_tra
     for each in (dive, known):
         see(each, 2 * GAP_S, SURE[4], track=0)
     assert dive.outcomes[3:5] == [Outcome.MOVED, Outcome.USED_LATER]
-    values = known.smoother.values
-    a, b = rows_of(dive.smoother.graph, values), rows_of(known.smoother.graph, values)
-    assert a.keys() == b.keys()
-    for name, rows in b.items():
-        np.testing.assert_allclose(a[name], rows, atol=1e-7 * max(1.0, np.abs(rows).max()))
+    assert_same_factors(dive.smoother.graph, known.smoother.graph, known.smoother.values)
 
 
 def test_the_end_does_not_depend_on_how_the_log_is_cut():
     """Estimates at the whole seconds, asked for alone and among others."""
     sequence = simulate_basin(BasinOptions(**BASIN, **TROUBLES["late and wrong"]))
-    estimators = [Isam2(sequence.calibration), Isam2(sequence.calibration)]
-    found: list[dict[int, gtsam.Pose3]] = [{}, {}]
-    for estimator, rate_hz, at in zip(estimators, (1.0, 4.0), found, strict=True):
-        for step in sequence.replay(sequence.instants(rate_hz)):
-            estimate = estimator.process(step)
-            if estimate is not None:
-                at[estimate.stamp_ns] = estimate.world_T_body
-    shared = found[0].keys() & found[1].keys()
+    (one, seldom), (other, often) = ran(sequence, 1.0), ran(sequence, 4.0)
+    found, others = ({each.stamp_ns: each.world_T_body.matrix() for each in of} for of in (seldom, often))
+    shared = found.keys() & others.keys()
     assert len(shared) > 100
-    assert max(np.abs(found[0][ns].matrix() - found[1][ns].matrix()).max() for ns in shared) < 1e-12
-    assert estimators[0].detections().outcomes == estimators[1].detections().outcomes
+    assert max(np.abs(found[ns] - others[ns]).max() for ns in shared) < 1e-12
+    assert one.detections().outcomes == other.detections().outcomes
 
 
-def test_what_waits_too_long_is_dropped_and_said():
-    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 2.0}))
-    for after_s in (0.0, 1.0, 2.5):
-        see(dive, after_s, FLAT)
-    assert dive.outcomes == [Outcome.FORGOTTEN, Outcome.WAITING, Outcome.WAITING]
-    see(dive, 3.0, SURE[5])
-    assert dive.outcomes == [Outcome.FORGOTTEN, Outcome.USED_LATER, Outcome.USED_LATER, Outcome.USED]
+NEW, USED, WAITING = Outcome.NEW, Outcome.USED, Outcome.WAITING
+USED_LATER, FORGOTTEN, TAKEN_BACK = Outcome.USED_LATER, Outcome.FORGOTTEN, Outcome.TAKEN_BACK
+NONE, DOUBTFUL = [0.0] * 4, [0.1, 0.6, 0.1, 0.1]
+TOLD = {
+    "too late": (2.0, [(0.0, FLAT), (1.0, FLAT), (2.5, FLAT)], [FORGOTTEN, WAITING, WAITING]),
+    "the rest in time": (2.0, [(0.9, FLAT), (1.0, FLAT), (3.0, SURE[5])], [FORGOTTEN, USED_LATER, USED]),
+    "taken back, and too late for another landmark": (
+        2.0, [(0.0, SURE[5]), (1.0, FLAT), (1.5, NONE), (2.6, SURE[5])], [TAKEN_BACK, USED_LATER, USED_LATER, USED],
+    ),
+    "over, then of another identity": (1.0, [(0.0, SURE[5]), (2.0, SURE[6])], [NEW, NEW]),
+    "doubtful once known": (60.0, [(0.0, SURE[5]), (0.5, DOUBTFUL)], [NEW, WAITING]),
+    "doubtful, then sure": (60.0, [(0.0, SURE[5]), (0.5, DOUBTFUL), (1.0, SURE[5])], [NEW, USED_LATER, USED]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("longest_wait_s", "seen", "outcomes"), TOLD.values(), ids=TOLD)
+def test_a_track_waits_for_an_identity_no_longer_than_asked(longest_wait_s, seen, outcomes):
+    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": longest_wait_s}))
+    for after_s, belief in seen:
+        see(dive, after_s, belief)
+    assert dive.outcomes == outcomes
+
+
+def test_what_waits_too_long_is_forgotten_without_another_frame():
     dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 2.0}))
     see(dive, 0.0, FLAT)
     dive.keyframes.advance(T0_NS + 5 * NS)
     dive.sightings.forget()
-    assert dive.outcomes == [Outcome.FORGOTTEN]
+    assert dive.outcomes == [FORGOTTEN]
     assert not dive.sightings.ids
-
-
-def test_what_was_taken_back_is_given_to_no_other_landmark_after_too_long():
-    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 2.0}))
-    see(dive, 0.0, SURE[5])
-    see(dive, 1.0, FLAT)
-    see(dive, 1.5, [0.0] * 4)
-    see(dive, 2.6, SURE[5])
-    assert dive.outcomes == [Outcome.TAKEN_BACK, Outcome.USED_LATER, Outcome.USED_LATER, Outcome.USED]
-
-
-def test_a_track_that_is_over_keeps_its_identity():
-    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 1.0}))
-    see(dive, 0.0, SURE[5])
-    see(dive, 2.0, SURE[6])
-    assert dive.outcomes == [Outcome.NEW, Outcome.NEW]
-
-
-def test_a_doubtful_row_of_a_known_track_waits_for_the_next_sure_one():
-    dive = Dive()
-    see(dive, 0.0, SURE[5])
-    see(dive, 0.5, [0.1, 0.6, 0.1, 0.1])
-    assert dive.outcomes == [Outcome.NEW, Outcome.WAITING]
-    see(dive, 1.0, SURE[5])
-    assert dive.outcomes == [Outcome.NEW, Outcome.USED_LATER, Outcome.USED]
 
 
 def test_what_was_refused_for_one_landmark_is_not_refused_for_good():
@@ -303,11 +273,6 @@ def said(tracks: list[int], beliefs: list[list[float]]) -> Sequence:
     return replace(sequence, detections=found)
 
 
-def result(estimator: Isam2) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    smoothed, landmarks = estimator.trajectory(), estimator.landmarks()
-    return landmarks.ids, landmarks.positions, smoothed.positions
-
-
 @pytest.mark.parametrize("policy", POLICIES)
 @settings(max_examples=4, phases=[Phase.explicit, Phase.generate])
 @given(data=st.data())
@@ -315,42 +280,23 @@ def test_a_run_is_that_without_second_rows_of_tracks(policy: str, data: st.DataO
     tracks = data.draw(st.lists(st.integers(NO_TRACK, 1), min_size=ROWS, max_size=ROWS))
     beliefs = data.draw(st.lists(st.sampled_from(BELIEFS_OF_REPEATED_TRACKS), min_size=ROWS, max_size=ROWS))
     sequence = said(tracks, beliefs)
+    heard: list[LandmarkDetections] = []
     with pytest.MonkeyPatch.context() as monkeypatch:
-        heard = Heard(monkeypatch)
+        monkeypatch.setattr(frontend, "once_a_track", lambda *given: heard.append(once_a_track(*given)) or heard[-1])
         estimator = run(sequence, 1 / STEP_S, keyframes__motion_noise_share=0.0, **POLICIES[policy])
     outcomes = assert_outcomes_account(estimator, sequence)
-    assert outcomes[Outcome.TRACK_REPEATED] == ROWS - len(once(sequence))
-    without = replace(sequence, detections=LandmarkDetections.concatenate(heard.rows))
+    pairs = enumerate(zip(sequence.detections.stamps_ns.tolist(), tracks, strict=True))
+    may_be_used = {(stamp_ns, track if track != NO_TRACK else -2 - row) for row, (stamp_ns, track) in pairs}
+    assert outcomes[Outcome.TRACK_REPEATED] == ROWS - len(may_be_used)
+    without = replace(sequence, detections=LandmarkDetections.concatenate(heard))
     alone = run(without, 1 / STEP_S, keyframes__motion_noise_share=0.0, **POLICIES[policy])
-    for with_others, known in zip(result(estimator), result(alone), strict=True):
-        assert np.array_equal(with_others, known)
-
-
-def once(sequence: Sequence) -> set[tuple[int, int]]:
-    """What may be used: each track once a frame, and all rows of none."""
-    seen = sequence.detections
-    assert seen is not None
-    pairs = zip(seen.stamps_ns.tolist(), seen.track.tolist(), range(len(seen)), strict=True)
-    return {(stamp_ns, track if track != NO_TRACK else -2 - row) for stamp_ns, track, row in pairs}
-
-
-class Heard:
-    """Keeps what the estimator's sightings are given once second rows are gone."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.rows: list[LandmarkDetections] = []
-        monkeypatch.setattr(sightings_module, "once_a_track", self._once)
-
-    def _once(self, *arguments) -> LandmarkDetections:
-        self.rows.append(once_a_track(*arguments))
-        return self.rows[-1]
+    assert np.array_equal(estimator.landmarks().ids, alone.landmarks().ids)
+    assert np.array_equal(estimator.landmarks().positions, alone.landmarks().positions)
+    assert np.array_equal(estimator.trajectory().positions, alone.trajectory().positions)
 
 
 def frame(track: list[int], beliefs: list[list[float]]) -> LandmarkDetections:
-    n = len(track)
-    stamps, covs = np.zeros(n, dtype=np.int64), np.full((n, 2, 2), np.nan)
-    ids = np.tile(IDS, (n, 1))
-    return LandmarkDetections(stamps, np.ones(n), np.zeros(n), covs, ids, np.array(beliefs, float), np.array(track))
+    return detected(0, np.eye(2)[[0] * len(track)], IDS, beliefs, track)
 
 
 def best_of_tracks(rows: LandmarkDetections, identity_of) -> np.ndarray:
@@ -359,17 +305,12 @@ def best_of_tracks(rows: LandmarkDetections, identity_of) -> np.ndarray:
 
 
 def test_the_row_stays_that_the_tracks_identity_explains_best():
+    """Of a track that counts as nothing the most probable row, of equals the first; of one named twice the sum."""
     rows = frame([3, 3, NO_TRACK, 8], [[0.9, 0, 0, 0], [0, 0, 0.8, 0], SURE[4], FLAT])
     assert best_of_tracks(rows, lambda _: 6).tolist() == [False, True, True, True]
     assert best_of_tracks(rows, lambda _: 4).tolist() == [True, False, True, True]
-
-
-def test_of_a_track_that_counts_as_nothing_the_most_probable_row_stays_and_of_equals_the_first():
     rows = frame([3, 3, 3, NO_TRACK, NO_TRACK], [FLAT, [0, 0.8, 0, 0], [0, 0, 0.8, 0], FLAT, FLAT])
     assert best_of_tracks(rows, of_no_landmark).tolist() == [False, True, False, True, True]
-
-
-def test_an_identity_that_a_row_names_twice_has_the_sum_of_both_posteriors():
     rows = replace(frame([3, 3], [[0, 0.6, 0, 0], [0.4, 0.4, 0, 0]]), candidate_ids=np.zeros((2, 4), int))
     assert best_of_tracks(rows, lambda _: 0).tolist() == [False, True]
 
@@ -400,8 +341,7 @@ def test_two_rows_of_a_known_track_that_name_others_do_not_end_the_run(policy: s
 
 
 def test_without_deferring_the_rail_does_not_end_there():
-    _, numbers = rail()
-    mean, _ = numbers.solution(len(numbers.displacements_m) + 1)
+    mean, _ = rail()[1].solution(21)
     wrong = on_the_rail(HISTORIES["wrong to the frame before the last"], NEARLY_4)
     estimator = run(wrong, 1 / STEP_S, kernel__shape="none", identity__longest_wait_s=0)
     assert estimator.landmarks().ids.tolist() == [4, 6, 7]
@@ -425,7 +365,6 @@ def test_an_earlier_sighting_becomes_the_one_that_a_landmark_begins_with():
     see(dive, 0.0, FLAT, track=4)
     see(dive, 0.5, SURE[5], track=-1)
     see(dive, 1.0, SURE[5], track=4)
-    graph = dive.smoother.graph
-    begun = [graph.at(i) for i in range(graph.size()) if isinstance(graph.at(i), gtsam.BearingRangeFactor3D)]
+    begun = [factor for factor in factors_of(dive.smoother.graph) if isinstance(factor, gtsam.BearingRangeFactor3D)]
     assert [gtsam.Symbol(factor.keys()[0]).index() for factor in begun] == [0]
     assert dive.outcomes == [Outcome.USED_LATER, Outcome.NEW, Outcome.USED]
