@@ -2,44 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from sonar_graph.logs.adapters.log_config import read_log_config
+from sonar_graph.logs.cdr.definitions import DEFINITIONS as ROS
 from sonar_graph.logs.cdr.definitions import definition
+from sonar_graph.logs.reading import read_log
 from tests.logs.conftest import header, vector, write_messages
 
 T0_NS = 1_700_000_000_000_000_000
 STEP_NS = 10**8
-
-_RULE = "=" * 80
-_HEADER = f"""{_RULE}
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-{_RULE}
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-_XYZ = "float64 x\nfloat64 y\nfloat64 z\n"
-_VECTOR = f"{_RULE}\nMSG: geometry_msgs/Vector3\n{_XYZ}"
-_WATER_LINKED_BEAM = f"""{_RULE}
-MSG: dvl_msgs/DVLBeam
-int64 id
-float64 velocity
-float64 distance
-float64 rssi
-float64 nsd
-bool valid
-"""
+IMU = "sensor_msgs/msg/Imu"
 
 
-def water_linked(covariance: str = "") -> str:
+def interface(fields: str, **own: str) -> str:
+    """Interface text of a driver: its fields, its own types (``package__Type``), and those of ROS that it may use."""
+    common = {name: text for name, text in ROS.items() if name.startswith(("builtin", "std_msgs/H", "geometry_msgs"))}
+    used = {name.replace("__", "/"): text for name, text in own.items()} | common
+    return fields + "".join(f"\n{'=' * 80}\nMSG: {name}\n{text}" for name, text in used.items()) + "\n"
+
+
+def water_linked_text(covariance: str = "") -> str:
     """dvl_msgs/DVL; the forks add a covariance after the figure of merit."""
-    return f"""std_msgs/Header header
+    return interface(
+        f"""std_msgs/Header header
 float64 time
 geometry_msgs/Vector3 velocity
 float64 fom
@@ -48,68 +40,31 @@ float64 altitude
 DVLBeam[] beams
 bool velocity_valid
 int64 status
-string form
-{_HEADER}{_VECTOR}{_WATER_LINKED_BEAM}"""
+string form""",
+        dvl_msgs__DVLBeam="int64 id\nfloat64 velocity\nfloat64 distance\nfloat64 rssi\nfloat64 nsd\nbool valid",
+    )
 
 
-UUV_DVL = f"""std_msgs/Header header
+UUV_DVL = interface(
+    """std_msgs/Header header
 geometry_msgs/Vector3 velocity
 float64[9] velocity_covariance
 float64 altitude
-DVLBeam[] beams
-{_HEADER}{_VECTOR}{_RULE}
-MSG: stonefish_ros2/DVLBeam
-float64 range
-float64 range_covariance
-float64 velocity
-float64 velocity_covariance
-"""
-TWIST = f"""std_msgs/Header header
-geometry_msgs/TwistWithCovariance twist
-{_HEADER}{_VECTOR}{_RULE}
-MSG: geometry_msgs/TwistWithCovariance
-geometry_msgs/Twist twist
-float64[36] covariance
-{_RULE}
-MSG: geometry_msgs/Twist
-geometry_msgs/Vector3 linear
-geometry_msgs/Vector3 angular
-"""
-DETECTIONS = f"""std_msgs/Header header
-vision_msgs/Detection3D[] detections
-{_HEADER}{_RULE}
-MSG: vision_msgs/Detection3D
-std_msgs/Header header
+DVLBeam[] beams""",
+    stonefish_ros2__DVLBeam="float64 range\nfloat64 range_covariance\nfloat64 velocity\nfloat64 velocity_covariance",
+)
+DETECTIONS = interface(
+    "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
+    vision_msgs__Detection3D="""std_msgs/Header header
 vision_msgs/ObjectHypothesisWithPose[] results
 vision_msgs/BoundingBox3D bbox
-string id
-{_RULE}
-MSG: vision_msgs/ObjectHypothesisWithPose
-vision_msgs/ObjectHypothesis hypothesis
-geometry_msgs/PoseWithCovariance pose
-{_RULE}
-MSG: vision_msgs/ObjectHypothesis
-string class_id
-float64 score
-{_RULE}
-MSG: vision_msgs/BoundingBox3D
-geometry_msgs/Pose center
-geometry_msgs/Vector3 size
-{_RULE}
-MSG: geometry_msgs/PoseWithCovariance
-geometry_msgs/Pose pose
-float64[36] covariance
-{_RULE}
-MSG: geometry_msgs/Pose
-geometry_msgs/Point position
-geometry_msgs/Quaternion orientation
-{_RULE}
-MSG: geometry_msgs/Point
-{_XYZ}{_RULE}
-MSG: geometry_msgs/Quaternion
-{_XYZ}float64 w
-{_VECTOR}"""
-OCULUS_PING = f"""std_msgs/Header header
+string id""",
+    vision_msgs__ObjectHypothesisWithPose="""vision_msgs/ObjectHypothesis hypothesis
+geometry_msgs/PoseWithCovariance pose""",
+    vision_msgs__ObjectHypothesis="string class_id\nfloat64 score",
+    vision_msgs__BoundingBox3D="geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
+)
+OCULUS_PING = interface("""std_msgs/Header header
 uint32 ping_id
 uint32 ping_firing_date
 float64 range
@@ -126,48 +81,57 @@ uint16 n_beams
 uint32 step
 uint8 sample_size
 int16[] bearings
-uint8[] ping_data
-{_HEADER}"""
-BARE_PD0 = "float64 timestamp\nfloat64[4] range\nfloat64[4] velocity\n"
-FLOAT = "float64 data\n"
+uint8[] ping_data""")
 DEFINITIONS = {
-    "dvl_msgs/msg/DVL": water_linked(),
+    "dvl_msgs/msg/DVL": water_linked_text(),
     "stonefish_ros2/msg/DVL": UUV_DVL,
-    "geometry_msgs/msg/TwistWithCovarianceStamped": TWIST,
+    "geometry_msgs/msg/TwistWithCovarianceStamped": interface(
+        "std_msgs/Header header\ngeometry_msgs/TwistWithCovariance twist"
+    ),
     "vision_msgs/msg/Detection3DArray": DETECTIONS,
     "oculus_interfaces/msg/Ping": OCULUS_PING,
-    "provider_dvl/msg/PD0Packet": BARE_PD0,
-    "std_msgs/msg/Float64": FLOAT,
+    "provider_dvl/msg/PD0Packet": "float64 timestamp\nfloat64[4] range\nfloat64[4] velocity\n",
+    "std_msgs/msg/Float64": "float64 data\n",
 }
 Entry = tuple[Any, ...]
+Case = tuple[list[Entry], str, dict[str, Any], dict[str, str | None]]
+"""Entries, configuration, expected values by their path in the sequence, and parts of notes, None: no such note."""
+
+
+def rows_of(topic: str, kind: str, rows: Iterable[dict[str, Any]], frame_id: str = "sensor", **common: Any) -> Entry:
+    """Messages with a header each, a tenth of a second apart."""
+    return topic, kind, [{"header": at(i, frame_id), **common, **row} for i, row in enumerate(rows)]
+
+
+def at(row: int, frame_id: str = "sensor") -> dict[str, Any]:
+    return header(T0_NS + row * STEP_NS, frame_id)
+
+
+def imu(
+    rows: int = 5, force: tuple[float, ...] = (0, 0, 9.8), rate: tuple[float, ...] = (0, 0, 0), **changes: Any
+) -> Entry:
+    """Messages that are alike, but for the fields of some rows (``at_2={...}``)."""
+    common = {"angular_velocity": vector(*rate), "linear_acceleration": vector(*force)}
+    return rows_of("/imu", IMU, [changes.get(f"at_{i}", {}) for i in range(rows)], "imu_link", **common)
+
+
+def dvl(rows: int = 5, **fields: Any) -> Entry:
+    message = {"velocity": vector(1, 2, 3), "velocity_mode": 1, "num_good_beams": 4, **fields}
+    return rows_of("/dvl", "marine_acoustic_msgs/msg/Dvl", [message] * rows)
+
+
+def tree(link: str, xyz: tuple[float, ...] = (0, 0, 0), **rotation: float) -> Entry:
+    """One frame below the body; what is not given of its quaternion is zero."""
+    transform = {"translation": vector(*xyz), "rotation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 0.0} | rotation}
+    entry = {"header": at(0, "base_link"), "child_frame_id": link, "transform": transform}
+    return "/tf_static", "tf2_msgs/msg/TFMessage", [{"transforms": [entry]}]
 
 
 class Foreign:
-    """Builds logs of other people's messages."""
-
-    t0_ns, step_ns = T0_NS, STEP_NS
-    water_linked, vector = staticmethod(water_linked), staticmethod(vector)
+    """Writes and reads logs of other people's messages."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-
-    def header(self, row: int, frame_id: str = "sensor") -> dict[str, Any]:
-        return header(T0_NS + row * STEP_NS, frame_id)
-
-    def imu(self, rows: int = 5, force: tuple[float, ...] = (0, 0, 9.8), rate: tuple[float, ...] = (0, 0, 0)) -> Entry:
-        messages = [
-            {
-                "header": self.header(i, "imu_link"),
-                "angular_velocity": self.vector(*rate),
-                "linear_acceleration": self.vector(*force),
-            }
-            for i in range(rows)
-        ]
-        return "/imu", "sensor_msgs/msg/Imu", messages
-
-    def dvl(self, rows: int = 5, **other: Any) -> Entry:
-        message = {"velocity": self.vector(1, 2, 3), "velocity_mode": 1, "num_good_beams": 4, **other}
-        return "/dvl", "marine_acoustic_msgs/msg/Dvl", [{"header": self.header(i), **message} for i in range(rows)]
 
     def write(self, *entries: Entry, name: str = "log.mcap") -> Path:
         """Entries are topic, type, messages, and the definition where it is not the usual one."""
@@ -177,24 +141,28 @@ class Foreign:
         ]
         return write_messages(self._folder / name, rows, T0_NS)
 
-    def config(self, text: str, name: str = "log.toml") -> Path:
-        path = self._folder / name
+    def config(self, text: str) -> Path:
+        path = self._folder / "log.toml"
         path.write_text(text, encoding="utf-8")
         return path
+
+    def read(self, *entries: Entry, toml: str = "", **settings: Any) -> Any:
+        """The sequence of a log of these entries, of IMU and DVL too where no IMU is among them."""
+        if not any(kind == IMU for _, kind, *_ in entries):
+            entries = (imu(), dvl(), *entries)
+        return read_log(self.write(*entries), config=read_log_config(self.config(toml)), **settings)
+
+    def check(self, entries: list[Entry], toml: str, expected: dict[str, Any], notes: dict[str, str | None]) -> Any:
+        """Read entries, and compare values, to single precision, and notes."""
+        sequence = self.read(*entries, toml=toml)
+        for path, values in expected.items():
+            np.testing.assert_allclose(attrgetter(path)(sequence), values, rtol=2e-7, atol=1e-12, err_msg=path)
+        for name, part in notes.items():
+            assert (name in sequence.notes) == (part is not None)
+            assert part is None or part in sequence.notes[name]
+        return sequence
 
 
 @pytest.fixture
 def foreign(tmp_path: Path) -> Foreign:
     return Foreign(tmp_path)
-
-
-@pytest.fixture
-def read(foreign: Foreign) -> Callable[..., Any]:
-    """Reads a log of these entries, with a configuration as text, as a sequence."""
-    from sonar_graph.logs.adapters.log_config import read_log_config
-    from sonar_graph.logs.reading import read_log
-
-    def read_these(*entries: Entry, toml: str = "", **settings: Any) -> Any:
-        return read_log(foreign.write(*entries), config=read_log_config(foreign.config(toml)), **settings)
-
-    return read_these

@@ -14,204 +14,139 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.logs.adapters.vehicle_messages import body_to_ros, ros_to_body
 
+from .conftest import Case, Entry, dvl, imu, rows_of, tree, vector
+
 FRD_DVL = '[dvl]\nrotation = "frd"\nsound_speed = false\n'
 """Without a warning about the Doppler log."""
+ONE_ATMOSPHERE, TEN_METRES_OF_SEA = 101_325.0, 1025 * 9.80665 * 10
+POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+HALF = float(np.sqrt(0.5))
+NAN = float("nan")
 
 
-def mounted(foreign: Any, link: str, xyz: tuple[float, ...], x: float = 0.0) -> Any:
-    """A frame below the body, rolled so far that its quaternion has this x."""
-    rotation = {"x": x, "y": 0.0, "z": 0.0, "w": float(np.sqrt(1 - x**2))}
-    transform = {"translation": foreign.vector(*xyz), "rotation": rotation}
-    entry = {"header": foreign.header(0, "base_link"), "child_frame_id": link, "transform": transform}
-    return "/tf_static", "tf2_msgs/msg/TFMessage", [{"transforms": [entry]}]
+def pressures(*values: float, variance: float = 0.0) -> Entry:
+    rows = [{"fluid_pressure": value} for value in values]
+    return rows_of("/bar30", "sensor_msgs/msg/FluidPressure", rows, variance=variance)
 
 
-# --- IMU ------------------------------------------------------------------------------------------------------------
+def poses(rotation: Rotation, covariance: Any = None, topic: str = "/ground_truth/pose") -> Entry:
+    x, y, z, w = rotation.as_quat().tolist()
+    pose = {"position": vector(1, 2, 3), "orientation": {"x": x, "y": y, "z": z, "w": w}}
+    if covariance is None:
+        return rows_of(topic, POSE, [{"pose": pose}] * 3)
+    return rows_of(topic, POSE_WITH_COVARIANCE, [{"pose": {"pose": pose, "covariance": list(covariance)}}] * 3)
 
 
-def test_units_are_scaled_and_axes_turned(foreign: Any, read: Any) -> None:
-    toml = '[imu]\nrotation = "frd"\nangular_velocity_scale = 0.017453292519943295\nlinear_acceleration_scale = 9.80665'
-    sequence = read(foreign.imu(force=(0, 0, -1), rate=(0, 0, 90)), foreign.dvl(), toml=toml)
-    np.testing.assert_allclose(sequence.imu.specific_force, [[0, 0, 9.80665]] * 5)
-    np.testing.assert_allclose(sequence.imu.angular_velocity, [[0, 0, -np.pi / 2]] * 5, atol=1e-15)
-
-
-GRAVITY: dict[tuple[float, ...], str | None] = {
-    (0, 0, 9.8): None,
-    (5, 0, 8.4): None,
-    (float("nan"),) * 3: None,
-    (0, 0, 1): "the typical specific force is 1 m/s2 instead of 9.81",
-    (9.8, 0, 0): "gravity is felt along +x",
-    (-9.8, 0, 0): "gravity is felt along -x",
-    (0, 9.8, 0): "+y (9.80 m/s2) instead of the body's +z: give rotation = [90, 0, 0]",
-    (0, -9.8, 0): "gravity is felt along -y",
-    (0, 0, -9.8): 'give rotation = "frd"',
+TURN = Rotation.from_euler("z", 1)
+DEVIATIONS = np.array([0.1, 0.2, 0.3, 0.01, 0.02, 0.03])
+ROTATION_FIRST = np.diag(DEVIATIONS[[3, 4, 5, 0, 1, 2]] ** 2)
+SEA = "[depth]\nwater_density_kg_m3 = 1025\n"
+NED = '[truth]\nworld = "ned"\nrotation = "frd"\n'
+HEIGHT = 'type = "std_msgs/msg/Float64"\nheight = "data"\nscale = -1\nstamp = "log"\nframe_id_field = false'
+NO_FORCE = (
+    "imu: linear_acceleration.x, linear_acceleration.y, linear_acceleration.z are 0 in every message, which no "
+    "accelerometer measures: taken as not measured"
+)
+# fmt: off
+CASES: dict[str, Case] = {
+    "IMU in degrees and g, z down": (
+        [imu(force=(0, 0, -1), rate=(0, 0, 90)), dvl()],
+        '[imu]\nrotation = "frd"\nangular_velocity_scale = 0.017453292519943295\nlinear_acceleration_scale = 9.80665',
+        {"imu.specific_force": [[0, 0, 9.80665]] * 5, "imu.angular_velocity": [[0, 0, -np.pi / 2]] * 5}, {}),
+    "gravity put right by the mounting of the frame that is named": (
+        [imu(force=(0, 9.8, 0)), dvl(), tree("real_link", (1, 2, 3), x=HALF, w=HALF)],
+        FRD_DVL + '[imu]\nframe_id = "real_link"',
+        {"calibration.imu.mounting.translation_m": (1, 2, 3)}, {"log.warnings": None}),
+    "force of zero throughout": (
+        [imu(force=(0, 0, 0)), dvl()], FRD_DVL, {"imu.specific_force": [[NAN] * 3] * 5}, {"log.warnings": NO_FORCE}),
+    "force of zero once": (
+        [imu(rows=2, at_1={"linear_acceleration": vector(0, 0, 0)}), dvl()], "",
+        {"imu.specific_force": [[0, 0, 9.8], [0, 0, 0]]}, {}),
+    "wild rate": (
+        [imu(300, at_150={"angular_velocity": vector(0, 0, 30)}), dvl(300)], "", {},
+        {"log.warnings": "imu: 1 angular rate stands out from both neighbours, by 30 rad/s"}),
+    # depth
+    **{f"pressure, {settings or 'as it is'}": (
+        [pressures(*values)], SEA + settings, {"depth.z_m": [0, -10]}, {"log.depth": "/ (1025 kg/m3 x 9.80665 m/s2)"})
+       for settings, values in {
+           "": (ONE_ATMOSPHERE, ONE_ATMOSPHERE + TEN_METRES_OF_SEA),
+           "atmosphere_pa = 0": (0.0, TEN_METRES_OF_SEA),
+           "scale = 100": (1013.25, 1013.25 + TEN_METRES_OF_SEA / 100)}.items()},
+    "variance of a pressure in mbar": (
+        [pressures(1500.0, variance=(0.05 * 1000 * 9.80665 / 100) ** 2)], "[depth]\nscale = 100",
+        {"depth.variance_m2": [0.05**2]}, {}),
+    "pressure below the atmosphere's": (
+        [pressures(1013.25, 1500.0)], FRD_DVL, {},
+        {"log.warnings": "less than the atmosphere's: give scale (100 for hPa or mbar)"}),
+    "pressure in pascals": ([pressures(ONE_ATMOSPHERE, 1.5e5)], FRD_DVL, {}, {"log.warnings": None}),
+    **{f"pose as a depth with a {meaning}": (
+        [poses(TURN, [*[0.0] * 14, 0.04, *[0.0] * 21], "/dead_reckoning")],
+        f'[depth]\ntopic = "/dead_reckoning"\nscale = -1\nvariance = {{meaning = "{meaning}"}}',
+        {"depth.z_m": [-3] * 3, "depth.variance_m2": [variance_m2] * 3}, {"log.depth": None})
+       for meaning, variance_m2 in {"variance": 0.04, "standard deviation": 0.04**2}.items()},
+    "bare number counted downwards": (
+        [("/depth", "std_msgs/msg/Float64", [{"data": float(i)} for i in range(3)])], f"[depth]\n{HEIGHT}",
+        {"depth.z_m": [0, -1, -2], "depth.variance_m2": [NAN] * 3}, {"log.depth": None}),
+    # reference poses
+    **{f"truth by its name, {'without' if covariance is None else 'with'} covariance": (
+        [poses(TURN, covariance)], "",
+        {"truth.positions": [(1, 2, 3)] * 3, "truth.quaternions_xyzw": [TURN.as_quat()] * 3}, {})
+       for covariance in (None, [0.0] * 36)},
+    "pose of another name": ([poses(TURN, topic="/pose")], "", {}, {"log.truth": "/pose only if chosen"}),
+    **{f"{meaning} in NED, where body x is north, y (left) west, z up": (
+        [poses(Rotation.identity(), np.diag(given).ravel().tolist())], f'{NED}covariance_meaning = "{meaning}"',
+        {"truth.covariances": [ROTATION_FIRST] * 3}, {})  # signs drop out of a diagonal
+       for meaning, given in {"variance": DEVIATIONS**2, "standard deviation": DEVIATIONS}.items()},
 }
+AXES: dict[str, tuple[str, Rotation, list[float], Rotation]] = {
+    # in NED and FRD: heading 30 degrees from north towards east, nose up by 10, right side down by 5; in ENU and FLU:
+    # 60 degrees from east towards north, pitch changes sign, roll does not
+    "ned": (NED, Rotation.from_euler("ZYX", [30, 10, 5], degrees=True),
+            [2, 1, -3], Rotation.from_euler("ZYX", [60, -10, 5], degrees=True)),
+    # the driver's x is our y: with it along the world's x, our x points along the world's -y
+    "turned": ("[truth]\nrotation = [0, 0, 90]", Rotation.identity(),
+               [1, 2, 3], Rotation.from_euler("z", -90, degrees=True)),
+}
+GRAVITY: dict[tuple[float, ...], str | None] = {
+    (0, 0, 9.8): None, (5, 0, 8.4): None, (NAN,) * 3: None,
+    (0, 0, 1): "the typical specific force is 1 m/s2 instead of 9.81",
+    (9.8, 0, 0): "gravity is felt along +x", (-9.8, 0, 0): "gravity is felt along -x",
+    (0, 9.8, 0): "+y (9.80 m/s2) instead of the body's +z: give rotation = [90, 0, 0]",
+    (0, -9.8, 0): "gravity is felt along -y", (0, 0, -9.8): 'give rotation = "frd"',
+}
+# fmt: on
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_messages_of_any_driver_become_measurements_with_what_is_doubtful_in_the_notes(
+    foreign: Any, case: Case
+) -> None:
+    sequence = foreign.check(*case)
+    assert (sequence.truth is None) == ("truth" not in sequence.notes["log.topics"])
+    if case[3].get("log.depth", "") is None:  # a pose in the world or a bare number has no port to mount
+        assert "depth" not in sequence.notes["log.calibration"]
+    if said := sequence.notes.get("log.depth"):
+        assert ("fresh water assumed" in said) == ("1000 kg/m3" in said)
 
 
 @pytest.mark.parametrize(("force", "warning"), GRAVITY.items(), ids=str)
 def test_gravity_that_is_not_felt_upwards_is_told_with_the_rotation_that_puts_it_right(
-    foreign: Any, read: Any, force: tuple[float, ...], warning: str | None
+    foreign: Any, force: tuple[float, ...], warning: str | None
 ) -> None:
-    notes = read(foreign.imu(force=force), foreign.dvl(), toml=FRD_DVL).notes
-    assert (warning is None) == ("log.warnings" not in notes)
-    assert warning is None or warning in notes["log.warnings"]
+    notes = foreign.check([imu(force=force), dvl()], FRD_DVL, {}, {"log.warnings": warning}).notes
     if proposed := re.search(r'give (rotation = ("\w+"|\[.*?\]))', notes.get("log.warnings", "")):
-        sequence = read(foreign.imu(force=force), foreign.dvl(), toml=f"{FRD_DVL}[imu]\n{proposed[1]}")
-        np.testing.assert_allclose(sequence.imu.specific_force, [[0, 0, 9.8]] * 5, atol=1e-12)
+        toml = f"{FRD_DVL}[imu]\n{proposed[1]}"
+        foreign.check([imu(force=force), dvl()], toml, {"imu.specific_force": [[0, 0, 9.8]] * 5}, {})
     assert bool(proposed) == (warning is not None and abs(sum(force)) > 9)
 
 
-def test_a_mounting_puts_gravity_right_and_is_found_by_the_frame_that_is_named(foreign: Any, read: Any) -> None:
-    tree = mounted(foreign, "real_link", (1, 2, 3), float(np.sqrt(0.5)))
-    toml = FRD_DVL + '[imu]\nframe_id = "real_link"'
-    sequence = read(foreign.imu(force=(0, 9.8, 0)), foreign.dvl(), tree, toml=toml)
-    assert "log.warnings" not in sequence.notes
-    assert sequence.calibration.imu.mounting.translation_m == (1, 2, 3)
-
-
-def test_a_force_that_is_zero_throughout_was_not_measured(foreign: Any, read: Any) -> None:
-    sequence = read(foreign.imu(force=(0, 0, 0)), foreign.dvl(), toml=FRD_DVL)
-    assert np.isnan(sequence.imu.specific_force).all()
-    assert sequence.notes["log.warnings"] == (
-        "imu: linear_acceleration.x, linear_acceleration.y, linear_acceleration.z are 0 in every message, which no "
-        "accelerometer measures: taken as not measured"
-    )
-    topic, kind, messages = foreign.imu()
-    messages[2]["linear_acceleration"] = foreign.vector(0, 0, 0)
-    np.testing.assert_array_equal(read((topic, kind, messages), foreign.dvl()).imu.specific_force[2], [0, 0, 0])
-
-
-def test_a_wild_angular_rate_is_mentioned(foreign: Any, read: Any) -> None:
-    topic, kind, messages = foreign.imu(rows=300)
-    messages[150]["angular_velocity"] = foreign.vector(0, 0, 30)
-    notes = read((topic, kind, messages), foreign.dvl(rows=300)).notes
-    assert "imu: 1 angular rate stands out from both neighbours, by 30 rad/s" in notes["log.warnings"]
-
-
-# --- depth ----------------------------------------------------------------------------------------------------------
-
-ONE_ATMOSPHERE, TEN_METRES_OF_SEA = 101_325.0, 1025 * 9.80665 * 10
-
-
-def pressures(foreign: Any, values: list[float], variance: float = 0.0) -> tuple[str, str, list[dict[str, Any]]]:
-    rows = [{"header": foreign.header(i), "fluid_pressure": p, "variance": variance} for i, p in enumerate(values)]
-    return "/bar30", "sensor_msgs/msg/FluidPressure", rows
-
-
-@pytest.mark.parametrize(
-    ("settings", "values"),
-    [
-        ("", [ONE_ATMOSPHERE, ONE_ATMOSPHERE + TEN_METRES_OF_SEA]),
-        ("atmosphere_pa = 0", [0.0, TEN_METRES_OF_SEA]),
-        ("scale = 100", [1013.25, 1013.25 + TEN_METRES_OF_SEA / 100]),
-    ],
-)
-def test_pressure_becomes_height_in_any_water_and_unit(
-    foreign: Any, read: Any, settings: str, values: list[float]
-) -> None:
-    toml = f"[depth]\nwater_density_kg_m3 = 1025\n{settings}"
-    sequence = read(foreign.imu(), foreign.dvl(), pressures(foreign, values), toml=toml)
-    np.testing.assert_allclose(sequence.depth.z_m, [0, -10], atol=1e-9)
-    assert "1025 kg/m3" in sequence.notes["log.depth"]
-    assert "fresh" not in sequence.notes["log.depth"]
-
-
-def test_a_variance_is_scaled_with_its_pressure(foreign: Any, read: Any) -> None:
-    deviation_m = 0.05
-    deviation_mbar = deviation_m * 1000 * 9.80665 / 100
-    entry = pressures(foreign, [1500.0], variance=deviation_mbar**2)
-    sequence = read(foreign.imu(), foreign.dvl(), entry, toml="[depth]\nscale = 100")
-    np.testing.assert_allclose(sequence.depth.variance_m2, [deviation_m**2])
-
-
-def test_a_pressure_that_is_no_absolute_one_in_pascals_is_mentioned(foreign: Any, read: Any) -> None:
-    sequence = read(foreign.imu(), foreign.dvl(), pressures(foreign, [1013.25, 1500.0]))
-    assert "less than the atmosphere's: give scale (100 for hPa or mbar)" in sequence.notes["log.warnings"]
-    sound = read(foreign.imu(), foreign.dvl(), pressures(foreign, [ONE_ATMOSPHERE, 1.5e5]))
-    assert "atmosphere" not in sound.notes["log.warnings"]
-
-
-@pytest.mark.parametrize(("meaning", "expected"), [("variance", 0.04), ("standard deviation", 0.04**2)])
-def test_poses_are_depths_with_a_variance(foreign: Any, read: Any, meaning: str, expected: float) -> None:
-    covariance = np.zeros(36)
-    covariance[14] = 0.04
-    pose = {"pose": {"position": foreign.vector(7, 8, -3)}, "covariance": covariance.tolist()}
-    messages = [{"header": foreign.header(i), "pose": pose} for i in range(3)]
-    entry = ("/waterlinked_dvl/dead_reckoning_report", POSE_WITH_COVARIANCE, messages)
-    toml = f'[depth]\ntopic = "{entry[0]}"\nvariance = {{meaning = "{meaning}"}}'
-    sequence = read(foreign.imu(), foreign.dvl(), entry, toml=toml)
-    assert sequence.depth.z_m.tolist() == [-3] * 3
-    assert "depth" not in sequence.notes["log.calibration"]  # a pose in the world has no port to mount
-    np.testing.assert_allclose(sequence.depth.variance_m2, expected)
-
-
-def test_a_bare_number_counted_downwards_is_a_depth(foreign: Any, read: Any) -> None:
-    entry = ("/depth", "std_msgs/msg/Float64", [{"data": float(i)} for i in range(3)])
-    toml = '[depth]\ntype = "std_msgs/msg/Float64"\nheight = "data"\nscale = -1\nstamp = "log"\nframe_id_field = false'
-    sequence = read(foreign.imu(), foreign.dvl(), entry, toml=toml)
-    assert sequence.depth.z_m.tolist() == [0, -1, -2]
-    assert np.isnan(sequence.depth.variance_m2).all()
-    assert "log.depth" not in sequence.notes
-
-
-# --- reference poses ------------------------------------------------------------------------------------------------
-
-POSE, POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
-TRUTH = "/ground_truth/pose"
-
-
-def poses(foreign: Any, kind: str, rotation: Rotation, covariance: Any = (0.0,) * 36, topic: str = TRUTH) -> Any:
-    x, y, z, w = rotation.as_quat().tolist()
-    inner = {"position": foreign.vector(1, 2, 3), "orientation": {"x": x, "y": y, "z": z, "w": w}}
-    whole = {"pose": inner, "covariance": list(covariance)} if kind == POSE_WITH_COVARIANCE else inner
-    return topic, kind, [{"header": foreign.header(i), "pose": whole} for i in range(3)]
-
-
-@pytest.mark.parametrize("kind", [POSE, POSE_WITH_COVARIANCE])
-def test_poses_are_truth_where_their_name_says_so(foreign: Any, read: Any, kind: str) -> None:
-    turn = Rotation.from_euler("z", 1)
-    sequence = read(foreign.imu(), foreign.dvl(), poses(foreign, kind, turn))
-    np.testing.assert_array_equal(sequence.truth.positions, [[1, 2, 3]] * 3)
-    np.testing.assert_allclose(sequence.truth.quaternions_xyzw, [turn.as_quat()] * 3)
-    guess = read(foreign.imu(), foreign.dvl(), poses(foreign, kind, turn, topic="/pose"))
-    assert guess.truth is None
-    assert "/pose only if chosen" in guess.notes["log.truth"]
-
-
-AXES: dict[str, tuple[str, Rotation, list[float], Rotation]] = {
-    # in NED and FRD: heading 30 degrees from north towards east, nose up by 10, right side down by 5; in ENU and FLU:
-    # 60 degrees from east towards north, pitch changes sign, roll does not
-    "ned": (
-        'world = "ned"\nrotation = "frd"',
-        Rotation.from_euler("ZYX", [30, 10, 5], degrees=True),
-        [2, 1, -3],
-        Rotation.from_euler("ZYX", [60, -10, 5], degrees=True),
-    ),
-    # the driver's x is our y: with it along the world's x, our x points along the world's -y
-    "turned": ("rotation = [0, 0, 90]", Rotation.identity(), [1, 2, 3], Rotation.from_euler("z", -90, degrees=True)),
-}
-
-
-@pytest.mark.parametrize(("settings", "recorded", "position", "expected"), AXES.values(), ids=AXES)
+@pytest.mark.parametrize(("toml", "recorded", "position", "expected"), AXES.values(), ids=AXES)
 def test_axes_of_world_and_body_become_ours(
-    foreign: Any, read: Any, settings: str, recorded: Rotation, position: list[float], expected: Rotation
+    foreign: Any, toml: str, recorded: Rotation, position: list[float], expected: Rotation
 ) -> None:
-    toml = f"[truth]\n{settings}"
-    truth = read(foreign.imu(), foreign.dvl(), poses(foreign, POSE, recorded), toml=toml).truth
+    truth = foreign.read(poses(recorded), toml=toml).truth
     np.testing.assert_array_equal(truth.positions, [position] * 3)
     np.testing.assert_allclose(truth.rotations().as_matrix(), [expected.as_matrix()] * 3, atol=1e-12)
-
-
-@pytest.mark.parametrize("meaning", ["variance", "standard deviation"])
-def test_covariances_follow_the_axes_and_what_they_mean(foreign: Any, read: Any, meaning: str) -> None:
-    deviations = np.array([0.1, 0.2, 0.3, 0.01, 0.02, 0.03])
-    given = np.diag(deviations**2 if meaning == "variance" else deviations).ravel().tolist()
-    toml = f'[truth]\nworld = "ned"\nrotation = "frd"\ncovariance_meaning = "{meaning}"'
-    entry = poses(foreign, POSE_WITH_COVARIANCE, Rotation.identity(), given)
-    truth = read(foreign.imu(), foreign.dvl(), entry, toml=toml).truth
-    # body x is north, y (left) west, z up: [rotation, translation] in the body, signs drop out of a diagonal
-    np.testing.assert_allclose(truth.covariances, [np.diag(deviations[[3, 4, 5, 0, 1, 2]] ** 2)] * 3, atol=1e-15)
 
 
 def random_covariances(seed: int, n: int) -> tuple[np.ndarray, np.ndarray]:
