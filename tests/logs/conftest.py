@@ -113,18 +113,18 @@ def bench(tmp_path: Path) -> Bench:
     return Bench(tmp_path)
 
 
+def decode(path: Path) -> dict[str, list[Any]]:
+    """Messages of a log by topic, as mcap-ros2-support reads them."""
+    found: dict[str, list[Any]] = {}
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        for _, channel, _, message in reader.iter_decoded_messages():
+            found.setdefault(channel.topic, []).append(message)
+    return found
+
+
 @pytest.fixture
 def decoded() -> Callable[[Path], dict[str, list[Any]]]:
-    """Reads the messages of a log by topic with mcap-ros2-support."""
-
-    def decode(path: Path) -> dict[str, list[Any]]:
-        found: dict[str, list[Any]] = {}
-        with path.open("rb") as stream:
-            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-            for _, channel, _, message in reader.iter_decoded_messages():
-                found.setdefault(channel.topic, []).append(message)
-        return found
-
     return decode
 
 
