@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ from mcap.reader import make_reader
 from mcap.records import ChunkIndex
 from mcap.writer import Writer
 
+from sonar_graph.logs.mcap.file_summary import TimeWindow
 from sonar_graph.logs.mcap.reader import Recording, scan
 from sonar_graph.logs.mcap.topic import Keep, Topic
 
@@ -17,13 +20,25 @@ TEXT = b"uint8[] data\n"
 Entry = tuple[int, bytes]
 
 
+@contextmanager
+def writing(path: Path, **settings: Any) -> Iterator[Writer]:
+    """A started file of mcap's own writer, finished at the end."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, **settings)
+        writer.start("ros2", "test")
+        yield writer
+        writer.finish()
+
+
+def channel_for(writer: Writer, topic: str, kind: str = "test_msgs/msg/Bytes", text: bytes = TEXT) -> int:
+    return writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", text))
+
+
 def write(path: Path, count: int = 400, *, chunk_size: int = 4096, **settings: Any) -> list[Entry]:
     """Messages of three lengths on /bytes, 1 ns apart, between others in JSON; what was written on /bytes."""
     rng = np.random.default_rng(0)
     written = [(1000 + i, rng.bytes([20, 50, 80][i % 3])) for i in range(count)]
-    with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=chunk_size, **settings)
-        writer.start("ros2", "test")
+    with writing(path, chunk_size=chunk_size, **settings) as writer:
         schema = writer.register_schema("test_msgs/msg/Bytes", "ros2msg", TEXT)
         other = writer.register_schema("Some", "jsonschema", b"{}")
         channel = writer.register_channel("/bytes", "cdr", schema)
@@ -33,24 +48,18 @@ def write(path: Path, count: int = 400, *, chunk_size: int = 4096, **settings: A
         for time_ns, payload in written:
             writer.add_message(channel, time_ns, payload, time_ns)
             writer.add_message(silent, time_ns, b'{"a": 1}', time_ns)
-        writer.finish()  # type: ignore[no-untyped-call]
     return written
 
 
 def write_apart(path: Path, count: int = 100) -> None:
     """/a and /b in chunks of their own, by turns, a second apart from second 1 on; /tf_static is in the first chunk."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start("ros2", "test")
-        channels = []
-        for name, kind in (("/a", "A"), ("/b", "B"), ("/tf_static", "Static")):
-            schema = writer.register_schema(f"test_msgs/msg/{kind}", "ros2msg", TEXT)
-            channels.append(writer.register_channel(name, "cdr", schema))
+    with writing(path) as writer:
+        kinds = {"/a": "A", "/b": "B", "/tf_static": "Static"}
+        channels = [channel_for(writer, name, f"test_msgs/msg/{kind}") for name, kind in kinds.items()]
         writer.add_message(channels[2], 10**9, b"static", 10**9)
         for i in range(count):
             writer.add_message(channels[i % 2], (1 + i) * 10**9, bytes([i]), 10**9)
-            writer.flush()  # type: ignore[no-untyped-call]
-        writer.finish()  # type: ignore[no-untyped-call]
+            writer.flush()
 
 
 def entries(topic: Topic) -> list[Entry]:
@@ -60,8 +69,8 @@ def entries(topic: Topic) -> list[Entry]:
     return [(int(time), payloads[row]) for row, time in enumerate(topic.log_times_ns)]
 
 
-def scan_all(path: Path) -> Recording:
-    return scan(path, lambda _: Keep.ALL)
+def scan_all(path: Path, window: TimeWindow | None = None) -> Recording:
+    return scan(path, lambda _: Keep.ALL, window)
 
 
 def read(path: Path) -> list[Entry]:

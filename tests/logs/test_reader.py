@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import struct
 import tracemalloc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta, timezone
 from io import BytesIO
@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from mcap.data_stream import ReadDataStream
 from mcap.records import Chunk, ChunkIndex, Message
 from mcap.stream_reader import breakup_chunk
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, IndexType
 
 from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.mcap.file_summary import Instant, TimeWindow
@@ -28,7 +28,7 @@ from sonar_graph.logs.mcap.records import seal
 from sonar_graph.logs.mcap.topic import Damage, Keep, Loss, Topic, settle
 from sonar_graph.logs.reading import read_log
 
-from .containers import TEXT, Entry, chunk_indexes, entries, flip, read, scan_all, write, write_apart
+from .containers import Entry, channel_for, chunk_indexes, entries, flip, read, scan_all, write, write_apart, writing
 
 NONE, LZ4, ZSTD = CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD
 
@@ -55,27 +55,30 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "log.mcap"
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"compression": ZSTD},
-        {"compression": LZ4},
-        {"compression": NONE},
-        {"use_chunking": False},
-        {"index_types": IndexType.NONE, "use_statistics": False, "use_summary_offsets": False},
-        {"repeat_channels": False, "repeat_schemas": False},
-    ],
-    ids=["zstd", "lz4", "none", "unchunked", "no-index", "no-summary"],
-)
-def test_every_message_is_found_whatever_the_container(path: Path, options: dict[str, object]) -> None:
+CONTAINERS: dict[str, dict[str, Any]] = {
+    "zstd": {"compression": ZSTD},
+    "lz4": {"compression": LZ4},
+    "none": {"compression": NONE},
+    "unchunked": {"use_chunking": False},
+    "no index": {"index_types": IndexType.NONE, "use_statistics": False, "use_summary_offsets": False},
+    "no summary": {"repeat_channels": False, "repeat_schemas": False},
+}
+
+
+@pytest.mark.parametrize("options", CONTAINERS.values(), ids=CONTAINERS)
+def test_every_message_is_found_whatever_the_container(path: Path, options: dict[str, Any]) -> None:
     written = write(path, **options)
     assert read(path) == written
-    recording = scan(path, lambda _: Keep.STAMP)
+    calls: list[tuple[int, int]] = []
+    recording = scan(path, lambda _: Keep.STAMP, progress=lambda done, total: calls.append((done, total)))
     assert list(recording.topics) == ["/bytes", "/json"]
     assert recording.metadata == {"sonar_graph": {"name": "x"}}
     assert (recording.ending, recording.corrupt, recording.damage.remarks) == (None, [], [])
     assert len(recording.topics["/bytes"]) == len(written)
     assert list(recording.topics["/bytes"].stacks) == [12]  # only the stamps were wanted
+    assert calls == sorted(calls)
+    assert {total for _, total in calls} <= {path.stat().st_size}
+    assert len(calls) == len(chunk_indexes(path)) or "use_chunking" in options or "index_types" in options
     pieces: dict[str, list[Entry]] = {}
     for piece in stream(path, lambda _: Keep.ALL):
         pieces.setdefault(piece.name, []).extend(entries(piece))
@@ -84,13 +87,10 @@ def test_every_message_is_found_whatever_the_container(path: Path, options: dict
 
 def test_messages_outside_chunks_may_be_larger_than_what_is_read_at_a_time(path: Path) -> None:
     payloads = [bytes([i]) * (3 << 20) for i in range(3)]
-    with path.open("wb") as stream:
-        writer = Writer(stream, use_chunking=False)
-        writer.start("ros2", "test")
-        channel = writer.register_channel("/a", "cdr", writer.register_schema("a/msg/A", "ros2msg", TEXT))
+    with writing(path, use_chunking=False) as writer:
+        channel = channel_for(writer, "/a")
         for i, payload in enumerate(payloads):
             writer.add_message(channel, i, payload, i)
-        writer.finish()  # type: ignore[no-untyped-call]
     assert entries(scan_all(path).topics["/a"]) == list(enumerate(payloads))
 
 
@@ -107,11 +107,10 @@ def at_text(text: bytes, offset: int = 0, bit: int = 1) -> Callable[[Path], None
     return lambda path: flip(path, path.read_bytes().index(text) + offset, bit)
 
 
-def both_lengths(path: Path) -> None:
-    """Both lengths of the second chunk, so that nothing says where it ends."""
-    at = chunk_indexes(path)[1].chunk_start_offset
-    flip(path, at + 1)
-    flip(path, at + 9 + 32, 1)
+def both_lengths(path: Path, number: int = 1) -> None:
+    """Both lengths of a chunk, so that nothing says where it ends."""
+    in_chunk(number, 1)(path)
+    in_chunk(number, 9 + 32, 1)(path)
 
 
 def missing_in_chunk(number: int, count: int) -> Callable[[Path], None]:
@@ -119,9 +118,9 @@ def missing_in_chunk(number: int, count: int) -> Callable[[Path], None]:
 
 
 def huge_size(path: Path) -> None:
-    content = bytearray(path.read_bytes())
-    struct.pack_into("<Q", content, chunk_indexes(path)[1].chunk_start_offset + 9 + 16, 1 << 62)
-    path.write_bytes(content)
+    at = chunk_indexes(path)[1].chunk_start_offset + 9 + 16
+    content = path.read_bytes()
+    path.write_bytes(content[:at] + struct.pack("<Q", 1 << 62) + content[at + 8 :])
 
 
 def in_index(offset: int) -> Callable[[Path], None]:
@@ -143,14 +142,12 @@ def shorter_index(path: Path) -> None:
 
 def message_200(offset: int, bit: int) -> Callable[[Path], None]:
     """A bit at an offset from the head of a message outside chunks."""
-    payload = np.random.default_rng(0)
-    for i in range(201):
-        text = payload.bytes([20, 50, 80][i % 3])
-    return at_text(text, offset - 31, bit)
+    rng = np.random.default_rng(0)
+    return at_text([rng.bytes([20, 50, 80][i % 3]) for i in range(201)][200], offset - 31, bit)
 
 
-def tail(content: bytes) -> Callable[[Path], None]:
-    return lambda path: path.write_bytes(path.read_bytes() + content) and None
+def tail(content: bytes) -> Callable[[Path], object]:
+    return lambda path: path.write_bytes(path.read_bytes() + content)
 
 
 @dataclass
@@ -221,9 +218,7 @@ def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(path: 
     assert recording.topics["/bytes"].type_name == ("test_msgs/msg/Bytes" if fault.options != UNREPEATED else "")
     if lost and not chunks:
         (loss,) = recording.damage.losses
-        assert loss.start_ns is not None
-        assert loss.end_ns is not None
-        assert loss.start_ns <= lost[0][0] <= loss.end_ns
+        assert (loss.start_ns or 0) <= lost[0][0] <= (loss.end_ns or 0)
     if lost and chunks:
         (loss,) = recording.damage.losses
         assert loss.at == chunks[fault.lost or 0].chunk_start_offset
@@ -232,12 +227,9 @@ def test_of_a_damaged_file_all_that_is_whole_is_read_and_the_rest_is_told(path: 
         with pytest.raises(LogError, match=r"damaged: bytes \d+ to \d+: .*--salvage"):
             recording.require_sound()
     if name.startswith("a bit in a chunk"):
-        (loss,), chunk = recording.damage.losses, chunks[1]
-        assert (loss.end, loss.start_ns, loss.end_ns) == (
-            chunk_end(chunk),
-            chunk.message_start_time,
-            chunk.message_end_time,
-        )
+        chunk = chunks[1]
+        times_ns = (chunk.message_start_time, chunk.message_end_time)
+        assert (loss.end, loss.start_ns, loss.end_ns) == (chunk_end(chunk), *times_ns)
 
 
 RANDOM = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -275,17 +267,13 @@ def test_the_crc_over_all_data_tells_a_bit_outside_chunks(path: Path) -> None:
     assert "the CRC over all data does not fit, and messages lie outside chunks" in loss.reason
 
 
-def test_messages_in_the_only_chunk_are_not_read_as_messages_outside_chunks(path: Path) -> None:
-    """Uncompressed, with both of its lengths wrong: the messages in it have no CRC that could be checked."""
+def test_messages_that_nothing_describes_are_not_read_but_counted_as_lost(path: Path) -> None:
+    """Without a CRC that could be checked, those of an uncompressed chunk are no messages outside chunks either."""
     write(path, chunk_size=1 << 20, compression=NONE)
     (chunk,) = chunk_indexes(path)
+    both_lengths(path, 0)
     path.write_bytes(path.read_bytes()[: chunk_end(chunk)])
-    flip(path, chunk.chunk_start_offset + 1)
-    flip(path, chunk.chunk_start_offset + 9 + 32, 1)
     assert scan_all(path).topics == {}
-
-
-def test_without_any_description_messages_are_counted_as_lost(path: Path) -> None:
     written = write(path)
     first, second = chunk_indexes(path)[:2]
     path.write_bytes(path.read_bytes()[: chunk_end(second)])
@@ -307,11 +295,8 @@ def test_what_no_crc_covers_is_named(path: Path) -> None:
 
 
 def test_metadata_under_a_seal_is_whole_or_lost(path: Path) -> None:
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
+    with writing(path) as writer:
         writer.add_metadata("sonar_graph", seal({"calibration": "0.05", "name": "x"}))
-        writer.finish()  # type: ignore[no-untyped-call]
     recording = scan_all(path)
     assert recording.metadata == {"sonar_graph": {"calibration": "0.05", "name": "x"}}
     assert recording.damage == Damage()
@@ -321,23 +306,18 @@ def test_metadata_under_a_seal_is_whole_or_lost(path: Path) -> None:
     assert "a metadata record is lost: its CRC does not fit" in recording.corrupt[0]
 
 
-def test_losses_are_estimated_from_rates_where_nothing_counts_them() -> None:
-    topic = Topic(Path("x"), "/imu", "", "cdr", "ros2msg", "", Keep.ALL)
+def test_losses_are_counted_by_the_statistics_or_else_estimated_from_rates() -> None:
     times_ns = np.delete(np.arange(1000) * 10_000_000, slice(400, 450))
-    topic.gather(bytes(10), np.zeros(950, np.int64), np.full(950, 10), times_ns)
+    topics = {name: Topic(Path("x"), name, "", "cdr", "ros2msg", "", Keep.ALL) for name in ("/imu", "/over")}
+    for topic, count in zip(topics.values(), (950, 400), strict=True):  # of /over there is nothing after the loss
+        topic.gather(bytes(10), np.zeros(count, np.int64), np.full(count, 10), times_ns[:count])
     loss = Loss(0, 100, "no valid record", int(times_ns[399]), int(times_ns[400]))
-    over = Topic(Path("x"), "/over", "", "cdr", "ros2msg", "", Keep.ALL)
-    over.gather(bytes(10), np.zeros(400, np.int64), np.full(400, 10), times_ns[:400])  # nothing after the loss
-    settle(Damage([loss]), {"/imu": topic, "/over": over}, None)
+    settle(Damage([loss]), topics, None)
     assert loss.messages == {"/imu": 50}
     assert loss.is_estimate
     assert loss.describe(0) == "bytes 0 to 100: no valid record; 3.990 s to 4.500 s of the log; lost: about 50 of /imu"
-
-
-def test_fewer_messages_than_the_statistics_count_are_a_loss() -> None:
-    damage = Damage()
-    settle(damage, {}, {"/imu": 3})
-    assert damage.losses[0].messages == {"/imu": 3}
+    settle(counted := Damage(), {}, {"/imu": 3})
+    assert counted.losses[0].messages == {"/imu": 3}
     settle(sound := Damage(), {}, {})
     assert sound.losses == []
 
@@ -398,28 +378,27 @@ def test_half_a_chunk_gives_its_whole_messages(path: Path, compression: Compress
 # ---- files that are no logs
 
 
-@pytest.mark.parametrize(
-    ("content", "kind"),
-    [
-        (b"#ROSBAG V2.0\n", r"a ROS 1 bag; `sonar-graph convert rosbag .*log\.bag -o log\.mcap`"),
-        (b"SQLite format 3\0", "a ROS 2 bag of the sqlite3 kind; `sonar-graph convert rosbag"),
-        (b"", "empty: copy it again"),
-        (bytes(1000), "zeros: copy it again"),
-        (b'{"a": 1}\nb', r"""a text that begins with '\{"a": 1\}'"""),
-        ("Überschrift\n".encode() * 9, "a text that begins with 'Überschrift'"),
-        (b" \n ", "a text that begins with ''"),
-        (b"\x7fELF\x02\x01\x01", "something else"),
-    ],
-)
-def test_other_files_are_named_for_what_they_are(tmp_path: Path, content: bytes, kind: str) -> None:
+OTHER_FILES = {
+    b"#ROSBAG V2.0\n": r"a ROS 1 bag; `sonar-graph convert rosbag .*log\.bag -o log\.mcap`",
+    b"SQLite format 3\0": "a ROS 2 bag of the sqlite3 kind; `sonar-graph convert rosbag",
+    b"": "empty: copy it again",
+    bytes(1000): "zeros: copy it again",
+    b'{"a": 1}\nb': r"""a text that begins with '\{"a": 1\}'""",
+    "Überschrift\n".encode() * 9: "a text that begins with 'Überschrift'",
+    b" \n ": "a text that begins with ''",
+    b"\x7fELF\x02\x01\x01": "something else",
+}
+
+
+def test_other_files_are_named_for_what_they_are(tmp_path: Path) -> None:
     path = tmp_path / "log.bag"
-    path.write_bytes(content)
-    with pytest.raises(LogError, match=rf"not an MCAP file but {kind}"):
-        scan_all(path)
-    with pytest.raises(LogError, match="is a folder"):
-        scan_all(tmp_path)
-    with pytest.raises(LogError, match="No such file"):
-        scan_all(tmp_path / "none.mcap")
+    for content, kind in OTHER_FILES.items():
+        path.write_bytes(content)
+        with pytest.raises(LogError, match=rf"not an MCAP file but {kind}"):
+            scan_all(path)
+    for path, kind in ((tmp_path, "is a folder"), (tmp_path / "none.mcap", "No such file")):
+        with pytest.raises(LogError, match=kind):
+            scan_all(path)
 
 
 # ---- parts of a file
@@ -428,15 +407,9 @@ def test_other_files_are_named_for_what_they_are(tmp_path: Path, content: bytes,
 def test_pieces_of_a_damaged_file_end_in_an_error(path: Path) -> None:
     written = write(path)
     in_chunk(1, 100)(path)
-    found: list[Entry] = []
-
-    def gather() -> Iterator[Topic]:
-        for piece in stream(path, lambda _: Keep.ALL):
-            found.extend(entries(piece) if piece.name == "/bytes" else [])
-        yield piece
-
+    pieces, found = stream(path, lambda _: Keep.ALL), list[Entry]()
     with pytest.raises(LogError, match="damaged: bytes"):
-        list(gather())
+        found.extend(entry for piece in pieces if piece.name == "/bytes" for entry in entries(piece))
     assert set(found) < set(written)
 
 
@@ -454,16 +427,16 @@ def test_chunks_without_a_wanted_topic_are_not_even_read(path: Path) -> None:
 
 def test_a_window_holds_what_was_recorded_in_it_and_latched_topics(path: Path) -> None:
     write_apart(path)
-    recording = scan(path, lambda _: Keep.ALL, TimeWindow(Instant.parse("10"), Instant.parse("20")))
+    recording = scan_all(path, TimeWindow(Instant.parse("10"), Instant.parse("20")))
     times_s = sorted(t for name in ("/a", "/b") for t in (recording.topics[name].log_times_ns // 10**9).tolist())
     assert times_s == list(range(11, 21))
     assert entries(recording.topics["/tf_static"]) == [(10**9, b"static")]
     assert recording.skipped_chunks == 89
     assert recording.notes()["log.part"] == "10.000 s to 20.000 s of the recording"
     absolute = TimeWindow(Instant.parse("1970-01-01T00:01:31Z"))
-    assert sum(len(t) for t in scan(path, lambda _: Keep.ALL, absolute).topics.values()) == 11
+    assert sum(len(t) for t in scan_all(path, absolute).topics.values()) == 11
     with pytest.raises(LogError, match=r"nothing was recorded from 1000\.000 s to the end"):
-        scan(path, lambda _: Keep.ALL, TimeWindow(Instant.parse("1000")))
+        scan_all(path, TimeWindow(Instant.parse("1000")))
 
 
 @pytest.mark.parametrize("summary", [True, False])
@@ -473,7 +446,7 @@ def test_a_window_is_the_same_without_summary(path: Path, summary: bool) -> None
         path.write_bytes(path.read_bytes()[: chunk_indexes(path)[-1].chunk_start_offset])
         written = read(path)
     window = TimeWindow(Instant.parse("100e-9"), Instant.parse("150e-9"))
-    recording = scan(path, lambda _: Keep.ALL, window)
+    recording = scan_all(path, window)
     assert entries(recording.topics["/bytes"]) == [entry for entry in written if 1100 <= entry[0] < 1150]
     assert (recording.skipped_chunks > 0) == summary
 
@@ -490,19 +463,10 @@ def test_a_summary_that_lies_about_chunks_is_not_used_to_skip(path: Path) -> Non
     at = content.index(entry)
     content[at : at + len(entry)] = struct.pack("<IHQ", 10, 2, index.message_index_offsets[1])
     path.write_bytes(content)
-    recording = scan(path, lambda _: Keep.ALL, TimeWindow(Instant.parse("3"), Instant.parse("7")))
+    recording = scan_all(path, TimeWindow(Instant.parse("3"), Instant.parse("7")))
     assert (recording.topics["/a"].log_times_ns // 10**9).tolist() == [5, 7]
     assert any("the summary's index does not fit chunk 5" in remark for remark in recording.damage.remarks)
     assert recording.skipped_chunks == 0
-
-
-def test_progress_ends_at_the_whole(path: Path) -> None:
-    write(path)
-    calls: list[tuple[int, int]] = []
-    scan(path, lambda _: Keep.ALL, progress=lambda done, total: calls.append((done, total)))
-    assert calls == sorted(calls)
-    assert {total for _, total in calls} == {path.stat().st_size}
-    assert len(calls) == len(chunk_indexes(path))
 
 
 BEGINNING_NS = 1_700_000_000_000_000_001
@@ -515,14 +479,11 @@ def test_a_date_is_absolute_in_its_zone(when: datetime, hours: int) -> None:
     assert Instant.parse(zoned.isoformat()).resolve(BEGINNING_NS) == expected_us * 1000
 
 
-def test_a_date_without_a_zone_is_in_utc_and_a_number_is_seconds_from_the_beginning() -> None:
+@pytest.mark.parametrize("text", ["-1", "nan", "inf", "x", "", "12:30", "1e30"])
+def test_a_number_is_seconds_from_the_beginning_a_date_without_a_zone_in_utc_and_all_else_refused(text: str) -> None:
     assert Instant.parse("1970-01-02T00:00:01").resolve(BEGINNING_NS) == 86_401 * 10**9
     assert Instant.parse("1.5").resolve(BEGINNING_NS) == BEGINNING_NS + 1_500_000_000
     assert Instant.parse("1700000000").resolve(0) == 1_700_000_000 * 10**9
-
-
-@pytest.mark.parametrize("text", ["-1", "nan", "inf", "x", "", "12:30", "1e30"])
-def test_other_times_and_an_end_before_the_start_are_refused(text: str) -> None:
     with pytest.raises(LogError, match=r"no time in a log: give seconds from its beginning"):
         Instant.parse(text)
     with pytest.raises(LogError, match="ends before it starts"):
@@ -532,15 +493,11 @@ def test_other_times_and_an_end_before_the_start_are_refused(text: str) -> None:
 def test_a_long_log_is_read_in_bounded_memory(path: Path) -> None:
     """60 MB of images between numbers, each image a chunk of its own."""
     image = np.random.default_rng(0).bytes(1 << 20)
-    with path.open("wb") as stream_:
-        writer = Writer(stream_, compression=NONE)
-        writer.start("ros2", "test")
-        schema = writer.register_schema("test_msgs/msg/Image", "ros2msg", TEXT)
-        images, numbers = (writer.register_channel(name, "cdr", schema) for name in ("/image", "/number"))
+    with writing(path, compression=NONE) as writer:
+        images, numbers = (channel_for(writer, name) for name in ("/image", "/number"))
         for i in range(60):
             writer.add_message(images, i, image, 0)
             writer.add_message(numbers, i, b"12345678", 0)
-        writer.finish()  # type: ignore[no-untyped-call]
     tracemalloc.start()
     total = sum(part.nbytes for t in stream(path, lambda _: Keep.ALL) for s in t.stacks.values() for _, part in s)
     _, peak = tracemalloc.get_traced_memory()
