@@ -22,10 +22,7 @@ ROOT = "fuzz_msgs/msg/Root"
 TEXTS = ["", "a", "base_link", "ψ → 深い", "with \0 inside", "\U0001f420", "x" * 40]
 CONSTANTS = ["uint8 A=1", "float64 B = -1.5", 'string C="a # b"', "  # a comment: float64 no", "", "bool D=true"]
 DEFAULTS = {"bool": "true", "string": '"a b"', "float32": "-1.5", "float64": "1e-3"}
-BUILTIN = {
-    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
-    "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
-}
+BUILTIN = dict.fromkeys(["builtin_interfaces/Time", "builtin_interfaces/Duration"], "int32 sec\nuint32 nanosec")
 
 
 class RandomTypes:
@@ -59,11 +56,9 @@ class RandomTypes:
         draw = self._rng.random()
         if draw < 0.3 and depth:
             return self.draw(f"fuzz_msgs/T{len(self.texts)}x{depth}", depth - 1)
-        if draw < 0.4:
-            kind = str(self._rng.choice(list(BUILTIN)))
-            self.texts[kind] = BUILTIN[kind]
-            return kind
-        return str(self._rng.choice([*PRIMITIVES, STRING, STRING]))
+        kind = str(self._rng.choice(list(BUILTIN) if draw < 0.4 else [*PRIMITIVES, STRING, STRING]))
+        self.texts |= {kind: BUILTIN[kind]} if kind in BUILTIN else {}
+        return kind
 
     def schema(self) -> str:
         """The text of the root with all others."""

@@ -1,44 +1,48 @@
+"""Summaries of logs: roles, times, damage, doubts, and the log configuration to start from."""
+
 from __future__ import annotations
 
-import io
 import tomllib
+from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from mcap.reader import make_reader
 
 from sonar_graph.cli.main import main
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.logs.convert.step_files import read_victoria_park
-from sonar_graph.logs.inspection import LogSummary, inspect_log
+from sonar_graph.logs.inspection import LogSummary, TopicSummary, inspect_log
 from sonar_graph.logs.mcap.reader import scan
 from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.roles import ROLES, Choice, choose_topic
+from sonar_graph.logs.roles import ROLES, choose_topic
 from sonar_graph.logs.writing import write_log
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
 from .conftest import TYPES
+from .containers import chunk_indexes, flip
 
 
 def role(summary: LogSummary, name: str) -> tuple[str | None, str]:
     return next((r.topic, r.reason) for r in summary.roles if r.role == name)
 
 
-def test_rates_and_gaps_come_from_the_headers(bench: Any) -> None:
+def topic(summary: LogSummary, name: str) -> TopicSummary:
+    return next(t for t in summary.topics if t.name == name)
+
+
+def test_rates_and_gaps_come_from_the_headers_and_mountings_are_mentioned(bench: Any) -> None:
     _, dvl = bench.basics()
-    seconds = [0, 1, 2, 5]
-    imu = ("/imu", "imu", [bench.imu(bench.t0_ns + s * 10**9) for s in seconds])
-    summary = inspect_log(bench.write(imu, dvl))
-    topic = next(t for t in summary.topics if t.name == "/imu")
-    assert (topic.type_name, topic.encoding, topic.messages) == ("sensor_msgs/msg/Imu", "cdr", 4)
-    assert (topic.first_stamp_ns, topic.last_stamp_ns) == (bench.t0_ns, bench.t0_ns + 5 * 10**9)
-    assert topic.rate_hz == pytest.approx(3 / 5)
-    assert topic.largest_gap_s == pytest.approx(3)
-    assert topic.stamps_from == "header"
-    assert summary.duration_s == pytest.approx(5)
+    imu = ("/imu", "imu", [bench.imu(bench.t0_ns + s * 10**9) for s in (0, 1, 2, 5)])
+    tree = ("/tf_static", "tf", [{"transforms": [bench.transform("base_link", "imu_link", (1, 0, 0))]}])
+    summary = inspect_log(bench.write(imu, dvl, tree))
+    found = topic(summary, "/imu")
+    assert (found.type_name, found.encoding, found.messages) == ("sensor_msgs/msg/Imu", "cdr", 4)
+    assert (found.first_stamp_ns, found.last_stamp_ns) == (bench.t0_ns, bench.t0_ns + 5 * 10**9)
+    assert (found.rate_hz, found.largest_gap_s, summary.duration_s) == pytest.approx((3 / 5, 3, 5))
+    assert (found.stamps_from, topic(summary, "/tf_static").stamps_from) == ("header", "log")
+    assert "mountings of /tf_static (imu_link)" in summary.calibration
 
 
 def test_roles_are_explained_whether_filled_or_not(bench: Any) -> None:
@@ -51,9 +55,11 @@ def test_roles_are_explained_whether_filled_or_not(bench: Any) -> None:
     assert role(summary, "truth")[0] is None
     assert "/odom only if chosen: --topic truth=/odom" in role(summary, "truth")[1]
     assert summary.obstacles == ("2 topics for imu (choose: --topic imu=/imu)",)
-    assert inspect_log(bench.write(odometry, name="other.mcap")).obstacles == ("no IMU", "no DVL")
     assert summary.calibration.startswith("none in the log and no /tf_static")
     assert "sonar_graph/calibration.py lists them" in summary.calibration
+    assert '# [imu]  # one of\n# topic = "/imu"\n# topic = "/second"' in summary.toml
+    assert '# [truth]  # one of\n# topic = "/odom"' in summary.toml
+    assert inspect_log(bench.write(odometry, name="other.mcap")).obstacles == ("no IMU", "no DVL")
     assert role(inspect_log(path, topics={"imu": "/second"}), "imu") == ("/second", "chosen by name")
     config = LogConfig.parse({"imu": {"topic": "/imu"}, "dvl": {"use": False}}, "my.toml")
     said = inspect_log(path, config)
@@ -67,32 +73,19 @@ def test_the_roles_are_those_that_reading_uses(make_sequence: Any, tmp_path: Pat
     summary = inspect_log(tmp_path / "a.mcap")
     used = read_log(tmp_path / "a.mcap").notes["log.topics"]
     assert used == "; ".join(f"{r.role}: {r.topic}" for r in summary.roles if r.topic)
-    assert summary.calibration == "in the log"
-    assert summary.name == sequence.name
-    assert summary.notes == sequence.notes
-    assert summary.damage == ()
-    assert summary.obstacles == ()
-
-
-def test_mountings_in_the_log_are_mentioned(bench: Any) -> None:
-    tree = ("/tf_static", "tf", [{"transforms": [bench.transform("base_link", "imu_link", (1, 0, 0))]}])
-    summary = inspect_log(bench.write(*bench.basics(), tree))
-    assert "mountings of /tf_static (imu_link)" in summary.calibration
-    assert next(t for t in summary.topics if t.name == "/tf_static").stamps_from == "log"
+    assert (summary.calibration, summary.name, summary.notes) == ("in the log", sequence.name, sequence.notes)
+    assert (summary.damage, summary.obstacles) == ((), ())
 
 
 def test_damage_is_reported_instead_of_raised(make_sequence: Any, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_log(path, make_sequence(samples=20_000))
-    content = path.read_bytes()
+    content, chunk = path.read_bytes(), chunk_indexes(path)[0]
+    flip(path, chunk.chunk_start_offset + chunk.chunk_length // 2, 1)
+    assert "chunk" in inspect_log(path).damage[0]
     path.write_bytes(content[: len(content) // 2])
     (ending,) = inspect_log(path).damage
     assert "cut off" in ending
-    flipped = np.frombuffer(content, np.uint8).copy()
-    chunk = make_reader(io.BytesIO(content)).get_summary().chunk_indexes[0]  # type: ignore[union-attr]
-    flipped[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
-    path.write_bytes(flipped.tobytes())
-    assert "chunk" in inspect_log(path).damage[0]
 
 
 @pytest.mark.recording
@@ -144,9 +137,12 @@ def test_what_this_package_wrote_gives_no_warning(tmp_path: Path) -> None:
 # --- the log configuration to start from ---------------------------------------------------------------------------
 
 
-def choices(path: Path, config: LogConfig) -> dict[str, Choice]:
+def choices(path: Path, config: LogConfig) -> dict[str, object]:
+    """For each role the topic, others that fit, and the adapter but for the topic that the text names."""
     recording = scan(path, lambda _: Keep.STAMP)
-    return {name: choose_topic(role, recording, config) for name, role in ROLES.items()}
+    found = {name: choose_topic(role, recording, config) for name, role in ROLES.items()}
+    adapters = {name: c.adapter and c.adapter.model_copy(update={"topic": None}) for name, c in found.items()}
+    return {name: (c.topic, c.candidates, adapters[name]) for name, c in found.items()}
 
 
 def test_read_back_unchanged_it_makes_the_same_choices(bench: Any, make_sequence: Any, tmp_path: Path) -> None:
@@ -160,25 +156,15 @@ def test_read_back_unchanged_it_makes_the_same_choices(bench: Any, make_sequence
         tmp_path / "own.mcap",
     ]
     write_log(logs[-1], make_sequence())
-    said = [
-        LogConfig(),
-        LogConfig.parse({"dvl": {"rotation": [1, 2, 3], "covariance": False}, "depth": {"use": False}}, "x"),
-        LogConfig.parse({"truth": {"topic": "/odom"}, "imu": {"frame_id": 'a "frame"', "stamp_offset_s": -0.04}}, "x"),
+    said: list[dict[str, Any]] = [
+        {},
+        {"dvl": {"rotation": [1, 2, 3], "covariance": False}, "depth": {"use": False}},
+        {"truth": {"topic": "/odom"}, "imu": {"frame_id": 'a "frame"', "stamp_offset_s": -0.04}},
     ]
-    for path in logs:
-        for config in said:
-            text = inspect_log(path, config).toml
-            again = LogConfig.parse(tomllib.loads(text), "again")
-            first, second = choices(path, config), choices(path, again)
-            for role in ROLES:
-                assert first[role].topic == second[role].topic
-                assert first[role].candidates == second[role].candidates
-                assert plain(first[role]) == plain(second[role])
-
-
-def plain(choice: Choice) -> object:
-    """The adapter but for its topic, which the text names and a search by type does not."""
-    return choice.adapter and choice.adapter.model_copy(update={"topic": None})
+    for path, tables in product(logs, said):
+        config = LogConfig.parse(tables, "x")
+        again = LogConfig.parse(tomllib.loads(inspect_log(path, config).toml), "again")
+        assert choices(path, config) == choices(path, again)
 
 
 def test_what_is_changed_in_it_counts(bench: Any) -> None:
@@ -188,14 +174,6 @@ def test_what_is_changed_in_it_counts(bench: Any) -> None:
     turned = LogConfig.parse(tomllib.loads(text.replace('rotation = "flu"', 'rotation = "frd"')), "x")
     plain, frd = read_log(path), read_log(path, config=turned)
     assert (frd.imu.specific_force == plain.imu.specific_force * [1, -1, -1]).all()
-
-
-def test_several_topics_are_offered_and_those_whose_names_say_nothing(bench: Any) -> None:
-    imu, dvl = bench.basics()
-    poses = [bench.odometry(bench.t0_ns, 0.0)]
-    text = inspect_log(bench.write(imu, dvl, ("/second", "imu", imu[2]), ("/odom", "odometry", poses))).toml
-    assert '# [imu]  # one of\n# topic = "/imu"\n# topic = "/second"' in text
-    assert '# [truth]  # one of\n# topic = "/odom"' in text
 
 
 def test_an_unknown_type_is_proposed_with_its_fields(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,13 +193,11 @@ def test_an_unknown_type_is_proposed_with_its_fields(bench: Any, monkeypatch: py
 def test_the_command_prints_what_the_option_takes(
     bench: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = bench.write(*bench.basics())
-    with pytest.raises(SystemExit) as done:
-        main(["inspect", str(path), "--toml"])
-    assert done.value.code == 0
-    config = tmp_path / "log.toml"
-    config.write_text(capsys.readouterr().out)
-    with pytest.raises(SystemExit) as done:
-        main(["inspect", str(path), "--log-config", str(config)])
-    assert done.value.code == 0
-    assert f"chosen in {config}" in capsys.readouterr().out
+    path, config = bench.write(*bench.basics()), tmp_path / "log.toml"
+    for arguments in (["--toml"], ["--log-config", str(config)]):
+        with pytest.raises(SystemExit) as done:
+            main(["inspect", str(path), *arguments])
+        assert done.value.code == 0
+        printed = capsys.readouterr().out
+        config.write_text(printed)
+    assert f"chosen in {config}" in printed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -74,16 +75,25 @@ def test_a_frame_that_does_not_hang_on_the_body_has_no_mounting() -> None:
     assert mounting_of("c", frames) is None, "a loop ends"
 
 
-def test_mountings_come_from_tf_static_through_frames_in_between(bench: Any) -> None:
+def test_mountings_come_from_tf_static_through_frames_in_between_and_after_a_file(bench: Any) -> None:
     first = bench.transform("base_link", "frame", (1, 0, 0), np.pi / 2)
     second = bench.transform("frame", "imu_link", (0.5, 0, 0), np.pi / 2)
-    tree = ("/tf_static", "tf", [{"transforms": [second]}, {"transforms": [first]}])
-    sequence = read_log(bench.write(*bench.basics(), tree))
+    log = bench.write(*bench.basics(), ("/tf_static", "tf", [{"transforms": [second]}, {"transforms": [first]}]))
+    sequence = read_log(log)
     # half a metre along the frame's x, which points along the body's y
     np.testing.assert_allclose(sequence.calibration.imu.mounting.translation_m, [1, 0.5, 0], atol=1e-12)
     np.testing.assert_allclose(np.abs(sequence.calibration.imu.mounting.rpy_rad), [0, 0, np.pi], atol=1e-12)
     assert sequence.calibration.dvl == Calibration().dvl
     assert "mountings from /tf_static: imu; not in the tree" in sequence.notes["log.calibration"]
+    tree = [bench.transform("base_link", "imu_link", (1, 0, 0)), bench.transform("base_link", "dvl_link", (0, 2, 0), 1)]
+    log = bench.write(*bench.basics(), ("/tf_static", "tf", [{"transforms": tree}]))
+    found = read_log(log, calibration=said(dvl={"mounting": {"translation_m": [0, 3, 0]}}))
+    assert found.calibration.imu.mounting.translation_m == (1, 0, 0)
+    assert found.calibration.dvl.mounting.translation_m == (0, 3, 0)
+    np.testing.assert_allclose(found.calibration.dvl.mounting.rpy_rad, (0, 0, 1), atol=1e-12)
+    assert found.notes["log.calibration"] == (
+        "from vehicle.toml: dvl.mounting.translation_m; else defaults; mountings from /tf_static: imu, dvl"
+    )
 
 
 # --- precedence -----------------------------------------------------------------------------------------------------
@@ -113,10 +123,7 @@ def nested(flat: dict[str, Any]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for path, value in flat.items():
         *sections, name = path.split(".")
-        at = tree
-        for section in sections:
-            at = at.setdefault(section, {})
-        at[name] = value
+        reduce(lambda at, section: at.setdefault(section, {}), sections, tree)[name] = value
     return tree
 
 
@@ -144,24 +151,11 @@ def test_a_file_goes_before_the_record_and_a_whole_calibration_before_everything
     imu = sequence.calibration.imu.model_copy(update={"gyro_noise_density": 0.5})
     assert imu.mounting != Mounting()
     assert found.calibration == sequence.calibration.model_copy(update={"imu": imu, "gravity_m_s2": 9.7})
-    assert found.notes["log.calibration"] == (
-        "from vehicle.toml: imu.gyro_noise_density, gravity_m_s2; else from the log"
-    )
+    expected = "from vehicle.toml: imu.gyro_noise_density, gravity_m_s2; else from the log"
+    assert found.notes["log.calibration"] == expected
     given = read_log(tmp_path / "a.mcap", calibration=Calibration(), name="mine")
     assert (given.calibration, given.name) == (Calibration(), "mine")
     assert given.notes["log.calibration"] == "given by the caller"
-
-
-def test_a_file_goes_before_tf_static(bench: Any) -> None:
-    tree = [bench.transform("base_link", "imu_link", (1, 0, 0)), bench.transform("base_link", "dvl_link", (0, 2, 0), 1)]
-    log = bench.write(*bench.basics(), ("/tf_static", "tf", [{"transforms": tree}]))
-    found = read_log(log, calibration=said(dvl={"mounting": {"translation_m": [0, 3, 0]}}))
-    assert found.calibration.imu.mounting.translation_m == (1, 0, 0)
-    assert found.calibration.dvl.mounting.translation_m == (0, 3, 0)
-    np.testing.assert_allclose(found.calibration.dvl.mounting.rpy_rad, (0, 0, 1), atol=1e-12)
-    assert found.notes["log.calibration"] == (
-        "from vehicle.toml: dvl.mounting.translation_m; else defaults; mountings from /tf_static: imu, dvl"
-    )
 
 
 def test_a_record_that_says_little_leaves_the_rest_to_tf_static(make_sequence: Any, tmp_path: Path) -> None:
@@ -192,31 +186,25 @@ def test_a_section_is_completed_by_the_log_or_taken_away_by_false() -> None:
         gathered(said(floor={"z_m": -2}), None, {})
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"imu": {"gyro_sigma": 1}}, r"^vehicle\.toml: imu\.gyro_sigma: there is no such field"),
-        ({"floor": {"z": 1}}, r"^vehicle\.toml: .*floor\.z: there is no such field"),
-        ({"start": {"position_m": [1, 2]}}, r"start\.position_m: expected 3 values, not \[1, 2\]"),
-        ({"depth": {"sigma_m": -1}}, r"depth\.sigma_m: .* greater than 0"),
-        ({"imu": False}, "imu: "),
-    ],
-)
-def test_mistakes_are_found_before_a_log_is_read(values: dict[str, Any], message: str) -> None:
-    with pytest.raises(CalibrationError, match=message):
-        said(**values)
+MISTAKES: list[tuple[dict[str, Any], str]] = [
+    ({"imu": {"gyro_sigma": 1}}, r"^vehicle\.toml: imu\.gyro_sigma: there is no such field"),
+    ({"floor": {"z": 1}}, r"^vehicle\.toml: .*floor\.z: there is no such field"),
+    ({"start": {"position_m": [1, 2]}}, r"start\.position_m: expected 3 values, not \[1, 2\]"),
+    ({"depth": {"sigma_m": -1}}, r"depth\.sigma_m: .* greater than 0"),
+    ({"imu": False}, "imu: "),
+]
+BROKEN_RECORDS: list[tuple[dict[str, str], type[Exception], str]] = [
+    ({"calibration": "{"}, LogError, "calibration is not JSON"),
+    ({"calibration": '{"imu": {"nonsense": 1}}'}, CalibrationError, "imu.nonsense"),
+    ({"notes": "[]"}, LogError, "notes must be a JSON object"),
+]
 
 
-@pytest.mark.parametrize(
-    ("record", "error", "message"),
-    [
-        ({"calibration": "{"}, LogError, "calibration is not JSON"),
-        ({"calibration": '{"imu": {"nonsense": 1}}'}, CalibrationError, "imu.nonsense"),
-        ({"notes": "[]"}, LogError, "notes must be a JSON object"),
-    ],
-)
-def test_a_broken_metadata_record_is_named(
-    make_sequence: Any, tmp_path: Path, record: dict[str, str], error: type[Exception], message: str
-) -> None:
-    with pytest.raises(error, match=message):
-        read_log(written(tmp_path / "a.mcap", make_sequence(), None, record))
+def test_mistakes_are_found_before_a_log_is_read_and_broken_records_named(make_sequence: Any, tmp_path: Path) -> None:
+    for values, message in MISTAKES:
+        with pytest.raises(CalibrationError, match=message):
+            said(**values)
+    for record, error, message in BROKEN_RECORDS:
+        path = written(tmp_path / "a.mcap", make_sequence(), None, record)
+        with pytest.raises(error, match=message):
+            read_log(path)

@@ -28,19 +28,17 @@ from .containers import chunk_indexes, flip, scan_all
 T0_NS = 1_700_000_000_000_000_000
 
 
-def poses(n: int = 20_000) -> Outgoing:
-    stamps_ns = T0_NS + np.arange(n) * 10**7
-    positions = np.random.default_rng(0).normal(size=(n, 3))
-    return pose_messages("/pose", Trajectory.without_covariances(stamps_ns, positions, np.tile([0, 0, 0, 1.0], (n, 1))))
-
-
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """20,000 poses and a latched one, with metadata and an attached file."""
     path = tmp_path_factory.mktemp("recorder") / "a.mcap"
-    still = poses(1)
-    messages = [static_message("/start", still.type_name, T0_NS, still.payloads), poses()]
+    positions = np.random.default_rng(0).normal(size=(20_000, 3))
+    stamps_ns = T0_NS + np.arange(20_000) * 10**7
+    truth = Trajectory.without_covariances(stamps_ns, positions, np.tile([0, 0, 0, 1.0], (20_000, 1)))
+    poses = pose_messages("/pose", truth)
+    still = static_message("/start", poses.type_name, T0_NS, poses.payloads[:1])
     file = Attachment("notes/a.json", "application/json", b'{"a": 1}')
-    write_recording(path, messages, {"about": {"key": "value ψ"}}, [file])
+    write_recording(path, [still, poses], {"about": {"key": "value ψ"}}, [file])
     return path
 
 
@@ -99,13 +97,12 @@ def test_latched_topics_offer_transient_local_in_numbers_that_all_rosbag2_read(r
         assert {m.name: m.metadata for m in reader.iter_metadata()}["rosbag2"] == {"serialized_metadata": ""}
 
 
-def break_off(path: Path) -> None:
-    with written_whole(path) as stream:
-        stream.write(b"half")
-        raise ZeroDivisionError
-
-
 def test_a_file_has_its_name_only_when_it_is_whole(tmp_path: Path) -> None:
+    def break_off(path: Path) -> None:
+        with written_whole(path) as stream:
+            stream.write(b"half")
+            raise ZeroDivisionError
+
     path = tmp_path / "new folder" / "log.mcap"
     with written_whole(path) as stream:
         stream.write(b"all of it")

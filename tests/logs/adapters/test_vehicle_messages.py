@@ -67,7 +67,8 @@ CASES: dict[str, Case] = {
         {"log.warnings": "imu: 1 angular rate stands out from both neighbours, by 30 rad/s"}),
     # depth
     **{f"pressure, {settings or 'as it is'}": (
-        [pressures(*values)], SEA + settings, {"depth.z_m": [0, -10]}, {"log.depth": "/ (1025 kg/m3 x 9.80665 m/s2)"})
+        [pressures(*values)], SEA + settings, {"depth.z_m": [0, -10], "depth.variance_m2": [NAN] * 2},
+        {"log.depth": "/ (1025 kg/m3 x 9.80665 m/s2)"})
        for settings, values in {
            "": (ONE_ATMOSPHERE, ONE_ATMOSPHERE + TEN_METRES_OF_SEA),
            "atmosphere_pa = 0": (0.0, TEN_METRES_OF_SEA),
