@@ -21,6 +21,10 @@ def stamps(rate_hz: float, seconds: float, offset_s: float = 0.0) -> Ints:
     return T0_NS + np.round((np.arange(n) / rate_hz + offset_s) * NS).astype(np.int64)
 
 
+def at(seconds: float) -> int:
+    return T0_NS + round(seconds * NS)
+
+
 def imu(stamps_ns: Ints, rate: ArrayLike, force: ArrayLike = (0.0, 0.0, 9.80665)) -> Imu:
     shape = (len(stamps_ns), 3)
     return Imu(stamps_ns, np.broadcast_to(rate, shape), np.broadcast_to(force, shape))
@@ -71,6 +75,11 @@ def derivative(function: Callable[[Floats], ArrayLike], size: int, step: float =
         (np.asarray(function(step * axis)) - np.asarray(function(-step * axis))) / (2 * step) for axis in np.eye(size)
     ]
     return np.column_stack(columns)
+
+
+def nees(errors: ArrayLike, covariance: Floats) -> Floats:
+    """``e^T P^-1 e`` of errors (n, d) of one covariance."""
+    return np.einsum("ni,ij,nj->n", errors, np.linalg.inv(covariance), errors)
 
 
 def dense_covariance(steps: Steps, bias: Floats, lever: Floats, gyro_density: float) -> tuple[Floats, Floats]:

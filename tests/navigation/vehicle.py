@@ -3,12 +3,12 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.calibration import DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
 from sonar_graph.navigation.odometry import Odometry, motion_between_nodes, motion_since_node
 from sonar_graph.navigation.preintegration.motion import Preintegrator
 
-from .rows import NS, T0_NS, stamps
+from .rows import T0_NS, at, stamps
 
 IMU_HZ, DVL_HZ, GRAVITY = 50.0, 5.0, np.array([0.0, 0.0, -9.8])
 LOST_S, FOUND_S = 6.0, 16.0
@@ -58,23 +58,16 @@ class Vehicle:
         return self.attitude(np.array([start_s])).inv().apply(np.diff(self.position(ends), axis=0))[0]
 
 
-def rows(seconds=20.0):
-    """Of the whole run but the Doppler log's gap; a row before its end, to confirm that."""
-    vehicle, dvl_ns = Vehicle(), stamps(DVL_HZ, seconds)
+def rows():
+    """Of 20 s but the Doppler log's gap; a row before its end, to confirm that."""
+    vehicle, dvl_ns = Vehicle(), stamps(DVL_HZ, 20.0)
     t = (dvl_ns - T0_NS) * 1e-9
-    return vehicle.imu(stamps(IMU_HZ, seconds + 0.1)), vehicle.dvl(dvl_ns[(t <= LOST_S) | (t > FOUND_S - 0.3)])
+    return vehicle.imu(stamps(IMU_HZ, 20.1)), vehicle.dvl(dvl_ns[(t <= LOST_S) | (t > FOUND_S - 0.3)])
 
 
-def at(seconds):
-    return T0_NS + round(seconds * NS)
-
-
-def motion(imu_rows, dvl_rows, imu=QUIET, until_s=FOUND_S, dvl=DVL):
-    calibration = Calibration(imu=imu, dvl=dvl)
-    odometry, preintegrator = Odometry(calibration), Preintegrator.from_calibration(calibration)
-    confirmed_ns = at(until_s) + (NS // 4 if until_s >= FOUND_S else 0)
-    odometry.add(imu_rows.between(0, at(until_s) + NS), dvl_rows.between(0, confirmed_ns))
-    ends = at(LOST_S), at(until_s)
-    if until_s >= FOUND_S:
-        return motion_between_nodes(odometry, preintegrator, *ends, np.zeros(3), None)
-    return motion_since_node(odometry, preintegrator, *ends, np.zeros(3), None)
+def motion(imu, dvl, known, start_s, until_s, bias=(0.0, 0.0, 0.0), earth=None):
+    """From a node; to a node by the final motion, to anywhere else by the provisional one, which sees no later row."""
+    odometry, preintegrator = Odometry(known), Preintegrator.from_calibration(known)
+    odometry.add(imu, dvl)
+    function = motion_between_nodes if at(until_s) in dvl.stamps_ns else motion_since_node
+    return function(odometry, preintegrator, at(start_s), at(until_s), np.array(bias), earth)
