@@ -229,10 +229,10 @@ def test_samples_out_of_order_give_the_same_estimate_as_in_order(name):
     assert found[1].covariance == pytest.approx(found[0].covariance, rel=1e-6, abs=1e-12)
 
 
-ZERO, NODE_S, RATE_HZ = (0.0, 0.0, 0.0), 10.0, 20.0
+ZERO, NODE_S, RATE_HZ, EVEN = (0.0, 0.0, 0.0), 10.0, 20.0, 1e-4 * np.eye(3)
 
 
-def fitted(dvl_hz, velocity=0.0, count=0, imu_rows=None, cov=1e-4 * np.eye(3)):
+def fitted(dvl_hz, velocity=0.0, count=0, imu_rows=None, cov=EVEN):
     """Line at the last sample of a vehicle at rest."""
     imu_rows = imu_rows or imu(stamps(RATE_HZ, NODE_S + 1.0), ZERO)
     samples = dvl(stamps(dvl_hz, NODE_S)[-count:], velocity, cov)
