@@ -18,23 +18,14 @@ from sonar_graph.navigation.dvl_screening.partial_beams import (
     PartialVelocities,
     carry,
 )
-from sonar_graph.navigation.odometry import Odometry, motion_between_nodes
-from sonar_graph.navigation.preintegration.motion import Preintegrator
 from sonar_graph.navigation.samples import is_partial
+from sonar_graph.testing import check_consistent
+from tests.devices.test_dvl_beams import JANUS, TILT
 
-from .test_motion_laws import at
+from .rows import NS, T0_NS, at, nees
+from .vehicle import DVL, QUIET, motion
 
-STEP_NS = 200_000_000
-STEP_S = 0.2
-WALK = 0.1
-SIGMA = 0.01
-TILT = np.radians(30.0)
-JANUS = np.array(
-    [
-        [np.sin(TILT) * np.cos(azimuth), np.sin(TILT) * np.sin(azimuth), np.cos(TILT)]
-        for azimuth in np.radians([45.0, -45.0, -135.0, 135.0])
-    ]
-)
+STEP_NS, STEP_S, WALK, SIGMA = 200_000_000, 0.2, 0.1, 0.01
 CALIBRATION = Calibration(dvl=DvlCalibration(velocity_walk_density=WALK))
 NO_FORCE = InertialRows(np.array([0, 10**12]), np.zeros((2, 3)), np.full((2, 3), np.nan))
 
@@ -67,12 +58,10 @@ def stamps(n):
 def test_rows_with_three_beams_or_more_stay_as_they_are_to_the_bit():
     rng = np.random.default_rng(0)
     velocity, cov = pings(valid_beams(4, 3, 2, 4, 1, 3), rng, walk(6, rng))
-    kept, velocities, covs = completed(stamps(6), velocity, cov)
-    whole = [0, 1, 3, 5]
-    np.testing.assert_array_equal(kept, stamps(6))
-    np.testing.assert_array_equal(velocities[whole], velocity[whole])
-    np.testing.assert_array_equal(covs[whole], cov[whole])
-    assert np.trace(covs, axis1=1, axis2=2).max() < 1.0
+    found = completed(stamps(6), velocity, cov)
+    for column, before in zip(found, (stamps(6), velocity, cov), strict=True):
+        np.testing.assert_array_equal(column[[0, 1, 3, 5]], before[[0, 1, 3, 5]])
+    assert np.trace(found[2], axis1=1, axis2=2).max() < 1.0
 
 
 def test_results_do_not_depend_on_how_rows_are_cut_into_blocks():
@@ -103,18 +92,12 @@ def test_what_no_beam_measured_is_half_way_between_the_whole_rows_and_shares_the
 @pytest.mark.parametrize("counts", [[2] * 12, [1] * 12, [2, 2, 1, 1, 2, 0, 1, 1, 2, 2, 1, 2]])
 def test_the_variance_of_a_displacement_is_what_the_rows_say_together(counts):
     """Monte Carlo over 600 runs, two-sided."""
-    counts = np.array([4, 4, *counts, 4])
-    runs, n = 600, len(counts)
-    rng = np.random.default_rng(2)
-    truth = walk(n, rng, runs)
-    errors, variance = [], np.zeros((3, 3))
-    for k in range(runs):
-        velocity, cov = pings(valid_beams(*counts), rng, truth[k])
+    rng, n, errors = np.random.default_rng(2), len(counts) + 3, []
+    for truth in walk(n, rng, 600):
+        velocity, cov = pings(valid_beams(4, 4, *counts, 4), rng, truth)
         _, velocities, covs = completed(stamps(n), velocity, cov)
-        errors.append(STEP_S * (velocities - truth[k]).sum(axis=0))
-        variance = STEP_S**2 * covs.sum(axis=0)
-    anees = np.mean(np.einsum("ki,ij,kj->k", errors, np.linalg.inv(variance), errors)) / 3
-    assert 0.9 < anees < 1.1
+        errors.append(STEP_S * (velocities - truth).sum(axis=0))
+    check_consistent(nees(errors, STEP_S**2 * covs.sum(axis=0)), 3, confidence=0.999)
 
 
 FLICKERING = [
@@ -200,15 +183,12 @@ def ats(*seconds: float) -> np.ndarray:
 
 
 RATE, FORCE = np.array([0.1, -0.2, 0.4]), np.array([0.3, -0.5, 9.7])
-QUIET = ImuCalibration(gyro_noise_density=0.0, gyro_bias_sigma=0.0, accel_noise_density=0.0, accel_bias_sigma=0.0)
-MOUNTED = Calibration(
-    imu=QUIET.model_copy(update={"mounting": Mounting(translation_m=(0.3, 0.1, -0.2))}),
-    dvl=DvlCalibration(mounting=Mounting(translation_m=(-0.1, 0.4, 0.2)), velocity_walk_density=0.123),
-)
+MOUNTED = Calibration(imu=QUIET, dvl=DVL.model_copy(update={"velocity_walk_density": 0.123}))
 
 
-def steady(seconds: float = 10.0, hz: int = 50) -> InertialRows:
-    stamps_ns = ats(*np.arange(round(seconds * hz) + 1) / hz)
+def steady(seconds: float = 10.0) -> InertialRows:
+    """Fifty rows a second."""
+    stamps_ns = ats(*np.arange(round(seconds * 50) + 1) / 50)
     return InertialRows(stamps_ns, np.tile(RATE, (len(stamps_ns), 1)), np.tile(FORCE, (len(stamps_ns), 1)))
 
 
@@ -218,8 +198,9 @@ def gained(seconds: float) -> np.ndarray:
     return Rotation.from_rotvec(np.outer(middle, RATE)).apply(FORCE).mean(axis=0) * seconds
 
 
-def density(imu: ImuCalibration, stamps_ns: np.ndarray, rows: InertialRows | None = None) -> float:
-    return carry(rows or steady(), stamps_ns, Calibration(imu=imu)).walk_density
+def density(seconds: float, **imu: float) -> float:
+    sensors = QUIET.model_copy(update=imu)
+    return carry(steady(), ats(1.0, 1.0 + seconds), Calibration(imu=sensors)).walk_density
 
 
 def test_rotation_and_velocity_since_the_first_row_are_those_of_the_integrals():
@@ -253,35 +234,36 @@ def test_inertial_rows_after_the_last_are_not_used_and_the_newest_holds():
     assert beyond.rotation[1] == pytest.approx(Rotation.from_rotvec(3.0 * RATE).as_matrix(), abs=1e-9)
 
 
-@pytest.mark.parametrize("missing", ["row", "before", "all"])
-def test_without_a_force_nothing_is_carried(missing):
-    rows, stamps_ns = steady(), ats(1.0, 2.0, 3.0)
-    if missing == "all":
-        rows, stamps_ns = InertialRows(*(column[:0] for column in rows)), stamps_ns
-    else:
-        force = rows.specific_force.copy()
-        force[75 if missing == "row" else 50] = np.nan
-        rows = InertialRows(*rows[:2], force)
-    found = carry(rows, stamps_ns, MOUNTED)
-    assert (found.is_inertial, found.walk_density) == (False, 0.123)
-    np.testing.assert_array_equal(found.rotation, np.tile(np.eye(3), (3, 1, 1)))
-    np.testing.assert_array_equal(found.velocity, np.zeros((3, 3)))
-    np.testing.assert_array_equal(found.from_lever, np.zeros((3, 3)))
+def unfelt(row: int) -> InertialRows:
+    rows = steady()
+    rows.specific_force[row] = np.nan
+    return rows
 
 
-def without_rows(begin_s: float, end_s: float) -> InertialRows:
+def holed(begin_s: float, end_s: float) -> InertialRows:
     rows = steady()
     kept = (rows.stamps_ns <= ats(begin_s)) | (rows.stamps_ns >= ats(end_s))
     return InertialRows(*(column[kept] for column in rows))
 
 
-@pytest.mark.parametrize("begin_s", [1.0, 2.0])
-def test_over_a_hole_nothing_is_carried_wherever_it_begins(begin_s):
-    """Right after the first row too, which alone tells no typical interval; one of five intervals is no hole."""
-    stamps_ns = ats(1.0, 2.5, 4.0)
-    assert not carry(without_rows(begin_s, begin_s + 0.9), stamps_ns, MOUNTED).is_inertial
-    assert carry(without_rows(begin_s, begin_s + 0.1), stamps_ns, MOUNTED).is_inertial
-    assert carry(without_rows(5.0, 5.9), stamps_ns, MOUNTED).is_inertial
+@pytest.mark.parametrize(
+    ("rows", "is_carried"),
+    [
+        *((unfelt(row), False) for row in (50, 75)),
+        (InertialRows(*(column[:0] for column in steady())), False),
+        # right after the first row too, which alone tells no typical interval; one of five intervals is no hole
+        *((holed(begin_s, begin_s + 0.9), begin_s > 4.0) for begin_s in (1.0, 2.0, 5.0)),
+        *((holed(begin_s, begin_s + 0.1), True) for begin_s in (1.0, 2.0)),
+    ],
+)
+def test_without_a_force_or_over_a_hole_nothing_is_carried(rows, is_carried):
+    found = carry(rows, ats(1.0, 2.5, 4.0), MOUNTED)
+    assert found.is_inertial == is_carried
+    if not is_carried:
+        assert found.walk_density == 0.123
+        np.testing.assert_array_equal(found.rotation, np.tile(np.eye(3), (3, 1, 1)))
+        assert not found.velocity.any()
+        assert not found.from_lever.any()
 
 
 G = Calibration().gravity_m_s2
@@ -297,7 +279,7 @@ G = Calibration().gravity_m_s2
 )
 def test_the_walk_over_six_seconds_is_of_each_noise_beside_the_earth(sensor, value, walk):
     earth = (G * EARTH_RATE_RAD_S) ** 2 * 6**3 / 16.0
-    assert density(QUIET.model_copy(update={sensor: value}), ats(1.0, 7.0)) ** 2 == pytest.approx(walk + earth)
+    assert density(6.0, **{sensor: value}) ** 2 == pytest.approx(walk + earth)
 
 
 def test_the_walk_of_gyro_noise_is_the_variance_in_mid_stretch_over_a_quarter_of_its_length():
@@ -308,13 +290,13 @@ def test_the_walk_of_gyro_noise_is_the_variance_in_mid_stretch_over_a_quarter_of
     velocity = np.cumsum(G * tilt * dt, axis=1)
     t = dt * np.arange(1, steps + 1)
     off_line = velocity[:, steps // 2] - velocity[:, -1] * t[steps // 2] / T
-    found = density(QUIET.model_copy(update={"gyro_noise_density": n}), ats(1.0, 1.0 + T))
+    found = density(T, gyro_noise_density=n)
     earth = (G * EARTH_RATE_RAD_S) ** 2 * T**3 / 16.0
     assert found**2 == pytest.approx((G * n * T) ** 2 / 12.0 + earth)
     assert found**2 * T / 4.0 == pytest.approx(off_line.var(), rel=0.1)
 
 
-IMU_HZ, SECONDS, LOST_S = 100, 40.0, (10.0, 30.0)
+IMU_HZ, SECONDS = 100, 40.0
 VEHICLE = Calibration(
     imu=ImuCalibration(mounting=Mounting(translation_m=(0.1, 0.0, 0.05))),
     dvl=DvlCalibration(mounting=Mounting(translation_m=(-0.4, 0.1, -0.1)), velocity_walk_density=0.1),
@@ -326,65 +308,48 @@ def drive(rng, with_force):
     fine = np.arange(0.0, SECONDS + 1e-9, 1.0 / (10 * IMU_HZ))
     yaw = 0.5 * np.sin(0.15 * fine)
     surge, sway = 0.8 + 0.4 * np.sin(0.4 * fine), 0.1 * np.sin(0.23 * fine)
-    rate = np.zeros((len(fine), 3))
-    rate[:, 2] = np.gradient(yaw, fine)
+    rate = np.outer(np.gradient(yaw, fine), [0.0, 0.0, 1.0])
     velocity = np.column_stack([surge, sway, 0.05 * np.sin(0.3 * fine)])
     R = Rotation.from_rotvec(yaw[:, None] * [0.0, 0.0, 1.0])
-    arm = np.array(VEHICLE.imu.mounting.translation_m)
-    at_imu = R.apply(velocity + np.cross(rate, arm))
+    at_imu = R.apply(velocity + np.cross(rate, VEHICLE.imu.mounting.translation_m))
     force = R.inv().apply(np.gradient(at_imu, fine, axis=0) + np.array([0.0, 0.0, VEHICLE.gravity_m_s2]))
-    every = slice(None, None, 10)
-    noise = VEHICLE.imu
+    every, noise = slice(None, None, 10), VEHICLE.imu
     white = np.sqrt(IMU_HZ) * rng.standard_normal((2, len(fine[every]), 3))
     force = force[every] + noise.accel_noise_density * white[1] + noise.accel_bias_sigma * rng.standard_normal(3)
-    stamps_ns = np.rint(fine[every] * 1e9).astype(np.int64)
+    stamps_ns = ats(*fine[every])
     imu = Imu(stamps_ns, rate[every] + noise.gyro_noise_density * white[0], force if with_force else force * np.nan)
     at_dvl = velocity + np.cross(rate, VEHICLE.dvl.mounting.translation_m)
-    path = np.trapezoid(R.apply(velocity), fine, axis=0)
-    return imu, np.rint(fine[::200] * 1e9).astype(np.int64), at_dvl[::200], R[0].inv().apply(path)
+    return imu, stamps_ns[::20], at_dvl[::200], R[0].inv().apply(np.trapezoid(R.apply(velocity), fine, axis=0))
 
 
 def displacement(imu, dvl):
     """Of the whole drive, by the odometry of all estimators."""
-    odometry = Odometry(VEHICLE)
-    odometry.add(imu, dvl)
-    total = None
-    nodes = odometry.nodes(0, int(imu.stamps_ns[-1]))
-    preintegrator = Preintegrator.from_calibration(VEHICLE)
-    total = motion_between_nodes(odometry, preintegrator, 0, int(nodes[-1]), np.zeros(3), None)
+    total = motion(imu, dvl, VEHICLE, 0.0, SECONDS)
     R = total.i_T_j.rotation().matrix()
     return total.i_T_j.translation(), R @ total.covariance[3:, 3:] @ R.T
 
 
-def lose_beams(stamps_ns, rng, count):
-    """All four, but for 20 s only some, which ones changes every second."""
-    valid = np.ones((len(stamps_ns), 4), dtype=bool)
-    for k in np.flatnonzero((stamps_ns > LOST_S[0] * 1e9) & (stamps_ns < LOST_S[1] * 1e9)):
-        valid[k] = np.isin(np.arange(4), np.random.default_rng(stamps_ns[k] // 10**9).permutation(4)[:count])
-    return valid
-
-
 @pytest.mark.parametrize("with_force", [False, True])
 def test_one_beam_is_better_than_a_gap_and_two_than_one(with_force):
-    """Against a plain gap, which the odometry bridges without any beam."""
-    runs = 20
-    rms = {}
-    for count in (0, 1, 2, 4):
-        squares, normalised = [], []
-        for seed in range(runs):
-            rng = np.random.default_rng(seed)
-            imu, stamps_ns, truth, path = drive(rng, with_force)
-            along = truth @ JANUS.T + SIGMA * rng.standard_normal((len(truth), 4))
-            valid = lose_beams(stamps_ns, rng, count)
+    """All four, but for 20 s only some, which ones changes every second; or none, which the odometry bridges."""
+    squares, nees_of_3, (none, one, two, four) = np.zeros((20, 4)), np.zeros((20, 4)), range(4)
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        imu, stamps_ns, truth, path = drive(rng, with_force)
+        along = truth @ JANUS.T + SIGMA * rng.standard_normal((len(truth), 4))
+        for column, count in enumerate((0, 1, 2, 4)):
+            valid = np.ones((len(stamps_ns), 4), dtype=bool)
+            for k in np.flatnonzero((stamps_ns > at(10.0)) & (stamps_ns < at(30.0))):
+                second = (stamps_ns[k] - T0_NS) // NS
+                valid[k] = np.isin(np.arange(4), np.random.default_rng(second).permutation(4)[:count])
             velocity, cov = velocity_of_beams(JANUS, along, valid, SIGMA)
             some = valid.any(axis=1)
             found, P = displacement(imu, Dvl(stamps_ns[some], velocity[some], cov[some]))
-            squares.append(np.sum((found - path) ** 2))
-            normalised.append((found - path) @ np.linalg.solve(P, found - path) / 3)
-        rms[count] = np.sqrt(np.mean(squares))
-        print(f"{count} beams: rms {rms[count]:.3f} m, NEES over 3 {np.mean(normalised):.2f}")
-        assert 0.2 < np.mean(normalised) < 1.6
-    assert rms[4] < rms[2] < rms[1] < 0.5 * rms[0]
+            squares[seed, column] = np.sum((found - path) ** 2)
+            nees_of_3[seed, column] = (found - path) @ np.linalg.solve(P, found - path)
+    rms = np.sqrt(squares.mean(axis=0))
+    assert rms[four] < rms[two] < rms[one] < 0.5 * rms[none]
+    assert np.all((nees_of_3.mean(axis=0) > 0.6) & (nees_of_3.mean(axis=0) < 4.8))
 
 
 def test_four_beams_of_equal_noise_are_the_velocity_that_a_driver_makes_of_them():
