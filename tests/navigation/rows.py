@@ -9,7 +9,9 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sonar_graph.calibration import Calibration
 from sonar_graph.measurements import Dvl, Floats, Imu, Ints
+from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.navigation.preintegration.recursion import Steps
 
 NS = 1_000_000_000
@@ -33,6 +35,15 @@ def imu(stamps_ns: Ints, rate: ArrayLike, force: ArrayLike = (0.0, 0.0, 9.80665)
 def dvl(stamps_ns: Ints, velocity: ArrayLike, cov: ArrayLike = np.nan) -> Dvl:
     n = len(stamps_ns)
     return Dvl(stamps_ns, np.broadcast_to(velocity, (n, 3)), np.broadcast_to(cov, (n, 3, 3)))
+
+
+def odometry_at_rest(*blocks: Dvl, calibration: Calibration | None = None) -> Odometry:
+    """Told inertial rows of 90 s at rest, then blocks of the Doppler log."""
+    odometry = Odometry(calibration or Calibration())
+    odometry.add(imu(stamps(50, 90.0), 0.0), None)
+    for block in blocks:
+        odometry.add(None, block)
+    return odometry
 
 
 def waves(stamps_ns: Ints, seed: int, amplitude: float) -> Floats:

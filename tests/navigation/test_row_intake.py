@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -18,20 +19,18 @@ from sonar_graph.navigation.odometry import Odometry
 from sonar_graph.navigation.samples import in_numbers, is_partial
 from sonar_graph.states import Refusal
 
-from .rows import NS, T0_NS, dvl, imu, stamps
+from .rows import NS, T0_NS, dvl, imu, odometry_at_rest, stamps
 
-DVL_HZ, SECONDS = 5, 6.0
-SIGMA = 0.01
-BLIND = np.diag([SIGMA**2, 100.0**2, 100.0**2])
-WHOLE = np.eye(3) * SIGMA**2
+DVL_HZ, SECONDS, SIGMA = 5, 6.0, 0.01
+BLIND, WHOLE = np.diag([SIGMA**2, 100.0**2, 100.0**2]), np.eye(3) * SIGMA**2
 
 
-def driven(partial: list[int], outliers: list[int]) -> Dvl:
+def driven(partial: tuple[int, ...] = (), outliers: tuple[int, ...] = (), blind: np.ndarray = BLIND) -> Dvl:
     """Straight ahead at 0.8 m/s; some rows measure the surge alone, some are wrong by 3 m/s."""
     at = stamps(DVL_HZ, SECONDS)
     velocity, cov = np.tile([0.8, 0.0, 0.0], (len(at), 1)), np.tile(WHOLE, (len(at), 1, 1))
-    cov[partial] = BLIND
-    velocity[outliers, 0] += 3.0
+    cov[list(partial)] = blind
+    velocity[list(outliers), 0] += 3.0
     return dvl(at, velocity, cov)
 
 
@@ -43,12 +42,9 @@ def told(odometry: Odometry) -> list[tuple[int, Refusal]]:
 @settings(max_examples=20, deadline=None)
 def test_what_is_refused_does_not_depend_on_how_rows_are_cut(cuts):
     """A row after rows with one beam is compared with the whole one before them, in whatever block that came."""
-    rows = driven(partial=[8, 9, 10, 11, 20], outliers=[5, 10, 12, 21])
-    whole, pieces = Odometry(Calibration()), Odometry(Calibration())
-    whole.add(imu(stamps(50, SECONDS), 0.0), rows)
-    pieces.add(imu(stamps(50, SECONDS), 0.0), None)
-    for after_ns, until_ns in pairwise([0, *(T0_NS + cut for cut in sorted(cuts)), T0_NS + 10 * NS]):
-        pieces.add(None, rows.between(after_ns, until_ns))
+    rows = driven(partial=(8, 9, 10, 11, 20), outliers=(5, 10, 12, 21))
+    edges = [0, *(T0_NS + cut for cut in sorted(cuts)), T0_NS + 10 * NS]
+    whole, pieces = odometry_at_rest(rows), odometry_at_rest(*(rows.between(*ends) for ends in pairwise(edges)))
     assert told(whole) == [(k, Refusal.OUTLIER) for k in (5, 10, 12, 21)]
     assert sorted(pieces.refused) == sorted(whole.refused)
     for one, other in zip(pieces.columns()[:6], whole.columns()[:6], strict=True):
@@ -57,19 +53,14 @@ def test_what_is_refused_does_not_depend_on_how_rows_are_cut(cuts):
 
 def test_what_a_row_with_one_beam_did_not_measure_hides_no_outlier():
     """Compared with a row that is blind to the side, any velocity to the side would pass."""
-    rows = driven(partial=[8], outliers=[])
-    velocity = rows.velocity.copy()
-    velocity[9, 1] = 3.0
-    odometry = Odometry(Calibration())
-    odometry.add(imu(stamps(50, SECONDS), 0.0), Dvl(rows.stamps_ns, velocity, rows.velocity_cov))
-    assert told(odometry) == [(9, Refusal.OUTLIER)]
+    rows = driven(partial=(8,))
+    velocity = rows.velocity + 3.0 * np.outer(np.arange(len(rows)) == 9, [0.0, 1.0, 0.0])
+    assert told(odometry_at_rest(replace(rows, velocity=velocity))) == [(9, Refusal.OUTLIER)]
 
 
 def test_rows_of_few_beams_are_named_until_they_are_completed():
-    odometry = Odometry(Calibration())
-    odometry.add(imu(stamps(50, SECONDS), 0.0), None)
-    rows = driven(partial=[0, 1, 8, 9, 28, 29, 30], outliers=[])
-    odometry.add(None, rows.rows(slice(0, 9)))
+    rows = driven(partial=(0, 1, 8, 9, 28, 29, 30))
+    odometry = odometry_at_rest(rows.rows(slice(0, 9)))
     assert told(odometry) == [(k, Refusal.INCOMPLETE) for k in (0, 1, 8)]
     odometry.add(None, rows.rows(slice(9, None)))
     assert told(odometry) == [(k, Refusal.INCOMPLETE) for k in (0, 1, 28, 29, 30)]
@@ -79,53 +70,46 @@ def test_rows_of_few_beams_are_named_until_they_are_completed():
 
 @pytest.mark.parametrize("more_ns", [0, 1])
 def test_rows_of_few_beams_over_too_long_a_stretch_are_named(more_ns):
-    beyond = T0_NS + LONGEST_STRETCH_NS + more_ns
+    ns = T0_NS + np.array([0, NS, LONGEST_STRETCH_NS + more_ns])
     odometry = Odometry(Calibration())
-    odometry.add(imu(np.array([T0_NS, beyond]), 0.0), None)
-    odometry.add(None, dvl(np.array([T0_NS, T0_NS + NS, beyond]), 0.8, np.array([WHOLE, BLIND, WHOLE])))
+    odometry.add(imu(ns[[0, 2]], 0.0), dvl(ns, 0.8, np.array([WHOLE, BLIND, WHOLE])))
     assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [(T0_NS + NS, Refusal.INCOMPLETE)] * more_ns
     assert len(odometry.columns()[3]) == 3 - more_ns
 
 
-def test_a_row_of_few_beams_that_is_overtaken_is_named():
-    odometry = Odometry(Calibration())
-    odometry.add(imu(stamps(50, SECONDS), 0.0), None)
-    rows = driven(partial=[3], outliers=[])
-    odometry.add(None, rows.rows(np.array([2, 4])))
-    odometry.add(None, rows.rows(np.array([3])))
-    odometry.add(None, rows.rows(np.array([5])))
-    assert told(odometry) == [(3, Refusal.INCOMPLETE)]
-    np.testing.assert_array_equal(odometry.columns()[3], rows.stamps_ns[[2, 4, 5]])
+@pytest.mark.parametrize(
+    ("partial", "blocks", "used"),
+    [(3, ([2, 4], [3], [5]), [2, 4, 5]), (25, ([0, 1, 25],), [0, 1])],
+    ids=["overtaken", "after a long gap"],
+)
+def test_a_row_of_few_beams_waits_to_be_completed_and_for_no_other(partial, blocks, used):
+    rows = driven(partial=(partial,))
+    odometry = odometry_at_rest(*(rows.rows(np.array(block)) for block in blocks))
+    assert told(odometry) == [(partial, Refusal.INCOMPLETE)]
+    np.testing.assert_array_equal(odometry.columns()[3], rows.stamps_ns[used])
 
 
-def test_a_row_of_few_beams_after_a_long_gap_waits_to_be_completed_and_for_no_other():
-    odometry = Odometry(Calibration())
-    odometry.add(imu(stamps(50, SECONDS), 0.0), None)
-    odometry.add(None, driven(partial=[25], outliers=[]).rows(np.array([0, 1, 25])))
-    assert told(odometry) == [(25, Refusal.INCOMPLETE)]
-
-
-def test_rows_are_late_from_the_settled_stamp_on_and_those_known_already_are_no_news():
-    odometry = Odometry(Calibration())
-    rows = driven([], [])
-    odometry.add(imu(stamps(50, SECONDS), 0.0), rows.rows(np.delete(np.arange(12), 4)))
+def test_rows_are_late_up_to_the_settled_stamp_and_those_known_already_are_no_news():
+    rows = driven()
+    odometry = odometry_at_rest(rows.rows(np.delete(np.arange(12), 4)))
     odometry.settle(int(rows.stamps_ns[5]))
     odometry.settle(int(rows.stamps_ns[2]))
     odometry.add(None, rows)
+    odometry.add(None, rows.rows(slice(5, 6)))
     assert told(odometry) == [(4, Refusal.LATE)]
     assert odometry.columns()[3][-1] == rows.stamps_ns[-1]
-    again = driven([], [])
-    odometry.add(None, dvl(again.stamps_ns[5:6], 0.8, WHOLE))
-    assert len(odometry.refused) == 1
+    odometry = Odometry(Calibration())
+    odometry.settle(T0_NS)
+    odometry.add(None, dvl(T0_NS + np.array([-1, 0, 1, 2]), [0.8, 0.0, 0.0]))
+    assert [row.stamp_ns - T0_NS for row in odometry.refused] == [-1, 0]
+    assert (odometry.columns()[3] - T0_NS).tolist() == [1, 2]
 
 
 def test_of_equal_stamps_the_first_counts():
     one, other = dvl(stamps(5, 1.0), [0.8, 0.0, 0.0]), dvl(stamps(5, 1.0), [0.81, 0.0, 0.0])
     within = dvl(np.repeat(stamps(5, 1.0), 2), np.tile([[0.8, 0, 0], [0.81, 0, 0]], (6, 1)))
-    across, inside = Odometry(Calibration()), Odometry(Calibration())
-    across.add(None, one)
+    across, inside = odometry_at_rest(one), odometry_at_rest(within)
     assert across.add(None, other)
-    inside.add(None, within)
     for odometry in (across, inside):
         np.testing.assert_array_equal(odometry.columns()[3], one.stamps_ns)
         np.testing.assert_array_equal(odometry.columns()[4], one.velocity)
@@ -141,62 +125,39 @@ def test_repeats_are_left_out_wherever_they_are_in_a_block(offsets, kept):
 
 
 def test_only_rows_before_others_ask_for_motion_anew():
-    rows = driven([], [])
-    odometry = Odometry(Calibration())
+    odometry, rows = Odometry(Calibration()), driven()
     assert not odometry.add(imu(stamps(50, SECONDS), 0.0), rows.rows(slice(0, 5)))
     assert not odometry.add(None, rows.rows(slice(6, 8)))
     assert odometry.add(None, rows.rows(slice(5, 6)))
     assert odometry.add(imu(stamps(50, SECONDS)[-1:] - 1, 0.0), None)
 
 
-def test_rows_are_turned_into_body_axes():
+def test_rows_are_turned_into_body_axes_with_the_calibrations_noise_where_the_log_says_none():
     """A sensor whose x axis points along the body's y, and whose y along the body's -x."""
     quarter = Mounting(rpy_rad=(0.0, 0.0, np.pi / 2))
-    calibration = Calibration(imu=ImuCalibration(mounting=quarter), dvl=DvlCalibration(mounting=quarter))
-    intake = RowIntake(calibration)
-    at = stamps(5, 0.2)
-    intake.add_imu(imu(at, [1.0, 2.0, 3.0], [4.0, 5.0, 6.0]))
-    intake.add_dvl(dvl(at, [0.1, 0.2, 0.3], np.diag([1e-4, 4e-4, 9e-4])))
-    assert intake.imu.values[0][1] == pytest.approx([-2.0, 1.0, 3.0])
-    assert intake.imu.values[1][1] == pytest.approx([-5.0, 4.0, 6.0])
-    assert intake.dvl.values[0][1] == pytest.approx([-0.2, 0.1, 0.3])
-    assert intake.dvl.values[1][1] == pytest.approx(np.diag([4e-4, 1e-4, 9e-4]))
-
-
-def test_noise_that_the_log_does_not_say_is_the_calibrations():
-    intake = RowIntake(Calibration(dvl=DvlCalibration(velocity_sigma_m_s=(0.01, 0.02, 0.03))))
-    intake.add_dvl(dvl(stamps(5, 0.2), 0.0))
-    assert intake.dvl.values[1][0] == pytest.approx(np.diag([1e-4, 4e-4, 9e-4]))
+    log = DvlCalibration(mounting=quarter, velocity_sigma_m_s=(0.01, 0.02, 0.03))
+    for cov in (np.diag([1e-4, 4e-4, 9e-4]), np.nan):
+        intake = RowIntake(Calibration(imu=ImuCalibration(mounting=quarter), dvl=log))
+        intake.add_imu(imu(stamps(5, 0.2), [1.0, 2.0, 3.0], [4.0, 5.0, 6.0]))
+        intake.add_dvl(dvl(stamps(5, 0.2), [0.1, 0.2, 0.3], cov))
+        assert intake.imu.values[0][1] == pytest.approx([-2.0, 1.0, 3.0])
+        assert intake.imu.values[1][1] == pytest.approx([-5.0, 4.0, 6.0])
+        assert intake.dvl.values[0][1] == pytest.approx([-0.2, 0.1, 0.3])
+        assert intake.dvl.values[1][1] == pytest.approx(np.diag([4e-4, 1e-4, 9e-4]))
 
 
 def test_held_velocities_may_jump():
-    jumping = driven([], outliers=[5, 12])
-    odometry = Odometry(Calibration(odometry_interpolation="hold-past"))
-    odometry.add(imu(stamps(50, SECONDS), 0.0), jumping)
-    assert not odometry.refused
+    held = Calibration(odometry_interpolation="hold-past")
+    assert not odometry_at_rest(driven(outliers=(5, 12)), calibration=held).refused
 
 
 def test_an_infinite_variance_is_completed_like_one_of_a_direction_not_measured():
     turned = Calibration(dvl=DvlCalibration(mounting=Mounting(rpy_rad=(0.1, 0.2, 0.7))))
-    found = []
-    for unmeasured in (100.0**2, np.inf):
-        rows = driven([4, 5], [])
-        cov = rows.velocity_cov.copy()
-        cov[[4, 5]] = np.diag([SIGMA**2, unmeasured, unmeasured])
-        odometry = Odometry(turned)
-        odometry.add(imu(stamps(50, SECONDS), 0.0), Dvl(rows.stamps_ns, rows.velocity, cov))
-        found.append(odometry.columns())
-    for one, other in zip(found[0][:6], found[1][:6], strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert len(found[0][3]) == len(rows)
-
-
-def test_rows_are_late_at_the_settled_stamp_and_not_after_it():
-    odometry = Odometry(Calibration())
-    odometry.settle(T0_NS)
-    odometry.add(None, dvl(T0_NS + np.array([-1, 0, 1, 2]), [0.8, 0.0, 0.0]))
-    assert [row.stamp_ns - T0_NS for row in odometry.refused] == [-1, 0]
-    assert (odometry.columns()[3] - T0_NS).tolist() == [1, 2]
+    logs = [driven((4, 5), blind=np.diag([SIGMA**2, unmeasured, unmeasured])) for unmeasured in (100.0**2, np.inf)]
+    one, other = (odometry_at_rest(rows, calibration=turned).columns()[:6] for rows in logs)
+    for column, same in zip(one, other, strict=True):
+        np.testing.assert_array_equal(column, same)
+    assert len(one[3]) == len(logs[0])
 
 
 def test_an_infinite_variance_is_that_of_a_direction_not_measured_and_nan_is_not_said():
