@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
 from sonar_graph.measurements import Dvl, Imu
@@ -19,7 +18,7 @@ from sonar_graph.navigation.preintegration.joint_recursion import RULES
 from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
 
 from .rows import NS, T0_NS, at, dvl, stamps
-from .vehicle import motion
+from .vehicle import acceleration_at, attitude, motion, rate_at, velocity_at
 
 IMU_HZ, DVL_HZ = 10.0, 2.0
 LOST_S, FOUND_S, OPEN_S, WAITS_S = 6.0, 11.0, 10.8, 1e-3
@@ -51,25 +50,6 @@ WAYS = {
     **{f"rule {rule}": Way(2.0, 5.5, rule) for rule in RULES},
 }
 every_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-
-
-def attitude(t):
-    return Rotation.from_euler(
-        "ZYX", np.column_stack([0.2 * t + 0.1 * np.sin(t), 0.1 * np.sin(0.6 * t), 0.15 * np.cos(0.5 * t)])
-    )
-
-
-def rate_at(t):
-    return (attitude(t - 1e-4).inv() * attitude(t + 1e-4)).as_rotvec() / 2e-4
-
-
-def velocity_at(t):
-    """Of the IMU's point in the world."""
-    return np.column_stack([1.0 + 0.2 * np.sin(t), 0.4 * np.cos(0.5 * t), 0.1 * np.sin(0.8 * t)])
-
-
-def acceleration_at(t):
-    return np.column_stack([0.2 * np.cos(t), -0.2 * np.sin(0.5 * t), 0.08 * np.cos(0.8 * t)])
 
 
 def rows(lever=BODY_P_DVL - BODY_P_IMU, dvl_hz=DVL_HZ, pings_s=None):
