@@ -1,12 +1,13 @@
 """Direction of gravity in a moving vehicle, the Earth's rotation, and roll and pitch of an up vector."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
 from sonar_graph.errors import AlignmentError
@@ -22,55 +23,37 @@ from sonar_graph.navigation.alignment.gravity import (
 )
 from sonar_graph.navigation.preintegration.motion import PreintegratedMotion, Preintegrator
 from sonar_graph.navigation.preintegration.recursion import Steps
+from sonar_graph.testing import check_consistent
 
 from .rows import derivative
+from .vehicle import acceleration_at, attitude, rate_at, velocity_at
 
 G = 9.81
 GRAVITY = np.array([0.0, 0.0, G])
 IMU = ImuCalibration(accel_noise_density=2e-3, accel_bias_sigma=5e-3, gyro_noise_density=2e-3, gyro_bias_sigma=1e-3)
 """A gyro that drifts so fast that directions a second apart share next to nothing."""
-T, N = 1.0, 2000
-TILT = Rotation.from_euler("xyz", [0.2, -0.3, 1.1])
-BODY_RATE = np.array([0.15, -0.1, 0.3])
+T, N, FROM_S = 1.0, 2000, 2.0
 
 
-def world_velocity(t: float) -> Floats:
-    return np.array([0.4 * np.sin(2 * t), 0.3 * t**2, 0.1 * np.cos(3 * t)])
+def accelerated() -> tuple[PreintegratedMotion, Floats, Floats, Rotation]:
+    """A turning, swaying vehicle's motion over T, its velocities in the body at both ends, and its last attitude."""
+    t = FROM_S + (np.arange(N) + 0.5) * T / N
+    force = attitude(t).inv().apply(acceleration_at(t) + GRAVITY)
+    velocity = attitude(t).inv().apply(velocity_at(t))
+    steps = Steps(np.full(N, T / N), rate_at(t), velocity, np.zeros((N, 3, 3)), force, np.zeros((N, 3)))
+    motion, ends = Preintegrator(0.0, np.zeros(3)).integrate(steps, np.zeros(3)), np.array([FROM_S, FROM_S + T])
+    return motion, *attitude(ends).inv().apply(velocity_at(ends)), attitude(ends)[1]
 
 
-def world_acceleration(t: float) -> Floats:
-    return np.array([0.8 * np.cos(2 * t), 0.6 * t, -0.3 * np.sin(3 * t)])
-
-
-def attitude(t: float) -> Rotation:
-    return TILT * Rotation.from_rotvec(BODY_RATE * t)
-
-
-def accelerated() -> tuple[PreintegratedMotion, Floats, Floats]:
-    """A turning, swaying vehicle's motion over T, with its velocities in the body at both ends."""
-    middles = (np.arange(N) + 0.5) * T / N
-    force = [attitude(t).inv().apply(world_acceleration(t) + GRAVITY) for t in middles]
-    velocity = [attitude(t).inv().apply(world_velocity(t)) for t in middles]
-    steps = Steps(
-        np.full(N, T / N),
-        np.tile(BODY_RATE, (N, 1)),
-        np.array(velocity),
-        np.zeros((N, 3, 3)),
-        np.array(force),
-        np.zeros((N, 3)),
-    )
-    motion = Preintegrator(0.0, np.zeros(3)).integrate(steps, np.zeros(3))
-    return motion, attitude(0).inv().apply(world_velocity(0)), attitude(T).inv().apply(world_velocity(T))
-
-
-def at_rest(duration_s: float, force: Floats = GRAVITY) -> PreintegratedMotion:
-    return PreintegratedMotion(gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), duration_s, force)
+def tilt_sigma_at_rest(duration_s: float, velocity_sigma: float, imu: ImuCalibration) -> float:
+    still = PreintegratedMotion(gtsam.Pose3(), np.eye(6), np.zeros((6, 3)), np.zeros(3), duration_s, GRAVITY)
+    return gravity_direction(still, np.zeros(3), np.zeros(3), velocity_sigma, imu, G)[1]
 
 
 def test_up_is_found_in_a_moving_vehicle():
     """And would be off by degrees, were the vehicle's own acceleration left in."""
-    motion, v_i, v_j = accelerated()
-    truth = attitude(T).inv().apply([0, 0, 1.0])
+    motion, v_i, v_j, end = accelerated()
+    truth = end.inv().apply([0, 0, 1.0])
     up, _ = gravity_direction(motion, v_i, v_j, 0.01, IMU, G)
     assert np.linalg.norm(up) == pytest.approx(1)
     assert np.arccos(up @ truth) < 1e-4
@@ -80,33 +63,27 @@ def test_up_is_found_in_a_moving_vehicle():
 
 def test_stated_sigma_is_that_of_many_noisy_intervals():
     """Two-sided, about both horizontal axes, with noise in force, bias, both velocities, and gyros."""
-    motion, v_i, v_j = accelerated()
-    truth, runs, rng, velocity_sigma = attitude(T).inv(), 1500, np.random.default_rng(1), 0.004
-    level = truth.apply(np.eye(3)[:2])
+    motion, v_i, v_j, end = accelerated()
+    level, rng, velocity_sigma, squares = end.inv().apply(np.eye(3)[:2]), np.random.default_rng(1), 0.004, []
     by_gyros = np.hypot(IMU.gyro_noise_density * np.sqrt(T / 3), IMU.gyro_bias_sigma * T / 2)
-    squares = []
-    for _ in range(runs):
+    for _ in range(1500):
         force = motion.mean_specific_force + IMU.accel_noise_density / np.sqrt(T) * rng.standard_normal(3)
-        noisy = PreintegratedMotion(
-            motion.i_T_j, motion.covariance, motion.D_bias, motion.bias, T,
-            force + IMU.accel_bias_sigma * rng.standard_normal(3),
-        )  # fmt: skip
+        noisy = replace(motion, mean_specific_force=force + IMU.accel_bias_sigma * rng.standard_normal(3))
         scatter = velocity_sigma * rng.standard_normal((2, 3))
         up, sigma = gravity_direction(noisy, v_i + scatter[0], v_j + scatter[1], velocity_sigma, IMU, G)
         up = up + np.cross(by_gyros * rng.standard_normal(3), up)
         squares.append(np.sum((level @ up / sigma) ** 2))
-    low, high = chi2.ppf([0.0005, 0.9995], 2 * runs) / runs
-    assert low < np.mean(squares) < high
+    check_consistent(squares, 2, confidence=0.999)
 
 
 @given(st.floats(0.2, 5.0), st.floats(0.0, 0.05))
 @settings(max_examples=30)
 def test_each_source_of_tilt_noise_falls_with_time_as_it_should(duration_s, velocity_sigma):
     """White force as 1 / sqrt(T), velocities as 1 / T, the bias not at all; the gyros' rises."""
-    _, sigma = gravity_direction(at_rest(duration_s), np.zeros(3), np.zeros(3), velocity_sigma, IMU, G)
     parts = [2e-3 / np.sqrt(duration_s), np.sqrt(2) * velocity_sigma / duration_s, 5e-3]
     by_gyros = IMU.gyro_noise_density * np.sqrt(duration_s / 3), IMU.gyro_bias_sigma * duration_s / 2
-    assert sigma == pytest.approx(np.linalg.norm([np.linalg.norm(parts) / G, *by_gyros]))
+    expected = np.linalg.norm([np.linalg.norm(parts) / G, *by_gyros])
+    assert tilt_sigma_at_rest(duration_s, velocity_sigma, IMU) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("duration_s", [1.0, 5.0])
@@ -114,51 +91,39 @@ def test_each_source_of_tilt_noise_falls_with_time_as_it_should(duration_s, velo
 def test_tilt_settles_at_what_the_accelerometer_bias_allows(duration_s, gyro_density):
     """A scalar Kalman filter fed with many directions; as fresh noise the bias would be claimed several times less."""
     imu = ImuCalibration(accel_noise_density=1e-5, accel_bias_sigma=1e-2, gyro_noise_density=gyro_density)
-    _, sigma = gravity_direction(at_rest(duration_s), np.zeros(3), np.zeros(3), 1e-6, imu, G)
-    settled, naive = (settled_tilt_sigma(s, gyro_density, duration_s) for s in (sigma, 1e-2 / G))
-    assert settled == pytest.approx(1e-2 / G, rel=0.03)
-    assert naive < 0.6 * settled
+    settled = []
+    for sigma in (tilt_sigma_at_rest(duration_s, 1e-6, imu), 1e-2 / G):
+        variance = 1.0
+        for _ in range(20_000):
+            predicted = variance + gyro_density**2 * duration_s
+            variance = predicted * sigma**2 / (predicted + sigma**2)
+        settled.append(np.sqrt(variance))
+    assert settled[0] == pytest.approx(1e-2 / G, rel=0.03)
+    assert settled[1] < 0.6 * settled[0]
 
 
 @pytest.mark.parametrize("duration_s", [1.0, 30.0])
 def test_what_the_gyros_do_meanwhile_is_in_the_tilt(duration_s):
     """Tilts that walk, and drift by a bias: at the end less their mean, which is what the accelerometers felt."""
-    rng, steps, runs = np.random.default_rng(2), 200, 20_000
-    density, bias = 2e-4, 3e-5
+    rng, steps, runs, density, bias = np.random.default_rng(2), 200, 20_000, 2e-4, 3e-5
     walk = np.cumsum(rng.normal(0, density * np.sqrt(duration_s / steps), (runs, steps)), axis=1)
-    drift = rng.normal(0, bias, (runs, 1)) * np.linspace(0, duration_s, steps)
-    tilt = walk + drift
-    imu = ImuCalibration(
-        accel_noise_density=1e-9, accel_bias_sigma=0.0, gyro_noise_density=density, gyro_bias_sigma=bias
-    )
-    _, sigma = gravity_direction(at_rest(duration_s), np.zeros(3), np.zeros(3), 0.0, imu, G)
-    assert sigma == pytest.approx((tilt[:, -1] - tilt.mean(axis=1)).std(), rel=0.03)
-
-
-def settled_tilt_sigma(sigma, gyro_density, duration_s):
-    variance = 1.0
-    for _ in range(20_000):
-        predicted = variance + gyro_density**2 * duration_s
-        variance = predicted * sigma**2 / (predicted + sigma**2)
-    return np.sqrt(variance)
+    tilt = walk + rng.normal(0, bias, (runs, 1)) * np.linspace(0, duration_s, steps)
+    noise = {"accel_noise_density": 1e-9, "accel_bias_sigma": 0.0}
+    imu = ImuCalibration(gyro_noise_density=density, gyro_bias_sigma=bias, **noise)
+    expected = (tilt[:, -1] - tilt.mean(axis=1)).std()
+    assert tilt_sigma_at_rest(duration_s, 0.0, imu) == pytest.approx(expected, rel=0.03)
 
 
 def test_without_forces_there_is_no_direction():
-    assert gravity_direction(at_rest(1.0, np.full(3, np.nan)), np.zeros(3), np.zeros(3), 0.01, IMU, G) is None
+    unfelt = replace(accelerated()[0], mean_specific_force=np.full(3, np.nan))
+    assert gravity_direction(unfelt, np.zeros(3), np.zeros(3), 0.01, IMU, G) is None
 
 
 def test_velocity_at_the_imu_is_that_of_a_point_of_a_rigid_body():
     """Differences of the two points' positions on a turning body."""
-    body_p_dvl, body_p_imu, v_dvl, w = (
-        np.array([-0.2, 0.1, -0.1]),
-        np.array([0.3, 0.0, 0.2]),
-        np.array([0.5, 0.1, 0]),
-        BODY_RATE,
-    )
-    twist_at_dvl = np.concatenate([w, v_dvl])
-    moved = gtsam.Pose3.Expmap(1e-6 * twist_at_dvl).transformFrom(body_p_imu - body_p_dvl)
-    expected = (moved - (body_p_imu - body_p_dvl)) / 1e-6
-    assert velocity_at_imu(v_dvl, w, body_p_dvl, body_p_imu) == pytest.approx(expected, abs=1e-5)
+    v_dvl, w, body_p_dvl, arm = np.array([[0.5, 0.1, 0], [0.15, -0.1, 0.3], [-0.2, 0.1, -0.1], [0.5, -0.1, 0.3]])
+    moved = gtsam.Pose3.Expmap(1e-6 * np.concatenate([w, v_dvl])).transformFrom(arm)
+    assert velocity_at_imu(v_dvl, w, body_p_dvl, body_p_dvl + arm) == pytest.approx((moved - arm) / 1e-6, abs=1e-5)
 
 
 @pytest.mark.parametrize(("latitude_deg", "rate"), [(0, [0, 15.041, 0]), (90, [0, 0, 15.041]), (-90, [0, 0, -15.041])])
