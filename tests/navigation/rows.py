@@ -29,12 +29,12 @@ def at(seconds: float) -> int:
 
 def imu(stamps_ns: Ints, rate: ArrayLike, force: ArrayLike = (0.0, 0.0, 9.80665)) -> Imu:
     shape = (len(stamps_ns), 3)
-    return Imu(stamps_ns, np.broadcast_to(rate, shape), np.broadcast_to(force, shape))
+    return Imu(stamps_ns, np.broadcast_to(rate, shape).copy(), np.broadcast_to(force, shape).copy())
 
 
 def dvl(stamps_ns: Ints, velocity: ArrayLike, cov: ArrayLike = np.nan) -> Dvl:
     n = len(stamps_ns)
-    return Dvl(stamps_ns, np.broadcast_to(velocity, (n, 3)), np.broadcast_to(cov, (n, 3, 3)))
+    return Dvl(stamps_ns, np.broadcast_to(velocity, (n, 3)).copy(), np.broadcast_to(cov, (n, 3, 3)).copy())
 
 
 def odometry_at_rest(*blocks: Dvl, calibration: Calibration | None = None) -> Odometry:
