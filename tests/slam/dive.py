@@ -1,7 +1,5 @@
 """A straight dive past objects, taken in up to the sightings."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Smoothers that were fed a run, with every factor that they were given."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 import pytest

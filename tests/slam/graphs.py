@@ -1,7 +1,5 @@
 """Sums of what the factors of a graph say, and differences between two graphs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import gtsam

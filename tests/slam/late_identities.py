@@ -1,7 +1,5 @@
 """Runs whose identities come late, change, or never come."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 

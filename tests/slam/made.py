@@ -1,7 +1,5 @@
 """Settings, estimators, smoothers, values, graphs and detections in few words."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from collections.abc import Sequence as Row
 from typing import Any

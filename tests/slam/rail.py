@@ -4,8 +4,6 @@ Ranges are differences of two coordinates and displacements are sums of velociti
 x alone (numpy, no linearisation) is the whole truth about mean and covariance along x.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Identities that are accepted, decided and weighed, and pairings that trying all of them finds."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

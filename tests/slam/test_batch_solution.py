@@ -1,7 +1,5 @@
 """Batch solutions against GTSAM's own optimiser, and landmarks stuck behind a sonar."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 import pytest
@@ -125,20 +123,12 @@ def seen(*sightings: np.ndarray) -> Sightlines:
     return lines
 
 
-@pytest.mark.parametrize(
-    ("off_rad", "is_behind"), [(0.0, False), (1.5, False), (-1.5, False), (1.7, True), (3.1, True)]
-)
-def test_behind_begins_at_a_right_angle_to_what_was_measured(off_rad, is_behind):
-    values = one_pose(world_point(5.0, Z[1] + off_rad))
-    assert seen(Z).turned_away(values) == ([L(1)] if is_behind else [])
-
-
-def test_the_camera_of_the_azimuth_factor_goes_blind_exactly_there():
+def test_behind_begins_at_a_right_angle_to_what_was_measured_where_the_azimuths_camera_goes_blind():
     camera = factors.landmark_sighting(X(0), L(1), BODY_T_SONAR, Z, np.diag([1e-4, 1e-4]), plain)[0]
-    for off_rad in np.linspace(-3, 3, 25):
-        values = one_pose(world_point(5.0, Z[1] + off_rad))
-        is_blind = not np.any(camera.linearize(values).jacobian()[0])
-        assert bool(seen(Z).turned_away(values)) == is_blind
+    for off_rad in [*np.linspace(-3, 3, 25), -1.57, 1.57, 1.572]:
+        values, is_behind = one_pose(world_point(5.0, Z[1] + off_rad)), abs(off_rad) > np.pi / 2
+        assert seen(Z).turned_away(values) == ([L(1)] if is_behind else [])
+        assert np.any(camera.linearize(values).jacobian()[0]) != is_behind
 
 
 def test_a_sighting_that_is_taken_away_no_longer_counts():

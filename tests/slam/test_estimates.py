@@ -1,7 +1,5 @@
 """Covariances against the inverse of the information of all factors, and requests that cannot be met."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

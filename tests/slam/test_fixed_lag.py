@@ -1,7 +1,5 @@
 """Windows begun anew where Cholesky gives up, and factors put in and taken out again."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Detections of a straight dive: gate, first place of a landmark, noise of the motion, waiting."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 import pytest
@@ -21,8 +19,6 @@ from .made import detected, polar, smoother_with
 BEAM = np.array([np.cos(0.2) * np.cos(0.4), np.sin(0.2) * np.cos(0.4), -np.sin(0.4)])
 """Centre beam of a sonar that looks 0.4 rad down and 0.2 rad to the left."""
 CERTAIN = Start(position_sigma_m=(1e-6,) * 3, rpy_sigma_rad=(1e-6,) * 3)
-LOW = FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.9), sigma_m=0.01)
-"""0.5 rad below the centre beam at 3 m, which is seven sigmas of the aperture."""
 
 
 def dive_with(smoother: Smoother | None = None, **changes) -> Dive:
@@ -175,32 +171,33 @@ def test_a_known_floor_gives_the_elevation():
     assert np.sqrt(dive.smoother.covariance(L(5))[2, 2]) == pytest.approx(FLOOR.sigma_m, rel=1e-3)
 
 
-def test_a_floor_out_of_the_aperture_is_believed_all_the_same():
+DOUBTFUL_HEIGHT = Start(position_sigma_m=(0.05, 0.02, 2.0), rpy_sigma_rad=(0.01, 0.01, 0.03))
+
+
+@pytest.mark.parametrize(
+    ("below_rad", "start"),
+    [(0.6, CALIBRATION.start), (0.9, DOUBTFUL_HEIGHT)],
+    ids=["near", "far, of a doubtful height"],
+)
+def test_a_floor_out_of_the_aperture_is_believed_all_the_same(below_rad: float, start: Start):
     """0.2 rad below the centre beam, where half the aperture is 0.12 rad: first put on the beam, then on the floor."""
-    dive = dive_with(floor=FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.6), sigma_m=0.01))
+    floor = FloorPrior(z_m=-0.1 - 3.0 * np.sin(below_rad), sigma_m=0.01)
+    dive = dive_with(floor=floor, start=start)
     dive.see(0.0, (5, 3.0, 0.0))
     settle(dive, 5)
     assert dive.outcomes == [Outcome.NEW]
-    assert dive.smoother.values.atPoint3(L(5))[2] == pytest.approx(-0.1 - 3.0 * np.sin(0.6), abs=1e-3)
-    assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-3)
+    assert dive.smoother.values.atPoint3(L(5))[2] == pytest.approx(floor.z_m, abs=1e-2)
+    assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-3) == (start is CALIBRATION.start)
 
 
 def test_a_landmark_that_cannot_stand_on_the_floor_does_not_drag_the_vehicle_there():
-    """No floor is said, but the aperture is."""
-    dive, without = dive_with(floor=LOW), Dive()
+    """0.5 rad below the centre beam is seven sigmas of the aperture: no floor is said, but the aperture is."""
+    dive, without = dive_with(floor=FloorPrior(z_m=-0.1 - 3.0 * np.sin(0.9), sigma_m=0.01)), Dive()
     for each in (dive, without):
         each.see(0.0, (5, 3.0, 0.0))
         settle(each)
     assert dive.smoother.graph.equals(without.smoother.graph, 1e-12)
     assert dive.smoother.values.atPose3(X(0)).equals(gtsam.Pose3(), 1e-9)
-
-
-def test_a_doubtful_height_of_the_vehicle_lets_the_floor_be_farther():
-    start = Start(position_sigma_m=(0.05, 0.02, 2.0), rpy_sigma_rad=(0.01, 0.01, 0.03))
-    dive = dive_with(floor=LOW, start=start)
-    dive.see(0.0, (5, 3.0, 0.0))
-    settle(dive, 5)
-    assert dive.smoother.values.atPoint3(L(5))[2] == pytest.approx(LOW.z_m, abs=1e-2)
 
 
 def test_elevation_is_said_once_for_a_landmark():

@@ -1,7 +1,5 @@
 """The estimator against its batch solution, on the basin, on MRCLAM and on faulty streams."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache, partial
 from itertools import product

@@ -1,7 +1,6 @@
 """Keyframes and the factors that they get from odometry, depth and gravity, on drives made by hand."""
 
-from __future__ import annotations
-
+from dataclasses import replace
 from itertools import product
 
 import gtsam
@@ -174,28 +173,28 @@ def test_every_keyframe_has_its_odometry_and_gravity():
     assert without.smoother.graph.size() == 1 + 3
 
 
-def test_gravity_tells_the_tilt_of_a_tilted_vehicle():
-    tilt = Rotation.from_euler("xyz", [0.1, -0.2, 0.5])
-    start = Start(rpy_rad=(0.1, -0.2, 0.5))
-    keyframes, imu = keyframes_of(Calibration(imu=NO_BIAS, start=start)), level_imu(2.0)
-    force = np.tile(tilt.inv().apply([0, 0, G]), (len(imu), 1))
-    keyframes.add(Imu(imu.stamps_ns, imu.angular_velocity, force), steady_dvl(2.0), None)
+def gravity_error(calibration: Calibration, imu: Imu, velocity=(0.5, 0.0, 0.0)) -> float:
+    """Largest of the direction of gravity at the second keyframe, after 2 s."""
+    keyframes = keyframes_of(calibration)
+    keyframes.add(imu, steady_dvl(2.0, velocity), None)
     keyframes.advance(int(at(2.0)[0]))
-    assert np.abs(error_of(keyframes, gtsam.MagPoseFactorPose3)).max() < 1e-9
+    return np.abs(error_of(keyframes, gtsam.MagPoseFactorPose3)).max()
+
+
+def test_gravity_tells_the_tilt_of_a_tilted_vehicle():
+    start, imu = Start(rpy_rad=(0.1, -0.2, 0.5)), level_imu(2.0)
+    up_in_body = Rotation.from_euler("xyz", start.rpy_rad).inv().apply([0, 0, G])
+    felt = replace(imu, specific_force=np.tile(up_in_body, (len(imu), 1)))
+    assert gravity_error(Calibration(imu=NO_BIAS, start=start), felt) < 1e-9
 
 
 def test_velocity_is_taken_to_the_imu_before_gravity_is():
     """A vehicle that begins to turn accelerates an IMU off its centre: without the lever arm up would seem to lean."""
-    arm, alpha, T = 2.0, 0.05, 2.0
+    arm, alpha = 2.0, 0.05
     calibration = Calibration(imu=NO_BIAS.model_copy(update={"mounting": Mounting(translation_m=(arm, 0, 0))}))
-    stamps = at(*(np.arange(41) / 20))
-    t = (stamps - T0_NS) / NS
-    rate = np.outer(alpha * t, [0, 0, 1.0])
+    stamps, t = at(*(np.arange(41) / 20)), np.arange(41) / 20
     force = np.column_stack([-((alpha * t) ** 2) * arm, np.full(41, alpha * arm), np.full(41, G)])
-    keyframes = keyframes_of(calibration)
-    keyframes.add(Imu(stamps, rate, force), steady_dvl(T, (0, 0, 0)), None)
-    keyframes.advance(int(at(T)[0]))
-    assert np.abs(error_of(keyframes, gtsam.MagPoseFactorPose3)).max() < 2e-5
+    assert gravity_error(calibration, Imu(stamps, np.outer(alpha * t, [0, 0, 1.0]), force), (0, 0, 0)) < 2e-5
     assert alpha * arm / G > 1e-2
 
 
@@ -321,17 +320,21 @@ def test_frames_over_one_gap_together_tell_ever_nearer_what_one_exact_frame_woul
     assert told == pytest.approx(n / (n + 1))
 
 
-def test_each_gap_counts_anew_and_frames_between_gaps_tell_all():
-    """With bottom lock, or only so long after it that velocity still counts as linear, frames share no such error."""
-    keyframes = keyframes_over_gaps()
-    told = shares(keyframes, [1.0, 2.2, 3.0, 4.0, 6.3, 6.7, 8.0, 9.0, 9.5, 11.0])
-    assert told == pytest.approx([1, 1, 1 / 2, 1 / 6, 1, 1, 1 / 2, 1 / 6, 1 / 12, 1])
+@pytest.mark.parametrize(
+    ("at_s", "told"),
+    [
+        ([1.0, 2.2, 3.0, 4.0, 6.3, 6.7, 8.0, 9.0, 9.5, 11.0], [1, 1, 1 / 2, 1 / 6, 1, 1, 1 / 2, 1 / 6, 1 / 12, 1]),
+        ([4.0, 6.4], [1 / 2, 1]),
+    ],
+    ids=["each gap anew", "a gap that has ended before a frame"],
+)
+def test_frames_between_gaps_tell_all(at_s: list[float], told: list[float]):
+    """With bottom lock, or only so long after it that velocity still counts as linear, frames share no such error.
 
-
-def test_a_gap_that_has_ended_before_a_frame_is_not_shared_with_it():
-    """Its end is a node, even where that is no keyframe."""
+    The end of a gap is a node, even where that is no keyframe.
+    """
     keyframes = keyframes_over_gaps()
-    assert shares(keyframes, [4.0, 6.4]) == pytest.approx([1 / 2, 1])
+    assert shares(keyframes, at_s) == pytest.approx(told)
     assert len(keyframes.stamps_ns) == 1
 
 

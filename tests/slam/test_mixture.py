@@ -1,7 +1,5 @@
 """Components of the mixture: densities by scipy, kernels by integration and by GTSAM, choices by trying all."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import gtsam

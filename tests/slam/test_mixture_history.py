@@ -1,7 +1,5 @@
 """Whole histories under other choices: least cost by trying all, graduated non-convexity beside GTSAM."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import gtsam

@@ -1,7 +1,5 @@
 """Max-mixture in the window: a fixed point that another solver finds, and choices that follow the estimate."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 import pytest

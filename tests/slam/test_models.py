@@ -1,7 +1,5 @@
 """Sonar model and prediction against numerical differences, draws and plain trigonometry."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -105,13 +103,6 @@ def test_a_wrapped_angle_is_the_same_direction(angle):
     assert math.remainder(wrapped - angle, 2 * math.pi) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_range_and_azimuth_are_those_of_a_compass_and_a_ruler():
-    left_of_a_sonar_that_looks_north = range_azimuth(
-        gtsam.Pose3(gtsam.Rot3.Yaw(math.pi / 2), np.array([1.0, 2.0, 0.0])), np.array([-2.0, 6.0, 0.0])
-    )
-    assert_allclose(left_of_a_sonar_that_looks_north, [5.0, math.atan2(3.0, 4.0)])
-
-
 @given(
     st.floats(-0.3, 0.3), st.floats(0.2, 0.9), st.floats(-3, 3), st.floats(-0.2, 0.2), st.floats(-0.12, 0.12),
     st.floats(1.0, 3.0),
@@ -192,9 +183,13 @@ def numerical_of_view(keyframe: gtsam.Pose3, motion: PreintegratedMotion, point:
 @with_bias
 @pytest.mark.parametrize("seed", range(3))
 def test_the_expected_covariance_is_that_of_the_whole_model(keyframe, bias, seed):
-    """H P H' of pose, landmark and bias together, and the motion's noise, with derivatives by differences."""
+    """H P H' of pose, landmark and bias together, and the motion's noise, with derivatives by differences.
+
+    Expected jointly each landmark is as alone.
+    """
     view, motion, landmarks, joint = some_view(keyframe, bias, seed)
-    for landmark_id, point in landmarks.items():
+    together, cov = view.expect_jointly([L(5), L(6)], np.array([landmarks[5], landmarks[6]]), [])
+    for k, (landmark_id, point) in enumerate(landmarks.items()):
         keys = [X(2), L(landmark_id), *([B(0)] if bias else [])]
         P = block_of(joint, keys)
         H = numerical_of_view(keyframe, motion, point)
@@ -203,20 +198,8 @@ def test_the_expected_covariance_is_that_of_the_whole_model(keyframe, bias, seed
         (z,), (S,) = expected_of(view, landmarks, landmark_id)
         assert z == pytest.approx(observed(keyframe.compose(motion.i_T_j), point))
         assert np.allclose(S, expected, rtol=1e-6, atol=1e-12)
-
-
-def test_the_expected_covariance_is_that_of_many_draws():
-    """Sample covariance of 20000 draws through the model itself; its relative standard error is 1 %."""
-    keyframe, n = KEYFRAMES["random"], 20_000
-    view, motion, landmarks, joint = some_view(keyframe, True, sigma=0.005)
-    keys, rng = [X(2), L(5), B(0)], np.random.default_rng(3)
-    states = rng.multivariate_normal(np.zeros(12), block_of(joint, keys), n)
-    noises = rng.multivariate_normal(np.zeros(6), motion.covariance, n)
-    pairs = zip(states, noises, strict=True)
-    seen = np.array([observed(moved(keyframe, motion, s[:6], s[9:], e), landmarks[5] + s[6:9]) for s, e in pairs])
-    S = expected_of(view, landmarks, 5)[1][0]
-    whitened = np.linalg.solve(np.linalg.cholesky(S), (seen - seen.mean(0)).T)
-    assert np.cov(whitened) == pytest.approx(np.eye(2), abs=0.05)
+        assert together[k] == pytest.approx(z, abs=1e-12)
+        assert cov[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] == pytest.approx(S, rel=1e-9)
 
 
 @keyframes
@@ -268,18 +251,6 @@ def test_weighing_is_mahalanobis_of_the_wrapped_innovation(measured, expected, r
 
 DRAWS = 20_000
 SMALL = 1e-3
-
-
-@keyframes
-@with_bias
-def test_alone_each_landmark_is_expected_as_before(keyframe: gtsam.Pose3, bias: bool):
-    view, _, landmarks, _ = some_view(keyframe, bias)
-    keys, points = [L(5), L(6)], np.array([landmarks[5], landmarks[6]])
-    predicted, cov = view.expect_jointly(keys, points, [])
-    alone, covs = view.expect(keys, points)
-    assert predicted == pytest.approx(alone, abs=1e-12)
-    assert cov[:2, :2] == pytest.approx(covs[0], rel=1e-9)
-    assert cov[2:, 2:] == pytest.approx(covs[1], rel=1e-9)
 
 
 @pytest.mark.parametrize("seen_from", [X(1), X(2)], ids=["an earlier keyframe", "the same keyframe"])

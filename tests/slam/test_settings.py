@@ -1,7 +1,5 @@
 """Settings of isam2: sections that refuse what they do not read, and old names that say the new one."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

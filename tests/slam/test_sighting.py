@@ -1,7 +1,5 @@
 """Sightings in the graph whatever came and went, and the points that they place."""
 
-from __future__ import annotations
-
 import math
 
 import gtsam

@@ -1,7 +1,5 @@
 """Identities that are known late, change or are repeated: the graph is that of a run that had known."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 
@@ -172,13 +170,16 @@ def test_a_track_waits_for_an_identity_no_longer_than_asked(longest_wait_s, seen
     assert dive.outcomes == outcomes
 
 
-def test_what_waits_too_long_is_forgotten_without_another_frame():
-    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 2.0}))
-    see(dive, 0.0, FLAT)
-    dive.keyframes.advance(T0_NS + 5 * NS)
-    dive.sightings.forget()
-    assert dive.outcomes == [FORGOTTEN]
-    assert not dive.sightings.ids
+@pytest.mark.parametrize("lag_s", [1e9, 0.5], ids=["in the window", "left it"])
+def test_late_sightings_pass_the_gate_one_by_one(lag_s: float):
+    """Also at keyframes that have left the window; what they were of meanwhile does not matter."""
+    dive = Dive(lag_s=lag_s)
+    for after_s in (0.0, 0.2, 0.4):
+        see(dive, after_s, SURE[5])
+    for after_s, off_m in ((6.0, 0.0), (6.2, 3.0)):
+        see(dive, after_s, FLAT if lag_s > 1.0 else SURE[6], track=4, off_m=off_m)
+    see(dive, 9.0, SURE[5], track=4)
+    assert dive.outcomes[3:] == [USED_LATER if lag_s > 1.0 else Outcome.MOVED, Outcome.GATED, USED]
 
 
 def test_what_was_refused_for_one_landmark_is_not_refused_for_good():
@@ -187,10 +188,19 @@ def test_what_was_refused_for_one_landmark_is_not_refused_for_good():
         see(dive, after_s, SURE[5])
     see(dive, 0.6, SURE[5], off_m=0.5)
     assert dive.outcomes[-1] == Outcome.GATED
-    see(dive, 0.8, [0.0] * 4)
-    assert dive.outcomes == [Outcome.TAKEN_BACK] * 3 + [Outcome.WAITING] * 2
+    see(dive, 0.8, NONE)
+    assert dive.outcomes == [TAKEN_BACK] * 3 + [WAITING] * 2
     see(dive, 1.0, SURE[6])
-    assert dive.outcomes[:5] == [Outcome.MOVED] * 3 + [Outcome.USED_LATER] * 2
+    assert dive.outcomes[:5] == [Outcome.MOVED] * 3 + [USED_LATER] * 2
+
+
+def test_what_waits_too_long_is_forgotten_without_another_frame():
+    dive = Dive(identity=TRUSTING.model_copy(update={"longest_wait_s": 2.0}))
+    see(dive, 0.0, FLAT)
+    dive.keyframes.advance(T0_NS + 5 * NS)
+    dive.sightings.forget()
+    assert dive.outcomes == [FORGOTTEN]
+    assert not dive.sightings.ids
 
 
 def test_of_tracks_that_claim_a_landmark_at_once_the_more_probable_gets_the_earlier_frames():
@@ -216,16 +226,6 @@ def test_a_landmark_may_begin_late_while_what_waits_makes_the_window_restart(mon
     assert dive.sightings.ids == {4, 6}
 
 
-def test_late_sightings_pass_the_gate_one_by_one():
-    dive = Dive()
-    for after_s in (0.0, 0.2, 0.4):
-        see(dive, after_s, SURE[5])
-    see(dive, 1.0, FLAT, track=4)
-    see(dive, 1.2, FLAT, track=4, off_m=0.5)
-    see(dive, 1.4, SURE[5], track=4)
-    assert dive.outcomes[3:] == [Outcome.USED_LATER, Outcome.GATED, Outcome.USED]
-
-
 def test_while_sightings_wait_the_window_stays_open_for_them(monkeypatch):
     """Late factors then cost no solution of the history; of a track that is of no landmark they may."""
     solves = []
@@ -238,16 +238,6 @@ def test_while_sightings_wait_the_window_stays_open_for_them(monkeypatch):
             see(dive, float(k), belief)
         assert len(solves) == expected
         assert dive.outcomes == [Outcome.USED_LATER] * 9 + [Outcome.USED]
-
-
-def test_late_sightings_pass_the_gate_at_keyframes_that_have_left_the_window():
-    dive = Dive(lag_s=0.5)
-    for after_s in (0.0, 0.2, 0.4):
-        see(dive, after_s, SURE[5])
-    for after_s, off_m in ((6.0, 0.0), (6.2, 3.0)):
-        see(dive, after_s, SURE[6], track=4, off_m=off_m)
-    see(dive, 9.0, SURE[5], track=4)
-    assert dive.outcomes[3:] == [Outcome.MOVED, Outcome.GATED, Outcome.USED]
 
 
 POLICIES = {
@@ -295,45 +285,35 @@ def test_a_run_is_that_without_second_rows_of_tracks(policy: str, data: st.DataO
     assert np.array_equal(estimator.trajectory().positions, alone.trajectory().positions)
 
 
-def frame(track: list[int], beliefs: list[list[float]]) -> LandmarkDetections:
-    return detected(0, np.eye(2)[[0] * len(track)], IDS, beliefs, track)
-
-
-def best_of_tracks(rows: LandmarkDetections, identity_of) -> np.ndarray:
-    numbered = replace(rows, range_m=1.0 + np.arange(len(rows)))
-    return np.isin(numbered.range_m, once_a_track(numbered, identity_of, DetectionJournal()).range_m)
-
-
-def test_the_row_stays_that_the_tracks_identity_explains_best():
+def test_of_a_tracks_rows_the_one_stays_that_its_identity_explains_best():
     """Of a track that counts as nothing the most probable row, of equals the first; of one named twice the sum."""
-    rows = frame([3, 3, NO_TRACK, 8], [[0.9, 0, 0, 0], [0, 0, 0.8, 0], SURE[4], FLAT])
-    assert best_of_tracks(rows, lambda _: 6).tolist() == [False, True, True, True]
-    assert best_of_tracks(rows, lambda _: 4).tolist() == [True, False, True, True]
-    rows = frame([3, 3, 3, NO_TRACK, NO_TRACK], [FLAT, [0, 0.8, 0, 0], [0, 0, 0.8, 0], FLAT, FLAT])
-    assert best_of_tracks(rows, of_no_landmark).tolist() == [False, True, False, True, True]
-    rows = replace(frame([3, 3], [[0, 0.6, 0, 0], [0.4, 0.4, 0, 0]]), candidate_ids=np.zeros((2, 4), int))
-    assert best_of_tracks(rows, lambda _: 0).tolist() == [False, True]
+
+    def kept(track: list[int], beliefs: list[list[float]], identity_of, ids=IDS) -> list[int]:
+        rows = detected(0, [(1.0 + row, 0.0) for row in range(len(track))], ids, beliefs, track)
+        return (once_a_track(rows, identity_of, DetectionJournal()).range_m - 1.0).astype(int).tolist()
+
+    one = [3, 3, NO_TRACK, 8], [[0.9, 0, 0, 0], [0, 0, 0.8, 0], SURE[4], FLAT]
+    assert kept(*one, lambda _: 6) == [1, 2, 3]
+    assert kept(*one, lambda _: 4) == [0, 2, 3]
+    nothing = [3, 3, 3, NO_TRACK, NO_TRACK], [FLAT, [0, 0.8, 0, 0], [0, 0, 0.8, 0], FLAT, FLAT]
+    assert kept(*nothing, of_no_landmark) == [1, 3, 4]
+    assert kept([3, 3], [[0, 0.6, 0, 0], [0.4, 0.4, 0, 0]], lambda _: 0, [0] * 4) == [1]
+
+
+PLACES_IN_FRAME = [int(i == 7) for _, i, _ in rail(NODES)[1].ranges]
 
 
 def test_where_tracks_are_not_used_all_rows_are():
-    sequence = said([0] * ROWS, [SURE[4] if i == 0 else SURE[7] for i in first_of_frame()])
+    sequence = said([0] * ROWS, [SURE[7] if place else SURE[4] for place in PLACES_IN_FRAME])
     outcomes = assert_outcomes_account(run(sequence, 1 / STEP_S, identity__longest_wait_s=0), sequence)
     assert outcomes[Outcome.TRACK_REPEATED] == 0
     assert outcomes[Outcome.USED] + outcomes[Outcome.NEW] == ROWS
 
 
-def first_of_frame() -> list[int]:
-    """Place of each of the rail's rows in its frame."""
-    seen = rail(NODES)[0].detections
-    assert seen is not None
-    return [int(np.count_nonzero(seen.stamps_ns[:row] == seen.stamps_ns[row])) for row in range(len(seen))]
-
-
 @pytest.mark.parametrize("policy", POLICIES)
 def test_two_rows_of_a_known_track_that_name_others_do_not_end_the_run(policy: str):
-    tracks = [40 if i == 0 else 70 for i in first_of_frame()]
-    beliefs = [SURE[4] if i == 0 else SURE[7] for i in first_of_frame()]
-    two = [row for row, i in enumerate(first_of_frame()) if i == 1][1]
+    tracks, beliefs = ([of[place] for place in PLACES_IN_FRAME] for of in ((40, 70), (SURE[4], SURE[7])))
+    two = np.flatnonzero(PLACES_IN_FRAME)[1]
     tracks[two], beliefs[two - 1], beliefs[two] = 40, SURE[5], SURE[6]
     sequence = said(tracks, beliefs)
     outcomes = assert_outcomes_account(run(sequence, 1 / STEP_S, **POLICIES[policy]), sequence)

@@ -1,7 +1,5 @@
 """Landmarks without names: paired, begun and merged by geometry."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import replace
@@ -169,20 +167,6 @@ def test_a_duplicate_is_merged_into_the_graph_of_one_landmark(monkeypatch: pytes
     assert outcomes[Outcome.MOVED] >= 5
     assert estimator.landmarks().ids.tolist() == known.landmarks().ids.tolist()
     assert_same_graph(estimator, known)
-
-
-def test_two_that_one_frame_shows_are_never_merged():
-    """Two landmarks closer than the noise, both always seen; merging would need them apart."""
-    seen = detections_of(clean())
-    twice = np.repeat(np.arange(len(seen)), 2)
-    doubled = seen.rows(twice)
-    ids = doubled.candidate_ids[:, :1].copy()
-    ids[::2, 0] = doubled.most_probable()[0][::2]
-    ids[1::2, 0] = -1
-    tracks = np.where((doubled.track >= 0) & (np.arange(len(doubled)) % 2 == 1), doubled.track + 1000, doubled.track)
-    doubled = replace(doubled, candidate_ids=ids, id_probability=(ids >= 0).astype(float), track=tracks)
-    estimator = run(replace(clean(), detections=doubled), **ASSOCIATED)
-    assert estimator.landmarks().ids.tolist() == [1, 2, 3, 4, *(FIRST_ANONYMOUS_ID + k for k in range(4))]
 
 
 def test_half_named_ends_in_names_only():
