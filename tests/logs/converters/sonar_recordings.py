@@ -1,4 +1,4 @@
-"""Recordings of sonars, byte for byte from the documented layouts; nothing of the readers is used."""
+"""Recordings of sonars, byte for byte from the documented layouts without use of the readers, and their logs."""
 
 from __future__ import annotations
 
@@ -6,10 +6,20 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sonar_graph.logs.convert.didson_aris import convert_aris, convert_didson
+from sonar_graph.logs.convert.oculus import convert_oculus
+from sonar_graph.logs.convert.sonar_file import SonarConversion
+from sonar_graph.logs.mcap.reader import Recording, scan
+from sonar_graph.logs.mcap.topic import Keep
+from sonar_graph.logs.reading import read_sonar_frames
+from sonar_graph.logs.vehicle_setup import read_calibration, read_notes
+from sonar_graph.measurements import SonarFrames
 
 START = datetime(2014, 5, 6, 7, 8, 9, 250_000, tzinfo=UTC)
 STEP = timedelta(milliseconds=120)
@@ -27,10 +37,30 @@ def put(header: bytearray, at: int, layout: str, *values: Any) -> None:
 
 
 @dataclass
-class Ddf:
+class Recorded:
+    """Frames as a file of a sonar, shape (count, beams, samples)."""
+
+    frames: NDArray[Any]
+    ending: ClassVar[str]
+
+    def file_header(self) -> bytes:
+        return b""
+
+    def frame(self, i: int) -> bytes:
+        raise NotImplementedError
+
+    def pieces(self) -> list[bytes]:
+        return [self.file_header(), *(self.frame(i) for i in range(len(self.frames)))]
+
+    def content(self) -> bytes:
+        return b"".join(self.pieces())
+
+
+@dataclass
+class Ddf(Recorded):
     """A DIDSON recording; the offsets are those of the DDF_03 and DDF_04 descriptions."""
 
-    frames: NDArray[np.uint8]
+    ending = "ddf"
     version: int = 3
     high: int = 1
     reverse: int = 0
@@ -66,18 +96,12 @@ class Ddf:
         put(header, 192, "i", self.flags)
         return bytes(header) + self.frames[i].T.tobytes()  # beams fastest
 
-    def pieces(self) -> list[bytes]:
-        return [self.file_header(), *(self.frame(i) for i in range(len(self.frames)))]
-
-    def content(self) -> bytes:
-        return b"".join(self.pieces())
-
 
 @dataclass
-class Aris:
+class Aris(Recorded):
     """An ARIS recording; the offsets are those of aris-file-sdk's ArisFrameHeader."""
 
-    frames: NDArray[np.uint8]
+    ending = "aris"
     mode: int = 9
     telephoto: int = 0
     system: int = 1
@@ -87,6 +111,9 @@ class Aris:
     delay_us: int = 1700
     in_order: int = 1
     sound_speeds: Sequence[float] = ()
+
+    def file_header(self) -> bytes:
+        return struct.pack("<4sI", b"DDF\x05", len(self.frames)).ljust(1024, b"\0")
 
     def frame(self, i: int) -> bytes:
         header = bytearray(1024)
@@ -101,20 +128,12 @@ class Aris:
         put(header, 516, "I", self.in_order)
         return bytes(header) + self.frames[i].T.tobytes()
 
-    def pieces(self) -> list[bytes]:
-        header = bytearray(1024)
-        put(header, 0, "4sI", b"DDF\x05", len(self.frames))
-        return [bytes(header), *(self.frame(i) for i in range(len(self.frames)))]
-
-    def content(self) -> bytes:
-        return b"".join(self.pieces())
-
 
 @dataclass
-class Oculus:
+class Oculus(Recorded):
     """Oculus pings of either version, with samples of 8, 16 or 32 bits and with or without gains."""
 
-    frames: NDArray[Any]
+    ending = "raw"
     version: int = 0
     gains: NDArray[np.uint32] | None = None
     first_clock: int = 2**32 - 100_000_000
@@ -147,13 +166,54 @@ class Oculus:
         header = struct.pack("<HHHHHIH", 0x4F53, 1, 2, 0x23, self.version, total - 16, 0)
         return (header + fire + result + bearings).ljust(offset, b"\0") + pixels
 
-    def pieces(self) -> list[bytes]:
-        return [b"", *(self.frame(i) for i in range(len(self.frames)))]
-
-    def content(self) -> bytes:
-        return b"".join(self.pieces())
-
 
 def oculus_note(payload: bytes = b"\0" * 12) -> bytes:
     """A message without an image: the user's configuration."""
     return struct.pack("<HHHHHIH", 0x4F53, 1, 2, 0x55, 0, len(payload), 0) + payload
+
+
+CONVERTERS = {"ddf": convert_didson, "aris": convert_aris, "raw": convert_oculus}
+
+
+@dataclass
+class Converted:
+    done: SonarConversion
+    blocks: list[SonarFrames]
+    recording: Recording
+
+    @property
+    def frames(self) -> SonarFrames:
+        """All of them, where there is one block."""
+        (block,) = self.blocks
+        return block
+
+    @property
+    def notes(self) -> dict[str, str]:
+        return read_notes(self.recording)
+
+    @property
+    def image(self) -> Any:
+        """Calibration of the samples."""
+        return read_calibration(self.recording).sonar.image
+
+    def by_stamp(self) -> dict[int, NDArray[Any]]:
+        return {
+            stamp_ns: image
+            for block in self.blocks
+            for stamp_ns, image in zip(block.stamps_ns.tolist(), block.intensity, strict=True)
+        }
+
+
+def converted(folder: Path, content: bytes, ending: str, **settings: Any) -> Converted:
+    source, log = folder / f"dive.{ending}", folder / "dive.mcap"
+    source.write_bytes(content)
+    done = CONVERTERS[ending](source, log, **settings)
+    return Converted(done, list(read_sonar_frames(log)), scan(log, lambda _: Keep.NONE))
+
+
+def log_of(folder: Path, recording: Recorded, **settings: Any) -> Converted:
+    return converted(folder, recording.content(), recording.ending, **settings)
+
+
+def degrees(frames: SonarFrames) -> NDArray[np.float64]:
+    return np.degrees(frames.azimuths_rad)

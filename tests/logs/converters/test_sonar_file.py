@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
-from sonar_graph.cli.main import main
+from sonar_graph.cli.main import app
 from sonar_graph.errors import DatasetError, LogError
 from sonar_graph.logs.convert.didson_aris import ArisFormat, convert_didson
 from sonar_graph.logs.convert.sonar_file import ByteSource, FrameHead, Lost
 from sonar_graph.logs.reading import read_sonar_frames
 
-from .sonar_logs import CONVERTERS, Converted, converted
-from .sonar_recordings import START_NS, STEP_NS, Aris, Ddf, Oculus, images, put
+from .sonar_recordings import START_NS, STEP_NS, Aris, Converted, Ddf, Oculus, converted, images, put
 
 COUNT, MIB = 7, 1 << 20
 EVERY = list(range(COUNT))
@@ -50,10 +50,8 @@ def read(folder: Path, pieces: Frames, ending: str) -> tuple[list[int], str]:
     lost = sum(loss.end - loss.at for loss in result.done.lost)
     assert len(PIECES[ending][0]) + len(PIECES[ending][1]) * result.done.frames + lost == len(content)
     numbers = which(result)
-    origins_ns = {
-        stamp_ns - number * STEP_NS for stamp_ns, number in zip(sorted(result.by_stamp()), numbers, strict=True)
-    }
-    assert len(origins_ns) == 1  # an Oculus counts from anywhere
+    origins_ns = np.array(sorted(result.by_stamp())) - np.array(numbers) * STEP_NS
+    assert np.unique(origins_ns).size == 1  # an Oculus counts from anywhere
     return numbers, "; ".join(result.done.shortcomings())
 
 
@@ -94,11 +92,7 @@ FAULTS: dict[str, tuple[Callable[[Frames, str], Frames], list[int], str]] = {
     "nothing": (lambda frames, _: frames, EVERY, "^$"),
     "one frame": (lambda frames, _: frames[:1], [0], ""),
     "two frames": (lambda frames, _: frames[:2], [0, 1], ""),
-    "a cut frame": (
-        lambda f, _: [*f[:3], f[3][:-10]],
-        [0, 1, 2],
-        r"frame (3|503): cut off, \d+ of \d+ bytes are there",
-    ),
+    "a cut frame": (lambda f, _: [*f[:3], f[3][:-10]], [0, 1, 2], r"(3|503): cut off, \d+ of \d+ bytes are there"),
     "a frame twice": (lambda f, _: [*f[:3], *f[2:]], EVERY, "a repetition of the frame at byte"),
     "two settings that alternate": (alternating, EVERY, "^$"),
     "damaged settings side by side": (settings_side_by_side, [2, 3, 6], "^([^;]*settings[^;]*(; )?){4}"),
@@ -191,39 +185,24 @@ def test_a_clock_that_is_set_back_loses_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("ending", ["ddf", "aris"])
-def test_a_file_header_that_lost_bytes_costs_no_frame(tmp_path, ending):
+def test_a_file_header_that_is_damaged_or_lost_bytes_costs_no_frame(tmp_path, ending):
     head, *frames = PIECES[ending]
+    if ending == "aris":
+        assert which(converted(tmp_path, b"".join([b"\xff" * 1024, *frames]), ending)) == EVERY
     result = converted(tmp_path, b"".join([head[:300], *frames]), ending)
     assert which(result) == EVERY
     assert [loss.end for loss in result.done.lost] == [300]
     assert f"{len(head) - 300} bytes too short" in result.done.shortcomings()[0]
 
 
-@each_kind
-def test_a_file_of_nothing_but_noise_after_its_header_is_refused(tmp_path, ending):
-    noise = np.random.default_rng(1).integers(0, 256, 200_000, dtype=np.uint8).tobytes()
-    path = tmp_path / f"dive.{ending}"
-    path.write_bytes(PIECES[ending][0] + noise)
-    with pytest.raises(DatasetError, match=rf"^{re.escape(str(path))}: "):
-        CONVERTERS[ending](path, tmp_path / "dive.mcap")
-
-
-@pytest.mark.parametrize(
-    ("content", "may_be"),
-    [
-        (b"", True),
-        (b"\x05", True),
-        (b"\x05\x01\0\0", True),
-        (b"\x06", False),
-        (b"\x05\x02", False),
-        (b"\x05\x01\0\0" + b"?" * 8 + b"DD", True),
-        (b"\x05\x01\0\0" + b"?" * 8 + b"DDF\x05" + b"?" * 50, True),
-        (b"\x05\x01\0\0" + b"?" * 8 + b"DX", False),
-        (b"\x04\x01\0\0" + b"?" * 8 + b"DDF\x05", False),
-    ],
-)
-def test_the_beginning_of_a_header_is_told_from_other_bytes(content, may_be):
-    assert object.__new__(ArisFormat).may_follow(content, FrameHead(0, 1, 0x104, 0, ())) is may_be
+def test_the_beginning_of_a_header_is_told_from_other_bytes():
+    number, gap = b"\x05\x01\0\0", b"?" * 8
+    signed = number + gap + b"DDF\x05"
+    may_be = (b"", b"\x05", number, number + gap + b"DD", signed + b"?" * 50)
+    cannot_be = (b"\x06", b"\x05\x02", number + gap + b"DX", b"\x04" + signed[1:])
+    for content in may_be + cannot_be:
+        follows = object.__new__(ArisFormat).may_follow(content, FrameHead(0, 1, 0x104, 0, ()))
+        assert follows is (content in may_be), content
 
 
 def test_a_pattern_is_found_wherever_it_is_and_reading_ends_with_the_file(tmp_path):
@@ -239,11 +218,8 @@ def test_a_pattern_is_found_wherever_it_is_and_reading_ends_with_the_file(tmp_pa
         assert list(source.places(b"aba", 8)) == places[2:]
         assert list(source.places(b"abb", 0)) == []
         end = source.size
-        assert (end, source.read(7, 3), source.read(end - 3, 9), source.read(end, 1)) == (
-            len(content),
-            *[b"aba"] * 2,
-            b"",
-        )
+        read = source.read(7, 3), source.read(end - 3, 9), source.read(end, 1)
+        assert (end, *read) == (len(content), b"aba", b"aba", b"")
     assert str(Lost(10, 20, "because")) == "bytes 10 to 19: because"
 
 
@@ -300,31 +276,27 @@ def test_the_log_has_the_name_of_the_recording_and_notes_what_is_lost(tmp_path):
     assert "cut off" in converted(tmp_path, b"".join(PIECES["aris"])[:-5], "aris").notes["sonar.shortcomings"]
 
 
-def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    with pytest.raises(SystemExit) as stop:
-        main([str(argument) for argument in arguments])
-    assert not stop.value.code
-    printed = capsys.readouterr()
-    return printed.out + printed.err
+def run(*arguments: object) -> str:
+    done = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert done.exit_code == 0, done.output
+    return done.output
 
 
 @pytest.mark.parametrize(("kind", "ending"), [("didson", "ddf"), ("aris", "aris"), ("oculus", "raw")])
-def test_the_commands_say_what_was_read_and_lost(tmp_path, capsys, kind, ending):
+def test_the_commands_say_what_was_read_and_lost(tmp_path, kind, ending):
     source, log = tmp_path / "dive.bin", tmp_path / "dive.mcap"
     source.write_bytes(b"".join(PIECES[ending][:5])[:-7])
-    said = run(capsys, "convert", kind, source, "-o", log)
-    for words in ("dive.bin: 3 frames, 0.2 s", "lost: bytes", "cut off"):
-        assert words in said
-    said = run(capsys, "inspect", log)
-    for words in ("48 beams x 50 bins of uint8", "cut off"):
-        assert words in said
+    said = run("convert", kind, source, "-o", log)
+    assert all(words in said for words in ("dive.bin: 3 frames, 0.2 s", "lost: bytes", "cut off"))
+    said = run("inspect", log)
+    assert all(words in said for words in ("48 beams x 50 bins of uint8", "cut off"))
 
 
-def test_the_command_takes_the_speed_of_sound_and_shows_some_of_many_losses(tmp_path, capsys):
+def test_the_command_takes_the_speed_of_sound_and_shows_some_of_many_losses(tmp_path):
     header, *frames = Ddf(images(50, 96, 512)).pieces()
     source, log = tmp_path / "dive.ddf", tmp_path / "dive.mcap"
     source.write_bytes(header + b"".join(bytes(len(f)) if i % 2 else f for i, f in enumerate(frames)))
-    said = run(capsys, "convert", "didson", source, "-o", log, "--sound-speed", 1500)
+    said = run("convert", "didson", source, "-o", log, "--sound-speed", 1500)
     assert said.count("lost: bytes") == 10
     assert "and 15 stretches more" in said
     assert next(iter(read_sonar_frames(log))).ranges_m[-1] == pytest.approx((1.26 + 1.25) * 1500 / 1465, abs=0.002)
