@@ -11,7 +11,6 @@ from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
-from rosbags.highlevel import AnyReader
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.mcap.writer import recording
@@ -50,9 +49,7 @@ def test_known_covariances_of_the_truth_survive(make_sequence, tmp_path):
     root = np.random.default_rng(0).normal(size=(len(sequence.truth), 6, 6))
     truth = replace(sequence.truth, covariances=root @ root.transpose(0, 2, 1))
     write_log(tmp_path / "a.mcap", replace(sequence, truth=truth))
-    found = read_log(tmp_path / "a.mcap").truth
-    assert found is not None
-    np.testing.assert_allclose(found.covariances, truth.covariances, atol=1e-12)
+    np.testing.assert_allclose(read_log(tmp_path / "a.mcap").truth.covariances, truth.covariances, atol=1e-12)
 
 
 def test_mcap_ros2_support_decodes_what_is_written(make_sequence, tmp_path, decoded):
@@ -77,34 +74,14 @@ def test_mcap_ros2_support_decodes_what_is_written(make_sequence, tmp_path, deco
     assert tree.transforms[0].transform.translation.y == 0.2
 
 
-def test_rosbags_re_encodes_all_that_is_written_to_the_same_bytes(make_sequence, tmp_path):
-    write_log(tmp_path / "a.mcap", make_sequence())
-    count = 0
-    with AnyReader([tmp_path / "a.mcap"]) as reader:
-        for connection, _, raw in reader.messages():
-            message = reader.typestore.deserialize_cdr(raw, connection.msgtype)
-            assert bytes(reader.typestore.serialize_cdr(message, connection.msgtype)) == raw
-            count += 1
-    assert count > 80
-
-
-def test_messages_lie_in_the_order_of_their_times(make_sequence, tmp_path):
-    write_log(tmp_path / "a.mcap", make_sequence())
-    with (tmp_path / "a.mcap").open("rb") as stream:
-        times = [r.log_time for r in StreamReader(stream).records if isinstance(r, Message)]
-    assert len(times) > 80
-    assert times == sorted(times)
-
-
-@pytest.mark.parametrize("stamp_ns", [2**31 * 10**9, -(2**31) * 10**9 - 1])
-def test_stamps_that_ros_cannot_express_are_refused(make_sequence, tmp_path, stamp_ns):
-    sequence = replace(make_sequence(), imu=Imu(np.array([stamp_ns]), np.zeros((1, 3)), np.zeros((1, 3))))
-    with pytest.raises(LogError, match="32-bit seconds"):
-        write_log(tmp_path / "a.mcap", sequence)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_file_that_cannot_be_written_is_named(make_sequence, tmp_path):
+def test_a_stamp_that_ros_cannot_express_or_a_file_that_cannot_be_written_is_named_and_nothing_is_left(
+    make_sequence, tmp_path
+):
+    for stamp_ns in (2**31 * 10**9, -(2**31) * 10**9 - 1):
+        sequence = replace(make_sequence(), imu=Imu(np.array([stamp_ns]), np.zeros((1, 3)), np.zeros((1, 3))))
+        with pytest.raises(LogError, match="32-bit seconds"):
+            write_log(tmp_path / "a.mcap", sequence)
+        assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(LogError, match=r"file/a\.mcap cannot be written"):
         write_log(tmp_path / "file" / "a.mcap", make_sequence())
@@ -173,7 +150,7 @@ def test_an_existing_recording_survives_an_error(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_images_that_are_made_one_by_one_lie_among_the_others_once_and_in_order(make_sequence, tmp_path):
+def test_messages_and_images_that_are_made_one_by_one_lie_in_the_order_of_their_times(make_sequence, tmp_path):
     sequence = make_sequence()
     blocks = [replace(frames(count=1), stamps_ns=sequence.imu.stamps_ns[row : row + 1]) for row in (4, 12)]
     write_log(tmp_path / "a.mcap", sequence)
@@ -182,4 +159,6 @@ def test_images_that_are_made_one_by_one_lie_among_the_others_once_and_in_order(
     for name in ("a.mcap", "b.mcap"):
         with (tmp_path / name).open("rb") as stream:
             times.append([r.log_time for r in StreamReader(stream).records if isinstance(r, Message)])
+    assert len(times[0]) > 80
+    assert times[0] == sorted(times[0])
     assert times[1] == sorted([*times[0], *(int(block.stamps_ns[0]) for block in blocks)])

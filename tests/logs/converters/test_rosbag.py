@@ -75,30 +75,26 @@ def ros1_bag(tmp_path: Path) -> Path:
     return path
 
 
-def test_stamps_values_and_times_are_those_of_the_bag(ros1_bag, tmp_path, decoded):
-    done = convert_rosbag(ros1_bag, tmp_path / "new.mcap")
+def test_a_ros_1_bag_becomes_a_log_of_ros_2_with_its_stamps_values_and_times(ros1_bag, tmp_path, decoded):
+    told = []
+    done = convert_rosbag(ros1_bag, tmp_path / "new.mcap", lambda at, total: told.append((at, total)))
     assert (done.topics, done.messages, done.left_out) == (3, 7, {})
+    assert told
+    assert all(total == 7 and at <= total for at, total in told)
     found = decoded(tmp_path / "new.mcap")
     stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in found["/imu"]]
     assert stamps == [T0_NS + row * STEP_NS for row in range(5)]
     assert [m.angular_velocity.x for m in found["/imu"]] == [0, 1, 2, 3, 4]
     with (tmp_path / "new.mcap").open("rb") as stream:
-        times = [message.log_time for _, _, message in make_reader(stream).iter_messages(topics=["/imu"])]
-    assert times == stamps
-
-
-def test_definitions_are_those_of_ros_2(ros1_bag, tmp_path, decoded):
-    convert_rosbag(ros1_bag, tmp_path / "new.mcap")
-    with (tmp_path / "new.mcap").open("rb") as stream:
         reader = make_reader(stream)
+        assert [message.log_time for _, _, message in reader.iter_messages(topics=["/imu"])] == stamps
         summary = reader.get_summary()
-        assert summary
-        texts = {schema.name: schema.data.decode() for schema in summary.schemas.values()}
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
-        offers = {channel.topic: channel.metadata for channel in summary.channels.values()}
+    texts = {schema.name: schema.data.decode() for schema in summary.schemas.values()}
+    offers = {channel.topic: channel.metadata for channel in summary.channels.values()}
     assert "seq" not in texts["sensor_msgs/msg/Imu"]
     assert "float64[] d\n" in texts["sensor_msgs/msg/CameraInfo"]
-    assert decoded(tmp_path / "new.mcap")["/camera"][0].k == list(range(9))
+    assert found["/camera"][0].k == list(range(9))
     assert metadata["rosbag"]["/imu"] == "sensor_msgs/Imu 6a62c6daae103f4ff57a132d6f95cec2"  # as rosmsg md5 prints it
     assert "durability: 1" in offers["/tf_static"]["offered_qos_profiles"]
     assert offers["/imu"] == {}
@@ -137,13 +133,6 @@ def test_a_type_of_the_users_own_keeps_its_definition(tmp_path, decoded):
     assert found.header.stamp.nanosec == (T0_NS + 3 * STEP_NS) % 10**9
 
 
-def test_progress_counts_messages(ros1_bag, tmp_path):
-    told: list[tuple[int, int]] = []
-    convert_rosbag(ros1_bag, tmp_path / "new.mcap", lambda done, total: told.append((done, total)))
-    assert told
-    assert all(total == 7 and done <= total for done, total in told)
-
-
 def test_without_the_library_the_command_that_installs_it_is_named(ros1_bag, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
     with pytest.raises(LogError, match=r"not installed: pip install 'sonar-graph\[rosbag\]'"):
@@ -158,11 +147,7 @@ def test_without_the_library_the_command_that_installs_it_is_named(ros1_bag, tmp
         ("text.txt", b"hello", r"text\.txt is no bag but a text that begins with 'hello'; give a ROS 1 \.bag"),
         ("empty.bag", b"", r"empty\.bag is no bag but empty: copy it again.*wrote anything$"),
         ("zeros.bag", bytes(99), r"zeros\.bag is no bag but zeros: copy it again.*wrote anything$"),
-        (
-            "a.mcap",
-            b"\x89MCAP0\r\n",
-            r"a\.mcap is already an MCAP file: read it directly, `sonar-graph inspect .*a\.mcap`",
-        ),
+        ("a.mcap", b"\x89MCAP0\r\n", r"a\.mcap is already an MCAP file: .* `sonar-graph inspect .*a\.mcap`"),
         ("a.bag", b"\x89MCAP0\r\n", r"a\.bag is already an MCAP file: read it directly"),
     ],
 )
@@ -185,10 +170,8 @@ def test_real_bags_decode_to_what_the_library_reads(recordings, tmp_path, decode
             expected.setdefault(connection.topic, []).append(bag.deserialize(raw, connection.msgtype))
     assert {topic: len(rows) for topic, rows in found.items()} == {t: len(rows) for t, rows in expected.items()}
     for ours, theirs in zip(found["/imu/data"], expected["/imu/data"], strict=True):
-        assert (ours.header.stamp.sec, ours.header.stamp.nanosec) == (
-            theirs.header.stamp.sec,
-            theirs.header.stamp.nanosec,
-        )
+        assert ours.header.stamp.sec == theirs.header.stamp.sec
+        assert ours.header.stamp.nanosec == theirs.header.stamp.nanosec
         assert ours.linear_acceleration.y == theirs.linear_acceleration.y
         assert ours.orientation_covariance == theirs.orientation_covariance.tolist()
 
