@@ -26,6 +26,12 @@ Model = TypeVar("Model", bound="Section")
 FILE_WIDTH = 200
 """Columns of output that does not go to a terminal, so that lines stay whole."""
 
+
+def existing_file(meaning: str, metavar: str = "FILE") -> Any:
+    """Option for a file that must exist."""
+    return typer.Option(metavar=metavar, exists=True, dir_okay=False, help=meaning)
+
+
 LogPath = Annotated[
     Path, typer.Argument(metavar="LOG", exists=True, dir_okay=False, readable=True, help="MCAP log to read.")
 ]
@@ -35,7 +41,6 @@ OutputFolder = Annotated[Path, typer.Option("--output", "-o", metavar="DIR", hel
 RateHz = Annotated[
     float,
     typer.Option(
-        "--rate-hz",
         min=1e-3,
         max=1e3,
         help="How often every estimator is asked for its estimate; at most as often as the IMU measures.",
@@ -48,7 +53,6 @@ EstimatorSettings = Annotated[
 DesignsPath = Annotated[
     Path | None,
     typer.Option(
-        "--designs",
         metavar="PATH",
         exists=True,
         help="Landmark designs: a TOML file, or a folder of such files. Default: those that ship.",
@@ -62,13 +66,7 @@ class ReadingOptions:
 
     calibration: Annotated[
         Path | None,
-        typer.Option(
-            "--calibration",
-            metavar="FILE",
-            exists=True,
-            dir_okay=False,
-            help="TOML or JSON file whose fields go before those of the log's own calibration and mountings.",
-        ),
+        existing_file("TOML or JSON file whose fields go before those of the log's own calibration and mountings."),
     ] = None
     topics: Annotated[
         list[str] | None,
@@ -81,18 +79,14 @@ class ReadingOptions:
     ] = None
     log_config: Annotated[
         Path | None,
-        typer.Option(
-            "--log-config",
-            metavar="FILE.toml",
-            exists=True,
-            dir_okay=False,
-            help="What the topics of a foreign log are: types, fields, units, axes. `inspect LOG --toml` prints one.",
+        existing_file(
+            "What the topics of a foreign log are: types, fields, units, axes. `inspect LOG --toml` prints one.",
+            "FILE.toml",
         ),
     ] = None
     start: Annotated[
         str | None,
         typer.Option(
-            "--start",
             metavar="TIME",
             help="Leave out what was recorded before: seconds from the log's beginning (90.5), or a date and time, "
             "in UTC unless it says else (2026-05-01T12:30:00Z).",
@@ -100,7 +94,7 @@ class ReadingOptions:
     ] = None
     end: Annotated[
         str | None,
-        typer.Option("--end", metavar="TIME", help="Leave out what was recorded then and later; written like --start."),
+        typer.Option(metavar="TIME", help="Leave out what was recorded then and later; written like --start."),
     ] = None
     salvage: Annotated[
         bool,

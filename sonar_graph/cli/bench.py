@@ -6,8 +6,6 @@ import math
 import os
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 from sonar_graph.cli.arguments import OutputFolder, examples
-from sonar_graph.cli.outputs import working, writable_json
+from sonar_graph.cli.outputs import progress_bars, working, writable_json
 
 if TYPE_CHECKING:
     from sonar_graph.batch import GateVerdict
@@ -72,7 +70,11 @@ def bench(
     from sonar_graph.batch import run_suite
 
     try:
-        with run_bar() as progress:
+        with progress_bars() as show:
+
+            def progress(done: int, planned: int, failed: int) -> None:
+                show("runs", done, planned, f"{done}/{planned}{f', {failed} failed' if failed else ''}")
+
             batch = run_suite(
                 suite,
                 output,
@@ -146,25 +148,6 @@ def write_report_of(folder: Path) -> Path:
     for sentence in [*missing_told(batch), *lost_told(batch)]:
         typer.echo(f"Warning: {sentence}", err=True)
     return page
-
-
-@contextmanager
-def run_bar() -> Iterator[Callable[[int, int, int], None]]:
-    """Progress bar of runs with the number of failures and the time left; silent unless stderr is a terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    columns = (TextColumn("runs"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[failed]}"))
-    with Progress(
-        *columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal, transient=True
-    ) as bar:
-        task = bar.add_task("runs", failed="")
-
-        def show(done: int, planned: int, failed: int) -> None:
-            bar.update(task, completed=done, total=planned, failed=f"{failed} failed" if failed else "")
-
-        yield show
 
 
 DEFAULT_COMMAND = "run"

@@ -23,7 +23,7 @@ from sonar_graph.cli.arguments import (
 )
 from sonar_graph.cli.bench import write_report_of
 from sonar_graph.cli.outputs import progress_bars, working, writable_folder, writable_log
-from sonar_graph.cli.recognise import RecogniserOptions, warn_of_other_designs
+from sonar_graph.cli.recognise import RecogniserOptions, recognise_log, warn_of_other_designs
 from sonar_graph.cli.simulate import write_basin
 from sonar_graph.errors import EstimatorError, EvaluationError, LogError
 
@@ -79,8 +79,6 @@ def compare(
     from sonar_graph.report import write_report
 
     names = [name.strip() for name in estimators.split(",")]
-    if not any(names):
-        raise EstimatorError(f"--estimators {estimators!r}: expected names such as {DEFAULT_ESTIMATORS}")
     again = next((name for name in names if names.count(name) > 1), None)
     if not all(names):
         raise EstimatorError(
@@ -130,7 +128,6 @@ def demo(output: OutputFolder = Path("demo")) -> None:
 
 def estimators() -> None:
     """List the installed estimators with their settings, defaults and meaning."""
-    from sonar_graph.errors import EstimatorError
     from sonar_graph.estimator import installed_estimators, load_estimator
     from sonar_graph.settings import settings_of
 
@@ -168,7 +165,7 @@ def compare_log(
     """
     from sonar_graph.evaluation import check_request
     from sonar_graph.evaluation import compare as compare_runs
-    from sonar_graph.recognition import no_images, recognise_images, with_detections
+    from sonar_graph.recognition import no_images, with_detections
 
     overrides = estimator_settings(settings, names)
     for name in names:
@@ -179,17 +176,7 @@ def compare_log(
     check_rate(rate_hz, sequence)
     found = None
     if sequence.detections is None or recognition.is_given:
-        with progress_bars() as progress:
-            found = recognise_images(
-                log,
-                sequence,
-                topic=reading.choices.get("sonar"),
-                config=reading.config,
-                recogniser=recognition.recogniser(sequence.calibration),
-                window=reading.window,
-                salvage=reading.salvage,
-                progress=lambda done: progress("recognising landmarks (frames)", done, 0),
-            )
+        found = recognise_log(log, sequence, reading, recognition.recogniser(sequence.calibration))
         if found is None and recognition.is_given:
             raise LogError(f"{no_images(log)}; --designs, --model and --rule are for images")
     if found is not None:

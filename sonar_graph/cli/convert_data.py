@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +14,7 @@ from sonar_graph.cli.outputs import progress_bars, working, writable_log
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from sonar_graph.logs.convert import SonarConversion
+    from sonar_graph.logs.convert import BagConversion, SonarConversion
     from sonar_graph.logs.mcap import Progress
     from sonar_graph.sequence import Sequence
 
@@ -102,13 +103,7 @@ def rosbag(
     """Any ROS 1 bag, or ROS 2 bag of the sqlite3 kind, with all its topics."""
     from sonar_graph.logs.convert import convert_rosbag
 
-    path = writable_log(output, bag, overwrite=overwrite)
-    with progress_bars() as progress:
-        done = convert_rosbag(bag, path, lambda number, total: progress(f"converting {bag.name}", number, total))
-    typer.echo(f"{bag.name}: {done.duration_s:.1f} s, {done.messages} messages on {done.topics} topics")
-    for topic, reason in done.left_out.items():
-        typer.echo(f"left out: {topic}: {reason}")
-    typer.echo(f"Log: {path}\nWhat is in it: sonar-graph inspect {path}")
+    _convert_file(convert_rosbag, bag, output, overwrite)
 
 
 SonarRecording = Annotated[
@@ -135,10 +130,7 @@ def didson(
     """Images of a DIDSON (.ddf, versions 3 and 4)."""
     from sonar_graph.logs.convert import convert_didson
 
-    def convert(log: Path, progress: Progress) -> SonarConversion:
-        return convert_didson(recording, log, progress, sound_speed_m_s=sound_speed)
-
-    _convert_sonar(convert, recording, output, overwrite)
+    _convert_file(partial(convert_didson, sound_speed_m_s=sound_speed), recording, output, overwrite)
 
 
 @datasets.command(epilog=examples("sonar-graph convert aris dive.aris -o dive_sonar.mcap"))
@@ -146,7 +138,7 @@ def aris(recording: SonarRecording, output: OutputLog, overwrite: Overwrite = Fa
     """Images of an ARIS (.aris)."""
     from sonar_graph.logs.convert import convert_aris
 
-    _convert_sonar(lambda log, progress: convert_aris(recording, log, progress), recording, output, overwrite)
+    _convert_file(convert_aris, recording, output, overwrite)
 
 
 @datasets.command(epilog=examples("sonar-graph convert oculus pings.raw -o dive_sonar.mcap"))
@@ -154,17 +146,19 @@ def oculus(recording: SonarRecording, output: OutputLog, overwrite: Overwrite = 
     """Images of an Oculus: its network messages, one after another in a file."""
     from sonar_graph.logs.convert import convert_oculus
 
-    _convert_sonar(lambda log, progress: convert_oculus(recording, log, progress), recording, output, overwrite)
+    _convert_file(convert_oculus, recording, output, overwrite)
 
 
-def _convert_sonar(
-    convert: Callable[[Path, Progress], SonarConversion], recording: Path, output: Path, overwrite: bool
+def _convert_file(
+    convert: Callable[[Path, Path, Progress], BagConversion | SonarConversion],
+    source: Path,
+    output: Path,
+    overwrite: bool,
 ) -> None:
-    path = writable_log(output, recording, overwrite=overwrite)
+    path = writable_log(output, source, overwrite=overwrite)
     with progress_bars() as progress:
-        done = convert(path, lambda at, size: progress(f"converting {recording.name}", at, size))
-    typer.echo(f"{recording.name}: {done.frames} frames, {done.duration_s:.1f} s")
-    for line in done.shortcomings(_MOST_LOSSES_SHOWN):
+        done = convert(source, path, lambda at, total: progress(f"converting {source.name}", at, total))
+    for line in (f"{source.name}: {done.content}", *done.shortcomings(_MOST_LOSSES_SHOWN)):
         typer.echo(line)
     typer.echo(f"Log: {path}\nWhat is in it: sonar-graph inspect {path}")
 

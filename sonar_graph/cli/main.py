@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 
 from sonar_graph.cli.arguments import examples
-from sonar_graph.cli.bench import benches
+from sonar_graph.cli.bench import INTERRUPTED, benches
 from sonar_graph.cli.compare import compare, demo, estimators, report, run
 from sonar_graph.cli.convert_data import datasets
 from sonar_graph.cli.inspect_log import inspect
@@ -23,7 +23,6 @@ from sonar_graph.cli.simulate import worlds
 from sonar_graph.errors import SonarGraphError
 from sonar_graph.version import __version__
 
-INTERRUPTED = 130
 MISTAKE = 2
 app = typer.Typer(
     name="sonar-graph",

@@ -98,22 +98,23 @@ def _require_writing_in(folder: Path, path: Path, refusal: type[SonarGraphError]
         raise refusal(f"{path}: cannot be written: {error.strerror}; choose another place with -o") from error
 
 
-Report = Callable[[str, int, int], None]
-"""Called with the name of the work, the number of steps done, and their total (0: not known)."""
+Report = Callable[..., None]
+"""Called with the name of the work, the number of steps done, their total (0: not known), and perhaps a remark."""
 
 
 @contextmanager
 def progress_bars() -> Iterator[Report]:
     """Progress bars, one for each name of work, while the context is open."""
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(elapsed_when_finished=True))
+    bar = (BarColumn(), TextColumn("{task.fields[remark]}"), TimeRemainingColumn(elapsed_when_finished=True))
+    columns = (TextColumn("{task.description}"), *bar)
     bars = Progress(*columns, console=console, disable=not console.is_terminal, transient=True)
     tasks = {}
 
-    def show(what: str, done: int, total: int) -> None:
+    def show(what: str, done: int, total: int, remark: str = "") -> None:
         if what not in tasks:
-            tasks[what] = bars.add_task(what, total=total or None)
-        bars.update(tasks[what], completed=done, total=total or None)
+            tasks[what] = bars.add_task(what, remark="")
+        bars.update(tasks[what], completed=done, total=total or None, remark=remark)
 
     with bars:
         yield show

@@ -17,6 +17,7 @@ from sonar_graph.cli.arguments import (
     Overwrite,
     ReadingOptions,
     answers,
+    existing_file,
     nested_settings,
     validated,
     with_options,
@@ -27,7 +28,7 @@ from sonar_graph.errors import LogError
 if TYPE_CHECKING:
     from sonar_graph.calibration import Calibration
     from sonar_graph.devices import LandmarkDesign
-    from sonar_graph.recognition import LandmarkRecogniser
+    from sonar_graph.recognition import LandmarkRecogniser, Recognition
     from sonar_graph.sequence import Sequence
     from sonar_graph.sonar import RecogniserParams
 
@@ -63,20 +64,12 @@ class RecogniserOptions:
     designs: DesignsPath = None
     model: Annotated[
         Path | None,
-        typer.Option(
-            "--model",
-            metavar="MODEL.json",
-            exists=True,
-            dir_okay=False,
-            help="How often landmarks look like which, as calibrate measured it.",
-        ),
+        existing_file("How often landmarks look like which, as calibrate measured it.", "MODEL.json"),
     ] = None
     rule: Annotated[
         str | None,
         typer.Option(
-            "--rule",
-            help="How beliefs are updated: virtual-evidence (ours, the default) or jeffrey (the 2014 paper's "
-            "equations).",
+            help="How beliefs are updated: virtual-evidence (ours, the default) or jeffrey (the 2014 paper's)."
         ),
     ] = None
 
@@ -146,20 +139,11 @@ def recognise(
     Detections that an earlier recognise put into the log are replaced.
     """
     from sonar_graph.logs import DETECTIONS, METADATA, detection_messages, with_notes, write_amended
-    from sonar_graph.recognition import no_images, recognise_images
+    from sonar_graph.recognition import no_images
 
     path = writable_log(output, log, overwrite=overwrite)
     sequence = reading.read(log, images=True)
-    with progress_bars() as progress:
-        found = recognise_images(
-            log,
-            sequence,
-            topic=reading.choices.get("sonar"),
-            config=reading.config,
-            recogniser=recognition.recogniser(sequence.calibration, settings, recogniser),
-            salvage=reading.salvage,
-            progress=lambda done: progress("recognising", done, 0),
-        )
+    found = recognise_log(log, sequence, reading, recognition.recogniser(sequence.calibration, settings, recogniser))
     if found is None:
         raise LogError(no_images(log))
     with working("writing"):
@@ -235,6 +219,25 @@ def calibrate(
             "give more logs before the model is relied on"
         )
     typer.echo(f"Model: {path}")
+
+
+def recognise_log(
+    log: Path, sequence: Sequence, reading: ReadingOptions, recogniser: LandmarkRecogniser
+) -> Recognition | None:
+    """Landmarks in a log's sonar images, with a progress bar; None without images."""
+    from sonar_graph.recognition import recognise_images
+
+    with progress_bars() as progress:
+        return recognise_images(
+            log,
+            sequence,
+            topic=reading.choices.get("sonar"),
+            config=reading.config,
+            recogniser=recogniser,
+            window=reading.window,
+            salvage=reading.salvage,
+            progress=lambda done: progress("recognising landmarks (frames)", done, 0),
+        )
 
 
 def warn_of_other_designs(sequence: Sequence) -> None:

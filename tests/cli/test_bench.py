@@ -55,84 +55,43 @@ name = "dead-reckoning"
 """
 
 
-def test_mistake_in_a_suite_is_one_line_and_exit_code_2(run, tmp_path, capsys):
-    suite = tmp_path / "suite.toml"
-    for text, told in (
-        ('name = "x"\nreference = "isam2"\nlogs = 3\n', "line 3: logs"),
-        (
-            'name = "x"\nreference = "b"\n[[logs]]\nname = "a"\nlog = "a.mcap"\n[[estimators]]\nname = "b"\n',
-            "line 7: est",
-        ),
-    ):
-        suite.write_text(text)
-        assert run("bench", suite, "-o", tmp_path / "out") == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert f"{suite}, {told}" in line
-        assert not (tmp_path / "out").exists()
-
-
 def test_missing_packages_are_named_with_how_to_get_them(run, tmp_path, capsys, monkeypatch):
-    suite = tmp_path / "suite.toml"
-    suite.touch()
+    (tmp_path / "suite.toml").touch()
     for name in [name for name in sys.modules if name.startswith("sonar_graph.batch")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "distributed", None)
-    assert run("bench", suite, "-o", tmp_path / "out") == 2
+    assert run("bench", tmp_path / "suite.toml", "-o", tmp_path / "out") == 2
     assert "pip install 'sonar-graph[bench]'" in capsys.readouterr().err
 
 
-def test_workers_and_scheduler_exclude_each_other(run, tmp_path, capsys):
-    suite = tmp_path / "suite.toml"
-    suite.touch()
-    assert run("bench", suite, "-o", tmp_path, "--workers", 2, "--scheduler", "tcp://127.0.0.1:1") == 2
-    assert "give one of them" in capsys.readouterr().err
-
-
-@pytest.fixture
-def folder(tmp_path) -> Path:
-    return _write(tmp_path / "batch", 1.0)
-
-
-@pytest.fixture
-def incomplete(folder) -> Path:
-    """The batch, had the last three runs not been done."""
-    rows = pq.read_table(folder / "results.parquet").to_pylist()
-    for row in rows[-3:]:
-        row |= {"status": "not run", "causal.ate_se2_m": None}
-    pq.write_table(pa.Table.from_pylist(rows), folder / "results.parquet")
-    return folder
-
-
-def _write(folder: Path, factor: float, seeds: int = 8) -> Path:
+def batch(folder: Path, factor: float = 1.0, seeds: int = 8, not_run: int = 0) -> Path:
+    """A batch whose errors of isam2 are so many times as large, and whose last runs were not done."""
     rng = np.random.default_rng(0)
-    rows = [
-        {
-            "key": f"{name}-{seed}",
-            "log": "basin",
-            "seed": seed,
-            "estimator": name,
-            "variant": "default",
-            "status": "ok",
-            "asked": json.dumps({"generator": "basin", "options": {}}),
-            "causal.ate_se2_m": size_m * (factor if name == "isam2" else 1.0) * rng.lognormal(0, 0.2),
-        }
-        for seed in range(seeds)
-        for name, size_m in (("dead-reckoning", 0.4), ("isam2", 0.1))
-    ]
+    rows = []
+    for seed in range(seeds):
+        for name, size_m in (("dead-reckoning", 0.4), ("isam2", 0.1 * factor)):
+            row = {"key": f"{name}-{seed}", "log": "basin", "seed": seed, "estimator": name, "variant": "default"}
+            row |= {"status": "ok", "asked": json.dumps({"generator": "basin", "options": {}})}
+            rows.append(row | {"causal.ate_se2_m": size_m * rng.lognormal(0, 0.2)})
+    for row in rows[len(rows) - not_run :]:
+        row |= {"status": "not run", "causal.ate_se2_m": None}
     folder.mkdir()
     pq.write_table(pa.Table.from_pylist(rows), folder / "results.parquet")
     return folder
 
 
-def test_report_rebuilds_page_and_tables_of_a_batch(run, folder, capsys):
-    assert run("report", folder) == 0
-    assert capsys.readouterr().out == f"Report: {folder / 'report.html'}\n"
-    assert (folder / "report.html").is_file()
-    assert (folder / "tables" / "difference-ate-se2-m.tex").is_file()
+def test_report_rebuilds_page_and_tables_of_a_batch_and_warns_of_an_incomplete_one(run, tmp_path, capsys):
+    for folder, warned in ((batch(tmp_path / "whole"), ""), (batch(tmp_path / "part", not_run=3), "3 of 16 runs")):
+        assert run("report", folder) == 0
+        said = capsys.readouterr()
+        assert said.out == f"Report: {folder / 'report.html'}\n"
+        assert (folder / "tables" / "difference-ate-se2-m.tex").is_file()
+        assert warned in (folder / "report.html").read_text("utf-8")
+    assert "Warning: This batch is not complete: 3 of 16 runs have not been done (dead-reckoning 1 of 8" in said.err
 
 
-def test_a_batch_passes_by_the_reference_that_it_became(run, folder, tmp_path, capsys):
-    reference = tmp_path / "reference.json"
+def test_a_batch_passes_by_the_reference_that_it_became_and_a_worse_one_fails(run, tmp_path, capsys):
+    reference, folder = tmp_path / "reference.json", batch(tmp_path / "batch")
     assert run("bench", "bless", folder, reference) == 0
     assert json.loads(reference.read_text("utf-8"))["format"] == "sonar_graph batch reference 2"
     assert run("bench", "gate", folder, reference) == 0
@@ -141,12 +100,7 @@ def test_a_batch_passes_by_the_reference_that_it_became(run, folder, tmp_path, c
         "Hardly different from the reference: dead-reckoning, isam2",
         f"Gate: passed, 16 runs held against {reference}",
     ]
-
-
-def test_a_worse_batch_ends_with_one_and_says_what_is_worse(run, folder, tmp_path, capsys):
-    reference = tmp_path / "reference.json"
-    run("bench", "bless", folder, reference)
-    assert run("bench", "gate", _write(tmp_path / "worse", 1.5), reference) == 1
+    assert run("bench", "gate", batch(tmp_path / "worse", 1.5), reference) == 1
     said = capsys.readouterr().out
     assert (
         "Worse: basin, isam2, causal.ate_se2_m: +50.0% in the mean of 8 cases, p = 0.0039 (of the whole batch)" in said
@@ -158,14 +112,14 @@ def test_a_worse_batch_ends_with_one_and_says_what_is_worse(run, folder, tmp_pat
 
 def test_only_a_strict_gate_fails_by_a_difference_that_no_test_can_judge(run, tmp_path, capsys):
     """Two seeds: twice the error is a line to look at."""
-    reference = tmp_path / "reference.json"
-    run("bench", "bless", _write(tmp_path / "before", 1.0, seeds=2), reference)
-    after = _write(tmp_path / "after", 2.0, seeds=2)
+    reference, before = tmp_path / "reference.json", batch(tmp_path / "before", seeds=2)
+    run("bench", "bless", before, reference)
+    after = batch(tmp_path / "after", 2.0, seeds=2)
     assert run("bench", "gate", after, reference) == 0
     assert "Look at: basin, isam2" in capsys.readouterr().out
     assert run("bench", "gate", after, reference, "--strict") == 1
     assert "Gate: failed, 4 runs" in capsys.readouterr().out
-    assert run("bench", "gate", tmp_path / "before", reference, "--strict") == 0
+    assert run("bench", "gate", before, reference, "--strict") == 0
 
 
 def test_no_more_than_ten_runs_that_stand_out_are_printed():
@@ -175,30 +129,16 @@ def test_no_more_than_ten_runs_that_stand_out_are_printed():
     assert any("No test of errors: isam2 (2)" in line for line in lines)
 
 
-def test_report_of_an_incomplete_batch_warns_and_is_written(run, incomplete, capsys):
-    assert run("report", incomplete) == 0
-    said = capsys.readouterr()
-    assert said.out == f"Report: {incomplete / 'report.html'}\n"
-    assert "Warning: This batch is not complete: 3 of 16 runs have not been done (dead-reckoning 1 of 8" in said.err
-    assert "3 of 16 runs" in (incomplete / "report.html").read_text("utf-8")
-
-
-def test_an_incomplete_batch_is_neither_blessed_nor_judged(run, incomplete, tmp_path, capsys):
-    reference = tmp_path / "reference.json"
+def test_an_incomplete_batch_is_neither_blessed_nor_judged(run, tmp_path, capsys):
+    reference, incomplete = tmp_path / "reference.json", batch(tmp_path / "incomplete", not_run=3)
     assert run("bench", "bless", incomplete, reference) == 2
     assert not reference.exists()
-    run("bench", "bless", _write(tmp_path / "whole", 1.0), reference)
+    run("bench", "bless", batch(tmp_path / "whole"), reference)
     capsys.readouterr()
     assert run("bench", "gate", incomplete, reference) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "3 of 16 runs have not been done" in line
     assert line.endswith("give the bench command that began it again: it goes on from there")
-
-
-def test_report_of_a_batch_that_was_killed_at_once_says_what_to_do(run, tmp_path, capsys):
-    (tmp_path / ".lock").touch()
-    assert run("report", tmp_path) == 2
-    assert "before any of its runs was done; give the bench command that began it again" in capsys.readouterr().err
 
 
 def install(site: Path, default: float) -> None:
@@ -209,40 +149,32 @@ def install(site: Path, default: float) -> None:
     (site / "noisy_estimator.py").write_text(ESTIMATOR.format(default=default))
 
 
-def command(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    path = os.pathsep.join([str(folder / "site"), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
-    program = "from sonar_graph.cli.main import main; main()"
-    return subprocess.run(
-        [sys.executable, "-c", program, "bench", *arguments],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-
-
 @pytest.mark.slow
 def test_a_default_that_got_worse_fails_the_gate_and_the_same_code_passes(tmp_path):
     pytest.importorskip("dask", reason="needs sonar-graph[bench]")
+    path = os.pathsep.join([str(tmp_path / "site"), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    environment = os.environ | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
+    program = [sys.executable, "-c", "from sonar_graph.cli.main import main; main()", "bench"]
+
+    def bench(words: str, code: int) -> subprocess.CompletedProcess[str]:
+        command = [*program, *words.split()]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300)
+        assert done.returncode == code, done.stdout + done.stderr
+        return done
+
     install(tmp_path / "site", 0.0)
     (tmp_path / "suite.toml").write_text(SUITE)
-    first = command(tmp_path, "suite.toml", "-o", "first", "--workers", "1")
-    assert first.returncode == 0, first.stderr
-    assert command(tmp_path, "bless", "first", "reference.json").returncode == 0
-
-    same = command(tmp_path, "suite.toml", "-o", "same", "--workers", "1", "--gate", "reference.json")
-    assert same.returncode == 0, same.stdout + same.stderr
+    bench("suite.toml -o first --workers 1", 0)
+    bench("bless first reference.json", 0)
+    same = bench("suite.toml -o same --workers 1 --gate reference.json", 0)
     assert "Gate: passed, 6 runs" in same.stdout
     assert "Worse" not in same.stdout
 
     install(tmp_path / "site", 1.0)
-    worse = command(tmp_path, "suite.toml", "-o", "worse", "--workers", "1", "--gate", "reference.json")
-    assert worse.returncode == 1, worse.stdout + worse.stderr
+    worse = bench("suite.toml -o worse --workers 1 --gate reference.json", 1)
     assert "Worse: basin, noisy, causal.ate_se2_m, smoothed.ate_se2_m: +" in worse.stdout
     assert "dead-reckoning, causal" not in worse.stdout
 
     (tmp_path / "suite.toml").write_text(SUITE.replace('"noisy"\n', '"noisy"\nparams = { lag_s = 2.0 }\n'))
-    other = command(tmp_path, "suite.toml", "-o", "other", "--workers", "1", "--gate", "reference.json")
-    assert other.returncode == 2
+    other = bench("suite.toml -o other --workers 1 --gate reference.json", 2)
     assert "noisy, seed 0: settings.lag_s is 2.0, in the reference not given" in other.stderr

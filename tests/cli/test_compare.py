@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -69,12 +70,9 @@ def test_failed_run_is_written_and_reported_by_exit_code(run, basin, tmp_path, m
     assert json.loads((tmp_path / "runs" / "ekf-slam" / "result.json").read_text())["status"] == "ok"
 
 
-def test_run_writes_one_estimator(run, basin, tmp_path):
-    assert run("run", basin, "--estimator", "dead-reckoning", "-o", tmp_path) == 0
-    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["dead-reckoning"]
-
-
-def test_calibration_file_goes_before_that_of_the_log_field_by_field(run, basin, tmp_path):
+def test_run_writes_one_estimator_with_the_calibration_given_before_that_of_the_log_field_by_field(
+    run, basin, tmp_path
+):
     moved = tmp_path / "moved.toml"
     moved.write_text("[start]\nposition_m = [100.0, 0.0, -1.0]\n")
     arguments = ("run", basin, "--estimator", "dead-reckoning", "-o", tmp_path / "out")
@@ -83,6 +81,7 @@ def test_calibration_file_goes_before_that_of_the_log_field_by_field(run, basin,
         assert run(*arguments, *more) == 0
         said = json.loads((tmp_path / "out" / "comparison.json").read_text())["sequence"]
         calibrations.append(said["calibration"])
+    assert [path.name for path in (tmp_path / "out" / "runs").iterdir()] == ["dead-reckoning"]
     first = (tmp_path / "out" / "runs" / "dead-reckoning" / "causal.tum").read_text().splitlines()[1].split()
     assert float(first[1]) == pytest.approx(100, abs=3)
     of_log, changed = calibrations
@@ -92,7 +91,6 @@ def test_calibration_file_goes_before_that_of_the_log_field_by_field(run, basin,
 
 
 def test_estimators_lists_every_setting(run, capsys):
-
     assert run("estimators") == 0
     shown = capsys.readouterr().out
     for name in ("isam2", "invariant-ekf", "ekf-slam", "dead-reckoning"):
@@ -136,10 +134,8 @@ def test_demo_goes_from_images_to_the_papers_table(run, tmp_path, capsys, monkey
     comparison = read_comparison(tmp_path)
     assert comparison.recognition is not None
     assert comparison.recognition.frames > 600
-    assert {run.estimator for run in comparison.runs if run.landmarks is not None and len(run.landmarks) == 4} == {
-        "isam2",
-        "ekf-slam",
-    }
+    found = {run.estimator for run in comparison.runs if run.landmarks is not None and len(run.landmarks) == 4}
+    assert found == {"isam2", "ekf-slam"}
 
 
 def test_demo_drives_the_three_laps_of_the_paper_with_images():
@@ -156,16 +152,35 @@ def measured_at(stamps_s: list[float]) -> Sequence:
     return Sequence("dive", Calibration(), Imu(stamps_ns, vectors, vectors), dvl)
 
 
-def test_estimates_are_asked_for_at_most_as_often_as_the_imu_measures():
-    dive = measured_at(np.arange(0, 10.01, 0.05).tolist())
-    check_rate(20.0, dive)
+def test_estimates_are_asked_for_at_most_as_often_as_the_imu_measures_or_at_the_default_rate():
+    dive, slow = measured_at(np.arange(0, 10.01, 0.05).tolist()), measured_at([0.0, 1.0, 2.0])
+    one_row = replace(slow, imu=slow.imu.between(0, 10**9))
+    for rate_hz, sequence in ((20.0, dive), (2.0, slow), (2.0, one_row)):
+        check_rate(rate_hz, sequence)
     with pytest.raises(EvaluationError, match=r"--rate-hz 21: the IMU of dive .* at most 20\.1"):
         check_rate(21.0, dive)
-
-
-def test_the_default_rate_is_never_refused():
-    slow = measured_at([0.0, 1.0, 2.0])
-    check_rate(2.0, slow)
     with pytest.raises(EvaluationError, match=r"give at most 2$"):
         check_rate(3.0, slow)
-    check_rate(2.0, replace(slow, imu=slow.imu.between(0, 10**9)))  # one row
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "theory" / "datasets.md"
+
+
+@pytest.mark.slow
+@pytest.mark.recording
+def test_the_documented_commands_convert_inspect_and_reckon(run, recordings, tmp_path, monkeypatch, capsys):
+    """A pool run with a Doppler log of unknown axes: the commands and the file of the page, and no code."""
+    section = PAGE.read_text(encoding="utf-8").split("## SONIA")[1]
+    (toml,) = re.findall(r"```toml\n(.*?)```", section, re.DOTALL)
+    (tmp_path / "sonia.toml").write_text(toml, encoding="utf-8")
+    (tmp_path / "sonia_imu_dvl.bag").symlink_to(recordings / "bags" / "sonia_imu_dvl.bag")
+    monkeypatch.chdir(tmp_path)
+    printed = []
+    for line in re.findall(r"^    sonar-graph (.*)$", section, re.MULTILINE):
+        assert run(*line.split()) == 0
+        printed.append(capsys.readouterr().out)
+    assert len(printed) == 3
+    assert re.search(r"DVL against IMU: time offset [+-]0\.\d+ ± 0\.\d+ s: no need to act", printed[1])
+    path = np.loadtxt("sonia/runs/dead-reckoning/causal.tum")[:, 1:4]
+    assert np.all(np.ptp(path, axis=0)[:2] < 5), "the vehicle stays in the pool"
+    assert 35 < np.linalg.norm(np.diff(path, axis=0), axis=1).sum() < 50

@@ -48,7 +48,12 @@ def test_a_mounting_in_the_calibration_moves_the_yaw_found(log, tmp_path):
     assert "dvl.mounting.rpy_rad" in yaw["advice"]
 
 
-def test_quick_says_that_nothing_was_compared(log):
+def test_json_has_lever_arm_bias_and_start_as_numbers_unless_nothing_was_compared(log):
+    said = answer(log)
+    assert sensor(said, "lever arm from IMU to DVL, x")["value"] == pytest.approx(-0.2, abs=0.1)
+    assert sensor(said, "lever arm from IMU to DVL, z")["unit"] == "m"
+    assert abs(sensor(said, "gyro bias, x")["value"]) < 1e-3
+    assert 0 < sensor(said, "start pitch: value")["sigma"] < 0.2
     said = answer(log, "--quick")
     assert said["sensors"] == []
     assert "--quick" in said["sensors_skipped"]
@@ -65,24 +70,12 @@ def test_sentences_say_whether_to_act(log):
         assert f"\n{row} " in result.stdout
 
 
-def test_json_has_lever_arm_bias_and_start_as_numbers(log):
-    said = answer(log)
-    assert sensor(said, "lever arm from IMU to DVL, x")["value"] == pytest.approx(-0.2, abs=0.1)
-    assert sensor(said, "lever arm from IMU to DVL, z")["unit"] == "m"
-    assert abs(sensor(said, "gyro bias, x")["value"]) < 1e-3
-    assert 0 < sensor(said, "start pitch: value")["sigma"] < 0.2
-
-
-def test_inspect_names_the_topics(run, basin, capsys):
+def test_inspect_names_the_topics_and_ends_in_what_compare_would_lack(run, basin, monkeypatch, capsys):
     assert run("inspect", basin) == 0
     shown = capsys.readouterr().out
     for name in ("sensor_msgs/msg/Imu", "marine_acoustic_msgs/msg/Dvl", "sonar_graph_msgs/msg/LandmarkDetections"):
         assert name in shown
-
-
-def test_inspect_ends_in_what_compare_would_lack(run, basin, monkeypatch, capsys):
-    assert run("inspect", basin) == 0
-    assert "not usable" not in capsys.readouterr().out
+    assert "not usable" not in shown
     monkeypatch.setattr(LogSummary, "obstacles", ("no IMU (a/msg/B)", "no DVL (c/msg/D)"))
     assert run("inspect", basin) == 0
     *_, lack, advice = capsys.readouterr().out.splitlines()

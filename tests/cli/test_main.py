@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,6 @@ import typer.main
 
 import sonar_graph
 from sonar_graph.cli.main import app
-
-Run = Callable[..., int]
 
 
 def commands(group: Any = None, path: tuple[str, ...] = ()) -> dict[tuple[str, ...], Any]:
@@ -26,10 +23,6 @@ def commands(group: Any = None, path: tuple[str, ...] = ()) -> dict[tuple[str, .
         deeper = hasattr(command, "commands")
         found |= commands(command, (*path, name)) if deeper else {(*path, name): command}
     return found
-
-
-def examples_of(command: Any) -> list[list[str]]:
-    return [line.split() for line in command.epilog.splitlines() if line.startswith("sonar-graph ")]
 
 
 def test_no_argument_shows_the_commands(run, capsys):
@@ -45,47 +38,35 @@ def test_help_does_not_wait_for_heavy_imports(run):
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
-def test_version_is_that_of_the_package(run, capsys):
-    assert run("--version") == 0
-    assert capsys.readouterr().out == f"sonar-graph {sonar_graph.__version__}\n"
+def test_version_is_that_of_the_package_which_can_be_run_as_a_module(run, capsys):
     assert run("--version", "nonsense") == 0
+    assert capsys.readouterr().out == f"sonar-graph {sonar_graph.__version__}\n"
+    done = subprocess.run([sys.executable, "-m", "sonar_graph", "--version"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"sonar-graph {sonar_graph.__version__}\n", "")
 
 
-@pytest.mark.parametrize("path", commands(), ids=" ".join)
-def test_every_command_has_help_that_ends_in_examples(run, path, capsys):
+GROUPS = {(path[0],): None for path in commands() if len(path) > 1}
+
+
+@pytest.mark.parametrize("path", commands() | GROUPS, ids=" ".join)
+def test_every_command_and_group_has_help_that_ends_in_examples(run, path, capsys):
     assert run(*path, "--help") == 0
     assert f"sonar-graph {' '.join(path)}" in capsys.readouterr().out.partition("Examples:")[2]
 
 
-@pytest.mark.parametrize("path", commands(), ids=" ".join)
-def test_examples_in_help_are_understood(path, tmp_path, monkeypatch):
+def test_examples_in_help_are_understood(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name in (
-        "dive.mcap",
-        "vehicle.toml",
-        "dive.toml",
-        "dive.bag",
-        "dive.ddf",
-        "dive.aris",
-        "pings.raw",
-        "reference.json",
-        "suite.toml",
-    ):
+    files = "dive.mcap vehicle.toml dive.toml dive.bag dive.ddf dive.aris pings.raw reference.json suite.toml"
+    for name in files.split():
         Path(name).touch()
     for name in ("comparison", "MRCLAM_Dataset6", "DLR", "A-KIT", "ros2_bag_folder", "results"):
         Path(name).mkdir()
-    command = commands()[path]
-    examples = examples_of(command)
-    assert examples
-    for words in examples:
-        assert tuple(words[1 : 1 + len(path)]) == path
-        command.make_context(path[-1], words[1 + len(path) :])
-
-
-@pytest.mark.parametrize("group", ["simulate", "convert", "bench"])
-def test_help_of_a_group_ends_in_examples(run, group, capsys):
-    assert run(group, "--help") == 0
-    assert f"sonar-graph {group} " in capsys.readouterr().out.partition("Examples:")[2]
+    for path, command in commands().items():
+        examples = [line.split() for line in command.epilog.splitlines() if line.startswith("sonar-graph ")]
+        assert examples
+        for words in examples:
+            assert tuple(words[1 : 1 + len(path)]) == path
+            command.make_context(path[-1], words[1 + len(path) :])
 
 
 def test_help_names_defaults_presets_and_roles_as_they_are():
@@ -108,7 +89,9 @@ def test_help_names_defaults_presets_and_roles_as_they_are():
     assert topic.endswith(f" Roles: {', '.join(ROLES)}.")
 
 
-def test_the_package_can_be_run_as_a_module():
-    done = subprocess.run([sys.executable, "-m", "sonar_graph", "--version"], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert sonar_graph.__version__ in done.stdout
+def test_every_command_that_writes_from_a_file_is_tried_in_the_tests_of_outputs():
+    """A command that joins later must not be forgotten."""
+    writing = {path[-1] for path, c in commands().items() if any(option.name == "output" for option in c.params)}
+    of_folders, of_nothing = {"mrclam", "dlr", "akit"}, {"basin", "demo"}
+    tried = {"rosbag", "didson", "aris", "oculus", "victoria-park", "compare", "recognise", "landmarks", "calibrate"}
+    assert writing == tried | of_folders | of_nothing | {"run"}

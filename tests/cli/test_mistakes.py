@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 
@@ -14,10 +14,8 @@ from sonar_graph.cli.main import main
 from sonar_graph.logs.mcap.writer import write_recording
 from sonar_graph.logs.writing import sonar_image_messages, write_log
 
-if TYPE_CHECKING:
-    pass
-
 DESIGN = '[[landmark]]\nid = {id}\nname = "plate"\nsize_m = {size_m}\nshapes = [{{ level_db = 12.0, {shape} }}]\n'
+SUITE = 'name = "x"\nreference = "b"\n[[logs]]\nname = "a"\nlog = "a.mcap"\n[[estimators]]\nname = "b"\n'
 CIRCLE, BAR = "circle_m = [0.0, 0.0, 0.15]", "polygon_m = [[-0.3, -0.02], [0.3, -0.02], [0.3, 0.02], [-0.3, 0.02]]"
 
 
@@ -36,6 +34,9 @@ def files(lane, lane_log, basin_content, tmp_path_factory) -> Path:
     texts |= {"strange.toml": DESIGN.format(id=9, size_m=0.6, shape=BAR)}
     texts |= {"broken.toml": DESIGN.format(id=1, size_m=-1, shape=CIRCLE)}
     texts |= {"large.toml": DESIGN.format(id=4, size_m=2.0, shape=CIRCLE.replace("0.15", "1.0"))}
+    texts |= {"gyro.toml": "[imu]\ngyro_sigma = 1\n", "logs.toml": 'name = "x"\nreference = "isam2"\nlogs = 3\n'}
+    texts |= {"late.toml": SUITE, "killed/.lock": ""}
+    (folder / "killed").mkdir()
     for name, text in texts.items():
         (folder / name).write_text(text)
     (folder / "empty").mkdir()
@@ -85,6 +86,7 @@ MISTAKES = {
     "run basin.mcap -o out --topic smell=/imu/data": "smell",
     "run basin.mcap -o out --topic imu=/imu/raw": "/imu/raw",
     "run basin.mcap -o out --calibration notes.txt": "not TOML",
+    "run basin.mcap -o out --calibration gyro.toml": r"gyro\.toml: imu\.gyro_sigma",
     "run basin.mcap -o out --calibration list.json": "expected an object with sections",
     "simulate basin -o new.mcap --set wind=3": "wind",
     "simulate basin -o new.mcap --images --set image.nois=1": r"image\.nois: there is no such field.*noise_db",
@@ -96,6 +98,10 @@ MISTAKES = {
     "simulate landmarks --on basin.mcap -o basin.mcap --overwrite": "is what is read",
     "convert mrclam empty --robot 1 -o new.mcap": "empty",
     "report empty": "empty",
+    "report killed": "before any of its runs was done; give the bench command that began it again",
+    "bench logs.toml -o out": r"logs\.toml, line 3: logs",
+    "bench late.toml -o out": r"late\.toml, line 7: est",
+    "bench late.toml -o out --workers 2 --scheduler tcp://127.0.0.1:1": "give one of them",
     "bench bless empty new.json": r"no results\.parquet in it",
     "recognise bare.mcap -o new.mcap": r"bare\.mcap: has no sonar images; .*inspect .*` lists .*compare` .* need none",
     "recognise lane.mcap -o new.mcap --rule bayes": "rule.*virtual-evidence.*jeffrey",

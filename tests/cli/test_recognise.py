@@ -8,7 +8,7 @@ import sys
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -36,16 +36,6 @@ def recognised(lane_log, run, tmp_path_factory):
     return out
 
 
-@pytest.fixture(scope="module")
-def strange_designs(tmp_path_factory) -> Path:
-    """Of a landmark that is not in the log."""
-    path = tmp_path_factory.mktemp("strange") / "mine.toml"
-    bar = "polygon_m = [[-0.3, -0.02], [0.3, -0.02], [0.3, 0.02], [-0.3, 0.02]]"
-    text = DESIGNS.replace("size_m = 0.3", "size_m = 0.6").replace("circle_m = [0.0, 0.0, 0.15]", bar)
-    path.write_text(text.replace("id = 4", "id = 9"))
-    return path
-
-
 def contents(path: Path) -> Counter[tuple[str, int, bytes]]:
     with path.open("rb") as stream:
         return Counter((channel.topic, m.log_time, m.data) for _, channel, m in make_reader(stream).iter_messages())
@@ -57,7 +47,6 @@ def test_recognise_adds_detections_and_leaves_the_rest_as_it_was(lane_log, recog
     added = after - before
     assert {topic for topic, _, _ in added} == {"/sonar/landmarks"}
     found, expected = read_log(recognised).detections, lane_recognition.detections
-    assert found is not None
     np.testing.assert_array_equal(found.stamps_ns, expected.stamps_ns)
     np.testing.assert_allclose(found.range_m, expected.range_m, atol=1e-4)
     np.testing.assert_allclose(found.range_azimuth_cov, expected.range_azimuth_cov, rtol=1e-3, atol=1e-9)
@@ -79,12 +68,13 @@ def test_recognise_says_what_became_of_everything(lane, lane_log, lane_recogniti
     assert "Warning" not in said
 
 
-def test_where_nothing_is_recognised_one_line_says_so_and_what_was_looked_for(
-    lane_log, strange_designs, run, tmp_path, capsys
-):
-    for command, out in (("recognise", "out.mcap"), ("compare", "out")):
-        more = QUICK if command == "compare" else ()
-        assert run(command, lane_log, "-o", tmp_path / out, "--designs", strange_designs, *more) == 0
+def test_where_nothing_is_recognised_one_line_says_so_and_what_was_looked_for(lane_log, run, tmp_path, capsys):
+    strange = tmp_path / "strange.toml"  # of a landmark that is not in the log
+    bar = "polygon_m = [[-0.3, -0.02], [0.3, -0.02], [0.3, 0.02], [-0.3, 0.02]]"
+    text = DESIGNS.replace("size_m = 0.3", "size_m = 0.6").replace("circle_m = [0.0, 0.0, 0.15]", bar)
+    strange.write_text(text.replace("id = 4", "id = 9"))
+    for command, out, more in (("recognise", "out.mcap", ()), ("compare", "out", QUICK)):
+        assert run(command, lane_log, "-o", tmp_path / out, "--designs", strange, *more) == 0
         said = capsys.readouterr().out
         assert "Warning: no landmark was recognised; looked for 9: plate; --designs gives others" in said
 
@@ -103,8 +93,6 @@ def test_recognising_again_replaces_what_was_there(recognised, run, tmp_path, ca
     assert run("recognise", recognised, "-o", tmp_path / "again.mcap", "--rule", "jeffrey") == 0
     assert "Replaced: " in capsys.readouterr().out
     one, other = read_log(recognised).detections, read_log(tmp_path / "again.mcap").detections
-    assert one is not None
-    assert other is not None
     assert len(one) == len(other)
     assert not np.allclose(one.id_probability, other.id_probability)
 
@@ -139,17 +127,17 @@ def test_a_model_that_calibrate_wrote_is_used(lane_log, run, tmp_path, monkeypat
     assert model.provenance["logs"] == "lane.mcap"
     assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--model", tmp_path / "model.json") == 0
     found = read_log(tmp_path / "out.mcap").detections
-    assert found is not None
     assert np.median(found.range_azimuth_cov[:, 0, 0]) < 0.05**2
 
 
-def test_designs_of_ones_own_need_no_code(lane_log, run, tmp_path, capsys):
+def test_designs_of_ones_own_and_settings_need_no_code(lane_log, run, tmp_path, capsys):
     (tmp_path / "mine.toml").write_text(DESIGNS)
     assert run("recognise", lane_log, "-o", tmp_path / "out.mcap", "--designs", tmp_path / "mine.toml") == 0
     assert "Warning: the log has landmarks 1, 2, 3, of which there is no design" in capsys.readouterr().out
     found = read_log(tmp_path / "out.mcap").detections
-    assert found is not None
     assert np.unique(found.candidate_ids).tolist() == [4]
+    assert run("recognise", lane_log, "-o", tmp_path / "none.mcap", "--set", "least_frames=10000") == 0
+    assert read_log(tmp_path / "none.mcap").detections is None
 
 
 class Decoder:
@@ -163,35 +151,19 @@ class Decoder:
         return [[5, corners, corners]] if image.any() else []
 
 
-@pytest.fixture
-def actag(monkeypatch):
-    module = ModuleType("actag")
-    module.AcTag = Decoder
-    monkeypatch.setitem(sys.modules, "actag", module)
-
-
-def test_tags_are_written_as_landmarks(lane_log, actag, run, tmp_path):
+def test_tags_are_written_as_landmarks_where_actag_is_installed(lane_log, run, tmp_path, monkeypatch, capsys):
     written = tmp_path / "tags.mcap"
+    monkeypatch.setitem(sys.modules, "actag", None)
+    assert run("recognise", lane_log, "-o", written, "--recogniser", "actag") == 2
+    assert "sonar-graph[actag]" in " ".join(capsys.readouterr().err.split())
+    assert not written.exists()
+    monkeypatch.setitem(sys.modules, "actag", SimpleNamespace(AcTag=Decoder))
     assert run("recognise", lane_log, "-o", written, "--recogniser", "actag", "--set", "tag_size_m=0.15") == 0
     sequence = read_log(written)
     found = sequence.detections
-    assert found is not None
     assert len(found) > 50
     assert set(found.candidate_ids.ravel().tolist()) == {5}
     np.testing.assert_allclose(found.range_m, 1.95)
     np.testing.assert_allclose(found.azimuth_rad, 0.05)
     assert "AcTag" in sequence.notes["detections.rule"]
     assert "0.15 m" in sequence.notes["detections.designs"]
-
-
-def test_without_actag_one_line_names_the_extra(lane_log, monkeypatch, run, tmp_path, capsys):
-    monkeypatch.setitem(sys.modules, "actag", None)
-    assert run("recognise", lane_log, "-o", tmp_path / "tags.mcap", "--recogniser", "actag") == 2
-    assert "sonar-graph[actag]" in " ".join(capsys.readouterr().err.split())
-    assert not (tmp_path / "tags.mcap").exists()
-
-
-def test_settings_reach_the_recogniser(lane_log, run, tmp_path):
-    written = tmp_path / "none.mcap"
-    assert run("recognise", lane_log, "-o", written, "--set", "least_frames=10000") == 0
-    assert read_log(written).detections is None

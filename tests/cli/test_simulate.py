@@ -28,7 +28,7 @@ def simulate(path: Path, *more: str, said: str = "Log: ") -> None:
     assert said in result.output
 
 
-def test_images_and_other_sensors_are_those_of_the_library(tmp_path):
+def test_images_and_other_sensors_are_those_of_the_library_in_the_order_of_time(tmp_path):
     simulate(
         tmp_path / "a.mcap", said="Landmarks: 1 disc at (5, 0), 2 square at (7, -5), 3 triangle at (2, -7), 4 cross"
     )
@@ -42,6 +42,10 @@ def test_images_and_other_sensors_are_those_of_the_library(tmp_path):
     assert sequence.detections is None
     np.testing.assert_array_equal(sequence.imu.angular_velocity, expected.imu.angular_velocity)
     assert sequence.true_landmarks is not None
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        times_ns = [record.log_time for record in StreamReader(stream).records if isinstance(record, Message)]
+    assert len(times_ns) > 60
+    assert times_ns == sorted(times_ns)
 
 
 @pytest.mark.slow
@@ -51,14 +55,6 @@ def test_same_seed_gives_the_same_bytes(tmp_path):
     contents = [(tmp_path / f"{name}.mcap").read_bytes() for name in "abc"]
     assert contents[0] == contents[1]
     assert contents[0] != contents[2]
-
-
-def test_images_lie_among_the_other_messages_in_the_order_of_time(tmp_path):
-    simulate(tmp_path / "a.mcap")
-    with (tmp_path / "a.mcap").open("rb") as stream:
-        times_ns = [record.log_time for record in StreamReader(stream).records if isinstance(record, Message)]
-    assert len(times_ns) > 60
-    assert times_ns == sorted(times_ns)
 
 
 def test_simulation_flags_and_settings_reach_the_simulator(run, tmp_path, monkeypatch, capsys):
@@ -81,29 +77,17 @@ def log(tmp_path_factory) -> Path:
     return path
 
 
-def place(*words: str | Path) -> tuple[int, str]:
-    result = CliRunner().invoke(app, ["simulate", "landmarks", *map(str, words)])
-    return result.exit_code, " ".join(result.output.split())
-
-
-def test_the_log_gets_what_the_library_places_and_keeps_its_sensors(log, tmp_path):
-    code, said = place("--on", log, "-o", tmp_path / "new.mcap", "--seed", "3", "--set", "spacing_m=4")
-    assert code == 0, said
-    read, recorded = read_log(tmp_path / "new.mcap"), read_log(log)
-    expected = add_landmarks(recorded, LandmarkOptions(seed=3, spacing_m=4.0))
-    assert read.detections is not None
-    assert expected.detections is not None
-    np.testing.assert_allclose(read.detections.range_m, expected.detections.range_m, atol=1e-6)
-    np.testing.assert_array_equal(read.imu.angular_velocity, recorded.imu.angular_velocity)
-    np.testing.assert_array_equal(read.dvl.velocity, recorded.dvl.velocity)
-    assert f"{len(read.true_landmarks or ())} landmarks, {len(read.detections)} detections" in said
-
-
-def test_another_seed_is_another_map(log, tmp_path):
+def test_the_log_gets_what_the_library_places_and_keeps_its_sensors(log, run, tmp_path, capsys):
     maps = []
-    for seed in "12":
-        assert place("--on", log, "-o", tmp_path / f"{seed}.mcap", "--seed", seed)[0] == 0
-        maps.append(read_log(tmp_path / f"{seed}.mcap").true_landmarks)
-    assert maps[0] is not None
-    assert maps[1] is not None
-    assert not np.array_equal(maps[0].positions, maps[1].positions)
+    for seed in (3, 4):
+        new = tmp_path / f"{seed}.mcap"
+        assert run("simulate", "landmarks", "--on", log, "-o", new, "--seed", seed, "--set", "spacing_m=4") == 0
+        read, recorded = read_log(new), read_log(log)
+        expected = add_landmarks(recorded, LandmarkOptions(seed=seed, spacing_m=4.0))
+        np.testing.assert_allclose(read.detections.range_m, expected.detections.range_m, atol=1e-6)
+        np.testing.assert_array_equal(read.imu.angular_velocity, recorded.imu.angular_velocity)
+        np.testing.assert_array_equal(read.dvl.velocity, recorded.dvl.velocity)
+        said = f"{len(read.true_landmarks)} landmarks, {len(read.detections)} detections"
+        assert said in " ".join(capsys.readouterr().out.split())
+        maps.append(read.true_landmarks.positions)
+    assert not np.array_equal(*maps)

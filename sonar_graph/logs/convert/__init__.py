@@ -5,11 +5,11 @@ from sonar_graph.logs.convert.akit import read_akit
 from sonar_graph.logs.convert.didson_aris import convert_aris, convert_didson
 from sonar_graph.logs.convert.mrclam import read_mrclam
 from sonar_graph.logs.convert.oculus import convert_oculus
-from sonar_graph.logs.convert.rosbag import convert_rosbag
+from sonar_graph.logs.convert.rosbag import BagConversion, convert_rosbag
 from sonar_graph.logs.convert.sonar_file import SonarConversion
 from sonar_graph.logs.convert.step_files import read_dlr, read_victoria_park
 
 __all__ = [
-    "SonarConversion", "convert_aris", "convert_didson", "convert_oculus", "convert_rosbag",
+    "BagConversion", "SonarConversion", "convert_aris", "convert_didson", "convert_oculus", "convert_rosbag",
     "read_akit", "read_dlr", "read_mrclam", "read_victoria_park",
 ]

@@ -36,7 +36,7 @@ Recode = Callable[[bytes], memoryview]
 
 
 @dataclass
-class Conversion:
+class BagConversion:
     """Result of the conversion of a bag."""
 
     topics: int
@@ -45,8 +45,17 @@ class Conversion:
     left_out: dict[str, str] = field(default_factory=dict)
     """Topics without some or all of their messages, with the reason."""
 
+    @property
+    def content(self) -> str:
+        """Duration and counts."""
+        return f"{self.duration_s:.1f} s, {self.messages} messages on {self.topics} topics"
 
-def convert_rosbag(source: Path, output: Path, progress: Progress | None = None) -> Conversion:
+    def shortcomings(self, most: int | None = None) -> list[str]:  # noqa: ARG002
+        """Lines about all topics that are left out."""
+        return [f"left out: {topic}: {reason}" for topic, reason in self.left_out.items()]
+
+
+def convert_rosbag(source: Path, output: Path, progress: Progress | None = None) -> BagConversion:
     """Write an MCAP log of a whole bag; an existing file is replaced only when the new one is complete.
 
     Parameters
@@ -106,7 +115,7 @@ class _BagCopy:
         self._schemas: dict[str, int] = {}
         self._recoders: dict[str, Recode] = {}
 
-    def run(self, progress: Progress | None) -> Conversion:
+    def run(self, progress: Progress | None) -> BagConversion:
         from rosbags.serde import SerdeError
 
         bag, writer = self._bag, self._writer
@@ -117,7 +126,9 @@ class _BagCopy:
         connections = [c for c in bag.connections if c.msgtype in bag.typestore.fielddefs]
         missing = {c.topic: f"{c.msgtype} is not defined in the bag" for c in bag.connections if c not in connections}
         channels = {(c.id, id(c.owner)): self._channel(c) for c in connections}
-        conversion = Conversion(len({c.topic for c in connections}), duration_s=bag.duration * 1e-9, left_out=missing)
+        conversion = BagConversion(
+            len({c.topic for c in connections}), duration_s=bag.duration * 1e-9, left_out=missing
+        )
         broken: dict[str, int] = {}
         total = sum(c.msgcount for c in connections)
         for number, (connection, time_ns, raw) in enumerate(

@@ -317,6 +317,11 @@ class SonarConversion:
         """Time from the first frame to the last."""
         return (self.last_ns - self.first_ns) * 1e-9
 
+    @property
+    def content(self) -> str:
+        """Number of frames and duration."""
+        return f"{self.frames} frames, {self.duration_s:.1f} s"
+
     def shortcomings(self, most: int | None = None) -> list[str]:
         """Lines about lost and missing frames; at most ``most`` of the losses."""
         lines = [f"lost: {loss}" for loss in self.lost[:most]]
