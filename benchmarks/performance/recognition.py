@@ -161,8 +161,7 @@ def race(path: Path, sequence: Sequence, clocks: Clocks) -> int:
         known = []
         for frame in seen:
             with clocks.timing("motion"):
-                motion = motions.at(int(frame.stamps_ns[0]))
-                known.append((motion.step(), motion.floor_view()))
+                known.append(motions.at(int(frame.stamps_ns[0])))
         compared = [(number + k) % ACTAG_EVERY == 0 for k in range(len(seen))]
         number += len(seen)
         for frame, (step, view), is_compared in zip(seen, known, compared, strict=True):

@@ -245,11 +245,10 @@ class RecognitionSession:
             reason = OUT_OF_ORDER if self._motions.passed(stamp_ns) else NO_ODOMETRY
             self._warn(stamp_ns, f"{NOT_USED}: {reason}")
             return None
-        motion = self._motions.at(stamp_ns)
+        step, view = self._motions.at(stamp_ns)
         frame = with_lens(frame, self._sonar.lens)
-        view = motion.floor_view()
         self.result.outcomes[NO_FLOOR] += view is None
-        found = self.recogniser.process(frame, motion.step(), view)
+        found = self.recogniser.process(frame, step, view)
         is_used = True
         for fate in self.recogniser.fates:
             if np.isnan(fate.range_m) and fate.track < 0:

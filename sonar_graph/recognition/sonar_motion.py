@@ -6,9 +6,6 @@ depth and the calibration's floor. Nothing stamped after a frame is used for it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import gtsam
 import numpy as np
 
 from sonar_graph.measurements import Depth, Floats
@@ -21,33 +18,6 @@ from sonar_graph.sonar import FloorView, SonarStep
 GRAVITY_INTERVAL_NS = NS_PER_S
 """Shortest time over which accelerometers are averaged; the noise of velocity at its ends falls with its square."""
 _NO_BIAS = np.zeros(3)
-
-
-@dataclass(frozen=True, eq=False)
-class SonarMotion:
-    """Motion, tilt and height of the sonar at a frame."""
-
-    previous_T_sonar: gtsam.Pose3 | None
-    """Motion from the frame before; None for the first."""
-    covariance: Floats
-    """Of its perturbation [rotation, translation], shape (6, 6)."""
-    level_R_sonar: Floats
-    """Rotation from sonar axes to level ones (z up, x horizontal along the centre beam), shape (3, 3)."""
-    tilt_sigma_rad: float
-    """Standard deviation of its tilt."""
-    height_m: float | None
-    """Height over the floor; None where it is not known."""
-    height_sigma_m: float
-
-    def step(self) -> SonarStep | None:
-        """Motion since the frame before, for the tracker; None for the first frame."""
-        return None if self.previous_T_sonar is None else SonarStep(self.previous_T_sonar, self.covariance)
-
-    def floor_view(self) -> FloorView | None:
-        """The floor; None where the height over it is not known or not positive."""
-        if self.height_m is None or self.height_m <= 0:
-            return None
-        return FloorView(self.level_R_sonar, self.height_m, self.height_sigma_m, self.tilt_sigma_rad)
 
 
 class _Tilt:
@@ -143,32 +113,31 @@ class SonarMotions:
         """True for an instant before the last one asked for."""
         return not self._is_first and stamp_ns < self._stamp_ns
 
-    def at(self, stamp_ns: int) -> SonarMotion:
-        """Motion, tilt and height at a frame, not before that of the last call."""
-        motion = self._between(self._stamp_ns, stamp_ns)
+    def at(self, stamp_ns: int) -> tuple[SonarStep | None, FloorView | None]:
+        """Motion since the frame before and view of the floor, at a frame not before that of the last call.
+
+        The motion of the first frame is None, and so is the view where the height is not known or not positive.
+        """
+        motion, step, view = self._between(self._stamp_ns, stamp_ns), None, None
         self._tilt.reach(stamp_ns)
         up, tilt_variance = self._tilt.after(self._between(self._tilt.node_ns, stamp_ns))
         body_R_previous = motion.i_T_j.rotation().matrix().T
         climbed = up @ body_R_previous @ motion.i_T_j.translation()
         self._height.carry(float(climbed), float(np.trace(motion.covariance[3:, 3:])) / 3)
         self._height.correct(up, stamp_ns)
-        height = None
+        if not self._is_first:
+            sonar_T_body = self._body_T_sonar.inverse()
+            adjoint = sonar_T_body.AdjointMap()
+            previous_T_sonar = sonar_T_body.compose(motion.i_T_j).compose(self._body_T_sonar)
+            step = SonarStep(previous_T_sonar, adjoint @ motion.covariance @ adjoint.T)
+        self._stamp_ns, self._is_first = stamp_ns, False
         if self._floor is not None:
-            height = float(self._height.z_m + up @ self._body_T_sonar.translation() - self._floor.z_m)
-        self._stamp_ns = stamp_ns
-        sonar_T_body = self._body_T_sonar.inverse()
-        adjoint = sonar_T_body.AdjointMap()
-        relative = None if self._is_first else sonar_T_body.compose(motion.i_T_j).compose(self._body_T_sonar)
-        self._is_first = False
-        up_in_sonar = self._body_T_sonar.rotation().matrix().T @ up
-        return SonarMotion(
-            relative,
-            adjoint @ motion.covariance @ adjoint.T,
-            level_from_up(up_in_sonar),
-            float(np.sqrt(tilt_variance)),
-            height,
-            float(np.hypot(np.sqrt(self._height.variance), self._floor.sigma_m if self._floor else 0.0)),
-        )
+            height_m = float(self._height.z_m + up @ self._body_T_sonar.translation() - self._floor.z_m)
+            if height_m > 0:
+                level_R_sonar = level_from_up(self._body_T_sonar.rotation().matrix().T @ up)
+                sigma_m = float(np.hypot(np.sqrt(self._height.variance), self._floor.sigma_m))
+                view = FloorView(level_R_sonar, height_m, sigma_m, float(np.sqrt(tilt_variance)))
+        return step, view
 
     def _between(self, start_ns: int, end_ns: int) -> PreintegratedMotion:
         return motion_between(self._odometry, self._preintegrator, start_ns, end_ns, _NO_BIAS)

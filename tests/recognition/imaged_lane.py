@@ -17,7 +17,7 @@ from sonar_graph.logs.writing import sonar_image_messages, write_log
 from sonar_graph.measurements import SonarFrames
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BODY_Z_M, FLOOR_Z_M, YSHARK
-from sonar_graph.simulation.detections import World, world_on_floor
+from sonar_graph.simulation.detections import world_on_floor
 from sonar_graph.simulation.options import SimulationOptions
 from sonar_graph.simulation.recording import Streams, frame_stamps, record
 from sonar_graph.simulation.sonar_image.frames import FrameSimulator, FrameTruth, image_along
@@ -34,13 +34,11 @@ TOPIC = "/sonar/image"
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """The sensors of the run, its images, and what is in them."""
+    """The sensors of the run (without detections), its images, and what is in each of them."""
 
     sequence: Sequence
-    """Without detections."""
     frames: SonarFrames
     truth: list[FrameTruth]
-    """One a frame."""
     path: VehiclePath
 
     def write(self, log: Path, frames: Iterable[SonarFrames] | None = None) -> Path:
@@ -51,10 +49,8 @@ class Lane:
 
     def one(self, row: int) -> SonarFrames:
         """A block of one frame."""
-        frames = self.frames
-        return SonarFrames(
-            frames.stamps_ns[row : row + 1], frames.intensity[row : row + 1], frames.ranges_m, frames.azimuths_rad
-        )
+        frames, only = self.frames, slice(row, row + 1)
+        return replace(frames, stamps_ns=frames.stamps_ns[only], intensity=frames.intensity[only])
 
 
 def _in_this_order(blocks: Iterable[SonarFrames]) -> Iterator[Outgoing]:
@@ -76,24 +72,18 @@ def lane_path(rng: np.random.Generator) -> VehiclePath:
     return VehiclePath.through(seconds, np.column_stack([x, y, level + BODY_Z_M, level, level, yaw]) + sway)
 
 
-def lane_run(seed: int, image: ImageOptions | None = None, rate_hz: float = 5.0) -> Lane:
+def lane_run(seed: int) -> Lane:
     """The run of a seed."""
-    options, image = SimulationOptions(seed=seed, frame_rate_hz=rate_hz), image or ImageOptions()
-    streams = Streams.of(seed)
+    options, streams = SimulationOptions(seed=seed, frame_rate_hz=5.0), Streams.of(seed)
     world = world_on_floor(LANDMARKS_XY_M, FLOOR_Z_M, options.floor_sigma_m, streams.world)
     path = lane_path(streams.path)
     sequence = replace(record("lane", options, YSHARK, path, world, streams, {"ours": "a lane"}), detections=None)
-    simulator = FrameSimulator(image, _objects(world, streams.seabed), FLOOR_Z_M, seed)
-    blocks = list(image_along(path, YSHARK.sonar, frame_stamps(rate_hz, path.duration_s), simulator, 1))
-    return Lane(sequence, _joined([block.frames for block in blocks]), [block.truth for block in blocks], path)
-
-
-def _objects(world: World, rng: np.random.Generator) -> list:
-    yaw_rad = rng.uniform(-np.pi, np.pi, len(DEFAULT_DESIGNS))
+    yaw_rad = streams.seabed.uniform(-np.pi, np.pi, len(DEFAULT_DESIGNS))
     placed = zip(DEFAULT_DESIGNS, world.landmark_positions, yaw_rad, strict=True)
-    return [place_landmark(*each, FLOOR_Z_M) for each in placed] + scattered_objects(OTHERS_M, 1, rng)
-
-
-def _joined(blocks: list[SonarFrames]) -> SonarFrames:
-    columns = (np.concatenate([getattr(b, name) for b in blocks]) for name in ("stamps_ns", "intensity"))
-    return SonarFrames(*columns, blocks[0].ranges_m, blocks[0].azimuths_rad)
+    objects = [place_landmark(*each, FLOOR_Z_M) for each in placed] + scattered_objects(OTHERS_M, 1, streams.seabed)
+    simulator = FrameSimulator(ImageOptions(), objects, FLOOR_Z_M, seed)
+    blocks = list(image_along(path, YSHARK.sonar, frame_stamps(5.0, path.duration_s), simulator, 1))
+    columns = (np.concatenate([getattr(b.frames, name) for b in blocks]) for name in ("stamps_ns", "intensity"))
+    first = blocks[0].frames
+    frames = SonarFrames(*columns, first.ranges_m, first.azimuths_rad)
+    return Lane(sequence, frames, [block.truth for block in blocks], path)

@@ -28,8 +28,7 @@ from sonar_graph.sonar.bayes import virtual_evidence
 from sonar_graph.sonar.confusion import Confusion, soft_scores
 from sonar_graph.sonar.recogniser import Recogniser, RecogniserParams
 
-IDS = np.array([5, 3])
-RANGE_M, AZIMUTH_RAD = np.array([2.0, 1.5]), np.array([0.1, -0.2])
+IDS, RANGE_M, AZIMUTH_RAD = np.array([5, 3]), np.array([2.0, 1.5]), np.array([0.1, -0.2])
 
 
 def sighting(range_m: float, azimuth_rad: float, *, is_fitted: bool = True, is_compared: bool = True) -> ObjectSighting:
@@ -37,43 +36,34 @@ def sighting(range_m: float, azimuth_rad: float, *, is_fitted: bool = True, is_c
     return ObjectSighting(fit, range_m, azimuth_rad, np.eye(2), is_fitted)
 
 
-@pytest.mark.parametrize(
-    ("range_m", "azimuth_rad", "label"),
-    [
-        (2.07, 0.1, 5),
-        (2.0, 0.1 + 0.07 / 2, 5),
-        (1.5, -0.2, 3),
-        (2.09, 0.1, NO_LABEL),
-        (2.0, 0.1 + 0.09 / 2, NO_LABEL),
-        (2.39, 0.1, NO_LABEL),
-        (2.41, 0.1, NONE),
-        (2.0, 0.1 + 0.42 / 2, NONE),
-    ],
-)
-def test_a_sighting_is_of_what_truly_lies_there(range_m: float, azimuth_rad: float, label: int):
-    assert label_of(sighting(range_m, azimuth_rad), IDS, RANGE_M, AZIMUTH_RAD)[0] == label
+def test_a_sighting_is_of_what_truly_lies_there():
     behind = np.array([0.1 + np.pi, -0.2 - np.pi])
-    assert label_of(sighting(range_m, azimuth_rad), IDS, RANGE_M, behind)[0] == NONE
+    for place, label in (
+        ((2.07, 0.1), 5),
+        ((2.0, 0.1 + 0.07 / 2), 5),
+        ((1.5, -0.2), 3),
+        ((2.09, 0.1), NO_LABEL),
+        ((2.0, 0.1 + 0.09 / 2), NO_LABEL),
+        ((2.39, 0.1), NO_LABEL),
+        ((2.41, 0.1), NONE),
+        ((2.0, 0.1 + 0.42 / 2), NONE),
+    ):
+        assert label_of(sighting(*place), IDS, RANGE_M, AZIMUTH_RAD)[0] == label, place
+        assert label_of(sighting(*place), IDS, RANGE_M, behind)[0] == NONE, place
 
 
 def test_sightings_become_columns_with_their_errors():
-    gathered = LabelledSightings((3, 5))
-    for seen in (
-        sighting(2.01, 0.102),
-        sighting(1.49, -0.2, is_fitted=False),
-        sighting(3.0, 0.1),
-        sighting(2.2, 0.1),
-        sighting(2.0, 0.1, is_compared=False),
-    ):
+    gathered, stranger = LabelledSightings((3, 5)), LabelledSightings((3, 9))  # no design is of landmark 5
+    fitted, other = sighting(2.01, 0.102), sighting(1.49, -0.2, is_fitted=False)
+    for seen in (fitted, other, sighting(3.0, 0.1), sighting(2.2, 0.1), sighting(2.0, 0.1, is_compared=False)):
         gathered.add(seen, (0, 7), IDS, RANGE_M, AZIMUTH_RAD)
+    stranger.add(fitted, (0, 1), IDS, RANGE_M, AZIMUTH_RAD)
     fits = gathered.fits()
     assert fits.label.tolist() == [1, 0, 2]  # in the order of the designs; what is unclear or not compared is left out
     np.testing.assert_allclose(fits.correlation, np.tile([0.9, 0.3], (3, 1)))
     np.testing.assert_allclose(fits.visible, 0.95)
     np.testing.assert_allclose(fits.range_azimuth_error[0], [0.01, 0.002])
     assert np.isnan(fits.range_azimuth_error[1:]).all()  # a centroid's error is not that of a fitted centre
-    stranger = LabelledSightings((3, 9))  # no design is of landmark 5
-    stranger.add(sighting(2.0, 0.1), (0, 1), IDS, RANGE_M, AZIMUTH_RAD)
     assert stranger.fits().correlation.shape == (0, 2)
 
 
@@ -106,14 +96,13 @@ def measured(lane_log) -> Confusion:
 
 def test_a_model_measured_on_a_log_is_of_its_landmarks_and_says_where_it_comes_from(lane, measured):
     assert measured.ids == (1, 2, 3, 4)
-    matrix = np.array(measured.matrix)
+    matrix, said = np.array(measured.matrix), measured.provenance
     assert (matrix.argmax(axis=1) == np.arange(5)).all()
     assert np.diag(matrix).mean() > 0.4
-    said = measured.provenance
     assert said["logs"] == "lane.mcap"
     assert said["what they are"] == lane.sequence.notes["ours"] == "a lane"
-    assert all(int(said[f"frames of landmark {k}"]) >= 8 for k in (1, 2, 3, 4))
-    assert int(said["frames of no landmark"]) >= 8
+    counts = [int(said[f"frames of {name}"]) for name in (*(f"landmark {k}" for k in measured.ids), "no landmark")]
+    assert min(counts) >= 8
     assert measured.range_sigma_m < 0.02
     assert np.degrees(measured.azimuth_sigma_rad) < 0.5
     assert Recogniser(lane.sequence.calibration, params=RecogniserParams(confusion=measured)).confusion is measured
@@ -122,22 +111,11 @@ def test_a_model_measured_on_a_log_is_of_its_landmarks_and_says_where_it_comes_f
 def test_logs_count_together(lane_log, measured):
     run = read_log(lane_log)
     twice = calibrate([(lane_log, run), (lane_log, replace(run, notes={}))])
-    assert twice.provenance["logs"] == "lane.mcap, lane.mcap"
-    assert twice.provenance["what they are"] == "a lane; recorded"
-
-    def said(model: Confusion, what: str) -> int:
-        return int(model.provenance[f"{what} of landmark 1"])
-
-    assert said(twice, "frames") == 2 * said(measured, "frames")
-    assert said(twice, "tracks") == 2 * said(measured, "tracks")
+    said, once = twice.provenance, measured.provenance
+    assert (said["logs"], said["what they are"]) == ("lane.mcap, lane.mcap", "a lane; recorded")
+    for name in ("frames of landmark 1", "tracks of landmark 1"):
+        assert int(said[name]) == 2 * int(once[name])
     assert (np.diag(twice.matrix) > np.diag(measured.matrix)).all()  # more tracks allow more certainty
-
-
-@pytest.mark.parametrize("missing", ["truth", "true_landmarks"])
-def test_a_log_without_truth_is_refused_by_name(lane_log, missing):
-    run = replace(read_log(lane_log), **{missing: None})
-    with pytest.raises(CalibrationError, match=r"lane\.mcap: without true trajectory and true landmarks"):
-        calibrate([(lane_log, run)])
 
 
 def test_frames_that_come_too_late_count_nothing_again(lane, measured, tmp_path):
@@ -148,24 +126,27 @@ def test_frames_that_come_too_late_count_nothing_again(lane, measured, tmp_path)
     assert calibrate([(late, read_log(late))]) == measured
 
 
-def test_landmarks_that_are_not_in_the_log_are_named(lane_log):
-    """The designs of two landmarks under other identities."""
-    run = read_log(lane_log)
-    strangers = tuple(replace(d, id=d.id + 6) for d in DEFAULT_DESIGNS[:2])
-    with pytest.raises(
-        CalibrationError, match=r"lane\.mcap: its true landmarks are 1, 2, 3, 4, the designs are 7, 8: "
-    ):
-        calibrate([(lane_log, run)], designs=strangers)
-    with pytest.raises(CalibrationError, match=r"landmark 8: 0"):
-        calibrate([(lane_log, run)], designs=(DEFAULT_DESIGNS[0], strangers[1]))
+STRANGERS = tuple(replace(d, id=d.id + 6) for d in DEFAULT_DESIGNS[:2])
+"""The designs of two landmarks under other identities."""
 
 
-def test_frames_outside_the_truth_are_not_labelled(lane_log, measured):
+@pytest.mark.parametrize(
+    ("changes", "designs", "words"),
+    [
+        ({"truth": None}, None, r"lane\.mcap: without true trajectory and true landmarks"),
+        ({"true_landmarks": None}, None, r"lane\.mcap: without true trajectory and true landmarks"),
+        ({}, STRANGERS, r"lane\.mcap: its true landmarks are 1, 2, 3, 4, the designs are 7, 8: "),
+        ({}, (DEFAULT_DESIGNS[0], STRANGERS[1]), r"landmark 8: 0"),
+        ({"truth": "late"}, None, "landmark 1: "),  # frames outside the truth are not labelled
+    ],
+)
+def test_logs_in_which_landmarks_cannot_be_labelled_are_refused_by_name(lane_log, changes, designs, words):
     run = read_log(lane_log)
-    middle_ns = int(run.truth.stamps_ns[len(run.truth.stamps_ns) // 3])
-    cut = replace(run, truth=run.truth.rows(run.truth.stamps_ns >= middle_ns))
-    with pytest.raises(CalibrationError, match="landmark 1: "):
-        calibrate([(lane_log, cut)])
+    if changes.get("truth"):
+        stamps_ns = run.truth.stamps_ns
+        changes = {"truth": run.truth.rows(stamps_ns >= stamps_ns[len(stamps_ns) // 3])}
+    with pytest.raises(CalibrationError, match=words):
+        calibrate([(lane_log, replace(run, **changes))], designs=designs)
 
 
 def _fits(per_class: int, noise: float, seed: int = 0) -> LabelledFits:
@@ -218,42 +199,33 @@ def test_frames_that_never_were_confused_are_as_sure_as_their_tracks_allow_withi
     assert model.sharpness < 100
 
 
+def some(fits: LabelledFits, rows: np.ndarray) -> LabelledFits:
+    return LabelledFits(*(column[rows] for column in vars(fits).values()))
+
+
 def test_a_class_with_too_few_frames_is_named():
-    fits = _fits(100, 0.1)
-    few = LabelledFits(
-        *(getattr(fits, n)[:205] for n in ("correlation", "visible", "label", "track", "range_azimuth_error"))
-    )
     with pytest.raises(CalibrationError, match="no landmark: 5"):
-        estimate_confusion(few, (1, 2), {})
+        estimate_confusion(some(_fits(100, 0.1), np.arange(205)), (1, 2), {})
 
 
-def test_errors_that_are_always_the_same_count_as_errors():
-    """A landmark that is always seen 3 cm too far: root mean square, not the spread about the mean."""
+def test_sigmas_are_root_mean_squares_of_a_landmark_that_is_wholly_in_view():
+    """A landmark that is always seen 3 cm too far errs by that, and not by the spread about the mean."""
     fits = _fits(300, 0.1)
     off = replace(fits, range_azimuth_error=fits.range_azimuth_error + np.array([0.03, -0.005]))
-    model = estimate_confusion(off, (1, 2), {})
-    assert model.range_sigma_m == pytest.approx(np.hypot(0.03, 0.01), rel=0.05)
-    assert model.azimuth_sigma_rad == pytest.approx(np.hypot(0.005, 0.002), rel=0.05)
-
-
-def test_sigmas_are_those_of_a_landmark_that_is_wholly_in_view():
-    fits = _fits(300, 0.1)
     cut = replace(fits, visible=np.full(900, 0.7), range_azimuth_error=fits.range_azimuth_error / 0.7**2)
-    model = estimate_confusion(cut, (1, 2), {})
-    assert model.range_sigma_m == pytest.approx(0.01, rel=0.15)
-    np.testing.assert_allclose(
-        np.diag(model.range_azimuth_cov(0.7)), np.nanmean(cut.range_azimuth_error**2, axis=0), rtol=1e-9
-    )
+    model, partly = (estimate_confusion(f, (1, 2), {}) for f in (off, cut))
+    sigmas = np.hypot([0.03, 0.005], [0.01, 0.002])
+    assert [model.range_sigma_m, model.azimuth_sigma_rad] == pytest.approx(sigmas, rel=0.05)
+    assert partly.range_sigma_m == pytest.approx(0.01, rel=0.15)
+    variances = np.nanmean(cut.range_azimuth_error**2, axis=0)
+    np.testing.assert_allclose(np.diag(partly.range_azimuth_cov(0.7)), variances, rtol=1e-9)
 
 
 def test_a_class_that_was_seen_more_often_counts_no_more():
     """Every frame of the first class five times over, on the same tracks."""
     fits = _fits(60, 0.1)
-    rows = np.concatenate([np.repeat(np.arange(60), 5), np.arange(60, 180)])
-    more = LabelledFits(*(column[rows] for column in vars(fits).values()))
+    more = some(fits, np.concatenate([np.repeat(np.arange(60), 5), np.arange(60, 180)]))
     one, other = (estimate_confusion(f, (1, 2), {}) for f in (fits, more))
-    assert (other.sharpness, other.threshold) == (
-        pytest.approx(one.sharpness, rel=0.01),
-        pytest.approx(one.threshold, abs=0.002),
-    )
+    assert other.sharpness == pytest.approx(one.sharpness, rel=0.01)
+    assert other.threshold == pytest.approx(one.threshold, abs=0.002)
     np.testing.assert_allclose(other.matrix, one.matrix, atol=2e-3)

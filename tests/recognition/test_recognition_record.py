@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -35,30 +36,19 @@ def test_the_surest_picture_of_each_landmark_is_shown_in_order(recognition: Reco
     assert len(recognition.shown()) == 6
 
 
-def test_what_was_written_is_read_again(recognition: Recognition, tmp_path: Path) -> None:
+def test_what_was_written_is_read_again_and_the_commonest_outcome_comes_first(recognition, tmp_path: Path) -> None:
     write_recognition(recognition, tmp_path)
     read = read_recognition(tmp_path)
     assert read is not None
     assert (read.frames, read.outcomes, read.notes) == (7, recognition.outcomes, recognition.notes)
+    assert list(read.outcomes) == ["reported", "not reported: rare"]
     assert read.warnings == recognition.warnings
     assert [p.__dict__ for p in read.pictures] == [p.__dict__ for p in recognition.shown()]
     assert read.detections is None
 
 
-def test_the_commonest_outcome_comes_first(recognition: Recognition, tmp_path: Path) -> None:
-    write_recognition(recognition, tmp_path)
-    read = read_recognition(tmp_path)
-    assert read is not None
-    assert list(read.outcomes) == ["reported", "not reported: rare"]
-
-
 def test_nothing_of_an_earlier_recognition_is_left(recognition: Recognition, tmp_path: Path) -> None:
-    write_recognition(recognition, tmp_path)
-    before = {path.name for path in (tmp_path / "recognised").iterdir()}
-    assert before == {"2.jpg"}
-    recognition.pictures = [drawn(9, id1=0.8)]
-    write_recognition(recognition, tmp_path)
-    assert {path.name for path in (tmp_path / "recognised").iterdir()} == {"9.jpg"}
-    write_recognition(None, tmp_path)
+    for pictures, files in ((recognition.pictures, ["2.jpg"]), ([drawn(9, id1=0.8)], ["9.jpg"]), (None, [])):
+        write_recognition(None if pictures is None else replace(recognition, pictures=pictures), tmp_path)
+        assert [path.name for path in (tmp_path / "recognised").iterdir()] == files
     assert read_recognition(tmp_path) is None
-    assert list((tmp_path / "recognised").iterdir()) == []

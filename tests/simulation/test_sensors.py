@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from sonar_graph.calibration import DepthCalibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.measurements import Floats
 from sonar_graph.simulation.sensors import (
     EPOCH_NS,
     DvlFaults,
@@ -29,14 +30,20 @@ EXACT_IMU = ImuCalibration(
 SKEWED = Mounting(translation_m=(0.3, -0.2, 0.1), rpy_rad=(0.3, -0.4, 0.8))
 
 
-def moving(seed: int = 2) -> VehiclePath:
-    wander = smooth_noise(SECONDS, np.array([1.0, 1.0, 0.3, 0.3, 0.3, 1.0]), 4.0, 6, np.random.default_rng(seed))
+def moving() -> VehiclePath:
+    wander = smooth_noise(SECONDS, np.array([1.0, 1.0, 0.3, 0.3, 0.3, 1.0]), 4.0, 6, np.random.default_rng(2))
     return VehiclePath.through(SECONDS, wander)
 
 
 def still(rpy: tuple[float, float, float] = (0.0, 0.0, 0.0), duration_s: float = 60.0) -> VehiclePath:
-    seconds = np.linspace(0, duration_s, 121)
-    return VehiclePath.through(seconds, np.tile([1.0, 2.0, -1.0, *rpy], (121, 1)))
+    return VehiclePath.through(np.linspace(0, duration_s, 121), np.tile([1.0, 2.0, -1.0, *rpy], (121, 1)))
+
+
+def imu_of(calibration: ImuCalibration, rate_hz: float, duration_s: float, seed: int) -> tuple[Floats, Floats]:
+    """Errors of angular velocity and specific force at rest."""
+    stamps_ns = regular_stamps(rate_hz, duration_s)
+    imu = simulate_imu(still(), stamps_ns, calibration, G, np.random.default_rng(seed))
+    return imu.angular_velocity, imu.specific_force - [0, 0, G]
 
 
 def test_stamps_begin_at_the_epoch_and_stay_within_the_run():
@@ -47,15 +54,12 @@ def test_stamps_begin_at_the_epoch_and_stay_within_the_run():
     assert regular_stamps(5.0, 10.0, offset_s=0.03)[-1] <= EPOCH_NS + 10_000_000_000
 
 
-def test_level_vehicle_at_rest_feels_gravity_upwards():
+@given(st.tuples(st.floats(-3, 3), st.floats(-1.4, 1.4), st.floats(-3, 3)))
+@settings(max_examples=20)
+def test_a_vehicle_at_rest_feels_gravity_along_the_worlds_up(rpy: tuple[float, float, float]):
     omega, force = imu_readings(still().at(SECONDS), Mounting(), G)
     np.testing.assert_allclose(omega, 0, atol=1e-9)
     np.testing.assert_allclose(force, np.tile([0, 0, G], (121, 1)), atol=1e-8)
-
-
-@given(st.tuples(st.floats(-3, 3), st.floats(-1.4, 1.4), st.floats(-3, 3)))
-@settings(max_examples=20)
-def test_tilted_vehicle_at_rest_feels_gravity_along_the_worlds_up(rpy: tuple[float, float, float]):
     up_in_imu = (gtsam.Rot3.RzRyRx(*rpy) * gtsam.Rot3.RzRyRx(*SKEWED.rpy_rad)).unrotate(np.array([0, 0, 1.0]))
     _, force = imu_readings(still(rpy).at(SECONDS[:1]), SKEWED, G)
     np.testing.assert_allclose(force[0], G * up_in_imu, atol=1e-7)
@@ -82,33 +86,28 @@ def test_gtsam_integrates_exact_imu_samples_back_to_the_truth():
     np.testing.assert_allclose(end.attitude().matrix(), last.world_R_body.as_matrix()[0], atol=1e-5)
 
 
-def points_of_mounting(path: VehiclePath, seconds: np.ndarray, lever: tuple[float, float, float]) -> np.ndarray:
+def points_of_mounting(path: VehiclePath, seconds: Floats, lever: tuple[float, float, float]) -> Floats:
     motion = path.at(seconds)
     return motion.position + motion.world_R_body.apply(lever)
 
 
-def test_accelerometers_on_a_lever_arm_feel_that_points_acceleration():
-    path, middle, h = moving(), np.linspace(5, 55, 31), 1e-3
-    before, at, after = (points_of_mounting(path, middle + d, SKEWED.translation_m) for d in (-h, 0, h))
-    acceleration = (after - 2 * at + before) / h**2
-    world_R_imu = path.at(middle).world_R_body.as_matrix() @ gtsam.Rot3.RzRyRx(*SKEWED.rpy_rad).matrix()
-    expected = np.einsum("nji,nj->ni", world_R_imu, acceleration + np.array([0, 0, G]))
-    _, force = imu_readings(path.at(middle), SKEWED, G)
-    np.testing.assert_allclose(force, expected, atol=1e-5)
-    _, without_lever = imu_readings(path.at(middle), Mounting(rpy_rad=SKEWED.rpy_rad), G)
-    assert np.abs(without_lever - expected).max() > 0.01
+def test_sensors_on_a_lever_arm_feel_that_points_velocity_and_acceleration():
+    path, middle = moving(), np.linspace(5, 55, 31)
+    motion, no_lever = path.at(middle), Mounting(rpy_rad=SKEWED.rpy_rad)
+    world_R_sensor = motion.world_R_body.as_matrix() @ gtsam.Rot3.RzRyRx(*SKEWED.rpy_rad).matrix()
+    before, at, after = (points_of_mounting(path, middle + d, SKEWED.translation_m) for d in (-1e-3, 0, 1e-3))
+    acceleration = (after - 2 * at + before) / 1e-3**2 + np.array([0, 0, G])
+    before, after = (points_of_mounting(path, middle + d, SKEWED.translation_m) for d in (-1e-4, 1e-4))
+    for exact, expected, atol in (
+        (lambda mounting: imu_readings(motion, mounting, G)[1], acceleration, 1e-5),
+        (lambda mounting: dvl_readings(motion, mounting), (after - before) / 2e-4, 1e-7),
+    ):
+        expected = np.einsum("nji,nj->ni", world_R_sensor, expected)
+        np.testing.assert_allclose(exact(SKEWED), expected, atol=atol)
+        assert np.abs(exact(no_lever) - expected).max() > 0.01
 
 
-def test_dvl_on_a_lever_arm_measures_that_points_velocity():
-    path, middle, h = moving(), np.linspace(5, 55, 31), 1e-4
-    before, after = (points_of_mounting(path, middle + d, SKEWED.translation_m) for d in (-h, h))
-    world_R_dvl = path.at(middle).world_R_body.as_matrix() @ gtsam.Rot3.RzRyRx(*SKEWED.rpy_rad).matrix()
-    expected = np.einsum("nji,nj->ni", world_R_dvl, (after - before) / (2 * h))
-    np.testing.assert_allclose(dvl_readings(path.at(middle), SKEWED), expected, atol=1e-7)
-    assert np.abs(dvl_readings(path.at(middle), Mounting(rpy_rad=SKEWED.rpy_rad)) - expected).max() > 0.01
-
-
-def assert_sigma(samples: np.ndarray, sigma: float, probability: float = 0.9999) -> None:
+def assert_sigma(samples: Floats, sigma: float, probability: float = 0.9999) -> None:
     """Two-sided: neither too small nor too large, and white."""
     n = samples.size
     low, high = stats.chi2.interval(probability, n)
@@ -120,62 +119,52 @@ def assert_sigma(samples: np.ndarray, sigma: float, probability: float = 0.9999)
 @pytest.mark.parametrize("rate_hz", [50.0, 200.0])
 def test_imu_white_noise_has_the_stated_density_at_any_rate(rate_hz: float):
     calibration = EXACT_IMU.model_copy(update={"gyro_noise_density": 2e-3, "accel_noise_density": 5e-3})
-    stamps = regular_stamps(rate_hz, 60.0)
-    imu = simulate_imu(still(), stamps, calibration, G, np.random.default_rng(5))
-    for axis in range(3):
-        assert_sigma(imu.angular_velocity[:, axis], 2e-3 * np.sqrt(rate_hz))
-        assert_sigma(imu.specific_force[:, axis] - [0, 0, G][axis], 5e-3 * np.sqrt(rate_hz))
+    for errors, density in zip(imu_of(calibration, rate_hz, 60, 5), (2e-3, 5e-3), strict=True):
+        for axis in errors.T:
+            assert_sigma(axis, density * np.sqrt(rate_hz))
 
 
 def test_biases_are_drawn_with_their_sigmas_and_stay_constant_without_walk():
     calibration = EXACT_IMU.model_copy(update={"gyro_bias_sigma": 3e-3, "accel_bias_sigma": 0.02})
-    runs = [simulate_imu(still(), regular_stamps(10, 2), calibration, G, np.random.default_rng(s)) for s in range(200)]
-    gyro = np.array([r.angular_velocity for r in runs])
-    np.testing.assert_allclose(gyro, gyro[:, :1] + np.zeros_like(gyro), atol=1e-9)
-    assert_sigma(gyro[:, 0].ravel(), 3e-3)
-    assert_sigma(np.array([r.specific_force[0] - [0, 0, G] for r in runs]).ravel(), 0.02)
+    gyro, accel = map(np.array, zip(*(imu_of(calibration, 10, 2, seed) for seed in range(200)), strict=True))
+    for bias, sigma in ((gyro, 3e-3), (accel, 0.02)):
+        np.testing.assert_allclose(bias, bias[:, :1] + np.zeros_like(bias), atol=1e-8)
+        assert_sigma(bias[:, 0].ravel(), sigma)
 
 
 def test_gyro_bias_walks_with_the_root_of_time():
     calibration = EXACT_IMU.model_copy(update={"gyro_bias_walk_density": 1e-3})
-    runs = [simulate_imu(still(), regular_stamps(20, 50), calibration, G, np.random.default_rng(s)) for s in range(200)]
-    walk = np.array([r.angular_velocity for r in runs])
+    walk = np.array([imu_of(calibration, 20, 50, seed)[0] for seed in range(200)])
     np.testing.assert_allclose(walk[:, 0], 0, atol=1e-9)
     for second in (5, 20, 50):
         assert_sigma(walk[:, 20 * second].ravel(), 1e-3 * np.sqrt(second))
 
 
-def test_dvl_noise_is_what_its_covariance_column_says():
+def test_dvl_noise_is_what_its_covariance_column_says_and_scale_error_stretches_velocity():
     calibration = DvlCalibration(velocity_sigma_m_s=(0.004, 0.008, 0.016), mounting=SKEWED)
     path, stamps = moving(), regular_stamps(100, 60)
+    exact = dvl_readings(path.at(seconds_since_start(stamps)), SKEWED)
     dvl = simulate_dvl(path, stamps, calibration, DvlFaults(), np.random.default_rng(6))
-    error = dvl.velocity - dvl_readings(path.at(seconds_since_start(stamps)), SKEWED)
     for axis in range(3):
-        assert_sigma(error[:, axis], float(np.sqrt(dvl.velocity_cov[0, axis, axis])))
+        assert_sigma((dvl.velocity - exact)[:, axis], float(np.sqrt(dvl.velocity_cov[0, axis, axis])))
     np.testing.assert_allclose(np.sqrt(np.diag(dvl.velocity_cov[-1])), calibration.velocity_sigma_m_s)
-
-
-def test_dvl_scale_error_stretches_velocity():
-    calibration = DvlCalibration(velocity_sigma_m_s=(1e-15, 1e-15, 1e-15))
-    path, stamps = moving(), regular_stamps(7, 60)
-    stretched = simulate_dvl(path, stamps, calibration, DvlFaults(scale_error=0.05), np.random.default_rng(0))
-    exact = dvl_readings(path.at(seconds_since_start(stamps)), Mounting())
+    quiet = calibration.model_copy(update={"velocity_sigma_m_s": (1e-15, 1e-15, 1e-15)})
+    stretched = simulate_dvl(path, stamps, quiet, DvlFaults(scale_error=0.05), np.random.default_rng(0))
     np.testing.assert_allclose(stretched.velocity, 1.05 * exact, atol=1e-12)
 
 
 def test_dvl_dropouts_leave_gaps_of_their_length_at_their_rate():
     path, stamps = still(duration_s=3600.0), regular_stamps(7, 3600)
-    faults = DvlFaults(dropouts_per_hour=60, dropout_s=5.0)
-    dvl = simulate_dvl(path, stamps, DvlCalibration(), faults, np.random.default_rng(8))
-    gaps_s = np.diff(dvl.stamps_ns) * 1e-9
-    gaps_s = gaps_s[gaps_s > 0.2]
-    assert dvl.stamps_ns[0] == stamps[0]
-    assert dvl.stamps_ns[-1] == stamps[-1]
+    faulty, whole = (
+        simulate_dvl(path, stamps, DvlCalibration(), faults, np.random.default_rng(8))
+        for faults in (DvlFaults(dropouts_per_hour=60, dropout_s=5.0), DvlFaults())
+    )
+    assert len(whole) == len(stamps)
+    assert faulty.stamps_ns[[0, -1]].tolist() == stamps[[0, -1]].tolist()
     # A sample is lost when a Poisson event lies within the 5 s before it.
-    assert 1 - len(dvl) / len(stamps) == pytest.approx(1 - np.exp(-60 * 5 / 3600), abs=0.03)
-    assert gaps_s.min() > 4.9
-    without = simulate_dvl(path, stamps, DvlCalibration(), DvlFaults(), np.random.default_rng(8))
-    assert len(without) == len(stamps)
+    assert 1 - len(faulty) / len(stamps) == pytest.approx(1 - np.exp(-60 * 5 / 3600), abs=0.03)
+    gaps_s = np.diff(faulty.stamps_ns) * 1e-9
+    assert gaps_s[gaps_s > 0.2].min() > 4.9
 
 
 def test_depth_is_the_height_of_the_port_with_the_stated_noise():

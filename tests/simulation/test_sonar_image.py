@@ -1,6 +1,7 @@
 """Simulated images obey the laws that real ones obey, each with its switch."""
 
 from copy import copy
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,7 +10,8 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import SonarImage
-from sonar_graph.devices.landmark_designs import LandmarkDesign
+from sonar_graph.devices.landmark_designs import DEFAULT_DESIGNS, LandmarkDesign
+from sonar_graph.measurements import Floats
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.simulation.sonar_image.frames import FrameSimulator, drawn_gain_error_db
 from sonar_graph.simulation.sonar_image.imaging_sonar import SONARS, ImageOptions, ImagingSonar
@@ -19,20 +21,17 @@ from sonar_graph.simulation.sonar_image.scene import (
     SeabedObject,
     block,
     place,
+    place_landmark,
     scatterers,
 )
 
 HEIGHT_M = 0.95
 TILT = Rotation.from_euler("ZYX", [0, 30, 0], degrees=True)
+ABOVE = np.array([0.0, 0.0, HEIGHT_M])
 PLAIN = ImageOptions(
-    cross_talk_db=None,
-    tvg_error_db=0.0,
-    texture_shape=None,
-    joints=False,
-    multipath=False,
-    noise_db=None,
+    cross_talk_db=None, tvg_error_db=0.0, texture_shape=None, joints=False, multipath=False, noise_db=None,
     drop_probability=0.0,
-)
+)  # fmt: skip
 EVEN = SONARS["didson"].model_copy(update={"lens_cubic": None})
 """The same sonar with equally spaced beams."""
 
@@ -52,15 +51,21 @@ def simulator(
     return made
 
 
-def level_db(made: FrameSimulator, x_m: float = 0.0, y_m: float = 0.0, number: int = 0) -> np.ndarray:
+def box_at(x_m: float, *size_and_level: float, y_m: float = 0.0) -> SeabedObject:
+    """A box on the floor; length, width, height and decibels over the floor."""
+    radius_m = max(size_and_level[:2]) / 2 + 0.06
+    return place(-1, "box", block(*size_and_level), radius_m, np.array([x_m, y_m, 0.0]), 0.0)
+
+
+def level_db(made: FrameSimulator, x_m: float = 0.0, y_m: float = 0.0, number: int = 0) -> Floats:
     return made.level_db(np.array([x_m, y_m, HEIGHT_M]), TILT, number)
 
 
-def intensity(made: FrameSimulator, x_m: float = 0.0, y_m: float = 0.0, number: int = 0) -> np.ndarray:
+def intensity(made: FrameSimulator, x_m: float = 0.0, y_m: float = 0.0, number: int = 0) -> Floats:
     return 10 ** (level_db(made, x_m, y_m, number).astype(float) / 10)
 
 
-def looks(count: int, **changes: object) -> np.ndarray:
+def looks(count: int, **changes: object) -> Floats:
     """Intensities from places so far apart that their speckle is independent, shape (count, beams, bins)."""
     made = simulator(**changes)
     return np.array([intensity(made, 0.31 * (k % 12), 0.33 * (k // 12), k) for k in range(count)])
@@ -70,17 +75,14 @@ def bins_at(made: FrameSimulator, *ranges_m: float) -> np.ndarray:
     return np.searchsorted(made.ranges_m(), ranges_m)
 
 
-def test_speckle_of_one_look_has_a_spread_of_5_57_decibels():
-    first, last = bins_at(simulator(), 1.7, 2.3)
-    level = 10 * np.log10(looks(24)[:, 30:66, first:last])
+def test_speckle_is_exponential_in_intensity_and_spreads_by_5_57_decibels():
+    first, near, far, last = bins_at(simulator(), 1.7, 1.9, 2.1, 2.3)
+    values = looks(24)
+    level = 10 * np.log10(values[:, 30:66, first:last])
     level -= level.mean(axis=(0, 1))
     assert level.std() == pytest.approx(5.57, rel=0.015)  # 1 % more: a cell holds a finite number of scatterers
-
-
-def test_speckle_is_exponential_in_intensity():
-    first, last = bins_at(simulator(), 1.9, 2.1)
-    values = looks(24)[:, 30:66:4, first:last:8]
-    relative = (values / values.mean(axis=(0, 1))).reshape(-1)
+    apart = values[:, 30:66:4, near:far:8]
+    relative = (apart / apart.mean(axis=(0, 1))).reshape(-1)
     assert stats.kstest(relative, "expon").pvalue > 1e-3
     assert stats.kstest(np.sqrt(relative), "expon").pvalue < 1e-6
 
@@ -94,12 +96,17 @@ def test_texture_makes_the_floor_k_distributed(shape: float):
     assert moments[1] == pytest.approx(2, rel=0.03)
 
 
-def speckle_correlation(moved_m: float, **changes: object) -> float:
-    """Correlation of intensities of the same floor, seen from a sonar that moved across and turned back to it."""
+@pytest.mark.parametrize(
+    ("moved_m", "speckle"), [(0.0, "world"), (0.018, "world"), (0.036, "world"), (0.07, "world"), (0.0, "frame")]
+)
+def test_speckle_decorrelates_with_motion_across_as_the_aperture_says(moved_m: float, speckle: str):
+    """Of the same floor, seen from a sonar that moved across and turned back to it; "frame": drawn for each frame.
+
+    Square of the autocorrelation of a two-way aperture (a triangle): the cubic B-spline, half of it after 3.6 cm.
+    """
     sonar = EVEN.model_copy(update={"beams": 9, "azimuth_span_rad": np.radians(0.3 * 9)})  # one looks straight ahead
-    made = simulator(sonar=sonar, **changes)
-    across_m = np.sqrt(2.0**2 - HEIGHT_M**2)
-    turned = Rotation.from_euler("Z", -np.arctan2(moved_m, across_m))
+    made, across_m = simulator(sonar=sonar, speckle=speckle), np.sqrt(2.0**2 - HEIGHT_M**2)
+    turned = Rotation.from_euler("Z", -np.arctan2(moved_m, across_m)) * TILT
     shift_m = (np.hypot(across_m, moved_m) - across_m) * across_m / 2.0
     ranges_m = made.ranges_m()
     near = (ranges_m > 1.96) & (ranges_m < 2.04)
@@ -107,20 +114,13 @@ def speckle_correlation(moved_m: float, **changes: object) -> float:
     for k in range(100):
         x_m, y_m = 0.31 * (k % 12), 0.33 * (k // 12)
         here = intensity(made, x_m, y_m, 2 * k)[4]
-        there = made.level_db(np.array([x_m, y_m + moved_m, HEIGHT_M]), turned * TILT, 2 * k + 1)[4]
-        pairs.append((here[near], np.interp(ranges_m[near] + shift_m, ranges_m, 10 ** (there.astype(float) / 10))))
-    here, there = np.array(pairs).transpose(1, 0, 2).reshape(2, -1)
-    return float(np.corrcoef(here, there)[0, 1])
-
-
-def spline_correlation(moved_m: float) -> float:
-    """Square of the autocorrelation of a two-way aperture (a triangle): the cubic B-spline."""
+        there = made.level_db(np.array([x_m, y_m + moved_m, HEIGHT_M]), turned, 2 * k + 1)[4].astype(float)
+        pairs.append((here[near], np.interp(ranges_m[near] + shift_m, ranges_m, 10 ** (there / 10))))
+    found = np.corrcoef(*np.array(pairs).transpose(1, 0, 2).reshape(2, -1))[0, 1]
     u = 2 * moved_m / (0.886 * 1480 / 1.8e6 / np.radians(0.3))
-    return max(1 - 1.5 * u**2 + 0.75 * u**3 if u < 1 else (2 - u) ** 3 / 4, 0) ** 2
-
-
-def test_speckle_drawn_for_each_frame_forgets_without_motion():
-    assert abs(speckle_correlation(0.0, speckle="frame")) < 0.1
+    spline = max(1 - 1.5 * u**2 + 0.75 * u**3 if u < 1 else (2 - u) ** 3 / 4, 0) ** 2
+    assert found == pytest.approx(spline if speckle == "world" else 0.0, abs=0.07 if speckle == "world" else 0.1)
+    assert moved_m != 0.036 or spline == pytest.approx(0.5, abs=0.02)
 
 
 def test_level_over_range_is_that_of_spreading_absorption_and_gain():
@@ -149,28 +149,23 @@ def test_absorption_is_what_gain_gives_back_and_noise_shows():
 
 @pytest.mark.parametrize("height_m", [0.03, 0.06])
 def test_shadow_is_as_long_as_height_and_grazing_angle_make_it(height_m: float):
-    near_x_m = 1.45
-    box = place(-1, "box", block(0.1, 0.3, height_m, 0.0), 0.2, np.array([near_x_m + 0.05, 0.0, 0.0]), 0.0)
-    end_m = (near_x_m + 0.1) * HEIGHT_M / (HEIGHT_M - height_m)  # horizontal: over the far upper edge
-    end_range_m = np.hypot(end_m, HEIGHT_M)
-    top_range_m = np.hypot(near_x_m + 0.1, HEIGHT_M - height_m)
-    made, open_ = simulator([box]), simulator([box], shadows=False)
-    profile = level_db(made)[40:56].mean(axis=0)
+    near_m, far_m = 1.45, 1.55
+    made, open_ = (simulator([box_at(1.5, 0.1, 0.3, height_m, 0.0)], shadows=is_on) for is_on in (True, False))
+    profile, lit = (level_db(one)[40:56].mean(axis=0) for one in (made, open_))
+    end_m = np.hypot(far_m * HEIGHT_M / (HEIGHT_M - height_m), HEIGHT_M)  # over the far upper edge
     ranges_m = made.ranges_m()
-    dark = np.flatnonzero((profile < 0) & (ranges_m > 1.6))
-    assert ranges_m[dark[0]] == pytest.approx(top_range_m, abs=0.012)
-    assert ranges_m[dark[-1]] == pytest.approx(end_range_m, abs=0.012)
-    floor_behind = (ranges_m > np.hypot(near_x_m + 0.11, HEIGHT_M)) & (ranges_m < end_range_m)
-    assert level_db(open_)[40:56].mean(axis=0)[floor_behind].min() > 20
+    dark = ranges_m[(profile < 0) & (ranges_m > 1.6)]
+    assert dark[0] == pytest.approx(np.hypot(far_m, HEIGHT_M - height_m), abs=0.012)
+    assert dark[-1] == pytest.approx(end_m, abs=0.012)
+    assert lit[(ranges_m > np.hypot(near_m + 0.11, HEIGHT_M)) & (ranges_m < end_m)].min() > 20
 
 
-def polar_picture(design: LandmarkDesign, position: np.ndarray, yaw_rad: float, made: FrameSimulator) -> np.ndarray:
+def polar_picture(design: LandmarkDesign, position: Floats, yaw_rad: float, made: FrameSimulator) -> np.ndarray:
     """Beams and bins on which a point of a landmark's figure falls, by geometry alone."""
-    u = np.linspace(-design.size_m / 2, design.size_m / 2, 600)
-    x, y = np.meshgrid(u, u)
+    x, y = np.meshgrid(*2 * [np.linspace(-design.size_m / 2, design.size_m / 2, 600)])
     foam = design.level_db(x, y) > 0
     plane = Rotation.from_euler("Z", yaw_rad).apply(np.column_stack([x[foam], y[foam], 0 * x[foam]]))
-    q = TILT.inv().apply(position + plane - [0, 0, HEIGHT_M])
+    q = TILT.inv().apply(position + plane - ABOVE)
     azimuths, ranges_m = made.sonar.azimuths_rad(), made.ranges_m()
     beam = np.abs(np.arctan2(q[:, 1], q[:, 0])[:, None] - azimuths).argmin(axis=1)
     picture = np.zeros((len(azimuths), len(ranges_m)), bool)
@@ -178,13 +173,25 @@ def polar_picture(design: LandmarkDesign, position: np.ndarray, yaw_rad: float, 
     return picture
 
 
+@pytest.mark.parametrize("index", [1, 2])
+def test_landmark_lies_where_geometry_says_and_left_is_positive(index: int):
+    design, bearing, yaw_rad = DEFAULT_DESIGNS[index], np.radians((-9.0, 4.0)[index % 2]), 0.7
+    position = np.array([1.7 * np.cos(bearing), 1.7 * np.sin(bearing), 0.02])
+    flush = replace(design, height_m=0.0)  # the edge that faces the sonar would glint
+    made = simulator([place_landmark(flush, position, yaw_rad, 0.0)], speckle="frame")
+    mean_db = 10 * np.log10(np.mean([intensity(made, number=n) for n in range(24)], axis=0))
+    seen, expected = mean_db > 45, polar_picture(design, position, yaw_rad, made)
+    assert np.sum(seen & expected) / np.sum(seen | expected) > 0.85
+    pixels = np.nonzero(seen), np.nonzero(expected)
+    one, other = ([made.azimuths_rad()[beam].mean(), made.ranges_m()[bin_].mean()] for beam, bin_ in pixels)
+    assert np.abs(np.subtract(one, other)) == pytest.approx([0, 0], abs=0.002)
+    assert polar_picture(design, position, yaw_rad + 0.6, made)[seen].mean() < 0.97 or design.name == "disc"
+
+
 def test_landmark_is_as_much_brighter_than_the_floor_as_its_mask_says():
-    plate = place(-1, "plate", block(0.3, 0.3, 0.0, 12.0), 0.25, np.array([1.7, 0.0, 0.0]), 0.0)
-    first, last = bins_at(simulator(), 1.9, 2.0)
-    pairs = [
-        (intensity(simulator([plate], speckle="frame"), number=n), intensity(simulator(speckle="frame"), number=n))
-        for n in range(8)
-    ]
+    made, bare = simulator([box_at(1.7, 0.3, 0.3, 0.0, 12.0)], speckle="frame"), simulator(speckle="frame")
+    first, last = bins_at(made, 1.9, 2.0)
+    pairs = [(intensity(made, number=n), intensity(bare, number=n)) for n in range(8)]
     on, off = np.mean(pairs, axis=0)[:, 42:54, first:last].mean(axis=(1, 2))
     assert 10 * np.log10(on / off) == pytest.approx(12, abs=0.2)
 
@@ -237,27 +244,11 @@ def test_cross_talk_shows_every_eighth_beam_at_its_level():
     assert 10 * np.log10(np.sum(10 ** (loud[list(ghosts)] / 10))) == pytest.approx(-25, abs=1.5)
 
 
-def test_echo_by_way_of_the_surface_arrives_where_the_mirror_puts_it():
-    depth_m, ahead_m = 0.75, 1.35
-    dot = place(-1, "dot", block(0.02, 0.02, 0.0, 60.0), 0.05, np.array([ahead_m, 0.0, 0.0]), 0.0)
-    position = np.array([0.0, 0.0, HEIGHT_M])
-    direct_m = np.hypot(ahead_m, HEIGHT_M)
-    ghost_m = 0.5 * (direct_m + np.hypot(ahead_m, HEIGHT_M + 2 * depth_m))
-    with_, without = (
-        simulator([dot], multipath=m).level_db(position, TILT, 0, HEIGHT_M + depth_m) for m in (True, False)
-    )
-    rise = (with_ - without)[46:50].mean(axis=0)
-    ranges_m = simulator().ranges_m()
-    assert ranges_m[np.argmax(rise)] == pytest.approx(ghost_m, abs=0.02)
-    assert rise[ranges_m < direct_m + 0.05].max() < 3
-
-
-def test_echo_by_way_of_the_surface_is_as_strong_as_its_longer_way_leaves_it():
+def test_echo_by_way_of_the_surface_is_as_late_and_as_strong_as_its_longer_way_makes_it():
     """The samples of a bright plate come again at the later bin: spreading (r / late)^4, gain (late / r)^3."""
-    depth_m, surface_path_db = 0.75, -9.0
-    plate = place(-1, "plate", block(0.3, 0.4, 0.0, 60.0), 0.25, np.array([1.35, 0.0, 0.0]), 0.0)
+    depth_m, surface_path_db, plate = 0.75, -9.0, box_at(1.35, 0.3, 0.4, 0.0, 60.0)
     made = simulator([plate], multipath=True, surface_path_db=surface_path_db, absorption_db_m=0.0)
-    image = made.level_db(np.array([0.0, 0.0, HEIGHT_M]), TILT, 0, HEIGHT_M + depth_m)[42:54].astype(float)
+    image = made.level_db(ABOVE, TILT, 0, HEIGHT_M + depth_m)[42:54].astype(float)
     r = made.ranges_m()
     late_m = 0.5 * (r + np.sqrt(np.maximum(r**2 - HEIGHT_M**2, 0) + (HEIGHT_M + 2 * depth_m) ** 2))
     on = (r > np.hypot(1.25, HEIGHT_M)) & (r < np.hypot(1.45, HEIGHT_M))
@@ -268,14 +259,12 @@ def test_echo_by_way_of_the_surface_is_as_strong_as_its_longer_way_leaves_it():
 
 
 def test_steep_faces_echo_again_by_way_of_the_floor():
-    box = place(-1, "box", block(0.1, 0.3, 0.08, 0.0), 0.2, np.array([1.6, 0.0, 0.0]), 0.0)
-    with_, without = (intensity(simulator([box], multipath=m))[42:54].mean(axis=0) for m in (True, False))
-    front_m = np.hypot(1.55, HEIGHT_M)
+    made = [simulator([box_at(1.6, 0.1, 0.3, 0.08, 0.0)], multipath=m) for m in (True, False)]
+    with_, without = (intensity(one)[42:54].mean(axis=0) for one in made)
     ghost_m = 0.5 * (np.hypot(1.55, HEIGHT_M - 0.08) + np.hypot(1.55, HEIGHT_M + 0.08))
-    ranges_m = simulator().ranges_m()
-    grown = 10 * np.log10(with_ / without)
+    ranges_m, grown = made[0].ranges_m(), 10 * np.log10(with_ / without)
     assert ranges_m[np.argmax(grown)] == pytest.approx(ghost_m, abs=0.01)
-    assert abs(grown[ranges_m < front_m - 0.08]).max() < 0.5
+    assert abs(grown[ranges_m < np.hypot(1.55, HEIGHT_M) - 0.08]).max() < 0.5
 
 
 def test_lens_is_the_measured_one_and_the_log_may_say_otherwise():
@@ -314,80 +303,55 @@ def test_stamps_of_dropped_frames_are_drawn_at_their_rate():
     assert not any(simulator().is_dropped(n) for n in range(300))
 
 
-def test_same_seed_gives_same_bytes_and_another_seed_others():
-    position = np.array([0.1, 0.2, HEIGHT_M])
+def test_same_seed_gives_same_bytes_another_seed_others_and_only_noise_differs_between_frames():
     full = {"texture_shape": 5.0, "noise_db": 15.0, "cross_talk_db": -25.0, "multipath": True, "joints": True}
-    one, again, other = (simulator(seed=s, **full).frame(position, TILT, 5, 1.7) for s in (4, 4, 5))
+    one, again, other = (simulator(seed=s, **full).frame(ABOVE, TILT, 5, 1.7) for s in (4, 4, 5))
     np.testing.assert_array_equal(one, again)
     assert np.mean(one != other) > 0.9
-    assert one.dtype == np.uint8
-    assert one.shape == (96, 512)
-
-
-def test_noise_differs_between_frames_and_speckle_does_not():
-    position = np.array([0.0, 0.0, HEIGHT_M])
-    noisy = simulator(noise_db=15.0)
-    first, second = (noisy.level_db(position, TILT, n) for n in (0, 1))
-    assert not np.array_equal(first, second)
-    still = simulator()
-    np.testing.assert_array_equal(still.level_db(position, TILT, 0), still.level_db(position, TILT, 1))
-
-
-def test_counts_are_decibels_over_the_span():
-    made = simulator()
-    counts = made.frame(np.array([0, 0, HEIGHT_M]), TILT, 0).astype(float)
-    inside = (counts > 0) & (counts < 255)
-    np.testing.assert_allclose(counts[inside] * 80 / 255, level_db(made)[inside], atol=0.5 * 80 / 255 + 1e-4)
+    assert (one.dtype, one.shape) == (np.uint8, (96, 512))
+    for made, is_still in ((simulator(noise_db=15.0), False), (simulator(), True)):
+        assert np.array_equal(level_db(made, number=0), level_db(made, number=1)) == is_still
 
 
 def test_sonar_that_looks_up_or_lies_on_the_floor_sees_only_noise():
-    made = simulator(noise_db=15.0)
-    for position, rotation in (
-        (np.array([0, 0, HEIGHT_M]), Rotation.from_euler("ZYX", [0, -40, 0], degrees=True)),
-        (np.array([0, 0, 0.0]), TILT),
-    ):
+    made, up = simulator(noise_db=15.0), Rotation.from_euler("ZYX", [0, -40, 0], degrees=True)
+    for position, rotation in ((ABOVE, up), (0 * ABOVE, TILT)):
         at_2_m = made.level_db(position, rotation, 0)[:, bins_at(made, 2.0)[0]]
         assert 10 * np.log10(np.mean(10 ** (at_2_m / 10))) == pytest.approx(15, abs=1.5)
 
 
 @pytest.mark.parametrize("name", sorted(SONARS))
-def test_every_sonar_makes_images_of_its_own_size(name):
-    made = simulator(sonar=SONARS[name], noise_db=15.0)
-    image = made.frame(np.array([0, 0, HEIGHT_M]), TILT, 0)
-    assert image.shape == (SONARS[name].beams, SONARS[name].bins)
-    middle = image[SONARS[name].beams // 2 - 5 : SONARS[name].beams // 2 + 5, 250:350]
+def test_every_sonar_makes_images_of_its_own_size_and_its_log_says_what_their_counts_span(name, monkeypatch):
+    sonar = SONARS[name]
+    image = simulator(sonar=sonar, noise_db=15.0).frame(ABOVE, TILT, 0)
+    assert image.shape == (sonar.beams, sonar.bins)
+    middle = image[sonar.beams // 2 - 5 : sonar.beams // 2 + 5, 250:350]
     assert np.mean(middle) * 80 / 255 == pytest.approx(40 - 2.5, abs=1.5)  # the mean of decibels: 2.5 below
-
-
-@pytest.mark.parametrize("name", sorted(SONARS))
-def test_the_log_of_each_sonar_says_what_its_counts_span(name, monkeypatch):
-    image = ImageOptions(sonar=name)
-    for span in (SONARS[name].decibel_span, 64.0):
-        monkeypatch.setitem(SONARS, name, SONARS[name].model_copy(update={"decibel_span": span}))
-        said = simulate_basin(BasinOptions(duration_s=120.0, laps=1, image=image)).calibration.sonar.image
+    for span in (sonar.decibel_span, 64.0):
+        monkeypatch.setitem(SONARS, name, sonar.model_copy(update={"decibel_span": span}))
+        run = simulate_basin(BasinOptions(duration_s=120.0, laps=1, image=ImageOptions(sonar=name)))
+        said = run.calibration.sonar.image
         assert (said.scale, said.decibel_span, said.full_scale) == ("decibel", span, 255)
 
 
-def test_levels_do_not_depend_on_the_span_that_counts_have():
-    at = np.array([0.0, 0.0, HEIGHT_M])
-    levels = []
-    for span in (80.0, 100.0):
-        sonar = SONARS["didson"].model_copy(update={"decibel_span": span})
-        counts = FrameSimulator(PLAIN, (), 0.0, 3, sonar).frame(at, TILT, 0)
-        levels.append(SonarImage(decibel_span=span).decibels(counts))
-    inside = (levels[0] > 1) & (levels[0] < 79)
+@pytest.mark.parametrize("span", [80.0, 100.0])
+def test_counts_are_decibels_over_the_span(span: float):
+    made = FrameSimulator(PLAIN, (), 0.0, 3, SONARS["didson"].model_copy(update={"decibel_span": span}))
+    counts = made.frame(ABOVE, TILT, 0)
+    inside = (counts > 0) & (counts < 255)
     assert inside.mean() > 0.9
-    assert np.abs(levels[0] - levels[1])[inside].max() < 0.5 * (80 + 100) / 255 + 1e-3
+    found = SonarImage(decibel_span=span).decibels(counts)
+    np.testing.assert_allclose(found[inside], level_db(made)[inside], atol=0.5 * span / 255 + 1e-4)
 
 
 MIDDLE_M, FRAMES = 1.6, 16
 LENGTH_M, WIDTH_M = 0.06, 0.2
 
 
-def ramp(rise: float):
+def ramp(rise: float) -> SeabedObject:
     """Rises away from the sonar; only its middle scatters to speak of, by 60 dB over the floor."""
 
-    def shape(x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def shape(x_m: Floats, y_m: Floats) -> tuple[Floats, Floats]:
         is_bright = (np.abs(x_m) < LENGTH_M / 2) & (np.abs(y_m) < WIDTH_M / 2)
         rises = (np.abs(x_m) < 0.08) & (np.abs(y_m) < 0.15)
         return np.where(is_bright, 60.0, np.nan), np.where(rises, rise * (x_m + 0.08), 0.0)
@@ -434,35 +398,25 @@ def test_a_steep_face_echoes_by_way_of_the_floor_there_and_back():
     assert share == pytest.approx(expected, rel=0.2)
 
 
-def correlation(field: np.ndarray) -> np.ndarray:
-    """Of a periodic field with itself over the distance along x, in cells."""
-    off = field - field.mean()
-    power = np.mean(np.abs(np.fft.fft(off, axis=1)) ** 2, axis=0)
-    found = np.fft.ifft(power).real
-    return found / found[0]
-
-
 def test_strength_of_the_floor_is_smooth_over_three_centimetres():
     """A Gaussian field whose correlation falls to 1/e at 3 cm; a Gamma of shape 50 is nearly one."""
     strength = scatterers(50.0, False, np.random.default_rng(3)).texture.astype(float) ** 2
-    found, distance_m = correlation(strength), np.arange(CELLS) * CELL_M
+    power = np.mean(np.abs(np.fft.fft(strength - strength.mean(), axis=1)) ** 2, axis=0)
+    correlation, distance_m = np.fft.ifft(power).real, np.arange(CELLS) * CELL_M  # periodic, along x
     near = distance_m < 0.08
-    np.testing.assert_allclose(found[near], np.exp(-((distance_m[near] / 0.03) ** 2)), atol=0.05)
+    expected = np.exp(-((distance_m[near] / 0.03) ** 2))
+    np.testing.assert_allclose(correlation[near] / correlation[0], expected, atol=0.05)
     assert strength.mean() == pytest.approx(1, rel=0.02)
     assert strength.var() == pytest.approx(1 / 50, rel=0.1)
 
 
-def test_a_floor_without_texture_is_even_and_joints_stand_out_of_it_by_six_decibels():
-    even, jointed = (scatterers(None, joints, np.random.default_rng(3)).texture for joints in (False, True))
-    np.testing.assert_array_equal(even, 1.0)
-    on = jointed > 1
-    np.testing.assert_allclose(20 * np.log10(jointed[on]), 6.0, atol=1e-5)
+def test_amplitudes_are_of_a_complex_normal_law_and_joints_stand_out_of_an_even_floor_by_six_decibels():
+    even, jointed = (scatterers(None, joints, np.random.default_rng(3)) for joints in (False, True))
+    np.testing.assert_array_equal(even.texture, 1.0)
+    on = jointed.texture > 1
+    np.testing.assert_allclose(20 * np.log10(jointed.texture[on]), 6.0, atol=1e-5)
     assert on.mean() == pytest.approx(2 * 0.008 / 0.5, rel=0.1)
-
-
-def test_amplitudes_are_of_a_complex_normal_law():
-    points = scatterers(None, False, np.random.default_rng(3)).points
-    intensity = points[..., 0].astype(float) ** 2 + points[..., 1].astype(float) ** 2
+    intensity = np.sum(even.points[..., :2].astype(float) ** 2, axis=-1)
     assert intensity.mean() == pytest.approx(1, rel=0.01)
     assert np.mean(intensity**2) == pytest.approx(2, rel=0.02)
-    assert ((points[..., 2:] >= 0) & (points[..., 2:] < 1)).all()
+    assert ((even.points[..., 2:] >= 0) & (even.points[..., 2:] < 1)).all()
