@@ -33,7 +33,6 @@ from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections, Measur
 from sonar_graph.sequence import NS_PER_S, Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.states import Estimate, Outcome
-from sonar_graph.testing.laws import CHECKS
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks" / "performance"
 T0_NS = 1_700_000_000 * NS_PER_S
@@ -101,12 +100,6 @@ def height_and_tilt(slam):
         return x[2], P[2, 2], np.diag(P)[3:5]
     state = state_of(slam)
     return state.points[0, 2], state.P[8, 8], np.diag(state.P)[:2]
-
-
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-@every_filter
-def test_the_contract_is_kept(kind, check):
-    check(kind)
 
 
 YAW_RATE, SPEED, LEVER = 0.1, 0.3, np.array([0.2, 0.1, -0.3])

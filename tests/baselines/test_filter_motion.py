@@ -28,7 +28,7 @@ from sonar_graph.navigation.preintegration.recursion import NO_MOTION, in_last_f
 from sonar_graph.numerics.jit import compiled
 from sonar_graph.sequence import NS_PER_S
 
-from .motions import motion_of
+from .filters import motion_of
 
 T0_NS, SECONDS = 1_700_000_000 * NS_PER_S, 2.0
 LEVER, GYRO_DENSITY = (-0.2, 0.1, -0.15), 1e-3
@@ -203,14 +203,6 @@ def test_a_gap_adds_what_an_unknown_gyro_bias_does_to_the_displacement(until_s):
     assert_allclose(added, sigma**2 * J @ J.T, atol=5e-3 * sigma**2 * np.linalg.norm(J) ** 2)
     assert np.abs(J @ J.T - J.T @ J).max() > 0.05 * np.linalg.norm(J) ** 2  # else the order would not be seen
     assert (unknown.cov_tt, unknown.cov_rt) == (known.cov_tt, known.cov_rt)
-
-
-@pytest.mark.parametrize("until_s", [FOUND_S, 2.0], ids=["closed", "open"])
-def test_the_turn_over_a_gap_is_that_without_one(until_s):
-    """Gyros do not miss the Doppler log; the Earth's rotation is taken out of them too."""
-    gapless, over = (over_gap(lost(), vehicle, until_s) for vehicle in (VEHICLE, vehicle_with_gaps(0.01)))
-    assert_allclose(over.dR, gapless.dR, atol=1e-12)
-    assert not np.allclose(over.dp, gapless.dp, atol=0.01)
 
 
 @pytest.mark.parametrize(("until_s", "node_s"), [(0.9, 0.8), (2.4, 2.3)])

@@ -2,122 +2,34 @@
 
 import math
 
-import gtsam
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from baselines import ekf_equations, invariant_equations
-from baselines.sonar_update import GATED, NEW, NO_SLOT, PASSED_OVER, USED, Frame, no_outcomes
+from baselines.sonar_update import GATED, NEW, NO_SLOT, PASSED_OVER, USED
 from sonar_graph.slam.landmarks.association import gate_threshold
 from sonar_graph.slam.models.sonar_model import FLOOR_GATE, elevation_on_floor, locate, range_azimuth
 
-from .invariant import D_BIAS, MOUNTING, SONAR, body_after, copied, gap_motion_of, moved_by, state_at
-from .motions import motion_of
+from .filters import BODY_M, LEVEL, MOTION_SIGMA, NOISE, SONAR, TWIST, both, observed, sonar_pose
 
-TWIST = np.array([0.02, -0.01, 0.05, 0.1, 0.02, -0.01])
-NOISE, MOTION_SIGMA = np.diag([0.02**2, 0.01**2]), 1e-3
-MOTION_COV = MOTION_SIGMA**2 * np.eye(6)
-TILTED, LEVEL = np.array([0.1, 0.2, 0.3]), np.zeros(3)
-BODY_M = np.array([1.0, -2.0, 0.5])
+TILTED = np.array([0.1, 0.2, 0.3])
 
 
-class Plain:
-    """EKF-SLAM; a state is (x, P, n) with room for three more landmarks."""
-
-    @staticmethod
-    def state(angles, landmarks, scale):
-        n = 6 + 3 * len(landmarks)
-        x, P = np.zeros(n + 9), np.zeros((n + 9, n + 9))
-        x[:n] = np.concatenate([BODY_M, angles, np.ravel(landmarks)])
-        A = scale * np.random.default_rng(3).normal(size=(n, n))
-        P[:n, :n] = A @ A.T
-        return x, P, n
-
-    @staticmethod
-    def observe(state, frame):
-        x, P, n = state[0].copy(), state[1].copy(), state[2]
-        return x, P, ekf_equations.observe_rows(x, P, n, motion_of(TWIST, MOTION_COV), frame.sonar, frame.rows)
-
-    @staticmethod
-    def world(state):
-        """Rotation and position of the body, the landmarks, and what the bias adds to the motion."""
-        x, _, n = state
-        return gtsam.Rot3.RzRyRx(x[3:6]).matrix(), x[:3], x[6:n].reshape(-1, 3), np.zeros(6)
-
-    @classmethod
-    def drawn(cls, state, rng):
-        x, P, n = state
-        return cls.world((np.r_[x[:n] + np.linalg.cholesky(P[:n, :n]) @ rng.normal(size=n), x[n:]], P, n))
-
-    @staticmethod
-    def covariance(state, k):
-        """Covariance of the body's position (k = 0) or a landmark's."""
-        at = 0 if k == 0 else 3 + 3 * k
-        return state[1][at : at + 3, at : at + 3]
+def drawn(filter_, state, rng):
+    """A true state, and the sonar there after a motion that errs."""
+    true = filter_.moved(state, np.linalg.cholesky(state.P) @ rng.normal(size=len(state.P)))
+    return true, sonar_pose(filter_, true, TWIST, MOTION_SIGMA * rng.normal(size=6))
 
 
-class Invariant:
-    """The invariant filter; a state is an `InvariantState`."""
-
-    @staticmethod
-    def state(angles, landmarks, scale):
-        attitude = gtsam.Rot3.Logmap(gtsam.Rot3.RzRyRx(angles))
-        return state_at(attitude, np.reshape(landmarks, (-1, 3)), scale=scale)
-
-    @staticmethod
-    def observe(state, frame):
-        motion = gap_motion_of(TWIST, MOTION_COV, D_BIAS)
-        return invariant_equations.observe_rows(copied(state), motion, frame.sonar, frame.rows)
-
-    @staticmethod
-    def world(state):
-        return state.R, state.points[0], state.points[1:], np.zeros(6)
-
-    @classmethod
-    def drawn(cls, state, rng):
-        xi = np.linalg.cholesky(state.P) @ rng.normal(size=len(state.P))
-        return *cls.world(moved_by(state, xi))[:3], D_BIAS @ xi[3:6]
-
-    @staticmethod
-    def covariance(state, k):
-        return invariant_equations.landmark_covariance(state, k)
-
-
-class Seen:
-    """Detections of a frame, and their outcomes."""
-
-    def __init__(self, slots, z, sonar, noise):
-        range_m, azimuth = np.array(z, float).T.copy()
-        columns = np.array(slots), range_m, azimuth, np.array([noise] * len(slots))
-        told = no_outcomes(len(slots))
-        self.sonar, self.rows = sonar, Frame(columns, 0, len(slots), told, False)
-        self.outcomes, self.innovations, self.covs = told
-
-
-both = pytest.mark.parametrize("filter_", [Plain, Invariant], ids=["ekf-slam", "invariant-ekf"])
-
-
-def observed(filter_, state, slots, z, sonar=SONAR, noise=NOISE):
-    seen = Seen(slots, z, sonar, noise)
-    return filter_.observe(state, seen), seen
-
-
-def sonar_pose(world, motion_xi=0.0):
-    """At the frame, with the motion perturbed by [theta_i, eps]."""
-    R, X, _, by_bias = world
-    R, X = body_after(state_at(LEVEL)._replace(R=R, points=X[None]), TWIST, by_bias + motion_xi)
-    return gtsam.Pose3(gtsam.Rot3(R), X).compose(MOUNTING)
-
-
-def drawn_pose(world, rng):
-    turn = np.kron(np.eye(2), gtsam.Rot3.Expmap(TWIST[:3]).matrix())
-    return sonar_pose(world, turn @ (MOTION_SIGMA * rng.normal(size=6)))
+def assert_covariance_of(draws, actual):
+    sigma = np.std(draws, axis=0)
+    scale = np.outer(sigma, sigma)
+    assert_allclose(actual / scale, np.cov(np.transpose(draws)) / scale, atol=0.05)
 
 
 def with_landmark(filter_, angles=TILTED, view=(2.0, 0.3, 0.05), scale=0.002):
     """A state with one landmark, and what is to be seen of it."""
-    pose = sonar_pose(filter_.world(filter_.state(angles, [], scale)))
+    pose = sonar_pose(filter_, filter_.state(angles, [], scale))
     return filter_.state(angles, [locate(pose, *view)], scale), np.array(view[:2])
 
 
@@ -136,12 +48,9 @@ def test_a_new_landmark_has_the_covariance_of_many_draws(filter_):
     draws = []
     for _ in range(20_000):
         z = rng.multivariate_normal([2.0, 0.3], NOISE)
-        pose = drawn_pose(filter_.drawn(before, rng), rng)
-        draws.append(locate(pose, *z, rng.uniform(-0.5, 0.5) * aperture))
-    sigma = np.std(draws, axis=0)
-    scale = np.outer(sigma, sigma)
+        draws.append(locate(drawn(filter_, before, rng)[1], *z, rng.uniform(-0.5, 0.5) * aperture))
     assert_allclose(filter_.world(after)[2][0], np.mean(draws, axis=0), atol=2e-3)
-    assert_allclose(filter_.covariance(after, 1) / scale, np.cov(np.transpose(draws)) / scale, atol=0.05)
+    assert_covariance_of(draws, filter_.covariance(after, 1))
 
 
 @pytest.mark.slow
@@ -154,19 +63,17 @@ def test_an_innovation_has_the_covariance_of_many_draws(filter_):
     assert_allclose(seen.innovations[0], [0.01, -0.005], atol=1e-9)
     views = []
     for _ in range(20_000):
-        world = filter_.drawn(state, rng)
-        view = np.asarray(range_azimuth(drawn_pose(world, rng), world[2][0]))
+        true, pose = drawn(filter_, state, rng)
+        view = np.asarray(range_azimuth(pose, filter_.world(true)[2][0]))
         views.append(view + np.sqrt(np.diag(NOISE)) * rng.normal(size=2))
-    sigma = np.std(views, axis=0)
-    scale = np.outer(sigma, sigma)
-    assert_allclose(seen.covs[0] / scale, np.cov(np.transpose(views)) / scale, atol=0.05)
+    assert_covariance_of(views, seen.covs[0])
     assert np.trace(filter_.covariance(after, 0)) < np.trace(filter_.covariance(state, 0))
 
 
 @both
 def test_a_known_floor_fixes_the_height_of_a_new_landmark(filter_):
     state = filter_.state(LEVEL, [], 0.003)
-    true = locate(sonar_pose(filter_.world(state)), 2.0, 0.3, 0.05)
+    true = locate(sonar_pose(filter_, state), 2.0, 0.3, 0.05)
     sonar = SONAR._replace(has_floor=True, floor_z_m=true[2], floor_variance_m2=1e-6)
     after, _ = observed(filter_, state, [0], [[2.0, 0.3]], sonar)
     assert_allclose(filter_.world(after)[2][0], true, atol=1e-3)
@@ -176,7 +83,7 @@ def test_a_known_floor_fixes_the_height_of_a_new_landmark(filter_):
 @both
 def test_without_a_floor_in_reach_a_new_landmark_is_on_the_centre_beam_and_the_vehicle_stays(filter_):
     state = filter_.state(TILTED, [], 0.003)
-    middle = locate(sonar_pose(filter_.world(state)), 3.0, 0.3, 0.0)
+    middle = locate(sonar_pose(filter_, state), 3.0, 0.3, 0.0)
     for sonar in (SONAR, SONAR._replace(has_floor=True, floor_z_m=BODY_M[2] - 5.0)):
         after, seen = observed(filter_, state, [0], [[3.0, 0.3]], sonar)
         assert seen.outcomes.tolist() == [NEW]
@@ -195,7 +102,7 @@ def test_a_floor_outside_the_aperture_counts_up_to_its_gate(filter_, side, share
     height_m, variance = filter_.world(bare)[2][0, 2], filter_.covariance(bare, 1)[2, 2]
     off_m = side * math.sqrt(share * FLOOR_GATE * (variance + floor_variance))
     sonar = SONAR._replace(has_floor=True, floor_z_m=height_m + off_m, floor_variance_m2=floor_variance)
-    pose = sonar_pose(filter_.world(state))
+    pose = sonar_pose(filter_, state)
     assert elevation_on_floor(pose, 2.0, 0.3, sonar.floor_z_m, sonar.aperture_rad) is None
     after, _ = observed(filter_, state, [0], [[2.0, 0.3]], sonar)
     if is_used:

@@ -5,29 +5,23 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from baselines.ekf_equations import observe_rows as observe_by_ekf
 from baselines.ekf_slam import EkfSlam
 from baselines.filter_window import LOST
 from baselines.invariant_ekf import InvariantEkf
-from baselines.invariant_equations import InvariantState, landmark_covariance
-from baselines.invariant_equations import observe_rows as observe_by_invariant
 from baselines.sonar_update import (
     GATED,
     USED,
-    Frame,
     SonarModel,
-    correct_jointly,
     far_polar_covariance,
     is_beyond_linear,
-    no_outcomes,
     range_azimuth_jacobian,
 )
-from sonar_graph.navigation.preintegration.dvl_gaps import GapMotion
-from sonar_graph.navigation.preintegration.recursion import NO_MOTION
-from sonar_graph.numerics.mat3 import IDENTITY, ZERO, ZEROS, skew
+from sonar_graph.numerics.mat3 import IDENTITY, ZERO
 from sonar_graph.sequence import NS_PER_S, Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
 from sonar_graph.slam.landmarks.association import gate_threshold
+
+from .filters import LEVEL, both, derivative, observed, rotation
 
 APERTURE_RAD = 0.3
 SONAR = SonarModel(IDENTITY, ZERO, gate_threshold(0.999, 2), APERTURE_RAD, 0.02**2, 0.01**2, False, 0.0, 1.0)
@@ -36,66 +30,53 @@ BEFORE_S, LOST_S = 25.0, 120.0
 AFTER_S = np.array([3.0, 10.0, 20.0])
 
 
-def by_ekf(P, seen, was_lost):
-    x, told = np.zeros(9), no_outcomes(1)
-    outcomes, innovation, S = told
-    x[6:] = LANDMARK
-    observe_by_ekf(x, P, 9, NO_MOTION, SONAR, Frame(seen, 0, 1, told, was_lost))
-    return outcomes[0], x[:3], P[:3, :3], innovation[0], S[0]
+def look(filter_, X, position_sigma_m, was_lost, wrong_m=0.0):
+    """One exact look at the landmark from X, by a filter that expects to be at the origin.
 
+    Returns the outcome, position and covariance after it, the innovation and its covariance.
+    """
 
-def by_invariant(P, seen, was_lost):
-    outcomes, innovation, S = told = no_outcomes(1)
-    own = np.r_[3:6, 9:12, 0:3, 6:9]  # [angles, bias, X, p] from [X, angles, p, bias]; the body is at the origin
-    wide = np.zeros((12, 12))
-    wide[:9, :9] = P
-    turned = np.eye(12)
-    turned[9:, :3] = skew(LANDMARK)
-    state = InvariantState(
-        np.eye(3), np.vstack([np.zeros(3), LANDMARK]), np.zeros(3), turned @ wide[np.ix_(own, own)] @ turned.T
-    )
-    still = GapMotion(NO_MOTION, ZEROS, ZEROS)
-    state = observe_by_invariant(state, still, SONAR, Frame(seen, 0, 1, told, was_lost))
-    return outcomes[0], state.points[0], landmark_covariance(state, 0), innovation[0], S[0]
+    def at(shift):
+        bare = filter_.posed(filter_.state(LEVEL, []), rotation(shift[3:6]), shift[:3])
+        return filter_.appended(bare, LANDMARK + shift[6:])
 
-
-FILTERS = pytest.mark.parametrize("observe", [by_ekf, by_invariant], ids=["ekf-slam", "invariant-ekf"])
-
-
-def look(observe, X, position_sigma_m, was_lost, wrong_m=0.0):
-    """One exact look at the landmark from X, by a filter that expects to be at the origin."""
-    P = np.diag(np.repeat(np.square([position_sigma_m, 1e-3, 0.01]), 3))
+    state = filter_.posed(filter_.state(LEVEL, LANDMARK), np.eye(3), np.zeros(3))
+    T = derivative(lambda shift: filter_.error(at(shift), state), 9)
+    state.P[:] = T @ np.diag(np.repeat(np.square([position_sigma_m, 1e-3, 0.01]), 3)) @ T.T
     q = LANDMARK - X
-    z = np.hypot(np.hypot(q[0], q[1]), q[2]) + wrong_m, np.arctan2(q[1], q[0])
-    seen = np.array([0]), np.array([z[0]]), np.array([z[1]]), np.full((1, 2, 2), np.nan)
-    return observe(P, seen, was_lost)
+    z = np.linalg.norm(q) + wrong_m, np.arctan2(q[1], q[0])
+    after, seen = observed(
+        filter_, state, [0], z, SONAR, np.full((2, 2), np.nan), np.zeros(6), np.zeros((6, 6)), was_lost
+    )
+    told = seen.outcomes[0], filter_.world(after)[1], filter_.covariance(after, 0)
+    return *told, seen.innovations[0], seen.covs[0]
 
 
 @pytest.mark.slow
-@FILTERS
-def test_one_look_finds_a_vehicle_that_is_far_from_where_it_was_expected(observe):
+@both
+def test_one_look_finds_a_vehicle_that_is_far_from_where_it_was_expected(filter_):
     """And linearised where it was expected it is sure of a wrong place."""
     X = np.array([40.0, 20.0, -0.5])
-    outcome, at, P, _, S = look(observe, X, 30.0, was_lost=True)
+    outcome, at, P, _, S = look(filter_, X, 30.0, was_lost=True)
     assert outcome == USED
     assert np.linalg.norm((at - X)[:2]) < 0.5
     assert (at - X) @ np.linalg.solve(P, at - X) < chi2.ppf(0.99, 3)
     assert S[0, 0] == pytest.approx(30.0**2, rel=0.01)
-    _, at, P, _, _ = look(observe, X, 30.0, was_lost=False)
+    _, at, P, _, _ = look(filter_, X, 30.0, was_lost=False)
     assert (at - X) @ np.linalg.solve(P, at - X) > 1000.0
 
 
-@FILTERS
-def test_a_vehicle_near_where_it_was_expected_sees_as_without_a_gap(observe):
+@both
+def test_a_vehicle_near_where_it_was_expected_sees_as_without_a_gap(filter_):
     X = np.array([0.1, -0.1, 0.05])
-    with_gap, without = look(observe, X, 0.2, True), look(observe, X, 0.2, False)
+    with_gap, without = look(filter_, X, 0.2, True), look(filter_, X, 0.2, False)
     for one, other in zip(with_gap, without, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
-@FILTERS
-def test_what_no_vehicle_in_reach_sees_is_refused(observe):
-    outcome, at, _, innovation, S = look(observe, np.array([40.0, 20.0, -0.5]), 30.0, True, wrong_m=300.0)
+@both
+def test_what_no_vehicle_in_reach_sees_is_refused(filter_):
+    outcome, at, _, innovation, S = look(filter_, np.array([40.0, 20.0, -0.5]), 30.0, True, wrong_m=300.0)
     assert outcome == GATED
     assert at.tolist() == [0.0, 0.0, 0.0]
     assert innovation @ np.linalg.solve(S, innovation) > SONAR.gate
@@ -183,22 +164,3 @@ def test_after_a_long_gap_landmarks_make_the_position_as_sure_as_it_is_right(kin
     for total in squares.sum(axis=0):
         assert low < total < high
     assert nees_after_gap(kind, 0, True).min() > high
-
-
-@pytest.mark.parametrize("m", [1, 2, 5])
-def test_a_joint_correction_is_the_textbooks_and_symmetric_to_the_last_bit(m):
-    """``K = P H^T S^-1``, ``P - K S K^T`` and ``K e`` by numpy's solver; room beyond the state is left alone."""
-    rng, n, room = np.random.default_rng(m), 7, 9
-    A, H = rng.standard_normal((n, n)), rng.standard_normal((m, n))
-    before = np.full((room, room), 3.0)
-    before[:n, :n] = A @ A.T
-    before[:n, :n] = 0.5 * (before[:n, :n] + before[:n, :n].T)
-    P, shifted, e = before.copy(), np.arange(float(room)), rng.standard_normal(m)
-    S = H @ before[:n, :n] @ H.T + np.eye(m)
-    K = np.linalg.solve(S, H @ before[:n, :n]).T
-    correct_jointly(P, n, H @ before[:n, :n], S, e, shifted)
-    np.testing.assert_allclose(P[:n, :n], before[:n, :n] - K @ S @ K.T, atol=1e-11)
-    np.testing.assert_allclose(shifted[:n], np.arange(n) + K @ e, atol=1e-11)
-    assert np.array_equal(P, P.T)
-    assert np.array_equal(P[n:], before[n:])
-    assert np.array_equal(shifted[n:], np.arange(n, room))

@@ -28,7 +28,7 @@ OTHER_KEYS = {
 }
 
 
-def test_scores_of_a_constant_offset_by_hand(install):
+def test_scores_of_a_constant_offset_by_hand_each_with_unit_and_protocol(install):
     scores = compare(straight_sequence(), ["offset"], {"offset": {"offset_m": 0.4, "sigma_m": 0.1}}).scores["offset"]
     value = {key: score.value for key, score in scores.items()}
     assert value["causal.ate_raw_m"] == pytest.approx(0.4)
@@ -43,10 +43,6 @@ def test_scores_of_a_constant_offset_by_hand(install):
     assert value["landmarks.nees"] == pytest.approx(0.1**2 / 0.01 / 2)
     assert (value["detections.used"], value["detections.refused"]) == (3, 1)
     assert value["detections.nis"] == pytest.approx((4.0 + 1.0) / 2 / 2)
-
-
-def test_every_score_is_there_with_unit_and_protocol(install):
-    scores = compare(straight_sequence(), ["offset"]).scores["offset"]
     expected = {f"{kind}.{key}" for kind in ("causal", "smoothed") for key in TRAJECTORY_KEYS} | OTHER_KEYS
     assert set(scores) - {"memory.peak_mb"} == expected
     for key, score in scores.items():
@@ -71,17 +67,14 @@ def test_ignored_detections_are_neither_used_nor_refused():
     assert "detections.nis" not in scores
 
 
-def test_only_independent_samples_get_a_band(install):
-    scores = compare(straight_sequence(), ["offset"]).scores["offset"]
+def test_only_independent_samples_get_a_band_and_spatial_runs_score_height_too(install):
+    comparison = compare(straight_sequence(planar=False), ["offset"])
+    scores = comparison.scores["offset"]
+    assert comparison.errors["offset"]["causal"].position_dof == 3
+    assert scores["causal.nees_position"].value == pytest.approx(1 / 3)
     assert scores["causal.nees_position"].interval is None
     assert "correlated" in scores["causal.nees_position"].protocol
     assert scores["detections.nis"].interval == pytest.approx(tuple(chi2.ppf([0.025, 0.975], 4) / 4))
-
-
-def test_spatial_runs_score_height_too(install):
-    comparison = compare(straight_sequence(planar=False), ["offset"], {"offset": {"offset_m": 0.3, "sigma_m": 0.3}})
-    assert comparison.errors["offset"]["causal"].position_dof == 3
-    assert comparison.scores["offset"]["causal.nees_position"].value == pytest.approx(1 / 3)
 
 
 def test_all_are_scored_at_the_instants_that_all_have(install):
@@ -110,7 +103,7 @@ def test_a_failed_run_is_a_row_and_does_not_disturb_the_others(install):
     assert together.scores["offset"]["causal.ate_raw_m"] == alone.scores["offset"]["causal.ate_raw_m"]
 
 
-def test_without_truth_the_rest_is_scored_and_it_is_said(install):
+def test_without_truth_or_with_too_little_the_rest_is_scored_and_it_is_said(install):
     comparison = compare(straight_sequence(truth=False), ["offset"])
     keys = set(comparison.scores["offset"])
     assert not any(key.startswith(("causal.", "smoothed.")) for key in keys)
@@ -118,13 +111,9 @@ def test_without_truth_the_rest_is_scored_and_it_is_said(install):
     assert "landmarks.raw_m" not in keys
     assert comparison.errors == {}
     assert "no truth" in comparison.environment["scored instants"]
-
-
-def test_a_truth_that_covers_one_instant_is_too_little(install):
     sequence = straight_sequence()
-    assert sequence.truth is not None
     comparison = compare(replace(sequence, truth=sequence.truth.rows(slice(0, 7))), ["offset"])
-    assert comparison.errors == {}
+    assert comparison.errors == {}, "one instant is too little"
     assert comparison.environment["scored instants"].startswith("1 of 40 instants")
 
 
@@ -139,30 +128,25 @@ def test_an_estimator_without_covariances_has_errors_but_no_nees(install):
     assert "causal.nees_position" not in scores
 
 
-def test_mistakes_of_the_user_are_raised(install):
-    sequence = straight_sequence()
-    with pytest.raises(EvaluationError, match="no estimator"):
-        compare(sequence, [])
-    with pytest.raises(EvaluationError, match="more than once: offset"):
-        compare(sequence, ["offset", "offset"])
-    with pytest.raises(EvaluationError, match="settings for ekf"):
-        compare(sequence, ["offset"], {"ekf": {}})
-    with pytest.raises(UnknownEstimatorError):
-        compare(sequence, ["offset", "nobody"])
-    with pytest.raises(EstimatorError, match="colour"):
-        compare(sequence, ["offset"], {"offset": {"colour": 1}})
-    with pytest.raises(TypeError, match=r"names is a list: give \['offset'\]"):
-        compare(sequence, "offset")
+@pytest.mark.parametrize(
+    ("arguments", "error", "said"),
+    [
+        (([],), EvaluationError, "no estimator"),
+        ((["offset", "offset"],), EvaluationError, "more than once: offset"),
+        ((["offset"], {"ekf": {}}), EvaluationError, "settings for ekf"),
+        ((["offset", "nobody"],), UnknownEstimatorError, "nobody"),
+        ((["offset"], {"offset": {"colour": 1}}), EstimatorError, "colour"),
+        (("offset",), TypeError, r"names is a list: give \['offset'\]"),
+    ],
+)
+def test_mistakes_of_the_user_are_raised_before_anything_runs(install, arguments, error, said):
+    calls: list[Any] = []
+    with pytest.raises(error, match=said):
+        compare(straight_sequence(), *arguments, progress=lambda *call: calls.append(call))
+    assert calls == []
     for call in (lambda log: compare(log, ["offset"]), lambda log: run_estimator(log, "offset")):
         with pytest.raises(TypeError, match="expected a Sequence, not str; read_log gives one"):
             call("dive.mcap")
-
-
-def test_a_wrong_name_is_found_before_anything_runs(install):
-    calls: list[Any] = []
-    with pytest.raises(UnknownEstimatorError):
-        compare(straight_sequence(), ["offset", "nobody"], progress=lambda *call: calls.append(call))
-    assert calls == []
 
 
 def test_times_by_hand():
@@ -176,14 +160,11 @@ def test_times_by_hand():
     assert "memory.peak_mb" not in value
 
 
-def test_progress_names_the_estimator(install):
+def test_progress_names_the_estimator_and_the_environment_versions_machine_date_and_command(install):
     install(one=Offset, two=Offset)
     calls: list[tuple[str, int, int]] = []
-    compare(straight_sequence(2.0), ["one", "two"], rate_hz=1.0, progress=lambda *call: calls.append(call))
+    comparison = compare(straight_sequence(2.0), ["one", "two"], rate_hz=1.0, progress=lambda *call: calls.append(call))
     assert calls == [("one", 1, 2), ("one", 2, 2), ("two", 1, 2), ("two", 2, 2)]
-
-
-def test_environment_names_versions_machine_date_and_command(install):
-    environment = compare(straight_sequence(), ["offset"]).environment
-    assert {"sonar_graph", "python", "numpy", "gtsam", "machine", "date", "command"} <= set(environment)
-    assert environment["numpy"] == np.__version__
+    expected = {"sonar_graph", "python", "numpy", "gtsam", "machine", "date", "command"}
+    assert expected <= set(comparison.environment)
+    assert comparison.environment["numpy"] == np.__version__

@@ -1,14 +1,20 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import chi2
+from scipy.spatial.transform import Rotation
+from scipy.stats import binned_statistic, chi2
 
+from sonar_graph.calibration import Calibration, Mounting, SonarCalibration
 from sonar_graph.evaluation import consistency
-from sonar_graph.states import DetectionLog, Estimate, Outcome, Trajectory
+from sonar_graph.measurements import LandmarkDetections
+from sonar_graph.sequence import Sequence
+from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
 
 angles = st.floats(-3.0, 3.0)
 tilts = st.floats(-1.2, 1.2)
@@ -44,12 +50,6 @@ def test_world_covariances_equal_numerical_propagation(seed, roll, pitch, yaw):
     scale = np.abs(expected).max()
     np.testing.assert_allclose(consistency.world_position_covs(trajectory)[0], expected[:3, :3], atol=1e-6 * scale)
     assert consistency.yaw_variances(trajectory)[0] == pytest.approx(expected[3, 3], abs=1e-6 * scale)
-
-
-def test_yaw_variance_is_not_merely_the_one_about_the_bodys_z():
-    tilted = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.6, 0.5, 0.0), np.zeros(3))
-    covariance = np.diag([0.0, 4e-4, 1e-4, 1.0, 1.0, 1.0])
-    assert abs(consistency.yaw_variances(single(tilted, covariance))[0] / 1e-4 - 1) > 0.5
 
 
 @pytest.mark.parametrize("dof", [2, 3])
@@ -96,14 +96,10 @@ def test_unknown_or_singular_covariances_have_no_nees():
     assert np.isnan(consistency.mean_normalised(squares[:2], 2))
 
 
-def test_anees_interval_of_fifty_runs_is_the_textbooks():
-    # Bar-Shalom et al. 2001, example 5.4.2: 50 runs of 2 degrees of freedom, chi-square(100) in [74.2, 129.6].
-    low, high = consistency.anees_interval(50, 2)
-    assert (100 * low, 100 * high) == pytest.approx((74.2, 129.6), abs=0.05)
-
-
 @given(st.integers(1, 500), st.integers(1, 6))
-def test_anees_interval_contains_one_and_narrows_with_runs(runs, dof):
+def test_anees_interval_contains_one_and_narrows_with_runs_to_the_textbooks(runs, dof):
+    # Bar-Shalom et al. 2001, example 5.4.2: 50 runs of 2 degrees of freedom, chi-square(100) in [74.2, 129.6].
+    assert 100 * np.array(consistency.anees_interval(50, 2)) == pytest.approx([74.2, 129.6], abs=0.05)
     low, high = consistency.anees_interval(runs, dof)
     narrower_low, narrower_high = consistency.anees_interval(4 * runs, dof)
     assert low < narrower_low < 1 < narrower_high < high
@@ -121,8 +117,127 @@ def test_nis_takes_used_detections_only():
     covs = np.array([np.full((2, 2), np.nan), np.diag([4.0, 1.0]), np.eye(2)])
     log = DetectionLog(np.arange(3), np.ones(3, int), np.array([[np.nan] * 2, [2.0, 3.0], [9.0, 9.0]]), covs, outcomes)
     np.testing.assert_allclose(consistency.nis(log), [1.0 + 9.0])
+    empty = DetectionLog(np.empty(0, int), np.empty(0, int), np.empty((0, 2)), np.empty((0, 2, 2)), [])
+    assert consistency.nis(empty).shape == (0,)
 
 
-def test_nis_of_an_empty_log_is_empty():
-    log = DetectionLog(np.empty(0, int), np.empty(0, int), np.empty((0, 2)), np.empty((0, 2, 2)), [])
-    assert consistency.nis(log).shape == (0,)
+def test_expected_error_of_five_detections_by_hand():
+    """Two at 0.95 and both right, one at 0.85 and wrong, two at 0.55 of which one is right: (0.1 + 0.85 + 0.1) / 5."""
+    found = consistency.reliability(np.array([0.95, 0.95, 0.85, 0.55, 0.55]), np.array([1.0, 1.0, 0.0, 1.0, 0.0]))
+    assert found.count.tolist() == [0, 0, 0, 0, 0, 2, 0, 0, 1, 2]
+    assert found.right[[5, 8, 9]].tolist() == [0.5, 0.0, 1.0]
+    assert found.confidence[[5, 8, 9]] == pytest.approx([0.55, 0.85, 0.95])
+    assert found.expected_error == pytest.approx((0.1 + 0.85 + 0.1) / 5)
+    assert np.isnan(found.right[0])
+    certain = consistency.reliability(np.array([1.0]), np.array([1.0]))
+    assert certain.count.tolist() == [0] * 9 + [1], "certainty counts in the last bin"
+
+
+@given(st.integers(1, 200), st.integers(0, 2**32 - 1))
+def test_bins_are_those_of_another_implementation(n, seed):
+    rng = np.random.default_rng(seed)
+    confidence, right = rng.uniform(0, 1, n), rng.integers(0, 2, n).astype(float)
+    found = consistency.reliability(confidence, right)
+    means = [binned_statistic(confidence, v, "mean", 10, (0, 1)).statistic for v in (confidence, right)]
+    count = binned_statistic(confidence, right, "count", 10, (0, 1)).statistic
+    np.testing.assert_array_equal(found.count, count)
+    np.testing.assert_allclose([found.confidence, found.right], means)
+    expected = sum(k / n * abs(c - r) for k, c, r in zip(count, *means, strict=True) if k)
+    assert found.expected_error == pytest.approx(expected)
+
+
+def test_confidence_is_that_of_the_most_probable_class_none_of_them_included():
+    ids, probabilities = np.tile([4, 9], (3, 1)), np.array([[0.1, 0.7], [0.3, 0.1], [0.5, 0.5]])
+    detections = LandmarkDetections(np.zeros(3, int), np.ones(3), np.zeros(3), np.zeros((3, 2, 2)), ids, probabilities)
+    confidence, named = consistency.confidences(detections)
+    assert confidence == pytest.approx([0.7, 0.6, 0.5])
+    assert named.tolist() == [9, consistency.NONE, 4]
+
+
+MOUNTING = Mounting(translation_m=(0.3, 0.1, -0.1), rpy_rad=(0.0, 0.5, 0.1))
+LANDMARKS_M = np.array([[3.0, 0.5, -1.0], [5.0, -2.0, -1.1]])
+IDS = np.array([11, 7])
+
+
+def turning_truth() -> Trajectory:
+    stamps_ns = np.arange(11) * 10**8
+    yaw = Rotation.from_euler("ZYX", np.column_stack([0.3 * np.arange(11), 0.02 * np.arange(11), np.zeros(11)]))
+    positions = np.column_stack([0.1 * np.arange(11), np.zeros(11), np.full(11, -0.5)])
+    return Trajectory.without_covariances(stamps_ns, positions, yaw.as_quat())
+
+
+def seen_at(stamp_ns: int, point: np.ndarray) -> tuple[float, float]:
+    """Range and azimuth of a world point, with transforms written out."""
+    truth = turning_truth()
+    row = truth.stamps_ns.tolist().index(stamp_ns)
+    in_body = truth.rotations()[row].inv().apply(point - truth.positions[row])
+    q = Rotation.from_euler("ZYX", [0.1, 0.5, 0.0]).inv().apply(in_body - [0.3, 0.1, -0.1])
+    return float(np.linalg.norm(q)), float(np.arctan2(q[1], q[0]))
+
+
+def run_with(rows: list[tuple[int, float, float]], named: list[int], probability: list[float]) -> Sequence:
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    ids, probabilities = np.array(named)[:, None], np.array(probability)[:, None]
+    detections = LandmarkDetections(*columns, np.zeros((len(rows), 2, 2)), ids, probabilities)
+    return Sequence(
+        "hand",
+        Calibration(sonar=SonarCalibration(mounting=MOUNTING)),
+        imu=None,  # type: ignore[arg-type]
+        dvl=None,  # type: ignore[arg-type]
+        detections=detections,
+        truth=turning_truth(),
+        true_landmarks=LandmarkMap(IDS, LANDMARKS_M, np.full((2, 3, 3), np.nan)),
+    )
+
+
+def test_a_detection_is_of_the_landmark_that_lies_there():
+    """Two stamps, detections 10 cm off, 25 cm off (cannot be told) and 60 cm off (none)."""
+    rows = []
+    for stamp_ns, landmark in ((2 * 10**8, 0), (6 * 10**8, 1)):
+        r, a = seen_at(stamp_ns, LANDMARKS_M[landmark])
+        off = (0.1, 0.0), (0.0, 0.1 / r), (0.25, 0.0), (0.0, 0.6 / r)
+        rows += [(stamp_ns, r + along, a + turn) for along, turn in off]
+    run = run_with(rows, [0] * 8, [1.0] * 8)
+    labels = consistency.true_identities(run, run.detections)
+    assert labels.tolist() == [
+        11,
+        11,
+        consistency.UNJUDGED,
+        consistency.NONE,
+        7,
+        7,
+        consistency.UNJUDGED,
+        consistency.NONE,
+    ]
+
+
+def test_azimuths_are_compared_round_the_circle_and_what_lies_outside_the_truth_is_not_judged():
+    r, a = seen_at(0, LANDMARKS_M[0])
+    rows = [(-5, r, a), (0, r, a), (0, r, a - 2 * np.pi), (0, r, a + np.pi), (10**9, r, a), (10**9 + 1, r, a)]
+    run = run_with(rows, [0] * 6, [1.0] * 6)
+    labels = consistency.true_identities(run, run.detections)
+    assert labels[[0, 5]].tolist() == [consistency.UNJUDGED] * 2
+    assert labels[1:4].tolist() == [11, 11, consistency.NONE]
+    early = run_with([(-5, r, a)], [0], [1.0])
+    assert consistency.true_identities(early, early.detections).tolist() == [consistency.UNJUDGED]
+    assert consistency.reliability_of(early) is None
+
+
+def test_a_sequence_is_judged_by_what_is_true():
+    """One right at 0.95, one taken for another at 0.85, one that is none and called so at 0.75, one left out."""
+    r, a = seen_at(2 * 10**8, LANDMARKS_M[0])
+    there, away, unclear = (2 * 10**8, r, a), (2 * 10**8, r, a + 0.6 / r), (2 * 10**8, r + 0.25, a)
+    run = run_with([there, there, away, unclear], [11, 7, 11, 11], [0.95, 0.85, 0.25, 0.5])
+    found = consistency.reliability_of(run)
+    assert found is not None
+    assert found.count.tolist() == [0] * 7 + [1, 1, 1]
+    assert found.right[7:].tolist() == [1.0, 0.0, 1.0]
+    assert found.expected_error == pytest.approx((0.25 + 0.85 + 0.05) / 3)
+
+
+def test_nothing_is_judged_without_truth():
+    r, a = seen_at(0, LANDMARKS_M[0])
+    run = run_with([(0, r, a)], [11], [0.9])
+    assert consistency.reliability_of(run) is not None
+    for missing in ("detections", "truth", "true_landmarks"):
+        assert consistency.reliability_of(replace(run, **{missing: None})) is None, missing

@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 import pytest
+from evo.core.geometry import umeyama_alignment
 from evo.core.metrics import APE, RPE, PoseRelation, StatisticsType, Unit
 from evo.core.trajectory import PoseTrajectory3D
 from hypothesis import given, settings
@@ -114,24 +117,19 @@ def line(yaws: list[float], positions: list[list[float]]) -> Trajectory:
     return Trajectory.without_covariances(np.arange(len(yaws)) * STEP_NS, np.array(positions, dtype=float), quaternions)
 
 
-def test_planar_errors_by_hand():
+def test_errors_by_hand():
+    """Height, which the plane leaves out; the displacement from start to end; yaw across half a turn."""
     truth = line([0.0] * 4, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     estimate = line([0.0] * 4, [[0, 0, 1], [1, 0, 1], [1, 1, -1], [0, 1, -1]])
     assert metrics.ate_raw_m(estimate, truth) == pytest.approx(1.0)
     assert metrics.ate_yaw_m(estimate, truth) == pytest.approx(1.0)
     assert metrics.ate_se2_m(estimate, truth) == pytest.approx(0.0, abs=1e-12)
-
-
-def test_return_error_is_the_error_of_the_displacement():
-    truth = line([0.0] * 3, [[0, 0, 0], [5, 0, 0], [0, 0, 0]])
-    estimate = line([0.0] * 3, [[1, 1, 0], [9, 9, 9], [1.3, 1.4, 0]])
+    truth = line([np.pi - 0.01] * 3, [[0, 0, 0], [5, 0, 0], [0, 0, 0]])
+    estimate = line([-np.pi + 0.02] * 3, [[1, 1, 0], [9, 9, 9], [1.3, 1.4, 0]])
     assert metrics.return_error_m(estimate, truth) == pytest.approx(0.5)
-
-
-def test_yaw_error_wraps():
-    truth = line([np.pi - 0.01], [[0, 0, 0]])
-    estimate = line([-np.pi + 0.02], [[0, 0, 0]])
-    np.testing.assert_allclose(metrics.yaw_errors_rad(estimate, truth), [0.03], atol=1e-12)
+    np.testing.assert_allclose(metrics.yaw_errors_rad(estimate, truth), [0.03] * 3, atol=1e-12)
+    with pytest.raises(EvaluationError, match=r"Trajectory\.at"):
+        metrics.ate_raw_m(truth.rows(slice(1, None)), truth)
 
 
 def test_a_constant_heading_error_is_in_yaw_but_not_in_relative_yaw():
@@ -141,25 +139,26 @@ def test_a_constant_heading_error_is_in_yaw_but_not_in_relative_yaw():
     assert metrics.rmse(metrics.relative_errors(estimate, truth, 1.0).yaw_rad) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_pairs_skip_instants_without_a_partner():
-    stamps = np.array([0.0, 0.5, 1.0, 1.5, 4.0, 5.0]) * 1e9
-    first, second = metrics.pairs_apart(stamps.astype(np.int64), 1.0)
-    assert list(zip(first.tolist(), second.tolist(), strict=True)) == [(0, 2), (1, 3), (4, 5)]
+@pytest.mark.parametrize(
+    ("stamps_s", "pairs"),
+    [
+        ([0.0, 0.5, 1.0, 1.5, 4.0, 5.0], [(0, 2), (1, 3), (4, 5)]),  # instants without a partner are skipped
+        ([k * 0.333_333_333 for k in range(10)], [(k, k + 3) for k in range(7)]),  # a third of a second is rounded
+        ([5.0], []),
+    ],
+)
+def test_pairs_are_a_second_apart(stamps_s, pairs):
+    first, second = metrics.pairs_apart(np.round(np.array(stamps_s) * 1e9).astype(np.int64), 1.0)
+    assert list(zip(first.tolist(), second.tolist(), strict=True)) == pairs
 
 
-def test_pairs_forgive_the_rounding_of_a_third_of_a_second():
-    stamps = np.arange(10, dtype=np.int64) * 333_333_333
-    first, second = metrics.pairs_apart(stamps, 1.0)
-    np.testing.assert_array_equal(second - first, 3)
-    assert len(first) == 7
+def landmark_map(ids: list[int], positions: object) -> LandmarkMap:
+    places = np.reshape(np.asarray(positions, dtype=float), (len(ids), 3))
+    return LandmarkMap(np.array(ids, dtype=np.int64), places, np.tile(np.eye(3), (len(ids), 1, 1)))
 
 
-def test_no_pairs_in_a_single_instant():
-    assert not len(metrics.pairs_apart(np.array([5]), 1.0)[0])
-
-
-def landmark_map(ids: list[int], positions: list[list[float]]) -> LandmarkMap:
-    return LandmarkMap(np.array(ids), np.array(positions, dtype=float), np.full((len(ids), 3, 3), np.nan))
+def on_floor(xy: np.ndarray) -> np.ndarray:
+    return np.column_stack([xy, np.zeros(len(xy))])
 
 
 def test_landmarks_of_the_seed_experiment_by_hand():
@@ -179,14 +178,88 @@ def test_landmarks_are_matched_by_identity_not_by_row():
     errors = metrics.landmark_errors(estimated, true)
     np.testing.assert_array_equal(errors.ids, [8, 20])
     np.testing.assert_allclose(errors.horizontal_m, [[0, 0.5], [0, 0]])
-
-
-def test_one_landmark_cannot_be_aligned():
     one = landmark_map([1], [[0, 0, 0]])
-    assert np.isnan(metrics.landmark_errors(one, one).aligned_rmse_m)
+    assert np.isnan(metrics.landmark_errors(one, one).aligned_rmse_m), "one landmark cannot be aligned"
 
 
-def test_trajectories_at_different_instants_are_refused():
-    truth = random_walk(0)
-    with pytest.raises(EvaluationError, match=r"Trajectory\.at"):
-        metrics.ate_raw_m(truth.rows(slice(1, None)), truth)
+UNKNOWN = 3_000_000_000
+FARTHEST_M = 1.0
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**31), n=st.integers(1, 4), m=st.integers(1, 4))
+def test_unnamed_landmarks_are_matched_as_the_best_of_all_matchings_says(seed, n, m):
+    rng = np.random.default_rng(seed)
+    estimated = landmark_map([UNKNOWN + k for k in range(n)], on_floor(1.2 * rng.standard_normal((n, 2))))
+    true = landmark_map(list(range(m)), on_floor(1.2 * rng.standard_normal((m, 2))))
+    squared = np.sum((estimated.positions[:, None] - true.positions[None]) ** 2, axis=-1)
+    best = (0, 0.0)
+    for order in permutations([*range(m), *[-1] * n], n):
+        pairs = [(k, j) for k, j in enumerate(order) if j >= 0]
+        if all(squared[pair] <= FARTHEST_M**2 for pair in pairs):
+            best = max(best, (len(pairs), -float(sum(squared[pair] for pair in pairs))))
+    named = metrics.named_by_place(estimated, true, FARTHEST_M)
+    assert np.all(np.diff(named.ids) > 0)
+    matched = metrics.landmark_errors(named, true)
+    assert len(matched) == best[0]
+    assert np.sum(matched.horizontal_m**2) == pytest.approx(-best[1])
+
+
+def test_known_identities_stay_wherever_they_are():
+    true = landmark_map([1, 2], [[0, 0, 0], [5, 0, 0]])
+    estimated = landmark_map([1, UNKNOWN, UNKNOWN + 1], [[5, 0, 0], [0, 0, 0], [5.1, 0, 0]])
+    named = metrics.named_by_place(estimated, true, FARTHEST_M)
+    assert named.ids.tolist() == [1, 2, UNKNOWN]
+    assert named.positions[:, 0].tolist() == [5.0, 5.1, 0.0]
+    empty = landmark_map([], [])
+    assert len(metrics.named_by_place(empty, true, FARTHEST_M)) == 0
+    assert metrics.named_by_place(true, empty, FARTHEST_M).ids.tolist() == [1, 2]
+    unnamed = landmark_map([UNKNOWN], [[0, 0, 0]])
+    assert len(metrics.landmark_errors(unnamed, true)) == 0, "unnamed landmarks are never taken for known ones"
+
+
+def cloud(seed: int, n: int = 30) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(n, 3)) * [5.0, 3.0, 1.0]
+
+
+@given(seeds, st.floats(-np.pi, np.pi))
+def test_alignment_undoes_a_motion_that_it_allows(seed, angle):
+    points, shift = cloud(seed), np.array([10.0, -3.0, 2.0])
+    turns = Rotation.random(rng=seed).as_matrix(), Rotation.from_euler("z", angle).as_matrix()
+    for align, turn in zip((metrics.align_se3, metrics.align_yaw), turns, strict=True):
+        alignment = align(points, points @ turn.T + shift)
+        np.testing.assert_allclose(alignment.rotation, turn, atol=1e-10)
+        np.testing.assert_allclose(alignment.translation, shift, atol=1e-9)
+
+
+@given(seeds, st.sampled_from([2, 3]))
+def test_umeyama_agrees_with_evo(seed, dimension):
+    points, targets = cloud(seed)[:, :dimension], cloud(seed + 1)[:, :dimension]
+    R, t = metrics.umeyama(points, targets)
+    expected_R, expected_t, _ = umeyama_alignment(points.T, targets.T)
+    np.testing.assert_allclose(R, expected_R, atol=1e-9)
+    np.testing.assert_allclose(t, expected_t, atol=1e-9)
+
+
+def test_yaw_alignment_leaves_a_tilt_where_se3_removes_it_and_one_place_is_moved_to_another():
+    np.testing.assert_allclose(metrics.align_se3(np.ones((5, 3)), np.full((5, 3), 3.0)).apply(np.ones((5, 3))), 3.0)
+    points = cloud(0)
+    tilted = points @ Rotation.from_euler("x", 0.2).as_matrix().T
+    assert metrics.rmse(metrics.align_se3(points, tilted).apply(points) - tilted) < 1e-10
+    assert metrics.rmse(metrics.align_yaw(points, tilted).apply(points) - tilted) > 0.1
+
+
+@given(seeds, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
+def test_more_freedom_never_fits_worse_and_yaw_alignment_is_the_best_of_the_plane(seed, turn, x, y):
+    points, targets = cloud(seed), cloud(seed) + np.random.default_rng(seed + 1).normal(size=(30, 3))
+    aligned = metrics.align_yaw(points, targets).apply(points)
+    se3 = metrics.rmse(metrics.align_se3(points, targets).apply(points) - targets)
+    assert se3 - 1e-12 <= metrics.rmse(aligned - targets) <= metrics.rmse(points - targets) + 1e-12
+    other = aligned @ Rotation.from_euler("z", turn).as_matrix().T + [x, y, 0.0]
+    assert metrics.rmse((aligned - targets)[:, :2]) <= metrics.rmse((other - targets)[:, :2]) + 1e-12
+
+
+@pytest.mark.parametrize("shapes", [((0, 3), (0, 3)), ((4, 3), (5, 3))])
+def test_unpaired_points_are_refused(shapes):
+    with pytest.raises(EvaluationError, match="paired points"):
+        metrics.umeyama(np.zeros(shapes[0]), np.zeros(shapes[1]))

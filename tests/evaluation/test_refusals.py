@@ -45,7 +45,7 @@ def with_outliers(sequence: Sequence, rows: list[int]) -> Sequence:
     return replace(sequence, dvl=Dvl(sequence.dvl.stamps_ns, velocity, sequence.dvl.velocity_cov))
 
 
-def test_few_rows_are_named_each_and_many_are_counted():
+def test_few_rows_are_named_each_and_many_are_counted_by_sensor_and_reason():
     few = [outlier(k, 50.0 + k) for k in range(MOST_ROWS_NAMED)]
     assert [(rows.count, rows.first_ns, rows.distances()) for rows in gathered(few[::-1])] == [
         (1, k, f"{50 + k}") for k in range(MOST_ROWS_NAMED)
@@ -53,9 +53,6 @@ def test_few_rows_are_named_each_and_many_are_counted():
     (many,) = gathered([*few, outlier(99, 7.5)])
     assert (many.count, many.first_ns, many.last_ns) == (MOST_ROWS_NAMED + 1, 0, 99)
     assert (many.times(-NS), many.distances()) == ("1.000 to 1.000", "7.50 to 54")
-
-
-def test_rows_of_other_sensors_and_reasons_are_counted_apart():
     rows = [outlier(k) for k in range(9)] + [late(k) for k in range(9)] + [RefusedRow("dvl", 3, Refusal.LATE, math.nan)]
     found = Counter({(rows.sensor, rows.reason): rows.count for rows in gathered(rows)})
     assert found == {("dvl", Refusal.OUTLIER): 9, ("imu", Refusal.LATE): 9, ("dvl", Refusal.LATE): 1}
@@ -71,14 +68,8 @@ def test_files_have_counts_for_people_and_every_row_for_the_report(tmp_path):
         (tmp_path / "runs" / "isam2" / "result.json", lambda content: content),
     ):
         told = entry(json.loads(path.read_text()))["refused"]
-        assert told[0] == {
-            "sensor": "dvl",
-            "reason": Refusal.OUTLIER.value,
-            "count": 8,
-            "first_ns": 0,
-            "last_ns": 7 * NS,
-            "least_and_largest_distance": [50.0, 57.0],
-        }
+        expected = {"sensor": "dvl", "reason": Refusal.OUTLIER.value, "count": 8, "first_ns": 0, "last_ns": 7 * NS}
+        assert told[0] == {**expected, "least_and_largest_distance": [50.0, 57.0]}
         assert told[1]["least_and_largest_distance"] is None
     restored = read_comparison(tmp_path)
     assert [run.withheld for run in restored.runs] == [["landmark 3; open: z"], [], []]
@@ -109,11 +100,8 @@ def test_outliers_are_named_and_not_used(straight, name):
 def live(name: str, sequence: Sequence, late: Measurements | None) -> tuple[Estimate | None, list[RefusedRow]]:
     """Half a second of both sensors is missing, and perhaps comes at the end."""
     estimator = load_estimator(name)(sequence.calibration)
-    for after_ns, until_ns in (
-        (0, HELD_NS[0]),
-        (HELD_NS[1], HELD_NS[1] + 4 * NS),
-        (HELD_NS[1] + 4 * NS, sequence.end_ns),
-    ):
+    resumed_ns = HELD_NS[1] + 4 * NS
+    for after_ns, until_ns in ((0, HELD_NS[0]), (HELD_NS[1], resumed_ns), (resumed_ns, sequence.end_ns)):
         imu, dvl = sequence.imu.between(after_ns, until_ns), sequence.dvl.between(after_ns, until_ns)
         estimator.process(Measurements(until_ns, imu, dvl))
     if late is not None:
@@ -183,18 +171,12 @@ def test_rows_recorded_late_are_placed_by_their_stamps_and_said(straight, tmp_pa
     np.testing.assert_array_equal(one.causal.positions, other.causal.positions)
 
 
-@pytest.fixture(scope="module")
-def spoilt_log(straight, tmp_path_factory) -> Path:
+def test_run_and_compare_name_what_was_refused_in_a_log(straight, tmp_path, capsys):
     """Two velocities are wrong."""
-    path = tmp_path_factory.mktemp("spoilt") / "log.mcap"
-    write_log(path, with_outliers(straight, [20, 60]))
-    return path
-
-
-def test_run_and_compare_name_what_was_refused_in_a_log(spoilt_log, tmp_path, capsys):
+    write_log(tmp_path / "log.mcap", with_outliers(straight, [20, 60]))
     for arguments in (["run", "--estimator", "dead-reckoning"], ["compare", "--estimators", "dead-reckoning,ekf-slam"]):
         out = tmp_path / arguments[0]
-        said = told_by(capsys, arguments[0], spoilt_log, "-o", out, *arguments[1:])
+        said = told_by(capsys, arguments[0], tmp_path / "log.mcap", "-o", out, *arguments[1:])
         for seconds in ("2.000", "6.000"):
             assert f"Warning: dvl, {seconds} s: {Refusal.OUTLIER} (squared distance" in said
         index = json.loads((out / "comparison.json").read_text())

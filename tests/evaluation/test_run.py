@@ -116,16 +116,15 @@ def test_the_instance_that_warms_up_waits_for_landmarks_that_can_be_named(ran):
     stamps_ns = sequence.imu.stamps_ns[5:155:10]
     n = len(stamps_ns)
     probable = np.where(np.arange(n) < 10, 0.2, 0.9)[:, None]
-    unsure = LandmarkDetections(
-        stamps_ns, np.ones(n), np.zeros(n), np.full((n, 2, 2), np.nan), np.full((n, 1), 7), probable
-    )
+    noise, ids = np.full((n, 2, 2), np.nan), np.full((n, 1), 7)
+    unsure = LandmarkDetections(stamps_ns, np.ones(n), np.zeros(n), noise, ids, probable)
     assert ran(replace(sequence, detections=unsure)).status == "ok"
     warmed_up, judged = (one.seen for one in ran.made)
     assert warmed_up[-1].end_ns >= stamps_ns[11]
     assert len(warmed_up) < len(judged)
 
 
-def test_causal_and_smoothed_are_what_the_estimator_said(ran):
+def test_results_are_what_the_estimator_said(ran):
     result = ran(settings={"offset_m": 0.4})
     np.testing.assert_allclose(result.causal.positions[:, 1], 0.4)
     np.testing.assert_allclose(result.smoothed.positions[:, 1], 0.2)
@@ -161,57 +160,38 @@ def test_an_exception_becomes_a_reason_of_one_line_with_type_and_time(ran):
 
 
 @pytest.mark.parametrize("can_tell", [True, False])
-def test_a_failed_run_names_what_was_refused_and_withheld_before(ran, can_tell):
+def test_a_run_names_what_was_refused_and_withheld_even_where_it_fails(ran, can_tell):
     told = {"refused": [RefusedRow("dvl", 2_000_000_000, Refusal.OUTLIER, 100.0)], "withheld": ["landmark 3; open: z"]}
 
     def telling(what: str):
         return lambda _: told[what] if can_tell else 1 / 0
 
-    result = ran(
-        process=failing_after(6, ValueError("singular")),
-        refused_rows=telling("refused"),
-        withheld=telling("withheld"),
-    )
+    methods = {"refused_rows": telling("refused"), "withheld": telling("withheld")}
+    result = ran(process=failing_after(6, ValueError("singular")), **methods)
     assert "ValueError: singular" in result.reason
     for what, known in told.items():
         assert getattr(result, what) == (known if can_tell else [])
-
-
-def test_telling_is_optional_and_heard_in_runs_that_end(ran):
-    assert (ran().refused, ran().withheld) == ([], [])
-    assert ran(withheld=lambda _: ["a", "b"]).withheld == ["a", "b"]
+    if can_tell:
+        assert ran(**methods).withheld == told["withheld"], "also in runs that end"
+    assert (ran().refused, ran().withheld) == ([], []), "telling is optional"
     assert withheld_of(load_estimator("dead-reckoning")(straight_sequence().calibration)) == []
 
 
 NAN_POSE = gtsam.Pose3(gtsam.Rot3(), np.array([np.nan, 0.0, 0.0]))
+IMPOSSIBLE = "causal covariance is impossible"
 
 
 @pytest.mark.parametrize(
     ("methods", "reason"),
     [
-        (
-            {"process": changing(world_T_body=NAN_POSE)},
-            "causal pose is not finite in 39 of 40 rows, first at ns 2000000000",
-        ),
-        (
-            {"process": changing(covariance=np.diag([1.0] * 5 + [-1e-3]))},
-            "causal covariance is impossible in 39 of 40 rows",
-        ),
-        ({"process": changing(covariance=np.eye(6) + 0.5 * np.eye(6, k=1))}, "causal covariance is impossible"),
-        (
-            {"process": changing(covariance=np.where(np.eye(6) > 0, np.nan, 0.0))},
-            "causal covariance is impossible",
-        ),
+        ({"process": changing(world_T_body=NAN_POSE)}, "pose is not finite in 39 of 40 rows, first at ns 2000000000"),
+        ({"process": changing(covariance=np.diag([1.0] * 5 + [-1e-3]))}, f"{IMPOSSIBLE} in 39 of 40 rows"),
+        ({"process": changing(covariance=np.eye(6) + 0.5 * np.eye(6, k=1))}, IMPOSSIBLE),
+        ({"process": changing(covariance=np.where(np.eye(6) > 0, np.nan, 0.0))}, IMPOSSIBLE),
         ({"process": changing(stamp_ns=17)}, "returned an estimate for 17 ns when asked for 2000000000 ns"),
         ({"process": lambda *_: None}, "never returned an estimate"),
-        (
-            {"trajectory": lambda self: Offset.trajectory(self).rows(slice(1, None))},
-            "trajectory() has 39 instants, not the 40",
-        ),
-        (
-            {"landmarks": lambda _: map_of([[np.inf, 0.0, 0.0]])},
-            "position is not finite in 1 of 1 rows, first at landmark 7",
-        ),
+        ({"trajectory": lambda self: Offset.trajectory(self).rows(slice(1, None))}, "has 39 instants, not the 40"),
+        ({"landmarks": lambda _: map_of([[np.inf, 0.0, 0.0]])}, "is not finite in 1 of 1 rows, first at landmark 7"),
         ({"beside": with_covariance(np.full((6, 6), np.nan))}, ""),  # unknown covariances are allowed,
         ({"beside": with_covariance(np.diag([1.0] * 5 + [-1e-12]))}, ""),  # rounding below zero,
         ({"landmarks": lambda _: map_of([])}, ""),  # and an empty map
@@ -224,11 +204,13 @@ def test_results_that_cannot_be_scored_fail_the_run(ran, methods, reason):
     assert bool(result.reason) == bool(reason)
 
 
-def test_mistakes_of_the_user_are_raised_and_a_broken_installation_is_a_failed_run(ran, monkeypatch):
+def test_mistakes_and_interruptions_of_the_user_are_raised_and_a_broken_installation_is_a_failed_run(ran, monkeypatch):
     with pytest.raises(EstimatorError, match="offset_cm"):
         ran(settings={"offset_cm": 3})
     with pytest.raises(UnknownEstimatorError):
         run_estimator(straight_sequence(), "ofset")
+    with pytest.raises(KeyboardInterrupt):
+        ran(process=failing_after(0, KeyboardInterrupt()))
 
     def load(name: str):
         raise EstimatorError(f"{name} cannot be loaded: No module named 'torch'")
@@ -237,11 +219,6 @@ def test_mistakes_of_the_user_are_raised_and_a_broken_installation_is_a_failed_r
     result = run_estimator(straight_sequence(), "neural")
     assert result.status == "failed"
     assert "No module named 'torch'" in result.reason
-
-
-def test_interruption_is_not_swallowed(ran):
-    with pytest.raises(KeyboardInterrupt):
-        ran(process=failing_after(0, KeyboardInterrupt()))
 
 
 def test_the_map_is_kept_on_the_way_as_it_was_known_then(ran):
@@ -295,15 +272,12 @@ def touch() -> float:
 
 
 @pytest.mark.skipif(np.isnan(PeakMemory().rise_mb()), reason="this system does not tell a process's peak memory")
-def test_peak_memory_sees_what_was_freed_again_and_forgets_what_was_before():
+def test_peak_memory_sees_what_was_freed_again_and_forgets_what_was_before(monkeypatch, tmp_path):
     touch()
     quiet = PeakMemory()
     assert quiet.rise_mb() < MEGABYTES / 2
     loud = PeakMemory()
     touch()
     assert loud.rise_mb() > 0.8 * MEGABYTES
-
-
-def test_peak_memory_is_unknown_where_the_system_does_not_tell(monkeypatch, tmp_path):
     monkeypatch.setattr(run_module, "CLEAR_REFS", tmp_path / "absent" / "clear_refs")
-    assert np.isnan(PeakMemory().rise_mb())
+    assert np.isnan(PeakMemory().rise_mb()), "unknown where the system does not tell"

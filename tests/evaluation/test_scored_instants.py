@@ -1,11 +1,29 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from sonar_graph.devices.landmark_designs import OWN_DESIGNS
+from sonar_graph.evaluation.metrics import landmark_errors, rmse
 from sonar_graph.evaluation.results import RunResult
-from sonar_graph.evaluation.scored_instants import gap_limit_s, map_instants, rows_at, scored_instants
-from sonar_graph.states import Trajectory
+from sonar_graph.evaluation.scored_instants import (
+    DURATION_S,
+    ESTIMATED_XY_M,
+    IDS,
+    MAP_TIMES_S,
+    TRUE_XY_M,
+    gap_limit_s,
+    map_instants,
+    published_maps,
+    repeats_published,
+    rows_at,
+    scored_instants,
+)
+from sonar_graph.simulation.basin import LANDMARKS_XY_M, BasinOptions, simulate_basin
+from sonar_graph.states import LandmarkMap, Trajectory
+from tests.synthetic import basin_comparison
 
 
 def trajectory(seconds: list[float]) -> Trajectory:
@@ -90,3 +108,45 @@ def test_maps_are_kept_at_the_published_times_or_the_same_fractions(duration_s):
 def test_few_instants_are_each_kept_once():
     np.testing.assert_array_equal(map_instants(seconds(1.0), 0), seconds(1.0))
     assert len(map_instants(seconds(), 0)) == 0
+
+
+DIFFERENCES_M = [[-0.19, -0.07], [-0.26, -0.01], [-0.15, 0.15], [-0.14, 0.18]]
+"""As Table I prints them, in brackets."""
+
+
+def complex_rms(differences: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.abs(differences) ** 2)))
+
+
+def test_published_errors_are_those_of_the_published_table():
+    """Against plane geometry in complex numbers: a shift removes the mean, the best turn has the phase of a sum."""
+    np.testing.assert_allclose(ESTIMATED_XY_M - TRUE_XY_M, DIFFERENCES_M, atol=1e-12)
+    estimated, true = (xy @ [1, 1j] for xy in (ESTIMATED_XY_M, TRUE_XY_M))
+    shifted = (estimated - estimated.mean()) - (true - true.mean())
+    turn = np.vdot(estimated - estimated.mean(), true - true.mean())
+    aligned = (estimated - estimated.mean()) * turn / abs(turn) - (true - true.mean())
+    errors = landmark_errors(*published_maps())
+    assert rmse(errors.horizontal_m) == pytest.approx(complex_rms(estimated - true))
+    assert errors.aligned_rmse_m == pytest.approx(complex_rms(aligned))
+    stated = complex_rms(estimated - true), complex_rms(shifted), complex_rms(aligned)
+    assert stated == pytest.approx((0.227, 0.115, 0.093), abs=5e-4)
+
+
+def test_only_the_same_landmarks_of_its_design_repeat_the_published_experiment():
+    """The simulated basin does; height does not matter."""
+    assert 0 < MAP_TIMES_S[0] < MAP_TIMES_S[1] < MAP_TIMES_S[2] == DURATION_S
+    np.testing.assert_array_equal(LANDMARKS_XY_M, TRUE_XY_M)
+    assert repeats_published(simulate_basin(BasinOptions(duration_s=120, laps=1)))
+    true, run = published_maps()[1], basin_comparison(4).sequence
+    for change, repeats in (
+        ({}, True),
+        ({"positions": true.positions + np.array([0.0, 0.0, -1.7])}, True),
+        ({"positions": true.positions + np.array([0.0, 0.005, 0.0])}, False),
+        ({"ids": IDS + 1}, False),
+    ):
+        assert repeats_published(replace(run, true_landmarks=replace(true, **change))) == repeats, change
+    assert not repeats_published(replace(run, true_landmarks=None))
+    assert not repeats_published(
+        replace(run, true_landmarks=LandmarkMap(np.arange(1, 6), np.zeros((5, 3)), np.zeros((5, 3, 3))))
+    )
+    assert not repeats_published(replace(run, true_landmarks=true, notes={OWN_DESIGNS: "1: ring, of mine.toml"}))

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from evo.tools import file_interface
+from mcap.reader import make_reader
 
 from sonar_graph.calibration import Calibration
 from sonar_graph.errors import EvaluationError
 from sonar_graph.evaluation.comparison import compare
 from sonar_graph.evaluation.results import Comparison
-from sonar_graph.evaluation.storage import read_comparison, write_comparison
+from sonar_graph.evaluation.storage import read_comparison, write_comparison, write_viewer_files
 from sonar_graph.measurements import Measurements
 from sonar_graph.states import Estimate
 
@@ -31,6 +32,18 @@ def comparison(install) -> Comparison:
 
     install(broken=Broken, other=Offset)
     return compare(straight_sequence(), ["offset", "broken"], {"offset": {"offset_m": 0.4}})
+
+
+@pytest.fixture
+def folder(comparison, tmp_path) -> Path:
+    write_comparison(comparison, tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def with_viewer_files(comparison, folder) -> Path:
+    write_viewer_files(comparison, folder)
+    return folder
 
 
 def assert_same(left: Any, right: Any, where: str = "") -> None:
@@ -52,9 +65,8 @@ def assert_same(left: Any, right: Any, where: str = "") -> None:
         assert left == right, where
 
 
-def test_reading_returns_what_was_written(comparison, tmp_path):
-    write_comparison(comparison, tmp_path)
-    restored = read_comparison(tmp_path)
+def test_reading_returns_what_was_written(comparison, folder):
+    restored = read_comparison(folder)
     for name in ("runs", "scores", "errors", "environment", "instants_ns"):
         assert_same(getattr(comparison, name), getattr(restored, name), name)
     for name in ("name", "notes", "truth", "true_landmarks", "detections", "start_ns", "end_ns"):
@@ -63,39 +75,28 @@ def test_reading_returns_what_was_written(comparison, tmp_path):
     assert isinstance(restored.sequence.calibration, Calibration)
 
 
-def test_a_comparison_without_truth_survives(install, tmp_path):
-    written = compare(straight_sequence(truth=False), ["offset"])
+@pytest.mark.parametrize("truth", ["none", "without covariances", "with covariances"])
+def test_truth_keeps_its_covariances_and_what_is_unknown_takes_no_space(install, tmp_path, truth):
+    sequence = straight_sequence(truth=truth != "none")
+    if truth == "with covariances":
+        covariances = sequence.truth.covariances.copy()
+        covariances[-1] = np.diag(np.arange(1.0, 7.0))
+        sequence = replace(sequence, truth=replace(sequence.truth, covariances=covariances))
+    written = compare(sequence, ["offset"])
     write_comparison(written, tmp_path)
     restored = read_comparison(tmp_path)
-    assert restored.sequence.truth is None
-    assert restored.errors == {}
     assert_same(written.scores, restored.scores)
-
-
-@pytest.mark.parametrize("are_known", [False, True])
-def test_truth_keeps_its_covariances_and_unknown_take_no_space(install, tmp_path, are_known):
-    sequence = straight_sequence()
-    assert sequence.truth is not None
-    assert np.isnan(sequence.truth.covariances).all()
-    covariances = sequence.truth.covariances.copy()
-    if are_known:
-        covariances[-1] = np.diag(np.arange(1.0, 7.0))
-    truth = replace(sequence.truth, covariances=covariances)
-    write_comparison(compare(replace(sequence, truth=truth), ["offset"]), tmp_path)
-    restored = read_comparison(tmp_path).sequence.truth
-    assert restored is not None
-    np.testing.assert_array_equal(restored.covariances, covariances)
+    assert_same(written.errors, restored.errors)
+    assert_same(written.sequence.truth, restored.sequence.truth)
     with np.load(tmp_path / "sequence.npz") as archive:
-        assert ("truth.covariances" in archive.files) == are_known
+        assert ("truth.covariances" in archive.files) == (truth == "with covariances")
 
 
-def test_json_is_strict_and_tells_units_and_protocol(comparison, tmp_path):
-    write_comparison(comparison, tmp_path)
-
+def test_json_is_strict_and_tells_units_and_protocol(folder):
     def refuse(constant: str) -> None:
         raise AssertionError(f"{constant} is not JSON")
 
-    index = json.loads((tmp_path / "comparison.json").read_text("utf-8"), parse_constant=refuse)
+    index = json.loads((folder / "comparison.json").read_text("utf-8"), parse_constant=refuse)
     score = index["runs"]["offset"]["scores"]["causal.ate_raw_m"]
     assert score["value"] == pytest.approx(0.4)
     assert score["unit"] == "m"
@@ -113,29 +114,22 @@ def test_what_is_not_a_number_is_null(comparison, tmp_path):
     assert np.isnan(read_comparison(tmp_path).runs[0].peak_memory_mb)
 
 
-def test_folder_holds_what_other_tools_read(comparison, tmp_path):
-    write_comparison(comparison, tmp_path)
-    folder = tmp_path / "runs" / "offset"
-    assert sorted(path.name for path in folder.iterdir()) == [
-        *("causal.tum", "landmarks.csv", "result.json", "series.npz", "trajectory.tum")
-    ]
-    causal = file_interface.read_tum_trajectory_file(folder / "causal.tum")
-    smoothed = file_interface.read_tum_trajectory_file(folder / "trajectory.tum")
+def test_folder_holds_what_other_tools_read_and_of_a_failed_run_only_its_reason(folder):
+    good, failed = folder / "runs" / "offset", folder / "runs" / "broken"
+    files = "causal.tum", "landmarks.csv", "result.json", "series.npz", "trajectory.tum"
+    assert tuple(sorted(path.name for path in good.iterdir())) == files
+    assert sorted(path.name for path in failed.iterdir()) == ["result.json", "series.npz"]
+    causal = file_interface.read_tum_trajectory_file(good / "causal.tum")
+    smoothed = file_interface.read_tum_trajectory_file(good / "trajectory.tum")
     np.testing.assert_allclose(causal.positions_xyz[:, 1], 0.4)
     np.testing.assert_allclose(smoothed.positions_xyz[:, 1], 0.2)
-    landmarks = (folder / "landmarks.csv").read_text("utf-8").splitlines()
+    landmarks = (good / "landmarks.csv").read_text("utf-8").splitlines()
     assert [row.split(",")[0] for row in landmarks] == ["id", "7", "9", "20"]
-    result = json.loads((folder / "result.json").read_text("utf-8"))
+    result = json.loads((good / "result.json").read_text("utf-8"))
     assert result["params"]["offset_m"] == 0.4
     assert result["environment"]["gtsam"]
     assert result["timings"]["update_median_ms"] > 0
-
-
-def test_a_failed_run_leaves_only_its_reason(comparison, tmp_path):
-    write_comparison(comparison, tmp_path)
-    folder = tmp_path / "runs" / "broken"
-    assert sorted(path.name for path in folder.iterdir()) == ["result.json", "series.npz"]
-    assert "diverged" in json.loads((folder / "result.json").read_text("utf-8"))["reason"]
+    assert "diverged" in json.loads((failed / "result.json").read_text("utf-8"))["reason"]
 
 
 def test_nothing_of_an_earlier_comparison_remains(comparison, tmp_path):
@@ -171,50 +165,54 @@ def test_a_name_that_leaves_the_folder_is_refused(comparison, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def damage_index(folder: Path) -> None:
-    (folder / "comparison.json").write_text("{")
-
-
-def damage_format(folder: Path) -> None:
-    (folder / "comparison.json").write_text('{"format": "something else"}')
-
-
-def damage_arrays(folder: Path) -> None:
-    path = folder / "runs" / "offset" / "series.npz"
-    path.write_bytes(path.read_bytes()[:100])
-
-
-def remove_arrays(folder: Path) -> None:
-    (folder / "sequence.npz").unlink()
-
-
-def remove_column(folder: Path) -> None:
-    path = folder / "sequence.npz"
-    with np.load(path) as archive:
-        kept = {name: archive[name] for name in archive.files if name != "truth.positions"}
-    np.savez(path, **kept)
-
-
 @pytest.mark.parametrize(
-    ("damage", "named"),
+    ("file", "content", "named"),
     [
-        (damage_index, r"comparison\.json"),
-        (damage_format, "something else"),
-        (damage_arrays, r"series\.npz"),
-        (remove_arrays, r"sequence\.npz"),
-        (remove_column, "truth lacks positions"),
+        ("comparison.json", b"{", r"comparison\.json"),
+        ("comparison.json", b'{"format": "something else"}', "something else"),
+        ("runs/offset/series.npz", b"PK cut off", r"series\.npz"),
+        ("sequence.npz", None, r"sequence\.npz"),
+        ("sequence.npz", "truth.positions", "truth lacks positions"),  # the name of a column to leave out
     ],
 )
-def test_damage_is_named(comparison, tmp_path, damage, named):
-    write_comparison(comparison, tmp_path)
-    damage(tmp_path)
+def test_damage_is_named(folder, file, content, named):
+    path = folder / file
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is None:
+        path.unlink()
+    else:
+        with np.load(path) as archive:
+            kept = {name: archive[name] for name in archive.files if name != content}
+        np.savez(path, **kept)
     with pytest.raises(EvaluationError, match=named):
-        read_comparison(tmp_path)
+        read_comparison(folder)
 
 
-def test_arrays_hold_no_code(comparison, tmp_path):
-    write_comparison(comparison, tmp_path)
-    for path in tmp_path.rglob("*.npz"):
+def test_arrays_hold_no_code(folder):
+    for path in folder.rglob("*.npz"):
         with zipfile.ZipFile(path) as archive:
             for name in archive.namelist():
                 assert b"'descr': '|O'" not in archive.read(name)[:200], name
+
+
+def test_the_result_carries_the_json_files_beside_it_settings_versions_and_topics(with_viewer_files):
+    with (with_viewer_files / "result.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        attached = {a.name: a.data for a in reader.iter_attachments()}
+        record = {m.name: m.metadata for m in reader.iter_metadata()}["sonar_graph_result"]
+    assert set(attached) == {"comparison.json", "runs/offset/result.json", "runs/broken/result.json"}
+    for name, content in attached.items():
+        assert content == (with_viewer_files / name).read_bytes()
+    environment = json.loads(attached["comparison.json"])["environment"]
+    assert environment.items() <= record.items()
+    assert {"gtsam", "numpy", "sonar_graph", "date", "command"} <= record.keys()
+    assert json.loads(record["settings of offset"])["offset_m"] == 0.4
+    assert (record["estimators"], record["topics"]) == ("offset", "offset")
+
+
+def test_layouts_name_what_ran_and_not_what_failed(with_viewer_files):
+    layout = json.loads((with_viewer_files / "result.foxglove.json").read_text("utf-8"))
+    names = {topic.split("/")[1] for topic in layout["configById"]["3D!result"]["topics"]}
+    assert names == {"offset", "ground_truth"}
+    assert "/offset/path" in (with_viewer_files / "result.rviz").read_text("utf-8")
