@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.devices.landmark_designs import OWN_DESIGNS
 from sonar_graph.errors import CalibrationError, SimulationError
+from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin, simulate_basin_frames
 from sonar_graph.simulation.sonar_image.frames import FrameSimulator, ImagedFrames, frame_truth
@@ -32,16 +33,11 @@ def run() -> tuple[Sequence, list[ImagedFrames]]:
     return simulate_basin(options()), list(blocks())
 
 
-def test_landmarks_must_be_recognised_where_there_are_images(run):
-    sequence, _ = run
+def test_asking_for_images_leaves_landmarks_to_be_recognised_and_all_other_sensors_alone(run):
+    sequence, plain = run[0], simulate_basin(BasinOptions.model_validate(SLOW))
     assert sequence.detections is None
-    assert simulate_basin(BasinOptions.model_validate(SLOW)).detections is not None
+    assert plain.detections is not None
     assert "image model" in sequence.notes["ours"]
-
-
-def test_asking_for_images_leaves_all_other_sensors_alone(run):
-    sequence, _ = run
-    plain = simulate_basin(BasinOptions.model_validate(SLOW))
     np.testing.assert_array_equal(sequence.imu.angular_velocity, plain.imu.angular_velocity)
     np.testing.assert_array_equal(sequence.dvl.velocity, plain.dvl.velocity)
     np.testing.assert_array_equal(sequence.true_landmarks.positions, plain.true_landmarks.positions)
@@ -50,30 +46,31 @@ def test_asking_for_images_leaves_all_other_sensors_alone(run):
 def test_truth_of_frames_is_that_of_the_run(run):
     sequence, made = run
     body_T_sonar = sequence.calibration.sonar.mounting.pose()
+    body_R_sonar = Rotation.from_matrix(np.array(body_T_sonar.rotation().matrix()))
     for imaged in made[::3]:
-        stamp_ns = imaged.frames.stamps_ns[0]
-        nearest = np.argmin(np.abs(sequence.truth.stamps_ns - stamp_ns))
+        nearest = np.argmin(np.abs(sequence.truth.stamps_ns - imaged.frames.stamps_ns[0]))
         world_R_body = sequence.truth.rotations()[nearest]
         position = sequence.truth.positions[nearest] + world_R_body.apply(np.array(body_T_sonar.translation()))
         np.testing.assert_allclose(imaged.truth.positions[0], position, atol=0.01)
-        world_R_sonar = world_R_body * Rotation.from_matrix(np.array(body_T_sonar.rotation().matrix()))
-        error = (world_R_sonar.inv() * Rotation.from_quat(imaged.truth.quaternions_xyzw[0])).magnitude()
-        assert error < 0.02
+        told = Rotation.from_quat(imaged.truth.quaternions_xyzw[0])
+        assert ((world_R_body * body_R_sonar).inv() * told).magnitude() < 0.02
+
+
+def around(imaged: ImagedFrames, frame: int, target: int, beams: int, bins: int) -> Floats:
+    """Samples around the true place of an object."""
+    frames, truth = imaged.frames, imaged.truth
+    beam = np.abs(frames.azimuths_rad - truth.azimuth_rad()[frame, target]).argmin()
+    bin_ = np.abs(frames.ranges_m - truth.range_m()[frame, target]).argmin()
+    return frames.intensity[frame, beam - beams : beam + beams + 1, bin_ - bins : bin_ + bins + 1].astype(float)
 
 
 def test_every_landmark_is_seen_whole_and_brightest_where_truth_says(run):
-    _, made = run
     seen = dict.fromkeys([1, 2, 3, 4], 0)
-    for imaged in made:
-        truth, frames = imaged.truth, imaged.frames
-        assert truth.ids[:4].tolist() == [1, 2, 3, 4]
-        for frame, target in np.argwhere(truth.share_in_view[:, :4] == 1):
-            beam = np.abs(frames.azimuths_rad - truth.azimuth_rad()[frame, target]).argmin()
-            bin_ = np.abs(frames.ranges_m - truth.range_m()[frame, target]).argmin()
-            image = frames.intensity[frame].astype(float)
-            on_landmark = image[beam - 3 : beam + 4, bin_ - 10 : bin_ + 11].mean()
-            assert on_landmark > np.median(image) + 20
-            seen[int(truth.ids[target])] += 1
+    for imaged in run[1]:
+        assert imaged.truth.ids[:4].tolist() == [1, 2, 3, 4]
+        for frame, target in np.argwhere(imaged.truth.share_in_view[:, :4] == 1):
+            assert around(imaged, frame, target, 3, 10).mean() > np.median(imaged.frames.intensity[frame]) + 20
+            seen[int(imaged.truth.ids[target])] += 1
     assert min(seen.values()) >= 2
 
 
@@ -104,18 +101,15 @@ def test_dropped_frames_are_missing_and_change_no_other():
     np.testing.assert_array_equal(some[0].intensity[5], whole[at // 16].intensity[at % 16])
 
 
-def test_time_offset_makes_stamps_late_and_nothing_else(run):
-    _, made = run
-    late = next(blocks(time_offset_s=0.05))
-    np.testing.assert_array_equal(late.frames.stamps_ns - made[0].frames.stamps_ns, 50_000_000)
-    np.testing.assert_array_equal(late.frames.intensity, made[0].frames.intensity)
-
-
-def test_wrong_sound_speed_scales_ranges_and_nothing_else(run):
-    _, made = run
-    wrong = next(blocks(sound_speed_error=0.01))
-    np.testing.assert_allclose(wrong.frames.ranges_m / made[0].frames.ranges_m, 1.01)
-    np.testing.assert_array_equal(wrong.frames.intensity, made[0].frames.intensity)
+def test_time_offset_makes_stamps_late_and_wrong_sound_speed_scales_ranges_and_nothing_else(run):
+    late, wrong = (next(blocks(**fault)).frames for fault in ({"time_offset_s": 0.05}, {"sound_speed_error": 0.01}))
+    plain = run[1][0].frames
+    np.testing.assert_array_equal(late.stamps_ns - plain.stamps_ns, 50_000_000)
+    np.testing.assert_array_equal(wrong.stamps_ns, plain.stamps_ns)
+    np.testing.assert_allclose(wrong.ranges_m / plain.ranges_m, 1.01)
+    np.testing.assert_array_equal(late.ranges_m, plain.ranges_m)
+    for frames in (late, wrong):
+        np.testing.assert_array_equal(frames.intensity, plain.intensity)
 
 
 def test_share_in_view_falls_from_one_to_zero_across_the_edge_of_the_fan():
@@ -160,18 +154,14 @@ def test_own_landmarks_lie_in_the_basin_under_their_own_identities(run, tmp_path
     own, other = next(islice(blocks(designs=str(file)), number, None)), made[number]
     assert own.truth.ids[:4].tolist() == [10, 20, 30, 40]
     assert (own.truth.ids[4:] < 0).all()
-    row, landmark = np.argwhere(other.truth.share_in_view[:, :4] == 1)[0]
-    beam = np.argmin(np.abs(own.frames.azimuths_rad - own.truth.azimuth_rad()[row, landmark]))
-    first = np.argmin(np.abs(own.frames.ranges_m - own.truth.range_m()[row, landmark]))
-    around = np.s_[row, beam - 2 : beam + 3, first - 10 : first + 11]
-    brighter = own.frames.intensity[around].mean() - other.frames.intensity[around].mean()
+    place = np.argwhere(other.truth.share_in_view[:, :4] == 1)[0]
+    brighter = around(own, *place, 2, 10).mean() - around(other, *place, 2, 10).mean()
     assert brighter * 80 / 255 == pytest.approx(25 - 12, abs=4)
 
 
 def test_too_few_landmarks_for_the_basin_are_refused(tmp_path):
-    with pytest.raises(
-        SimulationError, match=r"image.designs: .*own.toml has 3 landmark designs, the basin needs 4; add 1"
-    ):
-        simulate_basin(options(designs=str(squares(tmp_path / "own.toml", [1, 2, 3]))))
+    few = str(squares(tmp_path / "own.toml", [1, 2, 3]))
+    with pytest.raises(SimulationError, match=r"image.designs: .*own.toml has 3 landmark .* basin needs 4; add 1"):
+        simulate_basin(options(designs=few))
     with pytest.raises(CalibrationError, match=r"none\.toml"):
         next(blocks(designs=str(tmp_path / "none.toml")))

@@ -12,21 +12,16 @@ def mission() -> Sequence:
     return simulate_mission(MissionOptions(duration_s=400, landmarks=20, false_detections_per_frame=0))
 
 
-def test_vehicle_goes_round_at_the_stated_speed_heading_along_its_path(mission: Sequence):
-    truth = mission.truth
-    velocity = np.diff(truth.positions, axis=0) * 50
+def test_vehicle_goes_round_and_round_at_the_stated_speed_heading_along_its_path(mission: Sequence):
+    positions = mission.truth.positions
+    velocity = np.diff(positions, axis=0) * 50
     assert np.linalg.norm(velocity, axis=1).mean() == pytest.approx(0.5, rel=0.02)
-    forward = truth.rotations()[:-1].inv().apply(velocity)
+    forward = mission.truth.rotations()[:-1].inv().apply(velocity)
     assert np.median(forward[:, 0]) == pytest.approx(0.5, rel=0.05)
     assert np.abs(forward[:, 1:]).max() < 0.15
-    assert np.hypot(*truth.positions[:, :2].T).max() < 8
-
-
-def test_loop_is_closed_again_and_again(mission: Sequence):
-    truth = mission.truth
-    near_start = np.linalg.norm(truth.positions - truth.positions[0], axis=1) < 0.6
-    arrivals = np.sum(np.diff(near_start.astype(int)) == 1)
-    assert arrivals == int(400 * 0.5 / 41.5)
+    assert np.hypot(*positions[:, :2].T).max() < 8
+    near_start = np.linalg.norm(positions - positions[0], axis=1) < 0.6
+    assert np.sum(np.diff(near_start.astype(int)) == 1) == int(400 * 0.5 / 41.5)  # arrivals
 
 
 def test_up_to_ten_landmarks_are_in_view_and_all_come_back(mission: Sequence):
@@ -47,7 +42,7 @@ def test_sonar_options_bound_what_is_seen():
     assert np.abs(found.azimuth_rad).max() < 0.3 + 5 * narrow.azimuth_sigma_rad
 
 
-@pytest.mark.parametrize("landmarks", [1, 4, 20])
+@pytest.mark.parametrize("landmarks", [1, 20])
 def test_number_of_landmarks_is_the_one_asked_for(landmarks: int):
     run = simulate_mission(MissionOptions(duration_s=20, landmarks=landmarks))
     assert run.true_landmarks.ids.tolist() == list(range(1, landmarks + 1))
