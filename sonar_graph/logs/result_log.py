@@ -30,27 +30,10 @@ from pathlib import Path
 
 import numpy as np
 
+from sonar_graph.logs import viewer_messages as viewer
 from sonar_graph.logs.mcap import Attachment, Outgoing, write_recording
 from sonar_graph.logs.roles import TF
 from sonar_graph.logs.vehicle_setup import BODY_FRAME, encode_mountings
-from sonar_graph.logs.viewer_messages import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PATH,
-    PICTURES,
-    PURPLE,
-    Colour,
-    Layer,
-    Picture,
-    Scene,
-    landmark_cloud,
-    landmark_markers,
-    picture_messages,
-    position_ellipsoids,
-    write_layouts,
-)
 from sonar_graph.logs.writing import (
     WORLD_FRAME,
     fields,
@@ -71,7 +54,7 @@ _CAUSAL_PATH_STEP_NS = 10**9
 _MOST_CAUSAL_POSES = 1000
 _PATH_STEP_NS = 10**8
 _MOST_POSES = 5000
-_COLOURS: tuple[Colour, ...] = (BLUE, ORANGE, PURPLE, GREEN)
+_COLOURS: tuple[viewer.Colour, ...] = (viewer.BLUE, viewer.ORANGE, viewer.PURPLE, viewer.GREEN)
 Estimates = tuple[Trajectory, Trajectory, LandmarkMap]
 """Causal trajectory, smoothed trajectory, landmarks; any of them may be empty."""
 
@@ -82,7 +65,7 @@ def write_result(
     estimates: Mapping[str, Estimates],
     about: Mapping[str, str] | None = None,
     attachments: List[Attachment] = (),
-    pictures: List[Picture] = (),
+    pictures: List[viewer.Picture] = (),
 ) -> None:
     """Write the estimates and the truth, where there is one, and beside them the layouts of `write_layouts`.
 
@@ -110,26 +93,26 @@ def write_result(
     truth, landmarks = sequence.truth, sequence.true_landmarks
     drawn = [block.positions for estimate in estimates.values() for block in estimate]
     drawn += [block.positions for block in (truth, landmarks) if block is not None]
-    scene = Scene.around(drawn)
-    colours = {name: _COLOURS[i % len(_COLOURS)] for i, name in enumerate(sources)} | {TRUTH: GREY}
+    scene = viewer.Scene.around(drawn)
+    colours = {name: _COLOURS[i % len(_COLOURS)] for i, name in enumerate(sources)} | {TRUTH: viewer.GREY}
     messages = [static_message("/tf_static", TF, sequence.start_ns, encode_mountings(sequence.calibration))]
     if truth is not None and len(truth):
-        messages.append(odometry_messages(f"/{TRUTH}/odometry", truth, f"{TRUTH}/base_link"))
+        messages.append(odometry_messages(f"/{TRUTH}/odometry", truth, f"{TRUTH}/{BODY_FRAME}"))
         messages.append(_path(f"/{TRUTH}/path", _drawable(truth), sequence.start_ns))
     if landmarks is not None:
-        messages += _landmarks(TRUTH, landmarks, sequence.start_ns, GREY, scene)
+        messages += _landmarks(TRUTH, landmarks, sequence.start_ns, viewer.GREY, scene)
     for name, estimate in sources.items():
         messages += _estimator(name, estimate, colours[name], scene)
-    messages += picture_messages(PICTURES, pictures)
+    messages += viewer.picture_messages(viewer.PICTURES, pictures)
     messages += body_transforms("/tf", _bodies(sequence, sources))
     messages = [entry for entry in messages if len(entry.log_times_ns)]
     record = {"sequence": sequence.name, "estimators": ",".join(estimates), "topics": ",".join(sources)}
     write_recording(Path(path), messages, {RESULT_RECORD: record | dict(about or {})}, attachments)
     layers = [
-        Layer(topic, entry.type_name, colours.get(topic.split("/")[1], GREY), is_latched=entry.is_latched)
+        viewer.Layer(topic, entry.type_name, colours.get(topic.split("/")[1], viewer.GREY), is_latched=entry.is_latched)
         for topic, entry in {entry.topic: entry for entry in messages}.items()
     ]
-    write_layouts(Path(path), layers, scene)
+    viewer.write_layouts(Path(path), layers, scene)
 
 
 def source_names(estimators: Iterable[str]) -> list[str]:
@@ -148,14 +131,14 @@ def source_names(estimators: Iterable[str]) -> list[str]:
     return names
 
 
-def _estimator(name: str, estimate: Estimates, colour: Colour, scene: Scene) -> list[Outgoing]:
+def _estimator(name: str, estimate: Estimates, colour: viewer.Colour, scene: viewer.Scene) -> list[Outgoing]:
     """Messages of one estimator; an empty estimate has none."""
     causal, smoothed, landmarks = estimate
     messages = []
     if len(causal):
-        messages.append(odometry_messages(f"/{name}/odometry", causal, _frame(name)))
+        messages.append(odometry_messages(f"/{name}/odometry", causal, f"{name}/{BODY_FRAME}"))
         messages.append(pose_messages(f"/{name}/pose", causal))
-        messages.append(position_ellipsoids(f"/{name}/pose_ellipsoid", causal, colour))
+        messages.append(viewer.position_ellipsoids(f"/{name}/pose_ellipsoid", causal, colour))
         first_ns, last_ns = int(causal.stamps_ns[0]), int(causal.stamps_ns[-1])
         # the path so far, now and then, and thinned: all of them together would grow with the square of time
         period_ns = max(_PATH_PERIOD_NS, (last_ns - first_ns) // _MOST_CAUSAL_PATHS)
@@ -171,15 +154,13 @@ def _estimator(name: str, estimate: Estimates, colour: Colour, scene: Scene) -> 
     return messages + (_landmarks(name, landmarks, max(ends), colour, scene) if ends else [])
 
 
-def _landmarks(name: str, landmarks: LandmarkMap, stamp_ns: int, colour: Colour, scene: Scene) -> list[Outgoing]:
+def _landmarks(
+    name: str, landmarks: LandmarkMap, stamp_ns: int, colour: viewer.Colour, scene: viewer.Scene
+) -> list[Outgoing]:
     if not len(landmarks):
         return []
-    markers = landmark_markers(f"/{name}/landmarks", landmarks, stamp_ns, colour, scene.text_height_m)
-    return [markers, landmark_cloud(f"/{name}/landmark_cloud", landmarks, stamp_ns)]
-
-
-def _frame(name: str) -> str:
-    return f"{name}/{BODY_FRAME}"
+    markers = viewer.landmark_markers(f"/{name}/landmarks", landmarks, stamp_ns, colour, scene.text_height_m)
+    return [markers, viewer.landmark_cloud(f"/{name}/landmark_cloud", landmarks, stamp_ns)]
 
 
 def _drawable(trajectory: Trajectory) -> Trajectory:
@@ -201,18 +182,18 @@ def _path(topic: str, trajectory: Trajectory, stamp_ns: int) -> Outgoing:
     poses |= fields("poses.pose.position", "xyz", trajectory.positions)
     poses |= fields("poses.pose.orientation", "xyzw", trajectory.quaternions_xyzw)
     values = header(at_ns, WORLD_FRAME) | poses
-    return outgoing(topic, PATH, at_ns, values, {"poses": len(trajectory)}, is_latched=True)
+    return outgoing(topic, viewer.PATH, at_ns, values, {"poses": len(trajectory)}, is_latched=True)
 
 
 def _bodies(sequence: Sequence, sources: Mapping[str, Estimates]) -> dict[str, Trajectory]:
     """Trajectories of body frames: the sensors', each causal estimate's, and the truth's at the estimates' instants."""
-    bodies = {_frame(name): causal for name, (causal, _, _) in sources.items() if len(causal)}
+    bodies = {f"{name}/{BODY_FRAME}": causal for name, (causal, _, _) in sources.items() if len(causal)}
     owner = next(iter(bodies.values()), sequence.truth)
     truth = sequence.truth
     if truth is not None and len(truth):
         instants_ns = np.unique(np.concatenate([b.stamps_ns for b in bodies.values()] or [_drawable(truth).stamps_ns]))
         within = (instants_ns >= truth.stamps_ns[0]) & (instants_ns <= truth.stamps_ns[-1])
-        bodies[_frame(TRUTH)] = truth.at(instants_ns[within]) if len(truth) > 1 else truth
+        bodies[f"{TRUTH}/{BODY_FRAME}"] = truth.at(instants_ns[within]) if len(truth) > 1 else truth
     return {BODY_FRAME: owner, **bodies} if owner is not None and len(owner) else bodies
 
 

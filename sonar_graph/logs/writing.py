@@ -141,21 +141,20 @@ def detection_messages(topic: str, detections: LandmarkDetections) -> list[Outgo
     """``sonar_graph_msgs/LandmarkDetections``, one a frame; frames with equally many detections share an entry."""
     stamps_ns, first, counts = np.unique(detections.stamps_ns, return_index=True, return_counts=True)
     is_tracked = bool(np.any(detections.track != NO_TRACK))
+    columns = {
+        "range_m": detections.range_m,
+        "azimuth_rad": detections.azimuth_rad,
+        "covariance": detections.range_azimuth_cov,
+        "candidate_ids": detections.candidate_ids,
+        "id_probability": detections.id_probability,
+        "track": detections.track[:, None] if is_tracked else np.empty((len(detections), 0), np.int64),
+    }
     entries = []
     for count in np.unique(counts).tolist():
         frames = counts == count
         rows = first[frames][:, None] + np.arange(count)
-        values = header(stamps_ns[frames], "sonar") | {
-            name: column[rows].reshape(len(rows), -1)
-            for name, column in (
-                ("range_m", detections.range_m),
-                ("azimuth_rad", detections.azimuth_rad),
-                ("covariance", detections.range_azimuth_cov),
-                ("candidate_ids", detections.candidate_ids),
-                ("id_probability", detections.id_probability),
-                ("track", detections.track[:, None] if is_tracked else np.empty((len(detections), 0), np.int64)),
-            )
-        }
+        values = header(stamps_ns[frames], "sonar")
+        values |= {name: column[rows].reshape(len(rows), -1) for name, column in columns.items()}
         entries.append(outgoing(topic, DETECTIONS, stamps_ns[frames], values))
     return entries
 
@@ -253,11 +252,7 @@ def header(stamps_ns: Ints, frame_id: str, prefix: str = "header") -> dict[str, 
     seconds, nanoseconds = np.divmod(stamps_ns, NS_PER_S)
     if len(seconds) and not (_SECONDS.min <= seconds.min() and seconds.max() <= _SECONDS.max):
         raise LogError(f"stamp {stamps_ns.max()} ns: ROS 2 stamps have 32-bit seconds; give stamps of another epoch")
-    return {
-        f"{prefix}.stamp.sec": seconds,
-        f"{prefix}.stamp.nanosec": nanoseconds,
-        f"{prefix}.frame_id": frame_id,
-    }
+    return {f"{prefix}.stamp.sec": seconds, f"{prefix}.stamp.nanosec": nanoseconds, f"{prefix}.frame_id": frame_id}
 
 
 def fields(prefix: str, names: str, columns: Floats) -> dict[str, Value]:

@@ -44,8 +44,7 @@ START_RPY_SIGMA_RAD = (0.01, 0.01, 0.03)
 FILES = "TrajectoryN/{IMU,DVL,GT}_trajectoryN.csv"
 IMU_COLUMNS = ("Time", "ACC X", "ACC Y", "ACC Z", "GYRO X", "GYRO Y", "GYRO Z")
 DVL_COLUMNS = ("Time", "DVL X", "DVL Y", "DVL Z")
-_VELOCITY_COLUMNS = ("V North", "V East", "V Down")
-REFERENCE_COLUMNS = ("Time", "Longitude", "Latitude", "Altitude", *_VELOCITY_COLUMNS, "Roll", "Pitch", "Yaw")
+REFERENCE_COLUMNS = ("Time", "Longitude", "Latitude", "Altitude", "V North", "V East", "V Down", "Roll", "Pitch", "Yaw")
 SEMI_MAJOR_AXIS_M = 6378137.0
 FLATTENING = 1.0 / 298.257223563
 ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
@@ -56,33 +55,20 @@ def earth_centred(latitude_rad: Floats, longitude_rad: Floats, altitude_m: Float
     sin, cos = np.sin(latitude_rad), np.cos(latitude_rad)
     N = SEMI_MAJOR_AXIS_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * sin**2)
     across = (N + altitude_m) * cos
-    return np.column_stack(
-        [
-            across * np.cos(longitude_rad),
-            across * np.sin(longitude_rad),
-            (N * (1.0 - ECCENTRICITY_SQUARED) + altitude_m) * sin,
-        ]
-    )
-
-
-def enu_R_earth(latitude_rad: float, longitude_rad: float) -> Floats:
-    """Rotation from Earth-centred axes to east, north, up at a point, shape (3, 3)."""
-    sin_lat, cos_lat = np.sin(latitude_rad), np.cos(latitude_rad)
-    sin_lon, cos_lon = np.sin(longitude_rad), np.cos(longitude_rad)
-    return np.array(
-        [
-            [-sin_lon, cos_lon, 0.0],
-            [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
-            [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
-        ]
-    )
+    along = (N * (1.0 - ECCENTRICITY_SQUARED) + altitude_m) * sin
+    return np.column_stack([across * np.cos(longitude_rad), across * np.sin(longitude_rad), along])
 
 
 def east_north_up(latitude_rad: Floats, longitude_rad: Floats, altitude_m: Floats) -> Floats:
     """Positions east, north, up of the first row at altitude 0, shape (n, 3), metres."""
     origin = earth_centred(latitude_rad[:1], longitude_rad[:1], np.zeros(1))
     offsets = earth_centred(latitude_rad, longitude_rad, altitude_m) - origin
-    return offsets @ enu_R_earth(float(latitude_rad[0]), float(longitude_rad[0])).T
+    first_latitude_rad, first_longitude_rad = float(latitude_rad[0]), float(longitude_rad[0])
+    sin_lat, cos_lat = np.sin(first_latitude_rad), np.cos(first_latitude_rad)
+    sin_lon, cos_lon = np.sin(first_longitude_rad), np.cos(first_longitude_rad)
+    east, north = [-sin_lon, cos_lon, 0.0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
+    enu_R_earth = np.array([east, north, [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]])
+    return offsets @ enu_R_earth.T
 
 
 def enu_R_flu(roll_rad: Floats, pitch_rad: Floats, yaw_rad: Floats) -> Rotation:
@@ -134,9 +120,25 @@ def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
     start_ns = int(max(imu.stamps_ns[0], dvl.stamps_ns[0]))
     if truth.stamps_ns[-1] < start_ns:
         raise DatasetError(f"{folder}: the reference has fewer than two rows; expected one a second")
+    start = truth.at(np.array([start_ns]))
+    x, y, z = start.positions[0].tolist()
+    yaw, pitch, roll = start.rotations().as_euler("ZYX")[0].tolist()
+    calibration = Calibration(
+        imu=ImuCalibration(
+            gyro_noise_density=GYRO_NOISE_DENSITY,
+            gyro_bias_sigma=GYRO_BIAS_SIGMA_RAD_S,
+            gyro_bias_walk_density=GYRO_BIAS_WALK_DENSITY,
+            mounting=Mounting(translation_m=BODY_P_IMU_M),
+        ),
+        dvl=DvlCalibration(velocity_sigma_m_s=VELOCITY_SIGMA_M_S, mounting=Mounting(translation_m=BODY_P_DVL_M)),
+        start=Start(position_m=(x, y, z), rpy_rad=(roll, pitch, yaw), rpy_sigma_rad=START_RPY_SIGMA_RAD),
+        use_gravity=False,  # at 2 m/s a turn feels like a tilt of degrees, while the gyros drift by hundredths
+        odometry_interpolation="linear",
+        earth_rate_latitude_rad=float(latitude[0]),
+    )
     return Sequence(
         name=f"akit_trajectory{trajectory}",
-        calibration=_calibration(truth.at(np.array([start_ns])), float(latitude[0])),
+        calibration=calibration,
         imu=imu,
         dvl=dvl,
         truth=truth,
@@ -148,23 +150,4 @@ def read_akit(dataset_dir: Path, trajectory: int) -> Sequence:
             "poses of the reference are 0.4 to 0.5 s older (trajectories 1-4, 7) or newer (5, 6) than their time says",
             "imu": "y axes negated; forward-right-down turned to forward-left-up",
         },
-    )
-
-
-def _calibration(start: Trajectory, latitude_rad: float) -> Calibration:
-    """Calibration of the vehicle, from the reference's pose at the start."""
-    x, y, z = start.positions[0].tolist()
-    yaw, pitch, roll = start.rotations().as_euler("ZYX")[0].tolist()
-    return Calibration(
-        imu=ImuCalibration(
-            gyro_noise_density=GYRO_NOISE_DENSITY,
-            gyro_bias_sigma=GYRO_BIAS_SIGMA_RAD_S,
-            gyro_bias_walk_density=GYRO_BIAS_WALK_DENSITY,
-            mounting=Mounting(translation_m=BODY_P_IMU_M),
-        ),
-        dvl=DvlCalibration(velocity_sigma_m_s=VELOCITY_SIGMA_M_S, mounting=Mounting(translation_m=BODY_P_DVL_M)),
-        start=Start(position_m=(x, y, z), rpy_rad=(roll, pitch, yaw), rpy_sigma_rad=START_RPY_SIGMA_RAD),
-        use_gravity=False,  # at 2 m/s a turn feels like a tilt of degrees, while the gyros drift by hundredths
-        odometry_interpolation="linear",
-        earth_rate_latitude_rad=latitude_rad,
     )

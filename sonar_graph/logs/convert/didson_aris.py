@@ -14,14 +14,14 @@ from __future__ import annotations
 
 import struct
 from abc import abstractmethod
-from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
+from sonar_graph.calibration import SonarImage
 from sonar_graph.devices import aris_azimuths, didson_azimuths, even_azimuths
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.convert.sonar_file import (
@@ -82,7 +82,7 @@ class LensSonarFormat(SonarFormat):
     """Frames with a number in the first four bytes of their header, and a signature at byte 12."""
 
     signature_at = 12
-    readings_at: Mapping[str, int]
+    readings_at: ClassVar = {"depth": 128, "altitude": 132, "pitch": 136, "roll": 144, "heading": 152}
     """Offsets in the header of the readings of other sensors."""
 
     def head(self, content: bytes, at: int) -> FrameHead:
@@ -147,16 +147,7 @@ _TIME_AT, _WINDOW_AT, _FLAGS_AT = 20, 52, 192
 class DidsonFormat(LensSonarFormat):
     """Headers, samples and geometry of a ``.ddf`` file."""
 
-    readings_at: Mapping[str, int] = {
-        "depth": 128,
-        "altitude": 132,
-        "pitch": 136,
-        "roll": 144,
-        "heading": 152,
-        "pan": 160,
-        "tilt": 164,
-        "sonar roll": 168,
-    }
+    readings_at = LensSonarFormat.readings_at | {"pan": 160, "tilt": 164, "sonar roll": 168}
 
     def __init__(self, source: ByteSource, sound_speed_m_s: float | None = None) -> None:
         start = source.read(0, len(MAGIC) + 1)
@@ -183,8 +174,7 @@ class DidsonFormat(LensSonarFormat):
         first_frames = source.read(len(usual), self.first_at + 2 * (self.head_bytes + self._beams * self._samples))
         is_usual = usual in first_frames
         self.signature = usual if is_usual else source.read(self.first_at + self.signature_at, len(usual))
-        image = SonarImage(scale="decibel", decibel_span=DIDSON_DECIBEL_SPAN)
-        self.calibration = Calibration(sonar=SonarCalibration(image=image))
+        self.image = SonarImage(scale="decibel", decibel_span=DIDSON_DECIBEL_SPAN)
         self.notes = {
             "source": f"DIDSON recording {source.path.name}, DDF version {self._version}",
             "sonar.time": "the sonar's own calendar time, to hundredths of a second, taken as UTC",
@@ -226,9 +216,7 @@ class DidsonFormat(LensSonarFormat):
         begin_m = start * START_STEP_M[flags] * (1 if self._is_high else 2) * scale
         length_m = LENGTHS_M[flags][length + (0 if self._is_high else LOW_FREQUENCY_SHIFT)] * scale
         ranges_m = begin_m + (np.arange(samples, dtype=float) + 0.5) * (length_m / samples)
-        azimuths_rad = didson_azimuths(beams)
-        if self._reverse:
-            azimuths_rad = azimuths_rad[::-1]
+        azimuths_rad = didson_azimuths(beams)[:: -1 if self._reverse else 1]
         frequency_hz = HIGH_FREQUENCY_HZ if self._is_high else LOW_FREQUENCY_HZ
         return FrameGeometry(ranges_m, azimuths_rad, frequency_hz, self._sound_speed_m_s)
 
@@ -251,30 +239,17 @@ class ArisFormat(LensSonarFormat):
 
     first_at = head_bytes = 1024
     signature = b"DDF\x05"
-    readings_at: Mapping[str, int] = {
-        "depth": 128,
-        "altitude": 132,
-        "pitch": 136,
-        "roll": 144,
-        "heading": 152,
-        "compass heading": 160,
-        "compass pitch": 164,
-        "compass roll": 168,
-        "water temperature": 224,
-        "pan": 244,
-        "tilt": 248,
-    }
+    readings_at = LensSonarFormat.readings_at | {"compass heading": 160, "compass pitch": 164, "compass roll": 168}
+    readings_at |= {"water temperature": 224, "pan": 244, "tilt": 248}
 
     def __init__(self, source: ByteSource) -> None:
         start = source.read(0, len(self.signature))
         in_first_frame = source.read(self.first_at + self.signature_at, len(self.signature))
         if self.signature not in (start, in_first_frame):
-            raise DatasetError(
-                f"{source.path}: begins with {start!r}; an ARIS recording begins with {self.signature!r}"
-            )
+            expected = f"an ARIS recording begins with {self.signature!r}"
+            raise DatasetError(f"{source.path}: begins with {start!r}; {expected}")
         (self.frames_promised,) = struct.unpack("<I", source.read(4, 4).ljust(4, b"\0"))
-        image = SonarImage(scale="decibel", decibel_span=ARIS_DECIBEL_SPAN)
-        self.calibration = Calibration(sonar=SonarCalibration(image=image))
+        self.image = SonarImage(scale="decibel", decibel_span=ARIS_DECIBEL_SPAN)
         self.notes = {
             "source": f"ARIS recording {source.path.name}",
             "sonar.time": "the sonar's own clock, microseconds since 1970",

@@ -90,9 +90,8 @@ def read_mrclam(dataset_dir: Path, robot: int) -> Sequence:
     covariances = np.zeros((len(values), 3, 3))
     covariances[:, 0, 0], covariances[:, 1, 1] = values[:, 3] ** 2, values[:, 4] ** 2
     positions = np.column_stack([values[:, 1:3], np.zeros(len(values))])
-    per_sample = np.sqrt(TYPICAL_INTERVAL_S)
-    forward_sigma_m_s = float(FORWARD_NOISE_M_SQRT_S / per_sample)
-    sideways_sigma_m_s = float(SIDEWAYS_NOISE_M_SQRT_S / per_sample)
+    noises = (FORWARD_NOISE_M_SQRT_S, SIDEWAYS_NOISE_M_SQRT_S)
+    forward_sigma_m_s, sideways_sigma_m_s = (float(noise / np.sqrt(TYPICAL_INTERVAL_S)) for noise in noises)
     return Sequence(
         name=f"{dataset_dir.resolve().name}_robot{robot}",
         calibration=planar_calibration(
@@ -127,10 +126,8 @@ def _odometry(table: NumberTable) -> tuple[Imu, Dvl]:
     interval_s = np.concatenate([[TYPICAL_INTERVAL_S], np.diff(stamps_ns) * 1e-9])
     noise = np.diag(np.square([FORWARD_NOISE_M_SQRT_S, SIDEWAYS_NOISE_M_SQRT_S]))
     velocity = np.column_stack([in_force[:, 0], np.zeros(len(stamps_ns))])
-    return (
-        planar_imu(stamps_ns, in_force[:, 1]),
-        planar_dvl(stamps_ns, velocity, noise / interval_s[:, None, None]),
-    )
+    dvl = planar_dvl(stamps_ns, velocity, noise / interval_s[:, None, None])
+    return planar_imu(stamps_ns, in_force[:, 1]), dvl
 
 
 def _detections(table: NumberTable, barcodes: NumberTable) -> tuple[LandmarkDetections | None, str]:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
+from sonar_graph.calibration import SonarImage
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.convert.sonar_file import (
     ByteSource,
@@ -26,7 +26,7 @@ from sonar_graph.logs.convert.sonar_file import (
     SonarConversion,
     SonarFormat,
     convert_sonar_file,
-    first_sound,
+    plausible_headers,
 )
 from sonar_graph.logs.mcap import Progress
 from sonar_graph.measurements import Floats
@@ -77,7 +77,7 @@ class OculusFormat(SonarFormat):
     signature, signature_at = SIGNATURE, 0
 
     def __init__(self, source: ByteSource) -> None:
-        first = first_sound(source, self)
+        first = next((head for head in plausible_headers(source, self, 0) if head.has_image), None)
         if first is None:
             raise DatasetError(f"{source.path}: holds no Oculus ping; give the sonar's network messages as recorded")
         wraps = first.settings[0] != 2
@@ -85,8 +85,7 @@ class OculusFormat(SonarFormat):
         sample_bytes = int(first.settings[4])
         code = int(first.settings[2])
         gamma = 1.0 if code in NO_GAMMA else code / 255
-        image = SonarImage(scale="linear", full_scale=2 ** (8 * sample_bytes) - 1, gamma=gamma)
-        self.calibration = Calibration(sonar=SonarCalibration(image=image))
+        self.image = SonarImage(scale="linear", full_scale=2 ** (8 * sample_bytes) - 1, gamma=gamma)
         clock = ", a 32-bit number taken as nanoseconds and continued where it wraps around" if wraps else ""
         self.notes = {
             "source": f"Oculus recording {source.path.name}",
@@ -137,20 +136,8 @@ class OculusFormat(SonarFormat):
         }
         if any(faults.values()):
             raise DamagedFrameError(f"a ping with {', '.join(text for text, wrong in faults.items() if wrong)}")
-        settings = (
-            version,
-            mode,
-            gamma,
-            flags,
-            size,
-            offset,
-            ranges,
-            beams,
-            bin_m,
-            sound_speed,
-            frequency_hz,
-            bearings,
-        )
+        layout_of_image = version, mode, gamma, flags, size, offset, ranges, beams
+        settings = (*layout_of_image, bin_m, sound_speed, frequency_hz, bearings)
         clock_ns = round(clock * 1e9) if version == 2 else clock
         readings = dict(zip(("heading", "pitch", "roll"), attitude, strict=False))
         if version == 2:

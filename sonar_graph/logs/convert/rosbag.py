@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mcap.writer import Writer
 
@@ -173,10 +173,5 @@ class _BagCopy:
         store: Typestore = self._bag.typestore
         if is_same_wireformat(store, self._store, own, type_name):
             return memoryview if self._bag.is2 else partial(self._store.ros1_to_cdr, typename=type_name)
-        cache: dict[str, Any] = {}
-        sides = {"src_is2": self._bag.is2, "dst_is2": True}
-
-        def migrate(raw: bytes) -> memoryview:
-            return migrate_bytes(store, self._store, own, type_name, cache, raw, **sides)
-
-        return migrate
+        is2 = self._bag.is2
+        return partial(migrate_bytes, store, self._store, own, type_name, {}, src_is2=is2, dst_is2=True)

@@ -22,7 +22,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.calibration import Calibration
+from sonar_graph.calibration import Calibration, SonarCalibration, SonarImage
 from sonar_graph.errors import DatasetError
 from sonar_graph.logs.mcap import Progress, recording
 from sonar_graph.logs.vehicle_setup import METADATA
@@ -99,8 +99,8 @@ class FrameGeometry:
 class SonarFormat(ABC):
     """Format of a sonar's file, opened."""
 
-    calibration: Calibration
-    """Calibration of the sonar's images."""
+    image: SonarImage
+    """Calibration of the samples."""
     notes: Mapping[str, str]
     """Interpretation of the file, for users of the log."""
     first_at: int
@@ -174,12 +174,15 @@ class ByteSource:
                 found = block.find(pattern, found + 1)
 
 
-def first_sound(source: ByteSource, kind: SonarFormat) -> FrameHead | None:
-    """First plausible header with an image, anywhere in the file; None without any."""
-    head = _next_sound(source, kind, 0)
-    while head is not None and not head.has_image:
-        head = _next_sound(source, kind, head.at + 1)
-    return head
+def plausible_headers(source: ByteSource, kind: SonarFormat, start: int) -> Iterator[FrameHead]:
+    """Plausible headers from an offset on, wherever the signature is found."""
+    for at in source.places(kind.signature, start + kind.signature_at):
+        begin = at - kind.signature_at
+        try:
+            head = kind.head(source.read(begin, kind.head_bytes), begin)
+        except DamagedFrameError:
+            continue  # the signature's bytes by chance
+        yield head
 
 
 def frames_and_losses(source: ByteSource, kind: SonarFormat) -> Iterator[FrameHead | Lost]:
@@ -208,13 +211,13 @@ def _whole_frames(source: ByteSource, kind: SonarFormat) -> Iterator[FrameHead |
     while at < source.size:
         try:
             head = kind.head(source.read(at, kind.head_bytes), at)
-            if head.end > source.size and _next_sound(source, kind, at + 1):
+            if head.end > source.size and next(plausible_headers(source, kind, at + 1), None):
                 reason = f"frame {head.number} claims to be longer than the file, in which others follow"
                 raise DamagedFrameError(reason)
         except DamagedFrameError as error:
             # bytes may be missing from the frame before, or from the file's header
             start = pending.at + 1 if pending else 0 if at == kind.first_at else at + 1
-            found = _next_sound(source, kind, start, but_not=at)
+            found = next((other for other in plausible_headers(source, kind, start) if other.at != at), None)
             end = found.at if found else source.size
             if pending and _is_shifted(source, kind, pending, found):
                 yield Lost(pending.at, end, f"frame {pending.number} and what follows: bytes are missing or too many")
@@ -243,18 +246,6 @@ def _is_shifted(source: ByteSource, kind: SonarFormat, pending: FrameHead, found
     if rest < kind.head_bytes and kind.may_follow(source.read(pending.end, rest), pending):
         return False
     return rest % pending.size != 0
-
-
-def _next_sound(source: ByteSource, kind: SonarFormat, start: int, but_not: int = -1) -> FrameHead | None:
-    """First plausible header from ``start`` on, one offset left out."""
-    for at in source.places(kind.signature, start + kind.signature_at):
-        begin = at - kind.signature_at
-        try:
-            if begin != but_not:
-                return kind.head(source.read(begin, kind.head_bytes), begin)
-        except DamagedFrameError:
-            continue  # the signature's bytes by chance
-    return None
 
 
 def _fault(
@@ -349,7 +340,8 @@ def convert_sonar_file(
         When the log cannot be written.
     """
     conversion = SonarConversion(promised=kind.frames_promised)
-    record = {"name": source.path.stem, "calibration": kind.calibration.model_dump_json()}
+    calibration = Calibration(sonar=SonarCalibration(image=kind.image))
+    record = {"name": source.path.stem, "calibration": calibration.model_dump_json()}
     with recording(output, {METADATA: record | {"notes": json.dumps(dict(kind.notes))}}) as out:
         for block in _blocks(frames_and_losses(source, kind), kind.clock_period_ns, conversion):
             heads, stamps_ns = zip(*block, strict=True)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 
 from sonar_graph.errors import DatasetError
+from sonar_graph.logs.trajectory_files import decimal_ns
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.sequence import NS_PER_S
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,22 +27,6 @@ class NumberTable:
     def stamps_ns(self) -> Ints:
         """The first field as integer nanoseconds, shape (n,)."""
         return np.array([decimal_ns(text) for text in self.first], dtype=np.int64)
-
-
-def decimal_ns(seconds: str) -> int:
-    """Nanoseconds of a decimal number of seconds, rounded once.
-
-    A double cannot tell apart neighbouring nanoseconds of times counted from 1970; the text can.
-
-    Raises
-    ------
-    ValueError
-        When the text is no finite number.
-    """
-    try:
-        return int((Decimal(seconds) * NS_PER_S).to_integral_value())
-    except (InvalidOperation, OverflowError, ValueError) as error:
-        raise ValueError(f"{seconds!r} is no finite decimal number") from error
 
 
 def read_table(
