@@ -49,7 +49,7 @@ NO_TRACK = -1
 """Track number of a detection that belongs to no track."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Block:
     """Base class of the measurements: rows with a stamp each.
 
@@ -98,6 +98,9 @@ class Block:
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self)} rows, {self.stamps_ns[0]} to {self.stamps_ns[-1]} ns)"
+
     def rows(self, selection: slice | NDArray[np.bool_] | Ints) -> Self:
         """The block with only the selected rows."""
         if isinstance(selection, slice) and (selection.step or 1) > 0 and len(self.stamps_ns[selection]):
@@ -142,7 +145,7 @@ def _in_nanoseconds(name: str, stamps: NDArray[Any]) -> Ints:
     return stamps.astype(np.int64, copy=False)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Imu(Block):
     """Inertial measurements in the IMU's frame.
 
@@ -168,7 +171,7 @@ class Imu(Block):
     """Acceleration minus gravity, shape (n, 3), m/s²: +9.81 on z at rest; NaN: not measured."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Dvl(Block):
     """Velocity over the bottom by the Doppler log, in the DVL's frame; rows without bottom lock are left out.
 
@@ -192,7 +195,7 @@ class Dvl(Block):
     """Shape (n, 3, 3), m²/s²; NaN where unknown: the calibration's value then holds."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Depth(Block):
     """Height of the pressure sensor's port in the world, from pressure.
 
@@ -212,7 +215,7 @@ class Depth(Block):
     """Shape (n,); NaN where unknown: the calibration's value then holds."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LandmarkDetections(Block):
     """Landmarks recognised in sonar frames: one row per detection; rows of one frame share a stamp.
 
@@ -288,7 +291,7 @@ class LandmarkDetections(Block):
         return self.candidate_ids[row, best], self.id_probability[row, best]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SonarFrames:
     """Polar images of an imaging sonar, as recorded; frames of one block share their beams and range bins.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from collections import Counter
 from copy import deepcopy
 from dataclasses import dataclass
 from enum import StrEnum
@@ -39,7 +40,7 @@ class Estimate:
     """Covariance of the body-frame perturbation [rotation, translation], shape (6, 6), rad and m."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Trajectory:
     """Poses of the body in the world over time, with their covariances where known.
 
@@ -72,6 +73,11 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    def __repr__(self) -> str:
+        return f"Trajectory({len(self)} poses" + (
+            f", {self.stamps_ns[0]} to {self.stamps_ns[-1]} ns)" if len(self) else ")"
+        )
 
     @classmethod
     def from_estimates(cls, estimates: list[Estimate]) -> Trajectory:
@@ -129,7 +135,7 @@ class Trajectory:
         return Trajectory.without_covariances(stamps_ns, positions, quaternions)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class LandmarkMap:
     """Positions of landmarks, with their covariances, by identity.
 
@@ -150,6 +156,9 @@ class LandmarkMap:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def __repr__(self) -> str:
+        return f"LandmarkMap({self.ids.tolist()}, positions {self.positions.round(3).tolist()})"
 
 
 class Outcome(StrEnum):
@@ -176,7 +185,7 @@ class Outcome(StrEnum):
     IGNORED = "ignored: this estimator uses no landmarks"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DetectionLog:
     """Outcome of every detection, one row each, in the order processed.
 
@@ -201,6 +210,10 @@ class DetectionLog:
 
     def __len__(self) -> int:
         return len(self.outcomes)
+
+    def __repr__(self) -> str:
+        counts = Counter(outcome.name for outcome in self.outcomes)
+        return f"DetectionLog({', '.join(f'{count} {name}' for name, count in counts.items())})"
 
 
 class Refusal(StrEnum):

@@ -9,7 +9,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation, Slerp
 
 from sonar_graph.errors import MeasurementError
-from sonar_graph.states import Estimate, Trajectory
+from sonar_graph.states import DetectionLog, Estimate, LandmarkMap, Outcome, Trajectory
 
 angles = st.floats(-3.1, 3.1)
 
@@ -36,6 +36,17 @@ def test_trajectory_through_no_estimate_is_empty():
     path = Trajectory.from_estimates([])
     assert len(path) == 0
     assert path.covariances.shape == (0, 6, 6)
+
+
+def test_results_say_themselves_in_a_line():
+    two = LandmarkMap(np.array([1, 7]), np.arange(6.0).reshape(2, 3), np.zeros((2, 3, 3)))
+    log = DetectionLog(np.zeros(3, int), np.zeros(3, int), np.zeros((3, 2)), np.zeros((3, 2, 2)), [Outcome.USED] * 3)
+    assert [repr(each) for each in (turning(), Trajectory.from_estimates([]), two, log)] == [
+        "Trajectory(11 poses, 0 to 10000000000 ns)",
+        "Trajectory(0 poses)",
+        "LandmarkMap([1, 7], positions [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0]])",
+        "DetectionLog(3 USED)",
+    ]
 
 
 def test_poses_at_the_own_instants_are_the_own_poses():

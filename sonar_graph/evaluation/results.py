@@ -33,7 +33,7 @@ class MapSoFar:
     landmarks: LandmarkMap
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RunResult:
     """One estimator's run over one sequence; a failed run is a result too, with its reason.
 
@@ -42,8 +42,10 @@ class RunResult:
     >>> from sonar_graph import run_estimator
     >>> from sonar_graph.testing import small_world
     >>> result = run_estimator(small_world(), "dead-reckoning")
-    >>> result.status, len(result.causal) == len(result.smoothed)
-    ('ok', True)
+    >>> result
+    RunResult('dead-reckoning': ok, 40 estimates, 0 landmarks)
+    >>> len(result.causal) == len(result.smoothed)
+    True
     """
 
     estimator: str
@@ -70,6 +72,10 @@ class RunResult:
     """Duration of asking for the trajectory and the map at the end."""
     peak_memory_mb: float = float("nan")
     """Highest resident memory of the process while it ran, less what it was before."""
+
+    def __repr__(self) -> str:
+        end = self.reason or f"{len(self.causal or ())} estimates, {len(self.landmarks or ())} landmarks"
+        return f"RunResult({self.estimator!r}: {self.status}, {end})"
 
 
 @dataclass(frozen=True)
@@ -140,7 +146,7 @@ class ErrorSeries:
     """2 for a planar run, else 3."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
     """Several runs on one sequence, with scores: the content of comparison.json and of the report.
 
@@ -164,6 +170,11 @@ class Comparison:
     """Versions, machine, date, and the command that made it."""
     recognition: Recognition | None = None
     """The recognition of landmarks in sonar images; None where the log had detections or no images."""
+
+    def __repr__(self) -> str:
+        runs = ", ".join(f"{run.estimator} {run.status}" for run in self.runs)
+        keys = len(next(iter(self.scores.values()), {}))
+        return f"Comparison({self.sequence.name!r}: {runs}; {keys} scores of each in .scores)"
 
     def score_of(self, name: str, key: str) -> Score | None:
         """The score of a run; None where it is missing or not a number."""

@@ -1,7 +1,8 @@
 """Shipped adapters: message types of common drivers, with the conventions by which these fill them.
 
-A message type is added here for everybody: make an adapter of its role, whose attributes are field paths and
-conventions (`Adapter` and its subclasses), and put it into `SHIPPED` (docs/design/0004-logs.md).
+For one log, a few lines of TOML describe a type (docs/tutorials/04_your_own_log.md). For everybody it is added here:
+make an adapter of its role, whose attributes are field paths and conventions (`Adapter` and its subclasses), and put
+it into `SHIPPED` (docs/design/0004-logs.md).
 """
 
 from __future__ import annotations

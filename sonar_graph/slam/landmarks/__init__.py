@@ -1,7 +1,7 @@
 """Identities of detections: what is believed, gated, taken back or chosen anew (docs/theory/doubtful_identities.md).
 
 association.py       the recogniser's posterior, accepted above a least probability or weighed for the mixture
-tracked.py           "robust" (default), "gate" (prompt detections: slam/frontend.py); tracks taken back or moved
+tracked.py           policies "robust" (default) and "gate": a wrong identity is taken back when its track is renamed
 mixture_policy.py    policies "max-mixture" and "gnc" in the window; mixture_history.py: in the whole history
 mixture.py           log densities of the mixture, and the choice that maximises it
 unknown.py           detections that name no landmark, paired by joint_compatibility.py
