@@ -155,7 +155,7 @@ class _AmendedCopy:
         if wanted is not None:
             self._amended.replaced[topic.name] += len(piece.found.sizes)
             return False
-        channel, schema = self._passage.as_written(topic.name)
+        channel, schema = self._passage.as_written[topic.name]
         self._offer(topic.name, (schema.name, schema.encoding, schema.data), topic.encoding, channel.metadata)
         return True
 

@@ -18,17 +18,11 @@ from sonar_graph.errors import LogError
 from sonar_graph.files import as_path
 from sonar_graph.logs.adapters import (
     DepthAdapter,
-    DetectionArrayAdapter,
-    DetectionListsAdapter,
     Dropped,
-    DvlAdapter,
-    ImuAdapter,
-    LandmarkMapAdapter,
     LogConfig,
     MessageTable,
     Refused,
     SonarAdapter,
-    TruthAdapter,
     changes_text,
     detection_warnings,
     shipped_like,
@@ -178,12 +172,12 @@ class Assembly:
     ) -> None:
         self._recording = recording
         self._topics = {role: recording.topics[c.topic] for role, c in choices.items() if c.topic is not None}
-        self._adapters = {role: c.adapter for role, c in choices.items() if c.adapter is not None}
+        self._adapters: dict[str, Any] = {role: c.adapter for role, c in choices.items() if c.adapter is not None}
         self._blocks: dict[str, Any] = {}
         self._dropped: dict[str, Dropped] = {}
         self._tables: dict[str, MessageTable] = {}
         for role, topic in self._topics.items():
-            if isinstance(self._adapters[role], ImuAdapter | DvlAdapter | DepthAdapter | TruthAdapter):
+            if self._adapters[role].reads_table:
                 try:
                     self._tables[role] = self._adapters[role].table(topic)
                 except LogError:
@@ -237,19 +231,18 @@ class Assembly:
         """The measurements of a role; None where it has no topic, or none of its rows is fit."""
         if role in self._blocks or role not in self._topics:
             return self._blocks.get(role)
-        topic, table = self._topics[role], self._tables.get(role)
-        outcome: tuple[Any, Dropped] = None, {}
-        match self._adapters[role]:
-            case ImuAdapter() | DvlAdapter() | TruthAdapter() as adapter if table is not None:
-                outcome = adapter.read(table)
-            case DepthAdapter() as adapter if table is not None:
-                gravity_m_s2 = self.calibration.gravity_m_s2
-                if assumption := adapter.assumption(gravity_m_s2):
-                    self._notes["log.depth"] = assumption
-                outcome = adapter.read(table, gravity_m_s2)
-            case DetectionListsAdapter() | DetectionArrayAdapter() | LandmarkMapAdapter() as adapter:
-                outcome = adapter.read(topic)
-        self._blocks[role], dropped = outcome
+        topic, adapter = self._topics[role], self._adapters[role]
+        source: Any = self._tables.get(role) if adapter.reads_table else topic
+        dropped: Dropped = {}
+        if source is None:
+            self._blocks[role] = None
+        elif isinstance(adapter, DepthAdapter):
+            gravity_m_s2 = self.calibration.gravity_m_s2
+            if assumption := adapter.assumption(gravity_m_s2):
+                self._notes["log.depth"] = assumption
+            self._blocks[role], dropped = adapter.read(source, gravity_m_s2)
+        else:
+            self._blocks[role], dropped = adapter.read(source)
         if dropped := topic.unsound | dropped:
             self._dropped[role] = dropped
         return self._blocks[role]
@@ -262,9 +255,7 @@ class Assembly:
         for role in ("imu", "dvl"):
             if self.block(role) is None:
                 topic, faults = self._topics[role], _counts(self._dropped.get(role, {}))
-                raise LogError(
-                    f"{topic.file}: topic {topic.name}: none of its {len(topic)} messages can be used: {faults}"
-                )
+                raise topic.error(f"none of its {len(topic)} messages can be used: {faults}")
         require_use(str(self._recording.path), self.block("imu"), self.block("dvl"))
         blocks = {role: self.block(role) for role in SEQUENCE_ROLES}
         stamps = [

@@ -7,10 +7,10 @@ with its reason, for notes, error messages and `inspect_log` (docs/design/0004-l
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from sonar_graph.errors import LogError, MissingTopicError
-from sonar_graph.logs.adapters import SHIPPED, Adapter, LogConfig, Shipped
+from sonar_graph.logs.adapters import SHIPPED, Adapter, LogConfig, Shipped, shipped_for
 from sonar_graph.logs.cdr import parse_definition, short_name
 from sonar_graph.logs.mcap import Recording, Topic
 
@@ -69,9 +69,9 @@ class Choice:
     reason: str
     adapter: Adapter | None = None
     """Adapter for its messages."""
-    candidates: tuple[str, ...] = field(default=())
+    candidates: tuple[str, ...] = ()
     """Topics that fit, where they are several."""
-    could_be: tuple[str, ...] = field(default=())
+    could_be: tuple[str, ...] = ()
     """Topics of a fitting type whose names do not say that they play the role."""
     is_off: bool = False
     """The user wants nothing to play it."""
@@ -124,12 +124,7 @@ def adapter_for(role: Role, topic: Topic, config: LogConfig) -> Adapter | str:
             return adapter
     if lacking:
         return f"has no field {', '.join(lacking)}"
-    others = [
-        other.name
-        for other in ROLES.values()
-        if any(short_name(offer.adapter.type) == short_name(topic.type_name) for offer in other.shipped)
-    ]
-    if others:
+    if others := [other for other in ROLES if shipped_for(other, topic.type_name)]:
         roles = " or ".join(others)
         return f"is a {topic.type_name}; no adapter of role {role.name} reads it, it is a type of role {roles}"
     return f"is a {topic.type_name}, for which no adapter is shipped: name type and fields in --log-config"
@@ -192,14 +187,10 @@ def choose_topics(
     config: LogConfig = _DEFAULTS,
     roles: Iterable[str] = SEQUENCE_ROLES,
 ) -> dict[str, Choice]:
-    """Choose the topic for each role.
+    """Choose the topic for each role; a LogError where several fit one, or ``wanted`` names no role.
 
-    Raises
-    ------
-    MissingTopicError
-        When a needed role has no topic, or one that the user named is not there; listing the topics that are.
-    LogError
-        When several topics fit one role, or ``wanted`` names a role that does not exist.
+    A needed role without a topic, and a topic that is named but not there, are a MissingTopicError, which lists the
+    topics that are.
     """
     path, unknown = recording.path, wanted.keys() - ROLES.keys()
     if unknown:

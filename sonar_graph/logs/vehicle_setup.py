@@ -98,10 +98,7 @@ class PartialCalibration:
     def parse(cls, values: Values, source: str) -> PartialCalibration:
         """Check values as TOML and JSON give them; needed fields may still come from the log.
 
-        Raises
-        ------
-        CalibrationError
-            Naming the source, each wrong field, what was expected, and the fields that exist.
+        A CalibrationError names the source, each wrong field, what was expected, and the fields that exist.
         """
         try:
             Calibration.model_validate(_over(Calibration().model_dump(), values))
@@ -115,10 +112,7 @@ class PartialCalibration:
     def read(cls, path: Path) -> PartialCalibration:
         """Read a TOML or JSON file (by its suffix) whose fields go before the log's own.
 
-        Raises
-        ------
-        CalibrationError
-            When the file cannot be read, is neither TOML nor JSON, or a field does not fit.
+        A file that cannot be read, is neither, or has a field that does not fit is a CalibrationError.
         """
         kind = "JSON" if path.suffix == ".json" else "TOML"
         try:
@@ -129,9 +123,8 @@ class PartialCalibration:
         except (json.JSONDecodeError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise CalibrationError(f"{path}: not {kind}: {error}") from error
         if not isinstance(values, dict):
-            raise CalibrationError(
-                f"{path}: expected an object with sections such as imu, not {json.dumps(values):.40}"
-            )
+            what = "expected an object with sections such as imu"
+            raise CalibrationError(f"{path}: {what}, not {json.dumps(values):.40}")
         return cls.parse(values, str(path))
 
     def fields(self) -> list[str]:
@@ -142,21 +135,10 @@ class PartialCalibration:
 def gathered(
     given: PartialCalibration | None, recorded: Calibration | None, mountings: Mapping[str, Mounting]
 ) -> Calibration:
-    """Gather a calibration from all sources, field by field.
+    """Gather a calibration, field by field: what the user gives, what the record set, ``/tf_static``, and defaults.
 
-    Parameters
-    ----------
-    given
-        Fields of the user, before all others.
-    recorded
-        Calibration of the log's record; fields that were not set there do not count.
-    mountings
-        Mountings of ``/tf_static`` by sensor, before defaults; of ``depth`` only the translation counts.
-
-    Raises
-    ------
-    CalibrationError
-        When the fields together are no calibration; naming the user's source.
+    Mountings of ``/tf_static`` are by sensor; of ``depth`` only the translation counts. Fields that together are no
+    calibration are a CalibrationError, which names the user's source.
     """
     values = Calibration().model_dump()
     for sensor, mounting in mountings.items():
@@ -171,11 +153,8 @@ def gathered(
 
 def mounted_by(values: Values) -> set[str]:
     """Sensors whose mounting is given."""
-    return {
-        sensor
-        for sensor, field in MOUNTING_FIELDS.items()
-        if isinstance(values.get(sensor), Mapping) and field in values[sensor]
-    }
+    sections = {sensor: values[sensor] for sensor in MOUNTING_FIELDS if isinstance(values.get(sensor), Mapping)}
+    return {sensor for sensor, section in sections.items() if MOUNTING_FIELDS[sensor] in section}
 
 
 def _over(values: Values, changes: Values) -> dict[str, Any]:
@@ -222,19 +201,9 @@ def read_notes(recording: Recording) -> dict[str, str]:
 
 
 def with_notes(path: Path, notes: Mapping[str, str]) -> dict[str, str]:
-    """Record of a log with further notes.
+    """Record of a log with further notes by subject, before its own; without a record the new one holds only notes.
 
-    Parameters
-    ----------
-    path
-        The log; without a record the new one holds only notes.
-    notes
-        Notes by subject, before those of the log.
-
-    Raises
-    ------
-    LogError
-        When the log cannot be read, or its notes are no JSON object.
+    A log that cannot be read, or whose notes are no JSON object, is a LogError.
     """
     recording = scan(path, lambda _: Keep.NONE)
     return recording.metadata.get(METADATA, {}) | {"notes": json.dumps(read_notes(recording) | dict(notes))}

@@ -53,17 +53,8 @@ GREY: Colour = (0.5, 0.5, 0.5, 0.9)
 def ellipsoids(covariances: Floats) -> tuple[Floats, Floats]:
     """95 % ellipsoids of Gaussian points in space, ``x' C^-1 x = chi2_3(0.95)``.
 
-    Parameters
-    ----------
-    covariances
-        Shape (m, 3, 3), m²; NaN where unknown, which gives a small sphere.
-
-    Returns
-    -------
-    diameters
-        Along the principal axes, shape (m, 3), m.
-    quaternions_xyzw
-        From the principal axes to the world, shape (m, 4).
+    From covariances, shape (m, 3, 3), m², NaN where unknown, which gives a small sphere: diameters along the principal
+    axes, shape (m, 3), m, and quaternions x, y, z, w from these axes to the world, shape (m, 4).
     """
     covariances = covariances.copy()
     covariances[_unknown(covariances)] = np.eye(3) * (UNKNOWN_DIAMETER_M / (2 * _SIGMAS)) ** 2
@@ -259,13 +250,7 @@ class Layer:
 
 
 def write_layouts(result: Path, layers: Sequence[Layer], scene: Scene) -> None:
-    """Write ``NAME.foxglove.json`` and ``NAME.rviz`` beside ``NAME.mcap``.
-
-    Raises
-    ------
-    LogError
-        When one cannot be written.
-    """
+    """Write ``NAME.foxglove.json`` and ``NAME.rviz`` beside ``NAME.mcap``; a LogError where one cannot be written."""
     layout = json.dumps(foxglove_layout(layers, scene), indent=2, ensure_ascii=False) + "\n"
     for suffix, text in ((FOXGLOVE_SUFFIX, layout), (RVIZ_SUFFIX, rviz_config(layers, scene))):
         path = result.with_suffix(suffix)

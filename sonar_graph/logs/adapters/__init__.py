@@ -8,7 +8,7 @@ from sonar_graph.logs.adapters.landmark_messages import (
     DetectionArrayAdapter, DetectionListsAdapter, LandmarkMapAdapter, detection_warnings,
 )
 from sonar_graph.logs.adapters.log_config import (
-    LogConfig, changes_text, plain_lines, read_log_config, shipped_like, table_text,
+    LogConfig, changes_text, plain_lines, read_log_config, shipped_for, shipped_like, table_text,
 )
 from sonar_graph.logs.adapters.message_table import Dropped, MessageTable
 from sonar_graph.logs.adapters.sonar_messages import SAMPLE_TYPES, Refused, SonarAdapter
@@ -18,5 +18,5 @@ __all__ = [
     "Adapter", "DepthAdapter", "DetectionArrayAdapter", "DetectionListsAdapter", "Dropped", "DvlAdapter", "ImuAdapter",
     "LandmarkMapAdapter", "LogConfig", "MessageTable", "Refused", "SAMPLE_TYPES", "SHIPPED", "Shipped", "SonarAdapter",
     "TruthAdapter", "Z_DOWN_TYPES", "body_to_ros", "changes_text", "detection_warnings", "leaf_fields", "plain_lines",
-    "read_log_config", "shipped_like", "table_text",
+    "read_log_config", "shipped_for", "shipped_like", "table_text",
 ]

@@ -9,7 +9,7 @@ and conventions. A message type is added without code, as an instance of that su
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +66,8 @@ class Adapter(Section):
     measurements, with the number of rows left out by reason, in ``read``.
     """
 
+    reads_table: ClassVar[bool] = True
+    """False where ``read`` takes the topic, because its messages have lists of different lengths."""
     type: str
     """Message type, such as sensor_msgs/msg/Imu."""
     topic: str | None = None

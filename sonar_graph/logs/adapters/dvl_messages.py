@@ -49,29 +49,14 @@ class BeamGeometry(Section):
     def directions(self) -> Floats:
         """Unit vectors, shape (beams, 3), z down."""
         tilt, azimuth = np.radians(self.tilt_deg), np.radians(self.azimuth_deg)
-        across = np.sin(tilt)
-        return np.column_stack(
-            [across * np.cos(azimuth), across * np.sin(azimuth), np.full(azimuth.shape, np.cos(tilt))]
-        )
+        across, down = np.sin(tilt), np.full(azimuth.shape, np.cos(tilt))
+        return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), down])
 
     def velocities(self, table: MessageTable, scale: float) -> tuple[Floats, Floats, NDArray[np.int64]]:
-        """Velocities from the valid beams of each row, along the driver's axes.
+        """Velocities from the valid beams of each row, along the driver's axes; ``scale`` turns the field into m/s.
 
-        Parameters
-        ----------
-        table
-            The messages.
-        scale
-            Turns the velocity field into m/s.
-
-        Returns
-        -------
-        velocity
-            Shape (n, 3), NaN with too few beams.
-        covariance
-            Shape (n, 3, 3), NaN without `sigma_m_s`.
-        count
-            Number of valid beams, shape (n,).
+        Shape (n, 3), NaN with too few beams; their covariances, shape (n, 3, 3), NaN without `sigma_m_s`; and the
+        numbers of valid beams, shape (n,).
         """
         along = table.column(str(self.velocity)).astype(float)
         if along.shape[1:] != (len(self.azimuth_deg),):

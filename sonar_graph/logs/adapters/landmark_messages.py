@@ -15,7 +15,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sonar_graph.errors import LogError
 from sonar_graph.logs.adapters.adapter import Adapter, field_paths, turn, turn_covariances
 from sonar_graph.logs.adapters.message_table import NOT_FINITE, Dropped, fit_rows, header_stamps_ns, not_finite
 from sonar_graph.logs.cdr import Messages
@@ -62,17 +61,14 @@ class _Joined:
         self.ids = np.concatenate([_padded(part.ids, most, -1) for part in parts])
         self.probabilities = np.concatenate([_padded(part.probabilities, most, 0) for part in parts])
         if (large := too_large(self.ids)).any():
-            raise LogError(
-                f"{topic.file}: topic {topic.name}: message {self.message[int(np.argmax(large))]} has an identity of "
-                f"2^56 or more; {ID_ADVICE}, or do not use them: [detections] use = false"
-            )
+            where = f"message {self.message[int(np.argmax(large))]} has an identity of 2^56 or more"
+            raise topic.error(f"{where}; {ID_ADVICE}, or do not use them: [detections] use = false")
 
     def fit(self, faults: Mapping[str, np.ndarray]) -> tuple[Ints, Dropped]:
         """Rows without a fault, in the order of their stamps, and the number of the others by fault."""
         order = np.argsort(self.message, kind="stable")
-        rows, dropped = fit_rows(
-            self.stamps_ns[order], {f: has_it[order] for f, has_it in faults.items()}, unique=False
-        )
+        in_order = {fault: has_it[order] for fault, has_it in faults.items()}
+        rows, dropped = fit_rows(self.stamps_ns[order], in_order, unique=False)
         return order[rows], dropped
 
     def detections(
@@ -90,6 +86,8 @@ def _padded(columns: np.ndarray, count: int, filling: int) -> np.ndarray:
 
 class DetectionListsAdapter(Adapter):
     """``sonar_graph_msgs/LandmarkDetections``: range, azimuth, covariance and posterior, in flat lists."""
+
+    reads_table = False
 
     def read(self, topic: Topic) -> tuple[LandmarkDetections | None, Dropped]:
         """One row a detection; where messages differ in the number of candidates, -1 with probability 0 fills."""
@@ -110,15 +108,15 @@ class DetectionListsAdapter(Adapter):
         frames, count = group["range_m"].shape
         ids, probabilities = group["candidate_ids"], group["id_probability"]
         tracks = group["track"] if "track" in group.layout.columns else np.empty((frames, 0))  # not in old logs
-        where = f"{topic.file}: topic {topic.name}: message {group.rows[0]} has {count} ranges"
+        where = f"message {group.rows[0]} has {count} ranges"
         azimuths, covariances = group["azimuth_rad"].shape[1], group["covariance"].shape[1]
         if (azimuths, covariances, ids.shape[1] % count) != (count, 4 * count, 0) or probabilities.shape != ids.shape:
-            raise LogError(
+            raise topic.error(
                 f"{where}, {azimuths} azimuths, {covariances} covariance elements, {ids.shape[1]} identities, "
                 f"{probabilities.shape[1]} probabilities; expected n, n, 4n, kn and kn"
             )
         if tracks.shape[1] not in (0, count):
-            raise LogError(f"{where} and {tracks.shape[1]} tracks; expected as many, or none")
+            raise topic.error(f"{where} and {tracks.shape[1]} tracks; expected as many, or none")
         total, candidates = frames * count, ids.shape[1] // count
         return _Rows(
             np.repeat(group.rows, count),
@@ -146,6 +144,7 @@ class DetectionArrayAdapter(Adapter):
     Identities are integers here: a class that is a number stands for itself, others are given in `ids`.
     """
 
+    reads_table = False
     position: Literal["results", "bbox"] = "results"
     """Source of the position: a detection's first result, with its covariance, or the centre of its box, without."""
     ids: Mapping[str, int] = {}
@@ -164,9 +163,9 @@ class DetectionArrayAdapter(Adapter):
         scores = rows.probabilities
         worst = float(np.nanmax(scores.sum(axis=1), initial=0.0))
         if worst > 1 + ROUNDING or (scores < 0).any():
-            raise LogError(
-                f"{topic.file}: topic {topic.name}: scores of one detection add up to {worst:g}; the posterior over "
-                f"identities must be between 0 and 1 in sum: normalise the scores where the log is made"
+            raise topic.error(
+                f"scores of one detection add up to {worst:g}; the posterior over identities must be between 0 and 1 "
+                f"in sum: normalise the scores where the log is made"
             )
         positions, covariances = rows.values
         ranges, azimuths, spread = range_and_azimuth(
@@ -214,9 +213,9 @@ class DetectionArrayAdapter(Adapter):
             identity = self.ids[name] if name in self.ids else int(name)
             return max(-1, min(identity, FIRST_TOO_LARGE_ID))  # beyond int64 is refused as too large as well
         except ValueError:
-            raise LogError(
-                f"{topic.file}: topic {topic.name}: class {name!r} is no integer identity; say in a log "
-                f'configuration which it is: [detections] ids = {{"{name}" = 1}}, or do not use them: use = false'
+            raise topic.error(
+                f"class {name!r} is no integer identity; say in a log configuration which it is: [detections] ids = "
+                f'{{"{name}" = 1}}, or do not use them: use = false'
             ) from None
 
 
@@ -236,6 +235,8 @@ def range_and_azimuth(positions: Floats, covariances: Floats) -> tuple[Floats, F
 class LandmarkMapAdapter(Adapter):
     """``sonar_graph_msgs/LandmarkMap``: true positions of landmarks."""
 
+    reads_table = False
+
     def read(self, topic: Topic) -> tuple[LandmarkMap | None, Dropped]:
         """The last sound map of a topic; None where none is."""
         groups = topic.messages()
@@ -245,9 +246,9 @@ class LandmarkMapAdapter(Adapter):
         ids, position, covariance = (last[name][-1] for name in ("ids", "position", "covariance"))
         count, different = len(ids), len(np.unique(ids))
         if (different, len(position), len(covariance)) != (count, 3 * count, 9 * count):
-            raise LogError(
-                f"{topic.file}: topic {topic.name}: {count} ids ({different} different), {len(position)} position and "
-                f"{len(covariance)} covariance elements; expected n different, 3n and 9n"
+            raise topic.error(
+                f"{count} ids ({different} different), {len(position)} position and {len(covariance)} covariance "
+                f"elements; expected n different, 3n and 9n"
             )
         order = np.argsort(ids)
         positions, covariances = position.reshape(-1, 3)[order], covariance.reshape(-1, 3, 3)[order]

@@ -57,10 +57,7 @@ class LogConfig:
     def parse(cls, values: Mapping[str, Any], source: str) -> LogConfig:
         """Check values as TOML gives them, as far as that is possible before a log is read.
 
-        Raises
-        ------
-        LogError
-            Naming the source, the table and the key, and what was expected.
+        A LogError names the source, the table and the key, and what was expected.
         """
         for role, table in values.items():
             if role not in ADAPTERS:
@@ -169,10 +166,7 @@ def shipped_like(role: str, type_name: str, definition: Struct) -> Adapter | Non
 def read_log_config(path: Path) -> LogConfig:
     """Read a TOML file that says what the topics of a log are.
 
-    Raises
-    ------
-    LogError
-        When the file cannot be read, is not TOML, or says something that cannot be; naming table and key.
+    A LogError where it cannot be read, is not TOML, or says something that cannot be; it names table and key.
     """
     try:
         values = tomllib.loads(Path(path).read_text(encoding="utf-8"))

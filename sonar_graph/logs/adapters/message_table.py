@@ -8,7 +8,6 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from sonar_graph.errors import LogError
 from sonar_graph.logs.cdr import Messages
 from sonar_graph.logs.mcap import Topic
 from sonar_graph.measurements import Ints
@@ -28,23 +27,9 @@ def header_stamps_ns(group: Messages, log_times_ns: Ints, prefix: str = "header.
 
 
 class MessageTable:
-    """All messages of a topic whose fields of interest have the same size in each.
+    """All messages of a topic whose fields of interest have the same size in each, stamped as an `Adapter` says.
 
-    Parameters
-    ----------
-    topic
-        With its payloads.
-    stamp
-        Field with the time of validity: a Time or a number; ``log`` takes the time of recording.
-    stamp_unit_s
-        Unit of a stamp that is a number.
-    stamp_offset_s
-        Added to every stamp.
-
-    Raises
-    ------
-    LogError
-        Naming file, topic and field where the messages are not what their definition says.
+    A LogError names file, topic and field where the messages are not what their definition says.
     """
 
     def __init__(
@@ -54,7 +39,7 @@ class MessageTable:
         self.groups = topic.messages()
         if not self.groups:
             faults = ", ".join(f"{count} {fault}" for fault, count in topic.unsound.items())
-            raise LogError(f"{topic.file}: topic {topic.name}: no message is what its definition says: {faults}")
+            raise topic.error(f"no message is what its definition says: {faults}")
         log_times_ns = topic.log_times_ns
         if stamp == LOG_TIME:
             self.stamps_ns = log_times_ns
@@ -99,19 +84,13 @@ class MessageTable:
                 self.refuse(path, f"is an array of {column.shape[1]}; name one element, such as {path}[0]")
         return np.column_stack(found)
 
-    def first_string(self, path: str) -> str:
-        """A string field of the first message; empty where there is no such field."""
-        return self.groups[0].first_string(path)
-
     def refuse(self, path: str, fault: str) -> NoReturn:
         """Raise a `LogError` about a field."""
-        topic = self.topic
-        raise LogError(f"{topic.file}: topic {topic.name}: field {path} of {topic.type_name} {fault}")
+        raise self.topic.error(f"field {path} of {self.topic.type_name} {fault}")
 
     def _require(self, path: str) -> None:
         if not self.has(path):
-            topic = self.topic
-            raise LogError(f"{topic.file}: topic {topic.name}: its {topic.type_name} has no field {path}")
+            raise self.topic.error(f"its {self.topic.type_name} has no field {path}")
 
 
 def field_of(path: str) -> tuple[str, int | None]:
@@ -136,16 +115,10 @@ def not_finite(*columns: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def fit_rows(stamps_ns: Ints, faults: Mapping[str, NDArray[np.bool_]], *, unique: bool) -> tuple[Ints, Dropped]:
-    """Rows fit for use in the order of their stamps, and the number of the others by fault.
+    """Rows fit for use in the order of their stamps, shape (n,), and the number of the others by fault.
 
-    Parameters
-    ----------
-    stamps_ns
-        Shape (n,).
-    faults
-        Masks, shape (n,), by the fault's name; a row counts for its first fault only.
-    unique
-        Leave out all but the first of rows with the same stamp.
+    Faults are masks, shape (n,), by name; a row counts for its first fault only. With ``unique``, all but the first of
+    rows with the same stamp are left out.
     """
     fit = np.ones(len(stamps_ns), bool)
     counts = {}

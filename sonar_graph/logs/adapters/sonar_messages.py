@@ -40,6 +40,7 @@ class _Images(NamedTuple):
 class SonarAdapter(Adapter):
     """Beams, range bins and the image of every ping."""
 
+    reads_table = False
     data: str
     """Field with the image's bytes."""
     image_order: Literal["range-major", "beam-major"] = "range-major"

@@ -195,19 +195,9 @@ class TruthAdapter(Adapter):
 
 
 def body_to_ros(covariances: Floats, rotations: Floats) -> Floats:
-    """Covariances for ROS messages.
+    """Covariances for ROS messages: of ``[rho, theta]`` along the world's axes, shape (n, 6, 6); zeros: unknown.
 
-    Parameters
-    ----------
-    covariances
-        Of ``[theta, rho]`` in the body frame, shape (n, 6, 6); NaN: unknown.
-    rotations
-        ``world_R_body``, shape (n, 3, 3).
-
-    Returns
-    -------
-    ndarray
-        Of ``[rho, theta]`` along the world's axes, shape (n, 6, 6); zeros: unknown.
+    From those of ``[theta, rho]`` in the body frame, shape (n, 6, 6), NaN: unknown, and ``world_R_body``, (n, 3, 3).
     """
     swap = _swap(rotations)
     return np.nan_to_num(swap @ covariances @ swap.transpose(0, 2, 1), nan=0.0)

@@ -153,13 +153,7 @@ _FIELD_TYPE = re.compile(r"^(\w+/\w+)(?:\[.*?\])?\s", re.MULTILINE)
 
 
 def definition(type_name: str) -> str:
-    """Interface text of a message with all types that it uses, as in an MCAP schema.
-
-    Parameters
-    ----------
-    type_name
-        With or without the ``msg`` in the middle: ``sensor_msgs/msg/Imu``.
-    """
+    """Interface text of a type such as ``sensor_msgs/msg/Imu``, with all types that it uses, as in an MCAP schema."""
     wanted = [short_name(type_name)]
     for name in wanted:
         wanted += [used for used in dict.fromkeys(_FIELD_TYPE.findall(DEFINITIONS[name])) if used not in wanted]
@@ -173,21 +167,13 @@ def short_name(type_name: str) -> str:
     return type_name.replace("/msg/", "/")
 
 
+# fmt: off
 PRIMITIVES = {
-    "bool": "?",
-    "byte": "u1",
-    "char": "u1",
-    "uint8": "u1",
-    "int8": "i1",
-    "uint16": "u2",
-    "int16": "i2",
-    "uint32": "u4",
-    "int32": "i4",
-    "uint64": "u8",
-    "int64": "i8",
-    "float32": "f4",
-    "float64": "f8",
+    "bool": "?", "byte": "u1", "char": "u1", "float32": "f4", "float64": "f8",
+    "uint8": "u1", "uint16": "u2", "uint32": "u4", "uint64": "u8",
+    "int8":  "i1", "int16":  "i2", "int32":  "i4", "int64":  "i8",
 }
+# fmt: on
 """Type in numpy of each primitive, without the byte order."""
 STRING = "string"
 _MOST_FIELDS = 10_000
@@ -221,19 +207,10 @@ class Field:
 
 @lru_cache(maxsize=256)
 def parse_definition(type_name: str, text: str) -> Struct:
-    """Tree of a message type from its interface text.
+    """Tree of a message type, such as ``sensor_msgs/msg/Imu``, from its ``ros2msg`` text with all dependencies.
 
-    Parameters
-    ----------
-    type_name
-        Such as ``sensor_msgs/msg/Imu``; relative type names in the text belong to its package.
-    text
-        The ``ros2msg`` text with all dependencies.
-
-    Raises
-    ------
-    LogError
-        Naming the line that is not a field, or the type whose definition is not in the text.
+    Relative type names in the text belong to the package of the type. A LogError names the line that is not a field, or
+    the type whose definition is not in the text.
     """
     own, *rest = _SECTION.split(text.replace("\r\n", "\n"))
     texts = {short_name(name): body for name, body in zip(rest[::2], rest[1::2], strict=True)}

@@ -31,7 +31,6 @@ from sonar_graph.measurements import Ints
 
 HEADER_BYTES = 4
 LENGTH_BYTES = 4
-BYTE_ORDERS = "<>"
 _PHASES = 8
 
 
@@ -166,7 +165,7 @@ class Leaf(NamedTuple):
 
 @cache
 def _dtypes(kind: str) -> Mapping[str, np.dtype[Any]]:
-    return {order: np.dtype(order + kind) for order in BYTE_ORDERS}
+    return {order: np.dtype(order + kind) for order in "<>"}
 
 
 class Plan:
@@ -184,14 +183,9 @@ class Plan:
         self.booleans = [path for path, leaf in self.leaves.items() if leaf.dtypes["<"] == np.bool_]
 
     def walk(self, length_of: Callable[[DecodingStep, int], int], most_elements: int | None = None) -> PayloadWalk:
-        """Take all steps.
+        """Take all steps; ``length_of`` gives the length word of a step at a byte offset.
 
-        Parameters
-        ----------
-        length_of
-            Value of the length word of a step, given its byte offset.
-        most_elements
-            Limit of the elements of an array, because the payload ends.
+        An array of more than ``most_elements`` would reach beyond the end of the payload.
         """
         walk = PayloadWalk(self._parts, length_of, most_elements)
         for step in self._steps:
@@ -285,17 +279,11 @@ class Layout:
         self.byte_order = byte_order
         self.size = walk.end
         self.words = walk.words
-        self._plan = plan
+        self.plan = plan
         self._found = walk.found
 
     def column(self, path: str) -> PayloadColumn:
-        """Places of the values of a field.
-
-        Raises
-        ------
-        KeyError
-            When the type has no such field, or it holds no values itself.
-        """
+        """Places of the values of a field; a KeyError where the type has no such field with values of its own."""
         step, dtypes, is_single = self.columns[path]
         found = self._found[step.index]
         if isinstance(step, FieldBlock):
@@ -305,23 +293,9 @@ class Layout:
         return PayloadColumn(dtypes[self.byte_order], is_single, found[::2], found[1::2])
 
     def lengths(self, path: str) -> list[int]:
-        """Number of elements of an array or sequence, one each time it occurs.
-
-        Raises
-        ------
-        KeyError
-            When the type has no such field.
-        """
-        sequence = self._plan.sequences.get(path)
+        """Number of elements of an array or sequence, one each time it occurs."""
+        sequence = self.plan.sequences.get(path)
         return self.column(path).counts if sequence is None else self._found[sequence.index][1::2]
-
-    def texts(self) -> Iterator[tuple[str, PayloadColumn]]:
-        """Every string field with its path; the closing NUL counts as a byte."""
-        return ((path, self.column(path)) for path in self._plan.texts)
-
-    def booleans(self) -> Iterator[tuple[str, PayloadColumn]]:
-        """Every boolean field with its path."""
-        return ((path, self.column(path)) for path in self._plan.booleans)
 
     def same(self, payloads: Bytes, rows: Ints) -> NDArray[np.bool_]:
         """True for each of some rows of payloads, shape (n, size), that has this layout."""
@@ -344,13 +318,7 @@ class UnsoundMessageError(Exception):
 
 
 def layout_of(plan: Plan, payload: memoryview) -> Layout:
-    """Layout of a payload.
-
-    Raises
-    ------
-    UnsoundMessageError
-        When it is not plain CDR, or shorter or longer than its definition says.
-    """
+    """Layout of a payload; an UnsoundMessageError where it is not plain CDR or not as long as its definition says."""
     if len(payload) < HEADER_BYTES:
         raise UnsoundMessageError("without an encapsulation header")
     order = _BYTE_ORDERS.get(bytes(payload[:2]))
@@ -377,13 +345,15 @@ def layout_of(plan: Plan, payload: memoryview) -> Layout:
 
 def unsound_contents(layout: Layout, payloads: Bytes) -> Iterator[tuple[str, NDArray[np.bool_]]]:
     """Faults of booleans and strings of payloads that share a layout, and the rows that have them, shape (n,)."""
-    for path, column in layout.booleans():
+    for path in layout.plan.booleans:
+        column = layout.column(path)
         for start, count in zip(column.starts, column.counts, strict=True):
             has_it = np.asarray((payloads[:, start : start + count] > 1).any(axis=1))
             if has_it.any():
                 yield f"with a boolean {path} that is neither 0 nor 1", has_it
     many, first = len(payloads) > 1, payloads[0].data
-    for path, column in layout.texts():
+    for path in layout.plan.texts:
+        column = layout.column(path)
         for start, length in zip(column.starts, column.counts, strict=True):
             end = start + length
             characters = payloads[:, start:end].tobytes() if many else bytes(first[start:end])

@@ -54,13 +54,7 @@ class Messages:
         return len(self.rows)
 
     def __getitem__(self, path: str) -> NDArray[Any]:
-        """Values of a numeric field: shape (n,) for a single one, (n, m) within arrays.
-
-        Raises
-        ------
-        KeyError
-            When the type has no such field, or it holds no values itself.
-        """
+        """Values of a numeric field: shape (n,) for a single one, (n, m) within arrays; a KeyError where none is."""
         column = self.layout.column(path)
         values = _view(self.payloads, column)
         if values is None:
@@ -99,12 +93,7 @@ class Decoded(NamedTuple):
 def decode(definition: Struct, payloads: Iterable[tuple[Ints, Bytes]]) -> Decoded:
     """Messages grouped by layout; those that do not follow their definition are left out and named.
 
-    Parameters
-    ----------
-    definition
-        Definition of the messages' type.
-    payloads
-        For each payload length: rows of the messages, shape (n,), and their bytes, shape (n, length).
+    Payloads are, for each length, the rows of the messages, shape (n,), and their bytes, shape (n, length).
     """
     return Decoder(definition).decode(payloads)
 
@@ -178,25 +167,16 @@ class Decoder:
 
 
 def encode(definition: Struct, n: int, values: Mapping[str, Value], lengths: Lengths | None = None) -> Bytes:
-    """Payloads of n messages with the same layout; fields that are not given are zero or empty.
+    """Payloads of n messages with the same layout, shape (n, size); fields that are not given are zero or empty.
 
     Parameters
     ----------
-    definition
-        Definition of the messages' type.
-    n
-        Number of messages.
     values
         By path. Numbers: anything that broadcasts to shape (n,), or (n, m) within arrays, where m also is the length
         of a sequence of numbers. Strings: one for all, or a list with one for each occurrence in a message.
     lengths
         Number of elements of sequences by path, for all occurrences in a message or for each; needed for sequences of
         structs, and of numbers within those.
-
-    Returns
-    -------
-    NDArray[uint8]
-        Shape (n, size).
 
     Raises
     ------

@@ -85,13 +85,7 @@ _DECOMPRESSOR = zstandard.ZstdDecompressor()
 
 
 def unpack(chunk: ChunkRecord, packed: bytes) -> bytes:
-    """Records of a chunk, checked against its CRC.
-
-    Raises
-    ------
-    ChunkError
-        When they cannot be decompressed, or are not the bytes that were written.
-    """
+    """Records of a chunk; a ChunkError where they cannot be decompressed, or the CRC does not fit."""
     data = packed
     try:
         if chunk.compression == "zstd" or (chunk.compression not in ("", "lz4") and packed.startswith(_ZSTD)):

@@ -46,13 +46,7 @@ class FileSummary:
 
 
 def parse(kind: Callable[[ReadDataStream], T], content: bytes) -> T:
-    """Record as parsed by the mcap package.
-
-    Raises
-    ------
-    LogError
-        When the content is not exactly one such record.
-    """
+    """Record as parsed by the mcap package; a LogError where the content is not exactly one such record."""
     try:
         record = kind(ReadDataStream(BytesIO(content)))
         builder = RecordBuilder()
@@ -145,10 +139,7 @@ class Instant:
     def parse(cls, text: str) -> Instant:
         """Instant from a number of seconds from the log's beginning, or from a date and time, in UTC without a zone.
 
-        Raises
-        ------
-        LogError
-            When the text is neither.
+        Any other text is a LogError.
         """
         try:
             seconds = float(text)
@@ -183,20 +174,9 @@ class TimeWindow:
 
     @classmethod
     def parse(cls, start: str | None, end: str | None) -> TimeWindow:
-        """Window between two times in text, as `Instant.parse` takes them; None: no limit.
-
-        Raises
-        ------
-        LogError
-            When a text is no time.
-        """
+        """Window between two times in text, as `Instant.parse` takes them; None: no limit."""
         first, last = (None if text is None else Instant.parse(text) for text in (start, end))
         return cls(first, last)
-
-    @property
-    def is_all(self) -> bool:
-        """True when the window has no limits."""
-        return self.start is None and self.end is None
 
     def describe(self, beginning_ns: int) -> str:
         """Text with the limits in seconds after the log's beginning."""

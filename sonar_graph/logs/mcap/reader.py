@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Metadata, Schema
+from mcap.records import ChunkIndex, Metadata
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.mcap.chunks import (
@@ -53,20 +53,10 @@ class ChunkPart(NamedTuple):
 
 
 class Passage:
-    """One pass through a file, in the order of the file.
+    """One pass through a file, in the order of the file: the wanted messages of each chunk, topic by topic.
 
-    Parameters
-    ----------
-    file
-        The log.
-    keep
-        Part of the messages that is wanted, by the name of their type.
-    window
-        Time of recording that is wanted; of latched topics everything is.
-    may_skip
-        True to skip chunks without wanted messages by the summary.
-    progress
-        Called with the bytes done.
+    ``keep`` tells the wanted part of a message by the name of its type; ``window`` the wanted time of recording, but of
+    latched topics everything is wanted. With ``may_skip`` chunks without wanted messages are skipped by the summary.
     """
 
     def __init__(
@@ -92,10 +82,14 @@ class Passage:
         self.part: str | None = None
         """Text of the wanted time, if not all is wanted."""
         self._limits_ns: tuple[int, int] | None = None
-        if window is not None and not window.is_all:
+        if window is not None and (window.start or window.end):
             beginning_ns = first_time_ns(file, self._summary)
             self._limits_ns, self.part = window.resolve(beginning_ns), window.describe(beginning_ns)
         self._described = Descriptions(file.path, keep)
+        self.topics = self._described.by_name
+        """All described topics by name."""
+        self.as_written = self._described.as_written
+        """Channel and schema of each topic."""
         self._walk = RecordWalk(file, self._summary.data_end_at if self._summary else None)
         self._last_ns: int | None = None
         self._open_losses: list[Loss] = []
@@ -104,15 +98,6 @@ class Passage:
         self._is_loose = False
         if self._summary:
             self._described.add_summary(self._summary)
-
-    @property
-    def topics(self) -> dict[str, Topic]:
-        """All described topics by name."""
-        return self._described.by_name
-
-    def as_written(self, topic: str) -> tuple[Channel, Schema]:
-        """Channel and schema of a topic."""
-        return self._described.as_written[topic]
 
     @property
     def counts(self) -> dict[str, int] | None:
@@ -125,11 +110,6 @@ class Passage:
             name = self._name(channel)
             found[name] = found.get(name, 0) + count
         return found
-
-    @property
-    def is_complete(self) -> bool:
-        """True when every message that can be read was counted."""
-        return not self.skipped and self._limits_ns is None
 
     def __iter__(self) -> Iterator[ChunkPart]:
         chunk: ChunkRecord | None = None
@@ -382,13 +362,7 @@ class Recording:
         return {subject: text for subject, text in texts.items() if text}
 
     def require_sound(self) -> None:
-        """Refuse a file that has holes.
-
-        Raises
-        ------
-        LogError
-            Naming the first hole, and what reads the rest.
-        """
+        """Refuse a file that has holes by a LogError, which names the first hole and what reads the rest."""
         if self.corrupt:
             more = f" (and {len(self.corrupt) - 1} more)" if len(self.corrupt) > 1 else ""
             advice = "copy it again, or read what is whole with --salvage"
@@ -433,7 +407,8 @@ def scan(
         for name, topic in sorted(passage.topics.items())
         if len(topic) or (topic.keep is Keep.NONE and (counts or {}).get(name))  # those of skipped chunks
     }
-    settle(passage.damage, topics, counts if passage.is_complete else None)
+    is_complete = not passage.skipped and passage.part is None  # every message that can be read was counted
+    settle(passage.damage, topics, counts if is_complete else None)
     if passage.part and not any(len(topic) and not topic.is_latched for topic in topics.values()):
         raise LogError(f"{path}: nothing was recorded from {passage.part}")
     return Recording(
@@ -458,19 +433,8 @@ def stream(
 ) -> Iterator[Topic]:
     """Messages piece by piece: each item holds some messages of one topic, in the order of the file.
 
-    A piece is given as soon as it has 1 MiB, so memory does not grow with the file.
-
-    Parameters
-    ----------
-    path, keep, window, progress
-        As of `scan`.
-    salvage
-        True to accept holes.
-
-    Raises
-    ------
-    LogError
-        As `scan`, and without ``salvage`` at the end when the file has holes: what was given before is whole.
+    A piece is given as soon as it has 1 MiB, so memory does not grow with the file. Parameters and errors are those of
+    `scan`; without ``salvage`` also a file with holes is a LogError, at the end: what was given before is whole.
     """
     with LogFile(path) as file:
         passage = Passage(file, keep, window, progress=progress)

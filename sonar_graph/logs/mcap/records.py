@@ -15,7 +15,6 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -133,13 +132,7 @@ class Hole:
 
 
 class LogFile:
-    """An MCAP file open for reading.
-
-    Raises
-    ------
-    LogError
-        When the file does not exist or is not MCAP.
-    """
+    """An MCAP file open for reading; a LogError where the file does not exist or is not MCAP."""
 
     def __init__(self, path: Path) -> None:
         if path.is_dir():
@@ -158,7 +151,7 @@ class LogFile:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stream.close()
 
     def read(self, at: int, count: int) -> bytes:
@@ -210,15 +203,7 @@ def _chunk(start: bytes, at: int) -> ChunkRecord | None:
 
 
 class RecordWalk:
-    """Walk through the data section of a file.
-
-    Parameters
-    ----------
-    file
-        The file.
-    data_end_at
-        End of the data section, if the summary states it and can be trusted.
-    """
+    """Walk through the data section of a file, up to ``data_end_at`` where a summary that can be trusted states it."""
 
     def __init__(self, file: LogFile, data_end_at: int | None) -> None:
         self._file = file
@@ -334,13 +319,7 @@ def seal(metadata: Mapping[str, str]) -> dict[str, str]:
 
 
 def open_seal(metadata: Mapping[str, str]) -> tuple[dict[str, str], bool]:
-    """Metadata without the checksum, and True where it had one.
-
-    Raises
-    ------
-    LogError
-        When the checksum does not fit.
-    """
+    """Metadata without the checksum, and True where it had one; a LogError where the checksum does not fit."""
     content = {key: value for key, value in metadata.items() if key != _SEAL}
     if _SEAL not in metadata:
         return content, False

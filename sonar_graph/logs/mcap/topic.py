@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -80,26 +81,18 @@ class Topic:
         return self.times[0]
 
     def definition(self) -> Struct:
-        """Type of the messages.
-
-        Raises
-        ------
-        LogError
-            Naming file, topic and what is wrong in the definition.
-        """
+        """Type of the messages; a LogError names file, topic and what is wrong in the definition."""
         try:
             return parse_definition(self.type_name, self.schema_text)
         except LogError as error:
             raise LogError(f"{self.file}: topic {self.name} ({self.type_name}): {error}") from error
 
-    def messages(self) -> list[Messages]:
-        """All sound messages, grouped by layout. The others are counted in `unsound` and removed from the topic.
+    def error(self, fault: str) -> LogError:
+        """Error about the messages, naming file and topic."""
+        return LogError(f"{self.file}: topic {self.name}: {fault}")
 
-        Raises
-        ------
-        LogError
-            Naming file, topic and what is wrong in the definition.
-        """
+    def messages(self) -> list[Messages]:
+        """All sound messages, grouped by layout. The others are counted in `unsound` and removed from the topic."""
         if not self._decoders:
             self._decoders.append(Decoder(self.definition()))
         for parts in self.stacks.values():
@@ -199,16 +192,8 @@ def settle(damage: Damage, topics: Mapping[str, Topic], counts: Mapping[str, int
     """Find the number of lost messages where the loss itself does not tell it.
 
     By the statistics: counted messages less those read and those in losses of known number. Otherwise by the rate of
-    each topic: the time between the messages on both sides of the loss over the median interval before it.
-
-    Parameters
-    ----------
-    damage
-        Damage of a file; its losses are completed.
-    topics
-        Topics as read.
-    counts
-        Number of messages of each topic by the file's own statistics; None: not known.
+    each topic: the time between the messages on both sides of the loss over the median interval before it. ``counts``
+    are the messages of each topic by the file's statistics; None: not known.
     """
     missing: dict[str, int] | None = None
     if counts is not None:
@@ -269,48 +254,42 @@ class Descriptions:
             self._add_channel(channel, is_covered=summary.has_crc)
 
     def add(self, opcode: int, content: bytes, *, is_covered: bool) -> None:
-        """Add a record; ``is_covered``: a CRC fits it.
-
-        Raises
-        ------
-        LogError
-            When the content is not a record of this kind.
-        """
+        """Add a record; ``is_covered``: a CRC fits it. Content that is no record of this kind is a LogError."""
         if opcode == Opcode.SCHEMA:
             self._add_schema(parse(Schema.read, content), is_covered=is_covered)
         elif opcode == Opcode.CHANNEL:
             self._add_channel(parse(Channel.read, content), is_covered=is_covered)
 
     def _add_schema(self, schema: Schema, *, is_covered: bool) -> None:
-        known, was_covered = self._schemas.get(schema.id, (None, False))
-        if known is None or (known != schema and is_covered and not was_covered):
-            self._schemas[schema.id] = schema, is_covered
-        if known is not None and known != schema:
-            self._disagree(f"schema {schema.id} ({known.name})", is_covered=is_covered or was_covered)
+        self._holds(self._schemas, schema, f"schema {schema.id}", "name", is_covered=is_covered)
 
     def _add_channel(self, channel: Channel, *, is_covered: bool) -> None:
-        known, was_covered = self._channels.get(channel.id, (None, False))
-        if known is None or (known != channel and is_covered and not was_covered):
-            self._channels[channel.id] = channel, is_covered
-            schema, _ = self._schemas.get(channel.schema_id, (_NO_SCHEMA, True))
-            offered = channel.metadata.get("offered_qos_profiles", "")
-            topic = Topic(
-                file=self._path,
-                name=channel.topic,
-                type_name=schema.name,
-                encoding=channel.message_encoding,
-                schema_encoding=schema.encoding,
-                schema_text=schema.data.decode("utf-8", "replace"),
-                keep=self._keep(schema.name),
-                is_latched=channel.topic.endswith("_static") or bool(_TRANSIENT_LOCAL.search(offered)),
-            )
-            self.as_written.setdefault(channel.topic, (channel, schema))
-            self.by_channel[channel.id] = self.by_name.setdefault(channel.topic, topic)
-        if known is not None and known != channel:
-            self._disagree(f"channel {channel.id} ({known.topic})", is_covered=is_covered or was_covered)
+        if not self._holds(self._channels, channel, f"channel {channel.id}", "topic", is_covered=is_covered):
+            return
+        schema, _ = self._schemas.get(channel.schema_id, (_NO_SCHEMA, True))
+        offered = channel.metadata.get("offered_qos_profiles", "")
+        topic = Topic(
+            file=self._path,
+            name=channel.topic,
+            type_name=schema.name,
+            encoding=channel.message_encoding,
+            schema_encoding=schema.encoding,
+            schema_text=schema.data.decode("utf-8", "replace"),
+            keep=self._keep(schema.name),
+            is_latched=channel.topic.endswith("_static") or bool(_TRANSIENT_LOCAL.search(offered)),
+        )
+        self.as_written.setdefault(channel.topic, (channel, schema))
+        self.by_channel[channel.id] = self.by_name.setdefault(channel.topic, topic)
 
-    def _disagree(self, what: str, *, is_covered: bool) -> None:
-        held = "the one under a CRC holds" if is_covered else "the first holds"
-        remark = f"{what} is described in two ways; {held}"
-        if remark not in self.remarks:
-            self.remarks.append(remark)
+    def _holds(self, known: dict[int, tuple[Any, bool]], new: Any, what: str, name: str, *, is_covered: bool) -> bool:
+        """Keep a description that is the first of its number, or the first under a CRC; tells whether it is kept."""
+        old, was_covered = known.get(new.id, (None, False))
+        holds = old is None or (old != new and is_covered and not was_covered)
+        if holds:
+            known[new.id] = new, is_covered
+        if old is not None and old != new:
+            which = "the one under a CRC holds" if is_covered or was_covered else "the first holds"
+            remark = f"{what} ({getattr(old, name)}) is described in two ways; {which}"
+            if remark not in self.remarks:
+                self.remarks.append(remark)
+        return holds

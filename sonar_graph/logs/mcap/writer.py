@@ -74,12 +74,8 @@ def write_recording(
 ) -> None:
     """Write an MCAP file of profile ``ros2``; an existing file is replaced only when the new one is complete.
 
-    Messages appear in the order of their log times; those of one instant in the order of the list.
-
-    Raises
-    ------
-    LogError
-        When the file cannot be written.
+    Messages appear in the order of their log times; those of one instant in the order of the list. A file that cannot
+    be written is a LogError.
     """
     with recording(path, metadata) as out:
         if any(entry.is_latched for entry in messages):
@@ -92,21 +88,10 @@ def write_recording(
 
 @contextmanager
 def recording(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> Iterator[RecordingWriter]:
-    """Recording that is written piece by piece, for messages that do not fit into memory.
+    """Recording that is written piece by piece, for messages that do not fit into memory; metadata come first.
 
     An existing file is replaced when the context ends without an error; until then, the pieces go to a file beside it.
-
-    Parameters
-    ----------
-    path
-        The MCAP file.
-    metadata
-        Metadata records by name, written first.
-
-    Raises
-    ------
-    LogError
-        When the file cannot be written.
+    A file that cannot be written is a LogError.
     """
     with written_whole(path) as stream:
         out = RecordingWriter(stream)
