@@ -22,7 +22,17 @@ from typing import Any
 from pydantic import ValidationError
 
 from sonar_graph.batch.recorded import ALL_LOGS
-from sonar_graph.batch.sources import FILE, FILES, GENERATORS, KINDS, LOG, Stamp, files_below, fingerprint, stamp_of
+from sonar_graph.batch.sources import (
+    FILE,
+    FILES,
+    GENERATORS,
+    KINDS,
+    LOG,
+    content_hash,
+    files_below,
+    fingerprint,
+    stamp_of,
+)
 from sonar_graph.batch.store import PlannedRun
 from sonar_graph.batch.suite import LogEntry, Place, SuiteFile
 from sonar_graph.calibration import Section
@@ -308,18 +318,4 @@ def source_hash_now(package: str) -> str:
     ]
     if not folders and spec.origin is not None and (module := Path(spec.origin)).is_file():
         files = [(module.name, spec.origin, stamp_of(module))]
-    return content_hash(tuple(sorted(files))) if files else ""
-
-
-@lru_cache(maxsize=8)
-def content_hash(files: tuple[tuple[str, str, Stamp], ...]) -> str:
-    """SHA-256, cut to `DIGITS`, over files given by name, path and stamp.
-
-    The lengths of names and contents are hashed too, so that no two sets of files give the same bytes.
-    """
-    digest = hashlib.sha256()
-    for name, path, _ in files:
-        content = Path(path).read_bytes()
-        digest.update(f"{len(name.encode())} {name} {len(content)} ".encode())
-        digest.update(content)
-    return digest.hexdigest()[:DIGITS]
+    return content_hash(tuple(sorted(files)))[:DIGITS] if files else ""

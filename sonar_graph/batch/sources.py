@@ -135,15 +135,19 @@ def fingerprint(kind: str, options: dict[str, Any]) -> dict[str, Any]:
 def _hash(path: Path) -> str:
     """SHA-256 of a file, or of all names and files below a folder; read again only if stamps changed."""
     files = sorted(Path(entry.path) for entry in files_below(str(path))) if path.is_dir() else [path]
-    return _digest(path, tuple((file, stamp_of(file)) for file in files))
+    return content_hash(tuple((file.relative_to(path).as_posix(), str(file), stamp_of(file)) for file in files))
 
 
 @lru_cache
-def _digest(path: Path, files: tuple[tuple[Path, Stamp], ...]) -> str:
+def content_hash(files: tuple[tuple[str, str, Stamp], ...]) -> str:
+    """SHA-256 over names and contents of files, given by name, path and stamp.
+
+    The lengths of both are hashed too, so that no two sets of files give the same bytes.
+    """
     digest = hashlib.sha256()
-    for file, _ in files:
-        name = file.relative_to(path).as_posix().encode()
-        digest.update(f"{len(name)} {file.stat().st_size} ".encode() + name)
+    for name, path, _ in files:
+        file = Path(path)
+        digest.update(f"{len(name.encode())} {file.stat().st_size} {name}".encode())
         with file.open("rb") as content:
             while block := content.read(_BLOCK_BYTES):
                 digest.update(block)

@@ -29,81 +29,63 @@ DEAD_RECKONING = """
 name = "dead-reckoning"
 """
 
-MISBEHAVING = """
-import os, signal, time
-from pathlib import Path
-from baselines.dead_reckoning import DeadReckoning
+
+FORK = "if os.fork() == 0: time.sleep(1000)"
+EAT = "self.eaten = bytearray(os.urandom(1)) * 700_000_000"
+DIE = "os.kill(os.getpid(), signal.SIGKILL)"
+MISBEHAVING = {
+    "sleeps": ["time.sleep(1000)"],
+    "prints": ["os.write(1, b'written by native code')", "raise RuntimeError('diverged')"],
+    "hungry": [EAT, "time.sleep(1000)"],
+    "forks": [FORK, "time.sleep(1000)"],
+    "dies-after-forking": [FORK, DIE],
+    "hungry-child": ["if os.fork() == 0:", f"    {EAT}", "time.sleep(1000)"],
+    "dies": [DIE],
+    "dies-once": [
+        "mark = Path(os.environ['SONAR_GRAPH_TEST_MARK'])",
+        *("if not mark.exists():", "    mark.touch()", f"    {DIE}"),
+        "return super().process(measurements)",
+    ],
+    "sums-over-a-set": ["raise RuntimeError('-'.join({f'mine {number}' for number in range(20)}))"],
+}
+"""What an estimator does when it gets measurements, by its name."""
 
 
-class Sleeps(DeadReckoning):
-    def process(self, measurements):
-        time.sleep(1000)
+@pytest.fixture
+def misbehaving(tmp_path, monkeypatch):
+    """Estimators that fail in ways that cannot be caught, found here and in other processes."""
+    folder = tmp_path / "site"
+    about = folder / "misbehaving-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: misbehaving\nVersion: 1.0\n")
+    points, code = ["[sonar_graph.estimators]", "broken = not_there:Broken"], ["import os, signal, time"]
+    code += ["from pathlib import Path", "from baselines.dead_reckoning import DeadReckoning"]
+    for name, lines in MISBEHAVING.items():
+        class_name = name.title().replace("-", "")
+        points.append(f"{name} = misbehaving:{class_name}")
+        code += [f"class {class_name}(DeadReckoning):", "    def process(self, measurements):"]
+        code += [f"        {line}" for line in lines]
+    (about / "entry_points.txt").write_text("\n".join([*points, ""]))
+    (folder / "misbehaving.py").write_text("\n".join([*code, ""]))
+    monkeypatch.delitem(sys.modules, "misbehaving", raising=False)  # the one of an earlier test's folder
+    source_hash.cache_clear()
+    versions_of.cache_clear()
+    monkeypatch.syspath_prepend(folder)
+    path = os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])
+    monkeypatch.setenv("PYTHONPATH", path.rstrip(os.pathsep))
+    monkeypatch.setenv("SONAR_GRAPH_TEST_MARK", str(tmp_path / "died"))
 
 
-class Prints(DeadReckoning):
-    def process(self, measurements):
-        os.write(1, b"written by native code")
-        raise RuntimeError("diverged")
+@pytest.fixture
+def planned(write_suite) -> Callable[..., PlannedRun]:
+    """The one run of a suite with a named estimator."""
 
+    def plan(name: str = "dead-reckoning") -> PlannedRun:
+        suite = write_suite(HEADER.replace("dead-reckoning", name), BASIN, f'[[estimators]]\nname = "{name}"\n')
+        (run,) = plan_runs(read_suite(suite))
+        return run
 
-class Hungry(DeadReckoning):
-    def process(self, measurements):
-        self.eaten = bytearray(os.urandom(1)) * 700_000_000
-        time.sleep(1000)
-
-
-class Forks(DeadReckoning):
-    def process(self, measurements):
-        if os.fork() == 0:
-            time.sleep(1000)
-        time.sleep(1000)
-
-
-class DiesAfterForking(DeadReckoning):
-    def process(self, measurements):
-        if os.fork() == 0:
-            time.sleep(1000)
-        os.kill(os.getpid(), signal.SIGKILL)
-
-
-class HungryChild(DeadReckoning):
-    def process(self, measurements):
-        if os.fork() == 0:
-            self.eaten = bytearray(os.urandom(1)) * 700_000_000
-            time.sleep(1000)
-        time.sleep(1000)
-
-
-class SumsOverASet(DeadReckoning):
-    def process(self, measurements):
-        raise RuntimeError("-".join({f"mine {number}" for number in range(20)}))
-
-
-class Dies(DeadReckoning):
-    def process(self, measurements):
-        os.kill(os.getpid(), signal.SIGKILL)
-
-
-class DiesOnce(DeadReckoning):
-    def process(self, measurements):
-        mark = Path(os.environ["SONAR_GRAPH_TEST_MARK"])
-        if not mark.exists():
-            mark.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return super().process(measurements)
-"""
-ENTRY_POINTS = """[sonar_graph.estimators]
-sleeps = misbehaving:Sleeps
-prints = misbehaving:Prints
-hungry = misbehaving:Hungry
-forks = misbehaving:Forks
-dies-after-forking = misbehaving:DiesAfterForking
-hungry-child = misbehaving:HungryChild
-dies = misbehaving:Dies
-sums-over-a-set = misbehaving:SumsOverASet
-dies-once = misbehaving:DiesOnce
-broken = not_there:Broken
-"""
+    return plan
 
 
 @pytest.fixture
@@ -116,37 +98,3 @@ def write_suite(tmp_path) -> WriteSuite:
         return path
 
     return write
-
-
-@pytest.fixture
-def misbehaving(tmp_path, monkeypatch):
-    """Estimators that fail in ways that cannot be caught, found here and in other processes."""
-    folder = tmp_path / "site"
-    (folder / "misbehaving-1.0.dist-info").mkdir(parents=True)
-    (folder / "misbehaving-1.0.dist-info" / "METADATA").write_text(
-        "Metadata-Version: 2.1\nName: misbehaving\nVersion: 1.0\n"
-    )
-    (folder / "misbehaving-1.0.dist-info" / "entry_points.txt").write_text(ENTRY_POINTS)
-    (folder / "misbehaving.py").write_text(MISBEHAVING)
-    monkeypatch.delitem(sys.modules, "misbehaving", raising=False)  # the one of an earlier test's folder
-    source_hash.cache_clear()
-    versions_of.cache_clear()
-    monkeypatch.syspath_prepend(folder)
-    monkeypatch.setenv(
-        "PYTHONPATH", os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
-    )
-    monkeypatch.setenv("SONAR_GRAPH_TEST_MARK", str(tmp_path / "died"))
-
-
-@pytest.fixture
-def planned(write_suite) -> Callable[..., PlannedRun]:
-    """The one run of a suite with a named estimator."""
-
-    def plan(estimator: str = "dead-reckoning") -> PlannedRun:
-        suite = write_suite(
-            HEADER.replace("dead-reckoning", estimator), BASIN, f'[[estimators]]\nname = "{estimator}"\n'
-        )
-        (run,) = plan_runs(read_suite(suite))
-        return run
-
-    return plan

@@ -131,11 +131,54 @@ def test_full_disk_is_told_and_loses_no_run_that_is_done(suite, tmp_path, in_thi
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
 
 
-def test_mistake_in_a_suite_leaves_the_folder_alone(write_suite, tmp_path):
-    suite = write_suite(HEADER, BASIN, '[[estimators]]\nname = "no such"\n')
-    with pytest.raises(BatchError), Batch.opened(read_suite(suite), tmp_path / "out"):
+def test_what_a_killed_batch_did_is_read_with_what_it_did_not_do(suite, tmp_path, in_this_process, monkeypatch):
+    folder = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        kill(suite, folder, 0, patch)
+        assert is_batch(folder)
+        with pytest.raises(EvaluationError, match=r"before any of its runs was done; give the bench command .* again"):
+            read_batch(folder)
+        kill(suite, folder, 3, patch)
+    batch = read_batch(folder)
+    assert [(run.seed, run.status) for run in batch.runs] == [(0, "ok"), (1, "ok"), (2, "ok")]
+    assert [(run.seed, run.status) for run in batch.missing] == [(3, "not run")]
+    finished(suite, folder)
+    whole = read_batch(folder)
+    assert not whole.missing
+    assert whole.runs[:3] == batch.runs
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix in (".toml", ".parquet")}
+
+
+def test_a_changed_suite_goes_on_in_the_folder_once_a_run_is_done_and_another_suite_is_refused(
+    suite, tmp_path, in_this_process, monkeypatch
+):
+    folder, text = tmp_path / "out", suite.read_text()
+    suite.write_text(text + '[[estimators]]\nname = "no such"\n')
+    with pytest.raises(BatchError), Batch.opened(read_suite(suite), folder):
         pass
-    assert not (tmp_path / "out").exists()
+    assert not folder.exists(), "a suite with a mistake makes no folder"
+    suite.write_text(text)
+    before = finished(suite, folder)
+    suite.write_text(text := text.replace("seeds = 4", "seeds = 5"))
+    with Batch.opened(read_suite(suite), folder) as batch:
+        assert len(batch.rows()) == 4
+        batch.run(HERE, LIMITS, nobody)
+    assert table(folder)[:4] == before
+    assert "seeds = 5" in (folder / "suite.toml").read_text()
+    kept = contents(folder)
+    suite.write_text(text.replace("short", "other"))
+    told = r"holds the batch of suite 'short', and .* is suite 'other'; choose another"
+    with pytest.raises(BatchError, match=told), Batch.opened(read_suite(suite), folder):
+        pass
+    suite.write_text(text.replace("duration_s = 120", "duration_s = 125"))
+    kill(suite, folder, 0, monkeypatch)
+    assert contents(folder) == kept
+    kill(suite, folder, 1, monkeypatch)
+    assert "duration_s = 125" in (folder / "suite.toml").read_text()
+    assert [row["status"] for row in table(folder)] == ["ok", *["not run"] * 4]
 
 
 def test_failed_runs_are_kept_until_they_are_discarded(suite, tmp_path, in_this_process):
@@ -179,59 +222,6 @@ def kill(suite: Path, folder: Path, count: int, monkeypatch: pytest.MonkeyPatch)
         batch.run(HERE, LIMITS, nobody)
 
 
-def test_what_a_killed_batch_did_is_read_with_what_it_did_not_do(suite, tmp_path, monkeypatch):
-    folder = tmp_path / "out"
-    kill(suite, folder, 3, monkeypatch)
-    batch = read_batch(folder)
-    assert [(run.seed, run.status) for run in batch.runs] == [(0, "ok"), (1, "ok"), (2, "ok")]
-    assert [(run.seed, run.status) for run in batch.missing] == [(3, "not run")]
-    monkeypatch.setattr(cluster, "run_batch", do_here)
-    finished(suite, folder)
-    whole = read_batch(folder)
-    assert not whole.missing
-    assert whole.runs[:3] == batch.runs
-
-
-def test_batch_killed_before_any_run_is_done_says_what_to_do(suite, tmp_path, monkeypatch):
-    kill(suite, tmp_path / "out", 0, monkeypatch)
-    assert is_batch(tmp_path / "out")
-    with pytest.raises(EvaluationError, match=r"before any of its runs was done; give the bench command .* again"):
-        read_batch(tmp_path / "out")
-
-
-def test_suite_with_more_seeds_goes_on_in_the_folder_and_another_suite_is_refused(suite, tmp_path, in_this_process):
-    folder = tmp_path / "out"
-    before = finished(suite, folder)
-    suite.write_text(suite.read_text().replace("seeds = 4", "seeds = 5"))
-    with Batch.opened(read_suite(suite), folder) as batch:
-        assert len(batch.rows()) == 4
-        batch.run(HERE, LIMITS, nobody)
-    assert table(folder)[:4] == before
-    assert "seeds = 5" in (folder / "suite.toml").read_text()
-    kept = contents(folder)
-    suite.write_text(suite.read_text().replace("short", "other"))
-    told = r"holds the batch of suite 'short', and .* is suite 'other'; choose another"
-    with pytest.raises(BatchError, match=told), Batch.opened(read_suite(suite), folder):
-        pass
-    assert contents(folder) == kept
-
-
-def test_nothing_in_the_folder_is_replaced_before_a_run_is_done(suite, tmp_path, in_this_process, monkeypatch):
-    folder = tmp_path / "out"
-    finished(suite, folder)
-    kept = contents(folder)
-    suite.write_text(suite.read_text().replace("duration_s = 120", "duration_s = 125"))
-    kill(suite, folder, 0, monkeypatch)
-    assert contents(folder) == kept
-    kill(suite, folder, 1, monkeypatch)
-    assert "duration_s = 125" in (folder / "suite.toml").read_text()
-    assert [row["status"] for row in table(folder)] == ["ok", "not run", "not run", "not run"]
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix in (".toml", ".parquet")}
-
-
 def test_timeout_that_is_given_goes_before_the_one_of_the_suite(write_suite):
     file = read_suite(write_suite(HEADER, "timeout_s = 7\nmemory_mb = 900\n", BASIN, DEAD_RECKONING))
     assert limits_of(file, None) == Limits(7.0, 900.0)
@@ -267,7 +257,7 @@ def test_interrupt_or_termination_within_the_block_is_told_at_its_end(handler, n
     assert steps == ["went on"]
 
 
-def test_interrupt_of_a_block_that_fails_outlives_its_error(handler):
+def test_an_error_of_the_block_is_not_hidden_and_an_interrupt_outlives_it(handler):
     def failing_block() -> None:
         with contextlib.suppress(OSError), deferred_interrupt():
             os.kill(os.getpid(), signal.SIGINT)
@@ -275,15 +265,20 @@ def test_interrupt_of_a_block_that_fails_outlives_its_error(handler):
 
     with pytest.raises(KeyboardInterrupt):
         failing_block()
+    with pytest.raises(OSError, match="full"), deferred_interrupt():
+        raise OSError("full")
 
 
 @pytest.mark.parametrize("handler", [signal.default_int_handler, signal.SIG_IGN], indirect=True)
-def test_termination_counts_like_an_interrupt_also_where_shells_let_it_be_ignored(handler):
+def test_termination_counts_like_an_interrupt_and_an_interrupt_that_shells_let_be_ignored_stays_so(handler):
     with pytest.raises(KeyboardInterrupt), terminations_as_interrupts():
         os.kill(os.getpid(), signal.SIGTERM)
+    if handler is signal.SIG_IGN:
+        with deferred_interrupt():
+            os.kill(os.getpid(), signal.SIGINT)
 
 
-def test_block_without_interrupt_and_in_another_thread_is_as_without(handler):
+def test_block_in_another_thread_is_as_without(handler):
     done = []
 
     def block() -> None:
@@ -293,17 +288,4 @@ def test_block_without_interrupt_and_in_another_thread_is_as_without(handler):
     thread = threading.Thread(target=block)
     thread.start()
     thread.join()
-    with deferred_interrupt():
-        done.append(True)
-    assert done == [True, True]
-
-
-def test_error_within_the_block_is_not_hidden(handler):
-    with pytest.raises(OSError, match="full"), deferred_interrupt():
-        raise OSError("full")
-
-
-@pytest.mark.parametrize("handler", [signal.SIG_IGN], indirect=True)
-def test_interrupt_that_is_ignored_stays_so(handler):
-    with deferred_interrupt():
-        os.kill(os.getpid(), signal.SIGINT)
+    assert done == [True]

@@ -14,20 +14,27 @@ from sonar_graph.batch.permutation import ALL_SIGNS, DRAWN, Family, Group, clipp
 from sonar_graph.batch.recorded import ALL_LOGS
 
 
-def family(beyond: np.ndarray) -> Family:
-    return Family([(f"log {n}", "isam2", "error") for n in range(beyond.shape[1])], beyond, 1.0)
+def family(beyond: np.ndarray, share: float = 1.0) -> Family:
+    return Family([(f"log {n}", "isam2", "error") for n in range(beyond.shape[1])], beyond, share)
 
 
-def test_one_group_of_three_normal_ratios_has_the_p_value_of_the_t_test():
-    beyond = np.array([[0.3], [0.1], [0.5]])
-    expected = stats.ttest_1samp(beyond[:, 0], 0.0, alternative="greater").pvalue
-    assert family(beyond).p_values[0] == pytest.approx(expected, abs=3 * math.sqrt(expected / 2000))
-
-
-def test_one_group_of_five_has_the_share_of_sign_changes_with_a_larger_mean():
+def test_one_group_has_the_p_value_of_the_t_test_or_the_share_of_sign_changes_with_a_larger_mean():
+    beyond = np.array([0.3, 0.1, 0.5])
+    expected = stats.ttest_1samp(beyond, 0.0, alternative="greater").pvalue
+    assert family(beyond[:, None]).p_values[0] == pytest.approx(expected, abs=3 * math.sqrt(expected / 2000))
     beyond = np.array([0.5, 0.4, -0.3, 0.35, 0.25])
     means = [np.mean(np.array(signs) * beyond) for signs in itertools.product([1, -1], repeat=5)]
     assert family(beyond[:, None]).p_values[0] == np.mean(np.array(means) >= beyond.mean() - 1e-12)
+
+
+def test_p_values_are_of_all_changes_or_those_that_are_drawn_shared_by_families_and_not_above_one():
+    up = np.linspace(1.0, 2.0, ALL_SIGNS + 1)[:, None]
+    assert family(up[:-1]).p_values[0] == 2.0**-10
+    many = np.linspace(1.0, 2.0, 30)[:, None]
+    assert family(many).p_values[0] == 1 / (DRAWN + 1) == 1 / 2000
+    beyond = np.array([[0.3], [0.1], [0.5], [0.2], [0.3], [0.35]])
+    assert family(beyond, 0.5).p_values[0] == 2 * family(beyond).p_values[0]
+    assert family(-beyond, 0.25).p_values.tolist() == [1.0]
 
 
 def test_groups_that_go_together_cost_no_correction_and_others_do():
@@ -36,12 +43,6 @@ def test_groups_that_go_together_cost_no_correction_and_others_do():
     alone = family(own).p_values[0]
     assert family(np.repeat(own, 30, axis=1)).p_values[0] == alone
     assert family(np.hstack([own, rng.normal(0, 0.4, (8, 60))])).p_values[0] > 5 * alone
-
-
-def test_families_share_the_five_per_cent():
-    beyond = np.array([[0.3], [0.1], [0.5], [0.2], [0.3], [0.35]])
-    half = Family(family(beyond).groups, beyond, 0.5)
-    assert half.p_values[0] == 2 * family(beyond).p_values[0]
 
 
 def test_a_lost_run_counts_as_one_bad_run():
@@ -60,12 +61,16 @@ def test_all_logs_have_one_ratio_a_seed_and_logs_without_seeds_are_cases():
     assert tested.groups == [(ALL_LOGS, "isam2", "error")]
 
 
-def test_a_family_by_signs_and_one_by_rotations_share_what_there_is():
-    many = {("a", "isam2", "error"): dict.fromkeys(range(6), 0.1)}
-    few = {("a", "ekf-slam", "error"): dict.fromkeys(range(4), 0.1), ("a", "other", "error"): {0: 1.0, 1: 1.0}}
-    found = families(many | few)
-    assert [(one.cases, one.share) for one in found] == [(6, 0.5), (4, 0.5)]
-    assert ("a", "other", "error") not in [group for one in found for group in one.groups]
+def test_families_by_signs_and_by_rotations_of_the_same_cases_share_what_there_is():
+    def of(name: str, *cases: int) -> dict[Group, dict[int, float]]:
+        return {("a", name, "error"): dict.fromkeys(cases, 0.1)}
+
+    tested = families(of("isam2", *range(6)) | of("ekf-slam", *range(4)) | of("other", 0, 1))
+    assert [(one.cases, one.share) for one in tested] == [(6, 0.5), (4, 0.5)]
+    assert ("a", "other", "error") not in [group for one in tested for group in one.groups]
+    tested = families(of("isam2", 0, 1, 2) | of("other", 0, 1, 2) | of("ekf-slam", 2, 3, 4))
+    assert [(len(one.groups), one.cases, one.share) for one in tested] == [(2, 3, 0.5), (1, 3, 0.5)]
+    assert not any(np.isnan(one.beyond).any() for one in tested)
 
 
 def drawn(rng: np.random.Generator, seeds: int, *, lost: float, worse: float = 0.0):
@@ -109,25 +114,6 @@ def test_the_statistic_is_students_with_a_variance_that_like_groups_support():
     assert Family(groups, beyond, 1.0).statistics[0] == pytest.approx(math.sqrt(6) * mean / np.sqrt(spread))
 
 
-def test_the_least_p_value_is_one_of_all_changes_of_sign_and_of_those_that_are_drawn():
-    up = np.linspace(1.0, 2.0, ALL_SIGNS + 1)[:, None]
-    assert family(up[:-1]).p_values[0] == 2.0**-10
-    many = np.linspace(1.0, 2.0, 30)[:, None]
-    assert family(many).p_values[0] == 1 / (DRAWN + 1) == 1 / 2000
-
-
-def test_no_p_value_is_above_one():
-    down = np.array([[-0.3], [-0.1], [-0.5], [-0.2], [-0.3], [-0.35]])
-    assert Family(family(down).groups, down, 0.25).p_values.tolist() == [1.0]
-
-
-def test_groups_of_three_cases_are_rotated_with_those_that_have_the_same():
-    alike = {("a", name, "error"): dict.fromkeys((0, 1, 2), 0.1) for name in ("isam2", "other")}
-    found = families(alike | {("a", "ekf-slam", "error"): dict.fromkeys((2, 3, 4), 0.1)})
-    assert [(len(one.groups), one.cases, one.share) for one in found] == [(2, 3, 0.5), (1, 3, 0.5)]
-    assert not any(np.isnan(one.beyond).any() for one in found)
-
-
 def noise(scatter: float, seed: int, cases: int = 8) -> np.ndarray:
     return np.random.default_rng(seed).normal(0, scatter, cases)
 
@@ -139,34 +125,23 @@ def found(groups: dict[Group, np.ndarray], *columns: str, limit: float = 0.0, sh
 ALONE = {("a", "isam2", "error"): noise(0.1, 0)}
 
 
-def test_a_worsening_must_be_larger_beside_others_that_scatter():
+def test_a_worsening_must_be_larger_beside_what_scatters_shares_or_is_allowed():
+    alone = found(ALONE, "error")["isam2"]
     others = {(f"{n}", f"other {n}", "error"): noise(0.5, n + 1) for n in range(40)}
-    assert found(ALONE | others, "error")["isam2"] > found(ALONE, "error")["isam2"]
+    assert found(ALONE | others, "error")["isam2"] > alone
+    assert found(ALONE, "error", share=0.2)["isam2"] > alone
+    assert found(ALONE, "error", limit=math.log(1.5))["isam2"] > 0.5 > alone
 
 
-def test_a_worsening_must_be_larger_where_families_share_the_five_per_cent():
-    assert found(ALONE, "error", share=0.2)["isam2"] > found(ALONE, "error")["isam2"]
-
-
-def test_what_is_allowed_comes_on_top():
-    assert found(ALONE, "error", limit=math.log(1.5))["isam2"] > 0.5 > found(ALONE, "error")["isam2"]
-
-
-def test_a_contestant_is_told_of_its_errors_alone():
+def test_a_contestant_is_told_of_its_errors_alone_of_median_scatter_and_over_all_logs():
     assert found(ALONE, "other") == {}
-
-
-def test_the_error_of_the_median_scatter_stands_for_all():
     scatters = {"small": 0.01, "middle": 0.2, "large": 1.5}
     groups = {("a", "isam2", column): noise(scatter, 3) for column, scatter in scatters.items()}
     assert found(groups, *scatters) == found(groups, "middle")
     assert found(groups, "small")["isam2"] < found(groups, "middle")["isam2"] < found(groups, "large")["isam2"]
-
-
-def test_over_several_logs_a_contestant_is_told_of_all_together():
-    groups = {(log, "isam2", "error"): noise(1.0, n) for n, log in enumerate("abc")}
+    logs = {(log, "isam2", "error"): noise(1.0, n) for n, log in enumerate("abc")}
     together = {(ALL_LOGS, "isam2", "error"): noise(0.02, 5)}
-    assert found(groups | together, "error")["isam2"] < 0.3 < found(groups, "error")["isam2"]
+    assert found(logs | together, "error")["isam2"] < 0.3 < found(logs, "error")["isam2"]
 
 
 @pytest.mark.parametrize("scatter", [0.05, 0.2])

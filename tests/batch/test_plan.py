@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from sonar_graph.batch import plan
 from sonar_graph.batch.plan import plan_runs, source_hash, source_hash_now, versions_of
 from sonar_graph.batch.sources import LOG, fingerprint
 from sonar_graph.batch.store import PlannedRun
@@ -50,36 +49,23 @@ def test_every_combination_is_planned_once_in_order(write_suite):
     assert runs[-1].params["smoother"]["lag_s"] == 15
 
 
-@pytest.mark.parametrize(
-    "parts",
-    [
-        (HEADER_OF_ISAM2, BASIN.replace("120", "121"), ISAM2),
-        (HEADER_OF_ISAM2, BASIN, "seeds = [1]\n", ISAM2),
-        (HEADER_OF_ISAM2, BASIN, ISAM2, "params = { smoother.lag_s = 14 }\n"),
-        (HEADER_OF_ISAM2, "rate_hz = 1\n", BASIN, ISAM2),
-        (HEADER, BASIN, DEAD_RECKONING),
-    ],
-)
-def test_key_changes_with_all_that_decides_the_numbers(write_suite, parts):
-    assert key(write_suite, *parts) != key(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2)
+PARK = '[[logs]]\nname = "park"\ndataset = "victoria-park"\n'
+OTHERS = {
+    "another simulation": (HEADER_OF_ISAM2, BASIN.replace("120", "121"), ISAM2),
+    "another seed": (HEADER_OF_ISAM2, BASIN, "seeds = [1]\n", ISAM2),
+    "another setting": (HEADER_OF_ISAM2, BASIN, ISAM2, "params = { smoother.lag_s = 14 }\n"),
+    "another rate": (HEADER_OF_ISAM2, "rate_hz = 1\n", BASIN, ISAM2),
+    "another estimator": (HEADER, BASIN, DEAD_RECKONING),
+    "a log": (HEADER, PARK, DEAD_RECKONING),
+    "landmarks": (HEADER, PARK, "landmarks = {}\n", DEAD_RECKONING),
+    "other landmarks": (HEADER, PARK, "landmarks = { frame_rate_hz = 3 }\n", DEAD_RECKONING),
+}
 
 
-def test_key_changes_with_the_version(write_suite, monkeypatch):
-    before = key(write_suite)
-    monkeypatch.setattr(plan, "versions_of", lambda _name: {"sonar_graph": "another"})
-    assert key(write_suite) != before
-
-
-def test_key_changes_with_landmarks_on_a_log(write_suite):
-    log = '[[logs]]\nname = "park"\ndataset = "victoria-park"\n'
-    placed = [
-        key(write_suite, HEADER, log, f"landmarks = {{ {text} }}\n", DEAD_RECKONING)
-        for text in ("", "frame_rate_hz = 3")
-    ]
-    assert len({key(write_suite, HEADER, log, DEAD_RECKONING), *placed}) == 3
-
-
-def test_key_does_not_change_with_names_or_with_defaults_written_out(write_suite):
+def test_key_changes_with_all_that_decides_the_numbers_and_not_with_names_or_defaults(write_suite):
+    (run,) = planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2)
+    assert run.content == fingerprint(run.kind, run.options)
+    assert len({run.key, *(key(write_suite, *parts) for parts in OTHERS.values())}) == 1 + len(OTHERS)
     same = key(
         write_suite,
         HEADER_OF_ISAM2.replace("short", "another") + "timeout_s = 9\n",
@@ -88,7 +74,25 @@ def test_key_does_not_change_with_names_or_with_defaults_written_out(write_suite
         ISAM2,
         "params = { smoother.lag_s = 15.0 }\n",
     )
-    assert same == key(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2)
+    assert same == run.key
+
+
+def test_key_changes_with_the_class_behind_the_name_and_with_the_version_of_python(
+    write_suite, misbehaving, tmp_path, monkeypatch
+):
+    def anew() -> str:
+        versions_of.cache_clear()
+        return key(write_suite, HEADER.replace("dead-reckoning", "dies"), BASIN, '[[estimators]]\nname = "dies"\n')
+
+    keys = [anew()]
+    points = tmp_path / "site" / "misbehaving-1.0.dist-info" / "entry_points.txt"
+    points.write_text(points.read_text().replace("misbehaving:Dies\n", "misbehaving:Prints\n"))
+    keys.append(anew())
+    with monkeypatch.context() as patch:
+        patch.setattr("platform.python_version", lambda: "3.99.0")
+        keys.append(anew())
+    versions_of.cache_clear()
+    assert len(set(keys)) == 3
 
 
 def test_of_a_log_the_content_counts_and_not_the_place(tmp_path):
@@ -97,44 +101,26 @@ def test_of_a_log_the_content_counts_and_not_the_place(tmp_path):
     for path, content in zip(paths, (b"log", b"log", b"lob"), strict=True):
         path.write_bytes(content)
     first, moved, changed = (fingerprint(LOG, {"log": str(path)}) for path in paths)
-    assert first == moved
-    assert first != changed
+    assert first == moved != changed
     paths[0].write_bytes(b"lob")
     assert fingerprint(LOG, {"log": str(paths[0])}) == changed
 
 
-def test_folders_whose_files_end_elsewhere_have_another_content(tmp_path):
-    """Names and contents of both are the same characters one after the other."""
+def test_of_a_folder_every_name_and_content_counts_also_behind_links(tmp_path):
+    """Names and contents of the first three are the same characters one after the other."""
     for name, files in (("one", {"a": "b", "c": ""}), ("two", {"a": "", "bc": ""}), ("three", {"abc": ""})):
         (tmp_path / name).mkdir()
         for file, content in files.items():
             (tmp_path / name / file).write_text(content)
-    folders = [fingerprint("mrclam", {"folder": str(tmp_path / name)})["folder"] for name in ("one", "two", "three")]
-    assert len(set(folders)) == 3
 
+    def content_of(name: str) -> str:
+        return fingerprint("mrclam", {"folder": str(tmp_path / name)})["folder"]
 
-def test_key_changes_with_the_class_behind_the_name(write_suite, misbehaving, tmp_path):
-    suite = (HEADER.replace("dead-reckoning", "dies"), BASIN, '[[estimators]]\nname = "dies"\n')
-    before = key(write_suite, *suite)
-    points = tmp_path / "site" / "misbehaving-1.0.dist-info" / "entry_points.txt"
-    points.write_text(points.read_text().replace("misbehaving:Dies\n", "misbehaving:Prints\n"))
-    versions_of.cache_clear()
-    assert key(write_suite, *suite) != before
-    versions_of.cache_clear()
-
-
-def test_key_changes_with_the_version_of_python(write_suite, monkeypatch):
-    before = key(write_suite)
-    versions_of.cache_clear()
-    with monkeypatch.context() as patch:
-        patch.setattr("platform.python_version", lambda: "3.99.0")
-        assert key(write_suite) != before
-    versions_of.cache_clear()
-
-
-def test_run_has_the_content_that_its_key_is_made_of(write_suite):
-    (run,) = planned(write_suite)
-    assert run.content == fingerprint(run.kind, run.options)
+    found = [content_of(name) for name in ("one", "two", "three")]
+    (tmp_path / "three" / "run").symlink_to(tmp_path / "one", target_is_directory=True)
+    found.append(content_of("three"))
+    (tmp_path / "one" / "a").write_text("d")
+    assert len({*found, content_of("three")}) == 5
 
 
 def test_estimator_that_cannot_be_loaded_is_planned(write_suite, misbehaving):
@@ -148,15 +134,9 @@ def test_settings_that_exclude_each_other_are_told_with_line_and_key(write_suite
         planned(write_suite, HEADER_OF_ISAM2, BASIN, ISAM2, text)
 
 
-def test_what_was_asked_for_is_what_the_suite_states(write_suite):
-    (run,) = planned(
-        write_suite,
-        HEADER_OF_ISAM2,
-        BASIN,
-        "grid = { wrong_id_rate = [0.1] }\n",
-        ISAM2,
-        "params = { smoother.lag_s = 14 }\n",
-    )
+def test_what_was_asked_for_is_what_the_suite_states_with_files_by_their_content(write_suite, tmp_path):
+    grid, params = "grid = { wrong_id_rate = [0.1] }\n", "params = { smoother.lag_s = 14 }\n"
+    (run,) = planned(write_suite, HEADER_OF_ISAM2, BASIN, grid, ISAM2, params)
     assert run.asked == {
         "generator": "basin",
         "options": {"duration_s": 120, "laps": 1, "wrong_id_rate": 0.1},
@@ -165,11 +145,7 @@ def test_what_was_asked_for_is_what_the_suite_states(write_suite):
         "settings": {"smoother": {"lag_s": 14}},
         "rate_hz": 2.0,
     }
-
-
-def test_files_are_asked_for_by_content_and_landmarks_as_they_are_stated(write_suite, tmp_path):
-    park = '[[logs]]\nname = "park"\ndataset = "victoria-park"\nlandmarks = { frame_rate_hz = 3 }\n'
-    (run,) = planned(write_suite, HEADER, park, DEAD_RECKONING)
+    (run,) = planned(write_suite, HEADER, PARK, "landmarks = { frame_rate_hz = 3 }\n", DEAD_RECKONING)
     assert run.asked["files"] == {"file": fingerprint("victoria-park", {})["file"]}
     assert run.asked["landmarks"] == {"frame_rate_hz": 3}
     (tmp_path / "robots").mkdir()
@@ -178,16 +154,6 @@ def test_files_are_asked_for_by_content_and_landmarks_as_they_are_stated(write_s
     (run,) = planned(write_suite, HEADER, robots, DEAD_RECKONING)
     assert run.asked["options"] == {"robot": 1}
     assert len(run.asked["files"]["folder"]) == 64
-
-
-def test_content_of_a_folder_has_what_lies_behind_links(tmp_path):
-    for name in ("data", "elsewhere"):
-        (tmp_path / name).mkdir()
-    (tmp_path / "elsewhere" / "a.csv").write_text("1")
-    (tmp_path / "data" / "run").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
-    before = fingerprint("mrclam", {"folder": str(tmp_path / "data")})
-    (tmp_path / "elsewhere" / "a.csv").write_text("2")
-    assert fingerprint("mrclam", {"folder": str(tmp_path / "data")}) != before
 
 
 Hashed = Callable[[], str]
@@ -213,18 +179,23 @@ def hashed() -> Iterator[Hashed]:
     source_hash.cache_clear()
 
 
-def test_hash_changes_with_code_data_and_names(package, hashed):
+def test_hash_changes_with_code_data_and_names_also_behind_links_that_may_be_circles(package, hashed, tmp_path):
+    (elsewhere := tmp_path / "elsewhere").mkdir()
+    (elsewhere / "linked.py").write_text("a = 1\n")
+    (elsewhere / "around").symlink_to(package, target_is_directory=True)
+    changes = [
+        lambda: (package / "__init__.py").write_text("raise RuntimeError('Imported')\n"),
+        lambda: (package / "inner" / "data.json").write_text("[]"),
+        lambda: (package / "inner" / "data.json").rename(package / "data.json"),
+        (package / "more.py").touch,
+        lambda: (package / "linked").symlink_to(elsewhere, target_is_directory=True),
+        lambda: (elsewhere / "linked.py").write_text("a = 2\n"),
+    ]
     hashes = [hashed()]
-    (package / "__init__.py").write_text("raise RuntimeError('Imported')\n")
-    hashes.append(hashed())
-    (package / "inner" / "data.json").write_text("[]")
-    hashes.append(hashed())
-    (package / "inner" / "data.json").rename(package / "data.json")
-    hashes.append(hashed())
-    (package / "more.py").touch()
-    hashes.append(hashed())
-    assert len(set(hashes)) == 5
-    assert "" not in hashes
+    for change in changes:
+        change()
+        hashes.append(hashed())
+    assert len({*hashes, ""}) == len(changes) + 2
 
 
 def test_hash_is_of_neither_bytecode_nor_hidden_files_nor_place(package, hashed, tmp_path, monkeypatch):
@@ -233,47 +204,28 @@ def test_hash_is_of_neither_bytecode_nor_hidden_files_nor_place(package, hashed,
     (package / "__pycache__" / "kernel.nbi").write_text("compiled")
     (package / ".swap").write_text("edited")
     assert hashed() == before
-    moved = tmp_path / "second"
-    shutil.copytree(package.parent, moved)
-    shutil.rmtree(package)
-    monkeypatch.syspath_prepend(moved)
+    shutil.move(package.parent, tmp_path / "second")
+    monkeypatch.syspath_prepend(tmp_path / "second")
     assert hashed() == before
 
 
 def test_hash_of_a_module_is_of_its_file(tmp_path, hashed, monkeypatch):
     assert hashed() == ""
-    (tmp_path / "hashed_package.py").write_text("a = 1\n")
     monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "hashed_package.py").write_text("a = 1\n")
     first = hashed()
     (tmp_path / "hashed_package.py").write_text("a = 2\n")
     assert len({"", first, hashed()}) == 3
 
 
-def test_hash_is_taken_once_in_a_process(package, hashed):
-    before = hashed()
-    (package / "__init__.py").write_text("")
-    assert source_hash("hashed_package") == before
-    assert source_hash_now("hashed_package") == hashed() != before
-
-
-def test_look_at_the_disk_sees_a_change_of_equal_size_and_time(package, hashed):
+def test_hash_is_taken_once_in_a_process_and_a_look_at_the_disk_sees_a_change_of_equal_size_and_time(package, hashed):
     before, code = hashed(), package / "__init__.py"
     state = code.stat()
     code.write_text("raise RuntimeError('Imported')\n")
     os.utime(code, ns=(state.st_atime_ns, state.st_mtime_ns))
     assert (code.stat().st_size, code.stat().st_mtime_ns) == (state.st_size, state.st_mtime_ns)
-    assert source_hash_now("hashed_package") != before
-
-
-def test_files_that_differ_in_where_name_and_content_end_have_another_hash(package, hashed):
-    """Without lengths, the names and contents of both packages are the same characters one after the other."""
-    (package / "__init__.py").write_text("")
-    (package / "inner" / "data.json").unlink()
-    (package / "a").write_text("b")
-    first = hashed()
-    (package / "a").rename(package / "ab")
-    (package / "ab").write_text("")
-    assert hashed() != first
+    assert source_hash("hashed_package") == before
+    assert source_hash_now("hashed_package") == hashed() != before
 
 
 @pytest.mark.slow
@@ -313,14 +265,3 @@ def test_estimator_of_another_package_has_the_hash_of_that(misbehaving):
     assert versions_of("dies")["estimator_source"] == source_hash("misbehaving") != ""
     assert versions_of("broken")["estimator_source"] == ""
     assert versions_of("isam2")["estimator_source"] == versions_of("dies")["source"] == source_hash("sonar_graph")
-
-
-def test_code_behind_a_link_counts_and_links_in_a_circle_end(package, hashed, tmp_path):
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    (elsewhere / "linked.py").write_text("a = 1\n")
-    (package / "linked").symlink_to(elsewhere, target_is_directory=True)
-    (elsewhere / "around").symlink_to(package, target_is_directory=True)
-    before = hashed()
-    (elsewhere / "linked.py").write_text("a = 2\n")
-    assert hashed() != before

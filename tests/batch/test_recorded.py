@@ -1,5 +1,8 @@
+"""The table of a batch has a row for each planned run, and is read as it was written."""
+
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 
@@ -8,89 +11,106 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from sonar_graph.batch.plan import plan_runs
 from sonar_graph.batch.recorded import ALL_LOGS, RESULTS, is_batch, read_batch
+from sonar_graph.batch.result_table import COLUMNS, SUITE_METADATA, is_timing, write_results
+from sonar_graph.batch.store import RunOutcome, Store
+from sonar_graph.batch.suite import read_suite
 from sonar_graph.errors import EvaluationError
 from tests.recorded_batches import LOGS, drawn_batch, with_failures, write_batch
 
+from .conftest import BASIN, DEAD_RECKONING, HEADER
 
-def test_a_batch_is_read_as_it_was_written(tmp_path):
+ATE, MAP = "causal.ate_se2_m", "landmarks.se2_m"
+
+
+def test_a_batch_is_read_as_it_was_written_also_against_another_reference(tmp_path):
     batch = drawn_batch(3)
     back = read_batch(write_batch(batch, tmp_path))
     assert is_batch(tmp_path)
-    assert (back.name, back.reference, back.metrics, back.suite) == (
-        "drawn",
-        "dead-reckoning",
-        batch.metrics,
-        batch.suite,
-    )
-    assert [(run.key, run.log, run.seed, run.contestant) for run in back.runs] == [
-        (run.key, run.log, run.seed, run.contestant) for run in batch.runs
-    ]
-    assert all(back.runs[i].values == pytest.approx(batch.runs[i].values) for i in range(len(batch.runs)))
+    for name in ("name", "reference", "metrics", "suite"):
+        assert getattr(back, name) == getattr(batch, name)
+    for own, run in zip(back.runs, batch.runs, strict=True):
+        assert (own.key, own.log, own.seed, own.contestant) == (run.key, run.log, run.seed, run.contestant)
+        assert own.values == pytest.approx(run.values)
+    assert read_batch(tmp_path, "isam2").reference == "isam2"
 
 
-def test_pairs_have_the_same_log_and_seed(tmp_path):
+def test_pairs_have_the_same_log_and_seed():
     batch = drawn_batch(5)
-    own, reference = batch.pairs(LOGS[0], "isam2", "causal.ate_se2_m")
-    assert own.tolist() == [run.value("causal.ate_se2_m") for run in batch.group(LOGS[0], "isam2")]
-    assert reference.tolist() == [run.value("causal.ate_se2_m") for run in batch.group(LOGS[0], "dead-reckoning")]
-    assert len(batch.pairs(ALL_LOGS, "isam2", "causal.ate_se2_m")[0]) == 10
-
-
-def test_a_run_that_did_not_end_has_no_value_whatever_is_recorded():
-    assert math.isinf(replace(drawn_batch(2).runs[0], status="timeout").value("causal.ate_se2_m"))
-    batch = with_failures(drawn_batch(3), "isam2", LOGS[0], 1)
-    assert math.isinf(batch.group(LOGS[0], "isam2")[0].value("causal.ate_se2_m"))
-    assert len(batch.pairs(LOGS[0], "isam2", "causal.ate_se2_m")[0]) == 3, "it is not left out"
-
-
-def test_a_seed_that_the_reference_lacks_makes_no_pair():
-    batch = drawn_batch(3)
+    own, reference = batch.pairs(LOGS[0], "isam2", ATE)
+    assert own.tolist() == [run.value(ATE) for run in batch.group(LOGS[0], "isam2")]
+    assert reference.tolist() == [run.value(ATE) for run in batch.group(LOGS[0], "dead-reckoning")]
+    assert len(batch.pairs(ALL_LOGS, "isam2", ATE)[0]) == 10
     fewer = replace(batch, runs=[run for run in batch.runs if (run.contestant, run.seed) != ("dead-reckoning", 1)])
-    assert len(fewer.pairs(LOGS[0], "isam2", "causal.ate_se2_m")[0]) == 2
+    assert len(fewer.pairs(LOGS[0], "isam2", ATE)[0]) == 4
+
+
+def test_a_run_that_did_not_end_is_not_left_out_and_has_no_value_whatever_is_recorded():
+    assert math.isinf(replace(drawn_batch(2).runs[0], status="timeout").value(ATE))
+    batch = drawn_batch(6)
+    for count in (1, 6):
+        for log in LOGS:
+            batch = with_failures(batch, "isam2", log, count)
+        own, reference = batch.pairs(LOGS[0], "isam2", ATE)
+        assert np.isinf(own).tolist() == [True] * count + [False] * (6 - count)
+        assert np.isfinite(reference).all()
+    assert not batch.is_asked(LOGS[0], "isam2", "depth_m"), "nobody has it"
 
 
 def test_a_score_that_a_contestant_never_has_is_no_failure():
     batch = drawn_batch(3)
-    assert not batch.is_asked(LOGS[0], "dead-reckoning", "landmarks.se2_m")
-    assert batch.is_asked(LOGS[0], "isam2", "landmarks.se2_m")
-    assert len(batch.pairs(LOGS[0], "isam2", "landmarks.se2_m")[0]) == 0
-
-
-def test_a_contestant_that_never_ended_is_compared_as_one_that_failed():
-    batch = drawn_batch(6)
-    for log in LOGS:
-        batch = with_failures(batch, "isam2", log, 6)
-    own, reference = batch.pairs(LOGS[0], "isam2", "causal.ate_se2_m")
-    assert np.isinf(own).tolist() == [True] * 6
-    assert np.isfinite(reference).all()
-    assert not batch.is_asked(LOGS[0], "isam2", "depth_m"), "nobody has it"
-    assert not batch.is_asked(LOGS[0], "dead-reckoning", "landmarks.se2_m"), "it ended, and has no map"
-
-
-def test_another_reference_can_be_chosen_and_an_unknown_one_is_refused(tmp_path):
-    write_batch(drawn_batch(2), tmp_path)
-    assert read_batch(tmp_path, "isam2").reference == "isam2"
-    with pytest.raises(
-        EvaluationError, match="no run of the reference 'isam3'; there are runs of: dead-reckoning, isam"
-    ):
-        read_batch(tmp_path, "isam3")
+    assert not batch.is_asked(LOGS[0], "dead-reckoning", MAP)
+    assert batch.is_asked(LOGS[0], "isam2", MAP)
+    assert len(batch.pairs(LOGS[0], "isam2", MAP)[0]) == 0
 
 
 def test_what_is_no_batch_is_refused_with_the_file_at_fault(tmp_path):
-    with pytest.raises(EvaluationError, match=r"no results\.parquet in it"):
-        read_batch(tmp_path)
+    def refused(told: str, reference: str | None = None) -> None:
+        with pytest.raises(EvaluationError, match=told):
+            read_batch(tmp_path, reference)
+
+    refused(r"no results\.parquet in it")
     (tmp_path / RESULTS).write_bytes(b"PAR1 but not really")
-    with pytest.raises(EvaluationError, match="cannot be read as Parquet"):
-        read_batch(tmp_path)
+    refused("cannot be read as Parquet")
     pq.write_table(pa.table({"key": ["a"], "log": ["b"]}), tmp_path / RESULTS)
-    with pytest.raises(EvaluationError, match="no column estimator, status"):
-        read_batch(tmp_path)
-
-
-def test_a_run_with_two_rows_is_refused(tmp_path):
+    refused("no column estimator, status")
     write_batch(drawn_batch(2), tmp_path)
+    refused("no run of the reference 'isam3'; there are runs of: dead-reckoning, isam", "isam3")
     table = pq.read_table(tmp_path / RESULTS)
     pq.write_table(pa.concat_tables([table, table.slice(0, 1)]), tmp_path / RESULTS)
-    with pytest.raises(EvaluationError, match="has more than one row"):
-        read_batch(tmp_path)
+    refused("has more than one row")
+
+
+def test_table_has_a_row_for_each_planned_run_in_the_order_of_the_plan(write_suite, tmp_path):
+    file = read_suite(write_suite(HEADER, BASIN, "seeds = 4\n", DEAD_RECKONING))
+    runs, store = plan_runs(file), Store(tmp_path / "out")
+    for run, error_m in ((runs[2], 0.3), (runs[0], 0.1)):
+        store.write(run.key, RunOutcome({"status": "ok", "causal.ate_raw_m": error_m, "causal.nees_yaw_dof": 1}))
+    store.write(runs[3].key, RunOutcome({"status": "timeout", "reason": "took longer than 1 s"}))
+    table = pq.read_table(write_results(store, file.suite, runs))
+    assert table.column_names == [*COLUMNS, "causal.ate_raw_m", "causal.nees_yaw_dof"]
+    assert table["seed"].to_pylist() == [0, 1, 2, 3]
+    assert table["causal.ate_raw_m"].to_pylist() == [0.1, None, 0.3, None]
+    assert table["status"].to_pylist() == ["ok", "not run", "ok", "timeout"]
+    assert table["log_file"].null_count == 1
+    assert table["reason"].to_pylist()[1] == "not done when this table was written"
+    assert table["sonar_graph"].null_count == 0
+    assert table["causal.nees_yaw_dof"].type == pa.int64()
+    assert json.loads(table["options"][0].as_py())["duration_s"] == 120
+    assert (store.folder / table["log_file"][0].as_py()).is_file()
+    about = json.loads(table.schema.metadata[SUITE_METADATA])
+    assert about["reference"] == "dead-reckoning"
+
+
+def test_table_of_a_batch_without_any_run_has_the_columns(write_suite, tmp_path):
+    file = read_suite(write_suite())
+    table = pq.read_table(write_results(Store(tmp_path), file.suite, plan_runs(file)))
+    assert table.column_names == [*COLUMNS]
+    assert table["status"].to_pylist() == ["not run"]
+
+
+def test_times_and_memory_alone_may_differ_between_equal_runs():
+    timings = {"wall_s", "cpu_s", "peak_memory_mb", "update_p99_ms", "time.total_s", "memory.peak_mb"}
+    assert all(map(is_timing, timings))
+    assert not any(map(is_timing, ("key", "causal.ate_raw_m", "scored_instants", "machine", "status")))

@@ -6,8 +6,6 @@ import errno
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -103,24 +101,17 @@ def test_process_that_dies_while_it_removes_a_run_leaves_it_whole_or_not_at_all(
     assert names(tmp_path) == [f"runs/k/{name}" for name in whole]
 
 
-def test_row_that_the_machine_lost_counts_as_not_done(tmp_path):
+def test_row_that_the_machine_lost_or_that_is_of_another_run_counts_as_not_done(tmp_path):
     store = Store(tmp_path)
     store.write("k", OUTCOME)
     (store.run_folder("k") / "row.json").write_bytes(b"")
     assert store.row("k") is None
-    store.write("k", OUTCOME)
-    assert store.row("k") == OUTCOME.row
-
-
-def test_row_of_another_run_counts_as_not_done(tmp_path):
-    store = Store(tmp_path)
-    for key, error_m in (("a", 1.0), ("b", 2.0)):
-        store.write(key, RunOutcome({"status": "ok", "error_m": error_m}))
-    folders = {key: store.run_folder(key) for key in ("a", "b")}
-    folders["a"].rename(tmp_path / "aside")
-    folders["b"].rename(folders["a"])
-    (tmp_path / "aside").rename(folders["b"])
-    assert store.row("a") is store.row("b") is None
+    for key in ("k", "other"):
+        store.write(key, OUTCOME)
+        assert store.row(key) == OUTCOME.row
+    for old, new in (("k", "aside"), ("other", "k"), ("aside", "other")):
+        store.run_folder(old).rename(store.run_folder(new))
+    assert store.row("k") is store.row("other") is None
 
 
 HOLDER = """
@@ -135,44 +126,29 @@ with only_batch_in(Path(sys.argv[1])):
 """
 
 
-@contextmanager
-def another_process_in(folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
-    """A process that has the lock, and the number of its child, which has not."""
-    with subprocess.Popen([sys.executable, "-c", HOLDER, str(folder)], stdout=subprocess.PIPE, text=True) as process:
+def test_second_process_is_refused_until_the_first_is_killed_although_its_children_live(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", HOLDER, str(tmp_path)], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         child = int(process.stdout.readline())
         try:
-            yield process, child
+            with pytest.raises(BatchError) as refused, only_batch_in(tmp_path):
+                pass
+            assert str(refused.value).startswith(f"{tmp_path}: another batch is running in this folder; ")
+            assert "\n" not in str(refused.value)
+            process.kill()
+            process.wait()
+            os.kill(child, 0)
+            with only_batch_in(tmp_path):
+                assert (tmp_path / ".lock").exists()
         finally:
             process.kill()
             os.kill(child, 9)
 
 
-def test_second_process_is_refused_in_one_line_that_says_what_to_do(tmp_path):
-    with another_process_in(tmp_path), pytest.raises(BatchError) as refused, only_batch_in(tmp_path):
-        pass
-    assert str(refused.value).startswith(f"{tmp_path}: another batch is running in this folder; ")
-    assert "\n" not in str(refused.value)
-
-
-def test_killed_batch_leaves_no_lock_although_its_children_live(tmp_path):
-    with another_process_in(tmp_path) as (process, child):
-        process.kill()
-        process.wait()
-        os.kill(child, 0)
-        with only_batch_in(tmp_path):
-            assert (tmp_path / ".lock").exists()
-
-
-def test_lock_ends_with_the_block_also_by_an_error(tmp_path):
+def test_lock_is_of_one_folder_and_ends_with_the_block_also_by_an_error(tmp_path):
+    (tmp_path / "other").mkdir()
     with pytest.raises(KeyboardInterrupt), only_batch_in(tmp_path):
         raise KeyboardInterrupt
-    with only_batch_in(tmp_path):
-        pass
-
-
-def test_other_folders_are_free(tmp_path):
-    (tmp_path / "other").mkdir()
     with only_batch_in(tmp_path), only_batch_in(tmp_path / "other"):
         pass
 
