@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
+import importlib
 import json
 import math
 import os
@@ -29,7 +29,7 @@ from sonar_graph.errors import BatchError
 
 from .conftest import BASIN, DEAD_RECKONING, HEADER
 
-ROOT = Path(__file__).parents[2]
+VALIDATION = Path(__file__).parents[2] / "benchmarks" / "validation"
 MAIN = """
 import signal
 from sonar_graph.cli import main
@@ -46,21 +46,16 @@ def bench(suite: Path, folder: Path, *options: str) -> subprocess.Popen[str]:
 
 
 def test_faults_lose_no_run_and_change_no_number():
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "benchmarks" / "validation" / "batch_faults.py"), "--quick"],
-        capture_output=True,
-        text=True,
-        timeout=900,
-    )
+    command = [sys.executable, str(VALIDATION / "batch_faults.py"), "--quick"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr
     figures = json.loads(done.stdout.splitlines()[-1])
-    assert figures["rows_equal"] is True
-    assert figures["runs_lost"] == 0
-    assert figures["all_ok"] is True
+    assert (figures["rows_equal"], figures["runs_lost"], figures["all_ok"]) == (True, 0, True)
 
 
-def test_rows_that_differ_are_told_apart_and_times_are_not_compared(tmp_path):
-    faults = load_faults()
+def test_rows_that_differ_are_told_apart_and_times_are_not_compared(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(VALIDATION))
+    faults = importlib.import_module("batch_faults")
     tables = []
     for number, changed in enumerate(({}, {"wall_s": 2.0}, {"causal.ate_raw_m": math.nextafter(0.1, 1)})):
         (tmp_path / str(number)).mkdir()
@@ -70,14 +65,11 @@ def test_rows_that_differ_are_told_apart_and_times_are_not_compared(tmp_path):
     assert tables[0] == tables[1] != tables[2]
 
 
-def load_faults() -> Any:
-    path = ROOT / "benchmarks" / "validation" / "batch_faults.py"
-    spec = importlib.util.spec_from_file_location("batch_faults", path)
-    assert spec is not None
-    assert spec.loader is not None
-    faults = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(faults)
-    return faults
+def wait_for_a_run(folder: Path, process: subprocess.Popen[str]) -> None:
+    """Until the first run is kept."""
+    while not list(folder.glob("runs/*/row.json")):
+        assert process.poll() is None
+        time.sleep(0.05)
 
 
 @pytest.mark.parametrize("ended_by", [signal.SIGINT, signal.SIGTERM])
@@ -87,9 +79,7 @@ def test_interrupt_ends_in_seconds_says_how_to_go_on_and_leaves_no_process(
     sleeps = '[[estimators]]\nname = "sleeps"\n'
     suite = write_suite(HEADER, BASIN, "seeds = 2\n", DEAD_RECKONING, sleeps)
     with bench(suite, tmp_path / "out", "--workers", "1") as process:
-        while not list((tmp_path / "out").glob("runs/*/row.json")):
-            assert process.poll() is None
-            time.sleep(0.05)
+        wait_for_a_run(tmp_path / "out", process)
         time.sleep(1.0)
         family = psutil.Process(process.pid).children(recursive=True)
         assert family
@@ -132,9 +122,7 @@ def test_scheduler_that_is_lost_is_told_and_what_is_done_is_kept(write_suite, mi
         dask = [sys.executable, "-m", "distributed.cli.dask_worker", "--nthreads", "1"]
         with subprocess.Popen([*dask, *told], **quiet) as worker:
             with bench(suite, tmp_path / "out", "--scheduler", address) as process:
-                while not list((tmp_path / "out").glob("runs/*/row.json")):
-                    assert process.poll() is None
-                    time.sleep(0.05)
+                wait_for_a_run(tmp_path / "out", process)
                 scheduler.kill()
                 _, said = process.communicate(timeout=120)
             worker.terminate()

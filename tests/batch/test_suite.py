@@ -15,6 +15,9 @@ from .conftest import BASIN, DEAD_RECKONING, HEADER
 
 SUITES = sorted((Path(__file__).parents[2] / "benchmarks" / "suites").glob("*.toml"))
 ISAM2 = '\n[[estimators]]\nname = "isam2"\n'
+LAG_TWICE = "params = { smoother.lag_s = 3 }\ngrid = { smoother.lag_s = [4] }\n"
+AGAIN, PARK = ISAM2 + 'variant = "again"\n', 'dataset = "victoria-park"\n'
+DEAF, POOL = DEAD_RECKONING.replace("dead-", "deaf-"), BASIN.replace('"basin"\ngen', '"pool"\ngen')
 
 
 def line(text: str, word: str) -> int:
@@ -60,39 +63,19 @@ def second(entry: str) -> str:
         (log("grid = { wrong_id_rate = [2.0] }\n"), "grid", "grid.wrong_id_rate"),
         (log("grid = { wrong_id_rate = [] }\n"), "grid", "has no values"),
         (log("grid = { laps = [1, 2] }\n"), "grid", "grid.laps: is also in options"),
-        (
-            HEADER
-            + BASIN
-            + DEAD_RECKONING
-            + ISAM2
-            + "params = { smoother.lag_s = 3 }\ngrid = { smoother.lag_s = [4] }\n",
-            "grid",
-            "grid.smoother.lag_s: is also in params",
-        ),
+        (end(ISAM2 + LAG_TWICE), "grid", "grid.smoother.lag_s: is also in params"),
         (log("seeds = 0\n"), "seeds", "has no seeds"),
         (log("seeds = []\n"), "seeds", "has no seeds"),
         (log("landmarks = {}\n"), "[[logs]]", "a generator has its own"),
-        (
-            HEADER + BASIN + DEAD_RECKONING.replace("dead-", "deaf-"),
-            "deaf",
-            "estimators.0.name: no estimator is called",
-        ),
+        (HEADER + BASIN + DEAF, "deaf", "estimators.0.name: no estimator is called"),
         (end(ISAM2 + "params = { smoother.lag = 1 }\n"), "lag = 1", "did you mean lag_s?"),
         (end(ISAM2 + "[estimators.grid]\n\nsmoother.lag_s = [1, -1]\n"), "lag_s", "grid.smoother.lag_s"),
         (HEADER + BASIN + ISAM2, "reference", "'dead-reckoning' does not run here; what does: isam2"),
         (head('metrics = ["ate"]\n'), "metrics", "there is no score 'ate'"),
         (log(second(BASIN)), "# second", "logs.1: two logs are called 'basin'"),
-        (
-            log(second(BASIN.replace('"basin"\ngen', '"pool"\ngen'))),
-            "# second",
-            "logs.1: 'pool' and 'basin' are the same with seed 0",
-        ),
+        (log(second(POOL)), "# second", "logs.1: 'pool' and 'basin' are the same with seed 0"),
         (end(second(DEAD_RECKONING)), "# second", "estimators.1: dead-reckoning/default is there twice"),
-        (
-            end(ISAM2 + second(ISAM2) + 'variant = "again"\n'),
-            "# second",
-            "estimators.2: isam2/again and isam2/default have the same settings",
-        ),
+        (end(ISAM2 + second(AGAIN)), "# second", "estimators.2: isam2/again and isam2/default have the same settings"),
         (log("seeds = [1, 1]\n"), "seeds", "list of different whole numbers"),
         (log("seeds = [-1]\n"), "seeds", "logs.0.seeds: expected the number of seeds"),
         (log("seeds = [9223372036854775808]\n"), "seeds", "to 9223372036854775807"),
@@ -110,11 +93,7 @@ def second(entry: str) -> str:
         (other('log = "suite.toml"\n'), "suite.toml", "not an MCAP file but a text"),
         (other('log = "."\n'), "log =", "is a folder; give the .mcap file in it"),
         (other('dataset = "mrclam"\n'), "[[logs]]", "robot: is missing"),
-        (
-            other('dataset = "victoria-park"\nlandmarks = { seed = 1 }\n'),
-            "landmarks",
-            "logs.0.landmarks.seed: cannot be set",
-        ),
+        (other(f"{PARK}landmarks = {{ seed = 1 }}\n"), "landmarks", "logs.0.landmarks.seed: cannot be set"),
         (HEADER + "[[logs]\n", "[[logs]", "not TOML"),
     ],
 )
@@ -127,10 +106,6 @@ def test_mistake_is_told_with_file_line_and_key(write_suite, text, at, words):
     assert f"line {line(text, at)}" in message
     assert words in message
     assert "\n" not in message
-
-
-def test_the_same_suites_without_mistakes_are_planned(write_suite):
-    assert len(plan_runs(read_suite(write_suite(HEADER, BASIN, "seeds = [4, 2]\n", DEAD_RECKONING, ISAM2)))) == 4
 
 
 def test_data_beside_the_suite_goes_before_the_folder_of_data_sets(write_suite, tmp_path, monkeypatch):
@@ -154,9 +129,10 @@ def test_suites_that_ship_are_sound(path):
         assert plan_runs(file)
 
 
-def test_example_in_the_documentation_of_the_module_is_a_suite(write_suite):
+def test_suites_without_mistakes_are_planned_such_as_the_example_in_the_documentation(write_suite):
     from sonar_graph.batch import suite
 
+    assert len(plan_runs(read_suite(write_suite(HEADER, BASIN, "seeds = [4, 2]\n", DEAD_RECKONING, ISAM2)))) == 4
     example = "\n".join(row[4:] for row in (suite.__doc__ or "").splitlines() if row.startswith("    "))
     assert tomllib.loads(example)["name"] == "smoke"
     assert len(plan_runs(read_suite(write_suite(example)))) == 2 * 3 * 3
@@ -183,24 +159,15 @@ x.y = 1
 '''
 
 
-@pytest.mark.parametrize(
-    ("place", "line"),
-    [
-        (("name",), 1),
-        (("note",), 2),
-        (("logs",), 7),
-        (("logs", 0), 7),
-        (("logs", 0, "name"), 8),
-        (("logs", 0, "options"), 9),
-        (("logs", 0, "options", "seed"), 10),
-        (("logs", 1), 12),
-        (("logs", 1, "options", "odd key"), 13),
-        (("logs", 1, "grid", "lag_s", 0), 14),
-        (("logs", 1, "missing"), 12),
-        (("top", "inner part", "x", "y"), 18),
-        (("nothing",), 1),
-        ((), 1),
-    ],
-)
-def test_line_is_that_of_the_key_or_of_what_holds_it(place, line):
-    assert line_of(TEXT, place) == line
+# fmt: off
+LINES = {
+    ("name",): 1, ("note",): 2, ("logs",): 7, ("logs", 0): 7, ("logs", 0, "name"): 8, ("logs", 0, "options"): 9,
+    ("logs", 0, "options", "seed"): 10, ("logs", 1): 12, ("logs", 1, "options", "odd key"): 13,
+    ("logs", 1, "grid", "lag_s", 0): 14, ("logs", 1, "missing"): 12, ("top", "inner part", "x", "y"): 18,
+    ("nothing",): 1, (): 1,
+}
+# fmt: on
+
+
+def test_line_is_that_of_the_key_or_of_what_holds_it():
+    assert {place: line_of(TEXT, place) for place in LINES} == LINES

@@ -1,3 +1,5 @@
+"""The page of a batch: figures with their data, explanations, the runs that are missing, and panels for each log."""
+
 from __future__ import annotations
 
 import base64
@@ -6,20 +8,30 @@ import io
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from sonar_graph.batch.recorded import read_batch
+from sonar_graph.batch.gate import bless, gate
+from sonar_graph.batch.recorded import RecordedBatch, read_batch
+from sonar_graph.batch.result_table import metrics_of
+from sonar_graph.errors import EvaluationError
+from sonar_graph.report.batch_figures import WIDTH_IN, folded, log_panels, spread_out
 from sonar_graph.report.batch_page import render_batch, write_batch_report
-from tests.recorded_batches import LOGS, drawn_batch, failed, with_failures, write_batch
+from sonar_graph.report.batch_summary import lost_told, marked, missing_told
+from sonar_graph.report.batch_tables import all_tests, failure_table
+from sonar_graph.report.figure_style import colour
+from tests.recorded_batches import ESTIMATORS, LOGS, drawn_batch, failed, with_failures, with_missing, write_batch
+
+ATE = "causal.ate_se2_m"
 
 
 @pytest.fixture(scope="module")
-def batch():
+def batch() -> RecordedBatch:
     return with_failures(drawn_batch(), "ekf-slam", LOGS[1], 2)
 
 
 @pytest.fixture(scope="module")
-def html(batch):
+def html(batch) -> str:
     return render_batch(batch)
 
 
@@ -31,43 +43,184 @@ def test_every_figure_has_its_data(html, batch):
     assert set(figures) <= set(by_name)
     text = base64.b64decode(by_name["spread-ate-se2-m"].partition("base64,")[2]).decode()
     rows = list(csv.DictReader(io.StringIO(text)))
-    recorded = {
-        (run.key, key): run.value(key) for run in batch.runs for key in ("causal.ate_se2_m", "smoothed.ate_se2_m")
-    }
+    recorded = {(run.key, key): run.value(key) for run in batch.runs for key in (ATE, "smoothed.ate_se2_m")}
     assert {(row["key"], row["column"]) for row in rows} == set(recorded)
     assert all(float(row["value"] or "inf") == recorded[row["key"], row["column"]] for row in rows)
 
 
-def test_reading_comes_before_numbers_and_the_protocol_is_told(html):
+def test_reading_comes_before_numbers_and_protocol_and_counts_are_told(html):
     assert html.index("How to read this page") < html.index("<figure")
-    for said in ("Wilcoxon", "Holm (1979)", "Hall 1992", "Wilson", "chi-square", "Lachin 1999", "causal.ate_se2_m"):
-        assert said in html
-
-
-def test_the_page_says_what_its_counts_are_of(html):
     text = " ".join(html.split())
-    assert "from 6 pairs on, and only where both runs of every pair have a value" in text
-    assert "No test of fewer than 6 pairs, or seeds." in text
-    assert "All logs together have one difference a seed" in text
-    assert "of all logs together they count seeds" in text
-    assert "it is no second evidence" in text
-    assert "60 runs of 3 estimators on 2 logs, up to 10 seeds each, compared with dead-reckoning." in text
+    for said in (
+        *("Wilcoxon", "Holm (1979)", "Hall 1992", "Wilson", "chi-square", "Lachin 1999", ATE),
+        "from 6 pairs on, and only where both runs of every pair have a value",
+        "No test of fewer than 6 pairs, or seeds.",
+        "All logs together have one difference a seed",
+        "of all logs together they count seeds",
+        "it is no second evidence",
+        "60 runs of 3 estimators on 2 logs, up to 10 seeds each, compared with dead-reckoning.",
+    ):
+        assert said in text
     assert ">8 of 10 seeds<" in text or ">10 of 10 seeds<" in text
 
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_few_runs_and_runs_that_all_failed_make_a_page(count):
     batch = drawn_batch(count, logs=LOGS[:1])
-    assert "Every run ended well" in render_batch(batch)
-    nothing = replace(batch, runs=[failed(run) for run in batch.runs])
-    html = render_batch(nothing)
+    html = render_batch(batch)
+    assert "Every run ended well." in html
+    assert "not complete" not in html.lower()
+    html = render_batch(replace(batch, runs=[failed(run) for run in batch.runs]))
     assert "no run has an error to compare" in html
     assert "nan" not in re.sub(r"<svg.*?</svg>|base64,[^\"]*", "", html, flags=re.DOTALL).lower().split()
 
 
-def test_the_report_is_rebuilt_from_results_alone(tmp_path, batch):
-    write_batch(batch, tmp_path)
-    page = write_batch_report(read_batch(tmp_path), tmp_path)
+@pytest.fixture
+def incomplete() -> RecordedBatch:
+    """Of 60 runs four of isam2 and all ten of ekf-slam on one log are not done; one more run failed."""
+    batch = with_failures(drawn_batch(10), "isam2", LOGS[0], 1)
+    return with_missing(with_missing(batch, "isam2", LOGS[0], 4), "ekf-slam", LOGS[0], 10)
+
+
+def rows(batch: RecordedBatch) -> dict[tuple[str, str], dict[str, object]]:
+    table = failure_table(batch)
+    keys = [column.key for column in table.columns]
+    cells = [dict(zip(keys, [cell.numbers[0] for cell in row], strict=True)) for row in table.rows]
+    return {(str(row["log"]), str(row["contestant"])): row for row in cells}
+
+
+def test_missing_runs_are_counted_and_are_no_failures(incomplete):
+    counted = rows(incomplete)
+    assert len(counted) == 6
+    some, none = counted[LOGS[0], "isam2"], counted[LOGS[0], "ekf-slam"]
+    assert (some["runs"], some["ended"], some["failure_rate"], some["not_run"]) == (6, 5, 1 / 6, 4)
+    assert (none["runs"], none["not_run"]) == (0, 10)
+    assert np.isnan(none["failure_rate"])
+    assert counted[LOGS[1], "isam2"]["not_run"] == 0
+    complete = drawn_batch(2)
+    assert "not_run" not in rows(complete)[LOGS[0], "isam2"]
+    assert marked(complete, table := failure_table(complete)) is table
+    assert missing_told(complete) == []
+
+
+def test_missing_runs_make_no_pairs_and_no_values(incomplete):
+    assert len(incomplete.values(LOGS[0], "isam2", ATE)) == 6
+    assert len(incomplete.pairs(LOGS[0], "isam2", ATE)[0]) == 6
+    assert not incomplete.is_asked(LOGS[0], "ekf-slam", ATE)
+    complete = with_failures(drawn_batch(10), "isam2", LOGS[0], 1)
+    dropped = replace(incomplete, missing=[])
+    metrics = metrics_of(complete.metrics)
+    assert str(all_tests(incomplete, metrics)) == str(all_tests(dropped, metrics)) != str(all_tests(complete, metrics))
+
+
+def test_a_table_with_missing_runs_is_read_as_one_in_the_order_of_the_plan(incomplete, tmp_path):
+    lacks_first = with_missing(incomplete, "dead-reckoning", LOGS[0], 10)
+    assert lacks_first.contestants == list(ESTIMATORS)
+    back = read_batch(write_batch(lacks_first, tmp_path))
+    assert back.contestants == list(ESTIMATORS)
+    assert [run.key for run in back.runs] == [run.key for run in lacks_first.runs]
+    assert {run.key for run in back.missing} == {run.key for run in lacks_first.missing}
+    none = drawn_batch(1, logs=LOGS[:1])
+    for name in ESTIMATORS:
+        none = with_missing(none, name, LOGS[0], 1)
+    write_batch(none, tmp_path)
+    with pytest.raises(EvaluationError, match=r"none of its 3 runs has been done yet; give the bench command"):
+        read_batch(tmp_path)
+
+
+def test_page_and_tables_say_how_many_runs_are_missing_whose_where_and_how_to_go_on(incomplete, tmp_path):
+    (told,) = missing_told(incomplete)
+    assert told.startswith("This batch is not complete: 14 of 60 runs have not been done (isam2 4 of 20, ekf-slam")
+    assert "on basin. All numbers are of the other runs" in told
+    assert "give the bench command that began it again" in told
+    page = write_batch_report(read_batch(write_batch(incomplete, tmp_path)), tmp_path)  # from results alone
     assert page == tmp_path / "report.html"
-    assert page.read_text("utf-8").startswith("<!DOCTYPE html>")
+    html = page.read_text("utf-8")
+    assert html.startswith("<!DOCTYPE html>")
+    first = html.index('<p class="warning">')
+    assert html[first:].startswith('<p class="warning">This batch is not complete: 14 of 60 runs')
+    assert first < html.index("<table")
+    assert "that was done ended well" not in html, "one did not"
     assert {path.suffix for path in (tmp_path / "tables").iterdir()} == {".csv", ".tex"}
+    for path in (tmp_path / "tables").glob("*.tex"):
+        assert "Not complete: 14 of 60 runs have not been done." in path.read_text("utf-8"), path
+    counted = list(csv.DictReader(io.StringIO((tmp_path / "tables" / "failures.csv").read_text("utf-8"))))
+    assert sum(int(row["not_run"]) for row in counted) == 14
+
+
+@pytest.mark.parametrize("gone", ["dead-reckoning", "isam2"])
+def test_a_contestant_without_any_run_leaves_a_page_of_the_others(gone):
+    batch = drawn_batch(3)
+    for log in LOGS:
+        batch = with_missing(batch, gone, log, 3)
+    html = render_batch(batch)
+    assert "Every run that was done ended well." in html
+    assert f"({gone} 6 of 6)" in html
+
+
+def test_an_incomplete_batch_is_no_reference_and_passes_no_gate(incomplete, tmp_path):
+    reference = tmp_path / "reference.json"
+    with pytest.raises(EvaluationError, match=r"the batch 'drawn' cannot become a reference, 14 of 60 runs"):
+        bless(incomplete, reference)
+    assert not reference.exists()
+    bless(drawn_batch(9), reference)
+    extended = with_missing(drawn_batch(10), "isam2", LOGS[0], 1)
+    with pytest.raises(EvaluationError, match="1 of 60 runs has not been done"):
+        gate(extended, reference)
+
+
+@pytest.mark.parametrize(("count", "named"), [(3, "log 0; log 1; log 2."), (5, "log 0; log 1; log 2 and 2 more.")])
+def test_the_warning_names_three_logs_and_counts_the_others(count, named):
+    logs = tuple(f"log {place}" for place in range(count))
+    batch = drawn_batch(2, logs=logs)
+    for log in logs:
+        batch = with_missing(batch, "isam2", log, 1)
+    (told,) = missing_told(batch)
+    assert f", on {named} All numbers" in told
+
+
+def test_rows_whose_runs_are_not_here_are_told_and_lead_nowhere(tmp_path):
+    batch = drawn_batch(2)
+    write_batch(batch, tmp_path)
+    for run in batch.runs[1:]:
+        (tmp_path / run.log_file).parent.mkdir(parents=True)
+        (tmp_path / run.log_file).write_text("")
+    back = read_batch(tmp_path)
+    assert [run.log_file for run in back.runs] == ["", *(run.log_file for run in batch.runs[1:])]
+    (sentence,) = lost_told(back)
+    assert sentence.startswith(f"The table has 1 run whose folder is not here, first {batch.runs[0].key}")
+    assert lost_told(batch) == []
+
+
+@pytest.mark.parametrize(("logs", "shape"), [(1, (1, 1)), (2, (2, 1)), (3, (2, 2)), (4, (2, 3)), (9, (3, 3))])
+def test_many_logs_stand_beside_each_other_with_names_at_the_left_and_folded_headings(logs, shape):
+    names = tuple(f"tracks, wrong_id_rate=0.0{index}" for index in range(logs))
+    batch = drawn_batch(1, logs=names)
+    figure, panels = log_panels(batch, list(names), "error (m)")
+    headings = [panel.get_title(loc="left") for panel in panels]
+    assert [heading.replace("\n", " ") for heading in headings] == list(names)
+    assert ["\n" in heading for heading in headings] == [logs > 2] * logs
+    grid = panels[0].get_subplotspec().get_gridspec()
+    assert (len(figure.axes), figure.get_figwidth(), (grid.nrows, grid.ncols)) == (logs, WIDTH_IN, shape)
+    shown = [[label.get_text() for label in panel.get_yticklabels()] for panel in panels]
+    assert shown == [[""] * 3 if place % shape[1] else batch.contestants for place in range(logs)]
+    colours = [label.get_color() for label in panels[0].get_yticklabels()]
+    assert colours == [colour(place) for place in range(3)]
+    assert len(set(colours)) == 3
+    bottom, top = panels[0].get_ylim()
+    assert top < 0 < 2 < bottom, "the first contestant is on top"
+
+
+@pytest.mark.parametrize("name", ["isam2/identity.policy=max-mixture", "a, b=1, c=2", "plain", "/=,", "x" * 40])
+def test_folding_loses_no_letter(name):
+    lines = folded(name, 18).split("\n")
+    assert "".join(lines).replace(" ", "") == name.replace(" ", "")
+    assert all(len(line) <= 18 or not any(sign in line[:-1] for sign in "/=,") for line in lines)
+
+
+def test_a_spread_out_scale_has_numbers_at_one_two_and_five():
+    _, (panel, *_) = log_panels(drawn_batch(1), ["basin"], "")
+    spread_out(panel)
+    panel.set_xlim(0.9, 11)
+    shown = [place for place in panel.xaxis.get_majorticklocs() if 0.9 < place < 11]
+    assert shown == pytest.approx([1, 2, 5, 10])

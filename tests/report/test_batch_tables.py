@@ -1,8 +1,11 @@
+"""Tables and sentences of a batch: pairs, no mean over survivors, one family a metric, digits, and the warnings."""
+
 from __future__ import annotations
 
 import csv
 import io
 import itertools
+import math
 import re
 from dataclasses import replace
 
@@ -16,10 +19,16 @@ from sonar_graph.evaluation.digits import quantile_text
 from sonar_graph.evaluation.tables import Cell, Column, Table
 from sonar_graph.report.batch_figures import consistency_drawing, difference_drawing
 from sonar_graph.report.batch_summary import (
+    DIFFERENT,
+    HIGHER,
+    LOWER,
     errors_told,
     failures_told,
     head_metric,
+    headlines,
     instants_told,
+    mark_of,
+    overview_table,
     power_told,
     reference_told,
 )
@@ -35,9 +44,12 @@ from sonar_graph.report.batch_tables import (
     run_lists,
 )
 from sonar_graph.report.rendering import as_csv, as_latex, latex_text, write_tables
-from tests.recorded_batches import LOGS, METRICS, changed, drawn_batch, updated, with_failures, without
+from tests.recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, updated, with_failures, without
 
-ATE = metrics_of(["causal.ate_se2_m"])[0]
+ATE, YAW = metrics_of(["causal.ate_se2_m", "causal.yaw_rmse_rad"])
+EVERY_METRIC = metrics_of(METRICS)
+KEY, YAW_KEY = "causal.ate_se2_m", "causal.yaw_rmse_rad"
+BATCH = drawn_batch()
 
 
 def rows_of(table: Table) -> list[dict[str, str]]:
@@ -48,48 +60,74 @@ def row_of(table: Table, contestant: str, log: str = LOGS[0]) -> dict[str, str]:
     return next(row for row in rows_of(table) if (row["log"], row["contestant"]) == (log, contestant))
 
 
-def test_causal_and_smoothed_have_columns_of_their_own():
-    batch = drawn_batch()
-    row = row_of(accuracy_table(batch, ATE), "isam2")
-    for kind in ("causal", "smoothed"):
-        values = batch.values(LOGS[0], "isam2", f"{kind}.ate_se2_m")
-        assert float(row[f"{kind}.ate_se2_m_mean"]) == pytest.approx(values.mean())
-        assert float(row[f"{kind}.ate_se2_m_mean_se"]) == pytest.approx(values.std(ddof=1) / np.sqrt(10))
-        assert float(row[f"{kind}.ate_se2_m_median"]) == pytest.approx(np.median(values))
-        assert float(row[f"{kind}.ate_se2_m_10_percent"]) == pytest.approx(np.quantile(values, 0.1))
-        assert float(row[f"{kind}.ate_se2_m_90_percent"]) == pytest.approx(np.quantile(values, 0.9))
+def cells_of(table: Table, contestant: str) -> list[Cell]:
+    return next(row for row in table.rows if row[1].text == contestant)
 
 
-def test_no_mean_is_given_over_survivors_and_the_table_says_why():
-    batch = with_failures(drawn_batch(), "isam2", LOGS[0], 2)
+def overview_of(batch: RecordedBatch) -> Table:
+    return overview_table(batch, ATE, all_tests(batch, [ATE]))
+
+
+def cell_of(table: Table, log: str, over: str, contestant: str) -> Cell:
+    heads = [(column.over, column.heading.removesuffix(" (reference)")) for column in table.columns]
+    return next(row[heads.index((over, contestant))] for row in table.rows if row[0].text == log)
+
+
+def errors_of(batch: RecordedBatch, metrics: list[Metric] = EVERY_METRIC) -> list[str]:
+    return errors_told(batch, metrics, all_tests(batch, metrics))
+
+
+def test_causal_and_smoothed_have_columns_of_their_own_with_full_precision_in_files():
+    row = row_of(accuracy_table(BATCH, ATE), "isam2")
+    for kind in KINDS:
+        key = f"{kind}.ate_se2_m"
+        values = BATCH.values(LOGS[0], "isam2", key)
+        assert float(row[f"{key}_mean"]) == float(values.mean())
+        assert float(row[f"{key}_mean_se"]) == pytest.approx(values.std(ddof=1) / np.sqrt(10))
+        assert float(row[f"{key}_median"]) == pytest.approx(np.median(values))
+        assert float(row[f"{key}_10_percent"]) == pytest.approx(np.quantile(values, 0.1))
+        assert float(row[f"{key}_90_percent"]) == pytest.approx(np.quantile(values, 0.9))
+        overview = next(csv.DictReader(io.StringIO(as_csv(overview_of(BATCH)))))
+        for contestant in BATCH.contestants:
+            assert float(overview[f"{key} {contestant}"]) == np.median(BATCH.values(LOGS[0], contestant, key))
+    assert 1 < float(row_of(cost_table(BATCH), "isam2")["update_p50_ms_median"]) < 2
+
+
+def test_no_mean_is_given_over_survivors_and_the_tables_say_why():
+    batch = with_failures(BATCH, "isam2", LOGS[0], 2)
     table = accuracy_table(batch, ATE)
     row = row_of(table, "isam2")
-    assert row["causal.ate_se2_m_mean"] == ""
-    assert row["runs"] == "10"
+    assert (row[f"{KEY}_mean"], row["runs"]) == ("", "10")
     notes = [cell.note for line in table.rows for cell in line if cell.note]
     assert notes.count("2 of 10 without a value") == 2
-    assert row_of(table, "ekf-slam")["causal.ate_se2_m_mean"] != ""
+    assert row_of(table, "ekf-slam")[f"{KEY}_mean"] != ""
+    row = row_of(failure_table(batch), "isam2")
+    assert (row["ended"], row["timeout"], row["memory"], row["failure_rate"]) == ("8", "2", "0", "0.2")
+    assert float(row["failure_rate_low"]) < 0.2 < float(row["failure_rate_high"])
+    cell = cell_of(overview_of(with_failures(BATCH, "isam2", LOGS[0], 6)), LOGS[0], "Causal", "isam2")
+    assert cell.text.startswith("no value")
+    assert cell.note == "6 of 10 without a value"
 
 
 def test_a_column_that_a_contestant_cannot_have_is_a_dash_without_a_complaint():
-    table = accuracy_table(drawn_batch(), metrics_of(["landmarks.se2_m"])[0])
-    cells = next(line for line in table.rows if line[1].text == "dead-reckoning")
+    cells = cells_of(accuracy_table(BATCH, metrics_of(["landmarks.se2_m"])[0]), "dead-reckoning")
     assert [cell.text for cell in cells[3:]] == ["\N{EN DASH}"] * 3
     assert all(not cell.note for cell in cells)
 
 
 def test_differences_are_paired_and_their_tests_corrected_within_a_metric():
-    batch = drawn_batch()
-    metrics = metrics_of(METRICS)
-    tests = all_tests(batch, metrics)
-    own, reference = batch.pairs(LOGS[0], "isam2", "causal.ate_se2_m")
-    row = row_of(difference_table(batch, ATE, tests), "isam2")
-    assert float(row["causal.ate_se2_m_difference"]) == pytest.approx((own - reference).mean())
-    assert float(row["causal.ate_se2_m_difference_low"]) < float(row["causal.ate_se2_m_difference"])
-    single, corrected = float(row["causal.ate_se2_m_p_holm_single"]), float(row["causal.ate_se2_m_p_holm"])
+    tests = all_tests(BATCH, EVERY_METRIC)
+    own, reference = BATCH.pairs(LOGS[0], "isam2", KEY)
+    row = row_of(difference_table(BATCH, ATE, tests), "isam2")
+    assert float(row[f"{KEY}_difference"]) == pytest.approx((own - reference).mean())
+    assert float(row[f"{KEY}_difference_low"]) < float(row[f"{KEY}_difference"])
+    single, corrected = float(row[f"{KEY}_p_holm_single"]), float(row[f"{KEY}_p_holm"])
     assert single == pytest.approx(2**-9)
     assert single < corrected <= 12 * single + 1e-12
     assert {log for _, log, _ in tests} == {*LOGS, ALL_LOGS}
+    alone = all_tests(BATCH, [Metric("ate_se2_m", {"Causal": KEY})])
+    doubled = all_tests(BATCH, [Metric("ate_se2_m", {"Causal": KEY, "Smoothed": KEY})])  # as of a filter: one test
+    assert {place: p for place, (_, p) in doubled.items()} == {place: p for place, (_, p) in alone.items()}
 
 
 def test_of_all_logs_together_seeds_are_counted():
@@ -97,14 +135,10 @@ def test_of_all_logs_together_seeds_are_counted():
     tests = all_tests(batch, [ATE])
     table = difference_table(batch, ATE, tests)
     shown = {row[0].text: (row[2].text, row[5].text) for row in table.rows if row[1].text == "isam2"}
-    assert shown == {
-        LOGS[0]: ("8 pairs", "8 of 8 pairs"),
-        LOGS[1]: ("8 pairs", "8 of 8 pairs"),
-        ALL_LOGS: ("8 seeds", "8 of 8 seeds"),
-    }
+    assert shown == dict.fromkeys(LOGS, ("8 pairs", "8 of 8 pairs")) | {ALL_LOGS: ("8 seeds", "8 of 8 seeds")}
     assert [column.heading for column in table.columns[2:6]] == ["Compared", "Mean difference", "Median", "Smaller in"]
     row = row_of(table, "isam2", ALL_LOGS)
-    assert (row["pairs"], row["pairs_of"], row["causal.ate_se2_m_smaller"]) == ("8", "seed", "8")
+    assert (row["pairs"], row["pairs_of"], row[f"{KEY}_smaller"]) == ("8", "seed", "8")
     drawing = difference_drawing(batch, ATE, tests)
     counted = {(row["log"], row["pairs"], row["pairs_of"]) for row in csv.DictReader(io.StringIO(drawing.data))}
     assert counted == {(LOGS[0], "8", "pair"), (LOGS[1], "8", "pair"), (ALL_LOGS, "8", "seed")}
@@ -113,47 +147,30 @@ def test_of_all_logs_together_seeds_are_counted():
     assert [row[2].text for row in rows if row[1].text == "isam2"] == ["1 pair", "1 pair", "2 logs"]
 
 
-@pytest.mark.parametrize(
-    ("p_value", "text"),
-    [
-        (0.0496, "0.0496"),
-        (0.04996, "0.04996"),
-        (0.0504, "0.0504"),
-        (0.05, "0.05"),
-        (0.0512, "0.051"),
-        (0.0488, "0.049"),
-        (0.123, "0.12"),
-        (0.00099, "< 0.001"),
-        (0.9999, "1.0"),
-        (np.nextafter(0.05, 0.0), "0.049999999999999996"),
-    ],
-)
-def test_a_p_value_shows_its_side_of_five_percent(p_value, text):
-    assert p_text(p_value) == text
+# fmt: off
+P_TEXTS = {
+    0.0496: "0.0496", 0.04996: "0.04996", 0.0504: "0.0504", 0.05: "0.05", 0.0512: "0.051", 0.0488: "0.049",
+    0.123: "0.12", 0.00099: "< 0.001", 0.9999: "1.0", float(np.nextafter(0.05, 0.0)): "0.049999999999999996",
+}
+# fmt: on
 
 
-def test_a_filters_two_estimates_are_one_test():
-    batch = drawn_batch()
-    alone = all_tests(batch, [Metric("ate_se2_m", {"Causal": "causal.ate_se2_m"})])
-    doubled = all_tests(batch, [Metric("ate_se2_m", {"Causal": "causal.ate_se2_m", "Smoothed": "causal.ate_se2_m"})])
-    assert {place: p for place, (_, p) in doubled.items()} == {place: p for place, (_, p) in alone.items()}
-
-
-def test_failures_are_counted_by_kind_with_their_interval():
-    row = row_of(failure_table(with_failures(drawn_batch(), "isam2", LOGS[0], 2)), "isam2")
-    assert (row["ended"], row["timeout"], row["memory"]) == ("8", "2", "0")
-    assert float(row["failure_rate"]) == 0.2
-    assert float(row["failure_rate_low"]) < 0.2 < float(row["failure_rate_high"])
+def test_a_p_value_shows_its_side_of_five_percent():
+    assert {p_value: p_text(p_value) for p_value in P_TEXTS} == P_TEXTS
 
 
 def test_consistency_is_judged_over_runs_by_the_chi_square_band():
-    table = consistency_table(drawn_batch(40))
-    verdicts = {(row["log"], row["contestant"], row["of"]): row["causal_verdict"] for row in rows_of(table)}
+    batch = drawn_batch(40)
+    verdicts = {
+        (row["log"], row["contestant"], row["of"]): row["causal_verdict"] for row in rows_of(consistency_table(batch))
+    }
     assert verdicts[LOGS[0], "ekf-slam", "position"] == "over-confident"
     assert verdicts[LOGS[0], "isam2", "position"] == "consistent"
-    failed = consistency_table(with_failures(drawn_batch(40), "isam2", LOGS[0], 1))
-    row = next(row for row in rows_of(failed) if row["contestant"] == "isam2")
+    row = row_of(consistency_table(with_failures(batch, "isam2", LOGS[0], 1)), "isam2")
     assert (row["causal_anees"], row["causal_verdict"]) == ("", "")
+    rows = rows_of(consistency_table(without(drawn_batch(logs=LOGS[:1]), "causal.nees")))
+    assert all(row["smoothed_verdict"] for row in rows), "who has but a smoothed covariance is judged by it"
+    assert "causal_anees" not in rows[0]
 
 
 def with_one_end(batch: RecordedBatch, contestants: tuple[str, ...], factor: float = 1.0) -> RecordedBatch:
@@ -181,12 +198,6 @@ def test_a_smoothed_error_at_the_end_is_no_second_evidence(factor, shown):
         assert row[-2].numbers[0] == pytest.approx(row[-4].numbers[0] * (factor if is_told else 1.0))
 
 
-def test_who_has_but_a_smoothed_covariance_is_judged_by_it():
-    rows = rows_of(consistency_table(without(drawn_batch(logs=LOGS[:1]), "causal.nees")))
-    assert all(row["smoothed_verdict"] for row in rows)
-    assert "causal_anees" not in rows[0]
-
-
 def test_every_run_is_listed_once_and_leads_to_its_log():
     batch = drawn_batch(4)
     lists = run_lists(batch, metrics_of(METRICS))
@@ -197,13 +208,8 @@ def test_every_run_is_listed_once_and_leads_to_its_log():
     assert targets == anchors
 
 
-def test_costs_are_medians():
-    row = row_of(cost_table(drawn_batch()), "isam2")
-    assert 1 < float(row["update_p50_ms_median"]) < 2
-
-
-def test_latex_has_as_many_cells_as_columns_in_every_row():
-    table = accuracy_table(with_failures(drawn_batch(), "isam2", LOGS[0], 2), metrics_of(["causal.yaw_rmse_rad"])[0])
+def test_latex_has_as_many_cells_as_columns_in_every_row_and_takes_no_commands_from_names():
+    table = accuracy_table(with_failures(BATCH, "isam2", LOGS[0], 2), YAW)
     text = as_latex(table)
     body = text[text.index(r"\midrule") : text.index(r"\bottomrule")]
     lines = [line for line in body.splitlines() if line.endswith(r"\\")]
@@ -212,22 +218,14 @@ def test_latex_has_as_many_cells_as_columns_in_every_row():
     assert r"\multicolumn{3}{c}{Causal}" in text
     assert r"\cmidrule(lr){4-6}\cmidrule(lr){7-9}" in text
     assert re.search(r"[±°]", text) is None
-
-
-def test_latex_takes_no_commands_from_names():
-    table = Table("t", "100 % of $x_1$", "", [Column("a", r"\input{x}")], [[Cell("a&b#c")]])
-    text = as_latex(table)
+    text = as_latex(overview_of(BATCH))
+    assert r"$\downarrow$" in text
+    assert LOWER not in text
+    text = as_latex(Table("t", "100 % of $x_1$", "", [Column("a", r"\input{x}")], [[Cell("a&b#c")]]))
     assert r"100 \% of \$x\_1\$" in text
     assert r"\input" not in text
     assert r"a\&b\#c" in text
     assert latex_text("±") == r"$\pm$"
-
-
-def test_csv_has_full_precision_in_the_units_of_the_results():
-    batch = drawn_batch()
-    row = row_of(accuracy_table(batch, metrics_of(["causal.yaw_rmse_rad"])[0]), "isam2")
-    values = batch.values(LOGS[0], "isam2", "causal.yaw_rmse_rad")
-    assert float(row["causal.yaw_rmse_rad_mean"]) == float(values.mean())
 
 
 def test_tables_are_written_under_their_names(tmp_path):
@@ -236,82 +234,65 @@ def test_tables_are_written_under_their_names(tmp_path):
     assert all(path.stat().st_size for path in written)
 
 
+def test_angles_are_degrees_for_people_and_radians_in_files():
+    own, reference = (BATCH.values(LOGS[0], name, YAW_KEY) for name in ("isam2", "dead-reckoning"))
+    table = accuracy_table(BATCH, YAW)
+    cell = cells_of(table, "isam2")[3]
+    assert cell.numbers[0] == own.mean() == float(row_of(table, "isam2")[f"{YAW_KEY}_mean"])
+    assert float(cell.text.split(" ± ")[0]) == pytest.approx(np.degrees(own.mean()), rel=0.1)
+    assert table.title.endswith("°")
+    expected = quantile_text(math.degrees(np.median(own)), math.degrees(quantile_error(own, 0.5)))
+    assert cell_of(overview_table(BATCH, YAW, {}), LOGS[0], "Causal", "isam2").text == expected
+    told = errors_of(BATCH, [YAW])[0]
+    off = np.degrees(reference) - np.degrees(own)
+    size = quantile_text(np.median(off), quantile_error(off, 0.5))
+    assert f"isam2 {expected}, " in told
+    assert f"isam2 is below dead-reckoning by {size} in the median, smaller in 10 of 10 pairs" in told
+    assert " in °" in told
+    assert float(size) == pytest.approx(57.3 * np.median(reference - own), rel=0.1)
+
+
 def test_the_finding_names_failures_and_only_differences_beyond_chance():
-    batch = with_failures(drawn_batch(), "ekf-slam", LOGS[1], 3)
-    metrics = metrics_of(METRICS)
+    batch = with_failures(BATCH, "ekf-slam", LOGS[1], 3)
     assert failures_told(batch) == [f"ekf-slam: 3 of 20 runs did not end ({LOGS[1]})."]
-    told = errors_told(batch, metrics, all_tests(batch, metrics))
-    assert "isam2 is below dead-reckoning by " in told[0]
-    assert "below dead-reckoning" in told[0]
-    alike = changed(batch, "isam2", "causal.ate_se2_m", 4.0)
-    assert "Not told apart from dead-reckoning: isam2" in errors_told(alike, metrics, all_tests(alike, metrics))[0]
+    assert "isam2 is below dead-reckoning by " in errors_of(batch)[0]
+    assert "Not told apart from dead-reckoning: isam2" in errors_of(changed(batch, "isam2", KEY, 4.0))[0]
+    batch = drawn_batch(1, logs=tuple("abcdefg"))
+    for log in batch.logs:
+        batch = with_failures(batch, "isam2", log, 1)
+    assert failures_told(batch) == ["isam2: 7 of 7 runs did not end (a, b, c and 4 more)."]
 
 
-def test_the_finding_gives_no_mean_over_survivors():
-    batch = with_failures(drawn_batch(18), "isam2", LOGS[0], 1)
-    metrics = metrics_of(METRICS)
-    told = errors_told(batch, metrics, all_tests(batch, metrics))[0]
-    differences = np.subtract(*batch.pairs(LOGS[0], "isam2", "causal.ate_se2_m"))
+def test_the_finding_tells_the_side_of_the_test_and_of_failed_runs_no_mean_and_no_size():
+    batch = drawn_batch(18, logs=LOGS[:1])
+    one_failed = with_failures(batch, "isam2", LOGS[0], 1)
+    told = errors_of(one_failed)[0]
     found = re.search(r"isam2 is below dead-reckoning by (\S+) in the median, smaller in 17 of 18 pairs \(p ", told)
+    differences = np.subtract(*one_failed.pairs(LOGS[0], "isam2", KEY))
     assert float(found[1]) == pytest.approx(-np.median(differences), rel=0.1)
-
-
-def test_the_finding_tells_the_side_of_the_test_and_not_of_a_mean_that_one_run_turned():
-    lost = np.append(np.ones(17), 1e4)
-    batch = changed(drawn_batch(18, logs=LOGS[:1]), "isam2", "causal.ate_se2_m", lost)
-    metrics = metrics_of(METRICS)
-    tests = all_tests(batch, metrics)
-    test, p_value = tests["causal.ate_se2_m", LOGS[0], "isam2"]
+    all_failed = errors_of(with_failures(batch, "isam2", LOGS[0], 18))[0]
+    assert "isam2 is above dead-reckoning, smaller in 0 of 18 pairs (p " in all_failed
+    turned = changed(batch, "isam2", KEY, np.append(np.ones(17), 1e4))
+    test, p_value = all_tests(turned, [ATE])[KEY, LOGS[0], "isam2"]
     assert test.mean > 0 > test.median
     assert p_value < 0.05
-    assert "isam2 is below dead-reckoning by 0." in errors_told(batch, metrics, tests)[0]
+    assert "isam2 is below dead-reckoning by 0." in errors_of(turned)[0]
 
 
-def test_the_finding_of_who_never_ended_has_a_side_and_no_size():
-    batch = with_failures(drawn_batch(18, logs=LOGS[:1]), "isam2", LOGS[0], 18)
-    metrics = metrics_of(METRICS)
-    told = errors_told(batch, metrics, all_tests(batch, metrics))[0]
-    assert "isam2 is above dead-reckoning, smaller in 0 of 18 pairs (p " in told
-
-
-def test_angles_are_degrees_for_people_and_radians_in_files():
-    batch = drawn_batch()
-    table = accuracy_table(batch, metrics_of(["causal.yaw_rmse_rad"])[0])
-    mean = batch.values(LOGS[0], "isam2", "causal.yaw_rmse_rad").mean()
-    cell = next(line[3] for line in table.rows if line[1].text == "isam2")
-    assert cell.numbers[0] == mean
-    assert float(cell.text.split(" ± ")[0]) == pytest.approx(np.degrees(mean), rel=0.1)
-    assert table.title.endswith("°")
-
-
-def test_sentences_on_angles_are_in_degrees():
-    batch = changed(drawn_batch(12, logs=LOGS[:1]), "isam2", "causal.yaw_rmse_rad", 0.5)
-    (metric,) = metrics_of(["causal.yaw_rmse_rad"])
-    (told,) = errors_told(batch, [metric], all_tests(batch, [metric]))
-    own, reference = np.degrees(batch.pairs(LOGS[0], "isam2", "causal.yaw_rmse_rad"))
-    size = quantile_text(-np.median(own - reference), quantile_error(own - reference, 0.5))
-    assert f"isam2 {quantile_text(np.median(own), quantile_error(own, 0.5))}, " in told
-    assert f"isam2 is below dead-reckoning by {size} in the median, smaller in 12 of 12 pairs" in told
-    assert " in °" in told
-    assert float(size) == pytest.approx(57.3 * -np.median(np.radians(own - reference)), rel=0.1)
-
-
-def test_too_few_seeds_are_warned_of():
+def test_too_few_seeds_are_warned_of_and_cost_others_nothing():
     few, many = drawn_batch(4, logs=LOGS[:1]), drawn_batch(12, logs=LOGS[:1])
-    metrics = metrics_of(METRICS)
-    assert "4 pairs" in power_told(all_tests(few, metrics))[0]
-    assert power_told(all_tests(many, metrics)) == []
-    assert f"{ALL_LOGS} (4 seeds)" in power_told(all_tests(drawn_batch(4), metrics))[0]
-
-
-def test_what_has_too_few_pairs_for_a_test_costs_others_nothing():
+    assert "4 pairs" in power_told(all_tests(few, EVERY_METRIC))[0]
+    assert power_told(all_tests(many, EVERY_METRIC)) == []
+    assert f"{ALL_LOGS} (4 seeds)" in power_told(all_tests(drawn_batch(4), EVERY_METRIC))[0]
     tests = {
-        ("causal.ate_se2_m", f"{pairs} of them", "isam2"): (paired(np.arange(pairs) + 1.0, np.zeros(pairs)), 1.0)
-        for pairs in (5, 6)
+        (KEY, f"{pairs} of them", "isam2"): (paired(np.arange(pairs) + 1.0, np.zeros(pairs)), 1.0) for pairs in (5, 6)
     }
-    assert power_told(tests) == [
-        "Too few pairs for any corrected p value to fall below 0.05: 5 of them (5 pairs). Add seeds."
-    ]
+    told = "Too few pairs for any corrected p value to fall below 0.05: 5 of them (5 pairs). Add seeds."
+    assert power_told(tests) == [told]
+    batch = drawn_batch(7, logs=LOGS[:1])
+    same = updated(batch, lambda run: {"smoothed.ate_se2_m": run.values[KEY]})
+    assert "7 pairs" in power_told(all_tests(batch, [ATE]))[0], "four tests: 4 / 2**6 is above 5 %"
+    assert power_told(all_tests(same, [ATE])) == [], "two tests, as of filters"
 
 
 @pytest.mark.parametrize(("fewest", "blind"), [(8, False), (7, True), (5, True)])
@@ -326,13 +307,6 @@ def test_seeds_are_called_too_few_only_where_the_best_differences_find_nothing(f
     told = power_told(tests)
     assert bool(told) is blind
     assert not any(LOGS[0] + " (" in one for one in told)
-
-
-def test_a_filters_two_estimates_do_not_ask_for_more_seeds():
-    batch = drawn_batch(7, logs=LOGS[:1])
-    same = updated(batch, lambda run: {"smoothed.ate_se2_m": run.values["causal.ate_se2_m"]})
-    assert "7 pairs" in power_told(all_tests(batch, [ATE]))[0], "four tests: 4 / 2**6 is above 5 %"
-    assert power_told(all_tests(same, [ATE])) == [], "two tests"
 
 
 @pytest.mark.parametrize("key", ["time.total_s", "memory.peak_mb", "wall_s", "peak_memory_mb"])
@@ -355,15 +329,90 @@ def test_a_reference_that_never_ended_is_warned_of():
     assert told[4].text == "better: reference has no value"
 
 
-def test_a_warning_names_few_logs():
-    batch = drawn_batch(1, logs=tuple("abcdefg"))
-    for log in batch.logs:
-        batch = with_failures(batch, "isam2", log, 1)
-    assert failures_told(batch) == ["isam2: 7 of 7 runs did not end (a, b, c and 4 more)."]
-
-
 def test_runs_that_were_scored_at_other_instants_are_warned_of():
     even = updated(drawn_batch(2), lambda _: {"scored_instants": 50.0})
     fewer = replace(even.runs[0], values=even.runs[0].values | {"scored_instants": 40.0})
     assert instants_told(even) == []
     assert LOGS[0] in instants_told(replace(even, runs=[fewer, *even.runs[1:]]))[0]
+
+
+def test_arrows_point_to_the_side_of_the_difference_and_only_where_it_is_no_chance():
+    batch = replace(changed(drawn_batch(), "dead-reckoning", "causal.ate_se2_m", 3.0), reference="ekf-slam")
+    batch = changed(batch, "isam2", "causal.ate_se2_m", 0.2)
+    table = overview_of(batch)
+    assert cell_of(table, LOGS[0], "Causal", "isam2").text.endswith(LOWER)
+    assert cell_of(table, LOGS[0], "Causal", "dead-reckoning").text.endswith(HIGHER)
+    assert LOWER not in cell_of(table, LOGS[0], "Causal", "ekf-slam").text
+    few = overview_of(replace(batch, runs=[run for run in batch.runs if run.seed in (0, 1, 2)]))
+    assert not any(arrow in cell.text for row in few.rows for cell in row for arrow in (LOWER, HIGHER))
+
+
+@pytest.mark.parametrize(
+    ("median", "mark"), [(-0.1, LOWER), (0.1, HIGHER), (-math.inf, LOWER), (math.inf, HIGHER), (0.0, DIFFERENT)]
+)
+def test_the_mark_is_of_the_median_and_only_below_five_percent(median, mark):
+    test = replace(paired(np.arange(8.0), np.zeros(8)), mean=-7.0 * median, median=median)
+    assert mark_of((test, 0.049)) == mark
+    assert mark_of((replace(test, median=math.nan), 0.049)) == DIFFERENT
+    assert mark_of((test, 0.05)) == mark_of((test, math.nan)) == mark_of(None) == ""
+
+
+def test_a_filter_has_no_smoothed_column_and_the_reference_is_named():
+    same = updated(BATCH, lambda run: {"smoothed.ate_se2_m": run.values["causal.ate_se2_m"]}, ("ekf-slam",))
+    table = overview_of(same)
+    smoothed = [column.heading.removesuffix(" (reference)") for column in table.columns if column.over == "Smoothed"]
+    assert smoothed == ["dead-reckoning", "isam2"]
+    assert next(column.heading for column in table.columns if column.over == "Causal") == "dead-reckoning (reference)"
+
+
+def test_a_median_keeps_its_digits_beside_a_run_that_lost_its_way():
+    batch = changed(drawn_batch(logs=LOGS[:1]), "isam2", "causal.ate_se2_m", np.append(np.ones(9), 1e5))
+    shown = float(cell_of(overview_of(batch), LOGS[0], "Causal", "isam2").text.split()[0])
+    assert shown == pytest.approx(np.median(batch.values(LOGS[0], "isam2", "causal.ate_se2_m")), rel=0.1)
+    row = next(row for row in accuracy_table(batch, ATE).rows if row[1].text == "isam2")
+    assert float(row[4].text) == shown
+    assert 0 < float(row[5].text.partition(" to ")[0]) <= shown
+
+
+def test_who_never_ended_is_higher_than_the_reference_and_not_left_out():
+    batch = with_failures(drawn_batch(logs=LOGS[:1]), "isam2", LOGS[0], 10)
+    assert cell_of(overview_of(batch), LOGS[0], "Causal", "isam2").text == f"no value {HIGHER}"
+    assert "higher with isam2" in headlines(batch, ATE, all_tests(batch, [ATE]))[0]
+
+
+def test_the_sentence_counts_logs_where_somebody_is_told_apart():
+    beside, batch = "error beside that of dead-reckoning", drawn_batch(logs=("one", "two", "three"))
+    causal, smoothed = headlines(batch, ATE, all_tests(batch, [ATE]))
+    assert causal == f"Causal {beside} (on how many of 3 logs): lower with isam2 (3), ekf-slam (3)."
+    assert smoothed.startswith(f"Smoothed {beside}")
+    mixed = updated(batch, lambda run: {KEY: 9.0} if run.log == "two" else {}, ("isam2",))
+    told = headlines(mixed, ATE, all_tests(mixed, [ATE]))[0]
+    assert "lower with isam2 (2), ekf-slam (3); higher with isam2 (1)" in told
+    rng = np.random.default_rng(16)
+    batch = updated(BATCH, lambda _: {"smoothed.ate_se2_m": rng.lognormal()})
+    causal, smoothed = headlines(batch, ATE, all_tests(batch, [ATE]))
+    assert causal.startswith(f"Causal {beside} (on how many of 2 logs): lower with")
+    assert smoothed == f"Smoothed {beside}: never told apart: isam2, ekf-slam."
+    one, few = drawn_batch(logs=LOGS[:1]), drawn_batch(3, logs=LOGS[:1])
+    assert headlines(one, ATE, all_tests(one, [ATE]))[0] == f"Causal {beside}: lower with isam2, ekf-slam."
+    (told,) = headlines(few, ATE, all_tests(few, [ATE]))
+    assert told.endswith("no estimator is told apart from dead-reckoning.")
+
+
+def test_what_only_all_logs_together_tell_is_no_count_of_logs():
+    batch = drawn_batch(1, logs=tuple("abcdefgh"))
+    assert math.isnan(all_tests(batch, [ATE])["causal.ate_se2_m", ALL_LOGS, "isam2"][1]), "one seed is one case"
+    batch = replace(batch, runs=[replace(run, seed=None) for run in batch.runs])
+    tests = all_tests(batch, [ATE])
+    assert tests["causal.ate_se2_m", ALL_LOGS, "isam2"][0].pairs == 8
+    assert mark_of(tests["causal.ate_se2_m", ALL_LOGS, "isam2"]) == LOWER
+    (told,) = headlines(batch, ATE, tests)
+    assert told.endswith("no estimator is told apart from dead-reckoning on any one log.")
+
+
+def test_the_head_shows_the_first_error_that_most_logs_have():
+    assert head_metric(BATCH, EVERY_METRIC) == EVERY_METRIC[0]
+    assert head_metric(without(BATCH, "ate", LOGS[0]), EVERY_METRIC) == EVERY_METRIC[1]
+    assert head_metric(replace(BATCH, runs=[failed(run) for run in BATCH.runs]), EVERY_METRIC) is None
+    assert head_metric(BATCH, metrics_of(["causal.nees_position"])) is None
+    assert head_metric(BATCH, metrics_of(["causal.nees_position", KEY])).name == ATE.name

@@ -76,6 +76,19 @@ def test_the_smaller_error_is_named_only_where_the_difference_is_large(errors, s
     assert ("below" in sentence) == ("below" in said)
 
 
+@pytest.mark.parametrize(
+    ("score", "verdict"),
+    [
+        *((nees(value), said) for value, said in ((0.49, "over-cautious"), (0.51, ""), (1.99, ""))),
+        *((nees(value, (0.9, 1.1)), said) for value, said in ((0.8, "over-cautious"), (1.0, "consistent"))),
+        *((nees(2.01), "over-confident"), (nees(1.2, (0.9, 1.1)), "over-confident")),
+        *((nees(math.nan), ""), (Score(40.0, "m", ""), "")),
+    ],
+)
+def test_consistency_follows_the_interval_and_without_one_a_factor_of_two(score, verdict):
+    assert score.verdict == verdict
+
+
 def test_radians_are_shown_as_degrees():
     score = Score(math.pi / 2, "rad", "By hand.")
     assert (score.text(), score.with_unit, Score(2.0, "m", "").with_unit) == ("90", "90°", "2\N{NO-BREAK SPACE}m")
@@ -96,21 +109,6 @@ def test_failures_come_first_and_the_lack_of_a_finding_has_its_reason():
     assert "nothing to compare" in finding(with_failure(scored(isam2=0.1), "isam2", "no odometry"))[-1]
     unscored = replace(basin_comparison(60), scores={})
     assert finding(unscored) == ["No position error could be computed against the log's ground truth."]
-
-
-@pytest.mark.parametrize(
-    ("score", "verdict"),
-    [
-        *((nees(value), said) for value, said in ((0.49, "over-cautious"), (0.51, ""), (1.99, ""))),
-        (nees(2.01), "over-confident"),
-        *((nees(value, (0.9, 1.1)), said) for value, said in ((0.8, "over-cautious"), (1.0, "consistent"))),
-        (nees(1.2, (0.9, 1.1)), "over-confident"),
-        (nees(math.nan), ""),
-        (Score(40.0, "m", ""), ""),
-    ],
-)
-def test_consistency_follows_the_interval_and_without_one_a_factor_of_two(score, verdict):
-    assert score.verdict == verdict
 
 
 @pytest.mark.parametrize(
@@ -138,18 +136,26 @@ def test_finding_says_that_there_were_no_detections(truth):
     assert finding(replace(comparison, sequence=part))[0].startswith(said)
 
 
-@pytest.mark.parametrize(("gated", "is_told"), [(19, False), (21, True)])
-def test_an_estimator_that_refuses_a_fifth_of_the_detections_is_called_lost(gated, is_told):
-    outcomes = [Outcome.GATED] * gated + [Outcome.USED] * (100 - gated)
-    log = DetectionLog(
-        np.arange(100), np.ones(100, np.int64), np.full((100, 2), 0.1), np.tile(np.eye(2), (100, 1, 1)), outcomes
-    )
+@pytest.mark.parametrize(
+    ("gated", "params", "advice"),
+    [
+        (19, {}, None),
+        (21, {}, "identities are wrong, or noise is set far too small"),
+        (30, {"identity": {"policy": "gate"}}, 'wrong (try identity.policy = "max-mixture"), or noise is set far too'),
+    ],
+)
+def test_an_estimator_that_refuses_a_fifth_of_the_detections_is_called_lost(gated, params, advice):
+    log = log_of([Outcome.GATED] * gated + [Outcome.USED] * (100 - gated), [0.1] * 100)
     comparison = basin_comparison(60)
-    runs = [replace(run, detections=log) if run.estimator == "ekf-slam" else run for run in comparison.runs]
-    sentences = finding(replace(comparison, runs=runs))
-    told = [sentence for sentence in sentences if sentence.startswith(f"ekf-slam refused {gated} of 100")]
-    assert bool(told) == is_told
-    assert detection_scores(log)["detections.nis"].verdict == ("" if is_told else "over-cautious")
+    lost = with_run(comparison, replace(comparison.runs[1], detections=log, params=params))
+    told = [sentence for sentence in finding(lost) if sentence.startswith("ekf-slam refused")]
+    assert told == lost_runs(lost)
+    assert len(told) == (advice is not None)
+    for sentence in told:
+        assert sentence.startswith(f"ekf-slam refused {gated} of 100 detections as outside its gate: it has lost its")
+        assert advice in sentence
+    few = replace(log, innovations=np.full((100, 2), 0.1), innovation_covs=np.tile(np.eye(2), (100, 1, 1)))
+    assert detection_scores(few)["detections.nis"].verdict == ("" if told else "over-cautious")
 
 
 def test_without_truth_innovations_tell_whether_covariances_hold():
@@ -157,21 +163,6 @@ def test_without_truth_innovations_tell_whether_covariances_hold():
         basin_comparison(60, truth=False), "isam2", "detections.nis", Score(6.9, "1", "By hand.", (0.9, 1.1), "inside")
     )
     assert "isam2 6.90 (over-confident)" in finding(comparison)[-1]
-
-
-def test_a_gate_that_refuses_much_may_have_three_causes():
-    comparison = only(basin_comparison(60), "isam2")
-    run = comparison.runs[0]
-    gated = replace(run.detections, outcomes=[Outcome.GATED] * 30 + [Outcome.USED] * 30)
-    for policy, advice in (
-        ("gate", 'identities are wrong (try identity.policy = "max-mixture"), or'),
-        (None, "wrong, or"),
-    ):
-        params = {} if policy is None else {"identity": {"policy": policy}}
-        (sentence,) = lost_runs(with_run(comparison, replace(run, detections=gated, params=params)))
-        assert "refused 30 of 60 detections as outside its gate: it has lost its way, identities are wrong" in sentence
-        assert advice in sentence
-        assert "or noise is set far too small" in sentence
 
 
 def with_map(
@@ -193,8 +184,13 @@ def log_of(outcomes: list[Outcome], innovations_m: list[float], landmark_id: int
     return DetectionLog(np.arange(n), np.full(n, landmark_id), innovations, covs, outcomes)
 
 
-def test_the_threshold_is_the_quantile_that_chance_exceeds_once_in_a_billion():
+def test_a_map_is_called_wrong_beyond_the_quantile_that_chance_exceeds_once_in_a_billion():
     assert np.exp(-ABSURD / 2) == pytest.approx(1e-9, rel=1e-6)  # of two degrees of freedom, in closed form
+    limit_m, rng = SIGMA_M * np.sqrt(ABSURD), np.random.default_rng(1)
+    assert doubt_of_identities(with_map(IDS, [0.999 * limit_m] * 4)) == []
+    (line,) = doubt_of_identities(with_map(IDS, [1.001 * limit_m] * 4))
+    assert "landmarks 1, 2, 3 and 4 far outside" in line
+    assert not any(doubt_of_identities(with_map(IDS, list(rng.normal(0, SIGMA_M, 4)))) for _ in range(50))
 
 
 def test_a_landmark_that_its_covariance_rules_out_is_named_with_the_policy():
@@ -209,36 +205,21 @@ def test_a_landmark_that_its_covariance_rules_out_is_named_with_the_policy():
     assert page.index("puts landmark 3 far outside") < page.index("<nav")
 
 
-def test_just_inside_the_quantile_nothing_is_said_and_just_outside_it_is():
-    limit_m = SIGMA_M * np.sqrt(ABSURD)
-    assert doubt_of_identities(with_map(IDS, [0.999 * limit_m] * 4)) == []
-    (line,) = doubt_of_identities(with_map(IDS, [1.001 * limit_m] * 4))
-    assert "landmarks 1, 2, 3 and 4 far outside" in line
+def test_without_true_landmarks_the_innovations_of_used_detections_tell():
+    def doubts(log: DetectionLog, *, has_truth: bool = False) -> list[str]:
+        return doubt_of_identities(with_map(IDS, [0.0] * 4, has_truth=has_truth, detections=log))
 
-
-def test_consistent_maps_are_never_called_wrong():
-    rng = np.random.default_rng(1)
-    assert not any(doubt_of_identities(with_map(IDS, list(rng.normal(0, SIGMA_M, 4)))) for _ in range(50))
-
-
-def test_without_true_landmarks_the_innovations_tell():
-    used = [Outcome.USED] * 10
-    for far, is_told in ((2, False), (3, True), (10, True)):
-        log = log_of(used, [1.0] * far + [0.01] * (10 - far))
-        lines = doubt_of_identities(with_map(IDS, [0.0] * 4, has_truth=False, detections=log))
-        assert bool(lines) == is_told, far
-        if far == 3:
-            assert "(mean NIS up to 375)" in lines[0]  # (3 * 50² + 7 * 0.5²) / 10 / 2
-        assert not doubt_of_identities(with_map(IDS, [0.0] * 4, detections=log))  # the truth says that all is well
-    assert lines[0].startswith("Warning: isam2: sightings of landmark 2 contradict its map (mean NIS up to 1250); look")
-
-
-def test_sightings_contradict_a_map_where_sigmas_are_four_times_too_small_but_not_where_three():
+    start = "Warning: isam2: sightings of landmark 2 contradict its map (mean NIS up to"
+    for far, nis in ((2, None), (3, 375), (10, 1250)):  # (3 * 50² + 7 * 0.5²) / 10 / 2
+        log = log_of([Outcome.USED] * 10, [1.0] * far + [0.01] * (10 - far))
+        assert [line.partition(");")[0] for line in doubts(log)] == ([f"{start} {nis}"] if nis else [])
+        assert not doubts(log, has_truth=True)  # the truth says that all is well
+    for outcome in (Outcome.GATED, Outcome.WITHHELD, Outcome.REPEATED):
+        assert not doubts(log_of([outcome] * 10, [1.0] * 10))
     n, rng = 2000, np.random.default_rng(2)
     unit = replace(log_of([Outcome.USED] * n, [0.0] * n), innovations=SIGMA_M * rng.standard_normal((n, 2)))
-    for factor, is_told in ((3.0, False), (4.0, True)):
-        log = replace(unit, innovations=factor * unit.innovations)
-        assert bool(doubt_of_identities(with_map(IDS, [0.0] * 4, has_truth=False, detections=log))) == is_told
+    for factor, is_told in ((3.0, False), (4.0, True)):  # sigmas so many times too small
+        assert bool(doubts(replace(unit, innovations=factor * unit.innovations))) == is_told
 
 
 @pytest.mark.parametrize(
@@ -252,33 +233,28 @@ def test_five_landmarks_are_named_and_more_are_counted(count, listed):
     assert f"sightings of landmarks {listed} contradict its map" in line
 
 
-@pytest.mark.parametrize("outcome", [Outcome.GATED, Outcome.WITHHELD, Outcome.REPEATED])
-def test_innovations_that_were_refused_say_nothing_of_the_map(outcome):
-    log = log_of([outcome] * 10, [1.0] * 10)
-    assert doubt_of_identities(with_map(IDS, [0.0] * 4, has_truth=False, detections=log)) == []
+BEFORE = [Outcome.UNSOUND, Outcome.LATE, Outcome.UNLOCATED, Outcome.TRACK_REPEATED]
+NAMELESS = [Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNFIT]
+"""Outcomes before an identity mattered, and those of detections without one that can be used."""
 
 
-@pytest.mark.parametrize("outcome", [Outcome.NO_IDENTITY, Outcome.WAITING, Outcome.FORGOTTEN, Outcome.UNFIT])
-def test_a_log_without_any_identity_is_told_with_what_to_do(outcome):
-    log = log_of([outcome] * 6, [np.nan] * 6)
-    blind = with_map(IDS, [0.0] * 4, detections=log)
+@pytest.mark.parametrize(
+    ("outcomes", "count"),
+    [
+        *(([outcome] * 6, 6) for outcome in NAMELESS),
+        *(([outcome] * 5 + [Outcome.NEW], 0) for outcome in NAMELESS),
+        ([*BEFORE, Outcome.WAITING, Outcome.NO_IDENTITY, Outcome.WAITING], 3),
+        (BEFORE, 0),
+    ],
+)
+def test_a_log_without_any_identity_is_told_with_what_to_do(outcomes, count):
+    blind = with_map(IDS, [0.0] * 4, detections=log_of(outcomes, [np.nan] * len(outcomes)))
     line = (
-        "Warning: none of 6 detections has an identity that isam2 can use: no landmark is mapped; "
+        f"Warning: none of {count} detections has an identity that isam2 can use: no landmark is mapped; "
         'isam2 maps them by place with identity.unknown.policy = "associate"'
     )
-    assert doubt_of_identities(blind) == [line]
-    assert line in printed(blind, 200)
-    assert "none of 6 detections has an identity" in render_report(blind)
-    one_used = log_of([outcome] * 5 + [Outcome.NEW], [np.nan] * 6)
-    assert doubt_of_identities(with_map(IDS, [0.0] * 4, detections=one_used)) == []
-
-
-def test_detections_that_were_refused_before_their_identity_mattered_do_not_hide_that_none_has_one():
-    before = [Outcome.UNSOUND, Outcome.LATE, Outcome.UNLOCATED, Outcome.TRACK_REPEATED]
-    mixed = log_of([*before, Outcome.WAITING, Outcome.NO_IDENTITY, Outcome.WAITING], [np.nan] * 7)
-    (line,) = doubt_of_identities(with_map(IDS, [0.0] * 4, detections=mixed))
-    assert line.startswith("Warning: none of 3 detections has an identity that isam2 can use")
-    assert doubt_of_identities(with_map(IDS, [0.0] * 4, detections=log_of(before, [np.nan] * 4))) == []
+    assert doubt_of_identities(blind) == ([line] if count else [])
+    assert (line in printed(blind, 200)) == bool(count)
 
 
 def test_runs_that_know_no_identity_are_named_together_with_the_most_that_any_was_given():
@@ -289,10 +265,10 @@ def test_runs_that_know_no_identity_are_named_together_with_the_most_that_any_wa
     (line,) = doubt_of_identities(comparison)
     assert line.startswith("Warning: none of 6 detections has an identity that isam2, ekf-slam can use")
     assert "associate" in line
-    comparison = with_run(
-        comparison, replace(comparison.runs[0], params={"identity": {"unknown": {"policy": "associate"}}})
-    )
-    assert not any("associate" in line for line in doubt_of_identities(comparison))
+    assert line.replace('"', "&#34;") in render_report(comparison)
+    params = {"identity": {"unknown": {"policy": "associate"}}}
+    asked = with_run(comparison, replace(comparison.runs[0], params=params))
+    assert not any("associate" in line for line in doubt_of_identities(asked))
 
 
 def test_landmarks_without_a_name_are_counted_and_scored_by_place():
@@ -307,26 +283,18 @@ def test_landmarks_without_a_name_are_counted_and_scored_by_place():
     scores = landmark_scores(nameless.runs[0].landmarks, nameless.sequence.true_landmarks)
     assert scores["landmarks.raw_m"].value == pytest.approx(np.sqrt((0.01**2 + 0.02**2 + 0.01**2) / 3))
     assert "3 landmarks matched by identity, 3 of them by place within 1 m" in scores["landmarks.raw_m"].protocol
-
-
-def test_a_landmark_without_a_name_is_wrong_where_its_place_names_it_but_its_covariance_rules_it_out():
-    nameless = with_map(np.arange(4) + FIRST_ANONYMOUS_ID, [0.01, 0.5, 3.0, 0.01])  # the third is nobody's
-    (line,) = doubt_of_identities(nameless)
+    off = with_map(np.arange(4) + FIRST_ANONYMOUS_ID, [0.01, 0.5, 3.0, 0.01])  # the third is nobody's
+    (line,) = doubt_of_identities(off)
     assert "puts landmark 2 far outside its covariance" in line
-
-
-def test_an_identity_that_is_merely_wrong_is_not_named_by_place():
-    wrong = with_map(np.array([1, 2, 3, 9]), [0.0] * 4)
+    unknown = with_map(np.array([1, 2, 3, FIRST_ANONYMOUS_ID]), [0.0] * 4, has_truth=False)
+    made_up = (
+        "isam2 found 1 landmark without a name (identity.unknown.policy); identities from 3000000000 on are made up."
+    )
+    assert nameless_landmarks(unknown) == [made_up]
+    wrong = with_map(np.array([1, 2, 3, 9]), [0.0] * 4)  # merely wrong, and not named by place
     assert nameless_landmarks(wrong) == []
     scores = landmark_scores(wrong.runs[0].landmarks, wrong.sequence.true_landmarks)
     assert "3 landmarks matched by identity (4 true" in scores["landmarks.raw_m"].protocol
-
-
-def test_without_truth_they_are_only_counted():
-    nameless = with_map(np.array([1, 2, 3, FIRST_ANONYMOUS_ID]), [0.0] * 4, has_truth=False)
-    assert nameless_landmarks(nameless) == [
-        "isam2 found 1 landmark without a name (identity.unknown.policy); identities from 3000000000 on are made up."
-    ]
 
 
 def test_of_a_logs_notes_the_doubts_are_said_and_gaps_and_unlikely_numbers_are_warnings():
@@ -346,41 +314,26 @@ def test_a_line_names_sensor_stamp_reason_distance_and_runs():
     assert refusal_lines(many) == [
         f"Warning: dvl, 20 rows, 0.000 to 19.000 s: {Refusal.OUTLIER} (squared distance 60 to 79); isam2"
     ]
+    own, other = refusing([outlier(0)], "isam2"), refusing([outlier(0, 70.0)], "ekf-slam")
+    assert [line.rsplit("; ")[-1] for line in refusal_lines(with_run(own, other.runs[1]))] == ["isam2", "ekf-slam"]
 
 
-def test_runs_that_refused_differently_have_lines_of_their_own():
-    comparison = refusing([outlier(0)], "isam2")
-    other = refusing([outlier(0, 70.0)], "ekf-slam")
-    both = with_run(comparison, next(run for run in other.runs if run.estimator == "ekf-slam"))
-    assert [line.rsplit("; ")[-1] for line in refusal_lines(both)] == ["isam2", "ekf-slam"]
-
-
-def test_terminal_and_page_say_the_same_and_nothing_where_nothing_was_refused():
-    start_ns = basin_comparison(60).sequence.start_ns
-    comparison = refusing([outlier(start_ns + NS, 512.6), late(start_ns)], "isam2")
-    below = printed(comparison, 200)
-    assert all(line in below for line in refusal_lines(comparison))
-    page = render_report(comparison)
+def test_terminal_and_page_say_what_was_refused_and_withheld_and_nothing_where_nothing_was():
+    start_ns, calm = basin_comparison(60).sequence.start_ns, basin_comparison(60)
+    refused = refusing([outlier(start_ns + NS, 512.6), late(start_ns)], "isam2")
+    comparison, line = with_run(refused, replace(refused.runs[0], withheld=[WITHHELD])), f"Warning: isam2: {WITHHELD}"
+    assert withheld_lines(comparison) == [line]
+    below, page = printed(comparison, 200), render_report(comparison)
+    assert all(line in below for line in [*refusal_lines(comparison), line])
+    assert page.index(line) < page.index("<nav")
     section = page[page.index('<h2 id="refused">') : page.index('<h2 id="time">')]
     for word in ("dvl", "1.000", Refusal.OUTLIER, "513", "imu", "0.000", Refusal.LATE, "isam2"):
         assert word in section
     assert "ekf-slam" not in section
-    assert 'id="refused"' not in render_report(basin_comparison(60))
-    assert "Warning" not in printed(basin_comparison(60), 200)
-
-
-def withholding(messages: list[str]) -> Comparison:
-    comparison = basin_comparison(60)
-    return with_run(comparison, replace(comparison.runs[0], withheld=messages))
-
-
-def test_terminal_and_page_say_what_was_withheld_the_first_lines_in_full():
-    comparison, line = withholding([WITHHELD]), f"Warning: isam2: {WITHHELD}"
-    assert withheld_lines(comparison) == [line]
-    assert line in printed(comparison, 200)
-    page = render_report(comparison)
-    assert page.index(line) < page.index("<nav")
-    lines = withheld_lines(withholding([f"{WITHHELD} {k}" for k in range(MOST_ROWS_NAMED + 2)]))
+    assert 'id="refused"' not in render_report(calm)
+    assert "Warning" not in printed(calm, 200)
+    messages = [f"{WITHHELD} {k}" for k in range(MOST_ROWS_NAMED + 2)]
+    lines = withheld_lines(with_run(calm, replace(calm.runs[0], withheld=messages)))
     assert len(lines) == MOST_ROWS_NAMED + 1
     assert lines[-1] == "Warning: isam2 withheld 2 more: runs/isam2/result.json has all"
-    assert withheld_lines(basin_comparison(60)) == []
+    assert withheld_lines(calm) == []
