@@ -12,7 +12,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from sonar_graph.evaluation.results import Comparison, RunResult
+from sonar_graph.evaluation.results import Comparison
 from sonar_graph.report.figure_style import colour, evenly, inline_svg, thinned
 from sonar_graph.report.figures import (
     error_figure,
@@ -23,15 +23,19 @@ from sonar_graph.report.figures import (
     yaw_figure,
 )
 from sonar_graph.report.maps import map_figure, paths_cut_off
-from sonar_graph.states import Trajectory
 from tests.synthetic import basin_comparison, only, with_failure, with_run
 
-FIGURES = [map_figure, error_figure, yaw_figure, nees_figure, innovation_figure, nis_figure, timing_figure]
-
-
-@pytest.fixture(scope="module")
-def comparison() -> Comparison:
-    return basin_comparison()
+TIME = "time since start (s)"
+FIGURES = {
+    map_figure: ("world x (m)", {"world y (m)"}),
+    error_figure: (TIME, {"error in x (m)", "error in y (m)", "yaw error (°)"}),
+    yaw_figure: (TIME, {"yaw (°)"}),
+    nees_figure: (TIME, {"position NEES / dof", "yaw NEES / dof"}),
+    innovation_figure: (TIME, {"range (m)", "azimuth (°)"}),
+    nis_figure: ("NIS", {"detections below (%)"}),
+    timing_figure: ("duration of an update (ms)", {"updates at most as long (%)"}),
+}
+"""Every figure, with the labels of its axes."""
 
 
 def drawn(figure: Figure | None) -> Figure:
@@ -39,39 +43,55 @@ def drawn(figure: Figure | None) -> Figure:
     return figure
 
 
-def labels(figure: Figure) -> list[tuple[str, str]]:
-    return [(panel.get_xlabel(), panel.get_ylabel()) for panel in figure.axes]
+@pytest.mark.parametrize("draw", FIGURES)
+def test_a_figure_is_a_well_formed_svg_with_quantities_and_units_in_the_colours_of_the_page(comparison, draw):
+    figure, (x, y) = drawn(draw(comparison)), FIGURES[draw]
+    assert {panel.get_xlabel() for panel in figure.axes} - {""} == {x}
+    assert {panel.get_ylabel() for panel in figure.axes} - {""} == y
+    svg = inline_svg(figure, "figure", 'says "<x>" & more')
+    root = ElementTree.fromstring(svg)
+    assert root.attrib["aria-label"] == 'says "<x>" & more'
+    assert "var(--ink)" in svg
+    assert re.findall(r"#[0-9a-f]{6}\b", svg) == [], "a fixed colour would not follow dark and light"
+    assert "http" not in svg
+    empty = replace(only(comparison), sequence=replace(comparison.sequence, truth=None, true_landmarks=None))
+    assert draw(empty) is None
 
 
-def run_of(comparison: Comparison, name: str) -> RunResult:
-    return next(run for run in comparison.runs if run.estimator == name)
-
-
-def moved(path: Trajectory, offset: list[float]) -> Trajectory:
-    return replace(path, positions=path.positions + np.array(offset))
-
-
-@pytest.mark.parametrize(
-    ("draw", "x", "y"),
-    [
-        (map_figure, "world x (m)", {"world y (m)"}),
-        (error_figure, "time since start (s)", {"error in x (m)", "error in y (m)", "yaw error (°)"}),
-        (yaw_figure, "time since start (s)", {"yaw (°)"}),
-        (nees_figure, "time since start (s)", {"position NEES / dof", "yaw NEES / dof"}),
-        (innovation_figure, "time since start (s)", {"range (m)", "azimuth (°)"}),
-        (nis_figure, "NIS", {"detections below (%)"}),
-        (timing_figure, "duration of an update (ms)", {"updates at most as long (%)"}),
-    ],
-)
-def test_axes_say_quantity_and_unit(comparison, draw, x, y):
-    named = labels(drawn(draw(comparison)))
-    assert {label for label, _ in named} - {""} == {x}
-    assert {label for _, label in named} - {""} == y
-
-
-def test_three_dimensional_run_shows_the_error_in_height():
+def test_height_is_drawn_of_three_dimensional_runs_and_no_error_without_truth():
     figure = drawn(error_figure(basin_comparison(60, planar=False)))
-    assert "error in z (m)" in {label for _, label in labels(figure)}
+    assert "error in z (m)" in {panel.get_ylabel() for panel in figure.axes}
+    comparison = basin_comparison(60, truth=False)
+    assert [draw for draw in FIGURES if draw(comparison) is None] == [error_figure, nees_figure]
+
+
+def test_two_inline_svgs_share_no_identifier(comparison):
+    figures = [drawn(yaw_figure(comparison)), drawn(timing_figure(comparison))]
+    first, second = (inline_svg(figure, name, "") for figure, name in zip(figures, ("a", "b"), strict=True))
+    own = [set(re.findall(r'\sid="([^"]+)"', svg)) for svg in (first, second)]
+    assert own[0]
+    assert not own[0] & own[1]
+    assert set(re.findall(r"url\(#([^)]+)\)", first)) <= own[0]
+
+
+def test_map_has_one_scale_landmark_ids_smoothed_paths_that_differ_and_keeps_its_view(comparison):
+    panel = drawn(map_figure(comparison)).axes[0]
+    assert panel.get_aspect() == 1
+    assert {text.get_text() for text in panel.texts} == {"1", "2", "3", "4"}
+    shown = panel.get_legend_handles_labels()[1]
+    assert "isam2, smoothed" in shown
+    assert "ekf-slam, smoothed" not in shown
+    *_, run = comparison.runs
+    away = replace(run.causal, positions=run.causal.positions + np.array([500.0, 0, 0]))
+    gone = with_run(comparison, replace(run, causal=away, smoothed=None))
+    assert np.ptp(drawn(map_figure(gone)).axes[0].get_xlim()) < 20
+    assert paths_cut_off(gone) == ["dead-reckoning"]
+    assert paths_cut_off(only(comparison, "isam2")) == []
+
+
+@pytest.fixture(scope="module")
+def comparison() -> Comparison:
+    return basin_comparison()
 
 
 def test_errors_and_their_band_are_drawn_in_their_units(comparison):
@@ -107,7 +127,7 @@ def test_yaw_is_never_joined_across_the_wrap(comparison):
 
 
 def test_landmark_ellipses_hold_95_percent_of_draws(comparison):
-    run = run_of(comparison, "isam2")
+    run = comparison.runs[0]
     assert run.landmarks is not None
     panel = drawn(map_figure(only(comparison, "isam2"))).axes[0]
     ellipses = [patch for patch in panel.patches if isinstance(patch, Ellipse)]
@@ -119,27 +139,6 @@ def test_landmark_ellipses_hold_95_percent_of_draws(comparison):
         along = (draws - ellipse.center) @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
         inside = np.sum((2 * along / [ellipse.width, ellipse.height]) ** 2, axis=1) <= 1
         assert inside.mean() == pytest.approx(0.95, abs=0.01)
-
-
-def test_map_has_one_scale_and_landmark_ids(comparison):
-    panel = drawn(map_figure(comparison)).axes[0]
-    assert panel.get_aspect() == 1
-    assert {text.get_text() for text in panel.texts} == {"1", "2", "3", "4"}
-
-
-def test_a_run_that_flies_off_does_not_shrink_the_map(comparison):
-    run = run_of(comparison, "dead-reckoning")
-    assert run.causal is not None
-    gone = with_run(comparison, replace(run, causal=moved(run.causal, [500.0, 0, 0]), smoothed=None))
-    assert np.ptp(drawn(map_figure(gone)).axes[0].get_xlim()) < 20
-    assert paths_cut_off(gone) == ["dead-reckoning"]
-    assert paths_cut_off(only(comparison, "isam2")) == []
-
-
-def test_the_smoothed_path_is_drawn_only_where_it_differs(comparison):
-    shown = drawn(map_figure(comparison)).axes[0].get_legend_handles_labels()[1]
-    assert "isam2, smoothed" in shown
-    assert "ekf-slam, smoothed" not in shown
 
 
 @pytest.mark.parametrize("draw", [map_figure, yaw_figure, timing_figure])
@@ -155,37 +154,6 @@ def test_every_nees_stays_in_view(comparison):
     for panel, run in zip(figure.axes, comparison.runs, strict=False):
         errors = comparison.errors[run.estimator]["causal"]
         assert panel.get_ylim()[1] > np.nanmax(errors.nees_position) / errors.position_dof
-
-
-def test_without_truth_only_the_figures_of_errors_are_missing():
-    comparison = basin_comparison(60, truth=False)
-    missing = {draw.__name__ for draw in FIGURES if draw(comparison) is None}
-    assert missing == {"error_figure", "nees_figure"}
-
-
-@pytest.mark.parametrize("draw", FIGURES)
-def test_nothing_to_draw_is_no_figure(comparison, draw):
-    empty = replace(only(comparison), sequence=replace(comparison.sequence, truth=None, true_landmarks=None))
-    assert draw(empty) is None
-
-
-@pytest.mark.parametrize("draw", FIGURES)
-def test_inline_svg_is_well_formed_and_takes_the_colours_of_the_page(comparison, draw):
-    svg = inline_svg(drawn(draw(comparison)), "figure", 'says "<x>" & more')
-    root = ElementTree.fromstring(svg)
-    assert root.attrib["aria-label"] == 'says "<x>" & more'
-    assert "var(--ink)" in svg
-    assert re.findall(r"#[0-9a-f]{6}\b", svg) == [], "a fixed colour would not follow dark and light"
-    assert "http" not in svg
-
-
-def test_two_inline_svgs_share_no_identifier(comparison):
-    figures = [drawn(yaw_figure(comparison)), drawn(timing_figure(comparison))]
-    first, second = (inline_svg(figure, name, "") for figure, name in zip(figures, ("a", "b"), strict=True))
-    own = [set(re.findall(r'\sid="([^"]+)"', svg)) for svg in (first, second)]
-    assert own[0]
-    assert not own[0] & own[1]
-    assert set(re.findall(r"url\(#([^)]+)\)", first)) <= own[0]
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=400), st.integers(4, 60))

@@ -67,7 +67,7 @@ def test_estimates_stand_beside_the_truth_with_their_difference(estimated, true,
     assert len(shown) == (len(expected) if true is None else 2 * len(true) + 2)
 
 
-def test_totals_are_the_scores():
+def test_totals_are_the_scores_and_landmarks_beyond_what_a_page_holds_are_counted():
     comparison = basin_comparison(60)
     table = landmark_table(comparison)
     assert table is not None
@@ -76,18 +76,12 @@ def test_totals_are_the_scores():
     for row, key in zip(table.rows[first:], ("landmarks.raw_m", "landmarks.se2_m"), strict=True):
         expected = [f"{comparison.scores[name][key].value:.3f}" for name in ("isam2", "ekf-slam")]
         assert [cell.text for cell in row[2:]] == expected
-
-
-def test_no_map_no_table():
-    assert landmark_table(only(basin_comparison(8), "dead-reckoning")) is None
-    assert landmark_table(by_hand(mapped(), mapped((1, 0.0, 0.0)))) is None
-
-
-def test_landmarks_beyond_what_a_page_holds_are_counted():
     many = mapped(*((i, float(i), 0.0) for i in range(MOST_LANDMARKS + 3)))
     assert len(rows_of(by_hand(many, many))) == 2 * MOST_LANDMARKS + 2
     assert landmarks_left_out(by_hand(many, many)) == 3
-    assert landmarks_left_out(basin_comparison(8)) == 0
+    assert landmarks_left_out(comparison) == 0
+    assert landmark_table(only(comparison, "dead-reckoning")) is None, "no map, no table"
+    assert landmark_table(by_hand(mapped(), mapped((1, 0.0, 0.0)))) is None
 
 
 def test_only_the_repeated_experiment_has_the_papers_column():

@@ -70,15 +70,11 @@ def test_ellipses_are_enlarged_only_as_far_as_there_is_room(sigma_m):
     assert factor == 1 or half_m <= LARGEST_ELLIPSE * float((view[1] - view[0]).max())
 
 
-def test_without_maps_on_the_way_the_page_says_so():
+def test_without_maps_on_the_way_the_page_says_so_and_a_failed_run_has_no_row():
     comparison = basin_comparison(60)
     assert growth_figure(comparison) is None
     assert illustrations(comparison)["growth"].instead
-
-
-def test_a_failed_run_has_no_row():
-    comparison = with_failure(grown(60), "ekf-slam", "gave up")
-    figure = growth_figure(comparison)
+    figure = growth_figure(with_failure(grown(60), "ekf-slam", "gave up"))
     assert figure is not None
     assert len(figure.axes) == 3
 
