@@ -17,6 +17,7 @@ from sonar_graph.batch.store import SUITE
 METRICS = ["causal.ate_se2_m", "causal.yaw_rmse_rad", "landmarks.se2_m"]
 ESTIMATORS = {"dead-reckoning": 0.4, "isam2": 0.1, "ekf-slam": 0.12}
 ASKED = {"generator": "basin", "options": {"laps": 1}, "landmarks": None, "settings": {}, "rate_hz": 2.0, "files": {}}
+FIELDS = ("key", "log", "seed", "variant", "estimator", "status", "reason", "log_file")
 LOGS = ("basin", "basin, wrong_id_rate=0.05")
 
 
@@ -53,18 +54,6 @@ def with_missing(batch: RecordedBatch, contestant: str, log: str, count: int) ->
     return replace(batch, runs=done, missing=[*batch.missing, *lacking])
 
 
-def changed(batch: RecordedBatch, contestant: str, column: str, factors: np.ndarray | float) -> RecordedBatch:
-    """The batch, had one column of a contestant been multiplied."""
-    own = iter(np.broadcast_to(factors, len([run for run in batch.runs if run.contestant == contestant])).tolist())
-    runs = []
-    for run in batch.runs:
-        if run.contestant == contestant:
-            factor = next(own)
-            run = replace(run, values=run.values | {column: run.values[column] * factor})
-        runs.append(run)
-    return replace(batch, runs=runs)
-
-
 def updated(
     batch: RecordedBatch, values: Callable[[RecordedRun], dict[str, float]], contestants: tuple[str, ...] = ()
 ) -> RecordedBatch:
@@ -74,36 +63,29 @@ def updated(
     return replace(batch, runs=runs)
 
 
+def changed(batch: RecordedBatch, contestant: str, column: str, factors: np.ndarray | float) -> RecordedBatch:
+    """The batch, had one column of a contestant been multiplied."""
+    count = sum(run.contestant == contestant for run in batch.runs)
+    own = iter(np.broadcast_to(factors, count).tolist())
+    return updated(batch, lambda run: {column: run.values[column] * next(own)}, (contestant,))
+
+
 def without(batch: RecordedBatch, column: str, log: str | None = None) -> RecordedBatch:
     """The batch, had its runs, or those on one log, no column whose name has this part."""
-    runs = [
-        replace(run, values={key: value for key, value in run.values.items() if column not in key})
-        if log in (None, run.log)
-        else run
-        for run in batch.runs
-    ]
-    return replace(batch, runs=runs)
+
+    def without_column(run: RecordedRun) -> RecordedRun:
+        return replace(run, values={key: value for key, value in run.values.items() if column not in key})
+
+    return replace(batch, runs=[without_column(run) if log in (None, run.log) else run for run in batch.runs])
 
 
 def write_batch(batch: RecordedBatch, folder: Path) -> Path:
     """``results.parquet`` and ``suite.toml`` in a folder."""
     rows = [
         {
-            "key": run.key,
-            "suite": batch.name,
-            "log": run.log,
-            "generator": "basin",
-            "options": json.dumps({"laps": 1}),
-            "asked": run.texts["asked"],
-            "seed": run.seed,
-            "variant": run.variant,
-            "params": "{}",
-            "estimator": run.estimator,
-            "status": run.status,
-            "reason": run.reason,
-            "log_file": run.log_file,
-            "sonar_graph": "0.1",
-            "machine": "Linux, 4 processors",
+            **{name: getattr(run, name) for name in FIELDS},
+            **{"suite": batch.name, "generator": "basin", "options": '{"laps": 1}', "params": "{}"},
+            **{"asked": run.texts["asked"], "sonar_graph": "0.1", "machine": "Linux, 4 processors"},
             **{key: run.values.get(key) for key in (batch.runs or batch.missing)[-1].values},
         }
         for run in sorted([*batch.runs, *batch.missing], key=lambda run: run.place)

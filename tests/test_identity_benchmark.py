@@ -1,8 +1,9 @@
-"""The table of late and wrong identities: what it makes of runs that fail, and of runs that are kept."""
+"""The tables of late, wrong and falsified identities: what they make of runs that fail, and of runs that are kept."""
 
 from __future__ import annotations
 
 import importlib
+import itertools
 import json
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+FIGURES = ("smoothed", "causal", "landmarks", "time_s")
 
 
 @pytest.fixture
@@ -26,6 +28,11 @@ def table(monkeypatch) -> Any:
 @pytest.fixture
 def kept(table) -> Any:
     return importlib.import_module("identity_runs")
+
+
+@pytest.fixture
+def falsified(table) -> Any:
+    return importlib.import_module("mrclam_wrong_ids")
 
 
 def judged(kept: Any, error_m: float | None) -> Any:
@@ -86,6 +93,32 @@ def test_landmarks_that_are_not_found_are_no_gain(table, kept):
     found = table.summarise(wrong, clean, "iSAM2, robust")
     assert (found["missing"], found["more_missing"]) == (1.5, 1.5)
     assert found["landmark_loss"] < 0
+
+
+def collected(falsified: Any, failing: dict[tuple[str, float], int]) -> dict[str, Any]:
+    """Every run as good as any other, but for some robots' of some estimators and shares."""
+    cases = list(itertools.product(falsified.ROBOTS, (0.0, falsified.SHARE), falsified.ESTIMATORS))
+    runs = [
+        dict.fromkeys(FIGURES, np.nan if robot <= failing.get((label, share), 0) else 0.1)
+        for robot, share, label in cases
+    ]
+    return falsified.collect(cases, runs)
+
+
+def test_a_mean_of_recorded_runs_is_over_all_robots_and_none_that_counts_is_lost(falsified):
+    share = falsified.SHARE
+    figures = collected(falsified, {("isam2 robust", share): 1})
+    assert figures["isam2_robust_smoothed_wrong"] is None
+    assert figures["isam2_robust_growth"] is None
+    assert (figures["isam2_robust_lost_wrong"], figures["isam2_robust_lost_right"]) == (1, 0)
+    assert figures["isam2_gate_smoothed_wrong"] == pytest.approx(0.1)
+    for failing, is_met in (
+        ({}, True),
+        ({("isam2 robust", share): 2, ("ekf-slam", 0.0): 5}, True),
+        ({("isam2 gnc", share): 1}, False),
+        ({("isam2 gate", 0.0): 1}, False),
+    ):
+        assert falsified.is_met(collected(falsified, failing)) is is_met
 
 
 def test_what_is_kept_belongs_to_one_run_of_one_version(table, kept, tmp_path, monkeypatch):

@@ -10,6 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_typestore
+
+from sonar_graph.logs.adapters.log_config import read_log_config
+from sonar_graph.logs.reading import read_log
+from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
 TUTORIALS = Path(__file__).parents[1] / "docs" / "tutorials"
 TRUE_LANDMARKS = {1: (5.0, 0.0), 2: (7.0, -5.0), 3: (2.0, -7.0), 4: (0.0, -2.0)}
@@ -18,14 +24,9 @@ TRUE_LANDMARKS = {1: (5.0, 0.0), 2: (7.0, -5.0), 3: (2.0, -7.0), 4: (0.0, -2.0)}
 def output(folder: Path, *command: object, **environment: str) -> str:
     """Output of a command that ends well; the first word is an installed script."""
     script, *words = map(str, command)
-    done = subprocess.run(
-        [Path(sys.executable).parent / script, *words],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=600,
-        env=os.environ | environment,
-    )
+    asked = [Path(sys.executable).parent / script, *words]
+    told = os.environ | environment
+    done = subprocess.run(asked, cwd=folder, capture_output=True, text=True, timeout=600, env=told)
     assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
     return done.stdout
 
@@ -120,7 +121,11 @@ def test_page_on_own_logs_has_programs_a_configuration_and_commands_that_work(tm
     page = (TUTORIALS / "04_your_own_log.md").read_text(encoding="utf-8")
     making, *others = blocks(page, "python")
     (configuration,) = blocks(page, "toml")
-    write_ros1_bag(tmp_path / "old.bag")
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Writer(tmp_path / "old.bag") as writer:
+        connection = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=store)
+        text = store.types["std_msgs/msg/String"]("hello")
+        writer.write(connection, 1, store.serialize_ros1(text, "std_msgs/msg/String"))
     output(tmp_path, "python", "-W", "error", "-c", making)
     printed = {}
     for line in re.findall(r"^    sonar-graph (.*)$", page, re.MULTILINE):
@@ -136,28 +141,9 @@ def test_page_on_own_logs_has_programs_a_configuration_and_commands_that_work(tm
     assert not {"warning", "not usable", "left out"} & set(re.findall("warning|not usable|left out", second))
     for program in others:
         output(tmp_path, "python", "-W", "error", "-c", program)
-    assert_is_simulated(tmp_path)
-
-
-def write_ros1_bag(path: Path) -> None:
-    from rosbags.rosbag1 import Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS1_NOETIC)
-    with Writer(path) as writer:
-        text = store.types["std_msgs/msg/String"]("hello")
-        connection = writer.add_connection("/chatter", "std_msgs/msg/String", typestore=store)
-        writer.write(connection, 1, store.serialize_ros1(text, "std_msgs/msg/String"))
-
-
-def assert_is_simulated(folder: Path) -> None:
-    """What is read from the log that the page makes is what was simulated, whatever the axes and units between."""
-    from sonar_graph.logs.adapters.log_config import read_log_config
-    from sonar_graph.logs.reading import read_log
-    from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-
+    # What is read from the log that the page makes is what was simulated, whatever the axes and units between.
     truth = simulate_basin(BasinOptions(seed=1, duration_s=120.0, laps=1))
-    found = read_log(folder / "dive.mcap", config=read_log_config(folder / "dive.toml"))
+    found = read_log(tmp_path / "dive.mcap", config=read_log_config(tmp_path / "dive.toml"))
     assert truth.depth
     assert found.depth
     np.testing.assert_allclose(found.imu.angular_velocity, truth.imu.angular_velocity, atol=1e-12)

@@ -18,18 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from sonar_graph.batch.permutation import (
-    LEAST_CASES,
-    SIGNIFICANT,
-    Case,
-    Family,
-    Group,
-    Ratios,
-    detectable,
-    families,
-    testable,
-    with_all_logs,
-)
+from sonar_graph.batch import permutation
 from sonar_graph.batch.recorded import ALL_LOGS, RecordedBatch, RecordedRun, require_complete
 from sonar_graph.batch.result_table import KINDS, is_timing, metrics_of
 from sonar_graph.errors import EvaluationError
@@ -97,7 +86,7 @@ class GateVerdict:
     @property
     def untested(self) -> list[str]:
         """Contestants with too few cases for a test."""
-        return [contestant for contestant, cases in self.cases.items() if cases < LEAST_CASES]
+        return [contestant for contestant, cases in self.cases.items() if cases < permutation.LEAST_CASES]
 
     @property
     def has_test(self) -> bool:
@@ -176,7 +165,7 @@ def gate(batch: RecordedBatch, reference: Path) -> GateVerdict:
     columns = [key for key in content["metrics"] if not is_timing(key)]
     worsenings: list[Worsening] = []
     pairs: list[Pair] = []
-    ratios: Ratios = {}
+    ratios: permutation.Ratios = {}
     for name, entry in blessed.items():
         run, scores = runs[name], entry["scores"]
         seed = "" if run.seed is None else f"seed {run.seed}: "
@@ -192,9 +181,9 @@ def gate(batch: RecordedBatch, reference: Path) -> GateVerdict:
                 case = run.log if run.seed is None else run.seed
                 ratio = float(log_ratios(np.array([old]), np.array([new]), column)[0])
                 ratios.setdefault((run.log, run.contestant, column), {})[case] = ratio
-    ratios = with_all_logs(ratios)
-    tested = families(movable(ratios))
-    cases: dict[str, set[Case]] = {runs[name].contestant: set() for name in blessed}
+    ratios = permutation.with_all_logs(ratios)
+    tested = permutation.families(movable(ratios))
+    cases: dict[str, set[permutation.Case]] = {runs[name].contestant: set() for name in blessed}
     for (_, contestant, _), values in ratios.items():
         cases[contestant].update(values)
     errors = [column for column in columns if column not in CONSISTENCY_KEYS]
@@ -203,7 +192,7 @@ def gate(batch: RecordedBatch, reference: Path) -> GateVerdict:
         look_at=standing_out(pairs, ratios),
         compared=len(blessed),
         cases={contestant: len(own) for contestant, own in cases.items()},
-        detectable=detectable(tested, errors, math.log1p(TOLERANCE)),
+        detectable=permutation.detectable(tested, errors, math.log1p(TOLERANCE)),
         new=[told(name) for name in runs if name not in blessed],
     )
 
@@ -276,7 +265,7 @@ def limit_of(column: str) -> float:
     return math.log1p(CONSISTENCY_TOLERANCE if column in CONSISTENCY_KEYS else TOLERANCE)
 
 
-def movable(ratios: Ratios) -> Ratios:
+def movable(ratios: permutation.Ratios) -> permutation.Ratios:
     """Ratios less the limit, of groups that can be worse; each set of numbers once.
 
     The mean is at most the root of the mean square. If that is within the limit there is nothing to test, and no test
@@ -291,12 +280,12 @@ def movable(ratios: Ratios) -> Ratios:
     }
 
 
-def worse_groups(ratios: Ratios, tested: list[Family]) -> list[Worsening]:
+def worse_groups(ratios: permutation.Ratios, tested: list[permutation.Family]) -> list[Worsening]:
     """Groups significantly beyond the limit."""
     worse = []
     for family in tested:
         for group, p_value in zip(family.groups, family.p_values.tolist(), strict=True):
-            if p_value > SIGNIFICANT:
+            if p_value > permutation.SIGNIFICANT:
                 continue
             log, contestant, column = group
             own = ratios[group]
@@ -308,10 +297,10 @@ def worse_groups(ratios: Ratios, tested: list[Family]) -> list[Worsening]:
     return worse
 
 
-def standing_out(pairs: list[Pair], ratios: Ratios) -> list[str]:
+def standing_out(pairs: list[Pair], ratios: permutation.Ratios) -> list[str]:
     """Runs far beyond all of the reference, the farthest first, then groups without a test; one line each."""
     errors = [pair for pair in pairs if pair.column not in CONSISTENCY_KEYS]
-    worst: dict[Group, float] = {}
+    worst: dict[permutation.Group, float] = {}
     for pair in errors:
         group = (pair.run.log, pair.run.contestant, pair.column)
         worst[group] = max(worst.get(group, 0.0), pair.old)
@@ -326,7 +315,7 @@ def standing_out(pairs: list[Pair], ratios: Ratios) -> list[str]:
         "the reference"
         for name, (_, pair) in sorted(farthest.items(), key=lambda one: -one[1][0])
     ]
-    known, have_test = {name[:2] for name in farthest}, testable(ratios)
+    known, have_test = {name[:2] for name in farthest}, permutation.testable(ratios)
     most: dict[tuple[str, str], tuple[float, int, str]] = {}  # the column that is up most
     for (log, contestant, column), own in ratios.items():
         is_told = log == ALL_LOGS or (log, contestant) in known or (log, contestant, column) in have_test

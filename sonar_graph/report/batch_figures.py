@@ -15,20 +15,8 @@ from matplotlib.ticker import LogLocator
 
 from sonar_graph.batch import KINDS, Metric, RecordedBatch, failure_rate, quantile
 from sonar_graph.measurements import Floats
+from sonar_graph.report import figure_style as style
 from sonar_graph.report.batch_tables import SAME_EVIDENCE, Tests, anees_of, is_evidence, unit_of
-from sonar_graph.report.figure_style import (
-    INK,
-    LABEL_SIZE,
-    MUTED,
-    TICK_SIZE,
-    TRUTH,
-    Illustration,
-    blank_panels,
-    colour,
-    head_panel,
-    inline_svg,
-    logarithmic,
-)
 from sonar_graph.report.rendering import csv_text
 
 ROW_IN, PANEL_IN, WIDTH_IN = 0.36, 0.95, 7.4
@@ -51,7 +39,7 @@ def log_panels(batch: RecordedBatch, logs: list[str], x_label: str) -> tuple[Fig
     columns = 1 if len(logs) <= STACKED else min(MOST_COLUMNS, len(logs) - 1)
     rows = -(-len(logs) // columns)
     height_in = rows * (PANEL_IN + ROW_IN * len(names))
-    figure, axes = blank_panels(rows, columns, (WIDTH_IN, height_in))
+    figure, axes = style.blank_panels(rows, columns, (WIDTH_IN, height_in))
     panels: list[Axes] = list(axes.flat)
     for panel in panels[len(logs) :]:
         panel.remove()
@@ -62,10 +50,10 @@ def log_panels(batch: RecordedBatch, logs: list[str], x_label: str) -> tuple[Fig
         panel.set(ylim=(len(names) - 0.5, -0.5), yticks=range(len(names)), yticklabels=labels)
         panel.grid(False, axis="y")
         for place, label in enumerate(panel.get_yticklabels()):
-            label.set_color(colour(place))
+            label.set_color(style.colour(place))
             label.set_linespacing(0.95)
-        head_panel(panel, folded(log, HEADING_LETTERS) if narrow else log)
-    figure.supxlabel(x_label, color=INK, fontsize=LABEL_SIZE)
+        style.head_panel(panel, folded(log, HEADING_LETTERS) if narrow else log)
+    figure.supxlabel(x_label, color=style.INK, fontsize=style.LABEL_SIZE)
     return figure, panels[: len(logs)]
 
 
@@ -89,11 +77,11 @@ def folded(name: str, letters: int) -> str:
 
 def spread_out(panel: Axes) -> None:
     """A logarithmic scale with numbers at 1, 2 and 5 of each power of ten."""
-    logarithmic(panel, "x")
+    style.logarithmic(panel, "x")
     panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
 
 
-def spread_drawing(batch: RecordedBatch, metric: Metric) -> Illustration | None:
+def spread_drawing(batch: RecordedBatch, metric: Metric) -> style.Illustration | None:
     """Every run's value as a dot, with the median and the middle 80 %."""
     logs = [log for log in batch.logs if any(_finite(batch, log, name, metric).size for name in batch.contestants)]
     if not logs:
@@ -117,7 +105,7 @@ def spread_drawing(batch: RecordedBatch, metric: Metric) -> Illustration | None:
     return _drawn(figure, f"spread-{metric.name}", metric.label, caption, rows)
 
 
-def difference_drawing(batch: RecordedBatch, metric: Metric, tests: Tests) -> Illustration | None:
+def difference_drawing(batch: RecordedBatch, metric: Metric, tests: Tests) -> style.Illustration | None:
     """Mean differences to the reference with their intervals."""
     found = {place: test for place, (test, _) in tests.items() if place[0] in metric.keys.values()}
     logs = [log for log in batch.logs if any(place[1] == log and math.isfinite(t.mean) for place, t in found.items())]
@@ -125,7 +113,7 @@ def difference_drawing(batch: RecordedBatch, metric: Metric, tests: Tests) -> Il
         return None
     figure, panels = log_panels(batch, logs, f"difference to {batch.reference}{unit_of(metric)}")
     for panel, log in zip(panels, logs, strict=True):
-        panel.axvline(0, color=TRUTH, linewidth=1.6)
+        panel.axvline(0, color=style.TRUTH, linewidth=1.6)
         for place, contestant in enumerate(batch.contestants):
             for over, key in metric.keys.items():
                 test = found.get((key, log, contestant))
@@ -145,7 +133,7 @@ def difference_drawing(batch: RecordedBatch, metric: Metric, tests: Tests) -> Il
     return _drawn(figure, f"difference-{metric.name}", f"{metric.label}: against {batch.reference}", caption, rows)
 
 
-def consistency_drawing(batch: RecordedBatch, what: str) -> Illustration | None:
+def consistency_drawing(batch: RecordedBatch, what: str) -> style.Illustration | None:
     """ANEES over independent runs against its chi-square band."""
     rows: Rows = [["log", "contestant", "estimate", "runs", "anees", "low", "high"]]
     known: dict[tuple[str, str], list[tuple[str, float]]] = {}
@@ -168,8 +156,8 @@ def consistency_drawing(batch: RecordedBatch, what: str) -> Illustration | None:
         spread_out(panel)
         for low, high in bands[log]:
             if math.isfinite(low):
-                panel.axvspan(low, high, color=TRUTH, alpha=0.25, linewidth=0)
-        panel.axvline(1, color=TRUTH, linewidth=1.6)
+                panel.axvspan(low, high, color=style.TRUTH, alpha=0.25, linewidth=0)
+        panel.axvline(1, color=style.TRUTH, linewidth=1.6)
         for place, contestant in enumerate(batch.contestants):
             for over, mean in known.get((log, contestant), []):
                 _draw_point(panel, mean, place, over)
@@ -184,7 +172,7 @@ def consistency_drawing(batch: RecordedBatch, what: str) -> Illustration | None:
     return _drawn(figure, f"anees-{what}", f"Consistency of {what}", caption, rows)
 
 
-def failure_drawing(batch: RecordedBatch) -> Illustration | None:
+def failure_drawing(batch: RecordedBatch) -> style.Illustration | None:
     """Failure rates with their intervals; None where every run ended."""
     if all(run.ended for run in batch.runs):
         return None
@@ -204,7 +192,7 @@ def failure_drawing(batch: RecordedBatch) -> Illustration | None:
     return _drawn(figure, "failures", "Runs that did not end", caption, rows)
 
 
-def cost_drawing(batch: RecordedBatch) -> Illustration | None:
+def cost_drawing(batch: RecordedBatch) -> style.Illustration | None:
     """Median and 99th percentile of the time of an update, over all runs of a group."""
     keys = ("update_p50_ms", "update_p99_ms")
     if not any(keys[0] in run.values for run in batch.runs):
@@ -217,16 +205,16 @@ def cost_drawing(batch: RecordedBatch) -> Illustration | None:
             ends = [quantile(batch.values(log, contestant, key), 0.5) for key in keys]
             rows.append([log, contestant, *map(_text, ends)])
             if all(map(math.isfinite, ends)):
-                panel.plot(ends, [place, place], color=colour(place), linewidth=2.4)
-                panel.plot(ends[0], place, "o", color=colour(place), markersize=6)
-                panel.plot(ends[1], place, "|", color=colour(place), markersize=11, markeredgewidth=2.4)
+                panel.plot(ends, [place, place], color=style.colour(place), linewidth=2.4)
+                panel.plot(ends[0], place, "o", color=style.colour(place), markersize=6)
+                panel.plot(ends[1], place, "|", color=style.colour(place), markersize=11, markeredgewidth=2.4)
     caption = "Dot: median over runs of the median time of an update. Stroke: median over runs of the 99th percentile."
     return _drawn(figure, "costs", "Time of an update", caption, rows)
 
 
 def _draw_spread(panel: Axes, values: Floats, place: int, over: str) -> None:
     known, row = values[np.isfinite(values)], place + KIND_SHIFT[over]
-    own = colour(place)
+    own = style.colour(place)
     if not known.size:
         return
     inside = [quantile(values, share) for share in (0.1, 0.9)]
@@ -236,22 +224,24 @@ def _draw_spread(panel: Axes, values: Floats, place: int, over: str) -> None:
     panel.plot(known, shifts, "o", color=own, markersize=3.6, markerfacecolor=own if FILLED[over] else "none")
     middle = quantile(values, 0.5)
     if math.isfinite(middle):
-        panel.plot(middle, row, "|", color=INK, markersize=12, markeredgewidth=1.6)
+        panel.plot(middle, row, "|", color=style.INK, markersize=12, markeredgewidth=1.6)
     if len(known) < len(values):
         across, note = panel.get_yaxis_transform(), f"{len(values) - len(known)} without"
-        panel.text(1.01, row, note, transform=across, ha="left", va="center", color=MUTED, fontsize=TICK_SIZE - 1)
+        panel.text(
+            1.01, row, note, transform=across, ha="left", va="center", color=style.MUTED, fontsize=style.TICK_SIZE - 1
+        )
 
 
 def _draw_interval(panel: Axes, ends: Floats, place: int, over: str) -> None:
     """A point with the interval about it, shape (3,): point, low, high."""
     row = place + KIND_SHIFT[over]
     if np.isfinite(ends[1:]).all():
-        panel.plot(ends[1:], [row, row], color=colour(place), linewidth=1.8)
+        panel.plot(ends[1:], [row, row], color=style.colour(place), linewidth=1.8)
     _draw_point(panel, float(ends[0]), place, over)
 
 
 def _draw_point(panel: Axes, value: float, place: int, over: str) -> None:
-    own = colour(place)
+    own = style.colour(place)
     face = own if FILLED[over] else "none"
     panel.plot(
         value, place + KIND_SHIFT[over], "o", color=own, markerfacecolor=face, markersize=6.5, markeredgewidth=1.6
@@ -271,7 +261,7 @@ def _text(value: float) -> str:
     return repr(float(value)) if math.isfinite(value) else ""
 
 
-def _drawn(figure: Figure, name: str, title: str, caption: str, rows: Rows) -> Illustration:
+def _drawn(figure: Figure, name: str, title: str, caption: str, rows: Rows) -> style.Illustration:
     plain_name = name.replace("_", "-").replace(".", "-")
-    svg = inline_svg(figure, plain_name, f"{title}. {caption}")
-    return Illustration(plain_name, title, caption, svg, data=csv_text(rows))
+    svg = style.inline_svg(figure, plain_name, f"{title}. {caption}")
+    return style.Illustration(plain_name, title, caption, svg, data=csv_text(rows))

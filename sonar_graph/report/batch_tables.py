@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -342,20 +341,10 @@ def cost_table(batch: RecordedBatch) -> Table:
     return Table("costs", "Time and memory", caption, columns, rows)
 
 
-@dataclass(frozen=True)
-class RunList:
-    """The runs of one contestant on one log."""
-
-    log: str
-    anchor: str
-    table: Table
-
-
-def run_lists(batch: RecordedBatch, metrics: list[Metric]) -> list[RunList]:
-    """Every run, by log and contestant."""
+def run_lists(batch: RecordedBatch, metrics: list[Metric]) -> list[tuple[str, Table]]:
+    """Every run: logs, each with the table of one contestant, whose name is the `group_anchor`."""
     lists = []
     for log, contestant, group in groups_of(batch):
-        anchor = group_anchor(batch, log, contestant)
         shown = [
             (metric, over, key)
             for metric in metrics
@@ -376,5 +365,6 @@ def run_lists(batch: RecordedBatch, metrics: list[Metric]) -> list[RunList]:
                 value = run.value(key)
                 row.append(absent() if math.isinf(value) else number(value, format_value(value * metric.factor)))
             rows.append(row)
-        lists.append(RunList(log, anchor, Table(anchor, f"{log}, {contestant}", "", columns, rows)))
+        name = group_anchor(batch, log, contestant)
+        lists.append((log, Table(name, f"{log}, {contestant}", "", columns, rows)))
     return lists

@@ -41,27 +41,11 @@ from sonar_graph.evaluation import (
 from sonar_graph.files import replacing
 from sonar_graph.logs import PICTURES
 from sonar_graph.recognition import SURE
+from sonar_graph.report import figures, sentences
 from sonar_graph.report.figure_style import Illustration, inline_svg
-from sonar_graph.report.figures import (
-    error_figure,
-    innovation_figure,
-    nees_figure,
-    nis_figure,
-    reliability_figure,
-    timing_figure,
-    yaw_figure,
-)
 from sonar_graph.report.landmark_table import PAPER, landmark_table, landmarks_left_out
 from sonar_graph.report.maps import enlargement, growth_figure, map_figure, paths_cut_off
 from sonar_graph.report.rendering import data_address, render
-from sonar_graph.report.sentences import (
-    doubt_of_identities,
-    finding,
-    nameless_landmarks,
-    refused_by,
-    warning_lines,
-    withheld_lines,
-)
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import Outcome
 
@@ -146,8 +130,12 @@ def render_report(comparison: Comparison) -> str:
             f"{_counted(detections, 'landmark detection')}, {len(comparison.instants_ns)} instants, "
             f"{_counted(len(runs), 'estimator')}."
         ),
-        "finding": finding(comparison),
-        "doubts": [*doubt_of_identities(comparison), *withheld_lines(comparison), *warning_lines(sequence.notes)],
+        "finding": sentences.finding(comparison),
+        "doubts": [
+            *sentences.doubt_of_identities(comparison),
+            *sentences.withheld_lines(comparison),
+            *sentences.warning_lines(sequence.notes),
+        ],
         "failed": text_table(
             "failed",
             "Runs that did not come to an end",
@@ -162,8 +150,9 @@ def render_report(comparison: Comparison) -> str:
         "landmarks": landmark_table(comparison),
         "left_out": landmarks_left_out(comparison),
         "has_true_landmarks": sequence.true_landmarks is not None,
-        "nameless": nameless_landmarks(comparison),
+        "nameless": sentences.nameless_landmarks(comparison),
         "paper": PAPER if is_repeated else "",
+        "detections": detections,
         "outcomes": outcome_table(comparison),
         "refused": refused_table(comparison),
         "recognition": recognition_content(comparison),
@@ -242,7 +231,7 @@ def refused_table(comparison: Comparison) -> Table:
     ]
     rows = [
         [row.sensor, str(row.count), row.times(start_ns), row.reason, row.distances() or ABSENT, ", ".join(names)]
-        for row, names in refused_by(comparison).items()
+        for row, names in sentences.refused_by(comparison).items()
     ]
     cells = [[words(text) for text in row] for row in rows]
     return Table("refused", "Which rows were not used, and why", "", columns, cells)
@@ -266,7 +255,7 @@ def recognition_content(comparison: Comparison) -> dict[str, Any] | None:
             f"Reliability of identity posteriors: expected calibration error {judged.expected_error:.3f} over "
             f"{judged.count.sum()} detections."
         )
-        reliability = inline_svg(reliability_figure(judged), "reliability", description)
+        reliability = inline_svg(figures.reliability_figure(judged), "reliability", description)
     return {
         "frames": found.frames,
         "detections": 0 if sequence.detections is None else len(sequence.detections),
@@ -314,6 +303,45 @@ def naming_table(sequence: Sequence) -> Table | None:
     return text_table("naming", title, ["Truly", "named rightly", "named wrongly", "taken for no landmark"], rows)
 
 
+FIGURES = {
+    "map": ("Map", map_figure, "", "No run has a path to draw.", ()),
+    "growth": ("Map as it grew", growth_figure, "", "No run kept its map on the way.", ()),
+    "errors": (
+        *("Error over time", figures.error_figure),
+        "Estimate minus truth of the causal estimates, not aligned. The shaded band is three reported standard "
+        "deviations either side: a consistent estimator leaves it almost never. Each panel has its own scale.",
+        *("{no_errors}", ("causal.ate_raw_m", "causal.yaw_rmse_rad")),
+    ),
+    "yaw": ("Yaw over time", figures.yaw_figure, "", "No run has a path to draw.", ("causal.yaw_rmse_rad",)),
+    "nees": (
+        *("Consistency over time", figures.nees_figure),
+        "Normalised estimation error squared (NEES) of the causal estimates, divided by its degrees of freedom. "
+        "Dots are instants, the line is the mean over a fortieth of the run; 1 is consistent. The band holds 95 % "
+        "of a consistent estimator's values. Instants of one run depend on each other, so a share near 95 % is a "
+        "hint and not a test.",
+        *("{no_errors} NEES needs them.", ("causal.nees_position", "causal.nees_yaw")),
+    ),
+    "innovations": (
+        *("Innovations over time", figures.innovation_figure),
+        "Measured minus predicted range and azimuth of detections that had a prediction; in long runs an even "
+        "choice of them, with the extremes.",
+        *("No run reports innovations.", ()),
+    ),
+    "nis": (
+        *("Distribution of NIS", figures.nis_figure),
+        "Normalised innovation squared (NIS) of used detections. Right of the grey curve: innovations larger than "
+        "predicted; left: smaller.",
+        *("No run reports innovations with their covariances.", ("detections.nis",)),
+    ),
+    "timing": (
+        *("Time per update", figures.timing_figure),
+        "Share of updates that took at most the given time; dots mark the median and the 99th percentile.",
+        *("No run reports durations.", ("time.update_median_ms", "time.update_p99_ms")),
+    ),
+}
+"""Figures in reading order: title, function, caption, sentence where there is nothing to draw, scores to read out."""
+
+
 def illustrations(comparison: Comparison) -> dict[str, Illustration]:
     """All figures of the page by name, in reading order: headings, captions, and descriptions that can be read out."""
     is_repeated = repeats_published(comparison.sequence)
@@ -321,7 +349,6 @@ def illustrations(comparison: Comparison) -> dict[str, Illustration]:
     no_errors = "No run has errors against the ground truth."
     if comparison.sequence.truth is None:
         no_errors = "The log has no ground truth, so there are no errors to draw."
-    no_path = "No run has a path to draw."
     gone = paths_cut_off(comparison)
     factor = enlargement(comparison)
     growth = (
@@ -337,68 +364,24 @@ def illustrations(comparison: Comparison) -> dict[str, Illustration]:
             growth += (
                 f" T are the same fractions of this run as its {', '.join(others)} and {last} s of {DURATION_S:.1f} s."
             )
-    shown = (
-        (
-            *("map", "Map", map_figure),
+    captions = {
+        "map": (
             "Paths and landmarks in the world of the start pose, not aligned. Ellipses hold 95 % of where each "
             "estimator believes a landmark to be; numbers are landmark IDs. Smoothed paths are drawn where they differ."
-            + (f" Leaves the picture: {', '.join(gone)}." if gone else ""),
-            no_path,
-            (),
+            + (f" Leaves the picture: {', '.join(gone)}." if gone else "")
         ),
-        ("growth", "Map as it grew", growth_figure, growth, "No run kept its map on the way.", ()),
-        (
-            *("errors", "Error over time", error_figure),
-            "Estimate minus truth of the causal estimates, not aligned. The shaded band is three reported standard "
-            "deviations either side: a consistent estimator leaves it almost never. Each panel has its own scale.",
-            no_errors,
-            ("causal.ate_raw_m", "causal.yaw_rmse_rad"),
-        ),
-        (
-            *("yaw", "Yaw over time", yaw_figure),
-            f"Heading of the body's x axis, wrapped to ±180°, causal.{counterpart.format('Fig. 5')}",
-            no_path,
-            ("causal.yaw_rmse_rad",),
-        ),
-        (
-            *("nees", "Consistency over time", nees_figure),
-            "Normalised estimation error squared (NEES) of the causal estimates, divided by its degrees of freedom. "
-            "Dots are instants, the line is the mean over a fortieth of the run; 1 is consistent. The band holds 95 % "
-            "of a consistent estimator's values. Instants of one run depend on each other, so a share near 95 % is a "
-            "hint and not a test.",
-            f"{no_errors} NEES needs them.",
-            ("causal.nees_position", "causal.nees_yaw"),
-        ),
-        (
-            *("innovations", "Innovations over time", innovation_figure),
-            "Measured minus predicted range and azimuth of detections that had a prediction; in long runs an even "
-            "choice of them, with the extremes.",
-            "No run reports innovations.",
-            (),
-        ),
-        (
-            *("nis", "Distribution of NIS", nis_figure),
-            "Normalised innovation squared (NIS) of used detections. Right of the grey curve: innovations larger than "
-            "predicted; left: smaller.",
-            "No run reports innovations with their covariances.",
-            ("detections.nis",),
-        ),
-        (
-            *("timing", "Time per update", timing_figure),
-            "Share of updates that took at most the given time; dots mark the median and the 99th percentile.",
-            "No run reports durations.",
-            ("time.update_median_ms", "time.update_p99_ms"),
-        ),
-    )
+        "growth": growth,
+        "yaw": f"Heading of the body's x axis, wrapped to ±180°, causal.{counterpart.format('Fig. 5')}",
+    }
     found = {}
-    for name, title, draw, caption, instead, keys in shown:
+    for name, (title, draw, caption, instead, keys) in FIGURES.items():
         told = []  # the figure's numbers, run by run, for a reader who does not see it
         for run in comparison.runs:
             scores = [score for key in keys if (score := comparison.score_of(run.estimator, key))]
             if scores:
                 told.append(f"{run.estimator}: {' and '.join(score.with_unit for score in scores)}")
-        numbers = " ".join(finding(comparison)) if name == "map" else f"{'; '.join(told)}." if told else ""
-        figure = draw(comparison)
-        svg = "" if figure is None else inline_svg(figure, name, f"{title}. {caption} {numbers}".strip())
-        found[name] = Illustration(name, title, caption, svg, instead)
+        numbers = " ".join(sentences.finding(comparison)) if name == "map" else f"{'; '.join(told)}." if told else ""
+        figure, told_caption = draw(comparison), captions.get(name, caption)
+        svg = "" if figure is None else inline_svg(figure, name, f"{title}. {told_caption} {numbers}".strip())
+        found[name] = Illustration(name, title, told_caption, svg, instead.format(no_errors=no_errors))
     return found

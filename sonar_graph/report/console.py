@@ -8,17 +8,8 @@ from rich.table import Table
 from rich.text import Text
 
 from sonar_graph.evaluation import ABSENT, LABELS, TOLERATED_FACTOR, Comparison, repeats_published, score_keys
+from sonar_graph.report import sentences
 from sonar_graph.report.landmark_table import PAPER, landmark_table
-from sonar_graph.report.sentences import (
-    doubt_lines,
-    doubt_of_identities,
-    headline_metric,
-    lost_runs,
-    nameless_landmarks,
-    no_detections,
-    refusal_lines,
-    withheld_lines,
-)
 
 COLUMNS = {
     "causal.yaw_rmse_rad": "yaw",
@@ -42,9 +33,10 @@ PUBLISHED_LEGEND = (
 FAR_FROM_FITTING = 6.0
 """One draw of a chi-square of three, over three, is above 5.4 once in a thousand times."""
 ASK_INSPECT = (
-    "NEES far above 1 without landmarks at work: stamps, start or reference may be off; "
+    "NEES far above 1 without landmarks at work: stamps, start or reference{} may be off; "
     "sonar-graph inspect LOG compares reference, clocks and sensors"
 )
+"""Advice, with what the log says of its own reference: where that lacks something, inspect cannot mend it."""
 
 
 def summary(comparison: Comparison) -> Group:
@@ -53,7 +45,7 @@ def summary(comparison: Comparison) -> Group:
     The numbers are those of the report. NEES is 1 for a consistent estimator and marked by `Score.verdict`. The lines
     below the table may be as wide as the terminal.
     """
-    metric = headline_metric(comparison)
+    metric = sentences.headline_metric(comparison)
     errors = {f"causal.{metric}": "causal", f"smoothed.{metric}": "smoothed"} if metric else {}
     present = score_keys(comparison)
     columns = {key: heading for key, heading in {**errors, **COLUMNS}.items() if key in present}
@@ -76,12 +68,12 @@ def summary(comparison: Comparison) -> Group:
 def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
     """Failures, warnings, and the meaning of the columns."""
     lines = [f"{run.estimator} failed: {run.reason}" for run in comparison.failed_runs]
-    lines += lost_runs(comparison)
-    lines += refusal_lines(comparison)
-    lines += withheld_lines(comparison)
-    lines += doubt_of_identities(comparison)
-    lines += nameless_landmarks(comparison)
-    lines += doubt_lines(comparison.sequence.notes)
+    lines += sentences.lost_runs(comparison)
+    lines += sentences.refusal_lines(comparison)
+    lines += sentences.withheld_lines(comparison)
+    lines += sentences.doubt_of_identities(comparison)
+    lines += sentences.nameless_landmarks(comparison)
+    lines += sentences.doubt_lines(comparison.sequence.notes)
     if comparison.recognition is not None:
         found = comparison.recognition
         warned = [f"{n} x {reason}" for reason, n in found.warned().items()]
@@ -90,7 +82,7 @@ def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
         lines.append(RECOGNISED_BEFORE)
     has_detections = bool(comparison.sequence.detections)
     if not has_detections:
-        lines.append(no_detections(comparison))
+        lines.append(sentences.no_detections(comparison))
     if metric is None:
         return [*lines, "No position errors: the report says why."]
     lines += [f"causal, smoothed: {LABELS[metric]}", NEES_LEGEND]
@@ -98,7 +90,9 @@ def _lines_below(comparison: Comparison, metric: str | None) -> list[str]:
         score = comparison.score_of(name, "causal.nees_position")
         is_odometry = name == "dead-reckoning" or not has_detections
         if is_odometry and score is not None and score.value > FAR_FROM_FITTING:
-            return [*lines, ASK_INSPECT]  # odometry alone contradicts the reference: no estimator is to blame
+            # odometry alone contradicts the reference: no estimator is to blame
+            known = comparison.sequence.notes.get("truth")
+            return [*lines, ASK_INSPECT.format(f" ({known})" if known else "")]
     return lines
 
 

@@ -14,23 +14,7 @@ from scipy.stats import chi2
 
 from sonar_graph.evaluation import Comparison, Reliability, RunResult, nis, yaw_rad
 from sonar_graph.measurements import Floats
-from sonar_graph.report.figure_style import (
-    INK,
-    MUTED,
-    SERIES_POINTS,
-    TICK_SIZE,
-    TRUTH,
-    blank_panels,
-    colour,
-    evenly,
-    head_panel,
-    legend_above,
-    line_style,
-    logarithmic,
-    name_axes,
-    seconds_since_start,
-    thinned,
-)
+from sonar_graph.report import figure_style as style
 from sonar_graph.states import DetectionLog, Outcome, Trajectory
 
 TIME_LABEL = "time since start (s)"
@@ -57,10 +41,10 @@ def error_figure(comparison: Comparison) -> Figure | None:
     series = [comparison.errors[run.estimator]["causal"] for _, run in runs]
     axes_count = max(errors.position_dof for errors in series)
     labels = [*(f"error in {'xyz'[axis]} (m)" for axis in range(axes_count)), "yaw error (°)"]
-    figure, axes = blank_panels(len(labels), len(runs), _size(len(labels), len(runs)), sharex=True)
+    figure, axes = style.blank_panels(len(labels), len(runs), _size(len(labels), len(runs)), sharex=True)
     for column, ((index, run), errors) in enumerate(zip(runs, series, strict=True)):
-        head_panel(axes[0, column], run.estimator, colour(index))
-        seconds = seconds_since_start(comparison, errors.stamps_ns)
+        style.head_panel(axes[0, column], run.estimator, style.colour(index))
+        seconds = style.seconds_since_start(comparison, errors.stamps_ns)
         for row, label in enumerate(labels):
             panel: Axes = axes[row, column]
             if row < axes_count:
@@ -68,13 +52,15 @@ def error_figure(comparison: Comparison) -> Figure | None:
             else:
                 error, sigma = np.degrees(errors.yaw_rad), np.degrees(errors.yaw_sigma_rad)
             if np.isfinite(sigma).any():
-                band = np.union1d(evenly(len(sigma), SERIES_POINTS // 2), thinned(sigma, SERIES_POINTS // 2))
+                band = np.union1d(
+                    style.evenly(len(sigma), style.SERIES_POINTS // 2), style.thinned(sigma, style.SERIES_POINTS // 2)
+                )
                 low, high = -3 * sigma[band], 3 * sigma[band]
-                panel.fill_between(seconds[band], low, high, color=colour(index), alpha=0.2, linewidth=0)
-            rows = thinned(error)
-            panel.axhline(0.0, color=MUTED, linewidth=0.7)
-            panel.plot(seconds[rows], error[rows], color=colour(index), linewidth=1.1)
-            name_axes(panel, TIME_LABEL if row == axes_count else "", "" if column else label)
+                panel.fill_between(seconds[band], low, high, color=style.colour(index), alpha=0.2, linewidth=0)
+            rows = style.thinned(error)
+            panel.axhline(0.0, color=style.MUTED, linewidth=0.7)
+            panel.plot(seconds[rows], error[rows], color=style.colour(index), linewidth=1.1)
+            style.name_axes(panel, TIME_LABEL if row == axes_count else "", "" if column else label)
     return figure
 
 
@@ -83,19 +69,21 @@ def yaw_figure(comparison: Comparison) -> Figure | None:
     runs = [(i, run.causal) for i, run in enumerate(comparison.runs) if run.causal is not None and len(run.causal)]
     if not runs:
         return None
-    figure, axes = blank_panels(1, 1, SINGLE_IN)
+    figure, axes = style.blank_panels(1, 1, SINGLE_IN)
     panel: Axes = axes[0, 0]
     truth = comparison.sequence.truth
     if truth is not None and len(truth):
         seconds, degrees = _headings(comparison, truth)
-        panel.plot(seconds, degrees, color=TRUTH, linewidth=3.2, alpha=0.6, label="truth")
+        panel.plot(seconds, degrees, color=style.TRUTH, linewidth=3.2, alpha=0.6, label="truth")
     for index, path in runs:
         seconds, degrees = _headings(comparison, path)
         label = comparison.runs[index].estimator
-        panel.plot(seconds, degrees, color=colour(index), linestyle=line_style(index), linewidth=1.2, label=label)
+        panel.plot(
+            seconds, degrees, color=style.colour(index), linestyle=style.line_style(index), linewidth=1.2, label=label
+        )
     panel.set(ylim=(-185, 185), yticks=[-180, -90, 0, 90, 180])
-    name_axes(panel, TIME_LABEL, "yaw (°)")
-    legend_above(figure, panel)
+    style.name_axes(panel, TIME_LABEL, "yaw (°)")
+    style.legend_above(figure, panel)
     return figure
 
 
@@ -108,16 +96,16 @@ def nees_figure(comparison: Comparison) -> Figure | None:
             runs.append((index, run))
     if not runs:
         return None
-    figure, axes = blank_panels(2, len(runs), _size(2, len(runs)), sharex=True, sharey=True)
+    figure, axes = style.blank_panels(2, len(runs), _size(2, len(runs)), sharex=True, sharey=True)
     for column, (index, run) in enumerate(runs):
         errors = comparison.errors[run.estimator]["causal"]
-        head_panel(axes[0, column], run.estimator, colour(index))
-        seconds = seconds_since_start(comparison, errors.stamps_ns)
+        style.head_panel(axes[0, column], run.estimator, style.colour(index))
+        seconds = style.seconds_since_start(comparison, errors.stamps_ns)
         blocks = (("position", errors.nees_position, errors.position_dof), ("yaw", errors.nees_yaw, 1))
         for row, (label, nees, dof) in enumerate(blocks):
-            logarithmic(axes[row, column], "y")
-            _draw_nees(axes[row, column], seconds, nees, dof, colour(index))
-            name_axes(axes[row, column], TIME_LABEL if row else "", "" if column else f"{label} NEES / dof")
+            style.logarithmic(axes[row, column], "y")
+            _draw_nees(axes[row, column], seconds, nees, dof, style.colour(index))
+            style.name_axes(axes[row, column], TIME_LABEL if row else "", "" if column else f"{label} NEES / dof")
     return figure
 
 
@@ -131,25 +119,28 @@ def innovation_figure(comparison: Comparison) -> Figure | None:
     runs = [(index, name, log) for index, name, log in logs if is_predicted(log).any()]
     if not runs:
         return None
-    figure, axes = blank_panels(2, len(runs), _size(2, len(runs)), sharex=True)
+    figure, axes = style.blank_panels(2, len(runs), _size(2, len(runs)), sharex=True)
     for column, (index, name, log) in enumerate(runs):
-        head_panel(axes[0, column], name, colour(index))
+        style.head_panel(axes[0, column], name, style.colour(index))
         gated = np.array([outcome is Outcome.GATED for outcome in log.outcomes], dtype=bool)
         predicted = is_predicted(log)
-        seconds = seconds_since_start(comparison, log.stamps_ns)
+        seconds = style.seconds_since_start(comparison, log.stamps_ns)
         for row, (label, factor) in enumerate((("range (m)", 1.0), ("azimuth (°)", np.degrees(1.0)))):
             panel: Axes = axes[row, column]
             for chosen, marker, shade, outcome in (
-                (predicted & ~gated, ".", colour(index), "used"),
-                (predicted & gated, "x", INK, "refused by the gate"),
+                (predicted & ~gated, ".", style.colour(index), "used"),
+                (predicted & gated, "x", style.INK, "refused by the gate"),
             ):
                 values = factor * log.innovations[chosen, row]
-                rows = np.union1d(evenly(len(values), SERIES_POINTS // 2), thinned(values, SERIES_POINTS // 20))
+                rows = np.union1d(
+                    style.evenly(len(values), style.SERIES_POINTS // 2),
+                    style.thinned(values, style.SERIES_POINTS // 20),
+                )
                 x, y = seconds[chosen][rows], values[rows]
                 panel.plot(x, y, marker, color=shade, markersize=3.5, linestyle="none", label=outcome)
-            panel.axhline(0.0, color=MUTED, linewidth=0.7)
-            name_axes(panel, TIME_LABEL if row else "", "" if column else label)
-    legend_above(figure, axes[0, 0])
+            panel.axhline(0.0, color=style.MUTED, linewidth=0.7)
+            style.name_axes(panel, TIME_LABEL if row else "", "" if column else label)
+    style.legend_above(figure, axes[0, 0])
     return figure
 
 
@@ -159,16 +150,18 @@ def nis_figure(comparison: Comparison) -> Figure | None:
     runs = [(index, run, values) for index, run, values in known if values.size]
     if not runs:
         return None
-    figure, axes = blank_panels(1, 1, SINGLE_IN)
+    figure, axes = style.blank_panels(1, 1, SINGLE_IN)
     panel: Axes = axes[0, 0]
     grid = np.geomspace(1e-2, max(30.0, *(float(values.max()) for _, _, values in runs)), 200)
-    panel.plot(grid, 100 * chi2.cdf(grid, NIS_DOF), color=TRUTH, linewidth=3.2, alpha=0.6, label="χ², 2 dof: expected")
+    panel.plot(
+        grid, 100 * chi2.cdf(grid, NIS_DOF), color=style.TRUTH, linewidth=3.2, alpha=0.6, label="χ², 2 dof: expected"
+    )
     for index, run, values in runs:
         _draw_distribution(panel, values, index, run.estimator)
-    logarithmic(panel, "x")
+    style.logarithmic(panel, "x")
     panel.set_xlim(grid[0], grid[-1])
-    name_axes(panel, "NIS", "detections below (%)")
-    legend_above(figure, panel)
+    style.name_axes(panel, "NIS", "detections below (%)")
+    style.legend_above(figure, panel)
     return figure
 
 
@@ -177,15 +170,15 @@ def timing_figure(comparison: Comparison) -> Figure | None:
     runs = [(index, run) for index, run in enumerate(comparison.runs) if len(run.update_s)]
     if not runs:
         return None
-    figure, axes = blank_panels(1, 1, SINGLE_IN)
+    figure, axes = style.blank_panels(1, 1, SINGLE_IN)
     panel: Axes = axes[0, 0]
     for index, run in runs:
         update_ms = 1e3 * run.update_s
         _draw_distribution(panel, update_ms, index, run.estimator)
-        panel.plot(np.percentile(update_ms, [50, 99]), [50, 99], "o", color=colour(index), markersize=5)
-    logarithmic(panel, "x")
-    name_axes(panel, "duration of an update (ms)", "updates at most as long (%)")
-    legend_above(figure, panel)
+        panel.plot(np.percentile(update_ms, [50, 99]), [50, 99], "o", color=style.colour(index), markersize=5)
+    style.logarithmic(panel, "x")
+    style.name_axes(panel, "duration of an update (ms)", "updates at most as long (%)")
+    style.legend_above(figure, panel)
     return figure
 
 
@@ -194,19 +187,19 @@ def reliability_figure(judged: Reliability) -> Figure:
 
     A dot's area is in proportion to the detections behind it, down to a least size.
     """
-    figure, axes = blank_panels(2, 1, (5.2, 4.6), sharex=True, height_ratios=[3, 1])
+    figure, axes = style.blank_panels(2, 1, (5.2, 4.6), sharex=True, height_ratios=[3, 1])
     shares, counts = axes[:, 0]
-    shares.plot([0, 1], [0, 1], color=TRUTH, linewidth=1, zorder=1)
+    shares.plot([0, 1], [0, 1], color=style.TRUTH, linewidth=1, zorder=1)
     areas = np.maximum(LARGEST_DOT * judged.count / max(int(judged.count.max()), 1), SMALLEST_DOT)
-    shares.scatter(judged.confidence, judged.right, s=areas, color=INK, zorder=2, clip_on=False)
+    shares.scatter(judged.confidence, judged.right, s=areas, color=style.INK, zorder=2, clip_on=False)
     shares.set(xlim=(0, 1), ylim=(0, 1.03))
-    name_axes(shares, y="share that is right")
+    style.name_axes(shares, y="share that is right")
     width = 1 / len(judged.count)
     middles = (np.arange(len(judged.count)) + 0.5) * width
-    bars = counts.bar(middles, judged.count, width=0.8 * width, color=INK)
-    counts.bar_label(bars, [str(n) if n else "" for n in judged.count], color=MUTED, fontsize=SMALL, padding=1.5)
+    bars = counts.bar(middles, judged.count, width=0.8 * width, color=style.INK)
+    counts.bar_label(bars, [str(n) if n else "" for n in judged.count], color=style.MUTED, fontsize=SMALL, padding=1.5)
     counts.set_ylim(0, 1.25 * max(int(judged.count.max()), 1))
-    name_axes(counts, "posterior of the most probable class", "detections")
+    style.name_axes(counts, "posterior of the most probable class", "detections")
     return figure
 
 
@@ -225,8 +218,8 @@ def _size(rows: int, columns: int) -> tuple[float, float]:
 def _headings(comparison: Comparison, path: Trajectory) -> tuple[Floats, Floats]:
     """Seconds and degrees, with a gap wherever the heading passes ±180°."""
     degrees = np.degrees(yaw_rad(path.matrices))
-    rows = np.union1d(evenly(len(degrees), 2 * SERIES_POINTS), thinned(degrees))
-    seconds, degrees = seconds_since_start(comparison, path.stamps_ns)[rows], degrees[rows]
+    rows = np.union1d(style.evenly(len(degrees), 2 * style.SERIES_POINTS), style.thinned(degrees))
+    seconds, degrees = style.seconds_since_start(comparison, path.stamps_ns)[rows], degrees[rows]
     jumps = np.flatnonzero(np.abs(np.diff(degrees)) > 180) + 1
     return np.insert(seconds, jumps, np.nan), np.insert(degrees, jumps, np.nan)
 
@@ -237,21 +230,28 @@ def _draw_nees(panel: Axes, seconds: Floats, nees: Floats, dof: int, own_colour:
     known = per_dof[np.isfinite(per_dof)]
     top = max(panel.get_ylim()[1], 10.0, 2 * float(known.max(initial=0.0)))
     panel.set_ylim(NEES_FLOOR, top)
-    panel.axhspan(low, high, color=TRUTH, alpha=0.25, linewidth=0)
-    panel.axhline(1.0, color=MUTED, linewidth=0.7)
-    rows = evenly(len(per_dof), SERIES_POINTS // 2)
+    panel.axhspan(low, high, color=style.TRUTH, alpha=0.25, linewidth=0)
+    panel.axhline(1.0, color=style.MUTED, linewidth=0.7)
+    rows = style.evenly(len(per_dof), style.SERIES_POINTS // 2)
     panel.plot(seconds[rows], np.maximum(per_dof[rows], NEES_FLOOR), ".", color=own_colour, markersize=2, alpha=0.5)
     stretches = [rows for rows in np.array_split(np.flatnonzero(np.isfinite(per_dof)), NEES_MEANS) if rows.size]
     middles, means = ([values[rows].mean() for rows in stretches] for values in (seconds, per_dof))
     panel.plot(middles, means, color=own_colour, linewidth=1.6)
     if known.size:
         inside = 100 * float(np.mean((known >= low) & (known <= high)))
-        panel.text(0.02, 0.04, f"{inside:.0f} % in the band", transform=panel.transAxes, color=INK, fontsize=TICK_SIZE)
+        panel.text(
+            0.02,
+            0.04,
+            f"{inside:.0f} % in the band",
+            transform=panel.transAxes,
+            color=style.INK,
+            fontsize=style.TICK_SIZE,
+        )
 
 
 def _draw_distribution(panel: Axes, values: Floats, index: int, label: str) -> None:
     ordered = np.sort(values)
-    rows = evenly(len(ordered), SERIES_POINTS // 2)
+    rows = style.evenly(len(ordered), style.SERIES_POINTS // 2)
     share = 100 * (rows + 1) / len(ordered)
-    style = line_style(index)
-    panel.plot(ordered[rows], share, color=colour(index), linestyle=style, linewidth=1.5, label=label)
+    look = {"color": style.colour(index), "linestyle": style.line_style(index), "linewidth": 1.5}
+    panel.plot(ordered[rows], share, label=label, **look)

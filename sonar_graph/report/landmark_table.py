@@ -42,15 +42,12 @@ class MapColumn:
     """None for the paper, whose path is not published."""
     decimals: int = DECIMALS
 
-    def coordinate(self, identity: int, axis: int) -> float | None:
-        """The estimated x or y of a landmark; None where it is not in the map."""
-        return None if self.landmarks is None else coordinate(self.landmarks, identity, axis)
 
-
-def coordinate(landmarks: LandmarkMap, identity: int, axis: int) -> float | None:
-    """The x or y of a landmark; None where it is not in the map."""
-    rows = np.flatnonzero(landmarks.ids == identity)
-    return float(landmarks.positions[rows[0], axis]) if rows.size else None
+def coordinate(landmarks: LandmarkMap | None, identity: int, axis: int) -> float | None:
+    """The x or y of a landmark; None where it is not in the map, or there is none."""
+    if landmarks is None or identity not in landmarks.ids:
+        return None
+    return float(landmarks.positions[landmarks.ids == identity, axis][0])
 
 
 def landmark_table(comparison: Comparison) -> Table | None:
@@ -78,8 +75,9 @@ def landmark_table(comparison: Comparison) -> Table | None:
     rows: list[list[str]] = []
     for id_ in mapped_ids(comparison, known)[:MOST_LANDMARKS]:
         for axis in (0, 1):
-            at = None if true is None else coordinate(true, id_, axis)
-            cells = [_with_difference(column.coordinate(id_, axis), at, column.decimals) for column in columns.values()]
+            at = coordinate(true, id_, axis)
+            found = [(coordinate(column.landmarks, id_, axis), column.decimals) for column in columns.values()]
+            cells = [_with_difference(value, at, decimals) for value, decimals in found]
             rows.append([f"ID {id_}, {'xy'[axis]}", _with_difference(at, None, DECIMALS), *cells])
     sections = {}
     if true is not None:

@@ -15,20 +15,7 @@ from scipy.stats import chi2
 
 from sonar_graph.evaluation import Comparison, RunResult
 from sonar_graph.measurements import Floats
-from sonar_graph.report.figure_style import (
-    INK,
-    LABEL_SIZE,
-    TICK_SIZE,
-    TRUTH,
-    blank_panels,
-    colour,
-    evenly,
-    head_panel,
-    legend_above,
-    line_style,
-    name_axes,
-    seconds_since_start,
-)
+from sonar_graph.report import figure_style as style
 from sonar_graph.states import LandmarkMap, Trajectory
 
 ELLIPSE_PROBABILITY = 0.95
@@ -55,19 +42,19 @@ def map_figure(comparison: Comparison) -> Figure | None:
     view = map_view(comparison)
     if view is None:
         return None
-    figure, axes = blank_panels(1, 1, (WIDTH_IN, WIDTH_IN))
+    figure, axes = style.blank_panels(1, 1, (WIDTH_IN, WIDTH_IN))
     panel: Axes = axes[0, 0]
     truth, true_landmarks = comparison.sequence.truth, comparison.sequence.true_landmarks
     if truth is not None and len(truth):
-        look: dict[str, Any] = {"color": TRUTH, "linewidth": 3.2, "alpha": 0.6, "solid_capstyle": "round"}
+        look: dict[str, Any] = {"color": style.TRUTH, "linewidth": 3.2, "alpha": 0.6, "solid_capstyle": "round"}
         panel.plot(*horizontal(truth), label="truth", zorder=1, **look)
     if true_landmarks is not None and len(true_landmarks):
-        look = {"color": INK, "markersize": 9, "markeredgewidth": 1.4}
+        look = {"color": style.INK, "markersize": 9, "markeredgewidth": 1.4}
         panel.plot(*true_landmarks.positions.T[:2], "+", label="true landmarks", zorder=5, **look)
     for index, run in enumerate(comparison.runs):
-        own = colour(index)
+        own = style.colour(index)
         if run.causal is not None and len(run.causal):
-            look = {"linestyle": line_style(index), "linewidth": 1.3}
+            look = {"linestyle": style.line_style(index), "linewidth": 1.3}
             panel.plot(*horizontal(run.causal), color=own, label=f"{run.estimator}, causal", zorder=3, **look)
         if run.smoothed is not None and smoothed_differs(run):
             look = {"linestyle": (0, (1, 1)), "linewidth": 1.9, "alpha": 0.75}
@@ -80,8 +67,8 @@ def map_figure(comparison: Comparison) -> Figure | None:
     label_landmarks(panel, comparison, view)
     panel.set(xlim=view[:, 0], ylim=view[:, 1])
     panel.set_aspect("equal", adjustable="box")
-    name_axes(panel, "world x (m)", "world y (m)")
-    legend_above(figure, panel, columns=LEGEND_COLUMNS)
+    style.name_axes(panel, "world x (m)", "world y (m)")
+    style.legend_above(figure, panel, columns=LEGEND_COLUMNS)
     span = view[1] - view[0]  # axes of the view's shape fill the width; legend and labels need room above and below
     legend_rows = -(-len(panel.get_legend_handles_labels()[1]) // LEGEND_COLUMNS)
     drawing_in = np.clip((WIDTH_IN - 0.8) * span[1] / span[0], 2.5, 8.0)
@@ -158,7 +145,7 @@ def label_landmarks(panel: Axes, comparison: Comparison, view: Floats) -> None:
     landmarks = next((known for known in candidates if known is not None and len(known)), None)
     if landmarks is None:
         return
-    size = TICK_SIZE if len(landmarks) <= 40 else 6.0
+    size = style.TICK_SIZE if len(landmarks) <= 40 else 6.0
     for identity, position in zip(landmarks.ids.tolist(), landmarks.positions[:, :2], strict=True):
         if np.all((position >= view[0]) & (position <= view[1])):
             panel.annotate(
@@ -166,7 +153,7 @@ def label_landmarks(panel: Axes, comparison: Comparison, view: Floats) -> None:
                 (position[0], position[1]),
                 xytext=(7, 6),
                 textcoords="offset points",
-                color=INK,
+                color=style.INK,
                 fontsize=size,
                 fontweight="bold",
                 zorder=6,
@@ -175,7 +162,7 @@ def label_landmarks(panel: Axes, comparison: Comparison, view: Floats) -> None:
 
 def horizontal(trajectory: Trajectory) -> tuple[Floats, Floats]:
     """World x and y of at most `PATH_POINTS` poses."""
-    rows = evenly(len(trajectory), PATH_POINTS)
+    rows = style.evenly(len(trajectory), PATH_POINTS)
     return trajectory.positions[rows, 0], trajectory.positions[rows, 1]
 
 
@@ -190,16 +177,16 @@ def growth_figure(comparison: Comparison) -> Figure | None:
     span = view[1] - view[0]
     height_in = np.clip(GROWTH_WIDTH_IN / len(stamps_ns) * span[1] / span[0], 1.2, 4.0)
     size = GROWTH_WIDTH_IN, float(height_in) * len(runs) + 0.5
-    figure, axes = blank_panels(len(runs), len(stamps_ns), size, sharex=True, sharey=True)
+    figure, axes = style.blank_panels(len(runs), len(stamps_ns), size, sharex=True, sharey=True)
     for row, (index, run) in enumerate(runs):
         for column, stamp_ns in enumerate(stamps_ns.tolist()):
             panel: Axes = axes[row, column]
-            own, true = colour(index), comparison.sequence.true_landmarks
+            own, true = style.colour(index), comparison.sequence.true_landmarks
             truth = comparison.sequence.truth
-            _draw_until(panel, stamp_ns, truth, color=TRUTH, linewidth=2.6, alpha=0.6, label="truth")
+            _draw_until(panel, stamp_ns, truth, color=style.TRUTH, linewidth=2.6, alpha=0.6, label="truth")
             _draw_until(panel, stamp_ns, run.causal, color=own, linewidth=1.0, label="causal estimate")
             if true is not None:
-                look: dict[str, Any] = {"color": INK, "markersize": 7, "markeredgewidth": 1.2}
+                look: dict[str, Any] = {"color": style.INK, "markersize": 7, "markeredgewidth": 1.2}
                 panel.plot(*true.positions.T[:2], "+", label="true landmarks", **look)
             for known in (known.landmarks for known in run.maps if known.stamp_ns == stamp_ns):
                 panel.plot(*known.positions.T[:2], "o", color=own, markersize=2.5, label="estimated landmarks")
@@ -208,20 +195,20 @@ def growth_figure(comparison: Comparison) -> Figure | None:
             label_landmarks(panel, comparison, view)
             panel.set(xlim=view[:, 0], ylim=view[:, 1])
             panel.set_aspect("equal", adjustable="box")
-            name_axes(panel, "world x (m)" if row == len(runs) - 1 else "", "" if column else "world y (m)")
+            style.name_axes(panel, "world x (m)" if row == len(runs) - 1 else "", "" if column else "world y (m)")
         axes[row, 0].annotate(
             run.estimator,
             (-0.34, 0.5),
             xycoords="axes fraction",
             rotation=90,
             va="center",
-            color=colour(index),
-            fontsize=LABEL_SIZE,
+            color=style.colour(index),
+            fontsize=style.LABEL_SIZE,
             fontweight="bold",
         )
-    for column, seconds in enumerate(seconds_since_start(comparison, stamps_ns)):
-        head_panel(axes[0, column], f"T = {seconds:.1f} s")
-    legend_above(figure, axes[0, 0])
+    for column, seconds in enumerate(style.seconds_since_start(comparison, stamps_ns)):
+        style.head_panel(axes[0, column], f"T = {seconds:.1f} s")
+    style.legend_above(figure, axes[0, 0])
     return figure
 
 
@@ -246,8 +233,8 @@ def _runs_with_maps(comparison: Comparison) -> list[tuple[int, RunResult]]:
     return [(i, run) for i, run in enumerate(comparison.runs) if any(len(known.landmarks) for known in run.maps)]
 
 
-def _draw_until(panel: Axes, stamp_ns: int, path: Trajectory | None, **style: Any) -> None:
+def _draw_until(panel: Axes, stamp_ns: int, path: Trajectory | None, **look: Any) -> None:
     """The path until an instant."""
     until = None if path is None else path.rows(np.flatnonzero(path.stamps_ns <= stamp_ns))
     if until is not None and len(until):
-        panel.plot(*horizontal(until), **style)
+        panel.plot(*horizontal(until), **look)
