@@ -201,9 +201,9 @@ def test_a_smoothed_error_at_the_end_is_no_second_evidence(factor, shown):
 def test_every_run_is_listed_once_and_leads_to_its_log():
     batch = drawn_batch(4)
     lists = run_lists(batch, metrics_of(METRICS))
-    links = [cell.link for one in lists for line in one.table.rows for cell in line if cell.link]
+    links = [cell.link for _, table in lists for line in table.rows for cell in line if cell.link]
     assert sorted(links) == sorted(run.log_file for run in batch.runs)
-    anchors = {one.anchor for one in lists}
+    anchors = {table.name for _, table in lists}
     targets = {cell.link.removeprefix("#") for line in accuracy_table(batch, ATE).rows for cell in line if cell.link}
     assert targets == anchors
 

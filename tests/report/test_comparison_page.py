@@ -104,6 +104,17 @@ def test_page_is_whole_whatever_is_missing(comparison, change):
     assert re.findall(r"\b(nan|NaN|inf|None)\b", page.text) == []
 
 
+def test_without_landmarks_no_figure_of_them_is_announced(comparison):
+    alone = only(comparison, "dead-reckoning")
+    blind = replace(alone, sequence=replace(alone.sequence, detections=None))
+    for shown, said in ((alone, "No run reports what became of"), (blind, "The log has no landmark detections.</p>")):
+        html = render_report(shown)
+        figures = re.findall(r'<figure id="figure-(\w+)"', html)
+        assert figures == ["map", "errors", "yaw", "nees", "timing"]
+        assert html.count(said) == 1
+    assert {"growth", "innovations", "nis"} <= set(re.findall(r'<figure id="figure-(\w+)"', render_report(comparison)))
+
+
 @pytest.mark.parametrize("planar", [True, False], ids=["planar", "3-D"])
 def test_without_truth_the_page_says_so_and_shows_the_rest(planar):
     page = Page(render_report(basin_comparison(60, planar=planar, truth=False)))

@@ -105,3 +105,8 @@ def test_odometry_far_from_its_reference_asks_for_inspect_and_nothing_else_does(
         score = Score(nees, "1", "By hand.", better="inside")
         text = printed(with_score(case, name, "causal.nees_position", score), 200)
         assert (hint in text) == is_told, (name, nees)
+    told = replace(blind, sequence=replace(blind.sequence, notes={"truth": "of the same sensors"}))
+    text = printed(
+        with_score(told, "isam2", "causal.nees_position", Score(30.0, "1", "By hand.", better="inside")), 200
+    )
+    assert "stamps, start or reference (of the same sensors) may be off" in text
