@@ -177,7 +177,7 @@ def resource_scores(run: RunResult, log_s: float) -> dict[str, Score]:
         "time.update_median_ms": Score(float(np.median(ms)), "ms", f"Median wall-clock time {calls}."),
         "time.update_p99_ms": Score(float(np.quantile(ms, 0.99)), "ms", f"99th percentile of wall-clock time {calls}."),
         "time.update_max_ms": Score(
-            float(ms.max()), "ms", f"Longest wall-clock time {calls}; compiling is done beforehand."
+            float(ms.max()), "ms", f"Longest wall-clock time {calls}; compiling is not counted."
         ),
         "time.total_s": Score(
             total_s, "s", "Wall-clock time of all calls of process and of asking for trajectory and map at the end."

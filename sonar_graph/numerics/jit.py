@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from types import FunctionType
@@ -71,3 +72,29 @@ class _Notice(event.Listener):
 
 
 event.register("numba:compile", _Notice())  # type: ignore[no-untyped-call]  # numba has no types
+
+
+class _Stopwatch(event.Listener):
+    """Seconds in which numba compiles, or loads what it has compiled, in this process."""
+
+    def __init__(self) -> None:
+        self.total_s, self._depth, self._began_s = 0.0, 0, 0.0
+
+    def on_start(self, _event: Any) -> None:
+        if not self._depth:
+            self._began_s = time.perf_counter()
+        self._depth += 1
+
+    def on_end(self, _event: Any) -> None:
+        self._depth -= 1
+        if not self._depth:
+            self.total_s += time.perf_counter() - self._began_s
+
+
+_STOPWATCH = _Stopwatch()
+event.register("numba:compiler_lock", _STOPWATCH)  # type: ignore[no-untyped-call]  # numba has no types
+
+
+def compiling_s() -> float:
+    """Seconds that this process has spent compiling and loading compiled code until now."""
+    return _STOPWATCH.total_s
