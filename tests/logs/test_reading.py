@@ -84,18 +84,6 @@ def test_arguments_of_a_wrong_type_are_named_and_paths_may_be_texts(bench: Bench
             call()
 
 
-def test_truth_needs_a_name_that_says_so(bench: Bench) -> None:
-    poses = [bench.odometry(T0_NS + i, float(i)) for i in range(3)]
-    guess = read_log(bench.write(*bench.basics(), ("/odom", "odometry", poses)))
-    assert guess.truth is None
-    assert "/odom only if chosen" in guess.notes["log.truth"]
-    path = bench.write(*bench.basics(), ("/odom", "odometry", poses), ("/rov/ground_truth", "odometry", poses))
-    for sequence in (read_log(path), read_log(path, topics={"truth": "/odom"})):
-        assert sequence.truth is not None
-        assert sequence.truth.positions[:, 0].tolist() == [0, 1, 2]
-        assert np.isnan(sequence.truth.covariances).all()
-
-
 def test_a_definition_without_a_needed_field_is_named(bench: Bench) -> None:
     lacking = definition("sensor_msgs/msg/Imu").replace("geometry_msgs/Vector3 angular_velocity\n", "")
     (topic, kind, messages), dvl = bench.basics()

@@ -24,72 +24,45 @@ IMU = "sensor_msgs/msg/Imu"
 def interface(fields: str, **own: str) -> str:
     """Interface text of a driver: its fields, its own types (``package__Type``), and those of ROS that it may use."""
     common = {name: text for name, text in ROS.items() if name.startswith(("builtin", "std_msgs/H", "geometry_msgs"))}
-    used = {name.replace("__", "/"): text for name, text in own.items()} | common
-    return fields + "".join(f"\n{'=' * 80}\nMSG: {name}\n{text}" for name, text in used.items()) + "\n"
+    used = {name.replace("__", "/"): text.replace(", ", "\n") for name, text in own.items()} | common
+    sections = (f"\n{'=' * 80}\nMSG: {name}\n{text}" for name, text in used.items())
+    return "".join([fields.replace(", ", "\n"), *sections, "\n"])
 
 
-def water_linked_text(covariance: str = "") -> str:
+def water_linked_text(covariance: str = "float64 temperature") -> str:
     """dvl_msgs/DVL; the forks add a covariance after the figure of merit."""
     return interface(
-        f"""std_msgs/Header header
-float64 time
-geometry_msgs/Vector3 velocity
-float64 fom
-{covariance}
-float64 altitude
-DVLBeam[] beams
-bool velocity_valid
-int64 status
-string form""",
-        dvl_msgs__DVLBeam="int64 id\nfloat64 velocity\nfloat64 distance\nfloat64 rssi\nfloat64 nsd\nbool valid",
+        f"std_msgs/Header header, float64 time, geometry_msgs/Vector3 velocity, float64 fom, {covariance}, "
+        "float64 altitude, DVLBeam[] beams, bool velocity_valid, int64 status, string form",
+        dvl_msgs__DVLBeam="int64 id, float64 velocity, float64 distance, float64 rssi, float64 nsd, bool valid",
     )
 
 
-UUV_DVL = interface(
-    """std_msgs/Header header
-geometry_msgs/Vector3 velocity
-float64[9] velocity_covariance
-float64 altitude
-DVLBeam[] beams""",
-    stonefish_ros2__DVLBeam="float64 range\nfloat64 range_covariance\nfloat64 velocity\nfloat64 velocity_covariance",
-)
-DETECTIONS = interface(
-    "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
-    vision_msgs__Detection3D="""std_msgs/Header header
-vision_msgs/ObjectHypothesisWithPose[] results
-vision_msgs/BoundingBox3D bbox
-string id""",
-    vision_msgs__ObjectHypothesisWithPose="""vision_msgs/ObjectHypothesis hypothesis
-geometry_msgs/PoseWithCovariance pose""",
-    vision_msgs__ObjectHypothesis="string class_id\nfloat64 score",
-    vision_msgs__BoundingBox3D="geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
-)
-OCULUS_PING = interface("""std_msgs/Header header
-uint32 ping_id
-uint32 ping_firing_date
-float64 range
-float64 gain_percent
-float64 frequency
-float64 speed_of_sound_used
-float64 range_resolution
-float64 temperature
-float64 pressure
-uint8 master_mode
-bool has_gains
-uint16 n_ranges
-uint16 n_beams
-uint32 step
-uint8 sample_size
-int16[] bearings
-uint8[] ping_data""")
 DEFINITIONS = {
     "dvl_msgs/msg/DVL": water_linked_text(),
-    "stonefish_ros2/msg/DVL": UUV_DVL,
-    "geometry_msgs/msg/TwistWithCovarianceStamped": interface(
-        "std_msgs/Header header\ngeometry_msgs/TwistWithCovariance twist"
+    "stonefish_ros2/msg/DVL": interface(
+        "std_msgs/Header header, geometry_msgs/Vector3 velocity, float64[9] velocity_covariance, float64 altitude, "
+        "DVLBeam[] beams",
+        stonefish_ros2__DVLBeam="float64 range, float64 range_covariance, float64 velocity, float64 velocity_cov",
     ),
-    "vision_msgs/msg/Detection3DArray": DETECTIONS,
-    "oculus_interfaces/msg/Ping": OCULUS_PING,
+    "geometry_msgs/msg/TwistWithCovarianceStamped": interface(
+        "std_msgs/Header header, geometry_msgs/TwistWithCovariance twist"
+    ),
+    "vision_msgs/msg/Detection3DArray": interface(
+        "std_msgs/Header header, vision_msgs/Detection3D[] detections",
+        vision_msgs__Detection3D="std_msgs/Header header, vision_msgs/ObjectHypothesisWithPose[] results, "
+        "vision_msgs/BoundingBox3D bbox, string id",
+        vision_msgs__ObjectHypothesisWithPose="vision_msgs/ObjectHypothesis hypothesis, "
+        "geometry_msgs/PoseWithCovariance pose",
+        vision_msgs__ObjectHypothesis="string class_id, float64 score",
+        vision_msgs__BoundingBox3D="geometry_msgs/Pose center, geometry_msgs/Vector3 size",
+    ),
+    "oculus_interfaces/msg/Ping": interface(
+        "std_msgs/Header header, uint32 ping_id, uint32 ping_firing_date, float64 range, float64 gain_percent, "
+        "float64 frequency, float64 speed_of_sound_used, float64 range_resolution, float64 temperature, "
+        "float64 pressure, uint8 master_mode, bool has_gains, uint16 n_ranges, uint16 n_beams, uint32 step, "
+        "uint8 sample_size, int16[] bearings, uint8[] ping_data"
+    ),
     "provider_dvl/msg/PD0Packet": "float64 timestamp\nfloat64[4] range\nfloat64[4] velocity\n",
     "std_msgs/msg/Float64": "float64 data\n",
 }

@@ -25,7 +25,7 @@ def beam(number: int) -> dict[str, Any]:
     return {"id": number, "velocity": 0.1 * number, "distance": 2.0, "rssi": 0.0, "nsd": 0.0, "valid": True}
 
 
-def water_linked(*rows: dict[str, Any], covariance: str = "") -> Entry:
+def water_linked(*rows: dict[str, Any], covariance: str = "float64 temperature") -> Entry:
     common = {"velocity": vector(*VELOCITY), "fom": 0.02, "velocity_valid": True, "beams": [], "form": "json_v3"}
     return (*rows_of("/dvl/data", "dvl_msgs/msg/DVL", rows, **common), water_linked_text(covariance))
 

@@ -29,12 +29,13 @@ def pressures(*values: float, variance: float = 0.0) -> Entry:
     return rows_of("/bar30", "sensor_msgs/msg/FluidPressure", rows, variance=variance)
 
 
-def poses(rotation: Rotation, covariance: Any = None, topic: str = "/ground_truth/pose") -> Entry:
+def poses(rotation: Rotation, covariance: Any = None, topic: str = "/ground_truth/pose", kind: str = "") -> Entry:
     x, y, z, w = rotation.as_quat().tolist()
     pose = {"position": vector(1, 2, 3), "orientation": {"x": x, "y": y, "z": z, "w": w}}
     if covariance is None:
         return rows_of(topic, POSE, [{"pose": pose}] * 3)
-    return rows_of(topic, POSE_WITH_COVARIANCE, [{"pose": {"pose": pose, "covariance": list(covariance)}}] * 3)
+    row = {"pose": {"pose": pose, "covariance": list(covariance)}}
+    return rows_of(topic, kind or POSE_WITH_COVARIANCE, [row] * 3)
 
 
 TURN = Rotation.from_euler("z", 1)
@@ -93,6 +94,12 @@ CASES: dict[str, Case] = {
         [poses(TURN, covariance)], "",
         {"truth.positions": [(1, 2, 3)] * 3, "truth.quaternions_xyzw": [TURN.as_quat()] * 3}, {})
        for covariance in (None, [0.0] * 36)},
+    **{f"odometry {chosen or 'by its name'}": (
+        [poses(TURN, [0.0] * 36, topic, "nav_msgs/msg/Odometry"), poses(TURN, topic="/pose")], chosen,
+        {"truth.positions": [(1, 2, 3)] * 3, "truth.covariances": np.full((3, 6, 6), NAN)}, {"log.truth": None})
+       for topic, chosen in {"/odom": '[truth]\ntopic = "/odom"', "/rov/ground_truth": ""}.items()},
+    "odometry of another name": (
+        [poses(TURN, [0.0] * 36, "/odom", "nav_msgs/msg/Odometry")], "", {}, {"log.truth": "/odom only if chosen"}),
     "pose of another name": ([poses(TURN, topic="/pose")], "", {}, {"log.truth": "/pose only if chosen"}),
     **{f"{meaning} in NED, where body x is north, y (left) west, z up": (
         [poses(Rotation.identity(), np.diag(given).ravel().tolist())], f'{NED}covariance_meaning = "{meaning}"',
