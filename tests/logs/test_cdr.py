@@ -95,25 +95,25 @@ def doubling(levels: int) -> str:
 CHAIN = "T0 first\n" + "".join(f"{RULE}\nMSG: test_msgs/T{i}\nT{i + 1} next\n" for i in range(3000))
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("other_msgs/Part part\n", "other_msgs/Part"),
-        ("wstring text\n", "wstring"),
-        ("float64\n", "no ros2msg field"),
-        (f"Part p\n{RULE}\nMSG: test_msgs/Part\nPart[] p\n", "within itself"),
-        ("Root[] things\n", "within itself"),
-        ("float64 x\nint8 x\n", "two fields called x"),
-        ("float64[0] x\n", "no ros2msg field"),
-        ("{}", "no ros2msg field"),
-        (doubling(45), "more than 10000 fields"),
-        (CHAIN, "more than 50 deep"),
-    ],
-)
-def test_a_definition_that_cannot_be_understood_is_refused_and_named(text: str, message: str) -> None:
+REFUSED = {
+    "other_msgs/Part part\n": "other_msgs/Part",
+    "wstring text\n": "wstring",
+    "float64\n": "no ros2msg field",
+    "float64[0] x\n": "no ros2msg field",
+    "{}": "no ros2msg field",
+    f"Part p\n{RULE}\nMSG: test_msgs/Part\nPart[] p\n": "within itself",
+    "Root[] things\n": "within itself",
+    "float64 x\nint8 x\n": "two fields called x",
+    doubling(45): "more than 10000 fields",
+    CHAIN: "more than 50 deep",
+}
+
+
+def test_a_definition_that_cannot_be_understood_is_refused_and_named() -> None:
     assert len(parse_definition(NAME, doubling(8)).fields) == 1
-    with pytest.raises(LogError, match=message):
-        parse_definition(NAME, text)
+    for text, message in REFUSED.items():
+        with pytest.raises(LogError, match=message):
+            parse_definition(NAME, text)
 
 
 # ---- columns

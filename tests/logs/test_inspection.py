@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import tomllib
+from collections import Counter
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from sonar_graph.cli.main import main
+from sonar_graph.errors import LogError, MissingTopicError
 from sonar_graph.logs.adapters.log_config import LogConfig
 from sonar_graph.logs.convert.step_files import read_victoria_park
 from sonar_graph.logs.inspection import LogSummary, TopicSummary, inspect_log
 from sonar_graph.logs.mcap.reader import scan
 from sonar_graph.logs.mcap.topic import Keep
 from sonar_graph.logs.reading import read_log
-from sonar_graph.logs.roles import ROLES, choose_topic
+from sonar_graph.logs.roles import ROLES, choose_topic, refusal
 from sonar_graph.logs.writing import write_log
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
-from .conftest import TYPES
-from .containers import chunk_indexes, flip
+from .conftest import TYPES, Bench
+from .containers import channel_for, chunk_indexes, flip, writing
 
 
 def role(summary: LogSummary, name: str) -> tuple[str | None, str]:
@@ -32,7 +37,7 @@ def topic(summary: LogSummary, name: str) -> TopicSummary:
     return next(t for t in summary.topics if t.name == name)
 
 
-def test_rates_and_gaps_come_from_the_headers_and_mountings_are_mentioned(bench: Any) -> None:
+def test_rates_and_gaps_come_from_the_headers_and_mountings_are_mentioned(bench: Bench) -> None:
     _, dvl = bench.basics()
     imu = ("/imu", "imu", [bench.imu(bench.t0_ns + s * 10**9) for s in (0, 1, 2, 5)])
     tree = ("/tf_static", "tf", [{"transforms": [bench.transform("base_link", "imu_link", (1, 0, 0))]}])
@@ -45,7 +50,7 @@ def test_rates_and_gaps_come_from_the_headers_and_mountings_are_mentioned(bench:
     assert "mountings of /tf_static (imu_link)" in summary.calibration
 
 
-def test_roles_are_explained_whether_filled_or_not(bench: Any) -> None:
+def test_roles_are_explained_whether_filled_or_not(bench: Bench) -> None:
     imu, dvl = bench.basics()
     odometry = ("/odom", "odometry", [bench.odometry(bench.t0_ns, 0.0)])
     path = bench.write(imu, dvl, ("/second", "imu", imu[2]), odometry)
@@ -98,7 +103,7 @@ def test_a_third_party_log_is_described(recordings: Path) -> None:
     assert summary.damage == ()
 
 
-def test_what_a_run_would_leave_out_and_doubt_is_told_before(bench: Any) -> None:
+def test_what_a_run_would_leave_out_and_doubt_is_told_before(bench: Bench) -> None:
     imu, _ = bench.basics()
     sideways = [message | {"linear_acceleration": {"x": 0.0, "y": 9.8, "z": 0.0}} for message in imu[2]]
     sideways[0] |= {"header": bench.imu(0)["header"]}
@@ -115,7 +120,7 @@ def test_what_a_run_would_leave_out_and_doubt_is_told_before(bench: Any) -> None
     assert "1 message without a stamp: the time of recording is used" in faults["/imu"]
 
 
-def test_stuck_sensors_are_named(bench: Any) -> None:
+def test_stuck_sensors_are_named(bench: Bench) -> None:
     """The bench's rows are all alike."""
     assert not any("as measured" in text for text in inspect_log(bench.write(*bench.basics(10))).warnings)
     warnings = inspect_log(bench.write(*bench.basics(30), name="long.mcap")).warnings
@@ -134,6 +139,101 @@ def test_what_this_package_wrote_gives_no_warning(tmp_path: Path) -> None:
         assert not {"log.stamps", "log.warnings"} & read_log(tmp_path / name).notes.keys()
 
 
+# --- topics that cannot be read, and broken messages -----------------------------------------------------------------
+
+IMU = "sensor_msgs/msg/Imu"
+IDL = "module sensor_msgs { module msg { struct Imu { double x; }; }; };"
+FOREIGN = {
+    "/json": ("Some", "jsonschema", b"{}", "json", "has messages in json; only ROS 2 CDR is read"),
+    "/protobuf": ("pkg.Some", "protobuf", b"\x0a\xff", "protobuf", "has messages in protobuf; only ROS 2 CDR is read"),
+    "/idl": (IMU, "ros2idl", IDL.encode(), "cdr", "has a definition in ros2idl; only ros2msg is read: record it again"),
+    "/flat": (IMU, "flatbuffer", b"\0", "cdr", "has a definition in flatbuffer; only ros2msg is read"),
+    "/wide": ("a/msg/B", "ros2msg", b"wstring s\n", "cdr", "cannot be read: the definition of a/B uses wstring"),
+    "/loop": ("a/msg/B", "ros2msg", b"B[] b\n", "cdr", "cannot be read: the definition of a/B uses a/B within itself"),
+    "/noise": (IMU, "ros2msg", b"\xff\xfe{", "cdr", "has a definition that cannot be read: the definition of"),
+    "/bare": ("", "", b"", "cdr", "has no definition of its messages"),
+    "/nothing": ("", "", b"", "", "has messages in no named encoding"),
+}
+
+
+Change = Callable[[str, int, bytes], bytes | None]
+
+
+def copied(source: Path, change: Change, *, beside: bool = False) -> Path:
+    """Copy of a log with changed messages, by topic and number; with ``beside``, channels of other kinds among ours."""
+    target, seen = source.with_name("copy.mcap"), Counter[str]()
+    with source.open("rb") as original, writing(target) as writer:
+        channels = {}
+        for topic, (name, kind, text, encoding, _) in FOREIGN.items() if beside else ():
+            schema = writer.register_schema(name, kind, text) if kind else 0
+            channels[topic] = writer.register_channel(topic, encoding, schema)
+        others = list(channels.values())
+        for schema, channel, message in make_reader(original).iter_messages():
+            data = change(channel.topic, seen[channel.topic], message.data)
+            seen[channel.topic] += 1
+            if data is None:
+                continue
+            if channel.topic not in channels:
+                channels[channel.topic] = channel_for(writer, channel.topic, schema.name, schema.data)
+            writer.add_message(channels[channel.topic], message.log_time, data, message.publish_time)
+            for other in others if seen.total() <= 2 else ():
+                writer.add_message(other, message.log_time, b"{}", message.publish_time)
+    return target
+
+
+def test_topics_that_cannot_be_decoded_are_counted_and_listed_with_the_reason_and_do_not_touch_ours(
+    bench: Bench,
+) -> None:
+    path = bench.write(*bench.basics())
+    mixed = copied(path, lambda *message: message[-1], beside=True)
+    topics = {topic.name: topic for topic in inspect_log(mixed).topics}
+    assert {name for name, topic in topics.items() if topic.refusal} == set(FOREIGN)
+    scanned = scan(mixed, lambda _: Keep.STAMP).topics
+    for name, (*_, reason) in FOREIGN.items():
+        assert topics[name].messages == len(scanned[name]) == 2
+        assert reason in str(topics[name].refusal)
+        assert topics[name].refusal == refusal(scanned[name])
+    alone, beside = read_log(path), read_log(mixed)
+    np.testing.assert_array_equal(alone.imu.stamps_ns, beside.imu.stamps_ns)
+    np.testing.assert_array_equal(alone.imu.angular_velocity, beside.imu.angular_velocity)
+    without = copied(path, lambda topic, _, data: None if topic == "/imu" else data, beside=True)
+    with pytest.raises(MissingTopicError, match=r"nothing for imu: .*/idl has a definition in ros2idl"):
+        read_log(without)
+
+
+# topic, role, column, and what eight bytes less leave out: a part of a number, or the length of a list
+BROKEN = [
+    ("/imu", "imu", "angular_velocity", "their definition does"),
+    ("/pressure", "depth", "z_m", "their definition does"),
+    ("/landmarks", "detections", "range_m", "track"),
+]
+
+
+@pytest.mark.parametrize(("topic", "role", "column", "end"), BROKEN)
+def test_broken_messages_are_counted_and_the_others_are_as_if_alone(
+    bench: Bench, topic: str, role: str, column: str, end: str
+) -> None:
+    path = bench.write(
+        *bench.basics(9),
+        ("/pressure", "pressure", [bench.pressure(bench.t0_ns + i, 2e5) for i in range(9)]),
+        ("/landmarks", "detections", [bench.detections(bench.t0_ns + i, [1.0 + i], [3]) for i in range(9)]),
+    )
+    whole = getattr(read_log(path), role)
+    broken = read_log(copied(path, lambda name, i, data: data[:-8] if name == topic and i in (0, 4, 5) else data))
+    kept = [1, 2, 3, 6, 7, 8]
+    np.testing.assert_array_equal(getattr(broken, role).stamps_ns, whole.stamps_ns[kept])
+    np.testing.assert_array_equal(getattr(getattr(broken, role), column), getattr(whole, column)[kept])
+    assert broken.notes["log.dropped"] == f"{role}: 3 that end before {end}"
+    wholly = copied(path, lambda name, _, data: data[:-8] if name == topic else data)
+    if role == "imu":
+        with pytest.raises(LogError, match=rf"topic /imu: no message .* 9 that end before {end}"):
+            read_log(wholly)
+    else:
+        sequence = read_log(wholly)
+        assert getattr(sequence, role) is None
+        assert sequence.notes["log.dropped"] == f"{role}: 9 that end before {end}"
+
+
 # --- the log configuration to start from ---------------------------------------------------------------------------
 
 
@@ -145,7 +245,7 @@ def choices(path: Path, config: LogConfig) -> dict[str, object]:
     return {name: (c.topic, c.candidates, adapters[name]) for name, c in found.items()}
 
 
-def test_read_back_unchanged_it_makes_the_same_choices(bench: Any, make_sequence: Any, tmp_path: Path) -> None:
+def test_read_back_unchanged_it_makes_the_same_choices(bench: Bench, make_sequence: Any, tmp_path: Path) -> None:
     imu, dvl = bench.basics()
     poses = [bench.odometry(bench.t0_ns, 0.0)]
     pressure = ("/bar30", "pressure", [bench.pressure(bench.t0_ns, 2e5)])
@@ -167,7 +267,7 @@ def test_read_back_unchanged_it_makes_the_same_choices(bench: Any, make_sequence
         assert choices(path, config) == choices(path, again)
 
 
-def test_what_is_changed_in_it_counts(bench: Any) -> None:
+def test_what_is_changed_in_it_counts(bench: Bench) -> None:
     path = bench.write(*bench.basics())
     text = inspect_log(path).toml
     assert 'rotation = "flu"' in text
@@ -176,7 +276,7 @@ def test_what_is_changed_in_it_counts(bench: Any) -> None:
     assert (frd.imu.specific_force == plain.imu.specific_force * [1, -1, -1]).all()
 
 
-def test_an_unknown_type_is_proposed_with_its_fields(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_type_is_proposed_with_its_fields(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     own = "float64 time\nfloat64[3] speed\nfloat32[] beams\n"
     monkeypatch.setitem(TYPES, "own", "my_msgs/msg/Velocity")
     rows = [{"time": 0.0, "speed": [1.0, 2.0, 3.0], "beams": []}] * 3
@@ -191,7 +291,7 @@ def test_an_unknown_type_is_proposed_with_its_fields(bench: Any, monkeypatch: py
 
 
 def test_the_command_prints_what_the_option_takes(
-    bench: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, config = bench.write(*bench.basics()), tmp_path / "log.toml"
     for arguments in (["--toml"], ["--log-config", str(config)]):

@@ -6,9 +6,9 @@ import json
 import re
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -204,31 +204,15 @@ def estimate(offset_m: float) -> tuple[Trajectory, Trajectory, LandmarkMap]:
     return path, path, LandmarkMap(np.array([3]), np.array([[100.0, 20, -5]]), np.eye(3)[None])
 
 
-@dataclass(frozen=True)
-class Result:
-    """A result with its layouts, and its messages as another library decodes them."""
-
-    path: Path
-    messages: dict[str, list[Any]]
-    layout: dict[str, Any]
-    """For Foxglove."""
-    rviz: dict[str, Any]
-
-    @property
-    def view(self) -> dict[str, Any]:
-        return self.layout["configById"]["3D!result"]
-
-    @property
-    def types(self) -> dict[str, str]:
-        return {topic: type(found[0]).__name__ for topic, found in self.messages.items()}
-
-
 @pytest.fixture(scope="module")
-def result(make_sequence: Any, tmp_path_factory: pytest.TempPathFactory) -> Result:
+def result(make_sequence: Any, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """A result with its layouts, and its messages as another library decodes them."""
     path = tmp_path_factory.mktemp("result") / "result.mcap"
     write_result(path, make_sequence(), {"isam2": estimate(0), "my-filter": estimate(10)})
     layout = json.loads(path.with_suffix(".foxglove.json").read_text("utf-8"))
-    return Result(path, decode(path), layout, YAML(typ="safe").load(path.with_suffix(".rviz"))["Visualization Manager"])
+    rviz, messages = YAML(typ="safe").load(path.with_suffix(".rviz"))["Visualization Manager"], decode(path)
+    types, view = {topic: type(ms[0]).__name__ for topic, ms in messages.items()}, layout["configById"]["3D!result"]
+    return SimpleNamespace(path=path, messages=messages, types=types, layout=layout, view=view, rviz=rviz)
 
 
 def value_at(message: Any, path: str) -> Any:
@@ -238,7 +222,7 @@ def value_at(message: Any, path: str) -> Any:
     return message
 
 
-def test_foxglove_layout_shows_what_the_panel_can_draw_of_this_result_in_its_frames(result: Result) -> None:
+def test_foxglove_layout_shows_what_the_panel_can_draw_of_this_result_in_its_frames(result: Any) -> None:
     topics = result.view["topics"]
     assert set(topics) == {topic for topic, kind in result.types.items() if kind in DRAWN_BY_FOXGLOVE}
     shown = {topic for topic, settings in topics.items() if settings["visible"] is True}
@@ -251,7 +235,7 @@ def test_foxglove_layout_shows_what_the_panel_can_draw_of_this_result_in_its_fra
 
 
 def test_every_panel_of_the_foxglove_layout_is_placed_once_and_every_plotted_path_leads_to_a_number(
-    result: Result,
+    result: Any,
 ) -> None:
     def panels(node: Any) -> Iterator[str]:
         if isinstance(node, str):
@@ -273,7 +257,7 @@ def test_every_panel_of_the_foxglove_layout_is_placed_once_and_every_plotted_pat
         assert isinstance(value_at(result.messages[topic][0], field), float)
 
 
-def test_an_estimator_has_one_colour_everywhere(result: Result) -> None:
+def test_an_estimator_has_one_colour_everywhere(result: Any) -> None:
     topics, seen = result.view["topics"], set()
     for name in ("isam2", "my_filter", "ground_truth"):
         marker = result.messages[f"/{name}/landmarks"][0].markers[0].color
@@ -284,7 +268,7 @@ def test_an_estimator_has_one_colour_everywhere(result: Result) -> None:
     assert len(seen) == 3
 
 
-def test_rviz_has_one_display_of_the_right_kind_for_each_topic_in_the_frame_of_its_messages(result: Result) -> None:
+def test_rviz_has_one_display_of_the_right_kind_for_each_topic_in_the_frame_of_its_messages(result: Any) -> None:
     displays = result.rviz["Displays"]
     drawn = {d["Topic"]["Value"]: DRAWN_BY_RVIZ[d["Class"]] for d in displays if "Topic" in d}
     assert drawn == {topic: kind for topic, kind in result.types.items() if kind != "TFMessage"}
@@ -296,7 +280,7 @@ def test_rviz_has_one_display_of_the_right_kind_for_each_topic_in_the_frame_of_i
     assert headers == {result.rviz["Global Options"]["Fixed Frame"]}
 
 
-def test_rviz_asks_late_only_for_what_the_file_offers_late(result: Result) -> None:
+def test_rviz_asks_late_only_for_what_the_file_offers_late(result: Any) -> None:
     """A subscriber that asks for more than is offered gets nothing at all."""
     with AnyReader([result.path]) as reader:
         offered = {c.topic: [q.durability.name for q in c.ext.offered_qos_profiles] for c in reader.connections}
@@ -310,7 +294,7 @@ def test_rviz_asks_late_only_for_what_the_file_offers_late(result: Result) -> No
 # --- size -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_scene_holds_everything_and_the_camera_sees_it_and_the_identities(result: Result) -> None:
+def test_the_scene_holds_everything_and_the_camera_sees_it_and_the_identities(result: Any) -> None:
     """The landmark at (100, 20, -5) is farthest from the noise of the truth around the origin."""
     scene = Scene.around([np.array([[100.0, 20, -5], [-3, 0, 0]]), np.array([[np.nan, 1e9, 0]])])
     assert scene.centre_m == (48.5, 10.0, -2.5)
