@@ -105,7 +105,10 @@ def compare(
         raise EvaluationError(f"named more than once: {', '.join(twice)}; each estimator runs once in a comparison")
     idle = sorted(set(settings) - set(names))
     if idle:
-        raise EvaluationError(f"settings for {', '.join(idle)}, which is not among {', '.join(names)}")
+        raise EvaluationError(
+            f"settings for {', '.join(idle)}, which is not among {', '.join(names)}; "
+            f"give them by estimator: {{{names[0]!r}: {{...}}}}"
+        )
     for name in names:
         check_request(name, settings.get(name))
     instants_ns = sequence.instants(rate_hz)
