@@ -1,7 +1,5 @@
 """Commands as a user gives them, and a short log to give them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Settings, topics, calibrations and rates as a user writes them."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """``bench``: suites are run, blessed and judged from the command line."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """``run``, ``compare``, ``report``, ``demo`` and ``estimators``: from a log to reports and results."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """``inspect`` names what a log has, compares its sensors, and gives advice that can be followed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

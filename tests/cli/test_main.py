@@ -1,7 +1,5 @@
 """What ``--help`` says of every command."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A user's mistake ends with code 2 and one line that names it, and no file is written; other errors are not hidden."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace

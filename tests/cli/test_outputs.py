@@ -1,7 +1,5 @@
 """What a command reads, and what another program wrote, is never overwritten."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

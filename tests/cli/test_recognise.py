@@ -1,7 +1,5 @@
 """``recognise`` and ``calibrate`` on a log with images, and ``compare`` on one without detections."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

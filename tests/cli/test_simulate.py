@@ -1,7 +1,5 @@
 """``simulate``: the commands are the library's functions between reading and writing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A log written anew: everything that was in it, and what was added; also where it is not whole."""
 
-from __future__ import annotations
-
 import re
 import struct
 from dataclasses import replace

@@ -1,5 +1,4 @@
-from __future__ import annotations
-
+import decimal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonar_graph.errors import LogError
-from sonar_graph.logs.trajectory_files import read_landmarks_csv, read_tum, write_landmarks_csv, write_tum
+from sonar_graph.logs.trajectory_files import decimal_ns, read_landmarks_csv, read_tum, write_landmarks_csv, write_tum
 from sonar_graph.states import LandmarkMap, Trajectory
 
 STAMPS = st.lists(st.integers(-(2**62), 2**62), min_size=1, max_size=20, unique=True).map(sorted)
@@ -29,10 +28,22 @@ def test_not_a_nanosecond_nor_a_bit_is_lost(tmp_path_factory, stamps, seed):
     np.testing.assert_array_equal(found.quaternions_xyzw, written.quaternions_xyzw)
 
 
-def test_the_line_is_the_one_that_tum_describes(tmp_path):
+def test_lines_are_those_that_tum_describes_with_comments_blank_lines_and_exponents(tmp_path):
     pose = Trajectory.without_covariances(np.array([1_700_000_000_000_000_001]), np.array([[1, 2, 3.5]]), np.eye(4)[3:])
     write_tum(tmp_path / "t.tum", pose)
     assert (tmp_path / "t.tum").read_text() == "1700000000.000000001 1 2 3.5 0 0 0 1\n"
+    (tmp_path / "t.tum").write_text("# t x y z\n\n1.5e0 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
+    assert read_tum(tmp_path / "t.tum").stamps_ns.tolist() == [1_500_000_000, 2_000_000_000]
+
+
+def test_decimal_seconds_keep_their_nanoseconds_whatever_the_precision_of_the_caller():
+    with decimal.localcontext() as context:
+        context.prec = 28
+        assert decimal_ns("1.00250626566416034242424242") == 1002506266
+        assert decimal_ns("1248444175.103") == 1248444175103000000 != int(1248444175.103 * 1e9)  # lost by a double
+    for text in ("nan", "inf", "-Infinity", "soon", ""):
+        with pytest.raises(ValueError, match="no finite decimal"):
+            decimal_ns(text)
 
 
 def test_evo_reads_the_same_poses(make_sequence, tmp_path):
@@ -41,11 +52,6 @@ def test_evo_reads_the_same_poses(make_sequence, tmp_path):
     theirs = file_interface.read_tum_trajectory_file(tmp_path / "t.tum")
     np.testing.assert_array_equal(theirs.positions_xyz, truth.positions)
     np.testing.assert_array_equal(theirs.orientations_quat_wxyz, truth.quaternions_xyzw[:, [3, 0, 1, 2]])
-
-
-def test_comments_blank_lines_and_exponents_are_read(tmp_path):
-    (tmp_path / "t.tum").write_text("# t x y z\n\n1.5e0 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
-    assert read_tum(tmp_path / "t.tum").stamps_ns.tolist() == [1_500_000_000, 2_000_000_000]
 
 
 MISTAKES: list[tuple[Callable[[Path], object], str | None, str]] = [
@@ -68,23 +74,19 @@ def test_a_file_that_is_no_table_of_poses_or_landmarks_is_named(tmp_path, read, 
         read(path)
 
 
-def test_landmarks_come_back_from_their_table(tmp_path):
+def test_landmarks_come_back_from_their_table_and_an_empty_map_is_a_header(tmp_path):
     rng = np.random.default_rng(0)
     root = rng.normal(size=(3, 3, 3))
     covariances = root + root.transpose(0, 2, 1)
     covariances[1] = np.nan
-    landmarks = LandmarkMap(np.array([1, 6, 2**40]), rng.normal(size=(3, 3)), covariances)
-    write_landmarks_csv(tmp_path / "l.csv", landmarks)
-    lines = (tmp_path / "l.csv").read_text().splitlines()
-    assert lines[0] == "id,x_m,y_m,z_m,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz"
-    assert float(lines[1].split(",")[8]) == covariances[0, 1, 2]
-    found = read_landmarks_csv(tmp_path / "l.csv")
-    assert found.ids.tolist() == [1, 6, 2**40]
-    np.testing.assert_array_equal(found.positions, landmarks.positions)
-    np.testing.assert_array_equal(found.covariances, landmarks.covariances)
-
-
-def test_an_empty_map_is_a_header(tmp_path):
-    write_landmarks_csv(tmp_path / "l.csv", LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3))))
-    assert len((tmp_path / "l.csv").read_text().splitlines()) == 1
-    assert len(read_landmarks_csv(tmp_path / "l.csv")) == 0
+    columns = np.array([1, 6, 2**40]), rng.normal(size=(3, 3)), covariances
+    for count in (3, 0):
+        landmarks = LandmarkMap(*(column[:count] for column in columns))
+        write_landmarks_csv(tmp_path / "l.csv", landmarks)
+        header, *lines = (tmp_path / "l.csv").read_text().splitlines()
+        assert header == "id,x_m,y_m,z_m,cov_xx,cov_xy,cov_xz,cov_yy,cov_yz,cov_zz"
+        assert [float(line.split(",")[8]) for line in lines[:1]] == covariances[: min(count, 1), 1, 2].tolist()
+        found = read_landmarks_csv(tmp_path / "l.csv")
+        assert found.ids.tolist() == landmarks.ids.tolist()
+        np.testing.assert_array_equal(found.positions, landmarks.positions)
+        np.testing.assert_array_equal(found.covariances, landmarks.covariances)

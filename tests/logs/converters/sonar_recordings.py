@@ -1,7 +1,5 @@
 """Recordings of sonars, byte for byte from the documented layouts without use of the readers, and their logs."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Any sonar's file, whole and damaged: no frame but those recorded, and what is lost is told."""
 
-from __future__ import annotations
-
 import re
 import tracemalloc
 from collections.abc import Callable
@@ -67,21 +65,15 @@ def flipped(frames: Frames, which_one: int, at: int, bit: int) -> Frames:
     return patched(frames, which_one, at, bytes([frames[which_one][at] ^ bit]))
 
 
-def setting(which_one: int) -> Callable[[Frames, str], Frames]:
-    return lambda frames, ending: flipped(frames, which_one, SETTING_AT[ending], 4)
+def other_settings(bits: dict[int, int]) -> Callable[[Frames, str], Frames]:
+    """Damage that flips a bit of the settings of each of these frames."""
 
+    def damage(frames: Frames, ending: str) -> Frames:
+        for i, bit in bits.items():
+            frames = flipped(frames, i, SETTING_AT[ending], bit)
+        return frames
 
-def settings_side_by_side(frames: Frames, ending: str) -> Frames:
-    for i, bit in ((0, 1), (1, 2), (4, 4), (5, 8)):
-        frames = flipped(frames, i, SETTING_AT[ending], bit)
-    return frames
-
-
-def alternating(frames: Frames, ending: str) -> Frames:
-    """Some sonars switch between two frequencies or windows with every frame."""
-    for i in range(1, COUNT, 2):
-        frames = flipped(frames, i, SETTING_AT[ending], 4)
-    return frames
+    return damage
 
 
 def without(*lost: int) -> list[int]:
@@ -94,11 +86,15 @@ FAULTS: dict[str, tuple[Callable[[Frames, str], Frames], list[int], str]] = {
     "two frames": (lambda frames, _: frames[:2], [0, 1], ""),
     "a cut frame": (lambda f, _: [*f[:3], f[3][:-10]], [0, 1, 2], r"(3|503): cut off, \d+ of \d+ bytes are there"),
     "a frame twice": (lambda f, _: [*f[:3], *f[2:]], EVERY, "a repetition of the frame at byte"),
-    "two settings that alternate": (alternating, EVERY, "^$"),
-    "damaged settings side by side": (settings_side_by_side, [2, 3, 6], "^([^;]*settings[^;]*(; )?){4}"),
+    "two settings that alternate": (other_settings({1: 4, 3: 4, 5: 4}), EVERY, "^$"),  # as some sonars have
+    "damaged settings side by side": (
+        other_settings({0: 1, 1: 2, 4: 4, 5: 8}),
+        [2, 3, 6],
+        "^([^;]*settings[^;]*(; )?){4}",
+    ),
 }
 FAULTS |= {f"header {i}": (lambda f, _, i=i: patched(f, i, 0, b"\xa5" * 200), without(i), "bytes") for i in (0, 3, 6)}
-FAULTS |= {f"setting {i}": (setting(i), without(i), "settings are those of no frame") for i in (0, 1, 4, 6)}
+FAULTS |= {f"setting {i}": (other_settings({i: 4}), without(i), "settings are those of no frame") for i in (0, 1, 4, 6)}
 FAULTS |= {
     f"time {i}": (lambda f, e, i=i: flipped(f, i, CLOCK_AT[e], 16), without(i), "its time does not fit") for i in (2, 4)
 }
@@ -167,9 +163,8 @@ def test_missing_or_foreign_bytes_cost_the_frames_that_they_touch_and_perhaps_th
 @each_kind
 def test_a_setting_that_stays_changed_is_believed(tmp_path, ending):
     head, *frames = PIECES[ending]
-    for i in range(3, COUNT):
-        frames = flipped(frames, i, SETTING_AT[ending], 4)
-    result = converted(tmp_path, b"".join([head, *frames]), ending)
+    changed = other_settings(dict.fromkeys(range(3, COUNT), 4))(frames, ending)
+    result = converted(tmp_path, b"".join([head, *changed]), ending)
     assert which(result) == EVERY
     assert len(result.blocks) == 2
     assert result.blocks[0].ranges_m[-1] != result.blocks[1].ranges_m[-1]

@@ -1,7 +1,5 @@
 """DIDSON, ARIS and Oculus recordings; no file of a real DIDSON was at hand: they are written from the documents."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mcap.reader import make_reader

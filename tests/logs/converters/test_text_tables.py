@@ -1,32 +1,12 @@
-import decimal
-
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from sonar_graph.logs.convert.akit import read_akit
 from sonar_graph.logs.convert.mrclam import read_mrclam
 from sonar_graph.logs.convert.step_files import read_dlr, read_victoria_park
-from sonar_graph.logs.convert.text_tables import decimal_ns, read_table
+from sonar_graph.logs.convert.text_tables import read_table
 
 from .builders import assert_refused
-
-
-@given(st.integers(-(2**62), 2**62))
-def test_decimal_text_gives_its_nanoseconds_exactly_whatever_the_precision_of_the_caller(ns):
-    with decimal.localcontext() as context:
-        context.prec = 28
-        text = f"{'-' if ns < 0 else ''}{abs(ns) // 10**9}.{abs(ns) % 10**9:09d}"
-        assert decimal_ns(text) == ns
-        assert decimal_ns("1.00250626566416034242424242") == 1002506266
-    assert int(float("1248444175.103") * 1e9) != 1248444175103000000  # what a double would have lost
-
-
-@pytest.mark.parametrize("text", ["nan", "inf", "-Infinity", "soon", ""])
-def test_what_is_no_time_is_refused(text):
-    with pytest.raises(ValueError, match="no finite decimal"):
-        decimal_ns(text)
 
 
 def test_comments_and_blank_lines_are_passed_over(tmp_path):
