@@ -58,7 +58,10 @@ def test_times_subjects_and_coordinates_stay_the_data_sets_own_and_robots_are_le
 
 def test_start_is_the_truth_at_the_first_command_across_the_wrap(folder):
     """Half way from heading 3 to -3 by the short way is pi."""
-    start = read_mrclam(folder, 1).calibration.start
+    sequence = read_mrclam(folder, 1)
+    start, truth = sequence.calibration.start, sequence.truth
+    assert truth.positions.tolist() == [[1.0, 2.0, 0.0], [3.0, 2.0, 0.0]]
+    assert np.allclose(truth.rotations()[0].apply([1, 0, 0]), [np.cos(3), np.sin(3), 0])
     assert np.allclose(start.position_m, [2.0, 2.0, 0.0])
     assert abs(start.rpy_rad[2]) == pytest.approx(np.pi)
 

@@ -42,7 +42,25 @@ def messages(store: Any, *, ros1: bool) -> list[tuple[str, str, Any]]:
     move = types["geometry_msgs/msg/Transform"](vector(1, 2, 3), quaternion(0, 0, 0, 1))
     link = types["geometry_msgs/msg/TransformStamped"](head(0), "imu", move)
     found.append(("/tf_static", "tf2_msgs/msg/TFMessage", types["tf2_msgs/msg/TFMessage"]([link])))
+    if ros1:
+        roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+        matrices = np.array([0.5]), np.arange(9.0), np.arange(9.0), np.arange(12.0)
+        camera = types["sensor_msgs/msg/CameraInfo"](head(0), 480, 640, "plumb_bob", *matrices, 1, 1, roi)
+        found.append(("/camera", "sensor_msgs/msg/CameraInfo", camera))
     return found
+
+
+def write_bag(writer: Any, store: Any, entries: list[tuple[str, str, Any]]) -> None:
+    """Write messages one after another; the transform is latched in ROS 1."""
+    ros1 = isinstance(writer, Ros1Writer)
+    serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
+    connections: dict[str, Any] = {}
+    with writer:
+        for row, (topic, kind, message) in enumerate(entries):
+            if topic not in connections:
+                latched = {"latching": 1 if topic == "/tf_static" else None} if ros1 else {}
+                connections[topic] = writer.add_connection(topic, kind, typestore=store, **latched)
+            writer.write(connections[topic], T0_NS + row * STEP_NS, serialize(message, kind))
 
 
 def ros1_store() -> Any:
@@ -54,23 +72,8 @@ def ros1_store() -> Any:
 @pytest.fixture
 def ros1_bag(tmp_path: Path) -> Path:
     store = ros1_store()
-    path = tmp_path / "old.bag"
-    with Ros1Writer(path) as writer:
-        connections: dict[str, Any] = {}
-        for row, (topic, kind, message) in enumerate(messages(store, ros1=True)):
-            if topic not in connections:
-                latching = 1 if topic == "/tf_static" else None
-                connections[topic] = writer.add_connection(topic, kind, typestore=store, latching=latching)
-            writer.write(connections[topic], T0_NS + row * STEP_NS, store.serialize_ros1(message, kind))
-        info = store.types["sensor_msgs/msg/CameraInfo"]
-        names = {"D": np.array([0.5]), "K": np.arange(9.0), "R": np.arange(9.0), "P": np.arange(12.0)}
-        roi = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        head = messages(store, ros1=True)[0][2].header
-        camera = info(head, 480, 640, "plumb_bob", *names.values(), 1, 1, roi)
-        kind = "sensor_msgs/msg/CameraInfo"
-        connection = writer.add_connection("/camera", kind, typestore=store)
-        writer.write(connection, T0_NS, store.serialize_ros1(camera, kind))
-    return path
+    write_bag(Ros1Writer(tmp_path / "old.bag"), store, messages(store, ros1=True))
+    return tmp_path / "old.bag"
 
 
 def test_a_ros_1_bag_becomes_a_log_of_ros_2_with_its_stamps_values_and_times(ros1_bag, tmp_path, decoded):
@@ -101,12 +104,8 @@ def test_a_ros_1_bag_becomes_a_log_of_ros_2_with_its_stamps_values_and_times(ros
 def test_sqlite3_bags_keep_their_payloads(tmp_path, decoded):
     store = get_typestore(Stores.ROS2_HUMBLE)
     folder = tmp_path / "ros2"
-    with Ros2Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        connections: dict[str, Any] = {}
-        for row, (topic, kind, message) in enumerate(messages(store, ros1=False)):
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=store)
-            writer.write(connections[topic], T0_NS + row * STEP_NS, store.serialize_cdr(message, kind))
+    writer = Ros2Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3)
+    write_bag(writer, store, messages(store, ros1=False))
     (database,) = folder.glob("*.db3")
     for source in (folder, database):
         done = convert_rosbag(source, tmp_path / "new.mcap")
@@ -119,12 +118,8 @@ def test_sqlite3_bags_keep_their_payloads(tmp_path, decoded):
 def test_a_type_of_the_users_own_keeps_its_definition(tmp_path, decoded):
     store = ros1_store()
     store.register(get_types_from_msg("Header header\nfloat64[4] velocity\n", "provider_dvl/msg/Packet"))
-    with Ros1Writer(tmp_path / "own.bag") as writer:
-        kind = "provider_dvl/msg/Packet"
-        connection = writer.add_connection("/dvl", kind, typestore=store)
-        head = messages(store, ros1=True)[3][2].header
-        message = store.types[kind](head, np.arange(4.0))
-        writer.write(connection, T0_NS, store.serialize_ros1(message, kind))
+    message = store.types["provider_dvl/msg/Packet"](messages(store, ros1=True)[3][2].header, np.arange(4.0))
+    write_bag(Ros1Writer(tmp_path / "own.bag"), store, [("/dvl", "provider_dvl/msg/Packet", message)])
     convert_rosbag(tmp_path / "own.bag", tmp_path / "own.mcap")
     (found,) = decoded(tmp_path / "own.mcap")["/dvl"]
     assert found.velocity == [0, 1, 2, 3]
