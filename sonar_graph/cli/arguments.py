@@ -107,10 +107,7 @@ class ReadingOptions:
 
     @property
     def choices(self) -> dict[str, str]:
-        """Topics by role, from texts such as ``imu=/imu/data``.
-
-        Raises `LogError` when a text has no role, no ``=`` or no topic.
-        """
+        """Topics by role, from texts such as ``imu=/imu/data``."""
         choices = {}
         for text in self.topics or []:
             role, _, topic = text.partition("=")
@@ -188,10 +185,7 @@ def with_options(*left_out: str) -> Callable[[Callable[..., None]], Callable[...
 
 
 def parse_settings(texts: list[str]) -> dict[str, Any]:
-    """Values by name from texts such as ``laps=2``, read as TOML, or as plain text if they are no TOML.
-
-    Raises `EstimatorError` when a text has no name or no ``=``, or a name is given again with another value.
-    """
+    """Values by name from texts such as ``laps=2``, read as TOML, or as plain text if they are no TOML."""
     settings: dict[str, Any] = {}
     for text in texts:
         name, equals, value = (part.strip() for part in text.partition("="))
@@ -221,10 +215,7 @@ def nested_settings(texts: list[str] | None) -> dict[str, Any]:
 
 
 def estimator_settings(texts: list[str] | None, names: list[str]) -> dict[str, dict[str, Any]]:
-    """Settings by estimator, from texts such as ``isam2.smoother.lag_s=20``; dots go into nested settings.
-
-    Raises `EstimatorError` as `parse_settings`, and when a text does not begin with one of the estimators that run.
-    """
+    """Settings by estimator, from texts such as ``isam2.smoother.lag_s=20``; dots go into nested settings."""
     from sonar_graph.estimator import installed_estimators
     from sonar_graph.settings import nested, suggestion
 
@@ -244,10 +235,7 @@ def estimator_settings(texts: list[str] | None, names: list[str]) -> dict[str, d
 
 
 def validated(kind: type[Model], values: dict[str, Any], whose: str) -> Model:
-    """Settings as their model.
-
-    Raises `typer.BadParameter` naming each setting that does not exist or does not fit, and those that exist.
-    """
+    """Settings as their model."""
     from pydantic import ValidationError
 
     from sonar_graph.settings import faults_in

@@ -159,10 +159,7 @@ def compare_log(
     rate_hz: float,
     settings: list[str] | None,
 ) -> Comparison:
-    """Read a log, recognise landmarks if it needs that, and compare estimators; mistakes are reported first.
-
-    Raises `SonarGraphError` when an argument does not fit, or the log cannot be read.
-    """
+    """Read a log, recognise landmarks if it needs that, and compare estimators; mistakes are reported first."""
     from sonar_graph.evaluation import check_request
     from sonar_graph.evaluation import compare as compare_runs
     from sonar_graph.recognition import no_images, with_detections
@@ -189,10 +186,7 @@ def compare_log(
 
 
 def check_rate(rate_hz: float, sequence: Sequence) -> None:
-    """Refuse to ask for estimates more often than the IMU measures; the default rate is valid for any log.
-
-    Raises `EvaluationError` naming the highest rate.
-    """
+    """Refuse to ask for estimates more often than the IMU measures; the default rate is valid for any log."""
     stamps_ns = sequence.imu.stamps_ns
     imu_hz = len(stamps_ns) / max(float(stamps_ns[-1] - stamps_ns[0]) * 1e-9, 1.0)
     highest_hz = max(DEFAULT_RATE_HZ, imu_hz)

@@ -40,11 +40,7 @@ def writable_log(path: Path, source: Path | None = None, *, overwrite: bool = Fa
 
 
 def writable_json(path: Path, sources: Iterable[Path]) -> Path:
-    """Check that a JSON file can be written, make its folder, and return ``path``.
-
-    Raises `EvaluationError` when it is a folder, is not called ``*.json``, is one of the sources, or its folder cannot
-    be written to.
-    """
+    """Check that a JSON file can be written, make its folder, and return ``path``."""
     if path.is_dir() or path.suffix != ".json":
         raise EvaluationError(f"{path}: expected the name of a file that ends in .json")
     if any(_is_part_of(path, source) for source in sources):

@@ -79,19 +79,13 @@ class RecogniserOptions:
         return self != RecogniserOptions()
 
     def read_designs(self) -> tuple[LandmarkDesign, ...] | None:
-        """Designs of the user, if given.
-
-        Raises `CalibrationError` when a file is not what it should be.
-        """
+        """Designs of the user, if given."""
         from sonar_graph.devices import load_designs
 
         return None if self.designs is None else load_designs(self.designs)
 
     def params(self, settings: list[str] | None = None) -> RecogniserParams:
-        """Settings of the recogniser.
-
-        Raises `CalibrationError` when the model's file is none.
-        """
+        """Settings of the recogniser."""
         from sonar_graph.sonar import RecogniserParams, read_confusion
 
         values = nested_settings(settings)
@@ -108,11 +102,7 @@ class RecogniserOptions:
     def recogniser(
         self, calibration: Calibration, settings: list[str] | None = None, name: str = "designs"
     ) -> LandmarkRecogniser:
-        """The recogniser of that name.
-
-        Raises `CalibrationError` when a file is not what it should be, designs and model are of different landmarks, or
-        AcTag is not installed.
-        """
+        """The recogniser of that name."""
         from sonar_graph.sonar import AcTagRecogniser, AcTagSettings, Recogniser
 
         if name != "actag":

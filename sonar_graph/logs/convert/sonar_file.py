@@ -330,15 +330,7 @@ class SonarConversion:
 def convert_sonar_file(
     source: ByteSource, kind: SonarFormat, output: Path, progress: Progress | None = None
 ) -> SonarConversion:
-    """Write all whole frames to an MCAP log; memory holds a few of them at a time.
-
-    Raises
-    ------
-    DatasetError
-        When no frame is whole.
-    LogError
-        When the log cannot be written.
-    """
+    """Write all whole frames to an MCAP log; memory holds a few of them at a time."""
     conversion = SonarConversion(promised=kind.frames_promised)
     calibration = Calibration(sonar=SonarCalibration(image=kind.image))
     record = {"name": source.path.stem, "calibration": calibration.model_dump_json()}

@@ -84,13 +84,7 @@ def read_lines(
 
 
 def numbers(path: Path, number: int, fields: list[str], columns: tuple[str, ...]) -> list[float]:
-    """Fields of one line as finite numbers.
-
-    Raises
-    ------
-    DatasetError
-        Naming the line and the columns expected.
-    """
+    """Fields of one line as finite numbers; an error names the line and the columns expected."""
     expected = f"expected {len(columns)} numbers: {', '.join(columns)}"
     if len(fields) != len(columns):
         raise DatasetError(f"{path}, line {number}: {len(fields)} fields; {expected}")
@@ -115,12 +109,7 @@ def numbered_run(folder: Path, entry: str, number: int, kind: str, expected: str
     number
         The wanted run.
     kind, expected
-        Names of a run and of the content of the folder, for the errors.
-
-    Raises
-    ------
-    DatasetError
-        When the folder or the run does not exist.
+        Names of a run and of the content of the folder, for the errors where one does not exist.
     """
     if not folder.is_dir():
         raise DatasetError(f"{folder}: is not a folder; give the folder that holds {expected}")
