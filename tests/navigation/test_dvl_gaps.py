@@ -15,117 +15,59 @@ from sonar_graph.navigation.preintegration.dvl_gaps import integral, line_before
 from sonar_graph.navigation.preintegration.motion import Preintegrator
 from sonar_graph.testing import check_consistent
 
-from . import test_motion_laws as laws
-from . import vehicle
+from . import vehicle, ways
 from .rows import NS, at, dvl, imu, nees, stamps
 from .vehicle import DVL, NOISY, QUIET, motion
 
 WITH_OR_WITHOUT = pytest.mark.parametrize("is_blind", [False, True], ids=["accelerometers", "walk"])
 
 
-def density(per_root_hz):
-    return [per_root_hz * np.sqrt(laws.IMU_HZ)] * 3
-
-
-ONE_PLACE = {"imu": {"gyro_noise_density": 1e-3}, "body_p_imu": laws.BODY_P_DVL}
-ISOTROPIC = (0.01, 0.01, 0.01)
-OPEN, CLOSED, CHAIN = (laws.LOST_S, laws.OPEN_S), (laws.LOST_S, laws.FOUND_S), (5.0, 12.0)
-
-
-@pytest.mark.parametrize(
-    ("column", "sigma", "sensors", "measured", "span_s", "tolerance"),
-    [
-        # IMU and Doppler log in one place: how noise of single rates acts on the lever between them is left out.
-        ("rate", density(1e-3), ONE_PLACE, {"lever": np.zeros(3)}, CLOSED, 0.02),
-        ("rate", density(1e-3), ONE_PLACE, {"lever": np.zeros(3), "dvl_hz": 10.0}, OPEN, 0.15),
-        ("force", density(1e-2), {"imu": {"accel_noise_density": 1e-2}}, {}, CLOSED, 0.04),
-        ("force", density(1e-2), {"imu": {"accel_noise_density": 1e-2}}, {"dvl_hz": 10.0}, OPEN, 0.06),
-        ("velocity", ISOTROPIC, {}, {}, OPEN, 1e-6),
-        ("velocity", laws.SIGMA_M_S, {}, {}, CHAIN, 0.02),  # what the gap's ends share with their neighbours included
-        ("velocity", laws.SIGMA_M_S, {"gap_s": 0.9}, {"pings_s": (5, 7, 9, 11.5)}, (5.0, 11.5), 0.02),
-        ("velocity", laws.SIGMA_M_S, {"gap_s": 0.9}, {"pings_s": (5, 11, 12)}, (5.0, 12.0), 0.02),
-        ("velocity", laws.SIGMA_M_S, {"gap_s": 0.9}, {"pings_s": (5, 5.5, 8, 8.5, 11.5)}, (5.0, 11.5), 0.15),
-        ("walk", laws.SIGMA_M_S, {}, {}, CHAIN, 0.08),
-        ("walk", ISOTROPIC, {}, {}, OPEN, 0.15),
-    ],
-)
-def test_noise_spreads_gaps_as_noise_of_every_sample_does(column, sigma, sensors, measured, span_s, tolerance):
-    """``J Q J^T`` of white noise of every number of a column, J by differences; of pings alone too.
-
-    What gaps that follow each other share counts once; intervals of samples at their ends count as if they went on.
-    """
-    imu, dvl = laws.rows(**measured)
-    imu, column = (laws.blinded(imu), "velocity") if column == "walk" else (imu, column)
-    how = laws.calibration(**sensors, **({"velocity_sigma_m_s": sigma} if column == "velocity" else {})), *span_s
-    values = {"rate": imu.angular_velocity, "force": imu.specific_force, "velocity": dvl.velocity}[column]
-    base, truth, step = motion(imu, dvl, *how), np.zeros((6, 6)), 1e-5
-    for row, axis in np.ndindex(values.shape):
-        delta = np.zeros_like(values)
-        delta[row, axis] = step
-        j = laws.change_of(base, motion(*laws.spoilt(imu, dvl, column, delta), *how)) / step
-        truth += np.outer(j, j) * sigma[axis] ** 2
-    deviation = np.sqrt(np.diag(truth))
-    used = deviation > 1e-6
-    off = (base.covariance - truth)[np.ix_(used, used)] / np.outer(deviation[used], deviation[used])
-    assert np.abs(off).max() < tolerance
-
-
 @WITH_OR_WITHOUT
 def test_a_sample_that_ends_a_gap_counts_only_once_inertial_rows_cover_it(is_blind):
     """Before, there is no node at it, and the gap is as open as without it."""
-    known = laws.calibration({"accel_noise_density": 1e-2}, velocity_sigma_m_s=(0.01,) * 3, velocity_walk_density=0.02)
-    imu, dvl = laws.rows()
-    imu = laws.blinded(imu) if is_blind else imu
-    seen = imu.between(0, at(laws.FOUND_S) - 1)
-    until_s = laws.FOUND_S + 0.05
-    open_gap = motion(seen, dvl.between(0, at(laws.LOST_S)), known, laws.LOST_S, until_s)
-    found = motion(seen, dvl.between(0, at(laws.FOUND_S)), known, laws.LOST_S, until_s)
+    known = ways.calibration({"accel_noise_density": 1e-2}, velocity_sigma_m_s=(0.01,) * 3, velocity_walk_density=0.02)
+    imu, dvl = ways.rows()
+    imu = ways.blinded(imu) if is_blind else imu
+    seen = imu.between(0, at(ways.FOUND_S) - 1)
+    until_s = ways.FOUND_S + 0.05
+    open_gap = motion(seen, dvl.between(0, at(ways.LOST_S)), known, ways.LOST_S, until_s)
+    found = motion(seen, dvl.between(0, at(ways.FOUND_S)), known, ways.LOST_S, until_s)
     assert found.i_T_j.equals(open_gap.i_T_j, 0.0)
     assert np.array_equal(found.covariance, open_gap.covariance)
-    covered = motion(imu, dvl.between(0, at(laws.FOUND_S)), known, laws.LOST_S, laws.FOUND_S)
+    covered = motion(imu, dvl.between(0, at(ways.FOUND_S)), known, ways.LOST_S, ways.FOUND_S)
     assert np.trace(covered.covariance[3:, 3:]) < 0.5 * np.trace(open_gap.covariance[3:, 3:])
 
 
-@pytest.mark.parametrize("until_s", [laws.FOUND_S, laws.OPEN_S], ids=["closed", "open"])
-def test_an_accelerometer_bias_spreads_a_gap_as_moving_all_forces_does(until_s):
-    imu, dvl = laws.rows()
-    how = laws.calibration({"accel_bias_sigma": 0.02}), laws.LOST_S, until_s
-    base, step = motion(imu, dvl, *how), 1e-4
-    moved = [motion(*laws.spoilt(imu, dvl, "force", step * axis), *how) for axis in np.eye(3)]
-    J = [laws.change_of(base, one)[3:] / step for one in moved]
-    assert base.covariance[3:, 3:] == pytest.approx(0.02**2 * np.transpose(J) @ J, rel=1e-3, abs=1e-8)
-
-
 def test_a_gap_that_ends_between_inertial_rows_uses_the_row_after_its_end_and_no_later_one():
-    imu, dvl = laws.rows()
-    late = Dvl(dvl.stamps_ns + NS // 20 * (dvl.stamps_ns >= at(laws.FOUND_S)), dvl.velocity, dvl.velocity_cov)
-    how = laws.calibration(), laws.LOST_S, laws.FOUND_S + 0.05
+    imu, dvl = ways.rows()
+    late = Dvl(dvl.stamps_ns + NS // 20 * (dvl.stamps_ns >= at(ways.FOUND_S)), dvl.velocity, dvl.velocity_cov)
+    how = ways.calibration(), ways.LOST_S, ways.FOUND_S + 0.05
     base = motion(imu, late, *how).i_T_j
-    for row_s, is_used in ((laws.FOUND_S + 0.1, True), (laws.FOUND_S + 0.2, False)):
+    for row_s, is_used in ((ways.FOUND_S + 0.1, True), (ways.FOUND_S + 0.2, False)):
         only = (imu.stamps_ns == at(row_s))[:, None] * np.ones(3)
-        found = motion(*laws.spoilt(imu, late, "force", only), *how).i_T_j
+        found = motion(*ways.spoilt(imu, late, "force", only), *how).i_T_j
         assert found.equals(base, 1e-6) != is_used
 
 
 @WITH_OR_WITHOUT
 def test_both_ends_of_a_gap_count_by_their_own_noise(is_blind):
     """``T (T + 2 d) / 4`` of each one's variance, d the interval before the gap."""
-    imu, dvl = laws.rows()
-    sigma = np.where(dvl.stamps_ns <= at(laws.LOST_S), 0.01, 0.03)
+    imu, dvl = ways.rows()
+    sigma = np.where(dvl.stamps_ns <= at(ways.LOST_S), 0.01, 0.03)
     noisy = Dvl(dvl.stamps_ns, dvl.velocity, sigma[:, None, None] ** 2 * np.eye(3))
-    found = motion(laws.blinded(imu) if is_blind else imu, noisy, laws.calibration(), laws.LOST_S, laws.FOUND_S)
+    found = motion(ways.blinded(imu) if is_blind else imu, noisy, ways.calibration(), ways.LOST_S, ways.FOUND_S)
     assert np.diag(found.covariance)[3:] == pytest.approx(
         [(0.01**2 + 0.03**2) * 5.0 * (5.0 + 2 * 0.5) / 4] * 3, rel=1e-3
     )
 
 
 def test_too_few_samples_for_a_line_leave_a_walk():
-    imu, dvl = laws.rows()
-    known, few = laws.calibration(velocity_walk_density=0.1), dvl.rows(dvl.stamps_ns >= at(laws.LOST_S - 1.0))
-    found, walked = (motion(part, few, known, laws.LOST_S, laws.OPEN_S) for part in (imu, laws.blinded(imu)))
+    imu, dvl = ways.rows()
+    known, few = ways.calibration(velocity_walk_density=0.1), dvl.rows(dvl.stamps_ns >= at(ways.LOST_S - 1.0))
+    found, walked = (motion(part, few, known, ways.LOST_S, ways.OPEN_S) for part in (imu, ways.blinded(imu)))
     assert found.i_T_j.equals(walked.i_T_j, 0.0)
     assert np.array_equal(found.covariance, walked.covariance)
-    assert not motion(imu, dvl, known, laws.LOST_S, laws.OPEN_S).i_T_j.equals(walked.i_T_j, 0.1)
+    assert not motion(imu, dvl, known, ways.LOST_S, ways.OPEN_S).i_T_j.equals(walked.i_T_j, 0.1)
 
 
 @pytest.mark.parametrize("until_s", [16.0, 15.9, 14.0])
@@ -162,7 +104,7 @@ def test_the_covariance_of_a_gap_is_that_of_many_runs(until_s):
 def test_without_accelerometer_the_velocity_is_a_random_walk(until_s, share):
     imu_rows, dvl_rows = vehicle.rows()
     exact = DVL.model_copy(update={"velocity_sigma_m_s": (0.0,) * 3, "velocity_walk_density": 0.05})
-    found = motion(laws.blinded(imu_rows), dvl_rows, Calibration(imu=QUIET, dvl=exact), vehicle.LOST_S, until_s)
+    found = motion(ways.blinded(imu_rows), dvl_rows, Calibration(imu=QUIET, dvl=exact), vehicle.LOST_S, until_s)
     expected = 0.05**2 * (until_s - vehicle.LOST_S) ** 3 / share
     assert np.diag(found.covariance)[3:] == pytest.approx([expected] * 3)
 

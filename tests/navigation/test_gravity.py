@@ -26,7 +26,7 @@ from sonar_graph.navigation.preintegration.recursion import Steps
 from sonar_graph.testing import check_consistent
 
 from .rows import derivative
-from .vehicle import acceleration_at, attitude, rate_at, velocity_at
+from .ways import acceleration_at, attitude, rate_at, velocity_at
 
 G = 9.81
 GRAVITY = np.array([0.0, 0.0, G])

@@ -20,7 +20,7 @@ from sonar_graph.testing import check_consistent
 
 from .rows import dvl as dvl_rows
 from .rows import imu as imu_rows
-from .vehicle import acceleration_at, attitude, rate_at, velocity_at
+from .ways import acceleration_at, attitude, rate_at, velocity_at
 
 T = np.arange(round(15.0 * 100) + 1) / 100
 G, HZ, DVL_EVERY = 9.80665, 100, 20

@@ -1,4 +1,7 @@
-"""Steps of two sensors, and motion over them, against GTSAM's exponentials, a dense recursion and noisy runs."""
+"""Steps of two sensors and motion over them, against GTSAM's exponentials, a dense recursion and noisy runs.
+
+Then the laws of every way to a motion: over steps, over gaps, and by each rule of joint preintegration.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,12 @@ from sonar_graph.navigation.preintegration.motion import Preintegrator
 from sonar_graph.navigation.preintegration.recursion import Steps, merge_rows
 from sonar_graph.testing import check_consistent
 
-from .rows import NS, at, dead_reckoned, dense_covariance, dvl, imu, nees, part, random_steps, stamps, waves
+from . import ways
+from .rows import NS, T0_NS, at, dead_reckoned, dense_covariance, dvl, imu, nees, part, random_steps, stamps, waves
 from .vehicle import motion
+from .ways import WAYS, Way, attitude, change_of, moved_by, rows, spoilt, velocity_at
+
+every_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 
 IMU_NS = np.array([0, 10, 20, 32, 40, 50], dtype=np.int64) * 10**7
 DVL_NS = np.array([-5, 20, 36, 52], dtype=np.int64) * 10**7
@@ -193,3 +200,124 @@ def integrated(*vectors):
 def test_mistakes_are_named(mistake, error, message):
     with pytest.raises(error, match=message):
         mistake()
+
+
+@every_way
+def test_the_bias_derivative_is_that_of_integrating_again(way):
+    imu, dvl = rows()
+    base, step = moved_by(way, imu, dvl), 1e-6
+    J = [change_of(base, moved_by(way, *spoilt(imu, dvl, "rate", -step * axis))) / step for axis in np.eye(3)]
+    assert base.D_bias == pytest.approx(np.transpose(J), rel=1e-3, abs=0.02)
+
+
+@every_way
+def test_a_bias_that_is_removed_is_as_if_it_had_not_been(way):
+    imu, dvl = rows()
+    bias, noise = (
+        np.array([0.03, -0.02, 0.04]),
+        {"velocity_sigma_m_s": ways.SIGMA_M_S, "imu": {"gyro_noise_density": 1e-3}},
+    )
+    clean = moved_by(way, imu, dvl, known=noise)
+    biased = moved_by(way, *spoilt(imu, dvl, "rate", bias), bias, known=noise)
+    assert biased.i_T_j.equals(clean.i_T_j, 1e-9)
+    assert biased.covariance == pytest.approx(clean.covariance, abs=1e-12)
+    assert np.array_equal(biased.bias, bias)
+
+
+@every_way
+def test_earths_rotation_is_removed_as_if_it_stood_still(way):
+    """Exaggerated twentyfold, and known in the frame of the first node."""
+    imu, dvl = rows()
+    world_earth = np.array([0.0, 1e-3, 8e-4])
+    turning, at_dvl = (attitude((ns - T0_NS) * 1e-9).inv().apply(world_earth) for ns in (imu.stamps_ns, dvl.stamps_ns))
+    felt = spoilt(*spoilt(imu, dvl, "rate", turning), "velocity", -np.cross(at_dvl, ways.BODY_P_IMU - ways.BODY_P_DVL))
+    earth = attitude(np.array([way.start_s])).inv().apply(world_earth)[0]
+    still, found, left_in = moved_by(way, imu, dvl), moved_by(way, *felt, earth=earth), moved_by(way, *felt)
+    assert found.i_T_j.equals(still.i_T_j, 4e-3)
+    assert found.i_T_j.rotation().equals(still.i_T_j.rotation(), 4e-4)
+    assert not left_in.i_T_j.rotation().equals(still.i_T_j.rotation(), 1e-3)
+
+
+@every_way
+def test_rows_stamped_later_than_the_covering_one_change_nothing(way):
+    imu, dvl = rows()
+    is_open = way.until_s == ways.OPEN_S
+    way = way._replace(until_s=way.until_s + 0.03 * is_open)
+    noise = {"velocity_sigma_m_s": ways.SIGMA_M_S, "imu": {"gyro_noise_density": 1e-3, "accel_noise_density": 1e-2}}
+    begin_ns = 0 if way.rule is None else at(way.start_s) - NS // 10
+    part = imu.between(begin_ns - 1, at(way.until_s) + (0 if is_open else NS // 10))
+    whole, cut = moved_by(way, imu, dvl, known=noise), moved_by(way, part, dvl.between(0, at(way.until_s)), known=noise)
+    assert np.array_equal(whole.i_T_j.matrix(), cut.i_T_j.matrix())
+    assert np.array_equal(whole.covariance, cut.covariance)
+
+
+@pytest.mark.parametrize("name", ["two gaps", "inertial over gaps", "rule inertial", "linear"])
+def test_the_motion_is_that_of_the_vehicle(name):
+    way = WAYS[name]
+    seconds = np.linspace(way.start_s, way.until_s, 20001)
+    track = np.trapezoid(velocity_at(seconds), seconds, axis=0)
+    start, end = attitude(np.array([way.start_s, way.until_s]))
+    truth = start.inv().apply(track - (end.apply(ways.BODY_P_IMU) - start.apply(ways.BODY_P_IMU)))
+    found = moved_by(way, *rows())
+    assert found.i_T_j.translation() == pytest.approx(truth, abs=0.03)
+    assert found.i_T_j.rotation().matrix() == pytest.approx((start.inv() * end).as_matrix(), abs=2e-3)
+
+
+ONE_PLACE = {"body_p_imu": ways.BODY_P_DVL}
+ISOTROPIC = {"velocity_sigma_m_s": (0.01, 0.01, 0.01)}
+
+
+@pytest.mark.parametrize(
+    ("way", "column", "sensors", "measured", "tolerance"),
+    [
+        # IMU and Doppler log in one place: how noise of single rates acts on the lever between them is left out.
+        (WAYS["closed gap"], "rate", ONE_PLACE, {"lever": np.zeros(3)}, 0.02),
+        (WAYS["open gap"], "rate", ONE_PLACE, {"lever": np.zeros(3), "dvl_hz": 10.0}, 0.15),
+        (WAYS["closed gap"], "force", {}, {}, 0.04),
+        (WAYS["open gap"], "force", {}, {"dvl_hz": 10.0}, 0.06),
+        (WAYS["open gap"], "velocity", ISOTROPIC, {}, 1e-6),
+        (WAYS["open walk"], "velocity", ISOTROPIC, {}, 0.15),
+        (Way(5.0, 12.0), "velocity", {}, {}, 0.02),  # what the gap's ends share with their neighbours included
+        (Way(5.0, 12.0, is_blind=True), "velocity", {}, {}, 0.08),
+        (Way(5.0, 11.5), "velocity", {"gap_s": 0.9}, {"pings_s": (5.0, 7.0, 9.0, 11.5)}, 0.02),
+        (Way(5.0, 12.0), "velocity", {"gap_s": 0.9}, {"pings_s": (5.0, 11.0, 12.0)}, 0.02),
+        (Way(5.0, 11.5), "velocity", {"gap_s": 0.9}, {"pings_s": (5.0, 5.5, 8.0, 8.5, 11.5)}, 0.15),
+        (WAYS["inertial over gaps"], "rate", {}, {}, 0.1),
+        (WAYS["inertial over gaps"], "force", {}, {}, 0.06),
+        (WAYS["inertial over gaps"], "velocity", {}, {}, 1e-6),
+    ],
+)
+def test_noise_spreads_as_noise_of_every_sample_does(way, column, sensors, measured, tolerance):
+    """``J Q J^T`` of white noise of every number of a column, J by differences; of pings alone too.
+
+    What gaps that follow each other share counts once; intervals of samples at their ends count as if they went on.
+    """
+    imu, dvl = rows(**measured)
+    sigma, values, noise = {
+        "rate": ([1e-3 * np.sqrt(ways.IMU_HZ)] * 3, imu.angular_velocity, {"imu": {"gyro_noise_density": 1e-3}}),
+        "force": ([1e-2 * np.sqrt(ways.IMU_HZ)] * 3, imu.specific_force, {"imu": {"accel_noise_density": 1e-2}}),
+        "velocity": (
+            sensors.get("velocity_sigma_m_s", ways.SIGMA_M_S),
+            dvl.velocity,
+            {"velocity_sigma_m_s": ways.SIGMA_M_S},
+        ),
+    }[column]
+    known = noise | sensors
+    base, truth, step = moved_by(way, imu, dvl, known=known), np.zeros((6, 6)), 1e-5
+    for row, axis in np.ndindex(values.shape):
+        delta = np.zeros_like(values)
+        delta[row, axis] = step
+        j = change_of(base, moved_by(way, *spoilt(imu, dvl, column, delta), known=known)) / step
+        truth += np.outer(j, j) * sigma[axis] ** 2
+    deviation = np.sqrt(np.diag(truth))
+    used = deviation > 1e-6
+    off = (base.covariance - truth)[np.ix_(used, used)] / np.outer(deviation[used], deviation[used])
+    assert np.abs(off).max() < tolerance
+
+
+@pytest.mark.parametrize("name", ["closed gap", "open gap", "inertial over gaps"])
+def test_an_unknown_accelerometer_bias_spreads_as_moving_all_forces_does(name):
+    (imu, dvl), way, step = rows(), WAYS[name], 1e-4
+    base = moved_by(way, imu, dvl, known={"imu": {"accel_bias_sigma": 0.02}})
+    J = [change_of(base, moved_by(way, *spoilt(imu, dvl, "force", step * a)))[3:] / step for a in np.eye(3)]
+    assert base.covariance[3:, 3:] == pytest.approx(0.02**2 * np.transpose(J) @ J, rel=1e-3, abs=1e-8)

@@ -1,4 +1,4 @@
-"""Two vehicles by hand: one that rolls, pitches and turns; one that surges and sways, with a gap of its Doppler log."""
+"""A vehicle that surges and sways while it turns, with a gap of its Doppler log from 6 to 16 s."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,25 +22,6 @@ QUIET = ImuCalibration(
 )
 NOISY = QUIET.model_copy(update={"gyro_noise_density": GYRO, "accel_noise_density": ACCEL, "accel_bias_sigma": 5e-3})
 DVL = DvlCalibration(velocity_sigma_m_s=(SIGMA,) * 3, mounting=Mounting(translation_m=(-0.3, 0.2, -0.1)))
-
-
-def attitude(t, yaw=0.0):
-    """world_R_body of a vehicle that rolls, pitches and turns."""
-    angles = [yaw + 0.2 * t + 0.1 * np.sin(t), 0.1 * np.sin(0.6 * t), 0.15 * np.cos(0.5 * t)]
-    return Rotation.from_euler("ZYX", np.column_stack(angles))
-
-
-def rate_at(t):
-    return (attitude(t - 1e-4).inv() * attitude(t + 1e-4)).as_rotvec() / 2e-4
-
-
-def velocity_at(t):
-    """Of the IMU's point in the world."""
-    return np.column_stack([1.0 + 0.2 * np.sin(t), 0.4 * np.cos(0.5 * t), 0.1 * np.sin(0.8 * t)])
-
-
-def acceleration_at(t):
-    return np.column_stack([0.2 * np.cos(t), -0.2 * np.sin(0.5 * t), 0.08 * np.cos(0.8 * t)])
 
 
 class Vehicle:
