@@ -12,17 +12,10 @@ from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration,
 from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Dvl, Imu
-from sonar_graph.navigation.odometry import Odometry
-from sonar_graph.navigation.preintegration.joint_preintegration import (
-    DISPLACEMENT,
-    JointMotion,
-    JointPreintegrator,
-)
+from sonar_graph.navigation.preintegration.joint_preintegration import DISPLACEMENT, JointMotion, JointPreintegrator
 from sonar_graph.navigation.preintegration.joint_recursion import RULES
-from sonar_graph.navigation.preintegration.motion import Preintegrator
 
-from .rows import NS, T0_NS, at, derivative, dvl, imu, stamps, waves
-from .step_by_step import ACCEL, GYRO, StepByStep, random_rows, step_by_step
+from .rows import ACCEL, GYRO, NS, StepByStep, at, derivative, dvl, imu, random_rows, stamps, step_by_step, waves
 from .vehicle import DVL, QUIET, Vehicle
 
 BIAS = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.05])
@@ -53,38 +46,27 @@ def with_doppler(rows: tuple[Imu, Dvl], velocity: np.ndarray, cov: np.ndarray) -
     return rows[0], Dvl(rows[1].stamps_ns, velocity, np.broadcast_to(cov, (len(rows[1]), 3, 3)))
 
 
-def plain(rule: str, seed: int, earth=None, gyro=GYRO, accel=ACCEL, **rows_of) -> tuple[JointMotion, StepByStep]:
+def plain(
+    rule: str, seed: int, earth=(0.0, 0.0, 0.0), accel=ACCEL, cov=None, **rows_of
+) -> tuple[JointMotion, StepByStep]:
     rows = random_rows(seed, **rows_of)
-    motion = JointPreintegrator(gyro, accel, rule=rule, longest_s=2.0).integrate(*rows, *ends(rows), BIAS, earth)
-    truth = step_by_step(*rows, rule, BIAS, np.zeros(3) if earth is None else earth, accel_density=accel)
-    return motion, truth
-
-
-def gyros_alone(rule: str) -> tuple[JointMotion, StepByStep]:
-    """No other noise hides theirs."""
-    rows = random_rows(13)
-    rows = with_doppler(rows, rows[1].velocity, np.eye(3) * 1e-20)
-    motion = JointPreintegrator(GYRO, 0.0, rule=rule).integrate(*rows, *ends(rows), BIAS)
-    return motion, step_by_step(*rows, rule, BIAS, accel_density=0.0)
+    rows = rows if cov is None else with_doppler(rows, rows[1].velocity, cov)
+    motion = JointPreintegrator(GYRO, accel, rule=rule, longest_s=2.0).integrate(*rows, *ends(rows), BIAS, earth)
+    return motion, step_by_step(*rows, rule, BIAS, earth, accel_density=accel)
 
 
 def mounted(rule: str) -> tuple[JointMotion, StepByStep]:
     """Readings along a sensor's own axes, covariances of the calibration or the log in turn; no long interval."""
     rows = random_rows(109)
-    body_R_imu, body_R_dvl = gtsam.Rot3.RzRyRx(0.2, -0.4, 2.0), gtsam.Rot3.RzRyRx(3.0, 0.3, 0.8)
-    A, B, cov = body_R_imu.matrix(), body_R_dvl.matrix(), np.diag(np.square(SIGMAS))
-    own = Imu(rows[0].stamps_ns, rows[0].angular_velocity @ A, rows[0].specific_force @ A)
+    imu_at = Mounting(translation_m=(0.3, -0.1, 0.2), rpy_rad=(0.2, -0.4, 2.0))
+    dvl_at = Mounting(translation_m=(-0.2, 0.1, 0.4), rpy_rad=(3.0, 0.3, 0.8))
+    A, B = gtsam.Rot3.RzRyRx(0.2, -0.4, 2.0).matrix(), gtsam.Rot3.RzRyRx(3.0, 0.3, 0.8).matrix()
+    own, cov = Imu(rows[0].stamps_ns, rows[0].angular_velocity @ A, rows[0].specific_force @ A), np.diag(SIGMAS) ** 2
     said = np.where(np.arange(len(rows[1]))[:, None, None] % 2, cov, np.nan)
     log = with_doppler(rows, rows[1].velocity @ B, said)[1]
     known = Calibration(
-        imu=ImuCalibration(
-            gyro_noise_density=GYRO,
-            accel_noise_density=ACCEL,
-            mounting=Mounting(translation_m=(0.3, -0.1, 0.2), rpy_rad=(0.2, -0.4, 2.0)),
-        ),
-        dvl=DvlCalibration(
-            velocity_sigma_m_s=SIGMAS, mounting=Mounting(translation_m=(-0.2, 0.1, 0.4), rpy_rad=(3.0, 0.3, 0.8))
-        ),
+        imu=ImuCalibration(gyro_noise_density=GYRO, accel_noise_density=ACCEL, mounting=imu_at),
+        dvl=DvlCalibration(velocity_sigma_m_s=SIGMAS, mounting=dvl_at),
     )
     motion = JointPreintegrator.from_calibration(known, rule).integrate(own, log, *ends(rows), BIAS, EARTH)
     assert motion.body_p_imu == pytest.approx((0.3, -0.1, 0.2))
@@ -98,7 +80,7 @@ CASES = {
     "eastward Earth": lambda rule: plain(rule, 11, EARTH),
     "westward Earth": lambda rule: plain(rule, 11, -EARTH),
     "steps of up to 0.4 rad": lambda rule: plain(rule, 12, turn_rad_s=20.0),
-    "gyros alone": gyros_alone,
+    "gyros whose noise no other hides": lambda rule: plain(rule, 13, accel=0.0, cov=np.eye(3) * 1e-20),
     "sensors at an angle": mounted,
 }
 
@@ -170,29 +152,6 @@ def test_a_chain_has_the_displacement_of_the_whole(rule, seed, cut):
     assert (independent < (1 - 1e-6) * np.trace(expected)) == shares
 
 
-def test_linear_rule_is_the_motion_of_the_gyro_and_doppler_preintegrator():
-    """Mean, bias derivative and what gyro noise does, lever arm and mountings included."""
-    inertial, doppler = random_rows(8)
-    rows = inertial, dvl(doppler.stamps_ns, doppler.velocity)
-    log = DvlCalibration(
-        velocity_sigma_m_s=(1e-9, 2e-9, 3e-9),
-        mounting=Mounting(translation_m=(0.3, -0.1, 0.2), rpy_rad=(3.1, 0.1, 0.8)),
-    )
-    gyros = ImuCalibration(gyro_noise_density=GYRO, mounting=Mounting(rpy_rad=(0.2, -0.1, 2.0)))
-    calibration = Calibration(dvl=log, imu=gyros)
-    odometry = Odometry(calibration)
-    odometry.add(*rows)
-    steps = odometry.steps_between_nodes(*ends(rows))
-    expected = Preintegrator.from_calibration(calibration).integrate(steps, BIAS[:3])
-    joint = JointPreintegrator.from_calibration(calibration, "linear")
-    actual = joint.integrate(*rows, *ends(rows), np.r_[BIAS[:3], 0, 0, 0]).relative_pose()
-    sigmas = np.sqrt(np.diag(expected.covariance))
-    assert actual.i_T_j.equals(expected.i_T_j, 1e-10)
-    assert np.allclose(actual.D_bias, expected.D_bias, atol=1e-4)
-    assert np.allclose(actual.mean_specific_force, expected.mean_specific_force, atol=1e-9)
-    assert np.abs((actual.covariance - expected.covariance) / np.outer(sigmas, sigmas)).max() < 1e-3
-
-
 def test_inertial_part_is_that_of_gtsam():
     """Its tangent preintegration turns a step by the attitude at its start: first order in small steps."""
     quick = stamps(1000, 2.0)
@@ -212,19 +171,6 @@ def test_inertial_part_is_that_of_gtsam():
     order = np.r_[0:3, 6:9, 3:6]
     sigmas = np.sqrt(np.diag(motion.covariance)[order])
     assert np.sqrt(np.diag(theirs.preintMeasCov())) == pytest.approx(sigmas, rel=0.03)
-
-
-def test_the_accelerometer_draws_what_lies_between_two_samples():
-    """One swing of 0.5 m/s amplitude, unseen by samples that meet it at its zeros: also over a gap of two seconds."""
-    at, slow = stamps(500, 4.0), stamps(0.5, 4.0)
-    t = (at - T0_NS) * 1e-9
-    surge = 0.25 * np.sin(np.pi * t / 2) ** 2
-    force = np.column_stack([np.gradient(surge, t, edge_order=2), 0 * t, 9.81 + 0 * t])
-    rows = imu(at, np.zeros(3), force), dvl(slow, np.zeros(3))
-    truth = np.trapezoid(surge, t)
-    assert made(rows, "inertial", np.zeros(6)).displacement[0] == pytest.approx(truth, abs=1e-4)
-    assert made(rows, "linear", np.zeros(6)).displacement[0] == pytest.approx(0.0, abs=1e-12)
-    assert truth > 0.4
 
 
 def test_without_an_accelerometer_the_displacement_is_the_same():
@@ -342,8 +288,7 @@ SENSORS = JointPreintegrator(2e-4, 1e-4, (LONG_SIGMA,) * 3, BODY_T_IMU, BODY_T_D
 
 
 def apart(*doppler_s: float) -> tuple[Imu, Dvl]:
-    vehicle = Vehicle()
-    dvl_ns = T0_NS + np.round(np.array(doppler_s) * NS).astype(np.int64)
+    vehicle, dvl_ns = Vehicle(), np.array([at(second) for second in doppler_s])
     return vehicle.imu(stamps(QUICK_HZ, doppler_s[-1] + 0.1)), vehicle.dvl(dvl_ns)
 
 

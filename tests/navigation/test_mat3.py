@@ -1,7 +1,5 @@
 import importlib
 import sys
-from dataclasses import dataclass
-from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -56,56 +54,38 @@ CHECKED = {"imported": "from sonar_graph.numerics.jit import compiled", "decorat
 UNCHECKED = {"imported": "import numba", "decorator": "numba.njit(cache=True, error_model='numpy')"}
 
 
-@dataclass
-class Pair:
+@pytest.fixture
+def answer(tmp_path, monkeypatch):
     """A compiled function that calls another in another file, imported afresh as a new interpreter would."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
 
-    folder: Path
-    monkeypatch: pytest.MonkeyPatch
-
-    def write(self, how: dict[str, str], offset: float) -> None:
-        (self.folder / "callee.py").write_text(CALLEE.format(**how, offset=offset))
-        caller = self.folder / "caller.py"
-        if not caller.exists():
-            caller.write_text(CALLER.format(**how))
-
-    def answer(self) -> float:
-        self.monkeypatch.setattr(kernels, "_sources", set())
+    def ask(how: dict[str, str], offset: float) -> float:
+        for name, text in (("callee.py", CALLEE.format(**how, offset=offset)), ("caller.py", CALLER.format(**how))):
+            if not (tmp_path / name).exists() or (tmp_path / name).read_text() != text:
+                (tmp_path / name).write_text(text)
+        monkeypatch.setattr(kernels, "_sources", set())
         for name in ("callee", "caller"):
-            self.monkeypatch.delitem(sys.modules, name, raising=False)
+            monkeypatch.delitem(sys.modules, name, raising=False)
         importlib.invalidate_caches()
         return importlib.import_module("caller").outer(1.0)
 
-    @property
-    def index(self) -> Path:
-        (found,) = (self.folder / "__pycache__").glob("caller.outer-*.nbi")
-        return found
-
-
-@pytest.fixture
-def pair(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    made = Pair(tmp_path, monkeypatch)
-    yield made
+    yield ask
     for name in ("callee", "caller"):
         sys.modules.pop(name, None)
 
 
-def test_cached_code_does_not_outlive_a_callee_in_another_file(pair):
+def test_cached_code_does_not_outlive_a_callee_in_another_file(answer, tmp_path):
     """Nor is it dropped while nothing changes: the index then keeps its time."""
-    pair.write(CHECKED, 1.0)
-    assert pair.answer() == 20.0
-    made_ns = pair.index.stat().st_mtime_ns
-    assert pair.answer() == 20.0
-    assert pair.index.stat().st_mtime_ns == made_ns
-    pair.write(CHECKED, 2.5)
-    assert pair.answer() == 35.0
-    assert pair.index.stat().st_mtime_ns > made_ns
+    assert answer(CHECKED, 1.0) == 20.0
+    (index,) = (tmp_path / "__pycache__").glob("caller.outer-*.nbi")
+    made_ns = index.stat().st_mtime_ns
+    assert answer(CHECKED, 1.0) == 20.0
+    assert index.stat().st_mtime_ns == made_ns
+    assert answer(CHECKED, 2.5) == 35.0
+    assert index.stat().st_mtime_ns > made_ns
 
 
-def test_without_the_check_the_old_answer_comes_from_the_cache(pair):
+def test_without_the_check_the_old_answer_comes_from_the_cache(answer):
     """Negative control."""
-    for offset in (1.0, 2.5):
-        pair.write(UNCHECKED, offset)
-        assert pair.answer() == 20.0
+    assert answer(UNCHECKED, 1.0) == answer(UNCHECKED, 2.5) == 20.0

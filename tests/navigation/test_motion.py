@@ -315,6 +315,17 @@ def test_noise_spreads_as_noise_of_every_sample_does(way, column, sensors, measu
     assert np.abs(off).max() < tolerance
 
 
+def test_the_linear_rule_is_the_motion_of_the_gyros_and_the_doppler_log():
+    """Mean, bias derivative and what gyro noise does, lever arm included."""
+    known = {"velocity_sigma_m_s": (1e-9,) * 3, "imu": {"gyro_noise_density": 1e-3}}
+    plain, joint = (moved_by(WAYS[name], *rows(), BIAS, known=known) for name in ("linear", "rule linear"))
+    sigmas = np.sqrt(np.diag(plain.covariance))
+    assert same_pose(plain.i_T_j, joint.i_T_j)
+    assert np.allclose(joint.D_bias, plain.D_bias, atol=1e-3)
+    assert np.allclose(joint.mean_specific_force, plain.mean_specific_force, atol=1e-9)
+    assert np.abs((joint.covariance - plain.covariance) / np.outer(sigmas, sigmas)).max() < 1e-3
+
+
 @pytest.mark.parametrize("name", ["closed gap", "open gap", "inertial over gaps"])
 def test_an_unknown_accelerometer_bias_spreads_as_moving_all_forces_does(name):
     (imu, dvl), way, step = rows(), WAYS[name], 1e-4
