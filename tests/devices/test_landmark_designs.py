@@ -21,9 +21,14 @@ shapes = [{ level_db = 5.0, polygon_m = [[0.0, 0.0], [0.2, 0.0], [0.2, 0.2], [0.
 
 
 def written(folder: Path, text: str, name: str = "landmarks.toml") -> Path:
-    path = folder / name
-    path.write_text(text)
-    return path
+    (folder / name).write_text(text)
+    return folder / name
+
+
+def pictured(folder: Path, picture: np.ndarray, id_: int = 9, name: str = "ring") -> str:
+    """A landmark with a picture, as text."""
+    cv2.imwrite(str(folder / f"{name}.png"), picture)
+    return f'[[landmark]]\nid = {id_}\nname = "{name}"\nsize_m = 0.4\npicture = "{name}.png"\n'
 
 
 def test_four_distinct_designs_ship():
@@ -45,26 +50,27 @@ def test_areas_of_the_default_figures_are_those_of_geometry():
 
 def test_level_is_that_of_the_shape_at_a_point_and_nan_elsewhere(tmp_path: Path):
     (half,) = load_designs(written(tmp_path, HALF))
-    x_m = np.array([0.1, -0.1, 0.1, 0.1, 0.21])
-    y_m = np.array([0.1, 0.1, -0.1, 0.19, 0.1])
+    x_m, y_m = np.array([[0.1, -0.1, 0.1, 0.1, 0.21], [0.1, 0.1, -0.1, 0.19, 0.1]])
     np.testing.assert_array_equal(half.level_db(x_m, y_m), [5, np.nan, np.nan, 5, np.nan])
     assert half.height_m == 0.02
+    plain = LandmarkDesign(5, "plain", 0.2, np.full((1, 1), 3.0))
+    assert plain.level_db(np.array(0.0), np.array(0.0)) == 3
 
 
 def test_picture_means_what_its_greys_say(tmp_path: Path):
     picture = np.zeros((2, 2, 4), np.uint8)
     picture[0, 0], picture[0, 1], picture[1, 1] = [255, 255, 255, 255], [0, 0, 0, 255], [51, 51, 51, 255]
-    cv2.imwrite(str(tmp_path / "ring.png"), picture)
-    text = '[[landmark]]\nid = 9\nname = "ring"\nsize_m = 0.4\npicture = "ring.png"\nblack_db = -10\nwhite_db = 15\n'
-    (ring,) = load_designs(written(tmp_path, text))
+    (ring,) = load_designs(written(tmp_path, pictured(tmp_path, picture) + "black_db = -10\nwhite_db = 15\n"))
     np.testing.assert_allclose(ring.mask, [[15, -10], [np.nan, -5]], atol=1e-12)
     assert ring.level_db(np.array(-0.1), np.array(0.1)) == 15  # the first row is at +y, the first column at -x
 
 
-def test_folder_gives_the_designs_of_all_its_files(tmp_path: Path):
+def test_folder_gives_the_designs_of_all_its_files_and_a_missing_one_is_named(tmp_path: Path):
     written(tmp_path, HALF.replace("7", "8").replace("5.0", "6.0"), "b.toml")
     written(tmp_path, HALF, "a.toml")
     assert [design.id for design in load_designs(tmp_path)] == [7, 8]
+    with pytest.raises(CalibrationError, match=r"nowhere\.toml cannot be read"):
+        load_designs(tmp_path / "nowhere.toml")
 
 
 @pytest.mark.parametrize(
@@ -105,30 +111,26 @@ def test_impossible_files_are_refused_with_the_reason(tmp_path: Path, text: str,
     assert "landmarks.toml" in str(refusal.value)
 
 
-def pictured(folder: Path, picture: np.ndarray, id_: int = 9, name: str = "ring") -> str:
-    cv2.imwrite(str(folder / f"{name}.png"), picture)
-    return f'[[landmark]]\nid = {id_}\nname = "{name}"\nsize_m = 0.4\npicture = "{name}.png"\n'
-
-
-@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-def test_wholly_transparent_picture_is_refused(tmp_path: Path, kind: type[np.unsignedinteger]):
+def barely_transparent(kind: type[np.unsignedinteger]) -> np.ndarray:
     """Of 16 bits the limit lies in their middle, not at 128."""
     picture = np.full((4, 4, 4), np.iinfo(kind).max, kind)
     picture[..., 3] = np.iinfo(kind).max // 2 - 1
-    with pytest.raises(CalibrationError, match="landmark 'ring': its picture is wholly transparent"):
+    return picture
+
+
+@pytest.mark.parametrize(
+    ("picture", "complaint"),
+    [
+        *((barely_transparent(kind), "'ring': its picture is wholly transparent") for kind in (np.uint8, np.uint16)),
+        (np.full((4, 4), 102, np.uint8), "'ring': nowhere more than 0 dB over the floor"),
+        (np.full((2001, 2001), 255, np.uint8), "2001 x 2001; make it 2000 x 2000 or smaller"),
+        (np.zeros((2, 3), np.uint8), "3 x 2, not square"),
+    ],
+    ids=["transparent", "transparent, 16 bits", "even", "huge", "oblong"],
+)
+def test_impossible_pictures_are_refused_with_the_reason(tmp_path: Path, picture: np.ndarray, complaint: str):
+    with pytest.raises(CalibrationError, match=complaint):
         load_designs(written(tmp_path, pictured(tmp_path, picture)))
-
-
-def test_even_picture_at_the_level_of_the_floor_is_refused(tmp_path: Path):
-    text = pictured(tmp_path, np.full((4, 4), 102, np.uint8))
-    with pytest.raises(CalibrationError, match="landmark 'ring': nowhere more than 0 dB over the floor"):
-        load_designs(written(tmp_path, text))
-
-
-def test_picture_that_memory_may_not_hold_is_refused(tmp_path: Path):
-    text = pictured(tmp_path, np.full((2001, 2001), 255, np.uint8))
-    with pytest.raises(CalibrationError, match="2001 x 2001; make it 2000 x 2000 or smaller"):
-        load_designs(written(tmp_path, text))
 
 
 def test_pictures_that_are_each_other_turned_are_refused_and_mirrored_ones_are_not(tmp_path: Path):
@@ -144,29 +146,6 @@ def test_digest_is_that_of_all_that_a_landmark_looks_like():
     disc = DEFAULT_DESIGNS[0]
     changed = disc.mask.copy()
     changed[100, 100] = np.nan
-    others = [
-        replace(disc, name="disk"),
-        replace(disc, size_m=0.41),
-        replace(disc, height_m=0.02),
-        replace(disc, mask=changed),
-        replace(disc, mask=disc.mask + 0.5),
-    ]
-    assert len({disc.digest(), *(other.digest() for other in others)}) == 6
+    changes = ({"name": "disk"}, {"size_m": 0.41}, {"height_m": 0.02}, {"mask": changed}, {"mask": disc.mask + 0.5})
+    assert len({disc.digest(), *(replace(disc, **change).digest() for change in changes)}) == 6
     assert disc.digest() == replace(disc, mask=disc.mask.copy(), id=8).digest()
-
-
-def test_missing_file_is_named(tmp_path: Path):
-    with pytest.raises(CalibrationError, match=r"nowhere\.toml cannot be read"):
-        load_designs(tmp_path / "nowhere.toml")
-
-
-def test_oblong_picture_is_refused(tmp_path: Path):
-    cv2.imwrite(str(tmp_path / "flat.png"), np.zeros((2, 3), np.uint8))
-    text = '[[landmark]]\nid = 1\nname = "flat"\nsize_m = 1\npicture = "flat.png"\n'
-    with pytest.raises(CalibrationError, match="3 x 2, not square"):
-        load_designs(written(tmp_path, text))
-
-
-def test_design_can_be_made_without_a_file():
-    design = LandmarkDesign(5, "plain", 0.2, np.full((1, 1), 3.0))
-    assert design.level_db(np.array(0.0), np.array(0.0)) == 3
