@@ -173,13 +173,9 @@ def test_inertial_part_is_that_of_gtsam():
     assert np.sqrt(np.diag(theirs.preintMeasCov())) == pytest.approx(sigmas, rel=0.03)
 
 
-def test_without_an_accelerometer_the_displacement_is_the_same():
+def test_the_inertial_rule_needs_an_accelerometer():
     rows = random_rows(5)
-    unfelt = Imu(rows[0].stamps_ns, rows[0].angular_velocity, np.full((len(rows[0]), 3), np.nan))
-    with_it, without = made(rows, "linear").relative_pose(), made((unfelt, rows[1]), "linear").relative_pose()
-    assert with_it.i_T_j.equals(without.i_T_j, 1e-15)
-    assert np.array_equal(with_it.covariance, without.covariance)
-    assert np.isnan(without.mean_specific_force).all()
+    unfelt = replace(rows[0], specific_force=np.full((len(rows[0]), 3), np.nan))
     with pytest.raises(MeasurementError, match='rule "linear"'):
         made((unfelt, rows[1]), "inertial")
 
