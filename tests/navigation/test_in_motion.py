@@ -78,6 +78,7 @@ def squared_errors(known: Calibration, earth: float, runs: int) -> list[float]:
         found = align_in_motion(imu, dvl, known)
         error = error_of(found, truth)
         squares.append(float(error @ np.linalg.solve(found.covariance, error)))
+    print(f"NEES / 5 of {runs} runs: {np.mean(squares) / 5:.2f}")
     return squares
 
 

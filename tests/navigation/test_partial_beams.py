@@ -315,5 +315,6 @@ def test_one_beam_is_better_than_a_gap_and_two_than_one(with_force):
             squares[seed, column] = error @ error
             nees_of_3[seed, column] = error @ np.linalg.solve(found.covariance[3:, 3:], error)
     rms = np.sqrt(squares.mean(axis=0))
+    print(f"0, 1, 2, 4 beams: rms {rms.round(3)} m, NEES over 3 {(nees_of_3.mean(axis=0) / 3).round(2)}")
     assert rms[four] < rms[two] < rms[one] < 0.5 * rms[none]
     assert np.all((nees_of_3.mean(axis=0) > 0.6) & (nees_of_3.mean(axis=0) < 4.8))
