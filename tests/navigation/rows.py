@@ -1,7 +1,5 @@
 """Rows of sensors along made-up motions, derivatives by differences, and dead reckoning step by step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Alignment of simulated vehicles that sway and turn; truth by formulas and by differences of attitudes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 

@@ -3,8 +3,6 @@
 Kinematics of the simulator share no code with navigation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

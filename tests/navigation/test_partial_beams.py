@@ -1,7 +1,5 @@
 """Velocities of which beams measured a part: completed, as uncertain as they are, and their use in the odometry."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rows of a sensor: storage, values in between against numpy's, limits of what is refused, weights of depths."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 
 import numpy as np

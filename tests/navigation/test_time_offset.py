@@ -1,7 +1,5 @@
 """The fit against textbook generalised least squares, and the search on a signal against itself, shifted and noisy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -34,11 +32,11 @@ def stretch_of(seed: int, walks: tuple[bool, bool, bool]) -> SampleSeries:
     return SampleSeries(y, A, np.tile(np.eye(3), (m, 1, 1)), np.ones(m), walks)
 
 
-def dense_covariance(m: int, walks: bool) -> np.ndarray:
+def dense_covariance(m: int, walks: bool, ratios: np.ndarray = RATIOS, duration_s: float = 1.0) -> np.ndarray:
     """Of differences of white samples, plus a rate's white noise, plus the walk of a rate from the beginning."""
-    difference = np.diff(np.eye(m + 1), axis=0)
-    walk = np.minimum.outer(np.arange(m) + 0.5, np.arange(m) + 0.5)
-    return difference @ difference.T + RATIOS[0] * np.eye(m) + RATIOS[1] * walk * walks
+    difference, middle = np.diff(np.eye(m + 1), axis=0), duration_s * (np.arange(m) + 0.5)
+    walk = duration_s**2 * np.minimum.outer(middle, middle)
+    return difference @ difference.T + ratios[0] * duration_s * np.eye(m) + ratios[1] * walk * walks
 
 
 def by_axis(matrices: np.ndarray) -> np.ndarray:
@@ -126,10 +124,7 @@ def noisy_stretch(rng: np.random.Generator, ratios: tuple[float, float], duratio
 
 def restricted_likelihood(stretches: list[SampleSeries], ratios: np.ndarray) -> float:
     """``-2 log L`` but for a constant: Harville's formula with one dense covariance of everything."""
-    m, duration_s = len(stretches[0].y), float(stretches[0].duration_s[0])
-    difference, middle = np.diff(np.eye(m + 1), axis=0), duration_s * (np.arange(m) + 0.5)
-    one = difference @ difference.T + ratios[0] * duration_s * np.eye(m)
-    one = one + ratios[1] * duration_s**2 * np.minimum.outer(middle, middle)
+    one = dense_covariance(len(stretches[0].y), True, ratios, float(stretches[0].duration_s[0]))
     K = block_diag(*[one] * (3 * len(stretches)))
     (X, y), weight = one_problem(stretches), np.linalg.inv(K)
     left = y - X @ np.linalg.solve(X.T @ weight @ X, X.T @ weight @ y)

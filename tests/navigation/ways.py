@@ -1,7 +1,5 @@
 """A vehicle that rolls, pitches and turns, by hand, and every way to its motion: over steps, gaps, by each rule."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 
