@@ -32,12 +32,8 @@ TYPES = {
 Entry = tuple[str, str, list[dict[str, Any]]]
 
 
-def stamp(ns: int) -> dict[str, int]:
-    return {"sec": ns // 10**9, "nanosec": ns % 10**9}
-
-
 def header(ns: int, frame_id: str = "sensor") -> dict[str, Any]:
-    return {"stamp": stamp(ns), "frame_id": frame_id}
+    return {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}, "frame_id": frame_id}
 
 
 def vector(x: float, y: float, z: float) -> dict[str, float]:
@@ -85,11 +81,10 @@ class Bench:
         return [("/imu", "imu", [self.imu(s) for s in stamps]), ("/dvl", "dvl", [self.dvl(s) for s in stamps])]
 
     def write(self, *entries: Entry, name: str = "log.mcap", schemas: dict[str, str] | None = None) -> Path:
-        texts = schemas or {}
-        rows = [
-            (topic, TYPES[kind], messages, texts.get(kind) or definition(TYPES[kind]))
-            for topic, kind, messages in entries
-        ]
+        texts = {kind: definition(TYPES[kind]) for _, kind, _ in entries if kind not in (schemas or {})} | (
+            schemas or {}
+        )
+        rows = [(topic, TYPES[kind], messages, texts[kind]) for topic, kind, messages in entries]
         return write_messages(self._folder / name, rows)
 
 

@@ -122,15 +122,13 @@ def leaves_of(message: Any, definition: Struct, prefix: str, found: dict[str, li
 
 def paths_of(definition: Struct, prefix: str = "") -> tuple[dict[str, bool], list[str]]:
     """Fields that hold values, with whether those are strings; and arrays and sequences."""
-    values: dict[str, bool] = {}
-    arrays = []
+    values, arrays = dict[str, bool](), list[str]()
     for entry in definition.fields:
         path = prefix + entry.name
         arrays += [path] if entry.is_array else []
         if isinstance(entry.kind, Struct):
             inner_values, inner_arrays = paths_of(entry.kind, path + ".")
-            values |= inner_values
-            arrays += inner_arrays
+            values, arrays = values | inner_values, arrays + inner_arrays
         else:
             values[path] = entry.kind == STRING
     return values, arrays

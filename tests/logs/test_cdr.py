@@ -74,15 +74,10 @@ def test_constants_comments_defaults_and_bounds_are_understood() -> None:
         ("fixed", "int32", 4, True),
         ("open", "float32", None, True),
     ]
-
-
-@pytest.mark.parametrize("own", ["Part", "test_msgs/Part", "test_msgs/msg/Part"])
-def test_types_of_the_own_package_need_no_prefix_and_time_needs_no_definition(own: str) -> None:
-    part, stamp = parsed(f"{own} part\nbuiltin_interfaces/Time stamp", Part="float64 x").fields
-    assert isinstance(part.kind, Struct)
-    assert part.kind.name == "test_msgs/Part"
-    assert isinstance(stamp.kind, Struct)
-    assert [f.name for f in stamp.kind.fields] == ["sec", "nanosec"]
+    for own in ("Part", "test_msgs/Part", "test_msgs/msg/Part"):  # of the own package, with or without a prefix
+        part, stamp = parsed(f"{own} part\nbuiltin_interfaces/Time stamp", Part="float64 x").fields
+        assert (part.kind.name, stamp.kind.name) == ("test_msgs/Part", "builtin_interfaces/Time")
+        assert [f.name for f in stamp.kind.fields] == ["sec", "nanosec"]  # needs no definition
 
 
 def doubling(levels: int) -> str:
@@ -249,24 +244,18 @@ def test_messages_with_a_layout_each_are_read_like_those_that_share_one_and_byte
     assert column(groups, "c") == {row: row for row in range(82)}
 
 
-def test_layouts_met_in_an_earlier_part_give_the_same_columns() -> None:
+def test_layouts_met_earlier_give_the_same_columns_and_one_that_lies_evenly_is_a_view() -> None:
     definition = parsed("string s\nfloat64[] v")
     payloads = encode(definition, 6, {"s": "abc", "v": np.arange(12.0).reshape(6, 2)})
     decoder, rows = Decoder(definition), np.arange(6)
     parts = [decoder.decode([(rows[part], payloads[part])]).groups[0] for part in (slice(2), slice(2, 5), slice(5, 6))]
     np.testing.assert_array_equal(np.concatenate([part["v"] for part in parts]), np.arange(12.0).reshape(6, 2))
     assert parts[0].layout is parts[1].layout is parts[2].layout
-
-
-def test_a_column_that_lies_evenly_is_a_view_and_any_other_a_copy() -> None:
-    text = "float32[] image\nP[] points\nQ[] ragged"
-    definition = parsed(text, P="float64 x\nfloat64 y", Q="string name\nfloat64 x")
+    definition = parsed("float32[] image\nP[] points\nQ[] ragged", P="float64 x\nfloat64 y", Q="string name\nfloat64 x")
     values = {"image": np.ones((2, 5)), "points.y": np.ones((2, 3)), "ragged.name": ["a", "b" * 9, "c"]}
     payloads = encode(definition, 2, values, {"points": 3, "ragged": 3})
     (group,) = decode(definition, [(np.arange(2), payloads)]).groups
-    assert np.shares_memory(group.payloads, payloads)
-    assert np.shares_memory(group["image"], payloads)
-    assert np.shares_memory(group["points.y"], payloads)
+    assert all(np.shares_memory(found, payloads) for found in (group.payloads, group["image"], group["points.y"]))
     assert not np.shares_memory(group["ragged.x"], payloads)
     assert group["ragged.x"].shape == (2, 3)
 

@@ -91,9 +91,8 @@ def test_mountings_come_from_tf_static_through_frames_in_between_and_after_a_fil
     assert found.calibration.imu.mounting.translation_m == (1, 0, 0)
     assert found.calibration.dvl.mounting.translation_m == (0, 3, 0)
     np.testing.assert_allclose(found.calibration.dvl.mounting.rpy_rad, (0, 0, 1), atol=1e-12)
-    assert found.notes["log.calibration"] == (
-        "from vehicle.toml: dvl.mounting.translation_m; else defaults; mountings from /tf_static: imu, dvl"
-    )
+    expected = "from vehicle.toml: dvl.mounting.translation_m; else defaults; mountings from /tf_static: imu, dvl"
+    assert found.notes["log.calibration"] == expected
 
 
 # --- precedence -----------------------------------------------------------------------------------------------------

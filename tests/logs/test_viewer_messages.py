@@ -90,12 +90,9 @@ def test_namespaces_tell_ellipsoids_that_mean_something_from_those_that_do_not(d
     covariances = np.array([np.diag([0.01, 0.04, 0.09]), np.full((3, 3), np.nan)])
     landmarks = LandmarkMap(np.array([7, 2**40]), np.array([[1.0, 2, 3], [4, 5, 6]]), covariances)
     (array,) = drawn(landmark_markers("/landmarks", landmarks, 1, GREY, 0.5))
-    assert [(m.ns, m.text) for m in array.markers] == [
-        ("ellipsoid_95_percent", ""),
-        ("covariance_unknown", ""),
-        ("identity", "7"),
-        ("identity", "1099511627776"),
-    ]
+    spaces, texts = [m.ns for m in array.markers], [m.text for m in array.markers]
+    assert spaces == ["ellipsoid_95_percent", "covariance_unknown", "identity", "identity"]
+    assert texts == ["", "", "7", "1099511627776"]
     assert [(m.pose.position.z, m.scale.z) for m in array.markers[2:]] == [(3.5, 0.5), (6.5, 0.5)]
     assert {(m.header.frame_id, m.action, m.lifetime.sec) for m in array.markers} == {("map", 0, 0)}
 
@@ -184,13 +181,9 @@ def test_another_library_sees_each_picture_whole_with_its_stamp(tmp_path: Path) 
 # --- layouts ---------------------------------------------------------------------------------------------------------
 
 T0_NS = 1_700_000_000_000_000_000
-DRAWN_BY_RVIZ = {
-    "rviz_default_plugins/Path": "Path",
-    "rviz_default_plugins/Odometry": "Odometry",
-    "rviz_default_plugins/PoseWithCovariance": "PoseWithCovarianceStamped",
-    "rviz_default_plugins/MarkerArray": "MarkerArray",
-    "rviz_default_plugins/PointCloud2": "PointCloud2",
-}
+SAME_NAME = ("Path", "Odometry", "MarkerArray", "PointCloud2")
+DRAWN_BY_RVIZ = {f"rviz_default_plugins/{kind}": kind for kind in SAME_NAME}
+DRAWN_BY_RVIZ["rviz_default_plugins/PoseWithCovariance"] = "PoseWithCovarianceStamped"
 """By plugins_description.xml of rviz_default_plugins."""
 DRAWN_BY_FOXGLOVE = {"Path", "PoseWithCovarianceStamped", "MarkerArray", "PointCloud2"}
 """Of the types that we write; nav_msgs/Odometry is not drawn by Lichtblick 1.28."""
