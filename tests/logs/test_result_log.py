@@ -51,30 +51,11 @@ def messages(result: Path, decoded: Any) -> dict[str, list[Any]]:
     return decoded(result)
 
 
-def test_every_estimator_and_the_truth_are_there(messages):
+def test_every_estimator_and_the_truth_are_there_with_landmarks_as_ellipsoids_and_identities(messages):
     each = ("odometry", "pose", "pose_ellipsoid", "smoothed", "path", "landmarks", "landmark_cloud")
     expected = {f"/{name}/{kind}" for name in ("ekf_slam", "isam2") for kind in each}
     expected |= {f"/ground_truth/{kind}" for kind in ("odometry", "path", "landmarks", "landmark_cloud")}
     assert set(messages) == expected | {"/tf", "/tf_static"}
-
-
-def test_odometry_is_causal_and_the_last_path_smoothed(messages):
-    assert [m.pose.pose.position.x for m in messages["/isam2/odometry"]] == list(np.arange(100) + 10.0)
-    *so_far, last = messages["/isam2/path"]
-    assert [len(path.poses) for path in so_far] == [31, 61, 91]
-    assert [p.poses[0].pose.position.x for p in so_far] == [10, 10, 10]
-    assert [p.pose.position.x for p in last.poses] == list(np.arange(100) + 20.0)
-    assert [p.header.stamp.sec for p in last.poses] == list(range(1_700_000_000, 1_700_000_100))
-
-
-def test_covariances_are_in_the_order_and_axes_of_ros(messages):
-    pose = messages["/isam2/pose"][0]
-    # body axes turned by 90 degrees: what lies along the body's x lies along the world's y
-    assert np.diag(np.reshape(pose.pose.covariance, (6, 6))) == pytest.approx([5, 4, 6, 2, 1, 3])
-    assert (pose.header.frame_id, messages["/isam2/odometry"][0].child_frame_id) == ("map", "isam2/base_link")
-
-
-def test_landmarks_are_ellipsoids_with_their_identities(messages):
     (array,) = messages["/isam2/landmarks"]
     spheres = [m for m in array.markers if m.type == 2]
     texts = [m for m in array.markers if m.type == 9]
@@ -83,6 +64,19 @@ def test_landmarks_are_ellipsoids_with_their_identities(messages):
     scale = spheres[0].scale
     assert sorted([scale.x, scale.y, scale.z]) == pytest.approx(2 * 2.7954834829151074 * np.array([1, 2, 3]))
     assert len({(m.ns, m.id) for m in array.markers}) == 4
+
+
+def test_odometry_is_causal_with_covariances_in_the_axes_of_ros_and_the_last_path_smoothed(messages):
+    assert [m.pose.pose.position.x for m in messages["/isam2/odometry"]] == list(np.arange(100) + 10.0)
+    *so_far, last = messages["/isam2/path"]
+    assert [len(path.poses) for path in so_far] == [31, 61, 91]
+    assert [p.poses[0].pose.position.x for p in so_far] == [10, 10, 10]
+    assert [p.pose.position.x for p in last.poses] == list(np.arange(100) + 20.0)
+    assert [p.header.stamp.sec for p in last.poses] == list(range(1_700_000_000, 1_700_000_100))
+    pose = messages["/isam2/pose"][0]
+    # body axes turned by 90 degrees: what lies along the body's x lies along the world's y
+    assert np.diag(np.reshape(pose.pose.covariance, (6, 6))) == pytest.approx([5, 4, 6, 2, 1, 3])
+    assert (pose.header.frame_id, messages["/isam2/odometry"][0].child_frame_id) == ("map", "isam2/base_link")
 
 
 def test_tf_is_a_tree_below_the_map_whose_transforms_of_one_instant_share_a_message(messages):

@@ -211,7 +211,3 @@ def converted(folder: Path, content: bytes, ending: str, **settings: Any) -> Con
 
 def log_of(folder: Path, recording: Recorded, **settings: Any) -> Converted:
     return converted(folder, recording.content(), recording.ending, **settings)
-
-
-def degrees(frames: SonarFrames) -> NDArray[np.float64]:
-    return np.degrees(frames.azimuths_rad)

@@ -10,12 +10,6 @@ from sonar_graph.logs.convert.akit import earth_centred, east_north_up, enu_R_fl
 from sonar_graph.navigation.odometry import Odometry, motion_between_nodes
 from sonar_graph.navigation.preintegration.motion import Preintegrator
 
-IMU_HEADER = "Time [s],ACC X [m/s^2],ACC Y [m/s^2],ACC Z [m/s^2],GYRO X [rad/s],GYRO Y [rad/s],GYRO Z [rad/s]"
-DVL_HEADER = "Time [s],DVL X [m/s],DVL Y [m/s],DVL Z [m/s]"
-GT_HEADER = (
-    "Time [s],Longitude [rad],Latitude [rad],Altitude [m],V North [m/s],V East [m/s],V Down [m/s],"
-    "Roll [rad],Pitch [rad],Yaw [rad]"
-)
 LATITUDE = 0.5733
 EARTH_RATE_RAD_S = 7.292115e-5
 
@@ -26,14 +20,14 @@ def folder(tmp_path):
     run = tmp_path / "Trajectory2"
     run.mkdir()
 
-    def write(kind, header, rows):
-        text = "\n".join([header, *(",".join(map(repr, map(float, row))) for row in rows)])
+    def write(kind, rows):
+        text = "\n".join(["header", *(",".join(map(repr, map(float, row))) for row in rows)])
         (run / f"{kind}_trajectory2.csv").write_text(text + "\n")
 
-    write("IMU", IMU_HEADER, [(k * 0.01000025, 0.1, 0.2, -9.8, 0.01, 0.02, 0.03) for k in range(300)])
-    write("DVL", DVL_HEADER, [(k * 1.0025, 1.0, 0.5, 0.25) for k in range(3)])
+    write("IMU", [(k * 0.01000025, 0.1, 0.2, -9.8, 0.01, 0.02, 0.03) for k in range(300)])
+    write("DVL", [(k * 1.0025, 1.0, 0.5, 0.25) for k in range(3)])
     at = [(0.61 + k * 1e-6, LATITUDE + k * 1e-6, -10 - k) for k in range(3)]
-    write("GT", GT_HEADER, [(k, *at[k], 0, 0, 0, 0, 0, np.pi / 2) for k in range(3)])
+    write("GT", [(k, *at[k], 0, 0, 0, 0, 0, np.pi / 2) for k in range(3)])
     return tmp_path
 
 

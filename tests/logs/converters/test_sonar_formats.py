@@ -5,13 +5,22 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from sonar_graph.logs.convert.didson_aris import convert_aris
-from sonar_graph.logs.convert.oculus import convert_oculus
 from sonar_graph.logs.reading import read_sonar_frames
 
-from . import sonar_recordings as files
 from .builders import assert_refused
-from .sonar_recordings import CONVERTERS, START_NS, STEP_NS, Aris, Ddf, Oculus, converted, images, log_of, put
+from .sonar_recordings import (
+    CONVERTERS,
+    START_NS,
+    STEP_NS,
+    Aris,
+    Ddf,
+    Oculus,
+    converted,
+    images,
+    log_of,
+    oculus_note,
+    put,
+)
 
 ARIS_BEAMS = {1: 48, 2: 48, 3: 96, 5: 96, 6: 64, 8: 64, 9: 128, 12: 128}
 WHOLE = [
@@ -43,24 +52,20 @@ def test_frames_are_read_as_they_were_recorded(tmp_path, recording):
     assert (result.done.lost, result.done.shortcomings()) == ([], [])
 
 
-@pytest.mark.parametrize(
-    ("file", "begin_m", "length_m"),
-    [
-        ({"start_code": 3, "length_code": 0}, 1.26, 1.25),  # the window of the 2014 paper
-        ({"start_code": 1, "length_code": 3}, 0.42, 10.0),
-        ({"start_code": 3, "length_code": 0, "flags": 1}, 1.125, 1.125),
-        ({"start_code": 2, "length_code": 1, "flags": 2}, 0.84, 5.0),
-        ({"start_code": 2, "length_code": 1, "flags": 3}, 0.75, 4.5),
-        ({"start_code": 2, "length_code": 0, "high": 0}, 1.68, 5.0),
-        ({"start_code": 2, "length_code": 3, "high": 0, "flags": 1}, 1.5, 36.0),
-        ({"start_code": 2, "length_code": 0, "serial": 18}, 0.75, 1.125),
-        ({"start_code": 2, "length_code": 0, "serial": 15}, 0.75, 2.25),
-        ({"start_code": 3, "length_code": 0, "flags": 0xF0}, 1.26, 1.25),
-        ({"start_code": 3, "length_code": 0, "flags": 1, "version": 4}, 1.26, 1.25),
-    ],
-)
-def test_window_codes_of_a_didson_are_metres_at_1465_m_s(tmp_path, file, begin_m, length_m):
-    recording = Ddf(images(2, 96 if file.get("high", 1) else 48, 500), **file)
+# fmt: off
+WINDOWS = [  # start and length code, other fields, first range and length in metres; the first is of the 2014 paper
+    (3, 0, {}, 1.26, 1.25), (1, 3, {}, 0.42, 10.0), (2, 0, {"serial": 18}, 0.75, 1.125), (2, 0, {"high": 0}, 1.68, 5.0),
+    (3, 0, {"flags": 1}, 1.125, 1.125), (2, 1, {"flags": 2}, 0.84, 5.0), (2, 1, {"flags": 3}, 0.75, 4.5),
+    (2, 3, {"high": 0, "flags": 1}, 1.5, 36.0), (2, 0, {"serial": 15}, 0.75, 2.25), (3, 0, {"flags": 240}, 1.26, 1.25),
+    (3, 0, {"flags": 1, "version": 4}, 1.26, 1.25),
+]
+# fmt: on
+
+
+@pytest.mark.parametrize(("start_code", "length_code", "others", "begin_m", "length_m"), WINDOWS)
+def test_window_codes_of_a_didson_are_metres_at_1465_m_s(tmp_path, start_code, length_code, others, begin_m, length_m):
+    beams = 96 if others.get("high", 1) else 48
+    recording = Ddf(images(2, beams, 500), start_code=start_code, length_code=length_code, **others)
     expected = begin_m + length_m / 500 * (np.arange(500) + 0.5)
     np.testing.assert_allclose(log_of(tmp_path, recording).frames.ranges_m, expected, rtol=1e-6)
     warm = log_of(tmp_path, recording, sound_speed_m_s=1500.0)
@@ -92,10 +97,10 @@ MARKED[0, 0] = 255
 )
 def test_azimuths_are_positive_to_the_left(tmp_path, recording, first_deg, last_deg):
     frames = log_of(tmp_path, recording).frames
-    assert files.degrees(frames)[[0, -1]] == pytest.approx([first_deg, last_deg], abs=0.01)
+    assert np.degrees(frames.azimuths_rad)[[0, -1]] == pytest.approx([first_deg, last_deg], abs=0.01)
     np.testing.assert_array_equal(frames.intensity, recording.frames)
     if isinstance(recording, Oculus):
-        assert files.degrees(frames)[1] == pytest.approx(60.0)
+        assert np.degrees(frames.azimuths_rad)[1] == pytest.approx(60.0)
         np.testing.assert_allclose(frames.ranges_m, 0.003 * (np.arange(8) + 0.5), rtol=1e-6)
 
 
@@ -263,7 +268,7 @@ def test_gains_of_the_rows_are_taken_out(tmp_path, kind):
 def test_messages_without_images_are_passed_over_and_damage_after_one_costs_only_itself(tmp_path):
     pictures = images(4, 16, 8)
     _, *pings = Oculus(pictures).pieces()
-    note, huge = files.oculus_note(b"SO" * 6), bytearray(files.oculus_note())
+    note, huge = oculus_note(b"SO" * 6), bytearray(oculus_note())
     put(huge, 10, "I", 1 << 20)
     begin = len(note) + len(pings[0]) + len(note)
     for between, lost in (
@@ -285,33 +290,26 @@ def test_pings_that_were_not_recorded_are_counted_but_not_where_numbers_begin_an
     assert converted(tmp_path, b"".join(pings[:3] + anew), "raw").done.missing == 0
 
 
-# ---- recordings of real sonars
-
-
 @pytest.mark.recording
-def test_a_real_recording_of_an_aris_is_read_to_the_byte(recordings, tmp_path):
-    source = recordings / "sonar" / "sample.aris"
-    done = convert_aris(source, tmp_path / "dive.mcap")
+@pytest.mark.parametrize("name", ["sample.aris", "one_ping_8bit.raw", "three_pings_8bit.raw"])
+def test_recordings_of_real_sonars_are_read_to_the_byte(recordings, tmp_path, name):
+    source, is_aris = recordings / "sonar" / name, name.endswith("aris")
+    done = CONVERTERS[name.split(".")[1]](source, tmp_path / "dive.mcap")
     (frames,) = read_sonar_frames(tmp_path / "dive.mcap")
-    content = np.fromfile(source, np.uint8)[1024:].reshape(6, 1024 + 48 * 2000)[:, 1024:]
-    np.testing.assert_array_equal(frames.intensity, content.reshape(6, 2000, 48).transpose(0, 2, 1))
+    bins, beams, head_bytes = (2000, 48, 1024) if is_aris else (703, 256, 2048)
+    content = np.fromfile(source, np.uint8)[1024 if is_aris else 0 :].reshape(len(frames), -1)[:, head_bytes:]
+    np.testing.assert_array_equal(frames.intensity, content.reshape(-1, bins, beams).transpose(0, 2, 1))
     assert done.shortcomings() == []
-    assert frames.stamps_ns[0] == 1_371_198_080_759_456_000  # 2013-06-14, by the sonar
-    assert files.degrees(frames)[[0, -1]] == pytest.approx([-6.742, 6.742])  # an ARIS 1200 with telephoto lens
-    # the header also states 3.33 m and 20.3 m, for 1450 m/s; the water had 1435.93 m/s
-    assert frames.ranges_m[0] == pytest.approx(3.3299 * 1435.93 / 1450, abs=0.006)
-    assert frames.ranges_m[-1] - frames.ranges_m[0] == pytest.approx(20.3 * 1435.93 / 1450, abs=0.02)
-
-
-@pytest.mark.recording
-@pytest.mark.parametrize(("name", "count"), [("one_ping_8bit.raw", 1), ("three_pings_8bit.raw", 3)])
-def test_real_recordings_of_an_oculus_are_read_to_the_byte(recordings, tmp_path, name, count):
-    source = recordings / "sonar" / name
-    done = convert_oculus(source, tmp_path / "dive.mcap")
-    (frames,) = read_sonar_frames(tmp_path / "dive.mcap")
-    content = np.fromfile(source, np.uint8).reshape(count, -1)[:, 2048:]
-    np.testing.assert_array_equal(frames.intensity, content.reshape(count, 703, 256).transpose(0, 2, 1))
-    assert done.shortcomings() == []
-    assert files.degrees(frames)[[0, -1]] == pytest.approx([30.0, -30.0])
-    assert frames.ranges_m[-1] == pytest.approx(2.0, abs=0.005)
-    assert np.diff(frames.stamps_ns) == pytest.approx([62_502_130, 62_502_097][: count - 1])
+    edges_deg = np.degrees(frames.azimuths_rad)[[0, -1]]
+    if is_aris:
+        assert len(frames) == 6
+        assert frames.stamps_ns[0] == 1_371_198_080_759_456_000  # 2013-06-14, by the sonar
+        assert edges_deg == pytest.approx([-6.742, 6.742])  # an ARIS 1200 with telephoto lens
+        # the header also states 3.33 m and 20.3 m, for 1450 m/s; the water had 1435.93 m/s
+        assert frames.ranges_m[0] == pytest.approx(3.3299 * 1435.93 / 1450, abs=0.006)
+        assert frames.ranges_m[-1] - frames.ranges_m[0] == pytest.approx(20.3 * 1435.93 / 1450, abs=0.02)
+    else:
+        assert len(frames) == (1 if "one" in name else 3)
+        assert edges_deg == pytest.approx([30.0, -30.0])
+        assert frames.ranges_m[-1] == pytest.approx(2.0, abs=0.005)
+        assert np.diff(frames.stamps_ns) == pytest.approx([62_502_130, 62_502_097][: len(frames) - 1])
