@@ -38,19 +38,15 @@ def test_compare_writes_report_numbers_results_and_runs(compared):
         assert json.loads((compared / "runs" / estimator / "result.json").read_text())["status"] == "ok"
 
 
-def test_compare_says_where_the_report_is_and_nothing_on_stderr(run, basin, tmp_path, capsys):
+def test_compare_says_where_the_report_is_and_report_draws_the_same_page_again(run, basin, tmp_path, capsys):
     assert run("compare", basin, "-o", tmp_path, "--estimators", "dead-reckoning") == 0
-    told = capsys.readouterr()
-    assert f"Report: {tmp_path / 'report.html'}" in told.out.splitlines()
+    told, page = capsys.readouterr(), tmp_path / "report.html"
+    assert f"Report: {page}" in told.out.splitlines()
     assert "dead-reckoning" in told.out
     assert told.err == ""
-
-
-def test_report_draws_the_same_page_again(run, compared):
-    page = compared / "report.html"
     before = page.read_text()
     page.unlink()
-    assert run("report", compared) == 0
+    assert run("report", tmp_path) == 0
     assert len(page.read_text()) == pytest.approx(len(before), rel=0.01)
 
 

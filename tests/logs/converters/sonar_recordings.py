@@ -165,7 +165,7 @@ class Oculus(Recorded):
         return (header + fire + result + bearings).ljust(offset, b"\0") + pixels
 
 
-def oculus_note(payload: bytes = b"\0" * 12) -> bytes:
+def no_ping(payload: bytes = b"\0" * 12) -> bytes:
     """A message without an image: the user's configuration."""
     return struct.pack("<HHHHHIH", 0x4F53, 1, 2, 0x55, 0, len(payload), 0) + payload
 

@@ -8,19 +8,7 @@ from mcap_ros2.decoder import DecoderFactory
 from sonar_graph.logs.reading import read_sonar_frames
 
 from .builders import assert_refused
-from .sonar_recordings import (
-    CONVERTERS,
-    START_NS,
-    STEP_NS,
-    Aris,
-    Ddf,
-    Oculus,
-    converted,
-    images,
-    log_of,
-    oculus_note,
-    put,
-)
+from .sonar_recordings import CONVERTERS, START_NS, STEP_NS, Aris, Ddf, Oculus, converted, images, log_of, no_ping, put
 
 ARIS_BEAMS = {1: 48, 2: 48, 3: 96, 5: 96, 6: 64, 8: 64, 9: 128, 12: 128}
 WHOLE = [
@@ -268,7 +256,7 @@ def test_gains_of_the_rows_are_taken_out(tmp_path, kind):
 def test_messages_without_images_are_passed_over_and_damage_after_one_costs_only_itself(tmp_path):
     pictures = images(4, 16, 8)
     _, *pings = Oculus(pictures).pieces()
-    note, huge = oculus_note(b"SO" * 6), bytearray(oculus_note())
+    note, huge = no_ping(b"SO" * 6), bytearray(no_ping())
     put(huge, 10, "I", 1 << 20)
     begin = len(note) + len(pings[0]) + len(note)
     for between, lost in (
