@@ -175,18 +175,9 @@ def calibrate(
 def estimate_confusion(
     fits: LabelledFits, ids: tuple[int, ...], provenance: dict[str, str], designs: Sequence[LandmarkDesign] = ()
 ) -> Confusion:
-    """Fit the model to labelled frames, all classes weighing the same.
+    """Fit the model to labelled frames, all classes weighing the same, for designs with these ids in their order.
 
-    Parameters
-    ----------
-    fits
-        Labelled frames.
-    ids
-        Of the designs, in their order.
-    provenance
-        Source of the frames.
-    designs
-        The designs as measured; without them no recogniser accepts the model.
+    Without the designs themselves, as measured, no recogniser accepts the model.
 
     Raises
     ------

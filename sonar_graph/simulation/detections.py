@@ -11,12 +11,11 @@ have a wrong one for a share of the rest of the track, and the right one after t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sonar_graph.calibration import SonarCalibration
+from sonar_graph.calibration import Section, SonarCalibration
 from sonar_graph.measurements import NO_TRACK, Floats, Ints, LandmarkDetections
 from sonar_graph.simulation.sensors import body_R_sensor, seconds_since_start
 from sonar_graph.simulation.vehicle import VehiclePath
@@ -43,18 +42,7 @@ def world_on_floor(xy_m: Floats, floor_z_m: float, height_sigma_m: float, rng: n
     """Landmarks with IDs 1, 2, ... whose heights are drawn around that of the floor.
 
     Estimators are given the floor prior N(floor_z_m, height_sigma_m²), from which the heights are drawn: landmarks
-    exactly on the floor would make every estimator look too cautious.
-
-    Parameters
-    ----------
-    xy_m
-        Horizontal positions, shape (m, 2).
-    floor_z_m
-        Height of the floor.
-    height_sigma_m
-        Standard deviation of a landmark's height about the floor.
-    rng
-        Source of the heights.
+    exactly on the floor would make every estimator look too cautious. Horizontal positions have the shape (m, 2).
     """
     heights = floor_z_m + height_sigma_m * rng.standard_normal(len(xy_m))
     return World(np.arange(1, len(xy_m) + 1), np.column_stack([xy_m, heights]), floor_z_m)
@@ -62,16 +50,6 @@ def world_on_floor(xy_m: Floats, floor_z_m: float, height_sigma_m: float, rng: n
 
 LONGEST_GAP_S = 1.0
 """Longer without a detection ends a track."""
-
-
-@dataclass(frozen=True)
-class Tracking:
-    """Times that a recogniser needs for an identity, and for correcting a wrong one."""
-
-    id_delay_s: float = 0.0
-    """Age of a track at which it gets an identity."""
-    wrong_id_share: float = 0.5
-    """Share of the rest of a track for which a wrong identity is kept; 1: to its end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,10 +64,9 @@ class Watched:
     """Age of its track at each detection, shape (n,)."""
     lifetime_s: Floats
     """Duration of each track, shape (t,)."""
-    tracking: Tracking
 
     @classmethod
-    def of(cls, landmark: Ints, stamps_ns: Ints, tracking: Tracking) -> Watched:
+    def of(cls, landmark: Ints, stamps_ns: Ints) -> Watched:
         """Divide detections in time order, landmark index and stamp each (n,), into tracks."""
         track = np.empty(len(landmark), dtype=np.int64)
         newest: dict[int, tuple[int, int]] = {}
@@ -106,24 +83,7 @@ class Watched:
         age_s = np.asarray((stamps_ns - np.array(first_ns, dtype=np.int64)[track]) * 1e-9, dtype=np.float64)
         lifetime_s = np.zeros(len(landmarks))
         np.maximum.at(lifetime_s, track, age_s)
-        return cls(np.array(landmarks, dtype=np.int64), track, age_s, lifetime_s, tracking)
-
-    def is_undecided(self) -> NDArray[np.bool_]:
-        """True for detections of tracks too young for an identity, shape (n,)."""
-        return np.asarray(self.age_s < self.tracking.id_delay_s)
-
-    def believed(self, first_taken_for: Ints) -> Ints:
-        """Index of the landmark believed at each detection, shape (n,).
-
-        Parameters
-        ----------
-        first_taken_for
-            Index of the landmark that each track is taken for at first, shape (t,).
-        """
-        delay_s, share = self.tracking.id_delay_s, self.tracking.wrong_id_share
-        corrected_s = delay_s + share * np.maximum(self.lifetime_s - delay_s, 0.0)
-        is_corrected = (self.age_s >= corrected_s[self.track]) & (share < 1)
-        return np.where(is_corrected, self.landmark[self.track], first_taken_for[self.track])
+        return cls(np.array(landmarks, dtype=np.int64), track, age_s, lifetime_s)
 
 
 RECOGNISED_PROBABILITY = 0.97
@@ -156,8 +116,17 @@ class SimulatedRecogniser:
     """Share of the false detections taken for a landmark, with the confidence of a right one."""
     anonymous_share: float = 0.0
     """Share of all detections without any identity."""
-    tracking: Tracking | None = None
-    """None: no tracks, each frame stands for itself."""
+    tracks: bool = False
+    """Landmarks are watched over frames; off: each frame stands for itself."""
+    id_delay_s: float = 0.0
+    """Age of a track at which it gets an identity."""
+    wrong_id_share: float = 0.5
+    """Share of the rest of a track for which a wrong identity is kept; 1: to its end."""
+
+    @classmethod
+    def of(cls, options: Section) -> SimulatedRecogniser:
+        """The rates that some options have."""
+        return cls(**options.model_dump(include={field.name for field in fields(cls)}))
 
 
 def landmarks_in_sonar(path: VehiclePath, stamps_ns: Ints, sonar: SonarCalibration, world: World) -> Floats:
@@ -199,22 +168,7 @@ def simulate_detections(
 
     The posterior of a recognised detection is 0.97 for its identity and 0.02 spread evenly over the other landmarks
     (0.01 says "none of them"); that of a false one is 0.20 spread at random over all landmarks (0.80 says "none").
-    False detections belong to no track.
-
-    Parameters
-    ----------
-    path, world
-        The truth.
-    stamps_ns
-        One stamp a frame, shape (n,).
-    sonar
-        Mounting and noise of range and azimuth.
-    fan
-        Field of view of the sonar.
-    recogniser
-        Rates of its errors.
-    rng
-        Source of everything random.
+    False detections belong to no track. Path and world are the truth; there is one stamp a frame, shape (n,).
     """
     true_rng, false_rng = rng.spawn(2)
     frames, landmarks = len(stamps_ns), len(world.landmark_ids)
@@ -226,14 +180,18 @@ def simulate_detections(
     true_distance, true_azimuth, _ = range_azimuth_elevation(points[detected])
     true_views = np.column_stack([true_distance, true_azimuth])
     true_views = true_views + sigmas * true_rng.standard_normal((len(true_frame), 2))
-    if recogniser.tracking is None:
+    if recogniser.tracks:
+        watched = Watched.of(landmark, stamps_ns[true_frame])
+        true_track, delay_s, share = watched.track, recogniser.id_delay_s, recogniser.wrong_id_share
+        first_taken_for = _mistaken(watched.landmark, landmarks, recogniser.wrong_id_rate, true_rng)
+        corrected_s = delay_s + share * np.maximum(watched.lifetime_s - delay_s, 0.0)
+        is_corrected = (watched.age_s >= corrected_s[true_track]) & (share < 1)
+        believed = np.where(is_corrected, watched.landmark[true_track], first_taken_for[true_track])
+        true_posterior = _confident(believed, landmarks)
+        true_posterior[watched.age_s < delay_s] = 1 / (landmarks + 1)
+    else:
         taken_for = _mistaken(landmark, landmarks, recogniser.wrong_id_rate, true_rng)
         true_posterior, true_track = _confident(taken_for, landmarks), np.full(len(true_frame), NO_TRACK)
-    else:
-        watched = Watched.of(landmark, stamps_ns[true_frame], recogniser.tracking)
-        first_taken_for = _mistaken(watched.landmark, landmarks, recogniser.wrong_id_rate, true_rng)
-        true_posterior, true_track = _confident(watched.believed(first_taken_for), landmarks), watched.track
-        true_posterior[watched.is_undecided()] = 1 / (landmarks + 1)
 
     false_frame = np.repeat(np.arange(frames), false_rng.poisson(recogniser.false_detections_per_frame, frames))
     count = len(false_frame)

@@ -94,14 +94,8 @@ def add_landmarks(recorded: Sequence, options: LandmarkOptions | None = None) ->
     )
     azimuth_half_rad, elevation_half_rad = options.azimuth_aperture_rad / 2, options.elevation_aperture_rad / 2
     fan = FieldOfView(options.range_min_m, options.range_max_m, azimuth_half_rad, elevation_half_rad)
-    recogniser = SimulatedRecogniser(
-        detection_probability=options.detection_probability,
-        wrong_id_rate=options.wrong_id_rate,
-        false_detections_per_frame=options.false_detections_per_frame,
-        confident_false_fraction=options.confident_false_fraction,
-    )
     frames_ns = regular_stamps(options.frame_rate_hz, path.duration_s)
-    detections = simulate_detections(path, frames_ns, sonar, fan, recogniser, world, sonar_rng)
+    detections = simulate_detections(path, frames_ns, sonar, fan, SimulatedRecogniser.of(options), world, sonar_rng)
     if detections is None:
         raise SimulationError(
             f"{recorded.name}: not one landmark is seen; lower spacing_m = {options.spacing_m:g} or raise range_max_m"

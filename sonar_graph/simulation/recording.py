@@ -23,10 +23,9 @@ from sonar_graph.calibration import (
 from sonar_graph.errors import SimulationError
 from sonar_graph.measurements import Floats, Ints
 from sonar_graph.sequence import Sequence
-from sonar_graph.simulation.detections import FieldOfView, SimulatedRecogniser, Tracking, World, simulate_detections
+from sonar_graph.simulation.detections import FieldOfView, SimulatedRecogniser, World, simulate_detections
 from sonar_graph.simulation.options import DEPTH_RATE_HZ, DVL_PRESETS, IMU_PRESETS, IMU_RATE_HZ, SimulationOptions
 from sonar_graph.simulation.sensors import (
-    DvlFaults,
     regular_stamps,
     seconds_since_start,
     simulate_depth,
@@ -82,20 +81,7 @@ def record(
 ) -> Sequence:
     """Simulate all measurements along a path, with the truth and the calibration that holds for them.
 
-    Parameters
-    ----------
-    name
-        Name of the sequence.
-    options
-        Sensors and faults.
-    vehicle
-        Mountings and the sonar's fan.
-    path, world
-        The truth.
-    streams
-        Source of everything random.
-    notes
-        Provenance to add to generator and options.
+    Path and world are the truth; the notes say where values come from, beside generator and options.
 
     Raises
     ------
@@ -111,15 +97,6 @@ def record(
         raise SimulationError(
             f"simulate {name}: wrong_id_share = {options.wrong_id_share:g} is a share of a track; set tracks = true"
         )
-    recogniser = SimulatedRecogniser(
-        detection_probability=options.detection_probability,
-        wrong_id_rate=options.wrong_id_rate,
-        false_detections_per_frame=options.false_detections_per_frame,
-        confident_false_fraction=options.confident_false_fraction,
-        anonymous_share=options.anonymous_share,
-        tracking=Tracking(options.id_delay_s, options.wrong_id_share) if options.tracks else None,
-    )
-    dvl_faults = DvlFaults(options.dvl_scale_error, options.dvl_dropouts_per_hour, options.dvl_dropout_s)
     calibration = true_calibration(options, vehicle, path, world, streams.start)
     rates_hz = IMU_RATE_HZ, DVL_PRESETS[options.dvl].rate_hz, DEPTH_RATE_HZ, TRUTH_RATE_HZ
     imu_ns, dvl_ns, depth_ns, truth_ns = (regular_stamps(rate, path.duration_s) for rate in rates_hz)
@@ -129,10 +106,18 @@ def record(
         name=name,
         calibration=calibration,
         imu=simulate_imu(path, imu_ns, calibration.imu, calibration.gravity_m_s2, streams.imu),
-        dvl=simulate_dvl(path, dvl_ns, calibration.dvl, dvl_faults, streams.dvl),
+        dvl=simulate_dvl(
+            path,
+            dvl_ns,
+            calibration.dvl,
+            streams.dvl,
+            scale_error=options.dvl_scale_error,
+            dropouts_per_hour=options.dvl_dropouts_per_hour,
+            dropout_s=options.dvl_dropout_s,
+        ),
         depth=simulate_depth(path, depth_ns, calibration.depth, streams.depth),
         detections=simulate_detections(
-            path, frames_ns, calibration.sonar, vehicle.fan, recogniser, world, streams.sonar
+            path, frames_ns, calibration.sonar, vehicle.fan, SimulatedRecogniser.of(options), world, streams.sonar
         ),
         truth=Trajectory.without_covariances(truth_ns, truth.position, truth.world_R_body.as_quat()),
         true_landmarks=world.landmark_map(),

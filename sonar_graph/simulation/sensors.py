@@ -6,8 +6,6 @@ estimators to remove it. docs/theory/simulation.md
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -18,18 +16,6 @@ from sonar_graph.simulation.vehicle import Kinematics, VehiclePath, rotation_fro
 
 EPOCH_NS = 1_400_000_000 * NS_PER_S
 """Stamp of the start of every simulated run: a day in May 2014."""
-
-
-@dataclass(frozen=True)
-class DvlFaults:
-    """Faults of a Doppler log beyond white noise, unknown to estimators."""
-
-    scale_error: float = 0.0
-    """Relative: 0.007 reads 0.7 % too fast."""
-    dropouts_per_hour: float = 0.0
-    """Losses of bottom lock, at random times."""
-    dropout_s: float = 3.0
-    """Duration of each."""
 
 
 def regular_stamps(rate_hz: float, duration_s: float, offset_s: float = 0.0) -> Ints:
@@ -56,19 +42,7 @@ def imu_readings(motion: Kinematics, mounting: Mounting, gravity_m_s2: float) ->
         omega_imu = imu_R_body omega
         f_imu     = imu_R_body ( body_R_world (a - g) + omega' × l + omega × (omega × l) ),   g = (0, 0, -gravity)
 
-    Parameters
-    ----------
-    motion
-        Of the body, at n instants.
-    mounting
-        Of the IMU.
-    gravity_m_s2
-        Magnitude of gravity.
-
-    Returns
-    -------
-    tuple[Floats, Floats]
-        Angular velocity (rad/s) and specific force (m/s²), shapes (n, 3); at rest and level (0, 0, +gravity).
+    Shapes (n, 3), rad/s and m/s²; at rest and level the force is (0, 0, +gravity).
     """
     imu_R_body = body_R_sensor(mounting).inv()
     lever, omega = np.array(mounting.translation_m), motion.angular_velocity
@@ -106,22 +80,29 @@ def dvl_readings(motion: Kinematics, mounting: Mounting) -> Floats:
 
 
 def simulate_dvl(
-    path: VehiclePath, stamps_ns: Ints, calibration: DvlCalibration, faults: DvlFaults, rng: np.random.Generator
+    path: VehiclePath,
+    stamps_ns: Ints,
+    calibration: DvlCalibration,
+    rng: np.random.Generator,
+    *,
+    scale_error: float = 0.0,
+    dropouts_per_hour: float = 0.0,
+    dropout_s: float = 3.0,
 ) -> Dvl:
-    """DVL samples with white noise, a scale error, and gaps where bottom lock is lost.
+    """DVL samples with white noise, and with faults unknown to estimators.
 
-    Losses begin as a Poisson process. The first and the last row are never lost, so that faults do not change the time
-    that the run covers.
+    The relative ``scale_error`` 0.007 reads 0.7 % too fast. Losses of bottom lock begin as a Poisson process. The first
+    and the last row are never lost, so that faults do not change the time that the run covers.
     """
     seconds = seconds_since_start(stamps_ns)
     sigmas = np.array(calibration.velocity_sigma_m_s)
-    exact = dvl_readings(path.at(seconds), calibration.mounting) * (1 + faults.scale_error)
+    exact = dvl_readings(path.at(seconds), calibration.mounting) * (1 + scale_error)
     velocity = exact + sigmas * rng.standard_normal(exact.shape)
     covariance = np.broadcast_to(np.diag(sigmas**2), (len(stamps_ns), 3, 3))
     duration_s = float(seconds[-1])
-    begins = np.sort(rng.uniform(0, duration_s, rng.poisson(faults.dropouts_per_hour * duration_s / 3600)))
+    begins = np.sort(rng.uniform(0, duration_s, rng.poisson(dropouts_per_hour * duration_s / 3600)))
     latest = np.concatenate([[-np.inf], begins])[np.searchsorted(begins, seconds, side="right")]
-    locked = seconds - latest >= faults.dropout_s
+    locked = seconds - latest >= dropout_s
     locked[[0, -1]] = True
     return Dvl(stamps_ns, velocity, covariance).rows(locked)
 

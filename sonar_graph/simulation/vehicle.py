@@ -86,25 +86,10 @@ def rpy_from_rotation(rotation: Rotation) -> Floats:
 def smooth_noise(
     seconds: Floats, sigma: float | Floats, interval_s: float, columns: int, rng: np.random.Generator
 ) -> Floats:
-    """Random smooth wandering: quintic B-splines with independent normal coefficients every ``interval_s``.
+    """Random smooth wandering, shape (n, columns): quintic B-splines with independent normal coefficients.
 
-    Parameters
-    ----------
-    seconds
-        Instants from 0 on, shape (n,).
-    sigma
-        Standard deviation of the coefficients, for all columns or each; the curve's own is about 0.66 of it.
-    interval_s
-        Time between coefficients: the shorter, the livelier.
-    columns
-        Number of independent curves.
-    rng
-        Source of the coefficients.
-
-    Returns
-    -------
-    Floats
-        Shape (n, columns).
+    The shorter the interval between coefficients, the livelier. ``sigma`` is their standard deviation, for all columns
+    or each; the curve's own is about 0.66 of it.
     """
     spans = int(np.ceil(seconds[-1] / interval_s)) + 1
     knots = interval_s * np.arange(-DEGREE, spans + DEGREE + 1)
@@ -151,21 +136,9 @@ class RouteLeg:
 
 
 def follow(start: PlanarPose, legs: list[RouteLeg], seconds: Floats) -> Floats:
-    """The intended pose at some instants.
+    """The intended x, y (m) and unwrapped yaw (rad) at instants since the start, shape (n, 3).
 
-    Parameters
-    ----------
-    start
-        Pose before the first leg.
-    legs
-        Motions one after the other.
-    seconds
-        Instants since the start, shape (n,); after the last leg its goal holds.
-
-    Returns
-    -------
-    Floats
-        x, y (m) and unwrapped yaw (rad), shape (n, 3).
+    ``start`` is the pose before the first leg; after the last leg its goal holds.
     """
     pose = np.tile(np.array(start), (len(seconds), 1))
     begin_s = 0.0

@@ -190,7 +190,7 @@ class CandidateFit:
         shape = (frame.ranges_m, frame.azimuths_rad)
         is_same = (one is other or np.array_equal(one, other) for one, other in zip(self._shape, shape, strict=True))
         if self._grid is None or not all(is_same):
-            self._grid, self._shape = PolarGrid(*shape, self._aperture_rad), shape
+            self._grid, self._shape = PolarGrid.of(*shape, self._aperture_rad), shape
         view, appearance = view or SLANT_PLANE, self._appearance
         sightings: list[ObjectSighting | None] = []
         for row in rows.tolist():

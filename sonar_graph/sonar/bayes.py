@@ -129,17 +129,11 @@ class Beliefs:
     ) -> Floats:
         """Predict and update for one frame, equations (1) to (3); the beliefs after it, shape (M, K).
 
-        Parameters
-        ----------
-        association, scores
-            Of the tracks after the frame.
-        places
-            Position of the sonar in a fixed frame for each track that was looked at, shape (3,); None: not looked at.
-        sideways
-            Horizontal unit vector across each line of sight in the same frame, shape (M, 3).
+        Where a track was looked at, ``places`` has the position of the sonar in a fixed frame, shape (3,), else None;
+        ``sideways`` is the horizontal unit vector across each line of sight in the same frame, shape (M, 3).
         """
         rows = [self._order.index(track) for track in association.previous_ids.tolist()]
-        self._order = association.track_ids.tolist()
+        self._order = association.ids.tolist()
         weights = np.array([self._weight(*look) for look in zip(self._order, places, sideways, strict=True)])
         forgetting = self.params.forgetting * weights[:, None]
         predicted = predict(self._beliefs[rows], association.matrix, self._birth, forgetting)

@@ -10,6 +10,7 @@ sigma is measured at each pixel, so that texture raises the threshold. Derivatio
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from functools import lru_cache
 
@@ -22,7 +23,7 @@ from sonar_graph.calibration import Section
 from sonar_graph.devices import LEAST_BRIGHT_DB, LandmarkDesign
 from sonar_graph.errors import CalibrationError, MeasurementError
 from sonar_graph.measurements import Floats, Ints
-from sonar_graph.sonar.geometry import FloorView, elevation_sigma
+from sonar_graph.sonar.geometry import FloorView
 from sonar_graph.sonar.regions import Candidates, CandidateVerdict, Floats32, Regions, background_of, measure_regions
 
 DB_PER_NEPER = 10.0 / np.log(10.0)
@@ -62,16 +63,8 @@ def select_candidates(
 ) -> Candidates:
     """Regions of one polar frame over the threshold, rejected ones included.
 
-    Parameters
-    ----------
-    image_db
-        Levels in dB, shape (beams, bins), finite.
-    ranges_m, azimuths_rad
-        Middle of each bin, shape (bins,), and of each beam, shape (beams,).
-    view
-        The floor; None: not known, areas are in the slant plane.
-    params
-        Settings; None for the defaults.
+    Levels in dB, shape (beams, bins), must be finite. Ranges are those of the middles of the bins, azimuths those of
+    the beams. Without a floor (view of None) areas are in the slant plane.
 
     Raises
     ------
@@ -91,9 +84,9 @@ def select_candidates(
         odd_counts(length_m, cell_m) for length_m in (params.smoothing_m, params.background_m, params.closing_m)
     )
     smooth = np.asarray(cv2.blur(image_db, smoothing[::-1], borderType=cv2.BORDER_REFLECT_101), dtype=np.float32)
-    background = background_of(smooth, smoothing, neighbourhood)
-    contrast = smooth - _at_pixels(background.level_db, shape)
-    offsets = false_alarm_offsets_db(background.spread_db, params.false_alarm)
+    level_db, spread_db = background_of(smooth, smoothing, neighbourhood)
+    contrast = smooth - _at_pixels(level_db, shape)
+    offsets = false_alarm_offsets_db(spread_db, params.false_alarm)
     mask = cv2.compare(contrast, _at_pixels(offsets, shape), cv2.CMP_GT)
     closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_RECT, closing[::-1]))
     # opencv's default algorithm takes three times as long for the same labels
@@ -101,14 +94,14 @@ def select_candidates(
     labels, boxes = np.asarray(found, dtype=np.int32), stats[1:count].astype(np.int64)[:, [1, 0, 3, 2]]
     regions = measure_regions(contrast, labels, len(boxes), ranges_m, azimuths_rad, view)
     if view is None:
-        elevation_sigmas = np.full(len(boxes), elevation_sigma(params.elevation_aperture_rad))
+        aperture_rad = params.elevation_aperture_rad  # in which the elevation is uniform
+        elevation_sigmas = np.full(len(boxes), aperture_rad / math.sqrt(12.0))
     else:
         elevation_sigmas = view.elevation_sigmas(regions.points_m)
     window = np.array([[ranges_m.min(), ranges_m.max()], [azimuths_rad.min(), azimuths_rad.max()]])
-    verdicts = judged(regions, boxes, shape, params)
     return Candidates(
         **vars(regions),
-        verdicts=verdicts,
+        verdicts=judged(regions, boxes, shape, params),
         elevation_sigma_rad=elevation_sigmas,
         boxes=boxes,
         window=window,

@@ -181,11 +181,6 @@ def ranges_azimuths_elevations(points_m: Floats) -> tuple[Floats, Floats, Floats
     return np.hypot(level, z), np.arctan2(y, x), np.arctan2(z, level)
 
 
-def elevation_sigma(aperture_rad: float) -> float:
-    """Standard deviation of an elevation of which only the aperture is known: uniform, ``aperture / sqrt(12)``."""
-    return aperture_rad / math.sqrt(12.0)
-
-
 def point_covariances(points_m: Floats, range_azimuth_cov: Floats, elevation_sigmas_rad: Floats) -> Floats:
     """Covariance of points in the sonar frame, first order, shape (n, 3, 3).
 

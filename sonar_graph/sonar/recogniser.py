@@ -161,7 +161,7 @@ class Recogniser:
         image_db = self._calibration.sonar.image.decibels(np.ascontiguousarray(frame.intensity[0]))
         candidates = select_candidates(image_db, frame.ranges_m, frame.azimuths_rad, view, self.params.detection)
         association = self._tracker.step(candidates, motion, stamp_ns)
-        self.track_ids = association.track_ids
+        self.track_ids = association.ids
         self.sightings = self._look.at(image_db, frame, view, candidates, association.candidate)
         scores = self._look.scores(self.sightings)
         place = self._start_T_sonar.translation()
@@ -197,7 +197,7 @@ class Recogniser:
                 outcome = f"not reported: exists with less than {params.least_existence:g}"
             else:
                 reported.append((row, sighting))
-            track = int(association.track_ids[row])
+            track = int(association.ids[row])
             self.fates.append(Fate(stamp_ns, track, sighting.range_m, sighting.azimuth_rad, outcome))
         self.fates += [
             Fate(stamp_ns, track, np.nan, np.nan, f"track ended: {reason}")
@@ -213,7 +213,7 @@ class Recogniser:
             range_azimuth_cov=np.array([sighting.covariance for _, sighting in reported]),
             candidate_ids=np.tile(self.ids, (len(rows), 1)),
             id_probability=each_once(beliefs[rows])[:, :-1],
-            track=association.track_ids[rows],
+            track=association.ids[rows],
         )
 
     def notes(self) -> dict[str, str]:

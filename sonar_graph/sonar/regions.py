@@ -34,18 +34,13 @@ TREND_NODES = 5
 """Nodes in range over which the median along the beams is averaged."""
 
 
-@dataclass(frozen=True, eq=False)
-class Background:
-    """Background on a grid of nodes, about one independent level each, shape (nodes, nodes)."""
+def background_of(
+    smooth_db: Floats32, smoothing: tuple[int, int], neighbourhood: tuple[int, int]
+) -> tuple[Floats32, Floats32]:
+    """B and sigma of levels averaged over beams and bins, by medians over a larger neighbourhood of them.
 
-    level_db: Floats32
-    """B, median level."""
-    spread_db: Floats32
-    """sigma, spread around it."""
-
-
-def background_of(smooth_db: Floats32, smoothing: tuple[int, int], neighbourhood: tuple[int, int]) -> Background:
-    """Background of levels averaged over beams and bins, by medians over a larger neighbourhood of them."""
+    On a grid of nodes, about one independent level each, shapes (nodes, nodes).
+    """
     beams, bins = smoothing
     nodes = np.ascontiguousarray(smooth_db[beams // 2 :: beams, bins // 2 :: bins])
     ordered, count = np.sort(nodes, axis=0), len(nodes)
@@ -55,7 +50,7 @@ def background_of(smooth_db: Floats32, smoothing: tuple[int, int], neighbourhood
     residual = nodes - trend
     local = _median(residual, window, STEPS_PER_DB, 128.0)
     spread = MEDIAN_TO_SIGMA * _median(np.abs(residual - local), window, DEVIATION_STEPS_PER_DB, 0.0)
-    return Background(local + trend, np.maximum(spread, np.float32(LEAST_SPREAD_DB)))
+    return local + trend, np.maximum(spread, np.float32(LEAST_SPREAD_DB))
 
 
 def _median(values: Floats32, window: int, steps_per_db: float, zero: float) -> Floats32:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -107,71 +108,49 @@ class Patch:
     """(x, y) of its middle on the floor, shape (2,)."""
 
 
-class PolarGrid:
-    """Beams and bins of an image, for looking up ranges and azimuths.
+class PolarGrid(NamedTuple):
+    """Beams and bins of an image, for looking up ranges and azimuths."""
 
-    Parameters
-    ----------
-    ranges_m
-        Middle of each bin, equally spaced, shape (bins,).
-    azimuths_rad
-        Of each beam, increasing or decreasing, shape (beams,).
-    elevation_aperture_rad
-        Full vertical opening: what lies outside of it is not in the image, whatever the range.
-    """
+    first_range_m: float
+    bin_m: float
+    first_azimuth_rad: float
+    azimuth_step_rad: float
+    beam_of_azimuth: Floats
+    """Number of the beam, with fractions, at equally spaced azimuths."""
+    highest_sine: float
+    """Sine of the elevation at the rim of the opening; what lies above is not in the image, whatever the range."""
 
-    def __init__(self, ranges_m: Floats, azimuths_rad: Floats, elevation_aperture_rad: float = math.pi) -> None:
-        self.highest_sine = math.sin(min(elevation_aperture_rad, math.pi) / 2)
-        self.first_range_m = float(ranges_m[0])
-        self.bin_m = float(ranges_m[-1] - ranges_m[0]) / (len(ranges_m) - 1)
+    @classmethod
+    def of(cls, ranges_m: Floats, azimuths_rad: Floats, elevation_aperture_rad: float = math.pi) -> PolarGrid:
+        """Grid of equally spaced bins, shape (bins,), and of beams in one direction, shape (beams,)."""
         order = np.argsort(azimuths_rad)
-        steps = _STEPS_A_BEAM * len(azimuths_rad)
-        places = np.linspace(azimuths_rad.min(), azimuths_rad.max(), steps)
-        self.first_azimuth_rad, self.azimuth_step_rad = float(places[0]), float(places[1] - places[0])
-        self.beam_of_azimuth = np.interp(places, azimuths_rad[order], order.astype(float))
+        places = np.linspace(azimuths_rad.min(), azimuths_rad.max(), _STEPS_A_BEAM * len(azimuths_rad))
+        return cls(
+            float(ranges_m[0]),
+            float(ranges_m[-1] - ranges_m[0]) / (len(ranges_m) - 1),
+            float(places[0]),
+            float(places[1] - places[0]),
+            np.interp(places, azimuths_rad[order], order.astype(float)),
+            math.sin(min(elevation_aperture_rad, math.pi) / 2),
+        )
 
     def patch(self, image_db: Floats32, view: FloorView, centre_m: Floats, side: int, cell_m: float) -> Patch:
         """The image on a grid of ``side`` by ``side`` floor points around a centre."""
-        level, seen = sample_floor(
-            image_db,
-            self.first_range_m,
-            self.bin_m,
-            self.beam_of_azimuth,
-            self.first_azimuth_rad,
-            self.azimuth_step_rad,
-            view.level_R_sonar,
-            view.height_m,
-            self.highest_sine,
-            centre_m,
-            side,
-            cell_m,
-        )
+        level, seen = sample_floor(self, image_db, view.level_R_sonar, view.height_m, centre_m, side, cell_m)
         return Patch(level, seen, centre_m)
 
 
 @compiled
 def sample_floor(
-    image_db: Floats32,
-    first_range_m: float,
-    bin_m: float,
-    beam_of_azimuth: Floats,
-    first_azimuth_rad: float,
-    azimuth_step_rad: float,
-    level_R_sonar: Floats,
-    height_m: float,
-    highest_sine: float,
-    centre: Floats,
-    side: int,
-    cell_m: float,
+    grid: PolarGrid, image_db: Floats32, R: Floats, height_m: float, centre: Floats, side: int, cell_m: float
 ) -> tuple[Floats32, Floats32]:
     """Levels on a square grid of the floor, and whether each point is in the image, shapes (side, side).
 
-    Each is the mean of decibels over the range that a cell covers, linear between beams.
+    Each is the mean of decibels over the range that a cell covers, linear between beams. R is ``level_R_sonar``.
     """
     beams, bins = image_db.shape
     level, seen = np.zeros((side, side), np.float32), np.zeros((side, side), np.float32)
-    R = level_R_sonar
-    half_bins = 0.5 * cell_m / bin_m
+    half_bins = 0.5 * cell_m / grid.bin_m
     half = 0.5 * (side - 1)
     for i in range(side):
         for j in range(side):
@@ -180,14 +159,14 @@ def sample_floor(
             qy = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
             qz = R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
             distance = math.sqrt(x * x + y * y + z * z)
-            if abs(qz) > highest_sine * distance:
+            if abs(qz) > grid.highest_sine * distance:
                 continue
-            place = (math.atan2(qy, qx) - first_azimuth_rad) / azimuth_step_rad
-            if not 0 <= place < len(beam_of_azimuth) - 1:
+            place = (math.atan2(qy, qx) - grid.first_azimuth_rad) / grid.azimuth_step_rad
+            if not 0 <= place < len(grid.beam_of_azimuth) - 1:
                 continue
             k = int(place)
-            beam = beam_of_azimuth[k] + (place - k) * (beam_of_azimuth[k + 1] - beam_of_azimuth[k])
-            middle = (distance - first_range_m) / bin_m
+            beam = grid.beam_of_azimuth[k] + (place - k) * (grid.beam_of_azimuth[k + 1] - grid.beam_of_azimuth[k])
+            middle = (distance - grid.first_range_m) / grid.bin_m
             first, last = math.floor(middle - half_bins + 1), math.floor(middle + half_bins)
             if beam < 0 or beam > beams - 1 or first < 0 or last >= bins:
                 continue

@@ -104,7 +104,7 @@ class Expected(NamedTuple):
 
 def corrected(tracks: TrackStates, expected: Expected, z: Floats, took: Ints, noise: Floats) -> TrackStates:
     """Update by the measurement that each track took (-1: none), with the covariance in Joseph's form."""
-    q, P = corrected_points(tracks.position_m, tracks.position_cov, expected.z, expected.H, expected.S, z, took, noise)
+    q, P = corrected_points(tracks.position_m, tracks.position_cov, expected, z, took, noise)
     return replace(tracks, position_m=q, position_cov=P)
 
 
@@ -165,49 +165,32 @@ def innovation_densities(expected: Floats, S: Floats, z: Floats, gate: float) ->
 
 @compiled
 def corrected_points(
-    position_m: Floats,
-    position_cov: Floats,
-    expected: Floats,
-    H: Floats,
-    S: Floats,
-    z: Floats,
-    took: Ints,
-    noise: Floats,
+    position_m: Floats, position_cov: Floats, expected: Expected, z: Floats, took: Ints, noise: Floats
 ) -> tuple[Floats, Floats]:
     """Positions and covariances after the measurements."""
     q, P = position_m.copy(), position_cov.copy()
     for m in range(len(q)):
         if took[m] >= 0:
-            gain = P[m] @ H[m].T @ np.linalg.inv(S[m])
-            rest = np.eye(3) - gain @ H[m]
-            q[m] += gain @ _innovation(z[took[m]], expected[m])
+            gain = P[m] @ expected.H[m].T @ np.linalg.inv(expected.S[m])
+            rest = np.eye(3) - gain @ expected.H[m]
+            q[m] += gain @ _innovation(z[took[m]], expected.z[m])
             P[m] = rest @ P[m] @ rest.T + gain @ noise @ gain.T
     return q, P
 
 
 @dataclass(frozen=True, eq=False)
-class Association:
+class Association(TrackStates):
     """The M tracks after a frame and their association with the M' tracks before it, p(m, j) of equation (1)."""
 
     stamp_ns: int
     """Of the frame."""
     previous_ids: Ints
     """Track numbers before the frame, shape (M',)."""
-    track_ids: Ints
-    """Track numbers after the frame, shape (M,). Numbers are never used twice."""
     matrix: Floats
     """Probability that track m now was track j before, shape (M, M' + 1); the last column is "new track". Rows sum
     to 1. A track without a candidate in this frame is itself, with certainty; only a track that starts can be new."""
     candidate: Ints
     """Row in `Candidates` that each track took, shape (M,); -1: none."""
-    existence: Floats
-    """Probability that the track is of something persistent, shape (M,)."""
-    position_m: Floats
-    """In the sonar frame at ``stamp_ns``, shape (M, 3)."""
-    position_cov: Floats
-    """Shape (M, 3, 3), m²."""
-    frames_seen: Ints
-    """Frames in which the track had a candidate, shape (M,)."""
     ended_ids: Ints
     """Tracks ended in this frame, shape (k,)."""
     ended_reasons: tuple[str, ...]

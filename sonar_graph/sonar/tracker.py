@@ -148,15 +148,11 @@ class Tracker:
             tracks = tracks.and_(TrackStates(ids, position, covariance, existence, np.ones(n, dtype=np.int64)))
         self._tracks = tracks
         return Association(
+            **vars(tracks),
             stamp_ns=stamp_ns,
             previous_ids=previous_ids,
-            track_ids=tracks.ids,
             matrix=own,
             candidate=np.where(rows >= 0, np.append(candidates.accepted, -1)[rows], -1),
-            existence=tracks.existence,
-            position_m=tracks.position_m,
-            position_cov=tracks.position_cov,
-            frames_seen=tracks.frames_seen,
             ended_ids=previous_ids[ended],
             ended_reasons=tuple(reasons[row] for row in ended),
         )

@@ -14,7 +14,6 @@ from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.simulation.detections import (
     FieldOfView,
     SimulatedRecogniser,
-    Tracking,
     Watched,
     World,
     inside,
@@ -170,7 +169,7 @@ def tracks_of(found: LandmarkDetections) -> list[LandmarkDetections]:
 def test_a_track_is_of_one_landmark_and_has_no_gap(steps: list[tuple[int, int]]):
     landmark = np.array([index for index, _ in steps])
     stamps_ns = np.cumsum([gap for _, gap in steps])
-    watched = Watched.of(landmark, stamps_ns, Tracking())
+    watched = Watched.of(landmark, stamps_ns)
     for number, true in enumerate(watched.landmark.tolist()):
         rows = np.flatnonzero(watched.track == number)
         assert set(landmark[rows].tolist()) == {true}

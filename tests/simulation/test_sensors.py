@@ -11,7 +11,6 @@ from sonar_graph.calibration import DepthCalibration, DvlCalibration, ImuCalibra
 from sonar_graph.measurements import Floats
 from sonar_graph.simulation.sensors import (
     EPOCH_NS,
-    DvlFaults,
     dvl_readings,
     imu_readings,
     regular_stamps,
@@ -144,20 +143,20 @@ def test_dvl_noise_is_what_its_covariance_column_says_and_scale_error_stretches_
     calibration = DvlCalibration(velocity_sigma_m_s=(0.004, 0.008, 0.016), mounting=SKEWED)
     path, stamps = moving(), regular_stamps(100, 60)
     exact = dvl_readings(path.at(seconds_since_start(stamps)), SKEWED)
-    dvl = simulate_dvl(path, stamps, calibration, DvlFaults(), np.random.default_rng(6))
+    dvl = simulate_dvl(path, stamps, calibration, np.random.default_rng(6))
     for axis in range(3):
         assert_sigma((dvl.velocity - exact)[:, axis], float(np.sqrt(dvl.velocity_cov[0, axis, axis])))
     np.testing.assert_allclose(np.sqrt(np.diag(dvl.velocity_cov[-1])), calibration.velocity_sigma_m_s)
     quiet = calibration.model_copy(update={"velocity_sigma_m_s": (1e-15, 1e-15, 1e-15)})
-    stretched = simulate_dvl(path, stamps, quiet, DvlFaults(scale_error=0.05), np.random.default_rng(0))
+    stretched = simulate_dvl(path, stamps, quiet, np.random.default_rng(0), scale_error=0.05)
     np.testing.assert_allclose(stretched.velocity, 1.05 * exact, atol=1e-12)
 
 
 def test_dvl_dropouts_leave_gaps_of_their_length_at_their_rate():
     path, stamps = still(duration_s=3600.0), regular_stamps(7, 3600)
     faulty, whole = (
-        simulate_dvl(path, stamps, DvlCalibration(), faults, np.random.default_rng(8))
-        for faults in (DvlFaults(dropouts_per_hour=60, dropout_s=5.0), DvlFaults())
+        simulate_dvl(path, stamps, DvlCalibration(), np.random.default_rng(8), **faults)
+        for faults in ({"dropouts_per_hour": 60, "dropout_s": 5.0}, {})
     )
     assert len(whole) == len(stamps)
     assert faulty.stamps_ns[[0, -1]].tolist() == stamps[[0, -1]].tolist()

@@ -25,7 +25,7 @@ from .polar_images import (
     level_R_sonar,
 )
 
-GRID = PolarGrid(RANGES_M, AZIMUTHS_RAD)
+GRID = PolarGrid.of(RANGES_M, AZIMUTHS_RAD)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ def test_a_patch_shows_what_a_search_along_rays_finds_whatever_the_order_of_beam
     view, cells_m = FloorView(rotation, HEIGHT_M), 0.015 * (np.arange(21) - 10)
     for axis, expected in enumerate(np.meshgrid(centre[0] + cells_m, centre[1] + cells_m, indexing="ij")):
         image = np.where(lit, 100 * xy[..., axis], 0).astype(np.float32)
-        turned = PolarGrid(RANGES_M, AZIMUTHS_RAD[::-1])
+        turned = PolarGrid.of(RANGES_M, AZIMUTHS_RAD[::-1])
         for patch in (GRID.patch(image, view, centre, 21, 0.015), turned.patch(image[::-1], view, centre, 21, 0.015)):
             assert (patch.seen == 1).all()
             np.testing.assert_allclose(patch.level_db / 100, expected, atol=2e-3)

@@ -134,10 +134,9 @@ SIDEWAYS = np.array([[0.0, 1.0, 0.0]])
 def _association(before: list[int], after: list[int]) -> Association:
     matrix = np.array([[float(track == old) for old in before] + [float(track not in before)] for track in after])
     n = len(after)
-    return Association(
-        0, np.array(before, int), np.array(after), matrix.reshape(n, len(before) + 1), np.zeros(n, int), np.ones(n),
-        np.tile([2.0, 0, 0], (n, 1)), np.zeros((n, 3, 3)), np.full(n, 5), np.array([], int), (),
-    )  # fmt: skip
+    tracks = np.array(after), np.tile([2.0, 0, 0], (n, 1)), np.zeros((n, 3, 3)), np.ones(n), np.full(n, 5)
+    rows, none = matrix.reshape(n, len(before) + 1), np.array([], int)
+    return Association(*tracks, 0, np.array(before, int), rows, np.zeros(n, int), none, ())
 
 
 def _after(places: list[tuple[float, float, float] | None], rule: str = "virtual-evidence", **settings: float) -> list:

@@ -222,14 +222,14 @@ def test_the_background_is_a_median_and_the_spread_the_median_of_what_is_left(no
     level[: int(shaded * nodes)] -= 40
     level = level.astype(np.float32)
     pixels = np.kron(level, np.ones((BEAMS, BINS), np.float32))
-    found = background_of(pixels, (BEAMS, BINS), (SPAN * BEAMS, SPAN * BINS))
+    level_db, spread_db = background_of(pixels, (BEAMS, BINS), (SPAN * BEAMS, SPAN * BINS))
     trend = sliding_window_view(np.pad(np.median(level, axis=0), 2, mode="reflect"), 5).mean(axis=1)
     residual = level - trend
     local = medians(np.clip(residual, -16, 127 / 8))
-    assert found.level_db == pytest.approx(local + trend, abs=1.01 * HALF_STEP_DB)
-    spread = MEDIAN_TO_SIGMA * medians(np.minimum(np.abs(residual - (found.level_db - trend)), 255 / 40))
+    assert level_db == pytest.approx(local + trend, abs=1.01 * HALF_STEP_DB)
+    spread = MEDIAN_TO_SIGMA * medians(np.minimum(np.abs(residual - (level_db - trend)), 255 / 40))
     tolerance = MEDIAN_TO_SIGMA * 1.01 * HALF_DEVIATION_STEP_DB
-    assert found.spread_db == pytest.approx(np.maximum(spread, 0.2), abs=tolerance)
+    assert spread_db == pytest.approx(np.maximum(spread, 0.2), abs=tolerance)
 
 
 PARAMS = DetectionParams()

@@ -12,7 +12,6 @@ from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
 from sonar_graph.sonar.geometry import (
     Fan,
     FloorView,
-    elevation_sigma,
     point_covariances,
     points,
     ranges_azimuths_elevations,
@@ -90,7 +89,7 @@ def test_covariance_of_a_point_is_that_of_many_samples():
     rng, R = np.random.default_rng(1), np.array([[4e-4, 2e-5], [2e-5, 1e-4]])
     ra, e = rng.multivariate_normal([2.0, 0.2], R, 200_000), rng.uniform(-0.06, 0.06, 200_000)
     sampled = np.cov(points(ra[:, 0], ra[:, 1], e).T)
-    found = point_covariances(point(2.0, 0.2), R, np.array([elevation_sigma(0.12)]))[0]
+    found = point_covariances(point(2.0, 0.2), R, np.array([0.12 / np.sqrt(12)]))[0]
     assert np.allclose(found, sampled, atol=0.02 * np.abs(sampled).max())
 
 

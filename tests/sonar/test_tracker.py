@@ -52,14 +52,14 @@ def test_the_association_is_a_distribution_and_forgets_the_order_of_candidates(c
     shuffled = [[seen[i] for i in rng.permutation(len(seen))] for seen in frames]
     pairs, numbers = list(zip(run(Tracker(), frames), run(Tracker(), shuffled), strict=True)), []
     for found, _ in pairs:
-        assert found.matrix.shape == (len(found.track_ids), len(found.previous_ids) + 1)
+        assert found.matrix.shape == (len(found.ids), len(found.previous_ids) + 1)
         assert (found.matrix >= 0).all()
         assert np.allclose(found.matrix.sum(axis=1), 1.0)
         assert ((found.existence >= 0) & (found.existence <= 1)).all()
-        goes_on = np.isin(found.track_ids, found.previous_ids)
+        goes_on = np.isin(found.ids, found.previous_ids)
         assert (found.matrix[goes_on, -1] == 0).all()  # only a track that starts can be new
         assert (found.matrix[~goes_on, -1] > 0).all()
-        numbers += found.track_ids[~goes_on].tolist()
+        numbers += found.ids[~goes_on].tolist()
         assert len(set(numbers)) == len(numbers)  # numbers are not used twice
         taken = found.candidate[found.candidate >= 0]
         assert len(np.unique(taken)) == len(taken)  # one candidate serves one track
@@ -122,7 +122,7 @@ def test_what_persists_becomes_certain_and_what_flickers_ends_with_its_reason():
     frames = [[(2.0, 0.1), (rng.uniform(1.3, 2.5), rng.uniform(-0.24, 0.0))] for _ in range(20)]
     found = run(Tracker(), frames)
     last = found[-1]
-    persistent = int(np.flatnonzero(last.track_ids == found[0].track_ids[0])[0])
+    persistent = int(np.flatnonzero(last.ids == found[0].ids[0])[0])
     assert last.existence[persistent] > 0.999
     assert last.frames_seen[persistent] == 20
     assert (np.delete(last.existence, persistent) < 0.9).all()
@@ -139,7 +139,7 @@ def test_motion_is_what_makes_a_track_persist(is_compensated):
     for k in range(6):
         r, a = polar(point)
         found = tracker.step(candidates_at([r], [a]), step if is_compensated else STILL, (k + 1) * FRAME_NS)
-        ids.append(int(found.track_ids[found.candidate >= 0][0]))
+        ids.append(int(found.ids[found.candidate >= 0][0]))
         point = step.previous_T_sonar.transformTo(point)
     assert (len(set(ids)) == 1) is is_compensated
     if is_compensated:
@@ -157,7 +157,7 @@ def test_skipped_frames_move_the_tracks_too(skipped: int):
     r, a = polar(point)
     for number, motion in ((3, step), (4, STILL)):  # the skipped motion counts once
         found = tracker.step(candidates_at([r], [a]), motion, number * FRAME_NS)
-        assert found.track_ids.tolist() == [0]
+        assert found.ids.tolist() == [0]
         assert found.position_m[0] == pytest.approx(point, abs=1e-6)
 
 
@@ -230,7 +230,7 @@ def test_what_leaves_the_image_ends_and_is_not_held_against_it():
     before = run(tracker, [[(1.4, 0.0)]] * 10)[-1]
     tracker.skip(moved_by(0.2))
     out = tracker.step(candidates_at([], []), moved_by(0.0), 20 * FRAME_NS)
-    assert out.ended_ids.tolist() == before.track_ids.tolist() or out.existence[0] > 0.99
+    assert out.ended_ids.tolist() == before.ids.tolist() or out.existence[0] > 0.99
     gone = tracker.step(candidates_at([], []), moved_by(0.3), 21 * FRAME_NS)
     assert "left the image" in out.ended_reasons + gone.ended_reasons
 

@@ -68,18 +68,7 @@ BEARINGS, DISTANCE_STEP_M = 256, 0.006
 class FrameSimulator:
     """Simulator of frames over one floor; each depends only on the sonar's pose and on the frame's number.
 
-    Parameters
-    ----------
-    options
-        Effects and their values.
-    objects
-        Objects on the floor.
-    floor_z_m
-        Height of the floor in the world.
-    seed
-        Seed of the floor, gain error, noise and drop-outs.
-    sonar
-        None: the one that the options name.
+    The seed is that of the floor, gain error, noise and drop-outs. Without a sonar it is the one that the options name.
     """
 
     def __init__(
@@ -140,14 +129,8 @@ class FrameSimulator:
     ) -> NDArray[np.uint8]:
         """Recorded image, shape (beams, bins).
 
-        Parameters
-        ----------
-        position_m, world_R_sonar
-            The sonar in the world: x along its axis, y to its left.
-        number
-            Number of the frame, the seed of its noise.
-        surface_z_m
-            Height of the water's surface; None: too far away to matter.
+        The sonar's x points along its axis, its y to the left. The frame's number is the seed of its noise.
+        ``surface_z_m`` is the height of the water's surface; None: too far away to matter.
         """
         counts = self.level_db(position_m, world_R_sonar, number, surface_z_m) * (255 / self.sonar.decibel_span)
         return np.clip(np.rint(counts), 0, 255).astype(np.uint8)
@@ -343,18 +326,7 @@ def image_along(
 ) -> Iterator[ImagedFrames]:
     """Record a frame at every ping but those that are dropped, a block at a time.
 
-    Parameters
-    ----------
-    path
-        The true path.
-    mounting
-        Mounting of the sonar.
-    pings_ns
-        Stamps of the pings, shape (n,). Frames are stamped later by the options' time offset.
-    simulator
-        Simulator of the frames.
-    frames_per_block
-        Number of frames in one block.
+    Frames are stamped later than their pings, shape (n,), by the options' time offset.
     """
     numbers = np.array([n for n in range(len(pings_ns)) if not simulator.is_dropped(n)], dtype=np.int64)
     for first in range(0, len(numbers), frames_per_block):

@@ -101,12 +101,7 @@ def place(
 ) -> SeabedObject:
     """Put a shape on the grid, at a world position and turned by a yaw (positive to the left).
 
-    Parameters
-    ----------
-    extent_m
-        Radius of its material.
-    margin_m
-        Width of the slope of the floor around it.
+    Extent is the radius of its material, margin the width of the slope of the floor around it.
     """
     radius_m = extent_m + margin_m
     first = np.floor((position_m[:2] - radius_m) / CELL_M).astype(int) - 1
