@@ -214,7 +214,7 @@ class Sightings:
         return Seen(rows, ids, [L(max(i, 0)) for i in ids], [is_tracked[row] for row in rows], z, cov)
 
     def _view(self, motion: PreintegratedMotion, landmark_keys: list[int]) -> PredictedView:
-        key, bias_key = self.keyframes.newest_key, self.keyframes.newest_bias_key
+        key, bias_key = self.keyframes.newest_key, self.keyframes.bias_key(-1)
         keys = [key, *landmark_keys] if bias_key is None else [key, bias_key, *landmark_keys]
         return PredictedView(
             pose_key=key,

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -49,17 +49,6 @@ def without_unsound(frame: LandmarkDetections, journal: DetectionJournal) -> Lan
     for landmark_id in frame.most_probable()[0][~is_sound].tolist():
         journal.record(int(frame.stamps_ns[0]), landmark_id, Outcome.UNSOUND)
     return frame.rows(is_sound) if is_sound.any() else None
-
-
-def sound_velocities(dvl: Dvl) -> Flags:
-    """Rows with a sound covariance, shape (n,). An infinite variance is sound: that axis was not measured."""
-    return positive_definite(in_numbers(dvl.velocity_cov, np.eye(3)))
-
-
-def sound_depths(depth: Depth) -> Flags:
-    """Rows with a sound variance, shape (n,)."""
-    variance = np.where(np.isnan(depth.variance_m2), 1.0, depth.variance_m2)
-    return (variance > 0) & np.isfinite(variance)
 
 
 @compiled
@@ -103,14 +92,6 @@ class KeyframeParams(Section):
     share of the sonar's variance. 0: at every frame with a landmark."""
     bias_interval_s: float = Field(60.0, gt=0)
     """Time between two gyro bias variables in the graph; the bias is constant from one to the next."""
-
-
-class Carried(NamedTuple):
-    """Motion by which depth samples are carried to a keyframe."""
-
-    start_ns: int
-    steps: Steps
-    motion: PreintegratedMotion
 
 
 @dataclass
@@ -162,10 +143,11 @@ class Keyframes:
 
     def add(self, imu: Imu | None, dvl: Dvl | None, depth: Depth | None) -> None:
         """Take in rows; refuse unsound ones, and depths older than those that wait."""
-        if dvl is not None:
-            dvl = self._sound("dvl", dvl, sound_velocities(dvl))
+        if dvl is not None:  # an infinite variance is sound: that axis was not measured
+            dvl = self._sound("dvl", dvl, positive_definite(in_numbers(dvl.velocity_cov, np.eye(3))))
         if depth is not None:
-            depth = self._sound("depth", depth, sound_depths(depth))
+            variance = np.where(np.isnan(depth.variance_m2), 1.0, depth.variance_m2)
+            depth = self._sound("depth", depth, (variance > 0) & np.isfinite(variance))
         if self.odometry.add(imu, dvl):
             self._running = None
         self._latest = None
@@ -252,13 +234,8 @@ class Keyframes:
         return self.smoother.values.atPoint3(self.bias_keys[index]) if self._estimates_bias else np.zeros(3)
 
     def bias_key(self, index: int) -> int | None:
-        """Key of the bias that holds from a keyframe on; None when there is none to estimate."""
+        """Key of the bias that holds from a keyframe on, -1 the newest; None when there is none to estimate."""
         return self.bias_keys[index] if self._estimates_bias else None
-
-    @property
-    def newest_bias_key(self) -> int | None:
-        """Key of the bias that holds since the newest keyframe; None when there is none to estimate."""
-        return self.bias_key(len(self.stamps_ns) - 1)
 
     def _earth_rate(self) -> Floats | None:
         if self._earth is None:
@@ -267,31 +244,25 @@ class Keyframes:
 
     def _set(self, node_ns: int) -> None:
         i, j = len(self.stamps_ns) - 1, len(self.stamps_ns)
-        motion, carried = self._motion_to(node_ns)
+        start_ns, bias, earth_rate = self.stamps_ns[-1], self.bias(i), self._earth_rate()
+        gaps = self.odometry.gaps(start_ns, node_ns)
+        since_ns = gaps[-1][1] - CARRIED_IN_GAP_NS if gaps else start_ns  # depth samples are carried over no gap
+        steps = self.odometry.steps_to_node(since_ns, node_ns)
+        motion = carried = self._preintegrator.integrate(steps, bias, earth_rate)
+        if gaps:
+            motion = motion_between_nodes(self.odometry, self._preintegrator, start_ns, node_ns, bias, earth_rate)
         self.smoother.add_pose(X(j), self.smoother.values.atPose3(X(i)).compose(motion.i_T_j), node_ns * S_PER_NS)
         if self._estimates_bias:
             between = factors.odometry_with_bias(X(i), X(j), self.bias_keys[i], motion)
         else:
             between = factors.odometry(X(i), X(j), motion)
         self.smoother.add([between, *self._gravity(j, node_ns, motion)])
-        self.smoother.add(self._depth(j, node_ns, carried))
+        self.smoother.add(self._depth(j, node_ns, since_ns, steps, carried))
         self.bias_keys.append(self._next_bias_key(i, node_ns))
         self.stamps_ns.append(node_ns)
         self._running = self._latest = None
         self._constrain(j)
         self.odometry.forget_before(node_ns)
-
-    def _motion_to(self, node_ns: int) -> tuple[PreintegratedMotion, Carried]:
-        """From the newest keyframe to an epoch, and how depth samples reach it: not over a gap of the Doppler log."""
-        start_ns, bias, earth_rate = self.stamps_ns[-1], self.bias(len(self.stamps_ns) - 1), self._earth_rate()
-        gaps = self.odometry.gaps(start_ns, node_ns)
-        since_ns = gaps[-1][1] - CARRIED_IN_GAP_NS if gaps else start_ns
-        steps = self.odometry.steps_to_node(since_ns, node_ns)
-        motion = self._preintegrator.integrate(steps, bias, earth_rate)
-        carried = Carried(since_ns, steps, motion)
-        if gaps:
-            motion = motion_between_nodes(self.odometry, self._preintegrator, start_ns, node_ns, bias, earth_rate)
-        return motion, carried
 
     def _gravity(self, j: int, node_ns: int, motion: PreintegratedMotion) -> list[gtsam.NonlinearFactor]:
         if not self.calibration.use_gravity:
@@ -304,9 +275,10 @@ class Keyframes:
         up = gravity_direction(motion, at_i, at_j, sigma, imu, self.calibration.gravity_m_s2)
         return [factors.gravity_direction(X(j), *up)] if up else []
 
-    def _depth(self, j: int, node_ns: int, carried: Carried) -> list[gtsam.NonlinearFactor]:
-        """One factor for the samples since the last keyframe, carried to this one and averaged there."""
-        start_ns, steps, motion = carried
+    def _depth(
+        self, j: int, node_ns: int, start_ns: int, steps: Steps, motion: PreintegratedMotion
+    ) -> list[gtsam.NonlinearFactor]:
+        """One factor for the samples since an instant, carried by the motion to this keyframe and averaged there."""
         if not self._depths:
             return []
         waiting = Depth.concatenate(self._depths)

@@ -93,30 +93,23 @@ DECIDED = 1e-3
 """Weights so near to 0 and 1 end it."""
 
 
-def truncated_weights(r2: Floats, c2: Floats, mu: float) -> Floats:
-    """Weights of squared errors r2 truncated at c2, shape (n,) each."""
-    with np.errstate(divide="ignore"):
-        between = np.sqrt(c2 * mu * (mu + 1.0) / r2) - mu
-    return np.where(r2 <= mu / (mu + 1.0) * c2, 1.0, np.where(r2 >= (mu + 1.0) / mu * c2, 0.0, between))
-
-
-def first_mu(r2: Floats, c2: Floats) -> float:
-    """At which (1) is nearly convex: the largest error is still weighed."""
-    worst = float((r2 / c2).max(initial=0.0))
-    return 1.0 / (2.0 * worst - 1.0) if worst > 1.0 else np.inf
-
-
 def graduated_weights(
     weighted: Callable[[Floats], gtsam.NonlinearFactorGraph],
     squared_errors: Callable[[gtsam.Values], Floats],
     c2: Floats,
     values: gtsam.Values,
 ) -> tuple[gtsam.Values, Floats]:
-    """Solution of (1), and the weight of each object, shape (n,): 0 or 1, or nearly."""
-    mu = first_mu(squared_errors(values), c2)
-    weights = np.ones(len(c2))
+    """Solution of (1), and the weight of each object, shape (n,): 0 or 1, or nearly.
+
+    At the first mu (1) is nearly convex: the largest error is still weighed.
+    """
+    worst = float((squared_errors(values) / c2).max(initial=0.0))
+    mu, weights = 1.0 / (2.0 * worst - 1.0) if worst > 1.0 else np.inf, np.ones(len(c2))
     for _ in range(MOST_GRADES if np.isfinite(mu) else 0):
-        weights = truncated_weights(squared_errors(values), c2, mu)
+        r2 = squared_errors(values)
+        with np.errstate(divide="ignore"):
+            between = np.sqrt(c2 * mu * (mu + 1.0) / r2) - mu
+        weights = np.where(r2 <= mu / (mu + 1.0) * c2, 1.0, np.where(r2 >= (mu + 1.0) / mu * c2, 0.0, between))
         values = solve(weighted(weights), values, STEPS_EACH)
         if ((weights < DECIDED) | (weights > 1.0 - DECIDED)).all():
             break

@@ -72,12 +72,17 @@ class SightingFactors:
     def make(self, sighting: Sighting, key: int, *, is_first: bool) -> list[gtsam.NonlinearFactor]:
         """Range and azimuth; the first sighting of a landmark also says what is known of its height and direction."""
         elevation = None if sighting.floor or not is_first else self.elevation_sigma_rad
-        made = self._measured(sighting, key, elevation)
+        made = self.measured(sighting, key, elevation)
         return [*made, *(self._placed(sighting, key) if is_first else [])]
 
-    def measured(self, sighting: Sighting, key: int) -> list[gtsam.NoiseModelFactor]:
-        """Range and azimuth alone."""
-        return self._measured(sighting, key, None)
+    def measured(
+        self, sighting: Sighting, key: int, elevation_sigma_rad: float | None = None
+    ) -> list[gtsam.NoiseModelFactor]:
+        """Range and azimuth, and elevation where it has a sigma."""
+        line = sighting.line
+        return factors.landmark_sighting(
+            line.pose_key, key, line.body_T_sonar, line.z, sighting.noise, self._robust, elevation_sigma_rad
+        )
 
     def beginning(self, sighting: Sighting, key: int) -> list[gtsam.NonlinearFactor]:
         """Factors of a landmark's first sighting besides range and azimuth, with the same kernel."""
@@ -88,14 +93,6 @@ class SightingFactors:
             line.pose_key, key, line.body_T_sonar, float(line.z[1]), self.elevation_sigma_rad, self._robust
         )
         return [elevation, *self._placed(sighting, key)]
-
-    def _measured(
-        self, sighting: Sighting, key: int, elevation_sigma_rad: float | None
-    ) -> list[gtsam.NoiseModelFactor]:
-        line = sighting.line
-        return factors.landmark_sighting(
-            line.pose_key, key, line.body_T_sonar, line.z, sighting.noise, self._robust, elevation_sigma_rad
-        )
 
     def _placed(self, sighting: Sighting, key: int) -> list[gtsam.NonlinearFactor]:
         """Factors on the place and the floor of a landmark, added once."""

@@ -19,7 +19,6 @@ apart by about that, and P does not know it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Annotated, Literal, NamedTuple
 
@@ -139,11 +138,8 @@ def refuse_taken_ids(frame: LandmarkDetections) -> None:
         )
 
 
-@dataclass(eq=False)
-class Candidate:
-    """Sightings that may be of one landmark, in the order of time."""
-
-    sightings: list[Sighting] = field(default_factory=list)
+Candidate = list[Sighting]
+"""Sightings that may be of one landmark, in the order of time."""
 
 
 class PairedDetection(NamedTuple):
@@ -178,7 +174,7 @@ class AnonymousLandmarks:
 
     def keys(self) -> list[int]:
         """Keys whose joint covariance pairing needs: all landmarks, and keyframes that saw candidates."""
-        seen_from = [candidate.sightings[-1].line.pose_key for candidate in self._candidates]
+        seen_from = [candidate[-1].line.pose_key for candidate in self._candidates]
         return [*(L(i) for i in sorted(self._landmarks.ids)), *sorted(set(seen_from))]
 
     def pair(self, view: PredictedView, z: Floats, noise: Floats, taken: set[int]) -> list[PairedDetection]:
@@ -195,7 +191,7 @@ class AnonymousLandmarks:
         ids = sorted(self._landmarks.ids - taken)
         keys = [L(i) for i in ids]
         points = np.array([values.atPoint3(key) for key in keys])
-        sources = [source(candidate.sightings[-1], values, self._maker) for candidate in self._candidates]
+        sources = [source(candidate[-1], values, self._maker) for candidate in self._candidates]
         if not keys and not sources:
             return [PairedDetection(None, None)] * len(z)
         expected, cov = view.expect_jointly(keys, points, sources)
@@ -221,21 +217,21 @@ class AnonymousLandmarks:
                 sighting.outcome = Outcome.USED
                 continue
             if candidate is None:
-                candidate = Candidate()
+                candidate = []
                 self._candidates.append(candidate)
-            candidate.sightings.append(sighting)
-            if len(candidate.sightings) < self._policy.sightings:
+            candidate.append(sighting)
+            if len(candidate) < self._policy.sightings:
                 continue
-            _, cov = place(candidate.sightings, self._smoother.values, self._maker)
+            _, cov = place(candidate, self._smoother.values, self._maker)
             if not np.linalg.eigvalsh(cov)[-1] <= (LARGEST_SIGMA_SHARE * sighting.line.z[0]) ** 2:
                 continue
             landmark_id, self._next_id = self._next_id, self._next_id + 1
             self._candidates.remove(candidate)
-            for earlier in candidate.sightings[:-1]:
+            for earlier in candidate[:-1]:
                 earlier.outcome = Outcome.PLACED_LATER
                 self._journal.amend(earlier.row, earlier.outcome, landmark_id)
             sighting.outcome = Outcome.NEW  # its row comes with the frame
-            self._landmarks.exchange([], [(each, landmark_id) for each in candidate.sightings], time_s)
+            self._landmarks.exchange([], [(each, landmark_id) for each in candidate], time_s)
 
     def merge(self, covariance: JointCovariance, time_s: float) -> None:
         """Give the sightings of one landmark to another that is the same, if there are two such.
@@ -257,12 +253,12 @@ class AnonymousLandmarks:
     def forget(self, oldest_pose_key: int) -> None:
         """Forget sightings on keyframes older than one."""
         for candidate in self._candidates:
-            for sighting in candidate.sightings:
+            for sighting in candidate:
                 if sighting.line.pose_key < oldest_pose_key:
                     sighting.outcome = Outcome.FORGOTTEN
                     self._journal.amend(sighting.row, sighting.outcome)
-            candidate.sightings = [s for s in candidate.sightings if s.outcome is Outcome.WAITING]
-        self._candidates = [candidate for candidate in self._candidates if candidate.sightings]
+            candidate[:] = [sighting for sighting in candidate if sighting.outcome is Outcome.WAITING]
+        self._candidates = [candidate for candidate in self._candidates if candidate]
 
 
 def _choose(

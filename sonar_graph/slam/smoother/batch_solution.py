@@ -203,13 +203,13 @@ class JointCovariance:
         rows, n = {}, 0
         for key in keys:
             rows[key] = n
-            n += _size(key)
+            n += tangent_size(key)
         return cls(marginals.jointMarginalCovariance(keys).fullMatrix(), rows)
 
     def at(self, a: int, b: int) -> Floats:
         """The block of two variables."""
         i, j = self.rows[a], self.rows[b]
-        return self.matrix[i : i + _size(a), j : j + _size(b)]
+        return self.matrix[i : i + tangent_size(a), j : j + tangent_size(b)]
 
 
 class KeptCovariance:
@@ -239,5 +239,6 @@ class KeptCovariance:
         self._joint, self._asked, self._asked_before = None, set(), self._asked.intersection(lasting)
 
 
-def _size(key: int) -> int:
+def tangent_size(key: int) -> int:
+    """Dimension of a variable: 6 of a pose, 3 of a point."""
     return 6 if gtsam.symbolChr(key) == ord("x") else 3

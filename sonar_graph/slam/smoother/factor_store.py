@@ -110,15 +110,6 @@ class Recent:
             self.changes += 1
 
 
-def rest_of(history: History | Recent, handles: set[int]) -> gtsam.NonlinearFactorGraph:
-    """All factors but those of some handles."""
-    gone, graph, rest = {history.factor(handle) for handle in handles}, history.graph, gtsam.NonlinearFactorGraph()
-    for i in range(graph.size()):
-        if graph.at(i) not in gone:
-            rest.push_back(graph.at(i))
-    return rest
-
-
 @dataclass(frozen=True, eq=False)
 class GraphEdit:
     """Exchange of factors for others."""
@@ -154,13 +145,10 @@ class Pending:
         self.graph.add(factor)
         self.handles.append(handle)
 
-    def on(self, key: int) -> list[int]:
-        """Handles of the factors on a variable."""
-        return [handle for i, handle in enumerate(self.handles) if key in list(self.graph.at(i).keys())]
-
-    def factor(self, handle: int) -> gtsam.NonlinearFactor:
-        """The factor of a handle."""
-        return self.graph.at(self.handles.index(handle))
+    def on(self, key: int) -> dict[int, gtsam.NonlinearFactor]:
+        """The factors on a variable, by handle."""
+        pairs = zip(self.handles, self.factors, strict=True)
+        return {handle: factor for handle, factor in pairs if key in list(factor.keys())}
 
     def drop(self, handles: set[int], keys: set[int]) -> None:
         """Take factors and variables out again."""

@@ -7,7 +7,7 @@ once Cholesky has given up the window stays with QR (docs/theory/isam2.md).
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from typing import Any
 
 import gtsam
@@ -36,21 +36,6 @@ def marginal(
     separator = [key for key in linear.keyVector() if key in kept]
     found = linear.marginal(separator, gtsam.EliminateQR) if is_by_qr else linear.marginal(separator)
     return [gtsam.LinearContainerFactor(found.at(i), values) for i in range(found.size())]
-
-
-def joined_with_marginal(
-    inside: gtsam.NonlinearFactorGraph,
-    outside: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    kept: Container[int],
-    *,
-    is_by_qr: bool,
-) -> gtsam.NonlinearFactorGraph:
-    """A graph, with what another says about the kept variables."""
-    graph = gtsam.NonlinearFactorGraph(inside)
-    for factor in marginal(outside, values, kept, is_by_qr=is_by_qr):
-        graph.push_back(factor)
-    return graph
 
 
 def _copy(source: gtsam.Values, key: int, target: gtsam.Values) -> None:
@@ -128,19 +113,7 @@ class SmootherWindow:
 
     def begin(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times_s: Mapping[Any, float]) -> None:
         """Begin anew with nothing but these factors and variables; by QR where it is needed, else a RuntimeError."""
-        try:
-            self._begin_once(graph, values, times_s)
-        except RuntimeError:
-            if self.is_by_qr:
-                raise
-            self.is_by_qr = True
-            self._begin_once(graph, values, times_s)
-
-    def _begin_once(
-        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, times_s: Mapping[Any, float]
-    ) -> None:
-        self.isam = self._empty()
-        self.isam.update(graph, values, times_s)
+        self._begin(lambda: graph, values, times_s)
 
     def begin_after(
         self,
@@ -154,15 +127,27 @@ class SmootherWindow:
 
         A RuntimeError where even QR finds no solution.
         """
-        if not self.is_by_qr:
-            try:
-                graph = joined_with_marginal(inside, outside, solved, times_s, is_by_qr=False)
-                self._begin_once(graph, values, times_s)
-            except RuntimeError:
-                self.is_by_qr = True  # a marginal by Cholesky may also have lost what is weak without a word
-            else:
-                return
-        self._begin_once(joined_with_marginal(inside, outside, solved, times_s, is_by_qr=True), values, times_s)
+
+        def joined_with_marginal() -> gtsam.NonlinearFactorGraph:
+            """By QR made anew: a marginal by Cholesky may also have lost what is weak without a word."""
+            graph = gtsam.NonlinearFactorGraph(inside)
+            for factor in marginal(outside, solved, times_s, is_by_qr=self.is_by_qr):
+                graph.push_back(factor)
+            return graph
+
+        self._begin(joined_with_marginal, values, times_s)
+
+    def _begin(
+        self, make: Callable[[], gtsam.NonlinearFactorGraph], values: gtsam.Values, times_s: Mapping[Any, float]
+    ) -> None:
+        try:
+            graph, self.isam = make(), self._empty()
+            self.isam.update(graph, values, times_s)
+        except RuntimeError:
+            if self.is_by_qr:
+                raise
+            self.is_by_qr = True
+            self._begin(make, values, times_s)
 
     def update(
         self,

@@ -34,7 +34,7 @@ from sonar_graph.slam.smoother.batch_solution import (
     marginals_of,
     solve_in_sight,
 )
-from sonar_graph.slam.smoother.factor_store import GraphEdit, History, Pending, Recent, rest_of
+from sonar_graph.slam.smoother.factor_store import GraphEdit, History, Pending, Recent
 from sonar_graph.slam.smoother.fixed_lag import SmootherWindow, joined, keys_of, picked, split, without
 from sonar_graph.slam.smoother.observability import Withheld, culprits, reasons, spoilt, undetermined, variable_name
 
@@ -217,8 +217,16 @@ class Smoother:
             self.values.erase(key)
 
     def graph_without(self, handles: set[int]) -> gtsam.NonlinearFactorGraph:
-        """Every factor of the run but some."""
-        return rest_of(self._history, handles)
+        """Every factor of the run but those of some handles."""
+        gone, graph, rest = (
+            {self._history.factor(handle) for handle in handles},
+            self.graph,
+            gtsam.NonlinearFactorGraph(),
+        )
+        for i in range(graph.size()):
+            if graph.at(i) not in gone:
+                rest.push_back(graph.at(i))
+        return rest
 
     def settle(self, time_s: float) -> None:
         """Gauss-Newton steps until nothing would be relinearised any more, ten at most."""

@@ -19,6 +19,7 @@ import numpy as np
 
 from sonar_graph.errors import EstimatorError
 from sonar_graph.measurements import Floats
+from sonar_graph.slam.smoother.batch_solution import tangent_size
 from sonar_graph.slam.smoother.factor_store import Pending
 from sonar_graph.slam.smoother.fixed_lag import keys_of
 
@@ -87,8 +88,8 @@ def left_open(
     """
     places, size = {}, 0
     for key in keys:
-        places[key] = slice(size, size + _size(key))
-        size += _size(key)
+        places[key] = slice(size, size + tangent_size(key))
+        size += tangent_size(key)
     if not size:
         return []
     A = np.vstack([np.zeros((1, size)), *(_rows(graph.at(i), values, places, least_said) for i in range(graph.size()))])
@@ -118,8 +119,8 @@ def _rows(factor: gtsam.NonlinearFactor, values: gtsam.Values, places: dict[int,
     rows, column = np.zeros((len(A), size)), 0
     for key in list(linear.keys()):
         if key in places:
-            rows[:, places[key]] += A[:, column : column + _size(key)]
-        column += _size(key)
+            rows[:, places[key]] += A[:, column : column + tangent_size(key)]
+        column += tangent_size(key)
     return rows[np.linalg.norm(A, axis=1) >= least_said]
 
 
@@ -147,10 +148,6 @@ def factor_names(factors: Iterable[gtsam.NonlinearFactor]) -> str:
         custom = "odometry" if kinds[:2] == ["x", "x"] else "range and azimuth"
         counts[custom if name == "CustomFactor" else KINDS.get(name, name)] += 1
     return ", ".join(f"{count} {kind}" for kind, count in counts.items()) or "no factor"
-
-
-def _size(key: int) -> int:
-    return 6 if gtsam.symbolChr(key) == ord("x") else 3
 
 
 MISSING = {
@@ -242,9 +239,8 @@ def _placed(key: int, factors: list[gtsam.NonlinearFactor], times_s: dict[int, f
 
 
 def _without(open_: Open, pending: Pending, times_s: dict[int, float]) -> Withheld:
-    handles = pending.on(open_.key)
-    factors = [pending.factor(handle) for handle in handles]
-    return Withheld(set(handles), {open_.key}, f"{explained(open_, factors, times_s)}; withheld")
+    new = pending.on(open_.key)
+    return Withheld(set(new), {open_.key}, f"{explained(open_, list(new.values()), times_s)}; withheld")
 
 
 def _on(key: int, graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactor]:
