@@ -128,10 +128,7 @@ def in_the_basin(
 def counted_solves(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Sizes of the graphs that the smoother solves from now on."""
     sizes: list[int] = []
-
-    def counting(graph, values):
-        sizes.append(graph.size())
-        return solve(graph, values)
-
-    monkeypatch.setattr(batch_solution, "solve", counting)
+    monkeypatch.setattr(
+        batch_solution, "solve", lambda graph, values: sizes.append(graph.size()) or solve(graph, values)
+    )
     return sizes

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from sonar_graph.measurements import Floats
 from sonar_graph.sequence import Sequence
 from sonar_graph.slam import Isam2
 from sonar_graph.states import Outcome
@@ -28,20 +27,14 @@ OBJECTS = np.array([[4.0, 0.8, -1.4], [5.0, 0.2, -1.6], [4.5, 1.6, -1.5]])
 GAP_S = 0.7
 
 
-def believing(sequence: Sequence, id_probability: Floats) -> Sequence:
-    assert sequence.detections is not None
-    return replace(sequence, detections=replace(sequence.detections, id_probability=id_probability))
-
-
 def from_the_start(sequence: Sequence) -> Sequence:
     """The same, had each track's last belief been its first."""
     seen = sequence.detections
-    assert seen is not None
     beliefs = seen.id_probability.copy()
     for number in set(seen.track.tolist()) - {-1}:
         rows = np.flatnonzero(seen.track == number)
         beliefs[rows] = beliefs[rows[-1]]
-    return believing(sequence, beliefs)
+    return replace(sequence, detections=replace(seen, id_probability=beliefs))
 
 
 def run(sequence: Sequence, rate_hz: float = 2.0, **params) -> Isam2:
@@ -51,7 +44,6 @@ def run(sequence: Sequence, rate_hz: float = 2.0, **params) -> Isam2:
 def assert_outcomes_account(estimator: Isam2, sequence: Sequence) -> Counter:
     """One row a detection, in order."""
     log = estimator.detections()
-    assert sequence.detections is not None
     assert log.stamps_ns.tolist() == sequence.detections.stamps_ns.tolist()
     return Counter(log.outcomes)
 
@@ -60,7 +52,6 @@ def on_the_rail(beliefs_of_7: list[list[float]], beliefs_of_4: list[float]) -> S
     """One track a landmark; what is believed of 7 in its first, second, ... frame, the last for the rest."""
     sequence, _ = rail()
     seen = sequence.detections
-    assert seen is not None
     track = np.where(seen.candidate_ids[:, 0] == 7, 70, 40)
     beliefs = np.tile(np.array(beliefs_of_4), (len(seen), 1))
     for n, row in enumerate(np.flatnonzero(track == 70)):

@@ -6,6 +6,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+import pytest
 from gtsam.symbol_shorthand import B, L, X
 from numpy.typing import ArrayLike
 
@@ -105,6 +106,14 @@ def some_motion(seed: int = 0, sigma: float = 0.01) -> PreintegratedMotion:
     i_T_j = gtsam.Pose3.Expmap(np.concatenate([0.3 * rng.standard_normal(3), 0.5 * rng.standard_normal(3)]))
     D_bias, bias = rng.standard_normal((6, 3)), 0.01 * rng.standard_normal(3)
     return motion_of(i_T_j, random_covariance(6, sigma, seed + 1), D_bias, bias)
+
+
+def counted(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str) -> list[tuple]:
+    """Arguments of each call of a function or method from now on."""
+    calls: list[tuple] = []
+    original = getattr(owner, name)
+    monkeypatch.setattr(owner, name, lambda *given: calls.append(given) or original(*given))
+    return calls
 
 
 def detected(

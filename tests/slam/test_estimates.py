@@ -168,7 +168,6 @@ def test_settings_are_of_their_own_type(params: object):
 
 def test_names_of_landmarks_without_names_are_refused_where_these_begin():
     sequence, _ = rail(8)
-    assert sequence.detections is not None
     ids = np.where(sequence.detections.candidate_ids == 4, FIRST_ANONYMOUS_ID, 7)
     named = replace(sequence, detections=replace(sequence.detections, candidate_ids=ids))
     with pytest.raises(EstimatorError, match=rf"has identity {FIRST_ANONYMOUS_ID}; with identity.unknown.policy = "):
@@ -181,7 +180,6 @@ def test_names_of_landmarks_without_names_are_refused_where_these_begin():
 def test_a_range_beyond_any_sonar_is_refused_by_name_and_the_run_is_that_without_it(policy: str, range_m: float):
     sequence, _ = rail(8)
     seen = sequence.detections
-    assert seen is not None
     far = seen.range_m.copy()
     far[3] = range_m
     estimator = run(replace(sequence, detections=replace(seen, range_m=far)), 1 / STEP_S, identity__policy=policy)

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from sonar_graph.slam.smoother import fixed_lag
 from sonar_graph.slam.smoother.factor_store import GraphEdit, History, Recent
 from sonar_graph.slam.smoother.fixed_lag import SmootherWindow, marginal, picked
-from sonar_graph.slam.smoother.incremental import Smoother
 
 from .graphs import factors_of
 from .made import graph_of, isotropic, point_prior, pose_prior, smoother_with, values_of
@@ -37,19 +36,6 @@ def test_by_qr_a_marginal_has_the_sum_of_a_weak_chains_variances_which_cholesky_
     information, lost = (found.linearize(values).augmentedInformation()[:3, :3] for found in (by_qr, by_cholesky))
     assert np.linalg.inv(information) == pytest.approx((PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2) * np.eye(3), rel=1e-9)
     assert not lost.any()
-
-
-def begun_anew(tight_m: float) -> Smoother:
-    """Three keyframes like the chain; a factor on the first, which has left, is exchanged for its like."""
-    smoother = smoother_with(lag_s=0.5, relinearize_threshold=1e-6, stale_shift_m=1e9)
-    handles = []
-    for k, sigma in enumerate([PRIOR_M, tight_m, WEAK_M]):
-        smoother.add_pose(X(k), gtsam.Pose3(), float(k))
-        handles += smoother.add([factor(k, sigma)])
-        if k:
-            smoother.update(float(k))
-    smoother.exchange(GraphEdit([handles[0]], [[factor(0, PRIOR_M)]], {}, []), 2.0)
-    return smoother
 
 
 def factor(k: int, sigma: float) -> gtsam.NonlinearFactor:
@@ -99,6 +85,7 @@ def test_a_window_that_cholesky_cannot_begin_has_what_its_marginal_had_lost(is_b
 
 
 def test_where_cholesky_gives_up_on_the_marginal_qr_makes_it(monkeypatch: pytest.MonkeyPatch):
+    """Three keyframes like the chain; a factor on the first, which has left, is exchanged for its like."""
     ways = []
 
     def giving_up(*arguments, is_by_qr: bool):
@@ -108,7 +95,13 @@ def test_where_cholesky_gives_up_on_the_marginal_qr_makes_it(monkeypatch: pytest
         return marginal(*arguments, is_by_qr=True)
 
     monkeypatch.setattr(fixed_lag, "marginal", giving_up)
-    smoother = begun_anew(0.1)
+    smoother, handles = smoother_with(lag_s=0.5), []
+    for k, sigma in enumerate([PRIOR_M, 0.1, WEAK_M]):
+        smoother.add_pose(X(k), gtsam.Pose3(), float(k))
+        handles += smoother.add([factor(k, sigma)])
+        if k:
+            smoother.update(float(k))
+    smoother.exchange(GraphEdit([handles[0]], [[factor(0, PRIOR_M)]], {}, []), 2.0)
     assert ways == [False, True]
     assert smoother.covariance(X(2)) == pytest.approx((PRIOR_M**2 + 0.1**2 + WEAK_M**2) * np.eye(6), rel=1e-6)
     assert not smoother.withheld

@@ -1,4 +1,4 @@
-"""The estimator against its batch solution, on the basin, on MRCLAM and on faulty streams."""
+"""The estimator against its batch solution, on the basin, on MRCLAM and on faulty streams; its settings."""
 
 from dataclasses import replace
 from functools import cache, partial
@@ -11,13 +11,16 @@ import pytest
 from gtsam.symbol_shorthand import L
 from scipy.stats import chi2
 
-from sonar_graph.errors import CalibrationError
+from sonar_graph.errors import CalibrationError, EstimatorError
+from sonar_graph.estimator import make_params
 from sonar_graph.evaluation.consistency import normalised_squares
 from sonar_graph.logs.convert.mrclam import read_mrclam
-from sonar_graph.measurements import Depth, Dvl, Floats, Imu, LandmarkDetections, Measurements
+from sonar_graph.measurements import Floats, LandmarkDetections, Measurements
 from sonar_graph.sequence import NS_PER_S, Sequence
+from sonar_graph.settings import nested, settings_of
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
-from sonar_graph.slam import Isam2
+from sonar_graph.slam import Isam2, Isam2Params
+from sonar_graph.slam.isam2 import OLD_NAMES
 from sonar_graph.states import Estimate, Outcome
 from sonar_graph.testing import check_consistent, laws
 from sonar_graph.testing.drives import misnamed_world, small_world, still_world
@@ -43,51 +46,8 @@ def same(one: Estimate, other: Estimate) -> bool:
 
 def until(sequence: Sequence, end_ns: int) -> Sequence:
     """The log, had it been cut off there."""
-    return replace(
-        sequence,
-        imu=sequence.imu.between(0, end_ns),
-        dvl=sequence.dvl.between(0, end_ns),
-        depth=sequence.depth.between(0, end_ns) if sequence.depth else None,
-        detections=sequence.detections.between(0, end_ns) if sequence.detections else None,
-    )
-
-
-# At rest ------------------------------------------------------------------------------------------------------------
-
-
-def noisy(sequence: Sequence, seed: int) -> Sequence:
-    """The same with the noise that its calibration states."""
-    rng, c = np.random.default_rng(seed), sequence.calibration
-    imu_hz = NS_PER_S / np.diff(sequence.imu.stamps_ns)[0]
-
-    def scatter(values: Floats, sigma) -> Floats:
-        return values + sigma * rng.standard_normal(values.shape)
-
-    rate = scatter(sequence.imu.angular_velocity, c.imu.gyro_noise_density * np.sqrt(imu_hz))
-    force = scatter(sequence.imu.specific_force, c.imu.accel_noise_density * np.sqrt(imu_hz))
-    velocity = scatter(sequence.dvl.velocity, np.array(c.dvl.velocity_sigma_m_s))
-    return replace(
-        sequence,
-        imu=Imu(sequence.imu.stamps_ns, rate, force),
-        dvl=Dvl(sequence.dvl.stamps_ns, velocity, sequence.dvl.velocity_cov),
-        depth=Depth(sequence.depth.stamps_ns, scatter(sequence.depth.z_m, c.depth.sigma_m), sequence.depth.variance_m2),
-    )
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_still_vehicle_with_noise_stays_within_its_doubt(seed):
-    """A velocity of 1 cm/s at 5 Hz wanders by 1 cm/s x sqrt(0.2 s x 60 s) on each axis, and the filter knows it."""
-    sequence = noisy(still_world(), seed)
-    start = sequence.calibration.start.pose()
-    _, estimates = ran(sequence)
-    for estimate in estimates:
-        off = gtsam.Pose3.Logmap(start.between(estimate.world_T_body))
-        assert np.linalg.norm(off[:3]) < 0.01
-        assert off @ np.linalg.solve(estimate.covariance, off) < chi2.ppf(0.9999, 6)
-    R = estimates[-1].world_T_body.rotation().matrix()
-    sigmas = np.sqrt(np.diag(R @ estimates[-1].covariance[3:, 3:] @ R.T))
-    assert sigmas[:2] == pytest.approx([0.01 * np.sqrt(0.2 * 60)] * 2, rel=0.03)
-    assert sigmas[2] < 0.01
+    blocks = {name: getattr(sequence, name) for name in ("imu", "dvl", "depth", "detections")}
+    return replace(sequence, **{name: rows.between(0, end_ns) for name, rows in blocks.items() if rows is not None})
 
 
 # Against batch ------------------------------------------------------------------------------------------------------
@@ -170,19 +130,6 @@ def test_motion_and_depth_that_arrive_early_are_not_used_early():
         assert same(expected, early.process(Measurements(step.end_ns, *blocks, step.detections)))
 
 
-def test_every_detection_has_one_row_in_the_order_of_frames(basin):
-    estimator, _ = ran(basin)
-    log = estimator.detections()
-    seen = basin.detections.between(0, int(log.stamps_ns[-1]))
-    assert np.array_equal(log.stamps_ns, seen.stamps_ns)
-    rows = list(zip(log.stamps_ns.tolist(), log.landmark_ids.tolist(), strict=True))
-    assert sorted(rows) == sorted(zip(seen.stamps_ns.tolist(), seen.most_probable()[0].tolist(), strict=True))
-    counts = {outcome: log.outcomes.count(outcome) for outcome in set(log.outcomes)}
-    assert counts[Outcome.NEW] == 4
-    assert counts[Outcome.USED] > 0.8 * len(log)
-    assert counts.get(Outcome.NO_IDENTITY, 0) == int(np.sum(seen.most_probable()[1] < 0.7))
-
-
 def test_refused_detections_leave_everything_as_it_is():
     sequence = small_world()
     rows = sequence.detections
@@ -193,34 +140,26 @@ def test_refused_detections_leave_everything_as_it_is():
     assert all(same(a, b) for a, b in zip(refused, plain, strict=True))
 
 
-def test_a_detection_far_off_is_gated_and_changes_nothing():
-    sequence = small_world()
-    last = sequence.detections.rows(slice(len(sequence.detections) - 1, None))
-    ghost = replace(
-        last,
-        stamps_ns=last.stamps_ns + NS_PER_S // 10,
-        range_m=last.range_m + 2.0,
-        id_probability=last.id_probability * 0 + 1,
-    )
-    more = replace(sequence, detections=LandmarkDetections.concatenate([sequence.detections, ghost]))
-    gated = {"identity__policy": "gate", "identity__gate_probability": 0.999}
-    (haunted, ends), (plain, expected) = ran(more, **gated), ran(sequence, **gated)
-    assert haunted.detections().outcomes[-1] is Outcome.GATED
-    assert np.abs(gtsam.Pose3.Logmap(ends[-1].world_T_body.between(expected[-1].world_T_body))).max() < 1e-3
-    assert len(haunted.detections()) == len(plain.detections()) + 1
-
-
 # Consistency --------------------------------------------------------------------------------------------------------
 
 
 def position_nees(sequence: Sequence, estimates: list[Estimate]) -> Floats:
     truth = sequence.truth.at(np.array([e.stamp_ns for e in estimates]))
     off = np.array([e.world_T_body.translation() for e in estimates]) - truth.positions
-    covs = []
-    for e in estimates:
-        R = e.world_T_body.rotation().matrix()
-        covs.append(R @ e.covariance[3:, 3:] @ R.T)
+    rotations = [e.world_T_body.rotation().matrix() for e in estimates]
+    covs = [R @ e.covariance[3:, 3:] @ R.T for R, e in zip(rotations, estimates, strict=True)]
     return normalised_squares(off, np.array(covs))
+
+
+def test_a_vehicle_stays_within_its_doubt_which_at_rest_is_the_random_walk_of_the_log():
+    """A velocity of 1 cm/s at 5 Hz wanders by 1 cm/s x sqrt(0.2 s x 60 s) on each axis; depth holds the height."""
+    world = small_world()
+    assert position_nees(world, ran(world)[1]).max() < chi2.ppf(0.9999, 3)
+    last = ran(still_world())[1][-1]
+    R = last.world_T_body.rotation().matrix()
+    sigmas = np.sqrt(np.diag(R @ last.covariance[3:, 3:] @ R.T))
+    assert sigmas[:2] == pytest.approx([0.01 * np.sqrt(0.2 * 60)] * 2, rel=0.03)
+    assert sigmas[2] < 0.01
 
 
 @pytest.mark.slow
@@ -296,36 +235,30 @@ def basin_of_first_sightings() -> Sequence:
     return simulate_basin(BasinOptions(seed=2, duration_s=130.0, laps=1))
 
 
-def sightings_of(landmark: int) -> tuple[LandmarkDetections, list[int]]:
-    detections = basin_of_first_sightings().detections
-    assert detections is not None
-    ids, posterior = detections.most_probable()
-    return detections, np.flatnonzero((ids == landmark) & (posterior > 0.7)).tolist()
+def sightings_of(landmark: int) -> list[int]:
+    ids, posterior = basin_of_first_sightings().detections.most_probable()
+    return np.flatnonzero((ids == landmark) & (posterior > 0.7)).tolist()
 
 
 def named_wrongly() -> LandmarkDetections:
     """One sighting of the landmark before, called by the name of one that has not been seen yet."""
-    detections, rows = sightings_of(BEFORE)
+    detections, row = basin_of_first_sightings().detections, sightings_of(BEFORE)[5]
     ids = detections.candidate_ids.copy()
-    row = ids[rows[5]]
-    ids[rows[5]] = np.select([row == BEFORE, row == LANDMARK], [LANDMARK, BEFORE], row)
+    ids[row] = np.select([ids[row] == BEFORE, ids[row] == LANDMARK], [LANDMARK, BEFORE], ids[row])
     return replace(detections, candidate_ids=ids)
 
 
 def ranged_wrongly(by_m: float) -> LandmarkDetections:
     """The first of the landmark's sightings is too long."""
-    detections, rows = sightings_of(LANDMARK)
-    range_m = detections.range_m.copy()
-    range_m[rows[0]] += by_m
-    return replace(detections, range_m=range_m)
+    detections = basin_of_first_sightings().detections
+    is_first = np.arange(len(detections)) == sightings_of(LANDMARK)[0]
+    return replace(detections, range_m=detections.range_m + by_m * is_first)
 
 
 def error_and_sigma_m(detections: LandmarkDetections, **settings: str) -> tuple[float, float]:
     """Of the landmark at the end: how far it is from where it lies, horizontally, and what is said of that."""
     sequence = replace(basin_of_first_sightings(), detections=detections)
-    estimator, _ = ran(sequence, 1.0, **settings)
-    found, true = estimator.landmarks(), sequence.true_landmarks
-    assert true is not None
+    found, true = ran(sequence, 1.0, **settings)[0].landmarks(), sequence.true_landmarks
     at, truly = int(np.argmax(found.ids == LANDMARK)), int(np.argmax(true.ids == LANDMARK))
     offset = (found.positions[at] - true.positions[truly])[:2]
     return float(np.linalg.norm(offset)), float(np.sqrt(np.trace(found.covariances[at][:2, :2])))
@@ -341,7 +274,7 @@ def test_a_whole_history_takes_a_wrong_first_identity_back_and_a_bounded_one_kee
 
 def test_the_kernel_outvotes_a_first_range_that_is_wrong_by_a_metre_but_not_by_three():
     """Although twenty-two right sightings follow: what they say has no pull so far away."""
-    assert len(sightings_of(LANDMARK)[1]) == 23
+    assert len(sightings_of(LANDMARK)) == 23
     assert error_and_sigma_m(ranged_wrongly(1.0))[0] < 0.05
     error_m, sigma_m = error_and_sigma_m(ranged_wrongly(3.0))
     assert error_m == pytest.approx(2.6, abs=0.2)
@@ -357,3 +290,71 @@ def test_answers_that_differ_in_one_bit_are_unlike() -> None:
     assert unlike(one, other) == ["trajectory()", "landmarks()", "detections()"]
     del other.estimates[-1]
     assert "causal estimates" in unlike(one, other)
+
+
+# Settings ------------------------------------------------------------------------------------------------------------
+
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "gate without its policy": (
+        {"identity.gate_probability": 0.9},
+        'identity.gate_probability: there is no such field with policy = "robust"; identity.policy = "gate" has it',
+    ),
+    "mixture without its policy": ({"identity.view_range_m": 5.0}, 'policy = "max-mixture" or "gnc" has it'),
+    "unknown landmarks in a mixture": (
+        {"identity.policy": "gnc", "identity.unknown.policy": "associate"},
+        'identity.unknown: there is no such field with policy = "gnc"; identity.policy = "robust" or "gate" has it',
+    ),
+    "association without its policy": ({"identity.unknown.sightings": 3}, 'identity.unknown.policy = "associate" has'),
+    "belief in a mixture": ({"identity.policy": "max-mixture", "identity.minimum_probability": 0.9}, '"gate" has it'),
+    "memory of a whole history": ({"history.remembered_s": 30.0}, 'history.policy = "bounded" has it'),
+    "width of no kernel": ({"kernel.shape": "none", "kernel.width": 2.0}, 'kernel.shape = "huber" or "cauchy" has it'),
+    "mixture in a bounded history": (
+        {"identity.policy": "max-mixture", "history.policy": "bounded"},
+        'history.policy = "bounded" cannot be with identity.policy = "max-mixture", which chooses anew in the whole',
+    ),
+    "gnc in a bounded history": ({"identity.policy": "gnc", "history.policy": "bounded"}, 'policy = "gnc", which'),
+    "no such policy": ({"identity.policy": "gcn"}, "identity.policy: there is no 'gcn'; there are: robust, gate, max-"),
+    "a policy for its section": ({"identity": "gnc"}, 'identity: expected a section with policy = "gnc"'),
+    "no such section": ({"smother.lag_s": 3}, "smother: there is no such field; did you mean smoother?"),
+    "no such setting": ({"smoother.lag": 3}, "smoother.lag: there is no such field; did you mean lag_s? smoother has"),
+    "out of range": ({"identity.policy": "gate", "identity.gate_probability": 2}, "identity.gate_probability: Input"),
+}
+
+
+@pytest.mark.parametrize(("given", "fault"), REFUSED.values(), ids=REFUSED)
+def test_what_a_policy_does_not_read_is_refused_by_name(given: dict[str, Any], fault: str) -> None:
+    with pytest.raises(EstimatorError) as refused:
+        make_params(Isam2, nested(given), "isam2")
+    assert fault in str(refused.value)
+
+
+@pytest.mark.parametrize("old", OLD_NAMES)
+def test_an_old_name_says_the_new_one(old: str) -> None:
+    with pytest.raises(EstimatorError) as refused:
+        make_params(Isam2, {old: "x"}, "isam2")
+    new = OLD_NAMES[old]
+    assert str(refused.value) == f"settings of isam2: {old} is now {new}"
+    assert new.split(",")[0] in {setting.name for setting in settings_of(Isam2Params)}
+
+
+def test_a_section_keeps_its_default_policy_where_none_is_given() -> None:
+    params = Isam2Params(**nested({"identity.longest_wait_s": 3.0, "kernel.width": 2.0}))
+    assert params.identity.policy == "robust"
+    assert params.identity.longest_wait_s == 3.0
+    assert params.model_dump()["kernel"] == {"shape": "cauchy", "width": 2.0}
+    assert Isam2Params(**params.model_dump(mode="json")) == params
+
+
+def test_the_listing_has_every_setting_once_with_its_policy() -> None:
+    listed = {setting.name: setting for setting in settings_of(Isam2Params)}
+    assert len(listed) == len(settings_of(Isam2Params)) == 23
+    assert listed["smoother.lag_s"].default == 15.0
+    assert listed["identity.policy"].default == "robust"
+    assert listed["identity.gate_probability"].meaning.endswith('Only with policy = "gate".')
+    assert listed["identity.minimum_probability"].meaning.endswith('Only with policy = "robust" or "gate".')
+
+
+def test_settings_are_given_by_dotted_names_or_nested() -> None:
+    given: list[dict[str, object]] = [{"identity.policy": "gate"}, {"identity": {"policy": "gate"}}]
+    first, second = (make_params(Isam2, values, "isam2") for values in given)
+    assert first == second != Isam2.Params()

@@ -15,6 +15,7 @@ from sonar_graph.calibration import (
     DvlCalibration,
     ImuCalibration,
     Mounting,
+    PlanarMotion,
     SonarCalibration,
     Start,
 )
@@ -22,7 +23,6 @@ from sonar_graph.measurements import Depth, Dvl, Imu
 from sonar_graph.navigation.alignment.gravity import earth_rate_in_world
 from sonar_graph.navigation.preintegration.motion import PreintegratedMotion
 from sonar_graph.slam.keyframes import KeyframeParams, Keyframes, positive_definite
-from sonar_graph.slam.models import factors
 
 from .graphs import factors_of
 from .made import smoother_with
@@ -57,13 +57,17 @@ def keyframes_of(calibration: Calibration, policy: KeyframeParams = POLICY) -> K
     return Keyframes(calibration, policy, smoother_with(1e9, 0.01, 1e9))
 
 
-def driven(calibration: Calibration, until_s: float, depth: Depth | None = None, **motion) -> Keyframes:
+def driven(
+    calibration: Calibration,
+    until_s: float,
+    depth: Depth | None = None,
+    *,
+    rate=(0.0, 0.0, 0.0),
+    velocity=(0.5, 0.0, 0.0),
+    imu: Imu | None = None,
+) -> Keyframes:
     keyframes = keyframes_of(calibration)
-    keyframes.add(
-        level_imu(until_s, motion.get("rate", (0, 0, 0))),
-        steady_dvl(until_s, motion.get("velocity", (0.5, 0, 0))),
-        depth,
-    )
+    keyframes.add(imu or level_imu(until_s, rate), steady_dvl(until_s, velocity), depth)
     keyframes.advance(int(at(until_s)[0]))
     return keyframes
 
@@ -72,16 +76,21 @@ def factors_on(keyframes: Keyframes, kind: type, key: int) -> list[gtsam.Nonline
     return [f for f in factors_of(keyframes.smoother.graph) if isinstance(f, kind) and list(f.keys()) == [key]]
 
 
-def error_of(keyframes: Keyframes, kind: type) -> np.ndarray:
-    """Of the only factor of a kind on the second keyframe."""
+def factor_of(keyframes: Keyframes, kind: type) -> gtsam.NonlinearFactor:
+    """The only factor of a kind on the second keyframe."""
     (factor,) = factors_on(keyframes, kind, X(1))
-    return factor.unwhitenedError(keyframes.smoother.values)
+    return factor
+
+
+def error_of(keyframes: Keyframes, kind: type) -> np.ndarray:
+    return factor_of(keyframes, kind).unwhitenedError(keyframes.smoother.values)
 
 
 def test_one_is_set_at_the_first_node_after_the_longest_interval():
     keyframes = driven(Calibration(imu=NO_BIAS), 5.0)
     assert seconds(keyframes) == [0.0, 2.0, 4.0]
-    assert keyframes.newest_key == X(2)
+    assert keyframes.newest_key == keyframes.oldest_key(1.9) == X(2)
+    assert keyframes.oldest_key(2.0) == X(1)
     assert keyframes.newest_s == pytest.approx(T0_NS * 1e-9 + 4.0)
 
 
@@ -117,17 +126,11 @@ def test_a_frame_brings_one_once_the_motion_blurs_it_by_the_share(blurred_s, exp
 
 @pytest.mark.parametrize(
     ("density", "bias_sigma", "azimuth_sigma_rad", "expected"),
-    [
-        (0.1, 0.0, 0.20, [0.0, 0.4]),
-        (0.1, 0.0, 0.22, [0.0]),
-        (1e-12, 0.1, 0.1, [0.0, 0.4]),
-        (1e-12, 0.0, 0.1, [0.0]),
-    ],
-    ids=["noise", "noise under the share", "unknown bias", "known bias"],
+    [(0.1, 0.0, 0.20, [0.0, 0.4]), (0.1, 0.0, 0.22, [0.0]), (1e-12, 0.1, 0.1, [0.0, 0.4]), (1e-12, 0.1, 0.15, [0.0])],
+    ids=["noise", "noise under the share", "bias", "bias under the share"],
 )
 def test_the_turn_by_noise_or_unknown_bias_is_compared_with_azimuth(density, bias_sigma, azimuth_sigma_rad, expected):
-    """Gyro noise of 0.1 rad/s/sqrt(Hz): 0.0045 rad^2 after 0.45 s, a tenth of (0.21 rad)^2; a bias of 0.1 rad/s:
-    (0.045 rad)^2."""
+    """Noise of 0.1 rad/s/sqrt(Hz): 0.0045 rad^2 after 0.45 s, a tenth of (0.21 rad)^2; of a bias (0.045 rad)^2."""
     keyframes = noisy_keyframes(
         0.1,
         imu=ImuCalibration(gyro_noise_density=density, gyro_bias_sigma=bias_sigma),
@@ -145,56 +148,45 @@ def test_with_no_share_every_frame_brings_one_if_a_node_was_reached_since():
     assert seconds(keyframes) == pytest.approx([0.0, 0.2, 0.4, 1.0])
 
 
-def test_the_smoother_waits_with_sightings_and_not_with_keyframes():
-    keyframes = keyframes_of(Calibration(imu=NO_BIAS))
-    keyframes.smoother = smoother_with(1e9, 0.01, 1e9, 1.0)
-    keyframes.add(level_imu(4.0), steady_dvl(4.0), None)
-    keyframes.advance(int(at(1.0)[0]))
-    keyframes.update_if_due()
-    before = keyframes.smoother.covariance(X(0))
-    keyframes.smoother.add([factors.depth(X(0), 0.0, np.zeros(3), 1e-5)])
-    keyframes.smoother.waiting_gain = 0.9
-    keyframes.update_if_due()
-    assert np.array_equal(keyframes.smoother.covariance(X(0)), before)
-    keyframes.advance(int(at(2.0)[0]))
-    keyframes.update_if_due()
-    assert keyframes.smoother.covariance(X(0))[5, 5] < 0.1 * before[5, 5]
-
-
-def test_every_keyframe_has_its_odometry_and_gravity():
-    calibration = Calibration(imu=NO_BIAS)
-    keyframes = driven(calibration, 6.0)
+def test_every_keyframe_has_its_odometry_and_gravity_and_is_held_on_a_plane():
+    keyframes = driven(Calibration(imu=NO_BIAS), 6.0)
     graph = keyframes.smoother.graph
     assert graph.size() == 1 + 3 * 2
-    for k in range(1, 4):
-        assert len(factors_on(keyframes, gtsam.MagPoseFactorPose3, X(k))) == 1
+    assert [len(factors_on(keyframes, gtsam.MagPoseFactorPose3, X(k))) for k in range(4)] == [0, 1, 1, 1]
     assert [list(graph.at(k).keys()) for k in (1, 3, 5)] == [[X(0), X(1)], [X(1), X(2)], [X(2), X(3)]]
-    without = driven(calibration.model_copy(update={"use_gravity": False}), 6.0)
-    assert without.smoother.graph.size() == 1 + 3
-
-
-def gravity_error(calibration: Calibration, imu: Imu, velocity=(0.5, 0.0, 0.0)) -> float:
-    """Largest of the direction of gravity at the second keyframe, after 2 s."""
-    keyframes = keyframes_of(calibration)
-    keyframes.add(imu, steady_dvl(2.0, velocity), None)
-    keyframes.advance(int(at(2.0)[0]))
-    return np.abs(error_of(keyframes, gtsam.MagPoseFactorPose3)).max()
+    without = Calibration(imu=NO_BIAS, use_gravity=False)
+    assert driven(without, 6.0).smoother.graph.size() == 1 + 3
+    keyframes = driven(without.model_copy(update={"planar": PlanarMotion()}), 6.0)
+    for kind in (gtsam.MagPoseFactorPose3, gtsam.GPSFactorArm):
+        assert [len(factors_on(keyframes, kind, X(k))) for k in range(4)] == [1, 1, 1, 1]
 
 
 def test_gravity_tells_the_tilt_of_a_tilted_vehicle():
     start, imu = Start(rpy_rad=(0.1, -0.2, 0.5)), level_imu(2.0)
     up_in_body = Rotation.from_euler("xyz", start.rpy_rad).inv().apply([0, 0, G])
     felt = replace(imu, specific_force=np.tile(up_in_body, (len(imu), 1)))
-    assert gravity_error(Calibration(imu=NO_BIAS, start=start), felt) < 1e-9
+    keyframes = driven(Calibration(imu=NO_BIAS, start=start), 2.0, imu=felt)
+    assert np.abs(error_of(keyframes, gtsam.MagPoseFactorPose3)).max() < 1e-9
+
+
+def test_the_direction_of_gravity_is_as_doubtful_as_the_velocities_at_both_ends():
+    """Beside what the IMU adds: the change of a velocity that is known to sigma at either end, over 2 s and g."""
+    sigmas = np.array([0.1, 0.2])
+    logs = [DvlCalibration(velocity_sigma_m_s=(sigma,) * 3) for sigma in sigmas.tolist()]
+    factors = [factor_of(driven(Calibration(imu=NO_BIAS, dvl=log), 2.0), gtsam.MagPoseFactorPose3) for log in logs]
+    variances = [factor.noiseModel().sigma() ** 2 for factor in factors]
+    assert np.diff(variances) == pytest.approx(2 * np.diff(sigmas**2) / (2.0 * G) ** 2, rel=1e-3)
 
 
 def test_velocity_is_taken_to_the_imu_before_gravity_is():
     """A vehicle that begins to turn accelerates an IMU off its centre: without the lever arm up would seem to lean."""
     arm, alpha = 2.0, 0.05
     calibration = Calibration(imu=NO_BIAS.model_copy(update={"mounting": Mounting(translation_m=(arm, 0, 0))}))
-    stamps, t = at(*(np.arange(41) / 20)), np.arange(41) / 20
+    t = np.arange(41) / 20
     force = np.column_stack([-((alpha * t) ** 2) * arm, np.full(41, alpha * arm), np.full(41, G)])
-    assert gravity_error(calibration, Imu(stamps, np.outer(alpha * t, [0, 0, 1.0]), force), (0, 0, 0)) < 2e-5
+    felt = Imu(at(*t), np.outer(alpha * t, [0, 0, 1.0]), force)
+    keyframes = driven(calibration, 2.0, velocity=(0, 0, 0), imu=felt)
+    assert np.abs(error_of(keyframes, gtsam.MagPoseFactorPose3)).max() < 2e-5
     assert alpha * arm / G > 1e-2
 
 
@@ -205,11 +197,10 @@ def test_depths_since_the_last_keyframe_become_one_factor_at_their_weighted_mean
     when = np.array([0.5, 1.1, 1.9])
     depth = Depth(at(*when), -0.1 * when + port[2] + 0.01, variance)
     keyframes = driven(calibration, 2.0, depth, velocity=(0.0, 0.0, -0.1))
-    (factor,) = factors_on(keyframes, gtsam.GPSFactorArm, X(1))
     sigma = (1 / 1e-4 + 1 / 4e-4 + 1 / 9e-4) ** -0.5
     assert keyframes.smoother.values.atPose3(X(1)).translation()[2] == pytest.approx(-0.2)
     assert error_of(keyframes, gtsam.GPSFactorArm)[2] == pytest.approx(-0.01, abs=1e-9)
-    assert factor.noiseModel().sigmas()[2] == pytest.approx(sigma)
+    assert factor_of(keyframes, gtsam.GPSFactorArm).noiseModel().sigmas()[2] == pytest.approx(sigma)
 
 
 def test_a_depth_carried_far_by_a_noisy_log_is_worth_less():
@@ -218,8 +209,8 @@ def test_a_depth_carried_far_by_a_noisy_log_is_worth_less():
     for pitch, carried in ((0.0, 0.0), (-np.pi / 2, 0.2**2 * 0.2 * 1.5)):
         calibration = Calibration(imu=NO_BIAS, dvl=dvl, start=Start(rpy_rad=(0, pitch, 0)), use_gravity=False)
         keyframes = driven(calibration, 2.0, Depth(at(0.5), np.zeros(1), np.full(1, 1e-4)))
-        (factor,) = factors_on(keyframes, gtsam.GPSFactorArm, X(1))
-        assert factor.noiseModel().sigmas()[2] ** 2 == pytest.approx(1e-4 + carried, rel=1e-3)
+        sigma = factor_of(keyframes, gtsam.GPSFactorArm).noiseModel().sigmas()[2]
+        assert sigma**2 == pytest.approx(1e-4 + carried, rel=1e-3)
 
 
 def test_the_bias_walks_between_stretches():
@@ -241,13 +232,12 @@ def test_a_vehicle_that_turns_with_the_earth_stays_where_it_heads():
     start = Start(rpy_rad=(0.2, -0.1, -1.6))
     calibration = Calibration(imu=NO_BIAS, start=start, earth_rate_latitude_rad=0.63, use_gravity=False)
     felt = start.pose().rotation().matrix().T @ earth_rate_in_world(calibration)
-    kept = driven(calibration, 60.0, rate=felt, velocity=(0, 0, 0)).smoother.values.atPose3(X(30))
-    assert start.pose().between(kept).equals(gtsam.Pose3(), 1e-7)
     unaware = calibration.model_copy(update={"earth_rate_latitude_rad": None})
-    drifted = driven(unaware, 60.0, rate=felt, velocity=(0, 0, 0)).smoother.values.atPose3(X(30))
-    assert np.linalg.norm(gtsam.Rot3.Logmap(start.pose().rotation().between(drifted.rotation()))) == pytest.approx(
-        60 * 7.292115e-5, rel=1e-3
-    )
+    at_rest = [driven(given, 60.0, rate=felt, velocity=(0, 0, 0)) for given in (calibration, unaware)]
+    kept, drifted = (start.pose().between(each.smoother.values.atPose3(X(30))) for each in at_rest)
+    assert kept.equals(gtsam.Pose3(), 1e-7)
+    turned_rad = np.linalg.norm(gtsam.Rot3.Logmap(drifted.rotation()))
+    assert turned_rad == pytest.approx(60 * 7.292115e-5, rel=1e-3)
 
 
 def test_depths_that_come_late_are_passed_over():
@@ -260,37 +250,37 @@ def test_depths_that_come_late_are_passed_over():
         for t in when:
             keyframes.add(None, None, Depth(at(t), np.full(1, -t), np.full(1, 1e-4)))
         keyframes.advance(int(at(2.0)[0]))
-        (factor,) = factors_on(keyframes, gtsam.GPSFactorArm, X(1))
-        return factor
+        return factor_of(keyframes, gtsam.GPSFactorArm)
 
     in_order, again, more = depth_factor(0.3, 0.9), depth_factor(0.3, 0.9, 0.9, 0.6), depth_factor(0.3, 0.6, 0.9)
     assert in_order.equals(again, 1e-12)
     assert not in_order.equals(more, 1e-3)
 
 
-def test_rows_that_come_between_two_questions_about_one_instant_count():
+@pytest.mark.parametrize(("until_s", "late_s"), [(0.8, 1.0), (1.2, 0.7)], ids=["in order", "before others"])
+def test_rows_that_come_between_two_questions_about_one_instant_count(until_s: float, late_s: float):
     """A live feed delivers a Doppler row late, after the motion to that instant was already asked for."""
-    until, calibration = int(at(1.0)[0]), Calibration(imu=NO_BIAS, dvl=EXACT_DVL)
-    late = Dvl(at(1.0), np.array([[0.6, 0.0, 0.0]]), np.full((1, 3, 3), np.nan))
+    calibration = Calibration(imu=NO_BIAS, dvl=EXACT_DVL)
     asked_twice, at_once = keyframes_of(calibration), keyframes_of(calibration)
     for keyframes in (asked_twice, at_once):
-        keyframes.add(level_imu(2.0), steady_dvl(0.8), None)
+        keyframes.add(level_imu(2.0), steady_dvl(until_s), None)
         keyframes.advance(int(at(0.2)[0]))
-    before = asked_twice.motion_since_newest(until)
+    instants = int(at(1.0)[0]), int(at(1.2)[0])
+    before = [asked_twice.motion_since_newest(instant) for instant in instants]
     for keyframes in (asked_twice, at_once):
-        keyframes.add(None, late, None)
-    after, expected = asked_twice.motion_since_newest(until), at_once.motion_since_newest(until)
-    assert after.i_T_j.equals(expected.i_T_j, 1e-12)
-    assert not after.i_T_j.equals(before.i_T_j, 1e-3)
+        keyframes.add(None, Dvl(at(late_s), np.array([[0.6, 0.0, 0.0]]), np.full((1, 3, 3), np.nan)), None)
+    after, expected = (each.motion_since_newest(instants[1]).i_T_j for each in (asked_twice, at_once))
+    assert after.equals(expected, 1e-12)
+    assert not after.equals(before[1].i_T_j, 1e-3)
 
 
 GAPS_S = ((2.0, 6.0), (7.0, 10.0))
 
 
-def keyframes_over_gaps() -> Keyframes:
-    """Straight on at 0.5 m/s for twelve seconds, without bottom lock twice; no keyframe but the first is due."""
+def keyframes_over_gaps(max_interval_s: float = 1e3) -> Keyframes:
+    """Straight on at 0.5 m/s for twelve seconds, without bottom lock twice."""
     dvl = DvlCalibration(velocity_sigma_m_s=(0.01, 0.01, 0.01), gap_s=0.3)
-    never = KeyframeParams(max_interval_s=1e3, motion_noise_share=1e9, bias_interval_s=10.0)
+    never = KeyframeParams(max_interval_s=max_interval_s, motion_noise_share=1e9, bias_interval_s=10.0)
     keyframes = keyframes_of(Calibration(imu=NO_BIAS, dvl=dvl), never)
     velocity = steady_dvl(12.0)
     s = (velocity.stamps_ns - T0_NS) / NS
@@ -336,6 +326,19 @@ def test_frames_between_gaps_tell_all(at_s: list[float], told: list[float]):
     keyframes = keyframes_over_gaps()
     assert shares(keyframes, at_s) == pytest.approx(told)
     assert len(keyframes.stamps_ns) == 1
+
+
+@pytest.mark.parametrize(("depth_s", "count"), [(1.5, 0), (5.6, 0), (6.0, 1)])
+def test_over_a_gap_a_keyframe_has_the_motion_that_frames_have_and_only_depths_near_the_end(depth_s, count):
+    keyframes = keyframes_over_gaps(5.0)
+    keyframes.add(None, None, Depth(at(depth_s), np.zeros(1), np.full(1, 1e-4)))
+    keyframes.advance(int(at(5.9)[0]))
+    motion = keyframes.motion_since_newest(int(at(6.2)[0]))
+    keyframes.advance(int(at(6.3)[0]))
+    assert seconds(keyframes) == [0.0, 6.2]
+    (between,) = (f for f in factors_of(keyframes.smoother.graph) if isinstance(f, gtsam.BetweenFactorPose3))
+    np.testing.assert_allclose(between.noiseModel().covariance(), motion.covariance, rtol=1e-6, atol=1e-15)
+    assert len(factors_on(keyframes, gtsam.GPSFactorArm, X(1))) == count
 
 
 @pytest.mark.parametrize("k", [2, 3])

@@ -13,7 +13,7 @@ from sonar_graph.measurements import Floats
 from sonar_graph.slam import GaussianKernel, RobustKernel
 from sonar_graph.slam.landmarks import mixture
 from sonar_graph.slam.landmarks.association import IdentityPosterior, RecogniserErrors
-from sonar_graph.slam.landmarks.mixture import REPEATED_LOSS, Choices, Errors, Mixture, TrackedObject
+from sonar_graph.slam.landmarks.mixture import REPEATED_LOSS, Errors, Mixture, TrackedObject
 from sonar_graph.slam.landmarks.sighting import Sighting
 from sonar_graph.slam.models import Kernel, factors
 from sonar_graph.slam.smoother.batch_solution import Sightline
@@ -196,17 +196,6 @@ def test_a_landmark_that_one_watch_has_put_where_it_is_has_no_place_for_it(is_al
 # Choices ------------------------------------------------------------------------------------------------------------
 
 
-def component(values: gtsam.Values, seen: TrackedObject, i: int | None) -> float:
-    named, none = log_weights(seen.statement.probability, 0 if i is None else i)
-    return none + of_nothing(seen) if i is None else named + log_density(values, seen, PLACES[i])
-
-
-def is_possible(watches: list[TrackedObject], choices: Choices) -> bool:
-    """No landmark is twice in a frame."""
-    frames = [(i, k) for seen, i in zip(watches, choices, strict=True) if i is not None for k in seen.stamps_ns]
-    return len(set(frames)) == len(frames)
-
-
 @pytest.mark.parametrize("seed", range(8))
 def test_the_best_choices_are_the_most_probable_of_all(seed: int) -> None:
     """Five watches of three landmarks or of something else, half of them misnamed, two of them in the same frames."""
@@ -217,12 +206,16 @@ def test_the_best_choices_are_the_most_probable_of_all(seed: int) -> None:
         said = {int(rng.choice(list(PLACES))): float(rng.choice([0.4, 0.9]))}
         watches.append(watch(values, place, frames, rng.standard_normal((len(frames), 2)), said))
     found = MIXTURE.best(watches, values, [None] * 5, dict.fromkeys(PLACES, 9))
-    table = [{i: component(values, seen, i) for i in (*PLACES, None)} for seen in watches]
-    total = {
-        choices: sum(row[i] for row, i in zip(table, choices, strict=True))
-        for choices in product([*PLACES, None], repeat=5)
-        if is_possible(watches, list(choices))
-    }
+    table: list[dict[int | None, float]] = []
+    for seen in watches:
+        weights = {i: log_weights(seen.statement.probability, i) for i in PLACES}
+        placed = {i: named + log_density(values, seen, PLACES[i]) for i, (named, _) in weights.items()}
+        table.append(placed | {None: weights[7][1] + of_nothing(seen)})
+    total = {}
+    for choices in product([*PLACES, None], repeat=5):
+        frames = [(i, k) for seen, i in zip(watches, choices, strict=True) if i is not None for k in seen.stamps_ns]
+        if len(set(frames)) == len(frames):  # no landmark is twice in a frame
+            total[choices] = sum(row[i] for row, i in zip(table, choices, strict=True))
     best, second = sorted(total, key=total.__getitem__, reverse=True)[:2]
     assert tuple(found) == best
     assert total[best] > total[second] + 1e-3

@@ -63,14 +63,6 @@ def named(k: int, place: int, said: int, values: gtsam.Values) -> TrackedObject:
     return found
 
 
-def small_rival(watches: list[TrackedObject]) -> tuple[RivalHistory, gtsam.Values]:
-    """Poses that are known to a centimetre, and no landmark yet."""
-    poses = [small.world().atPose3(X(k)) for k in range(6)]
-    rest = graph_of(pose_prior(X(k), pose, 0.01) for k, pose in enumerate(poses))
-    values = values_of(**{f"X{k}": pose for k, pose in enumerate(poses)})
-    return RivalHistory(rest, watches, small.MIXTURE, MAKER), values
-
-
 def cost_of(rival: RivalHistory, values: gtsam.Values, choices: Choices) -> float:
     """The error of the graph that was chosen, and logarithms of densities and weights; by scipy."""
     found, sizes = rival._chosen_graph(choices).error(values), rival._sizes(choices)
@@ -95,7 +87,10 @@ def test_the_choices_that_settle_are_the_cheapest_of_all(said: list[int]) -> Non
     """Three sightings of each of two landmarks, from nothing: each begins with one, and gets the others then."""
     places = [7, 4, 7, 4, 7, 4]
     watches = [named(k, place, name, small.world()) for k, (place, name) in enumerate(zip(places, said, strict=True))]
-    rival, start = small_rival(watches)
+    poses = [small.world().atPose3(X(k)) for k in range(6)]
+    known = graph_of(pose_prior(X(k), pose, 0.01) for k, pose in enumerate(poses))
+    start = values_of(**{f"X{k}": pose for k, pose in enumerate(poses)})
+    rival = RivalHistory(known, watches, small.MIXTURE, MAKER)
     values, choices = rival.settled(start, [None] * 6, is_graduated=False)
     assert choices == places
     assert rival.cost(values, choices) == pytest.approx(cost_of(rival, values, choices), abs=0.05)

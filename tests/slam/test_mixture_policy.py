@@ -183,13 +183,6 @@ def test_many_sightings_of_another_object_do_not_prove_it_to_be_a_landmark(
     assert MIXTURE.best([seen], values, [None], {7: 50}) == [7], "as if each sighting were anywhere"
 
 
-def test_a_late_name_brings_all_sightings_of_its_track() -> None:
-    world, rng = dive("max-mixture"), np.random.default_rng(2)
-    for k, name in enumerate([-1, -1, -1, 7, 7], start=1):
-        watch(world, 0.3 * k, {7: name}, rng, track=2)
-    assert world.outcomes == [Outcome.USED_LATER] * 3 + [Outcome.NEW, Outcome.USED]
-
-
 def test_a_landmark_that_alone_was_named_wrongly_gets_its_name_with_all_sightings() -> None:
     """A landmark 4 that nothing else was seen of becomes 9 when its track is named so."""
     world, rng = dive("max-mixture"), np.random.default_rng(2)

@@ -38,7 +38,7 @@ from .late_identities import (
     run,
     see,
 )
-from .made import detected, ran, smoother_with
+from .made import counted, detected, ran, smoother_with
 from .rail import STEP_S, rail
 
 NEARLY_4 = [0.9, 0.0, 0.0, 0.0]
@@ -207,16 +207,13 @@ def test_of_tracks_that_claim_a_landmark_at_once_the_more_probable_gets_the_earl
     dive = Watch(identity=UNGATED)
     dive.watch(0, [FLAT, FLAT, FLAT])
     dive.watch(1, [[0.0, 0.8, 0.0, 0.0], SURE[5], FLAT])
-    repeated, later = Outcome.REPEATED, Outcome.USED_LATER
-    assert dive.outcomes == [repeated, later, Outcome.WAITING, repeated, Outcome.USED, Outcome.WAITING]
+    assert dive.outcomes == [Outcome.REPEATED, USED_LATER, WAITING, Outcome.REPEATED, USED, WAITING]
 
 
 def test_a_landmark_may_begin_late_while_what_waits_makes_the_window_restart(monkeypatch):
     monkeypatch.setattr(smoother_module, "FIRST_RESTART", 5)
     dive = Dive(smoother=smoother_with(1e9, 1e-6, 1e-9, waiting_gain=1e9))
-    restarts = []
-    restart = Smoother._restart
-    monkeypatch.setattr(Smoother, "_restart", lambda self, time_s: restarts.append(time_s) or restart(self, time_s))
+    restarts = counted(monkeypatch, Smoother, "_restart")
     for after_s in (0.0, 0.2, 0.4):
         see(dive, after_s, SURE[4])
         see(dive, after_s + 0.1, FLAT, track=5, off_m=0.3)
@@ -228,9 +225,7 @@ def test_a_landmark_may_begin_late_while_what_waits_makes_the_window_restart(mon
 
 def test_while_sightings_wait_the_window_stays_open_for_them(monkeypatch):
     """Late factors then cost no solution of the history; of a track that is of no landmark they may."""
-    solves = []
-    solve = Smoother._solve
-    monkeypatch.setattr(Smoother, "_solve", lambda self: solves.append(1) or solve(self))
+    solves = counted(monkeypatch, Smoother, "_solve")
     for beliefs, expected in (([FLAT] * 9, 0), ([FLAT] * 2 + [[0.0] * 4] * 7, 1)):
         dive = Dive(lag_s=0.5)
         solves.clear()
@@ -255,12 +250,9 @@ BELIEFS_OF_REPEATED_TRACKS = [*SURE.values(), FLAT, [0.0] * 4, [0.0, 0.9, 0.0, 0
 
 
 def said(tracks: list[int], beliefs: list[list[float]]) -> Sequence:
-    sequence, _ = rail(NODES)
-    seen = sequence.detections
-    assert seen is not None
-    ids = np.tile(IDS, (len(seen), 1))
-    found = replace(seen, track=np.array(tracks), candidate_ids=ids, id_probability=np.array(beliefs, dtype=float))
-    return replace(sequence, detections=found)
+    sequence, ids = rail(NODES)[0], np.tile(IDS, (ROWS, 1))
+    stated = {"track": np.array(tracks), "candidate_ids": ids, "id_probability": np.array(beliefs, dtype=float)}
+    return replace(sequence, detections=replace(sequence.detections, **stated))
 
 
 @pytest.mark.parametrize("policy", POLICIES)

@@ -12,7 +12,6 @@ from gtsam.symbol_shorthand import L, X
 from scipy.stats import chi2, multivariate_normal
 
 from sonar_graph.calibration import SonarCalibration
-from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 from sonar_graph.slam.landmarks import unknown as module
@@ -41,14 +40,9 @@ ASSOCIATED = {"identity__unknown__policy": "associate", "identity__unknown__gate
 USED = {Outcome.USED, Outcome.NEW, Outcome.PLACED_LATER, Outcome.USED_LATER, Outcome.MOVED}
 
 
-def detections_of(sequence: Sequence) -> LandmarkDetections:
-    assert sequence.detections is not None
-    return sequence.detections
-
-
 def anonymous_where(sequence: Sequence, rows: np.ndarray) -> Sequence:
     """Some detections name nothing."""
-    seen = detections_of(sequence)
+    seen = sequence.detections
     ids, probability = seen.candidate_ids.copy(), seen.id_probability.copy()
     ids[rows], probability[rows] = -1, 0.0
     return replace(sequence, detections=replace(seen, candidate_ids=ids, id_probability=probability))
@@ -74,7 +68,7 @@ def test_without_names_the_basin_is_that_with_names():
     name_of = dict(zip(landmarks.ids.tolist(), true.ids[np.argmin(apart_m, axis=1)].tolist(), strict=True))
     log = estimator.detections()
     assert set(log.outcomes) <= USED
-    assert [name_of[i] for i in log.landmark_ids.tolist()] == detections_of(sequence).most_probable()[0].tolist()
+    assert [name_of[i] for i in log.landmark_ids.tolist()] == sequence.detections.most_probable()[0].tolist()
     assert estimator.trajectory().positions == pytest.approx(known.trajectory().positions, abs=1e-4)
 
 
@@ -123,7 +117,7 @@ def test_scattered_detections_of_nothing_begin_no_landmark():
 
 def named_late(share: float = 0.4) -> Sequence:
     """The detections of a first share of the run name nothing."""
-    seen = detections_of(clean())
+    seen = clean().detections
     until_ns = seen.stamps_ns[0] + round(share * (seen.stamps_ns[-1] - seen.stamps_ns[0]))
     return anonymous_where(clean(), seen.stamps_ns < until_ns)
 
@@ -151,7 +145,7 @@ def test_with_a_bounded_history_none_is_merged_that_has_left_the_window():
 def test_a_duplicate_is_merged_into_the_graph_of_one_landmark(monkeypatch: pytest.MonkeyPatch):
     """Eight frames in which nothing is paired, as if the vehicle's error had led it astray."""
     known, calls = run(blind(), **ASSOCIATED), 0
-    first = len(detections_of(clean())) * 2 // 3
+    first = len(clean().detections) * 2 // 3
 
     def pair(innovations: Innovations, probability: float) -> Pairing:
         nonlocal calls
@@ -171,7 +165,7 @@ def test_a_duplicate_is_merged_into_the_graph_of_one_landmark(monkeypatch: pytes
 
 def test_half_named_ends_in_names_only():
     sequence = simulate_basin(BasinOptions(**TWO_LAPS, anonymous_share=0.5))
-    assert 0.4 < np.mean((detections_of(sequence).candidate_ids < 0).all(axis=1)) < 0.6
+    assert 0.4 < np.mean((sequence.detections.candidate_ids < 0).all(axis=1)) < 0.6
     estimator = run(sequence, identity__unknown__policy="associate")
     assert estimator.landmarks().ids.tolist() == [1, 2, 3, 4]
     ignoring = Counter(run(sequence).detections().outcomes)
@@ -226,7 +220,6 @@ def test_a_candidate_begins_a_landmark_when_it_is_known_to_a_tenth_of_its_range(
 
 PROBABILITY = 0.99
 NOISE_M = 0.02
-LIKELY = math.log(1.0)
 
 
 def nearest(
@@ -234,7 +227,7 @@ def nearest(
     cov: np.ndarray,
     named: list[int],
     frames: dict[int, list[int]],
-    log_rival: float = LIKELY,
+    log_rival: float = 0.0,
     ranges_m: tuple[float, ...] = (2.0, 2.0),
 ) -> tuple[int, int] | None:
     """Of landmarks at points with a joint covariance, each seen in some frames."""
