@@ -114,10 +114,15 @@ def test_quantile_of_finite_values_is_numpys(values, share):
     assert quantile(np.array(values), share) == pytest.approx(float(np.quantile(values, share)), rel=1e-9, abs=1e-6)
 
 
-def test_a_group_with_a_run_without_a_value_has_no_mean():
+def test_runs_without_a_value_lie_at_the_ends_of_quantiles_and_leave_no_mean():
+    for values, share, expected in (
+        *(([1.0, 2.0, 3.0, INF, INF], 0.5, 3.0), ([1.0, 2.0, INF, INF], 0.5, INF), ([INF, 1.0], 0.1, INF)),
+        *(([-INF, 1.0], 0.5, -INF), ([-INF, -INF, 1.0, 2.0], 0.5, -INF), ([-INF, 1.0, 2.0], 0.5, 1.0)),
+        *(([], 0.5, math.nan), ([-INF, INF], 0.5, math.nan)),
+    ):
+        assert quantile(np.array(values), share) == pytest.approx(expected, nan_ok=True), values
     complete, short = summarise(np.array([1.0, 2.0, 3.0, 4.0])), summarise(np.array([1.0, 2.0, INF, 4.0]))
-    assert complete.mean == 2.5
-    assert complete.standard_error == pytest.approx(stats.sem([1.0, 2.0, 3.0, 4.0]))
+    assert (complete.mean, complete.standard_error) == (2.5, pytest.approx(stats.sem([1.0, 2.0, 3.0, 4.0])))
     assert math.isnan(short.mean)
     assert math.isnan(short.standard_error)
     assert (short.runs, short.without, short.median) == (4, 1, 3.0)
@@ -247,18 +252,15 @@ KINDS = ("distinct", "ties", "zeros", "infinite", "mostly zeros", "one size")
 
 def drawn(kind: str, count: int, seed: int = 0, shift: float = 0.1) -> np.ndarray:
     """Differences of one kind."""
-    rng = np.random.default_rng(seed)
-    differences = rng.normal(shift, 1, count)
-    if kind == "ties":
-        differences = np.round(2 * differences) + 0.5
-    elif kind == "zeros":
-        differences[: count // 4] = 0.0
-    elif kind == "infinite":
-        differences[: count // 3] = np.copysign(INF, differences[: count // 3])
-    elif kind == "mostly zeros":
-        differences[: count - count // 8] = 0.0
-    elif kind == "one size":
-        differences = np.sign(differences)
+    differences = np.random.default_rng(seed).normal(shift, 1, count)
+    first, changed = {
+        "ties": (count, lambda values: np.round(2 * values) + 0.5),
+        "zeros": (count // 4, np.zeros_like),
+        "infinite": (count // 3, lambda values: np.copysign(INF, values)),
+        "mostly zeros": (count - count // 8, np.zeros_like),
+        "one size": (count, np.sign),
+    }.get(kind, (0, np.copy))
+    differences[:first] = changed(differences[:first])
     return differences
 
 
@@ -267,17 +269,17 @@ def finite(differences: np.ndarray) -> np.ndarray:
     return np.where(np.isinf(differences), np.sign(differences) * 100.0, differences)
 
 
-def ranks_of(differences: np.ndarray) -> np.ndarray:
-    """Whole ranks of what is not zero."""
-    doubled = np.rint(2 * stats.rankdata(np.abs(differences))).astype(np.int64)[differences != 0]
-    return doubled // np.gcd.reduce(doubled)
-
-
 def normal_p(differences: np.ndarray) -> float:
     """By a normal distribution with the variance that the ranks of what is not zero have."""
     ranks = stats.rankdata(np.abs(differences))[differences != 0]
     total = (np.sign(differences[differences != 0]) * ranks).sum()
     return float(2 * stats.norm.sf(abs(total) / math.sqrt((ranks**2).sum())))
+
+
+def ranks_of(differences: np.ndarray) -> np.ndarray:
+    """Whole ranks of what is not zero."""
+    doubled = np.rint(2 * stats.rankdata(np.abs(differences))).astype(np.int64)[differences != 0]
+    return doubled // np.gcd.reduce(doubled)
 
 
 def enumerated_p(differences: np.ndarray) -> float:
@@ -364,20 +366,3 @@ def test_equal_ranks_keep_their_steps():
     differences = np.repeat([1.0, -1.0], [5100, 4900])
     assert signed_rank_p(differences) == pytest.approx(stats.binomtest(5100, 10_000).pvalue, rel=1e-6)
     assert normal_p(differences) != pytest.approx(stats.binomtest(5100, 10_000).pvalue, rel=0.01), "the check can fail"
-
-
-@pytest.mark.parametrize(
-    ("values", "share", "expected"),
-    [
-        ([1.0, 2.0, 3.0, INF, INF], 0.5, 3.0),
-        ([1.0, 2.0, INF, INF], 0.5, INF),
-        ([INF, 1.0], 0.1, INF),
-        ([-INF, 1.0], 0.5, -INF),
-        ([-INF, -INF, 1.0, 2.0], 0.5, -INF),
-        ([-INF, 1.0, 2.0], 0.5, 1.0),
-        ([], 0.5, math.nan),
-        ([-INF, INF], 0.5, math.nan),
-    ],
-)
-def test_runs_without_a_value_lie_at_the_ends_of_quantiles(values, share, expected):
-    assert quantile(np.array(values), share) == pytest.approx(expected, nan_ok=True)

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sonar_graph.evaluation import Comparison, Score, comparison, digits, read_comparison, run, score_table, tables
+from sonar_graph.evaluation import Score, comparison, digits, read_comparison, run, score_table, tables
 from sonar_graph.report import batch_figures, comparison_page
 from sonar_graph.report.batch_page import render_batch
 from sonar_graph.report.comparison_page import render_report
@@ -59,21 +59,30 @@ class Page(HTMLParser):
         return [attrs for tag, attrs in self.tags if tag in names]
 
 
-def hostile_comparison() -> Comparison:
-    """Everything that a log or an estimator can say would run a script."""
-    compared = basin_comparison(60)
+def test_what_a_log_or_an_estimator_says_is_escaped_everywhere():
+    """Everything that a log, a suite or an estimator can say would run a script."""
+    compared, batch = basin_comparison(60), drawn_batch()
     sequence = replace(compared.sequence, name=HOSTILE, notes={HOSTILE: HOSTILE})
     told = replace(compared.runs[0], estimator=HOSTILE, params={HOSTILE: HOSTILE})
     scores = {**compared.scores, HOSTILE: {HOSTILE: Score(1.0, HOSTILE, HOSTILE)}}
     runs = [told, *compared.runs[1:]]
-    return replace(compared, sequence=sequence, runs=runs, scores=scores, environment={"x": HOSTILE})
+    hostile = replace(compared, sequence=sequence, runs=runs, scores=scores, environment={"x": HOSTILE})
+    lost = [failed(replace(run, log=HOSTILE), reason=HOSTILE) for run in batch.runs[:3]]
+    named = replace(batch, name=HOSTILE, description=HOSTILE, suite=HOSTILE, runs=[*lost, *batch.runs])
+    for text, scripts in ((render_report(hostile), 0), (render_batch(named), 1), (hostile._repr_html_(), 0)):
+        Page(text)
+        assert text.count("<script") == scripts
+        assert "alert(1)" in text
+    with pytest.raises(AssertionError):
+        Page("<div><p>text</div>")  # the check of tags can fail
 
 
-def hostile_batch() -> str:
-    batch = drawn_batch()
-    runs = [failed(replace(run, log=HOSTILE), reason=HOSTILE) for run in batch.runs[:3]]
-    named = replace(batch, name=HOSTILE, description=HOSTILE, suite=HOSTILE, runs=[*runs, *batch.runs])
-    return render_batch(named)
+def test_a_notebook_shows_every_score_under_its_run():
+    compared = basin_comparison(60)
+    text = Page(compared._repr_html_()).text
+    table = score_table(compared)
+    assert all(cell.text in text for row in table.rows for cell in row)
+    assert [column.heading for column in table.columns[2:-1]] == [run.estimator for run in compared.runs]
 
 
 PAGES = {
@@ -95,11 +104,6 @@ def html(kind) -> str:
 @pytest.fixture(scope="module")
 def page(html) -> Page:
     return Page(html)
-
-
-def test_the_check_of_tags_notices_an_unclosed_one():
-    with pytest.raises(AssertionError):
-        Page("<div><p>text</div>")
 
 
 def test_a_page_fetches_nothing_and_only_that_of_a_batch_has_a_script(page, html, kind):
@@ -136,22 +140,6 @@ def test_the_same_results_make_the_same_page(kind, html):
     assert kind == "comparison" or PAGES[kind]() == html
 
 
-@pytest.mark.parametrize(
-    ("shown", "scripts"),
-    [
-        (lambda: render_report(hostile_comparison()), 0),
-        (hostile_batch, 1),
-        (lambda: hostile_comparison()._repr_html_(), 0),
-    ],
-    ids=["comparison", "batch", "notebook"],
-)
-def test_what_a_log_or_an_estimator_says_is_escaped_everywhere(shown, scripts):
-    text = shown()
-    Page(text)
-    assert text.count("<script") == scripts
-    assert "alert(1)" in text
-
-
 def contrast(first: str, second: str) -> float:
     """WCAG 2.1 contrast ratio."""
 
@@ -174,14 +162,6 @@ def test_text_and_lines_stand_out_from_the_paper(html, scheme):
     runs = [name for name in colours if name.startswith("--run-")]
     assert len(runs) == len(ESTIMATOR_COLOURS) == tables.RUN_COLOURS
     assert all(contrast(colours[name], colours["--paper"]) >= 3 for name in runs)
-
-
-def test_a_notebook_shows_every_score_under_its_run():
-    compared = basin_comparison(60)
-    text = Page(compared._repr_html_()).text
-    table = score_table(compared)
-    assert all(cell.text in text for row in table.rows for cell in row)
-    assert [column.heading for column in table.columns[2:-1]] == [run.estimator for run in compared.runs]
 
 
 def test_examples_of_the_front_door_run(tmp_path):

@@ -95,20 +95,29 @@ def test_radians_are_shown_as_degrees():
 
 
 @pytest.mark.parametrize("truth", [True, False])
-def test_the_smoothed_error_is_told_only_where_it_is_another_one(truth):
-    sentences = [one for one in finding(basin_comparison(60, truth=truth)) if "(smoothed)" in one]
-    assert len(sentences) == truth
-    assert all("isam2" in one and "ekf-slam" not in one for one in sentences)
+def test_finding_tells_another_smoothed_error_and_that_there_were_no_detections(truth):
+    comparison = basin_comparison(60, truth=truth)
+    smoothed = [one for one in finding(comparison) if "(smoothed)" in one]
+    assert len(smoothed) == truth
+    assert all("isam2" in one and "ekf-slam" not in one for one in smoothed)
+    assert NO_DETECTIONS not in finding(comparison)
+    part = "The part of the log that was chosen (the beginning to 10.000 s) has no landmark detections"
+    for notes, said in (({}, NO_DETECTIONS), ({"log.part": "the beginning to 10.000 s"}, part)):
+        sequence = replace(comparison.sequence, detections=None, notes=notes)
+        assert finding(replace(comparison, sequence=sequence))[0].startswith(said)
 
 
 def test_failures_come_first_and_the_lack_of_a_finding_has_its_reason():
     sentences = finding(with_failure(basin_comparison(60), "ekf-slam", "no odometry."))
     assert sentences[0] == "ekf-slam failed: no odometry."
     assert "ekf-slam" not in " ".join(sentences[1:])
-    assert "no ground truth" in " ".join(finding(basin_comparison(60, truth=False)))
+    blind = basin_comparison(60, truth=False)
+    assert "no ground truth" in " ".join(finding(blind))
     assert "nothing to compare" in finding(with_failure(scored(isam2=0.1), "isam2", "no odometry"))[-1]
     unscored = replace(basin_comparison(60), scores={})
     assert finding(unscored) == ["No position error could be computed against the log's ground truth."]
+    nis = Score(6.9, "1", "By hand.", (0.9, 1.1), "inside")
+    assert "isam2 6.90 (over-confident)" in finding(with_score(blind, "isam2", "detections.nis", nis))[-1]
 
 
 @pytest.mark.parametrize(
@@ -123,17 +132,6 @@ def test_failures_come_first_and_the_lack_of_a_finding_has_its_reason():
 def test_the_nees_furthest_from_one_is_told(position, yaw, told):
     judged = with_score(scored(isam2=0.1), "isam2", "causal.nees_position", nees(position))
     assert finding(with_score(judged, "isam2", "causal.nees_yaw", nees(yaw)))[-1].endswith(f": {told}.")
-
-
-@pytest.mark.parametrize("truth", [True, False])
-def test_finding_says_that_there_were_no_detections(truth):
-    comparison = basin_comparison(60, truth=truth)
-    assert NO_DETECTIONS not in finding(comparison)
-    none = replace(comparison.sequence, detections=None)
-    assert finding(replace(comparison, sequence=none))[0] == NO_DETECTIONS
-    part = replace(none, notes={"log.part": "the beginning to 10.000 s"})
-    said = "The part of the log that was chosen (the beginning to 10.000 s) has no landmark detections"
-    assert finding(replace(comparison, sequence=part))[0].startswith(said)
 
 
 @pytest.mark.parametrize(
@@ -156,13 +154,6 @@ def test_an_estimator_that_refuses_a_fifth_of_the_detections_is_called_lost(gate
         assert advice in sentence
     few = replace(log, innovations=np.full((100, 2), 0.1), innovation_covs=np.tile(np.eye(2), (100, 1, 1)))
     assert detection_scores(few)["detections.nis"].verdict == ("" if told else "over-cautious")
-
-
-def test_without_truth_innovations_tell_whether_covariances_hold():
-    comparison = with_score(
-        basin_comparison(60, truth=False), "isam2", "detections.nis", Score(6.9, "1", "By hand.", (0.9, 1.1), "inside")
-    )
-    assert "isam2 6.90 (over-confident)" in finding(comparison)[-1]
 
 
 def with_map(
