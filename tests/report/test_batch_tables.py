@@ -17,32 +17,9 @@ from sonar_graph.batch.result_table import KINDS, Metric, metrics_of
 from sonar_graph.batch.statistics import paired, quantile_error
 from sonar_graph.evaluation.digits import quantile_text
 from sonar_graph.evaluation.tables import Cell, Column, Table
+from sonar_graph.report import batch_summary as summary
+from sonar_graph.report import batch_tables as tables
 from sonar_graph.report.batch_figures import consistency_drawing, difference_drawing
-from sonar_graph.report.batch_summary import (
-    DIFFERENT,
-    HIGHER,
-    LOWER,
-    errors_told,
-    failures_told,
-    head_metric,
-    headlines,
-    instants_told,
-    mark_of,
-    overview_table,
-    power_told,
-    reference_told,
-)
-from sonar_graph.report.batch_tables import (
-    SAME_EVIDENCE,
-    accuracy_table,
-    all_tests,
-    consistency_table,
-    cost_table,
-    difference_table,
-    failure_table,
-    p_text,
-    run_lists,
-)
 from sonar_graph.report.rendering import as_csv, as_latex, latex_text, write_tables
 from tests.recorded_batches import LOGS, METRICS, changed, drawn_batch, failed, updated, with_failures, without
 
@@ -64,8 +41,16 @@ def cells_of(table: Table, contestant: str) -> list[Cell]:
     return next(row for row in table.rows if row[1].text == contestant)
 
 
+def compared_runs(batch: RecordedBatch) -> tables.Tests:
+    return tables.all_tests(batch, [ATE])
+
+
+def heads_of(batch: RecordedBatch) -> list[str]:
+    return summary.headlines(batch, ATE, compared_runs(batch))
+
+
 def overview_of(batch: RecordedBatch) -> Table:
-    return overview_table(batch, ATE, all_tests(batch, [ATE]))
+    return summary.overview_table(batch, ATE, compared_runs(batch))
 
 
 def cell_of(table: Table, log: str, over: str, contestant: str) -> Cell:
@@ -74,11 +59,11 @@ def cell_of(table: Table, log: str, over: str, contestant: str) -> Cell:
 
 
 def errors_of(batch: RecordedBatch, metrics: list[Metric] = EVERY_METRIC) -> list[str]:
-    return errors_told(batch, metrics, all_tests(batch, metrics))
+    return summary.errors_told(batch, metrics, tables.all_tests(batch, metrics))
 
 
 def test_causal_and_smoothed_have_columns_of_their_own_with_full_precision_in_files():
-    row = row_of(accuracy_table(BATCH, ATE), "isam2")
+    row = row_of(tables.accuracy_table(BATCH, ATE), "isam2")
     for kind in KINDS:
         key = f"{kind}.ate_se2_m"
         values = BATCH.values(LOGS[0], "isam2", key)
@@ -90,18 +75,18 @@ def test_causal_and_smoothed_have_columns_of_their_own_with_full_precision_in_fi
         overview = next(csv.DictReader(io.StringIO(as_csv(overview_of(BATCH)))))
         for contestant in BATCH.contestants:
             assert float(overview[f"{key} {contestant}"]) == np.median(BATCH.values(LOGS[0], contestant, key))
-    assert 1 < float(row_of(cost_table(BATCH), "isam2")["update_p50_ms_median"]) < 2
+    assert 1 < float(row_of(tables.cost_table(BATCH), "isam2")["update_p50_ms_median"]) < 2
 
 
 def test_no_mean_is_given_over_survivors_and_the_tables_say_why():
     batch = with_failures(BATCH, "isam2", LOGS[0], 2)
-    table = accuracy_table(batch, ATE)
+    table = tables.accuracy_table(batch, ATE)
     row = row_of(table, "isam2")
     assert (row[f"{KEY}_mean"], row["runs"]) == ("", "10")
     notes = [cell.note for line in table.rows for cell in line if cell.note]
     assert notes.count("2 of 10 without a value") == 2
     assert row_of(table, "ekf-slam")[f"{KEY}_mean"] != ""
-    row = row_of(failure_table(batch), "isam2")
+    row = row_of(tables.failure_table(batch), "isam2")
     assert (row["ended"], row["timeout"], row["memory"], row["failure_rate"]) == ("8", "2", "0", "0.2")
     assert float(row["failure_rate_low"]) < 0.2 < float(row["failure_rate_high"])
     cell = cell_of(overview_of(with_failures(BATCH, "isam2", LOGS[0], 6)), LOGS[0], "Causal", "isam2")
@@ -110,30 +95,32 @@ def test_no_mean_is_given_over_survivors_and_the_tables_say_why():
 
 
 def test_a_column_that_a_contestant_cannot_have_is_a_dash_without_a_complaint():
-    cells = cells_of(accuracy_table(BATCH, metrics_of(["landmarks.se2_m"])[0]), "dead-reckoning")
+    cells = cells_of(tables.accuracy_table(BATCH, metrics_of(["landmarks.se2_m"])[0]), "dead-reckoning")
     assert [cell.text for cell in cells[3:]] == ["\N{EN DASH}"] * 3
     assert all(not cell.note for cell in cells)
 
 
 def test_differences_are_paired_and_their_tests_corrected_within_a_metric():
-    tests = all_tests(BATCH, EVERY_METRIC)
+    tests = tables.all_tests(BATCH, EVERY_METRIC)
     own, reference = BATCH.pairs(LOGS[0], "isam2", KEY)
-    row = row_of(difference_table(BATCH, ATE, tests), "isam2")
+    row = row_of(tables.difference_table(BATCH, ATE, tests), "isam2")
     assert float(row[f"{KEY}_difference"]) == pytest.approx((own - reference).mean())
     assert float(row[f"{KEY}_difference_low"]) < float(row[f"{KEY}_difference"])
     single, corrected = float(row[f"{KEY}_p_holm_single"]), float(row[f"{KEY}_p_holm"])
     assert single == pytest.approx(2**-9)
     assert single < corrected <= 12 * single + 1e-12
     assert {log for _, log, _ in tests} == {*LOGS, ALL_LOGS}
-    alone = all_tests(BATCH, [Metric("ate_se2_m", {"Causal": KEY})])
-    doubled = all_tests(BATCH, [Metric("ate_se2_m", {"Causal": KEY, "Smoothed": KEY})])  # as of a filter: one test
+    alone = tables.all_tests(BATCH, [Metric("ate_se2_m", {"Causal": KEY})])
+    doubled = tables.all_tests(
+        BATCH, [Metric("ate_se2_m", {"Causal": KEY, "Smoothed": KEY})]
+    )  # as of a filter: one test
     assert {place: p for place, (_, p) in doubled.items()} == {place: p for place, (_, p) in alone.items()}
 
 
 def test_of_all_logs_together_seeds_are_counted():
     batch = drawn_batch(8)
-    tests = all_tests(batch, [ATE])
-    table = difference_table(batch, ATE, tests)
+    tests = compared_runs(batch)
+    table = tables.difference_table(batch, ATE, tests)
     shown = {row[0].text: (row[2].text, row[5].text) for row in table.rows if row[1].text == "isam2"}
     assert shown == dict.fromkeys(LOGS, ("8 pairs", "8 of 8 pairs")) | {ALL_LOGS: ("8 seeds", "8 of 8 seeds")}
     assert [column.heading for column in table.columns[2:6]] == ["Compared", "Mean difference", "Median", "Smaller in"]
@@ -143,7 +130,7 @@ def test_of_all_logs_together_seeds_are_counted():
     counted = {(row["log"], row["pairs"], row["pairs_of"]) for row in csv.DictReader(io.StringIO(drawing.data))}
     assert counted == {(LOGS[0], "8", "pair"), (LOGS[1], "8", "pair"), (ALL_LOGS, "8", "seed")}
     unseeded = replace(batch, runs=[replace(run, seed=None) for run in batch.runs if run.seed == 0])
-    rows = difference_table(unseeded, ATE, all_tests(unseeded, [ATE])).rows
+    rows = tables.difference_table(unseeded, ATE, compared_runs(unseeded)).rows
     assert [row[2].text for row in rows if row[1].text == "isam2"] == ["1 pair", "1 pair", "2 logs"]
 
 
@@ -156,19 +143,20 @@ P_TEXTS = {
 
 
 def test_a_p_value_shows_its_side_of_five_percent():
-    assert {p_value: p_text(p_value) for p_value in P_TEXTS} == P_TEXTS
+    assert {p_value: tables.p_text(p_value) for p_value in P_TEXTS} == P_TEXTS
 
 
 def test_consistency_is_judged_over_runs_by_the_chi_square_band():
     batch = drawn_batch(40)
     verdicts = {
-        (row["log"], row["contestant"], row["of"]): row["causal_verdict"] for row in rows_of(consistency_table(batch))
+        (row["log"], row["contestant"], row["of"]): row["causal_verdict"]
+        for row in rows_of(tables.consistency_table(batch))
     }
     assert verdicts[LOGS[0], "ekf-slam", "position"] == "over-confident"
     assert verdicts[LOGS[0], "isam2", "position"] == "consistent"
-    row = row_of(consistency_table(with_failures(batch, "isam2", LOGS[0], 1)), "isam2")
+    row = row_of(tables.consistency_table(with_failures(batch, "isam2", LOGS[0], 1)), "isam2")
     assert (row["causal_anees"], row["causal_verdict"]) == ("", "")
-    rows = rows_of(consistency_table(without(drawn_batch(logs=LOGS[:1]), "causal.nees")))
+    rows = rows_of(tables.consistency_table(without(drawn_batch(logs=LOGS[:1]), "causal.nees")))
     assert all(row["smoothed_verdict"] for row in rows), "who has but a smoothed covariance is judged by it"
     assert "causal_anees" not in rows[0]
 
@@ -184,14 +172,14 @@ def with_one_end(batch: RecordedBatch, contestants: tuple[str, ...], factor: flo
 @pytest.mark.parametrize(("factor", "shown"), [(1.0, False), (1.09, False), (0.91, False), (1.11, True), (0.89, True)])
 def test_a_smoothed_error_at_the_end_is_no_second_evidence(factor, shown):
     batch = with_one_end(drawn_batch(logs=LOGS[:1]), ("dead-reckoning", "isam2", "ekf-slam"))
-    table = consistency_table(batch)
-    assert SAME_EVIDENCE in table.caption
+    table = tables.consistency_table(batch)
+    assert tables.SAME_EVIDENCE in table.caption
     assert [name for name, _ in table.groups] == ["", "Causal"]
     mixed = with_one_end(batch, ("isam2",), factor)
-    assert ("Smoothed" in [name for name, _ in consistency_table(mixed).groups]) is shown
+    assert ("Smoothed" in [name for name, _ in tables.consistency_table(mixed).groups]) is shown
     points = [one.svg.count("<use ") for drawn in (batch, mixed) if (one := consistency_drawing(drawn, "position"))]
     assert (points[1] > points[0]) is shown
-    for row in consistency_table(mixed).rows if shown else []:
+    for row in tables.consistency_table(mixed).rows if shown else []:
         is_told = row[1].text == "isam2"
         assert (row[-2].text != "as causal") is is_told
         assert bool(row[-1].text) is is_told
@@ -200,16 +188,18 @@ def test_a_smoothed_error_at_the_end_is_no_second_evidence(factor, shown):
 
 def test_every_run_is_listed_once_and_leads_to_its_log():
     batch = drawn_batch(4)
-    lists = run_lists(batch, metrics_of(METRICS))
+    lists = tables.run_lists(batch, metrics_of(METRICS))
     links = [cell.link for _, table in lists for line in table.rows for cell in line if cell.link]
     assert sorted(links) == sorted(run.log_file for run in batch.runs)
     anchors = {table.name for _, table in lists}
-    targets = {cell.link.removeprefix("#") for line in accuracy_table(batch, ATE).rows for cell in line if cell.link}
+    targets = {
+        cell.link.removeprefix("#") for line in tables.accuracy_table(batch, ATE).rows for cell in line if cell.link
+    }
     assert targets == anchors
 
 
-def test_latex_has_as_many_cells_as_columns_in_every_row_and_takes_no_commands_from_names():
-    table = accuracy_table(with_failures(BATCH, "isam2", LOGS[0], 2), YAW)
+def test_latex_has_as_many_cells_as_columns_in_every_row_and_takes_no_commands_from_names(tmp_path):
+    table = tables.accuracy_table(with_failures(BATCH, "isam2", LOGS[0], 2), YAW)
     text = as_latex(table)
     body = text[text.index(r"\midrule") : text.index(r"\bottomrule")]
     lines = [line for line in body.splitlines() if line.endswith(r"\\")]
@@ -220,29 +210,27 @@ def test_latex_has_as_many_cells_as_columns_in_every_row_and_takes_no_commands_f
     assert re.search(r"[±°]", text) is None
     text = as_latex(overview_of(BATCH))
     assert r"$\downarrow$" in text
-    assert LOWER not in text
+    assert summary.LOWER not in text
     text = as_latex(Table("t", "100 % of $x_1$", "", [Column("a", r"\input{x}")], [[Cell("a&b#c")]]))
     assert r"100 \% of \$x\_1\$" in text
     assert r"\input" not in text
     assert r"a\&b\#c" in text
     assert latex_text("±") == r"$\pm$"
-
-
-def test_tables_are_written_under_their_names(tmp_path):
-    written = write_tables([accuracy_table(drawn_batch(2), ATE)], tmp_path)
-    assert [path.name for path in written] == ["accuracy-ate-se2-m.csv", "accuracy-ate-se2-m.tex"]
-    assert all(path.stat().st_size for path in written)
+    csv_file, tex_file = write_tables([table], tmp_path)
+    assert (csv_file.name, tex_file.name) == ("accuracy-yaw-rmse-rad.csv", "accuracy-yaw-rmse-rad.tex")
+    assert csv_file.read_text("utf-8") == as_csv(table)
+    assert tex_file.read_text("utf-8") == as_latex(table)
 
 
 def test_angles_are_degrees_for_people_and_radians_in_files():
     own, reference = (BATCH.values(LOGS[0], name, YAW_KEY) for name in ("isam2", "dead-reckoning"))
-    table = accuracy_table(BATCH, YAW)
+    table = tables.accuracy_table(BATCH, YAW)
     cell = cells_of(table, "isam2")[3]
     assert cell.numbers[0] == own.mean() == float(row_of(table, "isam2")[f"{YAW_KEY}_mean"])
     assert float(cell.text.split(" ± ")[0]) == pytest.approx(np.degrees(own.mean()), rel=0.1)
     assert table.title.endswith("°")
     expected = quantile_text(math.degrees(np.median(own)), math.degrees(quantile_error(own, 0.5)))
-    assert cell_of(overview_table(BATCH, YAW, {}), LOGS[0], "Causal", "isam2").text == expected
+    assert cell_of(summary.overview_table(BATCH, YAW, {}), LOGS[0], "Causal", "isam2").text == expected
     told = errors_of(BATCH, [YAW])[0]
     off = np.degrees(reference) - np.degrees(own)
     size = quantile_text(np.median(off), quantile_error(off, 0.5))
@@ -254,13 +242,13 @@ def test_angles_are_degrees_for_people_and_radians_in_files():
 
 def test_the_finding_names_failures_and_only_differences_beyond_chance():
     batch = with_failures(BATCH, "ekf-slam", LOGS[1], 3)
-    assert failures_told(batch) == [f"ekf-slam: 3 of 20 runs did not end ({LOGS[1]})."]
+    assert summary.failures_told(batch) == [f"ekf-slam: 3 of 20 runs did not end ({LOGS[1]})."]
     assert "isam2 is below dead-reckoning by " in errors_of(batch)[0]
     assert "Not told apart from dead-reckoning: isam2" in errors_of(changed(batch, "isam2", KEY, 4.0))[0]
     batch = drawn_batch(1, logs=tuple("abcdefg"))
     for log in batch.logs:
         batch = with_failures(batch, "isam2", log, 1)
-    assert failures_told(batch) == ["isam2: 7 of 7 runs did not end (a, b, c and 4 more)."]
+    assert summary.failures_told(batch) == ["isam2: 7 of 7 runs did not end (a, b, c and 4 more)."]
 
 
 def test_the_finding_tells_the_side_of_the_test_and_of_failed_runs_no_mean_and_no_size():
@@ -273,7 +261,7 @@ def test_the_finding_tells_the_side_of_the_test_and_of_failed_runs_no_mean_and_n
     all_failed = errors_of(with_failures(batch, "isam2", LOGS[0], 18))[0]
     assert "isam2 is above dead-reckoning, smaller in 0 of 18 pairs (p " in all_failed
     turned = changed(batch, "isam2", KEY, np.append(np.ones(17), 1e4))
-    test, p_value = all_tests(turned, [ATE])[KEY, LOGS[0], "isam2"]
+    test, p_value = compared_runs(turned)[KEY, LOGS[0], "isam2"]
     assert test.mean > 0 > test.median
     assert p_value < 0.05
     assert "isam2 is below dead-reckoning by 0." in errors_of(turned)[0]
@@ -281,18 +269,18 @@ def test_the_finding_tells_the_side_of_the_test_and_of_failed_runs_no_mean_and_n
 
 def test_too_few_seeds_are_warned_of_and_cost_others_nothing():
     few, many = drawn_batch(4, logs=LOGS[:1]), drawn_batch(12, logs=LOGS[:1])
-    assert "4 pairs" in power_told(all_tests(few, EVERY_METRIC))[0]
-    assert power_told(all_tests(many, EVERY_METRIC)) == []
-    assert f"{ALL_LOGS} (4 seeds)" in power_told(all_tests(drawn_batch(4), EVERY_METRIC))[0]
+    assert "4 pairs" in summary.power_told(tables.all_tests(few, EVERY_METRIC))[0]
+    assert summary.power_told(tables.all_tests(many, EVERY_METRIC)) == []
+    assert f"{ALL_LOGS} (4 seeds)" in summary.power_told(tables.all_tests(drawn_batch(4), EVERY_METRIC))[0]
     tests = {
         (KEY, f"{pairs} of them", "isam2"): (paired(np.arange(pairs) + 1.0, np.zeros(pairs)), 1.0) for pairs in (5, 6)
     }
     told = "Too few pairs for any corrected p value to fall below 0.05: 5 of them (5 pairs). Add seeds."
-    assert power_told(tests) == [told]
+    assert summary.power_told(tests) == [told]
     batch = drawn_batch(7, logs=LOGS[:1])
     same = updated(batch, lambda run: {"smoothed.ate_se2_m": run.values[KEY]})
-    assert "7 pairs" in power_told(all_tests(batch, [ATE]))[0], "four tests: 4 / 2**6 is above 5 %"
-    assert power_told(all_tests(same, [ATE])) == [], "two tests, as of filters"
+    assert "7 pairs" in summary.power_told(compared_runs(batch))[0], "four tests: 4 / 2**6 is above 5 %"
+    assert summary.power_told(compared_runs(same)) == [], "two tests, as of filters"
 
 
 @pytest.mark.parametrize(("fewest", "blind"), [(8, False), (7, True), (5, True)])
@@ -301,10 +289,10 @@ def test_seeds_are_called_too_few_only_where_the_best_differences_find_nothing(f
     batch = replace(batch, runs=[run for run in batch.runs if run.log == LOGS[0] or run.seed < fewest])
     for name, kind in itertools.product(("isam2", "ekf-slam"), KINDS):
         batch = changed(batch, name, f"{kind}.ate_se2_m", 1e-3)
-    tests = all_tests(batch, [ATE])
+    tests = compared_runs(batch)
     assert len(tests) == 12
-    assert (tests["causal.ate_se2_m", LOGS[1], "isam2"][1] < 0.05) is not blind
-    told = power_told(tests)
+    assert (tests[KEY, LOGS[1], "isam2"][1] < 0.05) is not blind
+    told = summary.power_told(tests)
     assert bool(told) is blind
     assert not any(LOGS[0] + " (" in one for one in told)
 
@@ -313,48 +301,55 @@ def test_seeds_are_called_too_few_only_where_the_best_differences_find_nothing(f
 def test_time_and_memory_are_shown_and_not_tested(key):
     batch = updated(drawn_batch(12, logs=LOGS[:1]), lambda run: {key: len(run.estimator) + 0.01 * run.seed})
     (metric,) = metrics_of([key])
-    assert all_tests(batch, [metric]) == {}
-    assert accuracy_table(batch, metric).rows
-    assert head_metric(batch, [metric]) is None
+    assert tables.all_tests(batch, [metric]) == {}
+    assert tables.accuracy_table(batch, metric).rows
+    assert summary.head_metric(batch, [metric]) is None
 
 
 def test_a_reference_that_never_ended_is_warned_of():
     batch = drawn_batch(8)
-    assert reference_told(with_failures(batch, "dead-reckoning", LOGS[0], 7)) == []
+    assert summary.reference_told(with_failures(batch, "dead-reckoning", LOGS[0], 7)) == []
     lost = with_failures(batch, "dead-reckoning", LOGS[0], 8)
-    assert reference_told(lost) == [
+    assert summary.reference_told(lost) == [
         "The reference dead-reckoning never ended on basin: whoever ended is better there, by no known amount."
     ]
-    (told,) = difference_table(lost, ATE, all_tests(lost, [ATE])).rows[:1]
+    (told,) = tables.difference_table(lost, ATE, compared_runs(lost)).rows[:1]
     assert told[4].text == "better: reference has no value"
 
 
 def test_runs_that_were_scored_at_other_instants_are_warned_of():
     even = updated(drawn_batch(2), lambda _: {"scored_instants": 50.0})
     fewer = replace(even.runs[0], values=even.runs[0].values | {"scored_instants": 40.0})
-    assert instants_told(even) == []
-    assert LOGS[0] in instants_told(replace(even, runs=[fewer, *even.runs[1:]]))[0]
+    assert summary.instants_told(even) == []
+    assert LOGS[0] in summary.instants_told(replace(even, runs=[fewer, *even.runs[1:]]))[0]
 
 
 def test_arrows_point_to_the_side_of_the_difference_and_only_where_it_is_no_chance():
     batch = replace(changed(drawn_batch(), "dead-reckoning", "causal.ate_se2_m", 3.0), reference="ekf-slam")
     batch = changed(batch, "isam2", "causal.ate_se2_m", 0.2)
     table = overview_of(batch)
-    assert cell_of(table, LOGS[0], "Causal", "isam2").text.endswith(LOWER)
-    assert cell_of(table, LOGS[0], "Causal", "dead-reckoning").text.endswith(HIGHER)
-    assert LOWER not in cell_of(table, LOGS[0], "Causal", "ekf-slam").text
+    assert cell_of(table, LOGS[0], "Causal", "isam2").text.endswith(summary.LOWER)
+    assert cell_of(table, LOGS[0], "Causal", "dead-reckoning").text.endswith(summary.HIGHER)
+    assert summary.LOWER not in cell_of(table, LOGS[0], "Causal", "ekf-slam").text
     few = overview_of(replace(batch, runs=[run for run in batch.runs if run.seed in (0, 1, 2)]))
-    assert not any(arrow in cell.text for row in few.rows for cell in row for arrow in (LOWER, HIGHER))
+    assert not any(arrow in cell.text for row in few.rows for cell in row for arrow in (summary.LOWER, summary.HIGHER))
 
 
 @pytest.mark.parametrize(
-    ("median", "mark"), [(-0.1, LOWER), (0.1, HIGHER), (-math.inf, LOWER), (math.inf, HIGHER), (0.0, DIFFERENT)]
+    ("median", "mark"),
+    [
+        (-0.1, summary.LOWER),
+        (0.1, summary.HIGHER),
+        (-math.inf, summary.LOWER),
+        (math.inf, summary.HIGHER),
+        (0.0, summary.DIFFERENT),
+    ],
 )
 def test_the_mark_is_of_the_median_and_only_below_five_percent(median, mark):
     test = replace(paired(np.arange(8.0), np.zeros(8)), mean=-7.0 * median, median=median)
-    assert mark_of((test, 0.049)) == mark
-    assert mark_of((replace(test, median=math.nan), 0.049)) == DIFFERENT
-    assert mark_of((test, 0.05)) == mark_of((test, math.nan)) == mark_of(None) == ""
+    assert summary.mark_of((test, 0.049)) == mark
+    assert summary.mark_of((replace(test, median=math.nan), 0.049)) == summary.DIFFERENT
+    assert summary.mark_of((test, 0.05)) == summary.mark_of((test, math.nan)) == summary.mark_of(None) == ""
 
 
 def test_a_filter_has_no_smoothed_column_and_the_reference_is_named():
@@ -369,50 +364,50 @@ def test_a_median_keeps_its_digits_beside_a_run_that_lost_its_way():
     batch = changed(drawn_batch(logs=LOGS[:1]), "isam2", "causal.ate_se2_m", np.append(np.ones(9), 1e5))
     shown = float(cell_of(overview_of(batch), LOGS[0], "Causal", "isam2").text.split()[0])
     assert shown == pytest.approx(np.median(batch.values(LOGS[0], "isam2", "causal.ate_se2_m")), rel=0.1)
-    row = next(row for row in accuracy_table(batch, ATE).rows if row[1].text == "isam2")
+    row = next(row for row in tables.accuracy_table(batch, ATE).rows if row[1].text == "isam2")
     assert float(row[4].text) == shown
     assert 0 < float(row[5].text.partition(" to ")[0]) <= shown
 
 
 def test_who_never_ended_is_higher_than_the_reference_and_not_left_out():
     batch = with_failures(drawn_batch(logs=LOGS[:1]), "isam2", LOGS[0], 10)
-    assert cell_of(overview_of(batch), LOGS[0], "Causal", "isam2").text == f"no value {HIGHER}"
-    assert "higher with isam2" in headlines(batch, ATE, all_tests(batch, [ATE]))[0]
+    assert cell_of(overview_of(batch), LOGS[0], "Causal", "isam2").text == f"no value {summary.HIGHER}"
+    assert "higher with isam2" in heads_of(batch)[0]
 
 
 def test_the_sentence_counts_logs_where_somebody_is_told_apart():
     beside, batch = "error beside that of dead-reckoning", drawn_batch(logs=("one", "two", "three"))
-    causal, smoothed = headlines(batch, ATE, all_tests(batch, [ATE]))
+    causal, smoothed = heads_of(batch)
     assert causal == f"Causal {beside} (on how many of 3 logs): lower with isam2 (3), ekf-slam (3)."
     assert smoothed.startswith(f"Smoothed {beside}")
     mixed = updated(batch, lambda run: {KEY: 9.0} if run.log == "two" else {}, ("isam2",))
-    told = headlines(mixed, ATE, all_tests(mixed, [ATE]))[0]
+    told = heads_of(mixed)[0]
     assert "lower with isam2 (2), ekf-slam (3); higher with isam2 (1)" in told
     rng = np.random.default_rng(16)
     batch = updated(BATCH, lambda _: {"smoothed.ate_se2_m": rng.lognormal()})
-    causal, smoothed = headlines(batch, ATE, all_tests(batch, [ATE]))
+    causal, smoothed = heads_of(batch)
     assert causal.startswith(f"Causal {beside} (on how many of 2 logs): lower with")
     assert smoothed == f"Smoothed {beside}: never told apart: isam2, ekf-slam."
     one, few = drawn_batch(logs=LOGS[:1]), drawn_batch(3, logs=LOGS[:1])
-    assert headlines(one, ATE, all_tests(one, [ATE]))[0] == f"Causal {beside}: lower with isam2, ekf-slam."
-    (told,) = headlines(few, ATE, all_tests(few, [ATE]))
+    assert heads_of(one)[0] == f"Causal {beside}: lower with isam2, ekf-slam."
+    (told,) = heads_of(few)
     assert told.endswith("no estimator is told apart from dead-reckoning.")
 
 
 def test_what_only_all_logs_together_tell_is_no_count_of_logs():
     batch = drawn_batch(1, logs=tuple("abcdefgh"))
-    assert math.isnan(all_tests(batch, [ATE])["causal.ate_se2_m", ALL_LOGS, "isam2"][1]), "one seed is one case"
+    assert math.isnan(compared_runs(batch)[KEY, ALL_LOGS, "isam2"][1]), "one seed is one case"
     batch = replace(batch, runs=[replace(run, seed=None) for run in batch.runs])
-    tests = all_tests(batch, [ATE])
-    assert tests["causal.ate_se2_m", ALL_LOGS, "isam2"][0].pairs == 8
-    assert mark_of(tests["causal.ate_se2_m", ALL_LOGS, "isam2"]) == LOWER
-    (told,) = headlines(batch, ATE, tests)
+    tests = compared_runs(batch)
+    assert tests[KEY, ALL_LOGS, "isam2"][0].pairs == 8
+    assert summary.mark_of(tests[KEY, ALL_LOGS, "isam2"]) == summary.LOWER
+    (told,) = summary.headlines(batch, ATE, tests)
     assert told.endswith("no estimator is told apart from dead-reckoning on any one log.")
 
 
 def test_the_head_shows_the_first_error_that_most_logs_have():
-    assert head_metric(BATCH, EVERY_METRIC) == EVERY_METRIC[0]
-    assert head_metric(without(BATCH, "ate", LOGS[0]), EVERY_METRIC) == EVERY_METRIC[1]
-    assert head_metric(replace(BATCH, runs=[failed(run) for run in BATCH.runs]), EVERY_METRIC) is None
-    assert head_metric(BATCH, metrics_of(["causal.nees_position"])) is None
-    assert head_metric(BATCH, metrics_of(["causal.nees_position", KEY])).name == ATE.name
+    assert summary.head_metric(BATCH, EVERY_METRIC) == EVERY_METRIC[0]
+    assert summary.head_metric(without(BATCH, "ate", LOGS[0]), EVERY_METRIC) == EVERY_METRIC[1]
+    assert summary.head_metric(replace(BATCH, runs=[failed(run) for run in BATCH.runs]), EVERY_METRIC) is None
+    assert summary.head_metric(BATCH, metrics_of(["causal.nees_position"])) is None
+    assert summary.head_metric(BATCH, metrics_of(["causal.nees_position", KEY])).name == ATE.name

@@ -1,3 +1,5 @@
+"""Figures of a comparison: quantities with units, truth from the numbers, and maps as they grew."""
+
 from __future__ import annotations
 
 import re
@@ -11,29 +13,26 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from scipy.stats import chi2
 
-from sonar_graph.evaluation.results import Comparison
+from sonar_graph.evaluation.results import Comparison, MapSoFar
+from sonar_graph.evaluation.scored_instants import map_instants, published_maps
+from sonar_graph.report import figures
+from sonar_graph.report.comparison_page import illustrations
 from sonar_graph.report.figure_style import colour, evenly, inline_svg, thinned
-from sonar_graph.report.figures import (
-    error_figure,
-    innovation_figure,
-    nees_figure,
-    nis_figure,
-    timing_figure,
-    yaw_figure,
-)
-from sonar_graph.report.maps import map_figure, paths_cut_off
+from sonar_graph.report.maps import LARGEST_ELLIPSE, enlargement, growth_figure, map_figure, map_view, paths_cut_off
+from sonar_graph.states import LandmarkMap
 from tests.synthetic import basin_comparison, only, with_failure, with_run
 
 TIME = "time since start (s)"
 FIGURES = {
     map_figure: ("world x (m)", {"world y (m)"}),
-    error_figure: (TIME, {"error in x (m)", "error in y (m)", "yaw error (°)"}),
-    yaw_figure: (TIME, {"yaw (°)"}),
-    nees_figure: (TIME, {"position NEES / dof", "yaw NEES / dof"}),
-    innovation_figure: (TIME, {"range (m)", "azimuth (°)"}),
-    nis_figure: ("NIS", {"detections below (%)"}),
-    timing_figure: ("duration of an update (ms)", {"updates at most as long (%)"}),
+    figures.error_figure: (TIME, {"error in x (m)", "error in y (m)", "yaw error (°)"}),
+    figures.yaw_figure: (TIME, {"yaw (°)"}),
+    figures.nees_figure: (TIME, {"position NEES / dof", "yaw NEES / dof"}),
+    figures.innovation_figure: (TIME, {"range (m)", "azimuth (°)"}),
+    figures.nis_figure: ("NIS", {"detections below (%)"}),
+    figures.timing_figure: ("duration of an update (ms)", {"updates at most as long (%)"}),
 }
 """Every figure, with the labels of its axes."""
 
@@ -59,15 +58,15 @@ def test_a_figure_is_a_well_formed_svg_with_quantities_and_units_in_the_colours_
 
 
 def test_height_is_drawn_of_three_dimensional_runs_and_no_error_without_truth():
-    figure = drawn(error_figure(basin_comparison(60, planar=False)))
+    figure = drawn(figures.error_figure(basin_comparison(60, planar=False)))
     assert "error in z (m)" in {panel.get_ylabel() for panel in figure.axes}
     comparison = basin_comparison(60, truth=False)
-    assert [draw for draw in FIGURES if draw(comparison) is None] == [error_figure, nees_figure]
+    assert [draw for draw in FIGURES if draw(comparison) is None] == [figures.error_figure, figures.nees_figure]
 
 
 def test_two_inline_svgs_share_no_identifier(comparison):
-    figures = [drawn(yaw_figure(comparison)), drawn(timing_figure(comparison))]
-    first, second = (inline_svg(figure, name, "") for figure, name in zip(figures, ("a", "b"), strict=True))
+    both = [drawn(figures.yaw_figure(comparison)), drawn(figures.timing_figure(comparison))]
+    first, second = (inline_svg(figure, name, "") for figure, name in zip(both, ("a", "b"), strict=True))
     own = [set(re.findall(r'\sid="([^"]+)"', svg)) for svg in (first, second)]
     assert own[0]
     assert not own[0] & own[1]
@@ -96,7 +95,7 @@ def comparison() -> Comparison:
 
 def test_errors_and_their_band_are_drawn_in_their_units(comparison):
     name = "ekf-slam"
-    figure = drawn(error_figure(only(comparison, name)))
+    figure = drawn(figures.error_figure(only(comparison, name)))
     errors = comparison.errors[name]["causal"]
     x_line, yaw_line = figure.axes[0].lines[-1], figure.axes[2].lines[-1]
     np.testing.assert_allclose(x_line.get_ydata(), errors.position_m[:, 0])
@@ -115,12 +114,12 @@ def test_no_band_is_drawn_where_no_covariance_was_reported(comparison):
         yaw_sigma_rad=np.full_like(errors.yaw_sigma_rad, np.nan),
     )
     silent = replace(only(comparison, "isam2"), errors={"isam2": {"causal": unknown}})
-    assert not any(panel.collections for panel in drawn(error_figure(silent)).axes)
-    assert any(panel.collections for panel in drawn(error_figure(comparison)).axes)
+    assert not any(panel.collections for panel in drawn(figures.error_figure(silent)).axes)
+    assert any(panel.collections for panel in drawn(figures.error_figure(comparison)).axes)
 
 
 def test_yaw_is_never_joined_across_the_wrap(comparison):
-    for line in drawn(yaw_figure(comparison)).axes[0].lines:
+    for line in drawn(figures.yaw_figure(comparison)).axes[0].lines:
         steps = np.abs(np.diff(np.asarray(line.get_ydata(), dtype=float)))
         assert np.nanmax(steps) <= 180
         assert np.isnan(steps).any(), "three laps pass ±180° and must leave gaps"
@@ -141,7 +140,7 @@ def test_landmark_ellipses_hold_95_percent_of_draws(comparison):
         assert inside.mean() == pytest.approx(0.95, abs=0.01)
 
 
-@pytest.mark.parametrize("draw", [map_figure, yaw_figure, timing_figure])
+@pytest.mark.parametrize("draw", [map_figure, figures.yaw_figure, figures.timing_figure])
 def test_estimators_keep_their_colour_when_another_one_fails(comparison, draw):
     failed = with_failure(comparison, "isam2", "lost")
     used = {to_hex(line.get_color()) for panel in drawn(draw(failed)).axes for line in panel.lines}
@@ -150,7 +149,7 @@ def test_estimators_keep_their_colour_when_another_one_fails(comparison, draw):
 
 
 def test_every_nees_stays_in_view(comparison):
-    figure = drawn(nees_figure(comparison))
+    figure = drawn(figures.nees_figure(comparison))
     for panel, run in zip(figure.axes, comparison.runs, strict=False):
         errors = comparison.errors[run.estimator]["causal"]
         assert panel.get_ylim()[1] > np.nanmax(errors.nees_position) / errors.position_dof
@@ -176,3 +175,77 @@ def test_even_choice_keeps_the_ends(n, points):
     if n:
         assert rows[0] == 0
         assert rows[-1] == n - 1
+
+
+def grown(instants: int = 240, sigma_m: float = 0.05) -> Comparison:
+    """Runs that knew one landmark more at each of three times."""
+    comparison = basin_comparison(instants)
+    stamps = map_instants(comparison.instants_ns, comparison.sequence.start_ns).tolist()
+    runs = []
+    for run in comparison.runs:
+        maps = []
+        if run.landmarks is not None:
+            covariances = np.tile(sigma_m**2 * np.eye(3), (4, 1, 1))
+            known = replace(run.landmarks, covariances=covariances)
+            rows = [slice(0, 2), slice(0, 3), slice(0, 4)]
+            maps = [
+                MapSoFar(stamp, LandmarkMap(known.ids[r], known.positions[r], known.covariances[r]))
+                for stamp, r in zip(stamps, rows, strict=True)
+            ]
+        runs.append(replace(run, maps=maps))
+    return replace(comparison, runs=runs)
+
+
+def test_each_panel_shows_what_was_known_then():
+    comparison = grown()
+    figure = growth_figure(comparison)
+    assert figure is not None
+    panels = np.array(figure.axes).reshape(2, 3)
+    stamps = sorted({known.stamp_ns for run in comparison.runs for known in run.maps})
+    for row, run in enumerate(comparison.runs[:2]):
+        for column, (panel, stamp_ns) in enumerate(zip(panels[row], stamps, strict=True)):
+            lines = {line.get_label(): line for line in panel.get_lines()}
+            assert run.causal is not None
+            until = run.causal.positions[run.causal.stamps_ns <= stamp_ns]
+            path = np.column_stack(lines["causal estimate"].get_data())
+            np.testing.assert_allclose(path, until[:, :2])
+            assert len(lines["estimated landmarks"].get_xdata()) == 2 + column
+            assert sum(isinstance(patch, Ellipse) for patch in panel.patches) == 2 + column
+
+
+def test_ellipses_are_as_large_as_the_caption_says():
+    comparison = grown(sigma_m=0.02)
+    figure, factor = growth_figure(comparison), enlargement(comparison)
+    assert figure is not None
+    assert factor > 1
+    ellipse = next(patch for patch in figure.axes[0].patches if isinstance(patch, Ellipse))
+    assert ellipse.width == pytest.approx(2 * factor * 0.02 * np.sqrt(chi2.ppf(0.95, 2)))
+    assert f"drawn {factor} times as large" in illustrations(comparison)["growth"].caption
+
+
+@pytest.mark.parametrize("sigma_m", [1e-4, 0.01, 0.1, 3.0])
+def test_ellipses_are_enlarged_only_as_far_as_there_is_room(sigma_m):
+    comparison = grown(60, sigma_m)
+    view, factor = map_view(comparison), enlargement(comparison)
+    assert view is not None
+    half_m = factor * sigma_m * np.sqrt(chi2.ppf(0.95, 2))
+    assert factor == 1 or half_m <= LARGEST_ELLIPSE * float((view[1] - view[0]).max())
+
+
+def test_without_maps_on_the_way_the_page_says_so_and_a_failed_run_has_no_row():
+    comparison = basin_comparison(60)
+    assert growth_figure(comparison) is None
+    assert illustrations(comparison)["growth"].instead
+    figure = growth_figure(with_failure(grown(60), "ekf-slam", "gave up"))
+    assert figure is not None
+    assert len(figure.axes) == 3
+
+
+@pytest.mark.slow
+def test_only_the_repeated_experiment_names_the_papers_figures():
+    other = grown(60)
+    same = replace(other, sequence=replace(other.sequence, true_landmarks=published_maps()[1]))
+    for name, counterpart in (("growth", "Fig. 4"), ("yaw", "Fig. 5")):
+        assert counterpart in illustrations(same)[name].caption
+        assert "paper" not in illustrations(other)[name].caption
+    assert "same fractions of this run as its 833.1, 1369.4 and 2039.0 s" in illustrations(same)["growth"].caption

@@ -58,41 +58,39 @@ def opened(browser: Any, file: Path, width: int, scheme: str = "light") -> Itera
 
 
 @pytest.mark.parametrize("width", [PHONE, DESKTOP])
-def test_nothing_is_said_in_the_console_and_nothing_sticks_out(browser, page_file, width):
+def test_nothing_is_said_in_the_console_nothing_sticks_out_and_the_head_fits_a_screen(
+    browser, page_file, page_of_many_logs, tmp_path, width
+):
+    wide = "document.documentElement.scrollWidth"
+    with opened(browser, page_of_many_logs, width) as (page, said):
+        assert page.evaluate("document.documentElement.scrollHeight") < 25_000
+        assert page.evaluate("document.querySelector('#table-overview').getBoundingClientRect().bottom") <= 900
+        assert page.evaluate(wide) <= width
+        assert said == []
     with opened(browser, page_file, width) as (page, said):
         page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert page.evaluate(wide) <= width
         assert said == []
-
-
-def test_the_checks_notice_what_they_look_for(browser, page_file, tmp_path):
     broken = tmp_path / "broken.html"
     text = page_file.read_text("utf-8").replace("</main>", '<div style="width: 3000px">wide</div></main>')
     broken.write_text(text.replace("<script>", "<script>nothing();"), "utf-8")
-    with opened(browser, broken, PHONE) as (page, said):
-        assert page.evaluate("document.documentElement.scrollWidth") > PHONE
+    with opened(browser, broken, width) as (page, said):  # the checks can fail
+        assert page.evaluate(wide) > width
         assert any("nothing is not defined" in line for line in said)
 
 
-@pytest.mark.parametrize("width", [PHONE, DESKTOP])
-def test_many_logs_have_a_head_of_one_screen_and_a_page_that_can_be_scrolled(browser, page_of_many_logs, width):
-    with opened(browser, page_of_many_logs, width) as (page, said):
-        height = page.evaluate("document.documentElement.scrollHeight")
-        below = page.evaluate("document.querySelector('#table-overview').getBoundingClientRect().bottom")
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-        assert said == []
-    assert below <= 900
-    assert height < 25_000
-
-
-def test_folded_tables_are_printed(browser, page_of_many_logs):
+def test_paper_has_folded_tables_no_buttons_and_light_colours(browser, page_file, page_of_many_logs, tmp_path):
     shown = "document.querySelector('#table-consistency').checkVisibility()"
     with opened(browser, page_of_many_logs, DESKTOP) as (page, _):
-        assert not page.evaluate(shown)
-        page.evaluate("dispatchEvent(new Event('beforeprint'))")
-        assert page.evaluate(shown)
-        page.evaluate("dispatchEvent(new Event('afterprint'))")
-        assert not page.evaluate(shown)
+        for event, is_shown in (("click", False), ("beforeprint", True), ("afterprint", False)):
+            page.evaluate(f"dispatchEvent(new Event('{event}'))")
+            assert page.evaluate(shown) is is_shown
+    with opened(browser, page_file, DESKTOP, "dark") as (page, _):
+        page.emulate_media(media="print")
+        assert page.evaluate("getComputedStyle(document.querySelector('.downloads')).display") == "none"
+        assert sum(_rgb(page.evaluate("getComputedStyle(document.body).backgroundColor"))) == 3 * 255
+        page.pdf(path=str(tmp_path / "page.pdf"), format="A4")
+    assert (tmp_path / "page.pdf").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -129,32 +127,17 @@ def test_tables_sort_by_number_and_back_with_the_keyboard(browser, page_file):
     assert list(map(float, downwards)) == sorted(map(float, downwards), reverse=True)
 
 
-def test_a_number_of_runs_opens_the_list_of_them(browser, page_file):
+def test_a_number_of_runs_opens_the_list_of_them_and_data_of_a_figure_can_be_downloaded(browser, page_file):
     with opened(browser, page_file, DESKTOP) as (page, _):
         page.locator("#table-failures tbody a").first.click()
         page.wait_for_function("document.querySelector('#runs-0-0').closest('details').open")
         opened_ones = "[...document.querySelectorAll('#runs ~ details[open], #runs ~ details details[open]')]"
         assert page.evaluate(f"{opened_ones}.every(one => one.contains(document.querySelector('#runs-0-0')))")
         assert page.evaluate(f"{opened_ones}.length") == 2, "the log's and the contestant's"
-
-
-def test_data_of_a_figure_can_be_downloaded(browser, page_file):
-    with opened(browser, page_file, DESKTOP) as (page, _):
         with page.expect_download() as download:
             page.get_by_label("Data of this figure (CSV): spread-ate-se2-m").click()
         text = Path(download.value.path()).read_text("utf-8")
     assert text.startswith("log,contestant,seed,key,column,value\n")
-
-
-def test_paper_has_no_buttons_and_light_colours(browser, page_file, tmp_path):
-    with opened(browser, page_file, DESKTOP, "dark") as (page, _):
-        page.emulate_media(media="print")
-        shown = page.evaluate("getComputedStyle(document.querySelector('.downloads')).display")
-        paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
-        page.pdf(path=str(tmp_path / "page.pdf"), format="A4")
-    assert shown == "none"
-    assert sum(_rgb(paper)) == 3 * 255
-    assert (tmp_path / "page.pdf").stat().st_size > 10_000
 
 
 @pytest.mark.skipif(not AXE.is_file(), reason="no axe-core: npm install axe-core, or set SONAR_GRAPH_AXE")

@@ -1,31 +1,25 @@
-"""Findings in words follow the numbers: the smaller error, consistency, failures, and warnings that come first."""
+"""Findings in words and in the terminal follow the numbers: smaller errors, consistency, failures and warnings."""
 
 from __future__ import annotations
 
+import io
 import math
+import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from sonar_graph.evaluation.digits import ABSENT
 from sonar_graph.evaluation.results import MOST_ROWS_NAMED, Comparison, Score
+from sonar_graph.evaluation.scored_instants import published_maps
 from sonar_graph.evaluation.scores import detection_scores, landmark_scores
+from sonar_graph.report import sentences
 from sonar_graph.report.comparison_page import render_report
+from sonar_graph.report.console import published_counterpart, summary
 from sonar_graph.report.landmark_table import landmark_table
-from sonar_graph.report.sentences import (
-    ABSURD,
-    NO_DETECTIONS,
-    SAID_NOTES,
-    doubt_lines,
-    doubt_of_identities,
-    finding,
-    lost_runs,
-    nameless_landmarks,
-    refusal_lines,
-    warning_lines,
-    withheld_lines,
-)
 from sonar_graph.states import FIRST_ANONYMOUS_ID, DetectionLog, LandmarkMap, Outcome, Refusal
 from tests.synthetic import (
     IDS,
@@ -40,7 +34,103 @@ from tests.synthetic import (
     with_score,
 )
 
-from .test_console import printed
+
+def printed(comparison: Comparison, width: int = 80, shown: Any = None) -> str:
+    options: dict[str, Any] = {"file": io.StringIO(), "width": width, "color_system": None}
+    console = Console(**options)
+    console.print(summary(comparison) if shown is None else shown)
+    return console.file.getvalue()
+
+
+def test_the_terminal_shows_the_numbers_of_the_report_in_80_columns():
+    comparison = basin_comparison(60)
+    text = printed(comparison)
+    keys = ("causal.ate_se2_m", "smoothed.ate_se2_m", "causal.yaw_rmse_rad", "causal.nees_yaw", "time.update_max_ms")
+    for name, scores in comparison.scores.items():
+        row = next(line for line in text.splitlines() if name in line)
+        assert all(scores[key].text() in row for key in keys)
+    assert "…" not in text
+    assert "corrects the drift." not in text
+
+
+def test_a_failure_is_told_with_its_reason_as_it_is_and_as_wide_as_the_terminal():
+    reason = "no [bold] odometry covers the stamps of any of the sonar frames that the log holds"
+    text = printed(with_failure(basin_comparison(60, truth=False), "isam2", reason), width=100)
+    assert f"isam2 failed: {reason}" in text
+    assert "causal" not in text, "without truth columns of errors are left out"
+    assert "median" in text
+
+
+@pytest.mark.parametrize(
+    ("value", "interval", "shown"),
+    [
+        *((2.1, None, "2.10 ▲"), (1.9, None, "1.90"), (0.6, None, "0.600"), (0.4, None, "0.400 ▼")),
+        *((1.3, (0.9, 1.1), "1.30 ▲"), (2.1, (0.9, 2.2), "2.10")),
+    ],
+)
+def test_a_nees_is_marked_by_the_rule_of_the_legend_or_its_interval(value, interval, shown):
+    score = Score(value, "1", "By hand.", interval, "inside")
+    text = printed(with_score(basin_comparison(60), "isam2", "causal.nees_yaw", score))
+    row = next(line for line in text.splitlines() if "isam2" in line)
+    assert shown in row
+    assert any(mark in shown for mark in "▲▼") or not re.search(f"{shown} [▲▼]", row)
+    assert "▲ above 2 over-confident, ▼ below 0.5 over-cautious" in text
+
+
+def test_what_is_lost_or_looks_wrong_in_a_log_is_told():
+    sequence = basin_comparison(60).sequence
+    notes = {
+        "log.ending": "the file is cut off at byte 7",
+        "log.damage": "bytes 3 to 5: chunk 2 is lost",
+        "log.warnings": "imu: 1 angular rate stands out",
+        "log.gaps": "dvl: no velocity 10.000 to 30.000 s after the start",
+        "log.dropped": "dvl: 5 with values that are not finite",
+        "log.noise": "dvl: 5 of 5 rows say no covariance",
+    }
+    text = printed(replace(basin_comparison(60), sequence=replace(sequence, detections=None, notes=notes)), 120)
+    for line in (
+        "Log: the file is cut off at byte 7",
+        "Log: bytes 3 to 5: chunk 2 is lost",
+        "Warning: imu: 1 angular rate stands out",
+        "Warning: dvl: no velocity 10.000 to 30.000 s after the start",
+        "Log, left out: dvl: 5 with values that are not finite",
+        "without them nothing corrects the drift.",
+    ):
+        assert line in " ".join(text.split())
+    assert "say no covariance" not in text
+
+
+def test_the_published_table_has_a_counterpart_in_80_columns_with_the_numbers_of_the_report():
+    comparison = basin_comparison(60)
+    assert published_counterpart(comparison) is None
+    same = replace(comparison, sequence=replace(comparison.sequence, true_landmarks=published_maps()[1]))
+    text, table = printed(same, 80, published_counterpart(same)), landmark_table(same)
+    assert "…" not in text
+    assert table is not None
+    for row in table.rows:
+        assert all(cell.text in text for cell in row[1:])
+    assert "dead-reckoning x" not in text
+
+
+def test_odometry_far_from_its_reference_asks_for_inspect_and_nothing_else_does():
+    comparison, hint = basin_comparison(60), "sonar-graph inspect LOG compares reference"
+    blind = replace(comparison, sequence=replace(comparison.sequence, detections=None))
+    cases = [
+        (comparison, "dead-reckoning", 30.0, True),
+        (comparison, "dead-reckoning", 4.0, False),
+        (comparison, "isam2", 30.0, False),  # landmarks may be the cause
+        (blind, "isam2", 30.0, True),
+    ]
+    for case, name, nees, is_told in cases:
+        score = Score(nees, "1", "By hand.", better="inside")
+        text = printed(with_score(case, name, "causal.nees_position", score), 200)
+        assert (hint in text) == is_told, (name, nees)
+    told = replace(blind, sequence=replace(blind.sequence, notes={"truth": "of the same sensors"}))
+    text = printed(
+        with_score(told, "isam2", "causal.nees_position", Score(30.0, "1", "By hand.", better="inside")), 200
+    )
+    assert "stamps, start or reference (of the same sensors) may be off" in text
+
 
 KEY = "causal.ate_se2_m"
 SIGMA_M = 0.02
@@ -71,7 +161,7 @@ def nees(value: float, interval: tuple[float, float] | None = None) -> Score:
     ],
 )
 def test_the_smaller_error_is_named_only_where_the_difference_is_large(errors, said):
-    sentence = next(one for one in finding(scored(**errors)) if one.startswith("Causal position error"))
+    sentence = next(one for one in sentences.finding(scored(**errors)) if one.startswith("Causal position error"))
     assert said in sentence
     assert ("below" in sentence) == ("below" in said)
 
@@ -97,27 +187,27 @@ def test_radians_are_shown_as_degrees():
 @pytest.mark.parametrize("truth", [True, False])
 def test_finding_tells_another_smoothed_error_and_that_there_were_no_detections(truth):
     comparison = basin_comparison(60, truth=truth)
-    smoothed = [one for one in finding(comparison) if "(smoothed)" in one]
+    smoothed = [one for one in sentences.finding(comparison) if "(smoothed)" in one]
     assert len(smoothed) == truth
     assert all("isam2" in one and "ekf-slam" not in one for one in smoothed)
-    assert NO_DETECTIONS not in finding(comparison)
+    assert sentences.NO_DETECTIONS not in sentences.finding(comparison)
     part = "The part of the log that was chosen (the beginning to 10.000 s) has no landmark detections"
-    for notes, said in (({}, NO_DETECTIONS), ({"log.part": "the beginning to 10.000 s"}, part)):
+    for notes, said in (({}, sentences.NO_DETECTIONS), ({"log.part": "the beginning to 10.000 s"}, part)):
         sequence = replace(comparison.sequence, detections=None, notes=notes)
-        assert finding(replace(comparison, sequence=sequence))[0].startswith(said)
+        assert sentences.finding(replace(comparison, sequence=sequence))[0].startswith(said)
 
 
 def test_failures_come_first_and_the_lack_of_a_finding_has_its_reason():
-    sentences = finding(with_failure(basin_comparison(60), "ekf-slam", "no odometry."))
-    assert sentences[0] == "ekf-slam failed: no odometry."
-    assert "ekf-slam" not in " ".join(sentences[1:])
+    told_lines = sentences.finding(with_failure(basin_comparison(60), "ekf-slam", "no odometry."))
+    assert told_lines[0] == "ekf-slam failed: no odometry."
+    assert "ekf-slam" not in " ".join(told_lines[1:])
     blind = basin_comparison(60, truth=False)
-    assert "no ground truth" in " ".join(finding(blind))
-    assert "nothing to compare" in finding(with_failure(scored(isam2=0.1), "isam2", "no odometry"))[-1]
+    assert "no ground truth" in " ".join(sentences.finding(blind))
+    assert "nothing to compare" in sentences.finding(with_failure(scored(isam2=0.1), "isam2", "no odometry"))[-1]
     unscored = replace(basin_comparison(60), scores={})
-    assert finding(unscored) == ["No position error could be computed against the log's ground truth."]
+    assert sentences.finding(unscored) == ["No position error could be computed against the log's ground truth."]
     nis = Score(6.9, "1", "By hand.", (0.9, 1.1), "inside")
-    assert "isam2 6.90 (over-confident)" in finding(with_score(blind, "isam2", "detections.nis", nis))[-1]
+    assert "isam2 6.90 (over-confident)" in sentences.finding(with_score(blind, "isam2", "detections.nis", nis))[-1]
 
 
 @pytest.mark.parametrize(
@@ -131,7 +221,7 @@ def test_failures_come_first_and_the_lack_of_a_finding_has_its_reason():
 )
 def test_the_nees_furthest_from_one_is_told(position, yaw, told):
     judged = with_score(scored(isam2=0.1), "isam2", "causal.nees_position", nees(position))
-    assert finding(with_score(judged, "isam2", "causal.nees_yaw", nees(yaw)))[-1].endswith(f": {told}.")
+    assert sentences.finding(with_score(judged, "isam2", "causal.nees_yaw", nees(yaw)))[-1].endswith(f": {told}.")
 
 
 @pytest.mark.parametrize(
@@ -146,8 +236,8 @@ def test_an_estimator_that_refuses_a_fifth_of_the_detections_is_called_lost(gate
     log = log_of([Outcome.GATED] * gated + [Outcome.USED] * (100 - gated), [0.1] * 100)
     comparison = basin_comparison(60)
     lost = with_run(comparison, replace(comparison.runs[1], detections=log, params=params))
-    told = [sentence for sentence in finding(lost) if sentence.startswith("ekf-slam refused")]
-    assert told == lost_runs(lost)
+    told = [sentence for sentence in sentences.finding(lost) if sentence.startswith("ekf-slam refused")]
+    assert told == sentences.lost_runs(lost)
     assert len(told) == (advice is not None)
     for sentence in told:
         assert sentence.startswith(f"ekf-slam refused {gated} of 100 detections as outside its gate: it has lost its")
@@ -176,12 +266,12 @@ def log_of(outcomes: list[Outcome], innovations_m: list[float], landmark_id: int
 
 
 def test_a_map_is_called_wrong_beyond_the_quantile_that_chance_exceeds_once_in_a_billion():
-    assert np.exp(-ABSURD / 2) == pytest.approx(1e-9, rel=1e-6)  # of two degrees of freedom, in closed form
-    limit_m, rng = SIGMA_M * np.sqrt(ABSURD), np.random.default_rng(1)
-    assert doubt_of_identities(with_map(IDS, [0.999 * limit_m] * 4)) == []
-    (line,) = doubt_of_identities(with_map(IDS, [1.001 * limit_m] * 4))
+    assert np.exp(-sentences.ABSURD / 2) == pytest.approx(1e-9, rel=1e-6)  # of two degrees of freedom, in closed form
+    limit_m, rng = SIGMA_M * np.sqrt(sentences.ABSURD), np.random.default_rng(1)
+    assert sentences.doubt_of_identities(with_map(IDS, [0.999 * limit_m] * 4)) == []
+    (line,) = sentences.doubt_of_identities(with_map(IDS, [1.001 * limit_m] * 4))
     assert "landmarks 1, 2, 3 and 4 far outside" in line
-    assert not any(doubt_of_identities(with_map(IDS, list(rng.normal(0, SIGMA_M, 4)))) for _ in range(50))
+    assert not any(sentences.doubt_of_identities(with_map(IDS, list(rng.normal(0, SIGMA_M, 4)))) for _ in range(50))
 
 
 def test_a_landmark_that_its_covariance_rules_out_is_named_with_the_policy():
@@ -190,7 +280,7 @@ def test_a_landmark_that_its_covariance_rules_out_is_named_with_the_policy():
         "Warning: isam2 puts landmark 3 far outside its covariance (NEES up to 31250); "
         'look at identities (identity.policy is "robust"), then at noise and start'
     )
-    assert doubt_of_identities(comparison) == [line]
+    assert sentences.doubt_of_identities(comparison) == [line]
     assert line in printed(comparison, 200)
     page = render_report(comparison)
     assert page.index("puts landmark 3 far outside") < page.index("<nav")
@@ -198,7 +288,7 @@ def test_a_landmark_that_its_covariance_rules_out_is_named_with_the_policy():
 
 def test_without_true_landmarks_the_innovations_of_used_detections_tell():
     def doubts(log: DetectionLog, *, has_truth: bool = False) -> list[str]:
-        return doubt_of_identities(with_map(IDS, [0.0] * 4, has_truth=has_truth, detections=log))
+        return sentences.doubt_of_identities(with_map(IDS, [0.0] * 4, has_truth=has_truth, detections=log))
 
     start = "Warning: isam2: sightings of landmark 2 contradict its map (mean NIS up to"
     for far, nis in ((2, None), (3, 375), (10, 1250)):  # (3 * 50² + 7 * 0.5²) / 10 / 2
@@ -220,7 +310,9 @@ def test_five_landmarks_are_named_and_more_are_counted(count, listed):
     ids, blank = np.arange(1, count + 1), with_map(IDS, [0.0] * 4, has_truth=False)
     log = replace(log_of([Outcome.USED] * count, [1.0] * count), landmark_ids=ids)
     landmarks = LandmarkMap(ids, np.zeros((count, 3)), np.zeros((count, 3, 3)))
-    (line,) = doubt_of_identities(with_run(blank, replace(blank.runs[0], landmarks=landmarks, detections=log)))
+    (line,) = sentences.doubt_of_identities(
+        with_run(blank, replace(blank.runs[0], landmarks=landmarks, detections=log))
+    )
     assert f"sightings of landmarks {listed} contradict its map" in line
 
 
@@ -244,7 +336,7 @@ def test_a_log_without_any_identity_is_told_with_what_to_do(outcomes, count):
         f"Warning: none of {count} detections has an identity that isam2 can use: no landmark is mapped; "
         'isam2 maps them by place with identity.unknown.policy = "associate"'
     )
-    assert doubt_of_identities(blind) == ([line] if count else [])
+    assert sentences.doubt_of_identities(blind) == ([line] if count else [])
     assert (line in printed(blind, 200)) == bool(count)
 
 
@@ -253,19 +345,19 @@ def test_runs_that_know_no_identity_are_named_together_with_the_most_that_any_wa
     for run, n in zip(comparison.runs, (4, 6), strict=True):
         blind = replace(run, detections=log_of([Outcome.NO_IDENTITY] * n, [np.nan] * n))
         comparison = with_run(comparison, blind)
-    (line,) = doubt_of_identities(comparison)
+    (line,) = sentences.doubt_of_identities(comparison)
     assert line.startswith("Warning: none of 6 detections has an identity that isam2, ekf-slam can use")
     assert "associate" in line
     assert line.replace('"', "&#34;") in render_report(comparison)
     params = {"identity": {"unknown": {"policy": "associate"}}}
     asked = with_run(comparison, replace(comparison.runs[0], params=params))
-    assert not any("associate" in line for line in doubt_of_identities(asked))
+    assert not any("associate" in line for line in sentences.doubt_of_identities(asked))
 
 
 def test_landmarks_without_a_name_are_counted_and_scored_by_place():
     nameless = with_map(np.arange(4) + FIRST_ANONYMOUS_ID, [0.01, 0.02, 3.0, 0.01])
     sentence = "isam2 found 4 landmarks without a name (identity.unknown.policy); scored by place, as 1, 2 and 4."
-    assert nameless_landmarks(nameless) == [sentence]
+    assert sentences.nameless_landmarks(nameless) == [sentence]
     assert sentence in printed(nameless, 200)
     assert sentence in render_report(nameless)
     table = landmark_table(nameless)
@@ -275,47 +367,55 @@ def test_landmarks_without_a_name_are_counted_and_scored_by_place():
     assert scores["landmarks.raw_m"].value == pytest.approx(np.sqrt((0.01**2 + 0.02**2 + 0.01**2) / 3))
     assert "3 landmarks matched by identity, 3 of them by place within 1 m" in scores["landmarks.raw_m"].protocol
     off = with_map(np.arange(4) + FIRST_ANONYMOUS_ID, [0.01, 0.5, 3.0, 0.01])  # the third is nobody's
-    (line,) = doubt_of_identities(off)
+    (line,) = sentences.doubt_of_identities(off)
     assert "puts landmark 2 far outside its covariance" in line
     unknown = with_map(np.array([1, 2, 3, FIRST_ANONYMOUS_ID]), [0.0] * 4, has_truth=False)
     made_up = (
         "isam2 found 1 landmark without a name (identity.unknown.policy); identities from 3000000000 on are made up."
     )
-    assert nameless_landmarks(unknown) == [made_up]
+    assert sentences.nameless_landmarks(unknown) == [made_up]
     wrong = with_map(np.array([1, 2, 3, 9]), [0.0] * 4)  # merely wrong, and not named by place
-    assert nameless_landmarks(wrong) == []
+    assert sentences.nameless_landmarks(wrong) == []
     scores = landmark_scores(wrong.runs[0].landmarks, wrong.sequence.true_landmarks)
     assert "3 landmarks matched by identity (4 true" in scores["landmarks.raw_m"].protocol
 
 
 def test_of_a_logs_notes_the_doubts_are_said_and_gaps_and_unlikely_numbers_are_warnings():
-    notes = {subject: f"<{subject}>" for subject in SAID_NOTES} | {"log.topics": "imu: /imu", "log.noise": "dvl"}
-    assert [line.partition(": ")[2] for line in doubt_lines(notes)] == [f"<{subject}>" for subject in SAID_NOTES]
-    assert warning_lines(notes) == ["Warning: <log.warnings>", "Warning: <log.gaps>"]
+    notes = {subject: f"<{subject}>" for subject in sentences.SAID_NOTES} | {
+        "log.topics": "imu: /imu",
+        "log.noise": "dvl",
+    }
+    assert [line.partition(": ")[2] for line in sentences.doubt_lines(notes)] == [
+        f"<{subject}>" for subject in sentences.SAID_NOTES
+    ]
+    assert sentences.warning_lines(notes) == ["Warning: <log.warnings>", "Warning: <log.gaps>"]
 
 
 def test_a_line_names_sensor_stamp_reason_distance_and_runs():
     start_ns = basin_comparison(60).sequence.start_ns
     comparison = refusing([outlier(start_ns + 1_234_000_000, 512.6), late(start_ns)], "isam2", "ekf-slam")
-    assert refusal_lines(comparison) == [
+    assert sentences.refusal_lines(comparison) == [
         f"Warning: dvl, 1.234 s: {Refusal.OUTLIER} (squared distance 513); isam2, ekf-slam",
         f"Warning: imu, 0.000 s: {Refusal.LATE}; isam2, ekf-slam",
     ]
     many = refusing([outlier(start_ns + k * NS, 60.0 + k) for k in range(20)], "isam2")
-    assert refusal_lines(many) == [
+    assert sentences.refusal_lines(many) == [
         f"Warning: dvl, 20 rows, 0.000 to 19.000 s: {Refusal.OUTLIER} (squared distance 60 to 79); isam2"
     ]
     own, other = refusing([outlier(0)], "isam2"), refusing([outlier(0, 70.0)], "ekf-slam")
-    assert [line.rsplit("; ")[-1] for line in refusal_lines(with_run(own, other.runs[1]))] == ["isam2", "ekf-slam"]
+    assert [line.rsplit("; ")[-1] for line in sentences.refusal_lines(with_run(own, other.runs[1]))] == [
+        "isam2",
+        "ekf-slam",
+    ]
 
 
 def test_terminal_and_page_say_what_was_refused_and_withheld_and_nothing_where_nothing_was():
     start_ns, calm = basin_comparison(60).sequence.start_ns, basin_comparison(60)
     refused = refusing([outlier(start_ns + NS, 512.6), late(start_ns)], "isam2")
     comparison, line = with_run(refused, replace(refused.runs[0], withheld=[WITHHELD])), f"Warning: isam2: {WITHHELD}"
-    assert withheld_lines(comparison) == [line]
+    assert sentences.withheld_lines(comparison) == [line]
     below, page = printed(comparison, 200), render_report(comparison)
-    assert all(line in below for line in [*refusal_lines(comparison), line])
+    assert all(line in below for line in [*sentences.refusal_lines(comparison), line])
     assert page.index(line) < page.index("<nav")
     section = page[page.index('<h2 id="refused">') : page.index('<h2 id="time">')]
     for word in ("dvl", "1.000", Refusal.OUTLIER, "513", "imu", "0.000", Refusal.LATE, "isam2"):
@@ -324,7 +424,7 @@ def test_terminal_and_page_say_what_was_refused_and_withheld_and_nothing_where_n
     assert 'id="refused"' not in render_report(calm)
     assert "Warning" not in printed(calm, 200)
     messages = [f"{WITHHELD} {k}" for k in range(MOST_ROWS_NAMED + 2)]
-    lines = withheld_lines(with_run(calm, replace(calm.runs[0], withheld=messages)))
+    lines = sentences.withheld_lines(with_run(calm, replace(calm.runs[0], withheld=messages)))
     assert len(lines) == MOST_ROWS_NAMED + 1
     assert lines[-1] == "Warning: isam2 withheld 2 more: runs/isam2/result.json has all"
-    assert withheld_lines(calm) == []
+    assert sentences.withheld_lines(calm) == []
