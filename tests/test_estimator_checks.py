@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from itertools import count
 from typing import Any
 
@@ -91,138 +92,110 @@ class PlainDeadReckoning:
         return Estimate(stamp_ns, self._carried(stamp_ns), 1e-4 * np.eye(6))
 
 
-class NeedsASetting(PlainDeadReckoning):
-    class Params(Section):
-        gain: float
+def shifted(pose: gtsam.Pose3, step_m: float) -> gtsam.Pose3:
+    return pose.compose(gtsam.Pose3(gtsam.Rot3(), np.array([step_m, 0.0, 0.0])))
 
 
-class KnowsTooEarly(PlainDeadReckoning):
-    def landmarks(self) -> LandmarkMap:
-        return LandmarkMap(np.array([4]), np.zeros((1, 3)), np.eye(3)[None])
+def moving_at_each(method: str, step_m: float) -> dict[str, Any]:
+    def moving(self: PlainDeadReckoning, *arguments: Any) -> Any:
+        self.pose = shifted(self.pose, step_m)
+        return getattr(PlainDeadReckoning, method)(self, *arguments)
+
+    return {method: moving}
 
 
-class AnswersForAnotherInstant(PlainDeadReckoning):
-    def _estimate(self, stamp_ns: int) -> Estimate:
-        return super()._estimate(stamp_ns - 1)
+def driving(turn: float = 1.0, creep_m_s: float = 0.0) -> dict[str, Any]:
+    """Another rate about the vertical, or another speed, than was measured."""
+
+    def carried(self: PlainDeadReckoning, stamp_ns: int) -> gtsam.Pose3:
+        other = copy(self)
+        other.rate, other.velocity = self.rate * [1, 1, turn], self.velocity + np.array([creep_m_s, 0.0, 0.0])
+        return PlainDeadReckoning._carried(other, stamp_ns)
+
+    return {"_carried": carried}
 
 
-class NeverAnswers(PlainDeadReckoning):
-    def process(self, measurements: Measurements) -> None:
-        super().process(measurements)
+def answering(covariance: Any, late_ns: int = 0) -> dict[str, Any]:
+    """Another covariance, by the number of estimates before, or another stamp."""
+
+    def estimate(self: PlainDeadReckoning, stamp_ns: int) -> Estimate:
+        return Estimate(stamp_ns + late_ns, self._carried(stamp_ns), covariance(len(self.estimates)))
+
+    return {"_estimate": estimate}
 
 
-class AnswersWithoutDvl(PlainDeadReckoning):
-    def __init__(self, calibration: Calibration, params: Any = None) -> None:
-        super().__init__(calibration, params)
-        self.velocity = np.zeros(3)
+class NeedsASetting(Section):
+    gain: float
 
 
-class SkewCovariance(PlainDeadReckoning):
-    def _estimate(self, stamp_ns: int) -> Estimate:
-        skew = np.eye(6)
-        skew[0, 1] = 0.1
-        return Estimate(stamp_ns, super()._estimate(stamp_ns).world_T_body, skew)
+def see_to_the_right(self: PlainDeadReckoning, block: LandmarkDetections, i: int) -> None:
+    block.azimuth_rad[i] *= -1
+    PlainDeadReckoning._see(self, block, i)
+    block.azimuth_rad[i] *= -1
 
 
-class ForgetsItsFirstPose(PlainDeadReckoning):
-    def trajectory(self) -> Trajectory:
-        return Trajectory.from_estimates(self.estimates[1:])
+def unsorted_map(self: PlainDeadReckoning) -> LandmarkMap:
+    found = PlainDeadReckoning.landmarks(self)
+    return LandmarkMap(found.ids[::-1], found.positions[::-1], found.covariances[::-1])
 
 
-class TurnsRight(PlainDeadReckoning):
-    def _carried(self, stamp_ns: int) -> gtsam.Pose3:
-        rate, self.rate = self.rate, self.rate * [1, 1, -1]
-        pose = super()._carried(stamp_ns)
-        self.rate = rate
-        return pose
+def only_used(self: PlainDeadReckoning) -> DetectionLog:
+    self.log = [row for row in self.log if row[2] is Outcome.USED]
+    return PlainDeadReckoning.detections(self)
 
 
-class AzimuthToTheRight(PlainDeadReckoning):
-    def _see(self, block: LandmarkDetections, i: int) -> None:
-        block.azimuth_rad[i] *= -1
-        super()._see(block, i)
-        block.azimuth_rad[i] *= -1
+def write_into_input(self: PlainDeadReckoning, measurements: Measurements) -> Estimate | None:
+    if measurements.dvl:
+        measurements.dvl.velocity[0, 0] += 1e-9
+    return PlainDeadReckoning.process(self, measurements)
 
 
-class UnsortedMap(PlainDeadReckoning):
-    def landmarks(self) -> LandmarkMap:
-        sorted_map = super().landmarks()
-        return LandmarkMap(sorted_map.ids[::-1], sorted_map.positions[::-1], sorted_map.covariances[::-1])
+def begin_anew(**values: Any) -> dict[str, Any]:
+    """Another state at the beginning; ``pose`` by the number of instances before."""
+    made = count()
+
+    def init(self: PlainDeadReckoning, *arguments: Any) -> None:
+        PlainDeadReckoning.__init__(self, *arguments)
+        vars(self).update(values)
+        self.pose = shifted(self.pose, values.get("step_m", 0.0) * next(made))
+
+    return {"__init__": init}
 
 
-class SilentAboutRefusals(PlainDeadReckoning):
-    def detections(self) -> DetectionLog:
-        self.log = [row for row in self.log if row[2] is Outcome.USED]
-        return super().detections()
+def known_too_early(_: object) -> LandmarkMap:
+    return LandmarkMap(np.array([4]), np.zeros((1, 3)), np.eye(3)[None])
 
 
-class DiffersFromRunToRun(PlainDeadReckoning):
-    runs = count()
-
-    def __init__(self, calibration: Calibration, params: Any = None) -> None:
-        super().__init__(calibration, params)
-        self.pose = self.pose.compose(gtsam.Pose3(gtsam.Rot3(), np.array([1e-12 * next(self.runs), 0.0, 0.0])))
-
-
-class MovesWhenAsked(PlainDeadReckoning):
-    def trajectory(self) -> Trajectory:
-        path = super().trajectory()
-        self.pose = self.pose.compose(gtsam.Pose3(gtsam.Rot3(), np.array([1e-4, 0.0, 0.0])))
-        return path
-
-
-class MovesWithEachCall(PlainDeadReckoning):
-    step_m = 1e-4
-
-    def process(self, measurements: Measurements) -> Estimate | None:
-        self.pose = self.pose.compose(gtsam.Pose3(gtsam.Rot3(), np.array([self.step_m, 0.0, 0.0])))
-        return super().process(measurements)
-
-
-class MovesALittleWithEachCall(MovesWithEachCall):
-    step_m = 1e-8
-
-
-class SurerWithEachCall(PlainDeadReckoning):
-    def _estimate(self, stamp_ns: int) -> Estimate:
-        return Estimate(stamp_ns, self._carried(stamp_ns), 1e-4 * np.eye(6) / (1 + len(self.estimates)))
-
-
-class WritesIntoItsInput(PlainDeadReckoning):
-    def process(self, measurements: Measurements) -> Estimate | None:
-        if measurements.dvl:
-            measurements.dvl.velocity[0, 0] += 1e-9
-        return super().process(measurements)
-
-
-class CreepsForward(PlainDeadReckoning):
-    def _carried(self, stamp_ns: int) -> gtsam.Pose3:
-        velocity, self.velocity = self.velocity, self.velocity + np.array([1e-3, 0.0, 0.0])
-        pose = super()._carried(stamp_ns)
-        self.velocity = velocity
-        return pose
-
-
-BROKEN: list[tuple[type[PlainDeadReckoning], Check]] = [
-    (NeedsASetting, laws.settings_have_defaults),
-    (KnowsTooEarly, laws.knows_nothing_before_the_first_measurement),
-    (AnswersForAnotherInstant, laws.answers_from_the_first_imu_and_dvl_on),
-    (NeverAnswers, laws.answers_from_the_first_imu_and_dvl_on),
-    (AnswersWithoutDvl, laws.answers_from_the_first_imu_and_dvl_on),
-    (SkewCovariance, laws.covariances_are_covariances),
-    (ForgetsItsFirstPose, laws.trajectory_has_the_instants_of_the_estimates),
-    (TurnsRight, laws.frames_and_signs_are_those_of_the_vocabulary),
-    (AzimuthToTheRight, laws.frames_and_signs_are_those_of_the_vocabulary),
-    (UnsortedMap, laws.landmarks_are_sorted_and_unique),
-    (SilentAboutRefusals, laws.every_detection_has_an_outcome),
-    (DiffersFromRunToRun, laws.same_input_gives_same_output),
-    (MovesWhenAsked, laws.asking_changes_nothing),
-    (MovesWithEachCall, laws.live_agrees_with_replay),
-    (SurerWithEachCall, laws.live_agrees_with_replay),
-    (MovesALittleWithEachCall, laws.live_equals_replay),
-    (WritesIntoItsInput, laws.input_stays_as_it_was),
-    (CreepsForward, laws.still_vehicle_stays_still),
+STILL_CREEPS = driving(creep_m_s=1e-3)
+BROKEN: list[tuple[str, Check, dict[str, Any]]] = [
+    ("needs a setting", laws.settings_have_defaults, {"Params": NeedsASetting}),
+    ("knows too early", laws.knows_nothing_before_the_first_measurement, {"landmarks": known_too_early}),
+    ("answers for another instant", laws.answers_from_the_first_imu_and_dvl_on, answering(lambda _: np.eye(6), -1)),
+    ("never answers", laws.answers_from_the_first_imu_and_dvl_on, {"process": lambda *_: None}),
+    ("answers without DVL", laws.answers_from_the_first_imu_and_dvl_on, begin_anew(velocity=np.zeros(3))),
+    ("skew covariance", laws.covariances_are_covariances, answering(lambda _: np.eye(6) + 0.1 * np.eye(6, k=1))),
+    (
+        "forgets its first pose",
+        laws.trajectory_has_the_instants_of_the_estimates,
+        {"trajectory": lambda self: Trajectory.from_estimates(self.estimates[1:])},
+    ),
+    ("turns right", laws.frames_and_signs_are_those_of_the_vocabulary, driving(turn=-1.0)),
+    ("azimuth to the right", laws.frames_and_signs_are_those_of_the_vocabulary, {"_see": see_to_the_right}),
+    ("unsorted map", laws.landmarks_are_sorted_and_unique, {"landmarks": unsorted_map}),
+    ("silent about refusals", laws.every_detection_has_an_outcome, {"detections": only_used}),
+    ("differs from run to run", laws.same_input_gives_same_output, begin_anew(step_m=1e-12)),
+    ("moves when asked", laws.asking_changes_nothing, moving_at_each("trajectory", 1e-4)),
+    ("moves with each call", laws.live_agrees_with_replay, moving_at_each("process", 1e-4)),
+    ("surer with each call", laws.live_agrees_with_replay, answering(lambda n: 1e-4 * np.eye(6) / (1 + n))),
+    ("moves a little with each call", laws.live_equals_replay, moving_at_each("process", 1e-8)),
+    ("writes into its input", laws.input_stays_as_it_was, {"process": write_into_input}),
+    ("creeps forward", laws.still_vehicle_stays_still, STILL_CREEPS),
 ]
+
+
+def but(methods: dict[str, Any]) -> type[PlainDeadReckoning]:
+    """Plain dead reckoning, but for some methods."""
+    return type("But", (PlainDeadReckoning,), methods)
 
 
 ALL_CHECKS = (*CHECKS, *FILTER_CHECKS)
@@ -233,58 +206,39 @@ def test_estimator_that_keeps_the_contract_passes(check):
     check(PlainDeadReckoning)
 
 
-@pytest.mark.parametrize(("broken", "check"), BROKEN, ids=lambda part: part.__name__)
-def test_broken_estimator_fails_the_check_meant_for_it(broken, check):
+@pytest.mark.parametrize(("check", "methods"), [row[1:] for row in BROKEN], ids=[row[0] for row in BROKEN])
+def test_broken_estimator_fails_the_check_meant_for_it(check, methods):
     with pytest.raises(ContractError):
-        check(broken)
+        check(but(methods))
+    assert {check for _, check, _ in BROKEN} == set(ALL_CHECKS)
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("check", ALL_CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.parametrize("name", ["dead-reckoning", "ekf-slam", "invariant-ekf", "isam2"])
 def test_estimators_that_come_along_keep_the_contract(name, check):
-    check(load_estimator(name))
+    if name != "isam2" or check not in FILTER_CHECKS:  # a smoother iterates
+        check(load_estimator(name))
 
 
-@pytest.mark.parametrize("check", FILTER_CHECKS, ids=lambda check: check.__name__)
-@pytest.mark.parametrize("name", ["dead-reckoning", "ekf-slam", "invariant-ekf"])
-def test_filters_that_come_along_do_not_care_how_rows_are_cut(name, check):
-    check(load_estimator(name))
-
-
-def test_every_check_has_an_estimator_that_fails_it():
-    assert {check for _, check in BROKEN} == set(ALL_CHECKS)
-
-
-def test_first_violation_is_named():
+def test_the_first_violation_is_named_and_so_is_an_estimator_that_raises():
     check_estimator(PlainDeadReckoning)
     with pytest.raises(ContractError, match="still_vehicle_stays_still: a still vehicle drifts by"):
-        check_estimator(CreepsForward)
+        check_estimator(but(STILL_CREEPS))
+    with pytest.raises(ContractError, match=r"\w+: the estimator raised TypeError: .*may be None"):
+        check_estimator(but({"process": lambda _, measurements: len(measurements.dvl)}))
 
 
 @pytest.mark.parametrize(
-    ("spoil", "complaint"),
+    ("covariance", "complaint"),
     [
-        (lambda p: p[:5], "shape"),
-        (lambda p: p * np.nan, "not finite"),
-        (lambda p: p + np.triu(np.ones((6, 6)), 1), "not symmetric"),
-        (lambda p: -p, "negative eigenvalue"),
+        (np.eye(6)[:5], "shape"),
+        (np.eye(6) * np.nan, "not finite"),
+        (np.triu(np.ones((6, 6))), "not symmetric"),
+        (-np.eye(6), "negative eigenvalue"),
     ],
 )
-def test_what_is_no_covariance_is_refused(spoil, complaint):
+def test_what_is_no_covariance_is_refused(covariance, complaint):
     require_covariance(np.eye(6), 6, "P")
     require_covariance(np.zeros((6, 6)), 6, "P")
     with pytest.raises(ContractError, match=complaint):
-        require_covariance(spoil(np.eye(6)), 6, "P")
-
-
-class Careless(PlainDeadReckoning):
-    """Takes every block for present."""
-
-    def process(self, measurements: Measurements) -> Estimate | None:
-        len(measurements.dvl)  # type: ignore[arg-type]
-        return super().process(measurements)
-
-
-def test_an_estimator_that_raises_is_named_with_the_check():
-    with pytest.raises(ContractError, match=r"\w+: the estimator raised TypeError: .*may be None"):
-        check_estimator(Careless)
+        require_covariance(covariance, 6, "P")

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -60,44 +59,35 @@ USUAL_SPEED_M_S = 3.0
 HIGH_PERCENTILE = 95.0
 
 
-class WrongUnit(NamedTuple):
-    """A quantity in an implausible unit, and the line that corrects it."""
-
-    quantity: str
-    advice: str
-
-
-def wrong_units(sequence: Sequence, config: LogConfig) -> list[WrongUnit]:
+def wrong_units(sequence: Sequence, config: LogConfig) -> list[Finding]:
     """Velocities, rates and specific forces in an implausible unit; the configured scales enter the advice."""
-    found: list[WrongUnit] = []
+    advice: dict[str, str] = {}
     speed_m_s = _exceeded_by_few(sequence.dvl.velocity)
     if speed_m_s > FASTEST_M_S:
         unit = next((unit for unit, factor in SPEEDS.items() if speed_m_s * factor <= USUAL_SPEED_M_S), "mm/s")
         scale = float(config.table("dvl").get("scale", 1.0)) * SPEEDS[unit]
-        advice = (
+        advice["DVL: unit"] = (
             f"velocities look {1 / SPEEDS[unit]:.0f} times too large (up to {speed_m_s:.3g} m/s): {unit}? "
             f"`scale = {scale:.4g}` under [dvl] {IN_LOG_CONFIG}"
         )
-        found.append(WrongUnit("DVL: unit", advice))
     rate_rad_s = _exceeded_by_few(sequence.imu.angular_velocity)
     if rate_rad_s > FASTEST_TURN_RAD_S:
         scale = float(config.table("imu").get("angular_velocity_scale", 1.0)) * np.radians(1.0)
-        advice = (
+        advice["gyro: unit"] = (
             f"rates look 57 times too large (up to {rate_rad_s:.3g} rad/s): degrees a second? "
             f"`angular_velocity_scale = {scale:.5g}` under [imu] {IN_LOG_CONFIG}"
         )
-        found.append(WrongUnit("gyro: unit", advice))
     forces, gravity = _lengths(sequence.imu.specific_force), sequence.calibration.gravity_m_s2
     typical = float(np.median(forces)) if len(forces) else 0.0
     unit = min(FORCES, key=lambda unit: abs(typical * FORCES[unit] - gravity))
     if len(forces) and not abs(typical * FORCES[unit] / gravity - 1) > SHARE_OF_GRAVITY:
         scale = float(config.table("imu").get("linear_acceleration_scale", 1.0)) * FORCES[unit]
-        advice = (
+        advice["accelerometer: unit"] = (
             f"specific forces are typically {typical:.4g} instead of {gravity:.4g} m/s²: {unit}? "
             f"`linear_acceleration_scale = {scale:.6g}` under [imu] {IN_LOG_CONFIG}"
         )
-        found.append(WrongUnit("accelerometer: unit", advice))
-    return found
+    unknown = Estimate1D(np.nan, np.inf, "wrong unit")
+    return [Finding(quantity, unknown, "", line, acts=True) for quantity, line in advice.items()]
 
 
 def _exceeded_by_few(vectors: Floats) -> float:
@@ -135,10 +125,8 @@ def check_sensors(sequence: Sequence, config: LogConfig | None = None) -> list[F
         Log configuration of the reading; corrections are added to it.
     """
     config = config or LogConfig()
-    faults = wrong_units(sequence, config)
-    if faults:
-        unknown = Estimate1D(np.nan, np.inf, "wrong unit")
-        return [Finding(quantity, unknown, "", advice, acts=True) for quantity, advice in faults]
+    if faults := wrong_units(sequence, config):
+        return faults
     imu, dvl = sequence.imu, sequence.dvl
     first_ns, last_ns = max(imu.stamps_ns[0], dvl.stamps_ns[0]), min(imu.stamps_ns[-1], dvl.stamps_ns[-1])
     spare_ns = (int(last_ns - first_ns) - round(LONGEST_S * NS_PER_S)) // 2

@@ -26,9 +26,10 @@ from sonar_graph.navigation.preintegration.dvl_gaps import gap_values
 from sonar_graph.navigation.preintegration.motion import Preintegrator
 from sonar_graph.navigation.preintegration.recursion import NO_MOTION, in_last_frame
 from sonar_graph.numerics.jit import compiled
+from sonar_graph.numerics.mat3 import matrix, vector
 from sonar_graph.sequence import NS_PER_S
 
-from .filters import motion_of
+from .filters import motion_of, rotation
 
 T0_NS, SECONDS = 1_700_000_000 * NS_PER_S, 2.0
 LEVER, GYRO_DENSITY = (-0.2, 0.1, -0.15), 1e-3
@@ -283,8 +284,8 @@ def up_measured(columns, vehicle, motion, clock, interval):
     return up_at_node(columns, vehicle, motion, clock, interval)
 
 
-def test_gravity_has_the_velocity_noise_of_both_ends():
-    """Level and at rest; sigma as the theory page has it. A node before the interval is over measures nothing."""
+def test_gravity_is_that_of_a_turning_vehicle_with_the_velocity_noise_of_both_ends():
+    """Level at first; sigma as the theory page has it. A node before the interval is over measures nothing."""
     duration_s = 2.0
     imu_ns = T0_NS + np.arange(4) * NS_PER_S
     dvl_ns = T0_NS + np.array([0, round(duration_s * NS_PER_S)])
@@ -294,14 +295,16 @@ def test_gravity_has_the_velocity_noise_of_both_ends():
     )
     clock, interval = np.array([T0_NS, 0, 7, 7, 0]), an_interval()
     open_interval(columns, IMU_LEVER, interval, clock)
-    assert np.isnan(up_measured(columns, model, NO_MOTION, clock, interval)[1])
+    one, other = rotation([0.4, 0.0, 0.1]), rotation([0.0, 0.3, 0.5])
+    motion = NO_MOTION._replace(dR=matrix(one), impulse=(0.0, 0.0, 0.8 * GRAVITY))
+    assert np.isnan(up_measured(columns, model, motion, clock, interval)[1])
     clock[NODE] = dvl_ns[1]
-    motion = NO_MOTION._replace(impulse=(0.0, 0.0, GRAVITY * duration_s))
+    motion = NO_MOTION._replace(dR=matrix(other), impulse=vector(one.T @ [0.0, 0.0, (duration_s - 0.8) * GRAVITY]))
     up, sigma = up_measured(columns, model, motion, clock, interval)
     velocity_noise = VARIANCES.mean(axis=1).sum()
     tilt = (model.accel_noise_density**2 / duration_s + velocity_noise / duration_s**2) / GRAVITY**2
     tilt += model.gyro_noise_density**2 * duration_s / 3 + (model.gyro_bias_sigma * duration_s) ** 2 / 4
     assert sigma**2 == pytest.approx(tilt, rel=1e-9)
-    assert_allclose(up, [0.0, 0.0, 1.0], atol=1e-12)
+    assert_allclose(up, (one @ other)[2], atol=1e-12)
     assert clock[OPENED] == dvl_ns[1]
     assert interval.velocity[3] == pytest.approx(VARIANCES[1].mean())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sonar_graph.calibration import STANDARD_GRAVITY, Calibration, ImuCalibration, Start
 from sonar_graph.diagnosis.findings import (
+    Finding,
     StartHeading,
     StartTilt,
     bias_findings,
@@ -43,8 +45,14 @@ def match(lever: tuple[Estimate1D, ...], bias: tuple[Estimate1D, ...] = (UNKNOWN
     return DvlMatch(UNKNOWN, UNKNOWN, UNKNOWN, lever, bias)  # type: ignore[arg-type]
 
 
-def arm(*values: float, sigma: float = 0.01) -> tuple[Estimate1D, ...]:
+def arm(*values: float, sigma: float = 0.01) -> Any:
+    """Estimates of as many numbers."""
     return tuple(Estimate1D(value, sigma) for value in values)
+
+
+def lines_of(row: Finding) -> list[dict[str, Any]]:
+    """The two lines of an advice."""
+    return [tomllib.loads(line) for line in row.advice.split("`")[1::2]]
 
 
 def test_either_line_makes_the_arm_of_the_calibration_the_one_found():
@@ -54,57 +62,46 @@ def test_either_line_makes_the_arm_of_the_calibration_the_one_found():
     assert "not the calibration's -1.50 m" in texts[0]
     assert texts[1] == "+0.110 ± 0.020 m: the calibration's +0.10 m fits, no need to act"
     assert texts[2] == "+0.900 ± 0.020 m: put right by the line above"
-    _, imu_line, _, dvl_line, _ = rows[0].advice.split("`")
-    imu, dvl = (tomllib.loads(line) for line in (imu_line, dvl_line))
+    imu, dvl = lines_of(rows[0])
     places = [imu["imu"]["mounting"]["translation_m"], dvl["dvl"]["mounting"]["translation_m"]]
     assert np.subtract((-1.0, 0.2, 0.3), places[0]) == pytest.approx([-0.2, 0.1, 0.9])
     assert np.subtract(places[1], (0.5, 0.1, 0.0)) == pytest.approx([-0.2, 0.1, 0.9])
     assert with_fitted(match(arm(-0.2, 0.11, 0.9)), GIVEN).imu.mounting.translation_m == pytest.approx(places[0])
 
 
-def test_an_axis_that_cannot_be_told_keeps_the_place_of_the_calibration():
+def test_an_axis_that_cannot_be_told_keeps_the_place_and_where_none_can_one_row_says_why():
     rows = lever_findings(match((UNKNOWN, *arm(0.6, 0.3))), GIVEN)
     assert rows[0].text() == "cannot be told: too little turning"
     assert [row.acts for row in rows] == [False, True, False]
     assert "`imu.mounting.translation_m = [0.500, -0.400, 0.000]`" in rows[1].advice
-
-
-@pytest.mark.parametrize(("error_m", "sigma_m", "acts"), [(0.04, 0.01, False), (0.06, 0.01, True), (0.5, 0.3, False)])
-def test_an_arm_matters_by_centimetres_and_only_beyond_its_interval(error_m: float, sigma_m: float, acts: bool):
-    (row, *_) = lever_findings(match(arm(-1.5 + error_m, 0.1, 0.3, sigma=sigma_m)), GIVEN)
-    assert row.acts == acts
-
-
-def biases(*values: float, sigma: float = 1e-5) -> tuple[Estimate1D, Estimate1D, Estimate1D]:
-    x, y, z = (Estimate1D(value, sigma) for value in values)
-    return x, y, z
-
-
-def test_a_bias_beyond_its_sigma_asks_for_one_that_holds_the_largest():
-    sources = ("from 20 s of rest", "from turns", "from turns")
-    rows = bias_findings(biases(1e-3, 1.5e-4, -4e-3), sources, GIVEN.imu)
-    assert [row.acts for row in rows] == [True, False, True]
-    assert "from 20 s of rest" in rows[0].text()
-    assert tomllib.loads(rows[0].advice.split("`")[1]) == {"imu": {"gyro_bias_sigma": 0.004}}
-    assert rows[2].advice == "put right by the line above"
-    changed = with_fitted(match(arm(-1.5, 0.1, 0.3), biases(1e-3, 1.5e-4, -4e-3)), GIVEN).imu
-    assert changed.gyro_bias_sigma == 0.004
-    assert not any(row.acts for row in bias_findings(biases(1e-3, 1.5e-4, -4e-3), sources, changed))
-    fibre = ImuCalibration(gyro_bias_sigma=3e-6)  # the rotation of the Earth is no fault of a gyro
-    assert not any(row.acts for row in bias_findings(biases(7.3e-5, 0.0, -7.3e-5), sources, fibre))
-    assert bias_findings(biases(1.2e-4, 0.0, 0.0), sources, fibre)[0].acts
-
-
-def test_where_no_axis_can_be_told_one_row_says_why():
     rows = [*lever_findings(match((UNKNOWN,) * 3), GIVEN), *bias_findings((UNKNOWN,) * 3, ("",) * 3, GIVEN.imu)]
     assert [row.quantity for row in rows] == ["lever arm from IMU to DVL", "gyro bias"]
     assert [row.text() for row in rows] == ["cannot be told: too little turning"] * 2
     assert with_fitted(match((UNKNOWN,) * 3), GIVEN) == GIVEN
 
 
-def test_digits_are_those_that_the_interval_supports():
-    assert with_interval(Estimate1D(1.0312345, 0.0102), "s") == "+1.031 ± 0.020 s"
+@pytest.mark.parametrize(("error_m", "sigma_m", "acts"), [(0.04, 0.01, False), (0.06, 0.01, True), (0.5, 0.3, False)])
+def test_an_arm_matters_by_centimetres_and_only_beyond_its_interval(error_m: float, sigma_m: float, acts: bool):
+    (row, *_) = lever_findings(match(arm(-1.5 + error_m, 0.1, 0.3, sigma=sigma_m)), GIVEN)
+    assert row.acts == acts
+    assert with_interval(Estimate1D(1.0312345, 0.0102), "s") == "+1.031 ± 0.020 s", "digits that the interval supports"
     assert with_interval(Estimate1D(1.00213, 0.0011), "") == "1.0021 ± 0.0022"
+
+
+def test_a_bias_beyond_its_sigma_asks_for_one_that_holds_the_largest():
+    sources = ("from 20 s of rest", "from turns", "from turns")
+    biases = arm(1e-3, 1.5e-4, -4e-3, sigma=1e-5)
+    rows = bias_findings(biases, sources, GIVEN.imu)
+    assert [row.acts for row in rows] == [True, False, True]
+    assert "from 20 s of rest" in rows[0].text()
+    assert lines_of(rows[0])[0] == {"imu": {"gyro_bias_sigma": 0.004}}
+    assert rows[2].advice == "put right by the line above"
+    changed = with_fitted(match(arm(-1.5, 0.1, 0.3), biases), GIVEN).imu
+    assert changed.gyro_bias_sigma == 0.004
+    assert not any(row.acts for row in bias_findings(biases, sources, changed))
+    fibre = ImuCalibration(gyro_bias_sigma=3e-6)  # the rotation of the Earth is no fault of a gyro
+    assert not any(row.acts for row in bias_findings(arm(7.3e-5, 0.0, -7.3e-5, sigma=1e-5), sources, fibre))
+    assert bias_findings(arm(1.2e-4, 0.0, 0.0, sigma=1e-5), sources, fibre)[0].acts
 
 
 ROLL, PITCH, BIAS = 0.12, -0.07, np.array([3e-4, -2e-4, 1e-4])
@@ -126,12 +123,16 @@ def resting(rest_s: float, duration_s: float = 60.0, lay_s: float = 0.0) -> Sequ
     return Sequence("by hand", Calibration(), Imu(imu_ns, rate, force), dvl)
 
 
+def assert_tilt(found: StartTilt, roll_pitch: tuple[float, float]) -> None:
+    for axis, true in enumerate(roll_pitch):
+        assert abs(found.angle(axis).value - true) < 4 * found.angle(axis).sigma < 0.01
+
+
 @pytest.mark.parametrize(("rest_s", "used"), [(15.0, 10), (50.0, 40)])
 def test_a_rest_at_the_start_is_used_as_long_as_it_lasts(rest_s: float, used: int):
     found = find_start_tilt(resting(rest_s))
     assert found.said == f"from {used} s of rest"
-    for axis, true in enumerate((ROLL, PITCH)):
-        assert abs(found.angle(axis).value - true) < 4 * found.angle(axis).sigma < 0.01
+    assert_tilt(found, (ROLL, PITCH))
     bias = found.gyro_bias()
     assert bias is not None
     for one, true in zip(bias, BIAS, strict=True):
@@ -148,8 +149,7 @@ def test_without_a_rest_that_the_doppler_log_confirms_the_first_minute_in_motion
         found = find_start_tilt(sequence)
         assert found.said.endswith("s in motion")
         assert found.gyro_bias() is None
-        for axis, true in enumerate(rpy):
-            assert abs(found.angle(axis).value - true) < 4 * found.angle(axis).sigma < 0.01
+        assert_tilt(found, rpy)
 
 
 def test_a_start_that_contradicts_is_named_with_the_line_that_puts_it_right():
@@ -158,8 +158,7 @@ def test_a_start_that_contradicts_is_named_with_the_line_that_puts_it_right():
     assert [row.acts for row in rows] == [True, False]
     assert "from 40 s of rest, not the calibration's +0.00°" in rows[0].text()
     assert "the calibration's -4.01° fits, no need to act" in rows[1].text()
-    _, rpy_line, _, sigma_line, _ = rows[0].advice.split("`")
-    rpy, sigma = (tomllib.loads(line)["start"] for line in (rpy_line, sigma_line))
+    rpy, sigma = (line["start"] for line in lines_of(rows[0]))
     assert rpy["rpy_rad"] == pytest.approx([ROLL, PITCH, 0.9], abs=5e-3)
     assert sigma["rpy_sigma_rad"] == pytest.approx([found.angle(0).sigma, found.angle(1).sigma, 1e-3], rel=0.05)
     right = Start(rpy_rad=tuple(rpy["rpy_rad"]), rpy_sigma_rad=tuple(sigma["rpy_sigma_rad"]))
@@ -211,11 +210,11 @@ def test_a_wrong_heading_has_the_roll_and_pitch_of_the_alignment_also_where_the_
     heading = StartHeading((ROLL - 0.04, PITCH + 0.03, 0.9), (1.0, 2.0, -3.0), Estimate1D(0.2, 0.002))
     assert not any(row.acts for row in tilt_findings(found, Start(rpy_rad=(ROLL, PITCH, 0.7)), 0.9))
     row = heading.finding(found)
-    _, rpy_line, _, place_line, _ = row.advice.split("`")
+    rpy, place = (line["start"] for line in lines_of(row))
     expected = [found.angle(0).value, found.angle(1).value, 0.9]
-    assert tomllib.loads(rpy_line)["start"]["rpy_rad"] == pytest.approx(expected, abs=1e-4)
-    assert tomllib.loads(place_line)["start"]["position_m"] == [1.0, 2.0, -3.0]
+    assert rpy["rpy_rad"] == pytest.approx(expected, abs=1e-4)
+    assert place["position_m"] == [1.0, 2.0, -3.0]
     assert "with roll and pitch from 40 s of rest" in row.text()
     alone = heading.finding(StartTilt(None, "no rows"))
-    assert tomllib.loads(alone.advice.split("`")[1])["start"]["rpy_rad"] == pytest.approx(heading.rpy_rad, abs=1e-4)
+    assert lines_of(alone)[0]["start"]["rpy_rad"] == pytest.approx(heading.rpy_rad, abs=1e-4)
     assert "roll and pitch" not in alone.text()

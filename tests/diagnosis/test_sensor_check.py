@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from sonar_graph.calibration import Calibration
 from sonar_graph.diagnosis.findings import Finding, StartTilt, find_start_tilt
 from sonar_graph.diagnosis.sensor_check import (
-    WrongUnit,
     check_sensors,
     corrected_sequence,
     dvl_findings,
@@ -28,12 +27,20 @@ from sonar_graph.navigation.alignment.gravity import InitialTilt
 from sonar_graph.navigation.alignment.time_offset import Estimate1D
 from sonar_graph.sequence import Sequence
 from sonar_graph.simulation.mission import MissionOptions, simulate_mission
+from sonar_graph.states import Trajectory
 
 RIGHT = simulate_mission(MissionOptions(seed=4, duration_s=240, landmarks=1))
 SHORT = simulate_mission(MissionOptions(seed=4, duration_s=120, landmarks=1))
 OFFSET_S, YAW_RAD, SCALE = 0.4, np.radians(5), 1.04
 FAR_M = (0.9, 0.0, -0.7)
 """Where a calibration has the IMU that is at the origin; the Doppler log is at (-0.2, 0, -0.15) from it."""
+
+
+def with_rows(rate: Floats, force: Floats, velocity: Floats) -> Sequence:
+    """The mission with other rows: the IMU at 100 Hz, the Doppler log at 5 Hz."""
+    imu = Imu(np.arange(len(rate)) * 10_000_000, rate, force + np.array([0, 0, 9.80665]))
+    dvl = Dvl(np.arange(len(velocity)) * 200_000_000, velocity, np.full((len(velocity), 3, 3), np.nan))
+    return replace(RIGHT, imu=imu, dvl=dvl, truth=None)
 
 
 def by_name(findings: list[Finding]) -> dict[str, Finding]:
@@ -57,6 +64,17 @@ def with_mounting(run: Sequence, sensor: str, **change: tuple[float, ...]) -> Se
     section = getattr(run.calibration, sensor)
     moved = section.model_copy(update={"mounting": section.mounting.model_copy(update=change)})
     return replace(run, calibration=run.calibration.model_copy(update={sensor: moved}))
+
+
+def start_of(run: Sequence, reference: Trajectory) -> tuple[float, float, float]:
+    """Roll, pitch and yaw at the start."""
+    yaw, pitch, roll = reference.at(np.array([run.start_ns])).rotations().as_euler("ZYX")[0].tolist()
+    return roll, pitch, yaw
+
+
+def started_at(run: Sequence, *rpy_rad: float) -> Sequence:
+    start = run.calibration.start.model_copy(update={"rpy_rad": rpy_rad})
+    return replace(run, calibration=run.calibration.model_copy(update={"start": start}))
 
 
 def line_of(finding: Finding) -> dict[str, Any]:
@@ -92,10 +110,8 @@ def test_the_advised_lines_put_the_log_right(found_in_spoilt: dict[str, Finding]
 
 def test_the_start_is_aligned_with_what_was_found_before(found_in_spoilt: dict[str, Finding]):
     """With stamps half a second off, velocities and accelerations differ too much for an alignment."""
-    assert RIGHT.truth is not None
-    _, pitch, roll = RIGHT.truth.at(np.array([RIGHT.start_ns])).rotations().as_euler("ZYX", degrees=True)[0]
-    assert found_in_spoilt["start roll: value"].estimate.value == pytest.approx(roll, abs=0.1)
-    assert found_in_spoilt["start pitch: value"].estimate.value == pytest.approx(pitch, abs=0.1)
+    for name, angle in zip(("roll", "pitch"), np.degrees(start_of(RIGHT, RIGHT.truth)[:2]), strict=True):
+        assert found_in_spoilt[f"start {name}: value"].estimate.value == pytest.approx(angle, abs=0.1)
     assert find_start_tilt(spoilt()).tilt is None
 
 
@@ -113,26 +129,19 @@ def test_corrections_are_added_to_what_the_configuration_says_and_a_wrong_unit_i
 
 def test_a_start_taken_from_a_late_reference_is_named_with_the_right_one():
     """The vehicle turns at the start: half a second late is some degrees off."""
-    assert SHORT.truth is not None
     late = replace(SHORT.truth, stamps_ns=SHORT.truth.stamps_ns + 500_000_000)
-    turning = replace(SHORT, truth=late)
-    first_ns = turning.start_ns + 20_000_000_000
-    turning = replace(turning, imu=SHORT.imu.rows(SHORT.imu.stamps_ns >= first_ns))
+    is_left = SHORT.imu.stamps_ns >= SHORT.start_ns + 20_000_000_000
+    turning = replace(SHORT, truth=late, imu=SHORT.imu.rows(is_left))
     for reference, acts in ((late, True), (SHORT.truth, False)):
-        yaw, pitch, roll = reference.at(np.array([turning.start_ns])).rotations().as_euler("ZYX")[0].tolist()
-        start = turning.calibration.start.model_copy(update={"rpy_rad": (roll, pitch, yaw)})
-        run = replace(turning, calibration=turning.calibration.model_copy(update={"start": start}))
+        run = started_at(turning, *start_of(turning, reference))
         finding = by_name(check_sensors(run))["start heading: error"]
         assert finding.acts == acts, finding.text()
         assert ("(--calibration FILE); the position too is the reference's" in finding.advice) == acts
 
 
 def test_lines_for_the_start_agree_on_roll_pitch_and_heading():
-    assert SHORT.truth is not None
-    yaw, pitch, roll = SHORT.truth.at(np.array([SHORT.start_ns])).rotations().as_euler("ZYX")[0].tolist()
-    start = SHORT.calibration.start.model_copy(update={"rpy_rad": (roll + 0.1, pitch, yaw + 0.2)})
-    run = replace(SHORT, calibration=SHORT.calibration.model_copy(update={"start": start}))
-    found = by_name(check_sensors(run))
+    roll, pitch, yaw = start_of(SHORT, SHORT.truth)
+    found = by_name(check_sensors(started_at(SHORT, roll + 0.1, pitch, yaw + 0.2)))
     ours, theirs = (line_of(found[name])["start"] for name in ("start roll: value", "start heading: error"))
     assert ours["rpy_rad"] == theirs["rpy_rad"] == pytest.approx([roll, pitch, yaw], abs=2e-3)
 
@@ -163,11 +172,9 @@ def test_a_hole_of_the_imu_asks_for_nothing(hole_s: float, monkeypatch: pytest.M
 @pytest.mark.parametrize(("speed_m_s", "is_told"), [(0.0, True), (0.05, True), (0.8, False)])
 def test_a_steady_drive_is_no_rest_to_tell_noise_from(speed_m_s: float, is_told: bool):
     rng, n = np.random.default_rng(0), 5000
-    force = [0, 0, 9.80665] + 0.05 * rng.standard_normal((n, 3))
-    imu = Imu(np.arange(n) * 10_000_000, 0.01 * rng.standard_normal((n, 3)), force)
+    force, rate = 0.05 * rng.standard_normal((n, 3)), 0.01 * rng.standard_normal((n, 3))
     velocity = [speed_m_s, 0, 0] + 0.01 * rng.standard_normal((250, 3))
-    dvl = Dvl(np.arange(250) * 200_000_000, velocity, np.full((250, 3, 3), np.nan))
-    found = by_name(check_sensors(replace(RIGHT, imu=imu, dvl=dvl, truth=None)))
+    found = by_name(check_sensors(with_rows(rate, force, velocity)))
     for name in ("gyro noise density", "accelerometer noise density"):
         assert found[name].estimate.is_known == found[name].acts == is_told
         assert is_told or "steady, but at 0.8 m/s" in found[name].text()
@@ -178,10 +185,8 @@ def test_a_density_matters_by_half_as_much_again_either_way(factor: float, acts:
     """100 s of rest at 100 Hz, which tells a density to some percent."""
     rng, n, given = np.random.default_rng(1), 10_000, RIGHT.calibration.imu
     rate, force = factor * 10 * rng.standard_normal((2, n, 3))
-    at_rest = [0, 0, 9.80665] + given.accel_noise_density * force
-    imu = Imu(np.arange(n) * 10_000_000, given.gyro_noise_density * rate, at_rest)
-    dvl = Dvl(np.arange(500) * 200_000_000, np.zeros((500, 3)), np.full((500, 3, 3), np.nan))
-    for finding in noise_findings(replace(RIGHT, imu=imu, dvl=dvl)):
+    run = with_rows(given.gyro_noise_density * rate, given.accel_noise_density * force, np.zeros((500, 3)))
+    for finding in noise_findings(run):
         assert finding.acts == acts, finding.text()
 
 
@@ -191,7 +196,7 @@ def told(*values: float, sigma: float = 1e-3) -> tuple[Estimate1D, Estimate1D, E
 
 
 @pytest.mark.parametrize("acts", [True, False])
-def test_what_iscorrected_sequence_before_the_start_is_what_the_rows_advise(acts: bool):
+def test_what_is_corrected_before_the_start_is_what_the_rows_advise(acts: bool):
     offset, yaw, scale = (0.4, 0.05, 1.04) if acts else (0.008, 0.002, 1.001)
     numbers = (Estimate1D(value, 1e-5) for value in (offset, yaw, scale))
     match = DvlMatch(*numbers, lever=told(-0.2, 0.0, -0.15), gyro_bias=told(0.0, 0.0, 0.0, sigma=1e-6))
@@ -224,76 +229,57 @@ N = 100
 ALONG = np.array([2.0, -1.0, 2.0]) / 3.0
 
 
-def line(fault: WrongUnit) -> dict[str, float]:
-    return tomllib.loads(fault.advice.split("`")[1])
-
-
 def vectors(length: float | Floats) -> Floats:
     """All in one direction, along none of the axes."""
     return np.broadcast_to(length, N)[:, None] * ALONG
 
 
 def units(
-    speed: float | Floats = 1.0,
-    turn: float | Floats = 0.1,
-    force: float | Floats = 9.8,
-    gravity: float = 9.80665,
+    speed: float | Floats = 1.0, turn: float | Floats = 0.1, force: float | Floats = 9.8, gravity: float = 9.80665,
     **scales: dict[str, float],
-) -> list[WrongUnit]:
-    stamps_ns = np.arange(N) * 10_000_000
-    sequence = Sequence(
-        "hand",
-        Calibration(gravity_m_s2=gravity),
-        Imu(stamps_ns, vectors(turn), vectors(force)),
-        Dvl(stamps_ns, vectors(speed), np.full((N, 3, 3), np.nan)),
-    )
+) -> list[Finding]:  # fmt: skip
+    """Wrong units of readings so long; a force may be rows."""
+    stamps_ns, forces = np.arange(N) * 10_000_000, force if np.ndim(force) == 2 else vectors(force)
+    imu, dvl = Imu(stamps_ns, vectors(turn), forces), Dvl(stamps_ns, vectors(speed), np.full((N, 3, 3), np.nan))
+    sequence = Sequence("hand", Calibration(gravity_m_s2=gravity), imu, dvl)
     return wrong_units(sequence, LogConfig.parse(scales, "x"))
 
 
-@pytest.mark.parametrize(
-    ("speed", "unit", "times", "scale"),
-    [
-        (20.1, "cm/s", 100, 0.01),
-        (299.0, "cm/s", 100, 0.01),
-        (301.0, "mm/s", 1000, 0.001),
-        (2900.0, "mm/s", 1000, 0.001),
-        (9e5, "mm/s", 1000, 0.001),  # no unit makes it slow: the smallest
-    ],
-)
+# fmt: off
+SPEEDS = [
+    (20.1, "cm/s", 100, 0.01), (299.0, "cm/s", 100, 0.01), (301.0, "mm/s", 1000, 0.001), (2900.0, "mm/s", 1000, 0.001),
+    (9e5, "mm/s", 1000, 0.001),  # no unit makes it slow: the smallest
+]
+FORCES = [
+    ("g", 9.80665, (0.81, 1.0, 1.19)), ("mg", 9.80665e-3, (0.992, 1.0, 1.19)), ("cm/s²", 0.01, (0.81, 1.0, 1.008)),
+    ("mm/s²", 0.001, (0.81, 1.0, 1.19)),
+]
+# fmt: on
+
+
+@pytest.mark.parametrize(("speed", "unit", "times", "scale"), SPEEDS)
 def test_a_speed_over_twenty_is_in_the_largest_unit_in_which_it_is_no_more_than_three(speed, unit, times, scale):
     (fault,) = units(speed=speed)
     assert fault.quantity == "DVL: unit"
     assert fault.advice.startswith(f"velocities look {times} times too large (up to {speed:.3g} m/s): {unit}? ")
-    assert line(fault) == pytest.approx({"scale": scale})
+    assert line_of(fault) == pytest.approx({"scale": scale})
 
 
-@pytest.mark.parametrize(
-    ("unit", "factor", "shares"),
-    [
-        ("g", 9.80665, (0.81, 1.0, 1.19)),
-        ("mg", 9.80665e-3, (0.992, 1.0, 1.19)),
-        ("cm/s²", 0.01, (0.81, 1.0, 1.008)),
-        ("mm/s²", 0.001, (0.81, 1.0, 1.19)),
-    ],
-)
+@pytest.mark.parametrize(("unit", "factor", "shares"), FORCES)
 def test_a_force_is_in_the_unit_that_brings_it_nearest_to_gravity(unit, factor, shares):
     """Between mg and cm/s², which differ by a fiftieth, an accelerometer within a hundredth decides."""
     for share in shares:
         (fault,) = units(force=share * 9.80665 / factor)
         assert fault.quantity == "accelerometer: unit"
         assert f"instead of 9.807 m/s²: {unit}?" in fault.advice
-        assert line(fault) == pytest.approx({"linear_acceleration_scale": factor}, rel=1e-5)
-
-
-@pytest.mark.parametrize("force", [0.78, 1.22, 0.0, 1.5, 3.7, 300.0, 1e6])
-def test_a_force_that_is_gravity_in_no_unit_has_no_wrong_one(force):
-    assert not units(force=force)
+        assert line_of(fault) == pytest.approx({"linear_acceleration_scale": factor}, rel=1e-5)
 
 
 def test_what_is_usual_is_not_doubted_and_gravity_is_that_of_the_calibration():
     """0.78 g are within a fifth of 9.1 m/s². Shocks move a mean, not a median."""
     assert not units(speed=19.9, turn=1.99, force=9.0)
-    assert not units(force=0.78)
+    for force in (0.78, 1.22, 0.0, 1.5, 3.7, 300.0, 1e6):
+        assert not units(force=force), "gravity in no unit"
     (fault,) = units(force=0.78, gravity=9.1)
     assert "instead of 9.1 m/s²: g?" in fault.advice
     (fault,) = units(force=np.where(np.arange(N) < 40, 20.0, 1.0))
@@ -303,15 +289,10 @@ def test_what_is_usual_is_not_doubted_and_gravity_is_that_of_the_calibration():
 
 
 def test_what_the_configuration_scales_is_taken_over():
-    faults = units(
-        speed=200.0,
-        turn=20.0,
-        force=1.0,
-        dvl={"scale": 3.0},
-        imu={"angular_velocity_scale": -1.0, "linear_acceleration_scale": 2.0},
-    )
+    imu = {"angular_velocity_scale": -1.0, "linear_acceleration_scale": 2.0}
+    faults = units(speed=200.0, turn=20.0, force=1.0, dvl={"scale": 3.0}, imu=imu)
     assert [fault.quantity for fault in faults] == ["DVL: unit", "gyro: unit", "accelerometer: unit"]
-    speed, turn, force = map(line, faults)
+    speed, turn, force = map(line_of, faults)
     assert speed == pytest.approx({"scale": 0.03})
     assert turn == pytest.approx({"angular_velocity_scale": -np.pi / 180}, rel=1e-4)
     assert force == pytest.approx({"linear_acceleration_scale": 19.6133})
@@ -327,7 +308,5 @@ def test_rows_that_were_not_measured_in_full_do_not_count():
     """A vector without one component looks shorter than it is; without any row there is nothing to say."""
     force = vectors(9.8).copy()
     force[: N - 10] = [np.nan, 0.0, 1.0]
-    stamps_ns = np.arange(N) * 10_000_000
-    imu, dvl = Imu(stamps_ns, vectors(0.1), force), Dvl(stamps_ns, vectors(1.0), np.full((N, 3, 3), np.nan))
-    assert not wrong_units(Sequence("hand", Calibration(), imu, dvl), LogConfig())
+    assert not units(force=force)
     assert not units(force=np.nan)
