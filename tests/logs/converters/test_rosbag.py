@@ -1,5 +1,4 @@
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from sonar_graph.logs.reading import read_log
 
 T0_NS = 1_447_550_804_242_631_687
 STEP_NS = 20_000_001
-Decode = Callable[[Path], dict[str, list[Any]]]
 
 
 def messages(store: Any, *, ros1: bool) -> list[tuple[str, str, Any]]:
@@ -60,7 +58,8 @@ def write_bag(writer: Any, store: Any, entries: list[tuple[str, str, Any]]) -> N
             if topic not in connections:
                 latched = {"latching": 1 if topic == "/tf_static" else None} if ros1 else {}
                 connections[topic] = writer.add_connection(topic, kind, typestore=store, **latched)
-            writer.write(connections[topic], T0_NS + row * STEP_NS, serialize(message, kind))
+            raw = message if isinstance(message, bytes) else serialize(message, kind)
+            writer.write(connections[topic], T0_NS + row * STEP_NS, raw)
 
 
 def ros1_store() -> Any:
@@ -115,12 +114,14 @@ def test_sqlite3_bags_keep_their_payloads(tmp_path, decoded):
         assert found["/tf_static"][0].transforms[0].transform.translation.y == 2
 
 
-def test_a_type_of_the_users_own_keeps_its_definition(tmp_path, decoded):
+def test_a_type_of_the_users_own_keeps_its_definition_and_what_is_not_of_it_is_told(tmp_path, decoded):
     store = ros1_store()
     store.register(get_types_from_msg("Header header\nfloat64[4] velocity\n", "provider_dvl/msg/Packet"))
     message = store.types["provider_dvl/msg/Packet"](messages(store, ros1=True)[3][2].header, np.arange(4.0))
-    write_bag(Ros1Writer(tmp_path / "own.bag"), store, [("/dvl", "provider_dvl/msg/Packet", message)])
-    convert_rosbag(tmp_path / "own.bag", tmp_path / "own.mcap")
+    entries = [("/dvl", "provider_dvl/msg/Packet", content) for content in (message, b"cut")]
+    write_bag(Ros1Writer(tmp_path / "own.bag"), store, entries)
+    done = convert_rosbag(tmp_path / "own.bag", tmp_path / "own.mcap")
+    assert done.shortcomings() == ["left out: /dvl: 1 messages are not of their type"]
     (found,) = decoded(tmp_path / "own.mcap")["/dvl"]
     assert found.velocity == [0, 1, 2, 3]
     assert found.header.stamp.nanosec == (T0_NS + 3 * STEP_NS) % 10**9
