@@ -146,6 +146,8 @@ def test_poses_survive_to_the_bit_and_without_covariances_there_are_no_ellipsoid
         np.testing.assert_array_equal(quaternions, expected.quaternions_xyzw, topic)
     centres = [array.markers[0].pose.position for array in messages["/a/pose_ellipsoid"]]
     np.testing.assert_array_equal([(c.x, c.y, c.z) for c in centres], causal.positions)
+    last = messages["/a/path"][-1].header.stamp
+    assert last.sec * 10**9 + last.nanosec == max(causal.stamps_ns[-1], smoothed.stamps_ns[-1])
     assert not np.any([m.pose.covariance for m in messages["/unsure/pose"]])
     assert "/unsure/pose_ellipsoid" not in messages
     for layout in ("r.foxglove.json", "r.rviz"):
