@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 import struct
 import tracemalloc
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime, timedelta, timezone
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -149,17 +149,14 @@ def tail(content: bytes) -> Callable[[Path], object]:
     return lambda path: path.write_bytes(path.read_bytes() + content)
 
 
-@dataclass
-class Fault:
+class Fault(NamedTuple):
     """Damage to a file, and the account that is expected of it."""
 
     damage: Callable[[Path], object]
-    lost: int | None = None
-    """The chunk whose messages are lost; without chunks, the message."""
-    corrupt: str = ""
-    """What the losses must say; empty: there must be none."""
+    lost: int | None = None  # the chunk whose messages are lost; without chunks, the message
+    corrupt: str = ""  # what the losses must say; empty: there must be none
     remark: str = ""
-    options: dict[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = MappingProxyType({})
 
 
 PLAIN: dict[str, Any] = {"compression": NONE}

@@ -155,13 +155,10 @@ def test_a_file_goes_before_the_record_and_a_whole_calibration_before_everything
     given = read_log(tmp_path / "a.mcap", calibration=Calibration(), name="mine")
     assert (given.calibration, given.name) == (Calibration(), "mine")
     assert given.notes["log.calibration"] == "given by the caller"
-
-
-def test_a_record_that_says_little_leaves_the_rest_to_tf_static(make_sequence: Any, tmp_path: Path) -> None:
     mounting = Mounting(translation_m=TREE_M)
     tree = Calibration(imu=ImuCalibration(mounting=mounting), dvl=DvlCalibration(mounting=mounting))
-    record = {"calibration": json.dumps({"imu": {"mounting": {"translation_m": [7, 8, 9]}}})}
-    calibration = read_log(written(tmp_path / "a.mcap", make_sequence(), tree, record)).calibration
+    record = {"calibration": json.dumps({"imu": {"mounting": {"translation_m": [7, 8, 9]}}})}  # says little
+    calibration = read_log(written(tmp_path / "b.mcap", sequence, tree, record)).calibration
     assert calibration.imu.mounting.translation_m == (7, 8, 9)
     assert calibration.dvl.mounting.translation_m == TREE_M
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -65,16 +65,11 @@ def test_unknown_covariances_are_small_spheres_and_landmarks_known_exactly_can_s
     assert (diameters[2] > 0).all()
 
 
-@pytest.fixture
-def drawn(tmp_path: Path) -> Callable[[Outgoing], list[Any]]:
+def drawn(folder: Path, messages: Outgoing) -> list[Any]:
     """Messages of one topic as another library decodes them."""
-
-    def draw(messages: Outgoing) -> list[Any]:
-        write_recording(tmp_path / "a.mcap", [messages], {})
-        (found,) = decode(tmp_path / "a.mcap").values()
-        return found
-
-    return draw
+    write_recording(folder / "a.mcap", [messages], {})
+    (found,) = decode(folder / "a.mcap").values()
+    return found
 
 
 def xyz(vector: Any) -> np.ndarray:
@@ -86,10 +81,10 @@ def axes(marker: Any) -> Rotation:
     return Rotation.from_quat([q.x, q.y, q.z, q.w])
 
 
-def test_namespaces_tell_ellipsoids_that_mean_something_from_those_that_do_not(drawn: Any) -> None:
+def test_namespaces_tell_ellipsoids_that_mean_something_from_those_that_do_not(tmp_path: Path) -> None:
     covariances = np.array([np.diag([0.01, 0.04, 0.09]), np.full((3, 3), np.nan)])
     landmarks = LandmarkMap(np.array([7, 2**40]), np.array([[1.0, 2, 3], [4, 5, 6]]), covariances)
-    (array,) = drawn(landmark_markers("/landmarks", landmarks, 1, GREY, 0.5))
+    (array,) = drawn(tmp_path, landmark_markers("/landmarks", landmarks, 1, GREY, 0.5))
     spaces, texts = [m.ns for m in array.markers], [m.text for m in array.markers]
     assert spaces == ["ellipsoid_95_percent", "covariance_unknown", "identity", "identity"]
     assert texts == ["", "", "7", "1099511627776"]
@@ -97,19 +92,19 @@ def test_namespaces_tell_ellipsoids_that_mean_something_from_those_that_do_not(d
     assert {(m.header.frame_id, m.action, m.lifetime.sec) for m in array.markers} == {("map", 0, 0)}
 
 
-def test_a_drawn_ellipsoid_lies_as_its_covariance_does(drawn: Any) -> None:
+def test_a_drawn_ellipsoid_lies_as_its_covariance_does(tmp_path: Path) -> None:
     """A stick of 1 m standard deviation along (1, 1, 0), thin across; by hand, its longest axis lies there."""
     along, across = np.array([1.0, 1, 0]) / np.sqrt(2), np.array([1.0, -1, 0]) / np.sqrt(2)
     covariance = np.outer(along, along) + 0.04 * np.outer(across, across) + 0.01 * np.diag([0, 0, 1.0])
     landmarks = LandmarkMap(np.array([1]), np.zeros((1, 3)), covariance[None])
-    marker = drawn(landmark_markers("/landmarks", landmarks, 1, GREY, 0.5))[0].markers[0]
+    marker = drawn(tmp_path, landmark_markers("/landmarks", landmarks, 1, GREY, 0.5))[0].markers[0]
     diameters = xyz(marker.scale)
     longest = axes(marker).as_matrix()[:, np.argmax(diameters)]
     np.testing.assert_allclose(np.abs(longest @ along), 1)
     np.testing.assert_allclose(np.sort(diameters), 2 * 2.7954834829151074 * np.array([0.1, 0.2, 1.0]))
 
 
-def test_the_ellipsoid_of_a_pose_holds_95_percent_of_sampled_positions(drawn: Any) -> None:
+def test_the_ellipsoid_of_a_pose_holds_95_percent_of_sampled_positions(tmp_path: Path) -> None:
     """Its covariance is in the body's axes, the ellipsoid is drawn in those of the map."""
     rng = np.random.default_rng(5)
     root = rng.normal(size=(3, 6, 6))
@@ -118,7 +113,7 @@ def test_the_ellipsoid_of_a_pose_holds_95_percent_of_sampled_positions(drawn: An
     rotations = Rotation.random(3, rng)
     positions = rng.normal(size=(3, 3))
     trajectory = Trajectory(np.array([10, 20, 30]), positions, rotations.as_quat(), covariances)
-    markers = [array.markers[0] for array in drawn(position_ellipsoids("/pose", trajectory, GREY))]
+    markers = [array.markers[0] for array in drawn(tmp_path, position_ellipsoids("/pose", trajectory, GREY))]
     assert [marker.header.stamp.nanosec for marker in markers] == [10, 30]
     for marker, row in zip(markers, (0, 2), strict=True):
         samples = rng.multivariate_normal(np.zeros(6), covariances[row], 50_000)[:, 3:]
@@ -133,10 +128,10 @@ FORMATS = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}
 """By sensor_msgs/PointField."""
 
 
-def test_a_reader_of_the_fields_finds_position_identity_and_covariance(drawn: Any) -> None:
+def test_a_reader_of_the_fields_finds_position_identity_and_covariance(tmp_path: Path) -> None:
     ids, positions = [3, 2**40 + 1], np.array([[1.5, -2.25, 0.1], [4000.0, 5.0, -6.0]])
     covariances = np.array([[[1, 0.1, 0.2], [0.1, 2, 0.3], [0.2, 0.3, 3]], np.full((3, 3), np.nan)])
-    (cloud,) = drawn(landmark_cloud("/cloud", LandmarkMap(np.array(ids), positions, covariances), 5))
+    (cloud,) = drawn(tmp_path, landmark_cloud("/cloud", LandmarkMap(np.array(ids), positions, covariances), 5))
     places = {f.name: (f.offset, f.offset + struct.calcsize(FORMATS[f.datatype])) for f in cloud.fields}
     first, second = (
         {

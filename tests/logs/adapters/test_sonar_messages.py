@@ -56,6 +56,7 @@ def frames_in(foreign: Any, *entries: Entry, toml: str = "", **settings: Any) ->
 
 ROWS = POLAR.T.astype("u1").tobytes()
 BEAM_MAJOR, LEFT = '[sonar]\nimage_order = "beam-major"', '[sonar]\nbearing_positive = "left"'
+# fmt: off
 CASES: dict[str, tuple[Entry, str, Floats, Floats]] = {
     "range by range": (images(image(ROWS)), "", POLAR, AZIMUTHS),
     "beam by beam, as the definition states": (
@@ -68,12 +69,9 @@ CASES: dict[str, tuple[Entry, str, Floats, Floats]] = {
     "big endian numbers": (images(image(POLAR.T.astype(">f8").tobytes(), 9, big=True)), "", POLAR, AZIMUTHS),
     "positive bearings to the left": (pings(ping()), LEFT, POLAR, -AZIMUTHS),
     "row size from beams, samples and gain": (
-        pings(ping(gains=GAINS, size=2)),
-        "[sonar]\nrow_bytes = false",
-        POLAR / [1, 2, 3, 4],
-        AZIMUTHS,
-    ),
+        pings(ping(gains=GAINS, size=2)), "[sonar]\nrow_bytes = false", POLAR / [1, 2, 3, 4], AZIMUTHS),
 }
+# fmt: on
 
 
 @pytest.mark.parametrize(("entry", "toml", "intensity", "azimuths_rad"), CASES.values(), ids=CASES)
