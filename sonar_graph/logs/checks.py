@@ -31,14 +31,8 @@ LARGEST_LAG_CHANGE_S = 0.5
 STUCK_S = 1.0
 STUCK_ROWS = 5
 """Equal rows are named when they last longer than `STUCK_S` and are at least this many."""
-_ROTATIONS = {
-    (0, False): "give rotation = [0, -90, 0] or the IMU's mounting",
-    (0, True): "give rotation = [0, 90, 0] or the IMU's mounting",
-    (1, False): "give rotation = [90, 0, 0] or the IMU's mounting",
-    (1, True): "give rotation = [-90, 0, 0] or the IMU's mounting",
-    (2, True): 'give rotation = "frd", or linear_acceleration_scale = -1 where only the sign is wrong',
-}
-"""Advice by the axis along which gravity is felt, and whether against it."""
+_ROTATIONS = {(0, False): "[0, -90, 0]", (0, True): "[0, 90, 0]", (1, False): "[90, 0, 0]", (1, True): "[-90, 0, 0]"}
+"""Rotation to give, by the axis along which gravity is felt, and whether against it."""
 
 
 def stamp_faults(stamps_ns: Ints, log_times_ns: Ints) -> Iterator[str]:
@@ -187,7 +181,10 @@ def gravity_warning(specific_force: Floats, mounting: Mounting, gravity_m_s2: fl
     if typical[2] >= LEAST_PART_UPWARDS * length:
         return None
     axis = int(np.argmax(np.abs(typical)))
-    sign, advice = ("-" if typical[axis] < 0 else "+"), _ROTATIONS[axis, bool(typical[axis] < 0)]
+    sign, rotation = ("-" if typical[axis] < 0 else "+"), _ROTATIONS.get((axis, bool(typical[axis] < 0)))
+    advice = 'give rotation = "frd", or linear_acceleration_scale = -1 where only the sign is wrong'
+    if rotation is not None:
+        advice = f"give rotation = {rotation} or the IMU's mounting"
     return f"gravity is felt along {sign}{'xyz'[axis]} ({typical[axis]:.2f} m/s2) instead of the body's +z: {advice}"
 
 

@@ -186,13 +186,12 @@ class Assembly:
                     self._dropped[role] = topic.unsound
         self._notes = {key: note for key, note in read_notes(recording).items() if key not in FOUND_ANEW}
         self._notes["log.topics"] = "; ".join(f"{role}: {topic.name}" for role, topic in self._topics.items())
-        changes = []
-        for role, topic in self._topics.items():
-            adapter = self._adapters[role]
-            if text := changes_text(adapter, shipped_like(role, topic.type_name, topic.definition())):
-                changes.append(f"{role}: {text}")
-        if changes:
-            self._notes["log.adapters"] = "; ".join(changes)
+        changes = {
+            role: changes_text(self._adapters[role], shipped_like(role, topic.type_name, topic.definition()))
+            for role, topic in self._topics.items()
+        }
+        if text := "; ".join(f"{role}: {change}" for role, change in changes.items() if change):
+            self._notes["log.adapters"] = text
         if "truth" in choices and choices["truth"].topic is None:
             self._notes["log.truth"] = choices["truth"].reason
         self._notes |= recording.notes()

@@ -145,6 +145,18 @@ def message_200(offset: int, bit: int) -> Callable[[Path], None]:
     return at_text([rng.bytes([20, 50, 80][i % 3]) for i in range(201)][200], offset - 31, bit)
 
 
+def in_bare_summary(text: bytes) -> Callable[[Path], None]:
+    """A bit of the last such text, in a summary whose CRC is taken away."""
+
+    def change(path: Path) -> None:
+        content = bytearray(path.read_bytes())
+        content[-12:-8] = bytes(4)
+        content[content.rindex(text) + 1] ^= 1
+        path.write_bytes(content)
+
+    return change
+
+
 def tail(content: bytes) -> Callable[[Path], object]:
     return lambda path: path.write_bytes(path.read_bytes() + content)
 
@@ -183,6 +195,9 @@ FAULTS = {
     "a shorter message outside chunks": Fault(message_200(1, 64), 200, "no valid record", "", LOOSE),
     "a type's name outside chunks": Fault(at_text(b"test_msgs/msg/Bytes"), None, "", TWICE, LOOSE),
     "a topic's name outside chunks": Fault(at_text(b"/bytes"), None, "", r"channel 1 \(/bytes\) is desc", LOOSE),
+    "a topic's name in a bare summary": Fault(
+        in_bare_summary(b"/bytes"), None, "", r"1 \(/cytes\) .* under a CRC holds"
+    ),
     # of 13 bytes it claims 29, of which 13 are there
     "a length in a description": Fault(at_text(b"uint8[] d", -4, 16), None, "description of a ch", "", UNREPEATED),
     "the length of metadata": Fault(at_text(b"sonar_graph", -12, 64), None, "a metadata record is lost"),
