@@ -18,9 +18,9 @@ from sonar_graph.navigation.preintegration.joint_preintegration import JointPrei
 from sonar_graph.navigation.preintegration.motion import Preintegrator
 from sonar_graph.testing import check_consistent
 
-from . import vehicle, ways
+from . import ways
 from .rows import NS, T0_NS, at, dvl, imu, nees, stamps
-from .vehicle import DVL, NOISY, QUIET, motion
+from .ways import DVL, NOISY, QUIET, Vehicle, motion
 
 WITH_OR_WITHOUT = pytest.mark.parametrize("is_blind", [False, True], ids=["accelerometers", "walk"])
 
@@ -76,9 +76,9 @@ def test_too_few_samples_for_a_line_leave_a_walk():
 @pytest.mark.parametrize("until_s", [16.0, 15.9, 14.0])
 def test_accelerometers_carry_the_velocity_through_a_long_gap(until_s):
     """Closed or open; a straight line between the ends is wrong by metres."""
-    truth = vehicle.Vehicle().displacement(vehicle.LOST_S, until_s)
+    truth = Vehicle().displacement(Vehicle.LOST_S, until_s)
     found, straight = (
-        motion(*vehicle.rows(), Calibration(imu=QUIET, dvl=log), vehicle.LOST_S, until_s).i_T_j.translation()
+        motion(*Vehicle().rows(), Calibration(imu=QUIET, dvl=log), Vehicle.LOST_S, until_s).i_T_j.translation()
         for log in (DVL, DVL.model_copy(update={"gap_s": 100.0}))
     )
     assert found == pytest.approx(truth, abs=0.01)
@@ -88,15 +88,15 @@ def test_accelerometers_carry_the_velocity_through_a_long_gap(until_s):
 @pytest.mark.parametrize("until_s", [16.0, 14.0])
 def test_the_covariance_of_a_gap_is_that_of_many_runs(until_s):
     """Noise of gyros, accelerometers and Doppler log, and an accelerometer bias of its own for each run."""
-    (imu_rows, dvl_rows), ends = vehicle.rows(), (vehicle.LOST_S, until_s)
+    (imu_rows, dvl_rows), ends = Vehicle().rows(), (Vehicle.LOST_S, until_s)
     truth = motion(imu_rows, dvl_rows, Calibration(imu=QUIET, dvl=DVL), *ends).i_T_j.translation()
     rng, errors = np.random.default_rng(0), []
     for _ in range(400):
-        noise = rng.standard_normal((2, len(imu_rows), 3)) * np.sqrt(vehicle.IMU_HZ)
+        noise = rng.standard_normal((2, len(imu_rows), 3)) * np.sqrt(Vehicle.IMU_HZ)
         rate = imu_rows.angular_velocity + NOISY.gyro_noise_density * noise[0]
         bias = NOISY.accel_bias_sigma * rng.standard_normal(3)
         force = imu_rows.specific_force + NOISY.accel_noise_density * noise[1] + bias
-        velocity = dvl_rows.velocity + vehicle.SIGMA * rng.standard_normal(dvl_rows.velocity.shape)
+        velocity = dvl_rows.velocity + ways.SIGMA * rng.standard_normal(dvl_rows.velocity.shape)
         measured = Imu(imu_rows.stamps_ns, rate, force), Dvl(dvl_rows.stamps_ns, velocity, dvl_rows.velocity_cov)
         found = motion(*measured, Calibration(imu=NOISY, dvl=DVL), *ends)
         errors.append(found.i_T_j.rotation().unrotate(found.i_T_j.translation() - truth))
@@ -105,18 +105,18 @@ def test_the_covariance_of_a_gap_is_that_of_many_runs(until_s):
 
 @pytest.mark.parametrize(("until_s", "share"), [(16.0, 12.0), (15.0, 3.0)])
 def test_without_accelerometer_the_velocity_is_a_random_walk(until_s, share):
-    imu_rows, dvl_rows = vehicle.rows()
+    imu_rows, dvl_rows = Vehicle().rows()
     exact = DVL.model_copy(update={"velocity_sigma_m_s": (0.0,) * 3, "velocity_walk_density": 0.05})
-    found = motion(ways.blinded(imu_rows), dvl_rows, Calibration(imu=QUIET, dvl=exact), vehicle.LOST_S, until_s)
-    expected = 0.05**2 * (until_s - vehicle.LOST_S) ** 3 / share
+    found = motion(ways.blinded(imu_rows), dvl_rows, Calibration(imu=QUIET, dvl=exact), Vehicle.LOST_S, until_s)
+    expected = 0.05**2 * (until_s - Vehicle.LOST_S) ** 3 / share
     assert np.diag(found.covariance)[3:] == pytest.approx([expected] * 3)
 
 
 def test_nothing_changes_where_no_sample_is_missing():
     """The same bits with and without a model of gaps, between nodes and since one."""
-    steady, ns = vehicle.Vehicle(), stamps(vehicle.DVL_HZ, 8.0)
+    steady, ns = Vehicle(), stamps(Vehicle.DVL_HZ, 8.0)
     odometry = Odometry(Calibration(imu=NOISY, dvl=DVL))
-    odometry.add(steady.imu(stamps(vehicle.IMU_HZ, 8.1)), steady.dvl(ns))
+    odometry.add(steady.imu(stamps(Vehicle.IMU_HZ, 8.1)), steady.dvl(ns))
     bridging = Preintegrator.from_calibration(Calibration(imu=NOISY, dvl=DVL))
     plain = Preintegrator(bridging.gyro_noise_density, bridging.body_p_dvl)
     for function, until_s in ((motion_between_nodes, 7.0), (motion_since_node, 1.3)):
@@ -138,7 +138,7 @@ def estimates(name, blocks, start=KNOWN_START):
 
 def cut(until_ns):
     """Rows between successive instants."""
-    imu_rows, dvl_rows = vehicle.rows()
+    imu_rows, dvl_rows = Vehicle().rows()
     return [
         (end, (imu_rows.between(begin, end), dvl_rows.between(begin, end))) for begin, end in pairwise([0, *until_ns])
     ]
@@ -165,7 +165,7 @@ def test_an_estimate_in_a_gap_does_not_depend_on_how_rows_are_cut(name):
 def test_samples_out_of_order_give_the_same_estimate_as_in_order(name):
     """A block of each sensor overtakes the one before it."""
     blocks = [block for _, block in cut([at(2.0), at(2.45), at(2.55), at(5.0)])]
-    blocks[1] = blocks[1][0], vehicle.rows()[1].between(at(2.0), at(2.0) + NS // 4)
+    blocks[1] = blocks[1][0], Vehicle().rows()[1].between(at(2.0), at(2.0) + NS // 4)
     found = [
         estimates(name, [(at(5.0) if k == 3 else at(2.0), blocks[k]) for k in order], UNSURE)
         for order in ([0, 1, 2, 3], [0, 2, 1, 3])

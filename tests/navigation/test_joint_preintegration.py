@@ -16,7 +16,7 @@ from sonar_graph.navigation.preintegration.joint_preintegration import DISPLACEM
 from sonar_graph.navigation.preintegration.joint_recursion import RULES
 
 from .rows import ACCEL, GYRO, NS, StepByStep, at, derivative, dvl, imu, random_rows, stamps, step_by_step, waves
-from .vehicle import DVL, QUIET, Vehicle
+from .ways import DVL, QUIET, Vehicle
 
 BIAS = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.05])
 EARTH = np.array([0.04, -0.07, 0.05])

@@ -19,8 +19,7 @@ from sonar_graph.navigation.preintegration.recursion import Steps, merge_rows
 
 from . import ways
 from .rows import NS, T0_NS, at, dead_reckoned, dense_covariance, dvl, imu, part, random_steps, stamps, waves
-from .vehicle import motion
-from .ways import WAYS, Way, attitude, blinded, change_of, moved_by, rows, spoilt, velocity_at
+from .ways import WAYS, Way, attitude, blinded, change_of, motion, moved_by, rows, spoilt, velocity_at
 
 every_way = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 
@@ -263,6 +262,7 @@ ISOTROPIC = {"velocity_sigma_m_s": (0.01, 0.01, 0.01)}
         (Way(5.0, 12.0), "velocity", {"gap_s": 0.9}, {"pings_s": (5.0, 11.0, 12.0)}, 0.02),
         (Way(5.0, 11.5), "velocity", {"gap_s": 0.9}, {"pings_s": (5.0, 5.5, 8.0, 8.5, 11.5)}, 0.15),
         (WAYS["inertial over gaps"], "rate", {}, {}, 0.1),
+        (WAYS["rule inertial"], "rate", {}, {}, 0.4),  # five rows in an interval; without that of its ends 0.75
         (WAYS["inertial over gaps"], "force", {}, {}, 0.06),
         (WAYS["inertial over gaps"], "velocity", {}, {}, 1e-6),
     ],

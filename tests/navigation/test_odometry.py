@@ -22,9 +22,8 @@ from sonar_graph.navigation.preintegration.motion import PreintegratedMotion, Pr
 from sonar_graph.navigation.preintegration.recursion import Steps
 from sonar_graph.navigation.samples import longest_interval_ns
 
-from . import vehicle
 from .rows import NS, T0_NS, at, dvl, imu, part, random_steps, stamps, waves
-from .vehicle import DVL, FOUND_S, LOST_S, NOISY, QUIET, Vehicle
+from .ways import DVL, NOISY, QUIET, Vehicle
 
 SECONDS, ZERO = 3.0, np.zeros(3)
 HELD = Calibration(odometry_interpolation="hold-past")
@@ -115,6 +114,8 @@ def test_there_is_no_start_before_imu_rows_cover_a_node(imu_s, dvl_s, start_ns):
     assert odometry_of(imu_rows, dvl_rows).start_ns() == start_ns
     for rows in ((None, None), (imu_rows, None), (None, dvl_rows)):
         assert odometry_of(*rows).start_ns() is None
+    held = odometry_of(imu(stamps(10, 1), 0.0), dvl(stamps(10, 1, 0.03), 0.0), HELD)
+    assert (held.start_by(at(0.099)), held.start_by(at(0.1))) == (None, at(0.03))
 
 
 @pytest.mark.parametrize("calibration", [Calibration(), HELD], ids=["linear", "held"])
@@ -336,7 +337,7 @@ def test_then_is_integration_of_both(seed, cut):
 def ready(until_s=20.0, imu=QUIET):
     """What was measured until an instant, and what it means."""
     calibration = Calibration(imu=imu, dvl=DVL)
-    odometry = odometry_of(*(rows.between(0, at(until_s)) for rows in vehicle.rows()), calibration)
+    odometry = odometry_of(*(rows.between(0, at(until_s)) for rows in Vehicle().rows()), calibration)
     return odometry, Preintegrator.from_calibration(calibration)
 
 
@@ -369,10 +370,10 @@ def test_without_a_gap_motion_is_that_over_the_steps_to_the_bit():
 
 def test_motions_that_follow_each_other_in_a_gap_add_up_to_that_since_the_node():
     odometry, preintegrator = ready(15.0, NOISY)
-    total = motion_between(odometry, preintegrator, at(LOST_S), at(7.3), ZERO)
+    total = motion_between(odometry, preintegrator, at(Vehicle.LOST_S), at(7.3), ZERO)
     for start_s, end_s in pairwise([7.3, 7.6, 9.0, 9.2, 12.0, 14.7]):
         total = total.then(motion_between(odometry, preintegrator, at(start_s), at(end_s), ZERO))
-    whole = motion_since_node(odometry, preintegrator, at(LOST_S), at(14.7), ZERO, None)
+    whole = motion_since_node(odometry, preintegrator, at(Vehicle.LOST_S), at(14.7), ZERO, None)
     assert total.i_T_j.equals(whole.i_T_j, 1e-9)
     assert total.covariance == pytest.approx(whole.covariance, rel=1e-3, abs=1e-9)
     assert total.D_bias == pytest.approx(whole.D_bias, rel=1e-6, abs=1e-9)
@@ -391,7 +392,7 @@ def test_a_gap_that_has_ended_is_bridged_with_both_its_ends():
 
 
 @pytest.mark.parametrize(
-    ("start_s", "end_s"), [(1.03, 1.17), (5.0, 9.0), (8.0, 9.0), (15.0, FOUND_S + 0.2), (15.0, 16.3)]
+    ("start_s", "end_s"), [(1.03, 1.17), (5.0, 9.0), (8.0, 9.0), (15.0, Vehicle.FOUND_S + 0.2), (15.0, 16.3)]
 )
 def test_nothing_stamped_after_the_second_instant_is_used(start_s, end_s):
     here, there = (moved(start_s, end_s, until_s, NOISY) for until_s in (20.0, end_s))

@@ -20,7 +20,7 @@ from sonar_graph.navigation.samples import is_partial
 from tests.devices.test_dvl_beams import JANUS
 
 from .rows import NS, T0_NS, at
-from .vehicle import DVL, QUIET, motion
+from .ways import DVL, QUIET, motion
 
 STEP_NS, STEP_S, WALK, SIGMA = 200_000_000, 0.2, 0.1, 0.01
 CALIBRATION = Calibration(dvl=DvlCalibration(velocity_walk_density=WALK))

@@ -1,35 +1,34 @@
-"""Rows of a sensor: storage, values in between against numpy's, limits of what is refused, weights of depths."""
+"""Rows of a sensor: storage, values in between, limits of what is refused, weights of depths, and intake of rows.
+
+Rows that are not used are named; what is refused does not depend on how a log is cut.
+"""
 
 from contextlib import nullcontext
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from sonar_graph.calibration import Calibration, DvlCalibration, ImuCalibration, Mounting
+from sonar_graph.devices.dvl_beams import UNMEASURED_M_S
 from sonar_graph.errors import CalibrationError, MeasurementError
-from sonar_graph.navigation.samples import (
-    StampedRows,
-    finite_vector,
-    no_doppler_stamp,
-    node_range,
-    require_covariances,
-    require_distinct_stamps,
-    require_nanoseconds,
-    require_noise,
-    require_order,
-    rows_before_gaps,
-    rows_until,
-    value_among,
-    value_at,
-    weights_at_end,
-)
+from sonar_graph.measurements import Dvl
+from sonar_graph.navigation import samples
+from sonar_graph.navigation.dvl_screening.partial_beams import LONGEST_STRETCH_NS
+from sonar_graph.navigation.dvl_screening.row_intake import RowIntake
+from sonar_graph.navigation.odometry import Odometry
+from sonar_graph.states import Refusal
+
+from .rows import NS, T0_NS, dvl, imu, odometry_at_rest, stamps
 
 
-def kept(*blocks: list[int]) -> StampedRows:
+def kept(*blocks: list[int]) -> samples.StampedRows:
     """Values are the number of the block, so that it is seen which of equal stamps is there."""
-    rows = StampedRows((3,), (3, 3))
+    rows = samples.StampedRows((3,), (3, 3))
     for number, block in enumerate(blocks):
         n = len(block)
         rows.insert(np.array(block), np.full((n, 3), float(number)), np.full((n, 3, 3), float(-number)))
@@ -65,7 +64,7 @@ def test_nodes_are_after_one_instant_and_covered_by_the_other_sensor_until_anoth
     imu_ns, dvl_ns = np.array([0, 10, 20]), np.array([-5, 0, 7, 10, 15, 20, 25])
     ends = ((-5, 9), (-6, 10), (7, 19), (7, 99), (15, 10), (-6, -1))
     nodes = [(1, 2), (0, 4), (3, 4), (3, 6), (5, 5), (0, 0)]
-    assert [node_range(imu_ns, dvl_ns, *between) for between in ends] == nodes
+    assert [samples.node_range(imu_ns, dvl_ns, *between) for between in ends] == nodes
 
 
 @given(
@@ -76,7 +75,7 @@ def test_nodes_are_after_one_instant_and_covered_by_the_other_sensor_until_anoth
 def test_gaps_are_between_successive_rows_from_one_to_another_that_are_too_far_apart(stamps, ends, longest):
     start, end = (min(row, len(stamps) - 1) for row in ends)
     expected = [row for row in range(start, end) if stamps[row + 1] - stamps[row] > longest]
-    assert rows_before_gaps(np.array(stamps), stamps[start], stamps[end], longest).tolist() == expected
+    assert samples.rows_before_gaps(np.array(stamps), stamps[start], stamps[end], longest).tolist() == expected
 
 
 STAMPS = np.array([0, 10, 14, 30, 31], dtype=np.int64)
@@ -86,15 +85,17 @@ VALUES = np.random.default_rng(0).standard_normal((5, 3))
 @given(st.integers(-5, 40), st.integers(1, 5))
 def test_values_are_linear_between_rows_that_are_used_or_held_until_the_next_and_constant_beyond(t, known):
     """Of all rows; and of the first as if there were no others."""
-    assert rows_until(STAMPS, t) == np.count_nonzero(t >= STAMPS)
-    assert rows_until(STAMPS[:0], t) == 0
-    i = rows_until(STAMPS, t - 1)
+    assert samples.rows_until(STAMPS, t) == np.count_nonzero(t >= STAMPS)
+    assert samples.rows_until(STAMPS[:0], t) == 0
+    i = samples.rows_until(STAMPS, t - 1)
     stamps, values = STAMPS[:known], VALUES[:known]
     linear = [np.interp(t, stamps, values[:, axis]) for axis in range(3)]
     held = values[min(int(np.searchsorted(stamps, t)), known - 1)]
     for hold_past, expected in ((False, linear), (True, held)):
-        assert value_among(STAMPS, VALUES, known, i, t, hold_past) == pytest.approx(expected)
-        assert value_at(stamps, values, rows_until(stamps, t - 1), t, hold_past) == pytest.approx(expected)
+        assert samples.value_among(STAMPS, VALUES, known, i, t, hold_past) == pytest.approx(expected)
+        assert samples.value_at(stamps, values, samples.rows_until(stamps, t - 1), t, hold_past) == pytest.approx(
+            expected
+        )
 
 
 AT = np.array([10, 20, 30, 40, 50]) * 1_000_000_000
@@ -106,37 +107,45 @@ NEGATIVE = "sigma: expected finite numbers of zero or more"
 @pytest.mark.parametrize(
     ("check", "arguments", "message"),
     [
-        *((finite_vector, ("bias", v, 3), r"bias: expected shape \(3,\)") for v in ([1, 2], [[1], [2], [3]], 1.0)),
-        (finite_vector, ("bias", [0, np.inf, 0], 3), r"bias: expected finite numbers, not \[0.0, inf, 0.0\]"),
-        (finite_vector, ("bias", [0, np.nan, 0], 3, CalibrationError), "bias: expected finite numbers"),
-        *((require_noise, ("sigma", v, 1), NUMBER) for v in (True, [1.0], "1")),
-        *((require_noise, ("sigma", v, 3), NUMBERS) for v in (1.0, [1.0, 2.0], [True] * 3)),
-        *((require_noise, ("sigma", v, 1), NEGATIVE) for v in (-1e-9, np.inf, np.nan)),
-        *((require_noise, ("sigma", v, 3), NEGATIVE) for v in ([1.0, 1.0, -1.0], [-1.0, 1.0, 1.0])),
-        (require_order, (1.0, 2), "^start_ns: expected integer nanoseconds"),
-        (require_order, (1, np.float64(2)), "^end_ns: expected integer nanoseconds"),
-        (require_order, (5, 5), "end_ns: 5 is not after start_ns 5"),
-        (require_order, (5, 4), "end_ns: 4 is not after start_ns 5"),
-        (require_nanoseconds, ("Imu", 7 + np.arange(3) * 49_900), r"Imu.stamps_ns: 3 rows are 4.99e\+04 ns apart"),
-        (require_distinct_stamps, ("Imu", np.array([0, 0, 100]), 0, 2), "rows 0 and 1 are both stamped 0 ns"),
-        (require_distinct_stamps, ("Imu", np.array([0, 100, 100]), 0, 2), "rows 1 and 2 are both stamped 100 ns"),
+        *(("finite_vector", ("bias", v, 3), r"bias: expected shape \(3,\)") for v in ([1, 2], [[1], [2], [3]], 1.0)),
+        ("finite_vector", ("bias", [0, np.inf, 0], 3), r"bias: expected finite numbers, not \[0.0, inf, 0.0\]"),
+        ("finite_vector", ("bias", [0, np.nan, 0], 3, CalibrationError), "bias: expected finite numbers"),
+        *(("require_noise", ("sigma", v, 1), NUMBER) for v in (True, [1.0], "1")),
+        *(("require_noise", ("sigma", v, 3), NUMBERS) for v in (1.0, [1.0, 2.0], [True] * 3)),
+        *(("require_noise", ("sigma", v, 1), NEGATIVE) for v in (-1e-9, np.inf, np.nan)),
+        *(("require_noise", ("sigma", v, 3), NEGATIVE) for v in ([1.0, 1.0, -1.0], [-1.0, 1.0, 1.0])),
+        ("require_order", (1.0, 2), "^start_ns: expected integer nanoseconds"),
+        ("require_order", (1, np.float64(2)), "^end_ns: expected integer nanoseconds"),
+        ("require_order", (5, 5), "end_ns: 5 is not after start_ns 5"),
+        ("require_order", (5, 4), "end_ns: 4 is not after start_ns 5"),
+        (
+            samples.require_nanoseconds,
+            ("Imu", 7 + np.arange(3) * 49_900),
+            r"Imu.stamps_ns: 3 rows are 4.99e\+04 ns apart",
+        ),
+        ("require_distinct_stamps", ("Imu", np.array([0, 0, 100]), 0, 2), "rows 0 and 1 are both stamped 0 ns"),
+        (
+            samples.require_distinct_stamps,
+            ("Imu", np.array([0, 100, 100]), 0, 2),
+            "rows 1 and 2 are both stamped 100 ns",
+        ),
     ],
 )
 def test_mistakes_are_refused_by_name(check, arguments, message):
     with pytest.raises((MeasurementError, CalibrationError), match=message):
-        check(*arguments)
+        getattr(samples, check)(*arguments)
 
 
 def test_what_is_right_is_let_through():
     """Of two rows nothing can be said about their unit; one of them may be late."""
-    assert finite_vector("bias", [1, 2, 3], 3).tolist() == [1.0, 2.0, 3.0]
+    assert samples.finite_vector("bias", [1, 2, 3], 3).tolist() == [1.0, 2.0, 3.0]
     for numbers, size in ((0.0, 1), (2, 1), ([0.0, 1.0, 2.0], 3), (np.ones(3, np.int64), 3)):
-        require_noise("sigma", numbers, size)
-    require_order(np.int64(1), np.int32(2))
+        samples.require_noise("sigma", numbers, size)
+    samples.require_order(np.int64(1), np.int32(2))
     for ns in (7 + np.arange(3) * 50_100, np.array([7, 17])):
-        require_nanoseconds("Imu", ns)
+        samples.require_nanoseconds("Imu", ns)
     for first, last in ((0, 8), (0, 0), (8, 8)):
-        require_distinct_stamps("Imu", np.arange(9) * 100, first, last)
+        samples.require_distinct_stamps("Imu", np.arange(9) * 100, first, last)
 
 
 @pytest.mark.parametrize(
@@ -150,14 +159,14 @@ def test_what_is_right_is_let_through():
     ],
 )
 def test_the_nearest_stamp_and_another_unit_are_named(instant, ending):
-    assert str(no_doppler_stamp("end_ns", instant, AT)).endswith(ending)
-    assert "seems" not in str(no_doppler_stamp("start_ns", 0, AT - 30 * 10**9 - 1))
+    assert str(samples.no_doppler_stamp("end_ns", instant, AT)).endswith(ending)
+    assert "seems" not in str(samples.no_doppler_stamp("start_ns", 0, AT - 30 * 10**9 - 1))
 
 
 def test_doppler_stamps_closer_than_a_millisecond_are_in_a_larger_unit():
     """In the mean over all; a single one tells nothing."""
     for ns, is_close in ((np.arange(5) * 999_000, True), (np.arange(5) * 1_001_000, False), (np.array([9]), False)):
-        assert ("the stamps are so close" in str(no_doppler_stamp("end_ns", -5, ns))) == is_close
+        assert ("the stamps are so close" in str(samples.no_doppler_stamp("end_ns", -5, ns))) == is_close
 
 
 @pytest.mark.parametrize("row", range(8))
@@ -167,12 +176,12 @@ def test_stamps_repeated_from_the_row_before_to_the_row_after_are_refused(row):
     twice[row + 1] = twice[row]
     message = f"rows {row} and {row + 1} are both .* {row}00 ns"
     with pytest.raises(MeasurementError, match=message) if 1 <= row <= 4 else nullcontext():
-        require_distinct_stamps("Imu", twice, 2, 4)
+        samples.require_distinct_stamps("Imu", twice, 2, 4)
 
 
 def is_covariance(cov: np.ndarray) -> bool:
     try:
-        require_covariances("cov", cov[None], AT)
+        samples.require_covariances("cov", cov[None], AT)
     except MeasurementError:
         return False
     return True
@@ -183,7 +192,7 @@ def test_an_impossible_covariance_is_found_in_every_row(row):
     every = np.tile(np.eye(3), (3, 1, 1))
     every[row] *= -1.0
     with pytest.raises(MeasurementError, match=f"cov: the row at {AT[row]} ns is no covariance"):
-        require_covariances("cov", every, AT)
+        samples.require_covariances("cov", every, AT)
 
 
 @given(
@@ -191,14 +200,14 @@ def test_an_impossible_covariance_is_found_in_every_row(row):
     st.floats(1e-8, 1e-2),
     st.floats(0.0, 1.0),
 )
-def test_weights_are_those_of_least_squares_with_a_shared_random_walk(samples, wander, last_s):
+def test_weights_are_those_of_least_squares_with_a_shared_random_walk(depths, wander, last_s):
     """Two samples share the error of the way that both are carried: C_kl = q min(t_k, t_l) + r_k for k = l."""
-    steps, variance = np.array(samples).T
+    steps, variance = np.array(depths).T
     before_end = last_s + np.append(np.cumsum(steps[:0:-1])[::-1], 0.0)
     C = wander * np.minimum.outer(before_end, before_end) + np.diag(variance)
     ones = np.ones(len(variance))
     expected = np.linalg.solve(C, ones) / (ones @ np.linalg.solve(C, ones))
-    weights, mean_variance = weights_at_end(variance, before_end, wander)
+    weights, mean_variance = samples.weights_at_end(variance, before_end, wander)
     assert weights == pytest.approx(expected, rel=1e-6, abs=1e-9)
     assert mean_variance == pytest.approx(1 / (ones @ np.linalg.solve(C, ones)), rel=1e-6)
 
@@ -225,3 +234,170 @@ def test_a_covariance_has_no_negative_or_unknown_variance_and_is_symmetric_to_si
         changed = cov.copy()
         changed[place] += change * sigmas[place[0]] * sigmas[place[1]]
         assert is_covariance(changed) == (change in small)
+
+
+DVL_HZ, SECONDS, SIGMA = 5, 6.0, 0.01
+BLIND, WHOLE = np.diag([SIGMA**2, 100.0**2, 100.0**2]), np.eye(3) * SIGMA**2
+
+
+def driven(partial: tuple[int, ...] = (), outliers: tuple[int, ...] = (), blind: np.ndarray = BLIND) -> Dvl:
+    """Straight ahead at 0.8 m/s; some rows measure the surge alone, some are wrong by 3 m/s."""
+    at = stamps(DVL_HZ, SECONDS)
+    velocity, cov = np.tile([0.8, 0.0, 0.0], (len(at), 1)), np.tile(WHOLE, (len(at), 1, 1))
+    cov[list(partial)] = blind
+    velocity[list(outliers), 0] += 3.0
+    return dvl(at, velocity, cov)
+
+
+def told(odometry: Odometry) -> list[tuple[int, Refusal]]:
+    return sorted(((row.stamp_ns - T0_NS) * DVL_HZ // NS, row.reason) for row in odometry.refused)
+
+
+@given(st.lists(st.integers(0, round(SECONDS * NS)), max_size=5))
+@settings(max_examples=30, deadline=None)
+def test_what_is_refused_does_not_depend_on_how_rows_are_cut(cuts):
+    """A row after rows with one beam is compared with the whole one before them, in whatever block that came."""
+    outliers = (0, 1, 5, 10, 12, 21)
+    rows = driven(partial=(8, 9, 10, 11, 20), outliers=outliers)
+    edges = [0, *(T0_NS + cut for cut in sorted(cuts)), T0_NS + 10 * NS]
+    whole, pieces = odometry_at_rest(rows), odometry_at_rest(*(rows.between(*ends) for ends in pairwise(edges)))
+    assert told(whole) == [(k, Refusal.OUTLIER) for k in outliers]
+    assert sorted(pieces.refused) == sorted(whole.refused)
+    for one, other in zip(pieces.columns()[:6], whole.columns()[:6], strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_what_a_row_with_one_beam_did_not_measure_hides_no_outlier():
+    """Compared with a row that is blind to the side, any velocity to the side would pass."""
+    rows = driven(partial=(8,))
+    velocity = rows.velocity + 3.0 * np.outer(np.arange(len(rows)) == 9, [0.0, 1.0, 0.0])
+    assert told(odometry_at_rest(replace(rows, velocity=velocity))) == [(9, Refusal.OUTLIER)]
+
+
+def test_rows_of_few_beams_are_named_until_they_are_completed():
+    rows = driven(partial=(0, 1, 8, 9, 28, 29, 30))
+    odometry = odometry_at_rest(rows.rows(slice(0, 9)))
+    assert told(odometry) == [(k, Refusal.INCOMPLETE) for k in (0, 1, 8)]
+    odometry.add(None, rows.rows(slice(9, None)))
+    assert told(odometry) == [(k, Refusal.INCOMPLETE) for k in (0, 1, 28, 29, 30)]
+    assert np.isnan([row.distance for row in odometry.refused]).all()
+    np.testing.assert_array_equal(odometry.columns()[3], rows.stamps_ns[2:28])
+
+
+@pytest.mark.parametrize("more_ns", [0, 1])
+def test_rows_of_few_beams_over_too_long_a_stretch_are_named(more_ns):
+    ns = T0_NS + np.array([0, NS, LONGEST_STRETCH_NS + more_ns])
+    odometry = Odometry(Calibration())
+    odometry.add(imu(ns[[0, 2]], 0.0), dvl(ns, 0.8, np.array([WHOLE, BLIND, WHOLE])))
+    assert [(row.stamp_ns, row.reason) for row in odometry.refused] == [(T0_NS + NS, Refusal.INCOMPLETE)] * more_ns
+    assert len(odometry.columns()[3]) == 3 - more_ns
+
+
+@pytest.mark.parametrize(
+    ("partial", "blocks", "used"),
+    [(3, ([2, 4], [3], [5]), [2, 4, 5]), (25, ([0, 1, 25],), [0, 1])],
+    ids=["overtaken", "after a long gap"],
+)
+def test_a_row_of_few_beams_waits_to_be_completed_and_for_no_other(partial, blocks, used):
+    rows = driven(partial=(partial,))
+    odometry = odometry_at_rest(*(rows.rows(np.array(block)) for block in blocks))
+    assert told(odometry) == [(partial, Refusal.INCOMPLETE)]
+    np.testing.assert_array_equal(odometry.columns()[3], rows.stamps_ns[used])
+
+
+def test_rows_are_late_up_to_the_settled_stamp_and_those_known_already_are_no_news():
+    rows = driven()
+    odometry = odometry_at_rest(rows.rows(np.delete(np.arange(12), 4)))
+    odometry.settle(int(rows.stamps_ns[5]))
+    odometry.settle(int(rows.stamps_ns[2]))
+    odometry.add(None, rows)
+    odometry.add(None, rows.rows(slice(5, 6)))
+    assert told(odometry) == [(4, Refusal.LATE)]
+    assert odometry.columns()[3][-1] == rows.stamps_ns[-1]
+    odometry = Odometry(Calibration())
+    odometry.settle(T0_NS)
+    odometry.add(None, dvl(T0_NS + np.array([-1, 0, 1, 2]), [0.8, 0.0, 0.0]))
+    assert [row.stamp_ns - T0_NS for row in odometry.refused] == [-1, 0]
+    assert (odometry.columns()[3] - T0_NS).tolist() == [1, 2]
+
+
+def test_of_equal_stamps_the_first_counts():
+    one, other = dvl(stamps(5, 1.0), [0.8, 0.0, 0.0]), dvl(stamps(5, 1.0), [0.81, 0.0, 0.0])
+    within = dvl(np.repeat(stamps(5, 1.0), 2), np.tile([[0.8, 0, 0], [0.81, 0, 0]], (6, 1)))
+    across, inside = odometry_at_rest(one), odometry_at_rest(within)
+    assert across.add(None, other)
+    for odometry in (across, inside):
+        np.testing.assert_array_equal(odometry.columns()[3], one.stamps_ns)
+        np.testing.assert_array_equal(odometry.columns()[4], one.velocity)
+
+
+@pytest.mark.parametrize(
+    ("offsets", "kept"), [([0, 0], [0]), ([0, 1, 1], [0, 1]), ([0, 0, 1], [0, 1]), ([0, 1], [0, 1])]
+)
+def test_repeats_are_left_out_wherever_they_are_in_a_block(offsets, kept):
+    odometry = Odometry(Calibration())
+    odometry.add(imu(T0_NS + np.array(offsets), 0.0), None)
+    assert (odometry.columns()[0] - T0_NS).tolist() == kept
+
+
+def test_only_rows_before_others_ask_for_motion_anew():
+    odometry, rows = Odometry(Calibration()), driven()
+    assert not odometry.add(imu(stamps(50, SECONDS), 0.0), rows.rows(slice(0, 5)))
+    assert not odometry.add(None, rows.rows(slice(6, 8)))
+    assert odometry.add(None, rows.rows(slice(5, 6)))
+    assert odometry.add(imu(stamps(50, SECONDS)[-1:] - 1, 0.0), None)
+
+
+def test_rows_are_turned_into_body_axes_with_the_calibrations_noise_where_the_log_says_none():
+    """A sensor whose x axis points along the body's y, and whose y along the body's -x."""
+    quarter = Mounting(rpy_rad=(0.0, 0.0, np.pi / 2))
+    log = DvlCalibration(mounting=quarter, velocity_sigma_m_s=(0.01, 0.02, 0.03))
+    for cov in (np.diag([1e-4, 4e-4, 9e-4]), np.nan):
+        intake = RowIntake(Calibration(imu=ImuCalibration(mounting=quarter), dvl=log))
+        intake.add_imu(imu(stamps(5, 0.2), [1.0, 2.0, 3.0], [4.0, 5.0, 6.0]))
+        intake.add_dvl(dvl(stamps(5, 0.2), [0.1, 0.2, 0.3], cov))
+        assert intake.imu.values[0][1] == pytest.approx([-2.0, 1.0, 3.0])
+        assert intake.imu.values[1][1] == pytest.approx([-5.0, 4.0, 6.0])
+        assert intake.dvl.values[0][1] == pytest.approx([-0.2, 0.1, 0.3])
+        assert intake.dvl.values[1][1] == pytest.approx(np.diag([4e-4, 1e-4, 9e-4]))
+
+
+def test_held_velocities_may_jump():
+    held = Calibration(odometry_interpolation="hold-past")
+    assert not odometry_at_rest(driven(outliers=(5, 12)), calibration=held).refused
+
+
+def test_an_infinite_variance_is_completed_like_one_of_a_direction_not_measured():
+    turned = Calibration(dvl=DvlCalibration(mounting=Mounting(rpy_rad=(0.1, 0.2, 0.7))))
+    logs = [driven((4, 5), blind=np.diag([SIGMA**2, unmeasured, unmeasured])) for unmeasured in (100.0**2, np.inf)]
+    one, other = (odometry_at_rest(rows, calibration=turned).columns()[:6] for rows in logs)
+    for column, same in zip(one, other, strict=True):
+        np.testing.assert_array_equal(column, same)
+    assert len(one[3]) == len(logs[0])
+
+
+def test_an_infinite_variance_is_that_of_a_direction_not_measured_and_nan_is_not_said():
+    whole = np.array([[2.0, 0.5, 0.1], [0.5, 3.0, 0.2], [0.1, 0.2, 4.0]])
+    cov = np.array([whole, whole, np.full((3, 3), np.nan)])
+    cov[1, 1], cov[1, :, 1] = np.inf, np.inf
+    cov[0, 2, 1] = np.nan
+    unsaid = np.arange(9.0).reshape(3, 3)
+    whole[2, 1] = 7.0
+    found = samples.in_numbers(cov, unsaid)
+    np.testing.assert_array_equal(found[0], whole)
+    np.testing.assert_array_equal(found[1], [[2.0, 0.0, 0.1], [0.0, UNMEASURED_M_S**2, 0.0], [0.1, 0.0, 4.0]])
+    np.testing.assert_array_equal(found[2], unsaid)
+    np.testing.assert_array_equal(samples.is_partial(cov), [False, True, False])
+
+
+def test_a_row_is_partial_by_the_directions_that_it_leaves_whatever_its_axes():
+    turn = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
+    for variances, partial in (
+        ((1e-4, 1e-4, UNMEASURED_M_S**2), True),
+        ((UNMEASURED_M_S**2, 1e-4, 1e-4), True),
+        ((1e-4, UNMEASURED_M_S**2, 1e-4), True),
+        ((0.2 * UNMEASURED_M_S**2,) * 3, True),
+        ((0.16 * UNMEASURED_M_S**2,) * 3, False),
+        ((np.nan,) * 3, False),
+    ):
+        assert samples.is_partial((turn * np.array(variances) @ turn.T)[None])[0] == partial
