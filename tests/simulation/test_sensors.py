@@ -154,12 +154,12 @@ def test_dvl_noise_is_what_its_covariance_column_says_and_scale_error_stretches_
 
 def test_dvl_dropouts_leave_gaps_of_their_length_at_their_rate():
     path, stamps = still(duration_s=3600.0), regular_stamps(7, 3600)
-    faulty, whole = (
+    faulty, whole, lost = (
         simulate_dvl(path, stamps, DvlCalibration(), np.random.default_rng(8), **faults)
-        for faults in ({"dropouts_per_hour": 60, "dropout_s": 5.0}, {})
+        for faults in ({"dropouts_per_hour": 60, "dropout_s": 5.0}, {}, {"dropouts_per_hour": 1e5})
     )
     assert len(whole) == len(stamps)
-    assert faulty.stamps_ns[[0, -1]].tolist() == stamps[[0, -1]].tolist()
+    assert lost.stamps_ns.tolist() == stamps[[0, -1]].tolist()  # the run covers the same time
     # A sample is lost when a Poisson event lies within the 5 s before it.
     assert 1 - len(faulty) / len(stamps) == pytest.approx(1 - np.exp(-60 * 5 / 3600), abs=0.03)
     gaps_s = np.diff(faulty.stamps_ns) * 1e-9

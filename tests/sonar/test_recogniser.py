@@ -152,13 +152,13 @@ def test_a_bad_frame_has_a_row_and_no_sighting_and_the_motion_over_it_counts_onc
     good, bad = Recogniser(DECIBELS), Recogniser(DECIBELS)
     for recogniser in (good, bad):
         pass_by(recogniser, SQUARE, 5)
-    assert bad.process(frame(5, np.zeros((96, 512), np.float32)), aside(0.02), VIEW) is None
+    assert bad.process(frame(5, np.zeros((96, 512), np.float32)), aside(0.35), VIEW) is None
     assert [fate[:2] for fate in bad.fates] == [(5 * FRAME_NS, -1)]
     assert np.isnan(bad.fates[0][2:4]).all()
     assert bad.fates[0].outcome == "frame not used: all samples are zero"
     assert bad.sightings == []
     last = frame(6, picture(SQUARE, 1.7, -0.15, 0.4, 6))
-    expected, found = good.process(last, aside(0.05), VIEW), bad.process(last, aside(0.03), VIEW)
+    expected, found = good.process(last, aside(0.05), VIEW), bad.process(last, aside(-0.3), VIEW)
     np.testing.assert_allclose(found.range_m, expected.range_m)
     np.testing.assert_allclose(found.id_probability, expected.id_probability, atol=1e-6)
     assert [f.track for f in bad.fates if f.track >= 0] == [f.track for f in good.fates if f.track >= 0]
