@@ -68,23 +68,18 @@ def test_gaps_up_to_a_width_are_bridged(closing_m, count):
     assert len(select((speckle_db(1) + 15 * halves).astype(np.float32), closing_m=closing_m).accepted) == count
 
 
-@pytest.mark.parametrize("looks", [1, 4, 20])
-def test_offset_of_many_looks_is_that_of_their_mean_power(looks):
-    levels = 10 * np.log10(stats.gamma(looks).rvs(1_000_000, random_state=4))
-    offset = false_alarm_offset_db(float(np.std(levels)), 1e-2)
-    assert np.mean(levels > np.mean(levels) + offset) == pytest.approx(1e-2, rel=0.06)
-
-
-def test_offsets_are_those_of_an_exponential_for_one_look_and_interpolated_for_images():
+def test_offsets_are_those_of_speckle_of_one_look_and_of_many_and_interpolated_for_images():
     """-ln(0.01) = 4.605 times the mean is 6.63 dB, and the mean of decibels lies 2.51 dB below that of the power."""
     assert false_alarm_offset_db(5.570, 0.01) == pytest.approx(6.632 + 2.507, abs=0.01)
+    for looks in (1, 4, 20):
+        levels = 10 * np.log10(stats.gamma(looks).rvs(1_000_000, random_state=4))
+        offset = false_alarm_offset_db(float(np.std(levels)), 1e-2)
+        assert np.mean(levels > np.mean(levels) + offset) == pytest.approx(1e-2, rel=0.06)
     spreads = np.array([0.3, 1.23, 5.57, 8.0], dtype=np.float32)
     exact = [false_alarm_offset_db(float(spread), 1e-3) for spread in spreads]
     assert false_alarm_offsets_db(spreads, 1e-3) == pytest.approx(exact, abs=0.02)
-
-
-def test_lengths_become_odd_numbers_of_beams_and_bins():
-    assert [odd_counts(length_m, (1.885 * np.radians(0.3), 1.25 / 512)) for length_m in (0.03, 0)] == [(3, 13), (1, 1)]
+    cell_m = 1.885 * np.radians(0.3), 1.25 / 512
+    assert [odd_counts(length_m, cell_m) for length_m in (0.03, 0.0)] == [(3, 13), (1, 1)]  # beams and bins
 
 
 ACROSS = np.linspace(-1.0, 1.0, 96)[:, None]
