@@ -227,7 +227,6 @@ def gathered(rows: Iterable[RefusedRow]) -> list[RefusedRows]:
     found: list[RefusedRows] = []
     for _, alike in groupby(ordered, key=lambda row: (row.sensor, row.reason)):
         several = list(alike)
-        found += (
-            [RefusedRows.of(several)] if len(several) > MOST_ROWS_NAMED else [RefusedRows.of([row]) for row in several]
-        )
+        together = [several] if len(several) > MOST_ROWS_NAMED else [[row] for row in several]
+        found += map(RefusedRows.of, together)
     return found

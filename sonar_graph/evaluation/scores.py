@@ -46,27 +46,17 @@ def trajectory_scores(
     Estimate, truth and errors are at the scored instants; ``instants`` has these in words, for the protocols.
     """
     which, over = ESTIMATES[kind], f"over {instants}, to which the truth is interpolated"
-    fitted = "without scale (Umeyama 1991), fitted to these instants"
-    scores = {
-        "ate_raw_m": Score(ate_raw_m(estimate, truth), "m", f"{which}, not aligned: rms of 3-D position error {over}."),
-    }
-    for key, error_m, freedom, what in (
-        ("ate_yaw_m", ate_yaw_m, "yaw and translation", "3-D"),
-        ("ate_se2_m", ate_se2_m, "SE(2)", "horizontal"),
-        ("ate_se3_m", ate_se3_m, "SE(3)", "3-D"),
-    ):
-        protocol = f"{which}, aligned by {freedom} {fitted}: rms of {what} position error {over}."
-        scores[key] = Score(error_m(estimate, truth), "m", protocol)
-    scores |= {
-        "yaw_rmse_rad": Score(
-            rmse(yaw_errors_rad(estimate, truth)), "rad", f"{which}, not aligned: rms of wrapped heading error {over}."
-        ),
-        "return_error_m": Score(
-            return_error_m(estimate, truth),
-            "m",
-            f"{which}, not aligned: norm of estimated minus true displacement from the first to the last, {over}.",
-        ),
-    }
+    fitted = "without scale (Umeyama 1991), fitted to these instants: rms of"
+    rules = [
+        ("ate_raw_m", ate_raw_m(estimate, truth), "m", "not aligned: rms of 3-D position error"),
+        ("ate_yaw_m", ate_yaw_m(estimate, truth), "m", f"aligned by yaw and translation {fitted} 3-D position error"),
+        ("ate_se2_m", ate_se2_m(estimate, truth), "m", f"aligned by SE(2) {fitted} horizontal position error"),
+        ("ate_se3_m", ate_se3_m(estimate, truth), "m", f"aligned by SE(3) {fitted} 3-D position error"),
+        ("yaw_rmse_rad", rmse(yaw_errors_rad(estimate, truth)), "rad", "not aligned: rms of wrapped heading error"),
+        ("return_error_m", return_error_m(estimate, truth), "m",
+         "not aligned: norm of estimated minus true displacement from the first to the last,"),
+    ]  # fmt: skip
+    scores = {key: Score(value, unit, f"{which}, {rule} {over}.") for key, value, unit, rule in rules}
     for delta_s in RELATIVE_DELTAS_S:
         relative = relative_errors(estimate, truth, delta_s)
         if not len(relative):
@@ -108,19 +98,16 @@ def landmark_scores(estimated: LandmarkMap, true: LandmarkMap | None) -> dict[st
     how = f"by identity, {by_place} of them by place within {FARTHEST_M:g} m" if by_place else "by identity"
     which = f"Map at the end, {len(errors)} landmarks matched {how} ({len(true)} true, {len(estimated)} estimated)"
     nees = normalised_squares(errors.horizontal_m, errors.horizontal_covs)
+    se2 = "aligned by SE(2) without scale fitted to the landmarks: rms of horizontal error"
+    consistency = "mean normalised squared horizontal error divided by 2; 1 is consistent; landmarks of one map are"
     scores = {
         "landmarks.raw_m": Score(rmse(errors.horizontal_m), "m", f"{which}, not aligned: rms of horizontal error."),
-        "landmarks.se2_m": Score(
-            errors.aligned_rmse_m,
-            "m",
-            f"{which}, aligned by SE(2) without scale fitted to the landmarks: rms of horizontal error.",
-        ),
+        "landmarks.se2_m": Score(errors.aligned_rmse_m, "m", f"{which}, {se2}."),
         "landmarks.count": count,
         "landmarks.nees": Score(
             mean_normalised(nees, 2),
             "1",
-            f"{which}, not aligned: mean normalised squared horizontal error divided by 2; 1 is consistent; landmarks "
-            "of one map are correlated, so no band is given.",
+            f"{which}, not aligned: {consistency} correlated, so no band is given.",
             better="inside",
         ),
     }
@@ -135,25 +122,14 @@ def detection_scores(log: DetectionLog) -> dict[str, Score]:
     unnamed = counts[Outcome.NO_IDENTITY] + counts[Outcome.WAITING] + counts[Outcome.FORGOTTEN]
     refused = len(log) - used - ignored - unnamed
     of_all = f"of {len(log)}" + (f", {ignored} of which this estimator has no use for" if ignored else "")
-    scores = {
-        "detections.used": Score(
-            float(used), "1", f"Detections used, {of_all}; {new} of those used began a landmark.", better="none"
-        ),
-        "detections.refused": Score(
-            float(refused),
-            "1",
-            f"Detections of a landmark refused, {of_all}: outside the gate, repeated, too late, taken back "
-            "or without odometry.",
-            better="none",
-        ),
-        "detections.unnamed": Score(
-            float(unnamed),
-            "1",
-            f"Detections in which no landmark is probable enough for this estimator, {of_all}; the recogniser mostly "
-            "took these for no landmark.",
-            better="none",
-        ),
-    }
+    rules = (
+        ("used", used, f"Detections used, {of_all}; {new} of those used began a landmark."),
+        ("refused", refused, f"Detections of a landmark refused, {of_all}: outside the gate, repeated, too late, taken "
+         "back or without odometry."),
+        ("unnamed", unnamed, f"Detections in which no landmark is probable enough for this estimator, {of_all}; the "
+         "recogniser mostly took these for no landmark."),
+    )  # fmt: skip
+    scores = {f"detections.{key}": Score(float(n), "1", rule, better="none") for key, n, rule in rules}
     squares = nis(log)
     is_gated_much = counts[Outcome.GATED] > GATED_SHARE * len(log)
     if squares.size:
@@ -170,27 +146,22 @@ def detection_scores(log: DetectionLog) -> dict[str, Score]:
 
 def resource_scores(run: RunResult, log_s: float) -> dict[str, Score]:
     """Time and memory of one run over a log of this duration in seconds."""
-    calls = f"over {len(run.update_s)} calls of process, one per instant, each with all measurements since the last"
-    total_s = float(run.update_s.sum() + run.finish_s)
-    ms = run.update_s * 1e3
+    each = "one per instant, each with all measurements since the last"
+    calls = f"wall-clock time over {len(run.update_s)} calls of process, {each}"
+    total_s, ms = float(run.update_s.sum() + run.finish_s), run.update_s * 1e3
+    speed = f"Duration of the log ({log_s:.1f} s) divided by time.total_s."
+    whole = "all calls of process and of asking for trajectory and map at the end"
+    memory = (
+        "Highest resident memory of the process during the run above that at its start (Linux); memory freed by "
+        "earlier runs is reused without being counted."
+    )
     scores = {
-        "time.update_median_ms": Score(float(np.median(ms)), "ms", f"Median wall-clock time {calls}."),
-        "time.update_p99_ms": Score(float(np.quantile(ms, 0.99)), "ms", f"99th percentile of wall-clock time {calls}."),
-        "time.update_max_ms": Score(
-            float(ms.max()), "ms", f"Longest wall-clock time {calls}; compiling is not counted."
-        ),
-        "time.total_s": Score(
-            total_s, "s", "Wall-clock time of all calls of process and of asking for trajectory and map at the end."
-        ),
-        "time.real_time_factor": Score(
-            log_s / total_s, "1", f"Duration of the log ({log_s:.1f} s) divided by time.total_s.", better="higher"
-        ),
-        "memory.peak_mb": Score(
-            run.peak_memory_mb,
-            "MB",
-            "Highest resident memory of the process during the run above that at its start (Linux); memory freed by "
-            "earlier runs is reused without being counted.",
-        ),
+        "time.update_median_ms": Score(float(np.median(ms)), "ms", f"Median {calls}."),
+        "time.update_p99_ms": Score(float(np.quantile(ms, 0.99)), "ms", f"99th percentile of {calls}."),
+        "time.update_max_ms": Score(float(ms.max()), "ms", f"Longest {calls}; compiling is not counted."),
+        "time.total_s": Score(total_s, "s", f"Wall-clock time of {whole}."),
+        "time.real_time_factor": Score(log_s / total_s, "1", speed, better="higher"),
+        "memory.peak_mb": Score(run.peak_memory_mb, "MB", memory),
     }
     return _finite(scores)
 

@@ -22,7 +22,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from dataclasses import MISSING, asdict, fields, replace
+from dataclasses import MISSING, asdict, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -72,7 +72,7 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
                 (result.parent / name).unlink(missing_ok=True)
             if not any(result.parent.iterdir()):
                 result.parent.rmdir()
-    write_arrays(folder / SEQUENCE, sequence_arrays(comparison.sequence) | {"instants_ns": comparison.instants_ns})
+    _write_arrays(folder / SEQUENCE, _sequence_arrays(comparison.sequence) | {"instants_ns": comparison.instants_ns})
     entries = {}
     for run in comparison.runs:
         _write_run(run, comparison, folder / RUNS / run.estimator)
@@ -111,7 +111,7 @@ def _write_run(run: RunResult, comparison: Comparison, folder: Path) -> None:
             write_tum(path, run.causal)
         with replacing(folder / "landmarks.csv") as path:
             write_landmarks_csv(path, run.landmarks)
-    write_arrays(folder / SERIES, run_arrays(run, comparison.errors.get(run.estimator, {})))
+    _write_arrays(folder / SERIES, _run_arrays(run, comparison.errors.get(run.estimator, {})))
     scores = comparison.scores.get(run.estimator, {})
     timings = {key.removeprefix("time."): score.value for key, score in scores.items() if key.startswith("time.")}
     result = {
@@ -201,18 +201,8 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
     scores: dict[str, dict[str, Score]] = {}
     errors: dict[str, dict[Kind, ErrorSeries]] = {}
     for name, entry in index["runs"].items():
-        arrays = read_arrays(folder / RUNS / name / SERIES)
-        memory = entry["peak_memory_mb"]
-        told = RunResult(
-            name,
-            entry["params"],
-            entry["status"],
-            entry["reason"],
-            withheld=entry.get("withheld", []),
-            finish_s=entry["finish_s"],
-            peak_memory_mb=float("nan") if memory is None else memory,
-        )
-        runs.append(restore_run(told, arrays))
+        arrays = _read_arrays(folder / RUNS / name / SERIES)
+        runs.append(_restore_run(name, entry, arrays))
         scores[name] = {
             key: Score(**(score | {"interval": tuple(score["interval"]) if score["interval"] else None}))
             for key, score in entry["scores"].items()
@@ -220,10 +210,10 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
         if "errors" in entry:
             series = {kind: _unpack(f"errors.{kind}", ErrorSeries, arrays) for kind in KINDS}
             errors[name] = {kind: known for kind, known in series.items() if known is not None}
-    arrays, entry = read_arrays(folder / SEQUENCE), index["sequence"]
+    arrays, entry = _read_arrays(folder / SEQUENCE), index["sequence"]
     calibration = Calibration.parse(entry["calibration"], str(folder / INDEX))
     return Comparison(
-        sequence=restore_sequence(entry["name"], calibration, entry["notes"], arrays),
+        sequence=_restore_sequence(entry["name"], calibration, entry["notes"], arrays),
         instants_ns=arrays["instants_ns"],
         runs=runs,
         scores=scores,
@@ -233,7 +223,7 @@ def _restore(index: dict[str, Any], folder: Path) -> Comparison:
     )
 
 
-def write_arrays(path: Path, arrays: Arrays) -> None:
+def _write_arrays(path: Path, arrays: Arrays) -> None:
     """Write named arrays, whole or not at all; not compressed, since noise in every digit hardly gets smaller.
 
     The archive is built in memory: writing it goes back to the head of each of many small entries.
@@ -247,7 +237,7 @@ def write_arrays(path: Path, arrays: Arrays) -> None:
         partial.write_bytes(content.getbuffer())
 
 
-def read_arrays(path: Path) -> Arrays:
+def _read_arrays(path: Path) -> Arrays:
     """The arrays of a file by name.
 
     Raises `EvaluationError` when the file is missing or damaged.
@@ -259,7 +249,7 @@ def read_arrays(path: Path) -> Arrays:
         raise EvaluationError(f"{path}: cannot be read as arrays ({error}); write the comparison anew") from error
 
 
-def sequence_arrays(sequence: Sequence) -> Arrays:
+def _sequence_arrays(sequence: Sequence) -> Arrays:
     """Truth and detections, and the first and last row of IMU and Doppler log; their measurements are in the log."""
     ends = np.array([0, -1])
     arrays = _pack("imu", sequence.imu.rows(ends)) | _pack("dvl", sequence.dvl.rows(ends))
@@ -269,7 +259,7 @@ def sequence_arrays(sequence: Sequence) -> Arrays:
     return arrays | _pack("detections", sequence.detections)
 
 
-def restore_sequence(name: str, calibration: Calibration, notes: dict[str, str], arrays: Arrays) -> Sequence:
+def _restore_sequence(name: str, calibration: Calibration, notes: dict[str, str], arrays: Arrays) -> Sequence:
     """A sequence with its start, end, detections and truth, but without its motion's measurements."""
     imu, dvl = _unpack("imu", Imu, arrays), _unpack("dvl", Dvl, arrays)
     if imu is None or dvl is None:
@@ -288,7 +278,7 @@ def restore_sequence(name: str, calibration: Calibration, notes: dict[str, str],
     )
 
 
-def run_arrays(run: RunResult, errors: dict[Kind, ErrorSeries]) -> Arrays:
+def _run_arrays(run: RunResult, errors: dict[Kind, ErrorSeries]) -> Arrays:
     """All arrays of one run, and its errors."""
     arrays = {"update_s": run.update_s}
     for kind in KINDS:
@@ -299,21 +289,28 @@ def run_arrays(run: RunResult, errors: dict[Kind, ErrorSeries]) -> Arrays:
     return arrays | _pack("landmarks", run.landmarks) | _pack("detections", run.detections)
 
 
-def restore_run(run: RunResult, arrays: Arrays) -> RunResult:
-    """A run with its arrays put back."""
+def _restore_run(name: str, entry: dict[str, Any], arrays: Arrays) -> RunResult:
+    """A run from its entry in ``comparison.json`` and its arrays."""
     maps: list[MapSoFar] = []
     while (landmarks := _unpack(f"maps.{len(maps)}", LandmarkMap, arrays)) is not None:
         maps.append(MapSoFar(int(arrays[f"maps.{len(maps)}.stamp_ns"]), landmarks))
-    refused = zip(*(arrays[f"refused.{name}"].tolist() for name in RefusedRow._fields), strict=True)
-    return replace(
-        run,
+    refused = zip(*(arrays[f"refused.{field}"].tolist() for field in RefusedRow._fields), strict=True)
+    memory = entry["peak_memory_mb"]
+    return RunResult(
+        name,
+        entry["params"],
+        entry["status"],
+        entry["reason"],
         causal=_unpack("causal", Trajectory, arrays),
         smoothed=_unpack("smoothed", Trajectory, arrays),
         landmarks=_unpack("landmarks", LandmarkMap, arrays),
         detections=_unpack("detections", DetectionLog, arrays),
         refused=[RefusedRow(sensor, at_ns, Refusal(reason), distance) for sensor, at_ns, reason, distance in refused],
+        withheld=entry.get("withheld", []),
         maps=maps,
         update_s=arrays["update_s"],
+        finish_s=entry["finish_s"],
+        peak_memory_mb=float("nan") if memory is None else memory,
     )
 
 
