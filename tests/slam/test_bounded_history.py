@@ -67,6 +67,7 @@ def test_smoothed_poses_are_better_than_causal_ones_and_worse_than_those_of_the_
         truth = mission().truth.at(smoothed.stamps_ns)
         rms[history] = np.sqrt(np.mean(np.sum((smoothed.positions - truth.positions) ** 2, axis=1)))
         assert np.linalg.eigvalsh(smoothed.covariances).min() > 0
+        assert np.array_equal(smoothed.covariances, smoothed.covariances.transpose(0, 2, 1))
         sigma = np.sqrt(np.trace(smoothed.covariances[:, 3:, 3:], axis1=1, axis2=2))
         before = np.sqrt([np.trace(estimate.covariance[3:, 3:]) for estimate in causal])
         assert np.all(sigma < 1.001 * before)
