@@ -142,10 +142,7 @@ def make_params(estimator: type[Estimator], overrides: dict[str, Any], name: str
         Values by name; of a setting in a section by its dotted name, ``{"identity.policy": "gate"}``, or nested,
         ``{"identity": {"policy": "gate"}}``.
 
-    Raises
-    ------
-    EstimatorError
-        Naming the setting that does not exist or does not fit, and those that exist.
+    Raises `EstimatorError` naming the setting that does not exist or does not fit, and those that exist.
     """
     try:
         return estimator.Params.model_validate(nested(overrides))

@@ -44,10 +44,7 @@ def strict_json(content: dict[str, Any]) -> str:
 def read_json(path: Path) -> dict[str, Any]:
     """JSON object in a file.
 
-    Raises
-    ------
-    EvaluationError
-        When the file is missing or is not a JSON object.
+    Raises `EvaluationError` when the file is missing or is not a JSON object.
     """
     try:
         content = json.loads(path.read_text("utf-8"))
@@ -72,10 +69,7 @@ def _strict(value: Any) -> Any:
 def written_whole(path: Path) -> Iterator[BinaryIO]:
     """Open a temporary file beside ``path``, which replaces ``path`` when the block ends without an error.
 
-    Raises
-    ------
-    LogError
-        When the file cannot be written.
+    Raises `LogError` when the file cannot be written.
     """
     partial = path.with_name(path.name + ".part")
     try:

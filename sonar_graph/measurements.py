@@ -56,11 +56,8 @@ class Block:
     Every field is an array whose first axis runs over the rows. The constructor converts types where needed (without a
     copy where not) and checks shapes, finiteness and the order of stamps.
 
-    Raises
-    ------
-    MeasurementError
-        When there is no row, a column has another shape than it says, a number that must be finite is not, or stamps
-        are no integers or run backwards.
+    Raises `MeasurementError` when there is no row, a column has another shape than it says, a number that must be
+    finite is not, or stamps are no integers or run backwards.
     """
 
     stamps_ns: Ints

@@ -47,13 +47,8 @@ for many small tasks and is slowed down here, because it takes time from the run
 def run_batch(runs: Iterable[PlannedRun], store: Store, limits: Limits, where: Where, progress: Progress) -> None:
     """Do runs and keep each as soon as it is done; ``progress`` is called after that.
 
-    Raises
-    ------
-    BatchError
-        When there is no scheduler or no worker, workers cannot do any run, or nothing can be written. Runs that are
-        done by then are kept.
-    KeyboardInterrupt
-        On Ctrl-C, after a few seconds in which workers are ended.
+    Raises `BatchError` when there is no scheduler or no worker, workers cannot do any run, or nothing can be written.
+    Runs that are done by then are kept; `KeyboardInterrupt` on Ctrl-C, after a few seconds in which workers are ended.
     """
     planned = list(runs)
     if not planned:

@@ -59,10 +59,7 @@ def perform_watched(run: PlannedRun, limits: Limits) -> RunOutcome:
     -------
     Its outcome. For a run that is killed again, takes too long or needs too much memory, the row says so.
 
-    Raises
-    ------
-    BatchError, OSError
-        When no run can be done here: other versions, no process, no space.
+    Raises `BatchError` or `OSError` when no run can be done here: other versions, no process, no space.
     """
     reason, log = "", ""
     for _ in range(ATTEMPTS):
@@ -146,12 +143,8 @@ class Runner:
     def perform(self, run: PlannedRun, limits: Limits) -> RunOutcome:
         """Do one run, after a warm-up if it is the first of its estimator here.
 
-        Raises
-        ------
-        KilledError
-            When the process ended during the run.
-        BatchError, OSError
-            When the run could not be done at all.
+        Raises `KilledError` when the process ended during the run; `BatchError` or `OSError` when the run could not be
+        done at all.
         """
         if OWN in run.versions and run.estimator not in self._warm:
             self._warm.add(run.estimator)

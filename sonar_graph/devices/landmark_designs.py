@@ -136,10 +136,7 @@ class _Entry(Section):
     def design(self, folder: Path) -> LandmarkDesign:
         """The design, drawn or with its picture from the folder.
 
-        Raises
-        ------
-        ValueError
-            When the picture cannot be read, or the landmark cannot be told from the floor.
+        Raises `ValueError` when the picture cannot be read, or the landmark cannot be told from the floor.
         """
         if self.picture is not None:
             mask = read_picture(folder / self.picture, self.black_db, self.white_db)
@@ -171,10 +168,7 @@ class _Entry(Section):
 def read_picture(path: Path, black_db: float, white_db: float) -> Floats:
     """Mask from a picture file.
 
-    Raises
-    ------
-    ValueError
-        When the file is not a square picture of 8 or 16 bits.
+    Raises `ValueError` when the file is not a square picture of 8 or 16 bits.
     """
     try:
         picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None

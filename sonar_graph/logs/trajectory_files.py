@@ -28,10 +28,7 @@ def decimal_ns(seconds: str) -> int:
 
     A double cannot tell apart neighbouring nanoseconds of times counted from 1970; the text can.
 
-    Raises
-    ------
-    ValueError
-        When the text is no finite number.
+    Raises `ValueError` when the text is no finite number.
     """
     try:
         return int((Decimal(seconds) * NS_PER_S).to_integral_value())
@@ -59,10 +56,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 def read_tum(path: Path) -> Trajectory:
     """Read poses without covariances; blank lines and lines that begin with ``#`` are skipped.
 
-    Raises
-    ------
-    LogError
-        Naming the line that is not a pose; or when the file cannot be read or its stamps do not increase.
+    Raises `LogError` naming the line that is not a pose; or when the file cannot be read or its stamps do not increase.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
@@ -106,10 +100,7 @@ def write_landmarks_csv(path: Path, landmarks: LandmarkMap) -> None:
 def read_landmarks_csv(path: Path) -> LandmarkMap:
     """Read what `write_landmarks_csv` wrote.
 
-    Raises
-    ------
-    LogError
-        When the file cannot be read, or a column is missing or not a number.
+    Raises `LogError` when the file cannot be read, or a column is missing or not a number.
     """
     try:
         with Path(path).open(encoding="utf-8", newline="") as stream:

@@ -244,10 +244,7 @@ def own_definition(type_name: str) -> Struct:
 def header(stamps_ns: Ints, frame_id: str, prefix: str = "header") -> dict[str, Value]:
     """Columns of a message's header.
 
-    Raises
-    ------
-    LogError
-        When a stamp lies outside what ROS 2 can express (years 1901 to 2038).
+    Raises `LogError` when a stamp lies outside what ROS 2 can express (years 1901 to 2038).
     """
     seconds, nanoseconds = np.divmod(stamps_ns, NS_PER_S)
     if len(seconds) and not (_SECONDS.min <= seconds.min() and seconds.max() <= _SECONDS.max):

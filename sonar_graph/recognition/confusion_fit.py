@@ -179,10 +179,7 @@ def estimate_confusion(
 
     Without the designs themselves, as measured, no recogniser accepts the model.
 
-    Raises
-    ------
-    CalibrationError
-        When a class has too few frames, naming it.
+    Raises `CalibrationError` when a class has too few frames, naming it.
     """
     counts = np.bincount(fits.label, minlength=len(ids) + 1)
     names = [*(f"landmark {i}" for i in ids), "no landmark"]

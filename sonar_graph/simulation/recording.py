@@ -83,10 +83,7 @@ def record(
 
     Path and world are the truth; the notes say where values come from, beside generator and options.
 
-    Raises
-    ------
-    SimulationError
-        When options of tracks are set without ``tracks``.
+    Raises `SimulationError` when options of tracks are set without ``tracks``.
     """
     if options.id_delay_s > 0 and not options.tracks:
         raise SimulationError(

@@ -222,10 +222,7 @@ RING = (
 def tag_design(family: str, tag: int, tag_size_m: float) -> LandmarkDesign:
     """Design of a tag of foam and metal: 24 bits about a dark ring about a square of foam of this size.
 
-    Raises
-    ------
-    CalibrationError
-        When AcTag is not installed.
+    Raises `CalibrationError` when AcTag is not installed.
     """
     parameters = _import_actag("actag.tag_parameters", "drawing")
     levels = np.full((BITS_ACROSS, BITS_ACROSS), PLATE_DB)

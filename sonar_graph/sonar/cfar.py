@@ -66,10 +66,7 @@ def select_candidates(
     Levels in dB, shape (beams, bins), must be finite. Ranges are those of the middles of the bins, azimuths those of
     the beams. Without a floor (view of None) areas are in the slant plane.
 
-    Raises
-    ------
-    MeasurementError
-        When the shapes do not belong together, or a level is not finite.
+    Raises `MeasurementError` when the shapes do not belong together, or a level is not finite.
     """
     params, shape = params or DetectionParams(), (len(azimuths_rad), len(ranges_m))
     if image_db.shape != shape or min(shape) < 2:
@@ -176,10 +173,7 @@ def check_candidates(designs: Iterable[LandmarkDesign], params: DetectionParams,
     and up to ``search_m`` beside it. So some bright part of a design must have the right size and lie about the middle
     of its square. Parts are taken as `select_candidates` sees them in a perfect image without speckle.
 
-    Raises
-    ------
-    CalibrationError
-        Naming the design, its parts and the limits.
+    Raises `CalibrationError` naming the design, its parts and the limits.
     """
     reach_m = search_m + params.smoothing_m
     for design in designs:

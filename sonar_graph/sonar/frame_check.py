@@ -67,10 +67,7 @@ class RangeWindow(NamedTuple):
 def check_block(frame: SonarFrames) -> None:
     """Refuse a block that is not one frame.
 
-    Raises
-    ------
-    MeasurementError
-        When it has more frames, or none.
+    Raises `MeasurementError` when it has more frames, or none.
     """
     if len(frame) != 1:
         raise MeasurementError(f"a recogniser was given a block of {len(frame)} frames; give blocks of one, in order")

@@ -151,10 +151,7 @@ def with_lens(frames: SonarFrames, lens: str) -> SonarFrames:
 def lens_azimuths(lens: str, beams: int, is_rightmost_first: bool = True) -> Floats:
     """Azimuths of the beams of a lens, shape (beams,).
 
-    Raises
-    ------
-    CalibrationError
-        When no table is known for so many beams.
+    Raises `CalibrationError` when no table is known for so many beams.
     """
     if lens == "didson":
         table = didson_azimuths(beams) if beams in DIDSON_BEAMS else None

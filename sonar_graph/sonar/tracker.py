@@ -81,10 +81,7 @@ class Tracker:
     def step(self, candidates: Candidates, motion: SonarStep | None, stamp_ns: int) -> Association:
         """Predict the tracks by the motion since the frame before or the last `skip` (None: none), and update them.
 
-        Raises
-        ------
-        MeasurementError
-            When the stamp is not later.
+        Raises `MeasurementError` when the stamp is not later.
         """
         if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
             raise MeasurementError(

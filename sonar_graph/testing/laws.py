@@ -75,10 +75,7 @@ def run(
     ask_every
         Also ask twice after every so many steps, and again at the end; 0: only at the end.
 
-    Raises
-    ------
-    ContractError
-        When the answers to one question, asked twice, differ.
+    Raises `ContractError` when the answers to one question, asked twice, differ.
     """
     estimator = make(sequence.calibration)
     estimates: list[Estimate] = []

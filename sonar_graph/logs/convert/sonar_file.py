@@ -120,10 +120,7 @@ class SonarFormat(ABC):
     def head(self, content: bytes, at: int) -> FrameHead:
         """Header at the beginning of some bytes, which lie at ``at`` in the file.
 
-        Raises
-        ------
-        DamagedFrameError
-            When the bytes cannot be a header.
+        Raises `DamagedFrameError` when the bytes cannot be a header.
         """
 
     @abstractmethod

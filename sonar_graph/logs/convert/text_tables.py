@@ -45,10 +45,8 @@ def read_table(
     header_lines
         Number of lines at the top without data.
 
-    Raises
-    ------
-    DatasetError
-        When the file is missing, has no row, or a row does not hold as many numbers as there are columns.
+    Raises `DatasetError` when the file is missing, has no row, or a row does not hold as many numbers as there are
+    columns.
     """
     first: list[str] = []
     rows: list[list[float]] = []
@@ -63,10 +61,8 @@ def read_lines(
 ) -> Iterator[tuple[int, list[str]]]:
     """Line number (from 1) and fields of every line with content.
 
-    Raises
-    ------
-    DatasetError
-        When the file cannot be read or holds no such line; ``expected`` says what should have been there.
+    Raises `DatasetError` when the file cannot be read or holds no such line; ``expected`` says what should have been
+    there.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
