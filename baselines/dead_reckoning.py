@@ -1,7 +1,5 @@
 """Dead reckoning: gyros and Doppler log from a given start; docs/theory/dead_reckoning.md."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np

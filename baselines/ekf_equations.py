@@ -28,8 +28,6 @@ W, E: `sonar_graph.numerics`. Arrays have room for more landmarks than there are
 Derivation and the choices the paper leaves open: docs/theory/ekf_slam.md.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

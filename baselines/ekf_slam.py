@@ -3,8 +3,6 @@
 Equations (4) to (7) of the paper are in `baselines.ekf_equations`; docs/theory/ekf_slam.md.
 """
 
-from __future__ import annotations
-
 import math
 from typing import ClassVar
 

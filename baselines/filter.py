@@ -1,7 +1,5 @@
 """Shell of a filter, whatever its mathematics: the estimator's contract, windows of rows, and detections' outcomes."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 

@@ -12,8 +12,6 @@ Over about a second the mean specific force less the change of the Doppler veloc
 direction of the world's up in the body (`sonar_graph.navigation.alignment`, docs/theory/ekf_slam.md).
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -8,8 +8,6 @@ Depth samples and detections that are related to the state over the same gap of 
 (`baselines.filter_motion.inflate_shared_motion`).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

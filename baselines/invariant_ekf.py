@@ -3,8 +3,6 @@
 Equations: `baselines.invariant_equations`; docs/theory/invariant_ekf.md.
 """
 
-from __future__ import annotations
-
 import math
 from typing import ClassVar
 

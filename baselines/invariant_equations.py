@@ -33,8 +33,6 @@ Every H is zero along a shift of everything in x and y and a turn about the vert
 unobservable directions stay unobservable. Numbers and derivation: docs/theory/invariant_ekf.md.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -18,8 +18,6 @@ which is linear in both positions. V holds the noise of the detection, an elevat
 ``r^2 aperture^4 / 320`` for the length of a beam that is not level. Derivation: docs/theory/gaps.md.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Helpers of the benchmark scripts: arguments, recordings, workers, tables, and the last line of figures."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import multiprocessing

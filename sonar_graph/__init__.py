@@ -70,8 +70,6 @@ track           succession of detections of one object
 window          part of the graph that is still optimised
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from importlib import import_module

@@ -1,7 +1,5 @@
 """``python -m sonar_graph`` is ``sonar-graph``, for whom its folder is not on the path."""
 
-from __future__ import annotations
-
 from sonar_graph.cli import main
 
 if __name__ == "__main__":

@@ -19,8 +19,6 @@ Each message says what was asked, what was found, and what to do. The command li
 with 2; only an unforeseen error ends in a traceback.
 """
 
-from __future__ import annotations
-
 
 class SonarGraphError(Exception):
     """Root of every error that this package raises on purpose."""

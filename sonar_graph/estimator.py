@@ -9,8 +9,6 @@ An estimator is any class with the methods of `Estimator`, announced by its pack
 It then takes part in ``sonar-graph compare`` under that name. `sonar_graph.testing.check_estimator` tests the contract.
 """
 
-from __future__ import annotations
-
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, ClassVar, Protocol, runtime_checkable
 

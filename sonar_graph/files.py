@@ -1,7 +1,5 @@
 """Atomic writing of files, and JSON without NaN or infinity."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """A recorded or simulated run: produced by logs and simulator, consumed by estimators."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 

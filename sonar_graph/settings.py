@@ -1,7 +1,5 @@
 """Sections of settings, and messages about wrong ones that name each field and those that exist."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from copy import deepcopy
 from difflib import SequenceMatcher

@@ -3,8 +3,6 @@
 Three processes share the work. Where everything is compiled already, they take a few seconds.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from concurrent.futures import ProcessPoolExecutor, as_completed

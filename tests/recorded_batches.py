@@ -1,7 +1,5 @@
 """Batches as `bench` would leave them, with numbers drawn from known distributions."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

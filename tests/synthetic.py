@@ -1,7 +1,5 @@
 """A comparison as a basin run would leave it, made without any estimator: truth, drifting paths, maps, scores."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

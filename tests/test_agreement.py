@@ -1,7 +1,5 @@
 """EKF-SLAM, the smoother and dead reckoning where they must say the same."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Every benchmark script runs in its short version and ends in one line of figures; what tables make of failed runs."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import itertools

@@ -1,7 +1,5 @@
 """A plain dead reckoning keeps the contract; each way of breaking it is caught by the check that is meant for it."""
 
-from __future__ import annotations
-
 from copy import copy
 from itertools import count
 from typing import Any

@@ -1,7 +1,5 @@
 """Rules of the house: who may import what, how large a table of contents is, how docstrings begin, what runs."""
 
-from __future__ import annotations
-
 import ast
 import doctest
 import subprocess

@@ -1,7 +1,5 @@
 """The first compilation of a fresh clone is announced; with anything cached it is not."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The checks that users run on factors and covariances tell right from wrong."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """What the README and the pages of docs promise is there."""
 
-from __future__ import annotations
-
 import ast
 import re
 import tomllib

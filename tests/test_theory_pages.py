@@ -1,7 +1,5 @@
 """What pages of theory quote is what their scripts print."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

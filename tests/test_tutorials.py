@@ -1,7 +1,5 @@
 """The tutorials run as they stand, and what they print is true."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

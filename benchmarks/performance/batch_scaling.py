@@ -5,8 +5,6 @@ cluster. The overhead of a run is the time from one run being kept to the next w
 spent on reading or simulating its log and on estimating.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 import time

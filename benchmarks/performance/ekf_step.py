@@ -25,8 +25,6 @@ The comparison is void, and the exit code always 1, unless all three filters end
 and of P in units of its sigmas, within 1e-6.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

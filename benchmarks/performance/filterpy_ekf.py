@@ -6,8 +6,6 @@ IMU or Doppler sample is a prediction, corrections are filterpy's (Joseph's form
 node before, as `baselines.ekf_slam` has it.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -12,8 +12,6 @@ that a busy machine slows all alike; with turns of a single frame each would beg
 processor's caches, which no user's run does.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable, Iterator

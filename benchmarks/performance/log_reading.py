@@ -24,8 +24,6 @@ add them up chunk by chunk; ``arrays_rss_mb`` of one that keeps them; ``sequence
 The figures are void, and the exit code 1, unless the arrays hold what rosbags decodes.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 import subprocess

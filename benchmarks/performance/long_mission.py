@@ -17,8 +17,6 @@ Resident memory is that of the whole process. Poses and outcomes of a quarter of
 at several times the run time.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import resource

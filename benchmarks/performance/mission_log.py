@@ -1,7 +1,5 @@
 """A long log as a vehicle would record it: four sensors and an imaging sonar, written with mcap's own writer."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from heapq import merge
 from pathlib import Path

@@ -10,8 +10,6 @@ of each counts. Both must find the same values, otherwise the exit code is 1. Ou
 string besides, theirs does not.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

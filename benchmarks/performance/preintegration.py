@@ -22,8 +22,6 @@ of the compiled ones that come nearest.
 All take turns, and the fastest round of each counts.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable

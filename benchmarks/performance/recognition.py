@@ -23,8 +23,6 @@ that of one that does so on the first quarter of them, with all other sensors in
 pictures, at most 400, and the detections. The frames that only the longer log has are ``frames_mb``.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -4,8 +4,6 @@ A lap of the simulated basin with four AcTags on its floor instead of landmarks,
 Frames go through `sonar_graph.sonar.actag`, with the true motion between frames.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 import time

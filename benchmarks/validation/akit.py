@@ -15,8 +15,6 @@ The reference is computed from the same sensors: agreement with it shows consist
   says what can be expected).
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from functools import partial

@@ -11,8 +11,6 @@ gamma' its slow turning (the Earth's, that of the bias of the gyros). The noise 
 positions and the velocities of the reference are not used.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -14,8 +14,6 @@ Part of `akit`. Three things decide what is seen, and each is made visible:
   while they are in sight and leave the drift between. Seen up to 150 m away they are seen again and again.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from math import radians
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tables and figures of `akit`, from what was measured on each trajectory."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

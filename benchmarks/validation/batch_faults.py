@@ -5,8 +5,6 @@ and a Dask worker, killed on the way; with a disk that is full for a while; and 
 loopback address. All tables must be equal, timings aside. A run is lost when it was done once and is not in the end.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

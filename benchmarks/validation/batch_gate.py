@@ -12,8 +12,6 @@ that it would have found with 80 %. ``passed``: no design has more false alarms 
 one in a thousand).
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ intervals that hold the mean stands their median length over that of Student's.
 in at least 85 % and nowhere less often than BCa. Of lost runs nothing is asked.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path

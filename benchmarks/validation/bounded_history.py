@@ -8,8 +8,6 @@ come with their standard errors.
 There is no target.
 """
 
-from __future__ import annotations
-
 import sys
 from functools import partial
 from pathlib import Path

@@ -9,8 +9,6 @@ consistent). Instants of one run are correlated, seeds are not, so three things 
 * the share of instants whose ANEES is inside the band; 95 % on average, with much scatter as instants are correlated.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass
 from functools import partial

@@ -16,8 +16,6 @@ record that differs from it, or a missing message, while the reader names no los
 damaged file, and whose channels are still described in it. ``loose_share`` is the same for messages without chunks.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from collections import Counter, defaultdict

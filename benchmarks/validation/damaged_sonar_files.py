@@ -17,8 +17,6 @@ error.
 ``recovered_share`` is the share of the frames whose bytes, and those of the frame after, are all in the damaged file.
 """
 
-from __future__ import annotations
-
 import signal
 import sys
 import tempfile

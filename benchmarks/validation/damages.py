@@ -1,7 +1,5 @@
 """Ways in which a log gets damaged."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -12,8 +12,6 @@ that a slow vehicle errs far less than it claims (below the band). ``passed``: w
 the band.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path

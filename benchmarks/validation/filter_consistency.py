@@ -18,8 +18,6 @@ which should hold 1. Landmarks: all of a run's at its end, horizontally, with th
 lie inside the band. Of consistent estimators all four numbers do so at least in four cases of five.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass
 from functools import partial

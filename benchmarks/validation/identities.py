@@ -14,8 +14,6 @@ in it; how many are missing stands beside it. Differences are paired by seed.
 the map, is at 10 % wrong identities more than 15 % above its own at 0 %, or more landmarks are missing than there.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from itertools import product

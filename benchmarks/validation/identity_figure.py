@@ -1,7 +1,5 @@
 """The picture of identities.py: errors against the share of wrong identities, by estimator."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One basin with late and wrong identities, run by every estimator; each run is kept in a file once it is done."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -17,8 +17,6 @@ Then the first rows of the Doppler log are replaced: NEES of position 10 s after
 noise only; and no wrong first row makes the NEES of position 10 s after the start larger by half than without.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path

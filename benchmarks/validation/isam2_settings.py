@@ -12,8 +12,6 @@
 There is no target.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from functools import partial

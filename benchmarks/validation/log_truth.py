@@ -1,7 +1,5 @@
 """Content of an undamaged log, by mcap's own reader."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections import Counter

@@ -12,8 +12,6 @@ Two protocols, all estimators at the same instants of each:
   can know, and it is much of these figures.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass
 from functools import partial

@@ -8,8 +8,6 @@ default, at 2 Hz. Errors are horizontal rms after the best SE(2) alignment, mean
 A run that fails, or is farther off than `LOST_M`, is counted as lost; means are over all that do not fail.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 from functools import partial

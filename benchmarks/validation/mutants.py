@@ -11,8 +11,6 @@ made there too, in the same statement wherever it stands, and judged by the olde
 that was lost. ``--keep`` holds results, so that a run that was interrupted goes on.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import json

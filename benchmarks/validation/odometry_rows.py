@@ -14,8 +14,6 @@
 There is no target.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from dataclasses import dataclass, replace

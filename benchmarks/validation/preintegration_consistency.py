@@ -17,8 +17,6 @@ Brisk rows change surge and course every second instead of every three, which no
 follows. ``passed``: joint is within 0.9 and 1.1 in all rows but those.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, replace
 from itertools import product

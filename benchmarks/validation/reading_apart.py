@@ -1,7 +1,5 @@
 """Reading files in processes that may crash or hang without harm."""
 
-from __future__ import annotations
-
 import multiprocessing
 import zlib
 from concurrent.futures import ThreadPoolExecutor

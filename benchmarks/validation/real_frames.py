@@ -19,8 +19,6 @@ when a region has its centroid in it and a bounding box that overlaps it (inters
 "Wall" boxes are counted apart: a wall is no landmark, and gates on area are there to reject it.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence

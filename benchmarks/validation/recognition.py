@@ -22,8 +22,6 @@ that differ in nothing else: with speckle drawn anew in every frame, without mul
 equally spaced, with landmarks 3 dB brighter than their designs, and with a sound speed that is 1 % off.
 """
 
-from __future__ import annotations
-
 import hashlib
 import sys
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """One simulated basin, recognised by one or more rules: what every detection said, and what truly lay there."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -8,8 +8,6 @@ table. ``passed``: no coverage lies below the band that holds 99 % of the binomi
 probability of 0.95, and no root mean square of error over sigma outside that which holds 99.9 % of chi's, either way.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass

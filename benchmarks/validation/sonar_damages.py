@@ -1,7 +1,5 @@
 """Recordings of sonars and ways of damaging them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small logs to be damaged."""
 
-from __future__ import annotations
-
 import itertools
 import subprocess
 import sys

@@ -4,8 +4,6 @@ Euler angles and world velocity are splines of fifth degree through random knots
 rate are their exact integral and derivatives. The IMU and the Doppler log sit off the body's origin.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

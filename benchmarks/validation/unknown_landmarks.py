@@ -9,8 +9,6 @@ nothing. Errors of the map are of the landmarks within `FARTHEST_M` of a true on
 of the trajectory are horizontal: in the basin rms without alignment, for MRCLAM after the best SE(2) alignment.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from functools import partial

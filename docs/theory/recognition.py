@@ -1,7 +1,5 @@
 """The numbers and the picture of recognition.md: ``python docs/theory/recognition.py [PICTURE.png]``."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Sequence
 

@@ -5,8 +5,6 @@ file system, except for logs, and a full disk is noticed in one place. Workers o
 (`dask_setup`). Decisions: docs/design/0011-batch.md.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import signal

@@ -8,8 +8,6 @@ without a test. Single runs, and logs with few cases, are reported but fail no b
 distribution, the second has the worst run as often as the first. Method: docs/theory/batch_statistics.md.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ stdin and outcomes go pickled to what was stdout. Everything printed, also by na
 run's log. The process ends with stdin, so it never outlives the process that started it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import faulthandler
 import json

@@ -7,8 +7,6 @@ between them. Fewer than 5 cases have too few changes of sign for 5 %; their rat
 (Langsrud 2005). Method and limits: docs/theory/batch_statistics.md.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 from functools import cached_property

@@ -4,8 +4,6 @@ The key is a hash of everything that decides the numbers of a run, the source co
 nothing about a checkout that was changed. Decisions: docs/design/0011-batch.md.
 """
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json

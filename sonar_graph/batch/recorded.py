@@ -4,8 +4,6 @@ The table names every planned run. A run that it lists as not done may have been
 its row is then read from the run's own folder.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

@@ -6,8 +6,6 @@ done has the status ``not run`` and no numbers. The file's metadata have under `
 suite's name, description, reference, metrics and rate.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A source is a kind and its options. With a seed it gives the same sequence on ev
 `fingerprint` changes when a file does.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Callable, Iterator

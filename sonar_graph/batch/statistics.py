@@ -5,8 +5,6 @@ and rank tests work with it (Lachin 1999), and a mean over such a group does not
 Equations: docs/theory/batch_statistics.md.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -13,8 +13,6 @@ A run's folder is filled under a temporary name and then renamed, and is renamed
 with its final name is therefore complete. Decisions: docs/design/0011-batch.md.
 """
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import uuid

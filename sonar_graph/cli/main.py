@@ -5,8 +5,6 @@ reference; 2 a mistake of the user, reported in one line on stderr; 130 interrup
 traceback.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from typing import Annotated

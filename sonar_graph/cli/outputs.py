@@ -3,8 +3,6 @@
 Files that the user wrote are never overwritten.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -9,8 +9,6 @@ a sigma of `UNMEASURED_M_S`; `sonar_graph.navigation.dvl_screening.partial_beams
 docs/theory/beams.md.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@ An acoustic lens does not space beams evenly: 0.37° a beam in the middle and 0.
 spacing instead errs by up to 1.2°, which is 4 cm at 2 m.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.interpolate import make_interp_spline
 

@@ -5,8 +5,6 @@ a rest at the start or, if the vehicle moves there, from its first minute (docs/
 a reference. Derivation: docs/theory/sensor_check.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any

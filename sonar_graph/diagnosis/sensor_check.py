@@ -7,8 +7,6 @@ Units are recognised where the values, read as configured, are implausible for a
 plausible. A slow vehicle's rates in degrees can pass for rates in radians: no finding is no proof.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

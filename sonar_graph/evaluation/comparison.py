@@ -1,7 +1,5 @@
 """Comparison of estimators: the same measurements, the same instants, the same truth. See docs/design/0007."""
 
-from __future__ import annotations
-
 import os
 import platform
 import shlex

@@ -9,8 +9,6 @@ included. With n_b of n detections in bin b of confidence, the expected calibrat
     ECE = sum_b n_b / n | mean confidence of b - share of right ones in b |
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ Without a known standard error a number has three significant digits. With one i
 its second where the first is 1. The minus sign is typographic.
 """
 
-from __future__ import annotations
-
 import math
 
 ABSENT = "\N{EN DASH}"

@@ -7,8 +7,6 @@ interpolates a truth there. Maps are compared by identity. Landmarks of unknown 
 are first matched to the true ones by their place.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@
 Only calls of the estimator are timed. Results are checked before they are scored. See docs/design/0007.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import logging

@@ -7,8 +7,6 @@ positions from its Table I (in centimetres), times of maps from its Fig. 4. It s
 computed from the table. Its vehicle had no reference for its own path.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scores of one run: each a value with its unit and the sentence of its measuring rule (docs/theory/metrics.md)."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 

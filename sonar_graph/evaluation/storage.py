@@ -17,8 +17,6 @@ complete. In npz files the fields of one object share a prefix: ``causal.stamps_
 absent object has no fields.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

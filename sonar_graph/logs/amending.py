@@ -3,8 +3,6 @@
 The log is read as every log is (`sonar_graph.logs.mcap.reader`): of one that is cut off, what is whole is copied.
 """
 
-from __future__ import annotations
-
 import heapq
 import zlib
 from collections import Counter

@@ -4,8 +4,6 @@ Nothing is corrected here. Each check returns sentences for the notes of a seque
 (docs/design/0004-logs.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

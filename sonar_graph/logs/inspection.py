@@ -4,8 +4,6 @@
 configuration that it begins makes, read back unchanged, the same choices (docs/tutorials/04_your_own_log.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ and the calibration is gathered (`sonar_graph.logs.vehicle_setup`). The notes of
 was chosen, assumed and left out, and what looks wrong (docs/design/0004-logs.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any

@@ -21,8 +21,6 @@ Every body frame has one parent, the world. The transforms of one instant share 
 in time gets only the last message of a topic (docs/tutorials/03_viewers.md).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from collections.abc import Sequence as List

@@ -4,8 +4,6 @@ A role is a part of a `Sequence` (IMU, Doppler log, depth, detections, truth) or
 with its reason, for notes, error messages and `inspect_log` (docs/design/0004-logs.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 

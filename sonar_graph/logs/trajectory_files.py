@@ -4,8 +4,6 @@ TUM: one line a pose, ``t x y z qx qy qz qw``, seconds and metres
 (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats).
 """
 
-from __future__ import annotations
-
 import csv
 from decimal import Decimal, InvalidOperation
 from pathlib import Path

@@ -4,8 +4,6 @@ The functions ``*_messages`` are the reverse of the adapters; result logs for vi
 read back to the bit (docs/design/0004-logs.md).
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import replace

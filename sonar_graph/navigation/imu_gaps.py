@@ -16,8 +16,6 @@ as white noise; an open one gets the growth since its last row. Errors about the
 Derivation and what is left out: docs/theory/gaps.md.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sonar_graph.calibration import HOLE_INTERVALS, ROWS_BEFORE, SHORTEST_HOLE_S, UNTYPICAL_S, ImuCalibration

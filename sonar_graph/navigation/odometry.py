@@ -17,8 +17,6 @@ P is the growth of the error, so that successive motions, taken as independent, 
 docs/theory/preintegration.md, docs/theory/gaps.md.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

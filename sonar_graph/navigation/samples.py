@@ -10,8 +10,6 @@ a random walk, started from nothing::
     P <- P + q dt,    K = P / (P + r_k),    w <- (1 - K) w,  w_k = K,    P <- (1 - K) P
 """
 
-from __future__ import annotations
-
 from math import isfinite
 
 import numpy as np

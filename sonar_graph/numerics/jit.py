@@ -1,7 +1,5 @@
 """Compilation of loops over samples and pixels to machine code, with a cache that follows changed callees."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Iterable

@@ -12,8 +12,6 @@ A small rotation of the body, ``world_R_body Exp(delta)``, changes the angles by
 Marine Craft Hydrodynamics and Motion Control", 2011, (2.18), (2.28).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ none, in between (such as a piece of a landmark) it is left out. `estimate_confu
 of the soft scores, the confusion matrix and the accuracy of range and azimuth. Derivation: docs/theory/recognition.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

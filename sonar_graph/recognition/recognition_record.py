@@ -4,8 +4,6 @@ Pictures show the fan of a frame with the recognised identities, as Fig. 6 of th
 the nearest beam and bin, for display only.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path

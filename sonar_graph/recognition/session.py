@@ -6,8 +6,6 @@ Images are streamed. Motion, tilt and height come from the other sensors (`sonar
 Detections are made once for a log, and are the same for all estimators. Design: docs/design/0009-recognition.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

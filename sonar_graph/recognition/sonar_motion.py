@@ -4,8 +4,6 @@ Motion: preintegrated gyros and Doppler log. Tilt: gyros, corrected by the direc
 depth and the calibration's floor. Nothing stamped after a frame is used for it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sonar_graph.measurements import Depth, Floats

@@ -3,8 +3,6 @@
 Each log has a panel with its own scale and a line for each contestant, which keeps its colour and place everywhere.
 """
 
-from __future__ import annotations
-
 import math
 import re
 

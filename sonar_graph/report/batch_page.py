@@ -1,7 +1,5 @@
 """The report of a batch: one HTML page that needs nothing but itself. Explanations: ``templates/batch.html``."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 Failures and missing runs come first, then warnings, then errors against the reference.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import replace

@@ -3,8 +3,6 @@
 Statistics: `sonar_graph.batch`. A metric is a family of tests, corrected by Holm (1979).
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterator

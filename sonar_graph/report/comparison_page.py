@@ -3,8 +3,6 @@
 Layout and explanations: ``templates/comparison.html``. Design: docs/design/0008.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from pathlib import Path

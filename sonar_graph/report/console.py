@@ -1,7 +1,5 @@
 """The comparison in the terminal: the few numbers that are read first, and the counterpart of the published table."""
 
-from __future__ import annotations
-
 from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.table import Table

@@ -1,7 +1,5 @@
 """The style of all figures: colours, panels, thinning of long series, and inline SVG in the colours of the page."""
 
-from __future__ import annotations
-
 import html
 import io
 import re

@@ -4,8 +4,6 @@ Estimators keep their colour in all figures. Angles are drawn in degrees. Panels
 because the drift of a dead reckoning would flatten the errors of the others. Maps: `sonar_graph.report.maps`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure

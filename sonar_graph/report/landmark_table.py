@@ -4,8 +4,6 @@ Where a run repeats the published experiment, the paper's own table stands besid
 from the first to the last position.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

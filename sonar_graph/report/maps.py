@@ -3,8 +3,6 @@
 The growing map is the counterpart of Fig. 4 of the 2014 paper, at its times or the same fractions of another run.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

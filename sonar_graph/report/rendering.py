@@ -3,8 +3,6 @@
 Everything that comes from a suite, a log or an estimator is escaped.
 """
 
-from __future__ import annotations
-
 import base64
 import csv
 import io

@@ -5,8 +5,6 @@ squared innovations, exceed `ABSURD`; where covariances hold, that has a probabi
 too small it has 1e-9 to the power of 1/f².
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 

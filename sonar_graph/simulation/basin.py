@@ -7,8 +7,6 @@ of 7 m through the landmarks with a stop before each, is this project's: docs/th
 Source: "Experimental Results of Real-time Sonar-based Underwater Localization Using Landmarks", 2014.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace

@@ -6,8 +6,6 @@ detections too. Landmarks lie on either side of the track at random distances an
 sees the same ones.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ The vehicle goes round a closed, three-lobed loop again and again at a constant 
 forward-looking sonar sees up to ten landmarks at a time.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -13,8 +13,6 @@ The random walks of the gyro biases are ours: over 2000 s they add a tenth of th
 Sources: IS4S NavToolkit (Honeywell HG1700), Xsens MTi-1 data sheet, Field Robotics DAVE (Teledyne DVLs).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

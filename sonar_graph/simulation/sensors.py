@@ -4,8 +4,6 @@ Samples are instantaneous values at their stamps. The Earth's rotation is left o
 estimators to remove it. docs/theory/simulation.md
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -4,8 +4,6 @@ An instant is tied to the newest keyframe of its time by odometry. While that ke
 kept. Once it leaves a bounded window, only the pose is kept: 232 bytes an instant.
 """
 
-from __future__ import annotations
-
 from array import array
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence

@@ -8,8 +8,6 @@ One call of `Isam2.process`::
     newest keyframe's estimate, carried on by odometry ──► Estimate at end_ns
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import Any, ClassVar, Self

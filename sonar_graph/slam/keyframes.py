@@ -8,8 +8,6 @@ Rows that cannot be measurements are refused: variances not above zero, covarian
 ranges. NaN is sound: the log does not know the noise, and the calibration does.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from dataclasses import dataclass, field, replace
 from typing import TypeVar

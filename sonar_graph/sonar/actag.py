@@ -9,8 +9,6 @@ Source: K. Norman, D. Butterfield, J. Mangelson, "AcTag: Opti-Acoustic Fiducial 
 Mapping", IROS 2023; PyPI ``actag`` (BSD-2-Clause).
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Any, NamedTuple
 

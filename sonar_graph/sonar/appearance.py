@@ -5,8 +5,6 @@ templates on the same grid (`sonar_graph.sonar.templates`). The correlation c ov
 gain or on the level of the floor. Derivation: docs/theory/recognition.md.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

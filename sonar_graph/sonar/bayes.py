@@ -18,8 +18,6 @@ with base the share of each feature in the prior of the scores, and 0 <= weight 
 (`news_of_motion`). Comparison of both rules, and sources: docs/theory/recognition.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Literal
 

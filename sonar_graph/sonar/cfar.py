@@ -8,8 +8,6 @@
 sigma is measured at each pixel, so that texture raises the threshold. Derivation: docs/theory/candidates.md.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from functools import lru_cache

@@ -6,8 +6,6 @@ The steps are those of the 2014 paper: candidate selection, elimination of noisy
 Every candidate, track and unused frame has a row in `Recogniser.fates` that says why.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

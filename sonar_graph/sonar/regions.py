@@ -9,8 +9,6 @@ of about one independent level a node. Regions have centroids and second moments
 floor where it is known, else in the slant plane. Derivation: docs/theory/candidates.md.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import IntEnum

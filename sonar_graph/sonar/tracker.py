@@ -13,8 +13,6 @@ candidate of the most probable assignment. The elevation enters once, when a tra
 frame and must not be averaged.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

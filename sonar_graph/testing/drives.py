@@ -3,8 +3,6 @@
 In the turn body velocity and angular rate are constant, so that the truth is a circle in closed form.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -15,8 +15,6 @@ and without: ``check_estimator(MyFilter)``. An estimator that never iterates, su
 data nor simulator.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 

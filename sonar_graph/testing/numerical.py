@@ -1,7 +1,5 @@
 """Numerical checks of factors and covariances: Jacobians by central differences, NEES by its two-sided band."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike

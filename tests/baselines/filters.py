@@ -1,7 +1,5 @@
 """Both filters behind one interface: states and their errors, motions, detections; from numpy, scipy and gtsam."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple

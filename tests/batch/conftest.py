@@ -1,7 +1,5 @@
 """Suites of seconds, and estimators that misbehave, installed for the processes of runs too."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A batch resumes, loses no run, and ends in time on Ctrl-C."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

@@ -1,8 +1,6 @@
 """Batches on real clusters. Kills at random moments, and the same through a scheduler of its own: the benchmark
 `batch_faults`, whose short version is run here."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import json

@@ -1,7 +1,5 @@
 """The test of many groups keeps its level, has power, and knows how much."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

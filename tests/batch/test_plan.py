@@ -1,7 +1,5 @@
 """The key of a run changes with all that decides its numbers, and with nothing else."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The table of a batch has a row for each planned run, and is read as it was written."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Statistics of many runs agree with other definitions, and hold with runs that failed."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import time

@@ -1,7 +1,5 @@
 """Runs are kept whole or not at all, and a folder has one batch at a time."""
 
-from __future__ import annotations
-
 import errno
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """A suite is understood, and a mistake in it is reported with file, line and key."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

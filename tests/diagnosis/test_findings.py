@@ -1,7 +1,5 @@
 """Truth by hand: places, arms, biases and a vehicle that lies tilted; and the simulator's moving one."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Truth from the simulator: known faults are named with the line that puts them right, and that line does."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Small sequences whose truth is known by hand, and estimators that do exactly what they are told."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

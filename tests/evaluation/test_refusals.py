@@ -1,7 +1,5 @@
 """Rows that estimators refuse, and what they withhold, are named to the user, from the log to the files."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections import Counter

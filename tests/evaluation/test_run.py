@@ -1,7 +1,5 @@
 """One estimator over one sequence: fed in order, timed, checked; whatever it does wrong is a result with a reason."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Logs written by another library than ours, and a small sequence."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Small MCAP files to be read and damaged, written by mcap's own writer."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -4,8 +4,6 @@ Each case is encoded by rosbags, decoded by mcap-ros2-support and by us, compare
 byte for byte.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

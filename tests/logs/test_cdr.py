@@ -1,7 +1,5 @@
 """ROS 2 messages as columns: against two other libraries, by hand, and where payloads or definitions are broken."""
 
-from __future__ import annotations
-
 import struct
 import time
 from itertools import combinations, islice, pairwise

@@ -1,7 +1,5 @@
 """Checks of a log's numbers: each fault x the sentence about it, and whole logs without a sentence."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

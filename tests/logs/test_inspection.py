@@ -1,7 +1,5 @@
 """Summaries of logs: roles, times, damage, doubts, and the log configuration to start from."""
 
-from __future__ import annotations
-
 import tomllib
 from collections import Counter
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """MCAP files of every kind, whole and damaged: every message that is whole is read, and what is lost is told."""
 
-from __future__ import annotations
-
 import re
 import struct
 import tracemalloc

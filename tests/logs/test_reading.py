@@ -1,7 +1,5 @@
 """A log as a sequence: topics, stamps, rows left out, detections, damage, and the account of all that in the notes."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Where a calibration comes from: mountings of ``/tf_static``, the record of the log, and the user's file."""
 
-from __future__ import annotations
-
 import json
 from functools import reduce
 from pathlib import Path

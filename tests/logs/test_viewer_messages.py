@@ -1,7 +1,5 @@
 """Messages and layouts for viewers, as other libraries decode them."""
 
-from __future__ import annotations
-
 import json
 import re
 import struct

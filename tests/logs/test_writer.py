@@ -1,7 +1,5 @@
 """Recordings that this package writes, read by others; and files that are whole or not there."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

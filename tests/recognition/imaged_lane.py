@@ -3,8 +3,6 @@
 It holds in half a minute what a lap of the basin holds in two: for tests that need images.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Laws of the fitted model, and the model measured on a lane whose truth is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

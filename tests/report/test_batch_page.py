@@ -1,7 +1,5 @@
 """The page of a batch: figures with their data, explanations, the runs that are missing, and panels for each log."""
 
-from __future__ import annotations
-
 import base64
 import csv
 import io

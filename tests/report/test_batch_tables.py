@@ -1,7 +1,5 @@
 """Tables and sentences of a batch: pairs, no mean over survivors, one family a metric, digits, and the warnings."""
 
-from __future__ import annotations
-
 import csv
 import io
 import itertools

@@ -1,7 +1,5 @@
 """The page of a comparison says everything that the comparison holds, and what is missing."""
 
-from __future__ import annotations
-
 import base64
 import re
 from dataclasses import replace

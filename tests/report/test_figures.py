@@ -1,7 +1,5 @@
 """Figures of a comparison: quantities with units, truth from the numbers, and maps as they grew."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from xml.etree import ElementTree

@@ -4,8 +4,6 @@ Chromium comes from the system; axe-core from npm: ``SONAR_GRAPH_AXE`` names its
 ``node_modules``.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Iterator

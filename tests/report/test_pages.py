@@ -1,7 +1,5 @@
 """Laws of both pages, of a comparison and of a batch: whole, self-contained, escaped, readable; and the front door."""
 
-from __future__ import annotations
-
 import doctest
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Findings in words and in the terminal follow the numbers: smaller errors, consistency, failures and warnings."""
 
-from __future__ import annotations
-
 import io
 import math
 import re

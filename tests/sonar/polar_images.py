@@ -1,7 +1,5 @@
 """Small polar images of designs on a flat floor, of exponential speckle without memory, and candidates made by hand."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Laws of templates, of patches of the floor, of the fit of designs to them, and of the sightings that follow."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.special import erf

@@ -1,7 +1,5 @@
 """Laws of the identity rules, and of beliefs over tracks and places."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

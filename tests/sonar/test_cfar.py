@@ -1,7 +1,5 @@
 """Laws of the candidate selection, of its background, and of the designs that can be candidates."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

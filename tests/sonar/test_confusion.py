@@ -1,7 +1,5 @@
 """Laws of soft scores and of the measured model, its file and its marks."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace

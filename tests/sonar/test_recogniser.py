@@ -1,7 +1,5 @@
 """Laws of the whole recogniser, on small images of designs."""
 
-from __future__ import annotations
-
 from collections import Counter
 from functools import cache
 

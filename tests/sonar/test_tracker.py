@@ -1,7 +1,5 @@
 """Laws of tracks: existence, association, and the filter of points at rest."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 import pytest

@@ -6,8 +6,6 @@ and conventions. A message type is added without code, as an instance of that su
 `drivers.SHIPPED`, for one log in a table of a TOML file (`log_config`, docs/tutorials/04_your_own_log.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, ClassVar, Literal
 

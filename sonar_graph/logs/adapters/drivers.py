@@ -5,8 +5,6 @@ make an adapter of its role, whose attributes are field paths and conventions (`
 it into `SHIPPED` (docs/design/0004-logs.md).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sonar_graph.logs.adapters.adapter import Adapter, CovarianceFields

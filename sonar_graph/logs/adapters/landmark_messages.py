@@ -8,8 +8,6 @@ Impossible identities are refused, impossible rows are left out, and unlikely on
 (docs/design/0004-logs.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Literal, NamedTuple
 

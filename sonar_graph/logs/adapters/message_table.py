@@ -1,7 +1,5 @@
 """Messages of a topic as one table: columns over all rows, stamps, and the rows that are fit for use."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 

@@ -5,8 +5,6 @@ share it, and a field of all of them is one strided view of their bytes. For wri
 finds the place of each column.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -11,8 +11,6 @@ Latitude φ, longitude λ and altitude h become metres by Earth-centred coordina
     X = (N + h) cos φ cos λ,   Y = (N + h) cos φ sin λ,   Z = (N (1 - e²) + h) sin φ
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

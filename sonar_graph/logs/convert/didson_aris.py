@@ -10,8 +10,6 @@ Sources: SoundMetrics/aris-file-sdk (MIT) for ARIS; for facts on DIDSON oncvideo
 Echoview's description of the format. No file of a real DIDSON was at hand.
 """
 
-from __future__ import annotations
-
 import struct
 from abc import abstractmethod
 from datetime import UTC, datetime

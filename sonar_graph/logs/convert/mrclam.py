@@ -15,8 +15,6 @@ so the row at each stamp carries the command of the stamp before. ``docs/theory/
 and the origin of the noise parameters.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -7,8 +7,6 @@ first. See ``docs/theory/sonar_files.md``.
 Source: liboculus and oculus_driver (both BSD-3), which quote the manufacturer's description.
 """
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

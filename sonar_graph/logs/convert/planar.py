@@ -9,8 +9,6 @@ it, the logarithm of SE(2). With ``p = V(dθ) v T`` and ``V`` the left Jacobian 
 Held over the step, it composes to the step exactly. See ``docs/theory/datasets.md``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -7,8 +7,6 @@ that were overwritten in place, and missing or additional bytes of exactly the l
 ``docs/theory/sonar_files.md``.
 """
 
-from __future__ import annotations
-
 import json
 from abc import ABC, abstractmethod
 from collections import deque

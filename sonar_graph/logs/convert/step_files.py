@@ -20,8 +20,6 @@ Poses and landmarks share one numbering: a number is a pose where an ``ODOMETRY`
 ``LANDMARK`` line does. Landmarks keep their numbers.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import gtsam

@@ -1,7 +1,5 @@
 """Text files of numbers, and folders of numbered runs, read with errors that name file and line."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass

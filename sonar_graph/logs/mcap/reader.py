@@ -6,8 +6,6 @@ unread and unchecked, only when a summary that agrees with the chunk's head stat
 nothing of the wanted time. See ``docs/design/0004-logs.md``.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field

@@ -7,8 +7,6 @@ Where nothing agrees, the walk searches for the next place that does and reports
 MCAP has no CRC over a metadata record; `seal` adds one to the record's entries.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 import zlib

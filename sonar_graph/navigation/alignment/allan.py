@@ -11,8 +11,6 @@ white noise (W. J. Riley, Handbook of Frequency Stability Analysis, NIST SP 1065
     edf = [3 (N' - 1) / (2 m) - 2 (N' - 2) / N'] 4 m^2 / (4 m^2 + 5),    N' = N + 1
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

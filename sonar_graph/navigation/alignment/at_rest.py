@@ -12,8 +12,6 @@ covariance. docs/theory/alignment.md; coarse levelling: P. D. Groves, Principles
 Integrated Navigation Systems, 2nd ed., 2013, chapter 5.6.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.stats import chi2
 

@@ -18,8 +18,6 @@ world with x east and y north, at latitude phi, with n the north in body axes::
 Derivation: docs/theory/alignment.md.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

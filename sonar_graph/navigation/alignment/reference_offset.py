@@ -11,8 +11,6 @@ of the run stands out from that line, the reference began with a wrong heading. 
 IMU, and the beginning is compared with what comes before the first. docs/theory/sensor_check.md.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

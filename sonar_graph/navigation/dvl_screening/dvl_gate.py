@@ -20,8 +20,6 @@ row, with the variance of what may have changed since. Of a chain that ends a ga
 rows are no epochs. Stamps decide, not how a log is cut. docs/theory/gaps.md.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

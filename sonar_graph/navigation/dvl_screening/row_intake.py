@@ -6,8 +6,6 @@ no vehicle reaches is an outlier, and one with none before it waits until others
 (`sonar_graph.navigation.dvl_screening.partial_beams`).
 """
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import numpy as np

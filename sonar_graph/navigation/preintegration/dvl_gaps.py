@@ -28,8 +28,6 @@ The covariance includes the noise of the samples, gyros and accelerometers, and 
 the gap; the gyros' bias has a derivative. docs/theory/gaps.md.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -16,8 +16,6 @@ The last four are for comparison: a hold is late or early by half an interval. E
 `sonar_graph.navigation.preintegration.joint_steps`.
 """
 
-from __future__ import annotations
-
 from enum import IntEnum
 from typing import Literal, NamedTuple
 

@@ -19,8 +19,6 @@ initial velocity and a constant accelerometer bias cancel. Other rules: ``s = su
 docs/theory/preintegration.md.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from sonar_graph.navigation.preintegration.recursion import SERIES_ANGLE2, rotation_series, sine_series

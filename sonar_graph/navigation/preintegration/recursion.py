@@ -11,8 +11,6 @@ Doppler noise is white in time with the spectral density ``velocity_cov * interv
 on either side of its epoch. docs/theory/preintegration.md.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -9,8 +9,6 @@ with u the unit vector to the sonar: the intensity of Lambert's rule, cos² i ti
 `frames` applies the beams' pattern in azimuth and the factors of range alone to the sum. docs/theory/sonar_image.md
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -11,8 +11,6 @@ receiver noise, time-varied gain and a logarithmic 8-bit scale::
 docs/theory/sonar_image.md
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ width of a beam at half power, ``D = 0.886 wavelength / width``: its first side 
 values: docs/theory/sonar_image.md.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -9,8 +9,6 @@ Source: Abraham and Lyons, "Novel physical interpretations of K-distributed reve
 docs/theory/sonar_image.md
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -10,8 +10,6 @@ does not see that. The largest jointly compatible pairing is taken, of equally l
 (docs/theory/unknown_landmarks.md).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -14,8 +14,6 @@ vote on its place, ``vote(p) = sum of max(l_i(p), l_none)``, at the point where 
 not fit has it (docs/theory/doubtful_identities.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate

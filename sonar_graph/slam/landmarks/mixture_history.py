@@ -15,8 +15,6 @@ The minimum in (1) is graduated by mu, from nearly convex to (1) itself; each mu
 `gtsam.GncLMOptimizer` weighs each factor alone; here an object is kept or dropped whole (doubtful_identities.md).
 """
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Callable

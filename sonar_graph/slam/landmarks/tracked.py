@@ -9,8 +9,6 @@ row with the highest posterior for this landmark; otherwise the row with the hig
 several rows are equal, the first is kept.
 """
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Callable

@@ -16,8 +16,6 @@ Sigma is the noise of one sighting: of two landmarks in one place each gets the 
 apart by about that, and P does not know it.
 """
 
-from __future__ import annotations
-
 import math
 from itertools import combinations
 from typing import Annotated, Literal, NamedTuple

@@ -16,8 +16,6 @@ is ``azimuth - measured`` at elevation 0, times ``e / tan(e)`` at a small elevat
 coordinate is e near the axis. So a horizontal and a vertical sigma state what is known.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Annotated, Literal

@@ -23,8 +23,6 @@ Both are Python callbacks around compiled arithmetic; GTSAM has no compiled fact
 be estimated, `sonar_graph.slam.models.factors.odometry` makes of ``motion.relative_pose()`` a compiled one.
 """
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 

@@ -6,8 +6,6 @@ expectation has the covariance ``H P H' + H_M Q H_M'``: P of (X, b, p) together,
 derivative by the body's pose at the frame.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import gtsam

@@ -19,8 +19,6 @@ known height it follows from range and azimuth. Azimuth has no derivative on the
 outside every aperture.
 """
 
-from __future__ import annotations
-
 import math
 
 import gtsam

@@ -1,7 +1,5 @@
 """Stores of a growing graph from which single factors can be taken out: the whole history, or the window's part."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass

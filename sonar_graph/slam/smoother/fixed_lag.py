@@ -5,8 +5,6 @@ sigma given its neighbours, which millimetre odometry reaches after some metres 
 once Cholesky has given up the window stays with QR (docs/theory/isam2.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from typing import Any
 

@@ -13,8 +13,6 @@ factor is taken out that has been marginalised. A *bounded* history consists of 
 of what has left; a new window then begins from those, with the older linearisations.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated, Any, Literal

@@ -8,8 +8,6 @@ variables, and marginals for good. Such factors are withheld, with landmarks and
 rest goes on without them. A keyframe cannot be withheld, since later ones hang on it.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Logs as third-party drivers write them: their own message definitions, encoded by another library than ours."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from operator import attrgetter
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Doppler logs of any driver: velocities or beams, covariances, units, axes, and doubts about them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

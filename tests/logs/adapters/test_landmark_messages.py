@@ -1,7 +1,5 @@
 """Detections of landmarks from any recogniser: positions, identities and their posterior."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Log configurations: tables that change adapters, mistakes in them, and tables written from adapters."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 from typing import Any

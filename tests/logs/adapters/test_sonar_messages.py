@@ -1,7 +1,5 @@
 """Sonar images of any driver as frames: order, samples, gains, bearings and ranges."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

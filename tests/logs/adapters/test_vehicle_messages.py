@@ -1,7 +1,5 @@
 """IMU, depth and reference poses of any driver: units, axes, and doubts about both."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 
