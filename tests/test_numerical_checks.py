@@ -47,10 +47,7 @@ def test_robust_and_constrained_noise_is_refused_with_advice():
     robust = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Unit.Create(3))
     values = gtsam.Values()
     values.insert(0, np.zeros(3))
-    for noise, said in (
-        (robust, "leave out its kernel"),
-        (gtsam.noiseModel.Constrained.All(3), "not Constrained"),
-    ):
+    for noise, said in ((robust, "leave out its kernel"), (gtsam.noiseModel.Constrained.All(3), "not Constrained")):
         with pytest.raises(TypeError, match=said):
             check_jacobians(gtsam.PriorFactorPoint3(0, np.ones(3), noise), values)
 

@@ -177,12 +177,7 @@ class CandidateFit:
         self._shape: tuple[Floats, Floats] = np.empty(0), np.empty(0)
 
     def at(
-        self,
-        image_db: Floats32,
-        frame: SonarFrames,
-        view: FloorView | None,
-        candidates: Candidates,
-        rows: Ints,
+        self, image_db: Floats32, frame: SonarFrames, view: FloorView | None, candidates: Candidates, rows: Ints
     ) -> list[ObjectSighting | None]:
         """Sightings of the candidates in these rows; None for a row of -1."""
         shape = (frame.ranges_m, frame.azimuths_rad)

@@ -105,9 +105,7 @@ class Recogniser:
         check_candidates(self.designs, self.params.detection, self.params.appearance.search_m)
         self._calibration = calibration
         self._look = CandidateFit(
-            Appearance(self.designs, self.params.appearance),
-            self.confusion,
-            calibration.sonar.elevation_aperture_rad,
+            Appearance(self.designs, self.params.appearance), self.confusion, calibration.sonar.elevation_aperture_rad
         )
         self._tracker = Tracker(self.params.tracking)
         self._beliefs = Beliefs(self.confusion, self.params.identity)

@@ -50,9 +50,7 @@ def odometry(request):
         Calibration(
             imu=ImuCalibration(gyro_noise_density=GYRO_DENSITY),
             dvl=DvlCalibration(
-                mounting=Mounting(translation_m=LEVER),
-                velocity_sigma_m_s=(0.01, 0.02, 0.03),
-                velocity_walk_density=5.0,
+                mounting=Mounting(translation_m=LEVER), velocity_sigma_m_s=(0.01, 0.02, 0.03), velocity_walk_density=5.0
             ),
             odometry_interpolation=request.param,
         )
@@ -151,8 +149,7 @@ def lost(rate_error=(0.0, 0.0, 0.0), calibration=None):
     has_lock = (s <= LOST_S) | (s >= FOUND_S)
     rows = Odometry(calibration or Calibration())
     rows.add(
-        Imu(imu_ns, rates, forces),
-        Dvl(dvl_ns[has_lock], velocities[has_lock], np.full((has_lock.sum(), 3, 3), np.nan)),
+        Imu(imu_ns, rates, forces), Dvl(dvl_ns[has_lock], velocities[has_lock], np.full((has_lock.sum(), 3, 3), np.nan))
     )
     return rows
 

@@ -7,14 +7,7 @@ from hypothesis import strategies as st
 from sonar_graph.errors import CalibrationError
 from sonar_graph.measurements import Floats, SonarFrames
 from sonar_graph.simulation.sonar_image.imaging_sonar import DIDSON
-from sonar_graph.sonar.geometry import (
-    Fan,
-    FloorView,
-    point_covariances,
-    points,
-    ranges_azimuths_elevations,
-    with_lens,
-)
+from sonar_graph.sonar.geometry import Fan, FloorView, point_covariances, points, ranges_azimuths_elevations, with_lens
 
 angles = st.floats(-0.3, 0.3)
 

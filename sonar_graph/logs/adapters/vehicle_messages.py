@@ -53,10 +53,7 @@ class ImuAdapter(Adapter):
         force = _scaled(table.beside(self.linear_acceleration), self.linear_acceleration_scale)
         unmeasured = _is_marked(table, self.linear_acceleration_status) | self._is_force_unfilled(table)
         force = np.where(unmeasured[:, None] | ~np.isfinite(force), np.nan, force)
-        faults = {
-            "without angular rate": _is_marked(table, self.angular_velocity_status),
-            NOT_FINITE: not_finite(rate),
-        }
+        faults = {"without angular rate": _is_marked(table, self.angular_velocity_status), NOT_FINITE: not_finite(rate)}
         rows, dropped = fit_rows(table.stamps_ns, faults, unique=True)
         rate, force = turn(self.rotation, rate[rows]), turn(self.rotation, force[rows])
         return (Imu(table.stamps_ns[rows], rate, force) if rows.size else None), dropped

@@ -259,12 +259,7 @@ class Passage:
         return f"channel {channel}" if topic is None else topic.name
 
     def _lose(
-        self,
-        at: int,
-        end: int,
-        reason: str,
-        chunk: ChunkRecord | None = None,
-        messages: dict[str, int] | None = None,
+        self, at: int, end: int, reason: str, chunk: ChunkRecord | None = None, messages: dict[str, int] | None = None
     ) -> None:
         loss = Loss(at, end, reason, self._last_ns, None, messages)
         self.damage.losses.append(loss)
