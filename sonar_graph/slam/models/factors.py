@@ -109,10 +109,7 @@ def gaussian(cov: Floats) -> gtsam.noiseModel.Base:
     motion over a short time would lose all its correlations. A matrix that is none it takes as well, and weighs by
     numbers that are none.
 
-    Raises
-    ------
-    MeasurementError
-        When the matrix is not positive definite.
+    Raises `MeasurementError` when the matrix is not positive definite.
     """
     try:
         np.linalg.cholesky(cov)
