@@ -58,11 +58,7 @@ BEAM_MAJOR, LEFT = '[sonar]\nimage_order = "beam-major"', '[sonar]\nbearing_posi
 CASES: dict[str, tuple[Entry, str, Floats, Floats]] = {
     "range by range": (images(image(ROWS)), "", POLAR, AZIMUTHS),
     "beam by beam, as the definition states": (
-        images(image(POLAR.astype("u1").tobytes())),
-        BEAM_MAJOR,
-        POLAR,
-        AZIMUTHS,
-    ),
+        images(image(POLAR.astype("u1").tobytes())), BEAM_MAJOR, POLAR, AZIMUTHS),
     "big endian": (images(image(POLAR.T.astype(">u2").tobytes(), 2, big=True)), "", POLAR, AZIMUTHS),
     "big endian numbers": (images(image(POLAR.T.astype(">f8").tobytes(), 9, big=True)), "", POLAR, AZIMUTHS),
     "positive bearings to the left": (pings(ping()), LEFT, POLAR, -AZIMUTHS),
