@@ -1,17 +1,23 @@
-"""Logs written by another library than ours, and a small sequence."""
+"""Logs and MCAP files written by other libraries than ours, to be read and damaged, and a small sequence."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.records import ChunkIndex
+from mcap.writer import Writer as ContainerWriter
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 
 from sonar_graph.calibration import Calibration, ImuCalibration, Mounting
 from sonar_graph.logs.cdr.definitions import definition
+from sonar_graph.logs.mcap.file_summary import TimeWindow
+from sonar_graph.logs.mcap.reader import Recording, scan
+from sonar_graph.logs.mcap.topic import Keep, Topic
 from sonar_graph.measurements import Depth, Dvl, Imu, LandmarkDetections
 from sonar_graph.sequence import Sequence
 from sonar_graph.states import LandmarkMap, Trajectory
@@ -27,7 +33,10 @@ TYPES = {
     "map": "sonar_graph_msgs/msg/LandmarkMap",
     "tf": "tf2_msgs/msg/TFMessage",
 }
-Entry = tuple[str, str, list[dict[str, Any]]]
+Entry = tuple[Any, ...]
+"""Topic, type or a word for it, messages, and the definition where it is not the usual one."""
+Stored = tuple[int, bytes]
+"""Log time and payload of a message."""
 
 
 def header(ns: int, frame_id: str = "sensor") -> dict[str, Any]:
@@ -42,6 +51,8 @@ class Bench:
     """Builds logs message by message with mcap-ros2-support."""
 
     t0_ns = T0_NS
+    definitions: ClassVar[dict[str, str]] = {}
+    """Of types that ROS does not have."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -78,27 +89,19 @@ class Bench:
         stamps = [T0_NS + i * 10**8 for i in range(samples)]
         return [("/imu", "imu", [self.imu(s) for s in stamps]), ("/dvl", "dvl", [self.dvl(s) for s in stamps])]
 
-    def write(self, *entries: Entry, name: str = "log.mcap", schemas: dict[str, str] | None = None) -> Path:
-        texts = {kind: definition(TYPES[kind]) for _, kind, _ in entries if kind not in (schemas or {})} | (
-            schemas or {}
-        )
-        rows = [(topic, TYPES[kind], messages, texts[kind]) for topic, kind, messages in entries]
-        return write_messages(self._folder / name, rows)
-
-
-def write_messages(
-    path: Path, entries: list[tuple[str, str, list[dict[str, Any]], str]], begin_ns: int = T0_NS
-) -> Path:
-    """A log by mcap-ros2-support of topics, types, messages and definitions; ten messages a second."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        for topic, kind, messages, text in entries:
-            schema = writer.register_msgdef(kind, text)
-            for i, message in enumerate(messages):
-                time_ns = begin_ns + i * 10**8
-                writer.write_message(topic, schema, message, log_time=time_ns, publish_time=time_ns)
-        writer.finish()
-    return path
+    def write(self, *entries: Entry, name: str = "log.mcap") -> Path:
+        """A log of ten messages a second on each topic."""
+        with (self._folder / name).open("wb") as stream:
+            writer = Writer(stream)
+            for topic, word, messages, *text in entries:
+                kind = TYPES.get(word, word)
+                said = text[0] if text else self.definitions.get(kind) or definition(kind)
+                schema = writer.register_msgdef(kind, said)
+                for i, message in enumerate(messages):
+                    time_ns = self.t0_ns + i * 10**8
+                    writer.write_message(topic, schema, message, log_time=time_ns, publish_time=time_ns)
+            writer.finish()
+        return self._folder / name
 
 
 @pytest.fixture
@@ -158,3 +161,82 @@ def sequence_with(seed: int = 0, samples: int = 20, candidates: int = 2) -> Sequ
         true_landmarks=LandmarkMap(np.array([3, 7]), rng.normal(size=(2, 3)), np.full((2, 3, 3), np.nan)),
         notes={"source": "made up", "seed": str(seed)},
     )
+
+
+# --- MCAP files -------------------------------------------------------------------------------------------------------
+
+BYTES_TEXT = b"uint8[] data\n"
+
+
+@contextmanager
+def writing(path: Path, **settings: Any) -> Iterator[ContainerWriter]:
+    """A started file of mcap's own writer, finished at the end."""
+    with path.open("wb") as stream:
+        writer = ContainerWriter(stream, **settings)
+        writer.start("ros2", "test")
+        yield writer
+        writer.finish()
+
+
+def channel_for(
+    writer: ContainerWriter, topic: str, kind: str = "test_msgs/msg/Bytes", text: bytes = BYTES_TEXT
+) -> int:
+    return writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", text))
+
+
+def write(path: Path, count: int = 400, *, chunk_size: int = 4096, **settings: Any) -> list[Stored]:
+    """Messages of three lengths on /bytes, 1 ns apart, between others in JSON; what was written on /bytes."""
+    rng = np.random.default_rng(0)
+    written = [(1000 + i, rng.bytes([20, 50, 80][i % 3])) for i in range(count)]
+    with writing(path, chunk_size=chunk_size, **settings) as writer:
+        schema = writer.register_schema("test_msgs/msg/Bytes", "ros2msg", BYTES_TEXT)
+        other = writer.register_schema("Some", "jsonschema", b"{}")
+        channel = writer.register_channel("/bytes", "cdr", schema)
+        silent = writer.register_channel("/json", "json", other)
+        writer.register_channel("/never", "cdr", schema)
+        writer.add_metadata("sonar_graph", {"name": "x"})
+        for time_ns, payload in written:
+            writer.add_message(channel, time_ns, payload, time_ns)
+            writer.add_message(silent, time_ns, b'{"a": 1}', time_ns)
+    return written
+
+
+def write_apart(path: Path, count: int = 100) -> None:
+    """/a and /b in chunks of their own, by turns, a second apart from second 1 on; /tf_static is in the first chunk."""
+    with writing(path) as writer:
+        kinds = {"/a": "A", "/b": "B", "/tf_static": "Static"}
+        channels = [channel_for(writer, name, f"test_msgs/msg/{kind}") for name, kind in kinds.items()]
+        writer.add_message(channels[2], 10**9, b"static", 10**9)
+        for i in range(count):
+            writer.add_message(channels[i % 2], (1 + i) * 10**9, bytes([i]), 10**9)
+            writer.flush()
+
+
+def entries(topic: Topic) -> list[Stored]:
+    """Log times and payloads, in order."""
+    stacks = [part for stack in topic.stacks.values() for part in stack]
+    payloads = {row: p.tobytes() for rows, ps in stacks for row, p in zip(rows, ps, strict=True)}
+    return [(int(time), payloads[row]) for row, time in enumerate(topic.log_times_ns)]
+
+
+def scan_all(path: Path, window: TimeWindow | None = None) -> Recording:
+    return scan(path, lambda _: Keep.ALL, window)
+
+
+def read(path: Path) -> list[Stored]:
+    """Messages on /bytes."""
+    topics = scan_all(path).topics
+    return entries(topics["/bytes"]) if "/bytes" in topics else []
+
+
+def chunk_indexes(path: Path) -> list[ChunkIndex]:
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    return summary.chunk_indexes
+
+
+def flip(path: Path, at: int, bit: int = 4) -> None:
+    content = bytearray(path.read_bytes())
+    content[at] ^= bit
+    path.write_bytes(content)

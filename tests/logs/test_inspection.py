@@ -23,8 +23,7 @@ from sonar_graph.logs.roles import ROLES, choose_topic, refusal
 from sonar_graph.logs.writing import write_log
 from sonar_graph.simulation.basin import BasinOptions, simulate_basin
 
-from .conftest import TYPES, Bench
-from .containers import channel_for, chunk_indexes, flip, writing
+from .conftest import Bench, channel_for, chunk_indexes, flip, writing
 
 
 def role(summary: LogSummary, name: str) -> tuple[str | None, str]:
@@ -274,11 +273,10 @@ def test_what_is_changed_in_it_counts(bench: Bench) -> None:
     assert (frd.imu.specific_force == plain.imu.specific_force * [1, -1, -1]).all()
 
 
-def test_an_unknown_type_is_proposed_with_its_fields(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_type_is_proposed_with_its_fields(bench: Bench) -> None:
     own = "float64 time\nfloat64[3] speed\nfloat32[] beams\n"
-    monkeypatch.setitem(TYPES, "own", "my_msgs/msg/Velocity")
     rows = [{"time": 0.0, "speed": [1.0, 2.0, 3.0], "beams": []}] * 3
-    path = bench.write(bench.basics()[0], ("/my_dvl", "own", rows), schemas={"own": own})
+    path = bench.write(bench.basics()[0], ("/my_dvl", "my_msgs/msg/Velocity", rows, own))
     text = inspect_log(path).toml
     assert '# topic = "/my_dvl"\n# type = "my_msgs/msg/Velocity"\n# stamp = "log"' in text
     assert "#   time\n#   speed[3]\n#   beams[]" in text

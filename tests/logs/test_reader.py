@@ -26,7 +26,7 @@ from sonar_graph.logs.mcap.records import seal
 from sonar_graph.logs.mcap.topic import Damage, Keep, Loss, Topic, settle
 from sonar_graph.logs.reading import read_log
 
-from .containers import Entry, channel_for, chunk_indexes, entries, flip, read, scan_all, write, write_apart, writing
+from .conftest import Stored, channel_for, chunk_indexes, entries, flip, read, scan_all, write, write_apart, writing
 
 NONE, LZ4, ZSTD = CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD
 
@@ -35,7 +35,7 @@ def chunk_end(chunk: ChunkIndex) -> int:
     return chunk.chunk_start_offset + chunk.chunk_length
 
 
-def chunk_of(path: Path, number: int, channel: int = 1) -> list[Entry]:
+def chunk_of(path: Path, number: int, channel: int = 1) -> list[Stored]:
     """Messages of a chunk as mcap's own reader finds them."""
     index = chunk_indexes(path)[number]
     content = path.read_bytes()[index.chunk_start_offset + 9 :][: index.chunk_length - 9]
@@ -72,7 +72,7 @@ def test_every_message_is_found_whatever_the_container(path: Path, options: dict
     assert calls == sorted(calls)
     assert {total for _, total in calls} <= {path.stat().st_size}
     assert len(calls) == len(chunk_indexes(path)) or "use_chunking" in options or "index_types" in options
-    pieces: dict[str, list[Entry]] = {}
+    pieces: dict[str, list[Stored]] = {}
     for piece in stream(path, lambda _: Keep.ALL):
         pieces.setdefault(piece.name, []).extend(entries(piece))
     assert pieces == {name: entries(topic) for name, topic in scan_all(path).topics.items()}
@@ -405,7 +405,7 @@ def test_other_files_are_named_for_what_they_are(tmp_path: Path) -> None:
 def test_pieces_of_a_damaged_file_end_in_an_error(path: Path) -> None:
     written = write(path)
     in_chunk(1, 100)(path)
-    pieces, found = stream(path, lambda _: Keep.ALL), list[Entry]()
+    pieces, found = stream(path, lambda _: Keep.ALL), list[Stored]()
     with pytest.raises(LogError, match="damaged: bytes"):
         found.extend(entry for piece in pieces if piece.name == "/bytes" for entry in entries(piece))
     assert set(found) < set(written)

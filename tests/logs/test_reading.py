@@ -22,8 +22,7 @@ from sonar_graph.logs.writing import write_log
 from sonar_graph.measurements import LandmarkDetections
 from sonar_graph.slam.keyframes import sound_detections
 
-from .conftest import T0_NS, Bench, header
-from .containers import chunk_indexes, flip
+from .conftest import T0_NS, Bench, chunk_indexes, flip, header
 
 STEP_NS = 10**8
 UNKNOWN = [-1.0] + [0.0] * 8
@@ -56,7 +55,7 @@ def test_the_topic_that_is_chosen_is_read_and_choices_that_cannot_be_are_refused
     lacking = definition("sensor_msgs/msg/Imu").replace("geometry_msgs/Vector3 angular_velocity\n", "")
     without = [{key: value for key, value in m.items() if key != "angular_velocity"} for m in fast]
     with pytest.raises(LogError, match=r"nothing for imu: /imu has no field angular_velocity\.x"):
-        read_log(bench.write(("/imu", "imu", without), entries[1], schemas={"imu": lacking}))
+        read_log(bench.write(("/imu", "imu", without, lacking), entries[1]))
     path = bench.write(*entries)
     assert read_log(path, topics={"imu": "/imu"}).imu.angular_velocity[0, 2] == 0.1
     chosen = read_log(path, topics={"imu": "/other"})
@@ -173,9 +172,9 @@ def test_detections_are_padded_to_the_most_candidates_and_keep_their_tracks(benc
     assert found.track.tolist() == [4, 3, -1, -1, 7]
     # logs older than tracks
     lines = definition("sonar_graph_msgs/msg/LandmarkDetections").splitlines(keepends=True)
-    old = {"detections": "".join(line for line in lines if "track" not in line)}
+    old = "".join(line for line in lines if "track" not in line)
     frame = {key: value for key, value in frames[0].items() if key != "track"}
-    path = bench.write(*bench.basics(), ("/landmarks", "detections", [frame]), schemas=old)
+    path = bench.write(*bench.basics(), ("/landmarks", "detections", [frame], old))
     assert read_log(path).detections.track.tolist() == [-1, -1]  # type: ignore[union-attr]
 
 

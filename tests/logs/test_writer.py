@@ -21,7 +21,7 @@ from sonar_graph.logs.mcap.writer import Attachment, Outgoing, write_recording
 from sonar_graph.logs.writing import pose_messages, static_message
 from sonar_graph.states import Trajectory
 
-from .containers import chunk_indexes, flip, scan_all
+from .conftest import chunk_indexes, flip, scan_all
 
 T0_NS = 1_700_000_000_000_000_000
 

@@ -10,9 +10,8 @@ import pytest
 
 from sonar_graph.logs.adapters.log_config import read_log_config
 from sonar_graph.logs.cdr.definitions import DEFINITIONS as ROS
-from sonar_graph.logs.cdr.definitions import definition
 from sonar_graph.logs.reading import read_log
-from tests.logs.conftest import header, vector, write_messages
+from tests.logs.conftest import Bench, Entry, header, vector
 
 T0_NS = 1_700_000_000_000_000_000
 STEP_NS = 10**8
@@ -64,7 +63,6 @@ DEFINITIONS = {
     "provider_dvl/msg/PD0Packet": "float64 timestamp\nfloat64[4] range\nfloat64[4] velocity\n",
     "std_msgs/msg/Float64": "float64 data\n",
 }
-Entry = tuple[Any, ...]
 Case = tuple[list[Entry], str, dict[str, Any], dict[str, str | None]]
 """Entries, configuration, expected values by their path in the sequence, and parts of notes, None: no such note."""
 
@@ -98,19 +96,11 @@ def tree(link: str, xyz: tuple[float, ...] = (0, 0, 0), **rotation: float) -> En
     return "/tf_static", "tf2_msgs/msg/TFMessage", [{"transforms": [entry]}]
 
 
-class Foreign:
+class Foreign(Bench):
     """Writes and reads logs of other people's messages."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def write(self, *entries: Entry, name: str = "log.mcap") -> Path:
-        """Entries are topic, type, messages, and the definition where it is not the usual one."""
-        rows = [
-            (topic, kind, messages, text[0] if text else DEFINITIONS.get(kind) or definition(kind))
-            for topic, kind, messages, *text in entries
-        ]
-        return write_messages(self._folder / name, rows, T0_NS)
+    t0_ns = T0_NS
+    definitions = DEFINITIONS
 
     def config(self, text: str) -> Path:
         path = self._folder / "log.toml"
