@@ -128,9 +128,7 @@ def pose_after(x: Floats, P: Floats, motion: Integral) -> tuple[Floats, Floats, 
 
     ``theta = dR^T (W d(angles) + theta_i)`` and ``rho = dR^T (R^T dX - [dp]x W d(angles) + eps)``.
 
-    Returns
-    -------
-    world_R_body (3, 3), position (3,), covariance (6, 6).
+    Returns world_R_body (3, 3), position (3,), covariance (6, 6).
     """
     angles = vector(x[3:])
     R, W = rotation_from_euler(angles), rates_from_euler(angles)

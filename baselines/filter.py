@@ -45,10 +45,7 @@ class IdentifiedDetections(NamedTuple):
 class DetectionIntake:
     """Assigns landmarks their slots in a filter's state, and keeps the outcome of each detection.
 
-    Parameters
-    ----------
-    minimum_id_probability
-        Posterior below which an identity is not believed.
+    ``minimum_id_probability``: posterior below which an identity is not believed.
     """
 
     def __init__(self, minimum_id_probability: float) -> None:

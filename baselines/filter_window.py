@@ -188,10 +188,7 @@ def stamps_of(window: MeasurementWindow) -> Stamps:
 def next_event(stamps: Stamps, clock: Ints, longest_ns: int, done: Event) -> Event:
     """The event after another one; counts measurements in a gap on the clock.
 
-    Parameters
-    ----------
-    longest_ns
-        A longer time without Doppler log is a gap.
+    ``longest_ns``: a longer time without Doppler log is a gap.
     """
     samples, rows, count_in_gap = done.samples, done.rows, 0
     kind, stamp_ns = END, stamps.until_ns

@@ -192,9 +192,7 @@ def pose_after(state: InvariantState, motion: GapMotion) -> tuple[Floats, Floats
 
     In the body, ``theta_body = R'^T theta`` and ``rho = R'^T (xi_0 - [X']x theta)``.
 
-    Returns
-    -------
-    world_R_body (3, 3), position (3,), covariance (6, 6).
+    Returns world_R_body (3, 3), position (3,), covariance (6, 6).
     """
     R = matrix(state.R)
     R_after = product(R, motion.integral.dR)
@@ -248,10 +246,8 @@ def location(
 ) -> tuple[Vector, Floats, Floats, Floats]:
     """The point that a detection shows, and by (6) the derivatives of its xi.
 
-    Returns
-    -------
-    The point; G by xi, shape (3, 9 + 3 N); G_m by the motion, shape (3, 6); G_z by (range, azimuth, elevation), shape
-    (3, 3).
+    Returns the point; G by xi, shape (3, 9 + 3 N); G_m by the motion, shape (3, 6); G_z by (range, azimuth, elevation),
+    shape (3, 3).
     """
     R, dR, dp = matrix(state.R), motion.integral.dR, motion.integral.dp
     s = point_seen(motion.integral, sonar, z, elevation_rad)

@@ -26,28 +26,21 @@ UNTYPICAL_S = 1.0
 """Longest interval after the very first sample that is no hole."""
 
 
-def _within_a_turn(angle_rad: float) -> float:
-    if abs(angle_rad) > 2 * np.pi:
-        raise ValueError("expected radians between -2π and 2π (45° are 0.785)")
-    return angle_rad
+def within(lowest: float, highest: float, expected: str) -> AfterValidator:
+    """Validator that a number lies between bounds; ``expected`` states them."""
 
+    def check(value: float) -> float:
+        if not lowest <= value <= highest:
+            raise ValueError(f"expected {expected}")
+        return value
 
-def _latitude(angle_rad: float) -> float:
-    if abs(angle_rad) > np.pi / 2:
-        raise ValueError("expected radians between -π/2 and π/2 (48° are 0.838)")
-    return angle_rad
-
-
-def _earthly(gravity_m_s2: float) -> float:
-    if not 9 <= gravity_m_s2 <= 10.5:
-        raise ValueError("expected m/s² between 9 and 10.5 (9.76 to 9.84 on Earth)")
-    return gravity_m_s2
+    return AfterValidator(check)
 
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Positive = Annotated[Number, Field(gt=0)]
-Angle = Annotated[Number, AfterValidator(_within_a_turn)]
+Angle = Annotated[Number, within(-2 * np.pi, 2 * np.pi, "radians between -2π and 2π (45° are 0.785)")]
 Vector = tuple[Number, Number, Number]
 Sigmas = tuple[NotNegative, NotNegative, NotNegative]
 Angles = tuple[Angle, Angle, Angle]
@@ -213,8 +206,12 @@ class Calibration(Section):
     odometry_interpolation: Literal["linear", "hold-past"] = "linear"
     """Meaning of velocity and rate samples. ``linear``: values at their stamps, linear in between (Doppler logs,
     gyros); ``hold-past``: means over the interval that ends at the stamp (wheel odometry given as displacements)."""
-    gravity_m_s2: Annotated[Number, AfterValidator(_earthly)] = STANDARD_GRAVITY
-    earth_rate_latitude_rad: Annotated[Number, AfterValidator(_latitude)] | None = None
+    gravity_m_s2: Annotated[Number, within(9, 10.5, "m/s² between 9 and 10.5 (9.76 to 9.84 on Earth)")] = (
+        STANDARD_GRAVITY
+    )
+    earth_rate_latitude_rad: (
+        Annotated[Number, within(-np.pi / 2, np.pi / 2, "radians between -π/2 and π/2 (48° are 0.838)")] | None
+    ) = None
     """Latitude for removing the Earth's rotation from the gyros (world x east, y north); None: not removed."""
 
     @classmethod

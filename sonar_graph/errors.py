@@ -1,19 +1,4 @@
-"""The errors that this package raises on purpose, under one root.
-
-::
-
-    SonarGraphError
-    ├── MeasurementError        a block of measurements breaks its own rules
-    ├── CalibrationError        a calibration is missing or impossible
-    ├── SimulationError         a simulated run is asked for that cannot be made
-    ├── LogError                a file cannot be read as what it should be
-    │   ├── MissingTopicError   ... because a needed topic is not in it
-    │   └── DatasetError        ... because a data set's folder or file is not what a converter expects
-    ├── AlignmentError          attitude and gyro bias cannot be told from a stretch of a run
-    ├── EstimatorError          an estimator cannot be set up or go on
-    │   └── UnknownEstimatorError
-    ├── EvaluationError         a comparison or report cannot be made
-    └── BatchError              a suite cannot be run, or its runs cannot go on
+"""Errors that this package raises on purpose, under one root.
 
 Each message says what was asked, what was found, and what to do. The command line prints it on one line and exits
 with 2; only an unforeseen error ends in a traceback.

@@ -69,14 +69,9 @@ def written_whole(path: Path) -> Iterator[BinaryIO]:
 
     Raises `LogError` when the file cannot be written.
     """
-    partial = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with partial.open("wb") as stream:
-                yield stream
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
+        with replacing(path) as partial, partial.open("wb") as stream:
+            yield stream
     except OSError as error:
         raise LogError(f"{path} cannot be written: {error.strerror}") from error

@@ -20,12 +20,7 @@ _MISFIT = "misfit"
 def tagged(tag: str, default: str) -> tuple[FieldInfo, BeforeValidator]:
     """Metadata of a union of sections that one of their fields tells apart; it has a default.
 
-    Parameters
-    ----------
-    tag
-        That field, with a literal text in each section.
-    default
-        Its value where it is not given.
+    ``tag``: that field, with a literal text in each section; ``default``: its value where it is not given.
     """
 
     def with_tag(value: Any) -> Any:
@@ -77,14 +72,16 @@ def settings_of(model: type[BaseModel], default: BaseModel | None = None, sectio
         value = getattr(default, name) if default else field.get_default(call_default_factory=True)
         path, options, tag = f"{section}{name}", list(_sections(field.annotation)), field.discriminator
         if isinstance(tag, str):
-            meanings = (f"{' or '.join(_tags(option, tag))}: {_first_paragraph(option)}" for option in options)
+            docs = {option: " ".join((option.__doc__ or "").split("\n\n")[0].split()) for option in options}
+            meanings = (f"{' or '.join(_tags(option, tag))}: {docs[option]}" for option in options)
             found[f"{path}.{tag}"] = Setting(f"{path}.{tag}", getattr(value, tag), " ".join(meanings))
             for option in options:
                 others = [other for other in options if other is not option]
                 for setting in settings_of(option, value if isinstance(value, option) else None, f"{path}."):
                     top = setting.name[len(path) + 1 :].split(".")[0]
                     with_it = [option, *(other for other in others if top in other.model_fields)]
-                    limit = "" if len(with_it) == len(options) else _only_with(tag, with_it)
+                    names = " or ".join(f'"{name}"' for having in with_it for name in _tags(having, tag))
+                    limit = "" if len(with_it) == len(options) else f" Only with {tag} = {names}."
                     found.setdefault(setting.name, setting._replace(meaning=setting.meaning + limit))
         elif isinstance(value, BaseModel):
             found |= {setting.name: setting for setting in settings_of(type(value), value, f"{path}.")}
@@ -93,38 +90,25 @@ def settings_of(model: type[BaseModel], default: BaseModel | None = None, sectio
     return list(found.values())
 
 
-def _only_with(tag: str, options: list[type[BaseModel]]) -> str:
-    names = (f'"{name}"' for option in options for name in _tags(option, tag))
-    return f" Only with {tag} = {' or '.join(names)}."
-
-
-def _first_paragraph(section: type[BaseModel]) -> str:
-    return " ".join((section.__doc__ or "").split("\n\n")[0].split())
-
-
 def faults_in(error: ValidationError, model: type[BaseModel]) -> str:
     """Message naming every wrong field and the expected value, in one line.
 
-    Parameters
-    ----------
-    error
-        From validating plain values.
-    model
-        Model against which they were validated.
+    ``error``: from validating plain values; ``model``: model against which they were validated.
     """
     errors = error.errors()
-    short = dict.fromkeys(_list_of(e) for e in errors if _is_short_list(e))
+    short = dict.fromkeys(e["loc"][:-1] for e in errors if _is_short_list(e))
     texts = [_describe(e, model) for e in errors if not _is_short_list(e)]
-    return "; ".join([*texts, *(_wrong_length(place, errors) for place in short)])
+    for place in short:
+        lacking = [e for e in errors if _is_short_list(e) and e["loc"][:-1] == place]
+        expected = max(int(e["loc"][-1]) for e in lacking) + 1
+        texts.append(f"{_path(place)}: expected {expected} values, not {_shown(lacking[0]['input'])}")
+    return "; ".join(texts)
 
 
 def misfits(model: type[BaseModel], reasons: dict[str, str]) -> ValidationError:
     """Error for a model's validator to raise where fields exclude each other.
 
-    Parameters
-    ----------
-    reasons
-        Message for each field, so that the line in a file can be named.
+    ``reasons``: message for each field, so that the line in a file can be named.
     """
     found = [
         InitErrorDetails(type=PydanticCustomError(_MISFIT, "{reason}", {"reason": reason}), loc=(name,), input=None)
@@ -186,16 +170,6 @@ def _similarity(name: str, known: str) -> float:
 
 def _is_short_list(error: ErrorDetails) -> bool:
     return error["type"] == "missing" and bool(error["loc"]) and isinstance(error["loc"][-1], int)
-
-
-def _list_of(error: ErrorDetails) -> Place:
-    return error["loc"][:-1]
-
-
-def _wrong_length(place: Place, errors: list[ErrorDetails]) -> str:
-    lacking = [e for e in errors if _is_short_list(e) and _list_of(e) == place]
-    expected = max(int(e["loc"][-1]) for e in lacking) + 1
-    return f"{_path(place)}: expected {expected} values, not {_shown(lacking[0]['input'])}"
 
 
 def _shown(value: Any) -> str:

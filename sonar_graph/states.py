@@ -262,12 +262,8 @@ class DetectionJournal:
     ) -> int:
         """Append a row, and return its number.
 
-        Parameters
-        ----------
-        innovation
-            Measured minus predicted (range m, azimuth rad), shape (2,); None without a prediction.
-        innovation_cov
-            Shape (2, 2).
+        ``innovation``: measured minus predicted (range m, azimuth rad), shape (2,); None without a prediction;
+        ``innovation_cov``: shape (2, 2).
         """
         self._stamps_ns.append(stamp_ns)
         self._ids.append(landmark_id)

@@ -110,7 +110,8 @@ def bless(batch: RecordedBatch, path: Path) -> None:
         raise EvaluationError(
             f"{batch.name}: none of its {len(batch.runs)} runs ended, so every batch would pass by it"
         )
-    keys = gated_keys(batch)
+    errors = [key for metric in metrics_of(batch.metrics) if metric.is_error for key in metric.keys.values()]
+    keys = [*errors, *CONSISTENCY_KEYS]
     entries = [
         {
             "log": run.log,
@@ -124,12 +125,6 @@ def bless(batch: RecordedBatch, path: Path) -> None:
     ]
     content = {"format": FORMAT, "suite": batch.name, "versions": batch.runs[0].texts, "metrics": keys}
     write_json(path, content | {"runs": entries})
-
-
-def gated_keys(batch: RecordedBatch) -> list[str]:
-    """Columns to be judged: the suite's errors, causal and smoothed, and consistency."""
-    errors = [key for metric in metrics_of(batch.metrics) if metric.is_error for key in metric.keys.values()]
-    return [*errors, *CONSISTENCY_KEYS]
 
 
 def gate(batch: RecordedBatch, reference: Path) -> GateVerdict:

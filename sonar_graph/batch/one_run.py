@@ -71,10 +71,7 @@ class Clock:
 def perform(run: PlannedRun, folder: Path) -> Row:
     """Do one run and write what `compare` writes into a folder.
 
-    Returns
-    -------
-    Scores, times and versions. A log that cannot be read and an estimator that fails are rows with a reason.
-
+    Returns scores, times and versions. A log that cannot be read and an estimator that fails are rows with a reason.
     Raises `BatchError` when this process has other versions or another source than those that the run was planned with,
     before the estimator is loaded or after the run, or when its files have another content; `OSError` when the folder
     cannot be written; that is no result.

@@ -180,16 +180,10 @@ def detectable(families: list[Family], columns: list[str], limit: float) -> dict
     Noise is resampled from the scatter of a group about its mean, with random signs. A worsening is added, and the test
     of the whole family is repeated with the other groups unchanged.
 
-    Parameters
-    ----------
-    columns
-        The one with the median scatter stands for all, over all logs together if a contestant has several.
-    limit
-        Log ratio that is allowed, and was subtracted.
+    ``columns``: the one with the median scatter stands for all, over all logs together if a contestant has several;
+    ``limit``: log ratio that is allowed, and was subtracted.
 
-    Returns
-    -------
-    Worsening by contestant; infinity if a tenfold value would not be found.
+    Returns worsening by contestant; infinity if a tenfold value would not be found.
     """
     typical: dict[str, list[tuple[float, Family, int]]] = {}
     for family in families:

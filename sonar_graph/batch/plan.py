@@ -36,6 +36,7 @@ from sonar_graph.batch.suite import LogEntry, Place, SuiteFile
 from sonar_graph.calibration import Section
 from sonar_graph.errors import BatchError, EstimatorError, SonarGraphError, UnknownEstimatorError
 from sonar_graph.estimator import installed_estimators, load_estimator
+from sonar_graph.evaluation import LIBRARIES
 from sonar_graph.settings import faults_in, field_place, flattened, nested
 from sonar_graph.simulation import LandmarkOptions
 from sonar_graph.version import __version__
@@ -265,10 +266,7 @@ def versions_of(estimator: str) -> dict[str, str]:
     brings = {} if point.dist is None else {point.dist.name: point.dist.version}
     return brings | {
         "sonar_graph": __version__,
-        "gtsam": version("gtsam"),
-        "numpy": version("numpy"),
-        "scipy": version("scipy"),
-        "numba": version("numba"),
+        **{library: version(library) for library in LIBRARIES},
         "python": platform.python_version(),
         "estimator_target": point.value,
         "source": source_hash("sonar_graph"),
@@ -296,9 +294,7 @@ def source_hash(package: str) -> str:
     once in a process, before the first code of the package decides a number; `source_hash_now` tells whether it still
     holds. The package is not imported.
 
-    Returns
-    -------
-    Hexadecimal digits; empty if there is no such package.
+    Returns hexadecimal digits; empty if there is no such package.
     """
     return source_hash_now(package)
 

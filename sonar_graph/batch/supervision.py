@@ -55,10 +55,7 @@ class KilledError(Exception):
 def perform_watched(run: PlannedRun, limits: Limits) -> RunOutcome:
     """Do a run in one of this process's runners; a run that is killed is done once more.
 
-    Returns
-    -------
-    Its outcome. For a run that is killed again, takes too long or needs too much memory, the row says so.
-
+    The row of the outcome says where a run was killed again, took too long or needed too much memory.
     Raises `BatchError` or `OSError` when no run can be done here: other versions, no process, no space.
     """
     reason, log = "", ""

@@ -70,7 +70,13 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
                 (result.parent / name).unlink(missing_ok=True)
             if not any(result.parent.iterdir()):
                 result.parent.rmdir()
-    _write_arrays(folder / SEQUENCE, _sequence_arrays(comparison.sequence) | {"instants_ns": comparison.instants_ns})
+    sequence, ends = comparison.sequence, np.array([0, -1])  # all other rows of IMU and Doppler log are in the log
+    arrays = _pack("imu", sequence.imu.rows(ends)) | _pack("dvl", sequence.dvl.rows(ends))
+    arrays |= _pack("truth", sequence.truth) | _pack("true_landmarks", sequence.true_landmarks)
+    if sequence.truth is not None and np.isnan(sequence.truth.covariances).all():
+        del arrays["truth.covariances"]  # they would be most of the file
+    arrays |= _pack("detections", sequence.detections) | {"instants_ns": comparison.instants_ns}
+    _write_arrays(folder / SEQUENCE, arrays)
     entries = {}
     for run in comparison.runs:
         _write_run(run, comparison, folder / RUNS / run.estimator)
@@ -245,16 +251,6 @@ def _read_arrays(path: Path) -> Arrays:
             return {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise EvaluationError(f"{path}: cannot be read as arrays ({error}); write the comparison anew") from error
-
-
-def _sequence_arrays(sequence: Sequence) -> Arrays:
-    """Truth and detections, and the first and last row of IMU and Doppler log; their measurements are in the log."""
-    ends = np.array([0, -1])
-    arrays = _pack("imu", sequence.imu.rows(ends)) | _pack("dvl", sequence.dvl.rows(ends))
-    arrays |= _pack("truth", sequence.truth) | _pack("true_landmarks", sequence.true_landmarks)
-    if sequence.truth is not None and np.isnan(sequence.truth.covariances).all():
-        del arrays["truth.covariances"]  # they would be most of the file
-    return arrays | _pack("detections", sequence.detections)
 
 
 def _restore_sequence(name: str, calibration: Calibration, notes: dict[str, str], arrays: Arrays) -> Sequence:

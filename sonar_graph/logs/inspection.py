@@ -150,19 +150,16 @@ def inspect_log(
     --------
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
-    >>> import numpy as np
-    >>> from sonar_graph.calibration import Calibration
+    >>> from dataclasses import replace
     >>> from sonar_graph.logs import inspect_log, write_log
-    >>> from sonar_graph.measurements import Dvl, Imu
-    >>> from sonar_graph.sequence import Sequence
-    >>> stamps_ns = np.arange(50) * 10**8
-    >>> imu = Imu(stamps_ns, np.zeros((50, 3)), np.tile([0.0, 9.81, 0.0], (50, 1)))
-    >>> dvl = Dvl(stamps_ns, np.tile([0.5, 0.0, 0.0], (50, 1)), np.tile(1e-4 * np.eye(3), (50, 1, 1)))
+    >>> from sonar_graph.testing import small_world
+    >>> world = small_world()
+    >>> wrong_axes = replace(world.imu, specific_force=world.imu.specific_force[:, [0, 2, 1]])
     >>> with TemporaryDirectory() as folder:
-    ...     write_log(Path(folder) / "dive.mcap", Sequence("straight", Calibration(), imu, dvl))
+    ...     write_log(Path(folder) / "dive.mcap", replace(world, imu=wrong_axes))
     ...     summary = inspect_log(Path(folder) / "dive.mcap")
-    >>> sorted((topic.name, topic.messages, topic.rate_hz) for topic in summary.topics if topic.messages > 1)
-    [('/dvl/data', 50, 10.0), ('/imu/data', 50, 10.0)]
+    >>> sorted((topic.name, topic.rate_hz) for topic in summary.topics if topic.messages > 100)
+    [('/depth/pose', 5.0), ('/dvl/data', 5.0), ('/ground_truth/odometry', 50.0), ('/imu/data', 50.0)]
     >>> summary.warnings[0].split(":")[1]
     " gravity is felt along +y (9.81 m/s2) instead of the body's +z"
     """

@@ -118,21 +118,15 @@ def read_log(
     --------
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
-    >>> import numpy as np
-    >>> from sonar_graph.calibration import Calibration
     >>> from sonar_graph.logs import read_log, write_log
-    >>> from sonar_graph.measurements import Dvl, Imu
-    >>> from sonar_graph.sequence import Sequence
-    >>> stamps_ns = np.arange(50) * 10**8
-    >>> imu = Imu(stamps_ns, np.zeros((50, 3)), np.tile([0.0, 0.0, 9.81], (50, 1)))
-    >>> dvl = Dvl(stamps_ns, np.tile([0.5, 0.0, 0.0], (50, 1)), np.tile(1e-4 * np.eye(3), (50, 1, 1)))
+    >>> from sonar_graph.testing import small_world
     >>> with TemporaryDirectory() as folder:
-    ...     write_log(Path(folder) / "dive.mcap", Sequence("straight", Calibration(), imu, dvl))
+    ...     write_log(Path(folder) / "dive.mcap", small_world())
     ...     sequence = read_log(Path(folder) / "dive.mcap")
-    >>> sequence.name, len(sequence.imu), sequence.duration_s
-    ('straight', 50, 4.9)
+    >>> sequence
+    Sequence('left turn': 20.0 s, 1001 imu, 101 dvl, 101 depth, 102 detections, 1001 truth, 3 true_landmarks)
     >>> sequence.notes["log.topics"]
-    'imu: /imu/data; dvl: /dvl/data'
+    'imu: /imu/data; dvl: /dvl/data; ...'
     """
     path = as_path(path, "read_log(path)")
     if not isinstance(calibration, Calibration | PartialCalibration | None):

@@ -57,18 +57,12 @@ def write_log(path: str | Path, sequence: Sequence, more: Iterable[Outgoing] = (
     --------
     >>> from pathlib import Path
     >>> from tempfile import TemporaryDirectory
-    >>> import numpy as np
-    >>> from sonar_graph.calibration import Calibration
     >>> from sonar_graph.logs import read_log, write_log
-    >>> from sonar_graph.measurements import Dvl, Imu
-    >>> from sonar_graph.sequence import Sequence
-    >>> stamps_ns = np.arange(50) * 10**8
-    >>> imu = Imu(stamps_ns, np.zeros((50, 3)), np.tile([0.0, 0.0, 9.81], (50, 1)))
-    >>> dvl = Dvl(stamps_ns, np.tile([0.5, 0.0, 0.0], (50, 1)), np.tile(1e-4 * np.eye(3), (50, 1, 1)))
+    >>> from sonar_graph.testing import small_world
     >>> with TemporaryDirectory() as folder:
-    ...     write_log(Path(folder) / "dive.mcap", Sequence("straight", Calibration(), imu, dvl))
+    ...     write_log(Path(folder) / "dive.mcap", small_world())
     ...     copy = read_log(Path(folder) / "dive.mcap")
-    >>> bool((copy.dvl.velocity == dvl.velocity).all())
+    >>> bool((copy.dvl.velocity == small_world().dvl.velocity).all())
     True
     """
     path = as_path(path, "write_log(path, sequence)")

@@ -30,10 +30,7 @@ samples of 5 mm/s at 7 Hz, short enough for an accelerometer's bias not to have 
 class StampedRows:
     """Rows of one sensor in the order of their stamps, each stamp once, with two values per row.
 
-    Parameters
-    ----------
-    one, other
-        Shapes of either value's rows.
+    ``one``, ``other``: shapes of either value's rows.
     """
 
     def __init__(self, one: tuple[int, ...], other: tuple[int, ...]) -> None:

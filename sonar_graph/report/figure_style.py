@@ -140,10 +140,7 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
     Text stays text, colours become the page's custom properties, and nothing refers outside. Identifiers begin with
     ``name`` (letters, digits and hyphens, unique on the page), so that several figures can share a page.
 
-    Parameters
-    ----------
-    description
-        Content of the figure in words, for those who cannot see it.
+    ``description``: content of the figure in words, for those who cannot see it.
     """
     buffer = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "path.simplify_threshold": 0.25, "svg.hashsalt": name}):

@@ -37,16 +37,23 @@ def small_world(dvl_delay_s: float = 0.0) -> Sequence:
         Time by which the DVL begins after the IMU.
     """
     noise = np.random.default_rng(SEED)
-    calibration = Calibration(start=_circle_start(dvl_delay_s), imu=ImuCalibration(gyro_bias_sigma=1e-5))
-    truth = _circle(_stamps(0, IMU_HZ, DURATION_S))
+    x, y, z = _circle(np.array([START_NS + round(dvl_delay_s * NS_PER_S)], dtype=np.int64)).positions[0].tolist()
+    start = Start(position_m=(x, y, z), rpy_rad=(0.0, 0.0, YAW_RATE_RAD_S * dvl_delay_s))
+    calibration = Calibration(start=start, imu=ImuCalibration(gyro_bias_sigma=1e-5))
+    imu = _turning_imu(calibration, noise)
+    dvl_ns, depth_ns = _stamps(dvl_delay_s, DVL_HZ, DURATION_S), _stamps(0, DEPTH_HZ, DURATION_S)
+    n, m = len(dvl_ns), len(depth_ns)
+    velocity = np.array([SPEED_M_S, 0.0, 0.0]) + calibration.dvl.velocity_sigma_m_s * noise.standard_normal((n, 3))
+    dvl = Dvl(dvl_ns, velocity, np.full((n, 3, 3), np.nan))
+    depth = Depth(depth_ns, HEIGHT_M + calibration.depth.sigma_m * noise.standard_normal(m), np.full(m, np.nan))
     return Sequence(
         name="left turn",
         calibration=calibration,
-        imu=_turning_imu(calibration, noise),
-        dvl=_driving_dvl(calibration, dvl_delay_s, noise),
-        depth=_level_depth(calibration, noise),
+        imu=imu,
+        dvl=dvl,
+        depth=depth,
         detections=_detections(calibration, noise),
-        truth=truth,
+        truth=_circle(_stamps(0, IMU_HZ, DURATION_S)),
         true_landmarks=_true_landmarks(),
     )
 
@@ -114,12 +121,6 @@ def _circle(stamps_ns: Ints) -> Trajectory:
     return Trajectory.without_covariances(stamps_ns, positions, Rotation.from_euler("z", yaw_rad[:, None]).as_quat())
 
 
-def _circle_start(after_s: float) -> Start:
-    pose = _circle(np.array([START_NS + round(after_s * NS_PER_S)], dtype=np.int64))
-    x, y, z = pose.positions[0].tolist()
-    return Start(position_m=(x, y, z), rpy_rad=(0.0, 0.0, YAW_RATE_RAD_S * after_s))
-
-
 def _turning_imu(calibration: Calibration, noise: np.random.Generator) -> Imu:
     """Constant yaw rate; the specific force is centripetal acceleration v ω to the left, and gravity."""
     stamps_ns = _stamps(0, IMU_HZ, DURATION_S)
@@ -129,19 +130,6 @@ def _turning_imu(calibration: Calibration, noise: np.random.Generator) -> Imu:
     force_sigma = calibration.imu.accel_noise_density * root_hz
     rates = np.array([0.0, 0.0, YAW_RATE_RAD_S]) + rate_sigma * noise.standard_normal(shape)
     return Imu(stamps_ns, rates, force + force_sigma * noise.standard_normal(shape))
-
-
-def _driving_dvl(calibration: Calibration, delay_s: float, noise: np.random.Generator) -> Dvl:
-    stamps_ns = _stamps(delay_s, DVL_HZ, DURATION_S)
-    n = len(stamps_ns)
-    scatter = np.array(calibration.dvl.velocity_sigma_m_s) * noise.standard_normal((n, 3))
-    return Dvl(stamps_ns, np.array([SPEED_M_S, 0.0, 0.0]) + scatter, np.full((n, 3, 3), np.nan))
-
-
-def _level_depth(calibration: Calibration, noise: np.random.Generator) -> Depth:
-    stamps_ns = _stamps(0, DEPTH_HZ, DURATION_S)
-    n = len(stamps_ns)
-    return Depth(stamps_ns, HEIGHT_M + calibration.depth.sigma_m * noise.standard_normal(n), np.full(n, np.nan))
 
 
 def _detections(calibration: Calibration, noise: np.random.Generator) -> LandmarkDetections:

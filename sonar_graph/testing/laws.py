@@ -110,15 +110,12 @@ def unlike(one: EstimatorRun, other: EstimatorRun) -> list[str]:
 
 def _is_same(mine: object, theirs: object) -> bool:
     """Equality of all columns to the last bit."""
-    for name, column in vars(mine).items():
-        theirs_too = vars(theirs)[name]
-        if isinstance(column, np.ndarray):
-            is_same = np.array_equal(column, theirs_too, equal_nan=column.dtype.kind == "f")
-        else:
-            is_same = column == theirs_too
-        if not is_same:
-            return False
-    return True
+    return all(
+        np.array_equal(column, other, equal_nan=column.dtype.kind == "f")
+        if isinstance(column, np.ndarray)
+        else column == other
+        for column, other in zip(vars(mine).values(), vars(theirs).values(), strict=True)
+    )
 
 
 def difference(one: EstimatorRun, other: EstimatorRun) -> float:
@@ -216,14 +213,10 @@ def answers_from_the_first_imu_and_dvl_on(make: MakeEstimator) -> None:
         if step.end_ns < world.start_ns:
             require(estimate is None, "an estimate is returned before the first DVL sample")
         elif step.end_ns > world.start_ns:
-            _require_answer(estimate, step.end_ns)
-
-
-def _require_answer(estimate: Estimate | None, end_ns: int) -> None:
-    if estimate is None:
-        raise ContractError("nothing is returned although there are IMU and DVL")
-    require(isinstance(estimate, Estimate), f"{type(estimate).__name__} is returned, not an Estimate")
-    require(estimate.stamp_ns == end_ns, f"asked for {end_ns}, answered for {estimate.stamp_ns}")
+            if estimate is None:
+                raise ContractError("nothing is returned although there are IMU and DVL")
+            require(isinstance(estimate, Estimate), f"{type(estimate).__name__} is returned, not an Estimate")
+            require(estimate.stamp_ns == step.end_ns, f"asked for {step.end_ns}, answered for {estimate.stamp_ns}")
 
 
 def covariances_are_covariances(make: MakeEstimator) -> None:

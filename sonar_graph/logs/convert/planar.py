@@ -39,18 +39,10 @@ def twists_of_steps(steps: Floats, covs: Floats) -> tuple[Floats, Floats, Floats
     The covariance is that of the velocity given the turn, ``V^-1 S V^-T / T²`` with S the covariance of (dx, dy). The
     correlation with the turn is left out, since the two sensors are independent.
 
-    Parameters
-    ----------
-    steps
-        (dx, dy, dθ) in the frame before the step (x forward, y left), shape (n, 3), metres and radians; turns within
-        (-2π, 2π).
-    covs
-        Covariances of the steps, shape (n, 3, 3).
+    ``steps``: (dx, dy, dθ) in the frame before the step (x forward, y left), shape (n, 3), metres and radians; turns
+    within (-2π, 2π); ``covs``: covariances of the steps, shape (n, 3, 3).
 
-    Returns
-    -------
-    tuple
-        (v_x, v_y), shape (n, 2), m/s; its covariance, shape (n, 2, 2), m²/s²; ω, shape (n,), rad/s.
+    Returns (v_x, v_y), shape (n, 2), m/s; its covariance, shape (n, 2, 2), m²/s²; ω, shape (n,), rad/s.
     """
     angle_rad = steps[:, 2]
     half = 0.5 * angle_rad
@@ -123,16 +115,9 @@ def stepped_sequence(
     The turn's noise is one density whose integral over a step has the mean variance of dθ, ``sqrt(mean(c_θθ) / T)``;
     that of the velocity is in the rows, and in the calibration their root mean square. The gyro has no bias.
 
-    Parameters
-    ----------
-    steps, step_covs
-        As for `twists_of_steps`.
-    poses
-        Number of steps before each landmark, length m.
-    points, point_covs
-        Landmarks in the body frame (x forward, y left), shape (m, 2), and their covariances, shape (m, 2, 2).
-    ids
-        Equally probable identities of each landmark, length m; negative ones are left out.
+    ``steps``, ``step_covs``: as for `twists_of_steps`; ``poses``: number of steps before each landmark, length m;
+    ``points``, ``point_covs``: landmarks in the body frame (x forward, y left), shape (m, 2), and their covariances,
+    shape (m, 2, 2); ``ids``: equally probable identities of each landmark, length m; negative ones are left out.
     """
     velocity, velocity_cov, rate_rad_s = twists_of_steps(steps, step_covs)
     stamps_ns = np.arange(len(steps) + 1, dtype=np.int64) * NS_PER_S

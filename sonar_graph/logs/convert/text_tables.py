@@ -94,16 +94,9 @@ def numbers(path: Path, number: int, fields: list[str], columns: tuple[str, ...]
 def numbered_run(folder: Path, entry: str, number: int, kind: str, expected: str) -> Path:
     """Path of a run in a data set's folder, where the runs are numbered.
 
-    Parameters
-    ----------
-    folder
-        Folder of the data set.
-    entry
-        Name of a run's file or folder, with ``N`` for the number.
-    number
-        The wanted run.
-    kind, expected
-        Names of a run and of the content of the folder, for the errors where one does not exist.
+    ``folder``: folder of the data set; ``entry``: name of a run's file or folder, with ``N`` for the number;
+    ``number``: the wanted run; ``kind``, ``expected``: names of a run and of the content of the folder, for the errors
+    where one does not exist.
     """
     if not folder.is_dir():
         raise DatasetError(f"{folder}: is not a folder; give the folder that holds {expected}")

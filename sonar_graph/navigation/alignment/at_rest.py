@@ -86,10 +86,7 @@ def align_at_rest(imu: Imu, calibration: Calibration, dvl: Dvl | None = None) ->
 def covariance_at_rest(up: Floats, rest_s: float, calibration: Calibration) -> Floats:
     """Covariance of [roll, pitch, gyro bias] after a rest of ``rest_s`` seconds, shape (5, 5).
 
-    Parameters
-    ----------
-    up
-        Unit vector ``body_R_world e_z``, shape (3,).
+    ``up``: unit vector ``body_R_world e_z``, shape (3,).
     """
     upward, level = earth_up_and_level(calibration)
     sensors, across = calibration.imu, np.eye(3) - np.outer(up, up)

@@ -272,7 +272,11 @@ def velocity_changes(
         drifting = P_since - cross_matrices(F_since) @ S[r][0] - cross_matrices(carried) @ S_since
         columns = [-carried[:, :, None], C[r] @ cross_matrices(in_body), turning[r], -S_since, drifting]
         together = max(1, round(MEAN_OVER_S / float(np.median(np.diff(since)))))
-        t, y, A = (mean_of_successive(v, together) for v in (since, x[r], np.concatenate(columns, axis=2)))
+        whole = len(since) // together
+        t, y, A = (
+            v[: whole * together].reshape(whole, together, *v.shape[1:]).mean(axis=1)
+            for v in (since, x[r], np.concatenate(columns, axis=2))
+        )
         felt = impulse[r][-1] - impulse[r][0]
         level_R_g = np.asarray(Rotation.align_vectors([[0.0, 0.0, 1.0]], felt[None])[0].as_matrix())
         duration = np.diff(t)
@@ -281,12 +285,6 @@ def velocity_changes(
         y, A = np.diff(y, axis=0) @ level_R_g.T, level_R_g @ np.diff(A, axis=0)
         changes.append(SampleSeries(y, A, B, duration, walks=(True, True, False)))
     return changes
-
-
-def mean_of_successive(values: Floats, count: int) -> Floats:
-    """Means of ``count`` rows at a time; a remainder at the end is left out."""
-    whole = len(values) // count
-    return np.asarray(values[: whole * count].reshape(whole, count, *values.shape[1:]).mean(axis=1))
 
 
 def cross_matrices(vectors: Floats) -> Floats:

@@ -70,15 +70,9 @@ class LeastSquaresFit:
 def fit(stretches: Sequence[SampleSeries], prior_sigmas: Floats, ratios: Floats | None = None) -> LeastSquaresFit:
     """Fit the common parameters.
 
-    Parameters
-    ----------
-    stretches
-        At least one, with more differences in all than parameters.
-    prior_sigmas
-        Of the common parameters about zero, shape (p,): so wide that they matter only where the data say nothing. A
-        parameter whose covariance is the prior's was not observed.
-    ratios
-        Of the noises; None: estimated from the data.
+    ``stretches``: at least one, with more differences in all than parameters; ``prior_sigmas``: of the common
+    parameters about zero, shape (p,): so wide that they matter only where the data say nothing. A parameter whose
+    covariance is the prior's was not observed; ``ratios``: of the noises; None: estimated from the data.
     """
     if ratios is None:
         rate = 1.0 / float(np.concatenate([s.duration_s for s in stretches]).mean())
@@ -254,12 +248,8 @@ class OffsetFit:
 def search_offset(line_up: LineUp, prior_sigmas: Floats) -> OffsetFit:
     """Find the best offset within `RANGE_S`.
 
-    Parameters
-    ----------
-    line_up
-        Gives the data for an offset; the same rows for all of them.
-    prior_sigmas
-        Of the other common parameters (see `sonar_graph.navigation.alignment.time_offset.fit`), shape (p,).
+    ``line_up``: gives the data for an offset; the same rows for all of them; ``prior_sigmas``: of the other common
+    parameters (see `sonar_graph.navigation.alignment.time_offset.fit`), shape (p,).
     """
     grid = np.arange(-RANGE_S, RANGE_S + GRID_STEP_S / 2, GRID_STEP_S)
     lined_up = [line_up(float(offset)) for offset in grid]

@@ -153,10 +153,7 @@ class Confirmed(NamedTuple):
 class VelocityConfirmation:
     """Lets rows through one by one, or makes them wait for others that confirm them.
 
-    Parameters
-    ----------
-    walk
-        Root spectral density of the velocity's random walk, m/s/√s.
+    ``walk``: root spectral density of the velocity's random walk, m/s/√s.
     """
 
     def __init__(self, walk: float) -> None:

@@ -118,10 +118,7 @@ Rows = tuple[Ints, Floats, Floats]
 class PartialVelocities:
     """Completes rows in their order, one block after the other.
 
-    Parameters
-    ----------
-    calibration
-        Noise of the IMU, lever arms, and the walk of the vehicle's velocity.
+    ``calibration``: noise of the IMU, lever arms, and the walk of the vehicle's velocity.
     """
 
     def __init__(self, calibration: Calibration) -> None:

@@ -64,18 +64,10 @@ def refuse_holes(longest_s: float, imu_ns: Ints, first: int, last: int) -> None:
 def with_rate_noise(cov: Floats, dvl_ns: Ints, imu_ns: Ints, gyro_density: float, arm: Floats) -> Floats:
     """Covariances of ``z - w x l`` at samples that begin or end a long interval, of z at others.
 
-    Parameters
-    ----------
-    cov
-        Covariances of the samples z, body axes, shape (n, 3, 3), m²/s².
-    gyro_density
-        Noise density of the gyros, rad/s/√Hz.
-    arm
-        l, from the IMU to the Doppler log, body axes, shape (3,), m.
+    ``cov``: covariances of the samples z, body axes, shape (n, 3, 3), m²/s²; ``gyro_density``: noise density of the
+    gyros, rad/s/√Hz; ``arm``: l, from the IMU to the Doppler log, body axes, shape (3,), m.
 
-    Returns
-    -------
-    Shape (n, 3, 3), m²/s²: more by ``n_g² / dt [l]x [l]x^T`` with the mean time dt between inertial rows.
+    Returns shape (n, 3, 3), m²/s²: more by ``n_g² / dt [l]x [l]x^T`` with the mean time dt between inertial rows.
     """
     is_long = np.diff(dvl_ns) > LONG_S * 1e9
     if not is_long.any():

@@ -72,10 +72,8 @@ def pair_jointly(innovations: Innovations, probability: float) -> Pairing:
     pairing may be beyond the gate of its size, where more pairs make up for it. The cost is small where few pairs are
     compatible by themselves, and grows exponentially with the number of detections where many are.
 
-    Parameters
-    ----------
-    probability
-        Chance that a true pairing of k pairs passes the gate, the chi-square quantile with 2 k degrees of freedom.
+    ``probability``: chance that a true pairing of k pairs passes the gate, the chi-square quantile with 2 k degrees of
+    freedom.
     """
     search = _Search(innovations, probability)
     search.branch(0, _Whitened((UNPAIRED,) * len(innovations.innovation), [], np.zeros((0, 0)), np.zeros(0), 0.0))
@@ -151,16 +149,10 @@ def believed(innovations: Innovations, pairing: Pairing, log_rivals: Floats) -> 
         ln N(e; 0, C)  >  sum of ln_rivals          all pairs together
         ln N(e_i; given the others)  >  ln_rival_i  each pair, given the other pairs
 
-    Parameters
-    ----------
-    log_rivals
-        Logarithm of the density of range and azimuth, 1 / (m rad), that the rival has at each detection, shape (m,).
+    ``log_rivals``: logarithm of the density of range and azimuth, 1 / (m rad), that the rival has at each detection,
+    shape (m,).
 
-    Returns
-    -------
-    Pairing
-        Without the pair that fails worst, one after the other, until each one passes; without any if together they
-        do not.
+    Returns the pairing without the pairs that fail worst, until each one passes; without any if together they do not.
     """
     landmarks, nothing = pairing.landmarks, Pairing((UNPAIRED,) * len(pairing.landmarks), 0.0)
     while any(landmark != UNPAIRED for landmark in landmarks):

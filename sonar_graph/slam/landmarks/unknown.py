@@ -72,14 +72,13 @@ class LandmarkMerging:
         for k in near:
             stays, goes = pairs[k]
             of_both = self._landmarks.stamps_ns(stays) & self._landmarks.stamps_ns(goes)
-            if self._is_telling(d[k], S[k]) and not of_both and not self._landmarks.is_rooted(goes):
+            level = S[k][:2, :2]
+            log_density = -0.5 * (
+                float(d[k][:2] @ np.linalg.solve(level, d[k][:2])) + float(np.linalg.slogdet(level)[1])
+            ) - math.log(2 * math.pi)
+            if log_density > self._log_rival and not of_both and not self._landmarks.is_rooted(goes):
                 return stays, goes
         return None
-
-    def _is_telling(self, d: Floats, S: Floats) -> bool:
-        level = S[:2, :2]
-        log_det = float(np.linalg.slogdet(level)[1])
-        return -0.5 * (float(d[:2] @ np.linalg.solve(level, d[:2])) + log_det) - math.log(2 * math.pi) > self._log_rival
 
 
 ODDS = 10.0

@@ -185,20 +185,11 @@ def joint_error(
 ) -> tuple[Floats, Floats]:
     """Error of `inertial_doppler_odometry` and its derivatives.
 
-    Parameters
-    ----------
-    X_i, X_j
-        ``world_T_body``, shape (4, 4).
-    parameters
-        Gyro bias, accelerometer bias, scale, mounting, shape (10,).
-    measured
-        v, p, s as rows, shape (3, 3).
-    bias
-        For which ``measured`` holds, shape (6,).
+    ``X_i``, ``X_j``: ``world_T_body``, shape (4, 4); ``parameters``: gyro bias, accelerometer bias, scale, mounting,
+    shape (10,); ``measured``: v, p, s as rows, shape (3, 3); ``bias``: for which ``measured`` holds, shape (6,).
 
-    Returns
-    -------
-    Shape (12,), and (12, 28) by pose i, velocity i, pose j, velocity j, bias (accelerometers first), scale, mounting.
+    Returns shape (12,), and (12, 28) by pose i, velocity i, pose j, velocity j, bias (accelerometers first), scale,
+    mounting.
     """
     change = parameters.copy()
     change[:6] -= bias

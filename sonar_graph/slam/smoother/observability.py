@@ -70,19 +70,10 @@ def left_open(
 ) -> list[Open]:
     """Directions of some variables that the factors leave open, given all other variables.
 
-    Parameters
-    ----------
-    values
-        Of all variables of the factors.
-    keys
-        The variables that are not taken as known.
-    least_said
-        Whitened rows of A shorter than this, such as `LEAST_SAID`, count as zero.
+    ``values``: of all variables of the factors; ``keys``: the variables that are not taken as known; ``least_said``:
+    whitened rows of A shorter than this, such as `LEAST_SAID`, count as zero.
 
-    Returns
-    -------
-    list[Open]
-        Nothing where a derivative is no number (`not_finite`).
+    Returns nothing where a derivative is no number (`not_finite`).
     """
     places, size = {}, 0
     for key in keys:
