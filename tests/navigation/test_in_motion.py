@@ -23,14 +23,14 @@ from .ways import acceleration_at, attitude, rate_at, velocity_at
 T = np.arange(round(15.0 * 100) + 1) / 100
 G, HZ, DVL_EVERY = 9.80665, 100, 20
 EARTH, LATITUDE = 7.292115e-5, np.radians(40.0)
-LEVER_M = np.array([0.4, -0.1, 0.2])
+IMU_AT, DVL_AT = np.array([0.4, -0.1, 0.2]), np.array([-0.5, 0.3, -0.2])
 KNOWN = Calibration(
     imu=ImuCalibration(
         gyro_noise_density=1e-4,
         gyro_bias_sigma=1e-3,
         accel_noise_density=1e-3,
         accel_bias_sigma=1e-2,
-        mounting=Mounting(translation_m=(0.4, -0.1, 0.2)),
+        mounting=Mounting(translation_m=tuple(IMU_AT)),
     ),
     dvl=DvlCalibration(velocity_sigma_m_s=(0.005, 0.005, 0.005)),
 )
@@ -43,12 +43,19 @@ COARSE = KNOWN.model_copy(update={"imu": KNOWN.imu.model_copy(update={"gyro_nois
 """Gyros whose noise matters more than all else."""
 
 
+def exact_readings(t: Floats, known: Calibration, yaw: float, earth: float) -> tuple[Floats, Floats, Floats]:
+    """Rates, forces and velocities at the times of the IMU, in body axes, the last of the Doppler log's point."""
+    body_R_world, rate = attitude(t, yaw).inv(), rate_at(t)
+    world_rate = earth * np.array([0.0, np.cos(LATITUDE), np.sin(LATITUDE)])
+    coriolis = 2.0 * np.cross(world_rate, velocity_at(t))
+    lever = IMU_AT - known.dvl.mounting.translation_m
+    force = body_R_world.apply(acceleration_at(t) + coriolis + [0, 0, G])
+    return rate + body_R_world.apply(world_rate), force, body_R_world.apply(velocity_at(t)) - np.cross(rate, lever)
+
+
 def run(rng, yaw=0.0, earth=0.0, noise=1.0, known=KNOWN) -> tuple[Imu, Dvl, np.ndarray]:
     """Readings, and what they should give: roll, pitch, gyro bias."""
-    sensors, body_R_world, rate = known.imu, attitude(T, yaw).inv(), rate_at(T)
-    world_rate = earth * np.array([0.0, np.cos(LATITUDE), np.sin(LATITUDE)])
-    coriolis = 2.0 * np.cross(world_rate, velocity_at(T))
-    force = body_R_world.apply(acceleration_at(T) + coriolis + [0, 0, G])
+    sensors, (rate, force, at_dvl) = known.imu, exact_readings(T, known, yaw, earth)
     gyro_bias, accel_bias = (
         noise * np.array([[sensors.gyro_bias_sigma], [sensors.accel_bias_sigma]]) * (rng.standard_normal((2, 3)))
     )
@@ -56,10 +63,10 @@ def run(rng, yaw=0.0, earth=0.0, noise=1.0, known=KNOWN) -> tuple[Imu, Dvl, np.n
     stamps_ns = np.round(T * 1e9).astype(np.int64)
     imu = Imu(
         stamps_ns,
-        rate + body_R_world.apply(world_rate) + gyro_bias + sensors.gyro_noise_density * white[0],
+        rate + gyro_bias + sensors.gyro_noise_density * white[0],
         force + accel_bias + sensors.accel_noise_density * white[1],
     )
-    at_dvl = (body_R_world.apply(velocity_at(T)) - np.cross(rate, LEVER_M))[::DVL_EVERY]
+    at_dvl = at_dvl[::DVL_EVERY]
     at_dvl = at_dvl + noise * 0.005 * rng.standard_normal(at_dvl.shape)
     _, pitch, roll = attitude(np.zeros(1), yaw).as_euler("ZYX")[0]
     return imu, dvl_rows(stamps_ns[::DVL_EVERY], at_dvl), np.array([roll, pitch, *gyro_bias])
@@ -218,7 +225,6 @@ def test_what_comes_after_a_hole_of_the_imu_is_not_used(monkeypatch):
 SHORT_HZ, SHORT_EVERY = 10, 2
 SHORT_T = np.arange(round(2.4 * SHORT_HZ) + 1) / SHORT_HZ
 YAW = 0.8
-IMU_AT, DVL_AT = np.array([0.4, -0.1, 0.2]), np.array([-0.5, 0.3, -0.2])
 IMU_RPY, DVL_RPY = (0.2, -0.4, 1.0), (0.1, 0.5, -0.8)
 ROOT = np.array([[0.006, 0.0, 0.0], [0.002, 0.003, 0.0], [-0.001, 0.002, 0.008]])
 """Of the covariance of every velocity."""
@@ -245,13 +251,9 @@ def turned_by(rpy: tuple[float, float, float], vectors: Floats) -> Floats:
     return Rotation.from_euler("xyz", rpy).inv().apply(vectors)
 
 
-def exact_readings(known: Calibration, earth: float) -> tuple[Floats, Floats, Floats]:
-    """Rates, forces and velocities without noise, in body axes, the last of the Doppler log's point."""
-    body_R_world, rate = attitude(SHORT_T, YAW).inv(), rate_at(SHORT_T)
-    force = body_R_world.apply(acceleration_at(SHORT_T) + np.array([0, 0, G]))
-    lever = IMU_AT - known.dvl.mounting.translation_m
-    at_dvl = (body_R_world.apply(velocity_at(SHORT_T)) - np.cross(rate, lever))[::SHORT_EVERY]
-    return rate + body_R_world.apply(earth * np.array([0.0, np.cos(LATITUDE), np.sin(LATITUDE)])), force, at_dvl
+def short_readings(known: Calibration, earth: float) -> tuple[Floats, Floats, Floats]:
+    rate, force, velocity = exact_readings(SHORT_T, known, YAW, earth)
+    return rate, force, velocity[::SHORT_EVERY]
 
 
 def found_from(rate: Floats, force: Floats, at_dvl: Floats, known: Calibration):
@@ -266,7 +268,7 @@ def found_from(rate: Floats, force: Floats, at_dvl: Floats, known: Calibration):
 
 def error_spread(known: Calibration, earth: float) -> Floats:
     """``J Q J^T`` of what is found less what is true, of all white noises, both biases and the unknown heading."""
-    base, sensors = exact_readings(known, earth), known.imu
+    base, sensors = short_readings(known, earth), known.imu
     unmoved, share = found_from(*base, known), 0.1
 
     def spread(column: int, delta: Floats, truth: Floats | float = 0.0) -> Floats:
@@ -301,6 +303,6 @@ def error_spread(known: Calibration, earth: float) -> Floats:
     ids=["gyros in one place", "gyros at a lever", "accelerometers", "the Earth"],
 )
 def test_the_covariance_is_that_of_every_reading_and_bias(known, earth, tolerance):
-    truth, found = error_spread(known, earth), found_from(*exact_readings(known, earth), known)
+    truth, found = error_spread(known, earth), found_from(*short_readings(known, earth), known)
     size = np.sqrt(np.outer(np.diag(truth), np.diag(truth)))
     assert found.covariance / size == pytest.approx(truth / size, abs=tolerance)

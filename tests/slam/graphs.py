@@ -24,6 +24,13 @@ def factors_of(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactor]
     return [graph.at(i) for i in range(graph.size())]
 
 
+def gtsams_solution(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values, tolerance: float = 1e-12) -> gtsam.Values:
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(tolerance)
+    params.setMaxIterations(200)
+    return gtsam.LevenbergMarquardtOptimizer(graph, initial, params).optimize()
+
+
 def dense_covariance(factors: list[gtsam.NonlinearFactor], values: gtsam.Values, keys: list[int]) -> Floats:
     """Block of the inverse of the information of all factors, by numpy."""
     every = sorted({key for factor in factors for key in list(factor.keys())})

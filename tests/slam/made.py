@@ -70,6 +70,10 @@ def plain(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
     return noise
 
 
+def huber(noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
+    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(1.0), noise)
+
+
 def isotropic(size: int, sigma: float) -> gtsam.noiseModel.Base:
     return gtsam.noiseModel.Isotropic.Sigma(size, sigma)
 

@@ -21,7 +21,7 @@ from sonar_graph.slam.models.sonar_model import range_azimuth
 from sonar_graph.testing import check_jacobians
 
 from .graphs import information
-from .made import graph_of, plain, random_covariance, some_motion, values_of
+from .made import graph_of, huber, plain, random_covariance, some_motion, values_of
 
 BODY_T_SONAR = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.5, -0.2), np.array([0.4, 0.05, -0.1]))
 BODY_POSES = {
@@ -189,9 +189,6 @@ def test_without_an_elevation_a_sighting_says_next_to_nothing_about_it():
 
 @pytest.mark.parametrize("correlation", [0.0, 0.5])
 def test_the_robust_kernel_weighs_every_part_of_a_sighting(correlation):
-    def huber(noise):
-        return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(2.0), noise)
-
     z, cov = np.array([2.0, 0.0]), correlated(correlation)
     values = values_of(X0=gtsam.Pose3(), L0=np.array([3.0, 0.3, 0.0]))
     robust, quadratic = (

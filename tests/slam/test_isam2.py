@@ -26,6 +26,7 @@ from sonar_graph.testing import check_consistent, laws
 from sonar_graph.testing.drives import misnamed_world, small_world, still_world
 from sonar_graph.testing.laws import unlike
 
+from .graphs import gtsams_solution
 from .made import isam2_params, ran
 
 BASIN_S = 130.0
@@ -53,15 +54,9 @@ def until(sequence: Sequence, end_ns: int) -> Sequence:
 # Against batch ------------------------------------------------------------------------------------------------------
 
 
-def batch_solution(graph: gtsam.NonlinearFactorGraph, initial: gtsam.Values) -> gtsam.Values:
-    params = gtsam.LevenbergMarquardtParams()
-    params.setRelativeErrorTol(1e-9)
-    return gtsam.LevenbergMarquardtOptimizer(graph, initial, params).optimize()
-
-
 def assert_is_batch(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
     """Cost within 1 % and poses within 1 cm of Levenberg-Marquardt on the identical factors."""
-    batch = batch_solution(graph, values)
+    batch = gtsams_solution(graph, values, 1e-9)
     assert graph.error(batch) <= graph.error(values) * (1 + 1e-9)
     assert graph.error(values) == pytest.approx(graph.error(batch), rel=0.01)
     for key in poses_in(values):
@@ -99,7 +94,7 @@ def test_the_final_answer_is_the_batch_solution(basin):
     """Trajectory and landmarks with the default settings; the instants asked for are the keyframes' and others."""
     estimator, _ = ran(basin, 7.0)
     before = gtsam.Values(estimator.values)
-    batch = batch_solution(estimator.graph, before)
+    batch = gtsams_solution(estimator.graph, before, 1e-9)
     found, smoothed = estimator.landmarks(), estimator.trajectory()
     for landmark_id, position in zip(found.ids.tolist(), found.positions, strict=True):
         assert position == pytest.approx(batch.atPoint3(L(landmark_id)), abs=1e-3)

@@ -20,6 +20,7 @@ from sonar_graph.states import DetectionJournal, Outcome
 
 from . import dive as dive_module
 from .dive import CALIBRATION, FLOOR, T0_NS, Dive, spherical
+from .graphs import gtsams_solution
 from .made import plain, smoother_with, values_of
 
 PLACES = {7: np.array([2.6, 0.5, -1.0]), 4: np.array([2.9, 1.4, -1.0]), 9: np.array([3.2, 0.1, -1.0])}
@@ -127,9 +128,7 @@ def test_the_end_is_a_fixed_point_of_the_max_mixture_that_another_solver_finds()
         moved.insert(key, 3e-3 * rng.standard_normal(len(off.at(key))))
         off.update(moved)
     scattered = values.retract(off)
-    params = gtsam.LevenbergMarquardtParams()
-    params.setRelativeErrorTol(1e-12)
-    found = gtsam.LevenbergMarquardtOptimizer(max_mixture(world), scattered, params).optimize()
+    found = gtsams_solution(max_mixture(world), scattered)
     for i in PLACES:
         assert np.linalg.norm(scattered.atPoint3(L(i)) - values.atPoint3(L(i))) > 1e-3
         np.testing.assert_allclose(found.atPoint3(L(i)), values.atPoint3(L(i)), atol=1e-5)
@@ -288,6 +287,16 @@ def test_what_waited_in_a_frame_that_shows_the_landmark_already_is_not_of_it(mon
         *(Outcome.NEW, Outcome.UNFIT, Outcome.USED, Outcome.UNFIT),
         *(Outcome.USED_LATER, Outcome.USED),
     ]
+
+
+def test_a_detection_of_a_known_track_gets_its_landmark_also_where_another_is_nearer(monkeypatch) -> None:
+    """Before anything is chosen anew; without a track it is of the nearer landmark."""
+    monkeypatch.setattr(DoubtfulIdentities, "reconsider", lambda *_: None)
+    world = dive("max-mixture")
+    show(world, 0.3, np.vstack([at(0.3, 7), at(0.3, 9)]), [7, 9], [2, -1])
+    for after_s, track in ((0.6, 2), (0.9, -1)):
+        show(world, after_s, at(after_s, 9), [-1], [track])
+    assert world.sightings.journal.log().landmark_ids.tolist() == [7, 9, 7, 9]
 
 
 @pytest.mark.parametrize(("sigma_m", "stays"), [(0.01, False), (0.5, True)])
