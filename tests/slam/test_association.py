@@ -99,8 +99,6 @@ def test_what_reaches_the_least_probability_is_decided(belief: list[float], deci
     assert decide(stated([0, 0], [4, 7], [belief, [1.0, 0.0]]), 0.75) == [decided, 4]
 
 
-# Pairings -----------------------------------------------------------------------------------------------------------
-
 PROBABILITY = 0.95
 
 
@@ -197,9 +195,6 @@ def test_an_error_that_all_share_does_not_mislead_joint_compatibility():
     independent = Innovations(case.innovation, np.diag(np.diag(case.expected_cov)), case.noise)
     (_, joint), (_, apart) = distance(case, (1, 0)), distance(independent, (1, 0))
     assert joint > chi2.ppf(PROBABILITY, 4) > apart
-
-
-# What a pairing must be worth ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("sigma", [0.1, 0.5, 2.0])

@@ -96,9 +96,6 @@ def test_derivatives_are_those_of_differences(
         assert np.allclose(factor.linearize(values).jacobian()[1], -factor.whitenedError(values), rtol=1e-9)
 
 
-# Odometry ---------------------------------------------------------------------------------------------------------
-
-
 def test_odometry_error_is_what_the_pose_is_off_the_corrected_motion():
     """Zero where the second pose is the first moved by the corrected motion; else the perturbation from there."""
     motion, pose, bias = some_motion(2, 0.05), BODY_POSES["random"], np.array([0.02, 0.0, -0.03])
@@ -124,9 +121,6 @@ def test_odometry_keeps_the_correlations_of_the_shortest_motion(sigma: float):
     moved = start.pose().compose(gtsam.Pose3(gtsam.Rot3(), start.pose().rotation().unrotate(np.array([2e-5, 0, 0]))))
     prior = factors.start_prior(X(0), Calibration(start=start))
     assert prior.error(values_of(X0=moved)) == pytest.approx(0.5, rel=1e-5)
-
-
-# Sightings --------------------------------------------------------------------------------------------------------
 
 
 @poses
@@ -196,9 +190,6 @@ def test_the_robust_kernel_weighs_every_part_of_a_sighting(correlation):
         for kernel in (huber, plain)
     )
     assert robust < 0.2 * quadratic
-
-
-# Depth, gravity, floor, plane, start ------------------------------------------------------------------------------
 
 
 @poses

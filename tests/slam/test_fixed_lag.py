@@ -15,8 +15,7 @@ from .graphs import factors_of
 from .made import graph_of, isotropic, point_prior, pose_prior, smoother_with, values_of
 
 PRIOR_M, TIGHT_M, WEAK_M = 3.0, 2e-8, 1e3
-
-
+CHAIN_M2 = PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2
 ORIGIN = np.zeros(3)
 
 
@@ -34,7 +33,7 @@ def test_by_qr_a_marginal_has_the_sum_of_a_weak_chains_variances_which_cholesky_
     graph, values = chain()
     ((by_qr,), (by_cholesky,)) = (marginal(graph, values, [L(2)], is_by_qr=by) for by in (True, False))
     information, lost = (found.linearize(values).augmentedInformation()[:3, :3] for found in (by_qr, by_cholesky))
-    assert np.linalg.inv(information) == pytest.approx((PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2) * np.eye(3), rel=1e-9)
+    assert np.linalg.inv(information) == pytest.approx(CHAIN_M2 * np.eye(3), rel=1e-9)
     assert not lost.any()
 
 
@@ -44,7 +43,15 @@ def factor(k: int, sigma: float) -> gtsam.NonlinearFactor:
     return gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), isotropic(6, sigma))
 
 
-def begun_after(outside: gtsam.NonlinearFactorGraph, tight_m: float, *, is_by_qr: bool) -> SmootherWindow:
+PRIOR = graph_of([point_prior(L(2), ORIGIN, WEAK_M)])
+
+
+@pytest.mark.parametrize(
+    ("outside", "variance_m2", "tight_m", "is_by_qr"),
+    [(PRIOR, WEAK_M**2, 1e-6, False), (chain()[0], CHAIN_M2, 0.1, False), (chain()[0], CHAIN_M2, 0.1, True)],
+    ids=["window", "marginal", "already by QR"],
+)
+def test_what_lies_outside_counts_once_where_cholesky_gives_up(outside, variance_m2, tight_m, is_by_qr):
     """A third and a fourth point, near each other; inside, the third is known to a kilometre."""
     _, solved = chain()
     solved.insert(L(3), ORIGIN)
@@ -52,13 +59,9 @@ def begun_after(outside: gtsam.NonlinearFactorGraph, tight_m: float, *, is_by_qr
     window = SmootherWindow(1e-6, 1e9)
     window.is_by_qr = is_by_qr
     window.begin_after(outside, solved, inside, picked(solved, [L(2), L(3)]), {L(2): 0.0, L(3): 0.0})
-    return window
-
-
-def test_what_lies_outside_counts_once_where_cholesky_gives_up_on_the_window():
-    window = begun_after(graph_of([point_prior(L(2), ORIGIN, WEAK_M)]), 1e-6, is_by_qr=False)
+    expected = 1.0 / (1.0 / WEAK_M**2 + 1.0 / variance_m2)
     assert window.is_by_qr
-    assert window.isam.marginalCovariance(L(2)) == pytest.approx(0.5 * WEAK_M**2 * np.eye(3), rel=1e-5)
+    assert window.isam.marginalCovariance(L(2)) == pytest.approx(expected * np.eye(3), rel=1e-6)
 
 
 @pytest.mark.parametrize("is_by_qr", [False, True])
@@ -72,16 +75,6 @@ def test_a_marginal_holds_where_it_was_made_though_the_window_is_linearised_else
     window.settle()
     assert window.isam.getLinearizationPoint().atPoint3(L(2)) == pytest.approx(np.full(3, 1.5), abs=1e-5)
     assert window.isam.calculateEstimate().atPoint3(L(2)) == pytest.approx(np.full(3, 1.5))
-
-
-@pytest.mark.parametrize("is_by_qr", [False, True])
-def test_a_window_that_cholesky_cannot_begin_has_what_its_marginal_had_lost(is_by_qr: bool):
-    """Two sources say where the third point is: the chain outside, and a prior inside."""
-    outside, _ = chain()
-    window = begun_after(outside, 0.1, is_by_qr=is_by_qr)
-    expected = 1.0 / (1.0 / WEAK_M**2 + 1.0 / (PRIOR_M**2 + TIGHT_M**2 + WEAK_M**2))
-    assert window.is_by_qr
-    assert window.isam.marginalCovariance(L(2)) == pytest.approx(expected * np.eye(3), rel=1e-6)
 
 
 def test_where_cholesky_gives_up_on_the_marginal_qr_makes_it(monkeypatch: pytest.MonkeyPatch):
@@ -105,9 +98,6 @@ def test_where_cholesky_gives_up_on_the_marginal_qr_makes_it(monkeypatch: pytest
     assert ways == [False, True]
     assert smoother.covariance(X(2)) == pytest.approx((PRIOR_M**2 + 0.1**2 + WEAK_M**2) * np.eye(6), rel=1e-6)
     assert not smoother.withheld
-
-
-# Factors -------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [History, Recent])

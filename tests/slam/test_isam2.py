@@ -51,9 +51,6 @@ def until(sequence: Sequence, end_ns: int) -> Sequence:
     return replace(sequence, **{name: rows.between(0, end_ns) for name, rows in blocks.items() if rows is not None})
 
 
-# Against batch ------------------------------------------------------------------------------------------------------
-
-
 def assert_is_batch(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
     """Cost within 1 % and poses within 1 cm of Levenberg-Marquardt on the identical factors."""
     batch = gtsams_solution(graph, values, 1e-9)
@@ -104,9 +101,6 @@ def test_the_final_answer_is_the_batch_solution(basin):
     assert estimator.values.equals(before, 0.0)
 
 
-# Causality and bookkeeping ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("cut_s", [17.3, 64.0])
 def test_nothing_peeks_ahead(basin, cut_s):
     """Estimates until t are the same, to the bit, from a log that ends at t."""
@@ -133,9 +127,6 @@ def test_refused_detections_leave_everything_as_it_is():
     assert refusing.detections().outcomes == [Outcome.NO_IDENTITY] * len(rows)
     assert refusing.graph.size() == blind.graph.size()
     assert all(same(a, b) for a, b in zip(refused, plain, strict=True))
-
-
-# Consistency --------------------------------------------------------------------------------------------------------
 
 
 def position_nees(sequence: Sequence, estimates: list[Estimate]) -> Floats:

@@ -84,9 +84,6 @@ def some_watches(values: gtsam.Values) -> list[TrackedObject]:
     ]
 
 
-# Kernels ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kernel", KERNELS, ids=NAMES)
 def test_a_kernels_density_integrates_to_one(kernel: Kernel) -> None:
     e = np.sinh(np.linspace(-18.0, 18.0, 400_001))  # as far as Cauchy's tails matter
@@ -131,9 +128,6 @@ def test_a_kernel_on_correlated_noise_is_once_to_twice_as_strict_in_the_mixture(
     assert (ours >= theirs * (1 - 1e-9)).all()
     assert (ours <= 2.0 * theirs * (1 + 1e-9)).all()
     assert (ours / theirs).max() > 1.15, "else one of the two has come to be the other"
-
-
-# Components ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_new_detections_components_are_predictive_densities() -> None:

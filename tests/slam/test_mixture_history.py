@@ -100,9 +100,6 @@ def test_the_choices_that_settle_are_the_cheapest_of_all(said: list[int]) -> Non
         assert cost_of(rival, rival._solve(start, other), other) > cost_of(rival, values, choices) + 1.0
 
 
-# What the window chooses wrongly --------------------------------------------------------------------------------------
-
-
 def drifted(side_m: float, *, is_graduated: bool) -> tuple[Dive, list[int]]:
     """Three landmarks, and again after the vehicle has drifted aside; in two frames first only the middle one."""
     dvl = CALIBRATION.dvl.model_copy(update={"velocity_sigma_m_s": (0.2, 0.2, 0.2)})

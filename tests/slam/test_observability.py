@@ -126,9 +126,6 @@ def test_a_row_that_is_no_measurement_is_refused_and_changes_nothing(sensor, col
         assert [(row.sensor, row.stamp_ns) for row in refused] == [(sensor, stamp_ns)]
 
 
-# Time ---------------------------------------------------------------------------------------------------------------
-
-
 def test_depths_that_run_back_are_refused_by_name_and_change_nothing():
     fine, late = Isam2(mission().calibration), Isam2(mission().calibration)
     for step in mission().replay(mission().instants(0.5)):
@@ -143,9 +140,6 @@ def test_depths_that_run_back_are_refused_by_name_and_change_nothing():
     assert np.array_equal(fine.trajectory().positions, late.trajectory().positions)
     assert not fine.refused_rows()
     assert {(row.sensor, row.reason) for row in late.refused_rows()} == {("depth", Refusal.LATE)}
-
-
-# Keys and noise -----------------------------------------------------------------------------------------------------
 
 
 def test_a_key_that_is_taken_is_named_and_nothing_is_added():

@@ -112,9 +112,6 @@ def test_scattered_detections_of_nothing_begin_no_landmark():
     assert len(run(nothing, identity__unknown__policy="associate", identity__unknown__sightings=1).landmarks()) > 4
 
 
-# Merging ------------------------------------------------------------------------------------------------------------
-
-
 def named_late(share: float = 0.4) -> Sequence:
     """The detections of a first share of the run name nothing."""
     seen = clean().detections
