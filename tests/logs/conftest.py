@@ -169,11 +169,11 @@ BYTES_TEXT = b"uint8[] data\n"
 
 
 @contextmanager
-def writing(path: Path, **settings: Any) -> Iterator[ContainerWriter]:
+def writing(path: Path, profile: str = "ros2", **settings: Any) -> Iterator[ContainerWriter]:
     """A started file of mcap's own writer, finished at the end."""
     with path.open("wb") as stream:
         writer = ContainerWriter(stream, **settings)
-        writer.start("ros2", "test")
+        writer.start(profile, "test")
         yield writer
         writer.finish()
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from sonar_graph.errors import LogError
 from sonar_graph.logs.amending import write_amended
@@ -18,6 +17,8 @@ from sonar_graph.logs.mcap.writer import Outgoing, is_own_log
 from sonar_graph.logs.writing import landmark_map_message
 from sonar_graph.states import LandmarkMap
 
+from .conftest import writing
+
 MAP = "sonar_graph_msgs/msg/LandmarkMap"
 IMU_TEXT = b"float64 x"
 BINARY_SCHEMA = bytes(range(256))
@@ -25,9 +26,7 @@ BINARY_SCHEMA = bytes(range(256))
 
 def foreign_log(path: Path, count: int = 400, profile: str = "ros2", tick_ns: int = 10) -> Path:
     """A log of another program: two encodings, publish times that differ, metadata and an attachment."""
-    with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=2000, enable_data_crcs=True)
-        writer.start(profile=profile, library="another")
+    with writing(path, profile, chunk_size=2000, enable_data_crcs=True) as writer:
         text = writer.register_schema("a/msg/B", "ros2msg", IMU_TEXT)
         binary = writer.register_schema("c.D", "protobuf", BINARY_SCHEMA)
         one = writer.register_channel("/one", "cdr", text, {"offered_qos_profiles": "- {durability: 1}"})
@@ -39,7 +38,6 @@ def foreign_log(path: Path, count: int = 400, profile: str = "ros2", tick_ns: in
             at_ns = tick_ns * k
             writer.add_message(one, at_ns, struct.pack("<Id", 256, k), at_ns - (3 if k else 0), k)
             writer.add_message((other, bare)[k % 2], at_ns + 1, bytes([k % 256]) * (k % 50), at_ns + 1, 7)
-        writer.finish()
     return path
 
 
@@ -84,13 +82,10 @@ def test_everything_is_there_byte_by_byte_in_the_order_of_time_and_what_was_adde
 def test_messages_of_one_chunk_come_in_the_order_of_their_times_and_equal_ones_as_they_were(tmp_path):
     """Two topics in one chunk, whose times go to and fro."""
     times_ns = [70, 10, 40, 40, 90, 10, 40]
-    with (tmp_path / "a.mcap").open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
+    with writing(tmp_path / "a.mcap") as writer:
         channels = [writer.register_channel(topic, "json", 0) for topic in ("/one", "/other")]
         for number, time_ns in enumerate(times_ns):
             writer.add_message(channels[number % 2], time_ns, b"{}", time_ns, number)
-        writer.finish()
     write_amended(tmp_path / "a.mcap", tmp_path / "b.mcap", [landmarks(50)])
     with (tmp_path / "b.mcap").open("rb") as stream:
         messages = [(m.log_time, m.sequence) for _, _, m in make_reader(stream).iter_messages(log_time_order=False)]

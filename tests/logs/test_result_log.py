@@ -152,12 +152,12 @@ def turning(seed: int, n: int = 60) -> Trajectory:
     return Trajectory(stamps_ns, rng.normal(size=(n, 3)), Rotation.random(n, rng).as_quat(), covariances)
 
 
-def test_poses_survive_to_the_bit_and_without_covariances_there_are_no_ellipsoids(make_sequence, tmp_path, decoded):
+def test_poses_survive_to_the_bit_and_without_covariances_there_are_no_ellipsoids(make_sequence, tmp_path):
     sequence, causal, smoothed, path = make_sequence(), turning(1), turning(2), straight(0)
     unsure = Trajectory.without_covariances(path.stamps_ns, path.positions, path.quaternions_xyzw)
     estimates = {"a": (causal, smoothed, NO_LANDMARKS), "unsure": (unsure, unsure, NO_LANDMARKS)}
     write_result(tmp_path / "r.mcap", sequence, estimates)
-    messages = decoded(tmp_path / "r.mcap")
+    messages = decode(tmp_path / "r.mcap")
     topics = {"/a/odometry": causal, "/a/pose": causal, "/a/smoothed": smoothed}
     for topic, expected in (topics | {"/ground_truth/odometry": sequence.truth}).items():
         stamps = [m.header.stamp for m in messages[topic]]

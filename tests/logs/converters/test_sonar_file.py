@@ -80,6 +80,7 @@ def without(*lost: int) -> list[int]:
     return [n for n in EVERY if n not in lost]
 
 
+# fmt: off
 FAULTS: dict[str, tuple[Callable[[Frames, str], Frames], list[int], str]] = {
     "nothing": (lambda frames, _: frames, EVERY, "^$"),
     "one frame": (lambda frames, _: frames[:1], [0], ""),
@@ -88,30 +89,25 @@ FAULTS: dict[str, tuple[Callable[[Frames, str], Frames], list[int], str]] = {
     "a frame twice": (lambda f, _: [*f[:3], *f[2:]], EVERY, "a repetition of the frame at byte"),
     "two settings that alternate": (other_settings({1: 4, 3: 4, 5: 4}), EVERY, "^$"),  # as some sonars have
     "damaged settings side by side": (
-        other_settings({0: 1, 1: 2, 4: 4, 5: 8}),
-        [2, 3, 6],
-        "^([^;]*settings[^;]*(; )?){4}",
-    ),
+        other_settings({0: 1, 1: 2, 4: 4, 5: 8}), [2, 3, 6], "^([^;]*settings[^;]*(; )?){4}"),
+    **{f"header {i}": (lambda f, _, i=i: patched(f, i, 0, b"\xa5" * 200), without(i), "bytes") for i in (0, 3, 6)},
+    **{f"setting {i}": (other_settings({i: 4}), without(i), "settings are those of no frame") for i in (0, 1, 4, 6)},
+    **{f"time {i}": (lambda f, e, i=i: flipped(f, i, CLOCK_AT[e], 16), without(i), "its time does not fit")
+       for i in (2, 4)},
+    # the same number of bytes remains as of a cut header, but they are not how a header begins
+    **{f"{n} bytes in the last": (
+        lambda f, _, n=n: [*f[:-1], f[-1][:-30] + b"\x5a" * n + f[-1][-30:]], EVERY[:-1],
+        "bytes are missing or too many") for n in (1, 5, 40)},
 }
-FAULTS |= {f"header {i}": (lambda f, _, i=i: patched(f, i, 0, b"\xa5" * 200), without(i), "bytes") for i in (0, 3, 6)}
-FAULTS |= {f"setting {i}": (other_settings({i: 4}), without(i), "settings are those of no frame") for i in (0, 1, 4, 6)}
-FAULTS |= {
-    f"time {i}": (lambda f, e, i=i: flipped(f, i, CLOCK_AT[e], 16), without(i), "its time does not fit") for i in (2, 4)
+ARIS_FAULTS: dict[str, tuple[Callable[[Frames, str], Frames], list[int], str]] = {
+    **{f"time {i} far off": (lambda f, _, i=i: flipped(f, i, 24, 1), without(i), "its time does not fit")
+       for i in (0, 6)},
+    # 65,000 samples a beam are possible, but then other frames would lie within this one
+    **{f"length {i}": (
+        lambda f, _, i=i: patched(f, i, 468, (65_000).to_bytes(4, "little")), without(i), "longer than the")
+       for i in (0, 2)},
 }
-FAULTS |= {  # the same number of bytes remains as of a cut header, but they are not how a header begins
-    f"{n} bytes in the last": (
-        lambda f, _, n=n: [*f[:-1], f[-1][:-30] + b"\x5a" * n + f[-1][-30:]],
-        EVERY[:-1],
-        "bytes are missing or too many",
-    )
-    for n in (1, 5, 40)
-}
-ARIS_FAULTS = {
-    f"time {i} far off": (lambda f, _, i=i: flipped(f, i, 24, 1), without(i), "its time does not fit") for i in (0, 6)
-} | {  # 65,000 samples a beam are possible, but then other frames would lie within this one
-    f"length {i}": (lambda f, _, i=i: patched(f, i, 468, (65_000).to_bytes(4, "little")), without(i), "longer than the")
-    for i in (0, 2)
-}
+# fmt: on
 CASES = [(ending, name) for ending in PIECES for name in FAULTS] + [("aris", name) for name in ARIS_FAULTS]
 
 
