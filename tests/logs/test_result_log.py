@@ -97,10 +97,11 @@ def test_odometry_is_causal_with_covariances_in_the_axes_of_ros_and_the_last_pat
     assert [p.poses[0].pose.position.x for p in so_far] == [10, 10, 10]
     assert [p.pose.position.x for p in last.poses] == list(np.arange(100) + 20.0)
     assert [p.header.stamp.sec for p in last.poses] == list(range(1_700_000_000, 1_700_000_100))
-    pose = result.messages["/isam2/pose"][0]
-    # body axes turned by 90 degrees: what lies along the body's x lies along the world's y
-    assert np.diag(np.reshape(pose.pose.covariance, (6, 6))) == pytest.approx([5, 4, 6, 2, 1, 3])
-    assert (pose.header.frame_id, result.messages["/isam2/odometry"][0].child_frame_id) == ("map", "isam2/base_link")
+    pose, odometry = result.messages["/isam2/pose"][0], result.messages["/isam2/odometry"][0]
+    for message in (pose, odometry):
+        # body axes turned by 90 degrees: what lies along the body's x lies along the world's y
+        assert np.diag(np.reshape(message.pose.covariance, (6, 6))) == pytest.approx([5, 4, 6, 2, 1, 3])
+    assert (pose.header.frame_id, odometry.child_frame_id) == ("map", "isam2/base_link")
 
 
 def test_tf_is_a_tree_below_the_map_whose_transforms_of_one_instant_share_a_message(result):

@@ -121,11 +121,13 @@ CASES: dict[str, Case] = {
     # reference poses
     **{f"truth by its name, {'without' if covariance is None else 'with'} covariance": (
         [poses(TURN, covariance)], "",
-        {"truth.positions": [(1, 2, 3)] * 3, "truth.quaternions_xyzw": [TURN.as_quat()] * 3}, {})
+        {"truth.positions": [(1, 2, 3)] * 3, "truth.quaternions_xyzw": [TURN.as_quat()] * 3,
+         "truth.covariances": np.full((3, 6, 6), NAN)}, {})
        for covariance in (None, [0.0] * 36)},
     **{f"odometry {chosen or 'by its name'}": (
-        [poses(TURN, [0.0] * 36, topic, "nav_msgs/msg/Odometry"), poses(TURN, topic="/pose")], chosen,
-        {"truth.positions": [(1, 2, 3)] * 3, "truth.covariances": np.full((3, 6, 6), NAN)}, {"log.truth": None})
+        [poses(TURN, np.diag([4.0] * 3 + [1] * 3).ravel(), topic, "nav_msgs/msg/Odometry"), poses(TURN, topic="/pose")],
+        chosen, {"truth.positions": [(1, 2, 3)] * 3, "truth.covariances": [np.diag([1] * 3 + [4] * 3)] * 3},
+        {"log.truth": None})
        for topic, chosen in {"/odom": '[truth]\ntopic = "/odom"', "/rov/ground_truth": ""}.items()},
     "odometry of another name": (
         [poses(TURN, [0.0] * 36, "/odom", "nav_msgs/msg/Odometry")], "", {}, {"log.truth": "/odom only if chosen"}),
